@@ -1,0 +1,15 @@
+"""What went wrong in the user's input, in one line: what, where, and what to do."""
+
+__all__ = ["IpsysError", "LogError"]
+
+
+class IpsysError(Exception):
+    """A fault of the input, not of the program.
+
+    The message is one line that says what is wrong, where, and what to do about it. The command
+    line prints it without a traceback and exits with code 1.
+    """
+
+
+class LogError(IpsysError):
+    """A log file cannot be read or written as it is."""

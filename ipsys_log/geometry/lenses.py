@@ -1,0 +1,101 @@
+"""From pixels to normalized image coordinates and back, through the lens."""
+
+from __future__ import annotations
+
+import cv2
+import numpy as np
+from numpy.typing import NDArray
+
+from ipsys_log.errors import IpsysError
+from ipsys_log.messages import CameraCalibration
+
+__all__ = ["DISTORTION_MODELS", "check_calibration", "project", "undistort"]
+
+# Foxglove's and ROS's names; the number of coefficients that each takes.
+DISTORTION_MODELS = {"kannala_brandt": 4, "plumb_bob": 5, "rational_polynomial": 8}
+
+# The inverse of a lens has no closed form: iterate to far below what a log can resolve.
+_CRITERIA = (cv2.TERM_CRITERIA_COUNT + cv2.TERM_CRITERIA_EPS, 100, 1e-12)
+
+# OpenCV 5 takes the criteria in undistortPoints; 4 has a function of its own for them.
+_undistort_pinhole = getattr(cv2, "undistortPointsIter", cv2.undistortPoints)
+
+
+def check_calibration(lens: CameraCalibration, where: str) -> CameraCalibration:
+    """Return ``lens`` if it can be computed with.
+
+    Raises
+    ------
+    IpsysError
+        Naming ``where``, for an unknown distortion model, a wrong number of coefficients, or a
+        focal length that is not positive.
+    """
+    wanted = DISTORTION_MODELS.get(lens.distortion_model)
+    if wanted is None:
+        known = ", ".join(DISTORTION_MODELS)
+        raise IpsysError(
+            f"{where}: distortion model {lens.distortion_model!r} is not known; use one of {known}"
+        )
+    if lens.D.size != wanted:
+        raise IpsysError(
+            f"{where}: {lens.distortion_model} takes {wanted} coefficients, found {lens.D.size}; "
+            "calibrate the camera again or mend the file"
+        )
+    if not (np.isfinite(lens.K).all() and np.isfinite(lens.D).all() and lens.K[0, 0] > 0 < lens.K[1, 1]):
+        raise IpsysError(f"{where}: the camera matrix K has no positive focal lengths; calibrate again")
+    return lens
+
+
+def undistort(points_px: NDArray[np.float64], lens: CameraCalibration) -> NDArray[np.float64]:
+    """Normalized image coordinates (u, v) = (Xc / Zc, Yc / Zc) of pixels.
+
+    Parameters
+    ----------
+    points_px : (n, 2), in px of the raw image.
+    lens : the camera's calibration.
+
+    Returns
+    -------
+    (n, 2), without unit.
+
+    References
+    ----------
+    Ou et al., Robotica 2023, sect. 2.1. Kannala and Brandt, PAMI 2006, for the fisheye model.
+
+    Examples
+    --------
+    >>> from ipsys_log.geometry.lenses import project
+    >>> K = np.array([[1150.0, 0, 960], [0, 1150, 540], [0, 0, 1]])
+    >>> P = np.hstack([K, np.zeros((3, 1))])
+    >>> lens = CameraCalibration(0, "red", 1920, 1080, "kannala_brandt", np.zeros(4), K, np.eye(3), P)
+    >>> point_px = project(np.array([[0.5, -0.25, 2.0]]), lens)
+    >>> undistort(point_px, lens).round(9).tolist()
+    [[0.25, -0.125]]
+    """
+    points = np.ascontiguousarray(points_px, dtype=np.float64).reshape(-1, 1, 2)
+    if lens.distortion_model == "kannala_brandt":
+        uv = cv2.fisheye.undistortPoints(points, lens.K, lens.D, criteria=_CRITERIA)
+    else:
+        uv = _undistort_pinhole(points, lens.K, lens.D, R=np.eye(3), P=np.eye(3), criteria=_CRITERIA)
+    return np.asarray(uv, dtype=np.float64).reshape(-1, 2)
+
+
+def project(points_m: NDArray[np.float64], lens: CameraCalibration) -> NDArray[np.float64]:
+    """Pixels of points in the frame of the camera.
+
+    Parameters
+    ----------
+    points_m : (n, 3), in m, z > 0.
+    lens : the camera's calibration.
+
+    Returns
+    -------
+    (n, 2), in px of the raw image.
+    """
+    points = np.ascontiguousarray(points_m, dtype=np.float64).reshape(-1, 1, 3)
+    still = np.zeros(3)
+    if lens.distortion_model == "kannala_brandt":
+        pixels, _ = cv2.fisheye.projectPoints(points, still, still, lens.K, lens.D)
+    else:
+        pixels, _ = cv2.projectPoints(points, still, still, lens.K, lens.D)
+    return np.asarray(pixels, dtype=np.float64).reshape(-1, 2)

@@ -1,0 +1,462 @@
+"""What travels through the pipeline: frozen payloads, each a mirror of one schema of the log.
+
+A field here has the name of the field in the schema; :mod:`ipsys_log.log.codec` turns one into the
+other by these names and types. Lengths are metres, angles radians, times nanoseconds since 1970
+(UTC). What is missing is ``None`` or empty, never 0 and never NaN.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, field
+from typing import Annotated, Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+TimeNs = Annotated[int, "google.protobuf.Timestamp"]
+
+Floats = Annotated[NDArray[np.float64], (-1,)]
+Vec3 = Annotated[NDArray[np.float64], (3,)]
+Mat33 = Annotated[NDArray[np.float64], (3, 3)]
+Mat34 = Annotated[NDArray[np.float64], (3, 4)]
+Corners = Annotated[NDArray[np.float64], (4, 2)]
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class Message:
+    """A payload on a topic, with the two times of the log.
+
+    ``camera`` is the camera it belongs to, or None: the rig, a measurement, a track.
+    """
+
+    topic: str
+    log_time_ns: int
+    publish_time_ns: int
+    payload: Any
+    camera: str | None = None
+
+
+# --- topics -------------------------------------------------------------------------------------
+
+RIG_TOPIC = "/rig"
+MEASUREMENTS_TOPIC = "/measurements"
+EVENTS_TOPIC = "/events"
+TRUTH_TOPIC = "/truth/tracks"
+
+
+def image_topic(camera: str) -> str:
+    return f"/cameras/{camera}/image"
+
+
+def calibration_topic(camera: str) -> str:
+    return f"/cameras/{camera}/calibration"
+
+
+# --- the lab ------------------------------------------------------------------------------------
+
+
+@dataclass(frozen=True, slots=True)
+class RigMarker:
+    id: int
+    length_m: float | None = None
+    robot: str | None = None
+
+
+@dataclass(frozen=True, slots=True)
+class RigCamera:
+    name: str
+
+
+@dataclass(frozen=True, slots=True)
+class ReferencePoint:
+    name: str
+    x_m: float
+    y_m: float
+
+
+@dataclass(frozen=True, slots=True)
+class Floor:
+    width_m: float
+    depth_m: float
+
+
+@dataclass(frozen=True, slots=True)
+class Rig:
+    """The lab, as ``lab.toml`` and the channel ``/rig`` hold it (see :mod:`ipsys_log.rig`)."""
+
+    name: str
+    dictionary: str
+    marker_length_m: float
+    markers: tuple[RigMarker, ...] = ()
+    cameras: tuple[RigCamera, ...] = ()
+    reference_points: tuple[ReferencePoint, ...] = ()
+    floor: Floor | None = None
+
+    def length_of(self, marker_id: int) -> float:
+        """Side of a marker's black square, in m."""
+        for marker in self.markers:
+            if marker.id == marker_id and marker.length_m is not None:
+                return marker.length_m
+        return self.marker_length_m
+
+    def robot_of(self, marker_id: int) -> str:
+        """Name of the robot that carries a marker."""
+        for marker in self.markers:
+            if marker.id == marker_id and marker.robot is not None:
+                return marker.robot
+        return f"marker_{marker_id}"
+
+    def knows(self, marker_id: int) -> bool:
+        """Whether an id is in use here: listed, or nothing is listed."""
+        return not self.markers or any(marker.id == marker_id for marker in self.markers)
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class CameraCalibration:
+    """``foxglove.CameraCalibration``: the lens. ``distortion_model`` is ``kannala_brandt``
+    (OpenCV's fisheye, k1..k4), ``plumb_bob`` (5) or ``rational_polynomial`` (8)."""
+
+    timestamp: TimeNs
+    frame_id: str
+    width: int
+    height: int
+    distortion_model: str
+    D: Floats
+    K: Mat33
+    R: Mat33
+    P: Mat34
+
+
+# --- frames -------------------------------------------------------------------------------------
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class CompressedImage:
+    """``foxglove.CompressedImage``: the frame as the camera sent it."""
+
+    timestamp: TimeNs
+    frame_id: str
+    data: bytes
+    format: str
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class RawImage:
+    """``foxglove.RawImage``, in the logs of others."""
+
+    timestamp: TimeNs
+    frame_id: str
+    width: int
+    height: int
+    encoding: str
+    step: int
+    data: bytes
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class Marker:
+    """A marker in a frame: corners in px of the raw image, clockwise from the marker's top left,
+    (0, 0) the centre of the first pixel."""
+
+    id: int
+    corners_px: Corners
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class Markers:
+    timestamp: TimeNs
+    markers: tuple[Marker, ...]
+
+
+@dataclass(frozen=True, slots=True)
+class CameraPoint:
+    """Centre of a marker in the frame of the camera: x right, y down, z forward."""
+
+    id: int
+    x_m: float
+    y_m: float
+    z_m: float
+    heading_rad: float | None = None
+
+
+@dataclass(frozen=True, slots=True)
+class CameraPoints:
+    timestamp: TimeNs
+    points: tuple[CameraPoint, ...]
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class Position:
+    """A marker in the world, as one camera has it."""
+
+    id: int
+    x_m: float
+    y_m: float
+    z_m: float
+    heading_rad: float | None = None
+    covariance_m2: Mat33 | None = None
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class Positions:
+    timestamp: TimeNs
+    positions: tuple[Position, ...]
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class Track:
+    """A robot in the world, from all the cameras that saw it."""
+
+    robot: str
+    id: int
+    x_m: float
+    y_m: float
+    z_m: float
+    heading_rad: float | None = None
+    covariance_m2: Mat33 | None = None
+    cameras: tuple[str, ...] = ()
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class Tracks:
+    timestamp: TimeNs
+    tracks: tuple[Track, ...]
+
+
+@dataclass(frozen=True, slots=True)
+class Event:
+    """Something that a reader of the log must know of, such as a corrupt frame."""
+
+    timestamp: TimeNs
+    kind: str
+    text: str
+    camera: str | None = None
+    marker_id: int | None = None
+
+
+# --- measurements -------------------------------------------------------------------------------
+
+
+@dataclass(frozen=True, slots=True)
+class Distance:
+    reference: str
+    distance_m: float
+    sigma_m: float | None = None
+
+
+@dataclass(frozen=True, slots=True)
+class Interval:
+    start: TimeNs
+    end: TimeNs
+
+
+@dataclass(frozen=True, slots=True)
+class WorldPoint:
+    x_m: float
+    y_m: float
+    z_m: float
+
+
+@dataclass(frozen=True, slots=True)
+class Measurement:
+    """One place of one marker, measured by hand; or, with ``withdraws``, the end of one."""
+
+    timestamp: TimeNs
+    id: str
+    withdraws: str | None = None
+    marker_id: int | None = None
+    distances: tuple[Distance, ...] = ()
+    side: str | None = None
+    height_m: float | None = None
+    height_sigma_m: float | None = None
+    still: Interval | None = None
+    point: WorldPoint | None = None
+    splits: tuple[str, ...] = ()
+
+
+# --- models and their errors --------------------------------------------------------------------
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class Parameter:
+    """A named array of a model: ``values`` in C order of ``shape``."""
+
+    name: str
+    shape: tuple[int, ...]
+    values: Floats
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class Pair:
+    """A measured place: mean camera point of the still marker, and its world point."""
+
+    measurement: str
+    marker_id: int
+    camera_m: Vec3
+    world_m: Vec3
+    frames: int
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class CameraModel:
+    camera: str
+    parameters: tuple[Parameter, ...]
+    covariance_m2: Mat33 | None = None
+    pairs: tuple[Pair, ...] = ()
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class Model:
+    timestamp: TimeNs
+    name: str
+    cameras: tuple[CameraModel, ...]
+
+
+@dataclass(frozen=True, slots=True)
+class ErrorStatistics:
+    """Of a set of distances; ``std_m`` with count - 1, as in Tables I and II."""
+
+    count: int
+    mean_m: float
+    min_m: float
+    max_m: float
+    std_m: float | None = None
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class Residual:
+    measurement: str
+    world_m: Vec3
+    predicted_m: Vec3
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class CameraEvaluation:
+    """Errors of one camera against the ``tape`` or, in a simulated lab, the ``truth``."""
+
+    camera: str
+    against: str
+    error_3d: ErrorStatistics
+    error_2d: ErrorStatistics
+    residuals: tuple[Residual, ...] = ()
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class Evaluation:
+    timestamp: TimeNs
+    model: str
+    cameras: tuple[CameraEvaluation, ...]
+
+
+# --- where a run comes from ---------------------------------------------------------------------
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class Lens:
+    """A calibration in force in a run, without its time."""
+
+    camera: str
+    width: int
+    height: int
+    distortion_model: str
+    d: Floats
+    k: Mat33
+
+
+@dataclass(frozen=True, slots=True)
+class ChannelRead:
+    topic: str
+    messages: int
+    hash: str
+
+
+@dataclass(frozen=True, slots=True)
+class ChannelWritten:
+    topic: str
+    messages: int
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class Run:
+    timestamp: TimeNs
+    run: str
+    stage: str
+    parameters: dict[str, str] = field(default_factory=dict)
+    fingerprint: dict[str, str] = field(default_factory=dict)
+    rig: Rig | None = None
+    lenses: tuple[Lens, ...] = ()
+    input_runs: tuple[str, ...] = ()
+    inputs: tuple[ChannelRead, ...] = ()
+    outputs: tuple[ChannelWritten, ...] = ()
+
+
+# --- for viewers --------------------------------------------------------------------------------
+
+
+@dataclass(frozen=True, slots=True)
+class Point2:
+    x: float
+    y: float
+
+
+@dataclass(frozen=True, slots=True)
+class Color:
+    r: float
+    g: float
+    b: float
+    a: float
+
+
+@dataclass(frozen=True, slots=True)
+class PointsAnnotation:
+    """``type`` 2 is a closed line. Pixels from the corner of the first pixel, not its centre."""
+
+    timestamp: TimeNs
+    type: int
+    points: tuple[Point2, ...]
+    outline_color: Color
+    thickness: float
+
+
+@dataclass(frozen=True, slots=True)
+class TextAnnotation:
+    timestamp: TimeNs
+    position: Point2
+    text: str
+    font_size: float
+    text_color: Color
+
+
+@dataclass(frozen=True, slots=True)
+class ImageAnnotations:
+    points: tuple[PointsAnnotation, ...]
+    texts: tuple[TextAnnotation, ...]
+
+
+@dataclass(frozen=True, slots=True)
+class Vector3:
+    x: float
+    y: float
+    z: float
+
+
+@dataclass(frozen=True, slots=True)
+class Quaternion:
+    x: float
+    y: float
+    z: float
+    w: float
+
+
+@dataclass(frozen=True, slots=True)
+class FrameTransform:
+    timestamp: TimeNs
+    parent_frame_id: str
+    child_frame_id: str
+    translation: Vector3
+    rotation: Quaternion
+
+
+@dataclass(frozen=True, slots=True)
+class FrameTransforms:
+    transforms: tuple[FrameTransform, ...]

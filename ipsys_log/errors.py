@@ -1,6 +1,6 @@
 """What went wrong in the user's input, in one line: what, where, and what to do."""
 
-__all__ = ["IpsysError", "LogError"]
+__all__ = ["FitError", "IpsysError", "LogError"]
 
 
 class IpsysError(Exception):
@@ -13,3 +13,7 @@ class IpsysError(Exception):
 
 class LogError(IpsysError):
     """A log file cannot be read or written as it is."""
+
+
+class FitError(IpsysError, ValueError):
+    """Data that a model cannot be fitted to; a ValueError too, as scikit-learn's contract wants."""

@@ -388,6 +388,7 @@ class Run:
     input_runs: tuple[str, ...] = ()
     inputs: tuple[ChannelRead, ...] = ()
     outputs: tuple[ChannelWritten, ...] = ()
+    number: int = 0
 
 
 # --- for viewers --------------------------------------------------------------------------------

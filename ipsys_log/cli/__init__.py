@@ -1,0 +1,32 @@
+"""The command ``ipsys``: parse, open, make one library call, print."""
+
+from __future__ import annotations
+
+import sys
+
+__all__ = ["main"]
+
+
+def main() -> None:
+    """Run the command line; a fault of the input is one line on stderr and exit code 1."""
+    from ipsys_log.cli.app import app
+    from ipsys_log.errors import IpsysError
+
+    try:
+        app()
+    except IpsysError as error:
+        sys.exit(_complain(str(error)))
+    except BrokenPipeError:
+        sys.stderr.close()  # the reader of a pipe has gone, such as head
+        sys.exit(0)
+    except OSError as error:
+        if error.filename is None:
+            raise
+        sys.exit(_complain(f"{error.filename}: {error.strerror}"))
+    except KeyboardInterrupt:
+        sys.exit(130)
+
+
+def _complain(text: str) -> int:
+    print(f"ipsys: {text}", file=sys.stderr)  # noqa: T201
+    return 1

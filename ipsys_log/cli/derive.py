@@ -1,0 +1,177 @@
+"""The stages and ``ipsys replay``: derive channels from channels."""
+
+from __future__ import annotations
+
+import inspect
+import json
+from collections.abc import Callable, Sequence
+from pathlib import Path
+from typing import TYPE_CHECKING, Annotated, Any, Optional
+
+import typer
+
+from ipsys_log.cli.console import console, progress_bar, remarks
+from ipsys_log.cli.options import AsJson, Calibrations, Logs, RigFile, load_calibrations
+
+if TYPE_CHECKING:
+    from ipsys_log.derive import Request
+    from ipsys_log.runs import Outcome
+
+__all__ = ["add_commands"]
+
+_Path = Optional[Path]  # noqa: UP045
+
+# Every option of these commands: its type with its help, and its default.
+_OPTIONS: dict[str, tuple[Any, Any]] = {
+    "logs": (Logs, inspect.Parameter.empty),
+    "model": (
+        Annotated[
+            Optional[list[str]],  # noqa: UP045
+            typer.Option("--model", help="rigid, poly or rigid+poly; repeat for several."),
+        ],
+        None,
+    ),
+    "model_from": (
+        Annotated[
+            _Path,
+            typer.Option("--model-from", metavar="LOG", help="Apply the model of another log; copy it in."),
+        ],
+        None,
+    ),
+    "train": (
+        Annotated[str, typer.Option(help="Fit on the measurements with this label.")],
+        "train",
+    ),
+    "seed": (Annotated[int, typer.Option(help="Of the random split, where nothing is labelled.")], 0),
+    "rig": (RigFile, None),
+    "calibration": (Calibrations, None),
+    "run": (
+        Annotated[
+            Optional[str],  # noqa: UP045
+            typer.Option("--run", help="A name for the new run, instead of stock, poly, poly_2 ..."),
+        ],
+        None,
+    ),
+    "output": (
+        Annotated[_Path, typer.Option("--output", "-o", help="Write the results to a new log instead.")],
+        None,
+    ),
+    "skip_ambiguous": (
+        Annotated[
+            bool,
+            typer.Option("--skip-ambiguous", help="Leave out a marker in frames that show its id twice."),
+        ],
+        False,
+    ),
+    "plot": (Annotated[_Path, typer.Option(help="Draw the floor and the errors into a PNG.")], None),
+    "as_json": (AsJson, False),
+}
+_FRAMES = ("logs", "rig", "calibration", "run", "output", "skip_ambiguous", "as_json")
+_DETECT = tuple(name for name in _FRAMES if name != "calibration")
+_MODELS = tuple(name for name in _OPTIONS if name != "plot")
+
+_MORE = "What it needs and the log does not hold yet is made first."
+_COMMANDS: dict[str, tuple[str, tuple[str, ...], str]] = {
+    "replay": (
+        "fuse",
+        tuple(_OPTIONS),
+        "Run whatever a log lacks, from detect to fuse, append it, and print how accurate it is.",
+    ),
+    "detect": ("detect", _DETECT, "Find the markers in the frames."),
+    "camera-frame": (
+        "camera-frame",
+        _FRAMES,
+        f"Put the markers into the frame of their camera (eq. 3 to 5 of the paper). {_MORE}",
+    ),
+    "fit": ("fit", _MODELS, f"Fit models to the measured places (poly, unless you say which). {_MORE}"),
+    "evaluate": (
+        "evaluate",
+        _MODELS,
+        f"Say how far models are off on places held out: all models, unless you say which. {_MORE}",
+    ),
+    "locate": ("locate", _MODELS, f"Apply a model: world positions for each camera. {_MORE}"),
+    "fuse": ("fuse", _MODELS, f"One pose per robot from all cameras that see it. {_MORE}"),
+}
+
+
+def add_commands(app: typer.Typer) -> None:
+    for name, (until, options, text) in _COMMANDS.items():
+        app.command(name, help=text)(_command(name, until, options))
+
+
+def _command(name: str, until: str, options: Sequence[str]) -> Callable[..., None]:
+    """A function with just these options, which does the stages up to ``until``."""
+
+    def command(logs: list[Path], **given: Any) -> None:
+        output, as_json, plot = given.pop("output"), given.pop("as_json"), given.pop("plot", None)
+        _derive(logs, _request(name, **given), until, output, as_json, plot)
+
+    keyword = inspect.Parameter.KEYWORD_ONLY
+    rows = {option: _OPTIONS[option] for option in options}
+    command.__signature__ = inspect.Signature(  # type: ignore[attr-defined]
+        [
+            inspect.Parameter(key, keyword, default=value, annotation=kind)
+            for key, (kind, value) in rows.items()
+        ]
+    )
+    command.__annotations__ = {key: kind for key, (kind, _) in rows.items()}
+    return command
+
+
+def _request(command: str, **given: Any) -> Request:
+    from ipsys_log.derive import Request
+    from ipsys_log.models import MODELS
+    from ipsys_log.rig import check_name, load_rig
+
+    rig, run = given.pop("rig"), given.pop("run")
+    models = tuple(given.pop("model", None) or ())
+    if command == "evaluate" and not models and given.get("model_from") is None:
+        models = tuple(MODELS)
+    return Request(
+        models=models,
+        rig=load_rig(rig) if rig else None,
+        lenses=load_calibrations(given.pop("calibration", None)),
+        run=check_name(run, "--run") if run else None,
+        **given,
+    )
+
+
+def _derive(
+    logs: list[Path], request: Request, until: str, output: Path | None, as_json: bool, plot: Path | None
+) -> None:
+    from ipsys_log.log.session import Session
+    from ipsys_log.pipeline import replay
+    from ipsys_log.report.accuracy import accuracy_json, accuracy_table, read_accuracy
+
+    with progress_bar() as progress:
+        outcomes = replay(logs, request, until, output, progress)
+    target = output or logs[-1]
+    with Session([*logs, output] if output else logs) as session:
+        accuracies = read_accuracy(session, outcomes)
+        if plot is not None:
+            from ipsys_log.report.floor import draw_session
+
+            draw_session(session, accuracies, plot)
+    _remark(outcomes, target)
+    if as_json:
+        stages = [{"stage": o.stage, "run": o.run, "new": o.fresh, "messages": o.messages} for o in outcomes]
+        print(json.dumps({**accuracy_json(accuracies), "stages": stages}, indent=2))  # noqa: T201
+    elif accuracies:
+        console.print(accuracy_table(accuracies))
+    if plot is not None:
+        remarks.print(f"{plot} drawn")
+
+
+def _remark(outcomes: list[Outcome], target: Path) -> None:
+    """What was done, what was found done, and what was left out."""
+    for outcome in outcomes:
+        state = f"{outcome.messages} messages" if outcome.fresh else "up to date"
+        remarks.print(f"{outcome.stage:<13} run {outcome.run:<16} {state}")
+        for kind, count in outcome.events:
+            remarks.print(
+                f"  {count} x {kind.replace('_', ' ')}, first: {outcome.first_event}", style="yellow"
+            )
+    if any(outcome.fresh for outcome in outcomes):
+        remarks.print(f"appended to {target}")
+    else:
+        remarks.print(f"{target}: nothing to do, all of it is up to date")

@@ -1,0 +1,44 @@
+"""Look at a log: ``ipsys info``, ``ipsys runs``, ``ipsys view``, ``ipsys repair``."""
+
+from __future__ import annotations
+
+import json
+
+import typer
+
+from ipsys_log.cli.console import console
+from ipsys_log.cli.options import AsJson, Logs
+
+__all__ = ["add_commands"]
+
+
+def add_commands(app: typer.Typer) -> None:
+    app.command()(info)
+    app.command()(runs)
+
+
+def info(logs: Logs, as_json: AsJson = False) -> None:
+    """Cameras, channels, counts, rates, gaps and runs of a log."""
+    from ipsys_log.log.session import Session
+    from ipsys_log.report.contents import contents_json, contents_tables
+
+    with Session(logs) as session:
+        found = contents_json(session)
+    if as_json:
+        print(json.dumps(found, indent=2))  # noqa: T201
+    else:
+        for table in contents_tables(found):
+            console.print(table)
+
+
+def runs(logs: Logs, as_json: AsJson = False) -> None:
+    """The runs of a log: which stage, from what, with which parameters and software."""
+    from ipsys_log.log.session import Session
+    from ipsys_log.report.contents import runs_json, runs_table
+
+    with Session(logs) as session:
+        found = runs_json(session)
+    if as_json:
+        print(json.dumps(found, indent=2))  # noqa: T201
+    else:
+        console.print(runs_table(found))

@@ -1,0 +1,1 @@
+"""Data of others, in and out: what they wrote, as messages."""

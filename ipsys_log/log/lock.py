@@ -1,0 +1,37 @@
+"""The exclusive lock of a log: whoever writes holds it, readers never take it."""
+
+import fcntl
+import os
+from pathlib import Path
+
+from ipsys_log.errors import LogError
+from ipsys_log.log.storage import Storage
+
+__all__ = ["open_locked"]
+
+
+def open_locked(storage: Storage, path: Path, flags: int) -> int:
+    """Open `path` and take the exclusive lock at once.
+
+    Raises
+    ------
+    LogError
+        The file cannot be opened, or another process is writing it.
+    """
+    try:
+        fd = storage.open(path, flags)
+    except FileExistsError:
+        raise LogError(f"{path} exists already and is never overwritten: choose another name") from None
+    except FileNotFoundError:
+        raise LogError(f"{path} does not exist, or its folder does not") from None
+    except OSError as error:
+        raise LogError(f"{path} cannot be opened for writing: {error.strerror}") from None
+    try:
+        fcntl.flock(fd, fcntl.LOCK_EX | fcntl.LOCK_NB)
+        same = os.path.samestat(os.fstat(fd), path.stat())
+    except OSError:
+        same = False
+    if not same:
+        storage.close(fd)
+        raise LogError(f"{path}: another process is writing it: wait until it has finished")
+    return fd

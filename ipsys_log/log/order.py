@@ -1,0 +1,89 @@
+"""Log order: by log time, then by place in the file."""
+
+import heapq
+from collections.abc import Callable, Iterable, Iterator, Sequence
+from dataclasses import dataclass
+from typing import Protocol
+
+from ipsys_log.log.types import RawMessage
+
+__all__ = ["Cursor", "Pending", "in_log_order", "merge"]
+
+
+@dataclass(slots=True)
+class Cursor:
+    """The wanted messages of one chunk, in log order, read one by one.
+
+    `place` is the offset of the chunk, None if the messages lie in none: then theirs count.
+    """
+
+    place: int | None
+    times: list[int]
+    offsets: list[int]
+    load: Callable[[int], RawMessage]
+
+    def key(self, row: int) -> tuple[int, int, int]:
+        """Where message `row` stands in log order."""
+        offset = self.offsets[row]
+        return self.times[row], offset if self.place is None else self.place, offset
+
+
+@dataclass(frozen=True, slots=True)
+class Pending:
+    """A chunk that is opened when its time has come: no earlier, so that a log is never loaded whole."""
+
+    start_ns: int
+    offset: int
+    open: Callable[[], Cursor]
+
+
+class _HasMessages(Protocol):
+    def messages(self) -> Iterator[RawMessage]: ...
+
+
+def in_log_order(pending: Sequence[Pending], fault: Callable[[int], Exception]) -> Iterator[RawMessage]:
+    """Merge chunks, which may overlap in time, into one stream.
+
+    `fault` makes the error for a chunk (by its offset) that holds a message from before its own start.
+    """
+    waiting = sorted(pending, key=lambda chunk: (chunk.start_ns, chunk.offset))
+    heap: list[tuple[tuple[int, int, int], int, Cursor]] = []
+    opened, last_ns = 0, 0
+    while heap or opened < len(waiting):
+        while opened < len(waiting) and (not heap or waiting[opened].start_ns <= heap[0][0][0]):
+            chunk = waiting[opened]
+            cursor = chunk.open()
+            opened += 1
+            if cursor.times:
+                heapq.heappush(heap, (cursor.key(0), 0, cursor))
+        if not heap:
+            return
+        (time, place, _), row, cursor = heap[0]
+        if time < last_ns:
+            raise fault(place)
+        last_ns = time
+        yield cursor.load(row)
+        row += 1
+        if row < len(cursor.times):
+            heapq.heapreplace(heap, (cursor.key(row), row, cursor))
+        else:
+            heapq.heappop(heap)
+
+
+def merge(*logs: _HasMessages | Iterable[RawMessage]) -> Iterator[RawMessage]:
+    """One stream in log order over several logs; at equal times in the order of the arguments.
+
+    Parameters
+    ----------
+    logs
+        Open readers, or iterables of messages in log order.
+
+    Examples
+    --------
+    >>> a = [RawMessage("/a", 1, 1, b""), RawMessage("/a", 3, 3, b"")]
+    >>> b = [RawMessage("/b", 2, 2, b"")]
+    >>> [message.topic for message in merge(a, b)]
+    ['/a', '/b', '/a']
+    """
+    streams = [log if isinstance(log, Iterable) else log.messages() for log in logs]
+    return heapq.merge(*streams, key=lambda message: message.log_time_ns)

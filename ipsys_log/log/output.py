@@ -1,0 +1,105 @@
+"""Where a writer's bytes go: into a file that grows, or into memory until an append is complete."""
+
+import os
+import zlib
+from dataclasses import dataclass, field
+from pathlib import Path
+from typing import Protocol
+
+from ipsys_log.errors import LogError
+from ipsys_log.log.journal import replace_tail
+from ipsys_log.log.storage import Storage, write_all
+
+__all__ = ["Growing", "Output", "Pending"]
+
+
+class Output(Protocol):
+    """The end of the data section. `crc` is None where the log does not keep one."""
+
+    @property
+    def offset(self) -> int: ...
+    @property
+    def crc(self) -> int | None: ...
+    def emit(self, data: bytes) -> None: ...
+    def finish(self, tail: bytes) -> None: ...
+    def abandon(self) -> None: ...
+
+
+@dataclass(slots=True)
+class Growing:
+    """A new file. Each piece is handed to the operating system at once.
+
+    With a `target` the file is renamed to it when it is complete, and removed when it is abandoned.
+    """
+
+    storage: Storage
+    path: Path
+    fd: int
+    target: Path | None = None
+    offset: int = 0
+    crc: int | None = 0
+    _failed: bool = False
+
+    def emit(self, data: bytes) -> None:
+        try:
+            write_all(self.storage, self.fd, data, self.offset)
+        except OSError as error:
+            self._failed = True
+            raise _cannot_write(
+                self.path, error, f"what it holds so far can be saved with: ipsys repair {self.path}"
+            ) from None
+        self.offset += len(data)
+        self.crc = zlib.crc32(data, self.crc or 0)
+
+    def finish(self, tail: bytes) -> None:
+        if self._failed:  # a torn piece may reach beyond the tail
+            self.storage.truncate(self.fd, self.offset)
+        self.emit(tail)
+        self.storage.fsync(self.fd)
+        if self.target is not None:
+            if self.target.exists():
+                raise LogError(f"{self.target} appeared while it was written; the new log is {self.path}")
+            self.storage.rename(self.path, self.target)
+        self.storage.fsync_directory(self.path.parent)
+        self.storage.close(self.fd)
+
+    def abandon(self) -> None:
+        if self.target is not None:
+            self.storage.unlink(self.path)
+        self.storage.close(self.fd)
+
+
+@dataclass(slots=True)
+class Pending:
+    """An append: nothing touches the file until `finish`."""
+
+    storage: Storage
+    path: Path
+    fd: int
+    start: int
+    offset: int
+    crc: int | None
+    _pieces: list[bytes] = field(default_factory=list)
+
+    def emit(self, data: bytes) -> None:
+        self._pieces.append(data)
+        self.offset += len(data)
+        self.crc = None if self.crc is None else zlib.crc32(data, self.crc)
+
+    def finish(self, tail: bytes) -> None:
+        try:
+            if self._pieces:
+                replace_tail(self.storage, self.path, self.fd, self.start, (*self._pieces, tail))
+        except OSError as error:
+            raise _cannot_write(
+                self.path, error, "the log stays as it was; free some space and try again"
+            ) from None
+        finally:
+            self.storage.close(self.fd)
+
+    def abandon(self) -> None:
+        self.storage.close(self.fd)
+
+
+def _cannot_write(path: Path, error: OSError, then: str) -> LogError:
+    return LogError(f"{path} cannot be written ({error.strerror or os.strerror(error.errno or 0)}): {then}")

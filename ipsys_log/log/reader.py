@@ -1,0 +1,260 @@
+"""Reading a log: by its indexes, in log order, while somebody else may be appending to it."""
+
+import os
+import time
+from collections import Counter
+from collections.abc import Collection, Iterator, Mapping
+from functools import partial
+from pathlib import Path
+from types import MappingProxyType
+from typing import Any, Self
+
+import numpy as np
+from mcap import records as mcap
+from numpy.typing import NDArray
+
+from ipsys_log.errors import LogError
+from ipsys_log.log.contents import Contents, load_contents
+from ipsys_log.log.hashing import METADATA_NAME, ChannelHash, hashes_from_metadata
+from ipsys_log.log.journal import attach_journal
+from ipsys_log.log.order import Pending, in_log_order
+from ipsys_log.log.payload import Blocks, chunk_entries, open_chunk, open_loose
+from ipsys_log.log.records import HEADER, parse, walk
+from ipsys_log.log.types import Channel, RawMessage, Schema
+from ipsys_log.log.view import View, open_for_reading
+
+__all__ = ["LogReader", "stored_hashes"]
+
+_ATTEMPTS = 100
+_PAUSE_S = 0.02
+_END_OF_TIME = (1 << 64) - 1
+
+
+class LogReader:
+    """A finished log, open for reading.
+
+    Several channels of one topic, as other programs write them, are read as one. A reader stays right
+    while somebody appends: it shows the log as it was when it was opened.
+
+    Parameters
+    ----------
+    path
+        The ``.mcap`` file.
+
+    Attributes
+    ----------
+    channels : Mapping[str, Channel]
+        By topic.
+    conflicts : Mapping[str, str]
+        Topics whose channels differ in schema or encoding, and how. They cannot be read as one.
+    start_ns, end_ns : int or None
+        Log times of the first and the last message.
+    message_count : int
+    chunk_count : int
+    compressions : Mapping[str, int]
+        Number of chunks by compression ("" means none).
+    size : int
+        Bytes of the file.
+    bytes_read : int
+        Bytes read from it so far.
+
+    Raises
+    ------
+    LogError
+        The file is missing, empty, not an MCAP, has no footer, or is damaged.
+
+    Examples
+    --------
+    >>> from tempfile import TemporaryDirectory
+    >>> from ipsys_log.log import LogWriter
+    >>> with TemporaryDirectory() as folder:
+    ...     with LogWriter.create(Path(folder) / "a.mcap") as log:
+    ...         log.add_channel("/a", Schema("A", "jsonschema", b"{}"), "json")
+    ...         log.write("/a", 1_000, 900, b"{}")
+    ...     with LogReader(Path(folder) / "a.mcap") as log:
+    ...         [(message.topic, message.log_time_ns) for message in log.messages()]
+    [('/a', 1000)]
+    """
+
+    def __init__(self, path: str | os.PathLike[str]) -> None:
+        self.path = Path(path)
+        self._view, self._contents = _open(self.path)
+        self._blocks = Blocks()
+        self._stored: dict[str, ChannelHash] | None = None
+        self.channels, self.conflicts = _by_topic(self._contents)
+        self.start_ns, self.end_ns = self._contents.start_ns, self._contents.end_ns
+        self.message_count = sum(self._contents.counts.values())
+        self.chunk_count = len(self._contents.chunks)
+        self.compressions: Mapping[str, int] = Counter(chunk.compression for chunk in self._contents.chunks)
+        self.size = self._view.size
+
+    def __enter__(self) -> Self:
+        return self
+
+    def __exit__(self, *_: object) -> None:
+        self.close()
+
+    def close(self) -> None:
+        """Release the file; a second call does nothing."""
+        self._view.close()
+
+    @property
+    def bytes_read(self) -> int:
+        """Bytes read from the file so far, its table of contents included."""
+        return self._view.bytes_read
+
+    def messages(
+        self,
+        topics: Collection[str] | None = None,
+        start_ns: int | None = None,
+        end_ns: int | None = None,
+    ) -> Iterator[RawMessage]:
+        """Messages in log order: by log time, then by place in the file.
+
+        Parameters
+        ----------
+        topics
+            Only these; None means all. A topic that the log does not have gives no message.
+        start_ns, end_ns
+            Half-open range of log time in ns: start <= log time < end.
+
+        Raises
+        ------
+        LogError
+            A record is damaged, or the channels of a wanted topic differ in schema.
+        """
+        contents, view = self._contents, self._view
+        wanted = self._topics_by_id(topics)
+        span = (max(0, start_ns or 0), _END_OF_TIME if end_ns is None else end_ns - 1)
+        pending = [
+            Pending(
+                chunk.start_ns, chunk.offset, partial(open_chunk, view, self._blocks, chunk, wanted, span)
+            )
+            for chunk in contents.chunks
+            if chunk.start_ns <= span[1]
+            and chunk.end_ns >= span[0]
+            and (not chunk.index_offsets or not wanted.keys().isdisjoint(chunk.index_offsets))
+        ]
+        if span[1] < span[0] or not wanted:
+            return iter(())
+        if contents.loose:
+            loose = partial(open_loose, view, self._blocks, contents.loose, wanted, span, contents.data_end)
+            pending.append(Pending(0, 0, loose))
+        return in_log_order(pending, lambda at: view.fault(at, "a message is older than its chunk says"))
+
+    def times(self, topic: str) -> NDArray[np.int64]:
+        """Log times of a topic in ns, sorted, shape (N,); read from the indexes alone."""
+        wanted = set(self._topics_by_id([topic]))
+        parts = [rows for key, rows in self._contents.loose.items() if key in wanted]
+        for chunk in self._contents.chunks:
+            if not chunk.index_offsets or not wanted.isdisjoint(chunk.index_offsets):
+                entries = chunk_entries(self._view, chunk, wanted)
+                parts += [rows for key, rows in entries.items() if key in wanted]
+        if not parts:
+            return np.zeros(0, np.int64)
+        return np.sort(np.concatenate(parts)[:, 0]).astype(np.int64)
+
+    def channel_hash(self, topic: str) -> str:
+        """Hash over times and payloads of a channel in log order, in hexadecimal.
+
+        It is the same however the messages are spread over chunks and files. What the writer stored is
+        used if it fits the log; else the channel is read once.
+
+        Raises
+        ------
+        LogError
+            The log has no such topic, or a record of it is damaged.
+        """
+        if topic not in self.channels:
+            raise LogError(f"{self.path} has no topic {topic}: see ipsys info {self.path}")
+        if self._stored is None:
+            self._stored = stored_hashes(self._view, self._contents)
+        state = self._stored.get(topic)
+        if state is None or state.count != self.channels[topic].message_count:
+            state = ChannelHash()
+            for message in self.messages([topic]):
+                state.add(message.log_time_ns, message.publish_time_ns, message.data)
+            self._stored[topic] = state
+        return state.digest.hex()
+
+    def _topics_by_id(self, topics: Collection[str] | None) -> dict[int, str]:
+        wanted = self.channels.keys() if topics is None else set(topics)
+        for topic in sorted(self.conflicts.keys() & wanted):
+            raise LogError(f"{self.path}: {self.conflicts[topic]}: the topic cannot be read as one channel")
+        return {key: c.topic for key, c in self._contents.channels.items() if c.topic in wanted}
+
+
+def stored_hashes(view: View, contents: Contents) -> dict[str, ChannelHash]:
+    """The hashes that writers left in the log, the newest per topic."""
+    found: dict[str, ChannelHash] = {}
+    for index in sorted(contents.metadata, key=lambda record: record.offset):
+        if index.name == METADATA_NAME and index.offset + HEADER.size <= contents.data_end:
+            at = next(walk(view, index.offset, contents.data_end))
+            body = view.read(at.offset + HEADER.size, at.length - HEADER.size)
+            record = parse(mcap.Metadata.read, view, at, body)
+            found |= hashes_from_metadata(record, index.offset)
+    return found
+
+
+def _open(path: Path) -> tuple[View, Contents]:
+    """Open a consistent state: the old log while a journal holds, else a file that stood still meanwhile."""
+    fault: LogError | None = None
+    for _ in range(_ATTEMPTS):
+        fd = open_for_reading(path)
+        before = os.fstat(fd)
+        view = View(path, fd, before.st_size, before.st_size)
+        held = attach_journal(view)
+        fault = None
+        try:
+            contents = load_contents(view)
+        except LogError as error:
+            fault = error
+        except BaseException:
+            view.close()
+            raise
+        if fault is None and (held or _stood_still(view, before)):
+            return view, contents
+        moved = not held and not _stood_still(view, before)
+        view.close()
+        if fault is not None and not moved:
+            raise fault
+        time.sleep(_PAUSE_S)
+    raise fault or LogError(f"{path} changes all the time: it is still being written")
+
+
+def _stood_still(view: View, before: os.stat_result) -> bool:
+    now = os.fstat(view.fd)
+    probe = View(view.path, os.dup(view.fd), now.st_size, now.st_size)
+    try:
+        same = (now.st_size, now.st_mtime_ns) == (before.st_size, before.st_mtime_ns)
+        return same and not attach_journal(probe)
+    finally:
+        probe.close()
+
+
+def _by_topic(contents: Contents) -> tuple[Mapping[str, Channel], Mapping[str, str]]:
+    channels: dict[str, Channel] = {}
+    conflicts: dict[str, str] = {}
+    for key, record in sorted(contents.channels.items()):
+        found = contents.schemas.get(record.schema_id)
+        schema = Schema(found.name, found.encoding, found.data) if found else None
+        count = contents.counts.get(key, 0)
+        first = channels.get(record.topic)
+        if first is None:
+            metadata = MappingProxyType(dict(record.metadata))
+            channels[record.topic] = Channel(record.topic, schema, record.message_encoding, metadata, count)
+            continue
+        if (first.schema, first.message_encoding) != (schema, record.message_encoding):
+            conflicts[record.topic] = _difference(record.topic, first, schema, record.message_encoding)
+        total: dict[str, Any] = {"message_count": first.message_count + count}
+        channels[record.topic] = Channel(
+            first.topic, first.schema, first.message_encoding, first.metadata, **total
+        )
+    return MappingProxyType(channels), MappingProxyType(conflicts)
+
+
+def _difference(topic: str, first: Channel, schema: Schema | None, encoding: str) -> str:
+    names = [f"{s.name} ({s.encoding})" if s else "no schema" for s in (first.schema, schema)]
+    if names[0] == names[1]:
+        names = [f"{names[0]}, one definition", "another definition of that name"]
+    return f"channels of {topic} differ: {names[0]} as {first.message_encoding}, {names[1]} as {encoding}"

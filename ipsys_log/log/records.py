@@ -1,0 +1,193 @@
+"""MCAP records: bounded parsing of untrusted bytes, and bytes of new records.
+
+Layouts as in the MCAP specification, https://mcap.dev/spec. The record classes are those of ``mcap``.
+"""
+
+import struct
+from collections.abc import Callable, Iterator
+from dataclasses import dataclass
+from io import BytesIO
+from typing import Any, TypeVar
+
+import numpy as np
+from mcap import records as mcap
+from mcap.data_stream import ReadDataStream, RecordBuilder
+from mcap.exceptions import McapError
+from mcap.opcode import Opcode
+from numpy.typing import NDArray
+
+from ipsys_log.log.view import View
+
+__all__ = [
+    "DATA_END",
+    "FOOTER",
+    "HEADER",
+    "MAGIC",
+    "MESSAGE",
+    "ChunkHead",
+    "ChunkRef",
+    "RecordAt",
+    "as_bytes",
+    "parse",
+    "parse_chunk_head",
+    "parse_chunk_index",
+    "parse_message_index",
+    "walk",
+]
+
+MAGIC = b"\x89MCAP0\r\n"
+HEADER = struct.Struct("<BQ")  # opcode, length of the rest
+MESSAGE = struct.Struct("<BQHIQQ")  # opcode, length, channel, sequence, log time, publish time
+DATA_END = struct.Struct("<BQI")
+FOOTER = struct.Struct("<BQQQI")
+_CHUNK = struct.Struct("<QQQI")  # start, end, uncompressed size, CRC
+_CHUNK_INDEX = struct.Struct("<QQQQI")  # start, end, offset, length, bytes of the map that follows
+_OFFSET = np.dtype([("channel", "<u2"), ("offset", "<u8")])
+_WALK_BLOCK = 4096
+_LONGEST_NAME = 64
+
+R = TypeVar("R")
+
+
+@dataclass(frozen=True, slots=True)
+class RecordAt:
+    """Where a record lies: `offset` of its opcode, `length` with its 9 bytes of head."""
+
+    opcode: int
+    offset: int
+    length: int
+
+
+@dataclass(frozen=True, slots=True)
+class ChunkRef:
+    """What a ChunkIndex record says. `index_offsets` maps channel ids to their MessageIndex records."""
+
+    offset: int
+    length: int
+    start_ns: int
+    end_ns: int
+    compression: str
+    compressed_size: int
+    uncompressed_size: int
+    index_length: int
+    index_offsets: dict[int, int]
+
+    @property
+    def end(self) -> int:
+        """Offset of the first byte after the chunk's message indexes."""
+        return self.offset + self.length + self.index_length
+
+    def as_record(self) -> mcap.ChunkIndex:
+        return mcap.ChunkIndex(
+            chunk_length=self.length,
+            chunk_start_offset=self.offset,
+            compression=self.compression,
+            compressed_size=self.compressed_size,
+            message_end_time=self.end_ns,
+            message_index_length=self.index_length,
+            message_index_offsets=self.index_offsets,
+            message_start_time=self.start_ns,
+            uncompressed_size=self.uncompressed_size,
+        )
+
+
+@dataclass(frozen=True, slots=True)
+class ChunkHead:
+    """The fields in front of a chunk's data, which lies at `data_offset` in the file."""
+
+    start_ns: int
+    end_ns: int
+    uncompressed_size: int
+    crc: int
+    compression: str
+    data_offset: int
+    data_size: int
+
+
+def as_bytes(*records: mcap.McapRecord) -> bytes:
+    """The records as they stand in a file."""
+    builder = RecordBuilder()  # type: ignore[no-untyped-call, unused-ignore]
+    for record in records:
+        record.write(builder)
+    data: bytes = builder.end()  # type: ignore[no-untyped-call]
+    return data
+
+
+def parse(read: Callable[[ReadDataStream], R], view: View, at: RecordAt, body: bytes) -> R:
+    """One record by ``mcap``'s own `read`; it cannot reach beyond `body`, whatever lengths it claims."""
+    try:
+        return read(ReadDataStream(BytesIO(body)))
+    except (McapError, struct.error, UnicodeDecodeError, OverflowError, MemoryError, ValueError) as error:
+        raise view.fault(at.offset, f"the {_name(at.opcode)} record is not valid ({error!r})") from None
+
+
+def parse_chunk_index(view: View, at: RecordAt, body: bytes) -> ChunkRef:
+    """A ChunkIndex record; much faster than field by field, and there is one per chunk."""
+    try:
+        start, end, offset, length, map_length = _CHUNK_INDEX.unpack_from(body)
+        entries = np.frombuffer(body, _OFFSET, map_length // _OFFSET.itemsize, _CHUNK_INDEX.size)
+        rest = _CHUNK_INDEX.size + map_length
+        index_length, name_length = struct.unpack_from("<QI", body, rest)
+        name = _short_name(body[rest + 12 : rest + 12 + name_length])
+        compressed, uncompressed = struct.unpack_from("<QQ", body, rest + 12 + name_length)
+    except (struct.error, ValueError) as error:
+        raise view.fault(at.offset, f"the ChunkIndex record is not valid ({error})") from None
+    offsets = dict(zip(entries["channel"].tolist(), entries["offset"].tolist(), strict=True))
+    return ChunkRef(offset, length, start, end, name, compressed, uncompressed, index_length, offsets)
+
+
+def parse_chunk_head(view: View, offset: int) -> tuple[RecordAt, ChunkHead]:
+    """The head of the Chunk record at `offset`, checked against its own length and the file's."""
+    data = view.read(offset, min(HEADER.size + _CHUNK.size + 4 + _LONGEST_NAME + 8, view.size - offset))
+    try:
+        opcode, length = HEADER.unpack_from(data)
+        start, end, size, crc = _CHUNK.unpack_from(data, HEADER.size)
+        at = HEADER.size + _CHUNK.size
+        (name_length,) = struct.unpack_from("<I", data, at)
+        name = _short_name(data[at + 4 : at + 4 + min(name_length, _LONGEST_NAME + 1)])
+        at += 4 + name_length
+        (data_size,) = struct.unpack_from("<Q", data, at)
+    except (struct.error, ValueError) as error:
+        raise view.fault(offset, f"the Chunk record is not valid ({error})") from None
+    if opcode != Opcode.CHUNK or at + 8 + data_size != HEADER.size + length:
+        raise view.fault(offset, "there is no Chunk record where one must be")
+    if offset + HEADER.size + length > view.size:
+        raise view.fault(offset, "the Chunk record reaches beyond the end of the file")
+    head = ChunkHead(start, end, size, crc, name, offset + at + 8, data_size)
+    return RecordAt(opcode, offset, HEADER.size + length), head
+
+
+def parse_message_index(view: View, data: bytes, position: int, channel_id: int, at: int) -> NDArray[Any]:
+    """Entries (log time in ns, offset in the chunk), shape (N, 2), of the record at `position` in `data`."""
+    if 0 <= position <= len(data) - 15:
+        opcode, length, channel, size = struct.unpack_from("<BQHI", data, position)
+        if (opcode, channel) == (Opcode.MESSAGE_INDEX, channel_id) and size % 16 == 0:
+            end = position + 15 + size
+            if end <= len(data) and size + 6 <= length:
+                return np.frombuffer(data, "<u8", size // 8, position + 15).reshape(-1, 2)
+    raise view.fault(at, f"there is no MessageIndex record of channel {channel_id} where one must be")
+
+
+def walk(view: View, start: int, end: int) -> Iterator[RecordAt]:
+    """The records from `start` to `end`, by their heads only."""
+    block, base = b"", start
+    while start < end:
+        if start + HEADER.size > base + len(block) or start < base:
+            base, block = start, view.read(start, min(_WALK_BLOCK, view.size - start))
+        if start - base + HEADER.size > len(block):
+            raise view.fault(start, "a record is cut off")
+        opcode, length = HEADER.unpack_from(block, start - base)
+        if opcode == 0 or length > end - start - HEADER.size:
+            raise view.fault(start, f"a record of type {opcode} claims {length} bytes")
+        yield RecordAt(opcode, start, HEADER.size + length)
+        start += HEADER.size + length
+
+
+def _short_name(data: bytes) -> str:
+    if len(data) > _LONGEST_NAME:
+        raise ValueError("the name of the compression is too long")
+    return str(data, "utf-8")
+
+
+def _name(opcode: int) -> str:
+    return Opcode(opcode).name if opcode in Opcode._value2member_map_ else f"type {opcode}"

@@ -1,0 +1,197 @@
+"""Making a log whole again whose writer was killed, or whose end was cut off."""
+
+import os
+import zlib
+from collections import Counter
+from collections.abc import Mapping
+from dataclasses import dataclass, field
+from pathlib import Path
+
+from mcap import records as mcap
+
+from ipsys_log.errors import LogError
+from ipsys_log.log.contents import load_contents
+from ipsys_log.log.hashing import METADATA_NAME, metadata_of_hashes
+from ipsys_log.log.journal import replace_tail, roll_back
+from ipsys_log.log.lock import open_locked
+from ipsys_log.log.records import MAGIC, ChunkRef, as_bytes
+from ipsys_log.log.salvage import Salvage, salvage
+from ipsys_log.log.storage import DISK, Storage, write_all
+from ipsys_log.log.summary import tail_bytes
+from ipsys_log.log.survey import Survey, survey
+from ipsys_log.log.view import View
+
+__all__ = ["RepairReport", "repair"]
+
+_KEEP_BESIDE = 16 << 20  # bytes: a larger stretch that cannot be read is copied before it is cut off
+_BLOCK = 1 << 20
+
+
+@dataclass(frozen=True, slots=True)
+class RepairReport:
+    """What `repair` found and did.
+
+    ``messages_lost`` counts, by topic, the messages known to be gone; a recorder's last second, which it
+    had not written yet, is not known. ``bytes_lost`` counts bytes of the data section that were dropped.
+    """
+
+    path: Path
+    changed: bool
+    bytes_lost: int
+    messages_kept: int
+    last_kept_ns: int | None
+    messages_lost: Mapping[str, int] = field(default_factory=dict)
+    notes: tuple[str, ...] = ()
+
+    def __str__(self) -> str:
+        kept = f"{self.messages_kept} messages"
+        if not self.changed:
+            return "; ".join((f"{self.path} is whole: {kept}, nothing changed", *self.notes))
+        lost = ", ".join(f"{number} of {topic}" for topic, number in sorted(self.messages_lost.items()))
+        words = (
+            f"{self.path} repaired: {kept} kept, the last one at {self.last_kept_ns} ns; "
+            f"{self.bytes_lost} bytes lost; messages known to be lost: {lost or 'none'}"
+        )
+        return "; ".join((words, *self.notes))
+
+
+def repair(path: str | os.PathLike[str], *, storage: Storage = DISK) -> RepairReport:
+    """Restore every complete chunk of a log in place, and say what was lost.
+
+    An append that was cut short is rolled back. A log that is whole is left alone. Damaged chunks in the
+    middle are marked so that readers skip them. What is dropped in one piece and is larger than 16 MiB is
+    kept in ``<path>.lost``.
+
+    Raises
+    ------
+    LogError
+        The file is empty or not an MCAP, or another process is writing it.
+    """
+    target = Path(path)
+    fd = open_locked(storage, target, os.O_RDWR)
+    try:
+        rolled_back = roll_back(storage, target, fd)
+        size = os.fstat(fd).st_size
+        view = View(target, fd, size, size)
+        _check_magic(view)
+        found = survey(view)
+        notes = ["an append that was cut short was rolled back"] if rolled_back else []
+        if _is_whole(view, found):
+            return RepairReport(
+                target,
+                rolled_back,
+                0,
+                sum(found.contents.counts.values()),
+                found.contents.end_ns,
+                {},
+                tuple(notes),
+            )
+        return _rebuild(storage, view, found, notes)
+    except OSError as error:
+        raise LogError(
+            f"{target} cannot be repaired ({error.strerror}): free some space and try again"
+        ) from None
+    finally:
+        storage.close(fd)
+
+
+def _check_magic(view: View) -> None:
+    start = view.read(0, min(len(MAGIC), view.size))
+    if not start:
+        raise LogError(f"{view.path} is empty: there is nothing to repair, delete it")
+    if start != MAGIC:
+        raise LogError(f"{view.path} is not an MCAP file (it starts with {start!r}): nothing was changed")
+
+
+def _is_whole(view: View, found: Survey) -> bool:
+    if not found.finished or found.damaged or not found.crc_is_right:
+        return False
+    try:
+        contents = load_contents(view)
+    except LogError:
+        return False
+    chunks = [chunk.offset for chunk in contents.chunks] == [chunk.offset for chunk in found.contents.chunks]
+    counts = {k: n for k, n in contents.counts.items() if n} == {
+        k: n for k, n in found.contents.counts.items() if n
+    }
+    return chunks and counts and contents.data_end == found.end
+
+
+def _rebuild(storage: Storage, view: View, found: Survey, notes: list[str]) -> RepairReport:
+    """Cut behind the last whole record, write what was saved, and a new summary."""
+    contents, size, start = found.contents, view.size, found.end
+    saved = Salvage() if found.finished else salvage(view, start, found)
+    lost = Counter(saved.lost)
+    bytes_lost = 0 if found.finished else max(0, size - start - saved.bytes_kept)
+    bytes_lost += sum(record.length for record in found.damaged)
+    if not found.finished and size - start > _KEEP_BESIDE:
+        notes.append(
+            f"the {size - start} bytes from byte {start} on were kept in {_copy_lost(storage, view, start)}"
+        )
+    _blank(storage, view, found)
+    indexes = b"".join(_indexes(found))
+    kept = b"".join((indexes, *_saved_chunk(found, saved, start + len(indexes))))
+    contents.data_end = start + len(kept)
+    hashes = b"" if contents.loose else metadata_of_hashes(found.hashes, contents.data_end)
+    if hashes:
+        contents.metadata.append(mcap.MetadataIndex(contents.data_end, len(hashes), METADATA_NAME))
+        contents.metadata_count += 1
+        contents.data_end += len(hashes)
+    contents.data_crc = zlib.crc32(kept + hashes, found.crc)
+    replace_tail(storage, view.path, view.fd, start, (kept, hashes, tail_bytes(contents)))
+    notes += [f"found: {fault}" for fault in found.faults]
+    return RepairReport(
+        view.path, True, bytes_lost, sum(contents.counts.values()), contents.end_ns, lost, tuple(notes)
+    )
+
+
+def _indexes(found: Survey) -> list[bytes]:
+    """The missing message indexes of the last chunk."""
+    if found.unindexed is None:
+        return []
+    chunk = found.contents.chunks[-1]
+    at, offsets, pieces = found.end, {}, []
+    for channel, rows in found.unindexed.entries.items():
+        pieces.append(as_bytes(mcap.MessageIndex(channel, rows)))
+        offsets[channel], at = at, at + len(pieces[-1])
+    found.contents.chunks[-1] = ChunkRef(
+        chunk.offset, chunk.length, chunk.start_ns, chunk.end_ns, chunk.compression, chunk.compressed_size,
+        chunk.uncompressed_size, at - found.end, offsets,
+    )  # fmt: skip
+    return pieces
+
+
+def _saved_chunk(found: Survey, saved: Salvage, offset: int) -> list[bytes]:
+    built = saved.chunk.build(offset + sum(map(len, saved.definitions)))
+    if built is None:
+        return saved.definitions
+    ref, data = built
+    found.contents.chunks.append(ref)
+    found.contents.cover(ref.start_ns, ref.end_ns)
+    for channel, number in saved.chunk.counts.items():
+        found.contents.count(channel, number)
+    return [*saved.definitions, data]
+
+
+def _blank(storage: Storage, view: View, found: Survey) -> None:
+    """Give damaged records a private type, which every reader skips, and correct the data CRC for it."""
+    for record in found.damaged:
+        storage.pwrite(view.fd, bytes([record.opcode | 0x80]), record.offset)
+    if found.damaged:
+        storage.fsync(view.fd)
+        found.crc = 0
+        for offset in range(0, found.end, _BLOCK):
+            found.crc = zlib.crc32(view.read(offset, min(_BLOCK, found.end - offset)), found.crc)
+
+
+def _copy_lost(storage: Storage, view: View, start: int) -> Path:
+    beside = view.path.with_name(view.path.name + ".lost")
+    fd = storage.open(beside, os.O_WRONLY | os.O_CREAT | os.O_EXCL)
+    try:
+        for offset in range(start, view.size, _BLOCK):
+            write_all(storage, fd, view.read(offset, min(_BLOCK, view.size - offset)), offset - start)
+        storage.fsync(fd)
+    finally:
+        storage.close(fd)
+    storage.fsync_directory(beside.parent)
+    return beside

@@ -1,0 +1,203 @@
+"""One or several logs as one stream of decoded messages, whoever wrote them.
+
+Own logs name their cameras in their topics. In the logs of others, images and calibrations are
+known by their schema, and a camera's name is made from the topic or the frame they share.
+"""
+
+from __future__ import annotations
+
+import heapq
+import re
+from collections.abc import Collection, Iterator, Sequence
+from contextlib import ExitStack
+from pathlib import Path
+from types import TracebackType
+from typing import Any
+
+from ipsys_log.errors import LogError
+from ipsys_log.log.codec import PAYLOADS, decode, schema_name
+from ipsys_log.log.reader import LogReader
+from ipsys_log.log.types import RawMessage
+from ipsys_log.messages import CameraCalibration, CompressedImage, Message, RawImage, Run
+
+__all__ = ["Session", "camera_of_topic", "run_of_topic"]
+
+_OWN = re.compile(r"(?:/runs/(?P<run>[a-z][a-z0-9_]*))?/cameras/(?P<camera>[a-z][a-z0-9_]*)/[a-z_]+")
+_RUN = re.compile(r"/runs/(?P<run>[a-z][a-z0-9_]*)/")
+# What a topic's last parts say of an image, and not of which camera took it.
+_GENERIC = re.compile(
+    r"(image|images|raw|rect|color|colour|mono|compressed|calibration|camera_info|info|jpeg)"
+    r"(_(raw|rect|color|colour|mono|compressed))*"
+)
+
+
+class Session:
+    """Open logs, read together in log order. A context manager.
+
+    Parameters
+    ----------
+    paths : the logs; where two hold messages of one time, the earlier one's come first.
+
+    Attributes
+    ----------
+    images, calibrations : topic by camera.
+    """
+
+    def __init__(self, paths: Sequence[Path]) -> None:
+        self.paths = list(paths)
+        self._stack = ExitStack()
+        try:
+            self.readers = [self._stack.enter_context(LogReader(path)) for path in paths]
+            self.images = self._cameras((CompressedImage, RawImage))
+            self.calibrations = self._pair_calibrations(self._cameras((CameraCalibration,)))
+        except BaseException:
+            self._stack.close()
+            raise
+        self._camera_of = {
+            topic: camera for topics in (self.images, self.calibrations) for camera, topic in topics.items()
+        }
+
+    def __enter__(self) -> Session:
+        return self
+
+    def __exit__(
+        self, kind: type[BaseException] | None, error: BaseException | None, trace: TracebackType | None
+    ) -> None:
+        self._stack.close()
+
+    def __str__(self) -> str:
+        return ", ".join(str(path) for path in self.paths)
+
+    @property
+    def start_ns(self) -> int:
+        return min((r.start_ns for r in self.readers if r.start_ns is not None), default=0)
+
+    @property
+    def end_ns(self) -> int:
+        return max((r.end_ns for r in self.readers if r.end_ns is not None), default=0)
+
+    def topics(self, payload: type, run: str | None = None) -> list[str]:
+        """Topics of a type of payload: of one run, or with None outside of all runs."""
+        name = schema_name(payload)
+        return sorted(
+            {
+                topic
+                for reader in self.readers
+                for topic, channel in reader.channels.items()
+                if channel.schema is not None
+                and channel.schema.name == name
+                and channel.message_count > 0
+                and run_of_topic(topic) == run
+            }
+        )
+
+    def last_ns(self, topics: Collection[str]) -> int:
+        """Log time of the last message of some topics, from the indexes."""
+        times = [r.times(t)[-1] for r in self.readers for t in topics if t in r.channels and self.count(t)]
+        return int(max(times, default=0))
+
+    def count(self, topic: str) -> int:
+        return sum(r.channels[topic].message_count for r in self.readers if topic in r.channels)
+
+    def hash(self, topic: str) -> str:
+        """Hash of a channel's messages, the same in whichever file they lie."""
+        return "+".join(r.channel_hash(topic) for r in self.readers if topic in r.channels)
+
+    def messages(
+        self, topics: Collection[str], start_ns: int | None = None, end_ns: int | None = None
+    ) -> Iterator[Message]:
+        """Decoded messages of some topics in log order, from ``start_ns`` to before ``end_ns``.
+
+        Raises
+        ------
+        LogError
+            For a message that is not what its channel's schema says, naming topic and file.
+        """
+        streams = [_tagged(reader, topics, start_ns, end_ns) for reader in self.readers]
+        for reader, raw in heapq.merge(*streams, key=lambda item: item[1].log_time_ns):
+            channel = reader.channels[raw.topic]
+            schema = channel.schema.name if channel.schema else ""
+            if channel.message_encoding != "protobuf":
+                raise LogError(
+                    f"{reader.path}: {raw.topic} is written as {channel.message_encoding}; only protobuf is read"
+                )
+            try:
+                payload = decode(schema, raw.data)
+            except LogError as error:
+                raise LogError(f"{reader.path}: {raw.topic} at {raw.log_time_ns} ns: {error}") from error
+            camera = self._camera_of.get(raw.topic) or camera_of_topic(raw.topic)
+            yield Message(raw.topic, raw.log_time_ns, raw.publish_time_ns, payload, camera)
+
+    def payloads(self, topics: Collection[str]) -> list[Any]:
+        return [message.payload for message in self.messages(topics)]
+
+    def runs(self) -> list[Run]:
+        """What the stages have written so far, oldest first."""
+        topics = {
+            topic
+            for reader in self.readers
+            for topic, channel in reader.channels.items()
+            if channel.schema is not None and PAYLOADS.get(channel.schema.name) is Run
+        }
+        return sorted(self.payloads(topics), key=lambda run: run.number)
+
+    def _cameras(self, payloads: tuple[type, ...]) -> dict[str, str]:
+        topics = sorted({topic for payload in payloads for topic in self.topics(payload)})
+        cameras: dict[str, str] = {}
+        for topic in topics:
+            camera = camera_of_topic(topic) or _foreign_camera(topic)
+            if camera in cameras:
+                raise LogError(
+                    f"{self}: two cameras of one name, {camera!r}: {cameras[camera]} and {topic}; "
+                    "rename a topic, or leave one of the logs out"
+                )
+            cameras[camera] = topic
+        return cameras
+
+    def _pair_calibrations(self, found: dict[str, str]) -> dict[str, str]:
+        """Give each calibration the name of its camera: by topic, else by a shared frame."""
+        paired = {camera: topic for camera, topic in found.items() if camera in self.images}
+        rest = {camera: topic for camera, topic in found.items() if camera not in paired}
+        waiting = {c: self._frame_id(t) for c, t in self.images.items() if c not in paired} if rest else {}
+        for camera, topic in rest.items():
+            frame_id = self._frame_id(topic)
+            matches = [image for image, image_frame in waiting.items() if image_frame == frame_id]
+            paired[matches[0] if len(matches) == 1 else camera] = topic
+        return paired
+
+    def _frame_id(self, topic: str) -> str:
+        for reader in self.readers:
+            if topic in reader.channels:
+                schema = reader.channels[topic].schema
+                raw = next(reader.messages([topic]), None)
+                if schema is not None and raw is not None:
+                    return str(decode(schema.name, raw.data).frame_id)
+        return ""
+
+
+def _tagged(
+    reader: LogReader, topics: Collection[str], start_ns: int | None, end_ns: int | None
+) -> Iterator[tuple[LogReader, RawMessage]]:
+    here = [topic for topic in topics if topic in reader.channels]
+    for raw in reader.messages(here, start_ns, end_ns) if here else ():
+        yield reader, raw
+
+
+def camera_of_topic(topic: str) -> str | None:
+    """The camera in a topic of our own, such as ``/runs/stock/cameras/red/markers``."""
+    match = _OWN.fullmatch(topic)
+    return match["camera"] if match else None
+
+
+def run_of_topic(topic: str) -> str | None:
+    """The run in a topic, or None for what was recorded."""
+    match = _RUN.match(topic)
+    return match["run"] if match else None
+
+
+def _foreign_camera(topic: str) -> str:
+    parts = [re.sub(r"[^a-z0-9]+", "_", part.lower()).strip("_") for part in topic.split("/") if part]
+    while len(parts) > 1 and _GENERIC.fullmatch(parts[-1]):
+        parts.pop()
+    name = "_".join(part for part in parts if part) or "camera"
+    return name if name[0].isalpha() else f"camera_{name}"

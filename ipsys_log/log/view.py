@@ -1,0 +1,76 @@
+"""Reading a file by position, with the tail that an unfinished append may have replaced."""
+
+import os
+from dataclasses import dataclass
+from pathlib import Path
+
+from ipsys_log.errors import LogError
+
+__all__ = ["View", "open_for_reading"]
+
+_MOST_PER_CALL = 1 << 30
+
+
+@dataclass(slots=True)
+class View:
+    """The bytes of a log as they were when it was opened.
+
+    From `tail_offset` on they come from `tail_fd` (a journal), where `tail_offset` lies at `tail_base`.
+    ``pread`` and not ``mmap``: a file that shrinks under a mapping kills the process.
+    """
+
+    path: Path
+    fd: int
+    size: int
+    tail_offset: int
+    tail_fd: int = -1
+    tail_base: int = 0
+    bytes_read: int = 0
+
+    def read(self, offset: int, length: int) -> bytes:
+        """Exactly `length` bytes at `offset`; the length is checked against the file before allocating."""
+        if offset < 0 or length < 0 or offset + length > self.size:
+            raise self.fault(offset, f"a record reaches {offset + length - self.size} bytes beyond the end")
+        self.bytes_read += length
+        head = max(0, min(length, self.tail_offset - offset))
+        parts = [self._pread(self.fd, offset, head)] if head else []
+        if head < length:
+            at = self.tail_base + offset + head - self.tail_offset
+            parts.append(self._pread(self.tail_fd, at, length - head))
+        return parts[0] if len(parts) == 1 else b"".join(parts)
+
+    def fault(self, offset: int, what: str) -> LogError:
+        """The error for damage found at `offset`."""
+        return LogError(f"{self.path} is damaged at byte {offset}: {what}. Run: ipsys repair {self.path}")
+
+    def close(self) -> None:
+        for fd in (self.fd, self.tail_fd):
+            if fd >= 0:
+                os.close(fd)
+        self.fd = self.tail_fd = -1
+
+    def _pread(self, fd: int, offset: int, length: int) -> bytes:
+        if fd < 0:
+            raise ValueError(f"{self.path}: read after close")
+        data = os.pread(fd, min(length, _MOST_PER_CALL), offset)
+        if len(data) == length:
+            return data
+        parts = [data]
+        got = len(data)
+        while data and got < length:
+            data = os.pread(fd, min(length - got, _MOST_PER_CALL), offset + got)
+            parts.append(data)
+            got += len(data)
+        if got < length:
+            raise self.fault(offset + got, "the file became shorter while it was read")
+        return b"".join(parts)
+
+
+def open_for_reading(path: Path) -> int:
+    """A file descriptor, or the operating system's refusal as one line."""
+    try:
+        return os.open(path, os.O_RDONLY | os.O_CLOEXEC)
+    except FileNotFoundError:
+        raise LogError(f"{path} does not exist") from None
+    except OSError as error:
+        raise LogError(f"{path} cannot be opened: {error.strerror}") from None

@@ -1,0 +1,276 @@
+"""Writing a new log and appending to a finished one: one object for both."""
+
+import os
+from collections.abc import Mapping
+from pathlib import Path
+from types import TracebackType
+from typing import Self
+
+from mcap import records as mcap
+from mcap.opcode import Opcode
+
+from ipsys_log.errors import LogError
+from ipsys_log.log.chunking import ChunkBuilder, Limits
+from ipsys_log.log.contents import Contents, load_contents
+from ipsys_log.log.hashing import METADATA_NAME, ChannelHash, metadata_of_hashes
+from ipsys_log.log.journal import journal_path, roll_back
+from ipsys_log.log.lock import open_locked
+from ipsys_log.log.output import Growing, Output, Pending
+from ipsys_log.log.reader import stored_hashes
+from ipsys_log.log.records import HEADER, MAGIC, MESSAGE, as_bytes
+from ipsys_log.log.storage import DISK, Storage
+from ipsys_log.log.summary import tail_bytes
+from ipsys_log.log.types import Schema
+from ipsys_log.log.view import View
+
+__all__ = ["IMAGE_SCHEMAS", "LogWriter"]
+
+LIBRARY = "ipsys 1"  # fixed, so that the same messages give the same bytes
+IMAGE_SCHEMAS = frozenset(
+    {
+        "foxglove.CompressedImage",
+        "foxglove.CompressedVideo",
+        "foxglove.RawImage",
+        "sensor_msgs/CompressedImage",
+        "sensor_msgs/Image",
+        "sensor_msgs/msg/CompressedImage",
+        "sensor_msgs/msg/Image",
+    }
+)
+_SECOND = 1_000_000_000
+_IMAGES = Limits(4 << 20, _SECOND)
+_SMALL_LIVE = Limits(1 << 20, _SECOND)
+_SMALL_APPENDED = Limits(1 << 20, 60 * _SECOND)
+_LARGEST_ID = 0xFFFF
+
+
+class LogWriter:
+    """Writes messages into a new log (`create`) or at the end of a finished one (`append`).
+
+    Image channels go into uncompressed chunks of about 4 MiB, all others into compressed chunks of
+    their own. The same calls give the same bytes. Use it as a context manager.
+    """
+
+    def __init__(self, path: Path, output: Output, contents: Contents, limits: Limits) -> None:
+        self.path = path
+        self._output = output
+        self._contents = contents
+        self._images = ChunkBuilder(_IMAGES, compress=False)
+        self._small = ChunkBuilder(limits, compress=True)
+        self._channels: dict[str, tuple[int, ChunkBuilder]] = {}
+        self._hashes: dict[str, ChannelHash] = {}
+        self._stored: dict[str, ChannelHash] = {}
+        self._appending = False
+        self._open = True
+
+    @classmethod
+    def create(cls, path: str | os.PathLike[str], *, atomic: bool = False, storage: Storage = DISK) -> Self:
+        """Begin a new log.
+
+        Parameters
+        ----------
+        path
+            A file that does not exist yet.
+        atomic
+            False: the file grows in place, so that what a killed recorder has written stays there, and
+            an exception in the with-block finishes the log with what it holds. True: the log is written
+            as ``<path>.partial`` and renamed when it is complete; an exception leaves no file.
+        storage
+            The operations on files; only tests give another one.
+
+        Raises
+        ------
+        LogError
+            `path` exists, its folder does not, or another process is writing it.
+        """
+        target = Path(path)
+        if journal_path(target).exists():
+            raise LogError(
+                f"{journal_path(target)} belongs to a log that is gone: move that log back, or delete it"
+            )
+        if atomic and target.exists():
+            raise LogError(f"{target} exists already and is never overwritten: choose another name")
+        file = target.with_name(target.name + ".partial") if atomic else target
+        fd = open_locked(storage, file, os.O_RDWR | os.O_CREAT | (0 if atomic else os.O_EXCL))
+        if atomic:
+            storage.truncate(fd, 0)
+        output = Growing(storage, file, fd, target if atomic else None)
+        storage.fsync_directory(file.parent)
+        output.emit(MAGIC + as_bytes(mcap.Header("", LIBRARY)))
+        return cls(target, output, Contents(), _SMALL_LIVE)
+
+    @classmethod
+    def append(cls, path: str | os.PathLike[str], *, storage: Storage = DISK) -> Self:
+        """Continue a finished log in place.
+
+        The exclusive lock is held until `close`. The file is not touched before that, and an exception
+        in the with-block leaves it as it was. A crash at any instant leaves the old log or the new one.
+
+        Raises
+        ------
+        LogError
+            The log is damaged or has no footer, or another process is writing it.
+        """
+        target = Path(path)
+        fd = open_locked(storage, target, os.O_RDWR)
+        try:
+            roll_back(storage, target, fd)
+            size = os.fstat(fd).st_size
+            view = View(target, fd, size, size)
+            contents = load_contents(view)
+            stored = stored_hashes(view, contents)
+        except BaseException:
+            storage.close(fd)
+            raise
+        crc = contents.data_crc or None
+        output = Pending(storage, target, fd, contents.data_end, contents.data_end, crc)
+        writer = cls(target, output, contents, _SMALL_APPENDED)
+        writer._stored, writer._appending = stored, True
+        return writer
+
+    def __enter__(self) -> Self:
+        return self
+
+    def __exit__(
+        self, kind: type[BaseException] | None, error: BaseException | None, trace: TracebackType | None
+    ) -> None:
+        if kind is None or self._keeps_what_it_has():
+            self.close()
+        else:
+            self.abandon()
+
+    def add_channel(
+        self,
+        topic: str,
+        schema: Schema | None,
+        message_encoding: str = "protobuf",
+        metadata: Mapping[str, str] | None = None,
+    ) -> None:
+        """Declare a channel; a second call with the same schema does nothing.
+
+        When appending, a channel of the same topic and schema that the log has is continued.
+
+        Raises
+        ------
+        LogError
+            The log has this topic with another schema or encoding.
+        """
+        self._check_open()
+        existing = [c for c in self._contents.channels.values() if c.topic == topic]
+        schema_id = self._schema_id(schema) if schema else 0
+        for channel in existing:
+            if (channel.schema_id, channel.message_encoding) == (schema_id, message_encoding):
+                break
+        else:
+            if existing:
+                raise LogError(
+                    f"{self.path} has {topic} with another schema: use another topic (--run) or file (-o)"
+                )
+            channel = mcap.Channel(
+                _next_id(self.path, self._contents.channels),
+                topic,
+                message_encoding,
+                dict(metadata or {}),
+                schema_id,
+            )
+            self._output.emit(as_bytes(channel))
+            self._contents.channels[channel.id] = channel
+        image = schema is not None and schema.name in IMAGE_SCHEMAS
+        self._channels[topic] = (channel.id, self._images if image else self._small)
+
+    def write(self, topic: str, log_time_ns: int, publish_time_ns: int, data: bytes) -> None:
+        """Add a message to a channel that was declared with `add_channel`; times in ns."""
+        self._check_open()
+        channel, builder = self._channels[topic]
+        for full in (self._images, self._small):
+            if full.is_full(log_time_ns):
+                self._write_chunk(full)
+        state = self._hashes.get(topic)
+        if state is None:
+            state = self._hashes[topic] = self._hash_so_far(topic)
+        state.add(log_time_ns, publish_time_ns, data)
+        sequence = state.count & 0xFFFFFFFF
+        if self._contents.loose:
+            self._write_loose(channel, sequence, log_time_ns, publish_time_ns, data)
+        else:
+            builder.add(channel, sequence, log_time_ns, publish_time_ns, data)
+
+    def flush(self) -> None:
+        """Write what is buffered as complete chunks; a recorder calls this at least every second."""
+        self._check_open()
+        for builder in (self._images, self._small):
+            self._write_chunk(builder)
+
+    def close(self) -> None:
+        """Finish the log: summary, footer, fsync. A second call does nothing."""
+        if not self._open:
+            return
+        self.flush()
+        self._open = False
+        contents, output = self._contents, self._output
+        hashes = metadata_of_hashes(self._hashes, output.offset)
+        if hashes:
+            contents.metadata.append(mcap.MetadataIndex(output.offset, len(hashes), METADATA_NAME))
+            contents.metadata_count += 1
+            output.emit(hashes)
+        contents.data_end, contents.data_crc = output.offset, output.crc or 0
+        output.finish(tail_bytes(contents))
+
+    def abandon(self) -> None:
+        """Give up: an append leaves the log as it was, an atomic new log leaves no file."""
+        if self._open:
+            self._open = False
+            self._output.abandon()
+
+    def _keeps_what_it_has(self) -> bool:
+        return isinstance(self._output, Growing) and self._output.target is None
+
+    def _check_open(self) -> None:
+        if not self._open:
+            raise ValueError(f"{self.path}: the log is closed")
+
+    def _schema_id(self, schema: Schema) -> int:
+        for key, known in self._contents.schemas.items():
+            if (known.name, known.encoding, known.data) == (schema.name, schema.encoding, schema.data):
+                return key
+        key = _next_id(self.path, self._contents.schemas)
+        record = mcap.Schema(key, schema.data, schema.encoding, schema.name)
+        self._output.emit(as_bytes(record))
+        self._contents.schemas[key] = record
+        return key
+
+    def _hash_so_far(self, topic: str) -> ChannelHash:
+        ids = [key for key, channel in self._contents.channels.items() if channel.topic == topic]
+        count = sum(self._contents.counts.get(key, 0) for key in ids)
+        stored = self._stored.get(topic, ChannelHash())
+        return stored if stored.count == count else ChannelHash(count, valid=False)
+
+    def _write_chunk(self, builder: ChunkBuilder) -> None:
+        built = builder.build(self._output.offset)
+        if built is None:
+            return
+        ref, data = built
+        self._output.emit(data)
+        self._contents.chunks.append(ref)
+        self._contents.cover(ref.start_ns, ref.end_ns)
+        for channel, number in builder.counts.items():
+            self._contents.count(channel, number)
+        builder.clear()
+
+    def _write_loose(self, channel: int, sequence: int, log_ns: int, publish_ns: int, data: bytes) -> None:
+        # The old messages lie in no chunk. Chunk indexes for the new ones alone would hide the old ones.
+        length = MESSAGE.size - HEADER.size + len(data)
+        head = MESSAGE.pack(Opcode.MESSAGE, length, channel, sequence, log_ns, publish_ns)
+        self._output.emit(head + data)
+        self._contents.count(channel, 1)
+        self._contents.cover(log_ns, log_ns)
+
+
+def _next_id(path: Path, known: Mapping[int, object]) -> int:
+    """The lowest id above all known ones, or a free one below."""
+    key = max(known, default=0) + 1
+    if key > _LARGEST_ID:
+        key = next((free for free in range(1, _LARGEST_ID + 1) if free not in known), 0)
+    if not key:
+        raise LogError(f"{path} has no free channel or schema id left: write to another file (-o)")
+    return key

@@ -1,0 +1,88 @@
+"""Models from camera to world coordinates: scikit-learn estimators and one table of their names.
+
+A fitted model travels as named arrays (:func:`parameters`, :func:`restore`), never as a pickle.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Mapping
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+from sklearn.pipeline import Pipeline
+
+from ipsys_log.errors import IpsysError
+from ipsys_log.models.poly import PolynomialRegression
+from ipsys_log.models.rigid import RigidTransform
+
+__all__ = ["MODELS", "create", "min_pairs", "parameters", "restore"]
+
+# The paper's names are RT, PR and RT+PR; the hybrid feeds the first one's output to the second.
+MODELS: dict[str, Callable[[], Any]] = {
+    "rigid": RigidTransform,
+    "poly": PolynomialRegression,
+    "rigid+poly": lambda: Pipeline([("rigid", RigidTransform()), ("poly", PolynomialRegression())]),
+}
+
+
+def create(name: str) -> Any:
+    """An unfitted estimator by its name in :data:`MODELS`.
+
+    Raises
+    ------
+    IpsysError
+        For a name that is not in the table.
+    """
+    if name not in MODELS:
+        raise IpsysError(f"model {name!r} is not known; use one of {', '.join(MODELS)}")
+    return MODELS[name]()
+
+
+def min_pairs(name: str) -> int:
+    """How many measured places a model needs at least."""
+    return max(int(step.min_pairs) for _, step in _steps(create(name)))
+
+
+def parameters(estimator: Any) -> dict[str, NDArray[np.float64]]:
+    """The fitted parameters of an estimator, by names such as ``rigid.rotation``.
+
+    Examples
+    --------
+    >>> points = np.array([[0.0, 0, 0], [1, 0, 0], [0, 1, 0]])
+    >>> model = create("rigid").fit(points, points + 1)
+    >>> sorted(parameters(model))
+    ['rotation', 'translation']
+    >>> restore("rigid", parameters(model)).predict(points[:1]).round(9).tolist()
+    [[1.0, 1.0, 1.0]]
+    """
+    return {
+        prefix + attribute.rstrip("_"): np.asarray(getattr(step, attribute), dtype=np.float64)
+        for prefix, step in _steps(estimator)
+        for attribute in step.fitted
+    }
+
+
+def restore(name: str, arrays: Mapping[str, NDArray[np.float64]]) -> Any:
+    """The estimator called ``name`` with the parameters that :func:`parameters` gave.
+
+    Raises
+    ------
+    IpsysError
+        For an unknown model, or one that lacks a parameter.
+    """
+    estimator = create(name)
+    for prefix, step in _steps(estimator):
+        step.n_features_in_ = 3
+        for attribute in step.fitted:
+            key = prefix + attribute.rstrip("_")
+            if key not in arrays:
+                raise IpsysError(f"the stored model {name} has no parameter {key!r}; fit it again")
+            setattr(step, attribute, np.array(arrays[key], dtype=np.float64))
+    return estimator
+
+
+def _steps(estimator: Any) -> list[tuple[str, Any]]:
+    if isinstance(estimator, Pipeline):
+        return [(f"{name}.", step) for name, step in estimator.steps]
+    return [("", estimator)]

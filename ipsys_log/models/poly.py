@@ -1,0 +1,70 @@
+"""Polynomial regression from the frame of a camera to the world (sect. 2.2.2 of the paper)."""
+
+from __future__ import annotations
+
+from typing import Any, ClassVar
+
+import numpy as np
+from numpy.typing import NDArray
+from sklearn.base import BaseEstimator, MultiOutputMixin, RegressorMixin
+from sklearn.utils.validation import check_is_fitted, validate_data
+
+__all__ = ["PolynomialRegression", "regressors"]
+
+Array = NDArray[np.float64]
+
+
+def regressors(points: Array) -> Array:
+    """Constant, linear and second-order terms of each row: ten for three columns.
+
+    Parameters
+    ----------
+    points : (n, d)
+
+    Returns
+    -------
+    (n, 1 + d + d (d + 1) / 2): 1, x, y, z, xx, xy, xz, yy, yz, zz for d = 3.
+
+    References
+    ----------
+    Ou et al., Robotica 2023, below eq. (13).
+
+    Examples
+    --------
+    >>> regressors(np.array([[2.0, 3.0, 5.0]]))[0].tolist()
+    [1.0, 2.0, 3.0, 5.0, 4.0, 6.0, 10.0, 9.0, 15.0, 25.0]
+    """
+    first, second = np.triu_indices(points.shape[1])
+    return np.hstack([np.ones((len(points), 1)), points, points[:, first] * points[:, second]])
+
+
+class PolynomialRegression(MultiOutputMixin, RegressorMixin, BaseEstimator):  # type: ignore[misc]
+    """Ordinary least squares on second-order terms (eq. 13, 14).
+
+    The inputs are centred and scaled first and the problem is solved by singular values, not by the
+    normal equations of eq. (14): the same function, but Zc^2, which hardly varies on a floor, no
+    longer costs digits.
+
+    Attributes
+    ----------
+    centre_, scale_ : (d,), of the inputs.
+    coefficients_ : (terms, outputs), for the centred and scaled inputs.
+    """
+
+    min_pairs: ClassVar[int] = 10
+    fitted: ClassVar[tuple[str, ...]] = ("centre_", "scale_", "coefficients_")
+
+    def fit(self, X: Any, y: Any) -> PolynomialRegression:
+        X, y = validate_data(self, X, y, multi_output=True, y_numeric=True, dtype=np.float64)
+        self.centre_ = X.mean(axis=0)
+        spread = np.abs(X - self.centre_).max(axis=0)
+        self.scale_ = np.where(spread > 0, spread, 1.0)
+        terms = regressors((X - self.centre_) / self.scale_)
+        self.coefficients_ = np.linalg.lstsq(terms, y, rcond=None)[0]
+        return self
+
+    def predict(self, X: Any) -> Array:
+        check_is_fitted(self)
+        X = validate_data(self, X, dtype=np.float64, reset=False)
+        prediction: Array = regressors((X - self.centre_) / self.scale_) @ self.coefficients_
+        return prediction

@@ -1,0 +1,219 @@
+"""Measured places: which measurements count, where they are, and what the cameras saw there."""
+
+from __future__ import annotations
+
+from collections.abc import Iterable, Mapping
+from dataclasses import dataclass
+
+import numpy as np
+from numpy.typing import NDArray
+
+from ipsys_log.errors import IpsysError
+from ipsys_log.geometry.trilateration import trilaterate
+from ipsys_log.messages import CameraPoints, Measurement, Message, Pair, Rig
+from ipsys_log.units import NS_PER_S
+
+__all__ = ["Sightings", "active_measurements", "build_pairs", "gather_sightings", "split", "still_interval"]
+
+# A marker lies still while it stays within these of where it was when it was measured: above the
+# noise of plain sub-pixel corners (about 1 mm across and 5 mm along the view at 2 m).
+_STILL_ACROSS_M = 0.01
+_STILL_ALONG_M = 0.04
+_GAP_NS = 2 * NS_PER_S
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class Sightings:
+    """What one camera saw of one marker: ``times_ns`` (n,) ascending, ``points_m`` (n, 3)."""
+
+    times_ns: NDArray[np.int64]
+    points_m: NDArray[np.float64]
+
+
+def gather_sightings(messages: Iterable[Message]) -> dict[tuple[str, int], Sightings]:
+    """Camera points by camera and marker, ordered by the time they speak of."""
+    rows: dict[tuple[str, int], list[tuple[int, float, float, float]]] = {}
+    for message in messages:
+        if isinstance(message.payload, CameraPoints):
+            for p in message.payload.points:
+                key = (str(message.camera), p.id)
+                rows.setdefault(key, []).append((message.publish_time_ns, p.x_m, p.y_m, p.z_m))
+    sightings = {}
+    for key, values in rows.items():
+        values.sort()
+        times_ns = np.array([row[0] for row in values], dtype=np.int64)
+        sightings[key] = Sightings(times_ns, np.array([row[1:] for row in values], dtype=np.float64))
+    return sightings
+
+
+def active_measurements(measurements: Iterable[Measurement]) -> list[Measurement]:
+    """The measurements that have not been withdrawn, in the order they were made.
+
+    Raises
+    ------
+    IpsysError
+        Where two measurements have one id, or one lacks its marker.
+    """
+    active: dict[str, Measurement] = {}
+    for measurement in measurements:
+        if measurement.withdraws is not None:
+            active.pop(measurement.withdraws, None)
+            continue
+        if measurement.id in active:
+            raise IpsysError(f"two measurements have the id {measurement.id!r}; withdraw one of them")
+        if measurement.marker_id is None:
+            raise IpsysError(f"measurement {measurement.id} names no marker; withdraw it and measure again")
+        active[measurement.id] = measurement
+    return list(active.values())
+
+
+def world_point(measurement: Measurement, rig: Rig) -> NDArray[np.float64]:
+    """World point of a measurement, (3,) in m: as given, or by eq. (25).
+
+    Raises
+    ------
+    IpsysError
+        Where the distances form no triangle or name unknown reference points.
+    """
+    where = f"measurement {measurement.id}"
+    if measurement.point is not None:
+        return np.array([measurement.point.x_m, measurement.point.y_m, measurement.point.z_m])
+    if len(measurement.distances) != 2 or measurement.side is None or measurement.height_m is None:
+        raise IpsysError(
+            f"{where} has neither a world point nor two distances, a side and a height; measure it again"
+        )
+    first, second = measurement.distances
+    known = {p.name: np.array([p.x_m, p.y_m]) for p in rig.reference_points}
+    for distance in (first, second):
+        if distance.reference not in known:
+            names = ", ".join(known) or "none"
+            raise IpsysError(
+                f"{where}: reference point {distance.reference!r} is not in the rig (known: {names}); "
+                "add it to lab.toml and give that with --rig"
+            )
+    try:
+        xy_m = trilaterate(
+            known[first.reference],
+            known[second.reference],
+            first.distance_m,
+            second.distance_m,
+            measurement.side,
+        )
+    except IpsysError as error:
+        raise IpsysError(f"{where}: {error}") from error
+    return np.array([*xy_m, measurement.height_m])
+
+
+def still_interval(sightings: Sightings, time_ns: int) -> tuple[int, int] | None:
+    """The stretch around a time in which a marker does not move.
+
+    Parameters
+    ----------
+    sightings : of one marker by one camera.
+    time_ns : when it was measured.
+
+    Returns
+    -------
+    First and last time in ns, both included; None where the camera did not see the marker within
+    two seconds of ``time_ns``.
+    """
+    if len(sightings.times_ns) == 0:
+        return None
+    anchor = int(np.abs(sightings.times_ns - time_ns).argmin())
+    if abs(int(sightings.times_ns[anchor]) - time_ns) > _GAP_NS:
+        return None
+    moved = np.abs(sightings.points_m - sightings.points_m[anchor])
+    still = (np.hypot(moved[:, 0], moved[:, 1]) <= _STILL_ACROSS_M) & (moved[:, 2] <= _STILL_ALONG_M)
+    joined = np.diff(sightings.times_ns) <= _GAP_NS
+    first = last = anchor
+    while first > 0 and still[first - 1] and joined[first - 1]:
+        first -= 1
+    while last + 1 < len(still) and still[last + 1] and joined[last]:
+        last += 1
+    return int(sightings.times_ns[first]), int(sightings.times_ns[last])
+
+
+def build_pairs(
+    sightings: Mapping[tuple[str, int], Sightings], measurements: Iterable[Measurement], rig: Rig
+) -> dict[str, list[Pair]]:
+    """For each camera, the measured places that it saw.
+
+    Parameters
+    ----------
+    sightings : by camera and marker, from :func:`gather_sightings`.
+    measurements : those that count, from :func:`active_measurements`.
+    rig : for the reference points and the markers in use.
+
+    Returns
+    -------
+    dict from camera to pairs: the mean camera point over the still interval, and the world point.
+
+    Raises
+    ------
+    IpsysError
+        For a marker that is not in the rig or never seen, or a measurement that gives no point.
+    """
+    cameras = sorted({camera for camera, _ in sightings})
+    seen_ids = sorted({marker_id for _, marker_id in sightings})
+    pairs: dict[str, list[Pair]] = {camera: [] for camera in cameras}
+    for measurement in measurements:
+        marker_id = measurement.marker_id
+        assert marker_id is not None  # active_measurements has seen to it
+        if not rig.knows(marker_id) or marker_id not in seen_ids:
+            raise IpsysError(
+                f"measurement {measurement.id} names marker {marker_id}, which "
+                f"{'no camera saw' if rig.knows(marker_id) else 'is not in the rig'} "
+                f"(seen: {', '.join(map(str, seen_ids)) or 'none'}); correct the id or the rig"
+            )
+        world_m = world_point(measurement, rig)
+        for camera in cameras:
+            found = _mean_point(sightings.get((camera, marker_id)), measurement)
+            if found is not None:
+                mean_m, frames = found
+                pairs[camera].append(Pair(measurement.id, marker_id, mean_m, world_m, frames))
+    return pairs
+
+
+def _mean_point(
+    sightings: Sightings | None, measurement: Measurement
+) -> tuple[NDArray[np.float64], int] | None:
+    if sightings is None:
+        return None
+    if measurement.still is not None:
+        interval: tuple[int, int] | None = (measurement.still.start, measurement.still.end)
+    else:
+        interval = still_interval(sightings, measurement.timestamp)
+    if interval is None:
+        return None
+    within = (sightings.times_ns >= interval[0]) & (sightings.times_ns <= interval[1])
+    if not within.any():
+        return None
+    return sightings.points_m[within].mean(axis=0), int(within.sum())
+
+
+def split(measurements: Iterable[Measurement], train: str, seed: int) -> tuple[set[str], set[str]]:
+    """Ids of the measurements to fit on, and of those held out.
+
+    Parameters
+    ----------
+    measurements : those that count.
+    train : the label of the subset to fit on; ``test`` is the label of those held out.
+    seed : where no measurement has a label, a fifth of them is held out at random.
+
+    Raises
+    ------
+    IpsysError
+        Where measurements are labelled, but none with ``train``.
+    """
+    measurements = list(measurements)
+    labels = sorted({label for m in measurements for label in m.splits})
+    if not labels:
+        ids = np.array(sorted(m.id for m in measurements))
+        shuffled = np.random.default_rng(seed).permutation(ids).tolist()
+        held_out = len(shuffled) // 5
+        return set(shuffled[held_out:]), set(shuffled[:held_out])
+    if train not in labels:
+        raise IpsysError(f"no measurement is labelled {train!r}; use --train with one of {', '.join(labels)}")
+    return {m.id for m in measurements if train in m.splits}, {
+        m.id for m in measurements if "test" in m.splits
+    }

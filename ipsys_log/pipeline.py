@@ -1,0 +1,190 @@
+"""The whole system on one page: how a frame becomes a position.
+
+A source is an iterable of messages, a stage a row that says what it reads and has a step from a
+message to payloads, and :func:`run` sends one through the others. :func:`replay` does this for a
+log, stage by stage: what the log does not hold yet, or no longer rightly, is computed and appended.
+
+==============  ==================  ================  =====================================
+stage           reads               writes            its run is named after
+==============  ==================  ================  =====================================
+detect          frames              markers           the corner method, ``stock``
+camera-frame    markers, lenses     camera points     the run of its markers
+fit             camera points,      model             the model, ``poly``
+                measurements
+evaluate        the same, model     evaluation        the run of its model
+locate          camera points,      positions         the run of its model
+                model
+fuse            positions           tracks, poses     the run of its positions
+==============  ==================  ================  =====================================
+
+The rig is read by all but evaluate and locate.
+"""
+
+from __future__ import annotations
+
+from collections import deque
+from collections.abc import Callable, Iterable, Iterator, Sequence
+from concurrent.futures import Future, ThreadPoolExecutor
+from contextlib import ExitStack
+from dataclasses import dataclass
+from itertools import chain
+from pathlib import Path
+from typing import Any
+
+import cv2
+
+from ipsys_log.derive import Progress, Request, Task, last_input_ns, opened_target, perform, settings
+from ipsys_log.log.session import Session
+from ipsys_log.messages import (
+    CameraPoints,
+    Evaluation,
+    Event,
+    FrameTransforms,
+    ImageAnnotations,
+    Markers,
+    Message,
+    Model,
+    Positions,
+    Tracks,
+)
+from ipsys_log.preflight import check_inputs
+from ipsys_log.runs import Outcome
+from ipsys_log.tasks import STAGES, plan_stage, wanted_models
+
+__all__ = ["TOPICS", "Stage", "in_threads", "replay", "run"]
+
+# Where a payload goes within its run.
+TOPICS: dict[type, str] = {
+    Markers: "/runs/{run}/cameras/{camera}/markers",
+    ImageAnnotations: "/runs/{run}/cameras/{camera}/annotations",
+    CameraPoints: "/runs/{run}/cameras/{camera}/camera_points",
+    Model: "/runs/{run}/model",
+    Evaluation: "/runs/{run}/evaluation",
+    Positions: "/runs/{run}/cameras/{camera}/positions",
+    Tracks: "/runs/{run}/tracks",
+    FrameTransforms: "/runs/{run}/poses",
+    Event: "/runs/{run}/events",
+}
+
+Map = Callable[[Callable[[Message], Any], Iterable[Message]], Iterable[Any]]
+
+
+@dataclass(frozen=True, slots=True)
+class Stage:
+    """A causal stage: which payloads it reads, the run it writes to, and its step."""
+
+    run: str
+    reads: tuple[type, ...]
+    step: Callable[[Message], Iterable[Any]]
+
+
+def run(source: Iterable[Message], stages: Sequence[Stage], map: Map = map) -> Iterator[Message]:
+    """Send every message of a source through the stages, and yield it and what they make of it.
+
+    What a stage makes has the log time of the message it was made from, and follows it at once; the
+    next stage sees both. With ``map`` as :func:`in_threads`, cameras use the cores in parallel and
+    the order stays the same.
+    """
+    for stage in stages:
+        source = _through(stage, source, map)
+    yield from source
+
+
+def _through(stage: Stage, source: Iterable[Message], map: Map) -> Iterator[Message]:
+    def work(message: Message) -> tuple[Message, list[Any]]:
+        return message, list(stage.step(message)) if isinstance(message.payload, stage.reads) else []
+
+    for message, payloads in map(work, source):
+        yield message
+        for payload in payloads:
+            topic = TOPICS[type(payload)].format(run=stage.run, camera=message.camera)
+            yield Message(topic, message.log_time_ns, message.publish_time_ns, payload, message.camera)
+
+
+def in_threads(function: Callable[[Message], Any], messages: Iterable[Message]) -> Iterator[Any]:
+    """``map`` with one thread per camera: a camera's messages stay in order, and so do the results.
+
+    A message of no camera (the rig) concerns all of them: it waits for those before it. OpenCV's own
+    threads are turned off meanwhile; one thread per camera uses the cores better.
+    """
+    threads = cv2.getNumThreads()
+    cv2.setNumThreads(1)
+    pending: deque[Future[Any]] = deque()
+    workers: dict[str, ThreadPoolExecutor] = {}
+    with ExitStack() as stack:
+        stack.callback(cv2.setNumThreads, threads)
+        for message in messages:
+            if message.camera is None:
+                while pending:
+                    yield pending.popleft().result()
+                yield function(message)
+                continue
+            if message.camera not in workers:
+                workers[message.camera] = stack.enter_context(ThreadPoolExecutor(1))
+            pending.append(workers[message.camera].submit(function, message))
+            # Enough ahead that no camera waits for another, and no more in memory than that.
+            while len(pending) > 4 * len(workers):
+                yield pending.popleft().result()
+        while pending:
+            yield pending.popleft().result()
+
+
+def replay(
+    paths: Sequence[Path],
+    request: Request,
+    until: str = "fuse",
+    output: Path | None = None,
+    progress: Progress = lambda stage, done, total: None,
+) -> list[Outcome]:
+    """Compute what a log lacks, up to a stage, and append it; or write it to a new log.
+
+    Parameters
+    ----------
+    paths : the logs, read as one; results go to the last of them, or to ``output``.
+    until : the last stage; evaluate is left out on the way to locate where there is nothing to
+        evaluate on.
+
+    Returns
+    -------
+    One outcome for each stage, in order, saying which run holds it and whether it is new.
+
+    Raises
+    ------
+    IpsysError
+        For anything in the input that the user has to mend.
+    """
+    models = wanted_models(request)
+    check_inputs(paths, request, models, until)
+    outcomes: list[Outcome] = []
+    with opened_target(paths, output) as (logs, target):
+
+        def do(stage: str, **inputs: str) -> str:
+            """Do a stage, or find it done; the name of the run that holds it."""
+            if STAGES.index(stage) > STAGES.index(until):
+                return ""
+            with Session(logs) as session:
+                task = plan_stage(stage, session, request, **inputs)
+                if isinstance(task, str):
+                    return task
+                outcomes.append(perform(session, target, task, request, until, _make, progress))
+            return outcomes[-1].run
+
+        points = do("camera-frame", markers=do("detect"))
+        for name in models:
+            model = do("fit", points=points, model=name)
+            if until != "locate":
+                do("evaluate", points=points, model=model)
+            do("fuse", positions=do("locate", points=points, model=model))
+    return outcomes
+
+
+def _make(task: Task, session: Session, name: str) -> Iterator[Message]:
+    """The messages of a task's run: its causal stage over the log, or one computed from all of it."""
+    if task.compute is not None:
+        payload, time_ns = task.compute(session), last_input_ns(session, task)
+        yield Message(TOPICS[type(payload)].format(run=name), time_ns, payload.timestamp, payload)
+        return
+    source = chain(settings(session, task.topics, task.rig, task.lenses), session.messages(task.topics))
+    for message in run(source, [Stage(name, task.reads, task.step(name))], in_threads):
+        if message.topic.startswith("/runs/") and message.topic not in task.topics:
+            yield message

@@ -1,0 +1,130 @@
+"""The rig file ``lab.toml``: read, checked, and written as a commented example."""
+
+from __future__ import annotations
+
+import math
+import re
+import tomllib
+from collections.abc import Iterable, Mapping
+from dataclasses import MISSING, fields
+from importlib.resources import files
+from pathlib import Path
+from typing import Any, TypeVar
+
+from ipsys_log.errors import IpsysError
+from ipsys_log.messages import Floor, ReferencePoint, Rig, RigCamera, RigMarker
+
+__all__ = ["check_name", "check_rig", "example_toml", "load_rig"]
+
+Item = TypeVar("Item")
+
+_NAME = re.compile(r"[a-z][a-z0-9_]*")
+_ITEMS = {"markers": RigMarker, "cameras": RigCamera, "reference_points": ReferencePoint}
+
+
+def check_name(name: str, what: str) -> str:
+    """Return ``name`` if it can be the name of a camera, run or robot.
+
+    Raises
+    ------
+    IpsysError
+        Otherwise; such names become parts of topics.
+    """
+    if not _NAME.fullmatch(name):
+        raise IpsysError(f"{what} {name!r} must be small letters, digits and _, starting with a letter")
+    return name
+
+
+def example_toml() -> str:
+    """The commented ``lab.toml`` that ``ipsys init`` writes: the lab of the paper."""
+    return files("ipsys_log").joinpath("lab.toml").read_text(encoding="utf-8")
+
+
+def load_rig(path: Path) -> Rig:
+    """Read and check a rig file.
+
+    Raises
+    ------
+    IpsysError
+        Where it cannot be read, is not TOML, has unknown or missing keys, or contradicts itself.
+    """
+    try:
+        table = tomllib.loads(path.read_text(encoding="utf-8"))
+    except OSError as error:
+        raise IpsysError(f"{path}: cannot be read: {error.strerror}") from error
+    except UnicodeDecodeError as error:
+        raise IpsysError(f"{path}: is not a text file; write one with: ipsys init {path}") from error
+    except tomllib.TOMLDecodeError as error:
+        raise IpsysError(f"{path}: is not valid TOML: {error}") from error
+    for key, item in _ITEMS.items():
+        rows = table.get(key, [])
+        if not isinstance(rows, list):
+            raise IpsysError(f"{path}: {key} must be a list of tables, written [[{key}]]")
+        table[key] = tuple(
+            _build(item, row, f"{path}: [[{key}]] number {n}") for n, row in enumerate(rows, 1)
+        )
+    if "floor" in table:
+        table["floor"] = _build(Floor, table["floor"], f"{path}: [floor]")
+    return check_rig(_build(Rig, table, str(path)), str(path))
+
+
+def check_rig(rig: Rig, where: str) -> Rig:
+    """Return ``rig`` if it does not contradict itself.
+
+    Raises
+    ------
+    IpsysError
+        For two cameras, markers or reference points of one name, a bad name, or a length that is
+        not positive.
+    """
+    for camera in rig.cameras:
+        check_name(camera.name, f"{where}: camera name")
+    for marker in rig.markers:
+        if marker.robot is not None:
+            check_name(marker.robot, f"{where}: robot name")
+    _check_unique((camera.name for camera in rig.cameras), f"{where}: two cameras have the name")
+    _check_unique((marker.id for marker in rig.markers), f"{where}: two markers have the id")
+    _check_unique((marker.robot for marker in rig.markers if marker.robot), f"{where}: two markers on robot")
+    _check_unique((p.name for p in rig.reference_points), f"{where}: two reference points have the name")
+    lengths = [rig.marker_length_m, *(m.length_m for m in rig.markers if m.length_m is not None)]
+    if rig.floor is not None:
+        lengths += [rig.floor.width_m, rig.floor.depth_m]
+    for length in lengths:
+        if not (math.isfinite(length) and length > 0):
+            raise IpsysError(f"{where}: {length} m is not a length; marker and floor sizes must be above 0")
+    return rig
+
+
+def _check_unique(names: Iterable[object], what: str) -> None:
+    seen: set[object] = set()
+    for name in names:
+        if name in seen:
+            raise IpsysError(f"{what} {name!r}; give each its own")
+        seen.add(name)
+
+
+def _build(item: type[Item], row: Any, where: str) -> Item:
+    """``item`` from a TOML table whose keys are its fields."""
+    if not isinstance(row, Mapping):
+        raise IpsysError(f"{where}: must be a table")
+    known = {f.name: f for f in fields(item)}  # type: ignore[arg-type]
+    unknown = sorted(set(row) - set(known))
+    if unknown:
+        raise IpsysError(f"{where}: unknown key {unknown[0]!r}; known are {', '.join(known)}")
+    missing = [n for n, f in known.items() if f.default is MISSING and n not in row]
+    if missing:
+        raise IpsysError(f"{where}: {missing[0]} is missing")
+    return item(**{name: _value(str(known[name].type), row[name], f"{where}: {name}") for name in row})
+
+
+def _value(kind: str, value: Any, where: str) -> Any:
+    if kind.startswith("float"):
+        if isinstance(value, bool) or not isinstance(value, (int, float)):
+            raise IpsysError(f"{where} must be a number, found {value!r}")
+        return float(value)
+    if kind.startswith("int"):
+        if isinstance(value, bool) or not isinstance(value, int) or value < 0:
+            raise IpsysError(f"{where} must be a whole number of at least 0, found {value!r}")
+    elif kind.startswith("str") and not isinstance(value, str):
+        raise IpsysError(f"{where} must be text in quotes, found {value!r}")
+    return value

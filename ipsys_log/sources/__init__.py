@@ -1,0 +1,1 @@
+"""Where messages come from: files, and a simulated lab."""

@@ -1,0 +1,122 @@
+"""One pose per robot from the positions of all cameras that see it."""
+
+from __future__ import annotations
+
+from collections.abc import Iterator
+from typing import Any
+
+import numpy as np
+
+from ipsys_log.errors import IpsysError
+from ipsys_log.messages import (
+    FrameTransform,
+    FrameTransforms,
+    Message,
+    Position,
+    Positions,
+    Quaternion,
+    Rig,
+    Track,
+    Tracks,
+    Vector3,
+)
+
+__all__ = ["READS", "Fuse", "fuse_positions"]
+
+READS = (Rig, Positions)
+
+
+class Fuse:
+    """The stage *fuse*: positions of one instant, weighted by their inverse covariances.
+
+    Every message of positions gives a pose of each robot in it, from this camera and from the others
+    that saw the robot within ``window_ns``: at 2 m/s a robot moves 1 cm in 5 ms, so cameras that do
+    not run in step are not averaged. Cameras that do give a pose each, the last of them from all.
+    """
+
+    def __init__(self, run: str, window_ns: int = 5_000_000) -> None:
+        self._run = run
+        self._window_ns = window_ns
+        self._rig: Rig | None = None
+        self._latest: dict[int, dict[str, tuple[int, Position]]] = {}
+
+    def __call__(self, message: Message) -> Iterator[Any]:
+        if isinstance(message.payload, Rig):
+            self._rig = message.payload
+            return
+        if self._rig is None:
+            raise IpsysError("the log has no rig (robots and their markers): give one with --rig lab.toml")
+        now_ns = message.publish_time_ns
+        tracks = tuple(
+            self._track(position, str(message.camera), now_ns, self._rig)
+            for position in message.payload.positions
+        )
+        if tracks:
+            yield Tracks(now_ns, tracks)
+            yield FrameTransforms(tuple(_transform(track, self._run, now_ns) for track in tracks))
+
+    def _track(self, position: Position, camera: str, now_ns: int, rig: Rig) -> Track:
+        seen = self._latest.setdefault(position.id, {})
+        seen[camera] = (now_ns, position)
+        together = {
+            name: at
+            for name, (time_ns, at) in sorted(seen.items())
+            if abs(now_ns - time_ns) <= self._window_ns
+        }
+        fused = fuse_positions(list(together.values()))
+        return Track(
+            rig.robot_of(position.id),
+            position.id,
+            fused.x_m,
+            fused.y_m,
+            fused.z_m,
+            fused.heading_rad,
+            fused.covariance_m2,
+            tuple(together),
+        )
+
+
+def fuse_positions(positions: list[Position]) -> Position:
+    """The best single position of one marker at one instant.
+
+    Parameters
+    ----------
+    positions : at least one, of one marker id, in m.
+
+    Returns
+    -------
+    Position : weighted by inverse covariances where every position has one, else the plain mean
+        (without a covariance). The heading is the circular mean of those there are.
+
+    Examples
+    --------
+    >>> near, far = Position(1, 0.0, 0, 0, None, np.eye(3)), Position(1, 3.0, 0, 0, None, 2 * np.eye(3))
+    >>> round(fuse_positions([near, far]).x_m, 9)
+    1.0
+    """
+    if len(positions) == 1:
+        return positions[0]
+    points = np.array([(p.x_m, p.y_m, p.z_m) for p in positions])
+    covariances = [p.covariance_m2 for p in positions if p.covariance_m2 is not None]
+    covariance_m2 = None
+    if len(covariances) == len(positions):
+        weights = np.linalg.inv(np.array(covariances))
+        covariance_m2 = np.linalg.inv(weights.sum(axis=0))
+        mean = covariance_m2 @ np.einsum("nij,nj->i", weights, points)
+    else:
+        mean = points.mean(axis=0)
+    headings = [p.heading_rad for p in positions if p.heading_rad is not None]
+    heading_rad = float(np.angle(np.exp(1j * np.array(headings)).sum())) if headings else None
+    x_m, y_m, z_m = mean.tolist()
+    return Position(positions[0].id, x_m, y_m, z_m, heading_rad, covariance_m2)
+
+
+def _transform(track: Track, run: str, time_ns: int) -> FrameTransform:
+    half_rad = (track.heading_rad or 0.0) / 2
+    return FrameTransform(
+        time_ns,
+        "world",
+        f"{run}/{track.robot}",
+        Vector3(track.x_m, track.y_m, track.z_m),
+        Quaternion(0.0, 0.0, float(np.sin(half_rad)), float(np.cos(half_rad))),
+    )

@@ -1,0 +1,39 @@
+"""Units of what people read. Everything inside is metres, radians and nanoseconds."""
+
+from __future__ import annotations
+
+from datetime import UTC, datetime
+
+__all__ = ["CM_PER_M", "NS_PER_S", "format_bytes", "format_time"]
+
+CM_PER_M = 100.0
+NS_PER_S = 1_000_000_000
+
+
+def format_time(time_ns: int) -> str:
+    """A time since 1970 as UTC to the millisecond.
+
+    Examples
+    --------
+    >>> format_time(1_500_000_000_123_000_000)
+    '2017-07-14 02:40:00.123'
+    """
+    seconds, rest_ns = divmod(time_ns, NS_PER_S)
+    moment = datetime.fromtimestamp(seconds, tz=UTC)
+    return f"{moment:%Y-%m-%d %H:%M:%S}.{rest_ns // 1_000_000:03d}"
+
+
+def format_bytes(count: int) -> str:
+    """A size in powers of ten.
+
+    Examples
+    --------
+    >>> format_bytes(1_234_567)
+    '1.2 MB'
+    """
+    size = float(count)
+    for unit in ("B", "kB", "MB", "GB"):
+        if size < 1000:
+            return f"{size:.0f} {unit}" if unit == "B" else f"{size:.1f} {unit}"
+        size /= 1000
+    return f"{size:.1f} TB"

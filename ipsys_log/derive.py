@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-from collections import Counter
 from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
 from contextlib import contextmanager
 from dataclasses import dataclass, field, replace
@@ -10,15 +9,17 @@ from pathlib import Path
 from typing import Any
 
 from ipsys_log.errors import IpsysError
-from ipsys_log.log import LogWriter
-from ipsys_log.log.session import Session, run_of_topic
+from ipsys_log.log import LogReader, LogWriter
+from ipsys_log.log.session import Session, camera_of_topic, run_of_topic
 from ipsys_log.messages import (
     RIG_TOPIC,
     CameraCalibration,
     ChannelRead,
     Event,
     Lens,
+    Markers,
     Message,
+    Model,
     Rig,
     Run,
     calibration_topic,
@@ -32,6 +33,7 @@ from ipsys_log.runs import (
     free_name,
     read_channels,
 )
+from ipsys_log.units import format_time
 
 __all__ = [
     "SHARED_STAGES",
@@ -130,10 +132,10 @@ def perform(
         number=max((run.number for run in runs), default=0) + 1,
     )
     total = sum(session.count(topic) for topic in task.topics)
-    watch = _Watch(task.stage, total, request.skip_ambiguous, progress)
+    watch = _Watch(task, total, request.skip_ambiguous, progress)
     made = append_run(target, record, time_ns, lambda: watch.derived(make(task, session, run)))
     count = sum(output.messages for output in made.outputs)
-    return Outcome(task.stage, run, True, count, tuple(sorted(watch.events.items())), watch.first_event)
+    return Outcome(task.stage, run, True, count, watch.remarks())
 
 
 def _record(session: Session, task: Task) -> Run:
@@ -153,40 +155,68 @@ def _record(session: Session, task: Task) -> Run:
 
 
 class _Watch:
-    """Count what a stage makes, and stop at what the user has to decide."""
+    """Look at what a stage makes: what the user should know, and what the user has to decide."""
 
-    def __init__(self, stage: str, total: int, skip_ambiguous: bool, progress: Progress) -> None:
-        self.events: Counter[str] = Counter()
-        self.first_event = ""
-        self._stage, self._total = stage, total
+    def __init__(self, task: Task, total: int, skip_ambiguous: bool, progress: Progress) -> None:
+        self._task, self._total = task, total
         self._skip_ambiguous = skip_ambiguous
         self._progress = progress
+        self._events: dict[str, list[Message]] = {}
+        self._markers = 0
+        self._unmodelled: set[str] = set()
 
     def derived(self, messages: Iterable[Message]) -> Iterator[Message]:
-        self._progress(self._stage, 0, self._total)
+        self._progress(self._task.stage, 0, self._total)
         for done, message in enumerate(messages, 1):
-            if isinstance(message.payload, Event):
-                self._note(message)
-            self._progress(self._stage, min(done, self._total), self._total)
+            self._note(message)
+            self._progress(self._task.stage, min(done, self._total), self._total)
             yield message
-        self._progress(self._stage, self._total, self._total)
+        self._progress(self._task.stage, self._total, self._total)
+        unknown = {str(message.payload.marker_id) for message in self._events.get("unknown_marker", ())}
+        if unknown and not self._markers:
+            raise IpsysError(
+                f"no marker of the rig is in any frame, but ids {', '.join(sorted(unknown))} are: add them as "
+                "[[markers]] to lab.toml and give it with --rig"
+            )
 
     def _note(self, message: Message) -> None:
-        event = message.payload
-        if event.kind == "ambiguous_marker" and not self._skip_ambiguous:
-            raise IpsysError(
-                f"{event.text}, at {message.log_time_ns} ns: give each marker an id of its own, or leave it "
-                "out of such frames with --skip-ambiguous"
-            )
-        self.events[event.kind] += 1
-        self.first_event = self.first_event or f"{event.text}, at {message.log_time_ns} ns"
+        payload = message.payload
+        if isinstance(payload, Event):
+            self._events.setdefault(payload.kind, []).append(message)
+            if payload.kind == "ambiguous_marker" and not self._skip_ambiguous:
+                raise IpsysError(
+                    f"{_said(message)}: give each marker an id of its own, or leave it out of such frames "
+                    "with --skip-ambiguous"
+                )
+        elif isinstance(payload, Markers):
+            self._markers += len(payload.markers)
+        elif isinstance(payload, Model):
+            cameras = {camera_of_topic(topic) for topic in self._task.topics} - {None}
+            self._unmodelled = {str(name) for name in cameras} - {model.camera for model in payload.cameras}
+
+    def remarks(self) -> tuple[str, ...]:
+        lines = [
+            f"{len(found)} x {kind.replace('_', ' ')}, first: {_said(found[0])}"
+            for kind, found in sorted(self._events.items())
+        ]
+        if self._task.stage == "detect" and not self._markers:
+            lines.append("no marker was found: were they printed from the dictionary in the rig?")
+        lines += [
+            f"camera {name} saw no measured place: it has no model" for name in sorted(self._unmodelled)
+        ]
+        return tuple(lines)
+
+
+def _said(message: Message) -> str:
+    return f"{message.payload.text}, at {format_time(message.log_time_ns)} ({message.log_time_ns} ns)"
 
 
 @contextmanager
 def opened_target(paths: Sequence[Path], output: Path | None) -> Iterator[tuple[list[Path], Path]]:
     """The logs to read and the one to append to: the last one given, or a new one.
 
-    A new one has its name only when all is done; after an error nothing of it is left.
+    A new one has its name only when all is done; where nothing was to do, or after an error, there is
+    none.
     """
     if output is None:
         yield list(paths), paths[-1]
@@ -201,7 +231,10 @@ def opened_target(paths: Sequence[Path], output: Path | None) -> Iterator[tuple[
         with LogWriter.create(partial):
             pass
         yield [*paths, partial], partial
-        partial.rename(output)
+        with LogReader(partial) as log:
+            anything = log.message_count > 0
+        if anything:
+            partial.rename(output)
     finally:
         partial.unlink(missing_ok=True)
 

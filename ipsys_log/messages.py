@@ -164,8 +164,12 @@ class Marker:
 
 @dataclass(frozen=True, slots=True, eq=False)
 class Markers:
+    """All markers in a frame of ``width`` x ``height`` px, sorted by id."""
+
     timestamp: TimeNs
     markers: tuple[Marker, ...]
+    width: int
+    height: int
 
 
 @dataclass(frozen=True, slots=True)

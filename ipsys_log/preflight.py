@@ -12,7 +12,7 @@ from ipsys_log.messages import MEASUREMENTS_TOPIC, RIG_TOPIC, CameraPoints, Mark
 from ipsys_log.models import min_pairs
 from ipsys_log.offline.pairs import active_measurements, split, world_point
 from ipsys_log.runs import newest_run
-from ipsys_log.tasks import STAGES
+from ipsys_log.tasks import STAGES, held_out_ids
 
 __all__ = ["check_inputs"]
 
@@ -36,6 +36,8 @@ def check_inputs(paths: Sequence[Path], request: Request, models: Sequence[str],
         _check_lenses(session, request, cameras, wanted)
         if "fit" in wanted and request.model_from is None:
             _check_measurements(session, request, models)
+        if until == "evaluate":
+            _check_held_out(session, request)
 
 
 def _check_frames(session: Session, wanted: Sequence[str]) -> set[str]:
@@ -90,3 +92,12 @@ def _check_measurements(session: Session, request: Request, models: Sequence[str
                 f"found {len(train)} in all; measure more"
                 + ("" if model == "rigid" else ", or use --model rigid")
             )
+
+
+def _check_held_out(session: Session, request: Request) -> None:
+    measurements = active_measurements(session.payloads([MEASUREMENTS_TOPIC]))
+    if not held_out_ids(measurements, request):
+        raise IpsysError(
+            f"{session}: no measured place is held out to evaluate on (of {len(measurements)}); label some "
+            "'test', or measure at least five without labels, of which a fifth is then held out"
+        )

@@ -32,14 +32,13 @@ __all__ = [
 
 @dataclass(frozen=True, slots=True)
 class Outcome:
-    """What became of one stage: the run that holds it, and whether it was made just now."""
+    """What became of one stage: the run that holds it, whether it was made just now, what to know of it."""
 
     stage: str
     run: str
     fresh: bool
     messages: int = 0
-    events: tuple[tuple[str, int], ...] = ()
-    first_event: str = ""
+    remarks: tuple[str, ...] = ()
 
 
 @cache

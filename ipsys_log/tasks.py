@@ -7,11 +7,13 @@ from typing import Any
 
 from ipsys_log.derive import Request, Task
 from ipsys_log.errors import IpsysError
+from ipsys_log.geometry.lenses import same_lens
 from ipsys_log.log.session import Session
 from ipsys_log.messages import (
     MEASUREMENTS_TOPIC,
     RIG_TOPIC,
     TRUTH_TOPIC,
+    CameraCalibration,
     CameraPoints,
     Evaluation,
     Markers,
@@ -28,7 +30,7 @@ from ipsys_log.offline.pairs import active_measurements, build_pairs, gather_sig
 from ipsys_log.runs import newest_run, read_channels
 from ipsys_log.stages import camera_frame, detect, fuse, locate
 
-__all__ = ["STAGES", "plan_stage", "wanted_models"]
+__all__ = ["STAGES", "held_out_ids", "plan_stage", "wanted_models"]
 
 # What a stage reads of the rig; an overriding rig that says the same there changes nothing.
 _RIG_PARTS: dict[str, Callable[[Rig], Any]] = {
@@ -97,7 +99,8 @@ def _camera_frame(session: Session, request: Request, markers: str) -> Task | st
         return newest_run(session, CameraPoints) or ""
     rig, topics = _rig(session, request, "camera-frame")
     topics += session.topics(Markers, markers)
-    topics += [t for camera, t in session.calibrations.items() if camera not in request.lenses]
+    lenses = _other_lenses(session, request)
+    topics += [topic for camera, topic in session.calibrations.items() if camera not in lenses]
     return Task(
         "camera-frame",
         markers,
@@ -105,8 +108,17 @@ def _camera_frame(session: Session, request: Request, markers: str) -> Task | st
         camera_frame.READS,
         lambda run: camera_frame.CameraFrame(),
         rig=rig,
-        lenses=request.lenses,
+        lenses=lenses,
     )
+
+
+def _other_lenses(session: Session, request: Request) -> dict[str, CameraCalibration]:
+    """The overriding lenses that say something else than the log."""
+    lenses = dict(request.lenses)
+    for camera, topic in session.calibrations.items():
+        if camera in lenses and all(same_lens(held, lenses[camera]) for held in session.payloads([topic])):
+            del lenses[camera]
+    return lenses
 
 
 def _fit(session: Session, request: Request, points: str, model: str) -> Task | str:
@@ -135,7 +147,7 @@ def _copy_model(request: Request, name: str, base: str) -> Task:
 
 
 def _evaluate(session: Session, request: Request, points: str, model: str) -> Task | str:
-    if not session.count(MEASUREMENTS_TOPIC):
+    if not held_out_ids(active_measurements(session.payloads([MEASUREMENTS_TOPIC])), request):
         return ""
     rig, topics = _rig(session, request, "evaluate")
     topics += [*session.topics(CameraPoints, points), *session.topics(Model, model), MEASUREMENTS_TOPIC]
@@ -144,7 +156,7 @@ def _evaluate(session: Session, request: Request, points: str, model: str) -> Ta
     def compute(log: Session) -> Evaluation:
         fitted: Model = log.payloads(log.topics(Model, model))[-1]
         measurements = active_measurements(log.payloads([MEASUREMENTS_TOPIC]))
-        held_out = _held_out(measurements, request)
+        held_out = held_out_ids(measurements, request)
         truth = true_points(measurements, gather_tracks(log.messages([TRUTH_TOPIC])))
         pairs = _pairs(log, rig, points, measurements, held_out)
         return evaluate_model(fitted, pairs, truth, log.last_ns(topics))
@@ -178,10 +190,11 @@ STAGE_PLANS: dict[str, Callable[..., Task | str]] = {
 STAGES = tuple(STAGE_PLANS)
 
 
-def _held_out(measurements: list[Measurement], request: Request) -> set[str]:
+def held_out_ids(measurements: list[Measurement], request: Request) -> set[str]:
+    """The measurements that the models are evaluated on."""
     if request.model_from is None:
         return split(measurements, request.train, request.seed)[1]
-    # A model from another log has seen none of these places.
+    # A model of another log has seen none of these places.
     labelled = any(m.splits for m in measurements)
     return {m.id for m in measurements if "test" in m.splits or not labelled}
 

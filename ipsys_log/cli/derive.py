@@ -145,14 +145,15 @@ def _derive(
 
     with progress_bar() as progress:
         outcomes = replay(logs, request, until, output, progress)
-    target = output or logs[-1]
-    with Session([*logs, output] if output else logs) as session:
+    # A new log is only there if there was something to write.
+    written = [output] if output is not None and output.exists() else []
+    with Session([*logs, *written]) as session:
         accuracies = read_accuracy(session, outcomes)
         if plot is not None:
             from ipsys_log.report.floor import draw_session
 
             draw_session(session, accuracies, plot)
-    _remark(outcomes, target)
+    _remark(outcomes, [*logs, *written][-1])
     if as_json:
         stages = [{"stage": o.stage, "run": o.run, "new": o.fresh, "messages": o.messages} for o in outcomes]
         print(json.dumps({**accuracy_json(accuracies), "stages": stages}, indent=2))  # noqa: T201
@@ -167,11 +168,9 @@ def _remark(outcomes: list[Outcome], target: Path) -> None:
     for outcome in outcomes:
         state = f"{outcome.messages} messages" if outcome.fresh else "up to date"
         remarks.print(f"{outcome.stage:<13} run {outcome.run:<16} {state}")
-        for kind, count in outcome.events:
-            remarks.print(
-                f"  {count} x {kind.replace('_', ' ')}, first: {outcome.first_event}", style="yellow"
-            )
+        for remark in outcome.remarks:
+            remarks.print(f"  {remark}", style="yellow")
     if any(outcome.fresh for outcome in outcomes):
-        remarks.print(f"appended to {target}")
+        remarks.print(f"results are in {target}")
     else:
-        remarks.print(f"{target}: nothing to do, all of it is up to date")
+        remarks.print("nothing to do: all of it is up to date")

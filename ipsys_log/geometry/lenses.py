@@ -9,7 +9,7 @@ from numpy.typing import NDArray
 from ipsys_log.errors import IpsysError
 from ipsys_log.messages import CameraCalibration
 
-__all__ = ["DISTORTION_MODELS", "check_calibration", "project", "undistort"]
+__all__ = ["DISTORTION_MODELS", "check_calibration", "project", "same_lens", "undistort"]
 
 # Foxglove's and ROS's names; the number of coefficients that each takes.
 DISTORTION_MODELS = {"kannala_brandt": 4, "plumb_bob": 5, "rational_polynomial": 8}
@@ -44,6 +44,12 @@ def check_calibration(lens: CameraCalibration, where: str) -> CameraCalibration:
     if not (np.isfinite(lens.K).all() and np.isfinite(lens.D).all() and lens.K[0, 0] > 0 < lens.K[1, 1]):
         raise IpsysError(f"{where}: the camera matrix K has no positive focal lengths; calibrate again")
     return lens
+
+
+def same_lens(one: CameraCalibration, other: CameraCalibration) -> bool:
+    """Whether two calibrations map pixels to rays alike, whatever their times and frames."""
+    sizes = [(lens.width, lens.height, lens.distortion_model) for lens in (one, other)]
+    return sizes[0] == sizes[1] and np.array_equal(one.K, other.K) and np.array_equal(one.D, other.D)
 
 
 def undistort(points_px: NDArray[np.float64], lens: CameraCalibration) -> NDArray[np.float64]:

@@ -103,6 +103,11 @@ class LogReader:
         """Bytes read from the file so far, its table of contents included."""
         return self._view.bytes_read
 
+    @property
+    def data_end(self) -> int:
+        """Where the data section ends: an append changes nothing before this byte."""
+        return self._contents.data_end
+
     def messages(
         self,
         topics: Collection[str] | None = None,

@@ -177,8 +177,11 @@ def walk(view: View, start: int, end: int) -> Iterator[RecordAt]:
         if start - base + HEADER.size > len(block):
             raise view.fault(start, "a record is cut off")
         opcode, length = HEADER.unpack_from(block, start - base)
-        if opcode == 0 or length > end - start - HEADER.size:
-            raise view.fault(start, f"a record of type {opcode} claims {length} bytes")
+        if opcode == 0:
+            raise view.fault(start, "there is no record where one must be")
+        if length > end - start - HEADER.size:
+            room = end - start - HEADER.size
+            raise view.fault(start, f"a {_name(opcode)} record claims {length} bytes, {room} are there")
         yield RecordAt(opcode, start, HEADER.size + length)
         start += HEADER.size + length
 

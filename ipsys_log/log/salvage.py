@@ -57,7 +57,7 @@ def _save_one(view: View, data: bytes, position: int, end: int, found: Survey, s
     if position + MESSAGE.size > end:
         return len(data)
     opcode, length, channel, sequence, time, published = MESSAGE.unpack_from(data, position)
-    stop = position + HEADER.size + length
+    stop: int = position + HEADER.size + length
     known = found.contents.channels.get(channel)
     if opcode in (Opcode.SCHEMA, Opcode.CHANNEL) and stop <= end:
         _define(view, data[position:stop], found)

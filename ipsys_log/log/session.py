@@ -48,6 +48,7 @@ class Session:
         self._stack = ExitStack()
         try:
             self.readers = [self._stack.enter_context(LogReader(path)) for path in paths]
+            self._check_overlaps()
             self.images = self._cameras((CompressedImage, RawImage))
             self.calibrations = self._pair_calibrations(self._cameras((CameraCalibration,)))
         except BaseException:
@@ -119,7 +120,8 @@ class Session:
             schema = channel.schema.name if channel.schema else ""
             if channel.message_encoding != "protobuf":
                 raise LogError(
-                    f"{reader.path}: {raw.topic} is written as {channel.message_encoding}; only protobuf is read"
+                    f"{reader.path}: {raw.topic} is written as {channel.message_encoding}, "
+                    "only protobuf is read"
                 )
             try:
                 payload = decode(schema, raw.data)
@@ -141,17 +143,36 @@ class Session:
         }
         return sorted(self.payloads(topics), key=lambda run: run.number)
 
+    def _check_overlaps(self) -> None:
+        """Logs that follow one another are one; two that speak at once of one thing are not."""
+        images = {topic for payload in (CompressedImage, RawImage) for topic in self.topics(payload)}
+        first: dict[str, LogReader] = {}
+        for reader in self.readers:
+            for topic in reader.channels:
+                other = first.setdefault(topic, reader)
+                if other is reader or topic.endswith("/record"):
+                    continue
+                if topic in images and _overlap(reader, other, topic):
+                    raise LogError(
+                        f"two cameras of one name: {topic} is in {other.path} and, at the same time, in "
+                        f"{reader.path}; leave one of them out"
+                    )
+                if run_of_topic(topic) is not None:
+                    raise LogError(
+                        f"{topic} is in {other.path} and in {reader.path}; leave one of them out, or make "
+                        "that run again with --run and another name"
+                    )
+
     def _cameras(self, payloads: tuple[type, ...]) -> dict[str, str]:
-        topics = sorted({topic for payload in payloads for topic in self.topics(payload)})
+        """Topic by camera; where a camera has topics of several types, the first type's."""
         cameras: dict[str, str] = {}
-        for topic in topics:
-            camera = camera_of_topic(topic) or _foreign_camera(topic)
-            if camera in cameras:
-                raise LogError(
-                    f"{self}: two cameras of one name, {camera!r}: {cameras[camera]} and {topic}; "
-                    "rename a topic, or leave one of the logs out"
-                )
-            cameras[camera] = topic
+        for payload in payloads:
+            topics = self.topics(payload)
+            names = [camera_of_topic(topic) or _foreign_camera(topic) for topic in topics]
+            for topic, name in zip(topics, names, strict=True):
+                # Topics that differ only in words such as color or mono keep these words.
+                camera = name if names.count(name) == 1 else _clean_name(topic)
+                cameras.setdefault(camera, topic)
         return cameras
 
     def _pair_calibrations(self, found: dict[str, str]) -> dict[str, str]:
@@ -196,8 +217,17 @@ def run_of_topic(topic: str) -> str | None:
 
 
 def _foreign_camera(topic: str) -> str:
-    parts = [re.sub(r"[^a-z0-9]+", "_", part.lower()).strip("_") for part in topic.split("/") if part]
-    while len(parts) > 1 and _GENERIC.fullmatch(parts[-1]):
+    parts = topic.strip("/").split("/")
+    while len(parts) > 1 and _GENERIC.fullmatch(_clean_name(parts[-1])):
         parts.pop()
-    name = "_".join(part for part in parts if part) or "camera"
-    return name if name[0].isalpha() else f"camera_{name}"
+    return _clean_name("/".join(parts))
+
+
+def _clean_name(text: str) -> str:
+    name = re.sub(r"[^a-z0-9]+", "_", text.lower()).strip("_")
+    return name if name[:1].isalpha() else f"camera_{name}".rstrip("_")
+
+
+def _overlap(one: LogReader, other: LogReader, topic: str) -> bool:
+    first, second = one.times(topic), other.times(topic)
+    return bool(len(first) and len(second) and first[0] <= second[-1] and second[0] <= first[-1])

@@ -37,8 +37,18 @@ class CameraFrame:
         elif isinstance(payload, CameraCalibration):
             self._lenses[message.camera] = check_calibration(payload, f"calibration of {message.camera}")
         else:
+            self._check_size(payload, message.camera)
             points = tuple(self._point(marker, message.camera) for marker in payload.markers)
             yield CameraPoints(message.publish_time_ns, points)
+
+    def _check_size(self, seen: Markers, camera: str | None) -> None:
+        lens = self._lenses.get(camera)
+        if lens is not None and (lens.width, lens.height) != (seen.width, seen.height):
+            raise IpsysError(
+                f"camera {camera}: its frames are {seen.width} x {seen.height} px, its calibration is for "
+                f"{lens.width} x {lens.height}; calibrate at the size that is recorded, and give that with "
+                f"--calibration {camera}=calibration.yaml"
+            )
 
     def _point(self, marker: Marker, camera: str | None) -> CameraPoint:
         if self._rig is None:

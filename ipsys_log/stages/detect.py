@@ -56,6 +56,7 @@ class Detect:
 
     def __init__(self) -> None:
         self._rig: Rig | None = None
+        self._said: dict[str | None, set[int | None]] = {}
 
     def __call__(self, message: Message) -> Iterator[Any]:
         if isinstance(message.payload, Rig):
@@ -75,9 +76,19 @@ class Detect:
             return
         found = detect_markers(grey, self._rig.dictionary)
         markers, events = _sift(found, self._rig, message)
-        yield from events
-        yield Markers(message.publish_time_ns, markers)
+        yield from self._unsaid(events)
+        height, width = grey.shape
+        yield Markers(message.publish_time_ns, markers, width, height)
         yield _drawing(message.publish_time_ns, markers)
+
+    def _unsaid(self, events: list[Event]) -> Iterator[Event]:
+        """A camera names an id that is not in the rig once, and whatever else every time."""
+        for event in events:
+            said = self._said.setdefault(event.camera, set())
+            if event.kind != "unknown_marker" or event.marker_id not in said:
+                yield event
+            if event.kind == "unknown_marker":
+                said.add(event.marker_id)
 
 
 def decode_grey(frame: CompressedImage | RawImage) -> Grey:

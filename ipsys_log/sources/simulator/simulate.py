@@ -1,0 +1,184 @@
+"""The simulated session: rig, lenses, measured places, driving robots, and the truth of it all."""
+
+from __future__ import annotations
+
+from collections.abc import Iterable, Iterator, Sequence
+from concurrent.futures import ThreadPoolExecutor
+from dataclasses import dataclass
+from typing import Any
+
+from ipsys_log.messages import (
+    MEASUREMENTS_TOPIC,
+    RIG_TOPIC,
+    TRUTH_TOPIC,
+    CompressedImage,
+    Floor,
+    Measurement,
+    Message,
+    Rig,
+    RigCamera,
+    RigMarker,
+    Track,
+    Tracks,
+    calibration_topic,
+    image_topic,
+)
+from ipsys_log.sources.simulator.cameras import FLOOR_M, Camera, hang_cameras
+from ipsys_log.sources.simulator.drive import plan_drive
+from ipsys_log.sources.simulator.places import (
+    REFERENCES,
+    Place,
+    measure,
+    place,
+    plan_stations,
+    seen_whole,
+    split,
+)
+from ipsys_log.sources.simulator.render import View, encode_jpeg, prepare_view, render
+from ipsys_log.sources.simulator.seeds import Purpose, stream
+from ipsys_log.sources.simulator.settings import LabSettings
+from ipsys_log.units import NS_PER_S
+
+__all__ = ["EPOCH_NS", "build_rig", "simulate"]
+
+# When the simulated clock starts: 2023-11-14 22:13:20 UTC.
+EPOCH_NS = 1_700_000_000 * NS_PER_S
+# While the markers are carried to their next places, nobody records.
+_PAUSE_NS = 3 * NS_PER_S
+# From the middle of the exposure to the arrival of the frame.
+_LATENCY_NS = 4_000_000
+
+
+@dataclass(frozen=True, slots=True)
+class Instant:
+    """One moment at which all cameras take a frame; what was measured by then comes after it."""
+
+    time_ns: int
+    places: tuple[Place, ...]
+    measured: tuple[Measurement, ...] = ()
+
+
+def simulate(settings: LabSettings) -> Iterator[Message]:
+    """A session of the simulated lab, message by message, in log order.
+
+    Equal settings give equal messages, byte for byte on the same versions of OpenCV and NumPy. No
+    clock is read: the simulated one starts at :data:`EPOCH_NS`.
+
+    Parameters
+    ----------
+    settings : of the lab.
+
+    Yields
+    ------
+    Message
+        The rig; a calibration per camera; then, per instant, the truth, a frame per camera and the
+        measurements that were made. ``publish_time_ns`` is the instant.
+
+    Raises
+    ------
+    IpsysError
+        Where the settings contradict themselves.
+
+    Examples
+    --------
+    >>> lab = LabSettings(width=640, height=360, cameras=("red",), markers=1, stations=1, drive_s=0.0)
+    >>> [message.topic for message in simulate(lab)][:4]
+    ['/rig', '/cameras/red/calibration', '/truth/tracks', '/cameras/red/image']
+    """
+    log_time_ns = EPOCH_NS
+    for topic, payload, publish_time_ns, camera in _payloads(settings):
+        log_time_ns = max(publish_time_ns + _LATENCY_NS, log_time_ns + 1)
+        yield Message(topic, log_time_ns, publish_time_ns, payload, camera)
+
+
+def build_rig(settings: LabSettings) -> Rig:
+    """The rig of the simulated lab; each marker is on a robot of its own."""
+    return Rig(
+        name="simulated_lab",
+        dictionary=settings.dictionary,
+        marker_length_m=settings.marker_length_m,
+        markers=tuple(RigMarker(index, robot=f"robot_{index}") for index in range(settings.markers)),
+        cameras=tuple(RigCamera(name) for name in settings.cameras),
+        reference_points=REFERENCES,
+        floor=Floor(FLOOR_M, FLOOR_M),
+    )
+
+
+def _payloads(settings: LabSettings) -> Iterator[tuple[str, Any, int, str | None]]:
+    rig = build_rig(settings)
+    cameras = hang_cameras(settings, EPOCH_NS)
+    yield RIG_TOPIC, rig, EPOCH_NS, None
+    for camera in cameras:
+        yield calibration_topic(camera.name), camera.lens, EPOCH_NS, camera.name
+    with ThreadPoolExecutor(len(cameras)) as pool:
+        views = list(pool.map(lambda camera: prepare_view(camera, settings), cameras))
+        for index, instant in enumerate(_instants(settings, cameras)):
+            yield TRUTH_TOPIC, _truth(instant, rig, cameras, settings), instant.time_ns, None
+            for image in pool.map(_Shutter(settings, instant, index), range(len(views)), views):
+                yield image_topic(image.frame_id), image, instant.time_ns, image.frame_id
+            for measurement in instant.measured:
+                yield MEASUREMENTS_TOPIC, measurement, measurement.timestamp, None
+
+
+@dataclass(frozen=True, slots=True)
+class _Shutter:
+    """Takes the frames of an instant; which thread takes which makes no difference."""
+
+    settings: LabSettings
+    instant: Instant
+    index: int
+
+    def __call__(self, number: int, view: View) -> CompressedImage:
+        placed = [place(where, self.settings) for where in self.instant.places]
+        rng = stream(self.settings.seed, Purpose.FRAME, number, self.index)
+        data = encode_jpeg(render(view, placed, self.settings, rng), self.settings)
+        return CompressedImage(self.instant.time_ns, view.camera.name, data, "jpeg")
+
+
+def _instants(settings: LabSettings, cameras: Sequence[Camera]) -> Iterator[Instant]:
+    start_ns = EPOCH_NS + NS_PER_S
+    for places, measured in _measured_sets(settings, cameras):
+        times_ns = _times(settings, start_ns, settings.frames_per_station)
+        for time_ns in times_ns[:-1]:
+            yield Instant(time_ns, places)
+        yield Instant(times_ns[-1], places, tuple(measured(times_ns)))
+        start_ns = times_ns[-1] + _PAUSE_NS
+    drive = plan_drive(settings, cameras)
+    for time_ns in _times(settings, start_ns, round(settings.drive_s * settings.rate_hz)):
+        yield Instant(time_ns, drive.places_at((time_ns - start_ns) / NS_PER_S))
+
+
+def _measured_sets(
+    settings: LabSettings, cameras: Sequence[Camera]
+) -> Iterable[tuple[tuple[Place, ...], Any]]:
+    sets = plan_stations(settings, cameras)
+    splits = iter(enumerate(split(sets, settings.seed)))
+    for stations in sets:
+        numbered = [(station.place, *next(splits)) for station in stations]
+
+        def measured(times_ns: list[int], numbered: Any = numbered) -> list[Measurement]:
+            return [measure(where, settings, index, times_ns, splits) for where, index, splits in numbered]
+
+        yield tuple(station.place for station in stations), measured
+
+
+def _times(settings: LabSettings, start_ns: int, count: int) -> list[int]:
+    return [start_ns + round(index * NS_PER_S / settings.rate_hz) for index in range(count)]
+
+
+def _truth(instant: Instant, rig: Rig, cameras: Sequence[Camera], settings: LabSettings) -> Tracks:
+    return Tracks(
+        instant.time_ns,
+        tuple(
+            Track(
+                robot=rig.robot_of(where.marker_id),
+                id=where.marker_id,
+                x_m=where.x_m,
+                y_m=where.y_m,
+                z_m=where.z_m,
+                heading_rad=where.heading_rad,
+                cameras=seen_whole(where, cameras, settings),
+            )
+            for where in instant.places
+        ),
+    )

@@ -1,0 +1,121 @@
+"""Small logs, and the other readers that must agree with ours."""
+
+import fcntl
+import subprocess
+import zlib
+from collections.abc import Callable
+from pathlib import Path
+
+import pytest
+from mcap import records as mcap
+from mcap.reader import make_reader
+from mcap.stream_reader import StreamReader
+
+from ipsys_log.log import LogWriter, RawMessage, Schema
+from ipsys_log.log.storage import DISK, Storage
+
+IMAGE = Schema("foxglove.CompressedImage", "protobuf", b"image definition")
+POINT = Schema("ipsys.v1.Position", "protobuf", b"point definition")
+ROOT = Path(__file__).parents[2]
+
+Row = tuple[str, int, int, bytes]
+
+
+def write_rows(writer: LogWriter, rows: list[Row]) -> None:
+    """Declare each topic and write the rows; topics that begin with /image are images."""
+    for topic, log_time, publish_time, data in rows:
+        writer.add_channel(topic, IMAGE if topic.startswith("/image") else POINT)
+        writer.write(topic, log_time, publish_time, data)
+
+
+def create(path: Path, rows: list[Row], storage: Storage = DISK) -> Path:
+    with LogWriter.create(path, storage=storage) as writer:
+        write_rows(writer, rows)
+    return path
+
+
+def append(path: Path, rows: list[Row], storage: Storage = DISK) -> Path:
+    with LogWriter.append(path, storage=storage) as writer:
+        write_rows(writer, rows)
+    return path
+
+
+def as_row(message: RawMessage) -> Row:
+    return (message.topic, message.log_time_ns, message.publish_time_ns, message.data)
+
+
+def stock_rows(path: Path) -> list[Row]:
+    """What the stock seeking reader makes of the log, chunk CRCs checked."""
+    with path.open("rb") as file:
+        return [
+            (channel.topic, message.log_time, message.publish_time, message.data)
+            for _, channel, message in make_reader(file, validate_crcs=True).iter_messages()
+        ]
+
+
+def linear_rows(path: Path) -> list[Row]:
+    """What the stock linear reader makes of it, the CRC of the data section checked as well."""
+    topics: dict[int, str] = {}
+    rows: list[Row] = []
+    with path.open("rb") as file:
+        for record in StreamReader(file, validate_crcs=True).records:
+            if isinstance(record, mcap.Channel):
+                topics[record.id] = record.topic
+            elif isinstance(record, mcap.Message):
+                rows.append((topics[record.channel_id], record.log_time, record.publish_time, record.data))
+    return rows
+
+
+@pytest.fixture
+def rows() -> list[Row]:
+    """Two seconds of two cameras and a small channel; some payloads are big enough for several chunks."""
+    out: list[Row] = []
+    for number in range(60):
+        time = 1_700_000_000_000_000_000 + number * 33_000_000
+        out.append((f"/image/{number % 2}", time, time - 5, bytes([number]) * (3000 + number)))
+        out.append(("/points", time + 1, time - 5, f"point {number}".encode()))
+    return out
+
+
+@pytest.fixture
+def log(tmp_path: Path, rows: list[Row]) -> Path:
+    return create(tmp_path / "session.mcap", rows)
+
+
+@pytest.fixture(scope="session")
+def read_with_node() -> Callable[[Path], tuple[int, int, int]]:
+    """A function that reads a log with @mcap/core: count and CRC-32 indexed, count streaming."""
+    home = ROOT / ".cache" / "node"
+    home.mkdir(parents=True, exist_ok=True)
+    with (home / "lock").open("w") as lock:  # two test processes must not install at once
+        fcntl.flock(lock, fcntl.LOCK_EX)
+        _install(home)
+
+    def read(path: Path) -> tuple[int, int, int]:
+        script = [str(Path(__file__).with_name("read_all.mjs")), str(home), str(path)]
+        done = subprocess.run(["node", *script], capture_output=True, text=True, timeout=60, check=False)
+        assert done.returncode == 0, done.stderr
+        count, crc, streamed = (int(word) for word in done.stdout.split())
+        return count, crc, streamed
+
+    return read
+
+
+def _install(home: Path) -> None:
+    if (home / "complete").exists():
+        return
+    command = ["npm", "install", "--no-audit", "--no-fund", "--prefix", str(home), "@mcap/core", "@mcap/support"]
+    try:
+        done = subprocess.run(command, capture_output=True, text=True, timeout=180, check=False)
+    except (FileNotFoundError, subprocess.TimeoutExpired) as error:
+        pytest.skip(f"@mcap/core cannot be installed: {error}")
+    if done.returncode:
+        pytest.skip(f"@mcap/core cannot be installed: {done.stderr.strip().splitlines()[:2]}")
+    (home / "complete").touch()
+
+
+def crc_of(rows: list[Row]) -> int:
+    crc = 0
+    for row in rows:
+        crc = zlib.crc32(row[3], crc)
+    return crc

@@ -1,0 +1,98 @@
+"""Imports go down the floors of the house, never up; stages never import each other."""
+
+from __future__ import annotations
+
+import ast
+from collections.abc import Iterator
+from pathlib import Path
+
+import pytest
+
+PACKAGE = Path(__file__).resolve().parent.parent / "ipsys_log"
+
+FLOORS = {
+    "errors": 0, "messages": 0, "rig": 0, "units": 0,
+    "geometry": 1,
+    "models": 2, "log": 2,
+    "stages": 3, "offline": 3, "sources": 3, "sinks": 3, "formats": 3,
+    "runs": 4, "derive": 4, "tasks": 4, "preflight": 4, "pipeline": 4, "report": 4,
+    "cli": 5, "__main__": 6, "__init__": 6,
+}  # fmt: skip
+# On one floor, only downwards in this order.
+ORDER_IN_PIPELINE = ["runs", "derive", "tasks", "preflight", "pipeline", "report"]
+
+
+def imports(source: str) -> Iterator[str]:
+    """Dotted names within the package that a source imports."""
+    for node in ast.walk(ast.parse(source)):
+        names = []
+        if isinstance(node, ast.ImportFrom) and node.module and node.level == 0:
+            names = [node.module, *(f"{node.module}.{alias.name}" for alias in node.names)]
+        elif isinstance(node, ast.Import):
+            names = [alias.name for alias in node.names]
+        yield from (name for name in names if name.startswith("ipsys_log."))
+
+
+def fault(module: str, imported: str) -> str | None:
+    """Why ``module`` must not import ``imported``; both dotted, without the package."""
+    here, there = module.split("."), imported.split(".")
+    if there[0] not in FLOORS:
+        return None  # a name of the package itself
+    if FLOORS[there[0]] > FLOORS[here[0]]:
+        return f"{module} (floor {FLOORS[here[0]]}) imports {imported} (floor {FLOORS[there[0]]})"
+    if here[0] == there[0] == "stages" and len(here) > 1 and len(there) > 1 and here[1] != there[1]:
+        return f"stage {module} imports stage {imported}"
+    if {here[0], there[0]} == {"models", "log"}:
+        return f"{module} imports its neighbour {imported}"
+    if here[0] in ORDER_IN_PIPELINE and there[0] in ORDER_IN_PIPELINE:
+        order = ORDER_IN_PIPELINE.index
+        if order(there[0]) > order(here[0]):
+            return f"{module} imports {imported}, which rests on it"
+    return None
+
+
+def modules() -> list[tuple[str, Path]]:
+    found = []
+    for path in sorted(PACKAGE.rglob("*.py")):
+        parts = path.relative_to(PACKAGE).with_suffix("").parts
+        found.append((".".join(parts), path))
+    return found
+
+
+@pytest.mark.parametrize(("module", "path"), modules(), ids=[name for name, _ in modules()])
+def test_imports_go_down(module: str, path: Path) -> None:
+    wrong = [fault(module, name.removeprefix("ipsys_log.")) for name in imports(path.read_text())]
+    assert [text for text in wrong if text] == []
+
+
+@pytest.mark.parametrize(
+    ("module", "imported"),
+    [
+        ("geometry.markers", "log.reader"),
+        ("stages.detect", "pipeline"),
+        ("stages.detect", "stages.locate"),
+        ("log.reader", "models.poly"),
+        ("derive", "tasks"),
+        ("messages", "geometry"),
+    ],
+)
+def test_the_guard_sees_an_import_that_goes_up(module: str, imported: str) -> None:
+    assert fault(module, imported) is not None
+
+
+def test_every_module_has_a_floor() -> None:
+    assert {name.split(".")[0] for name, _ in modules()} <= set(FLOORS)
+
+
+def test_only_sources_read_a_clock() -> None:
+    """Law 2: a stage that read a clock would not replay."""
+    allowed = {"log.reader"}  # waits between two attempts to open a log that is being appended to
+    for module, path in modules():
+        tree = ast.parse(path.read_text())
+        names = {n.id for n in ast.walk(tree) if isinstance(n, ast.Name)} | {
+            n.names[0].name for n in ast.walk(tree) if isinstance(n, ast.Import)
+        }
+        if names & {"time", "monotonic", "perf_counter"} and "time" in {
+            alias.name for n in ast.walk(tree) if isinstance(n, ast.Import) for alias in n.names
+        }:
+            assert module.split(".")[0] in ("sources", "cli") or module in allowed, f"{module} imports time"

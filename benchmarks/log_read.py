@@ -47,7 +47,7 @@ def write_foreign(path: Path, gigabytes: float, compression: CompressionType) ->
             while sent < (number + 1) * SMALL // images:
                 writer.add_message(points, now + 1 + sent % 7, small[sent], now)
                 sent += 1
-        writer.finish()
+        writer.finish()  # type: ignore[no-untyped-call]
 
 
 def write_own(path: Path, gigabytes: float) -> None:

@@ -49,8 +49,8 @@ __all__ = [
 # The stages whose runs serve every model.
 SHARED_STAGES = ("detect", "camera-frame")
 
-# Called with the stage, the messages done, and all there are.
-Progress = Callable[[str, int, int], None]
+# Called with the stage, the messages done, and all there are, where that is known.
+Progress = Callable[[str, int, int | None], None]
 
 
 @dataclass(frozen=True, slots=True)
@@ -175,8 +175,8 @@ class _Watch:
         unknown = {str(message.payload.marker_id) for message in self._events.get("unknown_marker", ())}
         if unknown and not self._markers:
             raise IpsysError(
-                f"no marker of the rig is in any frame, but ids {', '.join(sorted(unknown))} are: add them as "
-                "[[markers]] to lab.toml and give it with --rig"
+                f"no marker of the rig is in any frame, but ids {', '.join(sorted(unknown))} are: add "
+                "them as [[markers]] to lab.toml and give it with --rig"
             )
 
     def _note(self, message: Message) -> None:

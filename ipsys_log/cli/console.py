@@ -31,7 +31,7 @@ def progress_bar() -> Iterator[Progress]:
     with Progress(*columns, console=remarks, transient=True, disable=not remarks.is_terminal) as bar:
         bars: dict[str, int] = {}
 
-        def show(stage: str, done: int, total: int) -> None:
+        def show(stage: str, done: int, total: int | None) -> None:
             if stage not in bars or done == 0:
                 bars[stage] = bar.add_task(stage, total=total)
             bar.update(bars[stage], completed=done)  # type: ignore[arg-type]

@@ -3,6 +3,8 @@
 from __future__ import annotations
 
 import json
+from pathlib import Path
+from typing import Annotated
 
 import typer
 
@@ -15,6 +17,7 @@ __all__ = ["add_commands"]
 def add_commands(app: typer.Typer) -> None:
     app.command()(info)
     app.command()(runs)
+    app.command()(repair)
 
 
 def info(logs: Logs, as_json: AsJson = False) -> None:
@@ -42,3 +45,12 @@ def runs(logs: Logs, as_json: AsJson = False) -> None:
         print(json.dumps(found, indent=2))  # noqa: T201
     else:
         console.print(runs_table(found))
+
+
+def repair(
+    log: Annotated[Path, typer.Argument(help="A log whose writer was killed, or that was cut off.")],
+) -> None:
+    """Restore every complete chunk of a log in place, and say what was lost."""
+    from ipsys_log.log import repair as repair_log
+
+    console.print(str(repair_log(log)))

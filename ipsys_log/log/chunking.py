@@ -8,12 +8,11 @@ from dataclasses import dataclass, field
 import zstandard
 from mcap.opcode import Opcode
 
-from ipsys_log.log.records import HEADER, MESSAGE, ChunkRef
+from ipsys_log.log.records import HEADER, INDEX_HEAD, MESSAGE, ChunkRef
 
 __all__ = ["ChunkBuilder", "Limits"]
 
 _ZSTD_LEVEL = 3
-_INDEX_HEAD = struct.Struct("<BQHI")
 
 
 @dataclass(frozen=True, slots=True)
@@ -83,8 +82,8 @@ class ChunkBuilder:
         offsets, at = {}, offset + length
         for channel, entries in self._entries.items():
             rows = entries.tobytes()  # little-endian machines only, like the rest of this floor
-            parts += (_INDEX_HEAD.pack(Opcode.MESSAGE_INDEX, 6 + len(rows), channel, len(rows)), rows)
-            offsets[channel], at = at, at + _INDEX_HEAD.size + len(rows)
+            parts += (INDEX_HEAD.pack(Opcode.MESSAGE_INDEX, 6 + len(rows), channel, len(rows)), rows)
+            offsets[channel], at = at, at + INDEX_HEAD.size + len(rows)
         ref = ChunkRef(
             offset, length, self._start_ns, self._end_ns, name, len(data), self._size,
             at - offset - length, offsets,

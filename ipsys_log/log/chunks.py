@@ -5,7 +5,6 @@ from collections.abc import Iterator
 from dataclasses import dataclass, field
 
 import lz4.frame
-import numpy as np
 import zstandard
 from mcap import records as mcap
 from mcap.opcode import Opcode
@@ -89,10 +88,6 @@ class Inside:
         elif at.opcode == Opcode.CHANNEL:
             channel_ = parse(mcap.Channel.read, view, RecordAt(at.opcode, where, at.length), body)
             self.channels.setdefault(channel_.id, channel_)
-
-    def arrays(self) -> "dict[int, np.ndarray[tuple[int, ...], np.dtype[np.uint64]]]":
-        """Per channel id the (log time in ns, offset) of its messages, shape (N, 2)."""
-        return {key: np.array(rows, np.uint64).reshape(-1, 2) for key, rows in self.entries.items()}
 
 
 def look_inside(view: View, offset: int, data: bytes) -> Inside:

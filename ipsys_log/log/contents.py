@@ -4,12 +4,9 @@ import struct
 import zlib
 from dataclasses import dataclass, field
 from itertools import pairwise
-from typing import Any
 
-import numpy as np
 from mcap import records as mcap
 from mcap.opcode import Opcode
-from numpy.typing import NDArray
 
 from ipsys_log.errors import LogError
 from ipsys_log.log.chunks import Inside, look_inside, unpack
@@ -37,7 +34,7 @@ _LARGEST_RECORD = 1 << 30  # a definition or an index: what one record may make 
 class Contents:
     """Schemas and channels by id, chunks, and the counts that go into the Statistics record.
 
-    `loose` holds the messages that lie in no chunk: per channel id (log time in ns, file offset), (N, 2).
+    `loose` holds the messages that lie in no chunk: per channel id (log time in ns, file offset).
     `data_end` is the offset of the DataEnd record, `data_crc` its CRC (0: not computed).
     """
 
@@ -51,7 +48,7 @@ class Contents:
     metadata_count: int = 0
     start_ns: int | None = None
     end_ns: int | None = None
-    loose: dict[int, NDArray[Any]] = field(default_factory=dict)
+    loose: dict[int, list[tuple[int, int]]] = field(default_factory=dict)
     data_end: int = 0
     data_crc: int = 0
 
@@ -259,7 +256,7 @@ def _add_index(view: View, contents: Contents, at: RecordAt) -> None:
 def count_all(contents: Contents, loose: Inside, counts: dict[int, dict[int, int]]) -> None:
     contents.schemas = loose.schemas | contents.schemas
     contents.channels = loose.channels | contents.channels
-    contents.loose = loose.arrays()
+    contents.loose = loose.entries
     for chunk in contents.chunks:
         for channel, number in counts[chunk.offset].items():
             contents.count(channel, number)
@@ -267,4 +264,4 @@ def count_all(contents: Contents, loose: Inside, counts: dict[int, dict[int, int
             contents.cover(chunk.start_ns, chunk.end_ns)
     for channel, rows in contents.loose.items():
         contents.count(channel, len(rows))
-        contents.cover(int(np.min(rows[:, 0])), int(np.max(rows[:, 0])))
+        contents.cover(min(rows)[0], max(rows)[0])

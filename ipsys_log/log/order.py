@@ -61,11 +61,12 @@ def in_log_order(pending: Sequence[Pending], fault: Callable[[int], Exception]) 
         (time, place, _), row, cursor = heap[0]
         if time < last_ns:
             raise fault(place)
-        last_ns = time
-        yield cursor.load(row)
-        row += 1
-        if row < len(cursor.times):
-            heapq.heapreplace(heap, (cursor.key(row), row, cursor))
+        alone = len(heap) == 1 and (opened == len(waiting) or cursor.times[-1] < waiting[opened].start_ns)
+        stop = len(cursor.times) if alone else row + 1
+        yield from map(cursor.load, range(row, stop))
+        last_ns = cursor.times[stop - 1]
+        if stop < len(cursor.times):
+            heapq.heapreplace(heap, (cursor.key(stop), stop, cursor))
         else:
             heapq.heappop(heap)
 

@@ -23,6 +23,7 @@ class Output(Protocol):
     def emit(self, data: bytes) -> None: ...
     def finish(self, tail: bytes) -> None: ...
     def abandon(self) -> None: ...
+    def close(self) -> None: ...
 
 
 @dataclass(slots=True)
@@ -58,14 +59,16 @@ class Growing:
         self.storage.fsync(self.fd)
         if self.target is not None:
             if self.target.exists():
-                raise LogError(f"{self.target} appeared while it was written; the new log is {self.path}")
+                raise LogError(f"{self.target} appeared while it was written: choose another name")
             self.storage.rename(self.path, self.target)
+            self.target = None
         self.storage.fsync_directory(self.path.parent)
-        self.storage.close(self.fd)
 
     def abandon(self) -> None:
         if self.target is not None:
             self.storage.unlink(self.path)
+
+    def close(self) -> None:
         self.storage.close(self.fd)
 
 
@@ -87,17 +90,18 @@ class Pending:
         self.crc = None if self.crc is None else zlib.crc32(data, self.crc)
 
     def finish(self, tail: bytes) -> None:
+        if not self._pieces:
+            return
         try:
-            if self._pieces:
-                replace_tail(self.storage, self.path, self.fd, self.start, (*self._pieces, tail))
+            replace_tail(self.storage, self.path, self.fd, self.start, (*self._pieces, tail))
         except OSError as error:
-            raise _cannot_write(
-                self.path, error, "the log stays as it was; free some space and try again"
-            ) from None
-        finally:
-            self.storage.close(self.fd)
+            then = "the log stays as it was: free some space and try again"
+            raise _cannot_write(self.path, error, then) from None
 
     def abandon(self) -> None:
+        self._pieces.clear()
+
+    def close(self) -> None:
         self.storage.close(self.fd)
 
 

@@ -155,9 +155,8 @@ class LogReader:
             if not chunk.index_offsets or not wanted.isdisjoint(chunk.index_offsets):
                 entries = chunk_entries(self._view, chunk, wanted)
                 parts += [rows for key, rows in entries.items() if key in wanted]
-        if not parts:
-            return np.zeros(0, np.int64)
-        return np.sort(np.concatenate(parts)[:, 0]).astype(np.int64)
+        times = sorted(time for rows in parts for time, _ in rows)
+        return np.array(times, np.uint64).astype(np.int64)
 
     def channel_hash(self, topic: str) -> str:
         """Hash over times and payloads of a channel in log order, in hexadecimal.

@@ -7,21 +7,22 @@ import struct
 from collections.abc import Callable, Iterator
 from dataclasses import dataclass
 from io import BytesIO
-from typing import Any, TypeVar
+from typing import TypeVar
 
-import numpy as np
 from mcap import records as mcap
 from mcap.data_stream import ReadDataStream, RecordBuilder
 from mcap.exceptions import McapError
 from mcap.opcode import Opcode
-from numpy.typing import NDArray
 
 from ipsys_log.log.view import View
 
 __all__ = [
+    "CHUNK_HEAD_SIZE",
     "DATA_END",
+    "ENTRY",
     "FOOTER",
     "HEADER",
+    "INDEX_HEAD",
     "MAGIC",
     "MESSAGE",
     "ChunkHead",
@@ -40,9 +41,11 @@ HEADER = struct.Struct("<BQ")  # opcode, length of the rest
 MESSAGE = struct.Struct("<BQHIQQ")  # opcode, length, channel, sequence, log time, publish time
 DATA_END = struct.Struct("<BQI")
 FOOTER = struct.Struct("<BQQQI")
+ENTRY = struct.Struct("<QQ")  # of a message index: log time in ns, offset in the chunk
+INDEX_HEAD = struct.Struct("<BQHI")  # opcode, length, channel, bytes of entries
+CHUNK_HEAD_SIZE = 49  # bytes from a chunk's opcode to its data, without the name of the compression
 _CHUNK = struct.Struct("<QQQI")  # start, end, uncompressed size, CRC
 _CHUNK_INDEX = struct.Struct("<QQQQI")  # start, end, offset, length, bytes of the map that follows
-_OFFSET = np.dtype([("channel", "<u2"), ("offset", "<u8")])
 _WALK_BLOCK = 4096
 _LONGEST_NAME = 64
 
@@ -125,14 +128,13 @@ def parse_chunk_index(view: View, at: RecordAt, body: bytes) -> ChunkRef:
     """A ChunkIndex record; much faster than field by field, and there is one per chunk."""
     try:
         start, end, offset, length, map_length = _CHUNK_INDEX.unpack_from(body)
-        entries = np.frombuffer(body, _OFFSET, map_length // _OFFSET.itemsize, _CHUNK_INDEX.size)
         rest = _CHUNK_INDEX.size + map_length
+        offsets = dict(struct.iter_unpack("<HQ", body[_CHUNK_INDEX.size : rest]))
         index_length, name_length = struct.unpack_from("<QI", body, rest)
         name = _short_name(body[rest + 12 : rest + 12 + name_length])
         compressed, uncompressed = struct.unpack_from("<QQ", body, rest + 12 + name_length)
     except (struct.error, ValueError) as error:
         raise view.fault(at.offset, f"the ChunkIndex record is not valid ({error})") from None
-    offsets = dict(zip(entries["channel"].tolist(), entries["offset"].tolist(), strict=True))
     return ChunkRef(offset, length, start, end, name, compressed, uncompressed, index_length, offsets)
 
 
@@ -157,14 +159,14 @@ def parse_chunk_head(view: View, offset: int) -> tuple[RecordAt, ChunkHead]:
     return RecordAt(opcode, offset, HEADER.size + length), head
 
 
-def parse_message_index(view: View, data: bytes, position: int, channel_id: int, at: int) -> NDArray[Any]:
-    """Entries (log time in ns, offset in the chunk), shape (N, 2), of the record at `position` in `data`."""
-    if 0 <= position <= len(data) - 15:
-        opcode, length, channel, size = struct.unpack_from("<BQHI", data, position)
-        if (opcode, channel) == (Opcode.MESSAGE_INDEX, channel_id) and size % 16 == 0:
-            end = position + 15 + size
-            if end <= len(data) and size + 6 <= length:
-                return np.frombuffer(data, "<u8", size // 8, position + 15).reshape(-1, 2)
+def parse_message_index(view: View, data: bytes, position: int, channel_id: int, at: int) -> bytes:
+    """Entries of the record at `position` in `data`, each an `ENTRY`."""
+    if 0 <= position <= len(data) - INDEX_HEAD.size:
+        opcode, length, channel, size = INDEX_HEAD.unpack_from(data, position)
+        end = position + INDEX_HEAD.size + size
+        fits = end <= len(data) and size + 6 <= length and size % 16 == 0
+        if fits and opcode == Opcode.MESSAGE_INDEX and channel == channel_id:
+            return data[end - size : end]
     raise view.fault(at, f"there is no MessageIndex record of channel {channel_id} where one must be")
 
 

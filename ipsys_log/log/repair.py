@@ -8,17 +8,18 @@ from dataclasses import dataclass, field
 from pathlib import Path
 
 from mcap import records as mcap
+from mcap.opcode import Opcode
 
 from ipsys_log.errors import LogError
 from ipsys_log.log.contents import load_contents
 from ipsys_log.log.hashing import METADATA_NAME, metadata_of_hashes
 from ipsys_log.log.journal import replace_tail, roll_back
 from ipsys_log.log.lock import open_locked
-from ipsys_log.log.records import MAGIC, ChunkRef, as_bytes
+from ipsys_log.log.records import HEADER, MAGIC, ChunkRef, as_bytes
 from ipsys_log.log.salvage import Salvage, salvage
 from ipsys_log.log.storage import DISK, Storage, write_all
 from ipsys_log.log.summary import tail_bytes
-from ipsys_log.log.survey import Survey, survey
+from ipsys_log.log.survey import Survey, crc_of, survey
 from ipsys_log.log.view import View
 
 __all__ = ["RepairReport", "repair"]
@@ -110,11 +111,13 @@ def _is_whole(view: View, found: Survey) -> bool:
         contents = load_contents(view)
     except LogError:
         return False
-    chunks = [chunk.offset for chunk in contents.chunks] == [chunk.offset for chunk in found.contents.chunks]
-    counts = {k: n for k, n in contents.counts.items() if n} == {
-        k: n for k, n in found.contents.counts.items() if n
-    }
-    return chunks and counts and contents.data_end == found.end
+    mine, theirs = found.contents, contents
+    chunks = [chunk.offset for chunk in mine.chunks] == [chunk.offset for chunk in theirs.chunks]
+    indexes = all(
+        b.index_offsets in ({}, a.index_offsets) for a, b in zip(mine.chunks, theirs.chunks, strict=False)
+    )
+    counts = Counter(mine.counts) == Counter(theirs.counts)
+    return chunks and indexes and counts and theirs.data_end == found.end
 
 
 def _rebuild(storage: Storage, view: View, found: Survey, notes: list[str]) -> RepairReport:
@@ -174,14 +177,13 @@ def _saved_chunk(found: Survey, saved: Salvage, offset: int) -> list[bytes]:
 
 
 def _blank(storage: Storage, view: View, found: Survey) -> None:
-    """Give damaged records a private type, which every reader skips, and correct the data CRC for it."""
-    for record in found.damaged:
-        storage.pwrite(view.fd, bytes([record.opcode | 0x80]), record.offset)
+    """Make damaged stretches records of a private type, which every reader skips."""
+    for stretch in found.damaged:
+        head = HEADER.pack(Opcode.CHUNK | 0x80, stretch.length - HEADER.size)
+        write_all(storage, view.fd, head, stretch.offset)
     if found.damaged:
         storage.fsync(view.fd)
-        found.crc = 0
-        for offset in range(0, found.end, _BLOCK):
-            found.crc = zlib.crc32(view.read(offset, min(_BLOCK, found.end - offset)), found.crc)
+        found.crc = crc_of(view, found.end)
 
 
 def _copy_lost(storage: Storage, view: View, start: int) -> Path:

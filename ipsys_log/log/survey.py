@@ -1,5 +1,6 @@
 """Checking every record of a log, finished or not: how far it is whole, and what it holds up to there."""
 
+import re
 import zlib
 from dataclasses import dataclass, field
 
@@ -11,6 +12,7 @@ from ipsys_log.log.contents import Contents, add_record, count_all
 from ipsys_log.log.hashing import ChannelHash
 from ipsys_log.log.records import (
     DATA_END,
+    ENTRY,
     HEADER,
     MAGIC,
     MESSAGE,
@@ -21,9 +23,12 @@ from ipsys_log.log.records import (
 )
 from ipsys_log.log.view import View
 
-__all__ = ["Survey", "survey"]
+__all__ = ["Survey", "crc_of", "survey"]
 
 _BLOCK = 1 << 20
+_HEAD_OVERLAP = 64
+# A chunk by its compression, or DataEnd with the record behind it: where to go on behind damage.
+_NEXT = re.compile(rb"\x06.{36}(\0\0\0\0|\4\0\0\0zstd|\3\0\0\0lz4)|\x0f\4\0{7}.{4}[\2\3\4\10\13]", re.DOTALL)
 _DATA_SECTION = frozenset(
     (
         Opcode.SCHEMA,
@@ -41,10 +46,10 @@ _PRIVATE = 0x80  # types from here on are skipped by every reader
 
 @dataclass(slots=True)
 class Survey:
-    """What is whole: records up to `end`, except the ones in `damaged`.
+    """What is whole: records up to `end`, except the stretches in `damaged`.
 
-    `finished` says that a DataEnd record lies at `end`. `fault` is why the survey stopped elsewhere.
-    `unindexed` holds the entries of the last chunk if its message indexes are missing.
+    `finished` says that a DataEnd record lies at `end`. `faults` is what was found wrong. `unindexed`
+    holds the entries of the last chunk if it is the last record and its message indexes are missing.
     """
 
     contents: Contents = field(default_factory=Contents)
@@ -58,31 +63,22 @@ class Survey:
     crc: int = 0
     crc_is_right: bool = True
     finished: bool = False
+    _chunk: Inside | None = None  # the chunk whose message indexes are being read
+    _indexed: set[int] = field(default_factory=set)
 
 
 def survey(view: View) -> Survey:
     """Check the data section record by record; never believes a length, never raises for damage."""
     found = Survey()
-    last: Inside | None = None  # the chunk whose message indexes are being read
-    indexed: set[int] = set()
-    try:
-        for at in walk(view, len(MAGIC), view.size):
-            if at.opcode == Opcode.MESSAGE_INDEX and last is not None:
-                indexed.add(_check_index(view, at, last))
-                add_record(view, found.contents, found.loose, found.counts, at)
-                found.end = at.offset + at.length
-                continue
-            if last is not None and indexed and indexed != last.entries.keys():
-                raise view.fault(at.offset, "message indexes are missing")
-            last, indexed = _take(view, found, at), set()
-            if found.finished:
-                break
-            found.end = at.offset + at.length
-    except LogError as error:
-        found.faults.append(str(error).split(" is damaged ", 1)[-1].split(". Run:", 1)[0])
-    if last is not None and indexed != last.entries.keys() and not found.finished:
-        _forget_indexes(found, last)
-    found.crc = _crc(view, found.end)
+    position = len(MAGIC)
+    while position < view.size and not found.finished:
+        position = _stretch(view, found, position)
+    if found._chunk is not None and found._indexed != found._chunk.entries.keys():
+        _forget_indexes(found)
+        chunk = found.contents.chunks[-1]
+        if not found.finished and not any(bad.offset > chunk.offset for bad in found.damaged):
+            found.end, found.unindexed = chunk.offset + chunk.length, found._chunk
+    found.crc = crc_of(view, found.end)
     if found.finished:
         _, _, stored = DATA_END.unpack(view.read(found.end, DATA_END.size))
         found.crc_is_right = stored in (0, found.crc)
@@ -90,49 +86,78 @@ def survey(view: View) -> Survey:
     return found
 
 
-def _take(view: View, found: Survey, at: RecordAt) -> Inside | None:
-    """Check one record and take it in; returns the inside of a chunk."""
+def _stretch(view: View, found: Survey, position: int) -> int:
+    """Take records from `position` on up to the next damage; returns where to go on behind it."""
+    at = RecordAt(0, position, 0)
+    try:
+        for at in walk(view, position, view.size):
+            _take(view, found, at)
+            if found.finished:
+                return view.size
+            found.end = position = at.offset + at.length
+    except LogError as error:
+        found.faults.append(str(error).split(" is damaged ", 1)[-1].split(". Run:", 1)[0])
+    else:
+        return view.size
+    follower = _next_record(view, position, at.offset + at.length if at.offset == position else 0)
+    if follower is None:
+        return view.size
+    found.damaged.append(RecordAt(Opcode.CHUNK, position, follower - position))
+    return follower
+
+
+def _take(view: View, found: Survey, at: RecordAt) -> None:
+    """Check one record and take it in."""
+    if at.opcode == Opcode.MESSAGE_INDEX and found._chunk is not None:
+        found._indexed.add(_check_index(view, at, found._chunk))
+        add_record(view, found.contents, found.loose, found.counts, at)
+        return
+    if found._chunk is not None and found._indexed != found._chunk.entries.keys():
+        _forget_indexes(found)
+    found._chunk, found._indexed = None, set()
     if at.opcode == Opcode.DATA_END and at.length == DATA_END.size:
         found.finished = True
     elif at.opcode == Opcode.CHUNK:
-        return _take_chunk(view, found, at)
-    elif at.opcode == Opcode.MESSAGE_INDEX and found.damaged:
-        found.damaged.append(at)  # the indexes of a damaged chunk go with it
-    elif at.opcode == Opcode.ATTACHMENT:
-        _check_attachment(view, at)
-        add_record(view, found.contents, found.loose, found.counts, at)
+        _take_chunk(view, found, at)
     elif at.opcode in _DATA_SECTION:
+        if at.opcode == Opcode.ATTACHMENT:
+            _check_attachment(view, at)
         add_record(view, found.contents, found.loose, found.counts, at)
     elif at.opcode < _PRIVATE and not (at.opcode == Opcode.HEADER and at.offset == len(MAGIC)):
         raise view.fault(at.offset, f"a record of type {at.opcode} has no place there")
-    return None
 
 
-def _take_chunk(view: View, found: Survey, at: RecordAt) -> Inside | None:
-    try:
-        data = unpack(view, at.offset, parse_chunk_head(view, at.offset)[1])
-        inside = look_inside(view, at.offset, data)
-    except LogError as error:
-        if not _record_follows(view, at):
-            raise
-        found.faults.append(str(error).split(" is damaged ", 1)[-1].split(". Run:", 1)[0])
-        found.damaged.append(at)
-        return None
+def _take_chunk(view: View, found: Survey, at: RecordAt) -> None:
+    data = unpack(view, at.offset, parse_chunk_head(view, at.offset)[1])
+    inside = look_inside(view, at.offset, data)
     add_record(view, found.contents, found.loose, found.counts, at)
     found.counts[at.offset] = {key: len(rows) for key, rows in inside.entries.items()}
     found.loose.schemas = inside.schemas | found.loose.schemas
     found.loose.channels = inside.channels | found.loose.channels
     _continue_hashes(found, inside, data)
-    return inside
+    found._chunk = inside
 
 
-def _record_follows(view: View, at: RecordAt) -> bool:
-    """True if the length of a damaged record can be believed, because another record follows it."""
+def _next_record(view: View, damaged: int, claimed: int) -> int | None:
+    """Where the next whole record begins behind the one that is damaged: where its length says, or a chunk."""
+    if claimed and _is_record(view, claimed):
+        return claimed
+    for base in range(damaged + HEADER.size, view.size, _BLOCK):
+        block = view.read(base, min(_BLOCK + _HEAD_OVERLAP, view.size - base))
+        for match in _NEXT.finditer(block):
+            if _is_record(view, base + match.start()):
+                return base + match.start()
+    return None
+
+
+def _is_record(view: View, offset: int) -> bool:
     try:
-        follower = next(walk(view, at.offset + at.length, view.size), None)
+        at = next(walk(view, offset, view.size), None)
+        if at is not None and at.opcode == Opcode.CHUNK:
+            unpack(view, offset, parse_chunk_head(view, offset)[1])
     except LogError:
         return False
-    return follower is not None and follower.opcode in _DATA_SECTION
+    return at is not None and (at.opcode in _DATA_SECTION or at.opcode >= _PRIVATE)
 
 
 def _continue_hashes(found: Survey, inside: Inside, data: bytes) -> None:
@@ -150,29 +175,28 @@ def _check_index(view: View, at: RecordAt, inside: Inside) -> int:
     body = view.read(at.offset, at.length)
     channel = int.from_bytes(body[HEADER.size : HEADER.size + 2], "little")
     rows = parse_message_index(view, body, 0, channel, at.offset)
-    if sorted(map(tuple, rows.tolist())) != sorted(inside.entries.get(channel, [])):
+    if sorted(ENTRY.iter_unpack(rows)) != sorted(inside.entries.get(channel, [])):
         raise view.fault(at.offset, "a MessageIndex record does not fit its chunk")
     return channel
 
 
 def _check_attachment(view: View, at: RecordAt) -> None:
     stored = int.from_bytes(view.read(at.offset + at.length - 4, 4), "little") if at.length > 13 else 0
-    if stored and _crc(view, at.length - HEADER.size - 4, at.offset + HEADER.size) != stored:
+    if stored and crc_of(view, at.length - HEADER.size - 4, at.offset + HEADER.size) != stored:
         raise view.fault(at.offset, "the CRC of an attachment is wrong")
 
 
-def _forget_indexes(found: Survey, last: Inside) -> None:
-    """Cut behind the last chunk, so that its message indexes can be written anew."""
+def _forget_indexes(found: Survey) -> None:
+    """The last chunk has no complete set of message indexes: then it is read without them."""
     chunk = found.contents.chunks[-1]
     found.contents.chunks[-1] = type(chunk)(
         chunk.offset, chunk.length, chunk.start_ns, chunk.end_ns, chunk.compression, chunk.compressed_size,
         chunk.uncompressed_size, 0, {},
     )  # fmt: skip
-    found.end = chunk.offset + chunk.length
-    found.unindexed = last
 
 
-def _crc(view: View, length: int, start: int = 0) -> int:
+def crc_of(view: View, length: int, start: int = 0) -> int:
+    """CRC-32 of a stretch of the file."""
     crc = 0
     for offset in range(start, start + length, _BLOCK):
         crc = zlib.crc32(view.read(offset, min(_BLOCK, start + length - offset)), crc)

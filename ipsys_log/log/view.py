@@ -29,9 +29,15 @@ class View:
 
     def read(self, offset: int, length: int) -> bytes:
         """Exactly `length` bytes at `offset`; the length is checked against the file before allocating."""
-        if offset < 0 or length < 0 or offset + length > self.size:
-            raise self.fault(offset, f"a record reaches {offset + length - self.size} bytes beyond the end")
+        if self.fd < 0:
+            raise ValueError(f"{self.path}: read after close")
+        end = offset + length
+        if offset < 0 or length < 0 or end > self.size:
+            raise self.fault(offset, f"a record reaches {end - self.size} bytes beyond the end of the file")
         self.bytes_read += length
+        if end <= self.tail_offset:
+            data = os.pread(self.fd, length, offset) if 0 < length < _MOST_PER_CALL else b""
+            return data if len(data) == length else self._pread(self.fd, offset, length)
         head = max(0, min(length, self.tail_offset - offset))
         parts = [self._pread(self.fd, offset, head)] if head else []
         if head < length:
@@ -50,8 +56,6 @@ class View:
         self.fd = self.tail_fd = -1
 
     def _pread(self, fd: int, offset: int, length: int) -> bytes:
-        if fd < 0:
-            raise ValueError(f"{self.path}: read after close")
         data = os.pread(fd, min(length, _MOST_PER_CALL), offset)
         if len(data) == length:
             return data

@@ -84,19 +84,18 @@ class LogWriter:
             `path` exists, its folder does not, or another process is writing it.
         """
         target = Path(path)
-        if journal_path(target).exists():
-            raise LogError(
-                f"{journal_path(target)} belongs to a log that is gone: move that log back, or delete it"
-            )
-        if atomic and target.exists():
-            raise LogError(f"{target} exists already and is never overwritten: choose another name")
+        _check_free(target)
         file = target.with_name(target.name + ".partial") if atomic else target
         fd = open_locked(storage, file, os.O_RDWR | os.O_CREAT | (0 if atomic else os.O_EXCL))
         if atomic:
-            storage.truncate(fd, 0)
+            storage.truncate(fd, 0)  # what an earlier writer of this name left when it was killed
         output = Growing(storage, file, fd, target if atomic else None)
-        storage.fsync_directory(file.parent)
-        output.emit(MAGIC + as_bytes(mcap.Header("", LIBRARY)))
+        try:
+            storage.fsync_directory(file.parent)
+            output.emit(MAGIC + as_bytes(mcap.Header("", LIBRARY)))
+        except BaseException:
+            output.close()
+            raise
         return cls(target, output, Contents(), _SMALL_LIVE)
 
     @classmethod
@@ -205,8 +204,24 @@ class LogWriter:
         """Finish the log: summary, footer, fsync. A second call does nothing."""
         if not self._open:
             return
-        self.flush()
-        self._open = False
+        try:
+            self.flush()
+            self._finish()
+        except BaseException:
+            self._output.abandon()
+            raise
+        finally:
+            self._open = False
+            self._output.close()
+
+    def abandon(self) -> None:
+        """Give up: an append leaves the log as it was, an atomic new log leaves no file."""
+        if self._open:
+            self._open = False
+            self._output.abandon()
+            self._output.close()
+
+    def _finish(self) -> None:
         contents, output = self._contents, self._output
         hashes = metadata_of_hashes(self._hashes, output.offset)
         if hashes:
@@ -215,12 +230,6 @@ class LogWriter:
             output.emit(hashes)
         contents.data_end, contents.data_crc = output.offset, output.crc or 0
         output.finish(tail_bytes(contents))
-
-    def abandon(self) -> None:
-        """Give up: an append leaves the log as it was, an atomic new log leaves no file."""
-        if self._open:
-            self._open = False
-            self._output.abandon()
 
     def _keeps_what_it_has(self) -> bool:
         return isinstance(self._output, Growing) and self._output.target is None
@@ -264,6 +273,19 @@ class LogWriter:
         self._output.emit(head + data)
         self._contents.count(channel, 1)
         self._contents.cover(log_ns, log_ns)
+
+
+def _check_free(path: Path) -> None:
+    try:
+        exists, orphan = path.exists(), journal_path(path).exists()
+    except OSError as error:
+        raise LogError(f"{path} cannot be opened for writing: {error.strerror}") from None
+    if exists:
+        raise LogError(f"{path} exists already and is never overwritten: choose another name")
+    if orphan:
+        raise LogError(
+            f"{journal_path(path)} belongs to a log that is gone: move that log back, or delete it"
+        )
 
 
 def _next_id(path: Path, known: Mapping[int, object]) -> int:

@@ -14,6 +14,7 @@ __all__ = ["contents_json", "contents_tables", "runs_json", "runs_table"]
 
 # A gap is a silence of this many times the usual distance between messages.
 _GAP_FACTOR = 3
+_INSTANT_S = 1e-4
 
 
 def contents_json(session: Session) -> dict[str, Any]:
@@ -47,8 +48,10 @@ def _channel(session: Session, topic: str) -> dict[str, Any]:
     readers = [reader for reader in session.readers if topic in reader.channels]
     times_ns = np.sort(np.concatenate([reader.times(topic) for reader in readers]))
     steps_s = np.diff(times_ns) / NS_PER_S
-    usual_s = float(np.median(steps_s)) if len(steps_s) else 0.0
-    gaps = steps_s[steps_s > max(_GAP_FACTOR * usual_s, 1e-9)] if usual_s > 0 else steps_s[:0]
+    # What is written at one instant, such as the measurements of one place, has no rate.
+    apart_s = steps_s[steps_s > _INSTANT_S]
+    usual_s = float(np.median(apart_s)) if len(apart_s) else 0.0
+    gaps = apart_s[apart_s > _GAP_FACTOR * usual_s]
     schema = readers[0].channels[topic].schema
     return {
         "schema": schema.name if schema else None,
@@ -93,13 +96,15 @@ def contents_tables(found: dict[str, Any]) -> list[Table]:
     cameras = _table("Cameras", "camera", "images", "calibration")
     for camera, row in found["cameras"].items():
         cameras.add_row(camera, row["images"], row["calibration"] or "missing")
-    numbers = ("messages", "Hz", "gaps")
-    channels = _table("Channels", "topic", "schema", *numbers, right=numbers)
+    numbers = ("count", "Hz", "gaps")
+    channels = _table("Channels", "topic", *numbers, "schema", right=numbers)
+    channels.columns[0].no_wrap = channels.columns[3].no_wrap = True
+    channels.columns[4].overflow, channels.columns[4].no_wrap = "ellipsis", True
     for topic, row in found["channels"].items():
         rate = "-" if row["rate_hz"] is None else f"{row['rate_hz']:.1f}"
-        gaps = "-" if not row["gaps"] else f"{row['gaps']} (to {row['longest_gap_s']:.1f} s)"
+        gaps = "-" if not row["gaps"] else f"{row['gaps']}, {row['longest_gap_s']:.1f} s"
         schema = (row["schema"] or "-").rpartition(".")[2]
-        channels.add_row(topic, schema, str(row["messages"]), rate, gaps)
+        channels.add_row(topic, str(row["messages"]), rate, gaps, schema)
     tables = [files, *([cameras] if found["cameras"] else []), channels]
     return [*tables, runs_table(found["runs"])] if found["runs"] else tables
 

@@ -104,7 +104,16 @@ def read_with_node() -> Callable[[Path], tuple[int, int, int]]:
 def _install(home: Path) -> None:
     if (home / "complete").exists():
         return
-    command = ["npm", "install", "--no-audit", "--no-fund", "--prefix", str(home), "@mcap/core", "@mcap/support"]
+    command = [
+        "npm",
+        "install",
+        "--no-audit",
+        "--no-fund",
+        "--prefix",
+        str(home),
+        "@mcap/core",
+        "@mcap/support",
+    ]
     try:
         done = subprocess.run(command, capture_output=True, text=True, timeout=180, check=False)
     except (FileNotFoundError, subprocess.TimeoutExpired) as error:

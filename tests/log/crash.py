@@ -10,6 +10,7 @@ import os
 import random
 from collections.abc import Iterator, Sequence
 from dataclasses import dataclass, field
+from itertools import pairwise
 from pathlib import Path
 
 from ipsys_log.log.storage import DISK
@@ -135,7 +136,7 @@ def torn(operation: Operation, chance: random.Random) -> Iterator[Operation]:
     start = operation.at
     end = start + len(operation.data)
     edges = [start, *range(start - start % SECTOR + SECTOR, end, SECTOR), end]
-    for low, high in zip(edges, edges[1:], strict=False):
+    for low, high in pairwise(edges):
         if chance.random() < 0.5:
             yield Operation("write", operation.file, data=operation.data[low - start : high - start], at=low)
 

@@ -8,6 +8,7 @@ import pytest
 
 from ipsys_log.errors import LogError
 from ipsys_log.log import LogReader, LogWriter, repair
+from ipsys_log.log.records import MAGIC
 from tests.log.conftest import POINT, Row, append, as_row, create, linear_rows, write_rows
 from tests.log.crash import Operation, Recorder, crashes
 
@@ -107,13 +108,13 @@ def check_recording(folder: Path, rows: list[Row], operations: Sequence[Operatio
     kept = set()
     for cut, disk in crashes({}, operations, random.Random(4), tries):
         disk.store(folder)
-        if not path.exists() or path.stat().st_size < 8 or path.read_bytes()[:8] == bytes(8):
+        if not path.exists() or path.stat().st_size < 8:
             continue
-        try:
-            repair(path)
-        except LogError as error:
-            assert "is not an MCAP" in str(error)
+        if path.read_bytes()[:8] != MAGIC:
+            with pytest.raises(LogError, match="is not an MCAP"):
+                repair(path)
             continue
+        repair(path)
         got = read(path)
         for topic, expected in by_topic.items():
             mine = [row for row in got if row[0] == topic]
@@ -162,7 +163,7 @@ def test_an_atomic_log_is_there_whole_or_not_at_all(tmp_path: Path) -> None:
         write_rows(writer, NEW)
     whole = path.read_bytes()
     for cut, disk in crashes({}, storage.operations, random.Random(7), 20):
-        content = disk.files[disk.names["out.mcap"]] if "out.mcap" in disk.names else None
+        content = bytes(disk.files[disk.names["out.mcap"]]) if "out.mcap" in disk.names else None
         assert content in (None, whole), f"after {cut} operations"
     assert content == whole
 
@@ -177,7 +178,7 @@ def test_what_a_killed_recorder_flushed_is_there(tmp_path: Path) -> None:
     copy = tmp_path / "killed.mcap"
     copy.write_bytes(path.read_bytes())
     writer.abandon()
-    with pytest.raises(LogError, match="no footer.*ipsys repair"):
+    with pytest.raises(LogError, match=r"no footer.*ipsys repair"):
         LogReader(copy)
     report = repair(copy)
     assert (report.messages_kept, report.bytes_lost, report.last_kept_ns) == (5, 0, 4)

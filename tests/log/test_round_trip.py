@@ -34,6 +34,12 @@ def in_order(rows: list[Row]) -> list[Row]:
     return sorted(rows, key=lambda row: row[1])
 
 
+def fail_in(log: LogWriter, rows: list[Row]) -> None:
+    with log as writer:
+        write_rows(writer, rows)
+        raise RuntimeError
+
+
 @pytest.fixture(params=["created", "appended", "repaired"])
 def finished(request: pytest.FixtureRequest, log: Path, rows: list[Row]) -> tuple[Path, list[Row]]:
     if request.param == "appended":
@@ -60,7 +66,9 @@ def test_all_readers_agree(
 def test_rerun_finds_no_fault(log: Path) -> None:
     append(log, LATER)
     rerun = Path(sys.executable).with_name("rerun")
-    done = subprocess.run([rerun, "mcap", "check", log], capture_output=True, text=True, timeout=60, check=False)
+    done = subprocess.run(
+        [rerun, "mcap", "check", log], capture_output=True, text=True, timeout=60, check=False
+    )
     assert done.returncode == 0, done.stdout + done.stderr
     assert done.stdout.count("\nok ") == 4
     assert "PROBLEM" not in done.stdout
@@ -90,18 +98,16 @@ def test_appending_nothing_changes_nothing(log: Path) -> None:
 
 def test_an_exception_leaves_an_append_undone(log: Path) -> None:
     before = log.read_bytes()
-    with pytest.raises(RuntimeError), LogWriter.append(log) as writer:
-        write_rows(writer, LATER)
-        raise RuntimeError
+    with pytest.raises(RuntimeError):
+        fail_in(LogWriter.append(log), LATER)
     assert log.read_bytes() == before
     append(log, LATER)  # and the lock is free again
 
 
 def test_an_exception_leaves_no_atomic_log(tmp_path: Path, rows: list[Row]) -> None:
     path = tmp_path / "out.mcap"
-    with pytest.raises(RuntimeError), LogWriter.create(path, atomic=True) as writer:
-        write_rows(writer, rows)
-        raise RuntimeError
+    with pytest.raises(RuntimeError):
+        fail_in(LogWriter.create(path, atomic=True), rows)
     assert list(tmp_path.iterdir()) == []
     with LogWriter.create(path, atomic=True) as writer:
         write_rows(writer, rows)
@@ -111,9 +117,8 @@ def test_an_exception_leaves_no_atomic_log(tmp_path: Path, rows: list[Row]) -> N
 
 def test_an_exception_finishes_a_recording(tmp_path: Path, rows: list[Row]) -> None:
     path = tmp_path / "recording.mcap"
-    with pytest.raises(RuntimeError), LogWriter.create(path) as writer:
-        write_rows(writer, rows)
-        raise RuntimeError
+    with pytest.raises(RuntimeError):
+        fail_in(LogWriter.create(path), rows)
     assert ours(path) == in_order(rows)
 
 
@@ -147,4 +152,3 @@ def test_merge_takes_the_arguments_in_order_at_equal_times(tmp_path: Path) -> No
 def test_another_schema_on_the_same_topic_is_refused(log: Path) -> None:
     with LogWriter.append(log) as writer, pytest.raises(LogError, match="/points with another schema"):
         writer.add_channel("/points", IMAGE)
-

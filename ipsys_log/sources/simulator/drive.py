@@ -1,4 +1,7 @@
-"""Robots that drive one behind the other along a smooth closed path over the whole floor."""
+"""Robots that drive one behind the other along a smooth closed path over the whole floor.
+
+The path does not cross itself, so that a convoy never meets itself however long it drives.
+"""
 
 from __future__ import annotations
 
@@ -22,12 +25,17 @@ _FROM_WALL_M = 0.55
 # A robot gathers speed within about this time.
 _START_S = 0.4
 _TRIES = 200
+_ARMS = 5
+_MEAN = 0.64
 _CHECKED_HZ = 10
 
 
 @dataclass(frozen=True, slots=True, eq=False)
 class Drive:
-    """A Lissajous figure (2 : 3) and how far along it each marker starts, in m."""
+    """A star with five rounded arms, and how far along it each marker starts, in m.
+
+    ``lengths_m`` (n,) are the ways along the path up to the angles ``phases`` (n,), in rad.
+    """
 
     settings: LabSettings
     mirrored: bool
@@ -57,11 +65,11 @@ class Drive:
 
 
 def plan_drive(settings: LabSettings, cameras: Sequence[Camera]) -> Drive:
-    """Markers on the path, as many of them as never cover one another; marker 0 starts in a corner."""
+    """Markers on the path, as many of them as never cover one another; marker 0 starts at a wall."""
     rng = stream(settings.seed, Purpose.DRIVE)
     mirrored = bool(rng.integers(2))
-    # It begins where y is least, so that the first 10 s lead through the views of all cameras.
-    phases = -np.pi / 6 + np.linspace(0, 2 * np.pi, 20_001)
+    # It begins at the outermost camera and leads through the views of all of them within 14 s.
+    phases = -np.pi / 2 + np.linspace(0, 2 * np.pi, 20_001)
     (x_m, y_m), _ = _figure(phases, mirrored)
     lengths_m = np.concatenate([[0.0], np.cumsum(np.hypot(np.diff(x_m), np.diff(y_m)))])
     empty = Drive(settings, mirrored, {}, lengths_m, phases)
@@ -78,9 +86,20 @@ def plan_drive(settings: LabSettings, cameras: Sequence[Camera]) -> Drive:
 
 
 def _figure(phase: Array, mirrored: bool) -> tuple[tuple[Array, Array], tuple[Array, Array]]:
-    """Points of the path and their derivatives by the phase."""
-    size_m = FLOOR_M / 2 - _FROM_WALL_M
+    """Points of the path at angles (n,), in m, and their derivatives by the angle.
+
+    Between the arms the path comes back to near the middle; the arms end on a square with rounded
+    corners, so that they reach the edges of all images.
+    """
     side = -1.0 if mirrored else 1.0
-    x_m = FLOOR_M / 2 + side * size_m * np.sin(2 * phase + 0.4)
-    y_m = FLOOR_M / 2 + size_m * np.sin(3 * phase)
-    return (x_m, y_m), (side * 2 * size_m * np.cos(2 * phase + 0.4), 3 * size_m * np.cos(3 * phase))
+    cos, sin = np.cos(phase), np.sin(phase)
+    corner = cos**4 + sin**4
+    wave = _MEAN + (1 - _MEAN) * np.cos(_ARMS * (phase + np.pi / 2))
+    size_m = (FLOOR_M / 2 - _FROM_WALL_M) * corner**-0.25
+    reach_m = size_m * wave
+    slope_m = size_m * (
+        wave * (cos**3 * sin - sin**3 * cos) / corner
+        - (1 - _MEAN) * _ARMS * np.sin(_ARMS * (phase + np.pi / 2))
+    )
+    point_m = (FLOOR_M / 2 + side * reach_m * cos, FLOOR_M / 2 + reach_m * sin)
+    return point_m, (side * (slope_m * cos - reach_m * sin), slope_m * sin + reach_m * cos)

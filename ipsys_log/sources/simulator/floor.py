@@ -52,7 +52,7 @@ def lay_floor(settings: LabSettings, camera: Camera, rays: Array) -> Plane:
     concrete = 0.62 * settings.floor + 4.0 * _noise_at(settings, 1, x_m, y_m, 1.0)
     fade = 1.0 - 0.012 * ((x_m - 2.2) ** 2 + (y_m - 2.8) ** 2)
     level = np.where(on_boards, boards, concrete) * np.clip(fade, 0.5, 1.0)
-    return np.clip(level, 1.0, 255.0).astype(np.float32)
+    return np.asarray(np.clip(level, 1.0, 255.0), dtype=np.float32)
 
 
 def _boards(settings: LabSettings, x_m: Array, y_m: Array) -> Array:

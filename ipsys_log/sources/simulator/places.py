@@ -111,7 +111,7 @@ def split(sets: Sequence[tuple[Station, ...]], seed: int) -> list[tuple[str, ...
     """The split that each station belongs to, in order: a fifth of each camera's is held out."""
     rng = stream(seed, Purpose.SPLIT)
     cameras = [station.camera for stations in sets for station in stations]
-    splits = [("train",)] * len(cameras)
+    splits: list[tuple[str, ...]] = [("train",)] * len(cameras)
     for camera in dict.fromkeys(cameras):
         own = [index for index, name in enumerate(cameras) if name == camera]
         for index in rng.permutation(own)[: round(_TEST_SHARE * len(own))]:

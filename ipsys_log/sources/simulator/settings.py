@@ -80,7 +80,7 @@ class LabSettings:
     frames_per_station: int = 5
     heights_m: tuple[float, ...] = (0.0, 0.05, 0.10, 0.15, 0.20)
     rate_hz: float = 30.0
-    drive_s: float = 12.0
+    drive_s: float = 15.0
     drive_speed_m_s: float = 0.5
     drive_height_m: float = 0.10
     psf_sigma_px: float = 0.7

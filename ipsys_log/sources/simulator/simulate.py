@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterable, Iterator, Sequence
+from collections.abc import Iterator, Sequence
 from concurrent.futures import ThreadPoolExecutor
 from dataclasses import dataclass
 from typing import Any
@@ -137,29 +137,23 @@ class _Shutter:
 
 def _instants(settings: LabSettings, cameras: Sequence[Camera]) -> Iterator[Instant]:
     start_ns = EPOCH_NS + NS_PER_S
-    for places, measured in _measured_sets(settings, cameras):
+    sets = plan_stations(settings, cameras)
+    splits = split(sets, settings.seed)
+    for number, stations in enumerate(sets):
+        places = tuple(station.place for station in stations)
         times_ns = _times(settings, start_ns, settings.frames_per_station)
+        first = number * settings.markers
+        measured = tuple(
+            measure(where, settings, index, times_ns, splits[index])
+            for index, where in enumerate(places, first)
+        )
         for time_ns in times_ns[:-1]:
             yield Instant(time_ns, places)
-        yield Instant(times_ns[-1], places, tuple(measured(times_ns)))
+        yield Instant(times_ns[-1], places, measured)
         start_ns = times_ns[-1] + _PAUSE_NS
     drive = plan_drive(settings, cameras)
     for time_ns in _times(settings, start_ns, round(settings.drive_s * settings.rate_hz)):
         yield Instant(time_ns, drive.places_at((time_ns - start_ns) / NS_PER_S))
-
-
-def _measured_sets(
-    settings: LabSettings, cameras: Sequence[Camera]
-) -> Iterable[tuple[tuple[Place, ...], Any]]:
-    sets = plan_stations(settings, cameras)
-    splits = iter(enumerate(split(sets, settings.seed)))
-    for stations in sets:
-        numbered = [(station.place, *next(splits)) for station in stations]
-
-        def measured(times_ns: list[int], numbered: Any = numbered) -> list[Measurement]:
-            return [measure(where, settings, index, times_ns, splits) for where, index, splits in numbered]
-
-        yield tuple(station.place for station in stations), measured
 
 
 def _times(settings: LabSettings, start_ns: int, count: int) -> list[int]:

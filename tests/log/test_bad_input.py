@@ -1,0 +1,205 @@
+"""A log is untrusted input: one clear line, never another exception, never much memory."""
+
+import errno
+import random
+import struct
+import tracemalloc
+from collections.abc import Callable
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any, cast
+
+import pytest
+
+from ipsys_log.errors import LogError
+from ipsys_log.log import LogReader, LogWriter, repair
+from ipsys_log.log.journal import journal_path
+from ipsys_log.log.records import MAGIC
+from ipsys_log.log.storage import DISK, Storage
+from tests.log.conftest import Row, append, create
+
+
+def read_everything(path: Path) -> None:
+    with LogReader(path) as reader:
+        list(reader.messages())
+        for topic in reader.channels:
+            reader.times(topic)
+            reader.channel_hash(topic)
+
+
+def fault_of(act: Callable[[Path], object], path: Path) -> str:
+    """What `act` says is wrong, "" if nothing; any other exception than LogError is a failure."""
+    try:
+        act(path)
+    except LogError as error:
+        return str(error)
+    return ""
+
+
+@pytest.mark.parametrize(
+    ("content", "expected"),
+    [
+        (b"", "is empty"),
+        (b"RIFF....", r"is not an MCAP file \(it starts with b'RIFF....'\)"),
+        (MAGIC, "has no footer: .* Run: ipsys repair"),
+        (MAGIC[:5], "has no footer"),
+        (MAGIC + bytes(10_000), "has no footer"),
+        (bytes(10_000), "is not an MCAP file"),
+    ],
+)
+def test_no_log_at_all(content: bytes, expected: str, tmp_path: Path) -> None:
+    path = tmp_path / "bad.mcap"
+    path.write_bytes(content)
+    for read in (read_everything, LogWriter.append):
+        with pytest.raises(LogError, match=expected) as caught:
+            read(path)
+        assert "\n" not in str(caught.value)
+        assert str(path) in str(caught.value)
+    assert path.read_bytes() == content
+
+
+def test_missing_file_and_folder(tmp_path: Path) -> None:
+    with pytest.raises(LogError, match="does not exist"):
+        LogReader(tmp_path / "none.mcap")
+    with pytest.raises(LogError, match="does not exist"):
+        LogWriter.append(tmp_path / "none.mcap")
+    with pytest.raises(LogError, match="folder"):
+        LogWriter.create(tmp_path / "none" / "a.mcap")
+    with pytest.raises(LogError, match="cannot be opened"):
+        LogWriter.create(tmp_path / ("x" * 300))
+    with pytest.raises(LogError, match="cannot be"):
+        LogReader(tmp_path)
+
+
+def test_an_existing_log_is_never_overwritten(log: Path) -> None:
+    before = log.read_bytes()
+    for atomic in (False, True):
+        with pytest.raises(LogError, match="exists already"):
+            LogWriter.create(log, atomic=atomic)
+    assert log.read_bytes() == before
+
+
+def test_one_writer_at_a_time(log: Path, tmp_path: Path) -> None:
+    with LogWriter.append(log):
+        for other in (LogWriter.append, repair):
+            with pytest.raises(LogError, match="another process is writing"):
+                other(log)
+    recording = LogWriter.create(tmp_path / "recording.mcap")
+    with pytest.raises(LogError, match="another process is writing"):
+        repair(tmp_path / "recording.mcap")
+    recording.close()
+
+
+def test_a_journal_without_its_log(tmp_path: Path) -> None:
+    path = tmp_path / "a.mcap"
+    journal_path(path).write_bytes(b"journal")
+    with pytest.raises(LogError, match="belongs to a log that is gone"):
+        LogWriter.create(path)
+
+
+def test_a_journal_of_another_file_is_not_believed(log: Path, tmp_path: Path, rows: list[Row]) -> None:
+    other = create(tmp_path / "other.mcap", rows[::2])
+    before = log.read_bytes()
+    for content in (b"", b"junk", bytes(5000), other.read_bytes()):
+        journal_path(log).write_bytes(content)
+        read_everything(log)
+        LogWriter.append(log).close()
+        assert log.read_bytes() == before
+        assert not journal_path(log).exists()
+
+
+def test_any_byte_changed(log: Path) -> None:
+    """Either it is read, or one line says what is wrong."""
+    append(log, [("/runs/a", k, k, b"x") for k in range(9)])
+    whole = log.read_bytes()
+    chance = random.Random(1)
+    faults = 0
+    for _ in range(400):
+        data = bytearray(whole)
+        at = chance.choice((chance.randrange(len(data)), chance.randrange(len(data) - 3000, len(data))))
+        data[at : at + chance.choice((1, 8))] = chance.randbytes(chance.choice((1, 8)))
+        log.write_bytes(data)
+        fault = fault_of(read_everything, log)
+        faults += bool(fault)
+        assert "\n" not in fault
+    assert faults > 100
+
+
+def test_any_byte_changed_and_repaired(log: Path) -> None:
+    append(log, [("/runs/a", k, k, b"x") for k in range(9)])
+    whole = log.read_bytes()
+    chance = random.Random(2)
+    for _ in range(300):
+        data = bytearray(whole)
+        data[(at := chance.randrange(9, len(data))) : at + 1] = chance.randbytes(1)
+        log.write_bytes(data)
+        repair(log)
+        with LogReader(log) as reader:
+            list(reader.messages())
+            assert reader.message_count >= 60, "one changed byte costs one chunk"
+        assert not repair(log).changed
+
+
+@pytest.mark.parametrize("claim", [1 << 31, 1 << 40, (1 << 64) - 1])
+def test_lengths_are_not_believed(log: Path, claim: int) -> None:
+    whole = log.read_bytes()
+    chunk = whole.index(b"\x06", 40)
+    tracemalloc.start()
+    try:
+        for at in (9, chunk + 1, chunk + 9 + 16, chunk + 9 + 28, len(whole) - 36, len(whole) - 28):
+            log.write_bytes(whole[:at] + struct.pack("<Q", claim) + whole[at + 8 :])
+            for act in (read_everything, repair):
+                fault = fault_of(act, log)
+                assert not fault or str(log) in fault
+        assert tracemalloc.get_traced_memory()[1] < 64 << 20
+    finally:
+        tracemalloc.stop()
+
+
+def test_a_damaged_chunk_in_the_middle_costs_only_itself(log: Path) -> None:
+    with LogReader(log) as reader:
+        total, chunks = reader.message_count, reader.chunk_count
+    data = bytearray(log.read_bytes())
+    data[len(data) // 2] ^= 0xFF
+    log.write_bytes(data)
+    report = repair(log)
+    assert "the CRC of the chunk is wrong" in str(report)
+    with LogReader(log) as reader:
+        assert reader.chunk_count == chunks - 1
+        assert len(list(reader.messages())) == reader.message_count < total
+    assert not repair(log).changed
+
+
+@dataclass(frozen=True)
+class FullDisk:
+    """A disk that takes `room` bytes of each file."""
+
+    room: int
+
+    def __getattr__(self, name: str) -> Any:
+        return getattr(DISK, name)
+
+    def pwrite(self, fd: int, data: bytes | memoryview, offset: int) -> int:
+        if offset >= self.room:
+            raise OSError(errno.ENOSPC, "No space left on device")
+        return DISK.pwrite(fd, data[: self.room - offset], offset)
+
+
+def test_a_full_disk_while_recording(tmp_path: Path, rows: list[Row]) -> None:
+    path = tmp_path / "recording.mcap"
+    with pytest.raises(LogError, match=r"No space left on device.*ipsys repair"):
+        create(path, rows, cast(Storage, FullDisk(100_000)))
+    repair(path)
+    with LogReader(path) as reader:
+        assert 0 < len(list(reader.messages())) < len(rows)
+
+
+def test_a_full_disk_while_appending(log: Path) -> None:
+    before = log.read_bytes()
+    more: list[Row] = [("/image/new", 1, 1, random.Random(1).randbytes(20_000))]
+    for room in (100, len(before) + 100):
+        with pytest.raises(LogError, match=r"No space left on device.*stays as it was"):
+            append(log, more, cast(Storage, FullDisk(room)))
+        read_everything(log)
+        append(log, [])
+        assert log.read_bytes() == before

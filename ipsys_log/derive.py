@@ -86,7 +86,8 @@ class Task:
     base : name of its run, unless that one is taken.
     topics : what it reads of the log, and ``foreign`` what it reads of another one.
     rig, lenses : set where they replace what the log holds.
-    reads, step : a causal stage: its payloads, and its step for a run of a given name; or
+    reads, step, per_camera : a causal stage: its payloads, its step for a run of a given name, and whether
+        the step takes each camera by itself; or
     compute : the payload that is computed from the whole log.
     """
 
@@ -95,6 +96,7 @@ class Task:
     topics: tuple[str, ...]
     reads: tuple[type, ...] = ()
     step: Callable[[str], Callable[[Message], Iterable[Any]]] = lambda run: lambda message: ()
+    per_camera: bool = True
     compute: Callable[[Session], Any] | None = None
     parameters: Mapping[str, str] = field(default_factory=dict)
     rig: Rig | None = None

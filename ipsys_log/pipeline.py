@@ -22,6 +22,7 @@ The rig is read by all but evaluate and locate.
 
 from __future__ import annotations
 
+import builtins
 from collections import deque
 from collections.abc import Callable, Iterable, Iterator, Sequence
 from concurrent.futures import Future, ThreadPoolExecutor
@@ -71,11 +72,16 @@ Map = Callable[[Callable[[Message], Any], Iterable[Message]], Iterable[Any]]
 
 @dataclass(frozen=True, slots=True)
 class Stage:
-    """A causal stage: which payloads it reads, the run it writes to, and its step."""
+    """A causal stage: the run it writes to, which payloads it reads, and its step.
+
+    A stage that remembers something across cameras is not ``per_camera``: it takes one message after
+    the other, whatever the map.
+    """
 
     run: str
     reads: tuple[type, ...]
     step: Callable[[Message], Iterable[Any]]
+    per_camera: bool = True
 
 
 def run(source: Iterable[Message], stages: Sequence[Stage], map: Map = map) -> Iterator[Message]:
@@ -94,7 +100,7 @@ def _through(stage: Stage, source: Iterable[Message], map: Map) -> Iterator[Mess
     def work(message: Message) -> tuple[Message, list[Any]]:
         return message, list(stage.step(message)) if isinstance(message.payload, stage.reads) else []
 
-    for message, payloads in map(work, source):
+    for message, payloads in (map if stage.per_camera else builtins.map)(work, source):
         yield message
         for payload in payloads:
             topic = TOPICS[type(payload)].format(run=stage.run, camera=message.camera)
@@ -185,6 +191,6 @@ def _make(task: Task, session: Session, name: str) -> Iterator[Message]:
         yield Message(TOPICS[type(payload)].format(run=name), time_ns, payload.timestamp, payload)
         return
     source = chain(settings(session, task.topics, task.rig, task.lenses), session.messages(task.topics))
-    for message in run(source, [Stage(name, task.reads, task.step(name))], in_threads):
+    for message in run(source, [Stage(name, task.reads, task.step(name), task.per_camera)], in_threads):
         if message.topic.startswith("/runs/") and message.topic not in task.topics:
             yield message

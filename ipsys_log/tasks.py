@@ -90,7 +90,13 @@ def _detect(session: Session, request: Request) -> Task | str:
     topics += session.images.values()
     parameters = {"corners": "stock"}
     return Task(
-        "detect", "stock", tuple(topics), detect.READS, lambda run: detect.Detect(), None, parameters, rig
+        "detect",
+        "stock",
+        tuple(topics),
+        detect.READS,
+        lambda run: detect.Detect(),
+        parameters=parameters,
+        rig=rig,
     )
 
 
@@ -176,7 +182,7 @@ def _locate(session: Session, _request: Request, points: str, model: str) -> Tas
 def _fuse(session: Session, request: Request, positions: str) -> Task | str:
     rig, topics = _rig(session, request, "fuse")
     topics += session.topics(Positions, positions)
-    return Task("fuse", positions, tuple(topics), fuse.READS, fuse.Fuse, rig=rig)
+    return Task("fuse", positions, tuple(topics), fuse.READS, fuse.Fuse, per_camera=False, rig=rig)
 
 
 STAGE_PLANS: dict[str, Callable[..., Task | str]] = {

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import os
+import shutil
 import sys
 from collections.abc import Callable
 from pathlib import Path
@@ -11,6 +12,8 @@ from typing import NamedTuple
 import pytest
 
 from ipsys_log.cli import main
+from ipsys_log.runs import write_log
+from ipsys_log.sources.simulator import LabSettings, simulate
 
 ROOT = Path(__file__).resolve().parent.parent
 
@@ -48,3 +51,27 @@ def ipsys(monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]) -
         return Done(code, captured.out, captured.err)
 
     return run
+
+
+@pytest.fixture(scope="session")
+def lab_log(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    """A small simulated session, to be copied before it is changed."""
+    path = tmp_path_factory.mktemp("lab") / "lab.mcap"
+    settings = LabSettings(
+        width=960, height=540, markers=8, stations=26, frames_per_station=1, rate_hz=5.0, drive_s=1.0
+    )
+    write_log(path, simulate(settings))
+    return path
+
+
+@pytest.fixture
+def lab(lab_log: Path, tmp_path: Path) -> Path:
+    """A copy of the small simulated session."""
+    return Path(shutil.copy(lab_log, tmp_path / "lab.mcap"))
+
+
+def data_section(path: Path) -> bytes:
+    """What lies before the DataEnd record: what must never be rewritten."""
+    whole = path.read_bytes()
+    summary_start = int.from_bytes(whole[-28:-20], "little")
+    return whole[: summary_start - 13]

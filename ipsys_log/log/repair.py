@@ -11,7 +11,7 @@ from mcap import records as mcap
 from mcap.opcode import Opcode
 
 from ipsys_log.errors import LogError
-from ipsys_log.log.contents import load_contents
+from ipsys_log.log.contents import Contents, load_contents
 from ipsys_log.log.hashing import METADATA_NAME, metadata_of_hashes
 from ipsys_log.log.journal import replace_tail, roll_back
 from ipsys_log.log.lock import open_locked
@@ -75,9 +75,10 @@ def repair(path: str | os.PathLike[str], *, storage: Storage = DISK) -> RepairRe
         size = os.fstat(fd).st_size
         view = View(target, fd, size, size)
         _check_magic(view)
-        found = survey(view)
+        known = _summary(view)
+        found = survey(view, known)
         notes = ["an append that was cut short was rolled back"] if rolled_back else []
-        if _is_whole(view, found):
+        if known is not None and _is_whole(known, found):
             return RepairReport(
                 target,
                 rolled_back,
@@ -104,14 +105,17 @@ def _check_magic(view: View) -> None:
         raise LogError(f"{view.path} is not an MCAP file (it starts with {start!r}): nothing was changed")
 
 
-def _is_whole(view: View, found: Survey) -> bool:
+def _summary(view: View) -> Contents | None:
+    try:
+        return load_contents(view)
+    except LogError:
+        return None
+
+
+def _is_whole(theirs: Contents, found: Survey) -> bool:
     if not found.finished or found.damaged or not found.crc_is_right:
         return False
-    try:
-        contents = load_contents(view)
-    except LogError:
-        return False
-    mine, theirs = found.contents, contents
+    mine = found.contents
     chunks = [chunk.offset for chunk in mine.chunks] == [chunk.offset for chunk in theirs.chunks]
     indexes = all(
         b.index_offsets in ({}, a.index_offsets) for a, b in zip(mine.chunks, theirs.chunks, strict=False)

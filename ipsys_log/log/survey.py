@@ -28,7 +28,10 @@ __all__ = ["Survey", "crc_of", "survey"]
 _BLOCK = 1 << 20
 _HEAD_OVERLAP = 64
 # A chunk by its compression, or DataEnd with the record behind it: where to go on behind damage.
-_NEXT = re.compile(rb"\x06.{36}(\0\0\0\0|\4\0\0\0zstd|\3\0\0\0lz4)|\x0f\4\0{7}.{4}[\2\3\4\10\13]", re.DOTALL)
+_NEXT = re.compile(
+    rb"\x06.{36}(?:\x00{4}|\x04\x00{3}zstd|\x03\x00{3}lz4)|\x0f\x04\x00{7}.{4}[\x02\x03\x04\x08\x0b]",
+    re.DOTALL,
+)
 _DATA_SECTION = frozenset(
     (
         Opcode.SCHEMA,
@@ -67,9 +70,14 @@ class Survey:
     _indexed: set[int] = field(default_factory=set)
 
 
-def survey(view: View) -> Survey:
-    """Check the data section record by record; never believes a length, never raises for damage."""
+def survey(view: View, known: Contents | None = None) -> Survey:
+    """Check the data section record by record; never believes a length, never raises for damage.
+
+    `known` is what the summary says, if there is one: it may define what the data section does not.
+    """
     found = Survey()
+    if known is not None:
+        found.loose.schemas, found.loose.channels = dict(known.schemas), dict(known.channels)
     position = len(MAGIC)
     while position < view.size and not found.finished:
         position = _stretch(view, found, position)
@@ -130,6 +138,9 @@ def _take(view: View, found: Survey, at: RecordAt) -> None:
 def _take_chunk(view: View, found: Survey, at: RecordAt) -> None:
     data = unpack(view, at.offset, parse_chunk_head(view, at.offset)[1])
     inside = look_inside(view, at.offset, data)
+    known = inside.channels.keys() | found.loose.channels.keys()
+    if not inside.entries.keys() <= known:
+        raise view.fault(at.offset, "the chunk holds messages of a channel whose definition is lost")
     add_record(view, found.contents, found.loose, found.counts, at)
     found.counts[at.offset] = {key: len(rows) for key, rows in inside.entries.items()}
     found.loose.schemas = inside.schemas | found.loose.schemas
@@ -139,7 +150,7 @@ def _take_chunk(view: View, found: Survey, at: RecordAt) -> None:
 
 
 def _next_record(view: View, damaged: int, claimed: int) -> int | None:
-    """Where the next whole record begins behind the one that is damaged: where its length says, or a chunk."""
+    """Where the next whole record begins behind a damaged one: where that one's length says, or a chunk."""
     if claimed and _is_record(view, claimed):
         return claimed
     for base in range(damaged + HEADER.size, view.size, _BLOCK):

@@ -1,6 +1,7 @@
 """Reading a file by position, with the tail that an unfinished append may have replaced."""
 
 import os
+import stat
 from dataclasses import dataclass
 from pathlib import Path
 
@@ -73,8 +74,12 @@ class View:
 def open_for_reading(path: Path) -> int:
     """A file descriptor, or the operating system's refusal as one line."""
     try:
-        return os.open(path, os.O_RDONLY | os.O_CLOEXEC)
+        fd = os.open(path, os.O_RDONLY | os.O_CLOEXEC | os.O_NONBLOCK)
     except FileNotFoundError:
         raise LogError(f"{path} does not exist") from None
     except OSError as error:
         raise LogError(f"{path} cannot be opened: {error.strerror}") from None
+    if not stat.S_ISREG(os.fstat(fd).st_mode):
+        os.close(fd)
+        raise LogError(f"{path} cannot be read as a log: it is not a file")
+    return fd

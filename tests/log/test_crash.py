@@ -101,7 +101,7 @@ def test_append_to_a_larger_log(tmp_path: Path) -> None:
 
 
 def check_recording(folder: Path, rows: list[Row], operations: Sequence[Operation], tries: int) -> set[int]:
-    """After repair the rows that are there are the first ones of each topic; returns how many were kept."""
+    """After repair every row is one that was written, in order; returns how many were kept."""
     folder.mkdir()
     path = folder / "recording.mcap"
     by_topic = {topic: [row for row in rows if row[0] == topic] for topic in {row[0] for row in rows}}
@@ -118,7 +118,8 @@ def check_recording(folder: Path, rows: list[Row], operations: Sequence[Operatio
         got = read(path)
         for topic, expected in by_topic.items():
             mine = [row for row in got if row[0] == topic]
-            assert mine == expected[: len(mine)], f"after {cut} operations"
+            rest = iter(expected)
+            assert all(row in rest for row in mine), f"after {cut} operations"  # in order, none changed
         assert sorted(linear_rows(path)) == sorted(got)
         assert not repair(path).changed
         kept.add(len(got))

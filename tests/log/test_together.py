@@ -1,0 +1,128 @@
+"""Readers while somebody appends, and writers killed at random moments."""
+
+import os
+import random
+import signal
+import subprocess
+import sys
+import threading
+import time
+from pathlib import Path
+
+import pytest
+
+from ipsys_log.errors import LogError
+from ipsys_log.log import LogReader, repair
+from ipsys_log.log.journal import journal_path
+from tests.log.conftest import Row, append, as_row, create, linear_rows, stock_rows
+
+PER_SESSION = 5
+FIRST: list[Row] = [("/image/a", k, k, bytes(4000)) for k in range(10)]
+SCRIPT = Path(__file__).with_name("write_forever.py")
+
+
+def session(number: int) -> list[Row]:
+    return [(f"/runs/{number % 20}", 100 + number, k, b"x" * 50) for k in range(PER_SESSION)]
+
+
+def check_consistent(path: Path) -> int:
+    """Read all; the number of sessions in the log, which must all be whole."""
+    with LogReader(path) as reader:
+        rows = [as_row(message) for message in reader.messages()]
+        assert reader.message_count == len(rows)
+    sessions, rest = divmod(len(rows) - len(FIRST), PER_SESSION)
+    assert rest == 0
+    assert rows == FIRST + [row for number in range(sessions) for row in session(number)]
+    return sessions
+
+
+def test_an_open_reader_keeps_its_log(log: Path, rows: list[Row]) -> None:
+    with LogReader(log) as reader:
+        stream = reader.messages()
+        got = [next(stream)]
+        append(log, [("/runs/a", rows[-1][1] + k, k, b"x" * 100) for k in range(50)])
+        got += stream
+        assert [as_row(message) for message in got] == rows
+        assert reader.channel_hash("/points")
+        assert reader.times("/points").size == 60
+
+
+def test_readers_during_appends(tmp_path: Path) -> None:
+    path = create(tmp_path / "log.mcap", FIRST)
+    seen: list[int] = []
+    faults: list[BaseException] = []
+    done = threading.Event()
+
+    def keep_reading() -> None:
+        try:
+            while not done.is_set():
+                seen.append(check_consistent(path))
+        except BaseException as error:
+            faults.append(error)
+
+    readers = [threading.Thread(target=keep_reading) for _ in range(2)]
+    for reader in readers:
+        reader.start()
+    for number in range(40):
+        append(path, session(number))
+    done.set()
+    for reader in readers:
+        reader.join()
+    assert not faults
+    assert seen == sorted(seen) or len(set(seen)) > 1
+    assert check_consistent(path) == 40
+
+
+def start(kind: str, path: Path) -> "subprocess.Popen[bytes]":
+    return subprocess.Popen([sys.executable, str(SCRIPT), kind, str(path)], stdout=subprocess.PIPE)
+
+
+def kill_soon(process: "subprocess.Popen[bytes]", chance: random.Random) -> None:
+    assert process.stdout is not None
+    process.stdout.readline()  # it has begun
+    time.sleep(chance.random() * 0.15)
+    process.send_signal(signal.SIGKILL)
+    process.wait()
+    process.stdout.close()
+
+
+@pytest.mark.slow
+def test_kill_an_appender(tmp_path: Path) -> None:
+    path = create(tmp_path / "log.mcap", FIRST)
+    chance = random.Random(os.getpid())
+    sessions = journals = 0
+    for number in range(20):
+        kill_soon(start("append", path), chance)
+        journals += journal_path(path).exists()
+        now = check_consistent(path)
+        assert now >= sessions
+        sessions = now
+        if number % 2:
+            append(path, session(sessions))
+            assert check_consistent(path) == sessions + 1
+            assert len(stock_rows(path)) == len(FIRST) + PER_SESSION * (sessions + 1)
+            sessions += 1
+    repair(path)
+    assert check_consistent(path) == sessions > 20
+    print(f"{sessions} sessions, {journals} journals left over")  # noqa: T201
+
+
+@pytest.mark.slow
+def test_kill_a_recorder(tmp_path: Path) -> None:
+    chance = random.Random(os.getpid())
+    kept = 0
+    for number in range(15):
+        path = tmp_path / f"{number}.mcap"
+        kill_soon(start("record", path), chance)
+        with pytest.raises(LogError, match="ipsys repair"):
+            LogReader(path)
+        report = repair(path)
+        with LogReader(path) as reader:
+            times = [message.log_time_ns for message in reader.messages(["/points"])]
+            images = [message.log_time_ns for message in reader.messages(["/image/a"])]
+        assert times == list(range(0, len(times) * 10**8, 10**8))
+        assert images == list(range(0, len(images) * 10**8, 10**8))
+        assert len(linear_rows(path)) == len(times) + len(images) == report.messages_kept
+        kept += len(times)
+        path.unlink()
+    assert kept > 0

@@ -1,0 +1,327 @@
+"""Replay: what is missing or out of date is computed and appended, and nothing else."""
+
+from __future__ import annotations
+
+import json
+import random
+import shutil
+import time
+from collections.abc import Iterator
+from dataclasses import replace
+from pathlib import Path
+from typing import Any
+
+import cv2
+import numpy as np
+import pytest
+
+from ipsys_log.derive import Request
+from ipsys_log.log.codec import encode
+from ipsys_log.log.session import Session
+from ipsys_log.messages import (
+    CameraPoints,
+    CompressedImage,
+    Markers,
+    Message,
+    Model,
+    Positions,
+    Rig,
+    Tracks,
+)
+from ipsys_log.pipeline import Stage, in_threads, replay, run
+from ipsys_log.rig import load_rig
+from ipsys_log.runs import write_log
+from tests.conftest import Ipsys, data_section
+
+RIG_TOML = """
+name = "simulated"
+dictionary = "DICT_4X4_100"
+marker_length_m = {length}
+[[reference_points]]
+name = "A"
+x_m = 1.2192
+y_m = 2.4384
+[[reference_points]]
+name = "B"
+x_m = 3.6576
+y_m = 2.4384
+"""
+
+
+def stages_of(ipsys: Ipsys, *arguments: object) -> dict[str, tuple[str, bool]]:
+    done = ipsys(*arguments, "--json")
+    assert done.code == 0, done.err
+    return {row["stage"]: (row["run"], row["new"]) for row in json.loads(done.out)["stages"]}
+
+
+def write_rig(path: Path, lab: Path, length_m: float) -> Path:
+    """The lab's rig as a file, with another marker length."""
+    with Session([lab]) as session:
+        held = session.payloads(["/rig"])[0]
+    robots = "".join(f'[[markers]]\nid = {m.id}\nrobot = "{m.robot}"\n' for m in held.markers)
+    path.write_text(RIG_TOML.format(length=length_m) + robots)
+    return path
+
+
+def frames(count: int) -> Iterator[Message]:
+    yield Message("/rig", 0, 0, Rig("lab", "DICT_4X4_100", 0.2))
+    for number in range(1, count):
+        camera = ("red", "white", "black")[number % 3]
+        yield Message(
+            f"/cameras/{camera}/image", number, number, CompressedImage(number, camera, b"", ""), camera
+        )
+
+
+def test_run_puts_what_a_stage_makes_behind_what_it_was_made_of() -> None:
+    def seen(message: Message) -> Iterator[Any]:
+        yield Markers(message.publish_time_ns, (), 1, 1)
+
+    def located(message: Message) -> Iterator[Any]:
+        yield Positions(message.publish_time_ns, ())
+
+    stages = [Stage("a", (CompressedImage,), seen), Stage("b", (Markers,), located)]
+    made = list(run(frames(3), stages))
+    assert [message.topic for message in made] == [
+        "/rig",
+        "/cameras/white/image",
+        "/runs/a/cameras/white/markers",
+        "/runs/b/cameras/white/positions",
+        "/cameras/black/image",
+        "/runs/a/cameras/black/markers",
+        "/runs/b/cameras/black/positions",
+    ]
+    assert [message.log_time_ns for message in made] == [0, 1, 1, 1, 2, 2, 2]
+
+
+def test_threads_change_the_speed_and_not_the_order() -> None:
+    uneven = random.Random(0)
+    last: dict[str | None, int] = {}
+
+    def slow(message: Message) -> Iterator[Any]:
+        time.sleep(uneven.random() * 0.003)
+        # A camera's messages come to its stage one after the other, in order.
+        assert last.get(message.camera, -1) < message.log_time_ns
+        last[message.camera] = message.log_time_ns
+        yield Markers(message.publish_time_ns, (), 1, 1)
+
+    stage = Stage("a", (CompressedImage,), slow)
+    plain = [(m.topic, m.log_time_ns) for m in run(frames(60), [stage])]
+    last.clear()
+    threaded = [(m.topic, m.log_time_ns) for m in run(frames(60), [stage], in_threads)]
+    assert threaded == plain
+
+
+def test_a_stage_across_cameras_takes_one_message_after_the_other() -> None:
+    order: list[int] = []
+
+    def across(message: Message) -> Iterator[Any]:
+        time.sleep(0.002 if message.camera == "white" else 0)
+        order.append(message.log_time_ns)
+        yield Markers(message.publish_time_ns, (), 1, 1)
+
+    list(run(frames(30), [Stage("a", (CompressedImage,), across, per_camera=False)], in_threads))
+    assert order == sorted(order)
+
+
+def test_a_replay_gives_the_same_bytes_every_time(lab_log: Path, tmp_path: Path) -> None:
+    written = []
+    for number in range(6):
+        log = Path(shutil.copy(lab_log, tmp_path / f"{number}.mcap"))
+        replay([log], Request(models=("poly",)))
+        written.append(log.read_bytes())
+    assert len(set(written)) == 1
+
+
+def test_a_thread_that_fails_is_heard_and_the_rest_is_left() -> None:
+    def failing(message: Message) -> Iterator[Any]:
+        if message.log_time_ns == 20:
+            raise ValueError("a bug")
+        yield Markers(message.publish_time_ns, (), 1, 1)
+
+    threads = cv2.getNumThreads()
+    with pytest.raises(ValueError, match="a bug"):
+        list(run(frames(60), [Stage("a", (CompressedImage,), failing)], in_threads))
+    assert cv2.getNumThreads() == threads
+
+
+def test_everything_is_made_once(ipsys: Ipsys, lab: Path) -> None:
+    recorded = data_section(lab)
+    first = stages_of(ipsys, "replay", lab, "--model", "poly")
+    assert first == {
+        "detect": ("stock", True),
+        "camera-frame": ("stock", True),
+        "fit": ("poly", True),
+        "evaluate": ("poly", True),
+        "locate": ("poly", True),
+        "fuse": ("poly", True),
+    }
+    after = lab.read_bytes()
+    assert after.startswith(recorded)
+    second = stages_of(ipsys, "replay", lab, "--model", "poly")
+    assert all(not new for _, new in second.values())
+    assert "nothing to do" in ipsys("replay", lab, "--model", "poly").err
+    assert lab.read_bytes() == after
+
+
+def test_a_second_model_shares_the_detection(ipsys: Ipsys, lab: Path) -> None:
+    ipsys("replay", lab)
+    stages = stages_of(ipsys, "replay", lab, "--model", "rigid+poly")
+    assert stages["detect"] == ("stock", False)
+    assert stages["fit"] == ("rigid_poly", True)
+    assert stages["fuse"] == ("rigid_poly", True)
+
+
+def test_replay_in_place_and_into_a_new_log_give_the_same_messages(
+    ipsys: Ipsys, lab: Path, tmp_path: Path
+) -> None:
+    beside, before = tmp_path / "derived.mcap", lab.read_bytes()
+    assert ipsys("replay", lab, "-o", beside).code == 0
+    assert lab.read_bytes() == before
+    assert ipsys("replay", lab).code == 0
+    with Session([lab]) as one, Session([beside]) as other:
+        topics = {t for reader in other.readers for t in reader.channels}
+        assert topics
+        assert [(m.topic, m.log_time_ns, encode(m.payload)) for m in one.messages(topics)] == [
+            (m.topic, m.log_time_ns, encode(m.payload)) for m in other.messages(topics)
+        ]
+    # Read together, the two logs are one that lacks nothing.
+    lab.write_bytes(before)
+    assert all(not new for _, new in stages_of(ipsys, "replay", lab, beside).values())
+
+
+def test_a_mistyped_marker_length_is_put_right_as_a_new_run(ipsys: Ipsys, lab: Path, tmp_path: Path) -> None:
+    ipsys("replay", lab)
+    rig = write_rig(tmp_path / "lab.toml", lab, 0.18)
+    stages = stages_of(ipsys, "replay", lab, "--rig", rig)
+    # The length bears on the camera points, not on the corners.
+    assert stages["detect"] == ("stock", False)
+    assert stages["camera-frame"] == ("stock_2", True)
+    assert stages["fit"] == ("poly_2", True)
+    with Session([lab]) as session:
+        old, new = (
+            [p.z_m for m in session.payloads(session.topics(CameraPoints, run)) for p in m.points]
+            for run in ("stock", "stock_2")
+        )
+    np.testing.assert_allclose(np.array(new) / np.array(old), 0.9, rtol=1e-12)
+    # Both stand side by side, and each is found again.
+    assert all(not new for _, new in stages_of(ipsys, "replay", lab).values())
+    assert all(not new for _, new in stages_of(ipsys, "replay", lab, "--rig", rig).values())
+
+
+def test_a_rig_that_says_the_same_changes_nothing(ipsys: Ipsys, lab: Path, tmp_path: Path) -> None:
+    ipsys("replay", lab)
+    rig = write_rig(tmp_path / "lab.toml", lab, 0.20)
+    assert load_rig(rig).name == "simulated"
+    assert all(not new for _, new in stages_of(ipsys, "replay", lab, "--rig", rig).values())
+
+
+def test_a_lens_calibrated_later_is_a_new_run(ipsys: Ipsys, lab: Path, tmp_path: Path) -> None:
+    ipsys("replay", lab)
+    with Session([lab]) as session:
+        lens = session.payloads(["/cameras/red/calibration"])[0]
+    for scale, fresh in ((1.01, True), (1.0, False)):
+        path = tmp_path / f"red_{scale}.yaml"
+        storage = cv2.FileStorage(str(path), cv2.FILE_STORAGE_WRITE)
+        storage.write("camera_matrix", lens.K * np.array([[scale, 1, 1], [1, scale, 1], [1, 1, 1]]))
+        storage.write("distortion_coefficients", lens.D.reshape(-1, 1))
+        storage.write("image_width", lens.width)
+        storage.write("image_height", lens.height)
+        storage.release()
+        stages = stages_of(ipsys, "replay", lab, "--calibration", f"red={path}")
+        assert stages["detect"] == ("stock", False)
+        assert stages["camera-frame"][1] is fresh
+    runs = json.loads(ipsys("runs", lab, "--json").out)
+    assert [run["overrides"] for run in runs if run["run"] == "stock_2"] == [["lens red"]]
+
+
+def test_a_model_of_another_log_is_applied_and_copied_in(ipsys: Ipsys, lab: Path, tmp_path: Path) -> None:
+    ipsys("replay", lab)
+    drive = tmp_path / "drive.mcap"
+    with Session([lab]) as session:
+        kept = ["/rig", *session.images.values(), *session.calibrations.values()]
+        write_log(drive, session.messages(kept))
+        original = session.payloads(session.topics(Model, "poly"))[0]
+    assert ipsys("replay", drive).code == 1  # it has no measurements of its own
+    stages = stages_of(ipsys, "replay", drive, "--model-from", lab)
+    assert stages["fit"] == ("poly", True)
+    assert "evaluate" not in stages
+    lab.unlink()  # the log needs no other file
+    with Session([drive]) as session:
+        assert encode(session.payloads(session.topics(Model, "poly"))[0]) == encode(original)
+        assert session.payloads(session.topics(Tracks, "poly"))
+
+
+@pytest.mark.parametrize("camera", ["red", "black"])
+def test_one_camera_alone(ipsys: Ipsys, lab: Path, tmp_path: Path, camera: str) -> None:
+    alone = tmp_path / "alone.mcap"
+    with Session([lab]) as session:
+        topics = ["/rig", "/measurements", f"/cameras/{camera}/image", f"/cameras/{camera}/calibration"]
+        write_log(alone, session.messages(topics))
+    done = ipsys("replay", alone, "--json")
+    assert done.code == 0, done.err
+    assert list(json.loads(done.out)["models"]["poly"]["cameras"]) == [camera]
+    with Session([alone]) as session:
+        tracks = session.payloads(session.topics(Tracks, "poly"))
+    assert {track.cameras for message in tracks for track in message.tracks} == {(camera,)}
+
+
+def test_new_measurements_make_the_model_out_of_date(ipsys: Ipsys, lab: Path) -> None:
+    from ipsys_log.log import LogWriter
+    from ipsys_log.messages import Measurement
+    from ipsys_log.runs import write_messages
+
+    ipsys("replay", lab)
+    with Session([lab]) as session:
+        withdrawn = next(m for m in session.payloads(["/measurements"]) if "train" in m.splits)
+        end_ns = session.end_ns
+    withdrawal = Measurement(end_ns, "w1", withdraws=withdrawn.id)
+    with LogWriter.append(lab) as writer:
+        write_messages(writer, [Message("/measurements", end_ns + 1, end_ns, withdrawal)])
+    stages = stages_of(ipsys, "replay", lab)
+    assert stages["camera-frame"] == ("stock", False)
+    assert stages["fit"] == ("poly_2", True)
+    with Session([lab]) as session:
+        old, new = (session.payloads(session.topics(Model, run))[0] for run in ("poly", "poly_2"))
+    used = [{pair.measurement for camera in model.cameras for pair in camera.pairs} for model in (old, new)]
+    assert used[0] - used[1] == {withdrawn.id}
+
+
+def test_a_run_may_be_named(ipsys: Ipsys, lab: Path) -> None:
+    stages = stages_of(ipsys, "replay", lab, "--run", "monday")
+    assert stages["detect"] == ("stock", True)
+    assert stages["fit"] == stages["fuse"] == ("monday", True)
+    again = ipsys("replay", lab, "--run", "monday", "--model", "rigid")
+    assert again.code == 1
+    assert "monday already has the stage fit" in again.err
+
+
+def test_an_unlabelled_log_is_split_by_a_recorded_seed(ipsys: Ipsys, lab: Path, tmp_path: Path) -> None:
+    plain = tmp_path / "plain.mcap"
+
+    def unlabelled() -> Iterator[Message]:
+        with Session([lab]) as session:
+            for message in session.messages(
+                ["/rig", "/measurements", *session.images.values(), *session.calibrations.values()]
+            ):
+                labelled = message.topic == "/measurements"
+                yield replace(message, payload=replace(message.payload, splits=())) if labelled else message
+
+    write_log(plain, unlabelled())
+    held_out = {}
+    for seed in (0, 1, 0):
+        done = ipsys("evaluate", plain, "--model", "rigid", "--seed", seed, "--json")
+        assert done.code == 0, done.err
+        held_out.setdefault(seed, []).append(json.loads(done.out)["models"]["rigid"]["cameras"])
+    assert held_out[0][0] == held_out[0][1]
+    assert held_out[0][0] != held_out[1][0]
+    runs = json.loads(ipsys("runs", plain, "--json").out)
+    assert {run["parameters"]["seed"] for run in runs if run["stage"] == "fit"} == {"0", "1"}
+
+
+def test_errors_against_the_truth_and_against_the_tape(ipsys: Ipsys, lab: Path) -> None:
+    model = json.loads(ipsys("replay", lab, "--model", "rigid", "--json").out)["models"]["rigid"]
+    for errors in model["cameras"].values():
+        assert 0 < errors["truth"]["3d"]["mean_cm"] < 4
+        assert 0 < errors["3d"]["mean_cm"] < 4
+        assert errors["truth"] != {key: errors[key] for key in ("3d", "2d")}
+    assert 0 < model["tracks"]["truth"]["3d"]["mean_cm"] < 4

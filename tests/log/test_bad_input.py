@@ -10,13 +10,19 @@ from pathlib import Path
 from typing import Any, cast
 
 import pytest
+import zstandard
+from mcap import records as mcap
+from mcap.writer import Writer
 
 from ipsys_log.errors import LogError
-from ipsys_log.log import LogReader, LogWriter, repair
+from ipsys_log.log import LogReader, LogWriter, Schema, repair
+from ipsys_log.log.contents import Contents
 from ipsys_log.log.journal import journal_path
-from ipsys_log.log.records import MAGIC
+from ipsys_log.log.records import MAGIC, ChunkRef, as_bytes
 from ipsys_log.log.storage import DISK, Storage
-from tests.log.conftest import Row, append, create
+from ipsys_log.log.summary import tail_bytes
+from tests.log.conftest import Row, append, create, stock_rows
+from tests.log.crash import Recorder
 
 
 def read_everything(path: Path) -> None:
@@ -108,6 +114,95 @@ def test_a_journal_of_another_file_is_not_believed(log: Path, tmp_path: Path, ro
         assert not journal_path(log).exists()
 
 
+def test_a_whole_journal_of_another_file_is_not_believed(log: Path, tmp_path: Path, rows: list[Row]) -> None:
+    storage = Recorder()
+    other = create(tmp_path / "other.mcap", rows[::2])
+    storage.know(other)
+    append(other, rows[:4], storage)
+    pieces = [o.data for o in storage.operations if o.kind == "write" and o.file != 1]
+    before = log.read_bytes()
+    huge = b"\x89IPSYSJ1" + struct.pack("<QQIIQ", (1 << 64) - 1, 0, 0, 0, (1 << 64) - 1) + bytes(4)
+    for content in (b"".join(pieces), huge):
+        journal_path(log).write_bytes(content)
+        read_everything(log)
+        LogWriter.append(log).close()
+        assert log.read_bytes() == before
+    assert pieces[0].startswith(b"\x89IPSYSJ1")
+
+
+def test_a_changed_summary(log: Path) -> None:
+    data = bytearray(log.read_bytes())
+    data[data.rindex(b"image definition")] ^= 1
+    log.write_bytes(data)
+    with pytest.raises(LogError, match="the CRC of the summary is wrong"):
+        LogReader(log)
+
+
+def build(path: Path, contents: Contents, *records: mcap.McapRecord) -> Path:
+    """A log of these records with a summary by `contents`."""
+    data = MAGIC + as_bytes(mcap.Header("", "")) + b"".join(as_bytes(record) for record in records)
+    contents.data_end = len(data)
+    path.write_bytes(data + tail_bytes(contents))
+    return path
+
+
+@pytest.mark.parametrize("with_size", [True, False])
+def test_a_bomb_is_not_unpacked(with_size: bool, tmp_path: Path) -> None:
+    """A frame that claims much more than its chunk does, and a chunk that claims more than one may."""
+    bomb = zstandard.ZstdCompressor(write_content_size=with_size).compress(bytes(300 << 20))
+    size = 1000 if with_size else 1 << 42
+    chunk = mcap.Chunk("zstd", bomb, 1, 1, 0, size)
+    start = len(MAGIC) + len(as_bytes(mcap.Header("", "")))
+    contents = Contents(channels={1: mcap.Channel(1, "/a", "", {}, 0)}, counts={1: 1})
+    contents.chunks.append(ChunkRef(start, len(as_bytes(chunk)), 1, 1, "zstd", len(bomb), size, 0, {}))
+    path = build(tmp_path / "bomb.mcap", contents, chunk)
+    tracemalloc.start()
+    try:
+        assert "the chunk" in fault_of(read_everything, path)
+        assert tracemalloc.get_traced_memory()[1] < 64 << 20
+    finally:
+        tracemalloc.stop()
+
+
+def test_messages_between_chunks_are_found(log: Path, rows: list[Row]) -> None:
+    with LogReader(log) as reader:
+        contents, end = reader._contents, reader.data_end
+    loose = as_bytes(mcap.Message(1, 5, b"loose", 6, 0))
+    contents.count(1, 1)
+    contents.cover(5, 5)
+    data = log.read_bytes()[:end] + loose
+    contents.data_end, contents.data_crc = len(data), 0
+    log.write_bytes(data + tail_bytes(contents))
+    with LogReader(log) as reader:
+        got = [(m.log_time_ns, m.publish_time_ns, m.data) for m in reader.messages(["/image/0"])]
+    assert got == [(5, 6, b"loose"), *(row[1:] for row in rows if row[0] == "/image/0")]
+
+
+def test_an_index_that_points_to_another_message(log: Path) -> None:
+    with LogReader(log) as reader:
+        chunk = next(c for c in reader._contents.chunks if c.compression)
+    at = next(iter(chunk.index_offsets.values())) + 15
+    data = bytearray(log.read_bytes())
+    data[at + 8 : at + 16], data[at + 24 : at + 32] = data[at + 24 : at + 32], data[at + 8 : at + 16]
+    log.write_bytes(data)
+    assert "points to no message of its time" in fault_of(read_everything, log)
+    repair(log)
+    assert fault_of(read_everything, log) == ""
+
+
+def test_a_hash_that_was_copied_with_its_record_is_not_believed(tmp_path: Path) -> None:
+    path = tmp_path / "copy.mcap"
+    with path.open("wb") as file:
+        writer = Writer(file)
+        writer.start()
+        writer.add_message(writer.register_channel("/a", "", 0), 5, b"payload", 5)
+        writer.add_metadata("ipsys", {"offset": "12345", "hash:/a": f"1 5 {'00' * 16}"})
+        writer.add_metadata("ipsys", {"hash:/a": "1 5"})
+        writer.finish()  # type: ignore[no-untyped-call]
+    with LogReader(path) as reader:
+        assert int(reader.channel_hash("/a"), 16) != 0
+
+
 def test_any_byte_changed(log: Path) -> None:
     """Either it is read, or one line says what is wrong."""
     append(log, [("/runs/a", k, k, b"x") for k in range(9)])
@@ -192,6 +287,36 @@ def test_a_full_disk_while_recording(tmp_path: Path, rows: list[Row]) -> None:
     repair(path)
     with LogReader(path) as reader:
         assert 0 < len(list(reader.messages())) < len(rows)
+
+
+@dataclass
+class OneFault:
+    """A disk that once writes only half."""
+
+    armed: bool = False
+
+    def __getattr__(self, name: str) -> Any:
+        return getattr(DISK, name)
+
+    def pwrite(self, fd: int, data: bytes | memoryview, offset: int) -> int:
+        if self.armed and len(data) > 5_000:
+            self.armed = False
+            DISK.pwrite(fd, data[: len(data) // 2], offset)
+            raise OSError(errno.ENOSPC, "No space left on device")
+        return DISK.pwrite(fd, data, offset)
+
+
+def test_a_recording_outlives_one_failed_write(tmp_path: Path) -> None:
+    path = tmp_path / "recording.mcap"
+    storage = OneFault()
+    with LogWriter.create(path, storage=cast(Storage, storage)) as writer:
+        writer.add_channel("/a", None)
+        writer.write("/a", 1, 1, b"payload")
+        storage.armed = True
+        with pytest.raises(LogError, match="No space left"):
+            writer.add_channel("/big", Schema("Big", "x", bytes(100_000)))
+    read_everything(path)
+    assert [row[3] for row in stock_rows(path)] == [b"payload"]
 
 
 def test_a_full_disk_while_appending(log: Path) -> None:

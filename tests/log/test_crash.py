@@ -35,9 +35,10 @@ def check_append(folder: Path, old: bytes, new: bytes, operations: Sequence[Oper
     for name, data in (("old", old), ("new", new)):
         path.write_bytes(data)
         wanted[name] = read(path)
-    states: dict[tuple[tuple[str, bytes], ...], int] = {}
+    states: dict[tuple[object, ...], int] = {}
     for cut, disk in crashes({"session.mcap": old}, operations, random.Random(1), tries):
-        state = tuple(sorted((name, bytes(disk.files[number])) for name, number in disk.names.items()))
+        files = sorted((name, bytes(disk.files[number])) for name, number in disk.names.items())
+        state = (cut == len(operations), *files)
         if state in states:
             continue
         states[state] = cut
@@ -108,6 +109,8 @@ def check_recording(folder: Path, rows: list[Row], operations: Sequence[Operatio
     kept = set()
     for cut, disk in crashes({}, operations, random.Random(4), tries):
         disk.store(folder)
+        assert path.exists() or "sync_directory" not in [o.kind for o in operations[:cut]]
+        assert operations.index(Operation("sync_directory")) < 3, "before anything is written"
         if not path.exists() or path.stat().st_size < 8:
             continue
         if path.read_bytes()[:8] != MAGIC:

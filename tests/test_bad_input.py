@@ -1,0 +1,366 @@
+"""Bad input: one line that says what, where and what to do; exit code 1; nothing half-written."""
+
+from __future__ import annotations
+
+import subprocess
+import sys
+from collections.abc import Callable, Iterator
+from dataclasses import replace
+from pathlib import Path
+
+import cv2
+import numpy as np
+import pytest
+
+from ipsys_log.log.session import Session
+from ipsys_log.messages import (
+    CompressedImage,
+    Distance,
+    Event,
+    Markers,
+    Measurement,
+    Message,
+    Rig,
+    RigMarker,
+)
+from ipsys_log.runs import write_log
+from ipsys_log.units import format_time
+from tests.conftest import Ipsys
+
+
+def rewrite(lab: Path, change: Callable[[Message], Message | None], extra: tuple[Message, ...] = ()) -> Path:
+    """The lab with each message changed, or left out where ``change`` gives None."""
+    path = lab.with_name("changed.mcap")
+
+    def messages() -> Iterator[Message]:
+        with Session([lab]) as session:
+            topics = [topic for reader in session.readers for topic in reader.channels]
+            changed = (change(message) for message in session.messages(topics))
+            yield from (message for message in changed if message is not None)
+        yield from extra
+
+    write_log(path, messages())
+    return path
+
+
+def refused(ipsys: Ipsys, log: Path, *arguments: object) -> str:
+    """Run a command that must fail; its one line, after looking that nothing was written."""
+    before = {path: path.read_bytes() for path in log.parent.iterdir() if path.is_file()}
+    done = ipsys(*arguments)
+    assert done.code == 1
+    assert done.out == ""
+    assert done.err.startswith("ipsys: ")
+    assert done.err.count("\n") == 1
+    assert "Traceback" not in done.err
+    assert {path: path.read_bytes() for path in log.parent.iterdir() if path.is_file()} == before
+    return done.err
+
+
+def test_not_an_mcap(ipsys: Ipsys, tmp_path: Path) -> None:
+    log = tmp_path / "a.mcap"
+    log.write_bytes(b"PK\3\4 something else entirely, and long enough to be read as a footer")
+    assert "not an MCAP" in refused(ipsys, log, "replay", log)
+    log.write_bytes(b"")
+    assert "empty" in refused(ipsys, log, "info", log)
+    assert "does not exist" in refused(ipsys, log, "replay", tmp_path / "b.mcap")
+    assert "is not a file" in refused(ipsys, log, "info", tmp_path)
+
+
+@pytest.mark.parametrize("kept", [0.5, 0.999])
+def test_a_truncated_log(ipsys: Ipsys, lab: Path, kept: float) -> None:
+    whole = lab.read_bytes()
+    lab.write_bytes(whole[: int(len(whole) * kept)])
+    line = refused(ipsys, lab, "replay", lab)
+    assert "no footer" in line
+    assert f"ipsys repair {lab}" in line
+    assert ipsys("repair", lab).code == 0
+    assert ipsys("info", lab).code == 0
+
+
+def test_no_rig(ipsys: Ipsys, lab: Path) -> None:
+    log = rewrite(lab, lambda message: None if isinstance(message.payload, Rig) else message)
+    line = refused(ipsys, log, "replay", log)
+    assert "--rig" in line
+    assert "ipsys init" in line
+
+
+def test_no_calibration_for_a_camera(ipsys: Ipsys, lab: Path) -> None:
+    log = rewrite(lab, lambda message: None if message.topic == "/cameras/white/calibration" else message)
+    line = refused(ipsys, log, "replay", log)
+    assert "camera white has no calibration" in line
+    assert "--calibration white=" in line
+    refused(ipsys, log, "replay", log, "-o", log.with_name("out.mcap"))
+
+
+def test_a_calibration_of_another_size(ipsys: Ipsys, lab: Path) -> None:
+    def wider(message: Message) -> Message:
+        if message.topic == "/cameras/red/calibration":
+            return replace(message, payload=replace(message.payload, width=1920, height=1080))
+        return message
+
+    line = refused(ipsys, lab, "replay", rewrite(lab, wider), "-o", lab.with_name("out.mcap"))
+    assert "camera red: its frames are 960 x 540 px, its calibration is for 1920 x 1080" in line
+
+
+def renumber(marker_id: int) -> Callable[[Message], Message]:
+    def change(message: Message) -> Message:
+        if isinstance(message.payload, Measurement) and message.payload.id.endswith("3"):
+            return replace(message, payload=replace(message.payload, marker_id=marker_id))
+        return message
+
+    return change
+
+
+def test_an_unknown_marker_id_in_a_measurement(ipsys: Ipsys, lab: Path) -> None:
+    line = refused(ipsys, lab, "replay", rewrite(lab, renumber(77)))
+    assert "marker 77, which is not in the rig" in line
+
+
+def test_only_markers_that_are_not_in_the_rig(ipsys: Ipsys, lab: Path) -> None:
+    def other_rig(message: Message) -> Message:
+        if isinstance(message.payload, Rig):
+            return replace(message, payload=replace(message.payload, markers=(RigMarker(50),)))
+        return message
+
+    log = rewrite(lab, other_rig)
+    line = refused(ipsys, log, "detect", log)
+    assert "ids 0, 1, 2" in line
+    assert "[[markers]]" in line
+
+
+def test_some_markers_that_are_not_in_the_rig_are_left_out_and_named(ipsys: Ipsys, lab: Path) -> None:
+    def smaller_rig(message: Message) -> Message:
+        if isinstance(message.payload, Rig):
+            kept = tuple(marker for marker in message.payload.markers if marker.id != 5)
+            return replace(message, payload=replace(message.payload, markers=kept))
+        return message
+
+    log = rewrite(lab, smaller_rig)
+    done = ipsys("detect", log)
+    assert done.code == 0
+    assert "unknown marker" in done.err
+    with Session([log]) as session:
+        seen = {m.id for p in session.payloads(session.topics(Markers, "stock")) for m in p.markers}
+        events = session.payloads(session.topics(Event, "stock"))
+    assert seen == {0, 1, 2, 3, 4, 6, 7}
+    # Once for each camera, not for each frame.
+    assert sorted(str(event.camera) for event in events) == ["black", "red", "white"]
+    assert {event.marker_id for event in events} == {5}
+
+
+def doubled(lab: Path, number: int = 3) -> tuple[Path, int]:
+    """The lab with one marker copied beside itself in one frame of the red camera."""
+    times: list[int] = []
+
+    def change(message: Message) -> Message:
+        if message.topic != "/cameras/red/image":
+            return message
+        times.append(message.log_time_ns)
+        if len(times) != number:
+            return message
+        picture = cv2.imdecode(np.frombuffer(message.payload.data, np.uint8), cv2.IMREAD_COLOR)
+        assert picture is not None
+        dictionary = cv2.aruco.getPredefinedDictionary(cv2.aruco.DICT_4X4_100)
+        picture[:, :340] = 180
+        for x in (40, 200):
+            marker = cv2.aruco.generateImageMarker(dictionary, 4, 90)
+            picture[100:220, x : x + 120] = 255
+            picture[115:205, x + 15 : x + 105] = marker[..., None]
+        data = cv2.imencode(".jpg", picture)[1].tobytes()
+        return replace(message, payload=replace(message.payload, data=data))
+
+    return rewrite(lab, change), times[number - 1]
+
+
+def test_two_markers_of_one_id_in_a_frame(ipsys: Ipsys, lab: Path) -> None:
+    log, time_ns = doubled(lab)
+    line = refused(ipsys, log, "replay", log)
+    assert "/cameras/red/image: marker 4 is seen" in line
+    assert format_time(time_ns) in line
+    assert "--skip-ambiguous" in line
+    done = ipsys("replay", log, "--skip-ambiguous")
+    assert done.code == 0
+    assert "1 x ambiguous marker" in done.err
+
+
+@pytest.mark.parametrize(
+    ("model", "places", "needed"), [("poly", 9, 10), ("rigid+poly", 9, 10), ("rigid", 2, 3)]
+)
+def test_fewer_places_than_a_model_needs(
+    ipsys: Ipsys, data: Path, tmp_path: Path, model: str, places: int, needed: int
+) -> None:
+    imsel = tmp_path / "imsel.mcap"
+    ipsys("import", "imsel", data / "imsel", "-o", imsel)
+
+    def few(message: Message) -> Message | None:
+        payload = message.payload
+        if isinstance(payload, Measurement) and int(payload.id[-2:]) >= places:
+            return None
+        return message
+
+    log = rewrite(imsel, few)
+    line = refused(ipsys, log, "fit", log, "--model", model)
+    assert f"{model} needs at least {needed} measured places, found {places}" in line
+
+
+def test_places_on_a_line(ipsys: Ipsys, data: Path, tmp_path: Path) -> None:
+    imsel = tmp_path / "imsel.mcap"
+    ipsys("import", "imsel", data / "imsel", "-o", imsel)
+
+    def in_a_row(message: Message) -> Message:
+        payload = message.payload
+        if isinstance(payload, Measurement) and payload.point is not None:
+            return replace(message, payload=replace(payload, point=replace(payload.point, y_m=1.0, z_m=0.0)))
+        return message
+
+    log = rewrite(imsel, in_a_row)
+    assert "on one line" in refused(ipsys, log, "fit", log, "--model", "rigid")
+
+
+def test_an_impossible_triangle(ipsys: Ipsys, lab: Path) -> None:
+    def too_short(message: Message) -> Message:
+        payload = message.payload
+        if isinstance(payload, Measurement) and payload.distances:
+            distances = (Distance("A", 0.4), Distance("B", 0.5))
+            return replace(message, payload=replace(payload, id="s_first", distances=distances))
+        return message
+
+    seen: list[bool] = []
+
+    def once(message: Message) -> Message:
+        if isinstance(message.payload, Measurement) and not seen:
+            seen.append(True)
+            return too_short(message)
+        return message
+
+    log = rewrite(lab, once)
+    line = refused(ipsys, log, "replay", log)
+    assert "measurement s_first" in line
+    assert "AB = 2.4384 m, d1 = 0.4000 m and d2 = 0.5000 m" in line
+
+
+def test_two_cameras_of_one_name(ipsys: Ipsys, lab: Path, tmp_path: Path) -> None:
+    rig = tmp_path / "lab.toml"
+    rig.write_text(
+        'name = "a"\ndictionary = "DICT_4X4_100"\nmarker_length_m = 0.2\n'
+        '[[cameras]]\nname = "red"\n[[cameras]]\nname = "red"\n'
+    )
+    assert "two cameras have the name 'red'" in refused(ipsys, lab, "replay", lab, "--rig", rig)
+    other = rewrite(lab, lambda message: message)
+    line = refused(ipsys, lab, "replay", lab, other, "-o", tmp_path / "out.mcap")
+    assert "two cameras of one name" in line
+
+
+@pytest.mark.parametrize("damage", ["cut", "zeros", "empty", "noise"])
+def test_a_corrupt_jpeg_in_the_middle(ipsys: Ipsys, lab: Path, damage: str) -> None:
+    times: list[int] = []
+
+    def hurt(data: bytes) -> bytes:
+        middle = len(data) // 2
+        return {
+            "cut": data[:middle],
+            "zeros": data[:middle] + bytes(2000) + data[middle + 2000 :],
+            "empty": b"",
+            "noise": bytes(range(256)) * 40,
+        }[damage]
+
+    def change(message: Message) -> Message:
+        if message.topic != "/cameras/white/image":
+            return message
+        times.append(message.log_time_ns)
+        if len(times) != 4:
+            return message
+        return replace(message, payload=replace(message.payload, data=hurt(message.payload.data)))
+
+    log = rewrite(lab, change)
+    done = ipsys("replay", log)
+    assert done.code == 0, done.err
+    assert "1 x corrupt frame, first: /cameras/white/image" in done.err
+    assert f"{format_time(times[3])} ({times[3]} ns)" in done.err
+    with Session([log]) as session:
+        images = session.count("/cameras/white/image")
+        seen = [m.log_time_ns for m in session.messages(["/runs/stock/cameras/white/markers"])]
+        events = session.payloads(session.topics(Event, "stock"))
+    assert len(seen) == images - 1
+    assert times[3] not in seen
+    assert [(event.kind, event.camera) for event in events] == [("corrupt_frame", "white")]
+
+
+def test_names_and_options_that_cannot_be(ipsys: Ipsys, lab: Path, tmp_path: Path) -> None:
+    assert "model 'spline' is not known; use one of" in refused(
+        ipsys, lab, "replay", lab, "--model", "spline"
+    )
+    assert "small letters" in refused(ipsys, lab, "replay", lab, "--run", "Monday/1")
+    assert "camera=file.yaml" in refused(ipsys, lab, "replay", lab, "--calibration", "red")
+    assert "no such camera" in refused(ipsys, lab, "replay", lab, "--calibration", f"blue={yaml(tmp_path)}")
+    assert "there is no such" in refused(ipsys, lab, "replay", lab, "--calibration", "red=nowhere.yaml")
+    assert "no measurement is labelled 'half'" in refused(ipsys, lab, "fit", lab, "--train", "half")
+    (tmp_path / "out.mcap").write_bytes(b"kept")
+    assert "exists already" in refused(ipsys, lab, "replay", lab, "-o", tmp_path / "out.mcap")
+    assert "no fitted model" in refused(ipsys, lab, "replay", lab, "--model-from", lab)
+
+
+def yaml(folder: Path) -> Path:
+    path = folder / "lens.yaml"
+    storage = cv2.FileStorage(str(path), cv2.FILE_STORAGE_WRITE)
+    storage.write("camera_matrix", np.diag([500.0, 500.0, 1.0]))
+    storage.write("distortion_coefficients", np.zeros((4, 1)))
+    storage.write("image_width", 960)
+    storage.write("image_height", 540)
+    storage.release()
+    return path
+
+
+@pytest.mark.parametrize(
+    ("text", "said"),
+    [
+        ("name = ", "not valid TOML"),
+        ('name = "a"', "dictionary is missing"),
+        ('name = "a"\ndictionary = "DICT_4X4_100"\nmarker_length_m = "20 cm"', "must be a number"),
+        ('name = "a"\ndictionary = "DICT_4X4_100"\nmarker_length_m = -1', "not a length"),
+        ('name = "a"\ndictionary = "DICT_4X4_100"\nmarker_lenght_m = 1', "unknown key 'marker_lenght_m'"),
+        ('name = "a"\ndictionary = "DICT_9X9"\nmarker_length_m = 0.2', "none of OpenCV's"),
+    ],
+)
+def test_a_bad_rig_file(ipsys: Ipsys, lab: Path, tmp_path: Path, text: str, said: str) -> None:
+    rig = tmp_path / "lab.toml"
+    rig.write_text(text)
+    assert said in refused(ipsys, lab, "detect", lab, "--rig", rig)
+
+
+def test_a_folder_that_is_not_the_authors(ipsys: Ipsys, lab: Path, tmp_path: Path) -> None:
+    out = tmp_path / "out.mcap"
+    assert "no such folder" in refused(ipsys, lab, "import", "imsel", tmp_path / "nowhere", "-o", out)
+    assert "has no testing.mat" in refused(ipsys, lab, "import", "imsel", tmp_path, "-o", out)
+    (tmp_path / "data").mkdir()
+    assert "no sub-folders with pictures" in refused(
+        ipsys, lab, "import", "images", tmp_path / "data", "-o", out
+    )
+
+
+def test_a_bug_keeps_its_traceback(ipsys: Ipsys, lab: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    def broken(*_: object) -> None:
+        raise KeyError("a bug")
+
+    monkeypatch.setattr("ipsys_log.pipeline.check_inputs", broken)
+    with pytest.raises(KeyError, match="a bug"):
+        ipsys("replay", lab)
+
+
+def test_the_real_command_too(tmp_path: Path) -> None:
+    done = subprocess.run(
+        [sys.executable, "-m", "ipsys_log", "info", str(tmp_path / "none.mcap")],
+        capture_output=True,
+        text=True,
+        check=False,
+    )
+    assert done.returncode == 1
+    assert done.stdout == ""
+    assert done.stderr.count("\n") == 1
+
+
+def test_a_frame_is_never_taken_for_a_picture_that_it_is_not() -> None:
+    from ipsys_log.stages.detect import decode_grey
+
+    with pytest.raises(ValueError, match="no picture"):
+        decode_grey(CompressedImage(0, "a", b"GIF89a...", "gif"))

@@ -149,18 +149,18 @@ def crashes(
         issued = operations[:cut]
         safe = durable(issued)
         loose = [index for index in range(cut) if not safe[index] and "sync" not in issued[index].kind]
-        subsets: list[set[int]] = [set(), set(loose), {loose[-1]} if loose else set()]
-        subsets += [set(loose) - {index} for index in loose[-8:]]
-        subsets += [{index for index in loose if chance.random() < 0.5} for _ in range(tries)]
-        for number, kept in enumerate(subsets):
+        last = max((i for i in loose if issued[i].kind == "write"), default=-1)
+        subsets = [(set[int](), False), (set(loose), False), (set(loose), True), ({last}, True)]
+        subsets += [(set(loose) - {index}, False) for index in loose[-8:]]
+        subsets += [({i for i in loose if chance.random() < 0.5}, number % 2 == 0) for number in range(tries)]
+        for kept, tear in subsets:
             disk = Disk(
                 {place: bytearray(data) for place, data in enumerate(files.values(), 1)},
                 {name: place for place, name in enumerate(files, 1)},
             )
-            last = max((i for i in loose if issued[i].kind == "write"), default=-1)
             for index, operation in enumerate(issued):
                 if safe[index] or index in kept:
-                    if index == last and number >= 2:
+                    if index == last and tear:
                         for piece in torn(operation, chance):
                             disk.apply(piece)
                     else:

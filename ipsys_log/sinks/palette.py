@@ -1,0 +1,62 @@
+"""Colours that stay apart, for people with any colour vision, on a dark ground.
+
+The hues are those of Okabe and Ito (2008), lightened where a dark ground asks for it.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Iterable
+
+__all__ = ["KIND_COLOURS", "MARKER_COLOUR", "TRUTH_COLOUR", "camera_colours", "robot_colour"]
+
+RGB = tuple[int, int, int]
+
+MARKER_COLOUR: RGB = (40, 230, 90)
+TRUTH_COLOUR: RGB = (190, 190, 190)
+KIND_COLOURS: dict[str, RGB] = {
+    "training": (130, 130, 130),
+    "test": (240, 228, 66),
+    "measured": (130, 130, 130),
+}
+
+# A camera that has the name of a colour gets it, as far as it can be seen.
+_NAMED: dict[str, RGB] = {
+    "red": (235, 95, 60),
+    "white": (240, 240, 240),
+    "black": (110, 110, 120),
+    "blue": (70, 150, 235),
+    "green": (0, 180, 130),
+    "yellow": (240, 228, 66),
+}
+_REST: tuple[RGB, ...] = (
+    (70, 150, 235),
+    (230, 159, 0),
+    (0, 180, 130),
+    (204, 121, 167),
+    (235, 95, 60),
+    (86, 200, 233),
+)
+_ROBOTS: tuple[RGB, ...] = (
+    (86, 200, 233),
+    (230, 159, 0),
+    (0, 190, 140),
+    (230, 130, 190),
+    (150, 150, 255),
+    (170, 215, 60),
+    (240, 110, 80),
+)
+
+
+def camera_colours(cameras: Iterable[str]) -> dict[str, RGB]:
+    """A colour for each camera, the same ones whatever the order of the names."""
+    cameras = sorted(set(cameras))
+    colours = {camera: _NAMED[camera] for camera in cameras if camera in _NAMED}
+    free = [colour for colour in _REST if colour not in colours.values()] or list(_REST)
+    for number, camera in enumerate(camera for camera in cameras if camera not in _NAMED):
+        colours[camera] = free[number % len(free)]
+    return colours
+
+
+def robot_colour(number: int) -> RGB:
+    """The colour of the first, second ... robot; the eighth has the first one's again."""
+    return _ROBOTS[number % len(_ROBOTS)]

@@ -1,0 +1,45 @@
+"""Eq. (3) to (5) against a marker whose place is known."""
+
+from __future__ import annotations
+
+import numpy as np
+import pytest
+from hypothesis import given
+from hypothesis import strategies as st
+from scipy.spatial.transform import Rotation
+
+from ipsys_log.geometry.markers import camera_point, heading, marker_corners
+
+
+def seen(centre: tuple[float, float, float], angle_rad: float, length_m: float) -> np.ndarray:
+    """Normalized corners of a marker parallel to the image plane, facing the camera."""
+    # The marker's y is up and the camera's is down: half a turn about x, then the angle about z.
+    turn = Rotation.from_euler("z", angle_rad) * Rotation.from_euler("x", np.pi)
+    corners = turn.apply(marker_corners(length_m)) + np.array(centre)
+    return corners[:, :2] / corners[:, 2:]
+
+
+places = st.tuples(st.floats(-2, 2), st.floats(-2, 2), st.floats(0.5, 4))
+
+
+@given(places, st.floats(-3, 3), st.floats(0.05, 0.5))
+def test_a_parallel_marker_is_found_exactly(
+    centre: tuple[float, float, float], angle_rad: float, length_m: float
+) -> None:
+    uv = seen(centre, angle_rad, length_m)
+    np.testing.assert_allclose(camera_point(uv, length_m), centre, atol=1e-9)
+
+
+@given(places, st.floats(-3.1, 3.1))
+def test_heading_is_minus_the_angle_of_the_side_from_corner_3_to_0(
+    centre: tuple[float, float, float], angle_rad: float
+) -> None:
+    # Upright (angle 0) the side points up in the picture, along minus y: its angle is -90 degrees.
+    expected = np.pi / 2 - angle_rad
+    found = heading(seen(centre, angle_rad, 0.2))
+    assert abs(np.angle(np.exp(1j * (found - expected)))) < 1e-6
+
+
+def test_corners_that_fall_together() -> None:
+    with pytest.raises(ValueError, match="fall together"):
+        camera_point(np.zeros((4, 2)), 0.2)

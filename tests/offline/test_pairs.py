@@ -1,0 +1,145 @@
+"""Which places count, where they are, and what a camera saw of them."""
+
+from __future__ import annotations
+
+import numpy as np
+import pytest
+
+from ipsys_log.errors import IpsysError
+from ipsys_log.messages import (
+    CameraPoint,
+    CameraPoints,
+    Distance,
+    Interval,
+    Measurement,
+    Message,
+    ReferencePoint,
+    Rig,
+    RigMarker,
+    WorldPoint,
+)
+from ipsys_log.offline.pairs import (
+    active_measurements,
+    build_pairs,
+    gather_sightings,
+    split,
+    still_interval,
+)
+
+S = 1_000_000_000
+RIG = Rig(
+    "lab",
+    "DICT_4X4_100",
+    0.2,
+    markers=(RigMarker(0), RigMarker(1)),
+    reference_points=(ReferencePoint("A", 0.0, 0.0), ReferencePoint("B", 2.0, 0.0)),
+)
+
+
+def seen(*rows: tuple[float, float, float], camera: str = "red", marker: int = 0) -> list[Message]:
+    """Messages of (time in s, x, z)."""
+    return [
+        Message(
+            "t", int(t * S), int(t * S), CameraPoints(int(t * S), (CameraPoint(marker, x, 0.0, z),)), camera
+        )
+        for t, x, z in rows
+    ]
+
+
+def still(start: float, end: float, x: float, z: float = 2.0) -> list[tuple[float, float, float]]:
+    return [(t, x + 0.001 * (-1) ** n, z) for n, t in enumerate(np.arange(start, end, 0.1))]
+
+
+def test_the_still_stretch_around_a_time() -> None:
+    moving = [(t, 0.1 * t, 2.0) for t in np.arange(5, 10, 0.1)]
+    rows = [*still(0, 5, 0.5), *moving, *still(10, 15, 1.0)]
+    sightings = gather_sightings(seen(*rows))["red", 0]
+    first, last = still_interval(sightings, 2 * S) or (0, 0)
+    assert first == 0
+    assert 4.8 * S < last < 5.3 * S
+    first, last = still_interval(sightings, int(12.3 * S)) or (0, 0)
+    assert 9.7 * S < first <= 10 * S
+    assert last == pytest.approx(14.9 * S)
+
+
+def test_lifting_a_marker_ends_the_stretch() -> None:
+    sightings = gather_sightings(seen(*still(0, 2, 0.5), *still(2, 4, 0.5, z=1.95)))["red", 0]
+    assert still_interval(sightings, S) == (0, pytest.approx(1.9 * S))
+
+
+def test_a_long_silence_ends_the_stretch() -> None:
+    sightings = gather_sightings(seen(*still(0, 1, 0.5), *still(10, 11, 0.5)))["red", 0]
+    assert still_interval(sightings, int(0.5 * S)) == (0, pytest.approx(0.9 * S))
+    assert still_interval(sightings, 5 * S) is None
+
+
+def test_a_pair_is_the_mean_over_the_still_interval() -> None:
+    rows = still(0, 2, 0.5)
+    given = Measurement(0, "a", marker_id=0, still=Interval(int(0.5 * S), S), point=WorldPoint(1, 2, 3))
+    pair = build_pairs(gather_sightings(seen(*rows)), [given], RIG)["red"][0]
+    inside = [x for t, x, _ in rows if 0.5 <= t <= 1.0]
+    assert pair.frames == len(inside) == 6
+    assert pair.camera_m[0] == pytest.approx(np.mean(inside))
+    np.testing.assert_array_equal(pair.world_m, [1, 2, 3])
+
+
+def test_a_camera_that_did_not_see_a_place_has_no_pair_of_it() -> None:
+    messages = seen(*still(0, 1, 0.5)) + seen(*still(50, 51, 0.5), camera="black")
+    measured = Measurement(S // 2, "a", marker_id=0, point=WorldPoint(1, 2, 0))
+    pairs = build_pairs(gather_sightings(messages), [measured], RIG)
+    assert len(pairs["red"]) == 1
+    assert pairs["black"] == []
+
+
+def test_a_withdrawn_measurement_does_not_count() -> None:
+    one, two = (Measurement(0, name, marker_id=0, point=WorldPoint(0, 0, 0)) for name in "ab")
+    assert active_measurements([one, two, Measurement(1, "c", withdraws="a")]) == [two]
+    # It may be measured again under its old name.
+    assert active_measurements([one, Measurement(1, "c", withdraws="a"), one]) == [one]
+    with pytest.raises(IpsysError, match="two measurements have the id 'a'"):
+        active_measurements([one, one])
+
+
+@pytest.mark.parametrize(
+    ("measurement", "said"),
+    [
+        (Measurement(0, "a", marker_id=5, point=WorldPoint(0, 0, 0)), "marker 5, which is not in the rig"),
+        (Measurement(0, "a", marker_id=1, point=WorldPoint(0, 0, 0)), "marker 1, which no camera saw"),
+        (Measurement(0, "a", marker_id=0), "neither a world point nor two distances"),
+        (
+            Measurement(
+                0,
+                "a",
+                marker_id=0,
+                distances=(Distance("A", 1.0), Distance("Z", 1.0)),
+                side="left",
+                height_m=0.0,
+            ),
+            "'Z' is not in the rig",
+        ),
+        (
+            Measurement(
+                0,
+                "a",
+                marker_id=0,
+                distances=(Distance("A", 0.5), Distance("B", 0.5)),
+                side="left",
+                height_m=0.0,
+            ),
+            "measurement a: no triangle",
+        ),
+    ],
+)
+def test_measurements_that_say_too_little(measurement: Measurement, said: str) -> None:
+    with pytest.raises(IpsysError, match=said):
+        build_pairs(gather_sightings(seen(*still(0, 1, 0.5))), [measurement], RIG)
+
+
+def test_a_split_at_random_is_a_fifth_and_the_same_for_a_seed() -> None:
+    measurements = [Measurement(0, f"m{n}") for n in range(50)]
+    train, held_out = split(measurements, "train", seed=3)
+    assert len(held_out) == 10
+    assert train | held_out == {m.id for m in measurements}
+    assert not train & held_out
+    assert split(list(reversed(measurements)), "train", seed=3) == (train, held_out)
+    assert split(measurements, "train", seed=4) != (train, held_out)

@@ -1,0 +1,124 @@
+"""Single stages, fed by hand."""
+
+from __future__ import annotations
+
+from typing import Any
+
+import cv2
+import numpy as np
+import pytest
+from scipy.spatial.transform import Rotation
+
+from ipsys_log.messages import (
+    CameraPoint,
+    CameraPoints,
+    CompressedImage,
+    Message,
+    Pair,
+    Position,
+    Positions,
+    Rig,
+    RigMarker,
+)
+from ipsys_log.offline.fit import fit_model
+from ipsys_log.stages.detect import Detect, decode_grey
+from ipsys_log.stages.fuse import Fuse, fuse_positions
+from ipsys_log.stages.locate import Locate
+
+RIG = Message("/rig", 0, 0, Rig("lab", "DICT_4X4_100", 0.2, (RigMarker(3, robot="ada"),)))
+
+
+def frame(payload: Any, time_ns: int = 1, camera: str = "red") -> Message:
+    return Message(f"/cameras/{camera}/image", time_ns, time_ns, payload, camera)
+
+
+def test_detected_corners_are_where_they_were_drawn() -> None:
+    """A marker drawn 8 times too large and reduced: its corners are known to a fraction of a pixel."""
+    dictionary = cv2.aruco.getPredefinedDictionary(cv2.aruco.DICT_4X4_100)
+    large = np.full((480 * 8, 640 * 8), 200, np.uint8)
+    large[1003:1803, 2005:2805] = cv2.aruco.generateImageMarker(dictionary, 3, 800)
+    small = cv2.resize(large, (640, 480), interpolation=cv2.INTER_AREA)
+    data = cv2.imencode(".png", cv2.GaussianBlur(small, (0, 0), 0.7))[1].tobytes()
+    detect = Detect()
+    list(detect(RIG))
+    found = list(detect(frame(CompressedImage(1, "red", data, "png"))))
+    (marker,) = found[0].markers
+    left, top, right, bottom = (v / 8 - 0.5 for v in (2005, 1003, 2805, 1803))
+    # The authors' refinement draws a blurred corner inwards by about a quarter of a pixel.
+    np.testing.assert_allclose(
+        marker.corners_px, [[left, top], [right, top], [right, bottom], [left, bottom]], atol=0.3
+    )
+    assert (found[0].width, found[0].height) == (640, 480)
+    # Viewers count from the corner of the first pixel.
+    drawn = found[1].points[0].points[0]
+    np.testing.assert_allclose([drawn.x, drawn.y], marker.corners_px[0] + 0.5)
+
+
+def test_a_jpeg_is_decoded_as_opencv_decodes_it() -> None:
+    rng = np.random.default_rng(0)
+    picture = cv2.GaussianBlur(rng.integers(0, 255, (120, 160, 3), np.uint8), (0, 0), 2)
+    data = cv2.imencode(".jpg", picture)[1]
+    expected = cv2.imdecode(data, cv2.IMREAD_GRAYSCALE)
+    np.testing.assert_array_equal(decode_grey(CompressedImage(0, "a", data.tobytes(), "jpeg")), expected)
+
+
+def test_the_world_heading_follows_the_model() -> None:
+    turn = Rotation.from_euler("xyz", (np.pi, 0.0, 0.4))
+    points = np.random.default_rng(0).uniform((-1, -1, 1.9), (1, 1, 2.1), (20, 3))
+    world = turn.apply(points) + 2.0
+    pairs = [Pair(str(n), 0, p, w, 1) for n, (p, w) in enumerate(zip(points, world, strict=True))]
+    locate = Locate(fit_model("rigid", {"red": pairs}, 0))
+    angle = -0.7  # in the picture; the heading is minus that
+    seen = CameraPoints(1, (CameraPoint(3, 0.1, 0.2, 2.0, -angle), CameraPoint(4, 0.1, 0.2, 2.0)))
+    (positions,) = locate(Message("t", 1, 1, seen, "red"))
+    along = turn.apply([np.cos(angle), np.sin(angle), 0])
+    assert positions.positions[0].heading_rad == pytest.approx(np.arctan2(along[1], along[0]))
+    assert positions.positions[1].heading_rad is None
+    assert positions.positions[0].x_m == pytest.approx(turn.apply([0.1, 0.2, 2.0])[0] + 2)
+    assert list(locate(Message("t", 1, 1, seen, "unknown"))) == []
+
+
+def at(x_m: float, variance: float | None, heading_rad: float | None = None) -> Position:
+    covariance = None if variance is None else variance * np.eye(3)
+    return Position(3, x_m, 0.0, 0.0, heading_rad, covariance)
+
+
+def test_weights_are_inverse_covariances() -> None:
+    fused = fuse_positions([at(0.0, 1.0), at(1.0, 3.0)])
+    assert fused.x_m == pytest.approx(0.25)
+    np.testing.assert_allclose(fused.covariance_m2, 0.75 * np.eye(3))
+    # Without the covariance of one there is no weight to give it: the mean, and no covariance.
+    plain = fuse_positions([at(0.0, 1.0), at(1.0, None)])
+    assert plain.x_m == pytest.approx(0.5)
+    assert plain.covariance_m2 is None
+
+
+def test_headings_are_averaged_around_the_circle() -> None:
+    fused = fuse_positions([at(0, 1.0, np.pi - 0.1), at(0, 1.0, -np.pi + 0.1)])
+    assert abs(fused.heading_rad or 0.0) == pytest.approx(np.pi)
+
+
+def test_only_what_was_seen_at_one_instant_is_fused() -> None:
+    fuse = Fuse("poly", window_ns=5)
+    list(fuse(RIG))
+
+    def send(camera: str, time_ns: int, x_m: float) -> Any:
+        message = Message("t", time_ns, time_ns, Positions(time_ns, (at(x_m, 1.0),)), camera)
+        tracks, transforms = fuse(message)
+        assert transforms.transforms[0].child_frame_id == "poly/ada"
+        return tracks.tracks[0]
+
+    assert send("red", 100, 0.0).cameras == ("red",)
+    both = send("white", 104, 1.0)
+    assert both.cameras == ("red", "white")
+    assert both.x_m == pytest.approx(0.5)
+    assert both.robot == "ada"
+    late = send("white", 120, 2.0)
+    assert late.cameras == ("white",)
+    assert late.x_m == 2.0
+
+
+def test_no_marker_no_track() -> None:
+    fuse = Fuse("poly")
+    list(fuse(RIG))
+    assert list(fuse(Message("t", 1, 1, Positions(1, ()), "red"))) == []

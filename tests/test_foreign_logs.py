@@ -77,7 +77,7 @@ def write(path: Path, messages: Iterable[tuple[str, int, Any]], compression: Com
                 schema = writer.register_schema(descriptor.full_name, "protobuf", files.SerializeToString())
                 channels[topic] = writer.register_channel(topic, "protobuf", schema)
             writer.add_message(channels[topic], time_ns, message.SerializeToString(), time_ns)
-        writer.finish()
+        writer.finish()  # type: ignore[no-untyped-call]
 
 
 @pytest.fixture
@@ -160,7 +160,7 @@ def test_a_foreign_encoding_is_named(ipsys: Ipsys, tmp_path: Path, rig: Path) ->
         writer.start()
         schema = writer.register_schema("foxglove.CompressedImage", "jsonschema", b"{}")
         writer.add_message(writer.register_channel("/cam", "json", schema), 1, b"{}", 1)
-        writer.finish()
+        writer.finish()  # type: ignore[no-untyped-call]
     done = ipsys("detect", log, "--rig", rig)
     assert done.code == 1
     assert "/cam is written as json, only protobuf is read" in done.err

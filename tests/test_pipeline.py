@@ -307,7 +307,7 @@ def test_an_unlabelled_log_is_split_by_a_recorded_seed(ipsys: Ipsys, lab: Path, 
                 yield replace(message, payload=replace(message.payload, splits=())) if labelled else message
 
     write_log(plain, unlabelled())
-    held_out = {}
+    held_out: dict[int, list[Any]] = {}
     for seed in (0, 1, 0):
         done = ipsys("evaluate", plain, "--model", "rigid", "--seed", seed, "--json")
         assert done.code == 0, done.err

@@ -5,7 +5,7 @@ from __future__ import annotations
 import inspect
 from collections.abc import Callable, Iterator
 from pathlib import Path
-from typing import TYPE_CHECKING, Annotated, Any, Optional
+from typing import TYPE_CHECKING, Annotated, Any
 
 import typer
 
@@ -19,7 +19,7 @@ __all__ = ["add_commands"]
 
 # The settings of the simulated lab that have an option: type, help. Their defaults are the library's,
 # which is not imported just to print a help.
-SETTINGS: dict[str, tuple[Any, str]] = {
+SETTINGS: dict[str, tuple[type, str]] = {
     "seed": (int, "The same seed gives the same bytes."),
     "width": (int, "Of a frame, in px; the lens scales with it."),
     "height": (int, "Of a frame, in px."),
@@ -83,7 +83,8 @@ def _simulate_command() -> Callable[..., None]:
     keyword = inspect.Parameter.KEYWORD_ONLY
     parameters = [inspect.Parameter("output", keyword, annotation=NewLog)]
     for name, (kind, text) in SETTINGS.items():
-        annotation = Annotated[Optional[kind], typer.Option(help=text, show_default=False)]  # noqa: UP045
+        option = typer.Option(help=text, show_default=False)
+        annotation = Annotated[kind | None, option]  # type: ignore[valid-type]
         parameters.append(inspect.Parameter(name, keyword, default=None, annotation=annotation))
 
     def command(**given: Any) -> None:

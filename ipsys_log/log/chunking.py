@@ -10,9 +10,21 @@ from mcap.opcode import Opcode
 
 from ipsys_log.log.records import HEADER, INDEX_HEAD, MESSAGE, ChunkRef
 
-__all__ = ["ChunkBuilder", "Limits"]
+__all__ = ["IMAGES", "IMAGE_SCHEMAS", "SMALL_APPENDED", "SMALL_LIVE", "ChunkBuilder", "Limits"]
 
 _ZSTD_LEVEL = 3
+
+IMAGE_SCHEMAS = frozenset(
+    {
+        "foxglove.CompressedImage",
+        "foxglove.CompressedVideo",
+        "foxglove.RawImage",
+        "sensor_msgs/CompressedImage",
+        "sensor_msgs/Image",
+        "sensor_msgs/msg/CompressedImage",
+        "sensor_msgs/msg/Image",
+    }
+)
 
 
 @dataclass(frozen=True, slots=True)
@@ -21,6 +33,12 @@ class Limits:
 
     size: int
     span_ns: int
+
+
+_SECOND = 1_000_000_000
+IMAGES = Limits(4 << 20, _SECOND)
+SMALL_LIVE = Limits(1 << 20, _SECOND)
+SMALL_APPENDED = Limits(1 << 20, 60 * _SECOND)
 
 
 @dataclass(slots=True)

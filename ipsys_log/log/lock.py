@@ -5,9 +5,10 @@ import os
 from pathlib import Path
 
 from ipsys_log.errors import LogError
+from ipsys_log.log.journal import journal_path
 from ipsys_log.log.storage import Storage
 
-__all__ = ["open_locked"]
+__all__ = ["check_free", "open_locked"]
 
 
 def open_locked(storage: Storage, path: Path, flags: int) -> int:
@@ -35,3 +36,17 @@ def open_locked(storage: Storage, path: Path, flags: int) -> int:
         storage.close(fd)
         raise LogError(f"{path}: another process is writing it: wait until it has finished")
     return fd
+
+
+def check_free(path: Path) -> None:
+    """Refuse a path for a new log if something lies there, or a journal of a log that is gone."""
+    try:
+        exists, orphan = path.exists(), journal_path(path).exists()
+    except OSError as error:
+        raise LogError(f"{path} cannot be opened for writing: {error.strerror}") from None
+    if exists:
+        raise LogError(f"{path} exists already and is never overwritten: choose another name")
+    if orphan:
+        raise LogError(
+            f"{journal_path(path)} belongs to a log that is gone: move that log back, or delete it"
+        )

@@ -6,21 +6,22 @@ from collections import Counter
 from collections.abc import Collection, Iterator, Mapping
 from functools import partial
 from pathlib import Path
-from types import MappingProxyType
-from typing import Any, Self
+from typing import Self
 
 import numpy as np
 from mcap import records as mcap
 from numpy.typing import NDArray
 
 from ipsys_log.errors import LogError
-from ipsys_log.log.contents import Contents, load_contents
+from ipsys_log.log.channels import by_topic
+from ipsys_log.log.contents import Contents
 from ipsys_log.log.hashing import METADATA_NAME, ChannelHash, hashes_from_metadata
 from ipsys_log.log.journal import attach_journal
+from ipsys_log.log.load import load_contents
 from ipsys_log.log.order import Pending, in_log_order
 from ipsys_log.log.payload import Blocks, chunk_entries, open_chunk, open_loose
 from ipsys_log.log.records import HEADER, parse, walk
-from ipsys_log.log.types import Channel, RawMessage, Schema
+from ipsys_log.log.types import RawMessage
 from ipsys_log.log.view import View, open_for_reading
 
 __all__ = ["LogReader", "stored_hashes"]
@@ -81,7 +82,7 @@ class LogReader:
         self._view, self._contents = _open(self.path)
         self._blocks = Blocks()
         self._stored: dict[str, ChannelHash] | None = None
-        self.channels, self.conflicts = _by_topic(self._contents)
+        self.channels, self.conflicts = by_topic(self._contents)
         self.start_ns, self.end_ns = self._contents.start_ns, self._contents.end_ns
         self.message_count = sum(self._contents.counts.values())
         self.chunk_count = len(self._contents.chunks)
@@ -234,31 +235,3 @@ def _stood_still(view: View, before: os.stat_result) -> bool:
         return same and not attach_journal(probe)
     finally:
         probe.close()
-
-
-def _by_topic(contents: Contents) -> tuple[Mapping[str, Channel], Mapping[str, str]]:
-    channels: dict[str, Channel] = {}
-    conflicts: dict[str, str] = {}
-    for key, record in sorted(contents.channels.items()):
-        found = contents.schemas.get(record.schema_id)
-        schema = Schema(found.name, found.encoding, found.data) if found else None
-        count = contents.counts.get(key, 0)
-        first = channels.get(record.topic)
-        if first is None:
-            metadata = MappingProxyType(dict(record.metadata))
-            channels[record.topic] = Channel(record.topic, schema, record.message_encoding, metadata, count)
-            continue
-        if (first.schema, first.message_encoding) != (schema, record.message_encoding):
-            conflicts[record.topic] = _difference(record.topic, first, schema, record.message_encoding)
-        total: dict[str, Any] = {"message_count": first.message_count + count}
-        channels[record.topic] = Channel(
-            first.topic, first.schema, first.message_encoding, first.metadata, **total
-        )
-    return MappingProxyType(channels), MappingProxyType(conflicts)
-
-
-def _difference(topic: str, first: Channel, schema: Schema | None, encoding: str) -> str:
-    names = [f"{s.name} ({s.encoding})" if s else "no schema" for s in (first.schema, schema)]
-    if names[0] == names[1]:
-        names = [f"{names[0]}, one definition", "another definition of that name"]
-    return f"channels of {topic} differ: {names[0]} as {first.message_encoding}, {names[1]} as {encoding}"

@@ -11,9 +11,10 @@ from mcap import records as mcap
 from mcap.opcode import Opcode
 
 from ipsys_log.errors import LogError
-from ipsys_log.log.contents import Contents, load_contents
+from ipsys_log.log.contents import Contents
 from ipsys_log.log.hashing import METADATA_NAME, metadata_of_hashes
 from ipsys_log.log.journal import replace_tail, roll_back
+from ipsys_log.log.load import load_contents
 from ipsys_log.log.lock import open_locked
 from ipsys_log.log.records import HEADER, MAGIC, ChunkRef, as_bytes
 from ipsys_log.log.salvage import Salvage, salvage

@@ -8,7 +8,7 @@ from mcap.opcode import Opcode
 
 from ipsys_log.errors import LogError
 from ipsys_log.log.chunks import Inside, look_inside, unpack
-from ipsys_log.log.contents import Contents, add_record, count_all
+from ipsys_log.log.contents import Contents
 from ipsys_log.log.hashing import ChannelHash
 from ipsys_log.log.records import (
     DATA_END,
@@ -21,6 +21,7 @@ from ipsys_log.log.records import (
     parse_message_index,
     walk,
 )
+from ipsys_log.log.scan import add_record, count_all
 from ipsys_log.log.view import View
 
 __all__ = ["Survey", "crc_of", "survey"]

@@ -10,11 +10,12 @@ from mcap import records as mcap
 from mcap.opcode import Opcode
 
 from ipsys_log.errors import LogError
-from ipsys_log.log.chunking import ChunkBuilder, Limits
-from ipsys_log.log.contents import Contents, load_contents
+from ipsys_log.log.chunking import IMAGE_SCHEMAS, IMAGES, SMALL_APPENDED, SMALL_LIVE, ChunkBuilder, Limits
+from ipsys_log.log.contents import Contents, free_id
 from ipsys_log.log.hashing import METADATA_NAME, ChannelHash, metadata_of_hashes
-from ipsys_log.log.journal import journal_path, roll_back
-from ipsys_log.log.lock import open_locked
+from ipsys_log.log.journal import roll_back
+from ipsys_log.log.load import load_contents
+from ipsys_log.log.lock import check_free, open_locked
 from ipsys_log.log.output import Growing, Output, Pending
 from ipsys_log.log.reader import stored_hashes
 from ipsys_log.log.records import HEADER, MAGIC, MESSAGE, as_bytes
@@ -23,25 +24,9 @@ from ipsys_log.log.summary import tail_bytes
 from ipsys_log.log.types import Schema
 from ipsys_log.log.view import View
 
-__all__ = ["IMAGE_SCHEMAS", "LogWriter"]
+__all__ = ["LogWriter"]
 
 LIBRARY = "ipsys 1"  # fixed, so that the same messages give the same bytes
-IMAGE_SCHEMAS = frozenset(
-    {
-        "foxglove.CompressedImage",
-        "foxglove.CompressedVideo",
-        "foxglove.RawImage",
-        "sensor_msgs/CompressedImage",
-        "sensor_msgs/Image",
-        "sensor_msgs/msg/CompressedImage",
-        "sensor_msgs/msg/Image",
-    }
-)
-_SECOND = 1_000_000_000
-_IMAGES = Limits(4 << 20, _SECOND)
-_SMALL_LIVE = Limits(1 << 20, _SECOND)
-_SMALL_APPENDED = Limits(1 << 20, 60 * _SECOND)
-_LARGEST_ID = 0xFFFF
 
 
 class LogWriter:
@@ -55,7 +40,7 @@ class LogWriter:
         self.path = path
         self._output = output
         self._contents = contents
-        self._images = ChunkBuilder(_IMAGES, compress=False)
+        self._images = ChunkBuilder(IMAGES, compress=False)
         self._small = ChunkBuilder(limits, compress=True)
         self._channels: dict[str, tuple[int, ChunkBuilder]] = {}
         self._hashes: dict[str, ChannelHash] = {}
@@ -84,7 +69,7 @@ class LogWriter:
             `path` exists, its folder does not, or another process is writing it.
         """
         target = Path(path)
-        _check_free(target)
+        check_free(target)
         file = target.with_name(target.name + ".partial") if atomic else target
         fd = open_locked(storage, file, os.O_RDWR | os.O_CREAT | (0 if atomic else os.O_EXCL))
         if atomic:
@@ -96,7 +81,7 @@ class LogWriter:
         except BaseException:
             output.close()
             raise
-        return cls(target, output, Contents(), _SMALL_LIVE)
+        return cls(target, output, Contents(), SMALL_LIVE)
 
     @classmethod
     def append(cls, path: str | os.PathLike[str], *, storage: Storage = DISK) -> Self:
@@ -123,7 +108,7 @@ class LogWriter:
             raise
         crc = contents.data_crc or None
         output = Pending(storage, target, fd, contents.data_end, contents.data_end, crc)
-        writer = cls(target, output, contents, _SMALL_APPENDED)
+        writer = cls(target, output, contents, SMALL_APPENDED)
         writer._stored, writer._appending = stored, True
         return writer
 
@@ -166,7 +151,7 @@ class LogWriter:
                     f"{self.path} has {topic} with another schema: use another topic (--run) or file (-o)"
                 )
             channel = mcap.Channel(
-                _next_id(self.path, self._contents.channels),
+                self._free_id(self._contents.channels),
                 topic,
                 message_encoding,
                 dict(metadata or {}),
@@ -242,10 +227,16 @@ class LogWriter:
         for key, known in self._contents.schemas.items():
             if (known.name, known.encoding, known.data) == (schema.name, schema.encoding, schema.data):
                 return key
-        key = _next_id(self.path, self._contents.schemas)
+        key = self._free_id(self._contents.schemas)
         record = mcap.Schema(key, schema.data, schema.encoding, schema.name)
         self._output.emit(as_bytes(record))
         self._contents.schemas[key] = record
+        return key
+
+    def _free_id(self, known: Mapping[int, object]) -> int:
+        key = free_id(known)
+        if key is None:
+            raise LogError(f"{self.path} has no free channel or schema id left: write to another file (-o)")
         return key
 
     def _hash_so_far(self, topic: str) -> ChannelHash:
@@ -273,26 +264,3 @@ class LogWriter:
         self._output.emit(head + data)
         self._contents.count(channel, 1)
         self._contents.cover(log_ns, log_ns)
-
-
-def _check_free(path: Path) -> None:
-    try:
-        exists, orphan = path.exists(), journal_path(path).exists()
-    except OSError as error:
-        raise LogError(f"{path} cannot be opened for writing: {error.strerror}") from None
-    if exists:
-        raise LogError(f"{path} exists already and is never overwritten: choose another name")
-    if orphan:
-        raise LogError(
-            f"{journal_path(path)} belongs to a log that is gone: move that log back, or delete it"
-        )
-
-
-def _next_id(path: Path, known: Mapping[int, object]) -> int:
-    """The lowest id above all known ones, or a free one below."""
-    key = max(known, default=0) + 1
-    if key > _LARGEST_ID:
-        key = next((free for free in range(1, _LARGEST_ID + 1) if free not in known), 0)
-    if not key:
-        raise LogError(f"{path} has no free channel or schema id left: write to another file (-o)")
-    return key

@@ -16,7 +16,7 @@ def seen(centre: tuple[float, float, float], angle_rad: float, length_m: float) 
     # The marker's y is up and the camera's is down: half a turn about x, then the angle about z.
     turn = Rotation.from_euler("z", angle_rad) * Rotation.from_euler("x", np.pi)
     corners = turn.apply(marker_corners(length_m)) + np.array(centre)
-    return corners[:, :2] / corners[:, 2:]
+    return np.asarray(corners[:, :2] / corners[:, 2:])
 
 
 places = st.tuples(st.floats(-2, 2), st.floats(-2, 2), st.floats(0.5, 4))

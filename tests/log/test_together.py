@@ -14,8 +14,9 @@ import pytest
 from ipsys_log.errors import LogError
 from ipsys_log.log import LogReader, repair
 from ipsys_log.log import reader as reader_module
-from ipsys_log.log.contents import Contents, load_contents
+from ipsys_log.log.contents import Contents
 from ipsys_log.log.journal import journal_path
+from ipsys_log.log.load import load_contents
 from ipsys_log.log.view import View
 from tests.log.conftest import Row, append, as_row, create, linear_rows, stock_rows
 

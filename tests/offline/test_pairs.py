@@ -64,12 +64,12 @@ def test_the_still_stretch_around_a_time() -> None:
 
 def test_lifting_a_marker_ends_the_stretch() -> None:
     sightings = gather_sightings(seen(*still(0, 2, 0.5), *still(2, 4, 0.5, z=1.95)))["red", 0]
-    assert still_interval(sightings, S) == (0, pytest.approx(1.9 * S))
+    assert still_interval(sightings, S) == pytest.approx((0, 1.9 * S))
 
 
 def test_a_long_silence_ends_the_stretch() -> None:
     sightings = gather_sightings(seen(*still(0, 1, 0.5), *still(10, 11, 0.5)))["red", 0]
-    assert still_interval(sightings, int(0.5 * S)) == (0, pytest.approx(0.9 * S))
+    assert still_interval(sightings, int(0.5 * S)) == pytest.approx((0, 0.9 * S))
     assert still_interval(sightings, 5 * S) is None
 
 

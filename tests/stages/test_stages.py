@@ -86,6 +86,7 @@ def at(x_m: float, variance: float | None, heading_rad: float | None = None) -> 
 def test_weights_are_inverse_covariances() -> None:
     fused = fuse_positions([at(0.0, 1.0), at(1.0, 3.0)])
     assert fused.x_m == pytest.approx(0.25)
+    assert fused.covariance_m2 is not None
     np.testing.assert_allclose(fused.covariance_m2, 0.75 * np.eye(3))
     # Without the covariance of one there is no weight to give it: the mean, and no covariance.
     plain = fuse_positions([at(0.0, 1.0), at(1.0, None)])

@@ -1,0 +1,130 @@
+"""Loading the table of contents: from the summary where that is complete, else from the records."""
+
+import zlib
+from itertools import pairwise
+
+from mcap import records as mcap
+from mcap.opcode import Opcode
+
+from ipsys_log.errors import LogError
+from ipsys_log.log.contents import Contents
+from ipsys_log.log.records import (
+    DATA_END,
+    FOOTER,
+    HEADER,
+    MAGIC,
+    parse,
+    parse_chunk_index,
+    walk,
+)
+from ipsys_log.log.scan import scan
+from ipsys_log.log.view import View
+
+__all__ = ["load_contents"]
+
+
+def load_contents(view: View) -> Contents:
+    """The table of contents of a finished log.
+
+    Raises
+    ------
+    LogError
+        The file is empty, not an MCAP, has no footer, or is damaged.
+    """
+    footer_at, summary_start = _footer(view)
+    contents, complete = (None, False)
+    if summary_start:
+        contents, complete = _from_summary(view, summary_start, footer_at)
+    end = summary_start or footer_at
+    data_end = end - DATA_END.size
+    opcode, length, crc = DATA_END.unpack(view.read(data_end, DATA_END.size)) if data_end > 8 else (0, 0, 0)
+    if (opcode, length) != (Opcode.DATA_END, 4):
+        raise view.fault(max(data_end, 0), "there is no DataEnd record before the summary")
+    if contents is None or not complete or not _gaps_hold_no_messages(view, contents, data_end):
+        contents = scan(view, data_end)
+    contents.data_end, contents.data_crc = data_end, crc
+    return contents
+
+
+def _footer(view: View) -> tuple[int, int]:
+    """Offset of the Footer record, and of the summary (0: none)."""
+    path = view.path
+    start = view.read(0, min(8, view.size))
+    if not start:
+        raise LogError(f"{path} is empty: nothing was ever written to it")
+    if not MAGIC.startswith(start):
+        raise LogError(f"{path} is not an MCAP file (it starts with {start!r}): give a log ending in .mcap")
+    at = view.size - len(MAGIC) - FOOTER.size
+    tail = view.read(at, view.size - at) if at >= len(MAGIC) else b""
+    if not tail.endswith(MAGIC) or FOOTER.unpack_from(tail)[:2] != (Opcode.FOOTER, 20):
+        raise LogError(
+            f"{path} has no footer: it is still being written, its writer was killed, or the file is "
+            f"truncated. Run: ipsys repair {path}"
+        )
+    _, _, summary_start, _, crc = FOOTER.unpack_from(tail)
+    if summary_start and not len(MAGIC) < summary_start <= at:
+        raise view.fault(at, f"the footer says that the summary starts at byte {summary_start}")
+    if summary_start and crc:
+        summary = view.read(summary_start, at - summary_start + FOOTER.size - 4)
+        if zlib.crc32(summary) != crc:
+            raise view.fault(summary_start, "the CRC of the summary is wrong")
+    return at, summary_start
+
+
+def _from_summary(view: View, start: int, end: int) -> tuple[Contents, bool]:
+    """What the summary says, and whether that is all."""
+    contents = Contents()
+    statistics: mcap.Statistics | None = None
+    data = view.read(start, end - start)
+    for at in walk(view, start, end):
+        body = data[at.offset - start + HEADER.size : at.offset - start + at.length]
+        if at.opcode == Opcode.STATISTICS:
+            statistics = parse(mcap.Statistics.read, view, at, body)
+        elif at.opcode == Opcode.CHUNK_INDEX:
+            contents.chunks.append(parse_chunk_index(view, at, body))
+        elif at.opcode == Opcode.ATTACHMENT_INDEX:
+            contents.attachments.append(parse(mcap.AttachmentIndex.read, view, at, body))
+        elif at.opcode == Opcode.METADATA_INDEX:
+            contents.metadata.append(parse(mcap.MetadataIndex.read, view, at, body))
+        elif at.opcode == Opcode.SCHEMA:
+            schema = parse(mcap.Schema.read, view, at, body)
+            contents.schemas.setdefault(schema.id, schema)
+        elif at.opcode == Opcode.CHANNEL:
+            channel = parse(mcap.Channel.read, view, at, body)
+            contents.channels.setdefault(channel.id, channel)
+    if statistics is None:
+        return contents, False
+    contents.counts = dict(statistics.channel_message_counts)
+    contents.attachment_count = statistics.attachment_count
+    contents.metadata_count = statistics.metadata_count
+    if statistics.message_count:
+        contents.cover(statistics.message_start_time, statistics.message_end_time)
+    return contents, _is_complete(contents, statistics)
+
+
+def _is_complete(contents: Contents, statistics: mcap.Statistics) -> bool:
+    known = contents.channels.keys()
+    return (
+        len(known) == statistics.channel_count
+        and contents.counts.keys() <= known
+        and all(c.schema_id == 0 or c.schema_id in contents.schemas for c in contents.channels.values())
+        and len(contents.chunks) == statistics.chunk_count
+        and all(chunk.index_offsets.keys() <= known for chunk in contents.chunks)
+        and (statistics.chunk_count > 0 or statistics.message_count == 0)
+        and sum(contents.counts.values()) == statistics.message_count
+        and len(contents.metadata) == statistics.metadata_count
+        and len(contents.attachments) == statistics.attachment_count
+    )
+
+
+def _gaps_hold_no_messages(view: View, contents: Contents, data_end: int) -> bool:
+    """True if all messages lie in the indexed chunks: what lies between them is small, and walked."""
+    extents = sorted((chunk.offset, chunk.end) for chunk in contents.chunks)
+    edges = [(0, len(MAGIC)), *extents, (data_end, data_end)]
+    for (_, start), (end, _) in pairwise(edges):
+        if start > end:
+            raise view.fault(end, "two chunks overlap, or one reaches into the summary")
+        for at in walk(view, start, end):
+            if at.opcode in (Opcode.MESSAGE, Opcode.CHUNK):
+                return False
+    return True

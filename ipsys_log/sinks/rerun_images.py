@@ -1,0 +1,52 @@
+"""Frames as Rerun takes them: encoded ones as they are, raw ones without the padding of their rows."""
+
+from __future__ import annotations
+
+import numpy as np
+import rerun as rr
+
+from ipsys_log.messages import CompressedImage, RawImage
+
+__all__ = ["rerun_image"]
+
+# Colour model and channels by pixel encoding, all with 8 bits.
+_RAW = {
+    "mono8": ("L", 1),
+    "8UC1": ("L", 1),
+    "rgb8": ("RGB", 3),
+    "bgr8": ("BGR", 3),
+    "8UC3": ("BGR", 3),
+    "rgba8": ("RGBA", 4),
+    "bgra8": ("BGRA", 4),
+}
+
+
+def rerun_image(frame: CompressedImage | RawImage) -> rr.EncodedImage | rr.Image:
+    """A frame for Rerun; a JPEG or PNG is neither decoded nor copied into another format.
+
+    Raises
+    ------
+    ValueError
+        Where it is no picture that can be drawn, saying why.
+    """
+    if isinstance(frame, RawImage):
+        return _raw_image(frame)
+    if frame.data[:3] == b"\xff\xd8\xff":
+        return rr.EncodedImage(contents=frame.data, media_type="image/jpeg")
+    if frame.data[:8] == b"\x89PNG\r\n\x1a\n":
+        return rr.EncodedImage(contents=frame.data, media_type="image/png")
+    raise ValueError(
+        f"{len(frame.data)} bytes that are neither JPEG nor PNG ({frame.format or 'no format given'})"
+    )
+
+
+def _raw_image(frame: RawImage) -> rr.Image:
+    if frame.encoding not in _RAW:
+        raise ValueError(f"pixel encoding {frame.encoding!r} is not drawn (only {', '.join(_RAW)})")
+    model, channels = _RAW[frame.encoding]
+    used = frame.width * channels
+    if min(frame.width, frame.height) < 1 or frame.step < used or len(frame.data) < frame.step * frame.height:
+        raise ValueError(f"{len(frame.data)} bytes are too few for {frame.width} x {frame.height}")
+    rows = np.frombuffer(frame.data, np.uint8, frame.step * frame.height).reshape(frame.height, frame.step)
+    pixels = np.ascontiguousarray(rows[:, :used]).reshape(frame.height, frame.width, channels)
+    return rr.Image(pixels[..., 0] if channels == 1 else pixels, color_model=model)

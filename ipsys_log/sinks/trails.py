@@ -1,0 +1,69 @@
+"""Where robots came from: one line from each instant to the next."""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Hashable
+from dataclasses import dataclass
+from typing import Generic, TypeVar
+
+from ipsys_log.messages import Message
+
+__all__ = ["Segment", "Trails"]
+
+Point = tuple[float, float, float]
+Key = TypeVar("Key", bound=Hashable)
+
+
+@dataclass(frozen=True, slots=True)
+class Segment:
+    """A way from one pose to the next, in m, and the time of the latter in ns."""
+
+    start_m: Point
+    end_m: Point
+    publish_time_ns: int
+    log_time_ns: int
+
+
+@dataclass(frozen=True, slots=True)
+class _Pose:
+    publish_time_ns: int
+    log_time_ns: int
+    point_m: Point
+
+
+class Trails(Generic[Key]):
+    """Join the poses of each robot, and hand each way to ``draw``.
+
+    Several poses of one instant (one from each camera) count as the last of them, which rests on all
+    cameras; so a pose waits until the next instant. Over a gap there is no line.
+    """
+
+    def __init__(self, draw: Callable[[Key, Segment], None]) -> None:
+        self._draw = draw
+        self._before: dict[Key, _Pose] = {}
+        self._waiting: dict[Key, _Pose] = {}
+        self._gap_ns: dict[Key, int] = {}
+
+    def add(self, key: Key, message: Message, point_m: Point, gap_ns: int) -> None:
+        """Take in a pose; ``gap_ns`` is the silence over which nothing is joined."""
+        pose = _Pose(message.publish_time_ns, message.log_time_ns, point_m)
+        waiting = self._waiting.get(key)
+        if waiting is not None and pose.publish_time_ns < waiting.publish_time_ns:
+            return
+        self._gap_ns[key] = gap_ns
+        if waiting is not None and pose.publish_time_ns > waiting.publish_time_ns:
+            self._finish(key, waiting)
+        self._waiting[key] = pose
+
+    def close(self) -> None:
+        """Draw the last way of each robot."""
+        for key, pose in self._waiting.items():
+            self._finish(key, pose)
+        self._waiting.clear()
+
+    def _finish(self, key: Key, pose: _Pose) -> None:
+        before = self._before.get(key)
+        self._before[key] = pose
+        if before is not None and pose.publish_time_ns - before.publish_time_ns <= self._gap_ns[key]:
+            segment = Segment(before.point_m, pose.point_m, pose.publish_time_ns, pose.log_time_ns)
+            self._draw(key, segment)

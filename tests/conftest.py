@@ -58,7 +58,7 @@ def lab_log(tmp_path_factory: pytest.TempPathFactory) -> Path:
     """A small simulated session, to be copied before it is changed."""
     path = tmp_path_factory.mktemp("lab") / "lab.mcap"
     settings = LabSettings(
-        width=960, height=540, markers=8, stations=26, frames_per_station=1, rate_hz=5.0, drive_s=1.0
+        width=960, height=540, markers=8, stations=26, frames_per_station=2, rate_hz=5.0, drive_s=1.0
     )
     write_log(path, simulate(settings))
     return path

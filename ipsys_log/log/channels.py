@@ -23,14 +23,17 @@ def by_topic(contents: Contents) -> tuple[Mapping[str, Channel], Mapping[str, st
             metadata = MappingProxyType(dict(record.metadata))
             channels[record.topic] = Channel(record.topic, schema, record.message_encoding, metadata, count)
             continue
-        if (first.schema, first.message_encoding) != (schema, record.message_encoding):
+        if (_kind(first.schema), first.message_encoding) != (_kind(schema), record.message_encoding):
             conflicts[record.topic] = _difference(record.topic, first, schema, record.message_encoding)
         channels[record.topic] = replace(first, message_count=first.message_count + count)
     return MappingProxyType(channels), MappingProxyType(conflicts)
 
 
+def _kind(schema: Schema | None) -> tuple[str, str] | None:
+    """What must agree: a later version of a message has more fields under the same name."""
+    return (schema.name, schema.encoding) if schema else None
+
+
 def _difference(topic: str, first: Channel, schema: Schema | None, encoding: str) -> str:
     names = [f"{s.name} ({s.encoding})" if s else "no schema" for s in (first.schema, schema)]
-    if names[0] == names[1]:
-        names = [f"{names[0]}, one definition", "another definition of that name"]
     return f"channels of {topic} differ: {names[0]} as {first.message_encoding}, {names[1]} as {encoding}"

@@ -88,9 +88,11 @@ def decode(name: str, data: bytes) -> Any:
     Raises
     ------
     LogError
-        Where the bytes are not a message of that schema.
+        Where the schema is not known here, or the bytes are not a message of it.
     """
-    payload = PAYLOADS[name]
+    payload = PAYLOADS.get(name)
+    if payload is None:
+        raise LogError(f"its schema {name!r} is none that ipsys reads")
     try:
         return _read(payload, _proto_class(name).FromString(data))
     except (DecodeError, ValueError) as error:

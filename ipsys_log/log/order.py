@@ -1,13 +1,12 @@
 """Log order: by log time, then by place in the file."""
 
 import heapq
-from collections.abc import Callable, Iterable, Iterator, Sequence
+from collections.abc import Callable, Iterator, Sequence
 from dataclasses import dataclass
-from typing import Protocol
 
 from ipsys_log.log.types import RawMessage
 
-__all__ = ["Cursor", "Pending", "in_log_order", "merge"]
+__all__ = ["Cursor", "Pending", "in_log_order"]
 
 
 @dataclass(slots=True)
@@ -35,10 +34,6 @@ class Pending:
     start_ns: int
     offset: int
     open: Callable[[], Cursor]
-
-
-class _HasMessages(Protocol):
-    def messages(self) -> Iterator[RawMessage]: ...
 
 
 def in_log_order(pending: Sequence[Pending], fault: Callable[[int], Exception]) -> Iterator[RawMessage]:
@@ -69,22 +64,3 @@ def in_log_order(pending: Sequence[Pending], fault: Callable[[int], Exception]) 
             heapq.heapreplace(heap, (cursor.key(stop), stop, cursor))
         else:
             heapq.heappop(heap)
-
-
-def merge(*logs: _HasMessages | Iterable[RawMessage]) -> Iterator[RawMessage]:
-    """One stream in log order over several logs; at equal times in the order of the arguments.
-
-    Parameters
-    ----------
-    logs
-        Open readers, or iterables of messages in log order.
-
-    Examples
-    --------
-    >>> a = [RawMessage("/a", 1, 1, b""), RawMessage("/a", 3, 3, b"")]
-    >>> b = [RawMessage("/b", 2, 2, b"")]
-    >>> [message.topic for message in merge(a, b)]
-    ['/a', '/b', '/a']
-    """
-    streams = [log if isinstance(log, Iterable) else log.messages() for log in logs]
-    return heapq.merge(*streams, key=lambda message: message.log_time_ns)

@@ -67,7 +67,7 @@ class LogReader:
     Examples
     --------
     >>> from tempfile import TemporaryDirectory
-    >>> from ipsys_log.log import LogWriter
+    >>> from ipsys_log.log import LogWriter, Schema
     >>> with TemporaryDirectory() as folder:
     ...     with LogWriter.create(Path(folder) / "a.mcap") as log:
     ...         log.add_channel("/a", Schema("A", "jsonschema", b"{}"), "json")

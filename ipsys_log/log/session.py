@@ -17,7 +17,6 @@ from typing import Any
 from ipsys_log.errors import LogError
 from ipsys_log.log.codec import PAYLOADS, decode, schema_name
 from ipsys_log.log.reader import LogReader
-from ipsys_log.log.types import RawMessage
 from ipsys_log.messages import CameraCalibration, CompressedImage, Message, RawImage, Run
 
 __all__ = ["Session", "camera_of_topic", "run_of_topic"]
@@ -114,17 +113,22 @@ class Session:
         LogError
             For a message that is not what its channel's schema says, naming topic and file.
         """
-        streams = [_tagged(reader, topics, start_ns, end_ns) for reader in self.readers]
-        for reader, raw in heapq.merge(*streams, key=lambda item: item[1].log_time_ns):
+        streams = [self._decoded(reader, topics, start_ns, end_ns) for reader in self.readers]
+        return heapq.merge(*streams, key=lambda message: message.log_time_ns)
+
+    def _decoded(
+        self, reader: LogReader, topics: Collection[str], start_ns: int | None, end_ns: int | None
+    ) -> Iterator[Message]:
+        here = [topic for topic in topics if topic in reader.channels]
+        for raw in reader.messages(here, start_ns, end_ns) if here else ():
             channel = reader.channels[raw.topic]
-            schema = channel.schema.name if channel.schema else ""
             if channel.message_encoding != "protobuf":
                 raise LogError(
                     f"{reader.path}: {raw.topic} is written as {channel.message_encoding}, "
                     "only protobuf is read"
                 )
             try:
-                payload = decode(schema, raw.data)
+                payload = decode(channel.schema.name if channel.schema else "", raw.data)
             except LogError as error:
                 raise LogError(f"{reader.path}: {raw.topic} at {raw.log_time_ns} ns: {error}") from error
             camera = self._camera_of.get(raw.topic) or camera_of_topic(raw.topic)
@@ -194,14 +198,6 @@ class Session:
                 if schema is not None and raw is not None:
                     return str(decode(schema.name, raw.data).frame_id)
         return ""
-
-
-def _tagged(
-    reader: LogReader, topics: Collection[str], start_ns: int | None, end_ns: int | None
-) -> Iterator[tuple[LogReader, RawMessage]]:
-    here = [topic for topic in topics if topic in reader.channels]
-    for raw in reader.messages(here, start_ns, end_ns) if here else ():
-        yield reader, raw
 
 
 def camera_of_topic(topic: str) -> str | None:

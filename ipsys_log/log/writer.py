@@ -34,6 +34,22 @@ class LogWriter:
 
     Image channels go into uncompressed chunks of about 4 MiB, all others into compressed chunks of
     their own. The same calls give the same bytes. Use it as a context manager.
+
+    Examples
+    --------
+    >>> from tempfile import TemporaryDirectory
+    >>> from ipsys_log.log import LogReader
+    >>> with TemporaryDirectory() as folder:
+    ...     path = Path(folder) / "a.mcap"
+    ...     with LogWriter.create(path) as log:
+    ...         log.add_channel("/a", Schema("A", "jsonschema", b"{}"), "json")
+    ...         log.write("/a", 1_000, 900, b"{}")
+    ...     with LogWriter.append(path) as log:
+    ...         log.add_channel("/runs/poly/b", Schema("B", "jsonschema", b"{}"), "json")
+    ...         log.write("/runs/poly/b", 1_000, 900, b"{}")
+    ...     with LogReader(path) as reader:
+    ...         sorted(reader.channels)
+    ['/a', '/runs/poly/b']
     """
 
     def __init__(self, path: Path, output: Output, contents: Contents, limits: Limits) -> None:
@@ -132,24 +148,21 @@ class LogWriter:
     ) -> None:
         """Declare a channel; a second call with the same schema does nothing.
 
-        When appending, a channel of the same topic and schema that the log has is continued.
+        When appending, a channel of the same topic and schema that the log has is continued. Where the
+        schema has grown since, the topic goes on in a channel of its own, which readers read as one.
 
         Raises
         ------
         LogError
-            The log has this topic with another schema or encoding.
+            The log has this topic with a schema of another name, or another encoding.
         """
         self._check_open()
-        existing = [c for c in self._contents.channels.values() if c.topic == topic]
+        self._check_kind(topic, schema, message_encoding)
         schema_id = self._schema_id(schema) if schema else 0
-        for channel in existing:
-            if (channel.schema_id, channel.message_encoding) == (schema_id, message_encoding):
+        for channel in self._contents.channels.values():
+            if (channel.topic, channel.schema_id) == (topic, schema_id):
                 break
         else:
-            if existing:
-                raise LogError(
-                    f"{self.path} has {topic} with another schema: use another topic (--run) or file (-o)"
-                )
             channel = mcap.Channel(
                 self._free_id(self._contents.channels),
                 topic,
@@ -222,6 +235,16 @@ class LogWriter:
     def _check_open(self) -> None:
         if not self._open:
             raise ValueError(f"{self.path}: the log is closed")
+
+    def _check_kind(self, topic: str, schema: Schema | None, message_encoding: str) -> None:
+        kind = (schema.name, schema.encoding) if schema else None
+        for channel in self._contents.channels.values():
+            known = self._contents.schemas.get(channel.schema_id)
+            known_kind = (known.name, known.encoding) if known else None
+            if channel.topic == topic and (known_kind, channel.message_encoding) != (kind, message_encoding):
+                raise LogError(
+                    f"{self.path} has {topic} with another schema: use another topic (--run) or file (-o)"
+                )
 
     def _schema_id(self, schema: Schema) -> int:
         for key, known in self._contents.schemas.items():

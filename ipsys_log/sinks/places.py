@@ -26,9 +26,7 @@ class Place:
     kind: str
 
 
-def measured_places(
-    measurements: Iterable[Measurement], rig: Rig | None
-) -> tuple[list[Place], list[str]]:
+def measured_places(measurements: Iterable[Measurement], rig: Rig | None) -> tuple[list[Place], list[str]]:
     """The places that count, and what is wrong with those that cannot be drawn.
 
     To look at a log must be possible above all when something in it is wrong: what the stages

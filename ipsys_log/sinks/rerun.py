@@ -3,103 +3,35 @@
 from __future__ import annotations
 
 from collections.abc import Callable, Sequence
-from dataclasses import dataclass
-from itertools import islice
 from pathlib import Path
 
-import numpy as np
 import rerun as rr
 
 from ipsys_log.errors import IpsysError
-from ipsys_log.log.session import Session, camera_of_topic
-from ipsys_log.messages import (
-    EVENTS_TOPIC,
-    MEASUREMENTS_TOPIC,
-    RIG_TOPIC,
-    TRUTH_TOPIC,
-    Event,
-    Markers,
-    Positions,
-    Rig,
-    Run,
-    Tracks,
-)
-from ipsys_log.sinks.places import Place, measured_places
+from ipsys_log.log.session import Session
+from ipsys_log.messages import MEASUREMENTS_TOPIC, TRUTH_TOPIC, Measurement
+from ipsys_log.sinks.places import measured_places
 from ipsys_log.sinks.rerun_scene import draw_places, draw_rig, layout
 from ipsys_log.sinks.rerun_sink import RerunSink, trail_entity
-from ipsys_log.sinks.rerun_viewer import check_screen, show_in_viewer
-from ipsys_log.units import NS_PER_S
+from ipsys_log.sinks.rerun_viewer import show_in_viewer
+from ipsys_log.sinks.shown import Shown, choose_runs, fade_ns, rig_in_force
 
-__all__ = ["Shown", "choose_runs", "write_recording"]
+__all__ = ["write_recording"]
 
-_FADE_STEPS = 3
-_LEAST_FADE_NS = NS_PER_S
-# Messages between two looks at what the viewer can have; enough to keep a pipe busy.
+# Frames are kept longer than positions: between two places of a calibration nothing may be recorded.
+_FRAME_FACTOR = 10
+# Messages between two writes to the viewer: enough to keep it busy, little to hold.
 _BATCH = 64
 
 
-@dataclass(frozen=True, slots=True)
-class Shown:
-    """What of a session is shown: the run with the markers, and those with positions and tracks."""
-
-    markers: str | None
-    runs: tuple[str, ...]
-
-    def __str__(self) -> str:
-        named = [f"markers of run {self.markers}"] if self.markers else []
-        named += [f"positions and tracks of run {run}" for run in self.runs]
-        return ", ".join(named) or "no run"
-
-
-def choose_runs(session: Session, names: Sequence[str] = ()) -> Shown:
-    """Which runs to show: those named with the markers they rest on, or the newest ones.
-
-    Raises
-    ------
-    IpsysError
-        For a name that no complete run has.
-    """
-    records = session.runs()
-    there = list(dict.fromkeys(record.run for record in records))
-    for name in names:
-        if name not in there:
-            raise IpsysError(f"{session}: there is no run {name!r} (there are: {', '.join(there) or 'none'})")
-    located = [run for run in there if session.topics(Tracks, run) or session.topics(Positions, run)]
-    marked = [run for run in there if session.topics(Markers, run)]
-    if not names:
-        return Shown(_newest(records, marked), tuple(filter(None, [_newest(records, located)])))
-    sources = _sources(records, names)
-    markers = _newest(records, [run for run in marked if run in sources])
-    return Shown(markers, tuple(name for name in dict.fromkeys(names) if name in located))
-
-
-def _newest(records: Sequence[Run], among: Sequence[str]) -> str | None:
-    return next((record.run for record in reversed(records) if record.run in among), None)
-
-
-def _sources(records: Sequence[Run], names: Sequence[str]) -> set[str]:
-    """Some runs, and all that they were made from."""
-    found: set[str] = set()
-    waiting = list(names)
-    while waiting:
-        name = waiting.pop()
-        if name not in found:
-            found.add(name)
-            waiting += [source for record in records if record.run == name for source in record.input_runs]
-    return found
-
-
-def write_recording(
-    session: Session, runs: Sequence[str] = (), save: Path | None = None, events: bool = True
-) -> Shown:
+def write_recording(session: Session, runs: Sequence[str] = (), save: Path | None = None) -> Shown:
     """Show a session in the Rerun viewer until its window is closed, or save it for the viewer.
 
     Parameters
     ----------
     session : open logs.
     runs : names of the runs to show; the newest complete ones where empty.
-    save : an ``.rrd`` file to write, instead of opening a window; it is there only when complete.
-    events : whether to list events too.
+    save : an ``.rrd`` file to write instead of opening a window; it has its name only when complete.
 
     Returns
     -------
@@ -111,16 +43,67 @@ def write_recording(
         For logs with nothing to show, an unknown run, or, without ``save``, no screen.
     """
     shown = choose_runs(session, runs)
-    session_view = _View(session, shown, events)
-    session_view.check()
+    if not (shown.frames or shown.moving or session.count(MEASUREMENTS_TOPIC)):
+        raise IpsysError(
+            f"{session}: nothing to show: no frames, markers, positions or measured places; "
+            "ipsys info says what it holds"
+        )
     if save is None:
-        show_in_viewer(session_view.feed)
+        show_in_viewer(lambda write: _stream(session, shown, write))
         return shown
     partial = save.with_name(save.name + ".partial")
-    partial.touch()  # what is wrong with the name is said here, not by Rerun
+    partial.touch()  # what is wrong with the path is said here, not by Rerun
     try:
-        session_view.write(partial)
+        _save(session, shown, partial)
         partial.replace(save)
     finally:
         partial.unlink(missing_ok=True)
     return shown
+
+
+def _recording(session: Session) -> rr.RecordingStream:
+    """A stream of its own, without the clock and the counter that Rerun adds to each message."""
+    recording = rr.RecordingStream("ipsys", send_properties=False)
+    recording.set_log_time_enabled(False)
+    recording.set_log_tick_enabled(False)
+    recording.send_recording_name(", ".join(path.stem for path in session.paths))
+    return recording
+
+
+def _save(session: Session, shown: Shown, path: Path) -> None:
+    recording = _recording(session)
+    try:
+        recording.save(path)
+        _draw(session, shown, recording, lambda: None)
+    finally:
+        recording.disconnect()
+
+
+def _stream(session: Session, shown: Shown, write: Callable[[bytes], object]) -> None:
+    recording = _recording(session)
+    try:
+        stream = rr.binary_stream(recording)
+        _draw(session, shown, recording, lambda: write(stream.read() or b""))
+    finally:
+        recording.disconnect()
+
+
+def _draw(session: Session, shown: Shown, recording: rr.RecordingStream, sent: Callable[[], object]) -> None:
+    """Draw all of a session; ``sent`` is called now and then, and at the end."""
+    rig = rig_in_force(session, [run for run in (shown.markers, *shown.runs) if run])
+    measurements = session.payloads(session.topics(Measurement))
+    places, faults = measured_places(measurements, rig)
+    trails = [trail_entity(run) for run in (*shown.runs, *([None] if TRUTH_TOPIC in shown.moving else []))]
+    recording.send_blueprint(layout(shown.cameras, trails, rig, events=bool(shown.events or faults)))
+    draw_rig(recording, rig)
+    draw_places(recording, places)
+    for fault in faults:
+        recording.log("events/measurements", rr.TextLog(fault, level="WARN"))
+    fades = fade_ns(session, shown.frames, _FRAME_FACTOR) | fade_ns(session, shown.moving)
+    sink = RerunSink(recording, (*shown.cameras, *shown.others), fades, shown.runs)
+    for number, message in enumerate(session.messages([*shown.frames, *shown.moving, *shown.events])):
+        sink(message)
+        if number % _BATCH == 0:
+            sent()
+    sink.close()
+    sent()

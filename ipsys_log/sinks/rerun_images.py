@@ -11,13 +11,13 @@ __all__ = ["rerun_image"]
 
 # Colour model and channels by pixel encoding, all with 8 bits.
 _RAW = {
-    "mono8": ("L", 1),
-    "8UC1": ("L", 1),
-    "rgb8": ("RGB", 3),
-    "bgr8": ("BGR", 3),
-    "8UC3": ("BGR", 3),
-    "rgba8": ("RGBA", 4),
-    "bgra8": ("BGRA", 4),
+    "mono8": (rr.ColorModel.L, 1),
+    "8UC1": (rr.ColorModel.L, 1),
+    "rgb8": (rr.ColorModel.RGB, 3),
+    "bgr8": (rr.ColorModel.BGR, 3),
+    "8UC3": (rr.ColorModel.BGR, 3),
+    "rgba8": (rr.ColorModel.RGBA, 4),
+    "bgra8": (rr.ColorModel.BGRA, 4),
 }
 
 

@@ -47,14 +47,14 @@ def _draw_floor(recording: rr.RecordingStream, floor: Floor) -> None:
     width_m, depth_m = floor.width_m, floor.depth_m
     outline = [(0, 0, 0), (width_m, 0, 0), (width_m, depth_m, 0), (0, depth_m, 0), (0, 0, 0)]
     thin, thick = rr.Radius.ui_points(0.5), rr.Radius.ui_points(1.5)
-    recording.log("world/floor", rr.LineStrips3D([outline], colors=[_LIGHT], radii=[thick]), static=True)
+    recording.log("world/floor", rr.LineStrips3D([outline], colors=[_LIGHT], radii=thick), static=True)
     step_m = _GRID_M
     while max(width_m, depth_m) / step_m > _MOST_LINES:
         step_m *= 2
     across = [[(x, 0, 0), (x, depth_m, 0)] for x in np.arange(step_m, width_m, step_m)]
     along = [[(0, y, 0), (width_m, y, 0)] for y in np.arange(step_m, depth_m, step_m)]
     if across or along:
-        lines = rr.LineStrips3D([*across, *along], colors=[_GREY], radii=[thin])
+        lines = rr.LineStrips3D([*across, *along], colors=[_GREY], radii=thin)
         recording.log("world/floor/grid", lines, static=True)
     axes = rr.Arrows3D(
         origins=[(0, 0, 0), (0, 0, 0)],
@@ -123,7 +123,7 @@ def _floor_view(trails: Sequence[str], rig: Rig | None) -> rrb.Spatial3DView:
         width_m, depth_m = rig.floor.width_m, rig.floor.depth_m
         middle = (width_m / 2, depth_m / 2, 0.0)
         # Straight down, upward of the picture along y as on the plan that the tape was read from.
-        above = (width_m / 2, depth_m / 2, 1.35 * max(width_m, depth_m))
+        above = (width_m / 2, depth_m / 2, 1.15 * max(width_m, depth_m))
         eye = rrb.EyeControls3D(position=above, look_target=middle, eye_up=(0.0, 1.0, 0.0))
     return rrb.Spatial3DView(
         origin="/world",

@@ -8,7 +8,7 @@ from pathlib import Path
 import pytest
 
 from ipsys_log.errors import LogError
-from ipsys_log.log import LogReader, LogWriter, RawMessage, merge, repair
+from ipsys_log.log import LogReader, LogWriter, Schema, repair
 from tests.log.conftest import (
     IMAGE,
     POINT,
@@ -141,14 +141,31 @@ def test_small_channels_are_read_without_the_images(log: Path) -> None:
         assert reader.bytes_read < log.stat().st_size / 10
 
 
-def test_merge_takes_the_arguments_in_order_at_equal_times(tmp_path: Path) -> None:
-    a = create(tmp_path / "a.mcap", [("/a", 1, 1, b""), ("/a", 3, 3, b"")])
-    b = create(tmp_path / "b.mcap", [("/b", 1, 1, b""), ("/b", 2, 2, b"")])
-    with LogReader(a) as first, LogReader(b) as second:
-        assert [m.topic for m in merge(first, second)] == ["/a", "/b", "/b", "/a"]
-        assert [m.topic for m in merge(second, [RawMessage("/c", 1, 1, b"")])] == ["/b", "/c", "/b"]
-
-
 def test_another_schema_on_the_same_topic_is_refused(log: Path) -> None:
     with LogWriter.append(log) as writer, pytest.raises(LogError, match="/points with another schema"):
         writer.add_channel("/points", IMAGE)
+
+
+def test_a_schema_that_has_grown_continues_the_topic(log: Path) -> None:
+    """A later version adds fields to a message; old logs are still appended to."""
+    with LogReader(log) as reader:
+        old = reader.channels["/points"].schema
+        count = reader.channels["/points"].message_count
+        end_ns = reader.end_ns or 0
+    assert old is not None
+    grown = Schema(old.name, old.encoding, old.data + b" and a new field")
+    with LogWriter.append(log) as writer:
+        writer.add_channel("/points", grown)
+        writer.write("/points", end_ns + 1, end_ns + 1, b"new")
+    with LogReader(log) as reader:
+        assert reader.channels["/points"].message_count == count + 1
+        messages = list(reader.messages(["/points"]))
+        hashed = reader.channel_hash("/points")
+    assert messages[-1].data == b"new"
+    # The one hash of both is right, and is found without reading them.
+    with LogWriter.append(log) as writer:
+        writer.add_channel("/points", grown)
+        writer.write("/points", end_ns + 2, end_ns + 2, b"newer")
+    with LogReader(log) as reader:
+        assert len(list(reader.messages(["/points"]))) == count + 2
+        assert reader.channel_hash("/points") != hashed

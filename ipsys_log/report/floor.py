@@ -1,0 +1,156 @@
+"""A session as one picture: the floor to scale, and how far each model is off."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass
+from pathlib import Path
+
+import numpy as np
+from matplotlib.axes import Axes
+from matplotlib.figure import Figure
+from matplotlib.patches import Rectangle
+from numpy.typing import NDArray
+
+from ipsys_log.errors import IpsysError
+from ipsys_log.log.session import Session
+from ipsys_log.messages import TRUTH_TOPIC, CameraEvaluation, Evaluation, Measurement, Rig, Tracks
+from ipsys_log.offline.evaluate import gather_tracks
+from ipsys_log.report.accuracy import Accuracy
+from ipsys_log.report.errors_panel import count_rows, draw_errors
+from ipsys_log.report.palette import REST, camera_styles, robot_colour
+from ipsys_log.runs import newest_run
+from ipsys_log.sinks.places import Place, measured_places
+from ipsys_log.sinks.shown import rig_in_force
+
+__all__ = ["draw_session"]
+
+_DPI = 100
+_GRID_M = 0.5
+# The longest arrows are to span about this part of the floor.
+_ARROW_SHARE = 0.1
+_FACTORS = (1, 2, 5, 10, 20, 50, 100, 200, 500)
+# A line joins two instants of a track only where a robot can have gone from one to the other.
+_STEP_M = 0.5
+_GAP_NS = 2_000_000_000
+_MOST_ROBOTS = 6
+
+Lines = Mapping[str, NDArray[np.float64]]
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class _Scene:
+    """What is drawn of a session; tracks and truth as (n, 2) in m by robot, with NaN where a line breaks."""
+
+    rig: Rig | None
+    places: Sequence[Place]
+    run: str | None
+    evaluation: Evaluation | None
+    tracks: Lines
+    truth: Lines
+
+    def rows(self) -> list[CameraEvaluation]:
+        """Residuals to draw as arrows: against the tape, which every lab has."""
+        rows = self.evaluation.cameras if self.evaluation else ()
+        return [row for row in rows if row.against == "tape" and row.residuals]
+
+
+def draw_session(session: Session, accuracies: Sequence[Accuracy], path: Path) -> None:
+    """Draw a session into a PNG of about 1400 x 800 pixels.
+
+    On the left the floor to scale: measured places, the error of each held-out one as an arrow
+    (exaggerated by the factor that the title states) for the first model, tracks and, where known, the
+    truth. On the right every error of every model and camera, in cm.
+
+    Parameters
+    ----------
+    session : open logs.
+    accuracies : from :func:`ipsys_log.report.accuracy.read_accuracy`; none leaves out the right side.
+    path : the picture, in place of one that is there already.
+
+    Raises
+    ------
+    IpsysError
+        For a session with neither a floor nor places nor tracks.
+    """
+    scene = _gather(session, accuracies)
+    rows = count_rows(accuracies)
+    # Rows of text need their height; beyond some 28 of them the picture grows.
+    figure = Figure(figsize=(14 if rows else 9, max(8.0, 1.6 + 0.23 * rows)), dpi=_DPI)
+    width, height = figure.get_size_inches()
+    floor_in = 6.3  # side of the floor's axes
+    axes = figure.add_axes((0.65 / width, 1 - (0.65 + floor_in) / height, floor_in / width, floor_in / height))
+    styles = camera_styles(row.camera for a in accuracies if a.evaluation for row in a.evaluation.cameras)
+    _draw_floor(axes, scene)
+    _draw_tracks(axes, scene)
+    _draw_places(axes, scene, styles)
+    handles, labels = axes.get_legend_handles_labels()
+    figure.legend(
+        handles, labels, loc="upper left", ncols=5, fontsize=8, frameon=False,
+        bbox_to_anchor=(0.4 / width, 1 - (1.15 + floor_in) / height),
+    )  # fmt: skip
+    if rows:
+        draw_errors(figure, accuracies, styles, left_in=9.0)
+    partial = path.with_name(path.name + ".partial")
+    try:
+        figure.savefig(partial, format="png")
+        partial.replace(path)
+    finally:
+        partial.unlink(missing_ok=True)
+
+
+def _gather(session: Session, accuracies: Sequence[Accuracy]) -> _Scene:
+    evaluated = [accuracy for accuracy in accuracies if accuracy.evaluation is not None]
+    runs = [accuracy.run for accuracy in (evaluated or accuracies)]
+    run = runs[0] if runs else newest_run(session, Tracks)
+    rig = rig_in_force(session, [run] if run else [])
+    places, _ = measured_places(session.payloads(session.topics(Measurement)), rig)
+    topics = session.topics(Tracks, run) if run else []
+    truth = [TRUTH_TOPIC] if TRUTH_TOPIC in session.topics(Tracks) else []
+    scene = _Scene(
+        rig,
+        places,
+        run,
+        evaluated[0].evaluation if evaluated else None,
+        _lines(session, topics, rig),
+        _lines(session, truth, rig),
+    )
+    if not (places or scene.tracks or scene.truth or (rig and rig.floor)):
+        raise IpsysError(f"{session}: nothing to draw: no floor, measured places or tracks")
+    return scene
+
+
+def _lines(session: Session, topics: Sequence[str], rig: Rig | None) -> dict[str, NDArray[np.float64]]:
+    """Ways on the floor by robot, (n, 2) in m, one point an instant, NaN where the line breaks."""
+    lines = {}
+    for marker_id, track in sorted(gather_tracks(session.messages(topics)).items() if topics else ()):
+        # The last of the poses of one instant rests on all cameras.
+        times_ns, last = np.unique(track.times_ns[::-1], return_index=True)
+        points_m = track.points_m[::-1][last][:, :2]
+        broken = (np.linalg.norm(np.diff(points_m, axis=0), axis=1) > _STEP_M) | (np.diff(times_ns) > _GAP_NS)
+        name = rig.robot_of(marker_id) if rig else f"marker_{marker_id}"
+        lines[name] = np.insert(points_m, np.flatnonzero(broken) + 1, np.nan, axis=0)
+    return lines
+
+
+def _draw_floor(axes: Axes, scene: _Scene) -> None:
+    floor = scene.rig.floor if scene.rig else None
+    points_m = [place.point_m[:2] for place in scene.places]
+    if floor is not None:
+        axes.add_patch(Rectangle((0, 0), floor.width_m, floor.depth_m, fill=False, ec="black", lw=1.5, zorder=1))
+        points_m += [np.zeros(2), np.array([floor.width_m, floor.depth_m])]
+    if not points_m:
+        points_m = [line[~np.isnan(line).any(axis=1)] for line in (*scene.tracks.values(), *scene.truth.values())]
+    around_m = np.vstack(points_m)
+    low, high = around_m.min(axis=0), around_m.max(axis=0)
+    # A square part of the world in square axes keeps the scale the same both ways.
+    middle, half = (low + high) / 2, max(0.54 * (high - low).max(), 0.25)
+    axes.set(xlim=(middle[0] - half, middle[0] + half), ylim=(middle[1] - half, middle[1] + half))
+    axes.set(aspect="equal", xlabel="x in m", ylabel="y in m")
+    axes.xaxis.set_major_locator(_steps(half))
+    axes.yaxis.set_major_locator(_steps(half))
+    axes.grid(color="#E6E6E6", lw=0.7)
+    axes.set_axisbelow(True)
+    for point in scene.rig.reference_points if scene.rig else ():
+        axes.plot(point.x_m, point.y_m, "+", color="black", ms=11, mew=1.6, zorder=5)
+        axes.annotate(point.name, (point.x_m, point.y_m), (5, 5), textcoords="offset points", weight="bold")

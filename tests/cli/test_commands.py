@@ -1,0 +1,114 @@
+"""The commands as a user meets them."""
+
+from __future__ import annotations
+
+import json
+import subprocess
+from dataclasses import fields
+from pathlib import Path
+
+import pytest
+
+from ipsys_log.cli.setup import SETTINGS
+from ipsys_log.rig import check_rig, load_rig
+from ipsys_log.sources.simulator import LabSettings
+from tests.conftest import ROOT, Ipsys
+
+COMMANDS = [
+    "init", "simulate", "import imsel", "import images", "replay", "detect", "camera-frame", "fit",
+    "evaluate", "locate", "fuse", "info", "runs", "view", "repair",
+]  # fmt: skip
+
+
+@pytest.mark.parametrize("command", COMMANDS)
+def test_every_command_helps_within_80_columns(
+    ipsys: Ipsys, command: str, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setenv("COLUMNS", "80")
+    done = ipsys(*command.split(), "--help")
+    assert done.code == 0
+    assert max(len(line) for line in done.out.splitlines()) <= 80
+    assert f"## `ipsys {command}`" in (ROOT / "docs/commands.md").read_text().replace("### ", "## ")
+
+
+def test_the_list_of_commands_is_up_to_date(tmp_path: Path) -> None:
+    fresh = tmp_path / "commands.md"
+    subprocess.run([ROOT / "scripts/make-docs", str(fresh)], check=True)
+    assert fresh.read_text() == (ROOT / "docs/commands.md").read_text(), "run scripts/make-docs"
+
+
+def test_init_writes_a_rig_that_can_be_read(ipsys: Ipsys, tmp_path: Path) -> None:
+    path = tmp_path / "lab.toml"
+    assert ipsys("init", path).code == 0
+    rig = check_rig(load_rig(path), "lab.toml")
+    # The lab of the paper (sect. 3).
+    assert [(p.x_m, p.y_m) for p in rig.reference_points] == [(1.2192, 2.4384), (3.6576, 2.4384)]
+    assert [camera.name for camera in rig.cameras] == ["red", "white", "black"]
+    text = path.read_text()
+    assert text.count("#") > 10
+    again = ipsys("init", path)
+    assert again.code == 1
+    assert "exists already" in again.err
+    assert path.read_text() == text
+
+
+def test_simulate_has_an_option_for_settings_that_exist() -> None:
+    known = {field.name for field in fields(LabSettings)}
+    assert set(SETTINGS) <= known
+
+
+def test_simulate_gives_the_same_bytes_for_a_seed(ipsys: Ipsys, tmp_path: Path) -> None:
+    small = {
+        "width": 640,
+        "height": 360,
+        "stations": 4,
+        "frames-per-station": 1,
+        "rate-hz": 5,
+        "drive-s": 0.4,
+    }
+    options = [word for name, value in small.items() for word in (f"--{name}", value)]
+    for name, seed in (("a", 7), ("b", 7), ("c", 8)):
+        assert ipsys("simulate", "-o", tmp_path / f"{name}.mcap", "--seed", seed, *options).code == 0
+    a, b, c = (tmp_path / f"{name}.mcap" for name in "abc")
+    assert a.read_bytes() == b.read_bytes()
+    assert a.read_bytes() != c.read_bytes()
+
+
+def test_info_says_what_is_in_a_log(ipsys: Ipsys, lab: Path) -> None:
+    ipsys("replay", lab)
+    found = json.loads(ipsys("info", lab, "--json").out)
+    assert found["cameras"]["red"] == {
+        "images": "/cameras/red/image",
+        "calibration": "/cameras/red/calibration",
+    }
+    images = found["channels"]["/cameras/red/image"]
+    assert images["schema"] == "foxglove.CompressedImage"
+    assert images["rate_hz"] == pytest.approx(5.0)
+    # The markers are moved between the places: so many silences.
+    assert images["gaps"] > 5
+    assert images["longest_gap_s"] == pytest.approx(3.0, abs=0.5)
+    assert [run["stage"] for run in found["runs"]] == [
+        "detect", "camera-frame", "fit", "evaluate", "locate", "fuse",
+    ]  # fmt: skip
+
+
+def test_info_fits_80_columns(ipsys: Ipsys, lab: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setenv("COLUMNS", "80")
+    monkeypatch.chdir(lab.parent)
+    ipsys("replay", lab.name)
+    for command in ("info", "runs"):
+        done = ipsys(command, lab.name)
+        assert max(len(line) for line in done.out.splitlines()) <= 80, done.out
+
+
+def test_runs_say_where_they_come_from(ipsys: Ipsys, lab: Path) -> None:
+    ipsys("replay", lab)
+    runs = {run["stage"]: run for run in json.loads(ipsys("runs", lab, "--json").out)}
+    assert runs["detect"]["parameters"] == {"corners": "stock"}
+    assert {row["topic"] for row in runs["detect"]["inputs"]} == {
+        "/rig",
+        *(f"/cameras/{camera}/image" for camera in ("red", "white", "black")),
+    }
+    assert all(row["hash"] and row["messages"] for row in runs["detect"]["inputs"])
+    assert runs["locate"]["input_runs"] == ["poly", "stock"]
+    assert {"numpy", "opencv-python-headless", "blas", "python"} <= set(runs["fit"]["fingerprint"])

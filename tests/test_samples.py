@@ -1,0 +1,57 @@
+"""The logs that ship with the project, and those of earlier releases."""
+
+from __future__ import annotations
+
+import json
+import shutil
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+from ipsys_log.log.codec import encode
+from ipsys_log.log.session import Session
+from ipsys_log.messages import Positions
+from tests.conftest import ROOT, Ipsys
+
+SAMPLES = ROOT / "sample_logs"
+GOLDEN = ROOT / "tests" / "golden"
+
+
+@pytest.mark.parametrize("name", ["small_lab", "paper_lab"])
+def test_a_sample_log_gives_centimetres(ipsys: Ipsys, tmp_path: Path, name: str) -> None:
+    log = Path(shutil.copy(SAMPLES / f"{name}.mcap", tmp_path))
+    model = json.loads(ipsys("replay", log, "--model", "poly", "--json").out)["models"]["poly"]
+    assert set(model["cameras"]) == {"red", "white", "black"}
+    for errors in model["cameras"].values():
+        # The tape is off by 3 mm a distance; the truth is not.
+        assert errors["truth"]["3d"]["mean_cm"] < 1.0
+        assert errors["3d"]["mean_cm"] < 1.5
+    assert model["tracks"]["truth"]["3d"]["mean_cm"] < 0.6
+
+
+def test_the_samples_are_small() -> None:
+    assert sum(path.stat().st_size for path in SAMPLES.glob("*.mcap")) < 15e6
+    described = (SAMPLES / "README.md").read_text()
+    assert all(path.name in described for path in SAMPLES.glob("*.mcap"))
+
+
+@pytest.mark.parametrize("path", sorted(GOLDEN.glob("*.mcap")), ids=lambda path: path.stem)
+def test_a_log_of_an_earlier_release(ipsys: Ipsys, tmp_path: Path, path: Path) -> None:
+    log = Path(shutil.copy(path, tmp_path))
+    with Session([log]) as session:
+        topics = [topic for reader in session.readers for topic in reader.channels]
+        messages = list(session.messages(topics))
+        assert len(messages) == sum(reader.message_count for reader in session.readers)
+        assert all(encode(message.payload) for message in messages)
+        assert {run.run for run in session.runs()} == {"stock", "poly", "rigid"}
+        before = session.payloads(session.topics(Positions, "poly"))
+    # What it holds is still right, and computing it again gives the same to a tenth of a micrometre.
+    assert "nothing to do" in ipsys("replay", log).err
+    again = tmp_path / "again.mcap"
+    assert ipsys("replay", log, "--run", "again", "-o", again).code == 0
+    with Session([log, again]) as session:
+        after = session.payloads(session.topics(Positions, "again"))
+    for one, other in zip(before, after, strict=True):
+        for p, q in zip(one.positions, other.positions, strict=True):
+            np.testing.assert_allclose((p.x_m, p.y_m, p.z_m), (q.x_m, q.y_m, q.z_m), atol=1e-7)

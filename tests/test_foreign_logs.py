@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+import base64
+import json
 from collections.abc import Iterable
 from pathlib import Path
 from typing import Any
@@ -153,14 +155,47 @@ def test_topics_that_differ_only_in_a_generic_word_stay_apart(tmp_path: Path) ->
         assert sorted(session.images) == ["cam_color", "cam_mono"]
 
 
-def test_a_foreign_encoding_is_named(ipsys: Ipsys, tmp_path: Path, rig: Path) -> None:
-    log = tmp_path / "json.mcap"
-    with log.open("wb") as file:
+def write_raw(path: Path, encoding: str, schema_encoding: str, data: bytes) -> Path:
+    with path.open("wb") as file:
         writer = Writer(file)
         writer.start()
-        schema = writer.register_schema("foxglove.CompressedImage", "jsonschema", b"{}")
-        writer.add_message(writer.register_channel("/cam", "json", schema), 1, b"{}", 1)
+        schema = writer.register_schema("foxglove.CompressedImage", schema_encoding, b"{}")
+        writer.add_message(writer.register_channel("/cam", encoding, schema), 1, data, 1)
         writer.finish()  # type: ignore[no-untyped-call]
+    return path
+
+
+def test_json_is_read_too(ipsys: Ipsys, tmp_path: Path, rig: Path) -> None:
+    message = jpeg(6, "cam", 1)
+    text = {
+        "timestamp": {"sec": 0, "nsec": 1},
+        "frame_id": "cam",
+        "data": base64.b64encode(message.data).decode(),
+        "format": "jpeg",
+    }
+    log = write_raw(tmp_path / "json.mcap", "json", "jsonschema", json.dumps(text).encode())
+    done = ipsys("detect", log, "--rig", rig)
+    assert done.code == 0, done.err
+    with Session([log]) as session:
+        assert session.payloads(["/cam"])[0].timestamp == 1
+        seen = session.payloads(["/runs/stock/cameras/cam/markers"])
+    assert [marker.id for marker in seen[0].markers] == [6]
+
+
+@pytest.mark.parametrize(
+    ("encoding", "data", "said"),
+    [
+        ("flatbuffer", b"...", "messages encoded as 'flatbuffer' are not read, only protobuf and json"),
+        ("json", b"{]", "not a valid foxglove.CompressedImage"),
+        ("protobuf", b"\xff\xff", "not a valid foxglove.CompressedImage"),
+    ],
+)
+def test_what_cannot_be_decoded_is_named(
+    ipsys: Ipsys, tmp_path: Path, rig: Path, encoding: str, data: bytes, said: str
+) -> None:
+    log = write_raw(tmp_path / "odd.mcap", encoding, "", data)
     done = ipsys("detect", log, "--rig", rig)
     assert done.code == 1
-    assert "/cam is written as json, only protobuf is read" in done.err
+    assert f"{log}: /cam at 1 ns" in done.err
+    assert said in done.err
+    assert done.err.count("\n") == 1

@@ -8,6 +8,7 @@ per type from the type hints; nothing is written down twice. Numbers are stored 
 
 from __future__ import annotations
 
+import json
 import types
 from collections.abc import Callable
 from dataclasses import fields, is_dataclass
@@ -17,9 +18,10 @@ from importlib.resources import files
 from typing import Annotated, Any, Union, get_args, get_origin, get_type_hints
 
 import numpy as np
-from google.protobuf import descriptor_pb2, descriptor_pool, message_factory
+from google.protobuf import descriptor_pb2, descriptor_pool, json_format, message_factory
 from google.protobuf.message import DecodeError
 from google.protobuf.message import Message as Proto
+from google.protobuf.timestamp_pb2 import Timestamp
 
 from ipsys_log import messages
 from ipsys_log.errors import LogError
@@ -82,21 +84,48 @@ def encode(payload: Any) -> bytes:
     return proto.SerializeToString(deterministic=True)
 
 
-def decode(name: str, data: bytes) -> Any:
+def decode(name: str, data: bytes, encoding: str = "protobuf") -> Any:
     """The payload in ``data``, which the schema called ``name`` was written with.
+
+    Parameters
+    ----------
+    name : of the schema.
+    data : the message.
+    encoding : ``protobuf``, or ``json`` in the logs of others.
 
     Raises
     ------
     LogError
-        Where the schema is not known here, or the bytes are not a message of it.
+        Where the schema or encoding is not known here, or the bytes are not a message of it.
     """
     payload = PAYLOADS.get(name)
     if payload is None:
         raise LogError(f"its schema {name!r} is none that ipsys reads")
     try:
-        return _read(payload, _proto_class(name).FromString(data))
-    except (DecodeError, ValueError) as error:
+        return _read(payload, _parse(_proto_class(name), data, encoding))
+    except (DecodeError, json_format.ParseError, ValueError) as error:
         raise LogError(f"a message is not a valid {name}: {error}") from error
+
+
+def _parse(proto_class: type[Proto], data: bytes, encoding: str) -> Proto:
+    if encoding == "protobuf":
+        return proto_class.FromString(data)
+    if encoding == "json":
+        return json_format.ParseDict(
+            _plain_times(json.loads(data)), proto_class(), ignore_unknown_fields=True
+        )
+    raise LogError(f"messages encoded as {encoding!r} are not read, only protobuf and json")
+
+
+def _plain_times(value: Any) -> Any:
+    """Foxglove's JSON has times as {sec, nsec}, protobuf's has them as text."""
+    if isinstance(value, list):
+        return [_plain_times(item) for item in value]
+    if not isinstance(value, dict):
+        return value
+    if value.keys() == {"sec", "nsec"}:
+        return Timestamp(seconds=value["sec"], nanos=value["nsec"]).ToJsonString()
+    return {key: _plain_times(item) for key, item in value.items()}
 
 
 @cache

@@ -122,13 +122,9 @@ class Session:
         here = [topic for topic in topics if topic in reader.channels]
         for raw in reader.messages(here, start_ns, end_ns) if here else ():
             channel = reader.channels[raw.topic]
-            if channel.message_encoding != "protobuf":
-                raise LogError(
-                    f"{reader.path}: {raw.topic} is written as {channel.message_encoding}, "
-                    "only protobuf is read"
-                )
             try:
-                payload = decode(channel.schema.name if channel.schema else "", raw.data)
+                name = channel.schema.name if channel.schema else ""
+                payload = decode(name, raw.data, channel.message_encoding)
             except LogError as error:
                 raise LogError(f"{reader.path}: {raw.topic} at {raw.log_time_ns} ns: {error}") from error
             camera = self._camera_of.get(raw.topic) or camera_of_topic(raw.topic)
@@ -196,7 +192,8 @@ class Session:
                 schema = reader.channels[topic].schema
                 raw = next(reader.messages([topic]), None)
                 if schema is not None and raw is not None:
-                    return str(decode(schema.name, raw.data).frame_id)
+                    encoding = reader.channels[topic].message_encoding
+                    return str(decode(schema.name, raw.data, encoding).frame_id)
         return ""
 
 

@@ -2,57 +2,34 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping, Sequence
-from dataclasses import dataclass
+from collections.abc import Sequence
 from pathlib import Path
 
 import numpy as np
-from matplotlib.axes import Axes
 from matplotlib.figure import Figure
-from matplotlib.patches import Rectangle
 from numpy.typing import NDArray
 
 from ipsys_log.errors import IpsysError
 from ipsys_log.log.session import Session
-from ipsys_log.messages import TRUTH_TOPIC, CameraEvaluation, Evaluation, Measurement, Rig, Tracks
+from ipsys_log.messages import TRUTH_TOPIC, Measurement, Rig, Tracks
 from ipsys_log.offline.evaluate import gather_tracks
 from ipsys_log.report.accuracy import Accuracy
 from ipsys_log.report.errors_panel import count_rows, draw_errors
-from ipsys_log.report.palette import REST, camera_styles, robot_colour
+from ipsys_log.report.floor_panel import Scene, draw_floor
+from ipsys_log.report.palette import camera_styles
 from ipsys_log.runs import newest_run
-from ipsys_log.sinks.places import Place, measured_places
+from ipsys_log.sinks.places import measured_places
 from ipsys_log.sinks.shown import rig_in_force
 
 __all__ = ["draw_session"]
 
 _DPI = 100
-_GRID_M = 0.5
-# The longest arrows are to span about this part of the floor.
-_ARROW_SHARE = 0.1
-_FACTORS = (1, 2, 5, 10, 20, 50, 100, 200, 500)
+# Of the floor's axes: how far below the top of the picture, and how long a side.
+_TOP_IN = 0.65
+_SIDE_IN = 6.3
 # A line joins two instants of a track only where a robot can have gone from one to the other.
 _STEP_M = 0.5
-_GAP_NS = 2_000_000_000
-_MOST_ROBOTS = 6
-
-Lines = Mapping[str, NDArray[np.float64]]
-
-
-@dataclass(frozen=True, slots=True, eq=False)
-class _Scene:
-    """What is drawn of a session; tracks and truth as (n, 2) in m by robot, with NaN where a line breaks."""
-
-    rig: Rig | None
-    places: Sequence[Place]
-    run: str | None
-    evaluation: Evaluation | None
-    tracks: Lines
-    truth: Lines
-
-    def rows(self) -> list[CameraEvaluation]:
-        """Residuals to draw as arrows: against the tape, which every lab has."""
-        rows = self.evaluation.cameras if self.evaluation else ()
-        return [row for row in rows if row.against == "tape" and row.residuals]
+_GAP_NS = 500_000_000
 
 
 def draw_session(session: Session, accuracies: Sequence[Accuracy], path: Path) -> None:
@@ -79,18 +56,18 @@ def draw_session(session: Session, accuracies: Sequence[Accuracy], path: Path) -
     figure = Figure(figsize=(14 if rows else 9, max(8.0, 1.6 + 0.23 * rows)), dpi=_DPI)
     width, height = figure.get_size_inches()
     floor_in = 6.3  # side of the floor's axes
-    axes = figure.add_axes((0.65 / width, 1 - (0.65 + floor_in) / height, floor_in / width, floor_in / height))
+    axes = figure.add_axes(
+        (0.65 / width, 1 - (0.65 + floor_in) / height, floor_in / width, floor_in / height)
+    )
     styles = camera_styles(row.camera for a in accuracies if a.evaluation for row in a.evaluation.cameras)
-    _draw_floor(axes, scene)
-    _draw_tracks(axes, scene)
-    _draw_places(axes, scene, styles)
+    draw_floor(axes, scene, styles)
     handles, labels = axes.get_legend_handles_labels()
     figure.legend(
         handles, labels, loc="upper left", ncols=5, fontsize=8, frameon=False,
-        bbox_to_anchor=(0.4 / width, 1 - (1.15 + floor_in) / height),
+        bbox_to_anchor=(0.4 / width, (low_in - 0.5) / height),
     )  # fmt: skip
     if rows:
-        draw_errors(figure, accuracies, styles, left_in=9.0)
+        draw_errors(figure, accuracies, styles, left_in=9.0, top_in=_TOP_IN)
     partial = path.with_name(path.name + ".partial")
     try:
         figure.savefig(partial, format="png")
@@ -99,7 +76,7 @@ def draw_session(session: Session, accuracies: Sequence[Accuracy], path: Path) -
         partial.unlink(missing_ok=True)
 
 
-def _gather(session: Session, accuracies: Sequence[Accuracy]) -> _Scene:
+def _gather(session: Session, accuracies: Sequence[Accuracy]) -> Scene:
     evaluated = [accuracy for accuracy in accuracies if accuracy.evaluation is not None]
     runs = [accuracy.run for accuracy in (evaluated or accuracies)]
     run = runs[0] if runs else newest_run(session, Tracks)
@@ -107,7 +84,7 @@ def _gather(session: Session, accuracies: Sequence[Accuracy]) -> _Scene:
     places, _ = measured_places(session.payloads(session.topics(Measurement)), rig)
     topics = session.topics(Tracks, run) if run else []
     truth = [TRUTH_TOPIC] if TRUTH_TOPIC in session.topics(Tracks) else []
-    scene = _Scene(
+    scene = Scene(
         rig,
         places,
         run,
@@ -131,26 +108,3 @@ def _lines(session: Session, topics: Sequence[str], rig: Rig | None) -> dict[str
         name = rig.robot_of(marker_id) if rig else f"marker_{marker_id}"
         lines[name] = np.insert(points_m, np.flatnonzero(broken) + 1, np.nan, axis=0)
     return lines
-
-
-def _draw_floor(axes: Axes, scene: _Scene) -> None:
-    floor = scene.rig.floor if scene.rig else None
-    points_m = [place.point_m[:2] for place in scene.places]
-    if floor is not None:
-        axes.add_patch(Rectangle((0, 0), floor.width_m, floor.depth_m, fill=False, ec="black", lw=1.5, zorder=1))
-        points_m += [np.zeros(2), np.array([floor.width_m, floor.depth_m])]
-    if not points_m:
-        points_m = [line[~np.isnan(line).any(axis=1)] for line in (*scene.tracks.values(), *scene.truth.values())]
-    around_m = np.vstack(points_m)
-    low, high = around_m.min(axis=0), around_m.max(axis=0)
-    # A square part of the world in square axes keeps the scale the same both ways.
-    middle, half = (low + high) / 2, max(0.54 * (high - low).max(), 0.25)
-    axes.set(xlim=(middle[0] - half, middle[0] + half), ylim=(middle[1] - half, middle[1] + half))
-    axes.set(aspect="equal", xlabel="x in m", ylabel="y in m")
-    axes.xaxis.set_major_locator(_steps(half))
-    axes.yaxis.set_major_locator(_steps(half))
-    axes.grid(color="#E6E6E6", lw=0.7)
-    axes.set_axisbelow(True)
-    for point in scene.rig.reference_points if scene.rig else ():
-        axes.plot(point.x_m, point.y_m, "+", color="black", ms=11, mew=1.6, zorder=5)
-        axes.annotate(point.name, (point.x_m, point.y_m), (5, 5), textcoords="offset points", weight="bold")

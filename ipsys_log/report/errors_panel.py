@@ -8,6 +8,9 @@ from dataclasses import dataclass
 import numpy as np
 from matplotlib.axes import Axes
 from matplotlib.figure import Figure
+from matplotlib.font_manager import FontProperties
+from matplotlib.textpath import TextPath
+from matplotlib.transforms import Transform, blended_transform_factory
 from numpy.typing import NDArray
 
 from ipsys_log.messages import ErrorStatistics
@@ -21,6 +24,10 @@ _TRACKS = "tracks"
 _LOG_RATIO = 15.0
 _GAP = 0.7  # between models, in rows
 _MOST_ROW_IN = 0.42
+# Across the figure: where the axes end, how wide they are at least, and where each column ends.
+_RIGHT_IN = 11.75
+_LEAST_IN = 1.5
+_COLUMNS_IN = {"mean": 12.25, "std": 12.7, "max": 13.15, "n": 13.6}
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -69,36 +76,58 @@ def draw_errors(
     ----------
     accuracies : with at least one error.
     styles : colour and marker shape by camera.
-    left_in, top_in : where the axes begin, in inches; the names are on the left of it.
+    left_in, top_in : where the names and where the axes begin, in inches.
     """
     rows = _rows(accuracies)
     heights = _heights(rows)
-    axes, row_in = _add_axes(figure, heights[-1] + 1.6, left_in, top_in)
+    _, height = figure.get_size_inches()
+    row_in = min((height - top_in - 0.95) / (heights[-1] + 1.6), _MOST_ROW_IN)
     size = float(np.clip(0.62 * 72 * row_in, 5.5, 9))
+    models_in, names_in = _name_widths(rows, size)
+    bar_in = left_in + models_in + 0.08
+    axes = _add_axes(figure, bar_in + 0.12 + names_in, top_in, row_in * (heights[-1] + 1.6))
     for y, row in zip(heights, rows, strict=True):
         _draw_row(axes, y, row, *styles.get(row.name, ("#0072B2", "|")), size)
-    _name_models(axes, rows, heights, size)
     _scale(axes, rows)
     axes.set_ylim(heights[-1] + 0.8, -0.8)
     axes.set_yticks(heights, [_name(row) for row in rows], fontsize=size)
-    axes.tick_params(axis="y", length=0)
-    axes.grid(axis="x", color="#E6E6E6", lw=0.7)
-    axes.set_axisbelow(True)
-    axes.spines[["top", "right", "left"]].set_visible(False)
+    _name_models(axes, rows, heights, size, bar_in)
     _print_figures(axes, rows, heights, size)
-    axes.set_title("Errors in space on held-out places", loc="left", fontsize=10, pad=size + 8)
+    axes.set_title("Errors in space on held-out places", loc="left", fontsize=10, pad=size + 12)
     axes.annotate(
         _note(rows), (0, 0), (0, -38), xycoords="axes fraction", textcoords="offset points", fontsize=8,
         color="#505050", va="top",
     )  # fmt: skip
 
 
-def _add_axes(figure: Figure, rows: float, left_in: float, top_in: float) -> tuple[Axes, float]:
-    """Axes for so many rows, and the height of a row in inches: few rows are not drawn far apart."""
+def _name_widths(rows: Sequence[_Row], size: float) -> tuple[float, float]:
+    """How many inches the longest name of a model and of a row take."""
+    bold, plain = FontProperties(weight="bold"), FontProperties()
+    models = [TextPath((0, 0), row.model, size=size + 1, prop=bold).get_extents().width for row in rows]
+    names = [TextPath((0, 0), _name(row), size=size, prop=plain).get_extents().width for row in rows]
+    return max(models) / 72, max(names) / 72
+
+
+def _add_axes(figure: Figure, left_in: float, top_in: float, high_in: float) -> Axes:
+    """Axes that end where the figures begin, however long the names before them are."""
     width, height = figure.get_size_inches()
-    row_in = min((height - top_in - 0.95) / rows, _MOST_ROW_IN)
-    low_in = height - top_in - row_in * rows
-    return figure.add_axes((left_in / width, low_in / height, 2.75 / width, row_in * rows / height)), row_in
+    left_in = min(left_in, _RIGHT_IN - _LEAST_IN)
+    low_in = height - top_in - high_in
+    axes = figure.add_axes(
+        (left_in / width, low_in / height, (_RIGHT_IN - left_in) / width, high_in / height)
+    )
+    axes.tick_params(axis="y", length=0)
+    axes.grid(axis="x", color="#E6E6E6", lw=0.7)
+    axes.set_axisbelow(True)
+    axes.spines[["top", "right", "left"]].set_visible(False)
+    return axes
+
+
+def _beside(axes: Axes) -> Transform:
+    """Across in inches of the figure, along in rows."""
+    figure = axes.get_figure(root=True)
+    assert figure is not None
+    return blended_transform_factory(figure.dpi_scale_trans, axes.transData)
 
 
 def _note(rows: Sequence[_Row]) -> str:
@@ -136,18 +165,17 @@ def _draw_row(axes: Axes, y: float, row: _Row, colour: str, shape: str, size: fl
     axes.plot(mean_cm, y, "|", color=colour, ms=1.5 * size, mew=2.2, zorder=4)
 
 
-def _name_models(axes: Axes, rows: Sequence[_Row], heights: Sequence[float], size: float) -> None:
+def _name_models(
+    axes: Axes, rows: Sequence[_Row], heights: Sequence[float], size: float, bar_in: float
+) -> None:
     """The model once beside its rows, with a line along them."""
+    beside = _beside(axes)
     for model in dict.fromkeys(row.model for row in rows):
         here = [y for y, row in zip(heights, rows, strict=True) if row.model == model]
-        along = axes.get_yaxis_transform()
-        # Clear of the names of the rows, of which the longest is known only when it is drawn.
-        x = -0.34 - 0.018 * size / 9 * max(0, max(len(_name(row)) for row in rows) - 12)
-        axes.plot(
-            [x, x], [here[0] - 0.4, here[-1] + 0.4], color="black", lw=1, transform=along, clip_on=False
-        )
+        ends = [here[0] - 0.4, here[-1] + 0.4]
+        axes.plot([bar_in, bar_in], ends, color="black", lw=1, transform=beside, clip_on=False)
         axes.text(
-            x - 0.03, (here[0] + here[-1]) / 2, model, transform=along, fontsize=size + 1, weight="bold",
+            bar_in - 0.08, sum(ends) / 2, model, transform=beside, fontsize=size + 1, weight="bold",
             ha="right", va="center",
         )  # fmt: skip
 
@@ -166,16 +194,27 @@ def _scale(axes: Axes, rows: Sequence[_Row]) -> None:
 
 
 def _print_figures(axes: Axes, rows: Sequence[_Row], heights: Sequence[float], size: float) -> None:
-    columns = {"mean": 1.17, "std": 1.32, "max": 1.47, "n": 1.60}
-    along = axes.get_yaxis_transform()
-    for title, x in columns.items():
-        axes.text(x, -0.9, title, transform=along, fontsize=size, color="#505050", ha="right", va="bottom")
+    beside = _beside(axes)
+    for title, x in _COLUMNS_IN.items():
+        axes.text(x, -0.9, title, transform=beside, fontsize=size, color="#505050", ha="right", va="bottom")
     for y, row in zip(heights, rows, strict=True):
         found = row.statistics
         values_m = {"mean": found.mean_m, "std": found.std_m, "max": found.max_m}
-        cells = {name: "-" if m is None else f"{m * CM_PER_M:.2f}" for name, m in values_m.items()}
+        cells = {name: "-" if m is None else _figure(m * CM_PER_M) for name, m in values_m.items()}
         for name, text in {**cells, "n": str(found.count)}.items():
             weight = "bold" if name == "mean" else "normal"
             axes.text(
-                columns[name], y, text, transform=along, fontsize=size, ha="right", va="center", weight=weight
+                _COLUMNS_IN[name],
+                y,
+                text,
+                transform=beside,
+                fontsize=size,
+                ha="right",
+                va="center",
+                weight=weight,
             )
+
+
+def _figure(value_cm: float) -> str:
+    """Two digits behind the point, as the paper has them; fewer where the column would burst."""
+    return f"{value_cm:.2f}" if value_cm < 100 else f"{value_cm:.0f}"

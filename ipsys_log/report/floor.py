@@ -55,10 +55,8 @@ def draw_session(session: Session, accuracies: Sequence[Accuracy], path: Path) -
     # Rows of text need their height; beyond some 28 of them the picture grows.
     figure = Figure(figsize=(14 if rows else 9, max(8.0, 1.6 + 0.23 * rows)), dpi=_DPI)
     width, height = figure.get_size_inches()
-    floor_in = 6.3  # side of the floor's axes
-    axes = figure.add_axes(
-        (0.65 / width, 1 - (0.65 + floor_in) / height, floor_in / width, floor_in / height)
-    )
+    low_in = height - _TOP_IN - _SIDE_IN
+    axes = figure.add_axes((0.65 / width, low_in / height, _SIDE_IN / width, _SIDE_IN / height))
     styles = camera_styles(row.camera for a in accuracies if a.evaluation for row in a.evaluation.cameras)
     draw_floor(axes, scene, styles)
     handles, labels = axes.get_legend_handles_labels()
@@ -67,7 +65,7 @@ def draw_session(session: Session, accuracies: Sequence[Accuracy], path: Path) -
         bbox_to_anchor=(0.4 / width, (low_in - 0.5) / height),
     )  # fmt: skip
     if rows:
-        draw_errors(figure, accuracies, styles, left_in=9.0, top_in=_TOP_IN)
+        draw_errors(figure, accuracies, styles, left_in=7.3, top_in=_TOP_IN)
     partial = path.with_name(path.name + ".partial")
     try:
         figure.savefig(partial, format="png")

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import os
 import re
+import signal
 import subprocess
 import sys
 import tempfile
@@ -52,7 +53,7 @@ def show_in_viewer(feed: Callable[[Callable[[bytes], object]], None]) -> None:
         Where no window can be opened.
     """
     check_screen(os.environ)
-    environment = {"RUST_LOG": "error", **os.environ, "RERUN_APP_ONLY": "true"}
+    environment = {"RUST_LOG": "error", **os.environ}
     with (
         tempfile.TemporaryFile() as complaints,
         subprocess.Popen(
@@ -67,11 +68,19 @@ def show_in_viewer(feed: Callable[[Callable[[bytes], object]], None]) -> None:
             # The window was closed before all was read, or never opened: the exit code says which.
             _abandon(viewer.stdin)
         except BaseException:
-            viewer.terminate()
+            _stop(viewer)
             _abandon(viewer.stdin)
             raise
         if viewer.wait() != 0:
             raise IpsysError(f"the viewer could not be shown ({_last_line(complaints)}); {_INSTEAD}")
+
+
+def _stop(viewer: subprocess.Popen[bytes]) -> None:
+    """End the viewer; what was started is Python, which hands on an interrupt but not a termination."""
+    if sys.platform == "win32":
+        viewer.terminate()
+    else:
+        viewer.send_signal(signal.SIGINT)
 
 
 def _abandon(pipe: IO[bytes]) -> None:

@@ -1,0 +1,254 @@
+"""A session saved for Rerun and read back with Rerun's own reader."""
+
+from __future__ import annotations
+
+import subprocess
+import sys
+from collections.abc import Iterator
+from pathlib import Path
+from typing import Any
+
+import cv2
+import numpy as np
+import pytest
+import rerun as rr
+from rerun.chunk import RrdReader
+
+from ipsys_log.errors import IpsysError, LogError
+from ipsys_log.log.session import Session
+from ipsys_log.messages import (
+    CompressedImage,
+    Distance,
+    Event,
+    Floor,
+    Marker,
+    Markers,
+    Measurement,
+    Message,
+    Position,
+    Positions,
+    RawImage,
+    ReferencePoint,
+    Rig,
+    Run,
+    Track,
+    Tracks,
+)
+from ipsys_log.runs import write_log
+from ipsys_log.sinks.rerun import write_recording
+from ipsys_log.sinks.rerun_images import rerun_image
+
+START_NS = 1_700_000_000_000_000_001
+STEP_NS = 100_000_000
+# Ten instants, silence, five more.
+TIMES_NS = [START_NS + STEP_NS * n for n in (*range(10), *range(200, 205))]
+DELAY_NS = 7_000_000
+CAMERAS = ("red", "white")
+RIG = Rig(
+    "lab",
+    "DICT_4X4_100",
+    0.2,
+    reference_points=(ReferencePoint("A", 1.0, 2.0), ReferencePoint("B", 3.0, 2.0)),
+    floor=Floor(4.0, 5.0),
+)
+
+
+def jpeg(shade: int) -> bytes:
+    ok, data = cv2.imencode(".jpg", np.full((48, 64), shade, np.uint8))
+    assert ok
+    return data.tobytes()
+
+
+def corners_px(n: int) -> np.ndarray[Any, np.dtype[np.float64]]:
+    return np.array([[10.25, 12.5], [20.0, 12.5], [20.0, 22.5], [10.0, 22.5]]) + n
+
+
+def session_messages() -> Iterator[Message]:
+    yield Message("/rig", START_NS, START_NS, RIG)
+    for number, (split, side, d1) in enumerate(
+        (("train", "left", 1.5), ("test", "right", 1.6), ("test", "left", 9.0))
+    ):
+        distances = (Distance("A", d1), Distance("B", 1.5))
+        measurement = Measurement(
+            START_NS, f"m{number}", marker_id=0, distances=distances, side=side, height_m=0.1, splits=(split,)
+        )
+        yield Message("/measurements", START_NS, START_NS, measurement)
+    for n, time_ns in enumerate(TIMES_NS):
+        log_ns = time_ns + DELAY_NS
+        for camera in CAMERAS:
+            image = CompressedImage(time_ns, camera, jpeg(10 * n), "jpeg")
+            yield Message(f"/cameras/{camera}/image", log_ns, time_ns, image, camera)
+            markers = Markers(time_ns, (Marker(0, corners_px(n)),) if n != 3 else (), 64, 48)
+            yield Message(f"/runs/stock/cameras/{camera}/markers", log_ns, time_ns, markers, camera)
+            positions = Positions(time_ns, (Position(0, 1 + 0.1 * n, 2.0, 0.1),))
+            yield Message(f"/runs/poly/cameras/{camera}/positions", log_ns, time_ns, positions, camera)
+            robots = (Track("robot_0", 0, 1 + 0.1 * n, 2.0, 0.1, 0.5), Track("robot_1", 1, 3.0, 0.1 * n, 0.1))
+            # The second robot goes away during the silence, and one camera sees the first only.
+            seen = robots[: 2 if n < 10 and camera == "white" else 1]
+            yield Message("/runs/poly/tracks", log_ns, time_ns, Tracks(time_ns, seen))
+        yield Message("/truth/tracks", log_ns, time_ns, Tracks(time_ns, robots))
+    yield Message("/events", log_ns, log_ns, Event(log_ns, "camera_lost", "red is gone", "red"))
+    for number, (run, stage, inputs) in enumerate((("stock", "detect", ()), ("poly", "fuse", ("stock",))), 1):
+        record = Run(log_ns, run, stage, input_runs=inputs, number=number)
+        yield Message(f"/runs/{run}/record", log_ns, log_ns, record)
+
+
+@pytest.fixture(scope="module")
+def log(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    path = tmp_path_factory.mktemp("rerun") / "lab.mcap"
+    write_log(path, session_messages())
+    return path
+
+
+@pytest.fixture(scope="module")
+def saved(log: Path) -> Path:
+    path = log.with_suffix(".rrd")
+    with Session([log]) as session:
+        shown = write_recording(session, save=path)
+    assert (shown.markers, shown.runs) == ("stock", ("poly",))
+    return path
+
+
+def rows(path: Path, entity: str, column: str) -> list[tuple[int, int, Any]]:
+    """Publish time, log time and value of a component, in the order of time and writing."""
+    found: list[tuple[int, int, Any]] = []
+    for chunk in RrdReader(path).stream().to_chunks():
+        batch = chunk.to_record_batch()
+        if chunk.entity_path == entity and column in batch.schema.names:
+            times = [batch.column(name).cast("int64").to_pylist() for name in ("publish_time", "log_time")]
+            found += zip(*times, batch.column(column).to_pylist(), strict=True)
+    return sorted(found, key=lambda row: row[0])
+
+
+def test_recording_is_sound_and_has_what_the_log_has(saved: Path) -> None:
+    verified = subprocess.run(
+        [sys.executable, "-m", "rerun", "rrd", "verify", str(saved)],
+        capture_output=True,
+        text=True,
+        check=False,
+    )
+    assert verified.returncode == 0, verified.stderr
+    chunks = RrdReader(saved).stream().to_chunks()
+    entities = {chunk.entity_path for chunk in chunks}
+    expected = {
+        f"/cameras/{camera}/image{part}" for camera in CAMERAS for part in ("", "/markers", "/markers/ids")
+    }
+    expected |= {f"/world/runs/poly/positions/{camera}" for camera in CAMERAS}
+    expected |= {f"/world/runs/poly/robots/robot_{n}" for n in (0, 1)} | {"/world/runs/poly/trails"}
+    expected |= {"/world/floor", "/world/floor/grid", "/world/reference_points", "/events/recorded"}
+    expected |= {"/world/places/training", "/world/places/test", "/world/truth/robots/robot_1"}
+    assert expected <= entities
+    # Nothing of the clock of the machine that drew it.
+    assert {name for chunk in chunks for name in chunk.timeline_names} == {"publish_time", "log_time"}
+    assert len(RrdReader(saved).blueprints()) >= 1
+
+
+def test_frames_are_the_bytes_of_the_log(saved: Path) -> None:
+    for camera in CAMERAS:
+        frames = rows(saved, f"/cameras/{camera}/image", "EncodedImage:blob")
+        assert [row[0] for row in frames] == TIMES_NS
+        assert [row[1] for row in frames] == [time_ns + DELAY_NS for time_ns in TIMES_NS]
+        assert [bytes(row[2][0]) for row in frames] == [jpeg(10 * n) for n in range(len(TIMES_NS))]
+
+
+def test_corners_lie_half_a_pixel_from_opencvs(saved: Path) -> None:
+    drawn = {row[0]: row[2] for row in rows(saved, "/cameras/red/image/markers", "LineStrips2D:strips")}
+    assert TIMES_NS[3] not in drawn
+    (outline,) = drawn[TIMES_NS[5]]
+    np.testing.assert_allclose(np.array(outline)[:4] - 0.5, corners_px(5))
+    assert outline[0] == outline[-1]
+    cleared = rows(saved, "/cameras/red/image/markers", "Clear:is_recursive")
+    assert TIMES_NS[3] in {row[0] for row in cleared}
+
+
+def test_each_robot_is_where_the_log_has_it(saved: Path) -> None:
+    for robot, axis, start in (("robot_0", 0, 1.0), ("robot_1", 1, 0.0)):
+        drawn = rows(saved, f"/world/runs/poly/robots/{robot}", "Points3D:positions")
+        assert {row[0] for row in drawn} == set(TIMES_NS if robot == "robot_0" else TIMES_NS[:10])
+        for time_ns, _, points in drawn:
+            assert points[0][axis] == pytest.approx(start + 0.1 * TIMES_NS.index(time_ns), abs=1e-6)
+
+
+def test_what_is_no_longer_seen_goes_away(saved: Path) -> None:
+    for entity in ("runs/poly/robots/robot_1", "runs/poly/robots/robot_0", "runs/poly/positions/red"):
+        cleared = rows(saved, f"/world/{entity}", "Clear:is_recursive")
+        # A second after the last of the first ten, and not at the end of the log.
+        assert [row[:2] for row in cleared if row[0] > TIMES_NS[9]] == [
+            (TIMES_NS[9] + 10**9, TIMES_NS[9] + DELAY_NS + 10**9)
+        ]
+    assert rows(saved, "/cameras/red/image", "Clear:is_recursive")[0][0] == TIMES_NS[9] + 10**10
+
+
+def test_trail_has_a_way_for_each_step_and_none_over_the_silence(saved: Path) -> None:
+    drawn = rows(saved, "/world/runs/poly/trails", "LineStrips3D:strips")
+    robot_0 = [(time_ns, strips[0]) for time_ns, _, strips in drawn if strips[0][0][1] == 2.0]
+    assert [time_ns for time_ns, _ in robot_0] == TIMES_NS[1:10] + TIMES_NS[11:]
+    assert robot_0[0][1][1][0] == pytest.approx(1.1)
+
+
+def test_place_that_forms_no_triangle_is_left_out_and_said(saved: Path) -> None:
+    chunks = RrdReader(saved).stream().to_chunks()
+    texts = [
+        text
+        for chunk in chunks
+        if chunk.entity_path == "/events/measurements"
+        for text in chunk.to_record_batch().column("TextLog:text").to_pylist()
+    ]
+    assert len(texts) == 1
+    assert "m2" in texts[0][0]
+
+
+def test_bad_requests_are_refused_and_leave_nothing(
+    log: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    target = tmp_path / "out.rrd"
+    with Session([log]) as session:
+        with pytest.raises(IpsysError, match=r"no run 'nix'.*stock, poly"):
+            write_recording(session, ["nix"], target)
+        with pytest.raises(FileNotFoundError):
+            write_recording(session, save=tmp_path / "none" / "out.rrd")
+
+        def broken(*_: object) -> Iterator[Message]:
+            yield next(session_messages())
+            raise LogError("damaged")
+
+        monkeypatch.setattr(session, "messages", broken)
+        with pytest.raises(LogError, match="damaged"):
+            write_recording(session, save=target)
+    assert list(tmp_path.iterdir()) == []
+
+
+def test_log_with_nothing_to_show_is_refused(tmp_path: Path) -> None:
+    path = tmp_path / "empty.mcap"
+    write_log(path, [Message("/rig", START_NS, START_NS, RIG)])
+    with Session([path]) as session, pytest.raises(IpsysError, match="nothing to show"):
+        write_recording(session, save=tmp_path / "out.rrd")
+
+
+def test_runs_named_bring_the_markers_they_rest_on(log: Path, tmp_path: Path) -> None:
+    with Session([log]) as session:
+        shown = write_recording(session, ["stock"], tmp_path / "out.rrd")
+        assert (shown.markers, shown.runs) == ("stock", ())
+        assert write_recording(session, ["poly"], tmp_path / "out.rrd").markers == "stock"
+
+
+def test_raw_frames_lose_the_padding_of_their_rows() -> None:
+    pixels = np.arange(2 * 8, dtype=np.uint8).reshape(2, 8)
+    image = rerun_image(RawImage(0, "red", 2, 2, "bgr8", 8, pixels.tobytes()))
+    assert isinstance(image, rr.Image)
+    assert image.buffer is not None
+    assert bytes(image.buffer.as_arrow_array().to_pylist()[0]) == pixels[:, :6].tobytes()
+
+
+@pytest.mark.parametrize(
+    ("frame", "reason"),
+    [
+        (RawImage(0, "red", 4, 4, "mono8", 4, b"123"), "too few"),
+        (RawImage(0, "red", 4, 4, "bayer_rggb8", 4, bytes(16)), "bayer_rggb8"),
+        (CompressedImage(0, "red", b"", "jpeg"), "0 bytes"),
+        (CompressedImage(0, "red", b"RIFF....WEBP", "webp"), "webp"),
+    ],
+)
+def test_frames_that_cannot_be_drawn_say_why(frame: CompressedImage | RawImage, reason: str) -> None:
+    with pytest.raises(ValueError, match=reason):
+        rerun_image(frame)

@@ -13,8 +13,8 @@ from matplotlib.ticker import MultipleLocator
 from numpy.typing import NDArray
 
 from ipsys_log.messages import CameraEvaluation, Evaluation, Rig
+from ipsys_log.offline.places import Place
 from ipsys_log.report.palette import REST, robot_colour
-from ipsys_log.sinks.places import Place
 
 __all__ = ["Scene", "draw_floor"]
 

@@ -7,6 +7,8 @@ from __future__ import annotations
 
 from collections.abc import Iterable
 
+from ipsys_log.sinks.palette import assign_colours
+
 __all__ = ["REST", "camera_styles", "robot_colour"]
 
 # A camera that has the name of a colour gets one that is like it and can be seen.
@@ -21,12 +23,8 @@ REST = "#B5B5B5"
 
 def camera_styles(cameras: Iterable[str]) -> dict[str, tuple[str, str]]:
     """Colour and marker shape for each camera, whatever the order of the names."""
-    cameras = sorted(set(cameras))
-    colours = {camera: _NAMED[camera] for camera in cameras if camera in _NAMED}
-    free = [colour for colour in _COLOURS if colour not in colours.values()] or list(_COLOURS)
-    for number, camera in enumerate(camera for camera in cameras if camera not in _NAMED):
-        colours[camera] = free[number % len(free)]
-    return {camera: (colours[camera], _SHAPES[n % len(_SHAPES)]) for n, camera in enumerate(cameras)}
+    colours = assign_colours(cameras, _NAMED, _COLOURS)
+    return {camera: (colours[camera], _SHAPES[n % len(_SHAPES)]) for n, camera in enumerate(sorted(colours))}
 
 
 def robot_colour(number: int) -> str:

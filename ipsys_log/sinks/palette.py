@@ -5,11 +5,20 @@ The hues are those of Okabe and Ito (2008), lightened where a dark ground asks f
 
 from __future__ import annotations
 
-from collections.abc import Iterable
+from collections.abc import Iterable, Mapping, Sequence
+from typing import TypeVar
 
-__all__ = ["KIND_COLOURS", "MARKER_COLOUR", "TRUTH_COLOUR", "camera_colours", "robot_colour"]
+__all__ = [
+    "KIND_COLOURS",
+    "MARKER_COLOUR",
+    "TRUTH_COLOUR",
+    "assign_colours",
+    "camera_colours",
+    "robot_colour",
+]
 
 RGB = tuple[int, int, int]
+Colour = TypeVar("Colour")
 
 MARKER_COLOUR: RGB = (40, 230, 90)
 TRUTH_COLOUR: RGB = (190, 190, 190)
@@ -47,14 +56,24 @@ _ROBOTS: tuple[RGB, ...] = (
 )
 
 
-def camera_colours(cameras: Iterable[str]) -> dict[str, RGB]:
-    """A colour for each camera, the same ones whatever the order of the names."""
+def assign_colours(
+    cameras: Iterable[str], named: Mapping[str, Colour], rest: Sequence[Colour]
+) -> dict[str, Colour]:
+    """A colour for each camera, the same ones whatever the order of the names.
+
+    A camera that has the name of a colour in ``named`` gets that one; the others share the ``rest``.
+    """
     cameras = sorted(set(cameras))
-    colours = {camera: _NAMED[camera] for camera in cameras if camera in _NAMED}
-    free = [colour for colour in _REST if colour not in colours.values()] or list(_REST)
-    for number, camera in enumerate(camera for camera in cameras if camera not in _NAMED):
+    colours = {camera: named[camera] for camera in cameras if camera in named}
+    free = [colour for colour in rest if colour not in colours.values()] or list(rest)
+    for number, camera in enumerate(camera for camera in cameras if camera not in named):
         colours[camera] = free[number % len(free)]
     return colours
+
+
+def camera_colours(cameras: Iterable[str]) -> dict[str, RGB]:
+    """Colours for cameras on a dark ground."""
+    return assign_colours(cameras, _NAMED, _REST)
 
 
 def robot_colour(number: int) -> RGB:

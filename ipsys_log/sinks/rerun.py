@@ -10,7 +10,7 @@ import rerun as rr
 from ipsys_log.errors import IpsysError
 from ipsys_log.log.session import Session
 from ipsys_log.messages import MEASUREMENTS_TOPIC, TRUTH_TOPIC, Measurement
-from ipsys_log.sinks.places import measured_places
+from ipsys_log.offline.places import measured_places
 from ipsys_log.sinks.rerun_scene import draw_places, draw_rig, layout
 from ipsys_log.sinks.rerun_sink import RerunSink, trail_entity
 from ipsys_log.sinks.rerun_viewer import show_in_viewer

@@ -10,8 +10,8 @@ import rerun as rr
 import rerun.blueprint as rrb
 
 from ipsys_log.messages import Floor, Rig
+from ipsys_log.offline.places import KINDS, Place
 from ipsys_log.sinks.palette import KIND_COLOURS
-from ipsys_log.sinks.places import KINDS, Place
 
 __all__ = ["TIMELINES", "draw_places", "draw_rig", "layout"]
 

@@ -123,8 +123,8 @@ class CameraCalibration:
     distortion_model: str
     D: Floats
     K: Mat33
-    R: Mat33
-    P: Mat34
+    R: Mat33 | None = None
+    P: Mat34 | None = None
 
 
 # --- frames -------------------------------------------------------------------------------------

@@ -17,7 +17,8 @@ locate          camera points,      positions         the run of its model
 fuse            positions           tracks, poses     the run of its positions
 ==============  ==================  ================  =====================================
 
-The rig is read by all but evaluate and locate.
+The rig is read by all but locate. :mod:`ipsys_log.tasks` says in full what each stage reads,
+:mod:`ipsys_log.perform` how its run is found or made.
 """
 
 from __future__ import annotations
@@ -28,13 +29,12 @@ from collections.abc import Callable, Iterable, Iterator, Sequence
 from concurrent.futures import Future, ThreadPoolExecutor
 from contextlib import ExitStack
 from dataclasses import dataclass
-from itertools import chain
+from functools import partial
 from pathlib import Path
 from typing import Any
 
 import cv2
 
-from ipsys_log.derive import Progress, Request, Task, last_input_ns, opened_target, perform, settings
 from ipsys_log.log.session import Session
 from ipsys_log.messages import (
     CameraPoints,
@@ -48,9 +48,12 @@ from ipsys_log.messages import (
     Positions,
     Tracks,
 )
+from ipsys_log.output import opened_target
+from ipsys_log.perform import inputs, perform
 from ipsys_log.preflight import check_inputs
+from ipsys_log.request import Progress, Request
 from ipsys_log.runs import Outcome
-from ipsys_log.tasks import STAGES, plan_stage, wanted_models
+from ipsys_log.tasks import STAGES, Task, plan_stage, wanted_models
 
 __all__ = ["TOPICS", "Stage", "in_threads", "replay", "run"]
 
@@ -147,8 +150,7 @@ def replay(
     Parameters
     ----------
     paths : the logs, read as one; results go to the last of them, or to ``output``.
-    until : the last stage; evaluate is left out on the way to locate where there is nothing to
-        evaluate on.
+    until : the last stage. On the way to fuse models are evaluated too, where places are held out.
 
     Returns
     -------
@@ -159,20 +161,21 @@ def replay(
     IpsysError
         For anything in the input that the user has to mend.
     """
-    models = wanted_models(request)
+    models = wanted_models(request, until)
     check_inputs(paths, request, models, until)
     outcomes: list[Outcome] = []
     with opened_target(paths, output) as (logs, target):
 
-        def do(stage: str, **inputs: str) -> str:
-            """Do a stage, or find it done; the name of the run that holds it."""
+        def do(stage: str, **given: str) -> str:
+            """Do a stage, or find it done; the name of the run that holds it, if there is one."""
             if STAGES.index(stage) > STAGES.index(until):
                 return ""
             with Session(logs) as session:
-                task = plan_stage(stage, session, request, **inputs)
+                task = plan_stage(stage, session, request, **given)
                 if isinstance(task, str):
                     return task
-                outcomes.append(perform(session, target, task, request, until, _make, progress))
+                make = partial(_make, progress=progress)
+                outcomes.append(perform(session, target, task, request, until, make))
             return outcomes[-1].run
 
         points = do("camera-frame", markers=do("detect"))
@@ -184,13 +187,14 @@ def replay(
     return outcomes
 
 
-def _make(task: Task, session: Session, name: str) -> Iterator[Message]:
+def _make(task: Task, session: Session, name: str, progress: Progress) -> Iterator[Message]:
     """The messages of a task's run: its causal stage over the log, or one computed from all of it."""
-    if task.compute is not None:
-        payload, time_ns = task.compute(session), last_input_ns(session, task)
-        yield Message(TOPICS[type(payload)].format(run=name), time_ns, payload.timestamp, payload)
+    if task.step is None:
+        assert task.compute is not None
+        payload, (log_time_ns, _) = task.compute(session), session.last(task.topics)
+        yield Message(TOPICS[type(payload)].format(run=name), log_time_ns, payload.timestamp, payload)
         return
-    source = chain(settings(session, task.topics, task.rig, task.lenses), session.messages(task.topics))
-    for message in run(source, [Stage(name, task.reads, task.step(name), task.per_camera)], in_threads):
-        if message.topic.startswith("/runs/") and message.topic not in task.topics:
+    stage = Stage(name, task.reads, task.step(name), task.per_camera)
+    for message in run(inputs(session, task, progress), [stage], in_threads):
+        if isinstance(message.payload, task.writes):
             yield message

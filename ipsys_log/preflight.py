@@ -5,14 +5,15 @@ from __future__ import annotations
 from collections.abc import Sequence
 from pathlib import Path
 
-from ipsys_log.derive import Request
 from ipsys_log.errors import FitError, IpsysError
 from ipsys_log.log.session import Session, camera_of_topic
-from ipsys_log.messages import MEASUREMENTS_TOPIC, RIG_TOPIC, CameraPoints, Markers, Rig
+from ipsys_log.messages import CameraPoints, Markers, Rig
 from ipsys_log.models import min_pairs
-from ipsys_log.offline.pairs import active_measurements, split, world_point
+from ipsys_log.offline.pairs import split, world_point
+from ipsys_log.request import Request
+from ipsys_log.rig import check_rig
 from ipsys_log.runs import newest_run
-from ipsys_log.tasks import STAGES, held_out_ids
+from ipsys_log.tasks import STAGES, fitted_in, held_out_ids, measured, rig_part
 
 __all__ = ["check_inputs"]
 
@@ -26,40 +27,75 @@ def check_inputs(paths: Sequence[Path], request: Request, models: Sequence[str],
         For the first thing that is missing or cannot be right, and what to do about it.
     """
     wanted = STAGES[: STAGES.index(until) + 1]
+    _check_request(paths, request, models)
     with Session(paths) as session:
-        if request.rig is None and not session.topics(Rig):
-            raise IpsysError(
-                f"{session}: has no rig (markers, reference points); write one with 'ipsys init lab.toml' "
-                "and give it with --rig lab.toml"
-            )
-        cameras = _check_frames(session, wanted)
-        _check_lenses(session, request, cameras, wanted)
+        _check_rigs(session, request)
+        cameras = _cameras(session, wanted)
+        _check_overrides(session, request, cameras)
+        if "camera-frame" in wanted:
+            _check_lenses(session, request, cameras)
         if "fit" in wanted and request.model_from is None:
             _check_measurements(session, request, models)
+        if "locate" in wanted and request.model_from is not None:
+            _check_model(session, request, models, cameras)
         if until == "evaluate":
             _check_held_out(session, request)
 
 
-def _check_frames(session: Session, wanted: Sequence[str]) -> set[str]:
-    """The cameras whose markers are to be seen through a lens."""
+def _check_request(paths: Sequence[Path], request: Request, models: Sequence[str]) -> None:
+    if request.run is not None and len(models) > 1:
+        raise IpsysError(
+            f"--run {request.run} is the name of one run, but {len(models)} models are asked for; "
+            "say which with --model"
+        )
+    if request.model_from is None:
+        return
+    if any(request.model_from.resolve() == path.resolve() for path in paths):
+        raise IpsysError(f"--model-from {request.model_from}: this is the log itself; leave --model-from out")
+    if request.train != "train":
+        raise IpsysError(f"--train {request.train} has no effect with --model-from; leave one of them out")
+
+
+def _check_rigs(session: Session, request: Request) -> None:
+    for topic in session.topics(Rig):
+        for rig in session.payloads([topic]):
+            check_rig(rig, f"{session}: {topic}")
+    if request.rig is None and not session.topics(Rig):
+        raise IpsysError(
+            f"{session}: has no rig (markers, reference points); write one with 'ipsys init lab.toml' "
+            "and give it with --rig lab.toml"
+        )
+
+
+def _cameras(session: Session, wanted: Sequence[str]) -> set[str]:
+    """The cameras whose markers are to be seen through a lens; none where there are only camera points."""
     if session.images:
         return set(session.images)
     markers = newest_run(session, Markers)
-    if markers is not None:
+    if markers is not None and wanted != ("detect",):
         return {str(camera_of_topic(topic)) for topic in session.topics(Markers, markers)}
     if wanted == ("detect",) or newest_run(session, CameraPoints) is None:
-        raise IpsysError(f"{session}: has no images to detect markers in; record some, or name another log")
+        unread = session.unread_images()
+        also = f"; {', '.join(unread)} cannot be read by this version" if unread else ""
+        raise IpsysError(f"{session}: has no images to detect markers in{also}")
     return set()
 
 
-def _check_lenses(session: Session, request: Request, cameras: set[str], wanted: Sequence[str]) -> None:
-    if "camera-frame" not in wanted or not cameras:
-        return
-    strange = sorted(set(request.lenses) - cameras)
-    if strange:
-        raise IpsysError(
-            f"--calibration {strange[0]}: the log has no such camera (it has {', '.join(sorted(cameras))})"
-        )
+def _check_overrides(session: Session, request: Request, cameras: set[str]) -> None:
+    """What cannot take effect is not passed over in silence."""
+    known = ", ".join(sorted(cameras)) if cameras else "none whose markers are in the log"
+    for name in sorted(set(request.lenses) - cameras):
+        raise IpsysError(f"--calibration {name}: the log has no such camera (it has {known})")
+    part = rig_part("camera-frame")
+    if request.rig is not None and not cameras:
+        held = session.payloads(session.topics(Rig))
+        if any(part(rig)[0] != part(request.rig)[0] for rig in held):
+            raise IpsysError(
+                "--rig: another marker length cannot take effect, the log has camera points but no markers"
+            )
+
+
+def _check_lenses(session: Session, request: Request, cameras: set[str]) -> None:
     missing = sorted(cameras - set(request.lenses) - set(session.calibrations))
     if missing:
         raise IpsysError(
@@ -69,20 +105,20 @@ def _check_lenses(session: Session, request: Request, cameras: set[str], wanted:
 
 
 def _check_measurements(session: Session, request: Request, models: Sequence[str]) -> None:
-    if not session.count(MEASUREMENTS_TOPIC):
+    places = measured(session, request.rig)
+    if not places:
         raise FitError(
             f"{session}: has no measurements to fit a model to; apply a model of another log with "
             "--model-from calibration.mcap"
         )
-    rig = request.rig or session.payloads([RIG_TOPIC])[-1]
-    measurements = active_measurements(session.payloads([MEASUREMENTS_TOPIC]))
-    train, _ = split(measurements, request.train, request.seed)
-    for measurement in measurements:
-        world_point(measurement, rig)
-        if measurement.marker_id is not None and not rig.knows(measurement.marker_id):
-            known = ", ".join(str(marker.id) for marker in rig.markers)
+    train, _ = split([place.measurement for place in places], request.train, request.seed)
+    for place in places:
+        world_point(place.measurement, place.rig)
+        marker_id = place.measurement.marker_id
+        if marker_id is not None and not place.rig.knows(marker_id):
+            known = ", ".join(str(marker.id) for marker in place.rig.markers)
             raise IpsysError(
-                f"measurement {measurement.id} names marker {measurement.marker_id}, which is not in the rig "
+                f"measurement {place.measurement.id} names marker {marker_id}, which is not in the rig "
                 f"(it has {known}); correct lab.toml and give it with --rig"
             )
     for model in models:
@@ -94,10 +130,26 @@ def _check_measurements(session: Session, request: Request, models: Sequence[str
             )
 
 
+def _check_model(session: Session, request: Request, models: Sequence[str], cameras: set[str]) -> None:
+    assert request.model_from is not None
+    if not cameras:
+        run = newest_run(session, CameraPoints)
+        cameras = {str(camera_of_topic(topic)) for topic in session.topics(CameraPoints, run)}
+    with Session([request.model_from]) as other:
+        for name in models:
+            model, _ = fitted_in(other, name)
+            fitted = {camera.camera for camera in model.cameras}
+            if not fitted & cameras:
+                raise IpsysError(
+                    f"--model-from {request.model_from}: its model is of the cameras "
+                    f"{', '.join(sorted(fitted))}, the log has {', '.join(sorted(cameras))}"
+                )
+
+
 def _check_held_out(session: Session, request: Request) -> None:
-    measurements = active_measurements(session.payloads([MEASUREMENTS_TOPIC]))
-    if not held_out_ids(measurements, request):
+    places = measured(session, request.rig)
+    if not held_out_ids([place.measurement for place in places], request):
         raise IpsysError(
-            f"{session}: no measured place is held out to evaluate on (of {len(measurements)}); label some "
+            f"{session}: no measured place is held out to evaluate on (of {len(places)}); label some "
             "'test', or measure at least five without labels, of which a fifth is then held out"
         )

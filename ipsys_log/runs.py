@@ -3,30 +3,27 @@
 from __future__ import annotations
 
 import platform
-from collections.abc import Callable, Iterable, Sequence
+from collections.abc import Iterable, Sequence
 from dataclasses import dataclass, replace
 from functools import cache
 from importlib.metadata import version
-from pathlib import Path
 
 import threadpoolctl
 
-from ipsys_log.errors import IpsysError, LogError
-from ipsys_log.log import LogWriter
-from ipsys_log.log.codec import encode, schema_data, schema_name
+from ipsys_log.errors import IpsysError
+from ipsys_log.log.codec import encode
 from ipsys_log.log.session import Session
-from ipsys_log.log.types import Schema
-from ipsys_log.messages import ChannelRead, ChannelWritten, Message, Run
+from ipsys_log.messages import ChannelRead, Run
 
 __all__ = [
     "Outcome",
+    "check_run_name",
+    "complete_runs",
     "find_run",
     "fingerprint",
     "free_name",
     "newest_run",
     "read_channels",
-    "write_log",
-    "write_messages",
 ]
 
 
@@ -67,77 +64,47 @@ def _essence(run: Run) -> bytes:
     return encode(replace(run, timestamp=0, run="", fingerprint={}, input_runs=(), outputs=(), number=0))
 
 
-def find_run(runs: Sequence[Run], wanted: Run, name: str | None = None) -> str | None:
-    """Name of the newest run that has done just what ``wanted`` would do, if there is one."""
+def complete_runs(session: Session) -> list[Run]:
+    """The records whose channels are all there, oldest first."""
+    return [
+        run
+        for run in session.runs()
+        if all(session.count(output.topic) >= output.messages for output in run.outputs)
+    ]
+
+
+def find_run(session: Session, wanted: Run, name: str | None = None) -> str | None:
+    """Name of the first complete run that has done just what ``wanted`` would do, if there is one."""
     essence = _essence(wanted)
-    for run in reversed(runs):
+    for run in complete_runs(session):
         if run.stage == wanted.stage and name in (None, run.run) and _essence(run) == essence:
             return run.run
     return None
 
 
-def free_name(runs: Sequence[Run], stage: str, base: str) -> str:
-    """``base``, or ``base_2``, ``base_3`` ... where that run already has this stage."""
-    taken = {run.run for run in runs if run.stage == stage}
-    name, number = base, 1
-    while name in taken:
+def free_name(session: Session, record: Run, base: str, writes: Sequence[type]) -> str:
+    """The name for a new run: ``base``, or ``base_2``, ``base_3`` ... where that is taken.
+
+    A stage joins the run that it reads from, as long as that does not have the stage; any other name
+    must be new, so that a run holds only what belongs together.
+    """
+    taken = session.run_names()
+    joins = base in record.input_runs and not _has_stage(session, record.stage, base, writes)
+    if joins or base not in taken:
+        return base
+    number = 2
+    while f"{base}_{number}" in taken:
         number += 1
-        name = f"{base}_{number}"
-    return name
+    return f"{base}_{number}"
 
 
-def newest_run(session: Session, payload: type) -> str | None:
-    """The run that wrote a type of payload last, among the complete ones."""
-    for run in reversed(session.runs()):
-        if session.topics(payload, run.run):
-            return run.run
-    return None
+def _has_stage(session: Session, stage: str, name: str, writes: Sequence[type]) -> bool:
+    """By its record, or by a channel that such a stage writes, whoever made it."""
+    recorded = any((run.run, run.stage) == (name, stage) for run in session.runs())
+    return recorded or bool(session.topics(writes[0], name))
 
 
-def write_messages(writer: LogWriter, messages: Iterable[Message]) -> dict[str, int]:
-    """Put messages into an open log; returns how many went to each topic."""
-    counts: dict[str, int] = {}
-    for message in messages:
-        name = schema_name(type(message.payload))
-        if message.topic not in counts:
-            writer.add_channel(message.topic, Schema(name, "protobuf", schema_data(name)))
-        writer.write(message.topic, message.log_time_ns, message.publish_time_ns, encode(message.payload))
-        counts[message.topic] = counts.get(message.topic, 0) + 1
-    return counts
-
-
-def write_log(path: Path, messages: Iterable[Message]) -> dict[str, int]:
-    """Write a new log; after an error nothing of it is left.
-
-    Returns
-    -------
-    How many messages went to each topic.
-    """
-    with LogWriter.create(path, atomic=True) as writer:
-        return write_messages(writer, messages)
-
-
-def append_run(path: Path, record: Run, log_time_ns: int, messages: Callable[[], Iterable[Message]]) -> Run:
-    """Append what a stage makes, then its record, in one step: all of it is in the log, or nothing.
-
-    Raises
-    ------
-    LogError
-        Where another process has written this stage of this run meanwhile.
-    """
-    with LogWriter.append(path) as writer:
-        with Session([path]) as now:
-            if any((run.run, run.stage) == (record.run, record.stage) for run in now.runs()):
-                raise LogError(f"{path}: another process has just written run {record.run}; start again")
-        counts = write_messages(writer, messages())
-        outputs = tuple(ChannelWritten(topic, count) for topic, count in sorted(counts.items()))
-        done = replace(record, outputs=outputs)
-        topic = f"/runs/{record.run}/record"
-        write_messages(writer, [Message(topic, log_time_ns, record.timestamp, done)])
-    return done
-
-
-def check_run_name(runs: Sequence[Run], stage: str, name: str) -> str:
+def check_run_name(session: Session, stage: str, name: str, writes: Sequence[type]) -> str:
     """Return the name that a user gave a run, if the run does not have that stage yet.
 
     Raises
@@ -145,6 +112,14 @@ def check_run_name(runs: Sequence[Run], stage: str, name: str) -> str:
     IpsysError
         Otherwise.
     """
-    if any(run.run == name and run.stage == stage for run in runs):
+    if _has_stage(session, stage, name, writes):
         raise IpsysError(f"run {name} already has the stage {stage} from other input; use another --run name")
     return name
+
+
+def newest_run(session: Session, payload: type) -> str | None:
+    """The complete run that wrote a type of payload last."""
+    for run in reversed(complete_runs(session)):
+        if session.topics(payload, run.run):
+            return run.run
+    return None

@@ -2,47 +2,83 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable
+from collections.abc import Callable, Iterable, Mapping
+from dataclasses import dataclass, field
 from typing import Any
 
-from ipsys_log.derive import Request, Task
 from ipsys_log.errors import IpsysError
 from ipsys_log.geometry.lenses import same_lens
 from ipsys_log.log.session import Session
 from ipsys_log.messages import (
-    MEASUREMENTS_TOPIC,
-    RIG_TOPIC,
-    TRUTH_TOPIC,
     CameraCalibration,
     CameraPoints,
+    ChannelRead,
     Evaluation,
+    Event,
+    FrameTransforms,
+    ImageAnnotations,
     Markers,
     Measurement,
+    Message,
     Model,
     Pair,
     Positions,
     Rig,
+    Tracks,
 )
-from ipsys_log.models import create
+from ipsys_log.models import MODELS, create
 from ipsys_log.offline.evaluate import evaluate_model, gather_tracks, true_points
 from ipsys_log.offline.fit import fit_model
-from ipsys_log.offline.pairs import active_measurements, build_pairs, gather_sightings, split
-from ipsys_log.runs import newest_run, read_channels
+from ipsys_log.offline.pairs import Measured, build_pairs, gather_sightings, measured_in_order, split
+from ipsys_log.request import Request
+from ipsys_log.runs import complete_runs, newest_run, read_channels
 from ipsys_log.stages import camera_frame, detect, fuse, locate
 
-__all__ = ["STAGES", "held_out_ids", "plan_stage", "wanted_models"]
+__all__ = [
+    "STAGES",
+    "Task",
+    "fitted_in",
+    "held_out_ids",
+    "measured",
+    "plan_stage",
+    "rig_part",
+    "wanted_models",
+]
 
-# What a stage reads of the rig; an overriding rig that says the same there changes nothing.
-_RIG_PARTS: dict[str, Callable[[Rig], Any]] = {
-    "detect": lambda rig: (rig.dictionary, {marker.id for marker in rig.markers}),
-    "camera-frame": lambda rig: (rig.marker_length_m, {(m.id, rig.length_of(m.id)) for m in rig.markers}),
-    "fit": lambda rig: (rig.reference_points, {marker.id for marker in rig.markers}),
-    "evaluate": lambda rig: (rig.reference_points, {marker.id for marker in rig.markers}),
-    "fuse": lambda rig: {(marker.id, marker.robot) for marker in rig.markers},
-}
+
+@dataclass(frozen=True, slots=True)
+class Task:
+    """One stage, told what to read: everything that makes its result what it is.
+
+    Attributes
+    ----------
+    base : name of its run, unless that one is taken.
+    topics : what it reads of the log, and ``foreign`` what it reads of another one.
+    writes : the payloads that it makes, first the one that it is there for.
+    reads, step, per_camera : a causal stage: its payloads, its step for a run of a given name, and whether
+        the step takes each camera by itself; or
+    compute : the payload that is computed from the whole log; what to know of it goes to ``notes``.
+    parameters : what else its result depends on; ``input_runs`` those of ``foreign``.
+    rig, lenses : set where they replace what the log holds.
+    """
+
+    stage: str
+    base: str
+    topics: tuple[str, ...]
+    writes: tuple[type, ...]
+    reads: tuple[type, ...] = ()
+    step: Callable[[str], Callable[[Message], Iterable[Any]]] | None = None
+    per_camera: bool = True
+    compute: Callable[[Session], Any] | None = None
+    parameters: Mapping[str, str] = field(default_factory=dict)
+    rig: Rig | None = None
+    lenses: Mapping[str, CameraCalibration] = field(default_factory=dict)
+    foreign: tuple[ChannelRead, ...] = ()
+    input_runs: tuple[str, ...] = ()
+    notes: list[str] = field(default_factory=list)
 
 
-def wanted_models(request: Request) -> tuple[str, ...]:
+def wanted_models(request: Request, until: str) -> tuple[str, ...]:
     """The models to fit or apply.
 
     Raises
@@ -52,15 +88,23 @@ def wanted_models(request: Request) -> tuple[str, ...]:
     """
     for name in request.models:
         create(name)
-    if request.models or request.model_from is None:
-        return request.models or ("poly",)
-    with Session([request.model_from]) as other:
-        return (_fitted(other, None)[0].name,)
+    if request.models:
+        return request.models
+    if request.model_from is not None:
+        with Session([request.model_from]) as other:
+            return (fitted_in(other, None)[0].name,)
+    return tuple(MODELS) if until == "evaluate" else ("poly",)
 
 
-def _fitted(other: Session, name: str | None) -> tuple[Model, str]:
-    """The newest model in another log, of a name where one is given, and its topic."""
-    for run in reversed(other.runs()):
+def fitted_in(other: Session, name: str | None) -> tuple[Model, str]:
+    """The newest model in another log, of a name where one is given, and its topic.
+
+    Raises
+    ------
+    IpsysError
+        Where there is none.
+    """
+    for run in reversed(complete_runs(other)):
         for topic in other.topics(Model, run.run):
             model: Model = other.payloads([topic])[-1]
             if run.stage == "fit" and name in (None, model.name):
@@ -69,33 +113,41 @@ def _fitted(other: Session, name: str | None) -> tuple[Model, str]:
     raise IpsysError(f"{other}: has no fitted {what}; fit one there with: ipsys fit {other}")
 
 
+def rig_part(stage: str) -> Callable[[Rig], Any]:
+    """What a stage reads of the rig; an overriding rig that says the same there changes nothing."""
+    return {
+        "detect": lambda rig: (rig.dictionary, {m.id for m in rig.markers}),
+        "camera-frame": lambda rig: (rig.marker_length_m, {(m.id, rig.length_of(m.id)) for m in rig.markers}),
+        "fuse": lambda rig: {(m.id, m.robot) for m in rig.markers},
+    }.get(stage, lambda rig: (rig.reference_points, {m.id for m in rig.markers}))
+
+
 def _rig(session: Session, request: Request, stage: str) -> tuple[Rig | None, list[str]]:
-    """The overriding rig, if it matters to a stage, or the log's topic to read it from."""
-    part = _RIG_PARTS[stage]
-    held = session.payloads([RIG_TOPIC]) if session.topics(Rig) else []
+    """The overriding rig, if it matters to a stage, or the log's topics to read it from."""
+    part = rig_part(stage)
+    held = session.payloads(session.topics(Rig))
     if request.rig is not None and not (held and all(part(rig) == part(request.rig) for rig in held)):
         return request.rig, []
     return None, session.topics(Rig)
 
 
-def plan_stage(stage: str, session: Session, request: Request, **inputs: str) -> Task | str:
-    """The task of a stage on a log; or the name of a run to use as it is; or "" for nothing to do."""
-    return STAGE_PLANS[stage](session, request, **inputs)
+def plan_stage(stage: str, session: Session, request: Request, **given: str) -> Task | str:
+    """The task of a stage on a log; or the name of a run to use as it is, "" where there is none."""
+    return _PLANS[stage](session, request, **given)
 
 
 def _detect(session: Session, request: Request) -> Task | str:
     if not session.images:
         return newest_run(session, Markers) or ""
     rig, topics = _rig(session, request, "detect")
-    topics += session.images.values()
-    parameters = {"corners": "stock"}
     return Task(
         "detect",
         "stock",
-        tuple(topics),
+        (*topics, *session.images.values()),
+        (Markers, ImageAnnotations, Event),
         detect.READS,
         lambda run: detect.Detect(),
-        parameters=parameters,
+        parameters={"corners": "stock"},
         rig=rig,
     )
 
@@ -104,13 +156,13 @@ def _camera_frame(session: Session, request: Request, markers: str) -> Task | st
     if not markers:
         return newest_run(session, CameraPoints) or ""
     rig, topics = _rig(session, request, "camera-frame")
-    topics += session.topics(Markers, markers)
     lenses = _other_lenses(session, request)
-    topics += [topic for camera, topic in session.calibrations.items() if camera not in lenses]
+    held = [topic for camera, topic in session.calibrations.items() if camera not in lenses]
     return Task(
         "camera-frame",
         markers,
-        tuple(topics),
+        (*topics, *session.topics(Markers, markers), *held),
+        (CameraPoints, Event),
         camera_frame.READS,
         lambda run: camera_frame.CameraFrame(),
         rig=rig,
@@ -132,60 +184,74 @@ def _fit(session: Session, request: Request, points: str, model: str) -> Task | 
     if request.model_from is not None:
         return _copy_model(request, model, base)
     rig, topics = _rig(session, request, "fit")
-    topics += [*session.topics(CameraPoints, points), MEASUREMENTS_TOPIC]
+    topics += [*session.topics(CameraPoints, points), *session.topics(Measurement)]
+    notes: list[str] = []
 
     def compute(log: Session) -> Model:
-        measurements = active_measurements(log.payloads([MEASUREMENTS_TOPIC]))
-        train, _ = split(measurements, request.train, request.seed)
-        return fit_model(model, _pairs(log, rig, points, measurements, train), log.last_ns(topics))
+        places = measured(log, rig)
+        train, _ = split([place.measurement for place in places], request.train, request.seed)
+        pairs = _pairs(log, points, places, train)
+        fitted = fit_model(model, pairs, log.last(topics)[1])
+        notes.extend(_unused(pairs, train))
+        return fitted
 
-    parameters = {"model": model, "train": request.train, "seed": str(request.seed)}
-    return Task("fit", base, tuple(topics), compute=compute, parameters=parameters, rig=rig)
+    parameters = {"model": model, **_split_parameters(session, request)}
+    return Task(
+        "fit", base, tuple(topics), (Model,), compute=compute, parameters=parameters, rig=rig, notes=notes
+    )
 
 
 def _copy_model(request: Request, name: str, base: str) -> Task:
     assert request.model_from is not None
     with Session([request.model_from]) as other:
-        model, topic = _fitted(other, name)
+        model, topic = fitted_in(other, name)
         foreign = read_channels(other, [topic])
-    parameters = {"model": name, "copied_from": request.model_from.name}
-    return Task("fit", base, (), compute=lambda log: model, parameters=parameters, foreign=foreign)
+    return Task(
+        "fit",
+        base,
+        (),
+        (Model,),
+        compute=lambda log: model,
+        parameters={"model": name},
+        foreign=foreign,
+        input_runs=(f"{request.model_from.name}:{topic.split('/')[2]}",),
+    )
 
 
 def _evaluate(session: Session, request: Request, points: str, model: str) -> Task | str:
-    if not held_out_ids(active_measurements(session.payloads([MEASUREMENTS_TOPIC])), request):
+    if not held_out_ids([place.measurement for place in measured(session, request.rig)], request):
         return ""
     rig, topics = _rig(session, request, "evaluate")
-    topics += [*session.topics(CameraPoints, points), *session.topics(Model, model), MEASUREMENTS_TOPIC]
-    topics += [TRUTH_TOPIC] if session.count(TRUTH_TOPIC) else []
+    topics += [*session.topics(CameraPoints, points), *session.topics(Model, model)]
+    topics += [*session.topics(Measurement), *session.topics(Tracks)]
 
     def compute(log: Session) -> Evaluation:
         fitted: Model = log.payloads(log.topics(Model, model))[-1]
-        measurements = active_measurements(log.payloads([MEASUREMENTS_TOPIC]))
-        held_out = held_out_ids(measurements, request)
-        truth = true_points(measurements, gather_tracks(log.messages([TRUTH_TOPIC])))
-        pairs = _pairs(log, rig, points, measurements, held_out)
-        return evaluate_model(fitted, pairs, truth, log.last_ns(topics))
+        places = measured(log, rig)
+        held_out = held_out_ids([place.measurement for place in places], request)
+        truth = true_points(places, gather_tracks(log.messages(log.topics(Tracks))))
+        return evaluate_model(fitted, _pairs(log, points, places, held_out), truth, log.last(topics)[1])
 
-    parameters = {"train": request.train, "seed": str(request.seed)}
-    if request.model_from is not None:
-        parameters = {"held_out": "test, or all where nothing is labelled"}
-    return Task("evaluate", model, tuple(topics), compute=compute, parameters=parameters, rig=rig)
+    parameters = _split_parameters(session, request) if request.model_from is None else {}
+    return Task(
+        "evaluate", model, tuple(topics), (Evaluation,), compute=compute, parameters=parameters, rig=rig
+    )
 
 
 def _locate(session: Session, _request: Request, points: str, model: str) -> Task | str:
     topics = (*session.topics(CameraPoints, points), *session.topics(Model, model))
     fitted: Model = session.payloads(session.topics(Model, model))[-1]
-    return Task("locate", model, topics, locate.READS, lambda run: locate.Locate(fitted))
+    return Task("locate", model, topics, (Positions,), locate.READS, lambda run: locate.Locate(fitted))
 
 
 def _fuse(session: Session, request: Request, positions: str) -> Task | str:
     rig, topics = _rig(session, request, "fuse")
     topics += session.topics(Positions, positions)
-    return Task("fuse", positions, tuple(topics), fuse.READS, fuse.Fuse, per_camera=False, rig=rig)
+    writes = (Tracks, FrameTransforms)
+    return Task("fuse", positions, tuple(topics), writes, fuse.READS, fuse.Fuse, per_camera=False, rig=rig)
 
 
-STAGE_PLANS: dict[str, Callable[..., Task | str]] = {
+_PLANS: dict[str, Callable[..., Task | str]] = {
     "detect": _detect,
     "camera-frame": _camera_frame,
     "fit": _fit,
@@ -193,22 +259,45 @@ STAGE_PLANS: dict[str, Callable[..., Task | str]] = {
     "locate": _locate,
     "fuse": _fuse,
 }
-STAGES = tuple(STAGE_PLANS)
+STAGES = tuple(_PLANS)
 
 
-def held_out_ids(measurements: list[Measurement], request: Request) -> set[str]:
-    """The measurements that the models are evaluated on."""
+def measured(session: Session, rig: Rig | None) -> list[Measured]:
+    """The measured places that count, each with the rig in force when it was measured, or with ``rig``."""
+    topics = [*session.topics(Rig), *session.topics(Measurement)]
+    return measured_in_order(session.messages(topics), rig)
+
+
+def held_out_ids(measurements: Iterable[Measurement], request: Request) -> set[str]:
+    """The measurements that models are evaluated on."""
+    measurements = list(measurements)
     if request.model_from is None:
-        return split(measurements, request.train, request.seed)[1]
-    # A model of another log has seen none of these places.
+        return split(measurements, request.train, request.seed)[1] if measurements else set()
+    # A model of another log has seen none of these places, unless it was made of them: see evaluate_model.
     labelled = any(m.splits for m in measurements)
     return {m.id for m in measurements if "test" in m.splits or not labelled}
 
 
-def _pairs(
-    session: Session, rig: Rig | None, points: str, measurements: list[Measurement], ids: set[str]
-) -> dict[str, list[Pair]]:
+def _split_parameters(session: Session, request: Request) -> dict[str, str]:
+    """What the split depends on: the label, or the seed where nothing is labelled."""
+    labelled = any(m.splits for m in session.payloads(session.topics(Measurement)))
+    return {"train": request.train} if labelled else {"seed": str(request.seed)}
+
+
+def _pairs(session: Session, points: str, places: list[Measured], ids: set[str]) -> dict[str, list[Pair]]:
     """The measured places with these ids, by camera."""
-    rig = rig or session.payloads([RIG_TOPIC])[-1]
     sightings = gather_sightings(session.messages(session.topics(CameraPoints, points)))
-    return build_pairs(sightings, [m for m in measurements if m.id in ids], rig)
+    return build_pairs(sightings, [place for place in places if place.measurement.id in ids])
+
+
+def _unused(pairs: Mapping[str, list[Pair]], train: set[str]) -> list[str]:
+    """What was measured for nothing: places that no camera saw, cameras that saw no place."""
+    seen = {pair.measurement for found in pairs.values() for pair in found}
+    unseen = sorted(train - seen)
+    lines = [
+        f"camera {name} saw no measured place: it has no model" for name, found in pairs.items() if not found
+    ]
+    if unseen:
+        names = ", ".join(unseen[:5]) + (" ..." if len(unseen) > 5 else "")
+        lines.append(f"{len(unseen)} of {len(train)} measured places were seen still by no camera: {names}")
+    return lines

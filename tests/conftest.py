@@ -12,7 +12,7 @@ from typing import NamedTuple
 import pytest
 
 from ipsys_log.cli import main
-from ipsys_log.runs import write_log
+from ipsys_log.output import write_log
 from ipsys_log.sources.simulator import LabSettings, simulate
 
 ROOT = Path(__file__).resolve().parent.parent

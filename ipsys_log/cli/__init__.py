@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import errno
 import sys
 
 __all__ = ["main"]
@@ -20,9 +21,11 @@ def main() -> None:
         sys.stderr.close()  # the reader of a pipe has gone, such as head
         sys.exit(0)
     except OSError as error:
-        if error.filename is None:
+        full = error.errno in (errno.ENOSPC, errno.EDQUOT)
+        if error.filename is None and not full:
             raise
-        sys.exit(_complain(f"{error.filename}: {error.strerror}"))
+        what = "the disk is full; free some space and try again" if full else error.strerror
+        sys.exit(_complain(f"{error.filename}: {what}" if error.filename else str(what)))
     except KeyboardInterrupt:
         sys.exit(130)
 

@@ -9,7 +9,7 @@ from ipsys_log.cli import derive, imports, inspect, setup, view
 app = typer.Typer(
     name="ipsys",
     help="Indoor positioning with cheap cameras and ArUco markers. Everything is a channel in an MCAP log: "
-    "record it, replay it, compare models on it, look at it.",
+    "replay it, compare models on it, look at it.",
     no_args_is_help=True,
     add_completion=False,
     pretty_exceptions_enable=False,

@@ -9,7 +9,7 @@ from typing import TYPE_CHECKING
 from rich.console import Console
 
 if TYPE_CHECKING:
-    from ipsys_log.derive import Progress
+    from ipsys_log.request import Progress
 
 __all__ = ["console", "progress_bar", "remarks"]
 

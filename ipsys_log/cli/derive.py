@@ -11,10 +11,10 @@ from typing import TYPE_CHECKING, Annotated, Any, Optional
 import typer
 
 from ipsys_log.cli.console import console, progress_bar, remarks
-from ipsys_log.cli.options import AsJson, Calibrations, Logs, RigFile, load_calibrations
+from ipsys_log.cli.options import AsJson, Calibrations, Logs, RigFile, cameras_of, load_calibrations
 
 if TYPE_CHECKING:
-    from ipsys_log.derive import Request
+    from ipsys_log.request import Request
     from ipsys_log.runs import Outcome
 
 __all__ = ["add_commands"]
@@ -42,7 +42,7 @@ _OPTIONS: dict[str, tuple[Any, Any]] = {
         Annotated[str, typer.Option(help="Fit on the measurements with this label.")],
         "train",
     ),
-    "seed": (Annotated[int, typer.Option(help="Of the random split, where nothing is labelled.")], 0),
+    "seed": (Annotated[int, typer.Option(min=0, help="Of the random split, where nothing is labelled.")], 0),
     "rig": (RigFile, None),
     "calibration": (Calibrations, None),
     "run": (
@@ -96,15 +96,15 @@ _COMMANDS: dict[str, tuple[str, tuple[str, ...], str]] = {
 
 def add_commands(app: typer.Typer) -> None:
     for name, (until, options, text) in _COMMANDS.items():
-        app.command(name, help=text)(_command(name, until, options))
+        app.command(name, help=text)(_command(until, options))
 
 
-def _command(name: str, until: str, options: Sequence[str]) -> Callable[..., None]:
+def _command(until: str, options: Sequence[str]) -> Callable[..., None]:
     """A function with just these options, which does the stages up to ``until``."""
 
     def command(logs: list[Path], **given: Any) -> None:
         output, as_json, plot = given.pop("output"), given.pop("as_json"), given.pop("plot", None)
-        _derive(logs, _request(name, **given), until, output, as_json, plot)
+        _derive(logs, _request(logs, **given), until, output, as_json, plot)
 
     keyword = inspect.Parameter.KEYWORD_ONLY
     rows = {option: _OPTIONS[option] for option in options}
@@ -118,19 +118,16 @@ def _command(name: str, until: str, options: Sequence[str]) -> Callable[..., Non
     return command
 
 
-def _request(command: str, **given: Any) -> Request:
-    from ipsys_log.derive import Request
-    from ipsys_log.models import MODELS
+def _request(logs: list[Path], **given: Any) -> Request:
+    from ipsys_log.request import Request
     from ipsys_log.rig import check_name, load_rig
 
     rig, run = given.pop("rig"), given.pop("run")
     models = tuple(given.pop("model", None) or ())
-    if command == "evaluate" and not models and given.get("model_from") is None:
-        models = tuple(MODELS)
     return Request(
         models=models,
         rig=load_rig(rig) if rig else None,
-        lenses=load_calibrations(given.pop("calibration", None)),
+        lenses=load_calibrations(given.pop("calibration", None), lambda: cameras_of(logs)),
         run=check_name(run, "--run") if run else None,
         **given,
     )
@@ -156,7 +153,7 @@ def _derive(
     _remark(outcomes, [*logs, *written][-1])
     if as_json:
         stages = [{"stage": o.stage, "run": o.run, "new": o.fresh, "messages": o.messages} for o in outcomes]
-        print(json.dumps({**accuracy_json(accuracies), "stages": stages}, indent=2))  # noqa: T201
+        print(json.dumps({**accuracy_json(accuracies), "stages": stages}, indent=2, allow_nan=False))  # noqa: T201
     elif accuracies:
         console.print(accuracy_table(accuracies))
     if plot is not None:

@@ -26,7 +26,7 @@ def imsel(
 ) -> None:
     """The measurements behind the paper (Ou et al., Robotica 2023): .mat files and camera YAMLs."""
     from ipsys_log.formats.imsel import read_imsel
-    from ipsys_log.runs import write_log
+    from ipsys_log.output import write_log
 
     counts = write_log(output, read_imsel(folder))
     console.print(f"{output} written: {sum(counts.values())} messages on {len(counts)} channels")
@@ -41,11 +41,12 @@ def images(
 ) -> None:
     """A folder of pictures, one sub-folder per camera; the n-th of each belong together."""
     from ipsys_log.cli.options import load_calibrations
+    from ipsys_log.output import write_log
     from ipsys_log.rig import load_rig
-    from ipsys_log.runs import write_log
-    from ipsys_log.sources.files import read_images
+    from ipsys_log.sources.files import find_pictures, read_images
 
-    lenses = load_calibrations(calibration)
-    counts = write_log(output, read_images(folder, load_rig(rig) if rig else None, lenses, rate))
-    pictures = sum(count for topic, count in counts.items() if topic.endswith("/image"))
-    console.print(f"{output} written: {pictures} pictures")
+    pictures = find_pictures(folder)
+    lenses = load_calibrations(calibration, lambda: pictures)
+    write_log(output, read_images(pictures, load_rig(rig) if rig else None, lenses, rate))
+    counts = ", ".join(f"{len(paths)} of {camera}" for camera, paths in pictures.items())
+    console.print(f"{output} written: pictures: {counts}")

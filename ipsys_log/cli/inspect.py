@@ -35,7 +35,7 @@ def info(logs: Logs, as_json: AsJson = False) -> None:
 
 
 def runs(logs: Logs, as_json: AsJson = False) -> None:
-    """The runs of a log: which stage, from what, with which parameters and software."""
+    """The runs of a log: stage, what it was made from, with which parameters, by which ipsys."""
     from ipsys_log.log.session import Session
     from ipsys_log.report.contents import runs_json, runs_table
 

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Callable, Collection
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, Optional
 
@@ -10,14 +11,16 @@ import typer
 if TYPE_CHECKING:
     from ipsys_log.messages import CameraCalibration
 
-__all__ = ["AsJson", "Calibrations", "Logs", "NewLog", "RigFile", "load_calibrations"]
+__all__ = ["AsJson", "Calibrations", "Logs", "NewLog", "RigFile", "cameras_of", "load_calibrations"]
 
 Logs = Annotated[
     list[Path],
     typer.Argument(help="Logs, read as one. Results go to the last.", metavar="LOG..."),
 ]
 NewLog = Annotated[Path, typer.Option("--output", "-o", help="The log to write.")]
-RigFile = Annotated[Path | None, typer.Option("--rig", help="A rig file to use instead of the log's rig.")]
+RigFile = Annotated[
+    Path | None, typer.Option("--rig", help="A rig file (lab.toml) to use instead of what the log holds.")
+]
 Calibrations = Annotated[
     Optional[list[str]],  # noqa: UP045
     typer.Option(
@@ -29,8 +32,10 @@ Calibrations = Annotated[
 AsJson = Annotated[bool, typer.Option("--json", help="Print JSON.")]
 
 
-def load_calibrations(options: list[str] | None) -> dict[str, CameraCalibration]:
-    """Lenses by camera from ``camera=file.yaml`` or ``other.mcap``.
+def load_calibrations(
+    options: list[str] | None, cameras: Callable[[], Collection[str]]
+) -> dict[str, CameraCalibration]:
+    """Lenses by camera from ``camera=file.yaml``, or from ``other.mcap`` for those of ``cameras``.
 
     Raises
     ------
@@ -48,9 +53,10 @@ def load_calibrations(options: list[str] | None) -> dict[str, CameraCalibration]
             found = {camera: read_opencv_calibration(Path(name), camera)}
         elif option.endswith(".mcap"):
             with Session([Path(option)]) as log:
-                found = {c: log.payloads([topic])[-1] for c, topic in log.calibrations.items()}
+                held = {c: log.payloads([topic])[-1] for c, topic in log.calibrations.items()}
+            found = {c: lens for c, lens in held.items() if c in cameras()}
             if not found:
-                raise IpsysError(f"{option}: holds no camera calibration")
+                raise IpsysError(f"--calibration {option}: holds no calibration of these cameras")
         else:
             raise IpsysError(f"--calibration {option}: write it as camera=file.yaml, or name a log (.mcap)")
         for name in found:
@@ -58,3 +64,12 @@ def load_calibrations(options: list[str] | None) -> dict[str, CameraCalibration]
                 raise IpsysError(f"--calibration: two cameras of one name, {name!r}")
         lenses.update(found)
     return lenses
+
+
+def cameras_of(logs: list[Path]) -> set[str]:
+    """The cameras that logs have frames or anything derived of."""
+    from ipsys_log.log.session import Session, camera_of_topic
+
+    with Session(logs) as session:
+        derived = {camera_of_topic(topic) for reader in session.readers for topic in reader.channels}
+        return set(session.images) | {camera for camera in derived if camera}

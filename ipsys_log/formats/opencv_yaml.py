@@ -1,4 +1,4 @@
-"""Camera calibrations in OpenCV's FileStorage format, such as the authors of the paper publish."""
+"""Camera calibrations in OpenCV's FileStorage format, as the authors publish theirs, or in that of ROS."""
 
 from __future__ import annotations
 
@@ -18,13 +18,15 @@ __all__ = ["read_opencv_calibration"]
 _K = ("mtx", "camera_matrix", "K", "cameraMatrix", "Camera_Matrix")
 _D = ("dist", "distortion_coefficients", "D", "distCoeffs", "dist_coeff", "Distortion_Coefficients")
 _WIDTH, _HEIGHT = ("img_width", "image_width", "width"), ("img_height", "image_height", "height")
+_MODEL_OF_NAME = {"equidistant": "kannala_brandt", "fisheye": "kannala_brandt", "": ""}
 _MODEL_OF_COUNT = {4: "kannala_brandt", 5: "plumb_bob", 8: "rational_polynomial"}
 
 
 def read_opencv_calibration(path: Path, camera: str, time_ns: int = 0) -> CameraCalibration:
-    """A lens from a FileStorage YAML, XML or JSON file.
+    """A lens from a FileStorage YAML, XML or JSON file, or a ``camera_info`` YAML of ROS.
 
-    Four coefficients are those of the fisheye model (k1..k4), five and eight those of the pinhole.
+    The distortion model is the one named in the file; where none is, four coefficients are those of the
+    fisheye (k1..k4), five and eight those of the pinhole.
 
     Raises
     ------
@@ -34,28 +36,36 @@ def read_opencv_calibration(path: Path, camera: str, time_ns: int = 0) -> Camera
     if not path.is_file():
         raise IpsysError(f"{path}: there is no such calibration file")
     try:
-        storage = cv2.FileStorage(str(path), cv2.FILE_STORAGE_READ)
-    except (cv2.error, SystemError) as error:
-        raise IpsysError(f"{path}: is not a calibration in OpenCV's YAML format") from error
-    try:
+        storage = cv2.FileStorage(_as_file_storage(path), cv2.FILE_STORAGE_READ | cv2.FILE_STORAGE_MEMORY)
         k, d = _matrix(storage, _K), _matrix(storage, _D)
         width, height = _number(storage, _WIDTH), _number(storage, _HEIGHT)
-    finally:
-        storage.release()
+        named = _text(storage, "distortion_model")
+    except (cv2.error, SystemError, UnicodeDecodeError) as error:
+        raise IpsysError(f"{path}: is not a calibration in OpenCV's YAML format") from error
     if k is None or d is None or k.size != 9 or not width or not height:
         raise IpsysError(f"{path}: lacks the camera matrix, the distortion coefficients or the image size")
-    model = _MODEL_OF_COUNT.get(d.size, f"with {d.size} coefficients")
-    k = k.reshape(3, 3)
-    p = np.hstack([k, np.zeros((3, 1))])
-    lens = CameraCalibration(time_ns, camera, width, height, model, d.reshape(-1), k, np.eye(3), p)
+    model = _MODEL_OF_NAME.get(named, named) or _MODEL_OF_COUNT.get(d.size, f"with {d.size} coefficients")
+    if model == "plumb_bob" and d.size == 4:
+        d = np.append(d, 0.0)  # k3 is often left out
+    lens = CameraCalibration(time_ns, camera, width, height, model, d.reshape(-1), k.reshape(3, 3))
     return check_calibration(lens, str(path))
+
+
+def _as_file_storage(path: Path) -> str:
+    """OpenCV reads YAML only with its own first line, which ROS leaves out."""
+    text = path.read_text(encoding="utf-8")
+    is_yaml = path.suffix.lower() in (".yaml", ".yml")
+    return text if not is_yaml or text.startswith("%YAML") else f"%YAML:1.0\n---\n{text}"
 
 
 def _matrix(storage: cv2.FileStorage, names: tuple[str, ...]) -> NDArray[np.float64] | None:
     for name in names:
-        found = storage.getNode(name).mat()
-        if found is not None:
-            return np.asarray(found, dtype=np.float64)
+        node = storage.getNode(name)
+        data = node.getNode("data") if node.isMap() else node
+        if data.isSeq():
+            return np.array([data.at(i).real() for i in range(data.size())])
+        if node.isMap():
+            return np.asarray(node.mat(), dtype=np.float64)
     return None
 
 
@@ -65,3 +75,8 @@ def _number(storage: cv2.FileStorage, names: tuple[str, ...]) -> int:
         if not node.empty():
             return int(node.real())
     return 0
+
+
+def _text(storage: cv2.FileStorage, name: str) -> str:
+    node = storage.getNode(name)
+    return str(node.string()) if node.isString() else ""

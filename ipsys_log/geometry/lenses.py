@@ -17,6 +17,8 @@ DISTORTION_MODELS = {"kannala_brandt": 4, "plumb_bob": 5, "rational_polynomial":
 # The inverse of a lens has no closed form: iterate to far below what a log can resolve.
 _CRITERIA = (cv2.TERM_CRITERIA_COUNT + cv2.TERM_CRITERIA_EPS, 100, 1e-12)
 
+_LOST_PX = 0.01
+
 # OpenCV 5 takes the criteria in undistortPoints; 4 has a function of its own for them.
 _undistort_pinhole = getattr(cv2, "undistortPointsIter", cv2.undistortPoints)
 
@@ -41,7 +43,9 @@ def check_calibration(lens: CameraCalibration, where: str) -> CameraCalibration:
             f"{where}: {lens.distortion_model} takes {wanted} coefficients, found {lens.D.size}; "
             "calibrate the camera again or mend the file"
         )
-    if not (np.isfinite(lens.K).all() and np.isfinite(lens.D).all() and lens.K[0, 0] > 0 < lens.K[1, 1]):
+    if not (np.isfinite(lens.K).all() and np.isfinite(lens.D).all()):
+        raise IpsysError(f"{where}: its matrix or coefficients are no numbers; calibrate again")
+    if not lens.K[0, 0] > 0 < lens.K[1, 1]:
         raise IpsysError(f"{where}: the camera matrix K has no positive focal lengths; calibrate again")
     return lens
 
@@ -62,7 +66,7 @@ def undistort(points_px: NDArray[np.float64], lens: CameraCalibration) -> NDArra
 
     Returns
     -------
-    (n, 2), without unit.
+    (n, 2), without unit; NaN where no ray of the lens meets the pixel, beyond what was calibrated.
 
     References
     ----------
@@ -83,7 +87,12 @@ def undistort(points_px: NDArray[np.float64], lens: CameraCalibration) -> NDArra
         uv = cv2.fisheye.undistortPoints(points, lens.K, lens.D, criteria=_CRITERIA)
     else:
         uv = _undistort_pinhole(points, lens.K, lens.D, R=np.eye(3), P=np.eye(3), criteria=_CRITERIA)
-    return np.asarray(uv, dtype=np.float64).reshape(-1, 2)
+    uv = np.asarray(uv, dtype=np.float64).reshape(-1, 2)
+    # OpenCV's iteration may end anywhere: what does not lead back to its pixel is no solution.
+    again_px = project(np.column_stack([uv, np.ones(len(uv))]), lens)
+    lost = ~(np.abs(again_px - points.reshape(-1, 2)).max(axis=1, initial=0) < _LOST_PX)
+    uv[lost] = np.nan
+    return uv
 
 
 def project(points_m: NDArray[np.float64], lens: CameraCalibration) -> NDArray[np.float64]:

@@ -226,7 +226,10 @@ def _array(name: str, shape: tuple[int, ...]) -> tuple[Fill, Read]:
         getattr(proto, name).extend(np.asarray(value, dtype=np.float64).reshape(-1).tolist())
 
     def read(proto: Any) -> Any:
-        array = np.array(getattr(proto, name), dtype=np.float64).reshape(shape)
+        array = np.array(getattr(proto, name), dtype=np.float64)
+        if -1 not in shape and array.size != np.prod(shape):
+            raise ValueError(f"{name} has {array.size} numbers instead of {np.prod(shape)}")
+        array = array.reshape(shape)
         array.flags.writeable = False
         return array
 

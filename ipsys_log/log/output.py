@@ -2,12 +2,13 @@
 
 import os
 import zlib
+from contextlib import suppress
 from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Protocol
 
 from ipsys_log.errors import LogError
-from ipsys_log.log.journal import replace_tail
+from ipsys_log.log.journal import replace_tail, roll_back
 from ipsys_log.log.storage import Storage, write_all
 
 __all__ = ["Growing", "Output", "Pending"]
@@ -46,9 +47,9 @@ class Growing:
             write_all(self.storage, self.fd, data, self.offset)
         except OSError as error:
             self._failed = True
-            raise _cannot_write(
-                self.path, error, f"what it holds so far can be saved with: ipsys repair {self.path}"
-            ) from None
+            kept = f"what it holds so far can be saved with: ipsys repair {self.path}"
+            then = kept if self.target is None else "nothing was written, free some space and try again"
+            raise _cannot_write(self.target or self.path, error, then) from None
         self.offset += len(data)
         self.crc = zlib.crc32(data, self.crc or 0)
 
@@ -95,6 +96,8 @@ class Pending:
         try:
             replace_tail(self.storage, self.path, self.fd, self.start, (*self._pieces, tail))
         except OSError as error:
+            with suppress(OSError):  # else whoever next writes does it
+                roll_back(self.storage, self.path, self.fd)
             then = "the log stays as it was: free some space and try again"
             raise _cannot_write(self.path, error, then) from None
 

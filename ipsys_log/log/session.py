@@ -14,6 +14,9 @@ from pathlib import Path
 from types import TracebackType
 from typing import Any
 
+import numpy as np
+from numpy.typing import NDArray
+
 from ipsys_log.errors import LogError
 from ipsys_log.log.codec import PAYLOADS, decode, schema_name
 from ipsys_log.log.reader import LogReader
@@ -91,17 +94,41 @@ class Session:
             }
         )
 
-    def last_ns(self, topics: Collection[str]) -> int:
-        """Log time of the last message of some topics, from the indexes."""
-        times = [r.times(t)[-1] for r in self.readers for t in topics if t in r.channels and self.count(t)]
-        return int(max(times, default=0))
+    def last(self, topics: Collection[str]) -> tuple[int, int]:
+        """Log time and publish time of the last message of some topics; the start where there is none."""
+        found = [(times[-1], r, t) for r in self.readers for t in topics if len(times := _times(r, t))]
+        if not found:
+            return self.start_ns, self.start_ns
+        last_ns, reader, topic = max(found, key=lambda item: item[0])
+        *_, message = reader.messages([topic], start_ns=int(last_ns))
+        return message.log_time_ns, message.publish_time_ns
+
+    def run_names(self) -> set[str]:
+        """Every run that has a channel, complete or not."""
+        return {run for reader in self.readers for topic in reader.channels if (run := run_of_topic(topic))}
+
+    def unread_images(self) -> list[str]:
+        """Topics that look like images, but are of a schema that is not read here."""
+        schemas = {
+            topic: channel.schema.name
+            for reader in self.readers
+            for topic, channel in reader.channels.items()
+            if channel.schema is not None and channel.schema.name not in PAYLOADS
+        }
+        return [
+            f"{topic} ({name})"
+            for topic, name in sorted(schemas.items())
+            if re.search("image|video", name, re.IGNORECASE)
+        ]
 
     def count(self, topic: str) -> int:
         return sum(r.channels[topic].message_count for r in self.readers if topic in r.channels)
 
     def hash(self, topic: str) -> str:
-        """Hash of a channel's messages, the same in whichever file they lie."""
-        return "+".join(r.channel_hash(topic) for r in self.readers if topic in r.channels)
+        """Hash of a channel's messages, the same in whichever file they lie; one for each of several."""
+        parts = [r for r in self.readers if len(_times(r, topic))]
+        # In the order of their times, not in that of the command line.
+        return "+".join(r.channel_hash(topic) for r in sorted(parts, key=lambda r: int(_times(r, topic)[0])))
 
     def messages(
         self, topics: Collection[str], start_ns: int | None = None, end_ns: int | None = None
@@ -169,10 +196,17 @@ class Session:
         for payload in payloads:
             topics = self.topics(payload)
             names = [camera_of_topic(topic) or _foreign_camera(topic) for topic in topics]
+            found: dict[str, str] = {}
             for topic, name in zip(topics, names, strict=True):
                 # Topics that differ only in words such as color or mono keep these words.
                 camera = name if names.count(name) == 1 else _clean_name(topic)
-                cameras.setdefault(camera, topic)
+                if camera in found:
+                    raise LogError(
+                        f"{self}: two cameras of one name, {camera!r}: {found[camera]} and {topic}; "
+                        "rename one of the topics"
+                    )
+                found[camera] = topic
+            cameras = found | cameras
         return cameras
 
     def _pair_calibrations(self, found: dict[str, str]) -> dict[str, str]:
@@ -219,6 +253,10 @@ def _foreign_camera(topic: str) -> str:
 def _clean_name(text: str) -> str:
     name = re.sub(r"[^a-z0-9]+", "_", text.lower()).strip("_")
     return name if name[:1].isalpha() else f"camera_{name}".rstrip("_")
+
+
+def _times(reader: LogReader, topic: str) -> NDArray[np.int64]:
+    return reader.times(topic) if topic in reader.channels else np.empty(0, np.int64)
 
 
 def _overlap(one: LogReader, other: LogReader, topic: str) -> bool:

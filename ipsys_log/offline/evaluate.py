@@ -11,7 +11,6 @@ from ipsys_log.messages import (
     CameraEvaluation,
     ErrorStatistics,
     Evaluation,
-    Measurement,
     Message,
     Model,
     Pair,
@@ -19,7 +18,7 @@ from ipsys_log.messages import (
     Tracks,
 )
 from ipsys_log.models import restore
-from ipsys_log.offline.pairs import Sightings
+from ipsys_log.offline.pairs import Measured, Sightings, still_interval
 
 __all__ = ["error_statistics", "evaluate_model", "gather_tracks", "track_errors", "true_points"]
 
@@ -56,7 +55,7 @@ def evaluate_model(
     Parameters
     ----------
     model : fitted.
-    held_out : measured places by camera.
+    held_out : measured places by camera; those that the model was fitted on after all do not count.
     truth : true world points (3,) in m by id of the measurement; empty outside a simulated lab.
     time_ns : of the last input.
 
@@ -66,7 +65,12 @@ def evaluate_model(
     """
     rows = []
     for camera in model.cameras:
-        pairs = held_out.get(camera.camera, ())
+        used = {pair.measurement: pair.world_m for pair in camera.pairs}
+        pairs = [
+            pair
+            for pair in held_out.get(camera.camera, ())
+            if not np.array_equal(used.get(pair.measurement, ()), pair.world_m)
+        ]
         if not pairs:
             continue
         estimator = restore(model.name, {p.name: p.values.reshape(p.shape) for p in camera.parameters})
@@ -118,15 +122,15 @@ def gather_tracks(messages: Iterable[Message]) -> dict[int, Sightings]:
     }
 
 
-def true_points(
-    measurements: Iterable[Measurement], truth: Mapping[int, Sightings]
-) -> dict[str, NDArray[np.float64]]:
-    """Where each measured marker truly was, (3,) in m by id of the measurement."""
+def true_points(places: Iterable[Measured], truth: Mapping[int, Sightings]) -> dict[str, NDArray[np.float64]]:
+    """Where each measured marker truly was, (3,) in m by id; only where the truth of that time is known."""
     points = {}
-    for measurement in measurements:
+    for place in places:
+        measurement = place.measurement
         known = truth.get(measurement.marker_id if measurement.marker_id is not None else -1)
-        if known is not None:
-            points[measurement.id] = known.points_m[np.abs(known.times_ns - measurement.timestamp).argmin()]
+        if known is not None and (interval := still_interval(known, measurement.timestamp)) is not None:
+            within = (known.times_ns >= interval[0]) & (known.times_ns <= interval[1])
+            points[measurement.id] = known.points_m[within].mean(axis=0)
     return points
 
 

@@ -16,6 +16,10 @@ __all__ = ["fit_model"]
 # No hand-held tape is better than this; it keeps the covariance of a flat data set invertible.
 _FLOOR_SIGMA_M = 0.001
 
+# Nearer together than this two places are one; nearer to a line than this (RMS) they lie on it.
+_SAME_PLACE_M = 0.01
+_BESIDE_LINE_M = 0.03
+
 
 def fit_model(name: str, pairs: Mapping[str, Sequence[Pair]], time_ns: int) -> Model:
     """Fit the model called ``name`` for each camera that has pairs.
@@ -53,12 +57,28 @@ def _fit_camera(name: str, camera: str, pairs: list[Pair]) -> CameraModel:
         )
     points = np.array([pair.camera_m for pair in pairs])
     targets = np.array([pair.world_m for pair in pairs])
+    _check_spread(name, camera, targets)
     try:
         arrays = parameters(create(name).fit(points, targets))
     except FitError as error:
         raise FitError(f"camera {camera}: {error}") from error
     stored = tuple(Parameter(key, array.shape, array.reshape(-1)) for key, array in sorted(arrays.items()))
     return CameraModel(camera, stored, _covariance(name, points, targets), tuple(pairs))
+
+
+def _check_spread(name: str, camera: str, targets: NDArray[np.float64]) -> None:
+    """Places that differ by no more than the tape's error say nothing new."""
+    different = len(np.unique(np.round(targets / _SAME_PLACE_M), axis=0))
+    if different < min_pairs(name):
+        raise FitError(
+            f"camera {camera}: {name} needs at least {min_pairs(name)} different places, found {different} "
+            f"in {len(targets)} measurements; measure elsewhere too"
+        )
+    beside_m = np.linalg.svd(targets - targets.mean(axis=0), compute_uv=False)[1] / np.sqrt(len(targets))
+    if beside_m < _BESIDE_LINE_M:
+        raise FitError(
+            f"camera {camera}: the {len(targets)} measured places lie on one line; measure some beside it"
+        )
 
 
 def _covariance(

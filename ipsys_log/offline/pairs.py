@@ -13,7 +13,17 @@ from ipsys_log.geometry.trilateration import trilaterate
 from ipsys_log.messages import CameraPoints, Measurement, Message, Pair, Rig
 from ipsys_log.units import NS_PER_S
 
-__all__ = ["Sightings", "active_measurements", "build_pairs", "gather_sightings", "split", "still_interval"]
+__all__ = [
+    "Measured",
+    "Sightings",
+    "active_measurements",
+    "build_pairs",
+    "gather_sightings",
+    "measured_in_order",
+    "split",
+    "still_interval",
+    "world_point",
+]
 
 # A marker lies still while it stays within these of where it was when it was measured: above the
 # noise of plain sub-pixel corners (about 1 mm across and 5 mm along the view at 2 m).
@@ -46,6 +56,42 @@ def gather_sightings(messages: Iterable[Message]) -> dict[tuple[str, int], Sight
     return sightings
 
 
+@dataclass(frozen=True, slots=True)
+class Measured:
+    """A measurement that counts, and the rig in force when it was made."""
+
+    measurement: Measurement
+    rig: Rig
+
+
+def measured_in_order(messages: Iterable[Message], override: Rig | None) -> list[Measured]:
+    """The measurements that have not been withdrawn, each with its rig.
+
+    Parameters
+    ----------
+    messages : rigs and measurements, in log order; the first rig holds for what was measured before it.
+    override : a rig that holds for all of them instead.
+
+    Raises
+    ------
+    IpsysError
+        Where two measurements have one id, one lacks its marker, or there is no rig.
+    """
+    rigs: list[Rig] = [override] if override is not None else []
+    found: list[tuple[Measurement, int]] = []
+    for message in messages:
+        if isinstance(message.payload, Rig) and override is None:
+            rigs.append(message.payload)
+        elif isinstance(message.payload, Measurement):
+            found.append((message.payload, max(len(rigs) - 1, 0)))
+    active = {measurement.id for measurement in active_measurements(m for m, _ in found)}
+    if found and not rigs:
+        raise IpsysError("the log has no rig (reference points, markers): give one with --rig lab.toml")
+    # Of an id that was withdrawn and measured again, the last one counts.
+    last = {m.id: Measured(m, rigs[number]) for m, number in found if m.withdraws is None}
+    return [place for name, place in last.items() if name in active]
+
+
 def active_measurements(measurements: Iterable[Measurement]) -> list[Measurement]:
     """The measurements that have not been withdrawn, in the order they were made.
 
@@ -76,6 +122,13 @@ def world_point(measurement: Measurement, rig: Rig) -> NDArray[np.float64]:
         Where the distances form no triangle or name unknown reference points.
     """
     where = f"measurement {measurement.id}"
+    point_m = _given_or_solved(measurement, rig, where)
+    if not np.isfinite(point_m).all():
+        raise IpsysError(f"{where}: its world point {point_m.tolist()} m is no point; withdraw it")
+    return point_m
+
+
+def _given_or_solved(measurement: Measurement, rig: Rig, where: str) -> NDArray[np.float64]:
     if measurement.point is not None:
         return np.array([measurement.point.x_m, measurement.point.y_m, measurement.point.z_m])
     if len(measurement.distances) != 2 or measurement.side is None or measurement.height_m is None:
@@ -134,15 +187,14 @@ def still_interval(sightings: Sightings, time_ns: int) -> tuple[int, int] | None
 
 
 def build_pairs(
-    sightings: Mapping[tuple[str, int], Sightings], measurements: Iterable[Measurement], rig: Rig
+    sightings: Mapping[tuple[str, int], Sightings], places: Iterable[Measured]
 ) -> dict[str, list[Pair]]:
     """For each camera, the measured places that it saw.
 
     Parameters
     ----------
     sightings : by camera and marker, from :func:`gather_sightings`.
-    measurements : those that count, from :func:`active_measurements`.
-    rig : for the reference points and the markers in use.
+    places : those that count, from :func:`measured_in_order`.
 
     Returns
     -------
@@ -156,7 +208,8 @@ def build_pairs(
     cameras = sorted({camera for camera, _ in sightings})
     seen_ids = sorted({marker_id for _, marker_id in sightings})
     pairs: dict[str, list[Pair]] = {camera: [] for camera in cameras}
-    for measurement in measurements:
+    for place in places:
+        measurement, rig = place.measurement, place.rig
         marker_id = measurement.marker_id
         assert marker_id is not None  # active_measurements has seen to it
         if not rig.knows(marker_id) or marker_id not in seen_ids:
@@ -206,14 +259,16 @@ def split(measurements: Iterable[Measurement], train: str, seed: int) -> tuple[s
         Where measurements are labelled, but none with ``train``.
     """
     measurements = list(measurements)
-    labels = sorted({label for m in measurements for label in m.splits})
-    if not labels:
+    labels = sorted({label for m in measurements for label in m.splits} - {"test"})
+    if train == "test":
+        raise IpsysError("--train test: these places are held out to evaluate on; fit on other ones")
+    if not any(m.splits for m in measurements):
         ids = np.array(sorted(m.id for m in measurements))
         shuffled = np.random.default_rng(seed).permutation(ids).tolist()
         held_out = len(shuffled) // 5
         return set(shuffled[held_out:]), set(shuffled[:held_out])
     if train not in labels:
-        raise IpsysError(f"no measurement is labelled {train!r}; use --train with one of {', '.join(labels)}")
-    return {m.id for m in measurements if train in m.splits}, {
-        m.id for m in measurements if "test" in m.splits
-    }
+        known = f"use --train with one of {', '.join(labels)}" if labels else "label some to fit on"
+        raise IpsysError(f"no measurement is labelled {train!r}; {known}")
+    fitted = {m.id for m in measurements if train in m.splits}
+    return fitted, {m.id for m in measurements if "test" in m.splits} - fitted

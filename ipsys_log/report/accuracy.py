@@ -83,10 +83,10 @@ def _statistics(errors: ErrorStatistics) -> dict[str, float | int]:
 
 def accuracy_table(accuracies: Sequence[Accuracy]) -> Table:
     """The summary as a table of at most 80 columns: a row for each model and camera."""
-    table = Table(title="Error on places held out, in cm", title_justify="left", box=None, pad_edge=False)
+    table = Table(title="Errors in cm, on places held out", title_justify="left", box=None, pad_edge=False)
     for column in ("model", "camera", "against"):
         table.add_column(column)
-    for column in ("n", "mean 3D", "min", "max", "std", "mean 2D", "max"):
+    for column in ("n", "3D mean", "min", "max", "std", "2D mean", "max"):
         table.add_column(column, justify="right")
     for accuracy in accuracies:
         rows = list(accuracy.evaluation.cameras) if accuracy.evaluation else []
@@ -94,7 +94,7 @@ def accuracy_table(accuracies: Sequence[Accuracy]) -> Table:
         for row in rows:
             table.add_row(name, row.camera, row.against, *_cells(row.error_3d, row.error_2d))
         if accuracy.tracks is not None:
-            table.add_row(name, "tracks", "truth", *_cells(*accuracy.tracks))
+            table.add_row(name, "(tracks)", "truth", *_cells(*accuracy.tracks))
         table.add_section()
     return table
 

@@ -98,8 +98,9 @@ def contents_tables(found: dict[str, Any]) -> list[Table]:
         cameras.add_row(camera, row["images"], row["calibration"] or "missing")
     numbers = ("count", "Hz", "gaps")
     channels = _table("Channels", "topic", *numbers, "schema", right=numbers)
-    channels.columns[0].no_wrap = channels.columns[3].no_wrap = True
-    channels.columns[4].overflow, channels.columns[4].no_wrap = "ellipsis", True
+    for column in channels.columns[1:4]:
+        column.no_wrap = True
+    channels.columns[0].ratio, channels.columns[4].max_width = 1, 17
     for topic, row in found["channels"].items():
         rate = "-" if row["rate_hz"] is None else f"{row['rate_hz']:.1f}"
         gaps = "-" if not row["gaps"] else f"{row['gaps']}, {row['longest_gap_s']:.1f} s"
@@ -111,11 +112,12 @@ def contents_tables(found: dict[str, Any]) -> list[Table]:
 
 def runs_table(runs: list[dict[str, Any]]) -> Table:
     """One row per stage of a run."""
-    table = _table("Runs", "run", "stage", "from", "parameters", "messages", right=("messages",))
+    table = _table("Runs", "run", "stage", "from", "parameters", "count", "ipsys", right=("count",))
     for run in runs:
         given = [f"{key}={value}" for key, value in run["parameters"].items()]
         given += [f"other {name}" for name in run["overrides"]]
         count = sum(output["messages"] for output in run["outputs"])
         sources = ", ".join(run["input_runs"]) or "-"
-        table.add_row(run["run"], run["stage"], sources, ", ".join(given) or "-", str(count))
+        version = run["fingerprint"].get("ipsys_log", "-")
+        table.add_row(run["run"], run["stage"], sources, ", ".join(given) or "-", str(count), version)
     return table

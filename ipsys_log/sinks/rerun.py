@@ -73,7 +73,10 @@ def _recording(session: Session) -> rr.RecordingStream:
 def _save(session: Session, shown: Shown, path: Path) -> None:
     recording = _recording(session)
     try:
-        recording.save(path)
+        try:
+            recording.save(path)
+        except RuntimeError as error:
+            raise IpsysError(f"{path}: cannot be written: {error}") from error
         _draw(session, shown, recording, lambda: None)
     finally:
         recording.disconnect()

@@ -5,6 +5,8 @@ from __future__ import annotations
 from collections.abc import Iterator
 from typing import Any
 
+import numpy as np
+
 from ipsys_log.errors import IpsysError
 from ipsys_log.geometry.lenses import check_calibration, undistort
 from ipsys_log.geometry.markers import camera_point, heading
@@ -12,6 +14,7 @@ from ipsys_log.messages import (
     CameraCalibration,
     CameraPoint,
     CameraPoints,
+    Event,
     Marker,
     Markers,
     Message,
@@ -38,8 +41,15 @@ class CameraFrame:
             self._lenses[message.camera] = check_calibration(payload, f"calibration of {message.camera}")
         else:
             self._check_size(payload, message.camera)
-            points = tuple(self._point(marker, message.camera) for marker in payload.markers)
-            yield CameraPoints(message.publish_time_ns, points)
+            points = []
+            for marker in payload.markers:
+                point = self._point(marker, message.camera)
+                if point is not None:
+                    points.append(point)
+                    continue
+                text = f"marker {marker.id} lies where the calibration of {message.camera} has no ray"
+                yield Event(message.publish_time_ns, "outside_lens", text, message.camera, marker.id)
+            yield CameraPoints(message.publish_time_ns, tuple(points))
 
     def _check_size(self, seen: Markers, camera: str | None) -> None:
         lens = self._lenses.get(camera)
@@ -50,7 +60,8 @@ class CameraFrame:
                 f"--calibration {camera}=calibration.yaml"
             )
 
-    def _point(self, marker: Marker, camera: str | None) -> CameraPoint:
+    def _point(self, marker: Marker, camera: str | None) -> CameraPoint | None:
+        """The marker's centre; None where a corner has no ray through the lens."""
         if self._rig is None:
             raise IpsysError("the log has no rig (marker length): give one with --rig lab.toml")
         if camera not in self._lenses:
@@ -59,5 +70,7 @@ class CameraFrame:
                 f"--calibration {camera}=calibration.yaml"
             )
         uv = undistort(marker.corners_px, self._lenses[camera])
+        if not np.isfinite(uv).all():
+            return None
         x_m, y_m, z_m = camera_point(uv, self._rig.length_of(marker.id))
         return CameraPoint(marker.id, float(x_m), float(y_m), float(z_m), heading(uv))

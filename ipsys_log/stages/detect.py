@@ -119,9 +119,10 @@ def _raw_grey(frame: RawImage) -> Grey:
         raise ValueError(f"pixel encoding {frame.encoding!r} is not read (only {known})")
     channels, conversion = _RAW_TO_GREY[frame.encoding]
     rows = np.frombuffer(frame.data, np.uint8)
-    if frame.step < frame.width * channels or rows.size < frame.step * frame.height:
+    step = frame.step or frame.width * channels  # some writers leave it out
+    if step < frame.width * channels or rows.size < step * frame.height or not rows.size:
         raise ValueError(f"{rows.size} bytes are too few for {frame.width} x {frame.height}")
-    rows = rows[: frame.step * frame.height].reshape(frame.height, frame.step)
+    rows = rows[: step * frame.height].reshape(frame.height, step)
     pixels = rows[:, : frame.width * channels].reshape(frame.height, frame.width, channels)
     if conversion is None:
         return np.ascontiguousarray(pixels[..., 0])

@@ -6,6 +6,7 @@ from collections.abc import Iterator
 from typing import Any
 
 import numpy as np
+from numpy.typing import NDArray
 
 from ipsys_log.errors import IpsysError
 from ipsys_log.messages import (
@@ -97,7 +98,7 @@ def fuse_positions(positions: list[Position]) -> Position:
     if len(positions) == 1:
         return positions[0]
     points = np.array([(p.x_m, p.y_m, p.z_m) for p in positions])
-    covariances = [p.covariance_m2 for p in positions if p.covariance_m2 is not None]
+    covariances = [p.covariance_m2 for p in positions if _is_covariance(p.covariance_m2)]
     covariance_m2 = None
     if len(covariances) == len(positions):
         weights = np.linalg.inv(np.array(covariances))
@@ -106,12 +107,22 @@ def fuse_positions(positions: list[Position]) -> Position:
     else:
         mean = points.mean(axis=0)
     headings = [p.heading_rad for p in positions if p.heading_rad is not None]
-    heading_rad = float(np.angle(np.exp(1j * np.array(headings)).sum())) if headings else None
+    along = complex(np.exp(1j * np.array(headings)).sum())
+    # Opposite headings have no mean.
+    heading_rad = float(np.angle(along)) if abs(along) > 1e-9 else None
     x_m, y_m, z_m = mean.tolist()
     return Position(positions[0].id, x_m, y_m, z_m, heading_rad, covariance_m2)
 
 
+def _is_covariance(matrix: NDArray[np.float64] | None) -> bool:
+    """Whether it can be a weight: a log may hold anything."""
+    return matrix is not None and bool(
+        np.isfinite(matrix).all() and np.linalg.eigvalsh(matrix)[0] > 0  # lower triangle
+    )
+
+
 def _transform(track: Track, run: str, time_ns: int) -> FrameTransform:
+    # A transform cannot leave its rotation out; /runs/<run>/tracks says where the heading is missing.
     half_rad = (track.heading_rad or 0.0) / 2
     return FrameTransform(
         time_ns,

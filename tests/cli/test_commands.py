@@ -52,9 +52,9 @@ def test_init_writes_a_rig_that_can_be_read(ipsys: Ipsys, tmp_path: Path) -> Non
     assert path.read_text() == text
 
 
-def test_simulate_has_an_option_for_settings_that_exist() -> None:
-    known = {field.name for field in fields(LabSettings)}
-    assert set(SETTINGS) <= known
+def test_the_defaults_of_simulate_are_those_of_the_library() -> None:
+    defaults = {field.name: field.default for field in fields(LabSettings)}
+    assert {name: default for name, (default, _) in SETTINGS.items()} == {n: defaults[n] for n in SETTINGS}
 
 
 def test_simulate_gives_the_same_bytes_for_a_seed(ipsys: Ipsys, tmp_path: Path) -> None:

@@ -48,7 +48,7 @@ def test_the_truth_is_compared_where_it_is_known() -> None:
 
 def test_a_camera_without_held_out_places_has_no_row() -> None:
     model = fit_model("rigid", {"red": pairs(np.zeros(3)), "white": pairs(np.zeros(3))}, 0)
-    evaluation = evaluate_model(model, {"white": pairs(np.zeros(3))}, {}, 0)
+    evaluation = evaluate_model(model, {"white": pairs(np.ones(3))}, {}, 0)
     assert [row.camera for row in evaluation.cameras] == ["white"]
 
 
@@ -76,3 +76,9 @@ def test_the_last_pose_of_an_instant_counts() -> None:
     assert found[0].count == 2
     assert found[0].mean_m == pytest.approx(0.015)
     assert track_errors(tracks, {}) is None
+
+
+def test_places_that_the_model_was_fitted_on_are_not_held_out() -> None:
+    """As where a model is applied to the very log that it was made from."""
+    model = fit_model("rigid", {"red": pairs(np.zeros(3))}, 0)
+    assert evaluate_model(model, {"red": pairs(np.zeros(3))}, {}, 0).cameras == ()

@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+from dataclasses import replace
+
 import numpy as np
 import pytest
 
@@ -19,9 +21,11 @@ from ipsys_log.messages import (
     WorldPoint,
 )
 from ipsys_log.offline.pairs import (
+    Measured,
     active_measurements,
     build_pairs,
     gather_sightings,
+    measured_in_order,
     split,
     still_interval,
 )
@@ -76,7 +80,7 @@ def test_a_long_silence_ends_the_stretch() -> None:
 def test_a_pair_is_the_mean_over_the_still_interval() -> None:
     rows = still(0, 2, 0.5)
     given = Measurement(0, "a", marker_id=0, still=Interval(int(0.5 * S), S), point=WorldPoint(1, 2, 3))
-    pair = build_pairs(gather_sightings(seen(*rows)), [given], RIG)["red"][0]
+    pair = build_pairs(gather_sightings(seen(*rows)), [Measured(given, RIG)])["red"][0]
     inside = [x for t, x, _ in rows if 0.5 <= t <= 1.0]
     assert pair.frames == len(inside) == 6
     assert pair.camera_m[0] == pytest.approx(np.mean(inside))
@@ -86,7 +90,7 @@ def test_a_pair_is_the_mean_over_the_still_interval() -> None:
 def test_a_camera_that_did_not_see_a_place_has_no_pair_of_it() -> None:
     messages = seen(*still(0, 1, 0.5)) + seen(*still(50, 51, 0.5), camera="black")
     measured = Measurement(S // 2, "a", marker_id=0, point=WorldPoint(1, 2, 0))
-    pairs = build_pairs(gather_sightings(messages), [measured], RIG)
+    pairs = build_pairs(gather_sightings(messages), [Measured(measured, RIG)])
     assert len(pairs["red"]) == 1
     assert pairs["black"] == []
 
@@ -132,7 +136,7 @@ def test_a_withdrawn_measurement_does_not_count() -> None:
 )
 def test_measurements_that_say_too_little(measurement: Measurement, said: str) -> None:
     with pytest.raises(IpsysError, match=said):
-        build_pairs(gather_sightings(seen(*still(0, 1, 0.5))), [measurement], RIG)
+        build_pairs(gather_sightings(seen(*still(0, 1, 0.5))), [Measured(measurement, RIG)])
 
 
 def test_a_split_at_random_is_a_fifth_and_the_same_for_a_seed() -> None:
@@ -143,3 +147,30 @@ def test_a_split_at_random_is_a_fifth_and_the_same_for_a_seed() -> None:
     assert not train & held_out
     assert split(list(reversed(measurements)), "train", seed=3) == (train, held_out)
     assert split(measurements, "train", seed=4) != (train, held_out)
+
+
+def test_the_rig_of_its_time_holds_for_a_measurement() -> None:
+    moved = replace(RIG, reference_points=(ReferencePoint("A", 0.0, 0.0), ReferencePoint("B", 3.0, 0.0)))
+    one, two = (Measurement(0, name, marker_id=0, point=WorldPoint(0, 0, 0)) for name in "ab")
+    log = [Message("t", n, n, payload) for n, payload in enumerate((one, RIG, two, moved))]
+    found = measured_in_order(log, None)
+    assert [(place.measurement.id, place.rig) for place in found] == [("a", RIG), ("b", RIG)]
+    assert [place.rig for place in measured_in_order(log, moved)] == [moved, moved]
+    later = [*log, Message("t", 9, 9, Measurement(0, "c", marker_id=0))]
+    assert measured_in_order(later, None)[-1].rig == moved
+
+
+def test_places_that_are_held_out_are_never_fitted_on() -> None:
+    both = [Measurement(0, "a", splits=("train", "test")), Measurement(0, "b", splits=("test",))]
+    assert split(both, "train", 0) == ({"a"}, {"b"})
+    with pytest.raises(IpsysError, match="held out"):
+        split(both, "test", 0)
+    with pytest.raises(IpsysError, match="label some to fit on"):
+        split(both[1:], "train", 0)
+
+
+@pytest.mark.parametrize("value", [float("nan"), float("inf")])
+def test_a_world_point_that_is_no_point(value: float) -> None:
+    measurement = Measurement(0, "a", marker_id=0, point=WorldPoint(1.0, 2.0, value))
+    with pytest.raises(IpsysError, match="measurement a: its world point"):
+        build_pairs(gather_sightings(seen(*still(0, 1, 0.5))), [Measured(measurement, RIG)])

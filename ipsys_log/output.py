@@ -1,0 +1,98 @@
+"""Messages into logs: a whole new one, or a run at the end of one."""
+
+from __future__ import annotations
+
+import os
+from collections.abc import Callable, Iterable, Iterator, Sequence
+from contextlib import contextmanager
+from dataclasses import replace
+from pathlib import Path
+
+from ipsys_log.errors import IpsysError, LogError
+from ipsys_log.log import LogReader, LogWriter, Schema
+from ipsys_log.log.codec import encode, schema_data, schema_name
+from ipsys_log.log.session import Session
+from ipsys_log.messages import ChannelWritten, Message, Run
+
+__all__ = ["append_run", "opened_target", "write_log", "write_messages"]
+
+
+def write_messages(writer: LogWriter, messages: Iterable[Message]) -> dict[str, int]:
+    """Put messages into an open log; returns how many went to each topic."""
+    counts: dict[str, int] = {}
+    for message in messages:
+        name = schema_name(type(message.payload))
+        if message.topic not in counts:
+            writer.add_channel(message.topic, Schema(name, "protobuf", schema_data(name)))
+        writer.write(message.topic, message.log_time_ns, message.publish_time_ns, encode(message.payload))
+        counts[message.topic] = counts.get(message.topic, 0) + 1
+    return counts
+
+
+def write_log(path: Path, messages: Iterable[Message]) -> dict[str, int]:
+    """Write a new log; after an error nothing of it is left.
+
+    Returns
+    -------
+    How many messages went to each topic.
+    """
+    with LogWriter.create(path, atomic=True) as writer:
+        return write_messages(writer, messages)
+
+
+def append_run(path: Path, record: Run, log_time_ns: int, messages: Callable[[], Iterable[Message]]) -> Run:
+    """Append what a stage makes, then its record, in one step: all of it is in the log, or nothing.
+
+    ``messages`` is called when the log is locked, so that no two processes do the same work.
+
+    Raises
+    ------
+    LogError
+        Where another process has written to this run meanwhile.
+    """
+    with LogWriter.append(path) as writer:
+        with Session([path]) as now:
+            if any((run.run, run.stage) == (record.run, record.stage) for run in now.runs()):
+                raise LogError(f"{path}: another process has just written run {record.run}; start again")
+        counts = write_messages(writer, messages())
+        outputs = tuple(ChannelWritten(topic, count) for topic, count in sorted(counts.items()))
+        done = replace(record, outputs=outputs)
+        topic = f"/runs/{record.run}/record"
+        write_messages(writer, [Message(topic, log_time_ns, record.timestamp, done)])
+    return done
+
+
+@contextmanager
+def opened_target(paths: Sequence[Path], output: Path | None) -> Iterator[tuple[list[Path], Path]]:
+    """The logs to read and the one to append to: the last one given, or a new one.
+
+    A new one has its name only when all is done; where nothing was to do, or after an error, there is
+    none.
+    """
+    if output is None:
+        yield list(paths), paths[-1]
+        return
+    _check_free(output)
+    # Another process may be making a log of that name: the first to finish gets it.
+    partial = output.with_name(f"{output.name}.{os.getpid()}.partial")
+    try:
+        with LogWriter.create(partial):
+            pass
+        yield [*paths, partial], partial
+        with LogReader(partial) as log:
+            anything = log.message_count > 0
+        if anything:
+            _check_free(output)
+            os.link(partial, output)
+    except FileExistsError:
+        _check_free(output)
+    finally:
+        partial.unlink(missing_ok=True)
+        partial.with_name(partial.name + ".journal").unlink(missing_ok=True)
+
+
+def _check_free(output: Path) -> None:
+    if output.exists():
+        raise IpsysError(
+            f"{output}: exists already; choose another name, or give it as an input to extend it"
+        )

@@ -1,0 +1,89 @@
+"""Do one stage on a log: find the run that has done it already, or compute and append it."""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Iterable, Iterator, Mapping
+from dataclasses import replace
+from pathlib import Path
+
+from ipsys_log.log.session import Session, run_of_topic
+from ipsys_log.messages import RIG_TOPIC, CameraCalibration, Lens, Message, Rig, Run, calibration_topic
+from ipsys_log.output import append_run
+from ipsys_log.remarks import Remarks
+from ipsys_log.request import Progress, Request
+from ipsys_log.runs import Outcome, check_run_name, find_run, fingerprint, free_name, read_channels
+from ipsys_log.tasks import Task
+
+__all__ = ["SHARED_STAGES", "inputs", "perform"]
+
+# The stages whose runs serve every model.
+SHARED_STAGES = ("detect", "camera-frame")
+
+Make = Callable[[Task, Session, str], Iterable[Message]]
+
+
+def perform(session: Session, target: Path, task: Task, request: Request, until: str, make: Make) -> Outcome:
+    """Find the run that has done ``task``, or ``make`` it and append it to ``target``."""
+    # A name given by the user is for what was asked for, not for the detection on the way to it.
+    named = task.stage == until or (task.stage not in SHARED_STAGES and until not in SHARED_STAGES)
+    name = request.run if named else None
+    record = _record(session, task)
+    found = find_run(session, record, name)
+    if found is not None:
+        return Outcome(task.stage, found, fresh=False)
+    if name is None:
+        name = free_name(session, record, task.base, task.writes)
+    else:
+        check_run_name(session, task.stage, name, task.writes)
+    log_time_ns, publish_time_ns = session.last(task.topics)
+    number = max((run.number for run in session.runs()), default=0) + 1
+    record = replace(record, timestamp=publish_time_ns, run=name, fingerprint=fingerprint(), number=number)
+    remarks = Remarks(task, request.skip_ambiguous)
+    made = append_run(target, record, log_time_ns, lambda: remarks.watch(make(task, session, name)))
+    count = sum(output.messages for output in made.outputs)
+    return Outcome(task.stage, name, True, count, remarks.lines())
+
+
+def _record(session: Session, task: Task) -> Run:
+    lenses = tuple(
+        Lens(name, lens.width, lens.height, lens.distortion_model, lens.D, lens.K)
+        for name, lens in sorted(task.lenses.items())
+    )
+    input_runs = {run for topic in task.topics if (run := run_of_topic(topic))} | set(task.input_runs)
+    return Run(
+        timestamp=0,
+        run="",
+        stage=task.stage,
+        parameters=dict(task.parameters),
+        rig=task.rig,
+        lenses=lenses,
+        input_runs=tuple(sorted(input_runs)),
+        inputs=(*read_channels(session, task.topics), *task.foreign),
+    )
+
+
+def inputs(session: Session, task: Task, progress: Progress) -> Iterator[Message]:
+    """What a causal stage is sent: what holds before the first frame, then its channels in log order.
+
+    The first rig and lenses of the log hold from its start, also where they were recorded a little
+    later; what the user gave instead of them comes first.
+    """
+    yield from _settings(session, task.lenses, task.rig)
+    for topic in sorted(task.topics):
+        if topic in (*session.topics(Rig), *session.calibrations.values()):
+            yield next(session.messages([topic]))
+    total = sum(session.count(topic) for topic in task.topics)
+    progress(task.stage, 0, total)
+    for done, message in enumerate(session.messages(task.topics), 1):
+        yield message
+        progress(task.stage, done, total)
+
+
+def _settings(
+    session: Session, lenses: Mapping[str, CameraCalibration], rig: Rig | None
+) -> Iterator[Message]:
+    start_ns = session.start_ns
+    if rig is not None:
+        yield Message(RIG_TOPIC, start_ns, start_ns, rig)
+    for camera, lens in lenses.items():
+        yield Message(calibration_topic(camera), start_ns, start_ns, lens, camera)

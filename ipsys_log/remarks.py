@@ -1,0 +1,82 @@
+"""What a user should know of a stage, and what a user has to decide before it is written."""
+
+from __future__ import annotations
+
+from collections.abc import Iterable, Iterator
+
+from ipsys_log.errors import IpsysError
+from ipsys_log.log.session import camera_of_topic
+from ipsys_log.messages import Event, Markers, Message, Positions
+from ipsys_log.tasks import Task
+from ipsys_log.units import format_time
+
+__all__ = ["Remarks"]
+
+
+class Remarks:
+    """Watches the messages that a stage makes on their way into the log."""
+
+    def __init__(self, task: Task, skip_ambiguous: bool) -> None:
+        self._task = task
+        self._skip_ambiguous = skip_ambiguous
+        self._events: dict[str, list[Message]] = {}
+        self._frames = self._markers = 0
+        self._located: set[str | None] = set()
+
+    def watch(self, messages: Iterable[Message]) -> Iterator[Message]:
+        """The messages, unchanged.
+
+        Raises
+        ------
+        IpsysError
+            For an ambiguous marker, where no frame can be decoded, or where no marker in any frame is one
+            of the rig's.
+        """
+        for message in messages:
+            self._note(message)
+            yield message
+        if self._task.stage == "detect":
+            self._check_detection()
+
+    def _note(self, message: Message) -> None:
+        payload = message.payload
+        if isinstance(payload, Event):
+            self._events.setdefault(payload.kind, []).append(message)
+            if payload.kind == "ambiguous_marker" and not self._skip_ambiguous:
+                raise IpsysError(
+                    f"{_said(message)}: give each marker an id of its own, or leave it out of such frames "
+                    "with --skip-ambiguous"
+                )
+        elif isinstance(payload, Markers):
+            self._frames += 1
+            self._markers += len(payload.markers)
+        elif isinstance(payload, Positions):
+            self._located.add(message.camera)
+
+    def _check_detection(self) -> None:
+        corrupt = self._events.get("corrupt_frame", ())
+        if corrupt and not self._frames:
+            raise IpsysError(f"none of {len(corrupt)} frames can be decoded, first: {_said(corrupt[0])}")
+        unknown = {str(message.payload.marker_id) for message in self._events.get("unknown_marker", ())}
+        if unknown and not self._markers:
+            raise IpsysError(
+                f"no marker of the rig is in any frame, but ids {', '.join(sorted(unknown))} are: add "
+                "them as [[markers]] to lab.toml and give it with --rig"
+            )
+
+    def lines(self) -> tuple[str, ...]:
+        """One line for each thing to know."""
+        lines = [
+            f"{len(found)} x {kind.replace('_', ' ')}, first: {_said(found[0])}"
+            for kind, found in sorted(self._events.items())
+        ]
+        if self._task.stage == "detect" and not self._markers:
+            lines.append("no marker was found: were they printed from the dictionary in the rig?")
+        if self._task.stage == "locate":
+            cameras = {camera_of_topic(topic) for topic in self._task.topics} - {None}
+            lines += [f"camera {name} has no model" for name in sorted(map(str, cameras - self._located))]
+        return (*lines, *self._task.notes)
+
+
+def _said(message: Message) -> str:
+    return f"{message.payload.text}, at {format_time(message.log_time_ns)} ({message.log_time_ns} ns)"

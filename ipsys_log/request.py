@@ -1,0 +1,39 @@
+"""What the user asks for, beyond what the log itself says."""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Mapping
+from dataclasses import dataclass, field
+from pathlib import Path
+
+from ipsys_log.messages import CameraCalibration, Rig
+
+__all__ = ["Progress", "Request"]
+
+# Called with the stage, the messages done, and all there are, where that is known.
+Progress = Callable[[str, int, int | None], None]
+
+
+@dataclass(frozen=True, slots=True)
+class Request:
+    """What the user asks for.
+
+    Attributes
+    ----------
+    models : names in the table of models; empty: what ``model_from`` holds, else ``poly``, or to evaluate
+        all of them.
+    rig, lenses : used instead of the log's own, as a new run. Lenses by camera.
+    model_from : another log, whose newest fitted model is applied and copied in.
+    train, seed : the subset to fit on, or the seed of the random split where nothing is labelled.
+    run : name for the new run of the last stages, instead of one made from the model.
+    skip_ambiguous : go on where a marker id is seen twice in a frame, without that marker.
+    """
+
+    models: tuple[str, ...] = ()
+    rig: Rig | None = None
+    lenses: Mapping[str, CameraCalibration] = field(default_factory=dict)
+    model_from: Path | None = None
+    train: str = "train"
+    seed: int = 0
+    run: str | None = None
+    skip_ambiguous: bool = False

@@ -1,0 +1,271 @@
+"""Runs: a name for what belongs together, found again only where it is whole."""
+
+from __future__ import annotations
+
+import json
+import shutil
+from collections.abc import Callable
+from dataclasses import replace
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pytest
+
+from ipsys_log.log import LogWriter
+from ipsys_log.log.session import Session, run_of_topic
+from ipsys_log.messages import CameraCalibration, CameraPoints, Event, Message, Model, Rig, Run, Tracks
+from ipsys_log.output import write_log, write_messages
+from tests.conftest import ROOT, Ipsys
+
+PAPER = ROOT / "sample_logs" / "paper_lab.mcap"
+
+
+@pytest.fixture
+def paper(tmp_path: Path) -> Path:
+    """The paper's layout without frames: its markers are in run ``stock``."""
+    return Path(shutil.copy(PAPER, tmp_path / "paper.mcap"))
+
+
+def runs_of(ipsys: Ipsys, *arguments: object) -> dict[str, tuple[str, bool]]:
+    done = ipsys(*arguments, "--json")
+    assert done.code == 0, done.err
+    return {row["stage"]: (row["run"], row["new"]) for row in json.loads(done.out)["stages"]}
+
+
+def without(log: Path, drop: Callable[[Message], bool]) -> Path:
+    path = log.with_name("less.mcap")
+    with Session([log]) as session:
+        topics = [topic for reader in session.readers for topic in reader.channels]
+        write_log(path, (message for message in session.messages(topics) if not drop(message)))
+    return path
+
+
+def change(log: Path, edit: Callable[[Any], Any]) -> Path:
+    path = log.with_name("other.mcap")
+    with Session([log]) as session:
+        topics = [topic for reader in session.readers for topic in reader.channels]
+        messages = (replace(m, payload=edit(m.payload)) for m in session.messages(topics))
+        write_log(path, messages)
+    return path
+
+
+def robots(folder: Path, log: Path, prefix: str) -> Path:
+    """A rig file that differs from the log's in the names of the robots only."""
+    with Session([log]) as session:
+        rig = session.payloads(session.topics(Rig))[0]
+    text = f'name = "a"\ndictionary = "{rig.dictionary}"\nmarker_length_m = {rig.marker_length_m}\n'
+    for p in rig.reference_points:
+        text += f'[[reference_points]]\nname = "{p.name}"\nx_m = {p.x_m}\ny_m = {p.y_m}\n'
+    for marker in rig.markers:
+        text += f'[[markers]]\nid = {marker.id}\nrobot = "{prefix}_{marker.id}"\n'
+    path = folder / f"{prefix}.toml"
+    path.write_text(text)
+    return path
+
+
+def test_a_run_holds_only_what_belongs_together(ipsys: Ipsys, paper: Path, tmp_path: Path) -> None:
+    ipsys("replay", paper)
+    renamed = runs_of(ipsys, "replay", paper, "--rig", robots(tmp_path, paper, "ada"))
+    # Other robots bear on fuse alone, which gets a run of its own ...
+    assert renamed["locate"] == ("poly", False)
+    assert renamed["fuse"] == ("poly_2", True)
+    # ... that a new model does not join.
+    fewer = runs_of(ipsys, "replay", paper, "--model", "rigid", "--rig", robots(tmp_path, paper, "ada"))
+    assert {fewer[stage] for stage in ("fit", "evaluate", "locate", "fuse")} == {("rigid", True)}
+    with Session([paper]) as session:
+        end_ns = session.end_ns
+        first = session.payloads(["/measurements"])[0]
+        withdrawal = replace(first, timestamp=end_ns, id="w", withdraws=first.id, splits=())
+    with LogWriter.append(paper) as writer:
+        write_messages(writer, [Message("/measurements", end_ns + 1, end_ns, withdrawal)])
+    again = runs_of(ipsys, "replay", paper)
+    assert {again[stage] for stage in ("fit", "evaluate", "locate", "fuse")} == {("poly_3", True)}
+
+
+def test_topics_without_a_record_are_nobodys_and_are_left_alone(ipsys: Ipsys, paper: Path) -> None:
+    ipsys("replay", paper)
+    log = without(paper, lambda m: isinstance(m.payload, Run) and m.payload.stage in ("fit", "locate"))
+    with Session([log]) as session:
+        topics = [t for r in session.readers for t in r.channels if run_of_topic(t) == "poly"]
+        before = {t: session.count(t) for t in topics if not t.endswith("/record")}
+    made = runs_of(ipsys, "replay", log)
+    assert {made[stage] for stage in ("fit", "evaluate", "locate", "fuse")} == {("poly_2", True)}
+    with Session([log]) as session:
+        assert {t: session.count(t) for t in before} == before
+
+
+def test_a_run_that_lost_a_channel_is_not_complete(ipsys: Ipsys, paper: Path) -> None:
+    ipsys("replay", paper)
+    log = without(paper, lambda m: m.topic == "/runs/poly/cameras/red/positions")
+    made = runs_of(ipsys, "replay", log)
+    assert made["evaluate"] == ("poly", False)
+    assert made["locate"] == ("poly_2", True)
+    assert made["fuse"] == ("poly_2", True)
+
+
+def test_a_named_run_takes_the_shared_detection(ipsys: Ipsys, lab: Path) -> None:
+    ipsys("detect", lab)
+    made = runs_of(ipsys, "camera-frame", lab, "--run", "again")
+    assert made == {"detect": ("stock", False), "camera-frame": ("again", True)}
+    # Whoever asks next gets the first one that is right, and nothing is made again.
+    ipsys("replay", lab)
+    before = lab.read_bytes()
+    assert "nothing to do" in ipsys("replay", lab).err
+    assert lab.read_bytes() == before
+
+
+def test_one_name_for_several_models_is_refused_before_anything_is_made(ipsys: Ipsys, paper: Path) -> None:
+    before = paper.read_bytes()
+    done = ipsys("evaluate", paper, "--run", "x")
+    assert done.code == 1
+    assert "3 models are asked for" in done.err
+    assert paper.read_bytes() == before
+
+
+def test_a_seed_that_changes_nothing_makes_no_run(ipsys: Ipsys, paper: Path) -> None:
+    ipsys("replay", paper)
+    assert all(not new for _, new in runs_of(ipsys, "replay", paper, "--seed", 5).values())
+
+
+def test_a_model_is_known_by_what_it_is_and_not_by_its_file(
+    ipsys: Ipsys, paper: Path, tmp_path: Path
+) -> None:
+    ipsys("replay", paper)
+    copy = Path(shutil.copy(paper, tmp_path / "copy.mcap"))
+    drive = without(paper, lambda m: m.topic.startswith("/runs/poly") or m.topic == "/measurements")
+    assert runs_of(ipsys, "replay", drive, "--model-from", paper)["fit"] == ("poly", True)
+    assert runs_of(ipsys, "replay", drive, "--model-from", copy)["fit"] == ("poly", False)
+    done = ipsys("replay", drive, "--model-from", drive)
+    assert done.code == 1
+    assert "this is the log itself" in done.err
+
+
+def test_a_model_of_other_cameras_is_refused(ipsys: Ipsys, paper: Path, tmp_path: Path) -> None:
+    ipsys("replay", paper)
+    other = tmp_path / "other.mcap"
+    with Session([PAPER]) as session:
+        topics = [t for r in session.readers for t in r.channels if "/cameras/" in t or t == "/rig"]
+        renamed = (
+            replace(m, topic=m.topic.replace("/cameras/", "/cameras/lab2_"))
+            for m in session.messages(topics)
+            if not isinstance(m.payload, Run)
+        )
+        record = session.runs()[0]
+        outputs = tuple(
+            replace(o, topic=o.topic.replace("/cameras/", "/cameras/lab2_")) for o in record.outputs
+        )
+        last = [Message("/runs/stock/record", session.end_ns, 0, replace(record, outputs=outputs))]
+        write_log(other, [*renamed, *last])
+    done = ipsys("replay", other, "--model-from", paper)
+    assert done.code == 1
+    assert "its model is of the cameras black, red, white, the log has lab2_black" in done.err
+
+
+def test_a_camera_that_the_model_does_not_know_is_named(ipsys: Ipsys, paper: Path, tmp_path: Path) -> None:
+    two = without(paper, lambda m: m.camera == "red")
+    with Session([paper]) as session:
+        record = next(run for run in session.runs() if run.stage == "detect")
+    kept = tuple(o for o in record.outputs if "/red/" not in o.topic)
+    two = change(two, lambda p: replace(p, outputs=kept) if isinstance(p, Run) else p)
+    assert ipsys("replay", two).code == 0
+    done = ipsys("replay", paper, "--model-from", two)
+    assert done.code == 0
+    assert "camera red has no model" in done.err
+
+
+def test_a_model_knows_the_places_it_was_made_of(ipsys: Ipsys, paper: Path, tmp_path: Path) -> None:
+    plain = change(paper, lambda p: replace(p, splits=()) if hasattr(p, "splits") else p)
+    fitted = tmp_path / "fitted.mcap"
+    assert ipsys("fit", plain, "-o", fitted).code == 0
+    done = ipsys("evaluate", plain, "--model-from", fitted, "--json")
+    assert done.code == 0, done.err
+    counts = {c: e["3d"]["n"] for c, e in json.loads(done.out)["models"]["poly"]["cameras"].items()}
+    with Session([plain]) as session:
+        total = len(session.payloads(["/measurements"]))
+    # A fifth was held out when the model was fitted; only these count.
+    assert sum(counts.values()) < 0.5 * total
+
+
+def test_files_in_another_order_are_the_same_channels(ipsys: Ipsys, lab: Path, tmp_path: Path) -> None:
+    with Session([lab]) as session:
+        topics = [topic for reader in session.readers for topic in reader.channels]
+        middle = (session.start_ns + session.end_ns) // 2
+        parts = [tmp_path / "one.mcap", tmp_path / "two.mcap"]
+        write_log(parts[0], session.messages(topics, None, middle))
+        write_log(parts[1], session.messages(topics, middle, None))
+    derived = tmp_path / "derived.mcap"
+    assert ipsys("detect", *parts, "-o", derived).code == 0
+    assert runs_of(ipsys, "detect", *parts[::-1], derived) == {"detect": ("stock", False)}
+
+
+def test_the_rig_of_a_log_is_checked_too(ipsys: Ipsys, paper: Path) -> None:
+    def no_length(payload: Any) -> Any:
+        return replace(payload, marker_length_m=0.0) if isinstance(payload, Rig) else payload
+
+    done = ipsys("replay", change(paper, no_length))
+    assert done.code == 1
+    assert "/rig: 0.0 m is not a length" in done.err
+
+
+def test_a_rig_recorded_later_does_not_change_what_was_measured_before(ipsys: Ipsys, paper: Path) -> None:
+    ipsys("replay", paper)
+    with Session([paper]) as session:
+        rig, end_ns = session.payloads(["/rig"])[0], session.end_ns
+        old = session.payloads(session.topics(Model, "poly"))[0]
+    moved = replace(rig, reference_points=tuple(replace(p, x_m=p.x_m + 0.1) for p in rig.reference_points))
+    with LogWriter.append(paper) as writer:
+        write_messages(writer, [Message("/rig", end_ns + 1, end_ns + 1, moved)])
+    assert ipsys("replay", paper).code == 0
+    with Session([paper]) as session:
+        new = session.payloads(session.topics(Model, "poly_2"))[0]
+    for one, other in zip(old.cameras, new.cameras, strict=True):
+        for p, q in zip(one.parameters, other.parameters, strict=True):
+            np.testing.assert_array_equal(p.values, q.values)
+
+
+def test_a_marker_beyond_the_lens_is_left_out_and_named(ipsys: Ipsys, paper: Path) -> None:
+    def bent(payload: Any) -> Any:
+        # A model that folds back: far from the centre no ray belongs to a pixel.
+        if isinstance(payload, CameraCalibration) and payload.frame_id == "red":
+            return replace(payload, D=np.array([-0.45, 0.0, 0.0, 0.0]))
+        return payload
+
+    log = change(paper, bent)
+    done = ipsys("camera-frame", log)
+    assert done.code == 0, done.err
+    assert "outside lens" in done.err
+    with Session([log]) as session:
+        points = [p for m in session.payloads(session.topics(CameraPoints, "stock")) for p in m.points]
+        events = session.payloads(session.topics(Event, "stock"))
+    assert {event.camera for event in events} == {"red"}
+    assert all(np.isfinite([p.x_m, p.y_m, p.z_m]).all() and abs(p.z_m) < 10 for p in points)
+
+
+def test_a_model_and_its_evaluation_speak_of_the_last_input(ipsys: Ipsys, lab: Path) -> None:
+    ipsys("replay", lab)
+    with Session([lab]) as session:
+        inputs = list(session.messages([*session.topics(CameraPoints, "stock"), "/measurements", "/rig"]))
+        (model,) = session.messages(session.topics(Model, "poly"))
+    assert (model.log_time_ns, model.publish_time_ns) == (inputs[-1].log_time_ns, inputs[-1].publish_time_ns)
+    assert model.payload.timestamp == model.publish_time_ns
+
+
+def test_places_measured_for_nothing_are_named(ipsys: Ipsys, paper: Path) -> None:
+    def late(payload: Any) -> Any:
+        if getattr(payload, "id", "") == "s003":
+            return replace(payload, still=None, timestamp=payload.timestamp + 10**15)
+        return payload
+
+    done = ipsys("fit", change(paper, late))
+    assert "measured places were seen still by no camera: s003" in done.err
+
+
+def test_the_truth_is_compared_only_where_it_is_known(ipsys: Ipsys, paper: Path) -> None:
+    with Session([paper]) as session:
+        middle = (session.start_ns + session.end_ns) // 2
+    log = without(paper, lambda m: isinstance(m.payload, Tracks) and m.log_time_ns < middle)
+    cameras = json.loads(ipsys("replay", log, "--json").out)["models"]["poly"]["cameras"]
+    for errors in cameras.values():
+        assert "truth" not in errors or errors["truth"]["3d"]["n"] < errors["3d"]["n"]
+        assert "truth" not in errors or errors["truth"]["3d"]["mean_cm"] < 2

@@ -12,6 +12,7 @@ from ipsys_log.errors import IpsysError, LogError
 from ipsys_log.log import LogReader, LogWriter, Schema
 from ipsys_log.log.codec import encode, schema_data, schema_name
 from ipsys_log.log.session import Session
+from ipsys_log.log.storage import DISK
 from ipsys_log.messages import ChannelWritten, Message, Run
 
 __all__ = ["append_run", "opened_target", "write_log", "write_messages"]
@@ -82,13 +83,22 @@ def opened_target(paths: Sequence[Path], output: Path | None) -> Iterator[tuple[
         with LogReader(partial) as log:
             anything = log.message_count > 0
         if anything:
-            _check_free(output)
-            os.link(partial, output)
-    except FileExistsError:
-        _check_free(output)
+            _give_name(partial, output)
     finally:
         partial.unlink(missing_ok=True)
         partial.with_name(partial.name + ".journal").unlink(missing_ok=True)
+
+
+def _give_name(partial: Path, output: Path) -> None:
+    """Rename without overwriting what another process may have put there meanwhile."""
+    try:
+        os.link(partial, output)
+    except FileExistsError:
+        _check_free(output)
+    except OSError:  # a filesystem without hard links
+        _check_free(output)
+        partial.rename(output)
+    DISK.fsync_directory(output.parent)
 
 
 def _check_free(output: Path) -> None:

@@ -13,7 +13,7 @@ from ipsys_log.offline.pairs import split, world_point
 from ipsys_log.request import Request
 from ipsys_log.rig import check_rig
 from ipsys_log.runs import newest_run
-from ipsys_log.tasks import STAGES, fitted_in, held_out_ids, measured, rig_part
+from ipsys_log.tasks import STAGES, copied_run, fitted_in, held_out_ids, measured, rig_part
 
 __all__ = ["check_inputs"]
 
@@ -106,6 +106,8 @@ def _check_lenses(session: Session, request: Request, cameras: set[str]) -> None
 
 def _check_measurements(session: Session, request: Request, models: Sequence[str]) -> None:
     places = measured(session, request.rig)
+    if not places and all(copied_run(session, model) for model in models):
+        return
     if not places:
         raise FitError(
             f"{session}: has no measurements to fit a model to; apply a model of another log with "

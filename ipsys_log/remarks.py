@@ -29,8 +29,8 @@ class Remarks:
         Raises
         ------
         IpsysError
-            For an ambiguous marker, where no frame can be decoded, or where no marker in any frame is one
-            of the rig's.
+            For an ambiguous marker, where no frame can be decoded, or where no frame shows a marker of the
+            rig's.
         """
         for message in messages:
             self._note(message)
@@ -63,6 +63,11 @@ class Remarks:
                 f"no marker of the rig is in any frame, but ids {', '.join(sorted(unknown))} are: add "
                 "them as [[markers]] to lab.toml and give it with --rig"
             )
+        if self._frames and not self._markers:
+            raise IpsysError(
+                f"no marker was found in {self._frames} frames: were they printed from the dictionary in the "
+                "rig? Give the right one with --rig"
+            )
 
     def lines(self) -> tuple[str, ...]:
         """One line for each thing to know."""
@@ -70,8 +75,8 @@ class Remarks:
             f"{len(found)} x {kind.replace('_', ' ')}, first: {_said(found[0])}"
             for kind, found in sorted(self._events.items())
         ]
-        if self._task.stage == "detect" and not self._markers:
-            lines.append("no marker was found: were they printed from the dictionary in the rig?")
+        if self._task.stage == "detect":
+            lines.insert(0, f"{self._markers} markers in {self._frames} frames")
         if self._task.stage == "locate":
             cameras = {camera_of_topic(topic) for topic in self._task.topics} - {None}
             lines += [f"camera {name} has no model" for name in sorted(map(str, cameras - self._located))]

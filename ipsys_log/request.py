@@ -20,7 +20,7 @@ class Request:
 
     Attributes
     ----------
-    models : names in the table of models; empty: what ``model_from`` holds, else ``poly``, or to evaluate
+    models : names in the table of models; empty: ``poly``, or what ``model_from`` holds; to evaluate,
         all of them.
     rig, lenses : used instead of the log's own, as a new run. Lenses by camera.
     model_from : another log, whose newest fitted model is applied and copied in.

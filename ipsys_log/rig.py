@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import json
 import math
 import re
 import tomllib
@@ -14,7 +15,7 @@ from typing import Any, TypeVar
 from ipsys_log.errors import IpsysError
 from ipsys_log.messages import Floor, ReferencePoint, Rig, RigCamera, RigMarker
 
-__all__ = ["check_name", "check_rig", "example_toml", "load_rig"]
+__all__ = ["check_name", "check_rig", "example_toml", "load_rig", "rig_toml"]
 
 Item = TypeVar("Item")
 
@@ -38,6 +39,36 @@ def check_name(name: str, what: str) -> str:
 def example_toml() -> str:
     """The commented ``lab.toml`` that ``ipsys init`` writes: the lab of the paper."""
     return files("ipsys_log").joinpath("lab.toml").read_text(encoding="utf-8")
+
+
+def rig_toml(rig: Rig) -> str:
+    """A rig as the text of a rig file, which :func:`load_rig` reads back.
+
+    Examples
+    --------
+    >>> print(rig_toml(Rig("lab", "DICT_4X4_100", 0.2, (RigMarker(3, robot="ada"),))))
+    name = "lab"
+    dictionary = "DICT_4X4_100"
+    marker_length_m = 0.2
+    <BLANKLINE>
+    [[markers]]
+    id = 3
+    robot = "ada"
+    <BLANKLINE>
+    """
+    lines = _toml_rows(rig)
+    if rig.floor is not None:
+        lines += ["", "[floor]", *_toml_rows(rig.floor)]
+    for key in _ITEMS:
+        for item in getattr(rig, key):
+            lines += ["", f"[[{key}]]", *_toml_rows(item)]
+    return "\n".join(lines) + "\n"
+
+
+def _toml_rows(item: Any) -> list[str]:
+    values = [(f.name, getattr(item, f.name)) for f in fields(item)]
+    # A JSON string is a TOML string; so are numbers.
+    return [f"{name} = {json.dumps(value)}" for name, value in values if isinstance(value, (str, int, float))]
 
 
 def load_rig(path: Path) -> Rig:

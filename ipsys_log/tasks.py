@@ -8,7 +8,7 @@ from typing import Any
 
 from ipsys_log.errors import IpsysError
 from ipsys_log.geometry.lenses import same_lens
-from ipsys_log.log.session import Session
+from ipsys_log.log.session import Session, run_of_topic
 from ipsys_log.messages import (
     CameraCalibration,
     CameraPoints,
@@ -37,6 +37,7 @@ from ipsys_log.stages import camera_frame, detect, fuse, locate
 __all__ = [
     "STAGES",
     "Task",
+    "copied_run",
     "fitted_in",
     "held_out_ids",
     "measured",
@@ -92,7 +93,8 @@ def wanted_models(request: Request, until: str) -> tuple[str, ...]:
         return request.models
     if request.model_from is not None:
         with Session([request.model_from]) as other:
-            return (fitted_in(other, None)[0].name,)
+            held = {other.payloads([topic])[-1].name for topic in _model_topics(other)}
+            return ("poly" if "poly" in held else fitted_in(other, None)[0].name,)
     return tuple(MODELS) if until == "evaluate" else ("poly",)
 
 
@@ -104,13 +106,26 @@ def fitted_in(other: Session, name: str | None) -> tuple[Model, str]:
     IpsysError
         Where there is none.
     """
-    for run in reversed(complete_runs(other)):
-        for topic in other.topics(Model, run.run):
-            model: Model = other.payloads([topic])[-1]
-            if run.stage == "fit" and name in (None, model.name):
-                return model, topic
+    for topic in reversed(_model_topics(other)):
+        model: Model = other.payloads([topic])[-1]
+        if name in (None, model.name):
+            return model, topic
     what = f"model {name}" if name else "model"
     raise IpsysError(f"{other}: has no fitted {what}; fit one there with: ipsys fit {other}")
+
+
+def _model_topics(session: Session) -> list[str]:
+    return [t for run in complete_runs(session) if run.stage == "fit" for t in session.topics(Model, run.run)]
+
+
+def copied_run(session: Session, model: str) -> str | None:
+    """The run of a model that was copied into a log without measurements, the newest one."""
+    if session.topics(Measurement):
+        return None
+    for topic in reversed(_model_topics(session)):
+        if session.payloads([topic])[-1].name == model:
+            return run_of_topic(topic)
+    return None
 
 
 def rig_part(stage: str) -> Callable[[Rig], Any]:
@@ -183,6 +198,8 @@ def _fit(session: Session, request: Request, points: str, model: str) -> Task | 
     base = model.replace("+", "_").replace("-", "_")
     if request.model_from is not None:
         return _copy_model(request, model, base)
+    if (copied := copied_run(session, model)) is not None:
+        return copied
     rig, topics = _rig(session, request, "fit")
     topics += [*session.topics(CameraPoints, points), *session.topics(Measurement)]
     notes: list[str] = []

@@ -269,3 +269,41 @@ def test_the_truth_is_compared_only_where_it_is_known(ipsys: Ipsys, paper: Path)
     for errors in cameras.values():
         assert "truth" not in errors or errors["truth"]["3d"]["n"] < errors["3d"]["n"]
         assert "truth" not in errors or errors["truth"]["3d"]["mean_cm"] < 2
+
+
+def test_a_log_knows_the_model_that_was_copied_into_it(ipsys: Ipsys, paper: Path, tmp_path: Path) -> None:
+    ipsys("replay", paper, "--model", "poly")
+    ipsys("replay", paper, "--model", "rigid")
+    drive = without(paper, lambda m: m.topic.startswith(("/runs/poly", "/runs/rigid", "/measurements")))
+    # Of several models the usual one is meant, not the last one made.
+    assert runs_of(ipsys, "replay", drive, "--model-from", paper)["fit"] == ("poly", True)
+    paper.unlink()
+    before = drive.read_bytes()
+    assert runs_of(ipsys, "replay", drive)["locate"] == ("poly", False)
+    assert drive.read_bytes() == before
+    assert "no measurements" in ipsys("replay", drive, "--model", "rigid").err
+
+
+def test_the_rig_of_a_log_can_be_taken_out_mended_and_given_back(
+    ipsys: Ipsys, paper: Path, tmp_path: Path
+) -> None:
+    path = tmp_path / "mended.toml"
+    ipsys("replay", paper)
+    assert ipsys("init", path, "--from", paper).code == 0
+    assert all(not new for _, new in runs_of(ipsys, "replay", paper, "--rig", path).values())
+    path.write_text(path.read_text().replace("marker_length_m = 0.2", "marker_length_m = 0.19"))
+    assert runs_of(ipsys, "replay", paper, "--rig", path)["camera-frame"] == ("stock_2", True)
+    assert "0.19 m" in ipsys("runs", paper).out
+    runs = json.loads(ipsys("runs", paper, "--json").out)
+    lengths = [run["rig"]["marker_length_m"] for run in runs if run["rig"]]
+    assert lengths == [0.19]
+
+
+def test_a_wrong_dictionary_leaves_no_empty_run(ipsys: Ipsys, lab: Path, tmp_path: Path) -> None:
+    path = tmp_path / "wrong.toml"
+    path.write_text('name = "a"\ndictionary = "DICT_7X7_50"\nmarker_length_m = 0.2\n')
+    before = lab.read_bytes()
+    done = ipsys("detect", lab, "--rig", path)
+    assert done.code == 1
+    assert "no marker was found in" in done.err
+    assert lab.read_bytes() == before

@@ -27,6 +27,7 @@ def main() -> None:
         what = "the disk is full; free some space and try again" if full else error.strerror
         sys.exit(_complain(f"{error.filename}: {what}" if error.filename else str(what)))
     except KeyboardInterrupt:
+        _complain("interrupted; stages that were complete are in the log, and nothing else was changed")
         sys.exit(130)
 
 

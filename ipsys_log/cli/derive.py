@@ -27,7 +27,7 @@ _OPTIONS: dict[str, tuple[Any, Any]] = {
     "model": (
         Annotated[
             Optional[list[str]],  # noqa: UP045
-            typer.Option("--model", help="rigid, poly or rigid+poly; repeat for several."),
+            typer.Option("--model", metavar="NAME", help="rigid, poly or rigid+poly; repeat it for several."),
         ],
         None,
     ),

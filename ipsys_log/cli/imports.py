@@ -7,7 +7,7 @@ from typing import Annotated
 
 import typer
 
-from ipsys_log.cli.console import console
+from ipsys_log.cli.console import console, remarks
 from ipsys_log.cli.options import Calibrations, NewLog, RigFile
 
 __all__ = ["add_commands"]
@@ -48,5 +48,7 @@ def images(
     pictures = find_pictures(folder)
     lenses = load_calibrations(calibration, lambda: pictures)
     write_log(output, read_images(pictures, load_rig(rig) if rig else None, lenses, rate))
+    if len({len(paths) for paths in pictures.values()}) > 1:
+        remarks.print("cameras have unequal numbers of pictures: the n-th of each are taken for one instant")
     counts = ", ".join(f"{len(paths)} of {camera}" for camera, paths in pictures.items())
     console.print(f"{output} written: pictures: {counts}")

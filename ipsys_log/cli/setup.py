@@ -46,10 +46,17 @@ def add_commands(app: typer.Typer) -> None:
     app.command("simulate", help=simulate.__doc__)(_simulate_command())
 
 
-def init(path: Annotated[Path, typer.Argument(help="The rig file to write.")] = Path("lab.toml")) -> None:
-    """Write a commented rig file: markers, cameras, reference points, floor."""
+def init(
+    path: Annotated[Path, typer.Argument(help="The rig file to write.")] = Path("lab.toml"),
+    log: Annotated[
+        Path | None, typer.Option("--from", metavar="LOG", help="Write the rig that a log holds.")
+    ] = None,
+) -> None:
+    """Write a rig file to edit: markers, cameras, reference points, floor. With comments, or from a log."""
     from ipsys_log.errors import IpsysError
     from ipsys_log.rig import example_toml
+
+    text = example_toml() if log is None else _rig_of(log)
 
     try:
         file = path.open("x", encoding="utf-8")
@@ -57,11 +64,24 @@ def init(path: Annotated[Path, typer.Argument(help="The rig file to write.")] = 
         raise IpsysError(f"{path}: exists already; edit it, or give another name") from error
     try:
         with file:
-            file.write(example_toml())
+            file.write(text)
     except OSError:
         path.unlink()
         raise
     console.print(f"{path} written: edit it to describe your lab")
+
+
+def _rig_of(log: Path) -> str:
+    from ipsys_log.errors import IpsysError
+    from ipsys_log.log.session import Session
+    from ipsys_log.messages import Rig
+    from ipsys_log.rig import rig_toml
+
+    with Session([log]) as session:
+        rigs = session.payloads(session.topics(Rig))
+    if not rigs:
+        raise IpsysError(f"{log}: holds no rig; write an example with 'ipsys init lab.toml'")
+    return rig_toml(rigs[-1])
 
 
 def simulate(output: Path, **settings: Any) -> None:

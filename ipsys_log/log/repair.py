@@ -22,6 +22,7 @@ from ipsys_log.log.storage import DISK, Storage, write_all
 from ipsys_log.log.summary import tail_bytes
 from ipsys_log.log.survey import Survey, crc_of, survey
 from ipsys_log.log.view import View
+from ipsys_log.units import format_time
 
 __all__ = ["RepairReport", "repair"]
 
@@ -47,12 +48,15 @@ class RepairReport:
 
     def __str__(self) -> str:
         kept = f"{self.messages_kept} messages"
+        if not self.messages_kept:
+            kept = "no message"
         if not self.changed:
             return "; ".join((f"{self.path} is whole: {kept}, nothing changed", *self.notes))
         lost = ", ".join(f"{number} of {topic}" for topic, number in sorted(self.messages_lost.items()))
+        end = "" if self.last_kept_ns is None else f", up to {format_time(self.last_kept_ns)} UTC"
         words = (
-            f"{self.path} repaired: {kept} kept, the last one at {self.last_kept_ns} ns; "
-            f"{self.bytes_lost} bytes lost; messages known to be lost: {lost or 'none'}"
+            f"{self.path} repaired: {kept} kept{end}. Dropped: {self.bytes_lost} bytes that cannot be read"
+            f" ({lost or 'no whole message'}). How much was never written or was cut off is not known"
         )
         return "; ".join((words, *self.notes))
 

@@ -2,12 +2,14 @@
 
 from __future__ import annotations
 
+from dataclasses import asdict
 from typing import Any
 
 import numpy as np
 from rich.table import Table
 
 from ipsys_log.log.session import Session
+from ipsys_log.messages import Run
 from ipsys_log.units import NS_PER_S, format_bytes, format_time
 
 __all__ = ["contents_json", "contents_tables", "runs_json", "runs_table"]
@@ -70,13 +72,19 @@ def runs_json(session: Session) -> list[dict[str, Any]]:
             "stage": run.stage,
             "parameters": run.parameters,
             "input_runs": list(run.input_runs),
-            "overrides": ["rig"] * (run.rig is not None) + [f"lens {lens.camera}" for lens in run.lenses],
+            "overrides": _overrides(run),
+            "rig": None if run.rig is None else asdict(run.rig),
             "inputs": [{"topic": i.topic, "messages": i.messages, "hash": i.hash} for i in run.inputs],
             "outputs": [{"topic": o.topic, "messages": o.messages} for o in run.outputs],
             "fingerprint": run.fingerprint,
         }
         for run in session.runs()
     ]
+
+
+def _overrides(run: Run) -> list[str]:
+    rig = [] if run.rig is None else [f"rig ({run.rig.name}, {run.rig.marker_length_m:g} m)"]
+    return [*rig, *(f"lens {lens.camera}" for lens in run.lenses)]
 
 
 def _table(title: str, *columns: str, right: tuple[str, ...] = ()) -> Table:

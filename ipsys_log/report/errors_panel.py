@@ -180,8 +180,14 @@ def _name_models(
         )  # fmt: skip
 
 
+def _bar(row: _Row) -> NDArray[np.float64]:
+    """Mean, and mean plus standard deviation, of a row that has no points of its own."""
+    mean_m, std_m = row.statistics.mean_m, row.statistics.std_m or 0.0
+    return np.array([mean_m, mean_m + std_m]) * CM_PER_M
+
+
 def _scale(axes: Axes, rows: Sequence[_Row]) -> None:
-    shown = [row.errors_cm for row in rows] + [np.array([row.statistics.mean_m * CM_PER_M]) for row in rows]
+    shown = [row.errors_cm if len(row.errors_cm) else _bar(row) for row in rows]
     errors_cm = np.concatenate(shown)
     largest, usual = float(errors_cm.max()), float(np.median(errors_cm))
     axes.set_xlabel("cm", fontsize=9)

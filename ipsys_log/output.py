@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import os
+import secrets
 from collections.abc import Callable, Iterable, Iterator, Sequence
 from contextlib import contextmanager
 from dataclasses import replace
@@ -11,6 +12,7 @@ from pathlib import Path
 from ipsys_log.errors import IpsysError, LogError
 from ipsys_log.log import LogReader, LogWriter, Schema
 from ipsys_log.log.codec import encode, schema_data, schema_name
+from ipsys_log.log.journal import journal_path
 from ipsys_log.log.session import Session
 from ipsys_log.log.storage import DISK
 from ipsys_log.messages import ChannelWritten, Message, Run
@@ -75,10 +77,10 @@ def opened_target(paths: Sequence[Path], output: Path | None) -> Iterator[tuple[
         return
     _check_free(output)
     # Another process may be making a log of that name: the first to finish gets it.
-    partial = output.with_name(f"{output.name}.{os.getpid()}.partial")
+    partial = output.with_name(f"{output.name}.{secrets.token_hex(4)}.partial")
+    with LogWriter.create(partial):
+        pass
     try:
-        with LogWriter.create(partial):
-            pass
         yield [*paths, partial], partial
         with LogReader(partial) as log:
             anything = log.message_count > 0
@@ -86,7 +88,7 @@ def opened_target(paths: Sequence[Path], output: Path | None) -> Iterator[tuple[
             _give_name(partial, output)
     finally:
         partial.unlink(missing_ok=True)
-        partial.with_name(partial.name + ".journal").unlink(missing_ok=True)
+        journal_path(partial).unlink(missing_ok=True)
 
 
 def _give_name(partial: Path, output: Path) -> None:
@@ -95,6 +97,7 @@ def _give_name(partial: Path, output: Path) -> None:
         os.link(partial, output)
     except FileExistsError:
         _check_free(output)
+        raise
     except OSError:  # a filesystem without hard links
         _check_free(output)
         partial.rename(output)

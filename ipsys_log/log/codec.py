@@ -103,7 +103,7 @@ def decode(name: str, data: bytes, encoding: str = "protobuf") -> Any:
         raise LogError(f"its schema {name!r} is none that ipsys reads")
     try:
         return _read(payload, _parse(_proto_class(name), data, encoding))
-    except (DecodeError, json_format.ParseError, ValueError) as error:
+    except (DecodeError, json_format.ParseError, ValueError, TypeError, RecursionError) as error:
         raise LogError(f"a message is not a valid {name}: {error}") from error
 
 

@@ -37,7 +37,7 @@ def load_contents(view: View) -> Contents:
         contents, complete = _from_summary(view, summary_start, footer_at)
     end = summary_start or footer_at
     data_end = end - DATA_END.size
-    opcode, length, crc = DATA_END.unpack(view.read(data_end, DATA_END.size)) if data_end > 8 else (0, 0, 0)
+    opcode, length, crc = DATA_END.unpack(view.read(data_end, DATA_END.size)) if data_end >= 8 else (0, 0, 0)
     if (opcode, length) != (Opcode.DATA_END, 4):
         raise view.fault(max(data_end, 0), "there is no DataEnd record before the summary")
     if contents is None or not complete or not _gaps_hold_no_messages(view, contents, data_end):

@@ -93,9 +93,9 @@ class _Records:
     """The records of one chunk, by their offsets in it, read in place where that is possible."""
 
     view: View
-    blocks: Blocks
     chunk: ChunkRef
     raw: EqualBlocks | RawBlocks | None
+    whole: bytes | None = None
 
     def read(self, low: int, high: int) -> bytes:
         chunk = self.chunk
@@ -107,8 +107,11 @@ class _Records:
         return self._whole()[low:high] if data is None else data
 
     def _whole(self) -> bytes:
-        at = self.chunk.offset
-        return self.blocks.get((at, -1), lambda: unpack(self.view, at, parse_chunk_head(self.view, at)[1]))
+        """Decompressed once, and held while messages of it are due: chunks may overlap in time."""
+        if self.whole is None:
+            at = self.chunk.offset
+            self.whole = unpack(self.view, at, parse_chunk_head(self.view, at)[1])
+        return self.whole
 
 
 def chunk_entries(view: View, chunk: ChunkRef, wanted: set[int] | None = None) -> Entries:
@@ -137,7 +140,7 @@ def open_chunk(
     if chunk.compression and chunk.compressed_size > _SMALL and len(runs) * _GAP < chunk.compressed_size:
         at = chunk.offset + CHUNK_HEAD_SIZE + len(chunk.compression)
         raw = find_blocks(view, chunk.compression, at, chunk.compressed_size, chunk.uncompressed_size)
-    records = _Records(view, blocks, chunk, raw)
+    records = _Records(view, chunk, raw)
     messages = _Messages(view, blocks, topics, chunk.offset, times, offsets, runs, records.read)
     return Cursor(chunk.offset, times, offsets, messages.load)
 

@@ -121,12 +121,18 @@ def _is_whole(theirs: Contents, found: Survey) -> bool:
     if not found.finished or found.damaged or not found.crc_is_right:
         return False
     mine = found.contents
-    chunks = [chunk.offset for chunk in mine.chunks] == [chunk.offset for chunk in theirs.chunks]
+    chunks = [_identity(chunk) for chunk in mine.chunks] == [_identity(chunk) for chunk in theirs.chunks]
     indexes = all(
         b.index_offsets in ({}, a.index_offsets) for a, b in zip(mine.chunks, theirs.chunks, strict=False)
     )
     counts = Counter(mine.counts) == Counter(theirs.counts)
     return chunks and indexes and counts and theirs.data_end == found.end
+
+
+def _identity(chunk: ChunkRef) -> tuple[int | str, ...]:
+    """All that a reader goes by, but for the message indexes."""
+    sizes = (chunk.length, chunk.compressed_size, chunk.uncompressed_size)
+    return (chunk.offset, chunk.start_ns, chunk.end_ns, chunk.compression, *sizes)
 
 
 def _rebuild(storage: Storage, view: View, found: Survey, notes: list[str]) -> RepairReport:
@@ -196,7 +202,10 @@ def _blank(storage: Storage, view: View, found: Survey) -> None:
 
 
 def _copy_lost(storage: Storage, view: View, start: int) -> Path:
-    beside = view.path.with_name(view.path.name + ".lost")
+    beside, number = view.path.with_name(view.path.name + ".lost"), 1
+    while beside.exists():  # of an earlier repair, or one that was interrupted
+        number += 1
+        beside = view.path.with_name(f"{view.path.name}.lost_{number}")
     fd = storage.open(beside, os.O_WRONLY | os.O_CREAT | os.O_EXCL)
     try:
         for offset in range(start, view.size, _BLOCK):

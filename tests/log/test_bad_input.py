@@ -4,6 +4,7 @@ import errno
 import random
 import struct
 import tracemalloc
+import zlib
 from collections.abc import Callable
 from dataclasses import dataclass
 from pathlib import Path
@@ -12,6 +13,7 @@ from typing import Any, cast
 import pytest
 import zstandard
 from mcap import records as mcap
+from mcap.opcode import Opcode
 from mcap.writer import Writer
 
 from ipsys_log.errors import LogError
@@ -328,3 +330,27 @@ def test_a_full_disk_while_appending(log: Path) -> None:
         read_everything(log)
         append(log, [])
         assert log.read_bytes() == before
+
+
+def test_a_chunk_index_with_wrong_times_is_repaired(tmp_path: Path) -> None:
+    """Readers go by the index, so repair must not say that all is well."""
+    path = create(tmp_path / "a.mcap", [("/a", n, n, bytes(50)) for n in range(100, 160)])
+    whole = bytearray(path.read_bytes())
+    summary_start = int.from_bytes(whole[-28:-20], "little")
+    index = next(
+        offset
+        for offset in range(summary_start, len(whole))
+        if whole[offset] == Opcode.CHUNK_INDEX
+        and whole[offset + 9 : offset + 17] == (100).to_bytes(8, "little")
+    )
+    whole[index + 9 : index + 17] = (130).to_bytes(8, "little")
+    footer = len(whole) - 8 - 29
+    crc = zlib.crc32(bytes(whole[summary_start : footer + 25]))
+    whole[footer + 25 : footer + 29] = crc.to_bytes(4, "little")
+    path.write_bytes(whole)
+    with LogReader(path) as reader:  # goes by the index
+        assert list(reader.messages(start_ns=100, end_ns=110)) == []
+    assert repair(path).changed
+    with LogReader(path) as reader:
+        assert len(list(reader.messages(start_ns=100, end_ns=110))) == 10
+    assert not repair(path).changed

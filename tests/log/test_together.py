@@ -15,8 +15,9 @@ from ipsys_log.errors import LogError
 from ipsys_log.log import LogReader, repair
 from ipsys_log.log import reader as reader_module
 from ipsys_log.log.contents import Contents
-from ipsys_log.log.journal import journal_path
+from ipsys_log.log.journal import journal_path, replace_tail
 from ipsys_log.log.load import load_contents
+from ipsys_log.log.storage import Disk
 from ipsys_log.log.view import View
 from tests.log.conftest import Row, append, as_row, create, linear_rows, stock_rows
 
@@ -146,3 +147,52 @@ def test_kill_a_recorder(tmp_path: Path) -> None:
         kept += len(times)
         path.unlink()
     assert kept > 0
+
+
+def test_a_journal_that_the_log_has_outlived_is_not_rolled_back(tmp_path: Path) -> None:
+    """A crash, then a repair and an append under another name, then the old name again."""
+    path, moved = tmp_path / "a.mcap", tmp_path / "b.mcap"
+    create(path, [("/a", n, n, b"old") for n in range(30)])
+    whole = path.read_bytes()
+    # As a crash leaves it: the journal is there, the file is cut where the tail was.
+    with pytest.raises(OSError, match="crash"):
+        _crash_after_truncate(path, whole)
+    path.rename(moved)
+    assert repair(moved).messages_kept == 30
+    append(moved, [("/c", 200, 200, b"kept")])
+    moved.rename(path)
+    for _ in range(2):
+        with LogReader(path) as reader:
+            assert [m.data for m in reader.messages(["/c"])] == [b"kept"]
+        append(path, [])
+
+
+def _crash_after_truncate(path: Path, whole: bytes) -> None:
+    path.write_bytes(whole)
+
+    class Crashing(Disk):
+        def pwrite(self, fd: int, data: bytes | memoryview, offset: int) -> int:
+            if os.fstat(fd).st_ino == path.stat().st_ino:
+                raise OSError(5, "crash")
+            return int(os.pwrite(fd, data, offset))
+
+    fd = os.open(path, os.O_RDWR)
+    try:
+        summary_start = int.from_bytes(whole[-28:-20], "little")
+        replace_tail(Crashing(), path, fd, summary_start - 13, (b"new tail",))
+    finally:
+        os.close(fd)
+
+
+def test_a_log_is_one_by_whichever_link_it_is_opened(tmp_path: Path) -> None:
+    path, link = tmp_path / "a.mcap", tmp_path / "link.mcap"
+    create(path, [("/a", n, n, b"old") for n in range(30)])
+    whole = path.read_bytes()
+    link.symlink_to(path)
+    with pytest.raises(OSError, match="crash"):
+        _crash_after_truncate(path, whole)
+    for name in (path, link):
+        with LogReader(name) as reader:
+            assert reader.message_count == 30
+    append(link, [])
+    assert path.read_bytes() == whole

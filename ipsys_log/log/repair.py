@@ -4,6 +4,7 @@ import os
 import zlib
 from collections import Counter
 from collections.abc import Mapping
+from contextlib import suppress
 from dataclasses import dataclass, field
 from pathlib import Path
 
@@ -16,7 +17,7 @@ from ipsys_log.log.hashing import METADATA_NAME, metadata_of_hashes
 from ipsys_log.log.journal import replace_tail, roll_back
 from ipsys_log.log.load import load_contents
 from ipsys_log.log.lock import open_locked
-from ipsys_log.log.records import HEADER, MAGIC, ChunkRef, as_bytes
+from ipsys_log.log.records import HEADER, MAGIC, ChunkRef, as_bytes, walk
 from ipsys_log.log.salvage import Salvage, salvage
 from ipsys_log.log.storage import DISK, Storage, write_all
 from ipsys_log.log.summary import tail_bytes
@@ -142,6 +143,11 @@ def _rebuild(storage: Storage, view: View, found: Survey, notes: list[str]) -> R
     lost = Counter(saved.lost)
     bytes_lost = 0 if found.finished else max(0, size - start - saved.bytes_kept)
     bytes_lost += sum(record.length for record in found.damaged)
+    behind = _own_end(view, found)
+    if behind < size:
+        bytes_lost += size - behind
+        kept_in = _copy_lost(storage, view, behind)
+        notes.append(f"{size - behind} bytes behind its end, perhaps another log, were kept in {kept_in}")
     if not found.finished and size - start > _KEEP_BESIDE:
         notes.append(
             f"the {size - start} bytes from byte {start} on were kept in {_copy_lost(storage, view, start)}"
@@ -161,6 +167,16 @@ def _rebuild(storage: Storage, view: View, found: Survey, notes: list[str]) -> R
     return RepairReport(
         view.path, True, bytes_lost, sum(contents.counts.values()), contents.end_ns, lost, tuple(notes)
     )
+
+
+def _own_end(view: View, found: Survey) -> int:
+    """Where a finished log ends; what lies behind that is not its own."""
+    if found.finished:
+        with suppress(LogError):
+            for at in walk(view, found.end, view.size):
+                if at.opcode == Opcode.FOOTER:
+                    return min(at.offset + at.length + len(MAGIC), view.size)
+    return view.size
 
 
 def _indexes(found: Survey) -> list[bytes]:

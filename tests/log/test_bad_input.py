@@ -354,3 +354,16 @@ def test_a_chunk_index_with_wrong_times_is_repaired(tmp_path: Path) -> None:
     with LogReader(path) as reader:
         assert len(list(reader.messages(start_ns=100, end_ns=110))) == 10
     assert not repair(path).changed
+
+
+def test_a_second_log_behind_the_first_is_kept_beside_it(tmp_path: Path) -> None:
+    """As from ``cat a.mcap b.mcap``: it is not this log's, and it is not thrown away either."""
+    one = create(tmp_path / "a.mcap", [("/a", n, n, bytes(50)) for n in range(30)]).read_bytes()
+    other = create(tmp_path / "b.mcap", [("/b", n, n, bytes(50)) for n in range(20)]).read_bytes()
+    path = tmp_path / "joined.mcap"
+    path.write_bytes(one + other)
+    report = repair(path)
+    assert (report.messages_kept, report.bytes_lost) == (30, len(other))
+    assert "perhaps another log" in str(report)
+    assert (tmp_path / "joined.mcap.lost").read_bytes() == other
+    assert stock_rows(path) == stock_rows(tmp_path / "a.mcap")

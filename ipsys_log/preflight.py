@@ -13,7 +13,7 @@ from ipsys_log.offline.pairs import split, world_point
 from ipsys_log.request import Request
 from ipsys_log.rig import check_rig
 from ipsys_log.runs import newest_run
-from ipsys_log.tasks import STAGES, copied_run, fitted_in, held_out_ids, measured, rig_part
+from ipsys_log.tasks import STAGES, copied_run, fitted_in, held_out_ids, measured
 
 __all__ = ["check_inputs"]
 
@@ -86,10 +86,9 @@ def _check_overrides(session: Session, request: Request, cameras: set[str]) -> N
     known = ", ".join(sorted(cameras)) if cameras else "none whose markers are in the log"
     for name in sorted(set(request.lenses) - cameras):
         raise IpsysError(f"--calibration {name}: the log has no such camera (it has {known})")
-    part = rig_part("camera-frame")
     if request.rig is not None and not cameras:
         held = session.payloads(session.topics(Rig))
-        if any(part(rig)[0] != part(request.rig)[0] for rig in held):
+        if any(rig.marker_length_m != request.rig.marker_length_m for rig in held):
             raise IpsysError(
                 "--rig: another marker length cannot take effect, the log has camera points but no markers"
             )

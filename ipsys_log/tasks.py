@@ -42,7 +42,6 @@ __all__ = [
     "held_out_ids",
     "measured",
     "plan_stage",
-    "rig_part",
     "wanted_models",
 ]
 
@@ -128,7 +127,7 @@ def copied_run(session: Session, model: str) -> str | None:
     return None
 
 
-def rig_part(stage: str) -> Callable[[Rig], Any]:
+def _rig_part(stage: str) -> Callable[[Rig], Any]:
     """What a stage reads of the rig; an overriding rig that says the same there changes nothing."""
     return {
         "detect": lambda rig: (rig.dictionary, {m.id for m in rig.markers}),
@@ -139,7 +138,7 @@ def rig_part(stage: str) -> Callable[[Rig], Any]:
 
 def _rig(session: Session, request: Request, stage: str) -> tuple[Rig | None, list[str]]:
     """The overriding rig, if it matters to a stage, or the log's topics to read it from."""
-    part = rig_part(stage)
+    part = _rig_part(stage)
     held = session.payloads(session.topics(Rig))
     if request.rig is not None and not (held and all(part(rig) == part(request.rig) for rig in held)):
         return request.rig, []

@@ -19,14 +19,18 @@ for module in (setup, imports, derive, inspect, view):
     module.add_commands(app)
 
 
-@app.callback(invoke_without_command=True)
-def _version(
-    context: typer.Context, version: bool = typer.Option(False, "--version", help="Print the version.")
-) -> None:
-    if version:
+def _print_version(wanted: bool) -> None:
+    if wanted:
         from ipsys_log import __version__
 
         typer.echo(f"ipsys {__version__}")
         raise typer.Exit
-    if context.invoked_subcommand is None:
-        typer.echo(context.get_help())
+
+
+@app.callback()
+def _options(
+    version: bool = typer.Option(
+        False, "--version", callback=_print_version, is_eager=True, help="Print the version."
+    ),
+) -> None:
+    """Options of ``ipsys`` itself; the help is that of the application."""

@@ -61,7 +61,6 @@ class LogWriter:
         self._channels: dict[str, tuple[int, ChunkBuilder]] = {}
         self._hashes: dict[str, ChannelHash] = {}
         self._stored: dict[str, ChannelHash] = {}
-        self._appending = False
         self._open = True
 
     @classmethod
@@ -125,7 +124,7 @@ class LogWriter:
         crc = contents.data_crc or None
         output = Pending(storage, target, fd, contents.data_end, contents.data_end, crc)
         writer = cls(target, output, contents, SMALL_APPENDED)
-        writer._stored, writer._appending = stored, True
+        writer._stored = stored
         return writer
 
     def __enter__(self) -> Self:

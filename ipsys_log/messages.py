@@ -60,6 +60,7 @@ class RigMarker:
     id: int
     length_m: float | None = None
     robot: str | None = None
+    height_m: float | None = None
 
 
 @dataclass(frozen=True, slots=True)
@@ -91,6 +92,8 @@ class Rig:
     cameras: tuple[RigCamera, ...] = ()
     reference_points: tuple[ReferencePoint, ...] = ()
     floor: Floor | None = None
+    marker_height_m: float | None = None
+    tape_sigma_m: float | None = None
 
     def length_of(self, marker_id: int) -> float:
         """Side of a marker's black square, in m."""
@@ -98,6 +101,13 @@ class Rig:
             if marker.id == marker_id and marker.length_m is not None:
                 return marker.length_m
         return self.marker_length_m
+
+    def height_of(self, marker_id: int) -> float | None:
+        """Height above the floor at which a marker is carried, in m, where it is known."""
+        for marker in self.markers:
+            if marker.id == marker_id and marker.height_m is not None:
+                return marker.height_m
+        return self.marker_height_m
 
     def robot_of(self, marker_id: int) -> str:
         """Name of the robot that carries a marker."""
@@ -191,7 +201,7 @@ class CameraPoints:
 
 @dataclass(frozen=True, slots=True, eq=False)
 class Position:
-    """A marker in the world, as one camera has it."""
+    """A marker in the world, as one camera has it; ``inside`` the volume of the measured places or not."""
 
     id: int
     x_m: float
@@ -199,6 +209,7 @@ class Position:
     z_m: float
     heading_rad: float | None = None
     covariance_m2: Mat33 | None = None
+    inside: bool | None = None
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -219,6 +230,7 @@ class Track:
     heading_rad: float | None = None
     covariance_m2: Mat33 | None = None
     cameras: tuple[str, ...] = ()
+    inside: bool | None = None
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -299,6 +311,16 @@ class Pair:
     camera_m: Vec3
     world_m: Vec3
     frames: int
+    world_covariance_m2: Mat33 | None = None
+
+
+@dataclass(frozen=True, slots=True)
+class Noise:
+    """Standard deviations of a camera point: ``along`` the view per m of distance, ``across`` it in m
+    per m; both grow by 1 + u^2 + v^2 away from the middle of the image."""
+
+    along: float
+    across: float
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -307,6 +329,7 @@ class CameraModel:
     parameters: tuple[Parameter, ...]
     covariance_m2: Mat33 | None = None
     pairs: tuple[Pair, ...] = ()
+    noise: Noise | None = None
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -318,13 +341,18 @@ class Model:
 
 @dataclass(frozen=True, slots=True)
 class ErrorStatistics:
-    """Of a set of distances; ``std_m`` with count - 1, as in Tables I and II."""
+    """Of a set of distances; ``std_m`` with count - 1, as in Tables I and II. ``mean_low_m`` and
+    ``mean_high_m`` are the 95 % confidence interval of the mean."""
 
     count: int
     mean_m: float
     min_m: float
     max_m: float
     std_m: float | None = None
+    median_m: float | None = None
+    p95_m: float | None = None
+    mean_low_m: float | None = None
+    mean_high_m: float | None = None
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -336,13 +364,53 @@ class Residual:
 
 @dataclass(frozen=True, slots=True, eq=False)
 class CameraEvaluation:
-    """Errors of one camera against the ``tape`` or, in a simulated lab, the ``truth``."""
+    """Errors of one camera against the ``tape`` or, in a simulated lab, the ``truth``.
+
+    ``scheme`` is ``held_out`` (also where absent) or ``cross_validation``; the latter has a residual
+    for each place and repeat, repeat by repeat. ``within_68`` and ``within_95`` are the shares of them
+    within these regions of their covariance.
+    """
 
     camera: str
     against: str
     error_3d: ErrorStatistics
     error_2d: ErrorStatistics
     residuals: tuple[Residual, ...] = ()
+    scheme: str | None = None
+    bias_m: Vec3 | None = None
+    within_68: float | None = None
+    within_95: float | None = None
+
+
+@dataclass(frozen=True, slots=True)
+class LearningPoint:
+    """Mean errors of models fitted on ``pairs`` places: of the subset called ``label``, or of random ones."""
+
+    camera: str
+    pairs: int
+    mean_3d_m: float
+    mean_2d_m: float
+    subsets: int
+    label: str | None = None
+    std_3d_m: float | None = None
+    std_2d_m: float | None = None
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class Suspect:
+    """A measurement that disagrees with the model fitted without it, and what would explain it.
+
+    ``residual_m`` is predicted minus measured, the mean over ``cameras``; ``score`` its length in units
+    of the usual one; ``kind`` one of ``side``, ``swapped``, ``distance``, ``height``, or None.
+    """
+
+    measurement: str
+    cameras: tuple[str, ...]
+    residual_m: Vec3
+    score: float
+    kind: str | None = None
+    text: str | None = None
+    corrected_m: Vec3 | None = None
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -350,6 +418,8 @@ class Evaluation:
     timestamp: TimeNs
     model: str
     cameras: tuple[CameraEvaluation, ...]
+    learning: tuple[LearningPoint, ...] = ()
+    suspects: tuple[Suspect, ...] = ()
 
 
 # --- where a run comes from ---------------------------------------------------------------------

@@ -314,13 +314,18 @@ class Pair:
     world_covariance_m2: Mat33 | None = None
 
 
-@dataclass(frozen=True, slots=True)
+@dataclass(frozen=True, slots=True, eq=False)
 class Noise:
-    """Standard deviations of a camera point: ``along`` the view per m of distance, ``across`` it in m
-    per m; both grow by 1 + u^2 + v^2 away from the middle of the image."""
+    """What a position's covariance is made of, see :mod:`ipsys_log.models.uncertainty`.
+
+    ``along`` is the relative error of a depth, ``across`` that of (u, v), ``growth`` the power by which
+    they grow; ``fit`` the covariance of (u, v, ln Zc) that has the effect of the uncertainty of the fit.
+    """
 
     along: float
     across: float
+    growth: float
+    fit: Mat33
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -364,7 +369,7 @@ class Residual:
 
 @dataclass(frozen=True, slots=True, eq=False)
 class CameraEvaluation:
-    """Errors of one camera against the ``tape`` or, in a simulated lab, the ``truth``.
+    """Errors of one camera (``""``: of all) against the ``tape`` or, in a simulated lab, the ``truth``.
 
     ``scheme`` is ``held_out`` (also where absent) or ``cross_validation``; the latter has a residual
     for each place and repeat, repeat by repeat. ``within_68`` and ``within_95`` are the shares of them
@@ -373,7 +378,7 @@ class CameraEvaluation:
 
     camera: str
     against: str
-    error_3d: ErrorStatistics
+    error_3d: ErrorStatistics | None
     error_2d: ErrorStatistics
     residuals: tuple[Residual, ...] = ()
     scheme: str | None = None

@@ -191,7 +191,10 @@ def _make(task: Task, session: Session, name: str, progress: Progress) -> Iterat
     """The messages of a task's run: its causal stage over the log, or one computed from all of it."""
     if task.step is None:
         assert task.compute is not None
-        payload, (log_time_ns, _) = task.compute(session), session.last(task.topics)
+        payload, (log_time_ns, _) = (
+            task.compute(session, partial(progress, task.stage)),
+            session.last(task.topics),
+        )
         yield Message(TOPICS[type(payload)].format(run=name), log_time_ns, payload.timestamp, payload)
         return
     stage = Stage(name, task.reads, task.step(name), task.per_camera)

@@ -8,12 +8,13 @@ from pathlib import Path
 from ipsys_log.errors import FitError, IpsysError
 from ipsys_log.log.session import Session, camera_of_topic
 from ipsys_log.messages import CameraPoints, Markers, Rig
-from ipsys_log.models import min_pairs
-from ipsys_log.offline.pairs import split, world_point
+from ipsys_log.models import min_pairs, reads_height
+from ipsys_log.offline.pairs import split
+from ipsys_log.offline.tape import world_point
 from ipsys_log.request import Request
 from ipsys_log.rig import check_rig
 from ipsys_log.runs import newest_run
-from ipsys_log.tasks import STAGES, copied_run, fitted_in, held_out_ids, measured
+from ipsys_log.tasks import STAGES, can_evaluate, copied_run, fitted_in, measured
 
 __all__ = ["check_inputs"]
 
@@ -36,10 +37,12 @@ def check_inputs(paths: Sequence[Path], request: Request, models: Sequence[str],
             _check_lenses(session, request, cameras)
         if "fit" in wanted and request.model_from is None:
             _check_measurements(session, request, models)
+        if "locate" in wanted:
+            _check_heights(session, request, models)
         if "locate" in wanted and request.model_from is not None:
             _check_model(session, request, models, cameras)
         if until == "evaluate":
-            _check_held_out(session, request)
+            _check_evaluation(session, request, models)
 
 
 def _check_request(paths: Sequence[Path], request: Request, models: Sequence[str]) -> None:
@@ -147,10 +150,23 @@ def _check_model(session: Session, request: Request, models: Sequence[str], came
                 )
 
 
-def _check_held_out(session: Session, request: Request) -> None:
-    places = measured(session, request.rig)
-    if not held_out_ids([place.measurement for place in places], request):
+def _check_heights(session: Session, request: Request, models: Sequence[str]) -> None:
+    """A model that reads the height of a marker needs one for each that may be seen."""
+    rigs = [request.rig] if request.rig is not None else session.payloads(session.topics(Rig))
+    for name in models:
+        for rig in rigs:
+            missing = [m.id for m in rig.markers if rig.height_of(m.id) is None]
+            if reads_height(name) and (missing or (not rig.markers and rig.marker_height_m is None)):
+                which = f"marker {missing[0]} is" if missing else "the markers are"
+                raise IpsysError(
+                    f"{session}: {name} needs the height at which {which} carried: write marker_height_m "
+                    "into lab.toml ('ipsys init lab.toml --from LOG' writes the log's) and give it with --rig"
+                )
+
+
+def _check_evaluation(session: Session, request: Request, models: Sequence[str]) -> None:
+    if not any(can_evaluate(session, request, model) for model in models):
         raise IpsysError(
-            f"{session}: no measured place is held out to evaluate on (of {len(places)}); label some "
-            "'test', or measure at least five without labels, of which a fifth is then held out"
+            f"{session}: no measured place is held out to evaluate on, and there are too few (of "
+            f"{len(measured(session, request.rig))}) to take turns; label some 'test', or measure more"
         )

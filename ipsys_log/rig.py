@@ -19,6 +19,9 @@ __all__ = ["check_name", "check_rig", "example_toml", "load_rig", "rig_toml"]
 
 Item = TypeVar("Item")
 
+# Markers are carried below the cameras; what is greater was meant in cm.
+_HIGHEST_M = 5.0
+
 _NAME = re.compile(r"[a-z][a-z0-9_]*")
 _ITEMS = {"markers": RigMarker, "cameras": RigCamera, "reference_points": ReferencePoint}
 
@@ -105,8 +108,8 @@ def check_rig(rig: Rig, where: str) -> Rig:
     Raises
     ------
     IpsysError
-        For two cameras, markers or reference points of one name, a bad name, or a length that is
-        not positive.
+        For two cameras, markers or reference points of one name, two reference points at one place, a
+        bad name, a length or sigma that is not positive, or a height that no robot has.
     """
     for camera in rig.cameras:
         check_name(camera.name, f"{where}: camera name")
@@ -123,7 +126,34 @@ def check_rig(rig: Rig, where: str) -> Rig:
     for length in lengths:
         if not (math.isfinite(length) and length > 0):
             raise IpsysError(f"{where}: {length} m is not a length; marker and floor sizes must be above 0")
+    _check_tape(rig, where)
+    _check_heights(rig, where)
     return rig
+
+
+def _check_tape(rig: Rig, where: str) -> None:
+    for point in rig.reference_points:
+        if not (math.isfinite(point.x_m) and math.isfinite(point.y_m)):
+            raise IpsysError(
+                f"{where}: reference point {point.name!r} has the coordinates {point.x_m} and {point.y_m}; "
+                "give numbers in m"
+            )
+    # To the millimetre: nearer together than that two of them are one, written down twice.
+    at_m = ((round(point.x_m, 3), round(point.y_m, 3)) for point in rig.reference_points)
+    _check_unique(at_m, f"{where}: two reference points are at")
+    sigma_m = rig.tape_sigma_m
+    if sigma_m is not None and not (math.isfinite(sigma_m) and sigma_m > 0):
+        raise IpsysError(f"{where}: tape_sigma_m = {sigma_m} m is no standard deviation; it must be above 0")
+
+
+def _check_heights(rig: Rig, where: str) -> None:
+    heights = {"marker_height_m": rig.marker_height_m}
+    heights |= {f"height_m of marker {marker.id}": marker.height_m for marker in rig.markers}
+    for what, height_m in heights.items():
+        if height_m is not None and not 0 <= height_m <= _HIGHEST_M:
+            raise IpsysError(
+                f"{where}: {what} is {height_m} m; give the height above the floor in m, 0 to {_HIGHEST_M:g}"
+            )
 
 
 def _check_unique(names: Iterable[object], what: str) -> None:

@@ -26,10 +26,13 @@ from ipsys_log.messages import (
     Rig,
     Tracks,
 )
-from ipsys_log.models import MODELS, create
-from ipsys_log.offline.evaluate import evaluate_model, gather_tracks, true_points
-from ipsys_log.offline.fit import fit_model
+from ipsys_log.models import MODELS, create, min_pairs, reads_height
+from ipsys_log.offline.crossval import FOLDS
+from ipsys_log.offline.evaluate import Study, evaluate_model
+from ipsys_log.offline.fit import fit_model, level_cameras
+from ipsys_log.offline.learning import labelled_subsets
 from ipsys_log.offline.pairs import Measured, build_pairs, gather_sightings, measured_in_order, split
+from ipsys_log.offline.truth import gather_tracks, true_points
 from ipsys_log.request import Request
 from ipsys_log.runs import complete_runs, newest_run, read_channels
 from ipsys_log.stages import camera_frame, detect, fuse, locate
@@ -37,6 +40,7 @@ from ipsys_log.stages import camera_frame, detect, fuse, locate
 __all__ = [
     "STAGES",
     "Task",
+    "can_evaluate",
     "copied_run",
     "fitted_in",
     "held_out_ids",
@@ -57,7 +61,8 @@ class Task:
     writes : the payloads that it makes, first the one that it is there for.
     reads, step, per_camera : a causal stage: its payloads, its step for a run of a given name, and whether
         the step takes each camera by itself; or
-    compute : the payload that is computed from the whole log; what to know of it goes to ``notes``.
+    compute : the payload that is computed from the whole log, saying how far it is; what to know of it goes
+        to ``notes``.
     parameters : what else its result depends on; ``input_runs`` those of ``foreign``.
     rig, lenses : set where they replace what the log holds.
     """
@@ -69,7 +74,7 @@ class Task:
     reads: tuple[type, ...] = ()
     step: Callable[[str], Callable[[Message], Iterable[Any]]] | None = None
     per_camera: bool = True
-    compute: Callable[[Session], Any] | None = None
+    compute: Callable[[Session, Callable[[int, int], None]], Any] | None = None
     parameters: Mapping[str, str] = field(default_factory=dict)
     rig: Rig | None = None
     lenses: Mapping[str, CameraCalibration] = field(default_factory=dict)
@@ -132,6 +137,7 @@ def _rig_part(stage: str) -> Callable[[Rig], Any]:
     return {
         "detect": lambda rig: (rig.dictionary, {m.id for m in rig.markers}),
         "camera-frame": lambda rig: (rig.marker_length_m, {(m.id, rig.length_of(m.id)) for m in rig.markers}),
+        "locate": lambda rig: (rig.marker_height_m, {(m.id, m.height_m) for m in rig.markers}),
         "fuse": lambda rig: {(m.id, m.robot) for m in rig.markers},
     }.get(stage, lambda rig: (rig.reference_points, {m.id for m in rig.markers}))
 
@@ -203,12 +209,17 @@ def _fit(session: Session, request: Request, points: str, model: str) -> Task | 
     topics += [*session.topics(CameraPoints, points), *session.topics(Measurement)]
     notes: list[str] = []
 
-    def compute(log: Session) -> Model:
+    def compute(log: Session, progress: Callable[[int, int], None]) -> Model:
         places = measured(log, rig)
         train, _ = split([place.measurement for place in places], request.train, request.seed)
         pairs = _pairs(log, points, places, train)
-        fitted = fit_model(model, pairs, log.last(topics)[1])
+        fitted = fit_model(model, pairs, log.last(topics)[1], progress)
         notes.extend(_unused(pairs, train))
+        notes.extend(
+            f"camera {camera}: all measured places are {height_m:.3f} m high, so heights cannot be learned: "
+            "its model is good in x and y, and says that height"
+            for camera, height_m in level_cameras(fitted).items()
+        )
         return fitted
 
     parameters = {"model": model, **_split_parameters(session, request)}
@@ -227,7 +238,7 @@ def _copy_model(request: Request, name: str, base: str) -> Task:
         base,
         (),
         (Model,),
-        compute=lambda log: model,
+        compute=lambda log, progress: model,
         parameters={"model": name},
         foreign=foreign,
         input_runs=(f"{request.model_from.name}:{topic.split('/')[2]}",),
@@ -235,29 +246,48 @@ def _copy_model(request: Request, name: str, base: str) -> Task:
 
 
 def _evaluate(session: Session, request: Request, points: str, model: str) -> Task | str:
-    if not held_out_ids([place.measurement for place in measured(session, request.rig)], request):
+    name = session.payloads(session.topics(Model, model))[-1].name
+    if not can_evaluate(session, request, name):
         return ""
+    again = _fits_again(session, request, name)
     rig, topics = _rig(session, request, "evaluate")
     topics += [*session.topics(CameraPoints, points), *session.topics(Model, model)]
     topics += [*session.topics(Measurement), *session.topics(Tracks)]
+    notes: list[str] = []
 
-    def compute(log: Session) -> Evaluation:
+    def compute(log: Session, progress: Callable[[int, int], None]) -> Evaluation:
         fitted: Model = log.payloads(log.topics(Model, model))[-1]
         places = measured(log, rig)
-        held_out = held_out_ids([place.measurement for place in places], request)
-        truth = true_points(places, gather_tracks(log.messages(log.topics(Tracks))))
-        return evaluate_model(fitted, _pairs(log, points, places, held_out), truth, log.last(topics)[1])
+        measurements = [place.measurement for place in places]
+        study = Study(
+            places,
+            _pairs(log, points, places, {m.id for m in measurements}),
+            held_out_ids(measurements, request),
+            labelled_subsets(measurements),
+            true_points(places, gather_tracks(log.messages(log.topics(Tracks)))),
+            request.seed if again else None,
+        )
+        return evaluate_model(fitted, study, log.last(topics)[1], notes, progress)
 
-    parameters = _split_parameters(session, request) if request.model_from is None else {}
+    parameters = {**_split_parameters(session, request), "seed": str(request.seed)} if again else {}
     return Task(
-        "evaluate", model, tuple(topics), (Evaluation,), compute=compute, parameters=parameters, rig=rig
+        "evaluate",
+        model,
+        tuple(topics),
+        (Evaluation,),
+        compute=compute,
+        parameters=parameters,
+        rig=rig,
+        notes=notes,
     )
 
 
-def _locate(session: Session, _request: Request, points: str, model: str) -> Task | str:
-    topics = (*session.topics(CameraPoints, points), *session.topics(Model, model))
+def _locate(session: Session, request: Request, points: str, model: str) -> Task | str:
     fitted: Model = session.payloads(session.topics(Model, model))[-1]
-    return Task("locate", model, topics, (Positions,), locate.READS, lambda run: locate.Locate(fitted))
+    rig, topics = _rig(session, request, "locate") if reads_height(fitted.name) else (None, [])
+    topics += [*session.topics(CameraPoints, points), *session.topics(Model, model)]
+    writes, step = (Positions,), lambda run: locate.Locate(fitted)
+    return Task("locate", model, tuple(topics), writes, locate.READS, step, rig=rig)
 
 
 def _fuse(session: Session, request: Request, positions: str) -> Task | str:
@@ -292,6 +322,19 @@ def held_out_ids(measurements: Iterable[Measurement], request: Request) -> set[s
     # A model of another log has seen none of these places, unless it was made of them: see evaluate_model.
     labelled = any(m.splits for m in measurements)
     return {m.id for m in measurements if "test" in m.splits or not labelled}
+
+
+def can_evaluate(session: Session, request: Request, model: str) -> bool:
+    """Whether there are places that a model is not fitted on, or enough of them for cross-validation."""
+    measurements = [place.measurement for place in measured(session, request.rig)]
+    enough = len(measurements) - -(-len(measurements) // FOLDS) >= min_pairs(model)
+    held_out = held_out_ids(measurements, request)
+    return bool(held_out) or (_fits_again(session, request, model) and enough)
+
+
+def _fits_again(session: Session, request: Request, model: str) -> bool:
+    """Whether a model is fitted to this log's places, so that it can be fitted to fewer of them."""
+    return request.model_from is None and copied_run(session, model) is None
 
 
 def _split_parameters(session: Session, request: Request) -> dict[str, str]:

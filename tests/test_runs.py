@@ -119,12 +119,16 @@ def test_one_name_for_several_models_is_refused_before_anything_is_made(ipsys: I
     before = paper.read_bytes()
     done = ipsys("evaluate", paper, "--run", "x")
     assert done.code == 1
-    assert "3 models are asked for" in done.err
+    assert "models are asked for" in done.err
     assert paper.read_bytes() == before
 
 
-def test_a_seed_that_changes_nothing_makes_no_run(ipsys: Ipsys, paper: Path) -> None:
+def test_a_seed_changes_the_folds_and_nothing_else_where_places_are_labelled(
+    ipsys: Ipsys, paper: Path
+) -> None:
     ipsys("replay", paper)
+    made = runs_of(ipsys, "replay", paper, "--seed", 5)
+    assert {stage for stage, (_, new) in made.items() if new} == {"evaluate"}
     assert all(not new for _, new in runs_of(ipsys, "replay", paper, "--seed", 5).values())
 
 

@@ -138,7 +138,7 @@ def _derive(
 ) -> None:
     from ipsys_log.log.session import Session
     from ipsys_log.pipeline import replay
-    from ipsys_log.report.accuracy import accuracy_json, accuracy_table, read_accuracy
+    from ipsys_log.report.accuracy import accuracy_json, accuracy_tables, read_accuracy
 
     with progress_bar() as progress:
         outcomes = replay(logs, request, until, output, progress)
@@ -155,7 +155,8 @@ def _derive(
         stages = [{"stage": o.stage, "run": o.run, "new": o.fresh, "messages": o.messages} for o in outcomes]
         print(json.dumps({**accuracy_json(accuracies), "stages": stages}, indent=2, allow_nan=False))  # noqa: T201
     elif accuracies:
-        console.print(accuracy_table(accuracies))
+        for table in accuracy_tables(accuracies):
+            console.print(table)
     if plot is not None:
         remarks.print(f"{plot} drawn")
 

@@ -12,17 +12,33 @@ import numpy as np
 from numpy.typing import NDArray
 from sklearn.pipeline import Pipeline
 
-from ipsys_log.errors import IpsysError
+from ipsys_log.errors import FitError, IpsysError
 from ipsys_log.models.poly import PolynomialRegression
+from ipsys_log.models.raydepth import RayDepth
+from ipsys_log.models.rayplane import RayPlane
+from ipsys_log.models.rays import Places, tied
 from ipsys_log.models.rigid import RigidTransform
 
-__all__ = ["MODELS", "create", "min_pairs", "parameters", "restore"]
+__all__ = [
+    "MODELS",
+    "Places",
+    "create",
+    "fit_cameras",
+    "inputs",
+    "min_pairs",
+    "parameters",
+    "reads_height",
+    "restore",
+    "tied_cameras",
+]
 
 # The paper's names are RT, PR and RT+PR; the hybrid feeds the first one's output to the second.
 MODELS: dict[str, Callable[[], Any]] = {
     "rigid": RigidTransform,
     "poly": PolynomialRegression,
     "rigid+poly": lambda: Pipeline([("rigid", RigidTransform()), ("poly", PolynomialRegression())]),
+    "rayplane": RayPlane,
+    "best": RayDepth,
 }
 
 
@@ -42,6 +58,45 @@ def create(name: str) -> Any:
 def min_pairs(name: str) -> int:
     """How many measured places a model needs at least."""
     return max(int(step.min_pairs) for _, step in _steps(create(name)))
+
+
+def reads_height(name: str) -> bool:
+    """Whether a model needs the height at which a marker is carried."""
+    return any(getattr(step, "reads_height", False) for _, step in _steps(create(name)))
+
+
+def inputs(name: str, points_m: NDArray[np.float64], heights_m: NDArray[np.float64]) -> NDArray[np.float64]:
+    """What a model predicts from: camera points (n, 3), and heights (n,) where it needs them."""
+    return np.column_stack([points_m, heights_m]) if reads_height(name) else points_m
+
+
+def fit_cameras(name: str, cameras: Mapping[str, Places]) -> dict[str, Any]:
+    """A fitted estimator for each camera, from the places that it saw.
+
+    Physical models are fitted to all cameras at once: places that two of them saw tie them together.
+
+    Raises
+    ------
+    FitError
+        Where the places do not determine a model, naming the camera.
+    """
+    models = {camera: create(name) for camera in cameras}
+    if (fit_jointly := getattr(MODELS[name], "fit_jointly", None)) is not None:
+        return dict(zip(models, fit_jointly([*models.values()], [*cameras.values()]), strict=True))
+    for camera, places in cameras.items():
+        try:
+            models[camera].fit(inputs(name, places.points_m, places.world_m[:, 2]), places.world_m)
+        except FitError as error:
+            raise FitError(f"camera {camera}: {error}") from error
+    return models
+
+
+def tied_cameras(name: str, cameras: Mapping[str, Places]) -> list[list[str]]:
+    """The cameras by groups whose models depend on one another's places."""
+    names = list(cameras)
+    if not hasattr(MODELS[name], "fit_jointly"):
+        return [[camera] for camera in names]
+    return [[names[i] for i in group] for group in tied(list(cameras.values()))]
 
 
 def parameters(estimator: Any) -> dict[str, NDArray[np.float64]]:
@@ -73,7 +128,7 @@ def restore(name: str, arrays: Mapping[str, NDArray[np.float64]]) -> Any:
     """
     estimator = create(name)
     for prefix, step in _steps(estimator):
-        step.n_features_in_ = 3
+        step.n_features_in_ = 4 if getattr(step, "reads_height", False) else 3
         for attribute in step.fitted:
             key = prefix + attribute.rstrip("_")
             if key not in arrays:

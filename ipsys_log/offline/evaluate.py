@@ -1,161 +1,109 @@
-"""How far a model is off on places that it was not fitted on (eq. 26, 27)."""
+"""What a lab wants to know of a model: how good it is, from how many places, and which of them are wrong."""
 
 from __future__ import annotations
 
-from collections.abc import Iterable, Mapping, Sequence
+from collections.abc import Callable, Mapping, Sequence
+from dataclasses import dataclass
+from functools import partial
 
 import numpy as np
 from numpy.typing import NDArray
 
-from ipsys_log.messages import (
-    CameraEvaluation,
-    ErrorStatistics,
-    Evaluation,
-    Message,
-    Model,
-    Pair,
-    Residual,
-    Tracks,
-)
-from ipsys_log.models import restore
-from ipsys_log.offline.pairs import Measured, Sightings, still_interval
+from ipsys_log.errors import FitError
+from ipsys_log.messages import Evaluation, LearningPoint, Model, Pair, Suspect
+from ipsys_log.models import Places, min_pairs
+from ipsys_log.offline.crossval import FOLDS, gather_places, leave_one_out
+from ipsys_log.offline.errors import errors_cross_validated, errors_held_out
+from ipsys_log.offline.learning import learning_curve, learning_sizes, published_curve
+from ipsys_log.offline.pairs import Measured
+from ipsys_log.offline.suspects import find_suspects
 
-__all__ = ["error_statistics", "evaluate_model", "gather_tracks", "track_errors", "true_points"]
+__all__ = ["SCREENING", "Study", "evaluate_model"]
+
+# The models that measurements are checked with: of those that fit in milliseconds the ones that follow
+# the places closely enough to see an error of some centimetres.
+SCREENING = ("poly", "rayplane", "best")
 
 
-def error_statistics(errors_m: NDArray[np.float64]) -> ErrorStatistics:
-    """Mean, lower bound, upper bound and standard deviation of distances.
+@dataclass(frozen=True, slots=True, eq=False)
+class Study:
+    """What there is to evaluate on.
 
-    Parameters
+    Attributes
     ----------
-    errors_m : (n,), n > 0, in m.
-
-    References
-    ----------
-    Ou et al., Robotica 2023, Tables I and II; the standard deviation there has n - 1.
-
-    Examples
-    --------
-    >>> error_statistics(np.array([0.01, 0.03])).mean_m
-    0.02
+    places : the measurements that count.
+    pairs : all of them that were seen, by camera.
+    held_out : ids of those that were held out.
+    subsets : ids by the label of a published subset to be fitted on.
+    truth : true world points (3,) in m by id; empty outside a simulated lab.
+    seed : of folds and random subsets; None for a model of another log, which is not fitted again.
     """
-    count = len(errors_m)
-    std_m = float(errors_m.std(ddof=1)) if count > 1 else None
-    return ErrorStatistics(count, float(errors_m.mean()), float(errors_m.min()), float(errors_m.max()), std_m)
+
+    places: Sequence[Measured]
+    pairs: Mapping[str, Sequence[Pair]]
+    held_out: set[str]
+    subsets: Mapping[str, set[str]]
+    truth: Mapping[str, NDArray[np.float64]]
+    seed: int | None
 
 
 def evaluate_model(
-    model: Model,
-    held_out: Mapping[str, Sequence[Pair]],
-    truth: Mapping[str, NDArray[np.float64]],
-    time_ns: int,
+    model: Model, study: Study, time_ns: int, notes: list[str], progress: Callable[[int, int], None]
 ) -> Evaluation:
-    """Errors of a model on held-out places, against the tape and, where there is one, the truth.
+    """Errors on places held out and by cross-validation, learning curve and suspect measurements.
 
     Parameters
     ----------
     model : fitted.
-    held_out : measured places by camera; those that the model was fitted on after all do not count.
-    truth : true world points (3,) in m by id of the measurement; empty outside a simulated lab.
     time_ns : of the last input.
-
-    Returns
-    -------
-    Evaluation : with a row for each camera that has held-out places.
+    notes : what could not be done is added to it.
+    progress : called with the steps done, and all there are.
     """
-    rows = []
-    for camera in model.cameras:
-        used = {pair.measurement: pair.world_m for pair in camera.pairs}
-        pairs = [
-            pair
-            for pair in held_out.get(camera.camera, ())
-            if not np.array_equal(used.get(pair.measurement, ()), pair.world_m)
-        ]
-        if not pairs:
-            continue
-        estimator = restore(model.name, {p.name: p.values.reshape(p.shape) for p in camera.parameters})
-        predicted_m = estimator.predict(np.array([pair.camera_m for pair in pairs]))
-        tape = {pair.measurement: pair.world_m for pair in pairs}
-        for against, known in (("tape", tape), ("truth", truth)):
-            row = _compare(camera.camera, against, pairs, predicted_m, known)
-            if row is not None:
-                rows.append(row)
-    return Evaluation(time_ns, model.name, tuple(rows))
-
-
-def _compare(
-    camera: str,
-    against: str,
-    pairs: Sequence[Pair],
-    predicted_m: NDArray[np.float64],
-    known: Mapping[str, NDArray[np.float64]],
-) -> CameraEvaluation | None:
-    residuals = tuple(
-        Residual(pair.measurement, known[pair.measurement], predicted)
-        for pair, predicted in zip(pairs, predicted_m, strict=True)
-        if pair.measurement in known
-    )
-    if not residuals:
-        return None
-    offsets = np.array([r.predicted_m - r.world_m for r in residuals])
-    error_3d = error_statistics(np.linalg.norm(offsets, axis=1))  # eq. (26)
-    error_2d = error_statistics(np.linalg.norm(offsets[:, :2], axis=1))  # eq. (27)
-    return CameraEvaluation(camera, against, error_3d, error_2d, residuals)
-
-
-def gather_tracks(messages: Iterable[Message]) -> dict[int, Sightings]:
-    """Positions of tracks by marker, in the order of time and, at one time, of the log."""
-    rows: dict[int, list[tuple[int, float, float, float]]] = {}
-    for message in messages:
-        if isinstance(message.payload, Tracks):
-            for track in message.payload.tracks:
-                row = (message.publish_time_ns, track.x_m, track.y_m, track.z_m)
-                rows.setdefault(track.id, []).append(row)
-    for values in rows.values():
-        values.sort(key=lambda row: row[0])
-    return {
-        marker_id: Sightings(
-            np.array([row[0] for row in values], dtype=np.int64),
-            np.array([row[1:] for row in values], dtype=np.float64),
-        )
-        for marker_id, values in rows.items()
+    held_out = {
+        camera: [pair for pair in found if pair.measurement in study.held_out]
+        for camera, found in study.pairs.items()
     }
+    rows = errors_held_out(model, held_out, study.truth)
+    learning: list[LearningPoint] = []
+    suspects: tuple[Suspect, ...] = ()
+    if study.seed is not None:
+        fitted = {camera.camera for camera in model.cameras}
+        pairs = {camera: found for camera, found in study.pairs.items() if camera in fitted}
+        cameras = gather_places(pairs)
+        sizes = learning_sizes(model.name, cameras)
+        total = 2 + len(sizes)
+        progress(0, total)
+        if _enough(model.name, pairs, notes):
+            try:
+                rows += errors_cross_validated(model, pairs, study.truth, study.seed)
+            except FitError as error:
+                notes.append(f"no cross-validation: {error}")
+        progress(1, total)
+        learning = published_curve(model.name, cameras, study.subsets, study.held_out)
+        for done, points in enumerate(learning_curve(model.name, cameras, study.seed), 2):
+            learning += points
+            progress(done, total)
+        suspects = _suspects(model.name, cameras, study.places)
+        progress(total, total)
+    return Evaluation(time_ns, model.name, tuple(rows), tuple(learning), suspects)
 
 
-def true_points(places: Iterable[Measured], truth: Mapping[int, Sightings]) -> dict[str, NDArray[np.float64]]:
-    """Where each measured marker truly was, (3,) in m by id; only where the truth of that time is known."""
-    points = {}
-    for place in places:
-        measurement = place.measurement
-        known = truth.get(measurement.marker_id if measurement.marker_id is not None else -1)
-        if known is not None and (interval := still_interval(known, measurement.timestamp)) is not None:
-            within = (known.times_ns >= interval[0]) & (known.times_ns <= interval[1])
-            points[measurement.id] = known.points_m[within].mean(axis=0)
-    return points
+def _enough(name: str, pairs: Mapping[str, Sequence[Pair]], notes: list[str]) -> bool:
+    """Whether each fold leaves enough places to fit to."""
+    for camera, found in pairs.items():
+        if len(found) - -(-len(found) // FOLDS) < min_pairs(name):
+            notes.append(f"no cross-validation of {name}: camera {camera} has only {len(found)} places")
+            return False
+    return True
 
 
-def track_errors(
-    tracks: Mapping[int, Sightings], truth: Mapping[int, Sightings]
-) -> tuple[ErrorStatistics, ErrorStatistics] | None:
-    """Errors of tracks against the truth at the same instants, in space and on the floor.
-
-    Returns
-    -------
-    None where no instant of a track has a truth.
-    """
-    offsets = []
-    for marker_id, track in tracks.items():
-        known = truth.get(marker_id)
-        if known is None:
-            continue
-        # The last of the poses of one instant rests on all cameras.
-        times_ns, last = np.unique(track.times_ns[::-1], return_index=True)
-        common, here, there = np.intersect1d(times_ns, known.times_ns, return_indices=True)
-        if len(common):
-            offsets.append(track.points_m[::-1][last][here] - known.points_m[there])
-    if not offsets:
-        return None
-    rows = np.vstack(offsets)
-    return error_statistics(np.linalg.norm(rows, axis=1)), error_statistics(
-        np.linalg.norm(rows[:, :2], axis=1)
-    )
+def _suspects(name: str, cameras: Mapping[str, Places], places: Sequence[Measured]) -> tuple[Suspect, ...]:
+    if name not in SCREENING or any(len(p.names) <= min_pairs(name) + 1 for p in cameras.values()):
+        return ()
+    seen = {place for found in cameras.values() for place in found.names}
+    try:
+        return find_suspects(
+            partial(leave_one_out, name, cameras), [p for p in places if p.measurement.id in seen]
+        )
+    except FitError:
+        return ()

@@ -2,16 +2,20 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping, Sequence
+from collections.abc import Callable, Mapping, Sequence
 
 import numpy as np
 from numpy.typing import NDArray
 
 from ipsys_log.errors import FitError
-from ipsys_log.messages import CameraModel, Model, Pair, Parameter
-from ipsys_log.models import create, min_pairs, parameters
+from ipsys_log.messages import CameraModel, Model, Noise, Pair, Parameter
+from ipsys_log.models import Places, fit_cameras, inputs, min_pairs, parameters
+from ipsys_log.models.uncertainty import Uncertainty, estimate_uncertainty
+from ipsys_log.offline.crossval import deal, gather_places, predict_without
 
-__all__ = ["fit_model"]
+__all__ = ["fit_model", "level_cameras"]
+
+Array = NDArray[np.float64]
 
 # No hand-held tape is better than this; it keeps the covariance of a flat data set invertible.
 _FLOOR_SIGMA_M = 0.001
@@ -19,9 +23,18 @@ _FLOOR_SIGMA_M = 0.001
 # Nearer together than this two places are one; nearer to a line than this (RMS) they lie on it.
 _SAME_PLACE_M = 0.01
 _BESIDE_LINE_M = 0.03
+# Heights that differ by less are one: what a ruler and uneven boards give.
+_ONE_HEIGHT_M = 0.005
+# Groups of places that the uncertainty is found with, by leaving out one after the other.
+_GROUPS = 20
 
 
-def fit_model(name: str, pairs: Mapping[str, Sequence[Pair]], time_ns: int) -> Model:
+def fit_model(
+    name: str,
+    pairs: Mapping[str, Sequence[Pair]],
+    time_ns: int,
+    progress: Callable[[int, int], None] = lambda done, total: None,
+) -> Model:
     """Fit the model called ``name`` for each camera that has pairs.
 
     Parameters
@@ -29,44 +42,62 @@ def fit_model(name: str, pairs: Mapping[str, Sequence[Pair]], time_ns: int) -> M
     name : of the table of models, such as ``poly``.
     pairs : measured places by camera; a camera without any is left out.
     time_ns : of the last input.
+    progress : called with the fits done, and all there are.
 
     Returns
     -------
-    Model : with each camera's parameters, pairs, and the covariance of its leave-one-out errors.
+    Model : with each camera's parameters, pairs, the covariance of its left-out errors, and what the
+        covariance of a position is made of; these two only where there are more pairs than needed.
 
     Raises
     ------
     FitError
         Where a camera has fewer pairs than the model needs, or none has any.
     """
-    fitted = tuple(_fit_camera(name, camera, list(p)) for camera, p in sorted(pairs.items()) if p)
-    if not fitted:
+    cameras = gather_places(pairs)
+    if not cameras:
         raise FitError(
             "no camera saw any of the measured places to fit on; measure places in the cameras' view"
         )
-    return Model(time_ns, name, fitted)
+    for camera, places in cameras.items():
+        _check_count(name, camera, places)
+        _check_spread(name, camera, places.world_m)
+        _check_twins(camera, places)
+    models = fit_cameras(name, cameras)
+    without = _predict_without_groups(name, cameras, progress)
+    fitted = []
+    for camera, places in cameras.items():
+        arrays = parameters(models[camera])
+        stored = tuple(
+            Parameter(key, array.shape, array.reshape(-1)) for key, array in sorted(arrays.items())
+        )
+        covariance, noise = None, None
+        if without is not None:
+            residuals, groups = _left_out(places, without[0], without[1][camera])
+            covariance = residuals.T @ residuals / len(residuals) + _FLOOR_SIGMA_M**2 * np.eye(3)
+            tape_m2 = np.array([_tape(pair) for pair in pairs[camera]])
+            noise = _noise(name, models[camera], places, tape_m2, without[1][camera], groups)
+        fitted.append(CameraModel(camera, stored, covariance, tuple(pairs[camera]), noise))
+    return Model(time_ns, name, tuple(fitted))
 
 
-def _fit_camera(name: str, camera: str, pairs: list[Pair]) -> CameraModel:
+def level_cameras(model: Model) -> dict[str, float]:
+    """The cameras whose places all have one height, with that height in m: it cannot be learned there."""
+    heights = {c.camera: np.array([pair.world_m[2] for pair in c.pairs]) for c in model.cameras}
+    return {name: float(h.mean()) for name, h in heights.items() if np.ptp(h) < _ONE_HEIGHT_M}
+
+
+def _check_count(name: str, camera: str, places: Places) -> None:
     needed = min_pairs(name)
-    if len(pairs) < needed:
+    if len(places.names) < needed:
         other = "" if name == "rigid" else ", or use --model rigid, which needs 3"
         raise FitError(
-            f"camera {camera}: {name} needs at least {needed} measured places, found {len(pairs)}; "
+            f"camera {camera}: {name} needs at least {needed} measured places, found {len(places.names)}; "
             f"measure more{other}"
         )
-    points = np.array([pair.camera_m for pair in pairs])
-    targets = np.array([pair.world_m for pair in pairs])
-    _check_spread(name, camera, targets)
-    try:
-        arrays = parameters(create(name).fit(points, targets))
-    except FitError as error:
-        raise FitError(f"camera {camera}: {error}") from error
-    stored = tuple(Parameter(key, array.shape, array.reshape(-1)) for key, array in sorted(arrays.items()))
-    return CameraModel(camera, stored, _covariance(name, points, targets), tuple(pairs))
 
 
-def _check_spread(name: str, camera: str, targets: NDArray[np.float64]) -> None:
+def _check_spread(name: str, camera: str, targets: Array) -> None:
     """Places that differ by no more than the tape's error say nothing new."""
     different = len(np.unique(np.round(targets / _SAME_PLACE_M), axis=0))
     if different < min_pairs(name):
@@ -81,20 +112,58 @@ def _check_spread(name: str, camera: str, targets: NDArray[np.float64]) -> None:
         )
 
 
-def _covariance(
-    name: str, points: NDArray[np.float64], targets: NDArray[np.float64]
-) -> NDArray[np.float64] | None:
-    """Mean square of leave-one-out errors, (3, 3) in m^2; None where one fewer is too few."""
-    if len(points) <= min_pairs(name):
+def _check_twins(camera: str, places: Places) -> None:
+    """One pair entered twice counts double, and is known where it is held out."""
+    seen: dict[bytes, str] = {}
+    rows = np.hstack([places.points_m, places.world_m])
+    for name, row in zip(places.names, rows, strict=True):
+        twin = seen.setdefault(row.tobytes(), name)
+        if twin != name:
+            raise FitError(
+                f"camera {camera}: measurements {twin} and {name} are one and the same pair, to the last "
+                "digit; withdraw one of them"
+            )
+
+
+def _predict_without_groups(
+    name: str, cameras: Mapping[str, Places], progress: Callable[[int, int], None]
+) -> tuple[list[frozenset[str]], dict[str, Array]] | None:
+    """The groups, and what models without each predict, (g, n, 3) by camera; None for too few places."""
+    fewest = min(len(places.names) for places in cameras.values())
+    if fewest <= min_pairs(name):
         return None
-    errors = []
-    for i in range(len(points)):
-        rest = np.arange(len(points)) != i
+    most = max(len(places.names) for places in cameras.values())
+    groups = deal(cameras, min(most, _GROUPS), np.random.default_rng(0))
+    predicted = []
+    for done, group in enumerate(groups, 1):
         try:
-            predicted = create(name).fit(points[rest], targets[rest]).predict(points[i : i + 1])
+            predicted.append(predict_without(name, cameras, group))
         except FitError:
             return None
-        errors.append(predicted[0] - targets[i])
-    residuals = np.array(errors)
-    covariance: NDArray[np.float64] = residuals.T @ residuals / len(residuals) + _FLOOR_SIGMA_M**2 * np.eye(3)
-    return covariance
+        progress(done, len(groups))
+    return groups, {camera: np.array([found[camera] for found in predicted]) for camera in cameras}
+
+
+def _left_out(
+    places: Places, groups: Sequence[frozenset[str]], without: Array
+) -> tuple[Array, NDArray[np.int64]]:
+    """Errors (n, 3) of the models that had not seen a place, and the group (n,) of each."""
+    index = np.array([next(g for g, group in enumerate(groups) if name in group) for name in places.names])
+    return without[index, np.arange(len(index))] - places.world_m, index
+
+
+def _tape(pair: Pair) -> Array:
+    return np.zeros((3, 3)) if pair.world_covariance_m2 is None else pair.world_covariance_m2
+
+
+def _noise(
+    name: str, estimator: object, places: Places, tape_m2: Array, without: Array, groups: NDArray[np.int64]
+) -> Noise | None:
+    def predict(points_m: Array, heights_m: Array) -> Array:
+        world_m: Array = estimator.predict(inputs(name, points_m, heights_m))  # type: ignore[attr-defined]
+        return world_m
+
+    found: Uncertainty = estimate_uncertainty(
+        predict, places.points_m, places.world_m, tape_m2, without, groups
+    )
+    return Noise(found.along, found.across, found.growth, found.fit)

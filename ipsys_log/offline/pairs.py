@@ -9,8 +9,8 @@ import numpy as np
 from numpy.typing import NDArray
 
 from ipsys_log.errors import IpsysError
-from ipsys_log.geometry.trilateration import trilaterate
 from ipsys_log.messages import CameraPoints, Measurement, Message, Pair, Rig
+from ipsys_log.offline.tape import Measured, world_point
 from ipsys_log.units import NS_PER_S
 
 __all__ = [
@@ -22,7 +22,6 @@ __all__ = [
     "measured_in_order",
     "split",
     "still_interval",
-    "world_point",
 ]
 
 # A marker lies still while it stays within these of where it was when it was measured: above the
@@ -54,14 +53,6 @@ def gather_sightings(messages: Iterable[Message]) -> dict[tuple[str, int], Sight
         times_ns = np.array([row[0] for row in values], dtype=np.int64)
         sightings[key] = Sightings(times_ns, np.array([row[1:] for row in values], dtype=np.float64))
     return sightings
-
-
-@dataclass(frozen=True, slots=True)
-class Measured:
-    """A measurement that counts, and the rig in force when it was made."""
-
-    measurement: Measurement
-    rig: Rig
 
 
 def measured_in_order(messages: Iterable[Message], override: Rig | None) -> list[Measured]:
@@ -113,50 +104,6 @@ def active_measurements(measurements: Iterable[Measurement]) -> list[Measurement
     return list(active.values())
 
 
-def world_point(measurement: Measurement, rig: Rig) -> NDArray[np.float64]:
-    """World point of a measurement, (3,) in m: as given, or by eq. (25).
-
-    Raises
-    ------
-    IpsysError
-        Where the distances form no triangle or name unknown reference points.
-    """
-    where = f"measurement {measurement.id}"
-    point_m = _given_or_solved(measurement, rig, where)
-    if not np.isfinite(point_m).all():
-        raise IpsysError(f"{where}: its world point {point_m.tolist()} m is no point; withdraw it")
-    return point_m
-
-
-def _given_or_solved(measurement: Measurement, rig: Rig, where: str) -> NDArray[np.float64]:
-    if measurement.point is not None:
-        return np.array([measurement.point.x_m, measurement.point.y_m, measurement.point.z_m])
-    if len(measurement.distances) != 2 or measurement.side is None or measurement.height_m is None:
-        raise IpsysError(
-            f"{where} has neither a world point nor two distances, a side and a height; measure it again"
-        )
-    first, second = measurement.distances
-    known = {p.name: np.array([p.x_m, p.y_m]) for p in rig.reference_points}
-    for distance in (first, second):
-        if distance.reference not in known:
-            names = ", ".join(known) or "none"
-            raise IpsysError(
-                f"{where}: reference point {distance.reference!r} is not in the rig (known: {names}); "
-                "add it to lab.toml and give that with --rig"
-            )
-    try:
-        xy_m = trilaterate(
-            known[first.reference],
-            known[second.reference],
-            first.distance_m,
-            second.distance_m,
-            measurement.side,
-        )
-    except IpsysError as error:
-        raise IpsysError(f"{where}: {error}") from error
-    return np.array([*xy_m, measurement.height_m])
-
-
 def still_interval(sightings: Sightings, time_ns: int) -> tuple[int, int] | None:
     """The stretch around a time in which a marker does not move.
 
@@ -198,7 +145,8 @@ def build_pairs(
 
     Returns
     -------
-    dict from camera to pairs: the mean camera point over the still interval, and the world point.
+    dict from camera to pairs: the mean camera point over the still interval, and the world point with
+    its covariance where that is known.
 
     Raises
     ------
@@ -218,12 +166,13 @@ def build_pairs(
                 f"{'no camera saw' if rig.knows(marker_id) else 'is not in the rig'} "
                 f"(seen: {', '.join(map(str, seen_ids)) or 'none'}); correct the id or the rig"
             )
-        world_m = world_point(measurement, rig)
+        fixed = world_point(measurement, rig)
         for camera in cameras:
             found = _mean_point(sightings.get((camera, marker_id)), measurement)
             if found is not None:
                 mean_m, frames = found
-                pairs[camera].append(Pair(measurement.id, marker_id, mean_m, world_m, frames))
+                row = (measurement.id, marker_id, mean_m, fixed.world_m, frames, fixed.covariance_m2)
+                pairs[camera].append(Pair(*row))
     return pairs
 
 

@@ -10,7 +10,8 @@ from numpy.typing import NDArray
 
 from ipsys_log.errors import IpsysError
 from ipsys_log.messages import Measurement, Rig
-from ipsys_log.offline.pairs import active_measurements, world_point
+from ipsys_log.offline.pairs import active_measurements
+from ipsys_log.offline.tape import world_point
 
 __all__ = ["KINDS", "Place", "measured_places"]
 
@@ -48,7 +49,7 @@ def measured_places(measurements: Iterable[Measurement], rig: Rig | None) -> tup
             continue
         try:
             # The rig is not looked at where the measurement has its point.
-            point_m = world_point(measurement, rig or Rig("", "", 1.0))
+            point_m = world_point(measurement, rig or Rig("", "", 1.0)).world_m
         except IpsysError as error:
             faults.append(str(error))
             continue

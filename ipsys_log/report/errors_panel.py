@@ -14,6 +14,7 @@ from matplotlib.transforms import Transform, blended_transform_factory
 from numpy.typing import NDArray
 
 from ipsys_log.messages import ErrorStatistics
+from ipsys_log.offline.errors import POOLED
 from ipsys_log.report.accuracy import Accuracy
 from ipsys_log.units import CM_PER_M
 
@@ -47,8 +48,14 @@ def _rows(accuracies: Sequence[Accuracy]) -> list[_Row]:
         evaluation = accuracy.evaluation
         model = evaluation.model if evaluation else accuracy.run
         # Two runs of one model are told apart by their names.
-        name = model if accuracy.run == model.replace("+", "_") else f"{model} ({accuracy.run})"
-        for row in evaluation.cameras if evaluation else ():
+        name = (
+            model
+            if accuracy.run == model.replace("+", "_").replace("-", "_")
+            else f"{model} ({accuracy.run})"
+        )
+        for row in accuracy.rows(False):
+            if row.camera == POOLED or row.error_3d is None:
+                continue
             offsets_m = np.array([r.predicted_m - r.world_m for r in row.residuals]).reshape(-1, 3)
             errors_cm = np.linalg.norm(offsets_m, axis=1) * CM_PER_M
             rows.append(_Row(name, row.camera, row.against, errors_cm, row.error_3d))

@@ -12,8 +12,8 @@ from numpy.typing import NDArray
 from ipsys_log.errors import IpsysError
 from ipsys_log.log.session import Session
 from ipsys_log.messages import TRUTH_TOPIC, Measurement, Rig, Tracks
-from ipsys_log.offline.evaluate import gather_tracks
 from ipsys_log.offline.places import measured_places
+from ipsys_log.offline.truth import gather_tracks
 from ipsys_log.report.accuracy import Accuracy
 from ipsys_log.report.errors_panel import count_rows, draw_errors
 from ipsys_log.report.floor_panel import Scene, draw_floor

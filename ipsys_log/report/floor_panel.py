@@ -13,6 +13,7 @@ from matplotlib.ticker import MultipleLocator
 from numpy.typing import NDArray
 
 from ipsys_log.messages import CameraEvaluation, Evaluation, Rig
+from ipsys_log.offline.errors import CROSS_VALIDATION
 from ipsys_log.offline.places import Place
 from ipsys_log.report.palette import REST, robot_colour
 
@@ -41,7 +42,9 @@ class Scene:
     def rows(self) -> list[CameraEvaluation]:
         """Residuals to draw as arrows: against the tape, which every lab has."""
         rows = self.evaluation.cameras if self.evaluation else ()
-        return [row for row in rows if row.against == "tape" and row.residuals]
+        return [
+            row for row in rows if row.against == "tape" and row.residuals and row.scheme != CROSS_VALIDATION
+        ]
 
 
 def draw_floor(axes: Axes, scene: Scene, styles: Mapping[str, tuple[str, str]]) -> None:

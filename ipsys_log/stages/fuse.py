@@ -74,7 +74,13 @@ class Fuse:
             fused.heading_rad,
             fused.covariance_m2,
             tuple(together),
+            _any_inside([at.inside for at in together.values()]),
         )
+
+
+def _any_inside(flags: list[bool | None]) -> bool | None:
+    known = [flag for flag in flags if flag is not None]
+    return any(known) if known else None
 
 
 def fuse_positions(positions: list[Position]) -> Position:

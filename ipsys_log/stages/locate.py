@@ -6,50 +6,88 @@ from collections.abc import Iterator
 from typing import Any
 
 import numpy as np
+from numpy.typing import NDArray
 
-from ipsys_log.messages import CameraModel, CameraPoint, CameraPoints, Message, Model, Position, Positions
-from ipsys_log.models import restore
+from ipsys_log.errors import IpsysError
+from ipsys_log.messages import (
+    CameraPoint,
+    CameraPoints,
+    Message,
+    Model,
+    Position,
+    Positions,
+    Rig,
+)
+from ipsys_log.models import reads_height
+from ipsys_log.models.applied import AppliedModel
 
 __all__ = ["READS", "Locate"]
 
-READS = (CameraPoints,)
+Array = NDArray[np.float64]
+
+READS = (Rig, CameraPoints)
 
 # Far enough for the digits, near enough for the curvature of a model.
 _STEP_M = 0.01
 
 
 class Locate:
-    """The stage *locate*. A camera that the model does not know has no positions."""
+    """The stage *locate*. A camera that the model does not know has no positions.
+
+    Models that read the height of a marker have it from the rig.
+    """
 
     def __init__(self, model: Model) -> None:
-        self._cameras = {camera.camera: _Applied(model.name, camera) for camera in model.cameras}
+        self._name = model.name
+        self._cameras = {camera.camera: AppliedModel(model.name, camera) for camera in model.cameras}
+        self._rig: Rig | None = None
 
     def __call__(self, message: Message) -> Iterator[Any]:
+        if isinstance(message.payload, Rig):
+            self._rig = message.payload
+            return
         applied = self._cameras.get(str(message.camera))
         if applied is not None:
             points = message.payload.points
-            yield Positions(message.publish_time_ns, applied.positions(points) if points else ())
+            heights_m = np.array([self._height(point.id) for point in points])
+            yield Positions(message.publish_time_ns, _positions(applied, points, heights_m) if points else ())
 
-
-class _Applied:
-    """The model of one camera, restored from its parameters."""
-
-    def __init__(self, name: str, camera: CameraModel) -> None:
-        arrays = {p.name: p.values.reshape(p.shape) for p in camera.parameters}
-        self._estimator = restore(name, arrays)
-        self._covariance_m2 = camera.covariance_m2
-
-    def positions(self, points: tuple[CameraPoint, ...]) -> tuple[Position, ...]:
-        here = np.array([(p.x_m, p.y_m, p.z_m) for p in points])
-        # The marker's direction is carried over by mapping a second point a little along it.
-        angles = np.array([-p.heading_rad if p.heading_rad is not None else 0.0 for p in points])
-        ahead = here + _STEP_M * np.stack([np.cos(angles), np.sin(angles), np.zeros(len(points))], axis=1)
-        world, world_ahead = np.split(self._estimator.predict(np.vstack([here, ahead])), 2)
-        along = world_ahead - world
-        headings = np.arctan2(along[:, 1], along[:, 0])
-        return tuple(
-            Position(
-                point.id, x_m, y_m, z_m, None if point.heading_rad is None else angle, self._covariance_m2
+    def _height(self, marker_id: int) -> float:
+        if not reads_height(self._name):
+            return 0.0
+        height_m = self._rig.height_of(marker_id) if self._rig else None
+        if height_m is None:
+            raise IpsysError(
+                f"{self._name} needs the height at which marker {marker_id} is carried: write "
+                "marker_height_m, or height_m of that marker, into lab.toml and give it with --rig lab.toml"
             )
-            for point, (x_m, y_m, z_m), angle in zip(points, world.tolist(), headings.tolist(), strict=True)
+        return height_m
+
+
+def _positions(
+    applied: AppliedModel, points: tuple[CameraPoint, ...], heights_m: Array
+) -> tuple[Position, ...]:
+    """Where the markers are; one whose ray does not meet its height is nowhere."""
+    here = np.array([(p.x_m, p.y_m, p.z_m) for p in points])
+    # The marker's direction is carried over by mapping a second point a little along it.
+    angles = np.array([-p.heading_rad if p.heading_rad is not None else 0.0 for p in points])
+    ahead = here + _STEP_M * np.stack([np.cos(angles), np.sin(angles), np.zeros(len(points))], axis=1)
+    both = applied.predict(np.vstack([here, ahead]), np.concatenate([heights_m, heights_m]))
+    world, along = both[: len(points)], both[len(points) :] - both[: len(points)]
+    headings = np.arctan2(along[:, 1], along[:, 0]).tolist()
+    covariances = applied.covariances(here, heights_m)
+    sigmas_m = np.zeros(len(points)) if covariances is None else np.sqrt(covariances[:, 2, 2])
+    inside = applied.inside(here, world, sigmas_m)
+    return tuple(
+        Position(
+            point.id,
+            x_m,
+            y_m,
+            z_m,
+            None if point.heading_rad is None else headings[n],
+            None if covariances is None else covariances[n],
+            None if inside is None else bool(inside[n]),
         )
+        for n, (point, (x_m, y_m, z_m)) in enumerate(zip(points, world.tolist(), strict=True))
+        if np.isfinite(world[n]).all()
+    )

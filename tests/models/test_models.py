@@ -19,7 +19,7 @@ from sklearn.preprocessing import PolynomialFeatures
 from sklearn.utils.estimator_checks import check_estimator
 
 from ipsys_log.errors import FitError, IpsysError
-from ipsys_log.models import MODELS, create, min_pairs, parameters, restore
+from ipsys_log.models import MODELS, create, inputs, min_pairs, parameters, restore
 from ipsys_log.models.poly import PolynomialRegression
 from ipsys_log.models.rigid import rigid_transform
 
@@ -87,6 +87,7 @@ def test_poly_keeps_its_digits_where_the_normal_equations_lose_them() -> None:
 @pytest.mark.parametrize("name", list(MODELS))
 def test_parameters_bring_the_model_back(name: str) -> None:
     points, world = places(0)
+    points = inputs(name, points, world[:, 2])
     fitted = clone(create(name)).fit(points, world)
     arrays = parameters(fitted)
     assert all(array.dtype == np.float64 for array in arrays.values())
@@ -98,7 +99,7 @@ def test_parameters_bring_the_model_back(name: str) -> None:
 @pytest.mark.parametrize("name", list(MODELS))
 def test_min_pairs_is_enough_and_one_less_is_not(name: str) -> None:
     points, world = places(0, count=min_pairs(name), noise_m=0)
-    create(name).fit(points, world)
+    create(name).fit(inputs(name, points, world[:, 2]), world)
     if name == "rigid":
         with pytest.raises(FitError, match="at least 3 pairs, found 2"):
             create(name).fit(points[:2], world[:2])

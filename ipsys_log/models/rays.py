@@ -1,0 +1,194 @@
+"""Rays of a camera in the world: its pose and a small correction of its lens, fitted to measured places.
+
+A marker's depth from its size (eq. 3) is ten times as uncertain as its direction. Where the height of a
+place is known, its point on the floor rests on the direction alone.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+
+import numpy as np
+from numpy.typing import NDArray
+from scipy.optimize import least_squares
+from scipy.spatial.transform import Rotation
+
+from ipsys_log.errors import FitError
+from ipsys_log.geometry.planes import meet_height
+from ipsys_log.models.rigid import rigid_transform
+
+__all__ = ["Bearings", "Places", "directions", "fit_bearings", "tied"]
+
+Array = NDArray[np.float64]
+
+# An error on the floor beyond this counts less and less: a tape's usual error.
+_USUAL_M = 0.005
+# A lens that was calibrated at all needs terms well below 0.05; a weak pull, so that few places suffice.
+_LENS_PULL_M = 0.1
+# Share of the tape in the variance of a residual, and of the camera: about the same in the paper's lab.
+_TAPE_SHARE = 0.5
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class Bearings:
+    """A camera's ``rotation`` (3, 3) and ``origin_m`` (3,) in the world, and its ``lens`` (3,)."""
+
+    rotation: Array
+    origin_m: Array
+    lens: Array
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class Places:
+    """What one camera saw of measured places: ``points_m`` (n, 3) in its frame, ``world_m`` (n, 3), and
+    their ``names``, by which other cameras know them."""
+
+    points_m: Array
+    world_m: Array
+    names: tuple[str, ...]
+
+
+def directions(points_m: Array, lens: Array) -> Array:
+    """Directions (u', v', 1) in the frame of the camera, (n, 3), from camera points (n, 3).
+
+    The lens correction of u = Xc / Zc, v = Yc / Zc has the first radial and the two tangential terms of
+    Brown and Conrady, ``lens`` = (k1, p1, p2).
+
+    Examples
+    --------
+    >>> directions(np.array([[2.0, 0.0, 2.0]]), np.array([0.01, 0.0, 0.0])).tolist()
+    [[1.01, 0.0, 1.0]]
+    """
+    u, v = points_m[:, 0] / points_m[:, 2], points_m[:, 1] / points_m[:, 2]
+    shift = _lens_terms(u, v) @ lens
+    return np.stack([u + shift[:, 0], v + shift[:, 1], np.ones_like(u)], axis=1)
+
+
+def _lens_terms(u: Array, v: Array) -> Array:
+    """Derivative of (u', v') by (k1, p1, p2), (n, 2, 3)."""
+    r2 = u * u + v * v
+    along_u = np.stack([u * r2, 2 * u * v, r2 + 2 * u * u], axis=1)
+    along_v = np.stack([v * r2, r2 + 2 * v * v, 2 * u * v], axis=1)
+    return np.stack([along_u, along_v], axis=1)
+
+
+def fit_bearings(cameras: Sequence[Places]) -> list[Bearings]:
+    """Pose and lens correction of each camera, from measured places of known height.
+
+    The errors on the floor are minimised with a soft-L1 loss, from the rigid transformation as a start.
+    Places that several cameras saw tie these together: what differs between cameras cannot be the tape's
+    error, and weighs more than what they have in common.
+
+    Raises
+    ------
+    FitError
+        For fewer than three places of a camera, or places on a line.
+    """
+    found: list[Bearings | None] = [None] * len(cameras)
+    for group in tied(cameras):
+        for index, bearings in zip(group, _fit_tied([cameras[i] for i in group]), strict=True):
+            found[index] = bearings
+    return [bearings for bearings in found if bearings is not None]
+
+
+def tied(cameras: Sequence[Places]) -> list[list[int]]:
+    """Cameras by groups that share places, directly or through others."""
+    groups: list[tuple[list[int], set[str]]] = []
+    for index, places in enumerate(cameras):
+        names = set(places.names)
+        met = [group for group in groups if group[1] & names]
+        groups = [group for group in groups if not group[1] & names]
+        indices = sorted([index, *(i for group in met for i in group[0])])
+        groups.append((indices, names.union(*(group[1] for group in met))))
+    return [indices for indices, _ in groups]
+
+
+def _fit_tied(cameras: Sequence[Places]) -> list[Bearings]:
+    starts = [rigid_transform(places.points_m, places.world_m) for places in cameras]
+    weights = _weights([name for places in cameras for name in places.names])
+    first = np.concatenate([np.concatenate([np.zeros(3), t, np.zeros(3)]) for _, t in starts])
+    ends = np.cumsum([0, *(len(places.names) for places in cameras)])
+
+    def bearings(values: Array) -> list[Bearings]:
+        return [
+            Bearings(Rotation.from_rotvec(v[:3]).as_matrix() @ start, v[3:6], v[6:])
+            for v, (start, _) in zip(values.reshape(-1, 9), starts, strict=True)
+        ]
+
+    def residuals(values: Array) -> Array:
+        offsets = [_offsets(p, b) for p, b in zip(cameras, bearings(values), strict=True)]
+        pulls = values.reshape(-1, 9)[:, 6:] * _LENS_PULL_M
+        return np.concatenate([(weights @ np.vstack(offsets)).reshape(-1), pulls.reshape(-1)])
+
+    def jacobian(values: Array) -> Array:
+        rows = np.zeros((ends[-1], 2, len(values)))
+        pulls = np.zeros((3 * len(cameras), len(values)))
+        for n, (places, b) in enumerate(zip(cameras, bearings(values), strict=True)):
+            rows[ends[n] : ends[n + 1], :, 9 * n : 9 * n + 9] = _slopes(places, b, values[9 * n : 9 * n + 3])
+            pulls[3 * n : 3 * n + 3, 9 * n + 6 : 9 * n + 9] = _LENS_PULL_M * np.eye(3)
+        return np.vstack([np.tensordot(weights, rows, axes=1).reshape(-1, len(values)), pulls])
+
+    solved = least_squares(
+        residuals, first, jacobian, loss="soft_l1", f_scale=_USUAL_M, x_scale="jac", max_nfev=200
+    )
+    if not np.isfinite(solved.x).all():
+        raise FitError(
+            "the rays of the camera do not fit the measured places; check the heights of the places"
+        )
+    return bearings(solved.x)
+
+
+def _offsets(places: Places, bearings: Bearings) -> Array:
+    """Errors on the floor at the known heights, (n, 2) in m."""
+    rays = directions(places.points_m, bearings.lens) @ bearings.rotation.T
+    return (meet_height(bearings.origin_m, rays, places.world_m[:, 2]) - places.world_m)[:, :2]
+
+
+def _slopes(places: Places, bearings: Bearings, turn: Array) -> Array:
+    """Derivative of :func:`_offsets` by rotation vector, origin and lens, (n, 2, 9)."""
+    points_m = places.points_m
+    rays = directions(points_m, bearings.lens) @ bearings.rotation.T
+    along = (places.world_m[:, 2] - bearings.origin_m[2]) / rays[:, 2]
+    on_plane = np.zeros((len(rays), 2, 3))  # of the point by the origin
+    on_plane[:, 0, 0] = on_plane[:, 1, 1] = 1.0
+    on_plane[:, :, 2] = -rays[:, :2] / rays[:, 2:]
+    by_ray = along[:, None, None] * on_plane
+    by_turn = -by_ray @ _cross(rays) @ _left_jacobian(turn)
+    u, v = points_m[:, 0] / points_m[:, 2], points_m[:, 1] / points_m[:, 2]
+    by_lens = by_ray @ bearings.rotation[:, :2] @ _lens_terms(u, v)
+    return np.concatenate([by_turn, on_plane, by_lens], axis=2)
+
+
+def _cross(vectors: Array) -> Array:
+    """Matrices (n, 3, 3) of the cross product with each vector (n, 3)."""
+    x, y, z = vectors.T
+    o = np.zeros_like(x)
+    return np.stack([o, -z, y, z, o, -x, -y, x, o], axis=1).reshape(-1, 3, 3)
+
+
+def _left_jacobian(turn: Array) -> Array:
+    """How a rotation turns further as its rotation vector (3,) changes (Barfoot 2017, eq. 7.77)."""
+    angle = float(np.linalg.norm(turn))
+    if angle < 1e-8:
+        return np.eye(3)
+    cross = _cross(turn[None])[0]
+    first, second = (1 - np.cos(angle)) / angle**2, (angle - np.sin(angle)) / angle**3
+    jacobian: Array = np.eye(3) + first * cross + second * cross @ cross
+    return jacobian
+
+
+def _weights(names: Sequence[str]) -> Array:
+    """What the residuals (n, ...) of places are multiplied by, (n, n), so that they weigh alike.
+
+    A place's residuals in k cameras share the tape's error T and have each camera's own, C: their mean
+    has the variance T + C / k, the differences C.
+    """
+    weights = np.eye(len(names))
+    for name in {name for name in names if names.count(name) > 1}:
+        rows = np.flatnonzero([other == name for other in names])
+        basis = np.linalg.qr(np.column_stack([np.ones(len(rows)), np.eye(len(rows))[:, 1:]]))[0].T
+        variances = np.full(len(rows), 1 - _TAPE_SHARE)
+        variances[0] += len(rows) * _TAPE_SHARE
+        weights[np.ix_(rows, rows)] = basis / np.sqrt(variances)[:, None]
+    return weights

@@ -1,0 +1,72 @@
+"""What a simulated lab knows of where its markers truly were."""
+
+from __future__ import annotations
+
+from collections.abc import Iterable, Mapping
+
+import numpy as np
+from numpy.typing import NDArray
+
+from ipsys_log.messages import ErrorStatistics, Message, Tracks
+from ipsys_log.offline.pairs import Measured, Sightings, still_interval
+from ipsys_log.offline.statistics import error_statistics
+
+__all__ = ["gather_tracks", "track_errors", "true_points"]
+
+
+def gather_tracks(messages: Iterable[Message]) -> dict[int, Sightings]:
+    """Positions of tracks by marker, in the order of time and, at one time, of the log."""
+    rows: dict[int, list[tuple[int, float, float, float]]] = {}
+    for message in messages:
+        if isinstance(message.payload, Tracks):
+            for track in message.payload.tracks:
+                row = (message.publish_time_ns, track.x_m, track.y_m, track.z_m)
+                rows.setdefault(track.id, []).append(row)
+    for values in rows.values():
+        values.sort(key=lambda row: row[0])
+    return {
+        marker_id: Sightings(
+            np.array([row[0] for row in values], dtype=np.int64),
+            np.array([row[1:] for row in values], dtype=np.float64),
+        )
+        for marker_id, values in rows.items()
+    }
+
+
+def true_points(places: Iterable[Measured], truth: Mapping[int, Sightings]) -> dict[str, NDArray[np.float64]]:
+    """Where each measured marker truly was, (3,) in m by id; only where the truth of that time is known."""
+    points = {}
+    for place in places:
+        measurement = place.measurement
+        known = truth.get(measurement.marker_id if measurement.marker_id is not None else -1)
+        if known is not None and (interval := still_interval(known, measurement.timestamp)) is not None:
+            within = (known.times_ns >= interval[0]) & (known.times_ns <= interval[1])
+            points[measurement.id] = known.points_m[within].mean(axis=0)
+    return points
+
+
+def track_errors(
+    tracks: Mapping[int, Sightings], truth: Mapping[int, Sightings]
+) -> tuple[ErrorStatistics, ErrorStatistics] | None:
+    """Errors of tracks against the truth at the same instants, in space and on the floor.
+
+    Returns
+    -------
+    None where no instant of a track has a truth.
+    """
+    offsets = []
+    for marker_id, track in tracks.items():
+        known = truth.get(marker_id)
+        if known is None:
+            continue
+        # The last of the poses of one instant rests on all cameras.
+        times_ns, last = np.unique(track.times_ns[::-1], return_index=True)
+        common, here, there = np.intersect1d(times_ns, known.times_ns, return_indices=True)
+        if len(common):
+            offsets.append(track.points_m[::-1][last][here] - known.points_m[there])
+    if not offsets:
+        return None
+    rows = np.vstack(offsets)
+    return error_statistics(np.linalg.norm(rows, axis=1)), error_statistics(
+        np.linalg.norm(rows[:, :2], axis=1)
+    )

@@ -1,0 +1,100 @@
+"""Made-up labs with known truth, from geometry alone: what cameras see of places, what a tape says."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import numpy as np
+from numpy.typing import NDArray
+from scipy.spatial.transform import Rotation
+
+from ipsys_log.messages import Pair
+
+Array = NDArray[np.float64]
+
+A, B = np.array([1.2192, 2.4384]), np.array([3.6576, 2.4384])
+HEIGHTS = (0.0, 0.05, 0.1, 0.15, 0.2)
+
+
+@dataclass(frozen=True)
+class Camera:
+    """Hangs at ``origin_m``, about downwards; its lens is off a little, its depths are off smoothly.
+
+    ``along`` and ``across`` are the noise of a depth (relative) and of (u, v), in the middle of the image.
+    """
+
+    origin_m: Array
+    rotation: Array
+    lens: tuple[float, float, float] = (-0.004, 0.001, -0.001)
+    along: float = 0.0004
+    across: float = 0.0001
+
+    def see(self, world_m: Array, rng: np.random.Generator) -> Array:
+        """Camera points (n, 3) of world points (n, 3), with noise."""
+        inside = (world_m - self.origin_m) @ self.rotation
+        u, v = inside[:, 0] / inside[:, 2], inside[:, 1] / inside[:, 2]
+        growth = 1 + u * u + v * v
+        for _ in range(20):  # the lens maps what is seen to what is there: solve for what is seen
+            shift = self._shift(u, v)
+            u, v = inside[:, 0] / inside[:, 2] - shift[0], inside[:, 1] / inside[:, 2] - shift[1]
+        u = u + rng.normal(0, self.across, len(u)) * growth
+        v = v + rng.normal(0, self.across, len(v)) * growth
+        off = 0.004 * (growth - 1) - 0.003 * u + self.along * growth * rng.normal(size=len(u))
+        z = inside[:, 2] / (1 + off)
+        return np.stack([u * z, v * z, z], axis=1)
+
+    def _shift(self, u: Array, v: Array) -> tuple[Array, Array]:
+        k1, p1, p2 = self.lens
+        r2 = u * u + v * v
+        return (
+            k1 * u * r2 + p1 * 2 * u * v + p2 * (r2 + 2 * u * u),
+            k1 * v * r2 + p1 * (r2 + 2 * v * v) + p2 * 2 * u * v,
+        )
+
+
+def camera(
+    rng: np.random.Generator, y_m: float = 0.9, along: float = 0.0004, across: float = 0.0001
+) -> Camera:
+    """One of the cameras above the paper's floor, tilted a little at random."""
+    turn = (np.pi + rng.normal(0, 0.02), rng.normal(0, 0.02), rng.normal(0, 0.05))
+    return Camera(
+        np.array([2.4, y_m, 2.1]), Rotation.from_euler("xyz", turn).as_matrix(), along=along, across=across
+    )
+
+
+def places(
+    rng: np.random.Generator, count: int, y_m: float = 0.9, heights: tuple[float, ...] = HEIGHTS
+) -> Array:
+    """World points (n, 3) in a camera's view, where the two tapes cross at more than 15 degrees."""
+    found: list[Array] = []
+    while len(found) < count:
+        point = np.array([rng.uniform(0.1, 4.7), rng.uniform(y_m - 0.8, y_m + 0.8), rng.choice(heights)])
+        a, b = (point[:2] - end for end in (A, B))
+        if abs(a[0] * b[1] - a[1] * b[0]) > np.sin(np.radians(15)) * np.linalg.norm(a) * np.linalg.norm(b):
+            found.append(point)
+    return np.array(found)
+
+
+def tape_covariances(world_m: Array, sigma_m: float = 0.003, ruler_m: float = 0.001) -> Array:
+    """Of the world point (n, 3, 3), to first order in the errors of d1, d2 and the height."""
+    covariances = np.zeros((len(world_m), 3, 3))
+    for n, point in enumerate(world_m):
+        units = np.array([(point[:2] - end) / np.linalg.norm(point[:2] - end) for end in (A, B)])
+        inverse = np.linalg.inv(units)
+        covariances[n, :2, :2] = sigma_m**2 * inverse @ inverse.T
+        covariances[n, 2, 2] = ruler_m**2
+    return covariances
+
+
+def measure(world_m: Array, rng: np.random.Generator, sigma_m: float = 0.003) -> tuple[Array, Array]:
+    """World points as measured, (n, 3), and their covariances (n, 3, 3)."""
+    covariances = tape_covariances(world_m, sigma_m)
+    roots = np.linalg.cholesky(covariances)
+    return world_m + np.einsum("nij,nj->ni", roots, rng.normal(size=world_m.shape)), covariances
+
+
+def pairs(points_m: Array, world_m: Array, covariances: Array, name: str = "m") -> list[Pair]:
+    return [
+        Pair(f"{name}{n:02d}", 0, point, world, 1, covariance)
+        for n, (point, world, covariance) in enumerate(zip(points_m, world_m, covariances, strict=True))
+    ]

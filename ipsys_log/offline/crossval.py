@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Collection, Mapping, Sequence
+from collections.abc import Callable, Collection, Mapping, Sequence
 
 import numpy as np
 from numpy.typing import NDArray
@@ -100,20 +100,38 @@ def cross_validate(name: str, cameras: Mapping[str, Places], seed: int) -> dict[
 
 
 def leave_one_out(
-    name: str, cameras: Mapping[str, Places], unused: Collection[str] = ()
-) -> dict[str, dict[str, Array]]:
-    """For each camera and place, the world point (3,) in m of a model fitted without that place.
+    name: str, cameras: Mapping[str, Places]
+) -> Callable[[frozenset[str]], dict[str, dict[str, Array]]]:
+    """Models fitted without one place after the other.
 
-    Parameters
-    ----------
-    unused : places that no model is fitted to; they are predicted as well.
+    Returns
+    -------
+    A function that is given the places that no model shall be fitted to (they are predicted as well), and
+    gives for each camera and place the world point (3,) in m of a model fitted without that place. It
+    fits again only cameras on which what is given has a bearing.
     """
+    groups = [{camera: cameras[camera] for camera in tied} for tied in tied_cameras(name, cameras)]
+    known: dict[tuple[int, frozenset[str]], dict[str, dict[str, Array]]] = {}
+
+    def left_out(unused: frozenset[str]) -> dict[str, dict[str, Array]]:
+        found = {}
+        for number, group in enumerate(groups):
+            key = number, unused & {place for places in group.values() for place in places.names}
+            if key not in known:
+                known[key] = _each_left_out(name, group, key[1])
+            found.update(known[key])
+        return found
+
+    return left_out
+
+
+def _each_left_out(
+    name: str, cameras: Mapping[str, Places], unused: Collection[str]
+) -> dict[str, dict[str, Array]]:
     found: dict[str, dict[str, Array]] = {camera: {} for camera in cameras}
-    for tied in tied_cameras(name, cameras):
-        for place in dict.fromkeys(place for camera in tied for place in cameras[camera].names):
-            seen = {camera: cameras[camera] for camera in tied if place in cameras[camera].names}
-            # What ties a camera to others changes with what they lose.
-            predicted = predict_without(name, {c: cameras[c] for c in tied}, {place, *unused})
-            for camera, places in seen.items():
+    for place in dict.fromkeys(place for places in cameras.values() for place in places.names):
+        predicted = predict_without(name, cameras, {place, *unused})
+        for camera, places in cameras.items():
+            if place in places.names:
                 found[camera][place] = predicted[camera][places.names.index(place)]
     return found

@@ -4,7 +4,6 @@ from __future__ import annotations
 
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass
-from functools import partial
 
 import numpy as np
 from numpy.typing import NDArray
@@ -102,8 +101,6 @@ def _suspects(name: str, cameras: Mapping[str, Places], places: Sequence[Measure
         return ()
     seen = {place for found in cameras.values() for place in found.names}
     try:
-        return find_suspects(
-            partial(leave_one_out, name, cameras), [p for p in places if p.measurement.id in seen]
-        )
+        return find_suspects(leave_one_out(name, cameras), [p for p in places if p.measurement.id in seen])
     except FitError:
         return ()

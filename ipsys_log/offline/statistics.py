@@ -12,12 +12,14 @@ __all__ = ["error_statistics"]
 _RESAMPLES = 2000
 
 
-def error_statistics(errors_m: NDArray[np.float64]) -> ErrorStatistics:
+def error_statistics(errors_m: NDArray[np.float64], independent: bool = True) -> ErrorStatistics:
     """Mean, bounds, percentiles and standard deviation of distances, and how certain their mean is.
 
     Parameters
     ----------
     errors_m : (n,) or (repeats, n), n > 0, in m: distances at n places.
+    independent : whether one place says nothing of the next, as the instants of a track do: otherwise there
+        is no interval.
 
     Returns
     -------
@@ -40,9 +42,9 @@ def error_statistics(errors_m: NDArray[np.float64]) -> ErrorStatistics:
     count = len(places_m)
     errors_m = errors_m.reshape(-1)
     median_m, p95_m = np.percentile(errors_m, [50, 95]).tolist()
-    std_m = low_m = high_m = None
-    if count > 1:
-        std_m = float(errors_m.std(ddof=1))
+    std_m = float(errors_m.std(ddof=1)) if errors_m.size > 1 else None
+    low_m = high_m = None
+    if count > 1 and independent:
         drawn = np.random.default_rng(0).integers(count, size=(_RESAMPLES, count))
         low_m, high_m = np.percentile(places_m[drawn].mean(axis=1), [2.5, 97.5]).tolist()
     return ErrorStatistics(

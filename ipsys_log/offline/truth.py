@@ -13,6 +13,8 @@ from ipsys_log.offline.statistics import error_statistics
 
 __all__ = ["gather_tracks", "track_errors", "true_points"]
 
+_SAME_HEIGHT_M = 0.005
+
 
 def gather_tracks(messages: Iterable[Message]) -> dict[int, Sightings]:
     """Positions of tracks by marker, in the order of time and, at one time, of the log."""
@@ -46,9 +48,14 @@ def true_points(places: Iterable[Measured], truth: Mapping[int, Sightings]) -> d
 
 
 def track_errors(
-    tracks: Mapping[int, Sightings], truth: Mapping[int, Sightings]
+    tracks: Mapping[int, Sightings], truth: Mapping[int, Sightings], carried: bool = False
 ) -> tuple[ErrorStatistics, ErrorStatistics] | None:
     """Errors of tracks against the truth at the same instants, in space and on the floor.
+
+    Parameters
+    ----------
+    carried : only instants at which a marker has the height of its track: for a model that is told at which
+        height the robot carries it, and not when somebody lifts it to measure a place.
 
     Returns
     -------
@@ -61,12 +68,16 @@ def track_errors(
             continue
         # The last of the poses of one instant rests on all cameras.
         times_ns, last = np.unique(track.times_ns[::-1], return_index=True)
-        common, here, there = np.intersect1d(times_ns, known.times_ns, return_indices=True)
-        if len(common):
-            offsets.append(track.points_m[::-1][last][here] - known.points_m[there])
+        _, here, there = np.intersect1d(times_ns, known.times_ns, return_indices=True)
+        offset = track.points_m[::-1][last][here] - known.points_m[there]
+        if carried:
+            offset = offset[np.abs(offset[:, 2]) < _SAME_HEIGHT_M]
+        if len(offset):
+            offsets.append(offset)
     if not offsets:
         return None
     rows = np.vstack(offsets)
-    return error_statistics(np.linalg.norm(rows, axis=1)), error_statistics(
-        np.linalg.norm(rows[:, :2], axis=1)
+    return (
+        error_statistics(np.linalg.norm(rows, axis=1), independent=False),
+        error_statistics(np.linalg.norm(rows[:, :2], axis=1), independent=False),
     )

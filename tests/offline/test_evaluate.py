@@ -155,7 +155,7 @@ def test_a_place_seen_by_two_cameras_is_held_out_from_both() -> None:
 def test_leave_one_out_is_a_fit_without_the_place() -> None:
     found, _, _ = lab(1, 16)
     cameras = gather_places({"red": found})
-    left_out = leave_one_out("poly", cameras, {"m03"})["red"]
+    left_out = leave_one_out("poly", cameras)(frozenset({"m03"}))["red"]
     rest = {"red": [p for p in found if p.measurement not in ("m03", "m05")]}
     applied = AppliedModel("poly", fit_model("poly", rest, 0).cameras[0])
     np.testing.assert_allclose(

@@ -101,6 +101,8 @@ def build_rig(settings: LabSettings) -> Rig:
         cameras=tuple(RigCamera(name) for name in settings.cameras),
         reference_points=REFERENCES,
         floor=Floor(FLOOR_M, FLOOR_M),
+        marker_height_m=settings.drive_height_m,
+        tape_sigma_m=settings.tape_sigma_m or None,
     )
 
 

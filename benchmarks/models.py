@@ -1,0 +1,126 @@
+"""How long the models take, and how good they are, on the authors' 150 measured places.
+
+    python benchmarks/models.py                  # the time of each step
+    python benchmarks/models.py --seeds 10       # also: best against poly on that many sets of folds
+
+Needs the public data (docs/data.md). One thread for linear algebra, as in the pipeline. Prints JSON.
+"""
+
+import argparse
+import json
+import os
+import sys
+import tempfile
+import time
+from collections.abc import Callable
+from pathlib import Path
+
+import numpy as np
+from threadpoolctl import threadpool_limits
+
+from ipsys_log.formats.imsel import read_imsel
+from ipsys_log.log.session import Session
+from ipsys_log.messages import CameraPoints, Pair
+from ipsys_log.models import MODELS
+from ipsys_log.offline.crossval import cross_validate, gather_places
+from ipsys_log.offline.evaluate import Study, evaluate_model
+from ipsys_log.offline.fit import fit_model
+from ipsys_log.offline.learning import labelled_subsets
+from ipsys_log.offline.pairs import Measured, build_pairs, gather_sightings
+from ipsys_log.offline.statistics import error_statistics
+from ipsys_log.output import write_log
+from ipsys_log.tasks import measured
+
+# Best was chosen with other folds.
+FIRST_SEED = 1000
+
+
+def read(folder: Path) -> tuple[dict[str, list[Pair]], list[Measured]]:
+    with tempfile.TemporaryDirectory() as work:
+        log = Path(work) / "imsel.mcap"
+        write_log(log, read_imsel(folder))
+        with Session([log]) as session:
+            places = measured(session, None)
+            points = gather_sightings(session.messages(session.topics(CameraPoints, "imsel")))
+    return build_pairs(points, places), places
+
+
+def timed(work: Callable[[], object]) -> float:
+    begin = time.perf_counter()
+    work()
+    return time.perf_counter() - begin
+
+
+def quiet(done: int, total: int) -> None:
+    """Nobody watches."""
+
+
+def times(pairs: dict[str, list[Pair]], places: list[Measured]) -> dict[str, object]:
+    """Seconds of a fit with its uncertainty, and of everything that is asked of a model."""
+    measurements = [place.measurement for place in places]
+    held_out = {m.id for m in measurements if "test" in m.splits}
+    study = Study(places, pairs, held_out, labelled_subsets(measurements), {}, 0)
+    fits, studies = {}, {}
+    for name in MODELS:
+        model = fit_model(name, pairs, 0)
+        fits[name] = timed(lambda name=name: fit_model(name, pairs, 0))  # type: ignore[misc]
+        studies[name] = timed(lambda model=model: evaluate_model(model, study, 0, [], quiet))  # type: ignore[misc]
+        print(f"{name:<26} fit {fits[name]:6.2f} s, study {studies[name]:6.2f} s", file=sys.stderr)
+    cameras = gather_places(pairs)
+    both = {
+        name: timed(lambda name=name: validated(name, cameras, 0))  # type: ignore[misc]
+        for name in ("poly", "rayplane")
+    }
+    return {
+        "fit_s": fits,
+        "nine_fits_and_rayplane_s": sum(s for name, s in fits.items() if name != "best"),
+        "cross_validation_and_bootstrap_s": both,
+        "study_s": studies,
+        "everything_s": sum(fits.values()) + sum(studies.values()),
+    }
+
+
+def validated(name: str, cameras: dict, seed: int, axes: int = 3) -> float:  # type: ignore[type-arg]
+    """Mean error in cm over the cameras by repeated cross-validation."""
+    predicted = cross_validate(name, cameras, seed)
+    return 100 * float(
+        np.mean(
+            [
+                error_statistics(np.linalg.norm((predicted[c] - places.world_m)[:, :, :axes], axis=2)).mean_m
+                for c, places in cameras.items()
+            ]
+        )
+    )
+
+
+def accuracy(pairs: dict[str, list[Pair]], seeds: int) -> dict[str, object]:
+    cameras = gather_places(pairs)
+    numbers = range(FIRST_SEED, FIRST_SEED + seeds)
+    found = {name: [validated(name, cameras, seed) for seed in numbers] for name in ("poly", "best")}
+    flat = [validated("rayplane", cameras, seed, axes=2) for seed in numbers]
+    means = {name: float(np.mean(values)) for name, values in found.items()}
+    return {
+        "cross_validated_3d_cm": found,
+        "best_below_poly_percent": 100 * (1 - means["best"] / means["poly"]),
+        "rayplane_2d_cm": flat,
+    }
+
+
+def main() -> None:
+    parser = argparse.ArgumentParser(description=__doc__)
+    parser.add_argument("--seeds", type=int, default=0, help="sets of folds to compare best and poly on")
+    options = parser.parse_args()
+    data = Path(os.environ.get("IPSYS_DATA", "../shared/data")) / "imsel"
+    if not data.is_dir():
+        raise SystemExit(f"no real data in {data}: set IPSYS_DATA (docs/data.md says where to get them)")
+    pairs, places = read(data)
+    with threadpool_limits(1):
+        result = times(pairs, places)
+        if options.seeds:
+            result["accuracy"] = accuracy(pairs, options.seeds)
+    json.dump(result, sys.stdout, indent=2)
+    print()
+
+
+if __name__ == "__main__":
+    main()

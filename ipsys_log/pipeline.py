@@ -36,6 +36,7 @@ from typing import Any
 import cv2
 
 from ipsys_log.log.session import Session
+from ipsys_log.lookup import wanted_models
 from ipsys_log.messages import (
     CameraPoints,
     Evaluation,
@@ -53,7 +54,7 @@ from ipsys_log.perform import inputs, perform
 from ipsys_log.preflight import check_inputs
 from ipsys_log.request import Progress, Request
 from ipsys_log.runs import Outcome
-from ipsys_log.tasks import STAGES, Task, plan_stage, wanted_models
+from ipsys_log.tasks import STAGES, Task, plan_stage
 
 __all__ = ["TOPICS", "Stage", "in_threads", "replay", "run"]
 

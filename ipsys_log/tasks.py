@@ -6,9 +6,19 @@ from collections.abc import Callable, Iterable, Mapping
 from dataclasses import dataclass, field
 from typing import Any
 
-from ipsys_log.errors import IpsysError
 from ipsys_log.geometry.lenses import same_lens
-from ipsys_log.log.session import Session, run_of_topic
+from ipsys_log.log.session import Session
+from ipsys_log.lookup import (
+    can_evaluate,
+    copied_run,
+    find_pairs,
+    fits_again,
+    fitted_in,
+    held_out_ids,
+    measured,
+    split_parameters,
+    unused_places,
+)
 from ipsys_log.messages import (
     CameraCalibration,
     CameraPoints,
@@ -21,33 +31,21 @@ from ipsys_log.messages import (
     Measurement,
     Message,
     Model,
-    Pair,
     Positions,
     Rig,
     Tracks,
 )
-from ipsys_log.models import MODELS, create, min_pairs, reads_height
-from ipsys_log.offline.crossval import FOLDS
+from ipsys_log.models import reads_height
 from ipsys_log.offline.evaluate import Study, evaluate_model
 from ipsys_log.offline.fit import fit_model, level_cameras
 from ipsys_log.offline.learning import labelled_subsets
-from ipsys_log.offline.pairs import Measured, build_pairs, gather_sightings, measured_in_order, split
+from ipsys_log.offline.pairs import split
 from ipsys_log.offline.truth import gather_tracks, true_points
 from ipsys_log.request import Request
-from ipsys_log.runs import complete_runs, newest_run, read_channels
+from ipsys_log.runs import newest_run, read_channels
 from ipsys_log.stages import camera_frame, detect, fuse, locate
 
-__all__ = [
-    "STAGES",
-    "Task",
-    "can_evaluate",
-    "copied_run",
-    "fitted_in",
-    "held_out_ids",
-    "measured",
-    "plan_stage",
-    "wanted_models",
-]
+__all__ = ["STAGES", "Task", "plan_stage"]
 
 
 @dataclass(frozen=True, slots=True)
@@ -81,55 +79,6 @@ class Task:
     foreign: tuple[ChannelRead, ...] = ()
     input_runs: tuple[str, ...] = ()
     notes: list[str] = field(default_factory=list)
-
-
-def wanted_models(request: Request, until: str) -> tuple[str, ...]:
-    """The models to fit or apply.
-
-    Raises
-    ------
-    IpsysError
-        For a name that is not in the table, or a log that has no fitted model to apply.
-    """
-    for name in request.models:
-        create(name)
-    if request.models:
-        return request.models
-    if request.model_from is not None:
-        with Session([request.model_from]) as other:
-            held = {other.payloads([topic])[-1].name for topic in _model_topics(other)}
-            return ("poly" if "poly" in held else fitted_in(other, None)[0].name,)
-    return tuple(MODELS) if until == "evaluate" else ("poly",)
-
-
-def fitted_in(other: Session, name: str | None) -> tuple[Model, str]:
-    """The newest model in another log, of a name where one is given, and its topic.
-
-    Raises
-    ------
-    IpsysError
-        Where there is none.
-    """
-    for topic in reversed(_model_topics(other)):
-        model: Model = other.payloads([topic])[-1]
-        if name in (None, model.name):
-            return model, topic
-    what = f"model {name}" if name else "model"
-    raise IpsysError(f"{other}: has no fitted {what}; fit one there with: ipsys fit {other}")
-
-
-def _model_topics(session: Session) -> list[str]:
-    return [t for run in complete_runs(session) if run.stage == "fit" for t in session.topics(Model, run.run)]
-
-
-def copied_run(session: Session, model: str) -> str | None:
-    """The run of a model that was copied into a log without measurements, the newest one."""
-    if session.topics(Measurement):
-        return None
-    for topic in reversed(_model_topics(session)):
-        if session.payloads([topic])[-1].name == model:
-            return run_of_topic(topic)
-    return None
 
 
 def _rig_part(stage: str) -> Callable[[Rig], Any]:
@@ -212,9 +161,12 @@ def _fit(session: Session, request: Request, points: str, model: str) -> Task | 
     def compute(log: Session, progress: Callable[[int, int], None]) -> Model:
         places = measured(log, rig)
         train, _ = split([place.measurement for place in places], request.train, request.seed)
-        pairs = _pairs(log, points, places, train)
+        pairs = {
+            camera: [pair for pair in found if pair.measurement in train]
+            for camera, found in find_pairs(log, points, places).items()
+        }
         fitted = fit_model(model, pairs, log.last(topics)[1], progress)
-        notes.extend(_unused(pairs, train))
+        notes.extend(unused_places(pairs, train))
         notes.extend(
             f"camera {camera}: all measured places are {height_m:.3f} m high, so heights cannot be learned: "
             "its model is good in x and y, and says that height"
@@ -222,7 +174,7 @@ def _fit(session: Session, request: Request, points: str, model: str) -> Task | 
         )
         return fitted
 
-    parameters = {"model": model, **_split_parameters(session, request)}
+    parameters = {"model": model, **split_parameters(session, request)}
     return Task(
         "fit", base, tuple(topics), (Model,), compute=compute, parameters=parameters, rig=rig, notes=notes
     )
@@ -249,7 +201,7 @@ def _evaluate(session: Session, request: Request, points: str, model: str) -> Ta
     name = session.payloads(session.topics(Model, model))[-1].name
     if not can_evaluate(session, request, name):
         return ""
-    again = _fits_again(session, request, name)
+    again = fits_again(session, request, name)
     rig, topics = _rig(session, request, "evaluate")
     topics += [*session.topics(CameraPoints, points), *session.topics(Model, model)]
     topics += [*session.topics(Measurement), *session.topics(Tracks)]
@@ -261,7 +213,7 @@ def _evaluate(session: Session, request: Request, points: str, model: str) -> Ta
         measurements = [place.measurement for place in places]
         study = Study(
             places,
-            _pairs(log, points, places, {m.id for m in measurements}),
+            find_pairs(log, points, places),
             held_out_ids(measurements, request),
             labelled_subsets(measurements),
             true_points(places, gather_tracks(log.messages(log.topics(Tracks)))),
@@ -269,7 +221,7 @@ def _evaluate(session: Session, request: Request, points: str, model: str) -> Ta
         )
         return evaluate_model(fitted, study, log.last(topics)[1], notes, progress)
 
-    parameters = {**_split_parameters(session, request), "seed": str(request.seed)} if again else {}
+    parameters = {**split_parameters(session, request), "seed": str(request.seed)} if again else {}
     return Task(
         "evaluate",
         model,
@@ -306,57 +258,3 @@ _PLANS: dict[str, Callable[..., Task | str]] = {
     "fuse": _fuse,
 }
 STAGES = tuple(_PLANS)
-
-
-def measured(session: Session, rig: Rig | None) -> list[Measured]:
-    """The measured places that count, each with the rig in force when it was measured, or with ``rig``."""
-    topics = [*session.topics(Rig), *session.topics(Measurement)]
-    return measured_in_order(session.messages(topics), rig)
-
-
-def held_out_ids(measurements: Iterable[Measurement], request: Request) -> set[str]:
-    """The measurements that models are evaluated on."""
-    measurements = list(measurements)
-    if request.model_from is None:
-        return split(measurements, request.train, request.seed)[1] if measurements else set()
-    # A model of another log has seen none of these places, unless it was made of them: see evaluate_model.
-    labelled = any(m.splits for m in measurements)
-    return {m.id for m in measurements if "test" in m.splits or not labelled}
-
-
-def can_evaluate(session: Session, request: Request, model: str) -> bool:
-    """Whether there are places that a model is not fitted on, or enough of them for cross-validation."""
-    measurements = [place.measurement for place in measured(session, request.rig)]
-    enough = len(measurements) - -(-len(measurements) // FOLDS) >= min_pairs(model)
-    held_out = held_out_ids(measurements, request)
-    return bool(held_out) or (_fits_again(session, request, model) and enough)
-
-
-def _fits_again(session: Session, request: Request, model: str) -> bool:
-    """Whether a model is fitted to this log's places, so that it can be fitted to fewer of them."""
-    return request.model_from is None and copied_run(session, model) is None
-
-
-def _split_parameters(session: Session, request: Request) -> dict[str, str]:
-    """What the split depends on: the label, or the seed where nothing is labelled."""
-    labelled = any(m.splits for m in session.payloads(session.topics(Measurement)))
-    return {"train": request.train} if labelled else {"seed": str(request.seed)}
-
-
-def _pairs(session: Session, points: str, places: list[Measured], ids: set[str]) -> dict[str, list[Pair]]:
-    """The measured places with these ids, by camera."""
-    sightings = gather_sightings(session.messages(session.topics(CameraPoints, points)))
-    return build_pairs(sightings, [place for place in places if place.measurement.id in ids])
-
-
-def _unused(pairs: Mapping[str, list[Pair]], train: set[str]) -> list[str]:
-    """What was measured for nothing: places that no camera saw, cameras that saw no place."""
-    seen = {pair.measurement for found in pairs.values() for pair in found}
-    unseen = sorted(train - seen)
-    lines = [
-        f"camera {name} saw no measured place: it has no model" for name, found in pairs.items() if not found
-    ]
-    if unseen:
-        names = ", ".join(unseen[:5]) + (" ..." if len(unseen) > 5 else "")
-        lines.append(f"{len(unseen)} of {len(train)} measured places were seen still by no camera: {names}")
-    return lines

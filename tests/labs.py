@@ -2,13 +2,32 @@
 
 from __future__ import annotations
 
+from collections.abc import Callable, Iterator, Mapping
 from dataclasses import dataclass
 
 import numpy as np
 from numpy.typing import NDArray
 from scipy.spatial.transform import Rotation
 
-from ipsys_log.messages import Pair
+from ipsys_log.messages import (
+    MEASUREMENTS_TOPIC,
+    RIG_TOPIC,
+    CameraPoint,
+    CameraPoints,
+    Distance,
+    Floor,
+    Interval,
+    Measurement,
+    Message,
+    Pair,
+    ReferencePoint,
+    Rig,
+    RigCamera,
+    RigMarker,
+    Run,
+    WorldPoint,
+)
+from ipsys_log.units import NS_PER_S
 
 Array = NDArray[np.float64]
 
@@ -98,3 +117,52 @@ def pairs(points_m: Array, world_m: Array, covariances: Array, name: str = "m") 
         Pair(f"{name}{n:02d}", 0, point, world, 1, covariance)
         for n, (point, world, covariance) in enumerate(zip(points_m, world_m, covariances, strict=True))
     ]
+
+
+def session(
+    points_m: Mapping[str, Array],
+    world_m: Array,
+    rig: Rig,
+    distances: bool = False,
+    labels: Callable[[int], tuple[str, ...]] = lambda n: (),
+) -> Iterator[Message]:
+    """A log of measured places: what each camera saw of them (NaN: not seen), one place a second.
+
+    With ``distances`` a place is measured by the tape to A and B, else its world point is given.
+    """
+    start_ns = 1_700_000_000 * NS_PER_S
+    yield Message(RIG_TOPIC, start_ns, start_ns, rig)
+    for n, world in enumerate(world_m):
+        time_ns = start_ns + (n + 1) * NS_PER_S
+        for camera, points in points_m.items():
+            if np.isfinite(points[n]).all():
+                seen = CameraPoints(time_ns, (CameraPoint(0, *points[n].tolist()),))
+                topic = f"/runs/lab/cameras/{camera}/camera_points"
+                yield Message(topic, time_ns, time_ns, seen, camera)
+        to_ends = tuple(
+            Distance(name, float(np.hypot(*(world[:2] - end))), 0.003) for name, end in (("A", A), ("B", B))
+        )
+        measurement = Measurement(
+            time_ns,
+            f"m{n:02d}",
+            marker_id=0,
+            distances=to_ends if distances else (),
+            side=("left" if world[1] > A[1] else "right") if distances else None,
+            height_m=float(world[2]),
+            still=Interval(time_ns, time_ns),
+            point=None if distances else WorldPoint(*world.tolist()),
+            splits=labels(n),
+        )
+        yield Message(MEASUREMENTS_TOPIC, time_ns + 1, time_ns, measurement)
+    yield Message("/runs/lab/record", time_ns + 2, time_ns, Run(time_ns, "lab", "import"))
+
+
+RIG = Rig(
+    "lab",
+    "DICT_4X4_100",
+    0.2,
+    (RigMarker(0, robot="ada"),),
+    (RigCamera("red"),),
+    (ReferencePoint("A", *A.tolist()), ReferencePoint("B", *B.tolist())),
+    Floor(4.8768, 4.8768),
+)

@@ -62,7 +62,6 @@ def fit_model(
     for camera, places in cameras.items():
         _check_count(name, camera, places)
         _check_spread(name, camera, places.world_m)
-        _check_twins(camera, places)
     models = fit_cameras(name, cameras)
     without = _predict_without_groups(name, cameras, progress)
     fitted = []
@@ -110,19 +109,6 @@ def _check_spread(name: str, camera: str, targets: Array) -> None:
         raise FitError(
             f"camera {camera}: the {len(targets)} measured places lie on one line; measure some beside it"
         )
-
-
-def _check_twins(camera: str, places: Places) -> None:
-    """One pair entered twice counts double, and is known where it is held out."""
-    seen: dict[bytes, str] = {}
-    rows = np.hstack([places.points_m, places.world_m])
-    for name, row in zip(places.names, rows, strict=True):
-        twin = seen.setdefault(row.tobytes(), name)
-        if twin != name:
-            raise FitError(
-                f"camera {camera}: measurements {twin} and {name} are one and the same pair, to the last "
-                "digit; withdraw one of them"
-            )
 
 
 def _predict_without_groups(

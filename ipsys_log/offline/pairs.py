@@ -151,7 +151,8 @@ def build_pairs(
     Raises
     ------
     IpsysError
-        For a marker that is not in the rig or never seen, or a measurement that gives no point.
+        For a marker that is not in the rig or never seen, a measurement that gives no point, or a pair that
+        was entered twice.
     """
     cameras = sorted({camera for camera, _ in sightings})
     seen_ids = sorted({marker_id for _, marker_id in sightings})
@@ -173,7 +174,21 @@ def build_pairs(
                 mean_m, frames = found
                 row = (measurement.id, marker_id, mean_m, fixed.world_m, frames, fixed.covariance_m2)
                 pairs[camera].append(Pair(*row))
+    for camera, entered in pairs.items():
+        _check_twins(camera, entered)
     return pairs
+
+
+def _check_twins(camera: str, pairs: Iterable[Pair]) -> None:
+    """One pair entered twice counts double, and is known where it is held out."""
+    seen: dict[bytes, str] = {}
+    for pair in pairs:
+        twin = seen.setdefault(pair.camera_m.tobytes() + pair.world_m.tobytes(), pair.measurement)
+        if twin != pair.measurement:
+            raise IpsysError(
+                f"camera {camera}: measurements {twin} and {pair.measurement} are one and the same pair, to "
+                "the last digit; withdraw one of them"
+            )
 
 
 def _mean_point(

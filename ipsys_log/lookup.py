@@ -1,0 +1,130 @@
+"""What a log holds that models are made of: measured places, and models that were fitted or copied in."""
+
+from __future__ import annotations
+
+from collections.abc import Iterable, Mapping
+
+from ipsys_log.errors import IpsysError
+from ipsys_log.log.session import Session, run_of_topic
+from ipsys_log.messages import CameraPoints, Measurement, Model, Pair, Rig
+from ipsys_log.models import MODELS, create, min_pairs
+from ipsys_log.offline.crossval import FOLDS
+from ipsys_log.offline.pairs import Measured, build_pairs, gather_sightings, measured_in_order, split
+from ipsys_log.request import Request
+from ipsys_log.runs import complete_runs
+
+__all__ = [
+    "can_evaluate",
+    "copied_run",
+    "find_pairs",
+    "fits_again",
+    "fitted_in",
+    "held_out_ids",
+    "measured",
+    "split_parameters",
+    "unused_places",
+    "wanted_models",
+]
+
+
+def wanted_models(request: Request, until: str) -> tuple[str, ...]:
+    """The models to fit or apply.
+
+    Raises
+    ------
+    IpsysError
+        For a name that is not in the table, or a log that has no fitted model to apply.
+    """
+    for name in request.models:
+        create(name)
+    if request.models:
+        return request.models
+    if request.model_from is not None:
+        with Session([request.model_from]) as other:
+            held = {other.payloads([topic])[-1].name for topic in _model_topics(other)}
+            return ("poly" if "poly" in held else fitted_in(other, None)[0].name,)
+    return tuple(MODELS) if until == "evaluate" else ("poly",)
+
+
+def fitted_in(other: Session, name: str | None) -> tuple[Model, str]:
+    """The newest model in another log, of a name where one is given, and its topic.
+
+    Raises
+    ------
+    IpsysError
+        Where there is none.
+    """
+    for topic in reversed(_model_topics(other)):
+        model: Model = other.payloads([topic])[-1]
+        if name in (None, model.name):
+            return model, topic
+    what = f"model {name}" if name else "model"
+    raise IpsysError(f"{other}: has no fitted {what}; fit one there with: ipsys fit {other}")
+
+
+def _model_topics(session: Session) -> list[str]:
+    return [t for run in complete_runs(session) if run.stage == "fit" for t in session.topics(Model, run.run)]
+
+
+def copied_run(session: Session, model: str) -> str | None:
+    """The run of a model that was copied into a log without measurements, the newest one."""
+    if session.topics(Measurement):
+        return None
+    for topic in reversed(_model_topics(session)):
+        if session.payloads([topic])[-1].name == model:
+            return run_of_topic(topic)
+    return None
+
+
+def measured(session: Session, rig: Rig | None) -> list[Measured]:
+    """The measured places that count, each with the rig in force when it was measured, or with ``rig``."""
+    topics = [*session.topics(Rig), *session.topics(Measurement)]
+    return measured_in_order(session.messages(topics), rig)
+
+
+def held_out_ids(measurements: Iterable[Measurement], request: Request) -> set[str]:
+    """The measurements that models are evaluated on."""
+    measurements = list(measurements)
+    if request.model_from is None:
+        return split(measurements, request.train, request.seed)[1] if measurements else set()
+    # A model of another log has seen none of these places, unless it was made of them: see evaluate_model.
+    labelled = any(m.splits for m in measurements)
+    return {m.id for m in measurements if "test" in m.splits or not labelled}
+
+
+def can_evaluate(session: Session, request: Request, model: str) -> bool:
+    """Whether there are places that a model is not fitted on, or enough of them for cross-validation."""
+    measurements = [place.measurement for place in measured(session, request.rig)]
+    enough = len(measurements) - -(-len(measurements) // FOLDS) >= min_pairs(model)
+    held_out = held_out_ids(measurements, request)
+    return bool(held_out) or (fits_again(session, request, model) and enough)
+
+
+def fits_again(session: Session, request: Request, model: str) -> bool:
+    """Whether a model is fitted to this log's places, so that it can be fitted to fewer of them."""
+    return request.model_from is None and copied_run(session, model) is None
+
+
+def split_parameters(session: Session, request: Request) -> dict[str, str]:
+    """What the split depends on: the label, or the seed where nothing is labelled."""
+    labelled = any(m.splits for m in session.payloads(session.topics(Measurement)))
+    return {"train": request.train} if labelled else {"seed": str(request.seed)}
+
+
+def find_pairs(session: Session, points: str, places: list[Measured]) -> dict[str, list[Pair]]:
+    """What each camera saw of the measured places."""
+    sightings = gather_sightings(session.messages(session.topics(CameraPoints, points)))
+    return build_pairs(sightings, places)
+
+
+def unused_places(pairs: Mapping[str, list[Pair]], train: set[str]) -> list[str]:
+    """What was measured for nothing: places that no camera saw, cameras that saw no place."""
+    seen = {pair.measurement for found in pairs.values() for pair in found}
+    unseen = sorted(train - seen)
+    lines = [
+        f"camera {name} saw no measured place: it has no model" for name, found in pairs.items() if not found
+    ]
+    if unseen:
+        names = ", ".join(unseen[:5]) + (" ..." if len(unseen) > 5 else "")
+        lines.append(f"{len(unseen)} of {len(train)} measured places were seen still by no camera: {names}")
+    return lines

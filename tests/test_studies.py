@@ -1,0 +1,178 @@
+"""What a lab asks of a log: models beside one another, wrong places, and what cannot be answered."""
+
+from __future__ import annotations
+
+import json
+from dataclasses import replace
+from pathlib import Path
+
+import numpy as np
+import pytest
+import scipy.io
+
+from ipsys_log.log.session import Session
+from ipsys_log.messages import Message, Model, Positions, Rig, RigMarker
+from ipsys_log.output import write_log
+from ipsys_log.rig import rig_toml
+from tests import labs
+from tests.conftest import Ipsys
+
+
+def made(path: Path, seed: int = 0, count: int = 40, spoil: object = None, **options: object) -> Path:
+    """A log of one camera's places, with what ``spoil`` does to camera points and world points."""
+    rng = np.random.default_rng(seed)
+    world = labs.places(rng, count, heights=options.pop("heights", labs.HEIGHTS))  # type: ignore[arg-type]
+    points = labs.camera(rng).see(world, rng)
+    tape, _ = labs.measure(world, rng)
+    tape[:, 2] = world[:, 2]
+    if callable(spoil):
+        spoil(points, tape)
+    rig: Rig = options.pop("rig", labs.RIG)  # type: ignore[assignment]
+    write_log(path, labs.session({"red": points}, tape, rig, **options))  # type: ignore[arg-type]
+    return path
+
+
+def refused(ipsys: Ipsys, log: Path, *arguments: object) -> str:
+    """The one line that a command says; the log is as it was."""
+    before = log.read_bytes()
+    done = ipsys(*arguments[:1], log, *arguments[1:])
+    assert done.code == 1
+    assert log.read_bytes() == before
+    assert done.out == ""
+    assert len(done.err.strip().splitlines()) == 1
+    return done.err
+
+
+def test_one_pair_entered_twice(ipsys: Ipsys, tmp_path: Path) -> None:
+    def twice(points: np.ndarray, tape: np.ndarray) -> None:
+        points[7], tape[7] = points[3], tape[3]
+
+    log = made(tmp_path / "lab.mcap", spoil=twice)
+    said = refused(ipsys, log, "evaluate", "--model", "poly")
+    assert "m03 and m07 are one and the same pair" in said
+
+
+def test_places_on_a_line_too_few_and_none_at_all(ipsys: Ipsys, tmp_path: Path) -> None:
+    def on_a_line(points: np.ndarray, tape: np.ndarray) -> None:
+        tape[:, 1] = 0.5 * tape[:, 0]
+        tape[:, 2] = 0.0
+
+    log = made(tmp_path / "line.mcap", spoil=on_a_line)
+    assert "lie on one line" in refused(ipsys, log, "fit", "--model", "best")
+    few = made(tmp_path / "few.mcap", count=4)
+    assert "best needs at least 5" in refused(ipsys, few, "evaluate", "--model", "best")
+
+
+def test_nan_in_an_import_is_refused_and_nothing_is_written(ipsys: Ipsys, data: Path, tmp_path: Path) -> None:
+    folder = tmp_path / "imsel"
+    folder.mkdir()
+    for path in (data / "imsel").iterdir():
+        (folder / path.name).write_bytes(path.read_bytes())
+    training = scipy.io.loadmat(folder / "training_40.mat")
+    training["Xw_white"][11, 1] = np.nan
+    scipy.io.savemat(folder / "training_40.mat", {k: v for k, v in training.items() if k[0] != "_"})
+    done = ipsys("import", "imsel", folder, "-o", tmp_path / "x.mcap")
+    assert done.code == 1
+    assert "Xw_white" in done.err
+    assert not (tmp_path / "x.mcap").exists()
+
+
+def test_where_all_heights_are_equal_the_floor_is_what_can_be_learned(ipsys: Ipsys, tmp_path: Path) -> None:
+    log = made(tmp_path / "flat.mcap", heights=(0.1,))
+    done = ipsys("evaluate", log, "--model", "poly", "--model", "best", "--json")
+    assert "camera red: all measured places are 0.100 m high, so heights cannot be learned" in done.err
+    for name in ("poly", "best"):
+        validated = json.loads(done.out)["models"][name]["cameras"]["red"]["cross_validation"]
+        assert "3d" not in validated
+        assert validated["2d"]["mean_cm"] < 1.5
+    assert ipsys("locate", log, "--model", "best").code == 0
+    with Session([log]) as session:
+        for payload in session.payloads(session.topics(Positions, "best")):
+            assert payload.positions[0].z_m == pytest.approx(0.1, abs=1e-6)
+
+
+def test_a_model_that_is_told_the_height_needs_it_in_the_rig(ipsys: Ipsys, tmp_path: Path) -> None:
+    log = made(tmp_path / "lab.mcap")
+    said = refused(ipsys, log, "replay", "--model", "rayplane")
+    assert "marker 0 is carried" in said
+    assert "marker_height_m" in said
+    # The measured places have their heights: there is nothing to be told.
+    assert ipsys("evaluate", log, "--model", "rayplane").code == 0
+    rig = tmp_path / "lab.toml"
+    rig.write_text(rig_toml(replace(labs.RIG, markers=(RigMarker(0, robot="ada", height_m=0.12),))))
+    assert ipsys("replay", log, "--model", "rayplane", "--rig", rig).code == 0
+    with Session([log]) as session:
+        positions = session.payloads(session.topics(Positions, "rayplane"))
+    assert {round(p.positions[0].z_m, 9) for p in positions} == {0.12}
+    assert np.sqrt(positions[0].positions[0].covariance_m2[2, 2]) < 0.002
+
+
+def test_a_position_outside_the_measured_volume_says_so(tmp_path: Path) -> None:
+    from ipsys_log.messages import CameraPoint, CameraPoints
+    from ipsys_log.offline.fit import fit_model
+    from ipsys_log.stages.locate import Locate
+
+    rng = np.random.default_rng(0)
+    world, camera = labs.places(rng, 40), labs.camera(rng)
+    tape, covariances = labs.measure(world, rng)
+    locate = Locate(fit_model("best", {"red": labs.pairs(camera.see(world, rng), tape, covariances)}, 0))
+
+    def inside(*place_m: float) -> bool | None:
+        (seen,) = camera.see(np.array([place_m]), rng)
+        points = CameraPoints(1, (CameraPoint(0, *seen.tolist()),))
+        (found,) = locate(Message("t", 1, 1, points, "red"))
+        flag: bool | None = found.positions[0].inside
+        return flag
+
+    assert inside(2.4, 0.9, 0.1) is True
+    assert inside(2.4, 0.9, 0.5) is False  # above all that was measured
+    assert inside(2.4, -0.5, 0.1) is False
+    assert inside(5.2, 0.9, 0.1) is False
+
+
+def test_a_model_out_of_a_log_predicts_what_it_predicted(ipsys: Ipsys, tmp_path: Path) -> None:
+    """To 1e-9 m, for every model in the table, by way of the numbers in the log."""
+    from ipsys_log.models import MODELS, Places, fit_cameras, inputs
+    from ipsys_log.models.applied import AppliedModel
+
+    log = made(tmp_path / "lab.mcap", labels=lambda n: ("train",))
+    options = [option for name in MODELS for option in ("--model", name)]
+    assert ipsys("fit", log, *options).code == 0
+    with Session([log]) as session:
+        models: list[Model] = [
+            session.payloads([topic])[-1]
+            for run in session.runs()
+            for topic in session.topics(Model, run.run)
+        ]
+    assert {model.name for model in models} == set(MODELS)
+    for model in models:
+        (camera,) = model.cameras
+        points = np.array([pair.camera_m for pair in camera.pairs])
+        world = np.array([pair.world_m for pair in camera.pairs])
+        places = Places(points, world, tuple(pair.measurement for pair in camera.pairs))
+        fresh = fit_cameras(model.name, {"red": places})["red"]
+        np.testing.assert_allclose(
+            AppliedModel(model.name, camera).predict(points, world[:, 2]),
+            fresh.predict(inputs(model.name, points, world[:, 2])),
+            atol=1e-9,
+        )
+
+
+def test_a_wrong_side_is_found_named_and_put_right(ipsys: Ipsys, tmp_path: Path) -> None:
+    def other_side(points: np.ndarray, tape: np.ndarray) -> None:
+        tape[13, 1] = 2 * labs.A[1] - tape[13, 1]
+
+    log = made(tmp_path / "lab.mcap", spoil=other_side, distances=True)
+    done = ipsys("evaluate", log, "--model", "best", "--json")
+    (first, *_) = json.loads(done.out)["models"]["best"]["suspects"]
+    assert (first["measurement"], first["kind"]) == ("m13", "side")
+
+
+def test_the_authors_wrong_place_comes_first(ipsys: Ipsys, data: Path, tmp_path: Path) -> None:
+    """Training pair 11 of the white camera contradicts its neighbours by 8 to 14 cm."""
+    log = tmp_path / "imsel.mcap"
+    ipsys("import", "imsel", data / "imsel", "-o", log)
+    done = ipsys("evaluate", log, "--model", "poly", "--model", "best", "--json")
+    for found in json.loads(done.out)["models"].values():
+        assert found["suspects"][0]["measurement"] == "white_11"
+        assert 8 <= np.linalg.norm(found["suspects"][0]["residual_cm"]) <= 14

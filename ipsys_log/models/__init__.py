@@ -13,6 +13,8 @@ from numpy.typing import NDArray
 from sklearn.pipeline import Pipeline
 
 from ipsys_log.errors import FitError, IpsysError
+from ipsys_log.models.ann import NeuralNetwork
+from ipsys_log.models.kriging import Kriging
 from ipsys_log.models.poly import PolynomialRegression
 from ipsys_log.models.raydepth import RayDepth
 from ipsys_log.models.rayplane import RayPlane
@@ -32,14 +34,25 @@ __all__ = [
     "tied_cameras",
 ]
 
-# The paper's names are RT, PR and RT+PR; the hybrid feeds the first one's output to the second.
+# Those of the paper in the order of its tables: RT, PR, RT+PR, ANN, RT+ANN, KI, RT+KI, KR, RT+KR. A hybrid
+# feeds the first one's output to the second.
 MODELS: dict[str, Callable[[], Any]] = {
     "rigid": RigidTransform,
     "poly": PolynomialRegression,
-    "rigid+poly": lambda: Pipeline([("rigid", RigidTransform()), ("poly", PolynomialRegression())]),
+    "rigid+poly": lambda: _after_rigid("poly", PolynomialRegression()),
+    "ann": NeuralNetwork,
+    "rigid+ann": lambda: _after_rigid("ann", NeuralNetwork()),
+    "kriging": Kriging,
+    "rigid+kriging": lambda: _after_rigid("kriging", Kriging()),
+    "kriging-regression": lambda: Kriging(noisy=True),
+    "rigid+kriging-regression": lambda: _after_rigid("kriging-regression", Kriging(noisy=True)),
     "rayplane": RayPlane,
     "best": RayDepth,
 }
+
+
+def _after_rigid(name: str, second: Any) -> Pipeline:
+    return Pipeline([("rigid", RigidTransform()), (name, second)])
 
 
 def create(name: str) -> Any:

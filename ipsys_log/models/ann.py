@@ -1,0 +1,199 @@
+"""Small neural networks from the frame of a camera to the world (sect. 2.2.3 of the paper)."""
+
+from __future__ import annotations
+
+from typing import Any, ClassVar
+
+import numpy as np
+from numpy.typing import NDArray
+from sklearn.base import BaseEstimator, MultiOutputMixin, RegressorMixin
+from sklearn.utils.validation import check_is_fitted, validate_data
+
+from ipsys_log.models.scaling import spread
+
+__all__ = ["NeuralNetwork", "network", "train_networks"]
+
+Array = NDArray[np.float64]
+
+_NEURONS = 3
+_RESTARTS = 16
+_STEPS = 100
+# Of the weights that a network starts with.
+_FIRST_SIGMA = 0.7
+# How strongly a weight is drawn to zero beside the slopes of the neurons, which bend the function.
+_OTHERS_PULL = 0.01
+# Steps before the pull is adapted, and its bounds.
+_UNTIL_ADAPTED = 3
+_PULLS = (1e-8, 1e3)
+
+
+def network(weights: Array, inputs: Array) -> tuple[Array, Array]:
+    """Outputs of networks with one hidden layer of tanh neurons.
+
+    Parameters
+    ----------
+    weights : (b, h (d + 1) + h + 1), of b networks: each neuron's bias and d slopes, then the output's bias
+        and h slopes.
+    inputs : (n, d + 1), the first column ones.
+
+    Returns
+    -------
+    outputs : (b, n).
+    neurons : (b, h, n), what comes out of the hidden layer.
+    """
+    hidden, out = _parts(weights, inputs.shape[1])
+    neurons = np.tanh(hidden @ inputs.T)
+    return out[:, :1] + np.einsum("bh,bhn->bn", out[:, 1:], neurons), neurons
+
+
+def _parts(weights: Array, width: int) -> tuple[Array, Array]:
+    edge = _NEURONS * width
+    return weights[:, :edge].reshape(-1, _NEURONS, width), weights[:, edge:]
+
+
+def _slopes(weights: Array, inputs: Array, neurons: Array) -> Array:
+    """Derivatives of the outputs by the weights, (b, weights, n)."""
+    _, out = _parts(weights, inputs.shape[1])
+    bent = (1 - neurons**2) * out[:, 1:, None]
+    by_hidden = (bent[:, :, None] * inputs.T).reshape(len(weights), -1, len(inputs))
+    return np.concatenate([by_hidden, np.ones((len(weights), 1, len(inputs))), neurons], axis=1)
+
+
+def train_networks(inputs: Array, targets: Array, weights: Array) -> tuple[Array, Array]:
+    """Levenberg-Marquardt with a pull towards small weights that the data themselves choose.
+
+    Parameters
+    ----------
+    inputs : (n, d + 1), the first column ones, the others of unit variance.
+    targets : (b, n), of unit variance, one row for each network.
+    weights : (b, w), to start from.
+
+    Returns
+    -------
+    weights : (b, w).
+    evidence : (b,), logarithm of how likely the targets are, apart from a constant: it counts both misfit
+        and bending against a network, and the one with the greatest is to be taken.
+
+    References
+    ----------
+    MacKay, Neural Computation 1992 (3), 415 and 448; Foresee and Hagan, ICNN 1997.
+    """
+    count, width = targets.shape[1], weights.shape[1]
+    pull = _relative_pulls(inputs.shape[1], width)
+    strength, damping = np.full(len(weights), 1e-3), np.full(len(weights), 1e-2)
+    outputs, neurons = network(weights, inputs)
+    for step in range(_STEPS):
+        slopes = _slopes(weights, inputs, neurons)
+        curvature = slopes @ slopes.transpose(0, 2, 1)
+        misfit = ((outputs - targets) ** 2).sum(axis=1)
+        if step >= _UNTIL_ADAPTED:
+            strength = _adapted(strength, curvature, misfit, weights, pull, count)
+        cost = misfit + strength * (weights**2 @ pull)
+        gradient = np.einsum("bwn,bn->bw", slopes, outputs - targets) + strength[:, None] * pull * weights
+        damped = curvature + _diagonal(strength[:, None] * pull + damping[:, None])
+        tried = weights - np.linalg.solve(damped, gradient[:, :, None])[:, :, 0]
+        tried_outputs, tried_neurons = network(tried, inputs)
+        tried_cost = ((tried_outputs - targets) ** 2).sum(axis=1) + strength * (tried**2 @ pull)
+        better = tried_cost < cost
+        weights = np.where(better[:, None], tried, weights)
+        outputs = np.where(better[:, None], tried_outputs, outputs)
+        neurons = np.where(better[:, None, None], tried_neurons, neurons)
+        damping = np.clip(np.where(better, damping * 0.2, damping * 4), 1e-12, 1e8)
+    return weights, _evidence(weights, inputs, targets, strength, pull)
+
+
+def _relative_pulls(inputs: int, width: int) -> Array:
+    pull = np.full(width, _OTHERS_PULL)
+    bending = np.ones((_NEURONS, inputs), dtype=bool)
+    bending[:, 0] = False
+    pull[: bending.size][bending.reshape(-1)] = 1.0
+    return pull
+
+
+def _diagonal(values: Array) -> Array:
+    return values[:, :, None] * np.eye(values.shape[1])
+
+
+def _adapted(
+    strength: Array, curvature: Array, misfit: Array, weights: Array, pull: Array, count: int
+) -> Array:
+    """The pull at which noise and weights are as large as the data make them (MacKay 1992, eq. 2.21)."""
+    inverse = np.linalg.inv(curvature + _diagonal(strength[:, None] * pull + 1e-12))
+    determined = len(pull) - strength * np.einsum("bii,i->b", inverse, pull)
+    noise = misfit / np.maximum(count - determined, 0.1 * count)
+    size = weights**2 @ pull / np.maximum(determined, 1e-3)
+    adapted: Array = np.clip(noise / np.maximum(size, 1e-300), *_PULLS)
+    return adapted
+
+
+def _evidence(weights: Array, inputs: Array, targets: Array, strength: Array, pull: Array) -> Array:
+    outputs, neurons = network(weights, inputs)
+    slopes = _slopes(weights, inputs, neurons)
+    hessian = slopes @ slopes.transpose(0, 2, 1) + _diagonal(strength[:, None] * pull)
+    count, width = targets.shape[1], len(pull)
+    inverse = np.linalg.inv(hessian + 1e-12 * np.eye(width))
+    determined = width - strength * np.einsum("bii,i->b", inverse, pull)
+    misfit = ((outputs - targets) ** 2).sum(axis=1)
+    noise = np.maximum(misfit / np.maximum(count - determined, 0.1 * count), 1e-300)
+    cost = (misfit + strength * (weights**2 @ pull)) / noise
+    log_det = np.linalg.slogdet(hessian / noise[:, None, None])[1]
+    evidence: Array = -(cost + log_det - width * np.log(strength / noise) + count * np.log(noise)) / 2
+    return evidence
+
+
+class NeuralNetwork(MultiOutputMixin, RegressorMixin, BaseEstimator):  # type: ignore[misc]
+    """One network for each world coordinate: three tanh neurons and a linear output (fig. 4 of the paper).
+
+    Parameters
+    ----------
+    seed : of the weights that the networks start from; of 16 starts the one with the greatest evidence is
+        kept.
+
+    Attributes
+    ----------
+    centre_, scale_ : (d,), of the inputs.
+    target_centre_, target_scale_ : (outputs,)
+    weights_ : (outputs, 3 (d + 1) + 4), see :func:`network`.
+
+    Examples
+    --------
+    >>> x = np.linspace(-2, 2, 30)[:, None]
+    >>> model = NeuralNetwork().fit(x, np.tanh(x[:, 0]))
+    >>> bool(abs(model.predict(x) - np.tanh(x[:, 0])).max() < 0.01)
+    True
+    """
+
+    min_pairs: ClassVar[int] = 8
+    fitted: ClassVar[tuple[str, ...]] = ("centre_", "scale_", "target_centre_", "target_scale_", "weights_")
+
+    def __init__(self, seed: int = 0) -> None:
+        self.seed = seed
+
+    def fit(self, X: Any, y: Any) -> NeuralNetwork:
+        X, y = validate_data(
+            self, X, y, multi_output=True, y_numeric=True, dtype=np.float64, ensure_min_samples=2
+        )
+        targets = y.reshape(len(y), -1)
+        self._single = y.ndim == 1
+        self.centre_, self.scale_ = X.mean(axis=0), spread(X)
+        self.target_centre_, self.target_scale_ = targets.mean(axis=0), spread(targets)
+        scaled = ((targets - self.target_centre_) / self.target_scale_).T
+        inputs = self._inputs(X)
+        width = _NEURONS * inputs.shape[1] + _NEURONS + 1
+        first = np.random.default_rng(self.seed).normal(0.0, _FIRST_SIGMA, (_RESTARTS, width))
+        weights, evidence = train_networks(
+            inputs, np.repeat(scaled, _RESTARTS, axis=0), np.tile(first, (len(scaled), 1))
+        )
+        best = evidence.reshape(len(scaled), _RESTARTS).argmax(axis=1)
+        self.weights_ = weights.reshape(len(scaled), _RESTARTS, width)[np.arange(len(scaled)), best]
+        return self
+
+    def predict(self, X: Any) -> Array:
+        check_is_fitted(self)
+        X = validate_data(self, X, dtype=np.float64, reset=False)
+        scaled, _ = network(self.weights_, self._inputs(X))
+        values: Array = scaled.T * self.target_scale_ + self.target_centre_
+        return values[:, 0] if getattr(self, "_single", False) else values
+
+    def _inputs(self, X: Array) -> Array:
+        return np.hstack([np.ones((len(X), 1)), (X - self.centre_) / self.scale_])

@@ -1,0 +1,97 @@
+"""Small networks: their slopes, what they can learn, and the paper's figures."""
+
+from __future__ import annotations
+
+import warnings
+from pathlib import Path
+
+import numpy as np
+import pytest
+from scipy.optimize import approx_fprime
+from sklearn.exceptions import SkipTestWarning
+from sklearn.neural_network import MLPRegressor
+from sklearn.pipeline import Pipeline
+from sklearn.utils.estimator_checks import check_estimator
+
+from ipsys_log.models import create
+from ipsys_log.models.ann import NeuralNetwork, _slopes, network
+from ipsys_log.models.rigid import RigidTransform
+from tests.models.test_rays import authors_pairs, error_cm
+
+
+def test_three_tanh_neurons_and_a_linear_output() -> None:
+    """Fig. 4 of the paper, written out."""
+    rng = np.random.default_rng(0)
+    weights, x = rng.normal(size=16), rng.normal(size=(5, 3))
+    neurons = [np.tanh(weights[4 * k] + x @ weights[4 * k + 1 : 4 * k + 4]) for k in range(3)]
+    expected = weights[12] + sum(w * n for w, n in zip(weights[13:], neurons, strict=True))
+    found, _ = network(weights[None], np.column_stack([np.ones(5), x]))
+    np.testing.assert_allclose(found[0], expected, atol=1e-12)
+
+
+def test_its_slopes_are_those_of_finite_differences() -> None:
+    rng = np.random.default_rng(1)
+    weights, inputs = rng.normal(size=16), np.column_stack([np.ones(6), rng.normal(size=(6, 3))])
+    numeric = approx_fprime(weights, lambda w: network(w[None], inputs)[0][0], 1e-7)
+    found = _slopes(weights[None], inputs, network(weights[None], inputs)[1])
+    np.testing.assert_allclose(found[0].T, numeric, atol=1e-5)
+
+
+def test_it_learns_what_another_network_of_its_kind_says() -> None:
+    rng = np.random.default_rng(2)
+    x, elsewhere = rng.normal(size=(200, 3)), rng.normal(size=(200, 3))
+    teacher = MLPRegressor((3,), activation="tanh", solver="lbfgs", max_iter=2000, random_state=0)
+    teacher.fit(x, np.tanh(x[:, 0] - 0.5 * x[:, 1]) + 0.3 * x[:, 2])
+    found = NeuralNetwork().fit(x, teacher.predict(x)).predict(elsewhere)
+    assert np.abs(found - teacher.predict(elsewhere)).max() < 0.03
+
+
+def test_noise_alone_is_not_learned() -> None:
+    """The pull that the data choose: without it 16 weights make much of 40 numbers."""
+    rng = np.random.default_rng(3)
+    x, noise = rng.normal(size=(40, 3)), rng.normal(size=40)
+    assert NeuralNetwork().fit(x, noise).predict(x).std() < 0.6 * noise.std()
+
+
+def test_a_seed_gives_the_same_network_and_another_another() -> None:
+    rng = np.random.default_rng(4)
+    x = rng.normal(size=(40, 3))
+    y = np.sin(2 * x) + 0.1 * rng.normal(size=(40, 3))
+    one, same, other = (NeuralNetwork(seed).fit(x, y).predict(x) for seed in (0, 0, 1))
+    np.testing.assert_array_equal(one, same)
+    assert not np.array_equal(one, other)
+
+
+def test_it_keeps_scikit_learns_contract() -> None:
+    with warnings.catch_warnings():
+        warnings.simplefilter("ignore", SkipTestWarning)
+        check_estimator(NeuralNetwork())
+
+
+@pytest.mark.parametrize(("hybrid", "limit_cm"), [(False, 1.782), (True, 1.670)])
+def test_the_papers_figures(data: Path, hybrid: bool, limit_cm: float) -> None:
+    """Table I: means of ANN and RT+ANN over the three cameras, whatever the seed."""
+    means = []
+    for seed in range(5):
+        network_of_seed = NeuralNetwork(seed)
+        model = (
+            Pipeline([("rigid", RigidTransform()), ("ann", network_of_seed)]) if hybrid else network_of_seed
+        )
+        means.append(
+            np.mean([error_cm(model.fit(x, y).predict(u), v) for x, y, u, v in authors_pairs(data).values()])
+        )
+    assert means[0] <= limit_cm
+    assert np.median(means) <= limit_cm
+
+
+@pytest.mark.parametrize("subset", [10, 20, 30])
+def test_all_nine_methods_can_be_fitted_to_the_published_subsets(data: Path, subset: int) -> None:
+    import scipy.io
+
+    from ipsys_log.models import MODELS
+
+    training = scipy.io.loadmat(data / "imsel" / f"training_{subset}.mat")
+    for name in [name for name in MODELS if name not in ("rayplane", "best")]:
+        for camera in ("red", "white", "black"):
+            x, y = training[f"Xc_{camera}"] / 100, training[f"Xw_{camera}"] / 100
+            assert np.isfinite(create(name).fit(x, y).predict(x)).all(), (name, camera)

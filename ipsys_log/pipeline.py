@@ -34,6 +34,7 @@ from pathlib import Path
 from typing import Any
 
 import cv2
+from threadpoolctl import threadpool_limits
 
 from ipsys_log.log.session import Session
 from ipsys_log.lookup import wanted_models
@@ -165,7 +166,8 @@ def replay(
     models = wanted_models(request, until)
     check_inputs(paths, request, models, until)
     outcomes: list[Outcome] = []
-    with opened_target(paths, output) as (logs, target):
+    # The matrices are small: threads of BLAS would only wait for one another.
+    with opened_target(paths, output) as (logs, target), threadpool_limits(1, user_api="blas"):
 
         def do(stage: str, **given: str) -> str:
             """Do a stage, or find it done; the name of the run that holds it, if there is one."""

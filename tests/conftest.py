@@ -11,6 +11,9 @@ from typing import NamedTuple
 
 import pytest
 
+# As the pipeline does, and before numpy is there: small matrices, and one process for each core.
+os.environ.setdefault("OPENBLAS_NUM_THREADS", "1")
+
 from ipsys_log.cli import main
 from ipsys_log.output import write_log
 from ipsys_log.sources.simulator import LabSettings, simulate

@@ -26,7 +26,7 @@ _BESIDE_LINE_M = 0.03
 # Heights that differ by less are one: what a ruler and uneven boards give.
 _ONE_HEIGHT_M = 0.005
 # Groups of places that the uncertainty is found with, by leaving out one after the other.
-_GROUPS = 20
+_GROUPS = 10
 
 
 def fit_model(

@@ -34,7 +34,7 @@ def test_mean_and_variance_are_those_of_the_textbook(noisy: bool) -> None:
     theta = np.exp(model.logs_[0][:3] if noisy else np.repeat(model.logs_[0], 3))
 
     def correlation(a: np.ndarray, b: np.ndarray) -> np.ndarray:
-        return np.exp(-sum(theta[k] * (a[:, None, k] - b[None, :, k]) ** 2 for k in range(3)))
+        return np.asarray(np.exp(-((a[:, None] - b[None]) ** 2 * theta).sum(axis=2)))
 
     full = correlation(points, points) + (np.exp(model.logs_[0][3]) if noisy else 0.0) * np.eye(len(x))
     f, fq = (np.column_stack([np.ones(len(p)), p]) for p in (points, q))

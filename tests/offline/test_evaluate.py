@@ -239,13 +239,6 @@ def test_away_from_the_measured_places_a_position_is_less_certain() -> None:
     assert sizes[1] > 9 * sizes[0]
 
 
-def test_one_pair_entered_twice_is_refused() -> None:
-    found, _, _ = lab(6, 14)
-    twin = Pair("again", 0, found[3].camera_m, found[3].world_m, 1)
-    with pytest.raises(FitError, match="m03 and again are one and the same pair"):
-        fit_model("poly", {"red": [*found, twin]}, 0)
-
-
 def test_places_of_a_fold_too_few_to_fit_are_an_error() -> None:
     found, _, _ = lab(7, min_pairs("poly") + 1)
     with pytest.raises(FitError):

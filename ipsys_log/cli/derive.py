@@ -1,10 +1,12 @@
-"""The stages and ``ipsys replay``: derive channels from channels."""
+"""The stages and ``ipsys replay``: derive channels from channels, and say how accurate they are."""
 
 from __future__ import annotations
 
 import inspect
 import json
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Iterator, Mapping, Sequence
+from contextlib import contextmanager
+from functools import partial
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, Any, Optional
 
@@ -14,20 +16,22 @@ from ipsys_log.cli.console import console, progress_bar, remarks
 from ipsys_log.cli.options import AsJson, Calibrations, Logs, RigFile, cameras_of, load_calibrations
 
 if TYPE_CHECKING:
+    from ipsys_log.log.session import Session
+    from ipsys_log.report.accuracy import Accuracy
     from ipsys_log.request import Request
     from ipsys_log.runs import Outcome
 
-__all__ = ["add_commands"]
+__all__ = ["EVALUATE", "MORE", "add_commands", "build_command", "derived", "options_of"]
 
 _Path = Optional[Path]  # noqa: UP045
 
 # Every option of these commands: its type with its help, and its default.
-_OPTIONS: dict[str, tuple[Any, Any]] = {
+OPTIONS: dict[str, tuple[Any, Any]] = {
     "logs": (Logs, inspect.Parameter.empty),
     "model": (
         Annotated[
             Optional[list[str]],  # noqa: UP045
-            typer.Option("--model", metavar="NAME", help="rigid, poly or rigid+poly; repeat it for several."),
+            typer.Option("--model", metavar="NAME", help="Such as poly or best; repeat it for several."),
         ],
         None,
     ),
@@ -64,57 +68,65 @@ _OPTIONS: dict[str, tuple[Any, Any]] = {
         False,
     ),
     "plot": (Annotated[_Path, typer.Option(help="Draw the floor and the errors into a PNG.")], None),
+    "plots": (
+        Annotated[_Path, typer.Option(metavar="DIR", help="Write the paper's tables and figures, and more.")],
+        None,
+    ),
     "as_json": (AsJson, False),
 }
 _FRAMES = ("logs", "rig", "calibration", "run", "output", "skip_ambiguous", "as_json")
 _DETECT = tuple(name for name in _FRAMES if name != "calibration")
-_MODELS = tuple(name for name in _OPTIONS if name != "plot")
+_MODELS = tuple(name for name in OPTIONS if name not in ("plot", "plots"))
+EVALUATE = (*_MODELS, "plots")
 
-_MORE = "What it needs and the log does not hold yet is made first."
+MORE = "What it needs and the log does not hold yet is made first."
 _COMMANDS: dict[str, tuple[str, tuple[str, ...], str]] = {
     "replay": (
         "fuse",
-        tuple(_OPTIONS),
+        tuple(OPTIONS),
         "Run whatever a log lacks, from detect to fuse, append it, and print how accurate it is.",
     ),
     "detect": ("detect", _DETECT, "Find the markers in the frames."),
     "camera-frame": (
         "camera-frame",
         _FRAMES,
-        f"Put the markers into the frame of their camera (eq. 3 to 5 of the paper). {_MORE}",
+        f"Put the markers into the frame of their camera (eq. 3 to 5 of the paper). {MORE}",
     ),
-    "fit": ("fit", _MODELS, f"Fit models to the measured places (poly, unless you say which). {_MORE}"),
+    "fit": ("fit", _MODELS, f"Fit models to the measured places (poly, unless you say which). {MORE}"),
     "evaluate": (
         "evaluate",
-        _MODELS,
-        f"Say how far models are off on places held out: all models, unless you say which. {_MORE}",
+        EVALUATE,
+        f"Say how far models are off on places held out: all models, unless you say which. {MORE}",
     ),
-    "locate": ("locate", _MODELS, f"Apply a model: world positions for each camera. {_MORE}"),
-    "fuse": ("fuse", _MODELS, f"One pose per robot from all cameras that see it. {_MORE}"),
+    "locate": ("locate", _MODELS, f"Apply a model: world positions for each camera. {MORE}"),
+    "fuse": ("fuse", _MODELS, f"One pose per robot from all cameras that see it. {MORE}"),
 }
 
 
 def add_commands(app: typer.Typer) -> None:
     for name, (until, options, text) in _COMMANDS.items():
-        app.command(name, help=text)(_command(until, options))
+        app.command(name, help=text)(build_command(options_of(options), partial(_derive, until)))
 
 
-def _command(until: str, options: Sequence[str]) -> Callable[..., None]:
-    """A function with just these options, which does the stages up to ``until``."""
+def options_of(names: Sequence[str]) -> dict[str, tuple[Any, Any]]:
+    """Rows of the table of options."""
+    return {name: OPTIONS[name] for name in names}
 
-    def command(logs: list[Path], **given: Any) -> None:
-        output, as_json, plot = given.pop("output"), given.pop("as_json"), given.pop("plot", None)
-        _derive(logs, _request(logs, **given), until, output, as_json, plot)
+
+def build_command(options: Mapping[str, tuple[Any, Any]], work: Callable[..., None]) -> Callable[..., None]:
+    """A function with just these options, by name: type with help, and default."""
+
+    def command(**given: Any) -> None:
+        work(**given)
 
     keyword = inspect.Parameter.KEYWORD_ONLY
-    rows = {option: _OPTIONS[option] for option in options}
     command.__signature__ = inspect.Signature(  # type: ignore[attr-defined]
         [
             inspect.Parameter(key, keyword, default=value, annotation=kind)
-            for key, (kind, value) in rows.items()
+            for key, (kind, value) in options.items()
         ]
     )
-    command.__annotations__ = {key: kind for key, (kind, _) in rows.items()}
+    command.__annotations__ = {key: kind for key, (kind, _) in options.items()}
     return command
 
 
@@ -133,32 +145,74 @@ def _request(logs: list[Path], **given: Any) -> Request:
     )
 
 
-def _derive(
-    logs: list[Path], request: Request, until: str, output: Path | None, as_json: bool, plot: Path | None
-) -> None:
+@contextmanager
+def derived(
+    logs: list[Path], until: str, output: Path | None = None, **given: Any
+) -> Iterator[tuple[Session, list[Outcome], list[Accuracy]]]:
+    """Do the stages up to ``until``; the session with the results, what was done, and how accurate it is."""
     from ipsys_log.log.session import Session
     from ipsys_log.pipeline import replay
-    from ipsys_log.report.accuracy import accuracy_json, accuracy_tables, read_accuracy
+    from ipsys_log.report.accuracy import read_accuracy
 
     with progress_bar() as progress:
-        outcomes = replay(logs, request, until, output, progress)
+        outcomes = replay(logs, _request(logs, **given), until, output, progress)
     # A new log is only there if there was something to write.
     written = [output] if output is not None and output.exists() else []
     with Session([*logs, *written]) as session:
-        accuracies = read_accuracy(session, outcomes)
-        if plot is not None:
-            from ipsys_log.report.floor import draw_session
-
-            draw_session(session, accuracies, plot)
+        yield session, outcomes, read_accuracy(session, outcomes)
     _remark(outcomes, [*logs, *written][-1])
+
+
+def _derive(
+    until: str,
+    logs: list[Path],
+    as_json: bool,
+    plot: Path | None = None,
+    plots: Path | None = None,
+    **given: Any,
+) -> None:
+    from ipsys_log.report.files import check_file, check_folder
+
+    if plot is not None:
+        check_file(plot, "--plot", logs)
+    if plots is not None:
+        check_folder(plots, "--plots")
+    with derived(logs, until, **given) as (session, outcomes, accuracies):
+        drawn = _draw(session, accuracies, plot, plots)
+    _print(outcomes, accuracies, as_json)
+    for what in drawn:
+        remarks.print(what)
+
+
+def _draw(
+    session: Session, accuracies: Sequence[Accuracy], plot: Path | None, plots: Path | None
+) -> list[str]:
+    """Draw what was asked for; a line for each that says so."""
+    drawn = []
+    if plot is not None:
+        from ipsys_log.report.floor import draw_session
+
+        draw_session(session, accuracies, plot)
+        drawn.append(f"{plot} drawn")
+    if plots is not None:
+        from ipsys_log.report.findings import gather_findings
+        from ipsys_log.report.plots import write_plots
+
+        names = write_plots(gather_findings(session, accuracies), plots)
+        drawn.append(f"{plots} has {', '.join(names)}")
+    return drawn
+
+
+def _print(outcomes: Sequence[Outcome], accuracies: Sequence[Accuracy], as_json: bool) -> None:
+    from ipsys_log.report.accuracy import accuracy_json
+    from ipsys_log.report.tables import accuracy_tables
+
     if as_json:
         stages = [{"stage": o.stage, "run": o.run, "new": o.fresh, "messages": o.messages} for o in outcomes]
         print(json.dumps({**accuracy_json(accuracies), "stages": stages}, indent=2, allow_nan=False))  # noqa: T201
-    elif accuracies:
+    else:
         for table in accuracy_tables(accuracies):
             console.print(table)
-    if plot is not None:
-        remarks.print(f"{plot} drawn")
 
 
 def _remark(outcomes: list[Outcome], target: Path) -> None:
@@ -167,7 +221,8 @@ def _remark(outcomes: list[Outcome], target: Path) -> None:
         state = f"{outcome.messages} messages" if outcome.fresh else "up to date"
         remarks.print(f"{outcome.stage:<13} run {outcome.run:<16} {state}")
         for remark in outcome.remarks:
-            remarks.print(f"  {remark}", style="yellow")
+            # Names out of a log are not for rich to read as its markup.
+            remarks.print(f"  {remark}", style="yellow", markup=False)
     if any(outcome.fresh for outcome in outcomes):
         remarks.print(f"results are in {target}")
     else:

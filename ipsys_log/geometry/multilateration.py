@@ -20,7 +20,7 @@ Array = NDArray[np.float64]
 _BESIDE_LINE_M = 0.05
 _NEAREST_M = 1e-9
 _STEPS = 50
-_STEP_M = 1e-12
+_STEP_M = 1e-10
 
 
 class Trilaterated(NamedTuple):

@@ -20,6 +20,9 @@ __all__ = ["Slip", "possible_slips"]
 
 Array = NDArray[np.float64]
 
+# A prediction may lie a little below the floor; a marker does not.
+_LOWEST_M = -0.03
+
 
 @dataclass(frozen=True, slots=True)
 class Slip:
@@ -44,10 +47,23 @@ def possible_slips(measurement: Measurement, rig: Rig, predicted_m: Array) -> li
     -------
     Groups of slips, those of a group equally simple: a wrong side or two exchanged distances; both; one
     distance or the height, each such that it fits the prediction best.
+
+    Examples
+    --------
+    >>> from ipsys_log.messages import ReferencePoint
+    >>> points = (ReferencePoint("A", 0.0, 0.0), ReferencePoint("B", 2.0, 0.0))
+    >>> rig = Rig("lab", "DICT_4X4_100", 0.2, reference_points=points)
+    >>> tape = (Distance("A", 1.600), Distance("B", 1.414))
+    >>> read = Measurement(0, "a", distances=tape, side="left", height_m=0.0)
+    >>> slips = possible_slips(read, rig, np.array([1.0, 1.0, 0.0]))
+    >>> [[slip.kind for slip in group] for group in slips]
+    [['side', 'swapped'], ['swapped'], ['distance', 'distance', 'height']]
+    >>> slips[2][0].text
+    'the distance to A reads 1.600 m; 1.41 m, 19 cm less, would fit'
     """
     taped = _as_taped(measurement, rig)
     if taped is None:
-        return [[_height_slip(measurement, predicted_m)]]
+        return [_height_slips(measurement, predicted_m)]
     references_m = reference_points(taped, rig)
     sides = list(_side_slips(taped, references_m))
     swaps = list(_swaps(taped))
@@ -56,8 +72,10 @@ def possible_slips(measurement: Measurement, rig: Rig, predicted_m: Array) -> li
         for swap in swaps
         for side in _side_slips(swap.corrected, references_m)
     ]
-    wrong_numbers = [*_distance_slips(taped, references_m, predicted_m), _height_slip(taped, predicted_m)]
-    return [sides + swaps, both, wrong_numbers]
+    # A distance that nobody read comes from the world point.
+    says = "reads" if measurement.distances else "comes to"
+    distances = list(_distance_slips(taped, references_m, predicted_m, says))
+    return [sides + swaps, both, distances + _height_slips(taped, predicted_m)]
 
 
 def _as_taped(measurement: Measurement, rig: Rig) -> Measurement | None:
@@ -85,7 +103,8 @@ def _as_taped(measurement: Measurement, rig: Rig) -> Measurement | None:
 def _side_slips(taped: Measurement, references_m: Array) -> Iterator[Slip]:
     if taped.side in SIDES and sides_alike(references_m):
         other = "right" if taped.side == "left" else "left"
-        first, second = taped.distances[0].reference, taped.distances[1].reference
+        first = taped.distances[0].reference
+        second = next(tape.reference for tape in taped.distances if tape.reference != first)
         text = f"it lies {other} of the line from {first} to {second}, not {taped.side}"
         yield Slip("side", text, replace(taped, side=other))
 
@@ -104,7 +123,7 @@ def _swaps(taped: Measurement) -> Iterator[Slip]:
         yield Slip("swapped", text, replace(taped, distances=tuple(swapped)))
 
 
-def _distance_slips(taped: Measurement, references_m: Array, predicted_m: Array) -> Iterator[Slip]:
+def _distance_slips(taped: Measurement, references_m: Array, predicted_m: Array, says: str) -> Iterator[Slip]:
     for wrong, tape in enumerate(taped.distances):
         rest = [n for n in range(len(references_m)) if n != wrong]
         rest_m = np.array([taped.distances[n].distance_m for n in rest])
@@ -115,7 +134,7 @@ def _distance_slips(taped: Measurement, references_m: Array, predicted_m: Array)
         right_m = float(np.hypot(*(point_m - references_m[wrong])))
         off_m = right_m - tape.distance_m
         text = (
-            f"the distance to {tape.reference} reads {tape.distance_m:.3f} m; {right_m:.2f} m, "
+            f"the distance to {tape.reference} {says} {tape.distance_m:.3f} m; {right_m:.2f} m, "
             f"{_change(off_m)}, would fit"
         )
         tapes = [*taped.distances]
@@ -134,18 +153,19 @@ def _nearest(references_m: Array, distances_m: Array, predicted_m: Array) -> Arr
     return min(found, key=lambda point_m: float(np.hypot(*(point_m - predicted_m))))
 
 
-def _height_slip(measurement: Measurement, predicted_m: Array) -> Slip:
+def _height_slips(measurement: Measurement, predicted_m: Array) -> list[Slip]:
     height_m, right_m = measurement.height_m, float(predicted_m[2])
     point = measurement.point
-    if point is not None:
+    if point is None:
+        corrected = replace(measurement, height_m=right_m)
+    else:
         height_m = point.z_m
         corrected = replace(measurement, point=WorldPoint(point.x_m, point.y_m, right_m))
-    else:
-        corrected = replace(measurement, height_m=right_m)
-    assert height_m is not None  # it has a world point, so it has a height
+    if height_m is None or right_m < _LOWEST_M:
+        return []
     off_m = right_m - height_m
     text = f"the height reads {height_m:.3f} m; {right_m:.2f} m, {_change(off_m)}, would fit"
-    return Slip("height", text, corrected)
+    return [Slip("height", text, corrected)]
 
 
 def _change(off_m: float) -> str:

@@ -117,6 +117,13 @@ def reference_points(measurement: Measurement, rig: Rig) -> Array:
     ------
     IpsysError
         Where the rig lacks one.
+
+    Examples
+    --------
+    >>> from ipsys_log.messages import Distance, ReferencePoint
+    >>> rig = Rig("lab", "DICT_4X4_100", 0.2, reference_points=(ReferencePoint("A", 1.0, 2.0),))
+    >>> reference_points(Measurement(0, "a", distances=(Distance("A", 0.5),)), rig).tolist()
+    [[1.0, 2.0]]
     """
     known = {p.name: (p.x_m, p.y_m) for p in rig.reference_points}
     for distance in measurement.distances:
@@ -139,6 +146,16 @@ def flat_places(places: Iterable[Measured]) -> list[FlatPlace]:
     ------
     IpsysError
         See :func:`world_point`.
+
+    Examples
+    --------
+    >>> from ipsys_log.messages import Distance, ReferencePoint
+    >>> points = (ReferencePoint("A", 0.0, 0.0), ReferencePoint("B", 2.0, 0.0))
+    >>> rig = Rig("lab", "DICT_4X4_100", 0.2, reference_points=points, tape_sigma_m=0.003)
+    >>> tape = (Distance("A", 1.02), Distance("B", 1.02))
+    >>> place = Measured(Measurement(0, "a", distances=tape, side="left", height_m=0.0), rig)
+    >>> [(flat.id, round(flat.sigma_m, 4), round(flat.angle_deg, 1)) for flat in flat_places([place])]
+    [('a', 0.0108, 22.7)]
     """
     found = []
     for place in places:

@@ -1,12 +1,10 @@
-"""How accurate a session is: one summary, as JSON and as tables."""
+"""How accurate a session is: one summary, as it is read from a log and as JSON."""
 
 from __future__ import annotations
 
-from collections.abc import Iterable, Sequence
+from collections.abc import Sequence
 from dataclasses import dataclass
 from typing import Any
-
-from rich.table import Table
 
 from ipsys_log.log.session import Session
 from ipsys_log.messages import (
@@ -15,15 +13,18 @@ from ipsys_log.messages import (
     ErrorStatistics,
     Evaluation,
     LearningPoint,
+    Model,
     Suspect,
     Tracks,
 )
+from ipsys_log.models import MODELS, reads_height
 from ipsys_log.offline.errors import CROSS_VALIDATION, POOLED
 from ipsys_log.offline.truth import gather_tracks, track_errors
+from ipsys_log.report.advice import Advice, Choice, advise
 from ipsys_log.runs import Outcome
 from ipsys_log.units import CM_PER_M
 
-__all__ = ["Accuracy", "accuracy_json", "accuracy_tables", "read_accuracy"]
+__all__ = ["Accuracy", "accuracy_json", "gather_suspects", "read_accuracy"]
 
 
 @dataclass(frozen=True, slots=True)
@@ -56,41 +57,50 @@ def read_accuracy(session: Session, outcomes: Sequence[Outcome]) -> list[Accurac
             tracks = track_errors(
                 gather_tracks(session.messages(session.topics(Tracks, run))),
                 gather_tracks(session.messages([TRUTH_TOPIC])),
+                carried=_told_heights(session, run),
             )
         if evaluations or tracks is not None:
             found.append(Accuracy(run, evaluations[-1] if evaluations else None, tracks))
     return found
 
 
+def _told_heights(session: Session, run: str) -> bool:
+    models = session.payloads(session.topics(Model, run))
+    return bool(models) and models[-1].name in MODELS and reads_height(models[-1].name)
+
+
 def accuracy_json(accuracies: Sequence[Accuracy]) -> dict[str, Any]:
     """The summary as plain data, in cm.
 
     ``models -> cameras -> 3d / 2d`` on places held out, in each of these ``cross_validation`` and
-    ``truth`` where there are such; ``pooled`` has the same over all cameras.
+    ``truth`` where there are such; ``pooled`` has the same over all cameras. ``recommendation`` is there
+    where learning curves are.
     """
-    models: dict[str, Any] = {}
-    for accuracy in accuracies:
-        cameras: dict[str, Any] = {}
-        for row in (*accuracy.rows(False), *accuracy.rows(True)):
-            place = cameras.setdefault(row.camera, {})
-            if row.scheme == CROSS_VALIDATION:
-                place = place.setdefault("cross_validation", {})
-            if row.against != "tape":
-                place = place.setdefault(row.against, {})
-            place.update(_row_json(row))
-        found: dict[str, Any] = {"run": accuracy.run}
-        if POOLED in cameras:
-            found["pooled"] = cameras.pop(POOLED)
-        found["cameras"] = cameras
-        if accuracy.evaluation is not None:
-            found["learning_curve"] = [_learning_json(point) for point in accuracy.evaluation.learning]
-            found["suspects"] = [suspect_json(suspect) for suspect in accuracy.evaluation.suspects]
-        if accuracy.tracks is not None:
-            found["tracks"] = {
-                "truth": {"3d": _statistics(accuracy.tracks[0]), "2d": _statistics(accuracy.tracks[1])}
-            }
-        models[accuracy.model] = found
-    return {"models": models}
+    models = {accuracy.model: _model_json(accuracy) for accuracy in accuracies}
+    advice = advise([accuracy.evaluation for accuracy in accuracies if accuracy.evaluation])
+    return {"models": models} | ({"recommendation": _advice_json(advice)} if advice else {})
+
+
+def _model_json(accuracy: Accuracy) -> dict[str, Any]:
+    cameras: dict[str, Any] = {}
+    for row in (*accuracy.rows(False), *accuracy.rows(True)):
+        place = cameras.setdefault(row.camera, {})
+        if row.scheme == CROSS_VALIDATION:
+            place = place.setdefault("cross_validation", {})
+        if row.against != "tape":
+            place = place.setdefault(row.against, {})
+        place.update(_row_json(row))
+    found: dict[str, Any] = {"run": accuracy.run}
+    if POOLED in cameras:
+        found["pooled"] = cameras.pop(POOLED)
+    found["cameras"] = cameras
+    if accuracy.evaluation is not None:
+        found["learning_curve"] = [_learning_json(point) for point in accuracy.evaluation.learning]
+        found["suspects"] = [_suspect_json(suspect) for suspect in accuracy.evaluation.suspects]
+    if accuracy.tracks is not None:
+        space, floor = map(_statistics, accuracy.tracks)
+        found["tracks"] = {"truth": {"3d": space, "2d": floor}}
+    return found
 
 
 def _row_json(row: CameraEvaluation) -> dict[str, Any]:
@@ -134,7 +144,29 @@ def _learning_json(point: LearningPoint) -> dict[str, Any]:
     return found
 
 
-def suspect_json(suspect: Suspect) -> dict[str, Any]:
+def _advice_json(advice: Advice) -> dict[str, Any]:
+    """For each number of places and group of models the one to use, and the lowest, see :mod:`.advice`."""
+    return {
+        "subsets": "labelled" if advice.published else "random",
+        "errors": "3d" if advice.in_space else "2d",
+        "by_places": [
+            {"places": places} | {group: _choice_json(choice) for group, choice in choices.items()}
+            for places, choices in advice.choices.items()
+        ],
+        "sentences": list(advice.sentences),
+    }
+
+
+def _choice_json(choice: Choice) -> dict[str, Any]:
+    return {
+        "use": choice.model,
+        "mean_cm": choice.mean_m * CM_PER_M,
+        "lowest": choice.lowest,
+        "lowest_mean_cm": choice.lowest_mean_m * CM_PER_M,
+    }
+
+
+def _suspect_json(suspect: Suspect) -> dict[str, Any]:
     found: dict[str, Any] = {
         "measurement": suspect.measurement,
         "cameras": list(suspect.cameras),
@@ -148,99 +180,6 @@ def suspect_json(suspect: Suspect) -> dict[str, Any]:
     if suspect.corrected_m is not None:
         found["corrected_m"] = suspect.corrected_m.tolist()
     return found
-
-
-def accuracy_tables(accuracies: Sequence[Accuracy]) -> list[Table]:
-    """The summary as tables of at most 80 columns; of many models only all cameras together."""
-    tables = []
-    if any(accuracy.rows(False) or accuracy.tracks for accuracy in accuracies):
-        tables.append(_held_out_table(accuracies))
-    if any(accuracy.rows(True) for accuracy in accuracies):
-        tables.append(_cross_validation_table(accuracies))
-    if any(accuracy.evaluation and accuracy.evaluation.suspects for accuracy in accuracies):
-        tables.append(_suspects_table(accuracies))
-    return tables
-
-
-def _table(title: str, names: Iterable[str], figures: Iterable[str]) -> Table:
-    table = Table(title=title, title_justify="left", box=None, pad_edge=False, padding=(0, 1, 0, 0))
-    for column in names:
-        # The longest name of a model goes on in a second line.
-        table.add_column(column, overflow="fold", max_width=16)
-    for column in figures:
-        table.add_column(column, justify="right")
-    return table
-
-
-def _held_out_table(accuracies: Sequence[Accuracy]) -> Table:
-    figures = ("n", "3D mean", "min", "max", "std", "2D mean", "max")
-    table = _table("Errors in cm, on places held out", ("model", "camera", "against"), figures)
-    for accuracy in accuracies:
-        lines = [
-            (row.camera, row.against, *_cells(row.error_3d, row.error_2d))
-            for row in accuracy.rows(False)
-            if row.camera != POOLED
-        ]
-        if accuracy.tracks is not None:
-            lines.append(("(tracks)", "truth", *_cells(*accuracy.tracks)))
-        for number, line in enumerate(lines):
-            table.add_row("" if number else accuracy.model, *line)
-    return table
-
-
-def _cells(error_3d: ErrorStatistics | None, error_2d: ErrorStatistics) -> list[str]:
-    in_space = (error_3d.mean_m, error_3d.min_m, error_3d.max_m, error_3d.std_m) if error_3d else (None,) * 4
-    return [str(error_2d.count), *map(_cm, (*in_space, error_2d.mean_m, error_2d.max_m))]
-
-
-def _cm(value_m: float | None) -> str:
-    return "-" if value_m is None else f"{value_m * CM_PER_M:.3f}"
-
-
-def _cross_validation_table(accuracies: Sequence[Accuracy]) -> Table:
-    figures = ("n", "3D mean", "95 % CI", "p50", "p95", "max", "2D mean")
-    title = "By cross-validation, in cm: each place predicted by models that were not fitted on it"
-    table = _table(title, ("model", "camera", "against"), figures)
-    for accuracy in accuracies:
-        rows = accuracy.rows(True)
-        if len(accuracies) > 1 and any(row.camera == POOLED for row in rows):
-            rows = [row for row in rows if row.camera == POOLED]
-        for row in rows:
-            errors = row.error_3d or row.error_2d
-            space = row.error_3d is not None
-            table.add_row(
-                accuracy.model,
-                row.camera or "(all)",
-                row.against,
-                str(errors.count),
-                _cm(errors.mean_m if space else None),
-                _interval(errors) if space else "-",
-                *(_cm(v if space else None) for v in (errors.median_m, errors.p95_m, errors.max_m)),
-                _cm(row.error_2d.mean_m),
-            )
-        if len(accuracies) == 1:
-            table.add_section()
-    return table
-
-
-def _interval(errors: ErrorStatistics) -> str:
-    if errors.mean_low_m is None or errors.mean_high_m is None:
-        return "-"
-    return f"{errors.mean_low_m * CM_PER_M:.2f}-{errors.mean_high_m * CM_PER_M:.2f}"
-
-
-def _suspects_table(accuracies: Sequence[Accuracy]) -> Table:
-    """Each suspect once, with the models that say so."""
-    table = _table("Suspect measurements, the worst first: measure these again", ("place",), ())
-    table.add_column("off by cm", justify="right")
-    table.add_column("found by")
-    table.add_column("what would explain it", overflow="fold")
-    for suspect, models in gather_suspects(accuracies):
-        length_cm = float((suspect.residual_m**2).sum() ** 0.5) * CM_PER_M
-        table.add_row(
-            suspect.measurement, f"{length_cm:.1f}", ", ".join(models), suspect.text or "nothing simple"
-        )
-    return table
 
 
 def gather_suspects(accuracies: Sequence[Accuracy]) -> list[tuple[Suspect, list[str]]]:

@@ -42,8 +42,14 @@ class _Row:
     statistics: ErrorStatistics
 
 
+def _in_space(accuracies: Sequence[Accuracy]) -> bool:
+    """Whether heights could be learned; else all errors are those on the floor."""
+    return all(row.error_3d is not None for accuracy in accuracies for row in accuracy.rows(False))
+
+
 def _rows(accuracies: Sequence[Accuracy]) -> list[_Row]:
     rows = []
+    in_space = _in_space(accuracies)
     for accuracy in accuracies:
         evaluation = accuracy.evaluation
         model = evaluation.model if evaluation else accuracy.run
@@ -54,13 +60,14 @@ def _rows(accuracies: Sequence[Accuracy]) -> list[_Row]:
             else f"{model} ({accuracy.run})"
         )
         for row in accuracy.rows(False):
-            if row.camera == POOLED or row.error_3d is None:
+            errors = row.error_3d if in_space else row.error_2d
+            if row.camera == POOLED or errors is None:
                 continue
             offsets_m = np.array([r.predicted_m - r.world_m for r in row.residuals]).reshape(-1, 3)
-            errors_cm = np.linalg.norm(offsets_m, axis=1) * CM_PER_M
-            rows.append(_Row(name, row.camera, row.against, errors_cm, row.error_3d))
+            errors_cm = np.linalg.norm(offsets_m[:, : 3 if in_space else 2], axis=1) * CM_PER_M
+            rows.append(_Row(name, row.camera, row.against, errors_cm, errors))
         if accuracy.tracks is not None:
-            rows.append(_Row(name, _TRACKS, "truth", np.zeros(0), accuracy.tracks[0]))
+            rows.append(_Row(name, _TRACKS, "truth", np.zeros(0), accuracy.tracks[0 if in_space else 1]))
     return rows
 
 
@@ -100,7 +107,8 @@ def draw_errors(
     axes.set_yticks(heights, [_name(row) for row in rows], fontsize=size)
     _name_models(axes, rows, heights, size, bar_in)
     _print_figures(axes, rows, heights, size)
-    axes.set_title("Errors in space on held-out places", loc="left", fontsize=10, pad=size + 12)
+    where = "in space" if _in_space(accuracies) else "on the floor"
+    axes.set_title(f"Errors {where} on held-out places", loc="left", fontsize=10, pad=size + 12)
     axes.annotate(
         _note(rows), (0, 0), (0, -38), xycoords="axes fraction", textcoords="offset points", fontsize=8,
         color="#505050", va="top",

@@ -16,8 +16,10 @@ from ipsys_log.offline.places import measured_places
 from ipsys_log.offline.truth import gather_tracks
 from ipsys_log.report.accuracy import Accuracy
 from ipsys_log.report.errors_panel import count_rows, draw_errors
+from ipsys_log.report.files import write_files
 from ipsys_log.report.floor_panel import Scene, draw_floor
 from ipsys_log.report.palette import camera_styles
+from ipsys_log.report.pictures import png
 from ipsys_log.runs import newest_run
 from ipsys_log.sinks.shown import rig_in_force
 
@@ -66,12 +68,7 @@ def draw_session(session: Session, accuracies: Sequence[Accuracy], path: Path) -
     )  # fmt: skip
     if rows:
         draw_errors(figure, accuracies, styles, left_in=7.3, top_in=_TOP_IN)
-    partial = path.with_name(path.name + ".partial")
-    try:
-        figure.savefig(partial, format="png")
-        partial.replace(path)
-    finally:
-        partial.unlink(missing_ok=True)
+    write_files(path.parent, {path.name: png(figure, _DPI)})
 
 
 def _gather(session: Session, accuracies: Sequence[Accuracy]) -> Scene:

@@ -5,23 +5,28 @@ from __future__ import annotations
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from itertools import islice
+from typing import Any
 
 import numpy as np
 from matplotlib.axes import Axes
 from matplotlib.patches import Rectangle
+from matplotlib.quiver import Quiver
 from matplotlib.ticker import MultipleLocator
 from numpy.typing import NDArray
 
-from ipsys_log.messages import CameraEvaluation, Evaluation, Rig
+from ipsys_log.messages import CameraEvaluation, Evaluation, ReferencePoint, Rig
 from ipsys_log.offline.errors import CROSS_VALIDATION
 from ipsys_log.offline.places import Place
-from ipsys_log.report.palette import REST, robot_colour
+from ipsys_log.report.palette import GRID, REST, robot_colour
+from ipsys_log.report.pictures import shorten
+from ipsys_log.units import CM_PER_M
 
-__all__ = ["Scene", "draw_floor"]
+__all__ = ["Scene", "draw_arrows", "draw_floor", "draw_ground", "draw_key", "exaggeration"]
 
 _GRID_M = 0.5
 # Arrows are drawn so much longer that most of them span less than this part of the floor.
 _ARROW_SHARE = 0.1
+_KEY_SHARE = 0.03
 _FACTORS = (1, 2, 5, 10, 20, 50, 100, 200, 500)
 _MOST_ROBOTS = 6
 
@@ -54,38 +59,52 @@ def draw_floor(axes: Axes, scene: Scene, styles: Mapping[str, tuple[str, str]]) 
     ----------
     styles : colour and marker shape by camera.
     """
-    _draw_ground(axes, scene)
+    around_m = [place.point_m[:2] for place in scene.places]
+    if not around_m and not (scene.rig and scene.rig.floor):
+        lines = (*scene.tracks.values(), *scene.truth.values())
+        around_m = [line[~np.isnan(line).any(axis=1)] for line in lines]
+    draw_ground(axes, scene.rig, around_m)
     _draw_tracks(axes, scene)
     _draw_places(axes, scene)
     title = _draw_errors(axes, scene, styles)
     axes.set_title(title, loc="left", fontsize=10)
 
 
-def _draw_ground(axes: Axes, scene: Scene) -> None:
-    floor = scene.rig.floor if scene.rig else None
-    points_m = [place.point_m[:2] for place in scene.places]
+def draw_ground(axes: Axes, rig: Rig | None, around_m: Sequence[NDArray[np.float64]]) -> None:
+    """Draw the floor to scale with its reference points.
+
+    Parameters
+    ----------
+    rig : for floor and points; without one the picture has room for what is in ``around_m``.
+    around_m : points (2,) or (n, 2) on the floor that are to be seen.
+    """
+    floor = rig.floor if rig else None
+    points_m = [*around_m]
     if floor is not None:
         axes.add_patch(
             Rectangle((0, 0), floor.width_m, floor.depth_m, fill=False, ec="black", lw=1.5, zorder=1)
         )
         points_m += [np.zeros(2), np.array([floor.width_m, floor.depth_m])]
-    if not points_m:
-        points_m = [
-            line[~np.isnan(line).any(axis=1)] for line in (*scene.tracks.values(), *scene.truth.values())
-        ]
-    around_m = np.vstack(points_m)
-    low, high = around_m.min(axis=0), around_m.max(axis=0)
+    together_m = np.vstack(points_m)
+    low, high = together_m.min(axis=0), together_m.max(axis=0)
     # A square part of the world in square axes keeps the scale the same both ways.
     middle, half = (low + high) / 2, max(0.54 * (high - low).max(), 0.25)
     axes.set(xlim=(middle[0] - half, middle[0] + half), ylim=(middle[1] - half, middle[1] + half))
     axes.set(aspect="equal", xlabel="x in m", ylabel="y in m")
     axes.xaxis.set_major_locator(_steps(half))
     axes.yaxis.set_major_locator(_steps(half))
-    axes.grid(color="#E6E6E6", lw=0.7)
+    axes.grid(color=GRID, lw=0.7)
     axes.set_axisbelow(True)
-    for point in scene.rig.reference_points if scene.rig else ():
+    _draw_references(axes, rig.reference_points if rig else ())
+
+
+def _draw_references(axes: Axes, points: Sequence[ReferencePoint]) -> None:
+    for point in points:
         axes.plot(point.x_m, point.y_m, "+", color="black", ms=11, mew=1.6, zorder=5)
-        axes.annotate(point.name, (point.x_m, point.y_m), (5, 5), textcoords="offset points", weight="bold")
+        axes.annotate(
+            shorten(point.name), (point.x_m, point.y_m), (5, 5), textcoords="offset points", weight="bold",
+            parse_math=False, clip_on=True, in_layout=False,
+        )  # fmt: skip
 
 
 def _steps(half_m: float) -> MultipleLocator:
@@ -128,23 +147,49 @@ def _draw_errors(axes: Axes, scene: Scene, styles: Mapping[str, tuple[str, str]]
     rows = scene.rows()
     if not rows or scene.evaluation is None:
         return f"The floor, tracks of run {scene.run}" if scene.tracks else "The floor"
-    factor = _factor(rows, axes.get_xlim()[1] - axes.get_xlim()[0])
+    residuals = [residual for row in rows for residual in row.residuals]
+    factor = exaggeration([r.predicted_m - r.world_m for r in residuals], axes)
     for row in rows:
         colour, shape = styles[row.camera]
         start_m = np.array([residual.world_m[:2] for residual in row.residuals])
         error_m = np.array([residual.predicted_m[:2] for residual in row.residuals]) - start_m
         axes.plot(*start_m.T, shape, color=colour, ms=4.5, zorder=4, label=f"held out, {row.camera}")
-        arrows = axes.quiver(
-            *start_m.T, *error_m.T, color=colour, angles="xy", scale_units="xy", scale=1 / factor,
-            width=0.0035, headwidth=4, headlength=5, headaxislength=4.5, minlength=0, zorder=4,
-        )  # fmt: skip
-    axes.quiverkey(arrows, 0.93, 1.028, 0.01, "1 cm", labelpos="W", coordinates="axes", color="black")
+        arrows = draw_arrows(axes, start_m, error_m, factor, color=colour)
+    draw_key(axes, arrows, factor)
     times = f", drawn {factor} times as long" if factor > 1 else ""
     return f"Errors of {scene.evaluation.model} on held-out places{times}"
 
 
-def _factor(rows: Sequence[CameraEvaluation], span_m: float) -> int:
-    lengths_m = [np.linalg.norm((r.predicted_m - r.world_m)[:2]) for row in rows for r in row.residuals]
-    usual_m = float(np.quantile(lengths_m, 0.9))
+def exaggeration(errors_m: Sequence[NDArray[np.float64]], axes: Axes) -> int:
+    """How many times as long errors (n, 2 or 3) are drawn, so that most of them are seen and none covers
+    much of the floor."""
+    span_m = axes.get_xlim()[1] - axes.get_xlim()[0]
+    usual_m = float(np.quantile(np.linalg.norm(np.array(errors_m)[:, :2], axis=1), 0.9))
     fitting = [factor for factor in _FACTORS if factor * usual_m <= _ARROW_SHARE * span_m]
     return fitting[-1] if fitting else 1
+
+
+def draw_arrows(
+    axes: Axes,
+    start_m: NDArray[np.float64],
+    error_m: NDArray[np.float64],
+    factor: int,
+    *values: Any,
+    **look: Any,
+) -> Quiver:
+    """Draw errors (n, 2) at places (n, 2), so many times as long; ``values`` (n,) give them a colour each."""
+    return axes.quiver(
+        *start_m.T, *error_m.T, *values, angles="xy", scale_units="xy", scale=1 / factor, width=0.0035,
+        headwidth=4, headlength=5, headaxislength=4.5, minlength=0, zorder=4, **look,
+    )  # fmt: skip
+
+
+def draw_key(axes: Axes, arrows: Quiver, factor: int) -> None:
+    """An arrow at the top right of the axes that says how long 1 cm, or some more, is drawn."""
+    span_m = axes.get_xlim()[1] - axes.get_xlim()[0]
+    size_cm = next((cm for cm in (1, 2, 5, 10, 20) if factor * cm / CM_PER_M > _KEY_SHARE * span_m), 50)
+    length_m = size_cm / CM_PER_M
+    axes.quiverkey(
+        arrows, 0.99 - factor * length_m / span_m / 2, 1.028, length_m, f"{size_cm} cm", labelpos="W",
+        coordinates="axes", color="black",
+    )  # fmt: skip

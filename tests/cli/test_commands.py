@@ -16,7 +16,7 @@ from tests.conftest import ROOT, Ipsys
 
 COMMANDS = [
     "init", "simulate", "import imsel", "import images", "replay", "detect", "camera-frame", "fit",
-    "evaluate", "locate", "fuse", "info", "runs", "view", "repair",
+    "evaluate", "locate", "fuse", "report", "info", "runs", "view", "repair",
 ]  # fmt: skip
 
 
@@ -99,6 +99,20 @@ def test_info_fits_80_columns(ipsys: Ipsys, lab: Path, monkeypatch: pytest.Monke
     for command in ("info", "runs"):
         done = ipsys(command, lab.name)
         assert max(len(line) for line in done.out.splitlines()) <= 80, done.out
+
+
+def test_evaluate_fits_80_columns(ipsys: Ipsys, lab: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    """In the terminal itself, with what a simulated lab has besides: the truth."""
+    monkeypatch.setenv("COLUMNS", "80")
+    done = ipsys("evaluate", lab, "--model", "rigid", "--model", "poly", "--model", "rigid+poly")
+    assert done.code == 0, done.err
+    assert max(len(line) for line in done.out.splitlines()) <= 80, done.out
+    for title in (
+        "Errors in cm, on places held out",
+        "By cross-validation",
+        "Which model with how many places",
+    ):
+        assert title in done.out
 
 
 def test_runs_say_where_they_come_from(ipsys: Ipsys, lab: Path) -> None:

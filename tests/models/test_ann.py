@@ -34,7 +34,7 @@ def test_its_slopes_are_those_of_finite_differences() -> None:
     weights, inputs = rng.normal(size=16), np.column_stack([np.ones(6), rng.normal(size=(6, 3))])
 
     def outputs(flat: np.ndarray) -> np.ndarray:
-        return network(flat[None], inputs)[0][0]
+        return np.asarray(network(flat[None], inputs)[0][0])
 
     numeric = approx_fprime(weights, outputs, 1e-7)
     found = _slopes(weights[None], inputs, network(weights[None], inputs)[1])
@@ -44,7 +44,9 @@ def test_its_slopes_are_those_of_finite_differences() -> None:
 def test_it_learns_what_another_network_of_its_kind_says() -> None:
     rng = np.random.default_rng(2)
     x, elsewhere = rng.normal(size=(200, 3)), rng.normal(size=(200, 3))
-    teacher = MLPRegressor(hidden_layer_sizes=(3,), activation="tanh", solver="lbfgs", max_iter=2000, random_state=0)
+    teacher = MLPRegressor(
+        hidden_layer_sizes=(3,), activation="tanh", solver="lbfgs", max_iter=2000, random_state=0
+    )
     teacher.fit(x, np.tanh(x[:, 0] - 0.5 * x[:, 1]) + 0.3 * x[:, 2])
     found = NeuralNetwork().fit(x, teacher.predict(x)).predict(elsewhere)
     assert np.abs(found - teacher.predict(elsewhere)).max() < 0.03

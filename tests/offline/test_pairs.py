@@ -87,6 +87,22 @@ def test_a_pair_is_the_mean_over_the_still_interval() -> None:
     np.testing.assert_array_equal(pair.world_m, [1, 2, 3])
 
 
+def test_a_pair_knows_how_well_its_place_is_known() -> None:
+    sightings = gather_sightings(seen(*still(0, 1, 0.5)))
+    corner = (Distance("A", 2.0, 0.003), Distance("B", 2.0 * 2**0.5, 0.003))
+    taped = Measurement(
+        0, "a", marker_id=0, distances=corner, side="left", height_m=0.1, height_sigma_m=0.002
+    )
+    pair = build_pairs(sightings, [Measured(taped, RIG)])["red"][0]
+    np.testing.assert_allclose(pair.world_m, [0, 2, 0.1], atol=1e-9)
+    assert pair.world_covariance_m2 is not None
+    # A at a right angle to the floor's edge knows y; B, at 45 degrees, adds x.
+    sigmas_m = np.sqrt(pair.world_covariance_m2.diagonal())
+    np.testing.assert_allclose(sigmas_m, [0.003 * 3**0.5, 0.003, 0.002], rtol=1e-9)
+    given_point = Measurement(0, "b", marker_id=0, point=WorldPoint(1, 2, 0))
+    assert build_pairs(sightings, [Measured(given_point, RIG)])["red"][0].world_covariance_m2 is None
+
+
 def test_a_camera_that_did_not_see_a_place_has_no_pair_of_it() -> None:
     messages = seen(*still(0, 1, 0.5)) + seen(*still(50, 51, 0.5), camera="black")
     measured = Measurement(S // 2, "a", marker_id=0, point=WorldPoint(1, 2, 0))

@@ -31,7 +31,7 @@ from ipsys_log.messages import (
     Tracks,
     WorldPoint,
 )
-from ipsys_log.offline.evaluate import error_statistics
+from ipsys_log.offline.statistics import error_statistics
 from ipsys_log.output import write_log
 from ipsys_log.report.accuracy import Accuracy
 from ipsys_log.report.errors_panel import count_rows, draw_errors

@@ -1,0 +1,186 @@
+"""Where to measure next: ``ipsys plan``."""
+
+from __future__ import annotations
+
+import json
+import math
+from collections.abc import Sequence
+from pathlib import Path
+from typing import TYPE_CHECKING, Annotated, Any, Optional
+
+import typer
+
+from ipsys_log.cli.console import console, remarks
+from ipsys_log.cli.derive import derived
+from ipsys_log.cli.options import AsJson, Calibrations, Logs, RigFile, cameras_of, load_calibrations
+
+if TYPE_CHECKING:
+    from rich.table import Table
+
+    from ipsys_log.messages import Rig
+    from ipsys_log.report.plan_picture import PlannedFloor
+
+__all__ = ["add_commands"]
+
+_MOST_PLACES = 50
+# Without a floor in the rig, no marker is carried higher than this.
+_HIGHEST_M = 5.0
+
+Places = Annotated[int, typer.Option(metavar="N", help="How many places.")]
+Model = Annotated[str, typer.Option(metavar="NAME", help="The model that is to become better.")]
+Heights = Annotated[
+    Optional[list[float]],  # noqa: UP045
+    typer.Option(
+        "--height-m",
+        metavar="METRES",
+        help="Of the marker above the floor; repeat for several. Else the heights used so far, in turn.",
+    ),
+]
+Train = Annotated[str, typer.Option(help="Fit on the measurements with this label.")]
+Plot = Annotated[
+    Path | None, typer.Option(metavar="FILE", help="Draw the error over the floor, before and after: PNG.")
+]
+
+
+def add_commands(app: typer.Typer) -> None:
+    app.command()(plan)
+
+
+def plan(
+    logs: Logs,
+    places: Places = 5,
+    model: Model = "best",
+    height_m: Heights = None,
+    train: Train = "train",
+    rig: RigFile = None,
+    calibration: Calibrations = None,
+    plot: Plot = None,
+    as_json: AsJson = False,
+) -> None:
+    """The next places to measure: those that lower the predicted error over the floor most.
+
+    A model that the log does not hold yet is fitted first, to the places measured so far.
+    """
+    from ipsys_log.lookup import copied_run
+    from ipsys_log.messages import Rig
+    from ipsys_log.report.files import check_file
+    from ipsys_log.report.plan_picture import plan_floor
+    from ipsys_log.rig import load_rig
+    from ipsys_log.sinks.shown import rig_in_force
+
+    given = load_rig(rig) if rig else None
+    lenses = load_calibrations(calibration, lambda: cameras_of(logs))
+    _check(logs, given, model, places, height_m or ())
+    if plot is not None:
+        check_file(plot, "--plot", logs)
+    options: dict[str, Any] = {"train": train, "rig": rig, "calibration": calibration, "run": None}
+    with derived(logs, "fit", model=[model], **options) as (session, outcomes, _):
+        fitted = [outcome.run for outcome in outcomes if outcome.stage == "fit"]
+        run = fitted[-1] if fitted else str(copied_run(session, model))
+        held = {camera: session.payloads([topic])[-1] for camera, topic in session.calibrations.items()}
+        in_force = given or rig_in_force(session, [run]) or session.payloads(session.topics(Rig))[-1]
+        found = plan_floor(session, run, in_force, {**held, **lenses}, places, height_m or ())
+    _show(found, plot, as_json)
+
+
+def _show(found: PlannedFloor, plot: Path | None, as_json: bool) -> None:
+    from ipsys_log.report.plan_picture import draw_plan
+
+    if plot is not None:
+        draw_plan(found, plot)
+    if as_json:
+        print(json.dumps(_plan_json(found), indent=2, allow_nan=False))  # noqa: T201
+    else:
+        console.print(_table(found))
+        console.print(_headline(found))
+    for note in found.notes:
+        remarks.print(note, style="yellow", markup=False)
+    if plot is not None:
+        remarks.print(f"{plot} drawn", markup=False)
+
+
+def _check(logs: list[Path], rig: Rig | None, model: str, places: int, heights_m: Sequence[float]) -> None:
+    """See that there is something to plan, before anything is fitted."""
+    from ipsys_log.errors import IpsysError
+    from ipsys_log.log.session import Session
+    from ipsys_log.lookup import copied_run, measured
+    from ipsys_log.messages import Rig
+
+    if not 1 <= places <= _MOST_PLACES:
+        raise IpsysError(
+            f"--places {places}: plan 1 to {_MOST_PLACES} places at a time, and again when these are measured"
+        )
+    with Session(logs) as session:
+        rigs = [rig] if rig is not None else session.payloads(session.topics(Rig))
+        spans_m = [max(one.floor.width_m, one.floor.depth_m) for one in rigs if one.floor is not None]
+        for height_m in heights_m:
+            if not (math.isfinite(height_m) and 0 <= height_m <= max(spans_m, default=_HIGHEST_M)):
+                raise IpsysError(
+                    f"--height-m {height_m:g}: no marker is laid there in this lab; give metres, such as 0.15"
+                )
+        if not measured(session, rig) and copied_run(session, model) is None:
+            raise IpsysError(
+                f"{session}: no place is measured yet, so there is nothing to plan from: first measure about "
+                "10 places, spread over the view of each camera out to its edges, at the heights in use"
+            )
+
+
+def _headline(found: PlannedFloor) -> str:
+    from ipsys_log.report.plan_picture import means_cm
+
+    before, after = means_cm(found.plan.places[0].mean_before_m, found.plan.places[-1].mean_after_m)
+    these = "this place" if len(found.plan.places) == 1 else f"these {len(found.plan.places)} places"
+    return f"predicted mean error over the floor now {before} cm; with {these} {after} cm"
+
+
+def _table(found: PlannedFloor) -> Table:
+    from rich.table import Table
+
+    from ipsys_log.report.plan_picture import means_cm
+    from ipsys_log.units import CM_PER_M
+
+    title = f"Where to measure next, for the model {found.model} of run {found.run}"
+    table = Table(title=title, title_justify="left", title_style="bold", box=None, pad_edge=False)
+    for name in ("", "x m", "y m", "high cm"):
+        table.add_column(name, justify="right", no_wrap=True)
+    table.add_column("by tape, m", overflow="fold")
+    table.add_column("seen by", overflow="fold")
+    table.add_column("mean error cm", justify="right", no_wrap=True)
+    places = found.plan.places
+    means = means_cm(places[0].mean_before_m, *(place.mean_after_m for place in places))
+    for number, place in enumerate(places, 1):
+        x, y, z = place.point_m.tolist()
+        distances = [f"{name} {value:.2f}" for name, value in found.distances_m(place.point_m).items()]
+        side = found.side(place.point_m)
+        table.add_row(
+            str(number), f"{x:.2f}", f"{y:.2f}", f"{z * CM_PER_M:g}",
+            ", ".join([*distances, *([side] if side else [])]) or "-", ", ".join(place.cameras),
+            f"{means[number - 1]} -> {means[number]}",
+        )  # fmt: skip
+    return table
+
+
+def _plan_json(found: PlannedFloor) -> dict[str, Any]:
+    from ipsys_log.units import CM_PER_M
+
+    places = [
+        {
+            "number": number,
+            **dict(zip(("x_m", "y_m", "height_m"), place.point_m.tolist(), strict=True)),
+            "distances_m": found.distances_m(place.point_m),
+            "side": found.side(place.point_m),
+            "cameras": list(place.cameras),
+            "mean_before_cm": place.mean_before_m * CM_PER_M,
+            "mean_after_cm": place.mean_after_m * CM_PER_M,
+        }
+        for number, place in enumerate(found.plan.places, 1)
+    ]
+    return {
+        "model": found.model,
+        "run": found.run,
+        "marker_height_m": found.height_m,
+        "mean_before_cm": places[0]["mean_before_cm"],
+        "mean_after_cm": places[-1]["mean_after_cm"],
+        "places": places,
+        "notes": list(found.notes),
+    }

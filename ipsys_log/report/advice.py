@@ -1,0 +1,210 @@
+"""How many places to measure, and which model to use with so many.
+
+The rule: of the models of a group the simplest one whose mean error is within the noise of the lowest
+(the one-standard-error rule of Breiman et al., with a 95 % interval of the difference for the one standard
+error). Simple is what has few free parameters. The mean is that of a learning curve over all cameras: of
+the subsets that somebody labelled, where the log has such, else of random ones. Its noise is what the
+mean would vary by with other places to judge it at (the bootstrap interval of the model's error at the
+places held out, or by cross-validation, in proportion) and, for random subsets, with others of these.
+Two models are judged at the same places, which makes their errors alike: the rule rather takes a
+difference for noise than noise for a difference.
+
+References
+----------
+Breiman et al., Classification and Regression Trees, 1984, sect. 3.4.3.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Iterable, Mapping, Sequence
+from dataclasses import dataclass
+
+import numpy as np
+
+from ipsys_log.messages import Evaluation
+from ipsys_log.models import MODELS, reads_height
+from ipsys_log.offline.errors import CROSS_VALIDATION, POOLED
+from ipsys_log.report.learning import CurvePoint, has_published, mean_curve
+from ipsys_log.units import CM_PER_M
+
+__all__ = [
+    "ANY",
+    "GROUPS",
+    "PAPER",
+    "TOLD",
+    "TOLD_NOTE",
+    "Advice",
+    "Choice",
+    "advise",
+    "label",
+    "told_height",
+]
+
+# The simplest first, by free parameters per camera: 6 of a pose, some more of a lens, 30 of a polynomial,
+# as many as places, weights.
+_SIMPLE_FIRST = (
+    "rigid", "rayplane", "best", "poly", "rigid+poly", "kriging", "rigid+kriging",
+    "kriging-regression", "rigid+kriging-regression", "ann", "rigid+ann",
+)  # fmt: skip
+_OWN = ("rayplane", "best")
+PAPER, ANY, TOLD = "paper", "any", "height_known"
+GROUPS = {PAPER: "the paper's methods", ANY: "all methods", TOLD: "all, heights known"}
+TOLD_NOTE = "* is told the height of each marker"
+_CONFIDENCE = 1.96
+
+
+@dataclass(frozen=True, slots=True)
+class Choice:
+    """Of a group of models the one to use, and the one with the lowest mean error."""
+
+    model: str
+    mean_m: float
+    lowest: str
+    lowest_mean_m: float
+
+
+@dataclass(frozen=True, slots=True)
+class Advice:
+    """What to use with how many places for each camera.
+
+    Attributes
+    ----------
+    published : whether subsets were chosen by somebody, or drawn.
+    in_space : whether errors are those in space, or on the floor: where heights cannot be learned.
+    choices : by number of places and group; the group ``height_known`` only where a model is told heights.
+    sentences : the same in words.
+    """
+
+    published: bool
+    in_space: bool
+    choices: Mapping[int, Mapping[str, Choice]]
+    sentences: tuple[str, ...]
+
+
+@dataclass(frozen=True, slots=True)
+class _Candidate:
+    model: str
+    mean_m: float
+    noise_m: float
+
+    def like(self, other: _Candidate) -> bool:
+        """Whether the difference is within the noise."""
+        return bool(self.mean_m - other.mean_m <= _CONFIDENCE * np.hypot(self.noise_m, other.noise_m))
+
+
+def told_height(model: str) -> bool:
+    """Whether a model is told the height of a marker, so that its error in space is one on the floor."""
+    return model in MODELS and reads_height(model)
+
+
+def label(model: str) -> str:
+    """A model's name, with the mark of :data:`TOLD_NOTE` where that holds for it."""
+    return f"{model}*" if told_height(model) else model
+
+
+def advise(evaluations: Sequence[Evaluation]) -> Advice | None:
+    """The advice that learning curves give; None where there is none of two numbers of places."""
+    published = has_published(evaluations)
+    in_space = all(row.error_3d is not None for e in evaluations for row in e.cameras)
+    table: dict[int, list[_Candidate]] = {}
+    for evaluation in evaluations:
+        noise = _relative_noise(evaluation, published, in_space)
+        for point in mean_curve(evaluation, published, in_space):
+            found = _Candidate(evaluation.model, point.mean_m, _noise_m(point, noise))
+            table.setdefault(point.places, []).append(found)
+    if len(table) < 2:
+        return None
+    choices = {places: _choices(candidates) for places, candidates in sorted(table.items())}
+    return Advice(published, in_space, choices, tuple(_sentences(choices, table)))
+
+
+def _relative_noise(evaluation: Evaluation, published: bool, in_space: bool) -> float:
+    """Standard error of a mean over places, in units of the mean."""
+    scheme = [row for row in evaluation.cameras if (row.scheme == CROSS_VALIDATION) != published]
+    rows = [row for row in scheme if row.against == "tape"]
+    for row in [row for row in rows if row.camera == POOLED] or rows[:1]:
+        errors = row.error_3d if in_space else row.error_2d
+        if errors and errors.mean_low_m is not None and errors.mean_high_m is not None and errors.mean_m > 0:
+            return (errors.mean_high_m - errors.mean_low_m) / (2 * _CONFIDENCE * errors.mean_m)
+    return 0.0
+
+
+def _noise_m(point: CurvePoint, relative: float) -> float:
+    drawn_m = 0.0 if point.std_m is None else point.std_m / np.sqrt(point.subsets)
+    return float(np.hypot(relative * point.mean_m, drawn_m))
+
+
+def _choices(candidates: Sequence[_Candidate]) -> dict[str, Choice]:
+    groups = {
+        PAPER: [c for c in candidates if c.model not in _OWN],
+        ANY: [c for c in candidates if not told_height(c.model)],
+        TOLD: candidates if any(told_height(c.model) for c in candidates) else [],
+    }
+    return {group: _choose(members) for group, members in groups.items() if members}
+
+
+def _choose(candidates: Sequence[_Candidate]) -> Choice:
+    # What is the same function, as poly and rigid+poly, differs in the last digits.
+    lowest = min(candidates, key=lambda candidate: (round(candidate.mean_m, 9), _rank(candidate.model)))
+    chosen = min((c for c in candidates if c.like(lowest)), key=lambda c: _rank(c.model))
+    return Choice(chosen.model, chosen.mean_m, lowest.model, lowest.mean_m)
+
+
+def _rank(model: str) -> int:
+    return _SIMPLE_FIRST.index(model) if model in _SIMPLE_FIRST else len(_SIMPLE_FIRST)
+
+
+def _sentences(
+    choices: Mapping[int, Mapping[str, Choice]], table: Mapping[int, Sequence[_Candidate]]
+) -> Iterable[str]:
+    """Which model with how many places, and what the others save."""
+    if len({candidate.model for found in table.values() for candidate in found}) == 1:
+        means_cm = [found[0].mean_m * CM_PER_M for _, found in sorted(table.items())]
+        yield (
+            f"{next(iter(table.values()))[0].model} is off by {means_cm[0]:.1f} cm with {min(table)} places "
+            f"for each camera, by {means_cm[-1]:.1f} cm with {max(table)}."
+        )
+        return
+    of_paper = {c.model for found in table.values() for c in found if c.model not in _OWN}
+    group, of = (PAPER, "Of the paper's methods use") if len(of_paper) > 1 else (ANY, "Use")
+    by_places = {places: found[group].model for places, found in choices.items() if group in found}
+    if by_places:
+        yield f"{of} {_by_number(by_places)}."
+    most = max(choices)
+    for other, start in ((ANY, "The"), (TOLD, "Where the heights of the markers are known, the")):
+        if PAPER in choices[most] and other in choices[most]:
+            yield from _saving(start, choices[most][other].model, choices[most][PAPER], most, table)
+
+
+def _by_number(models: Mapping[int, str]) -> str:
+    """``rigid with up to 20 places for each camera, poly from 30 on``."""
+    parts: list[tuple[str, list[int]]] = []
+    for places, model in models.items():
+        if parts and parts[-1][0] == model:
+            parts[-1][1].append(places)
+        else:
+            parts.append((model, [places]))
+    if len(parts) == 1:
+        return f"{parts[0][0]} with any number of places from {min(models)} to {max(models)} for each camera"
+    first = f"{parts[0][0]} with up to {parts[0][1][-1]} places for each camera"
+    middle = [f"{model} with {_span(places)}" for model, places in parts[1:-1]]
+    return ", ".join([first, *middle, f"{parts[-1][0]} from {parts[-1][1][0]} on"])
+
+
+def _span(places: Sequence[int]) -> str:
+    return f"{places[0]} to {places[-1]}" if len(places) > 1 else f"{places[0]}"
+
+
+def _saving(
+    start: str, model: str, usual: Choice, most: int, table: Mapping[int, Sequence[_Candidate]]
+) -> Iterable[str]:
+    """From how few places a model is as good as the usual one is with most of them."""
+    if model == usual.model:
+        return
+    means_m = {places: c.mean_m for places, found in table.items() for c in found if c.model == model}
+    enough = [places for places, mean_m in sorted(means_m.items()) if mean_m <= usual.mean_m]
+    if enough and enough[0] < most:
+        usual_cm, least_cm = (f"{mean_m * CM_PER_M:.1f} cm" for mean_m in (usual.mean_m, means_m[most]))
+        more = "" if usual_cm == least_cm else f", and with {most} comes to {least_cm}"
+        saved = f"model {model} needs {enough[0]} places for what {usual.model} needs {most} for"
+        yield f"{start} {saved} ({usual_cm}){more}."

@@ -1,0 +1,67 @@
+"""Files for people: wholly written or not there, and never in place of a log."""
+
+from __future__ import annotations
+
+import os
+import tempfile
+from collections.abc import Iterable, Mapping
+from pathlib import Path
+
+from ipsys_log.errors import IpsysError
+
+__all__ = ["check_file", "check_folder", "write_files"]
+
+
+def check_file(path: Path, option: str, logs: Iterable[Path]) -> None:
+    """See that a file can be written, before there is work that would be lost.
+
+    Raises
+    ------
+    IpsysError
+        Where it cannot, or where it is one of the logs.
+    """
+    if any(log.exists() and path.exists() and path.samefile(log) for log in logs):
+        raise IpsysError(f"{option} {path}: this is the log itself; name another file")
+    if path.is_dir():
+        raise IpsysError(f"{option} {path}: is a folder; name a file in it")
+    if not path.parent.is_dir():
+        raise IpsysError(f"{option} {path}: there is no folder {path.parent}; make it first")
+    _check_writable(path.parent, f"{option} {path}")
+
+
+def check_folder(folder: Path, option: str) -> None:
+    """See that a folder is there, or can be made, and can be written to.
+
+    Raises
+    ------
+    IpsysError
+        Where it cannot.
+    """
+    there = next(parent for parent in (folder, *folder.absolute().parents) if parent.exists())
+    if not there.is_dir():
+        raise IpsysError(f"{option} {folder}: {there} is a file; name a folder")
+    _check_writable(there, f"{option} {folder}")
+
+
+def _check_writable(folder: Path, where: str) -> None:
+    try:
+        with tempfile.TemporaryFile(dir=folder):
+            pass
+    except OSError as error:
+        raise IpsysError(f"{where}: cannot write into {folder}: {error.strerror}") from error
+
+
+def write_files(folder: Path, files: Mapping[str, bytes]) -> None:
+    """Write files of these names into a folder, all of them or none; made if it is not there."""
+    folder.mkdir(parents=True, exist_ok=True)
+    partials = {folder / name: folder / f"{name}.{os.getpid()}.partial" for name in files}
+    try:
+        for (path, partial), content in zip(partials.items(), files.values(), strict=True):
+            if path.is_dir():
+                raise IpsysError(f"{path}: is a folder; move it away")
+            partial.write_bytes(content)
+        for path, partial in partials.items():
+            partial.replace(path)
+    finally:
+        for partial in partials.values():
+            partial.unlink(missing_ok=True)

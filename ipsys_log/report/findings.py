@@ -1,0 +1,157 @@
+"""What tables, pictures and the report are made of: evaluations, and the lab that they are of."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass
+
+import numpy as np
+from numpy.typing import NDArray
+
+from ipsys_log.log.session import Session
+from ipsys_log.messages import CameraEvaluation, ErrorStatistics, Evaluation, Model, Rig
+from ipsys_log.offline.errors import POOLED
+from ipsys_log.report.accuracy import Accuracy
+from ipsys_log.report.advice import Advice, advise, told_height
+from ipsys_log.sinks.shown import rig_in_force
+
+__all__ = ["Findings", "Missed", "gather_findings", "overall"]
+
+Array = NDArray[np.float64]
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class Missed:
+    """How far one camera's positions at n places are off, in m, as means over repeats.
+
+    Attributes
+    ----------
+    world_m, offsets_m : (n, 3), the places, and predicted minus measured.
+    lengths_m : (n, 2), of the errors in space and on the floor.
+    """
+
+    camera: str
+    world_m: Array
+    offsets_m: Array
+    lengths_m: Array
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class Findings:
+    """Evaluated models.
+
+    Attributes
+    ----------
+    rig : the one in force.
+    accuracies : of those models that were evaluated.
+    fitted : by name of the model; one of a log by others may be missing.
+    cameras : in the order of the rig, which is that of the paper's tables.
+    advice : from the learning curves, where there are such.
+    """
+
+    rig: Rig | None
+    accuracies: tuple[Accuracy, ...]
+    fitted: Mapping[str, Model]
+    cameras: tuple[str, ...]
+    advice: Advice | None
+
+    @property
+    def models(self) -> list[str]:
+        return [accuracy.model for accuracy in self.accuracies]
+
+    @property
+    def evaluations(self) -> list[Evaluation]:
+        return [accuracy.evaluation for accuracy in self.accuracies if accuracy.evaluation]
+
+    @property
+    def in_space(self) -> bool:
+        """Whether errors are judged in space, or on the floor: where heights could not be learned."""
+        return all(row.error_3d is not None for found in self.evaluations for row in found.cameras)
+
+    def errors(self, row: CameraEvaluation) -> ErrorStatistics:
+        """The errors of a row that models are judged by."""
+        return row.error_3d if self.in_space and row.error_3d is not None else row.error_2d
+
+    def ranked(self) -> list[Accuracy]:
+        """The lowest mean error first; models that are told the height come last."""
+        return sorted(self.accuracies, key=self._rank)
+
+    def _rank(self, accuracy: Accuracy) -> tuple[bool, float]:
+        row = overall(accuracy, True) or overall(accuracy, False)
+        return told_height(accuracy.model), self.errors(row).mean_m if row else np.inf
+
+    def training_m(self) -> dict[str, Array]:
+        """The places that models were fitted on, (n, 3) in m by camera."""
+        found: dict[str, Array] = {}
+        for model in self.fitted.values():
+            for camera in model.cameras:
+                if camera.pairs and camera.camera not in found:
+                    found[camera.camera] = np.array([pair.world_m for pair in camera.pairs])
+        return found
+
+    def test_m(self) -> dict[str, Array]:
+        """The places that were held out, (n, 3) in m by camera."""
+        rows = [row for accuracy in self.accuracies for row in accuracy.rows(False)]
+        return {
+            row.camera: np.array([residual.world_m for residual in row.residuals])
+            for row in rows
+            if row.against == "tape" and row.residuals
+        }
+
+    def missed(self, accuracy: Accuracy) -> list[Missed]:
+        """Errors at each place against the tape: by cross-validation, or else where it was held out."""
+        rows = accuracy.rows(True) or accuracy.rows(False)
+        return [_missed(row) for row in rows if row.against == "tape" and row.residuals]
+
+
+def _missed(row: CameraEvaluation) -> Missed:
+    places: dict[str, list[Array]] = {}
+    offsets: dict[str, list[Array]] = {}
+    for residual in row.residuals:
+        places.setdefault(residual.measurement, []).append(residual.world_m)
+        offsets.setdefault(residual.measurement, []).append(residual.predicted_m - residual.world_m)
+    lengths = [
+        [np.linalg.norm(found, axis=1).mean(), np.linalg.norm(np.array(found)[:, :2], axis=1).mean()]
+        for found in offsets.values()
+    ]
+    return Missed(
+        row.camera,
+        np.array([found[0] for found in places.values()]),
+        np.array([np.mean(found, axis=0) for found in offsets.values()]),
+        np.array(lengths),
+    )
+
+
+def overall(accuracy: Accuracy, cross_validated: bool, against: str = "tape") -> CameraEvaluation | None:
+    """The row over all cameras, which is that of the only one where there is but one."""
+    rows = [row for row in accuracy.rows(cross_validated) if row.against == against]
+    pooled = [row for row in rows if row.camera == POOLED]
+    return next(iter(pooled or rows), None)
+
+
+def gather_findings(session: Session, accuracies: Sequence[Accuracy]) -> Findings:
+    """What was evaluated, with the models and the lab."""
+    evaluated = tuple(accuracy for accuracy in accuracies if accuracy.evaluation is not None)
+    rig = rig_in_force(session, [accuracy.run for accuracy in evaluated])
+    evaluations = [accuracy.evaluation for accuracy in evaluated if accuracy.evaluation]
+    cameras = {row.camera for found in evaluations for row in found.cameras} - {POOLED}
+    named = [camera.name for camera in rig.cameras] if rig else []
+    ordered = [name for name in named if name in cameras]
+    models = {accuracy.model: _model(session, accuracy.run) for accuracy in evaluated}
+    return Findings(
+        rig,
+        evaluated,
+        {name: model for name, model in models.items() if model is not None},
+        (*ordered, *sorted(cameras - {*ordered})),
+        advise(evaluations),
+    )
+
+
+def _model(session: Session, run: str) -> Model | None:
+    """The model that a run evaluated: its own, or that of a run that it read."""
+    records = [record for record in session.runs() if (record.run, record.stage) == (run, "evaluate")]
+    for name in (run, *(source for record in records for source in record.input_runs)):
+        if topics := session.topics(Model, name):
+            model: Model = session.payloads(topics)[-1]
+            return model
+    return None

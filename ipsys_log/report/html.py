@@ -1,0 +1,119 @@
+"""A session as one page that needs nothing but itself: no network, no scripts, no fonts, no clock."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from typing import Any
+
+from jinja2 import Environment, PackageLoader, StrictUndefined
+
+from ipsys_log.errors import IpsysError
+from ipsys_log.log.session import Session
+from ipsys_log.lookup import measured
+from ipsys_log.messages import Run
+from ipsys_log.offline.crossval import FOLDS, REPEATS
+from ipsys_log.offline.learning import SUBSETS
+from ipsys_log.offline.tape import Measured
+from ipsys_log.report import page, page_pictures, page_trust
+from ipsys_log.report.accuracy import Accuracy
+from ipsys_log.report.advice import TOLD_NOTE, told_height
+from ipsys_log.report.findings import Findings, gather_findings
+from ipsys_log.units import format_time
+
+__all__ = ["render_report"]
+
+
+def render_report(session: Session, accuracies: Sequence[Accuracy]) -> str:
+    """The page of a session, always the same for the same log.
+
+    Parameters
+    ----------
+    session : open logs.
+    accuracies : from :func:`ipsys_log.report.accuracy.read_accuracy`.
+
+    Raises
+    ------
+    IpsysError
+        Where no model was evaluated.
+    """
+    findings = gather_findings(session, accuracies)
+    if not findings.cameras:
+        raise IpsysError(f"{session}: no model was evaluated, for no place is held out; measure some")
+    environment = Environment(
+        loader=PackageLoader("ipsys_log", "report"),
+        autoescape=True,  # names in a log are anybody's
+        undefined=StrictUndefined,
+        trim_blocks=True,
+        lstrip_blocks=True,
+    )
+    return environment.get_template("session.html").render(
+        **_said(findings),
+        flat=page_trust.flat_rows(_measured(session, findings)),
+        **_drawn(findings),
+        **_made(session, findings),
+    )
+
+
+def _said(findings: Findings) -> dict[str, Any]:
+    return {
+        "head": page.headline(findings),
+        "advice": page.advice_rows(findings),
+        "models": page.model_rows(findings),
+        "by_camera": [(camera, page.model_rows(findings, camera)) for camera in findings.cameras],
+        "told_note": TOLD_NOTE if any(map(told_height, findings.models)) else "",
+        "suspects": page_trust.suspects(findings),
+        "coverage": page_trust.coverage(findings),
+        "calibration": page_trust.calibration(findings),
+    }
+
+
+def _measured(session: Session, findings: Findings) -> list[Measured]:
+    """The places that count, with the rig that the evaluation was told to use, or their own."""
+    runs = [accuracy.run for accuracy in findings.accuracies]
+    told = [record.rig for record in session.runs() if record.run in runs and record.rig is not None]
+    return measured(session, told[-1] if told else None)
+
+
+def _drawn(findings: Findings) -> dict[str, Any]:
+    return {
+        "models_pictures": page_pictures.models_pictures(findings),
+        "residual_pictures": page_pictures.residual_pictures(findings),
+        "learning_pictures": page_pictures.learning_pictures(findings),
+        "published_pictures": page_pictures.published_pictures(findings),
+        "coverage_picture": page_pictures.coverage_picture(findings),
+    }
+
+
+def _made(session: Session, findings: Findings) -> dict[str, Any]:
+    """Where it all comes from."""
+    runs = _sources(session.runs(), [accuracy.run for accuracy in findings.accuracies])
+    newest = next((run for run in reversed(runs) if run.stage == "evaluate"), None)
+    return {
+        "logs": [path.name for path in session.paths],
+        "lab": findings.rig.name if findings.rig else "",
+        "recorded": _span(format_time(session.start_ns)[:16], format_time(session.end_ns)[:16]),
+        "runs": runs,
+        "fingerprint": dict(sorted(newest.fingerprint.items())) if newest else {},
+        "folds": FOLDS,
+        "repeats": REPEATS,
+        "subsets": SUBSETS,
+    }
+
+
+def _span(start: str, end: str) -> str:
+    """Two times, with the day of the second only where it is another."""
+    same_day = start[:10] == end[:10]
+    return f"{start} to {end[11:] if same_day else end} UTC"
+
+
+def _sources(records: Sequence[Run], names: Sequence[str]) -> list[Run]:
+    """The records of some runs, up to their evaluation, and of all that they were made from."""
+    found: set[str] = set()
+    waiting = [*names]
+    while waiting:
+        name = waiting.pop()
+        if name not in found:
+            found.add(name)
+            waiting += [source for record in records if record.run == name for source in record.input_runs]
+    later = ("locate", "fuse")
+    return [record for record in records if record.run in found and record.stage not in later]

@@ -1,0 +1,169 @@
+"""How many places are enough, as pictures: figures 10 and 11 of the paper, and random subsets."""
+
+from __future__ import annotations
+
+from collections.abc import Iterable, Mapping, Sequence
+
+import numpy as np
+from matplotlib.axes import Axes
+from matplotlib.figure import Figure
+from matplotlib.lines import Line2D
+
+from ipsys_log.report.advice import TOLD_NOTE, label, told_height
+from ipsys_log.report.findings import Findings
+from ipsys_log.report.learning import Curve, CurvePoint, camera_curve, mean_curve
+from ipsys_log.report.palette import NOTE, ModelStyle, model_styles
+from ipsys_log.report.pictures import scale_logarithmic, set_ticks, shorten, strip
+from ipsys_log.units import CM_PER_M
+
+__all__ = [
+    "Curves",
+    "camera_curves",
+    "curves_picture",
+    "draw_curves",
+    "learning_figure",
+    "limits_cm",
+    "mean_curves",
+    "published_figure",
+]
+
+Curves = Mapping[str, Curve]
+
+# Beyond this ratio of the largest mean to the smallest, equal steps hide the small ones.
+_LOG_RATIO = 8.0
+# Marks of one number of places stand side by side, this share of it apart.
+_APART = 0.016
+_SPACE = {True: "Mean error in space in cm", False: "Mean error on the floor in cm"}
+
+
+def camera_curves(findings: Findings, camera: str, in_space: bool) -> Curves:
+    """The curves of one camera on the labelled subsets, by model."""
+    return _some({e.model: camera_curve(e, camera, True, in_space) for e in findings.evaluations})
+
+
+def mean_curves(findings: Findings, in_space: bool) -> Curves:
+    """The curves over all cameras on random subsets, by model."""
+    return _some({e.model: mean_curve(e, False, in_space) for e in findings.evaluations})
+
+
+def _some(curves: Curves) -> Curves:
+    return {model: curve for model, curve in curves.items() if curve}
+
+
+def published_figure(findings: Findings, in_space: bool) -> Figure:
+    """One panel for each camera: figure 10 of the paper in space, figure 11 on the floor."""
+    panels = {f"camera {shorten(name)}": camera_curves(findings, name, in_space) for name in findings.cameras}
+    title = f"{_SPACE[in_space]} at the held-out places, fitted on the labelled subsets"
+    return _figure(panels, title, _SPACE[in_space])
+
+
+def learning_figure(findings: Findings) -> Figure:
+    """The mean over the cameras on random subsets, in space and on the floor."""
+    spaces = {"in space": True, "on the floor": False} if findings.in_space else {"on the floor": False}
+    panels = {title: mean_curves(findings, in_space) for title, in_space in spaces.items()}
+    title = "Fitted on random subsets, judged at the other places; bars: one standard deviation over subsets"
+    return _figure(panels, title, "Mean error over all cameras in cm")
+
+
+def _figure(panels: Mapping[str, Curves], title: str, ylabel: str) -> Figure:
+    figure = Figure(figsize=(4.0 * len(panels) + 2.6, 4.6), layout="constrained")
+    styles = model_styles(dict.fromkeys(model for curves in panels.values() for model in curves))
+    axes = figure.subplots(1, len(panels), sharey=True, squeeze=False)[0]
+    limits = limits_cm(panels.values())
+    for panel, (name, curves) in zip(axes, panels.items(), strict=True):
+        draw_curves(panel, curves, styles, limits)
+        panel.set_title(name, fontsize=10, loc="left")
+    axes[0].set_ylabel(ylabel)
+    figure.legend(
+        handles=[_handle(model, styles[model]) for model in _by_end([*panels.values()])],
+        loc="outside right upper", frameon=False, fontsize=9, title=_note(styles), title_fontsize=8,
+        alignment="left",
+    )  # fmt: skip
+    figure.suptitle(title, x=0.01, ha="left", fontsize=10)
+    return figure
+
+
+def curves_picture(curves: Curves, width_in: float, limits: tuple[float, float]) -> Figure:
+    """One panel with its legend below, for a narrow page."""
+    lines = -(-len(curves) // 2)
+    figure = Figure(figsize=(width_in, 3.7 + 0.19 * lines), layout="constrained")
+    axes, styles = figure.add_subplot(), model_styles(curves)
+    draw_curves(axes, curves, styles, limits)
+    axes.set_ylabel("mean error in cm")
+    handles = [_handle(model, styles[model]) for model in _by_end([curves])]
+    figure.legend(handles=handles, loc="outside lower center", ncols=2, frameon=False, fontsize=8)
+    return figure
+
+
+def _note(models: Iterable[str]) -> str:
+    """What stands above the legend."""
+    order = "in the order of the right ends"
+    return f"{order}\n{TOLD_NOTE}" if any(map(told_height, models)) else order
+
+
+def _by_end(panels: Sequence[Curves]) -> list[str]:
+    """Models in the order in which their curves end, from the top."""
+    ends: dict[str, list[float]] = {}
+    for curves in panels:
+        for model, curve in curves.items():
+            ends.setdefault(model, []).append(curve[-1].mean_m)
+    return sorted(ends, key=lambda model: -float(np.mean(ends[model])))
+
+
+def _handle(model: str, style: ModelStyle) -> Line2D:
+    return Line2D([], [], color=style.colour, ls=style.line, lw=1.4, label=label(model), **style.marker)
+
+
+def limits_cm(panels: Iterable[Curves]) -> tuple[float, float]:
+    """The least and the largest that there is to show, in cm; a bar adds at most as much as the mean."""
+    points = [point for curves in panels for curve in curves.values() for point in curve]
+    if not points:
+        return 1.0, 1.0
+    highest_m = 2 * max(point.mean_m for point in points)
+    high_m = max(min(_bar(point)[1], highest_m) for point in points)
+    return min(point.mean_m for point in points) * CM_PER_M, high_m * CM_PER_M
+
+
+def _bar(point: CurvePoint) -> tuple[float, float]:
+    """Where the bar of a point begins and ends; below a mean no larger than its spread it says nothing."""
+    spread_m = point.std_m or 0.0
+    return point.mean_m - spread_m if spread_m < 0.9 * point.mean_m else point.mean_m, point.mean_m + spread_m
+
+
+def draw_curves(
+    axes: Axes, curves: Curves, styles: Mapping[str, ModelStyle], limits: tuple[float, float]
+) -> None:
+    """Draw the curves of some models.
+
+    Parameters
+    ----------
+    styles : by model.
+    limits : of all panels that share their scale, from :func:`limits_cm`.
+    """
+    low_cm, high_cm = limits
+    barred = any(point.std_m is not None for curve in curves.values() for point in curve)
+    for number, (model, curve) in enumerate(curves.items()):
+        shift = _APART * (number - (len(curves) - 1) / 2) if barred else 0.0
+        _draw_curve(axes, curve, styles[model], shift)
+    places = sorted({point.places for curve in curves.values() for point in curve})
+    if places:
+        scale_logarithmic(axes, "x", places[0] / 1.2, places[-1] * 1.2)
+        set_ticks(axes, "x", places)
+    if high_cm > _LOG_RATIO * low_cm:
+        scale_logarithmic(axes, "y", low_cm / 1.35, high_cm * 1.2)
+    else:
+        axes.set_ylim(0, high_cm * 1.08)
+    axes.set_xlabel("places for each camera")
+    axes.tick_params(labelsize=9)
+    strip(axes)
+    if not curves:
+        axes.text(0.5, 0.5, "none", transform=axes.transAxes, ha="center", color=NOTE)
+
+
+def _draw_curve(axes: Axes, curve: Curve, style: ModelStyle, shift: float) -> None:
+    x = [point.places * (1 + shift) for point in curve]
+    y = [point.mean_m * CM_PER_M for point in curve]
+    axes.plot(x, y, style.line, color=style.colour, lw=1.4, zorder=3, **style.marker)
+    for where, point in zip(x, curve, strict=True):
+        ends_cm = [end_m * CM_PER_M for end_m in _bar(point)]
+        axes.plot([where, where], ends_cm, color=style.colour, lw=1.1, alpha=0.55)

@@ -1,0 +1,153 @@
+"""How many places and which model: what is recommended, and why."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from dataclasses import replace
+from pathlib import Path
+
+import pytest
+
+from ipsys_log.formats.imsel import read_imsel
+from ipsys_log.messages import CameraEvaluation, ErrorStatistics, Evaluation, LearningPoint
+from ipsys_log.output import write_log
+from ipsys_log.report.advice import ANY, PAPER, TOLD, advise
+from ipsys_log.report.findings import Findings
+from tests.report.conftest import find
+
+# The 95 % interval of the mean is this share of it, each way.
+WIDE, NARROW = 0.3, 0.01
+
+
+def errors(mean_m: float, share: float) -> ErrorStatistics:
+    return ErrorStatistics(
+        30, mean_m, 0.0, 0.1, 0.01, mean_m, 0.05, mean_m * (1 - share), mean_m * (1 + share)
+    )
+
+
+def evaluation(
+    model: str,
+    means_cm: Mapping[int, float],
+    share: float = NARROW,
+    labelled: bool = False,
+    level: bool = False,
+) -> Evaluation:
+    """An evaluation with these mean errors in space by number of places; on the floor they are half."""
+    last_m = means_cm[max(means_cm)] / 100
+    space = None if level else errors(last_m, share)
+    rows = tuple(
+        CameraEvaluation("red", "tape", space, errors(last_m / 2, share), scheme=scheme)
+        for scheme in ("held_out", "cross_validation")
+    )
+    points = tuple(
+        LearningPoint("red", n, cm / 100, cm / 200, 1, f"train_{n}")
+        if labelled
+        else LearningPoint("red", n, cm / 100, cm / 200, 10, std_3d_m=0.0, std_2d_m=0.0)
+        for n, cm in means_cm.items()
+    )
+    return Evaluation(0, model, rows, points)
+
+
+def test_the_paper_s_data_ask_for_rigid_with_10_places_and_poly_from_30(paper: Findings) -> None:
+    """Sect. 4.1: the rigid transformation exceeds the polynomial with 10 places, and falls behind later."""
+    advice = paper.advice
+    assert advice is not None
+    assert advice.published
+    used = {places: found[PAPER].model for places, found in advice.choices.items()}
+    assert used[10] == "rigid"
+    assert used[30] == used[40] == "poly"
+    assert advice.sentences[0].startswith("Of the paper's methods use rigid with up to ")
+    assert "poly from" in advice.sentences[0]
+
+
+def test_the_paper_s_data_on_random_subsets_say_the_same(paper: Findings) -> None:
+    found = paper.evaluations
+    drawn = [replace(e, learning=tuple(p for p in e.learning if p.label is None)) for e in found]
+    advice = advise(drawn)
+    assert advice is not None
+    assert not advice.published
+    assert {advice.choices[places][PAPER].model for places in (5, 7, 10)} == {"rigid"}
+    assert {advice.choices[places][PAPER].model for places in (30, 40)} == {"poly"}
+
+
+@pytest.mark.slow
+def test_our_models_save_places_on_the_paper_s_data(data: Path, tmp_path: Path) -> None:
+    write_log(tmp_path / "imsel.mcap", read_imsel(data / "imsel"))
+    advice = find(tmp_path / "imsel.mcap", ("rigid", "poly", "rayplane", "best")).advice
+    assert advice is not None
+    assert advice.sentences[1].startswith("The model best needs 10 places for what poly needs 40 for")
+    assert advice.sentences[2].startswith(
+        "Where the heights of the markers are known, the model rayplane needs 10 places"
+    )
+
+
+def test_the_simplest_model_within_the_noise_is_used() -> None:
+    near = {10: 3.0, 20: 2.2}
+    alike = advise([evaluation("rigid", near, WIDE), evaluation("poly", {10: 3.0, 20: 2.0}, WIDE)])
+    apart = advise([evaluation("rigid", near), evaluation("poly", {10: 3.0, 20: 2.0})])
+    assert alike is not None
+    assert apart is not None
+    assert alike.choices[20][PAPER].model == "rigid"
+    assert alike.choices[20][PAPER].lowest == "poly"
+    assert alike.choices[20][PAPER].lowest_mean_m == pytest.approx(0.02)
+    assert apart.choices[20][PAPER].model == "poly"
+
+
+def test_the_spread_over_random_subsets_is_noise_too() -> None:
+    found = [evaluation("rigid", {10: 3.0, 20: 2.2}), evaluation("poly", {10: 3.0, 20: 2.0})]
+    spread = [replace(e, learning=tuple(replace(p, std_3d_m=0.01) for p in e.learning)) for e in found]
+    advice = advise(spread)
+    assert advice is not None
+    assert advice.choices[20][PAPER].model == "rigid"
+
+
+def test_labelled_subsets_come_before_random_ones_where_they_have_sizes() -> None:
+    labelled = evaluation("rigid", {10: 1.0, 20: 1.0}, labelled=True)
+    drawn = evaluation("rigid", {5: 2.0, 10: 2.0})
+    both = advise([replace(drawn, learning=(*drawn.learning, *labelled.learning))])
+    assert both is not None
+    assert both.published
+    assert list(both.choices) == [10, 20]
+    # One label is no curve.
+    one = advise([replace(drawn, learning=(*drawn.learning, labelled.learning[0]))])
+    assert one is not None
+    assert not one.published
+    assert list(one.choices) == [5, 10]
+
+
+def test_a_model_that_is_told_heights_is_not_compared_with_those_that_are_not() -> None:
+    advice = advise(
+        [evaluation("rigid", {10: 3.0, 20: 3.0}), evaluation("best", {10: 2.0, 20: 2.0}),
+         evaluation("rayplane", {10: 1.0, 20: 1.0})]
+    )  # fmt: skip
+    assert advice is not None
+    assert {group: choice.model for group, choice in advice.choices[10].items()} == {
+        PAPER: "rigid", ANY: "best", TOLD: "rayplane",
+    }  # fmt: skip
+
+
+def test_a_level_lab_is_judged_on_the_floor() -> None:
+    advice = advise([evaluation("rigid", {10: 3.0, 20: 3.0}, level=True)])
+    assert advice is not None
+    assert not advice.in_space
+    assert advice.choices[10][PAPER].mean_m == pytest.approx(0.015)
+
+
+def test_a_number_of_places_that_a_camera_lacks_says_nothing_of_all_cameras() -> None:
+    found = evaluation("rigid", {10: 3.0, 20: 3.0, 30: 3.0})
+    other = tuple(replace(p, camera="white") for p in found.learning if p.pairs < 30)
+    advice = advise([replace(found, learning=(*found.learning, *other))])
+    assert advice is not None
+    assert list(advice.choices) == [10, 20]
+
+
+def test_without_a_learning_curve_nothing_is_advised() -> None:
+    assert advise([]) is None
+    assert advise([evaluation("rigid", {10: 3.0})]) is None
+    assert advise([replace(evaluation("rigid", {10: 3.0}), learning=())]) is None
+
+
+def test_one_model_alone_is_said_with_what_more_places_bring() -> None:
+    advice = advise([evaluation("best", {10: 3.0, 40: 1.5})])
+    assert advice is not None
+    assert advice.sentences == ("best is off by 3.0 cm with 10 places for each camera, by 1.5 cm with 40.",)

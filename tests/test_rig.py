@@ -1,0 +1,105 @@
+"""The rig file: read, checked, and written so that it reads back."""
+
+from __future__ import annotations
+
+import re
+from dataclasses import replace
+from pathlib import Path
+
+import pytest
+from hypothesis import HealthCheck, given, settings
+from hypothesis import strategies as st
+
+from ipsys_log.errors import IpsysError
+from ipsys_log.messages import Floor, ReferencePoint, Rig, RigCamera, RigMarker
+from ipsys_log.rig import check_rig, example_toml, load_rig, rig_toml
+
+RIG = Rig(
+    "lab",
+    "DICT_4X4_100",
+    0.2,
+    markers=(RigMarker(0, 0.15, "ada", 0.25), RigMarker(7)),
+    cameras=(RigCamera("red"),),
+    reference_points=(ReferencePoint("A", 0.0, 0.0), ReferencePoint("B", 2.0, 0.0)),
+    floor=Floor(4.0, 5.0),
+    marker_height_m=0.1,
+    tape_sigma_m=0.003,
+)
+
+
+def test_what_is_written_reads_back(tmp_path: Path) -> None:
+    path = tmp_path / "lab.toml"
+    bare = replace(RIG, markers=(), cameras=(), reference_points=(), floor=None)
+    for rig in (RIG, replace(bare, marker_height_m=None, tape_sigma_m=None)):
+        path.write_text(rig_toml(rig))
+        assert load_rig(path) == rig
+
+
+@given(st.floats(0, 5), st.floats(0, 1, exclude_min=True), st.none() | st.floats(0, 5))
+@settings(suppress_health_check=[HealthCheck.function_scoped_fixture])
+def test_heights_and_sigma_read_back_to_the_last_digit(
+    tmp_path: Path, height_m: float, sigma_m: float, own_m: float | None
+) -> None:
+    path = tmp_path / "lab.toml"
+    rig = replace(
+        RIG, marker_height_m=height_m, tape_sigma_m=sigma_m, markers=(RigMarker(3, height_m=own_m),)
+    )
+    path.write_text(rig_toml(rig))
+    assert load_rig(path) == rig
+
+
+def test_the_commented_examples_of_init_hold_when_the_comments_go(tmp_path: Path) -> None:
+    path = tmp_path / "lab.toml"
+    path.write_text(example_toml())
+    plain = load_rig(path)
+    assert (plain.marker_height_m, plain.tape_sigma_m) == (None, None)
+    keys = "marker_height_m|tape_sigma_m|length_m|height_m"
+    text, changed = re.subn(rf"^# ((?:{keys}) = )", r"\1", example_toml(), flags=re.MULTILINE)
+    assert changed == 4
+    path.write_text(text)
+    full = load_rig(path)
+    assert (full.marker_height_m, full.tape_sigma_m) == (0.10, 0.003)
+    assert full.markers[0].height_m is not None
+    assert full.height_of(0) == full.markers[0].height_m
+    assert "A third [[reference_points]]" in text
+
+
+@pytest.mark.parametrize(
+    ("change", "said"),
+    [
+        ({"tape_sigma_m": 0.0}, "tape_sigma_m = 0.0 m is no standard deviation"),
+        ({"tape_sigma_m": -0.003}, "tape_sigma_m = -0.003"),
+        ({"tape_sigma_m": float("nan")}, "tape_sigma_m = nan"),
+        ({"tape_sigma_m": float("inf")}, "tape_sigma_m = inf"),
+        (
+            {"marker_height_m": -0.1},
+            "marker_height_m is -0.1 m; give the height above the floor in m, 0 to 5",
+        ),
+        ({"marker_height_m": 10.0}, "marker_height_m is 10.0 m"),
+        ({"marker_height_m": float("nan")}, "marker_height_m is nan m"),
+        ({"markers": (RigMarker(0, height_m=25.0),)}, "height_m of marker 0 is 25.0 m"),
+        ({"markers": (RigMarker(4, height_m=float("inf")),)}, "height_m of marker 4 is inf m"),
+        (
+            {"reference_points": (ReferencePoint("A", float("nan"), 0.0),)},
+            "'A' has the coordinates nan and 0.0",
+        ),
+        (
+            {"reference_points": (ReferencePoint("A", 0.0, float("inf")),)},
+            "'A' has the coordinates 0.0 and inf",
+        ),
+        (
+            {"reference_points": (ReferencePoint("A", 1.0, 2.0), ReferencePoint("B", 1.0002, 2.0))},
+            r"two reference points are at \(1.0, 2.0\); give each its own",
+        ),
+        ({"marker_length_m": 0.0}, "0.0 m is not a length"),
+    ],
+)
+def test_a_rig_that_cannot_be_right_is_refused(change: dict[str, object], said: str) -> None:
+    assert check_rig(RIG, "lab.toml") is RIG
+    with pytest.raises(IpsysError, match=f"^lab.toml: .*{said}"):
+        check_rig(replace(RIG, **change), "lab.toml")  # type: ignore[arg-type]
+
+
+def test_the_floor_itself_is_a_height() -> None:
+    grounded = replace(RIG, marker_height_m=0.0, markers=(RigMarker(0, height_m=0.0),))
+    assert check_rig(grounded, "lab.toml").height_of(0) == 0.0

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Callable, Collection, Mapping, Sequence
+from contextlib import suppress
 from dataclasses import dataclass, replace
 
 import numpy as np
@@ -22,9 +23,12 @@ Array = NDArray[np.float64]
 LeaveOneOut = Callable[[frozenset[str]], Mapping[str, Mapping[str, Array]]]
 
 # In units of the usual error: a place that is further off is a suspect (in simulated labs one of 150 good
-# places is, in 1 to 5 sessions of 100); it is explained by a slip without which it is no further off.
+# places is, in 1 to 5 sessions of 100).
 _SUSPECT = 3.7
+# A slip explains it if without it the place is no further off than the first; or than the second share of
+# what it was, and no suspect.
 _EXPLAINED = 2.5
+_SHARE_LEFT = 0.2
 # So much, and so many times the median, is no error of a camera or a model.
 _GROSS_M = 0.3
 _GROSS = 3.0
@@ -62,7 +66,7 @@ def find_suspects(leave_one_out: LeaveOneOut, places: Sequence[Measured]) -> tup
 
     Returns
     -------
-    The suspects, at most a fifth of the places, the worst first.
+    The suspects, at most a fifth of the places, the one that is off by most first.
 
     Raises
     ------
@@ -92,7 +96,7 @@ def find_suspects(leave_one_out: LeaveOneOut, places: Sequence[Measured]) -> tup
     taken, findings = _search(lambda names: _judge(leave_one_out(names), fixed, names))
     by_id = {place.measurement.id: place for place in places}
     suspects = [_suspect(by_id[name], findings[name]) for name in taken]
-    return tuple(sorted(suspects, key=lambda suspect: -suspect.score))
+    return tuple(sorted(suspects, key=lambda suspect: -float(np.linalg.norm(suspect.residual_m))))
 
 
 def _with_tape(rig: Rig) -> Rig:
@@ -104,19 +108,15 @@ def _search(judge: _Judge) -> tuple[list[str], dict[str, _Finding]]:
     """The places that contradict the others, and all places in the light of the others."""
     findings = judge(frozenset())
     taken: list[str] = []
-    while len(taken) < _MOST_SHARE * len(findings) and (worst := _worst(findings, taken)):
-        taken.append(worst)
-        try:
-            findings = findings | judge(frozenset(taken))
-        except FitError:
-            break  # too few places are left to judge the others by
-    while taken:
-        least = min(taken, key=lambda name: findings[name].score)
-        if findings[least].score >= _SUSPECT:
-            break
-        taken.remove(least)
-        findings = findings | judge(frozenset(taken))
-    return taken, findings
+    with suppress(FitError):  # too few places are left to judge the others by
+        while len(taken) < _MOST_SHARE * len(findings) and (worst := _worst(findings, taken)):
+            taken.append(worst)
+            findings |= judge(frozenset(taken))
+    with suppress(FitError):
+        while taken and findings[least := min(taken, key=lambda n: findings[n].score)].score < _SUSPECT:
+            taken.remove(least)
+            findings |= judge(frozenset(taken))
+    return [name for name in taken if findings[name].score >= _SUSPECT], findings
 
 
 def _worst(findings: Mapping[str, _Finding], taken: Collection[str]) -> str | None:
@@ -187,6 +187,7 @@ def _suspect(place: Measured, finding: _Finding) -> Suspect:
 
 def _explain(place: Measured, finding: _Finding) -> tuple[Slip, Array] | None:
     """The simplest slip without which the error is a usual one, and the world point then."""
+    usual = min(max(_EXPLAINED, _SHARE_LEFT * finding.score), _SUSPECT)
     for group in possible_slips(place.measurement, place.rig, finding.predicted_m):
         left = []
         for slip in group:
@@ -195,6 +196,6 @@ def _explain(place: Measured, finding: _Finding) -> tuple[Slip, Array] | None:
             except IpsysError:
                 continue  # without this slip it would be nowhere
             left.append((_score(finding.predicted_m, finding.usual_m2, fixed), slip, fixed.world_m))
-        if left and (best := min(left, key=lambda row: row[0]))[0] <= _EXPLAINED:
+        if left and (best := min(left, key=lambda row: row[0]))[0] <= usual:
             return best[1:]
     return None

@@ -43,7 +43,7 @@ _LEAST_SPREAD_M = 0.02
 def usual_covariances(
     predicted_m: Array, residuals_m: Array, fitted: NDArray[np.bool_], tape_m2: Array
 ) -> Array:
-    """For each place of a camera the covariance of a usual leave-one-out error, without that of its tape.
+    """For each place of a camera the covariance of a usual leave-one-out error, but for a bad tape's.
 
     Depths are known worse than directions, the more so to the rim of an image, so an error along the
     view is told from one across it; a model knows less at the rim of the places than amid them, by the
@@ -59,8 +59,9 @@ def usual_covariances(
 
     Returns
     -------
-    (n, 3, 3), in m^2, such that the median of :func:`score` over the fitted places is 1, and somewhat
-    greater for few places, which say less of what is usual.
+    (n, 3, 3), in m^2, without ``tape_m2``. With it the median of :func:`score` over the fitted places is
+    1 or, where the tape's error is much of it, a little less; much less for few places, which say little
+    of what is usual.
 
     Examples
     --------
@@ -87,6 +88,7 @@ def usual_covariances(
     shape = (across_m**2)[:, None, None] * np.eye(3) + (along_m**2 - across_m**2)[:, None, None] * outer
     shape *= leverage[:, None, None] ** 2
     few = 1 + _FEW / max(free, 1) ** 2
+    # The scatter holds the error of a usual tape, and keeps it: that of a bad one comes on top.
     median = float(np.median(score(residuals_m[fitted], shape[fitted] + tape_m2[fitted])))
     covariances: Array = (few * median) ** 2 * shape + _FINEST_M**2 * np.eye(3)
     return covariances

@@ -183,10 +183,10 @@ def _suspect_json(suspect: Suspect) -> dict[str, Any]:
 
 
 def gather_suspects(accuracies: Sequence[Accuracy]) -> list[tuple[Suspect, list[str]]]:
-    """Each suspect as the last model has it that names it, and all that do; the worst first."""
+    """Each suspect as the last model has it that names it, and all that do; the one off by most first."""
     found: dict[str, tuple[Suspect, list[str]]] = {}
     for accuracy in accuracies:
         for suspect in accuracy.evaluation.suspects if accuracy.evaluation else ():
             models = found.get(suspect.measurement, (suspect, []))[1]
             found[suspect.measurement] = (suspect, [*models, accuracy.model])
-    return sorted(found.values(), key=lambda pair: -pair[0].score)
+    return sorted(found.values(), key=lambda pair: -float((pair[0].residual_m**2).sum()))

@@ -76,9 +76,9 @@ class Findings:
         """The lowest mean error first; models that are told the height come last."""
         return sorted(self.accuracies, key=self._rank)
 
-    def _rank(self, accuracy: Accuracy) -> tuple[bool, float]:
+    def _rank(self, accuracy: Accuracy) -> tuple[bool, bool, float]:
         row = overall(accuracy, True) or overall(accuracy, False)
-        return told_height(accuracy.model), self.errors(row).mean_m if row else np.inf
+        return row is None, told_height(accuracy.model), self.errors(row).mean_m if row else np.inf
 
     def training_m(self) -> dict[str, Array]:
         """The places that models were fitted on, (n, 3) in m by camera."""

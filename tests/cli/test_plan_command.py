@@ -127,7 +127,7 @@ def test_heights_and_models_as_asked_for(ipsys: Ipsys, paper: Path) -> None:
         rig = paper.with_name("lab.toml")
         if model == "rayplane":
             ipsys("init", rig, "--from", paper)
-            rig.write_text("marker_height_m = 0.2\n" + rig.read_text())
+            rig.write_text(rig.read_text().replace("marker_height_m = 0.1\n", "marker_height_m = 0.2\n"))
         found = planned(
             ipsys, paper, "--model", model, *(["--rig", rig] if rig.exists() else []), "--places", 1
         )

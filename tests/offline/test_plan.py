@@ -188,16 +188,21 @@ def test_planned_places_are_worth_more_than_random_ones(seeds: range) -> None:
         cameras, pairs, rng = lab(seed)
         points_m = np.array([place.point_m for place in planned(views_of(cameras, pairs)).places])
         row = [true_mean_error_m(cameras, pairs)]
-        for label, world_m in (("planned", points_m), ("random", draw(cameras, 6, rng))):
-            more = measure(cameras, world_m, rng, label)
-            row.append(true_mean_error_m(cameras, {name: pairs[name] + more[name] for name in pairs}))
+        for label, chosen in (
+            ("planned", [points_m] * 3),
+            ("random", [draw(cameras, 6, rng) for _ in range(3)]),
+        ):
+            # By another tape each time: what is compared is where, not the luck of a reading.
+            more = [measure(cameras, world_m, rng, label) for world_m in chosen]
+            both = [{name: pairs[name] + found[name] for name in pairs} for found in more]
+            row.append(float(np.mean([true_mean_error_m(cameras, found) for found in both])))
         errors.append(row)
     without_m, planned_m, random_m = np.array(errors).T
     gain_m = random_m - planned_m
-    # Over 48 seeds: 0.65 cm with 12 places, 0.46 with 6 more at random, 0.35 with 6 planned ones.
-    assert planned_m.mean() < 0.9 * random_m.mean()
+    # Over 90 seeds: 0.62 cm with 12 places, 0.45 with 6 more at random, 0.34 with 6 planned ones.
+    assert planned_m.mean() < 0.85 * random_m.mean()
     assert planned_m.mean() < 0.7 * without_m.mean()
-    assert gain_m.mean() > 2 * gain_m.std(ddof=1) / np.sqrt(len(gain_m))
+    assert gain_m.mean() > 3 * gain_m.std(ddof=1) / np.sqrt(len(gain_m))
     assert (planned_m < without_m).mean() > 0.8
 
 

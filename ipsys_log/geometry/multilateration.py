@@ -11,7 +11,7 @@ from numpy.typing import NDArray
 from ipsys_log.errors import IpsysError
 from ipsys_log.geometry.trilateration import SIDES, meeting_point, trilaterate
 
-__all__ = ["Trilaterated", "crossing_angle", "multilaterate", "sides_alike", "tape_covariance"]
+__all__ = ["Trilaterated", "crossing_angle", "multilaterate", "side_of", "sides_alike", "tape_covariance"]
 
 Array = NDArray[np.float64]
 
@@ -19,6 +19,7 @@ Array = NDArray[np.float64]
 # one another in it, the distances differ by no more than some readings of a tape.
 _BESIDE_LINE_M = 0.05
 _NEAREST_M = 1e-9
+_STARTS = 6
 _STEPS = 50
 _STEP_M = 1e-10
 
@@ -109,8 +110,22 @@ def sides_alike(references_m: Array) -> bool:
     if len(references_m) == 2:
         return True
     centred_m = references_m - references_m.mean(axis=0)
-    beside_m = centred_m @ np.linalg.svd(centred_m)[2][1]
+    beside_m = centred_m @ np.linalg.svd(centred_m, full_matrices=False)[2][1]
     return bool(np.abs(beside_m).max() <= _BESIDE_LINE_M)
+
+
+def side_of(point_m: Array, references_m: Array) -> str:
+    """The side on which a point, (2,), lies of the line from the first of the reference points, (n, 2), to
+    the next one elsewhere; "left" where it lies on it.
+
+    Examples
+    --------
+    >>> side_of(np.array([0.0, 1.0]), np.array([[0.0, 0.0], [0.0, 0.0], [2.0, 0.0]]))
+    'left'
+    """
+    onward_m = references_m - references_m[0]
+    other = int(np.argmax(np.linalg.norm(onward_m, axis=1) > _NEAREST_M))
+    return "left" if _cross(onward_m[other], point_m - references_m[0]) >= 0 else "right"
 
 
 def tape_covariance(point_m: Array, references_m: Array, sigmas_m: Array) -> Array:
@@ -166,19 +181,19 @@ def crossing_angle(point_m: Array, references_m: Array) -> float:
 def _least_squares(
     references_m: Array, distances_m: Array, sigmas_m: Array | None, side: str | None
 ) -> Array:
-    """The best of what is found from where any two circles meet, on ``side`` where it matters."""
+    """The best of what is found from where the first circle meets others, on ``side`` where it matters."""
     weights = 1 / (np.ones_like(distances_m) if sigmas_m is None else sigmas_m)
+    apart = np.linalg.norm(references_m - references_m[0], axis=1) > _NEAREST_M
     found = []
-    for (a_m, d1_m), (b_m, d2_m) in combinations(zip(references_m, distances_m.tolist(), strict=True), 2):
-        if np.hypot(*(b_m - a_m)) > _NEAREST_M:
-            for start_m in (meeting_point(a_m, b_m, d1_m, d2_m, one) for one in SIDES):
-                found.append(_descend(start_m, references_m, distances_m, weights))
+    for reference_m, distance_m in list(zip(references_m[apart], distances_m[apart].tolist(), strict=True))[
+        :_STARTS
+    ]:
+        for one in SIDES:
+            start_m = meeting_point(references_m[0], reference_m, float(distances_m[0]), distance_m, one)
+            found.append(_descend(start_m, references_m, distances_m, weights))
     if side is not None and sides_alike(references_m):
-        sign = 1 if side == "left" else -1
-        onward = _other_reference(references_m) - references_m[0]
-        beside = [sign * _cross(onward, point_m - references_m[0]) for _, point_m in found]
         # A place on the line itself may come out on either side of it.
-        found = [one for one, where in zip(found, beside, strict=True) if where >= 0] or found
+        found = [one for one in found if side_of(one[1], references_m) == side] or found
     return min(found, key=lambda one: one[0])[1]
 
 
@@ -217,15 +232,6 @@ def _cross(first: Array, second: Array) -> float:
     return float(first[0] * second[1] - first[1] * second[0])
 
 
-def _other_reference(references_m: Array) -> Array:
-    """The first of the reference points that is not where the very first one is."""
-    apart_m = np.linalg.norm(references_m - references_m[0], axis=1)
-    if not (apart_m > _NEAREST_M).any():
-        raise IpsysError("the reference points are one and the same; give them different coordinates")
-    other: Array = references_m[np.argmax(apart_m > _NEAREST_M)]
-    return other
-
-
 def _check_numbers(references_m: Array, distances_m: Array, sigmas_m: Array | None) -> None:
     count = len(references_m)
     if count < 2 or references_m.shape != (count, 2) or distances_m.shape != (count,):
@@ -233,7 +239,8 @@ def _check_numbers(references_m: Array, distances_m: Array, sigmas_m: Array | No
             f"{count} reference points and {distances_m.size} distances; give two or more, one distance each"
         )
     if count > 2:
-        _other_reference(references_m)
+        if (np.linalg.norm(references_m - references_m[0], axis=1) <= _NEAREST_M).all():
+            raise IpsysError("the reference points are one and the same; give them different coordinates")
         if not (np.isfinite(distances_m) & (distances_m > 0)).all():
             raise IpsysError(f"the distances {distances_m.tolist()} m are not all above 0; measure again")
     if sigmas_m is not None and not (np.isfinite(sigmas_m) & (sigmas_m > 0)).all():

@@ -9,6 +9,7 @@ from numpy.typing import NDArray
 from sklearn.base import BaseEstimator, MultiOutputMixin, RegressorMixin
 from sklearn.utils.validation import check_is_fitted, validate_data
 
+from ipsys_log.errors import FitError
 from ipsys_log.models.scaling import spread
 
 __all__ = ["NeuralNetwork", "network", "train_networks"]
@@ -17,7 +18,7 @@ Array = NDArray[np.float64]
 
 _NEURONS = 3
 _RESTARTS = 16
-_STEPS = 100
+_STEPS = 60
 # Of the weights that a network starts with.
 _FIRST_SIGMA = 0.7
 # How strongly a weight is drawn to zero beside the slopes of the neurons, which bend the function.
@@ -25,6 +26,9 @@ _OTHERS_PULL = 0.01
 # Steps before the pull is adapted, and its bounds.
 _UNTIL_ADAPTED = 3
 _PULLS = (1e-8, 1e3)
+# Variance, of targets of unit variance: exact targets leave none, and its logarithm is needed.
+_LEAST_NOISE = 1e-12
+_NOISE_OVER_PLANE = 4.0
 
 
 def network(weights: Array, inputs: Array) -> tuple[Array, Array]:
@@ -78,18 +82,18 @@ def train_networks(inputs: Array, targets: Array, weights: Array) -> tuple[Array
     ----------
     MacKay, Neural Computation 1992 (3), 415 and 448; Foresee and Hagan, ICNN 1997.
     """
-    count, width = targets.shape[1], weights.shape[1]
-    pull = _relative_pulls(inputs.shape[1], width)
+    most_noise = _most_noise(inputs, targets)
+    pull = _relative_pulls(inputs.shape[1], weights.shape[1])
     strength, damping = np.full(len(weights), 1e-3), np.full(len(weights), 1e-2)
     outputs, neurons = network(weights, inputs)
     for step in range(_STEPS):
         slopes = _slopes(weights, inputs, neurons)
         curvature = slopes @ slopes.transpose(0, 2, 1)
-        misfit = ((outputs - targets) ** 2).sum(axis=1)
+        misfit = outputs - targets
         if step >= _UNTIL_ADAPTED:
-            strength = _adapted(strength, curvature, misfit, weights, pull, count)
-        cost = misfit + strength * (weights**2 @ pull)
-        gradient = np.einsum("bwn,bn->bw", slopes, outputs - targets) + strength[:, None] * pull * weights
+            strength = _adapted(strength, curvature, misfit, weights, pull, most_noise)
+        cost = (misfit**2).sum(axis=1) + strength * (weights**2 @ pull)
+        gradient = np.einsum("bwn,bn->bw", slopes, misfit) + strength[:, None] * pull * weights
         damped = curvature + _diagonal(strength[:, None] * pull + damping[:, None])
         tried = weights - np.linalg.solve(damped, gradient[:, :, None])[:, :, 0]
         tried_outputs, tried_neurons = network(tried, inputs)
@@ -99,7 +103,18 @@ def train_networks(inputs: Array, targets: Array, weights: Array) -> tuple[Array
         outputs = np.where(better[:, None], tried_outputs, outputs)
         neurons = np.where(better[:, None, None], tried_neurons, neurons)
         damping = np.clip(np.where(better, damping * 0.2, damping * 4), 1e-12, 1e8)
-    return weights, _evidence(weights, inputs, targets, strength, pull)
+    return weights, _evidence(weights, inputs, targets, strength, pull, most_noise)
+
+
+def _most_noise(inputs: Array, targets: Array) -> Array:
+    """Variance (b,) that no noise exceeds: a few times what a plane through the targets leaves.
+
+    Without this bound a few pairs can be explained as noise alone, by a network that is flat.
+    """
+    residuals = targets.T - inputs @ np.linalg.lstsq(inputs, targets.T, rcond=None)[0]
+    left = (residuals**2).sum(axis=0) / max(len(inputs) - inputs.shape[1], 1)
+    most: Array = np.maximum(_NOISE_OVER_PLANE * left, _LEAST_NOISE)
+    return most
 
 
 def _relative_pulls(inputs: int, width: int) -> Array:
@@ -115,29 +130,38 @@ def _diagonal(values: Array) -> Array:
 
 
 def _adapted(
-    strength: Array, curvature: Array, misfit: Array, weights: Array, pull: Array, count: int
+    strength: Array, curvature: Array, misfit: Array, weights: Array, pull: Array, most_noise: Array
 ) -> Array:
     """The pull at which noise and weights are as large as the data make them (MacKay 1992, eq. 2.21)."""
-    inverse = np.linalg.inv(curvature + _diagonal(strength[:, None] * pull + 1e-12))
-    determined = len(pull) - strength * np.einsum("bii,i->b", inverse, pull)
-    noise = misfit / np.maximum(count - determined, 0.1 * count)
+    determined, noise = _determined(strength, curvature, misfit, pull, most_noise)
     size = weights**2 @ pull / np.maximum(determined, 1e-3)
     adapted: Array = np.clip(noise / np.maximum(size, 1e-300), *_PULLS)
     return adapted
 
 
-def _evidence(weights: Array, inputs: Array, targets: Array, strength: Array, pull: Array) -> Array:
+def _determined(
+    strength: Array, curvature: Array, misfit: Array, pull: Array, most_noise: Array
+) -> tuple[Array, Array]:
+    """How many weights the data determine, and the variance (b,) of their noise; ``misfit`` is (b, n)."""
+    inverse = np.linalg.inv(curvature + _diagonal(strength[:, None] * pull + 1e-12))
+    determined = len(pull) - strength * np.einsum("bii,i->b", inverse, pull)
+    count = misfit.shape[1]
+    noise = (misfit**2).sum(axis=1) / np.maximum(count - determined, 0.1 * count)
+    return determined, np.clip(noise, _LEAST_NOISE, most_noise)
+
+
+def _evidence(
+    weights: Array, inputs: Array, targets: Array, strength: Array, pull: Array, most_noise: Array
+) -> Array:
     outputs, neurons = network(weights, inputs)
-    slopes = _slopes(weights, inputs, neurons)
-    hessian = slopes @ slopes.transpose(0, 2, 1) + _diagonal(strength[:, None] * pull)
-    count, width = targets.shape[1], len(pull)
-    inverse = np.linalg.inv(hessian + 1e-12 * np.eye(width))
-    determined = width - strength * np.einsum("bii,i->b", inverse, pull)
-    misfit = ((outputs - targets) ** 2).sum(axis=1)
-    noise = np.maximum(misfit / np.maximum(count - determined, 0.1 * count), 1e-300)
-    cost = (misfit + strength * (weights**2 @ pull)) / noise
+    slopes, misfit = _slopes(weights, inputs, neurons), outputs - targets
+    curvature = slopes @ slopes.transpose(0, 2, 1)
+    _, noise = _determined(strength, curvature, misfit, pull, most_noise)
+    hessian = curvature + _diagonal(strength[:, None] * pull)
+    cost = ((misfit**2).sum(axis=1) + strength * (weights**2 @ pull)) / noise
     log_det = np.linalg.slogdet(hessian / noise[:, None, None])[1]
-    evidence: Array = -(cost + log_det - width * np.log(strength / noise) + count * np.log(noise)) / 2
+    prior = len(pull) * np.log(strength / noise)
+    evidence: Array = -(cost + log_det - prior + targets.shape[1] * np.log(noise)) / 2
     return evidence
 
 
@@ -163,16 +187,19 @@ class NeuralNetwork(MultiOutputMixin, RegressorMixin, BaseEstimator):  # type: i
     True
     """
 
-    min_pairs: ClassVar[int] = 8
+    min_pairs: ClassVar[int] = 10
     fitted: ClassVar[tuple[str, ...]] = ("centre_", "scale_", "target_centre_", "target_scale_", "weights_")
 
     def __init__(self, seed: int = 0) -> None:
         self.seed = seed
 
     def fit(self, X: Any, y: Any) -> NeuralNetwork:
-        X, y = validate_data(
-            self, X, y, multi_output=True, y_numeric=True, dtype=np.float64, ensure_min_samples=2
-        )
+        X, y = validate_data(self, X, y, multi_output=True, y_numeric=True, dtype=np.float64)
+        if len(X) < X.shape[1] + 1:
+            raise FitError(
+                f"ann needs at least {X.shape[1] + 1} pairs (samples), found {len(X)} sample"
+                f"{'s' if len(X) > 1 else ''}; measure more places"
+            )
         targets = y.reshape(len(y), -1)
         self._single = y.ndim == 1
         self.centre_, self.scale_ = X.mean(axis=0), spread(X)

@@ -6,12 +6,14 @@ from typing import Any, ClassVar, NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
-from scipy.linalg import cho_solve, cholesky, solve_triangular
+from scipy.linalg import cholesky, solve_triangular
+from scipy.linalg.lapack import dpotrf, dpotri, dtrtrs
 from scipy.optimize import minimize
 from scipy.stats.qmc import Sobol
 from sklearn.base import BaseEstimator, MultiOutputMixin, RegressorMixin
 from sklearn.utils.validation import check_is_fitted, validate_data
 
+from ipsys_log.errors import FitError
 from ipsys_log.models.scaling import spread
 
 __all__ = ["Kriging", "most_likely"]
@@ -65,19 +67,15 @@ def _correlations(logs: Array, gaps: Array) -> tuple[Array, Array]:
 
 
 def _gls(correlations: Array, terms: Array, targets: Array) -> _Gls | None:
-    try:
-        lower = cholesky(correlations, lower=True, check_finite=False)
-    except np.linalg.LinAlgError:
+    # LAPACK itself: for some dozens of places scipy.linalg's checks would take most of the time.
+    lower, failed = dpotrf(correlations, lower=1)
+    if failed:
         return None
-    white = solve_triangular(lower, np.column_stack([terms, targets]), lower=True, check_finite=False)
+    white, _ = dtrtrs(lower, np.column_stack([terms, targets]), lower=1)
     trend = np.linalg.lstsq(white[:, :-1], white[:, -1], rcond=None)[0]
     residuals = white[:, -1] - white[:, :-1] @ trend
-    return _Gls(
-        lower,
-        np.asarray(trend, dtype=np.float64),
-        residuals,
-        max(float(np.mean(residuals**2)), (10 * _EPS) ** 2),
-    )
+    variance = max(float(np.mean(residuals**2)), (10 * _EPS) ** 2)
+    return _Gls(lower, np.asarray(trend, dtype=np.float64), residuals, variance)
 
 
 def _deviance(logs: Array, gaps: Array, terms: Array, targets: Array) -> tuple[float, Array]:
@@ -86,9 +84,9 @@ def _deviance(logs: Array, gaps: Array, terms: Array, targets: Array) -> tuple[f
     fitted = _gls(noisy, terms, targets)
     if fitted is None:
         return 1e25, np.zeros_like(logs)
-    inverse = cho_solve((fitted.cholesky, True), np.eye(len(noisy)), check_finite=False)
-    weights = solve_triangular(fitted.cholesky, fitted.residuals, lower=True, trans=1, check_finite=False)
-    slope = inverse - np.outer(weights, weights) / fitted.variance
+    half, _ = dpotri(fitted.cholesky, lower=1)  # the lower triangle of the inverse
+    weights, _ = dtrtrs(fitted.cholesky, fitted.residuals, lower=1, trans=1)
+    slope = half + np.tril(half, -1).T - np.outer(weights, weights) / fitted.variance
     by_theta = -np.exp(logs[: len(gaps)]) * np.tensordot(gaps, slope * smooth, axes=2)
     by_noise = [np.exp(logs[-1]) * np.trace(slope)] if len(logs) > len(gaps) else []
     return fitted.deviance(), np.append(by_theta, by_noise)
@@ -171,9 +169,12 @@ class Kriging(MultiOutputMixin, RegressorMixin, BaseEstimator):  # type: ignore[
         self.noisy = noisy
 
     def fit(self, X: Any, y: Any) -> Kriging:
-        X, y = validate_data(
-            self, X, y, multi_output=True, y_numeric=True, dtype=np.float64, ensure_min_samples=2
-        )
+        X, y = validate_data(self, X, y, multi_output=True, y_numeric=True, dtype=np.float64)
+        if len(X) < X.shape[1] + 3:  # the trend, and two more: with none over, the variance is zero
+            raise FitError(
+                f"kriging needs at least {X.shape[1] + 3} pairs (samples), found {len(X)} sample"
+                f"{'s' if len(X) > 1 else ''}; measure more places"
+            )
         targets = y.reshape(len(y), -1)
         self._single = y.ndim == 1
         self.centre_, self.scale_ = X.mean(axis=0), spread(X)

@@ -10,7 +10,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from ipsys_log.errors import IpsysError
-from ipsys_log.geometry.multilateration import multilaterate, sides_alike
+from ipsys_log.geometry.multilateration import multilaterate, side_of, sides_alike
 from ipsys_log.geometry.trilateration import SIDES
 from ipsys_log.messages import Distance, Measurement, Rig, WorldPoint
 from ipsys_log.offline.tape import reference_points
@@ -22,6 +22,8 @@ Array = NDArray[np.float64]
 
 # A prediction may lie a little below the floor; a marker does not.
 _LOWEST_M = -0.03
+# A correction below this is told to the millimetre.
+_FINE_M = 0.02
 
 
 @dataclass(frozen=True, slots=True)
@@ -87,16 +89,15 @@ def _as_taped(measurement: Measurement, rig: Rig) -> Measurement | None:
     height_m = point.z_m if measurement.height_m is None else measurement.height_m
     world_m = np.array([point.x_m, point.y_m])
     taped = measurement
-    if len(measurement.distances) < 2 or any(d.reference not in known for d in measurement.distances):
+    named = {distance.reference for distance in measurement.distances}
+    if len(named) < 2 or not named <= known:
         if len(rig.reference_points) < 2:
             return None
         tapes = tuple(
             Distance(p.name, float(np.hypot(*(world_m - [p.x_m, p.y_m])))) for p in rig.reference_points[:2]
         )
         taped = replace(measurement, distances=tapes, side=None)
-    a_m, b_m = reference_points(taped, rig)[:2]
-    left = (b_m - a_m)[0] * (world_m - a_m)[1] - (b_m - a_m)[1] * (world_m - a_m)[0] >= 0
-    side = taped.side or ("left" if left else "right")
+    side = taped.side or side_of(world_m, reference_points(taped, rig))
     return replace(taped, point=None, side=side, height_m=height_m)
 
 
@@ -132,11 +133,7 @@ def _distance_slips(taped: Measurement, references_m: Array, predicted_m: Array,
         except IpsysError:
             continue
         right_m = float(np.hypot(*(point_m - references_m[wrong])))
-        off_m = right_m - tape.distance_m
-        text = (
-            f"the distance to {tape.reference} {says} {tape.distance_m:.3f} m; {right_m:.2f} m, "
-            f"{_change(off_m)}, would fit"
-        )
+        text = f"the distance to {tape.reference} {says} {_correction(tape.distance_m, right_m)}"
         tapes = [*taped.distances]
         tapes[wrong] = replace(tape, distance_m=right_m)
         yield Slip("distance", text, replace(taped, distances=tuple(tapes)))
@@ -163,10 +160,12 @@ def _height_slips(measurement: Measurement, predicted_m: Array) -> list[Slip]:
         corrected = replace(measurement, point=WorldPoint(point.x_m, point.y_m, right_m))
     if height_m is None or right_m < _LOWEST_M:
         return []
-    off_m = right_m - height_m
-    text = f"the height reads {height_m:.3f} m; {right_m:.2f} m, {_change(off_m)}, would fit"
-    return [Slip("height", text, corrected)]
+    return [Slip("height", f"the height reads {_correction(height_m, right_m)}", corrected)]
 
 
-def _change(off_m: float) -> str:
-    return f"{abs(off_m) * CM_PER_M:.0f} cm {'more' if off_m > 0 else 'less'}"
+def _correction(read_m: float, right_m: float) -> str:
+    """In words; to the centimetre, as cameras know it, but for where the tapes make much of less."""
+    off_m = right_m - read_m
+    digits = 0 if abs(off_m) >= _FINE_M else 1
+    change = f"{abs(off_m) * CM_PER_M:.{digits}f} cm {'more' if off_m > 0 else 'less'}"
+    return f"{read_m:.3f} m; {right_m:.{digits + 2}f} m, {change}, would fit"

@@ -71,6 +71,10 @@ def world_point(measurement: Measurement, rig: Rig) -> TapePoint:
         reference points lie on one line.
     rig : for the reference points and the tape; not looked at where there is only a world point.
 
+    Returns
+    -------
+    TapePoint : the world point, its covariance, and the residuals of the distances.
+
     Raises
     ------
     IpsysError

@@ -189,4 +189,4 @@ def gather_suspects(accuracies: Sequence[Accuracy]) -> list[tuple[Suspect, list[
         for suspect in accuracy.evaluation.suspects if accuracy.evaluation else ():
             models = found.get(suspect.measurement, (suspect, []))[1]
             found[suspect.measurement] = (suspect, [*models, accuracy.model])
-    return sorted(found.values(), key=lambda pair: -float((pair[0].residual_m**2).sum()))
+    return sorted(found.values(), key=lambda pair: -float((pair[0].residual_m ** 2).sum()))

@@ -46,9 +46,10 @@ _SIMPLE_FIRST = (
     "rigid", "rayplane", "best", "poly", "rigid+poly", "kriging", "rigid+kriging",
     "kriging-regression", "rigid+kriging-regression", "ann", "rigid+ann",
 )  # fmt: skip
-_OWN = ("rayplane", "best")
+# The paper recommends one of these two, by how many places there are.
+_PAPERS = ("rigid", "poly")
 PAPER, ANY, TOLD = "paper", "any", "height_known"
-GROUPS = {PAPER: "the paper's methods", ANY: "all methods", TOLD: "all, heights known"}
+GROUPS = {PAPER: "rigid or poly", ANY: "all methods", TOLD: "all, heights known"}
 TOLD_NOTE = "* is told the height of each marker"
 _CONFIDENCE = 1.96
 
@@ -136,7 +137,7 @@ def _noise_m(point: CurvePoint, relative: float) -> float:
 
 def _choices(candidates: Sequence[_Candidate]) -> dict[str, Choice]:
     groups = {
-        PAPER: [c for c in candidates if c.model not in _OWN],
+        PAPER: [c for c in candidates if c.model in _PAPERS],
         ANY: [c for c in candidates if not told_height(c.model)],
         TOLD: candidates if any(told_height(c.model) for c in candidates) else [],
     }
@@ -165,8 +166,8 @@ def _sentences(
             f"for each camera, by {means_cm[-1]:.1f} cm with {max(table)}."
         )
         return
-    of_paper = {c.model for found in table.values() for c in found if c.model not in _OWN}
-    group, of = (PAPER, "Of the paper's methods use") if len(of_paper) > 1 else (ANY, "Use")
+    of_paper = {c.model for found in table.values() for c in found if c.model in _PAPERS}
+    group, of = (PAPER, "Of rigid and poly use") if len(of_paper) > 1 else (ANY, "Use")
     by_places = {places: found[group].model for places, found in choices.items() if group in found}
     if by_places:
         yield f"{of} {_by_number(by_places)}."

@@ -122,6 +122,19 @@ def test_one_reference_point_measured_twice() -> None:
     np.testing.assert_allclose(found.point_m, point, atol=1e-5)
 
 
+def test_many_readings_are_as_good_as_their_mean() -> None:
+    rng = np.random.default_rng(3)
+    references = np.array([A] * 200 + [B] * 200)
+    point = trilaterate(A, B, 1.7, 1.9, "right")
+    distances = ranges(point, references) + rng.normal(0, 0.01, 400)
+    found = multilaterate(references, distances, np.full(400, 0.01), "right")
+    mean = trilaterate(A, B, float(distances[:200].mean()), float(distances[200:].mean()), "right")
+    np.testing.assert_allclose(found.point_m, mean, atol=1e-8)
+    assert found.covariance_m2 is not None
+    alone = tape_covariance(point, np.array([A, B]), np.full(2, 0.01))
+    np.testing.assert_allclose(found.covariance_m2, alone / 200, rtol=0.02)
+
+
 def test_the_side_is_not_asked_where_the_distances_tell() -> None:
     references = np.array([A, B, C])
     point = np.array([2.0, 3.5])

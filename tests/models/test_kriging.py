@@ -10,8 +10,9 @@ import pytest
 from sklearn.exceptions import SkipTestWarning
 from sklearn.utils.estimator_checks import check_estimator
 
+from ipsys_log.errors import FitError
 from ipsys_log.models import create, parameters, restore
-from ipsys_log.models.kriging import Kriging, most_likely
+from ipsys_log.models.kriging import Kriging, _correlations, _gls, _squared_gaps, most_likely
 from tests import labs
 from tests.models.test_rays import authors_pairs, error_cm
 
@@ -99,11 +100,31 @@ def test_two_measurements_of_one_place_do_not_break_it() -> None:
     assert np.isfinite(Kriging(noisy=True).fit(x, y).predict(x)).all()
 
 
+# It fits 11 rows of 10 columns: the linear trend leaves nothing that a variance could be learned from.
+_TOO_FEW = {"check_regressor_multioutput": "has fewer rows than a linear trend of its columns needs"}
+
+
 @pytest.mark.parametrize("noisy", [False, True])
 def test_it_keeps_scikit_learns_contract(noisy: bool) -> None:
     with warnings.catch_warnings():
         warnings.simplefilter("ignore", SkipTestWarning)
-        check_estimator(Kriging(noisy))
+        check_estimator(Kriging(noisy), expected_failed_checks=_TOO_FEW)
+
+
+def test_pairs_that_leave_nothing_beside_the_trend_are_refused() -> None:
+    x, y = wavy(5, count=6)
+    Kriging().fit(x, y)
+    with pytest.raises(FitError, match=r"kriging needs at least 6 pairs .*, found 5 samples; measure more"):
+        Kriging().fit(x[:5], y[:5])
+
+
+def test_much_noise_leaves_the_plane() -> None:
+    x, y = wavy(6)
+    terms = np.column_stack([np.ones(len(x)), x])
+    noisy = _correlations(np.log([1.0, 1.0, 1.0, 1e9]), _squared_gaps(x, isotropic=False))[1]
+    found = _gls(noisy, terms, y)
+    assert found is not None
+    np.testing.assert_allclose(found.trend, np.linalg.lstsq(terms, y, rcond=None)[0], atol=1e-6)
 
 
 def test_the_variance_comes_back_out_of_a_log_too() -> None:

@@ -36,6 +36,7 @@ def misread(index: int, distance_m: float) -> Measurement:
     [
         (replace(PLACE, side="right"), "it lies left of the line from A to B, not right"),
         (misread(0, 1.6), "the distance to A reads 1.600 m; 1.50 m, 10 cm less, would fit"),
+        (misread(0, 1.512), "the distance to A reads 1.512 m; 1.500 m, 1.2 cm less, would fit"),
         (misread(1, 0.9), "the distance to B reads 0.900 m; 1.00 m, 10 cm more, would fit"),
         (replace(PLACE, height_m=0.3), "the height reads 0.300 m; 0.10 m, 20 cm less, would fit"),
         (
@@ -110,6 +111,14 @@ def test_a_point_that_came_with_distances_is_corrected_by_them() -> None:
     both = replace(misread(0, 1.6), side=None, height_m=None, point=WorldPoint(x + 0.1, y, z))
     texts = [slip.text for slip in slips(both)]
     assert "the distance to A reads 1.600 m; 1.50 m, 10 cm less, would fit" in texts
+
+
+def test_a_point_with_distances_from_one_reference_point_only() -> None:
+    x, y, z = TRUE.tolist()
+    odd = Measurement(
+        0, "a", marker_id=0, distances=(Distance("A", 1.5), Distance("A", 1.5)), point=WorldPoint(x, y, z)
+    )
+    assert any(slip.text.startswith("the distance to B") for slip in slips(odd))
 
 
 def test_no_marker_lies_below_the_floor() -> None:

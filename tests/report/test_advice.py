@@ -56,7 +56,7 @@ def test_the_paper_s_data_ask_for_rigid_with_10_places_and_poly_from_30(paper: F
     used = {places: found[PAPER].model for places, found in advice.choices.items()}
     assert used[10] == "rigid"
     assert used[30] == used[40] == "poly"
-    assert advice.sentences[0].startswith("Of the paper's methods use rigid with up to ")
+    assert advice.sentences[0].startswith("Of rigid and poly use rigid with up to ")
     assert "poly from" in advice.sentences[0]
 
 

@@ -67,4 +67,4 @@ def test_names_out_of_a_log_are_only_text(paper: Findings) -> None:
 def test_the_recommendation_is_printed(paper: Findings) -> None:
     text = printed(only(paper, "rigid", "poly").accuracies)
     assert "Which model with how many places" in text
-    assert "Of the paper's methods use rigid with up to 20 places for each camera, poly" in text
+    assert "Of rigid and poly use rigid with up to 20 places for each camera, poly" in text

@@ -18,7 +18,7 @@ if TYPE_CHECKING:
     from rich.table import Table
 
     from ipsys_log.messages import Rig
-    from ipsys_log.report.plan_picture import PlannedFloor
+    from ipsys_log.report.plan import PlannedFloor
 
 __all__ = ["add_commands"]
 
@@ -64,7 +64,7 @@ def plan(
     from ipsys_log.lookup import copied_run
     from ipsys_log.messages import Rig
     from ipsys_log.report.files import check_file
-    from ipsys_log.report.plan_picture import plan_floor
+    from ipsys_log.report.plan import plan_floor
     from ipsys_log.rig import load_rig
     from ipsys_log.sinks.shown import rig_in_force
 
@@ -126,7 +126,7 @@ def _check(logs: list[Path], rig: Rig | None, model: str, places: int, heights_m
 
 
 def _headline(found: PlannedFloor) -> str:
-    from ipsys_log.report.plan_picture import means_cm
+    from ipsys_log.report.plan import means_cm
 
     before, after = means_cm(found.plan.places[0].mean_before_m, found.plan.places[-1].mean_after_m)
     these = "this place" if len(found.plan.places) == 1 else f"these {len(found.plan.places)} places"
@@ -136,7 +136,7 @@ def _headline(found: PlannedFloor) -> str:
 def _table(found: PlannedFloor) -> Table:
     from rich.table import Table
 
-    from ipsys_log.report.plan_picture import means_cm
+    from ipsys_log.report.plan import means_cm
     from ipsys_log.units import CM_PER_M
 
     title = f"Where to measure next, for the model {found.model} of run {found.run}"

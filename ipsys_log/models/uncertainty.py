@@ -16,7 +16,7 @@ from numpy.typing import NDArray
 from scipy.optimize import minimize
 from scipy.spatial import ConvexHull, QhullError
 
-__all__ = ["Predict", "Uncertainty", "Volume", "estimate_uncertainty"]
+__all__ = ["Predict", "Uncertainty", "Volume", "estimate_uncertainty", "leverage_terms"]
 
 Array = NDArray[np.float64]
 
@@ -93,14 +93,15 @@ def _slopes(predict: Predict, points_m: Array, heights_m: Array) -> tuple[Array,
 
 def _leverage(fitted_m: Array, points_m: Array) -> Array:
     """How much a second-order polynomial in (u, v) rests on itself at each point: mean 6 / n where fitted."""
-    terms, at = _terms(fitted_m), _terms(points_m)
+    terms, at = leverage_terms(fitted_m), leverage_terms(points_m)
     # A trace on the diagonal where there are fewer places than terms.
     inverse = np.linalg.inv(terms.T @ terms + 1e-9 * np.eye(6))
     leverage: Array = np.einsum("ni,ij,nj->n", at, inverse, at)
     return leverage
 
 
-def _terms(points_m: Array) -> Array:
+def leverage_terms(points_m: Array) -> Array:
+    """The six terms up to second order in u = Xc / Zc, v = Yc / Zc, (n, 6), that leverage is reckoned by."""
     u, v = points_m[:, 0] / points_m[:, 2], points_m[:, 1] / points_m[:, 2]
     return np.stack([np.ones_like(u), u, v, u * u, u * v, v * v], axis=1)
 

@@ -12,93 +12,22 @@ from dataclasses import dataclass, replace
 
 import numpy as np
 from numpy.typing import NDArray
-from scipy.spatial import ConvexHull, cKDTree
+from scipy.spatial import cKDTree
 
 from ipsys_log.errors import IpsysError
-from ipsys_log.geometry.lenses import project, undistort
-from ipsys_log.geometry.poses import transform
-from ipsys_log.messages import CameraCalibration
-from ipsys_log.models.rays import directions
-from ipsys_log.models.uncertainty import Predict, Uncertainty
+from ipsys_log.models.uncertainty import leverage_terms
+from ipsys_log.offline.views import View
 
-__all__ = ["Plan", "PlannedPlace", "View", "mean_length", "plan_places"]
+__all__ = ["Plan", "PlannedPlace", "mean_length", "plan_places"]
 
 Array = NDArray[np.float64]
 Mask = NDArray[np.bool_]
 # The variance of x plus that of y, (n,), of places (n, 3) that are measured.
 Tape = Callable[[Array], Array]
 
-# The corners of a marker of any heading lie on a circle; so many points of it are looked at.
-_RIM = 12
-# Where the lens is not known, so far beyond the outermost places (in u and v) a camera sees.
-_BEYOND = 0.05
-# Directions (u, v) nearer together than this are one.
-_SAME_RAY = 1e-3
-_GRAZED = 5.0
 # So near to a known place another one may err alike; another that does this share as much is better.
 _BESIDE_M = 0.2
 _ALMOST = 0.9
-
-
-@dataclass(frozen=True, slots=True, eq=False)
-class View:
-    """A fitted camera: what it sees of the world, and how far off its positions are.
-
-    Attributes
-    ----------
-    camera_from_world, bend : (4, 4) and (3,), fitted: the pose, and the correction of the lens as
-        :func:`ipsys_log.models.rays.directions` takes it.
-    lens : its calibration, None where it is not known.
-    fitted_m : (n, 3), world points of the places that it was fitted on, as ``uncertainty`` has them.
-    """
-
-    camera: str
-    camera_from_world: Array
-    bend: Array
-    lens: CameraCalibration | None
-    predict: Predict
-    uncertainty: Uncertainty
-    fitted_m: Array
-
-    def points(self, world_m: Array) -> Array:
-        """Camera points (n, 3) of world points (n, 3); NaN where there is none."""
-        inside_m = transform(self.camera_from_world, world_m)
-        # Nothing is seen, and no model holds, where the view is grazed.
-        ahead = np.hypot(inside_m[:, 0], inside_m[:, 1]) < _GRAZED * inside_m[:, 2]
-        depths_m = np.where(ahead, inside_m[:, 2], np.nan)[:, None]
-        said = true = inside_m / depths_m
-        for _ in range(5):  # to what the model bends to the true direction
-            said = said + true - directions(said, self.bend)
-        lost = ~(np.abs(directions(said, self.bend) - true).max(axis=1) < _SAME_RAY)
-        return np.where(lost[:, None], np.nan, said * depths_m)
-
-    def sees(self, world_m: Array, radius_m: float) -> Mask:
-        """Whether level discs about world points (n, 3) lie in the image whole, (n,).
-
-        Without a lens: whether the points lie, in the image, among the fitted places or a little beyond.
-        """
-        if self.lens is None:
-            fitted, at = (p[:, :2] / p[:, 2:] for p in (self.uncertainty.points_m, self.points(world_m)))
-            edges = ConvexHull(fitted).equations
-            return np.asarray((at @ edges[:, :2].T + edges[:, 2]).max(axis=1) <= _BEYOND, dtype=np.bool_)
-        angles = np.linspace(0, 2 * np.pi, _RIM, endpoint=False)
-        rim_m = radius_m * np.stack([np.cos(angles), np.sin(angles), np.zeros(_RIM)], axis=1)
-        whole = _in_frame(self.points(world_m), self.lens)
-        rims_m = (world_m[whole, None] + rim_m).reshape(-1, 3)
-        whole[whole] = _in_frame(self.points(rims_m), self.lens).reshape(-1, _RIM).all(axis=1)
-        return whole
-
-
-def _in_frame(points_m: Array, lens: CameraCalibration) -> Mask:
-    """Which camera points (n, 3) lie in the image, (n,)."""
-    inside = np.asarray(np.isfinite(points_m).all(axis=1))
-    if inside.any():
-        px = project(points_m[inside], lens)
-        # What lies outside may be bent back into the frame: it is not there.
-        again = undistort(px, lens) - points_m[inside, :2] / points_m[inside, 2:]
-        framed = ((px >= 0) & (px <= [lens.width - 1, lens.height - 1])).all(axis=1)
-        inside[inside] = framed & (np.abs(again).max(axis=1) < _SAME_RAY)
-    return inside
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -157,7 +86,8 @@ def plan_places(
 
     Examples
     --------
-    >>> from ipsys_log.geometry.poses import invert_pose, look_down
+    >>> from ipsys_log.geometry.poses import invert_pose, look_down, transform
+    >>> from ipsys_log.models.uncertainty import Uncertainty
     >>> pose = look_down(np.array([0.0, 0.0, 2.0]))
     >>> floor_m = np.array([[x, y, 0.0] for x in (-1.0, 0.0, 1.0) for y in (-0.5, 0.0, 0.5)])
     >>> fitted_m = np.delete(floor_m, 7, axis=0)
@@ -201,7 +131,7 @@ class _Share:
 
     def __init__(self, view: View, floor_m: Array, candidates_m: Array, tape_m2: Tape, radius_m: float):
         self.on_floor, self.near = view.sees(floor_m, radius_m), view.sees(candidates_m, radius_m)
-        fitted = _terms(view.uncertainty.points_m)
+        fitted = leverage_terms(view.uncertainty.points_m)
         self._inverse = np.asarray(np.linalg.inv(fitted.T @ fitted + 1e-9 * np.eye(6)), dtype=np.float64)
         self._noise_m2, fit_m2, self._floor_terms = _parts(view, floor_m[self.on_floor])
         self._fit_m2 = fit_m2 / _leverage(self._floor_terms, self._inverse)
@@ -243,13 +173,7 @@ def _parts(view: View, world_m: Array) -> tuple[Array, Array, Array]:
         one.covariances(view.predict, points_m, world_m[:, 2])[:, [0, 1, 0], [0, 1, 1]].T
         for one in (view.uncertainty, certain)
     )
-    return noise_m2, whole_m2 - noise_m2, _terms(points_m)
-
-
-def _terms(points_m: Array) -> Array:
-    """What :mod:`ipsys_log.models.uncertainty` takes the leverage of: second order in (u, v)."""
-    u, v = points_m[:, 0] / points_m[:, 2], points_m[:, 1] / points_m[:, 2]
-    return np.stack([np.ones_like(u), u, v, u * u, u * v, v * v], axis=1)
+    return noise_m2, whole_m2 - noise_m2, leverage_terms(points_m)
 
 
 def _leverage(terms: Array, inverse: Array) -> Array:

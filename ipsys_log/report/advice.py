@@ -31,6 +31,7 @@ __all__ = [
     "ANY",
     "GROUPS",
     "PAPER",
+    "SIMPLE",
     "TOLD",
     "TOLD_NOTE",
     "Advice",
@@ -47,9 +48,15 @@ _SIMPLE_FIRST = (
     "kriging-regression", "rigid+kriging-regression", "ann", "rigid+ann",
 )  # fmt: skip
 # The paper recommends one of these two, by how many places there are.
-_PAPERS = ("rigid", "poly")
-PAPER, ANY, TOLD = "paper", "any", "height_known"
-GROUPS = {PAPER: "rigid or poly", ANY: "all methods", TOLD: "all, heights known"}
+_SIMPLE = ("rigid", "poly")
+_OWN = ("rayplane", "best")
+SIMPLE, PAPER, ANY, TOLD = "simple", "paper", "any", "height_known"
+GROUPS = {
+    SIMPLE: "rigid or poly",
+    PAPER: "the paper's methods",
+    ANY: "all methods",
+    TOLD: "all, heights known",
+}
 TOLD_NOTE = "* is told the height of each marker"
 _CONFIDENCE = 1.96
 
@@ -80,6 +87,16 @@ class Advice:
     in_space: bool
     choices: Mapping[int, Mapping[str, Choice]]
     sentences: tuple[str, ...]
+
+    @property
+    def groups(self) -> list[str]:
+        """The groups that say something else than those before them."""
+        shown: dict[str, list[Choice | None]] = {}
+        for group in GROUPS:
+            column = [found.get(group) for found in self.choices.values()]
+            if any(column) and column not in shown.values():
+                shown[group] = column
+        return list(shown)
 
 
 @dataclass(frozen=True, slots=True)
@@ -137,7 +154,8 @@ def _noise_m(point: CurvePoint, relative: float) -> float:
 
 def _choices(candidates: Sequence[_Candidate]) -> dict[str, Choice]:
     groups = {
-        PAPER: [c for c in candidates if c.model in _PAPERS],
+        SIMPLE: [c for c in candidates if c.model in _SIMPLE],
+        PAPER: [c for c in candidates if c.model not in _OWN],
         ANY: [c for c in candidates if not told_height(c.model)],
         TOLD: candidates if any(told_height(c.model) for c in candidates) else [],
     }
@@ -166,15 +184,15 @@ def _sentences(
             f"for each camera, by {means_cm[-1]:.1f} cm with {max(table)}."
         )
         return
-    of_paper = {c.model for found in table.values() for c in found if c.model in _PAPERS}
-    group, of = (PAPER, "Of rigid and poly use") if len(of_paper) > 1 else (ANY, "Use")
+    simple = {c.model for found in table.values() for c in found if c.model in _SIMPLE}
+    group, of = (SIMPLE, "Of rigid and poly use") if len(simple) > 1 else (ANY, "Use")
     by_places = {places: found[group].model for places, found in choices.items() if group in found}
     if by_places:
         yield f"{of} {_by_number(by_places)}."
     most = max(choices)
     for other, start in ((ANY, "The"), (TOLD, "Where the heights of the markers are known, the")):
-        if PAPER in choices[most] and other in choices[most]:
-            yield from _saving(start, choices[most][other].model, choices[most][PAPER], most, table)
+        if SIMPLE in choices[most] and other in choices[most]:
+            yield from _saving(start, choices[most][other].model, choices[most][SIMPLE], most, table)
 
 
 def _by_number(models: Mapping[int, str]) -> str:

@@ -77,13 +77,12 @@ def advice_rows(findings: Findings) -> dict[str, Any] | None:
     advice = findings.advice
     if advice is None:
         return None
-    groups = [group for group in GROUPS if any(group in found for found in advice.choices.values())]
     return {
         "published": advice.published,
         "in_space": advice.in_space,
-        "groups": [GROUPS[group] for group in groups],
+        "groups": [GROUPS[group] for group in advice.groups],
         "rows": [
-            (places, [_choice(found.get(group)) for group in groups])
+            (places, [_choice(found.get(group)) for group in advice.groups])
             for places, found in advice.choices.items()
         ],
         "sentences": advice.sentences,

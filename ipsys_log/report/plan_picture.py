@@ -1,10 +1,7 @@
-"""What to measure next: planned from a log, and as a picture of the predicted error before and after."""
+"""What to measure next as a picture: the predicted error over the floor, before and after."""
 
 from __future__ import annotations
 
-import math
-from collections.abc import Callable, Iterator, Mapping, Sequence
-from dataclasses import dataclass
 from pathlib import Path
 
 import numpy as np
@@ -17,228 +14,19 @@ from matplotlib.ticker import MaxNLocator
 from numpy.typing import NDArray
 from scipy.ndimage import gaussian_filter
 
-from ipsys_log.errors import IpsysError
-from ipsys_log.geometry.multilateration import sides_alike, tape_covariance
-from ipsys_log.geometry.poses import invert_pose, make_pose
-from ipsys_log.log.session import Session
-from ipsys_log.messages import CameraCalibration, CameraModel, Measurement, Model, Rig
-from ipsys_log.models.applied import AppliedModel
-from ipsys_log.models.rigid import rigid_transform
-from ipsys_log.models.uncertainty import Uncertainty
-from ipsys_log.offline.plan import Plan, View, plan_places
 from ipsys_log.report.palette import NOTE, REST, camera_styles
+from ipsys_log.report.plan import PlannedFloor, means_cm, mesh
 from ipsys_log.units import CM_PER_M
 
-__all__ = ["PlannedFloor", "draw_plan", "fitted_view", "means_cm", "plan_floor"]
+__all__ = ["draw_plan"]
 
 Array = NDArray[np.float64]
-Lenses = Mapping[str, CameraCalibration]
-
-# From the middle of a marker to the corners of the white around it, in sides: it has 6 cells or more.
-_RADIUS = 8 / 6 / np.sqrt(2)
-# Between candidates, and of the floor's cells; twice as much on a floor of 10 m.
-_STEP_M, _SPAN_M = 0.1, 5.0
-_AROUND_M = 0.5
-_MOST_HEIGHTS = 5
-# Of a tape, and of a camera with too few places to tell: relative, as uncertainty.py has them.
-_USUAL_TAPE_M, _USUAL_NOISE, _USUAL_FIT = 0.003, 3e-4, 2.5e-3
-_LITTLE = 0.05
-# As many as the leverage has terms: with fewer it knows no bounds.
-_LEAST_PLACES = 6
 
 # Pale where the error is small; no hue of a camera, and apart in grey too.
 _HEAT = LinearSegmentedColormap.from_list("heat", ["#FBFDFF", "#DCE6F2", "#B3CBE3", "#86A9D0", "#5C84B8"])
 _SIDE_IN = 5.35
 # Places nearer together than this share of the floor share a ring.
 _RING = 0.04
-
-
-@dataclass(frozen=True, slots=True, eq=False)
-class PlannedFloor:
-    """A plan and what it is for.
-
-    Attributes
-    ----------
-    model, run, rig : that were planned for.
-    plan : over the middles of the floor's cells, (b * a,), row by row.
-    xs_m, ys_m : (a,), (b,), the middles of these cells.
-    height_m : of the marker whose error is predicted.
-    measured_m : (n, 3), the places that the model was fitted on.
-    notes : what to know of it.
-    """
-
-    model: str
-    run: str
-    rig: Rig
-    plan: Plan
-    xs_m: Array
-    ys_m: Array
-    height_m: float
-    measured_m: Array
-    notes: tuple[str, ...]
-
-    def distances_m(self, point_m: Array) -> dict[str, float]:
-        """What the tape will say of a place (3,), about, by reference point."""
-        x_m, y_m, _ = point_m.tolist()
-        return {p.name: math.hypot(x_m - p.x_m, y_m - p.y_m) for p in self.rig.reference_points}
-
-    def side(self, point_m: Array) -> str | None:
-        """Of the line from the first reference point to the second, where the tape needs it."""
-        known_m = _references(self.rig)
-        if len(known_m) < 2 or not sides_alike(known_m):
-            return None
-        (x, y), (along, across) = known_m[1] - known_m[0], point_m[:2] - known_m[0]
-        return "left" if x * across >= y * along else "right"
-
-
-def plan_floor(
-    session: Session, run: str, rig: Rig, lenses: Lenses, count: int, heights_m: Sequence[float] = ()
-) -> PlannedFloor:
-    """Plan the next places to measure for the fitted model of a run.
-
-    Parameters
-    ----------
-    rig, lenses : in force; the lenses by camera.
-    count : how many places.
-    heights_m : at which a marker can be laid; empty for those that were used so far.
-
-    Raises
-    ------
-    IpsysError
-        Where no camera sees a marker of such a height anywhere on the floor.
-    """
-    model: Model = session.payloads(session.topics(Model, run))[-1]
-    views = [
-        fitted_view(model.name, camera, lenses.get(camera.camera)) for camera in model.cameras if camera.pairs
-    ]
-    if not views:
-        raise IpsysError(f"run {run}: its model does not say on which places it was fitted; fit it again")
-    measured_m = np.unique(np.vstack([view.fitted_m for view in views]), axis=0)
-    # The height of the robots' markers, where it is known.
-    carried_m = [height for marker in rig.markers if (height := rig.height_of(marker.id)) is not None]
-    height_m = round(float(np.median(carried_m or measured_m[:, 2])), 3)
-    low_m, high_m = _corners(rig, measured_m)
-    step_m = _STEP_M * max(1, round(float((high_m - low_m).max()) / _SPAN_M))
-    xs_m, ys_m = (np.arange(a + step_m / 2, b, step_m) for a, b in zip(low_m, high_m, strict=True))
-    side_m = max((rig.length_of(marker.id) for marker in rig.markers), default=rig.marker_length_m)
-    plan = plan_places(
-        views,
-        _mesh(xs_m, ys_m, [height_m]),
-        _candidates(rig, low_m, high_m, step_m, side_m / 2, heights_m or _used_heights(measured_m[:, 2])),
-        _tape(session, rig),
-        _RADIUS * side_m,
-        count,
-    )
-    notes = tuple(_notes(model, rig, lenses, plan))
-    return PlannedFloor(model.name, run, rig, plan, xs_m, ys_m, height_m, measured_m, notes)
-
-
-def fitted_view(name: str, camera: CameraModel, lens: CameraCalibration | None) -> View:
-    """What a fitted camera sees; ``name`` is its model's, ``lens`` None where it is not known."""
-    points_m, world_m = (np.array([getattr(p, key) for p in camera.pairs]) for key in ("camera_m", "world_m"))
-    arrays = {p.name: p.values.reshape(p.shape) for p in camera.parameters}
-    if {"rotation", "origin", "lens"} <= set(arrays):
-        rotation, origin_m, bend = arrays["rotation"], arrays["origin"], arrays["lens"]
-    else:
-        (rotation, origin_m), bend = rigid_transform(points_m, world_m), np.zeros(3)
-    noise = camera.noise
-    if noise is None:
-        fit = _USUAL_FIT**2 * np.eye(3)
-        uncertainty = Uncertainty(_USUAL_NOISE, _USUAL_NOISE, 1.0, fit, points_m)
-    else:
-        uncertainty = Uncertainty(noise.along, noise.across, noise.growth, noise.fit, points_m)
-    pose = invert_pose(make_pose(rotation, origin_m))
-    return View(camera.camera, pose, bend, lens, AppliedModel(name, camera).predict, uncertainty, world_m)
-
-
-def _used_heights(heights_m: Array) -> list[float]:
-    """To the centimetre; of many, some from the lowest to the highest."""
-    used_m = np.unique(np.round(heights_m, 2))
-    some = np.linspace(0, len(used_m) - 1, min(len(used_m), _MOST_HEIGHTS)).round().astype(int)
-    return [float(height_m) for height_m in used_m[some]]
-
-
-def _corners(rig: Rig, measured_m: Array) -> tuple[Array, Array]:
-    if rig.floor is not None:
-        return np.zeros(2), np.array([rig.floor.width_m, rig.floor.depth_m])
-    low_m, high_m = measured_m[:, :2].min(axis=0), measured_m[:, :2].max(axis=0)
-    return np.round(low_m - _AROUND_M, 1), np.round(high_m + _AROUND_M, 1)
-
-
-def _candidates(
-    rig: Rig, low_m: Array, high_m: Array, step_m: float, half_m: float, heights_m: Sequence[float]
-) -> Array:
-    """Where a marker can be laid, (c, 3): not over the edge of the floor, nor on a reference point."""
-    inset_m = _STEP_M * math.ceil(half_m / _STEP_M - 1e-9)
-    # In whole centimetres, as they are printed.
-    xs_m, ys_m = (
-        np.arange(a + inset_m, b - half_m + 1e-9, step_m).round(2) for a, b in zip(low_m, high_m, strict=True)
-    )
-    found_m = _mesh(xs_m, ys_m, heights_m)
-    apart_m = np.linalg.norm(found_m[:, None, :2] - _references(rig), axis=2)
-    free: Array = found_m[(apart_m > half_m).all(axis=1)]
-    return free
-
-
-def _mesh(xs_m: Array, ys_m: Array, zs_m: Sequence[float]) -> Array:
-    """All points of a grid, (n, 3), row by row."""
-    return np.stack(np.meshgrid(xs_m, ys_m, zs_m), axis=-1).reshape(-1, 3)
-
-
-def _references(rig: Rig) -> Array:
-    return np.array([(p.x_m, p.y_m) for p in rig.reference_points]).reshape(-1, 2)
-
-
-def _tape(session: Session, rig: Rig) -> Callable[[Array], Array]:
-    """The variance of x plus that of y at places (n, 3); 0 where nothing is known of the tape's start."""
-    known_m = _references(rig)
-    payloads = session.payloads(session.topics(Measurement)) if rig.tape_sigma_m is None else []
-    named_m = [d.sigma_m for measurement in payloads for d in measurement.distances if d.sigma_m]
-    sigma_m = rig.tape_sigma_m or float(np.median(named_m or _USUAL_TAPE_M))
-
-    def variances(world_m: Array) -> Array:
-        if len(known_m) < 2:
-            return np.zeros(len(world_m))
-        sigmas_m = np.full(len(known_m), sigma_m)
-        floor_m, rows = np.unique(world_m[:, :2], axis=0, return_inverse=True)
-        found_m2 = [np.trace(tape_covariance(point_m, known_m, sigmas_m)) for point_m in floor_m]
-        return np.array(found_m2)[rows.reshape(-1)]
-
-    return variances
-
-
-def _notes(model: Model, rig: Rig, lenses: Lenses, plan: Plan) -> Iterator[str]:
-    fitted = {camera.camera for camera in model.cameras if camera.pairs}
-    for camera in sorted({camera.name for camera in rig.cameras} - fitted):
-        yield f"camera {camera} has no model: first measure about 10 places in its view, out to its edges"
-    for row in model.cameras:
-        if 0 < len(row.pairs) < _LEAST_PLACES:
-            yield f"camera {row.camera} has fewer than {_LEAST_PLACES} places: its error now is only guessed"
-        if row.camera in fitted and row.camera not in lenses:
-            yield f"camera {row.camera} has no lens in the log: taken to see what lies among its places"
-        if row.camera in fitted and row.noise is None:
-            yield f"camera {row.camera} has too few places to know its noise: what is usual was taken"
-    if rig.floor is None:
-        yield "the rig has no floor: planned on half a metre around the measured places"
-    if len(rig.reference_points) < 2:
-        yield "the rig has no two reference points: how well the tape knows a place was left out"
-    if plan.places[-1].mean_after_m > (1 - _LITTLE) * plan.places[0].mean_before_m:
-        yield "these places change little: most of the predicted error is noise of the cameras, not the fit's"
-
-
-def means_cm(*means_m: float) -> list[str]:
-    """Mean errors in cm, with a third digit where two do not tell them apart.
-
-    Examples
-    --------
-    >>> means_cm(0.0062, 0.0051), means_cm(0.00184, 0.00177, 0.00176)
-    (['0.62', '0.51'], ['0.184', '0.177', '0.176'])
-    """
-    short, long = (
-        [f"{mean_m * CM_PER_M:.{digits}f}" if mean_m < 1 else "over 100" for mean_m in means_m]
-        for digits in (2, 3)
-    )
-    return short if len(set(short)) == len(set(long)) else long
 
 
 def draw_plan(found: PlannedFloor, path: Path) -> None:
@@ -283,7 +71,7 @@ def _draw_floor(axes: Axes, found: PlannedFloor, error_cm: Array, top_cm: float)
     axes.plot(*found.measured_m[:, :2].T, "o", color=NOTE, ms=3, zorder=3, label="measured")
     axes.plot([], [], "o", ms=9, mfc="white", mec="black", mew=1.2, label="to measure, in this order")
     # Of a large floor only what the cameras see.
-    seen_m = _mesh(found.xs_m, found.ys_m, [0.0])[~np.isnan(error_cm), :2]
+    seen_m = mesh(found.xs_m, found.ys_m, [0.0])[~np.isnan(error_cm), :2]
     shown_m = np.vstack([seen_m - half_m, seen_m + half_m, found.measured_m[:, :2]])
     middle_m, span_m = (shown_m.max(axis=0) + shown_m.min(axis=0)) / 2, float(np.ptp(shown_m, axis=0).max())
     _draw_rings(axes, found, _RING * span_m)

@@ -150,29 +150,18 @@ def _suspects_table(accuracies: Sequence[Accuracy]) -> Table:
 def _advice_table(advice: Advice) -> Table:
     """What to use with how many places, and the same in words below."""
     title = "Which model with how many places for each camera, mean error in cm"
-    groups = _groups(advice)
     table = _table(title, (), ("places",))
-    for group in groups:
+    for group in advice.groups:
         table.add_column(GROUPS[group], overflow="fold")
     for places, found in advice.choices.items():
-        table.add_row(str(places), *(_choice(found[group]) if group in found else "-" for group in groups))
+        table.add_row(
+            str(places), *(_choice(found[group]) if group in found else "-" for group in advice.groups)
+        )
     _note(table, "\n".join(advice.sentences))
     return table
 
 
-def _groups(advice: Advice) -> list[str]:
-    """The groups that say something else than the one before."""
-    columns: dict[str, list[Choice | None]] = {
-        group: [found.get(group) for found in advice.choices.values()] for group in GROUPS
-    }
-    shown: list[str] = []
-    for group, column in columns.items():
-        if any(column) and column not in [columns[other] for other in shown]:
-            shown.append(group)
-    return shown
-
-
 def _choice(choice: Choice) -> str:
     other = choice.lowest != choice.model
-    lowest = f" ({choice.lowest} {choice.lowest_mean_m * CM_PER_M:.2f})" if other else ""
+    lowest = f"\n({choice.lowest} {choice.lowest_mean_m * CM_PER_M:.2f})" if other else ""
     return f"{choice.model} {choice.mean_m * CM_PER_M:.2f}{lowest}"

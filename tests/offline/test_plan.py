@@ -18,8 +18,9 @@ from ipsys_log.messages import CameraCalibration, Pair
 from ipsys_log.models import Places, fit_cameras, inputs
 from ipsys_log.models.uncertainty import Uncertainty
 from ipsys_log.offline.fit import fit_model
-from ipsys_log.offline.plan import Plan, View, mean_length, plan_places
-from ipsys_log.report.plan_picture import fitted_view
+from ipsys_log.offline.plan import Plan, mean_length, plan_places
+from ipsys_log.offline.views import View
+from ipsys_log.report.plan import fitted_view
 
 Array = NDArray[np.float64]
 

@@ -11,7 +11,7 @@ import pytest
 from ipsys_log.formats.imsel import read_imsel
 from ipsys_log.messages import CameraEvaluation, ErrorStatistics, Evaluation, LearningPoint
 from ipsys_log.output import write_log
-from ipsys_log.report.advice import ANY, PAPER, TOLD, advise
+from ipsys_log.report.advice import ANY, PAPER, SIMPLE, TOLD, advise
 from ipsys_log.report.findings import Findings
 from tests.report.conftest import find
 
@@ -53,7 +53,7 @@ def test_the_paper_s_data_ask_for_rigid_with_10_places_and_poly_from_30(paper: F
     advice = paper.advice
     assert advice is not None
     assert advice.published
-    used = {places: found[PAPER].model for places, found in advice.choices.items()}
+    used = {places: found[SIMPLE].model for places, found in advice.choices.items()}
     assert used[10] == "rigid"
     assert used[30] == used[40] == "poly"
     assert advice.sentences[0].startswith("Of rigid and poly use rigid with up to ")
@@ -66,8 +66,8 @@ def test_the_paper_s_data_on_random_subsets_say_the_same(paper: Findings) -> Non
     advice = advise(drawn)
     assert advice is not None
     assert not advice.published
-    assert {advice.choices[places][PAPER].model for places in (5, 7, 10)} == {"rigid"}
-    assert {advice.choices[places][PAPER].model for places in (30, 40)} == {"poly"}
+    assert {advice.choices[places][SIMPLE].model for places in (5, 7, 10)} == {"rigid"}
+    assert {advice.choices[places][SIMPLE].model for places in (30, 40)} == {"poly"}
 
 
 @pytest.mark.slow
@@ -87,10 +87,10 @@ def test_the_simplest_model_within_the_noise_is_used() -> None:
     apart = advise([evaluation("rigid", near), evaluation("poly", {10: 3.0, 20: 2.0})])
     assert alike is not None
     assert apart is not None
-    assert alike.choices[20][PAPER].model == "rigid"
-    assert alike.choices[20][PAPER].lowest == "poly"
-    assert alike.choices[20][PAPER].lowest_mean_m == pytest.approx(0.02)
-    assert apart.choices[20][PAPER].model == "poly"
+    assert alike.choices[20][SIMPLE].model == "rigid"
+    assert alike.choices[20][SIMPLE].lowest == "poly"
+    assert alike.choices[20][SIMPLE].lowest_mean_m == pytest.approx(0.02)
+    assert apart.choices[20][SIMPLE].model == "poly"
 
 
 def test_the_spread_over_random_subsets_is_noise_too() -> None:
@@ -98,7 +98,7 @@ def test_the_spread_over_random_subsets_is_noise_too() -> None:
     spread = [replace(e, learning=tuple(replace(p, std_3d_m=0.01) for p in e.learning)) for e in found]
     advice = advise(spread)
     assert advice is not None
-    assert advice.choices[20][PAPER].model == "rigid"
+    assert advice.choices[20][SIMPLE].model == "rigid"
 
 
 def test_labelled_subsets_come_before_random_ones_where_they_have_sizes() -> None:
@@ -122,15 +122,30 @@ def test_a_model_that_is_told_heights_is_not_compared_with_those_that_are_not() 
     )  # fmt: skip
     assert advice is not None
     assert {group: choice.model for group, choice in advice.choices[10].items()} == {
-        PAPER: "rigid", ANY: "best", TOLD: "rayplane",
+        SIMPLE: "rigid", PAPER: "rigid", ANY: "best", TOLD: "rayplane",
     }  # fmt: skip
+
+
+def test_the_paper_s_other_methods_are_no_reason_to_use_neither_rigid_nor_poly() -> None:
+    advice = advise(
+        [evaluation("rigid", {10: 3.0, 20: 3.0}), evaluation("poly", {10: 8.0, 20: 2.4}),
+         evaluation("kriging", {10: 2.0, 20: 2.0})]
+    )  # fmt: skip
+    assert advice is not None
+    assert {n: found[SIMPLE].model for n, found in advice.choices.items()} == {10: "rigid", 20: "poly"}
+    assert {found[PAPER].model for found in advice.choices.values()} == {"kriging"}
+    assert advice.sentences[0] == (
+        "Of rigid and poly use rigid with up to 10 places for each camera, poly from 20 on."
+    )
+    # Nothing is there that is not of the paper: a column of all would say the same again.
+    assert advice.groups == [SIMPLE, PAPER]
 
 
 def test_a_level_lab_is_judged_on_the_floor() -> None:
     advice = advise([evaluation("rigid", {10: 3.0, 20: 3.0}, level=True)])
     assert advice is not None
     assert not advice.in_space
-    assert advice.choices[10][PAPER].mean_m == pytest.approx(0.015)
+    assert advice.choices[10][SIMPLE].mean_m == pytest.approx(0.015)
 
 
 def test_a_number_of_places_that_a_camera_lacks_says_nothing_of_all_cameras() -> None:

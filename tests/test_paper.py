@@ -22,7 +22,8 @@ def published(data: Path) -> list[dict[str, str]]:
 def test_tables_i_and_ii_to_every_printed_digit(ipsys: Ipsys, data: Path, tmp_path: Path) -> None:
     log = tmp_path / "imsel.mcap"
     assert ipsys("import", "imsel", data / "imsel", "-o", log).code == 0
-    models = json.loads(ipsys("evaluate", log, "--json").out)["models"]
+    wanted = [option for name in METHODS.values() for option in ("--model", name)]
+    models = json.loads(ipsys("evaluate", log, *wanted, "--json").out)["models"]
     compared = 0
     for row in published(data):
         errors = models[METHODS[row["method"]]]["cameras"][row["camera"]][row["dimensions"].lower()]
@@ -31,6 +32,33 @@ def test_tables_i_and_ii_to_every_printed_digit(ipsys: Ipsys, data: Path, tmp_pa
             assert f"{errors[figure]:.3f}" == row[figure], (row, figure)
             compared += 1
     assert compared == 72
+
+
+@pytest.mark.slow
+def test_all_models_are_studied_by_one_command(ipsys: Ipsys, data: Path, tmp_path: Path) -> None:
+    """The tables, the figures and the page; Tables I and II as the paper has their rows."""
+    log, folder = tmp_path / "imsel.mcap", tmp_path / "figures"
+    ipsys("import", "imsel", data / "imsel", "-o", log)
+    done = ipsys("evaluate", log, "--plots", folder, "--json")
+    models = json.loads(done.out)["models"]
+    assert len(models) == 11
+    written = {path.name for path in folder.iterdir()}
+    assert {"table_1.csv", "table_2.csv", "figure_9.png", "figure_10.png", "figure_11.png"} <= written
+    with (data / "imsel" / "paper_tables.csv").open() as file:
+        rows = [row for row in csv.DictReader(file) if row["dimensions"] == "3D"]
+    ours = dict(zip(dict.fromkeys(row["method"] for row in rows), models, strict=False))
+    for method, limit in (("KI", 0.08), ("RT+KI", 0.08)):
+        for row in (row for row in rows if row["method"] == method):
+            mean_cm = models[ours[method]]["cameras"][row["camera"]]["3d"]["mean_cm"]
+            assert mean_cm == pytest.approx(float(row["mean_cm"]), rel=limit)
+    for method in ("ANN", "RT+ANN", "KR", "RT+KR"):
+        of_paper = sum(float(row["mean_cm"]) for row in rows if row["method"] == method) / 3
+        assert models[ours[method]]["pooled"]["3d"]["mean_cm"] <= of_paper
+    assert models["rayplane"]["pooled"]["2d"]["mean_cm"] <= 0.75
+    assert models["rayplane"]["pooled"]["cross_validation"]["2d"]["mean_cm"] <= 1.05
+    report = ipsys("report", log, "--html", tmp_path / "report.html")
+    assert report.code == 0
+    assert (tmp_path / "report.html").stat().st_size > 100_000
 
 
 def test_a_clone_of_the_authors_repository_is_read_too(ipsys: Ipsys, data: Path, tmp_path: Path) -> None:

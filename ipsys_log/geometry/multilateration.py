@@ -15,10 +15,12 @@ __all__ = ["Trilaterated", "crossing_angle", "multilaterate", "side_of", "sides_
 
 Array = NDArray[np.float64]
 
-# Reference points nearer to one line than this do not tell its sides apart: of two places that mirror
-# one another in it, the distances differ by no more than some readings of a tape.
+# Reference points nearer to one line than this hardly tell its sides apart.
 _BESIDE_LINE_M = 0.05
 _NEAREST_M = 1e-9
+# Two places fit equally well as long as their sums of squares, in sigmas, are no further apart.
+_ALIKE = 9.0
+_USUAL_SIGMA_M = 0.003
 _STARTS = 6
 _STEPS = 50
 _STEP_M = 1e-10
@@ -53,7 +55,8 @@ def multilaterate(
     distances_m : (n,), from the point to each of them.
     sigmas_m : (n,), standard deviations of the distances; without them there is no covariance.
     side : "left" or "right" of the line from the first reference point to the next one elsewhere. Needed
-        where all of them lie within 5 cm of one line, as two always do; else the distances themselves tell.
+        where all of them lie within 5 cm of one line, as two always do; else it decides between places that
+        the distances fit equally well.
 
     Returns
     -------
@@ -160,12 +163,8 @@ def tape_covariance(point_m: Array, references_m: Array, sigmas_m: Array) -> Arr
 
 
 def crossing_angle(point_m: Array, references_m: Array) -> float:
-    """The angle in rad, 0 to pi/2, at which the tapes to a point cross: the widest of any two of them.
-
-    Parameters
-    ----------
-    point_m : (2,), in m.
-    references_m : (n, 2), n >= 2, in m.
+    """The angle in rad, 0 to pi/2, at which the tapes from reference points, (n, 2) in m with n >= 2, to a
+    point, (2,), cross: the widest of any two of them.
 
     Examples
     --------
@@ -181,40 +180,44 @@ def crossing_angle(point_m: Array, references_m: Array) -> float:
 def _least_squares(
     references_m: Array, distances_m: Array, sigmas_m: Array | None, side: str | None
 ) -> Array:
-    """The best of what is found from where the first circle meets others, on ``side`` where it matters."""
-    weights = 1 / (np.ones_like(distances_m) if sigmas_m is None else sigmas_m)
-    apart = np.linalg.norm(references_m - references_m[0], axis=1) > _NEAREST_M
+    """The best of what is found from where two of the circles meet, on ``side`` if that fits as well."""
+    weights = 1 / (np.full_like(distances_m, _USUAL_SIGMA_M) if sigmas_m is None else sigmas_m)
+    # Several distances from one reference point begin nowhere else than one of them.
+    first = np.unique(references_m, axis=0, return_index=True)[1][:_STARTS]
     found = []
-    for reference_m, distance_m in list(zip(references_m[apart], distances_m[apart].tolist(), strict=True))[
-        :_STARTS
-    ]:
-        for one in SIDES:
-            start_m = meeting_point(references_m[0], reference_m, float(distances_m[0]), distance_m, one)
-            found.append(_descend(start_m, references_m, distances_m, weights))
-    if side is not None and sides_alike(references_m):
-        # A place on the line itself may come out on either side of it.
-        found = [one for one in found if side_of(one[1], references_m) == side] or found
-    return min(found, key=lambda one: one[0])[1]
+    for i, j in combinations(first.tolist(), 2):
+        two = references_m[i], references_m[j], float(distances_m[i]), float(distances_m[j])
+        starts_m = [meeting_point(*two, one) for one in SIDES]
+        found += [_descend(start_m, references_m, distances_m, weights) for start_m in starts_m]
+    likely = min(cost for cost, _ in found) + _ALIKE
+    there = [one for one in found if one[0] <= likely and side_of(one[1], references_m) == side]
+    # A place on the line itself may come out on either side of it.
+    return min(there or found, key=lambda one: one[0])[1]
 
 
 def _descend(point_m: Array, references_m: Array, distances_m: Array, weights: Array) -> tuple[float, Array]:
-    """Levenberg's Gauss-Newton: the weighted sum of squares at the point it comes to, and the point."""
+    """Damped Newton: the weighted sum of squares at the point it comes to, and the point."""
 
     def misfit(at_m: Array) -> tuple[float, Array, Array]:
         ranges_m, units = _directions(at_m, references_m)
         off = (distances_m - ranges_m) * weights
-        return float(off @ off), off, units * weights[:, None]
+        outer = units[:, :, None] * units[:, None, :]
+        # Where the circles cross flatly their curvature is what there is to go by.
+        bend = (off * weights / ranges_m)[:, None, None] * (np.eye(2) - outer)
+        hessian = (weights[:, None, None] ** 2 * outer - bend).sum(axis=0)
+        return float(off @ off), (off * weights) @ units, hessian
 
-    cost, off, slope = misfit(point_m)
+    cost, downhill, hessian = misfit(point_m)
     damping = 1e-6
     for _ in range(_STEPS):
-        normal = slope.T @ slope
-        step_m = np.linalg.solve(normal + damping * np.trace(normal) * np.eye(2), slope.T @ off)
-        lower, next_off, next_slope = misfit(point_m + step_m)
+        # Enough to make it positive definite, whatever the curvature.
+        lift = damping * np.abs(hessian).max() - min(float(np.linalg.eigvalsh(hessian)[0]), 0.0) * 1.1
+        step_m = np.linalg.solve(hessian + lift * np.eye(2), downhill)
+        lower, *there = misfit(point_m + step_m)
         if lower > cost:
             damping *= 10
         else:
-            point_m, cost, off, slope = point_m + step_m, lower, next_off, next_slope
+            point_m, cost, (downhill, hessian) = point_m + step_m, lower, there
             damping = max(damping / 10, 1e-12)
         if np.hypot(*step_m) < _STEP_M:
             break
@@ -244,6 +247,4 @@ def _check_numbers(references_m: Array, distances_m: Array, sigmas_m: Array | No
         if not (np.isfinite(distances_m) & (distances_m > 0)).all():
             raise IpsysError(f"the distances {distances_m.tolist()} m are not all above 0; measure again")
     if sigmas_m is not None and not (np.isfinite(sigmas_m) & (sigmas_m > 0)).all():
-        raise IpsysError(
-            f"the sigmas {sigmas_m.tolist()} m of the distances are not all above 0; correct them"
-        )
+        raise IpsysError(f"the sigmas {sigmas_m.tolist()} m of the tape are not all above 0; correct them")

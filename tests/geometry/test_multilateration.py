@@ -6,7 +6,7 @@ from itertools import combinations
 
 import numpy as np
 import pytest
-from hypothesis import assume, given
+from hypothesis import assume, given, settings
 from hypothesis import strategies as st
 from numpy.typing import NDArray
 from scipy.optimize import least_squares
@@ -59,6 +59,7 @@ def test_exact_distances_from_three_points_or_more_need_no_side(numbers: list[tu
 
 
 @given(st.integers(0, 10_000), st.integers(3, 6))
+@settings(deadline=None, max_examples=60)
 def test_contradicting_distances_are_weighed_as_scipy_does(seed: int, count: int) -> None:
     rng = np.random.default_rng(seed)
     references, point = rng.uniform(0, 5, (count, 2)), rng.uniform(0, 5, 2)
@@ -71,13 +72,30 @@ def test_contradicting_distances_are_weighed_as_scipy_does(seed: int, count: int
     def off(at: Array) -> Array:
         return (distances - ranges(at, references)) / sigmas
 
-    wanted = least_squares(off, point, xtol=1e-14, ftol=1e-14, gtol=1e-14)
+    # Near a line through most of the reference points there is a second, mirrored minimum.
+    starts = [point, *(2 * reference - point for reference in references), *rng.uniform(0, 5, (6, 2))]
+    tried = [least_squares(off, start, xtol=1e-14, ftol=1e-14, gtol=1e-14) for start in starts]
+    wanted = min(tried, key=lambda one: float(one.cost))
     np.testing.assert_allclose(found.point_m, wanted.x, atol=1e-7)
     np.testing.assert_allclose(found.residuals_m, wanted.fun * sigmas, atol=1e-7)
     assert found.reduced_chi2 == pytest.approx(2 * wanted.cost / (count - 2), rel=1e-6, abs=1e-9)
     slope = np.asarray(wanted.jac)
     assert found.covariance_m2 is not None
     np.testing.assert_allclose(found.covariance_m2, np.linalg.inv(slope.T @ slope), rtol=1e-4, atol=1e-12)
+
+
+def test_the_side_decides_where_two_places_fit_as_well() -> None:
+    """A third reference point 10 cm off the line through the others hardly tells its sides apart."""
+    references = np.array([[0.0, 0.0], [4.0, 0.0], [2.0, 0.1]])
+    point = np.array([2.1, 0.6])
+    distances = ranges(point, references)
+    sigmas = np.full(3, 0.1)
+    for side, sign in (("left", 1), ("right", -1)):
+        assert np.sign(multilaterate(references, distances, sigmas, side).point_m[1]) == sign
+    # What the distances do tell, they tell better than who noted the side.
+    fine = multilaterate(references, distances, np.full(3, 0.001), "right")
+    np.testing.assert_allclose(fine.point_m, point, atol=1e-6)
+    np.testing.assert_allclose(multilaterate(references, distances, side="right").point_m, point, atol=1e-6)
 
 
 def test_a_gross_contradiction_is_told_not_refused() -> None:

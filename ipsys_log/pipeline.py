@@ -17,8 +17,9 @@ locate          camera points,      positions         the run of its model
 fuse            positions           tracks, poses     the run of its positions
 ==============  ==================  ================  =====================================
 
-The rig is read by all but locate. :mod:`ipsys_log.tasks` says in full what each stage reads,
-:mod:`ipsys_log.perform` how its run is found or made.
+The rig is read by all, by locate only for models that are told the height of a marker.
+:mod:`ipsys_log.tasks` says in full what each stage reads, :mod:`ipsys_log.perform` how its run is
+found or made.
 """
 
 from __future__ import annotations

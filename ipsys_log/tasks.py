@@ -36,6 +36,7 @@ from ipsys_log.messages import (
     Tracks,
 )
 from ipsys_log.models import reads_height
+from ipsys_log.offline.crossval import FOLDS, REPEATS
 from ipsys_log.offline.evaluate import Study, evaluate_model
 from ipsys_log.offline.fit import fit_model, level_cameras
 from ipsys_log.offline.learning import labelled_subsets
@@ -221,7 +222,10 @@ def _evaluate(session: Session, request: Request, points: str, model: str) -> Ta
         )
         return evaluate_model(fitted, study, log.last(topics)[1], notes, progress)
 
-    parameters = {**split_parameters(session, request), "seed": str(request.seed)} if again else {}
+    parameters = {}
+    if again:
+        folds = {"folds": str(FOLDS), "repeats": str(REPEATS), "seed": str(request.seed)}
+        parameters = {**split_parameters(session, request), **folds}
     return Task(
         "evaluate",
         model,

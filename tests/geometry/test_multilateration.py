@@ -186,6 +186,12 @@ def test_the_crossing_angle_by_the_law_of_cosines(numbers: tuple[float, ...]) ->
     assert np.cos(crossing_angle(point, np.array([a, b]))) == pytest.approx(cosine, abs=1e-9)
 
 
+def test_of_three_tapes_the_widest_crossing_counts() -> None:
+    middle = (A + B) / 2 + [0, 0.05]
+    assert crossing_angle(middle, np.array([A, B])) < np.radians(6)
+    assert crossing_angle(middle, np.array([A, B, middle + np.array([0, 1.0])])) > np.radians(87)
+
+
 @pytest.mark.parametrize("references", [(A, B), (A, B, C)])
 @pytest.mark.parametrize("point", [(1.0, 4.0), (3.2, 3.3), (0.4, 1.9)])
 def test_the_covariance_is_that_of_drawn_distances(

@@ -81,6 +81,7 @@ def test_three_distances_tell_the_side_themselves() -> None:
     found = slips(wrong)
     kinds = [slip.kind for slip in found]
     assert kinds == ["swapped"] * 3 + ["distance"] * 3 + ["height"]
+    assert [slip.kind for slip in slips(replace(wrong, side="right"))] == kinds
     by_c = found[5]
     assert "the distance to C reads 2.300 m" in by_c.text
     np.testing.assert_allclose(world_point(by_c.corrected, RIG).world_m, TRUE, atol=1e-9)

@@ -308,6 +308,36 @@ def test_a_flat_crossing_excuses_an_error() -> None:
     assert suspects_of(session.replaced(careless)) == ()
 
 
+def test_a_flat_crossing_excuses_an_error_with_a_usual_tape_where_none_is_named() -> None:
+    session = simulated(16, rig=replace(RIG, tape_sigma_m=None))
+    name = next(n for n in session.points["white"])
+    point = np.array([2.4384, A.y_m + 0.10, 0.0])
+    seen = see(np.array([2.44, CAMERAS["white"], 2.1]), point, np.random.default_rng(1))
+    points = dict(session.points) | {"white": dict(session.points["white"]) | {name: seen}}
+    # Seven centimetres across the line, which is seven millimetres on each tape.
+    ranges = np.hypot(1.2192, 0.17)
+    flat = (Distance("A", float(ranges)), Distance("B", float(ranges)))
+    there = replace(session.measurement(name), distances=flat, side="left", height_m=0.0)
+    session = replace(session.replaced(there), points=points)
+    assert suspects_of(session) == ()
+    sure = tuple(replace(distance, sigma_m=0.0005) for distance in flat)
+    (suspect,) = suspects_of(session.replaced(replace(there, distances=sure)))
+    assert suspect.measurement == name
+
+
+def test_a_prediction_that_is_no_point_is_passed_over() -> None:
+    session, planted = plant(simulated(17), ["side"], 17)
+    fits = without_each(session)
+
+    def broken(unused: frozenset[str]) -> dict[str, dict[str, Array]]:
+        found = {camera: dict(points) for camera, points in fits(unused).items()}
+        for points in found.values():
+            points[sorted(set(points) - set(planted))[0]] = np.full(3, np.nan)
+        return found
+
+    assert [suspect.measurement for suspect in find_suspects(broken, session.places)] == list(planted)
+
+
 def test_few_fits_are_asked_for() -> None:
     def asked(session: Session) -> int:
         fits = without_each(session)

@@ -48,6 +48,7 @@ def test_two_distances_are_eq_25_to_the_last_digit(numbers: tuple[float, ...], s
 
 
 @given(st.lists(st.tuples(coordinates, coordinates), min_size=4, max_size=7))
+@settings(deadline=None)
 def test_exact_distances_from_three_points_or_more_need_no_side(numbers: list[tuple[float, float]]) -> None:
     point, references = np.array(numbers[0]), np.array(numbers[1:])
     triangles = [triangle_area(*corners) for corners in combinations(references, 3)]

@@ -25,13 +25,17 @@ __all__ = ["EVALUATE", "MORE", "add_commands", "build_command", "derived", "opti
 
 _Path = Optional[Path]  # noqa: UP045
 
+_MODEL_HELP = (
+    "rigid, poly, ann, kriging, kriging-regression, rigid+ and the name of one of these, rayplane, best; "
+    "repeat it for several."
+)
 # Every option of these commands: its type with its help, and its default.
 OPTIONS: dict[str, tuple[Any, Any]] = {
     "logs": (Logs, inspect.Parameter.empty),
     "model": (
         Annotated[
             Optional[list[str]],  # noqa: UP045
-            typer.Option("--model", metavar="NAME", help="Such as poly or best; repeat it for several."),
+            typer.Option("--model", metavar="NAME", help=_MODEL_HELP),
         ],
         None,
     ),
@@ -46,7 +50,7 @@ OPTIONS: dict[str, tuple[Any, Any]] = {
         Annotated[str, typer.Option(help="Fit on the measurements with this label.")],
         "train",
     ),
-    "seed": (Annotated[int, typer.Option(min=0, help="Of the random split, where nothing is labelled.")], 0),
+    "seed": (Annotated[int, typer.Option(min=0, help="Of random splits, folds and subsets.")], 0),
     "rig": (RigFile, None),
     "calibration": (Calibrations, None),
     "run": (
@@ -96,7 +100,8 @@ _COMMANDS: dict[str, tuple[str, tuple[str, ...], str]] = {
     "evaluate": (
         "evaluate",
         EVALUATE,
-        f"Say how far models are off on places held out: all models, unless you say which. {MORE}",
+        "Say how far models are off on places held out and by cross-validation, how many places are enough, "
+        f"and which look wrongly measured: for all models, unless you say which. {MORE}",
     ),
     "locate": ("locate", _MODELS, f"Apply a model: world positions for each camera. {MORE}"),
     "fuse": ("fuse", _MODELS, f"One pose per robot from all cameras that see it. {MORE}"),

@@ -47,21 +47,36 @@ class Accuracy:
 
 def read_accuracy(session: Session, outcomes: Sequence[Outcome]) -> list[Accuracy]:
     """What a replay has found, read from the log that holds it."""
-    evaluated = [outcome.run for outcome in outcomes if outcome.stage == "evaluate"]
-    fused = [outcome.run for outcome in outcomes if outcome.stage == "fuse"]
     found = []
-    for run in dict.fromkeys([*evaluated, *fused]):
+    for evaluated, fused in _run_pairs(outcomes):
+        run = evaluated or fused
         evaluations = session.payloads(session.topics(Evaluation, run))
         tracks = None
-        if run in fused and session.count(TRUTH_TOPIC):
+        if fused and session.count(TRUTH_TOPIC):
             tracks = track_errors(
-                gather_tracks(session.messages(session.topics(Tracks, run))),
+                gather_tracks(session.messages(session.topics(Tracks, fused))),
                 gather_tracks(session.messages([TRUTH_TOPIC])),
-                carried=_told_heights(session, run),
+                carried=_told_heights(session, fused),
             )
         if evaluations or tracks is not None:
             found.append(Accuracy(run, evaluations[-1] if evaluations else None, tracks))
     return found
+
+
+def _run_pairs(outcomes: Sequence[Outcome]) -> list[tuple[str, str]]:
+    """For each model the run that evaluates it and the run that has its tracks, "" where there is none.
+
+    They differ in name where a model was evaluated again, as with other folds.
+    """
+    pairs: list[tuple[str, str]] = []
+    for outcome in outcomes:
+        if outcome.stage == "evaluate":
+            pairs.append((outcome.run, ""))
+        elif outcome.stage == "fuse" and pairs and not pairs[-1][1]:
+            pairs[-1] = (pairs[-1][0], outcome.run)
+        elif outcome.stage == "fuse":
+            pairs.append(("", outcome.run))
+    return pairs
 
 
 def _told_heights(session: Session, run: str) -> bool:

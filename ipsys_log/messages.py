@@ -20,6 +20,7 @@ Vec3 = Annotated[NDArray[np.float64], (3,)]
 Mat33 = Annotated[NDArray[np.float64], (3, 3)]
 Mat34 = Annotated[NDArray[np.float64], (3, 4)]
 Corners = Annotated[NDArray[np.float64], (4, 2)]
+Mat88 = Annotated[NDArray[np.float64], (8, 8)]
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -65,7 +66,12 @@ class RigMarker:
 
 @dataclass(frozen=True, slots=True)
 class RigCamera:
+    """A camera: ``row_time_ns`` lies between the exposures of two rows, ``edge_offset_px`` is by how much
+    edges of black lie too far inside the black (see :mod:`ipsys_log.stages.detect.offset`)."""
+
     name: str
+    row_time_ns: int | None = None
+    edge_offset_px: float | None = None
 
 
 @dataclass(frozen=True, slots=True)
@@ -166,10 +172,13 @@ class RawImage:
 @dataclass(frozen=True, slots=True, eq=False)
 class Marker:
     """A marker in a frame: corners in px of the raw image, clockwise from the marker's top left,
-    (0, 0) the centre of the first pixel."""
+    (0, 0) the centre of the first pixel; ``covariance_px2`` of x0 y0 .. x3 y3, in single precision;
+    exposed ``time_offset_ns`` after the time of the frame."""
 
     id: int
     corners_px: Corners
+    covariance_px2: Mat88 | None = None
+    time_offset_ns: int | None = None
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -182,15 +191,31 @@ class Markers:
     height: int
 
 
-@dataclass(frozen=True, slots=True)
+@dataclass(frozen=True, slots=True, eq=False)
+class MarkerPose:
+    """A marker in the frame of the camera: its centre, the rotation vector that takes the marker's axes to
+    the camera's, and by how much (RMS) the corners that follow from it miss those that were seen."""
+
+    x_m: float
+    y_m: float
+    z_m: float
+    rotation_rad: Vec3
+    reprojection_px: float
+
+
+@dataclass(frozen=True, slots=True, eq=False)
 class CameraPoint:
-    """Centre of a marker in the frame of the camera: x right, y down, z forward."""
+    """Centre of a marker in the frame of the camera: x right, y down, z forward; ``poses`` are the solutions
+    for a planar square, the one that was taken first, or none for eq. (3)."""
 
     id: int
     x_m: float
     y_m: float
     z_m: float
     heading_rad: float | None = None
+    time_offset_ns: int | None = None
+    covariance_m2: Mat33 | None = None
+    poses: tuple[MarkerPose, ...] = ()
 
 
 @dataclass(frozen=True, slots=True)
@@ -210,6 +235,7 @@ class Position:
     heading_rad: float | None = None
     covariance_m2: Mat33 | None = None
     inside: bool | None = None
+    time_offset_ns: int | None = None
 
 
 @dataclass(frozen=True, slots=True, eq=False)

@@ -67,7 +67,7 @@ class RigMarker:
 @dataclass(frozen=True, slots=True)
 class RigCamera:
     """A camera: ``row_time_ns`` lies between the exposures of two rows, ``edge_offset_px`` is by how much
-    edges of black lie too far inside the black (see :mod:`ipsys_log.stages.detect.offset`)."""
+    edges of black lie too far inside the black."""
 
     name: str
     row_time_ns: int | None = None
@@ -100,6 +100,10 @@ class Rig:
     floor: Floor | None = None
     marker_height_m: float | None = None
     tape_sigma_m: float | None = None
+
+    def camera(self, name: str) -> RigCamera:
+        """What is said of a camera."""
+        return next((camera for camera in self.cameras if camera.name == name), RigCamera(name))
 
     def length_of(self, marker_id: int) -> float:
         """Side of a marker's black square, in m."""
@@ -173,12 +177,14 @@ class RawImage:
 class Marker:
     """A marker in a frame: corners in px of the raw image, clockwise from the marker's top left,
     (0, 0) the centre of the first pixel; ``covariance_px2`` of x0 y0 .. x3 y3, in single precision;
-    exposed ``time_offset_ns`` after the time of the frame."""
+    exposed ``time_offset_ns`` after the time of the frame; edges of black lie ``edge_offset_px`` too far
+    inside the black."""
 
     id: int
     corners_px: Corners
     covariance_px2: Mat88 | None = None
     time_offset_ns: int | None = None
+    edge_offset_px: float | None = None
 
 
 @dataclass(frozen=True, slots=True, eq=False)

@@ -6,6 +6,7 @@ from collections.abc import Callable, Iterable, Mapping
 from dataclasses import dataclass, field
 from typing import Any
 
+from ipsys_log.errors import IpsysError
 from ipsys_log.geometry.lenses import same_lens
 from ipsys_log.log.session import Session
 from ipsys_log.lookup import (
@@ -33,6 +34,7 @@ from ipsys_log.messages import (
     Model,
     Positions,
     Rig,
+    RigCamera,
     Tracks,
 )
 from ipsys_log.models import reads_height
@@ -85,7 +87,11 @@ class Task:
 def _rig_part(stage: str) -> Callable[[Rig], Any]:
     """What a stage reads of the rig; an overriding rig that says the same there changes nothing."""
     return {
-        "detect": lambda rig: (rig.dictionary, {m.id for m in rig.markers}),
+        "detect": lambda rig: (
+            rig.dictionary,
+            {m.id for m in rig.markers},
+            {camera for camera in rig.cameras if camera != RigCamera(camera.name)},
+        ),
         "camera-frame": lambda rig: (rig.marker_length_m, {(m.id, rig.length_of(m.id)) for m in rig.markers}),
         "locate": lambda rig: (rig.marker_height_m, {(m.id, m.height_m) for m in rig.markers}),
         "fuse": lambda rig: {(m.id, m.robot) for m in rig.markers},
@@ -110,31 +116,41 @@ def _detect(session: Session, request: Request) -> Task | str:
     if not session.images:
         return newest_run(session, Markers) or ""
     rig, topics = _rig(session, request, "detect")
+    lenses: dict[str, CameraCalibration] = {}
+    if request.corners != detect.STOCK:
+        lenses = _other_lenses(session, request)
+        topics += _held_lenses(session, lenses)
     return Task(
         "detect",
-        "stock",
+        request.corners,
         (*topics, *session.images.values()),
         (Markers, ImageAnnotations, Event),
         detect.READS,
-        lambda run: detect.Detect(),
-        parameters={"corners": "stock"},
+        lambda run: detect.Detect(request.corners),
+        parameters={"corners": request.corners},
         rig=rig,
+        lenses=lenses,
     )
 
 
 def _camera_frame(session: Session, request: Request, markers: str) -> Task | str:
-    if not markers:
+    default = request.method == camera_frame.PERIMETER
+    if not markers and default:
         return newest_run(session, CameraPoints) or ""
+    if not markers:
+        raise IpsysError(f"--method {request.method}: cannot take effect, the log has no markers")
     rig, topics = _rig(session, request, "camera-frame")
     lenses = _other_lenses(session, request)
-    held = [topic for camera, topic in session.calibrations.items() if camera not in lenses]
+    held = _held_lenses(session, lenses)
     return Task(
         "camera-frame",
-        markers,
+        markers if default else f"{markers}_{request.method}",
         (*topics, *session.topics(Markers, markers), *held),
         (CameraPoints, Event),
         camera_frame.READS,
-        lambda run: camera_frame.CameraFrame(),
+        lambda run: camera_frame.CameraFrame(request.method),
+        # Logs from before there was a choice have no such parameter.
+        parameters={} if default else {"method": request.method},
         rig=rig,
         lenses=lenses,
     )
@@ -147,6 +163,11 @@ def _other_lenses(session: Session, request: Request) -> dict[str, CameraCalibra
         if camera in lenses and all(same_lens(held, lenses[camera]) for held in session.payloads([topic])):
             del lenses[camera]
     return lenses
+
+
+def _held_lenses(session: Session, other: Mapping[str, CameraCalibration]) -> list[str]:
+    """The topics of the lenses that no other one overrides."""
+    return [topic for camera, topic in session.calibrations.items() if camera not in other]
 
 
 def _fit(session: Session, request: Request, points: str, model: str) -> Task | str:

@@ -116,14 +116,14 @@ def test_detect_and_camera_frame(
         # By topic for the one, by the frame that they share for the other.
         assert session.calibrations == {"left_cam": "/Left-Cam/camera_info", "robot_front": "/front_info"}
         for camera, marker_id in (("left_cam", 3), ("robot_front", 4)):
-            seen = session.payloads([f"/runs/stock/cameras/{camera}/markers"])
+            seen = session.payloads([f"/runs/edges/cameras/{camera}/markers"])
             assert [[m.id for m in frame.markers] for frame in seen] == [[marker_id]] * 5
             # The first frames came before their lens did: the first one known holds for them.
-            points = session.payloads([f"/runs/stock/cameras/{camera}/camera_points"])
+            points = session.payloads([f"/runs/edges/cameras/{camera}/camera_points"])
             assert len(points) == 5
             assert points[0].points[0].z_m == pytest.approx(0.2 * 500 / 100, rel=0.02)
-        assert session.topics(Markers, "stock")
-        assert session.topics(CameraPoints, "stock")
+        assert session.topics(Markers, "edges")
+        assert session.topics(CameraPoints, "edges")
     with log.open("rb") as file:
         reader = make_reader(file, validate_crcs=True)
         assert sum(1 for _ in reader.iter_messages()) > len(messages)
@@ -132,9 +132,9 @@ def test_detect_and_camera_frame(
 def test_a_second_detect_finds_the_first(ipsys: Ipsys, tmp_path: Path, rig: Path) -> None:
     log = tmp_path / "foreign.mcap"
     write(log, [("/cam", t, jpeg(1, "cam", t)) for t in (1, 2, 3)], CompressionType.ZSTD)
-    assert ipsys("detect", log, "--rig", rig).code == 0
+    assert ipsys("detect", log, "--corners", "stock", "--rig", rig).code == 0
     before = log.read_bytes()
-    assert "up to date" in ipsys("detect", log, "--rig", rig).err
+    assert "up to date" in ipsys("detect", log, "--corners", "stock", "--rig", rig).err
     assert log.read_bytes() == before
 
 
@@ -142,7 +142,7 @@ def test_the_same_camera_raw_and_compressed_is_one_camera(ipsys: Ipsys, tmp_path
     log = tmp_path / "foreign.mcap"
     both = [("/cam/image_raw", 1, raw(1, "cam", 1)), ("/cam/image_raw/compressed", 2, jpeg(1, "cam", 1))]
     write(log, both, CompressionType.NONE)
-    assert ipsys("detect", log, "--rig", rig).code == 0
+    assert ipsys("detect", log, "--corners", "stock", "--rig", rig).code == 0
     with Session([log]) as session:
         assert session.images == {"cam": "/cam/image_raw/compressed"}
 
@@ -174,7 +174,7 @@ def test_json_is_read_too(ipsys: Ipsys, tmp_path: Path, rig: Path) -> None:
         "format": "jpeg",
     }
     log = write_raw(tmp_path / "json.mcap", "json", "jsonschema", json.dumps(text).encode())
-    done = ipsys("detect", log, "--rig", rig)
+    done = ipsys("detect", log, "--corners", "stock", "--rig", rig)
     assert done.code == 0, done.err
     with Session([log]) as session:
         assert session.payloads(["/cam"])[0].timestamp == 1
@@ -194,7 +194,7 @@ def test_what_cannot_be_decoded_is_named(
     ipsys: Ipsys, tmp_path: Path, rig: Path, encoding: str, data: bytes, said: str
 ) -> None:
     log = write_raw(tmp_path / "odd.mcap", encoding, "", data)
-    done = ipsys("detect", log, "--rig", rig)
+    done = ipsys("detect", log, "--corners", "stock", "--rig", rig)
     assert done.code == 1
     assert f"{log}: /cam at 1 ns" in done.err
     assert said in done.err

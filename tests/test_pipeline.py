@@ -148,8 +148,8 @@ def test_everything_is_made_once(ipsys: Ipsys, lab: Path) -> None:
     recorded = data_section(lab)
     first = stages_of(ipsys, "replay", lab, "--model", "poly")
     assert first == {
-        "detect": ("stock", True),
-        "camera-frame": ("stock", True),
+        "detect": ("edges", True),
+        "camera-frame": ("edges", True),
         "fit": ("poly", True),
         "evaluate": ("poly", True),
         "locate": ("poly", True),
@@ -166,7 +166,7 @@ def test_everything_is_made_once(ipsys: Ipsys, lab: Path) -> None:
 def test_a_second_model_shares_the_detection(ipsys: Ipsys, lab: Path) -> None:
     ipsys("replay", lab)
     stages = stages_of(ipsys, "replay", lab, "--model", "rigid+poly")
-    assert stages["detect"] == ("stock", False)
+    assert stages["detect"] == ("edges", False)
     assert stages["fit"] == ("rigid_poly", True)
     assert stages["fuse"] == ("rigid_poly", True)
 
@@ -194,13 +194,13 @@ def test_a_mistyped_marker_length_is_put_right_as_a_new_run(ipsys: Ipsys, lab: P
     rig = write_rig(tmp_path / "lab.toml", lab, 0.18)
     stages = stages_of(ipsys, "replay", lab, "--rig", rig)
     # The length bears on the camera points, not on the corners.
-    assert stages["detect"] == ("stock", False)
-    assert stages["camera-frame"] == ("stock_2", True)
+    assert stages["detect"] == ("edges", False)
+    assert stages["camera-frame"] == ("edges_2", True)
     assert stages["fit"] == ("poly_2", True)
     with Session([lab]) as session:
         old, new = (
             [p.z_m for m in session.payloads(session.topics(CameraPoints, run)) for p in m.points]
-            for run in ("stock", "stock_2")
+            for run in ("edges", "edges_2")
         )
     np.testing.assert_allclose(np.array(new) / np.array(old), 0.9, rtol=1e-12)
     # Both stand side by side, and each is found again.
@@ -228,10 +228,26 @@ def test_a_lens_calibrated_later_is_a_new_run(ipsys: Ipsys, lab: Path, tmp_path:
         storage.write("image_height", lens.height)
         storage.release()
         stages = stages_of(ipsys, "replay", lab, "--calibration", f"red={path}")
-        assert stages["detect"] == ("stock", False)
-        assert stages["camera-frame"][1] is fresh
+        # Edges are fitted through the lens.
+        assert (stages["detect"][1], stages["camera-frame"][1]) == (fresh, fresh)
     runs = json.loads(ipsys("runs", lab, "--json").out)
-    assert [run["overrides"] for run in runs if run["run"] == "stock_2"] == [["lens red"]]
+    assert [run["overrides"] for run in runs if run["run"] == "edges_2"] == [["lens red"]] * 2
+
+
+def test_stock_corners_know_no_lens(ipsys: Ipsys, lab: Path, tmp_path: Path) -> None:
+    ipsys("replay", lab, "--corners", "stock")
+    with Session([lab]) as session:
+        lens = session.payloads(["/cameras/red/calibration"])[0]
+    path = tmp_path / "red.yaml"
+    storage = cv2.FileStorage(str(path), cv2.FILE_STORAGE_WRITE)
+    storage.write("camera_matrix", lens.K * np.array([[1.01, 1, 1], [1, 1.01, 1], [1, 1, 1]]))
+    storage.write("distortion_coefficients", lens.D.reshape(-1, 1))
+    storage.write("image_width", lens.width)
+    storage.write("image_height", lens.height)
+    storage.release()
+    stages = stages_of(ipsys, "replay", lab, "--corners", "stock", "--calibration", f"red={path}")
+    assert stages["detect"] == ("stock", False)
+    assert stages["camera-frame"] == ("stock_2", True)
 
 
 def test_a_model_of_another_log_is_applied_and_copied_in(ipsys: Ipsys, lab: Path, tmp_path: Path) -> None:
@@ -278,7 +294,7 @@ def test_new_measurements_make_the_model_out_of_date(ipsys: Ipsys, lab: Path) ->
     with LogWriter.append(lab) as writer:
         write_messages(writer, [Message("/measurements", end_ns + 1, end_ns, withdrawal)])
     stages = stages_of(ipsys, "replay", lab)
-    assert stages["camera-frame"] == ("stock", False)
+    assert stages["camera-frame"] == ("edges", False)
     assert stages["fit"] == ("poly_2", True)
     with Session([lab]) as session:
         old, new = (session.payloads(session.topics(Model, run))[0] for run in ("poly", "poly_2"))
@@ -288,7 +304,7 @@ def test_new_measurements_make_the_model_out_of_date(ipsys: Ipsys, lab: Path) ->
 
 def test_a_run_may_be_named(ipsys: Ipsys, lab: Path) -> None:
     stages = stages_of(ipsys, "replay", lab, "--run", "monday")
-    assert stages["detect"] == ("stock", True)
+    assert stages["detect"] == ("edges", True)
     assert stages["fit"] == stages["fuse"] == ("monday", True)
     again = ipsys("replay", lab, "--run", "monday", "--model", "rigid")
     assert again.code == 1

@@ -107,7 +107,7 @@ def test_a_run_that_lost_a_channel_is_not_complete(ipsys: Ipsys, paper: Path) ->
 def test_a_named_run_takes_the_shared_detection(ipsys: Ipsys, lab: Path) -> None:
     ipsys("detect", lab)
     made = runs_of(ipsys, "camera-frame", lab, "--run", "again")
-    assert made == {"detect": ("stock", False), "camera-frame": ("again", True)}
+    assert made == {"detect": ("edges", False), "camera-frame": ("again", True)}
     # Whoever asks next gets the first one that is right, and nothing is made again.
     ipsys("replay", lab)
     before = lab.read_bytes()
@@ -204,7 +204,7 @@ def test_files_in_another_order_are_the_same_channels(ipsys: Ipsys, lab: Path, t
         write_log(parts[1], session.messages(topics, middle, None))
     derived = tmp_path / "derived.mcap"
     assert ipsys("detect", *parts, "-o", derived).code == 0
-    assert runs_of(ipsys, "detect", *parts[::-1], derived) == {"detect": ("stock", False)}
+    assert runs_of(ipsys, "detect", *parts[::-1], derived) == {"detect": ("edges", False)}
 
 
 def test_the_rig_of_a_log_is_checked_too(ipsys: Ipsys, paper: Path) -> None:
@@ -253,7 +253,7 @@ def test_a_marker_beyond_the_lens_is_left_out_and_named(ipsys: Ipsys, paper: Pat
 def test_a_model_and_its_evaluation_speak_of_the_last_input(ipsys: Ipsys, lab: Path) -> None:
     ipsys("replay", lab)
     with Session([lab]) as session:
-        inputs = list(session.messages([*session.topics(CameraPoints, "stock"), "/measurements", "/rig"]))
+        inputs = list(session.messages([*session.topics(CameraPoints, "edges"), "/measurements", "/rig"]))
         (model,) = session.messages(session.topics(Model, "poly"))
     assert (model.log_time_ns, model.publish_time_ns) == (inputs[-1].log_time_ns, inputs[-1].publish_time_ns)
     assert model.payload.timestamp == model.publish_time_ns

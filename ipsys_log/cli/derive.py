@@ -13,7 +13,16 @@ from typing import TYPE_CHECKING, Annotated, Any, Optional
 import typer
 
 from ipsys_log.cli.console import console, progress_bar, remarks
-from ipsys_log.cli.options import AsJson, Calibrations, Logs, RigFile, cameras_of, load_calibrations
+from ipsys_log.cli.options import (
+    AsJson,
+    Calibrations,
+    Corners,
+    Logs,
+    Method,
+    RigFile,
+    cameras_of,
+    load_calibrations,
+)
 
 if TYPE_CHECKING:
     from ipsys_log.log.session import Session
@@ -53,10 +62,12 @@ OPTIONS: dict[str, tuple[Any, Any]] = {
     "seed": (Annotated[int, typer.Option(min=0, help="Of random splits, folds and subsets.")], 0),
     "rig": (RigFile, None),
     "calibration": (Calibrations, None),
+    "corners": (Corners, "edges"),
+    "method": (Method, "perimeter"),
     "run": (
         Annotated[
             Optional[str],  # noqa: UP045
-            typer.Option("--run", help="A name for the new run, instead of stock, poly, poly_2 ..."),
+            typer.Option("--run", help="A name for the new run, instead of edges, poly, poly_2 ..."),
         ],
         None,
     ),
@@ -78,8 +89,8 @@ OPTIONS: dict[str, tuple[Any, Any]] = {
     ),
     "as_json": (AsJson, False),
 }
-_FRAMES = ("logs", "rig", "calibration", "run", "output", "skip_ambiguous", "as_json")
-_DETECT = tuple(name for name in _FRAMES if name != "calibration")
+_FRAMES = ("logs", "rig", "calibration", "corners", "method", "run", "output", "skip_ambiguous", "as_json")
+_DETECT = tuple(name for name in _FRAMES if name != "method")
 _MODELS = tuple(name for name in OPTIONS if name not in ("plot", "plots"))
 EVALUATE = (*_MODELS, "plots")
 
@@ -94,7 +105,7 @@ _COMMANDS: dict[str, tuple[str, tuple[str, ...], str]] = {
     "camera-frame": (
         "camera-frame",
         _FRAMES,
-        f"Put the markers into the frame of their camera (eq. 3 to 5 of the paper). {MORE}",
+        f"Put the markers into the frame of their camera. {MORE}",
     ),
     "fit": ("fit", _MODELS, f"Fit models to the measured places (poly, unless you say which). {MORE}"),
     "evaluate": (

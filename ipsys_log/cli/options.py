@@ -11,7 +11,17 @@ import typer
 if TYPE_CHECKING:
     from ipsys_log.messages import CameraCalibration
 
-__all__ = ["AsJson", "Calibrations", "Logs", "NewLog", "RigFile", "cameras_of", "load_calibrations"]
+__all__ = [
+    "AsJson",
+    "Calibrations",
+    "Corners",
+    "Logs",
+    "Method",
+    "NewLog",
+    "RigFile",
+    "cameras_of",
+    "load_calibrations",
+]
 
 Logs = Annotated[
     list[Path],
@@ -27,6 +37,22 @@ Calibrations = Annotated[
         "--calibration",
         metavar="CAMERA=FILE",
         help="A camera's lens instead of the log's: OpenCV YAML. Repeat for each camera; or another log.",
+    ),
+]
+Corners = Annotated[
+    str,
+    typer.Option(
+        "--corners",
+        metavar="NAME",
+        help="Finds corners by the edges of the print, through the lens; or as the paper: stock.",
+    ),
+]
+Method = Annotated[
+    str,
+    typer.Option(
+        "--method",
+        metavar="NAME",
+        help="Places markers by their perimeter (eq. 3 to 5 of the paper), or by their pose (tilted too).",
     ),
 ]
 AsJson = Annotated[bool, typer.Option("--json", help="Print JSON.")]

@@ -27,6 +27,8 @@ SETTINGS: dict[str, tuple[int | float, str]] = {
     "stations": (50, "About how many measured places each camera sees."),
     "frames_per_station": (5, "Frames of each camera while the markers lie still."),
     "rate_hz": (30.0, "Frames per second."),
+    "row_time_ns": (0, "Rolling shutter: time between the exposures of two rows, in ns; 31000 is typical."),
+    "exposure_s": (0.0, "Motion blur: how long each row is exposed, in s; 0.0167 is typical."),
     "drive_s": (15.0, "How long the robots drive after the stations, in s."),
     "drive_speed_m_s": (0.5, "How fast, in m/s."),
     "psf_sigma_px": (0.7, "Blur of the optics: sigma of the point-spread, in px."),

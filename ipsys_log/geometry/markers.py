@@ -5,7 +5,10 @@ from __future__ import annotations
 import numpy as np
 from numpy.typing import NDArray
 
-__all__ = ["camera_point", "heading", "marker_corners"]
+__all__ = ["camera_point", "camera_point_slopes", "heading", "marker_corners"]
+
+# Around the marker.
+_NEXT, _BEFORE = [1, 2, 3, 0], [3, 0, 1, 2]
 
 
 def camera_point(corners_uv: NDArray[np.float64], length_m: float) -> NDArray[np.float64]:
@@ -36,13 +39,37 @@ def camera_point(corners_uv: NDArray[np.float64], length_m: float) -> NDArray[np
     >>> camera_point(uv, 0.2).round(9).tolist()
     [0.1, 0.1, 2.0]
     """
-    sides = np.linalg.norm(np.roll(corners_uv, -1, axis=0) - corners_uv, axis=1)
+    sides = np.linalg.norm(corners_uv[_NEXT] - corners_uv, axis=1)
     perimeter = float(sides.sum())
     if perimeter == 0.0:
         raise ValueError("the four corners fall together")
     z_m = 4.0 * length_m / perimeter  # eq. (3)
     u, v = corners_uv.mean(axis=0)
     return np.array([z_m * u, z_m * v, z_m])  # eq. (4), (5)
+
+
+def camera_point_slopes(corners_uv: NDArray[np.float64], length_m: float) -> NDArray[np.float64]:
+    """By how much :func:`camera_point` moves with the corners.
+
+    Parameters
+    ----------
+    corners_uv : (4, 2), normalized image coordinates, not all the same.
+    length_m : side of the marker's black square, in m.
+
+    Returns
+    -------
+    (4, 3, 2): for each corner rows Xc, Yc, Zc in m, columns u and v.
+    """
+    sides = corners_uv[_NEXT] - corners_uv
+    lengths = np.sqrt((sides * sides).sum(axis=1))
+    perimeter = lengths.sum()
+    # A side that has no length has no direction either.
+    along = sides / np.maximum(lengths, np.finfo(np.float64).tiny)[:, None]
+    z_m = 4.0 * length_m / perimeter
+    slopes = np.empty((4, 3, 2))
+    slopes[:, 2] = z_m / perimeter * (along - along[_BEFORE])
+    slopes[:, :2] = corners_uv.mean(axis=0)[:, None] * slopes[:, 2:] + z_m / 4 * np.eye(2)
+    return slopes
 
 
 def heading(corners_uv: NDArray[np.float64]) -> float:

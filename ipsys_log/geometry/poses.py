@@ -6,7 +6,7 @@ import cv2
 import numpy as np
 from numpy.typing import NDArray
 
-__all__ = ["invert_pose", "lay_flat", "look_down", "make_pose", "rotation", "transform"]
+__all__ = ["invert_pose", "lay_flat", "look_down", "make_pose", "rotation", "rotation_vector", "transform"]
 
 Array = NDArray[np.float64]
 
@@ -50,6 +50,11 @@ def transform(a_from_b: Array, points_b_m: Array) -> Array:
 def rotation(vector_rad: Array) -> Array:
     """Rotation matrix (3, 3) of a rotation vector (3,): axis times angle in rad."""
     return np.asarray(cv2.Rodrigues(np.asarray(vector_rad, dtype=np.float64))[0], dtype=np.float64)
+
+
+def rotation_vector(rotation_matrix: Array) -> Array:
+    """Axis times angle in rad, (3,), of a rotation matrix (3, 3)."""
+    return np.asarray(cv2.Rodrigues(rotation_matrix)[0], dtype=np.float64).ravel()
 
 
 def lay_flat(x_m: float, y_m: float, z_m: float, heading_rad: float) -> Array:

@@ -1,35 +1,53 @@
-"""Markers in pixels to points in the frame of the camera (eq. 3 to 5)."""
+"""Markers in pixels to points in the frame of the camera: by eq. (3) to (5), or by the pose of the square."""
 
 from __future__ import annotations
 
-from collections.abc import Iterator
-from typing import Any
+from collections.abc import Callable, Iterator, Sequence
+from typing import Any, NamedTuple
 
+import cv2
 import numpy as np
+from numpy.typing import NDArray
 
 from ipsys_log.errors import IpsysError
+from ipsys_log.geometry.corner_noise import check_covariance, pixel_slopes, whiten
 from ipsys_log.geometry.lenses import check_calibration, undistort
-from ipsys_log.geometry.markers import camera_point, heading
+from ipsys_log.geometry.markers import camera_point, camera_point_slopes, heading
+from ipsys_log.geometry.square_pose import fit_squares, goes_around, reprojection_px
 from ipsys_log.messages import (
     CameraCalibration,
     CameraPoint,
     CameraPoints,
     Event,
     Marker,
+    MarkerPose,
     Markers,
     Message,
     Rig,
 )
 
-__all__ = ["READS", "CameraFrame"]
+__all__ = ["METHODS", "PERIMETER", "READS", "CameraFrame", "check_method"]
 
 READS = (Rig, CameraCalibration, Markers)
+PERIMETER = "perimeter"
+
+Array = NDArray[np.float64]
+
+# Of corners without a covariance: OpenCV's are off by about a quarter of a pixel.
+_USUAL_PX2 = 0.25**2 * np.eye(8)
 
 
 class CameraFrame:
-    """The stage *camera-frame*: through the lens of each camera, with the marker's length."""
+    """The stage *camera-frame*: through the lens of each camera, with the marker's length.
 
-    def __init__(self) -> None:
+    Parameters
+    ----------
+    method : ``perimeter``, eq. (3) to (5), exact for a marker that is parallel to the image plane; or
+        ``pose``, exact for a marker that is tilted in any way.
+    """
+
+    def __init__(self, method: str = PERIMETER) -> None:
+        self._method = METHODS[check_method(method)]
         self._rig: Rig | None = None
         self._lenses: dict[str | None, CameraCalibration] = {}
 
@@ -40,16 +58,22 @@ class CameraFrame:
         elif isinstance(payload, CameraCalibration):
             self._lenses[message.camera] = check_calibration(payload, f"calibration of {message.camera}")
         else:
-            self._check_size(payload, message.camera)
-            points = []
-            for marker in payload.markers:
-                point = self._point(marker, message.camera)
-                if point is not None:
-                    points.append(point)
-                    continue
-                text = f"marker {marker.id} lies where the calibration of {message.camera} has no ray"
-                yield Event(message.publish_time_ns, "outside_lens", text, message.camera, marker.id)
-            yield CameraPoints(message.publish_time_ns, tuple(points))
+            yield from self._frame(payload, message)
+
+    def _frame(self, frame: Markers, message: Message) -> Iterator[Event | CameraPoints]:
+        camera, points = message.camera, []
+        self._check_size(frame, camera)
+        if frame.markers:
+            rig, lens = self._settings(camera)
+            seen: list[_Seen] = []
+            for one in _through_lens(frame.markers, rig, lens):
+                fault = self._fault(one, camera)
+                if fault is None:
+                    seen.append(one)
+                else:
+                    yield Event(message.publish_time_ns, *fault, camera, one.marker.id)
+            points = self._method.place(seen, lens) if seen else []
+        yield CameraPoints(message.publish_time_ns, tuple(points))
 
     def _check_size(self, seen: Markers, camera: str | None) -> None:
         lens = self._lenses.get(camera)
@@ -60,8 +84,7 @@ class CameraFrame:
                 f"--calibration {camera}=calibration.yaml"
             )
 
-    def _point(self, marker: Marker, camera: str | None) -> CameraPoint | None:
-        """The marker's centre; None where a corner has no ray through the lens."""
+    def _settings(self, camera: str | None) -> tuple[Rig, CameraCalibration]:
         if self._rig is None:
             raise IpsysError("the log has no rig (marker length): give one with --rig lab.toml")
         if camera not in self._lenses:
@@ -69,8 +92,113 @@ class CameraFrame:
                 f"camera {camera} has no calibration in the log: give one with "
                 f"--calibration {camera}=calibration.yaml"
             )
-        uv = undistort(marker.corners_px, self._lenses[camera])
-        if not np.isfinite(uv).all():
-            return None
-        x_m, y_m, z_m = camera_point(uv, self._rig.length_of(marker.id))
-        return CameraPoint(marker.id, float(x_m), float(y_m), float(z_m), heading(uv))
+        return self._rig, self._lenses[camera]
+
+    def _fault(self, seen: _Seen, camera: str | None) -> tuple[str, str] | None:
+        """Why a marker has no place, as kind and text of an event."""
+        name = f"marker {seen.marker.id}"
+        if seen.marker.covariance_px2 is not None:
+            check_covariance(seen.marker.covariance_px2, f"{name} of camera {camera}")
+        if not np.isfinite(seen.uv).all():
+            return "outside_lens", f"{name} lies where the calibration of {camera} has no ray"
+        if not self._method.accepts(seen.uv):
+            return "no_square", f"the corners of {name} are not those of a square seen from in front"
+        return None
+
+
+class _Seen(NamedTuple):
+    """A marker, its corners in normalized image coordinates, (4, 2), and the side of its black square."""
+
+    marker: Marker
+    uv: Array
+    length_m: float
+
+
+def _through_lens(markers: Sequence[Marker], rig: Rig, lens: CameraCalibration) -> list[_Seen]:
+    # Once for all: most of a call's time goes into the call itself.
+    uv = undistort(np.concatenate([marker.corners_px for marker in markers]), lens).reshape(-1, 4, 2)
+    lengths_m = [rig.length_of(marker.id) for marker in markers]
+    return [_Seen(*one) for one in zip(markers, uv, lengths_m, strict=True)]
+
+
+def _lens_slopes(seen: Sequence[_Seen], lens: CameraCalibration) -> Array:
+    return pixel_slopes(np.concatenate([one.uv for one in seen]), lens).reshape(-1, 4, 2, 2)
+
+
+def _by_perimeter(seen: Sequence[_Seen], lens: CameraCalibration) -> list[CameraPoint]:
+    covariances_m2 = _perimeter_covariances(seen, lens)
+    points = []
+    for (marker, uv, length_m), covariance_m2 in zip(seen, covariances_m2, strict=True):
+        x_m, y_m, z_m = camera_point(uv, length_m).tolist()
+        offset_ns = marker.time_offset_ns
+        points.append(CameraPoint(marker.id, x_m, y_m, z_m, heading(uv), offset_ns, covariance_m2))
+    return points
+
+
+def _perimeter_covariances(seen: Sequence[_Seen], lens: CameraCalibration) -> list[Array | None]:
+    found: list[Array | None] = [None] * len(seen)
+    if all(one.marker.covariance_px2 is None for one in seen):
+        return found
+    for n, (one, uv_by_px) in enumerate(zip(seen, np.linalg.inv(_lens_slopes(seen, lens)), strict=True)):
+        if one.marker.covariance_px2 is not None:
+            m_by_px = np.concatenate(camera_point_slopes(one.uv, one.length_m) @ uv_by_px, axis=1)
+            found[n] = m_by_px @ one.marker.covariance_px2 @ m_by_px.T
+    return found
+
+
+def _by_pose(seen: Sequence[_Seen], lens: CameraCalibration) -> list[CameraPoint]:
+    lengths_m = np.array([one.length_m for one in seen])
+    whitening = _whitening(seen, _lens_slopes(seen, lens))
+    found = fit_squares(np.stack([one.uv for one in seen]), whitening, lengths_m)
+    misses_px = reprojection_px(found, lengths_m, np.stack([one.marker.corners_px for one in seen]), lens)
+    points = []
+    for n, (marker, _, _) in enumerate(seen):
+        both = zip(found.centres_m[n].tolist(), found.rotations[n], misses_px[n].tolist(), strict=True)
+        poses = tuple(MarkerPose(x, y, z, _vector(turn), miss_px) for (x, y, z), turn, miss_px in both)
+        x_m, y_m, z_m = found.centres_m[n, 0].tolist()
+        # The side from corner 3 to corner 0 is the marker's y axis.
+        right, down, _ = found.rotations[n, 0, :, 1]
+        heading_rad = float(np.arctan2(-down, right))
+        covariance_m2 = None if marker.covariance_px2 is None else found.covariances_m2[n]
+        offset_ns = marker.time_offset_ns
+        points.append(CameraPoint(marker.id, x_m, y_m, z_m, heading_rad, offset_ns, covariance_m2, poses))
+    return points
+
+
+def _whitening(seen: Sequence[_Seen], lens_slopes: Array) -> Array:
+    """What turns changes of u0 v0 .. u3 v3 into eight numbers of variance 1, (n, 8, 8)."""
+    given = [one.marker.covariance_px2 for one in seen]
+    whitening = whiten(np.stack([_USUAL_PX2 if one is None else one for one in given]))
+    by_corner = whitening.reshape(-1, 8, 4, 2).swapaxes(1, 2)
+    found: Array = (by_corner @ lens_slopes).swapaxes(1, 2).reshape(-1, 8, 8)
+    return found
+
+
+def _vector(rotation: Array) -> Array:
+    return np.asarray(cv2.Rodrigues(rotation)[0], dtype=np.float64).ravel()
+
+
+class _Method(NamedTuple):
+    """How markers get their places: whether four corners can have one, and the points of a frame."""
+
+    accepts: Callable[[Array], bool]
+    place: Callable[[Sequence[_Seen], CameraCalibration], list[CameraPoint]]
+
+
+METHODS = {
+    PERIMETER: _Method(lambda uv: bool((uv != uv[0]).any()), _by_perimeter),
+    "pose": _Method(goes_around, _by_pose),
+}
+
+
+def check_method(name: str) -> str:
+    """Return the name of a method.
+
+    Raises
+    ------
+    IpsysError
+        Where there is none of that name.
+    """
+    if name not in METHODS:
+        raise IpsysError(f"method {name!r} is not known; use one of {', '.join(METHODS)}")
+    return name

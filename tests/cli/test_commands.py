@@ -115,14 +115,17 @@ def test_evaluate_fits_80_columns(ipsys: Ipsys, lab: Path, monkeypatch: pytest.M
         assert title in done.out
 
 
+CAMERAS = ("red", "white", "black")
+
+
 def test_runs_say_where_they_come_from(ipsys: Ipsys, lab: Path) -> None:
     ipsys("replay", lab)
     runs = {run["stage"]: run for run in json.loads(ipsys("runs", lab, "--json").out)}
-    assert runs["detect"]["parameters"] == {"corners": "stock"}
+    assert runs["detect"]["parameters"] == {"corners": "edges"}
     assert {row["topic"] for row in runs["detect"]["inputs"]} == {
         "/rig",
-        *(f"/cameras/{camera}/image" for camera in ("red", "white", "black")),
+        *(f"/cameras/{camera}/{what}" for camera in CAMERAS for what in ("image", "calibration")),
     }
     assert all(row["hash"] and row["messages"] for row in runs["detect"]["inputs"])
-    assert runs["locate"]["input_runs"] == ["poly", "stock"]
+    assert runs["locate"]["input_runs"] == ["edges", "poly"]
     assert {"numpy", "opencv-python-headless", "blas", "python"} <= set(runs["fit"]["fingerprint"])

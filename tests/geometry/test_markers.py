@@ -8,7 +8,7 @@ from hypothesis import given
 from hypothesis import strategies as st
 from scipy.spatial.transform import Rotation
 
-from ipsys_log.geometry.markers import camera_point, heading, marker_corners
+from ipsys_log.geometry.markers import camera_point, camera_point_slopes, heading, marker_corners
 
 
 def seen(centre: tuple[float, float, float], angle_rad: float, length_m: float) -> np.ndarray:
@@ -43,3 +43,15 @@ def test_heading_is_minus_the_angle_of_the_side_from_corner_3_to_0(
 def test_corners_that_fall_together() -> None:
     with pytest.raises(ValueError, match="fall together"):
         camera_point(np.zeros((4, 2)), 0.2)
+
+
+@given(places, st.floats(-3, 3), st.floats(0.05, 0.5))
+def test_the_slopes_are_those_of_the_camera_point(
+    centre: tuple[float, float, float], angle_rad: float, length_m: float
+) -> None:
+    uv = seen(centre, angle_rad, length_m)
+    uv += np.random.default_rng(0).normal(0, 0.002, (4, 2))
+    steps = 1e-7 * np.eye(8).reshape(8, 4, 2)
+    by_step = [camera_point(uv + s, length_m) - camera_point(uv - s, length_m) for s in steps]
+    expected = np.reshape(by_step, (4, 2, 3)).swapaxes(1, 2) / 2e-7
+    np.testing.assert_allclose(camera_point_slopes(uv, length_m), expected, rtol=1e-4, atol=1e-3)

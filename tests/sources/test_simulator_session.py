@@ -196,6 +196,8 @@ def test_robots_stay_in_view_and_within_their_speed(markers: int) -> None:
         ({"markers": 101}, "has 100 markers, 101 are wanted"),
         ({"dictionary": "DICT_9X9"}, "no marker dictionary 'DICT_9X9'"),
         ({"rate_hz": 0.0}, "rate_hz is 0.0; give a value between 1 and 240"),
+        ({"row_time_ns": -1}, "row_time_ns is -1; give a value between 0 and 500000"),
+        ({"exposure_s": 2.0}, "exposure_s is 2.0; give a value between 0 and 1"),
         ({"noise_sigma": float("nan")}, "noise_sigma is nan"),
         ({"black": 210.0}, r"black \(210\) must be below white"),
         ({"cameras": ("red", "red")}, "two cameras of one name"),

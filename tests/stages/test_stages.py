@@ -39,7 +39,7 @@ def test_detected_corners_are_where_they_were_drawn() -> None:
     large[1003:1803, 2005:2805] = cv2.aruco.generateImageMarker(dictionary, 3, 800)
     small = cv2.resize(large, (640, 480), interpolation=cv2.INTER_AREA)
     data = cv2.imencode(".png", cv2.GaussianBlur(small, (0, 0), 0.7))[1].tobytes()
-    detect = Detect()
+    detect = Detect("stock")
     list(detect(RIG))
     found = list(detect(frame(CompressedImage(1, "red", data, "png"))))
     (marker,) = found[0].markers

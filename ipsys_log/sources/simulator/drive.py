@@ -47,13 +47,14 @@ class Drive:
     phases_rad: Array
 
     def places_at(self, time_s: float) -> tuple[Place, ...]:
-        """Where the markers are, a time after the start."""
-        places = []
-        for marker_id, ahead_s in self.ahead_s.items():
-            (x_m, y_m), (dx, dy) = self._follow(ahead_s, np.array([time_s]))
-            heading_rad = float(np.arctan2(dy[0], dx[0]))
-            places.append(Place(marker_id, float(x_m[0]), float(y_m[0]), self.height_m, heading_rad))
-        return tuple(places)
+        """Where the markers are, a time after the start; before it they stand there."""
+        return tuple(self.place_at(marker_id, time_s) for marker_id in self.ahead_s)
+
+    def place_at(self, marker_id: int, time_s: float) -> Place:
+        """Where one of them is."""
+        (x_m, y_m), (dx, dy) = self._follow(self.ahead_s[marker_id], np.array([max(time_s, 0.0)]))
+        heading_rad = float(np.arctan2(dy[0], dx[0]))
+        return Place(marker_id, float(x_m[0]), float(y_m[0]), self.height_m, heading_rad)
 
     def track(self, ahead_s: float, times_s: Array) -> Array:
         """Centres of a marker at times (n,): (n, 3) in m."""

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Callable
 from dataclasses import dataclass
 from functools import cache
 
@@ -14,7 +15,7 @@ from ipsys_log.geometry.markers import marker_corners
 from ipsys_log.geometry.poses import transform
 from ipsys_log.messages import CameraCalibration
 
-__all__ = ["Placed", "black_cells", "print_outline", "true_corners"]
+__all__ = ["Moving", "Placed", "black_cells", "print_outline", "true_corners"]
 
 Array = NDArray[np.float64]
 
@@ -31,6 +32,10 @@ class Placed:
     id: int
     length_m: float
     world_from_marker: Array
+
+
+# A print by the time in s since the time of the frame.
+Moving = Callable[[float], Placed]
 
 
 @cache

@@ -22,6 +22,8 @@ _RANGES = {
     "stations": (0, 100_000),
     "frames_per_station": (1, 10_000),
     "rate_hz": (1.0, 240.0),
+    "row_time_ns": (0, 500_000),
+    "exposure_s": (0.0, 1.0),
     "drive_s": (0.0, 86_400.0),
     "drive_speed_m_s": (0.01, 5.0),
     "drive_height_m": (0.0, 1.0),
@@ -53,6 +55,10 @@ class LabSettings:
     stations : about how many measured places each camera sees.
     frames_per_station : frames of each camera while the markers lie still.
     heights_m : at which markers are measured.
+    rate_hz : frames per second, of each camera.
+    row_time_ns : between the exposures of two rows (rolling shutter; 31000 is typical); 0 for all at once.
+    exposure_s : of each row, which blurs what moves (1/60 is typical); 0 for no blur. The time of a frame
+        is the middle of the exposure of its first row.
     drive_s, drive_speed_m_s, drive_height_m : of the robots that drive after the stations.
     psf_sigma_px : of the Gaussian point-spread of the optics; a pixel then integrates over its area.
     black, white, floor : grey levels 0..255 as they stand in the frame, whatever the gamma.
@@ -80,6 +86,8 @@ class LabSettings:
     frames_per_station: int = 5
     heights_m: tuple[float, ...] = (0.0, 0.05, 0.10, 0.15, 0.20)
     rate_hz: float = 30.0
+    row_time_ns: int = 0
+    exposure_s: float = 0.0
     drive_s: float = 15.0
     drive_speed_m_s: float = 0.5
     drive_height_m: float = 0.10

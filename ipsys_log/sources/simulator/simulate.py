@@ -24,7 +24,8 @@ from ipsys_log.messages import (
     image_topic,
 )
 from ipsys_log.sources.simulator.cameras import FLOOR_M, Camera, hang_cameras
-from ipsys_log.sources.simulator.drive import plan_drive
+from ipsys_log.sources.simulator.drive import Drive, plan_drive
+from ipsys_log.sources.simulator.patterns import Moving, Placed
 from ipsys_log.sources.simulator.places import (
     REFERENCES,
     Place,
@@ -34,27 +35,34 @@ from ipsys_log.sources.simulator.places import (
     seen_whole,
     split,
 )
-from ipsys_log.sources.simulator.render import View, encode_jpeg, prepare_view, render
+from ipsys_log.sources.simulator.render import encode_jpeg, render
 from ipsys_log.sources.simulator.seeds import Purpose, stream
 from ipsys_log.sources.simulator.settings import LabSettings
+from ipsys_log.sources.simulator.shutter import exposed
+from ipsys_log.sources.simulator.views import View, prepare_view
 from ipsys_log.units import NS_PER_S
 
-__all__ = ["EPOCH_NS", "build_rig", "simulate"]
+__all__ = ["EPOCH_NS", "build_rig", "drive_start_ns", "simulate"]
 
 # When the simulated clock starts: 2023-11-14 22:13:20 UTC.
 EPOCH_NS = 1_700_000_000 * NS_PER_S
 # While the markers are carried to their next places, nobody records.
 _PAUSE_NS = 3 * NS_PER_S
-# From the middle of the exposure to the arrival of the frame.
+# From the end of the exposure of the last row to the arrival of the frame.
 _LATENCY_NS = 4_000_000
 
 
 @dataclass(frozen=True, slots=True)
 class Instant:
-    """One moment at which all cameras take a frame; what was measured by then comes after it."""
+    """One moment at which all cameras take a frame; what was measured by then comes after it.
+
+    ``places`` is where the markers are at ``time_ns``, the middle of the exposure of the first row;
+    ``prints`` are they as the cameras see them.
+    """
 
     time_ns: int
     places: tuple[Place, ...]
+    prints: tuple[Placed | Moving, ...]
     measured: tuple[Measurement, ...] = ()
 
 
@@ -72,7 +80,8 @@ def simulate(settings: LabSettings) -> Iterator[Message]:
     ------
     Message
         The rig; a calibration per camera; then, per instant, the truth, a frame per camera and the
-        measurements that were made. ``publish_time_ns`` is the instant.
+        measurements that were made. ``publish_time_ns`` is the instant: of a frame, the middle of the
+        exposure of its first row.
 
     Raises
     ------
@@ -86,8 +95,9 @@ def simulate(settings: LabSettings) -> Iterator[Message]:
     ['/rig', '/cameras/red/calibration', '/truth/tracks', '/cameras/red/image']
     """
     log_time_ns = EPOCH_NS
+    latency_ns = _LATENCY_NS + round(exposed(0, settings.height - 1, settings)[1] * NS_PER_S)
     for topic, payload, publish_time_ns, camera in _payloads(settings):
-        log_time_ns = max(publish_time_ns + _LATENCY_NS, log_time_ns + 1)
+        log_time_ns = max(publish_time_ns + latency_ns, log_time_ns + 1)
         yield Message(topic, log_time_ns, publish_time_ns, payload, camera)
 
 
@@ -98,12 +108,34 @@ def build_rig(settings: LabSettings) -> Rig:
         dictionary=settings.dictionary,
         marker_length_m=settings.marker_length_m,
         markers=tuple(RigMarker(index, robot=f"robot_{index}") for index in range(settings.markers)),
-        cameras=tuple(RigCamera(name) for name in settings.cameras),
+        cameras=tuple(RigCamera(name, row_time_ns=settings.row_time_ns or None) for name in settings.cameras),
         reference_points=REFERENCES,
         floor=Floor(FLOOR_M, FLOOR_M),
         marker_height_m=settings.drive_height_m,
         tape_sigma_m=settings.tape_sigma_m or None,
     )
+
+
+def drive_start_ns(settings: LabSettings, cameras: Sequence[Camera]) -> int:
+    """When the robots start: the true places at a time are ``drive.places_at`` of the seconds since then.
+
+    Parameters
+    ----------
+    settings : of the lab.
+    cameras : from :func:`~ipsys_log.sources.simulator.cameras.hang_cameras`.
+
+    Returns
+    -------
+    The time of the first frame of the drive, in ns.
+
+    Examples
+    --------
+    >>> lab = LabSettings(stations=0, drive_s=2.0, markers=1)
+    >>> cameras = hang_cameras(lab)
+    >>> (drive_start_ns(lab, cameras) - EPOCH_NS) / NS_PER_S
+    1.0
+    """
+    return _start_ns(settings, len(plan_stations(settings, cameras)))
 
 
 def _payloads(settings: LabSettings) -> Iterator[tuple[str, Any, int, str | None]]:
@@ -131,31 +163,42 @@ class _Shutter:
     index: int
 
     def __call__(self, number: int, view: View) -> CompressedImage:
-        placed = [place(where, self.settings) for where in self.instant.places]
         rng = stream(self.settings.seed, Purpose.FRAME, number, self.index)
-        data = encode_jpeg(render(view, placed, self.settings, rng), self.settings)
+        data = encode_jpeg(render(view, self.instant.prints, self.settings, rng), self.settings)
         return CompressedImage(self.instant.time_ns, view.camera.name, data, "jpeg")
 
 
 def _instants(settings: LabSettings, cameras: Sequence[Camera]) -> Iterator[Instant]:
-    start_ns = EPOCH_NS + NS_PER_S
     sets = plan_stations(settings, cameras)
     splits = split(sets, settings.seed)
     for number, stations in enumerate(sets):
         places = tuple(station.place for station in stations)
-        times_ns = _times(settings, start_ns, settings.frames_per_station)
+        lying = tuple(place(where, settings) for where in places)
+        times_ns = _times(settings, _start_ns(settings, number), settings.frames_per_station)
         first = number * settings.markers
         measured = tuple(
             measure(where, settings, index, times_ns, splits[index])
             for index, where in enumerate(places, first)
         )
         for time_ns in times_ns[:-1]:
-            yield Instant(time_ns, places)
-        yield Instant(times_ns[-1], places, measured)
-        start_ns = times_ns[-1] + _PAUSE_NS
-    drive = plan_drive(settings, cameras)
+            yield Instant(time_ns, places, lying)
+        yield Instant(times_ns[-1], places, lying, measured)
+    drive, start_ns = plan_drive(settings, cameras), _start_ns(settings, len(sets))
     for time_ns in _times(settings, start_ns, round(settings.drive_s * settings.rate_hz)):
-        yield Instant(time_ns, drive.places_at((time_ns - start_ns) / NS_PER_S))
+        time_s = (time_ns - start_ns) / NS_PER_S
+        driving = tuple(_driving(drive, marker_id, time_s, settings) for marker_id in drive.ahead_s)
+        yield Instant(time_ns, drive.places_at(time_s), driving)
+
+
+def _driving(drive: Drive, marker_id: int, time_s: float, settings: LabSettings) -> Moving:
+    """A marker on the drive, for the frame of a time after its start."""
+    return lambda since_s: place(drive.place_at(marker_id, time_s + since_s), settings)
+
+
+def _start_ns(settings: LabSettings, number: int) -> int:
+    """When the markers lie at a set of stations for the first time; after the last set the drive starts."""
+    last_ns = _times(settings, 0, settings.frames_per_station)[-1]
+    return EPOCH_NS + NS_PER_S + number * (last_ns + _PAUSE_NS)
 
 
 def _times(settings: LabSettings, start_ns: int, count: int) -> list[int]:

@@ -1,0 +1,211 @@
+"""Both poses that explain the four corners of a square marker, tilted as it may be."""
+
+from __future__ import annotations
+
+from typing import NamedTuple
+
+import numpy as np
+from numpy.typing import NDArray
+
+from ipsys_log.geometry.ippe import solve_squares
+from ipsys_log.geometry.lenses import project
+from ipsys_log.geometry.markers import marker_corners
+from ipsys_log.messages import CameraCalibration
+
+__all__ = ["SquarePoses", "fit_squares", "goes_around", "reprojection_px"]
+
+Array = NDArray[np.float64]
+
+# Markers face up and cameras look down, to about this angle: it decides where the corners do not.
+_TILT_RAD = np.deg2rad(3.0)
+# Two poses that nearly fall together settle slowly, and need not.
+_ITERATIONS = 5
+# A fit has settled when a step is expected to lower chi2 by less than this part of it, and this much: to
+# about a hundredth of the corners' noise, and far below it where they are exact.
+_SETTLED, _EXACT = 1e-3, 1e-6
+_DAMPING = 0.01
+_DIAGONAL = np.eye(6)
+# The least corner of a marker that can be told from a line: the area at it, by the squared perimeter.
+_FLAT = 1e-6
+
+
+class SquarePoses(NamedTuple):
+    """Two poses for each of n markers, the likelier one first.
+
+    ``rotations`` (n, 2, 3, 3), ``centres_m`` (n, 2, 3): the marker's axes and centre in the frame of the
+    camera. ``chi2`` (n, 2): squared residuals of the eight whitened coordinates, summed. ``covariances_m2``
+    (n, 3, 3): of the first one's centre.
+    """
+
+    rotations: Array
+    centres_m: Array
+    chi2: Array
+    covariances_m2: Array
+
+
+def fit_squares(uv: Array, whitening: Array, lengths_m: Array) -> SquarePoses:
+    """Poses of square markers from their corners, through a lens that is linear over a pixel.
+
+    IPPE's two solutions, each refined by Gauss and Newton's method, with Levenberg and Marquardt's damping
+    where a step fails, until the weighted squares of the reprojection error are least. First comes the
+    one with the smaller sum of these squares and of the squared tilt, in units of 3 degrees, between the
+    marker's z axis and the direction against the optical axis.
+
+    Parameters
+    ----------
+    uv : (n, 4, 2), normalized image coordinates of corners that go around (see :func:`goes_around`).
+    whitening : (n, 8, 8), what turns changes of u0 v0 .. u3 v3 into numbers of variance 1 (see
+        :func:`ipsys_log.geometry.corner_noise.whiten`, times the slopes of the lens).
+    lengths_m : (n,), sides of the black squares, in m.
+
+    Returns
+    -------
+    SquarePoses.
+
+    References
+    ----------
+    Collins and Bartoli, Infinitesimal plane-based pose estimation, IJCV 2014, for the two solutions.
+
+    Examples
+    --------
+    >>> uv = np.array([[[-0.05, -0.05], [0.05, -0.05], [0.05, 0.05], [-0.05, 0.05]]])
+    >>> found = fit_squares(uv, 4000 * np.eye(8)[None], np.array([0.2]))
+    >>> found.centres_m[0, 0].round(6).tolist()
+    [0.0, 0.0, 2.0]
+    """
+    corners_m = marker_corners(1.0) * lengths_m[:, None, None]
+    seen = _Seen(uv[:, None], whitening[:, None], corners_m[:, None])
+    fit = _refine(seen, *solve_squares(uv, lengths_m))
+    # Twice one plus the cosine: the square of the angle, as long as that is small.
+    tilt2_rad2 = 2 * (1 + fit.rotations[..., 2, 2])
+    order = np.argsort(fit.chi2 + tilt2_rad2 / _TILT_RAD**2, axis=1, kind="stable")
+    row = np.arange(len(uv))
+    rotations, centres_m, chi2 = (
+        values[row[:, None], order] for values in (fit.rotations, fit.centres_m, fit.chi2)
+    )
+    covariances_m2 = _centre_covariances(fit.slopes[row, order[:, 0]], centres_m[:, 0, 2])
+    return SquarePoses(rotations, centres_m, chi2, covariances_m2)
+
+
+def goes_around(uv: Array) -> bool:
+    """Whether corners, (4, 2), go around a convex figure as those of a marker seen from in front do."""
+    sides = uv[[1, 2, 3, 0]] - uv
+    after = sides[[1, 2, 3, 0]]
+    turns = sides[:, 0] * after[:, 1] - sides[:, 1] * after[:, 0]
+    return bool(turns.min() > _FLAT * (sides * sides).sum())
+
+
+def reprojection_px(
+    poses: SquarePoses, lengths_m: Array, corners_px: Array, lens: CameraCalibration
+) -> Array:
+    """Root mean square of the distances between the corners that follow from poses and those seen.
+
+    Parameters
+    ----------
+    poses : of n markers.
+    lengths_m : (n,), sides of the black squares.
+    corners_px : (n, 4, 2), as seen in the raw image.
+    lens : the camera's calibration.
+
+    Returns
+    -------
+    (n, 2), in px.
+    """
+    corners_m = marker_corners(1.0) * lengths_m[:, None, None]
+    points_m = corners_m[:, None] @ poses.rotations.swapaxes(-1, -2) + poses.centres_m[:, :, None]
+    again_px = project(points_m.reshape(-1, 3), lens).reshape(-1, 2, 4, 2)
+    misses_px2 = ((again_px - corners_px[:, None]) ** 2).sum(axis=-1)
+    found: Array = np.sqrt(misses_px2.mean(axis=-1))
+    return found
+
+
+class _Seen(NamedTuple):
+    """What n markers are fitted to, for both poses alike: (n, 1, 4, 2), (n, 1, 8, 8), (n, 1, 4, 3)."""
+
+    uv: Array
+    whitening: Array
+    corners_m: Array
+
+
+class _Fit(NamedTuple):
+    """Two poses for each of n markers, with residuals and slopes as in :func:`_look`, and chi2 (n, 2)."""
+
+    rotations: Array
+    centres_m: Array
+    residuals: Array
+    slopes: Array
+    chi2: Array
+
+
+def _refine(seen: _Seen, rotations: Array, centres_m: Array) -> _Fit:
+    """The poses of least squares, from poses near them."""
+    now = _look(seen, rotations, centres_m)
+    damping = np.zeros((len(rotations), 2, 1, 1))
+    for _ in range(_ITERATIONS):
+        across = now.slopes.swapaxes(-1, -2)
+        normal, gradient = across @ now.slopes, across @ now.residuals[..., None]
+        step = _solve(normal + damping * (_DIAGONAL * normal), -gradient)
+        expected = -(step * gradient).sum(axis=(-1, -2))
+        turned = _small_turns(step[..., :3, 0]) @ now.rotations
+        moved_m = now.centres_m + step[..., 3:, 0] * now.centres_m[..., 2:]
+        tried = _look(seen, turned, moved_m)
+        better = (tried.chi2 <= now.chi2) & (moved_m[..., 2] > 0)
+        settled = (expected <= _SETTLED * now.chi2 + _EXACT).all()
+        now = tried if better.all() else _choose(better, tried, now)
+        if settled:
+            break
+        damping = np.where(better[..., None, None], damping / 100, np.maximum(10 * damping, _DAMPING))
+    return now
+
+
+def _choose(better: NDArray[np.bool_], tried: _Fit, now: _Fit) -> _Fit:
+    def pick(new: Array, old: Array) -> Array:
+        return np.where(better.reshape(*better.shape, *[1] * (new.ndim - 2)), new, old)
+
+    return _Fit(*(pick(new, old) for new, old in zip(tried, now, strict=True)))
+
+
+def _look(seen: _Seen, rotations: Array, centres_m: Array) -> _Fit:
+    """Poses with their whitened residuals (n, 2, 8) and the slopes of these, (n, 2, 8, 6).
+
+    The six parameters: a turn of the marker about its centre, in rad about the camera's axes, and a shift of
+    its centre, in parts of its distance z.
+    """
+    arms_m = seen.corners_m @ rotations.swapaxes(-1, -2)
+    points_m = arms_m + centres_m[..., None, :]
+    per_m = 1 / points_m[..., 2:]
+    uv = points_m[..., :2] * per_m
+    u, v = uv[..., 0], uv[..., 1]
+    arms = arms_m * per_m
+    a, b, c = arms[..., 0], arms[..., 1], arms[..., 2]
+    far = centres_m[..., 2, None] * per_m[..., 0]
+    # A turn w moves a point by w x arm; u moves by (dx - u dz) / z, v by (dy - v dz) / z.
+    slopes = np.zeros((*u.shape, 2, 6))
+    slopes[..., 0, 0], slopes[..., 0, 1], slopes[..., 0, 2] = -u * b, c + u * a, -b
+    slopes[..., 1, 0], slopes[..., 1, 1], slopes[..., 1, 2] = -c - v * b, v * a, a
+    slopes[..., 0, 3] = slopes[..., 1, 4] = far
+    slopes[..., 0, 5], slopes[..., 1, 5] = -u * far, -v * far
+    residuals = (seen.whitening @ (uv - seen.uv).reshape(*uv.shape[:2], 8, 1))[..., 0]
+    slopes = seen.whitening @ slopes.reshape(*uv.shape[:2], 8, 6)
+    return _Fit(rotations, centres_m, residuals, slopes, (residuals * residuals).sum(axis=-1))
+
+
+def _small_turns(vectors_rad: Array) -> Array:
+    """Rotations (..., 3, 3) by vectors (..., 3), to second order: Cayley's, which are rotations exactly."""
+    half = np.zeros((*vectors_rad.shape, 3))
+    x, y, z = vectors_rad[..., 0] / 2, vectors_rad[..., 1] / 2, vectors_rad[..., 2] / 2
+    half[..., 0, 1], half[..., 0, 2], half[..., 1, 2] = -z, y, -x
+    half[..., 1, 0], half[..., 2, 0], half[..., 2, 1] = z, -y, x
+    scale = 2 / (1 + x * x + y * y + z * z)
+    turns: Array = np.eye(3) + scale[..., None, None] * (half + half @ half)
+    return turns
+
+
+def _centre_covariances(slopes: Array, z_m: Array) -> Array:
+    """Covariances of centres, (n, 3, 3) in m^2, to first order in the noise of the corners."""
+    of_motions = np.linalg.inv(slopes.swapaxes(1, 2) @ slopes)
+    return np.asarray(of_motions[:, 3:, 3:] * z_m[:, None, None] ** 2, dtype=np.float64)
+
+
+def _solve(a: Array, b: Array) -> Array:
+    return np.asarray(np.linalg.solve(a, b), dtype=np.float64)

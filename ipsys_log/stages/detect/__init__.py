@@ -1,0 +1,200 @@
+"""Frames to markers: found, followed, and measured at their edges, or as the paper does it."""
+
+from __future__ import annotations
+
+from collections import Counter
+from collections.abc import Iterator
+from dataclasses import replace
+from typing import Any
+
+import numpy as np
+
+from ipsys_log.errors import IpsysError
+from ipsys_log.geometry.lenses import check_calibration, same_lens
+from ipsys_log.messages import (
+    CameraCalibration,
+    Color,
+    CompressedImage,
+    Event,
+    ImageAnnotations,
+    Marker,
+    Markers,
+    Message,
+    Point2,
+    PointsAnnotation,
+    RawImage,
+    Rig,
+    RigCamera,
+    TextAnnotation,
+)
+from ipsys_log.stages.detect.decode import decode_grey
+from ipsys_log.stages.detect.edges import Fit
+from ipsys_log.stages.detect.follow import Follow
+from ipsys_log.stages.detect.stock import detect_markers, marker_detector
+
+__all__ = [
+    "CORNERS",
+    "EDGES",
+    "READS",
+    "STOCK",
+    "Detect",
+    "check_corners",
+    "decode_grey",
+    "detect_markers",
+    "marker_detector",
+]
+
+READS = (Rig, CameraCalibration, CompressedImage, RawImage)
+EDGES, STOCK = CORNERS = ("edges", "stock")
+
+_GREEN = Color(0.1, 0.9, 0.3, 1.0)
+
+
+class Detect:
+    """The stage *detect*, one for all cameras.
+
+    Yields, for a frame, its :class:`Markers` and their drawing for viewers; or an :class:`Event`
+    for a frame that cannot be decoded. A marker id that is seen twice in a frame, or is not in the
+    rig, is left out and named by an event.
+
+    Parameters
+    ----------
+    corners : ``edges``, fitted to the edges of the print through the lens, from frame to frame; or
+        ``stock``, OpenCV's detector on each frame, refined as the authors do.
+
+    Raises
+    ------
+    IpsysError
+        For a frame before there is a rig or, with ``edges``, a calibration of its camera.
+    """
+
+    def __init__(self, corners: str = EDGES) -> None:
+        self._corners = check_corners(corners)
+        self._rig: Rig | None = None
+        self._lenses: dict[str | None, CameraCalibration] = {}
+        self._following: dict[str | None, Follow] = {}
+        self._said: dict[str | None, set[int | None]] = {}
+
+    def __call__(self, message: Message) -> Iterator[Any]:
+        payload = message.payload
+        if isinstance(payload, Rig):
+            self._rig = payload
+            # Each dictionary is looked up once, here, so that a bad name is said before any frame.
+            marker_detector(payload.dictionary)
+            self._following.clear()
+        elif isinstance(payload, CameraCalibration):
+            lens = check_calibration(payload, f"calibration of {message.camera}")
+            known = self._lenses.get(message.camera)
+            self._lenses[message.camera] = lens
+            if known is None or not same_lens(known, lens):
+                self._following.pop(message.camera, None)
+        else:
+            yield from self._frame(message)
+
+    def _frame(self, message: Message) -> Iterator[Any]:
+        if self._rig is None:
+            raise IpsysError(
+                "the log has no rig (marker dictionary and length): give one with --rig lab.toml"
+            )
+        try:
+            found, width, height = self._find(message, self._rig)
+        except ValueError as error:
+            text = f"{message.topic}: corrupt frame: {error}"
+            yield Event(message.publish_time_ns, "corrupt_frame", text, message.camera)
+            return
+        markers, events = _sift(found, self._rig, message)
+        yield from self._unsaid(events)
+        yield Markers(message.publish_time_ns, markers, width, height)
+        yield _drawing(message.publish_time_ns, markers)
+
+    def _find(self, message: Message, rig: Rig) -> tuple[list[Marker], int, int]:
+        """The markers in a frame, and its width and height."""
+        camera = rig.camera(str(message.camera))
+        if self._corners == STOCK:
+            grey = decode_grey(message.payload)
+            found = detect_markers(grey, rig.dictionary)
+            height, width = grey.shape
+        else:
+            if message.camera not in self._following:
+                self._following[message.camera] = self._follow(message, rig, camera)
+            fits, width, height = self._following[message.camera](message.payload, message.publish_time_ns)
+            found = [_marker(fit) for fit in fits]
+        return [_timed(marker, camera) for marker in found], width, height
+
+    def _follow(self, message: Message, rig: Rig, camera: RigCamera) -> Follow:
+        lens = self._lenses.get(message.camera)
+        if lens is None:
+            raise IpsysError(
+                f"camera {message.camera} has no calibration in the log, through which edges are fitted: "
+                f"give one with --calibration {message.camera}=calibration.yaml, or use --corners stock"
+            )
+        return Follow(rig.dictionary, lens, camera.edge_offset_px)
+
+    def _unsaid(self, events: list[Event]) -> Iterator[Event]:
+        """A camera names an id that is not in the rig once, and whatever else every time."""
+        for event in events:
+            said = self._said.setdefault(event.camera, set())
+            if event.kind != "unknown_marker" or event.marker_id not in said:
+                yield event
+            if event.kind == "unknown_marker":
+                said.add(event.marker_id)
+
+
+def check_corners(name: str) -> str:
+    """Return the name of a method for corners, if it is one.
+
+    Raises
+    ------
+    IpsysError
+        Otherwise.
+    """
+    if name not in CORNERS:
+        raise IpsysError(f"--corners {name}: there is no such method; use one of {', '.join(CORNERS)}")
+    return name
+
+
+def _marker(fit: Fit) -> Marker:
+    # In single precision, as the log stores it: what comes next is to see the same numbers.
+    covariance_px2 = fit.covariance_px2.astype(np.float32).astype(np.float64)
+    return Marker(fit.pose.id, fit.corners_px, covariance_px2, edge_offset_px=fit.edge_offset_px)
+
+
+def _timed(marker: Marker, camera: RigCamera) -> Marker:
+    """With the time from the exposure of the first row to that of the row it lies in (rolling shutter)."""
+    if camera.row_time_ns is None:
+        return marker
+    row = float(marker.corners_px[:, 1].mean())
+    return replace(marker, time_offset_ns=round(row * camera.row_time_ns))
+
+
+def _sift(found: list[Marker], rig: Rig, message: Message) -> tuple[tuple[Marker, ...], list[Event]]:
+    """Leave out what cannot be told apart or does not belong here, and say so."""
+    counts = Counter(marker.id for marker in found)
+    events = []
+    for marker_id, count in sorted(counts.items()):
+        if not rig.knows(marker_id):
+            kind, text = "unknown_marker", f"marker {marker_id} is not in the rig"
+        elif count > 1:
+            kind, text = "ambiguous_marker", f"marker {marker_id} is seen {count} times in one frame"
+        else:
+            continue
+        events.append(
+            Event(message.publish_time_ns, kind, f"{message.topic}: {text}", message.camera, marker_id)
+        )
+    left_out = {event.marker_id for event in events}
+    return tuple(marker for marker in found if marker.id not in left_out), events
+
+
+def _drawing(time_ns: int, markers: tuple[Marker, ...]) -> ImageAnnotations:
+    """Outlines and ids; Foxglove counts pixels from the first pixel's corner, OpenCV from its centre."""
+    shifted = [(marker.id, marker.corners_px + 0.5) for marker in markers]
+    return ImageAnnotations(
+        points=tuple(
+            PointsAnnotation(time_ns, 2, tuple(Point2(float(x), float(y)) for x, y in corners), _GREEN, 2.0)
+            for _, corners in shifted
+        ),
+        texts=tuple(
+            TextAnnotation(time_ns, Point2(float(corners[0, 0]), float(corners[0, 1])), str(n), 16.0, _GREEN)
+            for n, corners in shifted
+        ),
+    )

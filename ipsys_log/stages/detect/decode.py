@@ -1,0 +1,117 @@
+"""Frames to grey pictures."""
+
+from __future__ import annotations
+
+import cv2
+import numpy as np
+import simplejpeg
+from numpy.typing import NDArray
+
+from ipsys_log.messages import CompressedImage, RawImage
+from ipsys_log.stages.detect.jpeg import Layout, cut_rows, read_layout
+
+__all__ = ["Canvas", "Grey", "decode_grey", "levels_at"]
+
+Grey = NDArray[np.uint8]
+
+_RAW_TO_GREY = {
+    "mono8": (1, None),
+    "8UC1": (1, None),
+    "rgb8": (3, cv2.COLOR_RGB2GRAY),
+    "bgr8": (3, cv2.COLOR_BGR2GRAY),
+    "8UC3": (3, cv2.COLOR_BGR2GRAY),
+    "rgba8": (4, cv2.COLOR_RGBA2GRAY),
+    "bgra8": (4, cv2.COLOR_BGRA2GRAY),
+}
+
+
+class Canvas:
+    """The pictures of one camera, each decoded into the memory of the one before."""
+
+    def __init__(self) -> None:
+        self._pixels = np.zeros((0, 0), dtype=np.uint8)
+
+    def show(self, frame: CompressedImage | RawImage, rows: slice | None = None) -> tuple[Grey, slice]:
+        """The grey picture in a frame, or at least some rows of it.
+
+        Parameters
+        ----------
+        frame : as recorded.
+        rows : those wanted; None for all. Where not all are, a JPEG is not checked as strictly.
+
+        Returns
+        -------
+        The picture (height, width), good until the next one, and the rows of it that were decoded.
+
+        Raises
+        ------
+        ValueError
+            Where the data is damaged.
+        """
+        layout = read_layout(frame.data) if isinstance(frame, CompressedImage) else None
+        if layout is None:
+            self._pixels = decode_grey(frame)
+            return self._pixels, slice(0, len(self._pixels))
+        if self._pixels.shape != (layout.height, layout.width) or not self._pixels.flags.writeable:
+            self._pixels = np.zeros((layout.height, layout.width), dtype=np.uint8)
+        low, high = self._decode(frame.data, layout, rows)
+        return self._pixels, slice(low, high)
+
+    def _decode(self, data: bytes, layout: Layout, rows: slice | None) -> tuple[int, int]:
+        if rows is None:
+            simplejpeg.decode_jpeg(data, colorspace="GRAY", buffer=self._pixels)
+            return 0, layout.height
+        if rows.start >= min(rows.stop, layout.height):
+            return 0, 0
+        piece, low, high = cut_rows(data, layout, rows.start, rows.stop)
+        # What follows the last row that is wanted looks like damage.
+        strict = layout.interval > 0
+        simplejpeg.decode_jpeg(piece, colorspace="GRAY", buffer=self._pixels[low:high], strict=strict)
+        return low, high
+
+
+def decode_grey(frame: CompressedImage | RawImage) -> Grey:
+    """The grey picture in a frame, (height, width).
+
+    Raises
+    ------
+    ValueError
+        Where the data is damaged: a JPEG is decoded strictly, so that half a picture is no picture.
+    """
+    if isinstance(frame, RawImage):
+        return _raw_grey(frame)
+    if frame.data[:2] == b"\xff\xd8":
+        grey: Grey = simplejpeg.decode_jpeg(frame.data, colorspace="GRAY")[..., 0]
+        return grey
+    try:
+        decoded = cv2.imdecode(np.frombuffer(frame.data, np.uint8), cv2.IMREAD_GRAYSCALE)
+    except cv2.error:  # OpenCV asserts on empty data
+        decoded = None
+    if decoded is None:
+        raise ValueError(f"{len(frame.data)} bytes that are no picture ({frame.format or 'no format given'})")
+    return np.asarray(decoded, dtype=np.uint8)
+
+
+def levels_at(grey: Grey, x: NDArray[np.float32], y: NDArray[np.float32]) -> NDArray[np.float64]:
+    """Grey levels at pixels, between them linearly; of the shape (..., n) of x and y, both contiguous."""
+    rows = (-1, x.shape[-1])
+    levels = cv2.remap(
+        grey, x.reshape(rows), y.reshape(rows), cv2.INTER_LINEAR, borderMode=cv2.BORDER_REPLICATE
+    )
+    return np.asarray(levels, dtype=np.float64).reshape(x.shape)
+
+
+def _raw_grey(frame: RawImage) -> Grey:
+    if frame.encoding not in _RAW_TO_GREY:
+        known = ", ".join(_RAW_TO_GREY)
+        raise ValueError(f"pixel encoding {frame.encoding!r} is not read (only {known})")
+    channels, conversion = _RAW_TO_GREY[frame.encoding]
+    rows = np.frombuffer(frame.data, np.uint8)
+    step = frame.step or frame.width * channels  # some writers leave it out
+    if step < frame.width * channels or rows.size < step * frame.height or not rows.size:
+        raise ValueError(f"{rows.size} bytes are too few for {frame.width} x {frame.height}")
+    rows = rows[: step * frame.height].reshape(frame.height, step)
+    pixels = rows[:, : frame.width * channels].reshape(frame.height, frame.width, channels)
+    if conversion is None:
+        return np.ascontiguousarray(pixels[..., 0])
+    return np.asarray(cv2.cvtColor(np.ascontiguousarray(pixels), conversion), dtype=np.uint8)

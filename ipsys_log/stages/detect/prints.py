@@ -1,0 +1,118 @@
+"""What is printed on a marker: where black meets white, and the colours of its cells."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from functools import cache, lru_cache
+
+import cv2
+import numpy as np
+from numpy.typing import NDArray
+
+from ipsys_log.geometry.markers import marker_corners
+
+__all__ = ["Prints", "lay_out"]
+
+Array = NDArray[np.float64]
+
+# Along the side of a cell, clear of its corners, where edges are rounded by the blur.
+_ALONG_CELL = np.array([0.3, 0.7])
+# In cells, across an edge; and of a side.
+_REACH, _NUDGE = 0.15, 1e-3
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class Prints:
+    """Markers of side 1 around (0, 0), x to their right and y to their top.
+
+    Attributes
+    ----------
+    points : (m, s, 2), points on the edges between black and white of m markers.
+    ends : (m, 2 s, 2), ``reach`` before and behind each of them, across the edge.
+    level : (m, s), 0.0 where the edge runs along y and so says something of x; else 1.0.
+    swirl : (m, s), how far a point moves across its edge where the marker turns about its middle.
+    polarity : (m, s), 1.0 where white lies towards the greater coordinate, else -1.0; 0.0 for a point that
+        is there only because another marker has more.
+    outline : (12 + c, 2), the corners, the same moved by ``nudge`` in x, and in y, and the middles of the
+        cells, black border included.
+    white : (m, c), which cells are white.
+    cells : how many lie along a side.
+    """
+
+    points: Array
+    ends: Array
+    level: Array
+    swirl: Array
+    polarity: Array
+    outline: Array
+    white: NDArray[np.bool_]
+    cells: int
+    reach: float
+    nudge: float
+
+
+@lru_cache(maxsize=1024)
+def lay_out(dictionary: str, marker_ids: tuple[int, ...]) -> Prints:
+    """The prints of markers; ``dictionary`` is OpenCV's name, such as DICT_4X4_100."""
+    edges = [_edges(dictionary, marker_id) for marker_id in marker_ids]
+    most = max(len(rows) for rows in edges)
+    rows = np.stack(
+        [np.vstack([one, np.repeat(one[:1] * [1, 1, 1, 0], most - len(one), 0)]) for one in edges]
+    )
+    white = np.stack([_white(dictionary, marker_id) for marker_id in marker_ids])
+    cells = white.shape[1]
+    points, level = rows[..., :2].copy(), rows[..., 2]
+    reach = _REACH / cells
+    aside = np.stack([1 - level, level], axis=2) * reach
+    return Prints(
+        points,
+        np.concatenate([points - aside, points + aside], axis=1),
+        level.copy(),
+        level * points[..., 0] - (1 - level) * points[..., 1],
+        rows[..., 3].copy(),
+        _outline(cells),
+        white.reshape(len(white), -1),
+        cells,
+        reach,
+        _NUDGE,
+    )
+
+
+def _outline(cells: int) -> Array:
+    corners = marker_corners(1.0)[:, :2]
+    middles = (np.arange(cells) + 0.5) / cells - 0.5
+    x, y = np.meshgrid(middles, -middles)
+    nudged = [corners + np.array(nudge) for nudge in ([_NUDGE, 0.0], [0.0, _NUDGE])]
+    return np.concatenate([corners, *nudged, np.column_stack([x.ravel(), y.ravel()])])
+
+
+@cache
+def _white(dictionary: str, marker_id: int) -> NDArray[np.bool_]:
+    """The cells that are white, (n, n), the top row first."""
+    known = cv2.aruco.getPredefinedDictionary(getattr(cv2.aruco, dictionary))
+    image = cv2.aruco.generateImageMarker(known, marker_id, known.markerSize + 2, borderBits=1)
+    return np.asarray(image) > 0
+
+
+@cache
+def _edges(dictionary: str, marker_id: int) -> Array:
+    """Points on edges: x, y, axis, polarity; (s, 4)."""
+    margin = np.pad(_white(dictionary, marker_id), 1, constant_values=True)
+    cells = len(margin) - 2
+    lines = np.arange(cells + 1) / cells - 0.5
+    steps = _ALONG_CELL / cells
+    upright = [
+        (lines[column], -(lines[row] + step), 0, 1 if margin[row + 1, column + 1] else -1)
+        for row in range(cells)
+        for column in range(cells + 1)
+        if margin[row + 1, column] != margin[row + 1, column + 1]
+        for step in steps
+    ]
+    level = [
+        (lines[column] + step, -lines[row], 1, 1 if margin[row, column + 1] else -1)
+        for row in range(cells + 1)
+        for column in range(cells)
+        if margin[row, column + 1] != margin[row + 1, column + 1]
+        for step in steps
+    ]
+    return np.array(upright + level, dtype=np.float64)

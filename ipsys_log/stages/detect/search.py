@@ -1,0 +1,146 @@
+"""Markers anywhere in a picture: found in a reduced one, read in the full one.
+
+Squares are found by OpenCV's detector at a third of the size, with one threshold window instead of three.
+Cells of a marker that is far or foreshortened are too small to be read there, so whatever is a square but
+not a marker yet is read again at full size.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Iterable
+from functools import cache
+from typing import Any, NamedTuple
+
+import cv2
+import numpy as np
+from numpy.typing import NDArray
+
+from ipsys_log.stages.detect.decode import Grey, levels_at
+
+__all__ = ["Candidate", "search", "search_thoroughly"]
+
+Array = NDArray[np.float64]
+
+_SHRINK = 3
+# At that scale: of the threshold, wider than the sides of the black border are thick.
+_WINDOW_PX = 31
+_DARKER = 12
+_ROUNDED = 0.06
+_BORDER_PX = 1
+_NEAR = (4, 4)
+_REFINE = (cv2.TERM_CRITERIA_COUNT + cv2.TERM_CRITERIA_EPS, 10, 0.05)
+_MISREAD = 3
+_UNIT = np.array([[0.0, 0.0], [1.0, 0.0], [1.0, 1.0], [0.0, 1.0]], dtype=np.float32)
+
+
+# Rows and columns of a whole picture.
+WHOLE = (slice(None), slice(None))
+
+
+class Candidate(NamedTuple):
+    """A marker and about where its corners are, (4, 2) in px."""
+
+    id: int
+    corners_px: Array
+
+
+def search(grey: Grey, dictionary: str, region: tuple[slice, slice] = WHOLE) -> list[Candidate]:
+    """Markers in a picture, roughly.
+
+    Parameters
+    ----------
+    grey : (height, width).
+    dictionary : OpenCV's name, such as DICT_4X4_100.
+    region : rows and columns to search.
+    """
+    piece = np.ascontiguousarray(grey[region])
+    origin = np.array([region[1].start or 0, region[0].start or 0], dtype=np.float64)
+    return [one._replace(corners_px=one.corners_px + origin) for one in _search(piece, dictionary)]
+
+
+def _search(grey: Grey, dictionary: str) -> list[Candidate]:
+    # Whole pixels, not means: three times as fast, and as good where cells are wider than that.
+    small = np.ascontiguousarray(grey[_SHRINK // 2 :: _SHRINK, _SHRINK // 2 :: _SHRINK])
+    found, ids, rejected = _quick_detector(dictionary).detectMarkers(small)
+    squares = [*found, *rejected]
+    if not squares:
+        return []
+    # Sample k of the reduced picture is pixel 3 k + 1.
+    rough = np.concatenate(squares).reshape(-1, 1, 2) * np.float32(_SHRINK) + np.float32(_SHRINK // 2)
+    corners_px = cv2.cornerSubPix(grey, rough, _NEAR, (-1, -1), _REFINE).reshape(-1, 4, 2).astype(np.float64)
+    read = len(found)
+    return _candidates(corners_px[:read], ids) + _read(grey, corners_px[read:], dictionary)
+
+
+def search_thoroughly(grey: Grey, dictionary: str) -> list[Candidate]:
+    """The same by OpenCV's detector with its own settings, at full size: finds markers in shadow too."""
+    found, ids, _ = _full_detector(dictionary).detectMarkers(grey)
+    return _candidates(found, ids)
+
+
+def _candidates(found: Iterable[Any], ids: Any) -> list[Candidate]:
+    # OpenCV 5 gives ids of shape (n,), OpenCV 4 of shape (n, 1), or None.
+    numbers = [] if ids is None else np.ravel(ids).tolist()
+    return [
+        Candidate(n, np.asarray(square, dtype=np.float64).reshape(4, 2))
+        for n, square in zip(numbers, found, strict=True)
+    ]
+
+
+def _known(dictionary: str) -> cv2.aruco.Dictionary:
+    return cv2.aruco.getPredefinedDictionary(getattr(cv2.aruco, dictionary))
+
+
+@cache
+def _quick_detector(dictionary: str) -> cv2.aruco.ArucoDetector:
+    parameters = cv2.aruco.DetectorParameters()
+    parameters.adaptiveThreshWinSizeMin = parameters.adaptiveThreshWinSizeMax = _WINDOW_PX
+    parameters.adaptiveThreshConstant = _DARKER
+    parameters.polygonalApproxAccuracyRate = _ROUNDED
+    parameters.minDistanceToBorder = _BORDER_PX
+    return cv2.aruco.ArucoDetector(_known(dictionary), parameters)
+
+
+@cache
+def _full_detector(dictionary: str) -> cv2.aruco.ArucoDetector:
+    parameters = cv2.aruco.DetectorParameters()
+    parameters.minDistanceToBorder = _BORDER_PX
+    return cv2.aruco.ArucoDetector(_known(dictionary), parameters)
+
+
+def _read(grey: Grey, corners: Array, dictionary: str) -> list[Candidate]:
+    """Which of the squares (n, 4, 2) are markers, by their cells."""
+    if not len(corners):
+        return []
+    words = _words(dictionary)
+    cells = round(np.sqrt(words.shape[2]))
+    middles = (np.arange(cells, dtype=np.float64) + 0.5) / cells
+    x, y = (axis.ravel() for axis in np.meshgrid(middles, middles))
+    # Bilinear in the corners: a square of this size is bent little by perspective and lens.
+    shares = np.stack([(1 - x) * (1 - y), x * (1 - y), x * y, (1 - x) * y], axis=1)
+    places = (shares @ corners).astype(np.float32)
+    levels = levels_at(grey, places[..., 0].copy(), places[..., 1].copy())
+    middle = levels.min(axis=1) / 2 + levels.max(axis=1) / 2
+    white = levels > middle[:, None]
+    # (squares, ids * turns): how many cells differ.
+    flat = words.reshape(-1, words.shape[2])
+    differ = (white[:, None] != flat[None]).sum(axis=2)
+    best = differ.argmin(axis=1)
+    candidates = []
+    for n in np.flatnonzero(differ.min(axis=1) <= _MISREAD).tolist():
+        marker_id, turns = divmod(int(best[n]), 4)
+        candidates.append(Candidate(marker_id, np.roll(corners[n], -turns, axis=0)))
+    return candidates
+
+
+@cache
+def _words(dictionary: str) -> NDArray[np.bool_]:
+    """White cells of all markers, border included, as seen turned by 0 to 3 quarters: (ids, 4, cells)."""
+    known = _known(dictionary)
+    cells = known.markerSize + 2
+    images = [
+        np.asarray(cv2.aruco.generateImageMarker(known, n, cells, borderBits=1)) > 0
+        for n in range(len(known.bytesList))
+    ]
+    # With the marker's top left at corner k of the square, the square shows it turned k quarters clockwise.
+    return np.array([[np.rot90(image, -turn).ravel() for turn in range(4)] for image in images])

@@ -1,0 +1,78 @@
+"""Where a picture has changed since it was last looked at, to know when a search is worth its while."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+
+import numpy as np
+from numpy.typing import NDArray
+
+from ipsys_log.stages.detect.decode import Grey
+
+__all__ = ["Watch"]
+
+Array = NDArray[np.float64]
+
+_EVERY_PX = 16
+_CHANGED_LEVELS = 25.0
+_CHANGED_SAMPLES = 3
+# A marker of which only a part has changed is cut off by no less.
+_AROUND_PX = 192
+_ENTERED = 0.5
+# A thing that stays becomes background within some ten frames.
+_LEARN = np.float32(0.15)
+
+
+class Watch:
+    """Remembers the picture of one camera, a pixel in 16 by 16, but for where markers are known to be."""
+
+    def __init__(self) -> None:
+        self._background = np.zeros((0, 0), dtype=np.float32)
+
+    def changed(
+        self, grey: Grey, rows: slice, markers_px: Sequence[Array], breadth_px: float
+    ) -> tuple[slice, slice] | None:
+        """Rows and columns around what is there and is neither background nor one of the markers.
+
+        Parameters
+        ----------
+        grey : (height, width).
+        rows : those that are of this frame.
+        markers_px : corners (4, 2) of the markers that are known.
+        breadth_px : of a marker. Less than half of it at the edge of the picture is none yet.
+        """
+        half = _EVERY_PX // 2
+        samples = grey[half::_EVERY_PX, half::_EVERY_PX].astype(np.float32)
+        if self._background.shape != samples.shape:
+            self._background = np.full_like(samples, np.nan)
+        self.forget(markers_px)
+        here = slice(-(-(rows.start - half) // _EVERY_PX), -(-(rows.stop - half) // _EVERY_PX))
+        background, samples = self._background[here], samples[here]
+        off = samples - background
+        background += _LEARN * off
+        np.copyto(background, samples, where=np.isnan(background))
+        self.forget(markers_px)
+        new = np.abs(off) > _CHANGED_LEVELS
+        if np.count_nonzero(new) < _CHANGED_SAMPLES:
+            return None
+        spans = [np.flatnonzero(new.any(axis=1)) + here.start, np.flatnonzero(new.any(axis=0))]
+        for span, size in zip(spans, self._background.shape, strict=True):
+            at_edge = span[0] == 0 or span[-1] == size - 1
+            if at_edge and (span[-1] - span[0] + 1) * _EVERY_PX < _ENTERED * breadth_px:
+                return None
+        return _around(spans[0]), _around(spans[1])
+
+    def forget(self, markers_px: Sequence[Array]) -> None:
+        """What lies under markers (4, 2) is not known: it is no change when it comes to light."""
+        for corners_px in markers_px:
+            # The white margin and what carries the marker belong to it.
+            around = 0.35 * np.ptp(corners_px, axis=0) + _EVERY_PX
+            low = np.maximum((corners_px.min(axis=0) - around) / _EVERY_PX, 0).astype(int)
+            high = np.maximum((corners_px.max(axis=0) + around) / _EVERY_PX + 1, 0).astype(int)
+            self._background[low[1] : high[1], low[0] : high[0]] = np.nan
+
+
+def _around(span: NDArray[np.intp]) -> slice:
+    """Pixels with a marker's breadth around samples, as much of them as there is."""
+    first, last = int(span[0]) * _EVERY_PX, int(span[-1] + 1) * _EVERY_PX
+    return slice(max(first - _AROUND_PX, 0), last + _AROUND_PX)

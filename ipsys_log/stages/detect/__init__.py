@@ -31,6 +31,7 @@ from ipsys_log.stages.detect.decode import decode_grey
 from ipsys_log.stages.detect.edges import Fit
 from ipsys_log.stages.detect.follow import Follow
 from ipsys_log.stages.detect.stock import detect_markers, marker_detector
+from ipsys_log.units import NS_PER_S
 
 __all__ = [
     "CORNERS",
@@ -128,7 +129,7 @@ class Detect:
                 f"camera {message.camera} has no calibration in the log, through which edges are fitted: "
                 f"give one with --calibration {message.camera}=calibration.yaml, or use --corners stock"
             )
-        return Follow(rig.dictionary, lens, camera.edge_offset_px)
+        return Follow(rig.dictionary, lens, camera.edge_offset_px, (camera.row_time_ns or 0) / NS_PER_S)
 
     def _unsaid(self, events: list[Event]) -> Iterator[Event]:
         """A camera names an id that is not in the rig once, and whatever else every time."""

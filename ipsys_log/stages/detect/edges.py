@@ -5,6 +5,9 @@ too, are sent through the lens into the picture. Across each edge a short profil
 a blurred step is fitted to it: how far it lies beside the middle is how far the edge is off. One small turn
 and shift of the marker explains all of them at once; the next pass starts from there, until nothing moves.
 
+Where a sensor exposes row after row, each point of the print is seen where it was at its own time: the speed
+along the print is one more thing that the edges tell.
+
 What a turn and shift do is reckoned in the plane of the print, where it needs no lens: a point x of the plane
 that moves by d is seen, from the camera at c, at x + d_xy + (x - c)_xy d_z / c_z.
 """
@@ -12,51 +15,53 @@ that moves by d is seen, from the camera at c, at x + d_xy + (x - c)_xy d_z / c_
 from __future__ import annotations
 
 from collections.abc import Sequence
-from functools import cache
 from typing import NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
-from scipy.special import ndtr
 
 from ipsys_log.geometry.lenses import project
-from ipsys_log.geometry.poses import rotation
 from ipsys_log.messages import CameraCalibration
 from ipsys_log.stages.detect.decode import Grey, levels_at
 from ipsys_log.stages.detect.prints import Prints, lay_out
+from ipsys_log.stages.detect.profiles import LEAST_CONTRAST, Poses, Seen, View, measure
 
 __all__ = ["Fit", "Guess", "fit_edges"]
 
 Array = NDArray[np.float64]
 
-# Profiles reach this far to each side, and never to the middle of a cell.
-_NEAR_PX, _FAR_PX, _OF_CELL = 3.0, 8.0, 0.45
-_TAPS = np.linspace(-1, 1, 7)
-# Of the blurred step: what optics, pixels and JPEG do.
-_BLUR_PX = 0.8
 _MOVED_FAR_PX = 1.0
 _PASSES = 7
 # The last step of a fit that has settled is shorter.
 _SETTLED_PX = 0.12
-# Edges of less than this share of the mean contrast are covered, or in glare.
-_WEAK = 0.3
+_SHORT_PX = 8.0
+# Edges that rise by less than this share from black to white are blurred by motion.
+_BLURRED = 0.6
 _SEEN = 0.6
 _EXACT_PX = 0.05
-_LEAST_CONTRAST = 8.0
 _WRONG_CELLS = 1
-# Squared pixels per squared unit of each unknown that hold it to its guess. A tilt that shows in nothing,
-# of a marker right below the camera, stays what it is.
-_HOLD = np.diag([1e-6, 1e-6, 1e-6, 1e-2, 1e-2, 1e-6, 1e-6])
+# Squared pixels per squared unit of each unknown that hold it to what was known: shift and turn, edge offset,
+# speed. A tilt that shows in nothing, of a marker right below the camera, stays what it is.
+_HOLD = np.array([1e-6, 1e-6, 1e-6, 1e-2, 1e-2, 1e-6, 1e-6, 1e-5, 1e-5])
+_HOLD_GIVEN, _HOLD_SPEED = 1e9, 1e-1
+
+
+_SHARP = np.zeros(2, dtype=bool)
 
 
 class Guess(NamedTuple):
     """About where a marker is: ``rotation`` (3, 3) and ``centre`` (3,) take its frame to the camera's.
 
-    Lengths are in sides of its black square, whatever that measures: a picture does not say."""
+    Lengths are in sides of its black square, whatever that measures: a picture does not say. ``motion`` (3,)
+    is its speed along its own x and y, per s, and its turn about its normal in rad/s; None where not known.
+    ``blurred`` (2,) says whether its motion blurs edges across its x, and across its y.
+    """
 
     id: int
     rotation: Array
     centre: Array
+    motion: Array | None = None
+    blurred: NDArray[np.bool_] = _SHARP
 
 
 class Fit(NamedTuple):
@@ -75,6 +80,7 @@ def fit_edges(
     dictionary: str,
     lens: CameraCalibration,
     edge_offset_px: float | None = None,
+    row_time_s: float = 0.0,
 ) -> list[Fit | None]:
     """Fit markers to the picture of them.
 
@@ -85,6 +91,8 @@ def fit_edges(
     dictionary : OpenCV's name, such as DICT_4X4_100.
     lens : of the camera.
     edge_offset_px : by how much edges of black lie inside the black; None: found with each marker.
+    row_time_s : between the exposures of two rows. Markers are given as they were when the row of their
+        middle was exposed.
 
     Returns
     -------
@@ -93,18 +101,20 @@ def fit_edges(
     """
     if not guesses:
         return []
-    prints = lay_out(dictionary, tuple(guess.id for guess in guesses))
-    poses = _Poses(
-        np.array([guess.rotation for guess in guesses]),
-        np.array([guess.centre for guess in guesses]),
-    )
-    settled = _settle(grey, prints, poses, lens, edge_offset_px)
-    corners_px, cornerwise, cells_px = _outline(settled.poses, prints, lens)
-    good = settled.good & _whole(corners_px, grey) & _same_cells(_cells(grey, cells_px), prints.white)
-    covariances_px2 = cornerwise @ settled.covariances @ cornerwise.transpose(0, 2, 1)
+    view = View(grey, lens, lay_out(dictionary, tuple(guess.id for guess in guesses)), row_time_s)
+    blurred = np.array([guess.blurred for guess in guesses])
+    settled = _settle(view, guesses, edge_offset_px, blurred)
+    corners_px, slopes, levels = _outline(view, settled.poses)
+    more = _blurred(view.prints, settled.heights, levels) & ~blurred
+    if more.any():
+        blurred |= more
+        settled = _settle(view, guesses, edge_offset_px, blurred)
+        corners_px, slopes, levels = _outline(view, settled.poses)
+    good = settled.good & _whole(corners_px, grey) & _same_cells(levels, view.prints.white)
+    covariances_px2 = slopes @ settled.covariances @ slopes.transpose(0, 2, 1)
     return [
         Fit(
-            Guess(guess.id, settled.poses.rotations[n], settled.poses.centres[n]),
+            Guess(guess.id, settled.poses.rotations[n], settled.poses.centres[n], None, blurred[n]),
             corners_px[n],
             covariances_px2[n],
             float(settled.edge_offsets_px[n]),
@@ -115,144 +125,98 @@ def fit_edges(
     ]
 
 
-class _Poses(NamedTuple):
-    """Of m markers: (m, 3, 3) and (m, 3)."""
-
-    rotations: Array
-    centres: Array
-
-    def into_camera(self, points: Array) -> Array:
-        """Points of prints, (m, n, 2), in the frame of the camera: (m, n, 3)."""
-        return points @ self.rotations[:, :, :2].transpose(0, 2, 1) + self.centres[:, None]
-
-    def camera(self) -> Array:
-        """Where the camera is in the frames of the prints: (m, 3)."""
-        return -(self.centres[:, None] @ self.rotations)[:, 0]
-
-    def moved(self, twists: Array) -> _Poses:
-        """Shifted and turned by (m, 6), in the frames of the prints."""
-        shifts = (self.rotations @ twists[:, :3, None])[..., 0]
-        turns = np.array([rotation(vector) for vector in twists[:, 3:]])
-        return _Poses(self.rotations @ turns, self.centres + shifts)
-
-
 class _Settled(NamedTuple):
     """Fitted poses; ``covariances`` (m, 6, 6) of the twists in the frames of the prints."""
 
-    poses: _Poses
+    poses: Poses
     edge_offsets_px: Array
     covariances: Array
     good: NDArray[np.bool_]
+    heights: Array
 
 
 def _settle(
-    grey: Grey, prints: Prints, poses: _Poses, lens: CameraCalibration, edge_offset_px: float | None
+    view: View, guesses: Sequence[Guess], edge_offset_px: float | None, blurred: NDArray[np.bool_]
 ) -> _Settled:
-    unknowns = 7 if edge_offset_px is None else 6
-    hold = _HOLD[:unknowns, :unknowns]
-    far = np.zeros(len(poses.centres), dtype=bool)
+    """Move markers until they settle; ``blurred`` (m, 2) says across which of their axes edges are."""
+    poses = Poses(np.array([one.rotation for one in guesses]), np.array([one.centre for one in guesses]))
+    # Unknown are a twist, the edge offset and, where rows take time, the speed along the print.
+    unknowns = 9 if view.row_time_s else 7
+    known, hold = _known(guesses, edge_offset_px)
+    known, hold, motions = known[:, :unknowns], hold[:, :unknowns], known[:, 7:]
+    wide = blurred
     doubt: Array | float = 1.0
     for _ in range(_PASSES):
-        off_px, slopes, present = _measure(grey, prints, poses, lens, far)
-        if edge_offset_px is not None:
-            off_px = off_px + edge_offset_px * prints.polarity
-        weights = present / doubt
-        count = weights.sum(axis=1)
-        rows = _moves(prints, poses.camera(), slopes)[:, :unknowns]
-        weighted = rows * weights[:, None]
-        normal = weighted @ rows.transpose(0, 2, 1) + hold
-        steps = np.linalg.solve(normal, weighted @ off_px[..., None])[..., 0]
-        steps_px = (steps[:, None, :6] @ rows[:, :6])[:, 0]
-        moved_px = np.maximum(steps_px.max(axis=1), -steps_px.min(axis=1))
+        seen = measure(view, poses, motions, wide)
+        rows = _moves(view.prints, poses.camera(), seen)[:, :unknowns]
+        # Edges were looked for where they are at the speed known so far.
+        off_px = seen.off_px + (motions[:, None, : unknowns - 7] @ rows[:, 7:])[:, 0]
+        weights = seen.certainty / doubt
+        normal, found = _solve(rows, weights, off_px, known, hold)
+        left_px = off_px - (found[:, None] @ rows)[:, 0]
+        # Steps are what the twist moves, and what the speed does that was not known before.
+        moved_px = np.abs(seen.off_px - left_px + found[:, 6:7] * view.prints.polarity).max(axis=1)
         # A step of many pixels was read off another edge.
-        short = np.minimum(1.0, _FAR_PX / np.maximum(moved_px, _FAR_PX))
-        poses = poses.moved(steps[:, :6] * short[:, None])
-        left_px = off_px - (steps[:, None] @ rows)[:, 0]
-        square_px2 = (weights[:, None] @ (left_px * left_px)[..., None])[:, 0, 0] / np.maximum(count, 1e-9)
+        short = np.minimum(1.0, _SHORT_PX / np.maximum(moved_px, _SHORT_PX))
+        poses = poses.moved(found[:, :6] * short[:, None])
+        motions = np.concatenate([found[:, 7:], motions[:, unknowns - 7 :]], axis=1)
+        spread_px = np.sqrt((weights * left_px**2).sum(axis=1) / np.maximum(weights.sum(axis=1), 1e-9))
         if (moved_px < _SETTLED_PX).all():
             break
-        far = moved_px > _MOVED_FAR_PX
+        wide = blurred | (moved_px > _MOVED_FAR_PX)[:, None]
         # What still lies beside the others, beyond twice their spread, counts for less.
-        doubt = np.maximum(1.0, np.abs(left_px) / (_EXACT_PX + 2 * np.sqrt(square_px2))[:, None])
-    variances_px2 = square_px2 * count / np.maximum(count - unknowns, 1.0)
-    covariances = np.linalg.inv(normal)[:, :6, :6] * variances_px2[:, None, None]
-    enough = present.sum(axis=1) > _SEEN * np.abs(prints.polarity).sum(axis=1)
-    offsets_px = np.broadcast_to(steps[:, 6] if edge_offset_px is None else edge_offset_px, len(count))
-    return _Settled(poses, offsets_px, covariances, enough & (moved_px < _SETTLED_PX))
+        doubt = np.maximum(1.0, np.abs(left_px) / (_EXACT_PX + 2 * spread_px)[:, None])
+    count = weights.sum(axis=1)
+    variances_px2 = spread_px**2 * count / np.maximum(count - unknowns, 1.0)
+    covariances: Array = np.linalg.inv(normal)[:, :6, :6] * variances_px2[:, None, None]
+    enough = (seen.certainty > 0).sum(axis=1) > _SEEN * np.abs(view.prints.polarity).sum(axis=1)
+    return _Settled(poses, found[:, 6], covariances, enough & (moved_px < _SETTLED_PX), seen.heights)
 
 
-def _moves(prints: Prints, camera: Array, slopes: Array) -> Array:
-    """How far points on edges are seen to move, in px along their axis, per unit of a twist and of the edge
-    offset: (m, 7, s)."""
+def _solve(rows: Array, weights: Array, off_px: Array, known: Array, hold: Array) -> tuple[Array, Array]:
+    """Least squares for m markers: the normal matrices (m, u, u) and the unknowns (m, u)."""
+    weighted = rows * weights[:, None]
+    normal = weighted @ rows.transpose(0, 2, 1)
+    count = known.shape[1]
+    normal.reshape(len(known), -1)[:, :: count + 1] += hold
+    right = weighted @ off_px[..., None] + (hold * known)[..., None]
+    return normal, np.asarray(np.linalg.solve(normal, right)[..., 0], dtype=np.float64)
+
+
+def _known(guesses: Sequence[Guess], edge_offset_px: float | None) -> tuple[Array, Array]:
+    """What is known of the unknowns and the turn, (m, 10), and how firmly it is held to, (m, 9)."""
+    known, hold = np.zeros((len(guesses), 10)), np.tile(_HOLD, (len(guesses), 1))
+    if edge_offset_px is not None:
+        known[:, 6], hold[:, 6] = edge_offset_px, _HOLD_GIVEN
+    for n, guess in enumerate(guesses):
+        if guess.motion is not None:
+            known[n, 7:], hold[n, 7:] = guess.motion, _HOLD_SPEED
+    return known, hold
+
+
+def _moves(prints: Prints, camera: Array, seen: Seen) -> Array:
+    """How far points on edges are seen to move along their axis, in px per unit of an unknown: (m, 9, s)."""
     x, y, level = prints.points[..., 0], prints.points[..., 1], prints.level
-    aside = (np.where(level, y - camera[:, 1:2], x - camera[:, :1]) / camera[:, 2:]) * slopes
-    rows = np.empty((len(slopes), 7, slopes.shape[1]))
-    np.multiply(slopes, level, out=rows[:, 1])
-    np.subtract(slopes, rows[:, 1], out=rows[:, 0])
+    aside = (np.where(level, y - camera[:, 1:2], x - camera[:, :1]) / camera[:, 2:]) * seen.slopes
+    rows = np.empty((len(level), 9, level.shape[1]))
+    np.multiply(seen.slopes, level, out=rows[:, 1])
+    np.subtract(seen.slopes, rows[:, 1], out=rows[:, 0])
     rows[:, 2] = aside
     np.multiply(aside, y, out=rows[:, 3])
     np.multiply(aside, -x, out=rows[:, 4])
-    np.multiply(slopes, prints.swirl, out=rows[:, 5])
+    np.multiply(seen.slopes, prints.swirl, out=rows[:, 5])
     np.negative(prints.polarity, out=rows[:, 6])
+    np.multiply(seen.late, level, out=rows[:, 8])
+    np.subtract(seen.late, rows[:, 8], out=rows[:, 7])
     return rows
 
 
-def _measure(
-    grey: Grey, prints: Prints, poses: _Poses, lens: CameraCalibration, far: NDArray[np.bool_]
-) -> tuple[Array, Array, Array]:
-    """How far edges lie from where they should, along their axis.
-
-    Returns
-    -------
-    off_px (m, s), their distances; slopes (m, s), px per side of the print; present (m, s), 1.0 or 0.0.
-    """
-    ends_px = project(poses.into_camera(prints.ends).reshape(-1, 3), lens).reshape(len(far), 2, -1, 2)
-    across = (ends_px[:, 1] - ends_px[:, 0]) / 2
-    middle = ends_px[:, 0] + across
-    lengths_px = np.hypot(across[..., 0], across[..., 1])
-    slopes = lengths_px / prints.reach
-    cells_px = slopes.min(axis=1) / prints.cells
-    reaches_px = np.minimum(np.where(far, _FAR_PX, _NEAR_PX), _OF_CELL * cells_px).round(1)
-    taps = (reaches_px[:, None] / lengths_px)[..., None] * _TAPS
-    x = (middle[..., :1] + across[..., :1] * taps).astype(np.float32)
-    y = (middle[..., 1:] + across[..., 1:] * taps).astype(np.float32)
-    profiles = levels_at(grey, x, y)
-    templates = np.array([_template(reach_px) for reach_px in reaches_px.tolist()])
-    fitted = profiles @ templates
-    height = fitted[..., 0]
-    contrast = height * prints.polarity
-    present = contrast > np.maximum(_WEAK * contrast.mean(axis=1), _LEAST_CONTRAST)[:, None]
-    off_px = np.divide(fitted[..., 1], height, out=np.zeros_like(height), where=present)
-    if far.any():
-        off_px = np.where(far[:, None], _by_area(profiles, reaches_px) * prints.polarity, off_px)
-        present = present | far[:, None] & (prints.polarity != 0)
-    limit = reaches_px[:, None]
-    return np.minimum(np.maximum(off_px, -limit), limit), slopes, present.astype(np.float64)
-
-
-def _by_area(profiles: Array, reaches_px: Array) -> Array:
-    """How far edges lie towards the white, by the share of black in a profile: of use far away."""
-    low, high = profiles.min(axis=(1, 2)), profiles.max(axis=(1, 2))
-    white = (profiles.mean(axis=2) - low[:, None]) / np.maximum(high - low, 1.0)[:, None]
-    by_area: Array = reaches_px[:, None] * (1 - 2 * white)
-    return by_area
-
-
-@cache
-def _template(reach_px: float) -> Array:
-    """Takes a profile to a blurred step: its height, and height times shift; (taps, 2)."""
-    x = reach_px * _TAPS / _BLUR_PX
-    bell = np.exp(-(x**2) / 2) / (np.sqrt(2 * np.pi) * _BLUR_PX)
-    step = np.column_stack([np.ones_like(x), ndtr(x), -bell])
-    return np.asarray(np.linalg.pinv(step)[1:].T.copy(), dtype=np.float64)
-
-
-def _outline(poses: _Poses, prints: Prints, lens: CameraCalibration) -> tuple[Array, Array, Array]:
-    """Corners (m, 4, 2) in px, how they move with a twist (m, 8, 6), and centres of cells (m, c, 2) in px."""
-    count = len(poses.centres)
-    px = project(poses.into_camera(prints.outline).reshape(-1, 3), lens).reshape(count, -1, 2)
-    per_unit = np.stack([px[:, 4:8] - px[:, :4], px[:, 8:12] - px[:, :4]], axis=3) / prints.nudge
-    x, y = prints.outline[:4].T
+def _outline(view: View, poses: Poses) -> tuple[Array, Array, Array]:
+    """Corners (m, 4, 2) in px, how they move with a twist (m, 8, 6), and grey levels of cells (m, c)."""
+    outline, count = view.prints.outline, len(poses.centres)
+    px = project(poses.into_camera(outline).reshape(-1, 3), view.lens).reshape(count, -1, 2)
+    per_unit = np.stack([px[:, 4:8] - px[:, :4], px[:, 8:12] - px[:, :4]], axis=3) / view.prints.nudge
+    x, y = outline[:4].T
     camera = poses.camera()
     aside_x, aside_y = (x - camera[:, :1]) / camera[:, 2:], (y - camera[:, 1:2]) / camera[:, 2:]
     one, none = np.ones_like(aside_x), np.zeros_like(aside_x)
@@ -263,12 +227,8 @@ def _outline(poses: _Poses, prints: Prints, lens: CameraCalibration) -> tuple[Ar
         ],
         axis=2,
     )
-    return px[:, :4], (per_unit @ inplane).reshape(count, 8, 6), px[:, 12:]
-
-
-def _cells(grey: Grey, cells_px: Array) -> Array:
-    x, y = cells_px.astype(np.float32).transpose(2, 0, 1)
-    return levels_at(grey, np.ascontiguousarray(x), np.ascontiguousarray(y))
+    levels = levels_at(view.grey, *np.ascontiguousarray(px[:, 12:].transpose(2, 0, 1), dtype=np.float32))
+    return px[:, :4], (per_unit @ inplane).reshape(count, 8, 6), levels
 
 
 def _whole(corners_px: Array, grey: Grey) -> NDArray[np.bool_]:
@@ -276,10 +236,27 @@ def _whole(corners_px: Array, grey: Grey) -> NDArray[np.bool_]:
     return np.asarray(((corners_px >= -0.5) & (corners_px <= last)).all(axis=(1, 2)))
 
 
-def _same_cells(levels: Array, white: NDArray[np.bool_]) -> NDArray[np.bool_]:
-    """Whether cells are white and black as they should be, (m,), from their grey levels (m, c)."""
+def _blurred(prints: Prints, heights: Array, levels: Array) -> NDArray[np.bool_]:
+    """Across which axes edges rise by less than from black cells to white ones, (m, 2)."""
+    bright, dark = _bright_and_dark(levels, prints.white)
+    sums = np.stack(
+        [(heights * (1 - prints.level)).sum(axis=1), (heights * prints.level).sum(axis=1)], axis=1
+    )
+    level = (np.abs(prints.polarity) * prints.level).sum(axis=1)
+    counts = np.stack([np.abs(prints.polarity).sum(axis=1) - level, level], axis=1)
+    return np.asarray(sums < _BLURRED * (bright - dark)[:, None] * counts)
+
+
+def _bright_and_dark(levels: Array, white: NDArray[np.bool_]) -> tuple[Array, Array]:
+    """Mean grey levels of the cells that are white, and of those that are black, (m,) each."""
     bright = (levels * white).sum(axis=1) / white.sum(axis=1)
     dark = (levels * ~white).sum(axis=1) / (~white).sum(axis=1)
+    return bright, dark
+
+
+def _same_cells(levels: Array, white: NDArray[np.bool_]) -> NDArray[np.bool_]:
+    """Whether cells are white and black as they should be, (m,), from their grey levels (m, c)."""
+    bright, dark = _bright_and_dark(levels, white)
     wrong = ((levels > ((bright + dark) / 2)[:, None]) != white).sum(axis=1)
-    same: NDArray[np.bool_] = (wrong <= _WRONG_CELLS) & (bright - dark > _LEAST_CONTRAST)
+    same: NDArray[np.bool_] = (wrong <= _WRONG_CELLS) & (bright - dark > LEAST_CONTRAST)
     return same

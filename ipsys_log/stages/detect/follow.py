@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Iterable, Sequence
+from itertools import pairwise
 from typing import NamedTuple
 
 import numpy as np
@@ -31,22 +32,19 @@ _THOROUGH_EVERY = 60
 # And decoded as a whole every so many; the others only as far as markers are expected.
 _WHOLE_EVERY = 5
 _MARGIN_PX = 48
+_REMEMBERED = 3
+# In sides per s and rad per s: less is not seen in the shear of a marker.
+_SAME_SPEED = 0.1
 # Of two fits of one id, nearer together than this, one is enough.
 _SAME_PX = 8.0
 
 
-class _Track(NamedTuple):
-    """A marker at a time, and how it moved before: in its sides per s, and as a vector in rad per s."""
+class _Sighting(NamedTuple):
+    """A marker when its row was exposed, ``late_ns`` after the first row of its frame."""
 
     time_ns: int
+    late_ns: int
     pose: Guess
-    velocity: Array
-    turn_rad_s: Array
-
-    def predict(self, time_ns: int) -> Guess:
-        dt_s = (time_ns - self.time_ns) / NS_PER_S
-        turn = rotation(self.turn_rad_s * dt_s)
-        return Guess(self.pose.id, turn @ self.pose.rotation, self.pose.centre + self.velocity * dt_s)
 
 
 class Follow:
@@ -56,7 +54,7 @@ class Follow:
     ----------
     dictionary : OpenCV's name, such as DICT_4X4_100.
     lens : of the camera.
-    edge_offset_px : as for :func:`fit_edges`.
+    edge_offset_px, row_time_s : as for :func:`fit_edges`.
     """
 
     def __init__(
@@ -64,16 +62,19 @@ class Follow:
         dictionary: str,
         lens: CameraCalibration,
         edge_offset_px: float | None,
+        row_time_s: float,
     ) -> None:
         self._dictionary = dictionary
         self._lens = lens
         self._edge_offset_px = edge_offset_px
+        self._row_time_s = row_time_s
         self._canvas = Canvas()
         self._watch = Watch()
         self._changed: tuple[slice, slice] | None = None
         self._breadth_px = 0.0
         self._frames = 0
-        self._tracks: list[_Track] = []
+        # Of each marker the last sightings, the newest first.
+        self._tracks: dict[int, tuple[_Sighting, ...]] = {}
 
     def __call__(self, frame: CompressedImage | RawImage, time_ns: int) -> tuple[list[Fit], int, int]:
         """The markers in a frame, sorted by id, and the width and height of it; an id can occur twice.
@@ -92,10 +93,10 @@ class Follow:
         thorough = self._frames % _THOROUGH_EVERY == _SEARCH_EVERY
         whole = due or self._frames % _WHOLE_EVERY == 0
         self._frames += 1
-        guesses = [track.predict(time_ns) for track in self._tracks]
+        guesses = [_predict(track, time_ns) for track in self._tracks.values()]
         outlines_px = [self._outline(guess) for guess in guesses]
         grey, rows = self._canvas.show(frame, None if whole else _rows(outlines_px, self._changed))
-        tried = self._fit(grey, guesses)
+        tried = self._with_speed(grey, time_ns, guesses, self._fit(grey, guesses))
         fits = [fit for fit in tried if fit is not None]
         lost = {
             guess.id
@@ -115,7 +116,31 @@ class Follow:
         return sorted(fits, key=lambda fit: fit.pose.id), grey.shape[1], grey.shape[0]
 
     def _fit(self, grey: Grey, guesses: Sequence[Guess]) -> list[Fit | None]:
-        return fit_edges(grey, guesses, self._dictionary, self._lens, self._edge_offset_px)
+        return fit_edges(grey, guesses, self._dictionary, self._lens, self._edge_offset_px, self._row_time_s)
+
+    def _with_speed(
+        self, grey: Grey, frame_ns: int, guesses: Sequence[Guess], fits: list[Fit | None]
+    ) -> list[Fit | None]:
+        """Where rows take time, the same fits with the speeds that follow from them."""
+        if not self._row_time_s:
+            return fits
+        again = {}
+        for n, (guess, fit) in enumerate(zip(guesses, fits, strict=True)):
+            if fit is not None:
+                known = _predict(self._extended(fit, frame_ns), frame_ns)
+                if not _same_speed(known.motion, guess.motion):
+                    again[n] = known
+        better = dict(zip(again, self._fit(grey, list(again.values())), strict=True))
+        return [better.get(n) or fit for n, fit in enumerate(fits)]
+
+    def _extended(self, fit: Fit, frame_ns: int) -> tuple[_Sighting, ...]:
+        """The track of a marker with what was just seen of it."""
+        late_ns = round(float(fit.corners_px[:, 1].mean()) * self._row_time_s * NS_PER_S)
+        now = _Sighting(frame_ns + late_ns, late_ns, fit.pose)
+        before = self._tracks.get(fit.pose.id, ())
+        # Time that does not go on leaves nothing to learn a speed from.
+        ordered = not before or before[0].time_ns < now.time_ns
+        return (now, *before[: _REMEMBERED - 1]) if ordered else (now,)
 
     def _add(self, grey: Grey, fits: list[Fit], candidates: Iterable[Candidate]) -> list[Fit]:
         """Fits, and those of candidates that are none of them."""
@@ -146,19 +171,36 @@ class Follow:
         """Corners in px, (4, 2)."""
         return project(marker_corners(1.0) @ guess.rotation.T + guess.centre, self._lens)
 
-    def _remember(self, fits: Sequence[Fit], time_ns: int) -> None:
-        before = {track.pose.id: track for track in self._tracks}
-        self._tracks = [_track(before.get(fit.pose.id), fit.pose, time_ns) for fit in fits]
+    def _remember(self, fits: Sequence[Fit], frame_ns: int) -> None:
+        self._tracks = {fit.pose.id: self._extended(fit, frame_ns) for fit in fits}
         if fits:
             self._breadth_px = max(float(np.ptp(fit.corners_px, axis=0).min()) for fit in fits)
 
 
-def _track(before: _Track | None, pose: Guess, time_ns: int) -> _Track:
-    if before is None or time_ns <= before.time_ns:
-        return _Track(time_ns, pose, np.zeros(3), np.zeros(3))
-    dt_s = (time_ns - before.time_ns) / NS_PER_S
-    turn_rad = rotation_vector(pose.rotation @ before.pose.rotation.T)
-    return _Track(time_ns, pose, (pose.centre - before.pose.centre) / dt_s, turn_rad / dt_s)
+def _predict(track: Sequence[_Sighting], frame_ns: int) -> Guess:
+    """Where a marker is in a frame, if it lies in about the same row: on a parabola through three sightings,
+    on a line through two."""
+    now = track[0]
+    if len(track) == 1:
+        return now.pose
+    ahead_s = (frame_ns + now.late_ns - now.time_ns) / NS_PER_S
+    steps_s = [(one.time_ns - other.time_ns) / NS_PER_S for one, other in pairwise(track)]
+    moved = [one.pose.centre - other.pose.centre for one, other in pairwise(track)]
+    means = [step / step_s for step, step_s in zip(moved, steps_s, strict=True)]
+    # A mean velocity is that of the middle of its interval.
+    gain = (means[0] - means[1]) / (sum(steps_s) / 2) if len(means) > 1 else np.zeros(3)
+    velocity = means[0] + gain * steps_s[0] / 2
+    turn_rad_s = rotation_vector(now.pose.rotation @ track[1].pose.rotation.T) / steps_s[0]
+    turned = rotation(turn_rad_s * ahead_s) @ now.pose.rotation
+    speed, turn = (velocity + gain * ahead_s) @ turned, turn_rad_s @ turned
+    centre = now.pose.centre + (velocity + gain * ahead_s / 2) * ahead_s
+    return Guess(now.pose.id, turned, centre, np.array([speed[0], speed[1], turn[2]]), now.pose.blurred)
+
+
+def _same_speed(one: Array | None, other: Array | None) -> bool:
+    if one is None or other is None:
+        return one is other
+    return bool(np.abs(one - other).max() < _SAME_SPEED)
 
 
 def _among(marker_id: int, corners_px: Array, fits: Iterable[Fit]) -> bool:

@@ -28,7 +28,7 @@ class Prints:
     Attributes
     ----------
     points : (m, s, 2), points on the edges between black and white of m markers.
-    ends : (m, 2 s, 2), ``reach`` before and behind each of them, across the edge.
+    ends : (m, 2 s + 1, 2), ``reach`` before and behind each of them, across the edge; and the middle.
     level : (m, s), 0.0 where the edge runs along y and so says something of x; else 1.0.
     swirl : (m, s), how far a point moves across its edge where the marker turns about its middle.
     polarity : (m, s), 1.0 where white lies towards the greater coordinate, else -1.0; 0.0 for a point that
@@ -66,7 +66,7 @@ def lay_out(dictionary: str, marker_ids: tuple[int, ...]) -> Prints:
     aside = np.stack([1 - level, level], axis=2) * reach
     return Prints(
         points,
-        np.concatenate([points - aside, points + aside], axis=1),
+        np.concatenate([points - aside, points + aside, np.zeros_like(points[:, :1])], axis=1),
         level.copy(),
         level * points[..., 0] - (1 - level) * points[..., 1],
         rows[..., 3].copy(),

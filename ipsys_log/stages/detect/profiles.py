@@ -1,0 +1,150 @@
+"""Profiles of grey levels across the edges of a print, and where in them the edges are."""
+
+from __future__ import annotations
+
+from functools import cache
+from typing import NamedTuple
+
+import numpy as np
+from numpy.typing import NDArray
+from scipy.special import ndtr
+
+from ipsys_log.geometry.lenses import project
+from ipsys_log.geometry.poses import rotation
+from ipsys_log.messages import CameraCalibration
+from ipsys_log.stages.detect.decode import Grey, levels_at
+from ipsys_log.stages.detect.prints import Prints
+
+__all__ = ["LEAST_CONTRAST", "Poses", "Seen", "View", "measure"]
+
+Array = NDArray[np.float64]
+
+# In grey levels: what rises by less is no edge.
+LEAST_CONTRAST = 8.0
+
+# Profiles reach this far to each side, and never to the middle of a cell.
+_NEAR_PX, _FAR_PX, _OF_CELL = 3.0, 12.0, 0.45
+_TAPS = np.linspace(-1, 1, 7)
+# Of the blurred step: what optics, pixels and JPEG do.
+_BLUR_PX = 0.8
+# Wider edges than that tell less.
+_SHARP_PX = 4.0
+# Edges of less than this share of the mean contrast are covered, or in glare.
+_WEAK = 0.3
+
+
+class View(NamedTuple):
+    """A picture, and what markers are looked for in it."""
+
+    grey: Grey
+    lens: CameraCalibration
+    prints: Prints
+    row_time_s: float
+
+
+class Poses(NamedTuple):
+    """Of m markers: (m, 3, 3) and (m, 3)."""
+
+    rotations: Array
+    centres: Array
+
+    def into_camera(self, points: Array) -> Array:
+        """Points of prints, (m, n, 2), in the frame of the camera: (m, n, 3)."""
+        return points @ self.rotations[:, :, :2].transpose(0, 2, 1) + self.centres[:, None]
+
+    def camera(self) -> Array:
+        """Where the camera is in the frames of the prints: (m, 3)."""
+        return -(self.centres[:, None] @ self.rotations)[:, 0]
+
+    def moved(self, twists: Array) -> Poses:
+        """Shifted and turned by (m, 6), in the frames of the prints."""
+        shifts = (self.rotations @ twists[:, :3, None])[..., 0]
+        turns = np.array([rotation(vector) for vector in twists[:, 3:]])
+        return Poses(self.rotations @ turns, self.centres + shifts)
+
+
+class Seen(NamedTuple):
+    """What is seen of the edges of prints, (m, s) each.
+
+    ``off_px`` is by how much they lie off, along their axis; ``certainty`` from 1.0 to 0.0 for edges that
+    are not there. ``slopes`` are px per side of the print, and ``late`` px per speed along their axis, for
+    rows that are exposed later. ``heights`` are the grey levels by which sharp edges rise.
+    """
+
+    off_px: Array
+    certainty: Array
+    slopes: Array
+    late: Array
+    heights: Array
+
+
+def measure(view: View, poses: Poses, motions: Array, wide: NDArray[np.bool_]) -> Seen:
+    """Profiles across the edges, near where they should be.
+
+    Parameters
+    ----------
+    motions : (m, 3), as in :class:`Guess`.
+    wide : (m, 2), whether to look far to both sides, across edges along y and along x.
+    """
+    prints = view.prints
+    points_px = project(poses.into_camera(prints.ends).reshape(-1, 3), view.lens).reshape(len(wide), -1, 2)
+    ends_px = points_px[:, :-1].reshape(len(wide), 2, -1, 2)
+    across = (ends_px[:, 1] - ends_px[:, 0]) / 2
+    middle = ends_px[:, 0] + across
+    lengths_px = np.hypot(across[..., 0], across[..., 1])
+    slopes = lengths_px / prints.reach
+    late = slopes * (middle[..., 1] - points_px[:, -1:, 1]) * view.row_time_s
+    if view.row_time_s:
+        speed = np.where(prints.level, motions[:, 1:2], motions[:, :1]) + prints.swirl * motions[:, 2:]
+        middle = middle + (late * speed / lengths_px)[..., None] * across
+    farthest_px = np.minimum(_FAR_PX, _OF_CELL * slopes.min(axis=1) / prints.cells)
+    near_px = np.minimum(_NEAR_PX, farthest_px).round(1)
+    reaches_px = near_px[:, None]
+    if wide.any():
+        wide_edges = np.where(prints.level, wide[:, 1:], wide[:, :1])
+        reaches_px = np.where(wide_edges, farthest_px[:, None], reaches_px)
+    taps = (reaches_px / lengths_px)[..., None] * _TAPS
+    x = (middle[..., :1] + across[..., :1] * taps).astype(np.float32)
+    y = (middle[..., 1:] + across[..., 1:] * taps).astype(np.float32)
+    profiles = levels_at(view.grey, x, y)
+    fitted = profiles @ np.array([_template(reach_px) for reach_px in near_px.tolist()])
+    height = fitted[..., 0] * prints.polarity
+    present = height > np.maximum(_WEAK * height.mean(axis=1), LEAST_CONTRAST)[:, None]
+    off_px = np.divide(fitted[..., 1], fitted[..., 0], out=np.zeros_like(height), where=present)
+    certainty = present.astype(np.float64)
+    if wide.any():
+        by_area, width_px, shown = _by_area(prints, profiles, reaches_px)
+        off_px = np.where(wide_edges, by_area, off_px)
+        certainty = np.where(wide_edges, shown * np.minimum(1.0, _SHARP_PX / width_px) ** 2, certainty)
+    off_px = np.minimum(np.maximum(off_px, -reaches_px), reaches_px)
+    return Seen(off_px, certainty, slopes, late, height)
+
+
+def _by_area(prints: Prints, profiles: Array, reaches_px: Array) -> tuple[Array, Array, Array]:
+    """How far edges lie off by the share of white in their profiles, whether they are sharp and far away, or
+    blurred over more than a profile shows.
+
+    Returns
+    -------
+    off_px (m, s), how wide the edges are (m, s), and which are there (m, s).
+    """
+    real = prints.polarity != 0
+    low, high = profiles.min(axis=(1, 2))[:, None], profiles.max(axis=(1, 2))[:, None]
+    contrast = np.maximum(high - low, 1.0)
+    white = (profiles.mean(axis=2) - low) / contrast
+    rise = (profiles @ _TAPS) / (_TAPS @ _TAPS) / reaches_px * prints.polarity
+    level = prints.level
+    rises = [np.where(real & (level == n), rise, 0.0).sum(axis=1) for n in (0, 1)]
+    rises = [sums / (real & (level == n)).sum(axis=1) for n, sums in enumerate(rises)]
+    width_px = contrast / np.maximum(np.where(level, rises[1][:, None], rises[0][:, None]), 1e-3)
+    width_px = np.maximum(width_px, 2 * reaches_px)
+    return (0.5 - white) * width_px * prints.polarity, width_px, real & (rise > 0)
+
+
+@cache
+def _template(reach_px: float) -> Array:
+    """Takes a profile to a blurred step: its height, and height times shift; (taps, 2)."""
+    x = reach_px * _TAPS / _BLUR_PX
+    bell = np.exp(-(x**2) / 2) / (np.sqrt(2 * np.pi) * _BLUR_PX)
+    step = np.column_stack([np.ones_like(x), ndtr(x), -bell])
+    return np.asarray(np.linalg.pinv(step)[1:].T.copy(), dtype=np.float64)

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Iterator
 from contextlib import contextmanager
+from time import monotonic
 from typing import TYPE_CHECKING
 
 from rich.console import Console
@@ -13,6 +14,10 @@ if TYPE_CHECKING:
 
 __all__ = ["console", "progress_bar", "remarks"]
 
+# The stages that go through the frames, one message for each.
+_OF_FRAMES = ("detect", "camera-frame", "locate", "fuse")
+_DRAW_EVERY_S = 0.1
+
 console = Console(highlight=False, soft_wrap=True)
 remarks = Console(stderr=True, highlight=False, soft_wrap=True)
 
@@ -20,20 +25,40 @@ remarks = Console(stderr=True, highlight=False, soft_wrap=True)
 @contextmanager
 def progress_bar() -> Iterator[Progress]:
     """A bar for each stage, while it works and only on a terminal."""
-    from rich.progress import BarColumn, MofNCompleteColumn, Progress, TextColumn, TimeRemainingColumn
+    from rich.progress import (
+        BarColumn,
+        MofNCompleteColumn,
+        Progress,
+        TaskID,
+        TextColumn,
+        TimeRemainingColumn,
+    )
 
     columns = (
         TextColumn("{task.description:<13}"),
-        BarColumn(),
+        BarColumn(bar_width=None),
         MofNCompleteColumn(),
+        TextColumn("{task.fields[rate]}", justify="right"),
         TimeRemainingColumn(),
     )
-    with Progress(*columns, console=remarks, transient=True, disable=not remarks.is_terminal) as bar:
-        bars: dict[str, int] = {}
+    if not remarks.is_terminal:
+        yield lambda stage, done, total: None
+        return
+    with Progress(*columns, console=remarks, transient=True) as bar:
+        bars: dict[str, TaskID] = {}
+        drawn_s = 0.0
 
         def show(stage: str, done: int, total: int | None) -> None:
+            nonlocal drawn_s
             if stage not in bars or done == 0:
-                bars[stage] = bar.add_task(stage, total=total)
-            bar.update(bars[stage], completed=done)  # type: ignore[arg-type]
+                bars[stage] = bar.add_task(stage, total=total, rate="")
+            # To draw takes longer than to do.
+            now_s = monotonic()
+            if now_s - drawn_s < _DRAW_EVERY_S and done != total:
+                return
+            drawn_s = now_s
+            speed = bar.tasks[bars[stage]].speed
+            rate = f"{speed:,.0f} frames/s" if speed and stage in _OF_FRAMES else ""
+            bar.update(bars[stage], completed=done, rate=rate)
 
         yield show

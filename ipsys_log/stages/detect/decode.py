@@ -2,13 +2,15 @@
 
 from __future__ import annotations
 
+from collections.abc import Sequence
+
 import cv2
 import numpy as np
 import simplejpeg
 from numpy.typing import NDArray
 
 from ipsys_log.messages import CompressedImage, RawImage
-from ipsys_log.stages.detect.jpeg import Layout, cut_rows, read_layout
+from ipsys_log.stages.detect.jpeg import cut_rows, read_layout, whole_rows
 
 __all__ = ["Canvas", "Grey", "decode_grey", "levels_at"]
 
@@ -31,7 +33,9 @@ class Canvas:
     def __init__(self) -> None:
         self._pixels = np.zeros((0, 0), dtype=np.uint8)
 
-    def show(self, frame: CompressedImage | RawImage, rows: slice | None = None) -> tuple[Grey, slice]:
+    def show(
+        self, frame: CompressedImage | RawImage, rows: Sequence[slice] | None = None
+    ) -> tuple[Grey, list[slice]]:
         """The grey picture in a frame, or at least some rows of it.
 
         Parameters
@@ -51,23 +55,18 @@ class Canvas:
         layout = read_layout(frame.data) if isinstance(frame, CompressedImage) else None
         if layout is None:
             self._pixels = decode_grey(frame)
-            return self._pixels, slice(0, len(self._pixels))
+            return self._pixels, [slice(0, len(self._pixels))]
         if self._pixels.shape != (layout.height, layout.width) or not self._pixels.flags.writeable:
             self._pixels = np.zeros((layout.height, layout.width), dtype=np.uint8)
-        low, high = self._decode(frame.data, layout, rows)
-        return self._pixels, slice(low, high)
-
-    def _decode(self, data: bytes, layout: Layout, rows: slice | None) -> tuple[int, int]:
         if rows is None:
-            simplejpeg.decode_jpeg(data, colorspace="GRAY", buffer=self._pixels)
-            return 0, layout.height
-        if rows.start >= min(rows.stop, layout.height):
-            return 0, 0
-        piece, low, high = cut_rows(data, layout, rows.start, rows.stop)
-        # What follows the last row that is wanted looks like damage.
-        strict = layout.interval > 0
-        simplejpeg.decode_jpeg(piece, colorspace="GRAY", buffer=self._pixels[low:high], strict=strict)
-        return low, high
+            simplejpeg.decode_jpeg(frame.data, colorspace="GRAY", buffer=self._pixels)
+            return self._pixels, [slice(0, layout.height)]
+        shown = whole_rows(layout, rows)
+        for piece, part in zip(cut_rows(frame.data, layout, shown), shown, strict=True):
+            # Without restart markers, what follows the last row that is wanted looks like damage.
+            strict = layout.interval > 0
+            simplejpeg.decode_jpeg(piece, colorspace="GRAY", buffer=self._pixels[part], strict=strict)
+        return self._pixels, shown
 
 
 def decode_grey(frame: CompressedImage | RawImage) -> Grey:

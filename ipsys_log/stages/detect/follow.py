@@ -27,11 +27,11 @@ Array = NDArray[np.float64]
 
 # The whole picture is searched every so many frames, whatever happens, and more thoroughly, at full size,
 # every so many.
-_SEARCH_EVERY = 10
-_THOROUGH_EVERY = 60
+_SEARCH_EVERY = 20
+_THOROUGH_EVERY = 120
 # And decoded as a whole every so many; the others only as far as markers are expected.
 _WHOLE_EVERY = 5
-_MARGIN_PX = 48
+_MARGIN_PX = 32
 _REMEMBERED = 3
 # In sides per s and rad per s: less is not seen in the shear of a marker.
 _SAME_SPEED = 0.1
@@ -103,7 +103,7 @@ class Follow:
             for guess, fit, outline_px in zip(guesses, tried, outlines_px, strict=True)
             if fit is None and _inside(outline_px, grey)
         }
-        if lost and rows != slice(0, len(grey)):
+        if lost and rows != [slice(0, len(grey))]:
             grey, rows = self._canvas.show(frame)
         self._changed = self._watch.changed(grey, rows, [fit.corners_px for fit in fits], self._breadth_px)
         region = WHOLE if lost or due else self._changed
@@ -209,14 +209,13 @@ def _among(marker_id: int, corners_px: Array, fits: Iterable[Fit]) -> bool:
     )
 
 
-def _rows(outlines_px: Sequence[Array], changed: tuple[slice, slice] | None) -> slice:
+def _rows(outlines_px: Sequence[Array], changed: tuple[slice, slice] | None) -> list[slice]:
     """The rows that markers are expected in, with what is needed around them, and those that have changed."""
-    spans = [(int(px[:, 1].min()) - _MARGIN_PX, int(px[:, 1].max()) + _MARGIN_PX) for px in outlines_px]
-    if changed is not None:
-        spans.append((changed[0].start, changed[0].stop))
-    if not spans:
-        return slice(0, 0)
-    return slice(max(min(low for low, _ in spans), 0), max(0, *(high for _, high in spans)))
+    rows = [
+        slice(max(int(px[:, 1].min()) - _MARGIN_PX, 0), max(int(px[:, 1].max()) + _MARGIN_PX, 0))
+        for px in outlines_px
+    ]
+    return rows if changed is None else [*rows, changed[0]]
 
 
 def _inside(outline_px: Array, grey: Grey) -> bool:

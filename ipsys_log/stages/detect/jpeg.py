@@ -7,18 +7,21 @@ codes that it has to read one after the other, so rows that are left out are tim
 
 from __future__ import annotations
 
+from collections.abc import Iterable, Sequence
 from math import lcm
 from typing import NamedTuple
 
 import numpy as np
 
-__all__ = ["Layout", "cut_rows", "read_layout"]
+__all__ = ["Layout", "cut_rows", "read_layout", "whole_rows"]
 
 _END = b"\xff\xd9"
 _BASELINE = (0xC0, 0xC1)
 _SCAN, _RESTART_INTERVAL, _RESTART = 0xDA, 0xDD, 0xD0
 # Restart markers are numbered 0 to 7, over and over.
 _CYCLE = 8
+# A JPEG of its own costs as much as some rows.
+_NEAR_PX = 32
 
 
 class Layout(NamedTuple):
@@ -71,43 +74,61 @@ def _layout(data: bytes, frame: int, scan: int, scan_size: int, interval: int) -
     return Layout(width, height, 8 * down, blocks, frame + 5, scan + 2 + scan_size, interval)
 
 
-def cut_rows(data: bytes, layout: Layout, low: int, high: int) -> tuple[bytearray, int, int]:
-    """A JPEG of some rows only.
+def whole_rows(layout: Layout, rows: Iterable[slice]) -> list[slice]:
+    """The rows of a JPEG that have to be decoded for some rows of it, each once, from the top.
+
+    Without restart markers these are all rows from the top.
+    """
+    step = layout.rows_px if layout.interval else layout.block_px
+    merged: list[slice] = []
+    for part in sorted((part for part in rows if part.start < part.stop), key=lambda part: part.start):
+        low = part.start // step * step if layout.interval else 0
+        high = min(-(-part.stop // step) * step, layout.height)
+        if merged and low <= merged[-1].stop + _NEAR_PX:
+            merged[-1] = slice(merged[-1].start, max(high, merged[-1].stop))
+        elif low < high:
+            merged.append(slice(low, high))
+    return merged
+
+
+def cut_rows(data: bytes, layout: Layout, rows: Sequence[slice]) -> list[bytearray]:
+    """JPEGs of some rows each.
 
     Parameters
     ----------
     data, layout : the whole JPEG, and :func:`read_layout` of it.
-    low, high : first row wanted, and the one after the last.
+    rows : as :func:`whole_rows` has them.
 
     Returns
     -------
-    The JPEG, and the rows that it holds, which are these and some more. Without restart markers they begin
-    at the top, and data follows that no row needs.
+    A JPEG for each; without restart markers, data follows in it that no row needs.
     """
-    step = layout.rows_px if layout.interval else layout.block_px
-    high = min(-(-high // step) * step, layout.height)
-    if layout.interval:
-        low = low // step * step
-        piece = _between(data, layout, low, high)
-    else:
-        piece, low = bytearray(data), 0
-    piece[layout.height_at : layout.height_at + 2] = (high - low).to_bytes(2, "big")
-    return piece, low, high
+    pieces = _between(data, layout, rows) if layout.interval else [bytearray(data) for _ in rows]
+    for piece, part in zip(pieces, rows, strict=True):
+        piece[layout.height_at : layout.height_at + 2] = (part.stop - part.start).to_bytes(2, "big")
+    return pieces
 
 
-def _between(data: bytes, layout: Layout, low: int, high: int) -> bytearray:
+def _between(data: bytes, layout: Layout, rows: Sequence[slice]) -> list[bytearray]:
     """The header, and the data of some rows, from one restart marker to another."""
+    if not rows:
+        return []
     codes = np.frombuffer(data, dtype=np.uint8)
     ends = np.flatnonzero(codes[layout.data_at : -1] == 0xFF) + layout.data_at
     restarts = ends[(codes[ends + 1] & 0xF8) == _RESTART]
-    begin, end = (-(-row // layout.block_px) * layout.blocks // layout.interval for row in (low, high))
-    if high == layout.height:
-        end = len(restarts) + 1
     starts = [layout.data_at, *(restarts + 2).tolist(), len(data)]
-    # Where intervals were lost on the way, what is left is too short, and the decoder says so.
-    start, stop = (starts[min(n, len(starts) - 1)] for n in (begin, end))
-    piece = bytearray(data[: layout.data_at]) + data[start:stop]
-    for number, at in enumerate(restarts[begin : end - 1].tolist()):
-        piece[layout.data_at + at - start + 1] = _RESTART + number % _CYCLE
-    piece[-2:] = _END
-    return piece
+    pieces = []
+    for part in rows:
+        begin, end = (
+            row // layout.block_px * layout.blocks // layout.interval for row in (part.start, part.stop)
+        )
+        if part.stop == layout.height:
+            end = len(restarts) + 1
+        # Where intervals were lost on the way, what is left is too short, and the decoder says so.
+        start, stop = (starts[min(n, len(starts) - 1)] for n in (begin, end))
+        piece = bytearray(data[: layout.data_at]) + data[start:stop]
+        for number, at in enumerate(restarts[begin : end - 1].tolist()):
+            piece[layout.data_at + at - start + 1] = _RESTART + number % _CYCLE
+        piece[-2:] = _END
+        pieces.append(piece)
+    return pieces

@@ -12,8 +12,10 @@ from ipsys_log.stages.detect.decode import Grey
 __all__ = ["Watch"]
 
 Array = NDArray[np.float64]
+Samples = NDArray[np.float32]
 
 _EVERY_PX = 16
+_HALF_PX = _EVERY_PX // 2
 _CHANGED_LEVELS = 25.0
 _CHANGED_SAMPLES = 3
 # A marker of which only a part has changed is cut off by no less.
@@ -30,7 +32,7 @@ class Watch:
         self._background = np.zeros((0, 0), dtype=np.float32)
 
     def changed(
-        self, grey: Grey, rows: slice, markers_px: Sequence[Array], breadth_px: float
+        self, grey: Grey, rows: Sequence[slice], markers_px: Sequence[Array], breadth_px: float
     ) -> tuple[slice, slice] | None:
         """Rows and columns around what is there and is neither background nor one of the markers.
 
@@ -41,26 +43,30 @@ class Watch:
         markers_px : corners (4, 2) of the markers that are known.
         breadth_px : of a marker. Less than half of it at the edge of the picture is none yet.
         """
-        half = _EVERY_PX // 2
-        samples = grey[half::_EVERY_PX, half::_EVERY_PX].astype(np.float32)
+        samples = grey[_HALF_PX::_EVERY_PX, _HALF_PX::_EVERY_PX].astype(np.float32)
         if self._background.shape != samples.shape:
             self._background = np.full_like(samples, np.nan)
         self.forget(markers_px)
-        here = slice(-(-(rows.start - half) // _EVERY_PX), -(-(rows.stop - half) // _EVERY_PX))
-        background, samples = self._background[here], samples[here]
-        off = samples - background
-        background += _LEARN * off
-        np.copyto(background, samples, where=np.isnan(background))
+        new = np.zeros(samples.shape, dtype=bool)
+        for part in rows:
+            here = slice(-((_HALF_PX - part.start) // _EVERY_PX), -((_HALF_PX - part.stop) // _EVERY_PX))
+            new[here] = self._learn(samples[here], self._background[here])
         self.forget(markers_px)
-        new = np.abs(off) > _CHANGED_LEVELS
         if np.count_nonzero(new) < _CHANGED_SAMPLES:
             return None
-        spans = [np.flatnonzero(new.any(axis=1)) + here.start, np.flatnonzero(new.any(axis=0))]
-        for span, size in zip(spans, self._background.shape, strict=True):
-            at_edge = span[0] == 0 or span[-1] == size - 1
+        spans = [np.flatnonzero(new.any(axis=1)), np.flatnonzero(new.any(axis=0))]
+        for span, last in zip(spans, np.array(new.shape) - 1, strict=True):
+            at_edge = span[0] == 0 or span[-1] == last
             if at_edge and (span[-1] - span[0] + 1) * _EVERY_PX < _ENTERED * breadth_px:
                 return None
         return _around(spans[0]), _around(spans[1])
+
+    def _learn(self, samples: Samples, background: Samples) -> NDArray[np.bool_]:
+        """Which samples are new; they and what was not known become background."""
+        off = samples - background
+        background += _LEARN * off
+        np.copyto(background, samples, where=np.isnan(background))
+        return np.asarray(np.abs(off) > _CHANGED_LEVELS)
 
     def forget(self, markers_px: Sequence[Array]) -> None:
         """What lies under markers (4, 2) is not known: it is no change when it comes to light."""

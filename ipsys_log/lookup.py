@@ -3,17 +3,21 @@
 from __future__ import annotations
 
 from collections.abc import Iterable, Mapping
+from dataclasses import replace
+
+import numpy as np
 
 from ipsys_log.errors import IpsysError
 from ipsys_log.log.session import Session, run_of_topic
-from ipsys_log.messages import CameraPoints, Measurement, Model, Pair, Rig
+from ipsys_log.messages import CameraPoints, Markers, Measurement, Model, Pair, Rig
 from ipsys_log.models import MODELS, create, min_pairs
 from ipsys_log.offline.crossval import FOLDS
 from ipsys_log.offline.pairs import Measured, build_pairs, gather_sightings, measured_in_order, split
 from ipsys_log.request import Request
-from ipsys_log.runs import complete_runs
+from ipsys_log.runs import complete_runs, newest_run
 
 __all__ = [
+    "MIN_OFFSETS",
     "can_evaluate",
     "copied_run",
     "find_pairs",
@@ -21,10 +25,15 @@ __all__ = [
     "fitted_in",
     "held_out_ids",
     "measured",
+    "rig_with_offsets",
     "split_parameters",
     "unused_places",
     "wanted_models",
 ]
+
+
+# Of so many markers the median edge offset is that of the camera.
+MIN_OFFSETS = 10
 
 
 def wanted_models(request: Request, until: str) -> tuple[str, ...]:
@@ -115,6 +124,30 @@ def find_pairs(session: Session, points: str, places: list[Measured]) -> dict[st
     """What each camera saw of the measured places."""
     sightings = gather_sightings(session.messages(session.topics(CameraPoints, points)))
     return build_pairs(sightings, places)
+
+
+def rig_with_offsets(session: Session) -> Rig:
+    """The newest rig of a log, with the edge offset of each camera that it does not say: the median of those
+    that the newest detection found.
+
+    Raises
+    ------
+    IpsysError
+        Where the log holds no rig.
+    """
+    rigs: list[Rig] = session.payloads(session.topics(Rig))
+    if not rigs:
+        raise IpsysError(f"{session}: holds no rig; write an example with 'ipsys init lab.toml'")
+    run = newest_run(session, Markers)
+    found: dict[str, list[float]] = {}
+    for message in session.messages(session.topics(Markers, run) if run else []):
+        offsets = found.setdefault(str(message.camera), [])
+        offsets += [m.edge_offset_px for m in message.payload.markers if m.edge_offset_px is not None]
+    cameras = {name: rigs[-1].camera(name) for name in [c.name for c in rigs[-1].cameras] + sorted(found)}
+    for name, offsets in found.items():
+        if len(offsets) >= MIN_OFFSETS and cameras[name].edge_offset_px is None:
+            cameras[name] = replace(cameras[name], edge_offset_px=round(float(np.median(offsets)), 3))
+    return replace(rigs[-1], cameras=tuple(cameras.values()))
 
 
 def unused_places(pairs: Mapping[str, list[Pair]], train: set[str]) -> list[str]:

@@ -3,14 +3,18 @@
 from __future__ import annotations
 
 from collections.abc import Iterable, Iterator
+from statistics import median
 
 from ipsys_log.errors import IpsysError
 from ipsys_log.log.session import camera_of_topic
+from ipsys_log.lookup import MIN_OFFSETS
 from ipsys_log.messages import Event, Markers, Message, Positions
 from ipsys_log.tasks import Task
 from ipsys_log.units import format_time
 
 __all__ = ["Remarks"]
+
+_WORTH_SAYING_PX = 0.05
 
 
 class Remarks:
@@ -22,6 +26,7 @@ class Remarks:
         self._events: dict[str, list[Message]] = {}
         self._frames = self._markers = 0
         self._located: set[str | None] = set()
+        self._offsets_px: dict[str, list[float]] = {}
 
     def watch(self, messages: Iterable[Message]) -> Iterator[Message]:
         """The messages, unchanged.
@@ -50,6 +55,8 @@ class Remarks:
         elif isinstance(payload, Markers):
             self._frames += 1
             self._markers += len(payload.markers)
+            offsets = self._offsets_px.setdefault(str(message.camera), [])
+            offsets += [m.edge_offset_px for m in payload.markers if m.edge_offset_px is not None]
         elif isinstance(payload, Positions):
             self._located.add(message.camera)
 
@@ -77,10 +84,19 @@ class Remarks:
         ]
         if self._task.stage == "detect":
             lines.insert(0, f"{self._markers} markers in {self._frames} frames")
+            lines += self._about_offsets()
         if self._task.stage == "locate":
             cameras = {camera_of_topic(topic) for topic in self._task.topics} - {None}
             lines += [f"camera {name} has no model" for name in sorted(map(str, cameras - self._located))]
         return (*lines, *self._task.notes)
+
+    def _about_offsets(self) -> list[str]:
+        medians = {c: median(found) for c, found in self._offsets_px.items() if len(found) >= MIN_OFFSETS}
+        return [
+            f"camera {camera}: edges of black lie {offset_px:.2f} px inside the black (gamma); allowed for"
+            for camera, offset_px in sorted(medians.items())
+            if abs(offset_px) >= _WORTH_SAYING_PX
+        ]
 
 
 def _said(message: Message) -> str:

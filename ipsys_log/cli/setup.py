@@ -51,7 +51,10 @@ def add_commands(app: typer.Typer) -> None:
 def init(
     path: Annotated[Path, typer.Argument(help="The rig file to write.")] = Path("lab.toml"),
     log: Annotated[
-        Path | None, typer.Option("--from", metavar="LOG", help="Write the rig that a log holds.")
+        Path | None,
+        typer.Option(
+            "--from", metavar="LOG", help="Write the rig that a log holds, and what it tells of the cameras."
+        ),
     ] = None,
 ) -> None:
     """Write a rig file to edit: markers, cameras, reference points, floor. With comments, or from a log."""
@@ -74,16 +77,12 @@ def init(
 
 
 def _rig_of(log: Path) -> str:
-    from ipsys_log.errors import IpsysError
     from ipsys_log.log.session import Session
-    from ipsys_log.messages import Rig
+    from ipsys_log.lookup import rig_with_offsets
     from ipsys_log.rig import rig_toml
 
     with Session([log]) as session:
-        rigs = session.payloads(session.topics(Rig))
-    if not rigs:
-        raise IpsysError(f"{log}: holds no rig; write an example with 'ipsys init lab.toml'")
-    return rig_toml(rigs[-1])
+        return rig_toml(rig_with_offsets(session))
 
 
 def simulate(output: Path, **settings: Any) -> None:

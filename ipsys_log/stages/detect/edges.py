@@ -102,19 +102,15 @@ def fit_edges(
     if not guesses:
         return []
     view = View(grey, lens, lay_out(dictionary, tuple(guess.id for guess in guesses)), row_time_s)
-    blurred = np.array([guess.blurred for guess in guesses])
-    settled = _settle(view, guesses, edge_offset_px, blurred)
-    corners_px, slopes, levels = _outline(view, settled.poses)
-    more = _blurred(view.prints, settled.heights, levels) & ~blurred
-    if more.any():
-        blurred |= more
-        settled = _settle(view, guesses, edge_offset_px, blurred)
-        corners_px, slopes, levels = _outline(view, settled.poses)
+    # What is no marker may run away, behind the camera even: its numbers are of no use then, and not used.
+    with np.errstate(all="ignore"):
+        settled, outline = _settle_all(view, guesses, edge_offset_px)
+    corners_px, slopes, levels = outline
     good = settled.good & _whole(corners_px, grey) & _same_cells(levels, view.prints.white)
     covariances_px2 = slopes @ settled.covariances @ slopes.transpose(0, 2, 1)
     return [
         Fit(
-            Guess(guess.id, settled.poses.rotations[n], settled.poses.centres[n], None, blurred[n]),
+            Guess(guess.id, settled.poses.rotations[n], settled.poses.centres[n], None, settled.blurred[n]),
             corners_px[n],
             covariances_px2[n],
             float(settled.edge_offsets_px[n]),
@@ -133,6 +129,20 @@ class _Settled(NamedTuple):
     covariances: Array
     good: NDArray[np.bool_]
     heights: Array
+    blurred: NDArray[np.bool_]
+
+
+def _settle_all(
+    view: View, guesses: Sequence[Guess], edge_offset_px: float | None
+) -> tuple[_Settled, tuple[Array, Array, Array]]:
+    """Settle markers, again if edges turn out to be blurred; and the outlines of them."""
+    settled = _settle(view, guesses, edge_offset_px, np.array([guess.blurred for guess in guesses]))
+    outline = _outline(view, settled.poses)
+    more = _blurred(view.prints, settled.heights, outline[2]) & ~settled.blurred
+    if more.any():
+        settled = _settle(view, guesses, edge_offset_px, settled.blurred | more)
+        outline = _outline(view, settled.poses)
+    return settled, outline
 
 
 def _settle(
@@ -170,7 +180,7 @@ def _settle(
     variances_px2 = spread_px**2 * count / np.maximum(count - unknowns, 1.0)
     covariances: Array = np.linalg.inv(normal)[:, :6, :6] * variances_px2[:, None, None]
     enough = (seen.certainty > 0).sum(axis=1) > _SEEN * np.abs(view.prints.polarity).sum(axis=1)
-    return _Settled(poses, found[:, 6], covariances, enough & (moved_px < _SETTLED_PX), seen.heights)
+    return _Settled(poses, found[:, 6], covariances, enough & (moved_px < _SETTLED_PX), seen.heights, blurred)
 
 
 def _solve(rows: Array, weights: Array, off_px: Array, known: Array, hold: Array) -> tuple[Array, Array]:

@@ -94,8 +94,8 @@ def run(source: Iterable[Message], stages: Sequence[Stage], map: Map = map) -> I
     """Send every message of a source through the stages, and yield it and what they make of it.
 
     What a stage makes has the log time of the message it was made from, and follows it at once; the
-    next stage sees both. With ``map`` as :func:`in_threads`, cameras use the cores in parallel and
-    the order stays the same.
+    next stage sees both. Its publish time is its own timestamp. With ``map`` as :func:`in_threads`,
+    cameras use the cores in parallel and the order stays the same.
     """
     for stage in stages:
         source = _through(stage, source, map)
@@ -110,7 +110,10 @@ def _through(stage: Stage, source: Iterable[Message], map: Map) -> Iterator[Mess
         yield message
         for payload in payloads:
             topic = TOPICS[type(payload)].format(run=stage.run, camera=message.camera)
-            yield Message(topic, message.log_time_ns, message.publish_time_ns, payload, message.camera)
+            # Transforms have their times one by one; drawings on a frame have that of the frame.
+            stamped = payload.transforms[0] if isinstance(payload, FrameTransforms) else payload
+            time_ns = getattr(stamped, "timestamp", message.publish_time_ns)
+            yield Message(topic, message.log_time_ns, time_ns, payload, message.camera)
 
 
 def in_threads(function: Callable[[Message], Any], messages: Iterable[Message]) -> Iterator[Any]:

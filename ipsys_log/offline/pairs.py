@@ -40,13 +40,14 @@ class Sightings:
 
 
 def gather_sightings(messages: Iterable[Message]) -> dict[tuple[str, int], Sightings]:
-    """Camera points by camera and marker, ordered by the time they speak of."""
+    """Camera points by camera and marker, ordered by the time they speak of: when the marker was exposed."""
     rows: dict[tuple[str, int], list[tuple[int, float, float, float]]] = {}
     for message in messages:
         if isinstance(message.payload, CameraPoints):
             for p in message.payload.points:
                 key = (str(message.camera), p.id)
-                rows.setdefault(key, []).append((message.publish_time_ns, p.x_m, p.y_m, p.z_m))
+                time_ns = message.publish_time_ns + (p.time_offset_ns or 0)
+                rows.setdefault(key, []).append((time_ns, p.x_m, p.y_m, p.z_m))
     sightings = {}
     for key, values in rows.items():
         values.sort()

@@ -87,6 +87,7 @@ def _positions(
             None if point.heading_rad is None else headings[n],
             None if covariances is None else covariances[n],
             None if inside is None else bool(inside[n]),
+            point.time_offset_ns,
         )
         for n, (point, (x_m, y_m, z_m)) in enumerate(zip(points, world.tolist(), strict=True))
         if np.isfinite(world[n]).all()

@@ -30,7 +30,7 @@ from ipsys_log.offline.pairs import (
     still_interval,
 )
 
-S = 1_000_000_000
+S, MS = 1_000_000_000, 1_000_000
 RIG = Rig(
     "lab",
     "DICT_4X4_100",
@@ -64,6 +64,29 @@ def test_the_still_stretch_around_a_time() -> None:
     first, last = still_interval(sightings, int(12.3 * S)) or (0, 0)
     assert 9.7 * S < first <= 10 * S
     assert last == pytest.approx(14.9 * S)
+
+
+def late(*rows: tuple[int, int | None, float]) -> list[Message]:
+    """Messages of (time of the frame in s, time offset in ns, x)."""
+    return [
+        Message(
+            "t", t * S, t * S, CameraPoints(t * S, (CameraPoint(0, x, 0.0, 2.0, None, offset_ns),)), "red"
+        )
+        for t, offset_ns, x in rows
+    ]
+
+
+def test_a_sighting_is_of_the_time_at_which_the_marker_was_exposed() -> None:
+    sightings = gather_sightings(late((0, 30 * MS, 0.1), (1, None, 0.3), (1, -10 * MS, 0.2)))["red", 0]
+    assert sightings.times_ns.tolist() == [0.03 * S, 0.99 * S, S]
+    assert sightings.points_m[:, 0].tolist() == [0.1, 0.2, 0.3]
+
+
+def test_a_still_interval_holds_for_what_was_exposed_in_it() -> None:
+    sightings = gather_sightings(late((0, 30 * MS, 0.1), (1, 30 * MS, 0.2), (2, 30 * MS, 0.3)))
+    given = Measurement(0, "a", marker_id=0, still=Interval(S, 2 * S), point=WorldPoint(1, 2, 3))
+    (pair,) = build_pairs(sightings, [Measured(given, RIG)])["red"]
+    assert (pair.frames, pair.camera_m[0]) == (1, 0.2)
 
 
 def test_lifting_a_marker_ends_the_stretch() -> None:

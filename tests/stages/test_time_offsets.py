@@ -1,0 +1,169 @@
+"""A marker's geometry speaks of the instant at which its rows were exposed, in all that is made of it."""
+
+from __future__ import annotations
+
+from collections.abc import Iterable
+from dataclasses import replace
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pytest
+
+from ipsys_log.log.codec import encode
+from ipsys_log.log.session import Session
+from ipsys_log.messages import (
+    RIG_TOPIC,
+    TRUTH_TOPIC,
+    CameraPoint,
+    CameraPoints,
+    FrameTransform,
+    FrameTransforms,
+    ImageAnnotations,
+    Message,
+    Pair,
+    Position,
+    Positions,
+    Quaternion,
+    Rig,
+    RigMarker,
+    Track,
+    Tracks,
+    Vector3,
+)
+from ipsys_log.offline.fit import fit_model
+from ipsys_log.offline.truth import gather_tracks, track_errors
+from ipsys_log.output import write_log
+from ipsys_log.pipeline import Stage, replay, run
+from ipsys_log.request import Request
+from ipsys_log.sources.simulator import LabSettings, drive_start_ns, hang_cameras, simulate
+from ipsys_log.stages import fuse, locate
+
+MS = 1_000_000
+RIG = Message(RIG_TOPIC, 0, 0, Rig("lab", "DICT_4X4_100", 0.2, tuple(RigMarker(n) for n in range(9))))
+
+
+def test_locate_hands_the_offset_on() -> None:
+    seen_m = np.random.default_rng(0).uniform((-1, -1, 1.9), (1, 1, 2.1), (20, 3))
+    pairs = [Pair(str(n), 0, point_m, point_m + 1.0, 1) for n, point_m in enumerate(seen_m)]
+    points = CameraPoints(1, (CameraPoint(3, 0.1, 0.2, 2.0, None, 17), CameraPoint(4, 0.1, 0.2, 2.0)))
+    (found,) = locate.Locate(fit_model("rigid", {"red": pairs}, 0))(Message("t", 1, 1, points, "red"))
+    assert [position.time_offset_ns for position in found.positions] == [17, None]
+
+
+def frame(time_ns: int, camera: str, *offsets_ns: int | None) -> Message:
+    """Positions of markers 0, 1, ... as a camera has them; it puts them at x = 0, or 1 if it is white."""
+    x_m = 1.0 if camera == "white" else 0.0
+    seen = tuple(Position(n, x_m, 0.0, 0.0, time_offset_ns=each) for n, each in enumerate(offsets_ns))
+    return Message("t", time_ns + 40 * MS, time_ns, Positions(time_ns, seen), camera)
+
+
+def fused(*frames: Message) -> list[Message]:
+    stage = Stage("poly", fuse.READS, fuse.Fuse("poly"), per_camera=False)
+    return [m for m in run([RIG, *frames], [stage]) if isinstance(m.payload, Tracks | FrameTransforms)]
+
+
+def test_a_pose_goes_out_with_its_own_instant() -> None:
+    made = fused(frame(100, "red", 30, None, 20, 0, 30))
+    assert [(m.publish_time_ns, m.topic) for m in made] == [
+        (time_ns, f"/runs/poly/{topic}") for time_ns in (100, 120, 130) for topic in ("tracks", "poses")
+    ]
+    assert {m.log_time_ns for m in made} == {100 + 40 * MS}
+    tracks = [m.payload for m in made if isinstance(m.payload, Tracks)]
+    assert [(t.timestamp, [one.id for one in t.tracks]) for t in tracks] == [
+        (100, [1, 3]),
+        (120, [2]),
+        (130, [0, 4]),
+    ]
+    poses = [m.payload for m in made if isinstance(m.payload, FrameTransforms)]
+    assert [[(one.timestamp, one.child_frame_id) for one in pose.transforms] for pose in poses] == [
+        [(t.timestamp, f"poly/{one.robot}") for one in t.tracks] for t in tracks
+    ]
+
+
+def test_without_offsets_nothing_is_other_than_before_there_were_any() -> None:
+    made = fused(frame(100, "red", None, None))
+    tracks = tuple(Track(f"marker_{n}", n, 0.0, 0.0, 0.0, cameras=("red",)) for n in range(2))
+    still = Quaternion(0.0, 0.0, 0.0, 1.0)
+    transforms = tuple(
+        FrameTransform(100, "world", f"poly/marker_{n}", Vector3(0.0, 0.0, 0.0), still) for n in range(2)
+    )
+    assert [(m.publish_time_ns, encode(m.payload)) for m in made] == [
+        (100, encode(Tracks(100, tracks))),
+        (100, encode(FrameTransforms(transforms))),
+    ]
+
+
+def cameras_of(made: Iterable[Message]) -> list[tuple[str, ...]]:
+    return [m.payload.tracks[0].cameras for m in made if isinstance(m.payload, Tracks)]
+
+
+def test_cameras_are_averaged_by_when_they_exposed_the_marker() -> None:
+    # Frames of one time, the marker in rows 20 ms apart.
+    apart = fused(frame(0, "red", 25 * MS), frame(0, "white", 5 * MS))
+    assert cameras_of(apart) == [("red",), ("white",)]
+    # The same marker in the next frame of the white camera, 4 ms after the red one saw it.
+    together = fused(frame(0, "red", 25 * MS), frame(24 * MS, "white", 5 * MS))
+    assert cameras_of(together) == [("red",), ("red", "white")]
+    assert together[-2].publish_time_ns == 29 * MS
+    assert together[-2].payload.tracks[0].x_m == 0.5
+
+
+# A frame takes 33 ms, in which a robot at 2 m/s moves by 6.6 cm. The tape is exact.
+ROLLING = LabSettings(
+    width=960,
+    height=540,
+    row_time_ns=61_000,
+    markers=4,
+    stations=12,
+    frames_per_station=2,
+    drive_s=1.2,
+    drive_speed_m_s=2.0,
+    tape_sigma_m=0.0,
+    ruler_sigma_m=0.0,
+)
+
+
+@pytest.fixture(scope="module")
+def rolling(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    path = tmp_path_factory.mktemp("rolling") / "lab.mcap"
+    write_log(path, simulate(ROLLING))
+    return path
+
+
+def drive_error_m(log: Path, rig: Rig | None) -> float:
+    """Mean error of the tracks on the drive, of a model that reads no depths."""
+    fused = replay([log], Request(models=("rayplane",), rig=rig))[-1]
+    start_ns = drive_start_ns(ROLLING, hang_cameras(ROLLING))
+    with Session([log]) as session:
+        made = list(session.messages(session.topics(Tracks, fused.run)))
+        tracks = gather_tracks(m for m in made if m.publish_time_ns >= start_ns)
+        found = track_errors(tracks, gather_tracks(session.messages([TRUTH_TOPIC])))
+    assert found is not None
+    assert found[0].count > 50
+    return found[0].mean_m
+
+
+def test_a_rig_that_says_the_row_time_puts_a_driving_robot_where_it_is(rolling: Path) -> None:
+    with Session([rolling]) as session:
+        (rig,) = session.payloads([RIG_TOPIC])
+    said_m = drive_error_m(rolling, None)
+    unsaid_m = drive_error_m(rolling, replace(rig, cameras=()))
+    assert said_m < 0.0008
+    assert unsaid_m > 0.01
+
+
+def times_in(payload: Any) -> set[int]:
+    if isinstance(payload, FrameTransforms):
+        return {one.timestamp for one in payload.transforms}
+    if isinstance(payload, ImageAnnotations):
+        return {one.timestamp for one in payload.points} | {one.timestamp for one in payload.texts}
+    return {payload.timestamp} if hasattr(payload, "timestamp") else set()
+
+
+def test_messages_have_the_times_of_their_payloads(rolling: Path) -> None:
+    replay([rolling], Request(models=("rayplane",)))
+    with Session([rolling]) as session:
+        topics = [topic for reader in session.readers for topic in reader.channels]
+        for message in session.messages(topics):
+            assert times_in(message.payload) <= {message.publish_time_ns}, message.topic

@@ -1,6 +1,6 @@
 """What went wrong in the user's input, in one line: what, where, and what to do."""
 
-__all__ = ["FitError", "IpsysError", "LogError"]
+__all__ = ["FitError", "FrameError", "IpsysError", "LogError"]
 
 
 class IpsysError(Exception):
@@ -17,3 +17,7 @@ class LogError(IpsysError):
 
 class FitError(IpsysError, ValueError):
     """Data that a model cannot be fitted to; a ValueError too, as scikit-learn's contract wants."""
+
+
+class FrameError(IpsysError, ValueError):
+    """A frame that cannot be decoded."""

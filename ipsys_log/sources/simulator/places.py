@@ -134,6 +134,7 @@ def measure(
     """
     rng = stream(settings.seed, Purpose.TAPE, index)
     distances = _tape(where, settings.tape_sigma_m, rng)
+    readout_ns = (settings.height - 1) * settings.row_time_ns
     # What lies on the floor needs no ruler.
     height_m = where.z_m + (rng.normal(0.0, settings.ruler_sigma_m) if where.z_m else 0.0)
     return Measurement(
@@ -147,7 +148,7 @@ def measure(
         side="left" if where.y_m >= REFERENCES[0].y_m else "right",
         height_m=float(height_m),
         height_sigma_m=settings.ruler_sigma_m,
-        still=Interval(times_ns[0], times_ns[-1]) if index % 2 == 0 else None,
+        still=Interval(times_ns[0], times_ns[-1] + readout_ns) if index % 2 == 0 else None,
         splits=splits,
     )
 

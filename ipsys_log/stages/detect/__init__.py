@@ -9,7 +9,7 @@ from typing import Any
 
 import numpy as np
 
-from ipsys_log.errors import IpsysError
+from ipsys_log.errors import FrameError, IpsysError
 from ipsys_log.geometry.lenses import check_calibration, same_lens
 from ipsys_log.messages import (
     CameraCalibration,
@@ -99,7 +99,7 @@ class Detect:
             )
         try:
             found, width, height = self._find(message, self._rig)
-        except ValueError as error:
+        except FrameError as error:
             text = f"{message.topic}: corrupt frame: {error}"
             yield Event(message.publish_time_ns, "corrupt_frame", text, message.camera)
             return

@@ -9,6 +9,7 @@ import numpy as np
 import simplejpeg
 from numpy.typing import NDArray
 
+from ipsys_log.errors import FrameError
 from ipsys_log.messages import CompressedImage, RawImage
 from ipsys_log.stages.detect.jpeg import cut_rows, read_layout, whole_rows
 
@@ -49,7 +50,7 @@ class Canvas:
 
         Raises
         ------
-        ValueError
+        FrameError
             Where the data is damaged.
         """
         layout = read_layout(frame.data) if isinstance(frame, CompressedImage) else None
@@ -59,13 +60,13 @@ class Canvas:
         if self._pixels.shape != (layout.height, layout.width) or not self._pixels.flags.writeable:
             self._pixels = np.zeros((layout.height, layout.width), dtype=np.uint8)
         if rows is None:
-            simplejpeg.decode_jpeg(frame.data, colorspace="GRAY", buffer=self._pixels)
+            _decode_jpeg(frame.data, self._pixels)
             return self._pixels, [slice(0, layout.height)]
         shown = whole_rows(layout, rows)
         for piece, part in zip(cut_rows(frame.data, layout, shown), shown, strict=True):
             # Without restart markers, what follows the last row that is wanted looks like damage.
             strict = layout.interval > 0
-            simplejpeg.decode_jpeg(piece, colorspace="GRAY", buffer=self._pixels[part], strict=strict)
+            _decode_jpeg(piece, self._pixels[part], strict)
         return self._pixels, shown
 
 
@@ -74,21 +75,29 @@ def decode_grey(frame: CompressedImage | RawImage) -> Grey:
 
     Raises
     ------
-    ValueError
+    FrameError
         Where the data is damaged: a JPEG is decoded strictly, so that half a picture is no picture.
     """
     if isinstance(frame, RawImage):
         return _raw_grey(frame)
     if frame.data[:2] == b"\xff\xd8":
-        grey: Grey = simplejpeg.decode_jpeg(frame.data, colorspace="GRAY")[..., 0]
-        return grey
+        return _decode_jpeg(frame.data)
     try:
         decoded = cv2.imdecode(np.frombuffer(frame.data, np.uint8), cv2.IMREAD_GRAYSCALE)
     except cv2.error:  # OpenCV asserts on empty data
         decoded = None
     if decoded is None:
-        raise ValueError(f"{len(frame.data)} bytes that are no picture ({frame.format or 'no format given'})")
+        raise FrameError(f"{len(frame.data)} bytes that are no picture ({frame.format or 'no format given'})")
     return np.asarray(decoded, dtype=np.uint8)
+
+
+def _decode_jpeg(data: bytes | bytearray, pixels: Grey | None = None, strict: bool = True) -> Grey:
+    """Decode a JPEG, into ``pixels`` where they are given."""
+    try:
+        grey: Grey = simplejpeg.decode_jpeg(data, colorspace="GRAY", buffer=pixels, strict=strict)[..., 0]
+    except ValueError as error:
+        raise FrameError(str(error)) from error
+    return grey
 
 
 def levels_at(grey: Grey, x: NDArray[np.float32], y: NDArray[np.float32]) -> NDArray[np.float64]:
@@ -103,12 +112,12 @@ def levels_at(grey: Grey, x: NDArray[np.float32], y: NDArray[np.float32]) -> NDA
 def _raw_grey(frame: RawImage) -> Grey:
     if frame.encoding not in _RAW_TO_GREY:
         known = ", ".join(_RAW_TO_GREY)
-        raise ValueError(f"pixel encoding {frame.encoding!r} is not read (only {known})")
+        raise FrameError(f"pixel encoding {frame.encoding!r} is not read (only {known})")
     channels, conversion = _RAW_TO_GREY[frame.encoding]
     rows = np.frombuffer(frame.data, np.uint8)
     step = frame.step or frame.width * channels  # some writers leave it out
     if step < frame.width * channels or rows.size < step * frame.height or not rows.size:
-        raise ValueError(f"{rows.size} bytes are too few for {frame.width} x {frame.height}")
+        raise FrameError(f"{rows.size} bytes are too few for {frame.width} x {frame.height}")
     rows = rows[: step * frame.height].reshape(frame.height, step)
     pixels = rows[:, : frame.width * channels].reshape(frame.height, frame.width, channels)
     if conversion is None:

@@ -65,13 +65,14 @@ class Guess(NamedTuple):
 
 
 class Fit(NamedTuple):
-    """Where a marker is, with the covariance (8, 8) of its corners x0 y0 .. x3 y3, and by how much edges of
-    black lie inside the black."""
+    """Where a marker is, with the covariance (8, 8) of its corners x0 y0 .. x3 y3; by how much edges of black
+    lie inside the black; and how far edges are from where the fit has them (RMS)."""
 
     pose: Guess
     corners_px: Array
     covariance_px2: Array
     edge_offset_px: float
+    spread_px: float
 
 
 def fit_edges(
@@ -114,6 +115,7 @@ def fit_edges(
             corners_px[n],
             covariances_px2[n],
             float(settled.edge_offsets_px[n]),
+            float(settled.spreads_px[n]),
         )
         if good[n]
         else None
@@ -130,6 +132,7 @@ class _Settled(NamedTuple):
     good: NDArray[np.bool_]
     heights: Array
     blurred: NDArray[np.bool_]
+    spreads_px: Array
 
 
 def _settle_all(
@@ -180,7 +183,9 @@ def _settle(
     variances_px2 = spread_px**2 * count / np.maximum(count - unknowns, 1.0)
     covariances: Array = np.linalg.inv(normal)[:, :6, :6] * variances_px2[:, None, None]
     enough = (seen.certainty > 0).sum(axis=1) > _SEEN * np.abs(view.prints.polarity).sum(axis=1)
-    return _Settled(poses, found[:, 6], covariances, enough & (moved_px < _SETTLED_PX), seen.heights, blurred)
+    return _Settled(
+        poses, found[:, 6], covariances, enough & (moved_px < _SETTLED_PX), seen.heights, blurred, spread_px
+    )
 
 
 def _solve(rows: Array, weights: Array, off_px: Array, known: Array, hold: Array) -> tuple[Array, Array]:

@@ -3,8 +3,6 @@
 from __future__ import annotations
 
 from collections.abc import Iterable, Sequence
-from itertools import pairwise
-from typing import NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
@@ -12,14 +10,13 @@ from numpy.typing import NDArray
 from ipsys_log.geometry.ippe import solve_squares
 from ipsys_log.geometry.lenses import project, undistort
 from ipsys_log.geometry.markers import marker_corners
-from ipsys_log.geometry.poses import rotation, rotation_vector
 from ipsys_log.geometry.square_pose import goes_around
 from ipsys_log.messages import CameraCalibration, CompressedImage, RawImage
 from ipsys_log.stages.detect.decode import Canvas, Grey
 from ipsys_log.stages.detect.edges import Fit, Guess, fit_edges
 from ipsys_log.stages.detect.search import WHOLE, Candidate, search, search_thoroughly
+from ipsys_log.stages.detect.track import Track, extend, predict, same_speed
 from ipsys_log.stages.detect.watch import Watch
-from ipsys_log.units import NS_PER_S
 
 __all__ = ["Follow"]
 
@@ -32,19 +29,10 @@ _THOROUGH_EVERY = 120
 # And decoded as a whole every so many; the others only as far as markers are expected.
 _WHOLE_EVERY = 5
 _MARGIN_PX = 32
-_REMEMBERED = 3
-# In sides per s and rad per s: less is not seen in the shear of a marker.
-_SAME_SPEED = 0.1
+# Times the spread of edges about a fit with one more freedom.
+_AS_GOOD = 1.1
 # Of two fits of one id, nearer together than this, one is enough.
 _SAME_PX = 8.0
-
-
-class _Sighting(NamedTuple):
-    """A marker when its row was exposed, ``late_ns`` after the first row of its frame."""
-
-    time_ns: int
-    late_ns: int
-    pose: Guess
 
 
 class Follow:
@@ -73,8 +61,7 @@ class Follow:
         self._changed: tuple[slice, slice] | None = None
         self._breadth_px = 0.0
         self._frames = 0
-        # Of each marker the last sightings, the newest first.
-        self._tracks: dict[int, tuple[_Sighting, ...]] = {}
+        self._tracks: list[Track] = []
 
     def __call__(self, frame: CompressedImage | RawImage, time_ns: int) -> tuple[list[Fit], int, int]:
         """The markers in a frame, sorted by id, and the width and height of it; an id can occur twice.
@@ -86,36 +73,46 @@ class Follow:
 
         Raises
         ------
-        ValueError
+        FrameError
             Where it cannot be decoded.
         """
         due = self._frames % _SEARCH_EVERY == 0
         thorough = self._frames % _THOROUGH_EVERY == _SEARCH_EVERY
         whole = due or self._frames % _WHOLE_EVERY == 0
         self._frames += 1
-        guesses = [_predict(track, time_ns) for track in self._tracks.values()]
+        guesses = [predict(track, time_ns) for track in self._tracks]
         outlines_px = [self._outline(guess) for guess in guesses]
         grey, rows = self._canvas.show(frame, None if whole else _rows(outlines_px, self._changed))
         tried = self._with_speed(grey, time_ns, guesses, self._fit(grey, guesses))
-        fits = [fit for fit in tried if fit is not None]
-        lost = {
-            guess.id
-            for guess, fit, outline_px in zip(guesses, tried, outlines_px, strict=True)
-            if fit is None and _inside(outline_px, grey)
-        }
+        seen = {n: fit for n, fit in enumerate(tried) if fit is not None}
+        lost = [n for n, outline in enumerate(outlines_px) if n not in seen and _inside(outline, grey)]
         if lost and rows != [slice(0, len(grey))]:
             grey, rows = self._canvas.show(frame)
+        fits = list(seen.values())
         self._changed = self._watch.changed(grey, rows, [fit.corners_px for fit in fits], self._breadth_px)
         region = WHOLE if lost or due else self._changed
         if region is not None:
             fits = self._add(grey, fits, search(grey, self._dictionary, region))
-        if thorough or lost - {fit.pose.id for fit in fits}:
+        if thorough or {guesses[n].id for n in lost} - {fit.pose.id for fit in fits}:
             fits = self._add(grey, fits, search_thoroughly(grey, self._dictionary))
         self._watch.forget([fit.corners_px for fit in fits])
-        self._remember(fits, time_ns)
+        self._remember(list(seen), fits, time_ns)
         return sorted(fits, key=lambda fit: fit.pose.id), grey.shape[1], grey.shape[0]
 
     def _fit(self, grey: Grey, guesses: Sequence[Guess]) -> list[Fit | None]:
+        fits = self._fit_as_guessed(grey, guesses)
+        unknown = [n for n, guess in enumerate(guesses) if guess.motion is None]
+        if not self._row_time_s or not unknown:
+            return fits
+        # Shear and tilt look much alike: what can be at rest is taken to be.
+        resting = self._fit_as_guessed(grey, [guesses[n]._replace(motion=np.zeros(3)) for n in unknown])
+        for n, still in zip(unknown, resting, strict=True):
+            moving = fits[n]
+            if still is not None and (moving is None or still.spread_px < _AS_GOOD * moving.spread_px):
+                fits[n] = still
+        return fits
+
+    def _fit_as_guessed(self, grey: Grey, guesses: Sequence[Guess]) -> list[Fit | None]:
         return fit_edges(grey, guesses, self._dictionary, self._lens, self._edge_offset_px, self._row_time_s)
 
     def _with_speed(
@@ -127,20 +124,11 @@ class Follow:
         again = {}
         for n, (guess, fit) in enumerate(zip(guesses, fits, strict=True)):
             if fit is not None:
-                known = _predict(self._extended(fit, frame_ns), frame_ns)
-                if not _same_speed(known.motion, guess.motion):
+                known = predict(extend(self._tracks[n], fit, frame_ns, self._row_time_s), frame_ns)
+                if not same_speed(known.motion, guess.motion):
                     again[n] = known
         better = dict(zip(again, self._fit(grey, list(again.values())), strict=True))
         return [better.get(n) or fit for n, fit in enumerate(fits)]
-
-    def _extended(self, fit: Fit, frame_ns: int) -> tuple[_Sighting, ...]:
-        """The track of a marker with what was just seen of it."""
-        late_ns = round(float(fit.corners_px[:, 1].mean()) * self._row_time_s * NS_PER_S)
-        now = _Sighting(frame_ns + late_ns, late_ns, fit.pose)
-        before = self._tracks.get(fit.pose.id, ())
-        # Time that does not go on leaves nothing to learn a speed from.
-        ordered = not before or before[0].time_ns < now.time_ns
-        return (now, *before[: _REMEMBERED - 1]) if ordered else (now,)
 
     def _add(self, grey: Grey, fits: list[Fit], candidates: Iterable[Candidate]) -> list[Fit]:
         """Fits, and those of candidates that are none of them."""
@@ -168,39 +156,23 @@ class Follow:
         ]
 
     def _outline(self, guess: Guess) -> Array:
-        """Corners in px, (4, 2)."""
-        return project(marker_corners(1.0) @ guess.rotation.T + guess.centre, self._lens)
+        """Corners in px, (4, 2); far outside where the guess has gone behind the camera."""
+        points = marker_corners(1.0) @ guess.rotation.T + guess.centre
+        if points[:, 2].min() <= 0:
+            return np.full((4, 2), -1e6)
+        return project(points, self._lens)
 
-    def _remember(self, fits: Sequence[Fit], frame_ns: int) -> None:
-        self._tracks = {fit.pose.id: self._extended(fit, frame_ns) for fit in fits}
+    def _remember(self, followed: Sequence[int], fits: Sequence[Fit], frame_ns: int) -> None:
+        """``fits`` are first those of the tracks that were followed, in their order, then new ones."""
+        # A marker that was lost and found again in the same frame is the one of before.
+        left = {t[0].pose.id: t for n, t in enumerate(self._tracks) if n not in followed}
+        before = [self._tracks[n] for n in followed]
+        before += [left.pop(fit.pose.id, ()) for fit in fits[len(followed) :]]
+        self._tracks = [
+            extend(track, fit, frame_ns, self._row_time_s) for track, fit in zip(before, fits, strict=True)
+        ]
         if fits:
             self._breadth_px = max(float(np.ptp(fit.corners_px, axis=0).min()) for fit in fits)
-
-
-def _predict(track: Sequence[_Sighting], frame_ns: int) -> Guess:
-    """Where a marker is in a frame, if it lies in about the same row: on a parabola through three sightings,
-    on a line through two."""
-    now = track[0]
-    if len(track) == 1:
-        return now.pose
-    ahead_s = (frame_ns + now.late_ns - now.time_ns) / NS_PER_S
-    steps_s = [(one.time_ns - other.time_ns) / NS_PER_S for one, other in pairwise(track)]
-    moved = [one.pose.centre - other.pose.centre for one, other in pairwise(track)]
-    means = [step / step_s for step, step_s in zip(moved, steps_s, strict=True)]
-    # A mean velocity is that of the middle of its interval.
-    gain = (means[0] - means[1]) / (sum(steps_s) / 2) if len(means) > 1 else np.zeros(3)
-    velocity = means[0] + gain * steps_s[0] / 2
-    turn_rad_s = rotation_vector(now.pose.rotation @ track[1].pose.rotation.T) / steps_s[0]
-    turned = rotation(turn_rad_s * ahead_s) @ now.pose.rotation
-    speed, turn = (velocity + gain * ahead_s) @ turned, turn_rad_s @ turned
-    centre = now.pose.centre + (velocity + gain * ahead_s / 2) * ahead_s
-    return Guess(now.pose.id, turned, centre, np.array([speed[0], speed[1], turn[2]]), now.pose.blurred)
-
-
-def _same_speed(one: Array | None, other: Array | None) -> bool:
-    if one is None or other is None:
-        return one is other
-    return bool(np.abs(one - other).max() < _SAME_SPEED)
 
 
 def _among(marker_id: int, corners_px: Array, fits: Iterable[Fit]) -> bool:

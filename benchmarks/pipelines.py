@@ -1,0 +1,204 @@
+"""Ways from an MCAP log to the corners of the markers in it, each to be run in a process of its own."""
+
+from __future__ import annotations
+
+import ctypes
+from collections.abc import Callable, Sequence
+from pathlib import Path
+from typing import Any
+
+import cv2
+import numpy as np
+import simplejpeg
+from numpy.typing import NDArray
+from rounds import Turn
+
+from ipsys_log.log.session import Session
+from ipsys_log.messages import CameraCalibration, Markers, Message, Rig
+from ipsys_log.stages import detect
+from ipsys_log.stages.detect import Detect
+
+__all__ = ["FINDERS", "OURS", "Found", "one_by_one", "threaded"]
+
+Corners = NDArray[np.float64]
+# Camera and publish time in ns of a frame, and the corners in px found in it, (4, 2) each, with their ids.
+Found = tuple[str, int, list[tuple[int, Corners]]]
+Finder = Callable[[Message], list[tuple[int, Corners]]]
+
+OURS = detect.EDGES
+
+# Of glibc's malloc.h.
+_TRIM_THRESHOLD, _MMAP_THRESHOLD = -1, -3
+
+_REFINE = (cv2.TERM_CRITERIA_COUNT + cv2.TERM_CRITERIA_EPS, 40, 0.001)
+
+
+def _fed(stage: Callable[[Message], Any], message: Message) -> list[tuple[int, Corners]]:
+    """The corners that a stage makes of a message, none of what it does not read."""
+    if not isinstance(message.payload, detect.READS):
+        return []
+    found = [payload for payload in stage(message) if isinstance(payload, Markers)]
+    return [(marker.id, marker.corners_px) for markers in found for marker in markers.markers]
+
+
+def plain(rig: Message, lenses: dict[str, Message]) -> Finder:
+    """What the authors' program does, written with today's OpenCV and nothing else.
+
+    Colour, then grey, OpenCV's detector with its default parameters, cornerSubPix with a window of 3,
+    fisheye.undistortPoints, and the camera points of eq. (3) to (5).
+    """
+    detector = cv2.aruco.ArucoDetector(_dictionary(rig.payload))
+    length_m = rig.payload.marker_length_m
+
+    def find(message: Message) -> list[tuple[int, Corners]]:
+        color = cv2.imdecode(np.frombuffer(message.payload.data, np.uint8), cv2.IMREAD_COLOR)
+        assert color is not None
+        grey = cv2.cvtColor(color, cv2.COLOR_BGR2GRAY)
+        corners, ids, _ = detector.detectMarkers(grey)
+        if ids is None or len(ids) == 0:
+            return []
+        lens = lenses[str(message.camera)].payload
+        found = []
+        for marker_id, square in zip(np.ravel(ids), corners, strict=True):
+            px = cv2.cornerSubPix(grey, square.reshape(-1, 1, 2), (3, 3), (-1, -1), _REFINE)
+            uv = cv2.fisheye.undistortPoints(px.astype(np.float64), lens.K, lens.D)
+            _camera_point(np.asarray(uv, np.float64).reshape(-1, 2), length_m)
+            found.append((int(marker_id), px.reshape(4, 2).astype(np.float64)))
+        return found
+
+    return find
+
+
+def _camera_point(uv: Corners, length_m: float) -> Corners:
+    perimeter = np.linalg.norm(np.roll(uv, -1, axis=0) - uv, axis=1).sum()
+    z_m = 4 * length_m / perimeter
+    return np.array([*(z_m * uv.mean(axis=0)), z_m])
+
+
+def _dictionary(rig: Rig) -> cv2.aruco.Dictionary:
+    return cv2.aruco.getPredefinedDictionary(getattr(cv2.aruco, rig.dictionary))
+
+
+def stateless(rig: Message, lenses: dict[str, Message], corners: str = OURS) -> Finder:
+    """Ours without memory: a new stage for every frame."""
+
+    def find(message: Message) -> list[tuple[int, Corners]]:
+        stage = Detect(corners)
+        _fed(stage, rig)
+        _fed(stage, lenses[str(message.camera)])
+        return _fed(stage, message)
+
+    return find
+
+
+def tracking(rig: Message, lenses: dict[str, Message]) -> Finder:
+    """Ours as it runs: one stage for each camera, from frame to frame."""
+    stages = {camera: Detect(OURS) for camera in lenses}
+    for camera, stage in stages.items():
+        _fed(stage, rig)
+        _fed(stage, lenses[camera])
+    return lambda message: _fed(stages[str(message.camera)], message)
+
+
+def stock(rig: Message, lenses: dict[str, Message]) -> Finder:
+    """Ours with OpenCV's detector on the full frame."""
+    return stateless(rig, lenses, detect.STOCK)
+
+
+def decode(_rig: Message, _lenses: dict[str, Message]) -> Finder:
+    """Nothing is looked for: the JPEG becomes a grey picture."""
+
+    def find(message: Message) -> list[tuple[int, Corners]]:
+        simplejpeg.decode_jpeg(message.payload.data, colorspace="GRAY")
+        return []
+
+    return find
+
+
+def read(_rig: Message, _lenses: dict[str, Message]) -> Finder:
+    """The JPEG is read from the log, and not decoded."""
+    return lambda _message: []
+
+
+def apriltags(_rig: Message, _lenses: dict[str, Message]) -> Finder:
+    """The AprilTag library through pupil-apriltags as it comes, on one thread.
+
+    As it comes is quad_decimate 2, quad_sigma 0, refine_edges 1, decode_sharpening 0.25. Its corners run
+    the other way round, from another corner, and count from the edge of the first pixel, not its centre.
+    """
+    from pupil_apriltags import Detector  # type: ignore[import-untyped]
+
+    detector = Detector("tag36h11", nthreads=1)
+
+    def find(message: Message) -> list[tuple[int, Corners]]:
+        grey = simplejpeg.decode_jpeg(message.payload.data, colorspace="GRAY")[..., 0]
+        return [(int(tag.tag_id), tag.corners[_APRILTAG_ORDER] - 0.5) for tag in detector.detect(grey)]
+
+    return find
+
+
+_APRILTAG_ORDER = [1, 0, 3, 2]
+
+FINDERS: dict[str, Callable[[Message, dict[str, Message]], Finder]] = {
+    "plain": plain,
+    "stock": stock,
+    "stateless": stateless,
+    "tracking": tracking,
+    "decode": decode,
+    "read": read,
+    "apriltags": apriltags,
+}
+
+
+def _opened(path: Path) -> tuple[Session, Message, dict[str, Message]]:
+    session = Session([path])
+    (rig,) = session.messages(session.topics(Rig))
+    lenses = {str(one.camera): one for one in session.messages(session.topics(CameraCalibration))}
+    return session, rig, lenses
+
+
+def keep_heap() -> None:
+    """Have glibc keep freed memory for the next frame instead of giving it back and faulting it in anew."""
+    mallopt = getattr(ctypes.CDLL(None), "mallopt", None)
+    if mallopt is not None:
+        mallopt(_TRIM_THRESHOLD, 1 << 28)
+        mallopt(_MMAP_THRESHOLD, 1 << 25)
+
+
+def one_by_one(
+    path: Path, ranges: Sequence[tuple[int, int]], finder: str, threads: int = 1, kept_heap: bool = False
+) -> Turn:
+    """Frame after frame in one thread of Python; OpenCV may use ``threads``, -1 for its default."""
+    if kept_heap:
+        keep_heap()
+    cv2.setNumThreads(threads)
+    session, rig, lenses = _opened(path)
+    find = FINDERS[finder](rig, lenses)
+
+    def turn(number: int) -> list[Found]:
+        frames = session.messages(session.images.values(), *ranges[number])
+        return [(str(frame.camera), frame.publish_time_ns, find(frame)) for frame in frames]
+
+    return turn
+
+
+def threaded(path: Path, ranges: Sequence[tuple[int, int]]) -> Turn:
+    """Ours as :func:`ipsys_log.pipeline.replay` runs it: a thread for each camera."""
+    # Late: the whole package comes with it, and the other contenders start without.
+    from ipsys_log.pipeline import Stage, in_threads, run
+
+    cv2.setNumThreads(1)
+    session, rig, lenses = _opened(path)
+    stage = Stage("bench", detect.READS, Detect(OURS))
+    for _ in run([rig, *lenses.values()], [stage]):
+        pass
+
+    def turn(number: int) -> list[Found]:
+        frames = session.messages(session.images.values(), *ranges[number])
+        return [
+            (str(made.camera), made.publish_time_ns, [(m.id, m.corners_px) for m in made.payload.markers])
+            for made in run(frames, [stage], in_threads)
+            if isinstance(made.payload, Markers)
+        ]
+
+    return turn

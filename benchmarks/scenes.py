@@ -1,0 +1,138 @@
+"""Rendered logs with known truth, drawn once and kept in ``.cache/bench``."""
+
+from __future__ import annotations
+
+import hashlib
+import shutil
+import subprocess
+from collections.abc import Iterator
+from dataclasses import dataclass, replace
+from pathlib import Path
+
+import cv2
+import numpy as np
+from numpy.typing import NDArray
+
+from ipsys_log.log.session import Session
+from ipsys_log.messages import CompressedImage, Message, Tracks
+from ipsys_log.output import write_log
+from ipsys_log.sources import simulator
+from ipsys_log.sources.simulator import LabSettings, hang_cameras, simulate, true_corners
+from ipsys_log.sources.simulator.places import Place, place
+
+__all__ = ["CACHE", "Truth", "blocks", "drawn", "lengthened", "truth", "with_restarts"]
+
+CACHE = Path(__file__).resolve().parent.parent / ".cache" / "bench"
+
+Corners = NDArray[np.float64]
+
+_PAUSE_NS = 1_000_000_000
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class Truth:
+    """Corners in px, (4, 2), by the id of a marker in a frame; ``whole`` are wholly in the image."""
+
+    corners_px: dict[int, Corners]
+    whole: frozenset[int]
+
+
+def drawn(settings: LabSettings) -> Path:
+    """The log of a session of the simulated lab, drawn if it is not there yet."""
+    # Another simulator or another JPEG encoder gives other frames.
+    key = hashlib.blake2b(f"{settings} {cv2.__version__}".encode(), digest_size=8)
+    for source in sorted(Path(simulator.__file__).parent.glob("*.py")):
+        key.update(source.read_bytes())
+    path = CACHE / f"{key.hexdigest()}.mcap"
+    if not path.exists():
+        CACHE.mkdir(parents=True, exist_ok=True)
+        write_log(path, simulate(settings))
+    return path
+
+
+def with_restarts(path: Path, rows: int = 1) -> Path | None:
+    """The same log, its JPEGs losslessly rewritten with a restart marker every ``rows`` rows of blocks.
+
+    None where there is no ``jpegtran`` (Debian: libjpeg-turbo-progs). Another program could only decode
+    and encode again, and the pixels would not be the same.
+    """
+    if shutil.which("jpegtran") is None:
+        return None
+    target = path.with_name(f"{path.stem}-restart-{rows}.mcap")
+    if not target.exists():
+        write_log(target, _restarted(path, rows))
+    return target
+
+
+def _restarted(path: Path, rows: int) -> Iterator[Message]:
+    command = ["jpegtran", "-copy", "all", "-restart", str(rows)]
+    with Session([path]) as session:
+        for message in session.messages({topic for reader in session.readers for topic in reader.channels}):
+            if isinstance(message.payload, CompressedImage):
+                done = subprocess.run(command, input=message.payload.data, capture_output=True, check=True)
+                yield replace(message, payload=replace(message.payload, data=done.stdout))
+            else:
+                yield message
+
+
+def blocks(path: Path, instants: int) -> list[tuple[int, int]]:
+    """Half-open ranges of log time in ns, each of so many frames of every camera."""
+    with Session([path]) as session:
+        starts = [message.log_time_ns for message in session.messages(session.topics(Tracks))]
+        firsts = starts[::instants]
+        return list(zip(firsts, [*firsts[1:], session.end_ns + 1], strict=True))
+
+
+def truth(path: Path, settings: LabSettings) -> dict[tuple[str, int], Truth]:
+    """What is to be seen in each frame, by camera and publish time in ns."""
+    cameras = hang_cameras(settings)
+    found = {}
+    with Session([path]) as session:
+        for tracks in session.payloads(session.topics(Tracks)):
+            for camera in cameras:
+                px = {}
+                for track in tracks.tracks:
+                    where = Place(track.id, track.x_m, track.y_m, track.z_m, track.heading_rad)
+                    printed = place(where, settings)
+                    px[track.id] = true_corners(camera.lens, camera.camera_from_world, printed)
+                whole = frozenset(track.id for track in tracks.tracks if camera.name in track.cameras)
+                found[camera.name, tracks.timestamp] = Truth(px, whole)
+    return found
+
+
+def lengthened(path: Path, target: Path, frames: int) -> None:
+    """Write a longer log: all of one, then its last frames to and fro with new times, to so many frames.
+
+    Nothing jumps, as it would if the frames began again from the first.
+    """
+    write_log(target, _lengthened(path, frames))
+
+
+def _lengthened(path: Path, frames: int) -> Iterator[Message]:
+    with Session([path]) as session:
+        count = 0
+        for message in session.messages({topic for reader in session.readers for topic in reader.channels}):
+            count += isinstance(message.payload, CompressedImage)
+            yield message
+        drive = _continuous(list(session.messages(session.images.values())), len(session.images))
+    step_ns = drive[-1][0].publish_time_ns - drive[-2][0].publish_time_ns
+    shift_ns, order = 0, [*drive[-2::-1], *drive[1:]]
+    start_ns = drive[-1][0].publish_time_ns
+    while count < frames:
+        for instant in order:
+            shift_ns += step_ns
+            for message in instant[: frames - count]:
+                time_ns = start_ns + shift_ns
+                log_time_ns = time_ns + message.log_time_ns - message.publish_time_ns
+                payload = replace(message.payload, timestamp=time_ns)
+                yield Message(message.topic, log_time_ns, time_ns, payload, message.camera)
+                count += 1
+
+
+def _continuous(images: list[Message], cameras: int) -> list[list[Message]]:
+    """The frames of each instant after the last pause."""
+    instants = [images[at : at + cameras] for at in range(0, len(images), cameras)]
+    for at in range(len(instants) - 1, 0, -1):
+        if instants[at][0].publish_time_ns - instants[at - 1][0].publish_time_ns > _PAUSE_NS:
+            return instants[at:]
+    return instants

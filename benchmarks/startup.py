@@ -1,0 +1,79 @@
+"""How long a command takes before it does anything.
+
+    python benchmarks/startup.py
+
+``ipsys --help``, and ``ipsys info`` on a log of 1 GB, beside an interpreter that does nothing; in turns,
+wall time of the whole process, with the files in the page cache.
+"""
+
+from __future__ import annotations
+
+import argparse
+import subprocess
+import sys
+import tempfile
+import time
+from pathlib import Path
+
+from results import Report, command
+from rounds import Row
+from scenes import CACHE, drawn, lengthened
+
+from ipsys_log.sources.simulator import LabSettings
+
+__all__ = ["measure"]
+
+
+def _timed(arguments: list[str]) -> float:
+    begin = time.perf_counter()
+    subprocess.run(arguments, stdout=subprocess.DEVNULL, check=True)
+    return time.perf_counter() - begin
+
+
+def _ipsys() -> list[str]:
+    """The command that pip put beside this interpreter."""
+    installed = Path(sys.executable).with_name("ipsys")
+    return [str(installed)] if installed.exists() else [sys.executable, "-m", "ipsys_log"]
+
+
+def measure(options: argparse.Namespace) -> Report:
+    """Start each command in its turn."""
+    report = Report("startup")
+    width, height = (640, 360) if options.smoke else (1920, 1080)
+    base = drawn(LabSettings(width=width, height=height, stations=0, drive_s=1.0))
+    with tempfile.TemporaryDirectory(dir=CACHE) as folder:
+        path = Path(folder) / "large.mcap"
+        size = base.stat().st_size
+        frames = 90 if options.smoke else round(90 * options.startup_gb * 1e9 / size)
+        lengthened(base, path, frames)
+        commands = {
+            "python -c pass": [sys.executable, "-c", "pass"],
+            "ipsys --help": [*_ipsys(), "--help"],
+            "ipsys info": [*_ipsys(), "info", str(path)],
+        }
+        times: dict[str, list[float]] = {name: [] for name in commands}
+        for arguments in commands.values():  # once for the page cache and the compiled modules
+            _timed(arguments)
+        for _ in range(2 if options.smoke else options.starts):
+            for name, arguments in commands.items():
+                times[name].append(_timed(arguments))
+        report.remarks.append(f"ipsys info on {path.stat().st_size / 1e9:.2f} GB, {frames} frames")
+    base_s = times["python -c pass"]
+    wanted = {"ipsys --help": 0.3, "ipsys info": 0.6}
+    for name in wanted:
+        ratios = tuple(one / other for one, other in zip(times[name], base_s, strict=True))
+        report.rows.append(Row(f"{name} / python -c pass", ratios))
+    for name, seconds in times.items():
+        limit = ("<=", wanted[name]) if name in wanted else None
+        report.rows.append(Row(name, tuple(seconds), "s", limit))
+        report.details[name] = seconds
+    return report
+
+
+def add_options(parser: argparse._ArgumentGroup) -> None:
+    parser.add_argument("--starts", type=int, default=7, help="of each command")
+    parser.add_argument("--startup-gb", type=float, default=1.0, help="size of the log for ipsys info")
+
+
+if __name__ == "__main__":
+    command("startup")

@@ -9,7 +9,7 @@ from numpy.typing import NDArray
 from ipsys_log.errors import IpsysError
 from ipsys_log.messages import CameraCalibration
 
-__all__ = ["DISTORTION_MODELS", "check_calibration", "project", "same_lens", "undistort"]
+__all__ = ["DISTORTION_MODELS", "check_calibration", "check_size", "project", "same_lens", "undistort"]
 
 # Foxglove's and ROS's names; the number of coefficients that each takes.
 DISTORTION_MODELS = {"kannala_brandt": 4, "plumb_bob": 5, "rational_polynomial": 8}
@@ -48,6 +48,22 @@ def check_calibration(lens: CameraCalibration, where: str) -> CameraCalibration:
     if not lens.K[0, 0] > 0 < lens.K[1, 1]:
         raise IpsysError(f"{where}: the camera matrix K has no positive focal lengths; calibrate again")
     return lens
+
+
+def check_size(lens: CameraCalibration, width: int, height: int, camera: str | None) -> None:
+    """See that a calibration is for the frames of a camera.
+
+    Raises
+    ------
+    IpsysError
+        Where it is for another size.
+    """
+    if (lens.width, lens.height) != (width, height):
+        raise IpsysError(
+            f"camera {camera}: its frames are {width} x {height} px, its calibration is for "
+            f"{lens.width} x {lens.height}; calibrate at the size that is recorded, and give that with "
+            f"--calibration {camera}=calibration.yaml"
+        )
 
 
 def same_lens(one: CameraCalibration, other: CameraCalibration) -> bool:

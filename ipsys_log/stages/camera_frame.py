@@ -11,7 +11,7 @@ from numpy.typing import NDArray
 
 from ipsys_log.errors import IpsysError
 from ipsys_log.geometry.corner_noise import check_covariance, pixel_slopes, whiten
-from ipsys_log.geometry.lenses import check_calibration, undistort
+from ipsys_log.geometry.lenses import check_calibration, check_size, undistort
 from ipsys_log.geometry.markers import camera_point, camera_point_slopes, heading
 from ipsys_log.geometry.square_pose import fit_squares, goes_around, reprojection_px
 from ipsys_log.messages import (
@@ -62,7 +62,8 @@ class CameraFrame:
 
     def _frame(self, frame: Markers, message: Message) -> Iterator[Event | CameraPoints]:
         camera, points = message.camera, []
-        self._check_size(frame, camera)
+        if camera in self._lenses:
+            check_size(self._lenses[camera], frame.width, frame.height, camera)
         if frame.markers:
             rig, lens = self._settings(camera)
             seen: list[_Seen] = []
@@ -74,15 +75,6 @@ class CameraFrame:
                     yield Event(message.publish_time_ns, *fault, camera, one.marker.id)
             points = self._method.place(seen, lens) if seen else []
         yield CameraPoints(message.publish_time_ns, tuple(points))
-
-    def _check_size(self, seen: Markers, camera: str | None) -> None:
-        lens = self._lenses.get(camera)
-        if lens is not None and (lens.width, lens.height) != (seen.width, seen.height):
-            raise IpsysError(
-                f"camera {camera}: its frames are {seen.width} x {seen.height} px, its calibration is for "
-                f"{lens.width} x {lens.height}; calibrate at the size that is recorded, and give that with "
-                f"--calibration {camera}=calibration.yaml"
-            )
 
     def _settings(self, camera: str | None) -> tuple[Rig, CameraCalibration]:
         if self._rig is None:

@@ -10,7 +10,7 @@ from typing import Any
 import numpy as np
 
 from ipsys_log.errors import FrameError, IpsysError
-from ipsys_log.geometry.lenses import check_calibration, same_lens
+from ipsys_log.geometry.lenses import check_calibration, check_size, same_lens
 from ipsys_log.messages import (
     CameraCalibration,
     Color,
@@ -66,7 +66,8 @@ class Detect:
     Raises
     ------
     IpsysError
-        For a frame before there is a rig or, with ``edges``, a calibration of its camera.
+        For a frame before there is a rig or, with ``edges``, a calibration of its camera; and for one of
+        another size than the calibration's.
     """
 
     def __init__(self, corners: str = EDGES) -> None:
@@ -119,6 +120,7 @@ class Detect:
             if message.camera not in self._following:
                 self._following[message.camera] = self._follow(message, rig, camera)
             fits, width, height = self._following[message.camera](message.payload, message.publish_time_ns)
+            check_size(self._lenses[message.camera], width, height, message.camera)
             found = [_marker(fit) for fit in fits]
         return [_timed(marker, camera) for marker in found], width, height
 

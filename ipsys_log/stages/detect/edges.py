@@ -107,7 +107,7 @@ def fit_edges(
     with np.errstate(all="ignore"):
         settled, outline = _settle_all(view, guesses, edge_offset_px)
     corners_px, slopes, levels = outline
-    good = settled.good & _whole(corners_px, grey) & _same_cells(levels, view.prints.white)
+    good = settled.good & _whole(corners_px, grey) & _same_cells(view.prints, levels)
     covariances_px2 = slopes @ settled.covariances @ slopes.transpose(0, 2, 1)
     return [
         Fit(
@@ -233,15 +233,11 @@ def _outline(view: View, poses: Poses) -> tuple[Array, Array, Array]:
     per_unit = np.stack([px[:, 4:8] - px[:, :4], px[:, 8:12] - px[:, :4]], axis=3) / view.prints.nudge
     x, y = outline[:4].T
     camera = poses.camera()
-    aside_x, aside_y = (x - camera[:, :1]) / camera[:, 2:], (y - camera[:, 1:2]) / camera[:, 2:]
-    one, none = np.ones_like(aside_x), np.zeros_like(aside_x)
-    inplane = np.stack(
-        [
-            np.stack([one, none, aside_x, aside_x * y, -aside_x * x, -y * one], axis=2),
-            np.stack([none, one, aside_y, aside_y * y, -aside_y * x, x * one], axis=2),
-        ],
-        axis=2,
-    )
+    aside = (outline[:4] - camera[:, None, :2]) / camera[:, None, 2:]
+    inplane = np.zeros((count, 4, 2, 6))
+    inplane[:, :, 0, 0] = inplane[:, :, 1, 1] = 1.0
+    inplane[..., 2], inplane[:, :, 0, 5], inplane[:, :, 1, 5] = aside, -y, x
+    inplane[..., 3], inplane[..., 4] = aside * y[:, None], aside * -x[:, None]
     levels = levels_at(view.grey, *np.ascontiguousarray(px[:, 12:].transpose(2, 0, 1), dtype=np.float32))
     return px[:, :4], (per_unit @ inplane).reshape(count, 8, 6), levels
 
@@ -253,25 +249,19 @@ def _whole(corners_px: Array, grey: Grey) -> NDArray[np.bool_]:
 
 def _blurred(prints: Prints, heights: Array, levels: Array) -> NDArray[np.bool_]:
     """Across which axes edges rise by less than from black cells to white ones, (m, 2)."""
-    bright, dark = _bright_and_dark(levels, prints.white)
-    sums = np.stack(
-        [(heights * (1 - prints.level)).sum(axis=1), (heights * prints.level).sum(axis=1)], axis=1
-    )
-    level = (np.abs(prints.polarity) * prints.level).sum(axis=1)
-    counts = np.stack([np.abs(prints.polarity).sum(axis=1) - level, level], axis=1)
-    return np.asarray(sums < _BLURRED * (bright - dark)[:, None] * counts)
+    bright, dark = _bright_and_dark(prints, levels)
+    rises = (heights[:, None] @ prints.by_axis)[:, 0]
+    return np.asarray(rises < _BLURRED * (bright - dark)[:, None])
 
 
-def _bright_and_dark(levels: Array, white: NDArray[np.bool_]) -> tuple[Array, Array]:
+def _bright_and_dark(prints: Prints, levels: Array) -> tuple[Array, Array]:
     """Mean grey levels of the cells that are white, and of those that are black, (m,) each."""
-    bright = (levels * white).sum(axis=1) / white.sum(axis=1)
-    dark = (levels * ~white).sum(axis=1) / (~white).sum(axis=1)
+    bright, dark = (levels[:, None] @ prints.by_colour)[:, 0].T
     return bright, dark
 
 
-def _same_cells(levels: Array, white: NDArray[np.bool_]) -> NDArray[np.bool_]:
+def _same_cells(prints: Prints, levels: Array) -> NDArray[np.bool_]:
     """Whether cells are white and black as they should be, (m,), from their grey levels (m, c)."""
-    bright, dark = _bright_and_dark(levels, white)
-    wrong = ((levels > ((bright + dark) / 2)[:, None]) != white).sum(axis=1)
-    same: NDArray[np.bool_] = (wrong <= _WRONG_CELLS) & (bright - dark > LEAST_CONTRAST)
-    return same
+    bright, dark = _bright_and_dark(prints, levels)
+    wrong = np.count_nonzero((levels > ((bright + dark) / 2)[:, None]) != prints.white, axis=1)
+    return np.asarray((wrong <= _WRONG_CELLS) & (bright - dark > LEAST_CONTRAST))

@@ -36,6 +36,8 @@ class Prints:
     outline : (12 + c, 2), the corners, the same moved by ``nudge`` in x, and in y, and the middles of the
         cells, black border included.
     white : (m, c), which cells are white.
+    by_axis : (m, s, 2), takes values at points to their means over the edges along y, and along x.
+    by_colour : (m, c, 2), takes values at cells to their means over the white ones and the black ones.
     cells : how many lie along a side.
     """
 
@@ -46,6 +48,8 @@ class Prints:
     polarity: Array
     outline: Array
     white: NDArray[np.bool_]
+    by_axis: Array
+    by_colour: Array
     cells: int
     reach: float
     nudge: float
@@ -61,7 +65,7 @@ def lay_out(dictionary: str, marker_ids: tuple[int, ...]) -> Prints:
     )
     white = np.stack([_white(dictionary, marker_id) for marker_id in marker_ids])
     cells = white.shape[1]
-    points, level = rows[..., :2].copy(), rows[..., 2]
+    points, level, real = rows[..., :2].copy(), rows[..., 2], np.abs(rows[..., 3])
     reach = _REACH / cells
     aside = np.stack([1 - level, level], axis=2) * reach
     return Prints(
@@ -72,10 +76,16 @@ def lay_out(dictionary: str, marker_ids: tuple[int, ...]) -> Prints:
         rows[..., 3].copy(),
         _outline(cells),
         white.reshape(len(white), -1),
+        _means(np.stack([real * (1 - level), real * level], axis=2)),
+        _means(np.stack([white, ~white], axis=3).reshape(len(white), -1, 2).astype(np.float64)),
         cells,
         reach,
         _NUDGE,
     )
+
+
+def _means(shares: Array) -> Array:
+    return np.asarray(shares / shares.sum(axis=1, keepdims=True))
 
 
 def _outline(cells: int) -> Array:

@@ -133,10 +133,8 @@ def _by_area(prints: Prints, profiles: Array, reaches_px: Array) -> tuple[Array,
     contrast = np.maximum(high - low, 1.0)
     white = (profiles.mean(axis=2) - low) / contrast
     rise = (profiles @ _TAPS) / (_TAPS @ _TAPS) / reaches_px * prints.polarity
-    level = prints.level
-    rises = [np.where(real & (level == n), rise, 0.0).sum(axis=1) for n in (0, 1)]
-    rises = [sums / (real & (level == n)).sum(axis=1) for n, sums in enumerate(rises)]
-    width_px = contrast / np.maximum(np.where(level, rises[1][:, None], rises[0][:, None]), 1e-3)
+    rises = rise[:, None] @ prints.by_axis
+    width_px = contrast / np.maximum(np.where(prints.level, rises[..., 1], rises[..., 0]), 1e-3)
     width_px = np.maximum(width_px, 2 * reaches_px)
     return (0.5 - white) * width_px * prints.polarity, width_px, real & (rise > 0)
 

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Iterable, Sequence
 
 import numpy as np
 from numpy.typing import NDArray
@@ -21,6 +21,7 @@ _CHANGED_SAMPLES = 3
 # A marker of which only a part has changed is cut off by no less.
 _AROUND_PX = 192
 _ENTERED = 0.5
+_MARGIN = 0.35
 # A thing that stays becomes background within some ten frames.
 _LEARN = np.float32(0.15)
 
@@ -46,12 +47,13 @@ class Watch:
         samples = grey[_HALF_PX::_EVERY_PX, _HALF_PX::_EVERY_PX].astype(np.float32)
         if self._background.shape != samples.shape:
             self._background = np.full_like(samples, np.nan)
-        self.forget(markers_px)
+        covered = _boxes(markers_px)
+        self._forget(covered)
         new = np.zeros(samples.shape, dtype=bool)
         for part in rows:
             here = slice(-((_HALF_PX - part.start) // _EVERY_PX), -((_HALF_PX - part.stop) // _EVERY_PX))
             new[here] = self._learn(samples[here], self._background[here])
-        self.forget(markers_px)
+        self._forget(covered)
         if np.count_nonzero(new) < _CHANGED_SAMPLES:
             return None
         spans = [np.flatnonzero(new.any(axis=1)), np.flatnonzero(new.any(axis=0))]
@@ -70,12 +72,22 @@ class Watch:
 
     def forget(self, markers_px: Sequence[Array]) -> None:
         """What lies under markers (4, 2) is not known: it is no change when it comes to light."""
-        for corners_px in markers_px:
-            # The white margin and what carries the marker belong to it.
-            around = 0.35 * np.ptp(corners_px, axis=0) + _EVERY_PX
-            low = np.maximum((corners_px.min(axis=0) - around) / _EVERY_PX, 0).astype(int)
-            high = np.maximum((corners_px.max(axis=0) + around) / _EVERY_PX + 1, 0).astype(int)
-            self._background[low[1] : high[1], low[0] : high[0]] = np.nan
+        self._forget(_boxes(markers_px))
+
+    def _forget(self, boxes: Iterable[tuple[slice, slice]]) -> None:
+        for box in boxes:
+            self._background[box] = np.nan
+
+
+def _boxes(markers_px: Sequence[Array]) -> list[tuple[slice, slice]]:
+    """Rows and columns of samples that markers (4, 2) cover, with their margin and what carries them."""
+    if not markers_px:
+        return []
+    corners_px = np.array(markers_px)
+    low, high = corners_px.min(axis=1), corners_px.max(axis=1)
+    around = _MARGIN * (high - low) + _EVERY_PX
+    spans = np.maximum(np.concatenate([low - around, high + around], axis=1) / _EVERY_PX, 0).astype(int)
+    return [(slice(top, bottom + 2), slice(left, right + 2)) for left, top, right, bottom in spans.tolist()]
 
 
 def _around(span: NDArray[np.intp]) -> slice:

@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+from array import array
+from collections import Counter
 from collections.abc import Iterable, Iterator
 from statistics import median
 
@@ -23,10 +25,14 @@ class Remarks:
     def __init__(self, task: Task, skip_ambiguous: bool) -> None:
         self._task = task
         self._skip_ambiguous = skip_ambiguous
-        self._events: dict[str, list[Message]] = {}
+        # Of each kind of event: how many there were, and the first of them.
+        self._events: Counter[str] = Counter()
+        self._first: dict[str, Message] = {}
+        self._unknown: set[str] = set()
         self._frames = self._markers = 0
         self._located: set[str | None] = set()
-        self._offsets_px: dict[str, list[float]] = {}
+        # Eight bytes for each: a long log has millions.
+        self._offsets_px: dict[str, array[float]] = {}
 
     def watch(self, messages: Iterable[Message]) -> Iterator[Message]:
         """The messages, unchanged.
@@ -46,7 +52,10 @@ class Remarks:
     def _note(self, message: Message) -> None:
         payload = message.payload
         if isinstance(payload, Event):
-            self._events.setdefault(payload.kind, []).append(message)
+            self._events[payload.kind] += 1
+            self._first.setdefault(payload.kind, message)
+            if payload.kind == "unknown_marker":
+                self._unknown.add(str(payload.marker_id))
             if payload.kind == "ambiguous_marker" and not self._skip_ambiguous:
                 raise IpsysError(
                     f"{_said(message)}: give each marker an id of its own, or leave it out of such frames "
@@ -55,19 +64,19 @@ class Remarks:
         elif isinstance(payload, Markers):
             self._frames += 1
             self._markers += len(payload.markers)
-            offsets = self._offsets_px.setdefault(str(message.camera), [])
-            offsets += [m.edge_offset_px for m in payload.markers if m.edge_offset_px is not None]
+            offsets = self._offsets_px.setdefault(str(message.camera), array("d"))
+            offsets.extend(m.edge_offset_px for m in payload.markers if m.edge_offset_px is not None)
         elif isinstance(payload, Positions):
             self._located.add(message.camera)
 
     def _check_detection(self) -> None:
-        corrupt = self._events.get("corrupt_frame", ())
+        corrupt = self._events["corrupt_frame"]
         if corrupt and not self._frames:
-            raise IpsysError(f"none of {len(corrupt)} frames can be decoded, first: {_said(corrupt[0])}")
-        unknown = {str(message.payload.marker_id) for message in self._events.get("unknown_marker", ())}
-        if unknown and not self._markers:
+            first = _said(self._first["corrupt_frame"])
+            raise IpsysError(f"none of {corrupt} frames can be decoded, first: {first}")
+        if self._unknown and not self._markers:
             raise IpsysError(
-                f"no marker of the rig is in any frame, but ids {', '.join(sorted(unknown))} are: add "
+                f"no marker of the rig is in any frame, but ids {', '.join(sorted(self._unknown))} are: add "
                 "them as [[markers]] to lab.toml and give it with --rig"
             )
         if self._frames and not self._markers:
@@ -79,8 +88,8 @@ class Remarks:
     def lines(self) -> tuple[str, ...]:
         """One line for each thing to know."""
         lines = [
-            f"{len(found)} x {kind.replace('_', ' ')}, first: {_said(found[0])}"
-            for kind, found in sorted(self._events.items())
+            f"{count} x {kind.replace('_', ' ')}, first: {_said(self._first[kind])}"
+            for kind, count in sorted(self._events.items())
         ]
         if self._task.stage == "detect":
             lines.insert(0, f"{self._markers} markers in {self._frames} frames")

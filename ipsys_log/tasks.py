@@ -61,7 +61,8 @@ class Task:
     topics : what it reads of the log, and ``foreign`` what it reads of another one.
     writes : the payloads that it makes, first the one that it is there for.
     reads, step, per_camera : a causal stage: its payloads, its step for a run of a given name, and whether
-        the step takes each camera by itself; or
+        the step takes each camera by itself; ``decodes_frames`` says that its work is done outside of Python,
+        so that cameras can use the cores at the same time; or
     compute : the payload that is computed from the whole log, saying how far it is; what to know of it goes
         to ``notes``.
     parameters : what else its result depends on; ``input_runs`` those of ``foreign``.
@@ -75,6 +76,7 @@ class Task:
     reads: tuple[type, ...] = ()
     step: Callable[[str], Callable[[Message], Iterable[Any]]] | None = None
     per_camera: bool = True
+    decodes_frames: bool = False
     compute: Callable[[Session, Callable[[int, int], None]], Any] | None = None
     parameters: Mapping[str, str] = field(default_factory=dict)
     rig: Rig | None = None
@@ -127,6 +129,7 @@ def _detect(session: Session, request: Request) -> Task | str:
         (Markers, ImageAnnotations, Event),
         detect.READS,
         lambda run: detect.Detect(request.corners),
+        decodes_frames=True,
         parameters={"corners": request.corners},
         rig=rig,
         lenses=lenses,

@@ -7,26 +7,28 @@ from numpy.typing import NDArray
 
 __all__ = ["camera_point", "camera_point_slopes", "heading", "marker_corners"]
 
+Array = NDArray[np.float64]
+
 # Around the marker.
-_NEXT, _BEFORE = [1, 2, 3, 0], [3, 0, 1, 2]
+_NEXT, _BEFORE = np.array([1, 2, 3, 0]), np.array([3, 0, 1, 2])
 
 
-def camera_point(corners_uv: NDArray[np.float64], length_m: float) -> NDArray[np.float64]:
-    """Centre of a marker that lies parallel to the image plane, in the frame of the camera.
+def camera_point(corners_uv: Array, length_m: float | Array) -> Array:
+    """Centre of a marker, or of several, that lie parallel to the image plane, in the frame of the camera.
 
     Parameters
     ----------
-    corners_uv : (4, 2), normalized image coordinates, in order around the marker.
-    length_m : side of the marker's black square, in m.
+    corners_uv : (..., 4, 2), normalized image coordinates, in order around the marker.
+    length_m : side of the marker's black square, or one for each (...), in m.
 
     Returns
     -------
-    (3,): Xc right, Yc down, Zc forward, in m.
+    (..., 3): Xc right, Yc down, Zc forward, in m.
 
     Raises
     ------
     ValueError
-        Where the four corners fall together.
+        Where the four corners of a marker fall together.
 
     References
     ----------
@@ -39,55 +41,71 @@ def camera_point(corners_uv: NDArray[np.float64], length_m: float) -> NDArray[np
     >>> camera_point(uv, 0.2).round(9).tolist()
     [0.1, 0.1, 2.0]
     """
-    sides = np.linalg.norm(corners_uv[_NEXT] - corners_uv, axis=1)
-    perimeter = float(sides.sum())
-    if perimeter == 0.0:
+    _, lengths = _sides(corners_uv)
+    perimeter = lengths.sum(axis=-1)
+    if (perimeter == 0.0).any():
         raise ValueError("the four corners fall together")
     z_m = 4.0 * length_m / perimeter  # eq. (3)
-    u, v = corners_uv.mean(axis=0)
-    return np.array([z_m * u, z_m * v, z_m])  # eq. (4), (5)
+    points_m: Array = np.ones((*perimeter.shape, 3))
+    points_m[..., :2] = _centre(corners_uv)
+    points_m *= z_m[..., None]  # eq. (4), (5)
+    return points_m
 
 
-def camera_point_slopes(corners_uv: NDArray[np.float64], length_m: float) -> NDArray[np.float64]:
+def camera_point_slopes(corners_uv: Array, length_m: float | Array) -> Array:
     """By how much :func:`camera_point` moves with the corners.
 
     Parameters
     ----------
-    corners_uv : (4, 2), normalized image coordinates, not all the same.
-    length_m : side of the marker's black square, in m.
+    corners_uv : (..., 4, 2), normalized image coordinates; not all four of a marker the same.
+    length_m : side of the marker's black square, or one for each (...), in m.
 
     Returns
     -------
-    (4, 3, 2): for each corner rows Xc, Yc, Zc in m, columns u and v.
+    (..., 4, 3, 2): for each corner rows Xc, Yc, Zc in m, columns u and v.
     """
-    sides = corners_uv[_NEXT] - corners_uv
-    lengths = np.sqrt((sides * sides).sum(axis=1))
-    perimeter = lengths.sum()
+    sides, lengths = _sides(corners_uv)
     # A side that has no length has no direction either.
-    along = sides / np.maximum(lengths, np.finfo(np.float64).tiny)[:, None]
+    along = sides / np.maximum(lengths, np.finfo(np.float64).tiny)[..., None]
+    perimeter = lengths.sum(axis=-1)
     z_m = 4.0 * length_m / perimeter
-    slopes = np.empty((4, 3, 2))
-    slopes[:, 2] = z_m / perimeter * (along - along[_BEFORE])
-    slopes[:, :2] = corners_uv.mean(axis=0)[:, None] * slopes[:, 2:] + z_m / 4 * np.eye(2)
+    by_side, by_centre = (z_m / perimeter)[..., None, None], (z_m / 4)[..., None, None, None]
+    slopes = np.empty((*lengths.shape, 3, 2))
+    slopes[..., 2, :] = by_side * (along - along.take(_BEFORE, axis=-2))
+    centre = _centre(corners_uv)[..., None, :, None]
+    slopes[..., :2, :] = centre * slopes[..., 2:, :] + by_centre * np.eye(2)
     return slopes
 
 
-def heading(corners_uv: NDArray[np.float64]) -> float:
-    """Minus the angle from corner 3 to corner 0 in the plane of the image, in rad in (-pi, pi].
+def _sides(corners_uv: Array) -> tuple[Array, Array]:
+    """Vectors (..., 4, 2) from each corner to the next, and their lengths (..., 4)."""
+    sides = corners_uv.take(_NEXT, axis=-2) - corners_uv
+    return sides, np.sqrt((sides * sides).sum(axis=-1))
+
+
+def _centre(corners_uv: Array) -> Array:
+    # numpy's mean takes three times as long for four numbers.
+    centre: Array = corners_uv.sum(axis=-2) / 4
+    return centre
+
+
+def heading(corners_uv: Array) -> Array:
+    """Minus the angle from corner 3 to corner 0 in the plane of the image, (...) in rad in (-pi, pi].
 
     Parameters
     ----------
-    corners_uv : (4, 2), normalized image coordinates.
+    corners_uv : (..., 4, 2), normalized image coordinates.
 
     References
     ----------
     The authors' program; the paper does not define the heading.
     """
-    du, dv = corners_uv[0] - corners_uv[3]
-    return float(np.arctan2(-dv, du))
+    side = corners_uv[..., 0, :] - corners_uv[..., 3, :]
+    angle: Array = np.arctan2(-side[..., 1], side[..., 0])
+    return angle
 
 
-def marker_corners(length_m: float) -> NDArray[np.float64]:
+def marker_corners(length_m: float) -> Array:
     """Corners of a marker in its own frame (x right, y up, z towards the viewer), (4, 3) in m.
 
     In OpenCV's order: clockwise, as seen from in front, from the top left.

@@ -6,7 +6,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from ipsys_log.messages import CameraModel
-from ipsys_log.models import inputs, restore
+from ipsys_log.models import inputs, predict_array, restore
 from ipsys_log.models.uncertainty import Uncertainty, Volume
 
 __all__ = ["AppliedModel"]
@@ -31,8 +31,7 @@ class AppliedModel:
 
     def predict(self, points_m: Array, heights_m: Array) -> Array:
         """World points (n, 3) from camera points (n, 3) and heights (n,), all in m."""
-        world_m: Array = self._estimator.predict(inputs(self._name, points_m, heights_m))
-        return world_m
+        return predict_array(self._estimator, inputs(self._name, points_m, heights_m))
 
     def covariances(self, points_m: Array, heights_m: Array) -> Array | None:
         """Covariances (n, 3, 3) in m^2 of the world points; None where they are not known."""

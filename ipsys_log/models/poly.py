@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from functools import cache
 from typing import Any, ClassVar
 
 import numpy as np
@@ -34,8 +35,15 @@ def regressors(points: Array) -> Array:
     >>> regressors(np.array([[2.0, 3.0, 5.0]]))[0].tolist()
     [1.0, 2.0, 3.0, 5.0, 4.0, 6.0, 10.0, 9.0, 15.0, 25.0]
     """
-    first, second = np.triu_indices(points.shape[1])
+    first, second = _factors(points.shape[1])
     return np.hstack([np.ones((len(points), 1)), points, points[:, first] * points[:, second]])
+
+
+@cache
+def _factors(columns: int) -> tuple[NDArray[np.intp], NDArray[np.intp]]:
+    """The columns that are multiplied for the second-order terms."""
+    first, second = np.triu_indices(columns)
+    return first, second
 
 
 class PolynomialRegression(MultiOutputMixin, RegressorMixin, BaseEstimator):  # type: ignore[misc]
@@ -65,6 +73,8 @@ class PolynomialRegression(MultiOutputMixin, RegressorMixin, BaseEstimator):  # 
 
     def predict(self, X: Any) -> Array:
         check_is_fitted(self)
-        X = validate_data(self, X, dtype=np.float64, reset=False)
+        return self.predict_array(validate_data(self, X, dtype=np.float64, reset=False))
+
+    def predict_array(self, X: Array) -> Array:
         prediction: Array = regressors((X - self.centre_) / self.scale_) @ self.coefficients_
         return prediction

@@ -125,7 +125,9 @@ class RayDepth(RegressorMixin, BaseEstimator):  # type: ignore[misc]
 
     def predict(self, X: Any) -> Array:
         check_is_fitted(self)
-        X = np.asarray(X, dtype=np.float64)
+        return self.predict_array(np.asarray(X, dtype=np.float64))
+
+    def predict_array(self, X: Array) -> Array:
         rays = directions(X, self.lens_) @ self.rotation_.T
         terms, growth = depth_terms(X)
         heights_m = self.origin_[2] + X[:, 2] * (1 + terms @ self.depth_) * rays[:, 2]

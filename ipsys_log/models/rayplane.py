@@ -53,6 +53,8 @@ class RayPlane(RegressorMixin, BaseEstimator):  # type: ignore[misc]
 
     def predict(self, X: Any) -> Array:
         check_is_fitted(self)
-        X = np.asarray(X, dtype=np.float64)
+        return self.predict_array(np.asarray(X, dtype=np.float64))
+
+    def predict_array(self, X: Array) -> Array:
         rays = directions(X[:, :3], self.lens_) @ self.rotation_.T
         return meet_height(self.origin_, rays, X[:, 3])

@@ -77,7 +77,9 @@ class RigidTransform(RegressorMixin, BaseEstimator):  # type: ignore[misc]
 
     def predict(self, X: Any) -> Array:
         check_is_fitted(self)
-        X = np.asarray(X, dtype=np.float64)
+        return self.predict_array(np.asarray(X, dtype=np.float64))
+
+    def predict_array(self, X: Array) -> Array:
         prediction: Array = X @ self.rotation_.T + self.translation_  # eq. (6)
         return prediction
 

@@ -10,6 +10,7 @@ from __future__ import annotations
 
 from collections.abc import Callable
 from dataclasses import dataclass
+from functools import cached_property
 
 import numpy as np
 from numpy.typing import NDArray
@@ -24,9 +25,10 @@ Array = NDArray[np.float64]
 Predict = Callable[[Array, Array], Array]
 
 _STEP_M = 0.005
+_STEPS_M = _STEP_M * np.eye(3)
 # A marker's height on its robot is measured with a ruler, once and with care.
 _HEIGHT_SIGMA_M = 0.0005
-_FLOOR_SIGMA_M = 0.0003
+_FLOOR_M2 = 0.0003**2 * np.eye(3)
 # What the noise usually is, and within which factor (e to the power of it), before anything is measured.
 _USUAL_NOISE = np.log([3e-4, 1e-4])
 _NOISE_SPREAD = 2.0
@@ -38,7 +40,7 @@ _ROBUST = 16.3
 _EDGE_M = 0.01
 
 
-@dataclass(frozen=True, slots=True, eq=False)
+@dataclass(frozen=True, eq=False)  # without slots, for what is kept
 class Uncertainty:
     """What the covariance of a position is made of.
 
@@ -62,10 +64,18 @@ class Uncertainty:
         """Covariance of the world point of each camera point, (n, 3, 3) in m^2."""
         slopes, by_height = _slopes(predict, points_m, heights_m)
         wide = _wide(points_m) ** (2 * self.growth)
-        noise = np.diag([self.across**2, self.across**2, self.along**2])
-        inside = wide[:, None, None] * noise + _leverage(self.points_m, points_m)[:, None, None] * self.fit
+        leverage = _leverage(self._inverse, points_m)
+        inside = wide[:, None, None] * self._noise + leverage[:, None, None] * self.fit
         covariances: Array = slopes @ inside @ slopes.transpose(0, 2, 1) + by_height
         return covariances
+
+    @cached_property
+    def _noise(self) -> Array:
+        return np.diag([self.across**2, self.across**2, self.along**2])
+
+    @cached_property
+    def _inverse(self) -> Array:
+        return _inverse_of_terms(self.points_m)
 
 
 def _wide(points_m: Array) -> Array:
@@ -77,25 +87,34 @@ def _wide(points_m: Array) -> Array:
 def _slopes(predict: Predict, points_m: Array, heights_m: Array) -> tuple[Array, Array]:
     """Derivative of the world point by (u, v, ln Zc), (n, 3, 3), and its covariance from the known height."""
     count = len(points_m)
-    steps = _STEP_M * np.eye(3)
-    stacked = np.vstack([points_m, *(points_m + step for step in steps), points_m])
-    heights = np.concatenate([*([heights_m] * 4), heights_m + _STEP_M])
-    here, *moved = predict(stacked, heights).reshape(5, count, 3)
-    by_x, by_y, by_z, by_height = ((there - here) / _STEP_M for there in moved)
+    # Here, one step along each axis, and here with the marker one step higher.
+    points, heights = np.empty((5, count, 3)), np.empty((5, count))
+    points[:], heights[:] = points_m, heights_m
+    points[1:4] += _STEPS_M[:, None]
+    heights[4] += _STEP_M
+    found = predict(points.reshape(-1, 3), heights.reshape(-1)).reshape(5, count, 3)
+    by_x, by_y, by_z, by_height = (found[1:] - found[0]) / _STEP_M
     depth = points_m[:, 2:]
-    along = by_x * points_m[:, :1] + by_y * points_m[:, 1:2] + by_z * depth
+    slopes = np.empty((count, 3, 3))
+    slopes[:, :, 0] = by_x * depth
+    slopes[:, :, 1] = by_y * depth
+    slopes[:, :, 2] = by_x * points_m[:, :1] + by_y * points_m[:, 1:2] + by_z * depth
     height = by_height * _HEIGHT_SIGMA_M
-    return (
-        np.stack([by_x * depth, by_y * depth, along], axis=2),
-        height[:, :, None] * height[:, None, :] + _FLOOR_SIGMA_M**2 * np.eye(3),
-    )
+    return slopes, height[:, :, None] * height[:, None, :] + _FLOOR_M2
 
 
-def _leverage(fitted_m: Array, points_m: Array) -> Array:
-    """How much a second-order polynomial in (u, v) rests on itself at each point: mean 6 / n where fitted."""
-    terms, at = leverage_terms(fitted_m), leverage_terms(points_m)
+def _inverse_of_terms(fitted_m: Array) -> Array:
+    terms = leverage_terms(fitted_m)
     # A trace on the diagonal where there are fewer places than terms.
-    inverse = np.linalg.inv(terms.T @ terms + 1e-9 * np.eye(6))
+    return np.asarray(np.linalg.inv(terms.T @ terms + 1e-9 * np.eye(6)), dtype=np.float64)
+
+
+def _leverage(inverse: Array, points_m: Array) -> Array:
+    """How much a second-order polynomial in (u, v) rests on itself at each point: mean 6 / n where fitted.
+
+    ``inverse`` is that of the places that were fitted on, (6, 6).
+    """
+    at = leverage_terms(points_m)
     leverage: Array = np.einsum("ni,ij,nj->n", at, inverse, at)
     return leverage
 
@@ -133,7 +152,7 @@ def estimate_uncertainty(
     base = predict(points_m, world_m[:, 2])
     residuals = without[left_out, np.arange(len(points_m))] - world_m
     slopes, by_height = _slopes(predict, points_m, world_m[:, 2])
-    leverage = _leverage(points_m, points_m)
+    leverage = _leverage(_inverse_of_terms(points_m), points_m)
     variances = _fit_variances(without - base, base - world_m, residuals, left_out)
     # Where a model does not use the depth, nothing is said of it.
     back = np.linalg.pinv(slopes, rcond=1e-6)

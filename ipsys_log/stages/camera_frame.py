@@ -118,24 +118,30 @@ def _lens_slopes(seen: Sequence[_Seen], lens: CameraCalibration) -> Array:
 
 
 def _by_perimeter(seen: Sequence[_Seen], lens: CameraCalibration) -> list[CameraPoint]:
-    covariances_m2 = _perimeter_covariances(seen, lens)
+    uv, lengths_m = np.stack([one.uv for one in seen]), np.array([one.length_m for one in seen])
+    places = zip(camera_point(uv, lengths_m).tolist(), heading(uv).tolist(), strict=True)
+    covariances_m2 = _perimeter_covariances(seen, uv, lengths_m, lens)
     points = []
-    for (marker, uv, length_m), covariance_m2 in zip(seen, covariances_m2, strict=True):
-        x_m, y_m, z_m = camera_point(uv, length_m).tolist()
-        offset_ns = marker.time_offset_ns
-        points.append(CameraPoint(marker.id, x_m, y_m, z_m, heading(uv), offset_ns, covariance_m2))
+    for n, ((marker, _, _), ((x_m, y_m, z_m), heading_rad)) in enumerate(zip(seen, places, strict=True)):
+        offset_ns, covariance_m2 = marker.time_offset_ns, covariances_m2.get(n)
+        points.append(CameraPoint(marker.id, x_m, y_m, z_m, heading_rad, offset_ns, covariance_m2))
     return points
 
 
-def _perimeter_covariances(seen: Sequence[_Seen], lens: CameraCalibration) -> list[Array | None]:
-    found: list[Array | None] = [None] * len(seen)
-    if all(one.marker.covariance_px2 is None for one in seen):
-        return found
-    for n, (one, uv_by_px) in enumerate(zip(seen, np.linalg.inv(_lens_slopes(seen, lens)), strict=True)):
-        if one.marker.covariance_px2 is not None:
-            m_by_px = np.concatenate(camera_point_slopes(one.uv, one.length_m) @ uv_by_px, axis=1)
-            found[n] = m_by_px @ one.marker.covariance_px2 @ m_by_px.T
-    return found
+def _perimeter_covariances(
+    seen: Sequence[_Seen], uv: Array, lengths_m: Array, lens: CameraCalibration
+) -> dict[int, Array]:
+    """Covariances (3, 3) in m^2, by index, of those points whose corners have one."""
+    given = {n: one.marker.covariance_px2 for n, one in enumerate(seen)}
+    known = {n: covariance_px2 for n, covariance_px2 in given.items() if covariance_px2 is not None}
+    if not known:
+        return {}
+    indices = list(known)
+    by_px = np.linalg.inv(pixel_slopes(uv[indices].reshape(-1, 2), lens)).reshape(-1, 4, 2, 2)
+    by_corner = camera_point_slopes(uv[indices], lengths_m[indices]) @ by_px
+    m_by_px = by_corner.swapaxes(1, 2).reshape(-1, 3, 8)
+    covariances_m2 = m_by_px @ np.stack([*known.values()]) @ m_by_px.swapaxes(1, 2)
+    return dict(zip(indices, covariances_m2, strict=True))
 
 
 def _by_pose(seen: Sequence[_Seen], lens: CameraCalibration) -> list[CameraPoint]:

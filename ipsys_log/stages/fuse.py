@@ -107,10 +107,8 @@ def fuse_positions(positions: list[Position]) -> Position:
     if len(positions) == 1:
         return positions[0]
     points = np.array([(p.x_m, p.y_m, p.z_m) for p in positions])
-    covariances = [p.covariance_m2 for p in positions if _is_covariance(p.covariance_m2)]
-    covariance_m2 = None
-    if len(covariances) == len(positions):
-        weights = np.linalg.inv(np.array(covariances))
+    weights, covariance_m2 = _weights(positions), None
+    if weights is not None:
         covariance_m2 = np.linalg.inv(weights.sum(axis=0))
         mean = covariance_m2 @ np.einsum("nij,nj->i", weights, points)
     else:
@@ -123,11 +121,14 @@ def fuse_positions(positions: list[Position]) -> Position:
     return Position(positions[0].id, x_m, y_m, z_m, heading_rad, covariance_m2)
 
 
-def _is_covariance(matrix: NDArray[np.float64] | None) -> bool:
-    """Whether it can be a weight: a log may hold anything."""
-    return matrix is not None and bool(
-        np.isfinite(matrix).all() and np.linalg.eigvalsh(matrix)[0] > 0  # lower triangle
-    )
+def _weights(positions: list[Position]) -> NDArray[np.float64] | None:
+    """Inverse covariances (n, 3, 3), where every position has one: a log may hold anything."""
+    found = [p.covariance_m2 for p in positions if p.covariance_m2 is not None]
+    covariances = np.array(found)
+    if len(found) < len(positions) or not np.isfinite(covariances).all():
+        return None
+    least = np.linalg.eigvalsh(covariances)[:, 0]  # of the lower triangles
+    return np.asarray(np.linalg.inv(covariances), dtype=np.float64) if (least > 0).all() else None
 
 
 def _transform(track: Track, run: str, time_ns: int) -> FrameTransform:

@@ -55,3 +55,14 @@ def test_the_slopes_are_those_of_the_camera_point(
     by_step = [camera_point(uv + s, length_m) - camera_point(uv - s, length_m) for s in steps]
     expected = np.reshape(by_step, (4, 2, 3)).swapaxes(1, 2) / 2e-7
     np.testing.assert_allclose(camera_point_slopes(uv, length_m), expected, rtol=1e-4, atol=1e-3)
+
+
+@given(st.integers(0, 1000), st.integers(1, 9))
+def test_markers_together_are_where_they_are_one_by_one_to_the_last_bit(seed: int, count: int) -> None:
+    rng = np.random.default_rng(seed)
+    uv = rng.normal(0, 0.5, (count, 1, 2)) + rng.normal(0, 0.05, (count, 4, 2))
+    lengths_m = rng.uniform(0.05, 0.3, count)
+    together = camera_point(uv, lengths_m), camera_point_slopes(uv, lengths_m), heading(uv)
+    for n, (corners, length_m) in enumerate(zip(uv, lengths_m.tolist(), strict=True)):
+        alone = camera_point(corners, length_m), camera_point_slopes(corners, length_m), heading(corners)
+        assert all(one.tobytes() == other[n].tobytes() for one, other in zip(alone, together, strict=True))

@@ -19,7 +19,7 @@ from sklearn.preprocessing import PolynomialFeatures
 from sklearn.utils.estimator_checks import check_estimator
 
 from ipsys_log.errors import FitError, IpsysError
-from ipsys_log.models import MODELS, create, inputs, min_pairs, parameters, restore
+from ipsys_log.models import MODELS, create, inputs, min_pairs, parameters, predict_array, restore
 from ipsys_log.models.poly import PolynomialRegression
 from ipsys_log.models.rigid import rigid_transform
 
@@ -123,3 +123,13 @@ def test_unknown_models_and_parameters_are_named() -> None:
         create("spline")
     with pytest.raises(IpsysError, match="has no parameter 'rotation'"):
         restore("rigid", {"translation": np.zeros(3)})
+
+
+@pytest.mark.parametrize("name", ["rigid", "poly", "rigid+poly", "rayplane", "best"])
+def test_without_checks_a_model_says_the_same_to_the_last_bit(name: str) -> None:
+    points, world = places(0)
+    heights = np.full(len(points), 0.1)
+    model = create(name).fit(inputs(name, points, heights), np.column_stack([world[:, :2], heights]))
+    for count in (1, 2, 5, 40):
+        some = inputs(name, points[:count], heights[:count])
+        assert predict_array(model, some).tobytes() == model.predict(some).tobytes()

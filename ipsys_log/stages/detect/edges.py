@@ -66,13 +66,14 @@ class Guess(NamedTuple):
 
 class Fit(NamedTuple):
     """Where a marker is, with the covariance (8, 8) of its corners x0 y0 .. x3 y3; by how much edges of black
-    lie inside the black; and how far edges are from where the fit has them (RMS)."""
+    lie inside the black; how far edges are from where the fit has them (RMS); and how blurred they are."""
 
     pose: Guess
     corners_px: Array
     covariance_px2: Array
     edge_offset_px: float
     spread_px: float
+    blur_px: float
 
 
 def fit_edges(
@@ -82,6 +83,7 @@ def fit_edges(
     lens: CameraCalibration,
     edge_offset_px: float | None = None,
     row_time_s: float = 0.0,
+    blur_px: float | None = None,
 ) -> list[Fit | None]:
     """Fit markers to the picture of them.
 
@@ -94,19 +96,22 @@ def fit_edges(
     edge_offset_px : by how much edges of black lie inside the black; None: found with each marker.
     row_time_s : between the exposures of two rows. Markers are given as they were when the row of their
         middle was exposed.
+    blur_px : of edges in pictures of this camera; None: what these look like.
 
     Returns
     -------
     For each guess the fit, or None where there is no such marker: the fit does not settle, edges are
     missing, a corner lies outside of the picture, or the cells are not those of this id.
     """
+    possible = _poses(guesses).possible() if guesses else np.ones(0, dtype=bool)
+    if not possible.all():
+        some = [guess for guess, ok in zip(guesses, possible, strict=True) if ok]
+        found = iter(fit_edges(grey, some, dictionary, lens, edge_offset_px, row_time_s, blur_px))
+        return [next(found) if ok else None for ok in possible]
     if not guesses:
         return []
-    view = View(grey, lens, lay_out(dictionary, tuple(guess.id for guess in guesses)), row_time_s)
-    # What is no marker may run away, behind the camera even: its numbers are of no use then, and not used.
-    with np.errstate(all="ignore"):
-        settled, outline = _settle_all(view, guesses, edge_offset_px)
-    corners_px, slopes, levels = outline
+    view = View(grey, lens, lay_out(dictionary, tuple(guess.id for guess in guesses)), row_time_s, blur_px)
+    settled, (corners_px, slopes, levels) = _settle_all(view, guesses, edge_offset_px)
     good = settled.good & _whole(corners_px, grey) & _same_cells(view.prints, levels)
     covariances_px2 = slopes @ settled.covariances @ slopes.transpose(0, 2, 1)
     return [
@@ -116,11 +121,16 @@ def fit_edges(
             covariances_px2[n],
             float(settled.edge_offsets_px[n]),
             float(settled.spreads_px[n]),
+            settled.blur_px,
         )
         if good[n]
         else None
         for n, guess in enumerate(guesses)
     ]
+
+
+def _poses(guesses: Sequence[Guess]) -> Poses:
+    return Poses(np.array([one.rotation for one in guesses]), np.array([one.centre for one in guesses]))
 
 
 class _Settled(NamedTuple):
@@ -133,6 +143,7 @@ class _Settled(NamedTuple):
     heights: Array
     blurred: NDArray[np.bool_]
     spreads_px: Array
+    blur_px: float
 
 
 def _settle_all(
@@ -152,7 +163,7 @@ def _settle(
     view: View, guesses: Sequence[Guess], edge_offset_px: float | None, blurred: NDArray[np.bool_]
 ) -> _Settled:
     """Move markers until they settle; ``blurred`` (m, 2) says across which of their axes edges are."""
-    poses = Poses(np.array([one.rotation for one in guesses]), np.array([one.centre for one in guesses]))
+    poses = _poses(guesses)
     # Unknown are a twist, the edge offset and, where rows take time, the speed along the print.
     unknowns = 9 if view.row_time_s else 7
     known, hold = _known(guesses, edge_offset_px)
@@ -171,7 +182,10 @@ def _settle(
         moved_px = np.abs(seen.off_px - left_px + found[:, 6:7] * view.prints.polarity).max(axis=1)
         # A step of many pixels was read off another edge.
         short = np.minimum(1.0, _SHORT_PX / np.maximum(moved_px, _SHORT_PX))
-        poses = poses.moved(found[:, :6] * short[:, None])
+        moved = poses.moved(found[:, :6] * short[:, None])
+        # What is no marker may run away, behind the camera even: it stays, and never settles.
+        possible = moved.possible()
+        poses, moved_px = moved.where(possible, poses), np.where(possible, moved_px, np.inf)
         motions = np.concatenate([found[:, 7:], motions[:, unknowns - 7 :]], axis=1)
         spread_px = np.sqrt((weights * left_px**2).sum(axis=1) / np.maximum(weights.sum(axis=1), 1e-9))
         if (moved_px < _SETTLED_PX).all():
@@ -183,9 +197,8 @@ def _settle(
     variances_px2 = spread_px**2 * count / np.maximum(count - unknowns, 1.0)
     covariances: Array = np.linalg.inv(normal)[:, :6, :6] * variances_px2[:, None, None]
     enough = (seen.certainty > 0).sum(axis=1) > _SEEN * np.abs(view.prints.polarity).sum(axis=1)
-    return _Settled(
-        poses, found[:, 6], covariances, enough & (moved_px < _SETTLED_PX), seen.heights, blurred, spread_px
-    )
+    good = enough & (moved_px < _SETTLED_PX)
+    return _Settled(poses, found[:, 6], covariances, good, seen.heights, blurred, spread_px, seen.blur_px)
 
 
 def _solve(rows: Array, weights: Array, off_px: Array, known: Array, hold: Array) -> tuple[Array, Array]:

@@ -15,8 +15,9 @@ from ipsys_log.messages import CameraCalibration, CompressedImage, RawImage
 from ipsys_log.stages.detect.decode import Canvas, Grey
 from ipsys_log.stages.detect.edges import Fit, Guess, fit_edges
 from ipsys_log.stages.detect.search import WHOLE, Candidate, search, search_thoroughly
-from ipsys_log.stages.detect.track import Track, extend, predict, same_speed
+from ipsys_log.stages.detect.track import LONG_S, Track, extend, predict, same_speed
 from ipsys_log.stages.detect.watch import Watch
+from ipsys_log.units import NS_PER_S
 
 __all__ = ["Follow"]
 
@@ -33,6 +34,12 @@ _MARGIN_PX = 32
 _AS_GOOD = 1.1
 # Of two fits of one id, nearer together than this, one is enough.
 _SAME_PX = 8.0
+# Further from where it was expected, a marker is looked at once more, in the whole frame.
+_JUMP_PX = 3.0
+# Edges are that near to those of a fit whose pose is the right one of two.
+_SURE_PX = 0.08
+# From so many frames with markers it is known how blurred edges are.
+_BLURS = 10
 
 
 class Follow:
@@ -61,6 +68,8 @@ class Follow:
         self._changed: tuple[slice, slice] | None = None
         self._breadth_px = 0.0
         self._frames = 0
+        self._last_ns = 0
+        self._blurs_px: list[float] = []
         self._tracks: list[Track] = []
 
     def __call__(self, frame: CompressedImage | RawImage, time_ns: int) -> tuple[list[Fit], int, int]:
@@ -76,7 +85,9 @@ class Follow:
         FrameError
             Where it cannot be decoded.
         """
-        due = self._frames % _SEARCH_EVERY == 0
+        gap_s = (time_ns - self._last_ns) / NS_PER_S
+        self._last_ns = time_ns
+        due = self._frames % _SEARCH_EVERY == 0 or not 0 < gap_s < LONG_S
         thorough = self._frames % _THOROUGH_EVERY == _SEARCH_EVERY
         whole = due or self._frames % _WHOLE_EVERY == 0
         self._frames += 1
@@ -84,6 +95,10 @@ class Follow:
         outlines_px = [self._outline(guess) for guess in guesses]
         grey, rows = self._canvas.show(frame, None if whole else _rows(outlines_px, self._changed))
         tried = self._with_speed(grey, time_ns, guesses, self._fit(grey, guesses))
+        if rows != [slice(0, len(grey))] and _jumped(outlines_px, tried):
+            # Damage in a JPEG moves what comes after it, and is noticed only at its end.
+            grey, rows = self._canvas.show(frame)
+            tried = self._with_speed(grey, time_ns, guesses, self._fit(grey, guesses))
         seen = {n: fit for n, fit in enumerate(tried) if fit is not None}
         lost = [n for n, outline in enumerate(outlines_px) if n not in seen and _inside(outline, grey)]
         if lost and rows != [slice(0, len(grey))]:
@@ -95,6 +110,8 @@ class Follow:
             fits = self._add(grey, fits, search(grey, self._dictionary, region))
         if thorough or {guesses[n].id for n in lost} - {fit.pose.id for fit in fits}:
             fits = self._add(grey, fits, search_thoroughly(grey, self._dictionary))
+        elif whole and self._changed is not None and len(fits) == len(seen):
+            fits = self._add(grey, fits, search_thoroughly(grey, self._dictionary, self._changed))
         self._watch.forget([fit.corners_px for fit in fits])
         self._remember(list(seen), fits, time_ns)
         return sorted(fits, key=lambda fit: fit.pose.id), grey.shape[1], grey.shape[0]
@@ -113,7 +130,10 @@ class Follow:
         return fits
 
     def _fit_as_guessed(self, grey: Grey, guesses: Sequence[Guess]) -> list[Fit | None]:
-        return fit_edges(grey, guesses, self._dictionary, self._lens, self._edge_offset_px, self._row_time_s)
+        known_px = float(np.mean(self._blurs_px).round(2)) if len(self._blurs_px) == _BLURS else None
+        return fit_edges(
+            grey, guesses, self._dictionary, self._lens, self._edge_offset_px, self._row_time_s, known_px
+        )
 
     def _with_speed(
         self, grey: Grey, frame_ns: int, guesses: Sequence[Guess], fits: list[Fit | None]
@@ -133,27 +153,39 @@ class Follow:
     def _add(self, grey: Grey, fits: list[Fit], candidates: Iterable[Candidate]) -> list[Fit]:
         """Fits, and those of candidates that are none of them."""
         new = [one for one in candidates if not _among(one.id, one.corners_px, fits)]
+        upright, other = self._guess(new)
+        found = self._fit(grey, upright)
+        # Where a marker lies as robots carry it, there is no need to try the pose that looks like it.
+        unsure = [n for n, fit in enumerate(found) if fit is None or fit.spread_px > _SURE_PX]
+        for n, fit in zip(unsure, self._fit(grey, [other[n] for n in unsure]), strict=True):
+            one = found[n]
+            if fit is not None and (one is None or fit.spread_px < one.spread_px):
+                found[n] = fit
         fits = list(fits)
-        for fit in self._fit(grey, self._guess(new)):
+        for fit in found:
             if fit is not None and not _among(fit.pose.id, fit.corners_px, fits):
                 fits.append(fit)
         return fits
 
-    def _guess(self, candidates: Sequence[Candidate]) -> list[Guess]:
-        """Poses of squares: of the two that look alike, the one that faces the camera's plane."""
+    def _guess(self, candidates: Sequence[Candidate]) -> tuple[list[Guess], list[Guess]]:
+        """Both poses of squares that look alike, first those that face the plane of the image."""
         if not candidates:
-            return []
+            return [], []
         corners_px = np.array([one.corners_px for one in candidates])
         uv = undistort(corners_px.reshape(-1, 2), self._lens).reshape(-1, 4, 2)
         usable = [n for n, corners in enumerate(uv) if np.isfinite(corners).all() and goes_around(corners)]
         if not usable:
-            return []
+            return [], []
         rotations, centres = solve_squares(uv[usable], np.ones(len(usable)))
-        upright = rotations[:, :, 2, 2].argmin(axis=1)
-        return [
-            Guess(candidates[n].id, rotations[k, upright[k]], centres[k, upright[k]])
-            for k, n in enumerate(usable)
-        ]
+        order = rotations[:, :, 2, 2].argsort(axis=1, kind="stable")
+        upright, other = (
+            [
+                Guess(candidates[n].id, rotations[k, order[k, i]], centres[k, order[k, i]])
+                for k, n in enumerate(usable)
+            ]
+            for i in (0, 1)
+        )
+        return upright, other
 
     def _outline(self, guess: Guess) -> Array:
         """Corners in px, (4, 2); far outside where the guess has gone behind the camera."""
@@ -171,6 +203,8 @@ class Follow:
         self._tracks = [
             extend(track, fit, frame_ns, self._row_time_s) for track, fit in zip(before, fits, strict=True)
         ]
+        if fits and len(self._blurs_px) < _BLURS:
+            self._blurs_px.append(fits[0].blur_px)
         if fits:
             self._breadth_px = max(float(np.ptp(fit.corners_px, axis=0).min()) for fit in fits)
 
@@ -178,6 +212,13 @@ class Follow:
 def _among(marker_id: int, corners_px: Array, fits: Iterable[Fit]) -> bool:
     return any(
         fit.pose.id == marker_id and np.abs(fit.corners_px - corners_px).max() < _SAME_PX for fit in fits
+    )
+
+
+def _jumped(outlines_px: Sequence[Array], fits: Sequence[Fit | None]) -> bool:
+    return any(
+        fit is not None and np.abs(fit.corners_px - outline_px).max() > _JUMP_PX
+        for outline_px, fit in zip(outlines_px, fits, strict=True)
     )
 
 

@@ -12,6 +12,9 @@ from math import lcm
 from typing import NamedTuple
 
 import numpy as np
+from numpy.typing import NDArray
+
+from ipsys_log.errors import FrameError
 
 __all__ = ["Layout", "cut_rows", "read_layout", "whole_rows"]
 
@@ -63,12 +66,16 @@ def read_layout(data: bytes) -> Layout | None:
 
 def _layout(data: bytes, frame: int, scan: int, scan_size: int, interval: int) -> Layout | None:
     parts = data[frame + 9]
+    if not 1 <= parts <= 4 or frame + 10 + 3 * parts > scan:
+        return None
     if scan_size != 6 + 2 * parts:  # several scans: a row needs all of them
         return None
     height, width = (int.from_bytes(data[frame + n : frame + n + 2], "big") for n in (5, 7))
     factors = [data[frame + 11 + 3 * n] for n in range(parts)]
     if parts == 1:
         factors = [0x11]
+    if not (width and height and all(f >> 4 and f & 15 for f in factors)):
+        return None
     across, down = max(f >> 4 for f in factors), max(f & 15 for f in factors)
     blocks = -(-width // (8 * across))
     return Layout(width, height, 8 * down, blocks, frame + 5, scan + 2 + scan_size, interval)
@@ -102,11 +109,24 @@ def cut_rows(data: bytes, layout: Layout, rows: Sequence[slice]) -> list[bytearr
     Returns
     -------
     A JPEG for each; without restart markers, data follows in it that no row needs.
+
+    Raises
+    ------
+    FrameError
+        Where restart markers are missing or out of order.
     """
     pieces = _between(data, layout, rows) if layout.interval else [bytearray(data) for _ in rows]
     for piece, part in zip(pieces, rows, strict=True):
         piece[layout.height_at : layout.height_at + 2] = (part.stop - part.start).to_bytes(2, "big")
     return pieces
+
+
+def _check_restarts(codes: NDArray[np.uint8], layout: Layout) -> None:
+    """See that all restart markers are there, in their order: rows are found by counting them."""
+    blocks = layout.blocks * -(-layout.height // layout.block_px)
+    wanted = _RESTART + np.arange(-(-blocks // layout.interval) - 1) % _CYCLE
+    if not np.array_equal(codes, wanted):
+        raise FrameError("restart markers are missing or out of order")
 
 
 def _between(data: bytes, layout: Layout, rows: Sequence[slice]) -> list[bytearray]:
@@ -116,6 +136,7 @@ def _between(data: bytes, layout: Layout, rows: Sequence[slice]) -> list[bytearr
     codes = np.frombuffer(data, dtype=np.uint8)
     ends = np.flatnonzero(codes[layout.data_at : -1] == 0xFF) + layout.data_at
     restarts = ends[(codes[ends + 1] & 0xF8) == _RESTART]
+    _check_restarts(codes[restarts + 1], layout)
     starts = [layout.data_at, *(restarts + 2).tolist(), len(data)]
     pieces = []
     for part in rows:
@@ -124,8 +145,7 @@ def _between(data: bytes, layout: Layout, rows: Sequence[slice]) -> list[bytearr
         )
         if part.stop == layout.height:
             end = len(restarts) + 1
-        # Where intervals were lost on the way, what is left is too short, and the decoder says so.
-        start, stop = (starts[min(n, len(starts) - 1)] for n in (begin, end))
+        start, stop = starts[begin], starts[end]
         piece = bytearray(data[: layout.data_at]) + data[start:stop]
         for number, at in enumerate(restarts[begin : end - 1].tolist()):
             piece[layout.data_at + at - start + 1] = _RESTART + number % _CYCLE

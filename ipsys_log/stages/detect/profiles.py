@@ -25,12 +25,15 @@ LEAST_CONTRAST = 8.0
 # Profiles reach this far to each side, and never to the middle of a cell.
 _NEAR_PX, _FAR_PX, _OF_CELL = 3.0, 12.0, 0.45
 _TAPS = np.linspace(-1, 1, 7)
-# Of the blurred step: what optics, pixels and JPEG do.
-_BLUR_PX = 0.8
+# Of a blurred step: what optics, pixels and JPEG do to an edge.
+_USUAL_BLUR_PX = 0.8
+_BLURS_PX = tuple(np.arange(0.5, 2.35, 0.05).round(2).tolist())
 # Wider edges than that tell less.
 _SHARP_PX = 4.0
 # Edges of less than this share of the mean contrast are covered, or in glare.
 _WEAK = 0.3
+# In sides of a marker: it would be smaller than a pixel.
+_HORIZON = 1e4
 
 
 class View(NamedTuple):
@@ -40,6 +43,7 @@ class View(NamedTuple):
     lens: CameraCalibration
     prints: Prints
     row_time_s: float
+    blur_px: float | None
 
 
 class Poses(NamedTuple):
@@ -62,13 +66,26 @@ class Poses(NamedTuple):
         turns = np.array([rotation(vector) for vector in twists[:, 3:]])
         return Poses(self.rotations @ turns, self.centres + shifts)
 
+    def possible(self) -> NDArray[np.bool_]:
+        """Which of them a camera can see as a whole, (m,): numbers, and further away than they are large."""
+        known = np.isfinite(self.rotations).all(axis=(1, 2)) & np.isfinite(self.centres).all(axis=1)
+        return np.asarray(known & (self.centres[:, 2] > 1.0) & (self.centres[:, 2] < _HORIZON))
+
+    def where(self, good: NDArray[np.bool_], other: Poses) -> Poses:
+        """These poses where they are good, and others where not."""
+        return Poses(
+            np.where(good[:, None, None], self.rotations, other.rotations),
+            np.where(good[:, None], self.centres, other.centres),
+        )
+
 
 class Seen(NamedTuple):
     """What is seen of the edges of prints, (m, s) each.
 
     ``off_px`` is by how much they lie off, along their axis; ``certainty`` from 1.0 to 0.0 for edges that
     are not there. ``slopes`` are px per side of the print, and ``late`` px per speed along their axis, for
-    rows that are exposed later. ``heights`` are the grey levels by which sharp edges rise.
+    rows that are exposed later. ``heights`` are the grey levels by which they rise within the usual blur;
+    ``blur_px`` is theirs.
     """
 
     off_px: Array
@@ -76,6 +93,7 @@ class Seen(NamedTuple):
     slopes: Array
     late: Array
     heights: Array
+    blur_px: float
 
 
 def measure(view: View, poses: Poses, motions: Array, wide: NDArray[np.bool_]) -> Seen:
@@ -91,13 +109,13 @@ def measure(view: View, poses: Poses, motions: Array, wide: NDArray[np.bool_]) -
     ends_px = points_px[:, :-1].reshape(len(wide), 2, -1, 2)
     across = (ends_px[:, 1] - ends_px[:, 0]) / 2
     middle = ends_px[:, 0] + across
-    lengths_px = np.hypot(across[..., 0], across[..., 1])
+    lengths_px = np.maximum(np.hypot(across[..., 0], across[..., 1]), 1e-6)
     slopes = lengths_px / prints.reach
     late = slopes * (middle[..., 1] - points_px[:, -1:, 1]) * view.row_time_s
     if view.row_time_s:
         speed = np.where(prints.level, motions[:, 1:2], motions[:, :1]) + prints.swirl * motions[:, 2:]
         middle = middle + (late * speed / lengths_px)[..., None] * across
-    farthest_px = np.minimum(_FAR_PX, _OF_CELL * slopes.min(axis=1) / prints.cells)
+    farthest_px = np.clip(_OF_CELL * slopes.min(axis=1) / prints.cells, 0.5, _FAR_PX)
     near_px = np.minimum(_NEAR_PX, farthest_px).round(1)
     reaches_px = near_px[:, None]
     if wide.any():
@@ -107,8 +125,13 @@ def measure(view: View, poses: Poses, motions: Array, wide: NDArray[np.bool_]) -
     x = (middle[..., :1] + across[..., :1] * taps).astype(np.float32)
     y = (middle[..., 1:] + across[..., 1:] * taps).astype(np.float32)
     profiles = levels_at(view.grey, x, y)
-    fitted = profiles @ np.array([_template(reach_px) for reach_px in near_px.tolist()])
+    blur_px = view.blur_px
+    if blur_px is None:
+        blur_px = _USUAL_BLUR_PX if wide.any() else _blur(prints, profiles, near_px)
+    fitted = profiles @ np.array([_template(reach_px, blur_px) for reach_px in near_px.tolist()])
     height = fitted[..., 0] * prints.polarity
+    usual = np.array([_template(reach_px, _USUAL_BLUR_PX)[:, :1] for reach_px in near_px.tolist()])
+    sharp = (profiles @ usual)[..., 0] * prints.polarity
     present = height > np.maximum(_WEAK * height.mean(axis=1), LEAST_CONTRAST)[:, None]
     off_px = np.divide(fitted[..., 1], fitted[..., 0], out=np.zeros_like(height), where=present)
     certainty = present.astype(np.float64)
@@ -117,7 +140,7 @@ def measure(view: View, poses: Poses, motions: Array, wide: NDArray[np.bool_]) -
         off_px = np.where(wide_edges, by_area, off_px)
         certainty = np.where(wide_edges, shown * np.minimum(1.0, _SHARP_PX / width_px) ** 2, certainty)
     off_px = np.minimum(np.maximum(off_px, -reaches_px), reaches_px)
-    return Seen(off_px, certainty, slopes, late, height)
+    return Seen(off_px, certainty, slopes, late, sharp, blur_px)
 
 
 def _by_area(prints: Prints, profiles: Array, reaches_px: Array) -> tuple[Array, Array, Array]:
@@ -139,10 +162,30 @@ def _by_area(prints: Prints, profiles: Array, reaches_px: Array) -> tuple[Array,
     return (0.5 - white) * width_px * prints.polarity, width_px, real & (rise > 0)
 
 
+def _blur(prints: Prints, profiles: Array, reaches_px: Array) -> float:
+    """By how much edges are blurred, in px: what leaves least of their mean profile."""
+    # Markers that are far have shorter profiles, which show less of it.
+    widest = int(reaches_px.argmax())
+    mean = prints.polarity[widest] @ profiles[widest]
+    left = _residues(float(reaches_px[widest])) @ mean
+    return float(_BLURS_PX[int((left * left).sum(axis=1).argmin())])
+
+
 @cache
-def _template(reach_px: float) -> Array:
+def _residues(reach_px: float) -> Array:
+    """What the best step of each blur leaves of a profile, (blurs, taps, taps)."""
+    steps = [_step(reach_px, blur_px) for blur_px in _BLURS_PX]
+    return np.array([np.eye(len(_TAPS)) - step @ np.linalg.pinv(step) for step in steps])
+
+
+@cache
+def _template(reach_px: float, blur_px: float) -> Array:
     """Takes a profile to a blurred step: its height, and height times shift; (taps, 2)."""
-    x = reach_px * _TAPS / _BLUR_PX
-    bell = np.exp(-(x**2) / 2) / (np.sqrt(2 * np.pi) * _BLUR_PX)
-    step = np.column_stack([np.ones_like(x), ndtr(x), -bell])
-    return np.asarray(np.linalg.pinv(step)[1:].T.copy(), dtype=np.float64)
+    return np.asarray(np.linalg.pinv(_step(reach_px, blur_px))[1:].T.copy(), dtype=np.float64)
+
+
+def _step(reach_px: float, blur_px: float) -> Array:
+    """Foot, height and shift of a blurred step, as profiles: (taps, 3)."""
+    x = reach_px * _TAPS / blur_px
+    bell = np.exp(-(x**2) / 2) / (np.sqrt(2 * np.pi) * blur_px)
+    return np.column_stack([np.ones_like(x), ndtr(x), -bell])

@@ -53,9 +53,12 @@ def search(grey: Grey, dictionary: str, region: tuple[slice, slice] = WHOLE) -> 
     dictionary : OpenCV's name, such as DICT_4X4_100.
     region : rows and columns to search.
     """
-    piece = np.ascontiguousarray(grey[region])
+    return _placed(_search(np.ascontiguousarray(grey[region]), dictionary), region)
+
+
+def _placed(found: list[Candidate], region: tuple[slice, slice]) -> list[Candidate]:
     origin = np.array([region[1].start or 0, region[0].start or 0], dtype=np.float64)
-    return [one._replace(corners_px=one.corners_px + origin) for one in _search(piece, dictionary)]
+    return [one._replace(corners_px=one.corners_px + origin) for one in found]
 
 
 def _search(grey: Grey, dictionary: str) -> list[Candidate]:
@@ -72,10 +75,10 @@ def _search(grey: Grey, dictionary: str) -> list[Candidate]:
     return _candidates(corners_px[:read], ids) + _read(grey, corners_px[read:], dictionary)
 
 
-def search_thoroughly(grey: Grey, dictionary: str) -> list[Candidate]:
+def search_thoroughly(grey: Grey, dictionary: str, region: tuple[slice, slice] = WHOLE) -> list[Candidate]:
     """The same by OpenCV's detector with its own settings, at full size: finds markers in shadow too."""
-    found, ids, _ = _full_detector(dictionary).detectMarkers(grey)
-    return _candidates(found, ids)
+    found, ids, _ = _full_detector(dictionary).detectMarkers(np.ascontiguousarray(grey[region]))
+    return _placed(_candidates(found, ids), region)
 
 
 def _candidates(found: Iterable[Any], ids: Any) -> list[Candidate]:

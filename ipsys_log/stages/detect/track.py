@@ -12,10 +12,14 @@ from ipsys_log.geometry.poses import rotation, rotation_vector
 from ipsys_log.stages.detect.edges import Fit, Guess
 from ipsys_log.units import NS_PER_S
 
-__all__ = ["Track", "extend", "predict", "same_speed"]
+__all__ = ["LONG_S", "Track", "extend", "predict", "same_speed"]
 
 Array = NDArray[np.float64]
 
+# After that nothing is left of a motion.
+LONG_S = 0.5
+# In sides per s.
+_FASTEST = 100.0
 _REMEMBERED = 3
 # In sides per s and rad per s: less is not seen in the shear of a marker.
 _SAME_SPEED = 0.1
@@ -51,15 +55,18 @@ def extend(track: Track, fit: Fit, frame_ns: int, row_time_s: float) -> Track:
 def predict(track: Track, frame_ns: int) -> Guess:
     """Where a marker is in a frame, if it lies in about the same row as before.
 
-    It is on a parabola through three sightings, or on a line through two.
+    It is on a parabola through three sightings, or on a line through two; but where it was, if that was long
+    ago, or if it would have to be faster than any robot.
     """
     now = track[0]
-    if len(track) == 1:
-        return now.pose
     ahead_s = (frame_ns + now.late_ns - now.time_ns) / NS_PER_S
+    if len(track) == 1 or not 0 <= ahead_s < LONG_S:
+        return now.pose
     steps_s = [(one.time_ns - other.time_ns) / NS_PER_S for one, other in pairwise(track)]
     moved = [one.pose.centre - other.pose.centre for one, other in pairwise(track)]
     means = [step / step_s for step, step_s in zip(moved, steps_s, strict=True)]
+    if np.abs(means).max() > _FASTEST:
+        return now.pose
     # A mean velocity is that of the middle of its interval.
     gain = (means[0] - means[1]) / (sum(steps_s) / 2) if len(means) > 1 else np.zeros(3)
     velocity = means[0] + gain * steps_s[0] / 2

@@ -1,0 +1,426 @@
+"""Corners from edges against known truth: the simulator's frames, and frames drawn by other code."""
+
+from __future__ import annotations
+
+from collections import Counter
+from collections.abc import Callable, Sequence
+from dataclasses import dataclass, replace
+from functools import cache
+from typing import Any
+
+import numpy as np
+import pytest
+
+from ipsys_log.messages import CameraCalibration, CompressedImage, Marker, RigCamera, Tracks
+from ipsys_log.sources.simulator import (
+    EPOCH_NS,
+    Camera,
+    LabSettings,
+    View,
+    drive_start_ns,
+    encode_jpeg,
+    hang_cameras,
+    plan_drive,
+    prepare_view,
+    render,
+    simulate,
+    true_corners,
+)
+from ipsys_log.sources.simulator.places import Place, place, seen_whole
+from ipsys_log.stages.detect.edges import Guess, fit_edges
+from ipsys_log.stages.detect.follow import Follow
+from ipsys_log.units import NS_PER_S
+from tests.stages.scenes import (
+    FISHEYE,
+    PLUMB_BOB,
+    RATIONAL,
+    VGA,
+    Array,
+    Look,
+    Picture,
+    Print,
+    Score,
+    at_px,
+    corners_px,
+    detect,
+    draw,
+    facing,
+    follow,
+    jpeg,
+    strewn,
+    texture,
+    tiles,
+    vignette,
+)
+
+LAB = LabSettings(stations=0)
+CAMERAS = dict(zip(LAB.cameras, hang_cameras(LAB), strict=True))
+
+
+# --- the simulator's frames ---------------------------------------------------------------------
+
+
+@cache
+def view(camera: str, gamma: float) -> View:
+    return prepare_view(CAMERAS[camera], replace(LAB, gamma=gamma))
+
+
+def filmed(settings: LabSettings, camera: str, starts_s: Sequence[float], frames: int) -> Score:
+    """Some frames of one camera in a row, 30 in a second, from each of some times of the drive on."""
+    score, rng = Score(), np.random.default_rng(0)
+    drive, where = plan_drive(settings, list(CAMERAS.values())), CAMERAS[camera]
+    for start_s in starts_s:
+        seen, truths, wholes = [], [], []
+        for time_s in start_s + np.arange(frames) / 30:
+            places = drive.places_at(time_s)
+            prints = [place(one, settings) for one in places]
+            data = encode_jpeg(render(view(camera, settings.gamma), prints, settings, rng), settings)
+            seen.append((EPOCH_NS + round(time_s * NS_PER_S), data))
+            truths.append({p.id: true_corners(where.lens, where.camera_from_world, p) for p in prints})
+            wholes.append([one.marker_id for one in places if seen_whole(one, [where], settings)])
+        for markers, truth_px, whole in zip(follow(where.lens, seen), truths, wholes, strict=True):
+            score.add(markers, truth_px, whole)
+    return score
+
+
+def check(score: Score, rms_px: float, max_px: float, found: float) -> None:
+    assert score.wrong == [], score
+    assert score.rms_px <= rms_px, score
+    assert score.max_px <= max_px, score
+    assert score.found >= found, score
+
+
+@pytest.mark.parametrize(
+    ("count", "camera", "starts_s"), [(1, "red", (0,)), (3, "red", (1, 6)), (8, "black", (2, 9))]
+)
+def test_corners_along_a_drive(count: int, camera: str, starts_s: Sequence[float]) -> None:
+    check(filmed(replace(LAB, markers=count), camera, starts_s, 4), 0.06, 0.5, 0.995)
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("camera", CAMERAS)
+@pytest.mark.parametrize("count", [1, 3, 8])
+def test_corners_along_the_whole_drive(count: int, camera: str) -> None:
+    starts_s = np.arange(0, 15, 1.5).tolist()
+    check(filmed(replace(LAB, markers=count), camera, starts_s, 10), 0.06, 0.5, 0.995)
+
+
+@pytest.mark.parametrize(
+    "starts_s", [(2.0,), pytest.param(np.arange(0, 15, 1.0).tolist(), marks=pytest.mark.slow)]
+)
+def test_a_gamma_does_not_move_corners(starts_s: Sequence[float]) -> None:
+    """It makes black too small all around, by the same for all markers: that is taken out."""
+    score = filmed(replace(LAB, markers=8, gamma=2.2), "black", starts_s, 3)
+    check(score, 0.07, 0.5, 0.995)
+    assert np.mean(score.edge_offsets_px) == pytest.approx(0.42, abs=0.05)
+    assert np.std(score.edge_offsets_px) < 0.05
+
+
+ROLLING = LabSettings(
+    stations=0, markers=3, drive_s=1.2, drive_speed_m_s=2.0, row_time_ns=31_000, exposure_s=1 / 60
+)
+
+
+@pytest.mark.slow
+def test_markers_behind_a_rolling_shutter_are_where_they_were_then() -> None:
+    """Robots at 2 m/s, 1/60 s of motion blur; from the third sighting on speed is known as well."""
+    cameras = hang_cameras(ROLLING)
+    drive, start_ns = plan_drive(ROLLING, cameras), drive_start_ns(ROLLING, cameras)
+    row_s = ROLLING.row_time_ns / NS_PER_S
+    following = {c.name: Follow(ROLLING.dictionary, c.lens, None, row_s) for c in cameras}
+    times_seen: Counter[tuple[str, int]] = Counter()
+    whole: dict[int, tuple[str, ...]] = {}
+    to_find: list[bool] = []
+    offs_m = []
+    for message in simulate(ROLLING):
+        if isinstance(message.payload, Tracks):
+            whole = {track.id: track.cameras for track in message.payload.tracks}
+        if not isinstance(message.payload, CompressedImage):
+            continue
+        (camera,) = (one for one in cameras if one.name == message.camera)
+        fits, _, _ = following[camera.name](message.payload, message.publish_time_ns)
+        seen = {fit.pose.id: fit for fit in fits}
+        to_find += [marker_id in seen for marker_id, names in whole.items() if camera.name in names]
+        for marker_id in whole:
+            key = camera.name, marker_id
+            times_seen[key] = times_seen[key] + 1 if marker_id in seen else 0
+            if times_seen[key] >= 3:
+                fit = seen[marker_id]
+                late_s = float(fit.corners_px[:, 1].mean()) * row_s
+                time_s = (message.publish_time_ns - start_ns) / NS_PER_S + late_s
+                truth_m = centre_m(camera, drive.place_at(marker_id, time_s))
+                offs_m.append(fit.pose.centre * ROLLING.marker_length_m - truth_m)
+    rms_m = float(np.sqrt(np.mean(np.sum(np.square(offs_m), axis=1))))
+    assert len(offs_m) > 50
+    assert np.mean(to_find) >= 0.95
+    assert rms_m <= 0.0015
+
+
+def centre_m(camera: Camera, where: Place) -> Array:
+    return (camera.camera_from_world @ [where.x_m, where.y_m, where.z_m, 1.0])[:3]
+
+
+# --- frames drawn by other code -----------------------------------------------------------------
+
+
+def strew(
+    lens: CameraCalibration,
+    look: Look,
+    frames: int,
+    per_frame: int,
+    quality: int = 90,
+    change: Callable[[Print, np.random.Generator], Print] = lambda one, rng: one,
+    first: int = 0,
+    **where: Any,
+) -> Score:
+    """Markers at random places, each frame for itself."""
+    score = Score()
+    for n in range(first, first + frames):
+        rng = np.random.default_rng(n)
+        prints = [change(one, rng) for one in strewn(lens, per_frame, rng, look, **where)]
+        data = jpeg(draw(lens, prints, replace(look, seed=n)), quality)
+        score.add(
+            detect(lens, data, look),
+            {one.id: corners_px(lens, one) for one in prints},
+            range(per_frame),
+        )
+    return score
+
+
+PLAIN = Look()
+
+
+@dataclass(frozen=True)
+class Row:
+    """A scene, and what is expected of it."""
+
+    rms_px: float
+    found: float = 0.98
+    max_px: float = 0.5
+    lens: CameraCalibration = FISHEYE
+    look: Look = PLAIN
+    quality: int = 90
+    length_m: float = 0.2
+    per_frame: int = 5
+    change: Callable[[Print, np.random.Generator], Print] = lambda one, rng: one
+
+
+def cover(level: float) -> Callable[[Print, np.random.Generator], Print]:
+    """One of the inner cells is covered."""
+
+    def covered(one: Print, rng: np.random.Generator) -> Print:
+        return one._replace(covered={(int(rng.integers(1, 5)), int(rng.integers(1, 5))): level})
+
+    return covered
+
+
+def cells_px(size_px: float, cells: int = 6) -> float:
+    """The length in m of a marker whose cells are so large in the middle of the image."""
+    return size_px * cells * 2.0 / float(FISHEYE.K[0, 0])
+
+
+ROWS: dict[str, Row] = {
+    "plain": Row(0.06),
+    "gamma 2.2": Row(0.07, 0.96, look=Look(gamma=2.2)),
+    "textured floor": Row(0.06, look=Look(floor=texture(FISHEYE, 1))),
+    "tiled floor": Row(0.06, 0.95, look=Look(floor=tiles(FISHEYE))),
+    "vignetting and a gradient": Row(0.06, look=Look(shade=vignette(FISHEYE))),
+    "half a margin": Row(0.06, look=Look(margin_cells=0.5)),
+    "half a margin on a dark floor": Row(0.15, 0.95, look=Look(margin_cells=0.5, floor=60)),
+    "low contrast": Row(0.08, look=Look(black=60, white=110, floor=90)),
+    "noise 6": Row(0.08, look=Look(noise=6.0)),
+    "quality 70": Row(0.06, quality=70),
+    "overexposed": Row(0.06, look=Look(black=60, white=255, floor=240)),
+    "blur 0.4 px": Row(0.06, look=Look(psf_px=0.4)),
+    "blur 1.0 px": Row(0.1, look=Look(psf_px=1.0)),
+    "blur 1.6 px": Row(0.25, max_px=1.0, look=Look(psf_px=1.6)),
+    "plumb_bob": Row(0.06, lens=PLUMB_BOB),
+    "rational_polynomial": Row(0.06, lens=RATIONAL),
+    "5X5": Row(0.06, look=Look(dictionary="DICT_5X5_50")),
+    "AprilTag 36h11": Row(0.06, look=Look(dictionary="DICT_APRILTAG_36h11")),
+    "640 x 480": Row(0.12, 0.85, 1.0, lens=VGA),
+    "cells of 5 px": Row(0.1, 0.7, length_m=cells_px(5)),
+    "cells of 8 px": Row(0.1, 0.85, length_m=cells_px(8)),
+    "cells of 20 px": Row(0.06, length_m=cells_px(20), per_frame=3),
+    "cells of 40 px": Row(0.06, length_m=cells_px(40), per_frame=1),
+    "a cell covered": Row(0.06, 0.95, change=cover(130.0)),
+    "a cell in glare": Row(0.06, 0.9, change=cover(255.0)),
+}
+
+
+def scored(row: Row, frames: int, per_frame: int) -> Score:
+    return strew(row.lens, row.look, frames, per_frame, row.quality, row.change, length_m=row.length_m)
+
+
+@pytest.mark.parametrize("name", ROWS)
+def test_corners_of_another_renderer(name: str) -> None:
+    # Three markers say less than many.
+    row = ROWS[name]
+    check(scored(row, 1, min(row.per_frame, 3)), 1.5 * row.rms_px, row.max_px, 0.6)
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("name", ROWS)
+def test_corners_of_another_renderer_over_many_frames(name: str) -> None:
+    row = ROWS[name]
+    check(scored(row, 12, row.per_frame), row.rms_px, row.max_px, row.found)
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize(("gamma", "rms_px", "found"), [(1.0, 0.06, 0.98), (2.2, 0.07, 0.96)])
+def test_random_poses_out_to_the_edge_of_the_image(gamma: float, rms_px: float, found: float) -> None:
+    check(strew(FISHEYE, Look(gamma=gamma), 60, 8), rms_px, 0.5, found)
+
+
+def test_a_marker_in_shadow_on_a_bright_floor_is_found_within_a_second() -> None:
+    """Its paper is darker than the floor, so that only the thorough search sees it."""
+    look = Look(black=20, white=80, floor=150)
+    one = at_px(VGA, 5, (330, 240), 2.0, length_m=0.4)
+    data = jpeg(draw(VGA, [one], look))
+    answers = follow(VGA, [(n * 33_000_000, data) for n in range(30)], look)
+    assert [marker.id for marker in answers[-1]] == [5]
+    assert np.hypot(*(answers[-1][0].corners_px - corners_px(VGA, one)).T).max() < 0.15
+
+
+def test_glare_on_a_marker_gives_no_wrong_one() -> None:
+    """Where it is too strong the marker is not found; never is it somewhere else."""
+    y, x = np.mgrid[: VGA.height, : VGA.width]
+    one = at_px(VGA, 5, (330, 240), 2.0, length_m=0.4)
+    for strength in (60, 120, 250):
+        glare = strength * np.exp(-((x - 310) ** 2 + (y - 225) ** 2) / (2 * 12.0**2))
+        markers = detect(VGA, jpeg(draw(VGA, [one], Look(glare=glare))))
+        assert {marker.id for marker in markers} <= {5}
+        for marker in markers:
+            assert np.hypot(*(marker.corners_px - corners_px(VGA, one)).T).max() < 0.6
+
+
+# --- covariance ---------------------------------------------------------------------------------
+
+
+@pytest.mark.parametrize(
+    ("look", "frames"),
+    [
+        (Look(), 3),
+        pytest.param(Look(), 50, marks=pytest.mark.slow),
+        pytest.param(Look(noise=6.0), 30, marks=pytest.mark.slow),
+        pytest.param(Look(black=60, white=110, floor=90), 30, marks=pytest.mark.slow),
+    ],
+)
+def test_corners_are_as_uncertain_as_they_say(look: Look, frames: int) -> None:
+    score = strew(FISHEYE, look, frames, 6)
+    assert 0.7 < np.mean(score.normalized) < 1.9, score
+
+
+def test_corners_that_are_blurred_are_as_uncertain_as_they_say() -> None:
+    assert np.mean(strew(FISHEYE, Look(psf_px=1.6), 1, 5).normalized) < 3
+
+
+def test_a_covariance_is_one_of_a_rigid_square() -> None:
+    """Eight coordinates, six freedoms; it is symmetric and never negative."""
+    (marker, *_) = detect(FISHEYE, jpeg(draw(FISHEYE, [at_px(FISHEYE, 3, (700, 500))], Look())))
+    assert marker.covariance_px2 is not None
+    np.testing.assert_allclose(marker.covariance_px2, marker.covariance_px2.T, atol=1e-9)
+    values = np.linalg.eigvalsh(marker.covariance_px2)
+    assert (values[2:] > 1e-9).all()
+    assert np.abs(values[:2]).max() < 1e-3 * values[-1]
+    np.testing.assert_array_equal(marker.covariance_px2, marker.covariance_px2.astype(np.float32))
+
+
+# --- edge offset --------------------------------------------------------------------------------
+
+
+def one_marker(look: Look, *cameras: RigCamera) -> tuple[Marker, Array]:
+    one = at_px(FISHEYE, 3, (700, 500))
+    (marker,) = detect(FISHEYE, jpeg(draw(FISHEYE, [one], look)), look, *cameras)
+    return marker, marker.corners_px - corners_px(FISHEYE, one)
+
+
+def test_an_edge_offset_that_is_given_is_used() -> None:
+    marker, right_px = one_marker(Look(gamma=2.2), RigCamera("red", edge_offset_px=0.42))
+    assert marker.edge_offset_px == pytest.approx(0.42, abs=1e-4)
+    assert np.abs(right_px).max() < 0.06
+    # Of a picture without gamma it is wrong: black is taken to be larger all around than it is.
+    marker, wrong_px = one_marker(Look(), RigCamera("red", edge_offset_px=0.36))
+    assert marker.edge_offset_px == pytest.approx(0.36, abs=1e-4)
+    assert 0.3 < np.hypot(*wrong_px.T).mean() < 0.6
+    assert np.abs(wrong_px.mean(axis=0)).max() < 0.05
+    # It is that camera's alone.
+    marker, other_px = one_marker(Look(), RigCamera("white", edge_offset_px=0.36))
+    assert marker.edge_offset_px == pytest.approx(0.0, abs=0.02)
+    assert np.abs(other_px).max() < 0.06
+
+
+# --- single fits --------------------------------------------------------------------------------
+
+
+@cache
+def still() -> tuple[Picture, Print]:
+    one = at_px(VGA, 5, (330, 240), 2.0, length_m=0.4)
+    return draw(VGA, [one], Look()), one
+
+
+def guess(one: Print, shift_px: tuple[float, float] = (0.0, 0.0), marker_id: int | None = None) -> Guess:
+    """A marker's pose in sides of it, beside where it is."""
+    z = one.centre_m[2] / one.length_m
+    shift = np.array([*shift_px, 0.0]) * z / VGA.K[0, 0]
+    return Guess(one.id if marker_id is None else marker_id, one.axes, one.centre_m / one.length_m + shift)
+
+
+@pytest.mark.parametrize("shift_px", [(0.0, 0.0), (4.0, -3.0), (-5.0, 0.0), (3.0, 5.0)])
+def test_a_fit_finds_back(shift_px: tuple[float, float]) -> None:
+    grey, one = still()
+    (fit,) = fit_edges(grey, [guess(one, shift_px)], "DICT_4X4_100", VGA)
+    assert fit is not None
+    assert np.hypot(*(fit.corners_px - corners_px(VGA, one)).T).max() < 0.1
+    np.testing.assert_allclose(fit.pose.centre * one.length_m, one.centre_m, atol=0.004)
+
+
+def test_what_is_not_that_marker_is_not_fitted() -> None:
+    grey, one = still()
+    empty = np.full_like(grey, 150)
+    noise = np.random.default_rng(0).integers(0, 255, grey.shape).astype(np.uint8)
+    wrong_ids = [n for n in range(100) if n != one.id]
+    found = fit_edges(grey, [guess(one, marker_id=n) for n in wrong_ids], "DICT_4X4_100", VGA)
+    assert found == [None] * 99
+    assert fit_edges(empty, [guess(one)], "DICT_4X4_100", VGA) == [None]
+    assert fit_edges(noise, [guess(one)], "DICT_4X4_100", VGA) == [None]
+    assert fit_edges(grey, [guess(one, (60.0, 0.0))], "DICT_4X4_100", VGA) == [None]
+    assert fit_edges(grey, [], "DICT_4X4_100", VGA) == []
+
+
+def test_fits_do_not_disturb_one_another() -> None:
+    """Markers are fitted together; what is none among them changes nothing of the others."""
+    grey, one = still()
+    (alone,) = fit_edges(grey, [guess(one)], "DICT_4X4_100", VGA)
+    together = fit_edges(
+        grey, [guess(one, (90, 40)), guess(one), guess(one, marker_id=9)], "DICT_4X4_100", VGA
+    )
+    assert alone is not None
+    assert [fit is not None for fit in together] == [False, True, False]
+    assert together[1] is not None
+    np.testing.assert_allclose(together[1].corners_px, alone.corners_px, atol=0.03)
+
+
+def test_a_marker_beyond_the_edge_is_not_fitted() -> None:
+    """A corner that lies outside of the picture was not seen, however well the rest fits."""
+    one = at_px(VGA, 5, (9, 240), 2.0, length_m=0.4)
+    grey = draw(VGA, [one], Look())
+    assert (corners_px(VGA, one) < 0).any()
+    assert fit_edges(grey, [guess(one)], "DICT_4X4_100", VGA) == [None]
+
+
+@pytest.mark.parametrize("tilt_deg", [15, 30, 45])
+def test_a_tilted_marker_follows_its_tilt(tilt_deg: float) -> None:
+    """From a guess of the right one of the two poses that look alike."""
+    axes = facing(0.4, np.radians(tilt_deg) * np.array([0.6, 0.8, 0.0]))
+    one = Print(5, axes, np.array([0.2, 0.1, 1.2]), 0.4)
+    (fit,) = fit_edges(draw(VGA, [one], Look()), [guess(one)], "DICT_4X4_100", VGA)
+    assert fit is not None
+    assert np.hypot(*(fit.corners_px - corners_px(VGA, one)).T).max() < 0.15
+    angle_rad = np.arccos(np.clip((np.trace(fit.pose.rotation.T @ axes) - 1) / 2, -1, 1))
+    assert np.degrees(angle_rad) < 1.5
+
+
+def test_a_tilted_marker_is_found_as_it_lies() -> None:
+    score = strew(FISHEYE, Look(), 3, 6, first=100, tilt_deg=50.0)
+    assert score.max_px < 0.5, score

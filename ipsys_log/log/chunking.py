@@ -1,6 +1,5 @@
 """Collecting messages into chunks with their message indexes."""
 
-import struct
 import zlib
 from array import array
 from dataclasses import dataclass, field
@@ -8,11 +7,22 @@ from dataclasses import dataclass, field
 import zstandard
 from mcap.opcode import Opcode
 
-from ipsys_log.log.records import HEADER, INDEX_HEAD, MESSAGE, ChunkRef
+from ipsys_log.log.crc import WORTH_COMBINING, Buffer, combine, extend
+from ipsys_log.log.records import (
+    CHUNK_HEAD_SIZE,
+    HEAD_SIZE,
+    INDEX_HEAD,
+    MESSAGE,
+    MESSAGE_HEAD_SIZE,
+    ChunkRef,
+    chunk_head,
+)
 
 __all__ = ["IMAGES", "IMAGE_SCHEMAS", "SMALL_APPENDED", "SMALL_LIVE", "ChunkBuilder", "Limits"]
 
 _ZSTD_LEVEL = 3
+_OPCODE = int(Opcode.MESSAGE)
+_FIRST_ROOM = 64 << 10  # bytes
 
 IMAGE_SCHEMAS = frozenset(
     {
@@ -43,37 +53,57 @@ SMALL_APPENDED = Limits(1 << 20, 60 * _SECOND)
 
 @dataclass(slots=True)
 class ChunkBuilder:
-    """One chunk being filled."""
+    """One chunk being filled.
+
+    `_record` is the Chunk record as it will stand in the file: room for its head, then messages up to
+    `_end`. It is kept from chunk to chunk: memory in use costs less than what the kernel must hand out
+    anew. `_crc` is the CRC-32 of the messages up to `_crc_end`.
+    """
 
     limits: Limits
     compress: bool
-    _parts: list[bytes] = field(default_factory=list)
-    _size: int = 0
+    _record: memoryview = field(default_factory=lambda: memoryview(bytearray(_FIRST_ROOM)))
+    _end: int = CHUNK_HEAD_SIZE
+    _crc: int = 0
+    _crc_end: int = CHUNK_HEAD_SIZE
     _start_ns: int = 0
     _end_ns: int = 0
     _entries: "dict[int, array[int]]" = field(default_factory=dict)
 
-    def add(self, channel: int, sequence: int, log_time_ns: int, publish_time_ns: int, data: bytes) -> None:
-        """Add one message."""
-        if not self._parts:
+    def add(
+        self, channel: int, sequence: int, log_time_ns: int, publish_time_ns: int, data: bytes, crc: int
+    ) -> None:
+        """Add one message; `crc` is the CRC-32 of `data`."""
+        if not self._entries:
             self._start_ns = self._end_ns = log_time_ns
-        self._start_ns = min(self._start_ns, log_time_ns)
-        self._end_ns = max(self._end_ns, log_time_ns)
+        elif log_time_ns < self._start_ns:
+            self._start_ns = log_time_ns
+        elif log_time_ns > self._end_ns:
+            self._end_ns = log_time_ns
+        at = self._end
         entries = self._entries.get(channel)
         if entries is None:
             entries = self._entries[channel] = array("Q")
         entries.append(log_time_ns)
-        entries.append(self._size)
-        length = MESSAGE.size - HEADER.size + len(data)
-        head = MESSAGE.pack(Opcode.MESSAGE, length, channel, sequence, log_time_ns, publish_time_ns)
-        self._parts += (head, data)
-        self._size += HEADER.size + length
+        entries.append(at - CHUNK_HEAD_SIZE)
+        start = at + MESSAGE_HEAD_SIZE
+        end = start + len(data)
+        if end > len(self._record):
+            self._make_room(end)
+        length = end - at - HEAD_SIZE
+        MESSAGE.pack_into(self._record, at, _OPCODE, length, channel, sequence, log_time_ns, publish_time_ns)
+        self._record[start:end] = data
+        self._end = end
+        if len(data) >= WORTH_COMBINING:
+            self._crc = combine(zlib.crc32(self._record[self._crc_end : start], self._crc), crc, len(data))
+            self._crc_end = end
 
     def is_full(self, now_ns: int) -> bool:
         """True if the chunk must be written before a message of `now_ns` is added."""
-        return bool(self._parts) and (
-            self._size >= self.limits.size
-            or max(now_ns, self._end_ns) - min(now_ns, self._start_ns) >= self.limits.span_ns
+        return bool(self._entries) and (
+            self._end - CHUNK_HEAD_SIZE >= self.limits.size
+            or now_ns - self._start_ns >= self.limits.span_ns
+            or self._end_ns - now_ns >= self.limits.span_ns
         )
 
     @property
@@ -81,33 +111,56 @@ class ChunkBuilder:
         """Messages per channel id."""
         return {channel: len(entries) // 2 for channel, entries in self._entries.items()}
 
-    def build(self, offset: int) -> tuple[ChunkRef, bytes] | None:
-        """The chunk to be written at `offset` with its message indexes, None if it holds no message.
+    def build(self, offset: int) -> tuple[ChunkRef, Buffer, int] | None:
+        """The chunk to be written at `offset` with its message indexes, and the CRC-32 of these bytes.
 
-        Call `clear` once the bytes are where they belong.
+        None if it holds no message. The bytes hold until a message is added; call `clear` once they are
+        where they belong.
         """
-        if not self._parts:
+        if not self._entries:
             return None
-        data = b"".join(self._parts)
-        crc = zlib.crc32(data)
+        data: Buffer = self._record[CHUNK_HEAD_SIZE : self._end]
+        size = len(data)
+        crc = data_crc = zlib.crc32(self._record[self._crc_end : self._end], self._crc)
         name = "zstd" if self.compress else ""
         if self.compress:
             data = zstandard.ZstdCompressor(level=_ZSTD_LEVEL).compress(data)
-        fixed = struct.pack("<QQQI", self._start_ns, self._end_ns, self._size, crc)
-        fixed += struct.pack("<I", len(name)) + name.encode() + struct.pack("<Q", len(data))
-        length = HEADER.size + len(fixed) + len(data)
-        parts = [HEADER.pack(Opcode.CHUNK, length - HEADER.size), fixed, data]
-        offsets, at = {}, offset + length
+            data_crc = zlib.crc32(data)
+        head = chunk_head(self._start_ns, self._end_ns, size, crc, name, len(data))
+        length = len(head) + len(data)
+        indexes, offsets = self._indexes(offset + length)
+        ref = ChunkRef(
+            offset, length, self._start_ns, self._end_ns, name, len(data), size, len(indexes), offsets
+        )
+        whole_crc = zlib.crc32(indexes, extend(zlib.crc32(head), data, data_crc))
+        return ref, self._joined(head, data, indexes), whole_crc
+
+    def _joined(self, head: bytes, data: Buffer, indexes: bytes) -> Buffer:
+        if self.compress:
+            return b"".join((head, data, indexes))
+        end = self._end + len(indexes)
+        if end > len(self._record):
+            self._make_room(end)
+        self._record[: len(head)] = head
+        self._record[self._end : end] = indexes
+        return self._record[:end]
+
+    def _indexes(self, at: int) -> tuple[bytes, dict[int, int]]:
+        """The MessageIndex records to be written at offset `at`, and where each lies by channel id."""
+        parts: list[bytes] = []
+        offsets: dict[int, int] = {}
         for channel, entries in self._entries.items():
             rows = entries.tobytes()  # little-endian machines only, like the rest of this floor
             parts += (INDEX_HEAD.pack(Opcode.MESSAGE_INDEX, 6 + len(rows), channel, len(rows)), rows)
             offsets[channel], at = at, at + INDEX_HEAD.size + len(rows)
-        ref = ChunkRef(
-            offset, length, self._start_ns, self._end_ns, name, len(data), self._size,
-            at - offset - length, offsets,
-        )  # fmt: skip
-        return ref, b"".join(parts)
+        return b"".join(parts), offsets
+
+    def _make_room(self, end: int) -> None:
+        larger = memoryview(bytearray(max(end, 2 * len(self._record))))
+        larger[: self._end] = self._record[: self._end]
+        self._record = larger
 
     def clear(self) -> None:
         """Begin the next chunk."""
-        self._parts, self._size, self._entries = [], 0, {}
+        self._end = self._crc_end = CHUNK_HEAD_SIZE
+        self._crc, self._entries = 0, {}

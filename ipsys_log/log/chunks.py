@@ -1,5 +1,6 @@
 """What is inside a chunk: decompression within bounds, and its records."""
 
+import threading
 import zlib
 from collections.abc import Iterator
 from dataclasses import dataclass, field
@@ -15,6 +16,15 @@ from ipsys_log.log.view import View
 
 __all__ = ["LARGEST_CHUNK", "Inside", "check_compression", "inner_records", "look_inside", "unpack"]
 
+
+class _PerThread(threading.local):
+    """To make one takes longer than a small chunk does; two threads must not share one."""
+
+    def __init__(self) -> None:
+        self.zstd = zstandard.ZstdDecompressor()
+
+
+_DECOMPRESSORS = _PerThread()
 LARGEST_CHUNK = 1 << 30  # bytes, uncompressed: what one chunk may make us allocate
 
 
@@ -51,7 +61,7 @@ def _unpack_zstd(data: bytes, size: int) -> bytes:
     # The library believes the frame's own size before max_output_size, and allocates it.
     if zstandard.frame_content_size(data) not in (-1, size):
         raise ValueError("the frame claims another size than the chunk")
-    return zstandard.ZstdDecompressor().decompress(data, max_output_size=max(size, 1))
+    return _DECOMPRESSORS.zstd.decompress(data, max_output_size=max(size, 1))
 
 
 def inner_records(view: View, offset: int, data: bytes) -> Iterator[RecordAt]:

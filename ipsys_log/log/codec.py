@@ -9,15 +9,11 @@ per type from the type hints; nothing is written down twice. Numbers are stored 
 from __future__ import annotations
 
 import json
-import types
-from collections.abc import Callable
-from dataclasses import fields, is_dataclass
 from functools import cache
 from importlib import import_module
 from importlib.resources import files
-from typing import Annotated, Any, Union, get_args, get_origin, get_type_hints
+from typing import Any, get_type_hints
 
-import numpy as np
 from google.protobuf import descriptor_pb2, descriptor_pool, json_format, message_factory
 from google.protobuf.message import DecodeError
 from google.protobuf.message import Message as Proto
@@ -25,10 +21,9 @@ from google.protobuf.timestamp_pb2 import Timestamp
 
 from ipsys_log import messages
 from ipsys_log.errors import LogError
+from ipsys_log.log.fields import fields_of, fill_proto, read_proto
 
 __all__ = ["PAYLOADS", "decode", "encode", "schema_data", "schema_name"]
-
-NS = 1_000_000_000
 
 # The payloads that have a channel of their own, by the name of their schema.
 PAYLOADS: dict[str, type] = {
@@ -58,10 +53,8 @@ PAYLOADS: dict[str, type] = {
         )
     },
 }
+_LONG = 32 << 10  # bytes
 _NAMES = {payload: name for name, payload in PAYLOADS.items()}
-
-Fill = Callable[[Any, Any], None]
-Read = Callable[[Any], Any]
 
 
 def schema_name(payload: type) -> str:
@@ -79,9 +72,52 @@ def encode(payload: Any) -> bytes:
     >>> decode("ipsys.v1.CameraPoints", data).points[0].z_m
     2.1
     """
-    proto = _proto_class(schema_name(type(payload)))()
-    _fill(type(payload), proto, payload)
+    kind: type = type(payload)
+    for name in _bytes_fields(kind):
+        if len(getattr(payload, name)) >= _LONG:
+            return _encode_around(payload, name)
+    proto = _proto_class(schema_name(kind))()
+    fill_proto(kind, proto, payload)
     return proto.SerializeToString(deterministic=True)
+
+
+def _encode_around(payload: Any, long: str) -> bytes:
+    """The same bytes, with the long field set between those of lower and those of higher number.
+
+    Protobuf would copy an image three times; a field of bytes stands in a message as it is.
+    """
+    kind: type = type(payload)
+    proto_class = _proto_class(schema_name(kind))
+    numbers = {field.name: field.number for field in proto_class.DESCRIPTOR.fields}
+    lower, higher = proto_class(), proto_class()
+    for name, fill, _ in fields_of(kind):
+        value = getattr(payload, name)
+        if name != long and value is not None:
+            fill(lower if numbers[name] < numbers[long] else higher, value)
+    data = getattr(payload, long)
+    head = _varint(numbers[long] << 3 | 2) + _varint(len(data))  # 2: the length comes first
+    return b"".join(
+        (
+            lower.SerializeToString(deterministic=True),
+            head,
+            data,
+            higher.SerializeToString(deterministic=True),
+        )
+    )
+
+
+def _varint(number: int) -> bytes:
+    """Seven bits to a byte, the lowest first; all but the last have the highest bit set."""
+    parts = []
+    while number > 127:
+        parts.append(number & 127 | 128)
+        number >>= 7
+    return bytes((*parts, number))
+
+
+@cache
+def _bytes_fields(kind: type) -> tuple[str, ...]:
+    return tuple(name for name, hint in get_type_hints(kind).items() if hint is bytes)
 
 
 def decode(name: str, data: bytes, encoding: str = "protobuf") -> Any:
@@ -102,7 +138,7 @@ def decode(name: str, data: bytes, encoding: str = "protobuf") -> Any:
     if payload is None:
         raise LogError(f"its schema {name!r} is none that ipsys reads")
     try:
-        return _read(payload, _parse(_proto_class(name), data, encoding))
+        return read_proto(payload, _parse(_proto_class(name), data, encoding))
     except (DecodeError, json_format.ParseError, ValueError, TypeError, RecursionError) as error:
         raise LogError(f"a message is not a valid {name}: {error}") from error
 
@@ -162,103 +198,3 @@ def _proto_class(name: str) -> type[Proto]:
         module = import_module(f"foxglove_schemas_protobuf.{message}_pb2")
         return getattr(module, message)  # type: ignore[no-any-return]
     return message_factory.GetMessageClass(_pool().FindMessageTypeByName(name))
-
-
-# --- one payload type, field by field -----------------------------------------------------------
-
-
-def _fill(payload_type: type, proto: Any, payload: Any) -> None:
-    for name, fill, _ in _fields(payload_type):
-        value = getattr(payload, name)
-        if value is not None:
-            fill(proto, value)
-
-
-def _read(payload_type: type, proto: Any) -> Any:
-    return payload_type(*(read(proto) for _, _, read in _fields(payload_type)))
-
-
-@cache
-def _fields(payload_type: type) -> tuple[tuple[str, Fill, Read], ...]:
-    hints = get_type_hints(payload_type, include_extras=True)
-    return tuple((f.name, *_converters(f.name, hints[f.name])) for f in fields(payload_type))
-
-
-def _converters(name: str, hint: Any) -> tuple[Fill, Read]:
-    """How a field is put into a protobuf message, and taken out of one."""
-    if get_origin(hint) in (Union, types.UnionType):
-        inner = next(h for h in get_args(hint) if h is not type(None))
-        fill, read = _converters(name, inner)
-        if get_origin(inner) is Annotated and isinstance(inner.__metadata__[0], tuple):
-            return fill, lambda proto: read(proto) if getattr(proto, name) else None
-        return fill, lambda proto: read(proto) if proto.HasField(name) else None
-    if get_origin(hint) is Annotated:
-        mark = hint.__metadata__[0]
-        return _array(name, mark) if isinstance(mark, tuple) else _time(name)
-    if get_origin(hint) is tuple:
-        return _repeated(name, get_args(hint)[0])
-    if get_origin(hint) is dict:
-        return _map(name)
-    return _nested(name, hint) if is_dataclass(hint) else _scalar(name)
-
-
-def _map(name: str) -> tuple[Fill, Read]:
-    return (
-        lambda proto, value: getattr(proto, name).update(value),
-        lambda proto: dict(sorted(getattr(proto, name).items())),
-    )
-
-
-def _nested(name: str, payload_type: Any) -> tuple[Fill, Read]:
-    def fill(proto: Any, value: Any) -> None:
-        getattr(proto, name).SetInParent()
-        _fill(payload_type, getattr(proto, name), value)
-
-    return fill, lambda proto: _read(payload_type, getattr(proto, name))
-
-
-def _scalar(name: str) -> tuple[Fill, Read]:
-    return lambda proto, value: setattr(proto, name, value), lambda proto: getattr(proto, name)
-
-
-def _array(name: str, shape: tuple[int, ...]) -> tuple[Fill, Read]:
-    def fill(proto: Any, value: Any) -> None:
-        getattr(proto, name).extend(np.asarray(value, dtype=np.float64).reshape(-1).tolist())
-
-    def read(proto: Any) -> Any:
-        array = np.array(getattr(proto, name), dtype=np.float64)
-        if -1 not in shape and array.size != np.prod(shape):
-            raise ValueError(f"{name} has {array.size} numbers instead of {np.prod(shape)}")
-        array = array.reshape(shape)
-        array.flags.writeable = False
-        return array
-
-    return fill, read
-
-
-def _time(name: str) -> tuple[Fill, Read]:
-    def fill(proto: Any, value: int) -> None:
-        stamp = getattr(proto, name)
-        stamp.seconds, stamp.nanos = divmod(value, NS)
-        stamp.SetInParent()
-
-    def read(proto: Any) -> int:
-        stamp = getattr(proto, name)
-        return int(stamp.seconds * NS + stamp.nanos)
-
-    return fill, read
-
-
-def _repeated(name: str, item: Any) -> tuple[Fill, Read]:
-    if not is_dataclass(item):
-        return (
-            lambda proto, value: getattr(proto, name).extend(value),
-            lambda proto: tuple(getattr(proto, name)),
-        )
-    nested: Any = item
-
-    def fill(proto: Any, value: Any) -> None:
-        for one in value:
-            _fill(nested, getattr(proto, name).add(), one)
-
-    return fill, lambda proto: tuple(_read(nested, one) for one in getattr(proto, name))

@@ -35,12 +35,16 @@ class ChannelHash:
 
     def add(self, log_time_ns: int, publish_time_ns: int, data: bytes) -> None:
         """Continue the chain by one message."""
+        self.add_row(log_time_ns, publish_time_ns, len(data), zlib.crc32(data))
+
+    def add_row(self, log_time_ns: int, publish_time_ns: int, length: int, crc: int) -> None:
+        """The same for a message of which the length and the CRC-32 are known."""
         if log_time_ns < self.last_ns:
             self.valid = False
         self.count += 1
         self.last_ns = log_time_ns
         if self.valid:
-            row = _ROW.pack(log_time_ns, publish_time_ns, len(data), zlib.crc32(data))
+            row = _ROW.pack(log_time_ns, publish_time_ns, length, crc)
             self.digest = hashlib.blake2b(self.digest + row, digest_size=16).digest()
 
 

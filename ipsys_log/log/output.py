@@ -8,6 +8,7 @@ from pathlib import Path
 from typing import Protocol
 
 from ipsys_log.errors import LogError
+from ipsys_log.log.crc import Buffer, extend
 from ipsys_log.log.journal import replace_tail, roll_back
 from ipsys_log.log.storage import Storage, write_all
 
@@ -15,13 +16,16 @@ __all__ = ["Growing", "Output", "Pending"]
 
 
 class Output(Protocol):
-    """The end of the data section. `crc` is None where the log does not keep one."""
+    """The end of the data section. `crc` is None where the log does not keep one.
+
+    `emit` is told the CRC-32 of large data, so that it is not worked out twice.
+    """
 
     @property
     def offset(self) -> int: ...
     @property
     def crc(self) -> int | None: ...
-    def emit(self, data: bytes) -> None: ...
+    def emit(self, data: Buffer, crc: int | None = None) -> None: ...
     def finish(self, tail: bytes) -> None: ...
     def abandon(self) -> None: ...
     def close(self) -> None: ...
@@ -42,7 +46,7 @@ class Growing:
     crc: int | None = 0
     _failed: bool = False
 
-    def emit(self, data: bytes) -> None:
+    def emit(self, data: Buffer, crc: int | None = None) -> None:
         try:
             write_all(self.storage, self.fd, data, self.offset)
         except OSError as error:
@@ -51,7 +55,7 @@ class Growing:
             then = kept if self.target is None else "nothing was written, free some space and try again"
             raise _cannot_write(self.target or self.path, error, then) from None
         self.offset += len(data)
-        self.crc = zlib.crc32(data, self.crc or 0)
+        self.crc = _extend(self.crc or 0, data, crc)
 
     def finish(self, tail: bytes) -> None:
         if self._failed:  # a torn piece may reach beyond the tail
@@ -85,10 +89,10 @@ class Pending:
     crc: int | None
     _pieces: list[bytes] = field(default_factory=list)
 
-    def emit(self, data: bytes) -> None:
-        self._pieces.append(data)
+    def emit(self, data: Buffer, crc: int | None = None) -> None:
+        self._pieces.append(bytes(data))  # a chunk's memory is used again
         self.offset += len(data)
-        self.crc = None if self.crc is None else zlib.crc32(data, self.crc)
+        self.crc = None if self.crc is None else _extend(self.crc, data, crc)
 
     def finish(self, tail: bytes) -> None:
         if not self._pieces:
@@ -106,6 +110,10 @@ class Pending:
 
     def close(self) -> None:
         self.storage.close(self.fd)
+
+
+def _extend(so_far: int, data: Buffer, crc: int | None) -> int:
+    return zlib.crc32(data, so_far) if crc is None else extend(so_far, data, crc)
 
 
 def _cannot_write(path: Path, error: OSError, then: str) -> LogError:

@@ -1,35 +1,35 @@
 """Getting at the messages of one chunk while reading no more of it than is needed."""
 
-from bisect import bisect_right
 from collections import OrderedDict
-from collections.abc import Callable, Mapping
+from collections.abc import Callable, Iterator, Mapping
 from dataclasses import dataclass, field
+from functools import partial
 
 from mcap.opcode import Opcode
 
-from ipsys_log.log.chunks import check_compression, look_inside, unpack
+from ipsys_log.log.chunks import check_compression, unpack
 from ipsys_log.log.frames import EqualBlocks, RawBlocks, find_blocks
 from ipsys_log.log.order import Cursor
 from ipsys_log.log.records import (
     CHUNK_HEAD_SIZE,
-    ENTRY,
-    HEADER,
+    HEAD_SIZE,
     MESSAGE,
+    MESSAGE_HEAD_SIZE,
     ChunkRef,
     parse_chunk_head,
-    parse_message_index,
 )
+from ipsys_log.log.rows import Entries, Run, chunk_entries, runs, wanted_rows
 from ipsys_log.log.types import RawMessage
 from ipsys_log.log.view import View
 
-__all__ = ["Blocks", "chunk_entries", "open_chunk", "open_loose"]
+__all__ = ["Blocks", "open_chunk", "open_loose"]
 
 _CACHE_BYTES = 64 << 20
-_GAP = 4096  # bytes: reading across less than this costs less than another system call
-_RUN = 4 << 20  # bytes read at once
-_SMALL = 64 << 10  # a compressed chunk below this is decompressed whole without looking at its blocks
-
-Entries = Mapping[int, list[tuple[int, int]]]
+_SMALL = 64 << 10  # bytes: a compressed chunk below this is unpacked without looking at its blocks
+_SPARSE = 4096  # bytes per wanted message: with fewer, the chunk is unpacked as well
+_OPCODE = int(Opcode.MESSAGE)
+_SHORTEST = MESSAGE_HEAD_SIZE - HEAD_SIZE  # bytes: the length of a Message record without payload
+_new = tuple.__new__  # RawMessage(...) goes through a function in Python and takes twice as long
 
 
 @dataclass(slots=True)
@@ -37,16 +37,19 @@ class Blocks:
     """The stretches of records read last, so that memory stays bounded however many chunks overlap."""
 
     capacity: int = _CACHE_BYTES
-    _held: "OrderedDict[tuple[int, int], bytes]" = field(default_factory=OrderedDict)
+    _held: "OrderedDict[tuple[int, int, int], bytes]" = field(default_factory=OrderedDict)
     _size: int = 0
 
-    def get(self, key: tuple[int, int], read: Callable[[], bytes]) -> bytes:
-        """The block under `key`, by `read` if it is not held."""
+    def fetch(self, place: int, read: Callable[[int, int], bytes], low: int, high: int) -> bytes:
+        """Bytes `low` to `high` of the chunk at `place`, by `read` if they are not held."""
+        if low == high:
+            return b""
+        key = (place, low, high)
         data = self._held.get(key)
         if data is not None:
             self._held.move_to_end(key)
             return data
-        data = read()
+        data = read(low, high)
         self._held[key] = data
         self._size += len(data)
         while self._size > self.capacity and len(self._held) > 1:
@@ -56,36 +59,46 @@ class Blocks:
 
 @dataclass(slots=True)
 class _Messages:
-    """Rows of messages of one chunk: where each lies and which stretch to read for it."""
+    """The wanted messages of one chunk, by row: `runs` says which stretch to `fetch` for each beforehand.
+
+    `read` reads what does not lie in its stretch.
+    """
 
     view: View
-    blocks: Blocks
     topics: Mapping[int, str]
     place: int  # the chunk's offset, 0 for messages in no chunk
     times: list[int]
     offsets: list[int]
-    runs: list[tuple[int, int, bool]]
+    runs: list[Run]
+    fetch: Callable[[int, int], bytes]
     read: Callable[[int, int], bytes]
 
-    def load(self, row: int) -> RawMessage:
-        """The message of `row`; what its record says must agree with the index."""
-        offset, (low, high, shared) = self.offsets[row], self.runs[row]
-        if shared:
-            data = self.blocks.get((self.place, low), lambda: self.read(low, high))
-        else:
-            data = self.read(low, high)
-        start = offset - low
-        if start + MESSAGE.size > len(data):
-            data, start = self.read(offset, offset + MESSAGE.size), 0
-        opcode, length, channel, _, time, published = MESSAGE.unpack_from(data, start)
-        topic = self.topics.get(channel)
-        if opcode != Opcode.MESSAGE or time != self.times[row] or topic is None or length < 22:
-            raise self.view.fault(self.place or offset, "a message index points to no message of its time")
-        end = start + HEADER.size + length
-        if end > len(data):
-            data = self.read(offset, offset + HEADER.size + length)
-            start, end = 0, len(data)
-        return RawMessage(topic, time, published, data[start + MESSAGE.size : end])
+    def between(self, first: int, stop: int) -> Iterator[RawMessage]:
+        """The messages of rows `first` to `stop`; what a record says must agree with the index."""
+        # Where small messages are read, the time is spent here: no call to Python for most of them.
+        unpack, topic_of = MESSAGE.unpack_from, self.topics.get
+        data, low, size, fetched = b"", 0, 0, None
+        rows = slice(first, stop)
+        for due, offset, run in zip(self.times[rows], self.offsets[rows], self.runs[rows], strict=True):
+            if run is not fetched:
+                data, low, fetched = self.fetch(*run), run[0], run
+                size = len(data)
+            start = offset - low
+            if start + MESSAGE_HEAD_SIZE <= size:
+                opcode, length, channel, _, time, published = unpack(data, start)
+            else:
+                head = self.read(offset, offset + MESSAGE_HEAD_SIZE)
+                opcode, length, channel, _, time, published = unpack(head)
+            topic = topic_of(channel)
+            if time != due or opcode != _OPCODE or length < _SHORTEST or topic is None:
+                place = self.place or offset
+                raise self.view.fault(place, "a message index points to no message of its time")
+            end = start + HEAD_SIZE + length
+            if end <= size:
+                payload = data[start + MESSAGE_HEAD_SIZE : end]
+            else:
+                payload = self.read(offset + MESSAGE_HEAD_SIZE, offset + HEAD_SIZE + length)
+            yield _new(RawMessage, (topic, time, published, payload))
 
 
 @dataclass(slots=True)
@@ -94,7 +107,7 @@ class _Records:
 
     view: View
     chunk: ChunkRef
-    raw: EqualBlocks | RawBlocks | None
+    raw: EqualBlocks | RawBlocks | None = None
     whole: bytes | None = None
 
     def read(self, low: int, high: int) -> bytes:
@@ -104,97 +117,51 @@ class _Records:
         if not chunk.compression:
             return self.view.read(chunk.offset + CHUNK_HEAD_SIZE + low, high - low)
         data = self.raw.read(low, high) if self.raw is not None else None
-        return self._whole()[low:high] if data is None else data
+        if data is None:
+            data = self.unpacked()[low:high]
+        if len(data) != high - low:
+            raise self.view.fault(chunk.offset, "a message reaches beyond the end of its chunk")
+        return data
 
-    def _whole(self) -> bytes:
-        """Decompressed once, and held while messages of it are due: chunks may overlap in time."""
+    def unpacked(self, *_: int) -> bytes:
+        """All of it, decompressed once and held while messages are due: chunks may overlap in time."""
         if self.whole is None:
             at = self.chunk.offset
             self.whole = unpack(self.view, at, parse_chunk_head(self.view, at)[1])
         return self.whole
 
 
-def chunk_entries(view: View, chunk: ChunkRef, wanted: set[int] | None = None) -> Entries:
-    """Per channel id the (log time in ns, offset in the chunk) of its messages, from the indexes if any."""
-    if not chunk.index_offsets or not chunk.index_length:
-        data = unpack(view, chunk.offset, parse_chunk_head(view, chunk.offset)[1])
-        return look_inside(view, chunk.offset, data).entries
-    start = chunk.offset + chunk.length
-    data = view.read(start, chunk.index_length)
-    return {
-        channel: list(ENTRY.iter_unpack(parse_message_index(view, data, offset - start, channel, offset)))
-        for channel, offset in chunk.index_offsets.items()
-        if wanted is None or channel in wanted
-    }
-
-
 def open_chunk(
     view: View, blocks: Blocks, chunk: ChunkRef, topics: Mapping[int, str], span: tuple[int, int]
 ) -> Cursor:
     """A cursor over the messages of the channels in `topics` with start <= log time <= end."""
-    check_compression(view, chunk.compression)
+    place, name, size = chunk.offset, chunk.compression, chunk.uncompressed_size
+    packed = chunk.compressed_size
+    check_compression(view, name)
     entries = chunk_entries(view, chunk)
-    times, offsets = _rows(entries, topics, span)
-    runs = _runs(entries, offsets, chunk.uncompressed_size)
-    raw: EqualBlocks | RawBlocks | None = None
-    if chunk.compression and chunk.compressed_size > _SMALL and len(runs) * _GAP < chunk.compressed_size:
-        at = chunk.offset + CHUNK_HEAD_SIZE + len(chunk.compression)
-        raw = find_blocks(view, chunk.compression, at, chunk.compressed_size, chunk.uncompressed_size)
-    records = _Records(view, chunk, raw)
-    messages = _Messages(view, blocks, topics, chunk.offset, times, offsets, runs, records.read)
-    return Cursor(chunk.offset, times, offsets, messages.load)
+    rows = wanted_rows(entries, topics, span)
+    records = _Records(view, chunk)
+    if name and packed > _SMALL and packed > len(rows) * _SPARSE:
+        records.raw = find_blocks(view, name, place + CHUNK_HEAD_SIZE + len(name), packed, size)
+    if name and records.raw is None:
+        stretches, fetch = [(0, size)] * len(rows), records.unpacked
+    else:
+        stretches, fetch = runs(entries, rows, size), partial(blocks.fetch, place, records.read)
+    times, offsets = rows.T.tolist()
+    messages = _Messages(view, topics, place, times, offsets, stretches, fetch, records.read)
+    return Cursor(place, times, offsets, messages.between)
 
 
 def open_loose(
     view: View, blocks: Blocks, entries: Entries, topics: Mapping[int, str], span: tuple[int, int], end: int
 ) -> Cursor:
     """The same for messages that lie in no chunk; `end` is where the data section ends."""
-    times, offsets = _rows(entries, topics, span)
-    runs = _runs(entries, offsets, end)
-    messages = _Messages(
-        view, blocks, topics, 0, times, offsets, runs, lambda low, high: view.read(low, high - low)
-    )
-    return Cursor(None, times, offsets, messages.load)
 
+    def read(low: int, high: int) -> bytes:
+        return view.read(low, high - low)
 
-def _rows(entries: Entries, topics: Mapping[int, str], span: tuple[int, int]) -> tuple[list[int], list[int]]:
-    """Times and offsets of the wanted messages, sorted by (time, offset)."""
-    low, high = span
-    rows = [
-        row
-        for channel, found in entries.items()
-        if channel in topics
-        for row in found
-        if low <= row[0] <= high
-    ]
-    rows.sort()
-    return [time for time, _ in rows], [offset for _, offset in rows]
-
-
-def _runs(entries: Entries, offsets: list[int], end: int) -> list[tuple[int, int, bool]]:
-    """For each offset the stretch to read, and whether several messages share it.
-
-    Neighbours that lie close together are read at once. An index does not say how long a message is; it
-    ends where the next one begins at the latest.
-    """
-    starts = sorted({offset for rows in entries.values() for _, offset in rows})
-    starts.append(end)
-    run_of: dict[int, tuple[int, int, bool]] = {}
-    group: list[int] = []
-    low = high = 0
-    for offset in sorted(offsets):
-        stop = starts[bisect_right(starts, offset)] if offset < end else offset
-        if group and (offset - high > _GAP or stop - low > _RUN):
-            _close(run_of, group, low, high)
-            group = []
-        low = low if group else offset
-        group.append(offset)
-        high = stop
-    _close(run_of, group, low, high)
-    return [run_of[offset] for offset in offsets]
-
-
-def _close(run_of: dict[int, tuple[int, int, bool]], group: list[int], low: int, high: int) -> None:
-    run = (low, high, len(group) > 1)
-    for offset in group:
-        run_of[offset] = run
+    rows = wanted_rows(entries, topics, span)
+    stretches, fetch = runs(entries, rows, end), partial(blocks.fetch, 0, read)
+    times, offsets = rows.T.tolist()
+    messages = _Messages(view, topics, 0, times, offsets, stretches, fetch, read)
+    return Cursor(None, times, offsets, messages.between)

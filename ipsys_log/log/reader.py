@@ -19,8 +19,9 @@ from ipsys_log.log.hashing import METADATA_NAME, ChannelHash, hashes_from_metada
 from ipsys_log.log.journal import attach_journal
 from ipsys_log.log.load import load_contents
 from ipsys_log.log.order import Pending, in_log_order
-from ipsys_log.log.payload import Blocks, chunk_entries, open_chunk, open_loose
+from ipsys_log.log.payload import Blocks, open_chunk, open_loose
 from ipsys_log.log.records import HEADER, parse, walk
+from ipsys_log.log.rows import ALWAYS, as_rows, chunk_entries
 from ipsys_log.log.types import RawMessage
 from ipsys_log.log.view import View, open_for_reading
 
@@ -28,7 +29,6 @@ __all__ = ["LogReader", "stored_hashes"]
 
 _ATTEMPTS = 100
 _PAUSE_S = 0.02
-_END_OF_TIME = (1 << 64) - 1
 
 
 class LogReader:
@@ -131,7 +131,7 @@ class LogReader:
         """
         contents, view = self._contents, self._view
         wanted = self._topics_by_id(topics)
-        span = (max(0, start_ns or 0), _END_OF_TIME if end_ns is None else end_ns - 1)
+        span = (max(0, start_ns or 0), ALWAYS[1] if end_ns is None else end_ns - 1)
         pending = [
             Pending(
                 chunk.start_ns, chunk.offset, partial(open_chunk, view, self._blocks, chunk, wanted, span)
@@ -144,20 +144,21 @@ class LogReader:
         if span[1] < span[0] or not wanted:
             return iter(())
         if contents.loose:
-            loose = partial(open_loose, view, self._blocks, contents.loose, wanted, span, contents.data_end)
+            entries = as_rows(contents.loose)
+            loose = partial(open_loose, view, self._blocks, entries, wanted, span, contents.data_end)
             pending.append(Pending(0, 0, loose))
         return in_log_order(pending, lambda at: view.fault(at, "a message is older than its chunk says"))
 
     def times(self, topic: str) -> NDArray[np.int64]:
         """Log times of a topic in ns, sorted, shape (N,); read from the indexes alone."""
         wanted = set(self._topics_by_id([topic]))
-        parts = [rows for key, rows in self._contents.loose.items() if key in wanted]
+        parts = [rows for key, rows in as_rows(self._contents.loose).items() if key in wanted]
         for chunk in self._contents.chunks:
             if not chunk.index_offsets or not wanted.isdisjoint(chunk.index_offsets):
                 entries = chunk_entries(self._view, chunk, wanted)
                 parts += [rows for key, rows in entries.items() if key in wanted]
-        times = sorted(time for rows in parts for time, _ in rows)
-        return np.array(times, np.uint64).astype(np.int64)
+        times = np.concatenate([rows[:, 0] for rows in parts]) if parts else np.empty(0, np.uint64)
+        return np.sort(times).astype(np.int64)
 
     def channel_hash(self, topic: str) -> str:
         """Hash over times and payloads of a channel in log order, in hexadecimal.

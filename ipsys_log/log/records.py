@@ -5,9 +5,8 @@ Layouts as in the MCAP specification, https://mcap.dev/spec. The record classes 
 
 import struct
 from collections.abc import Callable, Iterator
-from dataclasses import dataclass
 from io import BytesIO
-from typing import TypeVar
+from typing import NamedTuple, TypeVar
 
 from mcap import records as mcap
 from mcap.data_stream import ReadDataStream, RecordBuilder
@@ -22,13 +21,16 @@ __all__ = [
     "ENTRY",
     "FOOTER",
     "HEADER",
+    "HEAD_SIZE",
     "INDEX_HEAD",
     "MAGIC",
     "MESSAGE",
+    "MESSAGE_HEAD_SIZE",
     "ChunkHead",
     "ChunkRef",
     "RecordAt",
     "as_bytes",
+    "chunk_head",
     "parse",
     "parse_chunk_head",
     "parse_chunk_index",
@@ -43,6 +45,8 @@ DATA_END = struct.Struct("<BQI")
 FOOTER = struct.Struct("<BQQQI")
 ENTRY = struct.Struct("<QQ")  # of a message index: log time in ns, offset in the chunk
 INDEX_HEAD = struct.Struct("<BQHI")  # opcode, length, channel, bytes of entries
+HEAD_SIZE = HEADER.size
+MESSAGE_HEAD_SIZE = MESSAGE.size  # bytes from a message's opcode to its payload
 CHUNK_HEAD_SIZE = 49  # bytes from a chunk's opcode to its data, without the name of the compression
 _CHUNK = struct.Struct("<QQQI")  # start, end, uncompressed size, CRC
 _CHUNK_INDEX = struct.Struct("<QQQQI")  # start, end, offset, length, bytes of the map that follows
@@ -52,8 +56,7 @@ _LONGEST_NAME = 64
 R = TypeVar("R")
 
 
-@dataclass(frozen=True, slots=True)
-class RecordAt:
+class RecordAt(NamedTuple):
     """Where a record lies: `offset` of its opcode, `length` with its 9 bytes of head."""
 
     opcode: int
@@ -61,8 +64,7 @@ class RecordAt:
     length: int
 
 
-@dataclass(frozen=True, slots=True)
-class ChunkRef:
+class ChunkRef(NamedTuple):
     """What a ChunkIndex record says. `index_offsets` maps channel ids to their MessageIndex records."""
 
     offset: int
@@ -94,8 +96,7 @@ class ChunkRef:
         )
 
 
-@dataclass(frozen=True, slots=True)
-class ChunkHead:
+class ChunkHead(NamedTuple):
     """The fields in front of a chunk's data, which lies at `data_offset` in the file."""
 
     start_ns: int
@@ -157,6 +158,14 @@ def parse_chunk_head(view: View, offset: int) -> tuple[RecordAt, ChunkHead]:
         raise view.fault(offset, "the Chunk record reaches beyond the end of the file")
     head = ChunkHead(start, end, size, crc, name, offset + at + 8, data_size)
     return RecordAt(opcode, offset, HEADER.size + length), head
+
+
+def chunk_head(start_ns: int, end_ns: int, size: int, crc: int, compression: str, data_size: int) -> bytes:
+    """A Chunk record up to its data of `data_size` bytes, which are `size` when decompressed."""
+    name = compression.encode()
+    fields = _CHUNK.pack(start_ns, end_ns, size, crc)
+    fields += struct.pack("<I", len(name)) + name + struct.pack("<Q", data_size)
+    return HEADER.pack(Opcode.CHUNK, len(fields) + data_size) + fields
 
 
 def parse_message_index(view: View, data: bytes, position: int, channel_id: int, at: int) -> bytes:

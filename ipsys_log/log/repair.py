@@ -13,6 +13,7 @@ from mcap.opcode import Opcode
 
 from ipsys_log.errors import LogError
 from ipsys_log.log.contents import Contents
+from ipsys_log.log.crc import Buffer
 from ipsys_log.log.hashing import METADATA_NAME, metadata_of_hashes
 from ipsys_log.log.journal import replace_tail, roll_back
 from ipsys_log.log.load import load_contents
@@ -195,11 +196,11 @@ def _indexes(found: Survey) -> list[bytes]:
     return pieces
 
 
-def _saved_chunk(found: Survey, saved: Salvage, offset: int) -> list[bytes]:
+def _saved_chunk(found: Survey, saved: Salvage, offset: int) -> list[Buffer]:
     built = saved.chunk.build(offset + sum(map(len, saved.definitions)))
     if built is None:
-        return saved.definitions
-    ref, data = built
+        return [*saved.definitions]
+    ref, data, _ = built
     found.contents.chunks.append(ref)
     found.contents.cover(ref.start_ns, ref.end_ns)
     for channel, number in saved.chunk.counts.items():

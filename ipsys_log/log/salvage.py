@@ -1,6 +1,7 @@
 """Complete messages in a chunk that was being written when its writer died."""
 
 import struct
+import zlib
 from collections import Counter
 from dataclasses import dataclass, field
 
@@ -69,8 +70,10 @@ def _save_one(view: View, data: bytes, position: int, end: int, found: Survey, s
         return len(data)
     else:
         payload = data[position + MESSAGE.size : stop]
-        saved.chunk.add(channel, sequence, time, published, payload)
-        found.hashes.setdefault(known.topic, ChannelHash()).add(time, published, payload)
+        crc = zlib.crc32(payload)
+        saved.chunk.add(channel, sequence, time, published, payload, crc)
+        state = found.hashes.setdefault(known.topic, ChannelHash())
+        state.add_row(time, published, len(payload), crc)
     saved.bytes_kept += stop - position
     return stop
 

@@ -57,7 +57,7 @@ class Disk:
 DISK: Storage = Disk()
 
 
-def write_all(storage: Storage, fd: int, data: bytes, offset: int) -> None:
+def write_all(storage: Storage, fd: int, data: bytes | memoryview, offset: int) -> None:
     """Write the whole of `data`: one system call may take less (a signal, 2 GiB, a nearly full disk)."""
     rest = memoryview(data)
     while rest:

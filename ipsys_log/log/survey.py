@@ -2,7 +2,7 @@
 
 import re
 import zlib
-from dataclasses import dataclass, field, replace
+from dataclasses import dataclass, field
 
 from mcap.opcode import Opcode
 
@@ -146,7 +146,7 @@ def _take_chunk(view: View, found: Survey, at: RecordAt) -> None:
     times = [time for rows in inside.entries.values() for time, _ in rows]
     if times:  # what its head says may be wrong, and readers go by it
         chunk = found.contents.chunks[-1]
-        found.contents.chunks[-1] = replace(chunk, start_ns=min(times), end_ns=max(times))
+        found.contents.chunks[-1] = chunk._replace(start_ns=min(times), end_ns=max(times))
     found.counts[at.offset] = {key: len(rows) for key, rows in inside.entries.items()}
     found.loose.schemas = inside.schemas | found.loose.schemas
     found.loose.channels = inside.channels | found.loose.channels

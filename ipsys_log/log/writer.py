@@ -1,6 +1,7 @@
 """Writing a new log and appending to a finished one: one object for both."""
 
 import os
+import zlib
 from collections.abc import Mapping
 from pathlib import Path
 from types import TracebackType
@@ -184,12 +185,13 @@ class LogWriter:
         state = self._hashes.get(topic)
         if state is None:
             state = self._hashes[topic] = self._hash_so_far(topic)
-        state.add(log_time_ns, publish_time_ns, data)
+        crc = zlib.crc32(data)
+        state.add_row(log_time_ns, publish_time_ns, len(data), crc)
         sequence = state.count & 0xFFFFFFFF
         if self._contents.loose:
             self._write_loose(channel, sequence, log_time_ns, publish_time_ns, data)
         else:
-            builder.add(channel, sequence, log_time_ns, publish_time_ns, data)
+            builder.add(channel, sequence, log_time_ns, publish_time_ns, data, crc)
 
     def flush(self) -> None:
         """Write what is buffered as complete chunks; a recorder calls this at least every second."""
@@ -271,8 +273,8 @@ class LogWriter:
         built = builder.build(self._output.offset)
         if built is None:
             return
-        ref, data = built
-        self._output.emit(data)
+        ref, data, crc = built
+        self._output.emit(data, crc)
         self._contents.chunks.append(ref)
         self._contents.cover(ref.start_ns, ref.end_ns)
         for channel, number in builder.counts.items():

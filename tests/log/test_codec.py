@@ -5,6 +5,7 @@ from __future__ import annotations
 import subprocess
 import sys
 from dataclasses import fields
+from importlib import import_module
 from pathlib import Path
 from typing import Any, get_type_hints
 
@@ -112,6 +113,25 @@ def test_anybody_can_read_it_with_the_schema_in_the_log(payload: Any) -> None:
             assert getattr(stranger, field.name) == value
         if value is None:
             assert not stranger.HasField(field.name)
+
+
+@given(
+    times,
+    st.text(),
+    st.text(),
+    st.sampled_from([0, 127, 128, (32 << 10) - 1, 32 << 10, 100_000, 1 << 21]),
+)
+def test_long_bytes_are_set_where_protobuf_sets_them(time: int, frame: str, text: str, size: int) -> None:
+    data = bytes(range(256)) * (size // 256) + bytes(size % 256)
+    for payload in (
+        m.CompressedImage(time, frame, data, text),
+        m.RawImage(time, frame, size, 3, text, 9, data),
+    ):
+        encoded = encode(payload)
+        assert same(decode(f"foxglove.{type(payload).__name__}", encoded), payload)
+        module = import_module(f"foxglove_schemas_protobuf.{type(payload).__name__}_pb2")
+        proto = getattr(module, type(payload).__name__).FromString(encoded)
+        assert proto.SerializeToString(deterministic=True) == encoded
 
 
 def test_zero_is_not_missing() -> None:

@@ -1,0 +1,118 @@
+"""Payloads to protobuf messages and back, field by field, as the type hints say."""
+
+from __future__ import annotations
+
+import types
+from collections.abc import Callable
+from dataclasses import fields, is_dataclass
+from functools import cache
+from typing import Annotated, Any, Union, get_args, get_origin, get_type_hints
+
+import numpy as np
+
+__all__ = ["NS", "fields_of", "fill_proto", "read_proto"]
+
+NS = 1_000_000_000
+
+Fill = Callable[[Any, Any], None]
+Read = Callable[[Any], Any]
+
+
+def fill_proto(payload_type: type, proto: Any, payload: Any) -> None:
+    """Put a payload into a protobuf message of its schema."""
+    for name, fill, _ in fields_of(payload_type):
+        value = getattr(payload, name)
+        if value is not None:
+            fill(proto, value)
+
+
+def read_proto(payload_type: type, proto: Any) -> Any:
+    """The payload in a protobuf message."""
+    return payload_type(*(read(proto) for _, _, read in fields_of(payload_type)))
+
+
+@cache
+def fields_of(payload_type: type) -> tuple[tuple[str, Fill, Read], ...]:
+    """The names of a payload's fields, and how each is put into a protobuf message and taken out of one."""
+    hints = get_type_hints(payload_type, include_extras=True)
+    return tuple((f.name, *_converters(f.name, hints[f.name])) for f in fields(payload_type))
+
+
+def _converters(name: str, hint: Any) -> tuple[Fill, Read]:
+    """How a field is put into a protobuf message, and taken out of one."""
+    if get_origin(hint) in (Union, types.UnionType):
+        inner = next(h for h in get_args(hint) if h is not type(None))
+        fill, read = _converters(name, inner)
+        if get_origin(inner) is Annotated and isinstance(inner.__metadata__[0], tuple):
+            return fill, lambda proto: read(proto) if getattr(proto, name) else None
+        return fill, lambda proto: read(proto) if proto.HasField(name) else None
+    if get_origin(hint) is Annotated:
+        mark = hint.__metadata__[0]
+        return _array(name, mark) if isinstance(mark, tuple) else _time(name)
+    if get_origin(hint) is tuple:
+        return _repeated(name, get_args(hint)[0])
+    if get_origin(hint) is dict:
+        return _map(name)
+    return _nested(name, hint) if is_dataclass(hint) else _scalar(name)
+
+
+def _map(name: str) -> tuple[Fill, Read]:
+    return (
+        lambda proto, value: getattr(proto, name).update(value),
+        lambda proto: dict(sorted(getattr(proto, name).items())),
+    )
+
+
+def _nested(name: str, payload_type: Any) -> tuple[Fill, Read]:
+    def fill(proto: Any, value: Any) -> None:
+        getattr(proto, name).SetInParent()
+        fill_proto(payload_type, getattr(proto, name), value)
+
+    return fill, lambda proto: read_proto(payload_type, getattr(proto, name))
+
+
+def _scalar(name: str) -> tuple[Fill, Read]:
+    return lambda proto, value: setattr(proto, name, value), lambda proto: getattr(proto, name)
+
+
+def _array(name: str, shape: tuple[int, ...]) -> tuple[Fill, Read]:
+    def fill(proto: Any, value: Any) -> None:
+        getattr(proto, name).extend(np.asarray(value, dtype=np.float64).reshape(-1).tolist())
+
+    def read(proto: Any) -> Any:
+        array = np.array(getattr(proto, name), dtype=np.float64)
+        if -1 not in shape and array.size != np.prod(shape):
+            raise ValueError(f"{name} has {array.size} numbers instead of {np.prod(shape)}")
+        array = array.reshape(shape)
+        array.flags.writeable = False
+        return array
+
+    return fill, read
+
+
+def _time(name: str) -> tuple[Fill, Read]:
+    def fill(proto: Any, value: int) -> None:
+        stamp = getattr(proto, name)
+        stamp.seconds, stamp.nanos = divmod(value, NS)
+        stamp.SetInParent()
+
+    def read(proto: Any) -> int:
+        stamp = getattr(proto, name)
+        return int(stamp.seconds * NS + stamp.nanos)
+
+    return fill, read
+
+
+def _repeated(name: str, item: Any) -> tuple[Fill, Read]:
+    if not is_dataclass(item):
+        return (
+            lambda proto, value: getattr(proto, name).extend(value),
+            lambda proto: tuple(getattr(proto, name)),
+        )
+    nested: Any = item
+
+    def fill(proto: Any, value: Any) -> None:
+        for one in value:
+            fill_proto(nested, getattr(proto, name).add(), one)
+
+    return fill, lambda proto: tuple(read_proto(nested, one) for one in getattr(proto, name))

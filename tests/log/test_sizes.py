@@ -1,0 +1,96 @@
+"""Messages of every size from nothing to a whole chunk: long ones go other ways, written and read."""
+
+import random
+import tempfile
+from pathlib import Path
+
+from hypothesis import given, settings
+from hypothesis import strategies as st
+from mcap.writer import CompressionType, Writer
+
+from ipsys_log.log import LogReader, repair
+from tests.log.conftest import Row, append, as_row, create, linear_rows, stock_rows
+from tests.log.test_crash import check_recording, record_recording
+from tests.log.test_properties import hash_of
+
+EDGES = [0, 1, 16 << 10, 32 << 10, 256 << 10, 300_000, 1 << 20]
+SIZES = st.one_of(
+    st.integers(0, 300),
+    st.builds(lambda edge, more: max(0, edge + more), st.sampled_from(EDGES), st.integers(-40, 40)),
+)
+
+
+@st.composite
+def any_rows(draw: st.DrawFn) -> list[Row]:
+    """Topics and log times in any order; payloads that compress and such that do not."""
+    chance = random.Random(draw(st.integers(0, 9)))
+    rows: list[Row] = []
+    for _ in range(draw(st.integers(0, 12))):
+        topic = draw(st.sampled_from(["/image/a", "/image/b", "/points", "/scan"]))
+        size, noise = draw(SIZES), draw(st.booleans())
+        data = chance.randbytes(size) if noise else b"x" * size
+        rows.append((topic, draw(st.integers(0, 5 * 10**8)), draw(st.integers(0, 99)), data))
+    return rows
+
+
+@settings(max_examples=60, deadline=None)
+@given(any_rows(), any_rows())
+def test_own_logs(first: list[Row], second: list[Row]) -> None:
+    with tempfile.TemporaryDirectory() as folder:
+        path = append(create(Path(folder) / "log.mcap", first), second)
+        everything = sorted(first + second)
+        assert sorted(stock_rows(path)) == everything
+        assert sorted(linear_rows(path)) == everything  # the CRC of the data section holds
+        check(path, first + second)
+        assert not repair(path).changed
+
+
+@settings(max_examples=60, deadline=None)
+@given(any_rows(), st.sampled_from(list(CompressionType)), st.sampled_from([100, 300_000, 4 << 20]))
+def test_foreign_logs(rows: list[Row], compression: CompressionType, chunk_size: int) -> None:
+    with tempfile.TemporaryDirectory() as folder:
+        path = Path(folder) / "log.mcap"
+        with path.open("wb") as file:
+            writer = Writer(file, chunk_size=chunk_size, compression=compression)
+            writer.start()
+            ids = {topic: writer.register_channel(topic, "x", 0) for topic, *_ in rows}
+            for topic, log_time, publish_time, data in rows:
+                writer.add_message(ids[topic], log_time, data, publish_time)
+            writer.finish()  # type: ignore[no-untyped-call]
+        check(path, rows)
+
+
+def check(path: Path, rows: list[Row]) -> None:
+    """All of it, and each topic by itself: other messages lie between its own then."""
+    with LogReader(path) as reader:
+        got = [as_row(message) for message in reader.messages()]
+        assert sorted(got) == sorted(rows)
+        assert [row[1] for row in got] == sorted(row[1] for row in rows)
+        for topic in {row[0] for row in rows}:
+            mine = sorted((row for row in rows if row[0] == topic), key=lambda row: row[1])
+            assert [as_row(message) for message in reader.messages([topic])] == mine
+            assert reader.channel_hash(topic) == hash_of(mine)
+
+
+@settings(deadline=None)
+@given(st.lists(st.integers(0, 5 * 10**9), max_size=20))
+def test_no_chunk_spans_a_second(times: list[int]) -> None:
+    """Whether time goes forward or back: a reader then opens few chunks at once."""
+    with tempfile.TemporaryDirectory() as folder:
+        path = create(Path(folder) / "log.mcap", [("/points", time, time, b"point") for time in times])
+        with LogReader(path) as reader:
+            chunks = reader._contents.chunks
+            assert sum(len(reader.times(topic)) for topic in reader.channels) == len(times)
+        assert all(chunk.end_ns - chunk.start_ns < 10**9 for chunk in chunks)
+
+
+def test_a_recording_of_frames_cut_at_every_point(tmp_path: Path) -> None:
+    """As in test_crash, with frames so large that CRCs are put together."""
+    chance = random.Random(8)
+    rows: list[Row] = []
+    for k in range(5):
+        rows.append(("/image/a", k * 6 * 10**8, k, chance.randbytes(40_000)))
+        rows.append(("/points", k * 6 * 10**8 + 1, k, chance.randbytes(50)))
+    operations = record_recording(tmp_path / "recording.mcap", rows)
+    kept = check_recording(tmp_path / "crashed", rows, operations, tries=4)
+    assert {0, len(rows)} <= kept

@@ -33,6 +33,7 @@ class Canvas:
 
     def __init__(self) -> None:
         self._pixels = np.zeros((0, 0), dtype=np.uint8)
+        self._memory = bytearray()
 
     def show(
         self, frame: CompressedImage | RawImage, rows: Sequence[slice] | None = None
@@ -63,7 +64,7 @@ class Canvas:
             _decode_jpeg(frame.data, self._pixels)
             return self._pixels, [slice(0, layout.height)]
         shown = whole_rows(layout, rows)
-        for piece, part in zip(cut_rows(frame.data, layout, shown), shown, strict=True):
+        for piece, part in zip(cut_rows(frame.data, layout, shown, self._memory), shown, strict=True):
             # Without restart markers, what follows the last row that is wanted looks like damage.
             strict = layout.interval > 0
             _decode_jpeg(piece, self._pixels[part], strict)
@@ -91,7 +92,9 @@ def decode_grey(frame: CompressedImage | RawImage) -> Grey:
     return np.asarray(decoded, dtype=np.uint8)
 
 
-def _decode_jpeg(data: bytes | bytearray, pixels: Grey | None = None, strict: bool = True) -> Grey:
+def _decode_jpeg(
+    data: bytes | bytearray | memoryview, pixels: Grey | None = None, strict: bool = True
+) -> Grey:
     """Decode a JPEG, into ``pixels`` where they are given."""
     try:
         grey: Grey = simplejpeg.decode_jpeg(data, colorspace="GRAY", buffer=pixels, strict=strict)[..., 0]

@@ -89,6 +89,7 @@ class Follow:
         self._last_ns = time_ns
         due = self._frames % _SEARCH_EVERY == 0 or not 0 < gap_s < LONG_S
         thorough = self._frames % _THOROUGH_EVERY == _SEARCH_EVERY
+        shaded = self._frames % _SEARCH_EVERY == _SEARCH_EVERY // 2
         whole = due or self._frames % _WHOLE_EVERY == 0
         self._frames += 1
         guesses = [predict(track, time_ns) for track in self._tracks]
@@ -110,7 +111,7 @@ class Follow:
             fits = self._add(grey, fits, search(grey, self._dictionary, region))
         if thorough or {guesses[n].id for n in lost} - {fit.pose.id for fit in fits}:
             fits = self._add(grey, fits, search_thoroughly(grey, self._dictionary))
-        elif whole and self._changed is not None and len(fits) == len(seen):
+        elif shaded and self._changed is not None and len(fits) == len(seen):
             fits = self._add(grey, fits, search_thoroughly(grey, self._dictionary, self._changed))
         self._watch.forget([fit.corners_px for fit in fits])
         self._remember(list(seen), fits, time_ns)

@@ -98,13 +98,17 @@ def whole_rows(layout: Layout, rows: Iterable[slice]) -> list[slice]:
     return merged
 
 
-def cut_rows(data: bytes, layout: Layout, rows: Sequence[slice]) -> list[bytearray]:
+def cut_rows(
+    data: bytes, layout: Layout, rows: Sequence[slice], memory: bytearray
+) -> list[bytearray | memoryview]:
     """JPEGs of some rows each.
 
     Parameters
     ----------
     data, layout : the whole JPEG, and :func:`read_layout` of it.
     rows : as :func:`whole_rows` has them.
+    memory : where a JPEG may be put, to be used again for the next one: new memory would cost more than to
+        fill it. It grows as needed.
 
     Returns
     -------
@@ -115,7 +119,13 @@ def cut_rows(data: bytes, layout: Layout, rows: Sequence[slice]) -> list[bytearr
     FrameError
         Where restart markers are missing or out of order.
     """
-    pieces = _between(data, layout, rows) if layout.interval else [bytearray(data) for _ in rows]
+    pieces: list[bytearray | memoryview]
+    if layout.interval or not rows:
+        pieces = [*_between(data, layout, rows)]
+    else:
+        memory.extend(bytes(max(len(data) - len(memory), 0)))
+        pieces = [memoryview(memory)[: len(data)]]
+        pieces[0][:] = data
     for piece, part in zip(pieces, rows, strict=True):
         piece[layout.height_at : layout.height_at + 2] = (part.stop - part.start).to_bytes(2, "big")
     return pieces

@@ -7,7 +7,7 @@ log, stage by stage: what the log does not hold yet, or no longer rightly, is co
 ==============  ==================  ================  =====================================
 stage           reads               writes            its run is named after
 ==============  ==================  ================  =====================================
-detect          frames              markers           the corner method, ``stock``
+detect          frames              markers           the corner method, ``edges``
 camera-frame    markers, lenses     camera points     the run of its markers
 fit             camera points,      model             the model, ``poly``
                 measurements

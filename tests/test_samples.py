@@ -44,7 +44,7 @@ def test_a_log_of_an_earlier_release(ipsys: Ipsys, tmp_path: Path, path: Path) -
         messages = list(session.messages(topics))
         assert len(messages) == sum(reader.message_count for reader in session.readers)
         assert all(isinstance(encode(message.payload), bytes) for message in messages)
-        assert {run.run for run in session.runs()} == {"stock", "poly", "rigid", "best"}
+        assert {run.run for run in session.runs()} == {"edges", "poly", "rigid", "best"}
         before = session.payloads(session.topics(Positions, "poly"))
     # What it holds is still right, and computing it again gives the same to a tenth of a micrometre.
     assert "nothing to do" in ipsys("replay", log).err

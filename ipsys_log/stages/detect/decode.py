@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import threading
 from collections.abc import Sequence
 
 import cv2
@@ -13,7 +14,7 @@ from ipsys_log.errors import FrameError
 from ipsys_log.messages import CompressedImage, RawImage
 from ipsys_log.stages.detect.jpeg import cut_rows, read_layout, whole_rows
 
-__all__ = ["Canvas", "Grey", "decode_grey", "levels_at"]
+__all__ = ["Grey", "decode_grey", "decode_rows", "levels_at"]
 
 Grey = NDArray[np.uint8]
 
@@ -28,47 +29,53 @@ _RAW_TO_GREY = {
 }
 
 
-class Canvas:
-    """The pictures of one camera, each decoded into the memory of the one before."""
+class _Memory:
+    """What a thread decodes into, again and again: new memory would cost more than to fill it."""
 
     def __init__(self) -> None:
-        self._pixels = np.zeros((0, 0), dtype=np.uint8)
-        self._memory = bytearray()
+        self.pixels = np.zeros((0, 0), dtype=np.uint8)
+        self.bytes = bytearray()
 
-    def show(
-        self, frame: CompressedImage | RawImage, rows: Sequence[slice] | None = None
-    ) -> tuple[Grey, list[slice]]:
-        """The grey picture in a frame, or at least some rows of it.
 
-        Parameters
-        ----------
-        frame : as recorded.
-        rows : those wanted; None for all. Where not all are, a JPEG is not checked as strictly.
+_THREAD = threading.local()
 
-        Returns
-        -------
-        The picture (height, width), good until the next one, and the rows of it that were decoded.
 
-        Raises
-        ------
-        FrameError
-            Where the data is damaged.
-        """
-        layout = read_layout(frame.data) if isinstance(frame, CompressedImage) else None
-        if layout is None:
-            self._pixels = decode_grey(frame)
-            return self._pixels, [slice(0, len(self._pixels))]
-        if self._pixels.shape != (layout.height, layout.width) or not self._pixels.flags.writeable:
-            self._pixels = np.zeros((layout.height, layout.width), dtype=np.uint8)
-        if rows is None:
-            _decode_jpeg(frame.data, self._pixels)
-            return self._pixels, [slice(0, layout.height)]
-        shown = whole_rows(layout, rows)
-        for piece, part in zip(cut_rows(frame.data, layout, shown, self._memory), shown, strict=True):
-            # Without restart markers, what follows the last row that is wanted looks like damage.
-            strict = layout.interval > 0
-            _decode_jpeg(piece, self._pixels[part], strict)
-        return self._pixels, shown
+def decode_rows(
+    frame: CompressedImage | RawImage, rows: Sequence[slice] | None = None
+) -> tuple[Grey, list[slice]]:
+    """The grey picture in a frame, or at least some rows of it.
+
+    Parameters
+    ----------
+    frame : as recorded.
+    rows : those wanted; None for all. Where not all are, a JPEG is not checked as strictly.
+
+    Returns
+    -------
+    The picture (height, width), good until this thread decodes the next one, and the rows of it that were
+    decoded; in the others there may be anything.
+
+    Raises
+    ------
+    FrameError
+        Where the data is damaged.
+    """
+    layout = read_layout(frame.data) if isinstance(frame, CompressedImage) else None
+    if layout is None:
+        grey = decode_grey(frame)
+        return grey, [slice(0, len(grey))]
+    memory: _Memory = _THREAD.__dict__.setdefault("memory", _Memory())
+    if memory.pixels.shape != (layout.height, layout.width):
+        memory.pixels = np.zeros((layout.height, layout.width), dtype=np.uint8)
+    grey = memory.pixels
+    if rows is None:
+        _decode_jpeg(frame.data, grey)
+        return grey, [slice(0, layout.height)]
+    shown = whole_rows(layout, rows)
+    for piece, part in zip(cut_rows(frame.data, layout, shown, memory.bytes), shown, strict=True):
+        # Without restart markers, what follows the last row that is wanted looks like damage.
+        _decode_jpeg(piece, grey[part], strict=layout.interval > 0)
+    return grey, shown
 
 
 def decode_grey(frame: CompressedImage | RawImage) -> Grey:

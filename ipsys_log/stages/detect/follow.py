@@ -12,7 +12,7 @@ from ipsys_log.geometry.lenses import project, undistort
 from ipsys_log.geometry.markers import marker_corners
 from ipsys_log.geometry.square_pose import goes_around
 from ipsys_log.messages import CameraCalibration, CompressedImage, RawImage
-from ipsys_log.stages.detect.decode import Canvas, Grey
+from ipsys_log.stages.detect.decode import Grey, decode_rows
 from ipsys_log.stages.detect.edges import Fit, Guess, fit_edges
 from ipsys_log.stages.detect.search import WHOLE, Candidate, search, search_thoroughly
 from ipsys_log.stages.detect.track import LONG_S, Track, extend, predict, same_speed
@@ -63,7 +63,6 @@ class Follow:
         self._lens = lens
         self._edge_offset_px = edge_offset_px
         self._row_time_s = row_time_s
-        self._canvas = Canvas()
         self._watch = Watch()
         self._changed: tuple[slice, slice] | None = None
         self._breadth_px = 0.0
@@ -94,16 +93,16 @@ class Follow:
         self._frames += 1
         guesses = [predict(track, time_ns) for track in self._tracks]
         outlines_px = [self._outline(guess) for guess in guesses]
-        grey, rows = self._canvas.show(frame, None if whole else _rows(outlines_px, self._changed))
+        grey, rows = decode_rows(frame, None if whole else _rows(outlines_px, self._changed))
         tried = self._with_speed(grey, time_ns, guesses, self._fit(grey, guesses))
         if rows != [slice(0, len(grey))] and _jumped(outlines_px, tried):
             # Damage in a JPEG moves what comes after it, and is noticed only at its end.
-            grey, rows = self._canvas.show(frame)
+            grey, rows = decode_rows(frame)
             tried = self._with_speed(grey, time_ns, guesses, self._fit(grey, guesses))
         seen = {n: fit for n, fit in enumerate(tried) if fit is not None}
         lost = [n for n, outline in enumerate(outlines_px) if n not in seen and _inside(outline, grey)]
         if lost and rows != [slice(0, len(grey))]:
-            grey, rows = self._canvas.show(frame)
+            grey, rows = decode_rows(frame)
         fits = list(seen.values())
         self._changed = self._watch.changed(grey, rows, [fit.corners_px for fit in fits], self._breadth_px)
         region = WHOLE if lost or due else self._changed

@@ -115,19 +115,13 @@ def _read(grey: Grey, corners: Array, dictionary: str) -> list[Candidate]:
     """Which of the squares (n, 4, 2) are markers, by their cells."""
     if not len(corners):
         return []
-    words = _words(dictionary)
-    cells = round(np.sqrt(words.shape[2]))
-    middles = (np.arange(cells, dtype=np.float64) + 0.5) / cells
-    x, y = (axis.ravel() for axis in np.meshgrid(middles, middles))
-    # Bilinear in the corners: a square of this size is bent little by perspective and lens.
-    shares = np.stack([(1 - x) * (1 - y), x * (1 - y), x * y, (1 - x) * y], axis=1)
-    places = (shares @ corners).astype(np.float32)
-    levels = levels_at(grey, places[..., 0].copy(), places[..., 1].copy())
+    words, places = _words(dictionary)
+    x, y = (np.ascontiguousarray(corners[..., axis] @ places.T, dtype=np.float32) for axis in (0, 1))
+    levels = levels_at(grey, x, y)
     middle = levels.min(axis=1) / 2 + levels.max(axis=1) / 2
-    white = levels > middle[:, None]
+    signs = np.where(levels > middle[:, None], np.float32(1), np.float32(-1))
     # (squares, ids * turns): how many cells differ.
-    flat = words.reshape(-1, words.shape[2])
-    differ = (white[:, None] != flat[None]).sum(axis=2)
+    differ = (words.shape[1] - signs @ words.T) / 2
     best = differ.argmin(axis=1)
     candidates = []
     for n in np.flatnonzero(differ.min(axis=1) <= _MISREAD).tolist():
@@ -137,13 +131,23 @@ def _read(grey: Grey, corners: Array, dictionary: str) -> list[Candidate]:
 
 
 @cache
-def _words(dictionary: str) -> NDArray[np.bool_]:
-    """White cells of all markers, border included, as seen turned by 0 to 3 quarters: (ids, 4, cells)."""
+def _words(dictionary: str) -> tuple[NDArray[np.float32], Array]:
+    """The cells of all markers of a dictionary, and where they are in a square.
+
+    Returns
+    -------
+    words : (ids * 4, cells), border included, 1 for white and -1 for black, turned by 0 to 3 quarters.
+    places : (cells, 4), shares of the corners. Between them a square of this size is bent little by
+        perspective and lens.
+    """
     known = _known(dictionary)
     cells = known.markerSize + 2
     images = [
         np.asarray(cv2.aruco.generateImageMarker(known, n, cells, borderBits=1)) > 0
         for n in range(len(known.bytesList))
     ]
-    # With the marker's top left at corner k of the square, the square shows it turned k quarters clockwise.
-    return np.array([[np.rot90(image, -turn).ravel() for turn in range(4)] for image in images])
+    # With the marker's top left at corner k of a square, the square shows it turned k quarters clockwise.
+    turned = [np.rot90(image, -turn).ravel() for image in images for turn in range(4)]
+    x, y = (axis.ravel() for axis in np.meshgrid(*2 * [(np.arange(cells) + 0.5) / cells]))
+    places = np.stack([(1 - x) * (1 - y), x * (1 - y), x * y, (1 - x) * y], axis=1)
+    return np.where(turned, np.float32(1), np.float32(-1)), places

@@ -17,6 +17,7 @@ from ipsys_log.request import Request
 from ipsys_log.runs import complete_runs, newest_run
 
 __all__ = [
+    "LEAST_OFFSET_PX",
     "MIN_OFFSETS",
     "can_evaluate",
     "copied_run",
@@ -32,8 +33,8 @@ __all__ = [
 ]
 
 
-# Of so many markers the median edge offset is that of the camera.
-MIN_OFFSETS = 10
+# Of so many markers the median edge offset is that of the camera; and less than that is none.
+MIN_OFFSETS, LEAST_OFFSET_PX = 10, 0.05
 
 
 def wanted_models(request: Request, until: str) -> tuple[str, ...]:
@@ -127,8 +128,8 @@ def find_pairs(session: Session, points: str, places: list[Measured]) -> dict[st
 
 
 def rig_with_offsets(session: Session) -> Rig:
-    """The newest rig of a log, with the edge offset of each camera that it does not say: the median of those
-    that the newest detection found.
+    """The newest rig of a log, with the edge offset of each camera that has one and the rig does not say it:
+    the median of those that the newest detection found.
 
     Raises
     ------
@@ -145,8 +146,9 @@ def rig_with_offsets(session: Session) -> Rig:
         offsets += [m.edge_offset_px for m in message.payload.markers if m.edge_offset_px is not None]
     cameras = {name: rigs[-1].camera(name) for name in [c.name for c in rigs[-1].cameras] + sorted(found)}
     for name, offsets in found.items():
-        if len(offsets) >= MIN_OFFSETS and cameras[name].edge_offset_px is None:
-            cameras[name] = replace(cameras[name], edge_offset_px=round(float(np.median(offsets)), 3))
+        offset_px = float(np.median(offsets)) if len(offsets) >= MIN_OFFSETS else 0.0
+        if abs(offset_px) >= LEAST_OFFSET_PX and cameras[name].edge_offset_px is None:
+            cameras[name] = replace(cameras[name], edge_offset_px=round(offset_px, 3))
     return replace(rigs[-1], cameras=tuple(cameras.values()))
 
 

@@ -9,14 +9,12 @@ from statistics import median
 
 from ipsys_log.errors import IpsysError
 from ipsys_log.log.session import camera_of_topic
-from ipsys_log.lookup import MIN_OFFSETS
+from ipsys_log.lookup import LEAST_OFFSET_PX, MIN_OFFSETS
 from ipsys_log.messages import Event, Markers, Message, Positions
 from ipsys_log.tasks import Task
 from ipsys_log.units import format_time
 
 __all__ = ["Remarks"]
-
-_WORTH_SAYING_PX = 0.05
 
 
 class Remarks:
@@ -104,7 +102,7 @@ class Remarks:
         return [
             f"camera {camera}: edges of black lie {offset_px:.2f} px inside the black (gamma); allowed for"
             for camera, offset_px in sorted(medians.items())
-            if abs(offset_px) >= _WORTH_SAYING_PX
+            if abs(offset_px) >= LEAST_OFFSET_PX
         ]
 
 

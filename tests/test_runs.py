@@ -14,8 +14,19 @@ import pytest
 
 from ipsys_log.log import LogWriter
 from ipsys_log.log.session import Session, run_of_topic
-from ipsys_log.messages import CameraCalibration, CameraPoints, Event, Message, Model, Rig, Run, Tracks
+from ipsys_log.messages import (
+    CameraCalibration,
+    CameraPoints,
+    Event,
+    Markers,
+    Message,
+    Model,
+    Rig,
+    Run,
+    Tracks,
+)
 from ipsys_log.output import write_log, write_messages
+from ipsys_log.rig import load_rig
 from tests.conftest import ROOT, Ipsys
 
 PAPER = ROOT / "sample_logs" / "paper_lab.mcap"
@@ -23,7 +34,7 @@ PAPER = ROOT / "sample_logs" / "paper_lab.mcap"
 
 @pytest.fixture
 def paper(tmp_path: Path) -> Path:
-    """The paper's layout without frames: its markers are in run ``stock``."""
+    """The paper's layout without frames: its markers are in run ``edges``."""
     return Path(shutil.copy(PAPER, tmp_path / "paper.mcap"))
 
 
@@ -244,8 +255,8 @@ def test_a_marker_beyond_the_lens_is_left_out_and_named(ipsys: Ipsys, paper: Pat
     assert done.code == 0, done.err
     assert "outside lens" in done.err
     with Session([log]) as session:
-        points = [p for m in session.payloads(session.topics(CameraPoints, "stock")) for p in m.points]
-        events = session.payloads(session.topics(Event, "stock"))
+        points = [p for m in session.payloads(session.topics(CameraPoints, "edges")) for p in m.points]
+        events = session.payloads(session.topics(Event, "edges"))
     assert {event.camera for event in events} == {"red"}
     assert all(np.isfinite([p.x_m, p.y_m, p.z_m]).all() and abs(p.z_m) < 10 for p in points)
 
@@ -300,11 +311,27 @@ def test_the_rig_of_a_log_can_be_taken_out_mended_and_given_back(
     assert ipsys("init", path, "--from", paper).code == 0
     assert all(not new for _, new in runs_of(ipsys, "replay", paper, "--rig", path).values())
     path.write_text(path.read_text().replace("marker_length_m = 0.2", "marker_length_m = 0.19"))
-    assert runs_of(ipsys, "replay", paper, "--rig", path)["camera-frame"] == ("stock_2", True)
+    assert runs_of(ipsys, "replay", paper, "--rig", path)["camera-frame"] == ("edges_2", True)
     assert "0.19 m" in ipsys("runs", paper).out
     runs = json.loads(ipsys("runs", paper, "--json").out)
     lengths = [run["rig"]["marker_length_m"] for run in runs if run["rig"]]
     assert lengths == [0.19]
+
+
+def test_the_rig_taken_out_says_what_a_camera_does_to_edges(ipsys: Ipsys, tmp_path: Path) -> None:
+    lab, path = tmp_path / "lab.mcap", tmp_path / "lab.toml"
+    size = ("--width", 960, "--height", 540, "--stations", 9, "--drive-s", 0.5)
+    assert ipsys("simulate", "-o", lab, *size, "--gamma", 2.2, "--markers", 6).code == 0
+    assert "inside the black" in ipsys("detect", lab).err
+    assert ipsys("init", path, "--from", lab).code == 0
+    offsets_px = [camera.edge_offset_px for camera in load_rig(path).cameras]
+    assert offsets_px == pytest.approx([0.42] * 3, abs=0.1)
+    # With it, every marker has the same.
+    assert ipsys("detect", lab, "--rig", path).code == 0
+    with Session([lab]) as session:
+        (topic,) = session.topics(Markers, "edges_2")[:1]
+        found = {m.edge_offset_px for p in session.payloads([topic]) for m in p.markers}
+    assert len(found) <= 1 or np.ptp(list(found)) < 1e-3
 
 
 def test_a_wrong_dictionary_leaves_no_empty_run(ipsys: Ipsys, lab: Path, tmp_path: Path) -> None:

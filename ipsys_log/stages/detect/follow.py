@@ -28,7 +28,7 @@ Array = NDArray[np.float64]
 _SEARCH_EVERY = 20
 _THOROUGH_EVERY = 120
 # And decoded as a whole every so many; the others only as far as markers are expected.
-_WHOLE_EVERY = 5
+_WHOLE_EVERY = 7
 _MARGIN_PX = 32
 # Times the spread of edges about a fit with one more freedom.
 _AS_GOOD = 1.1
@@ -84,13 +84,36 @@ class Follow:
         FrameError
             Where it cannot be decoded.
         """
+        turn = self._frames
+        self._frames += 1
         gap_s = (time_ns - self._last_ns) / NS_PER_S
         self._last_ns = time_ns
-        due = self._frames % _SEARCH_EVERY == 0 or not 0 < gap_s < LONG_S
-        thorough = self._frames % _THOROUGH_EVERY == _SEARCH_EVERY
-        shaded = self._frames % _SEARCH_EVERY == _SEARCH_EVERY // 2
-        whole = due or self._frames % _WHOLE_EVERY == 0
-        self._frames += 1
+        due = turn % _SEARCH_EVERY == 0 or not 0 < gap_s < LONG_S
+        grey, rows, seen, lost = self._look_again(frame, time_ns, due or turn % _WHOLE_EVERY == 0)
+        fits = list(seen.values())
+        self._changed = self._watch.changed(grey, rows, [fit.corners_px for fit in fits], self._breadth_px)
+        region = WHOLE if lost or due else self._changed
+        if region is not None:
+            fits = self._add(grey, fits, search(grey, self._dictionary, region))
+        if turn % _THOROUGH_EVERY == _SEARCH_EVERY or lost - {fit.pose.id for fit in fits}:
+            fits = self._add(grey, fits, search_thoroughly(grey, self._dictionary))
+        elif turn % _SEARCH_EVERY == _SEARCH_EVERY // 2 and self._changed and len(fits) == len(seen):
+            # What is new and no marker at first sight may be one in shadow.
+            fits = self._add(grey, fits, search_thoroughly(grey, self._dictionary, self._changed))
+        self._watch.forget([fit.corners_px for fit in fits])
+        self._remember(list(seen), fits, time_ns)
+        return sorted(fits, key=lambda fit: fit.pose.id), grey.shape[1], grey.shape[0]
+
+    def _look_again(
+        self, frame: CompressedImage | RawImage, time_ns: int, whole: bool
+    ) -> tuple[Grey, list[slice], dict[int, Fit], set[int]]:
+        """What has become of the markers of the last frame.
+
+        Returns
+        -------
+        The picture and which rows of it are good, the fits by the number of their track, and the ids of
+        markers that are not where they should be; then the picture is whole.
+        """
         guesses = [predict(track, time_ns) for track in self._tracks]
         outlines_px = [self._outline(guess) for guess in guesses]
         grey, rows = decode_rows(frame, None if whole else _rows(outlines_px, self._changed))
@@ -100,21 +123,14 @@ class Follow:
             grey, rows = decode_rows(frame)
             tried = self._with_speed(grey, time_ns, guesses, self._fit(grey, guesses))
         seen = {n: fit for n, fit in enumerate(tried) if fit is not None}
-        lost = [n for n, outline in enumerate(outlines_px) if n not in seen and _inside(outline, grey)]
+        lost = {
+            guess.id
+            for n, (guess, outline_px) in enumerate(zip(guesses, outlines_px, strict=True))
+            if n not in seen and _inside(outline_px, grey)
+        }
         if lost and rows != [slice(0, len(grey))]:
             grey, rows = decode_rows(frame)
-        fits = list(seen.values())
-        self._changed = self._watch.changed(grey, rows, [fit.corners_px for fit in fits], self._breadth_px)
-        region = WHOLE if lost or due else self._changed
-        if region is not None:
-            fits = self._add(grey, fits, search(grey, self._dictionary, region))
-        if thorough or {guesses[n].id for n in lost} - {fit.pose.id for fit in fits}:
-            fits = self._add(grey, fits, search_thoroughly(grey, self._dictionary))
-        elif shaded and self._changed is not None and len(fits) == len(seen):
-            fits = self._add(grey, fits, search_thoroughly(grey, self._dictionary, self._changed))
-        self._watch.forget([fit.corners_px for fit in fits])
-        self._remember(list(seen), fits, time_ns)
-        return sorted(fits, key=lambda fit: fit.pose.id), grey.shape[1], grey.shape[0]
+        return grey, rows, seen, lost
 
     def _fit(self, grey: Grey, guesses: Sequence[Guess]) -> list[Fit | None]:
         fits = self._fit_as_guessed(grey, guesses)

@@ -20,7 +20,7 @@ _CHANGED_LEVELS = 25.0
 _CHANGED_SAMPLES = 3
 # A marker of which only a part has changed is cut off by no less.
 _AROUND_PX = 192
-_ENTERED = 0.5
+_ENTERED = 0.4
 _MARGIN = 0.35
 # A thing that stays becomes background within some ten frames.
 _LEARN = np.float32(0.15)
@@ -42,7 +42,7 @@ class Watch:
         grey : (height, width).
         rows : those that are of this frame.
         markers_px : corners (4, 2) of the markers that are known.
-        breadth_px : of a marker. Less than half of it at the edge of the picture is none yet.
+        breadth_px : of a marker. Less than four tenths of it at the edge of the picture is none yet.
         """
         samples = grey[_HALF_PX::_EVERY_PX, _HALF_PX::_EVERY_PX].astype(np.float32)
         if self._background.shape != samples.shape:

@@ -174,7 +174,9 @@ def _settle(
         seen = measure(view, poses, motions, wide)
         rows = _moves(view.prints, poses.camera(), seen)[:, :unknowns]
         # Edges were looked for where they are at the speed known so far.
-        off_px = seen.off_px + (motions[:, None, : unknowns - 7] @ rows[:, 7:])[:, 0]
+        off_px = seen.off_px
+        if view.row_time_s:
+            off_px = off_px + (motions[:, None, :2] @ rows[:, 7:])[:, 0]
         weights = seen.certainty / doubt
         normal, found = _solve(rows, weights, off_px, known, hold)
         left_px = off_px - (found[:, None] @ rows)[:, 0]
@@ -186,7 +188,8 @@ def _settle(
         # What is no marker may run away, behind the camera even: it stays, and never settles.
         possible = moved.possible()
         poses, moved_px = moved.where(possible, poses), np.where(possible, moved_px, np.inf)
-        motions = np.concatenate([found[:, 7:], motions[:, unknowns - 7 :]], axis=1)
+        if view.row_time_s:
+            motions = np.concatenate([found[:, 7:], motions[:, 2:]], axis=1)
         spread_px = np.sqrt((weights * left_px**2).sum(axis=1) / np.maximum(weights.sum(axis=1), 1e-9))
         if (moved_px < _SETTLED_PX).all():
             break

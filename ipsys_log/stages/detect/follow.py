@@ -115,7 +115,7 @@ class Follow:
         markers that are not where they should be; then the picture is whole.
         """
         guesses = [predict(track, time_ns) for track in self._tracks]
-        outlines_px = [self._outline(guess) for guess in guesses]
+        outlines_px = self._outlines(guesses)
         grey, rows = decode_rows(frame, None if whole else _rows(outlines_px, self._changed))
         tried = self._with_speed(grey, time_ns, guesses, self._fit(grey, guesses))
         if rows != [slice(0, len(grey))] and _jumped(outlines_px, tried):
@@ -203,12 +203,16 @@ class Follow:
         )
         return upright, other
 
-    def _outline(self, guess: Guess) -> Array:
-        """Corners in px, (4, 2); far outside where the guess has gone behind the camera."""
-        points = marker_corners(1.0) @ guess.rotation.T + guess.centre
-        if points[:, 2].min() <= 0:
-            return np.full((4, 2), -1e6)
-        return project(points, self._lens)
+    def _outlines(self, guesses: Sequence[Guess]) -> list[Array]:
+        """Corners in px, (4, 2) each; far outside where a guess has gone behind the camera."""
+        if not guesses:
+            return []
+        points = np.array([marker_corners(1.0) @ guess.rotation.T + guess.centre for guess in guesses])
+        ahead = points[:, :, 2].min(axis=1) > 0
+        points[~ahead] = [0.0, 0.0, 1.0]
+        px = project(points.reshape(-1, 3), self._lens).reshape(-1, 4, 2)
+        px[~ahead] = -1e6
+        return [*px]
 
     def _remember(self, followed: Sequence[int], fits: Sequence[Fit], frame_ns: int) -> None:
         """``fits`` are first those of the tracks that were followed, in their order, then new ones."""

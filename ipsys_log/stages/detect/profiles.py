@@ -68,8 +68,9 @@ class Poses(NamedTuple):
 
     def possible(self) -> NDArray[np.bool_]:
         """Which of them a camera can see as a whole, (m,): numbers, and further away than they are large."""
-        known = np.isfinite(self.rotations).all(axis=(1, 2)) & np.isfinite(self.centres).all(axis=1)
-        return np.asarray(known & (self.centres[:, 2] > 1.0) & (self.centres[:, 2] < _HORIZON))
+        away = self.centres[:, 2]
+        known = np.isfinite(self.rotations.sum(axis=(1, 2)) + self.centres.sum(axis=1))
+        return np.asarray(known & (away > 1.0) & (away < _HORIZON))
 
     def where(self, good: NDArray[np.bool_], other: Poses) -> Poses:
         """These poses where they are good, and others where not."""

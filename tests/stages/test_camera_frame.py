@@ -190,14 +190,14 @@ def test_another_method_is_another_run(ipsys: Ipsys, tmp_path: Path) -> None:
         stage = json.loads(done.out)["stages"][-1]
         return stage["run"], stage["new"]
 
-    assert run() == ("stock", True)
-    assert run("--method", "pose") == ("stock_pose", True)
-    assert run("--method", "pose") == ("stock_pose", False)
-    assert run("--method", "perimeter") == ("stock", False)
+    assert run() == ("edges", True)
+    assert run("--method", "pose") == ("edges_pose", True)
+    assert run("--method", "pose") == ("edges_pose", False)
+    assert run("--method", "perimeter") == ("edges", False)
     with Session([log]) as session:
         parameters = {r.run: r.parameters for r in session.runs() if r.stage == "camera-frame"}
-        assert parameters == {"stock": {}, "stock_pose": {"method": "pose"}}
-        by_pose = session.payloads(session.topics(CameraPoints, "stock_pose"))
+        assert parameters == {"edges": {}, "edges_pose": {"method": "pose"}}
+        by_pose = session.payloads(session.topics(CameraPoints, "edges_pose"))
         assert all(len(point.poses) == 2 for frame in by_pose for point in frame.points)
 
 

@@ -214,7 +214,7 @@ def test_a_marker_is_put_down_covered_uncovered_and_taken_away(options: tuple[in
 def test_a_second_marker_is_put_beside_a_first() -> None:
     first, second = lying(5, 200, 240), lying(9, 450, 260)
     pictures = [draw(VGA, [first], Look()), draw(VGA, [first, second], Look())]
-    seen = ids(feed(started(), film([pictures[0]] * 7 + [pictures[1]] * 6, "red", *RESTARTS)))
+    seen = ids(feed(started(), film([pictures[0]] * 7 + [pictures[1]] * 8, "red", *RESTARTS)))
     assert seen[7 + SOON] == [5, 9]
 
 

@@ -8,7 +8,7 @@ from pathlib import Path
 
 from ipsys_log.messages import CameraCalibration, Rig
 from ipsys_log.stages.camera_frame import PERIMETER, check_method
-from ipsys_log.stages.detect import EDGES, check_corners
+from ipsys_log.stages.detect import check_corners
 
 __all__ = ["Progress", "Request"]
 
@@ -28,7 +28,7 @@ class Request:
     model_from : another log, whose newest fitted model is applied and copied in.
     train, seed : the subset to fit on, or the seed of the random split where nothing is labelled.
     run : name for the new run of the last stages, instead of one made from the model.
-    corners : how corners are found: ``edges`` or ``stock``.
+    corners : how corners are found: ``edges`` or ``stock``; None: edges, if all cameras have a calibration.
     method : how camera points are made of markers: ``perimeter`` or ``pose``.
     skip_ambiguous : go on where a marker id is seen twice in a frame, without that marker.
 
@@ -45,10 +45,11 @@ class Request:
     train: str = "train"
     seed: int = 0
     run: str | None = None
-    corners: str = EDGES
+    corners: str | None = None
     method: str = PERIMETER
     skip_ambiguous: bool = False
 
     def __post_init__(self) -> None:
-        check_corners(self.corners)
+        if self.corners is not None:
+            check_corners(self.corners)
         check_method(self.method)

@@ -118,21 +118,31 @@ def _detect(session: Session, request: Request) -> Task | str:
     if not session.images:
         return newest_run(session, Markers) or ""
     rig, topics = _rig(session, request, "detect")
+    without = sorted(set(session.images) - set(session.calibrations) - set(request.lenses))
+    corners = request.corners or (detect.STOCK if without else detect.EDGES)
     lenses: dict[str, CameraCalibration] = {}
-    if request.corners != detect.STOCK:
+    if corners == detect.EDGES:
         lenses = _other_lenses(session, request)
         topics += _held_lenses(session, lenses)
     return Task(
         "detect",
-        request.corners,
+        corners,
         (*topics, *session.images.values()),
         (Markers, ImageAnnotations, Event),
         detect.READS,
-        lambda run: detect.Detect(request.corners),
+        lambda run: detect.Detect(corners),
         decodes_frames=True,
-        parameters={"corners": request.corners},
+        parameters={"corners": corners},
         rig=rig,
         lenses=lenses,
+        notes=[] if request.corners else [_why_stock(name) for name in without],
+    )
+
+
+def _why_stock(camera: str) -> str:
+    return (
+        f"camera {camera} has no calibration: corners are found as with --corners stock, ten times less "
+        f"exact than with --calibration {camera}=calibration.yaml"
     )
 
 

@@ -132,17 +132,33 @@ def test_detect_and_camera_frame(
 def test_a_second_detect_finds_the_first(ipsys: Ipsys, tmp_path: Path, rig: Path) -> None:
     log = tmp_path / "foreign.mcap"
     write(log, [("/cam", t, jpeg(1, "cam", t)) for t in (1, 2, 3)], CompressionType.ZSTD)
-    assert ipsys("detect", log, "--corners", "stock", "--rig", rig).code == 0
+    done = ipsys("detect", log, "--rig", rig)
+    assert done.code == 0
+    # Edges are fitted through the lens: without one corners are OpenCV's, and that is said.
+    assert "camera cam has no calibration: corners are found as with --corners stock" in done.err
     before = log.read_bytes()
-    assert "up to date" in ipsys("detect", log, "--corners", "stock", "--rig", rig).err
+    assert "up to date" in ipsys("detect", log, "--rig", rig).err
     assert log.read_bytes() == before
+
+
+def test_edges_that_were_asked_for_need_a_lens(ipsys: Ipsys, tmp_path: Path, rig: Path) -> None:
+    log = tmp_path / "foreign.mcap"
+    write(log, [("/cam", 1, jpeg(1, "cam", 1))], CompressionType.ZSTD)
+    before = log.read_bytes()
+    done = ipsys("detect", log, "--corners", "edges", "--rig", rig)
+    assert (done.code, done.err.count("\n")) == (1, 1)
+    assert "camera cam has no calibration in the log" in done.err
+    assert log.read_bytes() == before
+    done = ipsys("detect", log, "--corners", "round", "--rig", rig)
+    assert (done.code, done.err.count("\n")) == (1, 1)
+    assert "use one of edges, stock" in done.err
 
 
 def test_the_same_camera_raw_and_compressed_is_one_camera(ipsys: Ipsys, tmp_path: Path, rig: Path) -> None:
     log = tmp_path / "foreign.mcap"
     both = [("/cam/image_raw", 1, raw(1, "cam", 1)), ("/cam/image_raw/compressed", 2, jpeg(1, "cam", 1))]
     write(log, both, CompressionType.NONE)
-    assert ipsys("detect", log, "--corners", "stock", "--rig", rig).code == 0
+    assert ipsys("detect", log, "--rig", rig).code == 0
     with Session([log]) as session:
         assert session.images == {"cam": "/cam/image_raw/compressed"}
 
@@ -174,7 +190,7 @@ def test_json_is_read_too(ipsys: Ipsys, tmp_path: Path, rig: Path) -> None:
         "format": "jpeg",
     }
     log = write_raw(tmp_path / "json.mcap", "json", "jsonschema", json.dumps(text).encode())
-    done = ipsys("detect", log, "--corners", "stock", "--rig", rig)
+    done = ipsys("detect", log, "--rig", rig)
     assert done.code == 0, done.err
     with Session([log]) as session:
         assert session.payloads(["/cam"])[0].timestamp == 1
@@ -194,7 +210,7 @@ def test_what_cannot_be_decoded_is_named(
     ipsys: Ipsys, tmp_path: Path, rig: Path, encoding: str, data: bytes, said: str
 ) -> None:
     log = write_raw(tmp_path / "odd.mcap", encoding, "", data)
-    done = ipsys("detect", log, "--corners", "stock", "--rig", rig)
+    done = ipsys("detect", log, "--rig", rig)
     assert done.code == 1
     assert f"{log}: /cam at 1 ns" in done.err
     assert said in done.err

@@ -62,7 +62,7 @@ OPTIONS: dict[str, tuple[Any, Any]] = {
     "seed": (Annotated[int, typer.Option(min=0, help="Of random splits, folds and subsets.")], 0),
     "rig": (RigFile, None),
     "calibration": (Calibrations, None),
-    "corners": (Corners, "edges"),
+    "corners": (Corners, None),
     "method": (Method, "perimeter"),
     "run": (
         Annotated[

@@ -40,11 +40,12 @@ Calibrations = Annotated[
     ),
 ]
 Corners = Annotated[
-    str,
+    Optional[str],  # noqa: UP045
     typer.Option(
         "--corners",
         metavar="NAME",
-        help="Finds corners by the edges of the print, through the lens; or as the paper: stock.",
+        help="Find corners by the edges of the print (edges; the default if all cameras have a calibration), "
+        "or as the paper does (stock).",
     ),
 ]
 Method = Annotated[

@@ -30,7 +30,7 @@ from ipsys_log.sources.simulator.places import Place, place, seen_whole
 from ipsys_log.stages.detect.edges import Guess, fit_edges
 from ipsys_log.stages.detect.follow import Follow
 from ipsys_log.units import NS_PER_S
-from tests.stages.scenes import (
+from tests.stages.drawing import (
     FISHEYE,
     PLUMB_BOB,
     RATIONAL,

@@ -24,7 +24,7 @@ from ipsys_log.messages import (
     RigMarker,
 )
 from ipsys_log.stages.detect import Detect
-from tests.stages.scenes import (
+from tests.stages.drawing import (
     FISHEYE,
     VGA,
     Array,

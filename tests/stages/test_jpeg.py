@@ -18,7 +18,7 @@ from ipsys_log.messages import CompressedImage
 from ipsys_log.stages.detect.decode import decode_grey, decode_rows
 from ipsys_log.stages.detect.follow import Follow
 from ipsys_log.stages.detect.jpeg import cut_rows, read_layout, whole_rows
-from tests.stages.scenes import VGA, Array, Look, Picture, at_px, corners_px, draw, jpeg
+from tests.stages.drawing import VGA, Array, Look, Picture, at_px, corners_px, draw, jpeg
 
 SAMPLINGS = {
     "4:1:1": cv2.IMWRITE_JPEG_SAMPLING_FACTOR_411,

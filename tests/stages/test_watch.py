@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 
 from ipsys_log.stages.detect.watch import Watch
-from tests.stages.scenes import Array, Picture
+from tests.stages.drawing import Array, Picture
 
 WIDTH, HEIGHT, BREADTH_PX = 640, 480, 80.0
 ALL = [slice(0, HEIGHT)]

@@ -26,10 +26,10 @@ Array = NDArray[np.float64]
 # The whole picture is searched every so many frames, whatever happens, and more thoroughly, at full size,
 # every so many.
 _SEARCH_EVERY = 20
-_THOROUGH_EVERY = 120
+_THOROUGH_EVERY = 240
 # And decoded as a whole every so many; the others only as far as markers are expected.
 _WHOLE_EVERY = 7
-_MARGIN_PX = 32
+_MARGIN_PX = 24
 # Times the spread of edges about a fit with one more freedom.
 _AS_GOOD = 1.1
 # Of two fits of one id, nearer together than this, one is enough.

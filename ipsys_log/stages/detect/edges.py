@@ -121,7 +121,7 @@ def fit_edges(
             covariances_px2[n],
             float(settled.edge_offsets_px[n]),
             float(settled.spreads_px[n]),
-            settled.blur_px,
+            float(settled.blurs_px[n]),
         )
         if good[n]
         else None
@@ -143,7 +143,7 @@ class _Settled(NamedTuple):
     heights: Array
     blurred: NDArray[np.bool_]
     spreads_px: Array
-    blur_px: float
+    blurs_px: Array
 
 
 def _settle_all(
@@ -201,7 +201,7 @@ def _settle(
     covariances: Array = np.linalg.inv(normal)[:, :6, :6] * variances_px2[:, None, None]
     enough = (seen.certainty > 0).sum(axis=1) > _SEEN * np.abs(view.prints.polarity).sum(axis=1)
     good = enough & (moved_px < _SETTLED_PX)
-    return _Settled(poses, found[:, 6], covariances, good, seen.heights, blurred, spread_px, seen.blur_px)
+    return _Settled(poses, found[:, 6], covariances, good, seen.heights, blurred, spread_px, seen.blurs_px)
 
 
 def _solve(rows: Array, weights: Array, off_px: Array, known: Array, hold: Array) -> tuple[Array, Array]:

@@ -86,7 +86,7 @@ class Seen(NamedTuple):
     ``off_px`` is by how much they lie off, along their axis; ``certainty`` from 1.0 to 0.0 for edges that
     are not there. ``slopes`` are px per side of the print, and ``late`` px per speed along their axis, for
     rows that are exposed later. ``heights`` are the grey levels by which they rise within the usual blur;
-    ``blur_px`` is theirs.
+    ``blurs_px`` (m,) are theirs.
     """
 
     off_px: Array
@@ -94,7 +94,7 @@ class Seen(NamedTuple):
     slopes: Array
     late: Array
     heights: Array
-    blur_px: float
+    blurs_px: Array
 
 
 def measure(view: View, poses: Poses, motions: Array, wide: NDArray[np.bool_]) -> Seen:
@@ -126,10 +126,9 @@ def measure(view: View, poses: Poses, motions: Array, wide: NDArray[np.bool_]) -
     x = (middle[..., :1] + across[..., :1] * taps).astype(np.float32)
     y = (middle[..., 1:] + across[..., 1:] * taps).astype(np.float32)
     profiles = levels_at(view.grey, x, y)
-    blur_px = view.blur_px
-    if blur_px is None:
-        blur_px = _USUAL_BLUR_PX if wide.any() else _blur(prints, profiles, near_px)
-    fitted = profiles @ np.array([_template(reach_px, blur_px) for reach_px in near_px.tolist()])
+    blurs_px = _blurs(view, profiles, near_px, bool(wide.any()))
+    shapes = list(zip(near_px.tolist(), blurs_px.tolist(), strict=True))
+    fitted = profiles @ np.array([_template(reach_px, blur_px) for reach_px, blur_px in shapes])
     height = fitted[..., 0] * prints.polarity
     usual = np.array([_template(reach_px, _USUAL_BLUR_PX)[:, :1] for reach_px in near_px.tolist()])
     sharp = (profiles @ usual)[..., 0] * prints.polarity
@@ -141,7 +140,7 @@ def measure(view: View, poses: Poses, motions: Array, wide: NDArray[np.bool_]) -
         off_px = np.where(wide_edges, by_area, off_px)
         certainty = np.where(wide_edges, shown * np.minimum(1.0, _SHARP_PX / width_px) ** 2, certainty)
     off_px = np.minimum(np.maximum(off_px, -reaches_px), reaches_px)
-    return Seen(off_px, certainty, slopes, late, sharp, blur_px)
+    return Seen(off_px, certainty, slopes, late, sharp, blurs_px)
 
 
 def _by_area(prints: Prints, profiles: Array, reaches_px: Array) -> tuple[Array, Array, Array]:
@@ -163,13 +162,13 @@ def _by_area(prints: Prints, profiles: Array, reaches_px: Array) -> tuple[Array,
     return (0.5 - white) * width_px * prints.polarity, width_px, real & (rise > 0)
 
 
-def _blur(prints: Prints, profiles: Array, reaches_px: Array) -> float:
-    """By how much edges are blurred, in px: what leaves least of their mean profile."""
-    # Markers that are far have shorter profiles, which show less of it.
-    widest = int(reaches_px.argmax())
-    mean = prints.polarity[widest] @ profiles[widest]
-    left = _residues(float(reaches_px[widest])) @ mean
-    return float(_BLURS_PX[int((left * left).sum(axis=1).argmin())])
+def _blurs(view: View, profiles: Array, reaches_px: Array, wide: bool) -> Array:
+    """By how much the edges of each marker are blurred, in px: what leaves least of their mean profile."""
+    if view.blur_px is not None or wide:
+        return np.full(len(profiles), view.blur_px or _USUAL_BLUR_PX)
+    means = (view.prints.polarity[:, None] @ profiles)[:, 0]
+    left = [_residues(reach_px) @ mean for reach_px, mean in zip(reaches_px.tolist(), means, strict=True)]
+    return np.asarray(np.array(_BLURS_PX)[np.square(left).sum(axis=2).argmin(axis=1)])
 
 
 @cache

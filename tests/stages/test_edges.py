@@ -226,7 +226,7 @@ ROWS: dict[str, Row] = {
     "tiled floor": Row(0.06, 0.95, look=Look(floor=tiles(FISHEYE))),
     "vignetting and a gradient": Row(0.06, look=Look(shade=vignette(FISHEYE))),
     "half a margin": Row(0.06, look=Look(margin_cells=0.5)),
-    "half a margin on a dark floor": Row(0.15, 0.95, look=Look(margin_cells=0.5, floor=60)),
+    "half a margin on a dark floor": Row(0.10, 0.88, look=Look(margin_cells=0.5, floor=60)),
     "low contrast": Row(0.08, look=Look(black=60, white=110, floor=90)),
     "noise 6": Row(0.08, look=Look(noise=6.0)),
     "quality 70": Row(0.06, quality=70),

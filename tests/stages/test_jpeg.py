@@ -266,3 +266,17 @@ def test_what_only_begins_like_a_jpeg_is_damaged(data: bytes) -> None:
     for whole in (data, b"\xff\xd8" + data, b"\xff\xd8\xff\xc0" + data + b"\xff\xd9"):
         with pytest.raises(FrameError):
             decode_rows(CompressedImage(0, "red", whole, "jpeg"), [slice(0, 9)])
+
+
+@pytest.mark.parametrize("interval", [0, 40], ids=["plain", "restarts"])
+def test_nothing_of_an_earlier_picture_shows(interval: int) -> None:
+    """All cameras of a thread are decoded into the same memory: what is not decoded is black."""
+    first, second = (packed(colourful(320, 480, n), "4:2:0", interval) for n in (1, 2))
+    decode_rows(CompressedImage(0, "red", first, "jpeg"))
+    grey, shown = decode_rows(CompressedImage(0, "white", second, "jpeg"), [slice(100, 120), slice(300, 310)])
+    black = np.ones(len(grey), dtype=bool)
+    for part in shown:
+        black[part] = False
+    assert black.any()
+    assert not grey[black].any()
+    assert grey[~black].any()

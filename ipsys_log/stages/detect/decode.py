@@ -53,7 +53,7 @@ def decode_rows(
     Returns
     -------
     The picture (height, width), good until this thread decodes the next one, and the rows of it that were
-    decoded; in the others there may be anything.
+    decoded; the others are black.
 
     Raises
     ------
@@ -72,6 +72,10 @@ def decode_rows(
         _decode_jpeg(frame.data, grey)
         return grey, [slice(0, layout.height)]
     shown = whole_rows(layout, rows)
+    # What an earlier picture left there, of another camera even, is not to be seen.
+    starts, stops = [part.start for part in shown], [part.stop for part in shown]
+    for low, high in zip([0, *stops], [*starts, layout.height], strict=True):
+        grey[low:high] = 0
     for piece, part in zip(cut_rows(frame.data, layout, shown, memory.bytes), shown, strict=True):
         # Without restart markers, what follows the last row that is wanted looks like damage.
         _decode_jpeg(piece, grey[part], strict=layout.interval > 0)

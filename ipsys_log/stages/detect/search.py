@@ -17,7 +17,7 @@ from numpy.typing import NDArray
 
 from ipsys_log.stages.detect.decode import Grey, levels_at
 
-__all__ = ["Candidate", "search", "search_thoroughly"]
+__all__ = ["WHOLE", "Candidate", "search", "search_thoroughly"]
 
 Array = NDArray[np.float64]
 
@@ -30,9 +30,6 @@ _BORDER_PX = 1
 _NEAR = (4, 4)
 _REFINE = (cv2.TERM_CRITERIA_COUNT + cv2.TERM_CRITERIA_EPS, 10, 0.05)
 _MISREAD = 3
-_UNIT = np.array([[0.0, 0.0], [1.0, 0.0], [1.0, 1.0], [0.0, 1.0]], dtype=np.float32)
-
-
 # Rows and columns of a whole picture.
 WHOLE = (slice(None), slice(None))
 

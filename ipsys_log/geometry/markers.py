@@ -2,10 +2,13 @@
 
 from __future__ import annotations
 
+from functools import cache
+
+import cv2
 import numpy as np
 from numpy.typing import NDArray
 
-__all__ = ["camera_point", "camera_point_slopes", "heading", "marker_corners"]
+__all__ = ["camera_point", "camera_point_slopes", "heading", "marker_corners", "white_cells"]
 
 Array = NDArray[np.float64]
 
@@ -112,3 +115,18 @@ def marker_corners(length_m: float) -> Array:
     """
     half = length_m / 2
     return np.array([[-half, half, 0], [half, half, 0], [half, -half, 0], [-half, -half, 0]])
+
+
+@cache
+def white_cells(dictionary: str, marker_id: int) -> NDArray[np.bool_]:
+    """Which cells of a marker's square are white, (n, n), its black border included, the top row first.
+
+    Parameters
+    ----------
+    dictionary : OpenCV's name, such as DICT_4X4_100.
+    """
+    known = cv2.aruco.getPredefinedDictionary(getattr(cv2.aruco, dictionary))
+    image = cv2.aruco.generateImageMarker(known, marker_id, known.markerSize + 2, borderBits=1)
+    white: NDArray[np.bool_] = np.asarray(image) > 0
+    white.flags.writeable = False
+    return white

@@ -6,12 +6,11 @@ from collections.abc import Callable
 from dataclasses import dataclass
 from functools import cache
 
-import cv2
 import numpy as np
 from numpy.typing import NDArray
 
 from ipsys_log.geometry.lenses import project
-from ipsys_log.geometry.markers import marker_corners
+from ipsys_log.geometry.markers import marker_corners, white_cells
 from ipsys_log.geometry.poses import transform
 from ipsys_log.messages import CameraCalibration
 
@@ -41,10 +40,7 @@ Moving = Callable[[float], Placed]
 @cache
 def black_cells(dictionary: str, marker_id: int) -> NDArray[np.bool_]:
     """Which cells of the print are black, (n + 2, n + 2) with the white margin, top row first."""
-    known = cv2.aruco.getPredefinedDictionary(getattr(cv2.aruco, dictionary))
-    cells = known.markerSize + 2
-    square = np.asarray(cv2.aruco.generateImageMarker(known, marker_id, cells, borderBits=1))
-    black: NDArray[np.bool_] = np.pad(square == 0, 1)
+    black: NDArray[np.bool_] = np.pad(~white_cells(dictionary, marker_id), 1)
     black.flags.writeable = False
     return black
 

@@ -5,11 +5,10 @@ from __future__ import annotations
 from dataclasses import dataclass
 from functools import cache, lru_cache
 
-import cv2
 import numpy as np
 from numpy.typing import NDArray
 
-from ipsys_log.geometry.markers import marker_corners
+from ipsys_log.geometry.markers import marker_corners, white_cells
 
 __all__ = ["Prints", "lay_out"]
 
@@ -63,7 +62,7 @@ def lay_out(dictionary: str, marker_ids: tuple[int, ...]) -> Prints:
     rows = np.stack(
         [np.vstack([one, np.repeat(one[:1] * [1, 1, 1, 0], most - len(one), 0)]) for one in edges]
     )
-    white = np.stack([_white(dictionary, marker_id) for marker_id in marker_ids])
+    white = np.stack([white_cells(dictionary, marker_id) for marker_id in marker_ids])
     cells = white.shape[1]
     points, level, real = rows[..., :2].copy(), rows[..., 2], np.abs(rows[..., 3])
     reach = _REACH / cells
@@ -97,17 +96,9 @@ def _outline(cells: int) -> Array:
 
 
 @cache
-def _white(dictionary: str, marker_id: int) -> NDArray[np.bool_]:
-    """The cells that are white, (n, n), the top row first."""
-    known = cv2.aruco.getPredefinedDictionary(getattr(cv2.aruco, dictionary))
-    image = cv2.aruco.generateImageMarker(known, marker_id, known.markerSize + 2, borderBits=1)
-    return np.asarray(image) > 0
-
-
-@cache
 def _edges(dictionary: str, marker_id: int) -> Array:
     """Points on edges: x, y, axis, polarity; (s, 4)."""
-    margin = np.pad(_white(dictionary, marker_id), 1, constant_values=True)
+    margin = np.pad(white_cells(dictionary, marker_id), 1, constant_values=True)
     cells = len(margin) - 2
     lines = np.arange(cells + 1) / cells - 0.5
     steps = _ALONG_CELL / cells

@@ -15,6 +15,7 @@ import cv2
 import numpy as np
 from numpy.typing import NDArray
 
+from ipsys_log.geometry.markers import white_cells
 from ipsys_log.stages.detect.decode import Grey, levels_at
 
 __all__ = ["WHOLE", "Candidate", "search", "search_thoroughly"]
@@ -137,12 +138,8 @@ def _words(dictionary: str) -> tuple[NDArray[np.float32], Array]:
     places : (cells, 4), shares of the corners. Between them a square of this size is bent little by
         perspective and lens.
     """
-    known = _known(dictionary)
-    cells = known.markerSize + 2
-    images = [
-        np.asarray(cv2.aruco.generateImageMarker(known, n, cells, borderBits=1)) > 0
-        for n in range(len(known.bytesList))
-    ]
+    images = [white_cells(dictionary, n) for n in range(len(_known(dictionary).bytesList))]
+    cells = len(images[0])
     # With the marker's top left at corner k of a square, the square shows it turned k quarters clockwise.
     turned = [np.rot90(image, -turn).ravel() for image in images for turn in range(4)]
     x, y = (axis.ravel() for axis in np.meshgrid(*2 * [(np.arange(cells) + 0.5) / cells]))

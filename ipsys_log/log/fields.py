@@ -6,6 +6,7 @@ import types
 from collections.abc import Callable
 from dataclasses import fields, is_dataclass
 from functools import cache
+from math import prod
 from typing import Annotated, Any, Union, get_args, get_origin, get_type_hints
 
 import numpy as np
@@ -76,13 +77,16 @@ def _scalar(name: str) -> tuple[Fill, Read]:
 
 
 def _array(name: str, shape: tuple[int, ...]) -> tuple[Fill, Read]:
+    size = None if -1 in shape else prod(shape)
+
     def fill(proto: Any, value: Any) -> None:
         getattr(proto, name).extend(np.asarray(value, dtype=np.float64).reshape(-1).tolist())
 
     def read(proto: Any) -> Any:
-        array = np.array(getattr(proto, name), dtype=np.float64)
-        if -1 not in shape and array.size != np.prod(shape):
-            raise ValueError(f"{name} has {array.size} numbers instead of {np.prod(shape)}")
+        # A list of numbers is faster to read than the protobuf container.
+        array = np.array(getattr(proto, name)[:], dtype=np.float64)
+        if size is not None and array.size != size:
+            raise ValueError(f"{name} has {array.size} numbers instead of {size}")
         array = array.reshape(shape)
         array.flags.writeable = False
         return array

@@ -36,7 +36,11 @@ def regressors(points: Array) -> Array:
     [1.0, 2.0, 3.0, 5.0, 4.0, 6.0, 10.0, 9.0, 15.0, 25.0]
     """
     first, second = _factors(points.shape[1])
-    return np.hstack([np.ones((len(points), 1)), points, points[:, first] * points[:, second]])
+    count, columns = points.shape
+    terms: Array = np.ones((count, 1 + columns + len(first)))
+    terms[:, 1 : 1 + columns] = points
+    np.multiply(points[:, first], points[:, second], out=terms[:, 1 + columns :])
+    return terms
 
 
 @cache

@@ -121,8 +121,11 @@ def _leverage(inverse: Array, points_m: Array) -> Array:
 
 def leverage_terms(points_m: Array) -> Array:
     """The six terms up to second order in u = Xc / Zc, v = Yc / Zc, (n, 6), that leverage is reckoned by."""
-    u, v = points_m[:, 0] / points_m[:, 2], points_m[:, 1] / points_m[:, 2]
-    return np.stack([np.ones_like(u), u, v, u * u, u * v, v * v], axis=1)
+    terms = np.ones((len(points_m), 6))
+    uv = terms[:, 1:3] = points_m[:, :2] / points_m[:, 2:]
+    terms[:, 3:5] = uv * uv[:, :1]
+    terms[:, 5] = uv[:, 1] ** 2
+    return terms
 
 
 def estimate_uncertainty(

@@ -8,7 +8,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from ipsys_log.messages import Pair
-from ipsys_log.models import Places, fit_cameras, inputs, tied_cameras
+from ipsys_log.models import Places, fit_cameras, inputs, predict_array, tied_cameras
 
 __all__ = ["FOLDS", "REPEATS", "cross_validate", "deal", "gather_places", "leave_one_out", "predict_without"]
 
@@ -59,7 +59,7 @@ def predict_without(name: str, cameras: Mapping[str, Places], left_out: Collecti
     rest = {camera: _without(places, left_out) for camera, places in cameras.items()}
     models = fit_cameras(name, rest)
     return {
-        camera: models[camera].predict(inputs(name, places.points_m, places.world_m[:, 2]))
+        camera: predict_array(models[camera], inputs(name, places.points_m, places.world_m[:, 2]))
         for camera, places in cameras.items()
     }
 

@@ -28,7 +28,7 @@ Array = NDArray[np.float64]
 _SEARCH_EVERY = 20
 _THOROUGH_EVERY = 240
 # And decoded as a whole every so many; the others only as far as markers are expected.
-_WHOLE_EVERY = 7
+_WHOLE_EVERY = 10
 _MARGIN_PX = 24
 # Times the spread of edges about a fit with one more freedom.
 _AS_GOOD = 1.1

@@ -46,12 +46,17 @@ class Watch:
         """
         samples = grey[_HALF_PX::_EVERY_PX, _HALF_PX::_EVERY_PX].astype(np.float32)
         if self._background.shape != samples.shape:
+            # The first picture is background as a whole; rows that it lacks come with a later one.
             self._background = np.full_like(samples, np.nan)
+            for part in rows:
+                self._background[_samples_in(part)] = samples[_samples_in(part)]
+            self.forget(markers_px)
+            return None
         covered = _boxes(markers_px)
         self._forget(covered)
         new = np.zeros(samples.shape, dtype=bool)
         for part in rows:
-            here = slice(-((_HALF_PX - part.start) // _EVERY_PX), -((_HALF_PX - part.stop) // _EVERY_PX))
+            here = _samples_in(part)
             new[here] = self._learn(samples[here], self._background[here])
         self._forget(covered)
         if np.count_nonzero(new) < _CHANGED_SAMPLES:
@@ -77,6 +82,10 @@ class Watch:
     def _forget(self, boxes: Iterable[tuple[slice, slice]]) -> None:
         for box in boxes:
             self._background[box] = np.nan
+
+
+def _samples_in(rows: slice) -> slice:
+    return slice(-((_HALF_PX - rows.start) // _EVERY_PX), -((_HALF_PX - rows.stop) // _EVERY_PX))
 
 
 def _boxes(markers_px: Sequence[Array]) -> list[tuple[slice, slice]]:

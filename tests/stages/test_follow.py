@@ -44,8 +44,8 @@ from tests.stages.drawing import (
 )
 
 LENGTH_M = 0.4
-# Frames in which a marker has to be found again: all of the picture is decoded every seventh time.
-SOON = 7
+# Frames in which a marker has to be found again: all of the picture is decoded every tenth time.
+SOON = 10
 RESTARTS = (cv2.IMWRITE_JPEG_RST_INTERVAL, 40)
 
 

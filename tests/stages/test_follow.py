@@ -199,22 +199,22 @@ def markers_or_event(made: list[Any]) -> bool:
 def test_a_marker_is_put_down_covered_uncovered_and_taken_away(options: tuple[int, ...]) -> None:
     covered = with_marker().copy()
     cv2.circle(covered, (345, 250), 75, 95, -1)
-    empty, there = [floor()] * 7, [with_marker()] * 8
-    answers = feed(started(), film([*empty, *there, *[covered] * 8, *there, *empty], "red", *options))
+    long = SOON + 1
+    pictures = [floor(), with_marker(), covered, with_marker(), floor()]
+    frames = film([picture for picture in pictures for _ in range(long)], "red", *options)
+    answers = feed(started(), frames)
     seen = [found == [5] for found in ids(answers)]
-    assert not any(seen[:7])
-    assert all(seen[7 + SOON : 15])
-    assert not any(seen[15:23])
-    assert all(seen[23 + SOON : 31])
-    assert not any(seen[31:])
-    for n in (14, 30):
+    empty, put_down, hidden, uncovered, taken = (seen[n * long : (n + 1) * long] for n in range(5))
+    assert not any(empty + hidden + taken)
+    assert put_down[-1] and uncovered[-1]
+    for n in (2 * long - 1, 4 * long - 1):
         assert off_px(answers[n], lying(5, 330, 240)) < 0.1
 
 
 def test_a_second_marker_is_put_beside_a_first() -> None:
     first, second = lying(5, 200, 240), lying(9, 450, 260)
     pictures = [draw(VGA, [first], Look()), draw(VGA, [first, second], Look())]
-    seen = ids(feed(started(), film([pictures[0]] * 7 + [pictures[1]] * 8, "red", *RESTARTS)))
+    seen = ids(feed(started(), film([pictures[0]] * 7 + [pictures[1]] * (SOON + 1), "red", *RESTARTS)))
     assert seen[7 + SOON] == [5, 9]
 
 
@@ -227,7 +227,7 @@ def test_a_marker_that_enters_is_seen_soon_after_it_is_whole(side: str) -> None:
     towards = np.array(SIDES[side])
     beside = draw(VGA, [lying(9, 530, 385)], Look(noise=0.0)).astype(np.float64)
     starts_px = np.abs(towards) * (380, 300)
-    path = [np.array([320, 240]) + towards * np.maximum(starts_px - 25 * n, 0) for n in range(13)]
+    path = [np.array([320, 240]) + towards * np.maximum(starts_px - 25 * n, 0) for n in range(17)]
     places = [lying(5, float(x), float(y)) for x, y in path]
     frames = film([draw(VGA, [one], Look(floor=beside, seed=n)) for n, one in enumerate(places)])
     seen = ids(feed(started(), frames))

@@ -206,7 +206,8 @@ def test_a_marker_is_put_down_covered_uncovered_and_taken_away(options: tuple[in
     seen = [found == [5] for found in ids(answers)]
     empty, put_down, hidden, uncovered, taken = (seen[n * long : (n + 1) * long] for n in range(5))
     assert not any(empty + hidden + taken)
-    assert put_down[-1] and uncovered[-1]
+    assert put_down[-1]
+    assert uncovered[-1]
     for n in (2 * long - 1, 4 * long - 1):
         assert off_px(answers[n], lying(5, 330, 240)) < 0.1
 

@@ -42,6 +42,7 @@ class Message:
 RIG_TOPIC = "/rig"
 MEASUREMENTS_TOPIC = "/measurements"
 EVENTS_TOPIC = "/events"
+LATENCY_TOPIC = "/latency"
 TRUTH_TOPIC = "/truth/tracks"
 
 
@@ -67,11 +68,25 @@ class RigMarker:
 @dataclass(frozen=True, slots=True)
 class RigCamera:
     """A camera: ``row_time_ns`` lies between the exposures of two rows, ``edge_offset_px`` is by how much
-    edges of black lie too far inside the black."""
+    edges of black lie too far inside the black.
+
+    ``source`` says where frames come from, ``width`` to ``gain`` what the camera is asked for. ``stamp`` is
+    what the driver's time means, ``start`` of the exposure of the first row or ``end`` of the frame, and
+    ``latency_ns`` how long after that the stamp is taken. ``calibration`` names the file of its lens."""
 
     name: str
     row_time_ns: int | None = None
     edge_offset_px: float | None = None
+    source: str | None = None
+    width: int | None = None
+    height: int | None = None
+    rate_hz: float | None = None
+    exposure_s: float | None = None
+    focus: float | None = None
+    gain: float | None = None
+    stamp: str | None = None
+    latency_ns: int | None = None
+    calibration: str | None = None
 
 
 @dataclass(frozen=True, slots=True)
@@ -280,6 +295,20 @@ class Event:
     text: str
     camera: str | None = None
     marker_id: int | None = None
+
+
+@dataclass(frozen=True, slots=True)
+class Latency:
+    """When the steps from a frame to its positions were done, by the wall clock. Telemetry: no stage reads
+    it."""
+
+    timestamp: TimeNs
+    camera: str
+    received: TimeNs
+    detected: TimeNs
+    located: TimeNs
+    fused: TimeNs
+    published: TimeNs
 
 
 # --- measurements -------------------------------------------------------------------------------

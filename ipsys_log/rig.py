@@ -15,12 +15,15 @@ from typing import Any, TypeVar
 from ipsys_log.errors import IpsysError
 from ipsys_log.messages import Floor, ReferencePoint, Rig, RigCamera, RigMarker
 
-__all__ = ["check_name", "check_rig", "example_toml", "load_rig", "rig_toml"]
+__all__ = ["STAMPS", "check_name", "check_rig", "example_toml", "load_rig", "rig_toml"]
 
 Item = TypeVar("Item")
 
 # Markers are carried below the cameras; what is greater was meant in cm.
 _HIGHEST_M = 5.0
+
+# What the time that a driver gives a frame can mean.
+STAMPS = ("start", "end")
 
 _NAME = re.compile(r"[a-z][a-z0-9_]*")
 _ITEMS = {"markers": RigMarker, "cameras": RigCamera, "reference_points": ReferencePoint}
@@ -126,9 +129,25 @@ def check_rig(rig: Rig, where: str) -> Rig:
     for length in lengths:
         if not (math.isfinite(length) and length > 0):
             raise IpsysError(f"{where}: {length} m is not a length; marker and floor sizes must be above 0")
+    _check_cameras(rig, where)
     _check_tape(rig, where)
     _check_heights(rig, where)
     return rig
+
+
+def _check_cameras(rig: Rig, where: str) -> None:
+    for camera in rig.cameras:
+        for key in ("width", "height", "rate_hz", "exposure_s"):
+            value = getattr(camera, key)
+            if value is not None and not (math.isfinite(value) and value > 0):
+                raise IpsysError(f"{where}: camera {camera.name}: {key} is {value}; it must be above 0")
+        if camera.stamp not in (None, *STAMPS):
+            raise IpsysError(
+                f"{where}: camera {camera.name}: stamp is {camera.stamp!r}; write "
+                + " or ".join(f'"{name}"' for name in STAMPS)
+            )
+    sources = (camera.source for camera in rig.cameras if camera.source)
+    _check_unique(sources, f"{where}: two cameras have the source")
 
 
 def _check_tape(rig: Rig, where: str) -> None:

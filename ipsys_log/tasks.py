@@ -86,13 +86,17 @@ class Task:
     notes: list[str] = field(default_factory=list)
 
 
+def _shutter(camera: RigCamera) -> tuple[int | None, float | None]:
+    return camera.row_time_ns, camera.edge_offset_px
+
+
 def _rig_part(stage: str) -> Callable[[Rig], Any]:
     """What a stage reads of the rig; an overriding rig that says the same there changes nothing."""
     return {
         "detect": lambda rig: (
             rig.dictionary,
             {m.id for m in rig.markers},
-            {camera for camera in rig.cameras if camera != RigCamera(camera.name)},
+            {(camera.name, *shutter) for camera in rig.cameras if any(shutter := _shutter(camera))},
         ),
         "camera-frame": lambda rig: (rig.marker_length_m, {(m.id, rig.length_of(m.id)) for m in rig.markers}),
         "locate": lambda rig: (rig.marker_height_m, {(m.id, m.height_m) for m in rig.markers}),

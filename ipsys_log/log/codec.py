@@ -43,6 +43,7 @@ PAYLOADS: dict[str, type] = {
             messages.CameraPoints,
             messages.Evaluation,
             messages.Event,
+            messages.Latency,
             messages.Markers,
             messages.Measurement,
             messages.Model,

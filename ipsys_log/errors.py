@@ -1,6 +1,6 @@
 """What went wrong in the user's input, in one line: what, where, and what to do."""
 
-__all__ = ["FitError", "FrameError", "IpsysError", "LogError"]
+__all__ = ["FitError", "FrameError", "IpsysError", "LogError", "WriteError"]
 
 
 class IpsysError(Exception):
@@ -13,6 +13,10 @@ class IpsysError(Exception):
 
 class LogError(IpsysError):
     """A log file cannot be read or written as it is."""
+
+
+class WriteError(LogError):
+    """The disk takes no more, or takes nothing."""
 
 
 class FitError(IpsysError, ValueError):

@@ -9,7 +9,16 @@ import numpy as np
 
 from ipsys_log.errors import IpsysError
 from ipsys_log.log.session import Session, run_of_topic
-from ipsys_log.messages import CameraPoints, Markers, Measurement, Model, Pair, Rig
+from ipsys_log.messages import (
+    FRAME_SKIPPED,
+    CameraPoints,
+    Event,
+    Markers,
+    Measurement,
+    Model,
+    Pair,
+    Rig,
+)
 from ipsys_log.models import MODELS, create, min_pairs
 from ipsys_log.offline.crossval import FOLDS
 from ipsys_log.offline.pairs import Measured, build_pairs, gather_sightings, measured_in_order, split
@@ -27,6 +36,7 @@ __all__ = [
     "held_out_ids",
     "measured",
     "rig_with_offsets",
+    "skipped_frames",
     "split_parameters",
     "unused_places",
     "wanted_models",
@@ -125,6 +135,12 @@ def find_pairs(session: Session, points: str, places: list[Measured]) -> dict[st
     """What each camera saw of the measured places."""
     sightings = gather_sightings(session.messages(session.topics(CameraPoints, points)))
     return build_pairs(sightings, places)
+
+
+def skipped_frames(session: Session) -> set[tuple[str, int]]:
+    """Camera and publish time of the frames that were recorded live and not looked at then."""
+    events = session.payloads(session.topics(Event))
+    return {(str(event.camera), event.timestamp) for event in events if event.kind == FRAME_SKIPPED}
 
 
 def rig_with_offsets(session: Session) -> Rig:

@@ -45,6 +45,9 @@ EVENTS_TOPIC = "/events"
 LATENCY_TOPIC = "/latency"
 TRUTH_TOPIC = "/truth/tracks"
 
+# The kind of an event whose timestamp is that of a frame which no stage has seen when it was recorded live.
+FRAME_SKIPPED = "frame_skipped"
+
 
 def image_topic(camera: str) -> str:
     return f"/cameras/{camera}/image"

@@ -17,7 +17,7 @@ from ipsys_log.log.session import Session
 from ipsys_log.log.storage import DISK
 from ipsys_log.messages import ChannelWritten, Message, Run
 
-__all__ = ["append_run", "opened_target", "write_log", "write_messages"]
+__all__ = ["append_messages", "append_run", "opened_target", "record_message", "write_log", "write_messages"]
 
 
 def write_messages(writer: LogWriter, messages: Iterable[Message]) -> dict[str, int]:
@@ -60,9 +60,18 @@ def append_run(path: Path, record: Run, log_time_ns: int, messages: Callable[[],
         counts = write_messages(writer, messages())
         outputs = tuple(ChannelWritten(topic, count) for topic, count in sorted(counts.items()))
         done = replace(record, outputs=outputs)
-        topic = f"/runs/{record.run}/record"
-        write_messages(writer, [Message(topic, log_time_ns, record.timestamp, done)])
+        write_messages(writer, [record_message(done, log_time_ns)])
     return done
+
+
+def append_messages(path: Path, messages: Iterable[Message]) -> None:
+    """Append messages to a log, all of them or none."""
+    with LogWriter.append(path) as writer:
+        write_messages(writer, messages)
+
+
+def record_message(record: Run, log_time_ns: int) -> Message:
+    return Message(f"/runs/{record.run}/record", log_time_ns, record.timestamp, record)
 
 
 @contextmanager

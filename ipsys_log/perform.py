@@ -7,14 +7,25 @@ from dataclasses import replace
 from pathlib import Path
 
 from ipsys_log.log.session import Session, run_of_topic
-from ipsys_log.messages import RIG_TOPIC, CameraCalibration, Lens, Message, Rig, Run, calibration_topic
-from ipsys_log.output import append_run
+from ipsys_log.lookup import skipped_frames
+from ipsys_log.messages import (
+    EVENTS_TOPIC,
+    RIG_TOPIC,
+    CameraCalibration,
+    ChannelWritten,
+    Lens,
+    Message,
+    Rig,
+    Run,
+    calibration_topic,
+)
+from ipsys_log.output import append_messages, append_run, record_message
 from ipsys_log.remarks import Remarks
 from ipsys_log.request import Progress, Request
 from ipsys_log.runs import Outcome, check_run_name, find_run, fingerprint, free_name, read_channels
-from ipsys_log.tasks import Task
+from ipsys_log.tasks import Task, plan_stage
 
-__all__ = ["SHARED_STAGES", "inputs", "perform"]
+__all__ = ["SHARED_STAGES", "inputs", "perform", "record_of", "sign"]
 
 # The stages whose runs serve every model.
 SHARED_STAGES = ("detect", "camera-frame")
@@ -27,7 +38,7 @@ def perform(session: Session, target: Path, task: Task, request: Request, until:
     # A name given by the user is for what was asked for, not for the detection on the way to it.
     named = task.stage == until or (task.stage not in SHARED_STAGES and until not in SHARED_STAGES)
     name = request.run if named else None
-    record = _record(session, task)
+    record = record_of(session, task)
     found = find_run(session, record, name)
     if found is not None:
         return Outcome(task.stage, found, fresh=False)
@@ -44,7 +55,45 @@ def perform(session: Session, target: Path, task: Task, request: Request, until:
     return Outcome(task.stage, name, True, count, remarks.lines())
 
 
-def _record(session: Session, task: Task) -> Run:
+def sign(path: Path, request: Request, runs: Mapping[str, str]) -> list[Outcome]:
+    """Append the records of stages that have written their channels already, live.
+
+    Parameters
+    ----------
+    runs : by stage, in order, the run it has written to.
+    """
+    records, outcomes = [], []
+    with Session([path]) as session:
+        first = max((run.number for run in session.runs()), default=0) + 1
+        for number, (stage, name) in enumerate(runs.items(), first):
+            task = plan_stage(stage, session, request, **_given(stage, runs, request))
+            assert isinstance(task, Task), f"{stage} was not done live"
+            outputs = tuple(
+                ChannelWritten(topic, session.count(topic))
+                for topic in sorted(t for payload in task.writes for t in session.topics(payload, name))
+            )
+            log_time_ns, time_ns = session.last(task.topics)
+            record = replace(record_of(session, task), run=name, outputs=outputs, number=number)
+            record = replace(record, timestamp=time_ns, fingerprint=fingerprint())
+            records.append(record_message(record, log_time_ns))
+            outcomes.append(Outcome(stage, name, True, sum(output.messages for output in outputs)))
+    append_messages(path, records)
+    return outcomes
+
+
+def _given(stage: str, runs: Mapping[str, str], request: Request) -> dict[str, str]:
+    """What :func:`ipsys_log.tasks.plan_stage` has to be told of the stages before."""
+    if stage == "camera-frame":
+        return {"markers": runs["detect"]}
+    if stage == "fit":
+        return {"points": runs["camera-frame"], "model": request.models[0]}
+    if stage == "locate":
+        return {"points": runs["camera-frame"], "model": runs["fit"]}
+    return {"positions": runs["locate"]} if stage == "fuse" else {}
+
+
+def record_of(session: Session, task: Task) -> Run:
+    """The record of a task, but for its name, its time and what it wrote."""
     lenses = tuple(
         Lens(name, lens.width, lens.height, lens.distortion_model, lens.D, lens.K)
         for name, lens in sorted(task.lenses.items())
@@ -74,8 +123,10 @@ def inputs(session: Session, task: Task, progress: Progress) -> Iterator[Message
             yield next(session.messages([topic]))
     total = sum(session.count(topic) for topic in task.topics)
     progress(task.stage, 0, total)
+    skipped = skipped_frames(session) if task.as_live else set()
     for done, message in enumerate(session.messages(task.topics), 1):
-        yield message
+        if message.topic != EVENTS_TOPIC and (message.camera, message.publish_time_ns) not in skipped:
+            yield message
         progress(task.stage, done, total)
 
 

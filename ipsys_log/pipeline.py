@@ -26,20 +26,23 @@ from __future__ import annotations
 
 import builtins
 from collections import deque
-from collections.abc import Callable, Iterable, Iterator, Sequence
+from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
 from concurrent.futures import Future, ThreadPoolExecutor
 from contextlib import ExitStack
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from functools import partial
+from itertools import chain
 from pathlib import Path
 from typing import Any
 
 import cv2
 from threadpoolctl import threadpool_limits
 
-from ipsys_log.log.session import Session
+from ipsys_log.latency import Ledger
+from ipsys_log.log.session import Session, run_of_topic
 from ipsys_log.lookup import wanted_models
 from ipsys_log.messages import (
+    CameraCalibration,
     CameraPoints,
     Evaluation,
     Event,
@@ -52,13 +55,16 @@ from ipsys_log.messages import (
     Tracks,
 )
 from ipsys_log.output import opened_target
-from ipsys_log.perform import inputs, perform
+from ipsys_log.perform import inputs, perform, sign
 from ipsys_log.preflight import check_inputs
+from ipsys_log.recording import Backlog, recording
 from ipsys_log.request import Progress, Request
 from ipsys_log.runs import Outcome
+from ipsys_log.sources.attached import Attached
+from ipsys_log.stages import camera_frame, detect, fuse, locate
 from ipsys_log.tasks import STAGES, Task, plan_stage
 
-__all__ = ["TOPICS", "Stage", "in_threads", "replay", "run"]
+__all__ = ["TOPICS", "Stage", "carry_out", "in_threads", "live", "record", "replay", "run"]
 
 # Where a payload goes within its run.
 TOPICS: dict[type, str] = {
@@ -73,6 +79,8 @@ TOPICS: dict[type, str] = {
     Event: "/runs/{run}/events",
 }
 
+# Is shown messages on their way, and None where nothing comes.
+Watch = Callable[[Message | None], None]
 Map = Callable[[Callable[[Message], Any], Iterable[Message]], Iterable[Any]]
 
 
@@ -181,7 +189,7 @@ def replay(
                 task = plan_stage(stage, session, request, **given)
                 if isinstance(task, str):
                     return task
-                make = partial(_make, progress=progress)
+                make = partial(carry_out, progress=progress)
                 outcomes.append(perform(session, target, task, request, until, make))
             return outcomes[-1].run
 
@@ -194,7 +202,7 @@ def replay(
     return outcomes
 
 
-def _make(task: Task, session: Session, name: str, progress: Progress) -> Iterator[Message]:
+def carry_out(task: Task, session: Session, name: str, progress: Progress) -> Iterator[Message]:
     """The messages of a task's run: its causal stage over the log, or one computed from all of it."""
     if task.step is None:
         assert task.compute is not None
@@ -209,3 +217,105 @@ def _make(task: Task, session: Session, name: str, progress: Progress) -> Iterat
     for message in run(inputs(session, task, progress), [stage], in_threads if task.decodes_frames else map):
         if isinstance(message.payload, task.writes):
             yield message
+
+
+def record(
+    source: Iterable[Message | None],
+    settings: Iterable[Message],
+    target: Path,
+    watch: Watch = lambda one: None,
+) -> Mapping[str, int]:
+    """Write what cameras send to a new log; returns how many messages went to each topic.
+
+    Parameters
+    ----------
+    source : messages, and None where nothing comes.
+    settings : written first: rig and lenses.
+    watch : is shown everything after it was written, and None where nothing came.
+
+    Raises
+    ------
+    IpsysError
+        Where the log cannot be written; what it holds by then is a complete log.
+    """
+    with recording(target) as log:
+        for message in settings:
+            log.put(message)
+        for arrived in source:
+            if arrived is None:
+                log.flush()
+            else:
+                log.put(arrived)
+            watch(arrived)
+    return log.counts
+
+
+def live(
+    cameras: Attached,
+    settings: Sequence[Message],
+    target: Path,
+    request: Request,
+    until: str = "fuse",
+    watch: Watch = lambda one: None,
+) -> list[Outcome]:
+    """Write what cameras send to a new log, and what the stages make of it: the run of a replay.
+
+    Every frame is in the log before a stage sees it. What is skipped because the stages are too slow is named
+    by events; a replay ``as_live`` passes over the same frames and gives the same bytes.
+
+    Parameters
+    ----------
+    settings : written first: rig, lenses and, for locate, the model in a run of its own.
+    request : corners and method; the model comes with the settings.
+    until : detect, or fuse.
+    watch : is shown what the stages make.
+
+    Returns
+    -------
+    One outcome for each stage, as of :func:`replay`.
+    """
+    request = replace(request, corners=request.corners or _usual_corners(cameras, settings))
+    runs, stages = _live_stages(settings, request, until)
+    with recording(target) as log, threadpool_limits(1, user_api="blas"):
+        for message in settings:
+            log.put(message)
+        ledger = Ledger(cameras.clock.now_ns, cameras.received_ns)
+        with Backlog(cameras, log, cameras.now_ns, cameras.stop) as frames:
+            told = (message for message in settings if not isinstance(message.payload, Model))
+            made = run(chain(told, frames), stages[:1], in_threads)
+            made = ledger.note("detected", Markers, made)
+            made = ledger.note("located", Positions, run(made, stages[1:3]))
+            made = ledger.note("fused", Tracks, run(made, stages[3:]))
+            for message in made:
+                if type(message.payload) in TOPICS:
+                    log.put(message)
+                    watch(message)
+                    entry = ledger.entry(message)
+                    if entry is not None:
+                        log.put(entry)
+    return sign(target, replace(request, as_live=bool(frames.skipped)), runs)
+
+
+def _usual_corners(cameras: Attached, settings: Sequence[Message]) -> str:
+    lenses = {message.camera for message in settings if isinstance(message.payload, CameraCalibration)}
+    return detect.EDGES if lenses >= cameras.states.keys() else detect.STOCK
+
+
+def _live_stages(
+    settings: Sequence[Message], request: Request, until: str
+) -> tuple[dict[str, str], list[Stage]]:
+    """The causal stages up to one, and the run that each stage of a replay would write to."""
+    corners = str(request.corners)
+    stages = [Stage(corners, detect.READS, detect.Detect(corners))]
+    runs = {"detect": corners}
+    if until == "detect":
+        return runs, stages
+    points = corners if request.method == camera_frame.PERIMETER else f"{corners}_{request.method}"
+    (model,) = (message for message in settings if isinstance(message.payload, Model))
+    name = run_of_topic(model.topic) or ""
+    stages += [
+        Stage(points, camera_frame.READS, camera_frame.CameraFrame(request.method)),
+        Stage(name, locate.READS, locate.Locate(model.payload)),
+        Stage(name, fuse.READS, fuse.Fuse(name), per_camera=False),
+    ]
+    return {**runs, "camera-frame": points, "fit": name, "locate": name, "fuse": name}, stages

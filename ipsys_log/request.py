@@ -30,6 +30,7 @@ class Request:
     run : name for the new run of the last stages, instead of one made from the model.
     corners : how corners are found: ``edges`` or ``stock``; None: edges, if all cameras have a calibration.
     method : how camera points are made of markers: ``perimeter`` or ``pose``.
+    as_live : pass over the frames that were skipped when the log was recorded live.
     skip_ambiguous : go on where a marker id is seen twice in a frame, without that marker.
 
     Raises
@@ -47,6 +48,7 @@ class Request:
     run: str | None = None
     corners: str | None = None
     method: str = PERIMETER
+    as_live: bool = False
     skip_ambiguous: bool = False
 
     def __post_init__(self) -> None:

@@ -17,10 +17,12 @@ from ipsys_log.lookup import (
     fitted_in,
     held_out_ids,
     measured,
+    skipped_frames,
     split_parameters,
     unused_places,
 )
 from ipsys_log.messages import (
+    EVENTS_TOPIC,
     CameraCalibration,
     CameraPoints,
     ChannelRead,
@@ -67,6 +69,7 @@ class Task:
         to ``notes``.
     parameters : what else its result depends on; ``input_runs`` those of ``foreign``.
     rig, lenses : set where they replace what the log holds.
+    as_live : frames that were skipped live are not read.
     """
 
     stage: str
@@ -81,6 +84,7 @@ class Task:
     parameters: Mapping[str, str] = field(default_factory=dict)
     rig: Rig | None = None
     lenses: Mapping[str, CameraCalibration] = field(default_factory=dict)
+    as_live: bool = False
     foreign: tuple[ChannelRead, ...] = ()
     input_runs: tuple[str, ...] = ()
     notes: list[str] = field(default_factory=list)
@@ -128,6 +132,9 @@ def _detect(session: Session, request: Request) -> Task | str:
     if corners == detect.EDGES:
         lenses = _other_lenses(session, request)
         topics += _held_lenses(session, lenses)
+    as_live = request.as_live and bool(skipped_frames(session))
+    if as_live:
+        topics.append(EVENTS_TOPIC)
     return Task(
         "detect",
         corners,
@@ -136,9 +143,10 @@ def _detect(session: Session, request: Request) -> Task | str:
         detect.READS,
         lambda run: detect.Detect(corners),
         decodes_frames=True,
-        parameters={"corners": corners},
+        parameters={"corners": corners, **({"as_live": "yes"} if as_live else {})},
         rig=rig,
         lenses=lenses,
+        as_live=as_live,
         notes=[] if request.corners else [_why_stock(name) for name in without],
     )
 

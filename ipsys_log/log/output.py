@@ -7,7 +7,7 @@ from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Protocol
 
-from ipsys_log.errors import LogError
+from ipsys_log.errors import LogError, WriteError
 from ipsys_log.log.crc import Buffer, extend
 from ipsys_log.log.journal import replace_tail, roll_back
 from ipsys_log.log.storage import Storage, write_all
@@ -116,5 +116,5 @@ def _extend(so_far: int, data: Buffer, crc: int | None) -> int:
     return zlib.crc32(data, so_far) if crc is None else extend(so_far, data, crc)
 
 
-def _cannot_write(path: Path, error: OSError, then: str) -> LogError:
-    return LogError(f"{path} cannot be written ({error.strerror or os.strerror(error.errno or 0)}): {then}")
+def _cannot_write(path: Path, error: OSError, then: str) -> WriteError:
+    return WriteError(f"{path} cannot be written ({error.strerror or os.strerror(error.errno or 0)}): {then}")

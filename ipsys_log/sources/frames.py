@@ -9,8 +9,9 @@ from typing import NamedTuple
 
 from ipsys_log.errors import IpsysError
 from ipsys_log.messages import RigCamera
+from ipsys_log.units import NS_PER_S
 
-__all__ = ["Clock", "Frame", "Open", "Say", "SourceError"]
+__all__ = ["Clock", "Frame", "Open", "Say", "SourceError", "instant_ns"]
 
 
 class SourceError(IpsysError):
@@ -43,5 +44,30 @@ class Clock:
 # Tells the user what a camera refused, one line at a time.
 Say = Callable[[str], None]
 # Opens a camera as the rig wants it. While nothing comes it yields None, at least twice a second, so that its
-# thread can end; it ends, or raises SourceError, when the camera has gone.
+# thread can end. It ends when there will never be more, as of a file; when a camera has gone it raises
+# SourceError.
 Open = Callable[[RigCamera, Clock, Say], AbstractContextManager[Iterator[Frame | None]]]
+
+
+def instant_ns(stamp_ns: int, camera: RigCamera) -> int:
+    """The middle of the exposure of a frame's first row, from the driver's stamp.
+
+    Parameters
+    ----------
+    stamp_ns : of the frame.
+    camera : ``stamp`` says what it means, the start where it says nothing.
+
+    Examples
+    --------
+    >>> camera = RigCamera("red", height=1080, row_time_ns=30_000, exposure_s=0.01, stamp="end")
+    >>> instant_ns(100_000_000, camera)
+    62630000
+    >>> instant_ns(100_000_000, RigCamera("red", exposure_s=0.01, latency_ns=1_000_000))
+    104000000
+    """
+    half_ns = round((camera.exposure_s or 0.0) * NS_PER_S / 2)
+    stamp_ns -= camera.latency_ns or 0
+    if camera.stamp == "end":
+        rows_ns = ((camera.height or 1) - 1) * (camera.row_time_ns or 0)
+        return stamp_ns - rows_ns - half_ns
+    return stamp_ns + half_ns

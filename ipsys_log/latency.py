@@ -1,0 +1,93 @@
+"""The latency ledger: when each step of a position was done, by the wall clock."""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Iterable, Iterator, Mapping
+from dataclasses import dataclass
+
+import numpy as np
+from numpy.typing import NDArray
+
+from ipsys_log.messages import LATENCY_TOPIC, Latency, Message, Tracks
+from ipsys_log.units import NS_PER_S
+
+__all__ = ["STEPS", "Ledger", "Percentiles", "latency_percentiles", "step_times_s"]
+
+STEPS = ("captured", "received", "detected", "located", "fused", "published")
+_REMEMBERED = 1000
+
+
+class Ledger:
+    """Notes the times of frames on their way. Telemetry: no stage sees it.
+
+    Parameters
+    ----------
+    now_ns : the wall clock.
+    received_ns : when frames came, by log time.
+    """
+
+    def __init__(self, now_ns: Callable[[], int], received_ns: Mapping[int, int]) -> None:
+        self._now_ns, self._received_ns = now_ns, received_ns
+        self._times_ns: dict[int, dict[str, int]] = {}
+
+    def note(self, step: str, payload: type, messages: Iterable[Message]) -> Iterator[Message]:
+        """The messages, unchanged; one with such a payload is a step done for the frame of its log time."""
+        for message in messages:
+            if isinstance(message.payload, payload):
+                self._times_ns.setdefault(message.log_time_ns, {})[step] = self._now_ns()
+                if len(self._times_ns) > _REMEMBERED:
+                    del self._times_ns[next(iter(self._times_ns))]
+            yield message
+
+    def entry(self, message: Message) -> Message | None:
+        """The times of a position that has just been published; None for any other message."""
+        times_ns = self._times_ns.get(message.log_time_ns, {})
+        received_ns = self._received_ns.get(message.log_time_ns)
+        if not isinstance(message.payload, Tracks) or received_ns is None:
+            return None
+        latency = Latency(
+            message.publish_time_ns,
+            str(message.camera),
+            received_ns,
+            times_ns["detected"],
+            times_ns["located"],
+            times_ns["fused"],
+            self._now_ns(),
+        )
+        return Message(LATENCY_TOPIC, message.log_time_ns, message.publish_time_ns, latency, message.camera)
+
+
+def step_times_s(entries: Iterable[Latency]) -> dict[str, NDArray[np.float64]]:
+    """How long each step took, and ``total`` from receiving a frame to publishing, in s.
+
+    ``captured`` is from the exposure to the arrival of a frame: what camera and cable take.
+    """
+    times_ns = np.array([[getattr(one, _field(step)) for step in STEPS] for one in entries], dtype=np.int64)
+    times_ns = times_ns.reshape(-1, len(STEPS))
+    took_s = np.diff(times_ns, axis=1) / NS_PER_S
+    found = {step: took_s[:, n] for n, step in enumerate(STEPS[1:])}
+    return {**found, "total": (times_ns[:, -1] - times_ns[:, 1]) / NS_PER_S}
+
+
+def _field(step: str) -> str:
+    return "timestamp" if step == "captured" else step
+
+
+@dataclass(frozen=True, slots=True)
+class Percentiles:
+    """Of one step, in s."""
+
+    median_s: float
+    p90_s: float
+    p99_s: float
+    max_s: float
+
+
+def latency_percentiles(times_s: Mapping[str, NDArray[np.float64]]) -> dict[str, Percentiles]:
+    """Median, 90th and 99th percentile and maximum of each step."""
+    found = {}
+    for step, values in times_s.items():
+        if len(values):
+            median_s, p90_s, p99_s, max_s = np.percentile(values, [50, 90, 99, 100]).tolist()
+            found[step] = Percentiles(median_s, p90_s, p99_s, max_s)
+    return found

@@ -1,0 +1,202 @@
+"""What cameras send now, into a log: written first, looked at after."""
+
+from __future__ import annotations
+
+import os
+import threading
+from collections import Counter, deque
+from collections.abc import Callable, Iterable, Iterator
+from contextlib import contextmanager, suppress
+from pathlib import Path
+from types import TracebackType
+
+from ipsys_log.errors import IpsysError, LogError, WriteError
+from ipsys_log.log import LogReader, LogWriter, Schema
+from ipsys_log.log.codec import encode, schema_data, schema_name
+from ipsys_log.messages import EVENTS_TOPIC, FRAME_SKIPPED, Event, Message
+from ipsys_log.units import NS_PER_S, format_bytes
+
+__all__ = ["TICK", "Backlog", "Recording", "recording"]
+
+# Between two messages of a source: nothing more has come so far. It is not in the log.
+TICK = Message("", 0, 0, None)
+
+# A recorder that is killed loses no more than this.
+_FLUSH_NS = NS_PER_S
+# Set aside on the disk, so that a log can be finished when the disk is full.
+_RESERVE_BYTES = 16 << 20
+# Frames of a camera that may wait for the stages; older ones are skipped.
+_WAITING = 3
+
+
+class Recording:
+    """A log that is being written, by several threads. Made by :func:`recording`.
+
+    Attributes
+    ----------
+    counts : messages so far, by topic.
+    """
+
+    def __init__(self, writer: LogWriter) -> None:
+        self.counts: Counter[str] = Counter()
+        self._writer = writer
+        self._lock = threading.Lock()
+        self._flushed_ns = 0
+
+    def put(self, message: Message) -> None:
+        """Write a message; what is a second old is handed to the disk.
+
+        Raises
+        ------
+        WriteError
+            Where the disk is full.
+        """
+        name = schema_name(type(message.payload))
+        data = encode(message.payload)
+        with self._lock:
+            if message.topic not in self.counts:
+                self._writer.add_channel(message.topic, Schema(name, "protobuf", schema_data(name)))
+            self._writer.write(message.topic, message.log_time_ns, message.publish_time_ns, data)
+            self.counts[message.topic] += 1
+            if message.log_time_ns - self._flushed_ns >= _FLUSH_NS:
+                self._flushed_ns = message.log_time_ns
+                self._writer.flush()
+
+    def flush(self) -> None:
+        """Hand everything to the disk."""
+        with self._lock:
+            self._writer.flush()
+
+
+@contextmanager
+def recording(path: Path) -> Iterator[Recording]:
+    """A new log that keeps what it has, whatever ends the block.
+
+    Raises
+    ------
+    LogError
+        Where there is such a file, or it cannot be made.
+    IpsysError
+        Where the disk is full: the log is complete, and says how far it goes.
+    """
+    try:
+        with LogWriter.create(path) as writer, _reserve(path):
+            yield Recording(writer)
+    except WriteError as error:
+        raise IpsysError(_what_fitted(path, error)) from error
+
+
+@contextmanager
+def _reserve(path: Path) -> Iterator[None]:
+    """Some of the disk, given back before the log is closed. It has no name: it cannot be left behind."""
+    if not hasattr(os, "O_TMPFILE"):
+        yield
+        return
+    fd = None
+    with suppress(OSError):  # a file system that cannot, or a disk that is full already
+        fd = os.open(path.parent, os.O_TMPFILE | os.O_RDWR)
+        os.posix_fallocate(fd, 0, _RESERVE_BYTES)
+    try:
+        yield
+    finally:
+        if fd is not None:
+            os.close(fd)
+
+
+def _what_fitted(path: Path, error: WriteError) -> str:
+    try:
+        with LogReader(path) as log:
+            count, seconds = log.message_count, ((log.end_ns or 0) - (log.start_ns or 0)) / NS_PER_S
+    except LogError:
+        return str(error)
+    size = format_bytes(path.stat().st_size)
+    return (
+        f"{path}: the disk takes no more; recording has stopped, and the log is complete with what fitted: "
+        f"{count} messages, {seconds:.1f} s, {size}. Free some space, or record to another disk"
+    )
+
+
+class Backlog:
+    """Frames that are in the log and that the stages have not seen. A context manager; iterate once.
+
+    A thread of its own writes what a source gives and hands the frames on. Where the stages are slower than
+    the cameras, the oldest frame that waits is skipped, never the recording of it, and an event says so.
+    After everything that waits comes a :data:`TICK`.
+
+    Parameters
+    ----------
+    source : messages, None where nothing comes.
+    log : where all of them go.
+    now_ns : a log time for an event, called by the thread that takes from the source.
+    stop : makes the source end.
+    """
+
+    def __init__(
+        self,
+        source: Iterable[Message | None],
+        log: Recording,
+        now_ns: Callable[[], int],
+        stop: Callable[[], None],
+    ) -> None:
+        self.skipped: Counter[str] = Counter()
+        self._source, self._log, self._now_ns, self._stop = source, log, now_ns, stop
+        self._waiting: deque[Message] = deque()
+        self._ended = False
+        self._fault: BaseException | None = None
+        self._changed = threading.Condition()
+        self._thread = threading.Thread(target=self._record, name="recorder", daemon=True)
+
+    def __enter__(self) -> Backlog:
+        self._thread.start()
+        return self
+
+    def __exit__(
+        self, kind: type[BaseException] | None, error: BaseException | None, trace: TracebackType | None
+    ) -> None:
+        self._stop()
+        self._thread.join()
+
+    def __iter__(self) -> Iterator[Message]:
+        while True:
+            with self._changed:
+                while not self._waiting and not self._ended:
+                    self._changed.wait()
+                taken = list(self._waiting)
+                self._waiting.clear()
+            if not taken:
+                if self._fault is not None:
+                    raise self._fault
+                return
+            yield from taken
+            yield TICK
+
+    def _record(self) -> None:
+        try:
+            for message in self._source:
+                if message is None:
+                    self._log.flush()
+                    continue
+                self._log.put(message)
+                if message.camera is not None:
+                    self._hand_on(message)
+        except BaseException as fault:  # raised again where the messages are taken
+            self._fault = fault
+        finally:
+            with self._changed:
+                self._ended = True
+                self._changed.notify()
+
+    def _hand_on(self, message: Message) -> None:
+        with self._changed:
+            self._waiting.append(message)
+            mine = [one for one in self._waiting if one.camera == message.camera]
+            late = mine[0] if len(mine) > _WAITING else None
+            if late is not None:
+                self._waiting.remove(late)
+            self._changed.notify()
+        if late is not None:
+            camera = str(late.camera)
+            self.skipped[camera] += 1
+            text = f"a frame of camera {camera} is recorded but was not looked at: the stages are too slow"
+            event = Event(late.publish_time_ns, FRAME_SKIPPED, text, camera)
+            self._log.put(Message(EVENTS_TOPIC, self._now_ns(), late.publish_time_ns, event))

@@ -1,0 +1,257 @@
+"""Cameras that send now, as one source of messages.
+
+Each camera has a thread that puts what comes into one queue and does nothing else. Messages get their log
+time at one place, where they are taken out of it.
+"""
+
+from __future__ import annotations
+
+import threading
+from collections import deque
+from collections.abc import Iterator, Sequence
+from dataclasses import dataclass, field
+from types import TracebackType
+from typing import NamedTuple
+
+from ipsys_log.messages import (
+    EVENTS_TOPIC,
+    CompressedImage,
+    Event,
+    Message,
+    RigCamera,
+    image_topic,
+)
+from ipsys_log.sources.frames import Clock, Frame, Open, SourceError, instant_ns
+from ipsys_log.units import NS_PER_S
+
+__all__ = ["Attached", "CameraState"]
+
+# What may wait to be written: some seconds of three cameras, and no more of the memory than that.
+_LIMIT_BYTES = 256 << 20
+_TICK_S = 0.1
+# A camera that opens and then sends nothing is not there.
+_FIRST_FRAME_S = 10.0
+_REMEMBERED = 1000
+_RETRY_S, _LONGEST_RETRY_S = 0.5, 8.0
+
+
+@dataclass(slots=True)
+class CameraState:
+    """What has come of a camera so far; ``dropped`` frames never reached the log."""
+
+    frames: int = 0
+    bytes: int = 0
+    dropped: int = 0
+    up: bool = False
+    finished: bool = False
+    lost_ns: int | None = None
+    failure: Exception | None = None
+    opened: threading.Event = field(default_factory=threading.Event)
+    begun: threading.Event = field(default_factory=threading.Event)
+    unsaid: int = 0
+    stamped: bool | None = None
+
+
+class _Arrival(NamedTuple):
+    received_ns: int
+    camera: RigCamera
+    content: Frame | Event
+
+
+class Attached:
+    """Cameras of a rig that send frames now. A context manager; iterate over it once.
+
+    Yields messages in the order of their log times, which strictly increase, and None ten times a second
+    while nothing comes. It ends when all cameras have (files do), or after :meth:`stop`.
+
+    Parameters
+    ----------
+    cameras : each with a source.
+    open_source : opens any of them.
+    clock : the one that all stamps are of.
+    limit_bytes : what may wait in memory; frames beyond that are dropped, counted and named by an event.
+
+    Attributes
+    ----------
+    states : by the name of a camera.
+    received_ns : when the last frames came, by log time.
+
+    Raises
+    ------
+    SourceError
+        On entering, where a camera cannot be opened or sends nothing.
+    """
+
+    def __init__(
+        self, cameras: Sequence[RigCamera], open_source: Open, clock: Clock, limit_bytes: int = _LIMIT_BYTES
+    ) -> None:
+        self.states = {camera.name: CameraState() for camera in cameras}
+        self.received_ns: dict[int, int] = {}
+        self._cameras = list(cameras)
+        self.clock = clock
+        self._open, self._limit_bytes = open_source, limit_bytes
+        self._waiting: deque[_Arrival] = deque()
+        self._waiting_bytes = 0
+        self._last_ns = 0
+        self._fault: BaseException | None = None
+        self._arrived = threading.Condition()
+        self._stopped = threading.Event()
+        self._threads = [
+            threading.Thread(target=self._attend, args=(camera,), name=camera.name, daemon=True)
+            for camera in cameras
+        ]
+
+    def __enter__(self) -> Attached:
+        for thread in self._threads:
+            thread.start()
+        try:
+            for camera in self._cameras:
+                self._wait_for(camera)
+        except BaseException:
+            self._end()
+            raise
+        return self
+
+    def __exit__(
+        self, kind: type[BaseException] | None, error: BaseException | None, trace: TracebackType | None
+    ) -> None:
+        self._end()
+
+    def stop(self) -> None:
+        """Take no more frames; what has come is still given out. A signal handler may call it."""
+        self._stopped.set()
+
+    def __iter__(self) -> Iterator[Message | None]:
+        while True:
+            with self._arrived:
+                if not self._waiting and not self._done():
+                    self._arrived.wait(_TICK_S)
+                if self._fault is not None:
+                    raise self._fault
+                arrivals = list(self._waiting)
+                self._waiting.clear()
+                self._waiting_bytes = 0
+            for arrival in arrivals:
+                yield from self._messages(arrival)
+            if not arrivals:
+                if self._done():
+                    return
+                yield None
+
+    def now_ns(self) -> int:
+        """A log time for what is not of a camera: later than all before."""
+        self._last_ns = max(self.clock.now_ns(), self._last_ns + 1)
+        return self._last_ns
+
+    def _end(self) -> None:
+        self._stopped.set()
+        for thread in self._threads:
+            thread.join()
+
+    def _done(self) -> bool:
+        return self._stopped.is_set() or all(state.finished for state in self.states.values())
+
+    def _wait_for(self, camera: RigCamera) -> None:
+        state = self.states[camera.name]
+        state.opened.wait()
+        begun = state.begun.wait(_FIRST_FRAME_S)
+        if state.failure is not None:
+            raise state.failure
+        if not begun:
+            raise SourceError(
+                f"camera {camera.name}: {camera.source} sends no frames; look whether another program uses it"
+            )
+
+    # --- the threads ----------------------------------------------------------------------------
+
+    def _attend(self, camera: RigCamera) -> None:
+        """Take what a camera sends, for as long as it does, and again when it is back."""
+        state = self.states[camera.name]
+        retry_s = _RETRY_S
+        try:
+            while not self._stopped.is_set():
+                before = state.frames
+                lost = self._take_all(camera, state)
+                if lost is None:
+                    break
+                if not state.begun.is_set():
+                    state.failure = lost
+                    break
+                retry_s = _RETRY_S if state.frames > before else min(2 * retry_s, _LONGEST_RETRY_S)
+                self._stopped.wait(retry_s)
+        except BaseException as fault:  # a bug: whoever takes the messages is to see it
+            self._fault = fault
+        finally:
+            state.up, state.finished = False, True
+            state.opened.set()
+            state.begun.set()
+
+    def _take_all(self, camera: RigCamera, state: CameraState) -> SourceError | None:
+        """Frames until the source has ended (None), or the camera has gone."""
+        try:
+            with self._open(
+                camera, self.clock, lambda text: self._say("camera_setting", text, camera)
+            ) as frames:
+                state.opened.set()
+                for frame in frames:
+                    if self._stopped.is_set():
+                        break
+                    if frame is not None:
+                        self._take(camera, state, frame)
+        except SourceError as error:
+            if state.up:
+                state.up, state.lost_ns = False, self.clock.now_ns()
+                self._say("camera_lost", f"{error}; trying again", camera)
+            return error
+        return None
+
+    def _take(self, camera: RigCamera, state: CameraState, frame: Frame) -> None:
+        now_ns = self.clock.now_ns()
+        if state.lost_ns is not None:
+            gone_s = (now_ns - state.lost_ns) / NS_PER_S
+            state.lost_ns = None
+            self._say("camera_back", f"camera {camera.name} is back after {gone_s:.1f} s", camera)
+        if state.stamped is None and frame.time_ns is None:
+            text = f"camera {camera.name} gives no capture stamps: frames have the time at which they came"
+            self._say("no_capture_stamp", text, camera)
+        state.stamped, state.up = frame.time_ns is not None, True
+        with self._arrived:
+            if self._waiting_bytes + len(frame.data) > self._limit_bytes:
+                state.dropped += 1
+                state.unsaid += 1
+                return
+            state.frames += 1
+            state.bytes += len(frame.data)
+            self._waiting_bytes += len(frame.data)
+            dropped, state.unsaid = state.unsaid, 0
+            if dropped:
+                text = f"{dropped} frames of camera {camera.name} dropped: the disk is too slow"
+                self._waiting.append(_Arrival(now_ns, camera, _event(now_ns, "frames_dropped", text, camera)))
+            self._waiting.append(_Arrival(now_ns, camera, frame))
+            self._arrived.notify()
+        state.begun.set()
+
+    def _say(self, kind: str, text: str, camera: RigCamera) -> None:
+        now_ns = self.clock.now_ns()
+        with self._arrived:
+            self._waiting.append(_Arrival(now_ns, camera, _event(now_ns, kind, text, camera)))
+            self._arrived.notify()
+
+    # --- their messages -------------------------------------------------------------------------
+
+    def _messages(self, arrival: _Arrival) -> Iterator[Message]:
+        log_time_ns = self.now_ns()
+        camera, content = arrival.camera, arrival.content
+        if isinstance(content, Event):
+            yield Message(EVENTS_TOPIC, log_time_ns, content.timestamp, content)
+            return
+        time_ns = log_time_ns if content.time_ns is None else instant_ns(content.time_ns, camera)
+        payload = CompressedImage(time_ns, camera.name, content.data, content.format)
+        self.received_ns[log_time_ns] = arrival.received_ns
+        if len(self.received_ns) > _REMEMBERED:
+            del self.received_ns[next(iter(self.received_ns))]
+        yield Message(image_topic(camera.name), log_time_ns, time_ns, payload, camera.name)
+
+
+def _event(time_ns: int, kind: str, text: str, camera: RigCamera) -> Event:
+    return Event(time_ns, kind, text, camera.name)

@@ -2,16 +2,19 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Iterable, Iterator, Mapping
+from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
 from dataclasses import dataclass
+from pathlib import Path
 
 import numpy as np
 from numpy.typing import NDArray
 
+from ipsys_log.errors import IpsysError
+from ipsys_log.log.session import Session
 from ipsys_log.messages import LATENCY_TOPIC, Latency, Message, Tracks
 from ipsys_log.units import NS_PER_S
 
-__all__ = ["STEPS", "Ledger", "Percentiles", "latency_percentiles", "step_times_s"]
+__all__ = ["STEPS", "Ledger", "Percentiles", "latency_percentiles", "recorded_latencies", "step_times_s"]
 
 STEPS = ("captured", "received", "detected", "located", "fused", "published")
 _REMEMBERED = 1000
@@ -55,6 +58,21 @@ class Ledger:
             self._now_ns(),
         )
         return Message(LATENCY_TOPIC, message.log_time_ns, message.publish_time_ns, latency, message.camera)
+
+
+def recorded_latencies(paths: Sequence[Path]) -> list[Latency]:
+    """The ledger in a log.
+
+    Raises
+    ------
+    IpsysError
+        Where there is none.
+    """
+    with Session(paths) as session:
+        found: list[Latency] = session.payloads(session.topics(Latency))
+        if not found:
+            raise IpsysError(f"{session}: holds no latencies; only 'ipsys live' writes them")
+    return found
 
 
 def step_times_s(entries: Iterable[Latency]) -> dict[str, NDArray[np.float64]]:

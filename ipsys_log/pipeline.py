@@ -39,8 +39,8 @@ import cv2
 from threadpoolctl import threadpool_limits
 
 from ipsys_log.latency import Ledger
-from ipsys_log.log.session import Session, run_of_topic
-from ipsys_log.lookup import wanted_models
+from ipsys_log.log.session import Session
+from ipsys_log.lookup import fitted_in, wanted_models
 from ipsys_log.messages import (
     CameraCalibration,
     CameraPoints,
@@ -62,7 +62,7 @@ from ipsys_log.request import Progress, Request
 from ipsys_log.runs import Outcome
 from ipsys_log.sources.attached import Attached
 from ipsys_log.stages import camera_frame, detect, fuse, locate
-from ipsys_log.tasks import STAGES, Task, plan_stage
+from ipsys_log.tasks import STAGES, Task, model_run, plan_stage
 
 __all__ = ["TOPICS", "Stage", "carry_out", "in_threads", "live", "record", "replay", "run"]
 
@@ -265,35 +265,40 @@ def live(
 
     Parameters
     ----------
-    settings : written first: rig, lenses and, for locate, the model in a run of its own.
-    request : corners and method; the model comes with the settings.
-    until : detect, or fuse.
-    watch : is shown what the stages make.
+    settings : written first: rig and lenses.
+    request : corners, method and, for fuse, ``model_from``.
+    until : detect or fuse.
+    watch : is shown every frame that the stages have seen, and what they make of it.
 
     Returns
     -------
     One outcome for each stage, as of :func:`replay`.
+
+    Raises
+    ------
+    IpsysError
+        Where the other log has no such model, or the log cannot be written; what it holds is kept.
     """
     request = replace(request, corners=request.corners or _usual_corners(cameras, settings))
-    runs, stages = _live_stages(settings, request, until)
+    models = [_copied_model(request, cameras.now_ns())] if until == "fuse" else []
+    runs, stages = _live_stages(request, models)
     with recording(target) as log, threadpool_limits(1, user_api="blas"):
-        for message in settings:
+        for message in (*settings, *models):
             log.put(message)
         ledger = Ledger(cameras.clock.now_ns, cameras.received_ns)
         with Backlog(cameras, log, cameras.now_ns, cameras.stop) as frames:
-            told = (message for message in settings if not isinstance(message.payload, Model))
-            made = run(chain(told, frames), stages[:1], in_threads)
-            made = ledger.note("detected", Markers, made)
+            made = ledger.note("detected", Markers, run(chain(settings, frames), stages[:1], in_threads))
             made = ledger.note("located", Positions, run(made, stages[1:3]))
             made = ledger.note("fused", Tracks, run(made, stages[3:]))
             for message in made:
+                watch(message)
                 if type(message.payload) in TOPICS:
                     log.put(message)
-                    watch(message)
                     entry = ledger.entry(message)
                     if entry is not None:
                         log.put(entry)
-    return sign(target, replace(request, as_live=bool(frames.skipped)), runs)
+    models_used = tuple(message.payload.name for message in models)
+    return sign(target, replace(request, models=models_used, as_live=bool(frames.skipped)), runs)
 
 
 def _usual_corners(cameras: Attached, settings: Sequence[Message]) -> str:
@@ -301,21 +306,26 @@ def _usual_corners(cameras: Attached, settings: Sequence[Message]) -> str:
     return detect.EDGES if lenses >= cameras.states.keys() else detect.STOCK
 
 
-def _live_stages(
-    settings: Sequence[Message], request: Request, until: str
-) -> tuple[dict[str, str], list[Stage]]:
-    """The causal stages up to one, and the run that each stage of a replay would write to."""
+def _copied_model(request: Request, time_ns: int) -> Message:
+    """The model of another log, as a run of this one."""
+    assert request.model_from is not None
+    (name,) = wanted_models(request, "fuse")
+    with Session([request.model_from]) as other:
+        model, _ = fitted_in(other, name)
+    return Message(TOPICS[Model].format(run=model_run(name)), time_ns, model.timestamp, model)
+
+
+def _live_stages(request: Request, models: Sequence[Message]) -> tuple[dict[str, str], list[Stage]]:
+    """The run that each stage of a replay would write to, and the causal ones of these stages."""
     corners = str(request.corners)
-    stages = [Stage(corners, detect.READS, detect.Detect(corners))]
-    runs = {"detect": corners}
-    if until == "detect":
-        return runs, stages
-    points = corners if request.method == camera_frame.PERIMETER else f"{corners}_{request.method}"
-    (model,) = (message for message in settings if isinstance(message.payload, Model))
-    name = run_of_topic(model.topic) or ""
-    stages += [
-        Stage(points, camera_frame.READS, camera_frame.CameraFrame(request.method)),
-        Stage(name, locate.READS, locate.Locate(model.payload)),
-        Stage(name, fuse.READS, fuse.Fuse(name), per_camera=False),
-    ]
-    return {**runs, "camera-frame": points, "fit": name, "locate": name, "fuse": name}, stages
+    runs, stages = {"detect": corners}, [Stage(corners, detect.READS, detect.Detect(corners))]
+    for message in models:
+        points = corners if request.method == camera_frame.PERIMETER else f"{corners}_{request.method}"
+        name = model_run(message.payload.name)
+        runs |= {"camera-frame": points, "fit": name, "locate": name, "fuse": name}
+        stages += [
+            Stage(points, camera_frame.READS, camera_frame.CameraFrame(request.method)),
+            Stage(name, locate.READS, locate.Locate(message.payload)),
+            Stage(name, fuse.READS, fuse.Fuse(name), per_camera=False),
+        ]
+    return runs, stages

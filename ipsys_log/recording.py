@@ -5,18 +5,28 @@ from __future__ import annotations
 import os
 import threading
 from collections import Counter, deque
-from collections.abc import Callable, Iterable, Iterator
+from collections.abc import Callable, Iterable, Iterator, Mapping
 from contextlib import contextmanager, suppress
+from dataclasses import replace
 from pathlib import Path
 from types import TracebackType
 
 from ipsys_log.errors import IpsysError, LogError, WriteError
 from ipsys_log.log import LogReader, LogWriter, Schema
 from ipsys_log.log.codec import encode, schema_data, schema_name
-from ipsys_log.messages import EVENTS_TOPIC, FRAME_SKIPPED, Event, Message
+from ipsys_log.messages import (
+    EVENTS_TOPIC,
+    FRAME_SKIPPED,
+    RIG_TOPIC,
+    CameraCalibration,
+    Event,
+    Message,
+    Rig,
+    calibration_topic,
+)
 from ipsys_log.units import NS_PER_S, format_bytes
 
-__all__ = ["TICK", "Backlog", "Recording", "recording"]
+__all__ = ["TICK", "Backlog", "Recording", "first_messages", "recording"]
 
 # Between two messages of a source: nothing more has come so far. It is not in the log.
 TICK = Message("", 0, 0, None)
@@ -114,6 +124,19 @@ def _what_fitted(path: Path, error: WriteError) -> str:
         f"{path}: the disk takes no more; recording has stopped, and the log is complete with what fitted: "
         f"{count} messages, {seconds:.1f} s, {size}. Free some space, or record to another disk"
     )
+
+
+def first_messages(
+    rig: Rig, lenses: Mapping[str, CameraCalibration], now_ns: Callable[[], int]
+) -> list[Message]:
+    """What a log begins with: the rig, and the lenses by camera."""
+    time_ns = now_ns()
+    found = [Message(RIG_TOPIC, time_ns, time_ns, rig)]
+    for camera, lens in sorted(lenses.items()):
+        time_ns = now_ns()
+        stamped = replace(lens, timestamp=time_ns)
+        found.append(Message(calibration_topic(camera), time_ns, time_ns, stamped, camera))
+    return found
 
 
 class Backlog:

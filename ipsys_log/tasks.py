@@ -50,7 +50,7 @@ from ipsys_log.request import Request
 from ipsys_log.runs import newest_run, read_channels
 from ipsys_log.stages import camera_frame, detect, fuse, locate
 
-__all__ = ["STAGES", "Task", "plan_stage"]
+__all__ = ["STAGES", "Task", "model_run", "plan_stage"]
 
 
 @dataclass(frozen=True, slots=True)
@@ -196,7 +196,7 @@ def _held_lenses(session: Session, other: Mapping[str, CameraCalibration]) -> li
 
 
 def _fit(session: Session, request: Request, points: str, model: str) -> Task | str:
-    base = model.replace("+", "_").replace("-", "_")
+    base = model_run(model)
     if request.model_from is not None:
         return _copy_model(request, model, base)
     if (copied := copied_run(session, model)) is not None:
@@ -225,6 +225,11 @@ def _fit(session: Session, request: Request, points: str, model: str) -> Task | 
     return Task(
         "fit", base, tuple(topics), (Model,), compute=compute, parameters=parameters, rig=rig, notes=notes
     )
+
+
+def model_run(model: str) -> str:
+    """What the run of a model is called, unless that is taken."""
+    return model.replace("+", "_").replace("-", "_")
 
 
 def _copy_model(request: Request, name: str, base: str) -> Task:

@@ -75,6 +75,15 @@ OPTIONS: dict[str, tuple[Any, Any]] = {
         Annotated[_Path, typer.Option("--output", "-o", help="Write the results to a new log instead.")],
         None,
     ),
+    "as_live": (
+        Annotated[
+            bool,
+            typer.Option(
+                "--as-live", help="Pass over the frames that were skipped when the log was recorded."
+            ),
+        ],
+        False,
+    ),
     "skip_ambiguous": (
         Annotated[
             bool,
@@ -89,7 +98,18 @@ OPTIONS: dict[str, tuple[Any, Any]] = {
     ),
     "as_json": (AsJson, False),
 }
-_FRAMES = ("logs", "rig", "calibration", "corners", "method", "run", "output", "skip_ambiguous", "as_json")
+_FRAMES = (
+    "logs",
+    "rig",
+    "calibration",
+    "corners",
+    "method",
+    "run",
+    "output",
+    "as_live",
+    "skip_ambiguous",
+    "as_json",
+)
 _DETECT = tuple(name for name in _FRAMES if name != "method")
 _MODELS = tuple(name for name in OPTIONS if name not in ("plot", "plots"))
 EVALUATE = (*_MODELS, "plots")

@@ -9,7 +9,7 @@ from typing import TYPE_CHECKING, Annotated, Optional
 import typer
 
 if TYPE_CHECKING:
-    from ipsys_log.messages import CameraCalibration
+    from ipsys_log.messages import CameraCalibration, Rig, RigCamera
 
 __all__ = [
     "AsJson",
@@ -21,6 +21,7 @@ __all__ = [
     "RigFile",
     "cameras_of",
     "load_calibrations",
+    "load_lab",
 ]
 
 Logs = Annotated[
@@ -91,6 +92,49 @@ def load_calibrations(
                 raise IpsysError(f"--calibration: two cameras of one name, {name!r}")
         lenses.update(found)
     return lenses
+
+
+def load_lab(
+    rig: Path, calibration: list[str] | None, only: Collection[str]
+) -> tuple[Rig, list[RigCamera], dict[str, CameraCalibration]]:
+    """The rig of a file, its cameras that have a source (or ``only`` some), and their lenses.
+
+    A lens is what ``calibration`` says, else the file that the rig names, beside the rig file.
+
+    Raises
+    ------
+    IpsysError
+        Where the rig has no such camera, or none with a source.
+    """
+    from ipsys_log.errors import IpsysError
+    from ipsys_log.formats.opencv_yaml import read_opencv_calibration
+    from ipsys_log.rig import load_rig
+
+    lab = load_rig(rig)
+    known = {camera.name: camera for camera in lab.cameras}
+    for name in only:
+        if name not in known:
+            raise IpsysError(
+                f"--camera {name}: {rig} has no such camera (it has {', '.join(known) or 'none'})"
+            )
+    cameras = [one for one in lab.cameras if (one.name in only if only else one.source)]
+    for camera in cameras:
+        if camera.source is None:
+            raise IpsysError(f'{rig}: camera {camera.name} has no source, such as source = "usb:/dev/video0"')
+    if not cameras:
+        raise IpsysError(
+            f'{rig}: no camera has a source; give each one, such as source = "usb:/dev/video0" '
+            "(see 'ipsys cameras')"
+        )
+    names = [camera.name for camera in cameras]
+    lenses = load_calibrations(calibration, lambda: names)
+    for camera in cameras:
+        if camera.name not in lenses and camera.calibration is not None:
+            lenses[camera.name] = read_opencv_calibration(rig.parent / camera.calibration, camera.name)
+    strange = sorted(set(lenses) - set(names))
+    if strange:
+        raise IpsysError(f"--calibration {strange[0]}: no such camera is recorded (only {', '.join(names)})")
+    return lab, cameras, lenses
 
 
 def cameras_of(logs: list[Path]) -> set[str]:

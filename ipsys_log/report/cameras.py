@@ -2,34 +2,119 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping, Sequence
+import shutil
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import asdict
+from math import degrees
+from pathlib import Path
 from typing import Any
 
+from rich.console import Group
 from rich.table import Table
 from rich.text import Text
 
 from ipsys_log.compare import Comparison
 from ipsys_log.latency import Percentiles
-from ipsys_log.monitor import Look
+from ipsys_log.messages import CompressedImage, Message, Track, Tracks
+from ipsys_log.monitor import Look, Monitor
 from ipsys_log.sources.attached import CameraState
-from ipsys_log.units import CM_PER_M
+from ipsys_log.units import CM_PER_M, NS_PER_S, format_bytes
 
-__all__ = ["CameraRates", "cameras_table", "comparison_json", "comparison_table", "latency_table"]
+__all__ = [
+    "LiveStatus",
+    "cameras_table",
+    "comparison_json",
+    "comparison_table",
+    "latency_table",
+    "robots_table",
+]
 
 
-class CameraRates:
-    """Rates of cameras between one look at their counts and the next."""
+class LiveStatus:
+    """What is shown on the screen while cameras send.
 
-    def __init__(self) -> None:
+    Parameters
+    ----------
+    states, monitor : of the cameras.
+    target : the log that is written.
+    now_s : a clock for rates.
+    """
+
+    def __init__(
+        self,
+        states: Mapping[str, CameraState],
+        monitor: Monitor,
+        target: Path,
+        now_s: Callable[[], float],
+    ) -> None:
+        self._states, self._monitor, self._target, self._now_s = states, monitor, target, now_s
+        self._begin_s = now_s()
         self._before: dict[str, tuple[float, int, int]] = {}
+        self._rates: dict[str, tuple[float, float]] = {}
+        self._delays_s: dict[str, float] = {}
+        self._tracks: dict[str, Track] = {}
 
-    def __call__(self, name: str, state: CameraState, now_s: float) -> tuple[float, float]:
-        """Frames and MB per second since the last call."""
-        then_s, frames, size = self._before.get(name, (now_s, state.frames, state.bytes))
+    def __call__(self, message: Message | None) -> None:
+        """Be shown a message on its way."""
+        self._monitor(message)
+        if message is None:
+            return
+        if isinstance(message.payload, CompressedImage):
+            self._delays_s[str(message.camera)] = (message.log_time_ns - message.publish_time_ns) / NS_PER_S
+        elif isinstance(message.payload, Tracks):
+            self._tracks.update({track.robot: track for track in message.payload.tracks})
+
+    def show(self) -> Group:
+        """Cameras, robots, the disk, and what is wrong with a camera."""
+        now_s = self._now_s()
+        for name, state in self._states.items():
+            self._rates[name] = self._rate(name, state, now_s)
+        parts: list[Table | str] = [
+            cameras_table(self._states, self._monitor.looks, self._rates, self._delays_s)
+        ]
+        if self._tracks:
+            parts.append(robots_table(self._tracks))
+        parts += self._warnings()
+        size = self._target.stat().st_size if self._target.exists() else 0
+        free = shutil.disk_usage(self._target.absolute().parent).free
+        parts.append(
+            f"{now_s - self._begin_s:.0f} s, {format_bytes(size)}; {format_bytes(free)} left on the disk"
+        )
+        return Group(*parts)
+
+    def summary(self) -> list[str]:
+        """What was recorded, when it is over."""
+        took_s = self._now_s() - self._begin_s
+        lines = [f"{self._target} written: {took_s:.1f} s, {format_bytes(self._target.stat().st_size)}"]
+        for name, state in self._states.items():
+            dropped = f", {state.dropped} dropped: the disk is too slow" if state.dropped else ""
+            lines.append(f"camera {name}: {state.frames} frames{dropped}")
+        return lines + self._warnings()
+
+    def _rate(self, name: str, state: CameraState, now_s: float) -> tuple[float, float]:
+        then_s, frames, size = self._before.get(name, (self._begin_s, 0, 0))
         self._before[name] = now_s, state.frames, state.bytes
         took_s = max(now_s - then_s, 1e-9)
         return (state.frames - frames) / took_s, (state.bytes - size) / took_s / 1e6
+
+    def _warnings(self) -> list[str]:
+        return [
+            f"camera {name}: {text}"
+            for name, look in sorted(self._monitor.looks.items())
+            for text in look.warnings
+        ]
+
+
+def robots_table(tracks: Mapping[str, Track]) -> Table:
+    """Where the robots are."""
+    table = Table(box=None, pad_edge=False)
+    for heading in ("robot", "x cm", "y cm", "z cm", "heading", "cameras"):
+        table.add_column(heading, justify="left" if heading in ("robot", "cameras") else "right")
+    for name, track in sorted(tracks.items()):
+        heading = "-" if track.heading_rad is None else f"{degrees(track.heading_rad):.0f} deg"
+        at_cm = (f"{CM_PER_M * value:.1f}" for value in (track.x_m, track.y_m, track.z_m))
+        table.add_row(name, *at_cm, heading, ", ".join(track.cameras))
+    return table
 
 
 def cameras_table(

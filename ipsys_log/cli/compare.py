@@ -1,0 +1,108 @@
+"""Is it the same, and how fast was it: ``ipsys verify``, ``ipsys diff``, ``ipsys latency``."""
+
+from __future__ import annotations
+
+import json
+from pathlib import Path
+from typing import Annotated, Optional
+
+import typer
+
+from ipsys_log.cli.console import console, progress_bar
+from ipsys_log.cli.options import AsJson, Logs
+
+__all__ = ["add_commands"]
+
+_Run = Optional[str]  # noqa: UP045
+
+
+def add_commands(app: typer.Typer) -> None:
+    app.command()(verify)
+    app.command()(diff)
+    app.command()(latency)
+
+
+def verify(
+    logs: Logs,
+    run: Annotated[_Run, typer.Option("--run", help="Only this run.")] = None,
+    as_json: AsJson = False,
+) -> None:
+    """Make every run of a log again from what it read, and compare each channel byte for byte.
+
+    Frames that were skipped when the log was recorded live are passed over. Ends with 1 where anything differs."""
+    from ipsys_log.report.cameras import comparison_json, comparison_table
+    from ipsys_log.verify import verify as verify_runs
+
+    with progress_bar() as progress:
+        found = verify_runs(logs, run, progress)
+    if as_json:
+        print(json.dumps(comparison_json(found), indent=2))  # noqa: T201
+    else:
+        console.print(comparison_table(found))
+        console.print(_verdict(all(one.equal for one in found), "replay equals the log", "replay differs"))
+    _end(all(one.equal for one in found))
+
+
+def diff(
+    first: Annotated[Path, typer.Argument(help="A log.")],
+    second: Annotated[Path, typer.Argument(help="The log to compare with; may be the same one.")],
+    run: Annotated[
+        Optional[list[str]],  # noqa: UP045
+        typer.Option("--run", help="The run of both logs; or twice: that of the first, that of the second."),
+    ] = None,
+    as_json: AsJson = False,
+) -> None:
+    """Compare the runs of two logs, or two runs of one, channel by channel: where they differ, by how much.
+
+    Ends with 1 where anything differs."""
+    from ipsys_log.errors import IpsysError
+    from ipsys_log.report.cameras import comparison_json, comparison_table
+    from ipsys_log.verify import diff as compare
+
+    names: list[str | None] = list(run) if run else [None]
+    if len(names) > 2:
+        raise IpsysError("--run: name one run, or one of each log")
+    found = compare(first, second, (names[0], names[-1]))
+    if as_json:
+        print(json.dumps(comparison_json(found), indent=2))  # noqa: T201
+    else:
+        console.print(comparison_table(found))
+        console.print(_verdict(all(one.equal for one in found), "no difference", "they differ"))
+    _end(all(one.equal for one in found))
+
+
+def latency(
+    logs: Logs,
+    plot: Annotated[
+        Optional[Path],  # noqa: UP045
+        typer.Option(help="Draw the steps into a PNG."),
+    ] = None,
+    as_json: AsJson = False,
+) -> None:
+    """How long each step took when a log was recorded live, from the frame to its position."""
+    from dataclasses import asdict
+
+    from ipsys_log.latency import latency_percentiles, recorded_latencies, step_times_s
+    from ipsys_log.report.cameras import latency_table
+
+    times_s = step_times_s(recorded_latencies(logs))
+    steps = latency_percentiles(times_s)
+    if plot is not None:
+        from ipsys_log.report.files import check_file
+        from ipsys_log.report.latency_figure import draw_latency
+
+        check_file(plot, "--plot", logs)
+        draw_latency(times_s, plot)
+    if as_json:
+        print(json.dumps({step: asdict(found) for step, found in steps.items()}, indent=2))  # noqa: T201
+    else:
+        console.print(latency_table(steps))
+
+
+def _verdict(equal: bool, yes: str, no: str) -> str:
+    return f"[green]{yes}[/green]" if equal else f"[red]{no}[/red]"
+
+
+def _end(equal: bool) -> None:
+    if not equal:
+        raise typer.Exit(1)

@@ -103,7 +103,8 @@ def clocks(source: str) -> set[str]:
 
 def test_nothing_but_a_source_reads_a_clock() -> None:
     """Law 2: a stage that read a clock would not replay. The simulator has a clock of its own."""
-    assert {name: clocks(path.read_text()) for name, path in modules() if clocks(path.read_text())} == {}
+    reading = {name for name, path in modules() if clocks(path.read_text())}
+    assert reading <= {"sources.frames"}
 
 
 def test_the_guard_sees_a_clock() -> None:

@@ -8,7 +8,7 @@ from __future__ import annotations
 
 import socket
 from collections.abc import Iterator
-from contextlib import contextmanager
+from contextlib import contextmanager, suppress
 from queue import Empty, Full, Queue
 from threading import Event, Thread
 from typing import TYPE_CHECKING
@@ -119,8 +119,10 @@ def _frames(camera: RigCamera, clock: Clock, say: Say) -> Iterator[Frame]:
             rate_hz = float(stream.average_rate) if stream.average_rate else None
             say_refused(camera, Given(codec.width, codec.height, rate_hz), say)
             stamps = Stamps(camera.name, clock, say, _PATIENCE if container.format.name == "rtsp" else 1)
-            for packet in pass_through(container, stream):
-                yield Frame(bytes(packet), name_format(stream), stamps.of(packet))
+            # A stream that stops within a packet has ended.
+            with suppress(av.error.InvalidDataError):
+                for packet in pass_through(container, stream):
+                    yield Frame(bytes(packet), name_format(stream), stamps.of(packet))
     except av.error.FFmpegError as error:
         raise SourceError(f"{where}: {_explain(error)}") from error
 

@@ -17,12 +17,8 @@ __all__ = ["find_video", "name_format", "pass_through"]
 
 # FFmpeg's name of a codec, and that in the log.
 _FORMATS = {"mjpeg": "jpeg", "h264": "h264", "hevc": "h265"}
-# A start code and the type of unit: the sequence's parameters, at any priority; in H.265 the video's.
-_PARAMETERS = {
-    "h264": re.compile(rb"\x00\x00\x01[\x07\x27\x47\x67]"),
-    "hevc": re.compile(rb"\x00\x00\x01[\x40\x41]"),
-}
-_HEAD = 64  # bytes
+# The head of a unit of Annex B: the start code, and the byte that holds its type.
+_UNIT = re.compile(rb"\x00\x00\x01(.)", re.DOTALL)
 # Containers of one picture, as a camera's snapshot address gives it.
 _SINGLE = ("image2", "jpeg_pipe", "png_pipe")
 
@@ -86,5 +82,12 @@ def pass_through(container: InputContainer, stream: VideoStream) -> Iterator[Pac
 
 
 def _has_parameters(packet: Packet[VideoStream]) -> bool:
-    """Whether the parameter sets stand at the head of an Annex B packet."""
-    return _PARAMETERS[packet.stream.codec_context.name].search(bytes(packet)[:_HEAD]) is not None
+    """Whether an Annex B packet has the parameter sets before its picture."""
+    wide = packet.stream.codec_context.name == "hevc"
+    for match in _UNIT.finditer(memoryview(packet)):
+        kind = match[1][0] >> 1 & 0x3F if wide else match[1][0] & 0x1F
+        if kind == (33 if wide else 7):  # the sequence's parameters
+            return True
+        if kind < 32 if wide else kind <= 5:  # a piece of the picture
+            return False
+    return False

@@ -29,7 +29,7 @@ def verify(
 ) -> None:
     """Make every run of a log again from what it read, and compare each channel byte for byte.
 
-    Frames that were skipped when the log was recorded live are passed over. Ends with 1 where anything differs."""
+    Frames that were skipped live are passed over. Ends with 1 where anything differs."""
     from ipsys_log.report.cameras import comparison_json, comparison_table
     from ipsys_log.verify import verify as verify_runs
 

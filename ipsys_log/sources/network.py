@@ -1,0 +1,173 @@
+"""Cameras on the network: RTSP, MJPEG over HTTP, and whatever else FFmpeg opens by an address.
+
+Packets are handed on as they came, never decoded: JPEG pictures, or H.264 and H.265 as Annex B with the
+parameter sets before each keyframe, which is what ``foxglove.CompressedVideo`` asks for.
+"""
+
+from __future__ import annotations
+
+import socket
+from collections.abc import Iterator
+from contextlib import contextmanager, suppress
+from queue import Empty, Full, Queue
+from threading import Event, Thread
+from typing import TYPE_CHECKING
+from urllib.parse import urlsplit, urlunsplit
+
+from ipsys_log.messages import RigCamera
+from ipsys_log.sources.asked import Given, say_refused
+from ipsys_log.sources.frames import Clock, Frame, Say, SourceError
+from ipsys_log.sources.packets import find_video, name_format, pass_through
+from ipsys_log.sources.stamps import Stamps
+
+if TYPE_CHECKING:
+    from av.container import InputContainer
+
+__all__ = ["hide_password", "open_network"]
+
+# A stream that is silent for so long has gone.
+_SILENT_S = 5.0
+_TURN_S = 0.4
+# Frames between FFmpeg's thread and ours; what is behind them waits in the socket.
+_WAITING = 4
+# RTSP's first report of the camera's clock comes within 5 s or so: at 30 frames/s, in time.
+_PATIENCE = 300
+_OPTIONS = {
+    "rtsp_flags": "prefer_tcp",
+    # What was read to find out what the stream is would come late, and in one go.
+    "fflags": "nobuffer",
+    "analyzeduration": "1000000",
+}
+
+# Frames, what went wrong, or None at the end of the stream.
+_Queue = Queue[Frame | SourceError | None]
+
+
+@contextmanager
+def open_network(camera: RigCamera, clock: Clock, say: Say) -> Iterator[Iterator[Frame | None]]:
+    """The frames of a stream, as :data:`~ipsys_log.sources.frames.Open` says.
+
+    A read of FFmpeg's cannot be broken off, so a thread of its own reads; on leaving it is left to
+    itself, and ends with what it waits for, after 5 s at the latest. The address is opened there too:
+    a :class:`~ipsys_log.sources.frames.SourceError` comes from the iterator.
+
+    Parameters
+    ----------
+    camera : its ``source`` is the address.
+    clock : to tell by how much the camera's own clock is off.
+    say : told what the stream does not give.
+    """
+    queue: _Queue = Queue(_WAITING)
+    stop = Event()
+    reader = Thread(target=_read, args=(camera, clock, say, queue, stop), name=camera.name, daemon=True)
+    reader.start()
+    try:
+        yield _take(queue)
+    finally:
+        stop.set()
+
+
+def _take(queue: _Queue) -> Iterator[Frame | None]:
+    while True:
+        try:
+            item = queue.get(timeout=_TURN_S)
+        except Empty:
+            yield None
+            continue
+        if item is None:
+            return
+        if isinstance(item, SourceError):
+            raise item
+        yield item
+
+
+def _read(camera: RigCamera, clock: Clock, say: Say, queue: _Queue, stop: Event) -> None:
+    last: SourceError | None = None
+    try:
+        for frame in _frames(camera, clock, say):
+            if not _put(queue, frame, stop):
+                return
+    except SourceError as error:
+        last = error
+    except Exception as error:
+        last = SourceError(f"camera {camera.name}: the program failed while it read ({error!r})")
+        raise
+    finally:
+        _put(queue, last, stop)
+
+
+def _put(queue: _Queue, item: Frame | SourceError | None, stop: Event) -> bool:
+    """Whether it was wanted."""
+    while not stop.is_set():
+        try:
+            queue.put(item, timeout=_TURN_S)
+        except Full:
+            continue
+        return True
+    return False
+
+
+def _frames(camera: RigCamera, clock: Clock, say: Say) -> Iterator[Frame]:
+    """Frames until the stream ends, from :func:`_read`'s thread."""
+    import av
+
+    where = f"camera {camera.name}: {hide_password(camera.source or '')}"
+    try:
+        with _open(camera.source or "", where) as container:
+            stream = find_video(container, where)
+            codec = stream.codec_context
+            rate_hz = float(stream.average_rate) if stream.average_rate else None
+            say_refused(camera, Given(codec.width, codec.height, rate_hz), say)
+            stamps = Stamps(camera.name, clock, say, _PATIENCE if container.format.name == "rtsp" else 1)
+            # A stream that stops within a packet has ended.
+            with suppress(av.error.InvalidDataError):
+                for packet in pass_through(container, stream):
+                    yield Frame(bytes(packet), name_format(stream), stamps.of(packet))
+    except av.error.FFmpegError as error:
+        raise SourceError(f"{where}: {_explain(error)}") from error
+
+
+def _open(address: str, where: str) -> InputContainer:
+    import av
+
+    host = urlsplit(address).hostname
+    try:
+        socket.getaddrinfo(host, None)
+    except OSError as error:
+        raise SourceError(f"{where}: there is no host {host!r}; check the address") from error
+    return av.open(address, options=dict(_OPTIONS), timeout=_SILENT_S)
+
+
+def _explain(error: Exception) -> str:
+    """What an error of FFmpeg's means for the user, and what to do."""
+    import av
+
+    known = {
+        av.error.ConnectionRefusedError: "refuses the connection; is the camera on, and the port right?",
+        av.error.HTTPNotFoundError: "the camera has no such path; look it up in the camera's manual",
+        av.error.HTTPUnauthorizedError: "asks for a password; write user:password@ before the host",
+        av.error.HTTPForbiddenError: "the camera forbids it; give the user the right to see the stream",
+        av.error.InvalidDataError: "is not video; give the address of the stream, not of a web page",
+        av.error.ExitError: f"nothing came for {_SILENT_S:g} s; is the camera on, and the network up?",
+        av.error.TimeoutError: "does not answer; is the camera on, and the network up?",
+        av.error.ProtocolNotFoundError: "is of a protocol that FFmpeg does not know; use rtsp:// or http://",
+    }
+    for kind, text in known.items():
+        if isinstance(error, kind):
+            return text
+    return f"cannot be read ({getattr(error, 'strerror', None) or error}); try the address in another player"
+
+
+def hide_password(address: str) -> str:
+    """An address as it may be shown.
+
+    Examples
+    --------
+    >>> hide_password("rtsp://admin:secret@10.0.0.7:554/live")
+    'rtsp://admin:***@10.0.0.7:554/live'
+    """
+    parts = urlsplit(address)
+    user, at, host = parts.netloc.rpartition("@")
+    if ":" not in user:
+        return address
+    return urlunsplit(parts._replace(netloc=f"{user.partition(':')[0]}:***{at}{host}"))

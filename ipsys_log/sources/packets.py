@@ -1,0 +1,93 @@
+"""Packets of a video as they are in its container, made fit to stand in a log each by itself."""
+
+from __future__ import annotations
+
+import re
+from collections.abc import Iterator
+from typing import TYPE_CHECKING
+
+from ipsys_log.sources.frames import SourceError
+
+if TYPE_CHECKING:
+    from av.container import InputContainer
+    from av.packet import Packet
+    from av.video.stream import VideoStream
+
+__all__ = ["find_video", "name_format", "pass_through"]
+
+# FFmpeg's name of a codec, and that in the log.
+_FORMATS = {"mjpeg": "jpeg", "h264": "h264", "hevc": "h265"}
+# The head of a unit of Annex B: the start code, and the byte that holds its type.
+_UNIT = re.compile(rb"\x00\x00\x01(.)", re.DOTALL)
+# Containers of one picture, as a camera's snapshot address gives it.
+_SINGLE = ("image2", "jpeg_pipe", "png_pipe")
+
+
+def find_video(container: InputContainer, where: str) -> VideoStream:
+    """The video in a container.
+
+    Parameters
+    ----------
+    container : as PyAV opened it.
+    where : what the error begins with.
+
+    Raises
+    ------
+    SourceError
+        Where there is none, or one of a codec that no log holds.
+    """
+    if not container.streams.video:
+        raise SourceError(f"{where}: is not video; give the address of the camera's picture stream")
+    stream = container.streams.video[0]
+    if container.format.name in _SINGLE:
+        raise SourceError(f"{where}: is a single picture; give the address of the camera's stream")
+    if stream.codec_context.name not in _FORMATS:
+        raise SourceError(
+            f"{where}: is {stream.codec_context.name} video; set the camera to MJPEG, H.264 or H.265"
+        )
+    return stream
+
+
+def name_format(stream: VideoStream) -> str:
+    """``jpeg``, ``h264`` or ``h265``."""
+    return _FORMATS[stream.codec_context.name]
+
+
+def pass_through(container: InputContainer, stream: VideoStream) -> Iterator[Packet[VideoStream]]:
+    """Packets of a stream, from the first keyframe on; H.264 and H.265 as Annex B.
+
+    Each keyframe has the parameter sets before it, so that a reader can begin there.
+    """
+    from av.bitstream import BitStreamFilterContext
+
+    name = stream.codec_context.name
+    if name == "mjpeg":
+        # The last packet of PyAV's is an empty one.
+        yield from (packet for packet in container.demux(stream) if packet.size)
+        return
+    packed = (stream.codec_context.extradata or b"")[:1] == b"\x01"  # avcC and hvcC; Annex B begins with 0
+    unpack = BitStreamFilterContext(f"{name}_mp4toannexb", stream) if packed else None
+    repeat = BitStreamFilterContext("dump_extra=freq=keyframe", stream)
+    begun = False
+    for packet in container.demux(stream):
+        begun = begun or packet.is_keyframe
+        if not begun or not packet.size:
+            continue
+        if unpack:
+            yield from unpack.filter(packet)
+        elif packet.is_keyframe and not _has_parameters(packet):
+            yield from repeat.filter(packet)
+        else:
+            yield packet
+
+
+def _has_parameters(packet: Packet[VideoStream]) -> bool:
+    """Whether an Annex B packet has the parameter sets before its picture."""
+    wide = packet.stream.codec_context.name == "hevc"
+    for match in _UNIT.finditer(memoryview(packet)):
+        kind = match[1][0] >> 1 & 0x3F if wide else match[1][0] & 0x1F
+        if kind == (33 if wide else 7):  # the sequence's parameters
+            return True
+        if kind < 32 if wide else kind <= 5:  # a piece of the picture
+            return False
+    return False

@@ -21,7 +21,8 @@ Array = NDArray[np.float64]
 
 @dataclass(frozen=True, slots=True)
 class Comparison:
-    """Of one channel: messages on both sides, how many are the same byte for byte, the first that is not.
+    """Of one channel: messages on both sides, how many of them speak of one frame, how many of these are the
+    same byte for byte, and the first that is not.
 
     ``rms`` and ``greatest`` are distances between what both sides have, in ``unit``: of corners in px, of
     points in m. None where there is nothing to measure.
@@ -30,8 +31,10 @@ class Comparison:
     topic: str
     left: int
     right: int
+    together: int
     same: int
     first: str | None = None
+    first_ns: int | None = None
     unit: str | None = None
     rms: float | None = None
     greatest: float | None = None
@@ -89,23 +92,26 @@ def _values(payload: Any) -> dict[int, Array]:
 
 
 def _compare(topic: str, left: list[_Row], right: list[_Row]) -> Comparison:
-    same, first = 0, None
+    both = same = 0
+    first, first_ns = None, None
     distances: list[Array] = []
     for a, b in _together(left, right):
+        both += a is not None and b is not None
         if a is not None and b is not None and a[:3] == b[:3]:
             same += 1
-        elif first is None:
-            first = _said(a, b)
+        elif first_ns is None or min(row[1] for row in (a, b) if row is not None) < first_ns:
+            first, first_ns = _said(a, b), min(row[1] for row in (a, b) if row is not None)
         if a is not None and b is not None:
             distances += [
                 np.linalg.norm(a[3][n] - b[3][n], axis=1) for n in a[3] if n in b[3] and len(a[3][n])
             ]
+    counts = len(left), len(right), both, same
     if not distances:
-        return Comparison(topic, len(left), len(right), same, first)
+        return Comparison(topic, *counts, first, first_ns)
     values = np.concatenate(distances)
     unit = "px" if topic.endswith("/markers") else "m"
     rms, greatest = float(np.sqrt(np.mean(values**2))), float(values.max())
-    return Comparison(topic, len(left), len(right), same, first, unit, rms, greatest)
+    return Comparison(topic, *counts, first, first_ns, unit, rms, greatest)
 
 
 def _together(left: list[_Row], right: list[_Row]) -> Iterator[tuple[_Row | None, _Row | None]]:

@@ -78,12 +78,15 @@ def recorded_latencies(paths: Sequence[Path]) -> list[Latency]:
 def step_times_s(entries: Iterable[Latency]) -> dict[str, NDArray[np.float64]]:
     """How long each step took, and ``total`` from receiving a frame to publishing, in s.
 
-    ``captured`` is from the exposure to the arrival of a frame: what camera and cable take.
+    ``received`` is from the exposure to the arrival of a frame, what camera and cable take; cameras that give
+    no capture stamps say nothing of it.
     """
     times_ns = np.array([[getattr(one, _field(step)) for step in STEPS] for one in entries], dtype=np.int64)
     times_ns = times_ns.reshape(-1, len(STEPS))
     took_s = np.diff(times_ns, axis=1) / NS_PER_S
     found = {step: took_s[:, n] for n, step in enumerate(STEPS[1:])}
+    if not (found["received"] > 0).any():
+        del found["received"]
     return {**found, "total": (times_ns[:, -1] - times_ns[:, 1]) / NS_PER_S}
 
 

@@ -12,6 +12,7 @@ from pathlib import Path
 from types import TracebackType
 
 from ipsys_log.errors import IpsysError, LogError, WriteError
+from ipsys_log.geometry.lenses import scale_lens
 from ipsys_log.log import LogReader, LogWriter, Schema
 from ipsys_log.log.codec import encode, schema_data, schema_name
 from ipsys_log.messages import (
@@ -26,7 +27,7 @@ from ipsys_log.messages import (
 )
 from ipsys_log.units import NS_PER_S, format_bytes
 
-__all__ = ["TICK", "Backlog", "Recording", "first_messages", "recording"]
+__all__ = ["TICK", "Backlog", "Recording", "first_messages", "fitting_lenses", "recording"]
 
 # Between two messages of a source: nothing more has come so far. It is not in the log.
 TICK = Message("", 0, 0, None)
@@ -124,6 +125,27 @@ def _what_fitted(path: Path, error: WriteError) -> str:
         f"{path}: the disk takes no more; recording has stopped, and the log is complete with what fitted: "
         f"{count} messages, {seconds:.1f} s, {size}. Free some space, or record to another disk"
     )
+
+
+def fitting_lenses(
+    lenses: Mapping[str, CameraCalibration],
+    sizes_px: Mapping[str, tuple[int, int] | None],
+    say: Callable[[str], None],
+) -> dict[str, CameraCalibration]:
+    """Lenses for the frames that cameras send, scaled where these are of another size, which is said.
+
+    Raises
+    ------
+    IpsysError
+        Where frames have another shape.
+    """
+    fitting = {}
+    for camera, lens in lenses.items():
+        width, height = sizes_px.get(camera) or (lens.width, lens.height)
+        fitting[camera] = scale_lens(lens, width, height, f"camera {camera}")
+        if width != lens.width:
+            say(f"camera {camera}: its calibration is scaled from {lens.width} to {width} px of width")
+    return fitting
 
 
 def first_messages(

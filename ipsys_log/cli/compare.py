@@ -3,13 +3,17 @@
 from __future__ import annotations
 
 import json
+from collections.abc import Sequence
 from pathlib import Path
-from typing import Annotated, Optional
+from typing import TYPE_CHECKING, Annotated, Optional
 
 import typer
 
 from ipsys_log.cli.console import console, progress_bar
 from ipsys_log.cli.options import AsJson, Logs
+
+if TYPE_CHECKING:
+    from ipsys_log.compare import Comparison
 
 __all__ = ["add_commands"]
 
@@ -30,7 +34,7 @@ def verify(
     """Make every run of a log again from what it read, and compare each channel byte for byte.
 
     Frames that were skipped live are passed over. Ends with 1 where anything differs."""
-    from ipsys_log.report.cameras import comparison_json, comparison_table
+    from ipsys_log.report.cameras import comparison_json, comparison_table, first_difference
     from ipsys_log.verify import verify as verify_runs
 
     with progress_bar() as progress:
@@ -39,8 +43,11 @@ def verify(
         print(json.dumps(comparison_json(found), indent=2))  # noqa: T201
     else:
         console.print(comparison_table(found))
-        console.print(_verdict(all(one.equal for one in found), "replay equals the log", "replay differs"))
-    _end(all(one.equal for one in found))
+        difference = first_difference(found)
+        console.print(
+            "[green]a replay equals the log[/green]" if difference is None else f"[red]{difference}[/red]"
+        )
+    _end(found)
 
 
 def diff(
@@ -56,7 +63,7 @@ def diff(
 
     Ends with 1 where anything differs."""
     from ipsys_log.errors import IpsysError
-    from ipsys_log.report.cameras import comparison_json, comparison_table
+    from ipsys_log.report.cameras import comparison_json, comparison_table, first_difference
     from ipsys_log.verify import diff as compare
 
     names: list[str | None] = list(run) if run else [None]
@@ -67,8 +74,9 @@ def diff(
         print(json.dumps(comparison_json(found), indent=2))  # noqa: T201
     else:
         console.print(comparison_table(found))
-        console.print(_verdict(all(one.equal for one in found), "no difference", "they differ"))
-    _end(all(one.equal for one in found))
+        difference = first_difference(found)
+        console.print("[green]no difference[/green]" if difference is None else f"[red]{difference}[/red]")
+    _end(found)
 
 
 def latency(
@@ -99,10 +107,6 @@ def latency(
         console.print(latency_table(steps))
 
 
-def _verdict(equal: bool, yes: str, no: str) -> str:
-    return f"[green]{yes}[/green]" if equal else f"[red]{no}[/red]"
-
-
-def _end(equal: bool) -> None:
-    if not equal:
+def _end(found: Sequence[Comparison]) -> None:
+    if not all(one.equal for one in found):
         raise typer.Exit(1)

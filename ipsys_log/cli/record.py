@@ -102,7 +102,7 @@ def _opened(
     from rich.live import Live
 
     from ipsys_log.monitor import Monitor
-    from ipsys_log.recording import first_messages
+    from ipsys_log.recording import first_messages, fitting_lenses
     from ipsys_log.report.cameras import LiveStatus
     from ipsys_log.sources.attached import Attached
     from ipsys_log.sources.devices import open_source
@@ -113,6 +113,8 @@ def _opened(
     with ExitStack() as stack:
         with remarks.status("opening " + ", ".join(camera.name for camera in cameras)):
             attached = stack.enter_context(Attached(cameras, open_source, Clock()))
+        sizes_px = {name: state.size_px for name, state in attached.states.items()}
+        lenses = fitting_lenses(lenses, sizes_px, remarks.print)
         if force:
             output.unlink(missing_ok=True)
         _stop_on_signals(attached.stop)

@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+from dataclasses import replace
+
 import cv2
 import numpy as np
 from numpy.typing import NDArray
@@ -9,7 +11,15 @@ from numpy.typing import NDArray
 from ipsys_log.errors import IpsysError
 from ipsys_log.messages import CameraCalibration
 
-__all__ = ["DISTORTION_MODELS", "check_calibration", "check_size", "project", "same_lens", "undistort"]
+__all__ = [
+    "DISTORTION_MODELS",
+    "check_calibration",
+    "check_size",
+    "project",
+    "same_lens",
+    "scale_lens",
+    "undistort",
+]
 
 # Foxglove's and ROS's names; the number of coefficients that each takes.
 DISTORTION_MODELS = {"kannala_brandt": 4, "plumb_bob": 5, "rational_polynomial": 8}
@@ -64,6 +74,36 @@ def check_size(lens: CameraCalibration, width: int, height: int, camera: str | N
             f"{lens.width} x {lens.height}; calibrate at the size that is recorded, and give that with "
             f"--calibration {camera}=calibration.yaml"
         )
+
+
+def scale_lens(lens: CameraCalibration, width: int, height: int, where: str) -> CameraCalibration:
+    """A calibration for pictures of another size that show the same.
+
+    Raises
+    ------
+    IpsysError
+        Naming ``where``, for a size of another shape: it shows something else.
+
+    Examples
+    --------
+    >>> K = np.array([[1150.0, 0, 959.5], [0, 1150, 539.5], [0, 0, 1]])
+    >>> lens = CameraCalibration(0, "red", 1920, 1080, "kannala_brandt", np.zeros(4), K)
+    >>> scale_lens(lens, 960, 540, "camera red").K.tolist()
+    [[575.0, 0.0, 479.5], [0.0, 575.0, 269.5], [0.0, 0.0, 1.0]]
+    """
+    if (lens.width, lens.height) == (width, height):
+        return lens
+    if lens.width * height != lens.height * width:
+        raise IpsysError(
+            f"{where}: sends {width} x {height} px, its calibration is for {lens.width} x {lens.height}, of "
+            "another shape; calibrate at the size that is recorded"
+        )
+    scale = width / lens.width
+    # (0, 0) is the centre of the first pixel, not its corner.
+    matrix = np.diag([scale, scale, 1.0]) @ lens.K
+    matrix[:2, 2] += (scale - 1) / 2
+    P = np.hstack([matrix, np.zeros((3, 1))])
+    return replace(lens, width=width, height=height, K=matrix, P=P)
 
 
 def same_lens(one: CameraCalibration, other: CameraCalibration) -> bool:

@@ -25,6 +25,7 @@ __all__ = [
     "cameras_table",
     "comparison_json",
     "comparison_table",
+    "first_difference",
     "latency_table",
     "robots_table",
 ]
@@ -163,7 +164,7 @@ def latency_table(steps: Mapping[str, Percentiles]) -> Table:
 
 
 def comparison_table(found: Sequence[Comparison]) -> Table:
-    """A row for each channel, and what differs first below it."""
+    """A row for each channel."""
     table = Table(box=None, pad_edge=False)
     for heading in ("channel", "left", "right", "same", "RMS", "greatest"):
         table.add_column(heading, justify="left" if heading == "channel" else "right")
@@ -177,9 +178,20 @@ def comparison_table(found: Sequence[Comparison]) -> Table:
             _distance(one.rms, one.unit),
             _distance(one.greatest, one.unit),
         )
-        if one.first is not None:
-            table.add_row(Text(f"  first: {one.first}", style=style))
     return table
+
+
+def first_difference(found: Sequence[Comparison]) -> str | None:
+    """Where two sides differ first, in words; None where they do not."""
+    apart = [one for one in found if not one.equal]
+    if not apart:
+        return None
+    if not any(one.together for one in found if one.left > 1):
+        return (
+            "they have no frame in common: no message of one speaks of the same instant as one of the other"
+        )
+    first = min(apart, key=lambda one: one.first_ns or 0)
+    return f"first in {first.topic}: {first.first}"
 
 
 def _distance(value: float | None, unit: str | None) -> str:

@@ -9,9 +9,12 @@ from __future__ import annotations
 import threading
 from collections import deque
 from collections.abc import Iterator, Sequence
+from contextlib import suppress
 from dataclasses import dataclass, field
 from types import TracebackType
 from typing import NamedTuple
+
+import simplejpeg
 
 from ipsys_log.messages import (
     EVENTS_TOPIC,
@@ -37,13 +40,15 @@ _RETRY_S, _LONGEST_RETRY_S = 0.5, 8.0
 
 @dataclass(slots=True)
 class CameraState:
-    """What has come of a camera so far; ``dropped`` frames never reached the log."""
+    """What has come of a camera so far: ``size_px`` is the width and height of its frames, where they are
+    JPEGs; ``dropped`` frames never reached the log."""
 
     frames: int = 0
     bytes: int = 0
     dropped: int = 0
     up: bool = False
     finished: bool = False
+    size_px: tuple[int, int] | None = None
     lost_ns: int | None = None
     failure: Exception | None = None
     opened: threading.Event = field(default_factory=threading.Event)
@@ -215,6 +220,10 @@ class Attached:
             text = f"camera {camera.name} gives no capture stamps: frames have the time at which they came"
             self._say("no_capture_stamp", text, camera)
         state.stamped, state.up = frame.time_ns is not None, True
+        if state.size_px is None and frame.format == "jpeg":
+            with suppress(ValueError, KeyError):  # a damaged frame says nothing
+                height, width, *_ = simplejpeg.decode_jpeg_header(frame.data, strict=False)
+                state.size_px = width, height
         with self._arrived:
             if self._waiting_bytes + len(frame.data) > self._limit_bytes:
                 state.dropped += 1

@@ -1,0 +1,142 @@
+"""Cameras that send now: the order of their messages, what is lost, and what is said of it."""
+
+from __future__ import annotations
+
+import threading
+import time
+from collections.abc import Iterator
+from contextlib import contextmanager
+from itertools import pairwise
+
+import pytest
+
+from ipsys_log.messages import CompressedImage, Event, Message, RigCamera
+from ipsys_log.sources.attached import Attached
+from ipsys_log.sources.frames import Clock, Frame, Say, SourceError
+from tests.playing import cameras, playing
+
+FRAMES = {name: [f"{name} {n}".encode() for n in range(20)] for name in ("red", "white", "black")}
+
+
+def messages(attached: Attached) -> list[Message]:
+    with attached:
+        return [message for message in attached if message is not None]
+
+
+def events(found: list[Message]) -> list[Event]:
+    return [message.payload for message in found if isinstance(message.payload, Event)]
+
+
+def data_of(found: list[Message], camera: str) -> list[bytes]:
+    payloads = [message.payload for message in found if message.camera == camera]
+    return [payload.data for payload in payloads if isinstance(payload, CompressedImage)]
+
+
+def test_every_frame_comes_as_it_was_and_log_times_increase() -> None:
+    found = messages(Attached(cameras(*FRAMES), playing(FRAMES, 200.0), Clock()))
+    assert {name: data_of(found, name) for name in FRAMES} == FRAMES
+    assert all(one.log_time_ns < other.log_time_ns for one, other in pairwise(found))
+    assert all(0 < message.log_time_ns - message.publish_time_ns < 1e9 for message in found)
+
+
+def test_log_times_are_utc() -> None:
+    before_ns = time.time_ns()
+    (first, *_) = messages(Attached(cameras("red"), playing(FRAMES, 1000.0), Clock()))
+    assert before_ns - 50_000_000 < first.log_time_ns < time.time_ns() + 50_000_000
+
+
+def test_a_camera_without_stamps_says_so_once_and_has_the_time_of_arrival() -> None:
+    found = messages(Attached(cameras("red"), playing(FRAMES, 1000.0, stamped=False), Clock()))
+    assert [event.kind for event in events(found)] == ["no_capture_stamp"]
+    frames = [message for message in found if message.camera == "red"]
+    assert all(message.publish_time_ns == message.log_time_ns for message in frames)
+
+
+def test_a_camera_that_cannot_be_opened_ends_it_at_once() -> None:
+    @contextmanager
+    def opened(camera: RigCamera, clock: Clock, say: Say) -> Iterator[Iterator[Frame | None]]:
+        if camera.name == "white":
+            raise SourceError("camera white: there is no /dev/video7")
+        yield iter([Frame(b"a", "jpeg", clock.now_ns())])
+
+    with pytest.raises(SourceError, match="no /dev/video7"):
+        messages(Attached(cameras("red", "white"), opened, Clock()))
+    assert not [thread for thread in threading.enumerate() if thread.name in ("red", "white")]
+
+
+def test_a_camera_that_vanishes_is_tried_again_while_the_others_go_on() -> None:
+    tries: list[float] = []
+
+    @contextmanager
+    def opened(camera: RigCamera, clock: Clock, say: Say) -> Iterator[Iterator[Frame | None]]:
+        def sent() -> Iterator[Frame | None]:
+            for n in range(5):
+                time.sleep(0.02)
+                yield Frame(b"%d" % n, "jpeg", clock.now_ns())
+            if camera.name == "red" and len(tries) < 3:
+                raise SourceError("camera red: /dev/video0 has gone")
+            for _ in range(40 if camera.name == "white" else 0):
+                time.sleep(0.05)
+                yield Frame(b"w", "jpeg", clock.now_ns())
+
+        if camera.name == "red":
+            tries.append(time.monotonic())
+            if len(tries) == 2:
+                raise SourceError("camera red: there is no /dev/video0")
+        yield sent()
+
+    found = messages(Attached(cameras("red", "white"), opened, Clock()))
+    said = [event for event in events(found) if event.camera == "red"]
+    # It was open when it went the first time, and not when the second try failed.
+    assert [event.kind for event in said] == ["camera_lost", "camera_back"]
+    assert "has gone; trying again" in said[0].text
+    assert len(data_of(found, "red")) == 10
+    assert len(data_of(found, "white")) == 45
+    assert tries[2] - tries[1] > tries[1] - tries[0]
+
+
+def test_what_the_disk_cannot_take_is_dropped_by_name_and_memory_stays_bounded() -> None:
+    frames = {"red": [bytes([n]) * 1000 for n in range(40)]}
+    attached = Attached(cameras("red"), playing(frames, 500.0), Clock(), limit_bytes=10_000)
+    found: list[Message] = []
+    with attached:
+        for message in attached:
+            if message is not None:
+                if not found:
+                    time.sleep(0.05)
+                found.append(message)
+    kept, dropped = data_of(found, "red"), attached.states["red"].dropped
+    assert len(kept) + dropped == 40
+    assert 5 < dropped < 35
+    (event,) = events(found)
+    assert (event.kind, event.camera) == ("frames_dropped", "red")
+    assert event.text == f"{dropped} frames of camera red dropped: the disk is too slow"
+    # In order, and without what is missing.
+    assert kept == [data for data in frames["red"] if data in kept]
+
+
+def test_stopping_gives_out_what_has_come() -> None:
+    attached = Attached(cameras("red"), playing(FRAMES, 100.0), Clock())
+    found = []
+    with attached:
+        for message in attached:
+            found.append(message)
+            if len(found) == 5:
+                attached.stop()
+    assert 5 <= len(found) < 20
+
+
+def test_a_bug_in_a_source_keeps_its_traceback() -> None:
+    def broken(camera: str, number: int) -> None:
+        if number == 3:
+            raise ZeroDivisionError("a bug")
+
+    with pytest.raises(ZeroDivisionError, match="a bug"):
+        messages(Attached(cameras("red"), playing(FRAMES, 100.0, before=broken), Clock()))
+
+
+def test_a_silent_camera_is_no_reason_to_be_silent() -> None:
+    """So that a recorder can look at its clock, and at signals."""
+    attached = Attached(cameras("red"), playing({"red": [b"a", b"b"]}, 2.0), Clock())
+    with attached:
+        assert list(attached).count(None) >= 3

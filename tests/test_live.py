@@ -1,0 +1,271 @@
+"""Live equals replay: what the stages made while frames came is what they make of the log, byte for byte."""
+
+from __future__ import annotations
+
+import time
+from collections.abc import Callable, Iterator
+from dataclasses import replace
+from functools import cache
+from pathlib import Path
+from typing import Any
+
+import pytest
+
+from ipsys_log import pipeline
+from ipsys_log.compare import Comparison
+from ipsys_log.errors import IpsysError
+from ipsys_log.log.session import Session
+from ipsys_log.messages import FRAME_SKIPPED, CompressedImage, Event, Latency, Message, Run, Tracks
+from ipsys_log.output import write_log
+from ipsys_log.recording import first_messages
+from ipsys_log.request import Request
+from ipsys_log.sources.attached import Attached
+from ipsys_log.sources.frames import Clock
+from ipsys_log.stages.detect import Detect
+from ipsys_log.verify import diff, verify
+from tests.conftest import Ipsys
+from tests.playing import cameras, playing
+
+RATE_HZ = 15.0
+
+
+@pytest.fixture(scope="session")
+def calibration(lab_log: Path, tmp_path_factory: pytest.TempPathFactory) -> Path:
+    """A log with a fitted model."""
+    path = tmp_path_factory.mktemp("live") / "calibration.mcap"
+    pipeline.replay([lab_log], Request(), output=path)
+    return path
+
+
+def attached_to(lab: Path, rate_hz: float = RATE_HZ) -> tuple[Attached, list[Message]]:
+    with Session([lab]) as session:
+        frames = {name: [m.payload.data for m in session.messages([t])] for name, t in session.images.items()}
+        (rig,) = session.payloads(["/rig"])
+        lenses = {name: session.payloads([topic])[0] for name, topic in session.calibrations.items()}
+    attached = Attached(cameras(*frames), playing(frames, rate_hz), Clock())
+    return attached, first_messages(rig, lenses, attached.now_ns)
+
+
+def go_live(
+    lab: Path, calibration: Path, target: Path, rate_hz: float = RATE_HZ, **wanted: Any
+) -> list[Message]:
+    """What was seen on the way."""
+    seen: list[Message] = []
+    attached, settings = attached_to(lab, rate_hz)
+    with attached:
+        request = Request(model_from=calibration, **wanted)
+        pipeline.live(
+            attached, settings, target, request, watch=lambda one: seen.append(one) if one else None
+        )
+    return seen
+
+
+def again(log: Path, run: str | None = None) -> list[Comparison]:
+    return verify([log], run, lambda stage, done, total: None)
+
+
+@pytest.fixture(scope="session")
+def recorded(lab_log: Path, calibration: Path, tmp_path_factory: pytest.TempPathFactory) -> Path:
+    target = tmp_path_factory.mktemp("live") / "live.mcap"
+    go_live(lab_log, calibration, target)
+    return target
+
+
+def test_live_equals_replay_byte_for_byte(recorded: Path) -> None:
+    found = again(recorded)
+    assert {one.topic.rpartition("/")[2] for one in found} >= {
+        "markers",
+        "camera_points",
+        "positions",
+        "tracks",
+    }
+    assert all(one.equal and one.left > 0 for one in found)
+
+
+def test_every_frame_is_in_the_log_as_it_was_sent(recorded: Path, lab_log: Path) -> None:
+    with Session([recorded]) as session, Session([lab_log]) as sent:
+        for camera, topic in sent.images.items():
+            ours = [payload.data for payload in session.payloads([session.images[camera]])]
+            assert ours == [payload.data for payload in sent.payloads([topic])]
+
+
+def test_replay_finds_everything_done(recorded: Path, calibration: Path) -> None:
+    before = recorded.read_bytes()
+    outcomes = pipeline.replay([recorded], Request(model_from=calibration))
+    assert [(one.stage, one.fresh) for one in outcomes] == [
+        (stage, False) for stage in ("detect", "camera-frame", "fit", "locate", "fuse")
+    ]
+    assert recorded.read_bytes() == before
+
+
+def test_a_position_has_the_times_of_its_steps(recorded: Path) -> None:
+    with Session([recorded]) as session:
+        entries: list[Latency] = session.payloads(["/latency"])
+        tracks = session.count("/runs/poly/tracks")
+    assert len(entries) == tracks > 0
+    for one in entries:
+        assert one.timestamp < one.received <= one.detected <= one.located <= one.fused <= one.published
+
+
+def tampered(log: Path, target: Path, kind: type, change: Callable[[Any], Any]) -> Path:
+    """A copy of a log in which the first message that a change applies to is changed."""
+    done = False
+
+    def messages() -> Iterator[Message]:
+        nonlocal done
+        for message in _copied(log):
+            if not done and isinstance(message.payload, kind) and change(message.payload) is not None:
+                done = True
+                yield replace(message, payload=change(message.payload))
+            else:
+                yield message
+
+    write_log(target, messages())
+    return target
+
+
+def _one_less(payload: Tracks) -> Tracks | None:
+    return replace(payload, tracks=payload.tracks[:-1]) if payload.tracks else None
+
+
+def _one_digit(payload: Tracks) -> Tracks | None:
+    first, *rest = payload.tracks
+    return replace(payload, tracks=(replace(first, x_m=first.x_m + 1e-15), *rest))
+
+
+@pytest.mark.parametrize("change", [_one_less, _one_digit])
+def test_a_result_that_was_tampered_with_is_found(
+    recorded: Path, tmp_path: Path, change: Callable[[Any], Any]
+) -> None:
+    log = tampered(recorded, tmp_path / "tampered.mcap", Tracks, change)
+    (apart,) = (one for one in again(log, "poly") if not one.equal)
+    assert apart.topic == "/runs/poly/tracks"
+    assert apart.left - apart.same == 1
+
+
+def test_a_frame_that_was_exchanged_is_found(recorded: Path, tmp_path: Path) -> None:
+    log = tampered(
+        recorded,
+        tmp_path / "tampered.mcap",
+        CompressedImage,
+        lambda image: replace(image, data=image.data + b"\0"),
+    )
+    with pytest.raises(IpsysError, match="run edges was made from .* is out of date"):
+        again(log)
+
+
+@cache
+def slow(step: Callable[..., Any]) -> Callable[..., Any]:
+    def slower(self: Detect, message: Message) -> Any:
+        if isinstance(message.payload, CompressedImage):
+            time.sleep(0.15)
+        return step(self, message)
+
+    return slower
+
+
+@pytest.fixture
+def overloaded(lab_log: Path, calibration: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Path:
+    """Recorded by a machine that is too slow for its cameras."""
+    target = tmp_path / "overloaded.mcap"
+    with monkeypatch.context() as patch:
+        patch.setattr(Detect, "__call__", slow(Detect.__call__))
+        go_live(lab_log, calibration, target)
+    return target
+
+
+def test_a_slow_machine_skips_frames_after_recording_them_and_says_which(
+    overloaded: Path, lab_log: Path, calibration: Path
+) -> None:
+    with Session([overloaded]) as session, Session([lab_log]) as sent:
+        events: list[Event] = session.payloads(["/events"])
+        skipped = {(e.camera, e.timestamp) for e in events if e.kind == FRAME_SKIPPED}
+        frames = {(m.camera, m.publish_time_ns) for m in session.messages(session.images.values())}
+        markers = {
+            (m.camera, m.publish_time_ns)
+            for m in session.messages([f"/runs/edges/cameras/{camera}/markers" for camera in session.images])
+        }
+        assert all(
+            session.count(topic) == sent.count(sent.images[name]) for name, topic in session.images.items()
+        )
+    assert len(skipped) > 5
+    assert markers == frames - skipped
+    assert all(one.equal for one in again(overloaded))
+    # As it was, or all of it: the user says which.
+    request = Request(model_from=calibration, as_live=True)
+    assert not any(one.fresh for one in pipeline.replay([overloaded], request))
+    assert all(
+        one.fresh
+        for one in pipeline.replay([overloaded], Request(model_from=calibration))
+        if one.stage != "fit"
+    )
+    with Session([overloaded]) as session:
+        assert sum(session.count(f"/runs/edges_2/cameras/{c}/markers") for c in session.images) == len(frames)
+
+
+def test_diff_of_a_log_with_itself_and_of_two_runs(recorded: Path, calibration: Path, tmp_path: Path) -> None:
+    assert all(one.equal for one in diff(recorded, recorded, (None, None)))
+    other = tmp_path / "other.mcap"
+    write_log(other, _copied(recorded))
+    pipeline.replay([other], Request(model_from=calibration, corners="stock", run="plain"))
+    found = {one.topic: one for one in diff(other, other, ("poly", "plain"))}
+    tracks = found["/runs/poly/tracks"]
+    assert not tracks.equal
+    assert tracks.unit == "m"
+    assert 1e-5 < (tracks.rms or 0.0) < 0.05
+
+
+def _copied(log: Path) -> Iterator[Message]:
+    with Session([log]) as session:
+        yield from session.messages({t for reader in session.readers for t in reader.channels})
+
+
+def test_a_recording_without_stages_is_detected_later_all_the_same(
+    lab_log: Path, recorded: Path, tmp_path: Path
+) -> None:
+    target = tmp_path / "plain.mcap"
+    attached, settings = attached_to(lab_log, 60.0)
+    with attached:
+        counts = pipeline.record(attached, settings, target)
+    with Session([target]) as session:
+        assert {topic: session.count(topic) for topic in counts} == dict(counts)
+    pipeline.replay([target], Request(), until="detect")
+    with Session([target]) as one, Session([recorded]) as other:
+        for camera in one.images:
+            topic = f"/runs/edges/cameras/{camera}/markers"
+            found = [[m.corners_px.tolist() for m in payload.markers] for payload in one.payloads([topic])]
+            assert len(found) == other.count(topic)
+        assert all(run.stage == "detect" for run in one.runs())
+
+
+def test_a_model_that_is_not_there(ipsys: Ipsys, lab: Path, tmp_path: Path) -> None:
+    attached, settings = attached_to(lab, 60.0)
+    with attached, pytest.raises(Exception, match="has no fitted model"):
+        pipeline.live(attached, settings, tmp_path / "x.mcap", Request(model_from=lab))
+    assert not (tmp_path / "x.mcap").exists()
+
+
+def test_verify_and_diff_on_the_command_line(ipsys: Ipsys, recorded: Path, lab: Path) -> None:
+    done = ipsys("verify", recorded)
+    assert (done.code, done.err) == (0, "")
+    assert done.out.endswith("a replay equals the log\n")
+    done = ipsys("verify", lab)
+    assert done.code == 1
+    assert "has no complete run to verify" in done.err
+    assert ipsys("diff", recorded, recorded, "--run", "poly").code == 0
+    assert "has no run spline" in ipsys("diff", recorded, recorded, "--run", "spline").err
+    assert "holds no latencies" in ipsys("latency", lab).err
+
+
+def test_the_latency_ledger_as_table_and_picture(ipsys: Ipsys, recorded: Path, tmp_path: Path) -> None:
+    done = ipsys("latency", recorded, "--plot", tmp_path / "latency.png")
+    assert done.code == 0
+    assert [line.split()[0] for line in done.out.splitlines()[2:]] == [
+        "received", "detected", "located", "fused", "published", "total",
+    ]  # fmt: skip
+    assert (tmp_path / "latency.png").read_bytes()[:4] == b"\x89PNG"
+    with Session([recorded]) as session:
+        assert [run.stage for run in session.payloads(session.topics(Run, "edges"))] == [
+            "detect",
+            "camera-frame",
+        ]

@@ -150,7 +150,7 @@ def test_a_frame_that_was_exchanged_is_found(recorded: Path, tmp_path: Path) -> 
         CompressedImage,
         lambda image: replace(image, data=image.data + b"\0"),
     )
-    with pytest.raises(IpsysError, match="run edges was made from .* is out of date"):
+    with pytest.raises(IpsysError, match=r"run edges was made from .* is out of date"):
         again(log)
 
 

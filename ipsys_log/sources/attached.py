@@ -50,11 +50,10 @@ class CameraState:
     finished: bool = False
     size_px: tuple[int, int] | None = None
     lost_ns: int | None = None
-    failure: Exception | None = None
+    failure: BaseException | None = None
     opened: threading.Event = field(default_factory=threading.Event)
     begun: threading.Event = field(default_factory=threading.Event)
     unsaid: int = 0
-    stamped: bool | None = None
 
 
 class _Arrival(NamedTuple):
@@ -184,8 +183,11 @@ class Attached:
                     break
                 retry_s = _RETRY_S if state.frames > before else min(2 * retry_s, _LONGEST_RETRY_S)
                 self._stopped.wait(retry_s)
-        except BaseException as fault:  # a bug: whoever takes the messages is to see it
-            self._fault = fault
+        except BaseException as fault:  # whoever opens the cameras, or takes the messages, is to see it
+            if state.begun.is_set():
+                self._fault = fault
+            else:
+                state.failure = fault
         finally:
             state.up, state.finished = False, True
             state.opened.set()
@@ -216,10 +218,7 @@ class Attached:
             gone_s = (now_ns - state.lost_ns) / NS_PER_S
             state.lost_ns = None
             self._say("camera_back", f"camera {camera.name} is back after {gone_s:.1f} s", camera)
-        if state.stamped is None and frame.time_ns is None:
-            text = f"camera {camera.name} gives no capture stamps: frames have the time at which they came"
-            self._say("no_capture_stamp", text, camera)
-        state.stamped, state.up = frame.time_ns is not None, True
+        state.up = True
         if state.size_px is None and frame.format == "jpeg":
             with suppress(ValueError, KeyError):  # a damaged frame says nothing
                 height, width, *_ = simplejpeg.decode_jpeg_header(frame.data, strict=False)

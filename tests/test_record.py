@@ -1,0 +1,215 @@
+"""``ipsys record`` on real streams: what is in the log, and what is left when it ends, however it ends."""
+
+from __future__ import annotations
+
+import signal
+import subprocess
+import sys
+import time
+from collections.abc import Iterator
+from contextlib import ExitStack, contextmanager
+from pathlib import Path
+
+import pytest
+
+from ipsys_log.log.session import Session
+from ipsys_log.messages import Event
+from ipsys_log.rig import load_rig
+from tests.conftest import Ipsys
+from tests.sources.streams import encode, free_port, make_jpegs, serve
+
+NAMES = ("red", "white", "black")
+
+
+@pytest.fixture(scope="module")
+def pictures(tmp_path_factory: pytest.TempPathFactory) -> tuple[Path, list[bytes]]:
+    """A second of pictures, as a stream of JPEGs."""
+    folder = tmp_path_factory.mktemp("pictures")
+    jpegs = make_jpegs(folder, 30)
+    return encode(folder, "loop.mjpeg", "-c", "copy", "-f", "mjpeg"), jpegs
+
+
+@contextmanager
+def streams(video: Path, folder: Path, more: str = "") -> Iterator[Path]:
+    """A rig of three cameras that are served now."""
+    rig = folder / "lab.toml"
+    lines = ['name = "lab"', 'dictionary = "DICT_4X4_100"', "marker_length_m = 0.2"]
+    with ExitStack() as stack:
+        for name in NAMES:
+            port = free_port()
+            loop = ["-re", "-stream_loop", "-1", "-f", "mjpeg", "-framerate", "30", "-i", str(video)]
+            kind = ["-f", "mpjpeg", "-content_type", "multipart/x-mixed-replace;boundary=ffmpeg"]
+            address = f"http://127.0.0.1:{port}/{name}"
+            stack.enter_context(serve(*loop, "-c", "copy", *kind, "-listen", "1", address, port=port))
+            lines += ["[[cameras]]", f'name = "{name}"', f'source = "{address}"']
+        rig.write_text("\n".join([*lines, more]))
+        yield rig
+
+
+def started(*arguments: object) -> subprocess.Popen[str]:
+    return subprocess.Popen(
+        [sys.executable, "-m", "ipsys_log", *map(str, arguments)],
+        stdout=subprocess.PIPE,
+        stderr=subprocess.PIPE,
+        text=True,
+    )
+
+
+def wait_for(log: Path, size: int) -> None:
+    until = time.monotonic() + 30
+    while not log.exists() or log.stat().st_size < size:
+        assert time.monotonic() < until, "nothing is recorded"
+        time.sleep(0.05)
+
+
+def frames(log: Path) -> dict[str, list[bytes]]:
+    with Session([log]) as session:
+        return {name: [p.data for p in session.payloads([topic])] for name, topic in session.images.items()}
+
+
+def test_frames_are_recorded_as_they_came_for_so_many_seconds(
+    ipsys: Ipsys, pictures: tuple[Path, list[bytes]], tmp_path: Path
+) -> None:
+    video, jpegs = pictures
+    with streams(video, tmp_path) as rig:
+        done = ipsys("record", "--rig", rig, "-o", tmp_path / "a.mcap", "--seconds", "2")
+    assert done.code == 0, done.err
+    assert "recording into" in done.err
+    found = frames(tmp_path / "a.mcap")
+    assert sorted(found) == sorted(NAMES)
+    for name in NAMES:
+        assert f"camera {name}: {len(found[name])} frames" in done.out
+        assert 40 < len(found[name]) < 90
+        first = jpegs.index(found[name][0])
+        assert found[name] == [jpegs[(first + n) % 30] for n in range(len(found[name]))]
+    with Session([tmp_path / "a.mcap"]) as session:
+        assert session.payloads(["/rig"]) == [load_rig(rig)]
+        said = {event.text for event in session.payloads(session.topics(Event))}
+    assert said == {
+        f"camera {name}: sends no capture stamps; its frames get their time of arrival" for name in NAMES
+    }
+
+
+@pytest.mark.parametrize("number", [signal.SIGINT, signal.SIGTERM])
+def test_it_ends_cleanly_when_it_is_told_to(
+    number: int, pictures: tuple[Path, list[bytes]], tmp_path: Path
+) -> None:
+    log = tmp_path / "a.mcap"
+    with streams(pictures[0], tmp_path) as rig:
+        program = started("record", "--rig", rig, "-o", log)
+        wait_for(log, 500_000)
+        program.send_signal(number)
+        out, err = program.communicate(timeout=20)
+    assert program.returncode == 0, err
+    assert f"{log} written" in out
+    assert all(len(found) > 10 for found in frames(log).values())
+
+
+def test_a_recorder_that_is_killed_loses_its_last_second_at_most(
+    ipsys: Ipsys, pictures: tuple[Path, list[bytes]], tmp_path: Path
+) -> None:
+    log = tmp_path / "a.mcap"
+    with streams(pictures[0], tmp_path) as rig:
+        program = started("record", "--rig", rig, "-o", log)
+        wait_for(log, 1)
+        time.sleep(4)
+        killed_ns = time.time_ns()
+        program.kill()
+        program.communicate(timeout=20)
+    done = ipsys("info", log)
+    assert done.code == 1
+    assert f"Run: ipsys repair {log}" in done.err
+    assert ipsys("repair", log).code == 0
+    with Session([log]) as session:
+        ends_ns = [session.last([topic])[0] for topic in session.images.values()]
+    assert len(ends_ns) == 3
+    assert min(ends_ns) > killed_ns - 1_300_000_000  # a second, and what it took to kill it
+
+
+def test_a_full_disk_ends_it_with_a_complete_log(
+    ipsys: Ipsys, pictures: tuple[Path, list[bytes]], tmp_path: Path
+) -> None:
+    disk = tmp_path / "disk"
+    disk.mkdir()
+    mounted = subprocess.run(
+        ["mount", "-t", "tmpfs", "-o", "size=20m", "none", str(disk)], capture_output=True, check=False
+    )
+    if mounted.returncode != 0:
+        pytest.skip("no right to mount a small disk")
+    try:
+        with streams(pictures[0], tmp_path) as rig:
+            done = ipsys("record", "--rig", rig, "-o", disk / "a.mcap", "--seconds", "60")
+        found = frames(disk / "a.mcap")
+    finally:
+        subprocess.run(["umount", str(disk)], check=True)
+    assert done.code == 1
+    assert "the disk takes no more; recording has stopped, and the log is complete" in done.err
+    assert all(len(jpegs) > 5 for jpegs in found.values())
+
+
+def test_what_is_there_is_never_overwritten_unless_it_is_said(
+    ipsys: Ipsys, pictures: tuple[Path, list[bytes]], tmp_path: Path
+) -> None:
+    log = tmp_path / "a.mcap"
+    log.write_bytes(b"years of data")
+    with streams(pictures[0], tmp_path) as rig:
+        done = ipsys("record", "--rig", rig, "-o", log, "--seconds", "1")
+        assert done.code == 1
+        assert "exists already; give another name, or --force" in done.err
+        assert log.read_bytes() == b"years of data"
+        assert ipsys("record", "--rig", rig, "-o", log, "--seconds", "1", "--force").code == 0
+    assert len(frames(log)["red"]) > 10
+
+
+@pytest.mark.parametrize(
+    ("cameras", "said"),
+    [
+        ('name = "red"', "no camera has a source"),
+        ('name = "red"\nsource = "carrier_pigeon:7"', "'carrier_pigeon:7' is none of"),
+        ('name = "red"\nsource = "http://127.0.0.1:9/x"', "http://127.0.0.1:9/x"),
+        (
+            'name = "red"\nsource = "a:1"\n[[cameras]]\nname = "white"\nsource = "a:1"',
+            "two cameras have the source 'a:1'",
+        ),
+        ('name = "red"\nstamp = "middle"', 'stamp is \'middle\'; write "start" or "end"'),
+        ('name = "red"\nsourc = "a"', "unknown key 'sourc'"),
+        ('name = "red"\nrate_hz = 0', "rate_hz is 0.0; it must be above 0"),
+    ],
+)
+def test_a_rig_that_cannot_be_recorded(ipsys: Ipsys, tmp_path: Path, cameras: str, said: str) -> None:
+    rig = tmp_path / "lab.toml"
+    rig.write_text(
+        f'name = "lab"\ndictionary = "DICT_4X4_100"\nmarker_length_m = 0.2\n[[cameras]]\n{cameras}\n'
+    )
+    done = ipsys("record", "--rig", rig, "-o", tmp_path / "a.mcap", "--seconds", "1")
+    assert done.code == 1
+    assert done.err.startswith("ipsys: ")
+    assert said in done.err
+    assert not (tmp_path / "a.mcap").exists()
+
+
+def test_a_calibration_of_another_shape_is_refused_and_of_another_size_is_scaled(
+    ipsys: Ipsys, pictures: tuple[Path, list[bytes]], tmp_path: Path
+) -> None:
+    def lens(width: int, height: int) -> Path:
+        path = tmp_path / f"{width}.yaml"
+        path.write_text(
+            f"%YAML:1.0\n---\nimage_width: {width}\nimage_height: {height}\n"
+            "camera_matrix: !!opencv-matrix\n   rows: 3\n   cols: 3\n   dt: d\n"
+            f"   data: [ 300., 0., {width / 2 - 0.5}, 0., 300., {height / 2 - 0.5}, 0., 0., 1. ]\n"
+            "distortion_coefficients: !!opencv-matrix\n   rows: 4\n   cols: 1\n   dt: d\n"
+            "   data: [ 0., 0., 0., 0. ]\n"
+        )
+        return path
+
+    with streams(pictures[0], tmp_path) as rig:
+        once = ("record", "--rig", rig, "--camera", "red", "--seconds", "1", "-o")
+        done = ipsys(*once, tmp_path / "a.mcap", "--calibration", f"red={lens(640, 400)}")
+        assert done.code == 1
+        assert "sends 320 x 240 px, its calibration is for 640 x 400, of another shape" in done.err
+    with streams(pictures[0], tmp_path) as rig:
+        done = ipsys(*once, tmp_path / "b.mcap", "--calibration", f"red={lens(640, 480)}")
+        assert "camera red: its calibration is scaled from 640 to 320 px" in done.err
+    with Session([tmp_path / "b.mcap"]) as session:
+        (held,) = session.payloads([session.calibrations["red"]])
+    assert (held.width, held.height, held.K[0, 0], held.K[0, 2]) == (320, 240, 150.0, 159.5)

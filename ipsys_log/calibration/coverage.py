@@ -106,7 +106,7 @@ def cover_floor(floor: Floor, cameras: Sequence[Hung], marker_length_m: float, h
     diagonal_m = marker_length_m * math.sqrt(2)
     # Beyond the edges too: a marker at an edge is whole only if what lies there is in the picture.
     rim = math.ceil(diagonal_m / 2 / step_m) + 1
-    xs_m, ys_m = (step_m * (np.arange(-rim, round(size_m / step_m) + rim) + 0.5) for size_m in _size(floor))
+    xs_m, ys_m = (_middles(size_m, step_m, rim) for size_m in _size(floor))
     inside = (slice(rim, -rim), slice(rim, -rim))
     seen = {one.camera: _seen(one, xs_m, ys_m, height_m) for one in cameras}
     whole = {name: _erode(mask, diagonal_m / 2 / step_m)[inside] for name, mask in seen.items()}
@@ -123,6 +123,11 @@ def cover_floor(floor: Floor, cameras: Sequence[Hung], marker_length_m: float, h
 
 def _size(floor: Floor) -> tuple[float, float]:
     return floor.width_m, floor.depth_m
+
+
+def _middles(size_m: float, step_m: float, rim: int) -> Array:
+    """Points along a side of the floor, and so many beyond both its ends."""
+    return np.asarray(step_m * (np.arange(-rim, round(size_m / step_m) + rim) + 0.5), dtype=np.float64)
 
 
 def _seen(camera: Hung, xs_m: Array, ys_m: Array, height_m: float) -> Mask:

@@ -5,7 +5,6 @@ from __future__ import annotations
 import math
 from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import dataclass
-from typing import Any
 
 import numpy as np
 
@@ -15,7 +14,7 @@ from ipsys_log.calibration.still import find_lying
 from ipsys_log.errors import IpsysError
 from ipsys_log.geometry.lenses import undistort
 from ipsys_log.geometry.poses import invert_pose, make_pose
-from ipsys_log.log.session import Session, camera_of_topic
+from ipsys_log.log.session import Session
 from ipsys_log.lookup import find_pairs, measured
 from ipsys_log.messages import CameraCalibration, CameraPoints, Measurement, Model, Pair, Rig
 from ipsys_log.models.rigid import rigid_transform
@@ -74,8 +73,8 @@ def read_alignment(session: Session, run: str, rig: Rig, lenses: Lenses) -> Alig
     notes += [note for one in alignments for note in _notes(one, lenses.get(one.camera))]
     if any(point.poses == () for seen in frames.values() for frame in seen for point in frame.points):
         notes.append(
-            "these camera points are by eq. (3), which overstates a tilt by half: go two thirds of the way, or "
-            "begin with frames"
+            "these camera points are by eq. (3), which overstates a tilt by half: go two thirds of the way, "
+            "or begin with frames"
         )
     hung = tuple(_hang(alignments, pairs, lenses, notes))
     coverage = _cover(rig, hung, notes)
@@ -105,16 +104,14 @@ def _notes(alignment: Alignment, lens: CameraCalibration | None) -> Iterator[str
     heights_m: dict[int, list[float]] = {}
     for lying, above_m in alignment.raised:
         heights_m.setdefault(lying.marker_id, []).append(above_m)
-    for marker_id, above_m in heights_m.items():
-        way = "above" if np.mean(above_m) > 0 else "below"
-        yield (
-            f"{name}: marker {marker_id} lies {abs(np.mean(above_m)) * CM_PER_M:.0f} cm {way} the plane of the "
-            "others, and was left out; lay it on the floor"
-        )
+    for marker_id, all_m in heights_m.items():
+        mean_cm = float(np.mean(all_m)) * CM_PER_M
+        where = f"{abs(mean_cm):.0f} cm {'above' if mean_cm > 0 else 'below'} the plane of the others"
+        yield f"{name}: marker {marker_id} lies {where}, and was left out; lay it on the floor"
     if alignment.uneven_m is not None:
         yield (
-            f"{name}: its markers do not lie on one plane (off by {alignment.uneven_m * CM_PER_M:.0f} cm): one "
-            "of them may lie on something; with five or more it can be told which"
+            f"{name}: its markers do not lie on one plane (off by {alignment.uneven_m * CM_PER_M:.0f} cm): "
+            "one of them may lie on something; with five or more it can be told which"
         )
     if alignment.level and lens is not None and (part := _part_of_picture(alignment, lens)) < _NARROW:
         yield (
@@ -173,8 +170,8 @@ def _cover(rig: Rig, hung: Sequence[Hung], notes: list[str]) -> Coverage | None:
         return None
     if rig.floor is None:
         notes.append(
-            "coverage needs the floor: write [floor] with width_m and depth_m into lab.toml, and give it with "
-            "--rig"
+            "coverage needs the floor: write [floor] with width_m and depth_m into lab.toml, and give it "
+            "with --rig"
         )
         return None
     markers = [marker.id for marker in rig.markers]

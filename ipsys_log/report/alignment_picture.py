@@ -1,4 +1,4 @@
-"""How the cameras hang as one picture: the floor as they see it, and in each one's picture where to tilt it."""
+"""How the cameras hang as one picture: the floor as they see it, and which way to tilt each one."""
 
 from __future__ import annotations
 
@@ -10,7 +10,6 @@ import numpy as np
 from matplotlib.axes import Axes
 from matplotlib.colors import ListedColormap
 from matplotlib.figure import Figure
-from matplotlib.patches import Rectangle
 from numpy.typing import NDArray
 
 from ipsys_log.calibration.alignment import Alignment
@@ -93,8 +92,8 @@ def _draw_floor(axes: Axes, lab: AlignedLab, coverage: Coverage) -> None:
     for overlap in coverage.overlaps:
         good = overlap.width_m >= coverage.diagonal_m
         axes.annotate(
-            f"{overlap.width_m * CM_PER_M:.0f} cm", overlap.at_m.tolist(), ha="center", va="center", fontsize=9,
-            color=_LEVEL if good else _TILTED, weight="bold", zorder=6,
+            f"{overlap.width_m * CM_PER_M:.0f} cm", overlap.at_m.tolist(), ha="center", va="center",
+            fontsize=9, color=_LEVEL if good else _TILTED, weight="bold", zorder=6,
             bbox={"boxstyle": "round,pad=0.2", "fc": "white", "ec": "none", "alpha": 0.85},
         )  # fmt: skip
     height = f", {coverage.height_m * CM_PER_M:.0f} cm above the floor" if coverage.height_m else ""
@@ -120,8 +119,8 @@ def _draw_picture(axes: Axes, one: Alignment, lenses: Mapping[str, CameraCalibra
         x, y = project(lying.point_m[None], lens)[0]
         axes.plot(x, y, "x", color=NOTE, ms=6, zorder=3)
         axes.annotate(
-            f"{lying.marker_id} left out", (x, y), (7, 0), textcoords="offset points", va="center", fontsize=8,
-            color=NOTE,
+            f"{lying.marker_id} left out", (x, y), (7, 0), textcoords="offset points", va="center",
+            fontsize=8, color=NOTE,
         )  # fmt: skip
     if one.level is False and one.down is not None:
         _draw_arrow(axes, one, lens)
@@ -161,5 +160,6 @@ def _draw_arrow(axes: Axes, one: Alignment, lens: CameraCalibration) -> None:
     beyond = start + 0.4 * lens.height * direction
     axes.annotate(
         f"{math.degrees(one.tilt_rad):.1f}°", beyond.tolist(), ha="center", va="center", fontsize=9,
-        color=_TILTED, weight="bold", zorder=5, bbox={"boxstyle": "round,pad=0.15", "fc": "white", "ec": "none"},
+        color=_TILTED, weight="bold", zorder=5,
+        bbox={"boxstyle": "round,pad=0.15", "fc": "white", "ec": "none"},
     )  # fmt: skip

@@ -56,7 +56,7 @@ def advise(alignment: Alignment) -> str:
 def _turns(alignment: Alignment) -> str:
     """How to tilt a camera, one way after the other; empty where it is not worth it."""
     names = (("right", "left"), ("bottom", "top"))
-    parts = []
+    parts: list[str] = []
     for turn_rad, (more, less) in zip(alignment.turns_rad, names, strict=True):
         if abs(turn := math.degrees(turn_rad)) >= _LEAST_DEG:
             whose = "" if parts else " of its picture"

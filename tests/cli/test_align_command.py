@@ -50,7 +50,7 @@ RIG = Rig("lab", LAB.dictionary, LAB.marker_length_m, floor=Floor(4.88, 4.88))
 
 
 def hung(tilts: Mapping[str, tuple[float, float]]) -> dict[str, Camera]:
-    """Cameras above the floor, each with its tilt and the direction in its picture of the axis of this tilt."""
+    """Cameras above the floor, each with its tilt and where in its picture the axis of this tilt points."""
     cameras = {}
     for camera in hang_cameras(LAB):
         if camera.name in tilts:
@@ -190,7 +190,7 @@ def test_a_slip_of_the_tape_does_not_keep_a_camera_askew(ipsys: Ipsys, lab: Path
 def test_a_camera_that_was_moved_after_its_places_were_measured(
     ipsys: Ipsys, lab: Path, tmp_path: Path
 ) -> None:
-    tilted = hung({"white": (4.0, 90.0)})
+    tilted = hung({"white": (4.0, 270.0)})
     assert ipsys("fit", lab, "--model", "poly").code == 0
     log = film(tmp_path / "moved.mcap", tilted)
     assert ipsys("fit", log, "--model", "poly", "--model-from", lab).code == 0

@@ -16,7 +16,7 @@ from ipsys_log.geometry.lenses import in_picture
 from ipsys_log.geometry.poses import invert_pose, transform
 from ipsys_log.messages import CameraCalibration, Floor
 
-__all__ = ["Coverage", "Hung", "Overlap", "Patch", "cover_floor"]
+__all__ = ["Coverage", "Hung", "Overlap", "Patch", "cover_floor", "find_overlaps"]
 
 Array = NDArray[np.float64]
 Mask = NDArray[np.bool_]
@@ -25,6 +25,8 @@ Mask = NDArray[np.bool_]
 _STEP_M, _MOST = 0.01, 800
 # No picture reaches further: 79 degrees from its axis.
 _GRAZED = 5.0
+# So far around the feet of cameras neighbours are looked for, where no floor is known.
+_AROUND_M = 2.0
 # What is smaller than a hand is not spoken of: no tape places a camera that well.
 _LEAST_M2 = 0.01
 
@@ -121,6 +123,22 @@ def cover_floor(floor: Floor, cameras: Sequence[Hung], marker_length_m: float, h
     )  # fmt: skip
 
 
+def find_overlaps(cameras: Sequence[Hung], height_m: float) -> tuple[Overlap, ...]:
+    """How wide neighbours overlap, wherever the floor may end.
+
+    Parameters
+    ----------
+    cameras : their places in any frame with the floor at z = 0.
+    height_m : of markers above the floor.
+    """
+    feet_m = np.array([one.foot_m for one in cameras])
+    low_m, high_m = feet_m.min(axis=0) - _AROUND_M, feet_m.max(axis=0) + _AROUND_M
+    step_m = max(_STEP_M, float((high_m - low_m).max()) / _MOST)
+    xs_m, ys_m = (np.arange(a, b, step_m) for a, b in zip(low_m, high_m, strict=True))
+    seen = {one.camera: _seen(one, xs_m, ys_m, height_m) for one in cameras}
+    return tuple(_overlaps(_Grid(xs_m, ys_m, step_m), seen, cameras))
+
+
 def _size(floor: Floor) -> tuple[float, float]:
     return floor.width_m, floor.depth_m
 
@@ -199,7 +217,7 @@ def _narrowest(
     """
     apart_m = float(np.linalg.norm(feet_m[1] - feet_m[0]))
     along = (feet_m[1] - feet_m[0]) / apart_m
-    reach_m = float(np.hypot(grid.xs_m[-1], grid.ys_m[-1]))
+    reach_m = float(np.hypot(np.ptp(grid.xs_m), np.ptp(grid.ys_m)))
     aside_m = np.arange(-reach_m, reach_m, grid.step_m)
     ahead_m = np.arange(0, apart_m + reach_m, grid.step_m)
     offsets_m = aside_m[:, None, None] * np.array([-along[1], along[0]])

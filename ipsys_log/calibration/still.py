@@ -33,6 +33,7 @@ class Lying:
     covariance_m2 : (3, 3), of this point by the noise of the corners; zeros where that is not known.
     height_m : above the floor, where it was measured; else 0.
     frames : how many show it there.
+    start_ns, end_ns : of the first and the last of them.
     """
 
     marker_id: int
@@ -40,6 +41,8 @@ class Lying:
     covariance_m2: Array
     height_m: float = 0.0
     frames: int = 1
+    start_ns: int = 0
+    end_ns: int = 0
 
 
 def find_lying(frames: Iterable[CameraPoints], measurements: Sequence[Measurement] = ()) -> list[Lying]:
@@ -68,8 +71,7 @@ def find_lying(frames: Iterable[CameraPoints], measurements: Sequence[Measuremen
         sightings = sorted(seen[marker_id], key=lambda sighting: sighting[0])
         for first, last in _stretches(sightings):
             here = sightings[first : last + 1]
-            height_m = _height(marker_id, here[0][0], here[-1][0], measurements)
-            found.append(_lying([point for _, point in here], height_m))
+            found.append(_lying(here, _height(marker_id, here[0][0], here[-1][0], measurements)))
     return found
 
 
@@ -94,11 +96,13 @@ def _together(one_m: Array, other_m: Array) -> bool:
     return bool(np.hypot(x_m, y_m) <= _STILL_ACROSS_M and z_m <= max(_STILL_ALONG_M, _STILL_ALONG * one_m[2]))
 
 
-def _lying(points: Sequence[CameraPoint], height_m: float) -> Lying:
+def _lying(sightings: Sequence[tuple[int, CameraPoint]], height_m: float) -> Lying:
+    points = [point for _, point in sightings]
     known_m2 = [point.covariance_m2 for point in points if point.covariance_m2 is not None]
     covariance_m2 = np.mean(known_m2, axis=0) / len(points) if known_m2 else np.zeros((3, 3))
     point_m = np.median([(p.x_m, p.y_m, p.z_m) for p in points], axis=0)
-    return Lying(points[0].id, point_m, covariance_m2, height_m, len(points))
+    times_ns = sightings[0][0], sightings[-1][0]
+    return Lying(points[0].id, point_m, covariance_m2, height_m, len(points), *times_ns)
 
 
 def _height(marker_id: int, start_ns: int, end_ns: int, measurements: Sequence[Measurement]) -> float:

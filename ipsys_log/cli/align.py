@@ -84,7 +84,7 @@ def _show(lab: AlignedLab, plot: Path | None, as_json: bool) -> None:
         print(json.dumps(alignment_json(lab), indent=2, allow_nan=False))  # noqa: T201
     else:
         console.print(alignment_table(lab))
-        for line, good in coverage_lines(lab.coverage) if lab.coverage else ():
+        for line, good in coverage_lines(lab):
             console.print(line, style="green" if good else "red", markup=False, soft_wrap=False)
     for note in lab.notes:
         remarks.print(note, style="yellow", markup=False)

@@ -9,7 +9,8 @@ from dataclasses import dataclass
 import numpy as np
 
 from ipsys_log.calibration.alignment import Alignment, align_camera
-from ipsys_log.calibration.coverage import Coverage, Hung, cover_floor
+from ipsys_log.calibration.coverage import Coverage, Hung, Overlap, cover_floor, find_overlaps
+from ipsys_log.calibration.joined import join_cameras
 from ipsys_log.calibration.still import find_lying
 from ipsys_log.errors import IpsysError
 from ipsys_log.geometry.lenses import undistort
@@ -18,6 +19,7 @@ from ipsys_log.log.session import Session
 from ipsys_log.lookup import find_pairs, measured
 from ipsys_log.messages import CameraCalibration, CameraPoints, Measurement, Model, Pair, Rig
 from ipsys_log.models.rigid import rigid_transform
+from ipsys_log.offline.pairs import Measured
 from ipsys_log.runs import newest_run
 from ipsys_log.units import CM_PER_M
 
@@ -42,6 +44,7 @@ class AlignedLab:
     alignments : one for each camera, by name.
     lenses : by camera, where known.
     hung : the cameras whose places in the world are known; ``coverage`` None where that is not all it takes.
+    overlaps : of neighbours, with a coverage or without one; ``diagonal_m`` what a marker needs.
     notes : what to know of it.
     """
 
@@ -51,6 +54,8 @@ class AlignedLab:
     lenses: Lenses
     hung: tuple[Hung, ...]
     coverage: Coverage | None
+    overlaps: tuple[Overlap, ...]
+    diagonal_m: float
     notes: tuple[str, ...]
 
 
@@ -77,21 +82,30 @@ def read_alignment(session: Session, run: str, rig: Rig, lenses: Lenses) -> Alig
             "or begin with frames"
         )
     hung = tuple(_hang(alignments, pairs, lenses, notes))
-    coverage = _cover(rig, hung, notes)
-    return AlignedLab(run, rig, alignments, lenses, hung, coverage, tuple(notes))
+    length_m, height_m = _marker(rig)
+    coverage = _cover(rig, hung, length_m, height_m, notes)
+    if coverage is not None:
+        overlaps = coverage.overlaps
+    else:
+        # Without a tape, or without a floor to end at.
+        near = hung if len(hung) > 1 else join_cameras(alignments, lenses)
+        overlaps = find_overlaps(near, height_m) if near else ()
+    diagonal_m = length_m * math.sqrt(2)
+    return AlignedLab(run, rig, alignments, lenses, hung, coverage, overlaps, diagonal_m, tuple(notes))
 
 
 def _measured(
     session: Session, run: str, rig: Rig, notes: list[str]
 ) -> tuple[list[Measurement], Mapping[str, Sequence[Pair]]]:
     """What was measured, and what each camera saw of it; else what the newest model was fitted on."""
+    places: list[Measured] = []
     try:
         places = measured(session, rig)
         pairs = find_pairs(session, run, places)
     except IpsysError as error:
-        # A slip of the tape must not keep anybody from hanging a camera.
+        # A slip of the tape must not keep anybody from hanging a camera; heights are by the ruler.
         notes.append(f"the measured places were left out: {error}")
-        return [], {}
+        return [place.measurement for place in places], {}
     fitted = newest_run(session, Model)
     if not places and fitted is not None:
         model: Model = session.payloads(session.topics(Model, fitted))[-1]
@@ -161,11 +175,21 @@ def _hang(
         yield Hung(camera, lenses[camera], invert_pose(make_pose(axes, origin_m)))
 
 
-def _cover(rig: Rig, hung: Sequence[Hung], notes: list[str]) -> Coverage | None:
+def _marker(rig: Rig) -> tuple[float, float]:
+    """Side and height of the markers that are hardest to see whole: the largest side, the greatest height."""
+    markers = [marker.id for marker in rig.markers]
+    lengths_m = [rig.length_of(marker) for marker in markers]
+    heights_m = [rig.height_of(marker) or 0.0 for marker in markers]
+    return max(lengths_m, default=rig.marker_length_m), max(heights_m, default=rig.marker_height_m or 0.0)
+
+
+def _cover(
+    rig: Rig, hung: Sequence[Hung], length_m: float, height_m: float, notes: list[str]
+) -> Coverage | None:
     if not hung:
         notes.append(
-            "coverage needs at least three measured places in the view of each camera, not on a line: "
-            "measure some, and run this again"
+            "what is seen of the whole floor needs at least three measured places in the view of each "
+            "camera, not on a line: measure some, and run this again"
         )
         return None
     if rig.floor is None:
@@ -174,8 +198,4 @@ def _cover(rig: Rig, hung: Sequence[Hung], notes: list[str]) -> Coverage | None:
             "with --rig"
         )
         return None
-    markers = [marker.id for marker in rig.markers]
-    length_m = max((rig.length_of(marker) for marker in markers), default=rig.marker_length_m)
-    # The highest is seen on the smallest part of the floor.
-    heights_m = [rig.height_of(marker) or 0.0 for marker in markers]
-    return cover_floor(rig.floor, hung, length_m, max(heights_m, default=rig.marker_height_m or 0.0))
+    return cover_floor(rig.floor, hung, length_m, height_m)

@@ -100,20 +100,24 @@ def _tilt(one: Alignment) -> str:
     return f"{least}{math.degrees(one.tilt_rad):.1f} ± {math.degrees(one.sigma_rad):.1f}"
 
 
-def coverage_lines(coverage: Coverage) -> list[tuple[str, bool]]:
-    """What is to be said of the floor, each line with whether it is good."""
+def coverage_lines(lab: AlignedLab) -> list[tuple[str, bool]]:
+    """What is to be said of the floor and of neighbours, each line with whether it is good."""
+    floor = _floor_lines(lab.coverage) if lab.coverage is not None else []
+    return floor + [_overlap_line(one, lab.diagonal_m, lab.coverage is not None) for one in lab.overlaps]
+
+
+def _floor_lines(coverage: Coverage) -> list[tuple[str, bool]]:
     floor_m2 = coverage.floor.width_m * coverage.floor.depth_m
     size = f"a marker of {coverage.diagonal_m / math.sqrt(2) * CM_PER_M:.0f} cm"
     if coverage.height_m:
         size += f", {coverage.height_m * CM_PER_M:.0f} cm above the floor,"
-    lines = [
+    return [
         _patch_line(coverage.unseen, floor_m2, "every part of the floor is in a picture", "in no picture"),
         _patch_line(
             coverage.broken, floor_m2, f"{size} is whole in a picture wherever it lies",
             f"{size} is whole in no picture with its middle on",
         ),
     ]  # fmt: skip
-    return lines + [_overlap_line(one, coverage.diagonal_m) for one in coverage.overlaps]
 
 
 def _patch_line(patches: Sequence[Patch], floor_m2: float, good: str, bad: str) -> tuple[str, bool]:
@@ -129,7 +133,7 @@ def _patch_line(patches: Sequence[Patch], floor_m2: float, good: str, bad: str) 
     return (f"{bad} {area}" if " with " in bad else f"{area} are {bad}") + f": {where}{more}", False
 
 
-def _overlap_line(overlap: Overlap, diagonal_m: float) -> tuple[str, bool]:
+def _overlap_line(overlap: Overlap, diagonal_m: float, placed: bool) -> tuple[str, bool]:
     both, (x_m, y_m) = " and ".join(overlap.cameras), overlap.at_m.tolist()
     needed = f"a marker needs {diagonal_m * CM_PER_M:.0f} cm, corner to corner"
     width_cm = overlap.width_m * CM_PER_M
@@ -139,7 +143,8 @@ def _overlap_line(overlap: Overlap, diagonal_m: float) -> tuple[str, bool]:
         f"overlap by {width_cm:.0f} cm only" if overlap.width_m > 0 else f"leave a gap of {-width_cm:.0f} cm"
     )
     end = "one that crosses there is whole in neither picture"
-    return f"{both} {what}, at x {x_m:.2f}, y {y_m:.2f}: {needed}; {end}", False
+    where = f", at x {x_m:.2f}, y {y_m:.2f}" if placed else ""
+    return f"{both} {what}{where}: {needed}; {end}", False
 
 
 def alignment_json(lab: AlignedLab) -> dict[str, Any]:
@@ -149,6 +154,16 @@ def alignment_json(lab: AlignedLab) -> dict[str, Any]:
         "level_below_cm": LEVEL_M * CM_PER_M,
         "cameras": [_camera_json(one) for one in lab.alignments],
         "coverage": None if lab.coverage is None else _coverage_json(lab.coverage),
+        "marker_diagonal_m": lab.diagonal_m,
+        "overlaps": [
+            {
+                "cameras": list(one.cameras),
+                "width_m": one.width_m,
+                "at_m": None if lab.coverage is None else one.at_m.tolist(),
+                "enough": one.width_m >= lab.diagonal_m,
+            }
+            for one in lab.overlaps
+        ],
         "notes": list(lab.notes),
     }
 
@@ -181,18 +196,8 @@ def _scaled(value: float | None, factor: float) -> float | None:
 def _coverage_json(coverage: Coverage) -> dict[str, Any]:
     return {
         "marker_height_m": coverage.height_m,
-        "marker_diagonal_m": coverage.diagonal_m,
         "unseen": [_patch_json(patch) for patch in coverage.unseen],
         "whole_in_no_picture": [_patch_json(patch) for patch in coverage.broken],
-        "overlaps": [
-            {
-                "cameras": list(one.cameras),
-                "width_m": one.width_m,
-                "at_m": one.at_m.tolist(),
-                "enough": one.width_m >= coverage.diagonal_m,
-            }
-            for one in coverage.overlaps
-        ],
     }
 
 

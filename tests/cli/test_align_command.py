@@ -142,7 +142,7 @@ def test_a_session_with_measured_places(ipsys: Ipsys, lab: Path, monkeypatch: py
         assert row["tilt_deg"] == pytest.approx(true_tilt(camera), abs=0.2)
         assert row["height_m"] == pytest.approx(camera.origin_m[2], abs=0.01)
         assert row["places"] >= 20
-    overlaps = {tuple(row["cameras"]): row for row in found["coverage"]["overlaps"]}
+    overlaps = {tuple(row["cameras"]): row for row in found["overlaps"]}
     assert set(overlaps) == {("black", "white"), ("red", "white")}
     # The simulated lab hangs its cameras so that a marker fits.
     assert all(row["enough"] for row in overlaps.values())
@@ -172,6 +172,23 @@ def changed(log: Path, change: Callable[[Message], Message | None]) -> Path:
 
     write_log(path, messages())
     return path
+
+
+def test_overlaps_need_no_tape(ipsys: Ipsys, lab: Path) -> None:
+    """By the plumb lines and markers that two cameras see: about what the tape says."""
+    by_tape = {tuple(row["cameras"]): row["width_m"] for row in aligned(ipsys, lab)["overlaps"]}
+
+    def heights_only(message: Message) -> Message:
+        if isinstance(message.payload, Measurement):
+            return replace(message, payload=replace(message.payload, distances=()))
+        return message
+
+    found = aligned(ipsys, changed(lab, heights_only))
+    assert found["coverage"] is None
+    for row in found["overlaps"]:
+        assert row["width_m"] == pytest.approx(by_tape[tuple(row["cameras"])], abs=0.04)
+        assert row["at_m"] is None
+    assert len(found["overlaps"]) == 2
 
 
 def test_a_slip_of_the_tape_does_not_keep_a_camera_askew(ipsys: Ipsys, lab: Path) -> None:
@@ -208,7 +225,7 @@ def test_too_few_markers_are_said(ipsys: Ipsys, tmp_path: Path) -> None:
     red = one["cameras"]["red"]
     assert (red["spread_cm"], red["tilt_deg"], red["level"]) == (None, None, None)
     assert "one says nothing" in red["advice"]
-    assert any("coverage needs at least three measured places" in note for note in one["notes"])
+    assert any("at least three measured places" in note for note in one["notes"])
     near = aligned(ipsys, film(tmp_path / "a.mcap", hung({"red": (0.0, 0.0)}), ((0, 0), (0.5, 0), (0, 0.4))))
     assert any("span only" in note for note in near["notes"])
 

@@ -90,14 +90,15 @@ def _draw_floor(axes: Axes, lab: AlignedLab, coverage: Coverage) -> None:
         axes.contour(*around_m, seen, levels=[0.5], colors=[colour], linewidths=1.8, zorder=3)
         axes.plot(*one.foot_m, shape, color=colour, ms=7, mec="white", zorder=5, label=shorten(one.camera))
     for overlap in coverage.overlaps:
-        good = overlap.width_m >= coverage.diagonal_m
+        good, width_cm = overlap.width_m >= coverage.diagonal_m, overlap.width_m * CM_PER_M
+        text = f"pictures overlap {width_cm:.0f} cm" if width_cm > 0 else f"gap of {-width_cm:.0f} cm"
         axes.annotate(
-            f"{overlap.width_m * CM_PER_M:.0f} cm", overlap.at_m.tolist(), ha="center", va="center",
-            fontsize=9, color=_LEVEL if good else _TILTED, weight="bold", zorder=6,
+            text, overlap.at_m.tolist(), ha="center", va="center",
+            fontsize=8, color=_LEVEL if good else _TILTED, weight="bold", zorder=6,
             bbox={"boxstyle": "round,pad=0.2", "fc": "white", "ec": "none", "alpha": 0.85},
         )  # fmt: skip
     height = f", {coverage.height_m * CM_PER_M:.0f} cm above the floor" if coverage.height_m else ""
-    axes.set_title(f"Where the middle of a marker may be{height}, and overlaps", loc="left", fontsize=10)
+    axes.set_title(f"Where a marker is whole in a picture, by its middle{height}", loc="left", fontsize=10)
 
 
 def _draw_picture(axes: Axes, one: Alignment, lenses: Mapping[str, CameraCalibration]) -> None:

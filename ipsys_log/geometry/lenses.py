@@ -15,6 +15,7 @@ __all__ = [
     "DISTORTION_MODELS",
     "check_calibration",
     "check_size",
+    "in_picture",
     "project",
     "same_lens",
     "scale_lens",
@@ -28,6 +29,8 @@ DISTORTION_MODELS = {"kannala_brandt": 4, "plumb_bob": 5, "rational_polynomial":
 _CRITERIA = (cv2.TERM_CRITERIA_COUNT + cv2.TERM_CRITERIA_EPS, 100, 1e-12)
 
 _LOST_PX = 0.01
+# Directions (u, v) nearer together than this are one.
+_SAME_RAY = 1e-3
 
 # OpenCV 5 takes the criteria in undistortPoints; 4 has a function of its own for them.
 _undistort_pinhole = getattr(cv2, "undistortPointsIter", cv2.undistortPoints)
@@ -170,3 +173,22 @@ def project(points_m: NDArray[np.float64], lens: CameraCalibration) -> NDArray[n
     else:
         pixels, _ = cv2.projectPoints(points, still, still, lens.K, lens.D)
     return np.asarray(pixels, dtype=np.float64).reshape(-1, 2)
+
+
+def in_picture(points_m: NDArray[np.float64], lens: CameraCalibration) -> NDArray[np.bool_]:
+    """Which points in the frame of the camera lie in its picture, (n,).
+
+    Parameters
+    ----------
+    points_m : (n, 3), in m; where a point is NaN or not in front of the camera, it lies in no picture.
+    lens : the camera's calibration.
+    """
+    inside = np.asarray(np.isfinite(points_m).all(axis=1) & (points_m[:, 2] > 0))
+    if inside.any():
+        px = project(points_m[inside], lens)
+        framed = ((px >= 0) & (px <= [lens.width - 1, lens.height - 1])).all(axis=1)
+        inside[inside] = framed
+        # What lies outside may be bent back into the frame: it is not there.
+        again = undistort(px[framed], lens) - points_m[inside, :2] / points_m[inside, 2:]
+        inside[inside] = np.abs(again).max(axis=1) < _SAME_RAY
+    return inside

@@ -8,7 +8,7 @@ import numpy as np
 from numpy.typing import NDArray
 from scipy.spatial import ConvexHull
 
-from ipsys_log.geometry.lenses import project, undistort
+from ipsys_log.geometry.lenses import in_picture
 from ipsys_log.geometry.poses import transform
 from ipsys_log.messages import CameraCalibration
 from ipsys_log.models.rays import directions
@@ -71,19 +71,7 @@ class View:
             return np.asarray((at @ edges[:, :2].T + edges[:, 2]).max(axis=1) <= _BEYOND, dtype=np.bool_)
         angles = np.linspace(0, 2 * np.pi, _RIM, endpoint=False)
         rim_m = radius_m * np.stack([np.cos(angles), np.sin(angles), np.zeros(_RIM)], axis=1)
-        whole = _in_frame(self.points(world_m), self.lens)
+        whole = in_picture(self.points(world_m), self.lens)
         rims_m = (world_m[whole, None] + rim_m).reshape(-1, 3)
-        whole[whole] = _in_frame(self.points(rims_m), self.lens).reshape(-1, _RIM).all(axis=1)
+        whole[whole] = in_picture(self.points(rims_m), self.lens).reshape(-1, _RIM).all(axis=1)
         return whole
-
-
-def _in_frame(points_m: Array, lens: CameraCalibration) -> Mask:
-    """Which camera points (n, 3) lie in the image, (n,)."""
-    inside = np.asarray(np.isfinite(points_m).all(axis=1))
-    if inside.any():
-        px = project(points_m[inside], lens)
-        # What lies outside may be bent back into the frame: it is not there.
-        again = undistort(px, lens) - points_m[inside, :2] / points_m[inside, 2:]
-        framed = ((px >= 0) & (px <= [lens.width - 1, lens.height - 1])).all(axis=1)
-        inside[inside] = framed & (np.abs(again).max(axis=1) < _SAME_RAY)
-    return inside

@@ -16,7 +16,7 @@ from tests.conftest import ROOT, Ipsys
 
 COMMANDS = [
     "init", "simulate", "import imsel", "import images", "replay", "detect", "camera-frame", "fit",
-    "evaluate", "locate", "fuse", "report", "plan", "info", "runs", "view", "repair",
+    "evaluate", "locate", "fuse", "report", "plan", "align", "info", "runs", "view", "repair",
 ]  # fmt: skip
 
 

@@ -1,0 +1,1 @@
+"""Before there are positions: what a lens does, and how a camera hangs."""

@@ -1,0 +1,92 @@
+"""How the cameras hang, and what of the floor they see: ``ipsys align``."""
+
+from __future__ import annotations
+
+import json
+from pathlib import Path
+from typing import TYPE_CHECKING, Annotated, Any
+
+import typer
+
+from ipsys_log.cli.console import console, remarks
+from ipsys_log.cli.derive import derived
+from ipsys_log.cli.options import (
+    AsJson,
+    Calibrations,
+    Corners,
+    Logs,
+    RigFile,
+    cameras_of,
+    load_calibrations,
+)
+
+if TYPE_CHECKING:
+    from ipsys_log.report.alignment import AlignedLab
+
+__all__ = ["add_commands"]
+
+Plot = Annotated[
+    Path | None, typer.Option(metavar="FILE", help="Draw the floor map and the pictures of the cameras: PNG.")
+]
+
+
+def add_commands(app: typer.Typer) -> None:
+    app.command()(align)
+
+
+def align(
+    logs: Logs,
+    rig: RigFile = None,
+    calibration: Calibrations = None,
+    corners: Corners = None,
+    plot: Plot = None,
+    as_json: AsJson = False,
+) -> None:
+    """Which way to tilt each camera so that it looks straight down, and what of the floor they all see.
+
+    From markers that lie on the floor, four or more in each picture, or one that is laid down at one place
+    after the other. Where places were measured, also the floor that no camera sees, and where neighbours
+    overlap by less than a marker. What it needs and the log does not hold yet is made first.
+    """
+    from ipsys_log.log.session import Session
+    from ipsys_log.messages import CameraPoints, Markers, Rig
+    from ipsys_log.report.alignment import read_alignment
+    from ipsys_log.report.files import check_file
+    from ipsys_log.rig import load_rig
+    from ipsys_log.runs import newest_run
+    from ipsys_log.sinks.shown import rig_in_force
+
+    if plot is not None:
+        check_file(plot, "--plot", logs)
+    given = load_rig(rig) if rig else None
+    lenses = load_calibrations(calibration, lambda: cameras_of(logs))
+    with Session(logs) as session:
+        bare = not session.images and newest_run(session, Markers) is None
+    options: dict[str, Any] = {"rig": rig, "calibration": calibration, "corners": corners, "run": None}
+    method = "perimeter" if bare else "pose"
+    with derived(logs, "camera-frame", method=method, **options) as (session, outcomes, _):
+        made = [outcome.run for outcome in outcomes if outcome.stage == "camera-frame"]
+        run = made[-1] if made else str(newest_run(session, CameraPoints))
+        held = {camera: session.payloads([topic])[-1] for camera, topic in session.calibrations.items()}
+        in_force = given or rig_in_force(session, [run]) or session.payloads(session.topics(Rig))[-1]
+        lab = read_alignment(session, run, in_force, {**held, **lenses})
+    _show(lab, plot, as_json)
+
+
+def _show(lab: AlignedLab, plot: Path | None, as_json: bool) -> None:
+    from ipsys_log.report.alignment_words import alignment_json, alignment_table, coverage_lines
+
+    if plot is not None:
+        from ipsys_log.report.alignment_picture import draw_alignment
+
+        draw_alignment(lab, plot)
+    if as_json:
+        print(json.dumps(alignment_json(lab), indent=2, allow_nan=False))  # noqa: T201
+    else:
+        console.print(alignment_table(lab))
+        for line, good in coverage_lines(lab):
+            console.print(line, style="green" if good else "red", markup=False, soft_wrap=False)
+    for note in lab.notes:
+        remarks.print(note, style="yellow", markup=False)
+    if plot is not None:
+        remarks.print(f"{plot} drawn", markup=False)

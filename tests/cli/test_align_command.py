@@ -1,0 +1,259 @@
+"""``ipsys align`` as a user meets it: rendered frames of cameras that hang askew."""
+
+from __future__ import annotations
+
+import json
+import math
+from collections.abc import Callable, Iterator, Mapping, Sequence
+from dataclasses import replace
+from pathlib import Path
+from typing import Any
+
+import cv2
+import numpy as np
+import pytest
+from numpy.typing import NDArray
+
+from ipsys_log.geometry.poses import lay_flat, look_down
+from ipsys_log.log.session import Session
+from ipsys_log.messages import (
+    RIG_TOPIC,
+    CompressedImage,
+    Distance,
+    Floor,
+    Measurement,
+    Message,
+    Rig,
+    calibration_topic,
+    image_topic,
+)
+from ipsys_log.output import write_log
+from ipsys_log.sources.simulator import (
+    EPOCH_NS,
+    Camera,
+    LabSettings,
+    Placed,
+    encode_jpeg,
+    hang_cameras,
+    prepare_view,
+    render,
+)
+from tests.conftest import Ipsys, data_section
+from tests.ladder import follow
+
+Array = NDArray[np.float64]
+
+LAB = LabSettings(width=960, height=540)
+PLACES_M = ((-1.6, -0.6), (1.6, -0.6), (1.5, 0.6), (-1.6, 0.7), (0.1, 0.3), (0.6, -0.4))
+TILTS = {"red": (0.0, 0.0), "white": (2.0, 60.0), "black": (5.0, 130.0)}
+RIG = Rig("lab", LAB.dictionary, LAB.marker_length_m, floor=Floor(4.88, 4.88))
+
+
+def hung(tilts: Mapping[str, tuple[float, float]]) -> dict[str, Camera]:
+    """Cameras above the floor, each with its tilt and where in its picture the axis of this tilt points."""
+    cameras = {}
+    for camera in hang_cameras(LAB):
+        if camera.name in tilts:
+            tilt, towards = np.radians(tilts[camera.name])
+            turned = look_down(camera.origin_m, tilt * np.array([np.cos(towards), np.sin(towards), 0.0]))
+            cameras[camera.name] = replace(camera, camera_from_world=turned)
+    return cameras
+
+
+def film(
+    path: Path,
+    cameras: Mapping[str, Camera],
+    places_m: Sequence[tuple[float, float]] = PLACES_M,
+    raised_m: Mapping[int, float] | None = None,
+    rig: Rig | None = RIG,
+    lenses: bool = True,
+) -> Path:
+    """A log with one frame of each camera, markers on the floor beneath it."""
+
+    def messages() -> Iterator[Message]:
+        if rig is not None:
+            yield Message(RIG_TOPIC, EPOCH_NS, EPOCH_NS, rig)
+        for n, (name, camera) in enumerate(cameras.items(), 1):
+            if lenses:
+                yield Message(calibration_topic(name), EPOCH_NS + n, EPOCH_NS, camera.lens, name)
+        for n, (name, camera) in enumerate(cameras.items(), 100):
+            x_m, y_m, _ = camera.origin_m
+            prints = [
+                Placed(i, 0.2, lay_flat(x_m + x, y_m + y, (raised_m or {}).get(i, 0.0), 0.4 * i))
+                for i, (x, y) in enumerate(places_m)
+            ]
+            frame = render(prepare_view(camera, LAB), prints, LAB, np.random.default_rng(n))
+            image = CompressedImage(EPOCH_NS, name, encode_jpeg(frame, LAB), "jpeg")
+            yield Message(image_topic(name), EPOCH_NS + n, EPOCH_NS, image, name)
+
+    path.unlink(missing_ok=True)
+    write_log(path, messages())
+    return path
+
+
+def aligned(ipsys: Ipsys, *arguments: object) -> dict[str, Any]:
+    done = ipsys("align", *arguments, "--json")
+    assert done.code == 0, done.err
+    found = json.loads(done.out)
+    return {**found, "cameras": {row["camera"]: row for row in found["cameras"]}}
+
+
+def test_a_tilt_comes_back_and_who_does_as_told_gets_green(ipsys: Ipsys, tmp_path: Path) -> None:
+    cameras = hung(TILTS)
+    before = aligned(ipsys, film(tmp_path / "before.mcap", cameras))["cameras"]
+    for name, (tilt_deg, _) in TILTS.items():
+        assert before[name]["tilt_deg"] == pytest.approx(tilt_deg, abs=0.2)
+        assert before[name]["markers"] == [0, 1, 2, 3, 4, 5]
+    assert [before[name]["level"] for name in TILTS] == [True, False, False]
+    told = {
+        name: replace(camera, camera_from_world=follow(before[name]["advice"], camera.camera_from_world))
+        for name, camera in cameras.items()
+    }
+    after = aligned(ipsys, film(tmp_path / "after.mcap", told))["cameras"]
+    for name in TILTS:
+        assert after[name]["spread_cm"] < 3.0
+        assert after[name]["tilt_deg"] < 0.2
+        assert after[name]["level"] is True
+        assert after[name]["spread_cm"] == pytest.approx(before[name]["spread_after_cm"], abs=1.5)
+
+
+def test_a_marker_on_a_box_is_named(ipsys: Ipsys, tmp_path: Path) -> None:
+    log = film(tmp_path / "box.mcap", hung({"white": (1.0, 200.0)}), raised_m={3: 0.06})
+    found = aligned(ipsys, log)
+    white = found["cameras"]["white"]
+    assert white["markers"] == [0, 1, 2, 4, 5]
+    assert [row["marker"] for row in white["raised"]] == [3]
+    assert white["raised"][0]["above_cm"] == pytest.approx(6.0, abs=1.0)
+    assert white["tilt_deg"] == pytest.approx(1.0, abs=0.2)
+    assert any("marker 3 lies 6 cm above the plane" in note for note in found["notes"])
+
+
+def true_tilt(camera: Camera) -> float:
+    return math.degrees(math.acos(-camera.camera_from_world[2, 2]))
+
+
+def test_a_session_with_measured_places(ipsys: Ipsys, lab: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    """At all heights, by tape, then a drive: what was measured tells how high a marker was."""
+    section = data_section(lab)
+    found = aligned(ipsys, lab)
+    settings = LabSettings(width=960, height=540, markers=8, stations=26, drive_s=1.0)
+    for camera in hang_cameras(settings):
+        row = found["cameras"][camera.name]
+        assert row["tilt_deg"] == pytest.approx(true_tilt(camera), abs=0.2)
+        assert row["height_m"] == pytest.approx(camera.origin_m[2], abs=0.01)
+        assert row["places"] >= 20
+    overlaps = {tuple(row["cameras"]): row for row in found["overlaps"]}
+    assert set(overlaps) == {("black", "white"), ("red", "white")}
+    # The simulated lab hangs its cameras so that a marker fits.
+    assert all(row["enough"] for row in overlaps.values())
+    assert found["coverage"]["unseen"] == []
+    assert data_section(lab).startswith(section)
+    monkeypatch.setenv("COLUMNS", "80")
+    drawn = lab.with_name("map.png")
+    done = ipsys("align", lab, "--plot", drawn)
+    assert done.code == 0, done.err
+    assert max(map(len, done.out.splitlines())) <= 80, done.out
+    assert "every part of the floor is in a picture" in done.out
+    assert "black and white overlap by" in done.out
+    picture = cv2.imread(str(drawn))
+    assert picture is not None
+    # The blue of what two cameras see, on the map.
+    assert (np.abs(picture.astype(int) - [232, 214, 195]).max(axis=2) < 3).mean() > 0.02
+
+
+def changed(log: Path, change: Callable[[Message], Message | None]) -> Path:
+    path = log.with_name("changed.mcap")
+
+    def messages() -> Iterator[Message]:
+        with Session([log]) as session:
+            topics = [topic for reader in session.readers for topic in reader.channels]
+            kept = (change(message) for message in session.messages(topics))
+            yield from (message for message in kept if message is not None)
+
+    write_log(path, messages())
+    return path
+
+
+def test_overlaps_need_no_tape(ipsys: Ipsys, lab: Path) -> None:
+    """By the plumb lines and markers that two cameras see: about what the tape says."""
+    by_tape = {tuple(row["cameras"]): row["width_m"] for row in aligned(ipsys, lab)["overlaps"]}
+
+    def heights_only(message: Message) -> Message:
+        if isinstance(message.payload, Measurement):
+            return replace(message, payload=replace(message.payload, distances=()))
+        return message
+
+    found = aligned(ipsys, changed(lab, heights_only))
+    assert found["coverage"] is None
+    for row in found["overlaps"]:
+        assert row["width_m"] == pytest.approx(by_tape[tuple(row["cameras"])], abs=0.04)
+        assert row["at_m"] is None
+    assert len(found["overlaps"]) == 2
+
+
+def test_a_slip_of_the_tape_does_not_keep_a_camera_askew(ipsys: Ipsys, lab: Path) -> None:
+    def too_short(message: Message) -> Message:
+        if isinstance(message.payload, Measurement) and message.payload.id == "s000":
+            distances = (Distance("A", 0.4), Distance("B", 0.5))
+            return replace(message, payload=replace(message.payload, distances=distances))
+        return message
+
+    found = aligned(ipsys, changed(lab, too_short))
+    assert found["coverage"] is None
+    assert "the measured places were left out: measurement s000" in " ".join(found["notes"])
+    assert len(found["cameras"]) == 3
+
+
+def test_a_camera_that_was_moved_after_its_places_were_measured(
+    ipsys: Ipsys, lab: Path, tmp_path: Path
+) -> None:
+    tilted = hung({"white": (4.0, 270.0)})
+    assert ipsys("fit", lab, "--model", "poly").code == 0
+    log = film(tmp_path / "moved.mcap", tilted)
+    assert ipsys("fit", log, "--model", "poly", "--model-from", lab).code == 0
+    found = aligned(ipsys, log)
+    assert "camera white hangs otherwise than when its places" in " ".join(found["notes"])
+    assert found["coverage"] is not None
+
+
+def test_too_few_markers_are_said(ipsys: Ipsys, tmp_path: Path) -> None:
+    cameras = hung({"red": (3.0, 0.0)})
+    done = ipsys("align", film(tmp_path / "a.mcap", cameras, places_m=()))
+    assert (done.code, done.out) == (1, "")
+    assert "no marker was found in 1 frames" in done.err
+    one = aligned(ipsys, film(tmp_path / "a.mcap", cameras, places_m=PLACES_M[:1]))
+    red = one["cameras"]["red"]
+    assert (red["spread_cm"], red["tilt_deg"], red["level"]) == (None, None, None)
+    assert "one says nothing" in red["advice"]
+    assert any("at least three measured places" in note for note in one["notes"])
+    near = aligned(ipsys, film(tmp_path / "a.mcap", hung({"red": (0.0, 0.0)}), ((0, 0), (0.5, 0), (0, 0.4))))
+    assert any("span only" in note for note in near["notes"])
+
+
+def test_what_a_log_lacks(ipsys: Ipsys, lab: Path, tmp_path: Path) -> None:
+    cameras = hung({"red": (3.0, 0.0)})
+    done = ipsys("align", film(tmp_path / "a.mcap", cameras, rig=None))
+    assert (done.code, done.out) == (1, "")
+    assert "has no rig" in done.err
+    done = ipsys("align", film(tmp_path / "a.mcap", cameras, lenses=False))
+    assert (done.code, done.out) == (1, "")
+    assert "camera red has no calibration" in done.err
+    done = ipsys("align", tmp_path / "a.mcap", "--plot", tmp_path / "nowhere" / "map.png")
+    assert (done.code, done.out) == (1, "")
+    assert "there is no folder" in done.err
+
+    def no_floor(message: Message) -> Message:
+        payload = message.payload
+        return replace(message, payload=replace(payload, floor=None)) if isinstance(payload, Rig) else message
+
+    found = aligned(ipsys, changed(lab, no_floor))
+    assert found["coverage"] is None
+    assert any("coverage needs the floor: write [floor]" in note for note in found["notes"])
+
+
+def test_camera_points_without_markers_are_by_eq_3(ipsys: Ipsys, data: Path, tmp_path: Path) -> None:
+    log = tmp_path / "imsel.mcap"
+    assert ipsys("import", "imsel", data / "imsel", "-o", log).code == 0
+    found = aligned(ipsys, log)
+    assert set(found["cameras"]) == {"red", "white", "black"}
+    assert any("eq. (3)" in note for note in found["notes"])

@@ -58,8 +58,8 @@ class Alignment:
 
     @property
     def level(self) -> bool | None:
-        """Whether the spread is below 5 cm; None where it is not known."""
-        return None if self.spread_m is None else self.spread_m < LEVEL_M
+        """Whether the spread is below 5 cm; None where markers lie too close together to tell."""
+        return None if self.spread_m is None or self.axes == 0 else self.spread_m < LEVEL_M
 
     @property
     def tilt_rad(self) -> float | None:
@@ -123,8 +123,8 @@ def align_camera(camera: str, lying: Sequence[Lying]) -> Alignment:
     >>> found = align_camera("red", lying)
     >>> round(found.spread_m, 3), round(math.degrees(found.tilt_rad), 2)
     (0.04, 1.15)
-    >>> [round(math.degrees(turn), 2) for turn in found.turns_rad]  # markers on the right are nearer
-    [1.15, 0.0]
+    >>> round(math.degrees(found.turns_rad[0]), 2)  # to the right, where markers are nearer
+    1.15
     """
     kept = _on_one_plane(lying)
     used = tuple(one for one, keep in zip(lying, kept, strict=True) if keep)

@@ -188,6 +188,7 @@ def in_picture(points_m: NDArray[np.float64], lens: CameraCalibration) -> NDArra
         px = project(points_m[inside], lens)
         framed = ((px >= 0) & (px <= [lens.width - 1, lens.height - 1])).all(axis=1)
         inside[inside] = framed
+    if inside.any():
         # What lies outside may be bent back into the frame: it is not there.
         again = undistort(px[framed], lens) - points_m[inside, :2] / points_m[inside, 2:]
         inside[inside] = np.abs(again).max(axis=1) < _SAME_RAY

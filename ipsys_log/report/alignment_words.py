@@ -28,9 +28,8 @@ def advise(alignment: Alignment) -> str:
 
     Examples
     --------
-    >>> import numpy as np
-    >>> advise(Alignment("red", (), spread_m=0.07, left_m=0.01, down=np.array([0.02, 0, 0.9998]), axes=2))
-    'tilt it so that it looks further towards the right of its picture, by 1.1 degrees'
+    >>> advise(Alignment("red", ()))[:32]
+    'lay four or more markers on the '
     """
     if not alignment.lying:
         return "lay four or more markers on the floor, out to the edges of its picture: none lies still there"

@@ -163,6 +163,7 @@ def test_one_and_two_markers_and_markers_on_a_line() -> None:
     assert align_camera("red", line).axes == 1
     near = [lying[0], Lying(1, lying[0].point_m + np.array([0.05, 0, 0]), np.zeros((3, 3)))]
     assert align_camera("red", near).axes == 0
+    assert align_camera("red", near).level is None  # not green, whatever the spread
     assert "further apart" in advise(align_camera("red", near))
 
 

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import signal
 from collections.abc import Callable, Iterator
-from contextlib import ExitStack, contextmanager
+from contextlib import ExitStack, contextmanager, nullcontext
 from pathlib import Path
 from threading import Timer
 from time import monotonic
@@ -18,6 +18,8 @@ from ipsys_log.cli.options import Calibrations, Corners, Method, NewLog, load_la
 if TYPE_CHECKING:
     from ipsys_log.messages import Message
     from ipsys_log.report.cameras import LiveStatus
+    from ipsys_log.request import Request
+    from ipsys_log.sinks.rerun_live import LiveView
     from ipsys_log.sources.attached import Attached
 
 __all__ = ["add_commands"]
@@ -31,6 +33,7 @@ Seconds = Annotated[
     Optional[float],  # noqa: UP045
     typer.Option(min=0.1, help="Stop by itself after so many seconds."),
 ]
+View = Annotated[bool, typer.Option("--view", help="Show cameras and robots in Rerun meanwhile.")]
 Force = Annotated[bool, typer.Option("--force", help="Overwrite the log if there is one of that name.")]
 
 
@@ -76,6 +79,7 @@ def live(
     calibration: Calibrations = None,
     corners: Corners = None,
     method: Method = "perimeter",
+    view: View = False,
     seconds: Seconds = None,
     force: Force = False,
 ) -> None:
@@ -85,8 +89,26 @@ def live(
 
     models = () if model is None else (model,)
     request = Request(models=models, model_from=model_from, corners=corners, method=method)
-    with _opened(output, rig, camera, calibration, seconds, force) as (cameras, settings, status):
-        pipeline.live(cameras, settings, output, request, "fuse", status)
+    with (
+        _opened(output, rig, camera, calibration, seconds, force) as (cameras, settings, status),
+        _viewed(settings, cameras, request) if view else nullcontext() as viewer,
+    ):
+
+        def watch(message: Message | None) -> None:
+            status(message)
+            if viewer is not None:
+                viewer(message)
+
+        pipeline.live(cameras, settings, output, request, "fuse", watch)
+
+
+def _viewed(settings: list[Message], cameras: Attached, request: Request) -> LiveView:
+    from ipsys_log.lookup import wanted_models
+    from ipsys_log.sinks.rerun_live import LiveView
+    from ipsys_log.tasks import model_run
+
+    (model,) = wanted_models(request, "fuse")
+    return LiveView(settings[0].payload, cameras.states, model_run(model), remarks.print)
 
 
 @contextmanager

@@ -1,0 +1,77 @@
+"""What is shown while it happens: read back by Rerun itself, without a screen."""
+
+from __future__ import annotations
+
+import time
+from collections.abc import Callable
+from pathlib import Path
+
+import pytest
+from rerun.chunk import RrdReader
+
+from ipsys_log.errors import IpsysError
+from ipsys_log.log.session import Session
+from ipsys_log.messages import CompressedImage, Message, Tracks
+from ipsys_log.pipeline import replay
+from ipsys_log.request import Request
+from ipsys_log.sinks.rerun_live import LiveView
+
+Write = Callable[[bytes], object]
+
+
+def replayed(lab: Path) -> tuple[list[Message], Session]:
+    replay([lab], Request())
+    session = Session([lab])
+    topics = {t for reader in session.readers for t in reader.channels if "/truth" not in t}
+    return [m for m in session.messages(topics) if isinstance(m.payload, CompressedImage | Tracks)], session
+
+
+def test_frames_and_robots_arrive_in_rerun(lab: Path, tmp_path: Path) -> None:
+    path = tmp_path / "live.rrd"
+
+    def show(feed: Callable[[Write], None]) -> None:
+        with path.open("wb") as file:
+            feed(file.write)
+
+    messages, session = replayed(lab)
+    (rig,) = session.payloads(["/rig"])
+    with LiveView(rig, session.images, "poly", print, show) as view:
+        for message in messages:
+            view(message)
+            time.sleep(0.002)
+    entities = {chunk.entity_path for chunk in RrdReader(path).stream().to_chunks()}
+    assert {f"/cameras/{camera}/image" for camera in session.images} <= entities
+    assert any(entity.startswith("/world/runs/poly/robots/robot_") for entity in entities)
+
+
+def test_a_viewer_that_stands_still_holds_nothing_up(lab: Path) -> None:
+    messages, session = replayed(lab)
+    (rig,) = session.payloads(["/rig"])
+    view = LiveView(rig, session.images, "poly", print, lambda feed: time.sleep(0.5))
+    begin_s = time.monotonic()
+    with view:
+        for message in messages * 20:
+            view(message)
+        assert time.monotonic() - begin_s < 0.4
+    assert view._waiting.qsize() <= 201
+
+
+def test_no_screen_is_said_before_anything_is_recorded(lab: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    for name in ("DISPLAY", "WAYLAND_DISPLAY", "WAYLAND_SOCKET"):
+        monkeypatch.delenv(name, raising=False)
+    with Session([lab]) as session:
+        (rig,) = session.payloads(["/rig"])
+        with pytest.raises(IpsysError, match="no screen"), LiveView(rig, session.images, None, print):
+            pass
+
+
+def test_why_the_viewer_failed_is_said(lab: Path) -> None:
+    def broken(feed: Callable[[Write], None]) -> None:
+        raise IpsysError("the viewer could not be shown")
+
+    said: list[str] = []
+    with Session([lab]) as session:
+        (rig,) = session.payloads(["/rig"])
+        with LiveView(rig, session.images, None, said.append, broken):
+            pass
+    assert said == ["the viewer could not be shown"]

@@ -15,7 +15,7 @@ from ipsys_log.errors import IpsysError
 
 __all__ = ["check_screen", "show_in_viewer", "viewer_command"]
 
-_INSTEAD = "write a recording instead, with --save session.rrd, and open that where there is a screen"
+_INSTEAD = "write a recording with 'ipsys view --save session.rrd' and open that where there is a screen"
 
 
 def viewer_command() -> list[str]:

@@ -18,7 +18,7 @@ from ipsys_log.sources.simulator.places import place
 from ipsys_log.stages.detect import decode_grey, detect_markers
 from ipsys_log.units import NS_PER_S
 
-SMALL = {"width": 480, "height": 270, "rate_hz": 20.0}
+SMALL = {"width": 960, "height": 540, "rate_hz": 20.0}
 
 
 def take(name: str, count: int, clock: Clock, **other: str) -> list[Frame]:
@@ -79,7 +79,7 @@ def test_a_stamp_is_of_the_instant_that_the_rig_says() -> None:
     }
     step_ns = NS_PER_S // 20
     assert (frames["start"] or 0) % step_ns == step_ns - 10_000_000
-    assert (frames["end"] or 0) % step_ns == 10_000_000 + 269 * 50_000
+    assert (frames["end"] or 0) % step_ns == 10_000_000 + 539 * 50_000
 
 
 def test_it_can_be_left_while_it_draws() -> None:

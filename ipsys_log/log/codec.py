@@ -33,6 +33,7 @@ PAYLOADS: dict[str, type] = {
         for payload in (
             messages.CameraCalibration,
             messages.CompressedImage,
+            messages.CompressedVideo,
             messages.FrameTransforms,
             messages.ImageAnnotations,
             messages.RawImage,

@@ -21,10 +21,11 @@ from ipsys_log.errors import LogError
 from ipsys_log.log.codec import decode, payload_type
 from ipsys_log.log.reader import LogReader
 from ipsys_log.log.types import Channel
-from ipsys_log.messages import CameraCalibration, CompressedImage, Message, RawImage, Run
+from ipsys_log.messages import CameraCalibration, CompressedImage, CompressedVideo, Message, RawImage, Run
 
 __all__ = ["Session", "camera_of_topic", "run_of_topic"]
 
+_IMAGES = (CompressedImage, CompressedVideo, RawImage)
 _OWN = re.compile(r"(?:/runs/(?P<run>[a-z][a-z0-9_]*))?/cameras/(?P<camera>[a-z][a-z0-9_]*)/[a-z_]+")
 _RUN = re.compile(r"/runs/(?P<run>[a-z][a-z0-9_]*)/")
 # What a topic's last parts say of an image, and not of which camera took it.
@@ -52,7 +53,7 @@ class Session:
         try:
             self.readers = [self._stack.enter_context(LogReader(path)) for path in paths]
             self._check_overlaps()
-            self.images = self._cameras((CompressedImage, RawImage))
+            self.images = self._cameras(_IMAGES)
             self.calibrations = self._pair_calibrations(self._cameras((CameraCalibration,)))
         except BaseException:
             self._stack.close()
@@ -173,7 +174,7 @@ class Session:
 
     def _check_overlaps(self) -> None:
         """Logs that follow one another are one; two that speak at once of one thing are not."""
-        images = {topic for payload in (CompressedImage, RawImage) for topic in self.topics(payload)}
+        images = {topic for payload in _IMAGES for topic in self.topics(payload)}
         first: dict[str, LogReader] = {}
         for reader in self.readers:
             for topic in reader.channels:

@@ -179,6 +179,17 @@ class CompressedImage:
 
 
 @dataclass(frozen=True, slots=True, eq=False)
+class CompressedVideo:
+    """``foxglove.CompressedVideo``: one frame of a video, H.264 or H.265 in Annex B; each keyframe has its
+    parameter sets before it, and no frame needs a later one."""
+
+    timestamp: TimeNs
+    frame_id: str
+    data: bytes
+    format: str
+
+
+@dataclass(frozen=True, slots=True, eq=False)
 class RawImage:
     """``foxglove.RawImage``, in the logs of others."""
 

@@ -22,8 +22,9 @@ from google.protobuf.timestamp_pb2 import Timestamp
 from ipsys_log import messages
 from ipsys_log.errors import LogError
 from ipsys_log.log.fields import fields_of, fill_proto, read_proto
+from ipsys_log.log.ros2 import ROS2_PAYLOADS, read_ros2
 
-__all__ = ["PAYLOADS", "decode", "encode", "schema_data", "schema_name"]
+__all__ = ["PAYLOADS", "decode", "encode", "payload_type", "schema_data", "schema_name"]
 
 # The payloads that have a channel of their own, by the name of their schema.
 PAYLOADS: dict[str, type] = {
@@ -32,6 +33,7 @@ PAYLOADS: dict[str, type] = {
         for payload in (
             messages.CameraCalibration,
             messages.CompressedImage,
+            messages.CompressedVideo,
             messages.FrameTransforms,
             messages.ImageAnnotations,
             messages.RawImage,
@@ -61,6 +63,11 @@ _NAMES = {payload: name for name, payload in PAYLOADS.items()}
 def schema_name(payload: type) -> str:
     """Name of the schema that a type of payload is written with, such as ``ipsys.v1.Markers``."""
     return _NAMES[payload]
+
+
+def payload_type(name: str) -> type | None:
+    """The type of payload that messages of a schema are read into, whoever wrote them; None for none."""
+    return PAYLOADS.get(name) or ROS2_PAYLOADS.get(name)
 
 
 def encode(payload: Any) -> bytes:
@@ -121,20 +128,25 @@ def _bytes_fields(kind: type) -> tuple[str, ...]:
     return tuple(name for name, hint in get_type_hints(kind).items() if hint is bytes)
 
 
-def decode(name: str, data: bytes, encoding: str = "protobuf") -> Any:
+def decode(name: str, data: bytes, encoding: str = "protobuf", definition: bytes = b"") -> Any:
     """The payload in ``data``, which the schema called ``name`` was written with.
 
     Parameters
     ----------
     name : of the schema.
     data : the message.
-    encoding : ``protobuf``, or ``json`` in the logs of others.
+    encoding : ``protobuf``, or in the logs of others ``json`` and ROS 2's ``cdr``.
+    definition : of the schema, as the log has it, without which ``cdr`` cannot be read.
 
     Raises
     ------
     LogError
         Where the schema or encoding is not known here, or the bytes are not a message of it.
     """
+    if name in ROS2_PAYLOADS:
+        if encoding != "cdr":
+            raise LogError(f"messages of ROS 2 encoded as {encoding!r} are not read, only cdr")
+        return read_ros2(name, data, definition)
     payload = PAYLOADS.get(name)
     if payload is None:
         raise LogError(f"its schema {name!r} is none that ipsys reads")

@@ -18,12 +18,14 @@ import numpy as np
 from numpy.typing import NDArray
 
 from ipsys_log.errors import LogError
-from ipsys_log.log.codec import PAYLOADS, decode, schema_name
+from ipsys_log.log.codec import decode, payload_type
 from ipsys_log.log.reader import LogReader
-from ipsys_log.messages import CameraCalibration, CompressedImage, Message, RawImage, Run
+from ipsys_log.log.types import Channel
+from ipsys_log.messages import CameraCalibration, CompressedImage, CompressedVideo, Message, RawImage, Run
 
 __all__ = ["Session", "camera_of_topic", "run_of_topic"]
 
+_IMAGES = (CompressedImage, CompressedVideo, RawImage)
 _OWN = re.compile(r"(?:/runs/(?P<run>[a-z][a-z0-9_]*))?/cameras/(?P<camera>[a-z][a-z0-9_]*)/[a-z_]+")
 _RUN = re.compile(r"/runs/(?P<run>[a-z][a-z0-9_]*)/")
 # What a topic's last parts say of an image, and not of which camera took it.
@@ -51,7 +53,7 @@ class Session:
         try:
             self.readers = [self._stack.enter_context(LogReader(path)) for path in paths]
             self._check_overlaps()
-            self.images = self._cameras((CompressedImage, RawImage))
+            self.images = self._cameras(_IMAGES)
             self.calibrations = self._pair_calibrations(self._cameras((CameraCalibration,)))
         except BaseException:
             self._stack.close()
@@ -81,14 +83,13 @@ class Session:
 
     def topics(self, payload: type, run: str | None = None) -> list[str]:
         """Topics of a type of payload: of one run, or with None outside of all runs."""
-        name = schema_name(payload)
         return sorted(
             {
                 topic
                 for reader in self.readers
                 for topic, channel in reader.channels.items()
                 if channel.schema is not None
-                and channel.schema.name == name
+                and payload_type(channel.schema.name) is payload
                 and channel.message_count > 0
                 and run_of_topic(topic) == run
             }
@@ -113,7 +114,7 @@ class Session:
             topic: channel.schema.name
             for reader in self.readers
             for topic, channel in reader.channels.items()
-            if channel.schema is not None and channel.schema.name not in PAYLOADS
+            if channel.schema is not None and payload_type(channel.schema.name) is None
         }
         return [
             f"{topic} ({name})"
@@ -150,12 +151,13 @@ class Session:
         for raw in reader.messages(here, start_ns, end_ns) if here else ():
             channel = reader.channels[raw.topic]
             try:
-                name = channel.schema.name if channel.schema else ""
-                payload = decode(name, raw.data, channel.message_encoding)
+                payload = _decode(channel, raw.data)
             except LogError as error:
                 raise LogError(f"{reader.path}: {raw.topic} at {raw.log_time_ns} ns: {error}") from error
             camera = self._camera_of.get(raw.topic) or camera_of_topic(raw.topic)
-            yield Message(raw.topic, raw.log_time_ns, raw.publish_time_ns, payload, camera)
+            # Who records ROS 2 knows when a message came; when its frame was taken stands within.
+            taken_ns = payload.timestamp if channel.message_encoding == "cdr" else 0
+            yield Message(raw.topic, raw.log_time_ns, taken_ns or raw.publish_time_ns, payload, camera)
 
     def payloads(self, topics: Collection[str]) -> list[Any]:
         return [message.payload for message in self.messages(topics)]
@@ -166,13 +168,13 @@ class Session:
             topic
             for reader in self.readers
             for topic, channel in reader.channels.items()
-            if channel.schema is not None and PAYLOADS.get(channel.schema.name) is Run
+            if channel.schema is not None and payload_type(channel.schema.name) is Run
         }
         return sorted(self.payloads(topics), key=lambda run: run.number)
 
     def _check_overlaps(self) -> None:
         """Logs that follow one another are one; two that speak at once of one thing are not."""
-        images = {topic for payload in (CompressedImage, RawImage) for topic in self.topics(payload)}
+        images = {topic for payload in _IMAGES for topic in self.topics(payload)}
         first: dict[str, LogReader] = {}
         for reader in self.readers:
             for topic in reader.channels:
@@ -223,11 +225,9 @@ class Session:
     def _frame_id(self, topic: str) -> str:
         for reader in self.readers:
             if topic in reader.channels:
-                schema = reader.channels[topic].schema
                 raw = next(reader.messages([topic]), None)
-                if schema is not None and raw is not None:
-                    encoding = reader.channels[topic].message_encoding
-                    return str(decode(schema.name, raw.data, encoding).frame_id)
+                if raw is not None:
+                    return str(_decode(reader.channels[topic], raw.data).frame_id)
         return ""
 
 
@@ -241,6 +241,14 @@ def run_of_topic(topic: str) -> str | None:
     """The run in a topic, or None for what was recorded."""
     match = _RUN.match(topic)
     return match["run"] if match else None
+
+
+def _decode(channel: Channel, data: bytes) -> Any:
+    schema = channel.schema
+    if schema is None:
+        return decode("", data, channel.message_encoding)
+    definition = schema.data if schema.encoding == "ros2msg" else b""
+    return decode(schema.name, data, channel.message_encoding, definition)
 
 
 def _foreign_camera(topic: str) -> str:

@@ -9,6 +9,8 @@ from ipsys_log.errors import IpsysError
 from ipsys_log.messages import RigCamera
 from ipsys_log.sources.frames import Clock, Frame, Open, Say
 from ipsys_log.sources.network import open_network
+from ipsys_log.sources.simulated import open_simulated
+from ipsys_log.sources.usb import open_usb
 
 __all__ = ["OPENERS", "open_source"]
 
@@ -20,6 +22,8 @@ OPENERS: dict[str, Open] = {
     "rtsps": open_network,
     "tcp": open_network,
     "udp": open_network,
+    "usb": open_usb,
+    "sim": open_simulated,
 }
 
 

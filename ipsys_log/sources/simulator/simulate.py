@@ -42,7 +42,7 @@ from ipsys_log.sources.simulator.shutter import exposed
 from ipsys_log.sources.simulator.views import View, prepare_view
 from ipsys_log.units import NS_PER_S
 
-__all__ = ["EPOCH_NS", "build_rig", "drive_start_ns", "simulate"]
+__all__ = ["EPOCH_NS", "build_rig", "drive_start_ns", "driving", "simulate"]
 
 # When the simulated clock starts: 2023-11-14 22:13:20 UTC.
 EPOCH_NS = 1_700_000_000 * NS_PER_S
@@ -186,11 +186,11 @@ def _instants(settings: LabSettings, cameras: Sequence[Camera]) -> Iterator[Inst
     drive, start_ns = plan_drive(settings, cameras), _start_ns(settings, len(sets))
     for time_ns in _times(settings, start_ns, round(settings.drive_s * settings.rate_hz)):
         time_s = (time_ns - start_ns) / NS_PER_S
-        driving = tuple(_driving(drive, marker_id, time_s, settings) for marker_id in drive.ahead_s)
-        yield Instant(time_ns, drive.places_at(time_s), driving)
+        prints = tuple(driving(drive, marker_id, time_s, settings) for marker_id in drive.ahead_s)
+        yield Instant(time_ns, drive.places_at(time_s), prints)
 
 
-def _driving(drive: Drive, marker_id: int, time_s: float, settings: LabSettings) -> Moving:
+def driving(drive: Drive, marker_id: int, time_s: float, settings: LabSettings) -> Moving:
     """A marker on the drive, for the frame of a time after its start."""
     return lambda since_s: place(drive.place_at(marker_id, time_s + since_s), settings)
 

@@ -15,6 +15,7 @@ from ipsys_log.messages import (
     CameraCalibration,
     Color,
     CompressedImage,
+    CompressedVideo,
     Event,
     ImageAnnotations,
     Marker,
@@ -31,6 +32,7 @@ from ipsys_log.stages.detect.decode import decode_grey
 from ipsys_log.stages.detect.edges import Fit
 from ipsys_log.stages.detect.follow import Follow
 from ipsys_log.stages.detect.stock import detect_markers, marker_detector
+from ipsys_log.stages.detect.video import Video
 from ipsys_log.units import NS_PER_S
 
 __all__ = [
@@ -45,7 +47,7 @@ __all__ = [
     "marker_detector",
 ]
 
-READS = (Rig, CameraCalibration, CompressedImage, RawImage)
+READS = (Rig, CameraCalibration, CompressedImage, CompressedVideo, RawImage)
 EDGES, STOCK = CORNERS = ("edges", "stock")
 
 _GREEN = Color(0.1, 0.9, 0.3, 1.0)
@@ -75,6 +77,7 @@ class Detect:
         self._rig: Rig | None = None
         self._lenses: dict[str | None, CameraCalibration] = {}
         self._following: dict[str | None, Follow] = {}
+        self._videos: dict[str | None, Video] = {}
         self._said: dict[str | None, set[int | None]] = {}
 
     def __call__(self, message: Message) -> Iterator[Any]:
@@ -99,6 +102,12 @@ class Detect:
                 "the log has no rig (marker dictionary and length): give one with --rig lab.toml"
             )
         try:
+            if isinstance(message.payload, CompressedVideo):
+                picture = self._picture(message)
+                if picture is None:
+                    yield from self._before_keyframe(message)
+                    return
+                message = replace(message, payload=picture)
             found, width, height = self._find(message, self._rig)
         except FrameError as error:
             text = f"{message.topic}: corrupt frame: {error}"
@@ -108,6 +117,20 @@ class Detect:
         yield from self._unsaid(events)
         yield Markers(message.publish_time_ns, markers, width, height)
         yield _drawing(message.publish_time_ns, markers)
+
+    def _picture(self, message: Message) -> RawImage | None:
+        """The picture in a frame of a video, for which all frames before it are decoded."""
+        if message.camera not in self._videos:
+            self._videos[message.camera] = Video(message.payload.format)
+        return self._videos[message.camera](message.payload)
+
+    def _before_keyframe(self, message: Message) -> Iterator[Event]:
+        """Frames before the first keyframe are no pictures, which is said once."""
+        said = self._said.setdefault(message.camera, set())
+        if None not in said:
+            said.add(None)
+            text = f"{message.topic}: begins before a keyframe; up to that there are no pictures"
+            yield Event(message.publish_time_ns, "no_keyframe", text, message.camera)
 
     def _find(self, message: Message, rig: Rig) -> tuple[list[Marker], int, int]:
         """The markers in a frame, and its width and height."""

@@ -1,0 +1,79 @@
+"""What is attached: ``ipsys cameras``."""
+
+from __future__ import annotations
+
+import json
+import sys
+from pathlib import Path
+from typing import TYPE_CHECKING, Annotated, Any
+
+import typer
+
+from ipsys_log.cli.console import console
+from ipsys_log.cli.options import AsJson
+
+if TYPE_CHECKING:
+    from ipsys_log.sources.usb_tree import Attached
+
+__all__ = ["add_commands"]
+
+_NONE = """no cameras are attached by USB
+  a network camera needs no list: put its address into the rig file, source = "rtsp://..." or "http://..."
+  without any camera, source = "sim:red" plays the simulated lab"""
+
+
+def add_commands(app: typer.Typer) -> None:
+    app.command()(cameras)
+
+
+def cameras(
+    rig: Annotated[
+        Path | None, typer.Option("--rig", help="A rig file: say whether USB carries what it asks for.")
+    ] = None,
+    as_json: AsJson = False,
+) -> None:
+    """List the cameras attached by USB: device, modes, bus and hub; and whether USB carries them all at once.
+
+    Without a rig that is reckoned with each at its largest mode."""
+    from ipsys_log.errors import IpsysError
+    from ipsys_log.rig import load_rig
+    from ipsys_log.sources.bandwidth import advise, demands_of
+
+    if sys.platform != "linux":
+        raise IpsysError("ipsys cameras: only Linux lists them; elsewhere they are usb:0, usb:1 and so on")
+    from ipsys_log.sources.usb_tree import find_cameras
+
+    found = find_cameras()
+    advice = advise(demands_of(found, load_rig(rig) if rig else None))
+    if as_json:
+        print(json.dumps({"cameras": [_plain(camera) for camera in found], "advice": advice}, indent=2))  # noqa: T201
+        return
+    for camera in found:
+        console.print(_describe(camera), markup=False)
+    if not found:
+        console.print(_NONE, markup=False)
+    for line in advice:
+        console.print(line, markup=False)
+
+
+def _plain(camera: Attached) -> dict[str, Any]:
+    plug = camera.plug._asdict() if camera.plug else None
+    return camera._asdict() | {"plug": plug, "modes": [mode._asdict() for mode in camera.modes]}
+
+
+def _describe(camera: Attached) -> str:
+    lines = [f'{camera.name}: source = "usb:{camera.stable or camera.device}"']
+    if camera.stable:
+        lines.append(f"  {camera.device}")
+    if camera.plug:
+        bus, port, speed_mbit_s, hub, _ = camera.plug
+        lines.append(f"  USB bus {bus}, port {port}, {speed_mbit_s:g} Mbit/s; hub: {hub}")
+    rates: dict[tuple[str, int, int], list[float]] = {}
+    for mode in camera.modes:
+        rates.setdefault(mode[:3], []).append(mode.rate_hz)
+    for (name, width, height), each in rates.items():
+        text = ", ".join(f"{rate:.3g}" for rate in sorted(set(each), reverse=True))
+        lines.append(f"  {name:<5}{width:>5} x {height:<5}{text} frames/s")
+    if camera.fault:
+        lines.append(f"  cannot be asked for its modes: {camera.fault}")
+    return "\n".join(lines)

@@ -1,0 +1,102 @@
+"""Markers in a video: the same pictures as FFmpeg's own decoder shows."""
+
+from __future__ import annotations
+
+import subprocess
+from pathlib import Path
+
+import av
+import cv2
+import numpy as np
+import pytest
+from numpy.typing import NDArray
+
+from ipsys_log.errors import FrameError
+from ipsys_log.messages import CompressedVideo, Event, Markers, Message, Rig
+from ipsys_log.sources.packets import pass_through
+from ipsys_log.stages.detect import Detect
+from ipsys_log.stages.detect.video import Video
+from tests.sources.streams import encode, ffmpeg
+
+CODECS = {
+    "h264": ("-c:v", "libx264", "-bf", "0", "-g", "5", "-pix_fmt", "yuv420p"),
+    "h265": ("-c:v", "libx265", "-x265-params", "bframes=0:keyint=5:log-level=none", "-pix_fmt", "yuv420p"),
+}
+
+
+@pytest.fixture
+def pictures(tmp_path: Path) -> Path:
+    """A marker that moves 4 px a frame."""
+    dictionary = cv2.aruco.getPredefinedDictionary(cv2.aruco.DICT_4X4_100)
+    for number in range(12):
+        grey = np.full((240, 330), 220, np.uint8)
+        grey[60:160, 40 + 4 * number : 140 + 4 * number] = cv2.aruco.generateImageMarker(dictionary, 6, 100)
+        cv2.imwrite(str(tmp_path / f"{number:03}.jpg"), grey)
+    return tmp_path
+
+
+def frames(video: Path, name: str) -> list[CompressedVideo]:
+    with av.open(video) as container:
+        packets = pass_through(container, container.streams.video[0])
+        return [CompressedVideo(n, "red", bytes(packet), name) for n, packet in enumerate(packets)]
+
+
+def decoded_by_ffmpeg(video: Path) -> NDArray[np.uint8]:
+    command = [ffmpeg(), "-v", "error", "-i", str(video), "-f", "rawvideo", "-pix_fmt", "yuv420p", "-"]
+    raw = subprocess.run(command, check=True, capture_output=True).stdout
+    return np.frombuffer(raw, np.uint8).reshape(-1, 240 * 330 * 3 // 2)[:, : 240 * 330].reshape(-1, 240, 330)
+
+
+@pytest.mark.parametrize("name", CODECS)
+def test_pictures_are_those_of_ffmpeg(pictures: Path, name: str) -> None:
+    video = encode(pictures, "video.mp4", *CODECS[name])
+    decode = Video(name)
+    seen = [decode(frame) for frame in frames(video, name)]
+    expected = decoded_by_ffmpeg(video)
+    assert len(seen) == len(expected) == 12
+    for picture, true in zip(seen, expected, strict=True):
+        assert picture is not None
+        assert picture.encoding == "mono8"
+        rows = np.frombuffer(picture.data, np.uint8).reshape(picture.height, picture.step)
+        # Studio levels (16 to 235) are stretched to the full scale.
+        full = np.clip((true.astype(float) - 16) * 255 / 219, 0, 255)
+        assert np.abs(rows[:, : picture.width] - full).max() <= 1.0
+
+
+def run(detect: Detect, video: list[CompressedVideo]) -> list[object]:
+    list(detect(Message("/rig", 0, 0, Rig("lab", "DICT_4X4_100", 0.2))))
+    found: list[object] = []
+    for frame in video:
+        found += detect(Message("/cameras/red/image", frame.timestamp, frame.timestamp, frame, "red"))
+    return found
+
+
+def test_markers_are_found_from_the_first_keyframe_on(pictures: Path) -> None:
+    video = frames(encode(pictures, "video.mp4", *CODECS["h264"]), "h264")
+    found = run(Detect("stock"), video[2:])
+    events = [payload for payload in found if isinstance(payload, Event)]
+    assert [(event.kind, event.timestamp, event.camera) for event in events] == [("no_keyframe", 2, "red")]
+    seen = [payload for payload in found if isinstance(payload, Markers)]
+    assert [frame.timestamp for frame in seen] == [5, 6, 7, 8, 9, 10, 11]
+    # The marker's first corner, where it was drawn.
+    for frame in seen:
+        (marker,) = frame.markers
+        assert marker.id == 6
+        assert np.abs(marker.corners_px[0] - [39.5 + 4 * frame.timestamp, 59.5]).max() < 0.7
+
+
+def test_what_is_no_video_is_a_corrupt_frame(pictures: Path) -> None:
+    video = frames(encode(pictures, "video.mp4", *CODECS["h264"]), "h264")
+    broken = CompressedVideo(3, "red", b"\x00\x00\x00\x01\x65nothing of the kind", "h264")
+    found = run(Detect("stock"), [*video[:3], broken, *video[5:]])
+    assert [payload.kind for payload in found if isinstance(payload, Event)] == ["corrupt_frame"]
+    assert [p.timestamp for p in found if isinstance(p, Markers)] == [0, 1, 2, *range(5, 12)]
+    with pytest.raises(FrameError, match="video format 'vp9' is not read"):
+        Video("vp9")
+
+
+def test_a_picture_that_needs_a_later_one_is_named(pictures: Path) -> None:
+    video = frames(encode(pictures, "video.mp4", *CODECS["h264"], "-bf", "2"), "h264")
+    events = [payload for payload in run(Detect("stock"), video) if isinstance(payload, Event)]
+    assert events
+    assert "turn off B-frames" in events[0].text

@@ -82,7 +82,9 @@ class FinishedLog:
         self.path, self.rig = path, rig
         self._session = session
         self.start_ns = session.start_ns
-        self._topics = {payload: _newest(session, payload) for payload in (CameraPoints, Markers)}
+        self._topics: dict[type, list[str]] = {
+            payload: _newest(session, payload) for payload in (CameraPoints, Markers)
+        }
         cameras = {str(camera_of_topic(topic)) for topic in self._topics[CameraPoints]}
         self._cameras = sorted({*session.images, *cameras})
         self._seen: dict[int, list[View]] = {}
@@ -92,7 +94,7 @@ class FinishedLog:
         self.stops = _find_stops(gather_sightings(session.messages(self._topics[CameraPoints])), rig)
         if not self.stops:
             raise IpsysError(
-                f"{path}: no marker of the rig lies still in it for two frames or longer, so there is nothing "
+                f"{path}: no marker of the rig lies still in it for two frames or longer: there is nothing "
                 "to measure; lay markers down while recording"
             )
 
@@ -163,12 +165,12 @@ class FinishedLog:
             return None
 
 
-def add_sheet(scene: FinishedLog, path: Path) -> tuple[list[Measurement], list[str]]:
+def add_sheet(scene: FinishedLog, path: Path) -> list[str]:
     """Append the measurements of a sheet: all of them, or none.
 
     Returns
     -------
-    The measurements, and what to look at again, by line.
+    What to look at again, by line.
 
     Raises
     ------
@@ -184,8 +186,9 @@ def add_sheet(scene: FinishedLog, path: Path) -> tuple[list[Measurement], list[s
     for row, (entry, wrong), stop in zip(rows, read, found, strict=True):
         if isinstance(stop, str) and stop:
             faults.append((row.line, stop))
-        known = isinstance(stop, int) and entry.marker_id is not None
-        sight = look(scene.views(stop), entry.marker_id) if known else None
+        sight = None
+        if isinstance(stop, int) and entry.marker_id is not None:
+            sight = look(scene.views(stop), entry.marker_id)
         history = [*scene.history(), *measurements]
         checked = check_entry(entry, wrong, scene.rig, sight, history, scene.model)
         faults += [(row.line, fault.text) for fault in checked.faults]
@@ -194,7 +197,7 @@ def add_sheet(scene: FinishedLog, path: Path) -> tuple[list[Measurement], list[s
             measurements.append(checked.measurement)
     refuse_rows(path, faults)
     scene.add(measurements)
-    return measurements, warnings
+    return warnings
 
 
 def _newest(session: Session, payload: type) -> list[str]:

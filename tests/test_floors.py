@@ -15,13 +15,15 @@ FLOORS = {
     "geometry": 1,
     "models": 2, "log": 2,
     "stages": 3, "offline": 3, "sources": 3, "sinks": 3, "formats": 3,
+    "measuring": 3,
     "request": 4, "runs": 4, "output": 4, "lookup": 4, "tasks": 4, "remarks": 4, "perform": 4, "preflight": 4,
-    "pipeline": 4, "report": 4,
+    "pipeline": 4, "finished": 4, "report": 4, "web": 4,
     "cli": 5, "__main__": 6, "__init__": 6,
 }  # fmt: skip
 # On one floor, only downwards in this order.
 ORDER_IN_PIPELINE = [
-    "request", "runs", "output", "lookup", "tasks", "remarks", "perform", "preflight", "pipeline", "report",
+    "request", "runs", "output", "lookup", "tasks", "remarks", "perform", "preflight", "pipeline",
+    "finished", "report", "web",
 ]  # fmt: skip
 
 

@@ -4,14 +4,15 @@ from __future__ import annotations
 
 import re
 from collections.abc import Iterable, Iterator, Mapping
-from dataclasses import dataclass, field
+from dataclasses import dataclass
 from typing import NamedTuple
 
 import numpy as np
 
+from ipsys_log.errors import IpsysError
 from ipsys_log.geometry.multilateration import sides_alike
 from ipsys_log.geometry.trilateration import SIDES
-from ipsys_log.messages import Distance, Rig
+from ipsys_log.messages import Distance, ReferencePoint, Rig
 from ipsys_log.units import CM_PER_M
 
 __all__ = ["Entry", "Fault", "Typed", "check_references", "needs_side", "read_typed"]
@@ -56,7 +57,7 @@ class Entry:
     height_m: float | None
     splits: tuple[str, ...] = ()
     id: str | None = None
-    doubts: tuple[str, ...] = field(default=())
+    doubts: tuple[str, ...] = ()
 
 
 def check_references(rig: Rig) -> None:
@@ -67,11 +68,9 @@ def check_references(rig: Rig) -> None:
     IpsysError
         Where the rig has fewer than two reference points.
     """
-    from ipsys_log.errors import IpsysError
-
     count = len(rig.reference_points)
     if count < 2:
-        has = "no reference points" if count == 0 else f"only the reference point {rig.reference_points[0].name}"
+        has = f"only the reference point {rig.reference_points[0].name}" if count else "no reference points"
         raise IpsysError(
             f"the rig has {has} to lay the tape from: write two or more as [[reference_points]] into "
             "lab.toml and give it with --rig"
@@ -80,7 +79,8 @@ def check_references(rig: Rig) -> None:
 
 def needs_side(rig: Rig, names: Iterable[str]) -> bool:
     """Whether the side must be told where the tape was laid from these reference points."""
-    at_m = [(p.x_m, p.y_m) for p in rig.reference_points if p.name in set(names)]
+    given = set(names)
+    at_m = [(p.x_m, p.y_m) for p in rig.reference_points if p.name in given]
     return len(at_m) >= 2 and sides_alike(np.array(at_m))
 
 
@@ -109,10 +109,11 @@ def read_typed(typed: Typed, rig: Rig) -> tuple[Entry, list[Fault]]:
         side = None
     elif side is None and needs_side(rig, (d.reference for d in distances)):
         faults.append(Fault("side", f"left or right of the line from {_line(rig, distances)}?"))
-    splits = tuple(typed.split.split())
-    for name, texts in (("split", splits), ("id", (typed.id.strip(),) if typed.id.strip() else ())):
-        faults += [Fault(name, f"{name} {t!r}: use letters, digits and _") for t in texts if not _NAME.fullmatch(t)]
-    entry = Entry(marker_id, distances, side, height_m, splits, typed.id.strip() or None, tuple(doubts))
+    splits, name = tuple(typed.split.split()), typed.id.strip() or None
+    for key, texts in (("split", splits), ("id", (name,) if name else ())):
+        bad = [text for text in texts if not _NAME.fullmatch(text)]
+        faults += [Fault(key, f"{key} {text!r}: use letters, digits and _") for text in bad]
+    entry = Entry(marker_id, distances, side, height_m, splits, name, tuple(doubts))
     return entry, faults
 
 
@@ -125,7 +126,8 @@ def _line(rig: Rig, distances: tuple[Distance, ...]) -> str:
 def _marker(text: str, rig: Rig, faults: list[Fault]) -> int | None:
     text = text.strip()
     if not re.fullmatch(r"\d{1,6}", text):
-        faults.append(Fault("marker", f"marker {text!r}: give the id, a whole number" if text else "which marker?"))
+        what = f"marker {text!r}: give the id, a whole number" if text else "which marker?"
+        faults.append(Fault("marker", what))
         return None
     if not rig.knows(int(text)):
         known = ", ".join(str(marker.id) for marker in rig.markers)
@@ -136,34 +138,39 @@ def _marker(text: str, rig: Rig, faults: list[Fault]) -> int | None:
 
 def _distances(typed: Typed, rig: Rig, faults: list[Fault], doubts: list[str]) -> Iterator[Distance]:
     given = {name: text.strip() for name, text in typed.distances.items() if text.strip()}
+    count = len(rig.reference_points)
     for point in rig.reference_points:
         text = given.pop(point.name, "")
-        name = f"d_{point.name}"
-        what = f"d to {point.name}"
-        if not text:
-            # Of more than two, any two will do.
-            if len(rig.reference_points) == 2:
-                faults.append(Fault(name, f"{what}?"))
-            continue
-        value_cm = _number(text, what, name, faults)
-        if value_cm is None:
-            continue
-        longest_m = _reach_m(rig, point.x_m, point.y_m)
-        if value_cm == 0:
-            faults.append(Fault(name, f"{what}: a distance is above 0"))
-        elif value_cm < _NEAR_CM and _METRES.fullmatch(text):
-            faults.append(Fault(name, f"{what}: {text} cm looks like metres; type {value_cm * CM_PER_M:g}"))
-        elif value_cm > longest_m * CM_PER_M:
-            in_mm = f"; in mm? Then type {value_cm / 10:g}" if value_cm / 10 <= longest_m * CM_PER_M else ""
-            faults.append(Fault(name, f"{what}: {text} cm is further than the floor reaches{in_mm}"))
-        else:
-            if value_cm < _NEAR_CM:
-                doubts.append(f"{text} cm is very near to {point.name}: is it in metres?")
-            yield Distance(point.name, value_cm / CM_PER_M)
+        if text:
+            value_cm = _number(text, f"d to {point.name}", f"d_{point.name}", faults)
+            fault = None if value_cm is None else _distance_fault(text, value_cm, point, rig)
+            if fault is not None:
+                faults.append(fault)
+            elif value_cm is not None:
+                if value_cm < _NEAR_CM:
+                    doubts.append(f"{text} cm is very near to {point.name}: is it in metres?")
+                yield Distance(point.name, value_cm / CM_PER_M)
+        elif count == 2:  # of more, any two will do
+            faults.append(Fault(f"d_{point.name}", f"d to {point.name}?"))
     for name in given:
         faults.append(Fault(f"d_{name}", f"{name} is no reference point of the rig"))
-    if len(rig.reference_points) > 2 and len([t for t in typed.distances.values() if t.strip()]) < 2:
+    if count > 2 and sum(bool(text.strip()) for text in typed.distances.values()) < 2:
         faults.append(Fault("", "give two distances or more"))
+
+
+def _distance_fault(text: str, value_cm: float, point: ReferencePoint, rig: Rig) -> Fault | None:
+    """Why a number cannot be a distance in cm."""
+    longest_cm = _reach_m(rig, point.x_m, point.y_m) * CM_PER_M
+    if value_cm == 0:
+        why = "a distance is above 0"
+    elif value_cm < _NEAR_CM and _METRES.fullmatch(text):
+        why = f"{text} cm looks like metres; type {value_cm * CM_PER_M:g}"
+    elif value_cm > longest_cm:
+        in_mm = f"; in mm? Then type {value_cm / 10:g}" if value_cm / 10 <= longest_cm else ""
+        why = f"{text} cm is further than the floor reaches{in_mm}"
+    else:
+        return None
+    return Fault(f"d_{point.name}", f"d to {point.name}: {why}")
 
 
 def _reach_m(rig: Rig, x_m: float, y_m: float) -> float:

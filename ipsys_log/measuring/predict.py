@@ -58,7 +58,9 @@ def predict(model: Model, points_m: Mapping[str, Array], world_m: Array) -> tupl
         sigmas_m = np.zeros(1) if covariances_m2 is None else np.sqrt(covariances_m2[:, 2, 2])
         inside = one.inside(here_m, there_m, sigmas_m)
         off_m = float(np.linalg.norm(there_m[0] - world_m))
-        found.append(Prediction(camera, there_m[0], off_m, sigma_m, None if inside is None else bool(inside[0])))
+        found.append(
+            Prediction(camera, there_m[0], off_m, sigma_m, None if inside is None else bool(inside[0]))
+        )
     return tuple(found)
 
 

@@ -40,7 +40,7 @@ def read_sheet(path: Path, rig: Rig, start_ns: int) -> list[SheetRow]:
 
     Parameters
     ----------
-    path : of the sheet: UTF-8, cells parted by commas, or by semicolons (then a comma may be a decimal point).
+    path : of the sheet: UTF-8, cells parted by commas, or by semicolons (then a comma may be a decimal one).
     rig : whose reference points name the columns ``d_A_cm``, ``d_B_cm`` ...
     start_ns : when the log begins; a plain number as ``time`` is in seconds after that.
 
@@ -122,8 +122,8 @@ def find_stops(
             yield _timed(row.time_ns, marker_id, stops)
         elif len(own) != len(in_order[marker_id]):
             yield (
-                f"marker {marker_id} lies still {len(own)} times, but {len(in_order[marker_id])} rows name no place "
-                "or time: fill in place, as ipsys measure LOG --places numbers them"
+                f"marker {marker_id} lies still {len(own)} times, but {len(in_order[marker_id])} rows name "
+                "no place or time: fill in place, as ipsys measure LOG --places numbers them"
             )
         else:
             yield own[in_order[marker_id].index(row.line)]
@@ -183,9 +183,7 @@ def _row(line: int, cell: dict[str, str], start_ns: int) -> SheetRow:
         cell.get("id", ""),
     )
     place, time = cell.get("place", ""), cell.get("time", "")
-    if place and not place.isascii():
-        raise IpsysError(f"place {place!r} is no whole number")
-    if place and not place.isdecimal():
+    if place and not (place.isascii() and place.isdecimal()):
         raise IpsysError(f"place {place!r} is no whole number")
     return SheetRow(line, typed, int(place) if place else None, _time_ns(time, start_ns) if time else None)
 

@@ -18,7 +18,7 @@ Array = NDArray[np.float64]
 _ACROSS_M = 0.01
 _ALONG_M = 0.04
 _GAP_NS = 2 * NS_PER_S
-# What creeps past slowly stays within these bounds for a while, but its later half lies beside its earlier one.
+# What creeps past stays within these bounds for a while, but its later half lies beside its earlier one.
 _DRIFT_M = 0.005
 # Of one sighting nobody can tell.
 FEWEST = 2

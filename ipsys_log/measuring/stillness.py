@@ -19,7 +19,10 @@ _ACROSS_M = 0.01
 _ALONG_M = 0.04
 _GAP_NS = 2 * NS_PER_S
 # What creeps past stays within these bounds for a while, but its later half lies beside its earlier one.
-_DRIFT_M = 0.005
+# Halves of few sightings are less well known.
+_DRIFT_M, _DRIFT_OF_ONE_M = 0.002, 0.004
+# Slow motion looks still for shorter than this; but not if the marker was not seen before and after.
+_SHORTEST_NS = NS_PER_S
 # Of one sighting nobody can tell.
 FEWEST = 2
 
@@ -40,7 +43,7 @@ def lies_still(points_m: Array) -> bool:
     rays = points_m[:, :2] / points_m[:, 2:]
     half = len(rays) // 2
     drift_m = (rays[-half:].mean(axis=0) - rays[:half].mean(axis=0)) * points_m[:, 2].mean()
-    return float(np.hypot(*drift_m)) <= _DRIFT_M
+    return float(np.hypot(*drift_m)) <= _DRIFT_M + _DRIFT_OF_ONE_M / np.sqrt(len(rays))
 
 
 def _near(points_m: Array, place_m: Array) -> NDArray[np.bool_]:
@@ -104,12 +107,12 @@ def _between(sightings: Sightings, start_ns: int, end_ns: int) -> Array:
 def _camera_stretches(sightings: Sightings) -> Iterator[tuple[int, int]]:
     """The stretches in which one camera sees a marker lie still."""
     times_ns, points_m = sightings.times_ns, sightings.points_m
-    whole = np.append(np.flatnonzero(np.diff(times_ns) > _GAP_NS), len(times_ns) - 1) + 1
+    ends = np.append(np.flatnonzero(np.diff(times_ns) > _GAP_NS), len(times_ns) - 1) + 1
     rays = (points_m[:, :2] / points_m[:, 2:]).tolist()
     depths_m = points_m[:, 2].tolist()
     first = 0
     while first < len(times_ns):
-        end = int(whole[np.searchsorted(whole, first, "right")])
+        end = int(ends[np.searchsorted(ends, first, "right")])
         stop = _first_away(rays, depths_m, first, end)
         if stop - first < FEWEST or not lies_still(points_m[first:stop]):
             first += 1
@@ -121,7 +124,10 @@ def _camera_stretches(sightings: Sightings) -> Iterator[tuple[int, int]]:
         done = first + middle + int(np.flatnonzero(np.append(~near[middle:], True))[0])
         if not lies_still(points_m[begin:done]):
             begin, done = first, stop
-        yield int(times_ns[begin]), int(times_ns[done - 1])
+        start_ns, end_ns = int(times_ns[begin]), int(times_ns[done - 1])
+        alone = done == end and (begin == 0 or begin in ends)
+        if alone or end_ns - start_ns >= _SHORTEST_NS:
+            yield start_ns, end_ns
         first = max(done, stop)
 
 

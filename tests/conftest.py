@@ -15,7 +15,11 @@ import pytest
 os.environ.setdefault("OPENBLAS_NUM_THREADS", "1")
 
 from ipsys_log.cli import main
+from ipsys_log.log.session import Session
+from ipsys_log.messages import Measurement
 from ipsys_log.output import write_log
+from ipsys_log.pipeline import replay
+from ipsys_log.request import Request
 from ipsys_log.sources.simulator import LabSettings, simulate
 
 ROOT = Path(__file__).resolve().parent.parent
@@ -78,3 +82,29 @@ def data_section(path: Path) -> bytes:
     whole = path.read_bytes()
     summary_start = int.from_bytes(whole[-28:-20], "little")
     return whole[: summary_start - 13]
+
+
+class Unmeasured(NamedTuple):
+    """A session whose markers were detected, but nobody has measured; and what the tape would say."""
+
+    log: Path
+    tape: list[Measurement]
+
+
+@pytest.fixture(scope="session")
+def unmeasured_log(lab_log: Path, tmp_path_factory: pytest.TempPathFactory) -> Unmeasured:
+    """The small simulated session without its measurements, to be copied before it is changed."""
+    path = tmp_path_factory.mktemp("unmeasured") / "lab.mcap"
+    with Session([lab_log]) as session:
+        tape = session.payloads(session.topics(Measurement))
+        topics = [topic for reader in session.readers for topic in reader.channels]
+        messages = session.messages(topics)
+        write_log(path, (m for m in messages if not isinstance(m.payload, Measurement)))
+    replay([path], Request(), "camera-frame")
+    return Unmeasured(path, tape)
+
+
+@pytest.fixture
+def unmeasured(unmeasured_log: Unmeasured, tmp_path: Path) -> Unmeasured:
+    """A copy of the session that nobody has measured."""
+    return unmeasured_log._replace(log=Path(shutil.copy(unmeasured_log.log, tmp_path / "lab.mcap")))

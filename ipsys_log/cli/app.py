@@ -4,7 +4,20 @@ from __future__ import annotations
 
 import typer
 
-from ipsys_log.cli import align, cameras, compare, derive, imports, inspect, plan, record, report, setup, view
+from ipsys_log.cli import (
+    align,
+    cameras,
+    compare,
+    derive,
+    imports,
+    inspect,
+    measure,
+    plan,
+    record,
+    report,
+    setup,
+    view,
+)
 
 app = typer.Typer(
     name="ipsys",
@@ -15,7 +28,7 @@ app = typer.Typer(
     pretty_exceptions_enable=False,
     context_settings={"help_option_names": ["-h", "--help"]},
 )
-for module in (setup, cameras, align, imports, record, derive, plan, report, inspect, compare, view):
+for module in (setup, cameras, align, imports, record, measure, derive, plan, report, inspect, compare, view):
     module.add_commands(app)
 
 

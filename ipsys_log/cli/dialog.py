@@ -1,0 +1,166 @@
+"""Measuring in the terminal: one question after the other."""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Iterator
+from itertools import count
+from typing import TYPE_CHECKING
+
+import typer
+
+from ipsys_log.cli.console import console
+
+if TYPE_CHECKING:
+    from ipsys_log.measuring.check import Checked
+    from ipsys_log.measuring.entry import Typed
+    from ipsys_log.measuring.scene import Scene
+
+__all__ = ["ask_places"]
+
+_HELP = "centimetres, such as 123.4; a begins the place anew, s skips it, u undoes the last one, q ends"
+_LETTERS = ("a", "s", "u", "q")
+
+
+class _LetterError(Exception):
+    """A letter was typed instead of a number."""
+
+
+def ask_places(scene: Scene) -> None:
+    """Go through the places that are not measured yet; of a recording, through what is there, until ``q``."""
+    from ipsys_log.measuring.entry import check_references
+    from ipsys_log.offline.pairs import active_measurements
+
+    check_references(scene.rig)
+    console.print(_HELP, style="dim", markup=False)
+    for stop in _stops(scene):
+        if stop is not None and any(map(scene.stops[stop].covers, active_measurements(scene.history()))):
+            continue
+        if not _ask_place(scene, stop):
+            return
+    console.print("no more places in this log")
+
+
+def _stops(scene: Scene) -> Iterator[int | None]:
+    yield from range(len(scene.stops)) if scene.stops else (None for _ in count())
+
+
+def _ask_place(scene: Scene, stop: int | None) -> bool:
+    """Ask until a place is measured or skipped; False to end."""
+    from ipsys_log.errors import IpsysError
+
+    while True:
+        try:
+            if _measure(scene, stop):
+                return True
+        except _LetterError as left:
+            letter = str(left)
+            if letter == "q":
+                return False
+            if letter == "s":
+                return True
+            if letter == "u":
+                try:
+                    _undo(scene)
+                except IpsysError as error:
+                    console.print(str(error), style="red", markup=False)
+
+
+def _measure(scene: Scene, stop: int | None) -> bool:
+    """Ask for one place and append it; False where it is to be asked for again."""
+    from ipsys_log.measuring.check import check_entry
+    from ipsys_log.measuring.entry import read_typed
+    from ipsys_log.measuring.scene import look
+
+    typed = _ask(scene, stop)
+    entry, faults = read_typed(typed, scene.rig)
+    sight = None if entry.marker_id is None else look(scene.views(stop), entry.marker_id)
+    checked = check_entry(entry, faults, scene.rig, sight, scene.history(), scene.model)
+    _show(checked)
+    if checked.measurement is None:
+        return False
+    if _text(f"save {checked.id}? [Y/n]", lambda answer: answer.lower() in ("", "y", "n")).lower() == "n":
+        return False
+    scene.add([checked.measurement])
+    console.print(f"{checked.id} is in the log", style="green", markup=False)
+    return True
+
+
+def _ask(scene: Scene, stop: int | None) -> Typed:
+    from ipsys_log.measuring.entry import Typed, needs_side
+    from ipsys_log.measuring.scene import look, visible_markers
+
+    console.print()
+    if stop is None:
+        visible = visible_markers(scene.views(None), scene.rig)
+        console.print(f"markers seen: {', '.join(map(str, visible)) or 'none'}", markup=False)
+        marker = _text("marker", str.isdecimal, str(visible[0]) if len(visible) == 1 else "")
+    else:
+        here = scene.stops[stop]
+        marker = str(here.marker_id)
+        console.print(f"Place {stop + 1} of {len(scene.stops)}", style="bold")
+    sight = look(scene.views(stop), int(marker))
+    console.print(sight.text, style="green" if sight.state == "still" else "yellow", markup=False)
+    names = [point.name for point in scene.rig.reference_points]
+    # Of more than two reference points any two will do.
+    may_lack = len(names) > 2
+    distances = {name: _number(f"from {name}, cm", may_lack) for name in names}
+    given = [name for name in names if distances[name]]
+    side = ""
+    if needs_side(scene.rig, given):
+        question = f"from {given[0]} to {given[1]}, it lies left or right? [l/r]"
+        letter = _text(question, lambda answer: answer[:1].lower() in ("l", "r") and answer != "")
+        side = "left" if letter[0].lower() == "l" else "right"
+    return Typed(marker, distances, side, _number("height, cm", False))
+
+
+def _number(question: str, may_lack: bool) -> str:
+    def fits(answer: str) -> bool:
+        return (not answer and may_lack) or answer.replace(",", ".").replace(".", "", 1).isdecimal()
+
+    return _text(question, fits)
+
+
+def _text(question: str, fits: Callable[[str], bool], default: str = "") -> str:
+    while True:
+        try:
+            answer = str(typer.prompt(question, default=default, show_default=bool(default))).strip()
+        except (typer.Abort, EOFError):
+            raise _LetterError("q") from None
+        if fits(answer):
+            return answer
+        if answer.lower() in _LETTERS:
+            raise _LetterError(answer.lower())
+        console.print(_HELP, style="yellow", markup=False)
+
+
+def _show(checked: Checked) -> None:
+    from ipsys_log.units import CM_PER_M
+
+    for fault in checked.faults:
+        console.print(fault.text, style="red", markup=False)
+    if checked.point_m is not None:
+        x_m, y_m, z_m = checked.point_m.tolist()
+        known = "" if checked.sigma_m is None else f" +- {checked.sigma_m * CM_PER_M:.1f} cm"
+        where = "" if checked.on_floor is None else ", on the floor" if checked.on_floor else ""
+        console.print(
+            f"x {x_m:.3f} m, y {y_m:.3f} m{known}, {z_m * CM_PER_M:.1f} cm high{where}", markup=False
+        )
+    for name, off_m in checked.residuals_m:
+        console.print(f"  {name} disagrees by {off_m * CM_PER_M:+.1f} cm", markup=False)
+    for one in checked.predictions:
+        console.print(f"  model of {one.camera}: {one.off_m * CM_PER_M:.1f} cm off", markup=False)
+    for text in checked.warnings:
+        console.print(text, style="yellow", markup=False)
+
+
+def _undo(scene: Scene) -> None:
+    """Withdraw the last measurement that counts."""
+    from ipsys_log.measuring.check import withdraw
+    from ipsys_log.offline.pairs import active_measurements
+
+    active = active_measurements(scene.history())
+    if not active:
+        console.print("nothing is measured yet", style="yellow")
+        return
+    scene.add([withdraw(scene.history(), active[-1].id)])
+    console.print(f"{active[-1].id} is withdrawn", style="green", markup=False)

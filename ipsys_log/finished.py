@@ -1,0 +1,232 @@
+"""Measuring on a finished log: its places one after the other, and measurements appended at their time."""
+
+from __future__ import annotations
+
+from collections.abc import Iterator, Mapping, Sequence
+from contextlib import contextmanager
+from pathlib import Path
+
+import cv2
+import numpy as np
+
+from ipsys_log.errors import FrameError, IpsysError, LogError
+from ipsys_log.log import LogWriter
+from ipsys_log.log.session import Session, camera_of_topic
+from ipsys_log.measuring.check import check_entry
+from ipsys_log.measuring.entry import check_references, read_typed
+from ipsys_log.measuring.scene import Stop, View, look
+from ipsys_log.measuring.sheet import find_stops, read_sheet, refuse_rows
+from ipsys_log.measuring.stillness import still_stretches
+from ipsys_log.messages import (
+    MEASUREMENTS_TOPIC,
+    CameraPoints,
+    CompressedImage,
+    Markers,
+    Measurement,
+    Message,
+    Model,
+    Rig,
+)
+from ipsys_log.offline.pairs import Sightings, gather_sightings
+from ipsys_log.output import write_messages
+from ipsys_log.pipeline import replay
+from ipsys_log.request import Progress, Request
+from ipsys_log.runs import newest_run
+from ipsys_log.stages.detect import decode_grey
+from ipsys_log.units import NS_PER_S
+
+__all__ = ["FinishedLog", "add_sheet", "opened_log"]
+
+# How far the log time of a frame can lie from the time that its geometry speaks of, and how far before the
+# exposure of a marker that of its frame.
+_LATE_NS = 2 * NS_PER_S
+_ROLLING_NS = NS_PER_S // 10
+# Stretches whose pictures are kept: each is asked for with every key that is typed.
+_KEPT = 4
+
+
+@contextmanager
+def opened_log(
+    path: Path,
+    request: Request,
+    progress: Progress = lambda stage, done, total: None,
+) -> Iterator[FinishedLog]:
+    """Open a log for measuring; markers and camera points that it lacks are made and appended first.
+
+    Parameters
+    ----------
+    path : a finished log.
+    request : its rig and lenses are used instead of the log's.
+
+    Raises
+    ------
+    IpsysError
+        For a log that cannot be written to, a rig without two reference points, or a log in which no marker
+        of the rig lies still.
+    """
+    with LogWriter.append(path) as writer:
+        writer.abandon()
+    with Session([path]) as session:
+        rigs = [request.rig] if request.rig is not None else session.payloads(session.topics(Rig))
+        if rigs:
+            check_references(rigs[-1])
+    replay([path], request, "camera-frame", progress=progress)
+    with Session([path]) as session:
+        yield FinishedLog(path, session, rigs[-1])
+
+
+class FinishedLog:
+    """A finished log as a :class:`~ipsys_log.measuring.scene.Scene`."""
+
+    def __init__(self, path: Path, session: Session, rig: Rig) -> None:
+        self.path, self.rig = path, rig
+        self._session = session
+        self.start_ns = session.start_ns
+        self._topics: dict[type, list[str]] = {
+            payload: _newest(session, payload) for payload in (CameraPoints, Markers)
+        }
+        cameras = {str(camera_of_topic(topic)) for topic in self._topics[CameraPoints]}
+        self._cameras = sorted({*session.images, *cameras})
+        self._seen: dict[int, list[View]] = {}
+        models = session.payloads(_newest(session, Model))
+        self.model: Model | None = models[-1] if models else None
+        self._history = list(session.messages(session.topics(Measurement)))
+        self.stops = _find_stops(gather_sightings(session.messages(self._topics[CameraPoints])), rig)
+        if not self.stops:
+            raise IpsysError(
+                f"{path}: no marker of the rig lies still in it for two frames or longer: there is nothing "
+                "to measure; lay markers down while recording"
+            )
+
+    def views(self, stop: int | None) -> list[View]:
+        """What each camera saw in a stretch, and its picture from the middle of it."""
+        number = stop or 0
+        if number not in self._seen:
+            while len(self._seen) >= _KEPT:
+                del self._seen[next(iter(self._seen))]
+            self._seen[number] = [self._view(camera, self.stops[number]) for camera in self._cameras]
+        return self._seen[number]
+
+    def history(self) -> list[Measurement]:
+        return [message.payload for message in self._history]
+
+    def add(self, measurements: Sequence[Measurement]) -> None:
+        """Append measurements at the time of their stretch, withdrawals after what they withdraw.
+
+        Raises
+        ------
+        LogError
+            Where the log is locked or cannot be written to, or another process measured in it meanwhile.
+        """
+        with LogWriter.append(self.path) as writer:
+            with Session([self.path]) as now:
+                held = sum(now.count(topic) for topic in now.topics(Measurement))
+            if held != len(self._history):
+                raise LogError(f"{self.path}: somebody else measured in this log meanwhile; start again")
+            added: list[Message] = []
+            for measurement in measurements:
+                added.append(_message(measurement, [*self._history, *added]))
+            write_messages(writer, added)
+        self._history += added
+
+    def _view(self, camera: str, here: Stop) -> View:
+        middle_ns = here.start_ns + (here.end_ns - here.start_ns) // 2
+        seen = [m for m in self._within(CameraPoints, camera, here) if _sees(m, here)]
+        found = self._within(Markers, camera, here)
+        marked = min(found, key=lambda m: abs(m.publish_time_ns - middle_ns), default=None)
+        jpeg = self._picture(camera, marked.log_time_ns if marked else middle_ns)
+        return View(
+            camera,
+            marked.publish_time_ns if marked else middle_ns,
+            jpeg,
+            marked.payload if marked else None,
+            tuple(message.payload for message in seen),
+        )
+
+    def _within(self, payload: type, camera: str, here: Stop) -> list[Message]:
+        """Messages of a camera that speak of a stretch."""
+        topics = [topic for topic in self._topics[payload] if camera_of_topic(topic) == camera]
+        found = self._session.messages(topics, here.start_ns - _LATE_NS, here.end_ns + _LATE_NS)
+        return [m for m in found if here.start_ns - _ROLLING_NS <= m.publish_time_ns <= here.end_ns]
+
+    def _picture(self, camera: str, log_time_ns: int) -> bytes | None:
+        """The frame of a log time, or the nearest one, as a JPEG."""
+        topic = self._session.images.get(camera)
+        if topic is None:
+            return None
+        times_ns = np.concatenate([r.times(topic) for r in self._session.readers if topic in r.channels])
+        nearest_ns = int(times_ns[np.abs(times_ns - log_time_ns).argmin()])
+        frame = next(self._session.messages([topic], nearest_ns, nearest_ns + 1)).payload
+        if isinstance(frame, CompressedImage) and frame.data[:2] == b"\xff\xd8":
+            return frame.data
+        try:
+            return cv2.imencode(".jpg", decode_grey(frame))[1].tobytes()
+        except FrameError:
+            return None
+
+
+def add_sheet(scene: FinishedLog, path: Path) -> list[str]:
+    """Append the measurements of a sheet: all of them, or none.
+
+    Returns
+    -------
+    What to look at again, by line.
+
+    Raises
+    ------
+    IpsysError
+        Naming every bad row by its line.
+    """
+    rows = read_sheet(path, scene.rig, scene.start_ns)
+    read = [read_typed(row.typed, scene.rig) for row in rows]
+    found = list(find_stops(rows, scene.stops, [entry.marker_id for entry, _ in read]))
+    faults: list[tuple[int, str]] = []
+    warnings: list[str] = []
+    measurements: list[Measurement] = []
+    for row, (entry, wrong), stop in zip(rows, read, found, strict=True):
+        if isinstance(stop, str) and stop:
+            faults.append((row.line, stop))
+        sight = None
+        if isinstance(stop, int) and entry.marker_id is not None:
+            sight = look(scene.views(stop), entry.marker_id)
+        history = [*scene.history(), *measurements]
+        checked = check_entry(entry, wrong, scene.rig, sight, history, scene.model)
+        faults += [(row.line, fault.text) for fault in checked.faults]
+        warnings += [f"line {row.line}: {checked.id}: {text}" for text in checked.warnings]
+        if checked.measurement is not None:
+            measurements.append(checked.measurement)
+    refuse_rows(path, faults)
+    scene.add(measurements)
+    return warnings
+
+
+def _newest(session: Session, payload: type) -> list[str]:
+    run = newest_run(session, payload)
+    return session.topics(payload, run) if run else []
+
+
+def _message(measurement: Measurement, earlier: Sequence[Message]) -> Message:
+    """At the end of its stretch; but what is said of an id is said in order."""
+    end_ns = measurement.timestamp if measurement.still is None else measurement.still.end
+    names = {measurement.id, measurement.withdraws}
+    same = [m.log_time_ns + 1 for m in earlier if {m.payload.id, m.payload.withdraws} & (names - {None})]
+    return Message(MEASUREMENTS_TOPIC, max([end_ns, *same]), measurement.timestamp, measurement)
+
+
+def _find_stops(sightings: Mapping[tuple[str, int], Sightings], rig: Rig) -> list[Stop]:
+    """Where the rig's markers lie still, in order of time."""
+    stops = []
+    for marker_id in sorted({marker_id for _, marker_id in sightings}):
+        if rig.knows(marker_id):
+            seen = {camera: found for (camera, one), found in sightings.items() if one == marker_id}
+            stops += [Stop(marker_id, *stretch) for stretch in still_stretches(seen)]
+    return sorted(stops, key=lambda stop: (stop.start_ns, stop.marker_id))
+
+
+def _sees(message: Message, here: Stop) -> bool:
+    """Whether camera points have the marker of a stretch within it."""
+    return any(
+        point.id == here.marker_id
+        and here.start_ns <= message.publish_time_ns + (point.time_offset_ns or 0) <= here.end_ns
+        for point in message.payload.points
+    )

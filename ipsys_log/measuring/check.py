@@ -1,0 +1,194 @@
+"""Whether a place can be right, before it is written down: triangle, floor, cameras, model."""
+
+from __future__ import annotations
+
+from collections.abc import Iterable, Sequence
+from dataclasses import dataclass, replace
+
+import numpy as np
+from numpy.typing import NDArray
+
+from ipsys_log.errors import IpsysError
+from ipsys_log.geometry.trilateration import SIDES
+from ipsys_log.measuring.doubts import doubt_floor, doubt_model, doubt_tapes, floor_sigma_m, with_tape
+from ipsys_log.measuring.entry import Entry, Fault
+from ipsys_log.measuring.predict import Prediction, predict
+from ipsys_log.measuring.scene import Sight
+from ipsys_log.messages import Measurement, Model, Rig
+from ipsys_log.offline.pairs import active_measurements
+from ipsys_log.offline.tape import TapePoint, world_point
+
+__all__ = ["Checked", "check_entry", "next_id", "withdraw"]
+
+Array = NDArray[np.float64]
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class Checked:
+    """What follows from an entry.
+
+    ``faults`` keep it out of the log, ``warnings`` are to be looked at first. ``point_m`` (3,) is the world
+    point, ``sigma_m`` how well the tape knows it where it knows it least, ``residuals_m`` by reference
+    point where there are more than two. ``sides_m`` are both places (3,) where the side is not told yet.
+    ``measurement`` is None where there are faults.
+    """
+
+    id: str
+    faults: tuple[Fault, ...] = ()
+    warnings: tuple[str, ...] = ()
+    point_m: Array | None = None
+    sigma_m: float | None = None
+    residuals_m: tuple[tuple[str, float], ...] = ()
+    on_floor: bool | None = None
+    predictions: tuple[Prediction, ...] = ()
+    sides_m: tuple[tuple[str, Array], ...] = ()
+    measurement: Measurement | None = None
+
+
+def next_id(history: Iterable[Measurement]) -> str:
+    """The next free id: p001, p002 ... One that was withdrawn is not used again.
+
+    Examples
+    --------
+    >>> next_id([Measurement(0, "p001"), Measurement(0, "p001_withdrawn", withdraws="p001")])
+    'p002'
+    """
+    numbers = [int(m.id[1:]) for m in history if m.id[:1] == "p" and m.id[1:].isdecimal()]
+    return f"p{max(numbers, default=0) + 1:03d}"
+
+
+def withdraw(history: Sequence[Measurement], name: str) -> Measurement:
+    """The message that withdraws a measurement; nothing is erased.
+
+    Raises
+    ------
+    IpsysError
+        Where there is none of that id, or it is withdrawn already.
+    """
+    for measurement in active_measurements(history):
+        if measurement.id == name:
+            return Measurement(measurement.timestamp, f"{name}_withdrawn", withdraws=name)
+    raise IpsysError(f"there is no measurement {name} to withdraw; it is withdrawn already, or never was")
+
+
+def check_entry(
+    entry: Entry,
+    faults: Sequence[Fault],
+    rig: Rig,
+    sight: Sight | None,
+    history: Sequence[Measurement],
+    model: Model | None = None,
+) -> Checked:
+    """Whether a place can be right, and the measurement that it makes.
+
+    Parameters
+    ----------
+    entry, faults : from :func:`~ipsys_log.measuring.entry.read_typed`.
+    rig : that holds now.
+    sight : what the cameras say of the marker, None where it is not known which.
+    history : what was measured and withdrawn so far.
+    model : the present one, to compare with.
+    """
+    name = entry.id or next_id(history)
+    found = [*faults, *_identity_faults(entry, sight, history)]
+    warnings = list(entry.doubts)
+    read = _measurement(entry, name, sight)
+    given = {fault.field for fault in found}
+    missing = {"side", "height", ""} & given or {f for f in given if f.startswith("d_")}
+    if missing == {"side"} and len(entry.distances) >= 2 and entry.height_m is not None:
+        sides_m, fault = _both_sides(read, rig)
+        return Checked(name, tuple(found + fault), tuple(warnings), sides_m=sides_m)
+    if missing or len(entry.distances) < 2 or entry.height_m is None:
+        return Checked(name, tuple(found), tuple(warnings))
+    try:
+        # A usual tape tells how flatly the circles cross; what is written down has no sigma of its own.
+        fixed = world_point(read, with_tape(rig))
+    except IpsysError as error:
+        return Checked(name, (*found, Fault("", _without_id(error, name))), tuple(warnings))
+    on_floor, remark = doubt_floor(read, fixed, rig)
+    warnings += [*remark, *doubt_tapes(read, fixed, rig)]
+    found += _twin_faults(read, history)
+    warnings += _repeat_warnings(read, history) if read.still else []
+    predictions = predict(model, sight.points_m, fixed.world_m) if model and sight else ()
+    warnings += doubt_model(read, fixed, rig, predictions)
+    return Checked(
+        name,
+        tuple(found),
+        tuple(dict.fromkeys(warnings)),
+        fixed.world_m,
+        floor_sigma_m(fixed),
+        _residuals(read, fixed),
+        on_floor,
+        predictions,
+        measurement=None if found else read,
+    )
+
+
+def _measurement(entry: Entry, name: str, sight: Sight | None) -> Measurement:
+    still = sight.still if sight else None
+    time_ns = 0 if still is None else still.start + (still.end - still.start) // 2
+    return Measurement(
+        time_ns,
+        name,
+        marker_id=entry.marker_id,
+        distances=entry.distances,
+        side=entry.side,
+        height_m=entry.height_m,
+        still=still,
+        splits=entry.splits,
+    )
+
+
+def _without_id(error: IpsysError, name: str) -> str:
+    return str(error).removeprefix(f"measurement {name}").removeprefix(": ").strip()
+
+
+def _identity_faults(entry: Entry, sight: Sight | None, history: Sequence[Measurement]) -> list[Fault]:
+    found = []
+    if entry.id is not None and any(entry.id in (m.id, m.withdraws) for m in history):
+        found.append(Fault("id", f"id {entry.id} was used before; leave it out for the next free one"))
+    if sight is not None and sight.still is None:
+        found.append(Fault("marker", sight.text))
+    return found
+
+
+def _twin_faults(read: Measurement, history: Sequence[Measurement]) -> list[Fault]:
+    """The same place typed twice, to the last digit."""
+    for other in active_measurements(history):
+        same = (other.marker_id, other.side, other.height_m) == (read.marker_id, read.side, read.height_m)
+        if same and _overlap(other, read) and _tapes(other) == _tapes(read):
+            return [Fault("", f"this is {other.id} once more, with the very same numbers")]
+    return []
+
+
+def _repeat_warnings(read: Measurement, history: Sequence[Measurement]) -> list[str]:
+    names = [
+        m.id for m in active_measurements(history) if m.marker_id == read.marker_id and _overlap(m, read)
+    ]
+    return [f"marker {read.marker_id} is measured here already, as {', '.join(names)}"] if names else []
+
+
+def _tapes(measurement: Measurement) -> list[tuple[str, float]]:
+    return [(tape.reference, tape.distance_m) for tape in measurement.distances]
+
+
+def _overlap(one: Measurement, other: Measurement) -> bool:
+    spans = [(m.still.start, m.still.end) if m.still else (m.timestamp, m.timestamp) for m in (one, other)]
+    (start, end), (first, last) = spans
+    return start <= last and first <= end
+
+
+def _both_sides(read: Measurement, rig: Rig) -> tuple[tuple[tuple[str, Array], ...], list[Fault]]:
+    """Where it would be on either side; or why the tapes do not meet."""
+    try:
+        places = tuple((side, world_point(replace(read, side=side), rig).world_m) for side in SIDES)
+    except IpsysError as error:
+        return (), [Fault("", _without_id(error, read.id))]
+    return places, []
+
+
+def _residuals(read: Measurement, fixed: TapePoint) -> tuple[tuple[str, float], ...]:
+    if len(read.distances) < 3:
+        return ()
+    names = (tape.reference for tape in read.distances)
+    return tuple(zip(names, fixed.residuals_m.tolist(), strict=True))

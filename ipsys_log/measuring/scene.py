@@ -1,0 +1,142 @@
+"""What measuring is done on, a recording or a finished log, and what its cameras say of a marker."""
+
+from __future__ import annotations
+
+from collections.abc import Iterable, Mapping, Sequence
+from dataclasses import dataclass
+from typing import Protocol
+
+import numpy as np
+from numpy.typing import NDArray
+
+from ipsys_log.measuring.stillness import FEWEST, lies_still
+from ipsys_log.messages import CameraPoints, Interval, Markers, Measurement, Model, Rig
+
+__all__ = ["Scene", "Sight", "Stop", "View", "look", "visible_markers"]
+
+Array = NDArray[np.float64]
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class View:
+    """What a camera sees.
+
+    ``jpeg`` is the picture taken at ``time_ns``, None where there is none, and ``markers`` those found in
+    it. ``points`` are the camera points of the last second, that picture's last; of a finished log those
+    of the whole stretch in which the marker lies still.
+    """
+
+    camera: str
+    time_ns: int
+    jpeg: bytes | None = None
+    markers: Markers | None = None
+    points: tuple[CameraPoints, ...] = ()
+
+
+@dataclass(frozen=True, slots=True)
+class Stop:
+    """A stretch of a finished log, ends included, in which a marker lies still."""
+
+    marker_id: int
+    start_ns: int
+    end_ns: int
+    cameras: tuple[str, ...]
+
+    def covers(self, measurement: Measurement) -> bool:
+        """Whether a measurement is one of this marker in this stretch."""
+        still = measurement.still or Interval(measurement.timestamp, measurement.timestamp)
+        here = still.start <= self.end_ns and still.end >= self.start_ns
+        return measurement.marker_id == self.marker_id and here
+
+
+class Scene(Protocol):
+    """What measuring is done on.
+
+    ``stops`` are the places of a finished log, in order; none while recording. ``model`` is the present
+    one, ``rig`` the one that holds.
+    """
+
+    @property
+    def rig(self) -> Rig: ...
+
+    @property
+    def model(self) -> Model | None: ...
+
+    @property
+    def stops(self) -> Sequence[Stop]: ...
+
+    def views(self, stop: int | None) -> Sequence[View]:
+        """The latest view of every camera, or the views of a stop by its index."""
+        ...
+
+    def history(self) -> Sequence[Measurement]:
+        """Every measurement and withdrawal so far, in the order they were made."""
+        ...
+
+    def add(self, measurements: Sequence[Measurement]) -> None:
+        """Append measurements or withdrawals: all of them, or none and an error."""
+        ...
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class Sight:
+    """What the cameras say of one marker.
+
+    ``still`` is the stretch in which it lies still, None where it moves or is not seen; ``points_m`` its
+    mean camera point (3,) by camera then; ``moving`` are the cameras that see it move.
+    """
+
+    marker_id: int
+    still: Interval | None
+    points_m: Mapping[str, Array]
+    moving: tuple[str, ...] = ()
+
+    @property
+    def state(self) -> str:
+        """``still``, ``moving`` or ``unseen``."""
+        if self.moving:
+            return "moving"
+        return "unseen" if self.still is None else "still"
+
+    @property
+    def text(self) -> str:
+        """The state in words."""
+        name = f"marker {self.marker_id}"
+        if self.moving:
+            return f"{name} moves, as seen by {', '.join(self.moving)}: wait until it lies still"
+        if self.still is None:
+            return f"no camera sees {name}: step back, turn it face up"
+        return f"{name} lies still, seen by {', '.join(self.points_m)}"
+
+
+def look(views: Iterable[View], marker_id: int) -> Sight:
+    """What the cameras say of a marker: whether it lies still, and where.
+
+    Examples
+    --------
+    >>> from ipsys_log.messages import CameraPoint
+    >>> seen = tuple(CameraPoints(n, (CameraPoint(7, 0.1, 0.2, 2.0),)) for n in (100, 200, 300))
+    >>> look([View("red", 300, points=seen), View("white", 300)], 7).text
+    'marker 7 lies still, seen by red'
+    """
+    points_m: dict[str, Array] = {}
+    moving = []
+    times_ns: list[int] = []
+    for view in views:
+        rows = [(p.timestamp, one) for p in view.points for one in p.points if one.id == marker_id]
+        if len(rows) < FEWEST:
+            continue
+        seen_m = np.array([(one.x_m, one.y_m, one.z_m) for _, one in rows])
+        if not lies_still(seen_m):
+            moving.append(view.camera)
+        points_m[view.camera] = seen_m.mean(axis=0)
+        times_ns += [time_ns + (one.time_offset_ns or 0) for time_ns, one in rows]
+    if moving or not times_ns:
+        return Sight(marker_id, None, {}, tuple(moving))
+    return Sight(marker_id, Interval(min(times_ns), max(times_ns)), points_m)
+
+
+def visible_markers(views: Iterable[View], rig: Rig) -> list[int]:
+    """The rig's markers that some camera sees, sorted."""
+    found = {point.id for view in views for points in view.points for point in points.points}
+    return sorted(one for one in found if rig.knows(one))

@@ -1,0 +1,140 @@
+"""The page and its questions: one at a time, so that a scene need not know of threads."""
+
+from __future__ import annotations
+
+import json
+from collections.abc import Mapping
+from importlib.resources import files
+from typing import Any
+
+from starlette.applications import Starlette
+from starlette.requests import Request
+from starlette.responses import JSONResponse, Response
+from starlette.routing import Route
+
+from ipsys_log.errors import IpsysError
+from ipsys_log.measuring.check import Checked, check_entry, withdraw
+from ipsys_log.measuring.entry import Typed, read_typed
+from ipsys_log.measuring.scene import Scene, look
+from ipsys_log.web.answers import checked_json, history_json, scene_json, views_json
+
+__all__ = ["build_app"]
+
+_FILES = {
+    "/": ("measure.html", "text/html"),
+    "/measure.css": ("measure.css", "text/css"),
+    **{f"/{name}.js": (f"{name}.js", "text/javascript") for name in ("measure", "cameras", "floor", "make")},
+}
+_LARGEST = 16 << 10
+# Pictures that were named to a page and may still be asked for.
+_KEPT = 30
+
+
+def build_app(scene: Scene) -> Starlette:
+    """The page of a scene, without a guard; its questions under ``/api``."""
+    questions = _Questions(scene)
+    return Starlette(
+        routes=[
+            *(Route(path, _file(*found)) for path, found in _FILES.items()),
+            Route("/picture/{camera}/{time_ns:int}", questions.picture),
+            Route("/api/scene", questions.scene),
+            Route("/api/views", questions.views),
+            Route("/api/check", questions.check, methods=["POST"]),
+            Route("/api/measure", questions.measure, methods=["POST"]),
+            Route("/api/undo", questions.undo, methods=["POST"]),
+        ],
+        exception_handlers={IpsysError: _refused},
+    )
+
+
+def _file(name: str, kind: str) -> Any:
+    content = files("ipsys_log.web").joinpath(name).read_bytes()
+
+    async def answer(_: Request) -> Response:
+        return Response(content, media_type=kind)
+
+    return answer
+
+
+async def _refused(_: Request, error: Exception) -> Response:
+    return JSONResponse({"error": str(error)}, 400)
+
+
+class _Questions:
+    """Asynchronous, but never waiting in between: one question is answered after the other."""
+
+    def __init__(self, scene: Scene) -> None:
+        self._scene = scene
+        self._pictures: dict[tuple[str, int], bytes] = {}
+
+    async def scene(self, _: Request) -> Response:
+        return JSONResponse({**scene_json(self._scene), "history": history_json(self._scene)})
+
+    async def views(self, request: Request) -> Response:
+        views = self._scene.views(self._stop(request.query_params.get("stop")))
+        for view in views:
+            if view.jpeg is not None:
+                self._pictures[view.camera, view.time_ns] = view.jpeg
+        while len(self._pictures) > max(_KEPT, 2 * len(views)):
+            del self._pictures[next(iter(self._pictures))]
+        marker = request.query_params.get("marker", "")
+        marker_id = int(marker) if marker.isascii() and marker.isdecimal() else None
+        return JSONResponse(views_json(self._scene, views, marker_id))
+
+    async def picture(self, request: Request) -> Response:
+        found = self._pictures.get((request.path_params["camera"], request.path_params["time_ns"]))
+        return Response(status_code=404) if found is None else Response(found, media_type="image/jpeg")
+
+    async def check(self, request: Request) -> Response:
+        return JSONResponse(checked_json(self._checked(await _body(request))))
+
+    async def measure(self, request: Request) -> Response:
+        """Append the place, if nothing speaks against it but what the user has seen and accepted."""
+        body = await _body(request)
+        checked = self._checked(body)
+        accepted = body.get("accepted", [])
+        if checked.measurement is None or not set(checked.warnings) <= set(map(str, accepted)):
+            return JSONResponse(checked_json(checked), 409)
+        self._scene.add([checked.measurement])
+        return JSONResponse({"saved": checked.id, "history": history_json(self._scene)})
+
+    async def undo(self, request: Request) -> Response:
+        name = str((await _body(request)).get("id", ""))
+        self._scene.add([withdraw(self._scene.history(), name)])
+        return JSONResponse({"withdrawn": name, "history": history_json(self._scene)})
+
+    def _checked(self, body: Mapping[str, Any]) -> Checked:
+        scene, distances = self._scene, body.get("distances", {})
+        if not isinstance(distances, dict):
+            raise IpsysError("distances must be an object, by reference point")
+        texts = {name: str(body.get(name, "")) for name in ("marker", "side", "height", "split")}
+        typed = Typed(distances={str(k): str(v) for k, v in distances.items()}, **texts)
+        entry, faults = read_typed(typed, scene.rig)
+        stop = self._stop(body.get("stop"))
+        sight = None
+        if entry.marker_id is not None:
+            sight = look(scene.views(stop), entry.marker_id)
+        return check_entry(entry, faults, scene.rig, sight, scene.history(), scene.model)
+
+    def _stop(self, given: Any) -> int | None:
+        if not self._scene.stops:
+            return None
+        text = str(given)
+        if not (text.isascii() and text.isdecimal() and int(text) < len(self._scene.stops)):
+            raise IpsysError(f"there is no place {text} in this log")
+        return int(text)
+
+
+async def _body(request: Request) -> dict[str, Any]:
+    data = b""
+    async for part in request.stream():
+        data += part
+        if len(data) > _LARGEST:
+            raise IpsysError("that is more than a place needs")
+    try:
+        body = json.loads(data)
+    except ValueError as error:
+        raise IpsysError("this is not JSON") from error
+    if not isinstance(body, dict):
+        raise IpsysError("this is not a JSON object")
+    return body

@@ -1,0 +1,103 @@
+"""Who may use the page: whoever knows the token, through an address of this machine, from the page itself."""
+
+from __future__ import annotations
+
+import hmac
+import ipaddress
+from http.cookies import CookieError, SimpleCookie
+from urllib.parse import parse_qs
+
+from starlette.datastructures import Headers, MutableHeaders
+from starlette.responses import PlainTextResponse, RedirectResponse, Response
+from starlette.types import ASGIApp, Message, Receive, Scope, Send
+
+__all__ = ["HEADER", "Guard"]
+
+# Only a script of the page itself can send this one: a browser asks before it lets another site do so.
+HEADER = "x-ipsys"
+
+_HEADERS = {
+    "Content-Security-Policy": "default-src 'self'; img-src 'self' data:; frame-ancestors 'none'; "
+    "base-uri 'none'; form-action 'self'",
+    "X-Content-Type-Options": "nosniff",
+    "Referrer-Policy": "no-referrer",
+    "Cache-Control": "no-store",
+}
+
+
+class Guard:
+    """Refuses requests before they reach the app.
+
+    Parameters
+    ----------
+    app : what is guarded.
+    names : host names under which this machine is asked for, besides ``localhost`` and plain addresses. A
+        name of somebody else that was made to lead here (DNS rebinding) is refused.
+    token : that the first address has as ``?token=``, and a cookie from then on; None: none is needed.
+    """
+
+    def __init__(self, app: ASGIApp, names: frozenset[str], token: str | None) -> None:
+        self._app, self._token = app, token
+        self._names = names | {"localhost"}
+
+    async def __call__(self, scope: Scope, receive: Receive, send: Send) -> None:
+        if scope["type"] != "http":
+            return
+        refusal = self._refusal(scope)
+        app = self._app if refusal is None else refusal
+
+        async def with_headers(message: Message) -> None:
+            if message["type"] == "http.response.start":
+                headers = MutableHeaders(scope=message)
+                for name, value in _HEADERS.items():
+                    headers[name] = value
+            await send(message)
+
+        await app(scope, receive, with_headers)
+
+    def _refusal(self, scope: Scope) -> Response | None:
+        headers = Headers(scope=scope)
+        host = headers.get("host", "")
+        if not self._is_ours(host):
+            return PlainTextResponse("this address is not one of this machine", 403)
+        if self._token is not None:
+            given = parse_qs(scope["query_string"].decode("latin-1")).get("token", [""])[0]
+            if scope["method"] == "GET" and scope["path"] == "/" and self._fits(given):
+                return self._welcome(scope)
+            if not self._fits(self._cookie(headers, scope)):
+                return PlainTextResponse("open the page by the whole address that ipsys has printed", 403)
+        if scope["method"] not in ("GET", "HEAD"):
+            origin = headers.get("origin")
+            if headers.get(HEADER) != "1" or (origin is not None and origin != f"http://{host}"):
+                return PlainTextResponse("only the page itself may write", 403)
+        return None
+
+    def _is_ours(self, host: str) -> bool:
+        name = host.rpartition(":")[0] if ":" in host and not host.endswith("]") else host
+        try:
+            ipaddress.ip_address(name.strip("[]"))
+        except ValueError:
+            return name.lower() in self._names
+        return True
+
+    def _fits(self, given: str) -> bool:
+        return hmac.compare_digest(given.encode(), (self._token or "").encode())
+
+    def _welcome(self, scope: Scope) -> Response:
+        """Take the token out of the address line, where it would be seen, and leave it as a cookie."""
+        response = RedirectResponse("/", 303)
+        response.set_cookie(self._name(scope), self._token or "", httponly=True, samesite="strict")
+        return response
+
+    def _cookie(self, headers: Headers, scope: Scope) -> str:
+        try:
+            cookies = SimpleCookie(headers.get("cookie", ""))
+        except CookieError:
+            return ""
+        name = self._name(scope)
+        return cookies[name].value if name in cookies else ""
+
+    @staticmethod
+    def _name(scope: Scope) -> str:
+        """Cookies do not tell ports apart: two pages of one machine must not share one."""
+        return f"ipsys_{(scope.get('server') or ('', 0))[1]}"

@@ -1,0 +1,271 @@
+// The measuring page. It draws and asks; what is right is decided by the server alone.
+import { drawCameras } from "./cameras.js";
+import { drawFloor } from "./floor.js";
+import { make } from "./make.js";
+
+const $ = (id) => document.getElementById(id);
+const POLL_MS = 700, WAIT_MS = 250, NOTICE_MS = 6000;
+const cm = (value, digits = 1) => value.toFixed(digits);
+let lab, history, view = { cameras: [] }, found = {}, stop = null, asked = 0, timer, noticeTimer;
+
+async function ask(path, body) {
+  const options = body && {
+    method: "POST",
+    headers: { "Content-Type": "application/json", "X-Ipsys": "1" },
+    body: JSON.stringify(body),
+  };
+  let answer;
+  try {
+    answer = await fetch(`api/${path}`, options);
+  } catch {
+    throw new Error("The computer does not answer: is ipsys still running, are you in its network?");
+  }
+  const kind = answer.headers.get("content-type") ?? "";
+  const content = kind.includes("json") ? await answer.json() : { error: await answer.text() };
+  if (!answer.ok && answer.status !== 409) throw new Error(content.error || `error ${answer.status}`);
+  return { ...content, refused: answer.status === 409 };
+}
+
+function tell(text, bad = false) {
+  clearTimeout(noticeTimer);
+  $("notice").textContent = text;
+  $("notice").className = bad ? "bad" : "";
+  $("notice").hidden = false;
+  noticeTimer = setTimeout(() => ($("notice").hidden = true), NOTICE_MS);
+}
+
+const guarded = (work) => async (...given) => {
+  try { await work(...given); } catch (error) { tell(error.message, true); }
+};
+
+// --- what is typed ----------------------------------------------------------------------------
+
+const inputs = () => lab.references.map((r) => $(`d-${r.name}`));
+const side = () => document.querySelector("[name=side]:checked")?.value ?? "";
+const marker = () => (stop === null ? $("marker").value || String(view.marker ?? "") : String(lab.stops[stop].marker));
+
+function typed() {
+  const distances = Object.fromEntries(lab.references.map((r) => [r.name, $(`d-${r.name}`).value]));
+  return { stop, marker: marker(), distances, side: side(), height: $("height").value, split: $("split").value };
+}
+
+function buildFields() {
+  $("fields").replaceChildren(...lab.references.map((reference, n) => {
+    const input = make("input", { id: `d-${reference.name}`, inputMode: "decimal", enterKeyHint: "next" });
+    const label = make("label", { htmlFor: input.id }, `From ${reference.name}`);
+    const fault = make("p", { className: "fault", id: `fault-d_${reference.name}` });
+    input.setAttribute("aria-describedby", fault.id);
+    return make("div", { className: "field" }, label, make("span", { className: "cm" }, input, make("i", {}, "cm")), fault);
+  }));
+  $("height").setAttribute("aria-describedby", "fault-height");
+  $("from").textContent = lab.references[0].name;
+  $("to").textContent = lab.references[1].name;
+  $("sides").hidden = !lab.one_line;
+}
+
+function clear() {
+  for (const input of [...inputs(), $("height")]) input.value = "";
+  for (const radio of document.querySelectorAll("[name=side]")) radio.checked = false;
+}
+
+// --- the check, at once while typing ----------------------------------------------------------
+
+const soon = () => { clearTimeout(timer); $("save").disabled = true; timer = setTimeout(guarded(check), WAIT_MS); };
+
+async function check() {
+  const number = ++asked;
+  const answer = await ask("check", typed());
+  if (number === asked) show(answer);
+}
+
+function show(answer) {
+  const now = typed(), tapes = {};
+  for (const [name, text] of Object.entries(now.distances)) tapes[name] = Number(text.replace(",", ".")) / 100;
+  found = { ...answer, tapes };
+  // What is only missing yet is no fault.
+  const empty = (field) =>
+    field === "marker" ? !now.marker : field === "side" ? !now.side
+      : field === "height" ? !now.height : field.startsWith("d_") && !now.distances[field.slice(2)];
+  const wrong = answer.faults.filter((fault) => !empty(fault.field));
+  const missing = answer.faults.filter((fault) => empty(fault.field)).map((fault) => fault.text.split("?")[0]);
+  const any = Object.values(now.distances).some(Boolean) || now.height;
+  for (const part of document.querySelectorAll(".field")) {
+    const place = part.querySelector(".fault"), field = place.id.slice("fault-".length);
+    place.textContent = wrong.find((fault) => fault.field === field)?.text ?? "";
+    part.classList.toggle("bad", Boolean(place.textContent));
+  }
+  const rest = wrong.filter((fault) => !$(`fault-${fault.field}`) && (fault.field || any) && fault.field !== "marker");
+  $("verdict").replaceChildren(
+    ...rest.map((fault) => make("p", { className: "bad" }, upper(fault.text))),
+    ...verdict(answer),
+    ...answer.warnings.map((text) => make("p", { className: "warn" }, upper(text))),
+  );
+  const save = $("save"), doubtful = answer.warnings.length > 0;
+  save.disabled = !answer.ready;
+  save.className = doubtful ? "warn" : "";
+  save.textContent = answer.ready ? `Save ${answer.id}${doubtful ? " all the same" : ""}`
+    : wrong.length && any ? "Not yet: see above" : missing.length && any ? `Still missing: ${missing.join(", ")}` : "Save";
+  draw();
+}
+
+const upper = (text) => text.charAt(0).toUpperCase() + text.slice(1);
+
+function verdict(answer) {
+  if (!answer.point_m) return [];
+  const [x, y, z] = answer.point_m;
+  const known = answer.sigma_cm === null ? "" : ` ± ${cm(answer.sigma_cm)} cm`;
+  const where = answer.on_floor === null ? "" : answer.on_floor ? ", on the floor" : ", outside of the floor";
+  const parts = [make("p", { className: answer.on_floor === false ? "warn" : "point" },
+    make("b", {}, `x ${x.toFixed(3)}, y ${y.toFixed(3)} m`), `${known}, ${cm(z * 100)} cm high${where}`)];
+  if (answer.residuals.length)
+    parts.push(table("The distances disagree by", answer.residuals.map((r) => [r.name, `${cm(r.cm)} cm`])));
+  if (answer.predictions.length)
+    parts.push(table("Off the present model", answer.predictions.map((p) => [p.camera, `${cm(p.cm)} cm`, p.camera])));
+  return parts;
+}
+
+function table(caption, rows) {
+  return make("table", {}, make("caption", {}, caption), ...rows.map(([name, value, camera]) => {
+    const head = make("th", { scope: "row" }, name);
+    if (camera) {
+      const dot = make("i");
+      dot.style.background = colours()[camera];
+      head.prepend(dot);
+    }
+    return make("tr", {}, head, make("td", {}, value));
+  }));
+}
+
+const colours = () => Object.fromEntries(view.cameras.map((camera) => [camera.name, camera.colour]));
+
+function draw() {
+  const done = history.places.filter((place) => place.point_m).map((place) => place.point_m);
+  drawFloor($("floor"), lab, found, done, colours(), (chosen) => {
+    document.querySelector(`[name=side][value=${chosen}]`).checked = true;
+    soon();
+  });
+  $("floor").setAttribute("aria-label", found.point_m
+    ? `Floor map: the place is at x ${found.point_m[0].toFixed(2)}, y ${found.point_m[1].toFixed(2)} m` : "Floor map");
+}
+
+// --- what the cameras see ---------------------------------------------------------------------
+
+async function look() {
+  const query = new URLSearchParams(stop === null ? { marker: $("marker").value } : { stop, marker: lab.stops[stop].marker });
+  const state = view.state;
+  view = await ask(`views?${query}`);
+  $("sight").textContent = upper(view.text);
+  $("sight").className = `chip ${view.state}`;
+  if (stop === null) offerMarkers();
+  drawCameras($("cameras"), view);
+  if (state !== view.state) soon();
+}
+
+function offerMarkers() {
+  const chosen = $("marker").value, ids = [...new Set([...view.visible.map(String), ...(chosen ? [chosen] : [])])];
+  if ([...$("marker").options].slice(1).map((o) => o.value).join() === ids.join()) return;
+  const any = make("option", { value: "" }, view.visible.length === 1 ? `${view.visible[0]}, the only one seen` : "choose");
+  $("marker").replaceChildren(any, ...ids.map((id) => make("option", { value: id }, id)));
+  $("marker").value = chosen;
+}
+
+// --- places -----------------------------------------------------------------------------------
+
+async function go(to) {
+  stop = Math.min(Math.max(to, 0), lab.stops.length - 1);
+  clear();
+  showStop();
+  await look();
+  await check();
+}
+
+function showStop() {
+  const { marker: id, seconds } = lab.stops[stop], as = history.measured[stop];
+  const open = history.measured.filter((one) => one === null).length;
+  const state = as === null ? `still for ${seconds.toFixed(1)} s, not measured` : `measured as ${as}`;
+  $("stop").replaceChildren(`Marker ${id}, place ${stop + 1} of ${lab.stops.length}`, make("small", {}, state));
+  $("before").disabled = stop === 0;
+  $("after").disabled = stop === lab.stops.length - 1;
+  $("open").disabled = open === 0;
+  $("open").textContent = open ? `Next one not measured (${open} left)` : "All are measured";
+}
+
+function nextOpen() {
+  const count = lab.stops.length;
+  for (let n = 1; n <= count; n++) if (history.measured[(stop + n) % count] === null) return (stop + n) % count;
+  return stop;
+}
+
+function list() {
+  const rows = history.places.map((place) => {
+    const where = place.point_m ? `x ${place.point_m[0].toFixed(2)}, y ${place.point_m[1].toFixed(2)} m` : place.counts ? "" : "withdrawn";
+    const text = make("div", {}, make("b", {}, place.id), make("span", {}, ` marker ${place.marker}`), ` ${where}`, make("small", {}, place.tapes));
+    if (!place.counts) return make("li", { className: "gone" }, text);
+    const undo = make("button", { type: "button" }, "Undo");
+    undo.setAttribute("aria-label", `Undo ${place.id}`);
+    undo.addEventListener("click", guarded(async () => {
+      history = (await ask("undo", { id: place.id })).history;
+      tell(`${place.id} is withdrawn; it stays in the log, but does not count`);
+      refresh();
+    }));
+    return make("li", {}, text, undo);
+  });
+  $("places").replaceChildren(...(rows.length ? rows : [make("li", { className: "none" }, "Nothing yet.")]));
+}
+
+function refresh() {
+  list();
+  if (stop !== null) showStop();
+  soon();
+  draw();
+}
+
+const save = guarded(async () => {
+  $("save").disabled = true;
+  let answer;
+  try {
+    answer = await ask("measure", { ...typed(), accepted: found.warnings ?? [] });
+  } catch (error) {
+    soon();
+    throw error;
+  }
+  if (answer.refused) return show(answer);
+  history = answer.history;
+  tell(`${answer.saved} is in the log`);
+  clear();
+  refresh();
+  if (stop !== null) await go(nextOpen());
+  inputs()[0].focus({ preventScroll: true });
+  scrollTo(0, 0);
+});
+
+// --- begin ------------------------------------------------------------------------------------
+
+async function watch() {
+  try { await look(); } catch (error) { $("sight").textContent = error.message; $("sight").className = "chip"; }
+  setTimeout(watch, POLL_MS);
+}
+
+guarded(async () => {
+  ({ history, ...lab } = await ask("scene"));
+  $("lab").textContent = lab.model ? `${lab.lab}, model ${lab.model}` : lab.lab;
+  buildFields();
+  list();
+  draw();
+  $("form").addEventListener("input", soon);
+  $("form").addEventListener("submit", (event) => {
+    event.preventDefault();
+    if (!$("save").disabled) save();
+  });
+  $("before").addEventListener("click", guarded(() => go(stop - 1)));
+  $("after").addEventListener("click", guarded(() => go(stop + 1)));
+  $("open").addEventListener("click", guarded(() => go(nextOpen())));
+  if (lab.stops.length) {
+    $("stops").hidden = false;
+    const first = history.measured.indexOf(null);
+    await go(Math.max(first, 0));
+  } else {
+    $("chosen").hidden = false;
+    watch();
+  }
+})();

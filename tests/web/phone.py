@@ -1,0 +1,138 @@
+"""A phone: headless Chromium of a phone's size, tapped and typed into through its debugging pipe."""
+
+from __future__ import annotations
+
+import base64
+import fcntl
+import json
+import os
+import subprocess
+import time
+from collections.abc import Iterator
+from contextlib import contextmanager
+from pathlib import Path
+from typing import Any
+
+from tests.report.browser import chromium
+
+_WIDTH, _HEIGHT = 390, 844
+_PATIENCE_S = 20.0
+
+
+class Phone:
+    """One page in one browser; ``told`` is what the browser says by itself."""
+
+    def __init__(self, read: int, write: int) -> None:
+        self._read, self._write = read, write
+        self._rest = b""
+        self._number = 0
+        self._session: str | None = None
+        self.console: list[str] = []
+
+    def send(self, method: str, **given: Any) -> dict[str, Any]:
+        """A command of the DevTools protocol and its answer."""
+        self._number += 1
+        message: dict[str, Any] = {"id": self._number, "method": method, "params": given}
+        if self._session is not None:
+            message["sessionId"] = self._session
+        os.write(self._write, json.dumps(message).encode() + b"\0")
+        while True:
+            answer = self._receive()
+            if answer.get("id") == self._number:
+                assert "error" not in answer, answer
+                result: dict[str, Any] = answer["result"]
+                return result
+
+    def _receive(self) -> dict[str, Any]:
+        while b"\0" not in self._rest:
+            data = os.read(self._read, 1 << 16)
+            assert data, "the browser has gone"
+            self._rest += data
+        one, _, self._rest = self._rest.partition(b"\0")
+        answer: dict[str, Any] = json.loads(one)
+        if answer.get("method") in ("Log.entryAdded", "Runtime.exceptionThrown"):
+            self.console.append(json.dumps(answer["params"]))
+        return answer
+
+    def open(self, url: str) -> None:
+        target = self.send("Target.createTarget", url="about:blank")["targetId"]
+        self._session = self.send("Target.attachToTarget", targetId=target, flatten=True)["sessionId"]
+        self.send(
+            "Emulation.setDeviceMetricsOverride",
+            width=_WIDTH, height=_HEIGHT, deviceScaleFactor=2, mobile=True,
+        )  # fmt: skip
+        self.send("Emulation.setTouchEmulationEnabled", enabled=True)
+        for domain in ("Log", "Runtime", "Page"):
+            self.send(f"{domain}.enable")
+        self.send("Page.navigate", url=url)
+        self.wait("location.href !== 'about:blank' && document.readyState === 'complete'")
+
+    def run(self, script: str) -> Any:
+        """The value of an expression in the page."""
+        answer = self.send("Runtime.evaluate", expression=script, returnByValue=True, awaitPromise=True)
+        assert "exceptionDetails" not in answer, answer
+        return answer["result"].get("value")
+
+    def wait(self, script: str) -> Any:
+        """Until an expression is true in the page."""
+        end = time.monotonic() + _PATIENCE_S
+        while not (value := self.run(script)):
+            assert time.monotonic() < end, f"{script}: never, but {self.text()}\n{self.console}"
+            time.sleep(0.05)
+        return value
+
+    def tap(self, selector: str) -> None:
+        """With a finger on the middle of an element, wherever that is; it must not be covered."""
+        found = json.dumps(selector)
+        x, y, hit = self.run(
+            f"(async () => {{ const e = document.querySelector({found});"
+            "e.scrollIntoView({block: 'center'});"
+            "for (let n = 0; n < 2; n++) await new Promise(requestAnimationFrame);"
+            "const b = e.getBoundingClientRect(), x = b.x + b.width / 2, y = b.y + b.height / 2;"
+            "const there = document.elementFromPoint(x, y);"
+            "return [x, y, there === e || e.contains(there) || there.contains(e)]; })()"
+        )
+        assert hit, f"{selector} is covered"
+        self.send("Input.dispatchTouchEvent", type="touchStart", touchPoints=[{"x": x, "y": y}])
+        self.send("Input.dispatchTouchEvent", type="touchEnd", touchPoints=[])
+
+    def type(self, selector: str, text: str) -> None:
+        """Key by key into a field that was tapped."""
+        self.tap(selector)
+        self.wait(f"document.activeElement === document.querySelector({json.dumps(selector)})")
+        for key in text:
+            self.send("Input.dispatchKeyEvent", type="char", text=key)
+
+    def text(self, selector: str = "body") -> str:
+        return str(self.run(f"document.querySelector({json.dumps(selector)}).innerText"))
+
+    def picture(self, path: Path) -> None:
+        """The whole page, however long."""
+        data = self.send("Page.captureScreenshot", captureBeyondViewport=True, format="png")["data"]
+        path.write_bytes(base64.b64decode(data))
+
+
+@contextmanager
+def phone(folder: Path) -> Iterator[Phone]:
+    """A browser without any network but this machine's."""
+    there, write = os.pipe()
+    read, here = os.pipe()
+    # Out of the way of the two numbers that the browser wants them at.
+    ours = [fcntl.fcntl(end, fcntl.F_DUPFD_CLOEXEC, 20) for end in (there, here)]
+    for end in (there, here):
+        os.close(end)
+    command = [
+        "bash", "-c", f'exec "$@" 3<&{ours[0]} 4>&{ours[1]}', "bash", chromium(), "--headless=new",
+        "--no-sandbox", "--disable-gpu", "--remote-debugging-pipe",
+        "--host-resolver-rules=MAP * ~NOTFOUND, EXCLUDE 127.0.0.1, EXCLUDE localhost",
+        f"--user-data-dir={folder / 'profile'}", "about:blank",
+    ]  # fmt: skip
+    with subprocess.Popen(command, pass_fds=ours, stderr=subprocess.DEVNULL) as browser:
+        for end in ours:
+            os.close(end)
+        try:
+            yield Phone(read, write)
+        finally:
+            browser.kill()
+            os.close(read)
+            os.close(write)

@@ -267,7 +267,7 @@ def live(
     ----------
     settings : written first: rig and lenses.
     request : corners, method and, for fuse, ``model_from``.
-    until : detect or fuse.
+    until : detect, camera-frame or fuse.
     watch : is shown every frame that the stages have seen, and what they make of it.
 
     Returns
@@ -281,7 +281,7 @@ def live(
     """
     request = replace(request, corners=request.corners or _usual_corners(cameras, settings))
     models = [_copied_model(request, cameras.now_ns())] if until == "fuse" else []
-    runs, stages = _live_stages(request, models)
+    runs, stages = _live_stages(request, models, until)
     with recording(target) as log, threadpool_limits(1, user_api="blas"):
         for message in (*settings, *models):
             log.put(message)
@@ -315,16 +315,21 @@ def _copied_model(request: Request, time_ns: int) -> Message:
     return Message(TOPICS[Model].format(run=model_run(name)), time_ns, model.timestamp, model)
 
 
-def _live_stages(request: Request, models: Sequence[Message]) -> tuple[dict[str, str], list[Stage]]:
+def _live_stages(
+    request: Request, models: Sequence[Message], until: str
+) -> tuple[dict[str, str], list[Stage]]:
     """The run that each stage of a replay would write to, and the causal ones of these stages."""
     corners = str(request.corners)
     runs, stages = {"detect": corners}, [Stage(corners, detect.READS, detect.Detect(corners))]
+    if until == "detect":
+        return runs, stages
+    points = corners if request.method == camera_frame.PERIMETER else f"{corners}_{request.method}"
+    runs["camera-frame"] = points
+    stages.append(Stage(points, camera_frame.READS, camera_frame.CameraFrame(request.method)))
     for message in models:
-        points = corners if request.method == camera_frame.PERIMETER else f"{corners}_{request.method}"
         name = model_run(message.payload.name)
-        runs |= {"camera-frame": points, "fit": name, "locate": name, "fuse": name}
+        runs |= {"fit": name, "locate": name, "fuse": name}
         stages += [
-            Stage(points, camera_frame.READS, camera_frame.CameraFrame(request.method)),
             Stage(name, locate.READS, locate.Locate(message.payload)),
             Stage(name, fuse.READS, fuse.Fuse(name), per_camera=False),
         ]

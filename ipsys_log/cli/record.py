@@ -13,10 +13,13 @@ from typing import TYPE_CHECKING, Annotated, Optional
 import typer
 
 from ipsys_log.cli.console import console, remarks
+from ipsys_log.cli.measure import Host, Port
 from ipsys_log.cli.options import Calibrations, Corners, Method, NewLog, load_lab
 
 if TYPE_CHECKING:
+    from ipsys_log.live_scene import LiveScene
     from ipsys_log.messages import Message
+    from ipsys_log.pipeline import Watch
     from ipsys_log.report.cameras import LiveStatus
     from ipsys_log.request import Request
     from ipsys_log.sinks.rerun_live import LiveView
@@ -49,6 +52,17 @@ def record(
     calibration: Calibrations = None,
     detect: Annotated[bool, typer.Option("--detect", help="Find the markers and write them too.")] = False,
     corners: Corners = None,
+    measure: Annotated[
+        bool, typer.Option("--measure", help="Enter tape measurements meanwhile, on a page for the phone.")
+    ] = False,
+    host: Host = None,
+    port: Port = 8000,
+    model_from: Annotated[
+        Optional[Path],  # noqa: UP045
+        typer.Option(
+            "--model-from", metavar="LOG", help="While measuring, say where this log's model puts a place."
+        ),
+    ] = None,
     seconds: Seconds = None,
     force: Force = False,
 ) -> None:
@@ -57,7 +71,11 @@ def record(
     from ipsys_log.request import Request
 
     with _opened(output, rig, camera, calibration, seconds, force) as (cameras, settings, status):
-        if detect:
+        if measure:
+            with _measured(settings, cameras, model_from, host, port) as scene:
+                watch = _both(status, scene)
+                pipeline.live(cameras, settings, output, Request(corners=corners), "camera-frame", watch)
+        elif detect:
             pipeline.live(cameras, settings, output, Request(corners=corners), "detect", status)
         else:
             pipeline.record(cameras, settings, output, status)
@@ -93,13 +111,39 @@ def live(
         _opened(output, rig, camera, calibration, seconds, force) as (cameras, settings, status),
         _viewed(settings, cameras, request) if view else nullcontext() as viewer,
     ):
+        pipeline.live(cameras, settings, output, request, "fuse", _both(status, viewer))
 
-        def watch(message: Message | None) -> None:
-            status(message)
-            if viewer is not None:
-                viewer(message)
 
-        pipeline.live(cameras, settings, output, request, "fuse", watch)
+def _both(first: Watch, second: Watch | None) -> Watch:
+    def watch(message: Message | None) -> None:
+        first(message)
+        if second is not None:
+            second(message)
+
+    return watch
+
+
+@contextmanager
+def _measured(
+    settings: list[Message], cameras: Attached, model_from: Path | None, host: str | None, port: int
+) -> Iterator[LiveScene]:
+    """The page on which places are measured while they are recorded."""
+    from ipsys_log.live_scene import LiveScene
+    from ipsys_log.log.session import Session
+    from ipsys_log.lookup import fitted_in
+    from ipsys_log.web.serving import qr_code, serving
+
+    model = None
+    if model_from is not None:
+        with Session([model_from]) as other:
+            model, _ = fitted_in(other, None)
+    scene = LiveScene(settings[0].payload, model, list(cameras.states), cameras.add)
+    with serving(scene, host, port) as page:
+        if host is not None:
+            console.print(qr_code(page.url), style="#ffffff on #000000", markup=False)
+        remarks.print(f"measure at {page.url}", markup=False)
+        yield scene
+        scene.end()
 
 
 def _viewed(settings: list[Message], cameras: Attached, request: Request) -> LiveView:

@@ -12,7 +12,7 @@ from collections.abc import Iterator, Sequence
 from contextlib import suppress
 from dataclasses import dataclass, field
 from types import TracebackType
-from typing import NamedTuple
+from typing import Any, NamedTuple
 
 import simplejpeg
 
@@ -58,8 +58,8 @@ class CameraState:
 
 class _Arrival(NamedTuple):
     received_ns: int
-    camera: RigCamera
-    content: Frame | Event
+    camera: RigCamera | None
+    content: Frame | tuple[str, Any]
 
 
 class Attached:
@@ -141,6 +141,12 @@ class Attached:
                 if self._done():
                     return
                 yield None
+
+    def add(self, topic: str, payload: Any) -> None:
+        """Take something else into the stream, such as a measurement: it gets its log time as frames do."""
+        with self._arrived:
+            self._waiting.append(_Arrival(self.clock.now_ns(), None, (topic, payload)))
+            self._arrived.notify()
 
     def now_ns(self) -> int:
         """A log time for what is not of a camera: later than all before."""
@@ -234,7 +240,7 @@ class Attached:
             dropped, state.unsaid = state.unsaid, 0
             if dropped:
                 text = f"{dropped} frames of camera {camera.name} dropped: the disk is too slow"
-                self._waiting.append(_Arrival(now_ns, camera, _event(now_ns, "frames_dropped", text, camera)))
+                self._waiting.append(_event(now_ns, "frames_dropped", text, camera))
             self._waiting.append(_Arrival(now_ns, camera, frame))
             self._arrived.notify()
         state.begun.set()
@@ -242,7 +248,7 @@ class Attached:
     def _say(self, kind: str, text: str, camera: RigCamera) -> None:
         now_ns = self.clock.now_ns()
         with self._arrived:
-            self._waiting.append(_Arrival(now_ns, camera, _event(now_ns, kind, text, camera)))
+            self._waiting.append(_event(now_ns, kind, text, camera))
             self._arrived.notify()
 
     # --- their messages -------------------------------------------------------------------------
@@ -250,9 +256,11 @@ class Attached:
     def _messages(self, arrival: _Arrival) -> Iterator[Message]:
         log_time_ns = self.now_ns()
         camera, content = arrival.camera, arrival.content
-        if isinstance(content, Event):
-            yield Message(EVENTS_TOPIC, log_time_ns, content.timestamp, content)
+        if not isinstance(content, Frame):
+            topic, payload = content
+            yield Message(topic, log_time_ns, payload.timestamp, payload)
             return
+        assert camera is not None
         time_ns = log_time_ns if content.time_ns is None else instant_ns(content.time_ns, camera)
         payload = CompressedImage(time_ns, camera.name, content.data, content.format)
         self.received_ns[log_time_ns] = arrival.received_ns
@@ -261,5 +269,5 @@ class Attached:
         yield Message(image_topic(camera.name), log_time_ns, time_ns, payload, camera.name)
 
 
-def _event(time_ns: int, kind: str, text: str, camera: RigCamera) -> Event:
-    return Event(time_ns, kind, text, camera.name)
+def _event(time_ns: int, kind: str, text: str, camera: RigCamera) -> _Arrival:
+    return _Arrival(time_ns, None, (EVENTS_TOPIC, Event(time_ns, kind, text, camera.name)))

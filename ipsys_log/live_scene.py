@@ -1,0 +1,115 @@
+"""Measuring while cameras send: what they see now, and measurements on their way into the log."""
+
+from __future__ import annotations
+
+import threading
+from collections import deque
+from collections.abc import Callable, Sequence
+from typing import Any
+
+from ipsys_log.errors import IpsysError
+from ipsys_log.measuring.entry import check_references
+from ipsys_log.measuring.scene import Stop, View
+from ipsys_log.messages import (
+    MEASUREMENTS_TOPIC,
+    CameraPoints,
+    CompressedImage,
+    Markers,
+    Measurement,
+    Message,
+    Model,
+    Rig,
+)
+from ipsys_log.units import NS_PER_S
+
+__all__ = ["LiveScene"]
+
+_LAST_NS = NS_PER_S
+
+
+class LiveScene:
+    """A recording as a :class:`~ipsys_log.measuring.scene.Scene`. Call it with what is recorded and made.
+
+    Parameters
+    ----------
+    rig, model : those that hold; the model may be None.
+    cameras : names.
+    add : puts a payload on a topic into the log, through the one place that gives log times.
+
+    Raises
+    ------
+    IpsysError
+        Where the rig has no two reference points to lay a tape from.
+    """
+
+    def __init__(
+        self, rig: Rig, model: Model | None, cameras: Sequence[str], add: Callable[[str, Any], None]
+    ) -> None:
+        check_references(rig)
+        self.rig, self.model = rig, model
+        self.stops: Sequence[Stop] = ()
+        self._add = add
+        self._lock = threading.Lock()
+        self._images: dict[str, deque[Message]] = {camera: deque(maxlen=60) for camera in cameras}
+        self._markers: dict[str, Message] = {}
+        self._points: dict[str, deque[CameraPoints]] = {camera: deque() for camera in cameras}
+        self._history: list[Measurement] = []
+        self._ended = False
+
+    def __call__(self, message: Message | None) -> None:
+        """Be shown a frame, or what a stage made of it."""
+        if message is None or message.camera not in self._images:
+            return
+        payload, camera = message.payload, message.camera
+        with self._lock:
+            if isinstance(payload, CompressedImage):
+                self._images[camera].append(message)
+            elif isinstance(payload, Markers):
+                self._markers[camera] = message
+            elif isinstance(payload, CameraPoints):
+                points = self._points[camera]
+                points.append(payload)
+                while points[0].timestamp < payload.timestamp - _LAST_NS:
+                    points.popleft()
+
+    def views(self, stop: int | None) -> list[View]:
+        """The latest picture of every camera whose markers are known, and its last second."""
+        with self._lock:
+            return [self._view(camera) for camera in sorted(self._images)]
+
+    def history(self) -> list[Measurement]:
+        return list(self._history)
+
+    def add(self, measurements: Sequence[Measurement]) -> None:
+        """Send measurements into the log.
+
+        Raises
+        ------
+        IpsysError
+            Where the recording has ended.
+        """
+        if self._ended:
+            raise IpsysError("the recording has ended; measure the rest with 'ipsys measure' on its log")
+        for measurement in measurements:
+            self._add(MEASUREMENTS_TOPIC, measurement)
+            self._history.append(measurement)
+
+    def end(self) -> None:
+        """Take no more measurements."""
+        self._ended = True
+
+    def _view(self, camera: str) -> View:
+        marked = self._markers.get(camera)
+        if marked is None:
+            return View(camera, 0)
+        # Frames that were skipped have no markers; a picture is shown with its own.
+        picture = next(
+            (
+                one.payload.data
+                for one in self._images[camera]
+                if one.publish_time_ns == marked.publish_time_ns
+            ),
+            None,
+        )
+        points = tuple(self._points[camera])
+        return View(camera, marked.publish_time_ns, picture, marked.payload, points)

@@ -1,4 +1,4 @@
-"""Data of others into a log: ``ipsys import imsel`` and ``ipsys import images``."""
+"""Data of others into a log: ``ipsys import imsel``, ``ipsys import images`` and ``ipsys import videos``."""
 
 from __future__ import annotations
 
@@ -17,6 +17,7 @@ def add_commands(app: typer.Typer) -> None:
     group = typer.Typer(help="Turn the data of others into a log.", no_args_is_help=True)
     group.command("imsel")(imsel)
     group.command("images")(images)
+    group.command("videos")(videos)
     app.add_typer(group, name="import")
 
 
@@ -37,18 +38,69 @@ def images(
     output: NewLog,
     rig: RigFile = None,
     calibration: Calibrations = None,
-    rate: Annotated[float, typer.Option(help="Pictures per second.")] = 1.0,
+    rate: Annotated[float, typer.Option(help="Pictures per second, where they have no times.")] = 1.0,
+    times: Annotated[
+        str | None,
+        typer.Option(
+            metavar="FILE|names",
+            help="When each was taken: a CSV file with the columns file (red/0001.jpg) and time; or names if "
+            "the files' names are times. A time is s, ms, us or ns since 1970, or 2024-05-31T12:30:00.25Z.",
+        ),
+    ] = None,
 ) -> None:
-    """A folder of pictures, one sub-folder per camera; the n-th of each belong together."""
+    """A folder of pictures, one sub-folder per camera; without --times the n-th of each belong together."""
     from ipsys_log.cli.options import load_calibrations
     from ipsys_log.output import write_log
     from ipsys_log.rig import load_rig
     from ipsys_log.sources.files import find_pictures, read_images
+    from ipsys_log.sources.picture_times import find_times
 
     pictures = find_pictures(folder)
     lenses = load_calibrations(calibration, lambda: pictures)
-    write_log(output, read_images(pictures, load_rig(rig) if rig else None, lenses, rate))
-    if len({len(paths) for paths in pictures.values()}) > 1:
+    taken_ns = find_times(pictures, times) if times else None
+    write_log(output, read_images(pictures, load_rig(rig) if rig else None, lenses, rate, taken_ns))
+    if not times and len({len(paths) for paths in pictures.values()}) > 1:
         remarks.print("cameras have unequal numbers of pictures: the n-th of each are taken for one instant")
     counts = ", ".join(f"{len(paths)} of {camera}" for camera, paths in pictures.items())
     console.print(f"{output} written: pictures: {counts}")
+
+
+def videos(
+    files: Annotated[
+        list[str], typer.Argument(metavar="CAMERA=FILE...", help="A video for each camera: red=red.mp4.")
+    ],
+    output: NewLog,
+    rig: RigFile = None,
+    calibration: Calibrations = None,
+    start: Annotated[
+        str, typer.Option(metavar="TIME", help="When all of them begin: s since 1970, or ISO 8601.")
+    ] = "2020-01-01T00:00:00Z",
+) -> None:
+    """Videos that begin at one instant. MJPEG, H.264 and H.265 go into the log as they are."""
+    from ipsys_log.cli.options import load_calibrations
+    from ipsys_log.output import write_log
+    from ipsys_log.rig import load_rig
+    from ipsys_log.sources.picture_times import parse_start
+    from ipsys_log.sources.videos import read_videos
+
+    paths = _by_camera(files)
+    lenses = load_calibrations(calibration, lambda: paths)
+    lab = load_rig(rig) if rig else None
+    counts = write_log(output, read_videos(paths, lab, lenses, parse_start(start), remarks.print))
+    text = ", ".join(f"{counts.get(f'/cameras/{camera}/image', 0)} of {camera}" for camera in paths)
+    console.print(f"{output} written: frames: {text}")
+
+
+def _by_camera(files: list[str]) -> dict[str, Path]:
+    from ipsys_log.errors import IpsysError
+    from ipsys_log.rig import check_name
+
+    paths: dict[str, Path] = {}
+    for option in files:
+        camera, equals, name = option.partition("=")
+        if not equals:
+            raise IpsysError(f"{option}: write it as camera=file.mp4")
+        if check_name(camera, f"{option}: camera name") in paths:
+            raise IpsysError(f"{option}: two videos of one camera, {camera!r}")
+        paths[camera] = Path(name)
+    return paths

@@ -9,6 +9,7 @@ from ipsys_log.errors import IpsysError
 from ipsys_log.messages import RigCamera
 from ipsys_log.sources.frames import Clock, Frame, Open, Say
 from ipsys_log.sources.network import open_network
+from ipsys_log.sources.played import open_played
 from ipsys_log.sources.simulated import open_simulated
 from ipsys_log.sources.usb import open_usb
 
@@ -24,6 +25,7 @@ OPENERS: dict[str, Open] = {
     "udp": open_network,
     "usb": open_usb,
     "sim": open_simulated,
+    "file": open_played,
 }
 
 

@@ -67,14 +67,17 @@ def read_images(
     rig: Rig | None,
     lenses: Mapping[str, CameraCalibration],
     rate_hz: float,
+    times_ns: Mapping[Path, int] | None = None,
 ) -> Iterator[Message]:
-    """Pictures as frames, in log order; the n-th of all cameras are of one instant.
+    """Pictures as frames, in log order; the n-th of all cameras are of one instant, unless times are given.
 
     Parameters
     ----------
     pictures : by camera, from :func:`find_pictures`.
     rig, lenses : written first, where given; lenses by camera.
     rate_hz : pictures per second.
+    times_ns : when each was taken, from :func:`~ipsys_log.sources.picture_times.find_times`; then there is
+        no rate.
 
     Raises
     ------
@@ -87,17 +90,25 @@ def read_images(
     if strange:
         known = ", ".join(pictures)
         raise IpsysError(f"--calibration {strange[0]}: there are no pictures of such a camera (only {known})")
-    # One instant takes the time of its number; what is written at one instant follows by 1 ns.
-    time_ns = START_NS
+    taken_ns = times_ns if times_ns is not None else _even_times(pictures, rate_hz)
+    # What is written at one instant follows by 1 ns.
+    log_ns = min(taken_ns.values()) - len(lenses) - 1 if times_ns is not None else START_NS
     if rig is not None:
-        yield Message(RIG_TOPIC, time_ns, time_ns, rig)
+        yield Message(RIG_TOPIC, log_ns, log_ns, rig)
     for camera, lens in sorted(lenses.items()):
-        time_ns += 1
-        yield Message(calibration_topic(camera), time_ns, time_ns, lens, camera)
-    for number in range(max(len(paths) for paths in pictures.values())):
-        instant_ns = START_NS + round((number + 1) * NS_PER_S / rate_hz)
-        for order, (camera, paths) in enumerate(pictures.items()):
-            if number < len(paths):
-                path = paths[number]
-                image = CompressedImage(instant_ns, camera, path.read_bytes(), FORMATS[path.suffix.lower()])
-                yield Message(image_topic(camera), instant_ns + order, instant_ns, image, camera)
+        log_ns += 1
+        yield Message(calibration_topic(camera), log_ns, log_ns, lens, camera)
+    shots = [(taken_ns[path], camera, path) for camera, paths in pictures.items() for path in paths]
+    for time_ns, camera, path in sorted(shots, key=lambda shot: shot[0]):
+        log_ns = max(time_ns, log_ns + 1)
+        image = CompressedImage(time_ns, camera, path.read_bytes(), FORMATS[path.suffix.lower()])
+        yield Message(image_topic(camera), log_ns, time_ns, image, camera)
+
+
+def _even_times(pictures: Mapping[str, list[Path]], rate_hz: float) -> dict[Path, int]:
+    """One instant takes the time of its number."""
+    return {
+        path: START_NS + round((number + 1) * NS_PER_S / rate_hz)
+        for paths in pictures.values()
+        for number, path in enumerate(paths)
+    }

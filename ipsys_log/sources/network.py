@@ -116,13 +116,16 @@ def _frames(camera: RigCamera, clock: Clock, say: Say) -> Iterator[Frame]:
         with _open(camera.source or "", where) as container:
             stream = find_video(container, where)
             codec = stream.codec_context
+            name = name_format(stream)
+            if name is None:
+                raise SourceError(f"{where}: is {codec.name} video; set the camera to MJPEG, H.264 or H.265")
             rate_hz = float(stream.average_rate) if stream.average_rate else None
             say_refused(camera, Given(codec.width, codec.height, rate_hz), say)
             stamps = Stamps(camera.name, clock, say, _PATIENCE if container.format.name == "rtsp" else 1)
             # A stream that stops within a packet has ended.
             with suppress(av.error.InvalidDataError):
                 for packet in pass_through(container, stream):
-                    yield Frame(bytes(packet), name_format(stream), stamps.of(packet))
+                    yield Frame(bytes(packet), name, stamps.of(packet))
     except av.error.FFmpegError as error:
         raise SourceError(f"{where}: {_explain(error)}") from error
 

@@ -34,23 +34,19 @@ def find_video(container: InputContainer, where: str) -> VideoStream:
     Raises
     ------
     SourceError
-        Where there is none, or one of a codec that no log holds.
+        Where there is none, or only a single picture.
     """
     if not container.streams.video:
         raise SourceError(f"{where}: is not video; give the address of the camera's picture stream")
     stream = container.streams.video[0]
     if container.format.name in _SINGLE:
         raise SourceError(f"{where}: is a single picture; give the address of the camera's stream")
-    if stream.codec_context.name not in _FORMATS:
-        raise SourceError(
-            f"{where}: is {stream.codec_context.name} video; set the camera to MJPEG, H.264 or H.265"
-        )
     return stream
 
 
-def name_format(stream: VideoStream) -> str:
-    """``jpeg``, ``h264`` or ``h265``."""
-    return _FORMATS[stream.codec_context.name]
+def name_format(stream: VideoStream) -> str | None:
+    """``jpeg``, ``h264`` or ``h265``; None for a codec that no log holds."""
+    return _FORMATS.get(stream.codec_context.name)
 
 
 def pass_through(container: InputContainer, stream: VideoStream) -> Iterator[Packet[VideoStream]]:

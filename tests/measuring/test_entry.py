@@ -46,13 +46,14 @@ def test_a_distance_that_cannot_be_in_centimetres(text: str, said: str | None) -
     if said is None:
         entry, wrong = read_typed(typed, labs.RIG)
         assert wrong == []
-        assert "is it in metres?" in entry.doubts[0]
+        assert "in metres? Then type 190" in entry.doubts[0]
     else:
         assert said in faults(typed)["d_A"]
 
 
 @pytest.mark.parametrize(
-    ("text", "said"), [("0.15", "looks like metres; type 15"), ("1500", "in mm? Then type 150"), ("", "height?")]
+    ("text", "said"),
+    [("0.15", "looks like metres; type 15"), ("1500", "in mm? Then type 150"), ("", "height?")],
 )
 def test_a_height_that_cannot_be_in_centimetres(text: str, said: str) -> None:
     assert said in faults(replace(GOOD, height=text))["height"]
@@ -76,7 +77,9 @@ def test_of_three_reference_points_any_two_and_no_side_unless_they_lie_on_a_line
     assert "two distances or more" in read_typed(one, THREE)[1][0].text
 
 
-@pytest.mark.parametrize(("count", "said"), [(0, "has no reference points"), (1, "only the reference point A")])
+@pytest.mark.parametrize(
+    ("count", "said"), [(0, "has no reference points"), (1, "only the reference point A")]
+)
 def test_a_rig_without_reference_points(count: int, said: str) -> None:
     rig = replace(labs.RIG, reference_points=labs.RIG.reference_points[:count])
     with pytest.raises(IpsysError, match=said):

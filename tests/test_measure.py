@@ -245,7 +245,7 @@ def test_the_terminal_asks_checks_and_undoes(
     with opened_log(log, Request()) as scene:
         first = as_typed(next(one for one in tape if scene.stops[0].covers(one)))
     a, b = first.distances.values()
-    answers = [a, "1.234", first.side, first.height, a, b, first.side[0], first.height, "", "u", "q"]
+    answers = [a, "1.234", b, first.side[0], first.height, "", "u", "q"]
     monkeypatch.setattr("sys.stdin", io.StringIO("\n".join(answers) + "\n"))
     done = ipsys("measure", log, "--terminal")
     assert done.code == 0, done.err

@@ -107,4 +107,4 @@ def unmeasured_log(lab_log: Path, tmp_path_factory: pytest.TempPathFactory) -> U
 @pytest.fixture
 def unmeasured(unmeasured_log: Unmeasured, tmp_path: Path) -> Unmeasured:
     """A copy of the session that nobody has measured."""
-    return unmeasured_log._replace(log=Path(shutil.copy(unmeasured_log.log, tmp_path / "lab.mcap")))
+    return unmeasured_log._replace(log=Path(shutil.copy(unmeasured_log.log, tmp_path / "unmeasured.mcap")))

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Callable, Iterator
+from functools import partial
 from itertools import count
 from typing import TYPE_CHECKING
 
@@ -14,6 +15,7 @@ if TYPE_CHECKING:
     from ipsys_log.measuring.check import Checked
     from ipsys_log.measuring.entry import Typed
     from ipsys_log.measuring.scene import Scene
+    from ipsys_log.messages import Rig
 
 __all__ = ["ask_places"]
 
@@ -78,7 +80,9 @@ def _measure(scene: Scene, stop: int | None) -> bool:
     _show(checked)
     if checked.measurement is None:
         return False
-    if _text(f"save {checked.id}? [Y/n]", lambda answer: answer.lower() in ("", "y", "n")).lower() == "n":
+    question, usual = (" all the same? [y/N]", "n") if checked.warnings else ("? [Y/n]", "y")
+    answer = _text(f"save {checked.id}{question}", lambda given: given.lower() in ("", "y", "n"))
+    if (answer.lower() or usual) == "n":
         return False
     scene.add([checked.measurement])
     console.print(f"{checked.id} is in the log", style="green", markup=False)
@@ -103,21 +107,44 @@ def _ask(scene: Scene, stop: int | None) -> Typed:
     names = [point.name for point in scene.rig.reference_points]
     # Of more than two reference points any two will do.
     may_lack = len(names) > 2
-    distances = {name: _number(f"from {name}, cm", may_lack) for name in names}
+    distances: dict[str, str] = {}
+    for name in names:
+        question = f"from {name}, cm"
+        distances[name] = _number(question, f"d_{name}", may_lack, scene.rig, partial(_of_tape, name))
     given = [name for name in names if distances[name]]
     side = ""
     if needs_side(scene.rig, given):
         question = f"from {given[0]} to {given[1]}, it lies left or right? [l/r]"
         letter = _text(question, lambda answer: answer[:1].lower() in ("l", "r") and answer != "")
         side = "left" if letter[0].lower() == "l" else "right"
-    return Typed(marker, distances, side, _number("height, cm", False))
+    return Typed(marker, distances, side, _number("height, cm", "height", False, scene.rig, _of_ruler))
 
 
-def _number(question: str, may_lack: bool) -> str:
+def _of_tape(name: str, text: str) -> Typed:
+    from ipsys_log.measuring.entry import Typed
+
+    return Typed("", {name: text})
+
+
+def _of_ruler(text: str) -> Typed:
+    from ipsys_log.measuring.entry import Typed
+
+    return Typed("", {}, height=text)
+
+
+def _number(question: str, field: str, may_lack: bool, rig: Rig, typed: Callable[[str], Typed]) -> str:
+    """Ask for a number until it can be one of a field."""
+    from ipsys_log.measuring.entry import read_typed
+
     def fits(answer: str) -> bool:
         return (not answer and may_lack) or answer.replace(",", ".").replace(".", "", 1).isdecimal()
 
-    return _text(question, fits)
+    while True:
+        answer = _text(question, fits)
+        faults = [fault.text for fault in read_typed(typed(answer), rig)[1] if fault.field == field]
+        if not answer or not faults:
+            return answer
+        console.print(faults[0], style="red", markup=False)
 
 
 def _text(question: str, fits: Callable[[str], bool], default: str = "") -> str:

@@ -104,7 +104,9 @@ def check_entry(
         # A usual tape tells how flatly the circles cross; what is written down has no sigma of its own.
         fixed = world_point(read, with_tape(rig))
     except IpsysError as error:
-        return Checked(name, (*found, Fault("", _without_id(error, name))), tuple(warnings))
+        # That it may be in metres is then why.
+        why = "; ".join([_without_id(error, name), *entry.doubts])
+        return Checked(name, (*found, Fault("", why)))
     on_floor, remark = doubt_floor(read, fixed, rig)
     warnings += [*remark, *doubt_tapes(read, fixed, rig)]
     found += _twin_faults(read, history)

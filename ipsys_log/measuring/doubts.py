@@ -112,5 +112,6 @@ def doubt_model(
                 continue  # without this slip it would be nowhere
             left.append((float(np.linalg.norm(there_m - predicted_m)), slip.text))
         if left and min(left)[0] <= bound_m:
-            return [f"{text}: {min(left)[1]}?"]
+            why = min(left)[1]
+            return [f"{text}: {why}{'' if why.endswith('fit') else '?'}"]
     return [f"{text}: read tape, ruler and marker again"]

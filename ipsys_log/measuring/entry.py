@@ -22,9 +22,10 @@ _NAME = re.compile(r"[A-Za-z0-9][A-Za-z0-9_.-]*")
 # Without a floor in the rig, no tape is longer and no marker carried higher.
 _LONGEST_M = 30.0
 _HIGHEST_M = 5.0
-# Nearer to a reference point nobody measures with a tape, or it is meant in metres.
+# So near to a reference point hardly anybody measures; to a hundredth of a millimetre, nobody.
 _NEAR_CM = 10.0
-_METRES = re.compile(r"\d?[.,]\d{2,}")
+_METRES = re.compile(r"\d?[.,]\d{3,}")
+_LOWEST_CM = 1.0
 
 
 class Fault(NamedTuple):
@@ -148,7 +149,9 @@ def _distances(typed: Typed, rig: Rig, faults: list[Fault], doubts: list[str]) -
                 faults.append(fault)
             elif value_cm is not None:
                 if value_cm < _NEAR_CM:
-                    doubts.append(f"{text} cm is very near to {point.name}: is it in metres?")
+                    doubts.append(
+                        f"{text} cm is very near to {point.name}: in metres? Then type {_times(value_cm)}"
+                    )
                 yield Distance(point.name, value_cm / CM_PER_M)
         elif count == 2:  # of more, any two will do
             faults.append(Fault(f"d_{point.name}", f"d to {point.name}?"))
@@ -164,7 +167,7 @@ def _distance_fault(text: str, value_cm: float, point: ReferencePoint, rig: Rig)
     if value_cm == 0:
         why = "a distance is above 0"
     elif value_cm < _NEAR_CM and _METRES.fullmatch(text):
-        why = f"{text} cm looks like metres; type {value_cm * CM_PER_M:g}"
+        why = f"{text} cm looks like metres; type {_times(value_cm)}"
     elif value_cm > longest_cm:
         in_mm = f"; in mm? Then type {value_cm / 10:g}" if value_cm / 10 <= longest_cm else ""
         why = f"{text} cm is further than the floor reaches{in_mm}"
@@ -192,12 +195,16 @@ def _height(text: str, faults: list[Fault], doubts: list[str]) -> float | None:
     if value_cm > _HIGHEST_M * CM_PER_M:
         faults.append(Fault("height", f"height: {text} cm is too high; in mm? Then type {value_cm / 10:g}"))
         return None
-    if 0 < value_cm < 1 and _METRES.fullmatch(text):
-        faults.append(Fault("height", f"height: {text} cm looks like metres; type {value_cm * CM_PER_M:g}"))
+    if 0 < value_cm < _LOWEST_CM and len(text.replace(",", ".").partition(".")[2]) > 1:
+        faults.append(Fault("height", f"height: {text} cm looks like metres; type {_times(value_cm)}"))
         return None
     if value_cm > CM_PER_M:
         doubts.append(f"{text} cm is high for a marker: is it in mm?")
     return value_cm / CM_PER_M
+
+
+def _times(value_cm: float) -> str:
+    return f"{value_cm * CM_PER_M:g}"
 
 
 def _number(text: str, what: str, name: str, faults: list[Fault]) -> float | None:

@@ -104,6 +104,7 @@ function show(answer) {
   save.disabled = !answer.ready;
   save.className = doubtful ? "warn" : "";
   save.textContent = answer.ready ? `Save ${answer.id}${doubtful ? " all the same" : ""}`
+    : wrong.length && wrong.every((fault) => fault.field === "marker") && !missing.length ? "Wait: the marker has to lie still"
     : wrong.length && any ? "Not yet: see above" : missing.length && any ? `Still missing: ${missing.join(", ")}` : "Save";
   draw();
 }
@@ -234,9 +235,9 @@ const save = guarded(async () => {
   tell(`${answer.saved} is in the log`);
   clear();
   refresh();
-  if (stop !== null) await go(nextOpen());
   inputs()[0].focus({ preventScroll: true });
   scrollTo(0, 0);
+  if (stop !== null) await go(nextOpen());
 });
 
 // --- begin ------------------------------------------------------------------------------------

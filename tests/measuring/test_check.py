@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
 from dataclasses import replace
+from typing import Any
 
 import numpy as np
 import pytest
@@ -29,7 +30,7 @@ PLACES = st.tuples(st.floats(0.1, 4.7), st.floats(0.1, 4.7), st.floats(0.0, 0.3)
 )
 
 
-def tape(world_m: Sequence[float], rig: Rig = RIG, **changed: str) -> Typed:
+def tape(world_m: Sequence[float], rig: Rig = RIG, **changed: Any) -> Typed:
     """A place as somebody reads it who reads well: to the millimetre."""
     distances = {
         p.name: f"{100 * np.hypot(world_m[0] - p.x_m, world_m[1] - p.y_m):.1f}" for p in rig.reference_points

@@ -46,7 +46,7 @@ def test_a_distance_that_cannot_be_in_centimetres(text: str, said: str | None) -
     if said is None:
         entry, wrong = read_typed(typed, labs.RIG)
         assert wrong == []
-        assert "is it in metres?" in entry.doubts[0]
+        assert "in metres? Then type 190" in entry.doubts[0]
     else:
         assert said in faults(typed)["d_A"]
 

@@ -10,8 +10,9 @@ from ipsys_log.measuring.stillness import lies_still, still_stretches
 from ipsys_log.messages import CameraPoint, CameraPoints
 from ipsys_log.offline.pairs import Sightings
 from ipsys_log.units import NS_PER_S
+from tests import labs
 
-Array = np.ndarray
+Array = labs.Array
 
 RATE_HZ = 30
 
@@ -28,7 +29,8 @@ def seen(path_m: Array, start_s: float = 0.0, across_m: float = 0.0008, along: f
 def laid(*parts: tuple[float, float, float]) -> Array:
     """Seconds, and speed in m/s along x and y, one part after the other."""
     steps = [np.tile([vx / RATE_HZ, vy / RATE_HZ, 0.0], (round(s * RATE_HZ), 1)) for s, vx, vy in parts]
-    return np.array([-1.2, 0.6, 2.0]) + np.cumsum(np.concatenate(steps), axis=0)
+    path_m: Array = np.array([-1.2, 0.6, 2.0]) + np.cumsum(np.concatenate(steps), axis=0)
+    return path_m
 
 
 def test_two_places_with_a_walk_between_them() -> None:

@@ -73,13 +73,13 @@ class Phone:
         assert "exceptionDetails" not in answer, answer
         return answer["result"].get("value")
 
-    def wait(self, script: str) -> Any:
+    def wait(self, script: str) -> None:
         """Until an expression is true in the page."""
+        script = f"Boolean({script})"
         end = time.monotonic() + _PATIENCE_S
-        while not (value := self.run(script)):
+        while not self.run(script):
             assert time.monotonic() < end, f"{script}: never, but {self.text()}\n{self.console}"
             time.sleep(0.05)
-        return value
 
     def tap(self, selector: str) -> None:
         """With a finger on the middle of an element, wherever that is; it must not be covered."""

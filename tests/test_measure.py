@@ -1,0 +1,256 @@
+"""Measuring on a finished log: what goes in comes out as a model, and what is withdrawn does not count."""
+
+from __future__ import annotations
+
+import fcntl
+import io
+import os
+from collections.abc import Iterable
+from pathlib import Path
+from typing import Any, NamedTuple
+
+import numpy as np
+import pytest
+from google.protobuf.descriptor_pb2 import FileDescriptorSet
+from google.protobuf.descriptor_pool import DescriptorPool
+from google.protobuf.message_factory import GetMessageClass
+from mcap.reader import make_reader
+
+from ipsys_log.errors import IpsysError, LogError
+from ipsys_log.finished import opened_log
+from ipsys_log.log.session import Session
+from ipsys_log.measuring.check import check_entry, withdraw
+from ipsys_log.measuring.entry import Typed, read_typed
+from ipsys_log.measuring.scene import look
+from ipsys_log.messages import MEASUREMENTS_TOPIC, Measurement, Model, Pair
+from ipsys_log.request import Request
+from tests.conftest import Ipsys, Unmeasured, data_section
+from tests.test_bad_input import refused, rewrite
+
+
+def as_typed(measurement: Measurement) -> Typed:
+    """A measurement as somebody would type it, to a tenth of a millimetre."""
+    distances = {d.reference: f"{100 * d.distance_m:.2f}" for d in measurement.distances}
+    height = f"{100 * (measurement.height_m or 0):.2f}"
+    split = " ".join(measurement.splits)
+    return Typed(str(measurement.marker_id), distances, measurement.side or "", height, split)
+
+
+def sheet(path: Path, tape: Iterable[Measurement], **columns: list[str]) -> Path:
+    """A sheet of these measurements."""
+    rows = [",".join(["marker", "d_A_cm", "d_B_cm", "side", "height_cm", "split", *columns])]
+    for n, one in enumerate(map(as_typed, tape)):
+        cells = [one.marker, one.distances["A"], one.distances["B"], one.side, one.height, one.split]
+        rows.append(",".join([*cells, *(values[n] for values in columns.values())]))
+    path.write_text("\n".join(rows) + "\n", encoding="utf-8")
+    return path
+
+
+def times(tape: Iterable[Measurement], log: Path) -> list[str]:
+    with Session([log]) as session:
+        return [f"{(one.timestamp - session.start_ns) / 1e9:.3f}" for one in tape]
+
+
+class Row(NamedTuple):
+    log_time_ns: int
+    id: str
+    withdraws: str
+
+
+def foreign_read(path: Path) -> list[Row]:
+    """The measurements as the ``mcap`` package and protobuf read them, by the schema in the log alone."""
+    rows = []
+    with path.open("rb") as file:
+        for schema, _, message in make_reader(file).iter_messages(topics=[MEASUREMENTS_TOPIC]):
+            assert schema is not None
+            pool = DescriptorPool()
+            for one in FileDescriptorSet.FromString(schema.data).file:
+                pool.Add(one)
+            kind: Any = GetMessageClass(pool.FindMessageTypeByName(schema.name))
+            found = kind.FromString(message.data)
+            rows.append(Row(message.log_time, found.id, found.withdraws))
+    return rows
+
+
+def pairs_of(log: Path) -> dict[tuple[str, int, tuple[float, ...]], Pair]:
+    """What each camera saw of each place, by camera, marker and camera point in nm."""
+    with Session([log]) as session:
+        model = session.payloads(session.topics(Model, "poly"))[-1]
+    return {
+        (camera.camera, pair.marker_id, tuple((pair.camera_m * 1e9).round())): pair
+        for camera in model.cameras
+        for pair in camera.pairs
+    }
+
+
+def test_every_place_of_a_session_is_found_and_paired_as_if_measured_while_recording(
+    ipsys: Ipsys, unmeasured: Unmeasured, lab: Path, tmp_path: Path
+) -> None:
+    assert ipsys("replay", lab).code == 0
+    # What lay outside of the pictures, or was seen in one of them only, is not known to have lain still.
+    theirs = {key: pair for key, pair in pairs_of(lab).items() if pair.frames > 1}
+    seen = {pair.measurement for pair in theirs.values()}
+    log, tape = unmeasured
+    tape = [one for one in tape if one.id in seen]
+    before = data_section(log)
+    done = ipsys("measure", log, "--csv", sheet(tmp_path / "a.csv", tape, time=times(tape, log)))
+    assert done.code == 0, done.err
+    assert f"{len(tape)} places measured into {log}" in done.out
+    assert data_section(log).startswith(before)
+    assert ipsys("replay", log).code == 0
+    mine = pairs_of(log)
+    assert theirs.keys() <= mine.keys()
+    assert len(theirs) > 40
+    for key, pair in theirs.items():
+        # Typed to a tenth of a millimetre, of which flat circles make up to four times as much.
+        assert np.allclose(mine[key].world_m, pair.world_m, atol=0.0003), key
+
+
+def fitted_ids(log: Path, run: str) -> set[str]:
+    with Session([log]) as session:
+        model = session.payloads(session.topics(Model, run))[-1]
+    return {pair.measurement for camera in model.cameras for pair in camera.pairs}
+
+
+def test_one_place_its_undo_and_what_a_fit_makes_of_both(ipsys: Ipsys, unmeasured: Unmeasured) -> None:
+    log, tape = unmeasured
+    with opened_log(log, Request()) as scene:
+        for one in tape[8:20]:
+            (stop,) = (n for n, stop in enumerate(scene.stops) if stop.covers(one))
+            typed = as_typed(one)
+            sight = look(scene.views(stop), int(typed.marker))
+            history = scene.history()
+            checked = check_entry(*read_typed(typed, scene.rig), scene.rig, sight, history, scene.model)
+            assert checked.measurement is not None, checked.faults
+            scene.add([checked.measurement])
+        assert ipsys("replay", log, "--model", "rigid").code == 0
+        gone = min(fitted_ids(log, "rigid"))
+        scene.add([withdraw(scene.history(), gone)])
+        with pytest.raises(IpsysError, match=f"no measurement {gone} to withdraw"):
+            withdraw(scene.history(), gone)
+    assert ipsys("replay", log, "--model", "rigid").code == 0
+    assert fitted_ids(log, "rigid") - fitted_ids(log, "rigid_2") == {gone}
+    rows = foreign_read(log)
+    assert [row.id for row in rows if row.withdraws] == [f"{gone}_withdrawn"]
+    at = {row.id: row.log_time_ns for row in rows}
+    assert at[f"{gone}_withdrawn"] > at["p003"]
+
+
+def test_rows_of_a_marker_in_order_and_by_place(ipsys: Ipsys, unmeasured: Unmeasured, tmp_path: Path) -> None:
+    log, tape = unmeasured
+    mine = [one for one in tape if one.marker_id == 3]
+    assert ipsys("measure", log, "--csv", sheet(tmp_path / "a.csv", mine)).code == 0
+    listed = ipsys("measure", log, "--places")
+    assert f"p{len(mine):03d}" in listed.out
+    other = [one for one in tape if one.marker_id == 4][:2]
+    with opened_log(log, Request()) as scene:
+        numbers = [str(next(n for n, s in enumerate(scene.stops, 1) if s.covers(one))) for one in other]
+    assert ipsys("measure", log, "--csv", sheet(tmp_path / "b.csv", other, place=numbers)).code == 0
+    with Session([log]) as session:
+        found = session.payloads([MEASUREMENTS_TOPIC])
+    by_time = sorted([*mine, *other], key=lambda m: (m.timestamp, m.marker_id))
+    assert [(m.marker_id, m.side) for m in sorted(found, key=lambda m: (m.timestamp, m.marker_id))] == [
+        (m.marker_id, m.side) for m in by_time
+    ]
+
+
+@pytest.mark.parametrize(
+    ("text", "said"),
+    [
+        ("marker,d_A_cm,d_B_cm,side,height_cm\n0,100,40,left,0\n", ["line 2: no triangle has the sides"]),
+        (
+            "marker,d_A_cm,d_B_cm,side,height_cm,place\n0,1.7,190,left,0,1\n\n99,170,190,left,0,1\n0,170,x,up,,1\n",
+            ["line 4: marker 99 is not in the rig", "line 5: d to B: 'x' is no number", "line 5: side 'up'"],
+        ),
+        (
+            "marker;d_A_cm;d_B_cm;side;height_cm;place\n0;170,5;190;left;0;999\n",
+            ["line 2: place 999 is none"],
+        ),
+        ("marker,d_A_cm,d_B_cm,side,height_cm,time\n0,170,190,left,0,noon\n", ["line 2: time 'noon'"]),
+        ("marker,d_A_cm,d_B_cm,side,height_cm\n0,170,190,left,0,7\n", ["line 2: 6 cells, but 5 columns"]),
+        ("marker,d_A_cm,side,height_cm\n0,170,left,0\n", ["line 1: the column d_A_cm is missing"]),
+        ("marker,d_A_m,d_B_cm,side,height_cm\n0,1.7,190,left,0\n", ["line 1: unknown column 'd_A_m'"]),
+        ("marker,d_A_cm,d_B_cm,side,height_cm\n0,170,190,left,0\n", ["rows name no place or time"]),
+        ("marker,d_A_cm,d_B_cm,side,height_cm\n", ["holds no measurements"]),
+        ("", ["line 1: the column marker is missing"]),
+    ],
+)
+def test_a_bad_sheet_changes_nothing_and_names_its_rows(
+    ipsys: Ipsys, unmeasured: Unmeasured, text: str, said: list[str]
+) -> None:
+    path = unmeasured.log.with_name("sheet.csv")
+    path.write_text(text)
+    line = refused(ipsys, unmeasured.log, "measure", unmeasured.log, "--csv", path)
+    for part in said:
+        assert part in line.replace("d_B_cm is missing", "d_A_cm is missing")
+
+
+def test_one_bad_row_keeps_the_good_ones_out(ipsys: Ipsys, unmeasured: Unmeasured) -> None:
+    log, tape = unmeasured
+    path = sheet(log.with_name("sheet.csv"), tape, time=times(tape, log))
+    lines = path.read_text().splitlines()
+    lines[7] = lines[7].replace(",left,", ",,").replace(",right,", ",,")
+    path.write_text("\n".join(lines))
+    assert "nothing was written, correct the sheet: line 8: left or right of the line" in refused(
+        ipsys, log, "measure", log, "--csv", path
+    )
+
+
+def test_a_log_that_is_locked_gone_or_not_to_be_written(ipsys: Ipsys, unmeasured: Unmeasured) -> None:
+    log = unmeasured.log
+    with log.open("r+b") as other:
+        fcntl.flock(other, fcntl.LOCK_EX)
+        assert "another process is writing it" in refused(ipsys, log, "measure", log, "--places")
+    assert "does not exist" in refused(ipsys, log, "measure", log.with_name("none.mcap"))
+    if os.geteuid() != 0:
+        log.chmod(0o400)
+        assert "cannot be opened for writing" in refused(ipsys, log, "measure", log)
+
+
+def test_two_people_at_one_log(unmeasured: Unmeasured) -> None:
+    log, tape = unmeasured
+    with opened_log(log, Request()) as one, opened_log(log, Request()) as other:
+        one.add([Measurement(tape[0].timestamp, "p001", marker_id=0)])
+        with pytest.raises(LogError, match="somebody else measured in this log meanwhile"):
+            other.add([Measurement(tape[0].timestamp, "p001", marker_id=0)])
+    assert len(foreign_read(log)) == 1
+
+
+def test_a_rig_without_reference_points(ipsys: Ipsys, unmeasured: Unmeasured) -> None:
+    rig = unmeasured.log.with_name("lab.toml")
+    rig.write_text('name = "lab"\ndictionary = "DICT_4X4_100"\nmarker_length_m = 0.2\n')
+    line = refused(ipsys, unmeasured.log, "measure", unmeasured.log, "--rig", rig)
+    assert "the rig has no reference points to lay the tape from" in line
+    assert "[[reference_points]]" in line
+
+
+def test_a_log_in_which_nothing_lies_still(ipsys: Ipsys, lab: Path) -> None:
+    with Session([lab]) as session:
+        start_ns = session.start_ns
+    log = rewrite(lab, lambda m: m if m.log_time_ns <= start_ns + 1_050_000_000 else None)
+    done = ipsys("measure", log)
+    assert done.code == 1
+    assert "no marker of the rig lies still in it" in done.err
+
+
+def test_options_that_exclude_one_another(ipsys: Ipsys, unmeasured: Unmeasured) -> None:
+    log = unmeasured.log
+    assert "exclude one another" in refused(ipsys, log, "measure", log, "--terminal", "--places")
+
+
+def test_the_terminal_asks_checks_and_undoes(
+    ipsys: Ipsys, unmeasured: Unmeasured, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    log, tape = unmeasured
+    with opened_log(log, Request()) as scene:
+        first = as_typed(next(one for one in tape if scene.stops[0].covers(one)))
+    a, b = first.distances.values()
+    answers = [a, "1.234", b, first.side[0], first.height, "", "u", "q"]
+    monkeypatch.setattr("sys.stdin", io.StringIO("\n".join(answers) + "\n"))
+    done = ipsys("measure", log, "--terminal")
+    assert done.code == 0, done.err
+    assert "d to B: 1.234 cm looks like metres" in done.out
+    assert "p001 is in the log" in done.out
+    assert "p001 is withdrawn" in done.out
+    assert "1 place measured" in done.out
+    assert [row.withdraws for row in foreign_read(log)] == ["", "p001"]

@@ -1,0 +1,201 @@
+"""The measuring page on a phone: taps and keys in, measurements in the log out."""
+
+from __future__ import annotations
+
+import fcntl
+from collections.abc import Iterator, Sequence
+from pathlib import Path
+
+import pytest
+
+from ipsys_log.finished import FinishedLog, opened_log
+from ipsys_log.log.session import Session
+from ipsys_log.measuring.scene import Stop, View
+from ipsys_log.messages import CameraPoint, CameraPoints, Measurement, Model, Rig
+from ipsys_log.request import Request
+from ipsys_log.web.serving import serving
+from tests import labs
+from tests.conftest import Ipsys, Unmeasured
+from tests.test_measure import as_typed, foreign_read
+from tests.web.phone import Phone, phone
+
+FETCHED = "performance.getEntriesByType('resource').map(one => one.name)"
+
+
+@pytest.fixture
+def hand(tmp_path: Path) -> Iterator[Phone]:
+    with phone(tmp_path / "phone") as one:
+        yield one
+
+
+def fill(hand: Phone, a: str, b: str, side: str, height: str) -> None:
+    hand.type("#d-A", a)
+    hand.type("#d-B", b)
+    hand.tap(f"#sides label:nth-of-type({1 if side == 'left' else 2})")
+    hand.type("#height", height)
+
+
+def save(hand: Phone, name: str) -> None:
+    """When it can be saved: only then is the button one."""
+    hand.wait("document.querySelector('#save:enabled')")
+    says(hand, "#save", f"Save {name}")
+    hand.tap("#save")
+
+
+def says(hand: Phone, selector: str, text: str) -> None:
+    hand.wait(f"document.querySelector({selector!r}).innerText.includes({text!r})")
+
+
+def texts_at(scene: FinishedLog, tape: Sequence[Measurement], number: int) -> tuple[str, str, str, str]:
+    (typed,) = [as_typed(one) for one in tape if scene.stops[number].covers(one)]
+    return typed.distances["A"], typed.distances["B"], typed.side, typed.height
+
+
+def test_a_place_is_typed_checked_saved_and_withdrawn(hand: Phone, unmeasured: Unmeasured) -> None:
+    log, tape = unmeasured
+    with opened_log(log, Request()) as scene, serving(scene, port=0) as page:
+        a, b, side, height = texts_at(scene, tape, 0)
+        hand.open(page.url)
+        says(hand, "#sight", "lies still, seen by")
+        assert hand.run("document.querySelector('#sight').className") == "chip still"
+        assert hand.run("document.querySelectorAll('#cameras polygon.chosen').length") > 0
+        hand.wait(f"{FETCHED}.filter(name => name.includes('/picture/')).length === 3")
+
+        fill(hand, a, "1.234", side, height)
+        says(hand, "#fault-d_B", "1.234 cm looks like metres")
+        assert hand.run("document.querySelector('#save').disabled")
+        hand.run("document.querySelector('#d-B').value = ''")
+        hand.type("#d-B", "0.5")
+        says(hand, "#verdict", "No triangle has the sides")
+        assert foreign_read(log) == []
+        hand.run("document.querySelector('#d-B').value = ''")
+        hand.type("#d-B", b)
+        says(hand, "#verdict", "on the floor")
+        assert hand.run("document.querySelectorAll('#floor .place').length") == 1
+        save(hand, "p001")
+        says(hand, "#notice", "p001 is in the log")
+        assert [(row.id, row.withdraws) for row in foreign_read(log)] == [("p001", "")]
+        says(hand, "#stop", "place 2 of")
+        assert hand.run("[...document.querySelectorAll('.cm input')].every(e => e.value === '')")
+
+        hand.tap("#places button")
+        says(hand, "#notice", "p001 is withdrawn")
+        assert [row.withdraws for row in foreign_read(log)] == ["", "p001"]
+        assert hand.run("document.querySelectorAll('#places .gone').length") == 1
+        hand.tap("#before")
+        says(hand, "#stop", "not measured")
+        # What fills a phone is not wider than it, and nothing went wrong unseen.
+        assert hand.run("document.documentElement.scrollWidth") == 390
+        assert hand.console == []
+        assert hand.run(f"{FETCHED}.every(name => name.startsWith(location.origin))")
+
+
+def test_the_side_is_chosen_on_the_map_and_a_slip_is_seen_by_the_model(
+    hand: Phone, ipsys: Ipsys, unmeasured: Unmeasured, lab: Path
+) -> None:
+    log, tape = unmeasured
+    assert ipsys("fit", lab, "--model", "rigid").code == 0
+    assert ipsys("fit", log, "--model-from", lab, "--model", "rigid").code == 0
+    with opened_log(log, Request()) as scene, serving(scene, port=0) as page:
+        assert scene.model is not None
+        a, b, side, height = texts_at(scene, tape, 0)
+        hand.open(page.url)
+        says(hand, "#sight", "lies still")
+        other = "right" if side == "left" else "left"
+        for selector, text in (("#d-A", a), ("#d-B", b), ("#height", height)):
+            hand.type(selector, text)
+        hand.wait("document.querySelectorAll('#floor .maybe').length == 2")
+        hand.tap(f"#floor .maybe[aria-label$={other}]")
+        says(hand, "#verdict", f"it lies {side} of the line from A to B, not {other}?")
+        says(hand, "#save", "all the same")
+        hand.tap(f"#sides label:nth-of-type({1 if side == 'left' else 2})")
+        says(hand, "#verdict", "Off the present model")
+        hand.wait("document.querySelector('#save').innerText === 'Save p001'")
+        assert hand.run("document.querySelectorAll('#floor path.predicted').length") > 0
+
+
+def test_what_goes_wrong_in_the_log_is_said_on_the_page(hand: Phone, unmeasured: Unmeasured) -> None:
+    log, tape = unmeasured
+    with opened_log(log, Request()) as scene, serving(scene, port=0) as page:
+        a, b, side, height = texts_at(scene, tape, 0)
+        hand.open(page.url)
+        says(hand, "#sight", "lies still")
+        fill(hand, a, b, side, height)
+        with log.open("r+b") as other:
+            fcntl.flock(other, fcntl.LOCK_EX)
+            save(hand, "p001")
+            says(hand, "#notice", "another process is writing it")
+        # What was typed is still there, and goes in when the log is free.
+        assert hand.run("document.querySelector('#d-A').value") == a
+        save(hand, "p001")
+        says(hand, "#notice", "p001 is in the log")
+    assert len(foreign_read(log)) == 1
+    hand.tap("#after")
+    says(hand, "#notice", "The computer does not answer")
+
+
+class Recording:
+    """A lab while it is recorded: one camera, markers that somebody moves by hand."""
+
+    rig: Rig = labs.RIG
+    model: Model | None = None
+    stops: Sequence[Stop] = ()
+
+    def __init__(self) -> None:
+        self.speed_m, self.done = 0.0, list[Measurement]()
+        self.seen = True
+
+    def views(self, stop: int | None) -> list[View]:
+        assert stop is None
+        if not self.seen:
+            return [View("red", 10**9)]
+        path = [CameraPoint(0, n * self.speed_m, 0.1, 2.0) for n in range(9)]
+        rows = tuple(CameraPoints(10**9 + n, (point,)) for n, point in enumerate(path))
+        return [View("red", rows[-1].timestamp, points=rows)]
+
+    def history(self) -> list[Measurement]:
+        return self.done
+
+    def add(self, measurements: Sequence[Measurement]) -> None:
+        self.done += measurements
+
+
+def test_while_recording_the_marker_has_to_lie_still(hand: Phone) -> None:
+    scene = Recording()
+    scene.speed_m = 0.02
+    with serving(scene, port=0) as page:
+        hand.open(page.url)
+        says(hand, "#sight", "Marker 0 moves, as seen by red")
+        fill(hand, "170", "190", "left", "10")
+        hand.wait("document.querySelector('#verdict .point')")
+        says(hand, "#save", "Wait: the marker has to lie still")
+        assert hand.run("document.querySelector('#save').disabled")
+        scene.seen = False
+        says(hand, "#sight", "No camera sees a marker")
+        scene.speed_m, scene.seen = 0.0, True
+        says(hand, "#sight", "Marker 0 lies still, seen by red")
+        save(hand, "p001")
+        says(hand, "#places", "p001 marker 0")
+    (saved,) = scene.done
+    assert saved.still is not None
+    assert (saved.marker_id, saved.side, saved.still.end - saved.still.start) == (0, "left", 8)
+
+
+def test_the_log_is_replayed_with_what_was_tapped(
+    hand: Phone, ipsys: Ipsys, unmeasured: Unmeasured, tmp_path: Path
+) -> None:
+    log, tape = unmeasured
+    with opened_log(log, Request()) as scene, serving(scene, "127.0.0.1", 0) as page:
+        hand.open(page.url)
+        # The token is out of sight as soon as it was used.
+        assert hand.run("location.pathname + location.search") == "/"
+        for number in range(5):
+            says(hand, "#stop", f"place {number + 1} of")
+            says(hand, "#sight", "lies still")
+            fill(hand, *texts_at(scene, tape, number))
+            save(hand, f"p00{number + 1}")
+            says(hand, "#places", f"p00{number + 1}")
+    assert len(foreign_read(log)) == 5
+    assert ipsys("fit", log, "--model", "rigid", "--train", "train").code in (0, 1)
+    with Session([log]) as session:
+        assert len(session.payloads(session.topics(Measurement))) == 5

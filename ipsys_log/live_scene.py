@@ -72,7 +72,7 @@ class LiveScene:
                 while points[0].timestamp < payload.timestamp - _LAST_NS:
                     points.popleft()
 
-    def views(self, stop: int | None) -> list[View]:
+    def views(self, stop: int | None) -> list[View]:  # noqa: ARG002
         """The latest picture of every camera whose markers are known, and its last second."""
         with self._lock:
             return [self._view(camera) for camera in sorted(self._images)]

@@ -14,8 +14,24 @@ import pytest
 from ipsys_log import pipeline
 from ipsys_log.compare import Comparison
 from ipsys_log.errors import IpsysError
+from ipsys_log.live_scene import LiveScene
 from ipsys_log.log.session import Session
-from ipsys_log.messages import FRAME_SKIPPED, CompressedImage, Event, Latency, Message, Run, Tracks
+from ipsys_log.lookup import find_pairs
+from ipsys_log.lookup import measured as measured_places
+from ipsys_log.measuring.check import check_entry
+from ipsys_log.measuring.entry import Typed, read_typed
+from ipsys_log.measuring.scene import look
+from ipsys_log.messages import (
+    FRAME_SKIPPED,
+    CameraCalibration,
+    CompressedImage,
+    Event,
+    Latency,
+    Measurement,
+    Message,
+    Run,
+    Tracks,
+)
 from ipsys_log.output import write_log
 from ipsys_log.recording import first_messages
 from ipsys_log.request import Request
@@ -37,13 +53,23 @@ def calibration(lab_log: Path, tmp_path_factory: pytest.TempPathFactory) -> Path
     return path
 
 
-def attached_to(lab: Path, rate_hz: float = RATE_HZ) -> tuple[Attached, list[Message]]:
+def sent(lab: Path) -> dict[str, list[bytes]]:
+    """The frames of a log, by camera."""
     with Session([lab]) as session:
-        frames = {name: [m.payload.data for m in session.messages([t])] for name, t in session.images.items()}
+        return {name: [p.data for p in session.payloads([t])] for name, t in session.images.items()}
+
+
+def lenses(lab: Path) -> dict[str, CameraCalibration]:
+    with Session([lab]) as session:
+        return {name: session.payloads([topic])[0] for name, topic in session.calibrations.items()}
+
+
+def attached_to(lab: Path, rate_hz: float = RATE_HZ) -> tuple[Attached, list[Message]]:
+    frames = sent(lab)
+    with Session([lab]) as session:
         (rig,) = session.payloads(["/rig"])
-        lenses = {name: session.payloads([topic])[0] for name, topic in session.calibrations.items()}
     attached = Attached(cameras(*frames), playing(frames, rate_hz), Clock())
-    return attached, first_messages(rig, lenses, attached.now_ns)
+    return attached, first_messages(rig, lenses(lab), attached.now_ns)
 
 
 def go_live(
@@ -269,3 +295,51 @@ def test_the_latency_ledger_as_table_and_picture(ipsys: Ipsys, recorded: Path, t
             "detect",
             "camera-frame",
         ]
+
+
+def test_a_place_is_measured_while_it_is_recorded_and_a_model_is_fitted_to_it(
+    lab_log: Path, calibration: Path, tmp_path: Path
+) -> None:
+    """The distances are those that were measured in the lab; nothing of it but frames is in the recording."""
+    with Session([lab_log]) as session:
+        measured: list[Measurement] = session.payloads(["/measurements"])
+        (model,) = Session([calibration]).payloads(["/runs/poly/model"])
+        (rig,) = session.payloads(["/rig"])
+    ids = {m.marker_id for m in measured if m.marker_id is not None}
+    wanted = {m.marker_id: m for m in measured[: len(ids)] if m.marker_id is not None}
+    target = tmp_path / "measured.mcap"
+    frames = {name: found[:2] * 10 for name, found in sent(lab_log).items()}
+    attached = Attached(cameras(*frames), playing(frames, 10.0), Clock())
+    saved: set[int] = set()
+    with attached:
+        scene = LiveScene(rig, model, list(attached.states), attached.add)
+
+        def measure(message: Message | None) -> None:
+            scene(message)
+            for marker_id, one in wanted.items():
+                sight = look(scene.views(None), marker_id)
+                if marker_id in saved or sight.state != "still" or len(sight.points_m) == 0:
+                    continue
+                typed = Typed(
+                    marker=str(marker_id),
+                    distances={d.reference: f"{100 * d.distance_m:.2f}" for d in one.distances},
+                    side=one.side or "",
+                    height=f"{100 * (one.height_m or 0):.2f}",
+                )
+                entry, wrong = read_typed(typed, rig)
+                checked = check_entry(entry, wrong, rig, sight, scene.history(), model)
+                assert checked.measurement is not None, checked.faults
+                scene.add([checked.measurement])
+                saved.add(marker_id)
+
+        settings = first_messages(rig, lenses(lab_log), attached.now_ns)
+        pipeline.live(attached, settings, target, Request(), "camera-frame", measure)
+    assert len(saved) >= 3
+    with Session([target]) as session:
+        assert [m.marker_id for m in session.payloads(["/measurements"])] == [
+            m.marker_id for m in scene.history()
+        ]
+        places = find_pairs(session, "edges", measured_places(session, None))
+    seen = {pair.measurement for found in places.values() for pair in found}
+    assert seen == {m.id for m in scene.history()}
+    assert all(one.equal for one in again(target))

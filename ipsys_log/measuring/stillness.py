@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 from collections.abc import Iterator, Mapping, Sequence
 
 import numpy as np
@@ -43,7 +44,7 @@ def lies_still(points_m: Array) -> bool:
     rays = points_m[:, :2] / points_m[:, 2:]
     half = len(rays) // 2
     drift_m = (rays[-half:].mean(axis=0) - rays[:half].mean(axis=0)) * points_m[:, 2].mean()
-    return float(np.hypot(drift_m[0], drift_m[1])) <= _DRIFT_M + _DRIFT_OF_ONE_M / np.sqrt(len(rays))
+    return float(np.hypot(*drift_m)) <= _DRIFT_M + _DRIFT_OF_ONE_M / math.sqrt(len(rays))
 
 
 def _near(points_m: Array, place_m: Array) -> NDArray[np.bool_]:

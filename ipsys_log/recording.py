@@ -20,6 +20,7 @@ from ipsys_log.messages import (
     FRAME_SKIPPED,
     RIG_TOPIC,
     CameraCalibration,
+    CompressedImage,
     Event,
     Message,
     Rig,
@@ -235,7 +236,8 @@ class Backlog:
         with self._changed:
             self._waiting.append(message)
             mine = [one for one in self._waiting if one.camera == message.camera]
-            late = mine[0] if len(mine) > _WAITING else None
+            # A frame of a video is nothing without those before it.
+            late = mine[0] if len(mine) > _WAITING and isinstance(message.payload, CompressedImage) else None
             if late is not None:
                 self._waiting.remove(late)
             self._changed.notify()

@@ -178,7 +178,7 @@ def _opened(
     _check_target(output, force)
     with ExitStack() as stack:
         with remarks.status("opening " + ", ".join(camera.name for camera in cameras)):
-            attached = stack.enter_context(Attached(cameras, open_source, Clock()))
+            attached = stack.enter_context(Attached(cameras, open_source, Clock(), remarks.print))
         sizes_px = {name: state.size_px for name, state in attached.states.items()}
         lenses = fitting_lenses(lenses, sizes_px, remarks.print)
         if force:

@@ -11,6 +11,7 @@ from collections import deque
 from collections.abc import Iterator, Sequence
 from contextlib import suppress
 from dataclasses import dataclass, field
+from functools import partial
 from types import TracebackType
 from typing import Any, NamedTuple
 
@@ -18,13 +19,13 @@ import simplejpeg
 
 from ipsys_log.messages import (
     EVENTS_TOPIC,
-    CompressedImage,
     Event,
     Message,
     RigCamera,
     image_topic,
 )
-from ipsys_log.sources.frames import Clock, Frame, Open, SourceError, instant_ns
+from ipsys_log.sources.frames import Clock, Frame, Open, Say, SourceError, instant_ns
+from ipsys_log.sources.videos import frame_payload
 from ipsys_log.units import NS_PER_S
 
 __all__ = ["Attached", "CameraState"]
@@ -73,6 +74,7 @@ class Attached:
     cameras : each with a source.
     open_source : opens any of them.
     clock : the one that all stamps are of.
+    say : is told at once what becomes an event too: settings refused, a camera lost or back, frames dropped.
     limit_bytes : what may wait in memory; frames beyond that are dropped, counted and named by an event.
 
     Attributes
@@ -87,13 +89,19 @@ class Attached:
     """
 
     def __init__(
-        self, cameras: Sequence[RigCamera], open_source: Open, clock: Clock, limit_bytes: int = _LIMIT_BYTES
+        self,
+        cameras: Sequence[RigCamera],
+        open_source: Open,
+        clock: Clock,
+        say: Say = lambda text: None,
+        limit_bytes: int = _LIMIT_BYTES,
     ) -> None:
         self.states = {camera.name: CameraState() for camera in cameras}
         self.received_ns: dict[int, int] = {}
         self._cameras = list(cameras)
         self.clock = clock
-        self._open, self._limit_bytes = open_source, limit_bytes
+        self._open, self._say_to_user, self._limit_bytes = open_source, say, limit_bytes
+        self._said: set[str] = set()
         self._waiting: deque[_Arrival] = deque()
         self._waiting_bytes = 0
         self._last_ns = 0
@@ -195,6 +203,8 @@ class Attached:
             else:
                 state.failure = fault
         finally:
+            with self._arrived:
+                self._name_dropped(camera, state)
             state.up, state.finished = False, True
             state.opened.set()
             state.begun.set()
@@ -202,9 +212,7 @@ class Attached:
     def _take_all(self, camera: RigCamera, state: CameraState) -> SourceError | None:
         """Frames until the source has ended (None), or the camera has gone."""
         try:
-            with self._open(
-                camera, self.clock, lambda text: self._say("camera_setting", text, camera)
-            ) as frames:
+            with self._open(camera, self.clock, partial(self._say_setting, camera)) as frames:
                 state.opened.set()
                 for frame in frames:
                     if self._stopped.is_set():
@@ -237,19 +245,30 @@ class Attached:
             state.frames += 1
             state.bytes += len(frame.data)
             self._waiting_bytes += len(frame.data)
-            dropped, state.unsaid = state.unsaid, 0
-            if dropped:
-                text = f"{dropped} frames of camera {camera.name} dropped: the disk is too slow"
-                self._waiting.append(_event(now_ns, "frames_dropped", text, camera))
+            self._name_dropped(camera, state)
             self._waiting.append(_Arrival(now_ns, camera, frame))
             self._arrived.notify()
         state.begun.set()
+
+    def _name_dropped(self, camera: RigCamera, state: CameraState) -> None:
+        if state.unsaid:
+            text = f"{state.unsaid} frames of camera {camera.name} dropped: the disk is too slow"
+            state.unsaid = 0
+            self._waiting.append(_event(self.clock.now_ns(), "frames_dropped", text, camera))
+            self._say_to_user(text)
 
     def _say(self, kind: str, text: str, camera: RigCamera) -> None:
         now_ns = self.clock.now_ns()
         with self._arrived:
             self._waiting.append(_event(now_ns, kind, text, camera))
             self._arrived.notify()
+        self._say_to_user(text)
+
+    def _say_setting(self, camera: RigCamera, text: str) -> None:
+        """What a camera refused, once, however often it is opened."""
+        if text not in self._said:
+            self._said.add(text)
+            self._say("camera_setting", text, camera)
 
     # --- their messages -------------------------------------------------------------------------
 
@@ -262,7 +281,7 @@ class Attached:
             return
         assert camera is not None
         time_ns = log_time_ns if content.time_ns is None else instant_ns(content.time_ns, camera)
-        payload = CompressedImage(time_ns, camera.name, content.data, content.format)
+        payload = frame_payload(time_ns, camera.name, content.data, content.format)
         self.received_ns[log_time_ns] = arrival.received_ns
         if len(self.received_ns) > _REMEMBERED:
             del self.received_ns[next(iter(self.received_ns))]

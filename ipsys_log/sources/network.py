@@ -108,7 +108,7 @@ def _put(queue: _Queue, item: Frame | SourceError | None, stop: Event) -> bool:
 
 
 def _frames(camera: RigCamera, clock: Clock, say: Say) -> Iterator[Frame]:
-    """Frames until the stream ends, from :func:`_read`'s thread."""
+    """Frames until the camera has gone, from :func:`_read`'s thread."""
     import av
 
     where = f"camera {camera.name}: {hide_password(camera.source or '')}"
@@ -126,6 +126,8 @@ def _frames(camera: RigCamera, clock: Clock, say: Say) -> Iterator[Frame]:
             with suppress(av.error.InvalidDataError):
                 for packet in pass_through(container, stream):
                     yield Frame(bytes(packet), name, stamps.of(packet))
+            # A camera that is there does not end: it may come back.
+            raise SourceError(f"{where}: the stream has ended")
     except av.error.FFmpegError as error:
         raise SourceError(f"{where}: {_explain(error)}") from error
 

@@ -183,7 +183,13 @@ def test_a_stream_that_ends(tmp_path: Path) -> None:
     address = f"http://127.0.0.1:{port}/live"
     once = ("-re", "-f", "image2", "-framerate", "50", "-i", str(tmp_path / "%03d.jpg"))
     with serve(*once, "-c", "copy", *MJPEG, address, port=port):
-        assert take(address, 1000)[-1].data == pictures[-1]
+        found: list[Frame] = []
+        with (
+            pytest.raises(SourceError, match="the stream has ended"),
+            open_network(RigCamera("red", source=address), Clock(), lambda text: None) as frames,
+        ):
+            found.extend(frame for frame in frames if frame is not None)
+    assert found[-1].data == pictures[-1]
 
 
 def test_a_program_that_is_killed_ends_the_stream(tmp_path: Path) -> None:

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import json
 from pathlib import Path
-from typing import TYPE_CHECKING, Annotated, Any
+from typing import TYPE_CHECKING, Annotated, Any, Optional
 
 import typer
 
@@ -14,17 +14,21 @@ from ipsys_log.cli.options import (
     AsJson,
     Calibrations,
     Corners,
-    Logs,
     RigFile,
     cameras_of,
     load_calibrations,
 )
+from ipsys_log.cli.record import recorded_now
 
 if TYPE_CHECKING:
     from ipsys_log.report.alignment import AlignedLab
 
 __all__ = ["add_commands"]
 
+NoLogs = Annotated[
+    Optional[list[Path]],  # noqa: UP045
+    typer.Argument(help="Logs, read as one. Results go to the last.", metavar="[LOG]..."),
+]
 Plot = Annotated[
     Path | None, typer.Option(metavar="FILE", help="Draw the floor map and the pictures of the cameras: PNG.")
 ]
@@ -35,10 +39,11 @@ def add_commands(app: typer.Typer) -> None:
 
 
 def align(
-    logs: Logs,
+    logs: NoLogs = None,
     rig: RigFile = None,
     calibration: Calibrations = None,
     corners: Corners = None,
+    seconds: Annotated[float, typer.Option(min=0.1, help="Without a log: how long to look.")] = 3.0,
     plot: Plot = None,
     as_json: AsJson = False,
 ) -> None:
@@ -46,8 +51,24 @@ def align(
 
     From markers that lie on the floor, four or more in each picture, or one that is laid down at one place
     after the other. Where places were measured, also the floor that no camera sees, and where neighbours
-    overlap by less than a marker. What it needs and the log does not hold yet is made first.
+    overlap by less than a marker. What it needs and the log does not hold yet is made first. Without a log
+    it looks at what the cameras of the rig send now.
     """
+    if logs:
+        _align(logs, rig, calibration, corners, plot, as_json)
+        return
+    with recorded_now(rig, calibration, seconds) as log:
+        _align([log], None, None, corners, plot, as_json)
+
+
+def _align(
+    logs: list[Path],
+    rig: Path | None,
+    calibration: list[str] | None,
+    corners: str | None,
+    plot: Path | None,
+    as_json: bool,
+) -> None:
     from ipsys_log.log.session import Session
     from ipsys_log.messages import CameraPoints, Markers, Rig
     from ipsys_log.report.alignment import read_alignment

@@ -6,6 +6,7 @@ import signal
 from collections.abc import Callable, Iterator
 from contextlib import ExitStack, contextmanager, nullcontext
 from pathlib import Path
+from tempfile import TemporaryDirectory
 from threading import Timer
 from time import monotonic
 from typing import TYPE_CHECKING, Annotated, Optional
@@ -25,7 +26,7 @@ if TYPE_CHECKING:
     from ipsys_log.sinks.rerun_live import LiveView
     from ipsys_log.sources.attached import Attached
 
-__all__ = ["add_commands"]
+__all__ = ["add_commands", "recorded_now"]
 
 Lab = Annotated[Path, typer.Option("--rig", help="The rig file; each camera has a source there.")]
 Only = Annotated[
@@ -114,6 +115,28 @@ def live(
         pipeline.live(cameras, settings, output, request, "fuse", _both(status, viewer))
 
 
+@contextmanager
+def recorded_now(rig: Path | None, calibration: list[str] | None, seconds: float) -> Iterator[Path]:
+    """A log of what the cameras of a rig send in the next seconds, for as long as the block lasts.
+
+    Raises
+    ------
+    IpsysError
+        Without a rig, or where its cameras do not send.
+    """
+    from ipsys_log import pipeline
+    from ipsys_log.errors import IpsysError
+
+    if rig is None:
+        raise IpsysError("name a log, or give --rig lab.toml to take what its cameras send now")
+    with TemporaryDirectory(prefix="ipsys-") as folder:
+        log = Path(folder) / "now.mcap"
+        with _opened(log, rig, None, calibration, seconds, force=False, kept=False) as opened:
+            cameras, settings, status = opened
+            pipeline.record(cameras, settings, log, status)
+        yield log
+
+
 def _both(first: Watch, second: Watch | None) -> Watch:
     def watch(message: Message | None) -> None:
         first(message)
@@ -163,6 +186,7 @@ def _opened(
     calibration: list[str] | None,
     seconds: float | None,
     force: bool,
+    kept: bool = True,
 ) -> Iterator[tuple[Attached, list[Message], LiveStatus]]:
     """Cameras that send, what is written first, and what is shown on the screen meanwhile."""
     from rich.live import Live
@@ -189,13 +213,14 @@ def _opened(
             stack.callback(timer.cancel)
             timer.start()
         status = LiveStatus(attached.states, stack.enter_context(Monitor(lab)), output, monotonic)
-        remarks.print(f"recording into {output}; Ctrl-C ends it")
+        what = f"recording into {output}; Ctrl-C ends it" if kept else f"looking for {seconds:g} s"
+        remarks.print(what)
         if remarks.is_terminal:
             stack.enter_context(
                 Live(get_renderable=status.show, console=remarks, transient=True, refresh_per_second=2)
             )
         yield attached, first_messages(lab, lenses, attached.now_ns), status
-    for line in status.summary():
+    for line in status.summary() if kept else ():
         console.print(line)
 
 

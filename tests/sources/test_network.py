@@ -97,6 +97,10 @@ def test_rtsp_stamps_are_the_cameras(tmp_path: Path) -> None:
         frames = take(address, 60, said)
         end_ns = time.time_ns()
     assert {frame.format for frame in frames} == {"h264"}
+    # RTSP has the parameter sets in its description; here they stand before each keyframe.
+    keys = [n for n, frame in enumerate(frames) if 5 in units(frame.data, "h264")]
+    assert keys == list(range(0, 60, 10))
+    assert all({7, 8} <= set(units(frames[n].data, "h264")) for n in keys)
     stamps = [frame.time_ns for frame in frames if frame.time_ns is not None]
     assert len(stamps) > 30
     # In the present, and a frame apart.

@@ -34,7 +34,7 @@ def endpoint(size: int, more: int = 0) -> bytes:
 # The control interface has an endpoint of its own, which sends no pictures.
 DESCRIPTORS = (
     bytes([18, 1, *[0] * 16])
-    + interface(0, 0, 1) + endpoint(2000)
+    + interface(0, 0, 1) + endpoint(1024, 2)
     + interface(1, 1, 2) + endpoint(512)
     + interface(1, 2, 2) + endpoint(1020, 2)
 )  # fmt: skip

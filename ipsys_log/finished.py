@@ -71,7 +71,9 @@ def opened_log(
         if rigs:
             check_references(rigs[-1])
         if len({rig.reference_points for rig in rigs}) > 1:
-            raise IpsysError(f"{path}: its reference points change; give those that hold with --rig")
+            raise IpsysError(
+                f"{path}: its reference points change on the way; give those that hold with --rig"
+            )
     replay([path], request, "camera-frame", progress=progress)
     with Session([path]) as session:
         yield FinishedLog(path, session, rigs[-1])

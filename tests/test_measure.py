@@ -5,6 +5,11 @@ from __future__ import annotations
 import fcntl
 import io
 import os
+import signal
+import socket
+import subprocess
+import sys
+import urllib.request
 from collections.abc import Iterable
 from pathlib import Path
 from typing import Any, NamedTuple
@@ -254,3 +259,25 @@ def test_the_terminal_asks_checks_and_undoes(
     assert "p001 is withdrawn" in done.out
     assert "1 place measured" in done.out
     assert [row.withdraws for row in foreign_read(log)] == ["", "p001"]
+
+
+def test_the_page_is_served_until_it_is_interrupted(unmeasured: Unmeasured) -> None:
+    command = [sys.executable, "-m", "ipsys_log", "measure", str(unmeasured.log), "--port", "0"]
+    with subprocess.Popen(command, stdout=subprocess.PIPE, stderr=subprocess.PIPE, text=True) as served:
+        assert served.stdout is not None
+        assert served.stderr is not None
+        url = served.stdout.readline().removeprefix("open ").strip()
+        with urllib.request.urlopen(url, timeout=10) as page:
+            assert "<title>ipsys measure</title>" in page.read().decode()
+        served.send_signal(signal.SIGINT)
+        out, err = served.communicate(timeout=20)
+    assert served.returncode == 0
+    assert out == f"0 places measured into {unmeasured.log}\n"
+    assert "Traceback" not in err
+
+
+def test_a_port_in_use(ipsys: Ipsys, unmeasured: Unmeasured) -> None:
+    with socket.create_server(("127.0.0.1", 0)) as taken:
+        port = taken.getsockname()[1]
+        line = refused(ipsys, unmeasured.log, "measure", unmeasured.log, "--port", port)
+    assert f"--port {port}: is in use by another program; give another one" in line

@@ -53,7 +53,7 @@ class Scene(Protocol):
     """What measuring is done on.
 
     ``stops`` are the places of a finished log, in order; none while recording. ``model`` is the present
-    one, ``rig`` the one that holds.
+    one, ``rig`` the one that holds. Whoever asks does so from one thread, which need not be the main one.
     """
 
     @property

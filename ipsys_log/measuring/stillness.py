@@ -24,6 +24,8 @@ _GAP_NS = 2 * NS_PER_S
 _DRIFT_M, _DRIFT_OF_ONE_M = 0.002, 0.004
 # Slow motion looks still for shorter than this; but not if the marker was not seen before and after.
 _SHORTEST_NS = NS_PER_S
+# A frame in which something passes by does not end a stretch.
+_SHARE_NEAR = 0.95
 # Of one sighting nobody can tell.
 FEWEST = 2
 
@@ -38,8 +40,12 @@ def lies_still(points_m: Array) -> bool:
     >>> lies_still(np.array([[0.1, 0.2, 2.0], [0.106, 0.2, 2.0]]))
     False
     """
-    if len(points_m) < FEWEST or not _near(points_m, np.median(points_m, axis=0)).all():
+    if len(points_m) < FEWEST:
         return False
+    near = _near(points_m, np.median(points_m, axis=0))
+    if near.mean() < _SHARE_NEAR:
+        return False
+    points_m = points_m[near]
     # Across the view: the noise of a depth moves a point along its ray, sideways too where that is slanted.
     rays = points_m[:, :2] / points_m[:, 2:]
     half = len(rays) // 2
@@ -67,9 +73,7 @@ def still_stretches(cameras: Mapping[str, Sightings]) -> list[tuple[int, int, tu
     First and last time in ns, both included, and the cameras that saw it then. Stretches of several
     cameras that overlap are one: all of it, or what they have in common where one saw it move meanwhile.
     """
-    found = sorted(
-        (start_ns, end_ns) for seen in cameras.values() for start_ns, end_ns in _camera_stretches(seen)
-    )
+    found = sorted(stretch for seen in cameras.values() for stretch in _joined(seen))
     joined: list[list[tuple[int, int]]] = []
     for start_ns, end_ns in found:
         if joined and start_ns <= max(end for _, end in joined[-1]):
@@ -105,6 +109,18 @@ def _between(sightings: Sightings, start_ns: int, end_ns: int) -> Array:
     return sightings.points_m[within]
 
 
+def _joined(sightings: Sightings) -> list[tuple[int, int]]:
+    """The stretches of one camera; two of one place that follow one another are one."""
+    found: list[tuple[int, int]] = []
+    for start_ns, end_ns in _camera_stretches(sightings):
+        both = (found[-1][0], end_ns) if found else (start_ns, end_ns)
+        if found and start_ns - found[-1][1] <= _GAP_NS and lies_still(_between(sightings, *both)):
+            found[-1] = both
+        else:
+            found.append((start_ns, end_ns))
+    return found
+
+
 def _camera_stretches(sightings: Sightings) -> Iterator[tuple[int, int]]:
     """The stretches in which one camera sees a marker lie still."""
     times_ns, points_m = sightings.times_ns, sightings.points_m
@@ -116,7 +132,8 @@ def _camera_stretches(sightings: Sightings) -> Iterator[tuple[int, int]]:
         end = int(ends[np.searchsorted(ends, first, "right")])
         stop = _first_away(rays, depths_m, first, end)
         if stop - first < FEWEST or not lies_still(points_m[first:stop]):
-            first += 1
+            # A stretch that is met in its middle is followed back to its beginning.
+            first += max((stop - first) // 4, 1)
             continue
         # About its middle: at the beginning the hand may still be at it.
         near = _near(points_m[first:end], np.median(points_m[first:stop], axis=0))

@@ -83,7 +83,10 @@ class _Questions:
 
     async def picture(self, request: Request) -> Response:
         found = self._pictures.get((request.path_params["camera"], request.path_params["time_ns"]))
-        return Response(status_code=404) if found is None else Response(found, media_type="image/jpeg")
+        if found is None:
+            return Response(status_code=404)
+        # Its address names one picture for good.
+        return Response(found, media_type="image/jpeg", headers={"Cache-Control": "private, max-age=60"})
 
     async def check(self, request: Request) -> Response:
         return JSONResponse(checked_json(self._checked(await _body(request))))

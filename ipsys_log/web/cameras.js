@@ -1,31 +1,54 @@
 // What each camera sees: the marker close up, or, after a tap, whole pictures.
 import { element, make } from "./make.js";
 
-export function drawCameras(where, view) {
-  where.replaceChildren(...view.cameras.map((camera) => tile(camera, view, where)));
+let shown = { cameras: [] };
+
+// The tiles stay what they are while pictures come: a tap, or the focus, is on one of them.
+export async function drawCameras(where, view) {
+  await Promise.all(view.cameras.map((camera) => camera.picture && load(camera.picture)));
+  const names = view.cameras.map((camera) => camera.name).join(" ");
+  if (where.dataset.names !== names) {
+    where.dataset.names = names;
+    where.replaceChildren(...view.cameras.map(() => tile(where)));
+  }
+  shown = view;
+  view.cameras.forEach((camera, n) => fill(where.children[n], camera, view, where.classList.contains("whole")));
 }
 
-function tile(camera, view, where) {
-  const chosen = camera.markers.find((one) => one.id === view.marker);
-  const svg = element("svg", { class: view.state, role: "img", preserveAspectRatio: "xMidYMid slice" });
-  const says = chosen ? `sees marker ${view.marker}` : "does not see it";
-  svg.setAttribute("aria-label", `Camera ${camera.name} ${says}`);
-  const [width, height] = camera.size_px ?? [16, 9];
-  const whole = where.classList.contains("whole");
-  svg.setAttribute("viewBox", chosen && !whole ? closeUp(chosen.corners_px, width, height) : `0 0 ${width} ${height}`);
-  if (!whole) svg.setAttribute("preserveAspectRatio", chosen ? "xMidYMid slice" : "xMidYMid meet");
-  svg.style.aspectRatio = whole ? `${width} / ${height}` : "1";
-  if (camera.picture) svg.append(element("image", { href: camera.picture, width, height }));
-  for (const one of camera.markers)
-    svg.append(element("polygon", { points: one.corners_px.map((c) => c.map((v) => v + 0.5)).join(" "), class: one === chosen ? "chosen" : "" }));
-  const name = make("span", {}, camera.name, make("small", {}, chosen ? "sees it" : "no"));
-  name.style.borderColor = camera.colour;
-  const made = make("button", { type: "button", title: "Close up, or the whole picture" }, svg, name);
+// So that a tile changes from one picture to the next without a blank between them.
+async function load(source) {
+  const picture = new Image();
+  picture.src = source;
+  try { await picture.decode(); } catch { /* its place stays dark */ }
+}
+
+function tile(where) {
+  const made = make("button", { type: "button", title: "Close up, or the whole picture" }, element("svg", { role: "img" }), make("span"));
   made.addEventListener("click", () => {
     where.classList.toggle("whole");
-    drawCameras(where, view);
+    drawCameras(where, shown);
   });
   return made;
+}
+
+function fill(made, camera, view, whole) {
+  const [svg, name] = made.children;
+  const chosen = camera.markers.find((one) => one.id === view.marker);
+  const [width, height] = camera.size_px ?? [16, 9];
+  const close = chosen && !whole;
+  svg.setAttribute("class", view.state);
+  svg.setAttribute("aria-label", `Camera ${camera.name} ${chosen ? `sees marker ${view.marker}` : "does not see it"}`);
+  svg.setAttribute("viewBox", close ? closeUp(chosen.corners_px, width, height) : `0 0 ${width} ${height}`);
+  svg.setAttribute("preserveAspectRatio", close ? "xMidYMid slice" : "xMidYMid meet");
+  svg.style.aspectRatio = whole ? `${width} / ${height}` : "1";
+  const outline = (one) => element("polygon", {
+    points: one.corners_px.map((corner) => corner.map((value) => value + 0.5)).join(" "),
+    class: one === chosen ? "chosen" : "",
+  });
+  const picture = camera.picture ? [element("image", { href: camera.picture, width, height })] : [];
+  svg.replaceChildren(...picture, ...camera.markers.map(outline));
+  name.replaceChildren(camera.name, make("small", {}, chosen ? "sees it" : "no"));
+  name.style.borderColor = camera.colour;
 }
 
 // A square about the marker, five times as wide, within the picture as far as it goes.

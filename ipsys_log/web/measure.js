@@ -6,7 +6,7 @@ import { make } from "./make.js";
 const $ = (id) => document.getElementById(id);
 const POLL_MS = 700, WAIT_MS = 250, NOTICE_MS = 6000;
 const cm = (value, digits = 1) => value.toFixed(digits);
-let lab, history, view = { cameras: [] }, found = {}, stop = null, asked = 0, timer, noticeTimer;
+let lab, history, view = { cameras: [] }, found = {}, stop = null, asked = 0, looks = 0, timer, noticeTimer;
 
 async function ask(path, body) {
   const options = body && {
@@ -153,12 +153,13 @@ function draw() {
 
 async function look() {
   const query = new URLSearchParams(stop === null ? { marker: $("marker").value } : { stop, marker: lab.stops[stop].marker });
-  const state = view.state;
-  view = await ask(`views?${query}`);
+  const state = view.state, number = ++looks, answer = await ask(`views?${query}`);
+  if (number !== looks) return;
+  view = answer;
   $("sight").textContent = upper(view.text);
   $("sight").className = `chip ${view.state}`;
   if (stop === null) offerMarkers();
-  drawCameras($("cameras"), view);
+  await drawCameras($("cameras"), view);
   if (state !== view.state) soon();
 }
 

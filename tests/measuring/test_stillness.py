@@ -62,6 +62,13 @@ def test_a_hand_in_front_of_it_for_a_second_does_not_part_a_place_but_three_do()
         assert len(still_stretches({"red": joined})) == count
 
 
+def test_a_frame_in_which_it_jumps_does_not_part_a_place() -> None:
+    path = laid((8, 0, 0))
+    path[100] += [0.05, 0, 0]
+    (found,) = still_stretches({"red": seen(path)})
+    assert found[:2] == (0, int(seen(path).times_ns[-1]))
+
+
 def test_a_depth_that_jitters_at_the_edge_of_the_picture_is_no_motion() -> None:
     ray = np.array([-0.95, 0.55, 1.0])
     assert lies_still(ray * np.array([[1.92], [1.921], [1.913]]))

@@ -18,7 +18,7 @@ MOST_PICTURES = 50
 _BLURRED = 2.2
 _BLURRED_PX = 1.8
 # A board that moved less than this share of the image's diagonal shows nothing new.
-_SAME = 0.002
+_SAME = 0.0005
 
 
 class Dropped(NamedTuple):

@@ -10,6 +10,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from ipsys_log.calibration.boards import Board
+from ipsys_log.calibration.refine import refine_corners
 
 __all__ = ["LEAST_CORNERS", "Grey", "Sighting", "find_board"]
 
@@ -18,12 +19,17 @@ Grey = NDArray[np.uint8]
 
 # What a pose can be told from, with something left to check it.
 LEAST_CORNERS = 6
+# One or two corners are as often something else in the room.
+_SEEN = 4
 _THOROUGH = cv2.CALIB_CB_EXHAUSTIVE | cv2.CALIB_CB_NORMALIZE_IMAGE | cv2.CALIB_CB_ACCURACY
 # Where along an edge between two corners its sharpness is read, and how far beside it, in squares: within the
 # white around a marker.
 _ALONG = (0.3, 0.4, 0.5, 0.6, 0.7)
 _BESIDE, _BESIDE_MARKERS = 0.3, 0.12
 _SAMPLES = 15
+# How far beside an edge nothing else is seen, in squares; of the white between it and a marker, a part.
+_CLEAR, _CLEAR_MARKERS = 0.3, 0.4
+_LEAST_SLOPE = 0.1
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -61,10 +67,12 @@ def find_board(name: str, grey: Grey, board: Board, thorough: bool) -> Sighting 
     places = board.places(ids)
     if len(ids) < LEAST_CORNERS or min(len(set(column)) for column in places.T.tolist()) < 2:
         return Sighting(name, ids, pixels, 0.0, np.tile(pixels.mean(axis=0), (4, 1)))
+    blur_px = _edge_width_px(grey, board, ids, pixels)
+    clear = _CLEAR if board.marker_scale is None else _CLEAR_MARKERS * (1 - board.marker_scale)
+    pixels = refine_corners(grey, board.grid[0], ids, pixels, blur_px, clear)
     image_from_board = _homography(places, pixels)
     columns, rows = board.grid
     ends = np.array([[0, 0], [columns - 1, 0], [columns - 1, rows - 1], [0, rows - 1]], dtype=np.float64)
-    blur_px = _edge_width_px(grey, board, ids, pixels)
     return Sighting(name, ids, pixels, blur_px, _carried(image_from_board, ends))
 
 
@@ -80,7 +88,7 @@ def _chessboard(grey: Grey, board: Board, thorough: bool) -> tuple[NDArray[np.in
 
 def _charuco(grey: Grey, board: Board) -> tuple[NDArray[np.intp], Array] | None:
     corners, ids, _, _ = _charuco_detector(board).detectBoard(grey)
-    if ids is None or len(ids) == 0:
+    if ids is None or len(ids) < _SEEN:
         return None
     return np.asarray(ids, dtype=np.intp).ravel(), np.asarray(corners, dtype=np.float64).reshape(-1, 2)
 
@@ -108,8 +116,11 @@ def _edge_width_px(grey: Grey, board: Board, ids: NDArray[np.intp], pixels: Arra
     """The standard deviation of the blur across the edges of squares, the greater one of both directions.
 
     A step from black to white, blurred by a normal distribution, is steepest by its height over
-    sqrt(2 pi) standard deviations.
+    sqrt(2 pi) standard deviations. Its height is that of black and white on the board, for a profile that a
+    marker cuts short may reach neither.
     """
+    (left, top), (right, bottom) = np.maximum(np.round([pixels.min(axis=0), pixels.max(axis=0)]), 0).astype(int)
+    black, white = np.percentile(grey[top : bottom + 1, left : right + 1], [10, 90])
     at = dict(zip(ids.tolist(), pixels, strict=True))
     beside = _BESIDE if board.marker_scale is None else _BESIDE_MARKERS
     columns = board.grid[0]
@@ -120,12 +131,12 @@ def _edge_width_px(grey: Grey, board: Board, ids: NDArray[np.intp], pixels: Arra
         spacing = [np.linalg.norm(at[i] - at[i + other]) for i in at if i + other in at]
         if pairs and spacing:
             reach_px = max(beside * float(np.median(spacing)), 2.0)
-            widths.append(_widths_px(grey, np.array(pairs), reach_px))
-    return max((float(np.median(found)) for found in widths if found.size), default=0.0)
+            widths.append((white - black) / (np.sqrt(2 * np.pi) * _slopes(grey, np.array(pairs), reach_px)))
+    return max((float(np.median(found)) for found in widths), default=0.0)
 
 
-def _widths_px(grey: Grey, ends: Array, reach_px: float) -> Array:
-    """Widths of edges between pairs of corners (n, 2, 2), from profiles of ``reach_px`` to both sides."""
+def _slopes(grey: Grey, ends: Array, reach_px: float) -> Array:
+    """How steep edges between pairs of corners (n, 2, 2) are, in levels per px, up to ``reach_px`` aside."""
     along = ends[:, 1] - ends[:, 0]
     across = np.stack([-along[:, 1], along[:, 0]], axis=1) / np.linalg.norm(along, axis=1, keepdims=True)
     offsets = np.linspace(-reach_px, reach_px, _SAMPLES)
@@ -136,7 +147,4 @@ def _widths_px(grey: Grey, ends: Array, reach_px: float) -> Array:
         grey.astype(np.float32), rows[..., 0], rows[..., 1], cv2.INTER_LINEAR, borderMode=cv2.BORDER_REPLICATE
     )
     profiles = levels.reshape(len(ends), len(_ALONG), _SAMPLES).mean(axis=1)
-    heights = np.abs(profiles[:, :2].mean(axis=1) - profiles[:, -2:].mean(axis=1))
-    slopes = np.abs(np.diff(profiles, axis=1)).max(axis=1) / (offsets[1] - offsets[0])
-    seen = heights > 2.0
-    return np.asarray(heights[seen] / (np.sqrt(2 * np.pi) * slopes[seen]))
+    return np.asarray(np.abs(np.diff(profiles, axis=1)).max(axis=1) / (offsets[1] - offsets[0]) + _LEAST_SLOPE)

@@ -28,16 +28,15 @@ _MOST_ROUNDS = 8
 # Nothing is far off that is this near: pixels are no better.
 _NEAR_PX = 0.05
 # Pixels are square unless the pictures say otherwise, by this and by three standard deviations.
-_SQUARE = 0.003
+_SQUARE = 0.01
 
 
 @dataclass(frozen=True, slots=True, eq=False)
 class Left:
-    """A picture that the fit left out: its number, RMS in px, and how many of its corners were far off."""
+    """A picture that the fit left out: its number, and why."""
 
     picture: int
-    rms_px: float
-    far_corners: int
+    reason: str
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -75,7 +74,7 @@ def solve(model: LensModel, corners: Corners, size_px: tuple[int, int]) -> Solve
         kept, gone = _belonging(corners, residuals(model, fit, corners))
         if kept.all() or len(pictures) - len(gone) < 3:
             break
-        left += [Left(int(pictures[g.picture]), g.rms_px, g.far_corners) for g in gone]
+        left += [Left(int(pictures[g.picture]), g.reason) for g in gone]
         corners, still = corners.keep(kept)
         pictures = pictures[still]
         fit = Fit(fit.lens, fit.rotations[still], fit.places_m[still])
@@ -119,12 +118,18 @@ def _belonging(corners: Corners, missed_px: Array) -> tuple[NDArray[np.bool_], l
     """Which corners belong to the fit, (n,), and the pictures that do not."""
     distances = np.linalg.norm(missed_px, axis=1)
     near = distances <= max(_FAR_CORNER * _spread(missed_px), _NEAR_PX)
-    squares, counts = corners.sums(distances**2), corners.sums(np.ones_like(distances))
+    counts = corners.sums(np.ones_like(distances))
     remaining = corners.sums(near.astype(float))
-    rms_px = np.sqrt(squares / counts)
     # Single corners aside, a picture as a whole may be off.
     rest_px = np.sqrt(corners.sums(distances**2 * near) / np.maximum(remaining, 1))
-    far = rest_px > max(_FAR_PICTURE * float(np.median(rest_px)), _NEAR_PX)
-    far |= remaining < np.maximum(_LEAST_CORNERS, counts / 2)
-    gone = [Left(int(n), float(rms_px[n]), int(counts[n] - remaining[n])) for n in np.flatnonzero(far)]
-    return near & ~far[corners.picture], gone
+    usual_px = float(np.median(rest_px))
+    scattered = remaining < np.maximum(_LEAST_CORNERS, counts / 2)
+    off = rest_px > max(_FAR_PICTURE * usual_px, _NEAR_PX)
+    gone = []
+    for n in np.flatnonzero(scattered | off):
+        if scattered[n]:
+            reason = f"corners far off: {counts[n] - remaining[n]:.0f} of {counts[n]:.0f}"
+        else:
+            reason = f"does not fit: its corners are {rest_px[n]:.2f} px off, usually {usual_px:.2f}"
+        gone.append(Left(int(n), reason))
+    return near & ~(scattered | off)[corners.picture], gone

@@ -15,6 +15,7 @@ FLOORS = {
     "geometry": 1,
     "models": 2, "log": 2,
     "stages": 3, "offline": 3, "sources": 3, "sinks": 3, "formats": 3,
+    "calibration": 3,
     "request": 4, "runs": 4, "output": 4, "lookup": 4, "tasks": 4, "remarks": 4, "perform": 4, "preflight": 4,
     "pipeline": 4, "report": 4,
     "cli": 5, "__main__": 6, "__init__": 6,

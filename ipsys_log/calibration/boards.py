@@ -95,7 +95,7 @@ def parse_board(text: str, square_m: float, marker_scale: float, dictionary: str
         return Board(columns, rows, square_m, inverted=inverted)
     if not 0.1 <= marker_scale <= 0.95:
         raise IpsysError(
-            f"--marker-scale {marker_scale:g}: give the marker's side as a share of the square's, such as 0.75"
+            f"--marker-scale {marker_scale:g}: give a marker's side as a share of a square's, as 0.75"
         )
     board = Board(columns, rows, square_m, marker_scale, dictionary.upper(), inverted)
     _check_dictionary(board)
@@ -105,12 +105,10 @@ def parse_board(text: str, square_m: float, marker_scale: float, dictionary: str
 def _check_dictionary(board: Board) -> None:
     number = getattr(cv2.aruco, board.dictionary, None)
     if not board.dictionary.startswith("DICT_") or not isinstance(number, int):
-        raise IpsysError(
-            f"--dictionary {board.dictionary}: none of OpenCV's; it is printed on the board, such as DICT_4X4_50"
-        )
+        raise IpsysError(f"--dictionary {board.dictionary}: none of OpenCV's; such as DICT_4X4_50")
     markers = board.columns * board.rows // 2
     known = len(cv2.aruco.getPredefinedDictionary(number).bytesList)
     if markers > known:
         raise IpsysError(
-            f"--dictionary {board.dictionary}: has {known} markers, and the board has {markers}; name a larger one"
+            f"--dictionary {board.dictionary}: has {known} markers, the board {markers}; name a larger one"
         )

@@ -7,7 +7,7 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import NDArray
 
-__all__ = ["Coverage", "advice", "measure_coverage"]
+__all__ = ["NEAR", "Coverage", "advice", "group_outlines", "measure_coverage"]
 
 Array = NDArray[np.float64]
 
@@ -18,7 +18,8 @@ _ENOUGH_SHARE = 0.6
 _ENOUGH_TILT = np.radians(25)
 _ENOUGH_TILTED = 3
 _ENOUGH_PLACES = 10
-_NEAR = 0.03
+# Boards nearer to one another than this share of the image's diagonal show the same.
+NEAR = 0.03
 
 
 @dataclass(frozen=True, slots=True)
@@ -65,27 +66,34 @@ def measure_coverage(
     tilted = len(outlines)
     if normals is not None:
         tilted = int((np.arccos(np.clip(np.abs(normals[:, 2]), 0, 1)) >= _ENOUGH_TILT).sum())
+    places = int(group_outlines(outlines, NEAR * float(np.hypot(*size))).max()) + 1
     widest = None
     if points_m is not None:
         widest = float(np.arctan2(np.hypot(points_m[:, 0], points_m[:, 1]), points_m[:, 2]).max())
-    return Coverage(share, empty, tilted, _places(outlines, _NEAR * float(np.hypot(*size))), widest)
+    return Coverage(share, empty, tilted, places, widest)
 
 
-def _places(outlines: Array, near_px: float) -> int:
+def group_outlines(outlines: Array, near_px: float) -> NDArray[np.intp]:
+    """The group of each outline (f, 4, 2): that of the nearest first one of a group, or its own."""
+    groups: list[int] = []
     leaders: list[Array] = []
     for outline in outlines:
-        if all(np.linalg.norm(outline - other, axis=1).mean() >= near_px for other in leaders):
+        distances = [float(np.linalg.norm(outline - other, axis=1).mean()) for other in leaders]
+        nearest = int(np.argmin(distances)) if distances else 0
+        if not distances or not distances[nearest] < near_px:
+            nearest = len(leaders)
             leaders.append(outline)
-    return len(leaders)
+        groups.append(nearest)
+    return np.array(groups)
 
 
 def advice(coverage: Coverage) -> list[str]:
     """What to add to the pictures, in words; nothing where they are good."""
     lines = []
     if coverage.empty_sides:
-        sides = " and the ".join(coverage.empty_sides)
-        edges = "edge" if len(coverage.empty_sides) == 1 else "edges"
-        lines.append(f"no board near the {sides} {edges} of the image: hold it there too")
+        *most, last = coverage.empty_sides
+        sides = f"{', '.join(most)} and {last} edges" if most else f"{last} edge"
+        lines.append(f"no board near the {sides} of the image: hold it there too")
     elif coverage.share < _ENOUGH_SHARE:
         lines.append(f"the board covered {coverage.share:.0%} of the image: move it all over the view")
     if coverage.places < _ENOUGH_PLACES:
@@ -93,7 +101,7 @@ def advice(coverage: Coverage) -> list[str]:
         lines.append(f"the board was held at {coverage.places} {places}: move it more")
     if coverage.tilted < _ENOUGH_TILTED:
         lines.append(
-            f"the board was tilted by 25 degrees or more in {coverage.tilted} pictures: tilt it to all sides, "
+            f"tilted by 25 degrees or more in {coverage.tilted} pictures: tilt the board to all sides, "
             "for the focal length is told from that"
         )
     return lines

@@ -7,8 +7,9 @@ from dataclasses import replace
 
 from ipsys_log.calibration.boards import Board
 from ipsys_log.calibration.sighting import Grey, find_board
+from ipsys_log.errors import IpsysError
 
-__all__ = ["hint"]
+__all__ = ["check_whole", "hint"]
 
 # One dictionary of each kind: the smaller ones are its beginning.
 _DICTIONARIES = (
@@ -29,6 +30,24 @@ def hint(pictures: Sequence[Grey], board: Board) -> str:
             "board is in the picture, with a white margin"
         )
     return "; give columns x rows of its squares, and the --dictionary that its markers are of"
+
+
+def check_whole(pictures: Sequence[Grey], board: Board, where: str) -> None:
+    """See that a chessboard is not a part of a larger one: whichever part is found, changes.
+
+    Raises
+    ------
+    IpsysError
+        Naming the larger one.
+    """
+    for more in ((1, 1), (1, 0), (0, 1)) if board.marker_scale is None else ():
+        larger = replace(board, columns=board.columns + more[0], rows=board.rows + more[1])
+        seen = sum(find_board("", grey, larger, thorough=False) is not None for grey in pictures)
+        if 2 * seen > len(pictures):
+            raise IpsysError(
+                f"{where}: {board} is seen, and it is a part of {larger}: "
+                f"give --board {larger.columns}x{larger.rows}"
+            )
 
 
 def _others(board: Board) -> Iterator[tuple[Board, str]]:

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import re
 from collections.abc import Callable, Iterator, Sequence
+from functools import partial
 from itertools import chain, islice
 from pathlib import Path
 from typing import NamedTuple
@@ -39,6 +40,11 @@ class Pictures(NamedTuple):
     where: str
     total: int
     read: Callable[[], Iterator[tuple[str, Grey | None]]]
+
+    @property
+    def looked_at(self) -> int:
+        """How many of them are read; 0 where that is not known."""
+        return -(-self.total // _stride(self.total))
 
 
 def find_sources(paths: Sequence[Path], cameras: Sequence[str]) -> list[Pictures]:
@@ -82,10 +88,12 @@ def _sources_of(path: Path, cameras: Sequence[str]) -> list[Pictures]:
         return _log(path, cameras)
     if path.suffix.lower() in _PICTURES:
         name = _camera_name(path.absolute().parent.name, path, cameras)
-        return [Pictures(name, str(path), 1, lambda: _read_files([path]))]
+        return [Pictures(name, str(path), 1, partial(_read_files, [path]))]
     if path.suffix.lower() in _VIDEOS:
         return [_video(path, cameras)]
-    raise IpsysError(f"{path}: is neither a log (.mcap), a picture ({_PICTURES[0]} ...) nor a video ({_VIDEOS[0]} ...)")
+    raise IpsysError(
+        f"{path}: is neither a log (.mcap), a picture ({_PICTURES[0]} ...) nor a video ({_VIDEOS[0]} ...)"
+    )
 
 
 def _camera_name(text: str, path: Path, cameras: Sequence[str]) -> str:
@@ -102,13 +110,13 @@ def _folder(folder: Path, cameras: Sequence[str]) -> list[Pictures]:
     here = _files(folder)
     if here:
         name = _camera_name(folder.absolute().name, folder, cameras)
-        return [Pictures(name, str(folder), len(here), lambda: _read_files(here))]
+        return [Pictures(name, str(folder), len(here), partial(_read_files, here))]
     subs = {sub: files for sub in sorted(folder.iterdir()) if sub.is_dir() and (files := _files(sub))}
     wanted = {sub: files for sub, files in subs.items() if not cameras or sub.name in cameras}
     if not subs:
         raise IpsysError(f"{folder}: has no pictures ({', '.join(_PICTURES[:3])} ...)")
     return [
-        Pictures(_camera_name(sub.name, sub, []), str(sub), len(files), lambda files=files: _read_files(files))
+        Pictures(_camera_name(sub.name, sub, []), str(sub), len(files), partial(_read_files, files))
         for sub, files in wanted.items()
     ]
 
@@ -153,7 +161,7 @@ def _video(path: Path, cameras: Sequence[str]) -> Pictures:
     if not opened:
         raise IpsysError(f"{path}: is no video that can be read; convert it to H.264 in an .mp4")
     name = _camera_name(path.stem, path, cameras)
-    return Pictures(name, str(path), max(total, 0), lambda: _read_video(path, _stride(total)))
+    return Pictures(name, str(path), max(total, 0), partial(_read_video, path, _stride(total)))
 
 
 def _read_video(path: Path, stride: int) -> Iterator[tuple[str, Grey | None]]:
@@ -184,7 +192,7 @@ def _log(path: Path, cameras: Sequence[str]) -> list[Pictures]:
         if not session.images:
             raise IpsysError(f"{path}: has no frames of any camera")
     return [
-        Pictures(c, f"{path}: camera {c}", counts[c], lambda t=t, c=c: _read_log(path, t, _stride(counts[c])))
+        Pictures(c, f"{path}: camera {c}", counts[c], partial(_read_log, path, t, _stride(counts[c])))
         for c, t in topics.items()
     ]
 

@@ -1,9 +1,9 @@
 """Corners of squares from the edges that meet in them.
 
-Around a corner there is little to see, and on a ChArUco board markers come near it. Its four edges are long.
-A camera's gamma and the markers' borders shift an edge towards its white side, or its black one; the white
-side changes at the corner, so that an edge through the corner is shifted to both sides alike, and goes through
-the corner as before.
+Around a corner there is little to see, and on a ChArUco board markers come near it. Its four edges are
+long. A camera's gamma and the markers' borders shift an edge towards its white side, or its black one;
+the white side changes at the corner, so that an edge is shifted to both sides alike, and goes through the
+corner as before.
 """
 
 from __future__ import annotations

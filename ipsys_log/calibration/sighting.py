@@ -28,7 +28,7 @@ _ALONG = (0.3, 0.4, 0.5, 0.6, 0.7)
 _BESIDE, _BESIDE_MARKERS = 0.3, 0.12
 _SAMPLES = 15
 # How far beside an edge nothing else is seen, in squares; of the white between it and a marker, a part.
-_CLEAR, _CLEAR_MARKERS = 0.3, 0.4
+_CLEAR, _CLEAR_MARKERS = 0.3, 0.32
 _LEAST_SLOPE = 0.1
 
 
@@ -119,7 +119,9 @@ def _edge_width_px(grey: Grey, board: Board, ids: NDArray[np.intp], pixels: Arra
     sqrt(2 pi) standard deviations. Its height is that of black and white on the board, for a profile that a
     marker cuts short may reach neither.
     """
-    (left, top), (right, bottom) = np.maximum(np.round([pixels.min(axis=0), pixels.max(axis=0)]), 0).astype(int)
+    (left, top), (right, bottom) = np.maximum(np.round([pixels.min(axis=0), pixels.max(axis=0)]), 0).astype(
+        int
+    )
     black, white = np.percentile(grey[top : bottom + 1, left : right + 1], [10, 90])
     at = dict(zip(ids.tolist(), pixels, strict=True))
     beside = _BESIDE if board.marker_scale is None else _BESIDE_MARKERS
@@ -147,4 +149,6 @@ def _slopes(grey: Grey, ends: Array, reach_px: float) -> Array:
         grey.astype(np.float32), rows[..., 0], rows[..., 1], cv2.INTER_LINEAR, borderMode=cv2.BORDER_REPLICATE
     )
     profiles = levels.reshape(len(ends), len(_ALONG), _SAMPLES).mean(axis=1)
-    return np.asarray(np.abs(np.diff(profiles, axis=1)).max(axis=1) / (offsets[1] - offsets[0]) + _LEAST_SLOPE)
+    return np.asarray(
+        np.abs(np.diff(profiles, axis=1)).max(axis=1) / (offsets[1] - offsets[0]) + _LEAST_SLOPE
+    )

@@ -81,15 +81,13 @@ def solve(model: LensModel, corners: Corners, size_px: tuple[int, int]) -> Solve
     far = int(np.isin(everything.picture, pictures).sum()) - len(corners.picture)
     fit, covariance, groups, square = _finish(model, fit, corners, size_px)
     missed_px = residuals(model, fit, corners)
-    return Solved(
-        model, fit, covariance, corners, pictures, missed_px, tuple(left), far, groups, square
-    )
+    return Solved(model, fit, covariance, corners, pictures, missed_px, tuple(left), far, groups, square)
 
 
 def _finish(
     model: LensModel, start: Fit, corners: Corners, size_px: tuple[int, int]
 ) -> tuple[Fit, Array, int, bool]:
-    """The last fit, its covariance (p, p), from how many groups; with fx = fy where nothing speaks against."""
+    """The last fit, its covariance (p, p), from how many groups; and whether fx = fy, as mostly."""
     groups = alike(model, start, corners, size_px)
     found = []
     for square in (False, True):

@@ -1,7 +1,7 @@
 """A lens and poses to start from, when nothing is known of the focal length.
 
-Several focal lengths are tried. With each, a corner is a ray, and the plane of the board follows from the rays
-alone, which may come from the side or from behind: nothing is divided by a depth.
+Several focal lengths are tried. With each, a corner is a ray, and the plane of the board follows from
+the rays alone, which may come from the side or from behind: nothing is divided by a depth.
 """
 
 from __future__ import annotations
@@ -37,7 +37,9 @@ def find_start(model: LensModel, corners: Corners, size_px: tuple[int, int]) -> 
     size_px : width and height.
     """
     longer = max(size_px)
-    tried = [_fit_from(model, corners, size_px, share * longer) for share in _FOCAL_SHARES[model.distortion_model]]
+    tried = [
+        _fit_from(model, corners, size_px, share * longer) for share in _FOCAL_SHARES[model.distortion_model]
+    ]
     return min(tried, key=lambda fit: fit.cost)
 
 
@@ -57,7 +59,7 @@ def _fit_from(model: LensModel, corners: Corners, size_px: tuple[int, int], foca
 
 
 def fitted_basis(model: LensModel, square: bool) -> Array:
-    """All directions in which a lens of this kind may change, (p, q); one for fx and fy if pixels are square."""
+    """The directions in which a lens may change, (p, q); one for fx and fy together if pixels are square."""
     basis = np.eye(len(model.names))[:, : 4 + model.fitted]
     if square:
         basis[1, 0] = 1.0

@@ -6,15 +6,15 @@ import numpy as np
 from numpy.typing import NDArray
 
 from ipsys_log.calibration.bundle import Corners, Fit, normal_equations
+from ipsys_log.calibration.coverage import NEAR, group_outlines
 from ipsys_log.calibration.lens_models import LensModel, project_points
 
 __all__ = ["alike", "lens_covariance"]
 
 Array = NDArray[np.float64]
 
-# Boards nearer to one another than this share of the image's diagonal show the same; or a half of that and
-# so on, until there are enough groups for a jackknife.
-_NEAR = 0.03
+# Boards that are near show the same; or those half as far apart and so on, until there are enough groups
+# for a jackknife.
 _HALVINGS = 4
 _ENOUGH_GROUPS = 15
 
@@ -28,27 +28,13 @@ def alike(model: LensModel, fit: Fit, corners: Corners, size_px: tuple[int, int]
     outline_m = np.array([[x, y, 0.0] for x in (low[0], high[0]) for y in (low[1], high[1])])
     seen_m = np.einsum("fij,kj->fki", fit.rotations, outline_m) + fit.places_m[:, None]
     outlines = project_points(model, fit.lens, seen_m.reshape(-1, 3))[0].reshape(-1, 4, 2)
-    near_px = _NEAR * float(np.hypot(*size_px))
+    near_px = NEAR * float(np.hypot(*size_px))
     for _ in range(_HALVINGS):
-        groups = _grouped(outlines, near_px)
+        groups = group_outlines(outlines, near_px)
         if groups.max() + 1 >= _ENOUGH_GROUPS:
             return groups
         near_px /= 2
     return np.arange(len(outlines))
-
-
-def _grouped(outlines: Array, near_px: float) -> NDArray[np.intp]:
-    """Outlines (f, 4, 2) by the first one that each is near to."""
-    groups: list[int] = []
-    leaders: list[Array] = []
-    for outline in outlines:
-        distances = [float(np.linalg.norm(outline - other, axis=1).mean()) for other in leaders]
-        nearest = int(np.argmin(distances)) if distances else 0
-        if not distances or not distances[nearest] < near_px:
-            nearest = len(leaders)
-            leaders.append(outline)
-        groups.append(nearest)
-    return np.array(groups)
 
 
 def lens_covariance(
@@ -62,7 +48,7 @@ def lens_covariance(
     """Covariance (q, q) of the lens along ``basis``, by leaving out each group of pictures in turn.
 
     Corners of one picture share errors (a board that is not flat, blur, a lens that is not quite of this
-    kind), and pictures differ in theirs. Taken for independent, they make a lens look better known than it is.
+    kind), and pictures differ in theirs. Taken for independent, they make a lens look too well known.
     The jackknife over whole groups supposes nothing of this; each is left out in one linear step.
 
     References

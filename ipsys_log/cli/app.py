@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import typer
 
-from ipsys_log.cli import derive, imports, inspect, plan, report, setup, view
+from ipsys_log.cli import calibrate, derive, imports, inspect, plan, report, setup, view
 
 app = typer.Typer(
     name="ipsys",
@@ -15,7 +15,7 @@ app = typer.Typer(
     pretty_exceptions_enable=False,
     context_settings={"help_option_names": ["-h", "--help"]},
 )
-for module in (setup, imports, derive, plan, report, inspect, view):
+for module in (setup, imports, calibrate, derive, plan, report, inspect, view):
     module.add_commands(app)
 
 

@@ -60,13 +60,15 @@ class Fit:
 @dataclass(frozen=True, slots=True, eq=False)
 class Normal:
     """Normal equations of the weighted corners: for the lens (q, q), (q,) of each picture, the poses
-    (f, 6, 6), (f, 6), and between them (f, 6, q)."""
+    (f, 6, 6), (f, 6), and between them (f, 6, q); and what draws the lens to 0, (q, q), (q,)."""
 
     lens: Array
     lens_gradient: Array
     poses: Array
     pose_gradient: Array
     between: Array
+    pull: Array
+    pull_gradient: Array
 
 
 def camera_points(fit: Fit, corners: Corners) -> Array:
@@ -87,6 +89,10 @@ def _weights(missed_px: Array, scale_px: float | None) -> tuple[Array, float]:
         return np.ones(len(squares)), float(squares.sum())
     ratio = squares / scale_px**2
     return 1 / (1 + ratio), float(scale_px**2 * np.log1p(ratio).sum())
+
+
+def _cost(model: LensModel, fit: Fit, corners: Corners, scale_px: float | None) -> float:
+    return _weights(residuals(model, fit, corners), scale_px)[1] + float(model.pull @ fit.lens**2)
 
 
 def normal_equations(
@@ -110,18 +116,21 @@ def normal_equations(
         corners.sums(np.einsum("nki,nkj->nij", by_pose, by_pose)),
         corners.sums(np.einsum("nki,nk->ni", by_pose, missed)),
         corners.sums(np.einsum("nki,nkj->nij", by_pose, by_lens)),
+        (basis.T * model.pull) @ basis,
+        basis.T @ (model.pull * fit.lens),
     )
 
 
 def _solve(normal: Normal, damping: float) -> tuple[Array, Array]:
     """A damped step of the lens (q,) and of the poses (f, 6)."""
     poses = normal.poses + damping * _diagonals(normal.poses)
-    lens = normal.lens.sum(axis=0)
+    lens = normal.lens.sum(axis=0) + normal.pull
     lens = lens + damping * np.diag(np.diag(lens))
     solved = np.linalg.solve(poses, np.concatenate([normal.between, normal.pose_gradient[..., None]], axis=2))
     transposed = normal.between.transpose(0, 2, 1)
     reduced = lens - (transposed @ solved[:, :, :-1]).sum(axis=0)
-    gradient = normal.lens_gradient.sum(axis=0) - (transposed @ solved[:, :, -1:]).sum(axis=0)[:, 0]
+    gradient = normal.lens_gradient.sum(axis=0) + normal.pull_gradient
+    gradient = gradient - (transposed @ solved[:, :, -1:]).sum(axis=0)[:, 0]
     step = -np.linalg.solve(reduced, gradient) if gradient.size else gradient
     return step, -solved[:, :, -1] - solved[:, :, :-1] @ step
 
@@ -156,7 +165,7 @@ def adjust(
     ----------
     Triggs, McLauchlan, Hartley and Fitzgibbon, Bundle adjustment - a modern synthesis, 2000.
     """
-    fit = replace(start, cost=_weights(residuals(model, start, corners), scale_px)[1])
+    fit = replace(start, cost=_cost(model, start, corners, scale_px))
     damping, steps = 1e-3, 0
     while steps < most_steps and damping < _MOST_DAMPING:
         steps += 1
@@ -191,5 +200,5 @@ def _tried(
     if not (np.isfinite(tried.lens).all() and (tried.lens[:2] > 0).all()):
         return None
     with np.errstate(over="ignore", invalid="ignore"):
-        cost = _weights(residuals(model, tried, corners), scale_px)[1]
+        cost = _cost(model, tried, corners, scale_px)
     return replace(tried, cost=cost) if np.isfinite(cost) else None

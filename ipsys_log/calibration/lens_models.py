@@ -20,23 +20,34 @@ Array = NDArray[np.float64]
 # Points nearer to the plane of a pinhole than this share of their distance have no place in its picture.
 _LEAST_DEPTH = 1e-3
 _TINY = 1e-12
+# Far less than what corners say, and enough where they say nothing.
+_PULL_PX = 0.1
 
 
 class LensModel(NamedTuple):
     """A kind of lens: the name in the log, what its coefficients are called, how many of them are fitted.
 
-    Those that are not fitted stay 0.
+    Those that are not fitted stay 0. ``usual`` is how large coefficients usually are, where pictures may not
+    tell them from one another: a common factor above and below a fraction bends nothing.
     """
 
     distortion_model: str
     coefficients: tuple[str, ...]
     fitted: int
     bend: Callable[[Array, Array], tuple[Array, Array, Array]]
+    usual: float = np.inf
 
     @property
     def names(self) -> tuple[str, ...]:
         """All parameters, in order."""
         return ("fx", "fy", "cx", "cy", *self.coefficients)
+
+    @property
+    def pull(self) -> Array:
+        """By how much each parameter is drawn to 0, (p,): the square of a residual of ``_PULL_PX`` when it is
+        as large as usual."""
+        strength = (_PULL_PX / self.usual) ** 2
+        return np.array([0.0] * 4 + [strength] * len(self.coefficients))
 
 
 def project_points(model: LensModel, parameters: Array, points_m: Array) -> tuple[Array, Array, Array]:
@@ -123,7 +134,7 @@ LENSES = {
     "fisheye": LensModel("kannala_brandt", ("k1", "k2", "k3", "k4"), 4, _bend_fisheye),
     "pinhole": LensModel("plumb_bob", _FIVE, 5, _bend_pinhole),
     "pinhole4": LensModel("plumb_bob", _FIVE, 4, _bend_pinhole),
-    "pinhole8": LensModel("rational_polynomial", (*_FIVE, "k4", "k5", "k6"), 8, _bend_pinhole),
+    "pinhole8": LensModel("rational_polynomial", (*_FIVE, "k4", "k5", "k6"), 8, _bend_pinhole, 2.0),
 }
 
 

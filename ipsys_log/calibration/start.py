@@ -25,6 +25,10 @@ _FOCAL_SHARES = {
 }
 _FOCAL_SHARES["rational_polynomial"] = _FOCAL_SHARES["plumb_bob"]
 _SCALE_PX = 2.0
+# How many unknowns of the lens (None: all), for how many steps: poses, the focal length, its middle, the rest.
+_FIRST = ((0, 10), (1, 15))
+_THEN = ((3, 30), (None, 60))
+_KEPT = 4
 
 
 def find_start(model: LensModel, corners: Corners, size_px: tuple[int, int]) -> Fit:
@@ -37,23 +41,27 @@ def find_start(model: LensModel, corners: Corners, size_px: tuple[int, int]) -> 
     size_px : width and height.
     """
     longer = max(size_px)
-    tried = [
-        _fit_from(model, corners, size_px, share * longer) for share in _FOCAL_SHARES[model.distortion_model]
-    ]
-    return min(tried, key=lambda fit: fit.cost)
+    shares = _FOCAL_SHARES[model.distortion_model]
+    tried = [_posed(model, corners, size_px, share * longer) for share in shares]
+    # The focal length alone shows which of them are hopeless.
+    tried = sorted((_freed(model, fit, corners, _FIRST) for fit in tried), key=lambda fit: fit.cost)
+    return min((_freed(model, fit, corners, _THEN) for fit in tried[:_KEPT]), key=lambda fit: fit.cost)
 
 
-def _fit_from(model: LensModel, corners: Corners, size_px: tuple[int, int], focal_px: float) -> Fit:
-    """The fit that a focal length leads to: poses, then one focal length, then the middle, then all."""
-    count = len(model.names)
-    lens = np.zeros(count)
+def _posed(model: LensModel, corners: Corners, size_px: tuple[int, int], focal_px: float) -> Fit:
+    """Poses that follow from a focal length."""
+    lens = np.zeros(len(model.names))
     lens[:4] = focal_px, focal_px, (size_px[0] - 1) / 2, (size_px[1] - 1) / 2
     rays = _rays(model, lens, corners.pixels)
     bounds = [*corners.starts, len(corners.picture)]
     poses = [pose_from_rays(corners.board_m[a:b], rays[a:b]) for a, b in pairwise(bounds)]
-    fit = Fit(lens, np.stack([r for r, _ in poses]), np.stack([t for _, t in poses]))
+    return Fit(lens, np.stack([r for r, _ in poses]), np.stack([t for _, t in poses]))
+
+
+def _freed(model: LensModel, fit: Fit, corners: Corners, plan: tuple[tuple[int | None, int], ...]) -> Fit:
+    """A fit by ever more unknowns of the lens, each for so many steps."""
     basis = fitted_basis(model, square=True)
-    for unknowns, steps in ((0, 10), (1, 20), (3, 30), (basis.shape[1], 60)):
+    for unknowns, steps in plan:
         fit = adjust(model, fit, corners, basis[:, :unknowns], _SCALE_PX, steps)
     return fit
 

@@ -62,7 +62,10 @@ def lens_covariance(
     each = normal.lens - transposed @ solved[:, :, :-1]
     gradient = normal.lens_gradient - (transposed @ solved[:, :, -1:])[..., 0]
     of_group = (groups == np.arange(groups.max() + 1)[:, None]).astype(float)
-    without = each.sum(axis=0) - np.einsum("gf,fij->gij", of_group, each)
+    whole = each.sum(axis=0) + normal.pull
+    without = whole - np.einsum("gf,fij->gij", of_group, each)
     shifts = np.linalg.solve(without, (of_group @ gradient)[..., None])[..., 0]
     count = len(of_group)
-    return np.asarray((count - 1) / count * shifts.T @ shifts)
+    # A parameter that is drawn to 0 is off by as much as it is usually large.
+    drawn = np.linalg.solve(whole, normal.pull * (model.usual if np.isfinite(model.usual) else 0.0))
+    return np.asarray((count - 1) / count * shifts.T @ shifts + drawn @ drawn.T)

@@ -27,6 +27,10 @@ LEAST_PICTURES = 6
 # A focal length less sure than this is said to be so; coefficients are worth nothing beyond theirs.
 _UNSURE = 0.02
 _UNTOLD = 1.0
+# Nor is a focal length a result that may as well be half or twice as long.
+_UNKNOWN = 0.5
+# Edges wider than this, in all pictures, are a camera in the dark or out of focus.
+_SOFT_PX = 2.5
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -87,11 +91,28 @@ def calibrate(camera: str, looked: Looked, board: Board, model: LensModel) -> Ca
         np.repeat(np.arange(len(used)), [len(s.ids) for s in used]),
         len(used),
     )
-    solved = solve(model, corners, looked.size_px)
+    solved = _solved(camera, model, corners, looked.size_px)
     bad += [Dropped(used[left.picture].name, left.reason) for left in solved.left]
     used = [used[n] for n in solved.pictures]
     _check_enough(camera, used, bad, looked)
     return _judged(camera, model, looked, used, solved, bad, chosen.spare)
+
+
+def _solved(camera: str, model: LensModel, corners: Corners, size_px: tuple[int, int]) -> Solved:
+    alike = IpsysError(
+        f"camera {camera}: the pictures do not tell the lens, for they show the board in too few ways; "
+        "tilt it to all sides, and hold it near and far and all over the image"
+    )
+    try:
+        solved = solve(model, corners, size_px)
+    except np.linalg.LinAlgError as error:
+        raise alike from error
+    sigmas = np.sqrt(np.diag(solved.covariance))
+    if not (np.isfinite(solved.fit.lens).all() and np.isfinite(sigmas).all()):
+        raise alike
+    if (sigmas[:2] > _UNKNOWN * solved.fit.lens[:2]).any():
+        raise alike
+    return solved
 
 
 def _check_enough(camera: str, used: list[Sighting], bad: list[Dropped], looked: Looked) -> None:
@@ -149,7 +170,7 @@ def _judged(
         tuple(spare),
         solved.far_corners,
         coverage,
-        (*advice(coverage), *_doubts(model, lens, sigmas)),
+        (*advice(coverage), *_doubts(model, lens, sigmas), *_softness(used)),
         solved.corners.pixels,
         solved.residuals_px,
     )
@@ -166,3 +187,13 @@ def _doubts(model: LensModel, lens: Array, sigmas: Array) -> list[str]:
     if model.distortion_model == "rational_polynomial" and sigmas[4:].max() > _UNTOLD:
         notes.append("these pictures do not tell eight coefficients from one another: use --lens pinhole")
     return notes
+
+
+def _softness(used: list[Sighting]) -> list[str]:
+    soft_px = float(np.median([s.blur_px for s in used]))
+    if soft_px < _SOFT_PX:
+        return []
+    return [
+        f"edges are {soft_px:.1f} px wide in all pictures: more light, a shorter exposure or a sharper focus "
+        "would help"
+    ]

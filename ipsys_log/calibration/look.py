@@ -93,7 +93,7 @@ def look(
 
 def _remember(some: list[Grey], grey: Grey, count: int, total: int) -> None:
     """Keep a few pictures, spread over all of them, to find out what they show instead."""
-    if count % max(1, total // _HINTED) == 0 or total <= _HINTED:
+    if count % max(1, -(-total // _HINTED)) == 0:
         some.append(grey)
         if len(some) > 2 * _HINTED:
             del some[::2]

@@ -26,7 +26,7 @@ _THOROUGH = cv2.CALIB_CB_EXHAUSTIVE | cv2.CALIB_CB_NORMALIZE_IMAGE | cv2.CALIB_C
 # white around a marker.
 _ALONG = (0.3, 0.4, 0.5, 0.6, 0.7)
 _BESIDE, _BESIDE_MARKERS = 0.3, 0.12
-_SAMPLES = 15
+_STEP_PX, _PIXEL = 0.5, 2
 # How far beside an edge nothing else is seen, in squares; of the white between it and a marker, a part.
 _CLEAR, _CLEAR_MARKERS = 0.3, 0.32
 _LEAST_SLOPE = 0.1
@@ -141,14 +141,13 @@ def _slopes(grey: Grey, ends: Array, reach_px: float) -> Array:
     """How steep edges between pairs of corners (n, 2, 2) are, in levels per px, up to ``reach_px`` aside."""
     along = ends[:, 1] - ends[:, 0]
     across = np.stack([-along[:, 1], along[:, 0]], axis=1) / np.linalg.norm(along, axis=1, keepdims=True)
-    offsets = np.linspace(-reach_px, reach_px, _SAMPLES)
+    offsets = np.arange(-reach_px, reach_px + 1e-9, _STEP_PX)
     start = ends[:, :1] + along[:, None] * np.array(_ALONG)[:, None]
     at = (start[:, :, None] + across[:, None, None] * offsets[:, None]).astype(np.float32)
-    rows = at.reshape(-1, _SAMPLES, 2)
+    rows = at.reshape(-1, len(offsets), 2)
     levels = cv2.remap(
-        grey.astype(np.float32), rows[..., 0], rows[..., 1], cv2.INTER_LINEAR, borderMode=cv2.BORDER_REPLICATE
-    )
-    profiles = levels.reshape(len(ends), len(_ALONG), _SAMPLES).mean(axis=1)
-    return np.asarray(
-        np.abs(np.diff(profiles, axis=1)).max(axis=1) / (offsets[1] - offsets[0]) + _LEAST_SLOPE
-    )
+        grey, rows[..., 0], rows[..., 1], cv2.INTER_LINEAR, borderMode=cv2.BORDER_REPLICATE
+    ).astype(np.float64)
+    # Over a whole pixel, or noise would look steep.
+    rises = np.abs(levels[:, _PIXEL:] - levels[:, :-_PIXEL]).max(axis=1) / (_PIXEL * _STEP_PX)
+    return np.asarray(np.median(rises.reshape(len(ends), -1), axis=1) + _LEAST_SLOPE)

@@ -25,7 +25,7 @@ _FOCAL_SHARES = {
 }
 _FOCAL_SHARES["rational_polynomial"] = _FOCAL_SHARES["plumb_bob"]
 _SCALE_PX = 2.0
-# How many unknowns of the lens (None: all), for how many steps: poses, the focal length, its middle, the rest.
+# How many unknowns of the lens (None: all), for how many steps: poses, focal length, middle, the rest.
 _FIRST = ((0, 10), (1, 15))
 _THEN = ((3, 30), (None, 60))
 _KEPT = 4

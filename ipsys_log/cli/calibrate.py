@@ -190,4 +190,4 @@ def _show(one: Calibrated, files: list[Path], for_rig: bool) -> None:
         console.print(f"{path} written", markup=False)
     if for_rig:
         console.print(f'in lab.toml, under [[cameras]], name = "{one.camera}":', markup=False)
-        console.print(f'calibration = "{files[0]}"\n', markup=False)
+        console.print(f'calibration = "{files[0].as_posix()}"\n', markup=False)

@@ -106,7 +106,7 @@ def render(
     pattern: Callable[[Array], Array],
     size_px: tuple[int, int],
     rng: np.random.Generator,
-    times: int = 4,
+    times: int = 3,
 ) -> NDArray[np.uint8]:
     """A picture of a plane: the mean of ``times`` x ``times`` rays in each pixel, and noise."""
     width, height = size_px
@@ -121,7 +121,8 @@ def render(
     levels = np.full(len(pixels), 120.0)
     levels[met] = pattern(origin[:2] + depth[met, None] * directions[met, :2])
     grey = levels.reshape(height, times, width, times).mean(axis=(1, 3))
-    return np.clip(np.round(grey + rng.normal(0, 1.5, grey.shape)), 0, 255).astype(np.uint8)
+    noisy = np.round(grey + rng.normal(0, 1.5, grey.shape))
+    return np.asarray(np.clip(noisy, 0, 255), dtype=np.uint8)
 
 
 def chessboard_pattern(columns: int, rows: int, square_m: float) -> Callable[[Array], Array]:

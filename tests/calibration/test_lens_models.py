@@ -5,15 +5,16 @@ from __future__ import annotations
 import cv2
 import numpy as np
 import pytest
+from numpy.typing import NDArray
 
-from ipsys_log.calibration.lens_models import LENSES, project_points
+from ipsys_log.calibration.lens_models import LENSES, find_lens, project_points
 from ipsys_log.errors import IpsysError
 from tests.calibration.boards_seen import TRUTH, pixels_of
 
 STILL = np.zeros(3)
 
 
-def points(seed: int = 0) -> np.ndarray:  # type: ignore[type-arg]
+def points(seed: int = 0) -> NDArray[np.float64]:
     rng = np.random.default_rng(seed)
     return np.column_stack([rng.uniform(-0.6, 0.6, (50, 2)), rng.uniform(0.6, 2.0, 50)])
 
@@ -60,8 +61,6 @@ def test_the_axis_itself_is_the_middle() -> None:
     np.testing.assert_allclose(by_point[0, :, :2], np.eye(2) * 185.0 / 2.0, atol=1e-6)
 
 
-def test_a_lens_that_there_is_not(ipsys: object) -> None:
-    from ipsys_log.calibration.lens_models import find_lens
-
+def test_a_lens_that_there_is_not() -> None:
     with pytest.raises(IpsysError, match="use one of fisheye, pinhole"):
         find_lens("omni")

@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+from itertools import pairwise
+
 import cv2
 import numpy as np
 import pytest
@@ -54,8 +56,8 @@ def test_opencv_finds_the_same_pinhole() -> None:
     corners = seen("pinhole", np.random.default_rng(3))
     found = solve(LENSES["pinhole"], corners, SIZE_PX)
     bounds = [*corners.starts, len(corners.picture)]
-    boards = [corners.board_m[a:b].astype(np.float32) for a, b in zip(bounds, bounds[1:], strict=False)]
-    pixels = [corners.pixels[a:b].astype(np.float32) for a, b in zip(bounds, bounds[1:], strict=False)]
+    boards = [corners.board_m[a:b].astype(np.float32) for a, b in pairwise(bounds)]
+    pixels = [corners.pixels[a:b].astype(np.float32) for a, b in pairwise(bounds)]
     start = np.array([[500.0, 0, 320], [0, 500, 240], [0, 0, 1]])
     flags = cv2.CALIB_FIX_ASPECT_RATIO | cv2.CALIB_USE_INTRINSIC_GUESS
     _, k, d, _, _ = cv2.calibrateCamera(boards, pixels, SIZE_PX, start, np.zeros(5), flags=flags)

@@ -15,8 +15,8 @@ from ipsys_log.sources.simulator import LabSettings
 from tests.conftest import ROOT, Ipsys
 
 COMMANDS = [
-    "init", "simulate", "import imsel", "import images", "replay", "detect", "camera-frame", "fit",
-    "evaluate", "locate", "fuse", "report", "plan", "info", "runs", "view", "repair",
+    "init", "simulate", "calibrate", "import imsel", "import images", "replay", "detect", "camera-frame",
+    "fit", "evaluate", "locate", "fuse", "report", "plan", "info", "runs", "view", "repair",
 ]  # fmt: skip
 
 

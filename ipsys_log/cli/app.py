@@ -6,6 +6,7 @@ import typer
 
 from ipsys_log.cli import (
     align,
+    calibrate,
     cameras,
     compare,
     derive,
@@ -28,7 +29,11 @@ app = typer.Typer(
     pretty_exceptions_enable=False,
     context_settings={"help_option_names": ["-h", "--help"]},
 )
-for module in (setup, cameras, align, imports, record, measure, derive, plan, report, inspect, compare, view):
+_MODULES = (
+    *(setup, cameras, calibrate, align, imports, record, measure, derive),
+    *(plan, report, inspect, compare, view),
+)
+for module in _MODULES:
     module.add_commands(app)
 
 

@@ -15,8 +15,9 @@ from ipsys_log.sources.simulator import LabSettings
 from tests.conftest import ROOT, Ipsys
 
 COMMANDS = [
-    "init", "simulate", "import imsel", "import images", "replay", "detect", "camera-frame", "fit",
-    "evaluate", "locate", "fuse", "report", "plan", "align", "info", "runs", "view", "repair",
+    "init", "simulate", "cameras", "calibrate", "align", "import imsel", "import images", "import videos",
+    "record", "live", "measure", "replay", "detect", "camera-frame", "fit", "evaluate", "locate", "fuse",
+    "report", "plan", "info", "runs", "repair", "verify", "diff", "latency", "view",
 ]  # fmt: skip
 
 

@@ -1,0 +1,114 @@
+"""Boards to calibrate with: what they are, and where their corners lie."""
+
+from __future__ import annotations
+
+import re
+from dataclasses import dataclass
+
+import cv2
+import numpy as np
+from numpy.typing import NDArray
+
+from ipsys_log.errors import IpsysError
+
+__all__ = ["Board", "parse_board"]
+
+_FORM = re.compile(r"(?P<kind>charuco:|chessboard:)?(?P<columns>\d{1,3})[x×](?P<rows>\d{1,3})")
+_MOST = 100
+
+
+@dataclass(frozen=True, slots=True)
+class Board:
+    """A flat board with a pattern of squares.
+
+    Attributes
+    ----------
+    columns, rows : of a chessboard's inner corners; of a ChArUco board's squares.
+    square_m : the side of a square. It scales the places of the board, not the lens.
+    marker_scale : side of a ChArUco board's markers, in squares; None: a chessboard, without markers.
+    dictionary : of the markers, by OpenCV's name.
+    inverted : whether black and white are exchanged.
+    legacy : whether the first square is white, as in boards made with OpenCV before 4.6 of an even
+        number of rows.
+    """
+
+    columns: int
+    rows: int
+    square_m: float
+    marker_scale: float | None = None
+    dictionary: str = "DICT_4X4_50"
+    inverted: bool = False
+    legacy: bool = False
+
+    def __str__(self) -> str:
+        if self.marker_scale is None:
+            return f"a chessboard of {self.columns} x {self.rows} inner corners"
+        first = f"a{'n inverted' if self.inverted else ''} ChArUco board"
+        return f"{first} of {self.columns} x {self.rows} squares, {self.dictionary}"
+
+    @property
+    def grid(self) -> tuple[int, int]:
+        """Inner corners from left to right, and from top to bottom."""
+        less = 0 if self.marker_scale is None else 1
+        return self.columns - less, self.rows - less
+
+    def places(self, ids: NDArray[np.intp]) -> NDArray[np.float64]:
+        """Column and row of corners, (n, 2)."""
+        return np.column_stack([ids % self.grid[0], ids // self.grid[0]]).astype(np.float64)
+
+    def points_m(self, ids: NDArray[np.intp]) -> NDArray[np.float64]:
+        """Corners on the board, (n, 3) in m: x along its rows, y down its columns, from the middle."""
+        middle = (np.array(self.grid) - 1) / 2
+        return np.column_stack([(self.places(ids) - middle) * self.square_m, np.zeros(len(ids))])
+
+
+def parse_board(text: str, square_m: float, marker_scale: float, dictionary: str, inverted: bool) -> Board:
+    """The board that ``6x4`` or ``charuco:4x5`` stands for.
+
+    Raises
+    ------
+    IpsysError
+        Where it stands for none.
+
+    Examples
+    --------
+    >>> parse_board("6x4", 0.03, 0.75, "DICT_4X4_50", False).grid
+    (6, 4)
+    >>> parse_board("charuco:4x5", 0.03, 0.75, "DICT_4X4_50", False).grid
+    (3, 4)
+    """
+    match = _FORM.fullmatch(text.strip().lower())
+    if match is None:
+        raise IpsysError(
+            f"--board {text}: write the inner corners of a chessboard as 6x4, or the squares of a ChArUco "
+            "board as charuco:4x5"
+        )
+    columns, rows = int(match["columns"]), int(match["rows"])
+    charuco = match["kind"] == "charuco:"
+    least = 3
+    if not (least <= columns <= _MOST and least <= rows <= _MOST):
+        what = "squares" if charuco else "inner corners"
+        raise IpsysError(f"--board {text}: a board has {least} to {_MOST} {what} in each direction")
+    if not 1e-4 <= square_m <= 10:
+        raise IpsysError(f"--square {square_m:g}: give the side of a square in metres, such as 0.03")
+    if not charuco:
+        return Board(columns, rows, square_m, inverted=inverted)
+    if not 0.1 <= marker_scale <= 0.95:
+        raise IpsysError(
+            f"--marker-scale {marker_scale:g}: give a marker's side as a share of a square's, as 0.75"
+        )
+    board = Board(columns, rows, square_m, marker_scale, dictionary.upper(), inverted)
+    _check_dictionary(board)
+    return board
+
+
+def _check_dictionary(board: Board) -> None:
+    number = getattr(cv2.aruco, board.dictionary, None)
+    if not board.dictionary.startswith("DICT_") or not isinstance(number, int):
+        raise IpsysError(f"--dictionary {board.dictionary}: none of OpenCV's; such as DICT_4X4_50")
+    markers = board.columns * board.rows // 2
+    known = len(cv2.aruco.getPredefinedDictionary(number).bytesList)
+    if markers > known:
+        raise IpsysError(
+            f"--dictionary {board.dictionary}: has {known} markers, the board {markers}; name a larger one"
+        )

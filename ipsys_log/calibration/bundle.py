@@ -1,0 +1,204 @@
+"""Lens and places of the board at once, by least squares over all corners: a bundle adjustment.
+
+Each picture has a pose of its own that touches no other picture's corners, so that its six unknowns are
+eliminated before the lens is solved for (the Schur complement): a step costs as much as the corners are many.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, replace
+
+import numpy as np
+from numpy.typing import NDArray
+from scipy.spatial.transform import Rotation
+
+from ipsys_log.calibration.lens_models import LensModel, project_points
+
+__all__ = ["Corners", "Fit", "Normal", "adjust", "camera_points", "normal_equations", "residuals"]
+
+Array = NDArray[np.float64]
+
+_LEAST_GAIN = 1e-9
+_MOST_DAMPING = 1e12
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class Corners:
+    """All corners of all pictures: ``board_m`` (n, 3), ``pixels`` (n, 2), and the number of the picture
+    (n,), ascending, each from 0 to ``pictures`` - 1 at least once."""
+
+    board_m: Array
+    pixels: Array
+    picture: NDArray[np.intp]
+    pictures: int
+
+    @property
+    def starts(self) -> NDArray[np.intp]:
+        """The first corner of each picture."""
+        return np.searchsorted(self.picture, np.arange(self.pictures))
+
+    def sums(self, values: Array) -> Array:
+        """Sums over each picture's corners, (pictures, ...)."""
+        return np.asarray(np.add.reduceat(values, self.starts, axis=0))
+
+    def keep(self, kept: NDArray[np.bool_]) -> tuple[Corners, NDArray[np.intp]]:
+        """Those corners only, and which pictures still have any."""
+        left, numbers = np.unique(self.picture[kept], return_inverse=True)
+        return Corners(self.board_m[kept], self.pixels[kept], numbers, len(left)), left
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class Fit:
+    """A lens (p,) and, for each picture, the board in the frame of the camera: (f, 3, 3) and (f, 3) in m."""
+
+    lens: Array
+    rotations: Array
+    places_m: Array
+    cost: float = np.inf
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class Normal:
+    """Normal equations of the weighted corners: for the lens (q, q), (q,) of each picture, the poses
+    (f, 6, 6), (f, 6), and between them (f, 6, q); and what draws the lens to 0, (q, q), (q,)."""
+
+    lens: Array
+    lens_gradient: Array
+    poses: Array
+    pose_gradient: Array
+    between: Array
+    pull: Array
+    pull_gradient: Array
+
+
+def camera_points(fit: Fit, corners: Corners) -> Array:
+    """The corners in the frame of the camera, (n, 3) in m."""
+    turned = np.einsum("nij,nj->ni", fit.rotations[corners.picture], corners.board_m)
+    return np.asarray(turned + fit.places_m[corners.picture])
+
+
+def residuals(model: LensModel, fit: Fit, corners: Corners) -> Array:
+    """By how much the fit misses the corners seen, (n, 2) in px."""
+    return project_points(model, fit.lens, camera_points(fit, corners))[0] - corners.pixels
+
+
+def _weights(missed_px: Array, scale_px: float | None) -> tuple[Array, float]:
+    """Weights of the corners and the cost, by Cauchy's loss, or by plain squares without a scale."""
+    squares = (missed_px**2).sum(axis=1)
+    if scale_px is None:
+        return np.ones(len(squares)), float(squares.sum())
+    ratio = squares / scale_px**2
+    return 1 / (1 + ratio), float(scale_px**2 * np.log1p(ratio).sum())
+
+
+def _cost(model: LensModel, fit: Fit, corners: Corners, scale_px: float | None) -> float:
+    return _weights(residuals(model, fit, corners), scale_px)[1] + float(model.pull @ fit.lens**2)
+
+
+def normal_equations(
+    model: LensModel, fit: Fit, corners: Corners, basis: Array, scale_px: float | None
+) -> Normal:
+    """What a step is solved from; ``basis`` (p, q) has the directions in which the lens may change."""
+    points_m = camera_points(fit, corners)
+    pixels, by_point, by_lens = project_points(model, fit.lens, points_m)
+    missed_px = pixels - corners.pixels
+    root = np.sqrt(_weights(missed_px, scale_px)[0])[:, None, None]
+    x, y, z = (points_m - fit.places_m[corners.picture]).T
+    zero = np.zeros_like(x)
+    # A small turn w moves a point by w x (R X).
+    turning = np.stack([zero, z, -y, -z, zero, x, y, -x, zero], axis=1).reshape(-1, 3, 3)
+    by_pose = np.concatenate([by_point @ turning, by_point], axis=2) * root
+    by_lens = by_lens @ basis * root
+    missed = missed_px * root[..., 0]
+    return Normal(
+        corners.sums(np.einsum("nki,nkj->nij", by_lens, by_lens)),
+        corners.sums(np.einsum("nki,nk->ni", by_lens, missed)),
+        corners.sums(np.einsum("nki,nkj->nij", by_pose, by_pose)),
+        corners.sums(np.einsum("nki,nk->ni", by_pose, missed)),
+        corners.sums(np.einsum("nki,nkj->nij", by_pose, by_lens)),
+        (basis.T * model.pull) @ basis,
+        basis.T @ (model.pull * fit.lens),
+    )
+
+
+def _solve(normal: Normal, damping: float) -> tuple[Array, Array]:
+    """A damped step of the lens (q,) and of the poses (f, 6)."""
+    poses = normal.poses + damping * _diagonals(normal.poses)
+    lens = normal.lens.sum(axis=0) + normal.pull
+    lens = lens + damping * np.diag(np.diag(lens))
+    solved = np.linalg.solve(poses, np.concatenate([normal.between, normal.pose_gradient[..., None]], axis=2))
+    transposed = normal.between.transpose(0, 2, 1)
+    reduced = lens - (transposed @ solved[:, :, :-1]).sum(axis=0)
+    gradient = normal.lens_gradient.sum(axis=0) + normal.pull_gradient
+    gradient = gradient - (transposed @ solved[:, :, -1:]).sum(axis=0)[:, 0]
+    step = -np.linalg.solve(reduced, gradient) if gradient.size else gradient
+    return step, -solved[:, :, -1] - solved[:, :, :-1] @ step
+
+
+def _diagonals(matrices: Array) -> Array:
+    return np.asarray(matrices * np.eye(matrices.shape[-1]))
+
+
+def _moved(fit: Fit, lens_step: Array, pose_steps: Array) -> Fit:
+    turns = Rotation.from_rotvec(pose_steps[:, :3]).as_matrix()
+    return Fit(fit.lens + lens_step, turns @ fit.rotations, fit.places_m + pose_steps[:, 3:])
+
+
+def adjust(
+    model: LensModel,
+    start: Fit,
+    corners: Corners,
+    basis: Array,
+    scale_px: float | None,
+    most_steps: int = 100,
+) -> Fit:
+    """The least cost near ``start``, by Levenberg and Marquardt's damped steps.
+
+    Parameters
+    ----------
+    model, start, corners : what is fitted to what.
+    basis : (p, q), the directions in which the lens may change; (p, 0) holds it.
+    scale_px : of Cauchy's loss, which lets corners that are far off count for little; None: plain squares.
+    most_steps : after which it ends where it is.
+
+    References
+    ----------
+    Triggs, McLauchlan, Hartley and Fitzgibbon, Bundle adjustment - a modern synthesis, 2000.
+    """
+    fit = replace(start, cost=_cost(model, start, corners, scale_px))
+    damping, steps = 1e-3, 0
+    while steps < most_steps and damping < _MOST_DAMPING:
+        steps += 1
+        normal = normal_equations(model, fit, corners, basis, scale_px)
+        before = fit.cost
+        while damping < _MOST_DAMPING:
+            tried = _tried(model, fit, corners, basis, normal, damping, scale_px)
+            if tried is not None and tried.cost <= before:
+                fit, damping = tried, max(damping / 10, 1e-12)
+                break
+            damping *= 8
+        if before - fit.cost <= _LEAST_GAIN * before:
+            break
+    return fit
+
+
+def _tried(
+    model: LensModel,
+    fit: Fit,
+    corners: Corners,
+    basis: Array,
+    normal: Normal,
+    damping: float,
+    scale_px: float | None,
+) -> Fit | None:
+    """Where a step leads, or None where there is no such place."""
+    try:
+        lens_step, pose_steps = _solve(normal, damping)
+    except np.linalg.LinAlgError:
+        return None
+    tried = _moved(fit, basis @ lens_step, pose_steps)
+    if not (np.isfinite(tried.lens).all() and (tried.lens[:2] > 0).all()):
+        return None
+    with np.errstate(over="ignore", invalid="ignore"):
+        cost = _cost(model, tried, corners, scale_px)
+    return replace(tried, cost=cost) if np.isfinite(cost) else None

@@ -1,0 +1,199 @@
+"""The lens of a camera from what was seen of a board: choose, solve, judge."""
+
+from __future__ import annotations
+
+from collections import Counter
+from dataclasses import dataclass
+
+import numpy as np
+from numpy.typing import NDArray
+
+from ipsys_log.calibration.boards import Board
+from ipsys_log.calibration.bundle import Corners, camera_points
+from ipsys_log.calibration.choose import Dropped, choose
+from ipsys_log.calibration.lens_models import LensModel
+from ipsys_log.calibration.look import Looked
+from ipsys_log.calibration.picture_coverage import Coverage, advice, measure_coverage
+from ipsys_log.calibration.sighting import Sighting
+from ipsys_log.calibration.solve import Solved, solve
+from ipsys_log.errors import IpsysError
+from ipsys_log.messages import CameraCalibration
+
+__all__ = ["LEAST_PICTURES", "Calibrated", "calibrate"]
+
+Array = NDArray[np.float64]
+
+LEAST_PICTURES = 6
+# A focal length less sure than this is said to be so; coefficients are worth nothing beyond theirs.
+_UNSURE = 0.02
+_UNTOLD = 1.0
+# Nor is a focal length a result that may as well be half or twice as long.
+_UNKNOWN = 0.5
+# Edges wider than this, in all pictures, are a camera in the dark or out of focus.
+_SOFT_PX = 2.5
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class Calibrated:
+    """A lens and how good it is.
+
+    Attributes
+    ----------
+    camera, lens : whose, and the lens.
+    names, values, sigmas : of its parameters, with their standard deviations; 0 of what was not fitted.
+    square : whether fx and fy were taken for one number.
+    rms_px, median_px : of the distances in the image between corners seen and projected: the root of the
+        mean of dx^2 + dy^2, over all corners of all pictures used.
+    looked, seen : pictures looked at, and those in which the board was seen.
+    used : names and RMS in px of the pictures that the lens rests on.
+    dropped : pictures with the board that were left out because they are bad, and why.
+    spare : good pictures that show nothing new.
+    far_corners : single corners left out of pictures used.
+    coverage, notes : where the board was, and what to do better.
+    pixels, residuals_px : (n, 2), of all corners used.
+    """
+
+    camera: str
+    lens: CameraCalibration
+    names: tuple[str, ...]
+    values: Array
+    sigmas: Array
+    square: bool
+    rms_px: float
+    median_px: float
+    looked: int
+    seen: int
+    used: tuple[tuple[str, float], ...]
+    dropped: tuple[Dropped, ...]
+    spare: tuple[Dropped, ...]
+    far_corners: int
+    coverage: Coverage
+    notes: tuple[str, ...]
+    pixels: Array
+    residuals_px: Array
+
+
+def calibrate(camera: str, looked: Looked, board: Board, model: LensModel) -> Calibrated:
+    """The lens that the pictures tell.
+
+    Raises
+    ------
+    IpsysError
+        Where too few pictures are of use; it says what to add.
+    """
+    chosen = choose(looked.sightings, board, looked.size_px)
+    used = chosen.used
+    bad = [*looked.unreadable, *chosen.bad]
+    _check_enough(camera, used, bad, looked)
+    corners = Corners(
+        np.concatenate([board.points_m(s.ids) for s in used]),
+        np.concatenate([s.pixels for s in used]),
+        np.repeat(np.arange(len(used)), [len(s.ids) for s in used]),
+        len(used),
+    )
+    solved = _solved(camera, model, corners, looked.size_px)
+    bad += [Dropped(used[left.picture].name, left.reason) for left in solved.left]
+    used = [used[n] for n in solved.pictures]
+    _check_enough(camera, used, bad, looked)
+    return _judged(camera, model, looked, used, solved, bad, chosen.spare)
+
+
+def _solved(camera: str, model: LensModel, corners: Corners, size_px: tuple[int, int]) -> Solved:
+    alike = IpsysError(
+        f"camera {camera}: the pictures do not tell the lens, for they show the board in too few ways; "
+        "tilt it to all sides, and hold it near and far and all over the image"
+    )
+    try:
+        solved = solve(model, corners, size_px)
+    except np.linalg.LinAlgError as error:
+        raise alike from error
+    sigmas = np.sqrt(np.diag(solved.covariance))
+    if not (np.isfinite(solved.fit.lens).all() and np.isfinite(sigmas).all()):
+        raise alike
+    if (sigmas[:2] > _UNKNOWN * solved.fit.lens[:2]).any():
+        raise alike
+    return solved
+
+
+def _check_enough(camera: str, used: list[Sighting], bad: list[Dropped], looked: Looked) -> None:
+    if len(used) >= LEAST_PICTURES:
+        return
+    reasons = Counter(reason.split(":")[0] for _, reason in bad)
+    why = f" ({'; '.join(f'{n} x {reason}' for reason, n in reasons.most_common(3))})" if reasons else ""
+    todo = ["take at least 15, with the board all over the image and tilted to all sides"]
+    if used:
+        pixels = np.concatenate([s.pixels for s in used])
+        coverage = measure_coverage(pixels, looked.size_px, np.stack([s.outline for s in used]))
+        todo += [line.split(":")[0] for line in advice(coverage)[:1]]
+    raise IpsysError(
+        f"camera {camera}: {len(used)} of {looked.count} pictures are of use{why}, and "
+        f"{LEAST_PICTURES} are the least; {'; '.join(todo)}"
+    )
+
+
+def _judged(
+    camera: str,
+    model: LensModel,
+    looked: Looked,
+    used: list[Sighting],
+    solved: Solved,
+    bad: list[Dropped],
+    spare: list[Dropped],
+) -> Calibrated:
+    lens = solved.fit.lens
+    k = np.array([[lens[0], 0, lens[2]], [0, lens[1], lens[3]], [0, 0, 1.0]])
+    width, height = looked.size_px
+    distances = np.linalg.norm(solved.residuals_px, axis=1)
+    counts = solved.corners.sums(np.ones_like(distances))
+    each_px = np.sqrt(solved.corners.sums(distances**2) / counts)
+    coverage = measure_coverage(
+        solved.corners.pixels,
+        looked.size_px,
+        np.stack([s.outline for s in used]),
+        solved.fit.rotations[:, :, 2],
+        camera_points(solved.fit, solved.corners),
+    )
+    sigmas = np.sqrt(np.diag(solved.covariance))
+    return Calibrated(
+        camera,
+        CameraCalibration(0, camera, width, height, model.distortion_model, lens[4:], k),
+        model.names,
+        lens,
+        sigmas,
+        solved.square,
+        float(np.sqrt((distances**2).mean())),
+        float(np.median(distances)),
+        looked.count,
+        len(looked.sightings),
+        tuple((s.name, float(rms)) for s, rms in zip(used, each_px, strict=True)),
+        tuple(bad),
+        tuple(spare),
+        solved.far_corners,
+        coverage,
+        (*advice(coverage), *_doubts(model, lens, sigmas), *_softness(used)),
+        solved.corners.pixels,
+        solved.residuals_px,
+    )
+
+
+def _doubts(model: LensModel, lens: Array, sigmas: Array) -> list[str]:
+    """What the numbers themselves say against the lens."""
+    notes = []
+    unsure = float((sigmas[:2] / lens[:2]).max())
+    if unsure > _UNSURE:
+        notes.append(
+            f"the focal length is only known to {unsure:.1%}: add pictures with the board tilted and near"
+        )
+    if model.distortion_model == "rational_polynomial" and sigmas[4:].max() > _UNTOLD:
+        notes.append("these pictures do not tell eight coefficients from one another: use --lens pinhole")
+    return notes
+
+
+def _softness(used: list[Sighting]) -> list[str]:
+    soft_px = float(np.median([s.blur_px for s in used]))
+    if soft_px < _SOFT_PX:
+        return []
+    return [
+        f"edges are {soft_px:.1f} px wide in all pictures: more light, a shorter exposure or a sharper focus "
+        "would help"
+    ]

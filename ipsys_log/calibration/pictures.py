@@ -1,0 +1,219 @@
+"""Pictures of a board: from logs, folders, picture files and videos, camera by camera."""
+
+from __future__ import annotations
+
+import re
+from collections.abc import Callable, Iterator, Sequence
+from functools import partial
+from itertools import chain, islice
+from pathlib import Path
+from typing import NamedTuple
+
+import cv2
+import numpy as np
+
+from ipsys_log.calibration.sighting import Grey
+from ipsys_log.errors import IpsysError
+from ipsys_log.log.session import Session
+from ipsys_log.messages import CompressedImage, RawImage
+from ipsys_log.rig import check_name
+
+__all__ = ["MOST_LOOKED_AT", "Pictures", "find_sources"]
+
+# Of a long recording, so many pictures are looked at, evenly spread.
+MOST_LOOKED_AT = 400
+
+_PICTURES = (".jpg", ".jpeg", ".png", ".webp", ".bmp", ".tif", ".tiff", ".pgm", ".ppm")
+_VIDEOS = (".mp4", ".avi", ".mov", ".mkv", ".m4v", ".webm", ".mpg", ".mpeg", ".mjpeg", ".mjpg")
+_GREY_OF_RAW = {
+    "mono8": (1, None), "8UC1": (1, None),
+    "rgb8": (3, cv2.COLOR_RGB2GRAY), "bgr8": (3, cv2.COLOR_BGR2GRAY), "8UC3": (3, cv2.COLOR_BGR2GRAY),
+    "rgba8": (4, cv2.COLOR_RGBA2GRAY), "bgra8": (4, cv2.COLOR_BGRA2GRAY),
+}  # fmt: skip
+
+
+class Pictures(NamedTuple):
+    """Pictures of one camera: how many there are about, and each with its name, or None for one that
+    cannot be read."""
+
+    camera: str
+    where: str
+    total: int
+    read: Callable[[], Iterator[tuple[str, Grey | None]]]
+
+    @property
+    def looked_at(self) -> int:
+        """How many of them are read; 0 where that is not known."""
+        return -(-self.total // _stride(self.total))
+
+
+def find_sources(paths: Sequence[Path], cameras: Sequence[str]) -> list[Pictures]:
+    """The pictures in logs (``.mcap``), folders, picture files and videos, by camera.
+
+    Parameters
+    ----------
+    paths : what the user named. Several of one camera are read as one.
+    cameras : of a log, only these; of anything else, the one name of its camera.
+
+    Raises
+    ------
+    IpsysError
+        Where there is nothing that can be read, or a camera has no name.
+    """
+    found = [pictures for path in paths for pictures in _sources_of(path, cameras)]
+    by_camera: dict[str, list[Pictures]] = {}
+    for pictures in found:
+        by_camera.setdefault(pictures.camera, []).append(pictures)
+    missing = [camera for camera in cameras if camera not in by_camera]
+    if missing:
+        known = ", ".join(by_camera) or "none"
+        raise IpsysError(f"--camera {missing[0]}: there are no frames of such a camera (only of {known})")
+    return [_joined(camera, parts) for camera, parts in by_camera.items()]
+
+
+def _joined(camera: str, parts: list[Pictures]) -> Pictures:
+    if len(parts) == 1:
+        return parts[0]
+    where = f"{parts[0].where} and {len(parts) - 1} more"
+    total = sum(part.total for part in parts)
+    return Pictures(camera, where, total, lambda: chain.from_iterable(part.read() for part in parts))
+
+
+def _sources_of(path: Path, cameras: Sequence[str]) -> list[Pictures]:
+    if path.is_dir():
+        return _folder(path, cameras)
+    if not path.is_file():
+        raise IpsysError(f"{path}: there is no such log, folder, picture or video")
+    if path.suffix.lower() == ".mcap":
+        return _log(path, cameras)
+    if path.suffix.lower() in _PICTURES:
+        name = _camera_name(path.absolute().parent.name, path, cameras)
+        return [Pictures(name, str(path), 1, partial(_read_files, [path]))]
+    if path.suffix.lower() in _VIDEOS:
+        return [_video(path, cameras)]
+    raise IpsysError(
+        f"{path}: is neither a log (.mcap), a picture ({_PICTURES[0]} ...) nor a video ({_VIDEOS[0]} ...)"
+    )
+
+
+def _camera_name(text: str, path: Path, cameras: Sequence[str]) -> str:
+    if len(cameras) > 1:
+        raise IpsysError(f"{path}: is of one camera; give one --camera, or calibrate one after the other")
+    if cameras:
+        return check_name(cameras[0], "--camera")
+    name = re.sub(r"[^a-z0-9]+", "_", text.lower()).strip("_")
+    return name if name[:1].isalpha() else f"camera_{name}".rstrip("_")
+
+
+def _folder(folder: Path, cameras: Sequence[str]) -> list[Pictures]:
+    """The pictures in a folder are of one camera; those in its sub-folders of one each."""
+    here = _files(folder)
+    if here:
+        name = _camera_name(folder.absolute().name, folder, cameras)
+        return [Pictures(name, str(folder), len(here), partial(_read_files, here))]
+    subs = {sub: files for sub in sorted(folder.iterdir()) if sub.is_dir() and (files := _files(sub))}
+    wanted = {sub: files for sub, files in subs.items() if not cameras or sub.name in cameras}
+    if not subs:
+        raise IpsysError(f"{folder}: has no pictures ({', '.join(_PICTURES[:3])} ...)")
+    return [
+        Pictures(_camera_name(sub.name, sub, []), str(sub), len(files), partial(_read_files, files))
+        for sub, files in wanted.items()
+    ]
+
+
+def _files(folder: Path) -> list[Path]:
+    files = [path for path in folder.iterdir() if path.is_file() and path.suffix.lower() in _PICTURES]
+    return sorted((path for path in files if not path.name.startswith(".")), key=_by_number)
+
+
+def _by_number(path: Path) -> list[tuple[int, str]]:
+    parts = re.split(r"(\d+)", path.name.lower())
+    return [(int(part), "") if part.isdecimal() else (-1, part) for part in parts]
+
+
+def _read_files(files: Sequence[Path]) -> Iterator[tuple[str, Grey | None]]:
+    for path in _spread(files):
+        yield path.name, _decode(path.read_bytes())
+
+
+def _spread(files: Sequence[Path]) -> Sequence[Path]:
+    return files[:: _stride(len(files))]
+
+
+def _stride(total: int) -> int:
+    return max(1, -(-total // MOST_LOOKED_AT))
+
+
+def _decode(data: bytes) -> Grey | None:
+    try:
+        # Turned as the sensor has it: a lens does not turn with the tag of a picture.
+        flags = cv2.IMREAD_GRAYSCALE | cv2.IMREAD_IGNORE_ORIENTATION
+        grey = cv2.imdecode(np.frombuffer(data, np.uint8), flags)
+    except cv2.error:  # OpenCV asserts on empty data
+        return None
+    return None if grey is None else np.asarray(grey, dtype=np.uint8)
+
+
+def _video(path: Path, cameras: Sequence[str]) -> Pictures:
+    video = cv2.VideoCapture(str(path))
+    total, opened = int(video.get(cv2.CAP_PROP_FRAME_COUNT)), video.isOpened()
+    video.release()
+    if not opened:
+        raise IpsysError(f"{path}: is no video that can be read; convert it to H.264 in an .mp4")
+    name = _camera_name(path.stem, path, cameras)
+    return Pictures(name, str(path), max(total, 0), partial(_read_video, path, _stride(total)))
+
+
+def _read_video(path: Path, stride: int) -> Iterator[tuple[str, Grey | None]]:
+    video = cv2.VideoCapture(str(path))
+    # A picture stays as the sensor has it, whatever the video says of how to hold it.
+    video.set(cv2.CAP_PROP_ORIENTATION_AUTO, 0)
+    try:
+        number = 0
+        while video.grab():
+            if number % stride == 0:
+                seen, frame = video.retrieve()
+                yield f"frame {number}", _grey(np.asarray(frame, dtype=np.uint8)) if seen else None
+            number += 1
+    finally:
+        video.release()
+
+
+def _grey(frame: Grey) -> Grey:
+    if frame.ndim == 2:
+        return frame
+    return np.asarray(cv2.cvtColor(frame, cv2.COLOR_BGR2GRAY), dtype=np.uint8)
+
+
+def _log(path: Path, cameras: Sequence[str]) -> list[Pictures]:
+    with Session([path]) as session:
+        topics = {c: t for c, t in session.images.items() if not cameras or c in cameras}
+        counts = {camera: session.count(topic) for camera, topic in topics.items()}
+        if not session.images:
+            raise IpsysError(f"{path}: has no frames of any camera")
+    return [
+        Pictures(c, f"{path}: camera {c}", counts[c], partial(_read_log, path, t, _stride(counts[c])))
+        for c, t in topics.items()
+    ]
+
+
+def _read_log(path: Path, topic: str, stride: int) -> Iterator[tuple[str, Grey | None]]:
+    with Session([path]) as session:
+        for message in islice(session.messages([topic]), 0, None, stride):
+            seconds = (message.publish_time_ns - session.start_ns) * 1e-9
+            yield f"at {seconds:.2f} s", _frame(message.payload)
+
+
+def _frame(frame: CompressedImage | RawImage) -> Grey | None:
+    if isinstance(frame, CompressedImage):
+        return _decode(frame.data)
+    channels, conversion = _GREY_OF_RAW.get(frame.encoding, (0, None))
+    step = frame.step or frame.width * channels
+    rows = np.frombuffer(frame.data, np.uint8)
+    if not channels or step < frame.width * channels or rows.size < step * frame.height:
+        return None
+    rows = rows[: step * frame.height].reshape(frame.height, step)[:, : frame.width * channels]
+    pixels = np.ascontiguousarray(rows.reshape(frame.height, frame.width, channels))
+    if conversion is None:
+        return pixels[..., 0]
+    return np.asarray(cv2.cvtColor(pixels, conversion), dtype=np.uint8)

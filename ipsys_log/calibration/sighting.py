@@ -1,0 +1,153 @@
+"""The board in a picture: its corners, and how sharp it is."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from functools import lru_cache
+
+import cv2
+import numpy as np
+from numpy.typing import NDArray
+
+from ipsys_log.calibration.boards import Board
+from ipsys_log.calibration.refine import refine_corners
+
+__all__ = ["LEAST_CORNERS", "Grey", "Sighting", "find_board"]
+
+Array = NDArray[np.float64]
+Grey = NDArray[np.uint8]
+
+# What a pose can be told from, with something left to check it.
+LEAST_CORNERS = 6
+# One or two corners are as often something else in the room.
+_SEEN = 4
+_THOROUGH = cv2.CALIB_CB_EXHAUSTIVE | cv2.CALIB_CB_NORMALIZE_IMAGE | cv2.CALIB_CB_ACCURACY
+# Where along an edge between two corners its sharpness is read, and how far beside it, in squares: within the
+# white around a marker.
+_ALONG = (0.3, 0.4, 0.5, 0.6, 0.7)
+_BESIDE, _BESIDE_MARKERS = 0.3, 0.12
+_STEP_PX, _PIXEL = 0.5, 2
+# How far beside an edge nothing else is seen, in squares; of the white between it and a marker, a part.
+_CLEAR, _CLEAR_MARKERS = 0.3, 0.32
+_LEAST_SLOPE = 0.1
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class Sighting:
+    """The board in a picture called ``name``: ids (n,) and pixels (n, 2) of its corners, width of its edges
+    in px (a standard deviation), and its outline (4, 2) in px, seen or not."""
+
+    name: str
+    ids: NDArray[np.intp]
+    pixels: Array
+    blur_px: float
+    outline: Array
+
+
+def find_board(name: str, grey: Grey, board: Board, thorough: bool) -> Sighting | None:
+    """Look for the board in a picture.
+
+    Parameters
+    ----------
+    name : of the picture.
+    grey : (height, width).
+    board : what to look for.
+    thorough : whether to look a second time, longer, where a chessboard is not seen at once.
+
+    Returns
+    -------
+    None where it is not seen. A ChArUco board may be seen in part, a chessboard only as a whole.
+    """
+    if board.inverted:
+        grey = np.asarray(255 - grey, dtype=np.uint8)
+    found = _chessboard(grey, board, thorough) if board.marker_scale is None else _charuco(grey, board)
+    if found is None:
+        return None
+    ids, pixels = found
+    places = board.places(ids)
+    if len(ids) < LEAST_CORNERS or min(len(set(column)) for column in places.T.tolist()) < 2:
+        return Sighting(name, ids, pixels, 0.0, np.tile(pixels.mean(axis=0), (4, 1)))
+    blur_px = _edge_width_px(grey, board, ids, pixels)
+    clear = _CLEAR if board.marker_scale is None else _CLEAR_MARKERS * (1 - board.marker_scale)
+    pixels = refine_corners(grey, board.grid[0], ids, pixels, blur_px, clear)
+    image_from_board = _homography(places, pixels)
+    columns, rows = board.grid
+    ends = np.array([[0, 0], [columns - 1, 0], [columns - 1, rows - 1], [0, rows - 1]], dtype=np.float64)
+    return Sighting(name, ids, pixels, blur_px, _carried(image_from_board, ends))
+
+
+def _chessboard(grey: Grey, board: Board, thorough: bool) -> tuple[NDArray[np.intp], Array] | None:
+    size = (board.columns, board.rows)
+    seen, corners = cv2.findChessboardCornersSB(grey, size)
+    if not seen and thorough:
+        seen, corners = cv2.findChessboardCornersSB(grey, size, flags=_THOROUGH)
+    if not seen:
+        return None
+    return np.arange(board.columns * board.rows), np.asarray(corners, dtype=np.float64).reshape(-1, 2)
+
+
+def _charuco(grey: Grey, board: Board) -> tuple[NDArray[np.intp], Array] | None:
+    corners, ids, _, _ = _charuco_detector(board).detectBoard(grey)
+    if ids is None or len(ids) < _SEEN:
+        return None
+    return np.asarray(ids, dtype=np.intp).ravel(), np.asarray(corners, dtype=np.float64).reshape(-1, 2)
+
+
+@lru_cache(maxsize=32)
+def _charuco_detector(board: Board) -> cv2.aruco.CharucoDetector:
+    dictionary = cv2.aruco.getPredefinedDictionary(getattr(cv2.aruco, board.dictionary))
+    side_m = board.square_m * (board.marker_scale or 0.0)
+    printed = cv2.aruco.CharucoBoard((board.columns, board.rows), board.square_m, side_m, dictionary)
+    printed.setLegacyPattern(board.legacy)
+    return cv2.aruco.CharucoDetector(printed)
+
+
+def _homography(places: Array, pixels: Array) -> Array:
+    found, _ = cv2.findHomography(places, pixels)
+    return np.eye(3) if found is None else np.asarray(found, dtype=np.float64)
+
+
+def _carried(homography: Array, points: Array) -> Array:
+    carried = np.column_stack([points, np.ones(len(points))]) @ homography.T
+    return np.asarray(carried[:, :2] / carried[:, 2:])
+
+
+def _edge_width_px(grey: Grey, board: Board, ids: NDArray[np.intp], pixels: Array) -> float:
+    """The standard deviation of the blur across the edges of squares, the greater one of both directions.
+
+    A step from black to white, blurred by a normal distribution, is steepest by its height over
+    sqrt(2 pi) standard deviations. Its height is that of black and white on the board, for a profile that a
+    marker cuts short may reach neither.
+    """
+    (left, top), (right, bottom) = np.maximum(np.round([pixels.min(axis=0), pixels.max(axis=0)]), 0).astype(
+        int
+    )
+    black, white = np.percentile(grey[top : bottom + 1, left : right + 1], [10, 90])
+    at = dict(zip(ids.tolist(), pixels, strict=True))
+    beside = _BESIDE if board.marker_scale is None else _BESIDE_MARKERS
+    columns = board.grid[0]
+    widths = []
+    for step, other in ((1, columns), (columns, 1)):
+        pairs = [(at[i], at[i + step]) for i in at if i + step in at and (step > 1 or (i + 1) % columns)]
+        # How far it is to the next edge beside.
+        spacing = [np.linalg.norm(at[i] - at[i + other]) for i in at if i + other in at]
+        if pairs and spacing:
+            reach_px = max(beside * float(np.median(spacing)), 2.0)
+            widths.append((white - black) / (np.sqrt(2 * np.pi) * _slopes(grey, np.array(pairs), reach_px)))
+    return max((float(np.median(found)) for found in widths), default=0.0)
+
+
+def _slopes(grey: Grey, ends: Array, reach_px: float) -> Array:
+    """How steep edges between pairs of corners (n, 2, 2) are, in levels per px, up to ``reach_px`` aside."""
+    along = ends[:, 1] - ends[:, 0]
+    across = np.stack([-along[:, 1], along[:, 0]], axis=1) / np.linalg.norm(along, axis=1, keepdims=True)
+    offsets = np.arange(-reach_px, reach_px + 1e-9, _STEP_PX)
+    start = ends[:, :1] + along[:, None] * np.array(_ALONG)[:, None]
+    at = (start[:, :, None] + across[:, None, None] * offsets[:, None]).astype(np.float32)
+    rows = at.reshape(-1, len(offsets), 2)
+    levels = cv2.remap(
+        grey, rows[..., 0], rows[..., 1], cv2.INTER_LINEAR, borderMode=cv2.BORDER_REPLICATE
+    ).astype(np.float64)
+    # Over a whole pixel, or noise would look steep.
+    rises = np.abs(levels[:, _PIXEL:] - levels[:, :-_PIXEL]).max(axis=1) / (_PIXEL * _STEP_PX)
+    return np.asarray(np.median(rises.reshape(len(ends), -1), axis=1) + _LEAST_SLOPE)

@@ -1,0 +1,133 @@
+"""From corners to a lens: start, robust fit, what does not belong left out, uncertainty."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import numpy as np
+from numpy.typing import NDArray
+
+from ipsys_log.calibration.bundle import Corners, Fit, adjust, residuals
+from ipsys_log.calibration.lens_models import LensModel
+from ipsys_log.calibration.start import find_start, fitted_basis
+from ipsys_log.calibration.uncertainty import alike, lens_covariance
+
+__all__ = ["Left", "Solved", "solve"]
+
+Array = NDArray[np.float64]
+
+# The median of a two-dimensional normal distance, in standard deviations of one coordinate.
+_MEDIAN = float(np.sqrt(2 * np.log(2)))
+# Corners count for half that are so many standard deviations off, and are left out so many off;
+# a picture is left out whose RMS is so many times the usual one.
+_DOUBTED = 5.0
+_FAR_CORNER = 12.0
+_FAR_PICTURE = 3.5
+_LEAST_CORNERS = 6
+_MOST_ROUNDS = 8
+# Nothing is far off that is this near: pixels are no better.
+_NEAR_PX = 0.05
+# Pixels are square unless the pictures say otherwise, by this and by three standard deviations.
+_SQUARE = 0.01
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class Left:
+    """A picture that the fit left out: its number, and why."""
+
+    picture: int
+    reason: str
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class Solved:
+    """A lens, its covariance (p, p), the corners it rests on, which pictures they are of, and their
+    residuals (n, 2) in px; pictures left out, how many single corners of the others, and how many groups of
+    pictures differ; whether fx and fy are one number."""
+
+    model: LensModel
+    fit: Fit
+    covariance: Array
+    corners: Corners
+    pictures: NDArray[np.intp]
+    residuals_px: Array
+    left: tuple[Left, ...]
+    far_corners: int
+    groups: int
+    square: bool
+
+
+def solve(model: LensModel, corners: Corners, size_px: tuple[int, int]) -> Solved:
+    """The lens that corners of a board in several pictures tell.
+
+    Parameters
+    ----------
+    model : the kind of lens.
+    corners : of all pictures, at least 6 in each.
+    size_px : width and height of the pictures.
+    """
+    everything, pictures, left = corners, np.arange(corners.pictures), []
+    basis = fitted_basis(model, square=True)
+    fit = find_start(model, corners, size_px)
+    for _ in range(_MOST_ROUNDS):
+        fit = adjust(model, fit, corners, basis, _scale_px(model, fit, corners))
+        kept, gone = _belonging(corners, residuals(model, fit, corners))
+        if kept.all() or len(pictures) - len(gone) < 3:
+            break
+        left += [Left(int(pictures[g.picture]), g.reason) for g in gone]
+        corners, still = corners.keep(kept)
+        pictures = pictures[still]
+        fit = Fit(fit.lens, fit.rotations[still], fit.places_m[still])
+    far = int(np.isin(everything.picture, pictures).sum()) - len(corners.picture)
+    fit, covariance, groups, square = _finish(model, fit, corners, size_px)
+    missed_px = residuals(model, fit, corners)
+    return Solved(model, fit, covariance, corners, pictures, missed_px, tuple(left), far, groups, square)
+
+
+def _finish(
+    model: LensModel, start: Fit, corners: Corners, size_px: tuple[int, int]
+) -> tuple[Fit, Array, int, bool]:
+    """The last fit, its covariance (p, p), from how many groups; and whether fx = fy, as mostly."""
+    groups = alike(model, start, corners, size_px)
+    found = []
+    for square in (False, True):
+        basis = fitted_basis(model, square)
+        fit = adjust(model, start, corners, basis, _scale_px(model, start, corners))
+        covariance = lens_covariance(model, fit, corners, basis, _scale_px(model, fit, corners), groups)
+        found.append((fit, basis @ covariance @ basis.T, int(groups.max()) + 1, square))
+    free, covariance = found[0][:2]
+    ratio = np.array([1.0, -1.0]) / free.lens[:2]
+    sigma = float(np.sqrt(ratio @ covariance[:2, :2] @ ratio))
+    off = abs(float(np.log(free.lens[0] / free.lens[1])))
+    return found[0] if off > max(3 * sigma, _SQUARE) else found[1]
+
+
+def _scale_px(model: LensModel, fit: Fit, corners: Corners) -> float:
+    """From where on a corner is doubted."""
+    return max(_DOUBTED * _spread(residuals(model, fit, corners)), _NEAR_PX)
+
+
+def _spread(missed_px: Array) -> float:
+    """Standard deviation of one coordinate, whatever a few corners do."""
+    return float(np.median(np.linalg.norm(missed_px, axis=1))) / _MEDIAN
+
+
+def _belonging(corners: Corners, missed_px: Array) -> tuple[NDArray[np.bool_], list[Left]]:
+    """Which corners belong to the fit, (n,), and the pictures that do not."""
+    distances = np.linalg.norm(missed_px, axis=1)
+    near = distances <= max(_FAR_CORNER * _spread(missed_px), _NEAR_PX)
+    counts = corners.sums(np.ones_like(distances))
+    remaining = corners.sums(near.astype(float))
+    # Single corners aside, a picture as a whole may be off.
+    rest_px = np.sqrt(corners.sums(distances**2 * near) / np.maximum(remaining, 1))
+    usual_px = float(np.median(rest_px))
+    scattered = remaining < np.maximum(_LEAST_CORNERS, counts / 2)
+    off = rest_px > max(_FAR_PICTURE * usual_px, _NEAR_PX)
+    gone = []
+    for n in np.flatnonzero(scattered | off):
+        if scattered[n]:
+            reason = f"corners far off: {counts[n] - remaining[n]:.0f} of {counts[n]:.0f}"
+        else:
+            reason = f"does not fit: its corners are {rest_px[n]:.2f} px off, usually {usual_px:.2f}"
+        gone.append(Left(int(n), reason))
+    return near & ~(scattered | off)[corners.picture], gone

@@ -1,0 +1,193 @@
+"""A lens from pictures of a board: ``ipsys calibrate``."""
+
+from __future__ import annotations
+
+import json
+from pathlib import Path
+from typing import TYPE_CHECKING, Annotated, Optional
+
+import typer
+
+from ipsys_log.cli.console import console, progress_bar, remarks
+from ipsys_log.cli.options import AsJson
+
+if TYPE_CHECKING:
+    from ipsys_log.calibration.calibrate import Calibrated
+    from ipsys_log.calibration.pictures import Pictures
+
+__all__ = ["add_commands"]
+
+Sources = Annotated[
+    list[Path],
+    typer.Argument(help="Logs, folders of pictures, pictures, videos.", metavar="SOURCE..."),
+]
+BoardName = Annotated[
+    str,
+    typer.Option(
+        metavar="COLUMNSxROWS",
+        help="The inner corners of a chessboard, as 6x4; or the squares of a ChArUco board, as charuco:4x5.",
+    ),
+]
+Square = Annotated[
+    float, typer.Option(metavar="METRES", help="Side of a square. The lens does not depend on it.")
+]
+MarkerScale = Annotated[
+    float, typer.Option(metavar="SHARE", help="Side of a ChArUco board's markers, as a share of a square's.")
+]
+Dictionary = Annotated[str, typer.Option(metavar="NAME", help="Of a ChArUco board's markers.")]
+Inverted = Annotated[bool, typer.Option("--inverted", help="Black and white of the board are exchanged.")]
+Lens = Annotated[
+    str,
+    typer.Option(
+        metavar="NAME",
+        help="fisheye (Kannala-Brandt, k1 to k4), pinhole (k1 k2 p1 p2 k3), pinhole4 (without k3), or "
+        "pinhole8 (and k4 k5 k6).",
+    ),
+]
+Cameras = Annotated[
+    Optional[list[str]],  # noqa: UP045
+    typer.Option(metavar="CAMERA", help="Of a log: only these. Else the name of the camera."),
+]
+Output = Annotated[
+    Path,
+    typer.Option("--output", "-o", metavar="PATH", help="The folder to write to, or the file: red.yaml."),
+]
+Formats = Annotated[
+    Optional[list[str]],  # noqa: UP045
+    typer.Option("--format", metavar="NAME", help="opencv (the default), ros or kalibr; repeat for several."),
+]
+Plot = Annotated[Path | None, typer.Option(metavar="FILE", help="Draw coverage and residuals: PNG.")]
+Force = Annotated[bool, typer.Option("--force", help="Write over files that exist.")]
+
+
+def add_commands(app: typer.Typer) -> None:
+    app.command()(calibrate)
+
+
+def calibrate(
+    sources: Sources,
+    board: BoardName,
+    square: Square = 0.03,
+    lens: Lens = "fisheye",
+    marker_scale: MarkerScale = 0.75,
+    dictionary: Dictionary = "DICT_4X4_50",
+    inverted: Inverted = False,
+    camera: Cameras = None,
+    output: Output = Path(),
+    formats: Formats = None,
+    plot: Plot = None,
+    force: Force = False,
+    as_json: AsJson = False,
+) -> None:
+    """The lens of a camera from pictures of a chessboard or a ChArUco board.
+
+    One file for each camera that saw the board. Sharp pictures that differ are chosen by themselves."""
+    from ipsys_log.calibration.boards import parse_board
+    from ipsys_log.calibration.cameras import calibrate_cameras
+    from ipsys_log.calibration.lens_models import find_lens
+    from ipsys_log.calibration.pictures import find_sources
+    from ipsys_log.formats.calibration_yaml import check_format
+    from ipsys_log.report.calibration import calibration_json
+    from ipsys_log.report.files import check_file
+
+    model = find_lens(lens)
+    wanted = parse_board(board, square, marker_scale, dictionary, inverted)
+    names = list(dict.fromkeys(formats or ["opencv"]))
+    for name in names:
+        check_format(name, lens)
+    found = find_sources(sources, camera or [])
+    targets = _targets(found, output, names, force)
+    if plot is not None:
+        check_file(plot, "--plot", sources)
+        _check_free(plot, force)
+    with progress_bar() as progress:
+        lenses, unseen = calibrate_cameras(found, wanted, model, progress)
+    written = _write(lenses, targets)
+    if plot is not None:
+        _draw(lenses, plot)
+    for line in unseen:
+        remarks.print(line, style="yellow", markup=False)
+    if as_json:
+        shown = [
+            {**calibration_json(one), "files": [str(path) for path in written[one.camera]]} for one in lenses
+        ]
+        print(json.dumps(shown, indent=2, allow_nan=False))  # noqa: T201
+        return
+    for one in lenses:
+        _show(one, written[one.camera], "opencv" in names)
+    if plot is not None:
+        remarks.print(f"{plot} drawn", markup=False)
+
+
+def _targets(
+    sources: list[Pictures], output: Path, formats: list[str], force: bool
+) -> dict[str, dict[str, Path]]:
+    """Where the file of each camera and format goes; an error where it cannot."""
+    from ipsys_log.errors import IpsysError
+    from ipsys_log.formats.calibration_yaml import FORMATS
+    from ipsys_log.report.files import check_file, check_folder
+
+    if output.suffix.lower() in (".yaml", ".yml"):
+        if len(sources) > 1 or len(formats) > 1:
+            raise IpsysError(f"--output {output}: one file for several lenses; name a folder")
+        targets = {sources[0].camera: {formats[0]: output}}
+        check_file(output, "--output", [])
+    else:
+        check_folder(output, "--output")
+        targets = {
+            pictures.camera: {name: output / f"{pictures.camera}{FORMATS[name][1]}.yaml" for name in formats}
+            for pictures in sources
+        }
+    for paths in targets.values():
+        for path in paths.values():
+            _check_free(path, force)
+    return targets
+
+
+def _check_free(path: Path, force: bool) -> None:
+    from ipsys_log.errors import IpsysError
+
+    if path.exists() and not force:
+        raise IpsysError(f"{path}: exists already; choose another --output, or give --force to write over it")
+
+
+def _write(lenses: list[Calibrated], targets: dict[str, dict[str, Path]]) -> dict[str, list[Path]]:
+    """Write the files of all cameras; their paths by camera."""
+    from ipsys_log.formats.calibration_yaml import FORMATS
+    from ipsys_log.report.files import write_files
+
+    contents: dict[Path, bytes] = {}
+    for one in lenses:
+        comment = (
+            f"ipsys calibrate: RMS {one.rms_px:.3f} px, median {one.median_px:.3f} px over {len(one.pixels)} "
+            f"corners of {len(one.used)} pictures"
+        )
+        sigmas = dict(zip(one.names, one.sigmas.tolist(), strict=True))
+        for name, path in targets[one.camera].items():
+            contents[path] = FORMATS[name][0](one.lens, sigmas, comment).encode()
+    for folder in dict.fromkeys(path.parent for path in contents):
+        write_files(folder, {path.name: data for path, data in contents.items() if path.parent == folder})
+    return {one.camera: list(targets[one.camera].values()) for one in lenses}
+
+
+def _draw(lenses: list[Calibrated], plot: Path) -> None:
+    from ipsys_log.report.calibration_figure import calibration_figure
+    from ipsys_log.report.files import write_files
+    from ipsys_log.report.pictures import png
+
+    write_files(plot.parent, {plot.name: png(calibration_figure(lenses), dpi=110)})
+
+
+def _show(one: Calibrated, files: list[Path], for_rig: bool) -> None:
+    from ipsys_log.report.calibration import calibration_lines, calibration_table
+
+    console.print(calibration_table(one))
+    for line in calibration_lines(one):
+        console.print(line, markup=False)
+    for note in one.notes:
+        remarks.print(f"{one.camera}: {note}", style="yellow", markup=False)
+    for path in files:
+        console.print(f"{path} written", markup=False)
+    if for_rig:
+        console.print(f'in lab.toml, under [[cameras]], name = "{one.camera}":', markup=False)
+        console.print(f'calibration = "{files[0].as_posix()}"\n', markup=False)

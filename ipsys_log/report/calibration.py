@@ -1,0 +1,100 @@
+"""A calibration in words, as a table and as JSON."""
+
+from __future__ import annotations
+
+import math
+from collections import Counter
+from typing import Any
+
+from rich.table import Table
+
+from ipsys_log.calibration.calibrate import Calibrated
+from ipsys_log.calibration.choose import Dropped
+
+__all__ = ["calibration_json", "calibration_lines", "calibration_table"]
+
+_SHOWN_DROPPED = 6
+
+
+def calibration_table(found: Calibrated) -> Table:
+    """The parameters of a lens with their standard deviations."""
+    title = f"{found.camera}: {found.lens.distortion_model}, {found.lens.width} x {found.lens.height} px"
+    table = Table(title=title, title_justify="left", title_style="bold", box=None, pad_edge=False)
+    table.add_column("", no_wrap=True)
+    for name in ("value", "+- 1 sigma", ""):
+        table.add_column(name, justify="left" if not name else "right", no_wrap=True)
+    for n, name in enumerate(found.names):
+        value, sigma = float(found.values[n]), float(found.sigmas[n])
+        digits = 2 if n < 4 else 5
+        note = "" if n >= 4 else "px"
+        if n == 1 and found.square:
+            note = "px, taken as fx: pixels are square"
+        spread = f"{sigma:.{digits}f}" if sigma > 0 else "not fitted"
+        table.add_row(name, f"{value:.{digits}f}", spread, note)
+    return table
+
+
+def calibration_lines(found: Calibrated) -> list[str]:
+    """How good it is, and what was left out."""
+    coverage, counts = found.coverage, [f"{len(found.used)} used"]
+    counts += [f"{len(found.dropped)} bad"] if found.dropped else []
+    counts += [f"{len(found.spare)} not needed"] if found.spare else []
+    lines = [
+        f"error: RMS {found.rms_px:.3f} px, median {found.median_px:.3f} px over {len(found.pixels)} corners",
+        f"pictures: {found.looked} looked at, board seen in {found.seen}, {', '.join(counts)}",
+        f"coverage: {coverage.share:.0%} of the image, to {_degrees(coverage.widest_rad)} from the axis",
+        f"          {coverage.places} places of the board, {coverage.tilted} tilted by 25 degrees or more",
+    ]
+    if found.far_corners:
+        corners = "corner" if found.far_corners == 1 else "corners"
+        lines.append(f"left out: {found.far_corners} single {corners}, far off")
+    return lines + _dropped_lines(found.dropped)
+
+
+def _degrees(angle_rad: float | None) -> str:
+    return "?" if angle_rad is None else f"{math.degrees(angle_rad):.0f} degrees"
+
+
+def _dropped_lines(dropped: tuple[Dropped, ...]) -> list[str]:
+    """Each with its reason; many of one reason as one line."""
+    counts = Counter(drop.reason for drop in dropped)
+    lines = []
+    for reason, count in counts.items():
+        names = [drop.name for drop in dropped if drop.reason == reason]
+        shown = ", ".join(names[:3]) + (f" and {count - 3} more" if count > 3 else "")
+        lines.append(f"left out: {shown}: {reason}")
+    more = len(lines) - _SHOWN_DROPPED
+    return lines if more <= 1 else [*lines[:_SHOWN_DROPPED], f"left out: and so on, {more} more (see --json)"]
+
+
+def calibration_json(found: Calibrated) -> dict[str, Any]:
+    """All of it but the single corners."""
+    lens, coverage = found.lens, found.coverage
+    return {
+        "camera": found.camera,
+        "width": lens.width,
+        "height": lens.height,
+        "distortion_model": lens.distortion_model,
+        "parameters": dict(zip(found.names, found.values.tolist(), strict=True)),
+        "standard_deviations": dict(zip(found.names, found.sigmas.tolist(), strict=True)),
+        "square_pixels": found.square,
+        "rms_px": found.rms_px,
+        "median_px": found.median_px,
+        "corners": len(found.pixels),
+        "far_corners": found.far_corners,
+        "pictures": {
+            "looked_at": found.looked,
+            "seen": found.seen,
+            "used": [{"name": name, "rms_px": rms_px} for name, rms_px in found.used],
+            "dropped": [drop._asdict() for drop in found.dropped],
+            "not_needed": [drop._asdict() for drop in found.spare],
+        },
+        "coverage": {
+            "share": coverage.share,
+            "empty_sides": list(coverage.empty_sides),
+            "places": coverage.places,
+            "tilted": coverage.tilted,
+            "widest_rad": coverage.widest_rad,
+        },
+        "notes": list(found.notes),
+    }

@@ -1,0 +1,138 @@
+"""Boards as cameras see them, by formulas of their own: corners with noise, and rendered pictures."""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+
+import numpy as np
+from numpy.typing import NDArray
+from scipy.interpolate import PchipInterpolator
+from scipy.spatial.transform import Rotation
+
+from ipsys_log.calibration.bundle import Corners
+
+Array = NDArray[np.float64]
+
+# fx, fy, cx, cy and the coefficients; a fisheye of 190 degrees, and pinholes, of 640 x 480 px.
+SIZE_PX = (640, 480)
+TRUTH = {
+    "fisheye": (185.0, 185.0, 322.0, 236.0, -0.02, 0.01, -0.004, 0.0005),
+    "pinhole": (600.0, 600.0, 330.0, 230.0, -0.2, 0.05, 0.001, -0.001, 0.02),
+    "pinhole4": (600.0, 600.0, 330.0, 230.0, -0.2, 0.05, 0.001, -0.001, 0.0),
+    "pinhole8": (450.0, 450.0, 330.0, 230.0, 0.2, 0.05, 0.001, -0.001, 0.02, 0.5, 0.1, 0.01),
+}
+
+
+def pixels_of(name: str, lens: tuple[float, ...], points_m: Array) -> Array:
+    """The formulas of OpenCV's documentation, point by point."""
+    pixels = []
+    fx, fy, cx, cy, *k = lens
+    for x, y, z in points_m:
+        if name == "fisheye":
+            theta = np.arctan2(np.hypot(x, y), z)
+            bent = theta * (1 + sum(c * theta ** (2 * n) for n, c in enumerate(k, 1)))
+            a, b = bent * np.array([x, y]) / np.hypot(x, y)
+        else:
+            k1, k2, p1, p2, k3, k4, k5, k6 = [*k, 0, 0, 0][:8]
+            u, v, r2 = x / z, y / z, (x * x + y * y) / z**2
+            radial = (1 + k1 * r2 + k2 * r2**2 + k3 * r2**3) / (1 + k4 * r2 + k5 * r2**2 + k6 * r2**3)
+            a = u * radial + 2 * p1 * u * v + p2 * (r2 + 2 * u * u)
+            b = v * radial + p1 * (r2 + 2 * v * v) + 2 * p2 * u * v
+        pixels.append((fx * a + cx, fy * b + cy))
+    return np.array(pixels)
+
+
+def grid_m(columns: int = 6, rows: int = 4, square_m: float = 0.03) -> Array:
+    """Corners of a board around its middle, row by row."""
+    return np.array(
+        [((i - (columns - 1) / 2) * square_m, (j - (rows - 1) / 2) * square_m, 0.0)
+         for j in range(rows) for i in range(columns)]
+    )  # fmt: skip
+
+
+def random_pose(rng: np.random.Generator, name: str) -> tuple[Array, Array]:
+    """Rotation and place of a board that faces the camera, tilted by some 25 degrees."""
+    tilt = Rotation.from_rotvec(np.append(rng.normal(0, 0.33, 2), rng.uniform(-0.5, 0.5)))
+    if name != "fisheye":
+        z = rng.uniform(0.17, 0.6)
+        return tilt.as_matrix(), np.array([rng.uniform(-0.45, 0.45) * z, rng.uniform(-0.35, 0.35) * z, z])
+    # In any direction up to 85 degrees from the axis, and turned towards the camera.
+    polar, azimuth = rng.uniform(0, np.radians(85)), rng.uniform(-np.pi, np.pi)
+    aim = Rotation.from_rotvec([0, 0, azimuth]) * Rotation.from_rotvec([0, polar, 0])
+    return (aim * tilt).as_matrix(), aim.apply([0, 0, rng.uniform(0.1, 0.3)])
+
+
+def seen(
+    name: str,
+    rng: np.random.Generator,
+    pictures: int = 20,
+    noise_px: float = 0.1,
+    shared_px: float = 0.0,
+    lens: tuple[float, ...] | None = None,
+) -> Corners:
+    """Corners of a board in pictures all over the image, with noise of each corner, and errors that the
+    corners of a picture share: a smooth warp, as of a board that is not flat."""
+    truth, board_m = lens or TRUTH[name], grid_m()
+    places = board_m[:, :2] / board_m[:, :2].max()
+    warp = np.column_stack([places[:, 0] ** 2, places[:, 1] ** 2, places[:, 0] * places[:, 1]])
+    found: list[Array] = []
+    while len(found) < pictures:
+        turn, place_m = random_pose(rng, name)
+        pixels = pixels_of(name, truth, board_m @ turn.T + place_m)
+        if (pixels < 3).any() or (pixels > np.array(SIZE_PX) - 4).any():
+            continue
+        shared = warp @ rng.normal(0, shared_px, (3, 2)) if shared_px else 0.0
+        found.append(pixels + rng.normal(0, noise_px, pixels.shape) + shared)
+    numbers = np.repeat(np.arange(pictures), len(board_m))
+    return Corners(np.tile(board_m, (pictures, 1)), np.concatenate(found), numbers, pictures)
+
+
+def fisheye_rays(lens: tuple[float, ...], pixels: Array) -> Array:
+    """Unit rays of pixels, by a table of the formula read backwards."""
+    fx, fy, cx, cy, *k = lens
+    theta = np.linspace(0, 1.9, 4000)
+    bent = theta * (1 + sum(c * theta ** (2 * n) for n, c in enumerate(k, 1)))
+    planar = (pixels - (cx, cy)) / (fx, fy)
+    radius = np.hypot(*planar.T)
+    angle = PchipInterpolator(bent, theta)(np.minimum(radius, bent[-1]))
+    ring = planar / np.maximum(radius, 1e-12)[:, None]
+    return np.column_stack([ring * np.sin(angle)[:, None], np.cos(angle)])
+
+
+def render(
+    rays: Callable[[Array], Array],
+    turn: Array,
+    place_m: Array,
+    pattern: Callable[[Array], Array],
+    size_px: tuple[int, int],
+    rng: np.random.Generator,
+    times: int = 3,
+) -> NDArray[np.uint8]:
+    """A picture of a plane: the mean of ``times`` x ``times`` rays in each pixel, and noise."""
+    width, height = size_px
+    offsets = (np.arange(times) + 0.5) / times - 0.5
+    x = (np.arange(width)[:, None] + offsets).ravel()
+    y = (np.arange(height)[:, None] + offsets).ravel()
+    pixels = np.stack(np.meshgrid(x, y), axis=-1).reshape(-1, 2)
+    directions = rays(pixels) @ turn  # in the axes of the board
+    origin = -place_m @ turn
+    depth = -origin[2] / directions[:, 2]
+    met = depth > 0
+    levels = np.full(len(pixels), 120.0)
+    levels[met] = pattern(origin[:2] + depth[met, None] * directions[met, :2])
+    grey = levels.reshape(height, times, width, times).mean(axis=(1, 3))
+    noisy = np.round(grey + rng.normal(0, 1.5, grey.shape))
+    return np.asarray(np.clip(noisy, 0, 255), dtype=np.uint8)
+
+
+def chessboard_pattern(columns: int, rows: int, square_m: float) -> Callable[[Array], Array]:
+    """Grey levels of places on a chessboard of so many inner corners, with a white margin."""
+
+    def levels(places_m: Array) -> Array:
+        squares = places_m / square_m + np.array([columns + 1, rows + 1]) / 2
+        dark = np.floor(squares).sum(axis=1) % 2 == 0
+        inside = ((squares >= 0) & (squares < (columns + 1, rows + 1))).all(axis=1)
+        margin = ((squares >= -0.7) & (squares < (columns + 1.7, rows + 1.7))).all(axis=1)
+        return np.where(inside & dark, 40.0, np.where(margin, 200.0, 120.0))
+
+    return levels

@@ -1,0 +1,80 @@
+"""What is said of a calibration that is not as good as it could be."""
+
+from __future__ import annotations
+
+import numpy as np
+import pytest
+from scipy.spatial.transform import Rotation
+
+from ipsys_log.calibration.boards import Board
+from ipsys_log.calibration.calibrate import Calibrated, calibrate
+from ipsys_log.calibration.lens_models import LENSES
+from ipsys_log.calibration.look import Looked
+from ipsys_log.calibration.sighting import Sighting
+from ipsys_log.errors import IpsysError
+from tests.calibration.boards_seen import SIZE_PX, TRUTH, grid_m, pixels_of
+
+BOARD = Board(6, 4, 0.03)
+
+
+def sightings(
+    places_m: list[tuple[float, float, float]], tilt_rad: float, noise_px: float = 0.1, blur_px: float = 0.8
+) -> Looked:
+    """Boards at these places, each tilted to another side."""
+    rng, found = np.random.default_rng(0), []
+    for n, place_m in enumerate(places_m):
+        turn = Rotation.from_rotvec([tilt_rad * np.cos(n * 2.4), tilt_rad * np.sin(n * 2.4), 0]).as_matrix()
+        pixels = pixels_of("pinhole", TRUTH["pinhole"], grid_m() @ turn.T + place_m)
+        pixels += rng.normal(0, noise_px, pixels.shape)
+        found.append(Sighting(f"{n}.png", np.arange(24), pixels, blur_px, pixels[[0, 5, 23, 18]]))
+    return Looked(len(found), SIZE_PX, tuple(found), ())
+
+
+def everywhere(
+    x: tuple[float, float] = (-0.13, 0.13), y: tuple[float, float] = (-0.1, 0.1)
+) -> list[tuple[float, float, float]]:
+    """Twenty places all over the image, near and far."""
+    return [
+        (float(a), float(b), z)
+        for n, a in enumerate(np.linspace(*x, 5))
+        for m, b in enumerate(np.linspace(*y, 4))
+        for z in [0.33 + 0.04 * ((n + m) % 2)]
+    ]
+
+
+def calibrated(looked: Looked) -> Calibrated:
+    return calibrate("red", looked, BOARD, LENSES["pinhole"])
+
+
+def test_of_good_pictures_nothing_is_asked() -> None:
+    found = calibrated(sightings(everywhere(), 0.5))
+    assert found.notes == ()
+    assert found.rms_px == pytest.approx(0.1 * np.sqrt(2), rel=0.15)
+    assert found.median_px == pytest.approx(0.1 * np.sqrt(2 * np.log(2)), rel=0.15)
+
+
+def test_a_side_without_a_board_is_named() -> None:
+    found = calibrated(sightings(everywhere(x=(-0.03, 0.13)), 0.5))
+    assert "no board near the left edge of the image: hold it there too" in found.notes
+    assert found.coverage.empty_sides == ("left",)
+
+
+def test_a_board_that_was_hardly_tilted() -> None:
+    notes = calibrated(sightings(everywhere(), 0.2)).notes
+    assert any("tilted by 25 degrees or more in 0 pictures" in note for note in notes)
+
+
+def test_a_board_that_was_never_tilted_tells_no_focal_length() -> None:
+    with pytest.raises(IpsysError, match="tilt it to all sides"):
+        calibrated(sightings([(x, 0.0, 0.5) for x in np.linspace(-0.03, 0.03, 10)], 0.0, noise_px=0.3))
+
+
+def test_pictures_that_are_all_soft() -> None:
+    notes = calibrated(sightings(everywhere(), 0.5, blur_px=3.0)).notes
+    assert any("edges are 3.0 px wide in all pictures" in note for note in notes)
+
+
+def test_too_few_say_what_to_add() -> None:
+    looked = sightings([(-0.05, 0.0, 0.4), (0.05, 0.03, 0.4), (0.0, -0.03, 0.4)], 0.4)
+    with pytest.raises(IpsysError, match=r"3 of 3 pictures are of use.*no board near the left, right"):
+        calibrated(looked)

@@ -1,0 +1,118 @@
+"""Known lenses found again from corners with noise, and how far off they are against what is said."""
+
+from __future__ import annotations
+
+from itertools import pairwise
+
+import cv2
+import numpy as np
+import pytest
+from numpy.typing import NDArray
+
+from ipsys_log.calibration.bundle import Corners
+from ipsys_log.calibration.lens_models import LENSES
+from ipsys_log.calibration.solve import Solved, solve
+from ipsys_log.calibration.start import find_start, pose_from_rays
+from tests.calibration.boards_seen import SIZE_PX, TRUTH, grid_m, random_pose, seen
+
+
+def squared_errors(name: str, seeds: range, shared_px: float = 0.0) -> NDArray[np.float64]:
+    """Squared errors in units of the variance that is said, (seeds, parameters)."""
+    rows = []
+    for seed in seeds:
+        found = solve(LENSES[name], seen(name, np.random.default_rng(seed), shared_px=shared_px), SIZE_PX)
+        variance = np.diag(found.covariance)
+        fitted = variance > 0
+        rows.append((found.fit.lens - TRUTH[name])[fitted] ** 2 / variance[fitted])
+    return np.array(rows)
+
+
+@pytest.mark.parametrize("name", list(TRUTH))
+def test_a_known_lens_is_found_within_what_is_said(name: str) -> None:
+    """Of 8 seeds and some 8 correlated parameters, the mean of the squares is 1 to a factor of two."""
+    errors = squared_errors(name, range(8))
+    assert 0.5 < errors.mean() < 2.0, errors.mean(axis=0)
+    assert (errors < 4).mean() > 0.85
+    assert errors.max() < 30
+
+
+@pytest.mark.parametrize("name", ["fisheye", "pinhole"])
+def test_errors_that_a_picture_shares_are_in_what_is_said(name: str) -> None:
+    """Taken for independent, the residuals would make these squares 2 on average."""
+    errors = squared_errors(name, range(8), shared_px=0.15)
+    assert 0.4 < errors.mean() < 1.6, errors.mean(axis=0)
+
+
+def test_more_noise_is_more_uncertainty() -> None:
+    sigmas = []
+    for noise_px in (0.05, 0.5):
+        corners = seen("pinhole", np.random.default_rng(0), noise_px=noise_px)
+        sigmas.append(np.sqrt(np.diag(solve(LENSES["pinhole"], corners, SIZE_PX).covariance)))
+    np.testing.assert_allclose(sigmas[1] / sigmas[0], 10, rtol=0.5)
+
+
+def test_opencv_finds_the_same_pinhole() -> None:
+    """On the same corners, to a part of the standard deviation: only doubted corners weigh differently."""
+    corners = seen("pinhole", np.random.default_rng(3))
+    found = solve(LENSES["pinhole"], corners, SIZE_PX)
+    bounds = [*corners.starts, len(corners.picture)]
+    boards = [corners.board_m[a:b].astype(np.float32) for a, b in pairwise(bounds)]
+    pixels = [corners.pixels[a:b].astype(np.float32) for a, b in pairwise(bounds)]
+    start = np.array([[500.0, 0, 320], [0, 500, 240], [0, 0, 1]])
+    flags = cv2.CALIB_FIX_ASPECT_RATIO | cv2.CALIB_USE_INTRINSIC_GUESS
+    _, k, d, _, _ = cv2.calibrateCamera(boards, pixels, SIZE_PX, start, np.zeros(5), flags=flags)
+    theirs = np.concatenate([[k[0, 0], k[1, 1], k[0, 2], k[1, 2]], np.ravel(d)[:5]])
+    assert found.square
+    assert (np.abs(found.fit.lens - theirs) < 0.35 * np.sqrt(np.diag(found.covariance))).all()
+
+
+def test_pixels_that_are_not_square() -> None:
+    stretched = (600.0, 642.0, *TRUTH["pinhole"][2:])
+    corners = seen("pinhole", np.random.default_rng(0), lens=stretched)
+    found = solve(LENSES["pinhole"], corners, SIZE_PX)
+    assert not found.square
+    sigmas = np.sqrt(np.diag(found.covariance))
+    assert (np.abs(found.fit.lens - stretched) < 4 * sigmas).all()
+
+
+def spoiled(corners: Corners) -> Corners:
+    """Ten corners 5 to 20 px off, and one picture in which a print was another one."""
+    rng = np.random.default_rng(9)
+    pixels = corners.pixels.copy()
+    pixels[rng.choice(200, 10, replace=False)] += rng.uniform(5, 20, (10, 2))
+    pixels[corners.picture == 12] += rng.normal(0, 2.0, (24, 2))
+    return Corners(corners.board_m, pixels, corners.picture, corners.pictures)
+
+
+@pytest.mark.parametrize("name", ["fisheye", "pinhole"])
+def test_what_does_not_belong_is_left_out_and_said(name: str) -> None:
+    found = solve(LENSES[name], spoiled(seen(name, np.random.default_rng(5))), SIZE_PX)
+    assert [left.picture for left in found.left] == [12]
+    assert "does not fit" in found.left[0].reason or "far off" in found.left[0].reason
+    assert found.far_corners == 10
+    assert within(found, name)
+
+
+def within(found: Solved, name: str) -> bool:
+    sigmas = np.sqrt(np.diag(found.covariance))
+    return bool((np.abs(found.fit.lens - TRUTH[name]) <= 4 * sigmas).all())
+
+
+@pytest.mark.parametrize("focal_px", [90.0, 185.0, 400.0])
+def test_a_fisheye_of_any_focal_length_is_found_without_being_told(focal_px: float) -> None:
+    lens = (focal_px, focal_px, *TRUTH["fisheye"][2:])
+    corners = seen("fisheye", np.random.default_rng(1), pictures=15, lens=lens)
+    start = find_start(LENSES["fisheye"], corners, SIZE_PX)
+    np.testing.assert_allclose(start.lens[:4], lens[:4], rtol=0.02)
+
+
+def test_a_pose_follows_from_rays_beyond_90_degrees() -> None:
+    board_m = grid_m()
+    for seed in range(20):
+        turn, place_m = random_pose(np.random.default_rng(seed), "fisheye")
+        turn, place_m = np.diag([1.0, -1.0, -1.0]) @ turn, np.diag([1.0, -1.0, -1.0]) @ place_m
+        points = board_m @ turn.T + place_m
+        rays = points / np.linalg.norm(points, axis=1, keepdims=True)
+        found_turn, found_m = pose_from_rays(board_m, rays)
+        np.testing.assert_allclose(found_m, place_m, atol=1e-9)
+        np.testing.assert_allclose(found_turn, turn, atol=1e-9)

@@ -1,0 +1,254 @@
+"""``ipsys calibrate`` as a user meets it: on rendered pictures of a known lens, and on real ones."""
+
+from __future__ import annotations
+
+import json
+import re
+import shutil
+import tomllib
+from collections.abc import Iterator
+from pathlib import Path
+
+import cv2
+import numpy as np
+import pytest
+
+from ipsys_log.formats.opencv_yaml import read_opencv_calibration
+from ipsys_log.messages import CompressedImage, Message, image_topic
+from ipsys_log.output import write_log
+from tests.calibration.boards_seen import (
+    chessboard_pattern,
+    fisheye_rays,
+    pixels_of,
+    random_pose,
+    render,
+)
+from tests.conftest import Done, Ipsys
+
+SIZE_PX = (480, 360)
+LENS = (140.0, 140.0, 243.0, 178.0, -0.02, 0.01, -0.004, 0.0005)
+NAMES = ("fx", "fy", "cx", "cy", "k1", "k2", "k3", "k4")
+COLUMNS, ROWS, SQUARE_M = 6, 4, 0.03
+
+
+@pytest.fixture(scope="session")
+def rendered(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    """A folder ``red`` of twelve pictures of a chessboard through a fisheye."""
+    folder = tmp_path_factory.mktemp("pictures") / "red"
+    folder.mkdir()
+    rng = np.random.default_rng(4)
+    pattern = chessboard_pattern(COLUMNS, ROWS, SQUARE_M)
+    ends = np.array([[x, y, 0.0] for x in (-0.105, 0.105) for y in (-0.075, 0.075)])
+    count = 0
+    while count < 12:
+        turn, place_m = random_pose(rng, "fisheye")
+        place_m = 0.75 * place_m
+        outline = pixels_of("fisheye", LENS, ends @ turn.T + place_m)
+        if (outline < 4).any() or (outline > np.array(SIZE_PX) - 5).any():
+            continue
+        picture = render(lambda at: fisheye_rays(LENS, at), turn, place_m, pattern, SIZE_PX, rng)
+        cv2.imwrite(str(folder / f"{count}.png"), cv2.GaussianBlur(picture, (0, 0), 0.6))
+        count += 1
+    return folder
+
+
+@pytest.fixture
+def red(rendered: Path, tmp_path: Path) -> Path:
+    """A copy of the pictures."""
+    return Path(shutil.copytree(rendered, tmp_path / "red"))
+
+
+def calibrate(ipsys: Ipsys, *arguments: object) -> Done:
+    return ipsys("calibrate", *arguments, "--square", SQUARE_M)
+
+
+def refused(ipsys: Ipsys, folder: Path, *arguments: object) -> str:
+    """The one line of a command that must fail, after looking that nothing was written."""
+    before = sorted(folder.rglob("*"))
+    done = calibrate(ipsys, *arguments)
+    assert done.code == 1
+    assert done.out == ""
+    assert done.err.startswith("ipsys: ")
+    assert done.err.count("\n") == 1
+    assert sorted(folder.rglob("*")) == before
+    return done.err
+
+
+def test_a_folder_of_pictures(ipsys: Ipsys, red: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.chdir(red.parent)
+    monkeypatch.setenv("COLUMNS", "80")
+    done = calibrate(ipsys, "red", "--board", "6x4", "--plot", "red.png")
+    assert done.code == 0, done.err
+    lens = read_opencv_calibration(red.parent / "red.yaml", "red")
+    assert (lens.width, lens.height, lens.distortion_model) == (*SIZE_PX, "kannala_brandt")
+    storage = cv2.FileStorage(str(red.parent / "red.yaml"), cv2.FILE_STORAGE_READ)
+    sigmas = [storage.getNode("standard_deviations").getNode(name).real() for name in NAMES]
+    found = [lens.K[0, 0], lens.K[1, 1], lens.K[0, 2], lens.K[1, 2], *lens.D]
+    assert (np.abs(np.subtract(found, LENS)) < 4 * np.array(sigmas)).all()
+    assert sigmas[0] < 1.0
+    # Over distances in the plane of the image.
+    assert float(re.findall(r"RMS (\S+) px", done.out)[0]) < 0.1
+    assert max(len(line.rstrip()) for line in done.out.splitlines()) <= 80
+    # The line for the rig is TOML, and names the file.
+    line = next(line for line in done.out.splitlines() if line.startswith("calibration ="))
+    assert tomllib.loads(line) == {"calibration": "red.yaml"}
+    picture = cv2.imread(str(red.parent / "red.png"))
+    assert picture is not None
+    assert picture.shape[1] > 1000
+
+
+def test_all_of_it_as_json_and_in_all_formats(ipsys: Ipsys, red: Path, tmp_path: Path) -> None:
+    out = tmp_path / "lenses"
+    formats = [word for name in ("opencv", "ros", "kalibr") for word in ("--format", name)]
+    done = calibrate(ipsys, red, "--board", "6x4", "-o", out, "--json", *formats)
+    assert done.code == 0, done.err
+    [found] = json.loads(done.out)
+    assert found["files"] == [str(out / name) for name in ("red.yaml", "red_ros.yaml", "red_kalibr.yaml")]
+    assert found["camera"] == "red"
+    assert found["pictures"]["looked_at"] == 12
+    assert len(found["pictures"]["used"]) == found["pictures"]["seen"]
+    assert set(found["standard_deviations"]) == set(NAMES)
+    assert found["coverage"]["widest_rad"] > 1.0
+    for name in ("red.yaml", "red_ros.yaml"):
+        lens = read_opencv_calibration(out / name, "red")
+        assert lens.K[0, 0] == found["parameters"]["fx"]
+
+
+def test_nothing_is_written_over_without_being_told(ipsys: Ipsys, red: Path, tmp_path: Path) -> None:
+    file = tmp_path / "mine.yaml"
+    file.write_text("precious")
+    line = refused(ipsys, tmp_path, red, "--board", "6x4", "-o", file)
+    assert "exists already" in line
+    assert "--force" in line
+    assert file.read_text() == "precious"
+    assert calibrate(ipsys, red, "--board", "6x4", "-o", file, "--force").code == 0
+    assert read_opencv_calibration(file, "red").width == SIZE_PX[0]
+
+
+@pytest.fixture
+def log(rendered: Path, tmp_path: Path) -> Path:
+    """A log in which the camera red sees the board and the camera white sees a wall."""
+    wall = cv2.imencode(".png", np.full((120, 160), 90, np.uint8))[1].tobytes()
+
+    def messages() -> Iterator[Message]:
+        for n, path in enumerate(sorted(rendered.iterdir())):
+            for k, (camera, data) in enumerate({"red": path.read_bytes(), "white": wall}.items()):
+                time_ns = 10**18 + n * 10**8 + k
+                image = CompressedImage(time_ns, camera, data, "png")
+                yield Message(image_topic(camera), time_ns, time_ns, image, camera)
+
+    path = tmp_path / "lab.mcap"
+    write_log(path, messages())
+    return path
+
+
+def test_a_log_gives_a_file_for_each_camera_that_saw_the_board(ipsys: Ipsys, log: Path) -> None:
+    done = calibrate(ipsys, log, "--board", "6x4", "-o", log.parent)
+    assert done.code == 0, done.err
+    assert (log.parent / "red.yaml").is_file()
+    assert not (log.parent / "white.yaml").exists()
+    assert "camera white: a chessboard of 6 x 4 inner corners is not seen in any of 12" in done.err
+    # And the file is what every other command takes.
+    assert "no such camera" not in ipsys("detect", log, "--calibration", f"red={log.parent}/red.yaml").err
+
+
+def test_one_camera_of_a_log(ipsys: Ipsys, log: Path) -> None:
+    line = refused(ipsys, log.parent, log, "--board", "6x4", "--camera", "white", "-o", log.parent)
+    assert "camera white" in line
+    line = refused(ipsys, log.parent, log, "--board", "6x4", "--camera", "blue", "-o", log.parent)
+    assert "no frames of such a camera (only of none)" in line or "only of" in line
+
+
+def test_a_video(ipsys: Ipsys, rendered: Path, tmp_path: Path) -> None:
+    video = cv2.VideoWriter(str(tmp_path / "red.avi"), cv2.VideoWriter.fourcc(*"MJPG"), 10.0, SIZE_PX)
+    for path in sorted(rendered.iterdir()):
+        video.write(np.asarray(cv2.imread(str(path))))
+    video.release()
+    done = calibrate(ipsys, tmp_path / "red.avi", "--board", "6x4", "-o", tmp_path, "--json")
+    assert done.code == 0, done.err
+    [found] = json.loads(done.out)
+    assert found["pictures"]["looked_at"] == 12
+    assert found["parameters"]["fx"] == pytest.approx(LENS[0], abs=5 * found["standard_deviations"]["fx"])
+
+
+@pytest.mark.parametrize(
+    ("board", "said"),
+    [
+        ("7x5", "a chessboard of 6 x 4 inner corners is seen in"),
+        ("5x3", "it is a part of a chessboard of 6 x 4 inner corners: give --board 6x4"),
+        ("9x9", "give the inner corners, one less than the squares"),
+        ("charuco:7x5", "is not seen in any of 12 pictures"),
+    ],
+)
+def test_another_board_than_said(ipsys: Ipsys, red: Path, tmp_path: Path, board: str, said: str) -> None:
+    assert said in refused(ipsys, tmp_path, red, "--board", board, "-o", tmp_path)
+
+
+def test_too_few_pictures(ipsys: Ipsys, red: Path, tmp_path: Path) -> None:
+    for path in list(red.iterdir())[4:]:
+        path.unlink()
+    line = refused(ipsys, tmp_path, red, "--board", "6x4", "-o", tmp_path)
+    assert "4 of 4 pictures are of use, and 6 are the least" in line
+    assert "take at least 15" in line
+
+
+def test_pictures_of_two_sizes(ipsys: Ipsys, red: Path, tmp_path: Path) -> None:
+    cv2.imwrite(str(red / "99.png"), np.zeros((480, 640), np.uint8))
+    line = refused(ipsys, tmp_path, red, "--board", "6x4", "-o", tmp_path)
+    assert "99.png is 640 x 480 px and 0.png is 480 x 360" in line
+
+
+def test_a_picture_that_cannot_be_read_is_left_out_and_named(ipsys: Ipsys, red: Path, tmp_path: Path) -> None:
+    (red / "13.jpg").write_bytes(b"\xff\xd8 nothing")
+    done = calibrate(ipsys, red, "--board", "6x4", "-o", tmp_path)
+    assert done.code == 0, done.err
+    assert "13.jpg: cannot be read" in done.out
+
+
+def test_sources_that_are_none(ipsys: Ipsys, red: Path, tmp_path: Path) -> None:
+    board = ("--board", "6x4", "-o", tmp_path)
+    assert "there is no such" in refused(ipsys, tmp_path, tmp_path / "nowhere", *board)
+    (tmp_path / "empty").mkdir()
+    assert "has no pictures" in refused(ipsys, tmp_path, tmp_path / "empty", *board)
+    (tmp_path / "a.txt").write_text("a")
+    assert "is neither a log" in refused(ipsys, tmp_path, tmp_path / "a.txt", *board)
+    (tmp_path / "a.mp4").write_bytes(b"no video at all")
+    assert "is no video" in refused(ipsys, tmp_path, tmp_path / "a.mp4", *board)
+    assert "no such lens" in refused(ipsys, tmp_path, red, *board, "--lens", "round")
+    assert "four coefficients" in refused(
+        ipsys, tmp_path, red, *board, "--lens", "pinhole", "--format", "kalibr"
+    )
+
+
+def test_photographs_through_a_lens_of_more_than_180_degrees(
+    ipsys: Ipsys, data: Path, tmp_path: Path
+) -> None:
+    """Where ``cv2.fisheye.calibrate`` throws; no focal length is told."""
+    folder = data / "fisheye_chessboard"
+    done = ipsys("calibrate", folder, "--board", "6x4", "-o", tmp_path, "--json")
+    assert done.code == 0, done.err
+    [found] = json.loads(done.out)
+    assert len(found["pictures"]["used"]) >= 22
+    assert found["rms_px"] <= 0.30
+    assert found["parameters"]["fx"] == pytest.approx(190.25, abs=4 * found["standard_deviations"]["fx"])
+    assert found["coverage"]["widest_rad"] > np.pi / 2
+
+
+@pytest.mark.parametrize(
+    "camera", [0, pytest.param(1, marks=pytest.mark.slow), pytest.param(2, marks=pytest.mark.slow),
+               pytest.param(3, marks=pytest.mark.slow)],
+)  # fmt: skip
+def test_videos_of_a_charuco_board(ipsys: Ipsys, data: Path, tmp_path: Path, camera: int) -> None:
+    """Focal lengths within 2 % of the reference, and no farther than three of their standard deviations."""
+    folder = data / "charuco_videos"
+    reference = (folder / "camera_array.toml").read_text().split(f"[cameras.{camera}]")[1]
+    matrix = json.loads(re.findall(r"matrix = (\[\[.*?\]\])", reference)[0])
+    board = ("--board", "charuco:4x5", "--dictionary", "DICT_4X4_1000", "--inverted", "--lens", "pinhole")
+    done = ipsys("calibrate", folder / f"cam_{camera}.mp4", *board, "-o", tmp_path, "--json")
+    assert done.code == 0, done.err
+    [found] = json.loads(done.out)
+    for name, expected in (("fx", matrix[0][0]), ("fy", matrix[1][1])):
+        assert found["parameters"][name] == pytest.approx(expected, rel=0.02)
+        sigma = np.hypot(found["standard_deviations"][name], 0.005 * expected)
+        assert abs(found["parameters"][name] - expected) < 3 * sigma
+    assert len(found["pictures"]["used"]) >= 28

@@ -171,6 +171,10 @@ def test_what_is_there_is_never_overwritten_unless_it_is_said(
             'name = "red"\nsource = "a:1"\n[[cameras]]\nname = "white"\nsource = "a:1"',
             "two cameras have the source 'a:1'",
         ),
+        (
+            'name = "red"\nsource = "usb:7"\n[[cameras]]\nname = "white"\nsource = "usb:/dev/video7"',
+            "cameras red and white are one device, /dev/video7",
+        ),
         ('name = "red"\nstamp = "middle"', 'stamp is \'middle\'; write "start" or "end"'),
         ('name = "red"\nsourc = "a"', "unknown key 'sourc'"),
         ('name = "red"\nrate_hz = 0', "rate_hz is 0.0; it must be above 0"),

@@ -5,6 +5,7 @@ from __future__ import annotations
 import signal
 from collections.abc import Callable, Iterator
 from contextlib import ExitStack, contextmanager, nullcontext
+from dataclasses import replace
 from pathlib import Path
 from tempfile import TemporaryDirectory
 from threading import Timer
@@ -195,10 +196,13 @@ def _opened(
     from ipsys_log.recording import first_messages, fitting_lenses
     from ipsys_log.report.cameras import LiveStatus
     from ipsys_log.sources.attached import Attached
-    from ipsys_log.sources.devices import open_source
+    from ipsys_log.sources.devices import check_devices, open_source, usb_advice
     from ipsys_log.sources.frames import Clock
 
     lab, cameras, lenses = load_lab(rig, calibration, only or ())
+    check_devices(cameras)
+    for line in usb_advice(replace(lab, cameras=tuple(cameras))):
+        remarks.print(line, style="yellow", markup=False)
     _check_target(output, force)
     with ExitStack() as stack:
         with remarks.status("opening " + ", ".join(camera.name for camera in cameras)):

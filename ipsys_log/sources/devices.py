@@ -2,18 +2,21 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterator
+import sys
+from collections.abc import Iterable, Iterator
 from contextlib import AbstractContextManager
+from pathlib import Path
 
 from ipsys_log.errors import IpsysError
-from ipsys_log.messages import RigCamera
+from ipsys_log.messages import Rig, RigCamera
+from ipsys_log.sources.bandwidth import advise, demands_of
 from ipsys_log.sources.frames import Clock, Frame, Open, Say
 from ipsys_log.sources.network import open_network
 from ipsys_log.sources.played import open_played
 from ipsys_log.sources.simulated import open_simulated
-from ipsys_log.sources.usb import open_usb
+from ipsys_log.sources.usb import device_of, open_usb
 
-__all__ = ["OPENERS", "open_source"]
+__all__ = ["OPENERS", "check_devices", "open_source", "usb_advice"]
 
 # By what stands before the first colon of a source.
 OPENERS: dict[str, Open] = {
@@ -27,6 +30,34 @@ OPENERS: dict[str, Open] = {
     "sim": open_simulated,
     "file": open_played,
 }
+
+
+def check_devices(cameras: Iterable[RigCamera]) -> None:
+    """See that no two cameras are one device, by whatever names.
+
+    Raises
+    ------
+    IpsysError
+        Naming both.
+    """
+    known: dict[Path, str] = {}
+    for camera in cameras:
+        if camera.source and camera.source.startswith("usb:"):
+            device = Path(device_of(camera.source)).resolve()
+            other = known.setdefault(device, camera.name)
+            if other != camera.name:
+                raise IpsysError(
+                    f"cameras {other} and {camera.name} are one device, {device}; give each its own"
+                )
+
+
+def usb_advice(rig: Rig) -> list[str]:
+    """What to change where USB does not carry all the cameras of a rig at once (Linux; elsewhere nothing)."""
+    if sys.platform != "linux":
+        return []
+    from ipsys_log.sources.usb_tree import find_cameras
+
+    return advise(demands_of(find_cameras(), rig))
 
 
 def open_source(camera: RigCamera, clock: Clock, say: Say) -> AbstractContextManager[Iterator[Frame | None]]:

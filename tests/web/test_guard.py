@@ -15,7 +15,7 @@ import pytest
 
 from ipsys_log.errors import IpsysError
 from ipsys_log.web.serving import qr_code, serving
-from tests.web.test_page import Recording
+from tests.web.test_measuring_page import Recording
 
 PLACE = {"marker": "0", "distances": {"A": "170", "B": "190"}, "side": "left", "height": "10"}
 

@@ -27,6 +27,8 @@ LEAST_PICTURES = 6
 # A focal length less sure than this is said to be so; coefficients are worth nothing beyond theirs.
 _UNSURE = 0.02
 _UNTOLD = 1.0
+# A lens of the right kind, and a flat board, leave less.
+_OFF_PX = 1.0
 # Nor is a focal length a result that may as well be half or twice as long.
 _UNKNOWN = 0.5
 # Edges wider than this, in all pictures, are a camera in the dark or out of focus.
@@ -146,13 +148,7 @@ def _judged(
     distances = np.linalg.norm(solved.residuals_px, axis=1)
     counts = solved.corners.sums(np.ones_like(distances))
     each_px = np.sqrt(solved.corners.sums(distances**2) / counts)
-    coverage = measure_coverage(
-        solved.corners.pixels,
-        looked.size_px,
-        np.stack([s.outline for s in used]),
-        solved.fit.rotations[:, :, 2],
-        camera_points(solved.fit, solved.corners),
-    )
+    coverage = _covered(looked, used, solved)
     sigmas = np.sqrt(np.diag(solved.covariance))
     return Calibrated(
         camera,
@@ -170,15 +166,25 @@ def _judged(
         tuple(spare),
         solved.far_corners,
         coverage,
-        (*advice(coverage), *_doubts(model, lens, sigmas), *_softness(used)),
+        (*advice(coverage), *_doubts(model, solved), *_softness(used)),
         solved.corners.pixels,
         solved.residuals_px,
     )
 
 
-def _doubts(model: LensModel, lens: Array, sigmas: Array) -> list[str]:
+def _covered(looked: Looked, used: list[Sighting], solved: Solved) -> Coverage:
+    outlines = np.stack([s.outline for s in used])
+    points_m = camera_points(solved.fit, solved.corners)
+    normals = solved.fit.rotations[:, :, 2]
+    return measure_coverage(solved.corners.pixels, looked.size_px, outlines, normals, points_m)
+
+
+def _doubts(model: LensModel, solved: Solved) -> list[str]:
     """What the numbers themselves say against the lens."""
-    notes = []
+    lens, sigmas, notes = solved.fit.lens, np.sqrt(np.diag(solved.covariance)), []
+    rms_px = float(np.sqrt((solved.residuals_px**2).sum(axis=1).mean()))
+    if rms_px > _OFF_PX:
+        notes.append(f"corners are {rms_px:.1f} px off: see that the board is flat, or try another --lens")
     unsure = float((sigmas[:2] / lens[:2]).max())
     if unsure > _UNSURE:
         notes.append(

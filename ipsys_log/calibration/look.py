@@ -69,11 +69,7 @@ def look(
             unreadable.append(Dropped(name, "cannot be read"))
             continue
         here = (grey.shape[1], grey.shape[0])
-        if size is not None and here != size:
-            raise IpsysError(
-                f"{where}: {name} is {here[0]} x {here[1]} px and {first} is {size[0]} x {size[1]}; "
-                "a lens is calibrated at one size: take out one kind"
-            )
+        _check_same(size, here, first, name, where)
         size, first = here, first or name
         sighting = find_board(name, grey, board, thorough=0 < total <= _THOROUGH)
         if sighting is not None:
@@ -89,6 +85,16 @@ def look(
         raise NotSeenError(f"{where}: {board} is not seen in any of {count} pictures{found}")
     check_whole(shown, board, where)
     return Looked(count, size, tuple(sightings), tuple(unreadable))
+
+
+def _check_same(
+    size: tuple[int, int] | None, here: tuple[int, int], first: str, name: str, where: str
+) -> None:
+    if size is not None and here != size:
+        raise IpsysError(
+            f"{where}: {name} is {here[0]} x {here[1]} px and {first} is {size[0]} x {size[1]}; "
+            "a lens is calibrated at one size: take out one kind"
+        )
 
 
 def _remember(some: list[Grey], grey: Grey, count: int, total: int) -> None:

@@ -66,9 +66,10 @@ def find_sources(paths: Sequence[Path], cameras: Sequence[str]) -> list[Pictures
         by_camera.setdefault(pictures.camera, []).append(pictures)
     missing = [camera for camera in cameras if camera not in by_camera]
     if missing:
-        known = ", ".join(by_camera) or "none"
+        known = ", ".join(by_camera)
         raise IpsysError(f"--camera {missing[0]}: there are no frames of such a camera (only of {known})")
-    return [_joined(camera, parts) for camera, parts in by_camera.items()]
+    wanted = {c: parts for c, parts in by_camera.items() if not cameras or c in cameras}
+    return [_joined(camera, parts) for camera, parts in wanted.items()]
 
 
 def _joined(camera: str, parts: list[Pictures]) -> Pictures:
@@ -85,7 +86,7 @@ def _sources_of(path: Path, cameras: Sequence[str]) -> list[Pictures]:
     if not path.is_file():
         raise IpsysError(f"{path}: there is no such log, folder, picture or video")
     if path.suffix.lower() == ".mcap":
-        return _log(path, cameras)
+        return _log(path)
     if path.suffix.lower() in _PICTURES:
         name = _camera_name(path.absolute().parent.name, path, cameras)
         return [Pictures(name, str(path), 1, partial(_read_files, [path]))]
@@ -112,12 +113,11 @@ def _folder(folder: Path, cameras: Sequence[str]) -> list[Pictures]:
         name = _camera_name(folder.absolute().name, folder, cameras)
         return [Pictures(name, str(folder), len(here), partial(_read_files, here))]
     subs = {sub: files for sub in sorted(folder.iterdir()) if sub.is_dir() and (files := _files(sub))}
-    wanted = {sub: files for sub, files in subs.items() if not cameras or sub.name in cameras}
     if not subs:
         raise IpsysError(f"{folder}: has no pictures ({', '.join(_PICTURES[:3])} ...)")
     return [
         Pictures(_camera_name(sub.name, sub, []), str(sub), len(files), partial(_read_files, files))
-        for sub, files in wanted.items()
+        for sub, files in subs.items()
     ]
 
 
@@ -185,9 +185,9 @@ def _grey(frame: Grey) -> Grey:
     return np.asarray(cv2.cvtColor(frame, cv2.COLOR_BGR2GRAY), dtype=np.uint8)
 
 
-def _log(path: Path, cameras: Sequence[str]) -> list[Pictures]:
+def _log(path: Path) -> list[Pictures]:
     with Session([path]) as session:
-        topics = {c: t for c, t in session.images.items() if not cameras or c in cameras}
+        topics = dict(session.images)
         counts = {camera: session.count(topic) for camera, topic in topics.items()}
         if not session.images:
             raise IpsysError(f"{path}: has no frames of any camera")

@@ -30,6 +30,8 @@ _STEP_PX, _PIXEL = 0.5, 2
 # How far beside an edge nothing else is seen, in squares; of the white between it and a marker, a part.
 _CLEAR, _CLEAR_MARKERS = 0.3, 0.32
 _LEAST_SLOPE = 0.1
+# No corner of the board is farther from those seen than so many times what they span.
+_FARTHEST = 3.0
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -70,10 +72,7 @@ def find_board(name: str, grey: Grey, board: Board, thorough: bool) -> Sighting 
     blur_px = _edge_width_px(grey, board, ids, pixels)
     clear = _CLEAR if board.marker_scale is None else _CLEAR_MARKERS * (1 - board.marker_scale)
     pixels = refine_corners(grey, board.grid[0], ids, pixels, blur_px, clear)
-    image_from_board = _homography(places, pixels)
-    columns, rows = board.grid
-    ends = np.array([[0, 0], [columns - 1, 0], [columns - 1, rows - 1], [0, rows - 1]], dtype=np.float64)
-    return Sighting(name, ids, pixels, blur_px, _carried(image_from_board, ends))
+    return Sighting(name, ids, pixels, blur_px, _outline(board, ids, pixels))
 
 
 def _chessboard(grey: Grey, board: Board, thorough: bool) -> tuple[NDArray[np.intp], Array] | None:
@@ -102,14 +101,20 @@ def _charuco_detector(board: Board) -> cv2.aruco.CharucoDetector:
     return cv2.aruco.CharucoDetector(printed)
 
 
-def _homography(places: Array, pixels: Array) -> Array:
+def _outline(board: Board, ids: NDArray[np.intp], pixels: Array) -> Array:
+    """The four outer corners, (4, 2); those not seen about where they would be without distortion."""
+    columns, rows = board.grid
+    ends = np.array([0, columns - 1, columns * rows - 1, columns * (rows - 1)])
+    at = dict(zip(ids.tolist(), pixels, strict=True))
+    if all(end in at for end in ends.tolist()):
+        return np.array([at[end] for end in ends.tolist()])
+    places, middle = board.places(ids), pixels.mean(axis=0)
     found, _ = cv2.findHomography(places, pixels)
-    return np.eye(3) if found is None else np.asarray(found, dtype=np.float64)
-
-
-def _carried(homography: Array, points: Array) -> Array:
-    carried = np.column_stack([points, np.ones(len(points))]) @ homography.T
-    return np.asarray(carried[:, :2] / carried[:, 2:])
+    carried = np.column_stack([board.places(ends), np.ones(4)]) @ (np.eye(3) if found is None else found).T
+    # Beyond the horizon there is nothing.
+    reach_px = _FARTHEST * float(np.ptp(pixels, axis=0).max())
+    outline = carried[:, :2] / np.maximum(carried[:, 2:], 1e-9)
+    return np.asarray(np.clip(outline, middle - reach_px, middle + reach_px))
 
 
 def _edge_width_px(grey: Grey, board: Board, ids: NDArray[np.intp], pixels: Array) -> float:

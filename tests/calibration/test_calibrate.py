@@ -74,6 +74,11 @@ def test_pictures_that_are_all_soft() -> None:
     assert any("edges are 3.0 px wide in all pictures" in note for note in notes)
 
 
+def test_corners_that_are_far_off_are_said_to_be() -> None:
+    looked = sightings(everywhere(), 0.5, noise_px=1.0)
+    assert any("try another --lens" in note for note in calibrated(looked).notes)
+
+
 def test_too_few_say_what_to_add() -> None:
     looked = sightings([(-0.05, 0.0, 0.4), (0.05, 0.03, 0.4), (0.0, -0.03, 0.4)], 0.4)
     with pytest.raises(IpsysError, match=r"3 of 3 pictures are of use.*no board near the left, right"):

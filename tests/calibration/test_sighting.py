@@ -43,12 +43,14 @@ def charuco_pattern(board: Board) -> Callable[[Array], Array]:
     return levels
 
 
-def drawn(board: Board, seed: int, blur_px: float, gamma: float = 1.0) -> tuple[NDArray[np.uint8], Array]:
+def drawn(
+    board: Board, seed: int, blur_px: float, gamma: float = 1.0, z_m: float = 0.42
+) -> tuple[NDArray[np.uint8], Array]:
     """A picture of a board, and its true corners."""
     rng = np.random.default_rng(seed)
     pattern = chessboard_pattern(board.columns, board.rows, board.square_m)
     turn, place_m = random_pose(rng, "pinhole")
-    place_m = np.array([0.1 * place_m[0], 0.1 * place_m[1], 0.42])
+    place_m = np.array([0.1 * place_m[0], 0.1 * place_m[1], z_m])
     pattern = pattern if board.marker_scale is None else charuco_pattern(board)
     picture = render(straight_rays, turn, place_m, pattern, (640, 480), rng)
     light = gaussian_filter(picture.astype(float), blur_px)
@@ -60,10 +62,10 @@ def drawn(board: Board, seed: int, blur_px: float, gamma: float = 1.0) -> tuple[
 @pytest.mark.parametrize("board", [CHESSBOARD, CHARUCO], ids=["chessboard", "charuco"])
 @pytest.mark.parametrize("gamma", [1.0, 2.2])
 def test_corners_are_where_they_are(board: Board, gamma: float) -> None:
-    """To 0.06 px; OpenCV's own are off by twice that and, at single corners, by half a pixel."""
+    """Squares of 26 px; OpenCV's own corners are off by 0.07 to 0.08 px here."""
     errors = []
     for seed in range(3):
-        picture, truth = drawn(board, seed, blur_px=0.7, gamma=gamma)
+        picture, truth = drawn(board, seed, blur_px=0.7, gamma=gamma, z_m=0.7)
         sighting = find_board("a", picture, board, thorough=True)
         assert sighting is not None
         # A chessboard of even and even corners looks the same upside down.
@@ -71,8 +73,8 @@ def test_corners_are_where_they_are(board: Board, gamma: float) -> None:
         distances = [np.linalg.norm(sighting.pixels - corners, axis=1) for corners in turned]
         errors.append(min(distances, key=lambda each: float(np.median(each))))
     rms_px = np.sqrt((np.concatenate(errors) ** 2).mean())
-    assert rms_px < 0.06
-    assert np.concatenate(errors).max() < 0.3
+    assert rms_px < 0.055
+    assert np.concatenate(errors).max() < 0.15
 
 
 @pytest.mark.parametrize("board", [CHESSBOARD, CHARUCO], ids=["chessboard", "charuco"])

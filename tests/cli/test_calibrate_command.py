@@ -156,7 +156,7 @@ def test_one_camera_of_a_log(ipsys: Ipsys, log: Path) -> None:
     line = refused(ipsys, log.parent, log, "--board", "6x4", "--camera", "white", "-o", log.parent)
     assert "camera white" in line
     line = refused(ipsys, log.parent, log, "--board", "6x4", "--camera", "blue", "-o", log.parent)
-    assert "no frames of such a camera (only of none)" in line or "only of" in line
+    assert "--camera blue: there are no frames of such a camera (only of red, white)" in line
 
 
 def test_a_video(ipsys: Ipsys, rendered: Path, tmp_path: Path) -> None:
@@ -177,10 +177,12 @@ def test_a_video(ipsys: Ipsys, rendered: Path, tmp_path: Path) -> None:
         ("7x5", "a chessboard of 6 x 4 inner corners is seen in"),
         ("5x3", "it is a part of a chessboard of 6 x 4 inner corners: give --board 6x4"),
         ("9x9", "give the inner corners, one less than the squares"),
-        ("charuco:7x5", "is not seen in any of 12 pictures"),
+        ("charuco:7x5", "is not seen in any of 6 pictures"),
     ],
 )
 def test_another_board_than_said(ipsys: Ipsys, red: Path, tmp_path: Path, board: str, said: str) -> None:
+    for path in list(red.iterdir())[6:]:
+        path.unlink()
     assert said in refused(ipsys, tmp_path, red, "--board", board, "-o", tmp_path)
 
 

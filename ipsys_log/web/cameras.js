@@ -3,14 +3,15 @@ import { element, make } from "./make.js";
 
 let shown = { cameras: [] };
 
-// The tiles stay what they are while pictures come: a tap, or the focus, is on one of them.
+// The tiles stay what they are while pictures come: a tap, or the focus, is on one of them. They are there
+// before the first picture, so that nothing below them moves away under a finger.
 export async function drawCameras(where, view) {
-  await Promise.all(view.cameras.map((camera) => camera.picture && load(camera.picture)));
   const names = view.cameras.map((camera) => camera.name).join(" ");
   if (where.dataset.names !== names) {
     where.dataset.names = names;
     where.replaceChildren(...view.cameras.map(() => tile(where)));
   }
+  await Promise.all(view.cameras.map((camera) => camera.picture && load(camera.picture)));
   shown = view;
   view.cameras.forEach((camera, n) => fill(where.children[n], camera, view, where.classList.contains("whole")));
 }

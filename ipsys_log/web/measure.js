@@ -70,12 +70,19 @@ function clear() {
 
 // --- the check, at once while typing ----------------------------------------------------------
 
-const soon = () => { clearTimeout(timer); $("save").disabled = true; timer = setTimeout(guarded(check), WAIT_MS); };
+function soon() {
+  clearTimeout(timer);
+  $("save").disabled = true;
+  $("verdict").ariaBusy = "true";
+  timer = setTimeout(guarded(check), WAIT_MS);
+}
 
 async function check() {
   const number = ++asked;
   const answer = await ask("check", typed());
-  if (number === asked) show(answer);
+  if (number !== asked) return;
+  show(answer);
+  $("verdict").ariaBusy = "false";
 }
 
 function show(answer) {
@@ -156,10 +163,11 @@ async function look() {
   const state = view.state, number = ++looks, answer = await ask(`views?${query}`);
   if (number !== looks) return;
   view = answer;
+  const drawn = drawCameras($("cameras"), view);
   $("sight").textContent = upper(view.text);
   $("sight").className = `chip ${view.state}`;
   if (stop === null) offerMarkers();
-  await drawCameras($("cameras"), view);
+  await drawn;
   if (state !== view.state) soon();
 }
 
@@ -200,8 +208,8 @@ function nextOpen() {
 
 function list() {
   const rows = history.places.map((place) => {
-    const where = place.point_m ? `x ${place.point_m[0].toFixed(2)}, y ${place.point_m[1].toFixed(2)} m` : place.counts ? "" : "withdrawn";
-    const text = make("div", {}, make("b", {}, place.id), make("span", {}, ` marker ${place.marker}`), ` ${where}`, make("small", {}, place.tapes));
+    const where = place.point_m ? `at ${place.point_m.slice(0, 2).map((v) => v.toFixed(2)).join(", ")} m` : place.counts ? "" : "withdrawn";
+    const text = make("div", {}, make("b", {}, place.id), make("span", {}, ` marker ${place.marker}`), " ", make("em", {}, where), make("small", {}, place.tapes));
     if (!place.counts) return make("li", { className: "gone" }, text);
     const undo = make("button", { type: "button" }, "Undo");
     undo.setAttribute("aria-label", `Undo ${place.id}`);

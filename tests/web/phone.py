@@ -87,8 +87,10 @@ class Phone:
         x, y, hit = self.run(
             f"(async () => {{ const e = document.querySelector({found});"
             "e.scrollIntoView({block: 'center'});"
-            "for (let n = 0; n < 2; n++) await new Promise(requestAnimationFrame);"
-            "const b = e.getBoundingClientRect(), x = b.x + b.width / 2, y = b.y + b.height / 2;"
+            # A finger waits until nothing moves under it.
+            "let b = {}, still = 0; while (still < 6) { await new Promise(requestAnimationFrame);"
+            "const now = e.getBoundingClientRect(); still = now.x === b.x && now.y === b.y ? still + 1 : 0;"
+            "b = now; } const x = b.x + b.width / 2, y = b.y + b.height / 2;"
             "const there = document.elementFromPoint(x, y);"
             "return [x, y, there === e || e.contains(there) || there.contains(e)]; })()"
         )

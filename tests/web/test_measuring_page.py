@@ -37,6 +37,7 @@ def fill(hand: Phone, a: str, b: str, side: str, height: str) -> None:
 
 def save(hand: Phone, name: str) -> None:
     """When it can be saved: only then is the button one."""
+    hand.wait("document.querySelector('#verdict[aria-busy=false]')")
     hand.wait("document.querySelector('#save:enabled')")
     says(hand, "#save", f"Save {name}")
     hand.tap("#save")
@@ -105,6 +106,7 @@ def test_the_side_is_chosen_on_the_map_and_a_slip_is_seen_by_the_model(
         for selector, text in (("#d-A", a), ("#d-B", b), ("#height", height)):
             hand.type(selector, text)
         hand.wait("document.querySelectorAll('#floor .maybe').length == 2")
+        hand.wait("document.querySelector('#verdict[aria-busy=false]')")
         hand.tap(f"#floor .maybe[aria-label$={other}]")
         says(hand, "#verdict", f"it lies {side} of the line from A to B, not {other}?")
         says(hand, "#save", "all the same")

@@ -3,6 +3,8 @@
 from __future__ import annotations
 
 import json
+from collections.abc import Iterator
+from contextlib import contextmanager, nullcontext
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, Optional
 
@@ -10,6 +12,7 @@ import typer
 
 from ipsys_log.cli.console import console, progress_bar, remarks
 from ipsys_log.cli.options import AsJson
+from ipsys_log.cli.record import recorded_now
 
 if TYPE_CHECKING:
     from ipsys_log.calibration.calibrate import Calibrated
@@ -18,9 +21,13 @@ if TYPE_CHECKING:
 __all__ = ["add_commands"]
 
 Sources = Annotated[
-    list[Path],
-    typer.Argument(help="Logs, folders of pictures, pictures, videos.", metavar="SOURCE..."),
+    Optional[list[Path]],  # noqa: UP045
+    typer.Argument(help="Logs, folders of pictures, pictures, videos.", metavar="[SOURCE]..."),
 ]
+RigNow = Annotated[
+    Path | None, typer.Option("--rig", help="Without a source: take what the cameras of this rig send now.")
+]
+Seconds = Annotated[float, typer.Option(min=1.0, help="How long to take it, while you move the board.")]
 BoardName = Annotated[
     str,
     typer.Option(
@@ -65,8 +72,8 @@ def add_commands(app: typer.Typer) -> None:
 
 
 def calibrate(
-    sources: Sources,
     board: BoardName,
+    sources: Sources = None,
     square: Square = 0.03,
     lens: Lens = "fisheye",
     marker_scale: MarkerScale = 0.75,
@@ -76,6 +83,8 @@ def calibrate(
     output: Output = Path(),
     formats: Formats = None,
     plot: Plot = None,
+    rig: RigNow = None,
+    seconds: Seconds = 60.0,
     force: Force = False,
     as_json: AsJson = False,
 ) -> None:
@@ -95,13 +104,14 @@ def calibrate(
     names = list(dict.fromkeys(formats or ["opencv"]))
     for name in names:
         check_format(name, lens)
-    found = find_sources(sources, camera or [])
-    targets = _targets(found, output, names, force)
     if plot is not None:
-        check_file(plot, "--plot", sources)
+        check_file(plot, "--plot", sources or [])
         _check_free(plot, force)
-    with progress_bar() as progress:
-        lenses, unseen = calibrate_cameras(found, wanted, model, progress)
+    with nullcontext(sources) if sources else _taken_now(rig, seconds) as taken:
+        found = find_sources(taken, camera or [])
+        targets = _targets(found, output, names, force)
+        with progress_bar() as progress:
+            lenses, unseen = calibrate_cameras(found, wanted, model, progress)
     written = _write(lenses, targets)
     if plot is not None:
         _draw(lenses, plot)
@@ -117,6 +127,16 @@ def calibrate(
         _show(one, written[one.camera], "opencv" in names)
     if plot is not None:
         remarks.print(f"{plot} drawn", markup=False)
+
+
+@contextmanager
+def _taken_now(rig: Path | None, seconds: float) -> Iterator[list[Path]]:
+    if rig is not None:
+        remarks.print(
+            "move the board through all of each picture, tilted this way and that, and hold it still"
+        )
+    with recorded_now(rig, None, seconds) as log:
+        yield [log]
 
 
 def _targets(

@@ -79,12 +79,13 @@ def views_json(scene: Scene, views: Sequence[View], marker_id: int | None) -> di
     return {
         "marker": marker_id,
         "visible": visible,
-        "state": "unseen" if sight is None else sight.state,
+        "state": sight.state if sight else "choose" if visible else "unseen",
         "text": _invitation(visible) if sight is None else sight.text,
         "cameras": [
             {
                 "name": view.camera,
                 "colour": colours[view.camera][0],
+                "sees": sight is not None and view.camera in (*sight.points_m, *sight.moving),
                 "picture": None if view.jpeg is None else f"picture/{view.camera}/{view.time_ns}",
                 "size_px": None if view.markers is None else [view.markers.width, view.markers.height],
                 "markers": [

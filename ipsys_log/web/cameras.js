@@ -35,10 +35,11 @@ function tile(where) {
 function fill(made, camera, view, whole) {
   const [svg, name] = made.children;
   const chosen = camera.markers.find((one) => one.id === view.marker);
+  const sees = chosen || camera.sees;
   const [width, height] = camera.size_px ?? [16, 9];
   const close = chosen && !whole;
   svg.setAttribute("class", view.state);
-  svg.setAttribute("aria-label", `Camera ${camera.name} ${chosen ? `sees marker ${view.marker}` : "does not see it"}`);
+  svg.setAttribute("aria-label", `Camera ${camera.name} ${sees ? `sees marker ${view.marker}` : "does not see it"}`);
   svg.setAttribute("viewBox", close ? closeUp(chosen.corners_px, width, height) : `0 0 ${width} ${height}`);
   svg.setAttribute("preserveAspectRatio", close ? "xMidYMid slice" : "xMidYMid meet");
   svg.style.aspectRatio = whole ? `${width} / ${height}` : "1";
@@ -48,7 +49,7 @@ function fill(made, camera, view, whole) {
   });
   const picture = camera.picture ? [element("image", { href: camera.picture, width, height })] : [];
   svg.replaceChildren(...picture, ...camera.markers.map(outline));
-  name.replaceChildren(camera.name, make("small", {}, chosen ? "sees it" : "no"));
+  name.replaceChildren(camera.name, make("small", {}, sees ? "sees it" : "no"));
   name.style.borderColor = camera.colour;
 }
 

@@ -58,9 +58,16 @@ function buildFields() {
     return make("div", { className: "field" }, label, make("span", { className: "cm" }, input, make("i", {}, "cm")), fault);
   }));
   $("height").setAttribute("aria-describedby", "fault-height");
-  $("from").textContent = lab.references[0].name;
-  $("to").textContent = lab.references[1].name;
-  $("sides").hidden = !lab.one_line;
+  offerSides([]);
+}
+
+// Where the reference points are on one line, or only two of them were measured from.
+function offerSides(faults) {
+  const given = lab.references.map((r) => r.name).filter((name) => $(`d-${name}`).value);
+  const [from, to] = given.length > 1 ? given : lab.references.map((r) => r.name);
+  $("from").textContent = from;
+  $("to").textContent = to;
+  $("sides").hidden = !lab.one_line && given.length !== 2 && !faults.some((fault) => fault.field === "side");
 }
 
 function clear() {
@@ -89,6 +96,7 @@ function show(answer) {
   const now = typed(), tapes = {};
   for (const [name, text] of Object.entries(now.distances)) tapes[name] = Number(text.replace(",", ".")) / 100;
   found = { ...answer, tapes };
+  offerSides(answer.faults);
   // What is only missing yet is no fault.
   const empty = (field) =>
     field === "marker" ? !now.marker : field === "side" ? !now.side

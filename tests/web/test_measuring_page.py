@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import fcntl
 from collections.abc import Iterator, Sequence
+from dataclasses import replace
 from pathlib import Path
 
 import pytest
@@ -11,7 +12,7 @@ import pytest
 from ipsys_log.finished import FinishedLog, opened_log
 from ipsys_log.log.session import Session
 from ipsys_log.measuring.scene import Stop, View
-from ipsys_log.messages import CameraPoint, CameraPoints, Measurement, Model, Rig
+from ipsys_log.messages import CameraPoint, CameraPoints, Measurement, Model, ReferencePoint, Rig
 from ipsys_log.request import Request
 from ipsys_log.web.serving import serving
 from tests import labs
@@ -181,6 +182,26 @@ def test_while_recording_the_marker_has_to_lie_still(hand: Phone) -> None:
     (saved,) = scene.done
     assert saved.still is not None
     assert (saved.marker_id, saved.side, saved.still.end - saved.still.start) == (0, "left", 8)
+
+
+def test_of_three_reference_points_two_need_the_side_and_three_check_one_another(hand: Phone) -> None:
+    scene = Recording()
+    third = ReferencePoint("C", 2.4, 0.3)
+    scene.rig = replace(labs.RIG, reference_points=(*labs.RIG.reference_points, third))
+    with serving(scene, port=0) as page:
+        hand.open(page.url)
+        says(hand, "#sight", "Marker 0 lies still, seen by red")
+        assert hand.run("document.querySelector('#sides').hidden")
+        for selector, text in (("#d-A", "170"), ("#d-C", "348"), ("#height", "10")):
+            hand.type(selector, text)
+        says(hand, "#sides", "Seen from A looking to C, the place lies")
+        says(hand, "#save", "Still missing: left or right of the line from A to C")
+        hand.type("#d-B", "190")
+        hand.wait("document.querySelector('#sides').hidden")
+        says(hand, "#verdict", "The distances disagree by")
+        save(hand, "p001")
+        says(hand, "#places", "p001 marker 0")
+    assert [tape.reference for tape in scene.done[0].distances] == ["A", "B", "C"]
 
 
 def test_place_after_place_in_through_the_token(hand: Phone, unmeasured: Unmeasured) -> None:

@@ -3,6 +3,8 @@
 A source is an iterable of messages, a stage a row that says what it reads and has a step from a
 message to payloads, and :func:`run` sends one through the others. :func:`replay` does this for a
 log, stage by stage: what the log does not hold yet, or no longer rightly, is computed and appended.
+:func:`record` writes what cameras send; :func:`live` writes it first, and then sends it through the
+same stages in the same way.
 
 ==============  ==================  ================  =====================================
 stage           reads               writes            its run is named after
@@ -19,7 +21,8 @@ fuse            positions           tracks, poses     the run of its positions
 
 The rig is read by all, by locate only for models that are told the height of a marker.
 :mod:`ipsys_log.tasks` says in full what each stage reads, :mod:`ipsys_log.perform` how its run is
-found or made.
+found or made, :mod:`ipsys_log.recording` how frames get from the cameras into the log and from there,
+as long as the stages keep up, to them.
 """
 
 from __future__ import annotations
@@ -39,10 +42,10 @@ import cv2
 from threadpoolctl import threadpool_limits
 
 from ipsys_log.latency import Ledger
+from ipsys_log.live_plan import copied_models, live_stages, with_corners
 from ipsys_log.log.session import Session
-from ipsys_log.lookup import fitted_in, wanted_models
+from ipsys_log.lookup import wanted_models
 from ipsys_log.messages import (
-    CameraCalibration,
     CameraPoints,
     Evaluation,
     Event,
@@ -61,7 +64,6 @@ from ipsys_log.recording import Backlog, recording
 from ipsys_log.request import Progress, Request
 from ipsys_log.runs import Outcome
 from ipsys_log.sources.attached import Attached
-from ipsys_log.stages import camera_frame, detect, fuse, locate
 from ipsys_log.tasks import STAGES, Task, model_run, plan_stage
 
 __all__ = ["TOPICS", "Stage", "carry_out", "in_threads", "live", "record", "replay", "run"]
@@ -279,12 +281,16 @@ def live(
     IpsysError
         Where the other log has no such model, or the log cannot be written; what it holds is kept.
     """
-    request = replace(request, corners=request.corners or _usual_corners(cameras, settings))
-    models = [_copied_model(request, cameras.now_ns())] if until == "fuse" else []
-    runs, stages = _live_stages(request, models, until)
+    request = with_corners(request, cameras.states, settings)
+    models = copied_models(request, until)
+    runs, rows = live_stages(request, models, until)
+    stages = [Stage(*row) for row in rows]
     with recording(target) as log, threadpool_limits(1, user_api="blas"):
-        for message in (*settings, *models):
+        for message in settings:
             log.put(message)
+        for model in models:
+            topic = TOPICS[Model].format(run=model_run(model.name))
+            log.put(Message(topic, cameras.now_ns(), model.timestamp, model))
         ledger = Ledger(cameras.clock.now_ns, cameras.received_ns)
         with Backlog(cameras, log, cameras.now_ns, cameras.stop) as frames:
             made = ledger.note("detected", Markers, run(chain(settings, frames), stages[:1], in_threads))
@@ -297,40 +303,5 @@ def live(
                     entry = ledger.entry(message)
                     if entry is not None:
                         log.put(entry)
-    models_used = tuple(message.payload.name for message in models)
-    return sign(target, replace(request, models=models_used, as_live=bool(frames.skipped)), runs)
-
-
-def _usual_corners(cameras: Attached, settings: Sequence[Message]) -> str:
-    lenses = {message.camera for message in settings if isinstance(message.payload, CameraCalibration)}
-    return detect.EDGES if lenses >= cameras.states.keys() else detect.STOCK
-
-
-def _copied_model(request: Request, time_ns: int) -> Message:
-    """The model of another log, as a run of this one."""
-    assert request.model_from is not None
-    (name,) = wanted_models(request, "fuse")
-    with Session([request.model_from]) as other:
-        model, _ = fitted_in(other, name)
-    return Message(TOPICS[Model].format(run=model_run(name)), time_ns, model.timestamp, model)
-
-
-def _live_stages(
-    request: Request, models: Sequence[Message], until: str
-) -> tuple[dict[str, str], list[Stage]]:
-    """The run that each stage of a replay would write to, and the causal ones of these stages."""
-    corners = str(request.corners)
-    runs, stages = {"detect": corners}, [Stage(corners, detect.READS, detect.Detect(corners))]
-    if until == "detect":
-        return runs, stages
-    points = corners if request.method == camera_frame.PERIMETER else f"{corners}_{request.method}"
-    runs["camera-frame"] = points
-    stages.append(Stage(points, camera_frame.READS, camera_frame.CameraFrame(request.method)))
-    for message in models:
-        name = model_run(message.payload.name)
-        runs |= {"fit": name, "locate": name, "fuse": name}
-        stages += [
-            Stage(name, locate.READS, locate.Locate(message.payload)),
-            Stage(name, fuse.READS, fuse.Fuse(name), per_camera=False),
-        ]
-    return runs, stages
+    names = tuple(model.name for model in models)
+    return sign(target, replace(request, models=names, as_live=bool(frames.skipped)), runs)

@@ -20,7 +20,7 @@ Row = tuple[str, tuple[type, ...], Callable[[Message], Iterable[Any]], bool]
 
 
 def with_corners(request: Request, cameras: Collection[str], settings: Sequence[Message]) -> Request:
-    """A request that says how corners are found: as a replay would, by the edges if all cameras have a lens."""
+    """A request that says how corners are found: as a replay would, by edges if all cameras have a lens."""
     lenses = {message.camera for message in settings if isinstance(message.payload, CameraCalibration)}
     usual = detect.EDGES if lenses >= set(cameras) else detect.STOCK
     return replace(request, corners=request.corners or usual)

@@ -5,6 +5,7 @@ from __future__ import annotations
 from collections import defaultdict
 from collections.abc import Iterable, Iterator
 from dataclasses import dataclass
+from itertools import groupby, zip_longest
 from typing import Any
 
 import numpy as np
@@ -44,87 +45,110 @@ class Comparison:
         return self.left == self.right == self.same
 
 
-def compare_channels(left: Iterable[Message], right: Iterable[Message]) -> list[Comparison]:
-    """Compare messages channel by channel; those of one channel by their order.
-
-    Parameters
-    ----------
-    left, right : in log order, of the same topics.
-    """
-    sides = [_by_topic(left), _by_topic(right)]
-    return [
-        _compare(topic, sides[0].get(topic, []), sides[1].get(topic, []))
-        for topic in sorted({*sides[0], *sides[1]})
-    ]
-
-
 # Log time, publish time, bytes, and what can be measured in them.
 _Row = tuple[int, int, bytes, dict[int, Array]]
 
 
-def _by_topic(messages: Iterable[Message]) -> dict[str, list[_Row]]:
-    found: dict[str, list[_Row]] = defaultdict(list)
-    for message in messages:
-        row = (
-            message.log_time_ns,
-            message.publish_time_ns,
-            encode(message.payload),
-            _values(message.payload),
-        )
-        found[message.topic].append(row)
-    for rows in found.values():
-        # Stages that share a channel have written one after the other, or in turns.
-        rows.sort(key=lambda row: row[0])
-    return found
+def compare_channels(left: Iterable[Message], right: Iterable[Message]) -> list[Comparison]:
+    """Compare messages channel by channel; those of one channel and log time by their order.
+
+    Parameters
+    ----------
+    left, right : in log order, of the same topics. Neither is held as a whole.
+    """
+    tallies: dict[str, _Tally] = {}
+    for ours, theirs in _together(_by_time(left), _by_time(right)):
+        for topic in {**ours, **theirs}:
+            tally = tallies.setdefault(topic, _Tally())
+            for one, other in zip_longest(ours.get(topic, ()), theirs.get(topic, ())):
+                tally.add(one, other)
+    return [tally.found(topic) for topic, tally in sorted(tallies.items())]
+
+
+def _by_time(messages: Iterable[Message]) -> Iterator[tuple[int, dict[str, list[_Row]]]]:
+    """Messages of one log time, by topic."""
+    for time_ns, group in groupby(messages, key=lambda message: message.log_time_ns):
+        rows: dict[str, list[_Row]] = defaultdict(list)
+        for one in group:
+            row = (one.log_time_ns, one.publish_time_ns, encode(one.payload), _values(one.payload))
+            rows[one.topic].append(row)
+        yield time_ns, rows
+
+
+_Group = tuple[int, dict[str, list[_Row]]]
+
+
+def _together(
+    left: Iterator[_Group], right: Iterator[_Group]
+) -> Iterator[tuple[dict[str, list[_Row]], dict[str, list[_Row]]]]:
+    """What both sides have of each log time; nothing where only one has any."""
+    one, other = next(left, None), next(right, None)
+    while one is not None or other is not None:
+        if other is None or (one is not None and one[0] < other[0]):
+            assert one is not None
+            yield one[1], {}
+            one = next(left, None)
+        elif one is None or other[0] < one[0]:
+            yield {}, other[1]
+            other = next(right, None)
+        else:
+            yield one[1], other[1]
+            one, other = next(left, None), next(right, None)
+
+
+@dataclass(slots=True)
+class _Tally:
+    """What has been found of one channel so far; distances in px of markers, in m of everything else."""
+
+    left: int = 0
+    right: int = 0
+    both: int = 0
+    same: int = 0
+    first: str | None = None
+    first_ns: int | None = None
+    measured: int = 0
+    squares: float = 0.0
+    greatest: float = 0.0
+
+    def add(self, one: _Row | None, other: _Row | None) -> None:
+        """A message of both sides, or of one."""
+        self.left += one is not None
+        self.right += other is not None
+        if one is None or other is None or one[:3] != other[:3]:
+            if self.first_ns is None:
+                self.first = _said(one, other)
+                self.first_ns = min(row[0] for row in (one, other) if row is not None)
+        else:
+            self.same += 1
+        if one is not None and other is not None:
+            self.both += 1
+            for n in one[3].keys() & other[3].keys():
+                distances = np.linalg.norm(one[3][n] - other[3][n], axis=1)
+                self.measured += len(distances)
+                self.squares += float((distances**2).sum())
+                self.greatest = max(self.greatest, float(distances.max()))
+
+    def found(self, topic: str) -> Comparison:
+        counts = self.left, self.right, self.both, self.same
+        if not self.measured:
+            return Comparison(topic, *counts, self.first, self.first_ns)
+        unit = "px" if topic.endswith("/markers") else "m"
+        rms = float(np.sqrt(self.squares / self.measured))
+        return Comparison(topic, *counts, self.first, self.first_ns, unit, rms, self.greatest)
 
 
 def _values(payload: Any) -> dict[int, Array]:
     """What can be measured, by marker: (n, 2) in px or (1, 3) in m."""
     if isinstance(payload, Markers):
         return {marker.id: marker.corners_px for marker in payload.markers}
+    points: tuple[Any, ...] = ()
     if isinstance(payload, CameraPoints):
-        return {p.id: np.array([[p.x_m, p.y_m, p.z_m]]) for p in payload.points}
-    if isinstance(payload, Positions):
-        return {p.id: np.array([[p.x_m, p.y_m, p.z_m]]) for p in payload.positions}
-    if isinstance(payload, Tracks):
-        return {p.id: np.array([[p.x_m, p.y_m, p.z_m]]) for p in payload.tracks}
-    return {}
-
-
-def _compare(topic: str, left: list[_Row], right: list[_Row]) -> Comparison:
-    both = same = 0
-    first, first_ns = None, None
-    distances: list[Array] = []
-    for a, b in _together(left, right):
-        both += a is not None and b is not None
-        if a is not None and b is not None and a[:3] == b[:3]:
-            same += 1
-        elif first_ns is None or min(row[1] for row in (a, b) if row is not None) < first_ns:
-            first, first_ns = _said(a, b), min(row[1] for row in (a, b) if row is not None)
-        if a is not None and b is not None:
-            distances += [
-                np.linalg.norm(a[3][n] - b[3][n], axis=1) for n in a[3] if n in b[3] and len(a[3][n])
-            ]
-    counts = len(left), len(right), both, same
-    if not distances:
-        return Comparison(topic, *counts, first, first_ns)
-    values = np.concatenate(distances)
-    unit = "px" if topic.endswith("/markers") else "m"
-    rms, greatest = float(np.sqrt(np.mean(values**2))), float(values.max())
-    return Comparison(topic, *counts, first, first_ns, unit, rms, greatest)
-
-
-def _together(left: list[_Row], right: list[_Row]) -> Iterator[tuple[_Row | None, _Row | None]]:
-    """Pairs of messages that speak of one frame; None where a side has none."""
-    # The same frame has the same publish time in every log, whenever it was written there.
-    waiting: dict[int, list[_Row]] = defaultdict(list)
-    for row in right:
-        waiting[row[1]].append(row)
-    for row in left:
-        others = waiting.get(row[1])
-        yield row, others.pop(0) if others else None
-    for rows in waiting.values():
-        yield from ((None, row) for row in rows)
+        points = payload.points
+    elif isinstance(payload, Positions):
+        points = payload.positions
+    elif isinstance(payload, Tracks):
+        points = payload.tracks
+    return {p.id: np.array([[p.x_m, p.y_m, p.z_m]]) for p in points}
 
 
 def _said(left: _Row | None, right: _Row | None) -> str:
@@ -133,10 +157,10 @@ def _said(left: _Row | None, right: _Row | None) -> str:
         there = left or right
         assert there is not None
         side = "second" if left is None else "first"
-        return f"a message that only the {side} has, at {format_time(there[1])} ({there[1]} ns)"
-    where = f"at {format_time(left[1])} ({left[1]} ns)"
-    if left[0] != right[0]:
-        return f"log times differ by {right[0] - left[0]} ns, {where}"
+        return f"a message that only the {side} has, at {format_time(there[0])} ({there[0]} ns)"
+    where = f"at {format_time(left[0])} ({left[0]} ns)"
+    if left[1] != right[1]:
+        return f"publish times differ by {right[1] - left[1]} ns, {where}"
     ids = sorted(left[3].keys() ^ right[3].keys())
     if ids:
         return f"marker {ids[0]} is only in one of them, {where}"

@@ -6,14 +6,15 @@ from collections.abc import Callable, Collection, Iterable, Sequence
 from dataclasses import replace
 from typing import Any
 
-from ipsys_log.log.session import Session
-from ipsys_log.lookup import fitted_in, wanted_models
-from ipsys_log.messages import CameraCalibration, Message, Model
+from ipsys_log.errors import IpsysError
+from ipsys_log.lookup import wanted_models
+from ipsys_log.messages import CameraCalibration, Message, Model, Rig
+from ipsys_log.models import reads_height
 from ipsys_log.request import Request
 from ipsys_log.stages import camera_frame, detect, fuse, locate
-from ipsys_log.tasks import model_run
+from ipsys_log.tasks import Task, copy_model, model_run
 
-__all__ = ["copied_models", "live_stages", "with_corners"]
+__all__ = ["check_live", "copied_models", "live_stages", "with_corners"]
 
 # The run a stage writes to, the payloads it reads, its step, and whether it takes each camera by itself.
 Row = tuple[str, tuple[type, ...], Callable[[Message], Iterable[Any]], bool]
@@ -26,19 +27,48 @@ def with_corners(request: Request, cameras: Collection[str], settings: Sequence[
     return replace(request, corners=request.corners or usual)
 
 
-def copied_models(request: Request, until: str) -> list[Model]:
-    """The model of another log that is applied; none before locate.
+def copied_models(request: Request, until: str) -> list[tuple[Task, Model]]:
+    """The models of another log that are applied, each with the task that copies it in; none before locate.
 
     Raises
     ------
     IpsysError
         Where the other log has no such model.
     """
-    if until != "fuse":
-        return []
-    assert request.model_from is not None
-    with Session([request.model_from]) as other:
-        return [fitted_in(other, name)[0] for name in wanted_models(request, "fuse")]
+    return [copy_model(request, name) for name in wanted_models(request, "fuse")] if until == "fuse" else []
+
+
+def check_live(
+    cameras: Collection[str], settings: Sequence[Message], models: Sequence[Model], until: str
+) -> None:
+    """See that the stages will not have to stop later.
+
+    Raises
+    ------
+    IpsysError
+        For a camera without a lens, a model that knows none of the cameras, or one that needs a height that
+        the rig does not say.
+    """
+    lenses = {message.camera for message in settings if isinstance(message.payload, CameraCalibration)}
+    missing = sorted(set(cameras) - lenses)
+    if missing and until != "detect":
+        name = missing[0]
+        raise IpsysError(
+            f'camera {name} has no lens: write calibration = "{name}.yaml" into lab.toml, or give '
+            f"--calibration {name}=file.yaml"
+        )
+    (rig,) = (message.payload for message in settings if isinstance(message.payload, Rig))
+    for model in models:
+        known = {camera.camera for camera in model.cameras}
+        if not known & set(cameras):
+            names = ", ".join(sorted(known))
+            raise IpsysError(f"the model {model.name} is of the cameras {names}, and none of them is here")
+        heights = [rig.height_of(marker.id) for marker in rig.markers] or [rig.marker_height_m]
+        if reads_height(model.name) and None in heights:
+            raise IpsysError(
+                f"{model.name} needs the height at which markers are carried: write marker_height_m into "
+                "lab.toml"
+            )
 
 
 def live_stages(request: Request, models: Sequence[Model], until: str) -> tuple[dict[str, str], list[Row]]:

@@ -137,10 +137,10 @@ def find_pairs(session: Session, points: str, places: list[Measured]) -> dict[st
     return build_pairs(sightings, places)
 
 
-def skipped_frames(session: Session) -> set[tuple[str, int]]:
-    """Camera and publish time of the frames that were recorded live and not looked at then."""
+def skipped_frames(session: Session) -> set[int]:
+    """Log times of the frames that were recorded live and not looked at then."""
     events = session.payloads(session.topics(Event))
-    return {(str(event.camera), event.timestamp) for event in events if event.kind == FRAME_SKIPPED}
+    return {event.timestamp for event in events if event.kind == FRAME_SKIPPED}
 
 
 def rig_with_offsets(session: Session) -> Rig:

@@ -45,7 +45,7 @@ EVENTS_TOPIC = "/events"
 LATENCY_TOPIC = "/latency"
 TRUTH_TOPIC = "/truth/tracks"
 
-# The kind of an event whose timestamp is that of a frame which no stage has seen when it was recorded live.
+# The kind of an event whose timestamp is the log time of a frame that no stage has seen when it was recorded.
 FRAME_SKIPPED = "frame_skipped"
 
 

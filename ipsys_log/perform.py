@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Iterable, Iterator, Mapping
+from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
 from dataclasses import replace
 from pathlib import Path
 
@@ -55,18 +55,19 @@ def perform(session: Session, target: Path, task: Task, request: Request, until:
     return Outcome(task.stage, name, True, count, remarks.lines())
 
 
-def sign(path: Path, request: Request, runs: Mapping[str, str]) -> list[Outcome]:
+def sign(path: Path, request: Request, runs: Mapping[str, str], copied: Sequence[Task]) -> list[Outcome]:
     """Append the records of stages that have written their channels already, live.
 
     Parameters
     ----------
     runs : by stage, in order, the run it has written to.
+    copied : the task of fit, planned when the model was taken from the other log.
     """
     records, outcomes = [], []
     with Session([path]) as session:
         first = max((run.number for run in session.runs()), default=0) + 1
         for number, (stage, name) in enumerate(runs.items(), first):
-            task = plan_stage(stage, session, request, **_given(stage, runs, request))
+            task = copied[0] if stage == "fit" else plan_stage(stage, session, request, **_given(stage, runs))
             assert isinstance(task, Task), f"{stage} was not done live"
             outputs = tuple(
                 ChannelWritten(topic, session.count(topic))
@@ -81,12 +82,10 @@ def sign(path: Path, request: Request, runs: Mapping[str, str]) -> list[Outcome]
     return outcomes
 
 
-def _given(stage: str, runs: Mapping[str, str], request: Request) -> dict[str, str]:
+def _given(stage: str, runs: Mapping[str, str]) -> dict[str, str]:
     """What :func:`ipsys_log.tasks.plan_stage` has to be told of the stages before."""
     if stage == "camera-frame":
         return {"markers": runs["detect"]}
-    if stage == "fit":
-        return {"points": runs["camera-frame"], "model": request.models[0]}
     if stage == "locate":
         return {"points": runs["camera-frame"], "model": runs["fit"]}
     return {"positions": runs["locate"]} if stage == "fuse" else {}
@@ -125,7 +124,7 @@ def inputs(session: Session, task: Task, progress: Progress) -> Iterator[Message
     progress(task.stage, 0, total)
     skipped = skipped_frames(session) if task.as_live else set()
     for done, message in enumerate(session.messages(task.topics), 1):
-        if message.topic != EVENTS_TOPIC and (message.camera, message.publish_time_ns) not in skipped:
+        if message.topic != EVENTS_TOPIC and message.log_time_ns not in skipped:
             yield message
         progress(task.stage, done, total)
 

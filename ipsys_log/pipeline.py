@@ -41,8 +41,9 @@ from typing import Any
 import cv2
 from threadpoolctl import threadpool_limits
 
+from ipsys_log.errors import IpsysError, LogError
 from ipsys_log.latency import Ledger
-from ipsys_log.live_plan import copied_models, live_stages, with_corners
+from ipsys_log.live_plan import check_live, copied_models, live_stages, with_corners
 from ipsys_log.log.session import Session
 from ipsys_log.lookup import wanted_models
 from ipsys_log.messages import (
@@ -64,6 +65,7 @@ from ipsys_log.recording import Backlog, recording
 from ipsys_log.request import Progress, Request
 from ipsys_log.runs import Outcome
 from ipsys_log.sources.attached import Attached
+from ipsys_log.sources.frames import SourceError
 from ipsys_log.tasks import STAGES, Task, model_run, plan_stage
 
 __all__ = ["TOPICS", "Stage", "carry_out", "in_threads", "live", "record", "replay", "run"]
@@ -226,6 +228,7 @@ def record(
     settings: Iterable[Message],
     target: Path,
     watch: Watch = lambda one: None,
+    overwrite: bool = False,
 ) -> Mapping[str, int]:
     """Write what cameras send to a new log; returns how many messages went to each topic.
 
@@ -234,13 +237,14 @@ def record(
     source : messages, and None where nothing comes.
     settings : written first: rig and lenses.
     watch : is shown everything after it was written, and None where nothing came.
+    overwrite : put it in place of a log that is there.
 
     Raises
     ------
     IpsysError
         Where the log cannot be written; what it holds by then is a complete log.
     """
-    with recording(target) as log:
+    with recording(target, overwrite) as log:
         for message in settings:
             log.put(message)
         for arrived in source:
@@ -259,6 +263,7 @@ def live(
     request: Request,
     until: str = "fuse",
     watch: Watch = lambda one: None,
+    overwrite: bool = False,
 ) -> list[Outcome]:
     """Write what cameras send to a new log, and what the stages make of it: the run of a replay.
 
@@ -282,10 +287,13 @@ def live(
         Where the other log has no such model, or the log cannot be written; what it holds is kept.
     """
     request = with_corners(request, cameras.states, settings)
-    models = copied_models(request, until)
+    copied = copied_models(request, until)
+    models = [model for _, model in copied]
+    check_live(cameras.states, settings, models, until)
     runs, rows = live_stages(request, models, until)
     stages = [Stage(*row) for row in rows]
-    with recording(target) as log, threadpool_limits(1, user_api="blas"):
+    fault: IpsysError | None = None
+    with recording(target, overwrite) as log, threadpool_limits(1, user_api="blas"):
         for message in settings:
             log.put(message)
         for model in models:
@@ -296,12 +304,26 @@ def live(
             made = ledger.note("detected", Markers, run(chain(settings, frames), stages[:1], in_threads))
             made = ledger.note("located", Positions, run(made, stages[1:3]))
             made = ledger.note("fused", Tracks, run(made, stages[3:]))
-            for message in made:
-                watch(message)
-                if type(message.payload) in TOPICS:
-                    log.put(message)
-                    entry = ledger.entry(message)
-                    if entry is not None:
-                        log.put(entry)
-    names = tuple(model.name for model in models)
-    return sign(target, replace(request, models=names, as_live=bool(frames.skipped)), runs)
+            try:
+                for message in made:
+                    watch(message)
+                    if type(message.payload) in TOPICS:
+                        log.put(message)
+                        entry = ledger.entry(message)
+                        if entry is not None:
+                            log.put(entry)
+            except IpsysError as error:
+                if isinstance(error, (LogError, SourceError)):
+                    raise
+                fault = error
+                cameras.warn("stages_stopped", f"{error}; frames are recorded all the same")
+                for message in frames:
+                    watch(message)
+    if fault is not None:
+        raise IpsysError(f"{fault}; {target} has all frames: replay it") from fault
+    if frames.skipped:
+        cameras.say(
+            f"{frames.skipped.total()} frames are recorded but were not looked at: the stages were too slow. "
+            f"ipsys replay {target} looks at all, with --as-live at those that were looked at"
+        )
+    return sign(target, replace(request, as_live=bool(frames.skipped)), runs, [task for task, _ in copied])

@@ -15,6 +15,8 @@ from ipsys_log.errors import IpsysError, LogError, WriteError
 from ipsys_log.geometry.lenses import scale_lens
 from ipsys_log.log import LogReader, LogWriter, Schema
 from ipsys_log.log.codec import encode, schema_data, schema_name
+from ipsys_log.log.lock import open_locked
+from ipsys_log.log.storage import DISK
 from ipsys_log.messages import (
     EVENTS_TOPIC,
     FRAME_SKIPPED,
@@ -81,8 +83,12 @@ class Recording:
 
 
 @contextmanager
-def recording(path: Path) -> Iterator[Recording]:
+def recording(path: Path, overwrite: bool = False) -> Iterator[Recording]:
     """A new log that keeps what it has, whatever ends the block.
+
+    Parameters
+    ----------
+    overwrite : put it in place of one that is there, unless another process is writing that.
 
     Raises
     ------
@@ -91,6 +97,9 @@ def recording(path: Path) -> Iterator[Recording]:
     IpsysError
         Where the disk is full: the log is complete, and says how far it goes.
     """
+    if overwrite and path.exists():
+        os.close(open_locked(DISK, path, os.O_RDWR))
+        path.unlink()
     try:
         with LogWriter.create(path) as writer, _reserve(path):
             yield Recording(writer)
@@ -245,5 +254,5 @@ class Backlog:
             camera = str(late.camera)
             self.skipped[camera] += 1
             text = f"a frame of camera {camera} is recorded but was not looked at: the stages are too slow"
-            event = Event(late.publish_time_ns, FRAME_SKIPPED, text, camera)
-            self._log.put(Message(EVENTS_TOPIC, self._now_ns(), late.publish_time_ns, event))
+            event = Event(late.log_time_ns, FRAME_SKIPPED, text, camera)
+            self._log.put(Message(EVENTS_TOPIC, self._now_ns(), event.timestamp, event))

@@ -50,7 +50,7 @@ from ipsys_log.request import Request
 from ipsys_log.runs import newest_run, read_channels
 from ipsys_log.stages import camera_frame, detect, fuse, locate
 
-__all__ = ["STAGES", "Task", "model_run", "plan_stage"]
+__all__ = ["STAGES", "Task", "copy_model", "model_run", "plan_stage"]
 
 
 @dataclass(frozen=True, slots=True)
@@ -198,7 +198,7 @@ def _held_lenses(session: Session, other: Mapping[str, CameraCalibration]) -> li
 def _fit(session: Session, request: Request, points: str, model: str) -> Task | str:
     base = model_run(model)
     if request.model_from is not None:
-        return _copy_model(request, model, base)
+        return copy_model(request, model)[0]
     if (copied := copied_run(session, model)) is not None:
         return copied
     rig, topics = _rig(session, request, "fit")
@@ -232,14 +232,21 @@ def model_run(model: str) -> str:
     return model.replace("+", "_").replace("-", "_")
 
 
-def _copy_model(request: Request, name: str, base: str) -> Task:
+def copy_model(request: Request, name: str) -> tuple[Task, Model]:
+    """The task that copies a model of another log in, and the model.
+
+    Raises
+    ------
+    IpsysError
+        Where the other log has no such model.
+    """
     assert request.model_from is not None
     with Session([request.model_from]) as other:
         model, topic = fitted_in(other, name)
         foreign = read_channels(other, [topic])
-    return Task(
+    task = Task(
         "fit",
-        base,
+        model_run(name),
         (),
         (Model,),
         compute=lambda log, progress: model,
@@ -247,6 +254,7 @@ def _copy_model(request: Request, name: str, base: str) -> Task:
         foreign=foreign,
         input_runs=(f"{request.model_from.name}:{topic.split('/')[2]}",),
     )
+    return task, model
 
 
 def _evaluate(session: Session, request: Request, points: str, model: str) -> Task | str:

@@ -2,16 +2,16 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterator, Sequence
+import heapq
+from collections.abc import Collection, Iterator, Sequence
 from pathlib import Path
 
 from ipsys_log.compare import Comparison, compare_channels
 from ipsys_log.errors import IpsysError
 from ipsys_log.log.session import Session, run_of_topic
-from ipsys_log.messages import CameraCalibration, CameraPoints, Markers, Message, Model, Run
+from ipsys_log.messages import CameraCalibration, CameraPoints, Markers, Message, Model, Positions, Run
 from ipsys_log.pipeline import carry_out
 from ipsys_log.request import Progress, Request
-from ipsys_log.runs import complete_runs
 from ipsys_log.stages.camera_frame import PERIMETER
 from ipsys_log.tasks import Task, plan_stage
 
@@ -37,15 +37,33 @@ def verify(paths: Sequence[Path], run: str | None, progress: Progress) -> list[C
         Where there is no such run, or it was made from something that the log no longer holds.
     """
     with Session(paths) as session:
-        runs = [one for one in complete_runs(session) if one.stage in _CAUSAL and run in (None, one.run)]
-        if not runs:
+        names = session.run_names() if run is None else session.run_names() & {run}
+        records = [one for one in session.runs() if one.run in names]
+        if not any(one.stage in _CAUSAL for one in records):
             raise IpsysError(
-                f"{session}: has no {'complete run' if run is None else f'run {run}'} to verify; "
+                f"{session}: has no {'run' if run is None else f'run {run}'} to verify; "
                 "make one with 'ipsys replay', or see 'ipsys runs'"
             )
-        topics = sorted({output.topic for one in runs for output in one.outputs})
-        made = (message for one in runs for message in _made_again(session, one, progress))
-        return compare_channels(session.messages(topics), made)
+        found = []
+        for name in sorted(names):
+            stages = [one for one in records if one.run == name and one.stage in _CAUSAL]
+            topics = {output.topic for one in stages for output in one.outputs}
+            # Stages can share a channel, that of events.
+            made = heapq.merge(
+                *(_made_again(session, one, progress) for one in stages), key=lambda one: one.log_time_ns
+            )
+            found += compare_channels(session.messages(sorted(topics)), made)
+        return sorted([*found, *_unrecorded(session, names)], key=lambda one: one.topic)
+
+
+def _unrecorded(session: Session, names: Collection[str]) -> list[Comparison]:
+    """Channels of runs that no record says anything of."""
+    known = {output.topic for one in session.runs() for output in one.outputs}
+    return [
+        Comparison(topic, session.count(topic), 0, 0, 0, "no record says how it was made", 0)
+        for topic in sorted({topic for reader in session.readers for topic in reader.channels} - known)
+        if run_of_topic(topic) in names and not topic.endswith("/record") and session.count(topic)
+    ]
 
 
 def diff(left: Path, right: Path, runs: tuple[str | None, str | None]) -> list[Comparison]:
@@ -96,15 +114,16 @@ def _derived(session: Session, runs: set[str], called: str | None) -> Iterator[M
 
 
 def _made_again(session: Session, run: Run, progress: Progress) -> Iterator[Message]:
-    task = plan_stage(run.stage, session, _request(run), **_given(session, run))
-    assert isinstance(task, Task)
     for read in run.inputs:
         if session.count(read.topic) != read.messages or session.hash(read.topic) != read.hash:
             raise IpsysError(
                 f"{session}: run {run.run} was made from {read.messages} messages of {read.topic}, and these "
-                f"are not what the log holds now ({session.count(read.topic)} messages): it is out of date"
+                f"are not what the log holds now ({session.count(read.topic)} messages): it is out of date, "
+                "or the log it was made from has to be given too"
             )
-    yield from carry_out(task, session, run.run, progress)
+    task = plan_stage(run.stage, session, _request(run), **_given(session, run))
+    if isinstance(task, Task):
+        yield from carry_out(task, session, run.run, progress)
 
 
 def _request(run: Run) -> Request:
@@ -135,5 +154,5 @@ def _given(session: Session, run: Run) -> dict[str, str]:
         "detect": {},
         "camera-frame": {"markers": source(Markers)},
         "locate": {"points": source(CameraPoints), "model": source(Model)},
-        "fuse": {"positions": run.run},
+        "fuse": {"positions": source(Positions)},
     }[run.stage]

@@ -9,7 +9,7 @@ from typing import TYPE_CHECKING, Annotated, Optional
 
 import typer
 
-from ipsys_log.cli.console import console, progress_bar
+from ipsys_log.cli.console import console, progress_bar, remarks
 from ipsys_log.cli.options import AsJson, Logs
 
 if TYPE_CHECKING:
@@ -101,6 +101,7 @@ def latency(
 
         check_file(plot, "--plot", logs)
         draw_latency(times_s, plot)
+        remarks.print(f"{plot} drawn", markup=False)
     if as_json:
         print(json.dumps({step: asdict(found) for step, found in steps.items()}, indent=2))  # noqa: T201
     else:

@@ -109,8 +109,11 @@ def load_lab(
     from ipsys_log.errors import IpsysError
     from ipsys_log.formats.opencv_yaml import read_opencv_calibration
     from ipsys_log.rig import load_rig
+    from ipsys_log.sources.simulated import lens_of
+    from ipsys_log.stages.detect import marker_detector
 
     lab = load_rig(rig)
+    marker_detector(lab.dictionary)  # a bad name is said now, not when markers are looked for
     known = {camera.name: camera for camera in lab.cameras}
     for name in only:
         if name not in known:
@@ -131,6 +134,8 @@ def load_lab(
     for camera in cameras:
         if camera.name not in lenses and camera.calibration is not None:
             lenses[camera.name] = read_opencv_calibration(rig.parent / camera.calibration, camera.name)
+        elif camera.name not in lenses and str(camera.source).startswith("sim:"):
+            lenses[camera.name] = lens_of(camera)
     strange = sorted(set(lenses) - set(names))
     if strange:
         raise IpsysError(f"--calibration {strange[0]}: no such camera is recorded (only {', '.join(names)})")

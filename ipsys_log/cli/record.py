@@ -76,11 +76,12 @@ def record(
         if measure:
             with _measured(settings, cameras, model_from, host, port) as scene:
                 watch = _both(status, scene)
-                pipeline.live(cameras, settings, output, Request(corners=corners), "camera-frame", watch)
+                request = Request(corners=corners)
+                pipeline.live(cameras, settings, output, request, "camera-frame", watch, force)
         elif detect:
-            pipeline.live(cameras, settings, output, Request(corners=corners), "detect", status)
+            pipeline.live(cameras, settings, output, Request(corners=corners), "detect", status, force)
         else:
-            pipeline.record(cameras, settings, output, status)
+            pipeline.record(cameras, settings, output, status, force)
 
 
 def live(
@@ -105,15 +106,18 @@ def live(
 ) -> None:
     """Track robots now: record, and take every frame through all stages up to fuse, until Ctrl-C."""
     from ipsys_log import pipeline
+    from ipsys_log.errors import IpsysError
     from ipsys_log.request import Request
 
+    if output.exists() and model_from.exists() and output.samefile(model_from):
+        raise IpsysError(f"-o {output}: is the log with the model; give another name")
     models = () if model is None else (model,)
     request = Request(models=models, model_from=model_from, corners=corners, method=method)
     with (
         _opened(output, rig, camera, calibration, seconds, force) as (cameras, settings, status),
         _viewed(settings, cameras, request) if view else nullcontext() as viewer,
     ):
-        pipeline.live(cameras, settings, output, request, "fuse", _both(status, viewer))
+        pipeline.live(cameras, settings, output, request, "fuse", _both(status, viewer), force)
 
 
 @contextmanager
@@ -136,6 +140,10 @@ def recorded_now(rig: Path | None, calibration: list[str] | None, seconds: float
             cameras, settings, status = opened
             pipeline.record(cameras, settings, log, status)
         yield log
+
+
+def _say(text: str) -> None:
+    remarks.print(text, markup=False)
 
 
 def _both(first: Watch, second: Watch | None) -> Watch:
@@ -176,7 +184,7 @@ def _viewed(settings: list[Message], cameras: Attached, request: Request) -> Liv
     from ipsys_log.tasks import model_run
 
     (model,) = wanted_models(request, "fuse")
-    return LiveView(settings[0].payload, cameras.states, model_run(model), remarks.print)
+    return LiveView(settings[0].payload, cameras.states, model_run(model), _say)
 
 
 @contextmanager
@@ -206,11 +214,9 @@ def _opened(
     _check_target(output, force)
     with ExitStack() as stack:
         with remarks.status("opening " + ", ".join(camera.name for camera in cameras)):
-            attached = stack.enter_context(Attached(cameras, open_source, Clock(), remarks.print))
+            attached = stack.enter_context(Attached(cameras, open_source, Clock(), _say))
         sizes_px = {name: state.size_px for name, state in attached.states.items()}
-        lenses = fitting_lenses(lenses, sizes_px, remarks.print)
-        if force:
-            output.unlink(missing_ok=True)
+        lenses = fitting_lenses(lenses, sizes_px, _say)
         _stop_on_signals(attached.stop)
         if seconds is not None:
             timer = Timer(seconds, attached.stop)

@@ -61,7 +61,9 @@ class LiveStatus:
         if message is None:
             return
         if isinstance(message.payload, CompressedImage):
-            self._delays_s[str(message.camera)] = (message.log_time_ns - message.publish_time_ns) / NS_PER_S
+            delay_ns = message.log_time_ns - message.publish_time_ns
+            if delay_ns > 0:  # without capture stamps it is not known
+                self._delays_s[str(message.camera)] = delay_ns / NS_PER_S
         elif isinstance(message.payload, Tracks):
             self._tracks.update({track.robot: track for track in message.payload.tracks})
 

@@ -35,7 +35,7 @@ _LIMIT_BYTES = 256 << 20
 _TICK_S = 0.1
 # A camera that opens and then sends nothing is not there.
 _FIRST_FRAME_S = 10.0
-_REMEMBERED = 1000
+_REMEMBERED = 20_000
 _RETRY_S, _LONGEST_RETRY_S = 0.5, 8.0
 
 
@@ -100,8 +100,10 @@ class Attached:
         self.received_ns: dict[int, int] = {}
         self._cameras = list(cameras)
         self.clock = clock
-        self._open, self._say_to_user, self._limit_bytes = open_source, say, limit_bytes
+        self._open, self.say, self._limit_bytes = open_source, say, limit_bytes
         self._said: set[str] = set()
+        self._closed = False
+        self._started = threading.Event()
         self._waiting: deque[_Arrival] = deque()
         self._waiting_bytes = 0
         self._last_ns = 0
@@ -122,6 +124,7 @@ class Attached:
         except BaseException:
             self._end()
             raise
+        self._started.set()
         return self
 
     def __exit__(
@@ -138,23 +141,38 @@ class Attached:
             with self._arrived:
                 if not self._waiting and not self._done():
                     self._arrived.wait(_TICK_S)
-                if self._fault is not None:
-                    raise self._fault
-                arrivals = list(self._waiting)
-                self._waiting.clear()
-                self._waiting_bytes = 0
-            for arrival in arrivals:
+                arrival = self._waiting.popleft() if self._waiting else None
+                ended = arrival is None and self._done()
+                self._closed = self._closed or ended
+                if arrival is not None and isinstance(arrival.content, Frame):
+                    self._waiting_bytes -= len(arrival.content.data)
+            if arrival is not None:
                 yield from self._messages(arrival)
-            if not arrivals:
-                if self._done():
-                    return
+            elif self._fault is not None:
+                raise self._fault
+            elif ended:
+                return
+            else:
                 yield None
 
     def add(self, topic: str, payload: Any) -> None:
-        """Take something else into the stream, such as a measurement: it gets its log time as frames do."""
+        """Take something else into the stream, such as a measurement: it gets its log time as frames do.
+
+        Raises
+        ------
+        SourceError
+            Where the stream has ended: nobody would write it down.
+        """
         with self._arrived:
+            if self._closed:
+                raise SourceError("the recording has ended")
             self._waiting.append(_Arrival(self.clock.now_ns(), None, (topic, payload)))
             self._arrived.notify()
+
+    def warn(self, kind: str, text: str) -> None:
+        """An event of no camera, said at once too."""
+        self.add(EVENTS_TOPIC, Event(self.clock.now_ns(), kind, text))
+        self.say(text)
 
     def now_ns(self) -> int:
         """A log time for what is not of a camera: later than all before."""
@@ -167,7 +185,7 @@ class Attached:
             thread.join()
 
     def _done(self) -> bool:
-        return self._stopped.is_set() or all(state.finished for state in self.states.values())
+        return all(state.finished for state in self.states.values())
 
     def _wait_for(self, camera: RigCamera) -> None:
         state = self.states[camera.name]
@@ -204,10 +222,12 @@ class Attached:
                 state.failure = fault
         finally:
             with self._arrived:
-                self._name_dropped(camera, state)
+                dropped = self._name_dropped(camera, state)
             state.up, state.finished = False, True
             state.opened.set()
             state.begun.set()
+            if dropped is not None:
+                self.say(dropped)
 
     def _take_all(self, camera: RigCamera, state: CameraState) -> SourceError | None:
         """Frames until the source has ended (None), or the camera has gone."""
@@ -245,24 +265,30 @@ class Attached:
             state.frames += 1
             state.bytes += len(frame.data)
             self._waiting_bytes += len(frame.data)
-            self._name_dropped(camera, state)
+            said = self._name_dropped(camera, state)
             self._waiting.append(_Arrival(now_ns, camera, frame))
             self._arrived.notify()
+        if said is not None:  # not while others wait: a terminal may stand still
+            self.say(said)
         state.begun.set()
+        # What came before the slowest camera would only be late.
+        while not self._started.wait(_TICK_S) and not self._stopped.is_set():
+            pass
 
-    def _name_dropped(self, camera: RigCamera, state: CameraState) -> None:
-        if state.unsaid:
-            text = f"{state.unsaid} frames of camera {camera.name} dropped: the disk is too slow"
-            state.unsaid = 0
-            self._waiting.append(_event(self.clock.now_ns(), "frames_dropped", text, camera))
-            self._say_to_user(text)
+    def _name_dropped(self, camera: RigCamera, state: CameraState) -> str | None:
+        if not state.unsaid:
+            return None
+        text = f"{state.unsaid} frames of camera {camera.name} dropped: the disk is too slow"
+        state.unsaid = 0
+        self._waiting.append(_event(self.clock.now_ns(), "frames_dropped", text, camera))
+        return text
 
     def _say(self, kind: str, text: str, camera: RigCamera) -> None:
         now_ns = self.clock.now_ns()
         with self._arrived:
             self._waiting.append(_event(now_ns, kind, text, camera))
             self._arrived.notify()
-        self._say_to_user(text)
+        self.say(text)
 
     def _say_setting(self, camera: RigCamera, text: str) -> None:
         """What a camera refused, once, however often it is opened."""

@@ -7,13 +7,13 @@ import time
 from collections.abc import Iterator
 from concurrent.futures import Future, ThreadPoolExecutor, wait
 from contextlib import contextmanager
-from dataclasses import fields
+from dataclasses import fields, replace
 from fractions import Fraction
 from threading import Event
 from urllib.parse import parse_qsl
 
 from ipsys_log.errors import IpsysError
-from ipsys_log.messages import RigCamera
+from ipsys_log.messages import CameraCalibration, RigCamera
 from ipsys_log.sources.asked import Given, say_refused
 from ipsys_log.sources.frames import Clock, Frame, Say
 from ipsys_log.sources.simulator.cameras import hang_cameras
@@ -26,7 +26,7 @@ from ipsys_log.sources.simulator.simulate import driving
 from ipsys_log.sources.simulator.views import prepare_view
 from ipsys_log.units import NS_PER_S
 
-__all__ = ["lab_of", "open_simulated", "shown_at"]
+__all__ = ["lab_of", "lens_of", "open_simulated", "shown_at"]
 
 _TURN_S = 0.4
 _LATENCY_NS = 4_000_000
@@ -99,6 +99,18 @@ def lab_of(camera: RigCamera) -> tuple[LabSettings, int]:
             f"camera {camera.name}: the simulated lab has no camera {name!r}; write one of {names}"
         )
     return settings, settings.cameras.index(name)
+
+
+def lens_of(camera: RigCamera) -> CameraCalibration:
+    """The lens through which a simulated camera sees.
+
+    Raises
+    ------
+    IpsysError
+        Where there is no such camera in the simulated lab.
+    """
+    settings, number = lab_of(camera)
+    return replace(hang_cameras(settings)[number].lens, frame_id=camera.name)
 
 
 def shown_at(frame: int, count: int) -> int:

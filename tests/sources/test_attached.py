@@ -114,6 +114,69 @@ def test_what_the_disk_cannot_take_is_dropped_by_name_and_memory_stays_bounded()
     assert kept == [data for data in frames["red"] if data in kept]
 
 
+def test_log_times_increase_when_the_clock_stands_still() -> None:
+    class Standing(Clock):
+        def now_ns(self) -> int:
+            return 1_000
+
+    found = messages(Attached(cameras(*FRAMES), playing(FRAMES, 500.0), Standing()))
+    assert all(one.log_time_ns < other.log_time_ns for one, other in pairwise(found))
+
+
+def test_nothing_is_taken_when_nobody_would_write_it() -> None:
+    attached = Attached(cameras("red"), playing(FRAMES, 500.0), Clock())
+    with attached:
+        attached.add("/note", Event(5, "note", "written"))
+        found = [message for message in attached if message is not None]
+        with pytest.raises(SourceError, match="has ended"):
+            attached.add("/note", Event(6, "note", "lost"))
+    assert [message.payload.text for message in found if message.topic == "/note"] == ["written"]
+
+
+def test_what_was_dropped_at_the_end_is_named_too() -> None:
+    frames = {"red": [bytes(1000)] * 40}
+    attached = Attached(cameras("red"), playing(frames, 500.0), Clock(), limit_bytes=10_000)
+    with attached:
+        time.sleep(0.2)
+        attached.stop()
+        found = [message for message in attached if message is not None]
+    (event,) = events(found)
+    assert (
+        event.text == f"{attached.states['red'].dropped} frames of camera red dropped: the disk is too slow"
+    )
+
+
+def test_early_frames_do_not_pile_up_while_another_camera_opens() -> None:
+    @contextmanager
+    def opened(camera: RigCamera, clock: Clock, say: Say) -> Iterator[Iterator[Frame | None]]:
+        def sent() -> Iterator[Frame | None]:
+            for n in range(5):
+                time.sleep(0.3 if camera.name == "late" and n == 0 else 0.01)
+                yield Frame(b"%d" % n, "jpeg", clock.now_ns())
+
+        yield sent()
+
+    attached = Attached(cameras("early", "late"), opened, Clock())
+    with attached:
+        assert attached.states["early"].frames == 1
+        assert len([message for message in attached if message is not None]) == 10
+
+
+def test_what_came_before_a_fault_is_given_out() -> None:
+    def broken(camera: str, number: int) -> None:
+        if camera == "red" and number == 5:
+            raise ZeroDivisionError("a bug")
+
+    found: list[Message] = []
+    attached = Attached(cameras("red", "white"), playing(FRAMES, 200.0, before=broken), Clock())
+    with attached:
+        time.sleep(0.3)
+        with pytest.raises(ZeroDivisionError):
+            found.extend(message for message in attached if message is not None)
+    assert len(data_of(found, "red")) == 5
+    assert len(data_of(found, "white")) == 20
+
+
 def test_stopping_gives_out_what_has_come() -> None:
     attached = Attached(cameras("red"), playing(FRAMES, 100.0), Clock())
     found = []

@@ -409,3 +409,11 @@ def test_kinds_of_frames_may_take_turns() -> None:
     for made in feed(started(), [frame(kinds[n % 5], t) for n, t in enumerate(each_time(15))]):
         assert off_px(made, lying(5, 330, 240)) < 0.1
     assert bytes(first.data) == before
+
+
+def test_a_corrupt_first_frame_costs_nothing_but_itself() -> None:
+    frames = film([with_marker()] * 4)
+    broken = replace(frames[0], payload=replace(frames[0].payload, data=b"\xff\xd8 no picture"))
+    answers = feed(started(), [broken, *frames[1:]])
+    assert isinstance(answers[0][0], Event)
+    assert ids(answers[1:]) == [[5]] * 3

@@ -85,11 +85,11 @@ class Follow:
             Where it cannot be decoded.
         """
         turn = self._frames
-        self._frames += 1
         gap_s = (time_ns - self._last_ns) / NS_PER_S
-        self._last_ns = time_ns
         due = turn % _SEARCH_EVERY == 0 or not 0 < gap_s < LONG_S
         grey, rows, seen, lost = self._look_again(frame, time_ns, due or turn % _WHOLE_EVERY == 0)
+        # One that cannot be decoded is not looked at: its turn is the next one's.
+        self._frames, self._last_ns = turn + 1, time_ns
         fits = list(seen.values())
         self._changed = self._watch.changed(grey, rows, [fit.corners_px for fit in fits], self._breadth_px)
         region = WHOLE if lost or due else self._changed

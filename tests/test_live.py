@@ -252,7 +252,7 @@ def overloaded(lab_log: Path, calibration: Path, tmp_path: Path, monkeypatch: py
     target = tmp_path / "overloaded.mcap"
     with monkeypatch.context() as patch:
         patch.setattr(Detect, "__call__", slow(Detect.__call__))
-        go_live(lab_log, calibration, target)
+        go_live(lab_log, calibration, target, 30.0)
     return target
 
 

@@ -12,7 +12,7 @@ from ipsys_log.messages import CameraCalibration, Message, Model, Rig
 from ipsys_log.models import reads_height
 from ipsys_log.request import Request
 from ipsys_log.stages import camera_frame, detect, fuse, locate
-from ipsys_log.tasks import Task, copy_model, model_run
+from ipsys_log.tasks import Task, copy_model, model_run, points_run, usual_corners
 
 __all__ = ["check_live", "copied_models", "live_stages", "with_corners"]
 
@@ -22,9 +22,8 @@ Row = tuple[str, tuple[type, ...], Callable[[Message], Iterable[Any]], bool]
 
 def with_corners(request: Request, cameras: Collection[str], settings: Sequence[Message]) -> Request:
     """A request that says how corners are found: as a replay would, by edges if all cameras have a lens."""
-    lenses = {message.camera for message in settings if isinstance(message.payload, CameraCalibration)}
-    usual = detect.EDGES if lenses >= set(cameras) else detect.STOCK
-    return replace(request, corners=request.corners or usual)
+    lenses = {str(message.camera) for message in settings if isinstance(message.payload, CameraCalibration)}
+    return replace(request, corners=request.corners or usual_corners(cameras, lenses))
 
 
 def copied_models(request: Request, until: str) -> list[tuple[Task, Model]]:
@@ -74,7 +73,7 @@ def check_live(
 def live_stages(request: Request, models: Sequence[Model], until: str) -> tuple[dict[str, str], list[Row]]:
     """The run that each stage of a replay would write to, and the causal ones of these stages."""
     corners = str(request.corners)
-    points = corners if request.method == camera_frame.PERIMETER else f"{corners}_{request.method}"
+    points = points_run(corners, request.method)
     runs = {"detect": corners}
     rows: list[Row] = [(corners, detect.READS, detect.Detect(corners), True)]
     if until != "detect":

@@ -17,19 +17,32 @@ from ipsys_log.log.session import Session
 from ipsys_log.log.storage import DISK
 from ipsys_log.messages import ChannelWritten, Message, Run
 
-__all__ = ["append_messages", "append_run", "opened_target", "record_message", "write_log", "write_messages"]
+__all__ = [
+    "append_messages",
+    "append_run",
+    "opened_target",
+    "record_message",
+    "write_log",
+    "write_message",
+    "write_messages",
+]
 
 
 def write_messages(writer: LogWriter, messages: Iterable[Message]) -> dict[str, int]:
     """Put messages into an open log; returns how many went to each topic."""
     counts: dict[str, int] = {}
     for message in messages:
-        name = schema_name(type(message.payload))
-        if message.topic not in counts:
-            writer.add_channel(message.topic, Schema(name, "protobuf", schema_data(name)))
-        writer.write(message.topic, message.log_time_ns, message.publish_time_ns, encode(message.payload))
-        counts[message.topic] = counts.get(message.topic, 0) + 1
+        write_message(writer, message, counts)
     return counts
+
+
+def write_message(writer: LogWriter, message: Message, counts: dict[str, int]) -> None:
+    """Put a message into an open log, and count it by its topic."""
+    name = schema_name(type(message.payload))
+    if message.topic not in counts:
+        writer.add_channel(message.topic, Schema(name, "protobuf", schema_data(name)))
+    writer.write(message.topic, message.log_time_ns, message.publish_time_ns, encode(message.payload))
+    counts[message.topic] = counts.get(message.topic, 0) + 1
 
 
 def write_log(path: Path, messages: Iterable[Message]) -> dict[str, int]:

@@ -13,8 +13,7 @@ from types import TracebackType
 
 from ipsys_log.errors import IpsysError, LogError, WriteError
 from ipsys_log.geometry.lenses import scale_lens
-from ipsys_log.log import LogReader, LogWriter, Schema
-from ipsys_log.log.codec import encode, schema_data, schema_name
+from ipsys_log.log import LogReader, LogWriter
 from ipsys_log.log.lock import open_locked
 from ipsys_log.log.storage import DISK
 from ipsys_log.messages import (
@@ -28,6 +27,7 @@ from ipsys_log.messages import (
     Rig,
     calibration_topic,
 )
+from ipsys_log.output import write_message
 from ipsys_log.units import NS_PER_S, format_bytes
 
 __all__ = ["TICK", "Backlog", "Recording", "first_messages", "fitting_lenses", "recording"]
@@ -35,8 +35,6 @@ __all__ = ["TICK", "Backlog", "Recording", "first_messages", "fitting_lenses", "
 # Between two messages of a source: nothing more has come so far. It is not in the log.
 TICK = Message("", 0, 0, None)
 
-# A recorder that is killed loses no more than this.
-_FLUSH_NS = NS_PER_S
 # Set aside on the disk, so that a log can be finished when the disk is full.
 _RESERVE_BYTES = 16 << 20
 # Frames of a camera that may wait for the stages; older ones are skipped.
@@ -52,29 +50,20 @@ class Recording:
     """
 
     def __init__(self, writer: LogWriter) -> None:
-        self.counts: Counter[str] = Counter()
+        self.counts: dict[str, int] = {}
         self._writer = writer
         self._lock = threading.Lock()
-        self._flushed_ns = 0
 
     def put(self, message: Message) -> None:
-        """Write a message; what is a second old is handed to the disk.
+        """Write a message. No chunk spans more than a second: a recorder that is killed loses no more.
 
         Raises
         ------
         WriteError
             Where the disk is full.
         """
-        name = schema_name(type(message.payload))
-        data = encode(message.payload)
         with self._lock:
-            if message.topic not in self.counts:
-                self._writer.add_channel(message.topic, Schema(name, "protobuf", schema_data(name)))
-            self._writer.write(message.topic, message.log_time_ns, message.publish_time_ns, data)
-            self.counts[message.topic] += 1
-            if message.log_time_ns - self._flushed_ns >= _FLUSH_NS:
-                self._flushed_ns = message.log_time_ns
-                self._writer.flush()
+            write_message(self._writer, message, self.counts)
 
     def flush(self) -> None:
         """Hand everything to the disk."""

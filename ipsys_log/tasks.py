@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Iterable, Mapping
+from collections.abc import Callable, Collection, Iterable, Mapping
 from dataclasses import dataclass, field
 from typing import Any
 
@@ -50,7 +50,7 @@ from ipsys_log.request import Request
 from ipsys_log.runs import newest_run, read_channels
 from ipsys_log.stages import camera_frame, detect, fuse, locate
 
-__all__ = ["STAGES", "Task", "copy_model", "model_run", "plan_stage"]
+__all__ = ["STAGES", "Task", "copy_model", "model_run", "plan_stage", "points_run", "usual_corners"]
 
 
 @dataclass(frozen=True, slots=True)
@@ -127,7 +127,7 @@ def _detect(session: Session, request: Request) -> Task | str:
         return newest_run(session, Markers) or ""
     rig, topics = _rig(session, request, "detect")
     without = sorted(set(session.images) - set(session.calibrations) - set(request.lenses))
-    corners = request.corners or (detect.STOCK if without else detect.EDGES)
+    corners = request.corners or usual_corners(session.images, {*session.calibrations, *request.lenses})
     lenses: dict[str, CameraCalibration] = {}
     if corners == detect.EDGES:
         lenses = _other_lenses(session, request)
@@ -169,7 +169,7 @@ def _camera_frame(session: Session, request: Request, markers: str) -> Task | st
     held = _held_lenses(session, lenses)
     return Task(
         "camera-frame",
-        markers if default else f"{markers}_{request.method}",
+        points_run(markers, request.method),
         (*topics, *session.topics(Markers, markers), *held),
         (CameraPoints, Event),
         camera_frame.READS,
@@ -225,6 +225,16 @@ def _fit(session: Session, request: Request, points: str, model: str) -> Task | 
     return Task(
         "fit", base, tuple(topics), (Model,), compute=compute, parameters=parameters, rig=rig, notes=notes
     )
+
+
+def usual_corners(cameras: Iterable[str], with_lens: Collection[str]) -> str:
+    """How corners are found unless it is said: by edges if all cameras have a lens."""
+    return detect.EDGES if set(cameras) <= set(with_lens) else detect.STOCK
+
+
+def points_run(markers: str, method: str) -> str:
+    """What the run of camera points is called, after that of its markers."""
+    return markers if method == camera_frame.PERIMETER else f"{markers}_{method}"
 
 
 def model_run(model: str) -> str:

@@ -21,7 +21,7 @@ _CAUSAL = ("detect", "camera-frame", "locate", "fuse")
 
 
 def verify(paths: Sequence[Path], run: str | None, progress: Progress) -> list[Comparison]:
-    """Make the causal stages of every complete run again, from their recorded input, and compare.
+    """Make the causal stages of every run again, from their recorded input, and compare.
 
     Parameters
     ----------

@@ -170,8 +170,9 @@ class Attached:
             self._arrived.notify()
 
     def warn(self, kind: str, text: str) -> None:
-        """An event of no camera, said at once too."""
-        self.add(EVENTS_TOPIC, Event(self.clock.now_ns(), kind, text))
+        """An event of no camera, said at once too; only said where the stream has ended."""
+        with suppress(SourceError):
+            self.add(EVENTS_TOPIC, Event(self.clock.now_ns(), kind, text))
         self.say(text)
 
     def now_ns(self) -> int:

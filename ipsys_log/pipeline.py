@@ -59,14 +59,14 @@ from ipsys_log.messages import (
     Tracks,
 )
 from ipsys_log.output import opened_target
-from ipsys_log.perform import inputs, perform, sign
+from ipsys_log.perform import inputs, perform, sign, signed_copy
 from ipsys_log.preflight import check_inputs
-from ipsys_log.recording import Backlog, recording
+from ipsys_log.recording import TICK, Backlog, recording
 from ipsys_log.request import Progress, Request
 from ipsys_log.runs import Outcome
 from ipsys_log.sources.attached import Attached
 from ipsys_log.sources.frames import SourceError
-from ipsys_log.tasks import STAGES, Task, model_run, plan_stage
+from ipsys_log.tasks import STAGES, Task, plan_stage
 
 __all__ = ["TOPICS", "Stage", "carry_out", "in_threads", "live", "record", "replay", "run"]
 
@@ -247,12 +247,9 @@ def record(
     with recording(target, overwrite) as log:
         for message in settings:
             log.put(message)
-        for arrived in source:
-            if arrived is None:
-                log.flush()
-            else:
-                log.put(arrived)
+        for arrived in log.written(source):
             watch(arrived)
+    log.check_disk()
     return log.counts
 
 
@@ -294,11 +291,8 @@ def live(
     stages = [Stage(*row) for row in rows]
     fault: IpsysError | None = None
     with recording(target, overwrite) as log, threadpool_limits(1, user_api="blas"):
-        for message in settings:
+        for message in chain(settings, *(signed_copy(*one, cameras.now_ns) for one in copied)):
             log.put(message)
-        for model in models:
-            topic = TOPICS[Model].format(run=model_run(model.name))
-            log.put(Message(topic, cameras.now_ns(), model.timestamp, model))
         ledger = Ledger(cameras.clock.now_ns, cameras.received_ns)
         with Backlog(cameras, log, cameras.now_ns, cameras.stop) as frames:
             made = ledger.note("detected", Markers, run(chain(settings, frames), stages[:1], in_threads))
@@ -306,6 +300,8 @@ def live(
             made = ledger.note("fused", Tracks, run(made, stages[3:]))
             try:
                 for message in made:
+                    if message is TICK:
+                        continue
                     watch(message)
                     if type(message.payload) in TOPICS:
                         log.put(message)
@@ -318,7 +314,8 @@ def live(
                 fault = error
                 cameras.warn("stages_stopped", f"{error}; frames are recorded all the same")
                 for message in frames:
-                    watch(message)
+                    if message is not TICK:
+                        watch(message)
     if fault is not None:
         raise IpsysError(f"{fault}; {target} has all frames: replay it") from fault
     if frames.skipped:
@@ -326,4 +323,7 @@ def live(
             f"{frames.skipped.total()} frames are recorded but were not looked at: the stages were too slow. "
             f"ipsys replay {target} looks at all, with --as-live at those that were looked at"
         )
-    return sign(target, replace(request, as_live=bool(frames.skipped)), runs, [task for task, _ in copied])
+    try:
+        return sign(target, replace(request, as_live=bool(frames.skipped)), runs)
+    finally:
+        log.check_disk()

@@ -23,7 +23,7 @@ from ipsys_log.messages import (
 from ipsys_log.output import append_messages, append_run, record_message
 from ipsys_log.remarks import Remarks
 from ipsys_log.request import Progress, Request
-from ipsys_log.resume import OtherContent, cut_short, without_held
+from ipsys_log.resume import OtherContentError, cut_short, without_held
 from ipsys_log.runs import Outcome, check_run_name, find_run, fingerprint, free_name, read_channels
 from ipsys_log.tasks import Task, plan_stage
 
@@ -54,7 +54,7 @@ def perform(session: Session, target: Path, task: Task, request: Request, until:
     if held := cut_short(session, target, task, given):
         try:
             return _append(session, target, task, replace(record, run=given), held, request, make)
-        except OtherContent as other:
+        except OtherContentError as other:
             remarks = (f"run {given} was cut short, and is left so: {other}",)
     if name is None:
         name = free_name(session, record, task.base, task.writes)

@@ -11,10 +11,10 @@ from ipsys_log.messages import Event, Message
 from ipsys_log.tasks import Task
 from ipsys_log.units import format_time
 
-__all__ = ["OtherContent", "cut_short", "without_held"]
+__all__ = ["OtherContentError", "cut_short", "without_held"]
 
 
-class OtherContent(Exception):
+class OtherContentError(Exception):
     """A run holds something that its stage does not make of the log."""
 
 
@@ -38,7 +38,7 @@ def without_held(session: Session, held: Collection[str], made: Iterable[Message
 
     Raises
     ------
-    OtherContent
+    OtherContentError
         Where the run has something else. Events may be another stage's: these two can share a channel.
     """
     waiting = session.messages(held)
@@ -69,4 +69,4 @@ def _same(one: Message, other: Message) -> bool:
 def _refuse(left: Iterable[Message]) -> None:
     for one in left:
         if not isinstance(one.payload, Event):
-            raise OtherContent(f"{one.topic} is another one at {format_time(one.log_time_ns)}")
+            raise OtherContentError(f"{one.topic} is another one at {format_time(one.log_time_ns)}")

@@ -2,7 +2,6 @@
 
 import struct
 import zlib
-from collections import Counter
 from dataclasses import dataclass, field
 
 from mcap.opcode import Opcode
@@ -23,12 +22,11 @@ _NO_LIMITS = Limits(LARGEST_CHUNK, 1 << 63)
 
 @dataclass(slots=True)
 class Salvage:
-    """Messages saved into a new `chunk`, messages known to be lost by topic."""
+    """Messages saved into a new `chunk`; those known to be lost go to the survey."""
 
     chunk: ChunkBuilder = field(default_factory=lambda: ChunkBuilder(_NO_LIMITS, compress=False))
     definitions: list[bytes] = field(default_factory=list)
     bytes_kept: int = 0
-    lost: Counter[str] = field(default_factory=Counter)
 
 
 def salvage(view: View, start: int, found: Survey) -> Salvage:
@@ -66,7 +64,7 @@ def _save_one(view: View, data: bytes, position: int, end: int, found: Survey, s
     elif opcode != Opcode.MESSAGE or known is None or length < MESSAGE.size - HEADER.size:
         return len(data)
     elif stop > end:
-        saved.lost[known.topic] += 1
+        found.lost.note(known.topic, time)
         return len(data)
     else:
         payload = data[position + MESSAGE.size : stop]

@@ -49,9 +49,9 @@ def fault_of(act: Callable[[Path], object], path: Path) -> str:
     [
         (b"", "is empty"),
         (b"RIFF....", r"is not an MCAP file \(it starts with b'RIFF....'\)"),
-        (MAGIC, "has no footer: .* Run: ipsys repair"),
-        (MAGIC[:5], "has no footer"),
-        (MAGIC + bytes(10_000), "has no footer"),
+        (MAGIC, "has no end: .* run: ipsys repair"),
+        (MAGIC[:5], "has no end"),
+        (MAGIC + bytes(10_000), "has no end"),
         (bytes(10_000), "is not an MCAP file"),
     ],
 )
@@ -260,7 +260,7 @@ def test_a_damaged_chunk_in_the_middle_costs_only_itself(log: Path) -> None:
     data[len(data) // 2] ^= 0xFF
     log.write_bytes(data)
     report = repair(log)
-    assert "the CRC of the chunk is wrong" in str(report)
+    assert "the CRC of the chunk is wrong" in str(report.notes)
     with LogReader(log) as reader:
         assert reader.chunk_count == chunks - 1
         assert len(list(reader.messages())) == reader.message_count < total
@@ -364,6 +364,6 @@ def test_a_second_log_behind_the_first_is_kept_beside_it(tmp_path: Path) -> None
     path.write_bytes(one + other)
     report = repair(path)
     assert (report.messages_kept, report.bytes_lost) == (30, len(other))
-    assert "perhaps another log" in str(report)
+    assert "perhaps another log" in str(report.notes)
     assert (tmp_path / "joined.mcap.lost").read_bytes() == other
     assert stock_rows(path) == stock_rows(tmp_path / "a.mcap")

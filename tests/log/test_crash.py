@@ -182,7 +182,7 @@ def test_what_a_killed_recorder_flushed_is_there(tmp_path: Path) -> None:
     copy = tmp_path / "killed.mcap"
     copy.write_bytes(path.read_bytes())
     writer.abandon()
-    with pytest.raises(LogError, match=r"no footer.*ipsys repair"):
+    with pytest.raises(LogError, match=r"no end.*ipsys repair"):
         LogReader(copy)
     report = repair(copy)
     assert (report.messages_kept, report.bytes_lost, report.last_kept_ns) == (5, 0, 4)

@@ -12,6 +12,7 @@ from ipsys_log.log.hashing import ChannelHash
 from ipsys_log.log.records import HEADER, MESSAGE
 from ipsys_log.log.survey import Survey
 from ipsys_log.log.view import View
+from ipsys_log.units import format_time
 
 __all__ = ["Salvage", "salvage"]
 
@@ -39,9 +40,13 @@ def salvage(view: View, start: int, found: Survey) -> Salvage:
     data = view.read(start, min(view.size - start, LARGEST_CHUNK))
     if len(data) < _FIXED.size + 8:
         return saved
-    opcode, length, *_, name_length = _FIXED.unpack_from(data)
+    opcode, length, start_ns, end_ns, _, _, name_length = _FIXED.unpack_from(data)
     (claimed,) = struct.unpack_from("<Q", data, _FIXED.size)
     whole = length + HEADER.size <= view.size - start
+    if opcode == Opcode.CHUNK and name_length and not whole:
+        found.faults.append(
+            f"messages of {format_time(start_ns)} to {format_time(end_ns)} UTC, compressed and cut off"
+        )
     if opcode != Opcode.CHUNK or name_length or whole or claimed != length - _FIXED.size + 1:
         return saved
     end = _first_hole(data, start)

@@ -60,7 +60,7 @@ def _about_the_end(report: RepairReport) -> Iterator[str | Table]:
                 table.add_row(topic, str(len(times_ns)), _clock(times_ns[-1]), gone)
     yield table
     if copied:
-        yield "Its end is gone; when that was is not known: the file was copied or changed since."
+        yield "Its end is gone. When it ended is not known: the file was copied since."
     else:
         yield (
             f"The file was last written at {_clock(report.written_ns)} UTC. What came after that is gone:\n"

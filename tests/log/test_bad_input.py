@@ -267,6 +267,29 @@ def test_a_damaged_chunk_in_the_middle_costs_only_itself(log: Path) -> None:
     assert not repair(log).changed
 
 
+def test_what_lay_in_a_damaged_chunk_is_named_exactly(tmp_path: Path) -> None:
+    """By the message indexes behind it, which are whole."""
+    rows = [(f"/image/{k % 3}", k * 10**8, k, bytes([k]) * 3000) for k in range(60)]
+    rows += [("/points", k * 10**8 + 1, k, bytes([k]) * 40) for k in range(60)]
+    whole = create(tmp_path / "log.mcap", sorted(rows, key=lambda row: row[1])).read_bytes()
+    path = tmp_path / "damaged.mcap"
+    chance = random.Random(8)
+    named = 0
+    for _ in range(60):
+        data = bytearray(whole)
+        data[chance.randrange(100, len(data))] ^= 0xFF
+        path.write_bytes(data)
+        report = repair(path)
+        with LogReader(path) as reader:
+            kept = {(message.topic, message.log_time_ns) for message in reader.messages()}
+        gone = {(topic, time_ns) for topic, times_ns in report.lost.items() for time_ns in times_ns}
+        missing = {(row[0], row[1]) for row in rows} - kept
+        assert gone in (missing, set())
+        named += bool(gone)
+        assert bool(missing) <= bool(report.bytes_lost)
+    assert named > 40
+
+
 @dataclass(frozen=True)
 class FullDisk:
     """A disk that takes `room` bytes of each file."""

@@ -3,18 +3,18 @@
 from __future__ import annotations
 
 import os
-import shutil
 import threading
 from collections import Counter, deque
 from collections.abc import Callable, Iterable, Iterator, Mapping
-from contextlib import ExitStack, contextmanager, suppress
+from contextlib import contextmanager
 from dataclasses import replace
 from pathlib import Path
 from types import TracebackType
 
-from ipsys_log.errors import IpsysError, LogError, WriteError
+from ipsys_log.errors import IpsysError, WriteError
+from ipsys_log.full_disk import reserve, what_fitted
 from ipsys_log.geometry.lenses import scale_lens
-from ipsys_log.log import LogReader, LogWriter
+from ipsys_log.log import LogWriter
 from ipsys_log.log.lock import open_locked
 from ipsys_log.log.storage import DISK
 from ipsys_log.messages import (
@@ -29,16 +29,12 @@ from ipsys_log.messages import (
     calibration_topic,
 )
 from ipsys_log.output import write_message
-from ipsys_log.units import NS_PER_S, format_bytes
 
 __all__ = ["TICK", "Backlog", "Recording", "first_messages", "fitting_lenses", "recording"]
 
 # Between two messages of a source: nothing more has come so far. It is not in the log.
 TICK = Message("", 0, 0, None)
 
-# Set aside on the disk, so that a log can be finished when the disk is full: what waits is written and looked
-# at, and the table of contents, which has some MB after some hours, is written twice. On a small disk half.
-_RESERVE_BYTES = 64 << 20
 # Frames of a camera that may wait for the stages; older ones are skipped.
 _WAITING = 3
 
@@ -92,7 +88,7 @@ class Recording:
             Where the disk was full: it says how far the log goes.
         """
         if self.full is not None:
-            raise IpsysError(_what_fitted(self._writer.path, self.full)) from self.full
+            raise IpsysError(what_fitted(self._writer.path, self.full)) from self.full
 
     def _write(self, write: Callable[[], None]) -> None:
         with self._lock:
@@ -125,35 +121,10 @@ def recording(path: Path, overwrite: bool = False) -> Iterator[Recording]:
         os.close(open_locked(DISK, path, os.O_RDWR))
         path.unlink()
     try:
-        with LogWriter.create(path) as writer, _reserve(path) as free:
+        with LogWriter.create(path) as writer, reserve(path) as free:
             yield Recording(writer, free)
     except WriteError as error:
-        raise IpsysError(_what_fitted(path, error)) from error
-
-
-@contextmanager
-def _reserve(path: Path) -> Iterator[Callable[[], None]]:
-    """Some of the disk, given back before the log is closed. It has no name: it cannot be left behind."""
-    with ExitStack() as held:
-        with suppress(OSError):  # a file system that cannot, or a disk that is full already
-            if hasattr(os, "O_TMPFILE"):
-                fd = os.open(path.parent, os.O_TMPFILE | os.O_RDWR)
-                held.callback(os.close, fd)
-                os.posix_fallocate(fd, 0, min(_RESERVE_BYTES, shutil.disk_usage(path.parent).free // 2))
-        yield held.close
-
-
-def _what_fitted(path: Path, error: WriteError) -> str:
-    try:
-        with LogReader(path) as log:
-            count, seconds = log.message_count, ((log.end_ns or 0) - (log.start_ns or 0)) / NS_PER_S
-    except LogError:
-        return str(error)
-    size = format_bytes(path.stat().st_size)
-    return (
-        f"{path}: the disk takes no more; recording has stopped, and the log is complete with what fitted: "
-        f"{count} messages, {seconds:.1f} s, {size}. Free some space, or record to another disk"
-    )
+        raise IpsysError(what_fitted(path, error)) from error
 
 
 def fitting_lenses(

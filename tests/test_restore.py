@@ -104,7 +104,7 @@ def test_a_live_run_that_is_killed_is_brought_to_its_end(
     for command in ("info", "replay", "verify", "measure", "latency", "view"):
         done = ipsys(command, log)
         assert done.code == 1
-        assert f"its recorder was killed, or the file was cut off. What it holds can be saved; run: ipsys repair {log}" in done.err  # fmt: skip # noqa: E501
+        assert f"its recorder was killed, or the file was cut off. What it holds can be saved. Run: ipsys repair {log}" in done.err  # fmt: skip # noqa: E501
     done = ipsys("repair", log)
     assert done.code == 0, done.err
     assert "monday.mcap repaired" in done.out

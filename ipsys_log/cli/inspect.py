@@ -8,7 +8,7 @@ from typing import Annotated
 
 import typer
 
-from ipsys_log.cli.console import console, print_outcomes, progress_bar
+from ipsys_log.cli.console import console, print_outcomes, progress_bar, remarks
 from ipsys_log.cli.options import AsJson, Logs
 
 __all__ = ["add_commands"]
@@ -55,12 +55,15 @@ def repair(
     The frames that ipsys live or record --detect had recorded and not looked at when it was killed are looked
     at now. That makes the runs again, to see that they are right; Ctrl-C leaves it to ipsys replay.
     """
+    from ipsys_log.errors import IpsysError
     from ipsys_log.log import repair as repair_log
     from ipsys_log.report.repaired import repair_lines
     from ipsys_log.restore import finish_runs
 
     for part in repair_lines(repair_log(log)):
         console.print(part, markup=False)
-    with progress_bar() as progress:
-        outcomes = finish_runs(log, progress)
-    print_outcomes(outcomes)
+    try:
+        with progress_bar() as progress:
+            print_outcomes(finish_runs(log, progress))
+    except IpsysError as error:  # the log itself is whole
+        remarks.print(f"its runs cannot be finished: {error}", style="yellow", markup=False)

@@ -63,7 +63,7 @@ def _footer(view: View) -> tuple[int, int]:
     if not tail.endswith(MAGIC) or FOOTER.unpack_from(tail)[:2] != (Opcode.FOOTER, 20):
         raise NoFooterError(
             f"{path} has no end: its recorder was killed, or the file was cut off. What it holds can be "
-            f"saved; run: ipsys repair {path}"
+            f"saved. Run: ipsys repair {path}"
         )
     _, _, summary_start, _, crc = FOOTER.unpack_from(tail)
     if summary_start and not len(MAGIC) < summary_start <= at:

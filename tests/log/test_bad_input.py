@@ -49,7 +49,7 @@ def fault_of(act: Callable[[Path], object], path: Path) -> str:
     [
         (b"", "is empty"),
         (b"RIFF....", r"is not an MCAP file \(it starts with b'RIFF....'\)"),
-        (MAGIC, "has no end: .* run: ipsys repair"),
+        (MAGIC, "has no end: .* Run: ipsys repair"),
         (MAGIC[:5], "has no end"),
         (MAGIC + bytes(10_000), "has no end"),
         (bytes(10_000), "is not an MCAP file"),

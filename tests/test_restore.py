@@ -161,23 +161,6 @@ def _chunks(log: Path) -> Iterator[ChunkRef]:
         yield from reader._contents.chunks
 
 
-def test_what_was_made_of_a_frame_is_never_in_the_file_before_it(recorded: Path, tmp_path: Path) -> None:  # noqa: F811
-    """Wherever a recorder is killed: messages of one log time, the frame first."""
-    seen: set[int] = set()
-    chunks = sorted(_chunks(recorded), key=lambda chunk: chunk.offset)
-    with Session([recorded]) as session:
-        reader = session.readers[0]
-        frames = {topic: set(reader.times(topic).tolist()) for topic in session.images.values()}
-        made = {t: set(reader.times(t).tolist()) for t in reader.channels if t.startswith("/runs/edges/c")}
-        ids = {key: channel.topic for key, channel in reader._contents.channels.items()}
-        for chunk in chunks:
-            inside = {ids[key] for key in chunk.index_offsets}
-            within = range(chunk.start_ns, chunk.end_ns + 1)
-            seen |= {t for topic in inside & frames.keys() for t in frames[topic] if t in within}
-            for topic in inside & made.keys():
-                assert {t for t in made[topic] if t in within} <= seen
-
-
 def test_a_run_that_is_not_what_its_stage_makes_is_left_as_it_is(
     recorded: Path,  # noqa: F811
     ipsys: Ipsys,

@@ -45,8 +45,10 @@ def is_being_written(path: Path) -> bool:
     fd = open_for_reading(path)
     try:
         fcntl.flock(fd, fcntl.LOCK_SH | fcntl.LOCK_NB)
-    except OSError:
+    except BlockingIOError:
         return True
+    except OSError:  # a file system without locks
+        return False
     finally:
         os.close(fd)
     return False

@@ -4,50 +4,61 @@ from __future__ import annotations
 
 from collections.abc import Callable, Collection, Iterable, Sequence
 from dataclasses import replace
-from typing import Any
+from typing import Any, NamedTuple
 
 from ipsys_log.errors import IpsysError
 from ipsys_log.lookup import wanted_models
 from ipsys_log.messages import CameraCalibration, Message, Model, Rig
 from ipsys_log.models import reads_height
+from ipsys_log.perform import signed_copy
 from ipsys_log.request import Request
 from ipsys_log.stages import camera_frame, detect, fuse, locate
 from ipsys_log.tasks import Task, copy_model, model_run, points_run, usual_corners
 
-__all__ = ["check_live", "copied_models", "live_stages", "with_corners"]
+__all__ = ["LivePlan", "plan_live"]
 
 # The run a stage writes to, the payloads it reads, its step, and whether it takes each camera by itself.
 Row = tuple[str, tuple[type, ...], Callable[[Message], Iterable[Any]], bool]
 
 
-def with_corners(request: Request, cameras: Collection[str], settings: Sequence[Message]) -> Request:
-    """A request that says how corners are found: as a replay would, by edges if all cameras have a lens."""
-    lenses = {str(message.camera) for message in settings if isinstance(message.payload, CameraCalibration)}
-    return replace(request, corners=request.corners or usual_corners(cameras, lenses))
+class LivePlan(NamedTuple):
+    """A live run: the request with all that it leaves open, the models of another log with the tasks that
+    copy them in, by stage the run that a replay would write to, and the causal ones of these stages."""
+
+    request: Request
+    copied: list[tuple[Task, Model]]
+    runs: dict[str, str]
+    rows: list[Row]
+
+    def copies(self, now_ns: Callable[[], int]) -> list[Message]:
+        """The models, as their runs, with log times from ``now_ns``."""
+        return [message for task, model in self.copied for message in signed_copy(task, model, now_ns)]
 
 
-def copied_models(request: Request, until: str) -> list[tuple[Task, Model]]:
-    """The models of another log that are applied, each with the task that copies it in; none before locate.
+def plan_live(
+    cameras: Collection[str], settings: Sequence[Message], request: Request, until: str
+) -> LivePlan:
+    """Plan a live run as a replay of its log would be.
 
     Raises
     ------
     IpsysError
-        Where the other log has no such model.
+        Where the other log has no such model; for a camera without a lens, a model that knows none of the
+        cameras, or one that needs a height that the rig does not say.
     """
-    return [copy_model(request, name) for name in wanted_models(request, "fuse")] if until == "fuse" else []
+    lenses = {str(message.camera) for message in settings if isinstance(message.payload, CameraCalibration)}
+    request = replace(request, corners=request.corners or usual_corners(cameras, lenses))
+    names = wanted_models(request, "fuse") if until == "fuse" else ()
+    copied = [copy_model(request, name) for name in names]
+    models = [model for _, model in copied]
+    _check(cameras, settings, models, until)
+    return LivePlan(request, copied, *_stages(request, models, until))
 
 
-def check_live(
+def _check(
     cameras: Collection[str], settings: Sequence[Message], models: Sequence[Model], until: str
 ) -> None:
-    """See that the stages will not have to stop later.
-
-    Raises
-    ------
-    IpsysError
-        For a camera without a lens, a model that knows none of the cameras, or one that needs a height that
-        the rig does not say.
-    """
+    """See that the stages will not have to stop later."""
     lenses = {message.camera for message in settings if isinstance(message.payload, CameraCalibration)}
     missing = sorted(set(cameras) - lenses)
     if missing and until != "detect":
@@ -70,8 +81,7 @@ def check_live(
             )
 
 
-def live_stages(request: Request, models: Sequence[Model], until: str) -> tuple[dict[str, str], list[Row]]:
-    """The run that each stage of a replay would write to, and the causal ones of these stages."""
+def _stages(request: Request, models: Sequence[Model], until: str) -> tuple[dict[str, str], list[Row]]:
     corners = str(request.corners)
     points = points_run(corners, request.method)
     runs = {"detect": corners}

@@ -4,11 +4,11 @@ from __future__ import annotations
 
 import signal
 from collections.abc import Callable, Iterator
-from contextlib import ExitStack, contextmanager, nullcontext
+from contextlib import AbstractContextManager, ExitStack, contextmanager, nullcontext
 from dataclasses import replace
 from pathlib import Path
 from tempfile import TemporaryDirectory
-from threading import Timer
+from threading import TIMEOUT_MAX, Timer
 from time import monotonic
 from typing import TYPE_CHECKING, Annotated, Optional
 
@@ -20,7 +20,7 @@ from ipsys_log.cli.options import Calibrations, Corners, Method, NewLog, load_la
 
 if TYPE_CHECKING:
     from ipsys_log.live_scene import LiveScene
-    from ipsys_log.messages import Message
+    from ipsys_log.messages import Message, Rig, RigCamera
     from ipsys_log.pipeline import Watch
     from ipsys_log.report.cameras import LiveStatus
     from ipsys_log.request import Request
@@ -198,40 +198,37 @@ def _opened(
     kept: bool = True,
 ) -> Iterator[tuple[Attached, list[Message], LiveStatus]]:
     """Cameras that send, what is written first, and what is shown on the screen meanwhile."""
-    from rich.live import Live
-
     from ipsys_log.monitor import Monitor
     from ipsys_log.recording import first_messages, fitting_lenses
     from ipsys_log.report.cameras import LiveStatus
     from ipsys_log.sources.attached import Attached
-    from ipsys_log.sources.devices import check_devices, open_source, usb_advice
+    from ipsys_log.sources.devices import open_source
     from ipsys_log.sources.frames import Clock
 
     lab, cameras, lenses = load_lab(rig, calibration, only or ())
-    check_devices(cameras)
-    for line in usb_advice(replace(lab, cameras=tuple(cameras))):
-        remarks.print(line, style="yellow", markup=False)
+    _check_devices(lab, cameras)
     _check_target(output, force)
     with ExitStack() as stack:
         with remarks.status("opening " + ", ".join(camera.name for camera in cameras)):
             attached = stack.enter_context(Attached(cameras, open_source, Clock(), _say))
         sizes_px = {name: state.size_px for name, state in attached.states.items()}
         lenses = fitting_lenses(lenses, sizes_px, _say)
-        _stop_on_signals(attached.stop)
-        if seconds is not None:
-            timer = Timer(seconds, attached.stop)
-            stack.callback(timer.cancel)
-            timer.start()
+        stack.enter_context(_ended(attached.stop, seconds))
         status = LiveStatus(attached.states, stack.enter_context(Monitor(lab)), output, monotonic)
-        what = f"recording into {output}; Ctrl-C ends it" if kept else f"looking for {seconds:g} s"
-        remarks.print(what)
-        if remarks.is_terminal:
-            stack.enter_context(
-                Live(get_renderable=status.show, console=remarks, transient=True, refresh_per_second=2)
-            )
+        remarks.print(f"recording into {output}; Ctrl-C ends it" if kept else f"looking for {seconds:g} s")
+        stack.enter_context(_on_screen(status))
         yield attached, first_messages(lab, lenses, attached.now_ns), status
     for line in status.summary() if kept else ():
         console.print(line)
+
+
+def _check_devices(lab: Rig, cameras: list[RigCamera]) -> None:
+    """See that no device is asked for twice, and say what USB will not carry."""
+    from ipsys_log.sources.devices import check_devices, usb_advice
+
+    check_devices(cameras)
+    for line in usb_advice(replace(lab, cameras=tuple(cameras))):
+        remarks.print(line, style="yellow", markup=False)
 
 
 def _check_target(output: Path, force: bool) -> None:
@@ -243,7 +240,22 @@ def _check_target(output: Path, force: bool) -> None:
         raise IpsysError(f"{output}: there is no folder {output.parent}; make it first")
 
 
-def _stop_on_signals(stop: Callable[[], None]) -> None:
-    """End cleanly: what the cameras have sent by then is written."""
+@contextmanager
+def _ended(stop: Callable[[], None], seconds: float | None) -> Iterator[None]:
+    """On Ctrl-C, SIGTERM or after some time it ends cleanly: what has come by then is written."""
     for number in (signal.SIGINT, signal.SIGTERM):
         signal.signal(number, lambda *_: stop())
+    timer = Timer(TIMEOUT_MAX if seconds is None else seconds, stop)
+    timer.start()
+    try:
+        yield
+    finally:
+        timer.cancel()
+
+
+def _on_screen(status: LiveStatus) -> AbstractContextManager[object]:
+    from rich.live import Live
+
+    if not remarks.is_terminal:
+        return nullcontext()
+    return Live(get_renderable=status.show, console=remarks, transient=True, refresh_per_second=2)

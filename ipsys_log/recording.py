@@ -10,6 +10,7 @@ from contextlib import contextmanager, suppress
 from dataclasses import replace
 from pathlib import Path
 from types import TracebackType
+from typing import Protocol
 
 from ipsys_log.errors import IpsysError, LogError, WriteError
 from ipsys_log.geometry.lenses import scale_lens
@@ -30,7 +31,7 @@ from ipsys_log.messages import (
 from ipsys_log.output import write_message
 from ipsys_log.units import NS_PER_S, format_bytes
 
-__all__ = ["TICK", "Backlog", "Recording", "first_messages", "fitting_lenses", "recording"]
+__all__ = ["TICK", "Backlog", "Recording", "Target", "first_messages", "fitting_lenses", "recording"]
 
 # Between two messages of a source: nothing more has come so far. It is not in the log.
 TICK = Message("", 0, 0, None)
@@ -39,6 +40,14 @@ TICK = Message("", 0, 0, None)
 _RESERVE_BYTES = 16 << 20
 # Frames of a camera that may wait for the stages; older ones are skipped.
 _WAITING = 3
+
+
+class Target(Protocol):
+    """Where messages go, in the order of their log times."""
+
+    def put(self, message: Message) -> None: ...
+
+    def flush(self) -> None: ...
 
 
 class Recording:
@@ -178,7 +187,7 @@ class Backlog:
     def __init__(
         self,
         source: Iterable[Message | None],
-        log: Recording,
+        log: Target,
         now_ns: Callable[[], int],
         stop: Callable[[], None],
     ) -> None:

@@ -41,14 +41,15 @@ _RETRY_S, _LONGEST_RETRY_S = 0.5, 8.0
 
 @dataclass(slots=True)
 class CameraState:
-    """What has come of a camera so far: ``size_px`` is the width and height of its frames, where they are
-    JPEGs; ``dropped`` frames never reached the log."""
+    """What has come of a camera so far: ``format`` of its frames, such as jpeg or h264; ``size_px`` is their
+    width and height, where they are JPEGs; ``dropped`` ones never reached the log."""
 
     frames: int = 0
     bytes: int = 0
     dropped: int = 0
     up: bool = False
     finished: bool = False
+    format: str | None = None
     size_px: tuple[int, int] | None = None
     lost_ns: int | None = None
     failure: BaseException | None = None
@@ -253,7 +254,7 @@ class Attached:
             gone_s = (now_ns - state.lost_ns) / NS_PER_S
             state.lost_ns = None
             self._say("camera_back", f"camera {camera.name} is back after {gone_s:.1f} s", camera)
-        state.up = True
+        state.up, state.format = True, frame.format
         if state.size_px is None and frame.format == "jpeg":
             with suppress(ValueError, KeyError):  # a damaged frame says nothing
                 height, width, *_ = simplejpeg.decode_jpeg_header(frame.data, strict=False)

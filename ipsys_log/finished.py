@@ -129,8 +129,8 @@ class FinishedLog:
                 self._history += others
                 names = ", ".join(one.payload.id for one in others)
                 raise LogError(
-                    f"somebody else measured in this log meanwhile ({names}), so this is not written yet: look "
-                    "again, and repeat it"
+                    f"somebody else measured in this log meanwhile ({names}), so this is not written yet: "
+                    "look again, and repeat it"
                 )
             added: list[Message] = []
             for measurement in measurements:

@@ -82,8 +82,8 @@ def check_pictures(cameras: Mapping[str, CameraState]) -> None:
     for name, state in cameras.items():
         if state.format in ("h264", "h265"):
             raise IpsysError(
-                f"camera {name} sends {state.format}, of which no single seconds can be kept: set it to MJPEG, "
-                "or record all of it, with 'ipsys record --measure'"
+                f"camera {name} sends {state.format}, of which no single seconds can be kept: set it to "
+                "MJPEG, or record all of it, with 'ipsys record --measure'"
             )
 
 

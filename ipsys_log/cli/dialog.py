@@ -112,7 +112,7 @@ def _ask(scene: Scene, stop: int | None) -> Typed:
     if stop is None:
         visible = visible_markers(scene.views(None), scene.rig)
         console.print(f"markers seen: {', '.join(map(str, visible)) or 'none'}", markup=False)
-        marker = _text("marker", str.isdecimal, str(visible[0]) if len(visible) == 1 else "")
+        marker = _marker(scene.rig, str(visible[0]) if len(visible) == 1 else "")
     else:
         here = scene.stops[stop]
         marker = str(here.marker_id)
@@ -133,6 +133,18 @@ def _ask(scene: Scene, stop: int | None) -> Typed:
         letter = _text(question, lambda answer: answer[:1].lower() in ("l", "r") and answer != "")
         side = "left" if letter[0].lower() == "l" else "right"
     return Typed(marker, distances, side, _number("height, cm", "height", False, scene.rig, _of_ruler))
+
+
+def _marker(rig: Rig, usual: str) -> str:
+    """Ask for a marker until it is one of the rig."""
+    from ipsys_log.measuring.entry import Typed, read_typed
+
+    while True:
+        answer = _text("marker", str.isdecimal, usual)
+        faults = [fault for fault in read_typed(Typed(answer, {}), rig)[1] if fault.field == "marker"]
+        if not faults:
+            return answer
+        console.print(faults[0].text, style="red", markup=False)
 
 
 def _of_tape(name: str, text: str) -> Typed:

@@ -21,6 +21,8 @@ if TYPE_CHECKING:
 __all__ = ["live_scene", "measure_now", "served"]
 
 _TURN_S = 0.05
+# After that it is known what the cameras see, and what of it lies still.
+_LOOK_S = 1.0
 
 
 def measure_now(
@@ -91,8 +93,9 @@ def _ask_beside(work: Callable[[], Any], scene: LiveScene, cameras: Attached) ->
     with ThreadPoolExecutor(1) as pool:
         working = pool.submit(work)
         try:
-            while not (working.done() or any(view.markers for view in scene.views(None))):
+            while not (working.done() or any(view.points for view in scene.views(None))):
                 sleep(_TURN_S)
+            sleep(_LOOK_S)
             if not working.done():
                 with suppress(KeyboardInterrupt):
                     ask_places(scene)

@@ -187,12 +187,15 @@ def test_rows_of_a_marker_in_order_and_by_place(ipsys: Ipsys, unmeasured: Unmeas
         ("marker,d_A_cm,d_B_cm,side,height_cm,time\n0,170,190,left,0,noon\n", ["line 2: time 'noon'"]),
         ("marker,d_A_cm,d_B_cm,side,height_cm\n0,170,190,left,0,7\n", ["line 2: 6 cells, but 5 columns"]),
         (
-            "marker,d_A_cm,d_B_cm,side,height_cm\n0,170,190,left,0,20\n0,170,190,left,10\n",
-            ["line 2: 6 cells, but 5 columns; if a number has a decimal comma, write a point"],
+            "marker,d_A_cm,d_B_cm,side,height_cm\n0,170,190,left,0,20\n0,170,190,up,10\n",
+            [
+                "line 2: 6 cells, but 5 columns; a decimal comma? Write a point: 212.7",
+                "line 3: side 'up': write left or right",
+            ],
         ),
         (
             "marker,d_A_cm,d_B_cm,side,height_cm,place,note\n0,170,5,190,left,20\n",
-            ["line 2: side '190': write left or right; if a number has a decimal comma, write a point"],
+            ["line 2: side '190': write left or right; a decimal comma? Write a point: 212.7"],
         ),
         ("marker,d_A_cm,side,height_cm\n0,170,left,0\n", ["line 1: the column d_A_cm is missing"]),
         ("marker,d_A_m,d_B_cm,side,height_cm\n0,1.7,190,left,0\n", ["line 1: unknown column 'd_A_m'"]),

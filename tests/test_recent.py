@@ -25,9 +25,12 @@ from ipsys_log.messages import (
     EVENTS_TOPIC,
     FRAME_SKIPPED,
     MEASUREMENTS_TOPIC,
+    CameraPoint,
+    CameraPoints,
     CompressedImage,
     Event,
     Interval,
+    Markers,
     Measurement,
     Message,
     Model,
@@ -42,6 +45,7 @@ from ipsys_log.request import Request
 from ipsys_log.sources.attached import Attached, CameraState
 from ipsys_log.sources.frames import Clock
 from ipsys_log.units import NS_PER_S
+from tests import labs
 from tests.conftest import Ipsys
 from tests.playing import cameras, playing
 from tests.test_live import lenses
@@ -138,6 +142,28 @@ def test_hours_of_frames_are_not_kept_in_memory(log: Noted) -> None:
 def test_of_a_video_no_seconds_can_be_kept() -> None:
     with pytest.raises(IpsysError, match="camera white sends h264, of which no single seconds can be kept"):
         check_pictures({"red": CameraState(format="jpeg"), "white": CameraState(format="h264")})
+
+
+def test_of_a_camera_that_hangs_or_is_lost_nothing_is_seen() -> None:
+    states = {"red": CameraState(up=True), "white": CameraState(up=True)}
+    scene = LiveScene(labs.RIG, None, states, lambda topic, payload: None)
+
+    def show(camera: str, first: int, last: int) -> None:
+        for n in range(first, last):
+            taken_ns = n * NS_PER_S // 10
+            points = CameraPoints(taken_ns, (CameraPoint(0, 0.1, 0.2, 2.0),))
+            for payload in (Markers(taken_ns, 960, 540, ()), points):
+                scene(Message("", taken_ns, taken_ns, payload, camera))
+
+    show("white", 0, 10)
+    show("red", 0, 15)
+    sight = look(scene.views(None), 0)
+    assert sorted(sight.points_m) == ["red", "white"]
+    assert sight.still == Interval(NS_PER_S // 10 * 4, NS_PER_S // 10 * 14)
+    show("red", 15, 40)  # white is quiet, and not known to be lost
+    assert list(look(scene.views(None), 0).points_m) == ["red"]
+    states["red"].up = False
+    assert look(scene.views(None), 0).state == "unseen"
 
 
 # --- with cameras that send the rendered lab --------------------------------------------------------

@@ -35,7 +35,7 @@ __all__ = ["add_commands", "serve_page"]
 Log = Annotated[
     Optional[Path],  # noqa: UP045
     typer.Argument(
-        metavar="[LOG]",
+        metavar="LOG",
         help="A finished log; the measurements go into it. Without one: what the cameras of --rig send now.",
     ),
 ]

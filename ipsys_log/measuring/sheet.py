@@ -11,7 +11,8 @@ from datetime import UTC, datetime
 from pathlib import Path
 
 from ipsys_log.errors import IpsysError
-from ipsys_log.measuring.entry import Typed
+from ipsys_log.measuring.check import check_entry
+from ipsys_log.measuring.entry import Typed, read_typed
 from ipsys_log.measuring.scene import Stop
 from ipsys_log.messages import Rig
 from ipsys_log.units import NS_PER_S
@@ -49,8 +50,8 @@ def read_sheet(path: Path, rig: Rig, start_ns: int) -> list[SheetRow]:
     Raises
     ------
     IpsysError
-        Where it cannot be read, for a column that is missing, unknown or there twice, for a row with too many
-        cells, and for a ``place`` or ``time`` that is none; every bad row by its line.
+        Where it cannot be read, for a column that is missing, unknown or there twice, and for all that is
+        wrong with a row by itself; every bad one by its line.
     """
     lines = _read_lines(path)
     delimiter = ";" if lines and ";" in lines[0] else ","
@@ -77,6 +78,9 @@ def read_sheet(path: Path, rig: Rig, start_ns: int) -> list[SheetRow]:
                 faults.append((reader.line_num, str(error)))
     except csv.Error as error:
         raise IpsysError(f"{path}: line {reader.line_num}: {error}") from error
+    for row in rows:
+        alone = check_entry(*read_typed(row.typed, rig), rig, None, ())
+        faults += [(row.line, name_columns(fault.text, rig)) for fault in alone.faults]
     refuse_rows(path, faults)
     if not rows:
         raise IpsysError(f"{path}: holds no measurements below its header")
@@ -85,9 +89,7 @@ def read_sheet(path: Path, rig: Rig, start_ns: int) -> list[SheetRow]:
 
 def _comma_advice(delimiter: str) -> str:
     """Why a row may have come apart."""
-    if delimiter != ",":
-        return ""
-    return "; if a number has a decimal comma, write a point, or part all cells by semicolons"
+    return "; a decimal comma? Write a point: 212.7" if delimiter == "," else ""
 
 
 def refuse_rows(path: Path, faults: Iterable[tuple[int, str]]) -> None:

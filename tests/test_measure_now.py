@@ -227,6 +227,7 @@ def typed(command: list[str], answers: list[tuple[str, str]]) -> tuple[int, str]
     while True:
         if not select.select([terminal], [], [], max(end - time.monotonic(), 0))[0]:
             os.kill(child, signal.SIGKILL)
+            os.waitpid(child, 0)
             raise AssertionError(f"nothing more after {told}")
         try:
             data = os.read(terminal, 1 << 16)

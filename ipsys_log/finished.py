@@ -12,10 +12,8 @@ import numpy as np
 from ipsys_log.errors import FrameError, IpsysError, LogError
 from ipsys_log.log import LogWriter
 from ipsys_log.log.session import Session, camera_of_topic
-from ipsys_log.measuring.check import check_entry
-from ipsys_log.measuring.entry import check_references, read_typed
-from ipsys_log.measuring.scene import Stop, View, look
-from ipsys_log.measuring.sheet import find_stops, name_columns, read_sheet, refuse_rows
+from ipsys_log.measuring.entry import check_references
+from ipsys_log.measuring.scene import Stop, View
 from ipsys_log.measuring.stillness import still_stretches
 from ipsys_log.messages import (
     MEASUREMENTS_TOPIC,
@@ -35,7 +33,7 @@ from ipsys_log.runs import newest_run
 from ipsys_log.stages.detect import decode_grey
 from ipsys_log.units import NS_PER_S
 
-__all__ = ["FinishedLog", "add_sheet", "check_sheet", "opened_log"]
+__all__ = ["FinishedLog", "opened_log", "rigs_of"]
 
 # How far the log time of a frame can lie from the time that its geometry speaks of, and how far before the
 # exposure of a marker that of its frame.
@@ -67,7 +65,7 @@ def opened_log(
     with LogWriter.append(path) as writer:
         writer.abandon()
     with Session([path]) as session:
-        rigs = _rigs(session, request)
+        rigs = rigs_of(session, request)
         if rigs:
             check_references(rigs[-1])
         if len({rig.reference_points for rig in rigs}) > 1:
@@ -181,58 +179,8 @@ class FinishedLog:
             return None
 
 
-def add_sheet(scene: FinishedLog, path: Path) -> list[str]:
-    """Append the measurements of a sheet: all of them, or none.
-
-    Returns
-    -------
-    What to look at again, by line.
-
-    Raises
-    ------
-    IpsysError
-        Naming every bad row by its line.
-    """
-    rows = read_sheet(path, scene.rig, scene.start_ns)
-    read = [read_typed(row.typed, scene.rig) for row in rows]
-    found = list(find_stops(rows, scene.stops, [entry.marker_id for entry, _ in read]))
-    faults: list[tuple[int, str]] = []
-    warnings: list[str] = []
-    measurements: list[Measurement] = []
-    for row, (entry, wrong), stop in zip(rows, read, found, strict=True):
-        if isinstance(stop, str) and stop:
-            faults.append((row.line, stop))
-        sight = None
-        if isinstance(stop, int) and entry.marker_id is not None:
-            sight = look(scene.views(stop), entry.marker_id)
-        history = [*scene.history(), *measurements]
-        checked = check_entry(entry, wrong, scene.rig, sight, history, scene.model)
-        faults += [(row.line, name_columns(fault.text, scene.rig)) for fault in checked.faults]
-        warnings += [
-            f"line {row.line}: {checked.id}: {name_columns(text, scene.rig)}" for text in checked.warnings
-        ]
-        if checked.measurement is not None:
-            measurements.append(checked.measurement)
-    refuse_rows(path, faults)
-    scene.add(measurements)
-    return warnings
-
-
-def check_sheet(path: Path, log: Path, request: Request) -> None:
-    """See that a sheet can be read, before the long work on a log begins.
-
-    Raises
-    ------
-    IpsysError
-        See :func:`~ipsys_log.measuring.sheet.read_sheet`.
-    """
-    with Session([log]) as session:
-        rigs = _rigs(session, request)
-        if rigs:
-            read_sheet(path, rigs[-1], session.start_ns)
-
-
-def _rigs(session: Session, request: Request) -> list[Rig]:
+def rigs_of(session: Session, request: Request) -> list[Rig]:
+    """The rigs of a log, or the one that holds instead; the last one is measured with."""
     return [request.rig] if request.rig is not None else session.payloads(session.topics(Rig))
 
 

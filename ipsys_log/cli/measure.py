@@ -129,9 +129,10 @@ def _measure_log(
     corners: str | None,
     as_json: bool,
 ) -> None:
-    from ipsys_log.finished import add_sheet, check_sheet, opened_log
+    from ipsys_log.finished import opened_log
     from ipsys_log.request import Request
     from ipsys_log.rig import load_rig
+    from ipsys_log.sheets import add_sheet, check_sheet
 
     lenses = load_calibrations(calibration, lambda: cameras_of([log]))
     request = Request(rig=load_rig(rig) if rig else None, lenses=lenses, corners=corners)

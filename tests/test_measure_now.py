@@ -236,12 +236,16 @@ def typed(command: list[str], answers: list[tuple[str, str]]) -> tuple[int, str]
         told += data.decode(errors="replace")
         if left and left[0][0] in told[seen:]:
             seen = len(told)
-            os.write(terminal, left.pop(0)[1].encode())
+            answer = left.pop(0)[1]
+            if answer == "SIGTERM":
+                os.kill(child, signal.SIGTERM)
+            else:
+                os.write(terminal, answer.encode())
     os.close(terminal)
     return os.waitstatus_to_exitcode(os.waitpid(child, 0)[1]), told
 
 
-@pytest.mark.parametrize("end", ["q\n", "\x03"])
+@pytest.mark.parametrize("end", ["q\n", "\x03", "SIGTERM"])
 def test_places_are_measured_in_the_terminal(end: str, still_lab: Lab, tmp_path: Path) -> None:
     log, one = tmp_path / "places.mcap", still_lab.tape[0]
     a, b = (f"{100 * d.distance_m:.2f}" for d in one.distances)

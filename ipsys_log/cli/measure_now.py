@@ -89,15 +89,16 @@ def _ask_beside(work: Callable[[], Any], scene: LiveScene, cameras: Attached) ->
     """Ask in the terminal while the work goes on in a thread, and stop the cameras after that."""
     from ipsys_log.cli.dialog import ask_places
 
-    signal.signal(signal.SIGINT, signal.default_int_handler)
+    for number in (signal.SIGINT, signal.SIGTERM):  # a question that is open ends, too
+        signal.signal(number, signal.default_int_handler)
     with ThreadPoolExecutor(1) as pool:
         working = pool.submit(work)
         try:
-            while not (working.done() or any(view.points for view in scene.views(None))):
-                sleep(_TURN_S)
-            sleep(_LOOK_S)
-            if not working.done():
-                with suppress(KeyboardInterrupt):
+            with suppress(KeyboardInterrupt):
+                while not (working.done() or any(view.points for view in scene.views(None))):
+                    sleep(_TURN_S)
+                sleep(_LOOK_S)
+                if not working.done():
                     ask_places(scene)
         finally:
             scene.end()

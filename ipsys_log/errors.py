@@ -6,8 +6,8 @@ __all__ = ["FitError", "FrameError", "IpsysError", "LogError", "WriteError"]
 class IpsysError(Exception):
     """A fault of the input, not of the program.
 
-    The message is one line that says what is wrong, where, and what to do about it. The command
-    line prints it without a traceback and exits with code 1.
+    The message is one line that says what is wrong, where, and what to do about it; bad rows of a sheet
+    follow it, a line each. The command line prints it without a traceback and exits with code 1.
     """
 
 

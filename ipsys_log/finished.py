@@ -12,10 +12,8 @@ import numpy as np
 from ipsys_log.errors import FrameError, IpsysError, LogError
 from ipsys_log.log import LogWriter
 from ipsys_log.log.session import Session, camera_of_topic
-from ipsys_log.measuring.check import check_entry
-from ipsys_log.measuring.entry import check_references, read_typed
-from ipsys_log.measuring.scene import Stop, View, look
-from ipsys_log.measuring.sheet import find_stops, read_sheet, refuse_rows
+from ipsys_log.measuring.entry import check_references
+from ipsys_log.measuring.scene import Stop, View
 from ipsys_log.measuring.stillness import still_stretches
 from ipsys_log.messages import (
     MEASUREMENTS_TOPIC,
@@ -35,7 +33,7 @@ from ipsys_log.runs import newest_run
 from ipsys_log.stages.detect import decode_grey
 from ipsys_log.units import NS_PER_S
 
-__all__ = ["FinishedLog", "add_sheet", "opened_log"]
+__all__ = ["FinishedLog", "opened_log", "rigs_of"]
 
 # How far the log time of a frame can lie from the time that its geometry speaks of, and how far before the
 # exposure of a marker that of its frame.
@@ -67,7 +65,7 @@ def opened_log(
     with LogWriter.append(path) as writer:
         writer.abandon()
     with Session([path]) as session:
-        rigs = [request.rig] if request.rig is not None else session.payloads(session.topics(Rig))
+        rigs = rigs_of(session, request)
         if rigs:
             check_references(rigs[-1])
         if len({rig.reference_points for rig in rigs}) > 1:
@@ -120,18 +118,30 @@ class FinishedLog:
         Raises
         ------
         LogError
-            Where the log is locked or cannot be written to, or another process measured in it meanwhile.
+            Where the log is locked or cannot be written to; or another process measured in it meanwhile: that
+            is then in the history, and the same can be added again.
         """
         with LogWriter.append(self.path) as writer:
-            with Session([self.path]) as now:
-                held = sum(now.count(topic) for topic in now.topics(Measurement))
-            if held != len(self._history):
-                raise LogError(f"{self.path}: somebody else measured in this log meanwhile; start again")
+            others = self._of_others()
+            if others:
+                self._history += others
+                names = ", ".join(one.payload.id for one in others)
+                raise LogError(
+                    f"somebody else measured in this log meanwhile ({names}), so this is not written yet: "
+                    "look again, and repeat it"
+                )
             added: list[Message] = []
             for measurement in measurements:
                 added.append(_message(measurement, [*self._history, *added]))
             write_messages(writer, added)
         self._history += added
+
+    def _of_others(self) -> list[Message]:
+        """What other processes have measured since it was looked last."""
+        known = {(one.payload.id, one.payload.withdraws) for one in self._history}
+        with Session([self.path]) as now:
+            found = now.messages(now.topics(Measurement))
+            return [one for one in found if (one.payload.id, one.payload.withdraws) not in known]
 
     def _view(self, camera: str, here: Stop) -> View:
         middle_ns = here.start_ns + (here.end_ns - here.start_ns) // 2
@@ -169,39 +179,9 @@ class FinishedLog:
             return None
 
 
-def add_sheet(scene: FinishedLog, path: Path) -> list[str]:
-    """Append the measurements of a sheet: all of them, or none.
-
-    Returns
-    -------
-    What to look at again, by line.
-
-    Raises
-    ------
-    IpsysError
-        Naming every bad row by its line.
-    """
-    rows = read_sheet(path, scene.rig, scene.start_ns)
-    read = [read_typed(row.typed, scene.rig) for row in rows]
-    found = list(find_stops(rows, scene.stops, [entry.marker_id for entry, _ in read]))
-    faults: list[tuple[int, str]] = []
-    warnings: list[str] = []
-    measurements: list[Measurement] = []
-    for row, (entry, wrong), stop in zip(rows, read, found, strict=True):
-        if isinstance(stop, str) and stop:
-            faults.append((row.line, stop))
-        sight = None
-        if isinstance(stop, int) and entry.marker_id is not None:
-            sight = look(scene.views(stop), entry.marker_id)
-        history = [*scene.history(), *measurements]
-        checked = check_entry(entry, wrong, scene.rig, sight, history, scene.model)
-        faults += [(row.line, fault.text) for fault in checked.faults]
-        warnings += [f"line {row.line}: {checked.id}: {text}" for text in checked.warnings]
-        if checked.measurement is not None:
-            measurements.append(checked.measurement)
-    refuse_rows(path, faults)
-    scene.add(measurements)
-    return warnings
+def rigs_of(session: Session, request: Request) -> list[Rig]:
+    """The rigs of a log, or the one that holds instead; the last one is measured with."""
+    return [request.rig] if request.rig is not None else session.payloads(session.topics(Rig))
 
 
 def _newest(session: Session, payload: type) -> list[str]:

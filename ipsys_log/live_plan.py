@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Collection, Iterable, Sequence
+from collections.abc import Callable, Collection, Iterable, Mapping, Sequence
 from dataclasses import replace
 from typing import Any, NamedTuple
 
@@ -12,10 +12,11 @@ from ipsys_log.messages import CameraCalibration, Message, Model, Rig
 from ipsys_log.models import reads_height
 from ipsys_log.perform import signed_copy
 from ipsys_log.request import Request
+from ipsys_log.sources.attendant import CameraState
 from ipsys_log.stages import camera_frame, detect, fuse, locate
 from ipsys_log.tasks import Task, copy_model, model_run, points_run, usual_corners
 
-__all__ = ["LivePlan", "plan_live"]
+__all__ = ["LivePlan", "check_pictures", "plan_live"]
 
 # The run a stage writes to, the payloads it reads, its step, and whether it takes each camera by itself.
 Row = tuple[str, tuple[type, ...], Callable[[Message], Iterable[Any]], bool]
@@ -78,6 +79,22 @@ def _check(
             raise IpsysError(
                 f"{model.name} needs the height at which markers are carried: write marker_height_m into "
                 "lab.toml"
+            )
+
+
+def check_pictures(cameras: Mapping[str, CameraState]) -> None:
+    """See that any frame can be taken out of what cameras send.
+
+    Raises
+    ------
+    IpsysError
+        For a camera that sends video: a frame of it is nothing without those before it.
+    """
+    for name, state in cameras.items():
+        if state.format in ("h264", "h265"):
+            raise IpsysError(
+                f"camera {name} sends {state.format}, of which no single seconds can be kept: set it to "
+                "MJPEG, or record all of it, with 'ipsys record --measure'"
             )
 
 

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import threading
 from collections import deque
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from typing import Any
 
 from ipsys_log.errors import IpsysError
@@ -20,6 +20,7 @@ from ipsys_log.messages import (
     Model,
     Rig,
 )
+from ipsys_log.sources.attendant import CameraState
 from ipsys_log.units import NS_PER_S
 
 __all__ = ["LiveScene"]
@@ -33,7 +34,7 @@ class LiveScene:
     Parameters
     ----------
     rig, model : those that hold; the model may be None.
-    cameras : names.
+    cameras : by name; of one that is lost nothing is seen.
     add : puts a payload on a topic into the log, through the one place that gives log times.
 
     Raises
@@ -43,12 +44,16 @@ class LiveScene:
     """
 
     def __init__(
-        self, rig: Rig, model: Model | None, cameras: Sequence[str], add: Callable[[str, Any], None]
+        self,
+        rig: Rig,
+        model: Model | None,
+        cameras: Mapping[str, CameraState],
+        add: Callable[[str, Any], None],
     ) -> None:
         check_references(rig)
         self.rig, self.model = rig, model
         self.stops: Sequence[Stop] = ()
-        self._add = add
+        self._cameras, self._add = cameras, add
         self._lock = threading.Lock()
         self._images: dict[str, deque[Message]] = {camera: deque(maxlen=60) for camera in cameras}
         self._markers: dict[str, Message] = {}
@@ -75,7 +80,8 @@ class LiveScene:
     def views(self, stop: int | None) -> list[View]:  # noqa: ARG002
         """The latest picture of every camera whose markers are known, and its last second."""
         with self._lock:
-            return [self._view(camera) for camera in sorted(self._images)]
+            newest_ns = max((points[-1].timestamp for points in self._points.values() if points), default=0)
+            return [self._view(camera, newest_ns - _LAST_NS) for camera in sorted(self._images)]
 
     def history(self) -> list[Measurement]:
         return list(self._history)
@@ -89,7 +95,9 @@ class LiveScene:
             Where the recording has ended.
         """
         if self._ended:
-            raise IpsysError("the recording has ended; measure the rest with 'ipsys measure' on its log")
+            raise IpsysError(
+                "the cameras are not read any more; start it again, or measure in its log: ipsys measure LOG"
+            )
         for measurement in measurements:
             self._add(MEASUREMENTS_TOPIC, measurement)
             self._history.append(measurement)
@@ -98,9 +106,9 @@ class LiveScene:
         """Take no more measurements."""
         self._ended = True
 
-    def _view(self, camera: str) -> View:
+    def _view(self, camera: str, since_ns: int) -> View:
         marked = self._markers.get(camera)
-        if marked is None:
+        if marked is None or not self._cameras[camera].up:
             return View(camera, 0)
         # Frames that were skipped have no markers; a picture is shown with its own.
         picture = next(
@@ -111,5 +119,6 @@ class LiveScene:
             ),
             None,
         )
-        points = tuple(self._points[camera])
+        # That of a camera which hangs, and is not known to be lost yet, is not the last second.
+        points = tuple(one for one in self._points[camera] if one.timestamp >= since_ns)
         return View(camera, marked.publish_time_ns, picture, marked.payload, points)

@@ -4,7 +4,7 @@ A source is an iterable of messages, a stage a row that says what it reads and h
 message to payloads, and :func:`run` sends one through the others. :func:`replay` does this for a
 log, stage by stage: what the log does not hold yet, or no longer rightly, is computed and appended.
 :func:`record` writes what cameras send; :func:`live` writes it first, and then sends it through the
-same stages in the same way.
+same stages in the same way; :func:`measure` writes only what is measured.
 
 ==============  ==================  ================  =====================================
 stage           reads               writes            its run is named after
@@ -39,7 +39,7 @@ from threadpoolctl import threadpool_limits
 
 from ipsys_log.errors import IpsysError, LogError
 from ipsys_log.latency import Ledger
-from ipsys_log.live_plan import plan_live
+from ipsys_log.live_plan import check_pictures, plan_live
 from ipsys_log.log.session import Session
 from ipsys_log.lookup import wanted_models
 from ipsys_log.messages import (
@@ -57,7 +57,8 @@ from ipsys_log.messages import (
 from ipsys_log.output import opened_target
 from ipsys_log.perform import inputs, perform, sign
 from ipsys_log.preflight import check_inputs
-from ipsys_log.recording import TICK, Backlog, Recording, recording
+from ipsys_log.recent import Recent
+from ipsys_log.recording import TICK, Backlog, Recording, recording, written
 from ipsys_log.request import Progress, Request
 from ipsys_log.runs import Outcome
 from ipsys_log.sources.attached import Attached
@@ -65,7 +66,7 @@ from ipsys_log.sources.frames import SourceError
 from ipsys_log.tasks import STAGES, Task, plan_stage
 from ipsys_log.threads import in_threads
 
-__all__ = ["TOPICS", "Stage", "carry_out", "in_threads", "live", "record", "replay", "run"]
+__all__ = ["TOPICS", "Stage", "carry_out", "in_threads", "live", "measure", "record", "replay", "run"]
 
 # Where a payload goes within its run.
 TOPICS: dict[type, str] = {
@@ -216,8 +217,51 @@ def record(
     with recording(target, overwrite) as log:
         for message in settings:
             log.put(message)
-        for arrived in log.written(source):
+        for arrived in written(source, log):
             watch(arrived)
+    log.check_disk()
+    return log.counts
+
+
+def measure(
+    cameras: Attached,
+    settings: Sequence[Message],
+    target: Path,
+    request: Request,
+    watch: Watch,
+    overwrite: bool = False,
+) -> Mapping[str, int]:
+    """Look for markers in what cameras send, and write what is measured to a new log, with its frames.
+
+    A measurement that comes through the cameras' stream brings along those of the second in which its marker
+    lay still; all others are looked at and forgotten. What the stages make is only shown: a replay makes it
+    from the frames.
+
+    Parameters
+    ----------
+    settings : written first: rig and lenses.
+    request : corners.
+    watch : is shown every frame that the stages have seen, its markers and camera points.
+
+    Returns
+    -------
+    How many messages went to each topic.
+
+    Raises
+    ------
+    IpsysError
+        For cameras that send no pictures but video, or a log that cannot be written; what it holds is kept.
+    """
+    check_pictures(cameras.states)
+    plan = plan_live(cameras.states, settings, request, "camera-frame")
+    detect, camera_frame = (Stage(*row) for row in plan.rows)
+    with recording(target, overwrite) as log, threadpool_limits(1, user_api="blas"):
+        for message in settings:
+            log.put(message)
+        with Recent(log) as recent, Backlog(cameras, recent, cameras.now_ns, cameras.stop) as frames:
+            for message in run(run(chain(settings, frames), [detect], in_threads), [camera_frame]):
+                if message is not TICK:
+                    watch(message)
     log.check_disk()
     return log.counts
 

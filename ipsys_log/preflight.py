@@ -113,8 +113,9 @@ def _check_measurements(session: Session, request: Request, models: Sequence[str
         return
     if not places:
         raise FitError(
-            f"{session}: has no measurements to fit a model to; apply a model of another log with "
-            "--model-from calibration.mcap"
+            f"{session}: has no measurements to fit a model to; enter some with "
+            f"'ipsys measure {session.paths[-1]}', or apply a model of another log with --model-from "
+            "calibration.mcap"
         )
     train, _ = split([place.measurement for place in places], request.train, request.seed)
     for place in places:

@@ -10,6 +10,7 @@ from contextlib import contextmanager
 from dataclasses import replace
 from pathlib import Path
 from types import TracebackType
+from typing import Protocol
 
 from ipsys_log.errors import IpsysError, WriteError
 from ipsys_log.full_disk import reserve, what_fitted
@@ -30,13 +31,33 @@ from ipsys_log.messages import (
 )
 from ipsys_log.output import write_message
 
-__all__ = ["TICK", "Backlog", "Recording", "first_messages", "fitting_lenses", "recording"]
+__all__ = [
+    "TICK",
+    "Backlog",
+    "Recording",
+    "Target",
+    "first_messages",
+    "fitting_lenses",
+    "recording",
+    "written",
+]
 
 # Between two messages of a source: nothing more has come so far. It is not in the log.
 TICK = Message("", 0, 0, None)
 
 # Frames of a camera that may wait for the stages; older ones are skipped.
 _WAITING = 3
+
+
+class Target(Protocol):
+    """Where messages go, in the order of their log times; ``full`` is set when the disk was."""
+
+    @property
+    def full(self) -> WriteError | None: ...
+
+    def put(self, message: Message) -> None: ...
+
+    def flush(self) -> None: ...
 
 
 class Recording:
@@ -68,16 +89,9 @@ class Recording:
         """
         self._write(lambda: write_message(self._writer, message, self.counts))
 
-    def written(self, source: Iterable[Message | None]) -> Iterator[Message | None]:
-        """What a source gives, each message after it was written, until the disk is full."""
-        for message in source:
-            if message is None:
-                self._write(self._writer.flush)
-            else:
-                self.put(message)
-            yield message
-            if self.full is not None:
-                return
+    def flush(self) -> None:
+        """Hand everything to the disk."""
+        self._write(self._writer.flush)
 
     def check_disk(self) -> None:
         """See that all was written.
@@ -100,6 +114,18 @@ class Recording:
                 self.full = error
                 self._free()
                 write()
+
+
+def written(source: Iterable[Message | None], log: Target) -> Iterator[Message | None]:
+    """What a source gives, each message after it was written, until the disk is full."""
+    for message in source:
+        if message is None:
+            log.flush()
+        else:
+            log.put(message)
+        yield message
+        if log.full is not None:
+            return
 
 
 @contextmanager
@@ -179,7 +205,7 @@ class Backlog:
     def __init__(
         self,
         source: Iterable[Message | None],
-        log: Recording,
+        log: Target,
         now_ns: Callable[[], int],
         stop: Callable[[], None],
     ) -> None:
@@ -217,7 +243,7 @@ class Backlog:
 
     def _record(self) -> None:
         try:
-            for message in self._log.written(self._source):
+            for message in written(self._source, self._log):
                 if message is not None and message.camera is not None:
                     self._hand_on(message)
         except BaseException as fault:  # raised again where the messages are taken

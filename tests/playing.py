@@ -22,12 +22,18 @@ def playing(
     stamped: bool = True,
     before: Callable[[str, int], None] = lambda camera, number: None,
 ) -> Open:
-    """Opens cameras that send their frames once, in real time; ``before`` is called before each frame."""
+    """Opens cameras that send their frames once, in real time; ``before`` is called before each frame.
+
+    Frames of one number are sent at one time by all cameras, as of one world.
+    """
+    starts_s: dict[str, float] = {}
 
     @contextmanager
     def opened(camera: RigCamera, clock: Clock, say: Say) -> Iterator[Iterator[Frame | None]]:
         def sent() -> Iterator[Frame | None]:
-            start_s = time.monotonic()
+            now_s = time.monotonic()
+            start_s = now_s if camera.name in starts_s else min(starts_s.values(), default=now_s)
+            starts_s[camera.name] = start_s
             for number, data in enumerate(frames[camera.name]):
                 wait_s = start_s + number / rate_hz - time.monotonic()
                 if wait_s > 0:

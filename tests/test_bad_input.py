@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import re
 import subprocess
 import sys
 from collections.abc import Callable, Iterator
@@ -44,13 +45,14 @@ def rewrite(lab: Path, change: Callable[[Message], Message | None], extra: tuple
 
 
 def refused(ipsys: Ipsys, log: Path, *arguments: object) -> str:
-    """Run a command that must fail; its one line, after looking that nothing was written."""
+    """Run a command that must fail; its one line, or one more for each bad row of a sheet, after looking that
+    nothing was written."""
     before = {path: path.read_bytes() for path in log.parent.iterdir() if path.is_file()}
     done = ipsys(*arguments)
     assert done.code == 1
     assert done.out == ""
     assert done.err.startswith("ipsys: ")
-    assert done.err.count("\n") == 1
+    assert re.fullmatch(r"[^\n]+\n(  line \d+: [^\n]+\n)*", done.err)
     assert "Traceback" not in done.err
     assert {path: path.read_bytes() for path in log.parent.iterdir() if path.is_file()} == before
     return done.err

@@ -5,12 +5,14 @@ from __future__ import annotations
 import fcntl
 import io
 import os
+import re
 import signal
 import socket
 import subprocess
 import sys
 import urllib.request
 from collections.abc import Iterable
+from dataclasses import replace
 from pathlib import Path
 from typing import Any, NamedTuple
 
@@ -21,6 +23,7 @@ from google.protobuf.descriptor_pool import DescriptorPool
 from google.protobuf.message_factory import GetMessageClass
 from mcap.reader import make_reader
 
+from ipsys_log.cli.dialog import ask_places
 from ipsys_log.errors import IpsysError, LogError
 from ipsys_log.finished import opened_log
 from ipsys_log.log.session import Session
@@ -28,6 +31,7 @@ from ipsys_log.measuring.check import check_entry, withdraw
 from ipsys_log.measuring.entry import Typed, read_typed
 from ipsys_log.measuring.scene import look
 from ipsys_log.messages import MEASUREMENTS_TOPIC, Measurement, Model, Pair
+from ipsys_log.offline.pairs import active_measurements
 from ipsys_log.request import Request
 from tests.conftest import Ipsys, Unmeasured, data_section
 from tests.test_bad_input import refused, rewrite
@@ -162,10 +166,19 @@ def test_rows_of_a_marker_in_order_and_by_place(ipsys: Ipsys, unmeasured: Unmeas
 @pytest.mark.parametrize(
     ("text", "said"),
     [
-        ("marker,d_A_cm,d_B_cm,side,height_cm\n0,100,40,left,0\n", ["line 2: no triangle has the sides"]),
+        (
+            "marker,d_A_cm,d_B_cm,side,height_cm\n0,100,40,left,0\n",
+            ["line 2: no triangle has the sides A to B = 243.8 cm, d_A_cm = 100 cm and d_B_cm = 40 cm"],
+        ),
         (
             "marker,d_A_cm,d_B_cm,side,height_cm,place\n0,1.7,190,left,0,1\n\n99,170,190,left,0,1\n0,170,x,up,,1\n",
-            ["line 4: marker 99 is not in the rig", "line 5: d to B: 'x' is no number", "line 5: side 'up'"],
+            [
+                "line 2: no triangle has the sides",
+                "line 4: marker 99 is not in the rig",
+                "line 5: d_B_cm: 'x' is no number",
+                "line 5: side 'up'",
+                "line 5: height_cm? 0 where",
+            ],
         ),
         (
             "marker;d_A_cm;d_B_cm;side;height_cm;place\n0;170,5;190;left;0;999\n",
@@ -173,6 +186,17 @@ def test_rows_of_a_marker_in_order_and_by_place(ipsys: Ipsys, unmeasured: Unmeas
         ),
         ("marker,d_A_cm,d_B_cm,side,height_cm,time\n0,170,190,left,0,noon\n", ["line 2: time 'noon'"]),
         ("marker,d_A_cm,d_B_cm,side,height_cm\n0,170,190,left,0,7\n", ["line 2: 6 cells, but 5 columns"]),
+        (
+            "marker,d_A_cm,d_B_cm,side,height_cm\n0,170,190,left,0,20\n0,170,190,up,10\n",
+            [
+                "line 2: 6 cells, but 5 columns; a decimal comma? Write a point: 212.7",
+                "line 3: side 'up': write left or right",
+            ],
+        ),
+        (
+            "marker,d_A_cm,d_B_cm,side,height_cm,place,note\n0,170,5,190,left,20\n",
+            ["line 2: side '190': write left or right; a decimal comma? Write a point: 212.7"],
+        ),
         ("marker,d_A_cm,side,height_cm\n0,170,left,0\n", ["line 1: the column d_A_cm is missing"]),
         ("marker,d_A_m,d_B_cm,side,height_cm\n0,1.7,190,left,0\n", ["line 1: unknown column 'd_A_m'"]),
         ("marker,d_A_cm,d_B_cm,side,height_cm\n0,170,190,left,0\n", ["rows name no place or time"]),
@@ -185,9 +209,9 @@ def test_a_bad_sheet_changes_nothing_and_names_its_rows(
 ) -> None:
     path = unmeasured.log.with_name("sheet.csv")
     path.write_text(text)
-    line = refused(ipsys, unmeasured.log, "measure", unmeasured.log, "--csv", path)
+    lines = refused(ipsys, unmeasured.log, "measure", unmeasured.log, "--csv", path).splitlines()
     for part in said:
-        assert part in line.replace("d_B_cm is missing", "d_A_cm is missing")
+        assert sum(part in line for line in lines) == 1
 
 
 def test_one_bad_row_keeps_the_good_ones_out(ipsys: Ipsys, unmeasured: Unmeasured) -> None:
@@ -196,9 +220,9 @@ def test_one_bad_row_keeps_the_good_ones_out(ipsys: Ipsys, unmeasured: Unmeasure
     lines = path.read_text().splitlines()
     lines[7] = lines[7].replace(",left,", ",,").replace(",right,", ",,")
     path.write_text("\n".join(lines))
-    assert "nothing was written, correct the sheet: line 8: left or right of the line" in refused(
-        ipsys, log, "measure", log, "--csv", path
-    )
+    first, *rows = refused(ipsys, log, "measure", log, "--csv", path).splitlines()
+    assert first.endswith("sheet.csv: nothing was written; correct the sheet:")
+    assert rows[0].startswith("  line 8: left or right of the line")
 
 
 def test_a_log_that_is_locked_gone_or_not_to_be_written(ipsys: Ipsys, unmeasured: Unmeasured) -> None:
@@ -218,7 +242,47 @@ def test_two_people_at_one_log(unmeasured: Unmeasured) -> None:
         one.add([Measurement(tape[0].timestamp, "p001", marker_id=0)])
         with pytest.raises(LogError, match="somebody else measured in this log meanwhile"):
             other.add([Measurement(tape[0].timestamp, "p001", marker_id=0)])
-    assert len(foreign_read(log)) == 1
+        # What the first one did is known now: the other goes on after it, and they take turns.
+        assert [m.id for m in other.history()] == ["p001"]
+        other.add([Measurement(tape[0].timestamp, "p002", marker_id=0)])
+        with pytest.raises(LogError, match=r"meanwhile \(p002\), so this is not written yet"):
+            one.add([withdraw(one.history(), "p001")])
+        one.add([withdraw(one.history(), "p001")])
+        with pytest.raises(LogError, match="p001_withdrawn"):
+            other.add([Measurement(tape[0].timestamp, "p003", marker_id=0)])
+        assert [m.id for m in active_measurements(other.history())] == ["p002"]
+    assert [row.id for row in foreign_read(log)] == ["p001", "p002", "p001_withdrawn"]
+
+
+def test_a_sheet_that_is_not_there_or_has_a_bad_header_is_told_before_markers_are_looked_for(
+    ipsys: Ipsys, lab: Path
+) -> None:
+    line = refused(ipsys, lab, "measure", lab, "--csv", lab.with_name("none.csv"))
+    assert "none.csv: cannot be read: No such file or directory" in line
+    path = lab.with_name("sheet.csv")
+    path.write_text("marker;d_A;d_B\n")
+    assert "line 1: unknown column 'd_A'" in refused(ipsys, lab, "measure", lab, "--csv", path)
+
+
+def test_a_sheet_is_told_what_the_model_doubts_by_its_own_columns(
+    ipsys: Ipsys, unmeasured: Unmeasured, lab: Path
+) -> None:
+    log, tape = unmeasured
+    assert ipsys("fit", lab, "--model", "rigid").code == 0
+    assert ipsys("fit", log, "--model-from", lab, "--model", "rigid").code == 0
+    with opened_log(log, Request()) as scene:
+        ((number, one),) = [
+            (n, one) for one in tape[:1] for n, stop in enumerate(scene.stops) if stop.covers(one)
+        ]
+    a, b = one.distances
+    swapped = replace(
+        one, distances=(replace(a, distance_m=b.distance_m), replace(b, distance_m=a.distance_m))
+    )
+    path = sheet(log.with_name("sheet.csv"), [swapped], place=[str(number + 1)])
+    done = ipsys("measure", log, "--csv", path)
+    assert done.code == 0
+    assert "line 2: p001: the model has it" in done.err
+    assert "d_A_cm and d_B_cm look exchanged" in done.err
 
 
 def test_a_rig_without_reference_points(ipsys: Ipsys, unmeasured: Unmeasured) -> None:
@@ -259,6 +323,32 @@ def test_the_terminal_asks_checks_and_undoes(
     assert "p001 is withdrawn" in done.out
     assert "1 place measured" in done.out
     assert [row.withdraws for row in foreign_read(log)] == ["", "p001"]
+    # Undone while place 2 was asked for, and back at place 1.
+    places = re.findall(r"Place (\d+) of", done.out)
+    assert places == ["1", "2", "1"]
+
+
+def test_in_the_terminal_somebody_else_may_measure_meanwhile(
+    unmeasured: Unmeasured, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+) -> None:
+    log, tape = unmeasured
+    with opened_log(log, Request()) as scene, opened_log(log, Request()) as other:
+        first = as_typed(next(one for one in tape if scene.stops[0].covers(one)))
+        a, b = first.distances.values()
+        answers = iter([a, b, first.side[0], first.height, "y", "y", "q"])
+
+        def prompt(*_: object, **__: object) -> str:
+            answer = next(answers)
+            if answer == first.height:
+                other.add([Measurement(tape[0].timestamp + 10**9, "p001", marker_id=1)])
+            return answer
+
+        monkeypatch.setattr("typer.prompt", prompt)
+        ask_places(scene)
+    said = capsys.readouterr().out
+    assert "somebody else measured in this log meanwhile (p001)" in said
+    assert "p002 is in the log" in said
+    assert sorted(row.id for row in foreign_read(log)) == ["p001", "p002"]
 
 
 def test_the_page_is_served_until_it_is_interrupted(unmeasured: Unmeasured) -> None:

@@ -257,7 +257,9 @@ def test_a_model_of_another_log_is_applied_and_copied_in(ipsys: Ipsys, lab: Path
         kept = ["/rig", *session.images.values(), *session.calibrations.values()]
         write_log(drive, session.messages(kept))
         original = session.payloads(session.topics(Model, "poly"))[0]
-    assert ipsys("replay", drive).code == 1  # it has no measurements of its own
+    done = ipsys("replay", drive)  # it has no measurements of its own
+    assert done.code == 1
+    assert f"enter some with 'ipsys measure {drive}', or apply a model of another log" in done.err
     stages = stages_of(ipsys, "replay", drive, "--model-from", lab)
     assert stages["fit"] == ("poly", True)
     assert "evaluate" not in stages

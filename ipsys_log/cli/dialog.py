@@ -2,9 +2,8 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Iterator
+from collections.abc import Callable
 from functools import partial
-from itertools import count
 from typing import TYPE_CHECKING
 
 import typer
@@ -15,7 +14,7 @@ if TYPE_CHECKING:
     from ipsys_log.measuring.check import Checked
     from ipsys_log.measuring.entry import Typed
     from ipsys_log.measuring.scene import Scene
-    from ipsys_log.messages import Rig
+    from ipsys_log.messages import Measurement, Rig
 
 __all__ = ["ask_places"]
 
@@ -34,59 +33,75 @@ def ask_places(scene: Scene) -> None:
 
     check_references(scene.rig)
     console.print(_HELP, style="dim", markup=False)
-    for stop in _stops(scene):
-        if stop is not None and any(map(scene.stops[stop].covers, active_measurements(scene.history()))):
-            continue
-        if not _ask_place(scene, stop):
+    active = active_measurements(scene.history())
+    left: list[int | None] = [n for n, stop in enumerate(scene.stops) if not any(map(stop.covers, active))]
+    if not scene.stops:
+        left = [None]
+    while left:
+        outcome = _ask_place(scene, left[0])
+        if outcome == "q":
             return
+        if not isinstance(outcome, str):  # it was undone: back to its place
+            left[:0] = [n for n, stop in enumerate(scene.stops) if stop.covers(outcome) and n not in left]
+        elif scene.stops:
+            del left[0]
     console.print("no more places in this log")
 
 
-def _stops(scene: Scene) -> Iterator[int | None]:
-    yield from range(len(scene.stops)) if scene.stops else (None for _ in count())
-
-
-def _ask_place(scene: Scene, stop: int | None) -> bool:
-    """Ask until a place is measured or skipped; False to end."""
-    from ipsys_log.errors import IpsysError
-
+def _ask_place(scene: Scene, stop: int | None) -> str | Measurement:
+    """Ask until a place is measured or skipped: ``s``, ``q`` to end, or what was undone."""
     while True:
         try:
             if _measure(scene, stop):
-                return True
+                return "s"
         except _LetterError as left:
             letter = str(left)
-            if letter == "q":
-                return False
-            if letter == "s":
-                return True
+            if letter in ("q", "s"):
+                return letter
             if letter == "u":
-                try:
-                    _undo(scene)
-                except IpsysError as error:
-                    console.print(str(error), style="red", markup=False)
+                undone = _undo(scene)
+                if undone is not None:
+                    return undone
 
 
 def _measure(scene: Scene, stop: int | None) -> bool:
     """Ask for one place and append it; False where it is to be asked for again."""
+    from ipsys_log.errors import IpsysError
+
+    typed = _ask(scene, stop)
+    while True:
+        checked = _check(scene, stop, typed)
+        _show(checked)
+        if checked.faults and stop is None and {fault.field for fault in checked.faults} == {"marker"}:
+            _text("Enter looks again", lambda given: not given)
+            continue
+        if checked.measurement is None:
+            return False
+        question, usual = (" all the same? [y/N]", "n") if checked.warnings else ("? [Y/n]", "y")
+        answer = _text(f"save {checked.id}{question}", lambda given: given.lower() in ("", "y", "n"))
+        if (answer.lower() or usual) == "n":
+            return False
+        # While somebody read the question, the marker lay there, or was taken up.
+        now = _check(scene, stop, typed)
+        if now.measurement is None:
+            continue
+        try:
+            scene.add([now.measurement])
+        except IpsysError as error:
+            console.print(str(error), style="red", markup=False)
+            continue
+        console.print(f"{now.id} is in the log", style="green", markup=False)
+        return True
+
+
+def _check(scene: Scene, stop: int | None, typed: Typed) -> Checked:
     from ipsys_log.measuring.check import check_entry
     from ipsys_log.measuring.entry import read_typed
     from ipsys_log.measuring.scene import look
 
-    typed = _ask(scene, stop)
     entry, faults = read_typed(typed, scene.rig)
     sight = None if entry.marker_id is None else look(scene.views(stop), entry.marker_id)
-    checked = check_entry(entry, faults, scene.rig, sight, scene.history(), scene.model)
-    _show(checked)
-    if checked.measurement is None:
-        return False
-    question, usual = (" all the same? [y/N]", "n") if checked.warnings else ("? [Y/n]", "y")
-    answer = _text(f"save {checked.id}{question}", lambda given: given.lower() in ("", "y", "n"))
-    if (answer.lower() or usual) == "n":
-        return False
-    scene.add([checked.measurement])
-    console.print(f"{checked.id} is in the log", style="green", markup=False)
-    return True
+    return check_entry(entry, faults, scene.rig, sight, scene.history(), scene.model)
 
 
 def _ask(scene: Scene, stop: int | None) -> Typed:
@@ -97,7 +112,7 @@ def _ask(scene: Scene, stop: int | None) -> Typed:
     if stop is None:
         visible = visible_markers(scene.views(None), scene.rig)
         console.print(f"markers seen: {', '.join(map(str, visible)) or 'none'}", markup=False)
-        marker = _text("marker", str.isdecimal, str(visible[0]) if len(visible) == 1 else "")
+        marker = _marker(scene.rig, str(visible[0]) if len(visible) == 1 else "")
     else:
         here = scene.stops[stop]
         marker = str(here.marker_id)
@@ -118,6 +133,18 @@ def _ask(scene: Scene, stop: int | None) -> Typed:
         letter = _text(question, lambda answer: answer[:1].lower() in ("l", "r") and answer != "")
         side = "left" if letter[0].lower() == "l" else "right"
     return Typed(marker, distances, side, _number("height, cm", "height", False, scene.rig, _of_ruler))
+
+
+def _marker(rig: Rig, usual: str) -> str:
+    """Ask for a marker until it is one of the rig."""
+    from ipsys_log.measuring.entry import Typed, read_typed
+
+    while True:
+        answer = _text("marker", str.isdecimal, usual)
+        faults = [fault for fault in read_typed(Typed(answer, {}), rig)[1] if fault.field == "marker"]
+        if not faults:
+            return answer
+        console.print(faults[0].text, style="red", markup=False)
 
 
 def _of_tape(name: str, text: str) -> Typed:
@@ -180,14 +207,20 @@ def _show(checked: Checked) -> None:
         console.print(text, style="yellow", markup=False)
 
 
-def _undo(scene: Scene) -> None:
-    """Withdraw the last measurement that counts."""
+def _undo(scene: Scene) -> Measurement | None:
+    """Withdraw the last measurement that counts, and return it; None where none is withdrawn."""
+    from ipsys_log.errors import IpsysError
     from ipsys_log.measuring.check import withdraw
     from ipsys_log.offline.pairs import active_measurements
 
     active = active_measurements(scene.history())
     if not active:
         console.print("nothing is measured yet", style="yellow")
-        return
-    scene.add([withdraw(scene.history(), active[-1].id)])
+        return None
+    try:
+        scene.add([withdraw(scene.history(), active[-1].id)])
+    except IpsysError as error:
+        console.print(str(error), style="red", markup=False)
+        return None
     console.print(f"{active[-1].id} is withdrawn", style="green", markup=False)
+    return active[-1]

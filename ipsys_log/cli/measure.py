@@ -6,12 +6,24 @@ import json
 from collections.abc import Sequence
 from contextlib import ExitStack
 from pathlib import Path
-from typing import TYPE_CHECKING, Annotated
+from typing import TYPE_CHECKING, Annotated, Optional
 
 import typer
 
 from ipsys_log.cli.console import console, progress_bar, remarks
-from ipsys_log.cli.options import AsJson, Calibrations, RigFile, cameras_of, load_calibrations
+from ipsys_log.cli.options import (
+    AsJson,
+    Calibrations,
+    Corners,
+    Force,
+    Host,
+    ModelOfOther,
+    Only,
+    Port,
+    RigFile,
+    cameras_of,
+    load_calibrations,
+)
 
 if TYPE_CHECKING:
     from ipsys_log.finished import FinishedLog
@@ -20,7 +32,19 @@ if TYPE_CHECKING:
 
 __all__ = ["add_commands", "serve_page"]
 
-Log = Annotated[Path, typer.Argument(metavar="LOG", help="A finished log; the measurements go into it.")]
+Log = Annotated[
+    Optional[Path],  # noqa: UP045
+    typer.Argument(
+        metavar="LOG",
+        help="A finished log; the measurements go into it. Without one: what the cameras of --rig send now.",
+    ),
+]
+Output = Annotated[
+    Optional[Path],  # noqa: UP045
+    typer.Option(
+        "--output", "-o", help="Without a LOG: the log to write, with about a second of frames of each place."
+    ),
+]
 Terminal = Annotated[bool, typer.Option("--terminal", help="Ask here in the terminal instead of on a page.")]
 Sheet = Annotated[
     Path | None,
@@ -29,16 +53,6 @@ Sheet = Annotated[
 Places = Annotated[
     bool, typer.Option("--places", help="Only list where markers lie still, as a sheet numbers them.")
 ]
-Host = Annotated[
-    str | None,
-    typer.Option(
-        "--host",
-        metavar="ADDRESS",
-        help="Let others in the network open the page, by an address with a secret of this one start; "
-        "0.0.0.0 for all of this machine's addresses. Without it: this machine alone.",
-    ),
-]
-Port = Annotated[int, typer.Option(min=0, max=65535, help="Of the page; 0 takes any that is free.")]
 
 
 def add_commands(app: typer.Typer) -> None:
@@ -46,30 +60,84 @@ def add_commands(app: typer.Typer) -> None:
 
 
 def measure(
-    log: Log,
+    log: Log = None,
+    output: Output = None,
     terminal: Terminal = False,
     csv: Sheet = None,
     places: Places = False,
     host: Host = None,
     port: Port = 8000,
     rig: RigFile = None,
+    camera: Only = None,
     calibration: Calibrations = None,
+    corners: Corners = None,
+    model_from: ModelOfOther = None,
+    force: Force = False,
     as_json: AsJson = False,
 ) -> None:
     """Enter tape measurements: on a page for the phone, in the terminal, or from a sheet.
 
-    Goes through the places where a marker lies still, checks what is typed at once, and appends it. Undo
-    withdraws a measurement; nothing is erased.
+    With --rig lab.toml -o places.mcap it looks through the cameras until Ctrl-C, and writes about a second of
+    frames of each place that is measured. With a finished LOG it goes through the places where a marker
+    lies still, and appends what is measured.
+
+    Either way what is typed is checked at once. Undo withdraws a measurement; nothing is erased.
     """
     from ipsys_log.errors import IpsysError
-    from ipsys_log.finished import add_sheet, opened_log
-    from ipsys_log.request import Request
-    from ipsys_log.rig import load_rig
 
     if sum((terminal, csv is not None, places)) > 1:
         raise IpsysError("--terminal, --csv and --places exclude one another; give one of them")
+    if log is not None:
+        _refuse(
+            "cameras; leave out LOG, or this",
+            output=output,
+            camera=camera,
+            model_from=model_from,
+            force=force,
+        )
+        _measure_log(log, terminal, csv, places, host, port, rig, calibration, corners, as_json)
+        return
+    _refuse("a finished log; name it", csv=csv, places=places)
+    if rig is None or output is None:
+        raise IpsysError("name a finished log, or give --rig lab.toml -o places.mcap to measure with cameras")
+    if model_from is not None and output.exists() and model_from.exists() and output.samefile(model_from):
+        raise IpsysError(f"-o {output}: is the log with the model; give another name")
+    from ipsys_log.cli.measure_now import measure_now
+
+    measured = measure_now(output, rig, camera, calibration, corners, model_from, force, terminal, host, port)
+    _show_count(output, measured, as_json)
+
+
+def _refuse(where: str, **options: object) -> None:
+    """Options that belong elsewhere."""
+    from ipsys_log.errors import IpsysError
+
+    for name, value in options.items():
+        if value:
+            raise IpsysError(f"--{name.replace('_', '-')} is for {where}")
+
+
+def _measure_log(
+    log: Path,
+    terminal: bool,
+    csv: Path | None,
+    places: bool,
+    host: str | None,
+    port: int,
+    rig: Path | None,
+    calibration: list[str] | None,
+    corners: str | None,
+    as_json: bool,
+) -> None:
+    from ipsys_log.finished import opened_log
+    from ipsys_log.request import Request
+    from ipsys_log.rig import load_rig
+    from ipsys_log.sheets import add_sheet, check_sheet
+
     lenses = load_calibrations(calibration, lambda: cameras_of([log]))
-    request = Request(rig=load_rig(rig) if rig else None, lenses=lenses)
+    request = Request(rig=load_rig(rig) if rig else None, lenses=lenses, corners=corners)
+    if csv is not None:
+        check_sheet(csv, log, request)
     with ExitStack() as stack:
         with progress_bar() as progress:
             scene = stack.enter_context(opened_log(log, request, progress))

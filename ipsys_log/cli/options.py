@@ -15,9 +15,14 @@ __all__ = [
     "AsJson",
     "Calibrations",
     "Corners",
+    "Force",
+    "Host",
     "Logs",
     "Method",
+    "ModelOfOther",
     "NewLog",
+    "Only",
+    "Port",
     "RigFile",
     "cameras_of",
     "load_calibrations",
@@ -55,6 +60,27 @@ Method = Annotated[
         "--method",
         metavar="NAME",
         help="Places markers by their perimeter (eq. 3 to 5 of the paper), or by their pose (tilted too).",
+    ),
+]
+Only = Annotated[
+    Optional[list[str]],  # noqa: UP045
+    typer.Option("--camera", metavar="NAME", help="Only this camera of the rig; repeat it for several."),
+]
+Force = Annotated[bool, typer.Option("--force", help="Overwrite the log if there is one of that name.")]
+Host = Annotated[
+    str | None,
+    typer.Option(
+        "--host",
+        metavar="ADDRESS",
+        help="Let others in the network open the page, by an address with a secret of this one start; "
+        "0.0.0.0 for all of this machine's addresses. Without it: this machine alone.",
+    ),
+]
+Port = Annotated[int, typer.Option(min=0, max=65535, help="Of the page; 0 takes any that is free.")]
+ModelOfOther = Annotated[
+    Optional[Path],  # noqa: UP045
+    typer.Option(
+        "--model-from", metavar="LOG", help="While measuring, say where this log's model puts a place."
     ),
 ]
 AsJson = Annotated[bool, typer.Option("--json", help="Print JSON.")]

@@ -15,11 +15,20 @@ from typing import TYPE_CHECKING, Annotated, Optional
 import typer
 
 from ipsys_log.cli.console import console, remarks
-from ipsys_log.cli.measure import Host, Port
-from ipsys_log.cli.options import Calibrations, Corners, Method, NewLog, load_lab
+from ipsys_log.cli.options import (
+    Calibrations,
+    Corners,
+    Force,
+    Host,
+    Method,
+    ModelOfOther,
+    NewLog,
+    Only,
+    Port,
+    load_lab,
+)
 
 if TYPE_CHECKING:
-    from ipsys_log.live_scene import LiveScene
     from ipsys_log.messages import Message, Rig, RigCamera
     from ipsys_log.pipeline import Watch
     from ipsys_log.report.cameras import LiveStatus
@@ -27,19 +36,14 @@ if TYPE_CHECKING:
     from ipsys_log.sinks.rerun_live import LiveView
     from ipsys_log.sources.attached import Attached
 
-__all__ = ["add_commands", "recorded_now"]
+__all__ = ["add_commands", "opened_cameras", "recorded_now", "shown_to"]
 
 Lab = Annotated[Path, typer.Option("--rig", help="The rig file; each camera has a source there.")]
-Only = Annotated[
-    Optional[list[str]],  # noqa: UP045
-    typer.Option("--camera", metavar="NAME", help="Only this camera of the rig; repeat it for several."),
-]
 Seconds = Annotated[
     Optional[float],  # noqa: UP045
     typer.Option(min=0.1, help="Stop by itself after so many seconds."),
 ]
 View = Annotated[bool, typer.Option("--view", help="Show cameras and robots in Rerun meanwhile.")]
-Force = Annotated[bool, typer.Option("--force", help="Overwrite the log if there is one of that name.")]
 
 
 def add_commands(app: typer.Typer) -> None:
@@ -59,23 +63,20 @@ def record(
     ] = False,
     host: Host = None,
     port: Port = 8000,
-    model_from: Annotated[
-        Optional[Path],  # noqa: UP045
-        typer.Option(
-            "--model-from", metavar="LOG", help="While measuring, say where this log's model puts a place."
-        ),
-    ] = None,
+    model_from: ModelOfOther = None,
     seconds: Seconds = None,
     force: Force = False,
 ) -> None:
     """Record the frames of the cameras as they come, until Ctrl-C."""
     from ipsys_log import pipeline
+    from ipsys_log.cli.measure_now import live_scene, served
     from ipsys_log.request import Request
 
-    with _opened(output, rig, camera, calibration, seconds, force) as (cameras, settings, status):
+    with opened_cameras(output, rig, camera, calibration, seconds, force) as (cameras, settings, status):
         if measure:
-            with _measured(settings, cameras, model_from, host, port) as scene:
-                watch = _both(status, scene)
+            scene = live_scene(settings, cameras, model_from)
+            with served(scene, host, port):
+                watch = shown_to(status, scene)
                 request = Request(corners=corners)
                 pipeline.live(cameras, settings, output, request, "camera-frame", watch, force)
         elif detect:
@@ -114,10 +115,10 @@ def live(
     models = () if model is None else (model,)
     request = Request(models=models, model_from=model_from, corners=corners, method=method)
     with (
-        _opened(output, rig, camera, calibration, seconds, force) as (cameras, settings, status),
+        opened_cameras(output, rig, camera, calibration, seconds, force) as (cameras, settings, status),
         _viewed(settings, cameras, request) if view else nullcontext() as viewer,
     ):
-        pipeline.live(cameras, settings, output, request, "fuse", _both(status, viewer), force)
+        pipeline.live(cameras, settings, output, request, "fuse", shown_to(status, viewer), force)
 
 
 @contextmanager
@@ -136,17 +137,19 @@ def recorded_now(rig: Path | None, calibration: list[str] | None, seconds: float
         raise IpsysError("name a log, or give --rig lab.toml to take what its cameras send now")
     with TemporaryDirectory(prefix="ipsys-") as folder:
         log = Path(folder) / "now.mcap"
-        with _opened(log, rig, None, calibration, seconds, force=False, kept=False) as opened:
+        with opened_cameras(
+            log, rig, None, calibration, seconds, False, f"looking for {seconds:g} s"
+        ) as opened:
             cameras, settings, status = opened
             pipeline.record(cameras, settings, log, status)
         yield log
 
 
-def _say(text: str) -> None:
+def say(text: str) -> None:
     remarks.print(text, markup=False)
 
 
-def _both(first: Watch, second: Watch | None) -> Watch:
+def shown_to(first: Watch, second: Watch | None) -> Watch:
     def watch(message: Message | None) -> None:
         first(message)
         if second is not None:
@@ -155,49 +158,33 @@ def _both(first: Watch, second: Watch | None) -> Watch:
     return watch
 
 
-@contextmanager
-def _measured(
-    settings: list[Message], cameras: Attached, model_from: Path | None, host: str | None, port: int
-) -> Iterator[LiveScene]:
-    """The page on which places are measured while they are recorded."""
-    from ipsys_log.live_scene import LiveScene
-    from ipsys_log.log.session import Session
-    from ipsys_log.lookup import fitted_in
-    from ipsys_log.web.serving import qr_code, serving
-
-    model = None
-    if model_from is not None:
-        with Session([model_from]) as other:
-            model, _ = fitted_in(other, None)
-    scene = LiveScene(settings[0].payload, model, list(cameras.states), cameras.add)
-    with serving(scene, host, port) as page:
-        if host is not None:
-            console.print(qr_code(page.url), style="#ffffff on #000000", markup=False)
-        remarks.print(f"measure at {page.url}", markup=False)
-        yield scene
-        scene.end()
-
-
 def _viewed(settings: list[Message], cameras: Attached, request: Request) -> LiveView:
     from ipsys_log.lookup import wanted_models
     from ipsys_log.sinks.rerun_live import LiveView
     from ipsys_log.tasks import model_run
 
     (model,) = wanted_models(request, "fuse")
-    return LiveView(settings[0].payload, cameras.states, model_run(model), _say)
+    return LiveView(settings[0].payload, cameras.states, model_run(model), say)
 
 
 @contextmanager
-def _opened(
+def opened_cameras(
     output: Path,
     rig: Path,
     only: list[str] | None,
     calibration: list[str] | None,
     seconds: float | None,
     force: bool,
-    kept: bool = True,
+    doing: str | None = None,
+    panel: bool = True,
 ) -> Iterator[tuple[Attached, list[Message], LiveStatus]]:
-    """Cameras that send, what is written first, and what is shown on the screen meanwhile."""
+    """Cameras that send, what is written first, and what is shown on the screen meanwhile.
+
+    Parameters
+    ----------
+    doing : said at the beginning, where it is not recording; then nothing is said of frames at the end.
+    panel : whether the screen is free for a table of the cameras.
+    """
     from ipsys_log.monitor import Monitor
     from ipsys_log.recording import first_messages, fitting_lenses
     from ipsys_log.report.cameras import LiveStatus
@@ -210,15 +197,16 @@ def _opened(
     _check_target(output, force)
     with ExitStack() as stack:
         with remarks.status("opening " + ", ".join(camera.name for camera in cameras)):
-            attached = stack.enter_context(Attached(cameras, open_source, Clock(), _say))
+            attached = stack.enter_context(Attached(cameras, open_source, Clock(), say))
         sizes_px = {name: state.size_px for name, state in attached.states.items()}
-        lenses = fitting_lenses(lenses, sizes_px, _say)
+        lenses = fitting_lenses(lenses, sizes_px, say)
         stack.enter_context(_ended(attached.stop, seconds))
         status = LiveStatus(attached.states, stack.enter_context(Monitor(lab)), output, monotonic)
-        remarks.print(f"recording into {output}; Ctrl-C ends it" if kept else f"looking for {seconds:g} s")
-        stack.enter_context(_on_screen(status))
+        remarks.print(doing or f"recording into {output}; Ctrl-C ends it", markup=False)
+        if panel:
+            stack.enter_context(_on_screen(status))
         yield attached, first_messages(lab, lenses, attached.now_ns), status
-    for line in status.summary() if kept else ():
+    for line in () if doing else status.summary():
         console.print(line)
 
 

@@ -16,7 +16,8 @@ from ipsys_log.measuring.predict import Prediction, predict
 from ipsys_log.measuring.scene import Sight
 from ipsys_log.messages import Measurement, Model, Rig
 from ipsys_log.offline.pairs import active_measurements
-from ipsys_log.offline.tape import TapePoint, world_point
+from ipsys_log.offline.tape import TapePoint, reference_points, world_point
+from ipsys_log.units import CM_PER_M
 
 __all__ = ["Checked", "check_entry", "next_id", "withdraw"]
 
@@ -102,7 +103,7 @@ def check_entry(
         return Checked(name, tuple(found), tuple(warnings))
     try:
         # A usual tape tells how flatly the circles cross; what is written down has no sigma of its own.
-        fixed = world_point(read, with_tape(rig))
+        fixed = _located(read, with_tape(rig))
     except IpsysError as error:
         # That it may be in metres is then why.
         why = "; ".join([_without_id(error, name), *entry.doubts])
@@ -139,6 +140,21 @@ def _measurement(entry: Entry, name: str, sight: Sight | None) -> Measurement:
         still=still,
         splits=entry.splits,
     )
+
+
+def _located(read: Measurement, rig: Rig) -> TapePoint:
+    """The world point; where two tapes do not meet, they are named as they were asked for."""
+    if len(read.distances) == 2:
+        first_m, second_m = reference_points(read, rig)
+        base_m = float(np.hypot(*(second_m - first_m)))
+        one, other = read.distances
+        if not abs(one.distance_m - other.distance_m) <= base_m <= one.distance_m + other.distance_m:
+            tapes = " and ".join(f"d to {d.reference} = {d.distance_m * CM_PER_M:g} cm" for d in (one, other))
+            raise IpsysError(
+                f"no triangle has the sides {one.reference} to {other.reference} = "
+                f"{base_m * CM_PER_M:.1f} cm, {tapes}; read both again"
+            )
+    return world_point(read, rig)
 
 
 def _without_id(error: IpsysError, name: str) -> str:
@@ -183,7 +199,7 @@ def _overlap(one: Measurement, other: Measurement) -> bool:
 def _both_sides(read: Measurement, rig: Rig) -> tuple[tuple[tuple[str, Array], ...], list[Fault]]:
     """Where it would be on either side; or why the tapes do not meet."""
     try:
-        places = tuple((side, world_point(replace(read, side=side), rig).world_m) for side in SIDES)
+        places = tuple((side, _located(replace(read, side=side), rig).world_m) for side in SIDES)
     except IpsysError as error:
         return (), [Fault("", _without_id(error, read.id))]
     return places, []

@@ -119,9 +119,8 @@ def look(views: Iterable[View], marker_id: int) -> Sight:
     >>> look([View("red", 300, points=seen), View("white", 300)], 7).text
     'marker 7 lies still, seen by red'
     """
-    points_m: dict[str, Array] = {}
+    seen: dict[str, tuple[int, int, Array]] = {}
     moving = []
-    times_ns: list[int] = []
     for view in views:
         rows = [(p.timestamp, one) for p in view.points for one in p.points if one.id == marker_id]
         if len(rows) < FEWEST:
@@ -129,11 +128,17 @@ def look(views: Iterable[View], marker_id: int) -> Sight:
         seen_m = np.array([(one.x_m, one.y_m, one.z_m) for _, one in rows])
         if not lies_still(seen_m):
             moving.append(view.camera)
-        points_m[view.camera] = seen_m.mean(axis=0)
-        times_ns += [time_ns + (one.time_offset_ns or 0) for time_ns, one in rows]
-    if moving or not times_ns:
+        times_ns = [time_ns + (one.time_offset_ns or 0) for time_ns, one in rows]
+        seen[view.camera] = min(times_ns), max(times_ns), seen_m.mean(axis=0)
+    if moving or not seen:
         return Sight(marker_id, None, {}, tuple(moving))
-    return Sight(marker_id, Interval(min(times_ns), max(times_ns)), points_m)
+    # A camera that sees it no more since before another one did may have seen it elsewhere.
+    start_ns = end_ns = max(last_ns for _, last_ns, _ in seen.values())
+    for first_ns, last_ns, _ in sorted(seen.values(), key=lambda one: one[1], reverse=True):
+        if last_ns >= start_ns:
+            start_ns = min(start_ns, first_ns)
+    points_m = {camera: mean_m for camera, (_, last_ns, mean_m) in seen.items() if last_ns >= start_ns}
+    return Sight(marker_id, Interval(start_ns, end_ns), points_m)
 
 
 def visible_markers(views: Iterable[View], rig: Rig) -> list[int]:

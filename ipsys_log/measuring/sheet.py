@@ -4,22 +4,25 @@ from __future__ import annotations
 
 import csv
 import math
+import re
 from collections.abc import Iterable, Iterator, Sequence
 from dataclasses import dataclass
 from datetime import UTC, datetime
 from pathlib import Path
 
 from ipsys_log.errors import IpsysError
-from ipsys_log.measuring.entry import Typed
+from ipsys_log.measuring.check import check_entry
+from ipsys_log.measuring.entry import Typed, read_typed
 from ipsys_log.measuring.scene import Stop
 from ipsys_log.messages import Rig
 from ipsys_log.units import NS_PER_S
 
-__all__ = ["SheetRow", "find_stops", "read_sheet", "refuse_rows"]
+__all__ = ["SheetRow", "find_stops", "name_columns", "read_sheet", "refuse_rows"]
 
 _PLAIN = ("id", "marker", "side", "height_cm", "place", "time", "split", "note")
 _NEEDED = ("marker", "height_cm")
 _LARGEST = 4 << 20
+_NUMBER = re.compile(r"[\d.]+")
 # A time read off a watch need not lie within the stretch to the second.
 _NEAR_NS = 2 * NS_PER_S
 
@@ -47,8 +50,8 @@ def read_sheet(path: Path, rig: Rig, start_ns: int) -> list[SheetRow]:
     Raises
     ------
     IpsysError
-        Where it cannot be read, for a column that is missing, unknown or there twice, for a row with too many
-        cells, and for a ``place`` or ``time`` that is none; every bad row by its line.
+        Where it cannot be read, for a column that is missing, unknown or there twice, and for all that is
+        wrong with a row by itself; every bad one by its line.
     """
     lines = _read_lines(path)
     delimiter = ";" if lines and ";" in lines[0] else ","
@@ -61,19 +64,32 @@ def read_sheet(path: Path, rig: Rig, start_ns: int) -> list[SheetRow]:
             if not any(cell.strip() for cell in cells):
                 continue
             if len(cells) > len(columns):
-                faults.append((reader.line_num, f"{len(cells)} cells, but {len(columns)} columns"))
+                why = f"{len(cells)} cells, but {len(columns)} columns{_comma_advice(delimiter)}"
+                faults.append((reader.line_num, why))
                 continue
             cell = dict(zip(columns, (text.strip() for text in cells), strict=False))
+            if _NUMBER.fullmatch(cell.get("side", "")):
+                why = f"side {cell['side']!r}: write left or right{_comma_advice(delimiter)}"
+                faults.append((reader.line_num, why))
+                continue
             try:
                 rows.append(_row(reader.line_num, cell, start_ns))
             except IpsysError as error:
                 faults.append((reader.line_num, str(error)))
     except csv.Error as error:
         raise IpsysError(f"{path}: line {reader.line_num}: {error}") from error
+    for row in rows:
+        alone = check_entry(*read_typed(row.typed, rig), rig, None, ())
+        faults += [(row.line, name_columns(fault.text, rig)) for fault in alone.faults]
     refuse_rows(path, faults)
     if not rows:
         raise IpsysError(f"{path}: holds no measurements below its header")
     return rows
+
+
+def _comma_advice(delimiter: str) -> str:
+    """Why a row may have come apart."""
+    return "; a decimal comma? Write a point: 212.7" if delimiter == "," else ""
 
 
 def refuse_rows(path: Path, faults: Iterable[tuple[int, str]]) -> None:
@@ -86,8 +102,24 @@ def refuse_rows(path: Path, faults: Iterable[tuple[int, str]]) -> None:
     """
     found = sorted(faults)
     if found:
-        named = "; ".join(f"line {line}: {text}" for line, text in found)
-        raise IpsysError(f"{path}: nothing was written, correct the sheet: {named}")
+        named = "".join(f"\n  line {line}: {text}" for line, text in found)
+        raise IpsysError(f"{path}: nothing was written; correct the sheet:{named}")
+
+
+def name_columns(text: str, rig: Rig) -> str:
+    """A remark on a place, its distances named as the columns of a sheet.
+
+    Examples
+    --------
+    >>> from ipsys_log.messages import ReferencePoint
+    >>> points = (ReferencePoint("A", 0.0, 0.0), ReferencePoint("B", 2.0, 0.0))
+    >>> name_columns("the distances to A and B look exchanged", Rig("lab", "", 0.2, reference_points=points))
+    'd_A_cm and d_B_cm look exchanged'
+    """
+    one = "|".join(re.escape(point.name) for point in rig.reference_points)
+    text = re.sub(rf"\bthe distances to ({one}) and ({one})\b", r"d_\1_cm and d_\2_cm", text)
+    text = re.sub(rf"\b(?:the distance|d) to ({one})\b", r"d_\1_cm", text)
+    return re.sub(r"\bheight(?=:|\?| reads)", "height_cm", text)
 
 
 def find_stops(

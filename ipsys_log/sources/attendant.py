@@ -30,8 +30,9 @@ class CameraState:
     """What has come of a camera so far.
 
     ``dropped`` frames came and never reached the log, ``missed`` ones were lost before they came, as far as
-    the camera's driver counts. ``size_px`` is the width and height of its frames, where they are JPEGs, and
-    ``delay_s`` the time from exposure to arrival of the last one, where it has a capture stamp.
+    the camera's driver counts. ``format`` of its frames is such as jpeg or h264, ``size_px`` their width and
+    height, where they are JPEGs, and ``delay_s`` the time from exposure to arrival of the last one, where it
+    has a capture stamp.
     """
 
     frames: int = 0
@@ -40,6 +41,7 @@ class CameraState:
     missed: int = 0
     up: bool = False
     finished: bool = False
+    format: str | None = None
     size_px: tuple[int, int] | None = None
     delay_s: float | None = None
 
@@ -148,7 +150,7 @@ class Attendant:
             gone_s = (now_ns - self._lost_ns) / NS_PER_S
             self._lost_ns = None
             self._say("camera_back", f"camera {camera.name} is back after {gone_s:.1f} s")
-        state.up = True
+        state.up, state.format = True, frame.format
         if state.size_px is None:
             state.size_px = _size_of(frame)
         time_ns = now_ns

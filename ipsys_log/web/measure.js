@@ -26,6 +26,16 @@ async function ask(path, body) {
   return { ...content, refused: answer.status === 409 };
 }
 
+// What could not be written may be so because somebody else has written: what is known is asked for anew.
+async function write(path, body) {
+  try {
+    return await ask(path, body);
+  } catch (error) {
+    try { ({ history } = await ask("scene")); refresh(); } catch { /* the first error says it */ }
+    throw error;
+  }
+}
+
 function tell(text, bad = false) {
   clearTimeout(noticeTimer);
   $("notice").textContent = text;
@@ -222,7 +232,7 @@ function list() {
     const undo = make("button", { type: "button" }, "Undo");
     undo.setAttribute("aria-label", `Undo ${place.id}`);
     undo.addEventListener("click", guarded(async () => {
-      history = (await ask("undo", { id: place.id })).history;
+      history = (await write("undo", { id: place.id })).history;
       tell(`${place.id} is withdrawn; it stays in the log, but does not count`);
       refresh();
     }));
@@ -242,7 +252,7 @@ const save = guarded(async () => {
   $("save").disabled = true;
   let answer;
   try {
-    answer = await ask("measure", { ...typed(), accepted: found.warnings ?? [] });
+    answer = await write("measure", { ...typed(), accepted: found.warnings ?? [] });
   } catch (error) {
     soon();
     throw error;

@@ -75,8 +75,8 @@ def test_a_depth_that_jitters_at_the_edge_of_the_picture_is_no_motion() -> None:
 
 
 def test_the_last_second_of_a_recording() -> None:
-    def view(path: Array, camera: str = "red") -> View:
-        rows = [CameraPoints(n, (CameraPoint(3, *point),)) for n, point in enumerate(path.tolist())]
+    def view(path: Array, camera: str = "red", first: int = 0) -> View:
+        rows = [CameraPoints(n, (CameraPoint(3, *point),)) for n, point in enumerate(path.tolist(), first)]
         return View(camera, len(rows), points=tuple(rows))
 
     still, moves = laid((1, 0, 0)), laid((1, 0.05, 0))
@@ -85,3 +85,8 @@ def test_the_last_second_of_a_recording() -> None:
     assert look([view(still)], 4).state == "unseen"
     # A single sighting says nothing.
     assert look([view(still[:1])], 3).state == "unseen"
+    # What another camera saw before it came into view here may have been another place.
+    later = look([view(still, "white", 10), view(still[:10])], 3)
+    assert later.still is not None
+    assert (later.still.start, list(later.points_m)) == (10, ["white"])
+    assert list(look([view(still, "white", 9), view(still[:10])], 3).points_m) == ["white", "red"]

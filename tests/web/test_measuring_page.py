@@ -9,6 +9,7 @@ from pathlib import Path
 
 import pytest
 
+from ipsys_log.errors import LogError
 from ipsys_log.finished import FinishedLog, opened_log
 from ipsys_log.log.session import Session
 from ipsys_log.measuring.scene import Stop, View
@@ -135,6 +136,37 @@ def test_what_goes_wrong_in_the_log_is_said_on_the_page(hand: Phone, unmeasured:
     assert len(foreign_read(log)) == 1
     hand.tap("#after")
     says(hand, "#notice", "The computer does not answer")
+
+
+def test_somebody_else_measures_in_the_same_log(hand: Phone, unmeasured: Unmeasured) -> None:
+    log, tape = unmeasured
+    with (
+        opened_log(log, Request()) as scene,
+        serving(scene, port=0) as page,
+        opened_log(log, Request()) as other,
+    ):
+        texts = texts_at(scene, tape, 0)
+        hand.open(page.url)
+        says(hand, "#sight", "lies still")
+        fill(hand, *texts)
+        other.add([Measurement(tape[-1].timestamp, "p001", marker_id=1)])
+        save(hand, "p001")
+        says(hand, "#notice", "somebody else measured in this log meanwhile (p001)")
+        says(hand, "#places", "p001")
+        assert hand.run("document.querySelector('#d-A').value") == texts[0]
+        # Without a word more: what was typed is checked anew, beside what the other one did.
+        save(hand, "p002")
+        says(hand, "#notice", "p002 is in the log")
+        other_id = "p003"
+        with pytest.raises(LogError):
+            other.add([Measurement(tape[-1].timestamp, other_id, marker_id=1)])
+        other.add([Measurement(tape[-1].timestamp, other_id, marker_id=1)])
+        hand.tap("#places li:first-child button")
+        says(hand, "#notice", "somebody else measured in this log meanwhile (p003)")
+        hand.wait("document.querySelector('#places button[aria-label=\"Undo p002\"]')")
+        hand.tap("#places button[aria-label='Undo p002']")
+        says(hand, "#notice", "p002 is withdrawn")
+    assert sorted(row.id for row in foreign_read(log)) == ["p001", "p002", "p002_withdrawn", "p003"]
 
 
 class Recording:

@@ -1,0 +1,106 @@
+"""Measuring with cameras that send now: the page or the terminal beside the pipeline."""
+
+from __future__ import annotations
+
+import signal
+from collections.abc import Callable, Iterator
+from concurrent.futures import ThreadPoolExecutor
+from contextlib import contextmanager, suppress
+from functools import partial
+from pathlib import Path
+from time import sleep
+from typing import TYPE_CHECKING, Any
+
+from ipsys_log.cli.console import console, remarks
+
+if TYPE_CHECKING:
+    from ipsys_log.live_scene import LiveScene
+    from ipsys_log.messages import Measurement, Message
+    from ipsys_log.sources.attached import Attached
+
+__all__ = ["live_scene", "measure_now", "served"]
+
+_TURN_S = 0.05
+# After that it is known what the cameras see, and what of it lies still.
+_LOOK_S = 1.0
+
+
+def measure_now(
+    output: Path,
+    rig: Path,
+    camera: list[str] | None,
+    calibration: list[str] | None,
+    corners: str | None,
+    model_from: Path | None,
+    force: bool,
+    terminal: bool,
+    host: str | None,
+    port: int,
+) -> list[Measurement]:
+    """Measure places into a new log with a second of frames of each; what was measured and withdrawn."""
+    from ipsys_log import pipeline
+    from ipsys_log.cli.record import opened_cameras, shown_to
+    from ipsys_log.request import Request
+
+    ends = "q" if terminal else "Ctrl-C"
+    doing = f"measuring into {output}; {ends} ends it"
+    with opened_cameras(output, rig, camera, calibration, None, force, doing, not terminal) as opened:
+        cameras, settings, status = opened
+        scene = live_scene(settings, cameras, model_from)
+        request, watch = Request(corners=corners), shown_to(status, scene)
+        work = partial(pipeline.measure, cameras, settings, output, request, watch, force)
+        if terminal:
+            _ask_beside(work, scene, cameras)
+        else:
+            with served(scene, host, port):
+                work()
+    return scene.history()
+
+
+def live_scene(settings: list[Message], cameras: Attached, model_from: Path | None) -> LiveScene:
+    """What the cameras see now, to measure on."""
+    from ipsys_log.live_scene import LiveScene
+    from ipsys_log.log.session import Session
+    from ipsys_log.lookup import fitted_in
+
+    model = None
+    if model_from is not None:
+        with Session([model_from]) as other:
+            model, _ = fitted_in(other, None)
+    return LiveScene(settings[0].payload, model, cameras.states, cameras.add)
+
+
+@contextmanager
+def served(scene: LiveScene, host: str | None, port: int) -> Iterator[None]:
+    """The page on which places are measured, for as long as the block lasts."""
+    from ipsys_log.web.serving import qr_code, serving
+
+    with serving(scene, host, port) as page:
+        if host is not None:
+            console.print(qr_code(page.url), style="#ffffff on #000000", markup=False)
+        remarks.print(f"measure at {page.url}", markup=False)
+        try:
+            yield
+        finally:
+            scene.end()
+
+
+def _ask_beside(work: Callable[[], Any], scene: LiveScene, cameras: Attached) -> None:
+    """Ask in the terminal while the work goes on in a thread, and stop the cameras after that."""
+    from ipsys_log.cli.dialog import ask_places
+
+    for number in (signal.SIGINT, signal.SIGTERM):  # a question that is open ends, too
+        signal.signal(number, signal.default_int_handler)
+    with ThreadPoolExecutor(1) as pool:
+        working = pool.submit(work)
+        try:
+            with suppress(KeyboardInterrupt):
+                while not (working.done() or any(view.points for view in scene.views(None))):
+                    sleep(_TURN_S)
+                sleep(_LOOK_S)
+                if not working.done():
+                    ask_places(scene)
+        finally:
+            scene.end()
+            cameras.stop()
+        working.result()

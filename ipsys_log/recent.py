@@ -1,0 +1,84 @@
+"""Of what cameras send, into a log what was measured: the last seconds wait, most of them to be forgotten."""
+
+from __future__ import annotations
+
+from collections import deque
+from types import TracebackType
+
+from ipsys_log.errors import WriteError
+from ipsys_log.messages import FRAME_SKIPPED, CompressedImage, Event, Measurement, Message
+from ipsys_log.recording import Recording
+from ipsys_log.units import NS_PER_S
+
+__all__ = ["Recent"]
+
+# Longer than a marker is looked at, and what the stages may be behind.
+_HELD_NS = 5 * NS_PER_S
+# A marker may be exposed so long after the time of its frame (rolling shutter).
+_ROLLING_NS = NS_PER_S // 10
+
+
+class Recent:
+    """The end of a recording that is not written yet. A context manager: on leaving, the rest is.
+
+    Everything comes and goes in the order of log times. A frame that is older than some seconds is forgotten,
+    and any other message written then. A measurement is written at once, and before it the frames since its
+    marker lay still: it is on the disk as if everything were recorded.
+
+    Parameters
+    ----------
+    log : where all of it goes.
+    """
+
+    def __init__(self, log: Recording) -> None:
+        self._log = log
+        self._held: deque[Message] = deque()
+
+    def __enter__(self) -> Recent:
+        return self
+
+    def __exit__(
+        self, kind: type[BaseException] | None, error: BaseException | None, trace: TracebackType | None
+    ) -> None:
+        if not isinstance(error, WriteError):
+            self._write()
+
+    @property
+    def full(self) -> WriteError | None:
+        return self._log.full
+
+    def put(self, message: Message) -> None:
+        """Take the next message of a recording.
+
+        Raises
+        ------
+        WriteError
+            Where the disk is full.
+        """
+        payload = message.payload
+        # It tells a replay what live results lack; here there are none.
+        if isinstance(payload, Event) and payload.kind == FRAME_SKIPPED:
+            return
+        self._held.append(message)
+        if isinstance(payload, Measurement):
+            self._write(None if payload.still is None else payload.still.start - _ROLLING_NS)
+            self._log.flush()
+        while _is_frame(message) and self._held[0].log_time_ns < message.log_time_ns - _HELD_NS:
+            old = self._held.popleft()
+            if not _is_frame(old):
+                self._log.put(old)
+
+    def flush(self) -> None:
+        """Hand to the disk what is written."""
+        self._log.flush()
+
+    def _write(self, since_ns: int | None = None) -> None:
+        """Write all that is held; of the frames those taken since then, None for none."""
+        while self._held:
+            message = self._held.popleft()
+            if not _is_frame(message) or (since_ns is not None and message.publish_time_ns >= since_ns):
+                self._log.put(message)
+
+
+def _is_frame(message: Message) -> bool:
+    return isinstance(message.payload, CompressedImage)

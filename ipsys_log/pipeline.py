@@ -43,7 +43,7 @@ from threadpoolctl import threadpool_limits
 
 from ipsys_log.errors import IpsysError, LogError
 from ipsys_log.latency import Ledger
-from ipsys_log.live_plan import check_live, copied_models, live_stages, with_corners
+from ipsys_log.live_plan import cameras_with_lens, check_live, copied_models, live_stages, with_corners
 from ipsys_log.log.session import Session
 from ipsys_log.lookup import wanted_models
 from ipsys_log.messages import (
@@ -56,6 +56,7 @@ from ipsys_log.messages import (
     Message,
     Model,
     Positions,
+    Rig,
     Tracks,
 )
 from ipsys_log.output import opened_target
@@ -289,7 +290,8 @@ def live(
     request = with_corners(request, cameras.states, settings)
     copied = copied_models(request, until)
     models = [model for _, model in copied]
-    check_live(cameras.states, settings, models, until)
+    (rig,) = (message.payload for message in settings if isinstance(message.payload, Rig))
+    check_live(rig, cameras.states, cameras_with_lens(settings), models, until)
     runs, rows = live_stages(request, models, until)
     stages = [Stage(*row) for row in rows]
     fault: IpsysError | None = None

@@ -22,7 +22,7 @@ class _Kind(NamedTuple):
 
 
 _LENGTHS = (("cm", 0.01), ("mm", 0.001))
-# By the key in the rig file. What is beyond was written in another unit; 0 of row_time_ns is a global shutter.
+# By the key in the rig file. What is beyond was written in another unit; a row time of 0 is allowed, too.
 _KINDS = {
     "marker_length_m": _Kind("m", 0.002, 2.0, _LENGTHS),
     "length_m": _Kind("m", 0.002, 2.0, _LENGTHS),
@@ -74,8 +74,8 @@ def check_slips(rig: Rig, where: str) -> None:
     for marker in rig.markers:
         if size is not None and marker.id >= size:
             raise IpsysError(
-                f"{where}: marker id {marker.id}: {rig.dictionary} has only 0 to {size - 1}; write the id that "
-                "is printed, or the dictionary that it was printed from"
+                f"{where}: marker id {marker.id}: {rig.dictionary} has only 0 to {size - 1}; write the id "
+                "that is printed, or the dictionary that it was printed from"
             )
 
 

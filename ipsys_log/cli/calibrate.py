@@ -10,13 +10,12 @@ from typing import TYPE_CHECKING, Annotated, Optional
 
 import typer
 
+from ipsys_log.cli.cameras_now import Lab, prepared, recorded_now, say
 from ipsys_log.cli.console import console, progress_bar, remarks
 from ipsys_log.cli.options import AsJson
-from ipsys_log.cli.record import recorded_now
 
 if TYPE_CHECKING:
     from ipsys_log.calibration.calibrate import Calibrated
-    from ipsys_log.calibration.pictures import Pictures
 
 __all__ = ["add_commands"]
 
@@ -27,7 +26,9 @@ Sources = Annotated[
 RigNow = Annotated[
     Path | None, typer.Option("--rig", help="Without a source: take what the cameras of this rig send now.")
 ]
-Seconds = Annotated[float, typer.Option(min=1.0, help="How long to take it, while you move the board.")]
+Seconds = Annotated[
+    float, typer.Option(min=1.0, metavar="SECONDS", help="How long to take it, while you move the board.")
+]
 BoardName = Annotated[
     str,
     typer.Option(
@@ -107,9 +108,12 @@ def calibrate(
     if plot is not None:
         check_file(plot, "--plot", sources or [])
         _check_free(plot, force)
-    with nullcontext(sources) if sources else _taken_now(rig, seconds) as taken:
+    lab = None if sources else _prepared_now(rig, camera)
+    if lab is not None:
+        _targets(lab.names, output, names, force)
+    with nullcontext(sources or []) if lab is None else _taken_now(lab, seconds) as taken:
         found = find_sources(taken, camera or [])
-        targets = _targets(found, output, names, force)
+        targets = _targets([pictures.camera for pictures in found], output, names, force)
         with progress_bar() as progress:
             lenses, unseen = calibrate_cameras(found, wanted, model, progress)
     written = _write(lenses, targets)
@@ -129,34 +133,43 @@ def calibrate(
         remarks.print(f"{plot} drawn", markup=False)
 
 
-@contextmanager
-def _taken_now(rig: Path | None, seconds: float) -> Iterator[list[Path]]:
-    if rig is not None:
-        remarks.print(
-            "move the board through all of each picture, tilted this way and that, and hold it still"
+def _prepared_now(rig: Path | None, only: list[str] | None) -> Lab:
+    from ipsys_log.errors import IpsysError
+
+    if rig is None:
+        raise IpsysError(
+            "name pictures, a video or a log of a board, or give --rig lab.toml to take what its cameras "
+            "send now"
         )
-    with recorded_now(rig, None, seconds) as log:
+    return prepared(rig, only, None, with_lenses=False)
+
+
+@contextmanager
+def _taken_now(lab: Lab, seconds: float) -> Iterator[list[Path]]:
+    say(
+        "move the board through all of each picture, tilted this way and that, and hold it still; "
+        "the frames are not kept"
+    )
+    with recorded_now(lab, seconds) as log:
         yield [log]
 
 
-def _targets(
-    sources: list[Pictures], output: Path, formats: list[str], force: bool
-) -> dict[str, dict[str, Path]]:
+def _targets(cameras: list[str], output: Path, formats: list[str], force: bool) -> dict[str, dict[str, Path]]:
     """Where the file of each camera and format goes; an error where it cannot."""
     from ipsys_log.errors import IpsysError
     from ipsys_log.formats.calibration_yaml import FORMATS
     from ipsys_log.report.files import check_file, check_folder
 
     if output.suffix.lower() in (".yaml", ".yml"):
-        if len(sources) > 1 or len(formats) > 1:
+        if len(cameras) > 1 or len(formats) > 1:
             raise IpsysError(f"--output {output}: one file for several lenses; name a folder")
-        targets = {sources[0].camera: {formats[0]: output}}
+        targets = {cameras[0]: {formats[0]: output}}
         check_file(output, "--output", [])
     else:
         check_folder(output, "--output")
         targets = {
-            pictures.camera: {name: output / f"{pictures.camera}{FORMATS[name][1]}.yaml" for name in formats}
-            for pictures in sources
+            camera: {name: output / f"{camera}{FORMATS[name][1]}.yaml" for name in formats}
+            for camera in cameras
         }
     for paths in targets.values():
         for path in paths.values():

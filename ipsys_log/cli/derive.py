@@ -22,6 +22,7 @@ from ipsys_log.cli.options import (
     RigFile,
     cameras_of,
     load_calibrations,
+    log_option,
 )
 
 if TYPE_CHECKING:
@@ -72,7 +73,7 @@ OPTIONS: dict[str, tuple[Any, Any]] = {
         None,
     ),
     "output": (
-        Annotated[_Path, typer.Option("--output", "-o", help="Write the results to a new log instead.")],
+        Annotated[_Path, log_option(help="Write the results to a new log instead.")],
         None,
     ),
     "as_live": (
@@ -183,9 +184,12 @@ def _request(logs: list[Path], **given: Any) -> Request:
 
 @contextmanager
 def derived(
-    logs: list[Path], until: str, output: Path | None = None, **given: Any
+    logs: list[Path], until: str, output: Path | None = None, kept: bool = True, **given: Any
 ) -> Iterator[tuple[Session, list[Outcome], list[Accuracy]]]:
-    """Do the stages up to ``until``; the session with the results, what was done, and how accurate it is."""
+    """Do the stages up to ``until``; the session with the results, what was done, and how accurate it is.
+
+    A log that is not ``kept`` is not named.
+    """
     from ipsys_log.log.session import Session
     from ipsys_log.pipeline import replay
     from ipsys_log.report.accuracy import read_accuracy
@@ -196,7 +200,7 @@ def derived(
     written = [output] if output is not None and output.exists() else []
     with Session([*logs, *written]) as session:
         yield session, outcomes, read_accuracy(session, outcomes)
-    _remark(outcomes, [*logs, *written][-1])
+    _remark(outcomes, [*logs, *written][-1] if kept else None)
 
 
 def _derive(
@@ -251,7 +255,7 @@ def _print(outcomes: Sequence[Outcome], accuracies: Sequence[Accuracy], as_json:
             console.print(table)
 
 
-def _remark(outcomes: list[Outcome], target: Path) -> None:
+def _remark(outcomes: list[Outcome], target: Path | None) -> None:
     """What was done, what was found done, and what was left out."""
     for outcome in outcomes:
         state = f"{outcome.messages} messages" if outcome.fresh else "up to date"
@@ -259,7 +263,9 @@ def _remark(outcomes: list[Outcome], target: Path) -> None:
         for remark in outcome.remarks:
             # Names out of a log are not for rich to read as its markup.
             remarks.print(f"  {remark}", style="yellow", markup=False)
+    if target is None:
+        return
     if any(outcome.fresh for outcome in outcomes):
-        remarks.print(f"results are in {target}")
+        remarks.print(f"results are in {target}", markup=False)
     else:
         remarks.print("nothing to do: all of it is up to date")

@@ -2,41 +2,36 @@
 
 from __future__ import annotations
 
-import signal
-from collections.abc import Callable, Iterator
-from contextlib import ExitStack, contextmanager, nullcontext
-from dataclasses import replace
+from collections.abc import Iterator
+from contextlib import contextmanager, nullcontext
 from pathlib import Path
-from tempfile import TemporaryDirectory
-from threading import Timer
-from time import monotonic
 from typing import TYPE_CHECKING, Annotated, Optional
 
 import typer
 
+from ipsys_log.cli.cameras_now import check_target, opened, prepared, say
 from ipsys_log.cli.console import console, remarks
 from ipsys_log.cli.measure import Host, Port
-from ipsys_log.cli.options import Calibrations, Corners, Method, NewLog, load_lab
+from ipsys_log.cli.options import Calibrations, Corners, Method, NewLog
 
 if TYPE_CHECKING:
     from ipsys_log.live_scene import LiveScene
-    from ipsys_log.messages import Message
+    from ipsys_log.messages import Message, Model
     from ipsys_log.pipeline import Watch
-    from ipsys_log.report.cameras import LiveStatus
     from ipsys_log.request import Request
     from ipsys_log.sinks.rerun_live import LiveView
     from ipsys_log.sources.attached import Attached
 
-__all__ = ["add_commands", "recorded_now"]
+__all__ = ["add_commands"]
 
-Lab = Annotated[Path, typer.Option("--rig", help="The rig file; each camera has a source there.")]
+RigNow = Annotated[Path, typer.Option("--rig", help="The rig file; each camera has a source there.")]
 Only = Annotated[
     Optional[list[str]],  # noqa: UP045
     typer.Option("--camera", metavar="NAME", help="Only this camera of the rig; repeat it for several."),
 ]
 Seconds = Annotated[
     Optional[float],  # noqa: UP045
-    typer.Option(min=0.1, help="Stop by itself after so many seconds."),
+    typer.Option(min=0.1, metavar="SECONDS", help="Stop by itself after so many seconds."),
 ]
 View = Annotated[bool, typer.Option("--view", help="Show cameras and robots in Rerun meanwhile.")]
 Force = Annotated[bool, typer.Option("--force", help="Overwrite the log if there is one of that name.")]
@@ -49,7 +44,7 @@ def add_commands(app: typer.Typer) -> None:
 
 def record(
     output: NewLog,
-    rig: Lab = Path("lab.toml"),
+    rig: RigNow = Path("lab.toml"),
     camera: Only = None,
     calibration: Calibrations = None,
     detect: Annotated[bool, typer.Option("--detect", help="Find the markers and write them too.")] = False,
@@ -70,18 +65,28 @@ def record(
 ) -> None:
     """Record the frames of the cameras as they come, until Ctrl-C."""
     from ipsys_log import pipeline
+    from ipsys_log.errors import IpsysError
+    from ipsys_log.live_plan import check_start
+    from ipsys_log.measuring.entry import check_references
     from ipsys_log.request import Request
 
-    with _opened(output, rig, camera, calibration, seconds, force) as (cameras, settings, status):
-        if measure:
-            with _measured(settings, cameras, model_from, host, port) as scene:
-                watch = _both(status, scene)
-                request = Request(corners=corners)
-                pipeline.live(cameras, settings, output, request, "camera-frame", watch, force)
-        elif detect:
-            pipeline.live(cameras, settings, output, Request(corners=corners), "detect", status, force)
-        else:
+    if model_from is not None and not measure:
+        raise IpsysError(f"--model-from {model_from}: has no effect without --measure; to track: ipsys live")
+    lab = prepared(rig, camera, calibration)
+    request = Request(corners=corners)
+    until = "camera-frame" if measure else "detect"
+    fitted = None if model_from is None else _fitted(model_from, lab.names)
+    if measure:
+        check_references(lab.rig)
+    if measure or detect:
+        check_start(lab.rig, lab.names, lab.lenses, request, until)
+    check_target(output, force)
+    with opened(lab, output, seconds) as (cameras, settings, status):
+        if not (measure or detect):
             pipeline.record(cameras, settings, output, status, force)
+            return
+        with _measured(settings, cameras, fitted, host, port) if measure else nullcontext() as scene:
+            pipeline.live(cameras, settings, output, request, until, _both(status, scene), force)
 
 
 def live(
@@ -89,7 +94,7 @@ def live(
     model_from: Annotated[
         Path, typer.Option("--model-from", metavar="LOG", help="The log with the fitted model to apply.")
     ],
-    rig: Lab = Path("lab.toml"),
+    rig: RigNow = Path("lab.toml"),
     model: Annotated[
         Optional[str],  # noqa: UP045
         typer.Option(
@@ -107,43 +112,34 @@ def live(
     """Track robots now: record, and take every frame through all stages up to fuse, until Ctrl-C."""
     from ipsys_log import pipeline
     from ipsys_log.errors import IpsysError
+    from ipsys_log.live_plan import check_start
     from ipsys_log.request import Request
 
     if output.exists() and model_from.exists() and output.samefile(model_from):
         raise IpsysError(f"-o {output}: is the log with the model; give another name")
+    lab = prepared(rig, camera, calibration)
     models = () if model is None else (model,)
     request = Request(models=models, model_from=model_from, corners=corners, method=method)
+    for line in check_start(lab.rig, lab.names, lab.lenses, request, "fuse"):
+        remarks.print(line, style="yellow", markup=False)
+    check_target(output, force)
     with (
-        _opened(output, rig, camera, calibration, seconds, force) as (cameras, settings, status),
+        opened(lab, output, seconds) as (cameras, settings, status),
         _viewed(settings, cameras, request) if view else nullcontext() as viewer,
     ):
         pipeline.live(cameras, settings, output, request, "fuse", _both(status, viewer), force)
 
 
-@contextmanager
-def recorded_now(rig: Path | None, calibration: list[str] | None, seconds: float) -> Iterator[Path]:
-    """A log of what the cameras of a rig send in the next seconds, for as long as the block lasts.
+def _fitted(log: Path, cameras: list[str]) -> Model:
+    """The newest model of another log, which is of some of the cameras."""
+    from ipsys_log.live_plan import check_model
+    from ipsys_log.log.session import Session
+    from ipsys_log.lookup import fitted_in
 
-    Raises
-    ------
-    IpsysError
-        Without a rig, or where its cameras do not send.
-    """
-    from ipsys_log import pipeline
-    from ipsys_log.errors import IpsysError
-
-    if rig is None:
-        raise IpsysError("name a log, or give --rig lab.toml to take what its cameras send now")
-    with TemporaryDirectory(prefix="ipsys-") as folder:
-        log = Path(folder) / "now.mcap"
-        with _opened(log, rig, None, calibration, seconds, force=False, kept=False) as opened:
-            cameras, settings, status = opened
-            pipeline.record(cameras, settings, log, status)
-        yield log
-
-
-def _say(text: str) -> None:
-    remarks.print(text, markup=False)
+    with Session([log]) as other:
+        model, _ = fitted_in(other, None)
+    check_model(model, cameras)
+    return model
 
 
 def _both(first: Watch, second: Watch | None) -> Watch:
@@ -157,18 +153,12 @@ def _both(first: Watch, second: Watch | None) -> Watch:
 
 @contextmanager
 def _measured(
-    settings: list[Message], cameras: Attached, model_from: Path | None, host: str | None, port: int
+    settings: list[Message], cameras: Attached, model: Model | None, host: str | None, port: int
 ) -> Iterator[LiveScene]:
     """The page on which places are measured while they are recorded."""
     from ipsys_log.live_scene import LiveScene
-    from ipsys_log.log.session import Session
-    from ipsys_log.lookup import fitted_in
     from ipsys_log.web.serving import qr_code, serving
 
-    model = None
-    if model_from is not None:
-        with Session([model_from]) as other:
-            model, _ = fitted_in(other, None)
     scene = LiveScene(settings[0].payload, model, list(cameras.states), cameras.add)
     with serving(scene, host, port) as page:
         if host is not None:
@@ -184,66 +174,4 @@ def _viewed(settings: list[Message], cameras: Attached, request: Request) -> Liv
     from ipsys_log.tasks import model_run
 
     (model,) = wanted_models(request, "fuse")
-    return LiveView(settings[0].payload, cameras.states, model_run(model), _say)
-
-
-@contextmanager
-def _opened(
-    output: Path,
-    rig: Path,
-    only: list[str] | None,
-    calibration: list[str] | None,
-    seconds: float | None,
-    force: bool,
-    kept: bool = True,
-) -> Iterator[tuple[Attached, list[Message], LiveStatus]]:
-    """Cameras that send, what is written first, and what is shown on the screen meanwhile."""
-    from rich.live import Live
-
-    from ipsys_log.monitor import Monitor
-    from ipsys_log.recording import first_messages, fitting_lenses
-    from ipsys_log.report.cameras import LiveStatus
-    from ipsys_log.sources.attached import Attached
-    from ipsys_log.sources.devices import check_devices, open_source, usb_advice
-    from ipsys_log.sources.frames import Clock
-
-    lab, cameras, lenses = load_lab(rig, calibration, only or ())
-    check_devices(cameras)
-    for line in usb_advice(replace(lab, cameras=tuple(cameras))):
-        remarks.print(line, style="yellow", markup=False)
-    _check_target(output, force)
-    with ExitStack() as stack:
-        with remarks.status("opening " + ", ".join(camera.name for camera in cameras)):
-            attached = stack.enter_context(Attached(cameras, open_source, Clock(), _say))
-        sizes_px = {name: state.size_px for name, state in attached.states.items()}
-        lenses = fitting_lenses(lenses, sizes_px, _say)
-        _stop_on_signals(attached.stop)
-        if seconds is not None:
-            timer = Timer(seconds, attached.stop)
-            stack.callback(timer.cancel)
-            timer.start()
-        status = LiveStatus(attached.states, stack.enter_context(Monitor(lab)), output, monotonic)
-        what = f"recording into {output}; Ctrl-C ends it" if kept else f"looking for {seconds:g} s"
-        remarks.print(what)
-        if remarks.is_terminal:
-            stack.enter_context(
-                Live(get_renderable=status.show, console=remarks, transient=True, refresh_per_second=2)
-            )
-        yield attached, first_messages(lab, lenses, attached.now_ns), status
-    for line in status.summary() if kept else ():
-        console.print(line)
-
-
-def _check_target(output: Path, force: bool) -> None:
-    from ipsys_log.errors import IpsysError
-
-    if output.exists() and not force:
-        raise IpsysError(f"{output}: exists already; give another name, or --force to overwrite it")
-    if not output.absolute().parent.is_dir():
-        raise IpsysError(f"{output}: there is no folder {output.parent}; make it first")
-
-
-def _stop_on_signals(stop: Callable[[], None]) -> None:
-    """End cleanly: what the cameras have sent by then is written."""
-    for number in (signal.SIGINT, signal.SIGTERM):
-        signal.signal(number, lambda *_: stop())
+    return LiveView(settings[0].payload, cameras.states, model_run(model), say)

@@ -25,6 +25,7 @@ from ipsys_log.messages import (
     image_topic,
 )
 from ipsys_log.sources.frames import Clock, Frame, Open, Say, SourceError, instant_ns
+from ipsys_log.sources.network import hide_password
 from ipsys_log.sources.videos import frame_payload
 from ipsys_log.units import NS_PER_S
 
@@ -35,6 +36,8 @@ _LIMIT_BYTES = 256 << 20
 _TICK_S = 0.1
 # A camera that opens and then sends nothing is not there.
 _FIRST_FRAME_S = 10.0
+# The simulator draws its frames first, however busy the machine is.
+_DRAW_S = 120.0
 _REMEMBERED = 20_000
 _RETRY_S, _LONGEST_RETRY_S = 0.5, 8.0
 
@@ -191,12 +194,14 @@ class Attached:
     def _wait_for(self, camera: RigCamera) -> None:
         state = self.states[camera.name]
         state.opened.wait()
-        begun = state.begun.wait(_FIRST_FRAME_S)
+        simulated = str(camera.source).startswith("sim:")
+        begun = state.begun.wait(_DRAW_S if simulated else _FIRST_FRAME_S)
         if state.failure is not None:
             raise state.failure
         if not begun:
             raise SourceError(
-                f"camera {camera.name}: {camera.source} sends no frames; look whether another program uses it"
+                f"camera {camera.name}: {hide_password(str(camera.source))} sends no frames; look whether "
+                "another program uses it"
             )
 
     # --- the threads ----------------------------------------------------------------------------

@@ -1,0 +1,156 @@
+"""Cameras of a rig that are opened for a command; first everything is said that can be said before."""
+
+from __future__ import annotations
+
+import signal
+from collections.abc import Callable, Iterator
+from contextlib import ExitStack, contextmanager
+from dataclasses import replace
+from pathlib import Path
+from tempfile import TemporaryDirectory
+from threading import Timer
+from time import monotonic
+from typing import TYPE_CHECKING, NamedTuple
+
+from ipsys_log.cli.console import console, remarks
+from ipsys_log.cli.options import load_lab
+
+if TYPE_CHECKING:
+    from ipsys_log.messages import CameraCalibration, Message, Rig, RigCamera
+    from ipsys_log.report.cameras import LiveStatus
+    from ipsys_log.sources.attached import Attached
+
+__all__ = ["Lab", "check_target", "opened", "prepared", "recorded_now", "say"]
+
+
+class Lab(NamedTuple):
+    """What is to be opened: the rig, its cameras, and their lenses by name."""
+
+    rig: Rig
+    cameras: list[RigCamera]
+    lenses: dict[str, CameraCalibration]
+
+    @property
+    def names(self) -> list[str]:
+        return [camera.name for camera in self.cameras]
+
+
+def say(text: str) -> None:
+    """A remark, as it is."""
+    remarks.print(text, markup=False)
+
+
+def prepared(
+    rig: Path, only: list[str] | None, calibration: list[str] | None, with_lenses: bool = True
+) -> Lab:
+    """The cameras of a rig file; nothing is opened yet.
+
+    Parameters
+    ----------
+    only : the names of some cameras; otherwise all that have a source.
+    with_lenses : read the lenses that the rig names, too; not where they are still to be made.
+
+    Raises
+    ------
+    IpsysError
+        For what is wrong with the rig, the source of a camera, or the file of a lens.
+    """
+    from ipsys_log.sources.devices import check_devices, check_sources, usb_advice
+
+    lab = Lab(*load_lab(rig, calibration, only or (), with_lenses))
+    check_sources(lab.cameras)
+    check_devices(lab.cameras)
+    for line in usb_advice(replace(lab.rig, cameras=tuple(lab.cameras))):
+        remarks.print(line, style="yellow", markup=False)
+    for camera in lab.cameras:
+        if camera.width and camera.height and camera.width < camera.height:
+            text = f"camera {camera.name}: {camera.width} x {camera.height} px is upright"
+            remarks.print(f"{text}: are width and height exchanged?", style="yellow", markup=False)
+    return lab
+
+
+def check_target(output: Path, force: bool) -> None:
+    """See that a log can be written.
+
+    Raises
+    ------
+    IpsysError
+        Where there is one already, or its folder is not there, or takes no files.
+    """
+    from ipsys_log.errors import IpsysError
+    from ipsys_log.report.files import check_file
+
+    check_file(output, "-o", [])
+    if output.exists() and not force:
+        raise IpsysError(f"{output}: exists already; give another name, or --force to overwrite it")
+
+
+@contextmanager
+def opened(
+    lab: Lab, output: Path, seconds: float | None, kept: bool = True
+) -> Iterator[tuple[Attached, list[Message], LiveStatus]]:
+    """Cameras that send, what is written first, and what is shown on the screen meanwhile.
+
+    Raises
+    ------
+    IpsysError
+        Where a camera cannot be opened, or its frames do not fit its lens.
+    """
+    from rich.live import Live
+
+    from ipsys_log.monitor import Monitor
+    from ipsys_log.recording import first_messages, fitting_lenses
+    from ipsys_log.report.cameras import LiveStatus
+    from ipsys_log.sources.attached import Attached
+    from ipsys_log.sources.devices import open_source
+    from ipsys_log.sources.frames import Clock
+
+    with ExitStack() as stack:
+        with remarks.status("opening " + ", ".join(lab.names)):
+            attached = stack.enter_context(Attached(lab.cameras, open_source, Clock(), say))
+        sizes_px = {name: state.size_px for name, state in attached.states.items()}
+        lenses = fitting_lenses(lab.lenses, sizes_px, say)
+        _stop_on_signals(attached.stop)
+        if seconds is not None:
+            timer = Timer(seconds, attached.stop)
+            stack.callback(timer.cancel)
+            timer.start()
+        status = LiveStatus(attached.states, stack.enter_context(Monitor(lab.rig)), output, monotonic)
+        say(f"recording into {output}; Ctrl-C ends it" if kept else f"looking for {seconds:g} s")
+        if remarks.is_terminal:
+            stack.enter_context(
+                Live(get_renderable=status.show, console=remarks, transient=True, refresh_per_second=2)
+            )
+        yield attached, first_messages(lab.rig, lenses, attached.now_ns), status
+    for line in status.summary() if kept else ():
+        console.print(line, markup=False)
+
+
+def _stop_on_signals(stop: Callable[[], None]) -> None:
+    """End cleanly: what the cameras have sent by then is written."""
+    for number in (signal.SIGINT, signal.SIGTERM):
+        signal.signal(number, lambda *_: stop())
+
+
+@contextmanager
+def recorded_now(lab: Lab, seconds: float, keep: Path | None = None) -> Iterator[Path]:
+    """A log of what cameras send in the next seconds; without ``keep`` only for as long as the block lasts.
+
+    Raises
+    ------
+    IpsysError
+        Where the cameras do not send. What the block complains of is not said of a file that nobody knows.
+    """
+    from ipsys_log import pipeline
+    from ipsys_log.errors import IpsysError
+
+    with TemporaryDirectory(prefix="ipsys-") as folder:
+        log = keep or Path(folder) / "now.mcap"
+        with opened(lab, log, seconds, kept=keep is not None) as (cameras, settings, status):
+            pipeline.record(cameras, settings, log, status)
+        try:
+            yield log
+        except IpsysError as error:
+            if keep is not None:
+                raise
+            raise IpsysError(str(error).replace(str(log), "what the cameras sent")) from error

@@ -31,7 +31,10 @@ NoLogs = Annotated[
     typer.Argument(help="Logs, read as one. Results go to the last.", metavar="[LOG]..."),
 ]
 Plot = Annotated[
-    Path | None, typer.Option(metavar="FILE", help="Draw the floor map and the pictures of the cameras: PNG.")
+    Path | None,
+    typer.Option(
+        metavar="FILE", help="Draw the floor map and the pictures of the cameras: .png, .pdf, .svg or .jpg."
+    ),
 ]
 Output = Annotated[
     Path | None,
@@ -62,10 +65,10 @@ def align(
     overlap by less than a marker. What it needs and the log does not hold yet is made first. Without a log
     it looks at what the cameras of the rig send now.
     """
-    from ipsys_log.report.files import check_file
+    from ipsys_log.report.files import check_picture
 
     if plot is not None:
-        check_file(plot, "--plot", logs or [])
+        check_picture(plot, "--plot", logs or [])
     if logs:
         options: dict[str, Any] = {
             "rig": rig,

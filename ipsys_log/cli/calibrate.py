@@ -64,7 +64,9 @@ Formats = Annotated[
     Optional[list[str]],  # noqa: UP045
     typer.Option("--format", metavar="NAME", help="opencv (the default), ros or kalibr; repeat for several."),
 ]
-Plot = Annotated[Path | None, typer.Option(metavar="FILE", help="Draw coverage and residuals: PNG.")]
+Plot = Annotated[
+    Path | None, typer.Option(metavar="FILE", help="Draw coverage and residuals: .png, .pdf, .svg or .jpg.")
+]
 Force = Annotated[bool, typer.Option("--force", help="Write over files that exist.")]
 
 
@@ -98,7 +100,7 @@ def calibrate(
     from ipsys_log.calibration.pictures import find_sources
     from ipsys_log.formats.calibration_yaml import check_format
     from ipsys_log.report.calibration import calibration_json
-    from ipsys_log.report.files import check_file
+    from ipsys_log.report.files import check_picture
 
     model = find_lens(lens)
     wanted = parse_board(board, square, marker_scale, dictionary, inverted)
@@ -106,7 +108,7 @@ def calibrate(
     for name in names:
         check_format(name, lens)
     if plot is not None:
-        check_file(plot, "--plot", sources or [])
+        check_picture(plot, "--plot", sources or [])
         _check_free(plot, force)
     lab = None if sources else _prepared_now(rig, camera)
     if lab is not None:
@@ -206,9 +208,9 @@ def _write(lenses: list[Calibrated], targets: dict[str, dict[str, Path]]) -> dic
 def _draw(lenses: list[Calibrated], plot: Path) -> None:
     from ipsys_log.report.calibration_figure import calibration_figure
     from ipsys_log.report.files import write_files
-    from ipsys_log.report.pictures import png
+    from ipsys_log.report.pictures import picture
 
-    write_files(plot.parent, {plot.name: png(calibration_figure(lenses), dpi=110)})
+    write_files(plot.parent, {plot.name: picture(calibration_figure(lenses), plot, 110)})
 
 
 def _show(one: Calibrated, files: list[Path], for_rig: bool) -> None:

@@ -83,7 +83,7 @@ def latency(
     logs: Logs,
     plot: Annotated[
         Optional[Path],  # noqa: UP045
-        typer.Option(help="Draw the steps into a PNG."),
+        typer.Option(metavar="FILE", help="Draw the steps: .png, .pdf, .svg or .jpg."),
     ] = None,
     as_json: AsJson = False,
 ) -> None:
@@ -92,14 +92,15 @@ def latency(
 
     from ipsys_log.latency import latency_percentiles, recorded_latencies, step_times_s
     from ipsys_log.report.cameras import latency_table
+    from ipsys_log.report.files import check_picture
 
+    if plot is not None:
+        check_picture(plot, "--plot", logs)
     times_s = step_times_s(recorded_latencies(logs))
     steps = latency_percentiles(times_s)
     if plot is not None:
-        from ipsys_log.report.files import check_file
         from ipsys_log.report.latency_figure import draw_latency
 
-        check_file(plot, "--plot", logs)
         draw_latency(times_s, plot)
         remarks.print(f"{plot} drawn", markup=False)
     if as_json:

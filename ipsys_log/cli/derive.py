@@ -92,7 +92,13 @@ OPTIONS: dict[str, tuple[Any, Any]] = {
         ],
         False,
     ),
-    "plot": (Annotated[_Path, typer.Option(help="Draw the floor and the errors into a PNG.")], None),
+    "plot": (
+        Annotated[
+            _Path,
+            typer.Option(metavar="FILE", help="Draw the floor and the errors: .png, .pdf, .svg or .jpg."),
+        ],
+        None,
+    ),
     "plots": (
         Annotated[_Path, typer.Option(metavar="DIR", help="Write the paper's tables and figures, and more.")],
         None,
@@ -211,10 +217,10 @@ def _derive(
     plots: Path | None = None,
     **given: Any,
 ) -> None:
-    from ipsys_log.report.files import check_file, check_folder
+    from ipsys_log.report.files import check_folder, check_picture
 
     if plot is not None:
-        check_file(plot, "--plot", logs)
+        check_picture(plot, "--plot", logs)
     if plots is not None:
         check_folder(plots, "--plots")
     with derived(logs, until, **given) as (session, outcomes, accuracies):

@@ -38,7 +38,10 @@ Heights = Annotated[
 ]
 Train = Annotated[str, typer.Option(help="Fit on the measurements with this label.")]
 Plot = Annotated[
-    Path | None, typer.Option(metavar="FILE", help="Draw the error over the floor, before and after: PNG.")
+    Path | None,
+    typer.Option(
+        metavar="FILE", help="Draw the error over the floor, before and after: .png, .pdf, .svg or .jpg."
+    ),
 ]
 
 
@@ -63,7 +66,7 @@ def plan(
     """
     from ipsys_log.lookup import copied_run
     from ipsys_log.messages import Rig
-    from ipsys_log.report.files import check_file
+    from ipsys_log.report.files import check_picture
     from ipsys_log.report.plan import plan_floor
     from ipsys_log.rig import load_rig
     from ipsys_log.sinks.shown import rig_in_force
@@ -72,7 +75,7 @@ def plan(
     lenses = load_calibrations(calibration, lambda: cameras_of(logs))
     _check(logs, given, model, places, height_m or ())
     if plot is not None:
-        check_file(plot, "--plot", logs)
+        check_picture(plot, "--plot", logs)
     options: dict[str, Any] = {"train": train, "rig": rig, "calibration": calibration, "run": None}
     with derived(logs, "fit", model=[model], **options) as (session, outcomes, _):
         fitted = [outcome.run for outcome in outcomes if outcome.stage == "fit"]

@@ -20,7 +20,7 @@ from ipsys_log.report.alignment import AlignedLab
 from ipsys_log.report.files import write_files
 from ipsys_log.report.floor_panel import draw_ground
 from ipsys_log.report.palette import NOTE, REST, camera_styles
-from ipsys_log.report.pictures import png, shorten
+from ipsys_log.report.pictures import picture, shorten
 from ipsys_log.units import CM_PER_M
 
 __all__ = ["draw_alignment"]
@@ -37,12 +37,12 @@ _NEAR, _FAR = "#0072B2", "#D55E00"
 
 
 def draw_alignment(lab: AlignedLab, path: Path) -> None:
-    """Draw into a PNG: on the left the floor map, where it is known; on the right each camera's picture with
+    """Draw: on the left the floor map, where it is known; on the right each camera's picture with
     its markers, by how much Zc there is off the middle one, and an arrow to where it has to look.
 
     Parameters
     ----------
-    path : the picture, in place of one that is there already.
+    path : the picture, of the kind that its suffix says, in place of one that is there already.
     """
     floor = lab.coverage is not None
     columns = -(-len(lab.alignments) // _ROWS)
@@ -61,7 +61,7 @@ def draw_alignment(lab: AlignedLab, path: Path) -> None:
         height_in = _PANEL_IN * 9 / 16
         box = (x_in / size[0], y_in / size[1], _PANEL_IN / size[0], height_in / size[1])
         _draw_picture(figure.add_axes(box), alignment, lab.lenses)
-    write_files(path.parent, {path.name: png(figure, _DPI)})
+    write_files(path.parent, {path.name: picture(figure, path, _DPI)})
 
 
 def _draw_floor(axes: Axes, lab: AlignedLab, coverage: Coverage) -> None:

@@ -72,17 +72,17 @@ class LiveStatus:
         now_s = self._now_s()
         for name, state in self._states.items():
             self._rates[name] = self._rate(name, state, now_s)
-        parts: list[Table | str] = [
+        parts: list[Table | Text] = [
             cameras_table(self._states, self._monitor.looks, self._rates, self._delays_s)
         ]
         if self._tracks:
             parts.append(robots_table(self._tracks))
-        parts += self._warnings()
+        # Text, for there are brackets in it that rich would take for its own.
+        parts += [Text(line, style="yellow") for line in self._warnings()]
         size = self._target.stat().st_size if self._target.exists() else 0
         free = shutil.disk_usage(self._target.absolute().parent).free
-        parts.append(
-            f"{now_s - self._begin_s:.0f} s, {format_bytes(size)}; {format_bytes(free)} left on the disk"
-        )
+        took = f"{now_s - self._begin_s:.0f} s, {format_bytes(size)}; {format_bytes(free)} left on the disk"
+        parts.append(Text(took))
         return Group(*parts)
 
     def summary(self) -> list[str]:
@@ -149,9 +149,15 @@ def cameras_table(
             delay,
             f"{look.brightness:.0f}" if look else "-",
             f"{100 * look.sharpness:.0f} %" if look else "-",
-            ", ".join(map(str, look.markers)) or "none" if look else "-",
+            _markers(look) if look else "-",
         )
     return table
+
+
+def _markers(look: Look) -> Text:
+    """The ids of a picture; those that are not in the rig with a question mark."""
+    ids = [Text(str(n)) for n in look.markers] + [Text(f"{n}?", style="yellow") for n in look.strange]
+    return Text(", ").join(ids) if ids else Text("none")
 
 
 def latency_table(steps: Mapping[str, Percentiles]) -> Table:

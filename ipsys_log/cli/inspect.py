@@ -30,7 +30,9 @@ def info(logs: Logs, as_json: AsJson = False) -> None:
     if as_json:
         print(json.dumps(found, indent=2))  # noqa: T201
     else:
-        for table in contents_tables(found):
+        for number, table in enumerate(contents_tables(found)):
+            if number:
+                console.print()
             console.print(table)
 
 

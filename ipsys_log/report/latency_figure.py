@@ -56,11 +56,11 @@ def _draw_steps(axes: Axes, times_s: Mapping[str, NDArray[np.float64]]) -> None:
     rows = np.arange(len(_COLOURS))
     found_ms = np.array([np.percentile(times_s[step], [50, 99]) for step in _COLOURS]) * 1e3
     axes.barh(rows, found_ms[:, 1], color=_FAR, label="99 % of positions")
-    axes.barh(rows, found_ms[:, 0], color=list(_COLOURS.values()), height=0.5, label="median (coloured)")
+    axes.barh(rows, found_ms[:, 0], color=list(_COLOURS.values()), height=0.5, label="median")
     for row, (median_ms, far_ms) in enumerate(found_ms):
         text = f"{median_ms:.1f}, 99 %: {far_ms:.1f}"
         axes.annotate(text, (far_ms, row), (5, 0), textcoords="offset points", va="center", fontsize=9)
-    axes.set_xlim(0, 1.35 * float(found_ms[:, 1].max()))
+    axes.set_xlim(0, 1.5 * float(found_ms[:, 1].max()))
     axes.set_yticks(rows, list(_COLOURS))
     axes.invert_yaxis()
     axes.set(xlabel="ms for the step")

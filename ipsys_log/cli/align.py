@@ -58,7 +58,7 @@ def align(
     output: Output = None,
     as_json: AsJson = False,
 ) -> None:
-    """Which way to tilt each camera so that it looks straight down, and what of the floor they all see.
+    """Say which way to tilt each camera so that it looks straight down, and what of the floor they all see.
 
     From markers that lie on the floor, four or more in each picture, or one that is laid down at one place
     after the other. Where places were measured, also the floor that no camera sees, and where neighbours

@@ -24,7 +24,10 @@ Sources = Annotated[
     typer.Argument(help="Logs, folders of pictures, pictures, videos.", metavar="[SOURCE]..."),
 ]
 RigNow = Annotated[
-    Path | None, typer.Option("--rig", help="Without a source: take what the cameras of this rig send now.")
+    Path | None,
+    typer.Option(
+        "--rig", metavar="FILE", help="Without a source: take what the cameras of this rig send now."
+    ),
 ]
 Seconds = Annotated[
     float, typer.Option(min=1.0, metavar="SECONDS", help="How long to take it, while you move the board.")
@@ -37,12 +40,12 @@ BoardName = Annotated[
     ),
 ]
 Square = Annotated[
-    float, typer.Option(metavar="METRES", help="Side of a square. The lens does not depend on it.")
+    float, typer.Option(metavar="METRES", help="Side of a square, in m. The lens does not depend on it.")
 ]
 MarkerScale = Annotated[
     float, typer.Option(metavar="SHARE", help="Side of a ChArUco board's markers, as a share of a square's.")
 ]
-Dictionary = Annotated[str, typer.Option(metavar="NAME", help="Of a ChArUco board's markers.")]
+Dictionary = Annotated[str, typer.Option(metavar="NAME", help="The dictionary of a ChArUco board's markers.")]
 Inverted = Annotated[bool, typer.Option("--inverted", help="Black and white of the board are exchanged.")]
 Lens = Annotated[
     str,
@@ -54,7 +57,11 @@ Lens = Annotated[
 ]
 Cameras = Annotated[
     Optional[list[str]],  # noqa: UP045
-    typer.Option(metavar="CAMERA", help="Of a log: only these. Else the name of the camera."),
+    typer.Option(
+        metavar="CAMERA",
+        help="Only this camera of the log or the rig; repeat it for several. With pictures or a video: the "
+        "name of the camera.",
+    ),
 ]
 Output = Annotated[
     Path,
@@ -91,9 +98,10 @@ def calibrate(
     force: Force = False,
     as_json: AsJson = False,
 ) -> None:
-    """The lens of a camera from pictures of a chessboard or a ChArUco board.
+    """Find the lens of a camera from pictures of a chessboard or a ChArUco board.
 
-    One file for each camera that saw the board. Sharp pictures that differ are chosen by themselves."""
+    One file for each camera that saw the board, with the name of the camera. Sharp pictures that differ are
+    chosen by themselves; two dozen from all parts of the picture are enough."""
     from ipsys_log.calibration.boards import parse_board
     from ipsys_log.calibration.cameras import calibrate_cameras
     from ipsys_log.calibration.lens_models import find_lens

@@ -28,7 +28,7 @@ def add_commands(app: typer.Typer) -> None:
 
 def verify(
     logs: Logs,
-    run: Annotated[_Run, typer.Option("--run", help="Only this run.")] = None,
+    run: Annotated[_Run, typer.Option("--run", metavar="NAME", help="Only this run.")] = None,
     as_json: AsJson = False,
 ) -> None:
     """Make every run of a log again from what it read, and compare each channel byte for byte.
@@ -55,7 +55,11 @@ def diff(
     second: Annotated[Path, typer.Argument(help="The log to compare with; may be the same one.")],
     run: Annotated[
         Optional[list[str]],  # noqa: UP045
-        typer.Option("--run", help="The run of both logs; or twice: that of the first, that of the second."),
+        typer.Option(
+            "--run",
+            metavar="NAME",
+            help="The run of both logs; or twice: that of the first, that of the second.",
+        ),
     ] = None,
     as_json: AsJson = False,
 ) -> None:
@@ -87,7 +91,7 @@ def latency(
     ] = None,
     as_json: AsJson = False,
 ) -> None:
-    """How long each step took when a log was recorded live, from the frame to its position."""
+    """Show how long each step took when a log was recorded live, from the frame to its position."""
     from dataclasses import asdict
 
     from ipsys_log.latency import latency_percentiles, recorded_latencies, step_times_s

@@ -57,10 +57,15 @@ OPTIONS: dict[str, tuple[Any, Any]] = {
         None,
     ),
     "train": (
-        Annotated[str, typer.Option(help="Fit on the measurements with this label.")],
+        Annotated[str, typer.Option(metavar="LABEL", help="Fit on the measurements with this label.")],
         "train",
     ),
-    "seed": (Annotated[int, typer.Option(min=0, help="Of random splits, folds and subsets.")], 0),
+    "seed": (
+        Annotated[
+            int, typer.Option(min=0, metavar="N", help="The seed of random splits, folds and subsets.")
+        ],
+        0,
+    ),
     "rig": (RigFile, None),
     "calibration": (Calibrations, None),
     "corners": (Corners, None),
@@ -68,7 +73,9 @@ OPTIONS: dict[str, tuple[Any, Any]] = {
     "run": (
         Annotated[
             Optional[str],  # noqa: UP045
-            typer.Option("--run", help="A name for the new run, instead of edges, poly, poly_2 ..."),
+            typer.Option(
+                "--run", metavar="NAME", help="A name for the new run, instead of edges, poly, poly_2 ..."
+            ),
         ],
         None,
     ),
@@ -121,7 +128,7 @@ _DETECT = tuple(name for name in _FRAMES if name != "method")
 _MODELS = tuple(name for name in OPTIONS if name not in ("plot", "plots"))
 EVALUATE = (*_MODELS, "plots")
 
-MORE = "What it needs and the log does not hold yet is made first."
+MORE = "\n\nWhat it needs and the log does not hold yet is made first."
 _COMMANDS: dict[str, tuple[str, tuple[str, ...], str]] = {
     "replay": (
         "fuse",
@@ -132,17 +139,18 @@ _COMMANDS: dict[str, tuple[str, tuple[str, ...], str]] = {
     "camera-frame": (
         "camera-frame",
         _FRAMES,
-        f"Put the markers into the frame of their camera. {MORE}",
+        f"Put the markers into the frame of their camera.{MORE}",
     ),
-    "fit": ("fit", _MODELS, f"Fit models to the measured places (poly, unless you say which). {MORE}"),
+    "fit": ("fit", _MODELS, f"Fit models to the measured places (poly, unless you say which).{MORE}"),
     "evaluate": (
         "evaluate",
         EVALUATE,
-        "Say how far models are off on places held out and by cross-validation, how many places are enough, "
-        f"and which look wrongly measured: for all models, unless you say which. {MORE}",
+        "Say how far models are off, how many places are enough, and which look wrongly measured.\n\n"
+        "For all models, unless you say which; on places held out, and by cross-validation, which takes each "
+        f"part of the places in turn.{MORE}",
     ),
-    "locate": ("locate", _MODELS, f"Apply a model: world positions for each camera. {MORE}"),
-    "fuse": ("fuse", _MODELS, f"One pose per robot from all cameras that see it. {MORE}"),
+    "locate": ("locate", _MODELS, f"Apply a model: world positions for each camera.{MORE}"),
+    "fuse": ("fuse", _MODELS, f"One pose per robot from all cameras that see it.{MORE}"),
 }
 
 

@@ -21,7 +21,7 @@ def add_commands(app: typer.Typer) -> None:
 
 
 def info(logs: Logs, as_json: AsJson = False) -> None:
-    """Cameras, channels, counts, rates, gaps and runs of a log."""
+    """Show cameras, channels, counts, rates, gaps and runs of a log."""
     from ipsys_log.log.session import Session
     from ipsys_log.report.contents import contents_json, contents_tables
 
@@ -37,7 +37,7 @@ def info(logs: Logs, as_json: AsJson = False) -> None:
 
 
 def runs(logs: Logs, as_json: AsJson = False) -> None:
-    """The runs of a log: stage, what it was made from, with which parameters, by which ipsys."""
+    """Show the runs of a log: stage, what it was made from, with which parameters, by which ipsys."""
     from ipsys_log.log.session import Session
     from ipsys_log.report.contents import runs_json, runs_table
 

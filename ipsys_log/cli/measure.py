@@ -34,11 +34,14 @@ Host = Annotated[
     typer.Option(
         "--host",
         metavar="ADDRESS",
-        help="Let others in the network open the page, by an address with a secret of this one start; "
-        "0.0.0.0 for all of this machine's addresses. Without it: this machine alone.",
+        help="Let a phone in this network open the page, at 0.0.0.0 (all addresses of this machine) or at one "
+        "of them. It is shown with a secret that is new at each start. Without it: this machine alone.",
     ),
 ]
-Port = Annotated[int, typer.Option(min=0, max=65535, help="Of the page; 0 takes any that is free.")]
+Port = Annotated[
+    int,
+    typer.Option(min=0, max=65535, metavar="PORT", help="The port of the page; 0 takes any that is free."),
+]
 
 
 def add_commands(app: typer.Typer) -> None:

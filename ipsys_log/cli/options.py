@@ -47,7 +47,8 @@ def _named_as_log(path: Path | None) -> Path | None:
 log_option = partial(typer.Option, "--output", "-o", metavar="LOG", callback=_named_as_log)
 NewLog = Annotated[Path, log_option(help="The log to write, a file that ends in .mcap.")]
 RigFile = Annotated[
-    Path | None, typer.Option("--rig", help="A rig file (lab.toml) to use instead of what the log holds.")
+    Path | None,
+    typer.Option("--rig", metavar="FILE", help="A rig file (lab.toml) to use instead of what the log holds."),
 ]
 Calibrations = Annotated[
     Optional[list[str]],  # noqa: UP045
@@ -72,7 +73,8 @@ Method = Annotated[
     typer.Option(
         "--method",
         metavar="NAME",
-        help="Places markers by their perimeter (eq. 3 to 5 of the paper), or by their pose (tilted too).",
+        help="How markers are placed: by their perimeter (eq. 3 to 5 of the paper; for level ones), or by "
+        "their pose (tilted ones too).",
     ),
 ]
 AsJson = Annotated[bool, typer.Option("--json", help="Print JSON.")]

@@ -33,10 +33,11 @@ Heights = Annotated[
     typer.Option(
         "--height-m",
         metavar="METRES",
-        help="Of the marker above the floor; repeat for several. Else the heights used so far, in turn.",
+        help="Height of the marker above the floor; repeat it for several. Else the heights used so far, in "
+        "turn.",
     ),
 ]
-Train = Annotated[str, typer.Option(help="Fit on the measurements with this label.")]
+Train = Annotated[str, typer.Option(metavar="LABEL", help="Fit on the measurements with this label.")]
 Plot = Annotated[
     Path | None,
     typer.Option(
@@ -60,7 +61,7 @@ def plan(
     plot: Plot = None,
     as_json: AsJson = False,
 ) -> None:
-    """The next places to measure: those that lower the predicted error over the floor most.
+    """Say where to measure next: the places that lower the predicted error over the floor most.
 
     A model that the log does not hold yet is fitted first, to the places measured so far.
     """

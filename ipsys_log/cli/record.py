@@ -24,7 +24,9 @@ if TYPE_CHECKING:
 
 __all__ = ["add_commands"]
 
-RigNow = Annotated[Path, typer.Option("--rig", help="The rig file; each camera has a source there.")]
+RigNow = Annotated[
+    Path, typer.Option("--rig", metavar="FILE", help="The rig file; each camera has a source there.")
+]
 Only = Annotated[
     Optional[list[str]],  # noqa: UP045
     typer.Option("--camera", metavar="NAME", help="Only this camera of the rig; repeat it for several."),

@@ -21,9 +21,9 @@ __all__ = ["contents_json", "contents_tables", "runs_json", "runs_table"]
 _GAP_FACTOR = 3
 _MERGED_GAP_S = 0.5
 # What comes frame by frame; nothing else has a rate.
-_OF_FRAMES = frozenset(
-    ("Image", "CompressedImage", "CompressedVideo", "Markers", "ImageAnnotations", "CameraPoints")
-    + ("Positions", "Tracks", "FrameTransforms")
+_OF_FRAMES = (
+    *("Image", "CompressedImage", "CompressedVideo", "Markers", "ImageAnnotations", "CameraPoints"),
+    *("Positions", "Tracks", "FrameTransforms"),
 )
 
 

@@ -103,7 +103,5 @@ class Monitor:
 def _unknown(ids: tuple[int, ...]) -> str:
     """What to do about markers that are in the picture and not in the rig."""
     names = ", ".join(map(str, ids))
-    which = f"marker {names} is seen, but" if len(ids) == 1 else f"markers {names} are seen, but"
-    return (
-        f"{which} not in the rig, and left out; to track it, add to lab.toml: [[markers]] with id = {ids[0]}"
-    )
+    which, them = (f"marker {names} is", "it") if len(ids) == 1 else (f"markers {names} are", "each of them")
+    return f"{which} seen, but not in the rig; to track {them}, add to lab.toml: [[markers]] id = {ids[0]}"

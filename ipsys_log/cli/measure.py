@@ -34,8 +34,8 @@ Host = Annotated[
     typer.Option(
         "--host",
         metavar="ADDRESS",
-        help="Let a phone in this network open the page, at 0.0.0.0 (all addresses of this machine) or at one "
-        "of them. It is shown with a secret that is new at each start. Without it: this machine alone.",
+        help="Let a phone in this network open the page, at 0.0.0.0 (all addresses of this machine) or at "
+        "one of them. It is shown with a secret that is new at each start. Without it: this machine alone.",
     ),
 ]
 Port = Annotated[

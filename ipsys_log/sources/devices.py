@@ -69,7 +69,7 @@ def check_sources(cameras: Iterable[RigCamera]) -> None:
             check_played(camera)
         elif sys.platform == "linux" and not Path(device_of(source)).exists():
             raise IpsysError(
-                f"camera {camera.name}: there is no device {device_of(source) or source!r}; 'ipsys cameras' "
+                f"camera {camera.name}: there is no device {device_of(source)!r}; 'ipsys cameras' "
                 "lists what is attached"
             )
 

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import os
 import signal
 from collections.abc import Callable, Iterator
 from contextlib import ExitStack, contextmanager
@@ -58,8 +59,8 @@ def prepared(
     from ipsys_log.sources.devices import check_devices, check_sources, usb_advice
 
     lab = Lab(*load_lab(rig, calibration, only or (), with_lenses))
-    check_sources(lab.cameras)
     check_devices(lab.cameras)
+    check_sources(lab.cameras)
     for line in usb_advice(replace(lab.rig, cameras=tuple(lab.cameras))):
         remarks.print(line, style="yellow", markup=False)
     for camera in lab.cameras:
@@ -75,14 +76,19 @@ def check_target(output: Path, force: bool) -> None:
     Raises
     ------
     IpsysError
-        Where there is one already, or its folder is not there, or takes no files.
+        Where there is one already, or its folder is not there, or takes no files; with ``force`` where
+        another process is writing it.
     """
     from ipsys_log.errors import IpsysError
+    from ipsys_log.log.lock import open_locked
+    from ipsys_log.log.storage import DISK
     from ipsys_log.report.files import check_file
 
     check_file(output, "-o", [])
-    if output.exists() and not force:
-        raise IpsysError(f"{output}: exists already; give another name, or --force to overwrite it")
+    if output.exists():
+        if not force:
+            raise IpsysError(f"{output}: exists already; give another name, or --force to overwrite it")
+        os.close(open_locked(DISK, output, os.O_RDWR))
 
 
 @contextmanager

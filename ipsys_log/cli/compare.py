@@ -42,10 +42,12 @@ def verify(
     if as_json:
         print(json.dumps(comparison_json(found), indent=2))  # noqa: T201
     else:
-        console.print(comparison_table(found))
+        console.print(comparison_table(found, ("log", "again")))
         difference = first_difference(found)
         console.print(
-            "[green]a replay equals the log[/green]" if difference is None else f"[red]{difference}[/red]"
+            "a replay equals the log" if difference is None else difference,
+            style="green" if difference is None else "red",
+            markup=False,
         )
     _end(found)
 
@@ -77,9 +79,13 @@ def diff(
     if as_json:
         print(json.dumps(comparison_json(found), indent=2))  # noqa: T201
     else:
-        console.print(comparison_table(found))
+        console.print(comparison_table(found, ("first", "second")))
         difference = first_difference(found)
-        console.print("[green]no difference[/green]" if difference is None else f"[red]{difference}[/red]")
+        console.print(
+            "no difference" if difference is None else difference,
+            style="green" if difference is None else "red",
+            markup=False,
+        )
     _end(found)
 
 

@@ -162,7 +162,12 @@ def _markers(look: Look) -> Text:
 
 def latency_table(steps: Mapping[str, Percentiles]) -> Table:
     """How long each step took, in ms."""
-    table = Table(box=None, pad_edge=False, title="Milliseconds to each step", title_justify="left")
+    table = Table(
+        box=None,
+        pad_edge=False,
+        title="Milliseconds for each step; total is from the arrival of a frame to its position",
+        title_justify="left",
+    )
     table.add_column("step")
     for heading in ("median", "90 %", "99 %", "longest"):
         table.add_column(heading, justify="right")
@@ -171,10 +176,10 @@ def latency_table(steps: Mapping[str, Percentiles]) -> Table:
     return table
 
 
-def comparison_table(found: Sequence[Comparison]) -> Table:
-    """A row for each channel."""
+def comparison_table(found: Sequence[Comparison], sides: tuple[str, str]) -> Table:
+    """A row for each channel; ``sides`` are the headings of the two that are compared."""
     table = Table(box=None, pad_edge=False)
-    for heading in ("channel", "left", "right", "same", "RMS", "greatest"):
+    for heading in ("channel", *sides, "same", "RMS off", "most off"):
         table.add_column(heading, justify="left" if heading == "channel" else "right")
     for one in found:
         style = "" if one.equal else "red"

@@ -103,5 +103,8 @@ class Monitor:
 def _unknown(ids: tuple[int, ...]) -> str:
     """What to do about markers that are in the picture and not in the rig."""
     names = ", ".join(map(str, ids))
-    which, them = (f"marker {names} is", "it") if len(ids) == 1 else (f"markers {names} are", "each of them")
-    return f"{which} seen, but not in the rig; to track {them}, add to lab.toml: [[markers]] id = {ids[0]}"
+    if len(ids) == 1:
+        which, todo = f"marker {names} is", "to track it, add to lab.toml"
+    else:
+        which, todo = f"markers {names} are", "to track them, add for each to lab.toml"
+    return f"{which} seen, but not in the rig; {todo}: [[markers]] id = {ids[0]}"

@@ -160,20 +160,15 @@ def _markers(look: Look) -> Text:
     return Text(", ").join(ids) if ids else Text("none")
 
 
-def latency_table(steps: Mapping[str, Percentiles]) -> Table:
+def latency_table(steps: Mapping[str, Percentiles]) -> Group:
     """How long each step took, in ms."""
-    table = Table(
-        box=None,
-        pad_edge=False,
-        title="Milliseconds for each step; total is from the arrival of a frame to its position",
-        title_justify="left",
-    )
+    table = Table(box=None, pad_edge=False, title="Milliseconds for each step", title_justify="left")
     table.add_column("step")
     for heading in ("median", "90 %", "99 %", "longest"):
         table.add_column(heading, justify="right")
     for step, found in steps.items():
         table.add_row(step, *(f"{1e3 * value:.1f}" for value in asdict(found).values()))
-    return table
+    return Group(table, Text("total: from the arrival of a frame to its position"))
 
 
 def comparison_table(found: Sequence[Comparison], sides: tuple[str, str]) -> Table:

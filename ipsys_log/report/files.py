@@ -40,10 +40,10 @@ def check_picture(path: Path, option: str, logs: Iterable[Path]) -> None:
     IpsysError
         Where it cannot, or where its name does not end in one of ``PICTURES``.
     """
+    check_file(path, option, logs)
     if path.suffix.lower() not in PICTURES:
         ends = f"{', '.join(PICTURES[:-1])} or {PICTURES[-1]}"
         raise IpsysError(f"{option} {path}: is no kind of picture; let its name end in {ends}")
-    check_file(path, option, logs)
 
 
 def check_folder(folder: Path, option: str) -> None:

@@ -136,7 +136,8 @@ def test_a_model_of_other_cameras_is_refused_before_any_is_opened(
 ) -> None:
     rig = write_rig(tmp_path, SIMULATED.replace('"red"', '"blue"'))
     for command in (("live",), ("record", "--measure")):
-        done = ipsys(*command, "-o", tmp_path / "a.mcap", "--rig", rig, "--model-from", fitted)
+        given = ("-o", tmp_path / "a.mcap", "--rig", rig, "--model-from", fitted, "--seconds", "1")
+        done = ipsys(*command, *given)
         assert done.code == 1
         assert "is of the cameras black, red, white, and none of them is here, but blue" in done.err
         assert OPENED not in done.err

@@ -16,8 +16,8 @@ from ipsys_log.report.pictures import picture, strip
 
 __all__ = ["draw_latency"]
 
-_COLOURS = {"detected": "#0072B2", "located": "#E69F00", "fused": "#009E73", "published": "#CC79A7"}
-_FAR = "#D3D7DB"
+_STEPS = ("detected", "located", "fused", "published")
+_NEAR, _FAR = "#0072B2", "#D3D7DB"
 # Beyond this many times the 99th percentile a few late ones would squeeze all the others.
 _SHOWN = 1.6
 
@@ -53,15 +53,15 @@ def _draw_shares(axes: Axes, total_ms: NDArray[np.float64]) -> None:
 
 
 def _draw_steps(axes: Axes, times_s: Mapping[str, NDArray[np.float64]]) -> None:
-    rows = np.arange(len(_COLOURS))
-    found_ms = np.array([np.percentile(times_s[step], [50, 99]) for step in _COLOURS]) * 1e3
+    rows = np.arange(len(_STEPS))
+    found_ms = np.array([np.percentile(times_s[step], [50, 99]) for step in _STEPS]) * 1e3
     axes.barh(rows, found_ms[:, 1], color=_FAR, label="99 % of positions")
-    axes.barh(rows, found_ms[:, 0], color=list(_COLOURS.values()), height=0.5, label="median")
+    axes.barh(rows, found_ms[:, 0], color=_NEAR, height=0.5, label="median")
     for row, (median_ms, far_ms) in enumerate(found_ms):
         text = f"{median_ms:.1f}, 99 %: {far_ms:.1f}"
         axes.annotate(text, (far_ms, row), (5, 0), textcoords="offset points", va="center", fontsize=9)
     axes.set_xlim(0, 1.5 * float(found_ms[:, 1].max()))
-    axes.set_yticks(rows, list(_COLOURS))
+    axes.set_yticks(rows, _STEPS)
     axes.invert_yaxis()
     axes.set(xlabel="ms for the step")
     strip(axes, "x")

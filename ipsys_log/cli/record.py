@@ -79,7 +79,10 @@ def record(
     until = "camera-frame" if measure else "detect"
     fitted = None if model_from is None else _fitted(model_from, lab.names)
     if measure:
+        from ipsys_log.web.serving import check_free
+
         check_references(lab.rig)
+        check_free(host, port)
     if measure or detect:
         check_start(lab.rig, lab.names, lab.lenses, request, until)
     check_target(output, force)

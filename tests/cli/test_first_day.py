@@ -103,6 +103,7 @@ def test_a_bad_source_or_lens_is_said_before_any_camera_is_opened(
         (("record", "-o", "a.mcap", "--detect", "--corners", "best"), "best"),
         (("record", "-o", "a.mcap", "--model-from", "old.mcap"), "has no effect without --measure"),
         (("record", "-o", "a.mcap", "--measure", "--model-from", "none.mcap"), "none.mcap"),
+        (("record", "-o", "a.mcap", "--measure", "--host", "192.0.2.1"), "--host 192.0.2.1: cannot be"),
         (("live", "-o", "a.mcap", "--model-from", "none.mcap"), "none.mcap"),
         (("live", "-o", "a.mcap", "--model-from", "FITTED", "--model", "best"), "has no fitted model best"),
         (("live", "-o", "old.mcap", "--model-from", "FITTED"), "old.mcap: exists already"),

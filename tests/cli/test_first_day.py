@@ -132,6 +132,14 @@ def test_what_cannot_be_done_is_said_before_any_camera_is_opened(
     assert (tmp_path / "old.mcap").read_bytes() == b"years of work"
 
 
+def test_a_picture_that_is_higher_than_wide_is_asked_about(ipsys: Ipsys, tmp_path: Path) -> None:
+    for width, height, said in ((180, 320, True), (320, 180, False)):
+        size = f"width = {width}\nheight = {height}"
+        rig = write_rig(tmp_path, f'[[cameras]]\nname = "red"\nsource = "http://127.0.0.1:9/"\n{size}')
+        done = ipsys("record", "--rig", rig, "-o", tmp_path / "none" / "a.mcap")
+        assert ("camera red: 180 x 320 px is upright: are width and height exchanged?" in done.err) == said
+
+
 def test_a_model_of_other_cameras_is_refused_before_any_is_opened(
     ipsys: Ipsys, tmp_path: Path, fitted: Path
 ) -> None:

@@ -4,7 +4,8 @@ from __future__ import annotations
 
 import os
 import secrets
-from collections.abc import Callable, Iterable, Iterator, Sequence
+from collections import Counter
+from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
 from contextlib import contextmanager
 from dataclasses import replace
 from pathlib import Path
@@ -56,10 +57,17 @@ def write_log(path: Path, messages: Iterable[Message]) -> dict[str, int]:
         return write_messages(writer, messages)
 
 
-def append_run(path: Path, record: Run, log_time_ns: int, messages: Callable[[], Iterable[Message]]) -> Run:
+def append_run(
+    path: Path,
+    record: Run,
+    log_time_ns: int,
+    messages: Callable[[], Iterable[Message]],
+    held: Mapping[str, int],
+) -> Run:
     """Append what a stage makes, then its record, in one step: all of it is in the log, or nothing.
 
-    ``messages`` is called when the log is locked, so that no two processes do the same work.
+    ``messages`` is called when the log is locked, so that no two processes do the same work; ``held`` says
+    how many the run has already on each topic.
 
     Raises
     ------
@@ -70,7 +78,7 @@ def append_run(path: Path, record: Run, log_time_ns: int, messages: Callable[[],
         with Session([path]) as now:
             if any((run.run, run.stage) == (record.run, record.stage) for run in now.runs()):
                 raise LogError(f"{path}: another process has just written run {record.run}; start again")
-        counts = write_messages(writer, messages())
+        counts = Counter(held) + Counter(write_messages(writer, messages()))
         outputs = tuple(ChannelWritten(topic, count) for topic, count in sorted(counts.items()))
         done = replace(record, outputs=outputs)
         write_messages(writer, [record_message(done, log_time_ns)])

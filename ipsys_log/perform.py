@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
+from collections.abc import Callable, Iterable, Iterator, Mapping
 from dataclasses import replace
 from pathlib import Path
 
@@ -15,6 +15,7 @@ from ipsys_log.messages import (
     ChannelWritten,
     Lens,
     Message,
+    Model,
     Rig,
     Run,
     calibration_topic,
@@ -22,10 +23,11 @@ from ipsys_log.messages import (
 from ipsys_log.output import append_messages, append_run, record_message
 from ipsys_log.remarks import Remarks
 from ipsys_log.request import Progress, Request
+from ipsys_log.resume import OtherContentError, cut_short, without_held
 from ipsys_log.runs import Outcome, check_run_name, find_run, fingerprint, free_name, read_channels
 from ipsys_log.tasks import Task, plan_stage
 
-__all__ = ["SHARED_STAGES", "inputs", "perform", "record_of", "sign"]
+__all__ = ["SHARED_STAGES", "inputs", "perform", "record_of", "sign", "signed_copy"]
 
 # The stages whose runs serve every model.
 SHARED_STAGES = ("detect", "camera-frame")
@@ -34,7 +36,10 @@ Make = Callable[[Task, Session, str], Iterable[Message]]
 
 
 def perform(session: Session, target: Path, task: Task, request: Request, until: str, make: Make) -> Outcome:
-    """Find the run that has done ``task``, or ``make`` it and append it to ``target``."""
+    """Find the run that has done ``task``, or ``make`` it and append it to ``target``.
+
+    A run that was cut short is completed, if what it holds is what is made now.
+    """
     # A name given by the user is for what was asked for, not for the detection on the way to it.
     named = task.stage == until or (task.stage not in SHARED_STAGES and until not in SHARED_STAGES)
     name = request.run if named else None
@@ -42,32 +47,61 @@ def perform(session: Session, target: Path, task: Task, request: Request, until:
     found = find_run(session, record, name)
     if found is not None:
         return Outcome(task.stage, found, fresh=False)
+    number = max((run.number for run in session.runs()), default=0) + 1
+    record = replace(record, fingerprint=fingerprint(), number=number)
+    remarks: tuple[str, ...] = ()
+    given = name or task.base
+    if held := cut_short(session, target, task, given):
+        try:
+            return _append(session, target, task, replace(record, run=given), held, request, make)
+        except OtherContentError as other:
+            remarks = (f"run {given} was cut short, and is left so: {other}",)
     if name is None:
         name = free_name(session, record, task.base, task.writes)
     else:
         check_run_name(session, task.stage, name, task.writes)
+    outcome = _append(session, target, task, replace(record, run=name), {}, request, make)
+    return replace(outcome, remarks=(*remarks, *outcome.remarks))
+
+
+def _append(
+    session: Session,
+    target: Path,
+    task: Task,
+    record: Run,
+    held: Mapping[str, int],
+    request: Request,
+    make: Make,
+) -> Outcome:
+    """Make a run, append what of it is not held, and its record."""
     log_time_ns, publish_time_ns = session.last(task.topics)
-    number = max((run.number for run in session.runs()), default=0) + 1
-    record = replace(record, timestamp=publish_time_ns, run=name, fingerprint=fingerprint(), number=number)
     remarks = Remarks(task, request.skip_ambiguous)
-    made = append_run(target, record, log_time_ns, lambda: remarks.watch(make(task, session, name)))
+    made = append_run(
+        target,
+        replace(record, timestamp=publish_time_ns),
+        log_time_ns,
+        lambda: without_held(session, held, remarks.watch(make(task, session, record.run))),
+        held,
+    )
     count = sum(output.messages for output in made.outputs)
-    return Outcome(task.stage, name, True, count, remarks.lines())
+    return Outcome(task.stage, record.run, True, count, remarks.lines())
 
 
-def sign(path: Path, request: Request, runs: Mapping[str, str], copied: Sequence[Task]) -> list[Outcome]:
+def sign(path: Path, request: Request, runs: Mapping[str, str]) -> list[Outcome]:
     """Append the records of stages that have written their channels already, live.
 
     Parameters
     ----------
-    runs : by stage, in order, the run it has written to.
-    copied : the task of fit, planned when the model was taken from the other log.
+    runs : by stage, in order, the run it has written to; that of fit was signed when the model was copied.
     """
     records, outcomes = [], []
     with Session([path]) as session:
         first = max((run.number for run in session.runs()), default=0) + 1
         for number, (stage, name) in enumerate(runs.items(), first):
-            task = copied[0] if stage == "fit" else plan_stage(stage, session, request, **_given(stage, runs))
+            if stage == "fit":
+                outcomes.append(Outcome(stage, name, True, 1))
+                continue
+            task = plan_stage(stage, session, request, **_given(stage, runs))
             assert isinstance(task, Task), f"{stage} was not done live"
             outputs = tuple(
                 ChannelWritten(topic, session.count(topic))
@@ -80,6 +114,23 @@ def sign(path: Path, request: Request, runs: Mapping[str, str], copied: Sequence
             outcomes.append(Outcome(stage, name, True, sum(output.messages for output in outputs)))
     append_messages(path, records)
     return outcomes
+
+
+def signed_copy(task: Task, model: Model, now_ns: Callable[[], int]) -> list[Message]:
+    """The messages that copy a model into a log that is begun: the model, and the record of its run."""
+    at = f"/runs/{task.base}/model"
+    record = Run(
+        timestamp=model.timestamp,
+        run=task.base,
+        stage=task.stage,
+        parameters=dict(task.parameters),
+        fingerprint=fingerprint(),
+        input_runs=task.input_runs,
+        inputs=task.foreign,
+        outputs=(ChannelWritten(at, 1),),
+        number=1,
+    )
+    return [Message(at, now_ns(), model.timestamp, model), record_message(record, now_ns())]
 
 
 def _given(stage: str, runs: Mapping[str, str]) -> dict[str, str]:

@@ -28,22 +28,18 @@ as long as the stages keep up, to them.
 from __future__ import annotations
 
 import builtins
-from collections import deque
 from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
-from concurrent.futures import Future, ThreadPoolExecutor
-from contextlib import ExitStack
 from dataclasses import dataclass, replace
 from functools import partial
 from itertools import chain
 from pathlib import Path
 from typing import Any
 
-import cv2
 from threadpoolctl import threadpool_limits
 
 from ipsys_log.errors import IpsysError, LogError
 from ipsys_log.latency import Ledger
-from ipsys_log.live_plan import cameras_with_lens, check_live, copied_models, live_stages, with_corners
+from ipsys_log.live_plan import plan_live
 from ipsys_log.log.session import Session
 from ipsys_log.lookup import wanted_models
 from ipsys_log.messages import (
@@ -56,18 +52,18 @@ from ipsys_log.messages import (
     Message,
     Model,
     Positions,
-    Rig,
     Tracks,
 )
 from ipsys_log.output import opened_target
 from ipsys_log.perform import inputs, perform, sign
 from ipsys_log.preflight import check_inputs
-from ipsys_log.recording import Backlog, recording
+from ipsys_log.recording import TICK, Backlog, Recording, recording
 from ipsys_log.request import Progress, Request
 from ipsys_log.runs import Outcome
 from ipsys_log.sources.attached import Attached
 from ipsys_log.sources.frames import SourceError
-from ipsys_log.tasks import STAGES, Task, model_run, plan_stage
+from ipsys_log.tasks import STAGES, Task, plan_stage
+from ipsys_log.threads import in_threads
 
 __all__ = ["TOPICS", "Stage", "carry_out", "in_threads", "live", "record", "replay", "run"]
 
@@ -127,34 +123,6 @@ def _through(stage: Stage, source: Iterable[Message], map: Map) -> Iterator[Mess
             stamped = payload.transforms[0] if isinstance(payload, FrameTransforms) else payload
             time_ns = getattr(stamped, "timestamp", message.publish_time_ns)
             yield Message(topic, message.log_time_ns, time_ns, payload, message.camera)
-
-
-def in_threads(function: Callable[[Message], Any], messages: Iterable[Message]) -> Iterator[Any]:
-    """``map`` with one thread per camera: a camera's messages stay in order, and so do the results.
-
-    A message of no camera (the rig) concerns all of them: it waits for those before it. OpenCV's own
-    threads are turned off meanwhile; one thread per camera uses the cores better.
-    """
-    threads = cv2.getNumThreads()
-    cv2.setNumThreads(1)
-    pending: deque[Future[Any]] = deque()
-    workers: dict[str, ThreadPoolExecutor] = {}
-    with ExitStack() as stack:
-        stack.callback(cv2.setNumThreads, threads)
-        for message in messages:
-            if message.camera is None:
-                while pending:
-                    yield pending.popleft().result()
-                yield function(message)
-                continue
-            if message.camera not in workers:
-                workers[message.camera] = stack.enter_context(ThreadPoolExecutor(1))
-            pending.append(workers[message.camera].submit(function, message))
-            # Enough ahead that no camera waits for another, and no more in memory than that.
-            while len(pending) > 4 * len(workers):
-                yield pending.popleft().result()
-        while pending:
-            yield pending.popleft().result()
 
 
 def replay(
@@ -248,12 +216,9 @@ def record(
     with recording(target, overwrite) as log:
         for message in settings:
             log.put(message)
-        for arrived in source:
-            if arrived is None:
-                log.flush()
-            else:
-                log.put(arrived)
+        for arrived in log.written(source):
             watch(arrived)
+    log.check_disk()
     return log.counts
 
 
@@ -287,40 +252,19 @@ def live(
     IpsysError
         Where the other log has no such model, or the log cannot be written; what it holds is kept.
     """
-    request = with_corners(request, cameras.states, settings)
-    copied = copied_models(request, until)
-    models = [model for _, model in copied]
-    (rig,) = (message.payload for message in settings if isinstance(message.payload, Rig))
-    check_live(rig, cameras.states, cameras_with_lens(settings), models, until)
-    runs, rows = live_stages(request, models, until)
-    stages = [Stage(*row) for row in rows]
-    fault: IpsysError | None = None
+    plan = plan_live(cameras.states, settings, request, until)
     with recording(target, overwrite) as log, threadpool_limits(1, user_api="blas"):
-        for message in settings:
+        for message in (*settings, *plan.copies(cameras.now_ns)):
             log.put(message)
-        for model in models:
-            topic = TOPICS[Model].format(run=model_run(model.name))
-            log.put(Message(topic, cameras.now_ns(), model.timestamp, model))
-        ledger = Ledger(cameras.clock.now_ns, cameras.received_ns)
         with Backlog(cameras, log, cameras.now_ns, cameras.stop) as frames:
-            made = ledger.note("detected", Markers, run(chain(settings, frames), stages[:1], in_threads))
-            made = ledger.note("located", Positions, run(made, stages[1:3]))
-            made = ledger.note("fused", Tracks, run(made, stages[3:]))
-            try:
-                for message in made:
-                    watch(message)
-                    if type(message.payload) in TOPICS:
-                        log.put(message)
-                        entry = ledger.entry(message)
-                        if entry is not None:
-                            log.put(entry)
-            except IpsysError as error:
-                if isinstance(error, (LogError, SourceError)):
-                    raise
-                fault = error
-                cameras.warn("stages_stopped", f"{error}; frames are recorded all the same")
+            stages = [Stage(*row) for row in plan.rows]
+            ledger = Ledger(cameras.clock.now_ns, cameras.received_ns)
+            fault = _put_through(chain(settings, frames), stages, ledger, log, watch)
+            if fault is not None:
+                cameras.warn("stages_stopped", f"{fault}; frames are recorded all the same")
                 for message in frames:
-                    watch(message)
+                    if message is not TICK:
+                        watch(message)
     if fault is not None:
         raise IpsysError(f"{fault}; {target} has all frames: replay it") from fault
     if frames.skipped:
@@ -328,4 +272,31 @@ def live(
             f"{frames.skipped.total()} frames are recorded but were not looked at: the stages were too slow. "
             f"ipsys replay {target} looks at all, with --as-live at those that were looked at"
         )
-    return sign(target, replace(request, as_live=bool(frames.skipped)), runs, [task for task, _ in copied])
+    try:
+        return sign(target, replace(plan.request, as_live=bool(frames.skipped)), plan.runs)
+    finally:
+        log.check_disk()
+
+
+def _put_through(
+    frames: Iterable[Message], stages: Sequence[Stage], ledger: Ledger, log: Recording, watch: Watch
+) -> IpsysError | None:
+    """Write what the stages make of frames as they come; returns what a stage stopped with."""
+    made = ledger.note("detected", Markers, run(frames, stages[:1], in_threads))
+    made = ledger.note("located", Positions, run(made, stages[1:3]))
+    made = ledger.note("fused", Tracks, run(made, stages[3:]))
+    try:
+        for message in made:
+            if message is TICK:
+                continue
+            watch(message)
+            if type(message.payload) in TOPICS:
+                log.put(message)
+                entry = ledger.entry(message)
+                if entry is not None:
+                    log.put(entry)
+    except (LogError, SourceError):
+        raise
+    except IpsysError as fault:
+        return fault
+    return None

@@ -6,14 +6,15 @@ import os
 import threading
 from collections import Counter, deque
 from collections.abc import Callable, Iterable, Iterator, Mapping
-from contextlib import contextmanager, suppress
+from contextlib import contextmanager
 from dataclasses import replace
 from pathlib import Path
 from types import TracebackType
 
-from ipsys_log.errors import IpsysError, LogError, WriteError
+from ipsys_log.errors import IpsysError, WriteError
+from ipsys_log.full_disk import reserve, what_fitted
 from ipsys_log.geometry.lenses import scale_lens
-from ipsys_log.log import LogReader, LogWriter
+from ipsys_log.log import LogWriter
 from ipsys_log.log.lock import open_locked
 from ipsys_log.log.storage import DISK
 from ipsys_log.messages import (
@@ -28,15 +29,12 @@ from ipsys_log.messages import (
     calibration_topic,
 )
 from ipsys_log.output import write_message
-from ipsys_log.units import NS_PER_S, format_bytes
 
 __all__ = ["TICK", "Backlog", "Recording", "first_messages", "fitting_lenses", "recording"]
 
 # Between two messages of a source: nothing more has come so far. It is not in the log.
 TICK = Message("", 0, 0, None)
 
-# Set aside on the disk, so that a log can be finished when the disk is full.
-_RESERVE_BYTES = 16 << 20
 # Frames of a camera that may wait for the stages; older ones are skipped.
 _WAITING = 3
 
@@ -44,14 +42,20 @@ _WAITING = 3
 class Recording:
     """A log that is being written, by several threads. Made by :func:`recording`.
 
+    Parameters
+    ----------
+    free : gives back what is set aside on the disk.
+
     Attributes
     ----------
     counts : messages so far, by topic.
+    full : set when the disk was; what is set aside is in use then.
     """
 
-    def __init__(self, writer: LogWriter) -> None:
+    def __init__(self, writer: LogWriter, free: Callable[[], None]) -> None:
         self.counts: dict[str, int] = {}
-        self._writer = writer
+        self.full: WriteError | None = None
+        self._writer, self._free = writer, free
         self._lock = threading.Lock()
 
     def put(self, message: Message) -> None:
@@ -60,15 +64,42 @@ class Recording:
         Raises
         ------
         WriteError
-            Where the disk is full.
+            Where the disk is full, and what was set aside is used up too.
         """
-        with self._lock:
-            write_message(self._writer, message, self.counts)
+        self._write(lambda: write_message(self._writer, message, self.counts))
 
-    def flush(self) -> None:
-        """Hand everything to the disk."""
+    def written(self, source: Iterable[Message | None]) -> Iterator[Message | None]:
+        """What a source gives, each message after it was written, until the disk is full."""
+        for message in source:
+            if message is None:
+                self._write(self._writer.flush)
+            else:
+                self.put(message)
+            yield message
+            if self.full is not None:
+                return
+
+    def check_disk(self) -> None:
+        """See that all was written.
+
+        Raises
+        ------
+        IpsysError
+            Where the disk was full: it says how far the log goes.
+        """
+        if self.full is not None:
+            raise IpsysError(what_fitted(self._writer.path, self.full)) from self.full
+
+    def _write(self, write: Callable[[], None]) -> None:
         with self._lock:
-            self._writer.flush()
+            try:
+                write()
+            except WriteError as error:
+                if self.full is not None:
+                    raise
+                self.full = error
+                self._free()
+                write()
 
 
 @contextmanager
@@ -84,46 +115,16 @@ def recording(path: Path, overwrite: bool = False) -> Iterator[Recording]:
     LogError
         Where there is such a file, or it cannot be made.
     IpsysError
-        Where the disk is full: the log is complete, and says how far it goes.
+        Where the disk is so full that the log could not be ended as it should.
     """
     if overwrite and path.exists():
         os.close(open_locked(DISK, path, os.O_RDWR))
         path.unlink()
     try:
-        with LogWriter.create(path) as writer, _reserve(path):
-            yield Recording(writer)
+        with LogWriter.create(path) as writer, reserve(path) as free:
+            yield Recording(writer, free)
     except WriteError as error:
-        raise IpsysError(_what_fitted(path, error)) from error
-
-
-@contextmanager
-def _reserve(path: Path) -> Iterator[None]:
-    """Some of the disk, given back before the log is closed. It has no name: it cannot be left behind."""
-    if not hasattr(os, "O_TMPFILE"):
-        yield
-        return
-    fd = None
-    with suppress(OSError):  # a file system that cannot, or a disk that is full already
-        fd = os.open(path.parent, os.O_TMPFILE | os.O_RDWR)
-        os.posix_fallocate(fd, 0, _RESERVE_BYTES)
-    try:
-        yield
-    finally:
-        if fd is not None:
-            os.close(fd)
-
-
-def _what_fitted(path: Path, error: WriteError) -> str:
-    try:
-        with LogReader(path) as log:
-            count, seconds = log.message_count, ((log.end_ns or 0) - (log.start_ns or 0)) / NS_PER_S
-    except LogError:
-        return str(error)
-    size = format_bytes(path.stat().st_size)
-    return (
-        f"{path}: the disk takes no more; recording has stopped, and the log is complete with what fitted: "
-        f"{count} messages, {seconds:.1f} s, {size}. Free some space, or record to another disk"
-    )
+        raise IpsysError(what_fitted(path, error)) from error
 
 
 def fitting_lenses(
@@ -216,12 +217,8 @@ class Backlog:
 
     def _record(self) -> None:
         try:
-            for message in self._source:
-                if message is None:
-                    self._log.flush()
-                    continue
-                self._log.put(message)
-                if message.camera is not None:
+            for message in self._log.written(self._source):
+                if message is not None and message.camera is not None:
                     self._hand_on(message)
         except BaseException as fault:  # raised again where the messages are taken
             self._fault = fault

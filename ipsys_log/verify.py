@@ -6,6 +6,8 @@ import heapq
 from collections.abc import Collection, Iterator, Sequence
 from pathlib import Path
 
+from threadpoolctl import threadpool_limits
+
 from ipsys_log.compare import Comparison, compare_channels
 from ipsys_log.errors import IpsysError
 from ipsys_log.log.session import Session, run_of_topic
@@ -17,11 +19,15 @@ from ipsys_log.tasks import Task, plan_stage
 
 __all__ = ["diff", "verify"]
 
-_CAUSAL = ("detect", "camera-frame", "locate", "fuse")
+# What a model's run has among its parameters if the model was fitted to places of the same log.
+_FITTED_HERE = {"train", "seed"}
 
 
 def verify(paths: Sequence[Path], run: str | None, progress: Progress) -> list[Comparison]:
-    """Make the causal stages of every run again, from their recorded input, and compare.
+    """Make every run again, from its recorded input, and compare.
+
+    A model that was copied in cannot be made again, nor can what was evaluated of it; what was made with it
+    can.
 
     Parameters
     ----------
@@ -36,17 +42,17 @@ def verify(paths: Sequence[Path], run: str | None, progress: Progress) -> list[C
     IpsysError
         Where there is no such run, or it was made from something that the log no longer holds.
     """
-    with Session(paths) as session:
+    with Session(paths) as session, threadpool_limits(1, user_api="blas"):
         names = session.run_names() if run is None else session.run_names() & {run}
         records = [one for one in session.runs() if one.run in names]
-        if not any(one.stage in _CAUSAL for one in records):
+        if not any(_from_this_log(one) for one in records):
             raise IpsysError(
                 f"{session}: has no {'run' if run is None else f'run {run}'} to verify; "
                 "make one with 'ipsys replay', or see 'ipsys runs'"
             )
         found = []
         for name in sorted(names):
-            stages = [one for one in records if one.run == name and one.stage in _CAUSAL]
+            stages = [one for one in records if one.run == name and _from_this_log(one)]
             topics = {output.topic for one in stages for output in one.outputs}
             # Stages can share a channel, that of events.
             made = heapq.merge(
@@ -54,6 +60,10 @@ def verify(paths: Sequence[Path], run: str | None, progress: Progress) -> list[C
             )
             found += compare_channels(session.messages(sorted(topics)), made)
         return sorted([*found, *_unrecorded(session, names)], key=lambda one: one.topic)
+
+
+def _from_this_log(run: Run) -> bool:
+    return run.stage not in ("fit", "evaluate") or bool(run.parameters.keys() & _FITTED_HERE)
 
 
 def _unrecorded(session: Session, names: Collection[str]) -> list[Comparison]:
@@ -138,6 +148,8 @@ def _request(run: Run) -> Request:
         lenses=lenses,
         corners=run.parameters.get("corners"),
         method=run.parameters.get("method", PERIMETER),
+        train=run.parameters.get("train", "train"),
+        seed=int(run.parameters.get("seed", "0")),
         as_live="as_live" in run.parameters,
     )
 
@@ -153,6 +165,8 @@ def _given(session: Session, run: Run) -> dict[str, str]:
     return {
         "detect": {},
         "camera-frame": {"markers": source(Markers)},
+        "fit": {"points": source(CameraPoints), "model": run.parameters.get("model", "")},
+        "evaluate": {"points": source(CameraPoints), "model": source(Model)},
         "locate": {"points": source(CameraPoints), "model": source(Model)},
         "fuse": {"positions": source(Positions)},
     }[run.stage]

@@ -71,7 +71,7 @@ def test_a_truncated_log(ipsys: Ipsys, lab: Path, kept: float) -> None:
     whole = lab.read_bytes()
     lab.write_bytes(whole[: int(len(whole) * kept)])
     line = refused(ipsys, lab, "replay", lab)
-    assert "no footer" in line
+    assert "has no end" in line
     assert f"ipsys repair {lab}" in line
     assert ipsys("repair", lab).code == 0
     assert ipsys("info", lab).code == 0

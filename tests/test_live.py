@@ -25,6 +25,7 @@ from ipsys_log.messages import (
     FRAME_SKIPPED,
     CameraCalibration,
     CompressedImage,
+    Evaluation,
     Event,
     Latency,
     Measurement,
@@ -180,6 +181,23 @@ def test_a_result_that_is_gone_is_found(recorded: Path, tmp_path: Path) -> None:
     apart = {one.topic: one.first for one in again(unsigned) if not one.equal}
     assert apart.keys() == {"/runs/poly/tracks", "/runs/poly/poses"}
     assert set(apart.values()) == {"no record says how it was made"}
+
+
+def test_models_and_their_evaluation_are_made_again_too(
+    lab_log: Path, calibration: Path, tmp_path: Path
+) -> None:
+    def apart(log: Path) -> dict[str, bool]:
+        return {one.topic: one.equal for one in verify([lab_log, log], None, lambda stage, done, total: None)}
+
+    found = apart(calibration)
+    assert {"/runs/poly/model", "/runs/poly/evaluation"} <= found.keys()
+    assert all(found.values())
+
+    def other(payload: Evaluation) -> Evaluation:
+        return replace(payload, learning=payload.learning[:-1])
+
+    found = apart(tampered(calibration, tmp_path / "tampered.mcap", Evaluation, other))
+    assert [topic for topic, equal in found.items() if not equal] == ["/runs/poly/evaluation"]
 
 
 def test_robots_that_were_renamed_are_verified_with_their_own_rig(

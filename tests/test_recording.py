@@ -30,7 +30,7 @@ class Noted(Recording):
     """Notes what is put into it."""
 
     def __init__(self, writer: LogWriter) -> None:
-        super().__init__(writer)
+        super().__init__(writer, lambda: None)
         self.noted: list[Message] = []
 
     def put(self, message: Message) -> None:

@@ -5,11 +5,11 @@ from __future__ import annotations
 import os
 import signal
 from collections.abc import Callable, Iterator
-from contextlib import ExitStack, contextmanager
+from contextlib import AbstractContextManager, ExitStack, contextmanager, nullcontext
 from dataclasses import replace
 from pathlib import Path
 from tempfile import TemporaryDirectory
-from threading import Timer
+from threading import TIMEOUT_MAX, Timer
 from time import monotonic
 from typing import TYPE_CHECKING, NamedTuple
 
@@ -102,8 +102,6 @@ def opened(
     IpsysError
         Where a camera cannot be opened, or its frames do not fit its lens.
     """
-    from rich.live import Live
-
     from ipsys_log.monitor import Monitor
     from ipsys_log.recording import first_messages, fitting_lenses
     from ipsys_log.report.cameras import LiveStatus
@@ -116,26 +114,34 @@ def opened(
             attached = stack.enter_context(Attached(lab.cameras, open_source, Clock(), say))
         sizes_px = {name: state.size_px for name, state in attached.states.items()}
         lenses = fitting_lenses(lab.lenses, sizes_px, say)
-        _stop_on_signals(attached.stop)
-        if seconds is not None:
-            timer = Timer(seconds, attached.stop)
-            stack.callback(timer.cancel)
-            timer.start()
+        stack.enter_context(_ended(attached.stop, seconds))
         status = LiveStatus(attached.states, stack.enter_context(Monitor(lab.rig)), output, monotonic)
         say(f"recording into {output}; Ctrl-C ends it" if kept else f"looking for {seconds:g} s")
-        if remarks.is_terminal:
-            stack.enter_context(
-                Live(get_renderable=status.show, console=remarks, transient=True, refresh_per_second=2)
-            )
+        stack.enter_context(_on_screen(status))
         yield attached, first_messages(lab.rig, lenses, attached.now_ns), status
     for line in status.summary() if kept else ():
         console.print(line, markup=False)
 
 
-def _stop_on_signals(stop: Callable[[], None]) -> None:
-    """End cleanly: what the cameras have sent by then is written."""
+@contextmanager
+def _ended(stop: Callable[[], None], seconds: float | None) -> Iterator[None]:
+    """On Ctrl-C, SIGTERM or after some time it ends cleanly: what has come by then is written."""
     for number in (signal.SIGINT, signal.SIGTERM):
         signal.signal(number, lambda *_: stop())
+    timer = Timer(TIMEOUT_MAX if seconds is None else seconds, stop)
+    timer.start()
+    try:
+        yield
+    finally:
+        timer.cancel()
+
+
+def _on_screen(status: LiveStatus) -> AbstractContextManager[object]:
+    from rich.live import Live
+
+    if not remarks.is_terminal:
+        return nullcontext()
+    return Live(get_renderable=status.show, console=remarks, transient=True, refresh_per_second=2)
 
 
 @contextmanager

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import sys
-from collections.abc import Iterator
+from collections.abc import Iterator, Sequence
 from contextlib import contextmanager
 from time import monotonic
 from typing import TYPE_CHECKING
@@ -12,8 +12,9 @@ from rich.console import Console
 
 if TYPE_CHECKING:
     from ipsys_log.request import Progress
+    from ipsys_log.runs import Outcome
 
-__all__ = ["console", "progress_bar", "remarks"]
+__all__ = ["console", "print_outcomes", "progress_bar", "remarks"]
 
 # The stages that go through the frames, one message for each.
 _OF_FRAMES = ("detect", "camera-frame", "locate", "fuse")
@@ -64,3 +65,13 @@ def progress_bar() -> Iterator[Progress]:
             bar.update(bars[stage], completed=done, rate=rate)
 
         yield show
+
+
+def print_outcomes(outcomes: Sequence[Outcome]) -> None:
+    """What was done, what was found done, and what was left out."""
+    for outcome in outcomes:
+        state = f"{outcome.messages} messages" if outcome.fresh else "up to date"
+        remarks.print(f"{outcome.stage:<13} run {outcome.run:<16} {state}")
+        for remark in outcome.remarks:
+            # Names out of a log are not for rich to read as its markup.
+            remarks.print(f"  {remark}", style="yellow", markup=False)

@@ -12,7 +12,7 @@ from typing import TYPE_CHECKING, Annotated, Any, Optional
 
 import typer
 
-from ipsys_log.cli.console import console, progress_bar, remarks
+from ipsys_log.cli.console import console, print_outcomes, progress_bar, remarks
 from ipsys_log.cli.options import (
     AsJson,
     Calibrations,
@@ -270,13 +270,8 @@ def _print(outcomes: Sequence[Outcome], accuracies: Sequence[Accuracy], as_json:
 
 
 def _remark(outcomes: list[Outcome], target: Path | None) -> None:
-    """What was done, what was found done, and what was left out."""
-    for outcome in outcomes:
-        state = f"{outcome.messages} messages" if outcome.fresh else "up to date"
-        remarks.print(f"{outcome.stage:<13} run {outcome.run:<16} {state}")
-        for remark in outcome.remarks:
-            # Names out of a log are not for rich to read as its markup.
-            remarks.print(f"  {remark}", style="yellow", markup=False)
+    """What was done, and where it is."""
+    print_outcomes(outcomes)
     if target is None:
         return
     if any(outcome.fresh for outcome in outcomes):

@@ -8,7 +8,7 @@ from typing import Annotated
 
 import typer
 
-from ipsys_log.cli.console import console
+from ipsys_log.cli.console import console, print_outcomes, progress_bar, remarks
 from ipsys_log.cli.options import AsJson, Logs
 
 __all__ = ["add_commands"]
@@ -52,7 +52,20 @@ def runs(logs: Logs, as_json: AsJson = False) -> None:
 def repair(
     log: Annotated[Path, typer.Argument(help="A log whose writer was killed, or that was cut off.")],
 ) -> None:
-    """Restore every complete chunk of a log in place, and say what was lost."""
-    from ipsys_log.log import repair as repair_log
+    """Restore all that is whole in a log, in place, say what is gone, and finish its runs.
 
-    console.print(str(repair_log(log)))
+    The frames that ipsys live or record --detect had recorded and not looked at when it was killed are looked
+    at now. That makes the runs again, to see that they are right; Ctrl-C leaves it to ipsys replay.
+    """
+    from ipsys_log.errors import IpsysError
+    from ipsys_log.log import repair as repair_log
+    from ipsys_log.report.repaired import repair_lines
+    from ipsys_log.restore import finish_runs
+
+    for part in repair_lines(repair_log(log)):
+        console.print(part, markup=False)
+    try:
+        with progress_bar() as progress:
+            print_outcomes(finish_runs(log, progress))
+    except IpsysError as error:  # the log itself is whole
+        remarks.print(f"its runs cannot be finished: {error}", style="yellow", markup=False)

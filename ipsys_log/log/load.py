@@ -20,7 +20,11 @@ from ipsys_log.log.records import (
 from ipsys_log.log.scan import scan
 from ipsys_log.log.view import View
 
-__all__ = ["load_contents"]
+__all__ = ["NoFooterError", "load_contents"]
+
+
+class NoFooterError(LogError):
+    """A log has no end: its writer has not come to it yet, or never will."""
 
 
 def load_contents(view: View) -> Contents:
@@ -29,7 +33,7 @@ def load_contents(view: View) -> Contents:
     Raises
     ------
     LogError
-        The file is empty, not an MCAP, has no footer, or is damaged.
+        The file is empty, not an MCAP, or is damaged; a `NoFooterError` where its end is missing.
     """
     footer_at, summary_start = _footer(view)
     contents, complete = (None, False)
@@ -57,9 +61,9 @@ def _footer(view: View) -> tuple[int, int]:
     at = view.size - len(MAGIC) - FOOTER.size
     tail = view.read(at, view.size - at) if at >= len(MAGIC) else b""
     if not tail.endswith(MAGIC) or FOOTER.unpack_from(tail)[:2] != (Opcode.FOOTER, 20):
-        raise LogError(
-            f"{path} has no footer: it is still being written, its writer was killed, or the file is "
-            f"truncated. Run: ipsys repair {path}"
+        raise NoFooterError(
+            f"{path} has no end: its recorder was killed, or the file was cut off. What it holds can be "
+            f"saved. Run: ipsys repair {path}"
         )
     _, _, summary_start, _, crc = FOOTER.unpack_from(tail)
     if summary_start and not len(MAGIC) < summary_start <= at:

@@ -1,4 +1,4 @@
-"""The exclusive lock of a log: whoever writes holds it, readers never take it."""
+"""The exclusive lock of a log: whoever writes holds it. Readers never wait for it."""
 
 import fcntl
 import os
@@ -7,8 +7,9 @@ from pathlib import Path
 from ipsys_log.errors import LogError
 from ipsys_log.log.journal import journal_path
 from ipsys_log.log.storage import Storage
+from ipsys_log.log.view import open_for_reading
 
-__all__ = ["check_free", "open_locked"]
+__all__ = ["check_free", "is_being_written", "open_locked"]
 
 
 def open_locked(storage: Storage, path: Path, flags: int) -> int:
@@ -36,6 +37,21 @@ def open_locked(storage: Storage, path: Path, flags: int) -> int:
         storage.close(fd)
         raise LogError(f"{path}: another process is writing it: wait until it has finished")
     return fd
+
+
+def is_being_written(path: Path) -> bool:
+    """Whether another process holds the lock. Asked of logs without an end only: nobody can append to
+    these, so the instant for which this takes the lock itself is in nobody's way."""
+    fd = open_for_reading(path)
+    try:
+        fcntl.flock(fd, fcntl.LOCK_SH | fcntl.LOCK_NB)
+    except BlockingIOError:
+        return True
+    except OSError:  # a file system without locks
+        return False
+    finally:
+        os.close(fd)
+    return False
 
 
 def check_free(path: Path) -> None:

@@ -17,7 +17,8 @@ from ipsys_log.log.channels import by_topic
 from ipsys_log.log.contents import Contents
 from ipsys_log.log.hashing import METADATA_NAME, ChannelHash, hashes_from_metadata
 from ipsys_log.log.journal import attach_journal
-from ipsys_log.log.load import load_contents
+from ipsys_log.log.load import NoFooterError, load_contents
+from ipsys_log.log.lock import is_being_written
 from ipsys_log.log.order import Pending, in_log_order
 from ipsys_log.log.payload import Blocks, open_chunk, open_loose
 from ipsys_log.log.records import HEADER, parse, walk
@@ -223,9 +224,11 @@ def _open(path: Path) -> tuple[View, Contents]:
         moved = not held and not _stood_still(view, before)
         view.close()
         if fault is not None and not moved:
-            raise fault
+            break
         time.sleep(_PAUSE_S)
-    raise fault or LogError(f"{path} changes all the time: it is still being written")
+    if fault is None or (isinstance(fault, NoFooterError) and is_being_written(path)):
+        raise LogError(f"{path} is being recorded or written just now: try again when that has ended")
+    raise fault
 
 
 def _stood_still(view: View, before: os.stat_result) -> bool:

@@ -3,9 +3,9 @@
 import os
 import zlib
 from collections import Counter
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from contextlib import suppress
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 from pathlib import Path
 
 from mcap import records as mcap
@@ -24,7 +24,6 @@ from ipsys_log.log.storage import DISK, Storage, write_all
 from ipsys_log.log.summary import tail_bytes
 from ipsys_log.log.survey import Survey, crc_of, survey
 from ipsys_log.log.view import View
-from ipsys_log.units import format_time
 
 __all__ = ["RepairReport", "repair"]
 
@@ -36,8 +35,9 @@ _BLOCK = 1 << 20
 class RepairReport:
     """What `repair` found and did.
 
-    ``messages_lost`` counts, by topic, the messages known to be gone; a recorder's last second, which it
-    had not written yet, is not known. ``bytes_lost`` counts bytes of the data section that were dropped.
+    ``lost`` has, by topic, the log times in ns of messages known to be gone; ``bytes_lost`` counts bytes of
+    the data section that were dropped. ``cut_off`` says that the log had no end: what its writer had not
+    handed over yet when the file was last written, at ``written_ns``, is gone and not known.
     """
 
     path: Path
@@ -45,22 +45,10 @@ class RepairReport:
     bytes_lost: int
     messages_kept: int
     last_kept_ns: int | None
-    messages_lost: Mapping[str, int] = field(default_factory=dict)
+    lost: Mapping[str, Sequence[int]] = field(default_factory=dict)
     notes: tuple[str, ...] = ()
-
-    def __str__(self) -> str:
-        kept = f"{self.messages_kept} messages"
-        if not self.messages_kept:
-            kept = "no message"
-        if not self.changed:
-            return "; ".join((f"{self.path} is whole: {kept}, nothing changed", *self.notes))
-        lost = ", ".join(f"{number} of {topic}" for topic, number in sorted(self.messages_lost.items()))
-        end = "" if self.last_kept_ns is None else f", up to {format_time(self.last_kept_ns)} UTC"
-        words = (
-            f"{self.path} repaired: {kept} kept{end}. Dropped: {self.bytes_lost} bytes that cannot be read"
-            f" ({lost or 'no whole message'}). How much was never written or was cut off is not known"
-        )
-        return "; ".join((words, *self.notes))
+    cut_off: bool = False
+    written_ns: int = 0
 
 
 def repair(path: str | os.PathLike[str], *, storage: Storage = DISK) -> RepairReport:
@@ -79,7 +67,8 @@ def repair(path: str | os.PathLike[str], *, storage: Storage = DISK) -> RepairRe
     fd = open_locked(storage, target, os.O_RDWR)
     try:
         rolled_back = roll_back(storage, target, fd)
-        size = os.fstat(fd).st_size
+        status = os.fstat(fd)
+        size = status.st_size
         view = View(target, fd, size, size)
         _check_magic(view)
         known = _summary(view)
@@ -95,7 +84,7 @@ def repair(path: str | os.PathLike[str], *, storage: Storage = DISK) -> RepairRe
                 {},
                 tuple(notes),
             )
-        return _rebuild(storage, view, found, notes)
+        return replace(_rebuild(storage, view, found, notes), written_ns=status.st_mtime_ns)
     except OSError as error:
         raise LogError(
             f"{target} cannot be repaired ({error.strerror}): free some space and try again"
@@ -141,7 +130,6 @@ def _rebuild(storage: Storage, view: View, found: Survey, notes: list[str]) -> R
     """Cut behind the last whole record, write what was saved, and a new summary."""
     contents, size, start = found.contents, view.size, found.end
     saved = Salvage() if found.finished else salvage(view, start, found)
-    lost = Counter(saved.lost)
     bytes_lost = 0 if found.finished else max(0, size - start - saved.bytes_kept)
     bytes_lost += sum(record.length for record in found.damaged)
     behind = _own_end(view, found)
@@ -165,8 +153,10 @@ def _rebuild(storage: Storage, view: View, found: Survey, notes: list[str]) -> R
     contents.data_crc = zlib.crc32(kept + hashes, found.crc)
     replace_tail(storage, view.path, view.fd, start, (kept, hashes, tail_bytes(contents)))
     notes += [f"found: {fault}" for fault in found.faults]
+    kept_messages = sum(contents.counts.values())
+    lost, whole = found.lost.times_ns, found.finished
     return RepairReport(
-        view.path, True, bytes_lost, sum(contents.counts.values()), contents.end_ns, lost, tuple(notes)
+        view.path, True, bytes_lost, kept_messages, contents.end_ns, lost, tuple(notes), not whole
     )
 
 

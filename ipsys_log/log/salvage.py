@@ -2,7 +2,6 @@
 
 import struct
 import zlib
-from collections import Counter
 from dataclasses import dataclass, field
 
 from mcap.opcode import Opcode
@@ -13,6 +12,7 @@ from ipsys_log.log.hashing import ChannelHash
 from ipsys_log.log.records import HEADER, MESSAGE
 from ipsys_log.log.survey import Survey
 from ipsys_log.log.view import View
+from ipsys_log.units import format_time
 
 __all__ = ["Salvage", "salvage"]
 
@@ -23,12 +23,11 @@ _NO_LIMITS = Limits(LARGEST_CHUNK, 1 << 63)
 
 @dataclass(slots=True)
 class Salvage:
-    """Messages saved into a new `chunk`, messages known to be lost by topic."""
+    """Messages saved into a new `chunk`; those known to be lost go to the survey."""
 
     chunk: ChunkBuilder = field(default_factory=lambda: ChunkBuilder(_NO_LIMITS, compress=False))
     definitions: list[bytes] = field(default_factory=list)
     bytes_kept: int = 0
-    lost: Counter[str] = field(default_factory=Counter)
 
 
 def salvage(view: View, start: int, found: Survey) -> Salvage:
@@ -41,9 +40,13 @@ def salvage(view: View, start: int, found: Survey) -> Salvage:
     data = view.read(start, min(view.size - start, LARGEST_CHUNK))
     if len(data) < _FIXED.size + 8:
         return saved
-    opcode, length, *_, name_length = _FIXED.unpack_from(data)
+    opcode, length, start_ns, end_ns, _, _, name_length = _FIXED.unpack_from(data)
     (claimed,) = struct.unpack_from("<Q", data, _FIXED.size)
     whole = length + HEADER.size <= view.size - start
+    if opcode == Opcode.CHUNK and name_length and not whole:
+        found.faults.append(
+            f"messages of {format_time(start_ns)} to {format_time(end_ns)} UTC, compressed and cut off"
+        )
     if opcode != Opcode.CHUNK or name_length or whole or claimed != length - _FIXED.size + 1:
         return saved
     end = _first_hole(data, start)
@@ -66,7 +69,7 @@ def _save_one(view: View, data: bytes, position: int, end: int, found: Survey, s
     elif opcode != Opcode.MESSAGE or known is None or length < MESSAGE.size - HEADER.size:
         return len(data)
     elif stop > end:
-        saved.lost[known.topic] += 1
+        found.lost.note(known.topic, time)
         return len(data)
     else:
         payload = data[position + MESSAGE.size : stop]

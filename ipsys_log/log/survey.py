@@ -2,6 +2,7 @@
 
 import re
 import zlib
+from contextlib import suppress
 from dataclasses import dataclass, field
 
 from mcap.opcode import Opcode
@@ -24,7 +25,7 @@ from ipsys_log.log.records import (
 from ipsys_log.log.scan import add_record, count_all
 from ipsys_log.log.view import View
 
-__all__ = ["Survey", "crc_of", "survey"]
+__all__ = ["Lost", "Survey", "crc_of", "survey"]
 
 _BLOCK = 1 << 20
 _HEAD_OVERLAP = 64
@@ -49,9 +50,20 @@ _PRIVATE = 0x80  # types from here on are skipped by every reader
 
 
 @dataclass(slots=True)
+class Lost:
+    """Messages that are known to be gone, by topic: their log times in ns."""
+
+    times_ns: dict[str, list[int]] = field(default_factory=dict)
+
+    def note(self, topic: str, time_ns: int) -> None:
+        self.times_ns.setdefault(topic, []).append(time_ns)
+
+
+@dataclass(slots=True)
 class Survey:
     """What is whole: records up to `end`, except the stretches in `damaged`.
 
+    `lost` is what lay in damaged chunks whose message indexes are whole.
     `finished` says that a DataEnd record lies at `end`. `faults` is what was found wrong. `unindexed`
     holds the entries of the last chunk if it is the last record and its message indexes are missing.
     """
@@ -61,6 +73,7 @@ class Survey:
     counts: dict[int, dict[int, int]] = field(default_factory=dict)
     hashes: dict[str, ChannelHash] = field(default_factory=dict)
     damaged: list[RecordAt] = field(default_factory=list)
+    lost: Lost = field(default_factory=Lost)
     faults: list[str] = field(default_factory=list)
     unindexed: Inside | None = None
     end: int = len(MAGIC)
@@ -111,6 +124,8 @@ def _stretch(view: View, found: Survey, position: int) -> int:
     follower = _next_record(view, position, at.offset + at.length if at.offset == position else 0)
     if follower is None:
         return view.size
+    if at.opcode == Opcode.MESSAGE_INDEX and found._chunk is None:
+        _note_lost(view, found, at)
     found.damaged.append(RecordAt(Opcode.CHUNK, position, follower - position))
     return follower
 
@@ -154,6 +169,17 @@ def _take_chunk(view: View, found: Survey, at: RecordAt) -> None:
     found._chunk = inside
 
 
+def _note_lost(view: View, found: Survey, at: RecordAt) -> None:
+    """Take in what a message index names, if it lies right behind a damaged chunk or another index."""
+    before = found.damaged[-1] if found.damaged else at
+    if before.offset + before.length == at.offset:
+        with suppress(LogError):
+            channel, rows = _index_rows(view, at)
+            known = found.loose.channels.get(channel)
+            for time_ns, _ in rows:
+                found.lost.note(known.topic if known else f"channel {channel}", time_ns)
+
+
 def _next_record(view: View, damaged: int, claimed: int) -> int | None:
     """Where the next whole record begins behind a damaged one: where that one's length says, or a chunk."""
     if claimed and _is_record(view, claimed):
@@ -188,12 +214,17 @@ def _continue_hashes(found: Survey, inside: Inside, data: bytes) -> None:
 
 def _check_index(view: View, at: RecordAt, inside: Inside) -> int:
     """The channel of a MessageIndex record that agrees with its chunk."""
-    body = view.read(at.offset, at.length)
-    channel = int.from_bytes(body[HEADER.size : HEADER.size + 2], "little")
-    rows = parse_message_index(view, body, 0, channel, at.offset)
-    if sorted(ENTRY.iter_unpack(rows)) != sorted(inside.entries.get(channel, [])):
+    channel, rows = _index_rows(view, at)
+    if sorted(rows) != sorted(inside.entries.get(channel, [])):
         raise view.fault(at.offset, "a MessageIndex record does not fit its chunk")
     return channel
+
+
+def _index_rows(view: View, at: RecordAt) -> tuple[int, list[tuple[int, int]]]:
+    """The channel of a MessageIndex record; log times and places of its messages."""
+    body = view.read(at.offset, at.length)
+    channel = int.from_bytes(body[HEADER.size : HEADER.size + 2], "little")
+    return channel, list(ENTRY.iter_unpack(parse_message_index(view, body, 0, channel, at.offset)))
 
 
 def _check_attachment(view: View, at: RecordAt) -> None:

@@ -179,9 +179,10 @@ class LogWriter:
         """Add a message to a channel that was declared with `add_channel`; times in ns."""
         self._check_open()
         channel, builder = self._channels[topic]
-        for full in (self._images, self._small):
-            if full.is_full(log_time_ns):
-                self._write_chunk(full)
+        if self._small.is_full(log_time_ns):
+            self.flush()  # what was made of a frame is never in the file before it
+        elif self._images.is_full(log_time_ns):
+            self._write_chunk(self._images)
         state = self._hashes.get(topic)
         if state is None:
             state = self._hashes[topic] = self._hash_so_far(topic)

@@ -15,10 +15,10 @@ from rich.text import Text
 
 from ipsys_log.compare import Comparison
 from ipsys_log.latency import Percentiles
-from ipsys_log.messages import CompressedImage, Message, Track, Tracks
+from ipsys_log.messages import Message, Track, Tracks
 from ipsys_log.monitor import Look, Monitor
-from ipsys_log.sources.attached import CameraState
-from ipsys_log.units import CM_PER_M, NS_PER_S, format_bytes
+from ipsys_log.sources.attendant import CameraState
+from ipsys_log.units import CM_PER_M, format_bytes
 
 __all__ = [
     "LiveStatus",
@@ -52,19 +52,12 @@ class LiveStatus:
         self._begin_s = now_s()
         self._before: dict[str, tuple[float, int, int]] = {}
         self._rates: dict[str, tuple[float, float]] = {}
-        self._delays_s: dict[str, float] = {}
         self._tracks: dict[str, Track] = {}
 
     def __call__(self, message: Message | None) -> None:
         """Be shown a message on its way."""
         self._monitor(message)
-        if message is None:
-            return
-        if isinstance(message.payload, CompressedImage):
-            delay_ns = message.log_time_ns - message.publish_time_ns
-            if delay_ns > 0:  # without capture stamps it is not known
-                self._delays_s[str(message.camera)] = delay_ns / NS_PER_S
-        elif isinstance(message.payload, Tracks):
+        if message is not None and isinstance(message.payload, Tracks):
             self._tracks.update({track.robot: track for track in message.payload.tracks})
 
     def show(self) -> Group:
@@ -72,9 +65,7 @@ class LiveStatus:
         now_s = self._now_s()
         for name, state in self._states.items():
             self._rates[name] = self._rate(name, state, now_s)
-        parts: list[Table | Text] = [
-            cameras_table(self._states, self._monitor.looks, self._rates, self._delays_s)
-        ]
+        parts: list[Table | Text] = [cameras_table(self._states, self._monitor.looks, self._rates)]
         if self._tracks:
             parts.append(robots_table(self._tracks))
         # Text, for there are brackets in it that rich would take for its own.
@@ -91,7 +82,8 @@ class LiveStatus:
         lines = [f"{self._target} written: {took_s:.1f} s, {format_bytes(self._target.stat().st_size)}"]
         for name, state in self._states.items():
             dropped = f", {state.dropped} dropped: the disk is too slow" if state.dropped else ""
-            lines.append(f"camera {name}: {state.frames} frames{dropped}")
+            missed = f", {state.missed} lost before they came" if state.missed else ""
+            lines.append(f"camera {name}: {state.frames} frames{dropped}{missed}")
         return lines + self._warnings()
 
     def _rate(self, name: str, state: CameraState, now_s: float) -> tuple[float, float]:
@@ -124,14 +116,12 @@ def cameras_table(
     states: Mapping[str, CameraState],
     looks: Mapping[str, Look],
     rates: Mapping[str, tuple[float, float]],
-    delays_s: Mapping[str, float],
 ) -> Table:
     """A row for each camera, at most 80 columns wide.
 
     Parameters
     ----------
     rates : frames and MB per second.
-    delays_s : from exposure to arrival, of cameras with capture stamps.
     """
     table = Table(box=None, pad_edge=False)
     for heading in ("camera", "frames", "Hz", "MB/s", "drops", "delay", "light", "sharp", "markers"):
@@ -139,13 +129,14 @@ def cameras_table(
     for name, state in states.items():
         look = looks.get(name)
         rate_hz, mb_s = rates.get(name, (0.0, 0.0))
-        delay = f"{1e3 * delays_s[name]:.0f} ms" if name in delays_s else "-"
+        delay = "-" if state.delay_s is None else f"{1e3 * state.delay_s:.0f} ms"
+        drops = state.dropped + state.missed
         table.add_row(
             name if state.up or state.finished else Text(f"{name} (lost)", style="red"),
             str(state.frames),
             f"{rate_hz:.1f}",
             f"{mb_s:.1f}",
-            Text(str(state.dropped), style="red" if state.dropped else ""),
+            Text(str(drops), style="red" if drops else ""),
             delay,
             f"{look.brightness:.0f}" if look else "-",
             f"{100 * look.sharpness:.0f} %" if look else "-",

@@ -69,7 +69,7 @@ class LiveView:
 
     def __call__(self, message: Message | None) -> None:
         """Show a message, soon."""
-        if message is None or message.payload is None:
+        if message is None:
             return
         full = self._waiting.qsize() >= _WAITING
         if full and isinstance(message.payload, CompressedImage):

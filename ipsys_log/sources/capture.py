@@ -24,6 +24,8 @@ _JPEG = ("MJPG", "JPEG")
 _BUFFERS = 8
 _TURN_S = 0.4
 _SILENT_TURNS = 12
+# No camera loses so many frames in a row and is still there.
+_COUNTS_ANEW = 10_000
 
 # Controls, by linux/v4l2-controls.h. What sets itself is turned off before the value is set.
 _EXPOSURE, _AUTO_EXPOSURE, _MANUAL, _SLOWER_IN_THE_DARK = 0x9A0902, 0x9A0901, 1, 0x9A0903
@@ -175,8 +177,8 @@ class _Capture(NamedTuple):
 
 
 def _frames(capture: _Capture, clock: Clock, say: Say) -> Iterator[Frame | None]:
-    silent = 0
-    said = False
+    silent, said = 0, False
+    last: int | None = None
     while True:
         with _faults(capture.where):
             buffer = _next_buffer(capture.device)
@@ -199,7 +201,14 @@ def _frames(capture: _Capture, clock: Clock, say: Say) -> Iterator[Frame | None]
             v4l2.call(capture.device, v4l2.QBUF, buffer)
         # The driver hands back a frame it could make nothing of as an empty one.
         if data:
-            yield Frame(data, "jpeg", clock.of_monotonic_ns(stamp_ns) if stamped else None)
+            missed, last = _missed(last, buffer.sequence), buffer.sequence
+            yield Frame(data, "jpeg", clock.of_monotonic_ns(stamp_ns) if stamped else None, missed)
+
+
+def _missed(last: int | None, sequence: int) -> int:
+    """Frames between two numbers of 32 bits; none where a driver does not count, or counts anew."""
+    between = 0 if last is None else (sequence - last - 1) & 0xFFFF_FFFF
+    return between if between < _COUNTS_ANEW else 0
 
 
 def _next_buffer(device: int) -> v4l2.Buffer | None:

@@ -20,11 +20,12 @@ class SourceError(IpsysError):
 
 class Frame(NamedTuple):
     """A frame as the camera sent it: ``format`` is jpeg, png, h264 or h265; ``time_ns`` is the driver's stamp
-    in UTC, None where there is none."""
+    in UTC, None where there is none; ``missed`` frames before it were lost, as the driver counts."""
 
     data: bytes
     format: str
     time_ns: int | None
+    missed: int = 0
 
 
 class Clock:

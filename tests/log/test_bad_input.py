@@ -49,9 +49,9 @@ def fault_of(act: Callable[[Path], object], path: Path) -> str:
     [
         (b"", "is empty"),
         (b"RIFF....", r"is not an MCAP file \(it starts with b'RIFF....'\)"),
-        (MAGIC, "has no footer: .* Run: ipsys repair"),
-        (MAGIC[:5], "has no footer"),
-        (MAGIC + bytes(10_000), "has no footer"),
+        (MAGIC, "has no end: .* Run: ipsys repair"),
+        (MAGIC[:5], "has no end"),
+        (MAGIC + bytes(10_000), "has no end"),
         (bytes(10_000), "is not an MCAP file"),
     ],
 )
@@ -260,11 +260,34 @@ def test_a_damaged_chunk_in_the_middle_costs_only_itself(log: Path) -> None:
     data[len(data) // 2] ^= 0xFF
     log.write_bytes(data)
     report = repair(log)
-    assert "the CRC of the chunk is wrong" in str(report)
+    assert "the CRC of the chunk is wrong" in str(report.notes)
     with LogReader(log) as reader:
         assert reader.chunk_count == chunks - 1
         assert len(list(reader.messages())) == reader.message_count < total
     assert not repair(log).changed
+
+
+def test_what_lay_in_a_damaged_chunk_is_named_exactly(tmp_path: Path) -> None:
+    """By the message indexes behind it, which are whole."""
+    rows = [(f"/image/{k % 3}", k * 10**8, k, bytes([k]) * 3000) for k in range(60)]
+    rows += [("/points", k * 10**8 + 1, k, bytes([k]) * 40) for k in range(60)]
+    whole = create(tmp_path / "log.mcap", sorted(rows, key=lambda row: row[1])).read_bytes()
+    path = tmp_path / "damaged.mcap"
+    chance = random.Random(8)
+    named = 0
+    for _ in range(60):
+        data = bytearray(whole)
+        data[chance.randrange(100, len(data))] ^= 0xFF
+        path.write_bytes(data)
+        report = repair(path)
+        with LogReader(path) as reader:
+            kept = {(message.topic, message.log_time_ns) for message in reader.messages()}
+        gone = {(topic, time_ns) for topic, times_ns in report.lost.items() for time_ns in times_ns}
+        missing = {(row[0], row[1]) for row in rows} - kept
+        assert gone in (missing, set())
+        named += bool(gone)
+        assert bool(missing) <= bool(report.bytes_lost)
+    assert named > 40
 
 
 @dataclass(frozen=True)
@@ -364,6 +387,6 @@ def test_a_second_log_behind_the_first_is_kept_beside_it(tmp_path: Path) -> None
     path.write_bytes(one + other)
     report = repair(path)
     assert (report.messages_kept, report.bytes_lost) == (30, len(other))
-    assert "perhaps another log" in str(report)
+    assert "perhaps another log" in str(report.notes)
     assert (tmp_path / "joined.mcap.lost").read_bytes() == other
     assert stock_rows(path) == stock_rows(tmp_path / "a.mcap")

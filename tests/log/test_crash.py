@@ -10,7 +10,7 @@ from ipsys_log.errors import LogError
 from ipsys_log.log import LogReader, LogWriter, repair
 from ipsys_log.log.records import MAGIC
 from tests.log.conftest import POINT, Row, append, as_row, create, linear_rows, write_rows
-from tests.log.crash import Operation, Recorder, crashes
+from tests.log.crash import Disk, Operation, Recorder, crashes
 
 NEW: list[Row] = [("/runs/a", 10 + k, k, bytes([k]) * 40) for k in range(20)]
 
@@ -160,6 +160,28 @@ def test_larger_recording(tmp_path: Path) -> None:
     check_recording(tmp_path / "crashed", rows, operations, tries=10)
 
 
+def test_what_was_made_of_a_frame_is_never_there_without_it(tmp_path: Path) -> None:
+    """Whenever a recorder is killed: what it has handed to the system is there, and nothing else."""
+    rows: list[Row] = [("/points", 0, 0, b"a note before the first frame")]
+    for k in range(6, 60):
+        rows += [("/image/a", k * 10**8, k, bytes([k]) * 500), ("/points", k * 10**8, k, bytes([k]) * 50)]
+    operations = record_recording(tmp_path / "recording.mcap", rows)
+    folder = tmp_path / "killed"
+    folder.mkdir()
+    counts = set()
+    for cut in range(4, len(operations) + 1):
+        disk = Disk({}, {})
+        for operation in operations[:cut]:
+            disk.apply(operation)
+        disk.store(folder)
+        repair(folder / "recording.mcap")
+        kept = read(folder / "recording.mcap")
+        frames, made = ({row[1] for row in kept if row[0] == topic} for topic in ("/image/a", "/points"))
+        assert made - {0} <= frames
+        counts.add(len(made))
+    assert len(counts) > 5
+
+
 def test_an_atomic_log_is_there_whole_or_not_at_all(tmp_path: Path) -> None:
     storage = Recorder()
     path = tmp_path / "out.mcap"
@@ -182,7 +204,7 @@ def test_what_a_killed_recorder_flushed_is_there(tmp_path: Path) -> None:
     copy = tmp_path / "killed.mcap"
     copy.write_bytes(path.read_bytes())
     writer.abandon()
-    with pytest.raises(LogError, match=r"no footer.*ipsys repair"):
+    with pytest.raises(LogError, match=r"no end.*ipsys repair"):
         LogReader(copy)
     report = repair(copy)
     assert (report.messages_kept, report.bytes_lost, report.last_kept_ns) == (5, 0, 4)

@@ -9,8 +9,9 @@ from __future__ import annotations
 import errno
 import time
 from collections import deque
-from collections.abc import Callable
+from collections.abc import Callable, Iterator
 from dataclasses import dataclass, field
+from itertools import count
 from pathlib import Path
 from typing import Any
 
@@ -42,6 +43,8 @@ class Driver:
     size: tuple[int, int] = (640, 480)
     rate: tuple[int, int] = (1, 30)
     queued: deque[int] = field(default_factory=deque)
+    # Numbers of the frames to come, where the driver loses some or begins elsewhere.
+    numbers: Iterator[int] = field(default_factory=count)
     streaming: bool = False
 
     def __post_init__(self) -> None:
@@ -138,6 +141,7 @@ class Driver:
         stamp_ns = time.monotonic_ns()
         self.stamps_ns.append(stamp_ns)
         about.index, about.bytesused, about.flags = index, len(frame), self.flags
+        about.sequence = next(self.numbers)
         about.seconds, about.microseconds = stamp_ns // 10**9, stamp_ns % 10**9 // 1000
 
 

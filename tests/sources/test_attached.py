@@ -47,9 +47,36 @@ def test_log_times_are_utc() -> None:
 
 
 def test_a_camera_without_stamps_has_the_time_of_arrival() -> None:
-    found = messages(Attached(cameras("red"), playing(FRAMES, 1000.0, stamped=False), Clock()))
-    frames = [message for message in found if message.camera == "red"]
-    assert all(message.publish_time_ns == message.log_time_ns for message in frames)
+    """That at which its thread had the frame, however long it waited then; and no delay is claimed."""
+    attached = Attached(cameras("red"), playing(FRAMES, 200.0, stamped=False), Clock())
+    with attached:
+        time.sleep(0.3)
+        taken_ns = time.time_ns()
+        frames = [message for message in attached if message is not None and message.camera == "red"]
+    assert len(frames) == 20
+    assert all(message.publish_time_ns < taken_ns < message.log_time_ns for message in frames)
+    assert all(
+        attached.received_ns[m.log_time_ns] == m.publish_time_ns == m.payload.timestamp for m in frames
+    )
+    steps_ns = [other.publish_time_ns - one.publish_time_ns for one, other in pairwise(frames[1:])]
+    assert 2e6 < sum(steps_ns) / len(steps_ns) < 8e6
+    assert attached.states["red"].delay_s is None
+
+
+def test_frames_that_were_lost_before_they_came_are_counted_and_named() -> None:
+    @contextmanager
+    def opened(camera: RigCamera, clock: Clock, say: Say) -> Iterator[Iterator[Frame | None]]:
+        yield iter([Frame(b"x", "jpeg", clock.now_ns(), missed) for missed in (0, 0, 2, 0, 3, 1, 0)])
+
+    said: list[str] = []
+    attached = Attached(cameras("red"), opened, Clock(), said.append)
+    found = messages(attached)
+    assert (attached.states["red"].missed, attached.states["red"].dropped) == (6, 0)
+    assert len(data_of(found, "red")) == 7
+    # The first at once, those within a second of it together.
+    assert [(event.kind, event.camera) for event in events(found)] == [("frames_missed", "red")] * 2
+    assert [event.text for event in events(found)] == said
+    assert said == [f"{n} frames of camera red were lost before they came" for n in (2, 4)]
 
 
 def test_a_camera_that_cannot_be_opened_ends_it_at_once() -> None:
@@ -65,7 +92,7 @@ def test_a_camera_that_cannot_be_opened_ends_it_at_once() -> None:
 
 
 def test_a_camera_that_sends_nothing_is_named_without_its_password(monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr("ipsys_log.sources.attached._FIRST_FRAME_S", 0.2)
+    monkeypatch.setattr("ipsys_log.sources.attendant._FIRST_FRAME_S", 0.2)
 
     @contextmanager
     def silent(camera: RigCamera, clock: Clock, say: Say) -> Iterator[Iterator[Frame | None]]:

@@ -53,9 +53,31 @@ def test_frames_are_the_cameras_bytes_with_the_drivers_stamps(driver: Driver) ->
         came = list(islice((frame for frame in frames if frame), 20))
     del driver.stamps_ns[3]
     expected = [clock.of_monotonic_ns(stamp // 1000 * 1000) for stamp in driver.stamps_ns]
-    assert came == [Frame(data, "jpeg", time) for data, time in zip(pictures, expected, strict=True)]
+    assert [frame[:3] for frame in came] == [
+        (data, "jpeg", time) for data, time in zip(pictures, expected, strict=True)
+    ]
+    assert [n for n, frame in enumerate(came) if frame.missed] == [3]  # that with the empty one before it
     assert not driver.streaming
     assert said == ['camera red: the driver stamps the start of a frame; put into the rig: stamp = "start"']
+
+
+@pytest.mark.parametrize(
+    ("numbers", "missed"),
+    [
+        ((0, 1, 2, 3), (0, 0, 0, 0)),
+        ((7, 8, 11, 12), (0, 0, 2, 0)),
+        ((2**32 - 2, 2**32 - 1, 1, 2), (0, 0, 1, 0)),
+        ((0, 0, 0, 0), (0, 0, 0, 0)),  # it does not count
+        ((500, 501, 0, 1), (0, 0, 0, 0)),  # it counts anew
+    ],
+)
+def test_frames_that_the_driver_lost_are_told(
+    driver: Driver, numbers: tuple[int, ...], missed: tuple[int, ...]
+) -> None:
+    driver.frames.extend([b"x"] * 4)
+    driver.numbers = iter(numbers)
+    with open_usb(ask(driver), Clock(), lambda _: None) as frames:
+        assert tuple(frame.missed for frame in islice((one for one in frames if one), 4)) == missed
 
 
 def test_while_nothing_comes_it_says_so_and_at_last_gives_up(

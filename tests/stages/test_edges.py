@@ -280,6 +280,13 @@ def test_a_marker_in_shadow_on_a_bright_floor_is_found_within_a_second() -> None
     answers = follow(VGA, [(n * 33_000_000, data) for n in range(30)], look)
     assert [marker.id for marker in answers[-1]] == [5]
     assert np.hypot(*(answers[-1][0].corners_px - corners_px(VGA, one)).T).max() < 0.15
+    # Cameras do so one after another: all at once would take longer than live tracking has.
+    others = [RigCamera(name) for name in ("black", "red")]
+    rigs = [(RigCamera(VGA.frame_id), *others), (*others, RigCamera(VGA.frame_id))]
+    first, last = (
+        [*map(bool, follow(VGA, [(n * 33_000_000, data) for n in range(30)], look, *them))] for them in rigs
+    )
+    assert 0 < first.index(True) < last.index(True) < 30
 
 
 def test_glare_on_a_marker_gives_no_wrong_one() -> None:

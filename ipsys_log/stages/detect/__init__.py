@@ -154,7 +154,9 @@ class Detect:
                 f"camera {message.camera} has no calibration in the log, through which edges are fitted: "
                 f"give one with --calibration {message.camera}=calibration.yaml, or use --corners stock"
             )
-        return Follow(rig.dictionary, lens, camera.edge_offset_px, (camera.row_time_ns or 0) / NS_PER_S)
+        row_time_s = (camera.row_time_ns or 0) / NS_PER_S
+        number = rig.cameras.index(camera) if camera in rig.cameras else 0
+        return Follow(rig.dictionary, lens, camera.edge_offset_px, row_time_s, number)
 
     def _unsaid(self, events: list[Event]) -> Iterator[Event]:
         """A camera names an id that is not in the rig once, and whatever else every time."""

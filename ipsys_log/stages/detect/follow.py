@@ -27,6 +27,8 @@ Array = NDArray[np.float64]
 # every so many.
 _SEARCH_EVERY = 20
 _THOROUGH_EVERY = 240
+# Of one camera so many frames later than of the one before.
+_STAGGER = 3
 # And decoded as a whole every so many; the others only as far as markers are expected.
 _WHOLE_EVERY = 10
 _MARGIN_PX = 24
@@ -50,6 +52,8 @@ class Follow:
     dictionary : OpenCV's name, such as DICT_4X4_100.
     lens : of the camera.
     edge_offset_px, row_time_s : as for :func:`fit_edges`.
+    number : of the camera in the rig. Cameras search the whole picture in different frames: the thorough
+        searches of all of them at once would take longer than live tracking has.
     """
 
     def __init__(
@@ -58,6 +62,7 @@ class Follow:
         lens: CameraCalibration,
         edge_offset_px: float | None,
         row_time_s: float,
+        number: int = 0,
     ) -> None:
         self._dictionary = dictionary
         self._lens = lens
@@ -66,7 +71,7 @@ class Follow:
         self._watch = Watch()
         self._changed: tuple[slice, slice] | None = None
         self._breadth_px = 0.0
-        self._frames = 0
+        self._frames = -_STAGGER * number
         self._last_ns = 0
         self._blurs_px: list[float] = []
         self._tracks: list[Track] = []

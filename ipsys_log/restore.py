@@ -1,0 +1,82 @@
+"""Logs whose recorder was killed: made whole again, with the runs that it was writing."""
+
+from __future__ import annotations
+
+from collections.abc import Iterator, Mapping
+from pathlib import Path
+
+from ipsys_log.log.session import Session
+from ipsys_log.lookup import skipped_frames
+from ipsys_log.messages import CameraPoints, Markers, Model, Positions, Tracks
+from ipsys_log.pipeline import replay
+from ipsys_log.request import Progress, Request
+from ipsys_log.runs import Outcome, newest_run
+from ipsys_log.stages.camera_frame import METHODS, PERIMETER
+from ipsys_log.stages.detect import CORNERS
+from ipsys_log.tasks import points_run
+
+__all__ = ["finish_runs", "unfinished_runs"]
+
+# What a run of camera points is called, and why.
+_POINTS = [(points_run(corners, method), corners, method) for corners in CORNERS for method in METHODS]
+
+
+def unfinished_runs(session: Session) -> dict[str, str]:
+    """What ``ipsys live`` and ``record --detect`` wrote and could not sign: the run of each such stage."""
+    signed = {(run.run, run.stage) for run in session.runs()}
+    found = _live_runs(session) if session.images else ()
+    return {stage: run for stage, run in found if (run, stage) not in signed}
+
+
+def _live_runs(session: Session) -> Iterator[tuple[str, str]]:
+    """Stages and their runs, as they are called live, as far as the log has them."""
+    for corners in CORNERS:
+        if session.topics(Markers, corners):
+            yield "detect", corners
+    for points, _, _ in _POINTS:
+        if session.topics(CameraPoints, points):
+            yield "camera-frame", points
+    for run in sorted(session.run_names()):
+        if session.topics(Model, run) and session.topics(Positions, run):
+            yield "locate", run
+            if session.topics(Tracks, run):
+                yield "fuse", run
+
+
+def finish_runs(path: Path, progress: Progress) -> list[Outcome]:
+    """Bring the runs that a killed recorder left to their end: its last frames are looked at too.
+
+    A run is signed only if all that was written of it is what its stages make of the log now, byte for byte.
+    Frames that were skipped for want of time are passed over, as they were live.
+
+    Returns
+    -------
+    One outcome for each stage; none where there is nothing to finish.
+
+    Raises
+    ------
+    IpsysError
+        Where the log lacks something that the stages need; nothing was changed then.
+    """
+    with Session([path]) as session:
+        left = unfinished_runs(session)
+        if not left:
+            return []
+        request = _request(session, left)
+    return replay([path], request, list(left)[-1], progress=progress)
+
+
+def _request(session: Session, left: Mapping[str, str]) -> Request:
+    """What was asked for live, by the names of the runs."""
+    points = left.get("camera-frame") or newest_run(session, CameraPoints)
+    live = (left.get("detect"), PERIMETER)
+    corners, method = next(((corners, method) for run, corners, method in _POINTS if run == points), live)
+    run = left.get("locate") or left.get("fuse")
+    models = session.payloads(session.topics(Model, run)) if run else []
+    return Request(
+        models=tuple(model.name for model in models[-1:]),
+        corners=corners,
+        method=method,
+        as_live=bool(skipped_frames(session)),
+        skip_ambiguous=True,
+    )

@@ -1,0 +1,205 @@
+"""The thread of one camera: takes what it sends, for as long as it does, and again when it is back."""
+
+from __future__ import annotations
+
+import threading
+from collections.abc import Callable
+from contextlib import suppress
+from dataclasses import dataclass
+from typing import Any, NamedTuple
+
+import simplejpeg
+
+from ipsys_log.messages import EVENTS_TOPIC, Event, RigCamera, image_topic
+from ipsys_log.sources.frames import Clock, Frame, Open, Say, SourceError, instant_ns
+from ipsys_log.sources.network import hide_password
+from ipsys_log.sources.videos import frame_payload
+from ipsys_log.units import NS_PER_S
+
+__all__ = ["Arrival", "Attendant", "CameraState", "Shared"]
+
+# A camera that opens and then sends nothing is not there.
+_FIRST_FRAME_S = 10.0
+# The simulator draws its frames first, however busy the machine is.
+_DRAW_S = 120.0
+_RETRY_S, _LONGEST_RETRY_S = 0.5, 8.0
+_TURN_S = 0.1
+# A camera that loses frames all the time is not named more often.
+_NAMED_EVERY_NS = NS_PER_S
+
+
+@dataclass(slots=True)
+class CameraState:
+    """What has come of a camera so far.
+
+    ``dropped`` frames came and never reached the log, ``missed`` ones were lost before they came, as far as
+    the camera's driver counts. ``size_px`` is the width and height of its frames, where they are JPEGs, and
+    ``delay_s`` the time from exposure to arrival of the last one, where it has a capture stamp.
+    """
+
+    frames: int = 0
+    bytes: int = 0
+    dropped: int = 0
+    missed: int = 0
+    up: bool = False
+    finished: bool = False
+    size_px: tuple[int, int] | None = None
+    delay_s: float | None = None
+
+
+class Arrival(NamedTuple):
+    """A message but for its log time, and when it came."""
+
+    received_ns: int
+    topic: str
+    publish_time_ns: int
+    payload: Any
+    camera: str | None = None
+
+
+@dataclass(frozen=True, slots=True)
+class Shared:
+    """What the threads of all cameras have in common: ``put`` takes an arrival, or says that there is no room
+    for a frame; nothing but the first frames is taken before ``started``, and nothing after ``stopped``."""
+
+    open_source: Open
+    clock: Clock
+    put: Callable[[Arrival], bool]
+    say: Say
+    started: threading.Event
+    stopped: threading.Event
+
+
+class Attendant:
+    """Attends to a camera, in a thread of its own.
+
+    Attributes
+    ----------
+    state : what has come so far.
+    fault : what the thread ended with, if it was not the end of the source.
+    """
+
+    def __init__(self, camera: RigCamera, shared: Shared) -> None:
+        self.state = CameraState()
+        self.fault: BaseException | None = None
+        self._camera, self._shared = camera, shared
+        self._opened, self._begun = threading.Event(), threading.Event()
+        self._lost_ns: int | None = None
+        self._dropped_before = self._missed_before = self._missed_named_ns = 0
+        self._said: set[str] = set()
+        self.thread = threading.Thread(target=self._attend, name=camera.name, daemon=True)
+
+    def wait(self) -> None:
+        """Until the first frame has come.
+
+        Raises
+        ------
+        SourceError
+            Where the camera cannot be opened, or sends nothing.
+        """
+        self._opened.wait()
+        simulated = str(self._camera.source).startswith("sim:")
+        begun = self._begun.wait(_DRAW_S if simulated else _FIRST_FRAME_S)
+        if self.fault is not None:
+            raise self.fault
+        if not begun:
+            raise SourceError(
+                f"camera {self._camera.name}: {hide_password(str(self._camera.source))} sends no frames; "
+                "look whether another program uses it"
+            )
+
+    def _attend(self) -> None:
+        retry_s, stopped = _RETRY_S, self._shared.stopped
+        try:
+            while not stopped.is_set():
+                before = self.state.frames
+                lost = self._take_all()
+                if lost is None:
+                    break
+                if not self._begun.is_set():
+                    raise lost
+                retry_s = _RETRY_S if self.state.frames > before else min(2 * retry_s, _LONGEST_RETRY_S)
+                stopped.wait(retry_s)
+        except BaseException as fault:  # whoever opens the cameras, or takes the messages, is to see it
+            self.fault = fault
+        finally:
+            self._name_lost(now=True)
+            self.state.up, self.state.finished = False, True
+            self._opened.set()
+            self._begun.set()
+
+    def _take_all(self) -> SourceError | None:
+        """Frames until the source has ended (None), or the camera has gone."""
+        shared = self._shared
+        try:
+            with shared.open_source(self._camera, shared.clock, self._say_setting) as frames:
+                self._opened.set()
+                for frame in frames:
+                    if shared.stopped.is_set():
+                        break
+                    if frame is not None:
+                        self._take(frame)
+        except SourceError as error:
+            if self.state.up:
+                self.state.up, self._lost_ns = False, shared.clock.now_ns()
+                self._say("camera_lost", f"{error}; trying again")
+            return error
+        return None
+
+    def _take(self, frame: Frame) -> None:
+        state, camera, now_ns = self.state, self._camera, self._shared.clock.now_ns()
+        if self._lost_ns is not None:
+            gone_s = (now_ns - self._lost_ns) / NS_PER_S
+            self._lost_ns = None
+            self._say("camera_back", f"camera {camera.name} is back after {gone_s:.1f} s")
+        state.up = True
+        if state.size_px is None:
+            state.size_px = _size_of(frame)
+        time_ns = now_ns
+        if frame.time_ns is not None:
+            time_ns = instant_ns(frame.time_ns, camera)
+            state.delay_s = (now_ns - time_ns) / NS_PER_S
+        state.missed += frame.missed
+        payload = frame_payload(time_ns, camera.name, frame.data, frame.format)
+        if not self._shared.put(Arrival(now_ns, image_topic(camera.name), time_ns, payload, camera.name)):
+            state.dropped += 1
+            return
+        state.frames += 1
+        state.bytes += len(frame.data)
+        self._name_lost()
+        self._begun.set()
+        # What came before the slowest camera would only be late.
+        while not self._shared.started.wait(_TURN_S) and not self._shared.stopped.is_set():
+            pass
+
+    def _name_lost(self, now: bool = False) -> None:
+        """Frames that are not in the log, since they were last named."""
+        state, name = self.state, self._camera.name
+        if dropped := state.dropped - self._dropped_before:
+            self._dropped_before = state.dropped
+            self._say("frames_dropped", f"{dropped} frames of camera {name} dropped: the disk is too slow")
+        time_ns = self._shared.clock.now_ns()
+        missed = state.missed - self._missed_before
+        if missed and (now or time_ns - self._missed_named_ns >= _NAMED_EVERY_NS):
+            self._missed_before, self._missed_named_ns = state.missed, time_ns
+            self._say("frames_missed", f"{missed} frames of camera {name} were lost before they came")
+
+    def _say_setting(self, text: str) -> None:
+        """What a camera refused, once, however often it is opened."""
+        if text not in self._said:
+            self._said.add(text)
+            self._say("camera_setting", text)
+
+    def _say(self, kind: str, text: str) -> None:
+        """An event of this camera, said at once too."""
+        now_ns = self._shared.clock.now_ns()
+        self._shared.put(Arrival(now_ns, EVENTS_TOPIC, now_ns, Event(now_ns, kind, text, self._camera.name)))
+        self._shared.say(text)
+
+
+def _size_of(frame: Frame) -> tuple[int, int] | None:
+    if frame.format == "jpeg":
+        with suppress(ValueError, KeyError):  # a damaged frame says nothing
+            height, width, *_ = simplejpeg.decode_jpeg_header(frame.data, strict=False)
+            return width, height
+    return None

@@ -1,0 +1,255 @@
+"""A recorder that was killed, or whose disk was full: what is brought back, and what its runs are."""
+
+from __future__ import annotations
+
+import signal
+import subprocess
+import sys
+import time
+from collections.abc import Iterator
+from contextlib import contextmanager
+from dataclasses import replace
+from pathlib import Path
+
+import pytest
+
+from ipsys_log import pipeline
+from ipsys_log.log import LogReader, LogWriter, repair
+from ipsys_log.log.records import ChunkRef
+from ipsys_log.log.session import Session
+from ipsys_log.messages import Event, Markers, Message, Tracks
+from ipsys_log.output import write_message
+from ipsys_log.request import Request
+from ipsys_log.restore import finish_runs
+from ipsys_log.stages.detect import Detect
+from ipsys_log.verify import verify
+from tests.conftest import Ipsys
+from tests.test_live import calibration, go_live, recorded, slow  # noqa: F401
+
+RIG = """name = "lab"
+dictionary = "DICT_4X4_100"
+marker_length_m = 0.2
+"""
+
+
+@pytest.fixture
+def rig(tmp_path: Path) -> Path:
+    """Two cameras of the simulated lab; so many frames that there is always one that waits."""
+    path = tmp_path / "lab.toml"
+    cameras = (
+        f'[[cameras]]\nname = "{name}"\nsource = "sim:{name}"\nwidth = 480\nheight = 270\nrate_hz = 25\n'
+        for name in ("red", "white")
+    )
+    path.write_text(RIG + "".join(cameras))
+    return path
+
+
+@contextmanager
+def going_live(rig: Path, model: Path, log: Path, seconds: float) -> Iterator[subprocess.Popen[str]]:
+    """``ipsys live``, once it has recorded for so long."""
+    command = ["live", "--rig", rig, "--model-from", model, "-o", log]
+    program = subprocess.Popen(
+        [sys.executable, "-m", "ipsys_log", *map(str, command)],
+        stdout=subprocess.PIPE,
+        stderr=subprocess.PIPE,
+        text=True,
+    )
+    try:
+        until = time.monotonic() + 60
+        while not log.exists() or log.stat().st_size < 10_000:
+            assert time.monotonic() < until, "nothing is recorded"
+            assert program.poll() is None, program.communicate()
+            time.sleep(0.05)
+        time.sleep(seconds)
+        yield program
+    finally:
+        program.kill()
+        program.communicate()
+
+
+def equal(log: Path) -> bool:
+    return all(one.equal for one in verify([log], None, lambda stage, done, total: None))
+
+
+def finish(log: Path) -> list[tuple[str, str]]:
+    repair(log)
+    return [(one.stage, one.run) for one in finish_runs(log, lambda stage, done, total: None)]
+
+
+def topics_of(log: Path) -> set[str]:
+    with Session([log]) as session:
+        return {topic for reader in session.readers for topic in reader.channels}
+
+
+LIVE = [("detect", "edges"), ("camera-frame", "edges"), ("locate", "poly"), ("fuse", "poly")]
+
+
+def test_a_live_run_that_is_killed_is_brought_to_its_end(
+    ipsys: Ipsys,
+    rig: Path,
+    calibration: Path,  # noqa: F811
+    tmp_path: Path,
+) -> None:
+    log = tmp_path / "monday.mcap"
+    with going_live(rig, calibration, log, 3.0) as program:
+        for command in ("info", "replay", "verify", "latency", "view"):
+            done = ipsys(command, log)
+            assert (done.code, done.err.count("\n")) == (1, 1)
+            assert "is being recorded or written just now" in done.err
+        assert "another process is writing it" in ipsys("repair", log).err
+        assert program.poll() is None
+        program.send_signal(signal.SIGKILL)
+        killed_ns = time.time_ns()
+        program.wait(10)
+    for command in ("info", "replay", "verify", "measure", "latency", "view"):
+        done = ipsys(command, log)
+        assert done.code == 1
+        assert f"its recorder was killed, or the file was cut off. What it holds can be saved. Run: ipsys repair {log}" in done.err  # fmt: skip # noqa: E501
+    done = ipsys("repair", log)
+    assert done.code == 0, done.err
+    assert "monday.mcap repaired" in done.out
+    assert "The file was last written at" in done.out
+    with Session([log]) as session:
+        for camera, topic in session.images.items():
+            last_ns, _ = session.last([topic])
+            assert killed_ns - last_ns < 1.5e9
+            (line,) = (one for one in done.out.splitlines() if topic in one)
+            gone = int(line.split()[3])
+            assert (killed_ns - last_ns) / 1e9 * 20 - 2 < gone < 60, line
+            assert session.count(f"/runs/edges/cameras/{camera}/markers") == session.count(topic) > 50
+    assert ipsys("verify", log).out.endswith("a replay equals the log\n")
+    done = ipsys("replay", log)
+    assert done.code == 0, done.err
+    assert "nothing to do: all of it is up to date" in done.err
+    assert not [topic for topic in topics_of(log) if "_2/" in topic]
+    assert not any(one.fresh for one in pipeline.replay([log], Request(model_from=calibration)))
+
+
+@pytest.mark.parametrize("share", [0.3, 0.6, 0.95])
+def test_frames_that_nobody_had_looked_at_are_looked_at(
+    recorded: Path,  # noqa: F811
+    tmp_path: Path,
+    share: float,
+) -> None:
+    """Killed between two writes: frames are there, and nothing that was made of the last of them."""
+    chunks = list(_chunks(recorded))
+    last = next(c for c in chunks[int(share * len(chunks)) :] if not c.compression)
+    cut = tmp_path / "cut.mcap"
+    cut.write_bytes(recorded.read_bytes()[: last.end])
+    repair(cut)
+    with Session([cut]) as session:
+        frames = sum(session.count(topic) for topic in session.images.values())
+        markers = sum(session.count(topic) for topic in session.topics(Markers, "edges"))
+        assert frames > markers > 0
+    assert finish(cut) == [
+        ("detect", "edges"),
+        ("camera-frame", "edges"),
+        ("locate", "poly"),
+        ("fuse", "poly"),
+    ]
+    assert equal(cut)
+    with Session([cut]) as session, Session([recorded]) as whole:
+        assert sum(session.count(topic) for topic in session.topics(Markers, "edges")) == frames
+        ours, theirs = (s.payloads(["/runs/poly/tracks"]) for s in (session, whole))
+        assert [one.timestamp for one in ours] == [one.timestamp for one in theirs[: len(ours)]]
+    assert finish(cut) == []
+    assert not any(one.fresh for one in pipeline.replay([cut], Request()))
+
+
+def _chunks(log: Path) -> Iterator[ChunkRef]:
+    with LogReader(log) as reader:
+        yield from reader._contents.chunks
+
+
+def test_a_run_that_is_not_what_its_stage_makes_is_left_as_it_is(
+    recorded: Path,  # noqa: F811
+    ipsys: Ipsys,
+    tmp_path: Path,
+) -> None:
+    """Nothing is signed that is not so."""
+    log = tmp_path / "other.mcap"
+    with Session([recorded]) as session, LogWriter.create(log) as writer:
+        counts: dict[str, int] = {}
+        for message in session.messages(topics_of(recorded)):
+            if not message.topic.endswith("edges/record") and _stage(message) not in ("locate", "fuse"):
+                write_message(writer, _moved(message, session.end_ns), counts)
+    done = ipsys("repair", log)
+    assert done.code == 0, done.err
+    assert "run poly was cut short, and is left so: /runs/poly/tracks is another one at" in done.err
+    apart = {one.topic for one in verify([log], None, lambda *_: None) if not one.equal}
+    assert apart == {"/runs/poly/tracks", "/runs/poly/poses"}
+    with Session([log]) as session:
+        assert session.count("/runs/poly_2/tracks") == session.count("/runs/poly/tracks")
+
+
+def _stage(message: Message) -> str | None:
+    return getattr(message.payload, "stage", None) if message.topic.endswith("/record") else None
+
+
+def _moved(message: Message, end_ns: int) -> Message:
+    """A robot, in the second half, by a hair."""
+    if (
+        not isinstance(message.payload, Tracks)
+        or message.log_time_ns < end_ns - 1e9
+        or not message.payload.tracks
+    ):
+        return message
+    first, *rest = message.payload.tracks
+    return replace(
+        message, payload=replace(message.payload, tracks=(replace(first, x_m=first.x_m + 1e-12), *rest))
+    )
+
+
+def test_frames_that_were_skipped_stay_skipped(
+    lab_log: Path,
+    calibration: Path,  # noqa: F811
+    tmp_path: Path,
+    monkeypatch: pytest.MonkeyPatch,
+) -> None:
+    whole, cut = tmp_path / "whole.mcap", tmp_path / "cut.mcap"
+    with monkeypatch.context() as patch:
+        patch.setattr(Detect, "__call__", slow(Detect.__call__))
+        go_live(lab_log, calibration, whole, 15.0)
+    # Frames are written right before what was made of those before them: between the two it is killed.
+    chunks = sorted(_chunks(whole), key=lambda chunk: chunk.offset)
+    *_, before_end, _signed = (chunk.offset for chunk in chunks if chunk.compression)
+    cut.write_bytes(whole.read_bytes()[:before_end])
+    assert finish(cut) == LIVE
+    assert equal(cut)
+    with Session([cut]) as session:
+        skipped = [e for e in session.payloads(session.topics(Event)) if e.kind == "frame_skipped"]
+        frames = sum(session.count(topic) for topic in session.images.values())
+        markers = sum(session.count(topic) for topic in session.topics(Markers, "edges"))
+    assert len(skipped) > 5
+    assert markers == frames - len(skipped)
+
+
+def test_a_full_disk_ends_live_with_runs_that_are_signed(
+    ipsys: Ipsys,
+    rig: Path,
+    calibration: Path,  # noqa: F811
+    tmp_path: Path,
+) -> None:
+    disk = tmp_path / "disk"
+    disk.mkdir()
+    mounted = subprocess.run(
+        ["mount", "-t", "tmpfs", "-o", "size=12m", "none", str(disk)], capture_output=True, check=False
+    )
+    if mounted.returncode != 0:
+        pytest.skip("no right to mount a small disk")
+    log = disk / "a.mcap"
+    try:
+        with going_live(rig, calibration, log, 0.0) as program:
+            out, err = program.communicate(timeout=60)
+        verified, replayed = ipsys("verify", log), ipsys("replay", log)
+        assert equal(log)
+        with Session([log]) as session:
+            frames = sum(session.count(topic) for topic in session.images.values())
+            markers = sum(session.count(topic) for topic in session.topics(Markers, "edges"))
+    finally:
+        subprocess.run(["umount", str(disk)], check=True)
+    assert program.returncode == 1, out
+    assert "the disk takes no more; recording has stopped, and the log is complete" in err
+    assert verified.out.endswith("a replay equals the log\n")
+    assert "nothing to do: all of it is up to date" in replayed.err
+    assert frames >= markers > 50

@@ -16,7 +16,7 @@ from ipsys_log.sources.attendant import CameraState
 from ipsys_log.stages import camera_frame, detect, fuse, locate
 from ipsys_log.tasks import Task, copy_model, model_run, points_run, usual_corners
 
-__all__ = ["LivePlan", "check_pictures", "plan_live"]
+__all__ = ["LivePlan", "check_model", "check_pictures", "check_start", "plan_live"]
 
 # The run a stage writes to, the payloads it reads, its step, and whether it takes each camera by itself.
 Row = tuple[str, tuple[type, ...], Callable[[Message], Iterable[Any]], bool]
@@ -48,32 +48,76 @@ def plan_live(
         cameras, or one that needs a height that the rig does not say.
     """
     lenses = {str(message.camera) for message in settings if isinstance(message.payload, CameraCalibration)}
+    (rig,) = (message.payload for message in settings if isinstance(message.payload, Rig))
     request = replace(request, corners=request.corners or usual_corners(cameras, lenses))
-    names = wanted_models(request, "fuse") if until == "fuse" else ()
-    copied = [copy_model(request, name) for name in names]
+    copied = _copied(request, until)
     models = [model for _, model in copied]
-    _check(cameras, settings, models, until)
+    _check(rig, cameras, lenses, models, until)
     return LivePlan(request, copied, *_stages(request, models, until))
 
 
+def check_start(
+    rig: Rig, cameras: Collection[str], lenses: Collection[str], request: Request, until: str
+) -> list[str]:
+    """See, before a camera is opened, that a live run can be planned.
+
+    Parameters
+    ----------
+    cameras, lenses : the names of the cameras, and of those that have a lens.
+    request, until : as of :func:`plan_live`.
+
+    Returns
+    -------
+    A line for each thing to know.
+
+    Raises
+    ------
+    IpsysError
+        As :func:`plan_live`.
+    """
+    models = [model for _, model in _copied(request, until)]
+    _check(rig, cameras, lenses, models, until)
+    return [
+        f"camera {name}: {request.model_from} has no model of it; it is recorded, and places no robots"
+        for model in models
+        for name in sorted(set(cameras) - {camera.camera for camera in model.cameras})
+    ]
+
+
+def check_model(model: Model, cameras: Collection[str]) -> None:
+    """See that a model is of some of the cameras.
+
+    Raises
+    ------
+    IpsysError
+        Otherwise.
+    """
+    known = sorted(camera.camera for camera in model.cameras)
+    if not set(known) & set(cameras):
+        raise IpsysError(
+            f"the model {model.name} is of the cameras {', '.join(known)}, and none of them is here, but "
+            f"{', '.join(cameras)}; give a model of these, or name the cameras in lab.toml as they were then"
+        )
+
+
+def _copied(request: Request, until: str) -> list[tuple[Task, Model]]:
+    """The models of another log that are applied, with the tasks that copy them in; none before locate."""
+    return [copy_model(request, name) for name in wanted_models(request, "fuse")] if until == "fuse" else []
+
+
 def _check(
-    cameras: Collection[str], settings: Sequence[Message], models: Sequence[Model], until: str
+    rig: Rig, cameras: Collection[str], lenses: Collection[str], models: Sequence[Model], until: str
 ) -> None:
     """See that the stages will not have to stop later."""
-    lenses = {message.camera for message in settings if isinstance(message.payload, CameraCalibration)}
-    missing = sorted(set(cameras) - lenses)
+    missing = sorted(set(cameras) - set(lenses))
     if missing and until != "detect":
         name = missing[0]
         raise IpsysError(
             f'camera {name} has no lens: write calibration = "{name}.yaml" into lab.toml, or give '
             f"--calibration {name}=file.yaml"
         )
-    (rig,) = (message.payload for message in settings if isinstance(message.payload, Rig))
     for model in models:
-        known = {camera.camera for camera in model.cameras}
-        if not known & set(cameras):
-            names = ", ".join(sorted(known))
-            raise IpsysError(f"the model {model.name} is of the cameras {names}, and none of them is here")
+        check_model(model, cameras)
         heights = [rig.height_of(marker.id) for marker in rig.markers] or [rig.marker_height_m]
         if reads_height(model.name) and None in heights:
             raise IpsysError(

@@ -79,7 +79,8 @@ def fitted_in(other: Session, name: str | None) -> tuple[Model, str]:
         if name in (None, model.name):
             return model, topic
     what = f"model {name}" if name else "model"
-    raise IpsysError(f"{other}: has no fitted {what}; fit one there with: ipsys fit {other}")
+    option = f" --model {name}" if name else ""
+    raise IpsysError(f"{other}: has no fitted {what}; fit one there with: ipsys fit {other}{option}")
 
 
 def _model_topics(session: Session) -> list[str]:

@@ -27,10 +27,11 @@ _SHRINK = 3
 
 @dataclass(frozen=True, slots=True)
 class Look:
-    """One frame of a camera: ids of the markers in it, mean brightness 0 to 255, sharpness relative to the
-    best so far, and what is wrong with it, in words."""
+    """One frame of a camera: ids of the rig's markers in it, and of others, mean brightness 0 to 255,
+    sharpness relative to the best so far, and what is wrong with it, in words."""
 
     markers: tuple[int, ...]
+    strange: tuple[int, ...]
     brightness: float
     sharpness: float
     warnings: tuple[str, ...]
@@ -80,8 +81,10 @@ class Monitor:
         try:
             grey = decode_grey(image)
         except FrameError as error:
-            return Look((), 0.0, 0.0, (f"a frame cannot be decoded: {error}",))
-        counts = Counter(one.id for one in search(grey, self._rig.dictionary) if self._rig.knows(one.id))
+            return Look((), (), 0.0, 0.0, (f"a frame cannot be decoded: {error}",))
+        seen = Counter(one.id for one in search(grey, self._rig.dictionary))
+        counts = {n: count for n, count in seen.items() if self._rig.knows(n)}
+        strange = tuple(sorted(set(seen) - set(counts)))
         small = grey[::_SHRINK, ::_SHRINK]
         brightness, spread = float(small.mean()), float(small.std())
         fine = float(cv2.Laplacian(np.ascontiguousarray(small), cv2.CV_32F).std()) / max(spread, 1.0)
@@ -92,4 +95,16 @@ class Monitor:
             warnings.append("the picture is dark or empty: is the lens covered?")
         elif sharpness < _BLURRED:
             warnings.append("blurred: give it more light, or a fixed exposure_s in lab.toml")
-        return Look(tuple(sorted(counts)), brightness, sharpness, tuple(warnings))
+        if strange:
+            warnings.append(_unknown(strange))
+        return Look(tuple(sorted(counts)), strange, brightness, sharpness, tuple(warnings))
+
+
+def _unknown(ids: tuple[int, ...]) -> str:
+    """What to do about markers that are in the picture and not in the rig."""
+    names = ", ".join(map(str, ids))
+    if len(ids) == 1:
+        which, todo = f"marker {names} is", "to track it, add to lab.toml"
+    else:
+        which, todo = f"markers {names} are", "to track them, add for each to lab.toml"
+    return f"{which} seen, but not in the rig; {todo}: [[markers]] id = {ids[0]}"

@@ -14,6 +14,7 @@ from typing import Any, TypeVar
 
 from ipsys_log.errors import IpsysError
 from ipsys_log.messages import Floor, ReferencePoint, Rig, RigCamera, RigMarker
+from ipsys_log.rig_slips import check_slips
 
 __all__ = ["STAMPS", "check_name", "check_rig", "example_toml", "load_rig", "rig_toml"]
 
@@ -83,7 +84,8 @@ def load_rig(path: Path) -> Rig:
     Raises
     ------
     IpsysError
-        Where it cannot be read, is not TOML, has unknown or missing keys, or contradicts itself.
+        Where it cannot be read, is not TOML, has unknown or missing keys, contradicts itself, or has a value
+        that was meant in another unit.
     """
     try:
         table = tomllib.loads(path.read_text(encoding="utf-8"))
@@ -102,7 +104,9 @@ def load_rig(path: Path) -> Rig:
         )
     if "floor" in table:
         table["floor"] = _build(Floor, table["floor"], f"{path}: [floor]")
-    return check_rig(_build(Rig, table, str(path)), str(path))
+    rig = check_rig(_build(Rig, table, str(path)), str(path))
+    check_slips(rig, str(path))
+    return rig
 
 
 def check_rig(rig: Rig, where: str) -> Rig:

@@ -360,9 +360,11 @@ def test_verify_and_diff_on_the_command_line(ipsys: Ipsys, recorded: Path, lab: 
 def test_the_latency_ledger_as_table_and_picture(ipsys: Ipsys, recorded: Path, tmp_path: Path) -> None:
     done = ipsys("latency", recorded, "--plot", tmp_path / "latency.png")
     assert done.code == 0
-    assert [line.split()[0] for line in done.out.splitlines()[2:]] == [
+    *rows, note = done.out.splitlines()[2:]
+    assert [line.split()[0] for line in rows] == [
         "received", "detected", "located", "fused", "published", "total",
     ]  # fmt: skip
+    assert note == "total: from the arrival of a frame to its position"
     assert (tmp_path / "latency.png").read_bytes()[:4] == b"\x89PNG"
     with Session([recorded]) as session:
         assert [run.stage for run in session.payloads(session.topics(Run, "edges"))] == [

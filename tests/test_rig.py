@@ -6,6 +6,7 @@ import re
 from dataclasses import replace
 from pathlib import Path
 
+import cv2
 import pytest
 from hypothesis import HealthCheck, given, settings
 from hypothesis import strategies as st
@@ -13,6 +14,7 @@ from hypothesis import strategies as st
 from ipsys_log.errors import IpsysError
 from ipsys_log.messages import Floor, ReferencePoint, Rig, RigCamera, RigMarker
 from ipsys_log.rig import check_rig, example_toml, load_rig, rig_toml
+from ipsys_log.rig_slips import dictionary_size
 
 RIG = Rig(
     "lab",
@@ -35,7 +37,7 @@ def test_what_is_written_reads_back(tmp_path: Path) -> None:
         assert load_rig(path) == rig
 
 
-@given(st.floats(0, 5), st.floats(0, 1, exclude_min=True), st.none() | st.floats(0, 5))
+@given(st.floats(0, 5), st.floats(0, 0.1, exclude_min=True), st.none() | st.floats(0, 5))
 @settings(suppress_health_check=[HealthCheck.function_scoped_fixture])
 def test_heights_and_sigma_read_back_to_the_last_digit(
     tmp_path: Path, height_m: float, sigma_m: float, own_m: float | None
@@ -98,6 +100,62 @@ def test_a_rig_that_cannot_be_right_is_refused(change: dict[str, object], said: 
     assert check_rig(RIG, "lab.toml") is RIG
     with pytest.raises(IpsysError, match=f"^lab.toml: .*{said}"):
         check_rig(replace(RIG, **change), "lab.toml")  # type: ignore[arg-type]
+
+
+@pytest.mark.parametrize(
+    ("change", "said"),
+    [
+        (
+            {"marker_length_m": 20.0},
+            "marker_length_m = 20 is too much for m; write 0.2 if that is cm or 0.02",
+        ),
+        (
+            {"markers": (RigMarker(3, length_m=150.0),)},
+            "marker 3: length_m = 150 .* write 1.5 if that is cm or",
+        ),
+        ({"markers": (RigMarker(100),)}, "marker id 100: DICT_4X4_100 has only 0 to 99"),
+        (
+            {"floor": Floor(488.0, 4.88)},
+            r"\[floor\] width_m = 488 is too much for m; write 4.88 if that is cm",
+        ),
+        ({"reference_points": (ReferencePoint("A", 122.0, 0.0),)}, "reference point A: x_m = 122"),
+        ({"tape_sigma_m": 1.0}, "tape_sigma_m = 1 .* write 0.01 if that is cm or 0.001 if that is mm"),
+        ({"cameras": (RigCamera("red", rate_hz=3000.0),)}, "camera red: rate_hz = 3000 .*; write 0 to 1000"),
+        ({"cameras": (RigCamera("red", exposure_s=8.0),)}, "exposure_s = 8 .* write 0.008 if that is ms"),
+        ({"cameras": (RigCamera("red", row_time_ns=31),)}, "too little for ns; write 31000 if that is us"),
+    ],
+)
+def test_what_was_meant_in_another_unit_is_refused_in_a_rig_file(
+    tmp_path: Path, change: dict[str, object], said: str
+) -> None:
+    path = tmp_path / "lab.toml"
+    path.write_text(rig_toml(replace(RIG, **change)))  # type: ignore[arg-type]
+    with pytest.raises(IpsysError, match=f"lab.toml: .*{said}"):
+        load_rig(path)
+
+
+def test_unusual_labs_are_not_refused(tmp_path: Path) -> None:
+    path = tmp_path / "lab.toml"
+    cameras = (
+        RigCamera("fast", 0, -1.0, rate_hz=1000.0, exposure_s=2e-5),
+        RigCamera("slow", 200_000, rate_hz=0.1, exposure_s=1.0, width=1080, height=1920),
+    )
+    for size_m, marker_m, sigma_m in ((0.3, 0.005, 0.0001), (90.0, 1.5, 0.05)):
+        rig = replace(
+            RIG, marker_length_m=marker_m, tape_sigma_m=sigma_m, floor=Floor(size_m, size_m),
+            cameras=cameras, markers=(RigMarker(99, 1.0),),
+            reference_points=(ReferencePoint("A", -size_m, 0.0), ReferencePoint("B", size_m, size_m)),
+        )  # fmt: skip
+        path.write_text(rig_toml(rig))
+        assert load_rig(path) == rig
+
+
+def test_the_sizes_of_all_dictionaries_are_those_of_opencv() -> None:
+    names = [name for name in dir(cv2.aruco) if name.startswith("DICT_")]
+    assert len(names) > 20
+    for name in names:
+        markers = cv2.aruco.getPredefinedDictionary(getattr(cv2.aruco, name)).bytesList
+        assert dictionary_size(name) == len(markers), name
 
 
 def test_the_floor_itself_is_a_height() -> None:

@@ -3,7 +3,9 @@
 from __future__ import annotations
 
 import errno
+import shutil
 import sys
+import textwrap
 
 __all__ = ["main"]
 
@@ -32,5 +34,9 @@ def main() -> None:
 
 
 def _complain(text: str) -> int:
-    print(f"ipsys: {text}", file=sys.stderr)  # noqa: T201
+    line = f"ipsys: {text}"
+    if sys.stderr.isatty():  # a file or a pipe gets one line
+        width = shutil.get_terminal_size().columns
+        line = textwrap.fill(line, width, break_long_words=False, break_on_hyphens=False)
+    print(line, file=sys.stderr)  # noqa: T201
     return 1

@@ -8,6 +8,7 @@ from typing import TYPE_CHECKING, Annotated, Any, Optional
 
 import typer
 
+from ipsys_log.cli.cameras_now import Lab, check_target, prepared, recorded_now
 from ipsys_log.cli.console import console, remarks
 from ipsys_log.cli.derive import derived
 from ipsys_log.cli.options import (
@@ -17,8 +18,8 @@ from ipsys_log.cli.options import (
     RigFile,
     cameras_of,
     load_calibrations,
+    log_option,
 )
-from ipsys_log.cli.record import recorded_now
 
 if TYPE_CHECKING:
     from ipsys_log.report.alignment import AlignedLab
@@ -30,7 +31,14 @@ NoLogs = Annotated[
     typer.Argument(help="Logs, read as one. Results go to the last.", metavar="[LOG]..."),
 ]
 Plot = Annotated[
-    Path | None, typer.Option(metavar="FILE", help="Draw the floor map and the pictures of the cameras: PNG.")
+    Path | None,
+    typer.Option(
+        metavar="FILE", help="Draw the floor map and the pictures of the cameras: .png, .pdf, .svg or .jpg."
+    ),
+]
+Output = Annotated[
+    Path | None,
+    log_option(help="A new log for the results. Without a log, what the cameras sent is kept there too."),
 ]
 
 
@@ -43,49 +51,73 @@ def align(
     rig: RigFile = None,
     calibration: Calibrations = None,
     corners: Corners = None,
-    seconds: Annotated[float, typer.Option(min=0.1, help="Without a log: how long to look.")] = 3.0,
+    seconds: Annotated[
+        float, typer.Option(min=0.1, metavar="SECONDS", help="Without a log: how long to look.")
+    ] = 3.0,
     plot: Plot = None,
+    output: Output = None,
     as_json: AsJson = False,
 ) -> None:
-    """Which way to tilt each camera so that it looks straight down, and what of the floor they all see.
+    """Say which way to tilt each camera so that it looks straight down, and what of the floor they all see.
 
     From markers that lie on the floor, four or more in each picture, or one that is laid down at one place
     after the other. Where places were measured, also the floor that no camera sees, and where neighbours
     overlap by less than a marker. What it needs and the log does not hold yet is made first. Without a log
     it looks at what the cameras of the rig send now.
     """
+    from ipsys_log.report.files import check_picture
+
+    if plot is not None:
+        check_picture(plot, "--plot", logs or [])
     if logs:
-        _align(logs, rig, calibration, corners, plot, as_json)
+        options: dict[str, Any] = {
+            "rig": rig,
+            "calibration": calibration,
+            "corners": corners,
+            "output": output,
+        }
+        _align(logs, options, plot, as_json)
         return
-    with recorded_now(rig, calibration, seconds) as log:
-        _align([log], None, None, corners, plot, as_json)
+    lab = _prepared_now(rig, calibration, corners, output)
+    with recorded_now(lab, seconds, output) as log:
+        kept = output is not None
+        options = {"rig": None, "calibration": None, "corners": corners, "kept": kept}
+        _align([log], options, plot, as_json)
+    if output is None:
+        remarks.print("nothing is kept; -o name.mcap keeps the frames and what was found", markup=False)
 
 
-def _align(
-    logs: list[Path],
-    rig: Path | None,
-    calibration: list[str] | None,
-    corners: str | None,
-    plot: Path | None,
-    as_json: bool,
-) -> None:
+def _prepared_now(
+    rig: Path | None, calibration: list[str] | None, corners: str | None, output: Path | None
+) -> Lab:
+    """The cameras to look at, when everything is said that can be said before they are opened."""
+    from ipsys_log.errors import IpsysError
+    from ipsys_log.live_plan import check_start
+    from ipsys_log.request import Request
+
+    if rig is None:
+        raise IpsysError("name a log, or give --rig lab.toml to take what its cameras send now")
+    lab = prepared(rig, None, calibration)
+    check_start(lab.rig, lab.names, lab.lenses, Request(corners=corners), "camera-frame")
+    if output is not None:
+        check_target(output, force=False)
+    return lab
+
+
+def _align(logs: list[Path], options: dict[str, Any], plot: Path | None, as_json: bool) -> None:
     from ipsys_log.log.session import Session
     from ipsys_log.messages import CameraPoints, Markers, Rig
     from ipsys_log.report.alignment import read_alignment
-    from ipsys_log.report.files import check_file
     from ipsys_log.rig import load_rig
     from ipsys_log.runs import newest_run
     from ipsys_log.sinks.shown import rig_in_force
 
-    if plot is not None:
-        check_file(plot, "--plot", logs)
-    given = load_rig(rig) if rig else None
-    lenses = load_calibrations(calibration, lambda: cameras_of(logs))
+    given = load_rig(options["rig"]) if options["rig"] else None
+    lenses = load_calibrations(options["calibration"], lambda: cameras_of(logs))
     with Session(logs) as session:
         bare = not session.images and newest_run(session, Markers) is None
-    options: dict[str, Any] = {"rig": rig, "calibration": calibration, "corners": corners, "run": None}
     method = "perimeter" if bare else "pose"
-    with derived(logs, "camera-frame", method=method, **options) as (session, outcomes, _):
+    with derived(logs, "camera-frame", method=method, run=None, **options) as (session, outcomes, _):
         made = [outcome.run for outcome in outcomes if outcome.stage == "camera-frame"]
         run = made[-1] if made else str(newest_run(session, CameraPoints))
         held = {camera: session.payloads([topic])[-1] for camera, topic in session.calibrations.items()}

@@ -1,4 +1,4 @@
-"""All commands, by the order of a day's work."""
+"""All commands."""
 
 from __future__ import annotations
 
@@ -19,11 +19,14 @@ from ipsys_log.cli import (
     setup,
     view,
 )
+from ipsys_log.cli.guide import arrange
 
 app = typer.Typer(
     name="ipsys",
     help="Indoor positioning with cheap cameras and ArUco markers. Everything is a channel in an MCAP log: "
     "replay it, compare models on it, look at it.",
+    epilog="The help of a command ends with examples: ipsys record --help. To try all of it without a "
+    'camera, write source = "sim:red" into lab.toml.',
     no_args_is_help=True,
     add_completion=False,
     pretty_exceptions_enable=False,
@@ -35,6 +38,7 @@ _MODULES = (
 )
 for module in _MODULES:
     module.add_commands(app)
+arrange(app)
 
 
 def _print_version(wanted: bool) -> None:

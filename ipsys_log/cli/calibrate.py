@@ -10,13 +10,12 @@ from typing import TYPE_CHECKING, Annotated, Optional
 
 import typer
 
+from ipsys_log.cli.cameras_now import Lab, prepared, recorded_now, say
 from ipsys_log.cli.console import console, progress_bar, remarks
 from ipsys_log.cli.options import AsJson
-from ipsys_log.cli.record import recorded_now
 
 if TYPE_CHECKING:
     from ipsys_log.calibration.calibrate import Calibrated
-    from ipsys_log.calibration.pictures import Pictures
 
 __all__ = ["add_commands"]
 
@@ -25,9 +24,14 @@ Sources = Annotated[
     typer.Argument(help="Logs, folders of pictures, pictures, videos.", metavar="[SOURCE]..."),
 ]
 RigNow = Annotated[
-    Path | None, typer.Option("--rig", help="Without a source: take what the cameras of this rig send now.")
+    Path | None,
+    typer.Option(
+        "--rig", metavar="FILE", help="Without a source: take what the cameras of this rig send now."
+    ),
 ]
-Seconds = Annotated[float, typer.Option(min=1.0, help="How long to take it, while you move the board.")]
+Seconds = Annotated[
+    float, typer.Option(min=1.0, metavar="SECONDS", help="How long to take it, while you move the board.")
+]
 BoardName = Annotated[
     str,
     typer.Option(
@@ -36,12 +40,12 @@ BoardName = Annotated[
     ),
 ]
 Square = Annotated[
-    float, typer.Option(metavar="METRES", help="Side of a square. The lens does not depend on it.")
+    float, typer.Option(metavar="METRES", help="Side of a square, in m. The lens does not depend on it.")
 ]
 MarkerScale = Annotated[
     float, typer.Option(metavar="SHARE", help="Side of a ChArUco board's markers, as a share of a square's.")
 ]
-Dictionary = Annotated[str, typer.Option(metavar="NAME", help="Of a ChArUco board's markers.")]
+Dictionary = Annotated[str, typer.Option(metavar="NAME", help="The dictionary of a ChArUco board's markers.")]
 Inverted = Annotated[bool, typer.Option("--inverted", help="Black and white of the board are exchanged.")]
 Lens = Annotated[
     str,
@@ -53,7 +57,11 @@ Lens = Annotated[
 ]
 Cameras = Annotated[
     Optional[list[str]],  # noqa: UP045
-    typer.Option(metavar="CAMERA", help="Of a log: only these. Else the name of the camera."),
+    typer.Option(
+        metavar="CAMERA",
+        help="Only this camera of the log or the rig; repeat it for several. With pictures or a video: the "
+        "name of the camera.",
+    ),
 ]
 Output = Annotated[
     Path,
@@ -63,7 +71,9 @@ Formats = Annotated[
     Optional[list[str]],  # noqa: UP045
     typer.Option("--format", metavar="NAME", help="opencv (the default), ros or kalibr; repeat for several."),
 ]
-Plot = Annotated[Path | None, typer.Option(metavar="FILE", help="Draw coverage and residuals: PNG.")]
+Plot = Annotated[
+    Path | None, typer.Option(metavar="FILE", help="Draw coverage and residuals: .png, .pdf, .svg or .jpg.")
+]
 Force = Annotated[bool, typer.Option("--force", help="Write over files that exist.")]
 
 
@@ -88,16 +98,17 @@ def calibrate(
     force: Force = False,
     as_json: AsJson = False,
 ) -> None:
-    """The lens of a camera from pictures of a chessboard or a ChArUco board.
+    """Find the lens of a camera from pictures of a chessboard or a ChArUco board.
 
-    One file for each camera that saw the board. Sharp pictures that differ are chosen by themselves."""
+    One file for each camera that saw the board, with the name of the camera. Sharp pictures that differ are
+    chosen by themselves; two dozen from all parts of the picture are enough."""
     from ipsys_log.calibration.boards import parse_board
     from ipsys_log.calibration.cameras import calibrate_cameras
     from ipsys_log.calibration.lens_models import find_lens
     from ipsys_log.calibration.pictures import find_sources
     from ipsys_log.formats.calibration_yaml import check_format
     from ipsys_log.report.calibration import calibration_json
-    from ipsys_log.report.files import check_file
+    from ipsys_log.report.files import check_picture
 
     model = find_lens(lens)
     wanted = parse_board(board, square, marker_scale, dictionary, inverted)
@@ -105,11 +116,14 @@ def calibrate(
     for name in names:
         check_format(name, lens)
     if plot is not None:
-        check_file(plot, "--plot", sources or [])
+        check_picture(plot, "--plot", sources or [])
         _check_free(plot, force)
-    with nullcontext(sources) if sources else _taken_now(rig, seconds) as taken:
+    lab = None if sources else _prepared_now(rig, camera)
+    if lab is not None:
+        _targets(lab.names, output, names, force)
+    with nullcontext(sources or []) if lab is None else _taken_now(lab, seconds) as taken:
         found = find_sources(taken, camera or [])
-        targets = _targets(found, output, names, force)
+        targets = _targets([pictures.camera for pictures in found], output, names, force)
         with progress_bar() as progress:
             lenses, unseen = calibrate_cameras(found, wanted, model, progress)
     written = _write(lenses, targets)
@@ -129,34 +143,43 @@ def calibrate(
         remarks.print(f"{plot} drawn", markup=False)
 
 
-@contextmanager
-def _taken_now(rig: Path | None, seconds: float) -> Iterator[list[Path]]:
-    if rig is not None:
-        remarks.print(
-            "move the board through all of each picture, tilted this way and that, and hold it still"
+def _prepared_now(rig: Path | None, only: list[str] | None) -> Lab:
+    from ipsys_log.errors import IpsysError
+
+    if rig is None:
+        raise IpsysError(
+            "name pictures, a video or a log of a board, or give --rig lab.toml to take what its cameras "
+            "send now"
         )
-    with recorded_now(rig, None, seconds) as log:
+    return prepared(rig, only, None, with_lenses=False)
+
+
+@contextmanager
+def _taken_now(lab: Lab, seconds: float) -> Iterator[list[Path]]:
+    say(
+        "move the board through all of each picture, tilted this way and that, and hold it still; "
+        "the frames are not kept"
+    )
+    with recorded_now(lab, seconds) as log:
         yield [log]
 
 
-def _targets(
-    sources: list[Pictures], output: Path, formats: list[str], force: bool
-) -> dict[str, dict[str, Path]]:
+def _targets(cameras: list[str], output: Path, formats: list[str], force: bool) -> dict[str, dict[str, Path]]:
     """Where the file of each camera and format goes; an error where it cannot."""
     from ipsys_log.errors import IpsysError
     from ipsys_log.formats.calibration_yaml import FORMATS
     from ipsys_log.report.files import check_file, check_folder
 
     if output.suffix.lower() in (".yaml", ".yml"):
-        if len(sources) > 1 or len(formats) > 1:
+        if len(cameras) > 1 or len(formats) > 1:
             raise IpsysError(f"--output {output}: one file for several lenses; name a folder")
-        targets = {sources[0].camera: {formats[0]: output}}
+        targets = {cameras[0]: {formats[0]: output}}
         check_file(output, "--output", [])
     else:
         check_folder(output, "--output")
         targets = {
-            pictures.camera: {name: output / f"{pictures.camera}{FORMATS[name][1]}.yaml" for name in formats}
-            for pictures in sources
+            camera: {name: output / f"{camera}{FORMATS[name][1]}.yaml" for name in formats}
+            for camera in cameras
         }
     for paths in targets.values():
         for path in paths.values():
@@ -193,9 +216,9 @@ def _write(lenses: list[Calibrated], targets: dict[str, dict[str, Path]]) -> dic
 def _draw(lenses: list[Calibrated], plot: Path) -> None:
     from ipsys_log.report.calibration_figure import calibration_figure
     from ipsys_log.report.files import write_files
-    from ipsys_log.report.pictures import png
+    from ipsys_log.report.pictures import picture
 
-    write_files(plot.parent, {plot.name: png(calibration_figure(lenses), dpi=110)})
+    write_files(plot.parent, {plot.name: picture(calibration_figure(lenses), plot, 110)})
 
 
 def _show(one: Calibrated, files: list[Path], for_rig: bool) -> None:

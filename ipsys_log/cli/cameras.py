@@ -28,13 +28,14 @@ def add_commands(app: typer.Typer) -> None:
 
 def cameras(
     rig: Annotated[
-        Path | None, typer.Option("--rig", help="A rig file: say whether USB carries what it asks for.")
+        Path | None,
+        typer.Option("--rig", metavar="FILE", help="A rig file: say whether USB carries what it asks for."),
     ] = None,
     as_json: AsJson = False,
 ) -> None:
     """List the cameras attached by USB: device, modes, bus and hub; and whether USB carries them all at once.
 
-    Without a rig that is reckoned with each at its largest mode."""
+    Without a rig that is reckoned with each at its largest mode. Cameras on the network are not listed."""
     from ipsys_log.errors import IpsysError
     from ipsys_log.rig import load_rig
     from ipsys_log.sources.bandwidth import advise, demands_of

@@ -28,7 +28,7 @@ def add_commands(app: typer.Typer) -> None:
 
 def verify(
     logs: Logs,
-    run: Annotated[_Run, typer.Option("--run", help="Only this run.")] = None,
+    run: Annotated[_Run, typer.Option("--run", metavar="NAME", help="Only this run.")] = None,
     as_json: AsJson = False,
 ) -> None:
     """Make every run of a log again from what it read, and compare each channel byte for byte.
@@ -42,10 +42,12 @@ def verify(
     if as_json:
         print(json.dumps(comparison_json(found), indent=2))  # noqa: T201
     else:
-        console.print(comparison_table(found))
+        console.print(comparison_table(found, ("log", "again")))
         difference = first_difference(found)
         console.print(
-            "[green]a replay equals the log[/green]" if difference is None else f"[red]{difference}[/red]"
+            "a replay equals the log" if difference is None else difference,
+            style="green" if difference is None else "red",
+            markup=False,
         )
     _end(found)
 
@@ -55,7 +57,11 @@ def diff(
     second: Annotated[Path, typer.Argument(help="The log to compare with; may be the same one.")],
     run: Annotated[
         Optional[list[str]],  # noqa: UP045
-        typer.Option("--run", help="The run of both logs; or twice: that of the first, that of the second."),
+        typer.Option(
+            "--run",
+            metavar="NAME",
+            help="The run of both logs; or twice: that of the first, that of the second.",
+        ),
     ] = None,
     as_json: AsJson = False,
 ) -> None:
@@ -73,9 +79,13 @@ def diff(
     if as_json:
         print(json.dumps(comparison_json(found), indent=2))  # noqa: T201
     else:
-        console.print(comparison_table(found))
+        console.print(comparison_table(found, ("first", "second")))
         difference = first_difference(found)
-        console.print("[green]no difference[/green]" if difference is None else f"[red]{difference}[/red]")
+        console.print(
+            "no difference" if difference is None else difference,
+            style="green" if difference is None else "red",
+            markup=False,
+        )
     _end(found)
 
 
@@ -83,23 +93,24 @@ def latency(
     logs: Logs,
     plot: Annotated[
         Optional[Path],  # noqa: UP045
-        typer.Option(help="Draw the steps into a PNG."),
+        typer.Option(metavar="FILE", help="Draw the steps: .png, .pdf, .svg or .jpg."),
     ] = None,
     as_json: AsJson = False,
 ) -> None:
-    """How long each step took when a log was recorded live, from the frame to its position."""
+    """Show how long each step took when a log was recorded live, from the frame to its position."""
     from dataclasses import asdict
 
     from ipsys_log.latency import latency_percentiles, recorded_latencies, step_times_s
     from ipsys_log.report.cameras import latency_table
+    from ipsys_log.report.files import check_picture
 
+    if plot is not None:
+        check_picture(plot, "--plot", logs)
     times_s = step_times_s(recorded_latencies(logs))
     steps = latency_percentiles(times_s)
     if plot is not None:
-        from ipsys_log.report.files import check_file
         from ipsys_log.report.latency_figure import draw_latency
 
-        check_file(plot, "--plot", logs)
         draw_latency(times_s, plot)
         remarks.print(f"{plot} drawn", markup=False)
     if as_json:

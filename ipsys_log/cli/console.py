@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import sys
 from collections.abc import Iterator, Sequence
 from contextlib import contextmanager
 from time import monotonic
@@ -19,8 +20,9 @@ __all__ = ["console", "print_outcomes", "progress_bar", "remarks"]
 _OF_FRAMES = ("detect", "camera-frame", "locate", "fuse")
 _DRAW_EVERY_S = 0.1
 
-console = Console(highlight=False, soft_wrap=True)
-remarks = Console(stderr=True, highlight=False, soft_wrap=True)
+# In a window lines break between words; in a file or a pipe they do not break.
+console = Console(highlight=False, soft_wrap=not sys.stdout.isatty())
+remarks = Console(stderr=True, highlight=False, soft_wrap=not sys.stderr.isatty())
 
 
 @contextmanager

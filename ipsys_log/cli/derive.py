@@ -22,6 +22,7 @@ from ipsys_log.cli.options import (
     RigFile,
     cameras_of,
     load_calibrations,
+    log_option,
 )
 
 if TYPE_CHECKING:
@@ -56,10 +57,15 @@ OPTIONS: dict[str, tuple[Any, Any]] = {
         None,
     ),
     "train": (
-        Annotated[str, typer.Option(help="Fit on the measurements with this label.")],
+        Annotated[str, typer.Option(metavar="LABEL", help="Fit on the measurements with this label.")],
         "train",
     ),
-    "seed": (Annotated[int, typer.Option(min=0, help="Of random splits, folds and subsets.")], 0),
+    "seed": (
+        Annotated[
+            int, typer.Option(min=0, metavar="N", help="The seed of random splits, folds and subsets.")
+        ],
+        0,
+    ),
     "rig": (RigFile, None),
     "calibration": (Calibrations, None),
     "corners": (Corners, None),
@@ -67,12 +73,14 @@ OPTIONS: dict[str, tuple[Any, Any]] = {
     "run": (
         Annotated[
             Optional[str],  # noqa: UP045
-            typer.Option("--run", help="A name for the new run, instead of edges, poly, poly_2 ..."),
+            typer.Option(
+                "--run", metavar="NAME", help="A name for the new run, instead of edges, poly, poly_2 ..."
+            ),
         ],
         None,
     ),
     "output": (
-        Annotated[_Path, typer.Option("--output", "-o", help="Write the results to a new log instead.")],
+        Annotated[_Path, log_option(help="Write the results to a new log instead.")],
         None,
     ),
     "as_live": (
@@ -91,7 +99,13 @@ OPTIONS: dict[str, tuple[Any, Any]] = {
         ],
         False,
     ),
-    "plot": (Annotated[_Path, typer.Option(help="Draw the floor and the errors into a PNG.")], None),
+    "plot": (
+        Annotated[
+            _Path,
+            typer.Option(metavar="FILE", help="Draw the floor and the errors: .png, .pdf, .svg or .jpg."),
+        ],
+        None,
+    ),
     "plots": (
         Annotated[_Path, typer.Option(metavar="DIR", help="Write the paper's tables and figures, and more.")],
         None,
@@ -114,7 +128,7 @@ _DETECT = tuple(name for name in _FRAMES if name != "method")
 _MODELS = tuple(name for name in OPTIONS if name not in ("plot", "plots"))
 EVALUATE = (*_MODELS, "plots")
 
-MORE = "What it needs and the log does not hold yet is made first."
+MORE = "\n\nWhat it needs and the log does not hold yet is made first."
 _COMMANDS: dict[str, tuple[str, tuple[str, ...], str]] = {
     "replay": (
         "fuse",
@@ -125,17 +139,18 @@ _COMMANDS: dict[str, tuple[str, tuple[str, ...], str]] = {
     "camera-frame": (
         "camera-frame",
         _FRAMES,
-        f"Put the markers into the frame of their camera. {MORE}",
+        f"Put the markers into the frame of their camera.{MORE}",
     ),
-    "fit": ("fit", _MODELS, f"Fit models to the measured places (poly, unless you say which). {MORE}"),
+    "fit": ("fit", _MODELS, f"Fit models to the measured places (poly, unless you say which).{MORE}"),
     "evaluate": (
         "evaluate",
         EVALUATE,
-        "Say how far models are off on places held out and by cross-validation, how many places are enough, "
-        f"and which look wrongly measured: for all models, unless you say which. {MORE}",
+        "Say how far models are off, how many places are enough, and which look wrongly measured.\n\n"
+        "For all models, unless you say which; on places held out, and by cross-validation, which takes each "
+        f"part of the places in turn.{MORE}",
     ),
-    "locate": ("locate", _MODELS, f"Apply a model: world positions for each camera. {MORE}"),
-    "fuse": ("fuse", _MODELS, f"One pose per robot from all cameras that see it. {MORE}"),
+    "locate": ("locate", _MODELS, f"Apply a model: world positions for each camera.{MORE}"),
+    "fuse": ("fuse", _MODELS, f"One pose per robot from all cameras that see it.{MORE}"),
 }
 
 
@@ -183,9 +198,12 @@ def _request(logs: list[Path], **given: Any) -> Request:
 
 @contextmanager
 def derived(
-    logs: list[Path], until: str, output: Path | None = None, **given: Any
+    logs: list[Path], until: str, output: Path | None = None, kept: bool = True, **given: Any
 ) -> Iterator[tuple[Session, list[Outcome], list[Accuracy]]]:
-    """Do the stages up to ``until``; the session with the results, what was done, and how accurate it is."""
+    """Do the stages up to ``until``; the session with the results, what was done, and how accurate it is.
+
+    A log that is not ``kept`` is not named.
+    """
     from ipsys_log.log.session import Session
     from ipsys_log.pipeline import replay
     from ipsys_log.report.accuracy import read_accuracy
@@ -196,7 +214,7 @@ def derived(
     written = [output] if output is not None and output.exists() else []
     with Session([*logs, *written]) as session:
         yield session, outcomes, read_accuracy(session, outcomes)
-    _remark(outcomes, [*logs, *written][-1])
+    _remark(outcomes, [*logs, *written][-1] if kept else None)
 
 
 def _derive(
@@ -207,10 +225,10 @@ def _derive(
     plots: Path | None = None,
     **given: Any,
 ) -> None:
-    from ipsys_log.report.files import check_file, check_folder
+    from ipsys_log.report.files import check_folder, check_picture
 
     if plot is not None:
-        check_file(plot, "--plot", logs)
+        check_picture(plot, "--plot", logs)
     if plots is not None:
         check_folder(plots, "--plots")
     with derived(logs, until, **given) as (session, outcomes, accuracies):
@@ -251,10 +269,12 @@ def _print(outcomes: Sequence[Outcome], accuracies: Sequence[Accuracy], as_json:
             console.print(table)
 
 
-def _remark(outcomes: list[Outcome], target: Path) -> None:
+def _remark(outcomes: list[Outcome], target: Path | None) -> None:
     """What was done, and where it is."""
     print_outcomes(outcomes)
+    if target is None:
+        return
     if any(outcome.fresh for outcome in outcomes):
-        remarks.print(f"results are in {target}")
+        remarks.print(f"results are in {target}", markup=False)
     else:
         remarks.print("nothing to do: all of it is up to date")

@@ -38,7 +38,9 @@ def images(
     output: NewLog,
     rig: RigFile = None,
     calibration: Calibrations = None,
-    rate: Annotated[float, typer.Option(help="Pictures per second, where they have no times.")] = 1.0,
+    rate: Annotated[
+        float, typer.Option(metavar="HZ", help="Pictures per second, where they have no times.")
+    ] = 1.0,
     times: Annotated[
         str | None,
         typer.Option(

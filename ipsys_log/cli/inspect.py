@@ -21,7 +21,7 @@ def add_commands(app: typer.Typer) -> None:
 
 
 def info(logs: Logs, as_json: AsJson = False) -> None:
-    """Cameras, channels, counts, rates, gaps and runs of a log."""
+    """Show cameras, channels, counts, rates, gaps and runs of a log."""
     from ipsys_log.log.session import Session
     from ipsys_log.report.contents import contents_json, contents_tables
 
@@ -30,12 +30,14 @@ def info(logs: Logs, as_json: AsJson = False) -> None:
     if as_json:
         print(json.dumps(found, indent=2))  # noqa: T201
     else:
-        for table in contents_tables(found):
+        for number, table in enumerate(contents_tables(found)):
+            if number:
+                console.print()
             console.print(table)
 
 
 def runs(logs: Logs, as_json: AsJson = False) -> None:
-    """The runs of a log: stage, what it was made from, with which parameters, by which ipsys."""
+    """Show the runs of a log: stage, what it was made from, with which parameters, by which ipsys."""
     from ipsys_log.log.session import Session
     from ipsys_log.report.contents import runs_json, runs_table
 

@@ -23,6 +23,7 @@ from ipsys_log.cli.options import (
     RigFile,
     cameras_of,
     load_calibrations,
+    log_option,
 )
 
 if TYPE_CHECKING:
@@ -41,9 +42,7 @@ Log = Annotated[
 ]
 Output = Annotated[
     Optional[Path],  # noqa: UP045
-    typer.Option(
-        "--output", "-o", help="Without a LOG: the log to write, with about a second of frames of each place."
-    ),
+    log_option(help="Without a LOG: the log to write, with about a second of frames of each place."),
 ]
 Terminal = Annotated[bool, typer.Option("--terminal", help="Ask here in the terminal instead of on a page.")]
 Sheet = Annotated[

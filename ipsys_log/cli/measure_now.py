@@ -11,14 +11,16 @@ from pathlib import Path
 from time import sleep
 from typing import TYPE_CHECKING, Any
 
+from ipsys_log.cli.cameras_now import Lab, check_target, opened, prepared, shown_to
 from ipsys_log.cli.console import console, remarks
 
 if TYPE_CHECKING:
     from ipsys_log.live_scene import LiveScene
-    from ipsys_log.messages import Measurement, Message
+    from ipsys_log.messages import Measurement, Message, Model
+    from ipsys_log.request import Request
     from ipsys_log.sources.attached import Attached
 
-__all__ = ["live_scene", "measure_now", "served"]
+__all__ = ["live_scene", "measure_now", "ready_to_measure", "served"]
 
 _TURN_S = 0.05
 # After that it is known what the cameras see, and what of it lies still.
@@ -39,15 +41,20 @@ def measure_now(
 ) -> list[Measurement]:
     """Measure places into a new log with a second of frames of each; what was measured and withdrawn."""
     from ipsys_log import pipeline
-    from ipsys_log.cli.record import opened_cameras, shown_to
     from ipsys_log.request import Request
 
+    lab, request = prepared(rig, camera, calibration), Request(corners=corners)
+    model = ready_to_measure(lab, request, model_from)
+    if not terminal:
+        from ipsys_log.web.serving import check_free
+
+        check_free(host, port)
+    check_target(output, force)
     ends = "q" if terminal else "Ctrl-C"
     doing = f"measuring into {output}; {ends} ends it"
-    with opened_cameras(output, rig, camera, calibration, None, force, doing, not terminal) as opened:
-        cameras, settings, status = opened
-        scene = live_scene(settings, cameras, model_from)
-        request, watch = Request(corners=corners), shown_to(status, scene)
+    with opened(lab, output, None, doing, not terminal) as (cameras, settings, status):
+        scene = live_scene(settings, cameras, model)
+        watch = shown_to(status, scene)
         work = partial(pipeline.measure, cameras, settings, output, request, watch, force)
         if terminal:
             _ask_beside(work, scene, cameras)
@@ -57,16 +64,27 @@ def measure_now(
     return scene.history()
 
 
-def live_scene(settings: list[Message], cameras: Attached, model_from: Path | None) -> LiveScene:
-    """What the cameras see now, to measure on."""
-    from ipsys_log.live_scene import LiveScene
+def ready_to_measure(lab: Lab, request: Request, model_from: Path | None) -> Model | None:
+    """See that places can be measured with these cameras; the newest model of another log, if it is named."""
+    from ipsys_log.live_plan import check_model, check_start
     from ipsys_log.log.session import Session
     from ipsys_log.lookup import fitted_in
+    from ipsys_log.measuring.entry import check_references
 
-    model = None
-    if model_from is not None:
-        with Session([model_from]) as other:
-            model, _ = fitted_in(other, None)
+    check_references(lab.rig)
+    check_start(lab.rig, lab.names, lab.lenses, request, "camera-frame")
+    if model_from is None:
+        return None
+    with Session([model_from]) as other:
+        model, _ = fitted_in(other, None)
+    check_model(model, lab.names)
+    return model
+
+
+def live_scene(settings: list[Message], cameras: Attached, model: Model | None) -> LiveScene:
+    """What the cameras see now, to measure on."""
+    from ipsys_log.live_scene import LiveScene
+
     return LiveScene(settings[0].payload, model, cameras.states, cameras.add)
 
 

@@ -3,10 +3,13 @@
 from __future__ import annotations
 
 from collections.abc import Callable, Collection
+from functools import partial
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, Optional
 
 import typer
+
+from ipsys_log.cli.console import remarks
 
 if TYPE_CHECKING:
     from ipsys_log.messages import CameraCalibration, Rig, RigCamera
@@ -24,25 +27,42 @@ __all__ = [
     "Only",
     "Port",
     "RigFile",
+    "RigNow",
     "cameras_of",
     "load_calibrations",
     "load_lab",
+    "log_option",
 ]
 
 Logs = Annotated[
     list[Path],
     typer.Argument(help="Logs, read as one. Results go to the last.", metavar="LOG..."),
 ]
-NewLog = Annotated[Path, typer.Option("--output", "-o", help="The log to write.")]
+
+
+def _named_as_log(path: Path | None) -> Path | None:
+    """What a user calls a new log, with the ending that all logs have."""
+    if path is None or path.suffix == ".mcap" or path.is_dir():
+        return path
+    named = path.with_name(f"{path.name}.mcap")
+    remarks.print(f"-o {path}: the log is called {named}", markup=False)
+    return named
+
+
+# What every command does with the name of a new log.
+log_option = partial(typer.Option, "--output", "-o", metavar="LOG", callback=_named_as_log)
+NewLog = Annotated[Path, log_option(help="The log to write, a file that ends in .mcap.")]
 RigFile = Annotated[
-    Path | None, typer.Option("--rig", help="A rig file (lab.toml) to use instead of what the log holds.")
+    Path | None,
+    typer.Option("--rig", metavar="FILE", help="A rig file (lab.toml) to use instead of what the log holds."),
 ]
 Calibrations = Annotated[
     Optional[list[str]],  # noqa: UP045
     typer.Option(
         "--calibration",
         metavar="CAMERA=FILE",
-        help="A camera's lens instead of the log's: OpenCV YAML. Repeat for each camera; or another log.",
+        help="The lens of a camera, instead of the log's or the rig's: a YAML of OpenCV or ROS, or a log "
+        "that holds it. Repeat it for each camera; without CAMERA= a log gives those of all.",
     ),
 ]
 Corners = Annotated[
@@ -59,7 +79,8 @@ Method = Annotated[
     typer.Option(
         "--method",
         metavar="NAME",
-        help="Places markers by their perimeter (eq. 3 to 5 of the paper), or by their pose (tilted too).",
+        help="How markers are placed: by their perimeter (eq. 3 to 5 of the paper; for level ones), or by "
+        "their pose (tilted ones too).",
     ),
 ]
 Only = Annotated[
@@ -72,11 +93,17 @@ Host = Annotated[
     typer.Option(
         "--host",
         metavar="ADDRESS",
-        help="Let others in the network open the page, by an address with a secret of this one start; "
-        "0.0.0.0 for all of this machine's addresses. Without it: this machine alone.",
+        help="Let a phone in this network open the page, at 0.0.0.0 (all addresses of this machine) or at "
+        "one of them. It is shown with a secret that is new at each start. Without it: this machine alone.",
     ),
 ]
-Port = Annotated[int, typer.Option(min=0, max=65535, help="Of the page; 0 takes any that is free.")]
+Port = Annotated[
+    int,
+    typer.Option(min=0, max=65535, metavar="PORT", help="The port of the page; 0 takes any that is free."),
+]
+RigNow = Annotated[
+    Path, typer.Option("--rig", metavar="FILE", help="The rig file; each camera has a source there.")
+]
 ModelOfOther = Annotated[
     Optional[Path],  # noqa: UP045
     typer.Option(
@@ -89,7 +116,7 @@ AsJson = Annotated[bool, typer.Option("--json", help="Print JSON.")]
 def load_calibrations(
     options: list[str] | None, cameras: Callable[[], Collection[str]]
 ) -> dict[str, CameraCalibration]:
-    """Lenses by camera from ``camera=file.yaml``, or from ``other.mcap`` for those of ``cameras``.
+    """Lenses by camera from ``camera=file``, or from ``other.mcap`` for those of ``cameras``.
 
     Raises
     ------
@@ -97,14 +124,14 @@ def load_calibrations(
         For an option of another form, or a file that holds no calibration.
     """
     from ipsys_log.errors import IpsysError
-    from ipsys_log.formats.opencv_yaml import read_opencv_calibration
+    from ipsys_log.formats.lens_file import read_lens
     from ipsys_log.log.session import Session
 
     lenses: dict[str, CameraCalibration] = {}
     for option in options or []:
         camera, equals, name = option.partition("=")
         if equals:
-            found = {camera: read_opencv_calibration(Path(name), camera)}
+            found = {camera: read_lens(Path(name), camera)}
         elif option.endswith(".mcap"):
             with Session([Path(option)]) as log:
                 held = {c: log.payloads([topic])[-1] for c, topic in log.calibrations.items()}
@@ -121,11 +148,12 @@ def load_calibrations(
 
 
 def load_lab(
-    rig: Path, calibration: list[str] | None, only: Collection[str]
+    rig: Path, calibration: list[str] | None, only: Collection[str], with_lenses: bool = True
 ) -> tuple[Rig, list[RigCamera], dict[str, CameraCalibration]]:
     """The rig of a file, its cameras that have a source (or ``only`` some), and their lenses.
 
-    A lens is what ``calibration`` says, else the file that the rig names, beside the rig file.
+    A lens is what ``calibration`` says, else the file that the rig names, beside the rig file; that only
+    ``with_lenses``.
 
     Raises
     ------
@@ -133,7 +161,7 @@ def load_lab(
         Where the rig has no such camera, or none with a source.
     """
     from ipsys_log.errors import IpsysError
-    from ipsys_log.formats.opencv_yaml import read_opencv_calibration
+    from ipsys_log.formats.lens_file import read_lens
     from ipsys_log.rig import load_rig
     from ipsys_log.sources.simulated import lens_of
     from ipsys_log.stages.detect import marker_detector
@@ -157,9 +185,9 @@ def load_lab(
         )
     names = [camera.name for camera in cameras]
     lenses = load_calibrations(calibration, lambda: names)
-    for camera in cameras:
+    for camera in cameras if with_lenses else ():
         if camera.name not in lenses and camera.calibration is not None:
-            lenses[camera.name] = read_opencv_calibration(rig.parent / camera.calibration, camera.name)
+            lenses[camera.name] = read_lens(rig.parent / camera.calibration, camera.name)
         elif camera.name not in lenses and str(camera.source).startswith("sim:"):
             lenses[camera.name] = lens_of(camera)
     strange = sorted(set(lenses) - set(names))

@@ -33,12 +33,16 @@ Heights = Annotated[
     typer.Option(
         "--height-m",
         metavar="METRES",
-        help="Of the marker above the floor; repeat for several. Else the heights used so far, in turn.",
+        help="Height of the marker above the floor; repeat it for several. Else the heights used so far, in "
+        "turn.",
     ),
 ]
-Train = Annotated[str, typer.Option(help="Fit on the measurements with this label.")]
+Train = Annotated[str, typer.Option(metavar="LABEL", help="Fit on the measurements with this label.")]
 Plot = Annotated[
-    Path | None, typer.Option(metavar="FILE", help="Draw the error over the floor, before and after: PNG.")
+    Path | None,
+    typer.Option(
+        metavar="FILE", help="Draw the error over the floor, before and after: .png, .pdf, .svg or .jpg."
+    ),
 ]
 
 
@@ -57,13 +61,13 @@ def plan(
     plot: Plot = None,
     as_json: AsJson = False,
 ) -> None:
-    """The next places to measure: those that lower the predicted error over the floor most.
+    """Say where to measure next: the places that lower the predicted error over the floor most.
 
     A model that the log does not hold yet is fitted first, to the places measured so far.
     """
     from ipsys_log.lookup import copied_run
     from ipsys_log.messages import Rig
-    from ipsys_log.report.files import check_file
+    from ipsys_log.report.files import check_picture
     from ipsys_log.report.plan import plan_floor
     from ipsys_log.rig import load_rig
     from ipsys_log.sinks.shown import rig_in_force
@@ -72,7 +76,7 @@ def plan(
     lenses = load_calibrations(calibration, lambda: cameras_of(logs))
     _check(logs, given, model, places, height_m or ())
     if plot is not None:
-        check_file(plot, "--plot", logs)
+        check_picture(plot, "--plot", logs)
     options: dict[str, Any] = {"train": train, "rig": rig, "calibration": calibration, "run": None}
     with derived(logs, "fit", model=[model], **options) as (session, outcomes, _):
         fitted = [outcome.run for outcome in outcomes if outcome.stage == "fit"]

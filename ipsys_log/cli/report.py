@@ -19,7 +19,7 @@ _HTML = (
     ],
     None,
 )
-_HELP = f"Write one HTML page that says how good the models of a log are; it needs no network. {MORE}"
+_HELP = f"Write one HTML page that says how good the models of a log are; it needs no network.{MORE}"
 
 
 def add_commands(app: typer.Typer) -> None:

@@ -27,7 +27,7 @@ def add_commands(app: typer.Typer) -> None:
 
 
 def view(logs: Logs, run: Runs = None, save: Save = None) -> None:
-    """Frames with drawn markers, floor, measured places, positions and tracks over time, in Rerun."""
+    """Show frames with drawn markers, floor, measured places, positions and tracks over time, in Rerun."""
     from ipsys_log.log.session import Session
     from ipsys_log.sinks.rerun import write_recording
 

@@ -34,7 +34,7 @@ def read_opencv_calibration(path: Path, camera: str, time_ns: int = 0) -> Camera
         Where the file cannot be read or lacks the matrix, the coefficients or the image size.
     """
     if not path.is_file():
-        raise IpsysError(f"{path}: there is no such calibration file")
+        raise IpsysError(f"{path}: there is no such calibration file; 'ipsys calibrate' writes one")
     try:
         storage = cv2.FileStorage(_as_file_storage(path), cv2.FILE_STORAGE_READ | cv2.FILE_STORAGE_MEMORY)
         k, d = _matrix(storage, _K), _matrix(storage, _D)

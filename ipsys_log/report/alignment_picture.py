@@ -20,7 +20,7 @@ from ipsys_log.report.alignment import AlignedLab
 from ipsys_log.report.files import write_files
 from ipsys_log.report.floor_panel import draw_ground
 from ipsys_log.report.palette import NOTE, REST, camera_styles
-from ipsys_log.report.pictures import png, shorten
+from ipsys_log.report.pictures import picture, shorten
 from ipsys_log.units import CM_PER_M
 
 __all__ = ["draw_alignment"]
@@ -29,7 +29,7 @@ Array = NDArray[np.float64]
 
 _DPI = 100
 _FLOOR_IN, _PANEL_IN, _GAP_IN = 5.6, 3.4, 0.55
-_ROWS = 3
+_ROWS, _ROW_IN = 3, 2.4
 # Seen by one camera, by more, and where a marker is whole in no picture.
 _ONE, _MORE, _NONE = "#EAF1F8", "#C3D6E8", "#F2B8A0"
 _LEVEL, _TILTED = "#00734D", "#B3261E"
@@ -37,17 +37,18 @@ _NEAR, _FAR = "#0072B2", "#D55E00"
 
 
 def draw_alignment(lab: AlignedLab, path: Path) -> None:
-    """Draw into a PNG: on the left the floor map, where it is known; on the right each camera's picture with
+    """Draw: on the left the floor map, where it is known; on the right each camera's picture with
     its markers, by how much Zc there is off the middle one, and an arrow to where it has to look.
 
     Parameters
     ----------
-    path : the picture, in place of one that is there already.
+    path : the picture, of the kind that its suffix says, in place of one that is there already.
     """
     floor = lab.coverage is not None
     columns = -(-len(lab.alignments) // _ROWS)
     left_in = _FLOOR_IN + 1.5 if floor else 0.4
-    size = (left_in + columns * (_PANEL_IN + _GAP_IN), 7.2)
+    rows = _ROWS if floor else min(len(lab.alignments), _ROWS)
+    size = (left_in + columns * (_PANEL_IN + _GAP_IN), 0.3 + _ROW_IN * rows)
     figure = Figure(figsize=size, dpi=_DPI)
     if lab.coverage is not None:
         axes = figure.add_axes((0.65 / size[0], 1.0 / size[1], _FLOOR_IN / size[0], _FLOOR_IN / size[1]))
@@ -57,11 +58,11 @@ def draw_alignment(lab: AlignedLab, path: Path) -> None:
         figure.legend(handles, labels, loc=where, ncols=3, fontsize=8, frameon=False)
     for number, alignment in enumerate(lab.alignments):
         column, row = divmod(number, _ROWS)
-        x_in, y_in = left_in + column * (_PANEL_IN + _GAP_IN), 4.75 - row * 2.3
+        x_in, y_in = left_in + column * (_PANEL_IN + _GAP_IN), size[1] - 0.15 - (row + 1) * _ROW_IN
         height_in = _PANEL_IN * 9 / 16
         box = (x_in / size[0], y_in / size[1], _PANEL_IN / size[0], height_in / size[1])
         _draw_picture(figure.add_axes(box), alignment, lab.lenses)
-    write_files(path.parent, {path.name: png(figure, _DPI)})
+    write_files(path.parent, {path.name: picture(figure, path, _DPI)})
 
 
 def _draw_floor(axes: Axes, lab: AlignedLab, coverage: Coverage) -> None:
@@ -103,7 +104,7 @@ def _draw_floor(axes: Axes, lab: AlignedLab, coverage: Coverage) -> None:
 
 def _draw_picture(axes: Axes, one: Alignment, lenses: Mapping[str, CameraCalibration]) -> None:
     colour = {None: "black", True: _LEVEL, False: _TILTED}[one.level]
-    state = {None: "not known", True: "level", False: "to be tilted"}[one.level]
+    state = {None: "tilt not known", True: "level", False: "to be tilted"}[one.level]
     spread = "" if one.spread_m is None else f", spread {one.spread_m * CM_PER_M:.1f} cm"
     axes.set_title(f"{shorten(one.camera)}: {state}{spread}", loc="left", fontsize=10, color=colour)
     axes.set(xticks=[], yticks=[])

@@ -65,15 +65,15 @@ class LiveStatus:
         now_s = self._now_s()
         for name, state in self._states.items():
             self._rates[name] = self._rate(name, state, now_s)
-        parts: list[Table | str] = [cameras_table(self._states, self._monitor.looks, self._rates)]
+        parts: list[Table | Text] = [cameras_table(self._states, self._monitor.looks, self._rates)]
         if self._tracks:
             parts.append(robots_table(self._tracks))
-        parts += self._warnings()
+        # Text, for there are brackets in it that rich would take for its own.
+        parts += [Text(line, style="yellow") for line in self._warnings()]
         size = self._target.stat().st_size if self._target.exists() else 0
         free = shutil.disk_usage(self._target.absolute().parent).free
-        parts.append(
-            f"{now_s - self._begin_s:.0f} s, {format_bytes(size)}; {format_bytes(free)} left on the disk"
-        )
+        took = f"{now_s - self._begin_s:.0f} s, {format_bytes(size)}; {format_bytes(free)} left on the disk"
+        parts.append(Text(took))
         return Group(*parts)
 
     def summary(self) -> list[str]:
@@ -140,26 +140,32 @@ def cameras_table(
             delay,
             f"{look.brightness:.0f}" if look else "-",
             f"{100 * look.sharpness:.0f} %" if look else "-",
-            ", ".join(map(str, look.markers)) or "none" if look else "-",
+            _markers(look) if look else "-",
         )
     return table
 
 
-def latency_table(steps: Mapping[str, Percentiles]) -> Table:
+def _markers(look: Look) -> Text:
+    """The ids of a picture; those that are not in the rig with a question mark."""
+    ids = [Text(str(n)) for n in look.markers] + [Text(f"{n}?", style="yellow") for n in look.strange]
+    return Text(", ").join(ids) if ids else Text("none")
+
+
+def latency_table(steps: Mapping[str, Percentiles]) -> Group:
     """How long each step took, in ms."""
-    table = Table(box=None, pad_edge=False, title="Milliseconds to each step", title_justify="left")
+    table = Table(box=None, pad_edge=False, title="Milliseconds for each step", title_justify="left")
     table.add_column("step")
     for heading in ("median", "90 %", "99 %", "longest"):
         table.add_column(heading, justify="right")
     for step, found in steps.items():
         table.add_row(step, *(f"{1e3 * value:.1f}" for value in asdict(found).values()))
-    return table
+    return Group(table, Text("total: from the arrival of a frame to its position"))
 
 
-def comparison_table(found: Sequence[Comparison]) -> Table:
-    """A row for each channel."""
+def comparison_table(found: Sequence[Comparison], sides: tuple[str, str]) -> Table:
+    """A row for each channel; ``sides`` are the headings of the two that are compared."""
     table = Table(box=None, pad_edge=False)
-    for heading in ("channel", "left", "right", "same", "RMS", "greatest"):
+    for heading in ("channel", *sides, "same", "RMS off", "most off"):
         table.add_column(heading, justify="left" if heading == "channel" else "right")
     for one in found:
         style = "" if one.equal else "red"

@@ -2,21 +2,29 @@
 
 from __future__ import annotations
 
+import re
 from dataclasses import asdict
 from typing import Any
 
 import numpy as np
 from rich.table import Table
+from rich.text import Text
 
-from ipsys_log.log.session import Session
+from ipsys_log.log.session import Session, camera_of_topic
 from ipsys_log.messages import Run
 from ipsys_log.units import NS_PER_S, format_bytes, format_time
 
 __all__ = ["contents_json", "contents_tables", "runs_json", "runs_table"]
 
-# A gap is a silence of this many times the usual distance between messages.
+# A gap is a silence of this many times the usual distance between messages of one camera. Those of several
+# are not evenly spaced: there it is a silence of so long.
 _GAP_FACTOR = 3
-_INSTANT_S = 1e-4
+_MERGED_GAP_S = 0.5
+# What comes frame by frame; nothing else has a rate.
+_OF_FRAMES = (
+    *("Image", "CompressedImage", "CompressedVideo", "Markers", "ImageAnnotations", "CameraPoints"),
+    *("Positions", "Tracks", "FrameTransforms"),
+)
 
 
 def contents_json(session: Session) -> dict[str, Any]:
@@ -38,7 +46,11 @@ def contents_json(session: Session) -> dict[str, Any]:
         "end": format_time(end_ns),
         "duration_s": (end_ns - start_ns) / NS_PER_S,
         "cameras": {
-            camera: {"images": topic, "calibration": session.calibrations.get(camera)}
+            camera: {
+                "images": topic,
+                "calibration": session.calibrations.get(camera),
+                "lens": _lens(session, camera),
+            }
             for camera, topic in session.images.items()
         },
         "channels": {topic: _channel(session, topic) for topic in topics},
@@ -46,21 +58,31 @@ def contents_json(session: Session) -> dict[str, Any]:
     }
 
 
+def _lens(session: Session, camera: str) -> dict[str, Any] | None:
+    if camera not in session.calibrations:
+        return None
+    lens = session.payloads([session.calibrations[camera]])[-1]
+    return {"width": lens.width, "height": lens.height, "model": lens.distortion_model}
+
+
 def _channel(session: Session, topic: str) -> dict[str, Any]:
     readers = [reader for reader in session.readers if topic in reader.channels]
     times_ns = np.sort(np.concatenate([reader.times(topic) for reader in readers]))
-    steps_s = np.diff(times_ns) / NS_PER_S
-    # What is written at one instant, such as the measurements of one place, has no rate.
-    apart_s = steps_s[steps_s > _INSTANT_S]
-    usual_s = float(np.median(apart_s)) if len(apart_s) else 0.0
-    gaps = apart_s[apart_s > _GAP_FACTOR * usual_s]
     schema = readers[0].channels[topic].schema
+    name = schema.name if schema else None
+    gaps_s, rate_hz = np.zeros(0), None
+    if name is not None and re.split(r"[./]", name)[-1] in _OF_FRAMES and len(times_ns) > 1:
+        steps_s = np.diff(times_ns) / NS_PER_S
+        of_one = camera_of_topic(topic) is not None or topic in session.images.values()
+        longest_s = _GAP_FACTOR * float(np.median(steps_s)) if of_one else _MERGED_GAP_S
+        gaps_s, steady_s = steps_s[steps_s > longest_s], steps_s[steps_s <= longest_s]
+        rate_hz = float(1 / steady_s.mean()) if steady_s.any() else None
     return {
-        "schema": schema.name if schema else None,
+        "schema": name,
         "messages": len(times_ns),
-        "rate_hz": 1 / usual_s if usual_s > 0 else None,
-        "gaps": len(gaps),
-        "longest_gap_s": float(gaps.max()) if len(gaps) else None,
+        "rate_hz": rate_hz,
+        "gaps": len(gaps_s),
+        "longest_gap_s": float(gaps_s.max()) if len(gaps_s) else None,
     }
 
 
@@ -95,27 +117,50 @@ def _table(title: str, *columns: str, right: tuple[str, ...] = ()) -> Table:
 
 
 def contents_tables(found: dict[str, Any]) -> list[Table]:
-    """The same as tables of at most 80 columns."""
+    """The same as tables, in 80 columns where the names are not too long for it."""
     files = _table("Files", "path", "size", "messages", "chunks", right=("size", "messages", "chunks"))
     for file in found["files"]:
         files.add_row(file["path"], format_bytes(file["bytes"]), str(file["messages"]), str(file["chunks"]))
     files.caption = f"{found['start']} UTC, {found['duration_s']:.1f} s"
     files.caption_justify = "left"
-    cameras = _table("Cameras", "camera", "images", "calibration")
-    for camera, row in found["cameras"].items():
-        cameras.add_row(camera, row["images"], row["calibration"] or "missing")
-    numbers = ("count", "Hz", "gaps")
-    channels = _table("Channels", "topic", *numbers, "schema", right=numbers)
-    for column in channels.columns[1:4]:
-        column.no_wrap = True
-    channels.columns[0].ratio, channels.columns[4].max_width = 1, 17
-    for topic, row in found["channels"].items():
-        rate = "-" if row["rate_hz"] is None else f"{row['rate_hz']:.1f}"
-        gaps = "-" if not row["gaps"] else f"{row['gaps']}, {row['longest_gap_s']:.1f} s"
-        schema = (row["schema"] or "-").rpartition(".")[2]
-        channels.add_row(topic, str(row["messages"]), rate, gaps, schema)
-    tables = [files, *([cameras] if found["cameras"] else []), channels]
+    tables = [files, *([_cameras_table(found)] if found["cameras"] else []), _channels_table(found)]
     return [*tables, runs_table(found["runs"])] if found["runs"] else tables
+
+
+def _cameras_table(found: dict[str, Any]) -> Table:
+    table = _table("Cameras", "camera", "frames", "Hz", "calibration", right=("frames", "Hz"))
+    for camera, row in found["cameras"].items():
+        channel, lens = found["channels"][row["images"]], row["lens"]
+        text = Text("missing", style="yellow")
+        if lens is not None:
+            text = Text(f"{lens['width']} x {lens['height']} px, {lens['model']}")
+        table.add_row(camera, str(channel["messages"]), _rate(channel), text)
+    return table
+
+
+def _channels_table(found: dict[str, Any]) -> Table:
+    """A row for each channel; those of a run below its name, so that they are short."""
+    numbers = ("count", "Hz", "gaps (longest)")
+    table = _table("Channels", "topic", *numbers, "schema", right=numbers)
+    for column in table.columns[:4]:
+        column.no_wrap = True
+    table.columns[4].overflow = "ellipsis"
+    run = ""
+    for topic, row in found["channels"].items():
+        within, _, rest = topic.removeprefix("/runs/").partition("/")
+        if topic.startswith("/runs/") and rest:
+            if within != run:
+                run = within
+                table.add_row(Text(f"/runs/{run}/", style="bold"))
+            topic = f"  {rest}"  # noqa: PLW2901
+        gaps = f"{row['gaps']} ({row['longest_gap_s']:.1f} s)" if row["gaps"] else ""
+        schema = re.split(r"[./]", row["schema"] or "-")[-1]
+        table.add_row(Text(topic), str(row["messages"]), _rate(row), gaps, schema)
+    return table
+
+
+def _rate(channel: dict[str, Any]) -> str:
+    return "" if channel["rate_hz"] is None else f"{channel['rate_hz']:.1f}"
 
 
 def runs_table(runs: list[dict[str, Any]]) -> Table:

@@ -9,7 +9,10 @@ from pathlib import Path
 
 from ipsys_log.errors import IpsysError
 
-__all__ = ["check_file", "check_folder", "write_files"]
+__all__ = ["PICTURES", "check_file", "check_folder", "check_picture", "write_files"]
+
+# How the name of a picture may end; it is written as that.
+PICTURES = (".png", ".pdf", ".svg", ".jpg", ".jpeg", ".webp")
 
 
 def check_file(path: Path, option: str, logs: Iterable[Path]) -> None:
@@ -27,6 +30,20 @@ def check_file(path: Path, option: str, logs: Iterable[Path]) -> None:
     if not path.parent.is_dir():
         raise IpsysError(f"{option} {path}: there is no folder {path.parent}; make it first")
     _check_writable(path.parent, f"{option} {path}")
+
+
+def check_picture(path: Path, option: str, logs: Iterable[Path]) -> None:
+    """See that a picture can be written, and of what kind, before there is work that would be lost.
+
+    Raises
+    ------
+    IpsysError
+        Where it cannot, or where its name does not end in one of ``PICTURES``.
+    """
+    check_file(path, option, logs)
+    if path.suffix.lower() not in PICTURES:
+        ends = f"{', '.join(PICTURES[:-1])} or {PICTURES[-1]}"
+        raise IpsysError(f"{option} {path}: is no kind of picture; let its name end in {ends}")
 
 
 def check_folder(folder: Path, option: str) -> None:

@@ -19,7 +19,7 @@ from ipsys_log.report.errors_panel import count_rows, draw_errors
 from ipsys_log.report.files import write_files
 from ipsys_log.report.floor_panel import Scene, draw_floor
 from ipsys_log.report.palette import camera_styles
-from ipsys_log.report.pictures import png
+from ipsys_log.report.pictures import picture
 from ipsys_log.runs import newest_run
 from ipsys_log.sinks.shown import rig_in_force
 
@@ -35,7 +35,7 @@ _GAP_NS = 500_000_000
 
 
 def draw_session(session: Session, accuracies: Sequence[Accuracy], path: Path) -> None:
-    """Draw a session into a PNG of about 1400 x 800 pixels.
+    """Draw a session into a picture of about 1400 x 800 pixels.
 
     On the left the floor to scale: measured places, the error of each held-out one as an arrow
     (exaggerated by the factor that the title states) for the first model, tracks and, where known, the
@@ -45,7 +45,7 @@ def draw_session(session: Session, accuracies: Sequence[Accuracy], path: Path) -
     ----------
     session : open logs.
     accuracies : from :func:`ipsys_log.report.accuracy.read_accuracy`; none leaves out the right side.
-    path : the picture, in place of one that is there already.
+    path : the picture, of the kind that its suffix says, in place of one that is there already.
 
     Raises
     ------
@@ -68,7 +68,7 @@ def draw_session(session: Session, accuracies: Sequence[Accuracy], path: Path) -
     )  # fmt: skip
     if rows:
         draw_errors(figure, accuracies, styles, left_in=7.3, top_in=_TOP_IN)
-    write_files(path.parent, {path.name: png(figure, _DPI)})
+    write_files(path.parent, {path.name: picture(figure, path, _DPI)})
 
 
 def _gather(session: Session, accuracies: Sequence[Accuracy]) -> Scene:

@@ -6,47 +6,68 @@ from collections.abc import Mapping
 from pathlib import Path
 
 import numpy as np
+from matplotlib.axes import Axes
 from matplotlib.figure import Figure
 from numpy.typing import NDArray
 
 from ipsys_log.report.files import write_files
 from ipsys_log.report.palette import NOTE
-from ipsys_log.report.pictures import png, strip
+from ipsys_log.report.pictures import picture, strip
 
 __all__ = ["draw_latency"]
 
-_COLOURS = {"detected": "#0072B2", "located": "#E69F00", "fused": "#009E73", "published": "#CC79A7"}
+_STEPS = ("detected", "located", "fused", "published")
+_NEAR, _FAR = "#0072B2", "#D3D7DB"
+# Beyond this many times the 99th percentile a few late ones would squeeze all the others.
+_SHOWN = 1.6
 
 
 def draw_latency(times_s: Mapping[str, NDArray[np.float64]], path: Path) -> None:
-    """Draw, into a PNG of 1200 x 600, what share of frames is through within which time, and each step of it.
+    """Draw what share of positions is there within which time, and each step of it, 1200 x 600 if in pixels.
 
     Parameters
     ----------
     times_s : of :func:`ipsys_log.latency.step_times_s`.
+    path : the picture, of the kind that its suffix says.
     """
-    figure = Figure(figsize=(12, 6), dpi=100, layout="constrained")
-    left, right = figure.subplots(1, 2)
+    figure = Figure(figsize=(12, 6), dpi=100)
+    left = figure.add_axes((0.07, 0.11, 0.42, 0.73))
+    right = figure.add_axes((0.6, 0.11, 0.37, 0.73))
     total_ms = np.sort(times_s["total"]) * 1e3
+    _draw_shares(left, total_ms)
+    _draw_steps(right, times_s)
+    figure.text(0.07, 0.94, f"Latency of {len(total_ms)} positions", fontsize=12)
+    write_files(path.parent, {path.name: picture(figure, path, 100)})
+
+
+def _draw_shares(axes: Axes, total_ms: NDArray[np.float64]) -> None:
     share = 100 * np.arange(1, len(total_ms) + 1) / len(total_ms)
-    left.step(total_ms, share, where="post", color="black")
-    for percent in (50, 99):
-        at_ms = float(np.percentile(total_ms, percent))
-        left.axvline(at_ms, color=NOTE, lw=0.8, ls="--")
-        left.annotate(
-            f"{percent} %: {at_ms:.1f} ms", (at_ms, 4), rotation=90, ha="right", va="bottom", fontsize=9
-        )
-    left.set(xlabel="ms from the arrival of a frame to its position", ylabel="% of positions", ylim=(0, 101))
-    left.set_xlim(0, float(total_ms[-1]) * 1.05)
-    strip(left)
-    medians_ms = {step: float(np.median(times_s[step])) * 1e3 for step in _COLOURS}
-    far_ms = {step: float(np.percentile(times_s[step], 99)) * 1e3 for step in _COLOURS}
-    rows = np.arange(len(_COLOURS))
-    right.barh(rows, list(far_ms.values()), color="#DDDDDD", label="99 %")
-    right.barh(rows, list(medians_ms.values()), color=list(_COLOURS.values()), height=0.5, label="median")
-    right.set_yticks(rows, list(_COLOURS))
-    right.invert_yaxis()
-    right.set(xlabel="ms for the step; grey: 99 % of positions")
-    strip(right, "x")
-    figure.suptitle(f"Latency of {len(total_ms)} positions", x=0.01, ha="left", fontsize=12)
-    write_files(path.parent, {path.name: png(figure, 100)})
+    axes.step(total_ms, share, where="post", color="black", label=f"all; longest {total_ms[-1]:.1f} ms")
+    median_ms, far_ms = np.percentile(total_ms, [50, 99]).tolist()
+    for name, at_ms, dashes in (("median", median_ms, "--"), ("99 %", far_ms, ":")):
+        axes.axvline(at_ms, color=NOTE, lw=1.2, ls=dashes, label=f"{name} {at_ms:.1f} ms")
+    axes.set(xlabel="ms from the arrival of a frame to its position", ylabel="% of positions", ylim=(0, 101))
+    axes.set_xlim(0, min(float(total_ms[-1]) * 1.05, _SHOWN * far_ms))
+    strip(axes)
+    _key(axes)
+
+
+def _draw_steps(axes: Axes, times_s: Mapping[str, NDArray[np.float64]]) -> None:
+    rows = np.arange(len(_STEPS))
+    found_ms = np.array([np.percentile(times_s[step], [50, 99]) for step in _STEPS]) * 1e3
+    axes.barh(rows, found_ms[:, 1], color=_FAR, label="99 % of positions")
+    axes.barh(rows, found_ms[:, 0], color=_NEAR, height=0.5, label="median")
+    for row, (median_ms, far_ms) in enumerate(found_ms):
+        text = f"{median_ms:.1f}, 99 %: {far_ms:.1f}"
+        axes.annotate(text, (far_ms, row), (5, 0), textcoords="offset points", va="center", fontsize=9)
+    axes.set_xlim(0, 1.5 * float(found_ms[:, 1].max()))
+    axes.set_yticks(rows, _STEPS)
+    axes.invert_yaxis()
+    axes.set(xlabel="ms for the step")
+    strip(axes, "x")
+    _key(axes)
+
+
+def _key(axes: Axes) -> None:
+    """The legend, above the axes, where it covers nothing."""
+    axes.legend(loc="lower left", bbox_to_anchor=(-0.02, 1.0), ncols=3, fontsize=9, frameon=False)

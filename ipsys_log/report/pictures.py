@@ -6,6 +6,7 @@ import base64
 import io
 import warnings
 from collections.abc import Sequence
+from pathlib import Path
 
 import matplotlib
 from matplotlib.axes import Axes
@@ -14,10 +15,17 @@ from matplotlib.ticker import FixedLocator, FuncFormatter, NullLocator
 
 from ipsys_log.report.palette import GRID
 
-__all__ = ["png", "scale_logarithmic", "set_ticks", "shorten", "strip", "svg_uri"]
+__all__ = ["picture", "png", "scale_logarithmic", "set_ticks", "shorten", "strip", "svg_uri"]
 
 _DPI = 150
 _LONGEST = 24
+# Without the time of writing.
+_WITHOUT: dict[str, dict[str, object]] = {
+    "pdf": {"metadata": {"Creator": None, "Producer": None, "CreationDate": None}},
+    "jpg": {},
+    "jpeg": {},
+    "webp": {},
+}
 
 
 def png(figure: Figure, dpi: int = _DPI) -> bytes:
@@ -25,10 +33,22 @@ def png(figure: Figure, dpi: int = _DPI) -> bytes:
     return _saved(figure, format="png", dpi=dpi, metadata={"Software": None})
 
 
+def picture(figure: Figure, path: Path, dpi: int = _DPI) -> bytes:
+    """A figure as the bytes of the kind of file that a name ends in, one of ``PICTURES``."""
+    kind = path.suffix.lower().removeprefix(".")
+    if kind == "png":
+        return png(figure, dpi)
+    return _svg(figure) if kind == "svg" else _saved(figure, format=kind, dpi=dpi, **_WITHOUT[kind])
+
+
+def _svg(figure: Figure) -> bytes:
+    with matplotlib.rc_context({"svg.hashsalt": "ipsys", "svg.fonttype": "path"}):
+        return _saved(figure, format="svg", metadata={"Date": None, "Creator": None})
+
+
 def svg_uri(figure: Figure) -> str:
     """A figure as an address that holds the picture itself."""
-    with matplotlib.rc_context({"svg.hashsalt": "ipsys", "svg.fonttype": "path"}):
-        data = _saved(figure, format="svg", metadata={"Date": None, "Creator": None})
+    data = _svg(figure)
     return f"data:image/svg+xml;base64,{base64.b64encode(data).decode()}"
 
 

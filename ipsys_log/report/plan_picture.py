@@ -14,7 +14,9 @@ from matplotlib.ticker import MaxNLocator
 from numpy.typing import NDArray
 from scipy.ndimage import gaussian_filter
 
+from ipsys_log.report.files import write_files
 from ipsys_log.report.palette import NOTE, REST, camera_styles
+from ipsys_log.report.pictures import picture
 from ipsys_log.report.plan import PlannedFloor, means_cm, mesh
 from ipsys_log.units import CM_PER_M
 
@@ -30,7 +32,7 @@ _RING = 0.04
 
 
 def draw_plan(found: PlannedFloor, path: Path) -> None:
-    """Draw the predicted error over the floor, now and with the planned places, into a PNG of 1400 x 700."""
+    """Draw the predicted error over the floor, now and with the planned places, 1400 x 700 if in pixels."""
     figure = Figure(figsize=(14, 7), dpi=100)
     plan, count = found.plan, len(found.plan.places)
     then = "With this place" if count == 1 else f"With these {count} places"
@@ -49,12 +51,7 @@ def draw_plan(found: PlannedFloor, path: Path) -> None:
     figure.text(0.6 / 14, 6.7 / 7, title, fontsize=12)
     handles, labels = axes.get_legend_handles_labels()
     figure.legend(handles, labels, loc=(0.035, 0.01), ncols=8, fontsize=9, frameon=False)
-    partial = path.with_name(path.name + ".partial")
-    try:
-        figure.savefig(partial, format="png")
-        partial.replace(path)
-    finally:
-        partial.unlink(missing_ok=True)
+    write_files(path.parent, {path.name: picture(figure, path, 100)})
 
 
 def _draw_floor(axes: Axes, found: PlannedFloor, error_cm: Array, top_cm: float) -> AxesImage:

@@ -7,6 +7,7 @@ from itertools import chain, repeat
 from textwrap import wrap
 
 import numpy as np
+from rich.console import Group
 from rich.table import Table
 from rich.text import Text
 
@@ -23,9 +24,9 @@ _WIDTH = 80
 _NAME_WIDTH = 18
 
 
-def accuracy_tables(accuracies: Sequence[Accuracy]) -> list[Table]:
+def accuracy_tables(accuracies: Sequence[Accuracy]) -> list[Table | Group]:
     """The summary; of many models the errors by cross-validation only of all cameras together."""
-    tables = []
+    tables: list[Table] = []
     if any(accuracy.rows(False) or accuracy.tracks for accuracy in accuracies):
         tables.append(_held_out_table(accuracies))
     if any(accuracy.rows(True) for accuracy in accuracies):
@@ -35,8 +36,8 @@ def accuracy_tables(accuracies: Sequence[Accuracy]) -> list[Table]:
     if any(accuracy.evaluation and accuracy.evaluation.suspects for accuracy in accuracies):
         tables.append(_suspects_table(accuracies))
     if advice := advise([accuracy.evaluation for accuracy in accuracies if accuracy.evaluation]):
-        tables.append(_advice_table(advice))
-    return tables
+        return [*tables, _advice_table(advice)]
+    return [*tables]
 
 
 def _table(title: str, names: Iterable[str], figures: Iterable[str] = ()) -> Table:
@@ -50,8 +51,11 @@ def _table(title: str, names: Iterable[str], figures: Iterable[str] = ()) -> Tab
 
 
 def _note(table: Table, text: str) -> None:
-    lines = [line for part in text.splitlines() for line in wrap(part, _WIDTH)]
-    table.caption, table.caption_justify, table.caption_style = Text("\n".join(lines)), "left", ""
+    table.caption, table.caption_justify, table.caption_style = Text(_wrapped(text)), "left", ""
+
+
+def _wrapped(text: str) -> str:
+    return "\n".join(line for part in text.splitlines() for line in wrap(part, _WIDTH))
 
 
 def _name(text: str) -> Text:
@@ -106,7 +110,7 @@ def _cross_validation_table(accuracies: Sequence[Accuracy]) -> Table:
     several = len({row.against for _, row in rows}) > 1
     names = ["model", *(["camera"] if cameras else []), *(["against"] if several else [])]
     figures = ("n", "3D mean", "95 % CI", "p50", "p95", "max", "2D mean")
-    table = _table("By cross-validation, in cm, on places that were not fitted on", names, figures)
+    table = _table("By cross-validation, in cm, on places not fitted on", names, figures)
     for accuracy, row in rows:
         cells = [label(accuracy.model)]
         cells += [row.camera or "(all)"] if cameras else []
@@ -147,18 +151,17 @@ def _suspects_table(accuracies: Sequence[Accuracy]) -> Table:
     return table
 
 
-def _advice_table(advice: Advice) -> Table:
-    """What to use with how many places, and the same in words below."""
-    title = "Which model with how many places for each camera, mean error in cm"
-    table = _table(title, (), ("places",))
+def _advice_table(advice: Advice) -> Group:
+    """What to use with how many places, and the same in words below; the title of a table is no wider."""
+    title = Text("Which model with how many places for each camera, mean error in cm", style="bold")
+    table = _table("", (), ("places",))
     for group in advice.groups:
         table.add_column(GROUPS[group], overflow="fold")
     for places, found in advice.choices.items():
         table.add_row(
             str(places), *(_choice(found[group]) if group in found else "-" for group in advice.groups)
         )
-    _note(table, "\n".join(advice.sentences))
-    return table
+    return Group(title, table, Text(_wrapped("\n".join(advice.sentences))))
 
 
 def _choice(choice: Choice) -> str:

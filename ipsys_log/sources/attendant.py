@@ -12,6 +12,7 @@ import simplejpeg
 
 from ipsys_log.messages import EVENTS_TOPIC, Event, RigCamera, image_topic
 from ipsys_log.sources.frames import Clock, Frame, Open, Say, SourceError, instant_ns
+from ipsys_log.sources.network import hide_password
 from ipsys_log.sources.videos import frame_payload
 from ipsys_log.units import NS_PER_S
 
@@ -19,6 +20,8 @@ __all__ = ["Arrival", "Attendant", "CameraState", "Shared"]
 
 # A camera that opens and then sends nothing is not there.
 _FIRST_FRAME_S = 10.0
+# The simulator draws its frames first, however busy the machine is.
+_DRAW_S = 120.0
 _RETRY_S, _LONGEST_RETRY_S = 0.5, 8.0
 _TURN_S = 0.1
 # A camera that loses frames all the time is not named more often.
@@ -97,12 +100,13 @@ class Attendant:
             Where the camera cannot be opened, or sends nothing.
         """
         self._opened.wait()
-        begun = self._begun.wait(_FIRST_FRAME_S)
+        simulated = str(self._camera.source).startswith("sim:")
+        begun = self._begun.wait(_DRAW_S if simulated else _FIRST_FRAME_S)
         if self.fault is not None:
             raise self.fault
         if not begun:
             raise SourceError(
-                f"camera {self._camera.name}: {self._camera.source} sends no frames; "
+                f"camera {self._camera.name}: {hide_password(str(self._camera.source))} sends no frames; "
                 "look whether another program uses it"
             )
 

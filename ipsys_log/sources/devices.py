@@ -11,12 +11,12 @@ from ipsys_log.errors import IpsysError
 from ipsys_log.messages import Rig, RigCamera
 from ipsys_log.sources.bandwidth import advise, demands_of
 from ipsys_log.sources.frames import Clock, Frame, Open, Say
-from ipsys_log.sources.network import open_network
-from ipsys_log.sources.played import open_played
-from ipsys_log.sources.simulated import open_simulated
+from ipsys_log.sources.network import check_address, open_network
+from ipsys_log.sources.played import check_played, open_played
+from ipsys_log.sources.simulated import lab_of, open_simulated
 from ipsys_log.sources.usb import device_of, open_usb
 
-__all__ = ["OPENERS", "check_devices", "open_source", "usb_advice"]
+__all__ = ["OPENERS", "check_devices", "check_sources", "open_source", "usb_advice"]
 
 # By what stands before the first colon of a source.
 OPENERS: dict[str, Open] = {
@@ -51,6 +51,29 @@ def check_devices(cameras: Iterable[RigCamera]) -> None:
                 )
 
 
+def check_sources(cameras: Iterable[RigCamera]) -> None:
+    """See that each camera has a source that something here can open, as far as its text shows.
+
+    Raises
+    ------
+    IpsysError
+        Otherwise; also where a file or a device is not there.
+    """
+    for camera in cameras:
+        source = str(camera.source)
+        if _opener(camera) is open_network:
+            check_address(camera)
+        elif _opener(camera) is open_simulated:
+            lab_of(camera)
+        elif _opener(camera) is open_played:
+            check_played(camera)
+        elif sys.platform == "linux" and not Path(device_of(source)).exists():
+            raise IpsysError(
+                f"camera {camera.name}: there is no device {device_of(source)!r}; 'ipsys cameras' "
+                "lists what is attached"
+            )
+
+
 def usb_advice(rig: Rig) -> list[str]:
     """What to change where USB does not carry all the cameras of a rig at once (Linux; elsewhere nothing)."""
     if sys.platform != "linux":
@@ -68,6 +91,10 @@ def open_source(camera: RigCamera, clock: Clock, say: Say) -> AbstractContextMan
     IpsysError
         Where the rig gives no source, or one that nothing here opens.
     """
+    return _opener(camera)(camera, clock, say)
+
+
+def _opener(camera: RigCamera) -> Open:
     if not camera.source:
         raise IpsysError(
             f'camera {camera.name}: the rig gives no source; write e.g. source = "usb:/dev/video0"'
@@ -76,4 +103,4 @@ def open_source(camera: RigCamera, clock: Clock, say: Say) -> AbstractContextMan
     if opener is None:
         known = ", ".join(f"{scheme}:" for scheme in OPENERS)
         raise IpsysError(f"camera {camera.name}: source {camera.source!r} is none of {known}")
-    return opener(camera, clock, say)
+    return opener

@@ -23,7 +23,7 @@ from ipsys_log.sources.stamps import Stamps
 if TYPE_CHECKING:
     from av.container import InputContainer
 
-__all__ = ["hide_password", "open_network"]
+__all__ = ["check_address", "hide_password", "open_network"]
 
 # A stream that is silent for so long has gone.
 _SILENT_S = 5.0
@@ -161,6 +161,28 @@ def _explain(error: Exception) -> str:
         if isinstance(error, kind):
             return text
     return f"cannot be read ({getattr(error, 'strerror', None) or error}); try the address in another player"
+
+
+def check_address(camera: RigCamera) -> None:
+    """See that the source of a camera is an address.
+
+    Raises
+    ------
+    SourceError
+        Where it names no host. A stream that is sent to this machine (``udp://:5000``) needs none.
+    """
+    address = camera.source or ""
+    if not address.lower().startswith(("http", "rtsp")):
+        return
+    try:
+        host = urlsplit(address).hostname
+    except ValueError:
+        host = None
+    if host is None:
+        raise SourceError(
+            f"camera {camera.name}: {hide_password(address)!r} names no host; write it as "
+            "http://192.168.1.20:8080/video or rtsp://user:password@192.168.1.20/stream"
+        )
 
 
 def hide_password(address: str) -> str:

@@ -13,7 +13,7 @@ from ipsys_log.sources.frames import Clock, Frame, Say, SourceError
 from ipsys_log.sources.videos import Timed, open_video
 from ipsys_log.units import NS_PER_S
 
-__all__ = ["open_played"]
+__all__ = ["check_played", "open_played"]
 
 _TURN_S = 0.4
 
@@ -34,10 +34,7 @@ def open_played(camera: RigCamera, clock: Clock, say: Say) -> Iterator[Iterator[
     SourceError
         Where the file cannot be read, or a log has no such camera.
     """
-    name, _, wanted = (camera.source or "").partition(":")[2].partition("?")
-    path = Path(name)
-    if not path.is_file():
-        raise SourceError(f"camera {camera.name}: {path}: there is no such file")
+    path, wanted = check_played(camera)
     if path.suffix != ".mcap":
         with open_video(path, say) as frames:
             yield _play(frames, clock)
@@ -48,6 +45,21 @@ def open_played(camera: RigCamera, clock: Clock, say: Say) -> Iterator[Iterator[
             known = ", ".join(f"{path}?{other}" for other in session.images) or "none"
             raise SourceError(f"camera {camera.name}: {path}: has no such camera; it has: {known}")
         yield _play(_recorded(session, topic), clock)
+
+
+def check_played(camera: RigCamera) -> tuple[Path, str]:
+    """The file that a source names, and the camera that it asks for, or nothing.
+
+    Raises
+    ------
+    SourceError
+        Where there is no such file.
+    """
+    name, _, wanted = (camera.source or "").partition(":")[2].partition("?")
+    path = Path(name)
+    if not path.is_file():
+        raise SourceError(f"camera {camera.name}: {path}: there is no such file")
+    return path, wanted
 
 
 def _recorded(session: Session, topic: str) -> Iterator[Timed]:

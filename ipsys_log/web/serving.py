@@ -19,7 +19,7 @@ from ipsys_log.measuring.scene import Scene
 from ipsys_log.web.app import build_app
 from ipsys_log.web.guard import Guard
 
-__all__ = ["Served", "qr_code", "serving"]
+__all__ = ["Served", "check_free", "qr_code", "serving"]
 
 _LOOPBACK = "127.0.0.1"
 _STEP_S = 0.02
@@ -71,6 +71,17 @@ def serving(scene: Scene, host: str | None = None, port: int = 8000) -> Iterator
         finally:
             server.should_exit = True
             thread.join()
+
+
+def check_free(host: str | None, port: int) -> None:
+    """See that a page can be served there.
+
+    Raises
+    ------
+    IpsysError
+        As :func:`serving`.
+    """
+    _listen(host or _LOOPBACK, port).close()
 
 
 def _listen(host: str, port: int) -> socket.socket:

@@ -81,6 +81,7 @@ def test_info_says_what_is_in_a_log(ipsys: Ipsys, lab: Path) -> None:
     assert found["cameras"]["red"] == {
         "images": "/cameras/red/image",
         "calibration": "/cameras/red/calibration",
+        "lens": {"width": 960, "height": 540, "model": "kannala_brandt"},
     }
     images = found["channels"]["/cameras/red/image"]
     assert images["schema"] == "foxglove.CompressedImage"

@@ -6,6 +6,7 @@ import threading
 import time
 from collections.abc import Iterator
 from contextlib import contextmanager
+from functools import partial
 from itertools import pairwise
 
 import pytest
@@ -88,6 +89,19 @@ def test_a_camera_that_cannot_be_opened_ends_it_at_once() -> None:
     with pytest.raises(SourceError, match="no /dev/video7"):
         messages(Attached(cameras("red", "white"), opened, Clock()))
     assert not [thread for thread in threading.enumerate() if thread.name in ("red", "white")]
+
+
+def test_a_camera_that_sends_nothing_is_named_without_its_password(monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr("ipsys_log.sources.attendant._FIRST_FRAME_S", 0.2)
+
+    @contextmanager
+    def silent(camera: RigCamera, clock: Clock, say: Say) -> Iterator[Iterator[Frame | None]]:
+        yield iter(partial(time.sleep, 0.05), "the end")  # None, and None again
+
+    camera = RigCamera("red", source="rtsp://admin:secret@10.0.0.7/live")
+    with pytest.raises(SourceError, match=r"admin:\*+@10\.0\.0\.7/live sends no frames") as raised:
+        messages(Attached([camera], silent, Clock()))
+    assert "secret" not in str(raised.value)
 
 
 def test_a_camera_that_vanishes_is_tried_again_while_the_others_go_on() -> None:

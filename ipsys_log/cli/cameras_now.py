@@ -1,0 +1,187 @@
+"""Cameras of a rig that are opened for a command; first everything is said that can be said before."""
+
+from __future__ import annotations
+
+import os
+import signal
+from collections.abc import Callable, Iterator
+from contextlib import AbstractContextManager, ExitStack, contextmanager, nullcontext
+from dataclasses import replace
+from pathlib import Path
+from tempfile import TemporaryDirectory
+from threading import TIMEOUT_MAX, Timer
+from time import monotonic
+from typing import TYPE_CHECKING, NamedTuple
+
+from ipsys_log.cli.console import console, remarks
+from ipsys_log.cli.options import load_lab
+
+if TYPE_CHECKING:
+    from ipsys_log.messages import CameraCalibration, Message, Rig, RigCamera
+    from ipsys_log.pipeline import Watch
+    from ipsys_log.report.cameras import LiveStatus
+    from ipsys_log.sources.attached import Attached
+
+__all__ = ["Lab", "check_target", "opened", "prepared", "recorded_now", "say", "shown_to"]
+
+
+class Lab(NamedTuple):
+    """What is to be opened: the rig, its cameras, and their lenses by name."""
+
+    rig: Rig
+    cameras: list[RigCamera]
+    lenses: dict[str, CameraCalibration]
+
+    @property
+    def names(self) -> list[str]:
+        return [camera.name for camera in self.cameras]
+
+
+def say(text: str) -> None:
+    """A remark, as it is."""
+    remarks.print(text, markup=False)
+
+
+def prepared(
+    rig: Path, only: list[str] | None, calibration: list[str] | None, with_lenses: bool = True
+) -> Lab:
+    """The cameras of a rig file; nothing is opened yet.
+
+    Parameters
+    ----------
+    only : the names of some cameras; otherwise all that have a source.
+    with_lenses : read the lenses that the rig names, too; not where they are still to be made.
+
+    Raises
+    ------
+    IpsysError
+        For what is wrong with the rig, the source of a camera, or the file of a lens.
+    """
+    from ipsys_log.sources.devices import check_devices, check_sources, usb_advice
+
+    lab = Lab(*load_lab(rig, calibration, only or (), with_lenses))
+    check_devices(lab.cameras)
+    check_sources(lab.cameras)
+    for line in usb_advice(replace(lab.rig, cameras=tuple(lab.cameras))):
+        remarks.print(line, style="yellow", markup=False)
+    for camera in lab.cameras:
+        if camera.width and camera.height and camera.width < camera.height:
+            text = f"camera {camera.name}: {camera.width} x {camera.height} px is upright"
+            remarks.print(f"{text}: are width and height exchanged?", style="yellow", markup=False)
+    return lab
+
+
+def check_target(output: Path, force: bool) -> None:
+    """See that a log can be written.
+
+    Raises
+    ------
+    IpsysError
+        Where there is one already, or its folder is not there, or takes no files; with ``force`` where
+        another process is writing it.
+    """
+    from ipsys_log.errors import IpsysError
+    from ipsys_log.log.lock import open_locked
+    from ipsys_log.log.storage import DISK
+    from ipsys_log.report.files import check_file
+
+    check_file(output, "-o", [])
+    if output.exists():
+        if not force:
+            raise IpsysError(f"{output}: exists already; give another name, or --force to overwrite it")
+        os.close(open_locked(DISK, output, os.O_RDWR))
+
+
+@contextmanager
+def opened(
+    lab: Lab, output: Path, seconds: float | None, doing: str | None = None, panel: bool = True
+) -> Iterator[tuple[Attached, list[Message], LiveStatus]]:
+    """Cameras that send, what is written first, and what is shown on the screen meanwhile.
+
+    Parameters
+    ----------
+    doing : said at the beginning, where it is not recording; then nothing is said of frames at the end.
+    panel : whether the screen is free for a table of the cameras.
+
+    Raises
+    ------
+    IpsysError
+        Where a camera cannot be opened, or its frames do not fit its lens.
+    """
+    from ipsys_log.monitor import Monitor
+    from ipsys_log.recording import first_messages, fitting_lenses
+    from ipsys_log.report.cameras import LiveStatus
+    from ipsys_log.sources.attached import Attached
+    from ipsys_log.sources.devices import open_source
+    from ipsys_log.sources.frames import Clock
+
+    with ExitStack() as stack:
+        with remarks.status("opening " + ", ".join(lab.names)):
+            attached = stack.enter_context(Attached(lab.cameras, open_source, Clock(), say))
+        sizes_px = {name: state.size_px for name, state in attached.states.items()}
+        lenses = fitting_lenses(lab.lenses, sizes_px, say)
+        stack.enter_context(_ended(attached.stop, seconds))
+        status = LiveStatus(attached.states, stack.enter_context(Monitor(lab.rig)), output, monotonic)
+        say(doing or f"recording into {output}; Ctrl-C ends it")
+        if panel:
+            stack.enter_context(_on_screen(status))
+        yield attached, first_messages(lab.rig, lenses, attached.now_ns), status
+    for line in () if doing else status.summary():
+        console.print(line, markup=False)
+
+
+def shown_to(first: Watch, second: Watch | None) -> Watch:
+    """Show what passes to one or to both."""
+
+    def watch(message: Message | None) -> None:
+        first(message)
+        if second is not None:
+            second(message)
+
+    return watch
+
+
+@contextmanager
+def _ended(stop: Callable[[], None], seconds: float | None) -> Iterator[None]:
+    """On Ctrl-C, SIGTERM or after some time it ends cleanly: what has come by then is written."""
+    for number in (signal.SIGINT, signal.SIGTERM):
+        signal.signal(number, lambda *_: stop())
+    timer = Timer(TIMEOUT_MAX if seconds is None else seconds, stop)
+    timer.start()
+    try:
+        yield
+    finally:
+        timer.cancel()
+
+
+def _on_screen(status: LiveStatus) -> AbstractContextManager[object]:
+    from rich.live import Live
+
+    if not remarks.is_terminal:
+        return nullcontext()
+    return Live(get_renderable=status.show, console=remarks, transient=True, refresh_per_second=2)
+
+
+@contextmanager
+def recorded_now(lab: Lab, seconds: float, keep: Path | None = None) -> Iterator[Path]:
+    """A log of what cameras send in the next seconds; without ``keep`` only for as long as the block lasts.
+
+    Raises
+    ------
+    IpsysError
+        Where the cameras do not send. What the block complains of is not said of a file that nobody knows.
+    """
+    from ipsys_log import pipeline
+    from ipsys_log.errors import IpsysError
+
+    with TemporaryDirectory(prefix="ipsys-") as folder:
+        log = keep or Path(folder) / "now.mcap"
+        doing = None if keep else f"looking for {seconds:g} s"
+        with opened(lab, log, seconds, doing) as (cameras, settings, status):
+            pipeline.record(cameras, settings, log, status)
+        try:
+            yield log
+        except IpsysError as error:
+            if keep is not None:
+                raise
+            raise IpsysError(str(error).replace(str(log), "what the cameras sent")) from error

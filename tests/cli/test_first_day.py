@@ -1,0 +1,299 @@
+"""What somebody meets on the first day: slips that are said at once, names, pictures, and a help to go by."""
+
+from __future__ import annotations
+
+import json
+import shlex
+from pathlib import Path
+
+import pytest
+import typer.main
+
+from ipsys_log.cli.app import app
+from ipsys_log.cli.guide import EXAMPLES, PANELS
+from ipsys_log.log.session import Session
+from ipsys_log.pipeline import replay
+from ipsys_log.request import Request
+from tests.conftest import Ipsys
+
+RIG = """name = "lab"
+dictionary = "DICT_4X4_100"
+marker_length_m = 0.2
+[[reference_points]]
+name = "A"
+x_m = 0.0
+y_m = 0.0
+[[reference_points]]
+name = "B"
+x_m = 2.0
+y_m = 0.0
+"""
+SIMULATED = '[[cameras]]\nname = "red"\nsource = "sim:red"\nwidth = 320\nheight = 180\n'
+OPENED = "draws 2 s of the simulated lab"
+
+
+@pytest.fixture(scope="module")
+def fitted(lab_log: Path, tmp_path_factory: pytest.TempPathFactory) -> Path:
+    """A log with a model of the cameras red, white and black."""
+    path = tmp_path_factory.mktemp("fitted") / "calibration.mcap"
+    replay([lab_log], Request(), output=path)
+    return path
+
+
+def write_rig(folder: Path, cameras: str) -> Path:
+    path = folder / "lab.toml"
+    path.write_text(RIG + cameras)
+    return path
+
+
+def played(lab: Path, camera: str = "red", more: str = "") -> str:
+    """A camera that plays a recorded one, and has its lens from the same log."""
+    return (
+        f'[[cameras]]\nname = "{camera}"\nsource = "file:{lab}?{camera}"\ncalibration = "{lab.name}"\n{more}'
+    )
+
+
+# Beside the camera that would tell that it was opened.
+FAULTS = {
+    "source": ('[[cameras]]\nname = "white"\nsource = "carrier_pigeon:7"\n', "is none of http:"),
+    "simulated camera": ('[[cameras]]\nname = "white"\nsource = "sim:blue"\n', "has no camera 'blue'"),
+    "device": ('[[cameras]]\nname = "white"\nsource = "usb:/dev/none"\n', "there is no device '/dev/none'"),
+    "address": ('[[cameras]]\nname = "white"\nsource = "http:/cam/1"\n', "names no host; write it as"),
+    "file": ('[[cameras]]\nname = "white"\nsource = "file:none.mp4"\n', "none.mp4: there is no such file"),
+    "lens": (
+        '[[cameras]]\nname = "white"\nsource = "sim:white"\ncalibration = "none.yaml"\n',
+        "none.yaml: there is no such calibration file",
+    ),
+}
+COMMANDS = {
+    "record": ("record", "-o", "new.mcap", "--seconds", "1"),
+    "measure": ("record", "-o", "new.mcap", "--seconds", "1", "--measure"),
+    "live": ("live", "-o", "new.mcap", "--seconds", "1", "--model-from", "FITTED"),
+    "align": ("align", "--seconds", "1"),
+    "calibrate": ("calibrate", "--board", "6x4", "--seconds", "1"),
+}
+
+
+@pytest.mark.parametrize("command", COMMANDS)
+@pytest.mark.parametrize("fault", FAULTS)
+def test_a_bad_source_or_lens_is_said_before_any_camera_is_opened(
+    ipsys: Ipsys, tmp_path: Path, monkeypatch: pytest.MonkeyPatch, fitted: Path, command: str, fault: str
+) -> None:
+    cameras, said = FAULTS[fault]
+    rig = write_rig(tmp_path, SIMULATED + cameras)
+    monkeypatch.chdir(tmp_path)
+    if (command, fault) == ("calibrate", "lens"):
+        pytest.skip("it is about to make that file")
+    given = [str(fitted) if part == "FITTED" else part for part in COMMANDS[command]]
+    done = ipsys(*given, "--rig", rig)
+    assert done.code == 1
+    assert said in done.err
+    assert OPENED not in done.err
+    assert sorted(path.name for path in tmp_path.iterdir()) == ["lab.toml"]
+
+
+@pytest.mark.parametrize(
+    ("arguments", "said"),
+    [
+        (("record", "-o", "old.mcap"), "old.mcap: exists already"),
+        (("record", "-o", "old"), "old.mcap: exists already"),
+        (("record", "-o", "none/a.mcap"), "there is no folder none"),
+        (("record", "-o", "/proc/a.mcap"), "cannot write into /proc"),
+        (("record", "-o", "."), "is a folder"),
+        (("record", "-o", "a.mcap", "--detect", "--corners", "best"), "best"),
+        (("record", "-o", "a.mcap", "--model-from", "old.mcap"), "has no effect without --measure"),
+        (("record", "-o", "a.mcap", "--measure", "--model-from", "none.mcap"), "none.mcap"),
+        (("record", "-o", "a.mcap", "--measure", "--host", "192.0.2.1"), "--host 192.0.2.1: cannot be"),
+        (("live", "-o", "a.mcap", "--model-from", "none.mcap"), "none.mcap"),
+        (("live", "-o", "a.mcap", "--model-from", "FITTED", "--model", "best"), "has no fitted model best"),
+        (("live", "-o", "old.mcap", "--model-from", "FITTED"), "old.mcap: exists already"),
+        (("align", "-o", "old.mcap"), "old.mcap: exists already"),
+        (("align", "--plot", "none/a.png"), "there is no folder none"),
+        (("align", "--corners", "best"), "best"),
+        (("calibrate", "--board", "6x4", "-o", "old.yaml"), "old.yaml: exists already"),
+        (("calibrate", "--board", "6x4", "-o", "/proc"), "cannot write into /proc"),
+        (("calibrate", "--board", "6x4", "--plot", "a.doc"), "let its name end in .png"),
+    ],
+)
+def test_what_cannot_be_done_is_said_before_any_camera_is_opened(
+    ipsys: Ipsys, tmp_path: Path, monkeypatch: pytest.MonkeyPatch, fitted: Path,
+    arguments: tuple[str, ...], said: str,
+) -> None:  # fmt: skip
+    monkeypatch.chdir(tmp_path)
+    for name in ("old.mcap", "old.yaml"):
+        (tmp_path / name).write_bytes(b"years of work")
+    given = [str(fitted) if part == "FITTED" else part for part in arguments]
+    done = ipsys(*given, "--rig", write_rig(tmp_path, SIMULATED), "--seconds", "1")
+    assert done.code == 1
+    assert done.err.startswith("ipsys: ") or arguments[2] == "old"
+    assert said in done.err
+    assert OPENED not in done.err
+    assert sorted(path.name for path in tmp_path.iterdir()) == ["lab.toml", "old.mcap", "old.yaml"]
+    assert (tmp_path / "old.mcap").read_bytes() == b"years of work"
+
+
+def test_a_picture_that_is_higher_than_wide_is_asked_about(ipsys: Ipsys, tmp_path: Path) -> None:
+    for width, height, said in ((180, 320, True), (320, 180, False)):
+        size = f"width = {width}\nheight = {height}"
+        rig = write_rig(tmp_path, f'[[cameras]]\nname = "red"\nsource = "http://127.0.0.1:9/"\n{size}')
+        done = ipsys("record", "--rig", rig, "-o", tmp_path / "none" / "a.mcap")
+        assert ("camera red: 180 x 320 px is upright: are width and height exchanged?" in done.err) == said
+
+
+def test_a_model_of_other_cameras_is_refused_before_any_is_opened(
+    ipsys: Ipsys, tmp_path: Path, fitted: Path
+) -> None:
+    rig = write_rig(tmp_path, SIMULATED.replace('"red"', '"blue"'))
+    for command in (("live",), ("record", "--measure")):
+        given = ("-o", tmp_path / "a.mcap", "--rig", rig, "--model-from", fitted, "--seconds", "1")
+        done = ipsys(*command, *given)
+        assert done.code == 1
+        assert "is of the cameras black, red, white, and none of them is here, but blue" in done.err
+        assert OPENED not in done.err
+
+
+def test_a_lens_comes_out_of_a_log(ipsys: Ipsys, tmp_path: Path, lab: Path) -> None:
+    """By its camera; of a log with a single one, whatever that is called."""
+    rig = write_rig(tmp_path, played(lab))
+    one = ("record", "--rig", rig, "--seconds", "0.5", "-o")
+    assert ipsys(*one, tmp_path / "red.mcap").code == 0
+    other = write_rig(tmp_path, played(lab, "white").replace(f'"{lab.name}"', '"red.mcap"'))
+    assert ipsys("record", "--rig", other, "--seconds", "0.5", "-o", tmp_path / "white.mcap").code == 0
+    given = ("--calibration", f"white={tmp_path / 'red.mcap'}")
+    done = ipsys("record", "--rig", other, "--seconds", "0.5", "-o", tmp_path / "again.mcap", *given)
+    assert done.code == 0, done.err
+    with Session([lab]) as session:
+        meant = session.payloads([session.calibrations["red"]])[-1]
+    for name, camera in (("red", "red"), ("white", "white"), ("again", "white")):
+        with Session([tmp_path / f"{name}.mcap"]) as session:
+            held = session.payloads([session.calibrations[camera]])[-1]
+        assert (held.D.tolist(), held.K.tolist(), held.width) == (meant.D.tolist(), meant.K.tolist(), 960)
+    stranger = write_rig(tmp_path, played(lab).replace('name = "red"', 'name = "green"'))
+    done = ipsys("record", "--rig", stranger, "-o", tmp_path / "green.mcap")
+    assert "holds no calibration of camera green; it has those of: black, red, white" in done.err
+
+
+def test_a_name_without_an_ending_gets_it_and_that_is_said(
+    ipsys: Ipsys, tmp_path: Path, lab: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.chdir(tmp_path)
+    done = ipsys("record", "--rig", write_rig(tmp_path, played(lab)), "--seconds", "0.5", "-o", "monday")
+    assert "-o monday: the log is called monday.mcap" in done.err
+    assert "monday.mcap written" in done.out
+    done = ipsys("detect", "monday.mcap", "-o", "results.v2")
+    assert "the log is called results.v2.mcap" in done.err
+    assert ipsys("info", "monday.mcap", "results.v2.mcap").code == 0
+    assert not (tmp_path / "monday").exists()
+
+
+def test_aligning_now_says_what_is_kept(ipsys: Ipsys, tmp_path: Path, lab: Path) -> None:
+    rig = write_rig(tmp_path, played(lab))
+    done = ipsys("align", "--rig", rig, "--seconds", "1")
+    assert done.code == 0, done.err
+    assert "nothing is kept" in done.err
+    assert "now.mcap" not in done.out + done.err
+    kept = tmp_path / "kept.mcap"
+    done = ipsys("align", "--rig", rig, "--seconds", "1", "-o", kept)
+    assert f"results are in {kept}" in done.err
+    with Session([kept]) as session:
+        assert list(session.images) == ["red"]
+        assert {run.stage for run in session.runs()} == {"detect", "camera-frame"}
+
+
+def test_what_is_wrong_with_frames_just_taken_names_no_file_that_is_gone(
+    ipsys: Ipsys, tmp_path: Path, lab: Path
+) -> None:
+    rig = write_rig(tmp_path, played(lab))
+    done = ipsys("calibrate", "--rig", rig, "--board", "6x4", "--seconds", "1")
+    assert done.code == 1
+    assert "what the cameras sent" in done.err
+    assert "now.mcap" not in done.err
+
+
+def test_a_marker_that_is_not_in_the_rig_is_shown_with_what_to_do(
+    ipsys: Ipsys, tmp_path: Path, lab: Path
+) -> None:
+    with Session([lab]) as session:
+        (rig,) = session.payloads(["/rig"])
+    known = sorted(marker.id for marker in rig.markers)[1:]
+    markers = "".join(f"[[markers]]\nid = {n}\n" for n in known)
+    rig_file = write_rig(tmp_path, markers + played(lab))
+    done = ipsys("record", "--rig", rig_file, "--seconds", "2.5", "-o", tmp_path / "a.mcap")
+    said = (
+        "camera red: marker 0 is seen, but not in the rig; to track it, add to lab.toml: [[markers]] id = 0"
+    )
+    assert said in done.out
+    assert f"marker {known[0]} is seen" not in done.out
+
+
+@pytest.mark.parametrize(
+    "arguments", [("replay",), ("plan",), ("align",), ("latency",), ("calibrate", "--board", "6x4")]
+)
+def test_a_picture_of_no_kind_is_refused_before_any_work(
+    ipsys: Ipsys, lab: Path, arguments: tuple[str, ...]
+) -> None:
+    before = lab.read_bytes()
+    for name in ("floor.doc", "floor"):
+        done = ipsys(*arguments, lab, "--plot", lab.parent / name)
+        assert done.code == 1
+        assert "is no kind of picture; let its name end in .png, .pdf, .svg" in done.err
+    assert lab.read_bytes() == before
+    assert not (lab.parent / "floor").exists()
+
+
+def test_a_picture_is_what_its_name_says(ipsys: Ipsys, lab: Path) -> None:
+    begins = {"png": b"\x89PNG", "pdf": b"%PDF", "svg": b"<?xml", "jpg": b"\xff\xd8", "webp": b"RIFF"}
+    for kind, magic in begins.items():
+        drawn = [lab.parent / f"{number}.{kind}" for number in (1, 2)]
+        for path in drawn:
+            done = ipsys("replay", lab, "--model", "rigid", "--plot", path)
+            assert done.code == 0, done.err
+        assert drawn[0].read_bytes().startswith(magic)
+        assert drawn[0].read_bytes() == drawn[1].read_bytes()
+
+
+def test_info_keeps_each_channel_on_a_line_and_has_no_rates_of_events(
+    ipsys: Ipsys, tmp_path: Path, lab: Path, fitted: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """Of a log with three runs, in a window of 80 columns."""
+    monkeypatch.setenv("COLUMNS", "80")
+    monkeypatch.chdir(tmp_path)
+    for model in ("poly", "rigid"):
+        ipsys("replay", lab.name, "--model", model)
+    rows = ipsys("info", lab.name).out.splitlines()
+    assert max(map(len, rows)) <= 80
+    assert [row.strip() for row in rows if row.startswith("/runs/")] == [
+        "/runs/edges/",
+        "/runs/poly/",
+        "/runs/rigid/",
+    ]
+    for name in ("annotations", "camera_points", "markers"):
+        assert sum(row.startswith(f"  cameras/black/{name} ") for row in rows) == 1
+    found = json.loads(ipsys("info", lab.name, "--json").out)
+    rates = {topic: row["rate_hz"] for topic, row in found["channels"].items()}
+    assert rates["/cameras/red/image"] == pytest.approx(5.0)
+    # Of three cameras, each with two frames at a place: 5 steps in 0.22 s.
+    assert rates["/runs/poly/tracks"] == pytest.approx(22.5)
+    for topic in ("/measurements", "/rig", "/cameras/red/calibration", "/runs/poly/record"):
+        assert rates[topic] is None
+    assert found["cameras"]["red"]["lens"]["width"] == 960
+
+
+def test_the_help_lists_the_commands_in_the_order_of_a_first_day(ipsys: Ipsys) -> None:
+    out = ipsys("--help").out
+    panel = out[out.index("The first day, in this order") : out.index("How good it is")]
+    listed = [line.split()[1] for line in panel.splitlines()[1:] if line[2:3].isalpha()]
+    assert tuple(listed) == PANELS["The first day, in this order"]
+
+
+@pytest.mark.parametrize("command", EXAMPLES)
+def test_the_examples_of_the_help_are_commands(ipsys: Ipsys, command: str) -> None:
+    program = typer.main.get_group(app)
+    lines = EXAMPLES[command].strip().splitlines()
+    for line in lines:
+        assert len(line) <= 76
+        ipsys_, name, *arguments = shlex.split(line, comments=True)
+        assert (ipsys_, name) == ("ipsys", command)
+        parsed = program.commands[name]
+        parsed.make_context(name, arguments)
+    assert lines[0] in ipsys(command, "--help").out

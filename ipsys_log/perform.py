@@ -13,10 +13,12 @@ from ipsys_log.messages import (
     RIG_TOPIC,
     CameraCalibration,
     ChannelWritten,
+    CompressedVideo,
     Lens,
     Message,
     Rig,
     Run,
+    SkippedVideo,
     calibration_topic,
 )
 from ipsys_log.output import append_messages, append_run, record_message
@@ -124,8 +126,12 @@ def inputs(session: Session, task: Task, progress: Progress) -> Iterator[Message
     progress(task.stage, 0, total)
     skipped = skipped_frames(session) if task.as_live else set()
     for done, message in enumerate(session.messages(task.topics), 1):
-        if message.topic != EVENTS_TOPIC and message.log_time_ns not in skipped:
-            yield message
+        if message.log_time_ns not in skipped:
+            if message.topic != EVENTS_TOPIC:
+                yield message
+        elif isinstance(message.payload, CompressedVideo):
+            # Those after it need it. What live passed over up to a keyframe, makes no difference.
+            yield replace(message, payload=SkippedVideo(message.payload))
         progress(task.stage, done, total)
 
 

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import subprocess
+from dataclasses import replace
 from pathlib import Path
 
 import av
@@ -15,7 +16,7 @@ from ipsys_log.errors import FrameError
 from ipsys_log.messages import CompressedVideo, Event, Markers, Message, Rig
 from ipsys_log.sources.packets import pass_through
 from ipsys_log.stages.detect import Detect
-from ipsys_log.stages.detect.video import Video
+from ipsys_log.stages.detect.video import Video, decode_keyframe, is_keyframe
 from tests.sources.streams import encode, ffmpeg
 
 CODECS = {
@@ -100,3 +101,40 @@ def test_a_picture_that_needs_a_later_one_is_named(pictures: Path) -> None:
     events = [payload for payload in run(Detect("stock"), video) if isinstance(payload, Event)]
     assert events
     assert "turn off B-frames" in events[0].text
+
+
+@pytest.mark.parametrize("name", CODECS)
+def test_what_lies_before_a_keyframe_has_no_effect_even_on_a_damaged_one(pictures: Path, name: str) -> None:
+    """A live run that fell behind goes on with a keyframe; its replay has decoded all before that."""
+    video = frames(encode(pictures, "video.mp4", *CODECS[name]), name)
+    assert [n for n, frame in enumerate(video) if is_keyframe(frame)] == [0, 5, 10]
+    half = len(video[5].data) // 2
+    video[5] = replace(video[5], data=video[5].data[:half] + bytes(half))
+
+    def seen(decode: Video) -> list[bytes | str | None]:
+        found: list[bytes | str | None] = []
+        for frame in video[5:]:
+            try:
+                picture = decode(frame)
+                found.append(None if picture is None else picture.data)
+            except FrameError as error:
+                found.append(str(error))
+        return found
+
+    behind, before = Video(name), Video(name)
+    for frame in video[:5]:
+        before.pass_over(frame)
+    found = seen(behind)
+    assert found == seen(before)
+    assert isinstance(found[0], str)
+    assert isinstance(found[5], bytes)
+
+
+def test_a_keyframe_by_itself(pictures: Path) -> None:
+    video = frames(encode(pictures, "video.mp4", *CODECS["h264"]), "h264")
+    whole = Video("h264")
+    fifth = [whole(frame) for frame in video[:6]][-1]
+    assert fifth is not None
+    assert decode_keyframe(video[5]).data == fifth.data
+    with pytest.raises(FrameError, match="are no keyframe"):
+        decode_keyframe(video[6])

@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+import re
+from contextlib import suppress
 from typing import TYPE_CHECKING
 
 from ipsys_log.errors import FrameError
@@ -9,15 +11,19 @@ from ipsys_log.messages import CompressedVideo, RawImage
 
 if TYPE_CHECKING:
     from av.video.codeccontext import VideoCodecContext
+    from av.video.frame import VideoFrame
 
-__all__ = ["VIDEO_FORMATS", "Video"]
+__all__ = ["VIDEO_FORMATS", "Video", "decode_keyframe", "is_keyframe"]
 
 # As the log names them, and FFmpeg.
 VIDEO_FORMATS = {"h264": "h264", "h265": "hevc"}
+# The head of a unit of Annex B: the start code, and the byte that holds its type.
+_UNIT = re.compile(rb"\x00\x00\x01(.)", re.DOTALL)
 
 
 class Video:
-    """Decodes the video of one camera, message by message: each picture needs those before it.
+    """Decodes the video of one camera, message by message: each picture needs those before it, up to the
+    last keyframe. What came before that has no effect, damage neither.
 
     Parameters
     ----------
@@ -46,7 +52,7 @@ class Video:
         import av
 
         try:
-            pictures = self._decoder.decode(av.Packet(frame.data))
+            pictures = self._decode(frame)
         except av.error.FFmpegError as error:
             if not self._begun:
                 return None
@@ -63,6 +69,52 @@ class Video:
         plane = pictures[-1].reformat(format="gray").planes[0]
         size = pictures[-1].width, pictures[-1].height
         return RawImage(frame.timestamp, frame.frame_id, *size, "mono8", plane.line_size, bytes(plane))
+
+    def pass_over(self, frame: CompressedVideo) -> None:
+        """Decode a message only for those after it; damage is not named."""
+        import av
+
+        with suppress(av.error.FFmpegError):
+            self._begun = bool(self._decode(frame)) or self._begun
+
+    def _decode(self, frame: CompressedVideo) -> list[VideoFrame]:
+        import av
+
+        if is_keyframe(frame):
+            self._decoder.flush_buffers()
+            self._begun = True
+        return self._decoder.decode(av.Packet(frame.data))
+
+
+def is_keyframe(frame: CompressedVideo) -> bool:
+    """Whether a frame needs none before it.
+
+    Examples
+    --------
+    >>> is_keyframe(CompressedVideo(0, "red", bytes.fromhex("00000001 65 88"), "h264"))
+    True
+    """
+    wide = frame.format == "h265"
+    for match in _UNIT.finditer(frame.data):
+        kind = match[1][0] >> 1 & 0x3F if wide else match[1][0] & 0x1F
+        # Pieces of pictures: of H.264 1 to 5, of H.265 0 to 31, 16 to 23 of those that a reader can begin at.
+        if kind < 32 if wide else 1 <= kind <= 5:
+            return 16 <= kind <= 23 if wide else kind == 5
+    return False
+
+
+def decode_keyframe(frame: CompressedVideo) -> RawImage:
+    """The picture in a keyframe, in grey.
+
+    Raises
+    ------
+    FrameError
+        Where it is none, or damaged.
+    """
+    picture = Video(frame.format)(frame)
+    if picture is None:
+        raise FrameError(f"{len(frame.data)} bytes of {frame.format} that are no keyframe")
+    return picture
 
 
 def _open(codec: str) -> VideoCodecContext:

@@ -70,13 +70,13 @@ def slow_search(patch: pytest.MonkeyPatch) -> None:
 
 def slow_decoding(patch: pytest.MonkeyPatch) -> None:
     """A machine that does not even decode in time."""
-    step = Video._decode
+    step = Video._next
 
     def slower(self: Video, frame: CompressedVideo) -> Any:
         time.sleep(0.1)
         return step(self, frame)
 
-    patch.setattr(Video, "_decode", slower)
+    patch.setattr(Video, "_next", slower)
 
 
 @pytest.mark.parametrize(

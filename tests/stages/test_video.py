@@ -13,7 +13,7 @@ import pytest
 from numpy.typing import NDArray
 
 from ipsys_log.errors import FrameError
-from ipsys_log.messages import CompressedVideo, Event, Markers, Message, Rig
+from ipsys_log.messages import CompressedVideo, Event, Markers, Message, RawImage, Rig
 from ipsys_log.sources.packets import pass_through
 from ipsys_log.stages.detect import Detect
 from ipsys_log.stages.detect.video import Video, decode_keyframe, is_keyframe
@@ -46,6 +46,14 @@ def decoded_by_ffmpeg(video: Path) -> NDArray[np.uint8]:
     command = [ffmpeg(), "-v", "error", "-i", str(video), "-f", "rawvideo", "-pix_fmt", "yuv420p", "-"]
     raw = subprocess.run(command, check=True, capture_output=True).stdout
     return np.frombuffer(raw, np.uint8).reshape(-1, 240 * 330 * 3 // 2)[:, : 240 * 330].reshape(-1, 240, 330)
+
+
+def pixels(picture: RawImage | None) -> bytes | None:
+    """Without the padding of the rows."""
+    if picture is None:
+        return None
+    rows = np.frombuffer(picture.data, np.uint8).reshape(picture.height, picture.step)
+    return rows[:, : picture.width].tobytes()
 
 
 @pytest.mark.parametrize("name", CODECS)
@@ -108,15 +116,13 @@ def test_what_lies_before_a_keyframe_has_no_effect_even_on_a_damaged_one(picture
     """A live run that fell behind goes on with a keyframe; its replay has decoded all before that."""
     video = frames(encode(pictures, "video.mp4", *CODECS[name]), name)
     assert [n for n, frame in enumerate(video) if is_keyframe(frame)] == [0, 5, 10]
-    half = len(video[5].data) // 2
-    video[5] = replace(video[5], data=video[5].data[:half] + bytes(half))
+    video[5] = replace(video[5], data=video[5].data[:-200] + bytes(200))
 
     def seen(decode: Video) -> list[bytes | str | None]:
         found: list[bytes | str | None] = []
         for frame in video[5:]:
             try:
-                picture = decode(frame)
-                found.append(None if picture is None else picture.data)
+                found.append(pixels(decode(frame)))
             except FrameError as error:
                 found.append(str(error))
         return found
@@ -126,15 +132,12 @@ def test_what_lies_before_a_keyframe_has_no_effect_even_on_a_damaged_one(picture
         before.pass_over(frame)
     found = seen(behind)
     assert found == seen(before)
-    assert isinstance(found[0], str)
-    assert isinstance(found[5], bytes)
+    assert [type(one) for one in found] == [*[str] * 5, *[bytes] * 2]
 
 
 def test_a_keyframe_by_itself(pictures: Path) -> None:
     video = frames(encode(pictures, "video.mp4", *CODECS["h264"]), "h264")
     whole = Video("h264")
-    fifth = [whole(frame) for frame in video[:6]][-1]
-    assert fifth is not None
-    assert decode_keyframe(video[5]).data == fifth.data
+    assert pixels(decode_keyframe(video[5])) == [pixels(whole(frame)) for frame in video[:6]][-1]
     with pytest.raises(FrameError, match="are no keyframe"):
         decode_keyframe(video[6])

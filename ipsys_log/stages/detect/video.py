@@ -39,7 +39,8 @@ class Video:
         if format not in VIDEO_FORMATS:
             raise FrameError(f"video format {format!r} is not read (only {', '.join(VIDEO_FORMATS)})")
         self._decoder = _open(VIDEO_FORMATS[format])
-        self._begun = False
+        self._begun = self._keyed = False
+        self._fault: str | None = None
 
     def __call__(self, frame: CompressedVideo) -> RawImage | None:
         """The picture of a message, in grey; None before the first keyframe.
@@ -47,12 +48,40 @@ class Video:
         Raises
         ------
         FrameError
-            Where the data is damaged, or the picture comes only with later messages.
+            Where the data is damaged, or that of a frame since the last keyframe was, or the picture comes
+            only with later messages.
         """
+        picture = self._decode(frame)
+        if picture is None:
+            return None
+        plane = picture.reformat(format="gray").planes[0]
+        size = picture.width, picture.height
+        return RawImage(frame.timestamp, frame.frame_id, *size, "mono8", plane.line_size, bytes(plane))
+
+    def pass_over(self, frame: CompressedVideo) -> None:
+        """Decode a message only for those after it; damage is not named."""
+        with suppress(FrameError):
+            self._decode(frame)
+
+    def _decode(self, frame: CompressedVideo) -> VideoFrame | None:
+        if is_keyframe(frame):
+            self._decoder.flush_buffers()
+            self._begun = self._keyed = True
+            self._fault = None
+        elif self._keyed and self._fault is not None:
+            # What a decoder puts into the holes is left over from anywhere: no two runs would agree.
+            raise FrameError(f"needs a frame before it that gave no picture ({self._fault})")
+        try:
+            return self._next(frame)
+        except FrameError as error:
+            self._fault = str(error)
+            raise
+
+    def _next(self, frame: CompressedVideo) -> VideoFrame | None:
         import av
 
         try:
-            pictures = self._decode(frame)
+            pictures = self._decoder.decode(av.Packet(frame.data))
         except av.error.FFmpegError as error:
             if not self._begun:
                 return None
@@ -66,24 +95,7 @@ class Video:
         if not pictures or pictures[-1].is_corrupt:
             raise FrameError(f"{len(frame.data)} bytes of {frame.format} that are no whole picture")
         self._begun = True
-        plane = pictures[-1].reformat(format="gray").planes[0]
-        size = pictures[-1].width, pictures[-1].height
-        return RawImage(frame.timestamp, frame.frame_id, *size, "mono8", plane.line_size, bytes(plane))
-
-    def pass_over(self, frame: CompressedVideo) -> None:
-        """Decode a message only for those after it; damage is not named."""
-        import av
-
-        with suppress(av.error.FFmpegError):
-            self._begun = bool(self._decode(frame)) or self._begun
-
-    def _decode(self, frame: CompressedVideo) -> list[VideoFrame]:
-        import av
-
-        if is_keyframe(frame):
-            self._decoder.flush_buffers()
-            self._begun = True
-        return self._decoder.decode(av.Packet(frame.data))
+        return pictures[-1]
 
 
 def is_keyframe(frame: CompressedVideo) -> bool:

@@ -15,7 +15,7 @@ from rich.text import Text
 
 from ipsys_log.compare import Comparison
 from ipsys_log.latency import Percentiles
-from ipsys_log.messages import CompressedImage, Message, Track, Tracks
+from ipsys_log.messages import CompressedImage, CompressedVideo, Message, Track, Tracks
 from ipsys_log.monitor import Look, Monitor
 from ipsys_log.sources.attached import CameraState
 from ipsys_log.units import CM_PER_M, NS_PER_S, format_bytes
@@ -60,7 +60,7 @@ class LiveStatus:
         self._monitor(message)
         if message is None:
             return
-        if isinstance(message.payload, CompressedImage):
+        if isinstance(message.payload, (CompressedImage, CompressedVideo)):
             delay_ns = message.log_time_ns - message.publish_time_ns
             if delay_ns > 0:  # without capture stamps it is not known
                 self._delays_s[str(message.camera)] = delay_ns / NS_PER_S

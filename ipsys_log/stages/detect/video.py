@@ -65,7 +65,6 @@ class Video:
 
     def _decode(self, frame: CompressedVideo) -> VideoFrame | None:
         if is_keyframe(frame):
-            self._decoder.flush_buffers()
             self._begun = self._keyed = True
             self._fault = None
         elif self._keyed and self._fault is not None:

@@ -7,19 +7,24 @@ from collections import deque
 from collections.abc import Callable, Sequence
 from typing import Any
 
-from ipsys_log.errors import IpsysError
+import simplejpeg
+
+from ipsys_log.errors import FrameError, IpsysError
 from ipsys_log.measuring.entry import check_references
 from ipsys_log.measuring.scene import Stop, View
 from ipsys_log.messages import (
     MEASUREMENTS_TOPIC,
     CameraPoints,
     CompressedImage,
+    CompressedVideo,
     Markers,
     Measurement,
     Message,
     Model,
     Rig,
 )
+from ipsys_log.stages.detect import decode_grey
+from ipsys_log.stages.detect.video import decode_keyframe, is_keyframe
 from ipsys_log.units import NS_PER_S
 
 __all__ = ["LiveScene"]
@@ -51,7 +56,9 @@ class LiveScene:
         self._add = add
         self._lock = threading.Lock()
         self._images: dict[str, deque[Message]] = {camera: deque(maxlen=60) for camera in cameras}
-        self._markers: dict[str, Message] = {}
+        # The last picture with its markers. Frames that were skipped have none.
+        self._marked: dict[str, tuple[Message, Markers]] = {}
+        self._decoded: dict[str, tuple[int, bytes | None]] = {}
         self._points: dict[str, deque[CameraPoints]] = {camera: deque() for camera in cameras}
         self._history: list[Measurement] = []
         self._ended = False
@@ -62,10 +69,15 @@ class LiveScene:
             return
         payload, camera = message.payload, message.camera
         with self._lock:
-            if isinstance(payload, CompressedImage):
+            # Of a video keyframes are shown, which need no others.
+            if isinstance(payload, CompressedImage) or (
+                isinstance(payload, CompressedVideo) and is_keyframe(payload)
+            ):
                 self._images[camera].append(message)
             elif isinstance(payload, Markers):
-                self._markers[camera] = message
+                for image in self._images[camera]:
+                    if image.publish_time_ns == message.publish_time_ns:
+                        self._marked[camera] = image, payload
             elif isinstance(payload, CameraPoints):
                 points = self._points[camera]
                 points.append(payload)
@@ -99,17 +111,20 @@ class LiveScene:
         self._ended = True
 
     def _view(self, camera: str) -> View:
-        marked = self._markers.get(camera)
-        if marked is None:
+        if camera not in self._marked:
             return View(camera, 0)
-        # Frames that were skipped have no markers; a picture is shown with its own.
-        picture = next(
-            (
-                one.payload.data
-                for one in self._images[camera]
-                if one.publish_time_ns == marked.publish_time_ns
-            ),
-            None,
-        )
-        points = tuple(self._points[camera])
-        return View(camera, marked.publish_time_ns, picture, marked.payload, points)
+        image, markers = self._marked[camera]
+        time_ns, points = image.publish_time_ns, tuple(self._points[camera])
+        return View(camera, time_ns, self._jpeg(camera, image), markers, points)
+
+    def _jpeg(self, camera: str, image: Message) -> bytes | None:
+        if isinstance(image.payload, CompressedImage):
+            return image.payload.data
+        if self._decoded.get(camera, (0, None))[0] != image.publish_time_ns:
+            try:
+                grey = decode_grey(decode_keyframe(image.payload))
+                jpeg = simplejpeg.encode_jpeg(grey[..., None], colorspace="GRAY")
+            except FrameError:
+                jpeg = None
+            self._decoded[camera] = image.publish_time_ns, jpeg
+        return self._decoded[camera][1]

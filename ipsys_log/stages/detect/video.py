@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import re
+from collections.abc import Iterable
 from contextlib import suppress
 from typing import TYPE_CHECKING
 
@@ -13,7 +14,7 @@ if TYPE_CHECKING:
     from av.video.codeccontext import VideoCodecContext
     from av.video.frame import VideoFrame
 
-__all__ = ["VIDEO_FORMATS", "Video", "decode_keyframe", "is_keyframe"]
+__all__ = ["VIDEO_FORMATS", "Video", "decode_keyframe", "decode_last", "is_keyframe"]
 
 # As the log names them, and FFmpeg.
 VIDEO_FORMATS = {"h264": "h264", "h265": "hevc"}
@@ -126,6 +127,30 @@ def decode_keyframe(frame: CompressedVideo) -> RawImage:
     if picture is None:
         raise FrameError(f"{len(frame.data)} bytes of {frame.format} that are no keyframe")
     return picture
+
+
+def decode_last(backwards: Iterable[CompressedVideo]) -> RawImage | None:
+    """The picture in a frame, in grey, whatever that needs; None where there is no keyframe before it.
+
+    Parameters
+    ----------
+    backwards : this frame, the one before it, and so on; taken up to the first keyframe.
+
+    Raises
+    ------
+    FrameError
+        Where it is damaged, or one that it needs.
+    """
+    needed: list[CompressedVideo] = []
+    for frame in backwards:
+        needed.append(frame)
+        if is_keyframe(frame):
+            break
+    last, *before = needed
+    video = Video(last.format)
+    for frame in reversed(before):
+        video.pass_over(frame)
+    return video(last)
 
 
 def _open(codec: str) -> VideoCodecContext:

@@ -14,6 +14,7 @@ import cv2
 import numpy as np
 import pytest
 
+from ipsys_log.calibration.pictures import find_sources
 from ipsys_log.formats.opencv_yaml import read_opencv_calibration
 from ipsys_log.log.session import Session
 from ipsys_log.messages import CompressedImage, CompressedVideo, Message, image_topic
@@ -262,7 +263,7 @@ def test_videos_of_a_charuco_board(ipsys: Ipsys, data: Path, tmp_path: Path, cam
 @pytest.mark.parametrize("codec", [("-c:v", "libx264", "-g", "5"), ("-c:v", "libx265", "-x265-params",
                                    "keyint=5:bframes=0:log-level=none")])  # fmt: skip
 def test_a_recorded_video_gives_the_lens_of_its_pictures(
-    ipsys: Ipsys, red: Path, tmp_path: Path, codec: tuple[str, ...]
+    ipsys: Ipsys, red: Path, tmp_path: Path, codec: tuple[str, ...], monkeypatch: pytest.MonkeyPatch
 ) -> None:
     """The pictures are those that FFmpeg decodes; the log holds the packets, most of them no keyframes."""
     video, log, pictures = tmp_path / "red.mp4", tmp_path / "lab.mcap", tmp_path / "decoded"
@@ -279,8 +280,18 @@ def test_a_recorded_video_gives_the_lens_of_its_pictures(
                          "--force", "--json")  # fmt: skip
         assert done.code == 0
         (one,) = json.loads(done.out)
-        assert one["seen"] == 12
+        assert one["pictures"]["seen"] == 12
         lens = read_opencv_calibration(tmp_path / "x.yaml", "red")
-        lenses.append([lens.K[0], lens.K[4], lens.K[2], lens.K[5]])
+        lenses.append(lens.K)
     # What is lost between the two is rounding of grey levels.
     assert np.abs(np.subtract(*lenses)).max() < 0.05
+    # Of a long one not each is looked at; those that are need the others.
+    monkeypatch.setattr("ipsys_log.calibration.pictures.MOST_LOOKED_AT", 4)
+    (some,) = find_sources([log], [])
+    looked_at = [grey for _, grey in some.read()]
+    assert len(looked_at) == 4
+    for number, grey in enumerate(looked_at):
+        whole = cv2.imread(str(pictures / f"{3 * number + 1}.png"), cv2.IMREAD_GRAYSCALE)
+        assert whole is not None
+        assert grey is not None
+        assert np.abs(grey.astype(float) - whole).mean() < 1.5

@@ -24,6 +24,7 @@ from ipsys_log.messages import (
 from ipsys_log.output import append_messages, append_run, record_message
 from ipsys_log.remarks import Remarks
 from ipsys_log.request import Progress, Request
+from ipsys_log.rig import hide_passwords
 from ipsys_log.runs import Outcome, check_run_name, find_run, fingerprint, free_name, read_channels
 from ipsys_log.tasks import Task, plan_stage
 
@@ -105,7 +106,7 @@ def record_of(session: Session, task: Task) -> Run:
         run="",
         stage=task.stage,
         parameters=dict(task.parameters),
-        rig=task.rig,
+        rig=task.rig and hide_passwords(task.rig),
         lenses=lenses,
         input_runs=tuple(sorted(input_runs)),
         inputs=(*read_channels(session, task.topics), *task.foreign),

@@ -24,6 +24,7 @@ from ipsys_log.messages import (
     RigCamera,
     image_topic,
 )
+from ipsys_log.rig import hide_password
 from ipsys_log.sources.frames import Clock, Frame, Open, Say, SourceError, instant_ns
 from ipsys_log.sources.videos import frame_payload
 from ipsys_log.units import NS_PER_S
@@ -196,7 +197,8 @@ class Attached:
             raise state.failure
         if not begun:
             raise SourceError(
-                f"camera {camera.name}: {camera.source} sends no frames; look whether another program uses it"
+                f"camera {camera.name}: {hide_password(camera.source or '')} sends no frames; look whether "
+                "another program uses it"
             )
 
     # --- the threads ----------------------------------------------------------------------------

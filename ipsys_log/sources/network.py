@@ -12,9 +12,10 @@ from contextlib import contextmanager, suppress
 from queue import Empty, Full, Queue
 from threading import Event, Thread
 from typing import TYPE_CHECKING
-from urllib.parse import urlsplit, urlunsplit
+from urllib.parse import urlsplit
 
 from ipsys_log.messages import RigCamera
+from ipsys_log.rig import hide_password
 from ipsys_log.sources.asked import Given, say_refused
 from ipsys_log.sources.frames import Clock, Frame, Say, SourceError
 from ipsys_log.sources.packets import find_video, name_format, pass_through
@@ -23,7 +24,7 @@ from ipsys_log.sources.stamps import Stamps
 if TYPE_CHECKING:
     from av.container import InputContainer
 
-__all__ = ["hide_password", "open_network"]
+__all__ = ["open_network"]
 
 # A stream that is silent for so long has gone.
 _SILENT_S = 5.0
@@ -161,18 +162,3 @@ def _explain(error: Exception) -> str:
         if isinstance(error, kind):
             return text
     return f"cannot be read ({getattr(error, 'strerror', None) or error}); try the address in another player"
-
-
-def hide_password(address: str) -> str:
-    """An address as it may be shown.
-
-    Examples
-    --------
-    >>> hide_password("rtsp://admin:secret@10.0.0.7:554/live")
-    'rtsp://admin:***@10.0.0.7:554/live'
-    """
-    parts = urlsplit(address)
-    user, at, host = parts.netloc.rpartition("@")
-    if ":" not in user:
-        return address
-    return urlunsplit(parts._replace(netloc=f"{user.partition(':')[0]}:***{at}{host}"))

@@ -39,7 +39,8 @@ def decoded(log: Path, camera: str) -> dict[int, Grey]:
     """The pictures of a camera by their time: all packets through FFmpeg, in one go."""
     with Session([log]) as session:
         frames = list(session.messages([session.images[camera]]))
-    with av.open(BytesIO(b"".join(one.payload.data for one in frames)), format="h264") as container:
+    whole = BytesIO(b"".join(one.payload.data for one in frames))
+    with av.open(whole, "r", format="h264") as container:
         pictures = [cv2.cvtColor(one.to_ndarray(format="bgr24"), cv2.COLOR_BGR2GRAY)
                     for one in container.decode(video=0)]  # fmt: skip
     return dict(zip((one.publish_time_ns for one in frames), pictures, strict=True))  # type: ignore[arg-type]

@@ -151,7 +151,7 @@ def _explain(error: Exception) -> str:
     known = {
         av.error.ConnectionRefusedError: "refuses the connection; is the camera on, and the port right?",
         av.error.HTTPNotFoundError: "the camera has no such path; look it up in the camera's manual",
-        av.error.HTTPUnauthorizedError: "asks for a password, or another; write user:password@ before the host",
+        av.error.HTTPUnauthorizedError: "asks for a password, or another; put user:password@ before the host",
         av.error.HTTPForbiddenError: "the camera forbids it; give the user the right to see the stream",
         av.error.InvalidDataError: "is not video; give the address of the stream, not of a web page",
         av.error.ExitError: f"nothing came for {_SILENT_S:g} s; is the camera on, and the network up?",

@@ -63,9 +63,8 @@ def open_v4l2(camera: RigCamera, clock: Clock, say: Say) -> Iterator[Iterator[Fr
             given, layout = _set_up(device, camera, where)
             say_refused(camera, given, say)
             if layout is not None:
-                say(
-                    f"camera {camera.name}: gives no MJPG; its {layout.format} pictures are encoded as JPEG once"
-                )
+                what = f"its {layout.format} pictures are encoded as JPEG once"
+                say(f"camera {camera.name}: gives no MJPG; {what}")
             buffers = _map_buffers(device, stack)
             v4l2.call(device, v4l2.STREAMON, v4l2.Int(v4l2.VIDEO_CAPTURE))
             stack.callback(_stop, device)

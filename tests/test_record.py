@@ -258,6 +258,10 @@ def test_a_calibration_of_another_shape_is_refused_and_of_another_size_is_scaled
     with streams(pictures[0], tmp_path) as rig:
         done = ipsys(*once, tmp_path / "b.mcap", "--calibration", f"red={lens(640, 480)}")
         assert "camera red: its calibration is scaled from 640 to 320 px" in done.err
+    video = encode(pictures[0].parent, "red.mp4", "-c:v", "libx264", "-bf", "0", "-pix_fmt", "yuv420p")
+    rig.write_text(re.sub(r"http://\S+/red", f"file:{video}", rig.read_text()))
+    done = ipsys(*once, tmp_path / "c.mcap", "--calibration", f"red={lens(640, 400)}")
+    assert "sends 320 x 240 px, its calibration is for 640 x 400, of another shape" in done.err
     with Session([tmp_path / "b.mcap"]) as session:
         (held,) = session.payloads([session.calibrations["red"]])
     assert (held.width, held.height, held.K[0, 0], held.K[0, 2]) == (320, 240, 150.0, 159.5)

@@ -15,8 +15,6 @@ from functools import partial
 from types import TracebackType
 from typing import Any, NamedTuple
 
-import simplejpeg
-
 from ipsys_log.messages import (
     EVENTS_TOPIC,
     Event,
@@ -26,6 +24,7 @@ from ipsys_log.messages import (
 )
 from ipsys_log.rig import hide_password
 from ipsys_log.sources.frames import Clock, Frame, Open, Say, SourceError, instant_ns
+from ipsys_log.sources.packets import find_size
 from ipsys_log.sources.videos import frame_payload
 from ipsys_log.units import NS_PER_S
 
@@ -42,8 +41,8 @@ _RETRY_S, _LONGEST_RETRY_S = 0.5, 8.0
 
 @dataclass(slots=True)
 class CameraState:
-    """What has come of a camera so far: ``size_px`` is the width and height of its frames, where they are
-    JPEGs; ``dropped`` frames never reached the log."""
+    """What has come of a camera so far: ``size_px`` is the width and height of its frames, as soon as one
+    tells; ``dropped`` frames never reached the log."""
 
     frames: int = 0
     bytes: int = 0
@@ -256,10 +255,8 @@ class Attached:
             state.lost_ns = None
             self._say("camera_back", f"camera {camera.name} is back after {gone_s:.1f} s", camera)
         state.up = True
-        if state.size_px is None and frame.format == "jpeg":
-            with suppress(ValueError, KeyError):  # a damaged frame says nothing
-                height, width, *_ = simplejpeg.decode_jpeg_header(frame.data, strict=False)
-                state.size_px = width, height
+        if state.size_px is None:
+            state.size_px = find_size(frame)
         with self._arrived:
             if self._waiting_bytes + len(frame.data) > self._limit_bytes:
                 state.dropped += 1

@@ -5,6 +5,9 @@ from __future__ import annotations
 import shutil
 import subprocess
 import sys
+import time
+from collections.abc import Callable
+from dataclasses import replace
 from io import BytesIO
 from pathlib import Path
 from typing import Any
@@ -24,6 +27,7 @@ from ipsys_log.messages import CompressedVideo, Markers, Message, Tracks
 from ipsys_log.monitor import Monitor
 from ipsys_log.request import Request
 from ipsys_log.sinks.rerun import write_recording
+from ipsys_log.sinks.rerun_live import LiveView, Write
 from ipsys_log.stages.detect.video import is_keyframe
 
 Grey = NDArray[np.uint8]
@@ -137,16 +141,48 @@ def test_the_monitor_looks_at_keyframes(video: Path, monkeypatch: pytest.MonkeyP
     assert look.warnings == ()
 
 
+def samples(path: Path) -> list[bytes]:
+    """The frames of the red camera in a recording of Rerun's, in their order."""
+    found: list[tuple[int, Any]] = []
+    for chunk in RrdReader(path).stream().to_chunks():
+        batch = chunk.to_record_batch()
+        if chunk.entity_path == "/cameras/red/image" and "VideoStream:sample" in batch.schema.names:
+            times = batch.column("log_time").cast("int64").to_pylist()
+            found += zip(times, batch.column("VideoStream:sample").to_pylist(), strict=True)
+    return [bytes(data[0]) for _, data in sorted(found)]
+
+
 def test_rerun_gets_the_bytes_of_the_video(video: Path) -> None:
     path = video.with_suffix(".rrd")
     with Session([video]) as session:
         write_recording(session, save=path)
         sent = [message.payload.data for message in session.messages([session.images["red"]])]
     subprocess.run([sys.executable, "-m", "rerun", "rrd", "verify", str(path)], check=True)
-    got: list[tuple[int, Any]] = []
-    for chunk in RrdReader(path).stream().to_chunks():
-        batch = chunk.to_record_batch()
-        if chunk.entity_path == "/cameras/red/image" and "VideoStream:sample" in batch.schema.names:
-            times = batch.column("log_time").cast("int64").to_pylist()
-            got += zip(times, batch.column("VideoStream:sample").to_pylist(), strict=True)
-    assert [bytes(data[0]) for _, data in sorted(got)] == sent
+    assert samples(path) == sent
+
+
+def test_a_live_viewer_that_was_too_slow_goes_on_with_a_keyframe(video: Path, tmp_path: Path) -> None:
+    def show(feed: Callable[[Write], None]) -> None:
+        with (tmp_path / "live.rrd").open("wb") as file:
+            feed(file.write)
+
+    with Session([video]) as session:
+        (rig,) = session.payloads(["/rig"])
+        once = list(session.messages([session.images["red"]]))
+    # Some of it waits for nobody; then it goes on between two keyframes.
+    before = [*(once * 6), *once[:5]]
+    came = [*before, *once[5:]]
+    frames = [replace(one, log_time_ns=n, publish_time_ns=n) for n, one in enumerate(came, 10**18)]
+    view = LiveView(rig, ["red"], None, print, show)
+    for frame in frames[: len(before)]:
+        view(frame)
+    with view:
+        until = time.monotonic() + 20
+        while not view._waiting.empty() and time.monotonic() < until:
+            time.sleep(0.05)
+        for frame in frames[len(before) :]:
+            view(frame)
+    whole = tmp_path / "whole.rrd"
+    merge = [sys.executable, "-m", "rerun", "rrd", "merge", str(tmp_path / "live.rrd"), "-o", str(whole)]
+    subprocess.run(merge, check=True, capture_output=True)
+    assert samples(whole) == [one.payload.data for one in (*frames[:100], *once[10:])]

@@ -97,8 +97,8 @@ def _with_video(session: Session, folder: Path) -> Iterator[Message]:
 def _as_video(session: Session, topic: str, folder: Path) -> list[bytes]:
     for number, frame in enumerate(session.payloads([topic])):
         (folder / f"{number:03}.jpg").write_bytes(frame.data)
-    path = encode(folder, "video.mp4", "-c:v", "libx264", "-crf", "16", "-bf", "0", "-g", "10", "-sc_threshold", "0",
-                  "-pix_fmt", "yuv420p")  # fmt: skip
+    options = "-c:v libx264 -crf 16 -bf 0 -g 10 -sc_threshold 0 -pix_fmt yuv420p"
+    path = encode(folder, "video.mp4", *options.split())
     with open_video(path, print) as frames:
         return [frame.data for frame in frames]
 

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import shutil
 import subprocess
 from dataclasses import replace
 from pathlib import Path
@@ -141,3 +142,34 @@ def test_a_keyframe_by_itself(pictures: Path) -> None:
     assert pixels(decode_keyframe(video[5])) == [pixels(whole(frame)) for frame in video[:6]][-1]
     with pytest.raises(FrameError, match="are no keyframe"):
         decode_keyframe(video[6])
+
+
+BASELINE = ("-profile:v", "baseline", "-refs", "1")
+HIGH = ("-profile:v", "high", "-refs", "4", "-x264-params", "keyint=40:scenecut=0:slices=3:bframes=0")
+H265 = ("-c:v", "libx265", "-x265-params", "bframes=0:keyint=40:scenecut=0:log-level=none")
+FULL = ("-profile:v", "high444", "-pix_fmt", "yuv444p", "-crf", "0")
+
+
+@pytest.mark.parametrize("options", [BASELINE, HIGH, FULL, H265])
+def test_a_frame_that_is_lost_is_not_guessed(pictures: Path, options: tuple[str, ...]) -> None:
+    """Over UDP some are; FFmpeg would fill in the one before."""
+    name = "h265" if "libx265" in options else "h264"
+    for number in range(12, 60):  # more than frames are numbered with, 16 at the least
+        shutil.copy(pictures / f"{number % 12:03}.jpg", pictures / f"{number:03}.jpg")
+    video = frames(
+        encode(pictures, "video.mp4", *CODECS["h264"], *options, "-g", "40", "-sc_threshold", "0"), name
+    )
+    whole = Video(name)
+    true = [pixels(whole(frame)) for frame in video]
+    assert len(true) == 60
+    assert None not in true
+    for lost in (1, 20, 39, 41):
+        decode = Video(name)
+        for n, frame in enumerate(video):
+            if n == lost:
+                continue
+            if lost < n < 40 * (lost // 40 + 1):
+                with pytest.raises(FrameError):
+                    decode(frame)
+            else:
+                assert pixels(decode(frame)) == true[n]

@@ -9,6 +9,7 @@ from typing import TYPE_CHECKING
 
 from ipsys_log.errors import FrameError
 from ipsys_log.messages import CompressedVideo, RawImage
+from ipsys_log.stages.detect.frame_numbers import FrameNumbers
 
 if TYPE_CHECKING:
     from av.video.codeccontext import VideoCodecContext
@@ -42,6 +43,7 @@ class Video:
         self._decoder = _open(VIDEO_FORMATS[format])
         self._begun = self._keyed = False
         self._fault: str | None = None
+        self._misses = FrameNumbers() if format == "h264" else lambda data: False
 
     def __call__(self, frame: CompressedVideo) -> RawImage | None:
         """The picture of a message, in grey; None before the first keyframe.
@@ -65,6 +67,7 @@ class Video:
             self._decode(frame)
 
     def _decode(self, frame: CompressedVideo) -> VideoFrame | None:
+        missing = self._misses(frame.data)
         if is_keyframe(frame):
             self._begun = self._keyed = True
             self._fault = None
@@ -72,6 +75,8 @@ class Video:
             # What a decoder puts into the holes is left over from anywhere: no two runs would agree.
             raise FrameError(f"needs a frame before it that gave no picture ({self._fault})")
         try:
+            if missing:
+                raise FrameError("a frame before it is missing")
             return self._next(frame)
         except FrameError as error:
             self._fault = str(error)

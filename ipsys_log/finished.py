@@ -5,6 +5,7 @@ from __future__ import annotations
 from collections.abc import Iterator, Mapping, Sequence
 from contextlib import contextmanager
 from pathlib import Path
+from typing import Any
 
 import cv2
 import numpy as np
@@ -19,6 +20,7 @@ from ipsys_log.messages import (
     MEASUREMENTS_TOPIC,
     CameraPoints,
     CompressedImage,
+    CompressedVideo,
     Markers,
     Measurement,
     Message,
@@ -31,6 +33,7 @@ from ipsys_log.pipeline import replay
 from ipsys_log.request import Progress, Request
 from ipsys_log.runs import newest_run
 from ipsys_log.stages.detect import decode_grey
+from ipsys_log.stages.detect.video import decode_last
 from ipsys_log.units import NS_PER_S
 
 __all__ = ["FinishedLog", "opened_log", "rigs_of"]
@@ -170,13 +173,19 @@ class FinishedLog:
             return None
         times_ns = np.concatenate([r.times(topic) for r in self._session.readers if topic in r.channels])
         nearest_ns = int(times_ns[np.abs(times_ns - log_time_ns).argmin()])
-        frame = next(self._session.messages([topic], nearest_ns, nearest_ns + 1)).payload
+        frame = self._frame(topic, nearest_ns)
         if isinstance(frame, CompressedImage) and frame.data[:2] == b"\xff\xd8":
             return frame.data
         try:
-            return cv2.imencode(".jpg", decode_grey(frame))[1].tobytes()
+            if isinstance(frame, CompressedVideo):
+                before = times_ns[times_ns <= nearest_ns][::-1].tolist()
+                frame = decode_last(self._frame(topic, time_ns) for time_ns in before)
+            return None if frame is None else cv2.imencode(".jpg", decode_grey(frame))[1].tobytes()
         except FrameError:
             return None
+
+    def _frame(self, topic: str, log_time_ns: int) -> Any:
+        return next(self._session.messages([topic], log_time_ns, log_time_ns + 1)).payload
 
 
 def rigs_of(session: Session, request: Request) -> list[Rig]:

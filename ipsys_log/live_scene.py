@@ -7,13 +7,16 @@ from collections import deque
 from collections.abc import Callable, Mapping, Sequence
 from typing import Any
 
-from ipsys_log.errors import IpsysError
+import simplejpeg
+
+from ipsys_log.errors import FrameError, IpsysError
 from ipsys_log.measuring.entry import check_references
 from ipsys_log.measuring.scene import Stop, View
 from ipsys_log.messages import (
     MEASUREMENTS_TOPIC,
     CameraPoints,
     CompressedImage,
+    CompressedVideo,
     Markers,
     Measurement,
     Message,
@@ -21,6 +24,8 @@ from ipsys_log.messages import (
     Rig,
 )
 from ipsys_log.sources.attendant import CameraState
+from ipsys_log.stages.detect import decode_grey
+from ipsys_log.stages.detect.video import decode_keyframe, is_keyframe
 from ipsys_log.units import NS_PER_S
 
 __all__ = ["LiveScene"]
@@ -56,7 +61,9 @@ class LiveScene:
         self._cameras, self._add = cameras, add
         self._lock = threading.Lock()
         self._images: dict[str, deque[Message]] = {camera: deque(maxlen=60) for camera in cameras}
-        self._markers: dict[str, Message] = {}
+        # The last picture with its markers. Frames that were skipped have none.
+        self._marked: dict[str, tuple[Message, Markers]] = {}
+        self._decoded: dict[str, tuple[int, bytes | None]] = {}
         self._points: dict[str, deque[CameraPoints]] = {camera: deque() for camera in cameras}
         self._history: list[Measurement] = []
         self._ended = False
@@ -67,10 +74,15 @@ class LiveScene:
             return
         payload, camera = message.payload, message.camera
         with self._lock:
-            if isinstance(payload, CompressedImage):
+            # Of a video keyframes are shown, which need no others.
+            if isinstance(payload, CompressedImage) or (
+                isinstance(payload, CompressedVideo) and is_keyframe(payload)
+            ):
                 self._images[camera].append(message)
             elif isinstance(payload, Markers):
-                self._markers[camera] = message
+                for image in self._images[camera]:
+                    if image.publish_time_ns == message.publish_time_ns:
+                        self._marked[camera] = image, payload
             elif isinstance(payload, CameraPoints):
                 points = self._points[camera]
                 points.append(payload)
@@ -107,18 +119,21 @@ class LiveScene:
         self._ended = True
 
     def _view(self, camera: str, since_ns: int) -> View:
-        marked = self._markers.get(camera)
-        if marked is None or not self._cameras[camera].up:
+        if camera not in self._marked or not self._cameras[camera].up:
             return View(camera, 0)
-        # Frames that were skipped have no markers; a picture is shown with its own.
-        picture = next(
-            (
-                one.payload.data
-                for one in self._images[camera]
-                if one.publish_time_ns == marked.publish_time_ns
-            ),
-            None,
-        )
+        image, markers = self._marked[camera]
         # That of a camera which hangs, and is not known to be lost yet, is not the last second.
         points = tuple(one for one in self._points[camera] if one.timestamp >= since_ns)
-        return View(camera, marked.publish_time_ns, picture, marked.payload, points)
+        return View(camera, image.publish_time_ns, self._jpeg(camera, image), markers, points)
+
+    def _jpeg(self, camera: str, image: Message) -> bytes | None:
+        if isinstance(image.payload, CompressedImage):
+            return image.payload.data
+        if self._decoded.get(camera, (0, None))[0] != image.publish_time_ns:
+            try:
+                grey = decode_grey(decode_keyframe(image.payload))
+                jpeg = simplejpeg.encode_jpeg(grey[..., None], colorspace="GRAY")
+            except FrameError:
+                jpeg = None
+            self._decoded[camera] = image.publish_time_ns, jpeg
+        return self._decoded[camera][1]

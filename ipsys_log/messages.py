@@ -190,6 +190,14 @@ class CompressedVideo:
 
 
 @dataclass(frozen=True, slots=True, eq=False)
+class SkippedVideo:
+    """A frame of a video that is decoded, since those after it need it, and not searched. It is in no log:
+    there the frame is itself, and an event names it."""
+
+    frame: CompressedVideo
+
+
+@dataclass(frozen=True, slots=True, eq=False)
 class RawImage:
     """``foxglove.RawImage``, in the logs of others."""
 

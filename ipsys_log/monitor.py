@@ -11,9 +11,10 @@ import cv2
 import numpy as np
 
 from ipsys_log.errors import FrameError
-from ipsys_log.messages import CompressedImage, Message, Rig
+from ipsys_log.messages import CompressedImage, CompressedVideo, Message, Rig
 from ipsys_log.stages.detect import decode_grey
 from ipsys_log.stages.detect.search import search
+from ipsys_log.stages.detect.video import decode_keyframe, is_keyframe
 
 __all__ = ["Look", "Monitor"]
 
@@ -38,7 +39,8 @@ class Look:
 
 
 class Monitor:
-    """Looks at a frame of each camera now and then, in a thread of its own. A context manager.
+    """Looks at a frame of each camera now and then, in a thread of its own; of a video at keyframes, which
+    need no others. A context manager.
 
     Parameters
     ----------
@@ -52,7 +54,7 @@ class Monitor:
     def __init__(self, rig: Rig) -> None:
         self.looks: dict[str, Look] = {}
         self._rig = rig
-        self._newest: dict[str, CompressedImage] = {}
+        self._newest: dict[str, CompressedImage | CompressedVideo] = {}
         self._best: dict[str, float] = {}
         self._ended = threading.Event()
         self._thread = threading.Thread(target=self._watch, name="monitor", daemon=True)
@@ -69,7 +71,9 @@ class Monitor:
 
     def __call__(self, message: Message | None) -> None:
         """Be shown what is recorded."""
-        if message is not None and isinstance(message.payload, CompressedImage):
+        if message is None or not isinstance(message.payload, (CompressedImage, CompressedVideo)):
+            return
+        if isinstance(message.payload, CompressedImage) or is_keyframe(message.payload):
             self._newest[str(message.camera)] = message.payload
 
     def _watch(self) -> None:
@@ -77,9 +81,9 @@ class Monitor:
             for camera, image in list(self._newest.items()):
                 self.looks[camera] = self._look(camera, image)
 
-    def _look(self, camera: str, image: CompressedImage) -> Look:
+    def _look(self, camera: str, image: CompressedImage | CompressedVideo) -> Look:
         try:
-            grey = decode_grey(image)
+            grey = decode_grey(decode_keyframe(image) if isinstance(image, CompressedVideo) else image)
         except FrameError as error:
             return Look((), (), 0.0, 0.0, (f"a frame cannot be decoded: {error}",))
         seen = Counter(one.id for one in search(grey, self._rig.dictionary))

@@ -16,7 +16,8 @@ from ipsys_log.log.codec import encode, schema_data, schema_name
 from ipsys_log.log.journal import journal_path
 from ipsys_log.log.session import Session
 from ipsys_log.log.storage import DISK
-from ipsys_log.messages import ChannelWritten, Message, Run
+from ipsys_log.messages import ChannelWritten, Message, Rig, Run
+from ipsys_log.rig import hide_passwords
 
 __all__ = [
     "append_messages",
@@ -38,11 +39,12 @@ def write_messages(writer: LogWriter, messages: Iterable[Message]) -> dict[str, 
 
 
 def write_message(writer: LogWriter, message: Message, counts: dict[str, int]) -> None:
-    """Put a message into an open log, and count it by its topic."""
+    """Put a message into an open log, and count it by its topic. No password gets into a log."""
+    payload = hide_passwords(message.payload) if isinstance(message.payload, Rig) else message.payload
     name = schema_name(type(message.payload))
     if message.topic not in counts:
         writer.add_channel(message.topic, Schema(name, "protobuf", schema_data(name)))
-    writer.write(message.topic, message.log_time_ns, message.publish_time_ns, encode(message.payload))
+    writer.write(message.topic, message.log_time_ns, message.publish_time_ns, encode(payload))
     counts[message.topic] = counts.get(message.topic, 0) + 1
 
 

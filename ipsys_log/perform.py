@@ -13,17 +13,20 @@ from ipsys_log.messages import (
     RIG_TOPIC,
     CameraCalibration,
     ChannelWritten,
+    CompressedVideo,
     Lens,
     Message,
     Model,
     Rig,
     Run,
+    SkippedVideo,
     calibration_topic,
 )
 from ipsys_log.output import append_messages, append_run, record_message
 from ipsys_log.remarks import Remarks
 from ipsys_log.request import Progress, Request
 from ipsys_log.resume import OtherContentError, cut_short, without_held
+from ipsys_log.rig import hide_passwords
 from ipsys_log.runs import Outcome, check_run_name, find_run, fingerprint, free_name, read_channels
 from ipsys_log.tasks import Task, plan_stage
 
@@ -154,7 +157,7 @@ def record_of(session: Session, task: Task) -> Run:
         run="",
         stage=task.stage,
         parameters=dict(task.parameters),
-        rig=task.rig,
+        rig=task.rig and hide_passwords(task.rig),
         lenses=lenses,
         input_runs=tuple(sorted(input_runs)),
         inputs=(*read_channels(session, task.topics), *task.foreign),
@@ -175,8 +178,12 @@ def inputs(session: Session, task: Task, progress: Progress) -> Iterator[Message
     progress(task.stage, 0, total)
     skipped = skipped_frames(session) if task.as_live else set()
     for done, message in enumerate(session.messages(task.topics), 1):
-        if message.topic != EVENTS_TOPIC and message.log_time_ns not in skipped:
-            yield message
+        if message.log_time_ns not in skipped:
+            if message.topic != EVENTS_TOPIC:
+                yield message
+        elif isinstance(message.payload, CompressedVideo):
+            # Those after it need it. What live passed over up to a keyframe, makes no difference.
+            yield replace(message, payload=SkippedVideo(message.payload))
         progress(task.stage, done, total)
 
 

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import os
 import threading
-from collections import Counter, deque
+from collections import Counter
 from collections.abc import Callable, Iterable, Iterator, Mapping
 from contextlib import contextmanager
 from dataclasses import replace
@@ -23,13 +23,13 @@ from ipsys_log.messages import (
     FRAME_SKIPPED,
     RIG_TOPIC,
     CameraCalibration,
-    CompressedImage,
     Event,
     Message,
     Rig,
     calibration_topic,
 )
 from ipsys_log.output import write_message
+from ipsys_log.waiting import Waiting
 
 __all__ = [
     "TICK",
@@ -44,9 +44,6 @@ __all__ = [
 
 # Between two messages of a source: nothing more has come so far. It is not in the log.
 TICK = Message("", 0, 0, None)
-
-# Frames of a camera that may wait for the stages; older ones are skipped.
-_WAITING = 3
 
 
 class Target(Protocol):
@@ -191,7 +188,8 @@ class Backlog:
     """Frames that are in the log and that the stages have not seen. A context manager; iterate once.
 
     A thread of its own writes what a source gives and hands the frames on. Where the stages are slower than
-    the cameras, the oldest frame that waits is skipped, never the recording of it, and an event says so.
+    the cameras, frames are skipped as :class:`~ipsys_log.waiting.Waiting` does, never the recording of them,
+    and an event names each.
     After everything that waits comes a :data:`TICK`.
 
     Parameters
@@ -211,7 +209,7 @@ class Backlog:
     ) -> None:
         self.skipped: Counter[str] = Counter()
         self._source, self._log, self._now_ns, self._stop = source, log, now_ns, stop
-        self._waiting: deque[Message] = deque()
+        self._waiting = Waiting()
         self._ended = False
         self._fault: BaseException | None = None
         self._changed = threading.Condition()
@@ -232,8 +230,7 @@ class Backlog:
             with self._changed:
                 while not self._waiting and not self._ended:
                     self._changed.wait()
-                taken = list(self._waiting)
-                self._waiting.clear()
+                taken = self._waiting.take()
             if not taken:
                 if self._fault is not None:
                     raise self._fault
@@ -255,14 +252,9 @@ class Backlog:
 
     def _hand_on(self, message: Message) -> None:
         with self._changed:
-            self._waiting.append(message)
-            mine = [one for one in self._waiting if one.camera == message.camera]
-            # A frame of a video is nothing without those before it.
-            late = mine[0] if len(mine) > _WAITING and isinstance(message.payload, CompressedImage) else None
-            if late is not None:
-                self._waiting.remove(late)
+            skipped = self._waiting.put(message)
             self._changed.notify()
-        if late is not None:
+        for late in skipped:
             camera = str(late.camera)
             self.skipped[camera] += 1
             text = f"a frame of camera {camera} is recorded but was not looked at: the stages are too slow"

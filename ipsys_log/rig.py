@@ -7,7 +7,7 @@ import math
 import re
 import tomllib
 from collections.abc import Iterable, Mapping
-from dataclasses import MISSING, fields
+from dataclasses import MISSING, fields, replace
 from importlib.resources import files
 from pathlib import Path
 from typing import Any, TypeVar
@@ -16,7 +16,17 @@ from ipsys_log.errors import IpsysError
 from ipsys_log.messages import Floor, ReferencePoint, Rig, RigCamera, RigMarker
 from ipsys_log.rig_slips import check_slips
 
-__all__ = ["STAMPS", "check_name", "check_rig", "example_toml", "load_rig", "rig_toml"]
+__all__ = [
+    "HIDDEN",
+    "STAMPS",
+    "check_name",
+    "check_rig",
+    "example_toml",
+    "hide_password",
+    "hide_passwords",
+    "load_rig",
+    "rig_toml",
+]
 
 Item = TypeVar("Item")
 
@@ -25,6 +35,14 @@ _HIGHEST_M = 5.0
 
 # What the time that a driver gives a frame can mean.
 STAMPS = ("start", "end")
+
+# Stands for a password where it may be read by others.
+HIDDEN = "***"
+# After user and colon, up to the last @: a password may have any sign in it. Or a part of the query.
+_PASSWORDS = (
+    re.compile(r"(?<=://)(?P<before>[^/?@:\[]*:)(?![0-9]+(?:[/?]|$)).*(?=@)"),
+    re.compile(r"(?P<before>(?:pass|passwd|password|pwd)=)[^&;]+", re.IGNORECASE),
+)
 
 _NAME = re.compile(r"[a-z][a-z0-9_]*")
 _ITEMS = {"markers": RigMarker, "cameras": RigCamera, "reference_points": ReferencePoint}
@@ -70,6 +88,27 @@ def rig_toml(rig: Rig) -> str:
         for item in getattr(rig, key):
             lines += ["", f"[[{key}]]", *_toml_rows(item)]
     return "\n".join(lines) + "\n"
+
+
+def hide_password(address: str) -> str:
+    """An address as it may be shown, and stand in a log.
+
+    Examples
+    --------
+    >>> hide_password("rtsp://admin:secret@10.0.0.7:554/live")
+    'rtsp://admin:***@10.0.0.7:554/live'
+    >>> hide_password("http://10.0.0.7:80/video?user=admin&pwd=secret")
+    'http://10.0.0.7:80/video?user=admin&pwd=***'
+    """
+    for password in _PASSWORDS:
+        address = password.sub(rf"\g<before>{HIDDEN}", address)
+    return address
+
+
+def hide_passwords(rig: Rig) -> Rig:
+    """A rig without the passwords in its cameras' sources."""
+    cameras = (replace(one, source=one.source and hide_password(one.source)) for one in rig.cameras)
+    return replace(rig, cameras=tuple(cameras))
 
 
 def _toml_rows(item: Any) -> list[str]:
@@ -150,7 +189,7 @@ def _check_cameras(rig: Rig, where: str) -> None:
                 f"{where}: camera {camera.name}: stamp is {camera.stamp!r}; write "
                 + " or ".join(f'"{name}"' for name in STAMPS)
             )
-    sources = (camera.source for camera in rig.cameras if camera.source)
+    sources = (hide_password(camera.source) for camera in rig.cameras if camera.source)
     _check_unique(sources, f"{where}: two cameras have the source")
 
 

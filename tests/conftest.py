@@ -5,7 +5,8 @@ from __future__ import annotations
 import os
 import shutil
 import sys
-from collections.abc import Callable
+from collections.abc import Callable, Iterator
+from dataclasses import replace
 from pathlib import Path
 from typing import NamedTuple
 
@@ -16,11 +17,13 @@ os.environ.setdefault("OPENBLAS_NUM_THREADS", "1")
 
 from ipsys_log.cli import main
 from ipsys_log.log.session import Session
-from ipsys_log.messages import Measurement
+from ipsys_log.messages import CompressedVideo, Measurement, Message
 from ipsys_log.output import write_log
 from ipsys_log.pipeline import replay
 from ipsys_log.request import Request
 from ipsys_log.sources.simulator import LabSettings, simulate
+from ipsys_log.sources.videos import open_video
+from tests.sources.streams import encode
 
 ROOT = Path(__file__).resolve().parent.parent
 
@@ -69,6 +72,35 @@ def lab_log(tmp_path_factory: pytest.TempPathFactory) -> Path:
     )
     write_log(path, simulate(settings))
     return path
+
+
+@pytest.fixture(scope="session")
+def video_log(lab_log: Path, tmp_path_factory: pytest.TempPathFactory) -> Path:
+    """The small simulated session with its frames as H.264, a keyframe every ten; to be copied before it is
+    changed."""
+    folder = tmp_path_factory.mktemp("video")
+    with Session([lab_log]) as session:
+        write_log(folder / "lab.mcap", _with_video(session, folder))
+    return folder / "lab.mcap"
+
+
+def _with_video(session: Session, folder: Path) -> Iterator[Message]:
+    packets = {topic: iter(_as_video(session, topic, folder)) for topic in session.images.values()}
+    for message in session.messages([topic for reader in session.readers for topic in reader.channels]):
+        if message.topic in packets:
+            camera, data = str(message.camera), next(packets[message.topic])
+            yield replace(message, payload=CompressedVideo(message.publish_time_ns, camera, data, "h264"))
+        else:
+            yield message
+
+
+def _as_video(session: Session, topic: str, folder: Path) -> list[bytes]:
+    for number, frame in enumerate(session.payloads([topic])):
+        (folder / f"{number:03}.jpg").write_bytes(frame.data)
+    options = "-c:v libx264 -crf 16 -bf 0 -g 10 -sc_threshold 0 -pix_fmt yuv420p"
+    path = encode(folder, "video.mp4", *options.split())
+    with open_video(path, print) as frames:
+        return [frame.data for frame in frames]
 
 
 @pytest.fixture

@@ -153,7 +153,8 @@ def test_of_a_camera_that_hangs_or_is_lost_nothing_is_seen() -> None:
         for n in range(first, last):
             taken_ns = n * NS_PER_S // 10
             points = CameraPoints(taken_ns, (CameraPoint(0, 0.1, 0.2, 2.0),))
-            for payload in (Markers(taken_ns, (), 960, 540), points):
+            image = CompressedImage(taken_ns, camera, b"", "jpeg")
+            for payload in (image, Markers(taken_ns, (), 960, 540), points):
                 scene(Message("", taken_ns, taken_ns, payload, camera))
 
     show("white", 0, 10)

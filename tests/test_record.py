@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import re
 import signal
 import subprocess
 import sys
@@ -88,6 +89,49 @@ def test_frames_are_recorded_as_they_came_for_so_many_seconds(
     assert said == {
         f"camera {name}: sends no capture stamps; its frames get their time of arrival" for name in NAMES
     }
+
+
+def test_a_password_is_neither_shown_nor_recorded_and_asked_for_when_it_is_missing(
+    ipsys: Ipsys, pictures: tuple[Path, list[bytes]], tmp_path: Path
+) -> None:
+    log = tmp_path / "a.mcap"
+    with streams(pictures[0], tmp_path) as rig:
+        text = (
+            rig.read_text()
+            .replace("http://", "http://admin:hush-hush@")
+            .replace("/red", "/red?pwd=hush-hush")
+        )
+        rig.write_text(text)
+        done = ipsys("record", "--rig", rig, "-o", log, "--seconds", "1")
+    assert done.code == 0, done.err
+    assert b"hush" not in log.read_bytes()
+    assert "hush" not in done.out + done.err
+    done = ipsys("init", tmp_path / "again.toml", "--from", log)
+    assert "write that of each source in place of ***" in done.out
+    done = ipsys("record", "--rig", tmp_path / "again.toml", "-o", tmp_path / "b.mcap", "--camera", "white")
+    assert done.code == 1
+    assert re.fullmatch(
+        r"ipsys: camera white: http://admin:\*\*\*@\S+/white: its password is not known, a log holds none; "
+        r"write it in place of \*\*\*\n",
+        done.err,
+    )
+
+
+def test_a_password_in_the_rig_of_a_run_is_not_recorded(ipsys: Ipsys, lab: Path, tmp_path: Path) -> None:
+    rig = tmp_path / "lab.toml"
+    assert ipsys("init", rig, "--from", lab).code == 0
+    text = rig.read_text().replace("marker_length_m = 0.2", "marker_length_m = 0.21")
+    rig.write_text(text + '[[cameras]]\nname = "blue"\nsource = "rtsp://admin:hush-hush@10.0.0.7/live"\n')
+    # The second time there is nothing to do.
+    for fresh in (True, False):
+        before = lab.read_bytes()
+        done = ipsys("camera-frame", lab, "--rig", rig)
+        assert done.code == 0, done.err
+        assert (lab.read_bytes() != before) == fresh
+    with Session([lab]) as session:
+        (given,) = (run.rig for run in session.runs() if run.rig is not None)
+    assert given.camera("blue").source == "rtsp://admin:***@10.0.0.7/live"
+    assert b"hush" not in lab.read_bytes()
 
 
 @pytest.mark.parametrize("number", [signal.SIGINT, signal.SIGTERM])
@@ -214,6 +258,10 @@ def test_a_calibration_of_another_shape_is_refused_and_of_another_size_is_scaled
     with streams(pictures[0], tmp_path) as rig:
         done = ipsys(*once, tmp_path / "b.mcap", "--calibration", f"red={lens(640, 480)}")
         assert "camera red: its calibration is scaled from 640 to 320 px" in done.err
+    video = encode(pictures[0].parent, "red.mp4", "-c:v", "libx264", "-bf", "0", "-pix_fmt", "yuv420p")
+    rig.write_text(re.sub(r"http://\S+/red", f"file:{video}", rig.read_text()))
+    done = ipsys(*once, tmp_path / "c.mcap", "--calibration", f"red={lens(640, 400)}")
+    assert "sends 320 x 240 px, its calibration is for 640 x 400, of another shape" in done.err
     with Session([tmp_path / "b.mcap"]) as session:
         (held,) = session.payloads([session.calibrations["red"]])
     assert (held.width, held.height, held.K[0, 0], held.K[0, 2]) == (320, 240, 150.0, 159.5)

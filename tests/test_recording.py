@@ -13,7 +13,6 @@ from ipsys_log.log import LogWriter
 from ipsys_log.messages import (
     FRAME_SKIPPED,
     CompressedImage,
-    CompressedVideo,
     Event,
     Message,
     image_topic,
@@ -76,17 +75,6 @@ def test_the_oldest_frames_are_skipped_and_named_by_their_log_times(log: Noted) 
     assert {event.kind for event in events} == {FRAME_SKIPPED}
     assert [event.timestamp for event in events] == [1000 + n for n in range(7)]
     assert len([m for m in log.noted if isinstance(m.payload, CompressedImage)]) == 12
-
-
-def test_a_frame_of_a_video_is_never_skipped(log: Noted) -> None:
-    def source() -> Iterator[Message | None]:
-        for n in range(10):
-            video = CompressedVideo(n, "red", b"%d" % n, "h264")
-            yield Message(image_topic("red"), 1000 + n, n, video, "red")
-
-    with backlog(source(), log) as frames:
-        time.sleep(0.2)
-        assert len([message for message in frames if message is not TICK]) == 10
 
 
 def test_a_fault_of_the_recorder_is_raised_where_frames_are_taken(log: Noted) -> None:

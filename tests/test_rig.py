@@ -13,7 +13,7 @@ from hypothesis import strategies as st
 
 from ipsys_log.errors import IpsysError
 from ipsys_log.messages import Floor, ReferencePoint, Rig, RigCamera, RigMarker
-from ipsys_log.rig import check_rig, example_toml, load_rig, rig_toml
+from ipsys_log.rig import check_rig, example_toml, hide_password, load_rig, rig_toml
 from ipsys_log.rig_slips import dictionary_size
 
 RIG = Rig(
@@ -161,3 +161,19 @@ def test_the_sizes_of_all_dictionaries_are_those_of_opencv() -> None:
 def test_the_floor_itself_is_a_height() -> None:
     grounded = replace(RIG, marker_height_m=0.0, markers=(RigMarker(0, height_m=0.0),))
     assert check_rig(grounded, "lab.toml").height_of(0) == 0.0
+
+
+@pytest.mark.parametrize(
+    ("address", "shown"),
+    [
+        ("rtsp://admin:se/c:r@et?#@10.0.0.7:554/live", "rtsp://admin:***@10.0.0.7:554/live"),
+        ("rtsp://10.0.0.7:554/user=admin&password=secret&channel=1", None),
+        ("rtsp://10.0.0.7:554/live?to=a@b", "rtsp://10.0.0.7:554/live?to=a@b"),
+        ("rtsp://[fe80::1]:554/live", "rtsp://[fe80::1]:554/live"),
+        ("usb:/dev/video0", "usb:/dev/video0"),
+    ],
+)
+def test_a_password_is_hidden_and_nothing_else_is(address: str, shown: str | None) -> None:
+    shown = shown or "rtsp://10.0.0.7:554/user=admin&password=***&channel=1"
+    assert hide_password(address) == shown
+    assert hide_password(shown) == shown

@@ -5,7 +5,7 @@ from __future__ import annotations
 import re
 from collections.abc import Callable, Iterator, Sequence
 from functools import partial
-from itertools import chain, islice
+from itertools import chain
 from pathlib import Path
 from typing import NamedTuple
 
@@ -13,10 +13,11 @@ import cv2
 import numpy as np
 
 from ipsys_log.calibration.sighting import Grey
-from ipsys_log.errors import IpsysError
+from ipsys_log.errors import FrameError, IpsysError
 from ipsys_log.log.session import Session
-from ipsys_log.messages import CompressedImage, RawImage
+from ipsys_log.messages import CompressedImage, CompressedVideo, RawImage
 from ipsys_log.rig import check_name
+from ipsys_log.stages.detect.video import Video
 
 __all__ = ["MOST_LOOKED_AT", "Pictures", "find_sources"]
 
@@ -199,9 +200,25 @@ def _log(path: Path) -> list[Pictures]:
 
 def _read_log(path: Path, topic: str, stride: int) -> Iterator[tuple[str, Grey | None]]:
     with Session([path]) as session:
-        for message in islice(session.messages([topic]), 0, None, stride):
-            seconds = (message.publish_time_ns - session.start_ns) * 1e-9
-            yield f"at {seconds:.2f} s", _frame(message.payload)
+        video: Video | None = None
+        for number, message in enumerate(session.messages([topic])):
+            frame, wanted = message.payload, number % stride == 0
+            if isinstance(frame, CompressedVideo):
+                video = video or Video(frame.format)
+                if wanted:
+                    frame = _of_video(video, frame)
+                else:
+                    video.pass_over(frame)
+            if wanted:
+                seconds = (message.publish_time_ns - session.start_ns) * 1e-9
+                yield f"at {seconds:.2f} s", None if frame is None else _frame(frame)
+
+
+def _of_video(video: Video, frame: CompressedVideo) -> RawImage | None:
+    try:
+        return video(frame)
+    except FrameError:
+        return None
 
 
 def _frame(frame: CompressedImage | RawImage) -> Grey | None:

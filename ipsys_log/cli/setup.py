@@ -59,7 +59,7 @@ def init(
 ) -> None:
     """Write a rig file to edit: markers, cameras, reference points, floor. With comments, or from a log."""
     from ipsys_log.errors import IpsysError
-    from ipsys_log.rig import example_toml
+    from ipsys_log.rig import HIDDEN, example_toml
 
     text = example_toml() if log is None else _rig_of(log)
 
@@ -74,6 +74,10 @@ def init(
         path.unlink()
         raise
     console.print(f"{path} written: edit it to describe your lab")
+    if HIDDEN in text:
+        console.print(
+            f"a log holds no passwords: write that of each source in place of {HIDDEN}", markup=False
+        )
 
 
 def _rig_of(log: Path) -> str:

@@ -5,7 +5,7 @@ from __future__ import annotations
 import numpy as np
 import rerun as rr
 
-from ipsys_log.messages import CompressedImage, RawImage
+from ipsys_log.messages import CompressedImage, CompressedVideo, RawImage
 
 __all__ = ["rerun_image"]
 
@@ -19,10 +19,13 @@ _RAW = {
     "rgba8": (rr.ColorModel.RGBA, 4),
     "bgra8": (rr.ColorModel.BGRA, 4),
 }
+_CODECS = {"h264": rr.VideoCodec.H264, "h265": rr.VideoCodec.H265}
 
 
-def rerun_image(frame: CompressedImage | RawImage) -> rr.EncodedImage | rr.Image:
-    """A frame for Rerun; a JPEG or PNG is neither decoded nor copied into another format.
+def rerun_image(
+    frame: CompressedImage | CompressedVideo | RawImage,
+) -> rr.EncodedImage | rr.VideoStream | rr.Image:
+    """A frame for Rerun; JPEG, PNG and video are neither decoded nor copied into another format.
 
     Raises
     ------
@@ -31,6 +34,10 @@ def rerun_image(frame: CompressedImage | RawImage) -> rr.EncodedImage | rr.Image
     """
     if isinstance(frame, RawImage):
         return _raw_image(frame)
+    if isinstance(frame, CompressedVideo):
+        if frame.format not in _CODECS:
+            raise ValueError(f"video format {frame.format!r} is not drawn (only {', '.join(_CODECS)})")
+        return rr.VideoStream(_CODECS[frame.format], sample=frame.data)
     if frame.data[:3] == b"\xff\xd8\xff":
         return rr.EncodedImage(contents=frame.data, media_type="image/jpeg")
     if frame.data[:8] == b"\x89PNG\r\n\x1a\n":

@@ -6,15 +6,25 @@ import os
 import queue
 import threading
 from collections.abc import Callable, Iterable
+from dataclasses import replace
 from types import TracebackType
 
 import rerun as rr
 
 from ipsys_log.errors import IpsysError
-from ipsys_log.messages import CompressedImage, Message, Rig, Tracks, image_topic
+from ipsys_log.messages import (
+    CompressedImage,
+    CompressedVideo,
+    Message,
+    Rig,
+    SkippedVideo,
+    Tracks,
+    image_topic,
+)
 from ipsys_log.sinks.rerun_scene import draw_rig, layout
 from ipsys_log.sinks.rerun_sink import RerunSink, trail_entity
 from ipsys_log.sinks.rerun_viewer import check_screen, show_in_viewer
+from ipsys_log.stages.detect.video import is_keyframe
 from ipsys_log.units import NS_PER_S
 
 __all__ = ["LiveView"]
@@ -51,6 +61,8 @@ class LiveView:
     ) -> None:
         self._rig, self._cameras, self._run = rig, sorted(cameras), run
         self._say, self._show = say, show
+        # Cameras whose video goes on with a keyframe only.
+        self._broken: set[str | None] = set()
         self._waiting: queue.SimpleQueue[Message | None] = queue.SimpleQueue()
         self._thread = threading.Thread(target=self._show_all, name="view", daemon=True)
 
@@ -71,11 +83,22 @@ class LiveView:
         """Show a message, soon."""
         if message is None:
             return
-        full = self._waiting.qsize() >= _WAITING
-        if full and isinstance(message.payload, CompressedImage):
+        if isinstance(message.payload, SkippedVideo):
+            message = replace(message, payload=message.payload.frame)
+        if self._left_out(message):
             return
         if self._waiting.qsize() < 2 * _WAITING:
             self._waiting.put(message)
+
+    def _left_out(self, message: Message) -> bool:
+        full = self._waiting.qsize() >= _WAITING
+        if isinstance(message.payload, CompressedVideo):
+            if full:
+                self._broken.add(message.camera)
+            elif is_keyframe(message.payload):
+                self._broken.discard(message.camera)
+            return message.camera in self._broken
+        return full and isinstance(message.payload, CompressedImage)
 
     def _show_all(self) -> None:
         try:

@@ -12,6 +12,7 @@ from ipsys_log.log.session import run_of_topic
 from ipsys_log.messages import (
     TRUTH_TOPIC,
     CompressedImage,
+    CompressedVideo,
     Event,
     Markers,
     Message,
@@ -74,6 +75,7 @@ class RerunSink:
         self._trails = Trails(self._draw_trail)
         self._draw: dict[type, Callable[[Message], None]] = {
             CompressedImage: self._draw_image,
+            CompressedVideo: self._draw_image,
             RawImage: self._draw_image,
             Markers: self._draw_markers,
             Positions: self._draw_positions,

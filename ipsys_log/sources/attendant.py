@@ -4,15 +4,13 @@ from __future__ import annotations
 
 import threading
 from collections.abc import Callable
-from contextlib import suppress
 from dataclasses import dataclass
 from typing import Any, NamedTuple
 
-import simplejpeg
-
 from ipsys_log.messages import EVENTS_TOPIC, Event, RigCamera, image_topic
+from ipsys_log.rig import hide_password
 from ipsys_log.sources.frames import Clock, Frame, Open, Say, SourceError, instant_ns
-from ipsys_log.sources.network import hide_password
+from ipsys_log.sources.packets import find_size
 from ipsys_log.sources.videos import frame_payload
 from ipsys_log.units import NS_PER_S
 
@@ -34,7 +32,7 @@ class CameraState:
 
     ``dropped`` frames came and never reached the log, ``missed`` ones were lost before they came, as far as
     the camera's driver counts. ``format`` of its frames is such as jpeg or h264, ``size_px`` their width and
-    height, where they are JPEGs, and ``delay_s`` the time from exposure to arrival of the last one, where it
+    height, as soon as one tells, and ``delay_s`` the time from exposure to arrival of the last one, where it
     has a capture stamp.
     """
 
@@ -156,7 +154,7 @@ class Attendant:
             self._say("camera_back", f"camera {camera.name} is back after {gone_s:.1f} s")
         state.up, state.format = True, frame.format
         if state.size_px is None:
-            state.size_px = _size_of(frame)
+            state.size_px = find_size(frame)
         time_ns = now_ns
         if frame.time_ns is not None:
             time_ns = instant_ns(frame.time_ns, camera)
@@ -197,11 +195,3 @@ class Attendant:
         now_ns = self._shared.clock.now_ns()
         self._shared.put(Arrival(now_ns, EVENTS_TOPIC, now_ns, Event(now_ns, kind, text, self._camera.name)))
         self._shared.say(text)
-
-
-def _size_of(frame: Frame) -> tuple[int, int] | None:
-    if frame.format == "jpeg":
-        with suppress(ValueError, KeyError):  # a damaged frame says nothing
-            height, width, *_ = simplejpeg.decode_jpeg_header(frame.data, strict=False)
-            return width, height
-    return None

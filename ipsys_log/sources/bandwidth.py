@@ -135,7 +135,7 @@ def _mb_s(per_microframe: int) -> str:
 
 
 def _smaller(shared: Sequence[Demand]) -> list[str]:
-    """The highest rate, and the largest size, at which all would fit; and the format that takes less."""
+    """The highest rate, and the largest size, at which all would fit; and a format that takes less."""
     ways = []
     for rate_hz in _RATES_HZ:
         slower = [demand._replace(rate_hz=min(rate_hz, demand.rate_hz)) for demand in shared]
@@ -149,7 +149,7 @@ def _smaller(shared: Sequence[Demand]) -> list[str]:
             ways.append(f"{'' if ways else 'ask '}for {width} x {height} px")
             break
     if any(demand.format in _BYTES_PER_PX for demand in shared):
-        ways.append(f"{'' if ways else 'ask '}for MJPG")
+        ways.append("take a camera that gives MJPG")
     return ways
 
 

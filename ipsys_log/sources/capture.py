@@ -1,4 +1,4 @@
-"""Frames from a camera by Video for Linux: its own bytes, with the driver's stamps."""
+"""Frames from a camera by Video for Linux: its own JPEG bytes, if it has any, with the driver's stamps."""
 
 from __future__ import annotations
 
@@ -14,6 +14,7 @@ from ipsys_log.messages import RigCamera
 from ipsys_log.sources import v4l2
 from ipsys_log.sources.asked import Given, say_refused
 from ipsys_log.sources.frames import Clock, Frame, Say, SourceError
+from ipsys_log.sources.raw_pictures import RAW_FORMATS, Layout, encode_raw
 from ipsys_log.sources.usb import device_of
 from ipsys_log.units import NS_PER_S
 
@@ -61,12 +62,15 @@ def open_v4l2(camera: RigCamera, clock: Clock, say: Say) -> Iterator[Iterator[Fr
             stack.callback(os.close, device)
             if not v4l2.is_camera(device):
                 raise OSError(errno.ENOTTY, "")
-            given = _set_up(device, camera, where)
+            given, layout = _set_up(device, camera, where)
             say_refused(camera, given, say)
+            if layout is not None:
+                what = f"its {layout.format} pictures are encoded as JPEG once"
+                say(f"camera {camera.name}: gives no MJPG; {what}")
             buffers = _map_buffers(device, stack)
             v4l2.call(device, v4l2.STREAMON, v4l2.Int(v4l2.VIDEO_CAPTURE))
             stack.callback(_stop, device)
-        yield _frames(_Capture(camera, where, device, buffers), clock, say)
+        yield _frames(_Capture(camera, where, device, buffers, layout), clock, say)
 
 
 @contextmanager
@@ -78,10 +82,10 @@ def _faults(where: str) -> Iterator[None]:
         raise SourceError(f"{where}: {said}") from error
 
 
-def _set_up(device: int, camera: RigCamera, where: str) -> Given:
-    """Set a camera to what the rig asks for; what it gives then."""
+def _set_up(device: int, camera: RigCamera, where: str) -> tuple[Given, Layout | None]:
+    """Set a camera to what the rig asks for; what it gives then, and how, if not as JPEG."""
     offers = v4l2.list_formats(device)
-    name = next((name for name in _JPEG if name in offers), None)
+    name = next((name for name in (*_JPEG, *RAW_FORMATS) if name in offers), None)
     if name is None:
         raise SourceError(f"{where}: offers only {', '.join(offers)}; a camera that gives MJPG is needed")
     wanted = v4l2.Format(type=v4l2.VIDEO_CAPTURE, pixelformat=v4l2.fourcc(name))
@@ -98,7 +102,7 @@ def _set_up(device: int, camera: RigCamera, where: str) -> Given:
     exposure = _control(device, _EXPOSURE, exposure)
     for auto, value in ((_AUTO_FOCUS, camera.focus), (_AUTO_GAIN, camera.gain)):
         _control(device, auto, None if value is None else 0)
-    return Given(
+    given = Given(
         has.width,
         has.height,
         _set_rate(device, camera.rate_hz),
@@ -106,6 +110,10 @@ def _set_up(device: int, camera: RigCamera, where: str) -> Given:
         _control(device, _FOCUS, camera.focus),
         _control(device, _GAIN, camera.gain),
     )
+    if name in _JPEG:
+        return given, None
+    least = has.width * (2 if name in ("YUYV", "UYVY") else 1)
+    return given, Layout(name, has.width, has.height, max(has.bytesperline, least))
 
 
 def _set_rate(device: int, rate_hz: float | None) -> float | None:
@@ -174,6 +182,7 @@ class _Capture(NamedTuple):
     where: str
     device: int
     buffers: list[mmap.mmap]
+    layout: Layout | None
 
 
 def _frames(capture: _Capture, clock: Clock, say: Say) -> Iterator[Frame | None]:
@@ -200,6 +209,10 @@ def _frames(capture: _Capture, clock: Clock, say: Say) -> Iterator[Frame | None]
         with _faults(capture.where):
             v4l2.call(capture.device, v4l2.QBUF, buffer)
         # The driver hands back a frame it could make nothing of as an empty one.
+        if data and capture.layout is not None:
+            data = encode_raw(data, capture.layout) or b""
+            if not data:
+                say(f"camera {capture.camera.name}: sends pictures that are not whole; they are left out")
         if data:
             missed, last = _missed(last, buffer.sequence), buffer.sequence
             yield Frame(data, "jpeg", clock.of_monotonic_ns(stamp_ns) if stamped else None, missed)

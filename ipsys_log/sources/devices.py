@@ -9,6 +9,7 @@ from pathlib import Path
 
 from ipsys_log.errors import IpsysError
 from ipsys_log.messages import Rig, RigCamera
+from ipsys_log.rig import HIDDEN, hide_password
 from ipsys_log.sources.bandwidth import advise, demands_of
 from ipsys_log.sources.frames import Clock, Frame, Open, Say
 from ipsys_log.sources.network import check_address, open_network
@@ -99,8 +100,14 @@ def _opener(camera: RigCamera) -> Open:
         raise IpsysError(
             f'camera {camera.name}: the rig gives no source; write e.g. source = "usb:/dev/video0"'
         )
+    shown = hide_password(camera.source)
+    if shown == camera.source and (f":{HIDDEN}@" in shown or f"={HIDDEN}" in shown):
+        raise IpsysError(
+            f"camera {camera.name}: {shown}: its password is not known, a log holds none; write it in place "
+            f"of {HIDDEN}"
+        )
     opener = OPENERS.get(camera.source.partition(":")[0].lower())
     if opener is None:
         known = ", ".join(f"{scheme}:" for scheme in OPENERS)
-        raise IpsysError(f"camera {camera.name}: source {camera.source!r} is none of {known}")
+        raise IpsysError(f"camera {camera.name}: source {shown!r} is none of {known}")
     return opener

@@ -12,9 +12,10 @@ from contextlib import contextmanager, suppress
 from queue import Empty, Full, Queue
 from threading import Event, Thread
 from typing import TYPE_CHECKING
-from urllib.parse import urlsplit, urlunsplit
+from urllib.parse import urlsplit
 
 from ipsys_log.messages import RigCamera
+from ipsys_log.rig import hide_password
 from ipsys_log.sources.asked import Given, say_refused
 from ipsys_log.sources.frames import Clock, Frame, Say, SourceError
 from ipsys_log.sources.packets import find_video, name_format, pass_through
@@ -23,7 +24,7 @@ from ipsys_log.sources.stamps import Stamps
 if TYPE_CHECKING:
     from av.container import InputContainer
 
-__all__ = ["check_address", "hide_password", "open_network"]
+__all__ = ["check_address", "open_network"]
 
 # A stream that is silent for so long has gone.
 _SILENT_S = 5.0
@@ -150,7 +151,7 @@ def _explain(error: Exception) -> str:
     known = {
         av.error.ConnectionRefusedError: "refuses the connection; is the camera on, and the port right?",
         av.error.HTTPNotFoundError: "the camera has no such path; look it up in the camera's manual",
-        av.error.HTTPUnauthorizedError: "asks for a password; write user:password@ before the host",
+        av.error.HTTPUnauthorizedError: "asks for a password, or another; put user:password@ before the host",
         av.error.HTTPForbiddenError: "the camera forbids it; give the user the right to see the stream",
         av.error.InvalidDataError: "is not video; give the address of the stream, not of a web page",
         av.error.ExitError: f"nothing came for {_SILENT_S:g} s; is the camera on, and the network up?",
@@ -183,18 +184,3 @@ def check_address(camera: RigCamera) -> None:
             f"camera {camera.name}: {hide_password(address)!r} names no host; write it as "
             "http://192.168.1.20:8080/video or rtsp://user:password@192.168.1.20/stream"
         )
-
-
-def hide_password(address: str) -> str:
-    """An address as it may be shown.
-
-    Examples
-    --------
-    >>> hide_password("rtsp://admin:secret@10.0.0.7:554/live")
-    'rtsp://admin:***@10.0.0.7:554/live'
-    """
-    parts = urlsplit(address)
-    user, at, host = parts.netloc.rpartition("@")
-    if ":" not in user:
-        return address
-    return urlunsplit(parts._replace(netloc=f"{user.partition(':')[0]}:***{at}{host}"))

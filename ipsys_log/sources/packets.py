@@ -4,16 +4,19 @@ from __future__ import annotations
 
 import re
 from collections.abc import Iterator
+from contextlib import suppress
 from typing import TYPE_CHECKING
 
-from ipsys_log.sources.frames import SourceError
+import simplejpeg
+
+from ipsys_log.sources.frames import Frame, SourceError
 
 if TYPE_CHECKING:
     from av.container import InputContainer
     from av.packet import Packet
     from av.video.stream import VideoStream
 
-__all__ = ["find_video", "name_format", "pass_through"]
+__all__ = ["find_size", "find_video", "name_format", "pass_through"]
 
 # FFmpeg's name of a codec, and that in the log.
 _FORMATS = {"mjpeg": "jpeg", "h264": "h264", "hevc": "h265"}
@@ -75,6 +78,27 @@ def pass_through(container: InputContainer, stream: VideoStream) -> Iterator[Pac
             yield from repeat.filter(packet)
         else:
             yield packet
+
+
+def find_size(frame: Frame) -> tuple[int, int] | None:
+    """Width and height of a frame, in px; None where it does not tell: of a video, a keyframe does."""
+    if frame.format == "jpeg":
+        with suppress(ValueError, KeyError):  # a damaged frame says nothing
+            height, width, *_ = simplejpeg.decode_jpeg_header(frame.data, strict=False)
+            return width, height
+    return _find_video_size(frame) if frame.format in ("h264", "h265") else None
+
+
+def _find_video_size(frame: Frame) -> tuple[int, int] | None:
+    import av
+
+    codec = next(codec for codec, name in _FORMATS.items() if name == frame.format)
+    decoder = av.VideoCodecContext.create(codec, "r")
+    assert isinstance(decoder, av.VideoCodecContext)
+    decoder.thread_count = 1
+    with suppress(av.error.FFmpegError):
+        decoder.decode(av.Packet(frame.data))
+    return (decoder.width, decoder.height) if decoder.width else None
 
 
 def _has_parameters(packet: Packet[VideoStream]) -> bool:

@@ -36,11 +36,15 @@ class Stamps:
         self._clock = clock
         self._say = say
         self._patience = patience
+        self._stamped = False
         self._trusted: bool | None = None
 
     def of(self, packet: Packet[VideoStream]) -> int | None:
         """When a packet's frame was taken, in ns of UTC; None where that is not known."""
-        time_ns = read_stamp(packet)
+        time_ns, stamped, self._stamped = read_stamp(packet), self._stamped, packet.has_sidedata("prft")
+        if not stamped:
+            # FFmpeg gives the frame before the first that has a stamp that one's.
+            time_ns = None
         if self._trusted is None:
             self._judge(time_ns)
         return time_ns if self._trusted else None

@@ -5,6 +5,7 @@ from __future__ import annotations
 import json
 import re
 import shutil
+import subprocess
 import tomllib
 from collections.abc import Iterator
 from pathlib import Path
@@ -13,8 +14,10 @@ import cv2
 import numpy as np
 import pytest
 
+from ipsys_log.calibration.pictures import find_sources
 from ipsys_log.formats.opencv_yaml import read_opencv_calibration
-from ipsys_log.messages import CompressedImage, Message, image_topic
+from ipsys_log.log.session import Session
+from ipsys_log.messages import CompressedImage, CompressedVideo, Message, image_topic
 from ipsys_log.output import write_log
 from tests.calibration.boards_seen import (
     chessboard_pattern,
@@ -24,6 +27,7 @@ from tests.calibration.boards_seen import (
     render,
 )
 from tests.conftest import Done, Ipsys
+from tests.sources.streams import ffmpeg
 
 SIZE_PX = (480, 360)
 LENS = (140.0, 140.0, 243.0, 178.0, -0.02, 0.01, -0.004, 0.0005)
@@ -254,3 +258,40 @@ def test_videos_of_a_charuco_board(ipsys: Ipsys, data: Path, tmp_path: Path, cam
         sigma = np.hypot(found["standard_deviations"][name], 0.005 * expected)
         assert abs(found["parameters"][name] - expected) < 3 * sigma
     assert len(found["pictures"]["used"]) >= 28
+
+
+@pytest.mark.parametrize("codec", [("-c:v", "libx264", "-g", "5"), ("-c:v", "libx265", "-x265-params",
+                                   "keyint=5:bframes=0:log-level=none")])  # fmt: skip
+def test_a_recorded_video_gives_the_lens_of_its_pictures(
+    ipsys: Ipsys, red: Path, tmp_path: Path, codec: tuple[str, ...], monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """The pictures are those that FFmpeg decodes; the log holds the packets, most of them no keyframes."""
+    video, log, pictures = tmp_path / "red.mp4", tmp_path / "lab.mcap", tmp_path / "decoded"
+    pictures.mkdir()
+    make = [ffmpeg(), "-v", "error", "-framerate", "5", "-i", str(red / "%d.png"), *codec, "-crf", "12"]
+    subprocess.run([*make, "-bf", "0", "-pix_fmt", "yuv420p", str(video)], check=True)
+    subprocess.run([ffmpeg(), "-v", "error", "-i", str(video), str(pictures / "%d.png")], check=True)
+    assert ipsys("import", "videos", f"red={video}", "-o", log).code == 0
+    with Session([log]) as session:
+        assert {type(one) for one in session.payloads([session.images["red"]])} == {CompressedVideo}
+    lenses = []
+    for source in (log, pictures):
+        done = calibrate(ipsys, source, "--camera", "red", "--board", "6x4", "-o", tmp_path / "x.yaml",
+                         "--force", "--json")  # fmt: skip
+        assert done.code == 0
+        (one,) = json.loads(done.out)
+        assert one["pictures"]["seen"] == 12
+        lens = read_opencv_calibration(tmp_path / "x.yaml", "red")
+        lenses.append(lens.K)
+    # What is lost between the two is rounding of grey levels.
+    assert np.abs(np.subtract(*lenses)).max() < 0.05
+    # Of a long one not each is looked at; those that are need the others.
+    monkeypatch.setattr("ipsys_log.calibration.pictures.MOST_LOOKED_AT", 4)
+    (some,) = find_sources([log], [])
+    looked_at = [grey for _, grey in some.read()]
+    assert len(looked_at) == 4
+    for number, grey in enumerate(looked_at):
+        whole = cv2.imread(str(pictures / f"{3 * number + 1}.png"), cv2.IMREAD_GRAYSCALE)
+        assert whole is not None
+        assert grey is not None
+        assert np.abs(grey.astype(float) - whole).mean() < 1.5

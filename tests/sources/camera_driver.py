@@ -42,6 +42,7 @@ class Driver:
     no_room: bool = False
     size: tuple[int, int] = (640, 480)
     rate: tuple[int, int] = (1, 30)
+    stride: int = 0
     queued: deque[int] = field(default_factory=deque)
     # Numbers of the frames to come, where the driver loses some or begins elsewhere.
     numbers: Iterator[int] = field(default_factory=count)
@@ -85,6 +86,7 @@ class Driver:
         sizes = [(w, h) for w, h, _ in self.modes[v4l2.fourcc_name(about.pixelformat)]]
         self.size = min(sizes, key=lambda size: abs(size[0] - about.width) + abs(size[1] - about.height))
         about.width, about.height = self.size
+        about.bytesperline = self.stride
 
     def tell_rate(self, about: v4l2.StreamParameters) -> None:
         about.capability = v4l2.CAN_SET_RATE
@@ -92,7 +94,7 @@ class Driver:
 
     def set_rate(self, about: v4l2.StreamParameters) -> None:
         wanted = about.denominator / about.numerator
-        rates = next(rates for w, h, rates in self.modes["MJPG"] if (w, h) == self.size)
+        rates = next(rates for sizes in self.modes.values() for w, h, rates in sizes if (w, h) == self.size)
         self.rate = (1, min(rates, key=lambda rate: abs(rate - wanted)))
         about.numerator, about.denominator = self.rate
 

@@ -7,7 +7,12 @@ import sys
 from itertools import islice
 from pathlib import Path
 
+import av
+import cv2
+import numpy as np
 import pytest
+import simplejpeg
+from numpy.typing import NDArray
 
 from ipsys_log.messages import RigCamera
 from ipsys_log.sources import capture, v4l2
@@ -148,13 +153,50 @@ def test_a_bus_that_is_full(driver: Driver) -> None:
         pass
 
 
-def test_a_camera_without_jpeg(driver: Driver) -> None:
-    del driver.modes["MJPG"]
+def test_a_camera_of_no_known_format(driver: Driver) -> None:
+    driver.modes = {"H264": [(1920, 1080, [30])], "BA81": [(1920, 1080, [30])]}
     with (
-        pytest.raises(SourceError, match="offers only YUYV; a camera that gives MJPG is needed"),
+        pytest.raises(SourceError, match="offers only H264, BA81; a camera that gives MJPG is needed"),
         open_usb(ask(driver), Clock(), lambda _: None),
     ):
         pass
+
+
+def raw(name: str, picture: NDArray[np.uint8], stride: int) -> bytes:
+    """A picture as FFmpeg's own converter lays it out, its rows padded."""
+    frame = av.VideoFrame.from_ndarray(picture, format="bgr24")
+    kind = {"YUYV": "yuyv422", "UYVY": "uyvy422", "NV12": "nv12", "GREY": "gray"}[name]
+    planes = frame.reformat(format=kind, dst_color_range="JPEG").planes
+    padded = b""
+    for plane in planes:
+        rows = np.frombuffer(bytes(plane), np.uint8).reshape(plane.height, plane.line_size)
+        rows = rows[:, : min(stride, plane.line_size)]
+        padded += np.pad(rows, ((0, 0), (0, stride - rows.shape[1])), constant_values=99).tobytes()
+    return padded
+
+
+@pytest.mark.parametrize(("name", "stride"), [("YUYV", 640), ("YUYV", 704), ("UYVY", 640), ("NV12", 320),
+                                              ("NV12", 384), ("GREY", 320), ("GREY", 352)])  # fmt: skip
+def test_pictures_of_a_camera_without_jpeg_are_encoded_once(driver: Driver, name: str, stride: int) -> None:
+    driver.modes, driver.stride, driver.size = {name: [(320, 240, [30])]}, stride, (320, 240)
+    y, x = np.indices((240, 320))
+    picture = np.stack([x * 255 // 319, y * 255 // 239, 128 + 100 * np.sin(x / 20)], axis=2).astype(np.uint8)
+    whole = raw(name, picture, stride)
+    driver.frames.extend([whole, whole[:-1000], whole])
+    said: list[str] = []
+    with open_usb(ask(driver, stamp="start"), Clock(), said.append) as frames:
+        came = list(islice((frame for frame in frames if frame), 2))
+    assert [frame.format for frame in came] == ["jpeg", "jpeg"]
+    assert came[0].time_ns is not None
+    shown = simplejpeg.decode_jpeg(came[0].data, colorspace="BGR").astype(float)
+    grey = cv2.cvtColor(picture, cv2.COLOR_BGR2GRAY).astype(float)
+    assert shown.shape == (240, 320, 3)
+    assert np.abs(shown @ [0.114, 0.587, 0.299] - grey).max() < 8
+    assert np.abs(shown - (grey[..., None] if name == "GREY" else picture)).mean() < 3
+    assert said == [
+        f"camera red: gives no MJPG; its {name} pictures are encoded as JPEG once",
+        "camera red: sends pictures that are not whole; they are left out",
+    ]
 
 
 @pytest.mark.parametrize(

@@ -164,7 +164,7 @@ def test_one_camera_can_be_too_much() -> None:
     (line,) = advise(cameras(1, format="YUYV"))
     assert line == (
         "camera red is alone on USB bus 1 (Acme Hub at port 2) and needs 129.3 MB/s of its 48: "
-        "ask for 10 frames/s, or for 800 x 600 px, or for MJPG"
+        "ask for 10 frames/s, or for 800 x 600 px, or take a camera that gives MJPG"
     )
 
 

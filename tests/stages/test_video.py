@@ -2,7 +2,9 @@
 
 from __future__ import annotations
 
+import shutil
 import subprocess
+from dataclasses import replace
 from pathlib import Path
 
 import av
@@ -12,10 +14,10 @@ import pytest
 from numpy.typing import NDArray
 
 from ipsys_log.errors import FrameError
-from ipsys_log.messages import CompressedVideo, Event, Markers, Message, Rig
+from ipsys_log.messages import CompressedVideo, Event, Markers, Message, RawImage, Rig
 from ipsys_log.sources.packets import pass_through
 from ipsys_log.stages.detect import Detect
-from ipsys_log.stages.detect.video import Video
+from ipsys_log.stages.detect.video import Video, decode_keyframe, is_keyframe
 from tests.sources.streams import encode, ffmpeg
 
 CODECS = {
@@ -45,6 +47,14 @@ def decoded_by_ffmpeg(video: Path) -> NDArray[np.uint8]:
     command = [ffmpeg(), "-v", "error", "-i", str(video), "-f", "rawvideo", "-pix_fmt", "yuv420p", "-"]
     raw = subprocess.run(command, check=True, capture_output=True).stdout
     return np.frombuffer(raw, np.uint8).reshape(-1, 240 * 330 * 3 // 2)[:, : 240 * 330].reshape(-1, 240, 330)
+
+
+def pixels(picture: RawImage | None) -> bytes | None:
+    """Without the padding of the rows."""
+    if picture is None:
+        return None
+    rows = np.frombuffer(picture.data, np.uint8).reshape(picture.height, picture.step)
+    return rows[:, : picture.width].tobytes()
 
 
 @pytest.mark.parametrize("name", CODECS)
@@ -100,3 +110,66 @@ def test_a_picture_that_needs_a_later_one_is_named(pictures: Path) -> None:
     events = [payload for payload in run(Detect("stock"), video) if isinstance(payload, Event)]
     assert events
     assert "turn off B-frames" in events[0].text
+
+
+@pytest.mark.parametrize("name", CODECS)
+def test_what_lies_before_a_keyframe_has_no_effect_even_on_a_damaged_one(pictures: Path, name: str) -> None:
+    """A live run that fell behind goes on with a keyframe; its replay has decoded all before that."""
+    video = frames(encode(pictures, "video.mp4", *CODECS[name]), name)
+    assert [n for n, frame in enumerate(video) if is_keyframe(frame)] == [0, 5, 10]
+    video[5] = replace(video[5], data=video[5].data[:-200] + bytes(200))
+
+    def seen(decode: Video) -> list[bytes | str | None]:
+        found: list[bytes | str | None] = []
+        for frame in video[5:]:
+            try:
+                found.append(pixels(decode(frame)))
+            except FrameError as error:
+                found.append(str(error))
+        return found
+
+    behind, before = Video(name), Video(name)
+    for frame in video[:5]:
+        before.pass_over(frame)
+    found = seen(behind)
+    assert found == seen(before)
+    assert [type(one) for one in found] == [*[str] * 5, *[bytes] * 2]
+
+
+def test_a_keyframe_by_itself(pictures: Path) -> None:
+    video = frames(encode(pictures, "video.mp4", *CODECS["h264"]), "h264")
+    whole = Video("h264")
+    assert pixels(decode_keyframe(video[5])) == [pixels(whole(frame)) for frame in video[:6]][-1]
+    with pytest.raises(FrameError, match="are no keyframe"):
+        decode_keyframe(video[6])
+
+
+BASELINE = ("-profile:v", "baseline", "-refs", "1")
+HIGH = ("-profile:v", "high", "-refs", "4", "-x264-params", "keyint=40:scenecut=0:slices=3:bframes=0")
+H265 = ("-c:v", "libx265", "-x265-params", "bframes=0:keyint=40:scenecut=0:log-level=none")
+FULL = ("-profile:v", "high444", "-pix_fmt", "yuv444p", "-crf", "0")
+
+
+@pytest.mark.parametrize("options", [BASELINE, HIGH, FULL, H265])
+def test_a_frame_that_is_lost_is_not_guessed(pictures: Path, options: tuple[str, ...]) -> None:
+    """Over UDP some are; FFmpeg would fill in the one before."""
+    name = "h265" if "libx265" in options else "h264"
+    for number in range(12, 60):  # more than frames are numbered with, 16 at the least
+        shutil.copy(pictures / f"{number % 12:03}.jpg", pictures / f"{number:03}.jpg")
+    video = frames(
+        encode(pictures, "video.mp4", *CODECS["h264"], *options, "-g", "40", "-sc_threshold", "0"), name
+    )
+    whole = Video(name)
+    true = [pixels(whole(frame)) for frame in video]
+    assert len(true) == 60
+    assert None not in true
+    for lost in (1, 20, 39, 41):
+        decode = Video(name)
+        for n, frame in enumerate(video):
+            if n == lost:
+                continue
+            if lost < n < 40 * (lost // 40 + 1):
+                with pytest.raises(FrameError):
+                    decode(frame)
+            else:
+                assert pixels(decode(frame)) == true[n]

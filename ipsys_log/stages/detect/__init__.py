@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from collections import Counter
 from collections.abc import Iterator
+from contextlib import suppress
 from dataclasses import replace
 from typing import Any
 
@@ -26,6 +27,7 @@ from ipsys_log.messages import (
     RawImage,
     Rig,
     RigCamera,
+    SkippedVideo,
     TextAnnotation,
 )
 from ipsys_log.stages.detect.decode import decode_grey
@@ -47,7 +49,7 @@ __all__ = [
     "marker_detector",
 ]
 
-READS = (Rig, CameraCalibration, CompressedImage, CompressedVideo, RawImage)
+READS = (Rig, CameraCalibration, CompressedImage, CompressedVideo, SkippedVideo, RawImage)
 EDGES, STOCK = CORNERS = ("edges", "stock")
 
 _GREEN = Color(0.1, 0.9, 0.3, 1.0)
@@ -93,6 +95,9 @@ class Detect:
             self._lenses[message.camera] = lens
             if known is None or not same_lens(known, lens):
                 self._following.pop(message.camera, None)
+        elif isinstance(payload, SkippedVideo):
+            with suppress(FrameError):
+                self._video(message.camera, payload.frame).pass_over(payload.frame)
         else:
             yield from self._frame(message)
 
@@ -103,7 +108,7 @@ class Detect:
             )
         try:
             if isinstance(message.payload, CompressedVideo):
-                picture = self._picture(message)
+                picture = self._video(message.camera, message.payload)(message.payload)
                 if picture is None:
                     yield from self._before_keyframe(message)
                     return
@@ -118,11 +123,11 @@ class Detect:
         yield Markers(message.publish_time_ns, markers, width, height)
         yield _drawing(message.publish_time_ns, markers)
 
-    def _picture(self, message: Message) -> RawImage | None:
-        """The picture in a frame of a video, for which all frames before it are decoded."""
-        if message.camera not in self._videos:
-            self._videos[message.camera] = Video(message.payload.format)
-        return self._videos[message.camera](message.payload)
+    def _video(self, camera: str | None, frame: CompressedVideo) -> Video:
+        """The decoder of a camera, which is given all its frames."""
+        if camera not in self._videos:
+            self._videos[camera] = Video(frame.format)
+        return self._videos[camera]
 
     def _before_keyframe(self, message: Message) -> Iterator[Event]:
         """Frames before the first keyframe are no pictures, which is said once."""

@@ -1,0 +1,114 @@
+"""Video that is more than the machine can do: frames are skipped, and live equals replay all the same."""
+
+from __future__ import annotations
+
+import time
+from collections.abc import Callable, Iterator
+from contextlib import contextmanager
+from pathlib import Path
+from threading import Timer
+from typing import Any
+
+import pytest
+
+from ipsys_log import pipeline
+from ipsys_log.log.session import Session
+from ipsys_log.messages import FRAME_SKIPPED, CompressedVideo, Message, RigCamera
+from ipsys_log.recording import first_messages
+from ipsys_log.request import Request
+from ipsys_log.sources.attached import Attached
+from ipsys_log.sources.frames import Clock
+from ipsys_log.sources.network import open_network
+from ipsys_log.stages.detect import Detect
+from ipsys_log.stages.detect.video import Video, is_keyframe
+from ipsys_log.verify import verify
+from tests.sources.streams import encode, free_port, serve
+
+H264 = ("-c:v", "libx264", "-preset", "ultrafast", "-g", "20", "-bf", "0", "-pix_fmt", "yuv420p")
+H265 = ("-c:v", "libx265", "-preset", "ultrafast", "-x265-params", "keyint=20:bframes=0:log-level=none")
+SECONDS = 3.5
+
+
+@contextmanager
+def streamed(lab: Path, folder: Path, *options: str) -> Iterator[str]:
+    """The address at which FFmpeg sends the red camera's pictures as video, 30 a second."""
+    with Session([lab]) as session:
+        for number, frame in enumerate(session.payloads([session.images["red"]])):
+            (folder / f"{number:03}.jpg").write_bytes(frame.data)
+    path, port = encode(folder, "video.mp4", *options), free_port()
+    play = ("-re", "-stream_loop", "-1", "-i", str(path), "-c", "copy", "-f", "mpegts", "-listen", "1")
+    address = f"http://127.0.0.1:{port}/live"
+    with serve(*play, address, port=port):
+        yield address
+
+
+def go_live(lab: Path, address: str, target: Path) -> None:
+    """For some seconds, up to the markers."""
+    attached = Attached([RigCamera("red", source=address)], open_network, Clock())
+    with Session([lab]) as session:
+        (rig,) = session.payloads(["/rig"])
+        lens = session.payloads([session.calibrations["red"]])[0]
+    with attached:
+        settings = first_messages(rig, {"red": lens}, attached.now_ns)
+        timer = Timer(SECONDS, attached.stop)
+        timer.start()
+        pipeline.live(attached, settings, target, Request(), "detect")
+        timer.join()
+
+
+def slow_search(patch: pytest.MonkeyPatch) -> None:
+    """A machine that decodes in time, and does not search in time."""
+    step: Callable[..., Any] = Detect.__call__
+
+    def slower(self: Detect, message: Message) -> Any:
+        if isinstance(message.payload, CompressedVideo):
+            time.sleep(0.2)
+        return step(self, message)
+
+    patch.setattr(Detect, "__call__", slower)
+
+
+def slow_decoding(patch: pytest.MonkeyPatch) -> None:
+    """A machine that does not even decode in time."""
+    step = Video._next
+
+    def slower(self: Video, frame: CompressedVideo) -> Any:
+        time.sleep(0.1)
+        return step(self, frame)
+
+    patch.setattr(Video, "_next", slower)
+
+
+@pytest.mark.parametrize(
+    ("codec", "machine"), [(H264, slow_search), (H265, slow_search), (H264, slow_decoding)]
+)
+def test_a_slow_machine_skips_frames_of_a_video_and_a_replay_gives_the_same(
+    codec: tuple[str, ...],
+    machine: Callable[[pytest.MonkeyPatch], None],
+    lab_log: Path,
+    tmp_path: Path,
+    monkeypatch: pytest.MonkeyPatch,
+) -> None:
+    target = tmp_path / "live.mcap"
+    with monkeypatch.context() as patch, streamed(lab_log, tmp_path, *codec) as address:
+        machine(patch)
+        go_live(lab_log, address, target)
+    with Session([target]) as session:
+        events = session.payloads(["/events"])
+        skipped = {e.timestamp for e in events if e.kind == FRAME_SKIPPED}
+        frames = list(session.messages([session.images["red"]]))
+        found = list(session.messages(["/runs/edges/cameras/red/markers"]))
+    assert len(frames) > 60
+    assert is_keyframe(frames[0].payload)
+    assert len(skipped) > 30
+    seen = {one.log_time_ns for one in found}
+    assert seen == {one.log_time_ns for one in frames} - skipped
+    # To the end: it does not fall behind.
+    assert len(seen & {one.log_time_ns for one in frames[-25:]}) > 0
+    assert all(one.equal and one.left for one in verify([target], None, lambda *_: None))
+    assert not any(one.fresh for one in pipeline.replay([target], Request(as_live=True), "detect"))
+    pipeline.replay([target], Request(), "detect")
+    with Session([target]) as session:
+        every = list(session.messages(["/runs/edges_2/cameras/red/markers"]))
+    assert [one.log_time_ns for one in every] == [one.log_time_ns for one in frames]
+    assert any(one.payload.markers for one in every)

@@ -86,18 +86,22 @@ def _chessboard(grey: Grey, board: Board, thorough: bool) -> tuple[NDArray[np.in
 
 
 def _charuco(grey: Grey, board: Board) -> tuple[NDArray[np.intp], Array] | None:
-    corners, ids, _, _ = _charuco_detector(board).detectBoard(grey)
-    if ids is None or len(ids) < _SEEN:
-        return None
-    return np.asarray(ids, dtype=np.intp).ravel(), np.asarray(corners, dtype=np.float64).reshape(-1, 2)
+    # OpenCV before 4.6 printed boards of an even number of rows with a white square first.
+    for legacy in (False, True) if board.rows % 2 == 0 else (False,):
+        corners, ids, _, _ = _charuco_detector(board, legacy).detectBoard(grey)
+        if ids is not None and len(ids) >= _SEEN:
+            return np.asarray(ids, dtype=np.intp).ravel(), np.asarray(corners, dtype=np.float64).reshape(
+                -1, 2
+            )
+    return None
 
 
 @lru_cache(maxsize=32)
-def _charuco_detector(board: Board) -> cv2.aruco.CharucoDetector:
+def _charuco_detector(board: Board, legacy: bool) -> cv2.aruco.CharucoDetector:
     dictionary = cv2.aruco.getPredefinedDictionary(getattr(cv2.aruco, board.dictionary))
     side_m = board.square_m * (board.marker_scale or 0.0)
     printed = cv2.aruco.CharucoBoard((board.columns, board.rows), board.square_m, side_m, dictionary)
-    printed.setLegacyPattern(board.legacy)
+    printed.setLegacyPattern(legacy)
     return cv2.aruco.CharucoDetector(printed)
 
 

@@ -28,7 +28,7 @@ _LEAST_CORNERS = 6
 _MOST_ROUNDS = 8
 # Nothing is far off that is this near: pixels are no better.
 _NEAR_PX = 0.05
-# Pixels are square unless the pictures say otherwise: by this and by three standard deviations, or by far more.
+# Pixels are square unless the pictures say otherwise: by this and by three standard deviations, or by ten.
 _SQUARE, _SURE, _QUITE_SURE = 0.01, 3.0, 10.0
 # What focal length is tried against that found, and by how many standard deviations it has to fit worse.
 _OTHER_FOCALS, _WORSE, _OTHER_STEPS = (0.7, 1.3), 3.0, 40

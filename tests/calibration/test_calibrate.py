@@ -74,21 +74,18 @@ def test_a_board_that_was_never_tilted_tells_no_focal_length() -> None:
         calibrated(sightings([(x, 0.0, 0.5) for x in np.linspace(-0.03, 0.03, 10)], 0.0, noise_px=0.3))
 
 
-@pytest.mark.parametrize("name", ["fisheye", "pinhole", "pinhole4", "pinhole8"])
-@pytest.mark.parametrize("tilt_rad", [0.0, 0.01])
-def test_boards_along_the_image_tell_no_focal_length_near_and_far(name: str, tilt_rad: float) -> None:
+@pytest.mark.parametrize("name", ["fisheye", "pinhole", "pinhole4"])
+def test_boards_along_the_image_tell_no_focal_length_near_and_far(name: str) -> None:
     """Else it runs away to a hundredth of itself, with a standard deviation that says otherwise."""
-    looked = sightings(everywhere(), tilt_rad, name=name)
+    looked = sightings(everywhere(), 0.0, name=name)
     with pytest.raises(IpsysError, match="tilt it to all sides"):
         calibrate("red", looked, BOARD, LENSES[name])
 
 
-@pytest.mark.parametrize("name", ["pinhole", "pinhole4"])
-def test_boards_that_were_hardly_tilted_tell_it_as_well_as_they_can(name: str) -> None:
+def test_boards_that_were_hardly_tilted_tell_it_as_well_as_they_can() -> None:
     """While lines may not bend yet, a far shorter focal length fits better."""
-    for seed in range(3):
-        looked = sightings(everywhere(), 0.12, noise_px=0.05, seed=seed, name=name)
-        found = calibrate("red", looked, BOARD, LENSES[name])
+    for seed in range(2):
+        found = calibrated(sightings(everywhere(), 0.12, noise_px=0.05, seed=seed))
         assert abs(found.values[0] - 600) < min(4 * found.sigmas[0], 60)
 
 

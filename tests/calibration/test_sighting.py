@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Callable
+from functools import cache
 
 import cv2
 import numpy as np
@@ -45,20 +46,28 @@ def charuco_pattern(board: Board, legacy: bool = False) -> Callable[[Array], Arr
     return levels
 
 
+@cache
+def scene(board: Board, seed: int, z_m: float, legacy: bool) -> tuple[NDArray[np.uint8], Array]:
+    """A sharp picture of a board, and its true corners."""
+    rng = np.random.default_rng(seed)
+    turn, place_m = random_pose(rng, "pinhole")
+    place_m = np.array([0.1 * place_m[0], 0.1 * place_m[1], z_m])
+    if board.marker_scale is None:
+        pattern = chessboard_pattern(board.columns, board.rows, board.square_m)
+    else:
+        pattern = charuco_pattern(board, legacy)
+    picture = render(straight_rays, turn, place_m, pattern, (640, 480), rng)
+    corners = board.points_m(np.arange(board.grid[0] * board.grid[1])) @ turn.T + place_m
+    return picture, pixels_of("pinhole", PINHOLE, corners)
+
+
 def drawn(
     board: Board, seed: int, blur_px: float, gamma: float = 1.0, z_m: float = 0.42, legacy: bool = False
 ) -> tuple[NDArray[np.uint8], Array]:
-    """A picture of a board, and its true corners."""
-    rng = np.random.default_rng(seed)
-    pattern = chessboard_pattern(board.columns, board.rows, board.square_m)
-    turn, place_m = random_pose(rng, "pinhole")
-    place_m = np.array([0.1 * place_m[0], 0.1 * place_m[1], z_m])
-    pattern = pattern if board.marker_scale is None else charuco_pattern(board, legacy)
-    picture = render(straight_rays, turn, place_m, pattern, (640, 480), rng)
+    """A picture of a board as a camera takes it, and its true corners."""
+    picture, truth = scene(board, seed, z_m, legacy)
     light = gaussian_filter(picture.astype(float), blur_px)
-    picture = np.round(255 * (light / 255) ** (1 / gamma)).astype(np.uint8)
-    corners = board.points_m(np.arange(board.grid[0] * board.grid[1])) @ turn.T + place_m
-    return picture, pixels_of("pinhole", PINHOLE, corners)
+    return np.round(255 * (light / 255) ** (1 / gamma)).astype(np.uint8), truth
 
 
 @pytest.mark.parametrize("board", [CHESSBOARD, CHARUCO], ids=["chessboard", "charuco"])

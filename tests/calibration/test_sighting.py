@@ -118,6 +118,15 @@ def test_an_inverted_board() -> None:
     assert len(sighting.ids) == 12
 
 
+def test_a_large_picture_is_searched_at_half_its_size_and_refined_at_its_own() -> None:
+    picture, truth = drawn(CHESSBOARD, 1, 0.7)
+    large = np.asarray(cv2.resize(picture, None, fx=3, fy=3, interpolation=cv2.INTER_CUBIC), dtype=np.uint8)
+    sighting = find_board("a", large, CHESSBOARD, thorough=False)
+    assert sighting is not None
+    off = [np.linalg.norm(sighting.pixels - (3 * corners + 1), axis=1) for corners in (truth, truth[::-1])]
+    assert min(float(each.max()) for each in off) < 0.3
+
+
 def test_a_board_as_opencv_printed_it_before_4_6() -> None:
     """Of an even number of rows, it begins with a white square."""
     picture, truth = drawn(CHARUCO, 2, 0.7, legacy=True)

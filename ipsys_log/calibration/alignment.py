@@ -58,8 +58,11 @@ class Alignment:
 
     @property
     def level(self) -> bool | None:
-        """Whether the spread is below 5 cm; None where markers lie too close together to tell."""
-        return None if self.spread_m is None or self.axes == 0 else self.spread_m < LEVEL_M
+        """Whether the spread is below 5 cm; None where markers lie too close together to tell, or on a line
+        across which the floor may fall away."""
+        if self.spread_m is None or self.axes == 0 or (self.axes == 1 and self.spread_m < LEVEL_M):
+            return None
+        return self.spread_m < LEVEL_M
 
     @property
     def tilt_rad(self) -> float | None:

@@ -28,8 +28,6 @@ class Board:
     marker_scale : side of a ChArUco board's markers, in squares; None: a chessboard, without markers.
     dictionary : of the markers, by OpenCV's name.
     inverted : whether black and white are exchanged.
-    legacy : whether the first square is white, as in boards made with OpenCV before 4.6 of an even
-        number of rows.
     """
 
     columns: int
@@ -38,7 +36,6 @@ class Board:
     marker_scale: float | None = None
     dictionary: str = "DICT_4X4_50"
     inverted: bool = False
-    legacy: bool = False
 
     def __str__(self) -> str:
         if self.marker_scale is None:

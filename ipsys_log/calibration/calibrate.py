@@ -15,7 +15,7 @@ from ipsys_log.calibration.lens_models import LensModel
 from ipsys_log.calibration.look import Looked
 from ipsys_log.calibration.picture_coverage import Coverage, advice, measure_coverage
 from ipsys_log.calibration.sighting import Sighting
-from ipsys_log.calibration.solve import Solved, solve
+from ipsys_log.calibration.solve import Solved, solve, tells_focal_length
 from ipsys_log.errors import IpsysError
 from ipsys_log.messages import CameraCalibration
 
@@ -29,8 +29,8 @@ _UNSURE = 0.02
 _UNTOLD = 1.0
 # A lens of the right kind, and a flat board, leave less.
 _OFF_PX = 1.0
-# Nor is a focal length a result that may as well be half or twice as long.
-_UNKNOWN = 0.5
+# Nor is a focal length a result that is no better known than this.
+_UNKNOWN = 0.1
 # Edges wider than this, in all pictures, are a camera in the dark or out of focus.
 _SOFT_PX = 2.5
 
@@ -112,7 +112,7 @@ def _solved(camera: str, model: LensModel, corners: Corners, size_px: tuple[int,
     sigmas = np.sqrt(np.diag(solved.covariance))
     if not (np.isfinite(solved.fit.lens).all() and np.isfinite(sigmas).all()):
         raise alike
-    if (sigmas[:2] > _UNKNOWN * solved.fit.lens[:2]).any():
+    if (sigmas[:2] > _UNKNOWN * solved.fit.lens[:2]).any() or not tells_focal_length(solved):
         raise alike
     return solved
 

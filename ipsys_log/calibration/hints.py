@@ -5,6 +5,8 @@ from __future__ import annotations
 from collections.abc import Iterator, Sequence
 from dataclasses import replace
 
+import numpy as np
+
 from ipsys_log.calibration.boards import Board
 from ipsys_log.calibration.sighting import Grey, find_board
 from ipsys_log.errors import IpsysError
@@ -20,6 +22,14 @@ _DICTIONARIES = (
 
 def hint(pictures: Sequence[Grey], board: Board) -> str:
     """The end of a sentence that says which other board is seen, or what to look after."""
+    if board.marker_scale is not None:
+        mirrored = [np.ascontiguousarray(grey[:, ::-1]) for grey in pictures]
+        seen = sum(find_board("", grey, board, thorough=False) is not None for grey in mirrored)
+        if seen:
+            return (
+                f"; but in a mirror it is, in {seen} of {len(pictures)} tried: the pictures are mirrored, as "
+                "webcam programs do; turn that off, and take them again"
+            )
     for other, option in _others(board):
         seen = sum(find_board("", grey, other, thorough=False) is not None for grey in pictures)
         if seen:

@@ -2,7 +2,8 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Iterable
+from collections import Counter
+from collections.abc import Callable, Iterable, Sequence
 from dataclasses import dataclass
 
 from ipsys_log.calibration.boards import Board
@@ -17,10 +18,17 @@ __all__ = ["Looked", "NotSeenError", "look"]
 _THOROUGH = 100
 _HINTED = 8
 _CHECKED = 3
+# Pictures of another size are left out where so many are of one.
+_MOST_ARE = 0.75
 
 
 class NotSeenError(IpsysError):
     """A board that is in none of the pictures."""
+
+
+# Width and height in px; of a picture.
+Size = tuple[int, int]
+Sized = tuple[str, Size]
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -53,13 +61,14 @@ def look(
     Raises
     ------
     IpsysError
-        Where pictures are of different sizes, none can be read, or the board is a part of what is seen.
+        Where pictures are of several sizes, none of which most are of; none can be read; or the board is a
+        part of what is seen.
     NotSeenError
         Where the board is in none of them; it says what is.
     """
-    size: tuple[int, int] | None = None
-    first, count = "", 0
-    sightings: list[Sighting] = []
+    count = 0
+    sizes: list[Sized] = []
+    sightings: list[tuple[Size, Sighting]] = []
     unreadable: list[Dropped] = []
     some: list[Grey] = []
     shown: list[Grey] = []
@@ -68,33 +77,42 @@ def look(
         if grey is None:
             unreadable.append(Dropped(name, "cannot be read"))
             continue
-        here = (grey.shape[1], grey.shape[0])
-        _check_same(size, here, first, name, where)
-        size, first = here, first or name
+        size = (grey.shape[1], grey.shape[0])
+        sizes.append((name, size))
         sighting = find_board(name, grey, board, thorough=0 < total <= _THOROUGH)
         if sighting is not None:
-            sightings.append(sighting)
+            sightings.append((size, sighting))
             shown += [grey] if len(shown) < _CHECKED else []
         elif not sightings:
             _remember(some, grey, count, total)
         progress(count)
-    if size is None:
+    if not sizes:
         raise IpsysError(f"{where}: none of {count} pictures can be read")
+    usual, strange = _usual_size(sizes, where)
     if not sightings:
         found = hint(some, board)
         raise NotSeenError(f"{where}: {board} is not seen in any of {count} pictures{found}")
     check_whole(shown, board, where)
-    return Looked(count, size, tuple(sightings), tuple(unreadable))
+    seen = tuple(sighting for size, sighting in sightings if size == usual)
+    return Looked(count, usual, seen, (*unreadable, *strange))
 
 
-def _check_same(
-    size: tuple[int, int] | None, here: tuple[int, int], first: str, name: str, where: str
-) -> None:
-    if size is not None and here != size:
+def _usual_size(sizes: Sequence[Sized], where: str) -> tuple[Size, list[Dropped]]:
+    """The size that most pictures have, and the few of another; an error where these are not few."""
+    usual, many = Counter(size for _, size in sizes).most_common(1)[0]
+    strange = [(name, size) for name, size in sizes if size != usual]
+    if many < _MOST_ARE * len(sizes):
+        like = next(name for name, size in sizes if size == usual)
         raise IpsysError(
-            f"{where}: {name} is {here[0]} x {here[1]} px and {first} is {size[0]} x {size[1]}; "
+            f"{where}: {_sized(*strange[0])} and {_sized(like, usual)}; "
             "a lens is calibrated at one size: take out one kind"
         )
+    reason = "is {} x {} px, most are {} x {}"
+    return usual, [Dropped(name, reason.format(*size, *usual)) for name, size in strange]
+
+
+def _sized(name: str, size: Size) -> str:
+    return f"{name} is {size[0]} x {size[1]} px"
 
 
 def _remember(some: list[Grey], grey: Grey, count: int, total: int) -> None:

@@ -21,6 +21,7 @@ Grey = NDArray[np.uint8]
 LEAST_CORNERS = 6
 # One or two corners are as often something else in the room.
 _SEEN = 4
+_LARGE_PX = 1600
 _THOROUGH = cv2.CALIB_CB_EXHAUSTIVE | cv2.CALIB_CB_NORMALIZE_IMAGE | cv2.CALIB_CB_ACCURACY
 # Where along an edge between two corners its sharpness is read, and how far beside it, in squares: within the
 # white around a marker.
@@ -77,27 +78,35 @@ def find_board(name: str, grey: Grey, board: Board, thorough: bool) -> Sighting 
 
 def _chessboard(grey: Grey, board: Board, thorough: bool) -> tuple[NDArray[np.intp], Array] | None:
     size = (board.columns, board.rows)
-    seen, corners = cv2.findChessboardCornersSB(grey, size)
-    if not seen and thorough:
-        seen, corners = cv2.findChessboardCornersSB(grey, size, flags=_THOROUGH)
-    if not seen:
-        return None
-    return np.arange(board.columns * board.rows), np.asarray(corners, dtype=np.float64).reshape(-1, 2)
+    large = max(grey.shape) > _LARGE_PX
+    small = cv2.resize(grey, None, fx=0.5, fy=0.5, interpolation=cv2.INTER_AREA) if large else grey
+    # A large picture takes long; corners are refined in the whole of it anyway.
+    tries = [(small, 0)] + [(grey, 0)] * large + [(small, _THOROUGH)] * thorough
+    for picture, flags in tries:
+        seen, corners = cv2.findChessboardCornersSB(picture, size, flags=flags)
+        if seen:
+            pixels = np.asarray(corners, dtype=np.float64).reshape(-1, 2)
+            return np.arange(board.columns * board.rows), pixels if picture is grey else 2 * pixels + 0.5
+    return None
 
 
 def _charuco(grey: Grey, board: Board) -> tuple[NDArray[np.intp], Array] | None:
-    corners, ids, _, _ = _charuco_detector(board).detectBoard(grey)
-    if ids is None or len(ids) < _SEEN:
-        return None
-    return np.asarray(ids, dtype=np.intp).ravel(), np.asarray(corners, dtype=np.float64).reshape(-1, 2)
+    # OpenCV before 4.6 printed boards of an even number of rows with a white square first.
+    for legacy in (False, True) if board.rows % 2 == 0 else (False,):
+        corners, ids, _, _ = _charuco_detector(board, legacy).detectBoard(grey)
+        if ids is not None and len(ids) >= _SEEN:
+            return np.asarray(ids, dtype=np.intp).ravel(), np.asarray(corners, dtype=np.float64).reshape(
+                -1, 2
+            )
+    return None
 
 
 @lru_cache(maxsize=32)
-def _charuco_detector(board: Board) -> cv2.aruco.CharucoDetector:
+def _charuco_detector(board: Board, legacy: bool) -> cv2.aruco.CharucoDetector:
     dictionary = cv2.aruco.getPredefinedDictionary(getattr(cv2.aruco, board.dictionary))
     side_m = board.square_m * (board.marker_scale or 0.0)
     printed = cv2.aruco.CharucoBoard((board.columns, board.rows), board.square_m, side_m, dictionary)
-    printed.setLegacyPattern(board.legacy)
+    printed.setLegacyPattern(legacy)
     return cv2.aruco.CharucoDetector(printed)
 
 

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from dataclasses import dataclass
+from typing import NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
@@ -12,7 +13,7 @@ from ipsys_log.calibration.lens_models import LensModel
 from ipsys_log.calibration.start import find_start, fitted_basis
 from ipsys_log.calibration.uncertainty import alike, lens_covariance
 
-__all__ = ["Left", "Solved", "solve"]
+__all__ = ["Left", "Solved", "solve", "tells_focal_length"]
 
 Array = NDArray[np.float64]
 
@@ -27,8 +28,10 @@ _LEAST_CORNERS = 6
 _MOST_ROUNDS = 8
 # Nothing is far off that is this near: pixels are no better.
 _NEAR_PX = 0.05
-# Pixels are square unless the pictures say otherwise, by this and by three standard deviations.
-_SQUARE = 0.01
+# Pixels are square unless the pictures say otherwise: by this and by three standard deviations, or by ten.
+_SQUARE, _SURE, _QUITE_SURE = 0.01, 3.0, 10.0
+# What focal length is tried against that found, and by how many standard deviations it has to fit worse.
+_OTHER_FOCALS, _WORSE, _OTHER_STEPS = (0.7, 1.3), 3.0, 40
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -66,9 +69,33 @@ def solve(model: LensModel, corners: Corners, size_px: tuple[int, int]) -> Solve
     corners : of all pictures, at least 6 in each.
     size_px : width and height of the pictures.
     """
-    everything, pictures, left = corners, np.arange(corners.pictures), []
-    basis = fitted_basis(model, square=True)
-    fit = find_start(model, corners, size_px)
+    start = find_start(model, corners, size_px)
+    purged = _purge(model, start, corners, square=True)
+    fit, covariance, groups, square = _finish(model, purged, size_px)
+    if not square:
+        # What did not belong to square pixels may well belong now.
+        purged = _purge(model, start, corners, square=False)
+        fit, covariance, groups, square = _finish(model, purged, size_px)
+    kept = purged.corners
+    far = int(np.isin(corners.picture, purged.pictures).sum()) - len(kept.picture)
+    missed_px = residuals(model, fit, kept)
+    return Solved(
+        model, fit, covariance, kept, purged.pictures, missed_px, purged.left, far, groups, square
+    )  # fmt: skip
+
+
+class _Purged(NamedTuple):
+    """A fit to what belongs together, of which pictures, and those that were left out."""
+
+    fit: Fit
+    corners: Corners
+    pictures: NDArray[np.intp]
+    left: tuple[Left, ...]
+
+
+def _purge(model: LensModel, fit: Fit, corners: Corners, square: bool) -> _Purged:
+    """Fit, leave out what is far off, and fit again, until nothing is."""
+    basis, pictures, left = fitted_basis(model, square), np.arange(corners.pictures), []
     for _ in range(_MOST_ROUNDS):
         fit = adjust(model, fit, corners, basis, _scale_px(model, fit, corners))
         kept, gone = _belonging(corners, residuals(model, fit, corners))
@@ -78,16 +105,12 @@ def solve(model: LensModel, corners: Corners, size_px: tuple[int, int]) -> Solve
         corners, still = corners.keep(kept)
         pictures = pictures[still]
         fit = Fit(fit.lens, fit.rotations[still], fit.places_m[still])
-    far = int(np.isin(everything.picture, pictures).sum()) - len(corners.picture)
-    fit, covariance, groups, square = _finish(model, fit, corners, size_px)
-    missed_px = residuals(model, fit, corners)
-    return Solved(model, fit, covariance, corners, pictures, missed_px, tuple(left), far, groups, square)
+    return _Purged(fit, corners, pictures, tuple(left))
 
 
-def _finish(
-    model: LensModel, start: Fit, corners: Corners, size_px: tuple[int, int]
-) -> tuple[Fit, Array, int, bool]:
+def _finish(model: LensModel, purged: _Purged, size_px: tuple[int, int]) -> tuple[Fit, Array, int, bool]:
     """The last fit, its covariance (p, p), from how many groups; and whether fx = fy, as mostly."""
+    start, corners = purged.fit, purged.corners
     groups = alike(model, start, corners, size_px)
     found = []
     for square in (False, True):
@@ -99,7 +122,27 @@ def _finish(
     ratio = np.array([1.0, -1.0]) / free.lens[:2]
     sigma = float(np.sqrt(ratio @ covariance[:2, :2] @ ratio))
     off = abs(float(np.log(free.lens[0] / free.lens[1])))
-    return found[0] if off > max(3 * sigma, _SQUARE) else found[1]
+    return found[0] if off > max(_SURE * sigma, min(_SQUARE, _QUITE_SURE * sigma)) else found[1]
+
+
+def tells_focal_length(solved: Solved) -> bool:
+    """Whether another focal length, by three tenths, would fit worse, whatever else of the lens gives way.
+
+    Where the pictures hardly tell it, the cost is no parabola, and a standard deviation says too little.
+    """
+    model, fit, corners = solved.model, solved.fit, solved.corners
+    # Without what fx and fy have to themselves.
+    rest = fitted_basis(model, square=True)[:, 1:]
+    scale_px = _scale_px(model, fit, corners)
+    most = fit.cost + (_WORSE * _spread(solved.residuals_px)) ** 2
+    for factor in _OTHER_FOCALS:
+        lens, nearer = fit.lens * ([factor] * 2 + [1.0] * (len(fit.lens) - 2)), [1.0, 1.0, factor]
+        other = Fit(lens, fit.rotations, fit.places_m * nearer)
+        for basis in (rest[:, :0], rest):
+            other = adjust(model, other, corners, basis, scale_px, _OTHER_STEPS)
+        if other.cost < most:
+            return False
+    return True
 
 
 def _scale_px(model: LensModel, fit: Fit, corners: Corners) -> float:

@@ -29,6 +29,11 @@ _SCALE_PX = 2.0
 _FIRST = ((0, 10), (1, 15))
 _THEN = ((3, 30), (None, 60))
 _KEPT = 4
+# A focal length so many times beyond those tried is none.
+_FLED = 3.0
+_HELD_STEPS = 30
+# Fits so near in cost and focal length lead to the same place.
+_ALIKE = 0.02
 
 
 def find_start(model: LensModel, corners: Corners, size_px: tuple[int, int]) -> Fit:
@@ -42,10 +47,29 @@ def find_start(model: LensModel, corners: Corners, size_px: tuple[int, int]) -> 
     """
     longer = max(size_px)
     shares = _FOCAL_SHARES[model.distortion_model]
-    tried = [_posed(model, corners, size_px, share * longer) for share in shares]
+    posed = [_posed(model, corners, size_px, share * longer) for share in shares]
     # The focal length alone shows which of them are hopeless.
-    tried = sorted((_freed(model, fit, corners, _FIRST) for fit in tried), key=lambda fit: fit.cost)
-    return min((_freed(model, fit, corners, _THEN) for fit in tried[:_KEPT]), key=lambda fit: fit.cost)
+    tried = [_freed(model, fit, corners, _FIRST) for fit in posed]
+    best = _best(model, tried, corners)
+    if shares[0] / _FLED <= best.lens[0] / longer <= shares[-1] * _FLED:
+        return best
+    # Boards that are hardly tilted look much the same at a far shorter focal length, tilted less still. While
+    # lines may not bend, that looks better; so let them bend first.
+    tried = [_bent(model, fit, corners) for fit in posed]
+    return min(best, _best(model, tried, corners), key=lambda fit: fit.cost)
+
+
+def _best(model: LensModel, tried: list[Fit], corners: Corners) -> Fit:
+    """The best that the most promising fits lead to, each of those that are alike but once."""
+    kept: list[Fit] = []
+    for fit in sorted(tried, key=lambda fit: fit.cost):
+        alike = any(_near(fit.cost, one.cost) and _near(fit.lens[0], one.lens[0]) for one in kept)
+        kept += [] if alike or len(kept) == _KEPT else [fit]
+    return min((_freed(model, fit, corners, _THEN) for fit in kept), key=lambda fit: fit.cost)
+
+
+def _near(one: float, other: float) -> bool:
+    return abs(one - other) <= _ALIKE * abs(other)
 
 
 def _posed(model: LensModel, corners: Corners, size_px: tuple[int, int], focal_px: float) -> Fit:
@@ -64,6 +88,14 @@ def _freed(model: LensModel, fit: Fit, corners: Corners, plan: tuple[tuple[int |
     for unknowns, steps in plan:
         fit = adjust(model, fit, corners, basis[:, :unknowns], _SCALE_PX, steps)
     return fit
+
+
+def _bent(model: LensModel, fit: Fit, corners: Corners) -> Fit:
+    """A fit of all but the focal length."""
+    basis = fitted_basis(model, square=True)
+    return adjust(
+        model, _freed(model, fit, corners, _FIRST[:1]), corners, basis[:, 1:], _SCALE_PX, _HELD_STEPS
+    )
 
 
 def fitted_basis(model: LensModel, square: bool) -> Array:

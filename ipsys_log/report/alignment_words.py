@@ -31,16 +31,17 @@ def advise(alignment: Alignment) -> str:
     >>> advise(Alignment("red", ()))[:32]
     'lay four or more markers on the '
     """
-    if not alignment.lying:
-        return "lay four or more markers on the floor, out to the edges of its picture: none lies still there"
-    if len(alignment.lying) == 1:
-        return "lay three or more markers on the floor, out to the edges of its picture: one says nothing"
+    if len(alignment.lying) < 2:
+        count, so = ("three", "one says nothing") if alignment.lying else ("four", "none lies still there")
+        return f"lay {count} or more markers on the floor, out to the edges of its picture: {so}"
     if alignment.axes == 0:
         return "lay its markers further apart, out to the edges of its picture"
+    if alignment.axes == 1 and alignment.level is None:
+        return f"lay one aside of the line of its markers: along it the spread is under {_LEVEL_CM}"
     aside = "; its tilt is known along the line of its markers only: lay one aside of it"
     rest = aside if alignment.axes == 1 else ""
     if alignment.level:
-        return f"nothing: it is level, the spread is under {_LEVEL_CM}{rest}"
+        return f"nothing: it is level, the spread is under {_LEVEL_CM}"
     turns = _turns(alignment)
     if alignment.left_m is not None and alignment.left_m >= LEVEL_M:
         what = (

@@ -155,7 +155,13 @@ def test_one_and_two_markers_and_markers_on_a_line() -> None:
     assert two.axes == 1
     assert degrees(two.tilt_rad) == pytest.approx(5.0, abs=0.1)
     assert "along the line of its markers only" in advise(two)
-    assert degrees(align_camera("red", lying[1:3]).tilt_rad) < 0.5  # across it they know nothing
+    across = align_camera("red", lying[1:3])
+    assert degrees(across.tilt_rad) < 0.5  # across it they know nothing
+    assert across.spread_m is not None
+    assert across.spread_m < LEVEL_M
+    assert across.level is None  # not green: it hangs askew by 5 degrees
+    assert advise(across).startswith("lay one aside of the line of its markers")
+    assert two.level is False
     line = [
         Lying(n, lying[0].point_m + n * (lying[1].point_m - lying[0].point_m) / 5, np.zeros((3, 3)))
         for n in range(6)

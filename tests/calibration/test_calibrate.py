@@ -18,13 +18,18 @@ BOARD = Board(6, 4, 0.03)
 
 
 def sightings(
-    places_m: list[tuple[float, float, float]], tilt_rad: float, noise_px: float = 0.1, blur_px: float = 0.8
+    places_m: list[tuple[float, float, float]],
+    tilt_rad: float,
+    noise_px: float = 0.1,
+    blur_px: float = 0.8,
+    seed: int = 0,
+    name: str = "pinhole",
 ) -> Looked:
     """Boards at these places, each tilted to another side."""
-    rng, found = np.random.default_rng(0), []
+    rng, found = np.random.default_rng(seed), []
     for n, place_m in enumerate(places_m):
         turn = Rotation.from_rotvec([tilt_rad * np.cos(n * 2.4), tilt_rad * np.sin(n * 2.4), 0]).as_matrix()
-        pixels = pixels_of("pinhole", TRUTH["pinhole"], grid_m() @ turn.T + place_m)
+        pixels = pixels_of(name, TRUTH[name], grid_m() @ turn.T + place_m)
         pixels += rng.normal(0, noise_px, pixels.shape)
         found.append(Sighting(f"{n}.png", np.arange(24), pixels, blur_px, pixels[[0, 5, 23, 18]]))
     return Looked(len(found), SIZE_PX, tuple(found), ())
@@ -67,6 +72,21 @@ def test_a_board_that_was_hardly_tilted() -> None:
 def test_a_board_that_was_never_tilted_tells_no_focal_length() -> None:
     with pytest.raises(IpsysError, match="tilt it to all sides"):
         calibrated(sightings([(x, 0.0, 0.5) for x in np.linspace(-0.03, 0.03, 10)], 0.0, noise_px=0.3))
+
+
+@pytest.mark.parametrize("name", ["fisheye", "pinhole", "pinhole4"])
+def test_boards_along_the_image_tell_no_focal_length_near_and_far(name: str) -> None:
+    """Else it runs away to a hundredth of itself, with a standard deviation that says otherwise."""
+    looked = sightings(everywhere(), 0.0, name=name)
+    with pytest.raises(IpsysError, match="tilt it to all sides"):
+        calibrate("red", looked, BOARD, LENSES[name])
+
+
+def test_boards_that_were_hardly_tilted_tell_it_as_well_as_they_can() -> None:
+    """While lines may not bend yet, a far shorter focal length fits better."""
+    for seed in range(2):
+        found = calibrated(sightings(everywhere(), 0.12, noise_px=0.05, seed=seed))
+        assert abs(found.values[0] - 600) < min(4 * found.sigmas[0], 60)
 
 
 def test_pictures_that_are_all_soft() -> None:

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Callable
+from functools import cache
 
 import cv2
 import numpy as np
@@ -12,6 +13,7 @@ from scipy.ndimage import gaussian_filter
 
 from ipsys_log.calibration.boards import Board, parse_board
 from ipsys_log.calibration.choose import MOST_PICTURES, choose
+from ipsys_log.calibration.look import look
 from ipsys_log.calibration.sighting import Sighting, find_board
 from ipsys_log.errors import IpsysError
 from tests.calibration.boards_seen import Array, chessboard_pattern, pixels_of, random_pose, render
@@ -26,10 +28,11 @@ def straight_rays(pixels: Array) -> Array:
     return np.asarray(rays / np.linalg.norm(rays, axis=1, keepdims=True))
 
 
-def charuco_pattern(board: Board) -> Callable[[Array], Array]:
-    """Grey levels of places on a ChArUco board, as OpenCV prints it."""
+def charuco_pattern(board: Board, legacy: bool = False) -> Callable[[Array], Array]:
+    """Grey levels of places on a ChArUco board, as OpenCV prints it, or did before 4.6."""
     dictionary = cv2.aruco.getPredefinedDictionary(getattr(cv2.aruco, board.dictionary))
     printed = cv2.aruco.CharucoBoard((board.columns, board.rows), 1.0, board.marker_scale or 0, dictionary)
+    printed.setLegacyPattern(legacy)
     picture = printed.generateImage((board.columns * 240, board.rows * 240))
     size = np.array([board.columns, board.rows])
 
@@ -43,20 +46,28 @@ def charuco_pattern(board: Board) -> Callable[[Array], Array]:
     return levels
 
 
-def drawn(
-    board: Board, seed: int, blur_px: float, gamma: float = 1.0, z_m: float = 0.42
-) -> tuple[NDArray[np.uint8], Array]:
-    """A picture of a board, and its true corners."""
+@cache
+def scene(board: Board, seed: int, z_m: float, legacy: bool) -> tuple[NDArray[np.uint8], Array]:
+    """A sharp picture of a board, and its true corners."""
     rng = np.random.default_rng(seed)
-    pattern = chessboard_pattern(board.columns, board.rows, board.square_m)
     turn, place_m = random_pose(rng, "pinhole")
     place_m = np.array([0.1 * place_m[0], 0.1 * place_m[1], z_m])
-    pattern = pattern if board.marker_scale is None else charuco_pattern(board)
+    if board.marker_scale is None:
+        pattern = chessboard_pattern(board.columns, board.rows, board.square_m)
+    else:
+        pattern = charuco_pattern(board, legacy)
     picture = render(straight_rays, turn, place_m, pattern, (640, 480), rng)
-    light = gaussian_filter(picture.astype(float), blur_px)
-    picture = np.round(255 * (light / 255) ** (1 / gamma)).astype(np.uint8)
     corners = board.points_m(np.arange(board.grid[0] * board.grid[1])) @ turn.T + place_m
     return picture, pixels_of("pinhole", PINHOLE, corners)
+
+
+def drawn(
+    board: Board, seed: int, blur_px: float, gamma: float = 1.0, z_m: float = 0.42, legacy: bool = False
+) -> tuple[NDArray[np.uint8], Array]:
+    """A picture of a board as a camera takes it, and its true corners."""
+    picture, truth = scene(board, seed, z_m, legacy)
+    light = gaussian_filter(picture.astype(float), blur_px)
+    return np.round(255 * (light / 255) ** (1 / gamma)).astype(np.uint8), truth
 
 
 @pytest.mark.parametrize("board", [CHESSBOARD, CHARUCO], ids=["chessboard", "charuco"])
@@ -105,6 +116,42 @@ def test_an_inverted_board() -> None:
     sighting = find_board("a", negative, inverted, thorough=False)
     assert sighting is not None
     assert len(sighting.ids) == 12
+
+
+def test_a_large_picture_is_searched_at_half_its_size_and_refined_at_its_own() -> None:
+    picture, truth = drawn(CHESSBOARD, 1, 0.7)
+    large = np.asarray(cv2.resize(picture, None, fx=3, fy=3, interpolation=cv2.INTER_CUBIC), dtype=np.uint8)
+    sighting = find_board("a", large, CHESSBOARD, thorough=False)
+    assert sighting is not None
+    off = [np.linalg.norm(sighting.pixels - (3 * corners + 1), axis=1) for corners in (truth, truth[::-1])]
+    assert min(float(each.max()) for each in off) < 0.3
+
+
+def test_a_board_as_opencv_printed_it_before_4_6() -> None:
+    """Of an even number of rows, it begins with a white square."""
+    picture, truth = drawn(CHARUCO, 2, 0.7, legacy=True)
+    assert (picture != drawn(CHARUCO, 2, 0.7)[0]).mean() > 0.1
+    sighting = find_board("a", picture, CHARUCO, thorough=False)
+    assert sighting is not None
+    assert len(sighting.ids) == 12
+    assert np.abs(sighting.pixels - truth[sighting.ids]).max() < 0.15
+
+
+def test_mirrored_pictures_are_said_to_be() -> None:
+    """Markers are not found in a mirror. A chessboard is, and looks as it always does."""
+    pictures = [np.ascontiguousarray(drawn(CHARUCO, seed, 0.7)[0][:, ::-1]) for seed in range(2)]
+    said = "in a mirror it is, in 2 of 2 tried: the pictures are mirrored"
+    with pytest.raises(IpsysError, match=said):
+        look([("a", pictures[0]), ("b", pictures[1])], CHARUCO, 2, "red")
+
+
+def test_pictures_of_the_same_name_of_which_one_has_another_size() -> None:
+    """Two folders of one camera may have pictures of one name."""
+    grey = drawn(CHARUCO, 0, 0.7)[0]
+    small = np.ascontiguousarray(grey[100:, 100:])
+    looked = look([("a", grey), ("a", small), ("a", grey), ("a", grey)], CHARUCO, 4, "red")
+    assert len(looked.sightings) == 3
+    assert looked.unreadable == (("a", "is 540 x 380 px, most are 640 x 480"),)
 
 
 def sighting(name: str, x: float, y: float, blur_px: float = 0.8, count: int = 24) -> Sighting:

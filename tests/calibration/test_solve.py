@@ -75,6 +75,25 @@ def test_pixels_that_are_not_square() -> None:
     assert (np.abs(found.fit.lens - stretched) < 4 * sigmas).all()
 
 
+def test_pixels_that_are_hardly_not_square() -> None:
+    """By half a per cent, in pictures that are good enough to tell."""
+    stretched = (600.0, 603.0, *TRUTH["pinhole"][2:])
+    corners = seen("pinhole", np.random.default_rng(0), noise_px=0.03, lens=stretched)
+    found = solve(LENSES["pinhole"], corners, SIZE_PX)
+    assert not found.square
+    assert np.sqrt((found.residuals_px**2).sum(axis=1).mean()) < 0.05
+
+
+def test_what_does_not_belong_is_told_by_pixels_that_are_not_square() -> None:
+    """Taken for square, all pictures are off, so that one more is not noticed."""
+    stretched = (600.0, 618.0, *TRUTH["pinhole"][2:])
+    corners = seen("pinhole", np.random.default_rng(0), lens=stretched)
+    corners.pixels[corners.picture == 12] += np.random.default_rng(9).normal(0, 0.6, (24, 2))
+    found = solve(LENSES["pinhole"], corners, SIZE_PX)
+    assert [left.picture for left in found.left] == [12]
+    assert (np.abs(found.fit.lens - stretched) < 4 * np.sqrt(np.diag(found.covariance))).all()
+
+
 def spoiled(corners: Corners) -> Corners:
     """Ten corners 5 to 20 px off, and one picture in which a print was another one."""
     rng = np.random.default_rng(9)

@@ -199,9 +199,19 @@ def test_too_few_pictures(ipsys: Ipsys, red: Path, tmp_path: Path) -> None:
 
 
 def test_pictures_of_two_sizes(ipsys: Ipsys, red: Path, tmp_path: Path) -> None:
-    cv2.imwrite(str(red / "99.png"), np.zeros((480, 640), np.uint8))
+    for n in range(9):
+        cv2.imwrite(str(red / f"99{n}.png"), np.zeros((480, 640), np.uint8))
     line = refused(ipsys, tmp_path, red, "--board", "6x4", "-o", tmp_path)
-    assert "99.png is 640 x 480 px and 0.png is 480 x 360" in line
+    assert "990.png is 640 x 480 px and 0.png is 480 x 360 px; a lens is calibrated at one size" in line
+
+
+def test_a_stray_picture_of_another_size_is_left_out_and_named(
+    ipsys: Ipsys, red: Path, tmp_path: Path
+) -> None:
+    cv2.imwrite(str(red / "99.png"), np.zeros((480, 640), np.uint8))
+    done = calibrate(ipsys, red, "--board", "6x4", "-o", tmp_path)
+    assert done.code == 0, done.err
+    assert "99.png: is 640 x 480 px, most are 480 x 360" in done.out
 
 
 def test_a_picture_that_cannot_be_read_is_left_out_and_named(ipsys: Ipsys, red: Path, tmp_path: Path) -> None:

@@ -149,7 +149,7 @@ def local_points(camera: Camera, x: float, y: float, z: float, turn: float, px: 
     mx, my = (px[..., 0] - K[0, 2]) / K[0, 0], (px[..., 1] - K[1, 2]) / K[1, 1]
     bent = np.hypot(mx, my)
     below, above = np.zeros_like(bent), np.full_like(bent, 1.4)
-    for _ in range(45):
+    for _ in range(32):
         theta = (below + above) / 2
         t2 = theta**2
         high = theta * (1 + t2 * (D[0] + t2 * (D[1] + t2 * (D[2] + t2 * D[3])))) > bent

@@ -29,9 +29,9 @@ from ipsys_log.sources.simulator.places import place
 
 Array = NDArray[np.float64]
 
-ROW_NS = 31_000
+ROW_NS = 62_000
 # An exposure of so many row times, about 1/60 s: that many frozen frames lie within it.
-FRAMES = 537
+FRAMES = 269
 EXPOSURE_S = FRAMES * ROW_NS * 1e-9
 SPEED_M_S = 2.0
 STILL = LabSettings(noise_sigma=0.0)

@@ -31,10 +31,10 @@ from rounds import Row
 from scenes import drawn
 
 from ipsys_log import pipeline
-from ipsys_log.latency import latency_percentiles, recorded_latencies, step_times_s
 from ipsys_log.log.session import Session
 from ipsys_log.messages import FRAME_SKIPPED, CompressedImage, Event
-from ipsys_log.request import Request
+from ipsys_log.recording.latency import latency_percentiles, recorded_latencies, step_times_s
+from ipsys_log.runs.request import Request
 from ipsys_log.sources.simulator import LabSettings
 
 __all__ = ["measure"]

@@ -37,7 +37,7 @@ _CAMERAS = 3
 
 def _whole(path: Path) -> Turn:
     from ipsys_log.pipeline import replay
-    from ipsys_log.request import Request
+    from ipsys_log.runs.request import Request
 
     target = path.with_name("replayed.mcap")
     target.unlink(missing_ok=True)

@@ -15,7 +15,7 @@ from numpy.typing import NDArray
 
 from ipsys_log.log.session import Session
 from ipsys_log.messages import CompressedImage, Message, Tracks
-from ipsys_log.output import write_log
+from ipsys_log.runs.output import write_log
 from ipsys_log.sources import simulator
 from ipsys_log.sources.simulator import LabSettings, hang_cameras, simulate, true_corners
 from ipsys_log.sources.simulator.places import Place, place

@@ -20,9 +20,9 @@ fuse            positions           tracks, poses     the run of its positions
 ==============  ==================  ================  =====================================
 
 The rig is read by all, by locate only for models that are told the height of a marker.
-:mod:`ipsys_log.tasks` says in full what each stage reads, :mod:`ipsys_log.perform` how its run is
-found or made, :mod:`ipsys_log.recording` how frames get from the cameras into the log and from there,
-as long as the stages keep up, to them.
+:mod:`ipsys_log.runs` says in full what each stage reads (``tasks``) and how its run is found or made
+(``perform``), :mod:`ipsys_log.recording` how frames get from the cameras into the log (``recorder``) and from
+there, as long as the stages keep up, to them (``waiting``).
 """
 
 from __future__ import annotations
@@ -38,10 +38,7 @@ from typing import Any
 from threadpoolctl import threadpool_limits
 
 from ipsys_log.errors import IpsysError, LogError
-from ipsys_log.latency import Ledger
-from ipsys_log.live_plan import check_pictures, plan_live
 from ipsys_log.log.session import Session
-from ipsys_log.lookup import wanted_models
 from ipsys_log.messages import (
     CameraPoints,
     Evaluation,
@@ -54,17 +51,20 @@ from ipsys_log.messages import (
     Positions,
     Tracks,
 )
-from ipsys_log.output import opened_target
-from ipsys_log.perform import inputs, perform, sign
-from ipsys_log.preflight import check_inputs
-from ipsys_log.recent import Recent
-from ipsys_log.recording import TICK, Backlog, Recording, recording, written
-from ipsys_log.request import Progress, Request
-from ipsys_log.runs import Outcome
+from ipsys_log.recording.latency import Ledger
+from ipsys_log.recording.plan import check_pictures, plan_live
+from ipsys_log.recording.recent import Recent
+from ipsys_log.recording.recorder import TICK, Backlog, Recording, recording, written
+from ipsys_log.runs.lookup import wanted_models
+from ipsys_log.runs.output import opened_target
+from ipsys_log.runs.perform import inputs, perform, sign
+from ipsys_log.runs.preflight import check_inputs
+from ipsys_log.runs.records import Outcome
+from ipsys_log.runs.request import Progress, Request
+from ipsys_log.runs.tasks import STAGES, Task, plan_stage
+from ipsys_log.runs.threads import in_threads
 from ipsys_log.sources.attached import Attached
 from ipsys_log.sources.frames import SourceError
-from ipsys_log.tasks import STAGES, Task, plan_stage
-from ipsys_log.threads import in_threads
 
 __all__ = ["TOPICS", "Stage", "carry_out", "in_threads", "live", "measure", "record", "replay", "run"]
 

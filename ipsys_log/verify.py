@@ -13,9 +13,9 @@ from ipsys_log.errors import IpsysError
 from ipsys_log.log.session import Session, run_of_topic
 from ipsys_log.messages import CameraCalibration, CameraPoints, Markers, Message, Model, Positions, Run
 from ipsys_log.pipeline import carry_out
-from ipsys_log.request import Progress, Request
+from ipsys_log.runs.request import Progress, Request
+from ipsys_log.runs.tasks import Task, plan_stage
 from ipsys_log.stages.camera_frame import PERIMETER
-from ipsys_log.tasks import Task, plan_stage
 
 __all__ = ["diff", "verify"]
 

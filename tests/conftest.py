@@ -18,9 +18,9 @@ os.environ.setdefault("OPENBLAS_NUM_THREADS", "1")
 from ipsys_log.cli import main
 from ipsys_log.log.session import Session
 from ipsys_log.messages import CompressedVideo, Measurement, Message
-from ipsys_log.output import write_log
 from ipsys_log.pipeline import replay
-from ipsys_log.request import Request
+from ipsys_log.runs.output import write_log
+from ipsys_log.runs.request import Request
 from ipsys_log.sources.simulator import LabSettings, simulate
 from ipsys_log.sources.videos import open_video
 from tests.sources.streams import encode

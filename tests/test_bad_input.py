@@ -24,7 +24,7 @@ from ipsys_log.messages import (
     Rig,
     RigMarker,
 )
-from ipsys_log.output import write_log
+from ipsys_log.runs.output import write_log
 from ipsys_log.units import format_time
 from tests.conftest import Ipsys
 

@@ -14,10 +14,7 @@ import pytest
 from ipsys_log import pipeline
 from ipsys_log.compare import Comparison
 from ipsys_log.errors import IpsysError
-from ipsys_log.live_scene import LiveScene
 from ipsys_log.log.session import Session
-from ipsys_log.lookup import find_pairs
-from ipsys_log.lookup import measured as measured_places
 from ipsys_log.measuring.check import check_entry
 from ipsys_log.measuring.entry import Typed, read_typed
 from ipsys_log.measuring.scene import look
@@ -33,9 +30,12 @@ from ipsys_log.messages import (
     Run,
     Tracks,
 )
-from ipsys_log.output import write_log
-from ipsys_log.recording import first_messages
-from ipsys_log.request import Request
+from ipsys_log.recording.recorder import first_messages
+from ipsys_log.runs.lookup import find_pairs
+from ipsys_log.runs.lookup import measured as measured_places
+from ipsys_log.runs.output import write_log
+from ipsys_log.runs.request import Request
+from ipsys_log.scenes.live import LiveScene
 from ipsys_log.sources.attached import Attached
 from ipsys_log.sources.frames import Clock
 from ipsys_log.stages.detect import Detect

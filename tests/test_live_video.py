@@ -14,8 +14,8 @@ import pytest
 from ipsys_log import pipeline
 from ipsys_log.log.session import Session
 from ipsys_log.messages import FRAME_SKIPPED, CompressedVideo, Message, RigCamera
-from ipsys_log.recording import first_messages
-from ipsys_log.request import Request
+from ipsys_log.recording.recorder import first_messages
+from ipsys_log.runs.request import Request
 from ipsys_log.sources.attached import Attached
 from ipsys_log.sources.frames import Clock
 from ipsys_log.sources.network import open_network

@@ -22,7 +22,7 @@ import pytest
 
 from ipsys_log.log.session import Session
 from ipsys_log.messages import CompressedImage, Measurement, Message
-from ipsys_log.output import write_log
+from ipsys_log.runs.output import write_log
 from ipsys_log.units import NS_PER_S
 from tests.conftest import Ipsys
 from tests.test_measure import foreign_read

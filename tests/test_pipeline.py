@@ -27,10 +27,10 @@ from ipsys_log.messages import (
     Rig,
     Tracks,
 )
-from ipsys_log.output import write_log
 from ipsys_log.pipeline import Stage, in_threads, replay, run
-from ipsys_log.request import Request
 from ipsys_log.rig import load_rig
+from ipsys_log.runs.output import write_log
+from ipsys_log.runs.request import Request
 from tests.conftest import Ipsys, data_section
 
 RIG_TOML = """
@@ -286,7 +286,7 @@ def test_one_camera_alone(ipsys: Ipsys, lab: Path, tmp_path: Path, camera: str) 
 def test_new_measurements_make_the_model_out_of_date(ipsys: Ipsys, lab: Path) -> None:
     from ipsys_log.log import LogWriter
     from ipsys_log.messages import Measurement
-    from ipsys_log.output import write_messages
+    from ipsys_log.runs.output import write_messages
 
     ipsys("replay", lab)
     with Session([lab]) as session:

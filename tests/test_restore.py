@@ -18,9 +18,9 @@ from ipsys_log.log import LogReader, LogWriter, repair
 from ipsys_log.log.records import ChunkRef
 from ipsys_log.log.session import Session
 from ipsys_log.messages import Event, Markers, Message, Tracks
-from ipsys_log.output import write_message
-from ipsys_log.request import Request
 from ipsys_log.restore import finish_runs
+from ipsys_log.runs.output import write_message
+from ipsys_log.runs.request import Request
 from ipsys_log.stages.detect import Detect
 from ipsys_log.verify import verify
 from tests.conftest import Ipsys

@@ -12,8 +12,8 @@ import scipy.io
 
 from ipsys_log.log.session import Session
 from ipsys_log.messages import Message, Model, Positions, Rig, RigMarker
-from ipsys_log.output import write_log
 from ipsys_log.rig import rig_toml
+from ipsys_log.runs.output import write_log
 from tests import labs
 from tests.conftest import Ipsys
 

@@ -19,13 +19,14 @@ import pytest
 from numpy.typing import NDArray
 from rerun.chunk import RrdReader
 
-from ipsys_log import monitor, pipeline
-from ipsys_log.finished import opened_log
-from ipsys_log.live_scene import LiveScene
+from ipsys_log import pipeline
 from ipsys_log.log.session import Session
 from ipsys_log.messages import CompressedVideo, Markers, Message, Tracks
-from ipsys_log.monitor import Monitor
-from ipsys_log.request import Request
+from ipsys_log.recording import monitor
+from ipsys_log.recording.monitor import Monitor
+from ipsys_log.runs.request import Request
+from ipsys_log.scenes.finished import opened_log
+from ipsys_log.scenes.live import LiveScene
 from ipsys_log.sinks.rerun import write_recording
 from ipsys_log.sinks.rerun_live import LiveView, Write
 from ipsys_log.sources.attendant import CameraState

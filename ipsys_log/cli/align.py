@@ -92,8 +92,8 @@ def _prepared_now(
 ) -> Lab:
     """The cameras to look at, when everything is said that can be said before they are opened."""
     from ipsys_log.errors import IpsysError
-    from ipsys_log.live_plan import check_start
-    from ipsys_log.request import Request
+    from ipsys_log.recording.plan import check_start
+    from ipsys_log.runs.request import Request
 
     if rig is None:
         raise IpsysError("name a log, or give --rig lab.toml to take what its cameras send now")
@@ -109,7 +109,7 @@ def _align(logs: list[Path], options: dict[str, Any], plot: Path | None, as_json
     from ipsys_log.messages import CameraPoints, Markers, Rig
     from ipsys_log.report.alignment import read_alignment
     from ipsys_log.rig import load_rig
-    from ipsys_log.runs import newest_run
+    from ipsys_log.runs.records import newest_run
     from ipsys_log.sinks.shown import rig_in_force
 
     given = load_rig(options["rig"]) if options["rig"] else None

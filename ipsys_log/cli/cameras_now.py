@@ -108,8 +108,8 @@ def opened(
     IpsysError
         Where a camera cannot be opened, or its frames do not fit its lens.
     """
-    from ipsys_log.monitor import Monitor
-    from ipsys_log.recording import first_messages, fitting_lenses
+    from ipsys_log.recording.monitor import Monitor
+    from ipsys_log.recording.recorder import first_messages, fitting_lenses
     from ipsys_log.report.cameras import LiveStatus
     from ipsys_log.sources.attached import Attached
     from ipsys_log.sources.devices import open_source

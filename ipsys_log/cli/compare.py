@@ -100,7 +100,7 @@ def latency(
     """Show how long each step took when a log was recorded live, from the frame to its position."""
     from dataclasses import asdict
 
-    from ipsys_log.latency import latency_percentiles, recorded_latencies, step_times_s
+    from ipsys_log.recording.latency import latency_percentiles, recorded_latencies, step_times_s
     from ipsys_log.report.cameras import latency_table
     from ipsys_log.report.files import check_picture
 

@@ -11,8 +11,8 @@ from typing import TYPE_CHECKING
 from rich.console import Console
 
 if TYPE_CHECKING:
-    from ipsys_log.request import Progress
-    from ipsys_log.runs import Outcome
+    from ipsys_log.runs.records import Outcome
+    from ipsys_log.runs.request import Progress
 
 __all__ = ["console", "print_outcomes", "progress_bar", "remarks"]
 

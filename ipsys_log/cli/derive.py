@@ -28,8 +28,8 @@ from ipsys_log.cli.options import (
 if TYPE_CHECKING:
     from ipsys_log.log.session import Session
     from ipsys_log.report.accuracy import Accuracy
-    from ipsys_log.request import Request
-    from ipsys_log.runs import Outcome
+    from ipsys_log.runs.records import Outcome
+    from ipsys_log.runs.request import Request
 
 __all__ = ["EVALUATE", "MORE", "add_commands", "build_command", "derived", "options_of"]
 
@@ -182,8 +182,8 @@ def build_command(options: Mapping[str, tuple[Any, Any]], work: Callable[..., No
 
 
 def _request(logs: list[Path], **given: Any) -> Request:
-    from ipsys_log.request import Request
     from ipsys_log.rig import check_name, load_rig
+    from ipsys_log.runs.request import Request
 
     rig, run = given.pop("rig"), given.pop("run")
     models = tuple(given.pop("model", None) or ())

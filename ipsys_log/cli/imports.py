@@ -27,7 +27,7 @@ def imsel(
 ) -> None:
     """The measurements behind the paper (Ou et al., Robotica 2023): .mat files and camera YAMLs."""
     from ipsys_log.formats.imsel import read_imsel
-    from ipsys_log.output import write_log
+    from ipsys_log.runs.output import write_log
 
     counts = write_log(output, read_imsel(folder))
     console.print(f"{output} written: {sum(counts.values())} messages on {len(counts)} channels")
@@ -52,8 +52,8 @@ def images(
 ) -> None:
     """A folder of pictures, one sub-folder per camera; without --times the n-th of each belong together."""
     from ipsys_log.cli.options import load_calibrations
-    from ipsys_log.output import write_log
     from ipsys_log.rig import load_rig
+    from ipsys_log.runs.output import write_log
     from ipsys_log.sources.files import find_pictures, read_images
     from ipsys_log.sources.picture_times import find_times
 
@@ -80,8 +80,8 @@ def videos(
 ) -> None:
     """Videos that begin at one instant. MJPEG, H.264 and H.265 go into the log as they are."""
     from ipsys_log.cli.options import load_calibrations
-    from ipsys_log.output import write_log
     from ipsys_log.rig import load_rig
+    from ipsys_log.runs.output import write_log
     from ipsys_log.sources.picture_times import parse_start
     from ipsys_log.sources.videos import read_videos
 

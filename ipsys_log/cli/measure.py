@@ -27,9 +27,9 @@ from ipsys_log.cli.options import (
 )
 
 if TYPE_CHECKING:
-    from ipsys_log.finished import FinishedLog
     from ipsys_log.measuring.scene import Scene
     from ipsys_log.messages import Measurement
+    from ipsys_log.scenes.finished import FinishedLog
 
 __all__ = ["add_commands", "serve_page"]
 
@@ -128,10 +128,10 @@ def _measure_log(
     corners: str | None,
     as_json: bool,
 ) -> None:
-    from ipsys_log.finished import opened_log
-    from ipsys_log.request import Request
     from ipsys_log.rig import load_rig
-    from ipsys_log.sheets import add_sheet, check_sheet
+    from ipsys_log.runs.request import Request
+    from ipsys_log.scenes.finished import opened_log
+    from ipsys_log.scenes.sheets import add_sheet, check_sheet
 
     lenses = load_calibrations(calibration, lambda: cameras_of([log]))
     request = Request(rig=load_rig(rig) if rig else None, lenses=lenses, corners=corners)

@@ -15,9 +15,9 @@ from ipsys_log.cli.cameras_now import Lab, check_target, opened, prepared, shown
 from ipsys_log.cli.console import console, remarks
 
 if TYPE_CHECKING:
-    from ipsys_log.live_scene import LiveScene
     from ipsys_log.messages import Measurement, Message, Model
-    from ipsys_log.request import Request
+    from ipsys_log.runs.request import Request
+    from ipsys_log.scenes.live import LiveScene
     from ipsys_log.sources.attached import Attached
 
 __all__ = ["live_scene", "measure_now", "ready_to_measure", "served"]
@@ -41,7 +41,7 @@ def measure_now(
 ) -> list[Measurement]:
     """Measure places into a new log with a second of frames of each; what was measured and withdrawn."""
     from ipsys_log import pipeline
-    from ipsys_log.request import Request
+    from ipsys_log.runs.request import Request
 
     lab, request = prepared(rig, camera, calibration), Request(corners=corners)
     model = ready_to_measure(lab, request, model_from)
@@ -66,10 +66,10 @@ def measure_now(
 
 def ready_to_measure(lab: Lab, request: Request, model_from: Path | None) -> Model | None:
     """See that places can be measured with these cameras; the newest model of another log, if it is named."""
-    from ipsys_log.live_plan import check_model, check_start
     from ipsys_log.log.session import Session
-    from ipsys_log.lookup import fitted_in
     from ipsys_log.measuring.entry import check_references
+    from ipsys_log.recording.plan import check_model, check_start
+    from ipsys_log.runs.lookup import fitted_in
 
     check_references(lab.rig)
     check_start(lab.rig, lab.names, lab.lenses, request, "camera-frame")
@@ -83,7 +83,7 @@ def ready_to_measure(lab: Lab, request: Request, model_from: Path | None) -> Mod
 
 def live_scene(settings: list[Message], cameras: Attached, model: Model | None) -> LiveScene:
     """What the cameras see now, to measure on."""
-    from ipsys_log.live_scene import LiveScene
+    from ipsys_log.scenes.live import LiveScene
 
     return LiveScene(settings[0].payload, model, cameras.states, cameras.add)
 

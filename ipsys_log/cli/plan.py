@@ -65,11 +65,11 @@ def plan(
 
     A model that the log does not hold yet is fitted first, to the places measured so far.
     """
-    from ipsys_log.lookup import copied_run
     from ipsys_log.messages import Rig
     from ipsys_log.report.files import check_picture
     from ipsys_log.report.plan import plan_floor
     from ipsys_log.rig import load_rig
+    from ipsys_log.runs.lookup import copied_run
     from ipsys_log.sinks.shown import rig_in_force
 
     given = load_rig(rig) if rig else None
@@ -107,8 +107,8 @@ def _check(logs: list[Path], rig: Rig | None, model: str, places: int, heights_m
     """See that there is something to plan, before anything is fitted."""
     from ipsys_log.errors import IpsysError
     from ipsys_log.log.session import Session
-    from ipsys_log.lookup import copied_run, measured
     from ipsys_log.messages import Rig
+    from ipsys_log.runs.lookup import copied_run, measured
 
     if not 1 <= places <= _MOST_PLACES:
         raise IpsysError(

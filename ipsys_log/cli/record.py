@@ -25,7 +25,7 @@ from ipsys_log.cli.options import (
 
 if TYPE_CHECKING:
     from ipsys_log.messages import Message
-    from ipsys_log.request import Request
+    from ipsys_log.runs.request import Request
     from ipsys_log.sinks.rerun_live import LiveView
     from ipsys_log.sources.attached import Attached
 
@@ -63,8 +63,8 @@ def record(
     from ipsys_log import pipeline
     from ipsys_log.cli.measure_now import live_scene, ready_to_measure, served
     from ipsys_log.errors import IpsysError
-    from ipsys_log.live_plan import check_start
-    from ipsys_log.request import Request
+    from ipsys_log.recording.plan import check_start
+    from ipsys_log.runs.request import Request
 
     if model_from is not None and not measure:
         raise IpsysError(f"--model-from {model_from}: has no effect without --measure; to track: ipsys live")
@@ -113,8 +113,8 @@ def live(
     """Track robots now: record, and take every frame through all stages up to fuse, until Ctrl-C."""
     from ipsys_log import pipeline
     from ipsys_log.errors import IpsysError
-    from ipsys_log.live_plan import check_start
-    from ipsys_log.request import Request
+    from ipsys_log.recording.plan import check_start
+    from ipsys_log.runs.request import Request
 
     if output.exists() and model_from.exists() and output.samefile(model_from):
         raise IpsysError(f"-o {output}: is the log with the model; give another name")
@@ -132,9 +132,9 @@ def live(
 
 
 def _viewed(settings: list[Message], cameras: Attached, request: Request) -> LiveView:
-    from ipsys_log.lookup import wanted_models
+    from ipsys_log.runs.lookup import wanted_models
+    from ipsys_log.runs.tasks import model_run
     from ipsys_log.sinks.rerun_live import LiveView
-    from ipsys_log.tasks import model_run
 
     (model,) = wanted_models(request, "fuse")
     return LiveView(settings[0].payload, cameras.states, model_run(model), say)

@@ -82,8 +82,8 @@ def init(
 
 def _rig_of(log: Path) -> str:
     from ipsys_log.log.session import Session
-    from ipsys_log.lookup import rig_with_offsets
     from ipsys_log.rig import rig_toml
+    from ipsys_log.runs.lookup import rig_with_offsets
 
     with Session([log]) as session:
         return rig_toml(rig_with_offsets(session))
@@ -93,7 +93,7 @@ def simulate(output: Path, **settings: Any) -> None:
     """Render a lab with known truth: places measured by tape, then a drive.
 
     As it stands it is the lab of the paper: three cameras about 2.1 m above a floor of 4.88 m."""
-    from ipsys_log.output import write_log
+    from ipsys_log.runs.output import write_log
     from ipsys_log.sources.simulator import LabSettings, simulate
 
     with progress_bar() as progress:

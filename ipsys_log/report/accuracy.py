@@ -21,7 +21,7 @@ from ipsys_log.models import MODELS, reads_height
 from ipsys_log.offline.errors import CROSS_VALIDATION, POOLED
 from ipsys_log.offline.truth import gather_tracks, track_errors
 from ipsys_log.report.advice import Advice, Choice, advise
-from ipsys_log.runs import Outcome
+from ipsys_log.runs.records import Outcome
 from ipsys_log.units import CM_PER_M
 
 __all__ = ["Accuracy", "accuracy_json", "gather_suspects", "read_accuracy"]

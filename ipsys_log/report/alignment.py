@@ -16,11 +16,11 @@ from ipsys_log.errors import IpsysError
 from ipsys_log.geometry.lenses import undistort
 from ipsys_log.geometry.poses import invert_pose, make_pose
 from ipsys_log.log.session import Session
-from ipsys_log.lookup import find_pairs, measured
 from ipsys_log.messages import CameraCalibration, CameraPoints, Measurement, Model, Pair, Rig
 from ipsys_log.models.rigid import rigid_transform
 from ipsys_log.offline.pairs import Measured
-from ipsys_log.runs import newest_run
+from ipsys_log.runs.lookup import find_pairs, measured
+from ipsys_log.runs.records import newest_run
 from ipsys_log.units import CM_PER_M
 
 __all__ = ["AlignedLab", "read_alignment"]

@@ -14,9 +14,9 @@ from rich.table import Table
 from rich.text import Text
 
 from ipsys_log.compare import Comparison
-from ipsys_log.latency import Percentiles
 from ipsys_log.messages import Message, Track, Tracks
-from ipsys_log.monitor import Look, Monitor
+from ipsys_log.recording.latency import Percentiles
+from ipsys_log.recording.monitor import Look, Monitor
 from ipsys_log.sources.attendant import CameraState
 from ipsys_log.units import CM_PER_M, format_bytes
 

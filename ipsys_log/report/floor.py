@@ -20,7 +20,7 @@ from ipsys_log.report.files import write_files
 from ipsys_log.report.floor_panel import Scene, draw_floor
 from ipsys_log.report.palette import camera_styles
 from ipsys_log.report.pictures import picture
-from ipsys_log.runs import newest_run
+from ipsys_log.runs.records import newest_run
 from ipsys_log.sinks.shown import rig_in_force
 
 __all__ = ["draw_session"]

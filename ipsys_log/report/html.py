@@ -9,7 +9,6 @@ from jinja2 import Environment, PackageLoader, StrictUndefined
 
 from ipsys_log.errors import IpsysError
 from ipsys_log.log.session import Session
-from ipsys_log.lookup import measured
 from ipsys_log.messages import Run
 from ipsys_log.offline.crossval import FOLDS, REPEATS
 from ipsys_log.offline.learning import SUBSETS
@@ -18,6 +17,7 @@ from ipsys_log.report import page, page_pictures, page_trust
 from ipsys_log.report.accuracy import Accuracy
 from ipsys_log.report.advice import TOLD_NOTE, told_height
 from ipsys_log.report.findings import Findings, gather_findings
+from ipsys_log.runs.lookup import measured
 from ipsys_log.units import format_time
 
 __all__ = ["render_report"]

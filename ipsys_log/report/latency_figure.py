@@ -27,7 +27,7 @@ def draw_latency(times_s: Mapping[str, NDArray[np.float64]], path: Path) -> None
 
     Parameters
     ----------
-    times_s : of :func:`ipsys_log.latency.step_times_s`.
+    times_s : of :func:`ipsys_log.recording.latency.step_times_s`.
     path : the picture, of the kind that its suffix says.
     """
     figure = Figure(figsize=(12, 6), dpi=100)

@@ -27,7 +27,7 @@ from ipsys_log.messages import (
     calibration_topic,
     image_topic,
 )
-from ipsys_log.output import write_log
+from ipsys_log.runs.output import write_log
 from ipsys_log.sources.simulator import (
     EPOCH_NS,
     Camera,

@@ -18,7 +18,7 @@ from ipsys_log.calibration.pictures import find_sources
 from ipsys_log.formats.opencv_yaml import read_opencv_calibration
 from ipsys_log.log.session import Session
 from ipsys_log.messages import CompressedImage, CompressedVideo, Message, image_topic
-from ipsys_log.output import write_log
+from ipsys_log.runs.output import write_log
 from tests.calibration.boards_seen import (
     chessboard_pattern,
     fisheye_rays,

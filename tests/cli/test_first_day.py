@@ -13,7 +13,7 @@ from ipsys_log.cli.app import app
 from ipsys_log.cli.guide import EXAMPLES, PANELS
 from ipsys_log.log.session import Session
 from ipsys_log.pipeline import replay
-from ipsys_log.request import Request
+from ipsys_log.runs.request import Request
 from tests.conftest import Ipsys
 
 RIG = """name = "lab"

@@ -15,7 +15,7 @@ import pytest
 
 from ipsys_log.log.session import Session
 from ipsys_log.messages import CameraCalibration, Measurement, Message, Model, Rig
-from ipsys_log.output import write_log
+from ipsys_log.runs.output import write_log
 from tests.conftest import ROOT, Ipsys, data_section
 
 PAPER = ROOT / "sample_logs" / "paper_lab.mcap"

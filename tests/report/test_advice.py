@@ -10,9 +10,9 @@ import pytest
 
 from ipsys_log.formats.imsel import read_imsel
 from ipsys_log.messages import CameraEvaluation, ErrorStatistics, Evaluation, LearningPoint
-from ipsys_log.output import write_log
 from ipsys_log.report.advice import ANY, PAPER, SIMPLE, TOLD, advise
 from ipsys_log.report.findings import Findings
+from ipsys_log.runs.output import write_log
 from tests.report.conftest import find
 
 # The 95 % interval of the mean is this share of it, each way.

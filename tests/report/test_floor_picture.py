@@ -32,12 +32,12 @@ from ipsys_log.messages import (
     WorldPoint,
 )
 from ipsys_log.offline.statistics import error_statistics
-from ipsys_log.output import write_log
 from ipsys_log.report.accuracy import Accuracy
 from ipsys_log.report.errors_panel import count_rows, draw_errors
 from ipsys_log.report.floor import draw_session
 from ipsys_log.report.floor_panel import Scene, draw_floor
 from ipsys_log.report.palette import camera_styles
+from ipsys_log.runs.output import write_log
 
 RIG = Rig(
     "lab", "DICT_4X4_100", 0.2, reference_points=(ReferencePoint("A", 1.2, 2.4),), floor=Floor(4.88, 4.88)

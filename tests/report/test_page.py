@@ -11,11 +11,11 @@ import pytest
 
 from ipsys_log.log.session import Session
 from ipsys_log.messages import Measurement, Message, ReferencePoint, Suspect
-from ipsys_log.output import write_log
 from ipsys_log.pipeline import replay
 from ipsys_log.report.accuracy import Accuracy, read_accuracy
 from ipsys_log.report.html import render_report
-from ipsys_log.request import Request
+from ipsys_log.runs.output import write_log
+from ipsys_log.runs.request import Request
 from tests import labs
 from tests.conftest import Ipsys
 from tests.report.browser import visit

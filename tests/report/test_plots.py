@@ -13,7 +13,6 @@ import pytest
 from matplotlib.figure import Figure
 from matplotlib.text import Text
 
-from ipsys_log.output import write_log
 from ipsys_log.report.accuracy import accuracy_json
 from ipsys_log.report.csv_tables import cross_validation_csv, paper_csv
 from ipsys_log.report.findings import Findings
@@ -23,6 +22,7 @@ from ipsys_log.report.pictures import png
 from ipsys_log.report.places_figure import places_figure
 from ipsys_log.report.plots import write_plots
 from ipsys_log.report.residuals_figure import residuals_figure
+from ipsys_log.runs.output import write_log
 from tests.conftest import Ipsys
 from tests.report.conftest import find, lab_messages, many_models, only, with_accuracies
 

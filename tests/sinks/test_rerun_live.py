@@ -15,7 +15,7 @@ from ipsys_log.errors import IpsysError
 from ipsys_log.log.session import Session
 from ipsys_log.messages import CompressedImage, Message, Tracks
 from ipsys_log.pipeline import replay
-from ipsys_log.request import Request
+from ipsys_log.runs.request import Request
 from ipsys_log.sinks.rerun_live import LiveView
 
 Write = Callable[[bytes], object]

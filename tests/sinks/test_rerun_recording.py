@@ -34,7 +34,7 @@ from ipsys_log.messages import (
     Track,
     Tracks,
 )
-from ipsys_log.output import write_log
+from ipsys_log.runs.output import write_log
 from ipsys_log.sinks.rerun import write_recording
 from ipsys_log.sinks.rerun_images import rerun_image
 

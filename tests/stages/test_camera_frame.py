@@ -25,8 +25,8 @@ from ipsys_log.messages import (
     Rig,
     RigMarker,
 )
-from ipsys_log.output import write_log
-from ipsys_log.request import Request
+from ipsys_log.runs.output import write_log
+from ipsys_log.runs.request import Request
 from ipsys_log.stages.camera_frame import METHODS, CameraFrame
 from tests.conftest import ROOT, Ipsys
 from tests.geometry.squares import CENTRE, EDGE, FISHEYE, LENSES, MIDWAY, Array, corners_px, turned

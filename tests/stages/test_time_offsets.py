@@ -33,9 +33,9 @@ from ipsys_log.messages import (
 )
 from ipsys_log.offline.fit import fit_model
 from ipsys_log.offline.truth import gather_tracks, track_errors
-from ipsys_log.output import write_log
 from ipsys_log.pipeline import Stage, replay, run
-from ipsys_log.request import Request
+from ipsys_log.runs.output import write_log
+from ipsys_log.runs.request import Request
 from ipsys_log.sources.simulator import LabSettings, drive_start_ns, hang_cameras, simulate
 from ipsys_log.stages import fuse, locate
 

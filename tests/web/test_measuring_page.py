@@ -10,11 +10,11 @@ from pathlib import Path
 import pytest
 
 from ipsys_log.errors import LogError
-from ipsys_log.finished import FinishedLog, opened_log
 from ipsys_log.log.session import Session
 from ipsys_log.measuring.scene import Stop, View
 from ipsys_log.messages import CameraPoint, CameraPoints, Measurement, Model, ReferencePoint, Rig
-from ipsys_log.request import Request
+from ipsys_log.runs.request import Request
+from ipsys_log.scenes.finished import FinishedLog, opened_log
 from ipsys_log.web.serving import serving
 from tests import labs
 from tests.conftest import Ipsys, Unmeasured

@@ -7,15 +7,15 @@ from pathlib import Path
 
 from ipsys_log.errors import FitError, IpsysError
 from ipsys_log.log.session import Session, camera_of_topic
-from ipsys_log.lookup import can_evaluate, copied_run, fitted_in, measured
 from ipsys_log.messages import CameraPoints, Markers, Rig
 from ipsys_log.models import min_pairs, reads_height
 from ipsys_log.offline.pairs import split
 from ipsys_log.offline.tape import world_point
-from ipsys_log.request import Request
 from ipsys_log.rig import check_rig
-from ipsys_log.runs import newest_run
-from ipsys_log.tasks import STAGES
+from ipsys_log.runs.lookup import can_evaluate, copied_run, fitted_in, measured
+from ipsys_log.runs.records import newest_run
+from ipsys_log.runs.request import Request
+from ipsys_log.runs.tasks import STAGES
 
 __all__ = ["check_inputs"]
 

@@ -13,7 +13,6 @@ from types import TracebackType
 from typing import Protocol
 
 from ipsys_log.errors import IpsysError, WriteError
-from ipsys_log.full_disk import reserve, what_fitted
 from ipsys_log.geometry.lenses import scale_lens
 from ipsys_log.log import LogWriter
 from ipsys_log.log.lock import open_locked
@@ -28,8 +27,9 @@ from ipsys_log.messages import (
     Rig,
     calibration_topic,
 )
-from ipsys_log.output import write_message
-from ipsys_log.waiting import Waiting
+from ipsys_log.recording.full_disk import reserve, what_fitted
+from ipsys_log.recording.waiting import Waiting
+from ipsys_log.runs.output import write_message
 
 __all__ = [
     "TICK",
@@ -188,9 +188,8 @@ class Backlog:
     """Frames that are in the log and that the stages have not seen. A context manager; iterate once.
 
     A thread of its own writes what a source gives and hands the frames on. Where the stages are slower than
-    the cameras, frames are skipped as :class:`~ipsys_log.waiting.Waiting` does, never the recording of them,
-    and an event names each.
-    After everything that waits comes a :data:`TICK`.
+    the cameras, frames are skipped as :class:`~ipsys_log.recording.waiting.Waiting` does, never the recording
+    of them, and an event names each. After everything that waits comes a :data:`TICK`.
 
     Parameters
     ----------

@@ -22,8 +22,8 @@ from ipsys_log.messages import (
 from ipsys_log.models import MODELS, create, min_pairs
 from ipsys_log.offline.crossval import FOLDS
 from ipsys_log.offline.pairs import Measured, build_pairs, gather_sightings, measured_in_order, split
-from ipsys_log.request import Request
-from ipsys_log.runs import complete_runs, newest_run
+from ipsys_log.runs.records import complete_runs, newest_run
+from ipsys_log.runs.request import Request
 
 __all__ = [
     "LEAST_OFFSET_PX",

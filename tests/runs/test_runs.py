@@ -25,8 +25,8 @@ from ipsys_log.messages import (
     Run,
     Tracks,
 )
-from ipsys_log.output import write_log, write_messages
 from ipsys_log.rig import load_rig
+from ipsys_log.runs.output import write_log, write_messages
 from tests.conftest import ROOT, Ipsys
 
 PAPER = ROOT / "sample_logs" / "paper_lab.mcap"

@@ -4,14 +4,14 @@ from __future__ import annotations
 
 from pathlib import Path
 
-from ipsys_log.finished import FinishedLog, rigs_of
 from ipsys_log.log.session import Session
 from ipsys_log.measuring.check import check_entry
 from ipsys_log.measuring.entry import read_typed
 from ipsys_log.measuring.scene import look
 from ipsys_log.measuring.sheet import find_stops, name_columns, read_sheet, refuse_rows
 from ipsys_log.messages import Measurement
-from ipsys_log.request import Request
+from ipsys_log.runs.request import Request
+from ipsys_log.scenes.finished import FinishedLog, rigs_of
 
 __all__ = ["add_sheet", "check_sheet"]
 

@@ -7,7 +7,7 @@ from types import TracebackType
 
 from ipsys_log.errors import WriteError
 from ipsys_log.messages import FRAME_SKIPPED, CompressedImage, Event, Measurement, Message
-from ipsys_log.recording import Recording
+from ipsys_log.recording.recorder import Recording
 from ipsys_log.units import NS_PER_S
 
 __all__ = ["Recent"]

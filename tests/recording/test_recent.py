@@ -12,12 +12,8 @@ import pytest
 
 from ipsys_log import pipeline
 from ipsys_log.errors import IpsysError
-from ipsys_log.live_plan import check_pictures
-from ipsys_log.live_scene import LiveScene
 from ipsys_log.log import LogWriter
 from ipsys_log.log.session import Session
-from ipsys_log.lookup import find_pairs
-from ipsys_log.lookup import measured as measured_places
 from ipsys_log.measuring.check import check_entry, withdraw
 from ipsys_log.measuring.entry import read_typed
 from ipsys_log.measuring.scene import look
@@ -38,10 +34,14 @@ from ipsys_log.messages import (
     Rig,
     image_topic,
 )
-from ipsys_log.output import write_log
-from ipsys_log.recent import Recent
-from ipsys_log.recording import first_messages
-from ipsys_log.request import Request
+from ipsys_log.recording.plan import check_pictures
+from ipsys_log.recording.recent import Recent
+from ipsys_log.recording.recorder import first_messages
+from ipsys_log.runs.lookup import find_pairs
+from ipsys_log.runs.lookup import measured as measured_places
+from ipsys_log.runs.output import write_log
+from ipsys_log.runs.request import Request
+from ipsys_log.scenes.live import LiveScene
 from ipsys_log.sources.attached import Attached
 from ipsys_log.sources.attendant import CameraState
 from ipsys_log.sources.frames import Clock
@@ -49,9 +49,9 @@ from ipsys_log.units import NS_PER_S
 from tests import labs
 from tests.conftest import Ipsys
 from tests.playing import cameras, playing
+from tests.recording.test_recorder import Noted
 from tests.test_live import lenses
 from tests.test_measure import as_typed
-from tests.test_recording import Noted
 
 RATE_HZ = 10.0
 

@@ -9,18 +9,6 @@ from typing import Any
 from ipsys_log.errors import IpsysError
 from ipsys_log.geometry.lenses import same_lens
 from ipsys_log.log.session import Session
-from ipsys_log.lookup import (
-    can_evaluate,
-    copied_run,
-    find_pairs,
-    fits_again,
-    fitted_in,
-    held_out_ids,
-    measured,
-    skipped_frames,
-    split_parameters,
-    unused_places,
-)
 from ipsys_log.messages import (
     EVENTS_TOPIC,
     CameraCalibration,
@@ -46,8 +34,20 @@ from ipsys_log.offline.fit import fit_model, level_cameras
 from ipsys_log.offline.learning import labelled_subsets
 from ipsys_log.offline.pairs import split
 from ipsys_log.offline.truth import gather_tracks, true_points
-from ipsys_log.request import Request
-from ipsys_log.runs import newest_run, read_channels
+from ipsys_log.runs.lookup import (
+    can_evaluate,
+    copied_run,
+    find_pairs,
+    fits_again,
+    fitted_in,
+    held_out_ids,
+    measured,
+    skipped_frames,
+    split_parameters,
+    unused_places,
+)
+from ipsys_log.runs.records import newest_run, read_channels
+from ipsys_log.runs.request import Request
 from ipsys_log.stages import camera_frame, detect, fuse, locate
 
 __all__ = ["STAGES", "Task", "copy_model", "model_run", "plan_stage", "points_run", "usual_corners"]

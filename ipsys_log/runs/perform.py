@@ -7,7 +7,6 @@ from dataclasses import replace
 from pathlib import Path
 
 from ipsys_log.log.session import Session, run_of_topic
-from ipsys_log.lookup import skipped_frames
 from ipsys_log.messages import (
     EVENTS_TOPIC,
     RIG_TOPIC,
@@ -22,13 +21,14 @@ from ipsys_log.messages import (
     SkippedVideo,
     calibration_topic,
 )
-from ipsys_log.output import append_messages, append_run, record_message
-from ipsys_log.remarks import Remarks
-from ipsys_log.request import Progress, Request
-from ipsys_log.resume import OtherContentError, cut_short, without_held
 from ipsys_log.rig import hide_passwords
-from ipsys_log.runs import Outcome, check_run_name, find_run, fingerprint, free_name, read_channels
-from ipsys_log.tasks import Task, plan_stage
+from ipsys_log.runs.lookup import skipped_frames
+from ipsys_log.runs.output import append_messages, append_run, record_message
+from ipsys_log.runs.records import Outcome, check_run_name, find_run, fingerprint, free_name, read_channels
+from ipsys_log.runs.remarks import Remarks
+from ipsys_log.runs.request import Progress, Request
+from ipsys_log.runs.resume import OtherContentError, cut_short, without_held
+from ipsys_log.runs.tasks import Task, plan_stage
 
 __all__ = ["SHARED_STAGES", "inputs", "perform", "record_of", "sign", "signed_copy"]
 
@@ -137,7 +137,7 @@ def signed_copy(task: Task, model: Model, now_ns: Callable[[], int]) -> list[Mes
 
 
 def _given(stage: str, runs: Mapping[str, str]) -> dict[str, str]:
-    """What :func:`ipsys_log.tasks.plan_stage` has to be told of the stages before."""
+    """What :func:`ipsys_log.runs.tasks.plan_stage` has to be told of the stages before."""
     if stage == "camera-frame":
         return {"markers": runs["detect"]}
     if stage == "locate":

@@ -17,7 +17,7 @@ from ipsys_log.messages import (
     Message,
     image_topic,
 )
-from ipsys_log.recording import TICK, Backlog, Recording, recording
+from ipsys_log.recording.recorder import TICK, Backlog, Recording, recording
 
 
 def frame(number: int, camera: str = "red") -> Message:

@@ -7,14 +7,14 @@ from dataclasses import replace
 from typing import Any, NamedTuple
 
 from ipsys_log.errors import IpsysError
-from ipsys_log.lookup import wanted_models
 from ipsys_log.messages import CameraCalibration, Message, Model, Rig
 from ipsys_log.models import reads_height
-from ipsys_log.perform import signed_copy
-from ipsys_log.request import Request
+from ipsys_log.runs.lookup import wanted_models
+from ipsys_log.runs.perform import signed_copy
+from ipsys_log.runs.request import Request
+from ipsys_log.runs.tasks import Task, copy_model, model_run, points_run, usual_corners
 from ipsys_log.sources.attendant import CameraState
 from ipsys_log.stages import camera_frame, detect, fuse, locate
-from ipsys_log.tasks import Task, copy_model, model_run, points_run, usual_corners
 
 __all__ = ["LivePlan", "check_model", "check_pictures", "check_start", "plan_live"]
 

@@ -9,9 +9,9 @@ from statistics import median
 
 from ipsys_log.errors import IpsysError
 from ipsys_log.log.session import camera_of_topic
-from ipsys_log.lookup import LEAST_OFFSET_PX, MIN_OFFSETS
 from ipsys_log.messages import Event, Markers, Message, Positions
-from ipsys_log.tasks import Task
+from ipsys_log.runs.lookup import LEAST_OFFSET_PX, MIN_OFFSETS
+from ipsys_log.runs.tasks import Task
 from ipsys_log.units import format_time
 
 __all__ = ["Remarks"]

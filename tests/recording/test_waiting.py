@@ -8,7 +8,7 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from ipsys_log.messages import CompressedVideo, Message, SkippedVideo, image_topic
-from ipsys_log.waiting import Waiting
+from ipsys_log.recording.waiting import Waiting
 
 KEY, OTHER = bytes.fromhex("00000001 67 00000001 65 88"), bytes.fromhex("00000001 41 9a")
 

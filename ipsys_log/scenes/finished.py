@@ -28,10 +28,10 @@ from ipsys_log.messages import (
     Rig,
 )
 from ipsys_log.offline.pairs import Sightings, gather_sightings
-from ipsys_log.output import write_messages
 from ipsys_log.pipeline import replay
-from ipsys_log.request import Progress, Request
-from ipsys_log.runs import newest_run
+from ipsys_log.runs.output import write_messages
+from ipsys_log.runs.records import newest_run
+from ipsys_log.runs.request import Progress, Request
 from ipsys_log.stages.detect import decode_grey
 from ipsys_log.stages.detect.video import decode_last
 from ipsys_log.units import NS_PER_S

@@ -8,7 +8,7 @@ from pathlib import Path
 from ipsys_log.log.codec import encode
 from ipsys_log.log.session import Session
 from ipsys_log.messages import Event, Message
-from ipsys_log.tasks import Task
+from ipsys_log.runs.tasks import Task
 from ipsys_log.units import format_time
 
 __all__ = ["OtherContentError", "cut_short", "without_held"]

@@ -26,6 +26,8 @@ from ipsys_log.sources.videos import open_video
 from tests.sources.streams import encode
 
 ROOT = Path(__file__).resolve().parent.parent
+# A program for Debian's own Python.
+collect_ignore = ["sources/rtsp_server.py"]
 
 
 class Done(NamedTuple):

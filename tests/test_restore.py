@@ -17,7 +17,7 @@ from ipsys_log import pipeline
 from ipsys_log.log import LogReader, LogWriter, repair
 from ipsys_log.log.records import ChunkRef
 from ipsys_log.log.session import Session
-from ipsys_log.messages import Event, Markers, Message, Tracks
+from ipsys_log.messages import FRAME_SKIPPED, Event, Markers, Message, Tracks
 from ipsys_log.restore import finish_runs
 from ipsys_log.runs.output import write_message
 from ipsys_log.runs.request import Request
@@ -76,6 +76,10 @@ def finish(log: Path) -> list[tuple[str, str]]:
     return [(one.stage, one.run) for one in finish_runs(log, lambda stage, done, total: None)]
 
 
+def skipped(session: Session, camera: str) -> int:
+    return sum((one.kind, one.camera) == (FRAME_SKIPPED, camera) for one in session.payloads(["/events"]))
+
+
 def topics_of(log: Path) -> set[str]:
     with Session([log]) as session:
         return {topic for reader in session.readers for topic in reader.channels}
@@ -116,13 +120,17 @@ def test_a_live_run_that_is_killed_is_brought_to_its_end(
             (line,) = (one for one in done.out.splitlines() if topic in one)
             gone = int(line.split()[3])
             assert (killed_ns - last_ns) / 1e9 * 20 - 2 < gone < 60, line
-            assert session.count(f"/runs/edges/cameras/{camera}/markers") == session.count(topic) > 50
+            looked_at = session.count(f"/runs/edges/cameras/{camera}/markers")
+            assert looked_at + skipped(session, camera) == session.count(topic) > 50
+            assert looked_at > 20
     assert ipsys("verify", log).out.endswith("a replay equals the log\n")
-    done = ipsys("replay", log)
+    # On a busy machine frames are skipped; a replay of all would be another run.
+    done = ipsys("replay", log, "--as-live")
     assert done.code == 0, done.err
     assert "nothing to do: all of it is up to date" in done.err
     assert not [topic for topic in topics_of(log) if "_2/" in topic]
-    assert not any(one.fresh for one in pipeline.replay([log], Request(model_from=calibration)))
+    again = pipeline.replay([log], Request(model_from=calibration, as_live=True))
+    assert not any(one.fresh for one in again)
 
 
 @pytest.mark.parametrize("share", [0.3, 0.6, 0.95])
@@ -241,7 +249,7 @@ def test_a_full_disk_ends_live_with_runs_that_are_signed(
     try:
         with going_live(rig, calibration, log, 0.0) as program:
             out, err = program.communicate(timeout=60)
-        verified, replayed = ipsys("verify", log), ipsys("replay", log)
+        verified, replayed = ipsys("verify", log), ipsys("replay", log, "--as-live")
         assert equal(log)
         with Session([log]) as session:
             frames = sum(session.count(topic) for topic in session.images.values())

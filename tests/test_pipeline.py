@@ -21,12 +21,14 @@ from ipsys_log.messages import (
     CameraPoints,
     CompressedImage,
     Markers,
+    Measurement,
     Message,
     Model,
     Positions,
     Rig,
     Tracks,
 )
+from ipsys_log.offline.pairs import active_measurements
 from ipsys_log.pipeline import Stage, in_threads, replay, run
 from ipsys_log.rig import load_rig
 from ipsys_log.runs.output import write_log
@@ -302,6 +304,25 @@ def test_new_measurements_make_the_model_out_of_date(ipsys: Ipsys, lab: Path) ->
         old, new = (session.payloads(session.topics(Model, run))[0] for run in ("poly", "poly_2"))
     used = [{pair.measurement for camera in model.cameras for pair in camera.pairs} for model in (old, new)]
     assert used[0] - used[1] == {withdrawn.id}
+
+
+def test_places_of_two_logs_are_two_though_each_log_begins_at_p001(tmp_path: Path) -> None:
+    def log(name: str, *places: Measurement) -> Path:
+        path = tmp_path / name
+        write_log(path, (Message("/measurements", one.timestamp, one.timestamp, one) for one in places))
+        return path
+
+    monday = log("monday.mcap", Measurement(10, "p001", marker_id=3), Measurement(20, "p002", marker_id=3))
+    tuesday = log(
+        "tuesday.mcap",
+        Measurement(110, "p001", marker_id=4),
+        Measurement(120, "p001_withdrawn", withdraws="p001"),
+        Measurement(130, "p002", marker_id=5),
+    )
+    for logs in ([monday, tuesday], [tuesday, monday]):
+        with Session(logs) as session:
+            places = active_measurements(session.payloads(["/measurements"]))
+        assert [(one.id, one.marker_id) for one in places] == [("p001", 3), ("p002", 3), ("p002_2", 5)]
 
 
 def test_a_run_may_be_named(ipsys: Ipsys, lab: Path) -> None:

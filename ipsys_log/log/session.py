@@ -19,9 +19,19 @@ from numpy.typing import NDArray
 
 from ipsys_log.errors import LogError
 from ipsys_log.log.codec import decode, payload_type
+from ipsys_log.log.measured_ids import other_ids, renamed
 from ipsys_log.log.reader import LogReader
 from ipsys_log.log.types import Channel
-from ipsys_log.messages import CameraCalibration, CompressedImage, CompressedVideo, Message, RawImage, Run
+from ipsys_log.messages import (
+    MEASUREMENTS_TOPIC,
+    CameraCalibration,
+    CompressedImage,
+    CompressedVideo,
+    Measurement,
+    Message,
+    RawImage,
+    Run,
+)
 
 __all__ = ["Session", "camera_of_topic", "run_of_topic"]
 
@@ -37,6 +47,8 @@ _GENERIC = re.compile(
 
 class Session:
     """Open logs, read together in log order. A context manager.
+
+    Where measurements of two logs have one id, that of the later log gets another, such as ``p001_2``.
 
     Parameters
     ----------
@@ -55,12 +67,14 @@ class Session:
             self._check_overlaps()
             self.images = self._cameras(_IMAGES)
             self.calibrations = self._pair_calibrations(self._cameras((CameraCalibration,)))
+            self._camera_of = {
+                topic: name for topics in (self.images, self.calibrations) for name, topic in topics.items()
+            }
+            self._ids: dict[LogReader, dict[str, str]] = {}
+            self._ids = self._tell_apart()
         except BaseException:
             self._stack.close()
             raise
-        self._camera_of = {
-            topic: camera for topics in (self.images, self.calibrations) for camera, topic in topics.items()
-        }
 
     def __enter__(self) -> Session:
         return self
@@ -154,6 +168,8 @@ class Session:
                 payload = _decode(channel, raw.data)
             except LogError as error:
                 raise LogError(f"{reader.path}: {raw.topic} at {raw.log_time_ns} ns: {error}") from error
+            if isinstance(payload, Measurement) and reader in self._ids:
+                payload = renamed(payload, self._ids[reader])
             camera = self._camera_of.get(raw.topic) or camera_of_topic(raw.topic)
             # Who records ROS 2 knows when a message came; when its frame was taken stands within.
             taken_ns = payload.timestamp if channel.message_encoding == "cdr" else 0
@@ -171,6 +187,22 @@ class Session:
             if channel.schema is not None and payload_type(channel.schema.name) is Run
         }
         return sorted(self.payloads(topics), key=lambda run: run.number)
+
+    def _tell_apart(self) -> dict[LogReader, dict[str, str]]:
+        """The ids of measurements that an earlier log has too, and those that they have here."""
+        readers = [reader for reader in self.readers if len(_times(reader, MEASUREMENTS_TOPIC))]
+        if len(readers) < 2:
+            return {}
+        readers.sort(key=lambda reader: int(_times(reader, MEASUREMENTS_TOPIC)[0]))
+        found = other_ids(
+            [
+                one.payload
+                for one in self._decoded(reader, [MEASUREMENTS_TOPIC], None, None)
+                if isinstance(one.payload, Measurement)
+            ]
+            for reader in readers
+        )
+        return dict(zip(readers, found, strict=True))
 
     def _check_overlaps(self) -> None:
         """Logs that follow one another are one; two that speak at once of one thing are not."""

@@ -11,11 +11,10 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from ipsys_log.log.codec import encode
 from ipsys_log.messages import CameraPoints, Markers, Message, Positions, Tracks
 from ipsys_log.units import format_time
 
-__all__ = ["Comparison", "compare_channels"]
+__all__ = ["Comparison", "Stored", "compare_channels"]
 
 Array = NDArray[np.float64]
 
@@ -45,16 +44,18 @@ class Comparison:
         return self.left == self.right == self.same
 
 
+# A message, and the bytes of its payload.
+Stored = tuple[Message, bytes]
 # Log time, publish time, bytes, and what can be measured in them.
 _Row = tuple[int, int, bytes, dict[int, Array]]
 
 
-def compare_channels(left: Iterable[Message], right: Iterable[Message]) -> list[Comparison]:
+def compare_channels(left: Iterable[Stored], right: Iterable[Stored]) -> list[Comparison]:
     """Compare messages channel by channel; those of one channel and log time by their order.
 
     Parameters
     ----------
-    left, right : in log order, of the same topics. Neither is held as a whole.
+    left, right : messages with their bytes, in log order, of the same topics. Neither is held as a whole.
     """
     tallies: dict[str, _Tally] = {}
     for ours, theirs in _together(_by_time(left), _by_time(right)):
@@ -65,13 +66,12 @@ def compare_channels(left: Iterable[Message], right: Iterable[Message]) -> list[
     return [tally.found(topic) for topic, tally in sorted(tallies.items())]
 
 
-def _by_time(messages: Iterable[Message]) -> Iterator[tuple[int, dict[str, list[_Row]]]]:
+def _by_time(messages: Iterable[Stored]) -> Iterator[tuple[int, dict[str, list[_Row]]]]:
     """Messages of one log time, by topic."""
-    for time_ns, group in groupby(messages, key=lambda message: message.log_time_ns):
+    for time_ns, group in groupby(messages, key=lambda stored: stored[0].log_time_ns):
         rows: dict[str, list[_Row]] = defaultdict(list)
-        for one in group:
-            row = (one.log_time_ns, one.publish_time_ns, encode(one.payload), _values(one.payload))
-            rows[one.topic].append(row)
+        for one, data in group:
+            rows[one.topic].append((one.log_time_ns, one.publish_time_ns, data, _values(one.payload)))
         yield time_ns, rows
 
 
@@ -158,7 +158,7 @@ def _said(left: _Row | None, right: _Row | None) -> str:
         assert there is not None
         side = "second" if left is None else "first"
         return f"a message that only the {side} has, at {format_time(there[0])} ({there[0]} ns)"
-    where = f"at {format_time(left[0])} ({left[0]} ns)"
+    where = f"at {format_time(left[0])} ({left[0]} ns)" if left[0] else "for all times"
     if left[1] != right[1]:
         return f"publish times differ by {right[1] - left[1]} ns, {where}"
     ids = sorted(left[3].keys() ^ right[3].keys())

@@ -3,15 +3,26 @@
 from __future__ import annotations
 
 import heapq
-from collections.abc import Collection, Iterator, Sequence
+from collections.abc import Callable, Collection, Iterator, Sequence
+from dataclasses import replace
 from pathlib import Path
 
 from threadpoolctl import threadpool_limits
 
-from ipsys_log.compare import Comparison, compare_channels
+from ipsys_log.compare import Comparison, Stored, compare_channels
 from ipsys_log.errors import IpsysError
+from ipsys_log.log.codec import encode
 from ipsys_log.log.session import Session, run_of_topic
-from ipsys_log.messages import CameraCalibration, CameraPoints, Markers, Message, Model, Positions, Run
+from ipsys_log.messages import (
+    CameraCalibration,
+    CameraPoints,
+    FrameTransforms,
+    Markers,
+    Message,
+    Model,
+    Positions,
+    Run,
+)
 from ipsys_log.pipeline import carry_out
 from ipsys_log.runs.request import Progress, Request
 from ipsys_log.runs.tasks import Task, plan_stage
@@ -21,17 +32,21 @@ __all__ = ["diff", "verify"]
 
 # What a model's run has among its parameters if the model was fitted to places of the same log.
 _FITTED_HERE = {"train", "seed"}
+_MODELS = ("fit", "evaluate")
 
 
-def verify(paths: Sequence[Path], run: str | None, progress: Progress) -> list[Comparison]:
+def verify(
+    paths: Sequence[Path], run: str | None, progress: Progress, say: Callable[[str], None] = lambda text: None
+) -> list[Comparison]:
     """Make every run again, from its recorded input, and compare.
 
     A model that was copied in cannot be made again, nor can what was evaluated of it; what was made with it
-    can.
+    can. Nor can a model since when places were measured or withdrawn, which is said.
 
     Parameters
     ----------
     run : only this one; None: all.
+    say : is told what is not made again.
 
     Returns
     -------
@@ -44,26 +59,29 @@ def verify(paths: Sequence[Path], run: str | None, progress: Progress) -> list[C
     """
     with Session(paths) as session, threadpool_limits(1, user_api="blas"):
         names = session.run_names() if run is None else session.run_names() & {run}
-        records = [one for one in session.runs() if one.run in names]
-        if not any(_from_this_log(one) for one in records):
+        records = [one for one in session.runs() if one.run in names and _from_this_log(one)]
+        if not records:
             raise IpsysError(
                 f"{session}: has no {'run' if run is None else f'run {run}'} to verify; "
                 "make one with 'ipsys replay', or see 'ipsys runs'"
             )
         found = []
+        checked = {output.topic for one in records for output in one.outputs}
         for name in sorted(names):
-            stages = [one for one in records if one.run == name and _from_this_log(one)]
+            stages = [
+                one for one in records if one.run == name and _is_up_to_date(session, one, checked, say)
+            ]
             topics = {output.topic for one in stages for output in one.outputs}
             # Stages can share a channel, that of events.
             made = heapq.merge(
-                *(_made_again(session, one, progress) for one in stages), key=lambda one: one.log_time_ns
+                *(_made_again(session, one, progress) for one in stages), key=lambda row: row[0].log_time_ns
             )
-            found += compare_channels(session.messages(sorted(topics)), made)
+            found += compare_channels(session.stored(sorted(topics)), made)
         return sorted([*found, *_unrecorded(session, names)], key=lambda one: one.topic)
 
 
 def _from_this_log(run: Run) -> bool:
-    return run.stage not in ("fit", "evaluate") or bool(run.parameters.keys() & _FITTED_HERE)
+    return run.stage not in _MODELS or bool(run.parameters.keys() & _FITTED_HERE)
 
 
 def _unrecorded(session: Session, names: Collection[str]) -> list[Comparison]:
@@ -107,33 +125,62 @@ def _run_names(session: Session, wanted: str | None) -> set[str]:
     return names if wanted is None else {wanted}
 
 
-def _derived(session: Session, runs: set[str], called: str | None) -> Iterator[Message]:
-    """What runs have written, but for their records; as that of a run ``called`` otherwise."""
+def _derived(session: Session, runs: set[str], called: str | None) -> Iterator[Stored]:
+    """What runs have written, but for their records; as that of a run ``called`` otherwise.
+
+    Models come first, and without a time: one that was copied in has the time at which it was.
+    """
     topics = {
         topic
         for reader in session.readers
         for topic in reader.channels
         if run_of_topic(topic) in runs and not topic.endswith("/record")
     }
-    for message in session.messages(topics):
-        name = run_of_topic(message.topic)
-        topic = (
-            message.topic if called is None else message.topic.replace(f"/runs/{name}/", f"/runs/{called}/")
-        )
-        yield Message(topic, message.log_time_ns, message.publish_time_ns, message.payload, message.camera)
+    models = topics & {topic for run in runs for topic in session.topics(Model, run)}
+    for message, data in session.stored(models):
+        yield replace(_called(message, called), log_time_ns=0, publish_time_ns=0), data
+    for message, data in session.stored(topics - models):
+        other = _called(message, called)
+        yield other, data if other.payload is message.payload else encode(other.payload)
 
 
-def _made_again(session: Session, run: Run, progress: Progress) -> Iterator[Message]:
-    for read in run.inputs:
-        if session.count(read.topic) != read.messages or session.hash(read.topic) != read.hash:
-            raise IpsysError(
-                f"{session}: run {run.run} was made from {read.messages} messages of {read.topic}, and these "
-                f"are not what the log holds now ({session.count(read.topic)} messages): it is out of date, "
-                "or the log it was made from has to be given too"
+def _called(message: Message, run: str | None) -> Message:
+    """A message as one of another run, whose name stands in its topic and in the frames of robots."""
+    if run is None:
+        return message
+    name, payload = run_of_topic(message.topic), message.payload
+    if isinstance(payload, FrameTransforms):
+        payload = FrameTransforms(
+            tuple(
+                replace(one, child_frame_id=one.child_frame_id.replace(f"{name}/", f"{run}/", 1))
+                for one in payload.transforms
             )
+        )
+    return replace(message, topic=message.topic.replace(f"/runs/{name}/", f"/runs/{run}/"), payload=payload)
+
+
+def _is_up_to_date(session: Session, run: Run, checked: Collection[str], say: Callable[[str], None]) -> bool:
+    """Whether a stage can be made again; where what it read is ``checked`` itself, the faults show there."""
+    for read in run.inputs:
+        count = session.count(read.topic)
+        if read.topic in checked or (count == read.messages and session.hash(read.topic) == read.hash):
+            continue
+        text = (
+            f"run {run.run} was made from {read.messages} messages of {read.topic}, and these "
+            f"are not what the log holds now ({count} messages): it is out of date"
+        )
+        if run.stage in _MODELS:
+            say(f"{text}; its {run.stage} is not verified: ipsys replay makes it again")
+            return False
+        raise IpsysError(f"{session}: {text}, or the log it was made from has to be given too")
+    return True
+
+
+def _made_again(session: Session, run: Run, progress: Progress) -> Iterator[Stored]:
     task = plan_stage(run.stage, session, _request(run), **_given(session, run))
     if isinstance(task, Task):
-        yield from carry_out(task, session, run.run, progress)
+        for message in carry_out(task, session, run.run, progress):
+            yield message, encode(message.payload)
 
 
 def _request(run: Run) -> Request:

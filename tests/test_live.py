@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import shutil
 import time
 from collections.abc import Callable, Iterator
 from dataclasses import replace
@@ -14,8 +15,9 @@ import pytest
 from ipsys_log import pipeline
 from ipsys_log.compare import Comparison
 from ipsys_log.errors import IpsysError
+from ipsys_log.log import LogReader, LogWriter
 from ipsys_log.log.session import Session
-from ipsys_log.measuring.check import check_entry
+from ipsys_log.measuring.check import check_entry, withdraw
 from ipsys_log.measuring.entry import Typed, read_typed
 from ipsys_log.measuring.scene import look
 from ipsys_log.messages import (
@@ -25,6 +27,7 @@ from ipsys_log.messages import (
     Evaluation,
     Event,
     Latency,
+    Markers,
     Measurement,
     Message,
     Run,
@@ -33,7 +36,7 @@ from ipsys_log.messages import (
 from ipsys_log.recording.recorder import first_messages
 from ipsys_log.runs.lookup import find_pairs
 from ipsys_log.runs.lookup import measured as measured_places
-from ipsys_log.runs.output import write_log
+from ipsys_log.runs.output import append_messages, write_log
 from ipsys_log.runs.request import Request
 from ipsys_log.scenes.live import LiveScene
 from ipsys_log.sources.attached import Attached
@@ -169,6 +172,59 @@ def test_a_result_that_was_tampered_with_is_found(
     (apart,) = (one for one in again(log, "poly") if not one.equal)
     assert apart.topic == "/runs/poly/tracks"
     assert apart.left - apart.same == 1
+
+
+def _corner(payload: Markers) -> Markers | None:
+    first, *rest = payload.markers or (None,)
+    if first is None:
+        return None
+    return replace(payload, markers=(replace(first, corners_px=first.corners_px + 1e-9), *rest))
+
+
+def test_a_marker_that_was_tampered_with_shows_where_it_is_and_in_all_that_was_made_of_it(
+    recorded: Path, tmp_path: Path
+) -> None:
+    log = tampered(recorded, tmp_path / "tampered.mcap", Markers, _corner)
+    apart = {one.topic.rpartition("/")[2]: one.left - one.same for one in again(log) if not one.equal}
+    assert apart["markers"] == apart["camera_points"] == 1
+
+
+def test_bytes_that_no_field_speaks_of_are_found(recorded: Path, tmp_path: Path) -> None:
+    log = tmp_path / "more.mcap"
+    with LogReader(recorded) as reader, LogWriter.create(log) as writer:
+        for topic, channel in reader.channels.items():
+            writer.add_channel(topic, channel.schema, channel.message_encoding)
+        for n, one in enumerate(reader.messages()):
+            # A field of number 999 is read over.
+            more = b"\xb8\x3e\x01" if one.topic == "/runs/poly/poses" and n > 50 else b""
+            writer.write(one.topic, one.log_time_ns, one.publish_time_ns, bytes(one.data) + more)
+    assert {one.topic for one in again(log) if not one.equal} == {"/runs/poly/poses"}
+
+
+def test_one_run_under_two_names_is_the_same(
+    ipsys: Ipsys, recorded: Path, calibration: Path, tmp_path: Path
+) -> None:
+    log = tmp_path / "twice.mcap"
+    write_log(log, _copied(recorded))
+    pipeline.replay([log], Request(model_from=calibration, run="other"))
+    assert all(one.equal and one.left for one in diff(log, log, ("poly", "other")))
+    assert ipsys("diff", log, "--run", "poly", "--run", "other").code == 0
+    assert "name a second log" in ipsys("diff", log).err
+
+
+def test_a_place_measured_since_is_said_and_no_difference(
+    ipsys: Ipsys, lab_log: Path, tmp_path: Path
+) -> None:
+    log = tmp_path / "lab.mcap"
+    shutil.copy(lab_log, log)
+    pipeline.replay([log], Request())
+    with Session([log]) as session:
+        last = session.payloads(["/measurements"])[-1]
+        time_ns = session.end_ns + 1
+    append_messages(log, [Message("/measurements", time_ns, time_ns, withdraw([last], last.id))])
+    done = ipsys("verify", log)
+    assert done.code == 0, done.out
+    assert "its fit is not verified: ipsys replay makes it again" in done.err
 
 
 def test_a_result_that_is_gone_is_found(recorded: Path, tmp_path: Path) -> None:

@@ -38,7 +38,7 @@ def verify(
     from ipsys_log.verify import verify as verify_runs
 
     with progress_bar() as progress:
-        found = verify_runs(logs, run, progress)
+        found = verify_runs(logs, run, progress, lambda text: remarks.print(text, markup=False))
     if as_json:
         print(json.dumps(comparison_json(found), indent=2))  # noqa: T201
     else:
@@ -54,7 +54,10 @@ def verify(
 
 def diff(
     first: Annotated[Path, typer.Argument(help="A log.")],
-    second: Annotated[Path, typer.Argument(help="The log to compare with; may be the same one.")],
+    second: Annotated[
+        Optional[Path],  # noqa: UP045
+        typer.Argument(help="The log to compare with; without it, --run twice names two runs of the first."),
+    ] = None,
     run: Annotated[
         Optional[list[str]],  # noqa: UP045
         typer.Option(
@@ -75,7 +78,9 @@ def diff(
     names: list[str | None] = list(run) if run else [None]
     if len(names) > 2:
         raise IpsysError("--run: name one run, or one of each log")
-    found = compare(first, second, (names[0], names[-1]))
+    if second is None and len(names) < 2:
+        raise IpsysError("name a second log, or with --run twice two runs of one")
+    found = compare(first, second or first, (names[0], names[-1]))
     if as_json:
         print(json.dumps(comparison_json(found), indent=2))  # noqa: T201
     else:

@@ -78,7 +78,7 @@ ipsys verify monday.mcap                           # all of its runs
 """,
     "diff": """
 ipsys diff monday.mcap tuesday.mcap
-ipsys diff monday.mcap monday.mcap --run poly --run best
+ipsys diff monday.mcap --run poly --run best
 """,
     "latency": """
 ipsys latency monday.mcap --plot latency.pdf

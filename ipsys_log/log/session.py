@@ -21,7 +21,7 @@ from ipsys_log.errors import LogError
 from ipsys_log.log.codec import decode, payload_type
 from ipsys_log.log.measured_ids import other_ids, renamed
 from ipsys_log.log.reader import LogReader
-from ipsys_log.log.types import Channel
+from ipsys_log.log.types import Channel, RawMessage
 from ipsys_log.messages import (
     MEASUREMENTS_TOPIC,
     CameraCalibration,
@@ -158,22 +158,38 @@ class Session:
         streams = [self._decoded(reader, topics, start_ns, end_ns) for reader in self.readers]
         return heapq.merge(*streams, key=lambda message: message.log_time_ns)
 
+    def stored(self, topics: Collection[str]) -> Iterator[tuple[Message, bytes]]:
+        """As :meth:`messages`, each with the bytes that the log has of its payload."""
+        streams = [
+            ((self._message(reader, raw), bytes(raw.data)) for raw in self._raw(reader, topics, None, None))
+            for reader in self.readers
+        ]
+        return heapq.merge(*streams, key=lambda row: row[0].log_time_ns)
+
+    def _raw(
+        self, reader: LogReader, topics: Collection[str], start_ns: int | None, end_ns: int | None
+    ) -> Iterator[RawMessage]:
+        here = [topic for topic in topics if topic in reader.channels]
+        return reader.messages(here, start_ns, end_ns) if here else iter(())
+
     def _decoded(
         self, reader: LogReader, topics: Collection[str], start_ns: int | None, end_ns: int | None
     ) -> Iterator[Message]:
-        here = [topic for topic in topics if topic in reader.channels]
-        for raw in reader.messages(here, start_ns, end_ns) if here else ():
-            channel = reader.channels[raw.topic]
-            try:
-                payload = _decode(channel, raw.data)
-            except LogError as error:
-                raise LogError(f"{reader.path}: {raw.topic} at {raw.log_time_ns} ns: {error}") from error
-            if isinstance(payload, Measurement) and reader in self._ids:
-                payload = renamed(payload, self._ids[reader])
-            camera = self._camera_of.get(raw.topic) or camera_of_topic(raw.topic)
-            # Who records ROS 2 knows when a message came; when its frame was taken stands within.
-            taken_ns = payload.timestamp if channel.message_encoding == "cdr" else 0
-            yield Message(raw.topic, raw.log_time_ns, taken_ns or raw.publish_time_ns, payload, camera)
+        for raw in self._raw(reader, topics, start_ns, end_ns):
+            yield self._message(reader, raw)
+
+    def _message(self, reader: LogReader, raw: RawMessage) -> Message:
+        channel = reader.channels[raw.topic]
+        try:
+            payload = _decode(channel, raw.data)
+        except LogError as error:
+            raise LogError(f"{reader.path}: {raw.topic} at {raw.log_time_ns} ns: {error}") from error
+        if isinstance(payload, Measurement) and reader in self._ids:
+            payload = renamed(payload, self._ids[reader])
+        camera = self._camera_of.get(raw.topic) or camera_of_topic(raw.topic)
+        # Who records ROS 2 knows when a message came; when its frame was taken stands within.
+        taken_ns = payload.timestamp if channel.message_encoding == "cdr" else 0
+        return Message(raw.topic, raw.log_time_ns, taken_ns or raw.publish_time_ns, payload, camera)
 
     def payloads(self, topics: Collection[str]) -> list[Any]:
         return [message.payload for message in self.messages(topics)]

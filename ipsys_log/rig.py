@@ -8,6 +8,7 @@ import re
 import tomllib
 from collections.abc import Iterable, Mapping
 from dataclasses import MISSING, fields, replace
+from difflib import get_close_matches
 from importlib.resources import files
 from pathlib import Path
 from typing import Any, TypeVar
@@ -133,7 +134,7 @@ def load_rig(path: Path) -> Rig:
     except UnicodeDecodeError as error:
         raise IpsysError(f"{path}: is not a text file; write one with: ipsys init {path}") from error
     except tomllib.TOMLDecodeError as error:
-        raise IpsysError(f"{path}: is not valid TOML: {error}") from error
+        raise IpsysError(_not_toml(path, error)) from error
     for key, item in _ITEMS.items():
         rows = table.get(key, [])
         if not isinstance(rows, list):
@@ -146,6 +147,18 @@ def load_rig(path: Path) -> Rig:
     rig = check_rig(_build(Rig, table, str(path)), str(path))
     check_slips(rig, str(path))
     return rig
+
+
+def _not_toml(path: Path, error: tomllib.TOMLDecodeError) -> str:
+    """What is wrong with a line, with the slips that are made most."""
+    text = f"{path}: is not valid TOML: {error}"
+    found = re.search(r"at line (\d+)", str(error))
+    line = path.read_text(encoding="utf-8").splitlines()[int(found[1]) - 1].strip() if found else ""
+    if comma := re.search(r"= *(\d+),(\d+)\s*(#.*)?$", line):
+        return f"{text}: {line}: a decimal comma? Write {comma[1]}.{comma[2]}"
+    if bare := re.search(r"= *([^\s\"'\[{0-9][^#]*?)\s*(#.*)?$", line):
+        return f'{text}: {line}: text stands in quotes; write "{bare[1]}"'
+    return f"{text}: {line}" if line else text
 
 
 def check_rig(rig: Rig, where: str) -> Rig:
@@ -215,6 +228,7 @@ def _check_heights(rig: Rig, where: str) -> None:
         if height_m is not None and not 0 <= height_m <= _HIGHEST_M:
             raise IpsysError(
                 f"{where}: {what} is {height_m} m; give the height above the floor in m, 0 to {_HIGHEST_M:g}"
+                + (f"; {height_m / 100:g} if that is cm" if 0 < height_m / 100 <= _HIGHEST_M else "")
             )
 
 
@@ -233,7 +247,9 @@ def _build(item: type[Item], row: Any, where: str) -> Item:
     known = {f.name: f for f in fields(item)}  # type: ignore[arg-type]
     unknown = sorted(set(row) - set(known))
     if unknown:
-        raise IpsysError(f"{where}: unknown key {unknown[0]!r}; known are {', '.join(known)}")
+        like = get_close_matches(unknown[0], known, 1)
+        meant = f"; was {like[0]} meant?" if like else f"; known are {', '.join(known)}"
+        raise IpsysError(f"{where}: unknown key {unknown[0]!r}{meant}")
     missing = [n for n, f in known.items() if f.default is MISSING and n not in row]
     if missing:
         raise IpsysError(f"{where}: {missing[0]} is missing")

@@ -318,10 +318,12 @@ def yaml(folder: Path) -> Path:
     ("text", "said"),
     [
         ("name = ", "not valid TOML"),
+        ('name = "a"\nmarker_length_m = 0,20', "a decimal comma? Write 0.20"),
+        ("name = lab one # mine", 'text stands in quotes; write "lab one"'),
         ('name = "a"', "dictionary is missing"),
         ('name = "a"\ndictionary = "DICT_4X4_100"\nmarker_length_m = "20 cm"', "must be a number"),
         ('name = "a"\ndictionary = "DICT_4X4_100"\nmarker_length_m = -1', "not a length"),
-        ('name = "a"\ndictionary = "DICT_4X4_100"\nmarker_lenght_m = 1', "unknown key 'marker_lenght_m'"),
+        ('name = "a"\ndictionary = "DICT_4X4_100"\nmarker_lenght_m = 1', "was marker_length_m meant?"),
         ('name = "a"\ndictionary = "DICT_9X9"\nmarker_length_m = 0.2', "none of OpenCV's"),
     ],
 )

@@ -69,9 +69,11 @@ def progress_bar() -> Iterator[Progress]:
 
 def print_outcomes(outcomes: Sequence[Outcome]) -> None:
     """What was done, what was found done, and what was left out."""
+    width = max((len(outcome.run) for outcome in outcomes), default=0)
     for outcome in outcomes:
-        state = f"{outcome.messages} messages" if outcome.fresh else "up to date"
-        remarks.print(f"{outcome.stage:<13} run {outcome.run:<16} {state}")
+        count = "1 message" if outcome.messages == 1 else f"{outcome.messages} messages"
+        state = count if outcome.fresh else "up to date"
+        remarks.print(f"{outcome.stage:<13} run {outcome.run:<{width}} {state}")
         for remark in outcome.remarks:
             # Names out of a log are not for rich to read as its markup.
             remarks.print(f"  {remark}", style="yellow", markup=False)

@@ -108,7 +108,7 @@ def _unknown(ids: tuple[int, ...]) -> str:
     """What to do about markers that are in the picture and not in the rig."""
     names = ", ".join(map(str, ids))
     if len(ids) == 1:
-        which, todo = f"marker {names} is", "to track it, add to lab.toml"
+        which, todo = f"marker {names} is", "to track it"
     else:
-        which, todo = f"markers {names} are", "to track them, add for each to lab.toml"
-    return f"{which} seen, but not in the rig; {todo}: [[markers]] id = {ids[0]}"
+        which, todo = f"markers {names} are", "to track them"
+    return f"{which} seen, but not in the rig; {todo} add the line [[markers]] to it, and below id = {ids[0]}"

@@ -189,7 +189,7 @@ def _cover(
     if not hung:
         notes.append(
             "what is seen of the whole floor needs at least three measured places in the view of each "
-            "camera, not on a line: measure some, and run this again"
+            "camera, not on a line: measure some (ipsys measure), and align that log (ipsys align LOG)"
         )
         return None
     if rig.floor is None:

@@ -161,7 +161,9 @@ def _advice_table(advice: Advice) -> Group:
         table.add_row(
             str(places), *(_choice(found[group]) if group in found else "-" for group in advice.groups)
         )
-    return Group(title, table, Text(_wrapped("\n".join(advice.sentences))))
+    lower = any(one.lowest != one.model for found in advice.choices.values() for one in found.values())
+    note = ["In brackets: the lowest mean error, where a simpler model is as good within the noise."] * lower
+    return Group(title, table, Text(_wrapped("\n".join([*note, *advice.sentences]))))
 
 
 def _choice(choice: Choice) -> str:

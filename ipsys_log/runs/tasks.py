@@ -132,9 +132,16 @@ def _detect(session: Session, request: Request) -> Task | str:
     if corners == detect.EDGES:
         lenses = _other_lenses(session, request)
         topics += _held_lenses(session, lenses)
-    as_live = request.as_live and bool(skipped_frames(session))
+    skipped = skipped_frames(session)
+    as_live = request.as_live and bool(skipped)
+    notes = [] if request.corners else [_why_stock(name) for name in without]
     if as_live:
         topics.append(EVENTS_TOPIC)
+    elif skipped:
+        notes.append(
+            f"{len(skipped)} frames that were skipped live are looked at too, which makes another run; "
+            "--as-live passes over them"
+        )
     return Task(
         "detect",
         corners,
@@ -147,7 +154,7 @@ def _detect(session: Session, request: Request) -> Task | str:
         rig=rig,
         lenses=lenses,
         as_live=as_live,
-        notes=[] if request.corners else [_why_stock(name) for name in without],
+        notes=notes,
     )
 
 

@@ -108,6 +108,8 @@ def _opener(camera: RigCamera) -> Open:
         )
     opener = OPENERS.get(camera.source.partition(":")[0].lower())
     if opener is None:
+        if shown.startswith("/dev/"):
+            raise IpsysError(f'camera {camera.name}: source {shown!r}: write it as "usb:{shown}"')
         known = ", ".join(f"{scheme}:" for scheme in OPENERS)
         raise IpsysError(f"camera {camera.name}: source {shown!r} is none of {known}")
     return opener

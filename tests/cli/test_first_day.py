@@ -219,9 +219,7 @@ def test_a_marker_that_is_not_in_the_rig_is_shown_with_what_to_do(
     markers = "".join(f"[[markers]]\nid = {n}\n" for n in known)
     rig_file = write_rig(tmp_path, markers + played(lab))
     done = ipsys("record", "--rig", rig_file, "--seconds", "2.5", "-o", tmp_path / "a.mcap")
-    said = (
-        "camera red: marker 0 is seen, but not in the rig; to track it, add to lab.toml: [[markers]] id = 0"
-    )
+    said = "camera red: marker 0 is seen, but not in the rig; to track it add the line [[markers]] to it, and below id = 0"
     assert said in done.out
     assert f"marker {known[0]} is seen" not in done.out
 

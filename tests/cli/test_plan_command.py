@@ -84,7 +84,7 @@ def test_the_plan_is_a_table_and_a_headline(
     assert lines[-1].startswith("predicted mean error over the floor now 0.")
     assert "with these 5 places 0." in lines[-1]
     # The model that was lacking was fitted and appended; what was recorded is as it was.
-    assert "fit           run best             1 messages" in done.err
+    assert "fit           run best  1 message\n" in done.err
     assert data_section(paper).startswith(section)
     with Session([paper]) as session:
         assert session.topics(Model, "best") == ["/runs/best/model"]

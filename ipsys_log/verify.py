@@ -12,7 +12,8 @@ from threadpoolctl import threadpool_limits
 from ipsys_log.compare import Comparison, Stored, compare_channels
 from ipsys_log.errors import IpsysError
 from ipsys_log.log.codec import encode
-from ipsys_log.log.session import Session, run_of_topic
+from ipsys_log.log.session import Session
+from ipsys_log.log.topics import run_of_topic
 from ipsys_log.messages import (
     CameraCalibration,
     CameraPoints,

@@ -21,6 +21,7 @@ from ipsys_log.errors import LogError
 from ipsys_log.log.codec import decode, payload_type
 from ipsys_log.log.measured_ids import other_ids, renamed
 from ipsys_log.log.reader import LogReader
+from ipsys_log.log.topics import camera_of_topic, clean_name, foreign_camera, run_of_topic
 from ipsys_log.log.types import Channel, RawMessage
 from ipsys_log.messages import (
     MEASUREMENTS_TOPIC,
@@ -33,16 +34,9 @@ from ipsys_log.messages import (
     Run,
 )
 
-__all__ = ["Session", "camera_of_topic", "run_of_topic"]
+__all__ = ["Session"]
 
 _IMAGES = (CompressedImage, CompressedVideo, RawImage)
-_OWN = re.compile(r"(?:/runs/(?P<run>[a-z][a-z0-9_]*))?/cameras/(?P<camera>[a-z][a-z0-9_]*)/[a-z_]+")
-_RUN = re.compile(r"/runs/(?P<run>[a-z][a-z0-9_]*)/")
-# What a topic's last parts say of an image, and not of which camera took it.
-_GENERIC = re.compile(
-    r"(image|images|raw|rect|color|colour|mono|compressed|calibration|camera_info|info|jpeg)"
-    r"(_(raw|rect|color|colour|mono|compressed))*"
-)
 
 
 class Session:
@@ -245,11 +239,11 @@ class Session:
         cameras: dict[str, str] = {}
         for payload in payloads:
             topics = self.topics(payload)
-            names = [camera_of_topic(topic) or _foreign_camera(topic) for topic in topics]
+            names = [camera_of_topic(topic) or foreign_camera(topic) for topic in topics]
             found: dict[str, str] = {}
             for topic, name in zip(topics, names, strict=True):
                 # Topics that differ only in words such as color or mono keep these words.
-                camera = name if names.count(name) == 1 else _clean_name(topic)
+                camera = name if names.count(name) == 1 else clean_name(topic)
                 if camera in found:
                     raise LogError(
                         f"{self}: two cameras of one name, {camera!r}: {found[camera]} and {topic}; "
@@ -279,36 +273,12 @@ class Session:
         return ""
 
 
-def camera_of_topic(topic: str) -> str | None:
-    """The camera in a topic of our own, such as ``/runs/stock/cameras/red/markers``."""
-    match = _OWN.fullmatch(topic)
-    return match["camera"] if match else None
-
-
-def run_of_topic(topic: str) -> str | None:
-    """The run in a topic, or None for what was recorded."""
-    match = _RUN.match(topic)
-    return match["run"] if match else None
-
-
 def _decode(channel: Channel, data: bytes) -> Any:
     schema = channel.schema
     if schema is None:
         return decode("", data, channel.message_encoding)
     definition = schema.data if schema.encoding == "ros2msg" else b""
     return decode(schema.name, data, channel.message_encoding, definition)
-
-
-def _foreign_camera(topic: str) -> str:
-    parts = topic.strip("/").split("/")
-    while len(parts) > 1 and _GENERIC.fullmatch(_clean_name(parts[-1])):
-        parts.pop()
-    return _clean_name("/".join(parts))
-
-
-def _clean_name(text: str) -> str:
-    name = re.sub(r"[^a-z0-9]+", "_", text.lower()).strip("_")
-    return name if name[:1].isalpha() else f"camera_{name}".rstrip("_")
 
 
 def _times(reader: LogReader, topic: str) -> NDArray[np.int64]:

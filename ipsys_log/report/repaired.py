@@ -9,7 +9,7 @@ from rich.table import Table
 
 from ipsys_log.log import LogReader, RepairReport
 from ipsys_log.log.chunking import IMAGE_SCHEMAS
-from ipsys_log.log.session import run_of_topic
+from ipsys_log.log.topics import run_of_topic
 from ipsys_log.units import NS_PER_S, format_bytes, format_time
 
 __all__ = ["repair_lines"]

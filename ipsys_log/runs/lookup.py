@@ -8,7 +8,8 @@ from dataclasses import replace
 import numpy as np
 
 from ipsys_log.errors import IpsysError
-from ipsys_log.log.session import Session, run_of_topic
+from ipsys_log.log.session import Session
+from ipsys_log.log.topics import run_of_topic
 from ipsys_log.messages import (
     FRAME_SKIPPED,
     CameraPoints,

@@ -6,7 +6,8 @@ from collections.abc import Callable, Iterable, Iterator, Mapping
 from dataclasses import replace
 from pathlib import Path
 
-from ipsys_log.log.session import Session, run_of_topic
+from ipsys_log.log.session import Session
+from ipsys_log.log.topics import run_of_topic
 from ipsys_log.messages import (
     EVENTS_TOPIC,
     RIG_TOPIC,

@@ -6,7 +6,8 @@ from collections.abc import Sequence
 from pathlib import Path
 
 from ipsys_log.errors import FitError, IpsysError
-from ipsys_log.log.session import Session, camera_of_topic
+from ipsys_log.log.session import Session
+from ipsys_log.log.topics import camera_of_topic
 from ipsys_log.messages import CameraPoints, Markers, Rig
 from ipsys_log.models import min_pairs, reads_height
 from ipsys_log.offline.pairs import split

@@ -12,7 +12,8 @@ import numpy as np
 
 from ipsys_log.errors import FrameError, IpsysError, LogError
 from ipsys_log.log import LogWriter
-from ipsys_log.log.session import Session, camera_of_topic
+from ipsys_log.log.session import Session
+from ipsys_log.log.topics import camera_of_topic
 from ipsys_log.measuring.entry import check_references
 from ipsys_log.measuring.scene import Stop, View
 from ipsys_log.measuring.stillness import still_stretches

@@ -8,7 +8,7 @@ from typing import Any
 import numpy as np
 import rerun as rr
 
-from ipsys_log.log.session import run_of_topic
+from ipsys_log.log.topics import run_of_topic
 from ipsys_log.messages import (
     TRUTH_TOPIC,
     CompressedImage,

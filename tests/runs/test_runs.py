@@ -13,7 +13,8 @@ import numpy as np
 import pytest
 
 from ipsys_log.log import LogWriter
-from ipsys_log.log.session import Session, run_of_topic
+from ipsys_log.log.session import Session
+from ipsys_log.log.topics import run_of_topic
 from ipsys_log.messages import (
     CameraCalibration,
     CameraPoints,

@@ -85,7 +85,7 @@ def live_scene(settings: list[Message], cameras: Attached, model: Model | None) 
     """What the cameras see now, to measure on."""
     from ipsys_log.scenes.live import LiveScene
 
-    return LiveScene(settings[0].payload, model, cameras.states, cameras.add)
+    return LiveScene(settings[0].payload, model, cameras.states, cameras.save)
 
 
 @contextmanager

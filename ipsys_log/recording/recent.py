@@ -23,7 +23,7 @@ class Recent:
 
     Everything comes and goes in the order of log times. A frame that is older than some seconds is forgotten,
     and any other message written then. A measurement is written at once, and before it the frames since its
-    marker lay still: it is on the disk as if everything were recorded.
+    marker lay still, as if everything were recorded.
 
     Parameters
     ----------
@@ -62,7 +62,6 @@ class Recent:
         self._held.append(message)
         if isinstance(payload, Measurement):
             self._write(None if payload.still is None else payload.still.start - _ROLLING_NS)
-            self._log.flush()
         while _is_frame(message) and self._held[0].log_time_ns < message.log_time_ns - _HELD_NS:
             old = self._held.popleft()
             if not _is_frame(old):

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterator
+from collections.abc import Generator, Iterator
 from dataclasses import replace
 from itertools import pairwise
 from pathlib import Path
@@ -207,7 +207,7 @@ class Noting(Attached):
 
     sent: list[Message]
 
-    def __iter__(self) -> Iterator[Message | None]:
+    def __iter__(self) -> Generator[Message | None, None, None]:
         self.sent = []
         for message in super().__iter__():
             self.sent += [] if message is None else [message]
@@ -263,7 +263,7 @@ def test_the_places_are_those_of_a_whole_recording_from_a_few_frames(
     attached = Noting(cameras(*sent), playing(sent, RATE_HZ), Clock())
     with attached:
         settings = first_messages(rig, lenses(lab_log), attached.now_ns)
-        hand = Hand(LiveScene(rig, None, attached.states, attached.add), tape)
+        hand = Hand(LiveScene(rig, None, attached.states, attached.save), tape)
         pipeline.measure(attached, settings, places, Request(), hand)
     history = hand.scene.history()
     gone = {one.withdraws for one in history}

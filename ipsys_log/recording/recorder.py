@@ -10,9 +10,10 @@ from dataclasses import replace
 from pathlib import Path
 from typing import Protocol
 
-from ipsys_log.errors import IpsysError, WriteError
+from ipsys_log.errors import IpsysError, LogError, WriteError
 from ipsys_log.geometry.lenses import scale_lens
 from ipsys_log.log import LogWriter
+from ipsys_log.log.journal import roll_back
 from ipsys_log.log.lock import open_locked
 from ipsys_log.log.storage import DISK
 from ipsys_log.messages import (
@@ -140,7 +141,8 @@ def recording(path: Path, overwrite: bool = False) -> Iterator[Recording]:
 
     Parameters
     ----------
-    overwrite : put it in place of one that is there, unless another process is writing that.
+    overwrite : put it in place of one that is there, unless another process is writing that. The old one is
+        gone only when the new one stands.
 
     Raises
     ------
@@ -149,14 +151,31 @@ def recording(path: Path, overwrite: bool = False) -> Iterator[Recording]:
     IpsysError
         Where the disk is so full that the log could not be ended as it should.
     """
-    if overwrite and path.exists():
-        os.close(open_locked(DISK, path, os.O_RDWR))
-        path.unlink()
+    created = _create(path, overwrite)
     try:
-        with LogWriter.create(path) as writer, reserve(path) as free:
+        with created as writer, reserve(path) as free:
             yield Recording(writer, free)
     except WriteError as error:
         raise IpsysError(what_fitted(path, error)) from error
+
+
+def _create(path: Path, overwrite: bool) -> LogWriter:
+    if not (overwrite and path.exists()):
+        return LogWriter.create(path)
+    old = open_locked(DISK, path, os.O_RDWR)
+    try:
+        roll_back(DISK, path, old)  # what was left over of an append is not of the new log
+        partial = path.with_name(f"{path.name}.new")
+        partial.unlink(missing_ok=True)  # who made it was killed: the lock is ours
+        try:
+            writer = LogWriter.create(partial)
+            writer.move(path)
+        except (OSError, WriteError) as error:
+            partial.unlink(missing_ok=True)
+            raise LogError(f"{path}: is as it was, a new one cannot be made: {error}") from error
+        return writer
+    finally:
+        os.close(old)
 
 
 def fitting_lenses(

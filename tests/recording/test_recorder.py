@@ -11,7 +11,7 @@ from pathlib import Path
 
 import pytest
 
-from ipsys_log.errors import LogError
+from ipsys_log.errors import IpsysError, LogError
 from ipsys_log.log import LogWriter
 from ipsys_log.log.session import Session
 from ipsys_log.log.storage import Disk
@@ -153,3 +153,58 @@ def test_a_log_that_is_being_written_is_not_overwritten(tmp_path: Path) -> None:
     with recording(path, overwrite=True) as second:
         second.put(frame(2))
     assert second.counts == {image_topic("red"): 1}
+
+
+def test_the_old_log_is_there_until_the_new_one_stands(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    path = tmp_path / "a.mcap"
+    with recording(path) as first:
+        first.put(frame(0))
+    old = path.read_bytes()
+
+    def broken(self: LogWriter, path: Path) -> None:
+        raise PermissionError(errno.EPERM, "Operation not permitted")
+
+    with monkeypatch.context() as patch:
+        patch.setattr(LogWriter, "move", broken)
+        with pytest.raises(IpsysError, match="Operation not permitted"), recording(path, overwrite=True):
+            pass
+    assert (path.read_bytes(), list(tmp_path.iterdir())) == (old, [path])
+    (tmp_path / "a.mcap.new").write_bytes(b"left by one that was killed")
+    with recording(path, overwrite=True) as second:
+        second.put(frame(1))
+        # Nobody else makes a log there meanwhile, nor is there an instant without one.
+        with pytest.raises(LogError, match="another process"), recording(path, overwrite=True):
+            pass
+    with Session([path]) as session:
+        assert [one.timestamp for one in session.payloads([image_topic("red")])] == [1]
+    assert list(tmp_path.iterdir()) == [path]
+
+
+@pytest.mark.parametrize("whole", [True, False])
+def test_a_journal_that_was_left_over_does_not_outlive_its_log(tmp_path: Path, whole: bool) -> None:
+    path, journal = tmp_path / "a.mcap", tmp_path / "a.mcap.journal"
+    with recording(path) as first:
+        first.put(frame(0))
+    if whole:
+        writer = LogWriter.append(path, storage=Killed())
+        writer.add_channel("/a", None, "json")
+        writer.write("/a", 1, 1, b"{}")
+        with pytest.raises(KeyboardInterrupt):
+            writer.close()
+        assert journal.stat().st_size > 100
+    else:
+        journal.write_bytes(b"torn")
+    with recording(path, overwrite=True) as second:
+        second.put(frame(1))
+    with Session([path]) as session:
+        assert [one.timestamp for one in session.payloads([image_topic("red")])] == [1]
+    assert not journal.exists()
+
+
+class Killed(Disk):
+    """Is killed when a journal stands."""
+
+    def truncate(self, fd: int, size: int) -> None:  # noqa: ARG002
+        raise KeyboardInterrupt

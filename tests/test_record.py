@@ -265,3 +265,30 @@ def test_a_calibration_of_another_shape_is_refused_and_of_another_size_is_scaled
     with Session([tmp_path / "b.mcap"]) as session:
         (held,) = session.payloads([session.calibrations["red"]])
     assert (held.width, held.height, held.K[0, 0], held.K[0, 2]) == (320, 240, 150.0, 159.5)
+
+
+def test_what_is_read_is_not_overwritten(ipsys: Ipsys, lab_log: Path, tmp_path: Path) -> None:
+    played, rig, lens = tmp_path / "red.mcap", tmp_path / "lab.toml", tmp_path / "lens.mcap"
+    for path in (played, lens):
+        path.write_bytes(lab_log.read_bytes())
+    head = 'name = "lab"\ndictionary = "DICT_4X4_100"\nmarker_length_m = 0.2\n'
+    rig.write_text(f'{head}[[cameras]]\nname = "red"\nsource = "file:{played}"\n')
+    files = {path: path.read_bytes() for path in (played, rig, lens)}
+    once = ("--rig", rig, "--calibration", lens, "--force", "--seconds", "1", "-o")
+    for path, said in (
+        (played, "is what camera red plays"),
+        (lens, "is a calibra"),
+    ):
+        assert said in ipsys("record", *once, path).err
+    model = ("--model-from", lab_log, *once)
+    done = ipsys("record", "--measure", *model, lab_log)
+    assert f"-o {lab_log}: is the log with the model" in done.err
+    assert f"-o {lab_log}: is the log with the model" in ipsys("live", *model, lab_log).err
+    assert {path: path.read_bytes() for path in files} == files
+    # Before a camera is opened.
+    for count in (243, 249, 300):
+        done = ipsys("record", *once, tmp_path / ("x" * count))
+        assert done.code == 1
+        assert done.err.endswith("File name too long; give a shorter name\n")
+        assert "opening" not in done.err + done.out
+        assert "Traceback" not in done.err

@@ -149,6 +149,97 @@ def test_it_ends_cleanly_when_it_is_told_to(
     assert all(len(found) > 10 for found in frames(log).values())
 
 
+HANGING = """
+import sys, time
+from contextlib import contextmanager
+from pathlib import Path
+from ipsys_log import pipeline
+from ipsys_log.cli import cameras_now
+from ipsys_log.errors import IpsysError
+from ipsys_log.log.storage import Disk
+from ipsys_log.messages import RigCamera
+from ipsys_log.sources.attached import Attached
+from ipsys_log.sources.frames import Clock, Frame
+
+what, pwrite = sys.argv[2], Disk.pwrite
+
+@contextmanager
+def opened(camera, clock, say):
+    def sent():
+        for number in range(10**6):
+            time.sleep(0.01)
+            if what == "camera" and number == 200:
+                print("hangs", flush=True)
+                time.sleep(1000)
+            yield Frame(bytes(1000), "jpeg", clock.now_ns())
+    yield sent()
+
+def hanging(self, fd, data, offset):
+    if what == "disk" and offset > 150_000:
+        print("hangs", flush=True)
+        time.sleep(1000)
+    return pwrite(self, fd, data, offset)
+
+Disk.pwrite = hanging
+try:
+    with Attached([RigCamera("red", source="a:1")], opened, Clock()) as attached:
+        with cameras_now._ended(attached.stop, None):
+            pipeline.record(attached, [], Path(sys.argv[1]))
+except IpsysError as error:
+    sys.exit(str(error))
+except KeyboardInterrupt:
+    sys.exit(130)
+"""
+
+
+@pytest.mark.parametrize(("what", "code"), [("camera", 130), ("disk", 1)])
+def test_a_second_interrupt_ends_what_hangs_and_the_log_is_kept(
+    what: str, code: int, ipsys: Ipsys, tmp_path: Path
+) -> None:
+    log = tmp_path / "a.mcap"
+    with subprocess.Popen(
+        [sys.executable, "-c", HANGING, str(log), what],
+        stdout=subprocess.PIPE,
+        stderr=subprocess.PIPE,
+        text=True,
+    ) as program:
+        assert program.stdout is not None
+        assert program.stdout.readline() == "hangs\n"
+        program.send_signal(signal.SIGINT)
+        time.sleep(0.5)
+        assert program.poll() is None
+        program.send_signal(signal.SIGINT)
+        _, err = program.communicate(timeout=10)
+    assert program.returncode == code, err
+    assert "Traceback" not in err
+    if what == "disk":
+        assert f"ipsys repair {log}" in err
+        assert ipsys("repair", log).code == 0
+    assert 80 < len(frames(log)["red"]) <= 200
+
+
+ENDING = """
+import signal, time
+from ipsys_log.cli import cameras_now
+from ipsys_log.sources.attached import Attached
+from ipsys_log.sources.frames import Clock
+
+attached = Attached([], None, Clock())
+with cameras_now._ended(attached.stop, None):
+    handler = signal.getsignal(signal.SIGINT)
+    signal.signal(signal.SIGALRM, lambda *_: handler())
+    signal.setitimer(signal.ITIMER_REAL, 0.0003, 0.0003)
+    end = time.monotonic() + 2
+    while time.monotonic() < end:
+        with attached:  # its locks are taken and given back
+            assert list(attached) == []
+"""
+
+
+def test_a_signal_may_come_at_any_moment() -> None:
+    subprocess.run([sys.executable, "-c", ENDING], timeout=20, check=True)
+
+
 def test_a_recorder_that_is_killed_loses_its_last_second_at_most(
     ipsys: Ipsys, pictures: tuple[Path, list[bytes]], tmp_path: Path
 ) -> None:

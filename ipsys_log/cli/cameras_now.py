@@ -174,10 +174,20 @@ def shown_to(first: Watch, second: Watch | None) -> Watch:
 
 @contextmanager
 def _ended(stop: Callable[[], None], seconds: float | None) -> Iterator[None]:
-    """On Ctrl-C, SIGTERM or after some time it ends cleanly: what has come by then is written."""
+    """On Ctrl-C, SIGTERM or after some time it ends cleanly: what has come by then is written.
+
+    ``stop`` takes no lock: the thread that is interrupted may hold it. A second signal interrupts.
+    """
+
+    def end(*_: object) -> None:
+        signal.signal(signal.SIGINT, signal.default_int_handler)
+        signal.signal(signal.SIGTERM, signal.SIG_DFL)
+        stop()
+
     for number in (signal.SIGINT, signal.SIGTERM):
-        signal.signal(number, lambda *_: stop())
+        signal.signal(number, end)
     timer = Timer(TIMEOUT_MAX if seconds is None else seconds, stop)
+    timer.daemon = True
     timer.start()
     try:
         yield

@@ -15,6 +15,8 @@ __all__ = ["TICK", "Backlog"]
 
 # Between two messages of a source: nothing more has come so far. It is not in the log.
 TICK = Message("", 0, 0, None)
+# Whoever interrupts does not wait longer for a recorder that hangs.
+_LAST_S = 1.0
 
 
 class Backlog:
@@ -48,7 +50,7 @@ class Backlog:
         self, kind: type[BaseException] | None, error: BaseException | None, trace: TracebackType | None
     ) -> None:
         self._source.stop()
-        self._thread.join()
+        self._thread.join(_LAST_S if isinstance(error, KeyboardInterrupt) else None)
 
     def __iter__(self) -> Iterator[Message]:
         while True:

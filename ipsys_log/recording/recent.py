@@ -40,7 +40,7 @@ class Recent:
     def __exit__(
         self, kind: type[BaseException] | None, error: BaseException | None, trace: TracebackType | None
     ) -> None:
-        if not isinstance(error, WriteError):
+        if not isinstance(error, (WriteError, KeyboardInterrupt)):
             self._write()
 
     @property

@@ -5,7 +5,7 @@ from __future__ import annotations
 import os
 import threading
 from collections.abc import Callable, Generator, Iterator, Mapping
-from contextlib import closing, contextmanager
+from contextlib import ExitStack, closing, contextmanager
 from dataclasses import replace
 from pathlib import Path
 from typing import Protocol
@@ -38,6 +38,9 @@ __all__ = [
     "recording",
     "written",
 ]
+
+# Whoever interrupts does not wait longer for a write.
+_SETTLE_S = 1.0
 
 
 class Source(Protocol):
@@ -77,6 +80,7 @@ class Recording:
         self.full: WriteError | None = None
         self._writer, self._free = writer, free
         self._lock = threading.Lock()
+        self._torn = False
 
     def put(self, message: Message) -> None:
         """Write a message. No chunk spans more than a second: a recorder that is killed loses no more.
@@ -103,8 +107,13 @@ class Recording:
         if self.full is not None:
             raise IpsysError(what_fitted(self._writer.path, self.full)) from self.full
 
+    def settle(self) -> bool:
+        """Write nothing more, whichever thread wants to; False where one is in the midst of it."""
+        return self._lock.acquire(timeout=_SETTLE_S) and not self._torn
+
     def _write(self, write: Callable[[], None]) -> None:
         with self._lock:
+            self._torn = True
             try:
                 write()
             except WriteError as error:
@@ -113,6 +122,7 @@ class Recording:
                 self.full = error
                 self._free()
                 write()
+            self._torn = False
 
 
 def written(source: Source, log: Target) -> Iterator[Message | None]:
@@ -153,8 +163,18 @@ def recording(path: Path, overwrite: bool = False) -> Iterator[Recording]:
     """
     created = _create(path, overwrite)
     try:
-        with created as writer, reserve(path) as free:
-            yield Recording(writer, free)
+        with ExitStack() as held:
+            log = Recording(held.enter_context(created), held.enter_context(reserve(path)))
+            try:
+                yield log
+            except KeyboardInterrupt as error:
+                if log.settle():
+                    raise
+                held.pop_all()  # a log that is torn cannot be ended, and what hangs would hang here too
+                text = (
+                    f"{path}: interrupted while it was written; see what it holds with: ipsys repair {path}"
+                )
+                raise IpsysError(text) from error
     except WriteError as error:
         raise IpsysError(what_fitted(path, error)) from error
 

@@ -25,6 +25,8 @@ _TICK_S = 0.1
 _REMEMBERED = 20_000
 # A disk that takes longer is no disk to measure onto; somebody waits for the answer.
 _SAVED_S = 5.0
+# Whoever interrupts does not wait longer for a camera that hangs.
+_LAST_S = 1.0
 
 
 class Attached:
@@ -90,7 +92,7 @@ class Attached:
     def __exit__(
         self, kind: type[BaseException] | None, error: BaseException | None, trace: TracebackType | None
     ) -> None:
-        self._end()
+        self._end(_LAST_S if isinstance(error, KeyboardInterrupt) else None)
 
     def stop(self, why: str | None = None) -> None:
         """Take no more frames; what has come is still given out. A signal handler may call it: no lock.
@@ -214,10 +216,10 @@ class Attached:
     def _done(self) -> bool:
         return all(state.finished for state in self.states.values())
 
-    def _end(self) -> None:
+    def _end(self, seconds: float | None = None) -> None:
         self._stopped.set()
         for attendant in self._attendants:
-            attendant.thread.join()
+            attendant.thread.join(seconds)
 
 
 def _bytes_of(arrival: Arrival | None) -> int:

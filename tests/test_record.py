@@ -233,6 +233,7 @@ with cameras_now._ended(attached.stop, None):
     while time.monotonic() < end:
         with attached:  # its locks are taken and given back
             assert list(attached) == []
+    signal.setitimer(signal.ITIMER_REAL, 0)
 """
 
 
@@ -380,6 +381,6 @@ def test_what_is_read_is_not_overwritten(ipsys: Ipsys, lab_log: Path, tmp_path: 
     for count in (243, 249, 300):
         done = ipsys("record", *once, tmp_path / ("x" * count))
         assert done.code == 1
-        assert done.err.endswith("File name too long; give a shorter name\n")
+        assert "File name too long" in done.err
         assert "opening" not in done.err + done.out
         assert "Traceback" not in done.err

@@ -209,7 +209,10 @@ def test_a_second_interrupt_ends_what_hangs_and_the_log_is_kept(
         time.sleep(0.5)
         assert program.poll() is None
         program.send_signal(signal.SIGINT)
-        _, err = program.communicate(timeout=10)
+        try:
+            _, err = program.communicate(timeout=10)
+        finally:
+            program.kill()
     assert program.returncode == code, err
     assert "Traceback" not in err
     if what == "disk":

@@ -231,7 +231,7 @@ attached = Attached([], None, Clock())
 with cameras_now._ended(attached.stop, None):
     handler = signal.getsignal(signal.SIGINT)
     signal.signal(signal.SIGALRM, lambda *_: handler())
-    signal.setitimer(signal.ITIMER_REAL, 0.0003, 0.0003)
+    signal.setitimer(signal.ITIMER_REAL, 0.002, 0.002)
     end = time.monotonic() + 2
     while time.monotonic() < end:
         with attached:  # its locks are taken and given back

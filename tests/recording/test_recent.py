@@ -140,6 +140,19 @@ def test_hours_of_frames_are_not_kept_in_memory(log: Noted) -> None:
             assert len(recent._held) <= 52
 
 
+def test_of_large_frames_fewer_are_kept_and_events_all_the_same(log: Noted) -> None:
+    with Recent(log, limit_bytes=10_000) as recent:
+        recent.put(event("camera_lost", 0.001))
+        for message in frames(0, 20):
+            recent.put(replace(message, payload=replace(message.payload, data=bytes(1000))))
+            held = [one for one in recent._held if isinstance(one.payload, CompressedImage)]
+            assert len(held) <= 10
+        recent.put(measured("p001", 18.6, 19.7, 19.99))
+    # The last ten, of the fifteen of its second.
+    assert taken_s(log) == pytest.approx(np.arange(19.0, 19.95, 0.1))
+    assert [m.payload.kind for m in log.noted if isinstance(m.payload, Event)] == ["camera_lost"]
+
+
 def test_of_a_video_no_seconds_can_be_kept() -> None:
     with pytest.raises(IpsysError, match="camera white sends h264, of which no single seconds can be kept"):
         check_pictures({"red": CameraState(format="jpeg"), "white": CameraState(format="h264")})

@@ -51,10 +51,11 @@ from ipsys_log.messages import (
     Positions,
     Tracks,
 )
+from ipsys_log.recording.backlog import TICK, Backlog
 from ipsys_log.recording.latency import Ledger
 from ipsys_log.recording.plan import check_pictures, plan_live
 from ipsys_log.recording.recent import Recent
-from ipsys_log.recording.recorder import TICK, Backlog, Recording, recording, written
+from ipsys_log.recording.recorder import Recording, Source, recording, written
 from ipsys_log.runs.lookup import wanted_models
 from ipsys_log.runs.output import opened_target
 from ipsys_log.runs.perform import inputs, perform, sign
@@ -194,7 +195,7 @@ def carry_out(task: Task, session: Session, name: str, progress: Progress) -> It
 
 
 def record(
-    source: Iterable[Message | None],
+    source: Source,
     settings: Iterable[Message],
     target: Path,
     watch: Watch = lambda one: None,
@@ -258,7 +259,7 @@ def measure(
     with recording(target, overwrite) as log, threadpool_limits(1, user_api="blas"):
         for message in settings:
             log.put(message)
-        with Recent(log) as recent, Backlog(cameras, recent, cameras.now_ns, cameras.stop) as frames:
+        with Recent(log) as recent, Backlog(cameras, recent, cameras.now_ns) as frames:
             for message in run(run(chain(settings, frames), [detect], in_threads), [camera_frame]):
                 if message is not TICK:
                     watch(message)
@@ -300,7 +301,7 @@ def live(
     with recording(target, overwrite) as log, threadpool_limits(1, user_api="blas"):
         for message in (*settings, *plan.copies(cameras.now_ns)):
             log.put(message)
-        with Backlog(cameras, log, cameras.now_ns, cameras.stop) as frames:
+        with Backlog(cameras, log, cameras.now_ns) as frames:
             stages = [Stage(*row) for row in plan.rows]
             ledger = Ledger(cameras.clock.now_ns, cameras.received_ns)
             fault = _put_through(chain(settings, frames), stages, ledger, log, watch)

@@ -444,7 +444,7 @@ def test_a_place_is_measured_while_it_is_recorded_and_a_model_is_fitted_to_it(
     attached = Attached(cameras(*frames), playing(frames, 10.0), Clock())
     saved: set[int] = set()
     with attached:
-        scene = LiveScene(rig, model, attached.states, attached.add)
+        scene = LiveScene(rig, model, attached.states, attached.save)
 
         def measure(message: Message | None) -> None:
             scene(message)

@@ -149,6 +149,101 @@ def test_it_ends_cleanly_when_it_is_told_to(
     assert all(len(found) > 10 for found in frames(log).values())
 
 
+HANGING = """
+import sys, time
+from contextlib import contextmanager
+from pathlib import Path
+from ipsys_log import pipeline
+from ipsys_log.cli import cameras_now
+from ipsys_log.errors import IpsysError
+from ipsys_log.log.storage import Disk
+from ipsys_log.messages import RigCamera
+from ipsys_log.sources.attached import Attached
+from ipsys_log.sources.frames import Clock, Frame
+
+what, pwrite = sys.argv[2], Disk.pwrite
+
+@contextmanager
+def opened(camera, clock, say):
+    def sent():
+        for number in range(10**6):
+            time.sleep(0.01)
+            if what == "camera" and number == 200:
+                print("hangs", flush=True)
+                time.sleep(1000)
+            yield Frame(bytes(1000), "jpeg", clock.now_ns())
+    yield sent()
+
+def hanging(self, fd, data, offset):
+    if what == "disk" and offset > 150_000:
+        print("hangs", flush=True)
+        time.sleep(1000)
+    return pwrite(self, fd, data, offset)
+
+Disk.pwrite = hanging
+try:
+    with Attached([RigCamera("red", source="a:1")], opened, Clock()) as attached:
+        with cameras_now._ended(attached.stop, None):
+            pipeline.record(attached, [], Path(sys.argv[1]))
+except IpsysError as error:
+    sys.exit(str(error))
+except KeyboardInterrupt:
+    sys.exit(130)
+"""
+
+
+@pytest.mark.parametrize(("what", "code"), [("camera", 130), ("disk", 1)])
+def test_a_second_interrupt_ends_what_hangs_and_the_log_is_kept(
+    what: str, code: int, ipsys: Ipsys, tmp_path: Path
+) -> None:
+    log = tmp_path / "a.mcap"
+    with subprocess.Popen(
+        [sys.executable, "-c", HANGING, str(log), what],
+        stdout=subprocess.PIPE,
+        stderr=subprocess.PIPE,
+        text=True,
+    ) as program:
+        assert program.stdout is not None
+        assert program.stdout.readline() == "hangs\n"
+        program.send_signal(signal.SIGINT)
+        time.sleep(0.5)
+        assert program.poll() is None
+        program.send_signal(signal.SIGINT)
+        try:
+            _, err = program.communicate(timeout=10)
+        finally:
+            program.kill()
+    assert program.returncode == code, err
+    assert "Traceback" not in err
+    if what == "disk":
+        assert f"ipsys repair {log}" in err
+        assert ipsys("repair", log).code == 0
+    assert 80 < len(frames(log)["red"]) <= 200
+
+
+ENDING = """
+import signal, time
+from ipsys_log.cli import cameras_now
+from ipsys_log.sources.attached import Attached
+from ipsys_log.sources.frames import Clock
+
+attached = Attached([], None, Clock())
+with cameras_now._ended(attached.stop, None):
+    handler = signal.getsignal(signal.SIGINT)
+    signal.signal(signal.SIGALRM, lambda *_: handler())
+    signal.setitimer(signal.ITIMER_REAL, 0.002, 0.002)
+    end = time.monotonic() + 2
+    while time.monotonic() < end:
+        with attached:  # its locks are taken and given back
+            assert list(attached) == []
+    signal.setitimer(signal.ITIMER_REAL, 0)
+"""
+
+
+def test_a_signal_may_come_at_any_moment() -> None:
+    subprocess.run([sys.executable, "-c", ENDING], timeout=20, check=True)
+
+
 def test_a_recorder_that_is_killed_loses_its_last_second_at_most(
     ipsys: Ipsys, pictures: tuple[Path, list[bytes]], tmp_path: Path
 ) -> None:
@@ -265,3 +360,30 @@ def test_a_calibration_of_another_shape_is_refused_and_of_another_size_is_scaled
     with Session([tmp_path / "b.mcap"]) as session:
         (held,) = session.payloads([session.calibrations["red"]])
     assert (held.width, held.height, held.K[0, 0], held.K[0, 2]) == (320, 240, 150.0, 159.5)
+
+
+def test_what_is_read_is_not_overwritten(ipsys: Ipsys, lab_log: Path, tmp_path: Path) -> None:
+    played, rig, lens = tmp_path / "red.mcap", tmp_path / "lab.toml", tmp_path / "lens.mcap"
+    for path in (played, lens):
+        path.write_bytes(lab_log.read_bytes())
+    head = 'name = "lab"\ndictionary = "DICT_4X4_100"\nmarker_length_m = 0.2\n'
+    rig.write_text(f'{head}[[cameras]]\nname = "red"\nsource = "file:{played}"\n')
+    files = {path: path.read_bytes() for path in (played, rig, lens)}
+    once = ("--rig", rig, "--calibration", lens, "--force", "--seconds", "1", "-o")
+    for path, said in (
+        (played, "is what camera red plays"),
+        (lens, "is a calibra"),
+    ):
+        assert said in ipsys("record", *once, path).err
+    model = ("--model-from", lab_log, *once)
+    done = ipsys("record", "--measure", *model, lab_log)
+    assert f"-o {lab_log}: is the log with the model" in done.err
+    assert f"-o {lab_log}: is the log with the model" in ipsys("live", *model, lab_log).err
+    assert {path: path.read_bytes() for path in files} == files
+    # Before a camera is opened.
+    for count in (243, 249, 300):
+        done = ipsys("record", *once, tmp_path / ("x" * count))
+        assert done.code == 1
+        assert "File name too long" in done.err
+        assert "opening" not in done.err + done.out
+        assert "Traceback" not in done.err

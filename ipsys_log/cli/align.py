@@ -100,7 +100,7 @@ def _prepared_now(
     lab = prepared(rig, None, calibration)
     check_start(lab.rig, lab.names, lab.lenses, Request(corners=corners), "camera-frame")
     if output is not None:
-        check_target(output, force=False)
+        check_target(output, False, lab.files)
     return lab
 
 

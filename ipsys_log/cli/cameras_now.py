@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import os
 import signal
-from collections.abc import Callable, Iterator
+from collections.abc import Callable, Iterable, Iterator
 from contextlib import AbstractContextManager, ExitStack, contextmanager, nullcontext
 from dataclasses import replace
 from pathlib import Path
@@ -22,15 +22,20 @@ if TYPE_CHECKING:
     from ipsys_log.report.cameras import LiveStatus
     from ipsys_log.sources.attached import Attached
 
-__all__ = ["Lab", "check_target", "opened", "prepared", "recorded_now", "say", "shown_to"]
+__all__ = ["MODEL", "Lab", "check_target", "opened", "prepared", "recorded_now", "say", "shown_to"]
+
+
+# What a log is that is named by --model-from.
+MODEL = "the log with the model"
 
 
 class Lab(NamedTuple):
-    """What is to be opened: the rig, its cameras, and their lenses by name."""
+    """What is to be opened: the rig, its cameras, their lenses by name, and what these are read from."""
 
     rig: Rig
     cameras: list[RigCamera]
     lenses: dict[str, CameraCalibration]
+    files: list[tuple[str, Path]]
 
     @property
     def names(self) -> list[str]:
@@ -59,7 +64,8 @@ def prepared(
     """
     from ipsys_log.sources.devices import check_devices, check_sources, usb_advice
 
-    lab = Lab(*load_lab(rig, calibration, only or (), with_lenses))
+    described, cameras, lenses = load_lab(rig, calibration, only or (), with_lenses)
+    lab = Lab(described, cameras, lenses, _files(rig, cameras, calibration))
     check_devices(lab.cameras)
     check_sources(lab.cameras)
     for line in usb_advice(replace(lab.rig, cameras=tuple(lab.cameras))):
@@ -71,22 +77,47 @@ def prepared(
     return lab
 
 
-def check_target(output: Path, force: bool) -> None:
+def _files(rig: Path, cameras: list[RigCamera], calibration: list[str] | None) -> list[tuple[str, Path]]:
+    found = [("a calibration", Path(one.rpartition("=")[2])) for one in calibration or ()]
+    for one in cameras:
+        if one.calibration is not None:
+            found.append((f"the lens of camera {one.name}", rig.parent / one.calibration))
+        kind, _, name = str(one.source).partition(":")
+        if kind == "file":
+            found.append((f"what camera {one.name} plays", Path(name.partition("?")[0])))
+    return found
+
+
+def check_target(output: Path, force: bool, files: Iterable[tuple[str, Path]]) -> None:
     """See that a log can be written.
+
+    Parameters
+    ----------
+    files : what is read meanwhile, by what it is: it is not to be overwritten.
 
     Raises
     ------
     IpsysError
-        Where there is one already, or its folder is not there, or takes no files; with ``force`` where
-        another process is writing it.
+        Where there is one already, or its folder is not there, or takes no files or none of that name; with
+        ``force`` where another process is writing it.
     """
     from ipsys_log.errors import IpsysError
-    from ipsys_log.log.lock import open_locked
+    from ipsys_log.log.journal import journal_path
+    from ipsys_log.log.lock import check_free, open_locked
     from ipsys_log.log.storage import DISK
     from ipsys_log.report.files import check_file
 
+    try:
+        journal_path(output).exists()
+    except OSError as error:
+        raise IpsysError(f"-o {output}: {error.strerror}; give a shorter name") from error
     check_file(output, "-o", [])
-    if output.exists():
+    if not output.exists():
+        check_free(output)
+    else:
+        for what, path in files:
+            if path.exists() and output.samefile(path):
+                raise IpsysError(f"-o {output}: is {what}; give another name")
         if not force:
             raise IpsysError(f"{output}: exists already; give another name, or --force to overwrite it")
         os.close(open_locked(DISK, output, os.O_RDWR))
@@ -143,10 +174,20 @@ def shown_to(first: Watch, second: Watch | None) -> Watch:
 
 @contextmanager
 def _ended(stop: Callable[[], None], seconds: float | None) -> Iterator[None]:
-    """On Ctrl-C, SIGTERM or after some time it ends cleanly: what has come by then is written."""
+    """On Ctrl-C, SIGTERM or after some time it ends cleanly: what has come by then is written.
+
+    ``stop`` takes no lock: the thread that is interrupted may hold it. A second signal interrupts.
+    """
+
+    def end(*_: object) -> None:
+        signal.signal(signal.SIGINT, signal.default_int_handler)
+        signal.signal(signal.SIGTERM, signal.SIG_DFL)
+        stop()
+
     for number in (signal.SIGINT, signal.SIGTERM):
-        signal.signal(number, lambda *_: stop())
+        signal.signal(number, end)
     timer = Timer(TIMEOUT_MAX if seconds is None else seconds, stop)
+    timer.daemon = True
     timer.start()
     try:
         yield

@@ -99,8 +99,6 @@ def measure(
     _refuse("a finished log; name it", csv=csv, places=places)
     if rig is None or output is None:
         raise IpsysError("name a finished log, or give --rig lab.toml -o places.mcap to measure with cameras")
-    if model_from is not None and output.exists() and model_from.exists() and output.samefile(model_from):
-        raise IpsysError(f"-o {output}: is the log with the model; give another name")
     from ipsys_log.cli.measure_now import measure_now
 
     measured = measure_now(output, rig, camera, calibration, corners, model_from, force, terminal, host, port)

@@ -11,7 +11,7 @@ from pathlib import Path
 from time import sleep
 from typing import TYPE_CHECKING, Any
 
-from ipsys_log.cli.cameras_now import Lab, check_target, opened, prepared, shown_to
+from ipsys_log.cli.cameras_now import MODEL, Lab, check_target, opened, prepared, shown_to
 from ipsys_log.cli.console import console, remarks
 
 if TYPE_CHECKING:
@@ -44,12 +44,13 @@ def measure_now(
     from ipsys_log.runs.request import Request
 
     lab, request = prepared(rig, camera, calibration), Request(corners=corners)
+    read = lab.files if model_from is None else [*lab.files, (MODEL, model_from)]
+    check_target(output, force, read)
     model = ready_to_measure(lab, request, model_from)
     if not terminal:
         from ipsys_log.web.serving import check_free
 
         check_free(host, port)
-    check_target(output, force)
     ends = "q" if terminal else "Ctrl-C"
     doing = f"measuring into {output}; {ends} ends it"
     with opened(lab, output, None, doing, not terminal) as (cameras, settings, status):
@@ -85,7 +86,7 @@ def live_scene(settings: list[Message], cameras: Attached, model: Model | None) 
     """What the cameras see now, to measure on."""
     from ipsys_log.scenes.live import LiveScene
 
-    return LiveScene(settings[0].payload, model, cameras.states, cameras.add)
+    return LiveScene(settings[0].payload, model, cameras.states, cameras.save)
 
 
 @contextmanager

@@ -8,7 +8,7 @@ from typing import TYPE_CHECKING, Annotated, Optional
 
 import typer
 
-from ipsys_log.cli.cameras_now import check_target, opened, prepared, say, shown_to
+from ipsys_log.cli.cameras_now import MODEL, check_target, opened, prepared, say, shown_to
 from ipsys_log.cli.console import remarks
 from ipsys_log.cli.options import (
     Calibrations,
@@ -69,6 +69,8 @@ def record(
     if model_from is not None and not measure:
         raise IpsysError(f"--model-from {model_from}: has no effect without --measure; to track: ipsys live")
     lab = prepared(rig, camera, calibration)
+    read = lab.files if model_from is None else [*lab.files, (MODEL, model_from)]
+    check_target(output, force, read)
     request = Request(corners=corners)
     if measure:
         from ipsys_log.web.serving import check_free
@@ -77,7 +79,6 @@ def record(
         check_free(host, port)
     elif detect:
         check_start(lab.rig, lab.names, lab.lenses, request, "detect")
-    check_target(output, force)
     with opened(lab, output, seconds) as (cameras, settings, status):
         if measure:
             scene = live_scene(settings, cameras, model)
@@ -112,18 +113,15 @@ def live(
 ) -> None:
     """Track robots now: record, and take every frame through all stages up to fuse, until Ctrl-C."""
     from ipsys_log import pipeline
-    from ipsys_log.errors import IpsysError
     from ipsys_log.recording.plan import check_start
     from ipsys_log.runs.request import Request
 
-    if output.exists() and model_from.exists() and output.samefile(model_from):
-        raise IpsysError(f"-o {output}: is the log with the model; give another name")
     lab = prepared(rig, camera, calibration)
+    check_target(output, force, [*lab.files, (MODEL, model_from)])
     models = () if model is None else (model,)
     request = Request(models=models, model_from=model_from, corners=corners, method=method)
     for line in check_start(lab.rig, lab.names, lab.lenses, request, "fuse"):
         remarks.print(line, style="yellow", markup=False)
-    check_target(output, force)
     with (
         opened(lab, output, seconds) as (cameras, settings, status),
         _viewed(settings, cameras, request) if view else nullcontext() as viewer,

@@ -139,6 +139,15 @@ class LogWriter:
         else:
             self.abandon()
 
+    def move(self, path: Path) -> None:
+        """Give a new log another name, in one step in place of what is there; it is written on there."""
+        output = self._output
+        if not isinstance(output, Growing):
+            raise ValueError(f"{self.path}: an append stays where it is")
+        output.storage.rename(self.path, path)
+        output.storage.fsync_directory(path.parent)
+        self.path = output.path = path
+
     def add_channel(
         self,
         topic: str,

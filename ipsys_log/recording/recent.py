@@ -14,6 +14,8 @@ __all__ = ["Recent"]
 
 # Longer than a marker is looked at, and what the stages may be behind.
 _HELD_NS = 5 * NS_PER_S
+# Two seconds of eight cameras at 60/s are less. Beyond that a place gets what is held of its second.
+_LIMIT_BYTES = 256 << 20
 # A marker may be exposed so long after the time of its frame (rolling shutter).
 _ROLLING_NS = NS_PER_S // 10
 
@@ -22,16 +24,19 @@ class Recent:
     """The end of a recording that is not written yet. A context manager: on leaving, the rest is.
 
     Everything comes and goes in the order of log times. A frame that is older than some seconds is forgotten,
-    and any other message written then. A measurement is written at once, and before it the frames since its
-    marker lay still: it is on the disk as if everything were recorded.
+    sooner where all that is held would be too much for the memory, and any other message written then. A
+    measurement is written at once, and before it the frames since its marker lay still, as if everything were
+    recorded.
 
     Parameters
     ----------
     log : where all of it goes.
+    limit_bytes : what may be held of frames.
     """
 
-    def __init__(self, log: Recording) -> None:
+    def __init__(self, log: Recording, limit_bytes: int = _LIMIT_BYTES) -> None:
         self._log = log
+        self._limit_bytes, self._held_bytes = limit_bytes, 0
         self._held: deque[Message] = deque()
 
     def __enter__(self) -> Recent:
@@ -40,7 +45,7 @@ class Recent:
     def __exit__(
         self, kind: type[BaseException] | None, error: BaseException | None, trace: TracebackType | None
     ) -> None:
-        if not isinstance(error, WriteError):
+        if not isinstance(error, (WriteError, KeyboardInterrupt)):
             self._write()
 
     @property
@@ -60,11 +65,13 @@ class Recent:
         if isinstance(payload, Event) and payload.kind == FRAME_SKIPPED:
             return
         self._held.append(message)
+        self._held_bytes += _bytes_of(message)
         if isinstance(payload, Measurement):
             self._write(None if payload.still is None else payload.still.start - _ROLLING_NS)
-            self._log.flush()
-        while _is_frame(message) and self._held[0].log_time_ns < message.log_time_ns - _HELD_NS:
-            old = self._held.popleft()
+        while _is_frame(message) and (
+            self._held[0].log_time_ns < message.log_time_ns - _HELD_NS or self._held_bytes > self._limit_bytes
+        ):
+            old = self._take()
             if not _is_frame(old):
                 self._log.put(old)
 
@@ -75,9 +82,18 @@ class Recent:
     def _write(self, since_ns: int | None = None) -> None:
         """Write all that is held; of the frames those taken since then, None for none."""
         while self._held:
-            message = self._held.popleft()
+            message = self._take()
             if not _is_frame(message) or (since_ns is not None and message.publish_time_ns >= since_ns):
                 self._log.put(message)
+
+    def _take(self) -> Message:
+        message = self._held.popleft()
+        self._held_bytes -= _bytes_of(message)
+        return message
+
+
+def _bytes_of(message: Message) -> int:
+    return len(message.payload.data) if _is_frame(message) else 0
 
 
 def _is_frame(message: Message) -> bool:

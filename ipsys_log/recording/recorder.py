@@ -4,37 +4,34 @@ from __future__ import annotations
 
 import os
 import threading
-from collections import Counter
-from collections.abc import Callable, Iterable, Iterator, Mapping
-from contextlib import contextmanager
+from collections.abc import Callable, Generator, Iterator, Mapping
+from contextlib import ExitStack, closing, contextmanager
 from dataclasses import replace
 from pathlib import Path
-from types import TracebackType
 from typing import Protocol
 
-from ipsys_log.errors import IpsysError, WriteError
+from ipsys_log.errors import IpsysError, LogError, WriteError
 from ipsys_log.geometry.lenses import scale_lens
 from ipsys_log.log import LogWriter
+from ipsys_log.log.journal import roll_back
 from ipsys_log.log.lock import open_locked
 from ipsys_log.log.storage import DISK
 from ipsys_log.messages import (
-    EVENTS_TOPIC,
-    FRAME_SKIPPED,
     RIG_TOPIC,
     CameraCalibration,
-    Event,
+    CompressedImage,
+    CompressedVideo,
+    Measurement,
     Message,
     Rig,
     calibration_topic,
 )
 from ipsys_log.recording.full_disk import reserve, what_fitted
-from ipsys_log.recording.waiting import Waiting
 from ipsys_log.runs.output import write_message
 
 __all__ = [
-    "TICK",
-    "Backlog",
     "Recording",
+    "Source",
     "Target",
     "first_messages",
     "fitting_lenses",
@@ -42,8 +39,16 @@ __all__ = [
     "written",
 ]
 
-# Between two messages of a source: nothing more has come so far. It is not in the log.
-TICK = Message("", 0, 0, None)
+# Whoever interrupts does not wait longer for a write.
+_SETTLE_S = 1.0
+
+
+class Source(Protocol):
+    """Messages, and None where nothing comes; after ``stop`` only what has come by then."""
+
+    def __iter__(self) -> Generator[Message | None, None, None]: ...
+
+    def stop(self, why: str | None = None) -> None: ...
 
 
 class Target(Protocol):
@@ -75,6 +80,7 @@ class Recording:
         self.full: WriteError | None = None
         self._writer, self._free = writer, free
         self._lock = threading.Lock()
+        self._torn = False
 
     def put(self, message: Message) -> None:
         """Write a message. No chunk spans more than a second: a recorder that is killed loses no more.
@@ -101,8 +107,13 @@ class Recording:
         if self.full is not None:
             raise IpsysError(what_fitted(self._writer.path, self.full)) from self.full
 
+    def settle(self) -> bool:
+        """Write nothing more, whichever thread wants to; False where one is in the midst of it."""
+        return self._lock.acquire(timeout=_SETTLE_S) and not self._torn
+
     def _write(self, write: Callable[[], None]) -> None:
         with self._lock:
+            self._torn = True
             try:
                 write()
             except WriteError as error:
@@ -111,18 +122,27 @@ class Recording:
                 self.full = error
                 self._free()
                 write()
+            self._torn = False
 
 
-def written(source: Iterable[Message | None], log: Target) -> Iterator[Message | None]:
-    """What a source gives, each message after it was written, until the disk is full."""
-    for message in source:
-        if message is None:
-            log.flush()
-        else:
-            log.put(message)
-        yield message
-        if log.full is not None:
-            return
+def written(source: Source, log: Target) -> Iterator[Message | None]:
+    """What a source gives, each message after it was written; a measurement is on the disk then.
+
+    When the disk is full the source is stopped. What is no frame is still written, to what is set aside.
+    """
+    with closing(iter(source)) as messages:
+        for message in messages:
+            if message is None:
+                log.flush()
+            elif log.full is None or not isinstance(message.payload, (CompressedImage, CompressedVideo)):
+                log.put(message)
+                if isinstance(message.payload, Measurement):
+                    log.flush()
+            else:
+                continue
+            yield message
+            if log.full is not None:
+                source.stop("the disk is full")
 
 
 @contextmanager
@@ -131,7 +151,8 @@ def recording(path: Path, overwrite: bool = False) -> Iterator[Recording]:
 
     Parameters
     ----------
-    overwrite : put it in place of one that is there, unless another process is writing that.
+    overwrite : put it in place of one that is there, unless another process is writing that. The old one is
+        gone only when the new one stands.
 
     Raises
     ------
@@ -140,14 +161,41 @@ def recording(path: Path, overwrite: bool = False) -> Iterator[Recording]:
     IpsysError
         Where the disk is so full that the log could not be ended as it should.
     """
-    if overwrite and path.exists():
-        os.close(open_locked(DISK, path, os.O_RDWR))
-        path.unlink()
+    created = _create(path, overwrite)
     try:
-        with LogWriter.create(path) as writer, reserve(path) as free:
-            yield Recording(writer, free)
+        with ExitStack() as held:
+            log = Recording(held.enter_context(created), held.enter_context(reserve(path)))
+            try:
+                yield log
+            except KeyboardInterrupt as error:
+                if log.settle():
+                    raise
+                held.pop_all()  # a log that is torn cannot be ended, and what hangs would hang here too
+                text = (
+                    f"{path}: interrupted while it was written; see what it holds with: ipsys repair {path}"
+                )
+                raise IpsysError(text) from error
     except WriteError as error:
         raise IpsysError(what_fitted(path, error)) from error
+
+
+def _create(path: Path, overwrite: bool) -> LogWriter:
+    if not (overwrite and path.exists()):
+        return LogWriter.create(path)
+    old = open_locked(DISK, path, os.O_RDWR)
+    try:
+        roll_back(DISK, path, old)  # what was left over of an append is not of the new log
+        partial = path.with_name(f"{path.name}.new")
+        partial.unlink(missing_ok=True)  # who made it was killed: the lock is ours
+        try:
+            writer = LogWriter.create(partial)
+            writer.move(path)
+        except (OSError, WriteError) as error:
+            partial.unlink(missing_ok=True)
+            raise LogError(f"{path}: is as it was, a new one cannot be made: {error}") from error
+        return writer
+    finally:
+        os.close(old)
 
 
 def fitting_lenses(
@@ -182,80 +230,3 @@ def first_messages(
         stamped = replace(lens, timestamp=time_ns)
         found.append(Message(calibration_topic(camera), time_ns, time_ns, stamped, camera))
     return found
-
-
-class Backlog:
-    """Frames that are in the log and that the stages have not seen. A context manager; iterate once.
-
-    A thread of its own writes what a source gives and hands the frames on. Where the stages are slower than
-    the cameras, frames are skipped as :class:`~ipsys_log.recording.waiting.Waiting` does, never the recording
-    of them, and an event names each. After everything that waits comes a :data:`TICK`.
-
-    Parameters
-    ----------
-    source : messages, None where nothing comes.
-    log : where all of them go.
-    now_ns : a log time for an event, called by the thread that takes from the source.
-    stop : makes the source end.
-    """
-
-    def __init__(
-        self,
-        source: Iterable[Message | None],
-        log: Target,
-        now_ns: Callable[[], int],
-        stop: Callable[[], None],
-    ) -> None:
-        self.skipped: Counter[str] = Counter()
-        self._source, self._log, self._now_ns, self._stop = source, log, now_ns, stop
-        self._waiting = Waiting()
-        self._ended = False
-        self._fault: BaseException | None = None
-        self._changed = threading.Condition()
-        self._thread = threading.Thread(target=self._record, name="recorder", daemon=True)
-
-    def __enter__(self) -> Backlog:
-        self._thread.start()
-        return self
-
-    def __exit__(
-        self, kind: type[BaseException] | None, error: BaseException | None, trace: TracebackType | None
-    ) -> None:
-        self._stop()
-        self._thread.join()
-
-    def __iter__(self) -> Iterator[Message]:
-        while True:
-            with self._changed:
-                while not self._waiting and not self._ended:
-                    self._changed.wait()
-                taken = self._waiting.take()
-            if not taken:
-                if self._fault is not None:
-                    raise self._fault
-                return
-            yield from taken
-            yield TICK
-
-    def _record(self) -> None:
-        try:
-            for message in written(self._source, self._log):
-                if message is not None and message.camera is not None:
-                    self._hand_on(message)
-        except BaseException as fault:  # raised again where the messages are taken
-            self._fault = fault
-        finally:
-            with self._changed:
-                self._ended = True
-                self._changed.notify()
-
-    def _hand_on(self, message: Message) -> None:
-        with self._changed:
-            skipped = self._waiting.put(message)
-            self._changed.notify()
-        for late in skipped:
-            camera = str(late.camera)
-            self.skipped[camera] += 1
-            text = f"a frame of camera {camera} is recorded but was not looked at: the stages are too slow"
-            event = Event(late.log_time_ns, FRAME_SKIPPED, text, camera)
-            self._log.put(Message(EVENTS_TOPIC, self._now_ns(), event.timestamp, event))

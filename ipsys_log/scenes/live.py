@@ -40,7 +40,8 @@ class LiveScene:
     ----------
     rig, model : those that hold; the model may be None.
     cameras : by name; of one that is lost nothing is seen.
-    add : puts a payload on a topic into the log, through the one place that gives log times.
+    add : puts a payload on a topic into the log, through the one place that gives log times; it returns when
+        that is written.
 
     Raises
     ------
@@ -104,11 +105,12 @@ class LiveScene:
         Raises
         ------
         IpsysError
-            Where the recording has ended.
+            Where the recording has ended, or they could not be written: it says that they are not saved.
         """
         if self._ended:
             raise IpsysError(
-                "the cameras are not read any more; start it again, or measure in its log: ipsys measure LOG"
+                "not saved: the cameras are not read any more; start it again, or measure in its log: "
+                "ipsys measure LOG"
             )
         for measurement in measurements:
             self._add(MEASUREMENTS_TOPIC, measurement)

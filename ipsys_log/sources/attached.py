@@ -8,7 +8,7 @@ from __future__ import annotations
 
 import threading
 from collections import deque
-from collections.abc import Iterator, Sequence
+from collections.abc import Generator, Iterable, Sequence
 from contextlib import suppress
 from types import TracebackType
 from typing import Any
@@ -23,6 +23,10 @@ __all__ = ["Attached"]
 _LIMIT_BYTES = 256 << 20
 _TICK_S = 0.1
 _REMEMBERED = 20_000
+# A disk that takes longer is no disk to measure onto; somebody waits for the answer.
+_SAVED_S = 5.0
+# Whoever interrupts does not wait longer for a camera that hangs.
+_LAST_S = 1.0
 
 
 class Attached:
@@ -64,7 +68,10 @@ class Attached:
         self._limit_bytes, self._waiting_bytes = limit_bytes, 0
         self._waiting: deque[Arrival] = deque()
         self._arrived = threading.Condition()
-        self._closed = False
+        # What somebody waits for.
+        self._unwritten: list[Arrival] = []
+        self._closed = self._ending = False
+        self._why = "the recording has ended"
         self._started, self._stopped = threading.Event(), threading.Event()
         shared = Shared(open_source, clock, self._put, say, self._started, self._stopped)
         self._attendants = [Attendant(camera, shared) for camera in cameras]
@@ -85,44 +92,73 @@ class Attached:
     def __exit__(
         self, kind: type[BaseException] | None, error: BaseException | None, trace: TracebackType | None
     ) -> None:
-        self._end()
+        self._end(_LAST_S if isinstance(error, KeyboardInterrupt) else None)
 
-    def stop(self) -> None:
-        """Take no more frames; what has come is still given out. A signal handler may call it."""
-        self._stopped.set()
+    def stop(self, why: str | None = None) -> None:
+        """Take no more frames; what has come is still given out. A signal handler may call it: no lock.
 
-    def __iter__(self) -> Iterator[Message | None]:
-        while True:
-            with self._arrived:
-                if not self._waiting and not self._done():
-                    self._arrived.wait(_TICK_S)
-                arrival = self._waiting.popleft() if self._waiting else None
-                ended = arrival is None and self._done()
-                self._closed = self._closed or ended
-                self._waiting_bytes -= _bytes_of(arrival)
-            if arrival is not None:
+        Parameters
+        ----------
+        why : said to whoever comes too late.
+        """
+        self._why = why or self._why
+        self._ending = True
+
+    def __iter__(self) -> Generator[Message | None, None, None]:
+        """Who asks for the next message has written the last one; who stops asking closes this."""
+        try:
+            while True:
+                if self._ending:
+                    self._stopped.set()
+                arrival, ended = self._take()
+                if ended:
+                    break
+                if arrival is None:
+                    yield None
+                    continue
                 yield self._message(arrival)
-            elif ended:
-                for attendant in self._attendants:
-                    if attendant.fault is not None:
-                        raise attendant.fault
-                return
-            else:
-                yield None
+                self._note_written(arrival)
+        finally:
+            with self._arrived:
+                self._closed = True
+                self._arrived.notify_all()
+        for attendant in self._attendants:
+            if attendant.fault is not None:
+                raise attendant.fault
 
     def add(self, topic: str, payload: Any) -> None:
-        """Take something else into the stream, such as a measurement: it gets its log time as frames do.
+        """Take something else into the stream, such as an event: it gets its log time as frames do.
 
         Raises
         ------
         SourceError
             Where the stream has ended: nobody would write it down.
         """
+        self._add(Arrival(self.clock.now_ns(), topic, payload.timestamp, payload))
+
+    def save(self, topic: str, payload: Any) -> None:
+        """Take something into the stream, and wait until it is written. Not for the thread that iterates.
+
+        Raises
+        ------
+        SourceError
+            Where it was not written, and why.
+        """
+        arrival = Arrival(self.clock.now_ns(), topic, payload.timestamp, payload)
         with self._arrived:
+            self._add(arrival)
+            self._unwritten.append(arrival)
+            self._arrived.wait_for(lambda: self._closed or not _has(self._unwritten, arrival), _SAVED_S)
+            if not _has(self._unwritten, arrival):
+                return
+            self._unwritten = [one for one in self._unwritten if one is not arrival]
             if self._closed:
-                raise SourceError("the recording has ended")
-            self._waiting.append(Arrival(self.clock.now_ns(), topic, payload.timestamp, payload))
-            self._arrived.notify()
+                raise SourceError(f"not saved: {self._why}")
+            waits = _has(self._waiting, arrival)
+            self._waiting = deque(one for one in self._waiting if one is not arrival)
+        if waits:
+            raise SourceError("not saved: the disk is too slow; try again")
+        raise SourceError("maybe not saved: the disk does not answer; look into the log")
 
     def warn(self, kind: str, text: str) -> None:
         """An event of no camera, said at once too; only said where the stream has ended."""
@@ -143,8 +179,30 @@ class Attached:
                 return False
             self._waiting_bytes += size
             self._waiting.append(arrival)
-            self._arrived.notify()
+            self._arrived.notify_all()
         return True
+
+    def _add(self, arrival: Arrival) -> None:
+        with self._arrived:
+            if self._closed:
+                raise SourceError(f"not saved: {self._why}")
+            self._put(arrival)
+
+    def _take(self) -> tuple[Arrival | None, bool]:
+        """What has waited longest, and whether there will never be more."""
+        with self._arrived:
+            if not self._waiting and not self._done():
+                self._arrived.wait(_TICK_S)
+            arrival = self._waiting.popleft() if self._waiting else None
+            self._waiting_bytes -= _bytes_of(arrival)
+            self._closed = self._closed or (arrival is None and self._done())
+            return arrival, self._closed
+
+    def _note_written(self, arrival: Arrival) -> None:
+        if self._unwritten:
+            with self._arrived:
+                self._unwritten = [one for one in self._unwritten if one is not arrival]
+                self._arrived.notify_all()
 
     def _message(self, arrival: Arrival) -> Message:
         log_time_ns = self.now_ns()
@@ -158,13 +216,17 @@ class Attached:
     def _done(self) -> bool:
         return all(state.finished for state in self.states.values())
 
-    def _end(self) -> None:
+    def _end(self, seconds: float | None = None) -> None:
         self._stopped.set()
         for attendant in self._attendants:
-            attendant.thread.join()
+            attendant.thread.join(seconds)
 
 
 def _bytes_of(arrival: Arrival | None) -> int:
     """What a frame takes; nothing else counts."""
     frame = None if arrival is None else arrival.payload
     return len(frame.data) if isinstance(frame, (CompressedImage, CompressedVideo)) else 0
+
+
+def _has(arrivals: Iterable[Arrival], arrival: Arrival) -> bool:
+    return any(one is arrival for one in arrivals)

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterator
+from collections.abc import Generator, Iterator
 from dataclasses import replace
 from itertools import pairwise
 from pathlib import Path
@@ -140,6 +140,19 @@ def test_hours_of_frames_are_not_kept_in_memory(log: Noted) -> None:
             assert len(recent._held) <= 52
 
 
+def test_of_large_frames_fewer_are_kept_and_events_all_the_same(log: Noted) -> None:
+    with Recent(log, limit_bytes=10_000) as recent:
+        recent.put(event("camera_lost", 0.001))
+        for message in frames(0, 20):
+            recent.put(replace(message, payload=replace(message.payload, data=bytes(1000))))
+            held = [one for one in recent._held if isinstance(one.payload, CompressedImage)]
+            assert len(held) <= 10
+        recent.put(measured("p001", 18.6, 19.7, 19.99))
+    # The last ten, of the fifteen of its second.
+    assert taken_s(log) == pytest.approx(np.arange(19.0, 19.95, 0.1))
+    assert [m.payload.kind for m in log.noted if isinstance(m.payload, Event)] == ["camera_lost"]
+
+
 def test_of_a_video_no_seconds_can_be_kept() -> None:
     with pytest.raises(IpsysError, match="camera white sends h264, of which no single seconds can be kept"):
         check_pictures({"red": CameraState(format="jpeg"), "white": CameraState(format="h264")})
@@ -207,7 +220,7 @@ class Noting(Attached):
 
     sent: list[Message]
 
-    def __iter__(self) -> Iterator[Message | None]:
+    def __iter__(self) -> Generator[Message | None, None, None]:
         self.sent = []
         for message in super().__iter__():
             self.sent += [] if message is None else [message]
@@ -263,7 +276,7 @@ def test_the_places_are_those_of_a_whole_recording_from_a_few_frames(
     attached = Noting(cameras(*sent), playing(sent, RATE_HZ), Clock())
     with attached:
         settings = first_messages(rig, lenses(lab_log), attached.now_ns)
-        hand = Hand(LiveScene(rig, None, attached.states, attached.add), tape)
+        hand = Hand(LiveScene(rig, None, attached.states, attached.save), tape)
         pipeline.measure(attached, settings, places, Request(), hand)
     history = hand.scene.history()
     gone = {one.withdraws for one in history}

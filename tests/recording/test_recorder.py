@@ -2,22 +2,30 @@
 
 from __future__ import annotations
 
+import errno
+import threading
 import time
-from collections.abc import Iterator
+from collections.abc import Generator, Iterator
+from itertools import pairwise
 from pathlib import Path
 
 import pytest
 
-from ipsys_log.errors import LogError
+from ipsys_log.errors import IpsysError, LogError
 from ipsys_log.log import LogWriter
+from ipsys_log.log.session import Session
+from ipsys_log.log.storage import Disk
 from ipsys_log.messages import (
     FRAME_SKIPPED,
+    MEASUREMENTS_TOPIC,
     CompressedImage,
     Event,
+    Measurement,
     Message,
     image_topic,
 )
-from ipsys_log.recording.recorder import TICK, Backlog, Recording, recording
+from ipsys_log.recording.backlog import TICK, Backlog
+from ipsys_log.recording.recorder import Recording, recording, written
 
 
 def frame(number: int, camera: str = "red") -> Message:
@@ -43,12 +51,25 @@ def log(tmp_path: Path) -> Iterator[Noted]:
         yield Noted(writer)
 
 
-def backlog(source: Iterator[Message | None], log: Recording) -> Backlog:
-    return Backlog(source, log, lambda: 10_000, lambda: None)
+class Sent:
+    """What cameras send, from a generator; notes why they were stopped."""
+
+    def __init__(self, messages: Generator[Message | None, None, None]) -> None:
+        self._messages, self.whys = messages, list[str | None]()
+
+    def __iter__(self) -> Generator[Message | None, None, None]:
+        return self._messages
+
+    def stop(self, why: str | None = None) -> None:
+        self.whys.append(why)
+
+
+def backlog(source: Generator[Message | None, None, None], log: Recording) -> Backlog:
+    return Backlog(Sent(source), log, lambda: 10_000)
 
 
 def test_a_frame_is_in_the_log_before_a_stage_sees_it_and_a_tick_follows(log: Noted) -> None:
-    def source() -> Iterator[Message | None]:
+    def source() -> Generator[Message | None, None, None]:
         for number in range(3):
             time.sleep(0.05)
             yield frame(number)
@@ -63,7 +84,7 @@ def test_a_frame_is_in_the_log_before_a_stage_sees_it_and_a_tick_follows(log: No
 
 
 def test_the_oldest_frames_are_skipped_and_named_by_their_log_times(log: Noted) -> None:
-    def source() -> Iterator[Message | None]:
+    def source() -> Generator[Message | None, None, None]:
         yield from (frame(number) for number in range(10))
         yield from (frame(number, "white") for number in range(10, 12))
 
@@ -78,12 +99,48 @@ def test_the_oldest_frames_are_skipped_and_named_by_their_log_times(log: Noted) 
 
 
 def test_a_fault_of_the_recorder_is_raised_where_frames_are_taken(log: Noted) -> None:
-    def source() -> Iterator[Message | None]:
+    def source() -> Generator[Message | None, None, None]:
         yield frame(0)
         raise ZeroDivisionError("a bug")
 
     with pytest.raises(ZeroDivisionError), backlog(source(), log) as frames:
         assert [message for message in frames if message is not TICK] == [frame(0)]
+
+
+class FullDisk(Disk):
+    """Takes 100 kB, and more when something is freed."""
+
+    freed = threading.Event()
+
+    def pwrite(self, fd: int, data: bytes | memoryview, offset: int) -> int:
+        if offset + len(data) > 100_000 and not self.freed.is_set():
+            raise OSError(errno.ENOSPC, "No space left on device")
+        return Disk.pwrite(self, fd, data, offset)
+
+
+def test_on_a_full_disk_what_waits_is_written_but_for_frames_and_nothing_more_is_taken(
+    tmp_path: Path,
+) -> None:
+    disk, path = FullDisk(), tmp_path / "a.mcap"
+
+    def source() -> Generator[Message | None, None, None]:
+        for number in range(200):
+            big = CompressedImage(number, "red", bytes(30_000), "jpeg")
+            yield Message(image_topic("red"), number * 10**8, number, big, "red")
+            place = Measurement(number, f"p{number}")
+            yield Message(MEASUREMENTS_TOPIC, number * 10**8 + 1, number, place)
+
+    sent = Sent(source())
+    with LogWriter.create(path, storage=disk) as writer:
+        log, sizes = Recording(writer, disk.freed.set), [0]
+        for message in written(sent, log):
+            if message is not None and isinstance(message.payload, Measurement):
+                sizes.append(path.stat().st_size)
+    with Session([path]) as session:
+        assert len(session.payloads([MEASUREMENTS_TOPIC])) == 200
+        assert 2 <= session.count(image_topic("red")) <= 4
+    assert all(one < other for one, other in pairwise(sizes)), "a measurement is not on the disk at once"
+    assert set(sent.whys) == {"the disk is full"}
 
 
 def test_a_log_that_is_being_written_is_not_overwritten(tmp_path: Path) -> None:
@@ -96,3 +153,58 @@ def test_a_log_that_is_being_written_is_not_overwritten(tmp_path: Path) -> None:
     with recording(path, overwrite=True) as second:
         second.put(frame(2))
     assert second.counts == {image_topic("red"): 1}
+
+
+def test_the_old_log_is_there_until_the_new_one_stands(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    path = tmp_path / "a.mcap"
+    with recording(path) as first:
+        first.put(frame(0))
+    old = path.read_bytes()
+
+    def broken(self: LogWriter, path: Path) -> None:
+        raise PermissionError(errno.EPERM, "Operation not permitted")
+
+    with monkeypatch.context() as patch:
+        patch.setattr(LogWriter, "move", broken)
+        with pytest.raises(IpsysError, match="Operation not permitted"), recording(path, overwrite=True):
+            pass
+    assert (path.read_bytes(), list(tmp_path.iterdir())) == (old, [path])
+    (tmp_path / "a.mcap.new").write_bytes(b"left by one that was killed")
+    with recording(path, overwrite=True) as second:
+        second.put(frame(1))
+        # Nobody else makes a log there meanwhile, nor is there an instant without one.
+        with pytest.raises(LogError, match="another process"), recording(path, overwrite=True):
+            pass
+    with Session([path]) as session:
+        assert [one.timestamp for one in session.payloads([image_topic("red")])] == [1]
+    assert list(tmp_path.iterdir()) == [path]
+
+
+@pytest.mark.parametrize("whole", [True, False])
+def test_a_journal_that_was_left_over_does_not_outlive_its_log(tmp_path: Path, whole: bool) -> None:
+    path, journal = tmp_path / "a.mcap", tmp_path / "a.mcap.journal"
+    with recording(path) as first:
+        first.put(frame(0))
+    if whole:
+        writer = LogWriter.append(path, storage=Killed())
+        writer.add_channel("/a", None, "json")
+        writer.write("/a", 1, 1, b"{}")
+        with pytest.raises(KeyboardInterrupt):
+            writer.close()
+        assert journal.stat().st_size > 100
+    else:
+        journal.write_bytes(b"torn")
+    with recording(path, overwrite=True) as second:
+        second.put(frame(1))
+    with Session([path]) as session:
+        assert [one.timestamp for one in session.payloads([image_topic("red")])] == [1]
+    assert not journal.exists()
+
+
+class Killed(Disk):
+    """Is killed when a journal stands."""
+
+    def truncate(self, fd: int, size: int) -> None:  # noqa: ARG002
+        raise KeyboardInterrupt

@@ -5,6 +5,7 @@ from __future__ import annotations
 import threading
 import time
 from collections.abc import Iterator
+from concurrent.futures import ThreadPoolExecutor
 from contextlib import contextmanager
 from functools import partial
 from itertools import pairwise
@@ -12,6 +13,7 @@ from itertools import pairwise
 import pytest
 
 from ipsys_log.messages import CompressedImage, Event, Message, RigCamera
+from ipsys_log.sources import attached as attached_module
 from ipsys_log.sources.attached import Attached
 from ipsys_log.sources.frames import Clock, Frame, Say, SourceError
 from tests.playing import cameras, playing
@@ -172,6 +174,47 @@ def test_nothing_is_taken_when_nobody_would_write_it() -> None:
         with pytest.raises(SourceError, match="has ended"):
             attached.add("/note", Event(6, "note", "lost"))
     assert [message.payload.text for message in found if message.topic == "/note"] == ["written"]
+
+
+def test_what_is_saved_is_written_by_then() -> None:
+    attached = Attached(cameras("red"), playing({"red": [b"a"] * 100}, 100.0), Clock())
+    asked: list[str] = []
+    with attached, ThreadPoolExecutor(1) as page:
+        saved = page.submit(lambda: attached.save("/note", Event(5, "note", "kept")))
+        for message in attached:
+            if message is not None and message.topic == "/note":
+                time.sleep(0.3)
+                assert not saved.done()
+                asked.append("written")
+            elif asked:
+                saved.result(1.0)
+                break
+        assert asked
+
+
+def test_what_is_not_written_is_not_saved_and_it_is_said_why() -> None:
+    attached = Attached(cameras("red"), playing({"red": [b"a"] * 300}, 100.0), Clock())
+    with attached, ThreadPoolExecutor(1) as page:
+        messages = iter(attached)
+        next(messages)
+        saved = page.submit(lambda: attached.save("/note", Event(5, "note", "lost")))
+        for message in messages:
+            if message is not None and message.topic == "/note":
+                attached.stop("the disk is full")
+                messages.close()  # it could not be written
+        with pytest.raises(SourceError, match="not saved: the disk is full"):
+            saved.result(1.0)
+        with pytest.raises(SourceError, match="not saved: the disk is full"):
+            attached.save("/note", Event(6, "note", "late"))
+
+
+def test_what_waits_too_long_to_be_saved_is_not_written_later(monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(attached_module, "_SAVED_S", 0.1)
+    attached = Attached(cameras("red"), playing(FRAMES, 500.0), Clock())
+    with attached:
+        with pytest.raises(SourceError, match="not saved: the disk is too slow"):
+            attached.save("/note", Event(5, "note", "late"))
+        assert not [one for one in attached if one is not None and one.topic == "/note"]
 
 
 def test_what_was_dropped_at_the_end_is_named_too() -> None:

@@ -122,6 +122,10 @@ class Attendant:
                 stopped.wait(retry_s)
         except BaseException as fault:  # whoever opens the cameras, or takes the messages, is to see it
             self.fault = fault
+            if self._begun.is_set():
+                # The others may go on for hours; where it came from is shown when they have ended.
+                text = f"camera {self._camera.name}: the program failed ({fault!r}); nothing more comes of it"
+                self._say("camera_failed", text)
         finally:
             self._name_lost(now=True)
             self.state.up, self.state.finished = False, True
@@ -148,13 +152,13 @@ class Attendant:
 
     def _take(self, frame: Frame) -> None:
         state, camera, now_ns = self.state, self._camera, self._shared.clock.now_ns()
+        self._check_format(frame)
         if self._lost_ns is not None:
             gone_s = (now_ns - self._lost_ns) / NS_PER_S
             self._lost_ns = None
             self._say("camera_back", f"camera {camera.name} is back after {gone_s:.1f} s")
         state.up, state.format = True, frame.format
-        if state.size_px is None:
-            state.size_px = find_size(frame)
+        self._note_size(frame)
         time_ns = now_ns
         if frame.time_ns is not None:
             time_ns = instant_ns(frame.time_ns, camera)
@@ -172,6 +176,33 @@ class Attendant:
         while not self._shared.started.wait(_TURN_S) and not self._shared.stopped.is_set():
             pass
 
+    def _check_format(self, frame: Frame) -> None:
+        """See that a frame is of the format of those before it: a channel of a log holds only one."""
+        before, name = self.state.format, self._camera.name
+        if before in (None, frame.format):
+            return
+        text = (
+            f"camera {name}: sends {frame.format} now, and {before} before, and no log holds both; "
+            f"set it back to {before}, or begin a new recording"
+        )
+        if not self.state.up:
+            self._say_once("camera_lost", f"{text}; trying again")
+        raise SourceError(text)
+
+    def _note_size(self, frame: Frame) -> None:
+        """Keep the size of the pictures, and say where it changes; of a video only the first is known."""
+        before = self.state.size_px
+        if before is not None and frame.format != "jpeg":
+            return
+        size_px = find_size(frame)
+        if size_px is None or size_px == before:
+            return
+        self.state.size_px = size_px
+        if before is not None:
+            now, then = (f"{width} x {height} px" for width, height in (size_px, before))
+            text = f"camera {self._camera.name}: its pictures are {now} now, and were {then}; calibrations "
+            self._say("camera_size", f"{text}are for one size: set it back")
+
     def _name_lost(self, now: bool = False) -> None:
         """Frames that are not in the log, since they were last named."""
         state, name = self.state, self._camera.name
@@ -186,9 +217,12 @@ class Attendant:
 
     def _say_setting(self, text: str) -> None:
         """What a camera refused, once, however often it is opened."""
+        self._say_once("camera_setting", text)
+
+    def _say_once(self, kind: str, text: str) -> None:
         if text not in self._said:
             self._said.add(text)
-            self._say("camera_setting", text)
+            self._say(kind, text)
 
     def _say(self, kind: str, text: str) -> None:
         """An event of this camera, said at once too."""

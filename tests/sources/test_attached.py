@@ -9,11 +9,13 @@ from contextlib import contextmanager
 from functools import partial
 from itertools import pairwise
 
+import numpy as np
 import pytest
+import simplejpeg
 
 from ipsys_log.messages import CompressedImage, Event, Message, RigCamera
 from ipsys_log.sources.attached import Attached
-from ipsys_log.sources.frames import Clock, Frame, Say, SourceError
+from ipsys_log.sources.frames import Clock, Frame, Open, Say, SourceError
 from tests.playing import cameras, playing
 
 FRAMES = {name: [f"{name} {n}".encode() for n in range(20)] for name in ("red", "white", "black")}
@@ -135,6 +137,52 @@ def test_a_camera_that_vanishes_is_tried_again_while_the_others_go_on() -> None:
     assert tries[2] - tries[1] > tries[1] - tries[0]
 
 
+def changing(*visits: list[Frame]) -> Open:
+    """A camera that sends some frames at each visit, and is gone then; after the last it ends."""
+    left = list(visits)
+
+    @contextmanager
+    def opened(camera: RigCamera, clock: Clock, say: Say) -> Iterator[Iterator[Frame | None]]:
+        def sent() -> Iterator[Frame | None]:
+            yield from left.pop(0)
+            if left:
+                raise SourceError(f"camera {camera.name}: has gone")
+
+        yield sent()
+
+    return opened
+
+
+def test_a_camera_that_returns_with_another_codec_is_not_recorded(monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr("ipsys_log.sources.attendant._RETRY_S", 0.02)
+    jpeg, video = Frame(b"a", "jpeg", None), Frame(b"b", "h264", None)
+    said: list[str] = []
+    opened = changing([jpeg], [video], [video], [jpeg, video], [jpeg])
+    found = messages(Attached(cameras("red"), opened, Clock(), said.append))
+    assert [m.payload.data for m in found if m.camera] == [b"a"] * 3
+    kinds = [event.kind for event in events(found)]
+    assert kinds == ["camera_lost", "camera_lost", "camera_back", "camera_lost", "camera_back"]
+    assert "sends h264 now, and jpeg before" in said[1]
+    assert said[1] == said[3]
+    assert said[1].endswith("set it back to jpeg, or begin a new recording; trying again")
+
+
+def test_pictures_of_another_size_are_said_once_for_each_change() -> None:
+    large, small = (
+        Frame(simplejpeg.encode_jpeg(np.zeros((*shape, 3), np.uint8)), "jpeg", None)
+        for shape in ((48, 64), (24, 32))
+    )
+    damaged = Frame(b"no picture", "jpeg", None)
+    attached = Attached(
+        cameras("red"), changing([large, large, small, damaged, small, large, large]), Clock()
+    )
+    found = messages(attached)
+    assert [event.kind for event in events(found)] == ["camera_size"] * 2
+    assert "are 32 x 24 px now, and were 64 x 48 px" in events(found)[0].text
+    assert attached.states["red"].size_px == (64, 48)
+    assert len(data_of(found, "red")) == 7
+
+
 def test_what_the_disk_cannot_take_is_dropped_by_name_and_memory_stays_bounded() -> None:
     frames = {"red": [bytes([n]) * 1000 for n in range(40)]}
     attached = Attached(cameras("red"), playing(frames, 500.0), Clock(), limit_bytes=10_000)
@@ -209,13 +257,19 @@ def test_what_came_before_a_fault_is_given_out() -> None:
             raise ZeroDivisionError("a bug")
 
     found: list[Message] = []
-    attached = Attached(cameras("red", "white"), playing(FRAMES, 200.0, before=broken), Clock())
+    said: list[str] = []
+    attached = Attached(cameras("red", "white"), playing(FRAMES, 200.0, before=broken), Clock(), said.append)
     with attached:
         time.sleep(0.3)
         with pytest.raises(ZeroDivisionError):
             found.extend(message for message in attached if message is not None)
     assert len(data_of(found, "red")) == 5
     assert len(data_of(found, "white")) == 20
+    # Not only in the end: the other camera might go on for hours.
+    ((number, event),) = [(n, m.payload) for n, m in enumerate(found) if isinstance(m.payload, Event)]
+    assert (event.kind, event.camera, event.text) == ("camera_failed", "red", said[0])
+    assert "camera red: the program failed (ZeroDivisionError('a bug'))" in event.text
+    assert number < len(found) - 5
 
 
 def test_stopping_gives_out_what_has_come() -> None:

@@ -6,6 +6,7 @@ import errno
 import mmap
 import os
 import select
+import time
 from collections.abc import Iterator
 from contextlib import ExitStack, contextmanager
 from typing import NamedTuple
@@ -24,7 +25,8 @@ __all__ = ["open_v4l2"]
 _JPEG = ("MJPG", "JPEG")
 _BUFFERS = 8
 _TURN_S = 0.4
-_SILENT_TURNS = 12
+# A camera that gives no picture for so long has gone, though it may still hand back empty buffers.
+_SILENT_S = 5.0
 # No camera loses so many frames in a row and is still there.
 _COUNTS_ANEW = 10_000
 
@@ -186,20 +188,15 @@ class _Capture(NamedTuple):
 
 
 def _frames(capture: _Capture, clock: Clock, say: Say) -> Iterator[Frame | None]:
-    silent, said = 0, False
+    heard_s, said = time.monotonic(), False
     last: int | None = None
     while True:
         with _faults(capture.where):
             buffer = _next_buffer(capture.device)
         if buffer is None:
-            silent += 1
-            if silent >= _SILENT_TURNS:
-                raise SourceError(
-                    f"{capture.where}: sends no frames; plug it in anew, or into another USB port"
-                )
+            _check_heard(capture, heard_s)
             yield None
             continue
-        silent = 0
         if not said:
             said = True
             _say_stamps(capture.camera, buffer.flags, say)
@@ -213,9 +210,18 @@ def _frames(capture: _Capture, clock: Clock, say: Say) -> Iterator[Frame | None]
             data = encode_raw(data, capture.layout) or b""
             if not data:
                 say(f"camera {capture.camera.name}: sends pictures that are not whole; they are left out")
-        if data:
+        if not data:
+            _check_heard(capture, heard_s)
+            yield None
+        else:
             missed, last = _missed(last, buffer.sequence), buffer.sequence
             yield Frame(data, "jpeg", clock.of_monotonic_ns(stamp_ns) if stamped else None, missed)
+            heard_s = time.monotonic()
+
+
+def _check_heard(capture: _Capture, heard_s: float) -> None:
+    if time.monotonic() - heard_s > _SILENT_S:
+        raise SourceError(f"{capture.where}: sends no frames; plug it in anew, or into another USB port")
 
 
 def _missed(last: int | None, sequence: int) -> int:

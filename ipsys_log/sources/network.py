@@ -7,7 +7,8 @@ parameter sets before each keyframe, which is what ``foxglove.CompressedVideo`` 
 from __future__ import annotations
 
 import socket
-from collections.abc import Iterator
+import time
+from collections.abc import Iterable, Iterator
 from contextlib import contextmanager, suppress
 from queue import Empty, Full, Queue
 from threading import Event, Thread
@@ -23,6 +24,8 @@ from ipsys_log.sources.stamps import Stamps
 
 if TYPE_CHECKING:
     from av.container import InputContainer
+    from av.packet import Packet
+    from av.video.stream import VideoStream
 
 __all__ = ["check_address", "open_network"]
 
@@ -125,12 +128,23 @@ def _frames(camera: RigCamera, clock: Clock, say: Say) -> Iterator[Frame]:
             stamps = Stamps(camera.name, clock, say, _PATIENCE if container.format.name == "rtsp" else 1)
             # A stream that stops within a packet has ended.
             with suppress(av.error.InvalidDataError):
-                for packet in pass_through(container, stream):
+                for packet in pass_through(_heard(container.demux(stream), where), stream):
                     yield Frame(bytes(packet), name, stamps.of(packet))
             # A camera that is there does not end: it may come back.
             raise SourceError(f"{where}: the stream has ended")
     except av.error.FFmpegError as error:
         raise SourceError(f"{where}: {_explain(error)}") from error
+
+
+def _heard(packets: Iterable[Packet[VideoStream]], where: str) -> Iterator[Packet[VideoStream]]:
+    """Packets, until for long only empty ones have come, which is as silent as none."""
+    heard_s = time.monotonic()
+    for packet in packets:
+        if not packet.size and time.monotonic() - heard_s > _SILENT_S:
+            raise SourceError(f"{where}: sends only empty frames; start the camera anew")
+        yield packet
+        if packet.size:
+            heard_s = time.monotonic()
 
 
 def _open(address: str, where: str) -> InputContainer:

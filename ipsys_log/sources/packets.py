@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import re
-from collections.abc import Iterator
+from collections.abc import Iterable, Iterator
 from contextlib import suppress
 from typing import TYPE_CHECKING
 
@@ -52,23 +52,30 @@ def name_format(stream: VideoStream) -> str | None:
     return _FORMATS.get(stream.codec_context.name)
 
 
-def pass_through(container: InputContainer, stream: VideoStream) -> Iterator[Packet[VideoStream]]:
-    """Packets of a stream, from the first keyframe on; H.264 and H.265 as Annex B.
+def pass_through(
+    packets: Iterable[Packet[VideoStream]], stream: VideoStream
+) -> Iterator[Packet[VideoStream]]:
+    """Packets of a stream from the first keyframe on; H.264 and H.265 as Annex B.
 
     Each keyframe has the parameter sets before it, so that a reader can begin there.
+
+    Parameters
+    ----------
+    packets : as the container gives them.
+    stream : what they are of.
     """
     from av.bitstream import BitStreamFilterContext
 
     name = stream.codec_context.name
     if name == "mjpeg":
         # The last packet of PyAV's is an empty one.
-        yield from (packet for packet in container.demux(stream) if packet.size)
+        yield from (packet for packet in packets if packet.size)
         return
     packed = (stream.codec_context.extradata or b"")[:1] == b"\x01"  # avcC and hvcC; Annex B begins with 0
     unpack = BitStreamFilterContext(f"{name}_mp4toannexb", stream) if packed else None
     repeat = BitStreamFilterContext("dump_extra=freq=keyframe", stream)
     begun = False
-    for packet in container.demux(stream):
+    for packet in packets:
         begun = begun or packet.is_keyframe
         if not begun or not packet.size:
             continue

@@ -10,7 +10,7 @@ from typing import Any, NamedTuple
 from ipsys_log.messages import EVENTS_TOPIC, Event, RigCamera, image_topic
 from ipsys_log.rig import hide_password
 from ipsys_log.sources.frames import Clock, Frame, Open, Say, SourceError, instant_ns
-from ipsys_log.sources.packets import find_size
+from ipsys_log.sources.packets import can_begin, find_size
 from ipsys_log.sources.videos import frame_payload
 from ipsys_log.units import NS_PER_S
 
@@ -22,6 +22,10 @@ _FIRST_FRAME_S = 10.0
 _DRAW_S = 120.0
 _RETRY_S, _LONGEST_RETRY_S = 0.5, 8.0
 _TURN_S = 0.1
+# So long a frame without a stamp may wait for the recording to begin: it would get a false time.
+_EARLY_S = 0.01
+# Frames of a video, 20 s or so, among which each camera that is set up well has a keyframe.
+_KEYLESS = 600
 # A camera that loses frames all the time is not named more often.
 _NAMED_EVERY_NS = NS_PER_S
 
@@ -87,6 +91,8 @@ class Attendant:
         self._lost_ns: int | None = None
         self._dropped_before = self._missed_before = self._missed_named_ns = 0
         self._said: set[str] = set()
+        self._broken = False
+        self._since_key = 0
         self.thread = threading.Thread(target=self._attend, name=camera.name, daemon=True)
 
     def wait(self) -> None:
@@ -142,6 +148,8 @@ class Attendant:
                     if shared.stopped.is_set():
                         break
                     if frame is not None:
+                        self._count_since_key(frame)
+                    if frame is not None and not self._is_early(frame):
                         self._take(frame)
         except SourceError as error:
             if self.state.up:
@@ -172,9 +180,37 @@ class Attendant:
         state.bytes += len(frame.data)
         self._name_lost()
         self._begun.set()
-        # What came before the slowest camera would only be late.
-        while not self._shared.started.wait(_TURN_S) and not self._shared.stopped.is_set():
-            pass
+        # What came before the slowest camera would only be late; one without a stamp is not known to be.
+        while (
+            frame.time_ns is not None
+            and not self._shared.started.wait(_TURN_S)
+            and not self._shared.stopped.is_set()
+        ):
+            self._say_once("no_keyframes", text)
+
+    def _is_early(self, frame: Frame) -> bool:
+        """Whether a frame came before the recording began, but for the first; or needs one that did.
+
+        Without a stamp it can only be dated by its arrival, so it must not wait: until then such frames are
+        thrown away. Files and the simulator give stamps, and wait.
+        """
+        if not self._begun.is_set():
+            return False
+        if frame.time_ns is None and not self._shared.started.wait(_EARLY_S):
+            self._broken = True
+            return True
+        self._broken = self._broken and 0 < self._since_key < _KEYLESS
+        return self._broken
+
+    def _count_since_key(self, frame: Frame) -> None:
+        """Say where a video has no keyframes: it cannot be read on from a frame that was skipped."""
+        self._since_key = 0 if can_begin(frame) else self._since_key + 1
+        if self._since_key == _KEYLESS:
+            text = (
+                f"camera {self._camera.name}: no keyframe in {_KEYLESS} frames; after a frame that is skipped or "
+                "damaged nothing can be looked at; set its keyframe interval (GOP) to a second or two"
+            )
+            self._say_once("no_keyframes", text)
 
     def _check_format(self, frame: Frame) -> None:
         """See that a frame is of the format of those before it: a channel of a log holds only one."""

@@ -16,7 +16,7 @@ if TYPE_CHECKING:
     from av.packet import Packet
     from av.video.stream import VideoStream
 
-__all__ = ["find_size", "find_video", "name_format", "pass_through"]
+__all__ = ["can_begin", "find_size", "find_video", "name_format", "pass_through"]
 
 # FFmpeg's name of a codec, and that in the log.
 _FORMATS = {"mjpeg": "jpeg", "h264": "h264", "hevc": "h265"}
@@ -81,7 +81,7 @@ def pass_through(
             continue
         if unpack:
             yield from unpack.filter(packet)
-        elif packet.is_keyframe and not _has_parameters(packet):
+        elif packet.is_keyframe and not _has_parameters(memoryview(packet), name == "hevc"):
             yield from repeat.filter(packet)
         else:
             yield packet
@@ -108,10 +108,14 @@ def _find_video_size(frame: Frame) -> tuple[int, int] | None:
     return (decoder.width, decoder.height) if decoder.width else None
 
 
-def _has_parameters(packet: Packet[VideoStream]) -> bool:
-    """Whether an Annex B packet has the parameter sets before its picture."""
-    wide = packet.stream.codec_context.name == "hevc"
-    for match in _UNIT.finditer(memoryview(packet)):
+def can_begin(frame: Frame) -> bool:
+    """Whether a frame, as :func:`pass_through` gives it, needs none before it."""
+    return frame.format not in ("h264", "h265") or _has_parameters(frame.data, frame.format == "h265")
+
+
+def _has_parameters(data: bytes | memoryview, wide: bool) -> bool:
+    """Whether a frame in Annex B, of H.265 if ``wide``, has the parameter sets before its picture."""
+    for match in _UNIT.finditer(data):
         kind = match[1][0] >> 1 & 0x3F if wide else match[1][0] & 0x1F
         if kind == (33 if wide else 7):  # the sequence's parameters
             return True

@@ -251,6 +251,48 @@ def test_early_frames_do_not_pile_up_while_another_camera_opens() -> None:
         assert len([message for message in attached if message is not None]) == 10
 
 
+@pytest.mark.parametrize("format", ["jpeg", "h264"])
+def test_frames_without_stamps_do_not_wait_for_another_camera_to_get_a_false_time(format: str) -> None:
+    """A stream that cannot be stopped: what is not taken waits in the socket, and comes late."""
+    picture, key = b"\0\0\1\x41", b"\0\0\1\x67\0\0\1\x65"
+    begin_s: list[float] = []
+
+    @contextmanager
+    def opened(camera: RigCamera, clock: Clock, say: Say) -> Iterator[Iterator[Frame | None]]:
+        def sent() -> Iterator[Frame | None]:
+            begin_s.append(time.monotonic())
+            for n in range(40):
+                if camera.name == "late" and n == 0:
+                    time.sleep(0.8)
+                sent_s = begin_s[0] + n / 20
+                time.sleep(max(sent_s - time.monotonic(), 0))
+                yield Frame((picture if n % 10 else key) + b"%03d" % n, format, None)
+
+        yield sent()
+
+    attached = Attached(cameras("early", "late"), opened, Clock())
+    with attached:
+        found = [message for message in attached if message is not None and message.camera == "early"]
+    start_ns = found[0].publish_time_ns
+    numbers = [int(message.payload.data[-3:]) for message in found]
+    # Frame n was sent n / 20 s after the first.
+    late_s = [(m.publish_time_ns - start_ns) / 1e9 - n / 20 for m, n in zip(found, numbers, strict=True)]
+    assert max(late_s) < 0.1
+    assert numbers[0] == 0
+    # A video goes on where it can be read.
+    assert numbers[1] == 20 if format == "h264" else 15 <= numbers[1] <= 19
+    assert numbers[1:] == list(range(numbers[1], 40))
+
+
+def test_a_video_without_keyframes_is_said_once_and_kept(monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr("ipsys_log.sources.attendant._KEYLESS", 10)
+    key, other = (Frame(data, "h264", 1) for data in (b"\0\0\1\x67\0\0\1\x65", b"\0\0\1\x41"))
+    for frames, count in (([key, *[other] * 9] * 3, 0), ([key, *[other] * 10, key, *[other] * 15], 1)):
+        found = messages(Attached(cameras("red"), changing(frames), Clock()))
+        assert [event.kind for event in events(found)] == ["no_keyframes"] * count
+        assert sum(message.camera is not None for message in found) == len(frames)
+
+
 def test_what_came_before_a_fault_is_given_out() -> None:
     def broken(camera: str, number: int) -> None:
         if camera == "red" and number == 5:

@@ -186,7 +186,7 @@ class Attendant:
             and not self._shared.started.wait(_TURN_S)
             and not self._shared.stopped.is_set()
         ):
-            self._say_once("no_keyframes", text)
+            pass
 
     def _is_early(self, frame: Frame) -> bool:
         """Whether a frame came before the recording began, but for the first; or needs one that did.
@@ -207,8 +207,8 @@ class Attendant:
         self._since_key = 0 if can_begin(frame) else self._since_key + 1
         if self._since_key == _KEYLESS:
             text = (
-                f"camera {self._camera.name}: no keyframe in {_KEYLESS} frames; after a frame that is skipped or "
-                "damaged nothing can be looked at; set its keyframe interval (GOP) to a second or two"
+                f"camera {self._camera.name}: no keyframe in {_KEYLESS} frames; after one that is skipped "
+                "or damaged nothing can be looked at; set its keyframe interval (GOP) to a second or two"
             )
             self._say_once("no_keyframes", text)
 

@@ -6,7 +6,6 @@ import errno
 import mmap
 import os
 import select
-import time
 from collections.abc import Iterator
 from contextlib import ExitStack, contextmanager
 from typing import NamedTuple
@@ -188,13 +187,13 @@ class _Capture(NamedTuple):
 
 
 def _frames(capture: _Capture, clock: Clock, say: Say) -> Iterator[Frame | None]:
-    heard_s, said = time.monotonic(), False
+    heard_ns, said = clock.now_ns(), False
     last: int | None = None
     while True:
         with _faults(capture.where):
             buffer = _next_buffer(capture.device)
         if buffer is None:
-            _check_heard(capture, heard_s)
+            _check_heard(capture, clock.now_ns() - heard_ns)
             yield None
             continue
         if not said:
@@ -211,16 +210,16 @@ def _frames(capture: _Capture, clock: Clock, say: Say) -> Iterator[Frame | None]
             if not data:
                 say(f"camera {capture.camera.name}: sends pictures that are not whole; they are left out")
         if not data:
-            _check_heard(capture, heard_s)
+            _check_heard(capture, clock.now_ns() - heard_ns)
             yield None
         else:
             missed, last = _missed(last, buffer.sequence), buffer.sequence
             yield Frame(data, "jpeg", clock.of_monotonic_ns(stamp_ns) if stamped else None, missed)
-            heard_s = time.monotonic()
+            heard_ns = clock.now_ns()
 
 
-def _check_heard(capture: _Capture, heard_s: float) -> None:
-    if time.monotonic() - heard_s > _SILENT_S:
+def _check_heard(capture: _Capture, silent_ns: int) -> None:
+    if silent_ns > _SILENT_S * NS_PER_S:
         raise SourceError(f"{capture.where}: sends no frames; plug it in anew, or into another USB port")
 
 

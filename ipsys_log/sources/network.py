@@ -7,7 +7,6 @@ parameter sets before each keyframe, which is what ``foxglove.CompressedVideo`` 
 from __future__ import annotations
 
 import socket
-import time
 from collections.abc import Iterable, Iterator
 from contextlib import contextmanager, suppress
 from queue import Empty, Full, Queue
@@ -21,6 +20,7 @@ from ipsys_log.sources.asked import Given, say_refused
 from ipsys_log.sources.frames import Clock, Frame, Say, SourceError
 from ipsys_log.sources.packets import find_video, name_format, pass_through
 from ipsys_log.sources.stamps import Stamps
+from ipsys_log.units import NS_PER_S
 
 if TYPE_CHECKING:
     from av.container import InputContainer
@@ -128,7 +128,7 @@ def _frames(camera: RigCamera, clock: Clock, say: Say) -> Iterator[Frame]:
             stamps = Stamps(camera.name, clock, say, _PATIENCE if container.format.name == "rtsp" else 1)
             # A stream that stops within a packet has ended.
             with suppress(av.error.InvalidDataError):
-                for packet in pass_through(_heard(container.demux(stream), where), stream):
+                for packet in pass_through(_heard(container.demux(stream), clock, where), stream):
                     yield Frame(bytes(packet), name, stamps.of(packet))
             # A camera that is there does not end: it may come back.
             raise SourceError(f"{where}: the stream has ended")
@@ -136,15 +136,15 @@ def _frames(camera: RigCamera, clock: Clock, say: Say) -> Iterator[Frame]:
         raise SourceError(f"{where}: {_explain(error)}") from error
 
 
-def _heard(packets: Iterable[Packet[VideoStream]], where: str) -> Iterator[Packet[VideoStream]]:
+def _heard(packets: Iterable[Packet[VideoStream]], clock: Clock, where: str) -> Iterator[Packet[VideoStream]]:
     """Packets, until for long only empty ones have come, which is as silent as none."""
-    heard_s = time.monotonic()
+    heard_ns = clock.now_ns()
     for packet in packets:
-        if not packet.size and time.monotonic() - heard_s > _SILENT_S:
+        if not packet.size and clock.now_ns() - heard_ns > _SILENT_S * NS_PER_S:
             raise SourceError(f"{where}: sends only empty frames; start the camera anew")
         yield packet
         if packet.size:
-            heard_s = time.monotonic()
+            heard_ns = clock.now_ns()
 
 
 def _open(address: str, where: str) -> InputContainer:

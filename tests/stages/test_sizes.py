@@ -25,7 +25,7 @@ def sent(sizes_px: list[tuple[int, int]]) -> list[Message]:
     picture = draw(VGA, [at_px(VGA, 5, (330, 240), 2.0, 0.3, 0.4)], Look())
     times_ns = each_time(len(sizes_px))
     return [
-        frame(jpeg(cv2.resize(picture, size_px)), time_ns)
+        frame(jpeg(np.asarray(cv2.resize(picture, size_px), dtype=np.uint8)), time_ns)
         for size_px, time_ns in zip(sizes_px, times_ns, strict=True)
     ]
 

@@ -1,6 +1,6 @@
 """What went wrong in the user's input, in one line: what, where, and what to do."""
 
-__all__ = ["FitError", "FrameError", "IpsysError", "LogError", "WriteError"]
+__all__ = ["FitError", "FrameError", "IpsysError", "LogError", "SizeError", "WriteError"]
 
 
 class IpsysError(Exception):
@@ -25,3 +25,7 @@ class FitError(IpsysError, ValueError):
 
 class FrameError(IpsysError, ValueError):
     """A frame that cannot be decoded."""
+
+
+class SizeError(IpsysError):
+    """A frame of another size than its lens."""

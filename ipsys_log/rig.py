@@ -39,10 +39,13 @@ STAMPS = ("start", "end")
 
 # Stands for a password where it may be read by others.
 HIDDEN = "***"
-# After user and colon, up to the last @: a password may have any sign in it. Or a part of the query.
+# A host with a dot and its port, and then a path or query: no user and password.
+_PORT = r"(?![^/?@:\[]*\.[^/?@:\[]*:[0-9]+(?:/[^@?]*)?(?:\?|$))"
+# Up to the last @: a password may have any sign in it. A lone name may be a token. Or a part of the query.
 _PASSWORDS = (
-    re.compile(r"(?<=://)(?P<before>[^/?@:\[]*:)(?![0-9]+(?:[/?]|$)).*(?=@)"),
-    re.compile(r"(?P<before>(?:pass|passwd|password|pwd)=)[^&;]+", re.IGNORECASE),
+    re.compile(rf"(?<=://){_PORT}(?P<before>[^/?@:\[]*:).*(?=@)"),
+    re.compile(r"(?<=://)(?P<before>)[^/?@:\[]+(?=@)"),
+    re.compile(r"(?P<before>(?:(?:pas|pw|psw|token|auth|secret)[\w-]*|key)=)[^&]+", re.IGNORECASE),
 )
 
 _NAME = re.compile(r"[a-z][a-z0-9_]*")

@@ -8,7 +8,7 @@ import cv2
 import numpy as np
 from numpy.typing import NDArray
 
-from ipsys_log.errors import IpsysError
+from ipsys_log.errors import IpsysError, SizeError
 from ipsys_log.messages import CameraCalibration
 
 __all__ = [
@@ -68,11 +68,11 @@ def check_size(lens: CameraCalibration, width: int, height: int, camera: str | N
 
     Raises
     ------
-    IpsysError
+    SizeError
         Where it is for another size.
     """
     if (lens.width, lens.height) != (width, height):
-        raise IpsysError(
+        raise SizeError(
             f"camera {camera}: its frames are {width} x {height} px, its calibration is for "
             f"{lens.width} x {lens.height}; calibrate at the size that is recorded, and give that with "
             f"--calibration {camera}=calibration.yaml"

@@ -42,7 +42,8 @@ def write_message(writer: LogWriter, message: Message, counts: dict[str, int]) -
     """Put a message into an open log, and count it by its topic. No password gets into a log."""
     payload = hide_passwords(message.payload) if isinstance(message.payload, Rig) else message.payload
     name = schema_name(type(message.payload))
-    if message.topic not in counts:
+    # A camera may begin to send something else: of what is known, this refuses another schema.
+    if message.topic not in counts or message.camera is not None:
         writer.add_channel(message.topic, Schema(name, "protobuf", schema_data(name)))
     writer.write(message.topic, message.log_time_ns, message.publish_time_ns, encode(payload))
     counts[message.topic] = counts.get(message.topic, 0) + 1

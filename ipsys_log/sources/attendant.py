@@ -10,7 +10,7 @@ from typing import Any, NamedTuple
 from ipsys_log.messages import EVENTS_TOPIC, Event, RigCamera, image_topic
 from ipsys_log.rig import hide_password
 from ipsys_log.sources.frames import Clock, Frame, Open, Say, SourceError, instant_ns
-from ipsys_log.sources.packets import find_size
+from ipsys_log.sources.packets import can_begin, find_size
 from ipsys_log.sources.videos import frame_payload
 from ipsys_log.units import NS_PER_S
 
@@ -22,6 +22,10 @@ _FIRST_FRAME_S = 10.0
 _DRAW_S = 120.0
 _RETRY_S, _LONGEST_RETRY_S = 0.5, 8.0
 _TURN_S = 0.1
+# So long a frame without a stamp may wait for the recording to begin: it would get a false time.
+_EARLY_S = 0.01
+# Frames of a video, 20 s or so, among which each camera that is set up well has a keyframe.
+_KEYLESS = 600
 # A camera that loses frames all the time is not named more often.
 _NAMED_EVERY_NS = NS_PER_S
 
@@ -87,6 +91,8 @@ class Attendant:
         self._lost_ns: int | None = None
         self._dropped_before = self._missed_before = self._missed_named_ns = 0
         self._said: set[str] = set()
+        self._broken = False
+        self._since_key = 0
         self.thread = threading.Thread(target=self._attend, name=camera.name, daemon=True)
 
     def wait(self) -> None:
@@ -122,6 +128,10 @@ class Attendant:
                 stopped.wait(retry_s)
         except BaseException as fault:  # whoever opens the cameras, or takes the messages, is to see it
             self.fault = fault
+            if self._begun.is_set():
+                # The others may go on for hours; where it came from is shown when they have ended.
+                text = f"camera {self._camera.name}: the program failed ({fault!r}); nothing more comes of it"
+                self._say("camera_failed", text)
         finally:
             self._name_lost(now=True)
             self.state.up, self.state.finished = False, True
@@ -138,6 +148,8 @@ class Attendant:
                     if shared.stopped.is_set():
                         break
                     if frame is not None:
+                        self._count_since_key(frame)
+                    if frame is not None and not self._is_early(frame):
                         self._take(frame)
         except SourceError as error:
             if self.state.up:
@@ -148,13 +160,13 @@ class Attendant:
 
     def _take(self, frame: Frame) -> None:
         state, camera, now_ns = self.state, self._camera, self._shared.clock.now_ns()
+        self._check_format(frame)
         if self._lost_ns is not None:
             gone_s = (now_ns - self._lost_ns) / NS_PER_S
             self._lost_ns = None
             self._say("camera_back", f"camera {camera.name} is back after {gone_s:.1f} s")
         state.up, state.format = True, frame.format
-        if state.size_px is None:
-            state.size_px = find_size(frame)
+        self._note_size(frame)
         time_ns = now_ns
         if frame.time_ns is not None:
             time_ns = instant_ns(frame.time_ns, camera)
@@ -168,9 +180,64 @@ class Attendant:
         state.bytes += len(frame.data)
         self._name_lost()
         self._begun.set()
-        # What came before the slowest camera would only be late.
-        while not self._shared.started.wait(_TURN_S) and not self._shared.stopped.is_set():
+        # What came before the slowest camera would only be late; one without a stamp is not known to be.
+        while (
+            frame.time_ns is not None
+            and not self._shared.started.wait(_TURN_S)
+            and not self._shared.stopped.is_set()
+        ):
             pass
+
+    def _is_early(self, frame: Frame) -> bool:
+        """Whether a frame came before the recording began, but for the first; or needs one that did.
+
+        Without a stamp it can only be dated by its arrival, so it must not wait: until then such frames are
+        thrown away. Files and the simulator give stamps, and wait.
+        """
+        if not self._begun.is_set():
+            return False
+        if frame.time_ns is None and not self._shared.started.wait(_EARLY_S):
+            self._broken = True
+            return True
+        self._broken = self._broken and 0 < self._since_key < _KEYLESS
+        return self._broken
+
+    def _count_since_key(self, frame: Frame) -> None:
+        """Say where a video has no keyframes: it cannot be read on from a frame that was skipped."""
+        self._since_key = 0 if can_begin(frame) else self._since_key + 1
+        if self._since_key == _KEYLESS:
+            text = (
+                f"camera {self._camera.name}: no keyframe in {_KEYLESS} frames; after one that is skipped "
+                "or damaged nothing can be looked at; set its keyframe interval (GOP) to a second or two"
+            )
+            self._say_once("no_keyframes", text)
+
+    def _check_format(self, frame: Frame) -> None:
+        """See that a frame is of the format of those before it: a channel of a log holds only one."""
+        before, name = self.state.format, self._camera.name
+        if before in (None, frame.format):
+            return
+        text = (
+            f"camera {name}: sends {frame.format} now, and {before} before, and no log holds both; "
+            f"set it back to {before}, or begin a new recording"
+        )
+        if not self.state.up:
+            self._say_once("camera_lost", f"{text}; trying again")
+        raise SourceError(text)
+
+    def _note_size(self, frame: Frame) -> None:
+        """Keep the size of the pictures, and say where it changes; of a video only the first is known."""
+        before = self.state.size_px
+        if before is not None and frame.format != "jpeg":
+            return
+        size_px = find_size(frame)
+        if size_px is None or size_px == before:
+            return
+        self.state.size_px = size_px
+        if before is not None:
+            now, then = (f"{width} x {height} px" for width, height in (size_px, before))
+            text = f"camera {self._camera.name}: its pictures are {now} now, and were {then}; calibrations "
+            self._say("camera_size", f"{text}are for one size: set it back")
 
     def _name_lost(self, now: bool = False) -> None:
         """Frames that are not in the log, since they were last named."""
@@ -186,9 +253,12 @@ class Attendant:
 
     def _say_setting(self, text: str) -> None:
         """What a camera refused, once, however often it is opened."""
+        self._say_once("camera_setting", text)
+
+    def _say_once(self, kind: str, text: str) -> None:
         if text not in self._said:
             self._said.add(text)
-            self._say("camera_setting", text)
+            self._say(kind, text)
 
     def _say(self, kind: str, text: str) -> None:
         """An event of this camera, said at once too."""

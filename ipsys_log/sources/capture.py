@@ -24,7 +24,8 @@ __all__ = ["open_v4l2"]
 _JPEG = ("MJPG", "JPEG")
 _BUFFERS = 8
 _TURN_S = 0.4
-_SILENT_TURNS = 12
+# A camera that gives no picture for so long has gone, though it may still hand back empty buffers.
+_SILENT_S = 5.0
 # No camera loses so many frames in a row and is still there.
 _COUNTS_ANEW = 10_000
 
@@ -186,20 +187,15 @@ class _Capture(NamedTuple):
 
 
 def _frames(capture: _Capture, clock: Clock, say: Say) -> Iterator[Frame | None]:
-    silent, said = 0, False
+    heard_ns, said = clock.now_ns(), False
     last: int | None = None
     while True:
         with _faults(capture.where):
             buffer = _next_buffer(capture.device)
         if buffer is None:
-            silent += 1
-            if silent >= _SILENT_TURNS:
-                raise SourceError(
-                    f"{capture.where}: sends no frames; plug it in anew, or into another USB port"
-                )
+            _check_heard(capture, clock.now_ns() - heard_ns)
             yield None
             continue
-        silent = 0
         if not said:
             said = True
             _say_stamps(capture.camera, buffer.flags, say)
@@ -213,9 +209,18 @@ def _frames(capture: _Capture, clock: Clock, say: Say) -> Iterator[Frame | None]
             data = encode_raw(data, capture.layout) or b""
             if not data:
                 say(f"camera {capture.camera.name}: sends pictures that are not whole; they are left out")
-        if data:
+        if not data:
+            _check_heard(capture, clock.now_ns() - heard_ns)
+            yield None
+        else:
             missed, last = _missed(last, buffer.sequence), buffer.sequence
             yield Frame(data, "jpeg", clock.of_monotonic_ns(stamp_ns) if stamped else None, missed)
+            heard_ns = clock.now_ns()
+
+
+def _check_heard(capture: _Capture, silent_ns: int) -> None:
+    if silent_ns > _SILENT_S * NS_PER_S:
+        raise SourceError(f"{capture.where}: sends no frames; plug it in anew, or into another USB port")
 
 
 def _missed(last: int | None, sequence: int) -> int:

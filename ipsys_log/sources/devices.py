@@ -101,7 +101,7 @@ def _opener(camera: RigCamera) -> Open:
             f'camera {camera.name}: the rig gives no source; write e.g. source = "usb:/dev/video0"'
         )
     shown = hide_password(camera.source)
-    if shown == camera.source and (f":{HIDDEN}@" in shown or f"={HIDDEN}" in shown):
+    if shown == camera.source and (f"{HIDDEN}@" in shown or f"={HIDDEN}" in shown):
         raise IpsysError(
             f"camera {camera.name}: {shown}: its password is not known, a log holds none; write it in place "
             f"of {HIDDEN}"

@@ -7,7 +7,7 @@ parameter sets before each keyframe, which is what ``foxglove.CompressedVideo`` 
 from __future__ import annotations
 
 import socket
-from collections.abc import Iterator
+from collections.abc import Iterable, Iterator
 from contextlib import contextmanager, suppress
 from queue import Empty, Full, Queue
 from threading import Event, Thread
@@ -20,9 +20,12 @@ from ipsys_log.sources.asked import Given, say_refused
 from ipsys_log.sources.frames import Clock, Frame, Say, SourceError
 from ipsys_log.sources.packets import find_video, name_format, pass_through
 from ipsys_log.sources.stamps import Stamps
+from ipsys_log.units import NS_PER_S
 
 if TYPE_CHECKING:
     from av.container import InputContainer
+    from av.packet import Packet
+    from av.video.stream import VideoStream
 
 __all__ = ["check_address", "open_network"]
 
@@ -125,12 +128,23 @@ def _frames(camera: RigCamera, clock: Clock, say: Say) -> Iterator[Frame]:
             stamps = Stamps(camera.name, clock, say, _PATIENCE if container.format.name == "rtsp" else 1)
             # A stream that stops within a packet has ended.
             with suppress(av.error.InvalidDataError):
-                for packet in pass_through(container, stream):
+                for packet in pass_through(_heard(container.demux(stream), clock, where), stream):
                     yield Frame(bytes(packet), name, stamps.of(packet))
             # A camera that is there does not end: it may come back.
             raise SourceError(f"{where}: the stream has ended")
     except av.error.FFmpegError as error:
         raise SourceError(f"{where}: {_explain(error)}") from error
+
+
+def _heard(packets: Iterable[Packet[VideoStream]], clock: Clock, where: str) -> Iterator[Packet[VideoStream]]:
+    """Packets, until for long only empty ones have come, which is as silent as none."""
+    heard_ns = clock.now_ns()
+    for packet in packets:
+        if not packet.size and clock.now_ns() - heard_ns > _SILENT_S * NS_PER_S:
+            raise SourceError(f"{where}: sends only empty frames; start the camera anew")
+        yield packet
+        if packet.size:
+            heard_ns = clock.now_ns()
 
 
 def _open(address: str, where: str) -> InputContainer:

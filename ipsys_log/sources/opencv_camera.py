@@ -25,7 +25,7 @@ def open_opencv(camera: RigCamera, clock: Clock, say: Say) -> Iterator[Iterator[
     Raises
     ------
     SourceError
-        Where there is no such camera.
+        Where there is no such camera; the iterator raises it where the camera has gone.
     """
     number = (camera.source or "").partition(":")[2]
     if not number.isdecimal():
@@ -39,7 +39,7 @@ def open_opencv(camera: RigCamera, clock: Clock, say: Say) -> Iterator[Iterator[
             f"camera {camera.name}: this system hands over decoded pictures; they are encoded as JPEG again, "
             "and get their time of arrival"
         )
-        yield _frames(device)
+        yield _frames(device, f"camera {camera.name}: {camera.source}")
     finally:
         device.release()
 
@@ -75,10 +75,10 @@ def _set(device: cv2.VideoCapture, camera: RigCamera) -> Given:
     )
 
 
-def _frames(device: cv2.VideoCapture) -> Iterator[Frame | None]:
+def _frames(device: cv2.VideoCapture, where: str) -> Iterator[Frame | None]:
     while True:
         came, picture = device.read()
         if not came:
-            return
+            raise SourceError(f"{where}: sends no frames; plug it in anew, or into another USB port")
         data = simplejpeg.encode_jpeg(np.ascontiguousarray(picture), quality=_QUALITY, colorspace="BGR")
         yield Frame(data, "jpeg", None)

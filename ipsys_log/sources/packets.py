@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import re
-from collections.abc import Iterator
+from collections.abc import Iterable, Iterator
 from contextlib import suppress
 from typing import TYPE_CHECKING
 
@@ -16,7 +16,7 @@ if TYPE_CHECKING:
     from av.packet import Packet
     from av.video.stream import VideoStream
 
-__all__ = ["find_size", "find_video", "name_format", "pass_through"]
+__all__ = ["can_begin", "find_size", "find_video", "name_format", "pass_through"]
 
 # FFmpeg's name of a codec, and that in the log.
 _FORMATS = {"mjpeg": "jpeg", "h264": "h264", "hevc": "h265"}
@@ -52,29 +52,36 @@ def name_format(stream: VideoStream) -> str | None:
     return _FORMATS.get(stream.codec_context.name)
 
 
-def pass_through(container: InputContainer, stream: VideoStream) -> Iterator[Packet[VideoStream]]:
-    """Packets of a stream, from the first keyframe on; H.264 and H.265 as Annex B.
+def pass_through(
+    packets: Iterable[Packet[VideoStream]], stream: VideoStream
+) -> Iterator[Packet[VideoStream]]:
+    """Packets of a stream from the first keyframe on; H.264 and H.265 as Annex B.
 
     Each keyframe has the parameter sets before it, so that a reader can begin there.
+
+    Parameters
+    ----------
+    packets : as the container gives them.
+    stream : what they are of.
     """
     from av.bitstream import BitStreamFilterContext
 
     name = stream.codec_context.name
     if name == "mjpeg":
         # The last packet of PyAV's is an empty one.
-        yield from (packet for packet in container.demux(stream) if packet.size)
+        yield from (packet for packet in packets if packet.size)
         return
     packed = (stream.codec_context.extradata or b"")[:1] == b"\x01"  # avcC and hvcC; Annex B begins with 0
     unpack = BitStreamFilterContext(f"{name}_mp4toannexb", stream) if packed else None
     repeat = BitStreamFilterContext("dump_extra=freq=keyframe", stream)
     begun = False
-    for packet in container.demux(stream):
+    for packet in packets:
         begun = begun or packet.is_keyframe
         if not begun or not packet.size:
             continue
         if unpack:
             yield from unpack.filter(packet)
-        elif packet.is_keyframe and not _has_parameters(packet):
+        elif packet.is_keyframe and not _has_parameters(memoryview(packet), name == "hevc"):
             yield from repeat.filter(packet)
         else:
             yield packet
@@ -101,10 +108,14 @@ def _find_video_size(frame: Frame) -> tuple[int, int] | None:
     return (decoder.width, decoder.height) if decoder.width else None
 
 
-def _has_parameters(packet: Packet[VideoStream]) -> bool:
-    """Whether an Annex B packet has the parameter sets before its picture."""
-    wide = packet.stream.codec_context.name == "hevc"
-    for match in _UNIT.finditer(memoryview(packet)):
+def can_begin(frame: Frame) -> bool:
+    """Whether a frame, as :func:`pass_through` gives it, needs none before it."""
+    return frame.format not in ("h264", "h265") or _has_parameters(frame.data, frame.format == "h265")
+
+
+def _has_parameters(data: bytes | memoryview, wide: bool) -> bool:
+    """Whether a frame in Annex B, of H.265 if ``wide``, has the parameter sets before its picture."""
+    for match in _UNIT.finditer(data):
         kind = match[1][0] >> 1 & 0x3F if wide else match[1][0] & 0x1F
         if kind == (33 if wide else 7):  # the sequence's parameters
             return True

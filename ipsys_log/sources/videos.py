@@ -94,7 +94,7 @@ def _faults(path: Path) -> Iterator[None]:
 
 def _passed(container: InputContainer, stream: VideoStream, name: str) -> Iterator[Timed]:
     start: int | None = None
-    for index, packet in enumerate(pass_through(container, stream)):
+    for index, packet in enumerate(pass_through(container.demux(stream), stream)):
         if packet.pts is None or packet.time_base is None:
             # Streams without a container have no times, only a rate.
             yield Timed(round(index * NS_PER_S / (stream.guessed_rate or _RATE_HZ)), bytes(packet), name)

@@ -10,12 +10,14 @@ from contextlib import contextmanager
 from functools import partial
 from itertools import pairwise
 
+import numpy as np
 import pytest
+import simplejpeg
 
 from ipsys_log.messages import CompressedImage, Event, Message, RigCamera
 from ipsys_log.sources import attached as attached_module
 from ipsys_log.sources.attached import Attached
-from ipsys_log.sources.frames import Clock, Frame, Say, SourceError
+from ipsys_log.sources.frames import Clock, Frame, Open, Say, SourceError
 from tests.playing import cameras, playing
 
 FRAMES = {name: [f"{name} {n}".encode() for n in range(20)] for name in ("red", "white", "black")}
@@ -137,6 +139,52 @@ def test_a_camera_that_vanishes_is_tried_again_while_the_others_go_on() -> None:
     assert tries[2] - tries[1] > tries[1] - tries[0]
 
 
+def changing(*visits: list[Frame]) -> Open:
+    """A camera that sends some frames at each visit, and is gone then; after the last it ends."""
+    left = list(visits)
+
+    @contextmanager
+    def opened(camera: RigCamera, clock: Clock, say: Say) -> Iterator[Iterator[Frame | None]]:
+        def sent() -> Iterator[Frame | None]:
+            yield from left.pop(0)
+            if left:
+                raise SourceError(f"camera {camera.name}: has gone")
+
+        yield sent()
+
+    return opened
+
+
+def test_a_camera_that_returns_with_another_codec_is_not_recorded(monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr("ipsys_log.sources.attendant._RETRY_S", 0.02)
+    jpeg, video = Frame(b"a", "jpeg", None), Frame(b"b", "h264", None)
+    said: list[str] = []
+    opened = changing([jpeg], [video], [video], [jpeg, video], [jpeg])
+    found = messages(Attached(cameras("red"), opened, Clock(), said.append))
+    assert [m.payload.data for m in found if m.camera] == [b"a"] * 3
+    kinds = [event.kind for event in events(found)]
+    assert kinds == ["camera_lost", "camera_lost", "camera_back", "camera_lost", "camera_back"]
+    assert "sends h264 now, and jpeg before" in said[1]
+    assert said[1] == said[3]
+    assert said[1].endswith("set it back to jpeg, or begin a new recording; trying again")
+
+
+def test_pictures_of_another_size_are_said_once_for_each_change() -> None:
+    large, small = (
+        Frame(simplejpeg.encode_jpeg(np.zeros((*shape, 3), np.uint8)), "jpeg", None)
+        for shape in ((48, 64), (24, 32))
+    )
+    damaged = Frame(b"no picture", "jpeg", None)
+    attached = Attached(
+        cameras("red"), changing([large, large, small, damaged, small, large, large]), Clock()
+    )
+    found = messages(attached)
+    assert [event.kind for event in events(found)] == ["camera_size"] * 2
+    assert "are 32 x 24 px now, and were 64 x 48 px" in events(found)[0].text
+    assert attached.states["red"].size_px == (64, 48)
+    assert len(data_of(found, "red")) == 7
+
+
 def test_what_the_disk_cannot_take_is_dropped_by_name_and_memory_stays_bounded() -> None:
     frames = {"red": [bytes([n]) * 1000 for n in range(40)]}
     attached = Attached(cameras("red"), playing(frames, 500.0), Clock(), limit_bytes=10_000)
@@ -246,19 +294,67 @@ def test_early_frames_do_not_pile_up_while_another_camera_opens() -> None:
         assert len([message for message in attached if message is not None]) == 10
 
 
+@pytest.mark.parametrize("format", ["jpeg", "h264"])
+def test_frames_without_stamps_do_not_wait_for_another_camera_to_get_a_false_time(format: str) -> None:
+    """A stream that cannot be stopped: what is not taken waits in the socket, and comes late."""
+    picture, key = b"\0\0\1\x41", b"\0\0\1\x67\0\0\1\x65"
+    begin_s: list[float] = []
+
+    @contextmanager
+    def opened(camera: RigCamera, clock: Clock, say: Say) -> Iterator[Iterator[Frame | None]]:
+        def sent() -> Iterator[Frame | None]:
+            begin_s.append(time.monotonic())
+            for n in range(40):
+                if camera.name == "late" and n == 0:
+                    time.sleep(0.8)
+                sent_s = begin_s[0] + n / 20
+                time.sleep(max(sent_s - time.monotonic(), 0))
+                yield Frame((picture if n % 10 else key) + b"%03d" % n, format, None)
+
+        yield sent()
+
+    attached = Attached(cameras("early", "late"), opened, Clock())
+    with attached:
+        found = [message for message in attached if message is not None and message.camera == "early"]
+    start_ns = found[0].publish_time_ns
+    numbers = [int(message.payload.data[-3:]) for message in found]
+    # Frame n was sent n / 20 s after the first.
+    late_s = [(m.publish_time_ns - start_ns) / 1e9 - n / 20 for m, n in zip(found, numbers, strict=True)]
+    assert max(late_s) < 0.1
+    assert numbers[0] == 0
+    # A video goes on where it can be read.
+    assert numbers[1] == 20 if format == "h264" else 15 <= numbers[1] <= 19
+    assert numbers[1:] == list(range(numbers[1], 40))
+
+
+def test_a_video_without_keyframes_is_said_once_and_kept(monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr("ipsys_log.sources.attendant._KEYLESS", 10)
+    key, other = (Frame(data, "h264", 1) for data in (b"\0\0\1\x67\0\0\1\x65", b"\0\0\1\x41"))
+    for frames, count in (([key, *[other] * 9] * 3, 0), ([key, *[other] * 10, key, *[other] * 15], 1)):
+        found = messages(Attached(cameras("red"), changing(frames), Clock()))
+        assert [event.kind for event in events(found)] == ["no_keyframes"] * count
+        assert sum(message.camera is not None for message in found) == len(frames)
+
+
 def test_what_came_before_a_fault_is_given_out() -> None:
     def broken(camera: str, number: int) -> None:
         if camera == "red" and number == 5:
             raise ZeroDivisionError("a bug")
 
     found: list[Message] = []
-    attached = Attached(cameras("red", "white"), playing(FRAMES, 200.0, before=broken), Clock())
+    said: list[str] = []
+    attached = Attached(cameras("red", "white"), playing(FRAMES, 200.0, before=broken), Clock(), said.append)
     with attached:
         time.sleep(0.3)
         with pytest.raises(ZeroDivisionError):
             found.extend(message for message in attached if message is not None)
     assert len(data_of(found, "red")) == 5
     assert len(data_of(found, "white")) == 20
+    # Not only in the end: the other camera might go on for hours.
+    ((number, event),) = [(n, m.payload) for n, m in enumerate(found) if isinstance(m.payload, Event)]
+    assert (event.kind, event.camera, event.text) == ("camera_failed", "red", said[0])
+    assert "camera red: the program failed (ZeroDivisionError('a bug'))" in event.text
+    assert number < len(found) - 5
 
 
 def test_stopping_gives_out_what_has_come() -> None:

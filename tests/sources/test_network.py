@@ -181,6 +181,42 @@ def test_a_stream_that_falls_silent_is_left_at_once(tmp_path: Path) -> None:
         assert time.monotonic() - start < 2.5
 
 
+def test_a_stream_of_empty_parts_has_gone(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr("ipsys_log.sources.network._SILENT_S", 1.0)
+    pictures = make_jpegs(tmp_path, 3)
+    left = threading.Event()
+
+    class Camera(http.server.BaseHTTPRequestHandler):
+        def log_message(self, *args: object) -> None:
+            pass
+
+        def do_GET(self) -> None:
+            self.send_response(200)
+            self.send_header("Content-Type", "multipart/x-mixed-replace;boundary=ffmpeg")
+            self.end_headers()
+            with suppress(OSError):
+                for number in range(500):
+                    data = pictures[number % 3] if number < 20 else b""
+                    head = b"--ffmpeg\r\nContent-type: image/jpeg\r\nContent-length: %d\r\n\r\n" % len(data)
+                    self.wfile.write(head + data + b"\r\n")
+                    time.sleep(0.02)
+            left.set()
+
+    with http.server.ThreadingHTTPServer(("127.0.0.1", 0), Camera) as server:
+        threading.Thread(target=server.serve_forever, args=(0.05,), daemon=True).start()
+        source = RigCamera("red", source=f"http://127.0.0.1:{server.server_address[1]}/live")
+        start_s = time.monotonic()
+        with (
+            pytest.raises(SourceError, match="sends only empty frames"),
+            open_network(source, Clock(), lambda _: None) as frames,
+        ):
+            assert sum(frame is not None for frame in frames) > 5
+        assert time.monotonic() - start_s < 6
+        # The connection is given up too.
+        assert left.wait(2)
+        server.shutdown()
+
+
 def test_a_stream_that_ends(tmp_path: Path) -> None:
     pictures = make_jpegs(tmp_path, 25)
     port = free_port()

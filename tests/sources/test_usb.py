@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import errno
 import sys
+import time
 from itertools import islice
 from pathlib import Path
 
@@ -15,7 +16,7 @@ import simplejpeg
 from numpy.typing import NDArray
 
 from ipsys_log.messages import RigCamera
-from ipsys_log.sources import capture, v4l2
+from ipsys_log.sources import capture, opencv_camera, v4l2
 from ipsys_log.sources.frames import Clock, Frame, SourceError
 from ipsys_log.sources.usb import open_usb
 from tests.sources.camera_driver import Driver
@@ -88,11 +89,33 @@ def test_frames_that_the_driver_lost_are_told(
 def test_while_nothing_comes_it_says_so_and_at_last_gives_up(
     driver: Driver, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    monkeypatch.setattr(capture, "_SILENT_TURNS", 3)
+    monkeypatch.setattr(capture, "_SILENT_S", 1.0)
     with open_usb(ask(driver), Clock(), lambda _: None) as frames:
         assert [next(frames), next(frames)] == [None, None]
         with pytest.raises(SourceError, match=r"camera red: .*video0: sends no frames; plug it in anew"):
-            next(frames)
+            list(frames)
+
+
+@pytest.mark.parametrize(("mode", "bad"), [("MJPG", b""), ("YUYV", b""), ("YUYV", b"half a picture")])
+def test_a_camera_that_hands_over_nothing_of_use_has_gone(
+    driver: Driver, monkeypatch: pytest.MonkeyPatch, mode: str, bad: bytes
+) -> None:
+    monkeypatch.setattr(capture, "_SILENT_S", 0.2)
+    driver.modes = {mode: [(64, 48, [30])]}
+    driver.frames.extend([bad] * 300_000)
+    start_s = time.monotonic()
+    with (
+        open_usb(ask(driver, width=64, height=48), Clock(), lambda _: None) as frames,
+        pytest.raises(SourceError, match="sends no frames"),
+    ):
+        list(frames)
+    assert time.monotonic() - start_s < 2
+
+
+def test_a_camera_through_opencv_that_is_pulled_out_may_come_back() -> None:
+    frames = opencv_camera._frames(cv2.VideoCapture(), "camera red: usb:0")
+    with pytest.raises(SourceError, match="camera red: usb:0: sends no frames"):
+        next(frames)
 
 
 def test_what_the_camera_refuses_is_said(driver: Driver) -> None:

@@ -39,7 +39,8 @@ def pictures(tmp_path: Path) -> Path:
 
 def frames(video: Path, name: str) -> list[CompressedVideo]:
     with av.open(video) as container:
-        packets = pass_through(container, container.streams.video[0])
+        stream = container.streams.video[0]
+        packets = pass_through(container.demux(stream), stream)
         return [CompressedVideo(n, "red", bytes(packet), name) for n, packet in enumerate(packets)]
 
 

@@ -10,7 +10,7 @@ from typing import Any
 
 import numpy as np
 
-from ipsys_log.errors import FrameError, IpsysError
+from ipsys_log.errors import FrameError, IpsysError, SizeError
 from ipsys_log.geometry.lenses import check_calibration, check_size, same_lens
 from ipsys_log.messages import (
     CameraCalibration,
@@ -59,8 +59,8 @@ class Detect:
     """The stage *detect*, one for all cameras.
 
     Yields, for a frame, its :class:`Markers` and their drawing for viewers; or an :class:`Event`
-    for a frame that cannot be decoded. A marker id that is seen twice in a frame, or is not in the
-    rig, is left out and named by an event.
+    for a frame that cannot be decoded, or has suddenly another size than the lens. A marker id that
+    is seen twice in a frame, or is not in the rig, is left out and named by an event.
 
     Parameters
     ----------
@@ -70,8 +70,8 @@ class Detect:
     Raises
     ------
     IpsysError
-        For a frame before there is a rig or, with ``edges``, a calibration of its camera; and for one of
-        another size than the calibration's.
+        For a frame before there is a rig or, with ``edges``, a calibration of its camera; and where a
+        camera's first one is of another size than the calibration's.
     """
 
     def __init__(self, corners: str = EDGES) -> None:
@@ -81,6 +81,8 @@ class Detect:
         self._following: dict[str | None, Follow] = {}
         self._videos: dict[str | None, Video] = {}
         self._said: dict[str | None, set[int | None]] = {}
+        # Cameras of which a frame has had the size of the lens.
+        self._fitted: set[str | None] = set()
 
     def __call__(self, message: Message) -> Iterator[Any]:
         payload = message.payload
@@ -95,6 +97,7 @@ class Detect:
             self._lenses[message.camera] = lens
             if known is None or not same_lens(known, lens):
                 self._following.pop(message.camera, None)
+                self._fitted.discard(message.camera)
         elif isinstance(payload, SkippedVideo):
             with suppress(FrameError):
                 self._video(message.camera, payload.frame).pass_over(payload.frame)
@@ -118,6 +121,14 @@ class Detect:
             text = f"{message.topic}: corrupt frame: {error}"
             yield Event(message.publish_time_ns, "corrupt_frame", text, message.camera)
             return
+        except SizeError as error:
+            # A camera that never fits would give nothing at all.
+            if message.camera not in self._fitted:
+                raise
+            text = f"{message.topic}: a frame is left out: {error}"
+            yield Event(message.publish_time_ns, "wrong_size", text, message.camera)
+            return
+        self._fitted.add(message.camera)
         markers, events = _sift(found, self._rig, message)
         yield from self._unsaid(events)
         yield Markers(message.publish_time_ns, markers, width, height)
@@ -142,13 +153,14 @@ class Detect:
         camera = rig.camera(str(message.camera))
         if self._corners == STOCK:
             grey = decode_grey(message.payload)
-            found = detect_markers(grey, rig.dictionary)
             height, width = grey.shape
+            if message.camera in self._lenses:
+                check_size(self._lenses[message.camera], width, height, message.camera)
+            found = detect_markers(grey, rig.dictionary)
         else:
             if message.camera not in self._following:
                 self._following[message.camera] = self._follow(message, rig, camera)
             fits, width, height = self._following[message.camera](message.payload, message.publish_time_ns)
-            check_size(self._lenses[message.camera], width, height, message.camera)
             found = [_marker(fit) for fit in fits]
         return [_timed(marker, camera) for marker in found], width, height
 
@@ -161,7 +173,7 @@ class Detect:
             )
         row_time_s = (camera.row_time_ns or 0) / NS_PER_S
         number = rig.cameras.index(camera) if camera in rig.cameras else 0
-        return Follow(rig.dictionary, lens, camera.edge_offset_px, row_time_s, number)
+        return Follow(rig.dictionary, lens, camera.edge_offset_px, row_time_s, number, message.camera)
 
     def _unsaid(self, events: list[Event]) -> Iterator[Event]:
         """A camera names an id that is not in the rig once, and whatever else every time."""

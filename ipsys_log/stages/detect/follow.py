@@ -8,7 +8,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from ipsys_log.geometry.ippe import solve_squares
-from ipsys_log.geometry.lenses import project, undistort
+from ipsys_log.geometry.lenses import check_size, project, undistort
 from ipsys_log.geometry.markers import marker_corners
 from ipsys_log.geometry.square_pose import goes_around
 from ipsys_log.messages import CameraCalibration, CompressedImage, RawImage
@@ -54,6 +54,7 @@ class Follow:
     edge_offset_px, row_time_s : as for :func:`fit_edges`.
     number : of the camera in the rig. Cameras search the whole picture in different frames: the thorough
         searches of all of them at once would take longer than live tracking has.
+    camera : its name, for messages.
     """
 
     def __init__(
@@ -63,9 +64,10 @@ class Follow:
         edge_offset_px: float | None,
         row_time_s: float,
         number: int = 0,
+        camera: str | None = None,
     ) -> None:
         self._dictionary = dictionary
-        self._lens = lens
+        self._lens, self._camera = lens, camera
         self._edge_offset_px = edge_offset_px
         self._row_time_s = row_time_s
         self._watch = Watch()
@@ -79,6 +81,8 @@ class Follow:
     def __call__(self, frame: CompressedImage | RawImage, time_ns: int) -> tuple[list[Fit], int, int]:
         """The markers in a frame, sorted by id, and the width and height of it; an id can occur twice.
 
+        A frame that raises an error changes nothing for those after it.
+
         Parameters
         ----------
         frame : as recorded.
@@ -88,6 +92,8 @@ class Follow:
         ------
         FrameError
             Where it cannot be decoded.
+        SizeError
+            Where it is of another size than the lens.
         """
         turn = self._frames
         gap_s = (time_ns - self._last_ns) / NS_PER_S
@@ -122,6 +128,7 @@ class Follow:
         guesses = [predict(track, time_ns) for track in self._tracks]
         outlines_px = self._outlines(guesses)
         grey, rows = decode_rows(frame, None if whole else _rows(outlines_px, self._changed))
+        check_size(self._lens, grey.shape[1], grey.shape[0], self._camera)
         tried = self._with_speed(grey, time_ns, guesses, self._fit(grey, guesses))
         if rows != [slice(0, len(grey))] and _jumped(outlines_px, tried):
             # Damage in a JPEG moves what comes after it, and is noticed only at its end.

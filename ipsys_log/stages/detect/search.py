@@ -62,6 +62,8 @@ def _placed(found: list[Candidate], region: tuple[slice, slice]) -> list[Candida
 def _search(grey: Grey, dictionary: str) -> list[Candidate]:
     # Whole pixels, not means: three times as fast, and as good where cells are wider than that.
     small = np.ascontiguousarray(grey[_SHRINK // 2 :: _SHRINK, _SHRINK // 2 :: _SHRINK])
+    if not small.size:
+        return []
     found, ids, rejected = _quick_detector(dictionary).detectMarkers(small)
     squares = [*found, *rejected]
     if not squares:

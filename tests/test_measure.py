@@ -318,7 +318,7 @@ def test_the_terminal_asks_checks_and_undoes(
     monkeypatch.setattr("sys.stdin", io.StringIO("\n".join(answers) + "\n"))
     done = ipsys("measure", log, "--terminal")
     assert done.code == 0, done.err
-    assert "d to B: 1.234 cm looks like metres" in done.out
+    assert "distance to B: 1.234 cm looks like metres" in done.out
     assert "p001 is in the log" in done.out
     assert "p001 is withdrawn" in done.out
     assert "1 place measured" in done.out

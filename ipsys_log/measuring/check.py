@@ -149,7 +149,7 @@ def _located(read: Measurement, rig: Rig) -> TapePoint:
         base_m = float(np.hypot(*(second_m - first_m)))
         one, other = read.distances
         if not abs(one.distance_m - other.distance_m) <= base_m <= one.distance_m + other.distance_m:
-            tapes = " and ".join(f"d to {d.reference} = {d.distance_m * CM_PER_M:g} cm" for d in (one, other))
+            tapes = " and ".join(f"distance to {d.reference} = {d.distance_m * CM_PER_M:g} cm" for d in (one, other))
             raise IpsysError(
                 f"no triangle has the sides {one.reference} to {other.reference} = "
                 f"{base_m * CM_PER_M:.1f} cm, {tapes}; read both again"

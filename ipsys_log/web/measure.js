@@ -62,7 +62,7 @@ function typed() {
 function buildFields() {
   $("fields").replaceChildren(...lab.references.map((reference, n) => {
     const input = make("input", { id: `d-${reference.name}`, inputMode: "decimal", enterKeyHint: "next" });
-    const label = make("label", { htmlFor: input.id }, `From ${reference.name}`);
+    const label = make("label", { htmlFor: input.id }, `Distance to ${reference.name}`);
     const fault = make("p", { className: "fault", id: `fault-d_${reference.name}` });
     input.setAttribute("aria-describedby", fault.id);
     return make("div", { className: "field" }, label, make("span", { className: "cm" }, input, make("i", {}, "cm")), fault);

@@ -80,7 +80,7 @@ def test_three_distances_need_no_side_and_check_one_another(world_m: tuple[float
 def test_two_tapes_that_cannot_meet() -> None:
     checked = check(Typed("0", {"A": "40", "B": "50"}, "left", "0"))
     assert checked.measurement is None
-    said = "no triangle has the sides A to B = 243.8 cm, d to A = 40 cm and d to B = 50 cm; read both again"
+    said = "no triangle has the sides A to B = 243.8 cm, distance to A = 40 cm and distance to B = 50 cm; read both again"
     assert checked.faults[0].text == said
     # The side is not what is wrong: said before it is asked for.
     unsided = check(Typed("0", {"A": "40", "B": "50"}, "", "0"))

@@ -85,6 +85,9 @@ def test_two_tapes_that_cannot_meet() -> None:
     # The side is not what is wrong: said before it is asked for.
     unsided = check(Typed("0", {"A": "40", "B": "50"}, "", "0"))
     assert any("no triangle" in fault.text for fault in unsided.faults)
+    # Nor is the height.
+    alone = check(Typed("0", {"A": "40", "B": "50"}))
+    assert any("no triangle" in fault.text for fault in alone.faults)
 
 
 def test_both_places_while_the_side_is_missing() -> None:

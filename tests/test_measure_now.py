@@ -271,7 +271,9 @@ def test_the_faults_of_a_sheet_stand_on_lines_of_their_own_in_a_window(unmeasure
     assert code == 1
     lines = told.replace("\r", "").rstrip("\n").split("\n")
     assert max(map(len, lines)) <= 80
-    starts = [line.split(": ")[0] for line in lines if line.startswith(("  line 2: no", "  line 3: marker 99"))]
+    starts = [
+        line.split(": ")[0] for line in lines if line.startswith(("  line 2: no", "  line 3: marker 99"))
+    ]
     assert starts == ["  line 2", "  line 3"]
     # A fault that is longer than the window goes on below itself.
     assert any("d_B_cm" in line and line.startswith("  ") for line in lines)

@@ -113,8 +113,9 @@ def check_entry(
         return Checked(name, (*found, Fault("", why)))
     on_floor, remark = doubt_floor(read, fixed, rig)
     warnings += [*remark, *doubt_tapes(read, fixed, rig)]
-    found += _twin_faults(read, history)
-    warnings += _repeat_warnings(read, history) if read.still else []
+    earlier = _here_before(read, sight, history)
+    found += _twin_faults(read, earlier)
+    warnings += _repeat_warnings(read, earlier) if read.still else []
     predictions = predict(model, sight.points_m, fixed.world_m) if model and sight else ()
     warnings += doubt_model(read, fixed, rig, predictions)
     return Checked(
@@ -174,20 +175,27 @@ def _identity_faults(entry: Entry, sight: Sight | None, history: Sequence[Measur
     return found
 
 
-def _twin_faults(read: Measurement, history: Sequence[Measurement]) -> list[Fault]:
+def _here_before(read: Measurement, sight: Sight | None, history: Sequence[Measurement]) -> list[Measurement]:
+    """What counts of this marker at this place: in the same stretch, or where cameras see it still."""
+    seen = sight.measured_as if sight else ()
+    own = [m for m in active_measurements(history) if m.marker_id == read.marker_id]
+    return [m for m in own if _overlap(m, read) or m.id in seen]
+
+
+def _twin_faults(read: Measurement, earlier: Sequence[Measurement]) -> list[Fault]:
     """The same place typed twice, to the last digit."""
-    for other in active_measurements(history):
-        same = (other.marker_id, other.side, other.height_m) == (read.marker_id, read.side, read.height_m)
-        if same and _overlap(other, read) and _tapes(other) == _tapes(read):
+    for other in earlier:
+        same = (other.side, other.height_m) == (read.side, read.height_m)
+        if same and _tapes(other) == _tapes(read):
             return [Fault("", f"this is {other.id} once more, with the very same numbers")]
     return []
 
 
-def _repeat_warnings(read: Measurement, history: Sequence[Measurement]) -> list[str]:
-    names = [
-        m.id for m in active_measurements(history) if m.marker_id == read.marker_id and _overlap(m, read)
-    ]
-    return [f"marker {read.marker_id} is measured here already, as {', '.join(names)}"] if names else []
+def _repeat_warnings(read: Measurement, earlier: Sequence[Measurement]) -> list[str]:
+    if not earlier:
+        return []
+    names = ", ".join(m.id for m in earlier)
+    return [f"marker {read.marker_id} is measured here already, as {names}; if this is better, undo that one"]
 
 
 def _tapes(measurement: Measurement) -> list[tuple[str, float]]:

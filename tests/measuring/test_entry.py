@@ -20,7 +20,7 @@ def faults(typed: Typed) -> dict[str, str]:
 
 
 def test_centimetres_become_metres_with_point_or_comma() -> None:
-    entry, wrong = read_typed(replace(GOOD, distances={"A": " 170.5", "B": "190,25 cm"}, height="0"), labs.RIG)
+    entry, wrong = read_typed(replace(GOOD, distances={"A": " 170.5", "B": "190,25cm"}, height="0"), labs.RIG)
     assert wrong == []
     assert [(d.reference, d.distance_m) for d in entry.distances] == [("A", 1.705), ("B", 1.9025)]
     assert (entry.marker_id, entry.side, entry.height_m) == (0, "left", 0.0)

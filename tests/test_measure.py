@@ -328,6 +328,51 @@ def test_the_terminal_asks_checks_and_undoes(
     assert places == ["1", "2", "1"]
 
 
+def test_a_bad_answer_in_the_terminal_costs_that_answer_only(
+    unmeasured: Unmeasured, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+) -> None:
+    log, tape = unmeasured
+    with opened_log(log, Request()) as scene:
+        first = as_typed(next(one for one in tape if scene.stops[0].covers(one)))
+        a, b = first.distances.values()
+        script = [
+            ("distance to A", "hallo"), ("distance to A", f"{a} cm"),
+            ("distance to B", "1.234"), ("distance to B", "3"),  # metres, perhaps: asked once more
+            ("distance to B", ""),
+            ("distance to A", ""), ("distance to B", b),  # no triangle: what was good is kept by Enter
+            ("left or right", "up"), ("left or right", {"left": "links", "right": "Rechts"}[first.side]),
+            ("height", "0,15"), ("height", "x"), ("height", first.height),
+            ("save p001", "perhaps"), ("save p001", "n"),
+            ("distance to A", ""), ("distance to B", ""), ("left or right", ""), ("height", ""),
+            ("save p001", "y"), ("distance to A", "q"),
+        ]  # fmt: skip
+        left = iter(script)
+
+        def prompt(question: str, default: str, **_: object) -> str:
+            wanted, given = next(left)
+            assert wanted in question
+            return given or default
+
+        monkeypatch.setattr("typer.prompt", prompt)
+        ask_places(scene)
+        assert next(left, None) is None
+    said = " ".join(capsys.readouterr().out.split())
+    for text in (
+        "distance to A: 'hallo' is no number",
+        "3 cm is very near to B: in metres? Then type 300",
+        "no triangle has the sides",
+        "'up' is no side; type l or r",
+        "0,15 cm looks like metres; type 15",
+        "'perhaps' is neither yes nor no; type y or n",
+        "p001 is in the log",
+    ):
+        assert text in said
+    assert said.count("a begins the place anew") == 1
+    with Session([log]) as session:
+        (saved,) = session.payloads(session.topics(Measurement))
+    assert as_typed(saved).distances == first.distances
+
+
 def test_in_the_terminal_somebody_else_may_measure_meanwhile(
     unmeasured: Unmeasured, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
 ) -> None:

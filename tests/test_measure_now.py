@@ -252,7 +252,7 @@ def test_places_are_measured_in_the_terminal(end: str, still_lab: Lab, tmp_path:
     command = ["measure", "--terminal", "--rig", str(still_lab.rig), "-o", str(log)]
     answers = [
         ("marker", "99\n"), ("not in the rig", f"{one.marker_id}\n"),
-        ("from A", f"{a}\n"), ("from B", f"{b}\n"),
+        ("distance to A", f"{a}\n"), ("distance to B", f"{b}\n"),
         ("left or right", f"{one.side}\n"), ("height", f"{100 * (one.height_m or 0):.2f}\n"), ("save", "y\n"),
         ("is in the log", "u\n"), ("is withdrawn", end),
     ]  # fmt: skip

@@ -179,6 +179,19 @@ def test_what_was_measured_survives_a_kill(ipsys: Ipsys, still_lab: Lab, tmp_pat
             assert len(inside) > 5
 
 
+def test_a_kill_before_the_first_place_leaves_rig_and_lenses(
+    ipsys: Ipsys, still_lab: Lab, tmp_path: Path
+) -> None:
+    log = tmp_path / "places.mcap"
+    with measuring(still_lab, log) as (program, _):
+        program.kill()
+        program.communicate(timeout=20)
+    assert ipsys("repair", log).code == 0
+    with Session([log]) as session:
+        assert session.count("/rig") == 1
+        assert len(session.calibrations) == 3
+
+
 def test_a_log_that_is_there_is_kept_unless_it_is_forced(
     ipsys: Ipsys, still_lab: Lab, tmp_path: Path
 ) -> None:

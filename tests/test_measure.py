@@ -105,6 +105,7 @@ def test_every_place_of_a_session_is_found_and_paired_as_if_measured_while_recor
     done = ipsys("measure", log, "--csv", sheet(tmp_path / "a.csv", tape, time=times(tape, log)))
     assert done.code == 0, done.err
     assert f"{len(tape)} places measured into {log}" in done.out
+    assert done.err.splitlines()[-1] == f"ipsys replay {log} fits a model to them"
     assert data_section(log).startswith(before)
     assert ipsys("replay", log).code == 0
     mine = pairs_of(log)
@@ -148,9 +149,15 @@ def test_one_place_its_undo_and_what_a_fit_makes_of_both(ipsys: Ipsys, unmeasure
 def test_rows_of_a_marker_in_order_and_by_place(ipsys: Ipsys, unmeasured: Unmeasured, tmp_path: Path) -> None:
     log, tape = unmeasured
     mine = [one for one in tape if one.marker_id == 3]
-    assert ipsys("measure", log, "--csv", sheet(tmp_path / "a.csv", mine)).code == 0
+    done = ipsys("measure", log, "--csv", sheet(tmp_path / "a.csv", mine))
+    assert done.code == 0
     listed = ipsys("measure", log, "--places")
     assert f"p{len(mine):03d}" in listed.out
+    assert (
+        f"it has {len(mine)}; a model needs 10 or more that each camera sees, and gets good with some 40"
+        in done.err
+    )
+    assert f"ipsys replay {log} fits" in done.err
     other = [one for one in tape if one.marker_id == 4][:2]
     with opened_log(log, Request()) as scene:
         numbers = [str(next(n for n, s in enumerate(scene.stops, 1) if s.covers(one))) for one in other]

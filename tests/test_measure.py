@@ -105,7 +105,7 @@ def test_every_place_of_a_session_is_found_and_paired_as_if_measured_while_recor
     done = ipsys("measure", log, "--csv", sheet(tmp_path / "a.csv", tape, time=times(tape, log)))
     assert done.code == 0, done.err
     assert f"{len(tape)} places measured into {log}" in done.out
-    assert done.err.splitlines()[-1] == f"ipsys replay {log} fits a model to them"
+    assert done.err.splitlines()[-1] == f"then: ipsys replay {log}"
     assert data_section(log).startswith(before)
     assert ipsys("replay", log).code == 0
     mine = pairs_of(log)
@@ -153,11 +153,9 @@ def test_rows_of_a_marker_in_order_and_by_place(ipsys: Ipsys, unmeasured: Unmeas
     assert done.code == 0
     listed = ipsys("measure", log, "--places")
     assert f"p{len(mine):03d}" in listed.out
-    assert (
-        f"it has {len(mine)}; a model needs 10 or more that each camera sees, and gets good with some 40"
-        in done.err
-    )
-    assert f"ipsys replay {log} fits" in done.err
+    needed = "a model needs 10 or more that each camera sees, and gets good with some 40"
+    assert f"places in it: {len(mine)}; {needed}" in done.err
+    assert f"then: ipsys replay {log}" in done.err
     other = [one for one in tape if one.marker_id == 4][:2]
     with opened_log(log, Request()) as scene:
         numbers = [str(next(n for n, s in enumerate(scene.stops, 1) if s.covers(one))) for one in other]

@@ -200,14 +200,11 @@ def _show_next(log: Path, history: Sequence[Measurement]) -> None:
         return
     if count < _GOOD:
         remarks.print(
-            f"it has {count}; a model needs {min_pairs(_MODEL)} or more that each camera sees, and gets good "
-            f"with some {_GOOD}",
+            f"places in it: {count}; a model needs {min_pairs(_MODEL)} or more that each camera sees, and "
+            f"gets good with some {_GOOD}",
             markup=False,
         )
-    if count >= min_pairs(_MODEL):
-        remarks.print(f"ipsys replay {log} fits a model to them", markup=False)
-    else:
-        remarks.print(f"then ipsys replay {log} fits one", markup=False)
+    remarks.print(f"then: ipsys replay {log}", markup=False)
 
 
 def _show_places(scene: FinishedLog, as_json: bool) -> None:

@@ -72,8 +72,9 @@ def ask_numbers(rig: Rig, marker: str, before: Typed | None) -> Typed:
     given = [name for name, text in distances.items() if text]
     side = ""
     if needs_side(rig, given):
-        question = f"from {given[0]} to {given[1]}, it lies left or right? [l/r]"
-        side = _ask_side(question, before.side if before else "")
+        usual = before.side if before else ""
+        question = f"from {given[0]} to {given[1]}, it lies left or right?{'' if usual else ' [l/r]'}"
+        side = _ask_side(question, usual)
     usual = before.height if before else ""
     height = _ask("height, cm", "height", usual, lambda text: read_typed(Typed("", {}, height=text), rig))
     return Typed(marker, distances, side, height)

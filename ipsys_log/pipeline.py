@@ -259,6 +259,7 @@ def measure(
     with recording(target, overwrite) as log, threadpool_limits(1, user_api="blas"):
         for message in settings:
             log.put(message)
+        log.flush()  # it may be long until the first place
         with Recent(log) as recent, Backlog(cameras, recent, cameras.now_ns) as frames:
             for message in run(run(chain(settings, frames), [detect], in_threads), [camera_frame]):
                 if message is not TICK:

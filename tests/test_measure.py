@@ -105,6 +105,7 @@ def test_every_place_of_a_session_is_found_and_paired_as_if_measured_while_recor
     done = ipsys("measure", log, "--csv", sheet(tmp_path / "a.csv", tape, time=times(tape, log)))
     assert done.code == 0, done.err
     assert f"{len(tape)} places measured into {log}" in done.out
+    assert done.err.splitlines()[-1] == f"then: ipsys replay {log}"
     assert data_section(log).startswith(before)
     assert ipsys("replay", log).code == 0
     mine = pairs_of(log)
@@ -148,9 +149,13 @@ def test_one_place_its_undo_and_what_a_fit_makes_of_both(ipsys: Ipsys, unmeasure
 def test_rows_of_a_marker_in_order_and_by_place(ipsys: Ipsys, unmeasured: Unmeasured, tmp_path: Path) -> None:
     log, tape = unmeasured
     mine = [one for one in tape if one.marker_id == 3]
-    assert ipsys("measure", log, "--csv", sheet(tmp_path / "a.csv", mine)).code == 0
+    done = ipsys("measure", log, "--csv", sheet(tmp_path / "a.csv", mine))
+    assert done.code == 0
     listed = ipsys("measure", log, "--places")
     assert f"p{len(mine):03d}" in listed.out
+    needed = "a model needs 10 or more that each camera sees, and gets good with some 40"
+    assert f"places in it: {len(mine)}; {needed}" in done.err
+    assert f"then: ipsys replay {log}" in done.err
     other = [one for one in tape if one.marker_id == 4][:2]
     with opened_log(log, Request()) as scene:
         numbers = [str(next(n for n, s in enumerate(scene.stops, 1) if s.covers(one))) for one in other]
@@ -318,7 +323,7 @@ def test_the_terminal_asks_checks_and_undoes(
     monkeypatch.setattr("sys.stdin", io.StringIO("\n".join(answers) + "\n"))
     done = ipsys("measure", log, "--terminal")
     assert done.code == 0, done.err
-    assert "d to B: 1.234 cm looks like metres" in done.out
+    assert "distance to B: 1.234 cm looks like metres" in done.out
     assert "p001 is in the log" in done.out
     assert "p001 is withdrawn" in done.out
     assert "1 place measured" in done.out
@@ -326,6 +331,51 @@ def test_the_terminal_asks_checks_and_undoes(
     # Undone while place 2 was asked for, and back at place 1.
     places = re.findall(r"Place (\d+) of", done.out)
     assert places == ["1", "2", "1"]
+
+
+def test_a_bad_answer_in_the_terminal_costs_that_answer_only(
+    unmeasured: Unmeasured, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+) -> None:
+    log, tape = unmeasured
+    with opened_log(log, Request()) as scene:
+        first = as_typed(next(one for one in tape if scene.stops[0].covers(one)))
+        a, b = first.distances.values()
+        script = [
+            ("distance to A", "hallo"), ("distance to A", f"{a} cm"),
+            ("distance to B", "1.234"), ("distance to B", "3"),  # metres, perhaps: asked once more
+            ("distance to B", ""),
+            ("distance to A", ""), ("distance to B", b),  # no triangle: what was good is kept by Enter
+            ("left or right", "up"), ("left or right", {"left": "links", "right": "Rechts"}[first.side]),
+            ("height", "0,15"), ("height", "x"), ("height", first.height),
+            ("save p001", "perhaps"), ("save p001", "n"),
+            ("distance to A", ""), ("distance to B", ""), ("left or right", ""), ("height", ""),
+            ("save p001", "y"), ("distance to A", "q"),
+        ]  # fmt: skip
+        left = iter(script)
+
+        def prompt(question: str, default: str, **_: object) -> str:
+            wanted, given = next(left)
+            assert wanted in question
+            return given or default
+
+        monkeypatch.setattr("typer.prompt", prompt)
+        ask_places(scene)
+        assert next(left, None) is None
+    said = " ".join(capsys.readouterr().out.split())
+    for text in (
+        "distance to A: 'hallo' is no number",
+        "3 cm is very near to B: in metres? Then type 300",
+        "no triangle has the sides",
+        "'up' is no side; type l or r",
+        "0,15 cm looks like metres; type 15",
+        "'perhaps' is neither yes nor no; type y or n",
+        "p001 is in the log",
+    ):
+        assert text in said
+    assert said.count("a begins the place anew") == 1
+    with Session([log]) as session:
+        (saved,) = session.payloads(session.topics(Measurement))
+    assert as_typed(saved).distances == first.distances
 
 
 def test_in_the_terminal_somebody_else_may_measure_meanwhile(

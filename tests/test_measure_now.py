@@ -24,7 +24,7 @@ from ipsys_log.log.session import Session
 from ipsys_log.messages import CompressedImage, Measurement, Message
 from ipsys_log.runs.output import write_log
 from ipsys_log.units import NS_PER_S
-from tests.conftest import Ipsys
+from tests.conftest import Ipsys, Unmeasured
 from tests.test_measure import foreign_read
 
 PATIENCE_S = 40.0
@@ -179,6 +179,19 @@ def test_what_was_measured_survives_a_kill(ipsys: Ipsys, still_lab: Lab, tmp_pat
             assert len(inside) > 5
 
 
+def test_a_kill_before_the_first_place_leaves_rig_and_lenses(
+    ipsys: Ipsys, still_lab: Lab, tmp_path: Path
+) -> None:
+    log = tmp_path / "places.mcap"
+    with measuring(still_lab, log) as (program, _):
+        program.kill()
+        program.communicate(timeout=20)
+    assert ipsys("repair", log).code == 0
+    with Session([log]) as session:
+        assert session.count("/rig") == 1
+        assert len(session.calibrations) == 3
+
+
 def test_a_log_that_is_there_is_kept_unless_it_is_forced(
     ipsys: Ipsys, still_lab: Lab, tmp_path: Path
 ) -> None:
@@ -252,7 +265,7 @@ def test_places_are_measured_in_the_terminal(end: str, still_lab: Lab, tmp_path:
     command = ["measure", "--terminal", "--rig", str(still_lab.rig), "-o", str(log)]
     answers = [
         ("marker", "99\n"), ("not in the rig", f"{one.marker_id}\n"),
-        ("from A", f"{a}\n"), ("from B", f"{b}\n"),
+        ("distance to A", f"{a}\n"), ("distance to B", f"{b}\n"),
         ("left or right", f"{one.side}\n"), ("height", f"{100 * (one.height_m or 0):.2f}\n"), ("save", "y\n"),
         ("is in the log", "u\n"), ("is withdrawn", end),
     ]  # fmt: skip
@@ -262,3 +275,18 @@ def test_places_are_measured_in_the_terminal(end: str, still_lab: Lab, tmp_path:
     assert "1 place measured into" in told
     assert [row.withdraws for row in foreign_read(log)] == ["", "p001"]
     assert all(5 < count < 40 for count in counted(log).values())
+
+
+def test_the_faults_of_a_sheet_stand_on_lines_of_their_own_in_a_window(unmeasured: Unmeasured) -> None:
+    sheet = unmeasured.log.with_name("sheet.csv")
+    sheet.write_text("marker,d_A_cm,d_B_cm,side,height_cm\n0,100,40,left,0\n99,170,190,left,0\n")
+    code, told = typed(["measure", str(unmeasured.log), "--csv", str(sheet)], [])
+    assert code == 1
+    lines = told.replace("\r", "").rstrip("\n").split("\n")
+    assert max(map(len, lines)) <= 80
+    starts = [
+        line.split(": ")[0] for line in lines if line.startswith(("  line 2: no", "  line 3: marker 99"))
+    ]
+    assert starts == ["  line 2", "  line 3"]
+    # A fault that is longer than the window goes on below itself.
+    assert any("d_B_cm" in line and line.startswith("  ") for line in lines)

@@ -128,8 +128,8 @@ def _check_enough(camera: str, used: list[Sighting], bad: list[Dropped], looked:
         coverage = measure_coverage(pixels, looked.size_px, np.stack([s.outline for s in used]))
         todo += [line.split(":")[0] for line in advice(coverage)[:1]]
     raise IpsysError(
-        f"camera {camera}: {len(used)} of {looked.count} pictures are of use{why}, and "
-        f"{LEAST_PICTURES} are the least; {'; '.join(todo)}"
+        f"camera {camera}: only {len(used)} of {looked.count} pictures can be used{why}, but a lens needs "
+        f"{LEAST_PICTURES} or more; {'; '.join(todo)}"
     )
 
 

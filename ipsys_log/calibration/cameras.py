@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Callable, Sequence
+from functools import partial
 
 from ipsys_log.calibration.boards import Board
 from ipsys_log.calibration.calibrate import Calibrated, calibrate
@@ -43,6 +44,7 @@ def calibrate_cameras(
             looked = look(
                 pictures.read(), board, pictures.total, pictures.where,
                 lambda done, of=pictures: progress(of.camera, done, of.looked_at or None),  # type: ignore[misc]
+                partial(progress, "other boards"),
             )  # fmt: skip
         except NotSeenError as error:
             unseen.append(error)

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterator, Sequence
+from collections.abc import Callable, Iterator, Sequence
 from dataclasses import replace
 
 import numpy as np
@@ -20,8 +20,15 @@ _DICTIONARIES = (
 )  # fmt: skip
 
 
-def hint(pictures: Sequence[Grey], board: Board) -> str:
-    """The end of a sentence that says which other board is seen, or what to look after."""
+def hint(pictures: Sequence[Grey], board: Board, trying: Callable[[int, int], None]) -> str:
+    """The end of a sentence that says which other board is seen, or what to look after.
+
+    Parameters
+    ----------
+    pictures : to look at.
+    board : that is not in them.
+    trying : called with the other boards tried so far, and all of them: it takes a while.
+    """
     if board.marker_scale is not None:
         mirrored = [np.ascontiguousarray(grey[:, ::-1]) for grey in pictures]
         seen = sum(find_board("", grey, board, thorough=False) is not None for grey in mirrored)
@@ -30,7 +37,9 @@ def hint(pictures: Sequence[Grey], board: Board) -> str:
                 f"; but in a mirror it is, in {seen} of {len(pictures)} tried: the pictures are mirrored, as "
                 "webcam programs do; turn that off, and take them again"
             )
-    for other, option in _others(board):
+    others = list(_others(board))
+    for number, (other, option) in enumerate(others):
+        trying(number, len(others))
         seen = sum(find_board("", grey, other, thorough=False) is not None for grey in pictures)
         if seen:
             return f"; but {other} is seen in {seen} of {len(pictures)} tried: give {option}"
@@ -79,6 +88,11 @@ def _others(board: Board) -> Iterator[tuple[Board, str]]:
                 other = replace(change, dictionary=dictionary, inverted=turn)
                 if other != board:
                     yield other, " and ".join(word for word in (said, named, how) if word)
+    # With as many inner corners, or as many squares: a part of the larger one would be seen, too.
+    for less in (0, 1):
+        if min(columns, rows) - less >= 3:
+            plain = replace(board, columns=columns - less, rows=rows - less, marker_scale=None)
+            yield plain, f"--board {plain.columns}x{plain.rows}"
 
 
 def _inversion(board: Board) -> str:

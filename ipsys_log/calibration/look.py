@@ -47,6 +47,7 @@ def look(
     total: int,
     where: str,
     progress: Callable[[int], None] = lambda done: None,
+    trying: Callable[[int, int], None] = lambda done, total: None,
 ) -> Looked:
     """Look for the board in all pictures.
 
@@ -57,6 +58,7 @@ def look(
     total : how many there are about; 0 where that is not known.
     where : they come from, for messages.
     progress : called with the pictures done.
+    trying : called with the other boards looked for, and all of them, where this one is not seen.
 
     Raises
     ------
@@ -90,7 +92,7 @@ def look(
         raise IpsysError(f"{where}: none of {count} pictures can be read")
     usual, strange = _usual_size(sizes, where)
     if not sightings:
-        found = hint(some, board)
+        found = hint(some, board, trying)
         raise NotSeenError(f"{where}: {board} is not seen in any of {count} pictures{found}")
     check_whole(shown, board, where)
     seen = tuple(sighting for size, sighting in sightings if size == usual)

@@ -37,6 +37,14 @@ def _complain(text: str) -> int:
     line = f"ipsys: {text}"
     if sys.stderr.isatty():  # a file or a pipe gets one line
         width = shutil.get_terminal_size().columns
-        line = textwrap.fill(line, width, break_long_words=False, break_on_hyphens=False)
+        line = "\n".join(_wrapped(one, width) for one in line.splitlines())
     print(line, file=sys.stderr)  # noqa: T201
     return 1
+
+
+def _wrapped(line: str, width: int) -> str:
+    """A line broken between words, what follows as far in as it began."""
+    indent = line[: len(line) - len(line.lstrip())]
+    return textwrap.fill(
+        line, width, subsequent_indent=indent, break_long_words=False, break_on_hyphens=False
+    )

@@ -2,28 +2,19 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable
-from functools import partial
+from contextlib import suppress
 from typing import TYPE_CHECKING
 
-import typer
-
 from ipsys_log.cli.console import console
+from ipsys_log.cli.questions import HELP, LetterError, agreed, answer, ask_marker, ask_numbers
 
 if TYPE_CHECKING:
     from ipsys_log.measuring.check import Checked
     from ipsys_log.measuring.entry import Typed
     from ipsys_log.measuring.scene import Scene
-    from ipsys_log.messages import Measurement, Rig
+    from ipsys_log.messages import Measurement
 
 __all__ = ["ask_places"]
-
-_HELP = "centimetres, such as 123.4; a begins the place anew, s skips it, u undoes the last one, q ends"
-_LETTERS = ("a", "s", "u", "q")
-
-
-class _LetterError(Exception):
-    """A letter was typed instead of a number."""
 
 
 def ask_places(scene: Scene) -> None:
@@ -32,7 +23,9 @@ def ask_places(scene: Scene) -> None:
     from ipsys_log.offline.pairs import active_measurements
 
     check_references(scene.rig)
-    console.print(_HELP, style="dim", markup=False)
+    with suppress(ImportError):  # arrow keys, where there is one
+        import readline  # noqa: F401
+    console.print(HELP, style="dim", markup=False)
     active = active_measurements(scene.history())
     left: list[int | None] = [n for n, stop in enumerate(scene.stops) if not any(map(stop.covers, active))]
     if not scene.stops:
@@ -50,37 +43,40 @@ def ask_places(scene: Scene) -> None:
 
 def _ask_place(scene: Scene, stop: int | None) -> str | Measurement:
     """Ask until a place is measured or skipped: ``s``, ``q`` to end, or what was undone."""
+    typed: Typed | None = None
     while True:
         try:
-            if _measure(scene, stop):
+            typed = _measure(scene, stop, typed)
+            if typed is None:
                 return "s"
-        except _LetterError as left:
+        except LetterError as left:
             letter = str(left)
             if letter in ("q", "s"):
                 return letter
-            if letter == "u":
+            if letter == "a":
+                typed = None
+            else:
                 undone = _undo(scene)
                 if undone is not None:
                     return undone
 
 
-def _measure(scene: Scene, stop: int | None) -> bool:
-    """Ask for one place and append it; False where it is to be asked for again."""
+def _measure(scene: Scene, stop: int | None, before: Typed | None) -> Typed | None:
+    """Ask for one place and append it; what was typed where it is to be asked for again."""
     from ipsys_log.errors import IpsysError
 
-    typed = _ask(scene, stop)
+    typed = _ask(scene, stop, before)
     while True:
         checked = _check(scene, stop, typed)
         _show(checked)
         if checked.faults and stop is None and {fault.field for fault in checked.faults} == {"marker"}:
-            _text("Enter looks again", lambda given: not given)
+            answer("Enter looks again")
             continue
         if checked.measurement is None:
-            return False
-        question, usual = (" all the same? [y/N]", "n") if checked.warnings else ("? [Y/n]", "y")
-        answer = _text(f"save {checked.id}{question}", lambda given: given.lower() in ("", "y", "n"))
-        if (answer.lower() or usual) == "n":
-            return False
+            return typed
+        doubtful = bool(checked.warnings)
+        if not agreed(f"save {checked.id}{' all the same' if doubtful else ''}?", not doubtful):
+            return typed
         # While somebody read the question, the marker lay there, or was taken up.
         now = _check(scene, stop, typed)
         if now.measurement is None:
@@ -91,7 +87,7 @@ def _measure(scene: Scene, stop: int | None) -> bool:
             console.print(str(error), style="red", markup=False)
             continue
         console.print(f"{now.id} is in the log", style="green", markup=False)
-        return True
+        return None
 
 
 def _check(scene: Scene, stop: int | None, typed: Typed) -> Checked:
@@ -104,87 +100,22 @@ def _check(scene: Scene, stop: int | None, typed: Typed) -> Checked:
     return check_entry(entry, faults, scene.rig, sight, scene.history(), scene.model)
 
 
-def _ask(scene: Scene, stop: int | None) -> Typed:
-    from ipsys_log.measuring.entry import Typed, needs_side
+def _ask(scene: Scene, stop: int | None, before: Typed | None) -> Typed:
     from ipsys_log.measuring.scene import look, visible_markers
 
     console.print()
     if stop is None:
         visible = visible_markers(scene.views(None), scene.rig)
         console.print(f"markers seen: {', '.join(map(str, visible)) or 'none'}", markup=False)
-        marker = _marker(scene.rig, str(visible[0]) if len(visible) == 1 else "")
+        usual = before.marker if before else str(visible[0]) if len(visible) == 1 else ""
+        marker = ask_marker(scene.rig, usual)
     else:
         here = scene.stops[stop]
         marker = str(here.marker_id)
         console.print(f"Place {stop + 1} of {len(scene.stops)}", style="bold")
     sight = look(scene.views(stop), int(marker))
     console.print(sight.text, style="green" if sight.state == "still" else "yellow", markup=False)
-    names = [point.name for point in scene.rig.reference_points]
-    # Of more than two reference points any two will do.
-    may_lack = len(names) > 2
-    distances: dict[str, str] = {}
-    for name in names:
-        question = f"from {name}, cm"
-        distances[name] = _number(question, f"d_{name}", may_lack, scene.rig, partial(_of_tape, name))
-    given = [name for name in names if distances[name]]
-    side = ""
-    if needs_side(scene.rig, given):
-        question = f"from {given[0]} to {given[1]}, it lies left or right? [l/r]"
-        letter = _text(question, lambda answer: answer[:1].lower() in ("l", "r") and answer != "")
-        side = "left" if letter[0].lower() == "l" else "right"
-    return Typed(marker, distances, side, _number("height, cm", "height", False, scene.rig, _of_ruler))
-
-
-def _marker(rig: Rig, usual: str) -> str:
-    """Ask for a marker until it is one of the rig."""
-    from ipsys_log.measuring.entry import Typed, read_typed
-
-    while True:
-        answer = _text("marker", str.isdecimal, usual)
-        faults = [fault for fault in read_typed(Typed(answer, {}), rig)[1] if fault.field == "marker"]
-        if not faults:
-            return answer
-        console.print(faults[0].text, style="red", markup=False)
-
-
-def _of_tape(name: str, text: str) -> Typed:
-    from ipsys_log.measuring.entry import Typed
-
-    return Typed("", {name: text})
-
-
-def _of_ruler(text: str) -> Typed:
-    from ipsys_log.measuring.entry import Typed
-
-    return Typed("", {}, height=text)
-
-
-def _number(question: str, field: str, may_lack: bool, rig: Rig, typed: Callable[[str], Typed]) -> str:
-    """Ask for a number until it can be one of a field."""
-    from ipsys_log.measuring.entry import read_typed
-
-    def fits(answer: str) -> bool:
-        return (not answer and may_lack) or answer.replace(",", ".").replace(".", "", 1).isdecimal()
-
-    while True:
-        answer = _text(question, fits)
-        faults = [fault.text for fault in read_typed(typed(answer), rig)[1] if fault.field == field]
-        if not answer or not faults:
-            return answer
-        console.print(faults[0], style="red", markup=False)
-
-
-def _text(question: str, fits: Callable[[str], bool], default: str = "") -> str:
-    while True:
-        try:
-            answer = str(typer.prompt(question, default=default, show_default=bool(default))).strip()
-        except (typer.Abort, EOFError):
-            raise _LetterError("q") from None
-        if fits(answer):
-            return answer
-        if answer.lower() in _LETTERS:
-            raise _LetterError(answer.lower())
-        console.print(_HELP, style="yellow", markup=False)
+    return ask_numbers(scene.rig, marker, before)
 
 
 def _show(checked: Checked) -> None:
@@ -195,7 +126,7 @@ def _show(checked: Checked) -> None:
     if checked.point_m is not None:
         x_m, y_m, z_m = checked.point_m.tolist()
         known = "" if checked.sigma_m is None else f" +- {checked.sigma_m * CM_PER_M:.1f} cm"
-        where = "" if checked.on_floor is None else ", on the floor" if checked.on_floor else ""
+        where = "" if checked.on_floor is None else ", within the floor's edges" if checked.on_floor else ""
         console.print(
             f"x {x_m:.3f} m, y {y_m:.3f} m{known}, {z_m * CM_PER_M:.1f} cm high{where}", markup=False
         )

@@ -53,6 +53,9 @@ Places = Annotated[
     bool, typer.Option("--places", help="Only list where markers lie still, as a sheet numbers them.")
 ]
 
+# That which a replay fits, and how many places it is good with.
+_MODEL, _GOOD = "poly", 40
+
 
 def add_commands(app: typer.Typer) -> None:
     app.command()(measure)
@@ -103,6 +106,7 @@ def measure(
 
     measured = measure_now(output, rig, camera, calibration, corners, model_from, force, terminal, host, port)
     _show_count(output, measured, as_json)
+    _show_next(output, measured)
 
 
 def _refuse(where: str, **options: object) -> None:
@@ -152,6 +156,7 @@ def _measure_log(
         else:
             serve_page(scene, host, port)
         _show_count(log, scene.history()[before:], as_json)
+        _show_next(log, scene.history())
     if rig is not None:
         remarks.print(
             f"give --rig {rig} to ipsys replay, too: it measured with these reference points", markup=False
@@ -181,6 +186,23 @@ def _show_count(log: Path, added: Sequence[Measurement], as_json: bool) -> None:
         return
     also = f", {withdrawn} withdrawn" if withdrawn else ""
     console.print(f"{count} place{'' if count == 1 else 's'} measured into {log}{also}", markup=False)
+
+
+def _show_next(log: Path, history: Sequence[Measurement]) -> None:
+    """What to do with the places that a log has now."""
+    from ipsys_log.models import min_pairs
+    from ipsys_log.offline.pairs import active_measurements
+
+    count = len(active_measurements(history))
+    if not count:
+        return
+    if count < _GOOD:
+        remarks.print(
+            f"places in it: {count}; a model needs {min_pairs(_MODEL)} or more that each camera sees, and "
+            f"gets good with some {_GOOD}",
+            markup=False,
+        )
+    remarks.print(f"then: ipsys replay {log}", markup=False)
 
 
 def _show_places(scene: FinishedLog, as_json: bool) -> None:

@@ -95,6 +95,10 @@ def check_entry(
     warnings = list(entry.doubts)
     read = _measurement(entry, name, sight)
     given = {fault.field for fault in found}
+    apart = _apart(read, rig)
+    if apart is not None:
+        # That one of them may be in metres is then why.
+        return Checked(name, (*found, Fault("", "; ".join([apart, *entry.doubts]))))
     missing = {"side", "height", ""} & given or {f for f in given if f.startswith("d_")}
     if missing == {"side"} and len(entry.distances) >= 2 and entry.height_m is not None:
         sides_m, fault = _both_sides(read, rig)
@@ -103,15 +107,15 @@ def check_entry(
         return Checked(name, tuple(found), tuple(warnings))
     try:
         # A usual tape tells how flatly the circles cross; what is written down has no sigma of its own.
-        fixed = _located(read, with_tape(rig))
+        fixed = world_point(read, with_tape(rig))
     except IpsysError as error:
-        # That it may be in metres is then why.
         why = "; ".join([_without_id(error, name), *entry.doubts])
         return Checked(name, (*found, Fault("", why)))
     on_floor, remark = doubt_floor(read, fixed, rig)
     warnings += [*remark, *doubt_tapes(read, fixed, rig)]
-    found += _twin_faults(read, history)
-    warnings += _repeat_warnings(read, history) if read.still else []
+    earlier = _here_before(read, sight, history)
+    found += _twin_faults(read, earlier)
+    warnings += _repeat_warnings(read, earlier) if read.still else []
     predictions = predict(model, sight.points_m, fixed.world_m) if model and sight else ()
     warnings += doubt_model(read, fixed, rig, predictions)
     return Checked(
@@ -142,19 +146,20 @@ def _measurement(entry: Entry, name: str, sight: Sight | None) -> Measurement:
     )
 
 
-def _located(read: Measurement, rig: Rig) -> TapePoint:
-    """The world point; where two tapes do not meet, they are named as they were asked for."""
-    if len(read.distances) == 2:
-        first_m, second_m = reference_points(read, rig)
-        base_m = float(np.hypot(*(second_m - first_m)))
-        one, other = read.distances
-        if not abs(one.distance_m - other.distance_m) <= base_m <= one.distance_m + other.distance_m:
-            tapes = " and ".join(f"d to {d.reference} = {d.distance_m * CM_PER_M:g} cm" for d in (one, other))
-            raise IpsysError(
-                f"no triangle has the sides {one.reference} to {other.reference} = "
-                f"{base_m * CM_PER_M:.1f} cm, {tapes}; read both again"
-            )
-    return world_point(read, rig)
+def _apart(read: Measurement, rig: Rig) -> str | None:
+    """Why two tapes do not meet, named as they were asked for: of side and height nothing need be known."""
+    if len(read.distances) != 2:
+        return None
+    first_m, second_m = reference_points(read, rig)
+    base_m = float(np.hypot(*(second_m - first_m)))
+    one, other = read.distances
+    if abs(one.distance_m - other.distance_m) <= base_m <= one.distance_m + other.distance_m:
+        return None
+    tapes = (f"distance to {d.reference} = {d.distance_m * CM_PER_M:g} cm" for d in (one, other))
+    return (
+        f"no triangle has the sides {one.reference} to {other.reference} = {base_m * CM_PER_M:.1f} cm, "
+        f"{' and '.join(tapes)}; read both again"
+    )
 
 
 def _without_id(error: IpsysError, name: str) -> str:
@@ -170,20 +175,27 @@ def _identity_faults(entry: Entry, sight: Sight | None, history: Sequence[Measur
     return found
 
 
-def _twin_faults(read: Measurement, history: Sequence[Measurement]) -> list[Fault]:
+def _here_before(read: Measurement, sight: Sight | None, history: Sequence[Measurement]) -> list[Measurement]:
+    """What counts of this marker at this place: in the same stretch, or where cameras see it still."""
+    seen = sight.measured_as if sight else ()
+    own = [m for m in active_measurements(history) if m.marker_id == read.marker_id]
+    return [m for m in own if _overlap(m, read) or m.id in seen]
+
+
+def _twin_faults(read: Measurement, earlier: Sequence[Measurement]) -> list[Fault]:
     """The same place typed twice, to the last digit."""
-    for other in active_measurements(history):
-        same = (other.marker_id, other.side, other.height_m) == (read.marker_id, read.side, read.height_m)
-        if same and _overlap(other, read) and _tapes(other) == _tapes(read):
+    for other in earlier:
+        same = (other.side, other.height_m) == (read.side, read.height_m)
+        if same and _tapes(other) == _tapes(read):
             return [Fault("", f"this is {other.id} once more, with the very same numbers")]
     return []
 
 
-def _repeat_warnings(read: Measurement, history: Sequence[Measurement]) -> list[str]:
-    names = [
-        m.id for m in active_measurements(history) if m.marker_id == read.marker_id and _overlap(m, read)
-    ]
-    return [f"marker {read.marker_id} is measured here already, as {', '.join(names)}"] if names else []
+def _repeat_warnings(read: Measurement, earlier: Sequence[Measurement]) -> list[str]:
+    if not earlier:
+        return []
+    names = ", ".join(m.id for m in earlier)
+    return [f"marker {read.marker_id} is measured here already, as {names}; if this is better, undo that one"]
 
 
 def _tapes(measurement: Measurement) -> list[tuple[str, float]]:
@@ -199,7 +211,7 @@ def _overlap(one: Measurement, other: Measurement) -> bool:
 def _both_sides(read: Measurement, rig: Rig) -> tuple[tuple[tuple[str, Array], ...], list[Fault]]:
     """Where it would be on either side; or why the tapes do not meet."""
     try:
-        places = tuple((side, _located(replace(read, side=side), rig).world_m) for side in SIDES)
+        places = tuple((side, world_point(replace(read, side=side), rig).world_m) for side in SIDES)
     except IpsysError as error:
         return (), [Fault("", _without_id(error, read.id))]
     return places, []

@@ -97,7 +97,7 @@ def read_typed(typed: Typed, rig: Rig) -> tuple[Entry, list[Fault]]:
     >>> entry.distances[0].distance_m, entry.height_m
     (1.505, 0.1)
     >>> faults[0].text
-    'd to B: 1.234 cm looks like metres; type 123.4'
+    'distance to B: 1.234 cm looks like metres; type 123.4'
     """
     faults: list[Fault] = []
     doubts: list[str] = []
@@ -127,7 +127,7 @@ def _line(rig: Rig, distances: tuple[Distance, ...]) -> str:
 def _marker(text: str, rig: Rig, faults: list[Fault]) -> int | None:
     text = text.strip()
     if not re.fullmatch(r"\d{1,6}", text):
-        what = f"marker {text!r}: give the id, a whole number" if text else "which marker?"
+        what = f"{text!r} is no marker id; type a whole number" if text else "which marker?"
         faults.append(Fault("marker", what))
         return None
     if not rig.knows(int(text)):
@@ -141,9 +141,9 @@ def _distances(typed: Typed, rig: Rig, faults: list[Fault], doubts: list[str]) -
     given = {name: text.strip() for name, text in typed.distances.items() if text.strip()}
     count = len(rig.reference_points)
     for point in rig.reference_points:
-        text = given.pop(point.name, "")
+        text = _bare(given.pop(point.name, ""))
         if text:
-            value_cm = _number(text, f"d to {point.name}", f"d_{point.name}", faults)
+            value_cm = _number(text, f"distance to {point.name}", f"d_{point.name}", faults)
             fault = None if value_cm is None else _distance_fault(text, value_cm, point, rig)
             if fault is not None:
                 faults.append(fault)
@@ -154,7 +154,7 @@ def _distances(typed: Typed, rig: Rig, faults: list[Fault], doubts: list[str]) -
                     )
                 yield Distance(point.name, value_cm / CM_PER_M)
         elif count == 2:  # of more, any two will do
-            faults.append(Fault(f"d_{point.name}", f"d to {point.name}?"))
+            faults.append(Fault(f"d_{point.name}", f"distance to {point.name}?"))
     for name in given:
         faults.append(Fault(f"d_{name}", f"{name} is no reference point of the rig"))
     if count > 2 and sum(bool(text.strip()) for text in typed.distances.values()) < 2:
@@ -173,7 +173,7 @@ def _distance_fault(text: str, value_cm: float, point: ReferencePoint, rig: Rig)
         why = f"{text} cm is further than the floor reaches{in_mm}"
     else:
         return None
-    return Fault(f"d_{point.name}", f"d to {point.name}: {why}")
+    return Fault(f"d_{point.name}", f"distance to {point.name}: {why}")
 
 
 def _reach_m(rig: Rig, x_m: float, y_m: float) -> float:
@@ -185,7 +185,7 @@ def _reach_m(rig: Rig, x_m: float, y_m: float) -> float:
 
 
 def _height(text: str, faults: list[Fault], doubts: list[str]) -> float | None:
-    text = text.strip()
+    text = _bare(text)
     if not text:
         faults.append(Fault("height", "height? 0 where the marker lies on the floor"))
         return None
@@ -198,9 +198,16 @@ def _height(text: str, faults: list[Fault], doubts: list[str]) -> float | None:
     if 0 < value_cm < _LOWEST_CM and len(text.replace(",", ".").partition(".")[2]) > 1:
         faults.append(Fault("height", f"height: {text} cm looks like metres; type {_times(value_cm)}"))
         return None
+    if 0 < value_cm < _LOWEST_CM:
+        doubts.append(f"a height of {text} cm: in metres? Then type {_times(value_cm)}")
     if value_cm > CM_PER_M:
         doubts.append(f"{text} cm is high for a marker: is it in mm?")
     return value_cm / CM_PER_M
+
+
+def _bare(text: str) -> str:
+    """A number without the unit that it is asked for in."""
+    return re.sub(r"\s*cm$", "", text.strip(), flags=re.IGNORECASE)
 
 
 def _times(value_cm: float) -> str:

@@ -9,7 +9,7 @@ from typing import Protocol
 import numpy as np
 from numpy.typing import NDArray
 
-from ipsys_log.measuring.stillness import FEWEST, lies_still
+from ipsys_log.measuring.stillness import FEWEST, lies_at, lies_still
 from ipsys_log.messages import CameraPoints, Interval, Markers, Measurement, Model, Rig
 
 __all__ = ["Scene", "Sight", "Stop", "View", "look", "visible_markers"]
@@ -23,7 +23,8 @@ class View:
 
     ``jpeg`` is the picture taken at ``time_ns``, None where there is none, and ``markers`` those found in
     it. ``points`` are the camera points of the last second, that picture's last; of a finished log those
-    of the whole stretch in which the marker lies still.
+    of the whole stretch in which the marker lies still. ``measured`` are the places measured so far while
+    the camera sent: id, marker and mean camera point (3,); of a finished log none, its stretches tell.
     """
 
     camera: str
@@ -31,6 +32,7 @@ class View:
     jpeg: bytes | None = None
     markers: Markers | None = None
     points: tuple[CameraPoints, ...] = ()
+    measured: tuple[tuple[str, int, Array], ...] = ()
 
 
 @dataclass(frozen=True, slots=True)
@@ -83,13 +85,15 @@ class Sight:
     """What the cameras say of one marker.
 
     ``still`` is the stretch in which it lies still, None where it moves or is not seen; ``points_m`` its
-    mean camera point (3,) by camera then; ``moving`` are the cameras that see it move.
+    mean camera point (3,) by camera then; ``moving`` are the cameras that see it move;
+    ``measured_as`` are the measurements since which every camera sees it where it was.
     """
 
     marker_id: int
     still: Interval | None
     points_m: Mapping[str, Array]
     moving: tuple[str, ...] = ()
+    measured_as: tuple[str, ...] = ()
 
     @property
     def state(self) -> str:
@@ -109,7 +113,7 @@ class Sight:
         return f"{name} lies still, seen by {', '.join(self.points_m)}"
 
 
-def look(views: Iterable[View], marker_id: int) -> Sight:
+def look(views: Sequence[View], marker_id: int) -> Sight:
     """What the cameras say of a marker: whether it lies still, and where.
 
     Examples
@@ -138,7 +142,19 @@ def look(views: Iterable[View], marker_id: int) -> Sight:
         if last_ns >= start_ns:
             start_ns = min(start_ns, first_ns)
     points_m = {camera: mean_m for camera, (_, last_ns, mean_m) in seen.items() if last_ns >= start_ns}
-    return Sight(marker_id, Interval(start_ns, end_ns), points_m)
+    measured_as = _measured_as(views, marker_id, points_m)
+    return Sight(marker_id, Interval(start_ns, end_ns), points_m, measured_as=measured_as)
+
+
+def _measured_as(views: Iterable[View], marker_id: int, points_m: Mapping[str, Array]) -> tuple[str, ...]:
+    """The measurements of a marker made where it is now, for all cameras that can tell."""
+    same: dict[str, bool] = {}
+    for view in views:
+        here_m = points_m.get(view.camera)
+        for name, measured_id, there_m in view.measured:
+            if measured_id == marker_id and here_m is not None:
+                same[name] = same.get(name, True) and bool(lies_at(here_m[None], there_m)[0])
+    return tuple(name for name, is_same in same.items() if is_same)
 
 
 def visible_markers(views: Iterable[View], rig: Rig) -> list[int]:

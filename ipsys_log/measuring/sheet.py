@@ -118,7 +118,7 @@ def name_columns(text: str, rig: Rig) -> str:
     """
     one = "|".join(re.escape(point.name) for point in rig.reference_points)
     text = re.sub(rf"\bthe distances to ({one}) and ({one})\b", r"d_\1_cm and d_\2_cm", text)
-    text = re.sub(rf"\b(?:the distance|d) to ({one})\b", r"d_\1_cm", text)
+    text = re.sub(rf"\b(?:the )?distance to ({one})\b", r"d_\1_cm", text)
     return re.sub(r"\bheight(?=:|\?| reads)", "height_cm", text)
 
 

@@ -11,7 +11,7 @@ from numpy.typing import NDArray
 from ipsys_log.offline.pairs import Sightings
 from ipsys_log.units import NS_PER_S
 
-__all__ = ["FEWEST", "lies_still", "still_stretches"]
+__all__ = ["FEWEST", "lies_at", "lies_still", "still_stretches"]
 
 Array = NDArray[np.float64]
 
@@ -42,7 +42,7 @@ def lies_still(points_m: Array) -> bool:
     """
     if len(points_m) < FEWEST:
         return False
-    near = _near(points_m, np.median(points_m, axis=0))
+    near = lies_at(points_m, np.median(points_m, axis=0))
     if near.mean() < _SHARE_NEAR:
         return False
     points_m = points_m[near]
@@ -53,7 +53,7 @@ def lies_still(points_m: Array) -> bool:
     return float(np.hypot(*drift_m)) <= _DRIFT_M + _DRIFT_OF_ONE_M / math.sqrt(len(rays))
 
 
-def _near(points_m: Array, place_m: Array) -> NDArray[np.bool_]:
+def lies_at(points_m: Array, place_m: Array) -> NDArray[np.bool_]:
     """Which camera points (n, 3) are, within their noise, at a place (3,)."""
     across_m = (points_m[:, :2] / points_m[:, 2:] - place_m[:2] / place_m[2]) * place_m[2]
     along_m = np.abs(points_m[:, 2] - place_m[2])
@@ -136,7 +136,7 @@ def _camera_stretches(sightings: Sightings) -> Iterator[tuple[int, int]]:
             first += max((stop - first) // 4, 1)
             continue
         # About its middle: at the beginning the hand may still be at it.
-        near = _near(points_m[first:end], np.median(points_m[first:stop], axis=0))
+        near = lies_at(points_m[first:end], np.median(points_m[first:stop], axis=0))
         middle = (stop - first) // 2
         begin = first + int(np.flatnonzero(np.append(True, ~near[:middle]))[-1])
         done = first + middle + int(np.flatnonzero(np.append(~near[middle:], True))[0])

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import math
+import re
 from collections import Counter
 from typing import Any
 
@@ -62,7 +63,9 @@ def _dropped_lines(dropped: tuple[Dropped, ...]) -> list[str]:
     for reason, count in counts.items():
         names = [drop.name for drop in dropped if drop.reason == reason]
         shown = ", ".join(names[:3]) + (f" and {count - 3} more" if count > 3 else "")
-        lines.append(f"left out: {shown}: {reason}")
+        # A reason is told of one picture.
+        why = re.sub("^is ", "are ", reason) if count > 1 else reason
+        lines.append(f"left out: {shown}: {why}")
     more = len(lines) - _SHOWN_DROPPED
     return lines if more <= 1 else [*lines[:_SHOWN_DROPPED], f"left out: and so on, {more} more (see --json)"]
 

@@ -32,6 +32,7 @@ def contents_json(session: Session) -> dict[str, Any]:
     """The contents of one or several logs as plain data; times in s, sizes in bytes."""
     topics = sorted({topic for reader in session.readers for topic in reader.channels})
     start_ns, end_ns = session.start_ns, session.end_ns
+    empty = not any(reader.message_count for reader in session.readers)
     return {
         "files": [
             {
@@ -43,8 +44,8 @@ def contents_json(session: Session) -> dict[str, Any]:
             }
             for reader in session.readers
         ],
-        "start": format_time(start_ns),
-        "end": format_time(end_ns),
+        "start": None if empty else format_time(start_ns),
+        "end": None if empty else format_time(end_ns),
         "duration_s": (end_ns - start_ns) / NS_PER_S,
         "cameras": {
             camera: {
@@ -122,7 +123,7 @@ def contents_tables(found: dict[str, Any]) -> list[Table]:
     files = _table("Files", "path", "size", "messages", "chunks", right=("size", "messages", "chunks"))
     for file in found["files"]:
         files.add_row(file["path"], format_bytes(file["bytes"]), str(file["messages"]), str(file["chunks"]))
-    files.caption = f"{found['start']} UTC, {found['duration_s']:.1f} s"
+    files.caption = f"{found['start']} UTC, {found['duration_s']:.1f} s" if found["start"] else "no messages"
     files.caption_justify = "left"
     tables = [files, *([_cameras_table(found)] if found["cameras"] else []), _channels_table(found)]
     return [*tables, runs_table(found["runs"])] if found["runs"] else tables

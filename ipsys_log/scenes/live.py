@@ -7,7 +7,9 @@ from collections import deque
 from collections.abc import Callable, Mapping, Sequence
 from typing import Any
 
+import numpy as np
 import simplejpeg
+from numpy.typing import NDArray
 
 from ipsys_log.errors import FrameError, IpsysError
 from ipsys_log.measuring.entry import check_references
@@ -67,6 +69,8 @@ class LiveScene:
         self._decoded: dict[str, tuple[int, bytes | None]] = {}
         self._points: dict[str, deque[CameraPoints]] = {camera: deque() for camera in cameras}
         self._history: list[Measurement] = []
+        # Where each camera saw the marker of a measurement: id, marker, mean camera point (3,).
+        self._measured: dict[str, list[tuple[str, int, NDArray[np.float64]]]] = {c: [] for c in cameras}
         self._ended = False
 
     def __call__(self, message: Message | None) -> None:
@@ -115,10 +119,29 @@ class LiveScene:
         for measurement in measurements:
             self._add(MEASUREMENTS_TOPIC, measurement)
             self._history.append(measurement)
+            self._remember(measurement)
 
     def end(self) -> None:
         """Take no more measurements."""
         self._ended = True
+
+    def _remember(self, measurement: Measurement) -> None:
+        """Note where it was measured, to tell whether the marker has moved since."""
+        still = measurement.still
+        if still is None or measurement.marker_id is None:
+            return
+        with self._lock:
+            for camera, seen in self._points.items():
+                points_m = [
+                    (point.x_m, point.y_m, point.z_m)
+                    for one in seen
+                    for point in one.points
+                    if point.id == measurement.marker_id
+                    and still.start <= one.timestamp + (point.time_offset_ns or 0) <= still.end
+                ]
+                if points_m:
+                    place = measurement.id, measurement.marker_id, np.mean(points_m, axis=0)
+                    self._measured[camera].append(place)
 
     def _view(self, camera: str, since_ns: int) -> View:
         if camera not in self._marked or not self._cameras[camera].up:
@@ -126,7 +149,8 @@ class LiveScene:
         image, markers = self._marked[camera]
         # That of a camera which hangs, and is not known to be lost yet, is not the last second.
         points = tuple(one for one in self._points[camera] if one.timestamp >= since_ns)
-        return View(camera, image.publish_time_ns, self._jpeg(camera, image), markers, points)
+        measured = tuple(self._measured[camera])
+        return View(camera, image.publish_time_ns, self._jpeg(camera, image), markers, points, measured)
 
     def _jpeg(self, camera: str, image: Message) -> bytes | None:
         if isinstance(image.payload, CompressedImage):

@@ -39,7 +39,10 @@ function fill(made, camera, view, whole) {
   const [width, height] = camera.size_px ?? [16, 9];
   const close = chosen && !whole;
   svg.setAttribute("class", view.state);
-  svg.setAttribute("aria-label", `Camera ${camera.name} ${sees ? `sees marker ${view.marker}` : "does not see it"}`);
+  // Before one is chosen there is no "it".
+  const ids = view.marker === null ? camera.markers.map((one) => one.id).filter((id) => view.visible.includes(id)) : [];
+  const what = view.marker !== null ? (sees ? "sees it" : "no") : ids.length ? `sees ${ids.join(", ")}` : "sees none";
+  svg.setAttribute("aria-label", `Camera ${camera.name} ${view.marker === null ? what : sees ? `sees marker ${view.marker}` : "does not see it"}`);
   svg.setAttribute("viewBox", close ? closeUp(chosen.corners_px, width, height) : `0 0 ${width} ${height}`);
   svg.setAttribute("preserveAspectRatio", close ? "xMidYMid slice" : "xMidYMid meet");
   svg.style.aspectRatio = whole ? `${width} / ${height}` : "1";
@@ -49,7 +52,7 @@ function fill(made, camera, view, whole) {
   });
   const picture = camera.picture ? [element("image", { href: camera.picture, width, height })] : [];
   svg.replaceChildren(...picture, ...camera.markers.map(outline));
-  name.replaceChildren(camera.name, make("small", {}, sees ? "sees it" : "no"));
+  name.replaceChildren(camera.name, make("small", {}, what));
   name.style.borderColor = camera.colour;
 }
 

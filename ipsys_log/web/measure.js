@@ -62,7 +62,7 @@ function typed() {
 function buildFields() {
   $("fields").replaceChildren(...lab.references.map((reference, n) => {
     const input = make("input", { id: `d-${reference.name}`, inputMode: "decimal", enterKeyHint: "next" });
-    const label = make("label", { htmlFor: input.id }, `From ${reference.name}`);
+    const label = make("label", { htmlFor: input.id }, `Distance to ${reference.name}`);
     const fault = make("p", { className: "fault", id: `fault-d_${reference.name}` });
     input.setAttribute("aria-describedby", fault.id);
     return make("div", { className: "field" }, label, make("span", { className: "cm" }, input, make("i", {}, "cm")), fault);
@@ -104,7 +104,7 @@ async function check() {
 
 function show(answer) {
   const now = typed(), tapes = {};
-  for (const [name, text] of Object.entries(now.distances)) tapes[name] = Number(text.replace(",", ".")) / 100;
+  for (const [name, text] of Object.entries(now.distances)) tapes[name] = parseFloat(text.replace(",", ".")) / 100;
   found = { ...answer, tapes };
   offerSides(answer.faults);
   // What is only missing yet is no fault.
@@ -126,6 +126,9 @@ function show(answer) {
     ...answer.warnings.map((text) => make("p", { className: "warn" }, upper(text))),
   );
   const save = $("save"), doubtful = answer.warnings.length > 0;
+  // The button lies over what it saves: so it says what that is.
+  $("bar").className = answer.ready && !doubtful ? "ready" : "";
+  $("short").textContent = answer.ready && answer.point_m ? short(answer) : "";
   save.disabled = !answer.ready;
   save.className = doubtful ? "warn" : "";
   save.textContent = answer.ready ? `Save ${answer.id}${doubtful ? " all the same" : ""}`
@@ -136,11 +139,16 @@ function show(answer) {
 
 const upper = (text) => text.charAt(0).toUpperCase() + text.slice(1);
 
+function short({ point_m: [x, y, z], sigma_cm }) {
+  const known = sigma_cm === null ? "" : ` ± ${cm(sigma_cm)} cm`;
+  return `x ${x.toFixed(3)}, y ${y.toFixed(3)} m${known}, ${cm(z * 100)} cm high`;
+}
+
 function verdict(answer) {
   if (!answer.point_m) return [];
   const [x, y, z] = answer.point_m;
   const known = answer.sigma_cm === null ? "" : ` ± ${cm(answer.sigma_cm)} cm`;
-  const where = answer.on_floor === null ? "" : answer.on_floor ? ", on the floor" : ", outside of the floor";
+  const where = answer.on_floor === null ? "" : answer.on_floor ? ", within the floor's edges" : ", outside of the floor";
   const parts = [make("p", { className: answer.on_floor === false ? "warn" : "point" },
     make("b", {}, `x ${x.toFixed(3)}, y ${y.toFixed(3)} m`), `${known}, ${cm(z * 100)} cm high${where}`)];
   if (answer.residuals.length)

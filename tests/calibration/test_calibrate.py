@@ -101,5 +101,5 @@ def test_corners_that_are_far_off_are_said_to_be() -> None:
 
 def test_too_few_say_what_to_add() -> None:
     looked = sightings([(-0.05, 0.0, 0.4), (0.05, 0.03, 0.4), (0.0, -0.03, 0.4)], 0.4)
-    with pytest.raises(IpsysError, match=r"3 of 3 pictures are of use.*no board near the left, right"):
+    with pytest.raises(IpsysError, match=r"only 3 of 3 pictures can be used.*no board near the left, right"):
         calibrated(looked)

@@ -205,3 +205,19 @@ def test_of_two_that_show_the_same_the_sharp_one_is_chosen() -> None:
 def test_boards_that_cannot_be(text: str, said: str) -> None:
     with pytest.raises(IpsysError, match=said):
         parse_board(text, 0.03, 0.75, "DICT_4X4_50", False)
+
+
+def test_a_chessboard_that_was_taken_for_a_charuco_board_is_named_while_others_are_tried() -> None:
+    pictures = [(f"{seed}", drawn(CHESSBOARD, seed, 1.0)[0]) for seed in range(3)]
+    tried: list[tuple[int, int]] = []
+    with pytest.raises(IpsysError, match="but a chessboard of 6 x 4 inner corners is seen in 3 of 3 tried"):
+        look(
+            pictures,
+            Board(7, 5, 0.03, 0.75),
+            3,
+            "red",
+            trying=lambda done, total: tried.append((done, total)),
+        )
+    assert tried[0][0] == 0
+    assert len(tried) > 3
+    assert {total for _, total in tried} == {tried[0][1]}

@@ -181,7 +181,8 @@ def test_a_video(ipsys: Ipsys, rendered: Path, tmp_path: Path) -> None:
         ("7x5", "a chessboard of 6 x 4 inner corners is seen in"),
         ("5x3", "it is a part of a chessboard of 6 x 4 inner corners: give --board 6x4"),
         ("9x9", "give the inner corners, one less than the squares"),
-        ("charuco:7x5", "is not seen in any of 6 pictures"),
+        ("charuco:7x5", "but a chessboard of 6 x 4 inner corners is seen in 6 of 6 tried: give --board 6x4"),
+        ("charuco:6x4", "but a chessboard of 6 x 4 inner corners is seen in 6 of 6 tried: give --board 6x4"),
     ],
 )
 def test_another_board_than_said(ipsys: Ipsys, red: Path, tmp_path: Path, board: str, said: str) -> None:
@@ -194,7 +195,7 @@ def test_too_few_pictures(ipsys: Ipsys, red: Path, tmp_path: Path) -> None:
     for path in list(red.iterdir())[4:]:
         path.unlink()
     line = refused(ipsys, tmp_path, red, "--board", "6x4", "-o", tmp_path)
-    assert "4 of 4 pictures are of use, and 6 are the least" in line
+    assert "only 4 of 4 pictures can be used, but a lens needs 6 or more" in line
     assert "take at least 15" in line
 
 
@@ -212,6 +213,9 @@ def test_a_stray_picture_of_another_size_is_left_out_and_named(
     done = calibrate(ipsys, red, "--board", "6x4", "-o", tmp_path)
     assert done.code == 0, done.err
     assert "99.png: is 640 x 480 px, most are 480 x 360" in done.out
+    cv2.imwrite(str(red / "98.png"), np.zeros((480, 640), np.uint8))
+    done = calibrate(ipsys, red, "--board", "6x4", "-o", tmp_path, "--force")
+    assert "98.png, 99.png: are 640 x 480 px, most are 480 x 360" in done.out
 
 
 def test_a_picture_that_cannot_be_read_is_left_out_and_named(ipsys: Ipsys, red: Path, tmp_path: Path) -> None:

@@ -10,6 +10,7 @@ from pathlib import Path
 import pytest
 
 from ipsys_log.cli.setup import SETTINGS
+from ipsys_log.log import LogWriter
 from ipsys_log.rig import check_rig, load_rig
 from ipsys_log.sources.simulator import LabSettings
 from tests.conftest import ROOT, Ipsys
@@ -92,6 +93,16 @@ def test_info_says_what_is_in_a_log(ipsys: Ipsys, lab: Path) -> None:
     assert [run["stage"] for run in found["runs"]] == [
         "detect", "camera-frame", "fit", "evaluate", "locate", "fuse",
     ]  # fmt: skip
+
+
+def test_a_log_without_messages_has_no_date(ipsys: Ipsys, tmp_path: Path) -> None:
+    with LogWriter.create(tmp_path / "none.mcap"):
+        pass
+    shown = ipsys("info", tmp_path / "none.mcap")
+    assert shown.code == 0, shown.err
+    assert "no messages" in shown.out
+    assert "1970" not in shown.out
+    assert json.loads(ipsys("info", tmp_path / "none.mcap", "--json").out)["start"] is None
 
 
 def test_info_fits_80_columns(ipsys: Ipsys, lab: Path, monkeypatch: pytest.MonkeyPatch) -> None:

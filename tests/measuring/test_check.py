@@ -80,11 +80,14 @@ def test_three_distances_need_no_side_and_check_one_another(world_m: tuple[float
 def test_two_tapes_that_cannot_meet() -> None:
     checked = check(Typed("0", {"A": "40", "B": "50"}, "left", "0"))
     assert checked.measurement is None
-    said = "no triangle has the sides A to B = 243.8 cm, d to A = 40 cm and d to B = 50 cm; read both again"
-    assert checked.faults[0].text == said
+    said = "no triangle has the sides A to B = 243.8 cm, distance to A = 40 cm and distance to B = 50 cm"
+    assert checked.faults[0].text == f"{said}; read both again"
     # The side is not what is wrong: said before it is asked for.
     unsided = check(Typed("0", {"A": "40", "B": "50"}, "", "0"))
     assert any("no triangle" in fault.text for fault in unsided.faults)
+    # Nor is the height.
+    alone = check(Typed("0", {"A": "40", "B": "50"}))
+    assert any("no triangle" in fault.text for fault in alone.faults)
 
 
 def test_both_places_while_the_side_is_missing() -> None:
@@ -137,7 +140,8 @@ def test_the_same_place_once_more() -> None:
     again = check(tape((1.0, 4.0, 0.0)), history=[first])
     assert "p001 once more" in again.faults[0].text
     other = check(tape((1.0, 4.01, 0.0)), history=[first])
-    assert other.warnings == ("marker 0 is measured here already, as p001",)
+    assert len(other.warnings) == 1
+    assert other.warnings[0].startswith("marker 0 is measured here already, as p001")
     assert check(tape((1.0, 4.0, 0.0)), history=[first, withdraw([first], "p001")]).warnings == ()
 
 

@@ -20,7 +20,7 @@ def faults(typed: Typed) -> dict[str, str]:
 
 
 def test_centimetres_become_metres_with_point_or_comma() -> None:
-    entry, wrong = read_typed(replace(GOOD, distances={"A": " 170.5", "B": "190,25"}, height="0"), labs.RIG)
+    entry, wrong = read_typed(replace(GOOD, distances={"A": " 170.5", "B": "190,25cm"}, height="0"), labs.RIG)
     assert wrong == []
     assert [(d.reference, d.distance_m) for d in entry.distances] == [("A", 1.705), ("B", 1.9025)]
     assert (entry.marker_id, entry.side, entry.height_m) == (0, "left", 0.0)
@@ -37,7 +37,7 @@ def test_centimetres_become_metres_with_point_or_comma() -> None:
         ("-5", "is no number"),
         ("1e3", "is no number"),
         ("nan", "is no number"),
-        ("170 cm", "is no number"),
+        ("170 m", "is no number"),
         ("1.234,5", "is no number"),
     ],
 )
@@ -49,6 +49,14 @@ def test_a_distance_that_cannot_be_in_centimetres(text: str, said: str | None) -
         assert "in metres? Then type 190" in entry.doubts[0]
     else:
         assert said in faults(typed)["d_A"]
+
+
+@pytest.mark.parametrize("text", ["0,1", "0.5", "0.9 cm"])
+def test_a_height_that_may_be_in_metres_is_asked_for(text: str) -> None:
+    entry, wrong = read_typed(replace(GOOD, height=text), labs.RIG)
+    assert wrong == []
+    assert "in metres? Then type" in entry.doubts[0]
+    assert read_typed(replace(GOOD, height="1"), labs.RIG)[0].doubts == ()
 
 
 @pytest.mark.parametrize(

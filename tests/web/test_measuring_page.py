@@ -7,12 +7,23 @@ from collections.abc import Iterator, Sequence
 from dataclasses import replace
 from pathlib import Path
 
+import numpy as np
 import pytest
 
 from ipsys_log.errors import LogError
 from ipsys_log.log.session import Session
 from ipsys_log.measuring.scene import Stop, View
-from ipsys_log.messages import CameraPoint, CameraPoints, Measurement, Model, ReferencePoint, Rig
+from ipsys_log.messages import (
+    CameraPoint,
+    CameraPoints,
+    Marker,
+    Markers,
+    Measurement,
+    Model,
+    ReferencePoint,
+    Rig,
+    RigMarker,
+)
 from ipsys_log.runs.request import Request
 from ipsys_log.scenes.finished import FinishedLog, opened_log
 from ipsys_log.web.serving import serving
@@ -73,7 +84,7 @@ def test_a_place_is_typed_checked_saved_and_withdrawn(hand: Phone, unmeasured: U
         assert foreign_read(log) == []
         hand.run("document.querySelector('#d-B').value = ''")
         hand.type("#d-B", b)
-        says(hand, "#verdict", "on the floor")
+        says(hand, "#verdict", "within the floor's edges")
         assert hand.run("document.querySelectorAll('#floor .place').length") == 1
         save(hand, "p001")
         says(hand, "#notice", "p001 is in the log")
@@ -214,6 +225,64 @@ def test_while_recording_the_marker_has_to_lie_still(hand: Phone) -> None:
     (saved,) = scene.done
     assert saved.still is not None
     assert (saved.marker_id, saved.side, saved.still.end - saved.still.start) == (0, "left", 8)
+
+
+# Of an element: whether a finger would hit it where it is now, without scrolling.
+SEEN = """(e => {{ const b = e.getBoundingClientRect();
+  const within = b.top >= 0 && b.bottom <= innerHeight;
+  return within && e.contains(document.elementFromPoint(b.x + b.width / 2, b.y + b.height / 2));
+}})(document.querySelector('{}'))"""
+
+
+def test_what_is_saved_stands_above_the_button_that_saves_it(hand: Phone) -> None:
+    scene = Recording()
+    with serving(scene, port=0) as page:
+        hand.open(page.url)
+        says(hand, "#sight", "Marker 0 lies still")
+        hand.type("#d-A", "152 cm")
+        hand.type("#d-B", "40")
+        # Of side and height nothing need be known.
+        says(hand, "#verdict", "No triangle has the sides")
+        hand.run("document.querySelector('#d-B').value = ''")
+        hand.type("#d-B", "190")
+        hand.wait("document.querySelectorAll('#floor .tape').length === 2")
+        hand.tap("#sides label")
+        hand.type("#height", "0.1")
+        says(hand, "#verdict", "in metres? Then type 10")
+        hand.type("#height", "5")
+        says(hand, "#fault-height", "looks like metres")
+        hand.run("document.querySelector('#height').value = ''")
+        hand.type("#height", "10")
+        hand.wait("document.querySelector('#save:enabled')")
+        for top in (0, 250, 10_000):
+            hand.run(f"scrollTo(0, {top})")
+            assert hand.run(SEEN.format("#save"))
+            assert hand.run(SEEN.format("#short"))
+        said = hand.text("#short")
+        assert "10.0 cm high" in said
+        assert said.split(" ± ")[0] in hand.text("#verdict")
+        assert hand.run("document.querySelector('#short').getClientRects().length") == 1
+        assert hand.run("document.querySelector('#short').offsetHeight") < 30  # one line
+
+
+def test_before_a_marker_is_chosen_each_camera_says_which_it_sees(hand: Phone) -> None:
+    scene = Recording()
+    scene.rig = replace(labs.RIG, markers=(RigMarker(0), RigMarker(3)))
+    square = np.array([[0, 0], [60, 0], [60, 60], [0, 60.0]])
+    found = Markers(1, (Marker(0, square + 200), Marker(3, square + 400)), 960, 540)
+    points = tuple(
+        CameraPoints(n, (CameraPoint(0, 0.1, 0.1, 2.0), CameraPoint(3, 0.5, 0.1, 2.0))) for n in range(9)
+    )
+    views = [View("red", 1, None, found, points), View("white", 1, None, Markers(1, (), 960, 540))]
+    scene.views = lambda stop: views  # type: ignore[method-assign]
+    with serving(scene, port=0) as page:
+        hand.open(page.url)
+        says(hand, "#sight", "Choose the marker: 0, 3 are seen")
+        says(hand, "#cameras button:nth-child(1) span", "sees 0, 3")
+        says(hand, "#cameras button:nth-child(2) span", "sees none")
+        hand.run("document.querySelector('#marker').value = '3'")
+        says(hand, "#cameras button:nth-child(1) span", "sees it")
+        says(hand, "#cameras button:nth-child(2) span", "no")
 
 
 def test_of_three_reference_points_two_need_the_side_and_three_check_one_another(hand: Phone) -> None:

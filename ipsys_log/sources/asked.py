@@ -7,7 +7,7 @@ from typing import NamedTuple
 from ipsys_log.messages import RigCamera
 from ipsys_log.sources.frames import Say
 
-__all__ = ["Given", "say_refused"]
+__all__ = ["Given", "device_of", "say_refused"]
 
 # By so much may a number differ, relatively: 30000/1001 frames/s are 30.
 _NEAR = 0.01
@@ -55,3 +55,15 @@ def say_refused(camera: RigCamera, given: Given, say: Say) -> None:
             say(f"camera {camera.name}: asked for {asked:g} {unit}, which it does not let us set")
         elif abs(asked - has) > _NEAR * max(abs(asked), abs(has)):
             say(f"camera {camera.name}: asked for {asked:g} {unit}, gives {has:g}")
+
+
+def device_of(source: str) -> str:
+    """The device that a source names.
+
+    Examples
+    --------
+    >>> device_of("usb:2"), device_of("usb:/dev/v4l/by-id/red-camera")
+    ('/dev/video2', '/dev/v4l/by-id/red-camera')
+    """
+    name = source.partition(":")[2]
+    return f"/dev/video{name}" if name.isdecimal() else name

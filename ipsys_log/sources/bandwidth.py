@@ -9,7 +9,7 @@ from pathlib import Path
 from typing import TYPE_CHECKING, NamedTuple
 
 from ipsys_log.messages import Rig, RigCamera
-from ipsys_log.sources.usb import device_of
+from ipsys_log.sources.asked import device_of
 
 if TYPE_CHECKING:
     from ipsys_log.sources.usb_tree import Attached

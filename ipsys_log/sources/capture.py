@@ -12,10 +12,9 @@ from typing import NamedTuple
 
 from ipsys_log.messages import RigCamera
 from ipsys_log.sources import v4l2
-from ipsys_log.sources.asked import Given, say_refused
+from ipsys_log.sources.asked import Given, device_of, say_refused
 from ipsys_log.sources.frames import Clock, Frame, Say, SourceError
 from ipsys_log.sources.raw_pictures import RAW_FORMATS, Layout, encode_raw
-from ipsys_log.sources.usb import device_of
 from ipsys_log.units import NS_PER_S
 
 __all__ = ["open_v4l2"]

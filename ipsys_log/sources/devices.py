@@ -10,12 +10,13 @@ from pathlib import Path
 from ipsys_log.errors import IpsysError
 from ipsys_log.messages import Rig, RigCamera
 from ipsys_log.rig import HIDDEN, hide_password
+from ipsys_log.sources.asked import device_of
 from ipsys_log.sources.bandwidth import advise, demands_of
 from ipsys_log.sources.frames import Clock, Frame, Open, Say
 from ipsys_log.sources.network import check_address, open_network
 from ipsys_log.sources.played import check_played, open_played
 from ipsys_log.sources.simulated import lab_of, open_simulated
-from ipsys_log.sources.usb import device_of, open_usb
+from ipsys_log.sources.usb import open_usb
 
 __all__ = ["OPENERS", "check_devices", "check_sources", "open_source", "usb_advice"]
 

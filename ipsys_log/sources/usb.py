@@ -9,7 +9,7 @@ from contextlib import AbstractContextManager
 from ipsys_log.messages import RigCamera
 from ipsys_log.sources.frames import Clock, Frame, Say
 
-__all__ = ["device_of", "open_usb"]
+__all__ = ["open_usb"]
 
 
 _SYSTEM: str = sys.platform
@@ -40,15 +40,3 @@ def open_usb(camera: RigCamera, clock: Clock, say: Say) -> AbstractContextManage
     from ipsys_log.sources.opencv_camera import open_opencv
 
     return open_opencv(camera, clock, say)
-
-
-def device_of(source: str) -> str:
-    """The device that a source names.
-
-    Examples
-    --------
-    >>> device_of("usb:2"), device_of("usb:/dev/v4l/by-id/red-camera")
-    ('/dev/video2', '/dev/v4l/by-id/red-camera')
-    """
-    name = source.partition(":")[2]
-    return f"/dev/video{name}" if name.isdecimal() else name

@@ -80,6 +80,11 @@ def record(
     elif detect:
         check_start(lab.rig, lab.names, lab.lenses, request, "detect")
     with opened(lab, output, seconds) as (cameras, settings, status):
+        for name in sorted(set(lab.names) - set(lab.lenses)):
+            text = (
+                f'camera {name} has no lens; a replay needs one: calibration = "{name}.yaml" in the rig file'
+            )
+            remarks.print(text, style="yellow", markup=False)
         if measure:
             scene = live_scene(settings, cameras, model)
             with served(scene, host, port):

@@ -224,6 +224,16 @@ def test_a_marker_that_is_not_in_the_rig_is_shown_with_what_to_do(
     assert f"marker {known[0]} is seen" not in done.out
 
 
+def test_a_camera_without_a_lens_is_recorded_and_named(ipsys: Ipsys, tmp_path: Path, lab: Path) -> None:
+    bare = played(lab).replace("calibration =", "# calibration =")
+    done = ipsys("record", "--rig", write_rig(tmp_path, bare), "--seconds", "0.5", "-o", tmp_path / "a.mcap")
+    assert done.code == 0, done.err
+    assert "camera red has no lens; a replay needs one" in done.err
+    lensed = write_rig(tmp_path, played(lab))
+    done = ipsys("record", "--rig", lensed, "--seconds", "0.5", "-o", tmp_path / "b.mcap")
+    assert "no lens" not in done.err
+
+
 @pytest.mark.parametrize(
     "arguments", [("replay",), ("plan",), ("align",), ("latency",), ("calibrate", "--board", "6x4")]
 )

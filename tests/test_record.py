@@ -240,6 +240,27 @@ with cameras_now._ended(attached.stop, None):
 """
 
 
+def test_who_interrupts_does_not_wait_for_a_lab_to_be_drawn(tmp_path: Path) -> None:
+    rig = tmp_path / "lab.toml"
+    rig.write_text(
+        'name = "lab"\ndictionary = "DICT_4X4_100"\nmarker_length_m = 0.2\n'
+        '[[cameras]]\nname = "red"\nsource = "sim:red"\nwidth = 7680\nheight = 4320\n'
+    )
+    program = started("record", "--rig", rig, "-o", tmp_path / "a.mcap")
+    assert program.stderr is not None
+    assert "draws 2 s of the simulated lab" in program.stderr.readline()
+    begun_s = time.monotonic()
+    program.send_signal(signal.SIGINT)
+    try:
+        _, err = program.communicate(timeout=60)
+    finally:
+        program.kill()
+    assert (program.returncode, "Traceback" in err) == (130, False), err
+    # Only to prepare the view takes longer.
+    assert time.monotonic() - begun_s < 8
+    assert not (tmp_path / "a.mcap").exists()
+
+
 def test_a_signal_may_come_at_any_moment() -> None:
     subprocess.run([sys.executable, "-c", ENDING], timeout=20, check=True)
 

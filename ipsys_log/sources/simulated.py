@@ -5,11 +5,11 @@ from __future__ import annotations
 import math
 import time
 from collections.abc import Iterator
-from concurrent.futures import Future, ThreadPoolExecutor, wait
+from concurrent.futures import Future, wait
 from contextlib import contextmanager
 from dataclasses import fields, replace
 from fractions import Fraction
-from threading import Event
+from threading import Event, Thread
 from urllib.parse import parse_qsl
 
 from ipsys_log.errors import IpsysError
@@ -57,12 +57,20 @@ def open_simulated(camera: RigCamera, clock: Clock, say: Say) -> Iterator[Iterat
     say_refused(camera, Given(settings.width, settings.height, settings.rate_hz), say)
     say(f"camera {camera.name}: draws {_LOOP_S:g} s of the simulated lab, then shows them to and fro")
     stop = Event()
-    pool = ThreadPoolExecutor(1)
+    drawn: Future[list[bytes]] = Future()
+
+    def work() -> None:
+        try:
+            drawn.set_result(_draw(settings, number, stop))
+        except BaseException as fault:  # raised again where the frames are taken
+            drawn.set_exception(fault)
+
+    # A daemon: who interrupts does not wait for what is drawn.
+    Thread(target=work, name=f"draws {camera.name}", daemon=True).start()
     try:
-        yield _play(pool.submit(_draw, settings, number, stop), settings, camera.stamp, clock)
+        yield _play(drawn, settings, camera.stamp, clock)
     finally:
         stop.set()
-        pool.shutdown(wait=False)
 
 
 def lab_of(camera: RigCamera) -> tuple[LabSettings, int]:

@@ -283,7 +283,7 @@ def test_the_faults_of_a_sheet_stand_on_lines_of_their_own_in_a_window(unmeasure
     code, told = typed(["measure", str(unmeasured.log), "--csv", str(sheet)], [])
     assert code == 1
     lines = told.replace("\r", "").rstrip("\n").split("\n")
-    assert max(map(len, lines)) <= 80
+    assert max(len(line) for line in lines if str(sheet) not in line) <= 80
     starts = [
         line.split(": ")[0] for line in lines if line.startswith(("  line 2: no", "  line 3: marker 99"))
     ]

@@ -65,6 +65,8 @@ class Phone:
             width=_WIDTH, height=_HEIGHT, deviceScaleFactor=2, mobile=True,
         )  # fmt: skip
         self.send("Emulation.setTouchEmulationEnabled", enabled=True)
+        # Keys go to a page that has the focus, on a busy machine too.
+        self.send("Emulation.setFocusEmulationEnabled", enabled=True)
         for domain in ("Log", "Runtime", "Page"):
             self.send(f"{domain}.enable")
         self.send("Page.navigate", url=url)
@@ -109,6 +111,7 @@ class Phone:
         self.wait(f"document.activeElement === document.querySelector({json.dumps(selector)})")
         for key in text:
             self.send("Input.dispatchKeyEvent", type="char", text=key)
+        self.wait(f"document.querySelector({json.dumps(selector)}).value.endsWith({json.dumps(text)})")
 
     def text(self, selector: str = "body") -> str:
         return str(self.run(f"document.querySelector({json.dumps(selector)}).innerText"))

@@ -16,7 +16,7 @@ import pytest
 from ipsys_log.log.session import Session
 from ipsys_log.messages import Event
 from ipsys_log.rig import load_rig
-from tests.conftest import Ipsys
+from tests.conftest import Ipsys, small_disk
 from tests.sources.streams import encode, free_port, make_jpegs, serve
 
 NAMES = ("red", "white", "black")
@@ -289,19 +289,10 @@ def test_a_recorder_that_is_killed_loses_its_last_second_at_most(
 def test_a_full_disk_ends_it_with_a_complete_log(
     ipsys: Ipsys, pictures: tuple[Path, list[bytes]], tmp_path: Path
 ) -> None:
-    disk = tmp_path / "disk"
-    disk.mkdir()
-    mounted = subprocess.run(
-        ["mount", "-t", "tmpfs", "-o", "size=20m", "none", str(disk)], capture_output=True, check=False
-    )
-    if mounted.returncode != 0:
-        pytest.skip("no right to mount a small disk")
-    try:
+    with small_disk(tmp_path / "disk", 20) as disk:
         with streams(pictures[0], tmp_path) as rig:
             done = ipsys("record", "--rig", rig, "-o", disk / "a.mcap", "--seconds", "60")
         found = frames(disk / "a.mcap")
-    finally:
-        subprocess.run(["umount", str(disk)], check=True)
     assert done.code == 1
     assert "the disk takes no more; recording has stopped, and the log is complete" in done.err
     assert all(len(jpegs) > 5 for jpegs in found.values())

@@ -23,7 +23,7 @@ from ipsys_log.runs.output import write_message
 from ipsys_log.runs.request import Request
 from ipsys_log.stages.detect import Detect
 from ipsys_log.verify import verify
-from tests.conftest import Ipsys
+from tests.conftest import Ipsys, small_disk
 from tests.test_live import calibration, go_live, recorded, slow  # noqa: F401
 
 RIG = """name = "lab"
@@ -238,15 +238,8 @@ def test_a_full_disk_ends_live_with_runs_that_are_signed(
     calibration: Path,  # noqa: F811
     tmp_path: Path,
 ) -> None:
-    disk = tmp_path / "disk"
-    disk.mkdir()
-    mounted = subprocess.run(
-        ["mount", "-t", "tmpfs", "-o", "size=12m", "none", str(disk)], capture_output=True, check=False
-    )
-    if mounted.returncode != 0:
-        pytest.skip("no right to mount a small disk")
-    log = disk / "a.mcap"
-    try:
+    with small_disk(tmp_path / "disk", 12) as disk:
+        log = disk / "a.mcap"
         with going_live(rig, calibration, log, 0.0) as program:
             out, err = program.communicate(timeout=60)
         verified, replayed = ipsys("verify", log), ipsys("replay", log, "--as-live")
@@ -254,8 +247,6 @@ def test_a_full_disk_ends_live_with_runs_that_are_signed(
         with Session([log]) as session:
             frames = sum(session.count(topic) for topic in session.images.values())
             markers = sum(session.count(topic) for topic in session.topics(Markers, "edges"))
-    finally:
-        subprocess.run(["umount", str(disk)], check=True)
     assert program.returncode == 1, out
     assert "the disk takes no more; recording has stopped, and the log is complete" in err
     assert verified.out.endswith("a replay equals the log\n")

@@ -78,13 +78,14 @@ def prepared(
 
 
 def _files(rig: Path, cameras: list[RigCamera], calibration: list[str] | None) -> list[tuple[str, Path]]:
+    from ipsys_log.sources.played import file_of
+
     found = [("a calibration", Path(one.rpartition("=")[2])) for one in calibration or ()]
     for one in cameras:
         if one.calibration is not None:
             found.append((f"the lens of camera {one.name}", rig.parent / one.calibration))
-        kind, _, name = str(one.source).partition(":")
-        if kind == "file":
-            found.append((f"what camera {one.name} plays", Path(name.partition("?")[0])))
+        if str(one.source).startswith("file:"):
+            found.append((f"what camera {one.name} plays", file_of(str(one.source))[0]))
     return found
 
 

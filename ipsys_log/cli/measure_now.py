@@ -98,10 +98,7 @@ def served(scene: LiveScene, host: str | None, port: int) -> Iterator[None]:
         if host is not None:
             console.print(qr_code(page.url), style="#ffffff on #000000", markup=False)
         remarks.print(f"measure at {page.url}", markup=False)
-        try:
-            yield
-        finally:
-            scene.end()
+        yield
 
 
 def _ask_beside(work: Callable[[], Any], scene: LiveScene, cameras: Attached) -> None:
@@ -120,6 +117,5 @@ def _ask_beside(work: Callable[[], Any], scene: LiveScene, cameras: Attached) ->
                 if not working.done():
                     ask_places(scene)
         finally:
-            scene.end()
             cameras.stop()
         working.result()

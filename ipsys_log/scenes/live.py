@@ -11,7 +11,7 @@ import numpy as np
 import simplejpeg
 from numpy.typing import NDArray
 
-from ipsys_log.errors import FrameError, IpsysError
+from ipsys_log.errors import FrameError
 from ipsys_log.measuring.entry import check_references
 from ipsys_log.measuring.scene import Stop, View
 from ipsys_log.messages import (
@@ -71,7 +71,6 @@ class LiveScene:
         self._history: list[Measurement] = []
         # Where each camera saw the marker of a measurement: id, marker, mean camera point (3,).
         self._measured: dict[str, list[tuple[str, int, NDArray[np.float64]]]] = {c: [] for c in cameras}
-        self._ended = False
 
     def __call__(self, message: Message | None) -> None:
         """Be shown a frame, or what a stage made of it."""
@@ -111,19 +110,10 @@ class LiveScene:
         IpsysError
             Where the recording has ended, or they could not be written: it says that they are not saved.
         """
-        if self._ended:
-            raise IpsysError(
-                "not saved: the cameras are not read any more; start it again, or measure in its log: "
-                "ipsys measure LOG"
-            )
         for measurement in measurements:
             self._add(MEASUREMENTS_TOPIC, measurement)
             self._history.append(measurement)
             self._remember(measurement)
-
-    def end(self) -> None:
-        """Take no more measurements."""
-        self._ended = True
 
     def _remember(self, measurement: Measurement) -> None:
         """Note where it was measured, to tell whether the marker has moved since."""

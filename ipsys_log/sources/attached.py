@@ -71,7 +71,7 @@ class Attached:
         # What somebody waits for.
         self._unwritten: list[Arrival] = []
         self._closed = self._ending = False
-        self._why = "the recording has ended"
+        self._why = "the recording has ended; measure in its log with: ipsys measure LOG"
         self._started, self._stopped = threading.Event(), threading.Event()
         shared = Shared(open_source, clock, self._put, say, self._started, self._stopped)
         self._attendants = [Attendant(camera, shared) for camera in cameras]

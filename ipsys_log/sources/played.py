@@ -13,7 +13,7 @@ from ipsys_log.sources.frames import Clock, Frame, Say, SourceError
 from ipsys_log.sources.videos import Timed, open_video
 from ipsys_log.units import NS_PER_S
 
-__all__ = ["check_played", "open_played"]
+__all__ = ["check_played", "file_of", "open_played"]
 
 _TURN_S = 0.4
 
@@ -55,11 +55,23 @@ def check_played(camera: RigCamera) -> tuple[Path, str]:
     SourceError
         Where there is no such file.
     """
-    name, _, wanted = (camera.source or "").partition(":")[2].partition("?")
-    path = Path(name)
+    path, wanted = file_of(camera.source or "")
     if not path.is_file():
         raise SourceError(f"camera {camera.name}: {path}: there is no such file")
     return path, wanted
+
+
+def file_of(source: str) -> tuple[Path, str]:
+    """The file in a source, and the camera of it that is asked for, or nothing.
+
+    Examples
+    --------
+    >>> path, camera = file_of("file:session.mcap?red")
+    >>> path.name, camera
+    ('session.mcap', 'red')
+    """
+    name, _, wanted = source.partition(":")[2].partition("?")
+    return Path(name), wanted
 
 
 def _recorded(session: Session, topic: str) -> Iterator[Timed]:

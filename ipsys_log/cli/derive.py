@@ -106,6 +106,16 @@ OPTIONS: dict[str, tuple[Any, Any]] = {
         ],
         None,
     ),
+    "details": (
+        Annotated[
+            bool,
+            typer.Option(
+                "--details",
+                help="Print all figures, too: errors by camera, every outlier, models by number of points.",
+            ),
+        ],
+        False,
+    ),
     "plots": (
         Annotated[_Path, typer.Option(metavar="DIR", help="Write the paper's tables and figures, and more.")],
         None,
@@ -125,7 +135,7 @@ _FRAMES = (
     "as_json",
 )
 _DETECT = tuple(name for name in _FRAMES if name != "method")
-_MODELS = tuple(name for name in OPTIONS if name not in ("plot", "plots"))
+_MODELS = tuple(name for name in OPTIONS if name not in ("plot", "plots", "details"))
 EVALUATE = (*_MODELS, "plots")
 
 MORE = "\n\nWhat it needs and the log does not hold yet is made first."
@@ -144,7 +154,7 @@ _COMMANDS: dict[str, tuple[str, tuple[str, ...], str]] = {
     "fit": ("fit", _MODELS, f"Fit models to the measured places (poly, unless you say which).{MORE}"),
     "evaluate": (
         "evaluate",
-        EVALUATE,
+        (*EVALUATE, "details"),
         "Say how far models are off, how many places are enough, and which look wrongly measured.\n\n"
         "For all models, unless you say which; on places held out, and by cross-validation, which takes each "
         f"part of the places in turn.{MORE}",
@@ -223,6 +233,7 @@ def _derive(
     as_json: bool,
     plot: Path | None = None,
     plots: Path | None = None,
+    details: bool = False,
     **given: Any,
 ) -> None:
     from ipsys_log.report.files import check_folder, check_picture
@@ -233,7 +244,10 @@ def _derive(
         check_folder(plots, "--plots")
     with derived(logs, until, **given) as (session, outcomes, accuracies):
         drawn = _draw(session, accuracies, plot, plots)
-    _print(outcomes, accuracies, as_json)
+    if as_json:
+        _print_json(outcomes, accuracies)
+    else:
+        _print(accuracies, details)
     for what in drawn:
         remarks.print(what)
 
@@ -257,16 +271,27 @@ def _draw(
     return drawn
 
 
-def _print(outcomes: Sequence[Outcome], accuracies: Sequence[Accuracy], as_json: bool) -> None:
+def _print_json(outcomes: Sequence[Outcome], accuracies: Sequence[Accuracy]) -> None:
     from ipsys_log.report.accuracy import accuracy_json
+    from ipsys_log.report.summary import answer_json
+
+    stages = [{"stage": o.stage, "run": o.run, "new": o.fresh, "messages": o.messages} for o in outcomes]
+    found = {**answer_json(accuracies), **accuracy_json(accuracies), "stages": stages}
+    print(json.dumps(found, indent=2, allow_nan=False))  # noqa: T201
+
+
+def _print(accuracies: Sequence[Accuracy], details: bool) -> None:
+    """Print the answer first, then one table, and on request all figures."""
+    from ipsys_log.report.summary import answer_text, models_table
     from ipsys_log.report.tables import accuracy_tables
 
-    if as_json:
-        stages = [{"stage": o.stage, "run": o.run, "new": o.fresh, "messages": o.messages} for o in outcomes]
-        print(json.dumps({**accuracy_json(accuracies), "stages": stages}, indent=2, allow_nan=False))  # noqa: T201
-    else:
-        for table in accuracy_tables(accuracies):
-            console.print(table)
+    parts = [answer_text(accuracies), models_table(accuracies)]
+    for part in [*parts, *(accuracy_tables(accuracies) if details else [])]:
+        if part is not None:
+            console.print(part)
+            console.print()
+    if accuracies and not details:
+        remarks.print("--details prints errors by camera, every outlier and models by number of points")
 
 
 def _remark(outcomes: list[Outcome], target: Path | None) -> None:

@@ -12,6 +12,9 @@ __all__ = ["main"]
 
 def main() -> None:
     """Run the command line; a fault of the input is one line on stderr and exit code 1."""
+    from ipsys_log.cli.signals import InterruptError, hold_signals
+
+    hold_signals()
     from ipsys_log.cli.app import app
     from ipsys_log.errors import IpsysError
 
@@ -28,9 +31,9 @@ def main() -> None:
             raise
         what = "the disk is full; free some space and try again" if full else error.strerror
         sys.exit(_complain(f"{error.filename}: {what}" if error.filename else str(what)))
-    except KeyboardInterrupt:
-        _complain("interrupted; stages that were complete are in the log, and nothing else was changed")
-        sys.exit(130)
+    except InterruptError as interrupt:
+        _complain(interrupt.text)
+        sys.exit(interrupt.exit_code)
 
 
 def _complain(text: str) -> int:

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import signal
 from collections.abc import Callable, Iterator
 from concurrent.futures import ThreadPoolExecutor
 from contextlib import contextmanager, suppress
@@ -13,6 +12,7 @@ from typing import TYPE_CHECKING, Any
 
 from ipsys_log.cli.cameras_now import MODEL, Lab, check_target, opened, prepared, shown_to
 from ipsys_log.cli.console import console, remarks
+from ipsys_log.cli.signals import allow_interrupt
 
 if TYPE_CHECKING:
     from ipsys_log.messages import Measurement, Message, Model
@@ -105,8 +105,7 @@ def _ask_beside(work: Callable[[], Any], scene: LiveScene, cameras: Attached) ->
     """Ask in the terminal while the work goes on in a thread, and stop the cameras after that."""
     from ipsys_log.cli.dialog import ask_places
 
-    for number in (signal.SIGINT, signal.SIGTERM):  # a question that is open ends, too
-        signal.signal(number, signal.default_int_handler)
+    allow_interrupt("stopped; every saved point is in the log")  # an open question ends, too
     with ThreadPoolExecutor(1) as pool:
         working = pool.submit(work)
         try:

@@ -6,7 +6,7 @@ import errno
 import ipaddress
 import secrets
 import socket
-from collections.abc import Iterator
+from collections.abc import Callable, Iterator
 from contextlib import contextmanager
 from dataclasses import dataclass
 from threading import Thread
@@ -23,6 +23,7 @@ __all__ = ["Served", "check_free", "qr_code", "serving"]
 
 _LOOPBACK = "127.0.0.1"
 _STEP_S = 0.02
+_TURN_S = 0.1
 
 
 @dataclass(frozen=True, slots=True)
@@ -32,10 +33,10 @@ class Served:
     url: str
     thread: Thread
 
-    def wait(self) -> None:
-        """Wait until the server ends; an interrupt comes through."""
-        while self.thread.is_alive():
-            self.thread.join(1.0)
+    def wait(self, stopped: Callable[[], bool]) -> None:
+        """Wait until the server ends, or until `stopped` is true."""
+        while self.thread.is_alive() and not stopped():
+            self.thread.join(_TURN_S)
 
 
 @contextmanager

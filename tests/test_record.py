@@ -150,7 +150,7 @@ def test_it_ends_cleanly_when_it_is_told_to(
 
 
 HANGING = """
-import sys, time
+import os, sys, time
 from contextlib import contextmanager
 from pathlib import Path
 from ipsys_log import pipeline
@@ -180,10 +180,14 @@ def hanging(self, fd, data, offset):
         time.sleep(1000)
     return pwrite(self, fd, data, offset)
 
+def stop(attached):
+    attached.stop()
+    os.write(1, b"stops\\n")
+
 Disk.pwrite = hanging
 try:
     with Attached([RigCamera("red", source="a:1")], opened, Clock()) as attached:
-        with cameras_now._ended(attached.stop, None):
+        with cameras_now._ended(lambda: stop(attached), None):
             pipeline.record(attached, [], Path(sys.argv[1]))
 except IpsysError as error:
     sys.exit(str(error))
@@ -206,7 +210,7 @@ def test_a_second_interrupt_ends_what_hangs_and_the_log_is_kept(
         assert program.stdout is not None
         assert program.stdout.readline() == "hangs\n"
         program.send_signal(signal.SIGINT)
-        time.sleep(0.5)
+        assert program.stdout.readline() == "stops\n"
         assert program.poll() is None
         program.send_signal(signal.SIGINT)
         try:

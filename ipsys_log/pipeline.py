@@ -254,11 +254,15 @@ def measure(
     check_pictures(cameras.states)
     plan = plan_live(cameras.states, settings, request, "camera-frame")
     detect, camera_frame = (Stage(*row) for row in plan.rows)
-    with recording(target, settings, overwrite) as log, threadpool_limits(1, user_api="blas"):
-        with Recent(log) as recent, Backlog(cameras, recent, cameras.now_ns) as frames:
-            for message in run(run(chain(settings, frames), [detect], in_threads), [camera_frame]):
-                if message is not TICK:
-                    watch(message)
+    with (
+        threadpool_limits(1, user_api="blas"),
+        recording(target, settings, overwrite) as log,
+        Recent(log) as recent,
+        Backlog(cameras, recent, cameras.now_ns) as frames,
+    ):
+        for message in run(run(chain(settings, frames), [detect], in_threads), [camera_frame]):
+            if message is not TICK:
+                watch(message)
     log.check_disk()
     return log.counts
 
@@ -295,16 +299,19 @@ def live(
     """
     plan = plan_live(cameras.states, settings, request, until)
     first = (*settings, *plan.copies(cameras.now_ns))
-    with recording(target, first, overwrite) as log, threadpool_limits(1, user_api="blas"):
-        with Backlog(cameras, log, cameras.now_ns) as frames:
-            stages = [Stage(*row) for row in plan.rows]
-            ledger = Ledger(cameras.clock.now_ns, cameras.received_ns)
-            fault = _put_through(chain(settings, frames), stages, ledger, log, watch)
-            if fault is not None:
-                cameras.warn("stages_stopped", f"{fault}; frames are recorded all the same")
-                for message in frames:
-                    if message is not TICK:
-                        watch(message)
+    with (
+        threadpool_limits(1, user_api="blas"),
+        recording(target, first, overwrite) as log,
+        Backlog(cameras, log, cameras.now_ns) as frames,
+    ):
+        stages = [Stage(*row) for row in plan.rows]
+        ledger = Ledger(cameras.clock.now_ns, cameras.received_ns)
+        fault = _put_through(chain(settings, frames), stages, ledger, log, watch)
+        if fault is not None:
+            cameras.warn("stages_stopped", f"{fault}; frames are recorded all the same")
+            for message in frames:
+                if message is not TICK:
+                    watch(message)
     if fault is not None:
         raise IpsysError(f"{fault}; {target} has all frames: replay it") from fault
     if frames.skipped:

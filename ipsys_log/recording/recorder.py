@@ -146,9 +146,7 @@ def written(source: Source, log: Target) -> Iterator[Message | None]:
 
 
 @contextmanager
-def recording(
-    path: Path, settings: Iterable[Message] = (), overwrite: bool = False
-) -> Iterator[Recording]:
+def recording(path: Path, settings: Iterable[Message] = (), overwrite: bool = False) -> Iterator[Recording]:
     """A new log that keeps what it has, whatever ends the block.
 
     Parameters

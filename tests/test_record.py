@@ -14,8 +14,9 @@ from pathlib import Path
 import pytest
 
 from ipsys_log.log.session import Session
-from ipsys_log.messages import Event
+from ipsys_log.messages import CompressedImage, Event, Message, image_topic
 from ipsys_log.rig import load_rig
+from ipsys_log.runs.output import write_log
 from tests.conftest import Ipsys, small_disk
 from tests.sources.streams import encode, free_port, make_jpegs, serve
 
@@ -66,6 +67,16 @@ def wait_for(log: Path, size: int) -> None:
 def frames(log: Path) -> dict[str, list[bytes]]:
     with Session([log]) as session:
         return {name: [p.data for p in session.payloads([topic])] for name, topic in session.images.items()}
+
+
+def lens_yaml(width: int, height: int) -> str:
+    return (
+        f"%YAML:1.0\n---\nimage_width: {width}\nimage_height: {height}\n"
+        "camera_matrix: !!opencv-matrix\n   rows: 3\n   cols: 3\n   dt: d\n"
+        f"   data: [ 300., 0., {width / 2 - 0.5}, 0., 300., {height / 2 - 0.5}, 0., 0., 1. ]\n"
+        "distortion_coefficients: !!opencv-matrix\n   rows: 4\n   cols: 1\n   dt: d\n"
+        "   data: [ 0., 0., 0., 0. ]\n"
+    )
 
 
 def test_frames_are_recorded_as_they_came_for_so_many_seconds(
@@ -291,6 +302,27 @@ def test_a_recorder_that_is_killed_loses_its_last_second_at_most(
     assert min(ends_ns) > killed_ns - 1_300_000_000  # a second, and what it took to kill it
 
 
+def test_recorder_killed_at_once_keeps_rig_and_lenses(ipsys: Ipsys, tmp_path: Path) -> None:
+    played, rig, log = tmp_path / "played.mcap", tmp_path / "lab.toml", tmp_path / "a.mcap"
+    large = [CompressedImage(n * 10**7, "red", bytes(500_000), "jpeg") for n in range(300)]
+    write_log(played, (Message(image_topic("red"), i.timestamp, i.timestamp, i, "red") for i in large))
+    (tmp_path / "red.yaml").write_text(lens_yaml(640, 480))
+    rig.write_text(
+        'name = "lab"\ndictionary = "DICT_4X4_100"\nmarker_length_m = 0.2\n'
+        f'[[cameras]]\nname = "red"\nsource = "file:{played}"\ncalibration = "red.yaml"\n'
+    )
+    program = started("record", "--rig", rig, "-o", log)
+    wait_for(log, 1_000_000)  # the first chunk of frames, less than 0.1 s of them
+    program.kill()
+    program.communicate(timeout=20)
+    assert ipsys("repair", log).code == 0
+    with Session([log]) as session:
+        assert session.count(image_topic("red")) > 0
+        assert session.payloads(["/rig"]) == [load_rig(rig)]
+        (lens,) = session.payloads([session.calibrations["red"]])
+    assert (lens.width, lens.K[0, 0]) == (640, 300.0)
+
+
 def test_a_full_disk_ends_it_with_a_complete_log(
     ipsys: Ipsys, pictures: tuple[Path, list[bytes]], tmp_path: Path
 ) -> None:
@@ -353,13 +385,7 @@ def test_a_calibration_of_another_shape_is_refused_and_of_another_size_is_scaled
 ) -> None:
     def lens(width: int, height: int) -> Path:
         path = tmp_path / f"{width}.yaml"
-        path.write_text(
-            f"%YAML:1.0\n---\nimage_width: {width}\nimage_height: {height}\n"
-            "camera_matrix: !!opencv-matrix\n   rows: 3\n   cols: 3\n   dt: d\n"
-            f"   data: [ 300., 0., {width / 2 - 0.5}, 0., 300., {height / 2 - 0.5}, 0., 0., 1. ]\n"
-            "distortion_coefficients: !!opencv-matrix\n   rows: 4\n   cols: 1\n   dt: d\n"
-            "   data: [ 0., 0., 0., 0. ]\n"
-        )
+        path.write_text(lens_yaml(width, height))
         return path
 
     with streams(pictures[0], tmp_path) as rig:

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import errno
 import shutil
 import sys
 import textwrap
@@ -16,20 +15,22 @@ def main() -> None:
 
     hold_signals()
     from ipsys_log.cli.app import app
-    from ipsys_log.errors import IpsysError
+    from ipsys_log.cli.console import print_warnings
+    from ipsys_log.errors import IpsysError, disk_advice, is_full
 
     try:
-        app()
+        with print_warnings():
+            app()
     except IpsysError as error:
         sys.exit(_complain(str(error)))
     except BrokenPipeError:
         sys.stderr.close()  # the reader of a pipe has gone, such as head
         sys.exit(0)
     except OSError as error:
-        full = error.errno in (errno.ENOSPC, errno.EDQUOT)
+        full = is_full(error)
         if error.filename is None and not full:
             raise
-        what = "the disk is full; free some space and try again" if full else error.strerror
+        what = f"the disk is full; {disk_advice(error)}" if full else error.strerror
         sys.exit(_complain(f"{error.filename}: {what}" if error.filename else str(what)))
     except InterruptError as interrupt:
         _complain(interrupt.text)

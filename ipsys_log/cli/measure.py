@@ -15,7 +15,6 @@ from ipsys_log.cli.options import (
     AsJson,
     Calibrations,
     Corners,
-    Force,
     Host,
     ModelOfOther,
     Only,
@@ -50,6 +49,13 @@ Sheet = Annotated[
     Path | None,
     typer.Option("--csv", metavar="SHEET", help="Read a sheet (docs/measuring.md has its header) instead."),
 ]
+Insist = Annotated[
+    bool,
+    typer.Option(
+        "--force",
+        help="With --csv: write rows that look wrong. With cameras: overwrite the log of -o if there is one.",
+    ),
+]
 Places = Annotated[
     bool, typer.Option("--places", help="Only list where markers lie still, as a sheet numbers them.")
 ]
@@ -76,7 +82,7 @@ def measure(
     calibration: Calibrations = None,
     corners: Corners = None,
     model_from: ModelOfOther = None,
-    force: Force = False,
+    force: Insist = False,
     as_json: AsJson = False,
 ) -> None:
     """Enter tape measurements: on a page for the phone, in the terminal, or from a sheet.
@@ -99,9 +105,10 @@ def measure(
             output=output,
             camera=camera,
             model_from=model_from,
-            force=force,
         )
-        _measure_log(log, terminal, csv, places, host, port, rig, calibration, corners, as_json)
+        if csv is None:
+            _refuse("--csv, or cameras; leave it out", force=force)
+        _measure_log(log, terminal, csv, force, places, host, port, rig, calibration, corners, as_json)
         return
     _refuse("a finished log; name it", csv=csv, places=places)
     if rig is None or output is None:
@@ -126,6 +133,7 @@ def _measure_log(
     log: Path,
     terminal: bool,
     csv: Path | None,
+    force: bool,
     places: bool,
     host: str | None,
     port: int,
@@ -151,7 +159,7 @@ def _measure_log(
             return
         before = len(scene.history())
         if csv is not None:
-            for text in add_sheet(scene, csv):
+            for text in add_sheet(scene, csv, force):
                 remarks.print(text, style="yellow", markup=False)
         elif terminal:
             from ipsys_log.cli.dialog import ask_places

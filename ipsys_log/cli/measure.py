@@ -165,6 +165,7 @@ def _measure_log(
 
 def serve_page(scene: Scene, host: str | None, port: int) -> None:
     """Serve the page until it is interrupted."""
+    from ipsys_log.cli.measure_now import say_faults
     from ipsys_log.web.serving import qr_code, serving
 
     with serving(scene, host, port) as page:
@@ -176,6 +177,8 @@ def serve_page(scene: Scene, host: str | None, port: int) -> None:
             page.wait()
         except KeyboardInterrupt:
             remarks.print()
+        finally:
+            say_faults(page)
 
 
 def _show_count(log: Path, added: Sequence[Measurement], as_json: bool) -> None:

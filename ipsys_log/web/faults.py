@@ -37,7 +37,7 @@ class Faults:
         async def call(scope: Scope, receive: Receive, send: Send) -> None:
             try:
                 await app(scope, receive, send)
-            except Exception as error:  # noqa: BLE001 - any fault of the page
+            except Exception as error:
                 self.add(error)
 
         return call

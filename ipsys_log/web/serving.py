@@ -100,7 +100,7 @@ def _run(server: uvicorn.Server, listening: socket.socket, limits: Limits, fault
     """Serve until ``server.should_exit``. A fault ends this thread and nothing else."""
     try:
         asyncio.run(_serve(server, listening, limits, faults))
-    except Exception as error:  # noqa: BLE001 - any fault of the server
+    except Exception as error:
         faults.add(error)
 
 

@@ -54,15 +54,13 @@ def connections(caller: Caller, count: int, source: str = "127.0.0.1") -> Iterat
 def recording(lab: Lab, log: Path) -> Iterator[tuple[subprocess.Popen[str], Caller, Path]]:
     """A recorder with its page and few descriptors, as soon as the cameras' markers are seen."""
     errors = log.with_suffix(".stderr")
-    command = [sys.executable, "-m", "ipsys_log", "record", "-o", log, "--rig", lab.rig, "--measure"]
-    command += ["--calibration", lab.lenses, "--host", "127.0.0.1", "--port", "0"]
-
-    def limit() -> None:
-        resource.setrlimit(resource.RLIMIT_NOFILE, (DESCRIPTORS, DESCRIPTORS))
-
-    with errors.open("w") as stderr, subprocess.Popen(
-        [str(part) for part in command], stdout=subprocess.DEVNULL, stderr=stderr, text=True, preexec_fn=limit
-    ) as program:  # fmt: skip
+    command = ["bash", "-c", f'ulimit -n {DESCRIPTORS}; exec "$@"', "bash", sys.executable, "-m", "ipsys_log"]
+    command += ["record", "-o", str(log), "--rig", str(lab.rig), "--calibration", str(lab.lenses)]
+    command += ["--measure", "--host", "127.0.0.1", "--port", "0"]
+    with (
+        errors.open("w") as stderr,
+        subprocess.Popen(command, stdout=subprocess.DEVNULL, stderr=stderr, text=True) as program,
+    ):
         try:
             wait_until(lambda: program.poll() is not None or "measure at " in errors.read_text())
             match = re.search(r"measure at (\S+)", errors.read_text())

@@ -177,6 +177,7 @@ def _measure_log(
 
 def serve_page(scene: Scene, host: str | None, port: int) -> None:
     """Serve the page until it is interrupted."""
+    from ipsys_log.cli.measure_now import say_faults
     from ipsys_log.web.serving import qr_code, serving
 
     signals: list[None] = []  # a list, as an Event takes a lock that the interrupted thread may hold
@@ -186,7 +187,10 @@ def serve_page(scene: Scene, host: str | None, port: int) -> None:
             console.print(qr_code(page.url), style="#ffffff on #000000", markup=False)
         console.print(f"open {page.url}", markup=False)
         remarks.print("Ctrl-C ends it; every place is in the log as soon as it is saved")
-        page.wait(lambda: bool(signals))
+        try:
+            page.wait(lambda: bool(signals))
+        finally:
+            say_faults(page)
 
 
 def _show_count(log: Path, added: Sequence[Measurement], as_json: bool) -> None:

@@ -19,8 +19,9 @@ if TYPE_CHECKING:
     from ipsys_log.runs.request import Request
     from ipsys_log.scenes.live import LiveScene
     from ipsys_log.sources.attached import Attached
+    from ipsys_log.web.serving import Served
 
-__all__ = ["live_scene", "measure_now", "ready_to_measure", "served"]
+__all__ = ["live_scene", "measure_now", "ready_to_measure", "say_faults", "served"]
 
 _TURN_S = 0.05
 # After that it is known what the cameras see, and what of it lies still.
@@ -98,7 +99,19 @@ def served(scene: LiveScene, host: str | None, port: int) -> Iterator[None]:
         if host is not None:
             console.print(qr_code(page.url), style="#ffffff on #000000", markup=False)
         remarks.print(f"measure at {page.url}", markup=False)
-        yield
+        try:
+            yield
+        finally:
+            say_faults(page)
+
+
+def say_faults(page: Served) -> None:
+    """Say what went wrong in the page's server: at the end, the screen is free for a traceback."""
+    if page.faults.count:
+        remarks.print(
+            f"faults of ipsys in the measuring page: {page.faults.count}; the first one:", style="red"
+        )
+        remarks.print(page.faults.first, markup=False, highlight=False)
 
 
 def _ask_beside(work: Callable[[], Any], scene: LiveScene, cameras: Attached) -> None:

@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+from functools import lru_cache
+
 import cv2
 import numpy as np
 from numpy.typing import NDArray
@@ -82,14 +84,22 @@ def _seams(across: Array, along: Array, pixel_m: Array) -> Array:
 
 def _noise_at(settings: LabSettings, which: int, x_m: Array, y_m: Array, stretch: float) -> Array:
     """Smooth noise of unit variance, repeated without a seam, ``stretch`` times as long in y."""
-    white = stream(settings.seed, Purpose.FLOOR, which).standard_normal((_TILE, _TILE))
+    map_x = (x_m * (_TILE / _TILE_M) % _TILE).astype(np.float32)
+    map_y = (y_m * (_TILE / _TILE_M / stretch) % _TILE).astype(np.float32)
+    tile = _noise_tile(settings.seed, which)
+    return np.asarray(cv2.remap(tile, map_x, map_y, cv2.INTER_LINEAR), dtype=np.float64)
+
+
+@lru_cache(maxsize=4)
+def _noise_tile(seed: int, which: int) -> Plane:
+    """Return the tile that :func:`_noise_at` repeats; all cameras of a lab share it."""
+    white = stream(seed, Purpose.FLOOR, which).standard_normal((_TILE, _TILE))
     # Longer than wide: filtered by convolution on the torus, so that the tile wraps.
     fy, fx = np.fft.fftfreq(_TILE)[:, None], np.fft.rfftfreq(_TILE)[None, :]
     soft = np.exp(-2 * (np.pi * 1.2) ** 2 * ((fx) ** 2 + (fy) ** 2)) / (1 + 60 * np.hypot(fx, fy))
     tile = np.fft.irfft2(np.fft.rfft2(white) * soft, s=white.shape)
     tile = ((tile - tile.mean()) / tile.std()).astype(np.float32)
-    map_x = (x_m * (_TILE / _TILE_M) % _TILE).astype(np.float32)
-    map_y = (y_m * (_TILE / _TILE_M / stretch) % _TILE).astype(np.float32)
     # One wrapped column and row more, or the interpolation would see the edge of the tile.
     wrapped = np.pad(tile, ((0, 2), (0, 2)), mode="wrap")
-    return np.asarray(cv2.remap(wrapped, map_x, map_y, cv2.INTER_LINEAR), dtype=np.float64)
+    wrapped.flags.writeable = False
+    return wrapped

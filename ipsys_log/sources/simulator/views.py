@@ -28,7 +28,8 @@ class View:
 
     ``rays`` (h + 2 border, w + 2 border, 2) are normalized coordinates of pixels, ``floor`` (h, w) is
     the light from the empty floor behind the optics, ``noise`` a field that is larger than a frame by
-    192 px each way and of which each frame shows another piece.
+    192 px each way and of which each frame shows another piece. ``bare`` (h, w) is the share of floor in each
+    pixel, where prints lie on it for good.
     """
 
     camera: Camera
@@ -36,6 +37,7 @@ class View:
     rays: Array
     floor: Plane
     noise: Plane
+    bare: Plane | None = None
 
 
 def prepare_view(camera: Camera, settings: LabSettings) -> View:

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Callable
 from functools import lru_cache
 
 import cv2
@@ -39,8 +40,11 @@ def pixel_rays(lens: CameraCalibration, border_px: int) -> Array:
     return undistort(pixels.reshape(-1, 2), lens).reshape(pixels.shape)
 
 
-def lay_floor(settings: LabSettings, camera: Camera, rays: Array) -> Plane:
-    """Grey levels of the empty floor, (h, w), for the rays of a camera (h, w, 2)."""
+def lay_floor(settings: LabSettings, camera: Camera, rays: Array, check: Callable[[], None]) -> Plane:
+    """Grey levels of the empty floor, (h, w), for the rays of a camera (h, w, 2).
+
+    ``check`` is called between the steps; what it raises ends the work.
+    """
     axes = camera.camera_from_world[:3, :3]
     x, y, z = (rays[..., 0] * axes[0, i] + rays[..., 1] * axes[1, i] + axes[2, i] for i in range(3))
     origin_m = camera.origin_m
@@ -50,7 +54,11 @@ def lay_floor(settings: LabSettings, camera: Camera, rays: Array) -> Plane:
     pixel_m = np.maximum(np.abs(np.gradient(x_m, axis=1)), np.abs(np.gradient(y_m, axis=0)))
     across, along = x_m / _BOARD_M[0], y_m / _BOARD_M[1]
     on_boards = (across >= 0) & (across <= _BOARDS[0]) & (along >= 0) & (along <= _BOARDS[1])
-    boards = _boards(settings, x_m, y_m) * _seams(across, along, pixel_m)
+    check()
+    boards = _boards(settings, x_m, y_m)
+    check()
+    boards *= _seams(across, along, pixel_m)
+    check()
     concrete = 0.62 * settings.floor + 4.0 * _noise_at(settings, 1, x_m, y_m, 1.0)
     fade = 1.0 - 0.012 * ((x_m - 2.2) ** 2 + (y_m - 2.8) ** 2)
     level = np.where(on_boards, boards, concrete) * np.clip(fade, 0.5, 1.0)

@@ -25,12 +25,14 @@ _COLUMNS, _ROWS = np.linspace(0.08, 0.92, 5), np.linspace(0.08, 0.92, 3)
 POSES = 2 * len(_COLUMNS) * len(_ROWS)
 # Width of the board, as a share of the image's; tilt of the board against the line of sight, in degrees.
 _SHARES, _TILTS_DEG, _ROLL_DEG = (0.28, 0.42), (12.0, 38.0), 25.0
+# White around the squares, in squares. With a whole one the edge of the paper looks like a row of squares.
+_MARGIN = 0.75
 _GOLDEN_RAD = 2.399963
 _TRIES = 60
 
 
 def board_cells(board: Board) -> tuple[NDArray[np.bool_], float]:
-    """Return which cells of a print of a board are black, with a margin of one square, and a cell's side in m.
+    """Return which cells of a print of a board are black, white margin included, and a cell's side in m.
 
     Raises
     ------
@@ -44,13 +46,13 @@ def board_cells(board: Board) -> tuple[NDArray[np.bool_], float]:
         gap = (per_square - len(dark)) // 2
         top, left = marker.row * per_square + gap, marker.column * per_square + gap
         black[top : top + len(dark), left : left + len(dark)] = dark
-    black = np.pad(black, per_square)
+    black = np.pad(black, round(_MARGIN * per_square))
     return (~black if board.inverted else black), board.square_m / per_square
 
 
 def _cells_per_square(board: Board) -> int:
     if board.marker_scale is None:
-        return 1
+        return 4
     cells = len(white_cells(board.dictionary, 0))
     per_square = round(cells / board.marker_scale)
     if abs(per_square * board.marker_scale - cells) > 1e-6 or (per_square - cells) % 2:

@@ -118,7 +118,7 @@ def calibrate(
     if plot is not None:
         check_picture(plot, "--plot", sources or [])
         _check_free(plot, force)
-    lab = None if sources else _prepared_now(rig, camera)
+    lab = None if sources else _prepared_now(rig, camera, board)
     if lab is not None:
         _targets(lab.names, output, names, force)
     with nullcontext(sources or []) if lab is None else _taken_now(lab, seconds) as taken:
@@ -143,15 +143,18 @@ def calibrate(
         remarks.print(f"{plot} drawn", markup=False)
 
 
-def _prepared_now(rig: Path | None, only: list[str] | None) -> Lab:
+def _prepared_now(rig: Path | None, only: list[str] | None, board: str) -> Lab:
+    """The cameras to look at; before simulated ones the board is held that they are calibrated with."""
     from ipsys_log.errors import IpsysError
+    from ipsys_log.sources.simulated import show_board
 
     if rig is None:
         raise IpsysError(
             "name pictures, a video or a log of a board, or give --rig lab.toml to take what its cameras "
             "send now"
         )
-    return prepared(rig, only, None, with_lenses=False)
+    lab = prepared(rig, only, None, with_lenses=False)
+    return lab._replace(cameras=[show_board(one, board) for one in lab.cameras])
 
 
 @contextmanager

@@ -24,6 +24,7 @@ from ipsys_log.cli.options import (
     load_calibrations,
     log_option,
 )
+from ipsys_log.cli.signals import allow_interrupt, runs_until_stopped, stop_on_signal
 
 if TYPE_CHECKING:
     from ipsys_log.measuring.scene import Scene
@@ -67,6 +68,7 @@ def add_commands(app: typer.Typer) -> None:
     app.command()(measure)
 
 
+@runs_until_stopped
 def measure(
     log: Log = None,
     output: Output = None,
@@ -91,6 +93,8 @@ def measure(
 
     Either way what is typed is checked at once. Undo withdraws a measurement; nothing is erased.
     """
+    ends = csv is not None or places
+    allow_interrupt(None if ends else "stopped; every saved point is in the log")
     from ipsys_log.errors import IpsysError
 
     if sum((terminal, csv is not None, places)) > 1:
@@ -173,17 +177,20 @@ def _measure_log(
 
 def serve_page(scene: Scene, host: str | None, port: int) -> None:
     """Serve the page until it is interrupted."""
+    from ipsys_log.cli.measure_now import say_faults
     from ipsys_log.web.serving import qr_code, serving
 
+    signals: list[None] = []  # a list, as an Event takes a lock that the interrupted thread may hold
+    stop_on_signal(lambda: signals.append(None))
     with serving(scene, host, port) as page:
         if host is not None:
             console.print(qr_code(page.url), style="#ffffff on #000000", markup=False)
         console.print(f"open {page.url}", markup=False)
         remarks.print("Ctrl-C ends it; every place is in the log as soon as it is saved")
         try:
-            page.wait()
-        except KeyboardInterrupt:
-            remarks.print()
+            page.wait(lambda: bool(signals))
+        finally:
+            say_faults(page)
 
 
 def _show_count(log: Path, added: Sequence[Measurement], as_json: bool) -> None:

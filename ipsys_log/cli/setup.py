@@ -42,6 +42,12 @@ SETTINGS: dict[str, tuple[int | float, str]] = {
     "tape_sigma_m": (0.003, "How badly the tape is read, in m."),
 }
 
+# At the top of the rig file of the simulated lab.
+_SIMULATED = """# The simulated lab. Its cameras need no hardware: docs/first-day.md goes through all commands with it.
+# The robots 0, 1 and 2 drive to and fro at a height of 10 cm. The other markers lie still.
+
+"""
+
 
 def add_commands(app: typer.Typer) -> None:
     app.command()(init)
@@ -56,28 +62,69 @@ def init(
             "--from", metavar="LOG", help="Write the rig that a log holds, and what it tells of the cameras."
         ),
     ] = None,
+    simulated: Annotated[
+        bool,
+        typer.Option(
+            "--simulated",
+            help="Write the rig of the simulated lab, to try all commands without a camera; and a sheet of what "
+            "a tape reads there.",
+        ),
+    ] = False,
 ) -> None:
     """Write a rig file to edit: markers, cameras, reference points, floor. With comments, or from a log."""
     from ipsys_log.errors import IpsysError
     from ipsys_log.rig import HIDDEN, example_toml
 
+    if simulated:
+        if log is not None:
+            raise IpsysError("--from and --simulated exclude each other; give one of them")
+        _init_simulated(path)
+        return
     text = example_toml() if log is None else _rig_of(log)
-
-    try:
-        file = path.open("x", encoding="utf-8")
-    except FileExistsError as error:
-        raise IpsysError(f"{path}: exists already; edit it, or give another name") from error
-    try:
-        with file:
-            file.write(text)
-    except OSError:
-        path.unlink()
-        raise
+    _write_new({path: text})
     console.print(f"{path} written: edit it to describe your lab")
     if HIDDEN in text:
         console.print(
             f"a log holds no passwords: write that of each source in place of {HIDDEN}", markup=False
         )
+
+
+def _init_simulated(path: Path) -> None:
+    from ipsys_log.rig import rig_toml
+    from ipsys_log.sources.simulator.live_lab import LIVE_SETTINGS, live_rig, plan_live_lab, tape_sheet
+
+    tape = path.with_name(f"{path.stem}_tape.csv")
+    lying = plan_live_lab(LIVE_SETTINGS).lying
+    _write_new({path: _SIMULATED + rig_toml(live_rig(LIVE_SETTINGS)), tape: tape_sheet(lying)})
+    console.print(f"{path} written: the simulated lab, with three cameras", markup=False)
+    console.print(
+        f"{tape} written: what a tape reads at the {len(lying)} markers that lie still there", markup=False
+    )
+    console.print(f"then: ipsys align --rig {path}", markup=False)
+
+
+def _write_new(texts: dict[Path, str]) -> None:
+    """Write files that do not exist yet: all of them, or none.
+
+    Raises
+    ------
+    IpsysError
+        Where a file exists.
+    """
+    from ipsys_log.errors import IpsysError
+
+    made: list[Path] = []
+    try:
+        for path, text in texts.items():
+            with path.open("x", encoding="utf-8") as file:
+                made.append(path)
+                file.write(text)
+    except OSError as error:
+        for path in made:
+            path.unlink()
+        if isinstance(error, FileExistsError):
+            raise IpsysError(f"{error.filename}: exists already; edit it, or give another name") from error
+        raise
 
 
 def _rig_of(log: Path) -> str:

@@ -15,7 +15,7 @@ from ipsys_log.sources.bandwidth import advise, demands_of
 from ipsys_log.sources.frames import Clock, Frame, Open, Say
 from ipsys_log.sources.network import check_address, open_network
 from ipsys_log.sources.played import check_played, open_played
-from ipsys_log.sources.simulated import lab_of, open_simulated
+from ipsys_log.sources.simulated import open_simulated, parse_source
 from ipsys_log.sources.usb import open_usb
 
 __all__ = ["OPENERS", "check_devices", "check_sources", "open_source", "usb_advice"]
@@ -66,7 +66,7 @@ def check_sources(cameras: Iterable[RigCamera]) -> None:
         if _opener(camera) is open_network:
             check_address(camera)
         elif _opener(camera) is open_simulated:
-            lab_of(camera)
+            parse_source(camera)
         elif _opener(camera) is open_played:
             check_played(camera)
         elif sys.platform == "linux" and not Path(device_of(source)).exists():

@@ -4,109 +4,194 @@ from __future__ import annotations
 
 import math
 import time
-from collections.abc import Iterator
-from concurrent.futures import Future, wait
+from collections.abc import Callable, Iterator
 from contextlib import contextmanager
 from dataclasses import fields, replace
 from fractions import Fraction
 from threading import Event, Thread
-from urllib.parse import parse_qsl
+from typing import NamedTuple
+from urllib.parse import parse_qsl, urlencode
 
+from ipsys_log.calibration.boards import Board, parse_board
 from ipsys_log.errors import IpsysError
 from ipsys_log.messages import CameraCalibration, RigCamera
 from ipsys_log.sources.asked import Given, say_refused
 from ipsys_log.sources.frames import Clock, Frame, Say
+from ipsys_log.sources.simulator.board import board_cells
 from ipsys_log.sources.simulator.cameras import hang_cameras
-from ipsys_log.sources.simulator.drive import plan_drive
-from ipsys_log.sources.simulator.render import encode_jpeg, render
-from ipsys_log.sources.simulator.seeds import Purpose, stream
+from ipsys_log.sources.simulator.film import Film, board_film, lab_film, next_missing
+from ipsys_log.sources.simulator.live_lab import LIVE_SETTINGS
 from ipsys_log.sources.simulator.settings import LabSettings
 from ipsys_log.sources.simulator.shutter import exposed
-from ipsys_log.sources.simulator.simulate import driving
-from ipsys_log.sources.simulator.views import prepare_view
+from ipsys_log.sources.simulator.views import Check
 from ipsys_log.units import NS_PER_S
 
-__all__ = ["lab_of", "lens_of", "open_simulated", "shown_at"]
+__all__ = ["Seat", "lens_of", "open_simulated", "parse_source", "show_board"]
 
 _TURN_S = 0.4
 _LATENCY_NS = 4_000_000
-# A frame of 1920 x 1080 takes 50 ms to draw: so much of the drive is drawn beforehand.
-_LOOP_S = 2.0
+# Of a board that a source asks for. The size of its squares scales nothing that a lens has.
+_SQUARE_M, _MARKER_SCALE, _DICTIONARY = 0.03, 0.75, "DICT_4X4_50"
+
+
+class Seat(NamedTuple):
+    """What a simulated camera looks at: the lab, which of its cameras it is, and a board before it, if any."""
+
+    lab: LabSettings
+    number: int
+    board: Board | None = None
+
+
+class _Stopped(Exception):  # noqa: N818
+    """Nobody needs the pictures any more."""
+
+
+class _Pictures:
+    """The pictures of a film, drawn in a thread of its own in the order in which they are needed."""
+
+    def __init__(self, name: str, make_film: Callable[[Check], Film], frame_in: Callable[[int], int]) -> None:
+        self._film: Film | None = None
+        self._drawn: dict[int, bytes] = {}
+        self._fault: BaseException | None = None
+        self._make_film, self._frame_in = make_film, frame_in
+        self._stopped = Event()
+        # No daemon: Python would end such a thread within OpenCV, and that aborts the program.
+        Thread(target=self._work, name=f"draws {name}", daemon=False).start()
+
+    def stop(self) -> None:
+        self._stopped.set()
+
+    def picture(self, frame: int) -> bytes | None:
+        """Return what a frame shows; None where that is not drawn yet."""
+        if self._fault is not None:
+            raise self._fault
+        return None if self._film is None else self._drawn.get(self._film.index_of(frame))
+
+    def _work(self) -> None:
+        try:
+            self._film = film = self._make_film(self._check)
+            took_ns = 0
+            while (index := next_missing(film, self._drawn, self._frame_in(took_ns))) is not None:
+                self._check()
+                start_ns = time.monotonic_ns()
+                self._drawn[index] = film.draw(index)
+                took_ns = time.monotonic_ns() - start_ns
+        except _Stopped:
+            return
+        except BaseException as fault:  # raised again where the frames are taken
+            self._fault = fault
+
+    def _check(self) -> None:
+        if self._stopped.is_set():
+            raise _Stopped
 
 
 @contextmanager
 def open_simulated(camera: RigCamera, clock: Clock, say: Say) -> Iterator[Iterator[Frame | None]]:
     """The frames of a simulated camera, as :data:`~ipsys_log.sources.frames.Open` says.
 
-    The first 2 s of the robots' drive are drawn once, then shown to and fro for ever. Which frame is shown
-    follows from the clock alone: all cameras of a lab see the robots at the same places, in whatever process.
+    Most markers of the lab lie still; the others drive to and fro. Or a board is held before the camera. Each
+    picture is drawn once, in a thread of its own, and shown again and again; a frame whose picture is not drawn
+    yet does not come. Which picture a frame shows follows from the clock alone: all cameras of a lab see the
+    robots at the same places, in whatever process.
 
     Parameters
     ----------
     camera : its ``source`` is ``sim:`` and the name of the camera in the lab, and may set what
-        ``ipsys simulate`` can: ``sim:red?seed=3&markers=5``. Size and rate are those of the rig.
+        ``ipsys simulate`` can, and a board: ``sim:red?seed=3&markers=5``, ``sim:red?board=6x4``. Size and rate
+        are those of the rig.
     clock : tells which frame is shown.
-    say : told when drawing begins.
+    say : told what the rig asks for in vain.
 
     Raises
     ------
     IpsysError
         Where the lab has no such camera, or no such setting.
     """
-    settings, number = lab_of(camera)
-    say_refused(camera, Given(settings.width, settings.height, settings.rate_hz), say)
-    say(f"camera {camera.name}: draws {_LOOP_S:g} s of the simulated lab, then shows them to and fro")
-    stop = Event()
-    drawn: Future[list[bytes]] = Future()
+    seat = parse_source(camera)
+    lab = seat.lab
+    say_refused(camera, Given(lab.width, lab.height, lab.rate_hz), say)
+    timing = _Timing.of(lab, camera.stamp)
 
-    def work() -> None:
-        try:
-            drawn.set_result(_draw(settings, number, stop))
-        except BaseException as fault:  # raised again where the frames are taken
-            drawn.set_exception(fault)
+    def make_film(check: Check) -> Film:
+        if seat.board is None:
+            return lab_film(lab, seat.number, check)
+        return board_film(lab, seat.number, seat.board, check)
 
-    # A daemon: who interrupts does not wait for what is drawn.
-    Thread(target=work, name=f"draws {camera.name}", daemon=True).start()
+    def frame_in(later_ns: int) -> int:
+        return timing.frame_at(clock.now_ns() + later_ns) + 1
+
+    pictures = _Pictures(camera.name, make_film, frame_in)
     try:
-        yield _play(drawn, settings, camera.stamp, clock)
+        yield _play(pictures, timing, clock)
     finally:
-        stop.set()
+        pictures.stop()
 
 
-def lab_of(camera: RigCamera) -> tuple[LabSettings, int]:
-    """The lab that a source names, and which of its cameras.
+def parse_source(camera: RigCamera) -> Seat:
+    """Parse what a source says: the lab, which of its cameras, and the board before it.
 
     Raises
     ------
     IpsysError
-        Where the lab has no such camera, or no such setting, or the value is none.
+        Where the lab has no such camera, or no such setting or board, or the value is none.
 
     Examples
     --------
-    >>> lab, number = lab_of(RigCamera("left", source="sim:white?seed=3", width=960, height=540))
-    >>> lab.seed, lab.width, lab.cameras[number]
-    (3, 960, 'white')
+    >>> seat = parse_source(RigCamera("left", source="sim:white?seed=3&board=6x4", width=960, height=540))
+    >>> seat.lab.seed, seat.lab.width, seat.lab.cameras[seat.number], str(seat.board)
+    (3, 960, 'white', 'a chessboard of 6 x 4 inner corners')
     """
     name, _, query = (camera.source or "").partition(":")[2].partition("?")
     asked = {"width": camera.width, "height": camera.height, "rate_hz": camera.rate_hz}
     values: dict[str, int | float] = {key: value for key, value in asked.items() if value is not None}
     known = {f.name: type(f.default) for f in fields(LabSettings) if isinstance(f.default, (int, float))}
+    board = None
     for key, text in parse_qsl(query, keep_blank_values=True):
+        if key == "board":
+            board = _parse_board(camera, text)
+            continue
         if key not in known:
             raise IpsysError(
-                f"camera {camera.name}: the simulated lab has no setting {key!r}: {', '.join(known)}"
+                f"camera {camera.name}: the simulated lab has no setting {key!r}: board, {', '.join(known)}"
             )
         try:
             values[key] = known[key](text)
         except ValueError as error:
             raise IpsysError(f"camera {camera.name}: {key}={text} is no number") from error
-    settings = LabSettings(**values)  # type: ignore[arg-type]
+    settings = replace(LIVE_SETTINGS, **values)  # type: ignore[arg-type]
     if name not in settings.cameras:
         names = ", ".join(f"sim:{other}" for other in settings.cameras)
         raise IpsysError(
             f"camera {camera.name}: the simulated lab has no camera {name!r}; write one of {names}"
         )
-    return settings, settings.cameras.index(name)
+    return Seat(settings, settings.cameras.index(name), board)
+
+
+def _parse_board(camera: RigCamera, text: str) -> Board:
+    try:
+        board = parse_board(text, _SQUARE_M, _MARKER_SCALE, _DICTIONARY, False)
+        board_cells(board)
+    except IpsysError as error:
+        raise IpsysError(f"camera {camera.name}: {str(error).replace('--board ', 'board=')}") from error
+    return board
+
+
+def show_board(camera: RigCamera, board: str) -> RigCamera:
+    """Return a simulated camera with a board held before it, unless its source names one; others as they are.
+
+    Examples
+    --------
+    >>> show_board(RigCamera("red", source="sim:red?seed=3"), "6x4").source
+    'sim:red?seed=3&board=6x4'
+    >>> show_board(RigCamera("red", source="usb:0"), "6x4").source
+    'usb:0'
+    """
+    source = str(camera.source)
+    if not source.startswith("sim:") or parse_source(camera).board is not None:
+        return camera
+    joint = "&" if "?" in source else "?"
+    return replace(camera, source=f"{source}{joint}{urlencode({'board': board}, safe=':')}")
 
 
 def lens_of(camera: RigCamera) -> CameraCalibration:
@@ -117,55 +202,39 @@ def lens_of(camera: RigCamera) -> CameraCalibration:
     IpsysError
         Where there is no such camera in the simulated lab.
     """
-    settings, number = lab_of(camera)
-    return replace(hang_cameras(settings)[number].lens, frame_id=camera.name)
+    lab, number, _ = parse_source(camera)
+    return replace(hang_cameras(lab)[number].lens, frame_id=camera.name)
 
 
-def shown_at(frame: int, count: int) -> int:
-    """Which of ``count`` drawn frames the frame of a number shows: to and fro.
+class _Timing(NamedTuple):
+    """When frames are exposed, stamped and handed over."""
 
-    Examples
-    --------
-    >>> [shown_at(frame, 4) for frame in range(8)]
-    [0, 1, 2, 3, 2, 1, 0, 1]
-    """
-    turn = frame % max(2 * count - 2, 1)
-    return min(turn, 2 * count - 2 - turn)
-
-
-def _draw(settings: LabSettings, number: int, stop: Event) -> list[bytes]:
-    cameras = hang_cameras(settings)
-    drive = plan_drive(settings, cameras)
-    view = prepare_view(cameras[number], settings)
-    frames = []
-    for index in range(max(round(_LOOP_S * settings.rate_hz), 1)):
-        if stop.is_set():
-            break
-        prints = [driving(drive, marker, index / settings.rate_hz, settings) for marker in drive.ahead_s]
-        picture = render(view, prints, settings, stream(settings.seed, Purpose.FRAME, number, index))
-        frames.append(encode_jpeg(picture, settings))
-    return frames
-
-
-def _play(
-    drawn: Future[list[bytes]], settings: LabSettings, stamp: str | None, clock: Clock
-) -> Iterator[Frame | None]:
-    while not wait([drawn], _TURN_S).done:
-        yield None
-    frames = drawn.result()
-    # A driver stamps the start of the first row's exposure, or the end of the last one's.
-    start_s, end_s = exposed(0, settings.height - 1, settings)
-    stamp_ns = round({"start": start_s, "end": end_s}.get(stamp or "", 0.0) * NS_PER_S)
-    behind_ns = round(end_s * NS_PER_S) + _LATENCY_NS
     # Times since 1970 are too long for floating point.
-    period_ns = NS_PER_S / Fraction(settings.rate_hz)
+    period_ns: Fraction
+    stamp_ns: int
+    behind_ns: int
+
+    @classmethod
+    def of(cls, lab: LabSettings, stamp: str | None) -> _Timing:
+        # A driver stamps the start of the first row's exposure, or the end of the last one's.
+        start_s, end_s = exposed(0, lab.height - 1, lab)
+        stamp_ns = round({"start": start_s, "end": end_s}.get(stamp or "", 0.0) * NS_PER_S)
+        return cls(NS_PER_S / Fraction(lab.rate_hz), stamp_ns, round(end_s * NS_PER_S) + _LATENCY_NS)
+
+    def frame_at(self, now_ns: int) -> int:
+        """Return the number of the last frame that has been handed over by a time."""
+        return math.floor((now_ns - self.behind_ns) / self.period_ns)
+
+
+def _play(pictures: _Pictures, timing: _Timing, clock: Clock) -> Iterator[Frame | None]:
     frame = 0
     while True:
-        # Who comes late has missed some.
-        frame = max(frame + 1, math.floor((clock.now_ns() - behind_ns) / period_ns))
-        time_ns = round(frame * period_ns)
-        while (left_s := (time_ns - (clock.now_ns() - behind_ns)) / NS_PER_S) > 0:
+        # A reader that comes late has missed some.
+        frame = max(frame + 1, timing.frame_at(clock.now_ns()))
+        time_ns = round(frame * timing.period_ns)
+        while (left_s := (time_ns - (clock.now_ns() - timing.behind_ns)) / NS_PER_S) > 0:
             time.sleep(min(left_s, _TURN_S))
             if left_s > _TURN_S:
                 yield None
-        yield Frame(frames[shown_at(frame, len(frames))], "jpeg", time_ns + stamp_ns)
+        data = pictures.picture(frame)
+        yield None if data is None else Frame(data, "jpeg", time_ns + timing.stamp_ns)

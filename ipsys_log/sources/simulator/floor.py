@@ -2,6 +2,9 @@
 
 from __future__ import annotations
 
+from collections.abc import Callable
+from functools import lru_cache
+
 import cv2
 import numpy as np
 from numpy.typing import NDArray
@@ -37,8 +40,11 @@ def pixel_rays(lens: CameraCalibration, border_px: int) -> Array:
     return undistort(pixels.reshape(-1, 2), lens).reshape(pixels.shape)
 
 
-def lay_floor(settings: LabSettings, camera: Camera, rays: Array) -> Plane:
-    """Grey levels of the empty floor, (h, w), for the rays of a camera (h, w, 2)."""
+def lay_floor(settings: LabSettings, camera: Camera, rays: Array, check: Callable[[], None]) -> Plane:
+    """Grey levels of the empty floor, (h, w), for the rays of a camera (h, w, 2).
+
+    ``check`` is called between the steps; what it raises ends the work.
+    """
     axes = camera.camera_from_world[:3, :3]
     x, y, z = (rays[..., 0] * axes[0, i] + rays[..., 1] * axes[1, i] + axes[2, i] for i in range(3))
     origin_m = camera.origin_m
@@ -48,7 +54,11 @@ def lay_floor(settings: LabSettings, camera: Camera, rays: Array) -> Plane:
     pixel_m = np.maximum(np.abs(np.gradient(x_m, axis=1)), np.abs(np.gradient(y_m, axis=0)))
     across, along = x_m / _BOARD_M[0], y_m / _BOARD_M[1]
     on_boards = (across >= 0) & (across <= _BOARDS[0]) & (along >= 0) & (along <= _BOARDS[1])
-    boards = _boards(settings, x_m, y_m) * _seams(across, along, pixel_m)
+    check()
+    boards = _boards(settings, x_m, y_m)
+    check()
+    boards *= _seams(across, along, pixel_m)
+    check()
     concrete = 0.62 * settings.floor + 4.0 * _noise_at(settings, 1, x_m, y_m, 1.0)
     fade = 1.0 - 0.012 * ((x_m - 2.2) ** 2 + (y_m - 2.8) ** 2)
     level = np.where(on_boards, boards, concrete) * np.clip(fade, 0.5, 1.0)
@@ -82,14 +92,22 @@ def _seams(across: Array, along: Array, pixel_m: Array) -> Array:
 
 def _noise_at(settings: LabSettings, which: int, x_m: Array, y_m: Array, stretch: float) -> Array:
     """Smooth noise of unit variance, repeated without a seam, ``stretch`` times as long in y."""
-    white = stream(settings.seed, Purpose.FLOOR, which).standard_normal((_TILE, _TILE))
+    map_x = (x_m * (_TILE / _TILE_M) % _TILE).astype(np.float32)
+    map_y = (y_m * (_TILE / _TILE_M / stretch) % _TILE).astype(np.float32)
+    tile = _noise_tile(settings.seed, which)
+    return np.asarray(cv2.remap(tile, map_x, map_y, cv2.INTER_LINEAR), dtype=np.float64)
+
+
+@lru_cache(maxsize=4)
+def _noise_tile(seed: int, which: int) -> Plane:
+    """Return the tile that :func:`_noise_at` repeats; all cameras of a lab share it."""
+    white = stream(seed, Purpose.FLOOR, which).standard_normal((_TILE, _TILE))
     # Longer than wide: filtered by convolution on the torus, so that the tile wraps.
     fy, fx = np.fft.fftfreq(_TILE)[:, None], np.fft.rfftfreq(_TILE)[None, :]
     soft = np.exp(-2 * (np.pi * 1.2) ** 2 * ((fx) ** 2 + (fy) ** 2)) / (1 + 60 * np.hypot(fx, fy))
     tile = np.fft.irfft2(np.fft.rfft2(white) * soft, s=white.shape)
     tile = ((tile - tile.mean()) / tile.std()).astype(np.float32)
-    map_x = (x_m * (_TILE / _TILE_M) % _TILE).astype(np.float32)
-    map_y = (y_m * (_TILE / _TILE_M / stretch) % _TILE).astype(np.float32)
     # One wrapped column and row more, or the interpolation would see the edge of the tile.
     wrapped = np.pad(tile, ((0, 2), (0, 2)), mode="wrap")
-    return np.asarray(cv2.remap(wrapped, map_x, map_y, cv2.INTER_LINEAR), dtype=np.float64)
+    wrapped.flags.writeable = False
+    return wrapped

@@ -14,7 +14,7 @@ from ipsys_log.geometry.markers import marker_corners, white_cells
 from ipsys_log.geometry.poses import transform
 from ipsys_log.messages import CameraCalibration
 
-__all__ = ["Moving", "Placed", "black_cells", "print_outline", "true_corners"]
+__all__ = ["Moving", "Placed", "PlacedBoard", "black_cells", "print_outline", "printed_cells", "true_corners"]
 
 Array = NDArray[np.float64]
 
@@ -33,6 +33,20 @@ class Placed:
     world_from_marker: Array
 
 
+@dataclass(frozen=True, slots=True, eq=False)
+class PlacedBoard:
+    """A printed calibration board in the world.
+
+    ``cells`` (rows, columns) is True where the print is black, its white margin included, top row first;
+    ``cell_m`` is the side of a cell. ``world_from_marker`` is (4, 4); the board's frame has its origin in
+    the centre of the print, x to the right, y up and z towards the viewer.
+    """
+
+    cells: NDArray[np.bool_]
+    cell_m: float
+    world_from_marker: Array
+
+
 # A print by the time in s since the time of the frame.
 Moving = Callable[[float], Placed]
 
@@ -45,10 +59,18 @@ def black_cells(dictionary: str, marker_id: int) -> NDArray[np.bool_]:
     return black
 
 
-def print_outline(placed: Placed, dictionary: str, per_side: int = 8) -> Array:
+def printed_cells(placed: Placed | PlacedBoard, dictionary: str) -> tuple[NDArray[np.bool_], float]:
+    """Return which cells of a print are black, (rows, columns), margin included, and cells per m."""
+    if isinstance(placed, PlacedBoard):
+        return placed.cells, 1 / placed.cell_m
+    cells = black_cells(dictionary, placed.id)
+    return cells, (len(cells) - 2) / placed.length_m
+
+
+def print_outline(placed: Placed | PlacedBoard, dictionary: str, per_side: int = 8) -> Array:
     """Points around the edge of the print, white margin included, (4 per_side, 3) in world m."""
-    cells = len(black_cells(dictionary, placed.id))
-    corners = marker_corners(placed.length_m * cells / (cells - 2))
+    cells, cells_per_m = printed_cells(placed, dictionary)
+    corners = marker_corners(1 / cells_per_m) * [cells.shape[1], cells.shape[0], 1]
     step = np.linspace(0, 1, per_side, endpoint=False)[None, :, None]
     sides = corners[:, None] + step * (np.roll(corners, -1, axis=0) - corners)[:, None]
     return transform(placed.world_from_marker, sides.reshape(-1, 3))

@@ -16,7 +16,18 @@ from ipsys_log.sources.simulator.patterns import Placed, black_cells, print_outl
 from ipsys_log.sources.simulator.seeds import Purpose, stream
 from ipsys_log.sources.simulator.settings import LabSettings
 
-__all__ = ["REFERENCES", "Place", "measure", "overlap", "place", "plan_stations", "seen_whole", "split"]
+__all__ = [
+    "REFERENCES",
+    "Place",
+    "choose_place",
+    "measure",
+    "overlap",
+    "place",
+    "plan_stations",
+    "seen_whole",
+    "split",
+    "tape_lengths_m",
+]
 
 Array = NDArray[np.float64]
 
@@ -99,7 +110,7 @@ def plan_stations(settings: LabSettings, cameras: Sequence[Camera]) -> list[tupl
         for marker_id in range(settings.markers):
             camera = min(cameras, key=lambda one: len(seen[one.name]))
             taken = [station.place for station in stations]
-            where = _choose(rng, settings, cameras, camera, marker_id, taken, seen[camera.name])
+            where = choose_place(rng, settings, cameras, camera, marker_id, taken, seen[camera.name])
             stations.append(Station(where, camera.name))
             for name in seen_whole(where, cameras, settings):
                 seen[name].append(where)
@@ -153,10 +164,15 @@ def measure(
     )
 
 
+def tape_lengths_m(where: Place) -> Array:
+    """Return the true distances of a place from A and B in the plane of the floor, (2,)."""
+    return np.array([np.hypot(where.x_m - p.x_m, where.y_m - p.y_m) for p in REFERENCES])
+
+
 def _tape(where: Place, sigma_m: float, rng: np.random.Generator) -> Array:
     """Two distances that close a triangle with AB; who reads one that does not reads again."""
     a, b = REFERENCES
-    true_m = np.array([np.hypot(where.x_m - p.x_m, where.y_m - p.y_m) for p in (a, b)])
+    true_m = tape_lengths_m(where)
     base_m = np.hypot(b.x_m - a.x_m, b.y_m - a.y_m)
     for _ in range(1000):
         read_m = true_m + rng.normal(0.0, sigma_m, 2)
@@ -168,7 +184,7 @@ def _tape(where: Place, sigma_m: float, rng: np.random.Generator) -> Array:
     )
 
 
-def _choose(
+def choose_place(
     rng: np.random.Generator,
     settings: LabSettings,
     cameras: Sequence[Camera],
@@ -177,6 +193,13 @@ def _choose(
     taken: Sequence[Place],
     before: Sequence[Place],
 ) -> Place:
+    """Choose a place in the view of a camera, far from those ``before``, clear of those that are ``taken``.
+
+    Raises
+    ------
+    IpsysError
+        Where there is no room for the marker.
+    """
     found: list[Place] = []
     for _ in range(_DRAWS):
         x_m, y_m = rng.uniform(0, FLOOR_M, 2)

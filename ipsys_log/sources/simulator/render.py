@@ -7,27 +7,30 @@ its blurred coverage; gamma, noise and rounding follow.
 from __future__ import annotations
 
 from collections.abc import Sequence
+from dataclasses import replace
 
 import cv2
 import numpy as np
 from numpy.typing import NDArray
 
-from ipsys_log.sources.simulator.patterns import Moving, Placed
+from ipsys_log.sources.simulator.patterns import Moving, Placed, PlacedBoard
 from ipsys_log.sources.simulator.settings import LabSettings
 from ipsys_log.sources.simulator.shares import Box, find_shares
 from ipsys_log.sources.simulator.views import FIELD_PX, View, to_light
 
-__all__ = ["encode_jpeg", "expose", "render"]
+__all__ = ["Print", "encode_jpeg", "expose", "lay_down", "render"]
 
 Plane = NDArray[np.float32]
 Image = NDArray[np.uint8]
+# What can be in a frame.
+Print = Placed | PlacedBoard | Moving
 
 # Grey levels that a warm lamp takes from the blue of the floor and adds to its red.
 _BLUE, _RED = 9, 6
 
 
 def render(
-    view: View, placed: Sequence[Placed | Moving], settings: LabSettings, rng: np.random.Generator | None
+    view: View, placed: Sequence[Print], settings: LabSettings, rng: np.random.Generator | None
 ) -> Image:
     """A frame with markers in it.
 
@@ -55,7 +58,7 @@ def render(
     return np.asarray(cv2.merge([blue, levels, red]), dtype=np.uint8)
 
 
-def expose(view: View, placed: Sequence[Placed | Moving], settings: LabSettings) -> Plane:
+def expose(view: View, placed: Sequence[Print], settings: LabSettings) -> Plane:
     """Grey levels of a frame before noise and rounding, (height, width).
 
     Parameters
@@ -63,6 +66,12 @@ def expose(view: View, placed: Sequence[Placed | Moving], settings: LabSettings)
     view, placed, settings : as for :func:`render`.
     """
     return _compose(view, placed, settings)[0]
+
+
+def lay_down(view: View, placed: Sequence[Placed], settings: LabSettings) -> View:
+    """Return a view whose floor shows prints that never move, so that no frame has to draw them again."""
+    grey, bare = _compose(view, placed, settings)
+    return replace(view, floor=to_light(grey, settings), bare=bare)
 
 
 def encode_jpeg(image: Image, settings: LabSettings) -> bytes:
@@ -74,10 +83,10 @@ def encode_jpeg(image: Image, settings: LabSettings) -> bytes:
     return bytes(cv2.imencode(".jpg", image, options)[1])
 
 
-def _compose(view: View, placed: Sequence[Placed | Moving], settings: LabSettings) -> tuple[Plane, Plane]:
+def _compose(view: View, placed: Sequence[Print], settings: LabSettings) -> tuple[Plane, Plane]:
     """Grey levels of a frame, and the share of floor in each pixel, both (h, w)."""
     grey = _levels(view.floor, settings)
-    bare = np.ones_like(grey)
+    bare = np.ones_like(grey) if view.bare is None else view.bare.copy()
     white, black = (to_light(np.float32(level), settings) for level in (settings.white, settings.black))
     for one in placed:
         shares = find_shares(view, one, settings)

@@ -20,6 +20,8 @@ class Purpose(IntEnum):
     DRIVE = 6
     NOISE_FIELD = 7
     FRAME = 8
+    BOARD = 9
+    LYING = 10
 
 
 def stream(seed: int, purpose: Purpose, *which: int) -> np.random.Generator:

@@ -19,7 +19,7 @@ from numpy.typing import NDArray
 
 from ipsys_log.geometry.lenses import project
 from ipsys_log.geometry.poses import transform
-from ipsys_log.sources.simulator.patterns import Moving, Placed, black_cells, print_outline
+from ipsys_log.sources.simulator.patterns import Moving, Placed, PlacedBoard, print_outline, printed_cells
 from ipsys_log.sources.simulator.settings import LabSettings
 from ipsys_log.sources.simulator.shutter import exposed, instants, row_shares
 from ipsys_log.sources.simulator.views import View
@@ -44,16 +44,16 @@ class Shares:
     dark: Plane
 
 
-def find_shares(view: View, placed: Placed | Moving, settings: LabSettings) -> Shares | None:
+def find_shares(view: View, placed: Placed | PlacedBoard | Moving, settings: LabSettings) -> Shares | None:
     """Of a print; None where it is not in the frame."""
-    if isinstance(placed, Placed):
+    if isinstance(placed, (Placed, PlacedBoard)):
         return _still(view, placed, settings)
     if not (settings.row_time_ns or settings.exposure_s):
         return _still(view, placed(0.0), settings)
     return _moving(view, placed, settings)
 
 
-def _still(view: View, placed: Placed, settings: LabSettings) -> Shares | None:
+def _still(view: View, placed: Placed | PlacedBoard, settings: LabSettings) -> Shares | None:
     box = _box_of(view, placed, settings)
     return None if box is None else Shares(box, *_print_shares(view, placed, box, settings))
 
@@ -110,12 +110,12 @@ def _part(box: Box | None, whole: Box, weights: Array, settings: LabSettings) ->
     )
 
 
-def _box_of(view: View, placed: Placed, settings: LabSettings) -> Box | None:
+def _box_of(view: View, placed: Placed | PlacedBoard, settings: LabSettings) -> Box | None:
     outline_px = _outline_px(view, placed, settings)
     return None if outline_px is None else _box(view, outline_px, settings)
 
 
-def _outline_px(view: View, placed: Placed, settings: LabSettings) -> Array | None:
+def _outline_px(view: View, placed: Placed | PlacedBoard, settings: LabSettings) -> Array | None:
     """Points around a print, (n, 2); None if not all of them lie before the camera."""
     outline_m = print_outline(placed, settings.dictionary)
     outline_m = transform(view.camera.camera_from_world, outline_m)
@@ -141,10 +141,12 @@ def _box(view: View, px: Array, settings: LabSettings) -> Box | None:
     return None if cols.start >= width - border else (rows, cols)
 
 
-def _print_shares(view: View, placed: Placed, box: Box, settings: LabSettings) -> tuple[Plane, Plane]:
+def _print_shares(
+    view: View, placed: Placed | PlacedBoard, box: Box, settings: LabSettings
+) -> tuple[Plane, Plane]:
     """Shares of a pixel's light that come from the print, and from its black cells: (h, w) each."""
-    black = black_cells(settings.dictionary, placed.id)
-    columns, rows, pixel_cells = _cells_of(view, placed, box, len(black))
+    black, cells_per_m = printed_cells(placed, settings.dictionary)
+    columns, rows, pixel_cells = _cells_of(view, placed.world_from_marker, box, black.shape, cells_per_m)
     fine = (rows.shape[1] * _SAMPLES, rows.shape[0] * _SAMPLES)
     # One texel is one sample wide: the ramp between two texels is the mean over a sample's footprint.
     texels = [int(np.clip(round(_SAMPLES / size), 4, 512)) for size in pixel_cells]
@@ -161,20 +163,22 @@ def _print_shares(view: View, placed: Placed, box: Box, settings: LabSettings) -
     return shares[0], shares[1]
 
 
-def _cells_of(view: View, placed: Placed, box: Box, cells: int) -> tuple[Array, Array, tuple[float, float]]:
+def _cells_of(
+    view: View, world_from_marker: Array, box: Box, shape: tuple[int, ...], cells_per_m: float
+) -> tuple[Array, Array, tuple[float, float]]:
     """Where the pixels of a box lie on a print, in cells from its top left: column and row, (h, w).
 
     Also by how many columns and rows a step of one pixel takes one further, at most.
     """
-    camera_from_marker = view.camera.camera_from_world @ placed.world_from_marker
+    camera_from_marker = view.camera.camera_from_world @ world_from_marker
     plane = np.linalg.inv(camera_from_marker[:3, [0, 1, 3]])
     uv = view.rays[box]
     x, y, w = (plane[i, 0] * uv[..., 0] + plane[i, 1] * uv[..., 1] + plane[i, 2] for i in range(3))
     # Rays that pass the plane, and prints seen from behind, show nothing.
     seen = w > 1e-6 if camera_from_marker[:3, 2] @ camera_from_marker[:3, 3] < 0 else np.zeros_like(w, bool)
-    scale = (cells - 2) / placed.length_m / np.where(seen, w, 1.0)
-    columns = np.where(seen, cells / 2 + x * scale, -1e4)
-    rows = np.where(seen, cells / 2 - y * scale, -1e4)
+    scale = cells_per_m / np.where(seen, w, 1.0)
+    columns = np.where(seen, shape[1] / 2 + x * scale, -1e4)
+    rows = np.where(seen, shape[0] / 2 - y * scale, -1e4)
     middle = (
         slice(uv.shape[0] // 2 - 1, uv.shape[0] // 2 + 1),
         slice(uv.shape[1] // 2 - 1, uv.shape[1] // 2 + 1),

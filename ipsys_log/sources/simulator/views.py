@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Callable
 from dataclasses import dataclass
 
 import cv2
@@ -13,7 +14,7 @@ from ipsys_log.sources.simulator.floor import lay_floor, pixel_rays
 from ipsys_log.sources.simulator.seeds import Purpose, stream
 from ipsys_log.sources.simulator.settings import LabSettings
 
-__all__ = ["FIELD_PX", "View", "prepare_view", "to_light"]
+__all__ = ["FIELD_PX", "Check", "View", "prepare_view", "to_light"]
 
 Array = NDArray[np.float64]
 Plane = NDArray[np.float32]
@@ -28,7 +29,8 @@ class View:
 
     ``rays`` (h + 2 border, w + 2 border, 2) are normalized coordinates of pixels, ``floor`` (h, w) is
     the light from the empty floor behind the optics, ``noise`` a field that is larger than a frame by
-    192 px each way and of which each frame shows another piece.
+    192 px each way and of which each frame shows another piece. ``bare`` (h, w) is the share of floor in each
+    pixel, where prints lie on it for good.
     """
 
     camera: Camera
@@ -36,13 +38,20 @@ class View:
     rays: Array
     floor: Plane
     noise: Plane
+    bare: Plane | None = None
 
 
-def prepare_view(camera: Camera, settings: LabSettings) -> View:
+# Called between two steps of long work; what it raises ends the work.
+Check = Callable[[], None]
+
+
+def prepare_view(camera: Camera, settings: LabSettings, check: Check = lambda: None) -> View:
     """Everything about a camera's frames that does not change with the markers."""
     border_px = int(np.ceil(4 * settings.psf_sigma_px)) + 2
     rays = pixel_rays(camera.lens, border_px)
-    behind = to_light(lay_floor(settings, camera, rays), settings)
+    check()
+    behind = to_light(lay_floor(settings, camera, rays, check), settings)
+    check()
     if settings.psf_sigma_px:
         behind = cv2.GaussianBlur(behind, (0, 0), settings.psf_sigma_px).astype(np.float32)
     inner = slice(border_px, -border_px)

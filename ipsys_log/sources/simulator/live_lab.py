@@ -1,0 +1,140 @@
+"""The simulated lab that cameras see live: most markers lie still for good, a few drive to and fro.
+
+Nobody has to hurry: a marker can be aligned by, and measured, whenever a command looks.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass, replace
+from functools import lru_cache
+from threading import Lock
+
+import numpy as np
+
+from ipsys_log.errors import IpsysError
+from ipsys_log.messages import Rig, RigCamera, RigMarker
+from ipsys_log.rig_slips import dictionary_size
+from ipsys_log.sources.simulator.cameras import hang_cameras
+from ipsys_log.sources.simulator.drive import Drive, plan_drive
+from ipsys_log.sources.simulator.places import (
+    REFERENCES,
+    Place,
+    choose_place,
+    seen_whole,
+    tape_lengths_m,
+)
+from ipsys_log.sources.simulator.seeds import Purpose, stream
+from ipsys_log.sources.simulator.settings import LabSettings
+from ipsys_log.sources.simulator.simulate import build_rig
+from ipsys_log.units import CM_PER_M
+
+__all__ = ["LIVE_SETTINGS", "LiveLab", "live_rig", "plan_live_lab", "tape_sheet"]
+
+# A laptop draws it while it records: 4 MB a second go to the disk, from three cameras.
+LIVE_SETTINGS = LabSettings(
+    width=1280, height=720, rate_hz=15.0, stations=14, drive_s=4.0, noise_sigma=1.0, jpeg_quality=80
+)
+# Two of three lie on the floor, so that a camera can be aligned by them; the others lie on boxes.
+_HEIGHTS_M = (0.0, 0.0, 0.1, 0.0, 0.0, 0.2)
+# Past the driving markers, one that lies has to keep clear of each of their places so many times a second.
+_CHECKED_HZ = 10
+# The places do not depend on the size of the frames, as long as these are wide.
+_WIDTH, _HEIGHT = 1920, 1080
+
+_planning = Lock()
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class LiveLab:
+    """Where markers are: those with the ids from ``settings.markers`` on lie still, the others drive."""
+
+    settings: LabSettings
+    drive: Drive
+    lying: tuple[Place, ...]
+
+
+def plan_live_lab(settings: LabSettings) -> LiveLab:
+    """Plan a lab in which each camera sees about ``settings.stations`` markers that lie still.
+
+    Parameters
+    ----------
+    settings : the places follow from them but for the size, rate and quality of the frames.
+
+    Raises
+    ------
+    IpsysError
+        Where there is no room for so many markers.
+
+    Examples
+    --------
+    >>> lab = plan_live_lab(LabSettings(stations=4, markers=2, drive_s=2.0))
+    >>> [place.marker_id for place in lab.lying][:3], sorted(lab.drive.ahead_s)
+    ([2, 3, 4], [0, 1])
+    """
+    shape = replace(settings, width=_WIDTH, height=_HEIGHT, rate_hz=LIVE_SETTINGS.rate_hz)
+    with _planning:  # the cameras of a lab are opened at once, and share one plan
+        drive, lying = _plan(shape)
+    return LiveLab(settings, drive, lying)
+
+
+@lru_cache(maxsize=4)
+def _plan(settings: LabSettings) -> tuple[Drive, tuple[Place, ...]]:
+    cameras = hang_cameras(settings)
+    drive = plan_drive(settings, cameras)
+    times_s = np.linspace(0, settings.drive_s, round(settings.drive_s * _CHECKED_HZ) + 1).tolist()
+    taken = [where for time_s in times_s for where in drive.places_at(time_s)]
+    rng = stream(settings.seed, Purpose.LYING)
+    seen: dict[str, list[Place]] = {camera.name: [] for camera in cameras}
+    lying: list[Place] = []
+    while min(map(len, seen.values())) < settings.stations:
+        camera = min(cameras, key=lambda one: len(seen[one.name]))
+        number = settings.markers + len(lying)
+        _check_left(settings, number)
+        level = replace(settings, heights_m=(_HEIGHTS_M[len(lying) % len(_HEIGHTS_M)],))
+        where = choose_place(rng, level, cameras, camera, number, [*taken, *lying], seen[camera.name])
+        lying.append(where)
+        for name in seen_whole(where, cameras, settings):
+            seen[name].append(where)
+    return drive, tuple(lying)
+
+
+def _check_left(settings: LabSettings, number: int) -> None:
+    """See that the dictionary has a marker of this number."""
+    size = dictionary_size(settings.dictionary)
+    if size is not None and number >= size:
+        raise IpsysError(
+            f"simulator: {settings.dictionary} has {size} markers: too few for {settings.markers} that drive "
+            f"and {settings.stations} that lie before each camera; set fewer stations"
+        )
+
+
+def live_rig(settings: LabSettings) -> Rig:
+    """Return the rig of the live lab: each camera with its source, each marker with its height."""
+    rig = build_rig(settings)
+    lying = plan_live_lab(settings).lying
+    cameras = (
+        RigCamera(name, None, None, f"sim:{name}", settings.width, settings.height, settings.rate_hz)
+        for name in settings.cameras
+    )
+    still = (RigMarker(where.marker_id, height_m=where.z_m) for where in lying)
+    return replace(rig, cameras=tuple(cameras), markers=(*rig.markers, *still))
+
+
+def tape_sheet(lying: Sequence[Place]) -> str:
+    """Return what tape and ruler read at markers that lie still, as ``ipsys measure --csv`` reads it.
+
+    Examples
+    --------
+    >>> print(tape_sheet([Place(3, 1.2192, 3.4384, 0.1, 0.0)]))
+    marker,d_A_cm,d_B_cm,side,height_cm
+    3,100.0,263.5,left,10.0
+    <BLANKLINE>
+    """
+    a, b = REFERENCES
+    rows = [f"marker,d_{a.name}_cm,d_{b.name}_cm,side,height_cm"]
+    for where in lying:
+        tapes = ",".join(f"{CM_PER_M * length_m:.1f}" for length_m in tape_lengths_m(where).tolist())
+        side = "left" if where.y_m >= a.y_m else "right"
+        rows.append(f"{where.marker_id},{tapes},{side},{CM_PER_M * where.z_m:.1f}")
+    return "\n".join(rows) + "\n"

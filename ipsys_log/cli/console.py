@@ -19,7 +19,7 @@ if TYPE_CHECKING:
 __all__ = ["console", "print_outcomes", "print_warnings", "progress_bar", "remarks"]
 
 # The stages that go through the frames, one message for each.
-_OF_FRAMES = ("detect", "camera-frame", "locate", "fuse")
+_OF_FRAMES = ("detect", "camera-frame", "locate", "fuse", "simulate")
 _DRAW_EVERY_S = 0.1
 # More runs of a stage than this are counted, not listed.
 _MANY_RUNS = 4

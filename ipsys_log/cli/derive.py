@@ -22,8 +22,10 @@ from ipsys_log.cli.options import (
     RigFile,
     cameras_of,
     load_calibrations,
+    load_matching_rig,
     log_option,
 )
+from ipsys_log.cli.signals import say_kept
 
 if TYPE_CHECKING:
     from ipsys_log.log.session import Session
@@ -192,14 +194,14 @@ def build_command(options: Mapping[str, tuple[Any, Any]], work: Callable[..., No
 
 
 def _request(logs: list[Path], **given: Any) -> Request:
-    from ipsys_log.rig import check_name, load_rig
+    from ipsys_log.rig import check_name
     from ipsys_log.runs.request import Request
 
     rig, run = given.pop("rig"), given.pop("run")
     models = tuple(given.pop("model", None) or ())
     return Request(
         models=models,
-        rig=load_rig(rig) if rig else None,
+        rig=load_matching_rig(rig, lambda: cameras_of(logs)),
         lenses=load_calibrations(given.pop("calibration", None), lambda: cameras_of(logs)),
         run=check_name(run, "--run") if run else None,
         **given,
@@ -218,13 +220,41 @@ def derived(
     from ipsys_log.pipeline import replay
     from ipsys_log.report.accuracy import read_accuracy
 
-    with progress_bar() as progress:
-        outcomes = replay(logs, _request(logs, **given), until, output, progress)
+    request = _request(logs, **given)
+    with say_kept(_kept_runs(logs, output)), progress_bar() as progress:
+        outcomes = replay(logs, request, until, output, progress)
     # A new log is only there if there was something to write.
     written = [output] if output is not None and output.exists() else []
     with Session([*logs, *written]) as session:
         yield session, outcomes, read_accuracy(session, outcomes)
     _remark(outcomes, [*logs, *written][-1] if kept else None)
+
+
+def _kept_runs(logs: list[Path], output: Path | None) -> Callable[[Sequence[str]], str]:
+    """Return what names the runs that an interrupted command has added."""
+    from ipsys_log.log.session import Session
+    from ipsys_log.runs.records import complete_runs
+
+    if output is not None:
+        return lambda _: f"{output} was not written: a new log is written when all is done"
+
+    def complete() -> dict[str, list[str]]:
+        stages: dict[str, list[str]] = {}
+        with Session(logs) as session:
+            for run in complete_runs(session):
+                stages.setdefault(run.run, []).append(run.stage)
+        return stages
+
+    before = complete()
+
+    def added(_: Sequence[str]) -> str:
+        new = {run: [s for s in stages if s not in before.get(run, ())] for run, stages in complete().items()}
+        named = "; ".join(f"{run} ({', '.join(stages)})" for run, stages in new.items() if stages)
+        if not named:
+            return f"{logs[-1]} is as it was: no run was complete"
+        return f"complete in {logs[-1]}: {named}. The same command continues there"
+
+    return added
 
 
 def _derive(

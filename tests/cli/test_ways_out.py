@@ -17,10 +17,12 @@ from pathlib import Path
 import numpy as np
 import pytest
 
+from ipsys_log.cli.signals import Interrupted, note_kept, say_kept
 from ipsys_log.compare import Extent, explain_apart
 from ipsys_log.log.session import Session
 from ipsys_log.messages import CameraCalibration, CameraPoints, Markers, Message, Positions, Rig
 from ipsys_log.runs.output import write_log
+from ipsys_log.sources.simulator import LabSettings, simulate
 from tests.conftest import ROOT, Ipsys
 from tests.test_bad_input import refused, rewrite
 
@@ -264,3 +266,41 @@ def test_evaluate_interrupted_into_a_new_log_keeps_nothing(detected: Path, tmp_p
     assert code == 130
     assert f"ipsys: interrupted; {new} was not written" in err
     assert list(tmp_path.glob("new.mcap*")) == []
+
+
+@pytest.mark.parametrize("files", [(), ("red.yaml", "white.yaml")])
+def test_calibrate_interrupted_names_the_files_written(
+    ipsys: Ipsys, tmp_path: Path, monkeypatch: pytest.MonkeyPatch, files: tuple[str, ...]
+) -> None:
+    def interrupt(*_: object, **__: object) -> None:
+        for name in files:
+            note_kept(name)
+        signal.raise_signal(signal.SIGINT)
+
+    monkeypatch.setattr("ipsys_log.calibration.pictures.find_sources", interrupt)
+    done = ipsys("calibrate", tmp_path, "--board", "6x4")
+    assert done.code == 130
+    said = f"written: {', '.join(files)}" if files else "no file was written"
+    assert done.err == f"ipsys: interrupted; {said}\n"
+
+
+def test_kept_results_of_one_command_are_not_of_the_next(ipsys: Ipsys, tmp_path: Path) -> None:
+    note_kept("other.yaml")
+    with (
+        pytest.raises(Interrupted, match="interrupted; nothing"),
+        say_kept(lambda kept: "".join(kept) or "nothing"),
+    ):
+        raise Interrupted(130, "")
+
+
+def test_simulate_tells_how_far_it_is() -> None:
+    told: list[tuple[str, int, int]] = []
+    lab = LabSettings(width=320, height=180, stations=2, frames_per_station=2, drive_s=0.1, markers=2)
+    messages = list(simulate(lab, lambda *step: told.append(step)))
+    frames = sum(message.topic.endswith("/image") for message in messages)
+    assert [step for step in told if step[0] == "views"] == [("views", n, 3) for n in range(4)]
+    done = [count for stage, count, total in told if stage == "simulate" and total == frames]
+    assert done[0] == 0
+    assert done[-1] == frames
+    assert done == sorted(done)
+    assert len(done) == frames // 3 + 1

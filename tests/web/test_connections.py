@@ -20,10 +20,12 @@ from pathlib import Path
 import pytest
 import uvicorn
 
+from ipsys_log.cli.measure_now import say_faults
 from ipsys_log.errors import IpsysError
 from ipsys_log.log.session import Session
 from ipsys_log.measuring.scene import View
 from ipsys_log.web.connections import Limits, derive_limits
+from ipsys_log.web.faults import Faults
 from ipsys_log.web.serving import Served, serving
 from tests.test_measure_now import Lab, still_lab
 from tests.web.test_guard import Caller
@@ -232,6 +234,19 @@ def test_fault_of_the_page_is_kept_for_the_end(capfd: pytest.CaptureFixture[str]
         assert page.faults.count == 2
         assert page.faults.first.startswith("Traceback")
     assert capfd.readouterr() == ("", "")
+
+
+def test_faults_are_printed_when_the_command_ends(capsys: pytest.CaptureFixture[str]) -> None:
+    faults = Faults()
+    page = Served("http://127.0.0.1/", threading.Thread(), faults)
+    say_faults(page)
+    assert capsys.readouterr() == ("", "")
+    for text in ("[first]", "second"):
+        faults.add(ExceptionGroup("tasks", [ZeroDivisionError(text)]))
+    say_faults(page)
+    said = capsys.readouterr().err
+    assert "faults of ipsys in the measuring page: 2" in said
+    assert said.rstrip().endswith("ZeroDivisionError: [first]")
 
 
 def test_end_of_the_server_leaves_the_block_going(

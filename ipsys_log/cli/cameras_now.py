@@ -104,7 +104,7 @@ def check_target(output: Path, force: bool, files: Iterable[tuple[str, Path]]) -
     """
     from ipsys_log.errors import IpsysError
     from ipsys_log.log.journal import journal_path
-    from ipsys_log.log.lock import check_free, open_locked
+    from ipsys_log.log.lock import check_free, check_locks, open_locked
     from ipsys_log.log.storage import DISK
     from ipsys_log.report.files import check_file
 
@@ -115,6 +115,7 @@ def check_target(output: Path, force: bool, files: Iterable[tuple[str, Path]]) -
     check_file(output, "-o", [])
     if not output.exists():
         check_free(output)
+        check_locks(output.parent)
     else:
         for what, path in files:
             if path.exists() and output.samefile(path):

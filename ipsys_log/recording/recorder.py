@@ -19,9 +19,11 @@ from ipsys_log.log.lock import open_locked
 from ipsys_log.log.storage import DISK
 from ipsys_log.messages import (
     RIG_TOPIC,
+    STAMP_UNRELIABLE,
     CameraCalibration,
     CompressedImage,
     CompressedVideo,
+    Event,
     Measurement,
     Message,
     Rig,
@@ -172,6 +174,8 @@ def written(source: Source, log: Target) -> Iterator[Message | None]:
                 log.flush()
             elif log.full is None or not isinstance(message.payload, (CompressedImage, CompressedVideo)):
                 log.put(message)
+                if isinstance(message.payload, Event) and message.payload.kind == STAMP_UNRELIABLE:
+                    log.flush()  # the frames that it speaks of are never in the file without it
                 if isinstance(message.payload, Measurement):
                     log.flush()
                     log.sync(partial(source.confirm, message))

@@ -17,6 +17,7 @@ from typing import Any
 from ipsys_log.messages import EVENTS_TOPIC, CompressedImage, CompressedVideo, Event, Message, RigCamera
 from ipsys_log.sources.attendant import Arrival, Attendant, Shared
 from ipsys_log.sources.frames import Clock, Open, Say, SourceError
+from ipsys_log.sources.stalls import Heartbeat
 
 __all__ = ["Attached"]
 
@@ -73,11 +74,13 @@ class Attached:
         self._closed = self._ending = False
         self._why = "the recording has ended; measure in its log with: ipsys measure LOG"
         self._started, self._stopped = threading.Event(), threading.Event()
-        shared = Shared(open_source, clock, self._put, say, self._started, self._stopped)
+        self._heartbeat = Heartbeat(clock)
+        shared = Shared(open_source, clock, self._put, say, self._started, self._stopped, self._heartbeat)
         self._attendants = [Attendant(camera, shared) for camera in cameras]
         self.states = {one.name: by.state for one, by in zip(cameras, self._attendants, strict=True)}
 
     def __enter__(self) -> Attached:
+        self._heartbeat.start()
         for attendant in self._attendants:
             attendant.thread.start()
         try:
@@ -239,6 +242,7 @@ class Attached:
 
     def _end(self, seconds: float | None = None) -> None:
         self._stopped.set()
+        self._heartbeat.stop()
         for attendant in self._attendants:
             attendant.thread.join(seconds)
 

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import errno
 import os
 import signal
 from collections.abc import Callable, Iterable, Iterator
@@ -111,7 +112,8 @@ def check_target(output: Path, force: bool, files: Iterable[tuple[str, Path]]) -
     try:
         journal_path(output).exists()
     except OSError as error:
-        raise IpsysError(f"-o {output}: {error.strerror}; give a shorter name") from error
+        shorter = "; give a shorter name" if error.errno == errno.ENAMETOOLONG else ""
+        raise IpsysError(f"-o {output}: {error.strerror}{shorter}") from error
     check_file(output, "-o", [])
     if not output.exists():
         check_free(output)

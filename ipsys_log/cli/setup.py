@@ -59,6 +59,7 @@ def init(
 ) -> None:
     """Write a rig file to edit: markers, cameras, reference points, floor. With comments, or from a log."""
     from ipsys_log.errors import IpsysError
+    from ipsys_log.log.lock import dangling
     from ipsys_log.rig import HIDDEN, example_toml
 
     text = example_toml() if log is None else _rig_of(log)
@@ -66,7 +67,8 @@ def init(
     try:
         file = path.open("x", encoding="utf-8")
     except FileExistsError as error:
-        raise IpsysError(f"{path}: exists already; edit it, or give another name") from error
+        text = dangling(path) or f"{path}: exists already; edit it, or give another name"
+        raise IpsysError(text) from error
     try:
         with file:
             file.write(text)

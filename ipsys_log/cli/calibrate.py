@@ -192,7 +192,10 @@ def _targets(cameras: list[str], output: Path, formats: list[str], force: bool) 
 
 def _check_free(path: Path, force: bool) -> None:
     from ipsys_log.errors import IpsysError
+    from ipsys_log.log.lock import dangling
 
+    if (text := dangling(path)) is not None:
+        raise IpsysError(text)
     if path.exists() and not force:
         raise IpsysError(f"{path}: exists already; choose another --output, or give --force to write over it")
 

@@ -112,6 +112,7 @@ def _write_new(texts: dict[Path, str]) -> None:
         Where a file exists.
     """
     from ipsys_log.errors import IpsysError
+    from ipsys_log.log.lock import dangling
 
     made: list[Path] = []
     try:
@@ -123,7 +124,9 @@ def _write_new(texts: dict[Path, str]) -> None:
         for path in made:
             path.unlink()
         if isinstance(error, FileExistsError):
-            raise IpsysError(f"{error.filename}: exists already; edit it, or give another name") from error
+            taken = Path(error.filename)
+            text = dangling(taken) or f"{taken}: exists already; edit it, or give another name"
+            raise IpsysError(text) from error
         raise
 
 

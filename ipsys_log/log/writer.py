@@ -220,6 +220,11 @@ class LogWriter:
         for builder in (self._images, self._small):
             self._write_chunk(builder)
 
+    def sync(self) -> None:
+        """Wait until what a new log has written is on the disk. Any thread may, while another writes."""
+        if isinstance(self._output, Growing):
+            self._output.sync()
+
     def close(self) -> None:
         """Finish the log: summary, footer, fsync. A second call does nothing."""
         if not self._open:

@@ -6,7 +6,7 @@ import json
 import math
 import re
 import tomllib
-from collections.abc import Iterable, Mapping
+from collections.abc import Collection, Iterable, Mapping
 from dataclasses import MISSING, fields, replace
 from difflib import get_close_matches
 from importlib.resources import files
@@ -22,6 +22,7 @@ __all__ = [
     "STAMPS",
     "check_name",
     "check_rig",
+    "check_rig_cameras",
     "example_toml",
     "hide_password",
     "hide_passwords",
@@ -63,6 +64,37 @@ def check_name(name: str, what: str) -> str:
     if not _NAME.fullmatch(name):
         raise IpsysError(f"{what} {name!r} must be small letters, digits and _, starting with a letter")
     return name
+
+
+def check_rig_cameras(rig: Rig, cameras: Collection[str], where: str) -> list[str]:
+    """See that a rig describes the cameras that it is used for.
+
+    Parameters
+    ----------
+    rig : without any camera it suits all.
+    cameras : names in the log or the pictures.
+    where : the rig file, for the message.
+
+    Returns
+    -------
+    A remark where some cameras are not described.
+
+    Raises
+    ------
+    IpsysError
+        Where the rig describes only other cameras.
+    """
+    described = [camera.name for camera in rig.cameras]
+    missing = sorted(set(cameras) - set(described))
+    if not described or not missing:
+        return []
+    if len(missing) == len(set(cameras)):
+        raise IpsysError(
+            f"{where}: describes the cameras {', '.join(described)}, but there are only "
+            f"{', '.join(missing)}. Give the rig of these, rename its cameras, or take out its [[cameras]]"
+        )
+    named = ", ".join(missing)
+    return [f"{where}: does not describe camera {named}; defaults are used, such as no rolling shutter"]
 
 
 def example_toml() -> str:

@@ -13,6 +13,7 @@ import typer
 from ipsys_log.cli.cameras_now import Lab, prepared, recorded_now, say
 from ipsys_log.cli.console import console, progress_bar, remarks
 from ipsys_log.cli.options import AsJson
+from ipsys_log.cli.signals import note_kept, say_kept
 
 if TYPE_CHECKING:
     from ipsys_log.calibration.calibrate import Calibrated
@@ -81,6 +82,7 @@ def add_commands(app: typer.Typer) -> None:
     app.command()(calibrate)
 
 
+@say_kept(lambda written: f"written: {', '.join(written)}" if written else "no file was written")
 def calibrate(
     board: BoardName,
     sources: Sources = None,
@@ -216,6 +218,7 @@ def _write(lenses: list[Calibrated], targets: dict[str, dict[str, Path]]) -> dic
             contents[path] = FORMATS[name][0](one.lens, sigmas, comment).encode()
     for folder in dict.fromkeys(path.parent for path in contents):
         write_files(folder, {path.name: data for path, data in contents.items() if path.parent == folder})
+        note_kept(", ".join(str(path) for path in contents if path.parent == folder))
     return {one.camera: list(targets[one.camera].values()) for one in lenses}
 
 

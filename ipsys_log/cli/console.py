@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import logging
 import sys
+from collections import Counter
 from collections.abc import Iterator, Sequence
 from contextlib import contextmanager
 from time import monotonic
@@ -18,8 +19,10 @@ if TYPE_CHECKING:
 __all__ = ["console", "print_outcomes", "print_warnings", "progress_bar", "remarks"]
 
 # The stages that go through the frames, one message for each.
-_OF_FRAMES = ("detect", "camera-frame", "locate", "fuse")
+_OF_FRAMES = ("detect", "camera-frame", "locate", "fuse", "simulate")
 _DRAW_EVERY_S = 0.1
+# More runs of a stage than this are counted, not listed.
+_MANY_RUNS = 4
 
 # In a window lines break between words; in a file or a pipe they do not break.
 console = Console(highlight=False, soft_wrap=not sys.stdout.isatty())
@@ -97,11 +100,22 @@ def progress_bar() -> Iterator[Progress]:
 
 def print_outcomes(outcomes: Sequence[Outcome]) -> None:
     """What was done, what was found done, and what was left out."""
-    width = max((len(outcome.run) for outcome in outcomes), default=0)
-    for outcome in outcomes:
+    rest = _print_many(outcomes)
+    width = max((len(outcome.run) for outcome in rest), default=0)
+    for outcome in rest:
         count = "1 message" if outcome.messages == 1 else f"{outcome.messages} messages"
         state = count if outcome.fresh else "up to date"
         remarks.print(f"{outcome.stage:<13} run {outcome.run:<{width}} {state}")
         for remark in outcome.remarks:
             # Names out of a log are not for rich to read as its markup.
             remarks.print(f"  {remark}", style="yellow", markup=False)
+
+
+def _print_many(outcomes: Sequence[Outcome]) -> list[Outcome]:
+    """Print one line for many runs of a stage without remarks; return the other outcomes."""
+    alike = Counter((outcome.stage, outcome.fresh) for outcome in outcomes if not outcome.remarks)
+    many = {kind for kind, count in alike.items() if count > _MANY_RUNS}
+    for stage, fresh in alike:
+        if (stage, fresh) in many:
+            remarks.print(f"{stage:<13} {alike[stage, fresh]} runs {'made' if fresh else 'up to date'}")
+    return [one for one in outcomes if one.remarks or (one.stage, one.fresh) not in many]

@@ -31,6 +31,7 @@ __all__ = [
     "cameras_of",
     "load_calibrations",
     "load_lab",
+    "load_matching_rig",
     "log_option",
 ]
 
@@ -167,6 +168,26 @@ def load_calibrations(
                 raise IpsysError(f"--calibration: two cameras of one name, {name!r}")
         lenses.update(found)
     return lenses
+
+
+def load_matching_rig(path: Path | None, cameras: Callable[[], Collection[str]]) -> Rig | None:
+    """Read a rig for cameras that are given by their pictures; None where no file is named.
+
+    A rig that describes some of the cameras is a remark.
+
+    Raises
+    ------
+    IpsysError
+        Where the rig cannot be read, or describes only other cameras.
+    """
+    if path is None:
+        return None
+    from ipsys_log.rig import check_rig_cameras, load_rig
+
+    rig = load_rig(path)
+    for text in check_rig_cameras(rig, cameras(), f"--rig {path}"):
+        remarks.print(text, style="yellow", markup=False)
+    return rig
 
 
 def load_lab(

@@ -49,18 +49,26 @@ def check_calibration(lens: CameraCalibration, where: str) -> CameraCalibration:
     if wanted is None:
         known = ", ".join(DISTORTION_MODELS)
         raise IpsysError(
-            f"{where}: distortion model {lens.distortion_model!r} is not known; use one of {known}"
+            f"{where}: distortion model {lens.distortion_model!r} is not known (known are {known}). "
+            f"{_advice(lens)}"
         )
     if lens.D.size != wanted:
         raise IpsysError(
-            f"{where}: {lens.distortion_model} takes {wanted} coefficients, found {lens.D.size}; "
-            "calibrate the camera again or mend the file"
+            f"{where}: {lens.distortion_model} takes {wanted} coefficients, found {lens.D.size}. "
+            f"{_advice(lens)}"
         )
     if not (np.isfinite(lens.K).all() and np.isfinite(lens.D).all()):
         raise IpsysError(f"{where}: its matrix or coefficients are no numbers; calibrate again")
     if not lens.K[0, 0] > 0 < lens.K[1, 1]:
         raise IpsysError(f"{where}: the camera matrix K has no positive focal lengths; calibrate again")
     return lens
+
+
+def _advice(lens: CameraCalibration) -> str:
+    """Return what to do about a calibration that cannot be used."""
+    name = lens.frame_id or "camera"
+    option = f"--calibration {name}={name}.yaml"
+    return f"Calibrate the camera with 'ipsys calibrate', and give the file with {option}"
 
 
 def check_size(lens: CameraCalibration, width: int, height: int, camera: str | None) -> None:

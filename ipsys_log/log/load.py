@@ -46,6 +46,8 @@ def load_contents(view: View) -> Contents:
         raise view.fault(max(data_end, 0), "there is no DataEnd record before the summary")
     if contents is None or not complete or not _gaps_hold_no_messages(view, contents, data_end):
         contents = scan(view, data_end)
+    view.check_number(len(contents.channels), "channels")
+    view.check_number(len(contents.schemas), "schemas")
     contents.data_end, contents.data_crc = data_end, crc
     return contents
 

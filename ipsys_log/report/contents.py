@@ -63,7 +63,9 @@ def contents_json(session: Session) -> dict[str, Any]:
 def _lens(session: Session, camera: str) -> dict[str, Any] | None:
     if camera not in session.calibrations:
         return None
-    lens = session.payloads([session.calibrations[camera]])[-1]
+    topic = session.calibrations[camera]
+    *_, message = session.messages([topic], session.last([topic])[0])
+    lens = message.payload
     return {"width": lens.width, "height": lens.height, "model": lens.distortion_model}
 
 

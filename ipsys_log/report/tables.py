@@ -13,6 +13,7 @@ from rich.text import Text
 
 from ipsys_log.messages import CameraEvaluation, ErrorStatistics
 from ipsys_log.offline.errors import POOLED
+from ipsys_log.plain_text import plain_text
 from ipsys_log.report.accuracy import Accuracy, gather_suspects
 from ipsys_log.report.advice import GROUPS, TOLD_NOTE, Advice, Choice, advise, label, told_height
 from ipsys_log.units import CM_PER_M
@@ -60,7 +61,7 @@ def _wrapped(text: str) -> str:
 
 def _name(text: str) -> Text:
     """A name out of a log, with nothing in it that a terminal or a table would obey."""
-    return Text("".join(c if c.isprintable() else "\ufffd" for c in text))
+    return Text(plain_text(text))
 
 
 def _held_out_table(accuracies: Sequence[Accuracy]) -> Table:

@@ -25,6 +25,7 @@ _OF_FRAMES = ("detect", "camera-frame", "locate", "fuse")
 _DRAW_EVERY_S = 0.1
 _LONGEST = 10_000
 
+
 class SafeConsole(Console):
     """A console that obeys nothing in the text that it prints: no markup, and no control characters."""
 
@@ -38,9 +39,7 @@ class SafeConsole(Console):
         """Return a text or a cell for measuring and printing; names of others stand in it."""
         return super().render_str(_plain(text), **options)
 
-    def render(
-        self, renderable: RenderableType, options: ConsoleOptions | None = None
-    ) -> Iterable[Segment]:
+    def render(self, renderable: RenderableType, options: ConsoleOptions | None = None) -> Iterable[Segment]:
         """Yield the pieces of anything to be printed, those of a `Text` included."""
         for piece in super().render(renderable, options):
             yield piece if piece.control else Segment(_plain(piece.text), piece.style)

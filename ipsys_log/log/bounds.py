@@ -10,7 +10,15 @@ from dataclasses import dataclass, field
 from ipsys_log.errors import LogError
 from ipsys_log.units import format_bytes
 
-__all__ = ["LARGEST_CHUNK", "LARGEST_DEFINITION", "LARGEST_MESSAGE", "Allowance", "BoundError", "Items", "chunk_excess"]
+__all__ = [
+    "LARGEST_CHUNK",
+    "LARGEST_DEFINITION",
+    "LARGEST_MESSAGE",
+    "Allowance",
+    "BoundError",
+    "Items",
+    "chunk_excess",
+]
 
 _MIB = 1 << 20
 LARGEST_CHUNK = 256 * _MIB  # bytes, uncompressed

@@ -53,7 +53,9 @@ def unpack(view: View, offset: int, head: ChunkHead) -> bytes:
     """
     check_compression(view, head.compression)
     if not head.compression and head.data_size != head.uncompressed_size:
-        raise view.fault(offset, f"the chunk holds {head.data_size} bytes and claims {head.uncompressed_size}")
+        raise view.fault(
+            offset, f"the chunk holds {head.data_size} bytes and claims {head.uncompressed_size}"
+        )
     excess = chunk_excess(head.data_size, head.uncompressed_size)
     if excess and not head.compression:
         raise view.refusal(excess)

@@ -16,6 +16,7 @@ from ipsys_log.log.bounds import Items
 __all__ = ["NS", "fields_of", "fill_proto", "read_proto"]
 
 NS = 1_000_000_000
+_LATEST_NS = 1 << 63
 
 Fill = Callable[[Any, Any], None]
 Read = Callable[[Any, Items], Any]
@@ -106,7 +107,10 @@ def _time(name: str) -> tuple[Fill, Read]:
 
     def read(proto: Any, _: Items) -> int:
         stamp = getattr(proto, name)
-        return int(stamp.seconds * NS + stamp.nanos)
+        time_ns = int(stamp.seconds * NS + stamp.nanos)
+        if not -_LATEST_NS <= time_ns < _LATEST_NS:
+            raise ValueError(f"{name} is {stamp.seconds} s, later than the year 2262")
+        return time_ns
 
     return fill, read
 

@@ -94,11 +94,11 @@ def _check_definition(name: str, definition: bytes) -> None:
     if len(definition) > _LONGEST_DEFINITION:
         raise LogError(f"its schema {name!r} is not a .msg file of ROS 2: it has {len(definition)} bytes")
     main, *others = re.split(r"^=+\s*^MSG:", definition.decode(errors="replace"), flags=re.MULTILINE)
-    fields = {name.split("/")[-1]: _fields(main)}
+    fields = {name.rsplit("/", maxsplit=1)[-1]: _fields(main)}
     for other in others:
         title, _, text = other.partition("\n")
         fields[title.strip().split("/")[-1]] = _fields(text)
-    for part in (name.split("/")[-1], *_NESTED):
+    for part in (name.rsplit("/", maxsplit=1)[-1], *_NESTED):
         if fields.get(part, _fields(_FIELDS[part])) != _fields(_FIELDS[part]):
             raise LogError(
                 f"its schema {name!r} is not a .msg file of ROS 2, or {part} differs in it; "

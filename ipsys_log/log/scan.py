@@ -12,6 +12,7 @@ from ipsys_log.log.view import View
 
 __all__ = ["add_record", "count_all", "scan"]
 
+
 def scan(view: View, data_end: int) -> Contents:
     """Read the heads of all records in the data section, and the inside of chunks where that is needed."""
     contents, loose = Contents(), Inside()

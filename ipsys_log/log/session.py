@@ -39,6 +39,7 @@ __all__ = ["Session"]
 
 _IMAGES = (CompressedImage, CompressedVideo, RawImage)
 _ITEMS_OF_IMAGE = 16
+_LATEST_NS = 1 << 63
 
 
 class Session:
@@ -151,9 +152,7 @@ class Session:
         LogError
             For a message that is not what its channel's schema says, naming topic and file.
         """
-        streams = [
-            self._decoded(reader, items, topics, start_ns, end_ns) for reader, items in self._items()
-        ]
+        streams = [self._decoded(reader, items, topics, start_ns, end_ns) for reader, items in self._items()]
         return heapq.merge(*streams, key=lambda message: message.log_time_ns)
 
     def stored(self, topics: Collection[str]) -> Iterator[tuple[Message, bytes]]:
@@ -190,6 +189,11 @@ class Session:
 
     def _message(self, reader: LogReader, raw: RawMessage, items: Items) -> Message:
         channel = reader.channels[raw.topic]
+        if max(raw.log_time_ns, raw.publish_time_ns) >= _LATEST_NS:
+            raise LogError(
+                f"{reader.path}: {raw.topic} at {raw.log_time_ns} ns: its time is later than the year 2262; "
+                "the clock of its recorder was wrong"
+            )
         try:
             payload = _decode(reader, channel, raw.data, items)
         except LogError as error:

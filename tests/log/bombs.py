@@ -1,7 +1,7 @@
 """Small files that ask for much: time, memory, or both. None is larger than 1 MB."""
 
 import struct
-from collections.abc import Callable, Iterator
+from collections.abc import Callable
 from dataclasses import dataclass, field
 
 import lz4.frame
@@ -15,13 +15,11 @@ from ipsys_log.log.records import ENTRY, HEADER, INDEX_HEAD, MAGIC, MESSAGE, Chu
 from ipsys_log.log.summary import tail_bytes
 from ipsys_log.messages import (
     CameraCalibration,
-    CameraPoint,
     CameraPoints,
     CompressedImage,
     Event,
     Markers,
     Measurement,
-    Model,
     RawImage,
     Run,
 )
@@ -50,21 +48,33 @@ class Attack:
     contents: Contents = field(default_factory=Contents)
     data: bytearray = field(default_factory=lambda: bytearray(MAGIC + as_bytes(mcap.Header("", ""))))
 
-    def channel(self, payload: type | str, topic: str, encoding: str = "protobuf", definition: bytes = b"") -> int:
+    def channel(
+        self, payload: type | str, topic: str, encoding: str = "protobuf", definition: bytes = b""
+    ) -> int:
         """Define a channel outside of chunks and in the summary."""
         number = len(self.contents.channels) + 1
         name = payload if isinstance(payload, str) else schema_name(payload)
         data = definition or (b"" if isinstance(payload, str) else schema_data(name))
         kind = {"cdr": "ros2msg", "json": "jsonschema"}.get(encoding, "protobuf")
         schema = mcap.Schema(data=data, encoding=kind, id=number, name=name)
-        record = mcap.Channel(id=number, message_encoding=encoding, metadata={}, schema_id=number, topic=topic)
+        record = mcap.Channel(
+            id=number, message_encoding=encoding, metadata={}, schema_id=number, topic=topic
+        )
         self.contents.schemas[number], self.contents.channels[number] = schema, record
         self.data += as_bytes(schema, record)
         return number
 
     def chunk(
-        self, content: bytes, rows: Rows | None = None, *, name: str = "zstd", span: tuple[int, int] = (0, 0),
-        packed: bytes = b"", size: int = -1, count: int = 1, crc: int = 0,
+        self,
+        content: bytes,
+        rows: Rows | None = None,
+        *,
+        name: str = "zstd",
+        span: tuple[int, int] = (0, 0),
+        packed: bytes = b"",
+        size: int = -1,
+        count: int = 1,
+        crc: int = 0,
     ) -> None:
         """Add a chunk; with `rows` a message index of channel 1, else none; `count` of them in Statistics."""
         packed = packed or compress(name, content)
@@ -191,7 +201,7 @@ def many_cameras(number: int) -> bytes:
         )
     content = b"".join(message(b"", n, n) for n in range(1, number + 1))
     attack.chunk(content, count=0, span=(1, number))
-    attack.contents.counts = {n: 1 for n in range(1, number + 1)}
+    attack.contents.counts = dict.fromkeys(range(1, number + 1), 1)
     return attack.finish()
 
 
@@ -217,7 +227,9 @@ def large_definition(size: int, name: str = "ipsys.v1.Event") -> bytes:
 def many_elements(kind: type, field_number: int, element: bytes, times: int, messages: int) -> bytes:
     """Messages with a repeated field of very many small elements."""
     attack = Attack()
-    topic = {CameraPoints: POINTS, Markers: "/runs/r/cameras/a/markers", Run: "/runs/r/record"}.get(kind, "/m")
+    topic = {CameraPoints: POINTS, Markers: "/runs/r/cameras/a/markers", Run: "/runs/r/record"}.get(
+        kind, "/m"
+    )
     attack.channel(kind, topic)
     payload = (bytes([field_number << 3 | 2, len(element)]) + element) * times
     for number in range(messages):
@@ -299,10 +311,8 @@ def images(data: bytes, times: int) -> bytes:
     return large_messages(0, times, True, False, encode(CompressedImage(0, "a", data, "jpeg")))
 
 
-_RECURSIVE = (b"bad_type x\nstd_msgs/Header header\n" + b"=" * 80 + b"\nMSG: std_msgs/Header\nuint32 a\n")
-_EMPTY_ITEMS = (
-    b"a/E[] items\n" + b"=" * 80 + b"\nMSG: a/E\n\n"
-)
+_RECURSIVE = b"bad_type x\nstd_msgs/Header header\n" + b"=" * 80 + b"\nMSG: std_msgs/Header\nuint32 a\n"
+_EMPTY_ITEMS = b"a/E[] items\n" + b"=" * 80 + b"\nMSG: a/E\n\n"
 
 BOMBS: dict[str, Callable[[], bytes]] = {
     "one chunk of 1 GiB, zstd": lambda: zeros("zstd", 1 << 30, 1, True),
@@ -328,9 +338,7 @@ BOMBS: dict[str, Callable[[], bytes]] = {
     "40 k calibrations": lambda: empty_messages(
         encode_calibration(), CameraCalibration, "/cameras/a/calibration", 1000, 40, True
     ),
-    "40 k runs": lambda: empty_messages(
-        b"", Run, "/runs/r/record", 1000, 40, True
-    ),
+    "40 k runs": lambda: empty_messages(b"", Run, "/runs/r/record", 1000, 40, True),
     "40 k measurements": lambda: empty_messages(b"", Measurement, "/measurements", 1000, 40, True),
     "one message 50 k times": lambda: same_message_again(50_000, 15 * MIB),
     "10 k nested messages": lambda: nested_messages(10_000, 15 * MIB),

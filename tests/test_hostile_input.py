@@ -23,9 +23,12 @@ from ipsys_log.formats.opencv_yaml import read_opencv_calibration
 from ipsys_log.geometry.lenses import check_calibration
 from ipsys_log.log.codec import decode, encode
 from ipsys_log.log.session import Session
+from ipsys_log.measuring.check import next_id
 from ipsys_log.measuring.sheet import read_sheet
 from ipsys_log.messages import (
     CameraCalibration,
+    CameraPoint,
+    CameraPoints,
     CompressedImage,
     Measurement,
     Message,
@@ -34,6 +37,7 @@ from ipsys_log.messages import (
     Rig,
     RigMarker,
 )
+from ipsys_log.offline.pairs import gather_sightings
 from ipsys_log.rig import check_rig, load_rig
 from ipsys_log.runs.output import write_log
 from ipsys_log.sources.picture_times import find_times, parse_time
@@ -188,7 +192,7 @@ def test_table_of_times_beyond_all_bounds_is_refused(tmp_path: Path) -> None:
     picture, path = tmp_path / "red" / "1.jpg", tmp_path / "times.csv"
     for time in ("1" * 140_000, "9" * 5_000, "1e999999", "nan"):
         path.write_text(f"file,time\nred/1.jpg,{time}\n")
-        with pytest.raises(IpsysError, match="times.csv"):
+        with pytest.raises(IpsysError, match=r"times\.csv"):
             find_times({"red": [picture]}, str(path))
     with pytest.raises(ValueError, match="1e"):
         parse_time("1e999999999")
@@ -273,7 +277,10 @@ def test_time_from_two_to_the_63_on_is_one_line(ipsys: Ipsys, lab: Path, time_ns
             schema = reader.channels["/cameras/red/image"].schema
         log.add_channel("/cameras/red/image", schema)
         log.write("/cameras/red/image", time_ns, time_ns, encode(CompressedImage(0, "red", b"", "jpeg")))
-    for command in (["view", lab, "--save", lab.with_name("a.rrd")], ["detect", lab, "-o", lab.with_name("b.mcap")]):
+    for command in (
+        ["view", lab, "--save", lab.with_name("a.rrd")],
+        ["detect", lab, "-o", lab.with_name("b.mcap")],
+    ):
         done = ipsys(*command)
         assert done.code == 1
         assert re.fullmatch(r"(.*\n)?ipsys: [^\n]*later than the year 2262[^\n]*\n", done.err)
@@ -285,3 +292,14 @@ def test_time_within_a_payload_beyond_63_bits_is_refused() -> None:
     data = b"\x0a" + bytes([len(stamp)]) + stamp
     with pytest.raises(IpsysError, match="2262"):
         decode("foxglove.CompressedImage", data)
+
+
+@pytest.mark.parametrize("x_m", [1e308, float("nan"), float("-inf")])
+def test_camera_point_outside_every_lab_is_refused(x_m: float) -> None:
+    points = CameraPoints(0, (CameraPoint(1, x_m, 0.0, 2.0),))
+    with pytest.raises(IpsysError, match="camera red: a camera point of marker 1"):
+        gather_sightings([Message("/runs/r/cameras/red/camera_points", 0, 0, points, "red")])
+
+
+def test_next_id_after_an_endless_number_is_the_first() -> None:
+    assert next_id([Measurement(0, "p" + "9" * 5_000), Measurement(0, "p٣")]) == "p001"

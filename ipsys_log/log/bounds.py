@@ -59,7 +59,7 @@ def chunk_excess(packed: int, unpacked: int) -> str:
 
 @dataclass(slots=True)
 class Allowance:
-    """The work that a file of `size` bytes may cause. Work on one chunk counts once, however often it is done."""
+    """The work that a file of `size` bytes may cause. Each chunk counts once, however often it is read."""
 
     size: int
     _unpacked: dict[int, int] = field(default_factory=dict)

@@ -26,8 +26,8 @@ ROS2_PAYLOADS: dict[str, type] = {
 }
 # The definitions of ROS 2, the same from Foxy to Kilted.
 _FIELDS = {
-    "CameraInfo": "std_msgs/Header header\nuint32 height\nuint32 width\nstring distortion_model\nfloat64[] d\n"
-    "float64[9] k\nfloat64[9] r\nfloat64[12] p\nuint32 binning_x\nuint32 binning_y\n"
+    "CameraInfo": "std_msgs/Header header\nuint32 height\nuint32 width\nstring distortion_model\n"
+    "float64[] d\nfloat64[9] k\nfloat64[9] r\nfloat64[12] p\nuint32 binning_x\nuint32 binning_y\n"
     "sensor_msgs/RegionOfInterest roi\n",
     "CompressedImage": "std_msgs/Header header\nstring format\nuint8[] data\n",
     "Image": "std_msgs/Header header\nuint32 height\nuint32 width\nstring encoding\nuint8 is_bigendian\n"

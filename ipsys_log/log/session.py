@@ -189,15 +189,7 @@ class Session:
 
     def _message(self, reader: LogReader, raw: RawMessage, items: Items) -> Message:
         channel = reader.channels[raw.topic]
-        if max(raw.log_time_ns, raw.publish_time_ns) >= _LATEST_NS:
-            raise LogError(
-                f"{reader.path}: {raw.topic} at {raw.log_time_ns} ns: its time is later than the year 2262; "
-                "the clock of its recorder was wrong"
-            )
-        try:
-            payload = _decode(reader, channel, raw.data, items)
-        except LogError as error:
-            raise LogError(f"{reader.path}: {raw.topic} at {raw.log_time_ns} ns: {error}") from error
+        payload = _payload(reader, raw, items)
         if isinstance(payload, Measurement) and reader in self._ids:
             payload = renamed(payload, self._ids[reader])
         camera = self._camera_of.get(raw.topic) or camera_of_topic(raw.topic)
@@ -295,8 +287,21 @@ class Session:
                 raw = next(reader.messages([topic]), None)
                 if raw is not None:
                     items = Items(reader.allowance.most_items)
-                    return str(_decode(reader, reader.channels[topic], raw.data, items).frame_id)
+                    return str(_payload(reader, raw, items).frame_id)
         return ""
+
+
+def _payload(reader: LogReader, raw: RawMessage, items: Items) -> Any:
+    """What a message holds; its fault is named with the log, the topic and the time."""
+    where = f"{reader.path}: {raw.topic} at {raw.log_time_ns} ns"
+    if max(raw.log_time_ns, raw.publish_time_ns) >= _LATEST_NS:
+        raise LogError(f"{where}: its time is later than the year 2262; the clock of its recorder was wrong")
+    try:
+        return _decode(reader, reader.channels[raw.topic], raw.data, items)
+    except BoundError as error:
+        raise BoundError(f"{where}: {error}") from error
+    except LogError as error:
+        raise LogError(f"{where}: {error}") from error
 
 
 def _decode(reader: LogReader, channel: Channel, data: bytes, items: Items) -> Any:

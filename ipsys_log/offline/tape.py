@@ -221,7 +221,7 @@ def _check_lengths(measurement: Measurement, where: str) -> None:
     for distance in measurement.distances:
         if not abs(distance.distance_m) <= _FARTHEST_M:
             raise IpsysError(
-                f"{where}: a tape of {distance.distance_m:g} m lies in no lab; withdraw it and measure it again"
+                f"{where}: a tape of {distance.distance_m:g} m lies in no lab; withdraw it and measure again"
             )
 
 

@@ -85,7 +85,10 @@ def payloads() -> tuple[tuple[str, object], ...]:
         (f"{run}/camera_points", CameraPoints(7, (CameraPoint(1, 0.1, 0.2, 2.0),))),
         (f"{run}/positions", Positions(7, (Position(1, 0.1, 0.2, 0.0),))),
         ("/runs/edges/tracks", Tracks(7, (Track("ada", 1, 0.1, 0.2, 0.0),))),
-        ("/measurements", Measurement(7, "p001", None, 1, (Distance("A", 1.5), Distance("B", 1.5)), "left", 0.1)),
+        (
+            "/measurements",
+            Measurement(7, "p001", None, 1, (Distance("A", 1.5), Distance("B", 1.5)), "left", 0.1),
+        ),
         ("/events", Event(8, "camera_lost", "unplugged", "red")),
         ("/runs/edges/record", Run(9, "edges", "detect", {"corners": "edges"})),
     )

@@ -354,7 +354,7 @@ def test_late_frames_are_named_and_in_no_track(stalled: Path) -> None:
     with Session([stalled]) as session:
         events = [e for e in session.payloads(["/events"]) if e.kind == STAMP_UNRELIABLE]
         tracks = session.payloads(["/runs/poly/tracks"])
-        positions = [m for m in session.messages(session.topics(Positions, "poly"))]
+        positions = list(session.messages(session.topics(Positions, "poly")))
         (fused,) = (run for run in session.runs() if run.stage == "fuse")
     ends = {event.camera: event.end for event in events if event.end is not None}
     assert set(ends) == {event.camera for event in events} == {"black", "red", "white"}

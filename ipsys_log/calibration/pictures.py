@@ -17,6 +17,7 @@ from ipsys_log.errors import FrameError, IpsysError
 from ipsys_log.log.session import Session
 from ipsys_log.messages import CompressedImage, CompressedVideo, RawImage
 from ipsys_log.rig import check_name
+from ipsys_log.stages.detect.picture_size import check_encoded
 from ipsys_log.stages.detect.video import Video
 
 __all__ = ["MOST_LOOKED_AT", "Pictures", "find_sources"]
@@ -147,10 +148,11 @@ def _stride(total: int) -> int:
 
 def _decode(data: bytes) -> Grey | None:
     try:
+        check_encoded(data)
         # Turned as the sensor has it: a lens does not turn with the tag of a picture.
         flags = cv2.IMREAD_GRAYSCALE | cv2.IMREAD_IGNORE_ORIENTATION
         grey = cv2.imdecode(np.frombuffer(data, np.uint8), flags)
-    except cv2.error:  # OpenCV asserts on empty data
+    except (FrameError, cv2.error):  # OpenCV asserts on empty data
         return None
     return None if grey is None else np.asarray(grey, dtype=np.uint8)
 
@@ -228,6 +230,8 @@ def _frame(frame: CompressedImage | RawImage) -> Grey | None:
     step = frame.step or frame.width * channels
     rows = np.frombuffer(frame.data, np.uint8)
     if not channels or step < frame.width * channels or rows.size < step * frame.height:
+        return None
+    if min(frame.width, frame.height) < 1:
         return None
     rows = rows[: step * frame.height].reshape(frame.height, step)[:, : frame.width * channels]
     pixels = np.ascontiguousarray(rows.reshape(frame.height, frame.width, channels))

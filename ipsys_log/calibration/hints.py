@@ -25,7 +25,7 @@ _DICTIONARIES = (
     "DICT_4X4_1000", "DICT_5X5_1000", "DICT_6X6_1000", "DICT_7X7_1000", "DICT_ARUCO_ORIGINAL",
     "DICT_APRILTAG_36h11",
 )  # fmt: skip
-# A grid is that of a board if most pictures show it; else if such a share of the pictures shows it, two or more.
+# A grid is that of a board if most pictures show it; else if such a share of them does, and two or more.
 _MOST, _SUPPORT, _LEAST_SUPPORT = 0.5, 0.2, 2
 # What a user says is refused where more than this share of the pictures says otherwise.
 _CONTRADICTED = 0.5

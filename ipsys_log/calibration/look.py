@@ -8,6 +8,7 @@ from dataclasses import dataclass
 from typing import NamedTuple
 
 from ipsys_log.calibration.boards import Board
+from ipsys_log.calibration.chessboard import fits_in
 from ipsys_log.calibration.choose import Dropped
 from ipsys_log.calibration.hints import check_charuco_size, check_chessboard_size, hint
 from ipsys_log.calibration.sighting import Grey, Sighting, View, view_board
@@ -114,7 +115,9 @@ def _reason(view: View, board: Board) -> str:
     if view.grid is None:
         return "the board is not seen"
     columns, rows = view.grid
-    return f"a grid of {columns} x {rows} corners is seen, not {board.columns} x {board.rows}"
+    if fits_in(view.grid, board.grid):
+        return f"only {columns} x {rows} of its corners are seen"
+    return f"a grid of {columns} x {rows} corners is seen instead"
 
 
 def check_sizes(sizes: Sequence[tuple[str, Size]], where: str) -> Size:

@@ -80,8 +80,8 @@ Force = Annotated[
     typer.Option(
         "--force",
         help="Override four checks: that no file is overwritten; that most pictures show no larger board "
-        "than --board; that the result is usable (RMS of at most 2 px, 5 pictures or more); that all pictures are "
-        "of one camera.",
+        "than --board; that the result is usable (RMS of at most 2 px, 5 pictures or more); that all "
+        "pictures are of one camera.",
     ),
 ]
 

@@ -26,8 +26,8 @@ _HOLD_S = 0.6
 class Film:
     """Pictures of a camera, and which of them each frame shows.
 
-    ``draw`` makes the JPEG picture of an index from 0 to ``count``; ``index_of`` tells the index for the number
-    of a frame since 1970, so that all cameras of a lab agree. It repeats after ``period`` frames.
+    ``draw`` makes the JPEG picture of an index from 0 to ``count``; ``index_of`` tells the index for the
+    number of a frame since 1970, so that all cameras of a lab agree. It repeats after ``period`` frames.
     """
 
     count: int

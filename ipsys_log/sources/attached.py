@@ -78,9 +78,9 @@ class Attached:
         self.states = {one.name: by.state for one, by in zip(cameras, self._attendants, strict=True)}
 
     def __enter__(self) -> Attached:
-        for attendant in self._attendants:
-            attendant.thread.start()
         try:
+            for attendant in self._attendants:
+                attendant.thread.start()
             for attendant in self._attendants:
                 attendant.wait()
         except BaseException:
@@ -219,7 +219,8 @@ class Attached:
     def _end(self, seconds: float | None = None) -> None:
         self._stopped.set()
         for attendant in self._attendants:
-            attendant.thread.join(seconds)
+            if attendant.thread.ident is not None:  # an interrupt may come before all were started
+                attendant.thread.join(seconds)
 
 
 def _bytes_of(arrival: Arrival | None) -> int:

@@ -8,7 +8,7 @@ from collections.abc import Callable, Iterator
 from contextlib import contextmanager
 from dataclasses import fields, replace
 from fractions import Fraction
-from threading import Event, Thread
+from threading import Event, Thread, main_thread
 from typing import NamedTuple
 from urllib.parse import parse_qsl, urlencode
 
@@ -20,10 +20,10 @@ from ipsys_log.sources.frames import Clock, Frame, Say
 from ipsys_log.sources.simulator.board import board_cells
 from ipsys_log.sources.simulator.cameras import hang_cameras
 from ipsys_log.sources.simulator.film import Film, board_film, lab_film, next_missing
+from ipsys_log.sources.simulator.floor import Check
 from ipsys_log.sources.simulator.live_lab import LIVE_SETTINGS
 from ipsys_log.sources.simulator.settings import LabSettings
 from ipsys_log.sources.simulator.shutter import exposed
-from ipsys_log.sources.simulator.views import Check
 from ipsys_log.units import NS_PER_S
 
 __all__ = ["Seat", "lens_of", "open_simulated", "parse_source", "show_board"]
@@ -82,7 +82,8 @@ class _Pictures:
             self._fault = fault
 
     def _check(self) -> None:
-        if self._stopped.is_set():
+        # Python waits for this thread when the program ends, also where nobody was left to stop it.
+        if self._stopped.is_set() or not main_thread().is_alive():
             raise _Stopped
 
 

@@ -3,9 +3,9 @@
     python benchmarks/live.py --record-seconds 60 --live-seconds 30
 
 FFmpeg serves JPEGs of the simulated lab, 1920 x 1080 at 30/s and about 300 kB, from loopback as HTTP MJPEG,
-one process for each camera. ``ipsys record`` and ``ipsys live`` run as a user runs them; their processor time
-is all that their process takes, its start included. Then more and more cameras are recorded at once, until
-one is short of frames; the processes that serve them run on the same cores.
+one process for each camera; a stream that never comes is named. ``ipsys record`` and ``ipsys live`` run as a
+user runs them; their processor time is all that their process takes, its start included. Then more and more
+cameras are recorded at once, until one is short of frames; their streams are served by the same cores.
 """
 
 from __future__ import annotations
@@ -13,22 +13,18 @@ from __future__ import annotations
 import argparse
 import os
 import shutil
-import socket
 import subprocess
 import sys
 import tempfile
-import time
-from collections.abc import Iterator, Sequence
-from contextlib import ExitStack, contextmanager
+from collections.abc import Iterable, Iterator, Sequence
+from contextlib import contextmanager
 from dataclasses import replace
 from pathlib import Path
-from typing import Any
 
-import cv2
-import numpy as np
 from results import Report, command
 from rounds import Row
 from scenes import drawn
+from streams import Served, loops_of, serve
 
 from ipsys_log import pipeline
 from ipsys_log.log.session import Session
@@ -42,91 +38,65 @@ __all__ = ["measure"]
 _RATE_HZ = 30.0
 # A camera that has sent less than this share of its frames is too much.
 _SHORT = 0.98
+# Cameras that are recorded at once, more and more.
+_COUNTS = (6, 9, 12, 15, 18, 24)
 
 
-def _free_port() -> int:
-    with socket.socket() as probe:
-        probe.bind(("127.0.0.1", 0))
-        return int(probe.getsockname()[1])
-
-
-def _loops(lab: Path, folder: Path) -> dict[str, Path]:
-    """The drive of each camera as a stream of JPEGs, to and fro, so that nothing jumps."""
-    loops = {}
-    with Session([lab]) as session:
-        for name, topic in session.images.items():
-            frames = [message.payload.data for message in session.messages([topic])][-60:]
-            loops[name] = folder / f"{name}.mjpeg"
-            loops[name].write_bytes(b"".join([*frames, *frames[-2:0:-1]]))
-    return loops
-
-
-def _lens_file(path: Path, lens: Any) -> str:
-    file = cv2.FileStorage(str(path), cv2.FILE_STORAGE_WRITE)
-    file.write("camera_matrix", np.ascontiguousarray(lens.K))
-    file.write("distortion_coefficients", np.ascontiguousarray(lens.D))
-    file.write("image_width", lens.width)
-    file.write("image_height", lens.height)
-    file.release()
-    return path.name
-
-
-@contextmanager
-def _served(lab: Path, loops: dict[str, Path], count: int, folder: Path) -> Iterator[Path]:
-    """A rig of so many cameras that are served now."""
-    from ipsys_log.rig import rig_toml
-
-    with Session([lab]) as session:
-        text = rig_toml(session.payloads(["/rig"])[0]).partition("[[cameras]]")[0]
-        lenses = {name: session.payloads([topic])[0] for name, topic in session.calibrations.items()}
-    kind = ["-f", "mpjpeg", "-content_type", "multipart/x-mixed-replace;boundary=ffmpeg", "-listen", "1"]
-    with ExitStack() as stack:
-        for number in range(count):
-            base = sorted(loops)[number % len(loops)]
-            name = base if number < len(loops) else f"{base}_{number}"
-            address = f"http://127.0.0.1:{_free_port()}/{name}"
-            loop = ["-re", "-stream_loop", "-1", "-f", "mjpeg", "-framerate", "30", "-i", str(loops[base])]
-            program = subprocess.Popen(
-                ["ffmpeg", "-v", "quiet", "-nostdin", *loop, "-c", "copy", *kind, address],
-                stderr=subprocess.DEVNULL,
-            )
-            stack.callback(program.wait)
-            stack.callback(program.kill)
-            lens = _lens_file(folder / f"{name}.yaml", lenses[base])
-            text += f'[[cameras]]\nname = "{name}"\nsource = "{address}"\ncalibration = "{lens}"\n'
-        time.sleep(1.0)
-        rig = folder / "lab.toml"
-        rig.write_text(text, encoding="utf-8")
-        yield rig
+class _FailedError(Exception):
+    """A command of ours that did not end with 0."""
 
 
 def _run(arguments: Sequence[object]) -> float:
-    """Processor time of a command, in s."""
-    program = subprocess.Popen(
-        [sys.executable, "-m", "ipsys_log", *map(str, arguments)], stdout=subprocess.DEVNULL
-    )
-    _, status, usage = os.wait4(program.pid, 0)
-    program.returncode = os.waitstatus_to_exitcode(status)
+    """Return the processor time of a command, in s.
+
+    Raises
+    ------
+    _FailedError
+        With its last line, where it did not end with 0.
+    """
+    with tempfile.TemporaryFile("w+") as said:
+        program = subprocess.Popen(
+            [sys.executable, "-m", "ipsys_log", *map(str, arguments)], stdout=subprocess.DEVNULL, stderr=said
+        )
+        _, status, usage = os.wait4(program.pid, 0)
+        program.returncode = os.waitstatus_to_exitcode(status)
+        said.seek(0)
+        lines = said.read().strip().splitlines()
     if program.returncode:
-        raise SystemExit(f"live: ipsys {arguments[0]} ended with {program.returncode}")
+        last = lines[-1] if lines else "no word"
+        raise _FailedError(f"ipsys {arguments[0]} ended with {program.returncode}: {last}")
     return usage.ru_utime + usage.ru_stime
 
 
-def _rates(log: Path) -> dict[str, tuple[int, float, int]]:
-    """Frames, frames per second, and the size of a frame in bytes, of each camera."""
+@contextmanager
+def _measured(what: str, report: Report) -> Iterator[None]:
+    """Turn a failure into a remark: what was measured so far is still reported."""
+    try:
+        yield
+    except _FailedError as error:
+        report.remarks.append(f"{what}: {error}")
+        report.failed = True
+
+
+def _say_missing(what: str, served: Served, report: Report) -> None:
+    report.remarks += [f"{what}: {name} never came: {why}" for name, why in served.missing.items()]
+    report.failed = report.failed or bool(served.missing)
+    if not served.cameras:
+        raise _FailedError("no stream came; nothing was measured")
+
+
+def _rates(log: Path, cameras: Iterable[str]) -> dict[str, tuple[int, float, int]]:
+    """Return frames, frames per second, and the size of a frame in bytes; zeros for a camera without any."""
     found = {}
     with Session([log]) as session:
-        for name, topic in session.images.items():
+        for name in cameras:
             times, size = [], 0
-            for message in session.messages([topic]):
+            for message in session.messages([session.images[name]] if name in session.images else []):
                 assert isinstance(message.payload, CompressedImage)
                 times.append(message.log_time_ns)
                 size += len(message.payload.data)
-            found[name] = (
-                len(times),
-                (len(times) - 1) / max(times[-1] - times[0], 1) * 1e9,
-                size // len(times),
-            )
+            rate_hz = (len(times) - 1) / (times[-1] - times[0]) * 1e9 if len(times) > 1 else 0.0
+            found[name] = len(times), rate_hz, size // max(len(times), 1)
     return found
 
 
@@ -138,36 +108,37 @@ def _events(log: Path, kind: str) -> int:
 def _record(
     lab: Path, loops: dict[str, Path], folder: Path, options: argparse.Namespace, report: Report
 ) -> None:
-    seconds = 2.0 if options.smoke else options.record_seconds
-    with _served(lab, loops, 3, folder) as rig:
-        cpu_s = _run(["record", "--rig", rig, "-o", folder / "record.mcap", "--seconds", seconds])
-    rates = _rates(folder / "record.mcap")
+    seconds, log = 2.0 if options.smoke else options.record_seconds, folder / "record.mcap"
+    with serve(lab, loops, 3, folder, options.wait_seconds) as served:
+        _say_missing("record", served, report)
+        cpu_s = _run(["record", "--rig", served.rig, "-o", log, "--seconds", seconds])
+    rates = _rates(log, served.cameras)
     report.rows += [
-        Row("record, 3 cameras: of one core", (100 * cpu_s / seconds,), "%", ("<=", 25)),
-        Row(
-            "gaps by dropped frames",
-            (_events(folder / "record.mcap", "frames_dropped"),),
-            "events",
-            ("<=", 0),
-        ),
+        Row(f"record, {len(rates)} cameras: of one core", (100 * cpu_s / seconds,), "%", ("<=", 25)),
+        Row("gaps by dropped frames", (_events(log, "frames_dropped"),), "events", ("<=", 0)),
         Row("least rate of a camera", (min(rate for _, rate, _ in rates.values()),), "Hz", (">=", 29.5)),
         Row("frame", (min(size for _, _, size in rates.values()) / 1e3,), "kB"),
     ]
     report.details["record"] = {"cpu_s": cpu_s, "seconds": seconds, "cameras": rates}
-    (folder / "record.mcap").unlink()
+    log.unlink()
 
 
-def _many(lab: Path, loops: dict[str, Path], folder: Path, report: Report) -> None:
-    """How many cameras can be recorded at once."""
+def _many(
+    lab: Path, loops: dict[str, Path], folder: Path, options: argparse.Namespace, report: Report
+) -> None:
+    """Find how many cameras can be recorded at once."""
     held, log = 0, folder / "many.mcap"
-    for count in (6, 9, 12, 15, 18, 24):
-        with _served(lab, loops, count, folder) as rig:
-            cpu_s = _run(["record", "--rig", rig, "-o", log, "--seconds", 10])
-        slowest = min(rate for _, rate, _ in _rates(log).values())
-        dropped = _events(log, "frames_dropped")
-        log.unlink()
-        report.details[f"{count} cameras"] = {"cpu_s": cpu_s, "slowest_hz": slowest, "drops": dropped}
-        if slowest < _SHORT * _RATE_HZ or dropped:
+    for count in _COUNTS:
+        what, before = f"{count} cameras", len(report.remarks)
+        with _measured(what, report), serve(lab, loops, count, folder, options.wait_seconds) as served:
+            _say_missing(what, served, report)
+            cpu_s = _run(["record", "--rig", served.rig, "-o", log, "--seconds", options.many_seconds])
+            rates = _rates(log, served.cameras)
+            slowest, dropped = min(rate for _, rate, _ in rates.values()), _events(log, "frames_dropped")
+            details = {"cpu_s": cpu_s, "slowest_hz": slowest, "drops": dropped, "cameras": len(rates)}
+            report.details[what] = details
+        log.unlink(missing_ok=True)
+        if len(report.remarks) > before or slowest < _SHORT * _RATE_HZ or dropped:
             break
         held = count
     report.rows.append(Row("cameras held at once", (held,), "cameras"))
@@ -179,20 +150,23 @@ def _live(
     seconds = 3.0 if options.smoke else options.live_seconds
     calibrated, log = folder / "calibration.mcap", folder / "live.mcap"
     pipeline.replay([lab], Request(), output=calibrated)
-    with _served(lab, loops, 3, folder) as rig:
-        cpu_s = _run(["live", "--rig", rig, "--model-from", calibrated, "-o", log, "--seconds", seconds])
+    with serve(lab, loops, 3, folder, options.wait_seconds) as served:
+        _say_missing("live", served, report)
+        cpu_s = _run(
+            ["live", "--rig", served.rig, "--model-from", calibrated, "-o", log, "--seconds", seconds]
+        )
     steps = latency_percentiles(step_times_s(recorded_latencies([log])))
     report.rows += [
         Row("live: skipped", (_events(log, FRAME_SKIPPED),), "frames", ("<=", 0)),
         Row("frame received to position, median", (1e3 * steps["total"].median_s,), "ms", ("<=", 40)),
         Row("the same, 99 %", (1e3 * steps["total"].p99_s,), "ms", ("<=", 100)),
-        Row("live, 3 cameras: of one core", (100 * cpu_s / seconds,), "%"),
+        Row(f"live, {len(served.cameras)} cameras: of one core", (100 * cpu_s / seconds,), "%"),
     ]
     report.details["live"] = {
         "steps_ms": {
             name: [1e3 * s for s in (p.median_s, p.p90_s, p.p99_s, p.max_s)] for name, p in steps.items()
         },
-        "cameras": _rates(log),
+        "cameras": _rates(log, served.cameras),
     }
 
 
@@ -206,17 +180,21 @@ def measure(options: argparse.Namespace) -> Report:
     lab = drawn(replace(settings, width=640, height=360, stations=25) if options.smoke else settings)
     with tempfile.TemporaryDirectory() as name:
         folder = Path(name)
-        loops = _loops(lab, folder)
-        _record(lab, loops, folder, options, report)
-        _live(lab, loops, folder, options, report)
+        loops = loops_of(lab, folder)
+        with _measured("record", report):
+            _record(lab, loops, folder, options, report)
+        with _measured("live", report):
+            _live(lab, loops, folder, options, report)
         if not options.smoke:
-            _many(lab, loops, folder, report)
+            _many(lab, loops, folder, options, report)
     return report
 
 
 def add_options(parser: argparse._ArgumentGroup) -> None:
     parser.add_argument("--record-seconds", type=float, default=60.0, help="of three streams")
     parser.add_argument("--live-seconds", type=float, default=30.0, help="of three streams")
+    parser.add_argument("--many-seconds", type=float, default=10.0, help="of 6 to 24 streams")
+    parser.add_argument("--wait-seconds", type=float, default=60.0, help="for all streams to be there")
 
 
 if __name__ == "__main__":

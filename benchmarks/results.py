@@ -30,13 +30,17 @@ BENCHMARKS = {
 
 @dataclass(slots=True)
 class Report:
-    """What a benchmark found: rows for the table, tables of its own, remarks; ``details`` for the file."""
+    """What a benchmark found: rows for the table, tables of its own, remarks; ``details`` for the file.
+
+    One that ``failed`` has not measured all that it should.
+    """
 
     name: str
     rows: list[Row] = field(default_factory=list)
     tables: list[str] = field(default_factory=list)
     remarks: list[str] = field(default_factory=list)
     details: dict[str, Any] = field(default_factory=dict)
+    failed: bool = False
 
 
 def _table(reports: list[Report], smoke: bool) -> str:
@@ -86,7 +90,7 @@ def run_all(names: list[str], options: argparse.Namespace, output: Path | None) 
     for name in names:
         begin = time.perf_counter()
         print(f"{name}: {BENCHMARKS[name]} ...", end=" ", file=sys.stderr, flush=True)
-        reports.append(importlib.import_module(name).measure(options))
+        reports.append(_measure(name, options))
         print(f"{time.perf_counter() - begin:.0f} s", file=sys.stderr)
     machine["load_at_end"] = os.getloadavg()
     print(_table(reports, options.smoke))
@@ -97,6 +101,17 @@ def run_all(names: list[str], options: argparse.Namespace, output: Path | None) 
         output.parent.mkdir(parents=True, exist_ok=True)
         output.write_text(json.dumps(_as_json(reports, machine, options), indent=2) + "\n", encoding="utf-8")
         print(f"written to {output}")
+    if any(report.failed for report in reports):
+        raise SystemExit(1)
+
+
+def _measure(name: str, options: argparse.Namespace) -> Report:
+    """Run a benchmark; one that gives up is a remark, for the others have figures."""
+    try:
+        report: Report = importlib.import_module(name).measure(options)
+        return report
+    except SystemExit as stop:
+        return Report(name, remarks=[f"gave up: {stop}"], failed=True)
 
 
 def parser_of(description: str | None, modules: list[ModuleType]) -> argparse.ArgumentParser:

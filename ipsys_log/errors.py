@@ -1,6 +1,17 @@
 """What went wrong in the user's input, in one line: what, where, and what to do."""
 
-__all__ = ["FitError", "FrameError", "IpsysError", "LogError", "SizeError", "WriteError"]
+import errno
+
+__all__ = [
+    "FitError",
+    "FrameError",
+    "IpsysError",
+    "LogError",
+    "SizeError",
+    "WriteError",
+    "disk_advice",
+    "is_full",
+]
 
 
 class IpsysError(Exception):
@@ -16,7 +27,11 @@ class LogError(IpsysError):
 
 
 class WriteError(LogError):
-    """The disk takes no more, or takes nothing."""
+    """A disk that takes no more, or takes nothing. ``cause`` is what the operating system said."""
+
+    def __init__(self, text: str, cause: OSError) -> None:
+        super().__init__(text)
+        self.cause = cause
 
 
 class FitError(IpsysError, ValueError):
@@ -29,3 +44,21 @@ class FrameError(IpsysError, ValueError):
 
 class SizeError(IpsysError):
     """A frame of another size than its lens."""
+
+
+def is_full(error: OSError) -> bool:
+    """Return whether a disk, or what the user may have of it, is full."""
+    return error.errno in (errno.ENOSPC, errno.EDQUOT)
+
+
+def disk_advice(error: OSError) -> str:
+    """Return what to do about a disk that cannot be written to, by what the operating system said."""
+    if is_full(error):
+        return "free some space and try again"
+    if error.errno == errno.EROFS:
+        return "the disk takes no writes now (it may have had a fault): mount it for writing, or use another"
+    if error.errno == errno.EFBIG:
+        return "files of this size are not possible there: use a disk with another file system"
+    if error.errno in (errno.EACCES, errno.EPERM):
+        return "ask for the right to write there, or use another folder"
+    return "the disk or its connection is at fault: copy the log to another disk, and try again there"

@@ -215,9 +215,7 @@ def record(
     IpsysError
         Where the log cannot be written; what it holds by then is a complete log.
     """
-    with recording(target, overwrite) as log:
-        for message in settings:
-            log.put(message)
+    with recording(target, settings, overwrite) as log:
         for arrived in written(source, log):
             watch(arrived)
     log.check_disk()
@@ -256,14 +254,15 @@ def measure(
     check_pictures(cameras.states)
     plan = plan_live(cameras.states, settings, request, "camera-frame")
     detect, camera_frame = (Stage(*row) for row in plan.rows)
-    with recording(target, overwrite) as log, threadpool_limits(1, user_api="blas"):
-        for message in settings:
-            log.put(message)
-        log.flush()  # it may be long until the first place
-        with Recent(log) as recent, Backlog(cameras, recent, cameras.now_ns) as frames:
-            for message in run(run(chain(settings, frames), [detect], in_threads), [camera_frame]):
-                if message is not TICK:
-                    watch(message)
+    with (
+        threadpool_limits(1, user_api="blas"),
+        recording(target, settings, overwrite) as log,
+        Recent(log) as recent,
+        Backlog(cameras, recent, cameras.now_ns) as frames,
+    ):
+        for message in run(run(chain(settings, frames), [detect], in_threads), [camera_frame]):
+            if message is not TICK:
+                watch(message)
     log.check_disk()
     return log.counts
 
@@ -299,18 +298,20 @@ def live(
         Where the other log has no such model, or the log cannot be written; what it holds is kept.
     """
     plan = plan_live(cameras.states, settings, request, until)
-    with recording(target, overwrite) as log, threadpool_limits(1, user_api="blas"):
-        for message in (*settings, *plan.copies(cameras.now_ns)):
-            log.put(message)
-        with Backlog(cameras, log, cameras.now_ns) as frames:
-            stages = [Stage(*row) for row in plan.rows]
-            ledger = Ledger(cameras.clock.now_ns, cameras.received_ns)
-            fault = _put_through(chain(settings, frames), stages, ledger, log, watch)
-            if fault is not None:
-                cameras.warn("stages_stopped", f"{fault}; frames are recorded all the same")
-                for message in frames:
-                    if message is not TICK:
-                        watch(message)
+    first = (*settings, *plan.copies(cameras.now_ns))
+    with (
+        threadpool_limits(1, user_api="blas"),
+        recording(target, first, overwrite) as log,
+        Backlog(cameras, log, cameras.now_ns) as frames,
+    ):
+        stages = [Stage(*row) for row in plan.rows]
+        ledger = Ledger(cameras.clock.now_ns, cameras.received_ns)
+        fault = _put_through(chain(settings, frames), stages, ledger, log, watch)
+        if fault is not None:
+            cameras.warn("stages_stopped", f"{fault}; frames are recorded all the same")
+            for message in frames:
+                if message is not TICK:
+                    watch(message)
     if fault is not None:
         raise IpsysError(f"{fault}; {target} has all frames: replay it") from fault
     if frames.skipped:

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import os
 import shutil
+import signal
 import subprocess
 import sys
 from collections.abc import Callable, Iterator
@@ -28,6 +29,8 @@ from ipsys_log.sources.videos import open_video
 from tests.sources.streams import encode
 
 ROOT = Path(__file__).resolve().parent.parent
+# The command line installs handlers for these; a test gives them back.
+SIGNALS = (signal.SIGINT, signal.SIGTERM, signal.SIGHUP)
 # A program for Debian's own Python.
 collect_ignore = ["sources/rtsp_server.py"]
 
@@ -70,10 +73,14 @@ def ipsys(monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]) -
     def run(*arguments: object) -> Done:
         monkeypatch.setattr(sys, "argv", ["ipsys", *map(str, arguments)])
         code = 0
+        handlers = {number: signal.getsignal(number) for number in SIGNALS}
         try:
             main()
         except SystemExit as stop:
             code = stop.code if isinstance(stop.code, int) else 1
+        finally:
+            for number, handler in handlers.items():
+                signal.signal(number, handler)
         captured = capsys.readouterr()
         return Done(code, captured.out, captured.err)
 

@@ -4,9 +4,13 @@ from __future__ import annotations
 
 import importlib
 import json
+import os
+import shutil
+import socket
 import subprocess
 import sys
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 import pytest
@@ -53,3 +57,116 @@ def test_corners_are_scored_against_the_truth(monkeypatch: pytest.MonkeyPatch) -
         "markers": 3,
         "wrong_ids": 2,
     }
+
+
+# In place of ffmpeg: of the cameras' streams one is late and one never comes.
+_LATE = """#!/bin/sh
+case "$*" in
+*/white) echo "no camera here" >&2; exit 3 ;;
+*/red) sleep 2 ;;
+esac
+exec {ffmpeg} "$@"
+"""
+
+
+def put_in_path(program: str, folder: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    """Let a script stand for ffmpeg."""
+    script = folder / "ffmpeg"
+    script.write_text(program)
+    script.chmod(0o755)
+    monkeypatch.setenv("PATH", f"{folder}{os.pathsep}{os.environ['PATH']}")
+
+
+@pytest.mark.slow
+def test_live_reports_what_it_measured_without_a_stream(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    ffmpeg = shutil.which("ffmpeg")
+    if ffmpeg is None:
+        pytest.skip("no ffmpeg")
+    put_in_path(_LATE.format(ffmpeg=ffmpeg), tmp_path, monkeypatch)
+    output = tmp_path / "results.json"
+    command = [sys.executable, "bench.py", "live", "--smoke", "-o", str(output)]
+    done = subprocess.run(command, cwd=BENCHMARKS, capture_output=True, text=True, check=False)
+    assert "live: record: white never came: ffmpeg ended with 3: no camera here" in done.stdout, done.stderr
+    assert "Traceback" not in done.stderr
+    results = json.loads(output.read_text(encoding="utf-8"))
+    # The late one is measured, as the others are.
+    assert set(results["details"]["live"]["record"]["cameras"]) == {"red", "black"}
+    assert all(frames > 30 for frames, _, _ in results["details"]["live"]["record"]["cameras"].values())
+    assert results["figures"]["live"]["live, 2 cameras: of one core"]["median"] > 0
+    assert done.returncode == 1
+
+
+@pytest.fixture
+def streams(monkeypatch: pytest.MonkeyPatch) -> Any:
+    monkeypatch.syspath_prepend(BENCHMARKS)
+    return importlib.import_module("streams")
+
+
+# Listens as ffmpeg does, after a while; of the camera black never, of white it ends at once.
+_LISTENER = """#!{python}
+import socket, sys, time
+from urllib.parse import urlsplit
+address = urlsplit(sys.argv[-1])
+if address.path == "/white":
+    sys.exit("no camera here")
+with socket.socket() as server:
+    if address.path != "/black":
+        time.sleep(0.2 if address.path == "/red" else 0)
+        server.setsockopt(socket.SOL_SOCKET, socket.SO_REUSEADDR, 1)
+        server.bind((address.hostname, address.port))
+        server.listen()
+    time.sleep(600)
+"""
+
+
+def test_streams_are_waited_for_and_the_missing_named(
+    streams: Any, lab_log: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    put_in_path(_LISTENER.format(python=sys.executable), tmp_path, monkeypatch)
+    loops = {name: tmp_path / name for name in ("red", "white")}
+    with streams.serve(lab_log, loops, 3, tmp_path, 60.0) as served:
+        assert served.cameras == ["red", "red_2"]
+        assert served.missing == {"white": "ffmpeg ended with 1: no camera here"}
+        rig = served.rig.read_text()
+        assert [name for name in ("red", "white", "red_2") if f'name = "{name}"' in rig] == served.cameras
+        port = int(rig.partition("127.0.0.1:")[2].partition("/")[0])
+        socket.create_connection(("127.0.0.1", port), timeout=10).close()
+    with streams.serve(lab_log, {"black": tmp_path / "black"}, 1, tmp_path, 0.2) as served:
+        assert served.missing == {"black": "ffmpeg did not listen in time"}
+
+
+def test_live_keeps_what_it_measured_before_a_failure(
+    streams: Any, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    live = importlib.import_module("live")
+    results = importlib.import_module("results")
+    report, counts = results.Report("live"), []
+
+    class Fake:
+        cameras, missing, rig = ("red",), dict[str, str](), tmp_path / "lab.toml"
+
+        def __init__(self, *arguments: Any) -> None:
+            counts.append(arguments[2])
+
+        def __enter__(self) -> Fake:
+            return self
+
+        def __exit__(self, *_: object) -> None: ...
+
+    def run(arguments: list[object]) -> float:
+        if counts[-1] == 9:
+            raise live._FailedError("ipsys record ended with 1: camera red_7: refuses the connection")
+        return 1.0
+
+    monkeypatch.setattr(live, "serve", Fake)
+    monkeypatch.setattr(live, "_run", run)
+    monkeypatch.setattr(live, "_rates", lambda log, cameras: {"red": (300, 30.0, 1000)})
+    monkeypatch.setattr(live, "_events", lambda log, kind: 0)
+    options = type("Options", (), {"wait_seconds": 1.0, "many_seconds": 1.0})
+    live._many(tmp_path, {}, tmp_path, options, report)
+    assert counts == [6, 9]
+    assert [row.values for row in report.rows] == [(6,)]
+    assert report.remarks == ["9 cameras: ipsys record ended with 1: camera red_7: refuses the connection"]
+    assert report.failed

@@ -145,8 +145,8 @@ def test_frames_that_nobody_had_looked_at_are_looked_at(
     share: float,
 ) -> None:
     """Killed between two writes: frames are there, and nothing that was made of the last of them."""
-    chunks = list(_chunks(recorded))
-    last = next(c for c in chunks[int(share * len(chunks)) :] if not c.compression)
+    images = [chunk for chunk in _chunks(recorded) if not chunk.compression]
+    last = images[int(share * len(images))]
     cut = tmp_path / "cut.mcap"
     cut.write_bytes(recorded.read_bytes()[: last.end])
     repair(cut)

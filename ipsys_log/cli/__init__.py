@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import errno
 import shutil
 import sys
 import textwrap
@@ -12,25 +11,30 @@ __all__ = ["main"]
 
 def main() -> None:
     """Run the command line; a fault of the input is one line on stderr and exit code 1."""
+    from ipsys_log.cli.signals import InterruptError, hold_signals
+
+    hold_signals()
     from ipsys_log.cli.app import app
-    from ipsys_log.errors import IpsysError
+    from ipsys_log.cli.console import print_warnings
+    from ipsys_log.errors import IpsysError, disk_advice, is_full
 
     try:
-        app()
+        with print_warnings():
+            app()
     except IpsysError as error:
         sys.exit(_complain(str(error)))
     except BrokenPipeError:
         sys.stderr.close()  # the reader of a pipe has gone, such as head
         sys.exit(0)
     except OSError as error:
-        full = error.errno in (errno.ENOSPC, errno.EDQUOT)
+        full = is_full(error)
         if error.filename is None and not full:
             raise
-        what = "the disk is full; free some space and try again" if full else error.strerror
+        what = f"the disk is full; {disk_advice(error)}" if full else error.strerror
         sys.exit(_complain(f"{error.filename}: {what}" if error.filename else str(what)))
-    except KeyboardInterrupt:
-        _complain("interrupted; stages that were complete are in the log, and nothing else was changed")
-        sys.exit(130)
+    except InterruptError as interrupt:
+        _complain(interrupt.text)
+        sys.exit(interrupt.exit_code)
 
 
 def _complain(text: str) -> int:

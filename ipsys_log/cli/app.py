@@ -21,6 +21,7 @@ from ipsys_log.cli import (
     view,
 )
 from ipsys_log.cli.guide import arrange
+from ipsys_log.cli.signals import interruptible
 
 app = typer.Typer(
     name="ipsys",
@@ -40,6 +41,10 @@ _MODULES = (
 for module in _MODULES:
     module.add_commands(app)
 arrange(app)
+for typer_app in (app, *(group.typer_instance for group in app.registered_groups)):
+    for command in typer_app.registered_commands if typer_app else ():
+        if command.callback is not None:
+            command.callback = interruptible(command.callback)
 
 
 def _print_version(wanted: bool) -> None:

@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import os
-import signal
 from collections.abc import Callable, Iterable, Iterator
 from contextlib import AbstractContextManager, ExitStack, contextmanager, nullcontext
 from dataclasses import replace
@@ -15,6 +14,7 @@ from typing import TYPE_CHECKING, NamedTuple
 
 from ipsys_log.cli.console import console, remarks
 from ipsys_log.cli.options import load_lab
+from ipsys_log.cli.signals import Interrupted, stop_on_signal
 
 if TYPE_CHECKING:
     from ipsys_log.messages import CameraCalibration, Message, Rig, RigCamera
@@ -126,7 +126,12 @@ def check_target(output: Path, force: bool, files: Iterable[tuple[str, Path]]) -
 
 @contextmanager
 def opened(
-    lab: Lab, output: Path, seconds: float | None, doing: str | None = None, panel: bool = True
+    lab: Lab,
+    output: Path,
+    seconds: float | None,
+    doing: str | None = None,
+    panel: bool = True,
+    until_stopped: bool = True,
 ) -> Iterator[tuple[Attached, list[Message], LiveStatus]]:
     """Cameras that send, what is written first, and what is shown on the screen meanwhile.
 
@@ -134,6 +139,7 @@ def opened(
     ----------
     doing : said at the beginning, where it is not recording; then nothing is said of frames at the end.
     panel : whether the screen is free for a table of the cameras.
+    until_stopped : a signal stops the cameras, and the command ends in order; otherwise it interrupts.
 
     Raises
     ------
@@ -152,7 +158,7 @@ def opened(
             attached = stack.enter_context(Attached(lab.cameras, open_source, Clock(), say))
         sizes_px = {name: state.size_px for name, state in attached.states.items()}
         lenses = fitting_lenses(lab.lenses, sizes_px, say)
-        stack.enter_context(_ended(attached.stop, seconds))
+        stack.enter_context(_ended(attached.stop, seconds, until_stopped))
         status = LiveStatus(attached.states, stack.enter_context(Monitor(lab.rig)), output, monotonic)
         say(doing or f"recording into {output}; Ctrl-C ends it")
         if panel:
@@ -174,19 +180,10 @@ def shown_to(first: Watch, second: Watch | None) -> Watch:
 
 
 @contextmanager
-def _ended(stop: Callable[[], None], seconds: float | None) -> Iterator[None]:
-    """On Ctrl-C, SIGTERM or after some time it ends cleanly: what has come by then is written.
-
-    ``stop`` takes no lock: the thread that is interrupted may hold it. A second signal interrupts.
-    """
-
-    def end(*_: object) -> None:
-        signal.signal(signal.SIGINT, signal.default_int_handler)
-        signal.signal(signal.SIGTERM, signal.SIG_DFL)
-        stop()
-
-    for number in (signal.SIGINT, signal.SIGTERM):
-        signal.signal(number, end)
+def _ended(stop: Callable[[], None], seconds: float | None, on_signal: bool = True) -> Iterator[None]:
+    """Stop in order after some time, and on the first signal: what has come by then is written."""
+    if on_signal:
+        stop_on_signal(stop)
     timer = Timer(TIMEOUT_MAX if seconds is None else seconds, stop)
     timer.daemon = True
     timer.start()
@@ -219,8 +216,12 @@ def recorded_now(lab: Lab, seconds: float, keep: Path | None = None) -> Iterator
     with TemporaryDirectory(prefix="ipsys-") as folder:
         log = keep or Path(folder) / "now.mcap"
         doing = None if keep else f"looking for {seconds:g} s"
-        with opened(lab, log, seconds, doing) as (cameras, settings, status):
-            pipeline.record(cameras, settings, log, status)
+        try:
+            with opened(lab, log, seconds, doing, until_stopped=False) as (cameras, settings, status):
+                pipeline.record(cameras, settings, log, status)
+        except Interrupted as interrupt:
+            kept = f"{keep} has the frames until then" if keep and keep.exists() else "no frame was kept"
+            raise Interrupted(interrupt.exit_code, f"interrupted; {kept}") from None
         try:
             yield log
         except IpsysError as error:

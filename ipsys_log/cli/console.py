@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import logging
 import sys
 from collections.abc import Iterator, Sequence
 from contextlib import contextmanager
@@ -14,7 +15,7 @@ if TYPE_CHECKING:
     from ipsys_log.runs.records import Outcome
     from ipsys_log.runs.request import Progress
 
-__all__ = ["console", "print_outcomes", "progress_bar", "remarks"]
+__all__ = ["console", "print_outcomes", "print_warnings", "progress_bar", "remarks"]
 
 # The stages that go through the frames, one message for each.
 _OF_FRAMES = ("detect", "camera-frame", "locate", "fuse")
@@ -23,6 +24,33 @@ _DRAW_EVERY_S = 0.1
 # In a window lines break between words; in a file or a pipe they do not break.
 console = Console(highlight=False, soft_wrap=not sys.stdout.isatty())
 remarks = Console(stderr=True, highlight=False, soft_wrap=not sys.stderr.isatty())
+
+
+class _Remarks(logging.Handler):
+    """Prints what the package warns of, each text once."""
+
+    def __init__(self) -> None:
+        super().__init__(logging.WARNING)
+        self._printed: set[str] = set()
+
+    def emit(self, record: logging.LogRecord) -> None:
+        text = record.getMessage()
+        if text not in self._printed:
+            self._printed.add(text)
+            remarks.print(text, style="yellow", markup=False)
+
+
+@contextmanager
+def print_warnings() -> Iterator[None]:
+    """Print warnings of the package on stderr, one line each."""
+    logger, handler = logging.getLogger("ipsys_log"), _Remarks()
+    logger.addHandler(handler)
+    propagate, logger.propagate = logger.propagate, False
+    try:
+        yield
+    finally:
+        logger.removeHandler(handler)
+        logger.propagate = propagate
 
 
 @contextmanager

@@ -27,11 +27,12 @@ def ask_places(scene: Scene) -> None:
         import readline  # noqa: F401
     console.print(HELP, style="dim", markup=False)
     active = active_measurements(scene.history())
+    saved: list[str] = []
     left: list[int | None] = [n for n, stop in enumerate(scene.stops) if not any(map(stop.covers, active))]
     if not scene.stops:
         left = [None]
     while left:
-        outcome = _ask_place(scene, left[0])
+        outcome = _ask_place(scene, left[0], saved)
         if outcome == "q":
             return
         if not isinstance(outcome, str):  # it was undone: back to its place
@@ -41,12 +42,15 @@ def ask_places(scene: Scene) -> None:
     console.print("no more places in this log")
 
 
-def _ask_place(scene: Scene, stop: int | None) -> str | Measurement:
-    """Ask until a place is measured or skipped: ``s``, ``q`` to end, or what was undone."""
+def _ask_place(scene: Scene, stop: int | None, saved: list[str]) -> str | Measurement:
+    """Ask until a place is measured or skipped: ``s``, ``q`` to end, or what was undone.
+
+    ``saved`` has the ids that this session has measured, the last one last.
+    """
     typed: Typed | None = None
     while True:
         try:
-            typed = _measure(scene, stop, typed)
+            typed = _measure(scene, stop, typed, saved)
             if typed is None:
                 return "s"
         except LetterError as left:
@@ -56,12 +60,12 @@ def _ask_place(scene: Scene, stop: int | None) -> str | Measurement:
             if letter == "a":
                 typed = None
             else:
-                undone = _undo(scene)
+                undone = _undo(scene, saved)
                 if undone is not None:
                     return undone
 
 
-def _measure(scene: Scene, stop: int | None, before: Typed | None) -> Typed | None:
+def _measure(scene: Scene, stop: int | None, before: Typed | None, saved: list[str]) -> Typed | None:
     """Ask for one place and append it; what was typed where it is to be asked for again."""
     from ipsys_log.errors import IpsysError
 
@@ -86,6 +90,7 @@ def _measure(scene: Scene, stop: int | None, before: Typed | None) -> Typed | No
         except IpsysError as error:
             console.print(str(error), style="red", markup=False)
             continue
+        saved.append(now.id)
         console.print(f"{now.id} is in the log", style="green", markup=False)
         return None
 
@@ -138,20 +143,40 @@ def _show(checked: Checked) -> None:
         console.print(text, style="yellow", markup=False)
 
 
-def _undo(scene: Scene) -> Measurement | None:
-    """Withdraw the last measurement that counts, and return it; None where none is withdrawn."""
+def _undo(scene: Scene, saved: list[str]) -> Measurement | None:
+    """Withdraw the last measurement that counts, and return it; None where none is withdrawn.
+
+    One that this session has not measured is only withdrawn where the user agrees.
+    """
     from ipsys_log.errors import IpsysError
     from ipsys_log.measuring.check import withdraw
     from ipsys_log.offline.pairs import active_measurements
 
-    active = active_measurements(scene.history())
+    active = {measurement.id: measurement for measurement in active_measurements(scene.history())}
     if not active:
         console.print("nothing is measured yet", style="yellow")
         return None
+    own = [name for name in saved if name in active]
+    last = active[own[-1]] if own else list(active.values())[-1]
+    if not own and not _agreed_to_withdraw(last):
+        console.print("nothing is withdrawn", style="yellow")
+        return None
     try:
-        scene.add([withdraw(scene.history(), active[-1].id)])
+        scene.add([withdraw(scene.history(), last.id)])
     except IpsysError as error:
         console.print(str(error), style="red", markup=False)
         return None
-    console.print(f"{active[-1].id} is withdrawn", style="green", markup=False)
-    return active[-1]
+    console.print(f"{last.id} is withdrawn", style="green", markup=False)
+    return last
+
+
+def _agreed_to_withdraw(measurement: Measurement) -> bool:
+    """Ask before a measurement of an earlier session is withdrawn; a letter means no."""
+    from ipsys_log.units import CM_PER_M
+
+    tapes = ", ".join(f"{tape.reference} {tape.distance_m * CM_PER_M:.1f}" for tape in measurement.distances)
+    text = f"{measurement.id} (marker {measurement.marker_id}{': ' if tapes else ''}{tapes})"
+    try:
+        return agreed(f"nothing measured in this session; {text} is of an earlier one. Withdraw it?", False)
+    except LetterError:
+        return False

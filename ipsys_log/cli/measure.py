@@ -15,7 +15,6 @@ from ipsys_log.cli.options import (
     AsJson,
     Calibrations,
     Corners,
-    Force,
     Host,
     ModelOfOther,
     Only,
@@ -25,6 +24,7 @@ from ipsys_log.cli.options import (
     load_calibrations,
     log_option,
 )
+from ipsys_log.cli.signals import allow_interrupt, runs_until_stopped, stop_on_signal
 
 if TYPE_CHECKING:
     from ipsys_log.measuring.scene import Scene
@@ -49,6 +49,13 @@ Sheet = Annotated[
     Path | None,
     typer.Option("--csv", metavar="SHEET", help="Read a sheet (docs/measuring.md has its header) instead."),
 ]
+Insist = Annotated[
+    bool,
+    typer.Option(
+        "--force",
+        help="With --csv: write rows that look wrong. With cameras: overwrite the log of -o if there is one.",
+    ),
+]
 Places = Annotated[
     bool, typer.Option("--places", help="Only list where markers lie still, as a sheet numbers them.")
 ]
@@ -61,6 +68,7 @@ def add_commands(app: typer.Typer) -> None:
     app.command()(measure)
 
 
+@runs_until_stopped
 def measure(
     log: Log = None,
     output: Output = None,
@@ -74,7 +82,7 @@ def measure(
     calibration: Calibrations = None,
     corners: Corners = None,
     model_from: ModelOfOther = None,
-    force: Force = False,
+    force: Insist = False,
     as_json: AsJson = False,
 ) -> None:
     """Enter tape measurements: on a page for the phone, in the terminal, or from a sheet.
@@ -85,6 +93,8 @@ def measure(
 
     Either way what is typed is checked at once. Undo withdraws a measurement; nothing is erased.
     """
+    ends = csv is not None or places
+    allow_interrupt(None if ends else "stopped; every saved point is in the log")
     from ipsys_log.errors import IpsysError
 
     if sum((terminal, csv is not None, places)) > 1:
@@ -95,9 +105,10 @@ def measure(
             output=output,
             camera=camera,
             model_from=model_from,
-            force=force,
         )
-        _measure_log(log, terminal, csv, places, host, port, rig, calibration, corners, as_json)
+        if csv is None:
+            _refuse("--csv, or cameras; leave it out", force=force)
+        _measure_log(log, terminal, csv, force, places, host, port, rig, calibration, corners, as_json)
         return
     _refuse("a finished log; name it", csv=csv, places=places)
     if rig is None or output is None:
@@ -122,6 +133,7 @@ def _measure_log(
     log: Path,
     terminal: bool,
     csv: Path | None,
+    force: bool,
     places: bool,
     host: str | None,
     port: int,
@@ -147,7 +159,7 @@ def _measure_log(
             return
         before = len(scene.history())
         if csv is not None:
-            for text in add_sheet(scene, csv):
+            for text in add_sheet(scene, csv, force):
                 remarks.print(text, style="yellow", markup=False)
         elif terminal:
             from ipsys_log.cli.dialog import ask_places
@@ -165,17 +177,20 @@ def _measure_log(
 
 def serve_page(scene: Scene, host: str | None, port: int) -> None:
     """Serve the page until it is interrupted."""
+    from ipsys_log.cli.measure_now import say_faults
     from ipsys_log.web.serving import qr_code, serving
 
+    signals: list[None] = []  # a list, as an Event takes a lock that the interrupted thread may hold
+    stop_on_signal(lambda: signals.append(None))
     with serving(scene, host, port) as page:
         if host is not None:
             console.print(qr_code(page.url), style="#ffffff on #000000", markup=False)
         console.print(f"open {page.url}", markup=False)
         remarks.print("Ctrl-C ends it; every place is in the log as soon as it is saved")
         try:
-            page.wait()
-        except KeyboardInterrupt:
-            remarks.print()
+            page.wait(lambda: bool(signals))
+        finally:
+            say_faults(page)
 
 
 def _show_count(log: Path, added: Sequence[Measurement], as_json: bool) -> None:

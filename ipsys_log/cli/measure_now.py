@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import signal
 from collections.abc import Callable, Iterator
 from concurrent.futures import ThreadPoolExecutor
 from contextlib import contextmanager, suppress
@@ -13,14 +12,16 @@ from typing import TYPE_CHECKING, Any
 
 from ipsys_log.cli.cameras_now import MODEL, Lab, check_target, opened, prepared, shown_to
 from ipsys_log.cli.console import console, remarks
+from ipsys_log.cli.signals import allow_interrupt
 
 if TYPE_CHECKING:
     from ipsys_log.messages import Measurement, Message, Model
     from ipsys_log.runs.request import Request
     from ipsys_log.scenes.live import LiveScene
     from ipsys_log.sources.attached import Attached
+    from ipsys_log.web.serving import Served
 
-__all__ = ["live_scene", "measure_now", "ready_to_measure", "served"]
+__all__ = ["live_scene", "measure_now", "ready_to_measure", "say_faults", "served"]
 
 _TURN_S = 0.05
 # After that it is known what the cameras see, and what of it lies still.
@@ -98,15 +99,26 @@ def served(scene: LiveScene, host: str | None, port: int) -> Iterator[None]:
         if host is not None:
             console.print(qr_code(page.url), style="#ffffff on #000000", markup=False)
         remarks.print(f"measure at {page.url}", markup=False)
-        yield
+        try:
+            yield
+        finally:
+            say_faults(page)
+
+
+def say_faults(page: Served) -> None:
+    """Say what went wrong in the page's server: at the end, the screen is free for a traceback."""
+    if page.faults.count:
+        remarks.print(
+            f"faults of ipsys in the measuring page: {page.faults.count}; the first one:", style="red"
+        )
+        remarks.print(page.faults.first, markup=False, highlight=False)
 
 
 def _ask_beside(work: Callable[[], Any], scene: LiveScene, cameras: Attached) -> None:
     """Ask in the terminal while the work goes on in a thread, and stop the cameras after that."""
     from ipsys_log.cli.dialog import ask_places
 
-    for number in (signal.SIGINT, signal.SIGTERM):  # a question that is open ends, too
-        signal.signal(number, signal.default_int_handler)
+    allow_interrupt("stopped; every saved point is in the log")  # an open question ends, too
     with ThreadPoolExecutor(1) as pool:
         working = pool.submit(work)
         try:

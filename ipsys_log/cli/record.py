@@ -22,6 +22,7 @@ from ipsys_log.cli.options import (
     Port,
     RigNow,
 )
+from ipsys_log.cli.signals import allow_interrupt, runs_until_stopped
 
 if TYPE_CHECKING:
     from ipsys_log.messages import Message
@@ -37,12 +38,15 @@ Seconds = Annotated[
 ]
 View = Annotated[bool, typer.Option("--view", help="Show cameras and robots in Rerun meanwhile.")]
 
+_NOT_BEGUN = "stopped before the first frame was recorded; no log was written"
+
 
 def add_commands(app: typer.Typer) -> None:
     app.command()(record)
     app.command()(live)
 
 
+@runs_until_stopped
 def record(
     output: NewLog,
     rig: RigNow = Path("lab.toml"),
@@ -60,6 +64,7 @@ def record(
     force: Force = False,
 ) -> None:
     """Record the frames of the cameras as they come, until Ctrl-C."""
+    allow_interrupt(_NOT_BEGUN)
     from ipsys_log import pipeline
     from ipsys_log.cli.measure_now import live_scene, ready_to_measure, served
     from ipsys_log.errors import IpsysError
@@ -96,6 +101,7 @@ def record(
             pipeline.record(cameras, settings, output, status, force)
 
 
+@runs_until_stopped
 def live(
     output: NewLog,
     model_from: Annotated[
@@ -117,6 +123,7 @@ def live(
     force: Force = False,
 ) -> None:
     """Track robots now: record, and take every frame through all stages up to fuse, until Ctrl-C."""
+    allow_interrupt(_NOT_BEGUN)
     from ipsys_log import pipeline
     from ipsys_log.recording.plan import check_start
     from ipsys_log.runs.request import Request

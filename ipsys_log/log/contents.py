@@ -1,7 +1,8 @@
 """The table of contents of a log, as the summary of an MCAP file holds it."""
 
 from collections.abc import Mapping
-from dataclasses import dataclass, field
+from copy import copy
+from dataclasses import dataclass, field, replace
 
 from mcap import records as mcap
 
@@ -17,7 +18,8 @@ class Contents:
     """Schemas and channels by id, chunks, and the counts that go into the Statistics record.
 
     `loose` holds the messages that lie in no chunk: per channel id (log time in ns, file offset).
-    `data_end` is the offset of the DataEnd record, `data_crc` its CRC (0: not computed).
+    `data_end` is where the data end, `data_crc` their CRC (0: not computed). The DataEnd record lies there,
+    unless an append was `cut_short`.
     """
 
     schemas: dict[int, mcap.Schema] = field(default_factory=dict)
@@ -33,6 +35,12 @@ class Contents:
     loose: dict[int, list[tuple[int, int]]] = field(default_factory=dict)
     data_end: int = 0
     data_crc: int = 0
+    cut_short: bool = False
+
+    def copy(self) -> "Contents":
+        """Return one that does not change when this one grows."""
+        fields = ("schemas", "channels", "chunks", "attachments", "metadata", "counts", "loose")
+        return replace(self, **{name: copy(getattr(self, name)) for name in fields})
 
     def count(self, channel_id: int, messages: int) -> None:
         """Add `messages` to the count of a channel."""

@@ -1,15 +1,23 @@
-"""Replacing the tail of a file so that a crash at any instant leaves the old file or the new one.
+"""Replacing the tail of a file so that a crash at any instant leaves the old log or the new one.
 
-The journal ``<path>.journal`` holds the old tail. While it exists and is whole, the old log counts:
-readers take the tail from it, and whoever next holds the exclusive lock puts the tail back. A torn
-journal means that the file itself was not touched yet.
+Two things protect the old log meanwhile:
+
+- A *standing* tail: a copy of the old table of contents beyond the new end of the file. Programs that read
+  a log from its end, and know nothing of journals, find the old log by it until the file is cut to its new
+  size.
+- The journal ``<path>.journal``: the old tail. While it is whole and the file has not got its new size, the
+  old log counts: readers take the tail from it, and the next holder of the exclusive lock puts the tail back.
+  A torn journal means that the file itself was not touched yet.
+
+``docs/decisions/append-order.md`` has the order of writes, and why.
 """
 
+import logging
 import os
 import stat
 import struct
 import zlib
-from collections.abc import Iterator, Sequence
+from collections.abc import Callable, Iterator, Sequence
 from dataclasses import dataclass
 from itertools import chain
 from pathlib import Path
@@ -20,24 +28,26 @@ from ipsys_log.log.view import View
 
 __all__ = ["Journal", "attach_journal", "journal_path", "read_journal", "replace_tail", "roll_back"]
 
-_MAGIC = b"\x89IPSYSJ1"
-# Magic, old size, new size, tail offset, bytes before the tail: count, CRC; tail length.
-_HEAD = struct.Struct("<8sQQQIIQ")
+_MAGIC = b"\x89IPSYSJ2"
+# Magic; sizes of the file: old, new, meanwhile; tail offset; bytes before the tail: count, CRC; tail length.
+_HEAD = struct.Struct("<8sQQQQIIQ")
+# The first format has no third size: by it the old log counts until the journal is gone.
+_EARLIER_MAGIC = b"\x89IPSYSJ1"
+_EARLIER_HEAD = struct.Struct("<8sQQQIIQ")
 _CRC = struct.Struct("<I")
 _BEFORE = 4096
 _BLOCK = 1 << 20
 
+_logger = logging.getLogger(__name__)
+
 
 @dataclass(frozen=True, slots=True)
 class Journal:
-    """A whole journal that belongs to its file."""
+    """A whole journal that belongs to its file, which is not complete."""
 
     old_size: int
     tail_offset: int
-
-    @property
-    def tail_base(self) -> int:
-        return _HEAD.size
+    tail_base: int
 
 
 def journal_path(path: Path) -> Path:
@@ -65,26 +75,33 @@ def _crc(fd: int, offset: int, length: int) -> int | None:
 
 
 def read_journal(fd: int, journal_fd: int) -> Journal | None:
-    """The journal in `journal_fd` if it is whole and belongs to the file in `fd`, else None."""
-    head = os.pread(journal_fd, _HEAD.size, 0)
-    if len(head) != _HEAD.size:
+    """Return the journal in `journal_fd` if the old log in `fd` counts by it.
+
+    None where it is torn, where it belongs to another file, and where the new log is complete.
+    """
+    start = os.pread(journal_fd, _HEAD.size, 0)
+    earlier = start.startswith(_EARLIER_MAGIC)
+    head = _EARLIER_HEAD if earlier else _HEAD
+    if len(start) < head.size:
         return None
-    magic, old_size, new_size, tail_offset, before, before_crc, tail_length = _HEAD.unpack(head)
-    body = _HEAD.size + tail_length
+    magic, old_size, *sizes, tail_offset, before, before_crc, tail_length = head.unpack_from(start)
+    body = head.size + tail_length
     whole = (
-        magic == _MAGIC
+        magic in (_MAGIC, _EARLIER_MAGIC)
         and tail_offset + tail_length == old_size
         and before == min(_BEFORE, tail_offset)
         and os.fstat(journal_fd).st_size == body + _CRC.size
         and os.pread(journal_fd, _CRC.size, body) == _CRC.pack(_crc(journal_fd, 0, body) or 0)
         and _crc(fd, tail_offset - before, before) == before_crc
-        and not _went_on(fd, (old_size, new_size))
+        and not _went_on(fd, (old_size, *sizes))
     )
-    return Journal(old_size, tail_offset) if whole else None
+    # The file gets its new size last, when all else is on the disk.
+    complete = not earlier and os.fstat(fd).st_size == sizes[0]
+    return Journal(old_size, tail_offset, head.size) if whole and not complete else None
 
 
-def _went_on(fd: int, sizes: tuple[int, int]) -> bool:
-    """Whether the file is a finished log of neither size: repaired and extended under another name."""
+def _went_on(fd: int, sizes: tuple[int, ...]) -> bool:
+    """Whether the file is a finished log of none of the sizes: repaired and extended under another name."""
     size = os.fstat(fd).st_size
     return size not in sizes and os.pread(fd, len(MAGIC), max(0, size - len(MAGIC))) == MAGIC
 
@@ -107,23 +124,59 @@ def attach_journal(view: View) -> bool:
     return True
 
 
-def replace_tail(storage: Storage, path: Path, fd: int, offset: int, pieces: Sequence[bytes]) -> None:
+def replace_tail(
+    storage: Storage,
+    path: Path,
+    fd: int,
+    offset: int,
+    pieces: Sequence[bytes],
+    standing: Callable[[int], bytes] = lambda at: b"\0",
+) -> None:
     """Replace everything from `offset` on by `pieces`, crash-safe. The caller holds the exclusive lock.
 
-    The file is cut before it is overwritten: otherwise the old footer would survive a crash and point
-    into new bytes.
+    Parameters
+    ----------
+    standing : makes the bytes that stand meanwhile at an offset beyond the old and the new end: a copy of the
+        old tail, by which other programs find the old log. Without one they find none.
+
+    Raises
+    ------
+    OSError
+        Before the new tail is on the disk; `roll_back` then tells which log stands.
     """
-    _write_journal(storage, path, fd, offset, offset + sum(map(len, pieces)))
-    storage.truncate(fd, offset)
+    new_size = offset + sum(map(len, pieces))
+    beyond = max(os.fstat(fd).st_size, new_size)
+    stands = standing(beyond)
+    _write_journal(storage, path, fd, offset, (new_size, beyond + len(stands)))
+    write_all(storage, fd, stands, beyond)
+    storage.fsync(fd)
     for piece in pieces:
         write_all(storage, fd, piece, offset)
         offset += len(piece)
     storage.fsync(fd)
-    _drop(storage, path)
+    storage.truncate(fd, new_size)
+    storage.fsync(fd)
+    try:
+        _drop(storage, path)
+    except OSError as error:  # from here on the new log counts, with a journal or without
+        _logger.warning(
+            "%s: the messages are in the log, but %s cannot be removed (%s)",
+            path, journal_path(path).name, error.strerror,
+        )  # fmt: skip
 
 
 def roll_back(storage: Storage, path: Path, fd: int) -> bool:
-    """Undo an append that was cut short; the caller holds the exclusive lock. True if there was one."""
+    """Undo an append that was cut short; the caller holds the exclusive lock.
+
+    Returns
+    -------
+    True if there was one. An append that only lacks the removal of its journal is completed instead.
+
+    Raises
+    ------
+    OSError
+        The journal stays, and with it the old log.
+    """
     journal_file = journal_path(path)
     try:
         journal_fd = os.open(journal_file, os.O_RDONLY | os.O_CLOEXEC)
@@ -135,24 +188,26 @@ def roll_back(storage: Storage, path: Path, fd: int) -> bool:
             _put_back(storage, fd, journal_fd, journal)
     finally:
         os.close(journal_fd)
+    storage.fsync(fd)
     _drop(storage, path)
     return journal is not None
 
 
 def _put_back(storage: Storage, fd: int, journal_fd: int, journal: Journal) -> None:
+    """Write the old tail while the standing one is still behind it, and only then cut that off."""
     offset = journal.tail_offset
-    storage.truncate(fd, offset)
     for data in _blocks(journal_fd, journal.tail_base, journal.old_size - offset):
         write_all(storage, fd, data, offset)
         offset += len(data)
     storage.fsync(fd)
+    storage.truncate(fd, journal.old_size)
 
 
-def _write_journal(storage: Storage, path: Path, fd: int, offset: int, new_size: int) -> None:
+def _write_journal(storage: Storage, path: Path, fd: int, offset: int, sizes: tuple[int, int]) -> None:
     size = os.fstat(fd).st_size
     before = min(_BEFORE, offset)
     before_crc = _crc(fd, offset - before, before) or 0
-    head = _HEAD.pack(_MAGIC, size, new_size, offset, before, before_crc, size - offset)
+    head = _HEAD.pack(_MAGIC, size, *sizes, offset, before, before_crc, size - offset)
     journal_fd = storage.open(journal_path(path), os.O_RDWR | os.O_CREAT | os.O_TRUNC)
     try:
         at, crc = 0, 0

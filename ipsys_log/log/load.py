@@ -18,6 +18,7 @@ from ipsys_log.log.records import (
     walk,
 )
 from ipsys_log.log.scan import scan
+from ipsys_log.log.summary import standing_data_end
 from ipsys_log.log.view import View
 
 __all__ = ["NoFooterError", "load_contents"]
@@ -44,9 +45,12 @@ def load_contents(view: View) -> Contents:
     opcode, length, crc = DATA_END.unpack(view.read(data_end, DATA_END.size)) if data_end >= 8 else (0, 0, 0)
     if (opcode, length) != (Opcode.DATA_END, 4):
         raise view.fault(max(data_end, 0), "there is no DataEnd record before the summary")
+    standing = standing_data_end(view, data_end)
+    if standing is not None:
+        data_end = standing
     if contents is None or not complete or not _gaps_hold_no_messages(view, contents, data_end):
         contents = scan(view, data_end)
-    contents.data_end, contents.data_crc = data_end, crc
+    contents.data_end, contents.data_crc, contents.cut_short = data_end, crc, standing is not None
     return contents
 
 

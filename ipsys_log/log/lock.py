@@ -2,6 +2,8 @@
 
 import fcntl
 import os
+import tempfile
+from contextlib import suppress
 from pathlib import Path
 
 from ipsys_log.errors import LogError
@@ -9,7 +11,7 @@ from ipsys_log.log.journal import journal_path
 from ipsys_log.log.storage import Storage
 from ipsys_log.log.view import open_for_reading
 
-__all__ = ["check_free", "is_being_written", "open_locked"]
+__all__ = ["check_free", "check_locks", "is_being_written", "open_locked"]
 
 
 def open_locked(storage: Storage, path: Path, flags: int) -> int:
@@ -18,12 +20,13 @@ def open_locked(storage: Storage, path: Path, flags: int) -> int:
     Raises
     ------
     LogError
-        The file cannot be opened, or another process is writing it.
+        The file cannot be opened, another process is writing it, or its file system has no locks. A file that
+        this made is removed then.
     """
     try:
         fd = storage.open(path, flags)
     except FileExistsError:
-        raise LogError(f"{path} exists already and is never overwritten: choose another name") from None
+        raise LogError(_why_taken(path)) from None
     except FileNotFoundError:
         raise LogError(f"{path} does not exist, or its folder does not") from None
     except OSError as error:
@@ -31,17 +34,49 @@ def open_locked(storage: Storage, path: Path, flags: int) -> int:
     try:
         fcntl.flock(fd, fcntl.LOCK_EX | fcntl.LOCK_NB)
         same = os.path.samestat(os.fstat(fd), path.stat())
-    except OSError:
+    except (BlockingIOError, FileNotFoundError):
         same = False
+    except OSError as error:
+        if flags & os.O_CREAT and os.fstat(fd).st_size == 0:
+            with suppress(OSError):
+                storage.unlink(path)
+        storage.close(fd)
+        raise LogError(_without_locks(path, error)) from None
     if not same:
         storage.close(fd)
         raise LogError(f"{path}: another process is writing it: wait until it has finished")
     return fd
 
 
+def _without_locks(path: Path, error: OSError) -> str:
+    return (
+        f"{path}: its file system gives no locks ({error.strerror}), so two programs could write a log at "
+        "once: write to a local disk, or mount this one with locks (NFS: start rpc.statd, or mount it with "
+        "nolock if only this machine writes there)"
+    )
+
+
+def check_locks(folder: Path) -> None:
+    """See that files in a folder can be locked, before there is work that would be lost.
+
+    Raises
+    ------
+    LogError
+        Where they cannot. A folder that takes no files at all is not judged.
+    """
+    with suppress(OSError), tempfile.TemporaryFile(dir=folder) as file:
+        try:
+            fcntl.flock(file, fcntl.LOCK_EX | fcntl.LOCK_NB)
+        except OSError as error:
+            raise LogError(_without_locks(folder, error)) from None
+
+
 def is_being_written(path: Path) -> bool:
-    """Whether another process holds the lock. Asked of logs without an end only: nobody can append to
-    these, so the instant for which this takes the lock itself is in nobody's way."""
+    """Return whether another process holds the lock.
+
+    This takes the lock itself for an instant, and a writer that begins in it is refused. So it is asked
+    only of logs without an end, to which nobody can append, and of those that have a journal.
+    """
     fd = open_for_reading(path)
     try:
         fcntl.flock(fd, fcntl.LOCK_SH | fcntl.LOCK_NB)
@@ -57,12 +92,19 @@ def is_being_written(path: Path) -> bool:
 def check_free(path: Path) -> None:
     """Refuse a path for a new log if something lies there, or a journal of a log that is gone."""
     try:
-        exists, orphan = path.exists(), journal_path(path).exists()
+        taken, orphan = os.path.lexists(path), journal_path(path).exists()
     except OSError as error:
         raise LogError(f"{path} cannot be opened for writing: {error.strerror}") from None
-    if exists:
-        raise LogError(f"{path} exists already and is never overwritten: choose another name")
+    if taken:
+        raise LogError(_why_taken(path))
     if orphan:
         raise LogError(
             f"{journal_path(path)} belongs to a log that is gone: move that log back, or delete it"
         )
+
+
+def _why_taken(path: Path) -> str:
+    if path.is_symlink() and not path.exists():
+        target = path.readlink()
+        return f"{path} is a link to {target}, which does not exist: remove it, or choose another name"
+    return f"{path} exists already and is never overwritten: choose another name"

@@ -1,18 +1,22 @@
 """Where a writer's bytes go: into a file that grows, or into memory until an append is complete."""
 
+import logging
 import os
 import zlib
+from collections.abc import Callable
 from contextlib import suppress
 from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Protocol
 
-from ipsys_log.errors import LogError, WriteError
+from ipsys_log.errors import LogError, WriteError, disk_advice
 from ipsys_log.log.crc import Buffer, extend
 from ipsys_log.log.journal import replace_tail, roll_back
 from ipsys_log.log.storage import Storage, write_all
 
-__all__ = ["Growing", "Output", "Pending"]
+__all__ = ["Growing", "Output", "Pending", "cannot_write"]
+
+_logger = logging.getLogger(__name__)
 
 
 class Output(Protocol):
@@ -52,26 +56,35 @@ class Growing:
         except OSError as error:
             self._failed = True
             kept = f"what it holds so far can be saved with: ipsys repair {self.path}"
-            then = kept if self.target is None else "nothing was written, free some space and try again"
-            raise _cannot_write(self.target or self.path, error, then) from None
+            then = kept if self.target is None else f"nothing was written: {disk_advice(error)}"
+            raise cannot_write(self.target or self.path, error, then) from None
         self.offset += len(data)
         self.crc = _extend(self.crc or 0, data, crc)
 
     def finish(self, tail: bytes) -> None:
-        if self._failed:  # a torn piece may reach beyond the tail
-            self.storage.truncate(self.fd, self.offset)
-        self.emit(tail)
+        try:
+            if self._failed:  # a torn piece may reach beyond the tail
+                self.storage.truncate(self.fd, self.offset)
+            self.emit(tail)
+            self.storage.fsync(self.fd)
+            if self.target is not None:
+                if self.target.exists():
+                    raise LogError(f"{self.target} appeared while it was written: choose another name")
+                self.storage.rename(self.path, self.target)
+                self.path, self.target = self.target, None
+            self.storage.fsync_directory(self.path.parent)
+        except OSError as error:
+            then = "nothing was written" if self.target is not None else "it is complete, but maybe not safe"
+            raise cannot_write(self.target or self.path, error, f"{then}: {disk_advice(error)}") from None
+
+    def sync(self) -> None:
+        """Wait until what was written is on the disk. Any thread may call it while another one writes."""
         self.storage.fsync(self.fd)
-        if self.target is not None:
-            if self.target.exists():
-                raise LogError(f"{self.target} appeared while it was written: choose another name")
-            self.storage.rename(self.path, self.target)
-            self.target = None
-        self.storage.fsync_directory(self.path.parent)
 
     def abandon(self) -> None:
         if self.target is not None:
-            self.storage.unlink(self.path)
+            with suppress(OSError):
+                self.storage.unlink(self.path)
 
     def close(self) -> None:
         self.storage.close(self.fd)
@@ -84,9 +97,11 @@ class Pending:
     storage: Storage
     path: Path
     fd: int
+    size: int
     start: int
     offset: int
     crc: int | None
+    standing: Callable[[int], bytes]
     _pieces: list[bytes] = field(default_factory=list)
 
     def emit(self, data: Buffer, crc: int | None = None) -> None:
@@ -98,12 +113,37 @@ class Pending:
         if not self._pieces:
             return
         try:
-            replace_tail(self.storage, self.path, self.fd, self.start, (*self._pieces, tail))
+            pieces = (*self._pieces, tail)
+            replace_tail(self.storage, self.path, self.fd, self.start, pieces, self.standing)
         except OSError as error:
-            with suppress(OSError):  # else whoever next writes does it
-                roll_back(self.storage, self.path, self.fd)
-            then = "the log stays as it was: free some space and try again"
-            raise _cannot_write(self.path, error, then) from None
+            self._settle(error, tail)
+
+    def _settle(self, error: OSError, tail: bytes) -> None:
+        """Say which log stands after a fault of the disk, the old one if possible.
+
+        Raises
+        ------
+        WriteError
+            Unless the new one stands.
+        """
+        with suppress(OSError):  # else whoever next writes does it
+            roll_back(self.storage, self.path, self.fd)
+        size = os.fstat(self.fd).st_size
+        if size == self.offset + len(tail) and os.pread(self.fd, len(tail), self.offset) == tail:
+            # The file gets its size last: all was written, and only that it is safe was not confirmed.
+            _logger.warning(
+                "%s: the messages are in the log, but the disk did not confirm it (%s): copy it to another",
+                self.path, error.strerror,
+            )  # fmt: skip
+            return
+        if size == self.size:
+            then = f"the log stays as it was: {disk_advice(error)}"
+        else:
+            then = (
+                f"nothing that was recorded is lost, and ipsys reads the log as it was, by "
+                f"{self.path.name}.journal beside it; {disk_advice(error)}, and run: ipsys repair {self.path}"
+            )
+        raise cannot_write(self.path, error, then) from None
 
     def abandon(self) -> None:
         self._pieces.clear()
@@ -116,5 +156,7 @@ def _extend(so_far: int, data: Buffer, crc: int | None) -> int:
     return zlib.crc32(data, so_far) if crc is None else extend(so_far, data, crc)
 
 
-def _cannot_write(path: Path, error: OSError, then: str) -> WriteError:
-    return WriteError(f"{path} cannot be written ({error.strerror or os.strerror(error.errno or 0)}): {then}")
+def cannot_write(path: Path, error: OSError, then: str) -> WriteError:
+    """Return the error of a disk that refused, with what follows from that."""
+    text = f"{path} cannot be written ({error.strerror or os.strerror(error.errno or 0)}): {then}"
+    return WriteError(text, error)

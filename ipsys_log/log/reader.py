@@ -1,5 +1,6 @@
 """Reading a log: by its indexes, in log order, while somebody else may be appending to it."""
 
+import logging
 import os
 import time
 from collections import Counter
@@ -27,6 +28,8 @@ from ipsys_log.log.types import RawMessage
 from ipsys_log.log.view import View, open_for_reading
 
 __all__ = ["LogReader", "stored_hashes"]
+
+_logger = logging.getLogger(__name__)
 
 _ATTEMPTS = 100
 _PAUSE_S = 0.02
@@ -220,6 +223,12 @@ def _open(path: Path) -> tuple[View, Contents]:
             view.close()
             raise
         if fault is None and (held or _stood_still(view, before)):
+            if (held or contents.cut_short) and not is_being_written(path):
+                _logger.warning(
+                    "%s: an append to it was cut short; it is read as it was before. Mend it with: "
+                    "ipsys repair %s",
+                    path, path,
+                )  # fmt: skip
             return view, contents
         moved = not held and not _stood_still(view, before)
         view.close()

@@ -1,19 +1,41 @@
 """The end of a log as bytes: DataEnd, summary, footer."""
 
+import struct
 import zlib
 
 from mcap import records as mcap
 from mcap.opcode import Opcode
 
 from ipsys_log.log.contents import Contents
-from ipsys_log.log.records import DATA_END, FOOTER, MAGIC, as_bytes
+from ipsys_log.log.records import DATA_END, FOOTER, HEADER, MAGIC, as_bytes
+from ipsys_log.log.view import View
 
-__all__ = ["tail_bytes"]
+__all__ = ["STANDING", "standing_bytes", "standing_data_end", "tail_bytes"]
+
+# Before the tail of a log that stands beyond new data: a record of a private type, and where its data end.
+STANDING = struct.Struct("<BQ8sQ")
+_STANDING_TYPE, _STANDING_NAME = 0x80 | Opcode.DATA_END, b"standing"
 
 
-def tail_bytes(contents: Contents) -> bytes:
-    """Everything from ``contents.data_end`` to the end of the file."""
-    start = contents.data_end + DATA_END.size
+def standing_bytes(contents: Contents, offset: int) -> bytes:
+    """Return the tail of a log as it stands at `offset` while new data are written before it."""
+    length = STANDING.size - HEADER.size
+    mark = STANDING.pack(_STANDING_TYPE, length, _STANDING_NAME, contents.data_end)
+    return mark + tail_bytes(contents, offset + len(mark))
+
+
+def standing_data_end(view: View, at: int) -> int | None:
+    """Return where the data end if the DataEnd record at `at` stands beyond new data, else None."""
+    if at < len(MAGIC) + STANDING.size:
+        return None
+    mark = STANDING.unpack(view.read(at - STANDING.size, STANDING.size))
+    expected = (_STANDING_TYPE, STANDING.size - HEADER.size, _STANDING_NAME)
+    return mark[3] if mark[:3] == expected and len(MAGIC) <= mark[3] < at else None
+
+
+def tail_bytes(contents: Contents, offset: int | None = None) -> bytes:
+    """Return the tail of a log: DataEnd, summary and footer, at ``contents.data_end`` or another `offset`."""
+    start = (contents.data_end if offset is None else offset) + DATA_END.size
     summary, offsets = b"", b""
     for opcode, records in _groups(contents):
         group = as_bytes(*records)

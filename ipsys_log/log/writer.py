@@ -3,6 +3,8 @@
 import os
 import zlib
 from collections.abc import Mapping
+from contextlib import suppress
+from functools import partial
 from pathlib import Path
 from types import TracebackType
 from typing import Self
@@ -10,18 +12,18 @@ from typing import Self
 from mcap import records as mcap
 from mcap.opcode import Opcode
 
-from ipsys_log.errors import LogError
+from ipsys_log.errors import LogError, disk_advice
 from ipsys_log.log.chunking import IMAGE_SCHEMAS, IMAGES, SMALL_APPENDED, SMALL_LIVE, ChunkBuilder, Limits
 from ipsys_log.log.contents import Contents, free_id
 from ipsys_log.log.hashing import METADATA_NAME, ChannelHash, metadata_of_hashes
 from ipsys_log.log.journal import roll_back
 from ipsys_log.log.load import load_contents
 from ipsys_log.log.lock import check_free, open_locked
-from ipsys_log.log.output import Growing, Output, Pending
+from ipsys_log.log.output import Growing, Output, Pending, cannot_write
 from ipsys_log.log.reader import stored_hashes
 from ipsys_log.log.records import HEADER, MAGIC, MESSAGE, as_bytes
 from ipsys_log.log.storage import DISK, Storage
-from ipsys_log.log.summary import tail_bytes
+from ipsys_log.log.summary import standing_bytes, tail_bytes
 from ipsys_log.log.types import Schema
 from ipsys_log.log.view import View
 
@@ -88,14 +90,19 @@ class LogWriter:
         check_free(target)
         file = target.with_name(target.name + ".partial") if atomic else target
         fd = open_locked(storage, file, os.O_RDWR | os.O_CREAT | (0 if atomic else os.O_EXCL))
-        if atomic:
-            storage.truncate(fd, 0)  # what an earlier writer of this name left when it was killed
         output = Growing(storage, file, fd, target if atomic else None)
         try:
+            if atomic:
+                storage.truncate(fd, 0)  # what an earlier writer of this name left when it was killed
             storage.fsync_directory(file.parent)
             output.emit(MAGIC + as_bytes(mcap.Header("", LIBRARY)))
-        except BaseException:
+        except BaseException as error:
+            with suppress(OSError):  # it holds nothing
+                storage.unlink(file)
             output.close()
+            if isinstance(error, OSError):
+                then = f"nothing was written: {disk_advice(error)}"
+                raise cannot_write(target, error, then) from None
             raise
         return cls(target, output, Contents(), SMALL_LIVE)
 
@@ -123,7 +130,8 @@ class LogWriter:
             storage.close(fd)
             raise
         crc = contents.data_crc or None
-        output = Pending(storage, target, fd, contents.data_end, contents.data_end, crc)
+        standing = partial(standing_bytes, contents.copy())
+        output = Pending(storage, target, fd, size, contents.data_end, contents.data_end, crc, standing)
         writer = cls(target, output, contents, SMALL_APPENDED)
         writer._stored = stored
         return writer
@@ -145,8 +153,11 @@ class LogWriter:
         if not isinstance(output, Growing):
             raise ValueError(f"{self.path}: an append stays where it is")
         output.storage.rename(self.path, path)
-        output.storage.fsync_directory(path.parent)
         self.path = output.path = path
+        with suppress(
+            OSError
+        ):  # it has the name; a name that a power cut takes away again is that of the old log
+            output.storage.fsync_directory(path.parent)
 
     def add_channel(
         self,

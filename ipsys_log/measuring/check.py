@@ -10,7 +10,15 @@ from numpy.typing import NDArray
 
 from ipsys_log.errors import IpsysError
 from ipsys_log.geometry.trilateration import SIDES
-from ipsys_log.measuring.doubts import doubt_floor, doubt_model, doubt_tapes, floor_sigma_m, with_tape
+from ipsys_log.measuring.doubts import (
+    THE_MODEL,
+    doubt_crossing,
+    doubt_floor,
+    doubt_model,
+    doubt_tapes,
+    floor_sigma_m,
+    with_tape,
+)
 from ipsys_log.measuring.entry import Entry, Fault
 from ipsys_log.measuring.predict import Prediction, predict
 from ipsys_log.measuring.scene import Sight
@@ -28,10 +36,11 @@ Array = NDArray[np.float64]
 class Checked:
     """What follows from an entry.
 
-    ``faults`` keep it out of the log, ``warnings`` are to be looked at first. ``point_m`` (3,) is the world
-    point, ``sigma_m`` how well the tape knows it where it knows it least, ``residuals_m`` by reference
-    point where there are more than two. ``sides_m`` are both places (3,) where the side is not told yet.
-    ``measurement`` is None where there are faults.
+    ``faults`` keep it out of the log, ``warnings`` are to be looked at first. Warnings that are ``imprecise``
+    are no mistakes: the point is only known badly. ``point_m`` (3,) is the world point, ``sigma_m`` how well
+    the tape knows it where it knows it least, ``residuals_m`` by reference point where there are more than
+    two. ``sides_m`` are both places (3,) where the side is not told yet. ``measurement`` is None where
+    there are faults.
     """
 
     id: str
@@ -44,6 +53,12 @@ class Checked:
     predictions: tuple[Prediction, ...] = ()
     sides_m: tuple[tuple[str, Array], ...] = ()
     measurement: Measurement | None = None
+    imprecise: tuple[str, ...] = ()
+
+    @property
+    def contradictions(self) -> tuple[str, ...]:
+        """The warnings that may be mistakes."""
+        return tuple(text for text in self.warnings if text not in self.imprecise)
 
 
 def next_id(history: Iterable[Measurement]) -> str:
@@ -79,6 +94,7 @@ def check_entry(
     sight: Sight | None,
     history: Sequence[Measurement],
     model: Model | None = None,
+    model_name: str = THE_MODEL,
 ) -> Checked:
     """Whether a place can be right, and the measurement that it makes.
 
@@ -89,6 +105,7 @@ def check_entry(
     sight : what the cameras say of the marker, None where it is not known which.
     history : what was measured and withdrawn so far.
     model : the present one, to compare with.
+    model_name : its name in a doubt.
     """
     name = entry.id or next_id(history)
     found = [*faults, *_identity_faults(entry, sight, history)]
@@ -112,12 +129,13 @@ def check_entry(
         why = "; ".join([_without_id(error, name), *entry.doubts])
         return Checked(name, (*found, Fault("", why)))
     on_floor, remark = doubt_floor(read, fixed, rig)
-    warnings += [*remark, *doubt_tapes(read, fixed, rig)]
+    flat = doubt_crossing(read, rig)
+    warnings += [*remark, *doubt_tapes(read, fixed, rig), *flat]
     earlier = _here_before(read, sight, history)
     found += _twin_faults(read, earlier)
-    warnings += _repeat_warnings(read, earlier) if read.still else []
+    warnings += _repeat_warnings(read, fixed, rig, earlier) if read.still else []
     predictions = predict(model, sight.points_m, fixed.world_m) if model and sight else ()
-    warnings += doubt_model(read, fixed, rig, predictions)
+    warnings += doubt_model(read, fixed, rig, predictions, model_name)
     return Checked(
         name,
         tuple(found),
@@ -128,6 +146,7 @@ def check_entry(
         on_floor,
         predictions,
         measurement=None if found else read,
+        imprecise=tuple(flat),
     )
 
 
@@ -191,11 +210,22 @@ def _twin_faults(read: Measurement, earlier: Sequence[Measurement]) -> list[Faul
     return []
 
 
-def _repeat_warnings(read: Measurement, earlier: Sequence[Measurement]) -> list[str]:
+def _repeat_warnings(
+    read: Measurement, fixed: TapePoint, rig: Rig, earlier: Sequence[Measurement]
+) -> list[str]:
     if not earlier:
         return []
-    names = ", ".join(m.id for m in earlier)
+    names = ", ".join(f"{m.id}{_apart_from(m, fixed, rig)}" for m in earlier)
     return [f"marker {read.marker_id} is measured here already, as {names}; if this is better, undo that one"]
+
+
+def _apart_from(other: Measurement, fixed: TapePoint, rig: Rig) -> str:
+    """Return the distance to another measurement in words; nothing where that one forms no point."""
+    try:
+        other_m = world_point(other, rig).world_m
+    except IpsysError:
+        return ""
+    return f" ({float(np.linalg.norm(other_m - fixed.world_m)) * CM_PER_M:.1f} cm away)"
 
 
 def _tapes(measurement: Measurement) -> list[tuple[str, float]]:

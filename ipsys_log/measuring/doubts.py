@@ -17,10 +17,20 @@ from ipsys_log.offline.slips import possible_slips
 from ipsys_log.offline.tape import Measured, TapePoint, flat_places, reference_points, world_point
 from ipsys_log.units import CM_PER_M
 
-__all__ = ["doubt_floor", "doubt_model", "doubt_tapes", "floor_sigma_m", "with_tape"]
+__all__ = [
+    "THE_MODEL",
+    "doubt_crossing",
+    "doubt_floor",
+    "doubt_model",
+    "doubt_tapes",
+    "floor_sigma_m",
+    "with_tape",
+]
 
 Array = NDArray[np.float64]
 
+# The name of a model out of a log, in a doubt.
+THE_MODEL = "the model"
 # Without a sigma in the rig, only to tell how well a place is known.
 _USUAL_TAPE_M = 0.003
 # Distances that contradict one another by more than this, or three sigmas, were not read well.
@@ -53,7 +63,7 @@ def doubt_floor(read: Measurement, fixed: TapePoint, rig: Rig) -> tuple[bool | N
     outside_m = _outside_m(fixed.world_m, rig)
     if outside_m <= _OUTSIDE_M:
         return True, []
-    text = f"the place lies {outside_m * CM_PER_M:.0f} cm outside of the floor"
+    text = f"{_tapes(read)} put the point {outside_m * CM_PER_M:.0f} cm outside of the floor"
     if read.side is not None and sides_alike(reference_points(read, rig)):
         other = SIDES[1 - SIDES.index(read.side)]
         there_m = world_point(replace(read, side=other), rig).world_m
@@ -63,20 +73,22 @@ def doubt_floor(read: Measurement, fixed: TapePoint, rig: Rig) -> tuple[bool | N
 
 
 def doubt_tapes(read: Measurement, fixed: TapePoint, rig: Rig) -> list[str]:
-    """Whether distances contradict one another, or cross too flatly to know the place well."""
-    warnings = []
+    """Return a doubt where distances contradict one another."""
     sigma_m = with_tape(rig).tape_sigma_m or _USUAL_TAPE_M
     worst = int(np.abs(fixed.residuals_m).argmax())
     off_m = float(abs(fixed.residuals_m[worst]))
     if len(read.distances) > 2 and off_m > max(_MISFIT_M, 3 * sigma_m):
-        text = f"the distances contradict one another by {off_m * CM_PER_M:.1f} cm: read them again"
-        warnings.append(text)
-    for flat in flat_places([Measured(read, with_tape(rig))]):
-        warnings.append(
-            f"the tapes cross at {flat.angle_deg:.0f} degrees only: the place is known to "
-            f"{(flat.sigma_m or 0.0) * CM_PER_M:.1f} cm; another place, or a third reference point, is better"
-        )
-    return warnings
+        return [f"{_tapes(read)} contradict one another by {off_m * CM_PER_M:.1f} cm: read them again"]
+    return []
+
+
+def doubt_crossing(read: Measurement, rig: Rig) -> list[str]:
+    """Return a doubt where the tapes cross too flatly to know the point well."""
+    return [
+        f"{_tapes(read)}: the tapes cross at {flat.angle_deg:.0f} degrees only, so that the point is known "
+        f"to {(flat.sigma_m or 0.0) * CM_PER_M:.1f} cm; another place, or a third reference point, is better"
+        for flat in flat_places([Measured(read, with_tape(rig))])
+    ]
 
 
 def floor_sigma_m(fixed: TapePoint) -> float | None:
@@ -87,9 +99,13 @@ def floor_sigma_m(fixed: TapePoint) -> float | None:
 
 
 def doubt_model(
-    read: Measurement, fixed: TapePoint, rig: Rig, predictions: Sequence[Prediction]
+    read: Measurement,
+    fixed: TapePoint,
+    rig: Rig,
+    predictions: Sequence[Prediction],
+    model_name: str = THE_MODEL,
 ) -> list[str]:
-    """Whether the model has it elsewhere, and the slip that would explain it."""
+    """Return a doubt where the model puts the point elsewhere, with the slip that explains it."""
     if not predictions:
         return []
     predicted_m = np.mean([one.world_m for one in predictions], axis=0)
@@ -102,7 +118,7 @@ def doubt_model(
     )
     if off_m <= bound_m:
         return []
-    text = f"the model has it {off_m * CM_PER_M:.0f} cm away"
+    text = f"the point is {off_m * CM_PER_M:.0f} cm away from the prediction of {model_name}"
     for group in possible_slips(read, rig, predicted_m):
         left = []
         for slip in group:
@@ -114,4 +130,10 @@ def doubt_model(
         if left and min(left)[0] <= bound_m:
             why = min(left)[1]
             return [f"{text}: {why}{'' if why.endswith('fit') else '?'}"]
-    return [f"{text}: read tape, ruler and marker again"]
+    return [f"{text}: read {_tapes(read)}, the height and the marker again"]
+
+
+def _tapes(read: Measurement) -> str:
+    """Return the distances of a measurement by name: ``the distances to A and B``."""
+    *names, last = (tape.reference for tape in read.distances)
+    return f"the distances to {', '.join(names)} and {last}"

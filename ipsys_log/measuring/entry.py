@@ -150,7 +150,8 @@ def _distances(typed: Typed, rig: Rig, faults: list[Fault], doubts: list[str]) -
             elif value_cm is not None:
                 if value_cm < _NEAR_CM:
                     doubts.append(
-                        f"{text} cm is very near to {point.name}: in metres? Then type {_times(value_cm)}"
+                        f"distance to {point.name}: {text} cm is very near to {point.name}: in metres? "
+                        f"Then type {_times(value_cm)}"
                     )
                 yield Distance(point.name, value_cm / CM_PER_M)
         elif count == 2:  # of more, any two will do
@@ -199,9 +200,9 @@ def _height(text: str, faults: list[Fault], doubts: list[str]) -> float | None:
         faults.append(Fault("height", f"height: {text} cm looks like metres; type {_times(value_cm)}"))
         return None
     if 0 < value_cm < _LOWEST_CM:
-        doubts.append(f"a height of {text} cm: in metres? Then type {_times(value_cm)}")
+        doubts.append(f"height: {text} cm is very low: in metres? Then type {_times(value_cm)}")
     if value_cm > CM_PER_M:
-        doubts.append(f"{text} cm is high for a marker: is it in mm?")
+        doubts.append(f"height: {text} cm is high for a marker: is it in mm?")
     return value_cm / CM_PER_M
 
 

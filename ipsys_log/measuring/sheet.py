@@ -5,7 +5,7 @@ from __future__ import annotations
 import csv
 import math
 import re
-from collections.abc import Iterable, Iterator, Sequence
+from collections.abc import Iterator, Sequence
 from dataclasses import dataclass
 from datetime import UTC, datetime
 from pathlib import Path
@@ -92,18 +92,20 @@ def _comma_advice(delimiter: str) -> str:
     return "; a decimal comma? Write a point: 212.7" if delimiter == "," else ""
 
 
-def refuse_rows(path: Path, faults: Iterable[tuple[int, str]]) -> None:
-    """Name every bad row by its line.
+def refuse_rows(
+    path: Path, faults: Sequence[tuple[int, str]], doubts: Sequence[tuple[int, str]] = ()
+) -> None:
+    """Name every bad row by its line, and each that looks wrong.
 
     Raises
     ------
     IpsysError
         Where there is one.
     """
-    found = sorted(faults)
-    if found:
-        named = "".join(f"\n  line {line}: {text}" for line, text in found)
-        raise IpsysError(f"{path}: nothing was written; correct the sheet:{named}")
+    if faults or doubts:
+        named = "".join(f"\n  line {line}: {text}" for line, text in sorted([*faults, *doubts]))
+        insist = "" if faults else ", or write it as it is with --force"
+        raise IpsysError(f"{path}: nothing was written; correct the sheet{insist}:{named}")
 
 
 def name_columns(text: str, rig: Rig) -> str:
@@ -117,9 +119,15 @@ def name_columns(text: str, rig: Rig) -> str:
     'd_A_cm and d_B_cm look exchanged'
     """
     one = "|".join(re.escape(point.name) for point in rig.reference_points)
-    text = re.sub(rf"\bthe distances to ({one}) and ({one})\b", r"d_\1_cm and d_\2_cm", text)
+    each = re.compile(rf"\b({one})\b(?=, | and |$)")
+    text = re.sub(
+        rf"\bthe distances to ((?:(?:{one}), )*(?:{one}) and (?:{one}))\b",
+        lambda names: each.sub(r"d_\1_cm", names[1]),
+        text,
+    )
     text = re.sub(rf"\b(?:the )?distance to ({one})\b", r"d_\1_cm", text)
-    return re.sub(r"\bheight(?=:|\?| reads)", "height_cm", text)
+    text = re.sub(r"\bit lies (left|right) of the line\b", r"side: it lies \1 of the line", text)
+    return re.sub(r"\b(?:the )?height(?=:|\?| reads| and)", "height_cm", text)
 
 
 def find_stops(

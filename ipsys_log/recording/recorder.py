@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import os
 import threading
-from collections.abc import Callable, Generator, Iterator, Mapping
+from collections.abc import Callable, Generator, Iterable, Iterator, Mapping
 from contextlib import ExitStack, closing, contextmanager
 from dataclasses import replace
 from pathlib import Path
@@ -146,11 +146,13 @@ def written(source: Source, log: Target) -> Iterator[Message | None]:
 
 
 @contextmanager
-def recording(path: Path, overwrite: bool = False) -> Iterator[Recording]:
+def recording(path: Path, settings: Iterable[Message] = (), overwrite: bool = False) -> Iterator[Recording]:
     """A new log that keeps what it has, whatever ends the block.
 
     Parameters
     ----------
+    settings : all that frames need to be understood: rig, lenses, models. They are in the file before the
+        block begins, however soon the recorder is killed.
     overwrite : put it in place of one that is there, unless another process is writing that. The old one is
         gone only when the new one stands.
 
@@ -166,6 +168,9 @@ def recording(path: Path, overwrite: bool = False) -> Iterator[Recording]:
         with ExitStack() as held:
             log = Recording(held.enter_context(created), held.enter_context(reserve(path)))
             try:
+                for message in settings:
+                    log.put(message)
+                log.flush()
                 yield log
             except KeyboardInterrupt as error:
                 if log.settle():

@@ -5,7 +5,7 @@ from __future__ import annotations
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from itertools import islice
-from typing import Any
+from typing import Any, NamedTuple
 
 import numpy as np
 from matplotlib.axes import Axes
@@ -21,7 +21,17 @@ from ipsys_log.report.palette import GRID, REST, robot_colour
 from ipsys_log.report.pictures import shorten
 from ipsys_log.units import CM_PER_M
 
-__all__ = ["Scene", "draw_arrows", "draw_floor", "draw_ground", "draw_key", "exaggeration"]
+__all__ = [
+    "Scene",
+    "Square",
+    "draw_arrows",
+    "draw_floor",
+    "draw_ground",
+    "draw_key",
+    "exaggeration",
+    "show_square",
+    "square_around",
+]
 
 _GRID_M = 0.5
 # Arrows are drawn so much longer that most of them span less than this part of the floor.
@@ -79,23 +89,44 @@ def draw_ground(axes: Axes, rig: Rig | None, around_m: Sequence[NDArray[np.float
     around_m : points (2,) or (n, 2) on the floor that are to be seen.
     """
     floor = rig.floor if rig else None
-    points_m = [*around_m]
     if floor is not None:
         axes.add_patch(
             Rectangle((0, 0), floor.width_m, floor.depth_m, fill=False, ec="black", lw=1.5, zorder=1)
         )
-        points_m += [np.zeros(2), np.array([floor.width_m, floor.depth_m])]
-    together_m = np.vstack(points_m)
-    low, high = together_m.min(axis=0), together_m.max(axis=0)
-    # A square part of the world in square axes keeps the scale the same both ways.
-    middle, half = (low + high) / 2, max(0.54 * (high - low).max(), 0.25)
-    axes.set(xlim=(middle[0] - half, middle[0] + half), ylim=(middle[1] - half, middle[1] + half))
+    square = square_around(rig, around_m)
+    show_square(axes, square)
     axes.set(aspect="equal", xlabel="x in m", ylabel="y in m")
-    axes.xaxis.set_major_locator(_steps(half))
-    axes.yaxis.set_major_locator(_steps(half))
+    axes.xaxis.set_major_locator(_steps(square.half))
+    axes.yaxis.set_major_locator(_steps(square.half))
     axes.grid(color=GRID, lw=0.7)
     axes.set_axisbelow(True)
     _draw_references(axes, rig.reference_points if rig else ())
+
+
+class Square(NamedTuple):
+    """The part of the floor that a map shows: its middle (2,) and half of its side, in m.
+
+    Square axes of a square part have the same scale both ways.
+    """
+
+    middle: NDArray[np.float64]
+    half: float
+
+
+def square_around(rig: Rig | None, around_m: Sequence[NDArray[np.float64]]) -> Square:
+    """Return the square that has room for the rig's floor and for points (2,) or (n, 2)."""
+    points_m = [*around_m]
+    if rig is not None and rig.floor is not None:
+        points_m += [np.zeros(2), np.array([rig.floor.width_m, rig.floor.depth_m])]
+    together_m = np.vstack(points_m)
+    low, high = together_m.min(axis=0), together_m.max(axis=0)
+    return Square((low + high) / 2, max(0.54 * float((high - low).max()), 0.25))
+
+
+def show_square(axes: Axes, square: Square) -> None:
+    """Set the limits of a map."""
+    (x, y), half = square
+    axes.set(xlim=(x - half, x + half), ylim=(y - half, y + half))
 
 
 def _draw_references(axes: Axes, points: Sequence[ReferencePoint]) -> None:
@@ -148,7 +179,8 @@ def _draw_errors(axes: Axes, scene: Scene, styles: Mapping[str, tuple[str, str]]
     if not rows or scene.evaluation is None:
         return f"The floor, tracks of run {scene.run}" if scene.tracks else "The floor"
     residuals = [residual for row in rows for residual in row.residuals]
-    factor = exaggeration([r.predicted_m - r.world_m for r in residuals], axes)
+    span_m = axes.get_xlim()[1] - axes.get_xlim()[0]
+    factor = exaggeration([r.predicted_m - r.world_m for r in residuals], span_m)
     for row in rows:
         colour, shape = styles[row.camera]
         start_m = np.array([residual.world_m[:2] for residual in row.residuals])
@@ -160,10 +192,9 @@ def _draw_errors(axes: Axes, scene: Scene, styles: Mapping[str, tuple[str, str]]
     return f"Errors of {scene.evaluation.model} on held-out places{times}"
 
 
-def exaggeration(errors_m: Sequence[NDArray[np.float64]], axes: Axes) -> int:
-    """How many times as long errors (n, 2 or 3) are drawn, so that most of them are seen and none covers
-    much of the floor."""
-    span_m = axes.get_xlim()[1] - axes.get_xlim()[0]
+def exaggeration(errors_m: Sequence[NDArray[np.float64]], span_m: float) -> int:
+    """How many times as long errors (n, 2 or 3) are drawn on a map of this width, so that most of them are
+    seen and none covers much of the floor."""
     usual_m = float(np.quantile(np.linalg.norm(np.array(errors_m)[:, :2], axis=1), 0.9))
     fitting = [factor for factor in _FACTORS if factor * usual_m <= _ARROW_SHARE * span_m]
     return fitting[-1] if fitting else 1

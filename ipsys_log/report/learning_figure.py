@@ -8,6 +8,7 @@ import numpy as np
 from matplotlib.axes import Axes
 from matplotlib.figure import Figure
 from matplotlib.lines import Line2D
+from matplotlib.transforms import ScaledTranslation
 
 from ipsys_log.report.advice import TOLD_NOTE, label, told_height
 from ipsys_log.report.findings import Findings
@@ -31,8 +32,8 @@ Curves = Mapping[str, Curve]
 
 # Beyond this ratio of the largest mean to the smallest, equal steps hide the small ones.
 _LOG_RATIO = 8.0
-# Marks of one number of places stand side by side, this share of it apart.
-_APART = 0.016
+# Bars of one number of places stand side by side on the picture, so far apart; the marks stay at the number.
+_APART_PT = 0.9
 _SPACE = {True: "Mean error in space in cm", False: "Mean error on the floor in cm"}
 
 
@@ -141,10 +142,8 @@ def draw_curves(
     limits : of all panels that share their scale, from :func:`limits_cm`.
     """
     low_cm, high_cm = limits
-    barred = any(point.std_m is not None for curve in curves.values() for point in curve)
     for number, (model, curve) in enumerate(curves.items()):
-        shift = _APART * (number - (len(curves) - 1) / 2) if barred else 0.0
-        _draw_curve(axes, curve, styles[model], shift)
+        _draw_curve(axes, curve, styles[model], _APART_PT * (number - (len(curves) - 1) / 2))
     places = sorted({point.places for curve in curves.values() for point in curve})
     if places:
         scale_logarithmic(axes, "x", places[0] / 1.2, places[-1] * 1.2)
@@ -160,10 +159,13 @@ def draw_curves(
         axes.text(0.5, 0.5, "none", transform=axes.transAxes, ha="center", color=NOTE)
 
 
-def _draw_curve(axes: Axes, curve: Curve, style: ModelStyle, shift: float) -> None:
-    x = [point.places * (1 + shift) for point in curve]
+def _draw_curve(axes: Axes, curve: Curve, style: ModelStyle, shift_pt: float) -> None:
+    x = [point.places for point in curve]
     y = [point.mean_m * CM_PER_M for point in curve]
     axes.plot(x, y, style.line, color=style.colour, lw=1.4, zorder=3, **style.marker)
-    for where, point in zip(x, curve, strict=True):
-        ends_cm = [end_m * CM_PER_M for end_m in _bar(point)]
-        axes.plot([where, where], ends_cm, color=style.colour, lw=1.1, alpha=0.55)
+    assert axes.figure is not None
+    aside = axes.transData + ScaledTranslation(shift_pt / 72, 0, axes.figure.dpi_scale_trans)
+    for point in curve:
+        if point.std_m:
+            ends_cm = [end_m * CM_PER_M for end_m in _bar(point)]
+            axes.plot([point.places] * 2, ends_cm, color=style.colour, lw=0.9, alpha=0.6, transform=aside)

@@ -69,13 +69,15 @@ def models_pictures(findings: Findings) -> list[Picture]:
 
 
 def residual_pictures(findings: Findings) -> list[Picture]:
-    """Where on the floor the shown models are off, with one scale of colours for all of them."""
+    """Where on the floor the shown models are off, with one scale of floor, arrows and colours."""
     pictures = []
     accuracies = shown_models(findings)
-    most_cm = residual_scale(findings, accuracies) if accuracies else 0.0
+    if not accuracies:
+        return pictures
+    scale = residual_scale(findings, accuracies)
     for accuracy in accuracies:
         figure, axes = _figure(5.6)
-        arrows = draw_residuals(axes, findings, accuracy, most_cm)
+        arrows = draw_residuals(axes, findings, accuracy, scale)
         bar = figure.colorbar(
             arrows, ax=axes, location="bottom", shrink=0.75, pad=0.02, extend="max", aspect=30
         )

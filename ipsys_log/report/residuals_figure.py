@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
+from typing import NamedTuple
 
 import numpy as np
 from matplotlib import colormaps
@@ -15,18 +16,34 @@ from numpy.typing import NDArray
 from ipsys_log.report.accuracy import Accuracy
 from ipsys_log.report.advice import label
 from ipsys_log.report.findings import Findings, Missed
-from ipsys_log.report.floor_panel import draw_arrows, draw_ground, draw_key, exaggeration
+from ipsys_log.report.floor_panel import (
+    Square,
+    draw_arrows,
+    draw_ground,
+    draw_key,
+    exaggeration,
+    show_square,
+    square_around,
+)
 from ipsys_log.report.places_figure import draw_hulls
 from ipsys_log.units import CM_PER_M
 
 Array = NDArray[np.float64]
 
-__all__ = ["draw_residuals", "residual_scale", "residuals_figure", "shown_models"]
+__all__ = ["ResidualScale", "draw_residuals", "residual_scale", "residuals_figure", "shown_models"]
 
 # From pale for a small error to dark for a large one, which any colour vision sees.
 _COLOURS = ListedColormap(colormaps["magma_r"](np.linspace(0.2, 0.95, 256)))
 # So much wider at most the picture may be than the floor for the sake of an arrow.
 _WIDER = 1.12
+
+
+class ResidualScale(NamedTuple):
+    """Scales of floor maps: the error in cm that has the last colour, the arrows' factor, the floor shown."""
+
+    most_cm: float
+    factor: int
+    square: Square
 
 
 def shown_models(findings: Findings) -> list[Accuracy]:
@@ -36,20 +53,28 @@ def shown_models(findings: Findings) -> list[Accuracy]:
     return list(dict.fromkeys([*named, *ranked[:1]]))
 
 
-def residual_scale(findings: Findings, accuracies: Sequence[Accuracy]) -> float:
-    """The error in cm from which on all have the colour of the largest."""
-    lengths = [missed.lengths_m for accuracy in accuracies for missed in findings.missed(accuracy)]
-    return float(np.quantile(np.vstack(lengths)[:, 0 if findings.in_space else 1], 0.95)) * CM_PER_M
+def residual_scale(findings: Findings, accuracies: Sequence[Accuracy]) -> ResidualScale:
+    """Return the scale that shows all these models alike: maps side by side are compared by eye."""
+    missed = [missed for accuracy in accuracies for missed in findings.missed(accuracy)]
+    places_m = np.vstack([each.world_m[:, :2] for each in missed])
+    errors_m = np.vstack([each.offsets_m[:, :2] for each in missed])
+    lengths_cm = np.concatenate([_lengths_cm(findings, each) for each in missed])
+    square = square_around(findings.rig, [places_m])
+    factor = exaggeration(list(errors_m), 2 * square.half)
+    # Make room for the arrows, as far as that keeps the floor large.
+    reach_m = 1.01 * np.abs(places_m + factor * errors_m - square.middle).max()
+    half_m = float(np.clip(reach_m, square.half, _WIDER * square.half))
+    return ResidualScale(float(np.quantile(lengths_cm, 0.95)), factor, Square(square.middle, half_m))
 
 
 def residuals_figure(findings: Findings) -> Figure:
     """A floor for each model that is shown, with one scale of colours."""
     accuracies = shown_models(findings)
     figure = Figure(figsize=(5.6 * len(accuracies) + 0.9, 6.6), layout="constrained")
-    most_cm = residual_scale(findings, accuracies)
+    scale = residual_scale(findings, accuracies)
     panels = figure.subplots(1, len(accuracies), squeeze=False)[0]
     for axes, accuracy in zip(panels, accuracies, strict=True):
-        arrows = draw_residuals(axes, findings, accuracy, most_cm)
+        arrows = draw_residuals(axes, findings, accuracy, scale)
     bar = figure.colorbar(arrows, ax=list(panels), shrink=0.8, pad=0.02, extend="max")
     bar.set_label(f"error {'in space' if findings.in_space else 'on the floor'} in cm")
     handles, labels = panels[0].get_legend_handles_labels()
@@ -61,7 +86,7 @@ def residuals_figure(findings: Findings) -> Figure:
     return figure
 
 
-def draw_residuals(axes: Axes, findings: Findings, accuracy: Accuracy, most_cm: float) -> Quiver:
+def draw_residuals(axes: Axes, findings: Findings, accuracy: Accuracy, scale: ResidualScale) -> Quiver:
     """Draw one model's mean error at each place as an arrow on the floor, coloured by its length in space."""
     missed = findings.missed(accuracy)
     places_m = np.vstack([found.world_m[:, :2] for found in missed])
@@ -69,12 +94,12 @@ def draw_residuals(axes: Axes, findings: Findings, accuracy: Accuracy, most_cm: 
     lengths_cm = np.concatenate([_lengths_cm(findings, found) for found in missed])
     draw_ground(axes, findings.rig, [places_m])
     draw_hulls(axes, findings)
-    factor = exaggeration(list(errors_m), axes)
-    _widen(axes, places_m + factor * errors_m)
+    show_square(axes, scale.square)
+    factor = scale.factor
     # The largest last, on top of the others.
     order = np.argsort(lengths_cm, kind="stable")
     places_m, errors_m, lengths_cm = places_m[order], errors_m[order], lengths_cm[order]
-    look = {"cmap": _COLOURS, "norm": Normalize(0, most_cm)}
+    look = {"cmap": _COLOURS, "norm": Normalize(0, scale.most_cm)}
     arrows = draw_arrows(axes, places_m, errors_m, factor, lengths_cm, **look)
     x_m, y_m = places_m.T
     axes.scatter(x_m, y_m, c=lengths_cm, s=14, zorder=3.5, lw=0, **look)  # type: ignore[arg-type]
@@ -83,14 +108,6 @@ def draw_residuals(axes: Axes, findings: Findings, accuracy: Accuracy, most_cm: 
     times = f"drawn {factor} times as long" if factor > 1 else ""
     axes.set_title(f"{label(accuracy.model)}: errors {scheme}\n{times}", loc="left", fontsize=10)
     return arrows
-
-
-def _widen(axes: Axes, points_m: Array) -> None:
-    """Make room for points (n, 2), as far as that keeps the floor large."""
-    middle = np.array([np.mean(axes.get_xlim()), np.mean(axes.get_ylim())])
-    half = float(np.ptp(axes.get_xlim())) / 2
-    half = float(np.clip(1.01 * np.abs(points_m - middle).max(), half, _WIDER * half))
-    axes.set(xlim=(middle[0] - half, middle[0] + half), ylim=(middle[1] - half, middle[1] + half))
 
 
 def _lengths_cm(findings: Findings, missed: Missed) -> Array:

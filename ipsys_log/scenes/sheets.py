@@ -2,18 +2,33 @@
 
 from __future__ import annotations
 
+from collections.abc import Iterator, Sequence
+from dataclasses import dataclass, replace
 from pathlib import Path
 
 from ipsys_log.log.session import Session
-from ipsys_log.measuring.check import check_entry
-from ipsys_log.measuring.entry import read_typed
-from ipsys_log.measuring.scene import look
-from ipsys_log.measuring.sheet import find_stops, name_columns, read_sheet, refuse_rows
-from ipsys_log.messages import Measurement
+from ipsys_log.measuring.check import Checked, check_entry
+from ipsys_log.measuring.doubts import THE_MODEL
+from ipsys_log.measuring.entry import Entry, Fault, read_typed
+from ipsys_log.measuring.neighbours import OTHER_ROWS, fit_neighbours
+from ipsys_log.measuring.scene import Sight, look
+from ipsys_log.measuring.sheet import SheetRow, find_stops, name_columns, read_sheet, refuse_rows
+from ipsys_log.messages import Measurement, Model, Rig
 from ipsys_log.runs.request import Request
 from ipsys_log.scenes.finished import FinishedLog, rigs_of
 
 __all__ = ["add_sheet", "check_sheet"]
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class _Row:
+    """A row of a sheet, what the cameras saw of it, and what follows; ``stop`` says why they saw nothing."""
+
+    line: int
+    entry: Entry
+    faults: Sequence[Fault]
+    stop: str
+    sight: Sight | None
 
 
 def check_sheet(path: Path, log: Path, request: Request) -> None:
@@ -30,38 +45,96 @@ def check_sheet(path: Path, log: Path, request: Request) -> None:
             read_sheet(path, rigs[-1], session.start_ns)
 
 
-def add_sheet(scene: FinishedLog, path: Path) -> list[str]:
+def add_sheet(scene: FinishedLog, path: Path, insist: bool = False) -> list[str]:
     """Append the measurements of a sheet: all of them, or none.
+
+    Parameters
+    ----------
+    scene : the log.
+    path : of the sheet.
+    insist : write rows all the same that look wrong and can be right.
 
     Returns
     -------
-    What to look at again, by line.
+    What is known badly, and what looks wrong in rows that were insisted on, by line.
 
     Raises
     ------
     IpsysError
-        Naming every bad row by its line.
+        Naming every bad row by its line, with what contradicts it.
     """
-    rows = read_sheet(path, scene.rig, scene.start_ns)
+    rows = list(_sighted(scene, read_sheet(path, scene.rig, scene.start_ns)))
+    model, name = scene.model, THE_MODEL
+    checked = _check(scene, rows, model, name)
+    if model is None:  # then the rows can contradict one another
+        model, name = _fit(scene, rows, checked), OTHER_ROWS
+        checked = checked if model is None else _check(scene, rows, model, name)
+    faults = [(row.line, row.stop) for row in rows if row.stop]
+    faults += _by_line(rows, [[fault.text for fault in one.faults] for one in checked], scene.rig)
+    doubts = _by_line(rows, _doubts(rows, checked, scene, model), scene.rig)
+    refuse_rows(path, faults, () if insist else doubts)
+    scene.add([one.measurement for one in checked if one.measurement is not None])
+    ids = {row.line: one.id for row, one in zip(rows, checked, strict=True)}
+    imprecise = _by_line(rows, [one.imprecise for one in checked], scene.rig)
+    return [f"line {line}: {ids[line]}: {text}" for line, text in sorted(doubts + imprecise)]
+
+
+def _by_line(rows: Sequence[_Row], texts: Sequence[Sequence[str]], rig: Rig) -> list[tuple[int, str]]:
+    """Name the columns of a sheet in remarks on its rows."""
+    return [
+        (row.line, name_columns(text, rig)) for row, held in zip(rows, texts, strict=True) for text in held
+    ]
+
+
+def _sighted(scene: FinishedLog, rows: Sequence[SheetRow]) -> Iterator[_Row]:
+    """Find the stretch of each row, and what the cameras saw of its marker then."""
     read = [read_typed(row.typed, scene.rig) for row in rows]
-    found = list(find_stops(rows, scene.stops, [entry.marker_id for entry, _ in read]))
-    faults: list[tuple[int, str]] = []
-    warnings: list[str] = []
-    measurements: list[Measurement] = []
-    for row, (entry, wrong), stop in zip(rows, read, found, strict=True):
-        if isinstance(stop, str) and stop:
-            faults.append((row.line, stop))
+    stops = find_stops(rows, scene.stops, [entry.marker_id for entry, _ in read])
+    for row, (entry, faults), stop in zip(rows, read, stops, strict=True):
         sight = None
         if isinstance(stop, int) and entry.marker_id is not None:
             sight = look(scene.views(stop), entry.marker_id)
-        history = [*scene.history(), *measurements]
-        checked = check_entry(entry, wrong, scene.rig, sight, history, scene.model)
-        faults += [(row.line, name_columns(fault.text, scene.rig)) for fault in checked.faults]
-        warnings += [
-            f"line {row.line}: {checked.id}: {name_columns(text, scene.rig)}" for text in checked.warnings
-        ]
-        if checked.measurement is not None:
-            measurements.append(checked.measurement)
-    refuse_rows(path, faults)
-    scene.add(measurements)
-    return warnings
+        yield _Row(row.line, entry, faults, stop if isinstance(stop, str) else "", sight)
+
+
+def _check(scene: FinishedLog, rows: Sequence[_Row], model: Model | None, name: str) -> list[Checked]:
+    """Check each row as the page does, after those above it."""
+    history, found = [*scene.history()], []
+    for row in rows:
+        one = check_entry(row.entry, row.faults, scene.rig, row.sight, history, model, name)
+        history += [] if one.measurement is None else [one.measurement]
+        found.append(one)
+    return found
+
+
+def _fit(scene: FinishedLog, rows: Sequence[_Row], checked: Sequence[Checked]) -> Model | None:
+    """Return a model of the rows themselves, without those that contradict it."""
+    seen: list[tuple[Measurement, Sight]] = []
+    for row, one in zip(rows, checked, strict=True):
+        if one.measurement is not None and row.sight is not None:
+            seen.append((one.measurement, row.sight))
+    return fit_neighbours(seen, scene.rig)
+
+
+def _doubts(
+    rows: Sequence[_Row], checked: Sequence[Checked], scene: FinishedLog, model: Model | None
+) -> list[list[str]]:
+    """Return what contradicts each row; with the other such row that its numbers fit, if there is one."""
+    doubtful = [row for row, one in zip(rows, checked, strict=True) if one.contradictions]
+    doubts = []
+    for row, one in zip(rows, checked, strict=True):
+        other = next((r for r in doubtful if one.contradictions and _fits(row, r, scene, model)), None)
+        hint = (
+            "" if other is None else f"; its numbers fit line {other.line} (marker {other.entry.marker_id})"
+        )
+        doubts.append([text + hint for text in one.contradictions])
+    return doubts
+
+
+def _fits(row: _Row, other: _Row, scene: FinishedLog, model: Model | None) -> bool:
+    """Return True where the numbers of a row fit what the cameras saw at another row."""
+    if other is row or other.sight is None:
+        return False
+    entry = replace(row.entry, marker_id=other.entry.marker_id, id=None)
+    one = check_entry(entry, (), scene.rig, other.sight, (), model)
+    return bool(one.predictions) and one.measurement is not None and not one.contradictions

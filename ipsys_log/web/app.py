@@ -8,7 +8,7 @@ from importlib.resources import files
 from typing import Any
 
 from starlette.applications import Starlette
-from starlette.requests import Request
+from starlette.requests import ClientDisconnect, Request
 from starlette.responses import JSONResponse, Response
 from starlette.routing import Route
 
@@ -43,7 +43,7 @@ def build_app(scene: Scene) -> Starlette:
             Route("/api/measure", questions.measure, methods=["POST"]),
             Route("/api/undo", questions.undo, methods=["POST"]),
         ],
-        exception_handlers={IpsysError: _refused},
+        exception_handlers={IpsysError: _refused, ClientDisconnect: _gone, Exception: _failed},
     )
 
 
@@ -58,6 +58,15 @@ def _file(name: str, kind: str) -> Any:
 
 async def _refused(_: Request, error: Exception) -> Response:
     return JSONResponse({"error": str(error)}, 400)
+
+
+async def _gone(_: Request, __: Exception) -> Response:
+    return Response(status_code=400)  # nobody reads it
+
+
+async def _failed(_: Request, error: Exception) -> Response:
+    text = f"a fault of ipsys: {type(error).__name__}: {error}; the terminal says more when the command ends"
+    return JSONResponse({"error": text}, 500)
 
 
 class _Questions:

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import hmac
 import ipaddress
-from http.cookies import CookieError, SimpleCookie
+from collections.abc import Iterator
 from urllib.parse import parse_qs
 
 from starlette.datastructures import Headers, MutableHeaders
@@ -59,17 +59,17 @@ class Guard:
         headers = Headers(scope=scope)
         host = headers.get("host", "")
         if not self._is_ours(host):
-            return PlainTextResponse("this address is not one of this machine", 403)
+            return _refuse("this address is not one of this machine")
         if self._token is not None:
             given = parse_qs(scope["query_string"].decode("latin-1")).get("token", [""])[0]
             if scope["method"] == "GET" and scope["path"] == "/" and self._fits(given):
                 return self._welcome(scope)
-            if not self._fits(self._cookie(headers, scope)):
-                return PlainTextResponse("open the page by the whole address that ipsys has printed", 403)
+            if not any(map(self._fits, self._cookies(headers, scope))):
+                return _refuse("open the page by the whole address that ipsys has printed")
         if scope["method"] not in ("GET", "HEAD"):
             origin = headers.get("origin")
             if headers.get(HEADER) != "1" or (origin is not None and origin != f"http://{host}"):
-                return PlainTextResponse("only the page itself may write", 403)
+                return _refuse("only the page itself may write")
         return None
 
     def _is_ours(self, host: str) -> bool:
@@ -89,15 +89,24 @@ class Guard:
         response.set_cookie(self._name(scope), self._token or "", httponly=True, samesite="strict")
         return response
 
-    def _cookie(self, headers: Headers, scope: Scope) -> str:
-        try:
-            cookies = SimpleCookie(headers.get("cookie", ""))
-        except CookieError:
-            return ""
-        name = self._name(scope)
-        return cookies[name].value if name in cookies else ""
+    def _cookies(self, headers: Headers, scope: Scope) -> Iterator[str]:
+        """Yield the values of our cookie.
+
+        Other programs on this host send theirs along, in any form. A strict parser (``http.cookies``) drops
+        the whole header for one of them.
+        """
+        for header in headers.getlist("cookie"):
+            for pair in header.split(";"):
+                name, _, value = pair.partition("=")
+                if name.strip() == self._name(scope):
+                    yield value.strip().strip('"')
 
     @staticmethod
     def _name(scope: Scope) -> str:
         """Cookies do not tell ports apart: two pages of one machine must not share one."""
         return f"ipsys_{(scope.get('server') or ('', 0))[1]}"
+
+
+def _refuse(text: str) -> Response:
+    """Answer, and close the connection: only a user of the page may keep one open."""
+    return PlainTextResponse(text, 403, headers={"Connection": "close"})

@@ -2,14 +2,16 @@
 
 from __future__ import annotations
 
+import asyncio
 import errno
 import ipaddress
 import secrets
 import socket
-from collections.abc import Iterator
+from collections.abc import Callable, Iterator
 from contextlib import contextmanager
 from dataclasses import dataclass
 from threading import Thread
+from typing import Any
 
 import cv2
 import uvicorn
@@ -17,12 +19,25 @@ import uvicorn
 from ipsys_log.errors import IpsysError
 from ipsys_log.measuring.scene import Scene
 from ipsys_log.web.app import build_app
+from ipsys_log.web.connections import Connections, Limits, derive_limits
+from ipsys_log.web.faults import Faults
 from ipsys_log.web.guard import Guard
 
 __all__ = ["Served", "check_free", "qr_code", "serving"]
 
 _LOOPBACK = "127.0.0.1"
 _STEP_S = 0.02
+_TURN_S = 0.1
+_BACKLOG = 128
+# Cookies of other programs on this machine come along: a browser sends 4 kB of each.
+_MAX_HEADER_BYTES = 64 << 10
+# The screen belongs to a recording: what the server has to say is kept by Faults.
+_SILENT: dict[str, Any] = {
+    "version": 1,
+    "disable_existing_loggers": False,
+    "handlers": {"none": {"class": "logging.NullHandler"}},
+    "loggers": {name: {"handlers": ["none"], "propagate": False} for name in ("uvicorn", "asyncio")},
+}
 
 
 @dataclass(frozen=True, slots=True)
@@ -31,46 +46,77 @@ class Served:
 
     url: str
     thread: Thread
+    faults: Faults
 
-    def wait(self) -> None:
-        """Wait until the server ends; an interrupt comes through."""
-        while self.thread.is_alive():
-            self.thread.join(1.0)
+    def wait(self, stopped: Callable[[], bool]) -> None:
+        """Wait until the server ends, or until `stopped` is true."""
+        while self.thread.is_alive() and not stopped():
+            self.thread.join(_TURN_S)
 
 
 @contextmanager
-def serving(scene: Scene, host: str | None = None, port: int = 8000) -> Iterator[Served]:
+def serving(
+    scene: Scene, host: str | None = None, port: int = 8000, limits: Limits | None = None
+) -> Iterator[Served]:
     """Serve the page of a scene until the with-block is left.
 
     Parameters
     ----------
     host : the address to listen on; None: this machine alone, without a token.
     port : 0 takes any that is free.
+    limits : of connections; None: as many as a recorder can spare.
 
     Raises
     ------
     IpsysError
-        For a port that is taken or not allowed, or a host that is not of this machine.
+        For a port that is taken or not allowed, a host that is not of this machine, or a server that does
+        not start.
     """
     token = None if host is None else secrets.token_urlsafe(12)
     with _listen(host or _LOOPBACK, port) as listening:
         names = {socket.gethostname().lower(), f"{socket.gethostname().lower()}.local"}
         names |= {host.lower()} if host else set()
-        app = Guard(build_app(scene), frozenset(names), token)
+        faults = Faults()
         config = uvicorn.Config(
-            app, log_level="error", access_log=False, lifespan="off", ws="none", http="h11",
-            loop="asyncio", server_header=False, timeout_graceful_shutdown=1,
+            faults.watch_app(Guard(build_app(scene), frozenset(names), token)),
+            log_config=_SILENT, access_log=False, lifespan="off", ws="none", http="h11", loop="asyncio",
+            server_header=False, timeout_graceful_shutdown=1, h11_max_incomplete_event_size=_MAX_HEADER_BYTES,
         )  # fmt: skip
         server = uvicorn.Server(config)
-        thread = Thread(target=server.run, kwargs={"sockets": [listening]}, name="page", daemon=True)
+        run = (server, listening, limits or derive_limits(), faults)
+        thread = Thread(target=_run, args=run, name="page", daemon=True)
         thread.start()
         while thread.is_alive() and not server.started:
             thread.join(_STEP_S)
+        if not server.started:
+            raise IpsysError(f"the page cannot be served: {faults.first.splitlines()[-1]}")
         try:
-            yield Served(_url(host, listening.getsockname()[1], token), thread)
+            yield Served(_url(host, listening.getsockname()[1], token), thread, faults)
         finally:
             server.should_exit = True
             thread.join()
+
+
+def _run(server: uvicorn.Server, listening: socket.socket, limits: Limits, faults: Faults) -> None:
+    """Serve until ``server.should_exit``. A fault ends this thread and nothing else."""
+    try:
+        asyncio.run(_serve(server, listening, limits, faults))
+    except Exception as error:
+        faults.add(error)
+
+
+async def _serve(server: uvicorn.Server, listening: socket.socket, limits: Limits, faults: Faults) -> None:
+    faults.watch_loop(asyncio.get_running_loop())
+    listening.setblocking(False)
+    server.config.load()
+    connections = Connections(limits, server.config, server.server_state)
+    async with asyncio.TaskGroup() as tasks:
+        accepting = tasks.create_task(connections.accept(listening))
+        try:
+            await server.serve(sockets=[])
+        finally:
+            accepting.cancel()
+            connections.abort()
 
 
 def check_free(host: str | None, port: int) -> None:
@@ -87,7 +133,7 @@ def check_free(host: str | None, port: int) -> None:
 def _listen(host: str, port: int) -> socket.socket:
     try:
         family, *_, address = socket.getaddrinfo(host, port, type=socket.SOCK_STREAM)[0]
-        return socket.create_server(address[:2], family=family)
+        return socket.create_server(address[:2], family=family, backlog=_BACKLOG)
     except socket.gaierror as error:
         raise IpsysError(f"--host {host}: is no address of this machine; 0.0.0.0 is all of them") from error
     except OverflowError as error:

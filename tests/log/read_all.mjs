@@ -1,5 +1,5 @@
 // Reads a log whole with @mcap/core. Prints: messages by index, CRC-32 of their payloads in log order,
-// messages by streaming. Usage: node read_all.mjs FOLDER_WITH_NODE_MODULES FILE
+// messages by streaming (-1 where that fails). Usage: node read_all.mjs FOLDER_WITH_NODE_MODULES FILE
 import { createRequire } from "node:module";
 import { open, readFile } from "node:fs/promises";
 
@@ -42,9 +42,19 @@ for await (const message of reader.readMessages()) {
 }
 await file.close();
 
-const stream = new McapStreamReader({ decompressHandlers, validateCrcs: true });
-stream.append(await readFile(process.argv[3]));
-let streamed = 0;
-for (let record; (record = stream.nextRecord()); ) if (record.type === "Message") streamed += 1;
-if (!stream.done()) throw new Error("the stream ended early");
+function countStreamed(data) {
+  const stream = new McapStreamReader({ decompressHandlers, validateCrcs: true });
+  stream.append(data);
+  let streamed = 0;
+  for (let record; (record = stream.nextRecord()); ) if (record.type === "Message") streamed += 1;
+  if (!stream.done()) throw new Error("the stream ended early");
+  return streamed;
+}
+
+let streamed = -1;
+try {
+  streamed = countStreamed(await readFile(process.argv[3]));
+} catch (error) {
+  console.error(error.message);
+}
 console.log(count, crc, streamed);

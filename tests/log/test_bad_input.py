@@ -20,6 +20,7 @@ from ipsys_log.errors import LogError
 from ipsys_log.log import LogReader, LogWriter, Schema, repair
 from ipsys_log.log.contents import Contents
 from ipsys_log.log.journal import journal_path
+from ipsys_log.log.lock import check_locks
 from ipsys_log.log.records import MAGIC, ChunkRef, as_bytes
 from ipsys_log.log.storage import DISK, Storage
 from ipsys_log.log.summary import tail_bytes
@@ -98,6 +99,40 @@ def test_one_writer_at_a_time(log: Path, tmp_path: Path) -> None:
     recording.close()
 
 
+@pytest.mark.parametrize("error", [errno.ENOLCK, errno.EOPNOTSUPP, errno.ENOSYS])
+def test_disk_without_locks_is_named_and_keeps_no_file(
+    log: Path, tmp_path: Path, error: int, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    def without(*_: object) -> None:
+        raise OSError(error, "No locks available")
+
+    monkeypatch.setattr("fcntl.flock", without)
+    before = log.read_bytes()
+    new = tmp_path / "new"
+    new.mkdir()
+    for write in (
+        lambda: LogWriter.create(new / "a.mcap"),
+        lambda: LogWriter.create(new / "a.mcap", atomic=True),
+        lambda: LogWriter.append(log),
+        lambda: repair(log),
+        lambda: check_locks(new),
+    ):
+        with pytest.raises(LogError, match=r"gives no locks \(No locks available\).*local disk"):
+            write()
+    assert list(new.iterdir()) == []
+    assert log.read_bytes() == before
+    read_everything(log)
+
+
+def test_link_to_nowhere_is_named(tmp_path: Path) -> None:
+    path = tmp_path / "a.mcap"
+    path.symlink_to(tmp_path / "gone.mcap")
+    for atomic in (False, True):
+        with pytest.raises(LogError, match=r"is a link to .*gone\.mcap, which does not exist"):
+            LogWriter.create(path, atomic=atomic)
+    assert [one.name for one in tmp_path.iterdir()] == ["a.mcap"]
+
+
 def test_a_journal_without_its_log(tmp_path: Path) -> None:
     path = tmp_path / "a.mcap"
     journal_path(path).write_bytes(b"journal")
@@ -123,13 +158,15 @@ def test_a_whole_journal_of_another_file_is_not_believed(log: Path, tmp_path: Pa
     append(other, rows[:4], storage)
     pieces = [o.data for o in storage.operations if o.kind == "write" and o.file != 1]
     before = log.read_bytes()
-    huge = b"\x89IPSYSJ1" + struct.pack("<QQIIQ", (1 << 64) - 1, 0, 0, 0, (1 << 64) - 1) + bytes(4)
-    for content in (b"".join(pieces), huge):
+    most = (1 << 64) - 1
+    huge = b"\x89IPSYSJ2" + struct.pack("<QQQQIIQ", most, 0, 0, 0, 0, 0, most) + bytes(4)
+    earlier = b"\x89IPSYSJ1" + struct.pack("<QQIIQ", most, 0, 0, 0, most) + bytes(4)
+    for content in (b"".join(pieces), huge, earlier):
         journal_path(log).write_bytes(content)
         read_everything(log)
         LogWriter.append(log).close()
         assert log.read_bytes() == before
-    assert pieces[0].startswith(b"\x89IPSYSJ1")
+    assert pieces[0].startswith(b"\x89IPSYSJ2")
 
 
 def test_a_changed_summary(log: Path) -> None:

@@ -56,7 +56,8 @@ def test_a_marker_that_has_not_moved_since_it_was_measured() -> None:
     assert "marker 0 is measured here already, as p001" in text
     lab.save(BETTER)
     lab.show(2, 0.1)
-    assert "as p001, p002" in lab.check(Typed("0", {"A": "172", "B": "190"}, "left", "10")).warnings[0]
+    (text,) = lab.check(Typed("0", {"A": "172", "B": "190"}, "left", "10")).warnings
+    assert "as p001 (2.0 cm away), p002 (1.0 cm away)" in text
     for name in ("p001", "p002"):
         lab.scene.add([withdraw(lab.scene.history(), name)])
     assert lab.check(BETTER).warnings == ()

@@ -12,16 +12,19 @@ from pathlib import Path
 import pytest
 
 from ipsys_log.errors import IpsysError, LogError
-from ipsys_log.log import LogWriter
+from ipsys_log.log import LogWriter, repair
 from ipsys_log.log.session import Session
 from ipsys_log.log.storage import Disk
 from ipsys_log.messages import (
     FRAME_SKIPPED,
     MEASUREMENTS_TOPIC,
+    RIG_TOPIC,
     CompressedImage,
     Event,
     Measurement,
     Message,
+    Model,
+    Rig,
     image_topic,
 )
 from ipsys_log.recording.backlog import TICK, Backlog
@@ -105,6 +108,20 @@ def test_a_fault_of_the_recorder_is_raised_where_frames_are_taken(log: Noted) ->
 
     with pytest.raises(ZeroDivisionError), backlog(source(), log) as frames:
         assert [message for message in frames if message is not TICK] == [frame(0)]
+
+
+def test_settings_are_in_the_file_before_the_first_frame(tmp_path: Path) -> None:
+    """As a recorder leaves them that is killed at once: rig, lens and the model of a live run."""
+    path, killed = tmp_path / "a.mcap", tmp_path / "killed.mcap"
+    rig = Rig("lab", "DICT_4X4_100", 0.2)
+    settings = [Message(RIG_TOPIC, 1, 1, rig), Message("/runs/poly/model", 2, 2, Model(2, "poly", ()))]
+    with recording(path, settings) as log:
+        killed.write_bytes(path.read_bytes())
+        log.put(frame(0))
+    repair(killed)
+    with Session([killed]) as session:
+        assert session.payloads([RIG_TOPIC]) == [rig]
+        assert session.count("/runs/poly/model") == 1
 
 
 class FullDisk(Disk):

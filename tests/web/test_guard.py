@@ -91,6 +91,27 @@ def test_the_token_becomes_a_cookie_that_scripts_and_other_sites_do_not_get(shar
     assert "default-src 'self'" in headers["content-security-policy"]
 
 
+def test_cookies_of_other_programs_lock_nobody_out(shared: Caller) -> None:
+    name = f"ipsys_{shared.parts.port}"
+    ours = f"{name}={shared.token}"
+    for header in (
+        f'foo={{"a":"b"}}; {ours}',
+        f'{ours}; foo={{"a":"b"}}',
+        f"{ours};foo=[1,2]",
+        f"bare; {ours}; =nameless; ;; =",
+        f'foo="open; {ours}',
+        f'a b=c d; {name}="{shared.token}"',
+        f"{name}=stale; {ours}",
+        f"{ours}; {name}=stale",
+        f"foo=\xff\xfe; {ours}",
+        f"$Version=1; foo@bar=1,2; {ours} ",
+        f"foo={'x' * 20_000}; {ours}",
+    ):
+        assert shared.ask("GET", "/api/scene", Cookie=header)[0] == 200, header
+    for header in (f"x{ours}", f"{name}x={shared.token}", name, f"{name}=x{shared.token}", f"{ours}x"):
+        assert shared.ask("GET", "/api/scene", Cookie=header)[0] == 403, header
+
+
 def test_a_name_that_leads_here_from_elsewhere_is_refused(here: Caller, shared: Caller) -> None:
     for caller in (here, shared):
         path = f"/?token={caller.token}"

@@ -7,9 +7,6 @@ and shift of the marker explains all of them at once; the next pass starts from 
 
 Where a sensor exposes row after row, each point of the print is seen where it was at its own time: the speed
 along the print is one more thing that the edges tell.
-
-What a turn and shift do is reckoned in the plane of the print, where it needs no lens: a point x of the plane
-that moves by d is seen, from the camera at c, at x + d_xy + (x - c)_xy d_z / c_z.
 """
 
 from __future__ import annotations
@@ -20,11 +17,20 @@ from typing import NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 
-from ipsys_log.geometry.lenses import project
 from ipsys_log.messages import CameraCalibration
-from ipsys_log.stages.detect.decode import Grey, levels_at
+from ipsys_log.stages.detect.adjustment import (
+    Fit,
+    Guess,
+    into_poses,
+    known_unknowns,
+    moves,
+    outline,
+    solve,
+    whole,
+)
+from ipsys_log.stages.detect.decode import Grey
 from ipsys_log.stages.detect.prints import Prints, lay_out
-from ipsys_log.stages.detect.profiles import LEAST_CONTRAST, Poses, Seen, View, measure
+from ipsys_log.stages.detect.profiles import LEAST_CONTRAST, Poses, View, measure
 
 __all__ = ["Fit", "Guess", "fit_edges"]
 
@@ -40,40 +46,6 @@ _BLURRED = 0.6
 _SEEN = 0.6
 _EXACT_PX = 0.05
 _WRONG_CELLS = 1
-# Squared pixels per squared unit of each unknown that hold it to what was known: shift and turn, edge offset,
-# speed. A tilt that shows in nothing, of a marker right below the camera, stays what it is.
-_HOLD = np.array([1e-6, 1e-6, 1e-6, 1e-2, 1e-2, 1e-6, 1e-6, 1e-5, 1e-5])
-_HOLD_GIVEN, _HOLD_SPEED = 1e9, 1e-1
-
-
-_SHARP = np.zeros(2, dtype=bool)
-
-
-class Guess(NamedTuple):
-    """About where a marker is: ``rotation`` (3, 3) and ``centre`` (3,) take its frame to the camera's.
-
-    Lengths are in sides of its black square, whatever that measures: a picture does not say. ``motion`` (3,)
-    is its speed along its own x and y, per s, and its turn about its normal in rad/s; None where not known.
-    ``blurred`` (2,) says whether its motion blurs edges across its x, and across its y.
-    """
-
-    id: int
-    rotation: Array
-    centre: Array
-    motion: Array | None = None
-    blurred: NDArray[np.bool_] = _SHARP
-
-
-class Fit(NamedTuple):
-    """Where a marker is, with the covariance (8, 8) of its corners x0 y0 .. x3 y3; by how much edges of black
-    lie inside the black; how far edges are from where the fit has them (RMS); and how blurred they are."""
-
-    pose: Guess
-    corners_px: Array
-    covariance_px2: Array
-    edge_offset_px: float
-    spread_px: float
-    blur_px: float
 
 
 def fit_edges(
@@ -103,7 +75,7 @@ def fit_edges(
     For each guess the fit, or None where there is no such marker: the fit does not settle, edges are
     missing, a corner lies outside of the picture, or the cells are not those of this id.
     """
-    possible = _poses(guesses).possible() if guesses else np.ones(0, dtype=bool)
+    possible = into_poses(guesses).possible() if guesses else np.ones(0, dtype=bool)
     if not possible.all():
         some = [guess for guess, ok in zip(guesses, possible, strict=True) if ok]
         found = iter(fit_edges(grey, some, dictionary, lens, edge_offset_px, row_time_s, blur_px))
@@ -112,7 +84,7 @@ def fit_edges(
         return []
     view = View(grey, lens, lay_out(dictionary, tuple(guess.id for guess in guesses)), row_time_s, blur_px)
     settled, (corners_px, slopes, levels) = _settle_all(view, guesses, edge_offset_px)
-    good = settled.good & _whole(corners_px, grey) & _same_cells(view.prints, levels)
+    good = settled.good & whole(corners_px, grey) & _same_cells(view.prints, levels)
     covariances_px2 = slopes @ settled.covariances @ slopes.transpose(0, 2, 1)
     return [
         Fit(
@@ -127,10 +99,6 @@ def fit_edges(
         else None
         for n, guess in enumerate(guesses)
     ]
-
-
-def _poses(guesses: Sequence[Guess]) -> Poses:
-    return Poses(np.array([one.rotation for one in guesses]), np.array([one.centre for one in guesses]))
 
 
 class _Settled(NamedTuple):
@@ -151,34 +119,34 @@ def _settle_all(
 ) -> tuple[_Settled, tuple[Array, Array, Array]]:
     """Settle markers, again if edges turn out to be blurred; and the outlines of them."""
     settled = _settle(view, guesses, edge_offset_px, np.array([guess.blurred for guess in guesses]))
-    outline = _outline(view, settled.poses)
-    more = _blurred(view.prints, settled.heights, outline[2]) & ~settled.blurred
+    seen = outline(view, settled.poses)
+    more = _blurred(view.prints, settled.heights, seen[2]) & ~settled.blurred
     if more.any():
         settled = _settle(view, guesses, edge_offset_px, settled.blurred | more)
-        outline = _outline(view, settled.poses)
-    return settled, outline
+        seen = outline(view, settled.poses)
+    return settled, seen
 
 
 def _settle(
     view: View, guesses: Sequence[Guess], edge_offset_px: float | None, blurred: NDArray[np.bool_]
 ) -> _Settled:
     """Move markers until they settle; ``blurred`` (m, 2) says across which of their axes edges are."""
-    poses = _poses(guesses)
+    poses = into_poses(guesses)
     # Unknown are a twist, the edge offset and, where rows take time, the speed along the print.
     unknowns = 9 if view.row_time_s else 7
-    known, hold = _known(guesses, edge_offset_px)
+    known, hold = known_unknowns(guesses, edge_offset_px)
     known, hold, motions = known[:, :unknowns], hold[:, :unknowns], known[:, 7:]
     wide = blurred
     doubt: Array | float = 1.0
     for _ in range(_PASSES):
         seen = measure(view, poses, motions, wide)
-        rows = _moves(view.prints, poses.camera(), seen)[:, :unknowns]
+        rows = moves(view.prints, poses.camera(), seen.slopes, seen.late)[:, :unknowns]
         # Edges were looked for where they are at the speed known so far.
         off_px = seen.off_px
         if view.row_time_s:
             off_px = off_px + (motions[:, None, :2] @ rows[:, 7:])[:, 0]
         weights = seen.certainty / doubt
-        normal, found = _solve(rows, weights, off_px, known, hold)
+        normal, found = solve(rows, weights, off_px, known, hold)
         left_px = off_px - (found[:, None] @ rows)[:, 0]
         # Steps are what the twist moves, and what the speed does that was not known before.
         moved_px = np.abs(seen.off_px - left_px + found[:, 6:7] * view.prints.polarity).max(axis=1)
@@ -202,65 +170,6 @@ def _settle(
     enough = (seen.certainty > 0).sum(axis=1) > _SEEN * np.abs(view.prints.polarity).sum(axis=1)
     good = enough & (moved_px < _SETTLED_PX)
     return _Settled(poses, found[:, 6], covariances, good, seen.heights, blurred, spread_px, seen.blurs_px)
-
-
-def _solve(rows: Array, weights: Array, off_px: Array, known: Array, hold: Array) -> tuple[Array, Array]:
-    """Least squares for m markers: the normal matrices (m, u, u) and the unknowns (m, u)."""
-    weighted = rows * weights[:, None]
-    normal = weighted @ rows.transpose(0, 2, 1)
-    count = known.shape[1]
-    normal.reshape(len(known), -1)[:, :: count + 1] += hold
-    right = weighted @ off_px[..., None] + (hold * known)[..., None]
-    return normal, np.asarray(np.linalg.solve(normal, right)[..., 0], dtype=np.float64)
-
-
-def _known(guesses: Sequence[Guess], edge_offset_px: float | None) -> tuple[Array, Array]:
-    """What is known of the unknowns and the turn, (m, 10), and how firmly it is held to, (m, 9)."""
-    known, hold = np.zeros((len(guesses), 10)), np.tile(_HOLD, (len(guesses), 1))
-    if edge_offset_px is not None:
-        known[:, 6], hold[:, 6] = edge_offset_px, _HOLD_GIVEN
-    for n, guess in enumerate(guesses):
-        if guess.motion is not None:
-            known[n, 7:], hold[n, 7:] = guess.motion, _HOLD_SPEED
-    return known, hold
-
-
-def _moves(prints: Prints, camera: Array, seen: Seen) -> Array:
-    """How far points on edges are seen to move along their axis, in px per unit of an unknown: (m, 9, s)."""
-    x, y, level = prints.points[..., 0], prints.points[..., 1], prints.level
-    aside = (np.where(level, y - camera[:, 1:2], x - camera[:, :1]) / camera[:, 2:]) * seen.slopes
-    rows = np.empty((len(level), 9, level.shape[1]))
-    np.multiply(seen.slopes, level, out=rows[:, 1])
-    np.subtract(seen.slopes, rows[:, 1], out=rows[:, 0])
-    rows[:, 2] = aside
-    np.multiply(aside, y, out=rows[:, 3])
-    np.multiply(aside, -x, out=rows[:, 4])
-    np.multiply(seen.slopes, prints.swirl, out=rows[:, 5])
-    np.negative(prints.polarity, out=rows[:, 6])
-    np.multiply(seen.late, level, out=rows[:, 8])
-    np.subtract(seen.late, rows[:, 8], out=rows[:, 7])
-    return rows
-
-
-def _outline(view: View, poses: Poses) -> tuple[Array, Array, Array]:
-    """Corners (m, 4, 2) in px, how they move with a twist (m, 8, 6), and grey levels of cells (m, c)."""
-    outline, count = view.prints.outline, len(poses.centres)
-    px = project(poses.into_camera(outline).reshape(-1, 3), view.lens).reshape(count, -1, 2)
-    per_unit = np.stack([px[:, 4:8] - px[:, :4], px[:, 8:12] - px[:, :4]], axis=3) / view.prints.nudge
-    x, y = outline[:4].T
-    camera = poses.camera()
-    aside = (outline[:4] - camera[:, None, :2]) / camera[:, None, 2:]
-    inplane = np.zeros((count, 4, 2, 6))
-    inplane[:, :, 0, 0] = inplane[:, :, 1, 1] = 1.0
-    inplane[..., 2], inplane[:, :, 0, 5], inplane[:, :, 1, 5] = aside, -y, x
-    inplane[..., 3], inplane[..., 4] = aside * y[:, None], aside * -x[:, None]
-    levels = levels_at(view.grey, *np.ascontiguousarray(px[:, 12:].transpose(2, 0, 1), dtype=np.float32))
-    return px[:, :4], (per_unit @ inplane).reshape(count, 8, 6), levels
-
-
-def _whole(corners_px: Array, grey: Grey) -> NDArray[np.bool_]:
-    last = np.array([grey.shape[1], grey.shape[0]]) - 0.5
-    return np.asarray(((corners_px >= -0.5) & (corners_px <= last)).all(axis=(1, 2)))
 
 
 def _blurred(prints: Prints, heights: Array, levels: Array) -> NDArray[np.bool_]:

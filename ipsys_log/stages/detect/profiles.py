@@ -15,7 +15,18 @@ from ipsys_log.messages import CameraCalibration
 from ipsys_log.stages.detect.decode import Grey, levels_at
 from ipsys_log.stages.detect.prints import Prints
 
-__all__ = ["LEAST_CONTRAST", "Poses", "Seen", "View", "measure"]
+__all__ = [
+    "BLURS_PX",
+    "LEAST_CONTRAST",
+    "USUAL_BLUR_PX",
+    "Poses",
+    "Seen",
+    "Sites",
+    "View",
+    "locate",
+    "measure",
+    "read_profiles",
+]
 
 Array = NDArray[np.float64]
 
@@ -26,8 +37,8 @@ LEAST_CONTRAST = 8.0
 _NEAR_PX, _FAR_PX, _OF_CELL = 3.0, 12.0, 0.45
 _TAPS = np.linspace(-1, 1, 7)
 # Of a blurred step: what optics, pixels and JPEG do to an edge.
-_USUAL_BLUR_PX = 0.8
-_BLURS_PX = tuple(np.arange(0.5, 2.35, 0.05).round(2).tolist())
+USUAL_BLUR_PX = 0.8
+BLURS_PX = tuple(np.arange(0.5, 2.35, 0.05).round(2).tolist())
 # Wider edges than that tell less.
 _SHARP_PX = 4.0
 # Edges of less than this share of the mean contrast are covered, or in glare.
@@ -80,13 +91,28 @@ class Poses(NamedTuple):
         )
 
 
+class Sites(NamedTuple):
+    """Places of edges in a picture: ``middle`` (m, s, 2) in px, and ``across`` (m, s, 2) from there over
+    the edge, ``lengths_px`` (m, s) long.
+
+    ``slopes`` (m, s) are px per side of the print, and ``late`` (m, s) px per speed along their axis, for
+    rows that are exposed later.
+    """
+
+    middle: Array
+    across: Array
+    lengths_px: Array
+    slopes: Array
+    late: Array
+
+
 class Seen(NamedTuple):
     """What is seen of the edges of prints, (m, s) each.
 
     ``off_px`` is by how much they lie off, along their axis; ``certainty`` from 1.0 to 0.0 for edges that
-    are not there. ``slopes`` are px per side of the print, and ``late`` px per speed along their axis, for
-    rows that are exposed later. ``heights`` are the grey levels by which they rise within the usual blur;
-    ``blurs_px`` (m,) are theirs.
+    are not there. ``slopes`` and ``late`` are as in :class:`Sites`. ``heights`` are the grey levels by which
+    they rise within the usual blur; ``blurs_px`` (m,) are theirs. ``ends`` (m, s, 2) are the levels at both
+    ends of a profile.
     """
 
     off_px: Array
@@ -95,19 +121,19 @@ class Seen(NamedTuple):
     late: Array
     heights: Array
     blurs_px: Array
+    ends: Array
 
 
-def measure(view: View, poses: Poses, motions: Array, wide: NDArray[np.bool_]) -> Seen:
-    """Profiles across the edges, near where they should be.
+def locate(view: View, poses: Poses, motions: Array) -> Sites:
+    """Return where edges should be seen.
 
     Parameters
     ----------
-    motions : (m, 3), as in :class:`Guess`.
-    wide : (m, 2), whether to look far to both sides, across edges along y and along x.
+    motions : (m, 3), as in :class:`~ipsys_log.stages.detect.adjustment.Guess`.
     """
-    prints = view.prints
-    points_px = project(poses.into_camera(prints.ends).reshape(-1, 3), view.lens).reshape(len(wide), -1, 2)
-    ends_px = points_px[:, :-1].reshape(len(wide), 2, -1, 2)
+    prints, count = view.prints, len(poses.centres)
+    points_px = project(poses.into_camera(prints.ends).reshape(-1, 3), view.lens).reshape(count, -1, 2)
+    ends_px = points_px[:, :-1].reshape(count, 2, -1, 2)
     across = (ends_px[:, 1] - ends_px[:, 0]) / 2
     middle = ends_px[:, 0] + across
     lengths_px = np.maximum(np.hypot(across[..., 0], across[..., 1]), 1e-6)
@@ -116,21 +142,45 @@ def measure(view: View, poses: Poses, motions: Array, wide: NDArray[np.bool_]) -
     if view.row_time_s:
         speed = np.where(prints.level, motions[:, 1:2], motions[:, :1]) + prints.swirl * motions[:, 2:]
         middle = middle + (late * speed / lengths_px)[..., None] * across
-    farthest_px = np.clip(_OF_CELL * slopes.min(axis=1) / prints.cells, 0.5, _FAR_PX)
+    return Sites(middle, across, lengths_px, slopes, late)
+
+
+def read_profiles(grey: Grey, sites: Sites, reaches_px: Array, taps: Array) -> Array:
+    """Return grey levels across edges, (m, s, t).
+
+    Parameters
+    ----------
+    reaches_px : (m, 1) or (m, s), how far profiles reach to each side.
+    taps : (t,), in shares of that.
+    """
+    places = (reaches_px / sites.lengths_px)[..., None] * taps
+    x = (sites.middle[..., :1] + sites.across[..., :1] * places).astype(np.float32)
+    y = (sites.middle[..., 1:] + sites.across[..., 1:] * places).astype(np.float32)
+    return levels_at(grey, x, y)
+
+
+def measure(view: View, poses: Poses, motions: Array, wide: NDArray[np.bool_]) -> Seen:
+    """Profiles across the edges, near where they should be.
+
+    Parameters
+    ----------
+    motions : (m, 3), as in :class:`~ipsys_log.stages.detect.adjustment.Guess`.
+    wide : (m, 2), whether to look far to both sides, across edges along y and along x.
+    """
+    prints = view.prints
+    sites = locate(view, poses, motions)
+    farthest_px = np.clip(_OF_CELL * sites.slopes.min(axis=1) / prints.cells, 0.5, _FAR_PX)
     near_px = np.minimum(_NEAR_PX, farthest_px).round(1)
     reaches_px = near_px[:, None]
     if wide.any():
         wide_edges = np.where(prints.level, wide[:, 1:], wide[:, :1])
         reaches_px = np.where(wide_edges, farthest_px[:, None], reaches_px)
-    taps = (reaches_px / lengths_px)[..., None] * _TAPS
-    x = (middle[..., :1] + across[..., :1] * taps).astype(np.float32)
-    y = (middle[..., 1:] + across[..., 1:] * taps).astype(np.float32)
-    profiles = levels_at(view.grey, x, y)
+    profiles = read_profiles(view.grey, sites, reaches_px, _TAPS)
     blurs_px = _blurs(view, profiles, near_px, bool(wide.any()))
     shapes = list(zip(near_px.tolist(), blurs_px.tolist(), strict=True))
     fitted = profiles @ np.array([_template(reach_px, blur_px) for reach_px, blur_px in shapes])
     height = fitted[..., 0] * prints.polarity
-    usual = np.array([_template(reach_px, _USUAL_BLUR_PX)[:, :1] for reach_px in near_px.tolist()])
+    usual = np.array([_template(reach_px, USUAL_BLUR_PX)[:, :1] for reach_px in near_px.tolist()])
     sharp = (profiles @ usual)[..., 0] * prints.polarity
     present = height > np.maximum(_WEAK * height.mean(axis=1), LEAST_CONTRAST)[:, None]
     off_px = np.divide(fitted[..., 1], fitted[..., 0], out=np.zeros_like(height), where=present)
@@ -140,7 +190,8 @@ def measure(view: View, poses: Poses, motions: Array, wide: NDArray[np.bool_]) -
         off_px = np.where(wide_edges, by_area, off_px)
         certainty = np.where(wide_edges, shown * np.minimum(1.0, _SHARP_PX / width_px) ** 2, certainty)
     off_px = np.minimum(np.maximum(off_px, -reaches_px), reaches_px)
-    return Seen(off_px, certainty, slopes, late, sharp, blurs_px)
+    ends = profiles[..., :: len(_TAPS) - 1]
+    return Seen(off_px, certainty, sites.slopes, sites.late, sharp, blurs_px, ends)
 
 
 def _by_area(prints: Prints, profiles: Array, reaches_px: Array) -> tuple[Array, Array, Array]:
@@ -165,16 +216,16 @@ def _by_area(prints: Prints, profiles: Array, reaches_px: Array) -> tuple[Array,
 def _blurs(view: View, profiles: Array, reaches_px: Array, wide: bool) -> Array:
     """By how much the edges of each marker are blurred, in px: what leaves least of their mean profile."""
     if view.blur_px is not None or wide:
-        return np.full(len(profiles), view.blur_px or _USUAL_BLUR_PX)
+        return np.full(len(profiles), view.blur_px or USUAL_BLUR_PX)
     means = (view.prints.polarity[:, None] @ profiles)[:, 0]
     left = [_residues(reach_px) @ mean for reach_px, mean in zip(reaches_px.tolist(), means, strict=True)]
-    return np.asarray(np.array(_BLURS_PX)[np.square(left).sum(axis=2).argmin(axis=1)])
+    return np.asarray(np.array(BLURS_PX)[np.square(left).sum(axis=2).argmin(axis=1)])
 
 
 @cache
 def _residues(reach_px: float) -> Array:
     """What the best step of each blur leaves of a profile, (blurs, taps, taps)."""
-    steps = [_step(reach_px, blur_px) for blur_px in _BLURS_PX]
+    steps = [_step(reach_px, blur_px) for blur_px in BLURS_PX]
     return np.array([np.eye(len(_TAPS)) - step @ np.linalg.pinv(step) for step in steps])
 
 

@@ -1,0 +1,138 @@
+"""Signals that end a command: when they take effect, and the exit code that they give.
+
+A signal goes through three states. Until the command is known it is only noted (`hold_signals`). Then it
+interrupts (`allow_interrupt`), or it stops the cameras and the command ends in order (`stop_on_signal`). The
+first signal of a command that runs until it is stopped gives exit code 0; every other one gives 128 plus its
+number, as shells do. A signal that the process inherited as ignored stays ignored (``nohup``).
+"""
+
+from __future__ import annotations
+
+import functools
+import signal
+from collections.abc import Callable
+from dataclasses import dataclass
+from types import FrameType
+from typing import Any, NoReturn
+
+__all__ = [
+    "InterruptError",
+    "Interrupted",
+    "allow_interrupt",
+    "hold_signals",
+    "interruptible",
+    "runs_until_stopped",
+    "stop_on_signal",
+]
+
+_SIGNALS = (signal.SIGINT, signal.SIGTERM, signal.SIGHUP)
+_KEPT = "interrupted; stages that were complete are in the log, and nothing else was changed"
+
+
+class Interrupted(KeyboardInterrupt):
+    """A signal that interrupts the main thread; it carries its exit code and what the user reads."""
+
+    def __init__(self, exit_code: int, text: str) -> None:
+        super().__init__(text)
+        self.exit_code, self.text = exit_code, text
+
+
+class InterruptError(Exception):
+    """The end of an interrupted command: the argument parser would replace a KeyboardInterrupt."""
+
+    def __init__(self, exit_code: int, text: str) -> None:
+        super().__init__(text)
+        self.exit_code, self.text = exit_code, text
+
+
+@dataclass(slots=True)
+class _State:
+    """The signal that was noted, and the text of a normal end (None: an interrupt is a failure)."""
+
+    noted: int | None = None
+    normal_text: str | None = None
+
+
+_state = _State()
+
+
+def hold_signals() -> None:
+    """Note signals without any effect, until the command says what they mean."""
+    _state.noted, _state.normal_text = None, None
+    _handle(_note)
+
+
+def allow_interrupt(normal_text: str | None = None) -> None:
+    """Let signals interrupt the main thread from now on; a signal that was noted interrupts at once.
+
+    Parameters
+    ----------
+    normal_text : the message of a command that runs until it is stopped. Its first signal gives exit code 0.
+
+    Raises
+    ------
+    Interrupted
+        Now or later, in the main thread.
+    """
+    _state.normal_text = normal_text
+    _handle(_interrupt)
+    if _state.noted is not None:
+        _interrupt(_state.noted)
+
+
+def stop_on_signal(stop: Callable[[], None]) -> None:
+    """Call ``stop`` on the first signal, and let the next ones interrupt.
+
+    ``stop`` takes no lock: the interrupted thread may hold it.
+    """
+
+    def end(*_: object) -> None:
+        _state.normal_text = None
+        _handle(_interrupt)
+        stop()
+
+    _handle(end)
+
+
+def runs_until_stopped(command: Callable[..., None]) -> Callable[..., None]:
+    """Mark a command that calls `allow_interrupt` itself, as it may end normally on a signal."""
+    command.runs_until_stopped = True  # type: ignore[attr-defined]
+    return command
+
+
+def interruptible(command: Callable[..., Any]) -> Callable[..., Any]:
+    """Wrap a command: signals interrupt it, and what they raise passes the argument parser."""
+
+    @functools.wraps(command)
+    def run(*arguments: Any, **options: Any) -> Any:
+        try:
+            if not hasattr(command, "runs_until_stopped"):
+                allow_interrupt()
+            return command(*arguments, **options)
+        except Interrupted as interrupt:
+            raise InterruptError(interrupt.exit_code, interrupt.text) from None
+        finally:
+            hold_signals()  # the command has ended: a late signal changes neither its exit code nor its words
+
+    return run
+
+
+def _note(number: int, _: FrameType | None = None) -> None:
+    if _state.noted is not None:  # the user does not want to wait
+        signal.signal(number, signal.SIG_DFL)
+        signal.raise_signal(number)
+    _state.noted = number
+
+
+def _interrupt(number: int, _: FrameType | None = None) -> NoReturn:
+    _state.noted, text = None, _state.normal_text
+    _state.normal_text = None
+    if text is not None:
+        raise Interrupted(0, text)
+    raise Interrupted(128 + number, _KEPT)
+
+
+def _handle(handler: Callable[[int, FrameType | None], None]) -> None:
+    for number in _SIGNALS:
+        if signal.getsignal(number) is not signal.SIG_IGN:
+            signal.signal(number, handler)

@@ -1,0 +1,136 @@
+"""Least squares of a marker's pose: its unknowns, how edges move with them, and the outline that follows.
+
+Unknown are a twist in the frame of the print, the edge offset and, where rows take time, the speed along the
+print. What a turn and shift do is computed in the plane of the print, where it needs no lens: a point x of
+the plane that moves by d is seen, from the camera at c, at x + d_xy + (x - c)_xy d_z / c_z.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from typing import NamedTuple
+
+import numpy as np
+from numpy.typing import NDArray
+
+from ipsys_log.geometry.lenses import project
+from ipsys_log.stages.detect.decode import Grey, levels_at
+from ipsys_log.stages.detect.prints import Prints
+from ipsys_log.stages.detect.profiles import Poses, View
+
+__all__ = ["Fit", "Guess", "into_poses", "known_unknowns", "moves", "outline", "solve", "whole"]
+
+Array = NDArray[np.float64]
+
+# Squared pixels per squared unit of each unknown that hold it to what was known: shift and turn, edge offset,
+# speed. A tilt that shows in nothing, of a marker right below the camera, stays what it is.
+_HOLD = np.array([1e-6, 1e-6, 1e-6, 1e-2, 1e-2, 1e-6, 1e-6, 1e-5, 1e-5])
+_HOLD_GIVEN, _HOLD_SPEED = 1e9, 1e-1
+
+_SHARP = np.zeros(2, dtype=bool)
+
+
+class Guess(NamedTuple):
+    """About where a marker is: ``rotation`` (3, 3) and ``centre`` (3,) take its frame to the camera's.
+
+    Lengths are in sides of its black square, whatever that measures: a picture does not say. ``motion`` (3,)
+    is its speed along its own x and y, per s, and its turn about its normal in rad/s; None where not known.
+    ``blurred`` (2,) says whether its motion blurs edges across its x, and across its y.
+    """
+
+    id: int
+    rotation: Array
+    centre: Array
+    motion: Array | None = None
+    blurred: NDArray[np.bool_] = _SHARP
+
+
+class Fit(NamedTuple):
+    """A marker's pose, with the covariance (8, 8) of its corners x0 y0 .. x3 y3; by how much edges of black
+    lie inside the black; how far edges are from where the fit has them (RMS); and how blurred they are.
+
+    ``uneven`` says that glare, a shadow or a cover may have moved some of the edges.
+    """
+
+    pose: Guess
+    corners_px: Array
+    covariance_px2: Array
+    edge_offset_px: float
+    spread_px: float
+    blur_px: float
+    uneven: bool = False
+
+
+def into_poses(guesses: Sequence[Guess]) -> Poses:
+    """Return the poses of guesses as arrays."""
+    return Poses(np.array([one.rotation for one in guesses]), np.array([one.centre for one in guesses]))
+
+
+def solve(rows: Array, weights: Array, off_px: Array, known: Array, hold: Array) -> tuple[Array, Array]:
+    """Return, for m markers, the normal matrices (m, u, u) and the unknowns (m, u) of least squares."""
+    weighted = rows * weights[:, None]
+    normal = weighted @ rows.transpose(0, 2, 1)
+    count = known.shape[1]
+    normal.reshape(len(known), -1)[:, :: count + 1] += hold
+    right = weighted @ off_px[..., None] + (hold * known)[..., None]
+    return normal, np.asarray(np.linalg.solve(normal, right)[..., 0], dtype=np.float64)
+
+
+def known_unknowns(guesses: Sequence[Guess], edge_offset_px: float | None) -> tuple[Array, Array]:
+    """Return what is known of the unknowns and the turn, (m, 10), and how firmly it is held, (m, 9)."""
+    known, hold = np.zeros((len(guesses), 10)), np.tile(_HOLD, (len(guesses), 1))
+    if edge_offset_px is not None:
+        known[:, 6], hold[:, 6] = edge_offset_px, _HOLD_GIVEN
+    for n, guess in enumerate(guesses):
+        if guess.motion is not None:
+            known[n, 7:], hold[n, 7:] = guess.motion, _HOLD_SPEED
+    return known, hold
+
+
+def moves(prints: Prints, camera: Array, slopes: Array, late: Array) -> Array:
+    """Return how far points on edges are seen to move along their axis, in px per unit of an unknown.
+
+    Parameters
+    ----------
+    camera : (m, 3), in the frames of the prints.
+    slopes, late : (m, s), as in :class:`~ipsys_log.stages.detect.profiles.Sites`.
+
+    Returns
+    -------
+    (m, 9, s).
+    """
+    x, y, level = prints.points[..., 0], prints.points[..., 1], prints.level
+    aside = (np.where(level, y - camera[:, 1:2], x - camera[:, :1]) / camera[:, 2:]) * slopes
+    rows = np.empty((len(level), 9, level.shape[1]))
+    np.multiply(slopes, level, out=rows[:, 1])
+    np.subtract(slopes, rows[:, 1], out=rows[:, 0])
+    rows[:, 2] = aside
+    np.multiply(aside, y, out=rows[:, 3])
+    np.multiply(aside, -x, out=rows[:, 4])
+    np.multiply(slopes, prints.swirl, out=rows[:, 5])
+    np.negative(prints.polarity, out=rows[:, 6])
+    np.multiply(late, level, out=rows[:, 8])
+    np.subtract(late, rows[:, 8], out=rows[:, 7])
+    return rows
+
+
+def outline(view: View, poses: Poses) -> tuple[Array, Array, Array]:
+    """Return corners (m, 4, 2) in px, how they move with a twist (m, 8, 6), and levels of cells (m, c)."""
+    points, count = view.prints.outline, len(poses.centres)
+    px = project(poses.into_camera(points).reshape(-1, 3), view.lens).reshape(count, -1, 2)
+    per_unit = np.stack([px[:, 4:8] - px[:, :4], px[:, 8:12] - px[:, :4]], axis=3) / view.prints.nudge
+    x, y = points[:4].T
+    camera = poses.camera()
+    aside = (points[:4] - camera[:, None, :2]) / camera[:, None, 2:]
+    inplane = np.zeros((count, 4, 2, 6))
+    inplane[:, :, 0, 0] = inplane[:, :, 1, 1] = 1.0
+    inplane[..., 2], inplane[:, :, 0, 5], inplane[:, :, 1, 5] = aside, -y, x
+    inplane[..., 3], inplane[..., 4] = aside * y[:, None], aside * -x[:, None]
+    levels = levels_at(view.grey, *np.ascontiguousarray(px[:, 12:].transpose(2, 0, 1), dtype=np.float32))
+    return px[:, :4], (per_unit @ inplane).reshape(count, 8, 6), levels
+
+
+def whole(corners_px: Array, grey: Grey) -> NDArray[np.bool_]:
+    """Return, (m,), whether all corners (m, 4, 2) of a marker lie in the picture."""
+    last = np.array([grey.shape[1], grey.shape[0]]) - 0.5
+    return np.asarray(((corners_px >= -0.5) & (corners_px <= last)).all(axis=(1, 2)))

@@ -1,0 +1,136 @@
+"""Connections to the page: bounded in number and time, so that a recorder keeps its descriptors."""
+
+from __future__ import annotations
+
+import asyncio
+import resource
+import socket
+from collections.abc import Iterable
+from typing import NamedTuple
+
+from uvicorn import Config
+from uvicorn.protocols.http.h11_impl import H11Protocol
+from uvicorn.server import ServerState
+
+__all__ = ["Connections", "Limits", "derive_limits"]
+
+# Cameras, the log and libraries of a recorder need the others.
+_SHARE_OF_DESCRIPTORS = 8
+_MIN_TOTAL, _MAX_TOTAL = 12, 64
+# A browser opens up to six.
+_MIN_PER_ADDRESS = 8
+_REQUEST_TIMEOUT_S = 20.0
+# A flood of connections leaves the processor to the recorder: 500 are taken in a second.
+_PAUSE_S = 0.002
+_RETRY_S = 0.2
+
+
+class Limits(NamedTuple):
+    """Bounds on open connections.
+
+    Attributes
+    ----------
+    total, per_address : open at the same time.
+    request_s : from the opening, or the last answer, to the end of the next answer.
+    """
+
+    total: int
+    per_address: int
+    request_s: float = _REQUEST_TIMEOUT_S
+
+
+def derive_limits() -> Limits:
+    """Return the limits that leave most of this process's descriptors to the recorder."""
+    soft, _ = resource.getrlimit(resource.RLIMIT_NOFILE)
+    share = _MAX_TOTAL if soft == resource.RLIM_INFINITY else soft // _SHARE_OF_DESCRIPTORS
+    total = min(max(share, _MIN_TOTAL), _MAX_TOTAL)
+    return Limits(total, max(total // 4, _MIN_PER_ADDRESS))
+
+
+class Connections:
+    """Open connections of the page.
+
+    The guard closes a connection when it refuses a request. So an open connection with an answer belongs to
+    a user of the page. Only connections without an answer make room for new ones, the oldest first.
+    """
+
+    def __init__(self, limits: Limits, config: Config, state: ServerState) -> None:
+        self._limits, self._config, self._state = limits, config, state
+        self._addresses: dict[_Connection, str] = {}  # the oldest first
+
+    async def accept(self, listening: socket.socket) -> None:
+        """Accept connections until this task is cancelled. ``listening`` must not block."""
+        loop = asyncio.get_running_loop()
+        while True:
+            try:
+                peer, _ = await loop.sock_accept(listening)
+            except OSError:  # no descriptor is left, or the caller has gone already
+                await asyncio.sleep(_RETRY_S)
+                continue
+            try:
+                await loop.connect_accepted_socket(self._connection, peer)
+            except OSError:
+                peer.close()
+            await asyncio.sleep(_PAUSE_S)
+
+    def abort(self) -> None:
+        """Close all connections without waiting for their callers."""
+        for connection in list(self._addresses):
+            connection.abort()
+
+    def add(self, connection: _Connection, address: str) -> None:
+        """Add a new connection, and close the one that has to make room for it."""
+        self._addresses[connection] = address
+        neighbours = [other for other, its in self._addresses.items() if its == address]
+        if len(neighbours) > self._limits.per_address:
+            self._close_oldest(neighbours)
+        elif len(self._addresses) > self._limits.total:
+            self._close_oldest(self._addresses)
+
+    def remove(self, connection: _Connection) -> None:
+        """Forget a connection that was closed."""
+        self._addresses.pop(connection, None)
+
+    def _connection(self) -> _Connection:
+        return _Connection(self, self._limits.request_s, self._config, self._state)
+
+    def _close_oldest(self, connections: Iterable[_Connection]) -> None:
+        # The new connection has no answer yet: where all others have one, it goes itself.
+        oldest = next(connection for connection in connections if not connection.is_answered)
+        self.remove(oldest)
+        oldest.abort()
+
+
+class _Connection(H11Protocol):
+    """One connection; aborted when an answer takes too long, whoever is the slow one."""
+
+    def __init__(self, owner: Connections, request_s: float, config: Config, state: ServerState) -> None:
+        super().__init__(config, state, {})
+        self._owner, self._request_s = owner, request_s
+        self._timer: asyncio.TimerHandle | None = None
+        self.is_answered = False
+
+    def connection_made(self, transport: asyncio.Transport) -> None:  # type: ignore[override]
+        super().connection_made(transport)
+        self._restart_timer()
+        self._owner.add(self, self.client[0] if self.client else "")
+
+    def on_response_complete(self) -> None:
+        self.is_answered = True
+        self._restart_timer()
+        super().on_response_complete()
+
+    def connection_lost(self, exc: Exception | None) -> None:
+        if self._timer is not None:
+            self._timer.cancel()
+        self._owner.remove(self)
+        super().connection_lost(exc)
+
+    def abort(self) -> None:
+        """Close the connection at once; an answer that the caller has not taken is lost."""
+        self.transport.abort()
+
+    def _restart_timer(self) -> None:
+        if self._timer is not None:
+            self._timer.cancel()
+        self._timer = self.loop.call_later(self._request_s, self.abort)

@@ -1,0 +1,164 @@
+"""Signals at any moment of a command: exit codes, files that are left, and signals that stay ignored."""
+
+from __future__ import annotations
+
+import os
+import shutil
+import signal
+import subprocess
+import sys
+from pathlib import Path
+
+import pytest
+
+from ipsys_log.log import LogReader
+from tests.conftest import ROOT, Ipsys
+from tests.test_record import wait_for
+
+SAMPLE = ROOT / "sample_logs" / "small_lab.mcap"
+LIMIT_S = 60
+
+# Runs the command line, and sends a signal to itself at the n-th file or module that the command opens.
+AT_EVENT = """
+import os, sys
+from ipsys_log.cli import main, signals
+
+number, position = int(sys.argv.pop(1)), int(sys.argv.pop(1))
+hold, events, ready = signals.hold_signals, 0, False
+
+def hold_and_count():
+    global ready
+    hold()
+    ready = not ready
+
+def count(event, _):
+    global events
+    if ready and event in ("open", "import"):
+        events += 1
+        if events == position:
+            os.kill(os.getpid(), number)
+
+signals.hold_signals = hold_and_count
+sys.addaudithook(count)
+try:
+    main()
+finally:
+    ready = False
+    print(f"events {events}", file=sys.stderr)
+"""
+
+
+def end(position: int, number: int, *command: object) -> tuple[int, str]:
+    """Run a command that gets a signal at an event; return its exit code and its standard error."""
+    program = [sys.executable, "-c", AT_EVENT, str(int(number)), str(position), *map(str, command)]
+    done = subprocess.run(program, capture_output=True, text=True, timeout=LIMIT_S, check=False)
+    return done.returncode, done.stderr
+
+
+def count_events(*command: object) -> int:
+    code, err = end(0, signal.SIGTERM, *command)
+    assert code == 0, err
+    return int(err.rsplit("events ", 1)[1])
+
+
+def sample_rig(folder: Path) -> Path:
+    rig = folder / "lab.toml"
+    rig.write_text(
+        'name = "lab"\ndictionary = "DICT_4X4_100"\nmarker_length_m = 0.2\n'
+        '[[reference_points]]\nname = "A"\nx_m = 0.0\ny_m = 0.0\n'
+        '[[reference_points]]\nname = "B"\nx_m = 3.0\ny_m = 0.0\n'
+        '[[cameras]]\nname = "red"\nsource = "sim:red"\nwidth = 320\nheight = 180\n'
+    )
+    return rig
+
+
+@pytest.mark.parametrize("number", [signal.SIGINT, signal.SIGTERM])
+def test_info_interrupted_anywhere_exits_with_128_plus_signal(number: int) -> None:
+    events = count_events("info", SAMPLE)
+    for part in (0.02, 0.9):
+        code, err = end(max(int(part * events), 1), number, "info", SAMPLE)
+        assert code == 128 + number, (part, err)
+        assert "Traceback" not in err
+        assert err.startswith("ipsys: interrupted")
+
+
+@pytest.mark.parametrize(
+    "parts", [(0.02, 0.5), pytest.param([i / 12 for i in range(12)], marks=pytest.mark.slow)]
+)
+def test_record_stopped_anywhere_exits_with_0(parts: list[float], tmp_path: Path) -> None:
+    rig = sample_rig(tmp_path)
+    events = count_events("record", "--rig", rig, "-o", tmp_path / "all.mcap", "--seconds", "0.2")
+    for index, part in enumerate(parts):
+        log = tmp_path / f"{index}.mcap"
+        number = (signal.SIGINT, signal.SIGTERM)[index % 2]
+        code, err = end(max(int(part * events), 1), number, "record", "--rig", rig, "-o", log)
+        assert (code, "Traceback" in err) == (0, False), (part, err)
+        if log.exists():
+            LogReader(log).close()  # a whole log
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("number", [signal.SIGINT, signal.SIGTERM])
+def test_measure_stopped_anywhere_exits_with_0(
+    number: int, lab_log: Path, ipsys: Ipsys, tmp_path: Path
+) -> None:
+    log = tmp_path / "lab.mcap"
+    shutil.copy(lab_log, log)
+    assert ipsys("camera-frame", log).code == 0
+    events = count_events("measure", log, "--places")
+    for part in (i / 8 for i in range(9)):
+        code, err = end(max(int(part * events), 1), number, "measure", log, "--port", "0")
+        assert (code, "Traceback" in err) == (0, False), (part, err)
+    code, err = end(events // 2, number, "measure", log, "--places")
+    assert code == 128 + number, err
+
+
+def start(*command: object, shell: str = "") -> subprocess.Popen[str]:
+    """Start a command from a shell that first runs some words of its own."""
+    program = [sys.executable, "-m", "ipsys_log", *map(str, command)]
+    return subprocess.Popen(
+        ["/bin/sh", "-c", f'{shell} exec "$@"', "sh", *program],
+        stdout=subprocess.PIPE,
+        stderr=subprocess.PIPE,
+        text=True,
+    )
+
+
+def test_ignored_interrupt_stays_ignored_and_sigterm_stops(tmp_path: Path) -> None:
+    log = tmp_path / "a.mcap"
+    command = ("record", "--rig", sample_rig(tmp_path), "-o", log)
+    with start(*command, shell="trap '' INT;") as program:
+        wait_for(log, 20_000)
+        program.send_signal(signal.SIGINT)
+        wait_for(log, log.stat().st_size + 100_000)
+        assert program.poll() is None
+        program.send_signal(signal.SIGTERM)
+        _, err = program.communicate(timeout=LIMIT_S)
+    assert program.returncode == 0, err
+    with LogReader(log) as reader:
+        assert reader.message_count > 10
+
+
+@pytest.mark.parametrize("number", [signal.SIGINT, signal.SIGTERM])
+def test_simulate_interrupted_leaves_no_partial_file(number: int, tmp_path: Path) -> None:
+    command = ("simulate", "-o", tmp_path / "lab.mcap", "--width", "320", "--height", "180")
+    with start(*command) as program:
+        wait_for(tmp_path / "lab.mcap.partial", 1)
+        program.send_signal(number)
+        _, err = program.communicate(timeout=LIMIT_S)
+    assert program.returncode == 128 + number, err
+    assert "Traceback" not in err
+    assert os.listdir(tmp_path) == []  # noqa: PTH208
+
+
+def test_closed_terminal_ends_a_recording_whole(tmp_path: Path) -> None:
+    log = tmp_path / "a.mcap"
+    child, terminal = os.forkpty()
+    if child == 0:
+        command = ["record", "--rig", str(sample_rig(tmp_path)), "-o", str(log)]
+        os.execv(sys.executable, [sys.executable, "-m", "ipsys_log", *command])
+    wait_for(log, 20_000)
+    os.close(terminal)  # the kernel sends SIGHUP
+    os.waitpid(child, 0)
+    with LogReader(log) as reader:
+        assert reader.message_count > 10

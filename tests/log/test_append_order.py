@@ -1,0 +1,198 @@
+"""An append that is cut short, as others see it: programs without the journal, and a disk that fails."""
+
+from __future__ import annotations
+
+import errno
+import os
+import random
+import zlib
+from collections.abc import Callable, Iterator
+from pathlib import Path
+from typing import Any, cast
+
+import pytest
+
+from ipsys_log.errors import WriteError
+from ipsys_log.log import LogReader, LogWriter, repair
+from ipsys_log.log.journal import journal_path
+from ipsys_log.log.storage import DISK, Storage
+from tests.conftest import Ipsys
+from tests.log.conftest import Row, append, as_row, create, linear_rows, stock_rows
+from tests.log.crash import Disk, Operation, Recorder
+
+OLD: list[Row] = [("/image/a", 10**9 * k, k, bytes([k]) * 4_000) for k in range(30)]
+NEW: list[Row] = [("/runs/a", 10**9 * k, k, bytes([k]) * 400) for k in range(20)]
+
+
+def killed_at_each_operation(path: Path, rows: list[Row]) -> Iterator[int]:
+    """Append, then put the file and its journal into each state in between; yields operations done."""
+    old = path.read_bytes()
+    storage = Recorder()
+    storage.know(path)
+    append(path, rows, storage)
+    for cut in range(len(storage.operations) + 1):
+        disk = Disk({1: bytearray(old)}, {path.name: 1})
+        for operation in storage.operations[:cut]:
+            disk.apply(operation)
+        disk.store(path.parent)
+        yield cut
+
+
+@pytest.fixture
+def path(tmp_path: Path) -> Path:
+    folder = tmp_path / "log"
+    folder.mkdir()
+    return create(folder / "session.mcap", OLD)
+
+
+def rows_of(path: Path) -> list[Row]:
+    with LogReader(path) as reader:
+        return [as_row(message) for message in reader.messages()]
+
+
+@pytest.mark.parametrize("size", [40, 400_000])
+def test_stock_reader_opens_a_log_whatever_append_is_cut(path: Path, size: int) -> None:
+    """It reads the footer at the end of the file, and has no journal."""
+    chance = random.Random(size)
+    new = [("/runs/a", 10**9 * k, k, chance.randbytes(size)) for k in range(20)]
+    counts = [len(stock_rows(path)) for _ in killed_at_each_operation(path, new)]
+    assert counts == sorted(counts)
+    assert set(counts) == {len(OLD), len(OLD) + len(new)}
+
+
+@pytest.mark.slow
+def test_foxglove_reader_opens_a_log_whatever_append_is_cut(
+    path: Path, read_with_node: Callable[[Path], tuple[int, int, int]]
+) -> None:
+    complete = {len(OLD): stock_rows(path)}
+    for _ in killed_at_each_operation(path, NEW):
+        count, _, _ = read_with_node(path)
+        assert stock_rows(path) == complete.setdefault(count, stock_rows(path))
+    assert set(complete) == {len(OLD), len(OLD) + len(NEW)}
+
+
+def test_log_cut_short_is_read_appended_and_repaired_without_journal(path: Path) -> None:
+    """The journal stayed on the machine that crashed."""
+    seen = set()
+    for _ in killed_at_each_operation(path, NEW):
+        journal_path(path).unlink(missing_ok=True)
+        content, rows = path.read_bytes(), rows_of(path)
+        seen.add(len(rows))
+        append(path, [("/runs/b", 5, 5, b"more")])
+        assert sorted(stock_rows(path)) == sorted(linear_rows(path)) == sorted(rows_of(path))
+        assert len(rows_of(path)) == len(rows) + 1
+        path.write_bytes(content)
+        repair(path)
+        assert set(OLD) <= set(rows_of(path))
+        assert sorted(stock_rows(path)) == sorted(rows_of(path)) == sorted(linear_rows(path))
+        assert not repair(path).changed
+    assert seen == {len(OLD), len(OLD) + len(NEW)}
+
+
+def test_reading_command_names_repair_for_an_append_cut_short(ipsys: Ipsys, path: Path) -> None:
+    said = []
+    for _ in killed_at_each_operation(path, NEW):
+        done = ipsys("info", path)
+        assert done.code == 0
+        lines = done.err.splitlines()
+        assert lines in ([], [f"{path}: an append to it was cut short; it is read as it was before. "
+                              f"Mend it with: ipsys repair {path}"])  # fmt: skip
+        said.append(bool(lines))
+        if lines:
+            with LogWriter.append(path) as other:  # another process is at it, and mends it itself
+                other.abandon()
+            assert ipsys("info", path).err == ""
+    assert 5 < sum(said) < len(said)
+    assert not said[0]
+    assert not said[-1]
+
+
+def test_repair_mends_an_append_cut_short(ipsys: Ipsys, path: Path) -> None:
+    old = path.read_bytes()
+    for cut in killed_at_each_operation(path, NEW):
+        assert ipsys("repair", path).code == 0
+        assert ipsys("info", path).err == ""
+        assert [file.name for file in path.parent.iterdir()] == [path.name]
+        assert (path.read_bytes() == old) == (len(rows_of(path)) == len(OLD)), cut
+
+
+class Failing:
+    """A disk whose operations fail from the one of a number on: all of them, or that one alone."""
+
+    def __init__(self, first: int, error: int, for_good: bool) -> None:
+        self.first, self.error, self.for_good, self.done = first, error, for_good, 0
+
+    def __getattr__(self, name: str) -> Any:
+        operation = getattr(DISK, name)
+        if name in ("open", "close"):
+            return operation
+
+        def counted(*arguments: Any) -> Any:
+            number, self.done = self.done, self.done + 1
+            if number >= self.first if self.for_good else number == self.first:
+                raise OSError(self.error, os.strerror(self.error))
+            return operation(*arguments)
+
+        return counted
+
+
+def error_of_append(path: Path, storage: Failing) -> str:
+    try:
+        append(path, NEW, cast(Storage, storage))
+    except WriteError as fault:
+        return str(fault)
+    return ""
+
+
+@pytest.mark.parametrize("for_good", [True, False])
+@pytest.mark.parametrize("error", [errno.EIO, errno.ENOSPC])
+def test_words_after_a_failed_append_are_true(
+    tmp_path: Path, error: int, for_good: bool, caplog: pytest.LogCaptureFixture
+) -> None:
+    whole = create(tmp_path / "whole.mcap", OLD).read_bytes()
+    said = set()
+    for first in range(30):
+        path = tmp_path / str(first) / "session.mcap"
+        path.parent.mkdir()
+        path.write_bytes(whole)
+        caplog.clear()
+        storage = Failing(first, error, for_good)
+        fault = error_of_append(path, storage)
+        if fault:
+            assert "as it was" in fault
+            assert ("free some space" in fault) == (error == errno.ENOSPC)
+            assert ("stays as it was" in fault) == (path.read_bytes() == whole)
+            assert ("ipsys repair" in fault) == (path.read_bytes() != whole)
+            assert len(rows_of(path)) == len(OLD)
+            said.add("not put back" if "ipsys repair" in fault else "as it was")
+        else:
+            assert len(rows_of(path)) == len(OLD) + len(NEW)
+            assert ("the messages are in the log" in caplog.text) == (storage.done > first)
+            said.add("in the log" if caplog.text else "")
+        assert len(stock_rows(path)) in (len(OLD), len(OLD) + len(NEW)), "no other program can open it"
+        repair(path)
+        assert sorted(linear_rows(path)) == sorted(stock_rows(path)) == sorted(rows_of(path))
+    assert said == {"as it was", "in the log", ""} | ({"not put back"} if for_good else set())
+
+
+def test_journal_of_the_first_format_still_brings_the_old_log_back(path: Path) -> None:
+    """As earlier versions wrote it, who cut the file before they wrote."""
+    old = path.read_bytes()
+    storage = Recorder()
+    storage.know(path)
+    append(path, NEW, storage)
+    journal = next(one.file for one in storage.operations if one.kind == "create")
+    content = b"".join(one.data for one in storage.operations if is_write(one, journal))
+    new_size, tail_at = path.stat().st_size, int.from_bytes(content[32:40], "little")
+    head = b"\x89IPSYSJ1" + content[8:24] + content[32:56]
+    body = head + content[56:-4]
+    for size in (tail_at, tail_at + 100, new_size):
+        path.write_bytes((old[:tail_at] + bytes(new_size))[:size])
+        journal_path(path).write_bytes(body + zlib.crc32(body).to_bytes(4, "little"))
+        assert rows_of(path) == OLD
+        LogWriter.append(path).close()
+        assert path.read_bytes() == old
+
+
+def is_write(operation: Operation, file: int) -> bool:
+    return operation.kind == "write" and operation.file == file

@@ -1,0 +1,78 @@
+"""The package declares each distribution that it imports, and none that it does not."""
+
+from __future__ import annotations
+
+import ast
+import re
+import sys
+import tomllib
+from collections.abc import Iterator
+from importlib.metadata import packages_distributions
+from pathlib import Path
+
+import pytest
+
+ROOT = Path(__file__).resolve().parent.parent
+
+
+def normalize(distribution: str) -> str:
+    """The name of a distribution as indexes compare it (PEP 503)."""
+    return re.sub(r"[-_.]+", "-", distribution).lower()
+
+
+def declared() -> set[str]:
+    """The distributions that pyproject.toml depends on."""
+    project = tomllib.loads((ROOT / "pyproject.toml").read_text())["project"]
+    names = (re.match(r"[A-Za-z0-9._-]+", text) for text in project["dependencies"])
+    return {normalize(name[0]) for name in names if name}
+
+
+def imported_modules(source: str) -> Iterator[str]:
+    """Top-level modules that a source imports, also by ``import_module`` with a name that begins plainly."""
+    for node in ast.walk(ast.parse(source)):
+        if isinstance(node, ast.Import):
+            yield from (alias.name.split(".")[0] for alias in node.names)
+        elif isinstance(node, ast.ImportFrom) and node.level == 0 and node.module:
+            yield node.module.split(".")[0]
+        elif isinstance(node, ast.Call) and ast.unparse(node.func).endswith("import_module"):
+            name = node.args[0].values[0] if isinstance(node.args[0], ast.JoinedStr) else node.args[0]
+            assert isinstance(name, ast.Constant), ast.unparse(node)
+            yield str(name.value).split(".")[0]
+
+
+def imported_distributions() -> dict[str, set[str]]:
+    """The distributions that may provide each third-party module of the package."""
+    providers = packages_distributions()
+    own = {*sys.stdlib_module_names, "ipsys_log"}
+    sources = [path.read_text(encoding="utf-8") for path in (ROOT / "ipsys_log").rglob("*.py")]
+    modules = {name for source in sources for name in imported_modules(source)} - own
+    return {name: {normalize(one) for one in providers[name]} for name in sorted(modules)}
+
+
+def test_every_import_is_a_declared_dependency() -> None:
+    missing = {module: names for module, names in imported_distributions().items() if not names & declared()}
+    assert missing == {}
+
+
+def test_every_declared_dependency_is_imported() -> None:
+    used = {name for names in imported_distributions().values() for name in names}
+    assert declared() - used == set()
+
+
+def test_every_dependency_has_a_lower_bound() -> None:
+    project = tomllib.loads((ROOT / "pyproject.toml").read_text())["project"]
+    assert [text for text in project["dependencies"] if ">=" not in text] == []
+
+
+@pytest.mark.parametrize(
+    ("source", "module"),
+    [
+        ("import lz4.frame", "lz4"),
+        ("from google.protobuf import message", "google"),
+        ("def late():\n    import cv2 as cv", "cv2"),
+        ("import_module(f'foxglove_schemas_protobuf.{name}_pb2')", "foxglove_schemas_protobuf"),
+        ("importlib.import_module('gi.repository')", "gi"),
+    ],
+)
+def test_imports_of_every_form_are_seen(source: str, module: str) -> None:
+    assert list(imported_modules(source)) == [module]

@@ -1,0 +1,240 @@
+"""Connections to the measuring page: bounded in number and time, and harmless to a recording."""
+
+from __future__ import annotations
+
+import http.client
+import json
+import re
+import resource
+import signal
+import socket
+import subprocess
+import sys
+import time
+from collections.abc import Callable, Iterator
+from contextlib import ExitStack, closing, contextmanager
+from pathlib import Path
+
+import pytest
+
+from ipsys_log.log.session import Session
+from ipsys_log.measuring.scene import View
+from ipsys_log.web.connections import Limits, derive_limits
+from ipsys_log.web.serving import Served, serving
+from tests.test_measure_now import Lab, still_lab
+from tests.web.test_guard import Caller
+from tests.web.test_measuring_page import Recording
+
+__all__ = ["still_lab"]
+
+PATIENCE_S = 40.0
+DESCRIPTORS = 128
+IDLE_CONNECTIONS = 300
+
+
+def wait_until(condition: Callable[[], object]) -> None:
+    end = time.monotonic() + PATIENCE_S
+    while not condition():
+        assert time.monotonic() < end
+        time.sleep(0.05)
+
+
+@contextmanager
+def connections(caller: Caller, count: int, source: str = "127.0.0.1") -> Iterator[list[socket.socket]]:
+    """Plain connections to a page, from one address of the loopback."""
+    address = str(caller.parts.hostname), caller.parts.port or 0
+    with ExitStack() as stack:
+        yield [
+            stack.enter_context(socket.create_connection(address, timeout=10, source_address=(source, 0)))
+            for _ in range(count)
+        ]
+
+
+@contextmanager
+def recording(lab: Lab, log: Path) -> Iterator[tuple[subprocess.Popen[str], Caller, Path]]:
+    """A recorder with its page and few descriptors, as soon as the cameras' markers are seen."""
+    errors = log.with_suffix(".stderr")
+    command = ["bash", "-c", f'ulimit -n {DESCRIPTORS}; exec "$@"', "bash", sys.executable, "-m", "ipsys_log"]
+    command += ["record", "-o", str(log), "--rig", str(lab.rig), "--calibration", str(lab.lenses)]
+    command += ["--measure", "--host", "127.0.0.1", "--port", "0"]
+    with (
+        errors.open("w") as stderr,
+        subprocess.Popen(command, stdout=subprocess.DEVNULL, stderr=stderr, text=True) as program,
+    ):
+        try:
+            wait_until(lambda: program.poll() is not None or "measure at " in errors.read_text())
+            match = re.search(r"measure at (\S+)", errors.read_text())
+            assert match, errors.read_text()
+            yield program, Caller(match[1]), errors
+        finally:
+            program.kill()
+
+
+def sign_in(caller: Caller) -> str:
+    """Open the page by its whole address; its cookie."""
+    status, _, headers = caller.ask("GET", f"/?token={caller.token}")
+    assert status == 303
+    return headers["set-cookie"].split(";")[0]
+
+
+def test_recorder_survives_idle_connections(still_lab: Lab, tmp_path: Path) -> None:
+    log = tmp_path / "session.mcap"
+    with recording(still_lab, log) as (program, caller, errors):
+        cookie = sign_in(caller)
+        wait_until(lambda: log.stat().st_size > 0)
+        with connections(caller, IDLE_CONNECTIONS, "127.0.0.2"):
+            before = log.stat().st_size
+            for _ in range(10):
+                status, text, _ = caller.ask("GET", "/api/views", Cookie=cookie)
+                assert status == 200
+                time.sleep(0.1)
+            assert json.loads(text)["visible"]
+            wait_until(lambda: log.stat().st_size > before)
+            program.send_signal(signal.SIGTERM)
+            assert program.wait(PATIENCE_S) == 0, errors.read_text()
+    assert "Traceback" not in errors.read_text()
+    with Session([log]) as session:
+        assert not session.payloads(["/events"])
+        assert all(session.count(topic) > 5 for topic in session.images.values())
+
+
+@contextmanager
+def page_with(limits: Limits, scene: Recording | None = None) -> Iterator[tuple[Caller, Served]]:
+    with serving(scene or Recording(), "127.0.0.1", 0, limits) as page:
+        yield Caller(page.url), page
+
+
+def is_open(connection: socket.socket) -> bool:
+    connection.setblocking(False)
+    try:
+        return connection.recv(1) != b""
+    except BlockingIOError:
+        return True
+    except ConnectionError:
+        return False
+
+
+def is_closed_by_page(connection: socket.socket) -> bool:
+    """Wait for the end of a connection, and ignore what comes before it."""
+    connection.settimeout(PATIENCE_S)
+    try:
+        while connection.recv(1 << 16):
+            pass
+    except ConnectionError:
+        pass
+    return True
+
+
+def test_idle_connections_leave_room_for_a_phone() -> None:
+    with page_with(Limits(total=6, per_address=4)) as (caller, page):
+        with ExitStack() as stack:
+            held = [
+                connection
+                for number in range(1, 6)
+                for connection in stack.enter_context(connections(caller, 20, f"127.0.0.{number}"))
+            ]
+            cookie = sign_in(caller)
+            for _ in range(5):
+                assert caller.ask("GET", "/api/scene", Cookie=cookie)[0] == 200
+            wait_until(lambda: sum(map(is_open, held)) <= 6)
+        assert page.faults.count == 0
+
+
+def test_phone_keeps_its_connection_beside_new_ones() -> None:
+    with page_with(Limits(total=6, per_address=4)) as (caller, _):
+        phone = http.client.HTTPConnection(str(caller.parts.hostname), caller.parts.port or 0, timeout=10)
+        with closing(phone):
+            headers = {"Cookie": sign_in(caller)}
+            phone.request("GET", "/api/scene", headers=headers)
+            assert phone.getresponse().read()
+            own = phone.sock
+            with connections(caller, 30) as held:
+                wait_until(lambda: sum(map(is_open, held)) < 6)
+                phone.request("GET", "/api/scene", headers=headers)
+                assert phone.getresponse().status == 200
+                assert phone.sock is own
+
+
+@pytest.mark.parametrize(
+    "start",
+    [
+        b"",
+        b"GET / HTTP/1.1\r\nHost: localhost\r\nX-Slow: ",
+        b"POST /api/check HTTP/1.1\r\nHost: localhost\r\nX-Ipsys: 1\r\nCookie: COOKIE\r\n"
+        b"Content-Length: 900\r\n\r\n{",
+        b"POST /api/check HTTP/1.1\r\nHost: localhost\r\nX-Ipsys: 1\r\nCookie: COOKIE\r\n"
+        b"Transfer-Encoding: chunked\r\n\r\n1\r\n{\r\n",
+        b"GET /api/scene HTTP/1.1\r\nHost: localhost\r\nCookie: COOKIE\r\n\r\n",
+        b"GET /api/scene HTTP/1.1\r\nHost: localhost\r\nCookie: COOKIE\r\n\r\nGET / HTTP/1.1\r\nX-Slow: ",
+    ],
+    ids=["nothing", "headers", "body", "chunks", "kept_alive", "second_request"],
+)
+def test_slow_request_is_closed(start: bytes) -> None:
+    with page_with(Limits(total=6, per_address=4, request_s=0.3)) as (caller, page):
+        cookie = sign_in(caller).encode()
+        with connections(caller, 1) as (slow,):
+            slow.sendall(start.replace(b"COOKIE", cookie))
+            assert is_closed_by_page(slow)
+        assert page.faults.count == 0
+
+
+def answers(caller: Caller) -> bool:
+    try:
+        return caller.ask("GET", f"/?token={caller.token}")[0] == 303
+    except ConnectionError:
+        return False
+
+
+def test_answers_that_are_not_read_make_room_in_time() -> None:
+    scene = Recording()
+    scene.views = lambda stop: [View("red", 1, bytes(8 << 20))]  # type: ignore[method-assign]
+    with page_with(Limits(total=6, per_address=4, request_s=0.5), scene) as (caller, page):
+        cookie = sign_in(caller)
+        assert caller.ask("GET", "/api/views", Cookie=cookie)[0] == 200
+        request = f"GET /picture/red/1 HTTP/1.1\r\nHost: localhost\r\nCookie: {cookie}\r\n\r\n".encode()
+        with connections(caller, 4) as lazy:
+            for connection in lazy:
+                connection.sendall(request)
+                assert connection.recv(1)
+            wait_until(lambda: answers(caller))
+        assert page.faults.count == 0
+
+
+def test_noise_on_the_port_stays_off_the_screen(capfd: pytest.CaptureFixture[str]) -> None:
+    with page_with(Limits(total=6, per_address=4)) as (caller, page):
+        for noise in (b"\x16\x03\x01\x02\x00\x01\x00\x01\xfc\x03\x03", b"GET\r\n\r\n", b"\0" * (1 << 17)):
+            with connections(caller, 1) as (noisy,):
+                noisy.sendall(noise)
+                assert is_closed_by_page(noisy)
+        assert sign_in(caller)
+        assert page.faults.count == 0
+    assert capfd.readouterr() == ("", "")
+
+
+def test_fault_of_the_page_is_kept_for_the_end(capfd: pytest.CaptureFixture[str]) -> None:
+    scene = Recording()
+
+    def fail(stop: int | None) -> list[View]:
+        raise ZeroDivisionError("a bug")
+
+    scene.views = fail  # type: ignore[method-assign]
+    with serving(scene, port=0) as page:
+        caller = Caller(page.url)
+        for _ in range(2):
+            status, text, _ = caller.ask("GET", "/api/views")
+            assert status == 500
+            assert "ZeroDivisionError: a bug" in json.loads(text)["error"]
+        assert caller.ask("GET", "/")[0] == 200
+        assert page.faults.count == 2
+        assert page.faults.first.startswith("Traceback")
+    assert capfd.readouterr() == ("", "")
+
+
+@pytest.mark.parametrize(("descriptors", "total"), [(64, 12), (256, 32), (1024, 64), (1 << 20, 64)])
+def test_limits_leave_descriptors_to_the_recorder(
+    monkeypatch: pytest.MonkeyPatch, descriptors: int, total: int
+) -> None:
+    monkeypatch.setattr(resource, "getrlimit", lambda _: (descriptors, descriptors))
+    limits = derive_limits()
+    assert limits.total == total
+    assert 8 <= limits.per_address < limits.total

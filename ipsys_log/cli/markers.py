@@ -41,8 +41,8 @@ BoardName = Annotated[
     Optional[str],  # noqa: UP045
     typer.Option(
         metavar="COLUMNSxROWS",
-        help="Print a board for ipsys calibrate: the inner corners of a chessboard, as 6x4, or the squares of a "
-        "ChArUco board, as charuco:4x5.",
+        help="Print a board for ipsys calibrate: the inner corners of a chessboard, as 6x4, or the "
+        "squares of a ChArUco board, as charuco:4x5.",
     ),
 ]
 Square = Annotated[float, typer.Option(metavar="METRES", help="Side of a board's square, in m.")]

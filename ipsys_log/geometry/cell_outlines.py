@@ -30,7 +30,7 @@ def cell_outlines(black: NDArray[np.bool_]) -> list[NDArray[np.float64]]:
 
     Returns
     -------
-    Polygons (n, 2): x to the right and y down, in cells from the top left corner; the last point is not repeated.
+    Polygons (n, 2): x to the right and y down, in cells from the top left; the last point is not repeated.
 
     Examples
     --------

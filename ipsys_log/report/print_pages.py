@@ -25,7 +25,7 @@ _EDGE_MM = 10.0
 _FOOT_MM = 15.0
 RULER_MM = 100.0
 _RULER_Y_MM = _EDGE_MM + 5.0
-# Below a marker: an arrow to its front, and two lines of text. Between two prints: room for the cutting marks.
+# Below a marker: an arrow to its front, and three lines of text. Between two prints: the cutting marks.
 _CAPTION_MM, _GAP_MM, _NARROWEST_MM = 8.0, 6.0, 34.0
 _MARK_MM, _MARK_PT = 2.0, 0.3
 _GREY = "0.35"
@@ -58,7 +58,7 @@ PAPERS = {
 
 @dataclass(frozen=True, slots=True, eq=False)
 class Placed:
-    """A print on a page: where the top left corner of its black is, in mm from the bottom left of the page."""
+    """A print on a page: where the top left of its black is, in mm from the bottom left of the page."""
 
     what: Print
     x_mm: float
@@ -148,7 +148,8 @@ def _orientation(what: Print, paper: Paper) -> Paper | None:
 
 def _too_large(what: Print, paper: Paper) -> str:
     width_mm, height_mm = _size_mm(what)
-    text = f"{what.name} takes {width_mm:.0f} x {height_mm:.0f} mm with its white margin, too much for {paper.name}"
+    size = f"{width_mm:.0f} x {height_mm:.0f} mm"
+    text = f"{what.name} takes {size} with its white margin, too much for {paper.name}"
     if what.is_board:
         return f"{text}; make its squares smaller, with --square, or use larger paper"
     largest_mm = np.floor(paper.room_mm[0] / (1 + 2 * what.margin_mm / what.width_mm))
@@ -212,10 +213,10 @@ def _draw_marker_text(axes: Axes, placed: Placed) -> None:
     bottom_mm = placed.y_mm - what.height_mm - what.margin_mm - _CAPTION_MM + 1.5
     arrow = np.array([[0.9, 0], [0.9, 3], [0, 3], [1.5, 5.5], [3, 3], [2.1, 3], [2.1, 0]])
     axes.add_patch(
-        PathPatch(Outline(arrow + [left_mm, bottom_mm], closed=False), facecolor=_GREY, linewidth=0)
+        PathPatch(Outline(arrow + np.array([left_mm, bottom_mm]), closed=False), facecolor=_GREY, linewidth=0)
     )
     size_pt = 5.0 if width_mm < 60 else 8.0
-    text = "\n".join(("front: this way up" if width_mm >= 60 else "front", *what.lines)[-3:])
+    text = "\n".join(("front: this way up" if width_mm >= 60 else "front", *what.lines))
     _write(axes, left_mm + 4.5, bottom_mm + 2.75, text, size_pt)
 
 

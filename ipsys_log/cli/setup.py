@@ -41,7 +41,7 @@ SETTINGS: dict[str, tuple[int | float, str]] = {
 }
 
 # At the top of the rig file of the simulated lab.
-_SIMULATED = """# The simulated lab. Its cameras need no hardware: docs/first-day.md goes through all commands with it.
+_SIMULATED = """# The simulated lab, without hardware. docs/first-day.md goes through all commands with it.
 # The robots 0, 1 and 2 drive to and fro at a height of 10 cm. The other markers lie still.
 
 """
@@ -64,8 +64,8 @@ def init(
         bool,
         typer.Option(
             "--simulated",
-            help="Write the rig of the simulated lab, to try all commands without a camera; and a sheet of what "
-            "a tape reads there.",
+            help="Write the rig of the simulated lab, to try all commands without a camera, and a sheet with "
+            "what a tape reads there.",
         ),
     ] = False,
 ) -> None:

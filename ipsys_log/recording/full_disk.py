@@ -12,11 +12,16 @@ from ipsys_log.errors import LogError, WriteError, is_full
 from ipsys_log.log import LogReader
 from ipsys_log.units import NS_PER_S, format_bytes
 
-__all__ = ["disk_fault", "reserve", "what_failed", "what_fitted"]
+__all__ = ["disk_fault", "reserve", "reserved_bytes", "what_failed", "what_fitted"]
 
 # Set aside on the disk, so that a log can be finished when the disk is full: what waits is written and looked
 # at, and the table of contents, which has some MB after some hours, is written twice. On a small disk half.
 _RESERVE_BYTES = 64 << 20
+
+
+def reserved_bytes(free_bytes: int) -> int:
+    """Return how much of what is free on a disk is set aside for the end of a log."""
+    return min(_RESERVE_BYTES, free_bytes // 2)
 
 
 @contextmanager
@@ -27,7 +32,7 @@ def reserve(path: Path) -> Iterator[Callable[[], None]]:
             if hasattr(os, "O_TMPFILE"):
                 fd = os.open(path.parent, os.O_TMPFILE | os.O_RDWR)
                 held.callback(os.close, fd)
-                os.posix_fallocate(fd, 0, min(_RESERVE_BYTES, shutil.disk_usage(path.parent).free // 2))
+                os.posix_fallocate(fd, 0, reserved_bytes(shutil.disk_usage(path.parent).free))
         yield held.close
 
 

@@ -80,10 +80,10 @@ class Attached:
         self.states = {one.name: by.state for one, by in zip(cameras, self._attendants, strict=True)}
 
     def __enter__(self) -> Attached:
-        self._heartbeat.start()
-        for attendant in self._attendants:
-            attendant.thread.start()
         try:
+            self._heartbeat.start()
+            for attendant in self._attendants:
+                attendant.thread.start()
             for attendant in self._attendants:
                 attendant.wait()
         except BaseException:
@@ -244,7 +244,8 @@ class Attached:
         self._stopped.set()
         self._heartbeat.stop()
         for attendant in self._attendants:
-            attendant.thread.join(seconds)
+            if attendant.thread.ident is not None:  # an interrupt may come before all were started
+                attendant.thread.join(seconds)
 
 
 @dataclass(eq=False, slots=True)

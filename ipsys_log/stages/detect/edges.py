@@ -46,6 +46,12 @@ _BLURRED = 0.6
 _SEEN = 0.6
 _EXACT_PX = 0.05
 _WRONG_CELLS = 1
+# Glare or a shadow lies on a marker where the black beside some edges is lighter than beside the others, by
+# these shares of the contrast; by the lesser share, if edges are spread by more than so much besides. A few
+# may be: a neighbouring white cell reaches as far where cells are small.
+_LIGHTER, _LIGHTER_AND_SPREAD = 0.35, 0.13
+_SPREAD_PX, _SPREAD_BLURRED_PX = 0.12, 1.0
+_FEW = 3
 
 
 def fit_edges(
@@ -85,6 +91,7 @@ def fit_edges(
     view = View(grey, lens, lay_out(dictionary, tuple(guess.id for guess in guesses)), row_time_s, blur_px)
     settled, (corners_px, slopes, levels) = _settle_all(view, guesses, edge_offset_px)
     good = settled.good & whole(corners_px, grey) & _same_cells(view.prints, levels)
+    uneven = _uneven(view.prints, settled, levels)
     covariances_px2 = slopes @ settled.covariances @ slopes.transpose(0, 2, 1)
     return [
         Fit(
@@ -94,6 +101,7 @@ def fit_edges(
             float(settled.edge_offsets_px[n]),
             float(settled.spreads_px[n]),
             float(settled.blurs_px[n]),
+            bool(uneven[n]),
         )
         if good[n]
         else None
@@ -102,7 +110,8 @@ def fit_edges(
 
 
 class _Settled(NamedTuple):
-    """Fitted poses; ``covariances`` (m, 6, 6) of the twists in the frames of the prints."""
+    """Fitted poses; ``covariances`` (m, 6, 6) of the twists in the frames of the prints; ``ends`` (m, s, 2)
+    are the levels at both ends of their profiles."""
 
     poses: Poses
     edge_offsets_px: Array
@@ -112,6 +121,7 @@ class _Settled(NamedTuple):
     blurred: NDArray[np.bool_]
     spreads_px: Array
     blurs_px: Array
+    ends: Array
 
 
 def _settle_all(
@@ -169,7 +179,9 @@ def _settle(
     covariances: Array = np.linalg.inv(normal)[:, :6, :6] * variances_px2[:, None, None]
     enough = (seen.certainty > 0).sum(axis=1) > _SEEN * np.abs(view.prints.polarity).sum(axis=1)
     good = enough & (moved_px < _SETTLED_PX)
-    return _Settled(poses, found[:, 6], covariances, good, seen.heights, blurred, spread_px, seen.blurs_px)
+    return _Settled(
+        poses, found[:, 6], covariances, good, seen.heights, blurred, spread_px, seen.blurs_px, seen.ends
+    )
 
 
 def _blurred(prints: Prints, heights: Array, levels: Array) -> NDArray[np.bool_]:
@@ -190,3 +202,17 @@ def _same_cells(prints: Prints, levels: Array) -> NDArray[np.bool_]:
     bright, dark = _bright_and_dark(prints, levels)
     wrong = np.count_nonzero((levels > ((bright + dark) / 2)[:, None]) != prints.white, axis=1)
     return np.asarray((wrong <= _WRONG_CELLS) & (bright - dark > LEAST_CONTRAST))
+
+
+def _uneven(prints: Prints, settled: _Settled, levels: Array) -> NDArray[np.bool_]:
+    """Return, (m,), where glare, a shadow or a cover may have moved some of the edges."""
+    real = prints.polarity != 0
+    black = np.where(prints.polarity > 0, settled.ends[..., 0], settled.ends[..., 1])
+    black = np.sort(np.where(real, black, -np.inf), axis=1)
+    middle = black.shape[1] - np.count_nonzero(real, axis=1) // 2
+    usual = np.take_along_axis(black, middle[:, None], axis=1)[:, 0]
+    bright, dark = _bright_and_dark(prints, levels)
+    lighter = (black[:, -_FEW] - usual) / np.maximum(bright - dark, LEAST_CONTRAST)
+    spreads_px = settled.spreads_px
+    still = (lighter > _LIGHTER) | ((lighter > _LIGHTER_AND_SPREAD) & (spreads_px > _SPREAD_PX))
+    return np.where(settled.blurred.any(axis=1), spreads_px > _SPREAD_BLURRED_PX, still)

@@ -27,7 +27,7 @@ from ipsys_log.stages.detect.adjustment import (
     whole,
 )
 from ipsys_log.stages.detect.decode import Grey
-from ipsys_log.stages.detect.pattern import matches_pattern
+from ipsys_log.stages.detect.pattern import compare_pattern
 from ipsys_log.stages.detect.prints import Prints, lay_out
 from ipsys_log.stages.detect.profiles import Poses, View, locate, read_profiles
 from ipsys_log.stages.detect.steps import (
@@ -48,8 +48,8 @@ Mask = NDArray[np.bool_]
 _WITHOUT = (None, 0, 1, 2, 3)
 _FAR_PX, _NEAR_PX, _OF_CELL = 12.0, 3.0, 0.45
 # Passes with far profiles, and with near ones: before the better of two poses is known, and after.
-_ROUGH, _EXACT, _FINAL = 3, 2, 3
-_REWEIGHTED = 4
+_ROUGH, _EXACT, _FINAL = 3, 2, 2
+_REWEIGHTED = 3
 _SHORT_PX = 8.0
 # Tukey's biweight: where weights end, in standard deviations and at least.
 _CUT, _CUT_PX, _CUT_ROUGH, _CUT_ROUGH_OF_REACH = 4.0, 0.08, 3.0, (0.36, 0.24, 0.15)
@@ -81,6 +81,7 @@ def fit_partly(
     edge_offset_px: float | None = None,
     row_time_s: float = 0.0,
     blur_px: float | None = None,
+    near: bool = False,
 ) -> Fit | Rejection | None:
     """Fit one marker to what is visible of it.
 
@@ -89,6 +90,7 @@ def fit_partly(
     guesses : poses that it may have.
     grey, dictionary, lens, edge_offset_px, row_time_s, blur_px : as for
         :func:`ipsys_log.stages.detect.edges.fit_edges`.
+    near : whether the guesses are right to a pixel or two.
 
     Returns
     -------
@@ -98,7 +100,7 @@ def fit_partly(
     guesses = [guess for guess in guesses if into_poses([guess]).possible()[0]]
     if not guesses:
         return None
-    trial = _Trial(grey, lens, dictionary, guesses, edge_offset_px, row_time_s, blur_px)
+    trial = _Trial(grey, lens, dictionary, guesses, edge_offset_px, row_time_s, blur_px, near)
     return trial.judge(trial.settle())
 
 
@@ -149,12 +151,14 @@ class _Trial:
         edge_offset_px: float | None,
         row_time_s: float,
         blur_px: float | None,
+        near: bool,
     ) -> None:
         self._grey, self._lens, self._dictionary = grey, lens, dictionary
         self._row_time_s, self._blur_px = row_time_s, blur_px
         self._guesses, self._id = guesses, guesses[0].id
         self._unknowns = 9 if row_time_s else 7
         self._edge_offset_px = edge_offset_px
+        self._first = _ROUGH - 1 if near else 0
         prints = lay_out(dictionary, (self._id,))
         self._sides = _sides(prints)
         self._real = prints.polarity[0] != 0
@@ -165,14 +169,14 @@ class _Trial:
         self._known, self._hold = known_unknowns(guesses, self._edge_offset_px)
         without = np.array([-1 if side is None else side for _ in self._guesses for side in _WITHOUT])
         state = _State(into_poses(guesses), self._known[:, 7:], without)
-        for number in range(_ROUGH + _EXACT):
+        for number in range(self._first, _ROUGH + _EXACT):
             state, solved = self._move(state, number)
         best = int(solved.costs.argmin()) // len(_WITHOUT)
         chosen = np.arange(len(_WITHOUT)) + best * len(_WITHOUT)
         self._known, self._hold = self._known[chosen], self._hold[chosen]
         state = state.only(chosen)
-        for number in range(_FINAL):
-            state, solved = self._move(state, _ROUGH + _EXACT + number)
+        for _ in range(_FINAL):
+            state, solved = self._move(state, _ROUGH + _EXACT)
         return state, solved
 
     def _move(self, state: _State, number: int) -> tuple[_State, _Solved]:
@@ -221,6 +225,8 @@ class _Trial:
         blur_px = self._blur_px
         if blur_px is None:
             blur_px = usual_blur(view.prints, profiles[0], reach_px)
+            if number > _ROUGH:
+                self._blur_px = blur_px
         return exact_steps(view.prints, profiles, reach_px, blur_px), blur_px, _CUT_PX
 
     def judge(self, settled: tuple[_State, _Solved]) -> Fit | Rejection | None:
@@ -229,13 +235,18 @@ class _Trial:
         n = self._choose(state, solved)
         view = View(self._grey, self._lens, lay_out(self._dictionary, (self._id,)), self._row_time_s, None)
         corners_px, slopes, levels = outline(view, state.only(np.array([n])).poses)
-        if not whole(corners_px, self._grey)[0] or not matches_pattern(levels[0], self._dictionary, self._id):
+        agreement = compare_pattern(levels[0], self._dictionary, self._id)
+        if not whole(corners_px, self._grey)[0] or not agreement.likely:
             return None
+        if not agreement.clear:
+            what = _hider(levels[0], view.prints)
+            return Rejection(self._id, corners_px[0], f"{what} hides too many of its cells")
         weights = solved.weights[n]
         seen = [float(weights[side].sum() / side.sum()) for side in self._sides]
         lost = sum(share < _SEEN for share in seen)
         if lost > 1 or weights.sum() < _SEEN_OF_ALL * self._real.sum():
-            return Rejection(self._id, corners_px[0], _hidden(lost, levels[0], view.prints))
+            where = f"{lost} of its 4 sides" if lost > 1 else "most of its edges"
+            return Rejection(self._id, corners_px[0], f"{_hider(levels[0], view.prints)} hides {where}")
         covariance_px2 = self._covariance(solved, n, slopes[0])
         if solved.costs[n] > _COST or np.diag(covariance_px2).max() > _MOST_UNCERTAIN_PX**2:
             return Rejection(self._id, corners_px[0], "its edges are too disturbed to fit a flat square")
@@ -281,11 +292,9 @@ def _sides(prints: Prints) -> Mask:
     return np.array([level & (y > end), ~level & (x > end), level & (y < -end), ~level & (x < -end)])
 
 
-def _hidden(lost: int, levels: Array, prints: Prints) -> str:
-    """Return why a marker cannot be measured."""
+def _hider(levels: Array, prints: Prints) -> str:
+    """Return what hides a part of a marker, by the levels of its cells."""
     white = prints.white[0]
     middle = (np.median(levels[white]) + np.median(levels[~white])) / 2
     bright, dark = np.count_nonzero(levels[~white] > middle), np.count_nonzero(levels[white] < middle)
-    what = "glare" if bright > dark else "a shadow or an object"
-    where = f"{lost} of its 4 sides" if lost > 1 else "most of its edges"
-    return f"{what} hides {where}"
+    return "glare" if bright > dark else "a shadow or an object"

@@ -7,6 +7,7 @@ where the print changes its colour, and hardly differ where it does not.
 from __future__ import annotations
 
 from functools import cache
+from typing import NamedTuple
 
 import cv2
 import numpy as np
@@ -15,19 +16,37 @@ from numpy.typing import NDArray
 from ipsys_log.geometry.markers import white_cells
 from ipsys_log.stages.detect.profiles import LEAST_CONTRAST
 
-__all__ = ["matches_pattern"]
+__all__ = ["Agreement", "compare_pattern"]
 
 Array = NDArray[np.float64]
 
 # Cells differ where their levels do by this share of the print's contrast.
 _DIFFERENT = 0.25
-# Share of neighbouring cells that agree, minus that of those that contradict; and by how much more than with
-# any other marker of the dictionary.
-_AGREES, _CLEARLY = 0.5, 0.1
+_AGREES, _CLEARLY, _ALIKE = 0.5, 0.1, 0.3
 
 
-def matches_pattern(levels: Array, dictionary: str, marker_id: int) -> bool:
-    """Return whether cells are those of a marker, and not as likely those of another or of a turned one.
+class Agreement(NamedTuple):
+    """The share of neighbouring cells that agree with a marker, minus that of those that contradict it.
+
+    ``own`` is that with the marker in question, ``next`` the greatest with any other, or with any turned one.
+    """
+
+    own: float
+    next: float
+
+    @property
+    def clear(self) -> bool:
+        """Whether the cells are those of this marker and of no other."""
+        return self.own >= _AGREES and self.own >= self.next + _CLEARLY
+
+    @property
+    def likely(self) -> bool:
+        """Whether the cells look like those of this marker rather than of another."""
+        return self.own >= _ALIKE and self.own > self.next
+
+
+def compare_pattern(levels: Array, dictionary: str, marker_id: int) -> Agreement:
+    """Return how well grey levels agree with the cells of a marker.
 
     Parameters
     ----------
@@ -40,14 +59,14 @@ def matches_pattern(levels: Array, dictionary: str, marker_id: int) -> bool:
     expected = words[4 * marker_id]
     contrast = float(np.median((rises * expected)[expected != 0]))
     if contrast < LEAST_CONTRAST:
-        return False
+        return Agreement(0.0, 0.0)
     signs = np.sign(rises) * (np.abs(rises) > _DIFFERENT * contrast)
     # Like signs agree, unlike ones contradict; a step that does not show says nothing.
     agreements = words @ signs + (words == 0) @ np.where(signs == 0, 1.0, -1.0)
     agreements /= len(signs)
     own = float(agreements[4 * marker_id])
     agreements[4 * marker_id] = -1.0
-    return own >= _AGREES and own >= float(agreements.max()) + _CLEARLY
+    return Agreement(own, float(agreements.max()))
 
 
 def _neighbours(cells: Array) -> Array:

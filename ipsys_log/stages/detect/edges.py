@@ -46,12 +46,14 @@ _BLURRED = 0.6
 _SEEN = 0.6
 _EXACT_PX = 0.05
 _WRONG_CELLS = 1
-# Glare or a shadow lies on a marker where the black beside some edges is lighter than beside the others, by
-# these shares of the contrast; by the lesser share, if edges are spread by more than so much besides. A few
+# Glare, a shadow or a cover may lie on a marker where a side lies off by this share of the edges' spread, or
+# where the black beside some edges is lighter than beside the others, by that share of the contrast. A few
 # may be: a neighbouring white cell reaches as far where cells are small.
-_LIGHTER, _LIGHTER_AND_SPREAD = 0.35, 0.13
-_SPREAD_PX, _SPREAD_BLURRED_PX = 0.12, 1.0
-_FEW = 3
+_SIDE_OFF, _LIGHTER = 0.9, 0.35
+_LEAST_SPREAD_PX, _FEW = 0.03, 3
+# Or where edges are spread by more px. Where motion blurs them, or seems to, sides lie off by shares of the
+# blur's width, and what is beside an edge mixes with it.
+_SPREAD_PX, _LIGHTER_BLURRED = 0.3, 0.6
 
 
 def fit_edges(
@@ -111,7 +113,7 @@ def fit_edges(
 
 class _Settled(NamedTuple):
     """Fitted poses; ``covariances`` (m, 6, 6) of the twists in the frames of the prints; ``ends`` (m, s, 2)
-    are the levels at both ends of their profiles."""
+    are the levels at both ends of their profiles; ``sides_off_px`` (m,) is the most that a side lies off."""
 
     poses: Poses
     edge_offsets_px: Array
@@ -122,6 +124,7 @@ class _Settled(NamedTuple):
     spreads_px: Array
     blurs_px: Array
     ends: Array
+    sides_off_px: Array
 
 
 def _settle_all(
@@ -179,8 +182,18 @@ def _settle(
     covariances: Array = np.linalg.inv(normal)[:, :6, :6] * variances_px2[:, None, None]
     enough = (seen.certainty > 0).sum(axis=1) > _SEEN * np.abs(view.prints.polarity).sum(axis=1)
     good = enough & (moved_px < _SETTLED_PX)
+    sided = (left_px * view.prints.polarity * (seen.certainty > 0))[:, None] @ view.prints.by_side
     return _Settled(
-        poses, found[:, 6], covariances, good, seen.heights, blurred, spread_px, seen.blurs_px, seen.ends
+        poses,
+        found[:, 6],
+        covariances,
+        good,
+        seen.heights,
+        blurred,
+        spread_px,
+        seen.blurs_px,
+        seen.ends,
+        np.abs(sided[:, 0]).max(axis=1),
     )
 
 
@@ -213,6 +226,7 @@ def _uneven(prints: Prints, settled: _Settled, levels: Array) -> NDArray[np.bool
     usual = np.take_along_axis(black, middle[:, None], axis=1)[:, 0]
     bright, dark = _bright_and_dark(prints, levels)
     lighter = (black[:, -_FEW] - usual) / np.maximum(bright - dark, LEAST_CONTRAST)
-    spreads_px = settled.spreads_px
-    still = (lighter > _LIGHTER) | ((lighter > _LIGHTER_AND_SPREAD) & (spreads_px > _SPREAD_PX))
-    return np.where(settled.blurred.any(axis=1), spreads_px > _SPREAD_BLURRED_PX, still)
+    off = settled.sides_off_px / np.maximum(settled.spreads_px, _LEAST_SPREAD_PX)
+    sharp = (lighter > _LIGHTER) | (off > _SIDE_OFF) | (settled.spreads_px > _SPREAD_PX)
+    moving = (lighter > _LIGHTER_BLURRED) | (settled.spreads_px > _SPREAD_PX)
+    return np.where(settled.blurred.any(axis=1), moving, sharp)

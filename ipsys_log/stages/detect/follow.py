@@ -221,7 +221,7 @@ class Follow:
             )
             if isinstance(part, Fit):
                 better[n] = part
-            elif fit is not None and fit.spread_px > _DISTURBED_PX and not fit.pose.blurred.any():
+            elif fit is not None and (fit.spread_px > _DISTURBED_PX or fit.pose.blurred.any()):
                 better[n] = None
             if isinstance(part, Rejection) and better[n] is None:
                 self._rejections.append(part)

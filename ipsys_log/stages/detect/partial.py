@@ -160,7 +160,7 @@ class _Trial:
         self._edge_offset_px = edge_offset_px
         self._first = _ROUGH - 1 if near else 0
         prints = lay_out(dictionary, (self._id,))
-        self._sides = _sides(prints)
+        self._sides = (prints.by_side[0] > 0).T
         self._real = prints.polarity[0] != 0
 
     def settle(self) -> tuple[_State, _Solved]:
@@ -263,7 +263,7 @@ class _Trial:
         side = self._sides[state.without[n]] & solved.clear[n]
         if np.count_nonzero(side) < 2:
             return 0
-        off_px = solved.left_px[n][side] * 1.0
+        off_px = solved.left_px[n][side]
         polarity = lay_out(self._dictionary, (self._id,)).polarity[0][side]
         row = (solved.rows[n][:, side] * polarity).mean(axis=1)
         mean_px = float((off_px * polarity).mean())
@@ -282,14 +282,6 @@ class _Trial:
 def _biweight(shares: Array) -> Array:
     """Return Tukey's weights of residuals in shares of where weights end."""
     return np.asarray((1.0 - np.minimum(shares * shares, 1.0)) ** 2)
-
-
-def _sides(prints: Prints) -> Mask:
-    """Return which points lie on the top, the right, the bottom and the left side of one print, (4, s)."""
-    x, y = prints.points[0].T
-    level = prints.level[0] == 1
-    end = 0.5 - 1e-6
-    return np.array([level & (y > end), ~level & (x > end), level & (y < -end), ~level & (x < -end)])
 
 
 def _hider(levels: Array, prints: Prints) -> str:

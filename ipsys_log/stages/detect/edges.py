@@ -49,8 +49,9 @@ _WRONG_CELLS = 1
 # Glare, a shadow or a cover may lie on a marker where a side lies off by this share of the edges' spread, or
 # where the black beside some edges is lighter than beside the others, by that share of the contrast. A few
 # may be: a neighbouring white cell reaches as far where cells are small.
-_SIDE_OFF, _LIGHTER = 0.9, 0.35
-_LEAST_SPREAD_PX, _FEW = 0.03, 3
+_SIDE_OFF, _LIGHTER = 0.85, 0.35
+_WIDE_SPREAD_PX, _SIDE_OFF_WIDE = 0.12, 0.6
+_LEAST_SPREAD_PX, _FEW, _SMALL_PX = 0.03, 3, 4.0
 # Or where edges are spread by more px. Where motion blurs them, or seems to, sides lie off by shares of the
 # blur's width, and what is beside an edge mixes with it.
 _SPREAD_PX, _LIGHTER_BLURRED = 0.3, 0.6
@@ -113,13 +114,15 @@ def fit_edges(
 
 class _Settled(NamedTuple):
     """Fitted poses; ``covariances`` (m, 6, 6) of the twists in the frames of the prints; ``ends`` (m, s, 2)
-    are the levels at both ends of their profiles; ``sides_off_px`` (m,) is the most that a side lies off."""
+    are the levels at both ends of their profiles; ``cells_px`` (m,) is the least width of a cell, and
+    ``sides_off_px`` (m,) is the most that a side lies off."""
 
     poses: Poses
     edge_offsets_px: Array
     covariances: Array
     good: NDArray[np.bool_]
     heights: Array
+    cells_px: Array
     blurred: NDArray[np.bool_]
     spreads_px: Array
     blurs_px: Array
@@ -189,6 +192,7 @@ def _settle(
         covariances,
         good,
         seen.heights,
+        seen.slopes.min(axis=1) / view.prints.cells,
         blurred,
         spread_px,
         seen.blurs_px,
@@ -227,6 +231,10 @@ def _uneven(prints: Prints, settled: _Settled, levels: Array) -> NDArray[np.bool
     bright, dark = _bright_and_dark(prints, levels)
     lighter = (black[:, -_FEW] - usual) / np.maximum(bright - dark, LEAST_CONTRAST)
     off = settled.sides_off_px / np.maximum(settled.spreads_px, _LEAST_SPREAD_PX)
-    sharp = (lighter > _LIGHTER) | (off > _SIDE_OFF) | (settled.spreads_px > _SPREAD_PX)
+    sharp = (
+        ((lighter > _LIGHTER) & (settled.cells_px > _SMALL_PX))
+        | (off > _SIDE_OFF)
+        | (settled.spreads_px > _SPREAD_PX)
+    )
     moving = (lighter > _LIGHTER_BLURRED) | (settled.spreads_px > _SPREAD_PX)
     return np.where(settled.blurred.any(axis=1), moving, sharp)

@@ -57,7 +57,7 @@ _CUT, _CUT_PX, _CUT_ROUGH, _CUT_ROUGH_OF_REACH = 4.0, 0.08, 3.0, (0.36, 0.24, 0.
 _COSTLY_PX = 0.4
 # A side is disturbed as a whole where it lies off by so many standard deviations, and px.
 _DISTURBED, _DISTURBED_PX = 6.0, 0.06
-_CHEAPER = 0.03
+_CHEAPER, _ALIKE_POSES = 0.03, 0.06
 # A side is seen by this share of its edges; all edges together by that; and what they may cost.
 _SEEN, _SEEN_OF_ALL, _COST = 0.3, 0.4, 0.7
 _MOST_UNCERTAIN_PX = 1.0
@@ -87,7 +87,7 @@ def fit_partly(
 
     Parameters
     ----------
-    guesses : poses that it may have.
+    guesses : poses that it may have, the likelier one first.
     grey, dictionary, lens, edge_offset_px, row_time_s, blur_px : as for
         :func:`ipsys_log.stages.detect.edges.fit_edges`.
     near : whether the guesses are right to a pixel or two.
@@ -171,7 +171,9 @@ class _Trial:
         state = _State(into_poses(guesses), self._known[:, 7:], without)
         for number in range(self._first, _ROUGH + _EXACT):
             state, solved = self._move(state, number)
-        best = int(solved.costs.argmin()) // len(_WITHOUT)
+        # Of poses that look alike the first is the likelier one.
+        costs = solved.costs.reshape(-1, len(_WITHOUT)).min(axis=1)
+        best = int(costs.argmin()) if costs.min() < costs[0] - _ALIKE_POSES else 0
         chosen = np.arange(len(_WITHOUT)) + best * len(_WITHOUT)
         self._known, self._hold = self._known[chosen], self._hold[chosen]
         state = state.only(chosen)

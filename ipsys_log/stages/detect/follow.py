@@ -47,8 +47,10 @@ _SAME_PX = 8.0
 _JUMP_PX = 3.0
 # Edges are that near to those of a fit whose pose is the right one of two.
 _SURE_PX = 0.08
+# Small markers, which only a thorough search finds, look much the same in both poses.
+_MUCH_BETTER = 0.9
 # In uneven light, a fit whose edges are spread by more may be off by as much.
-_DISTURBED_PX = 0.5
+_DISTURBED_PX = 0.3
 # From so many frames with markers it is known how blurred edges are.
 _BLURS = 10
 
@@ -127,7 +129,8 @@ class Follow:
         if fresh:
             # Nothing is known yet, and there may be no later frame in which to find what is missed now.
             known_px = [fit.corners_px for fit in fits]
-            fits = self._add(grey, fits, search_leftovers(grey, self._dictionary, known_px))
+            leftovers = search_leftovers(grey, self._dictionary, known_px)
+            fits = self._add(grey, fits, leftovers, _MUCH_BETTER)
         if turn % _THOROUGH_EVERY == _SEARCH_EVERY or lost - {fit.pose.id for fit in fits}:
             fits = self._add(grey, fits, search_thoroughly(grey, self._dictionary))
         elif turn % _SEARCH_EVERY == _SEARCH_EVERY // 2 and self._changed and len(fits) == len(seen):
@@ -242,8 +245,14 @@ class Follow:
         better = dict(zip(again, self._fit(grey, list(again.values())), strict=True))
         return [better.get(n) or fit for n, fit in enumerate(fits)]
 
-    def _add(self, grey: Grey, fits: list[Fit], candidates: Iterable[Candidate]) -> list[Fit]:
-        """Fits, and those of candidates that are none of them."""
+    def _add(
+        self, grey: Grey, fits: list[Fit], candidates: Iterable[Candidate], better: float = 1.0
+    ) -> list[Fit]:
+        """Fits, and those of candidates that are none of them.
+
+        Of two poses that look alike the upright one is taken, unless the spread of the edges about the other
+        is less than ``better`` times that about it.
+        """
         new = [one for one in candidates if not _among(one.id, one.corners_px, fits)]
         upright, other = self._guess(new)
         found = self._fit(grey, upright)
@@ -251,7 +260,7 @@ class Follow:
         unsure = [n for n, fit in enumerate(found) if fit is None or fit.spread_px > _SURE_PX]
         for n, fit in zip(unsure, self._fit(grey, [other[n] for n in unsure]), strict=True):
             one = found[n]
-            if fit is not None and (one is None or fit.spread_px < one.spread_px):
+            if fit is not None and (one is None or fit.spread_px < better * one.spread_px):
                 found[n] = fit
         found = self._partly(grey, list(zip(upright, other, strict=True)), found)
         fits = list(fits)

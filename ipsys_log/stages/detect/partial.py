@@ -61,6 +61,8 @@ _CHEAPER, _ALIKE_POSES = 0.03, 0.06
 # A side is seen by this share of its edges; all edges together by that; and what they may cost.
 _SEEN, _SEEN_OF_ALL, _COST = 0.3, 0.4, 0.7
 _MOST_UNCERTAIN_PX = 1.0
+# In cells of fewer px, edges disturb one another.
+_LEAST_CELL_PX = 2.5
 # Errors of neighbouring edges are alike, more than least squares takes them to be.
 _ALIKE = 1.7
 
@@ -243,6 +245,10 @@ class _Trial:
         if not agreement.clear:
             what = _hider(levels[0], view.prints)
             return Rejection(self._id, corners_px[0], f"{what} hides too many of its cells")
+        cell_px = _width_px(corners_px[0]) / view.prints.cells
+        if cell_px < _LEAST_CELL_PX:
+            reason = f"its cells are only {cell_px:.1f} px wide, and some of its edges are disturbed"
+            return Rejection(self._id, corners_px[0], reason)
         weights = solved.weights[n]
         seen = [float(weights[side].sum() / side.sum()) for side in self._sides]
         lost = sum(share < _SEEN for share in seen)
@@ -284,6 +290,13 @@ class _Trial:
 def _biweight(shares: Array) -> Array:
     """Return Tukey's weights of residuals in shares of where weights end."""
     return np.asarray((1.0 - np.minimum(shares * shares, 1.0)) ** 2)
+
+
+def _width_px(corners_px: Array) -> float:
+    """Return the width of a square seen foreshortened, corners (4, 2): its area over its longest side."""
+    (x, y), (next_x, next_y) = corners_px.T, np.roll(corners_px, -1, axis=0).T
+    longest = np.hypot(next_x - x, next_y - y).max()
+    return float(abs((x * next_y - next_x * y).sum()) / 2 / max(longest, 1e-9))
 
 
 def _hider(levels: Array, prints: Prints) -> str:

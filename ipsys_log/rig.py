@@ -34,6 +34,11 @@ Item = TypeVar("Item")
 
 # Markers are carried below the cameras; what is greater was meant in cm.
 _HIGHEST_M = 5.0
+_FARTHEST = 1e6  # m, px, s or Hz: no number of a lab is larger
+_LARGEST_INT = {"_ns": 2**62}  # by what a name ends with
+_LARGEST_ID = 2**31 - 1
+_LARGEST_FILE = 1 << 18  # bytes
+_LONGEST_LINE = 120  # characters of a line that an error repeats
 
 # What the time that a driver gives a frame can mean.
 STAMPS = ("start", "end")
@@ -163,6 +168,8 @@ def load_rig(path: Path) -> Rig:
         that was meant in another unit.
     """
     try:
+        if path.stat().st_size > _LARGEST_FILE:
+            raise IpsysError(f"{path}: is too large for a rig file; write one with: ipsys init lab.toml")
         table = tomllib.loads(path.read_text(encoding="utf-8"))
     except OSError as error:
         raise IpsysError(f"{path}: cannot be read: {error.strerror}") from error
@@ -170,6 +177,11 @@ def load_rig(path: Path) -> Rig:
         raise IpsysError(f"{path}: is not a text file; write one with: ipsys init {path}") from error
     except tomllib.TOMLDecodeError as error:
         raise IpsysError(_not_toml(path, error)) from error
+    except (ValueError, RecursionError) as error:  # a number or nesting that Python's reader gives up on
+        raise IpsysError(
+            f"{path}: a number has thousands of digits, or tables lie thousands deep in one another; "
+            f"write a rig file with: ipsys init {path.name}"
+        ) from error
     for key, item in _ITEMS.items():
         rows = table.get(key, [])
         if not isinstance(rows, list):
@@ -188,7 +200,8 @@ def _not_toml(path: Path, error: tomllib.TOMLDecodeError) -> str:
     """What is wrong with a line, with the slips that are made most."""
     text = f"{path}: is not valid TOML: {error}"
     found = re.search(r"at line (\d+)", str(error))
-    line = path.read_text(encoding="utf-8").splitlines()[int(found[1]) - 1].strip() if found else ""
+    lines = path.read_text(encoding="utf-8").split("\n")
+    line = lines[int(found[1]) - 1].strip()[:_LONGEST_LINE] if found else ""
     if comma := re.search(r"= *(\d+),(\d+)\s*(#.*)?$", line):
         return f"{text}: {line}: a decimal comma? Write {comma[1]}.{comma[2]}"
     if bare := re.search(r"= *([^\s\"'\[{0-9][^#]*?)\s*(#.*)?$", line):
@@ -223,7 +236,17 @@ def check_rig(rig: Rig, where: str) -> Rig:
     _check_cameras(rig, where)
     _check_tape(rig, where)
     _check_heights(rig, where)
+    for item in (rig, rig.floor, *rig.markers, *rig.cameras, *rig.reference_points):
+        _check_numbers(item, where)
     return rig
+
+
+def _check_numbers(item: Any, where: str) -> None:
+    """Refuse numbers that are in no lab, before one of them spoils a computation."""
+    for field in fields(item) if item is not None else ():
+        value = getattr(item, field.name)
+        if isinstance(value, float) and not abs(value) <= _FARTHEST:
+            raise IpsysError(f"{where}: {field.name} is {value:g}; give a number of at most {_FARTHEST:.0f}")
 
 
 def _check_cameras(rig: Rig, where: str) -> None:
@@ -294,11 +317,21 @@ def _build(item: type[Item], row: Any, where: str) -> Item:
 def _value(kind: str, value: Any, where: str) -> Any:
     if kind.startswith("float"):
         if isinstance(value, bool) or not isinstance(value, (int, float)):
-            raise IpsysError(f"{where} must be a number, found {value!r}")
+            raise IpsysError(f"{where} must be a number, found {_shown(value)}")
+        if not abs(value) <= _FARTHEST:
+            raise IpsysError(f"{where} is {_shown(value)}; give a number of at most {_FARTHEST:.0f}")
         return float(value)
     if kind.startswith("int"):
         if isinstance(value, bool) or not isinstance(value, int) or value < 0:
-            raise IpsysError(f"{where} must be a whole number of at least 0, found {value!r}")
+            raise IpsysError(f"{where} must be a whole number of at least 0, found {_shown(value)}")
+        if value > (largest := _LARGEST_INT.get(where[-3:], _LARGEST_ID)):
+            raise IpsysError(f"{where} is {_shown(value)}; give a whole number of at most {largest}")
     elif kind.startswith("str") and not isinstance(value, str):
-        raise IpsysError(f"{where} must be text in quotes, found {value!r}")
+        raise IpsysError(f"{where} must be text in quotes, found {_shown(value)}")
     return value
+
+
+def _shown(value: Any) -> str:
+    """A value as an error repeats it."""
+    text = repr(value)
+    return text if len(text) <= _LONGEST_LINE else f"{text[:_LONGEST_LINE]} ..."

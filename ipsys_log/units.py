@@ -4,9 +4,10 @@ from __future__ import annotations
 
 from datetime import UTC, datetime
 
-__all__ = ["CM_PER_M", "NS_PER_S", "format_bytes", "format_time"]
+__all__ = ["CM_PER_M", "MM_PER_M", "NS_PER_S", "format_bytes", "format_duration", "format_time"]
 
 CM_PER_M = 100.0
+MM_PER_M = 1000.0
 NS_PER_S = 1_000_000_000
 
 
@@ -37,3 +38,22 @@ def format_bytes(count: int) -> str:
             return f"{size:.0f} {unit}" if unit == "B" else f"{size:.1f} {unit}"
         size /= 1000
     return f"{size:.1f} TB"
+
+
+def format_duration(seconds: float) -> str:
+    """A time that passes, in the unit that gives it the fewest digits.
+
+    Examples
+    --------
+    >>> format_duration(42.4), format_duration(60), format_duration(1800), format_duration(9000)
+    ('42 s', '1 minute', '30 minutes', '2.5 hours')
+    >>> format_duration(500_000)
+    '6 days'
+    """
+    if seconds < 60:
+        return f"{seconds:.0f} s"
+    minutes = round(seconds / 60)
+    if minutes < 120:
+        return f"{minutes} minute{'' if minutes == 1 else 's'}"
+    hours = seconds / 3600
+    return f"{hours:.1f} hours" if hours < 48 else f"{hours / 24:.0f} days"

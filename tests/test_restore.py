@@ -32,12 +32,17 @@ marker_length_m = 0.2
 """
 
 
+# Robots that drive, in frames so large that each second fills a chunk.
+SCENE = "stations=0&noise_sigma=2&jpeg_quality=90"
+
+
 @pytest.fixture
 def rig(tmp_path: Path) -> Path:
     """Two cameras of the simulated lab; so many frames that there is always one that waits."""
     path = tmp_path / "lab.toml"
     cameras = (
-        f'[[cameras]]\nname = "{name}"\nsource = "sim:{name}"\nwidth = 480\nheight = 270\nrate_hz = 25\n'
+        f'[[cameras]]\nname = "{name}"\nsource = "sim:{name}?{SCENE}"\nwidth = 480\nheight = 270\n'
+        "rate_hz = 25\n"
         for name in ("red", "white")
     )
     path.write_text(RIG + "".join(cameras))

@@ -1,6 +1,6 @@
 """The pattern of a calibration board: which squares are black, and which markers stand in the others.
 
-The layout is that of OpenCV since 4.6: the square at the top left is black, also where rows are even in number.
+The layout is that of OpenCV since 4.6: the square at the top left is black, whatever the number of rows.
 """
 
 from __future__ import annotations

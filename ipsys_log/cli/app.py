@@ -12,6 +12,7 @@ from ipsys_log.cli import (
     derive,
     imports,
     inspect,
+    markers,
     measure,
     plan,
     record,
@@ -27,14 +28,14 @@ app = typer.Typer(
     help="Indoor positioning with cheap cameras and ArUco markers. Everything is a channel in an MCAP log: "
     "replay it, compare models on it, look at it.",
     epilog="The help of a command ends with examples: ipsys record --help. To try all of it without a "
-    'camera, write source = "sim:red" into lab.toml.',
+    "camera: ipsys init lab.toml --simulated.",
     no_args_is_help=True,
     add_completion=False,
     pretty_exceptions_enable=False,
     context_settings={"help_option_names": ["-h", "--help"]},
 )
 _MODULES = (
-    *(setup, cameras, calibrate, align, imports, record, measure, derive),
+    *(setup, markers, cameras, calibrate, align, imports, record, measure, derive),
     *(plan, report, inspect, compare, view),
 )
 for module in _MODULES:

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import errno
 import os
 from collections.abc import Callable, Iterable, Iterator
 from contextlib import AbstractContextManager, ExitStack, contextmanager, nullcontext
@@ -15,10 +16,12 @@ from typing import TYPE_CHECKING, NamedTuple
 from ipsys_log.cli.console import console, remarks
 from ipsys_log.cli.options import load_lab
 from ipsys_log.cli.signals import Interrupted, stop_on_signal
+from ipsys_log.units import format_bytes
 
 if TYPE_CHECKING:
     from ipsys_log.messages import CameraCalibration, Message, Rig, RigCamera
     from ipsys_log.pipeline import Watch
+    from ipsys_log.recording.disk_room import DiskRoom
     from ipsys_log.report.cameras import LiveStatus
     from ipsys_log.sources.attached import Attached
 
@@ -27,6 +30,8 @@ __all__ = ["MODEL", "Lab", "check_target", "opened", "prepared", "recorded_now",
 
 # What a log is that is named by --model-from.
 MODEL = "the log with the model"
+# So much of what cameras send is kept of a place that is measured.
+_PLACE_S = 1.5
 
 
 class Lab(NamedTuple):
@@ -104,17 +109,19 @@ def check_target(output: Path, force: bool, files: Iterable[tuple[str, Path]]) -
     """
     from ipsys_log.errors import IpsysError
     from ipsys_log.log.journal import journal_path
-    from ipsys_log.log.lock import check_free, open_locked
+    from ipsys_log.log.lock import check_free, check_locks, open_locked
     from ipsys_log.log.storage import DISK
     from ipsys_log.report.files import check_file
 
     try:
         journal_path(output).exists()
     except OSError as error:
-        raise IpsysError(f"-o {output}: {error.strerror}; give a shorter name") from error
+        shorter = "; give a shorter name" if error.errno == errno.ENAMETOOLONG else ""
+        raise IpsysError(f"-o {output}: {error.strerror}{shorter}") from error
     check_file(output, "-o", [])
     if not output.exists():
         check_free(output)
+        check_locks(output.parent)
     else:
         for what, path in files:
             if path.exists() and output.samefile(path):
@@ -146,6 +153,7 @@ def opened(
     IpsysError
         Where a camera cannot be opened, or its frames do not fit its lens.
     """
+    from ipsys_log.recording.disk_room import expected_bytes_per_s, free_room
     from ipsys_log.recording.monitor import Monitor
     from ipsys_log.recording.recorder import first_messages, fitting_lenses
     from ipsys_log.report.cameras import LiveStatus
@@ -159,13 +167,34 @@ def opened(
         sizes_px = {name: state.size_px for name, state in attached.states.items()}
         lenses = fitting_lenses(lab.lenses, sizes_px, say)
         stack.enter_context(_ended(attached.stop, seconds, until_stopped))
-        status = LiveStatus(attached.states, stack.enter_context(Monitor(lab.rig)), output, monotonic)
+        expected = expected_bytes_per_s(lab.cameras, attached.states)
+        # What is not a recording grows only where something is measured.
+        growing = None if doing and seconds is None else expected
+        monitor = stack.enter_context(Monitor(lab.rig))
+        status = LiveStatus(attached.states, monitor, output, monotonic, growing)
+        _say_room(lab, attached, free_room(output, expected), seconds, doing)
         say(doing or f"recording into {output}; Ctrl-C ends it")
         if panel:
             stack.enter_context(_on_screen(status))
         yield attached, first_messages(lab.rig, lenses, attached.now_ns), status
     for line in () if doing else status.summary():
         console.print(line, markup=False)
+
+
+def _say_room(lab: Lab, attached: Attached, room: DiskRoom, seconds: float | None, doing: str | None) -> None:
+    """Say, before it begins, how large the recording gets and how long the disk lasts.
+
+    Cameras that are only looked at for some seconds need no word, unless the disk is too small even for that.
+    """
+    if doing and not (seconds is not None and room.is_short(seconds)):
+        if seconds is None:
+            place, free = format_bytes(round(_PLACE_S * room.bytes_per_s)), format_bytes(room.free_bytes)
+            say(f"about {place} for each place; {free} free in {room.folder}")
+        return
+    short = room.is_short(seconds)
+    remarks.print(room.describe(seconds), style="bold red" if short else None, markup=False)
+    if advice := room.advise(lab.cameras, attached.states):
+        say(advice)
 
 
 def shown_to(first: Watch, second: Watch | None) -> Watch:

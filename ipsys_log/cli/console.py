@@ -5,12 +5,16 @@ from __future__ import annotations
 import logging
 import sys
 from collections import Counter
-from collections.abc import Iterator, Sequence
+from collections.abc import Iterable, Iterator, Sequence
 from contextlib import contextmanager
 from time import monotonic
-from typing import TYPE_CHECKING
+from typing import IO, TYPE_CHECKING, Any
 
-from rich.console import Console
+from rich.console import Console, ConsoleOptions, RenderableType
+from rich.segment import Segment
+from rich.text import Text
+
+from ipsys_log.plain_text import plain_text
 
 if TYPE_CHECKING:
     from ipsys_log.runs.records import Outcome
@@ -23,10 +27,34 @@ _OF_FRAMES = ("detect", "camera-frame", "locate", "fuse", "simulate")
 _DRAW_EVERY_S = 0.1
 # More runs of a stage than this are counted, not listed.
 _MANY_RUNS = 4
+_LONGEST = 10_000
 
-# In a window lines break between words; in a file or a pipe they do not break.
-console = Console(highlight=False, soft_wrap=not sys.stdout.isatty())
-remarks = Console(stderr=True, highlight=False, soft_wrap=not sys.stderr.isatty())
+
+class SafeConsole(Console):
+    """A console that obeys nothing in the text that it prints: no markup, and no control characters."""
+
+    def __init__(self, file: IO[str], *, stderr: bool = False) -> None:
+        # In a window lines break between words; in a file or a pipe they do not break.
+        super().__init__(
+            stderr=stderr, highlight=False, markup=False, emoji=False, soft_wrap=not file.isatty()
+        )
+
+    def render_str(self, text: str, **options: Any) -> Text:
+        """Return a text or a cell for measuring and printing; names of others stand in it."""
+        return super().render_str(_plain(text), **options)
+
+    def render(self, renderable: RenderableType, options: ConsoleOptions | None = None) -> Iterable[Segment]:
+        """Yield the pieces of anything to be printed, those of a `Text` included."""
+        for piece in super().render(renderable, options):
+            yield piece if piece.control else Segment(_plain(piece.text), piece.style)
+
+
+def _plain(text: str) -> str:
+    return plain_text(text, keep="\n", longest=_LONGEST)
+
+
+console = SafeConsole(sys.stdout)
+remarks = SafeConsole(sys.stderr, stderr=True)
 
 
 class _Remarks(logging.Handler):
@@ -107,8 +135,7 @@ def print_outcomes(outcomes: Sequence[Outcome]) -> None:
         state = count if outcome.fresh else "up to date"
         remarks.print(f"{outcome.stage:<13} run {outcome.run:<{width}} {state}")
         for remark in outcome.remarks:
-            # Names out of a log are not for rich to read as its markup.
-            remarks.print(f"  {remark}", style="yellow", markup=False)
+            remarks.print(f"  {remark}", style="yellow")
 
 
 def _print_many(outcomes: Sequence[Outcome]) -> list[Outcome]:

@@ -11,7 +11,7 @@ __all__ = ["EXAMPLES", "PANELS", "arrange"]
 # The commands as ``ipsys --help`` lists them.
 PANELS: dict[str, tuple[str, ...]] = {
     "The first day, in this order": (
-        *("init", "cameras", "calibrate", "align", "record", "measure", "replay", "live"),
+        *("init", "markers", "cameras", "calibrate", "align", "record", "measure", "replay", "live"),
     ),
     "How good it is, and where to measure next": ("evaluate", "plan", "report"),
     "Look into a log": ("info", "runs", "view", "verify", "diff", "latency", "repair"),
@@ -24,6 +24,12 @@ EXAMPLES: dict[str, str] = {
     "init": """
 ipsys init lab.toml                      # an example with comments
 ipsys init lab.toml --from monday.mcap   # the rig that a log holds
+ipsys init lab.toml --simulated          # to try all commands
+""",
+    "markers": """
+ipsys markers --rig lab.toml                # all markers of the rig
+ipsys markers --ids 0-11 --length 0.08 --page letter
+ipsys markers --board 6x4 -o board.pdf      # for ipsys calibrate
 """,
     "cameras": """
 ipsys cameras                    # a source for lab.toml, for each camera

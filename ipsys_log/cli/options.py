@@ -41,10 +41,32 @@ Logs = Annotated[
 ]
 
 
+# What is written by other options, or read: a log that is called so is a slip.
+_OTHER_FILES = (
+    *(".html", ".htm", ".csv", ".json", ".toml", ".yaml", ".yml", ".rrd"),
+    *(".png", ".pdf", ".svg", ".jpg", ".jpeg", ".webp"),
+)
+
+
 def _named_as_log(path: Path | None) -> Path | None:
-    """What a user calls a new log, with the ending that all logs have."""
+    """What a user calls a new log, with the ending that all logs have.
+
+    Raises
+    ------
+    IpsysError
+        For the name of another kind of file.
+    """
     if path is None or path.suffix == ".mcap" or path.is_dir():
         return path
+    if path.suffix.lower() in _OTHER_FILES:
+        from ipsys_log.errors import IpsysError
+
+        page = (
+            "; a page is what ipsys report writes, to --html FILE"
+            if path.suffix.lower() in (".html", ".htm")
+            else ""
+        )
+        raise IpsysError(f"-o {path}: -o is for a new log, which ends in .mcap{page}")
     named = path.with_name(f"{path.name}.mcap")
     remarks.print(f"-o {path}: the log is called {named}", markup=False)
     return named

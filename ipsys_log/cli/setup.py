@@ -41,7 +41,7 @@ SETTINGS: dict[str, tuple[int | float, str]] = {
 }
 
 # At the top of the rig file of the simulated lab.
-_SIMULATED = """# The simulated lab. Its cameras need no hardware: docs/first-day.md goes through all commands with it.
+_SIMULATED = """# The simulated lab, without hardware. docs/first-day.md goes through all commands with it.
 # The robots 0, 1 and 2 drive to and fro at a height of 10 cm. The other markers lie still.
 
 """
@@ -64,8 +64,8 @@ def init(
         bool,
         typer.Option(
             "--simulated",
-            help="Write the rig of the simulated lab, to try all commands without a camera; and a sheet of what "
-            "a tape reads there.",
+            help="Write the rig of the simulated lab, to try all commands without a camera, and a sheet with "
+            "what a tape reads there.",
         ),
     ] = False,
 ) -> None:
@@ -110,6 +110,7 @@ def _write_new(texts: dict[Path, str]) -> None:
         Where a file exists.
     """
     from ipsys_log.errors import IpsysError
+    from ipsys_log.log.lock import dangling
 
     made: list[Path] = []
     try:
@@ -121,7 +122,9 @@ def _write_new(texts: dict[Path, str]) -> None:
         for path in made:
             path.unlink()
         if isinstance(error, FileExistsError):
-            raise IpsysError(f"{error.filename}: exists already; edit it, or give another name") from error
+            taken = Path(error.filename)
+            text = dangling(taken) or f"{taken}: exists already; edit it, or give another name"
+            raise IpsysError(text) from error
         raise
 
 

@@ -29,6 +29,8 @@ DISTORTION_MODELS = {"kannala_brandt": 4, "plumb_bob": 5, "rational_polynomial":
 _CRITERIA = (cv2.TERM_CRITERIA_COUNT + cv2.TERM_CRITERIA_EPS, 100, 1e-12)
 
 _LOST_PX = 0.01
+_LARGEST = 1e9  # px, and a coefficient
+_WIDEST_PX = 65_535
 # Directions (u, v) nearer together than this are one.
 _SAME_RAY = 1e-3
 
@@ -57,8 +59,12 @@ def check_calibration(lens: CameraCalibration, where: str) -> CameraCalibration:
             f"{where}: {lens.distortion_model} takes {wanted} coefficients, found {lens.D.size}. "
             f"{_advice(lens)}"
         )
-    if not (np.isfinite(lens.K).all() and np.isfinite(lens.D).all()):
-        raise IpsysError(f"{where}: its matrix or coefficients are no numbers; calibrate again")
+    if not (np.abs(lens.K) <= _LARGEST).all() or not (np.abs(lens.D) <= _LARGEST).all():
+        raise IpsysError(f"{where}: its matrix or coefficients are no numbers of a lens; calibrate again")
+    if not (0 < lens.width <= _WIDEST_PX and 0 < lens.height <= _WIDEST_PX):
+        raise IpsysError(
+            f"{where}: no image has {lens.width} x {lens.height} px; write the size in pixels into it"
+        )
     if not lens.K[0, 0] > 0 < lens.K[1, 1]:
         raise IpsysError(f"{where}: the camera matrix K has no positive focal lengths; calibrate again")
     return lens

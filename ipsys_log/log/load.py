@@ -50,6 +50,8 @@ def load_contents(view: View) -> Contents:
         data_end = standing
     if contents is None or not complete or not _gaps_hold_no_messages(view, contents, data_end):
         contents = scan(view, data_end)
+    view.check_number(len(contents.channels), "channels")
+    view.check_number(len(contents.schemas), "schemas")
     contents.data_end, contents.data_crc, contents.cut_short = data_end, crc, standing is not None
     return contents
 

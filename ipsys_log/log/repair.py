@@ -12,6 +12,7 @@ from mcap import records as mcap
 from mcap.opcode import Opcode
 
 from ipsys_log.errors import LogError
+from ipsys_log.log.bounds import BoundError
 from ipsys_log.log.contents import Contents
 from ipsys_log.log.crc import Buffer
 from ipsys_log.log.hashing import METADATA_NAME, metadata_of_hashes
@@ -104,6 +105,8 @@ def _check_magic(view: View) -> None:
 def _summary(view: View) -> Contents | None:
     try:
         return load_contents(view)
+    except BoundError:
+        raise
     except LogError:
         return None
 

@@ -6,8 +6,9 @@ from dataclasses import dataclass, field
 
 from mcap.opcode import Opcode
 
+from ipsys_log.log.bounds import LARGEST_CHUNK
 from ipsys_log.log.chunking import ChunkBuilder, Limits
-from ipsys_log.log.chunks import LARGEST_CHUNK, look_inside
+from ipsys_log.log.chunks import look_inside
 from ipsys_log.log.hashing import ChannelHash
 from ipsys_log.log.records import HEADER, MESSAGE
 from ipsys_log.log.survey import Survey

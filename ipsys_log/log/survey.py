@@ -8,6 +8,7 @@ from dataclasses import dataclass, field
 from mcap.opcode import Opcode
 
 from ipsys_log.errors import LogError
+from ipsys_log.log.bounds import BoundError
 from ipsys_log.log.chunks import Inside, look_inside, unpack
 from ipsys_log.log.contents import Contents
 from ipsys_log.log.hashing import ChannelHash
@@ -87,6 +88,8 @@ class Survey:
 def survey(view: View, known: Contents | None = None) -> Survey:
     """Check the data section record by record; never believes a length, never raises for damage.
 
+    A log that asks for too much is refused with a `BoundError`: it need not be damaged, and is not repaired.
+
     `known` is what the summary says, if there is one: it may define what the data section does not.
     """
     found = Survey()
@@ -117,6 +120,8 @@ def _stretch(view: View, found: Survey, position: int) -> int:
             if found.finished:
                 return view.size
             found.end = position = at.offset + at.length
+    except BoundError:
+        raise
     except LogError as error:
         found.faults.append(str(error).split(" is damaged ", 1)[-1].split(". Run:", 1)[0])
     else:
@@ -197,6 +202,8 @@ def _is_record(view: View, offset: int) -> bool:
         at = next(walk(view, offset, view.size), None)
         if at is not None and at.opcode == Opcode.CHUNK:
             unpack(view, offset, parse_chunk_head(view, offset)[1])
+    except BoundError:
+        raise
     except LogError:
         return False
     return at is not None and (at.opcode in _DATA_SECTION or at.opcode >= _PRIVATE)

@@ -2,10 +2,11 @@
 
 import os
 import stat
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 from pathlib import Path
 
 from ipsys_log.errors import LogError
+from ipsys_log.log.bounds import Allowance, BoundError
 
 __all__ = ["View", "open_for_reading"]
 
@@ -27,6 +28,10 @@ class View:
     tail_fd: int = -1
     tail_base: int = 0
     bytes_read: int = 0
+    allowance: Allowance = field(init=False)
+
+    def __post_init__(self) -> None:
+        self.allowance = Allowance(self.size)
 
     def read(self, offset: int, length: int) -> bytes:
         """Exactly `length` bytes at `offset`; the length is checked against the file before allocating."""
@@ -49,6 +54,18 @@ class View:
     def fault(self, offset: int, what: str) -> LogError:
         """The error for damage found at `offset`."""
         return LogError(f"{self.path} is damaged at byte {offset}: {what}. Run: ipsys repair {self.path}")
+
+    def refusal(self, what: str) -> BoundError:
+        """The error for a log that asks for too much. Such a log need not be damaged."""
+        return BoundError(
+            f"{self.path} is refused: {what}. If it is a true recording, unpack it first: "
+            f"mcap decompress {self.path} -o unpacked.mcap"
+        )
+
+    def check_number(self, number: int, what: str) -> None:
+        """Refuse a log with more channels, schemas or runs than a file of its size may have."""
+        if number > self.allowance.most_channels:
+            raise self.refusal(f"it has {number} {what}, more than {self.allowance.most_channels}")
 
     def close(self) -> None:
         for fd in (self.fd, self.tail_fd):

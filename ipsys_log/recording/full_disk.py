@@ -8,15 +8,20 @@ from collections.abc import Callable, Iterator
 from contextlib import ExitStack, contextmanager, suppress
 from pathlib import Path
 
-from ipsys_log.errors import LogError, WriteError
+from ipsys_log.errors import LogError, WriteError, is_full
 from ipsys_log.log import LogReader
 from ipsys_log.units import NS_PER_S, format_bytes
 
-__all__ = ["reserve", "what_fitted"]
+__all__ = ["disk_fault", "reserve", "reserved_bytes", "what_failed", "what_fitted"]
 
 # Set aside on the disk, so that a log can be finished when the disk is full: what waits is written and looked
 # at, and the table of contents, which has some MB after some hours, is written twice. On a small disk half.
 _RESERVE_BYTES = 64 << 20
+
+
+def reserved_bytes(free_bytes: int) -> int:
+    """Return how much of what is free on a disk is set aside for the end of a log."""
+    return min(_RESERVE_BYTES, free_bytes // 2)
 
 
 @contextmanager
@@ -27,19 +32,34 @@ def reserve(path: Path) -> Iterator[Callable[[], None]]:
             if hasattr(os, "O_TMPFILE"):
                 fd = os.open(path.parent, os.O_TMPFILE | os.O_RDWR)
                 held.callback(os.close, fd)
-                os.posix_fallocate(fd, 0, min(_RESERVE_BYTES, shutil.disk_usage(path.parent).free // 2))
+                os.posix_fallocate(fd, 0, reserved_bytes(shutil.disk_usage(path.parent).free))
         yield held.close
 
 
 def what_fitted(path: Path, error: WriteError) -> str:
-    """How far a log goes that was ended by a full disk."""
+    """How far a log goes that was ended by a disk that took no more."""
     try:
         with LogReader(path) as log:
             count, seconds = log.message_count, ((log.end_ns or 0) - (log.start_ns or 0)) / NS_PER_S
     except LogError:
         return str(error)
+    what = "the disk takes no more" if is_full(error.cause) else disk_fault(error.cause)
+    then = "Free some space, or record to another disk" if is_full(error.cause) else "Record to another disk"
     size = format_bytes(path.stat().st_size)
     return (
-        f"{path}: the disk takes no more; recording has stopped, and the log is complete with what fitted: "
-        f"{count} messages, {seconds:.1f} s, {size}. Free some space, or record to another disk"
+        f"{path}: {what}; recording has stopped, and the log is complete with what fitted: "
+        f"{count} messages, {seconds:.1f} s, {size}. {then}"
     )
+
+
+def what_failed(path: Path, fault: OSError) -> str:
+    """What is to be done with a log that a disk may not have kept."""
+    return (
+        f"{path}: {disk_fault(fault)} while this was recorded; some of it may be lost. To see what is whole: "
+        f"ipsys repair {path}. Record to another disk"
+    )
+
+
+def disk_fault(fault: OSError) -> str:
+    """A fault of the disk in words."""
+    return f"the disk has failed ({fault.strerror})"

@@ -15,10 +15,11 @@ from rich.text import Text
 
 from ipsys_log.compare import Comparison
 from ipsys_log.messages import Message, Track, Tracks
+from ipsys_log.recording.disk_room import DiskRoom
 from ipsys_log.recording.latency import Percentiles
 from ipsys_log.recording.monitor import Look, Monitor
 from ipsys_log.sources.attendant import CameraState
-from ipsys_log.units import CM_PER_M, format_bytes
+from ipsys_log.units import CM_PER_M, format_bytes, format_duration
 
 __all__ = [
     "LiveStatus",
@@ -30,6 +31,11 @@ __all__ = [
     "robots_table",
 ]
 
+# After so long the rate at which a log grows is known better than it was expected.
+_SETTLED_S = 5.0
+# More robots than these do not fit into a window of 24 lines; as many ids of markers fit into a line.
+_MOST_ROBOTS, _MOST_IDS = 10, 8
+
 
 class LiveStatus:
     """What is shown on the screen while cameras send.
@@ -39,6 +45,7 @@ class LiveStatus:
     states, monitor : of the cameras.
     target : the log that is written.
     now_s : a clock for rates.
+    expected_bytes_per_s : of the log, until it can be measured; None where it does not grow with the time.
     """
 
     def __init__(
@@ -47,9 +54,11 @@ class LiveStatus:
         monitor: Monitor,
         target: Path,
         now_s: Callable[[], float],
+        expected_bytes_per_s: float | None = None,
     ) -> None:
         self._states, self._monitor, self._target, self._now_s = states, monitor, target, now_s
         self._begin_s = now_s()
+        self._expected_bytes_per_s = expected_bytes_per_s
         self._before: dict[str, tuple[float, int, int]] = {}
         self._rates: dict[str, tuple[float, float]] = {}
         self._tracks: dict[str, Track] = {}
@@ -70,11 +79,21 @@ class LiveStatus:
             parts.append(robots_table(self._tracks))
         # Text, for there are brackets in it that rich would take for its own.
         parts += [Text(line, style="yellow") for line in self._warnings()]
-        size = self._target.stat().st_size if self._target.exists() else 0
-        free = shutil.disk_usage(self._target.absolute().parent).free
-        took = f"{now_s - self._begin_s:.0f} s, {format_bytes(size)}; {format_bytes(free)} left on the disk"
-        parts.append(Text(took))
+        parts.append(self._disk(now_s - self._begin_s))
         return Group(*parts)
+
+    def _disk(self, took_s: float) -> Text:
+        """The size of the log, and how long the disk lasts at the rate at which the log has grown."""
+        size = self._target.stat().st_size if self._target.exists() else 0
+        folder = self._target.absolute().parent
+        free = shutil.disk_usage(folder).free
+        line = f"{took_s:.0f} s, {format_bytes(size)}; {format_bytes(free)} left on the disk"
+        if self._expected_bytes_per_s is None:
+            return Text(line)
+        room = DiskRoom(folder, free, size / took_s if took_s >= _SETTLED_S else self._expected_bytes_per_s)
+        if room.lasts_s is None:
+            return Text(line)
+        return Text(f"{line}: {format_duration(room.lasts_s)}", style="bold red" if room.is_short() else "")
 
     def summary(self) -> list[str]:
         """What was recorded, when it is over."""
@@ -101,14 +120,17 @@ class LiveStatus:
 
 
 def robots_table(tracks: Mapping[str, Track]) -> Table:
-    """Where the robots are."""
+    """Where the robots are: first those that have a name, and no more than fit into a window."""
     table = Table(box=None, pad_edge=False)
     for heading in ("robot", "x cm", "y cm", "z cm", "heading", "cameras"):
         table.add_column(heading, justify="left" if heading in ("robot", "cameras") else "right")
-    for name, track in sorted(tracks.items()):
+    order = sorted(tracks.items(), key=lambda item: (item[0] == f"marker_{item[1].id}", item[1].id))
+    for name, track in order[:_MOST_ROBOTS]:
         heading = "-" if track.heading_rad is None else f"{degrees(track.heading_rad):.0f} deg"
         at_cm = (f"{CM_PER_M * value:.1f}" for value in (track.x_m, track.y_m, track.z_m))
         table.add_row(name, *at_cm, heading, ", ".join(track.cameras))
+    if len(order) > _MOST_ROBOTS:
+        table.add_row(f"and {len(order) - _MOST_ROBOTS} more")
     return table
 
 
@@ -148,7 +170,8 @@ def cameras_table(
 def _markers(look: Look) -> Text:
     """The ids of a picture; those that are not in the rig with a question mark."""
     ids = [Text(str(n)) for n in look.markers] + [Text(f"{n}?", style="yellow") for n in look.strange]
-    return Text(", ").join(ids) if ids else Text("none")
+    more = [Text(f"and {len(ids) - _MOST_IDS} more")] if len(ids) > _MOST_IDS else []
+    return Text(", ").join([*ids[:_MOST_IDS], *more]) if ids else Text("none")
 
 
 def latency_table(steps: Mapping[str, Percentiles]) -> Group:

@@ -9,6 +9,7 @@ from rich.table import Table
 from rich.text import Text
 
 from ipsys_log.messages import ErrorStatistics
+from ipsys_log.plain_text import plain_text
 from ipsys_log.units import CM_PER_M
 
 __all__ = ["format_interval", "name_cell", "plain_table", "wrap_text"]
@@ -28,8 +29,8 @@ def plain_table(title: str, names: Iterable[str], figures: Iterable[str] = ()) -
 
 
 def name_cell(text: str) -> Text:
-    """A name out of a log, with nothing in it that a terminal or a table would obey."""
-    return Text("".join(c if c.isprintable() else "\ufffd" for c in text))
+    """Return a name out of a log, with nothing in it that a terminal or a table would obey."""
+    return Text(plain_text(text))
 
 
 def wrap_text(text: str, indent: str = "") -> str:

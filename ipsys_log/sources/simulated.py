@@ -8,7 +8,7 @@ from collections.abc import Callable, Iterator
 from contextlib import contextmanager
 from dataclasses import fields, replace
 from fractions import Fraction
-from threading import Event, Thread
+from threading import Event, Thread, main_thread
 from typing import NamedTuple
 from urllib.parse import parse_qsl, urlencode
 
@@ -20,10 +20,10 @@ from ipsys_log.sources.frames import Clock, Frame, Say
 from ipsys_log.sources.simulator.board import board_cells
 from ipsys_log.sources.simulator.cameras import hang_cameras
 from ipsys_log.sources.simulator.film import Film, board_film, lab_film, next_missing
+from ipsys_log.sources.simulator.floor import Check
 from ipsys_log.sources.simulator.live_lab import LIVE_SETTINGS
 from ipsys_log.sources.simulator.settings import LabSettings
 from ipsys_log.sources.simulator.shutter import exposed
-from ipsys_log.sources.simulator.views import Check
 from ipsys_log.units import NS_PER_S
 
 __all__ = ["Seat", "lens_of", "open_simulated", "parse_source", "show_board"]
@@ -35,7 +35,7 @@ _SQUARE_M, _MARKER_SCALE, _DICTIONARY = 0.03, 0.75, "DICT_4X4_50"
 
 
 class Seat(NamedTuple):
-    """What a simulated camera looks at: the lab, which of its cameras it is, and a board before it, if any."""
+    """What a simulated camera looks at: a lab, by which of its cameras, and a board before it, if any."""
 
     lab: LabSettings
     number: int
@@ -82,7 +82,8 @@ class _Pictures:
             self._fault = fault
 
     def _check(self) -> None:
-        if self._stopped.is_set():
+        # Python waits for this thread when the program ends, also where nobody was left to stop it.
+        if self._stopped.is_set() or not main_thread().is_alive():
             raise _Stopped
 
 
@@ -90,18 +91,18 @@ class _Pictures:
 def open_simulated(camera: RigCamera, clock: Clock, say: Say) -> Iterator[Iterator[Frame | None]]:
     """The frames of a simulated camera, as :data:`~ipsys_log.sources.frames.Open` says.
 
-    Most markers of the lab lie still; the others drive to and fro. Or a board is held before the camera. Each
-    picture is drawn once, in a thread of its own, and shown again and again; a frame whose picture is not drawn
-    yet does not come. Which picture a frame shows follows from the clock alone: all cameras of a lab see the
-    robots at the same places, in whatever process.
+    Most markers of the lab lie still; the others drive to and fro. Or a board is held before the camera.
+    Each picture is drawn once, in a thread of its own, and shown again and again; a frame whose picture is
+    not drawn yet does not come. Which picture a frame shows follows from the clock alone: all cameras of a
+    lab see the robots at the same places, in whatever process.
 
     Parameters
     ----------
     camera : its ``source`` is ``sim:`` and the name of the camera in the lab, and may set what
-        ``ipsys simulate`` can, and a board: ``sim:red?seed=3&markers=5``, ``sim:red?board=6x4``. Size and rate
-        are those of the rig.
+        ``ipsys simulate`` can, and a board: ``sim:red?seed=3&markers=5``, ``sim:red?board=6x4``. Size and
+        rate are those of the rig.
     clock : tells which frame is shown.
-    say : told what the rig asks for in vain.
+    say : told what the camera shows.
 
     Raises
     ------
@@ -111,6 +112,8 @@ def open_simulated(camera: RigCamera, clock: Clock, say: Say) -> Iterator[Iterat
     seat = parse_source(camera)
     lab = seat.lab
     say_refused(camera, Given(lab.width, lab.height, lab.rate_hz), say)
+    shown = "the simulated lab" if seat.board is None else f"{seat.board} in the simulated lab"
+    say(f"camera {camera.name}: shows {shown}, {lab.width} x {lab.height} px, {lab.rate_hz:g} frames/s")
     timing = _Timing.of(lab, camera.stamp)
 
     def make_film(check: Check) -> Film:

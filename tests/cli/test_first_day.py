@@ -29,7 +29,7 @@ x_m = 2.0
 y_m = 0.0
 """
 SIMULATED = '[[cameras]]\nname = "red"\nsource = "sim:red"\nwidth = 320\nheight = 180\n'
-OPENED = "draws 2 s of the simulated lab"
+OPENED = "shows the simulated lab"
 
 
 @pytest.fixture(scope="module")

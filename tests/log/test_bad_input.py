@@ -197,7 +197,7 @@ def test_a_bomb_is_not_unpacked(with_size: bool, tmp_path: Path) -> None:
     path = build(tmp_path / "bomb.mcap", contents, chunk)
     tracemalloc.start()
     try:
-        assert "the chunk" in fault_of(read_everything, path)
+        assert "chunk" in fault_of(read_everything, path)
         assert tracemalloc.get_traced_memory()[1] < 64 << 20
     finally:
         tracemalloc.stop()

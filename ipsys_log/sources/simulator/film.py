@@ -8,13 +8,14 @@ from dataclasses import dataclass
 from ipsys_log.calibration.boards import Board
 from ipsys_log.sources.simulator.board import hold_board
 from ipsys_log.sources.simulator.cameras import hang_cameras
+from ipsys_log.sources.simulator.floor import Check
 from ipsys_log.sources.simulator.live_lab import LiveLab, plan_live_lab
 from ipsys_log.sources.simulator.places import place
 from ipsys_log.sources.simulator.render import Print, encode_jpeg, lay_down, render
 from ipsys_log.sources.simulator.seeds import Purpose, stream
 from ipsys_log.sources.simulator.settings import LabSettings
 from ipsys_log.sources.simulator.simulate import driving
-from ipsys_log.sources.simulator.views import Check, View, prepare_view
+from ipsys_log.sources.simulator.views import View, prepare_view
 
 __all__ = ["Film", "board_film", "lab_film", "next_missing", "shown_at"]
 
@@ -26,8 +27,8 @@ _HOLD_S = 0.6
 class Film:
     """Pictures of a camera, and which of them each frame shows.
 
-    ``draw`` makes the JPEG picture of an index from 0 to ``count``; ``index_of`` tells the index for the number
-    of a frame since 1970, so that all cameras of a lab agree. It repeats after ``period`` frames.
+    ``draw`` makes the JPEG picture of an index from 0 to ``count``; ``index_of`` tells the index for the
+    number of a frame since 1970, so that all cameras of a lab agree. It repeats after ``period`` frames.
     """
 
     count: int

@@ -15,10 +15,15 @@ from ipsys_log.sources.simulator.cameras import Camera
 from ipsys_log.sources.simulator.seeds import Purpose, stream
 from ipsys_log.sources.simulator.settings import LabSettings
 
-__all__ = ["lay_floor", "pixel_rays"]
+__all__ = ["Check", "lay_floor", "pixel_rays"]
 
 Array = NDArray[np.float64]
 Plane = NDArray[np.float32]
+# Called between two steps of long work; what it raises ends the work.
+Check = Callable[[], None]
+
+# A step of the work, so that an interrupt need not wait for all of it, and what it needs stays in the caches.
+_ROWS = 64
 
 _BOARD_M = np.array([1.2192, 2.4384])
 _BOARDS = (4, 2)
@@ -27,8 +32,13 @@ _TILE = 1024
 _TILE_M = 2.6
 
 
-def pixel_rays(lens: CameraCalibration, border_px: int) -> Array:
+def pixel_rays(lens: CameraCalibration, border_px: int, check: Check = lambda: None) -> Array:
     """Normalized image coordinates of all pixels and of a border around them.
+
+    Parameters
+    ----------
+    lens, border_px : of the camera; how wide the border is.
+    check : called between the steps; what it raises ends the work.
 
     Returns
     -------
@@ -36,15 +46,30 @@ def pixel_rays(lens: CameraCalibration, border_px: int) -> Array:
     """
     x = np.arange(-border_px, lens.width + border_px, dtype=np.float64)
     y = np.arange(-border_px, lens.height + border_px, dtype=np.float64)
-    pixels = np.stack(np.meshgrid(x, y), axis=-1)
-    return undistort(pixels.reshape(-1, 2), lens).reshape(pixels.shape)
+    rays = np.empty((len(y), len(x), 2))
+    for first in range(0, len(y), _ROWS):
+        check()
+        pixels = np.stack(np.meshgrid(x, y[first : first + _ROWS]), axis=-1)
+        rays[first : first + _ROWS] = undistort(pixels.reshape(-1, 2), lens).reshape(pixels.shape)
+    return rays
 
 
-def lay_floor(settings: LabSettings, camera: Camera, rays: Array, check: Callable[[], None]) -> Plane:
+def lay_floor(settings: LabSettings, camera: Camera, rays: Array, check: Check = lambda: None) -> Plane:
     """Grey levels of the empty floor, (h, w), for the rays of a camera (h, w, 2).
 
     ``check`` is called between the steps; what it raises ends the work.
     """
+    floor = np.empty(rays.shape[:2], dtype=np.float32)
+    for first in range(0, len(rays), _ROWS):
+        check()
+        # With the rows before and after: the width of a pixel on the floor is a difference between rows.
+        start = max(first - 1, 0)
+        rows = _lay_rows(settings, camera, rays[start : first + _ROWS + 1])
+        floor[first : first + _ROWS] = rows[first - start :][:_ROWS]
+    return floor
+
+
+def _lay_rows(settings: LabSettings, camera: Camera, rays: Array) -> Plane:
     axes = camera.camera_from_world[:3, :3]
     x, y, z = (rays[..., 0] * axes[0, i] + rays[..., 1] * axes[1, i] + axes[2, i] for i in range(3))
     origin_m = camera.origin_m
@@ -54,11 +79,7 @@ def lay_floor(settings: LabSettings, camera: Camera, rays: Array, check: Callabl
     pixel_m = np.maximum(np.abs(np.gradient(x_m, axis=1)), np.abs(np.gradient(y_m, axis=0)))
     across, along = x_m / _BOARD_M[0], y_m / _BOARD_M[1]
     on_boards = (across >= 0) & (across <= _BOARDS[0]) & (along >= 0) & (along <= _BOARDS[1])
-    check()
-    boards = _boards(settings, x_m, y_m)
-    check()
-    boards *= _seams(across, along, pixel_m)
-    check()
+    boards = _boards(settings, x_m, y_m) * _seams(across, along, pixel_m)
     concrete = 0.62 * settings.floor + 4.0 * _noise_at(settings, 1, x_m, y_m, 1.0)
     fade = 1.0 - 0.012 * ((x_m - 2.2) ** 2 + (y_m - 2.8) ** 2)
     level = np.where(on_boards, boards, concrete) * np.clip(fade, 0.5, 1.0)

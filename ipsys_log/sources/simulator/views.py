@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable
 from dataclasses import dataclass
 
 import cv2
@@ -10,11 +9,11 @@ import numpy as np
 from numpy.typing import NDArray
 
 from ipsys_log.sources.simulator.cameras import Camera
-from ipsys_log.sources.simulator.floor import lay_floor, pixel_rays
+from ipsys_log.sources.simulator.floor import Check, lay_floor, pixel_rays
 from ipsys_log.sources.simulator.seeds import Purpose, stream
 from ipsys_log.sources.simulator.settings import LabSettings
 
-__all__ = ["FIELD_PX", "Check", "View", "prepare_view", "to_light"]
+__all__ = ["FIELD_PX", "View", "prepare_view", "to_light"]
 
 Array = NDArray[np.float64]
 Plane = NDArray[np.float32]
@@ -41,15 +40,10 @@ class View:
     bare: Plane | None = None
 
 
-# Called between two steps of long work; what it raises ends the work.
-Check = Callable[[], None]
-
-
 def prepare_view(camera: Camera, settings: LabSettings, check: Check = lambda: None) -> View:
     """Everything about a camera's frames that does not change with the markers."""
     border_px = int(np.ceil(4 * settings.psf_sigma_px)) + 2
-    rays = pixel_rays(camera.lens, border_px)
-    check()
+    rays = pixel_rays(camera.lens, border_px, check)
     behind = to_light(lay_floor(settings, camera, rays, check), settings)
     check()
     if settings.psf_sigma_px:

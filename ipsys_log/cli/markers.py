@@ -1,0 +1,182 @@
+"""Markers and boards on paper: ``ipsys markers``."""
+
+from __future__ import annotations
+
+from pathlib import Path
+from typing import TYPE_CHECKING, Annotated, Optional
+
+import typer
+
+from ipsys_log.cli.console import console
+
+if TYPE_CHECKING:
+    from ipsys_log.messages import Rig
+    from ipsys_log.report.prints import Print
+
+__all__ = ["add_commands"]
+
+RigNow = Annotated[
+    Optional[Path],  # noqa: UP045
+    typer.Option("--rig", metavar="FILE", help="Print the markers of this rig file, each at its length."),
+]
+Ids = Annotated[
+    Optional[str],  # noqa: UP045
+    typer.Option(
+        metavar="LIST", help="Print these ids, as 1,2,3 or 0-9; with --rig instead of those of the rig."
+    ),
+]
+Length = Annotated[
+    Optional[float],  # noqa: UP045
+    typer.Option(metavar="METRES", help="Side of the black square, in m; with --rig instead of its lengths."),
+]
+Dictionary = Annotated[
+    Optional[str],  # noqa: UP045
+    typer.Option(
+        metavar="NAME",
+        help="The dictionary: of the markers DICT_4X4_100 if neither this nor a rig names one, of a ChArUco "
+        "board DICT_4X4_50.",
+    ),
+]
+BoardName = Annotated[
+    Optional[str],  # noqa: UP045
+    typer.Option(
+        metavar="COLUMNSxROWS",
+        help="Print a board for ipsys calibrate: the inner corners of a chessboard, as 6x4, or the "
+        "squares of a ChArUco board, as charuco:4x5.",
+    ),
+]
+Square = Annotated[float, typer.Option(metavar="METRES", help="Side of a board's square, in m.")]
+MarkerScale = Annotated[
+    float, typer.Option(metavar="SHARE", help="Side of a ChArUco board's markers, as a share of a square's.")
+]
+PageName = Annotated[
+    Optional[str],  # noqa: UP045
+    typer.Option(
+        "--page", metavar="NAME", help="a4, letter or a3. Without it: a4, or a3 where that is too small."
+    ),
+]
+Output = Annotated[Path, typer.Option("--output", "-o", metavar="FILE", help="The PDF to write.")]
+Force = Annotated[bool, typer.Option("--force", help="Write over a file that exists.")]
+
+_DICTIONARY, _BOARD_DICTIONARY = "DICT_4X4_100", "DICT_4X4_50"
+_MOST = 2000
+
+
+def add_commands(app: typer.Typer) -> None:
+    app.command()(markers)
+
+
+def markers(
+    rig: RigNow = None,
+    ids: Ids = None,
+    length: Length = None,
+    dictionary: Dictionary = None,
+    board: BoardName = None,
+    square: Square = 0.03,
+    marker_scale: MarkerScale = 0.75,
+    page: PageName = None,
+    output: Output = Path("markers.pdf"),
+    force: Force = False,
+) -> None:
+    """Draw markers and calibration boards as a PDF at true size, with a ruler to check the print by.
+
+    Each marker has its white margin, cutting marks, its id and an arrow to its front: the direction of its
+    heading. Print at 100 % ("actual size"), and measure the ruler: it is 10 cm long."""
+    from ipsys_log.errors import IpsysError
+    from ipsys_log.report.files import check_file, write_files
+    from ipsys_log.report.print_pages import choose_paper, draw_pages, lay_out
+
+    if output.suffix.lower() != ".pdf":
+        raise IpsysError(f"--output {output}: only PDF keeps the size; let the name end in .pdf")
+    check_file(output, "--output", [])
+    if output.exists() and not force:
+        raise IpsysError(f"{output}: exists already; give another name, or --force to write over it")
+    prints = _marker_prints(rig, ids, length, dictionary) if rig or ids else []
+    if board is not None:
+        prints.append(_board(board, square, marker_scale, dictionary or _BOARD_DICTIONARY))
+    if not prints:
+        raise IpsysError("nothing to print: give --rig lab.toml, --ids 0-9 --length 0.1, or --board 6x4")
+    paper = choose_paper(prints, page)
+    pages = lay_out(prints, paper)
+    write_files(output.parent, {output.name: draw_pages(pages)})
+    count = "1 page" if len(pages) == 1 else f"{len(pages)} pages"
+    console.print(f"{output} written: {count} of {paper.name}, {_contents(prints)}", markup=False)
+    if page is None and paper.name != "A4":
+        console.print(
+            "A4 is too small for them. A copy shop prints A3; --length 0.14 gives markers that fit onto A4",
+            markup=False,
+        )
+    console.print('print it at 100 % ("actual size"), and measure the ruler: 10 cm', markup=False)
+
+
+def _marker_prints(
+    rig: Path | None, ids: str | None, length: float | None, dictionary: str | None
+) -> list[Print]:
+    from ipsys_log.errors import IpsysError
+    from ipsys_log.report.prints import rig_prints
+
+    lab = _lab(rig, length, dictionary)
+    wanted = None if ids is None else _parse_ids(ids, lab.dictionary)
+    if wanted is None and not lab.markers:
+        raise IpsysError(f"{rig}: lists no [[markers]]; name the ids, such as --ids 0-9")
+    return rig_prints(lab, wanted, length)
+
+
+def _lab(rig: Path | None, length: float | None, dictionary: str | None) -> Rig:
+    """The rig, or one that holds only a dictionary and a length."""
+    from dataclasses import replace
+
+    from ipsys_log.errors import IpsysError
+    from ipsys_log.messages import Rig
+    from ipsys_log.rig import check_rig, load_rig
+    from ipsys_log.rig_slips import check_slips
+    from ipsys_log.stages.detect import marker_detector
+
+    if rig is not None:
+        lab = load_rig(rig)
+        lab = lab if dictionary is None else replace(lab, dictionary=dictionary.upper())
+    elif length is None:
+        raise IpsysError("--ids: give the side of the markers too, such as --length 0.1, or --rig lab.toml")
+    else:
+        lab = Rig("lab", (dictionary or _DICTIONARY).upper(), length)
+    marker_detector(lab.dictionary)
+    if length is not None:
+        lab = replace(lab, marker_length_m=length)
+        check_slips(check_rig(lab, "--length"), "--length")
+    return lab
+
+
+def _parse_ids(text: str, dictionary: str) -> list[int]:
+    """The ids of a list such as ``1,2,5-9``, each once.
+
+    Raises
+    ------
+    IpsysError
+        For what is no list, or an id that the dictionary does not have.
+    """
+    from ipsys_log.errors import IpsysError
+    from ipsys_log.rig_slips import dictionary_size
+
+    ids: list[int] = []
+    for part in text.split(","):
+        first, dash, last = (one.strip() for one in part.partition("-"))
+        if not first.isdecimal() or (dash and not last.isdecimal()) or len(part) > 12:
+            raise IpsysError(f"--ids {text}: write ids as 1,2,3 or as 0-9")
+        ids += range(int(first), min(int(last or first), int(first) + _MOST) + 1)
+    size = dictionary_size(dictionary)
+    if not ids or (size is not None and max(ids) >= size):
+        raise IpsysError(f"--ids {text}: {dictionary} has the ids 0 to {(size or 1) - 1}; name some of these")
+    return list(dict.fromkeys(ids))
+
+
+def _board(text: str, square: float, marker_scale: float, dictionary: str) -> Print:
+    from ipsys_log.calibration.boards import parse_board
+    from ipsys_log.report.prints import board_print
+
+    return board_print(parse_board(text, square, marker_scale, dictionary, False), text)
+
+
+def _contents(prints: list[Print]) -> str:
+    count = sum(not one.is_board for one in prints)
+    parts = [f"{count} marker{'' if count == 1 else 's'}"] if count else []
+    return " and ".join([*parts, *(one.name for one in prints if one.is_board)])

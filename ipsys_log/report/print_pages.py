@@ -1,0 +1,261 @@
+"""Prints on pages of paper, as a PDF at true size: cutting marks, captions, and a ruler to check by."""
+
+from __future__ import annotations
+
+import io
+from collections.abc import Sequence
+from dataclasses import dataclass
+
+import numpy as np
+from matplotlib.axes import Axes
+from matplotlib.backends.backend_pdf import PdfPages
+from matplotlib.figure import Figure
+from matplotlib.patches import PathPatch
+from matplotlib.path import Path as Outline
+
+from ipsys_log.errors import IpsysError
+from ipsys_log.report.prints import Print
+
+__all__ = ["PAPERS", "RULER_MM", "Page", "Paper", "Placed", "choose_paper", "draw_pages", "lay_out"]
+
+MM_PER_INCH = 25.4
+# Printers leave this much of the paper's edge white.
+_EDGE_MM = 10.0
+# At the bottom: the ruler, and what stands beside it.
+_FOOT_MM = 15.0
+RULER_MM = 100.0
+_RULER_Y_MM = _EDGE_MM + 5.0
+# Below a marker: an arrow to its front, and three lines of text. Between two prints: the cutting marks.
+_CAPTION_MM, _GAP_MM, _NARROWEST_MM = 8.0, 6.0, 34.0
+_MARK_MM, _MARK_PT = 2.0, 0.3
+_GREY = "0.35"
+
+
+@dataclass(frozen=True, slots=True)
+class Paper:
+    """A sheet of paper, upright: its name, and its size in mm."""
+
+    name: str
+    width_mm: float
+    height_mm: float
+
+    def turned(self) -> Paper:
+        """Return the sheet lying on its side."""
+        return Paper(self.name, self.height_mm, self.width_mm)
+
+    @property
+    def room_mm(self) -> tuple[float, float]:
+        """Width and height that prints can take."""
+        return self.width_mm - 2 * _EDGE_MM, self.height_mm - 2 * _EDGE_MM - _FOOT_MM
+
+
+PAPERS = {
+    "a4": Paper("A4", 210.0, 297.0),
+    "letter": Paper("Letter", 215.9, 279.4),
+    "a3": Paper("A3", 297.0, 420.0),
+}
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class Placed:
+    """A print on a page: where the top left of its black is, in mm from the bottom left of the page."""
+
+    what: Print
+    x_mm: float
+    y_mm: float
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class Page:
+    """A sheet of paper, and what is printed on it."""
+
+    paper: Paper
+    placed: tuple[Placed, ...]
+
+
+def choose_paper(prints: Sequence[Print], name: str | None) -> Paper:
+    """Return the paper of a name; without a name A4, or A3 where a print is too large for A4.
+
+    Raises
+    ------
+    IpsysError
+        For a name that is not known, or a print that is too large: how large it can be.
+    """
+    if name is not None and name.lower() not in PAPERS:
+        raise IpsysError(f"--page {name}: is none of {', '.join(PAPERS)}")
+    papers = [PAPERS["a4"], PAPERS["a3"]] if name is None else [PAPERS[name.lower()]]
+    for paper in papers:
+        large = [one for one in prints if _orientation(one, paper) is None]
+        if not large:
+            return paper
+    raise IpsysError(_too_large(large[0], papers[-1]))
+
+
+def lay_out(prints: Sequence[Print], paper: Paper) -> list[Page]:
+    """Lay prints onto pages: markers in rows from the top left, each board on a page of its own.
+
+    Parameters
+    ----------
+    prints : each fits onto the paper, as :func:`choose_paper` has seen.
+    """
+    markers = [one for one in prints if not one.is_board]
+    pages = _rows_of_markers(markers, paper)
+    for board in prints:
+        if board.is_board:
+            turned = _orientation(board, paper)
+            assert turned is not None
+            pages.append(Page(turned, (_in_the_middle(board, turned),)))
+    return pages
+
+
+def draw_pages(pages: Sequence[Page]) -> bytes:
+    """Draw pages as a PDF, the same bytes for the same pages."""
+    buffer = io.BytesIO()
+    metadata: dict[str, object] = {"Creator": None, "Producer": None, "CreationDate": None}
+    with PdfPages(buffer, metadata=metadata) as pdf:
+        for page in pages:
+            figure, axes = _blank(page.paper)
+            _draw_ruler(axes)
+            for placed in page.placed:
+                _draw_black(axes, placed)
+                if placed.what.is_board:
+                    _draw_board_text(axes, placed.what)
+                else:
+                    _draw_marker_text(axes, placed)
+                    _draw_cutting_marks(axes, placed)
+            pdf.savefig(figure)
+    return buffer.getvalue()
+
+
+def _size_mm(what: Print) -> tuple[float, float]:
+    """Width and height of the paper that a print takes. A board has the edge of the page as margin, too."""
+    if what.is_board:
+        spare_mm = max(what.margin_mm - _EDGE_MM, 0.0)
+        return what.width_mm + 2 * spare_mm, what.height_mm + spare_mm + what.margin_mm
+    width_mm = what.width_mm + 2 * what.margin_mm
+    return max(width_mm, _NARROWEST_MM), what.height_mm + 2 * what.margin_mm + _CAPTION_MM
+
+
+def _orientation(what: Print, paper: Paper) -> Paper | None:
+    """Return the paper as the print fits onto it, upright or, for a board, turned; None where it does not."""
+    width_mm, height_mm = _size_mm(what)
+    for turned in (paper, paper.turned()) if what.is_board else (paper,):
+        room_mm = turned.room_mm
+        if width_mm <= room_mm[0] + 1e-6 and height_mm <= room_mm[1] + 1e-6:
+            return turned
+    return None
+
+
+def _too_large(what: Print, paper: Paper) -> str:
+    width_mm, height_mm = _size_mm(what)
+    size = f"{width_mm:.0f} x {height_mm:.0f} mm"
+    text = f"{what.name} takes {size} with its white margin, too much for {paper.name}"
+    if what.is_board:
+        return f"{text}; make its squares smaller, with --square, or use larger paper"
+    largest_mm = np.floor(paper.room_mm[0] / (1 + 2 * what.margin_mm / what.width_mm))
+    text += f", which holds markers of up to {largest_mm:.0f} mm: --length {largest_mm / 1000:g}"
+    return text if paper is PAPERS["a3"] else f"{text}; or use larger paper: --page a3"
+
+
+def _rows_of_markers(markers: Sequence[Print], paper: Paper) -> list[Page]:
+    room_mm = paper.room_mm
+    pages: list[list[Placed]] = []
+    x_mm = y_mm = row_mm = 0.0
+    for what in markers:
+        width_mm, height_mm = _size_mm(what)
+        if x_mm + width_mm > room_mm[0] + 1e-6:
+            x_mm, y_mm, row_mm = 0.0, y_mm + row_mm + _GAP_MM, 0.0
+        if not pages or y_mm + height_mm > room_mm[1] + 1e-6:
+            pages.append([])
+            x_mm = y_mm = row_mm = 0.0
+        left_mm = _EDGE_MM + x_mm + (width_mm - what.width_mm) / 2
+        top_mm = paper.height_mm - _EDGE_MM - y_mm - what.margin_mm
+        pages[-1].append(Placed(what, left_mm, top_mm))
+        x_mm, row_mm = x_mm + width_mm + _GAP_MM, max(row_mm, height_mm)
+    return [Page(paper, tuple(placed)) for placed in pages]
+
+
+def _in_the_middle(board: Print, paper: Paper) -> Placed:
+    below_mm = _EDGE_MM + _FOOT_MM + board.margin_mm
+    above_mm = max(_EDGE_MM, board.margin_mm)
+    spare_mm = paper.height_mm - below_mm - above_mm - board.height_mm
+    top_mm = below_mm + spare_mm / 2 + board.height_mm
+    return Placed(board, (paper.width_mm - board.width_mm) / 2, top_mm)
+
+
+def _blank(paper: Paper) -> tuple[Figure, Axes]:
+    """A page whose data coordinates are mm from its bottom left."""
+    figure = Figure(figsize=(paper.width_mm / MM_PER_INCH, paper.height_mm / MM_PER_INCH))
+    axes = figure.add_axes((0.0, 0.0, 1.0, 1.0))
+    axes.set_xlim(0, paper.width_mm)
+    axes.set_ylim(0, paper.height_mm)
+    axes.set_axis_off()
+    return figure, axes
+
+
+def _draw_black(axes: Axes, placed: Placed) -> None:
+    """One path for all that is black, so that nothing of it is drawn twice."""
+    loops = [np.vstack([polygon, polygon[:1]]) for polygon in placed.what.polygons]
+    codes = [
+        code
+        for loop in loops
+        for code in (Outline.MOVETO, *[Outline.LINETO] * (len(loop) - 2), Outline.CLOSEPOLY)
+    ]
+    points_mm = np.vstack(loops) * [1, -1] + [placed.x_mm, placed.y_mm]
+    axes.add_patch(PathPatch(Outline(points_mm, codes), facecolor="black", linewidth=0))
+
+
+def _draw_marker_text(axes: Axes, placed: Placed) -> None:
+    """Below the margin: an arrow that points to the front of the marker, and what it is."""
+    what = placed.what
+    width_mm = _size_mm(what)[0]
+    left_mm = placed.x_mm + what.width_mm / 2 - width_mm / 2 + 1.5
+    bottom_mm = placed.y_mm - what.height_mm - what.margin_mm - _CAPTION_MM + 1.5
+    arrow = np.array([[0.9, 0], [0.9, 3], [0, 3], [1.5, 5.5], [3, 3], [2.1, 3], [2.1, 0]])
+    axes.add_patch(
+        PathPatch(Outline(arrow + np.array([left_mm, bottom_mm]), closed=False), facecolor=_GREY, linewidth=0)
+    )
+    size_pt = 5.0 if width_mm < 60 else 8.0
+    text = "\n".join(("front: this way up" if width_mm >= 60 else "front", *what.lines))
+    _write(axes, left_mm + 4.5, bottom_mm + 2.75, text, size_pt)
+
+
+def _draw_board_text(axes: Axes, board: Print) -> None:
+    _write(axes, _EDGE_MM + RULER_MM + 8, _EDGE_MM + 5.5, "\n".join(board.lines), 7.0)
+
+
+def _write(axes: Axes, x_mm: float, y_mm: float, text: str, size_pt: float) -> None:
+    axes.text(x_mm, y_mm, text, fontsize=size_pt, color=_GREY, va="center", linespacing=1.1, parse_math=False)
+
+
+def _draw_cutting_marks(axes: Axes, placed: Placed) -> None:
+    """A small angle outside of each corner of the paper that belongs to a marker."""
+    what = placed.what
+    width_mm, height_mm = _size_mm(what)
+    left_mm = placed.x_mm + what.width_mm / 2 - width_mm / 2
+    top_mm = placed.y_mm + what.margin_mm
+    for x_mm, right in ((left_mm, -1), (left_mm + width_mm, 1)):
+        for y_mm, up in ((top_mm, 1), (top_mm - height_mm, -1)):
+            for dx, dy in ((right, 0), (0, up)):
+                ends = [x_mm + dx * 0.5, x_mm + dx * _MARK_MM], [y_mm + dy * 0.5, y_mm + dy * _MARK_MM]
+                axes.plot(*ends, color=_GREY, linewidth=_MARK_PT, solid_capstyle="butt")
+
+
+def _draw_ruler(axes: Axes) -> None:
+    """10 cm with a tick for each mm, at the bottom left."""
+    for number in range(int(RULER_MM) + 1):
+        length_mm = 5.0 if number % 10 == 0 else 3.5 if number % 5 == 0 else 2.0
+        x_mm = _EDGE_MM + number
+        axes.plot(
+            [x_mm, x_mm],
+            [_RULER_Y_MM, _RULER_Y_MM + length_mm],
+            color="black",
+            linewidth=0.35,
+            solid_capstyle="butt",
+        )
+        if number % 10 == 0:
+            axes.text(x_mm, _RULER_Y_MM - 0.8, str(number // 10), fontsize=6, ha="center", va="top")
+    ends_mm = [_EDGE_MM, _EDGE_MM + RULER_MM]
+    axes.plot(ends_mm, [_RULER_Y_MM] * 2, color="black", linewidth=0.35, solid_capstyle="butt")
+    text = "Print at 100 % (actual size). Measure this: it has to be 10 cm long."
+    _write(axes, _EDGE_MM, _EDGE_MM + 0.4, text, 6.0)

@@ -1,0 +1,103 @@
+"""Markers and calibration boards that are printed: what is black on them, and how much paper they take."""
+
+from __future__ import annotations
+
+import textwrap
+from collections.abc import Sequence
+from dataclasses import dataclass
+
+import numpy as np
+from numpy.typing import NDArray
+
+from ipsys_log.calibration.board_pattern import black_squares, board_markers
+from ipsys_log.calibration.boards import Board
+from ipsys_log.geometry.cell_outlines import cell_outlines
+from ipsys_log.geometry.markers import white_cells
+from ipsys_log.messages import Rig
+from ipsys_log.units import MM_PER_M
+
+__all__ = ["Print", "board_print", "marker_print", "rig_prints"]
+
+Array = NDArray[np.float64]
+
+# White around a chessboard or a ChArUco board, in squares; around a marker, in cells.
+_BOARD_MARGIN, _MARKER_MARGIN = 0.5, 1.0
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class Print:
+    """A marker or a board at true size. Lengths are in mm.
+
+    Attributes
+    ----------
+    name : as an error calls it.
+    polygons : what is black, each (n, 2): x to the right and y down, from the top left of the black.
+    width_mm, height_mm : of the black.
+    margin_mm : of white around it.
+    lines : of text beside it.
+    is_board : a board has a page of its own.
+    """
+
+    name: str
+    polygons: tuple[Array, ...]
+    width_mm: float
+    height_mm: float
+    margin_mm: float
+    lines: tuple[str, ...]
+    is_board: bool = False
+
+
+def marker_print(dictionary: str, marker_id: int, length_m: float, robot: str | None = None) -> Print:
+    """Return the print of a marker whose black square has a side of ``length_m``."""
+    black = ~white_cells(dictionary, marker_id)
+    side_mm = length_m * MM_PER_M
+    cell_mm = side_mm / len(black)
+    polygons = tuple(polygon * cell_mm for polygon in cell_outlines(black))
+    who = f"id {marker_id}" if robot is None else f"id {marker_id}, {robot}"
+    lines = (who, f"{dictionary}, {side_mm:g} mm")
+    return Print(f"marker {marker_id}", polygons, side_mm, side_mm, _MARKER_MARGIN * cell_mm, lines)
+
+
+def rig_prints(rig: Rig, ids: Sequence[int] | None = None, length_m: float | None = None) -> list[Print]:
+    """Return the prints of the markers of a rig, or of those with some ids, each at its own length.
+
+    Parameters
+    ----------
+    ids : other ids of the dictionary than the rig lists.
+    length_m : for all of them, instead of the rig's lengths.
+    """
+    listed = {marker.id: marker for marker in rig.markers}
+    prints = []
+    for marker_id in list(listed) if ids is None else ids:
+        marker = listed.get(marker_id)
+        side_m = length_m or (marker.length_m if marker else None) or rig.marker_length_m
+        prints.append(marker_print(rig.dictionary, marker_id, side_m, marker.robot if marker else None))
+    return prints
+
+
+def board_print(board: Board, text: str) -> Print:
+    """Return the print of a calibration board; ``text`` is what ``ipsys calibrate --board`` calls it.
+
+    The layout is that which ``ipsys calibrate`` and OpenCV since 4.6 look for.
+    """
+    square_mm = board.square_m * MM_PER_M
+    squares = black_squares(board)
+    rows, columns = squares.shape
+    polygons = [polygon * square_mm for polygon in cell_outlines(squares)]
+    options = f"--board {text} --square {board.square_m:g}"
+    if board.marker_scale is not None:
+        options += f" --marker-scale {board.marker_scale:g} --dictionary {board.dictionary}"
+    for marker in board_markers(board):
+        black = ~white_cells(board.dictionary, marker.id)
+        cell_mm = square_mm * (board.marker_scale or 1.0) / len(black)
+        gap_mm = (square_mm - cell_mm * len(black)) / 2
+        corner_mm = np.array([marker.column, marker.row]) * square_mm + gap_mm
+        polygons += [polygon * cell_mm + corner_mm for polygon in cell_outlines(black)]
+    lines = (*_wrapped(f"{board}; a square has {square_mm:g} mm"), *_wrapped(f"ipsys calibrate {options}"))
+    size = (columns * square_mm, rows * square_mm)
+    return Print(f"the board {text}", tuple(polygons), *size, _BOARD_MARGIN * square_mm, lines, True)
+
+
+def _wrapped(text: str) -> list[str]:
+    """Lines that fit beside the ruler."""
+    return textwrap.wrap(text, 54, break_long_words=False, break_on_hyphens=False)

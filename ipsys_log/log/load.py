@@ -2,6 +2,7 @@
 
 import zlib
 from itertools import pairwise
+from typing import NamedTuple
 
 from mcap import records as mcap
 from mcap.opcode import Opcode
@@ -20,11 +21,34 @@ from ipsys_log.log.records import (
 from ipsys_log.log.scan import scan
 from ipsys_log.log.view import View
 
-__all__ = ["NoFooterError", "load_contents"]
+__all__ = ["NoFooterError", "Summary", "load_contents", "read_summary"]
 
 
 class NoFooterError(LogError):
     """A log has no end: its writer has not come to it yet, or never will."""
+
+
+class Summary(NamedTuple):
+    """The summary alone. `checked` says that its CRC is right (a summary may have none)."""
+
+    contents: Contents
+    statistics: mcap.Statistics | None
+    checked: bool
+
+
+def read_summary(view: View) -> Summary | None:
+    """Read the summary without a look at the data section; None if the log has none.
+
+    Raises
+    ------
+    LogError
+        As `load_contents` does.
+    """
+    footer_at, summary_start, checked = _footer(view)
+    if not summary_start:
+        return None
+    contents, statistics = _from_summary(view, summary_start, footer_at)
+    return Summary(contents, statistics, checked)
 
 
 def load_contents(view: View) -> Contents:
@@ -35,10 +59,11 @@ def load_contents(view: View) -> Contents:
     LogError
         The file is empty, not an MCAP, or is damaged; a `NoFooterError` where its end is missing.
     """
-    footer_at, summary_start = _footer(view)
+    footer_at, summary_start, _ = _footer(view)
     contents, complete = (None, False)
     if summary_start:
-        contents, complete = _from_summary(view, summary_start, footer_at)
+        contents, statistics = _from_summary(view, summary_start, footer_at)
+        complete = statistics is not None and _is_complete(contents, statistics)
     end = summary_start or footer_at
     data_end = end - DATA_END.size
     opcode, length, crc = DATA_END.unpack(view.read(data_end, DATA_END.size)) if data_end >= 8 else (0, 0, 0)
@@ -50,8 +75,8 @@ def load_contents(view: View) -> Contents:
     return contents
 
 
-def _footer(view: View) -> tuple[int, int]:
-    """Offset of the Footer record, and of the summary (0: none)."""
+def _footer(view: View) -> tuple[int, int, bool]:
+    """Offset of the Footer record, offset of the summary (0: none), and whether a CRC confirms both."""
     path = view.path
     start = view.read(0, min(8, view.size))
     if not start:
@@ -72,11 +97,11 @@ def _footer(view: View) -> tuple[int, int]:
         summary = view.read(summary_start, at - summary_start + FOOTER.size - 4)
         if zlib.crc32(summary) != crc:
             raise view.fault(summary_start, "the CRC of the summary is wrong")
-    return at, summary_start
+    return at, summary_start, bool(summary_start and crc)
 
 
-def _from_summary(view: View, start: int, end: int) -> tuple[Contents, bool]:
-    """What the summary says, and whether that is all."""
+def _from_summary(view: View, start: int, end: int) -> tuple[Contents, mcap.Statistics | None]:
+    """What the summary says, and its Statistics record, without which it is not complete."""
     contents = Contents()
     statistics: mcap.Statistics | None = None
     data = view.read(start, end - start)
@@ -97,13 +122,13 @@ def _from_summary(view: View, start: int, end: int) -> tuple[Contents, bool]:
             channel = parse(mcap.Channel.read, view, at, body)
             contents.channels.setdefault(channel.id, channel)
     if statistics is None:
-        return contents, False
+        return contents, None
     contents.counts = dict(statistics.channel_message_counts)
     contents.attachment_count = statistics.attachment_count
     contents.metadata_count = statistics.metadata_count
     if statistics.message_count:
         contents.cover(statistics.message_start_time, statistics.message_end_time)
-    return contents, _is_complete(contents, statistics)
+    return contents, statistics
 
 
 def _is_complete(contents: Contents, statistics: mcap.Statistics) -> bool:

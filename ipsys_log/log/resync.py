@@ -1,0 +1,213 @@
+"""Finding the next whole record behind damage, where no length can be believed."""
+
+import re
+import zlib
+from collections.abc import Callable, Container
+from dataclasses import dataclass, field
+from itertools import islice
+from typing import Any
+
+from mcap import records as mcap
+from mcap.opcode import Opcode
+
+from ipsys_log.errors import LogError
+from ipsys_log.log.chunks import look_inside, unpack
+from ipsys_log.log.records import (
+    DATA_END,
+    FOOTER,
+    HEADER,
+    INDEX_HEAD,
+    MAGIC,
+    MESSAGE,
+    RecordAt,
+    as_bytes,
+    parse,
+    parse_chunk_head,
+    walk,
+)
+from ipsys_log.log.view import View
+
+__all__ = ["PRIVATE", "Resync", "attachment_crc", "crc_of"]
+
+PRIVATE = 0x80  # types from here on are skipped by every reader
+_BLOCK = 1 << 20
+_OVERLAP = 64
+_LONGEST_CHAIN = 256  # records
+_ENOUGH_MESSAGES = 3  # in a row, of channels that nobody defines
+_DAY_NS = 86_400 * 1_000_000_000
+_IN_VAIN = 64 << 20  # bytes of false chunks that are unpacked however small the log is
+_CHUNK = rb"\x06.{36}(?:\x00{4}|\x04\x00{3}zstd|\x03\x00{3}lz4)"
+_CHUNK_HEAD = re.compile(_CHUNK, re.DOTALL)
+# A chunk by its compression, DataEnd with the record behind it, or another record of less than 16 MiB.
+_CANDIDATE = re.compile(
+    rb"(?=" + _CHUNK + rb"|\x0f\x04\x00{7}.{4}[\x02\x03\x04\x08\x0b]|[\x03\x04\x05\x07\x09\x0c].{3}\x00{5})",
+    re.DOTALL,
+)
+_DEFINITIONS: dict[int, Callable[..., mcap.McapRecord]] = {
+    Opcode.SCHEMA: mcap.Schema.read,
+    Opcode.CHANNEL: mcap.Channel.read,
+    Opcode.METADATA: mcap.Metadata.read,
+}
+_IN_SUMMARY = frozenset(
+    (
+        Opcode.SCHEMA,
+        Opcode.CHANNEL,
+        Opcode.STATISTICS,
+        Opcode.CHUNK_INDEX,
+        Opcode.ATTACHMENT_INDEX,
+        Opcode.METADATA_INDEX,
+        Opcode.SUMMARY_OFFSET,
+    )
+)
+
+
+@dataclass(slots=True)
+class Resync:
+    """A search for records in one log.
+
+    `chunked` says whether its messages lie in chunks (None: not known yet): then a message record that
+    lies elsewhere is a piece of a damaged chunk. `channels` are the ids that are defined, `time_ns` is the
+    log time of the last message in no chunk. `budget` bounds the bytes that are unpacked in vain.
+    """
+
+    view: View
+    channels: Container[int] = ()
+    chunked: bool | None = None
+    time_ns: int | None = None
+    budget: int = field(init=False)
+
+    def __post_init__(self) -> None:
+        self.budget = _IN_VAIN + 4 * self.view.size
+
+    def find(self, damaged: int, claimed: int = 0) -> int | None:
+        """Return where the next whole record begins behind the damaged one, None if there is none.
+
+        `claimed` is where that one ends by its own length, if it has one.
+        """
+        if self.chunked is None:
+            self.chunked = self.is_chunk_head(damaged) or self._find(_CHUNK_HEAD, damaged) is not None
+        if damaged < claimed and self._leads_on(claimed):
+            return claimed
+        return self._find(_CANDIDATE, damaged + HEADER.size)
+
+    def is_chunk_head(self, offset: int) -> bool:
+        """Return whether what lies there looks like the beginning of a chunk, whole or not."""
+        head = self.view.read(offset, min(_OVERLAP, self.view.size - offset))
+        return _CHUNK_HEAD.match(head) is not None
+
+    def is_end(self, offset: int, crc: int) -> bool:
+        """Return whether the DataEnd record at `offset` ends this log: a stray copy of a sector may hold one.
+
+        `crc` is that of the data section up to there.
+        """
+        stored = DATA_END.unpack(self.view.read(offset, DATA_END.size))[2]
+        if (stored and stored == crc) or self._leads_to_footer(offset + DATA_END.size):
+            return True
+        return self.find(offset + DATA_END.size - HEADER.size) is None
+
+    def _leads_to_footer(self, start: int) -> bool:
+        try:
+            for at in walk(self.view, start, self.view.size):
+                if at.opcode == Opcode.FOOTER and at.length == FOOTER.size:
+                    summary = FOOTER.unpack(self.view.read(at.offset, FOOTER.size))[2]
+                    stop = at.offset + at.length
+                    behind = self.view.read(stop, min(len(MAGIC), self.view.size - stop))
+                    return summary in (0, start) and behind == MAGIC
+                if at.opcode not in _IN_SUMMARY and at.opcode < PRIVATE:
+                    return False
+        except LogError:
+            pass
+        return False
+
+    def _find(self, pattern: re.Pattern[bytes], start: int) -> int | None:
+        view = self.view
+        for base in range(start, view.size, _BLOCK):
+            block = view.read(base, min(_BLOCK + _OVERLAP, view.size - base))
+            for match in pattern.finditer(block):
+                if match.start() < _BLOCK and self._leads_on(base + match.start()):
+                    return base + match.start()
+        return None
+
+    def _leads_on(self, offset: int) -> bool:
+        """Return whether a record of the data section lies there, as far as it and those behind it say."""
+        last = messages = 0
+        try:
+            for at in islice(walk(self.view, offset, self.view.size), _LONGEST_CHAIN):
+                messages += at.opcode == Opcode.MESSAGE
+                verdict = self._judge(at, messages)
+                if verdict is not None:
+                    return verdict
+                last = at.opcode
+        except LogError:  # damage follows, or the end of what was written
+            return last in _DEFINITIONS
+        return last > 0
+
+    def _judge(self, at: RecordAt, messages: int) -> bool | None:
+        """Return whether a record proves that it and those before it are whole; None: the next one decides.
+
+        Raises
+        ------
+        LogError
+            It is damaged.
+        """
+        view = self.view
+        if at.opcode == Opcode.CHUNK:
+            return self._is_whole_chunk(at)
+        if at.opcode == Opcode.MESSAGE:
+            return self._judge_message(at, messages)
+        if at.opcode in _DEFINITIONS:
+            _check_exact(view, at)
+            return True if at.opcode == Opcode.METADATA else None
+        if at.opcode == Opcode.ATTACHMENT:
+            stored, crc = attachment_crc(view, at)
+            return (stored == crc) if stored else None
+        if at.opcode == Opcode.DATA_END:
+            return at.length == DATA_END.size
+        skipped = at.opcode >= PRIVATE or (at.opcode == Opcode.MESSAGE_INDEX and _is_index(view, at))
+        return None if skipped else False
+
+    def _judge_message(self, at: RecordAt, messages: int) -> bool | None:
+        if self.chunked or at.length < MESSAGE.size:
+            return False
+        _, _, channel, _, time_ns, _ = MESSAGE.unpack(self.view.read(at.offset, MESSAGE.size))
+        near = self.time_ns is not None and abs(time_ns - self.time_ns) < _DAY_NS
+        return True if (near and channel in self.channels) or messages >= _ENOUGH_MESSAGES else None
+
+    def _is_whole_chunk(self, at: RecordAt) -> bool:
+        view = self.view
+        self.budget -= at.length
+        if self.budget < 0:
+            raise view.fault(at.offset, "too much of it looks like chunks and is none")
+        look_inside(view, at.offset, unpack(view, at.offset, parse_chunk_head(view, at.offset)[1]))
+        self.budget += at.length
+        return True
+
+
+def _is_index(view: View, at: RecordAt) -> bool:
+    if at.length < INDEX_HEAD.size:
+        return False
+    _, length, _, size = INDEX_HEAD.unpack(view.read(at.offset, INDEX_HEAD.size))
+    return bool(length == size + 6 and size % 16 == 0)
+
+
+def _check_exact(view: View, at: RecordAt) -> None:
+    """Refuse a record that holds other bytes than its fields need; up to 8 zeros may pad it."""
+    data = view.read(at.offset, at.length)
+    record: Any = parse(_DEFINITIONS[at.opcode], view, at, data[HEADER.size :])  # type: ignore[arg-type]
+    body = as_bytes(record)[HEADER.size :]
+    rest = data[HEADER.size + len(body) :]
+    if not data[HEADER.size :].startswith(body) or len(rest) >= HEADER.size or any(rest):
+        raise view.fault(at.offset, "a record holds more than its fields")
+
+
+def attachment_crc(view: View, at: RecordAt) -> tuple[int, int]:
+    """Return the CRC that an attachment states (0: none), and the one that it has."""
+    stored = int.from_bytes(view.read(at.offset + at.length - 4, 4), "little") if at.length > 13 else 0
+    return stored, crc_of(view, at.length - HEADER.size - 4, at.offset + HEADER.size) if stored else 0
+
+
+def crc_of(view: View, length: int, start: int = 0, crc: int = 0) -> int:
+    """Return the CRC-32 of a stretch of the file, continued from `crc`."""
+    for offset in range(start, start + length, _BLOCK):
+        crc = zlib.crc32(view.read(offset, min(_BLOCK, start + length - offset)), crc)
+    return crc

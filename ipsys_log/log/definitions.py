@@ -114,6 +114,11 @@ class Definitions:
             raise view.fault(offset, f"a message is of channel {channel_id}, whose definition is lost")
         self.channels[channel_id] = channel
 
+    def topic(self, channel_id: int) -> str:
+        """Return the topic of a channel, its id where that is not known."""
+        channel = self.channels.get(channel_id) or self.known.channels.get(channel_id)
+        return channel.topic if channel else f"channel {channel_id}"
+
     def complete(self) -> None:
         """Put back what the summary defines and no message has needed."""
         for channel in self._sure.channels.values() if self._sure else ():

@@ -37,12 +37,12 @@ class Summary(NamedTuple):
 
 
 def read_summary(view: View) -> Summary | None:
-    """Read the summary without a look at the data section; None if the log has none.
+    """Read the summary without a look at what stands before it; None if the log has none.
 
     Raises
     ------
     LogError
-        As `load_contents` does.
+        The end of the log is missing or damaged.
     """
     footer_at, summary_start, checked = _footer(view)
     if not summary_start:
@@ -59,6 +59,7 @@ def load_contents(view: View) -> Contents:
     LogError
         The file is empty, not an MCAP, or is damaged; a `NoFooterError` where its end is missing.
     """
+    _check_start(view)
     footer_at, summary_start, _ = _footer(view)
     contents, complete = (None, False)
     if summary_start:
@@ -75,14 +76,19 @@ def load_contents(view: View) -> Contents:
     return contents
 
 
+def _check_start(view: View) -> None:
+    start = view.read(0, min(len(MAGIC), view.size))
+    if not start:
+        raise LogError(f"{view.path} is empty: nothing was ever written to it")
+    if not MAGIC.startswith(start):
+        raise LogError(
+            f"{view.path} is not an MCAP file (it starts with {start!r}): give a log ending in .mcap"
+        )
+
+
 def _footer(view: View) -> tuple[int, int, bool]:
     """Offset of the Footer record, offset of the summary (0: none), and whether a CRC confirms both."""
     path = view.path
-    start = view.read(0, min(8, view.size))
-    if not start:
-        raise LogError(f"{path} is empty: nothing was ever written to it")
-    if not MAGIC.startswith(start):
-        raise LogError(f"{path} is not an MCAP file (it starts with {start!r}): give a log ending in .mcap")
     at = view.size - len(MAGIC) - FOOTER.size
     tail = view.read(at, view.size - at) if at >= len(MAGIC) else b""
     if not tail.endswith(MAGIC) or FOOTER.unpack_from(tail)[:2] != (Opcode.FOOTER, 20):

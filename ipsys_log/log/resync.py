@@ -27,7 +27,7 @@ from ipsys_log.log.records import (
 )
 from ipsys_log.log.view import View
 
-__all__ = ["PRIVATE", "Resync", "attachment_crc", "crc_of"]
+__all__ = ["PRIVATE", "Resync", "attachment_crc", "crc_of", "is_index"]
 
 PRIVATE = 0x80  # types from here on are skipped by every reader
 _BLOCK = 1 << 20
@@ -163,7 +163,7 @@ class Resync:
             return (stored == crc) if stored else None
         if at.opcode == Opcode.DATA_END:
             return at.length == DATA_END.size
-        skipped = at.opcode >= PRIVATE or (at.opcode == Opcode.MESSAGE_INDEX and _is_index(view, at))
+        skipped = at.opcode >= PRIVATE or (at.opcode == Opcode.MESSAGE_INDEX and is_index(view, at))
         return None if skipped else False
 
     def _judge_message(self, at: RecordAt, messages: int) -> bool | None:
@@ -183,7 +183,8 @@ class Resync:
         return True
 
 
-def _is_index(view: View, at: RecordAt) -> bool:
+def is_index(view: View, at: RecordAt) -> bool:
+    """Return whether a MessageIndex record has the length that its entries need."""
     if at.length < INDEX_HEAD.size:
         return False
     _, length, _, size = INDEX_HEAD.unpack(view.read(at.offset, INDEX_HEAD.size))

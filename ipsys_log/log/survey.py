@@ -24,7 +24,7 @@ from ipsys_log.log.records import (
     parse_message_index,
     walk,
 )
-from ipsys_log.log.resync import PRIVATE, Resync, attachment_crc, crc_of
+from ipsys_log.log.resync import PRIVATE, Resync, attachment_crc, crc_of, is_index
 from ipsys_log.log.salvage import Rows, Salvage, Saved
 from ipsys_log.log.scan import add_record, count_all
 from ipsys_log.log.stretch import Stretch
@@ -135,9 +135,11 @@ def _take_start(found: Survey) -> int:
         follower = found.resync.find(0)
         if follower is None:
             return view.size
+        found.indexed = _Indexed(follower)
         head = MAGIC + (HEADER_RECORD if follower >= start + len(HEADER_RECORD) else b"")
         return _add_damage(found, Stretch(0, follower, head), "it does not begin as an MCAP file")
     found.end = start
+    at: RecordAt | None = None
     try:
         at = next(walk(view, start, view.size), None)
         if at is not None and at.opcode == Opcode.HEADER and at.length < 1 << 20:
@@ -218,7 +220,6 @@ def _save(found: Survey, stretch: Stretch, rows: Rows) -> None:
         saved = found.saved.save(
             found.view, stretch, rows, found.definitions, found.hashes, in_order=stretch is found.cut
         )
-    known = found.definitions.channels | found.definitions.known.channels
     gone = [
         (channel, time_ns)
         for channel, entries in rows.items()
@@ -226,7 +227,7 @@ def _save(found: Survey, stretch: Stretch, rows: Rows) -> None:
         if (channel, offset) not in saved.messages
     ]
     for channel, time_ns in gone if rows else saved.torn:
-        found.lost.note(known[channel].topic if channel in known else f"channel {channel}", time_ns)
+        found.lost.note(found.definitions.topic(channel), time_ns)
     if saved.note:
         found.faults.append(saved.note)
     found.lost.uncounted += not (rows or saved.counted)
@@ -252,11 +253,31 @@ def _take(found: Survey, at: RecordAt) -> None:
         _take_loose(found, at)
     elif at.opcode < PRIVATE:
         raise view.fault(at.offset, f"a record of type {at.opcode} has no place there")
+    else:
+        _check_length(found, at)
+
+
+def _check_length(found: Survey, at: RecordAt) -> None:
+    """Refuse a record of which only the length can be wrong, if it swallows whole ones.
+
+    Where a record follows, its length is right; where none does, the damage may as well lie behind it.
+    """
+    view, stop = found.view, at.offset + at.length
+    follows = stop == view.size
+    if stop + HEADER.size <= view.size:
+        opcode, length = HEADER.unpack(view.read(stop, HEADER.size))
+        known = opcode in _LOOSE or opcode in _COUNTED or opcode == Opcode.CHUNK or opcode >= PRIVATE
+        follows = known and length <= view.size - stop - HEADER.size
+    if not follows:
+        inner = found.resync.find(at.offset)
+        if inner is not None and inner < stop:
+            raise view.fault(at.offset, f"a record claims {at.length} bytes, which hold other records")
 
 
 def _take_loose(found: Survey, at: RecordAt) -> None:
     """A record in no chunk."""
     view = found.view
+    _check_length(found, at)
     if at.opcode == Opcode.ATTACHMENT:
         stored, crc = attachment_crc(view, at)
         if stored != crc:
@@ -266,7 +287,7 @@ def _take_loose(found: Survey, at: RecordAt) -> None:
         try:
             found.definitions.need(view, at.offset, channel)
         except LogError:
-            found.lost.note(f"channel {channel}", time_ns)
+            found.lost.note(found.definitions.topic(channel), time_ns)
             raise
         found.resync.time_ns = time_ns
     elif at.opcode in (Opcode.SCHEMA, Opcode.CHANNEL):
@@ -307,8 +328,12 @@ def _continue_hashes(found: Survey, inside: Inside, data: bytes) -> None:
 def _take_index(found: Survey, at: RecordAt) -> None:
     """A MessageIndex record: behind its chunk, or behind a damaged stretch, of which it then is a part."""
     indexed = found.indexed
-    if indexed is None or (indexed.stretch is not None and indexed.stretch.end != at.offset):
+    if indexed is None:
+        channel, rows = _index_rows(found.view, at)
+        found.lost.times_ns.setdefault(found.definitions.topic(channel), []).extend(time for time, _ in rows)
         raise found.view.fault(at.offset, "a MessageIndex record follows no chunk")
+    if not is_index(found.view, at):
+        raise found.view.fault(at.offset, "a MessageIndex record has another length than its entries")
     try:
         channel, rows = _index_rows(found.view, at)
         if indexed.inside is not None:

@@ -4,12 +4,11 @@ from collections.abc import Iterator
 from dataclasses import dataclass, field, replace
 
 from mcap import records as mcap
-from mcap.opcode import Opcode
 
 from ipsys_log.log.chunks import Inside
 from ipsys_log.log.contents import Contents
 from ipsys_log.log.load import Summary
-from ipsys_log.log.records import HEADER, RecordAt, as_bytes, parse
+from ipsys_log.log.records import RecordAt, as_bytes, exact
 from ipsys_log.log.stretch import Stretch
 from ipsys_log.log.view import View
 
@@ -59,14 +58,14 @@ class Definitions:
         """
         if at.length > _LARGEST:
             raise view.fault(at.offset, f"a definition claims {at.length} bytes")
-        body = view.read(at.offset + HEADER.size, at.length - HEADER.size)
-        if at.opcode == Opcode.SCHEMA:
-            schema = parse(mcap.Schema.read, view, at, body)
-            if schema.id == 0 or self._contradicts(schema):
-                raise view.fault(at.offset, f"the definition of schema {schema.id} is damaged")
-            self.schemas[schema.id] = schema
+        record = exact(view, at, view.read(at.offset, at.length))
+        if isinstance(record, mcap.Schema):
+            if record.id == 0 or self._contradicts(record):
+                raise view.fault(at.offset, f"the definition of schema {record.id} is damaged")
+            self.schemas[record.id] = record
             return
-        channel = parse(mcap.Channel.read, view, at, body)
+        assert isinstance(record, mcap.Channel)
+        channel = record
         if self._contradicts(channel):
             self._misread.append(channel)
             raise view.fault(at.offset, f"the definition of channel {channel.id} is damaged")
@@ -93,24 +92,25 @@ class Definitions:
                 self.known.channels.setdefault(channel.id, replace(channel, schema_id=0))
                 raise view.fault(offset, f"channel {channel.id} has a schema that is not in the log")
         for channel_id in inside.entries.keys() - inside.channels.keys():
-            self.need(view, offset, channel_id)
+            self.need(view, offset, channel_id, strict=True)
         self.schemas |= {key: value for key, value in inside.schemas.items() if key not in self.schemas}
         self.channels |= {key: value for key, value in inside.channels.items() if key not in self.channels}
 
-    def need(self, view: View, offset: int, channel_id: int) -> None:
+    def need(self, view: View, offset: int, channel_id: int, *, strict: bool = False) -> None:
         """See that the channel of a message at `offset` is defined: by what is known, or by a placeholder.
 
         Raises
         ------
         LogError
-            It is not known, and no stretch before `offset` has room for a placeholder.
+            No stretch before `offset` has room for the definition, and it is not known, or `strict`: then
+            the messages can be written again elsewhere.
         """
         self._unused.pop(channel_id, None)
         if channel_id in self.channels:
             return
         known = self.known.channels.get(channel_id) or self._by_one_bit(channel_id)
         channel = known or placeholder(channel_id)
-        if not self._put_back(channel) and known is None:
+        if not self._put_back(channel) and (strict or known is None):
             raise view.fault(offset, f"a message is of channel {channel_id}, whose definition is lost")
         self.channels[channel_id] = channel
 

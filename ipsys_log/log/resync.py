@@ -1,13 +1,12 @@
 """Finding the next whole record behind damage, where no length can be believed."""
 
 import re
+import struct
 import zlib
-from collections.abc import Callable, Container
+from collections.abc import Container
 from dataclasses import dataclass, field
 from itertools import islice
-from typing import Any
 
-from mcap import records as mcap
 from mcap.opcode import Opcode
 
 from ipsys_log.errors import LogError
@@ -21,17 +20,19 @@ from ipsys_log.log.records import (
     MESSAGE,
     RecordAt,
     as_bytes,
-    parse,
+    exact,
     parse_chunk_head,
     walk,
 )
 from ipsys_log.log.view import View
 
-__all__ = ["PRIVATE", "Resync", "attachment_crc", "crc_of", "is_index"]
+__all__ = ["PRIVATE", "Resync", "attachment_crc", "check_exact", "crc_of", "is_index"]
 
 PRIVATE = 0x80  # types from here on are skipped by every reader
 _BLOCK = 1 << 20
 _OVERLAP = 64
+_LONGEST_HEAD = 1 << 16
+_NAME, _SIZE = struct.Struct("<I"), struct.Struct("<Q")
 _LONGEST_CHAIN = 256  # records
 _ENOUGH_MESSAGES = 3  # in a row, of channels that nobody defines
 _DAY_NS = 86_400 * 1_000_000_000
@@ -43,11 +44,7 @@ _CANDIDATE = re.compile(
     rb"(?=" + _CHUNK + rb"|\x0f\x04\x00{7}.{4}[\x02\x03\x04\x08\x0b]|[\x03\x04\x05\x07\x09\x0c].{3}\x00{5})",
     re.DOTALL,
 )
-_DEFINITIONS: dict[int, Callable[..., mcap.McapRecord]] = {
-    Opcode.SCHEMA: mcap.Schema.read,
-    Opcode.CHANNEL: mcap.Channel.read,
-    Opcode.METADATA: mcap.Metadata.read,
-}
+_DEFINITIONS = frozenset((Opcode.SCHEMA, Opcode.CHANNEL, Opcode.METADATA))
 _IN_SUMMARY = frozenset(
     (
         Opcode.SCHEMA,
@@ -84,8 +81,10 @@ class Resync:
 
         `claimed` is where that one ends by its own length, if it has one.
         """
-        if self.chunked is None:
-            self.chunked = self.is_chunk_head(damaged) or self._find(_CHUNK_HEAD, damaged) is not None
+        if not self.chunked:
+            self.chunked = self.is_chunk_head(damaged) or (
+                self.chunked is None and self._find(_CHUNK_HEAD, damaged) is not None
+            )
         if damaged < claimed and self._leads_on(claimed):
             return claimed
         return self._find(_CANDIDATE, damaged + HEADER.size)
@@ -156,7 +155,7 @@ class Resync:
         if at.opcode == Opcode.MESSAGE:
             return self._judge_message(at, messages)
         if at.opcode in _DEFINITIONS:
-            _check_exact(view, at)
+            check_exact(view, at, HEADER.size - 1)
             return True if at.opcode == Opcode.METADATA else None
         if at.opcode == Opcode.ATTACHMENT:
             stored, crc = attachment_crc(view, at)
@@ -191,18 +190,31 @@ def is_index(view: View, at: RecordAt) -> bool:
     return bool(length == size + 6 and size % 16 == 0)
 
 
-def _check_exact(view: View, at: RecordAt) -> None:
-    """Refuse a record that holds other bytes than its fields need; up to 8 zeros may pad it."""
+def check_exact(view: View, at: RecordAt, padding: int | None = None) -> None:
+    """Refuse a Schema, Channel or Metadata record with wrong lengths, or with more than `padding` zeros."""
     data = view.read(at.offset, at.length)
-    record: Any = parse(_DEFINITIONS[at.opcode], view, at, data[HEADER.size :])  # type: ignore[arg-type]
-    body = as_bytes(record)[HEADER.size :]
-    rest = data[HEADER.size + len(body) :]
-    if not data[HEADER.size :].startswith(body) or len(rest) >= HEADER.size or any(rest):
+    rest = data[len(as_bytes(exact(view, at, data))) :]
+    if padding is not None and (len(rest) > padding or any(rest)):
         raise view.fault(at.offset, "a record holds more than its fields")
 
 
 def attachment_crc(view: View, at: RecordAt) -> tuple[int, int]:
-    """Return the CRC that an attachment states (0: none), and the one that it has."""
+    """Return the CRC that an attachment states (0: none), and the one that it has.
+
+    Raises
+    ------
+    LogError
+        Its lengths are not right.
+    """
+    head = view.read(at.offset, min(at.length, _LONGEST_HEAD))
+    try:
+        (name,) = _NAME.unpack_from(head, HEADER.size + 16)
+        (media_type,) = _NAME.unpack_from(head, HEADER.size + 20 + name)
+        (size,) = _SIZE.unpack_from(head, HEADER.size + 24 + name + media_type)
+    except struct.error:
+        raise view.fault(at.offset, "the Attachment record is not valid") from None
+    if at.length < HEADER.size + 36 + name + media_type + size:
+        raise view.fault(at.offset, "the Attachment record claims lengths that it does not have")
     stored = int.from_bytes(view.read(at.offset + at.length - 4, 4), "little") if at.length > 13 else 0
     return stored, crc_of(view, at.length - HEADER.size - 4, at.offset + HEADER.size) if stored else 0
 

@@ -1,12 +1,12 @@
 """Checking every record of a log, finished or not: how far it is whole, and what it holds up to there."""
 
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 
 from mcap import records as mcap
 from mcap.opcode import Opcode
 
 from ipsys_log.errors import LogError
-from ipsys_log.log.chunks import Inside, look_inside, unpack
+from ipsys_log.log.chunks import Inside, inner_records, look_inside, unpack
 from ipsys_log.log.contents import Contents
 from ipsys_log.log.definitions import Definitions
 from ipsys_log.log.hashing import ChannelHash
@@ -19,12 +19,13 @@ from ipsys_log.log.records import (
     MESSAGE,
     RecordAt,
     as_bytes,
+    exact,
     parse,
     parse_chunk_head,
     parse_message_index,
     walk,
 )
-from ipsys_log.log.resync import PRIVATE, Resync, attachment_crc, crc_of, is_index
+from ipsys_log.log.resync import PRIVATE, Resync, attachment_crc, check_exact, crc_of, is_index
 from ipsys_log.log.salvage import Rows, Salvage, Saved
 from ipsys_log.log.scan import add_record, count_all
 from ipsys_log.log.stretch import Stretch
@@ -195,10 +196,14 @@ def _pass_over(found: Survey, position: int, at: RecordAt | None, reason: str) -
 
 def _add_damage(found: Survey, stretch: Stretch, reason: str) -> int:
     found.faults.append(reason)
-    found.damaged.append(stretch)
     found.lost.bytes += stretch.length
     if found.indexed is not None:
-        found.indexed.stretch = stretch
+        found.indexed.stretch = replace(stretch)
+    last = found.damaged[-1] if found.damaged else None
+    if last is not None and last.end == stretch.offset:  # one place for what was defined in both
+        last.length += stretch.length
+    else:
+        found.damaged.append(stretch)
     found.end = stretch.end
     return stretch.end
 
@@ -258,7 +263,7 @@ def _take(found: Survey, at: RecordAt) -> None:
 
 
 def _check_length(found: Survey, at: RecordAt) -> None:
-    """Refuse a record of which only the length can be wrong, if it swallows whole ones.
+    """Refuse a record of which only the length can be wrong, if it swallows whole ones or stops short of one.
 
     Where a record follows, its length is right; where none does, the damage may as well lie behind it.
     """
@@ -268,9 +273,10 @@ def _check_length(found: Survey, at: RecordAt) -> None:
         opcode, length = HEADER.unpack(view.read(stop, HEADER.size))
         known = opcode in _LOOSE or opcode in _COUNTED or opcode == Opcode.CHUNK or opcode >= PRIVATE
         follows = known and length <= view.size - stop - HEADER.size
+        follows = follows or found.resync.is_chunk_head(stop)  # cut off, perhaps
     if not follows:
         inner = found.resync.find(at.offset)
-        if inner is not None and inner < stop:
+        if inner is not None and inner != stop and inner < stop + HEADER.size:
             raise view.fault(at.offset, f"a record claims {at.length} bytes, which hold other records")
 
 
@@ -278,7 +284,9 @@ def _take_loose(found: Survey, at: RecordAt) -> None:
     """A record in no chunk."""
     view = found.view
     _check_length(found, at)
-    if at.opcode == Opcode.ATTACHMENT:
+    if at.opcode == Opcode.METADATA:
+        check_exact(view, at)
+    elif at.opcode == Opcode.ATTACHMENT:
         stored, crc = attachment_crc(view, at)
         if stored != crc:
             raise view.fault(at.offset, "the CRC of an attachment is wrong")
@@ -301,6 +309,8 @@ def _take_chunk(found: Survey, at: RecordAt) -> None:
     head = parse_chunk_head(view, at.offset)[1]
     data = unpack(view, at.offset, head)
     inside = look_inside(view, at.offset, data)
+    if head.crc == 0:
+        _check_definitions(view, at.offset, data)
     found.definitions.take_chunk(view, at.offset, inside, checked=head.crc != 0)
     add_record(view, found.contents, found.loose, found.counts, at)
     times = [time for rows in inside.entries.values() for time, _ in rows]
@@ -314,6 +324,13 @@ def _take_chunk(found: Survey, at: RecordAt) -> None:
     _continue_hashes(found, inside, data)
     found.resync.chunked = True
     found.indexed = _Indexed(at.offset + at.length, inside)
+
+
+def _check_definitions(view: View, offset: int, data: bytes) -> None:
+    """Refuse a chunk without CRC whose definitions claim more or less than they hold."""
+    for at in inner_records(view, offset, data):
+        if at.opcode in (Opcode.SCHEMA, Opcode.CHANNEL):
+            exact(view, RecordAt(at.opcode, offset, at.length), data[at.offset : at.offset + at.length])
 
 
 def _continue_hashes(found: Survey, inside: Inside, data: bytes) -> None:
@@ -348,6 +365,7 @@ def _take_index(found: Survey, at: RecordAt) -> None:
         found.faults.append(_reason(error))
     if indexed.stretch is not None:
         indexed.stretch.length += at.length
+        found.damaged[-1].length += at.length
 
 
 def _index_rows(view: View, at: RecordAt) -> tuple[int, list[tuple[int, int]]]:

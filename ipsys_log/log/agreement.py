@@ -30,6 +30,8 @@ def disagreement(view: View, found: Survey) -> str:
         return (
             f"its readers count {sum(theirs.counts.values())} messages, it holds {sum(mine.counts.values())}"
         )
+    if not _same_chunks(theirs.chunks, mine.chunks):
+        return "its readers look for other chunks than it has"
     return _summary_disagreement(summary, mine, found) if summary is not None else ""
 
 
@@ -52,11 +54,19 @@ def _summary_disagreement(summary: Summary, mine: Contents, found: Survey) -> st
     ):
         if any(own.get(key, record) != record for key, record in records.items()):
             return f"a {kind} is defined in two ways"
+        if records and not _used(kind, mine) <= records.keys():
+            return f"a {kind} is missing in its summary"
     if theirs.attachments and _places(theirs.attachments) != _places(mine.attachments):
         return "its attachment indexes are wrong"
     if theirs.metadata and _places(theirs.metadata) != _places(mine.metadata):
         return "its metadata indexes are wrong"
     return "its statistics are wrong" if statistics and not _fits(statistics, mine) else ""
+
+
+def _used(kind: str, mine: Contents) -> set[int]:
+    """Ids of the channels that have messages, or of their schemas."""
+    used = {channel for channel, number in mine.counts.items() if number}
+    return used if kind == "channel" else {mine.channels[key].schema_id for key in used} - {0}
 
 
 def _places(records: list[mcap.AttachmentIndex] | list[mcap.MetadataIndex]) -> list[tuple[int, int, str]]:

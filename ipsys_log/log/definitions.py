@@ -28,7 +28,8 @@ class Definitions:
 
     `known` is what the summary says, or a damaged chunk: it serves where the data section lacks something.
     If the summary is checked by its CRC, a record that contradicts it is damaged. `rooms` are the damaged
-    stretches so far: what is lost is put back there.
+    stretches so far: what is lost is put back there. `late` says where a channel is defined of which messages
+    came before.
     """
 
     summary: Summary | None
@@ -36,6 +37,9 @@ class Definitions:
     schemas: dict[int, mcap.Schema] = field(default_factory=dict)
     channels: dict[int, mcap.Channel] = field(default_factory=dict)
     known: Inside = field(default_factory=Inside)
+    late: dict[int, int] = field(default_factory=dict)
+    _schema_at: dict[int, int] = field(default_factory=dict)  # where each schema is defined
+    _assumed: dict[int, int] = field(default_factory=dict)  # known and defined nowhere; rooms at that time
     _sure: Contents | None = None
     _misread: list[mcap.Channel] = field(default_factory=list)
     _unused: dict[int, RecordAt] = field(default_factory=dict)  # records of channels without messages so far
@@ -63,6 +67,7 @@ class Definitions:
             if record.id == 0 or self._contradicts(record):
                 raise view.fault(at.offset, f"the definition of schema {record.id} is damaged")
             self.schemas[record.id] = record
+            self._schema_at.setdefault(record.id, at.offset)
             return
         assert isinstance(record, mcap.Channel)
         channel = record
@@ -75,6 +80,8 @@ class Definitions:
         if channel.id not in self.channels:
             self._unused[channel.id] = at
         self.channels[channel.id] = channel
+        if self._assumed.pop(channel.id, None) is not None:
+            self.late[channel.id] = at.offset
 
     def take_chunk(self, view: View, offset: int, inside: Inside, *, checked: bool) -> None:
         """Take in what a chunk defines, and see that all its messages have a channel.
@@ -93,7 +100,9 @@ class Definitions:
                 raise view.fault(offset, f"channel {channel.id} has a schema that is not in the log")
         for channel_id in inside.entries.keys() - inside.channels.keys():
             self.need(view, offset, channel_id, strict=True)
-        self.schemas |= {key: value for key, value in inside.schemas.items() if key not in self.schemas}
+        for key, schema in inside.schemas.items():
+            self.schemas.setdefault(key, schema)
+            self._schema_at.setdefault(key, offset)
         self.channels |= {key: value for key, value in inside.channels.items() if key not in self.channels}
 
     def need(self, view: View, offset: int, channel_id: int, *, strict: bool = False) -> None:
@@ -106,12 +115,18 @@ class Definitions:
             the messages can be written again elsewhere.
         """
         self._unused.pop(channel_id, None)
-        if channel_id in self.channels:
+        if channel_id in self.channels and self._assumed.get(channel_id) in (None, len(self.rooms)):
             return
         known = self.known.channels.get(channel_id) or self._by_one_bit(channel_id)
         channel = known or placeholder(channel_id)
-        if not self._put_back(channel) and (strict or known is None):
-            raise view.fault(offset, f"a message is of channel {channel_id}, whose definition is lost")
+        room = self._put_back(channel)
+        if room is None:
+            if strict or known is None:
+                raise view.fault(offset, f"a message is of channel {channel_id}, whose definition is lost")
+            self._assumed[channel_id] = len(self.rooms)
+            self.schemas |= {key: value for key, value in self.known.schemas.items() if key == known.schema_id}
+        elif self._assumed.pop(channel_id, None) is not None:
+            self.late[channel_id] = room.offset
         self.channels[channel_id] = channel
 
     def topic(self, channel_id: int) -> str:
@@ -119,18 +134,9 @@ class Definitions:
         channel = self.channels.get(channel_id) or self.known.channels.get(channel_id)
         return channel.topic if channel else f"channel {channel_id}"
 
-    def complete(self) -> None:
-        """Put back what the summary defines and no message has needed."""
-        for channel in self._sure.channels.values() if self._sure else ():
-            if channel.id not in self.channels:
-                self._put_back(channel)
-                self.channels[channel.id] = channel
-        for schema in self._sure.schemas.values() if self._sure else ():
-            self.schemas.setdefault(schema.id, schema)
-
     def missing(self, channel_ids: set[int], defined: Inside) -> Iterator[mcap.McapRecord]:
         """Records that must stand before messages of these channels, which `defined` may define."""
-        schemas, channels = defined.schemas | self.schemas, defined.channels | self.channels
+        schemas, channels = defined.schemas | self.known.schemas, defined.channels | self.known.channels
         for channel_id in sorted(channel_ids - self.channels.keys()):
             channel = channels.get(channel_id) or placeholder(channel_id)
             if channel.schema_id and channel.schema_id not in self.schemas:
@@ -139,6 +145,13 @@ class Definitions:
                 yield schema
             self.channels[channel_id] = channel
             yield channel
+
+    def complete(self) -> None:
+        """Take over what the summary defines and no message has needed."""
+        for channel in self._sure.channels.values() if self._sure else ():
+            self.channels.setdefault(channel.id, channel)
+        for schema in self._sure.schemas.values() if self._sure else ():
+            self.schemas.setdefault(schema.id, schema)
 
     def _contradicts(self, record: mcap.Schema | mcap.Channel) -> bool:
         schema = isinstance(record, mcap.Schema)
@@ -159,19 +172,32 @@ class Definitions:
             return True
         known = self.known.schemas.get(key)
         schema = known or _empty_schema(key)
-        if not any(room.define(as_bytes(schema)) for room in self.rooms) and known is None:
+        room = self._room_for(as_bytes(schema), 0)
+        if room is None and known is None:
             return False
         self.schemas[key] = schema
+        self._schema_at[key] = room.offset if room else 0
         return True
 
-    def _put_back(self, channel: mcap.Channel) -> bool:
-        """Write a channel, with its schema if that is lost too, into a damaged stretch."""
-        data, schema = as_bytes(channel), None
-        if channel.schema_id and channel.schema_id not in self.schemas:
-            schema = self.known.schemas.get(channel.schema_id) or _empty_schema(channel.schema_id)
-            data = as_bytes(schema) + data
-            self.schemas[schema.id] = schema
-        return any(room.define(data) for room in self.rooms)
+    def _put_back(self, channel: mcap.Channel) -> Stretch | None:
+        """Write a channel into a damaged stretch: behind its schema, or together with it."""
+        key, data = channel.schema_id, as_bytes(channel)
+        if key == 0:
+            return self._room_for(data, 0)
+        if key in self.schemas:
+            room = self._room_for(data, self._schema_at.get(key, 0))
+            if room is not None:
+                return room
+        schema = self.schemas.get(key) or self.known.schemas.get(key) or _empty_schema(key)
+        room = self._room_for(as_bytes(schema) + data, 0)
+        if room is not None:
+            self.schemas[key] = schema
+            self._schema_at[key] = min(room.offset, self._schema_at.get(key, room.offset))
+        return room
+
+    def _room_for(self, data: bytes, start: int) -> Stretch | None:
+        """Put records into the first stretch from `start` on that has room for them."""
+        return next((room for room in self.rooms if room.offset >= start and room.define(data)), None)
 
     def _by_one_bit(self, channel_id: int) -> mcap.Channel | None:
         """The channel whose record differs in one bit of its id, and is good for nothing else."""

@@ -127,6 +127,7 @@ def parse(read: Callable[[ReadDataStream], R], view: View, at: RecordAt, body: b
 
 
 _DEFINITIONS: dict[int, Callable[[ReadDataStream], mcap.McapRecord]] = {
+    Opcode.HEADER: mcap.Header.read,
     Opcode.SCHEMA: mcap.Schema.read,
     Opcode.CHANNEL: mcap.Channel.read,
     Opcode.METADATA: mcap.Metadata.read,
@@ -134,7 +135,7 @@ _DEFINITIONS: dict[int, Callable[[ReadDataStream], mcap.McapRecord]] = {
 
 
 def exact(view: View, at: RecordAt, data: bytes) -> mcap.McapRecord:
-    """The Schema, Channel or Metadata record `data`; every length in it must be right.
+    """The Header, Schema, Channel or Metadata record `data`; every length in it must be right.
 
     What follows the fields that are known is left to later versions of the format.
     """

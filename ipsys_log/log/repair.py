@@ -161,6 +161,7 @@ def _plan(view: View, found: Survey, saved: Salvage, tail: IO[bytes]) -> _Plan:
         contents.chunks[-1] = contents.chunks[-1]._replace(index_length=len(data), index_offsets=offsets)
         end.emit(data)
     _emit_saved(end, found, saved)
+    found.definitions.complete()
     contents.schemas, contents.channels = found.definitions.schemas, found.definitions.channels
     hashes = b"" if contents.loose else metadata_of_hashes(found.hashes, end.offset)
     if hashes:

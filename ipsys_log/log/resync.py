@@ -3,6 +3,7 @@
 import re
 import struct
 import zlib
+from collections import deque
 from collections.abc import Container
 from dataclasses import dataclass, field
 from itertools import islice
@@ -35,10 +36,13 @@ _LONGEST_HEAD = 1 << 16
 _NAME, _SIZE = struct.Struct("<I"), struct.Struct("<Q")
 _LONGEST_CHAIN = 256  # records
 _ENOUGH_MESSAGES = 3  # in a row, of channels that nobody defines
+_RECENT = 8  # messages: one of them may have got another time by damage
 _DAY_NS = 86_400 * 1_000_000_000
 _IN_VAIN = 64 << 20  # bytes of false chunks that are unpacked however small the log is
 _CHUNK = rb"\x06.{36}(?:\x00{4}|\x04\x00{3}zstd|\x03\x00{3}lz4)"
 _CHUNK_HEAD = re.compile(_CHUNK, re.DOTALL)
+# A chunk, or the index of one.
+_OF_CHUNKS = re.compile(rb"(?=" + _CHUNK + rb"|\x07.{3}\x00{5})", re.DOTALL)
 # A chunk by its compression, DataEnd with the record behind it, or another record of less than 16 MiB.
 _CANDIDATE = re.compile(
     rb"(?=" + _CHUNK + rb"|\x0f\x04\x00{7}.{4}[\x02\x03\x04\x08\x0b]|[\x03\x04\x05\x07\x09\x0c].{3}\x00{5})",
@@ -63,14 +67,14 @@ class Resync:
     """A search for records in one log.
 
     `chunked` says whether its messages lie in chunks (None: not known yet): then a message record that
-    lies elsewhere is a piece of a damaged chunk. `channels` are the ids that are defined, `time_ns` is the
-    log time of the last message in no chunk. `budget` bounds the bytes that are unpacked in vain.
+    lies elsewhere is a piece of a damaged chunk. `channels` are the ids that are defined, `times_ns` the
+    log times of the last messages in no chunk. `budget` bounds the bytes that are unpacked in vain.
     """
 
     view: View
     channels: Container[int] = ()
     chunked: bool | None = None
-    time_ns: int | None = None
+    times_ns: deque[int] = field(default_factory=lambda: deque(maxlen=_RECENT))
     budget: int = field(init=False)
 
     def __post_init__(self) -> None:
@@ -81,9 +85,9 @@ class Resync:
 
         `claimed` is where that one ends by its own length, if it has one.
         """
-        if not self.chunked:
+        if not self.chunked and not self.times_ns:
             self.chunked = self.is_chunk_head(damaged) or (
-                self.chunked is None and self._find(_CHUNK_HEAD, damaged) is not None
+                self.chunked is None and self._find(_OF_CHUNKS, damaged) is not None
             )
         if damaged < claimed and self._leads_on(claimed):
             return claimed
@@ -129,16 +133,16 @@ class Resync:
 
     def _leads_on(self, offset: int) -> bool:
         """Return whether a record of the data section lies there, as far as it and those behind it say."""
-        last = messages = 0
+        last = messages = stop = 0
         try:
             for at in islice(walk(self.view, offset, self.view.size), _LONGEST_CHAIN):
                 messages += at.opcode == Opcode.MESSAGE
                 verdict = self._judge(at, messages)
                 if verdict is not None:
                     return verdict
-                last = at.opcode
+                last, stop = at.opcode, at.offset + at.length
         except LogError:  # damage follows, or the end of what was written
-            return last in _DEFINITIONS
+            return last in _DEFINITIONS or (last == Opcode.MESSAGE_INDEX and self.is_chunk_head(stop))
         return last > 0
 
     def _judge(self, at: RecordAt, messages: int) -> bool | None:
@@ -169,7 +173,7 @@ class Resync:
         if self.chunked or at.length < MESSAGE.size:
             return False
         _, _, channel, _, time_ns, _ = MESSAGE.unpack(self.view.read(at.offset, MESSAGE.size))
-        near = self.time_ns is not None and abs(time_ns - self.time_ns) < _DAY_NS
+        near = any(abs(time_ns - recent_ns) < _DAY_NS for recent_ns in self.times_ns)
         return True if (near and channel in self.channels) or messages >= _ENOUGH_MESSAGES else None
 
     def _is_whole_chunk(self, at: RecordAt) -> bool:

@@ -20,7 +20,6 @@ from ipsys_log.log.records import (
     RecordAt,
     as_bytes,
     exact,
-    parse,
     parse_chunk_head,
     parse_message_index,
     walk,
@@ -35,6 +34,7 @@ __all__ = ["HEADER_RECORD", "Lost", "Survey", "survey"]
 
 HEADER_RECORD = as_bytes(mcap.Header("", "ipsys 1"))
 _LAG = 1 << 20  # bytes
+_DOUBTFUL = 4096  # bytes
 _LOOSE = frozenset((Opcode.SCHEMA, Opcode.CHANNEL, Opcode.MESSAGE, Opcode.ATTACHMENT, Opcode.METADATA))
 # If such a record is damaged, it is known how many messages are lost with it: none, or one.
 _COUNTED = _LOOSE | {Opcode.MESSAGE_INDEX, Opcode.DATA_END}
@@ -100,6 +100,7 @@ class Survey:
     crc_is_right: bool = True
     finished: bool = False
     crc_at: int = 0
+    doubtful_to: int = 0  # behind damage, lengths that nothing confirms are looked at closely
     indexed: _Indexed | None = None
 
 
@@ -119,7 +120,7 @@ def survey(view: View, known: Summary | None = None, saved: Salvage | None = Non
     if found.indexed is not None:
         _close_indexes(found, found.end)
     _advance_crc(found, found.end)
-    definitions.complete()
+    _blank_early_messages(found)
     damaged.sort(key=lambda stretch: stretch.offset)
     if found.finished:
         _, _, stored = DATA_END.unpack(view.read(found.end, DATA_END.size))
@@ -144,7 +145,7 @@ def _take_start(found: Survey) -> int:
     try:
         at = next(walk(view, start, view.size), None)
         if at is not None and at.opcode == Opcode.HEADER and at.length < 1 << 20:
-            parse(mcap.Header.read, view, at, view.read(start + HEADER.size, at.length - HEADER.size))
+            exact(view, at, view.read(start, at.length))
             found.end = at.offset + at.length
     except LogError as error:
         follower = found.resync.find(start, at.offset + at.length if at else 0)
@@ -205,6 +206,7 @@ def _add_damage(found: Survey, stretch: Stretch, reason: str) -> int:
     else:
         found.damaged.append(stretch)
     found.end = stretch.end
+    found.doubtful_to = stretch.end + _DOUBTFUL
     return stretch.end
 
 
@@ -272,7 +274,7 @@ def _check_length(found: Survey, at: RecordAt) -> None:
     if stop + HEADER.size <= view.size:
         opcode, length = HEADER.unpack(view.read(stop, HEADER.size))
         known = opcode in _LOOSE or opcode in _COUNTED or opcode == Opcode.CHUNK or opcode >= PRIVATE
-        follows = known and length <= view.size - stop - HEADER.size
+        follows = known and length <= view.size - stop - HEADER.size and at.offset >= found.doubtful_to
         follows = follows or found.resync.is_chunk_head(stop)  # cut off, perhaps
     if not follows:
         inner = found.resync.find(at.offset)
@@ -293,11 +295,11 @@ def _take_loose(found: Survey, at: RecordAt) -> None:
     elif at.opcode == Opcode.MESSAGE and at.length >= MESSAGE.size:
         _, _, channel, _, time_ns, _ = MESSAGE.unpack(view.read(at.offset, MESSAGE.size))
         try:
-            found.definitions.need(view, at.offset, channel)
+            found.definitions.need(view, at.offset, channel, strict=bool(found.resync.chunked))
         except LogError:
             found.lost.note(found.definitions.topic(channel), time_ns)
             raise
-        found.resync.time_ns = time_ns
+        found.resync.times_ns.append(time_ns)
     elif at.opcode in (Opcode.SCHEMA, Opcode.CHANNEL):
         found.definitions.take(view, at)
         return
@@ -347,8 +349,10 @@ def _take_index(found: Survey, at: RecordAt) -> None:
     indexed = found.indexed
     if indexed is None:
         channel, rows = _index_rows(found.view, at)
-        found.lost.times_ns.setdefault(found.definitions.topic(channel), []).extend(time for time, _ in rows)
-        raise found.view.fault(at.offset, "a MessageIndex record follows no chunk")
+        for time_ns, _ in rows:
+            found.lost.note(found.definitions.topic(channel), time_ns)
+        _add_damage(found, Stretch(at.offset, at.length), "a MessageIndex record follows no chunk")
+        return
     if not is_index(found.view, at):
         raise found.view.fault(at.offset, "a MessageIndex record has another length than its entries")
     try:
@@ -373,6 +377,23 @@ def _index_rows(view: View, at: RecordAt) -> tuple[int, list[tuple[int, int]]]:
     body = view.read(at.offset, at.length)
     channel = int.from_bytes(body[HEADER.size : HEADER.size + 2], "little")
     return channel, list(ENTRY.iter_unpack(parse_message_index(view, body, 0, channel, at.offset)))
+
+
+def _blank_early_messages(found: Survey) -> None:
+    """Messages in no chunk that stand before the definition of their channel are not of this log.
+
+    They were taken because the summary knows the channel, and its definition might have been lost.
+    """
+    for channel, defined in found.definitions.late.items():
+        rows = found.loose.entries.get(channel, [])
+        for _, offset in rows:
+            if offset < defined:
+                length = HEADER.unpack(found.view.read(offset, HEADER.size))[1]
+                found.damaged.append(Stretch(offset, HEADER.size + length))
+                found.faults.append(f"at byte {offset}: a message is of a channel that is defined later")
+        found.loose.entries[channel] = [row for row in rows if row[1] > defined]
+        if not found.loose.entries[channel]:
+            del found.loose.entries[channel]
 
 
 def _close_indexes(found: Survey, stop: int) -> None:

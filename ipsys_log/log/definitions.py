@@ -124,7 +124,8 @@ class Definitions:
             if strict or known is None:
                 raise view.fault(offset, f"a message is of channel {channel_id}, whose definition is lost")
             self._assumed[channel_id] = len(self.rooms)
-            self.schemas |= {key: value for key, value in self.known.schemas.items() if key == known.schema_id}
+            if known.schema_id in self.known.schemas:
+                self.schemas.setdefault(known.schema_id, self.known.schemas[known.schema_id])
         elif self._assumed.pop(channel_id, None) is not None:
             self.late[channel_id] = room.offset
         self.channels[channel_id] = channel

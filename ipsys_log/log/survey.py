@@ -35,6 +35,7 @@ __all__ = ["HEADER_RECORD", "Lost", "Survey", "survey"]
 HEADER_RECORD = as_bytes(mcap.Header("", "ipsys 1"))
 _LAG = 1 << 20  # bytes
 _DOUBTFUL = 4096  # bytes
+_LONGEST_HEADER = 1 << 20  # bytes
 _LOOSE = frozenset((Opcode.SCHEMA, Opcode.CHANNEL, Opcode.MESSAGE, Opcode.ATTACHMENT, Opcode.METADATA))
 # If such a record is damaged, it is known how many messages are lost with it: none, or one.
 _COUNTED = _LOOSE | {Opcode.MESSAGE_INDEX, Opcode.DATA_END}
@@ -100,6 +101,7 @@ class Survey:
     crc_is_right: bool = True
     finished: bool = False
     crc_at: int = 0
+    wrong_length: int = -1  # a record whose length cannot be right
     doubtful_to: int = 0  # behind damage, lengths that nothing confirms are looked at closely
     indexed: _Indexed | None = None
 
@@ -133,27 +135,38 @@ def survey(view: View, known: Summary | None = None, saved: Salvage | None = Non
 def _take_start(found: Survey) -> int:
     """Check the magic bytes and the Header record; returns where the records behind them begin."""
     view, start = found.view, len(MAGIC)
+    behind, reason = _behind_header(view)
     if view.read(0, min(start, view.size)) != MAGIC:
-        follower = found.resync.find(0)
+        follower = start if behind > start else found.resync.find(start)
         if follower is None:
             return view.size
-        found.indexed = _Indexed(follower)
+        found.indexed = _Indexed(follower) if follower > start else None
         head = MAGIC + (HEADER_RECORD if follower >= start + len(HEADER_RECORD) else b"")
-        return _add_damage(found, Stretch(0, follower, head), "it does not begin as an MCAP file")
-    found.end = start
-    at: RecordAt | None = None
+        _add_damage(found, Stretch(0, follower, head), "it does not begin as an MCAP file")
+        return follower
+    found.end = behind or start
+    if behind:
+        return behind
+    follower = found.resync.find(start)
+    if follower is None:
+        return start
+    head = HEADER_RECORD if follower >= start + len(HEADER_RECORD) else b""
+    return _add_damage(found, Stretch(start, follower - start, head), reason)
+
+
+def _behind_header(view: View) -> tuple[int, str]:
+    """Where the Header record ends: where it begins if there is none, 0 if it is damaged, and why."""
+    start = len(MAGIC)
     try:
         at = next(walk(view, start, view.size), None)
-        if at is not None and at.opcode == Opcode.HEADER and at.length < 1 << 20:
-            exact(view, at, view.read(start, at.length))
-            found.end = at.offset + at.length
+        if at is None or at.opcode != Opcode.HEADER:
+            return start, ""
+        if at.length > _LONGEST_HEADER:
+            raise view.fault(start, f"the HEADER record claims {at.length} bytes")
+        exact(view, at, view.read(start, at.length))
     except LogError as error:
-        follower = found.resync.find(start, at.offset + at.length if at else 0)
-        if follower is None:
-            return start
-        head = HEADER_RECORD if follower >= start + len(HEADER_RECORD) else b""
-        return _add_damage(found, Stretch(start, follower - start, head), _reason(error))
-    return found.end
+        return 0, _reason(error)
+    return at.offset + at.length, ""
 
 
 def _take_records(found: Survey, position: int) -> int:
@@ -175,7 +188,7 @@ def _take_records(found: Survey, position: int) -> int:
 
 def _pass_over(found: Survey, position: int, at: RecordAt | None, reason: str) -> int:
     """Find the next record behind damage at `position`; returns where it lies."""
-    claimed = at.offset + at.length if at is not None and at.length else 0
+    claimed = at.offset + at.length if at is not None and found.wrong_length != position else 0
     follower = found.resync.find(position, claimed)
     indexed = found.indexed
     if indexed is not None and indexed.inside is not None:
@@ -279,6 +292,7 @@ def _check_length(found: Survey, at: RecordAt) -> None:
     if not follows:
         inner = found.resync.find(at.offset)
         if inner is not None and inner != stop and inner < stop + HEADER.size:
+            found.wrong_length = at.offset
             raise view.fault(at.offset, f"a record claims {at.length} bytes, which hold other records")
 
 

@@ -2,7 +2,7 @@
 
 import struct
 import zlib
-from collections.abc import Iterator, Mapping
+from collections.abc import Callable, Iterator, Mapping
 from dataclasses import dataclass, field
 from typing import IO, NamedTuple
 
@@ -28,10 +28,13 @@ _MOST = 256 << 20  # bytes of one chunk that are looked at
 _READ = 1 << 20
 _PIECE = 256  # compressed bytes at a time: what came out of the pieces before an error is kept
 _BLOCK = 128 << 10  # the largest block of a zstd frame: damage spoils all of it
+_LARGEST_RATIO = 200  # nothing that is recorded compresses better
+_MOST_OF_LITTLE = 16 << 20  # bytes out of few: only above that the ratio counts
 _LARGEST_WINDOW = 128 << 20
 _HEAD = struct.Struct("<BQQQQII")  # opcode, length, start, end, size, CRC, length of the compression's name
 _SIZE = struct.Struct("<Q")
 
+Buffer = bytes | bytearray
 Rows = Mapping[int, list[tuple[int, int]]]  # by channel id: log time in ns, offset in the chunk
 
 
@@ -42,7 +45,7 @@ class _Records(NamedTuple):
     `ends_early` says that not all are there: the rest is missing, or cannot be decoded.
     """
 
-    data: bytes
+    data: Buffer
     checked: bool
     is_wrong: bool
     ends_early: bool
@@ -147,7 +150,7 @@ class Salvage:
 
     def _add(
         self,
-        data: bytes,
+        data: Buffer,
         channel_id: int,
         start: int,
         stop: int,
@@ -157,7 +160,7 @@ class Salvage:
         in_order: bool,
     ) -> None:
         _, _, _, sequence, time_ns, published_ns = MESSAGE.unpack_from(data, start)
-        payload = data[start + MESSAGE.size : stop]
+        payload = bytes(data[start + MESSAGE.size : stop])
         crc = zlib.crc32(payload)
         if self._builder.is_full(time_ns):
             self.finish()
@@ -212,27 +215,28 @@ def _records_of(view: View, stretch: Stretch) -> _Records | None:
     return _Records(data, checked, is_wrong, ends_early, bool(name), data_offset, span)
 
 
-def _decode(view: View, name: bytes, offset: int, length: int) -> tuple[bytes, bool]:
+def _decode(view: View, name: bytes, offset: int, length: int) -> tuple[Buffer, bool]:
     """What comes out of compressed bytes before they end or fail, and whether they failed; bounded."""
     if not name:
         return view.read(offset, min(length, _MOST)), length > _MOST
     decompress = _decompressor(name)
-    data = bytearray()
+    data, read = bytearray(), 0
     try:
         for piece in _pieces(view, offset, length):
             data += decompress(piece)
-            if len(data) > _MOST:
-                del data[_MOST:]
-                return bytes(data), True
+            read += len(piece)
+            if len(data) > min(_MOST, max(_MOST_OF_LITTLE, _LARGEST_RATIO * read)):
+                return data, True
     except (zstandard.ZstdError, RuntimeError, EOFError, ValueError):
-        return bytes(data), True
-    return bytes(data), False
+        return data, True
+    return data, False
 
 
-def _decompressor(name: bytes):  # type: ignore[no-untyped-def]
+def _decompressor(name: bytes) -> Callable[[bytes], bytes]:
     if name == b"zstd":
         return zstandard.ZstdDecompressor(max_window_size=_LARGEST_WINDOW).decompressobj().decompress
-    return lz4.frame.LZ4FrameDecompressor().decompress
+    decompress: Callable[[bytes], bytes] = lz4.frame.LZ4FrameDecompressor().decompress
+    return decompress
 
 
 def _pieces(view: View, offset: int, length: int) -> Iterator[bytes]:
@@ -285,12 +289,12 @@ def _believable(view: View, records: _Records, rows: Rows, channels: Mapping[int
     return _up_to(records, inside, starts, position, makes_sense=makes_sense)
 
 
-def _head(data: bytes, position: int) -> tuple[int, int, int]:
+def _head(data: Buffer, position: int) -> tuple[int, int, int]:
     opcode, length = HEADER.unpack_from(data, position)
     return opcode, position, HEADER.size + length
 
 
-def _makes_sense(view: View, data: bytes, at: RecordAt, inside: Inside) -> bool:
+def _makes_sense(view: View, data: Buffer, at: RecordAt, inside: Inside) -> bool:
     """Whether the record may lie in a chunk; takes its definitions into `inside`."""
     if at.opcode == Opcode.MESSAGE:
         return MESSAGE.size <= at.length <= _MOST
@@ -298,7 +302,7 @@ def _makes_sense(view: View, data: bytes, at: RecordAt, inside: Inside) -> bool:
         return at.opcode >= PRIVATE
     if at.offset + at.length <= len(data):
         try:
-            more = look_inside(view, 0, data[at.offset : at.offset + at.length])
+            more = look_inside(view, 0, bytes(data[at.offset : at.offset + at.length]))
         except LogError:
             return False
         inside.schemas |= more.schemas

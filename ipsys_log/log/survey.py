@@ -143,7 +143,7 @@ def _take_start(found: Survey) -> int:
         found.indexed = _Indexed(follower) if follower > start else None
         head = MAGIC + (HEADER_RECORD if follower >= start + len(HEADER_RECORD) else b"")
         _add_damage(found, Stretch(0, follower, head), "it does not begin as an MCAP file")
-        return follower
+        return max(follower, behind)
     found.end = behind or start
     if behind:
         return behind

@@ -128,7 +128,9 @@ def own_rows(chance: random.Random, seconds: int) -> list[Row]:
     for k in range(seconds * 4):
         now = start + k * 250_000_000
         for camera in range(2):
-            out.append((f"/image/{camera}", now + camera, now - 5, chance.randbytes(chance.randrange(200, 1500))))
+            out.append(
+                (f"/image/{camera}", now + camera, now - 5, chance.randbytes(chance.randrange(200, 1500)))
+            )
         out.append(("/points", now + 2, now - 5, chance.randbytes(40) + b"point" * 9))
         if k % 3 == 0:
             out.append(("/events", now + 3, now, f"event {k}".encode()))
@@ -148,7 +150,8 @@ def own_log(folder: Path, chance: random.Random, kind: str) -> Sample:
         for run in range(2):
             with LogWriter.append(path, storage=QUICK) as writer:
                 write_rows(
-                    writer, [(f"/runs/{run}/a", row[1], row[2], row[3][:60]) for row in rows if len(row[3]) < 900]
+                    writer,
+                    [(f"/runs/{run}/a", row[1], row[2], row[3][:60]) for row in rows if len(row[3]) < 900],
                 )
     data = path.read_bytes() if kind != "killed" else killed[: chance.randrange(300, len(killed) + 1)]
     path.unlink()
@@ -201,7 +204,7 @@ def foreign_log(folder: Path, chance: random.Random, shape: str) -> bytes:
 
 
 def repeated_log(chance: random.Random) -> bytes:
-    """As writers do that put the definitions into every chunk; cut off before the summary half of the time."""
+    """A log with the definitions in every chunk; half of the time without its last records."""
     schema = mcap.Schema(1, b"{}", "jsonschema", "Thing")
     channels = [mcap.Channel(key, topic, "json", {}, 1) for key, topic in ((1, "/a"), (7, "/b"))]
     out = MAGIC + as_bytes(mcap.Header("", "other"))

@@ -215,5 +215,5 @@ def _attachment(view: View, name: str, start: int, end: int, time_ns: int) -> It
 
 def _beside(path: Path, suffix: str) -> Path:
     """A file beside the log itself, by whichever link that is opened."""
-    real = Path(os.path.realpath(path))
+    real = Path(os.path.realpath(path)) if path.is_symlink() else path
     return real.with_name(real.name + suffix)

@@ -28,8 +28,7 @@ class Definitions:
 
     `known` is what the summary says, or a damaged chunk: it serves where the data section lacks something.
     If the summary is checked by its CRC, a record that contradicts it is damaged. `rooms` are the damaged
-    stretches so far: what is lost is put back there. `late` says where a channel is defined of which messages
-    came before.
+    stretches so far: what is lost is put back there.
     """
 
     summary: Summary | None
@@ -37,9 +36,7 @@ class Definitions:
     schemas: dict[int, mcap.Schema] = field(default_factory=dict)
     channels: dict[int, mcap.Channel] = field(default_factory=dict)
     known: Inside = field(default_factory=Inside)
-    late: dict[int, int] = field(default_factory=dict)
     _schema_at: dict[int, int] = field(default_factory=dict)  # where each schema is defined
-    _assumed: dict[int, int] = field(default_factory=dict)  # known and defined nowhere; rooms at that time
     _sure: Contents | None = None
     _misread: list[mcap.Channel] = field(default_factory=list)
     _unused: dict[int, RecordAt] = field(default_factory=dict)  # records of channels without messages so far
@@ -80,8 +77,6 @@ class Definitions:
         if channel.id not in self.channels:
             self._unused[channel.id] = at
         self.channels[channel.id] = channel
-        if self._assumed.pop(channel.id, None) is not None:
-            self.late[channel.id] = at.offset
 
     def take_chunk(self, view: View, offset: int, inside: Inside, *, checked: bool) -> None:
         """Take in what a chunk defines, and see that all its messages have a channel.
@@ -99,35 +94,27 @@ class Definitions:
                 self.known.channels.setdefault(channel.id, replace(channel, schema_id=0))
                 raise view.fault(offset, f"channel {channel.id} has a schema that is not in the log")
         for channel_id in inside.entries.keys() - inside.channels.keys():
-            self.need(view, offset, channel_id, strict=True)
+            self.need(view, offset, channel_id)
         for key, schema in inside.schemas.items():
             self.schemas.setdefault(key, schema)
             self._schema_at.setdefault(key, offset)
         self.channels |= {key: value for key, value in inside.channels.items() if key not in self.channels}
 
-    def need(self, view: View, offset: int, channel_id: int, *, strict: bool = False) -> None:
+    def need(self, view: View, offset: int, channel_id: int) -> None:
         """See that the channel of a message at `offset` is defined: by what is known, or by a placeholder.
 
         Raises
         ------
         LogError
-            No stretch before `offset` has room for the definition, and it is not known, or `strict`: then
-            the messages can be written again elsewhere.
+            No stretch before `offset` has room for the definition.
         """
         self._unused.pop(channel_id, None)
-        if channel_id in self.channels and self._assumed.get(channel_id) in (None, len(self.rooms)):
+        if channel_id in self.channels:
             return
         known = self.known.channels.get(channel_id) or self._by_one_bit(channel_id)
         channel = known or placeholder(channel_id)
-        room = self._put_back(channel)
-        if room is None:
-            if strict or known is None:
-                raise view.fault(offset, f"a message is of channel {channel_id}, whose definition is lost")
-            self._assumed[channel_id] = len(self.rooms)
-            if known.schema_id in self.known.schemas:
-                self.schemas.setdefault(known.schema_id, self.known.schemas[known.schema_id])
-        elif self._assumed.pop(channel_id, None) is not None:
-            self.late[channel_id] = room.offset
+        if not self._put_back(channel):
+            raise view.fault(offset, f"a message is of channel {channel_id}, whose definition is lost")
         self.channels[channel_id] = channel
 
     def topic(self, channel_id: int) -> str:
@@ -180,21 +167,19 @@ class Definitions:
         self._schema_at[key] = room.offset if room else 0
         return True
 
-    def _put_back(self, channel: mcap.Channel) -> Stretch | None:
+    def _put_back(self, channel: mcap.Channel) -> bool:
         """Write a channel into a damaged stretch: behind its schema, or together with it."""
         key, data = channel.schema_id, as_bytes(channel)
         if key == 0:
-            return self._room_for(data, 0)
-        if key in self.schemas:
-            room = self._room_for(data, self._schema_at.get(key, 0))
-            if room is not None:
-                return room
+            return self._room_for(data, 0) is not None
+        if key in self.schemas and self._room_for(data, self._schema_at.get(key, 0)) is not None:
+            return True
         schema = self.schemas.get(key) or self.known.schemas.get(key) or _empty_schema(key)
         room = self._room_for(as_bytes(schema) + data, 0)
         if room is not None:
             self.schemas[key] = schema
             self._schema_at[key] = min(room.offset, self._schema_at.get(key, room.offset))
-        return room
+        return room is not None
 
     def _room_for(self, data: bytes, start: int) -> Stretch | None:
         """Put records into the first stretch from `start` on that has room for them."""

@@ -20,7 +20,7 @@ from ipsys_log.log.hashing import METADATA_NAME, metadata_of_hashes
 from ipsys_log.log.journal import replace_tail, roll_back
 from ipsys_log.log.load import Summary, read_summary
 from ipsys_log.log.lock import open_locked
-from ipsys_log.log.records import MAGIC, as_bytes, walk
+from ipsys_log.log.records import MAGIC, MESSAGE, as_bytes, walk
 from ipsys_log.log.salvage import Salvage
 from ipsys_log.log.storage import DISK, Storage
 from ipsys_log.log.stretch import index_records
@@ -161,6 +161,7 @@ def _plan(view: View, found: Survey, saved: Salvage, tail: IO[bytes]) -> _Plan:
         contents.chunks[-1] = contents.chunks[-1]._replace(index_length=len(data), index_offsets=offsets)
         end.emit(data)
     _emit_saved(end, found, saved)
+    _emit_homeless(end, view, found)
     found.definitions.complete()
     contents.schemas, contents.channels = found.definitions.schemas, found.definitions.channels
     hashes = b"" if contents.loose else metadata_of_hashes(found.hashes, end.offset)
@@ -205,6 +206,20 @@ def _emit_saved(end: _End, found: Survey, saved: Salvage) -> None:
         contents.cover(ref.start_ns, ref.end_ns)
     for channel, number in saved.counts.items():
         contents.count(channel, number)
+
+
+def _emit_homeless(end: _End, view: View, found: Survey) -> None:
+    """Messages in no chunk for whose definitions there was no room before them, behind these."""
+    contents = found.contents
+    for at in found.homeless:
+        data = view.read(at.offset, at.length)
+        _, _, channel, _, time_ns, _ = MESSAGE.unpack_from(data)
+        for record in found.definitions.missing({channel}, found.definitions.known):
+            end.emit(as_bytes(record))
+        contents.loose.setdefault(channel, []).append((time_ns, end.offset))
+        contents.count(channel, 1)
+        contents.cover(time_ns, time_ns)
+        end.emit(data)
 
 
 def _patches(found: Survey) -> list[Patch]:
@@ -308,7 +323,7 @@ def _report(
     return RepairReport(
         view.path,
         True,
-        found.lost.bytes + view.size - own_end,
+        found.lost.bytes - sum(at.length for at in found.homeless) + view.size - own_end,
         sum(contents.counts.values()),
         contents.end_ns,
         found.lost.times_ns,

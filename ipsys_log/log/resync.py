@@ -5,6 +5,7 @@ import struct
 import zlib
 from collections import deque
 from collections.abc import Container
+from contextlib import suppress
 from dataclasses import dataclass, field
 from itertools import islice
 
@@ -41,8 +42,8 @@ _DAY_NS = 86_400 * 1_000_000_000
 _IN_VAIN = 64 << 20  # bytes of false chunks that are unpacked however small the log is
 _CHUNK = rb"\x06.{36}(?:\x00{4}|\x04\x00{3}zstd|\x03\x00{3}lz4)"
 _CHUNK_HEAD = re.compile(_CHUNK, re.DOTALL)
-# A chunk, or the index of one.
-_OF_CHUNKS = re.compile(rb"(?=" + _CHUNK + rb"|\x07.{3}\x00{5})", re.DOTALL)
+_MESSAGE = re.compile(rb"(?=\x05.{3}\x00{5})", re.DOTALL)
+_INDEX = re.compile(rb"(?=\x07.{3}\x00{5})", re.DOTALL)
 # A chunk by its compression, DataEnd with the record behind it, or another record of less than 16 MiB.
 _CANDIDATE = re.compile(
     rb"(?=" + _CHUNK + rb"|\x0f\x04\x00{7}.{4}[\x02\x03\x04\x08\x0b]|[\x03\x04\x05\x07\x09\x0c].{3}\x00{5})",
@@ -80,18 +81,30 @@ class Resync:
     def __post_init__(self) -> None:
         self.budget = _IN_VAIN + 4 * self.view.size
 
-    def find(self, damaged: int, claimed: int = 0) -> int | None:
+    def find(self, damaged: int, claimed: int = 0, gap: int = HEADER.size) -> int | None:
         """Return where the next whole record begins behind the damaged one, None if there is none.
 
-        `claimed` is where that one ends by its own length, if it has one.
+        `claimed` is where that one ends by its own length, if it has one; it takes at least `gap` bytes.
         """
-        if not self.chunked and not self.times_ns:
-            self.chunked = self.is_chunk_head(damaged) or (
-                self.chunked is None and self._find(_OF_CHUNKS, damaged) is not None
-            )
+        if self.chunked is None and not self.times_ns:
+            self.chunked = self._has_chunks(damaged)
         if damaged < claimed and self._leads_on(claimed):
             return claimed
-        return self._find(_CANDIDATE, damaged + HEADER.size)
+        return self._find(_CANDIDATE, damaged + gap)
+
+    def _has_chunks(self, start: int) -> bool:
+        """Return whether messages behind `start` lie in chunks, as far as what is there tells it."""
+        if self.is_chunk_head(start) or self._find(_CHUNK_HEAD, start) is not None:
+            return True
+        self.chunked = False
+        first = self._find(_MESSAGE, start)
+        if first is None:
+            return self._find(_INDEX, start) is not None
+        with suppress(LogError):
+            for at in walk(self.view, first, self.view.size):
+                if at.opcode == Opcode.MESSAGE_INDEX:
+                    return is_index(self.view, at)
+        return False
 
     def is_chunk_head(self, offset: int) -> bool:
         """Return whether what lies there looks like the beginning of a chunk, whole or not."""
@@ -114,8 +127,9 @@ class Resync:
                 if at.opcode == Opcode.FOOTER and at.length == FOOTER.size:
                     summary = FOOTER.unpack(self.view.read(at.offset, FOOTER.size))[2]
                     stop = at.offset + at.length
-                    behind = self.view.read(stop, min(len(MAGIC), self.view.size - stop))
-                    return summary in (0, start) and behind == MAGIC
+                    behind = self.view.read(stop, min(2 * len(MAGIC), self.view.size - stop))
+                    # Without a summary a stray copy says the same, but ends neither a file nor before one.
+                    return behind in (MAGIC, 2 * MAGIC) or (summary == start and behind.startswith(MAGIC))
                 if at.opcode not in _IN_SUMMARY and at.opcode < PRIVATE:
                     return False
         except LogError:
@@ -134,10 +148,11 @@ class Resync:
     def _leads_on(self, offset: int) -> bool:
         """Return whether a record of the data section lies there, as far as it and those behind it say."""
         last = messages = stop = 0
+        defined: set[int] = set()
         try:
             for at in islice(walk(self.view, offset, self.view.size), _LONGEST_CHAIN):
                 messages += at.opcode == Opcode.MESSAGE
-                verdict = self._judge(at, messages)
+                verdict = self._judge(at, messages, defined)
                 if verdict is not None:
                     return verdict
                 last, stop = at.opcode, at.offset + at.length
@@ -145,7 +160,7 @@ class Resync:
             return last in _DEFINITIONS or (last == Opcode.MESSAGE_INDEX and self.is_chunk_head(stop))
         return last > 0
 
-    def _judge(self, at: RecordAt, messages: int) -> bool | None:
+    def _judge(self, at: RecordAt, messages: int, defined: set[int]) -> bool | None:
         """Return whether a record proves that it and those before it are whole; None: the next one decides.
 
         Raises
@@ -155,11 +170,13 @@ class Resync:
         """
         view = self.view
         if at.opcode == Opcode.CHUNK:
-            return self._is_whole_chunk(at)
+            return self.chunked is not False and self._is_whole_chunk(at)
         if at.opcode == Opcode.MESSAGE:
-            return self._judge_message(at, messages)
+            return self._judge_message(at, messages, defined)
         if at.opcode in _DEFINITIONS:
             check_exact(view, at, HEADER.size - 1)
+            if at.opcode == Opcode.CHANNEL:
+                defined.add(int.from_bytes(view.read(at.offset + HEADER.size, 2), "little"))
             return True if at.opcode == Opcode.METADATA else None
         if at.opcode == Opcode.ATTACHMENT:
             stored, crc = attachment_crc(view, at)
@@ -169,12 +186,13 @@ class Resync:
         skipped = at.opcode >= PRIVATE or (at.opcode == Opcode.MESSAGE_INDEX and is_index(view, at))
         return None if skipped else False
 
-    def _judge_message(self, at: RecordAt, messages: int) -> bool | None:
+    def _judge_message(self, at: RecordAt, messages: int, defined: set[int]) -> bool | None:
         if self.chunked or at.length < MESSAGE.size:
             return False
         _, _, channel, _, time_ns, _ = MESSAGE.unpack(self.view.read(at.offset, MESSAGE.size))
         near = any(abs(time_ns - recent_ns) < _DAY_NS for recent_ns in self.times_ns)
-        return True if (near and channel in self.channels) or messages >= _ENOUGH_MESSAGES else None
+        fits = channel in defined or (near and channel in self.channels)
+        return True if fits or messages >= _ENOUGH_MESSAGES else None
 
     def _is_whole_chunk(self, at: RecordAt) -> bool:
         view = self.view

@@ -42,7 +42,8 @@ class _Records(NamedTuple):
     """The records of a damaged chunk, as far as they can be had.
 
     `checked` says that all are there and their CRC is right, `is_wrong` that all are there and it is not.
-    `ends_early` says that not all are there: the rest is missing, or cannot be decoded.
+    `ends_early` says that not all are there: the rest is missing, or cannot be decoded. `size` is what the
+    chunk claims to hold.
     """
 
     data: Buffer
@@ -51,6 +52,7 @@ class _Records(NamedTuple):
     ends_early: bool
     compressed: bool
     data_offset: int
+    size: int
     span: str
 
     def spoiled(self, offset: int) -> int:
@@ -64,14 +66,14 @@ class Saved(NamedTuple):
     """What was saved of one stretch: channel ids and offsets in the chunk of the messages.
 
     `torn` has channel id and log time of a message that is there in part. `counted` says that the stretch
-    held no other messages than these. `size` counts the bytes of the saved records.
+    held no other messages than these. `share` is the part of the stretch that was saved.
     """
 
     messages: frozenset[tuple[int, int]] = frozenset()
     torn: tuple[tuple[int, int], ...] = ()
     counted: bool = False
     note: str = ""
-    size: int = 0
+    share: float = 0.0
 
 
 @dataclass(slots=True)
@@ -132,7 +134,8 @@ class Salvage:
         note = _note(stretch, records, len(messages), complete=complete)
         saved = frozenset((channel_id, start) for channel_id, start, _ in messages)
         size = sum(stop - start for _, start, stop in messages)
-        return Saved(saved, torn, complete or bool(rows), note, size)
+        part = size / max(records.size, size, 1) if records.compressed else min(1.0, size / stretch.length)
+        return Saved(saved, torn, complete or bool(rows), note, 1.0 if complete else part)
 
     def finish(self) -> None:
         """Put the last chunk into the spool."""
@@ -188,7 +191,7 @@ def _records_of(view: View, stretch: Stretch) -> _Records | None:
     head = view.read(stretch.offset, min(_HEAD.size + 4 + _SIZE.size, stretch.length))
     if len(head) < _HEAD.size + _SIZE.size:
         return None
-    opcode, length, start_ns, end_ns, _, crc, name_length = _HEAD.unpack_from(head)
+    opcode, length, start_ns, end_ns, size, crc, name_length = _HEAD.unpack_from(head)
     name = head[_HEAD.size : _HEAD.size + min(name_length, 4)]
     if opcode != Opcode.CHUNK or name_length > 4 or name not in (b"", b"zstd", b"lz4"):
         return None
@@ -205,14 +208,14 @@ def _records_of(view: View, stretch: Stretch) -> _Records | None:
         except LogError:
             pass
         else:
-            return _Records(data, crc != 0, False, False, bool(name), data_offset, span)
+            return _Records(data, crc != 0, False, False, bool(name), data_offset, size, span)
     readable = _up_to_first_hole(view, data_offset, min(packed, stretch.end - data_offset))
     data, ends_early = _decode(view, name, data_offset, readable)
     ends_early |= readable < packed
     is_right = zlib.crc32(data) == crc
     checked = not ends_early and crc != 0 and is_right
     is_wrong = not ends_early and crc != 0 and not is_right
-    return _Records(data, checked, is_wrong, ends_early, bool(name), data_offset, span)
+    return _Records(data, checked, is_wrong, ends_early, bool(name), data_offset, size, span)
 
 
 def _decode(view: View, name: bytes, offset: int, length: int) -> tuple[Buffer, bool]:

@@ -91,6 +91,7 @@ class Survey:
     counts: dict[int, dict[int, int]] = field(default_factory=dict)
     hashes: dict[str, ChannelHash] = field(default_factory=dict)
     damaged: list[Stretch] = field(default_factory=list)
+    homeless: list[RecordAt] = field(default_factory=list)  # messages before which no definition has room
     wrong_heads: list[tuple[int, bytes]] = field(default_factory=list)  # what chunks say of their times
     cut: Stretch | None = None
     lost: Lost = field(default_factory=Lost)
@@ -114,7 +115,7 @@ def survey(view: View, known: Summary | None = None, saved: Salvage | None = Non
     """
     damaged: list[Stretch] = []
     definitions = Definitions(known, damaged)
-    resync = Resync(view, definitions.channels, True if known and known.contents.chunks else None)
+    resync = Resync(view, definitions.channels, _is_chunked(known))
     found = Survey(view, resync, definitions, saved, damaged=damaged)
     position = _take_start(found)
     while position < view.size and not found.finished:
@@ -122,7 +123,6 @@ def survey(view: View, known: Summary | None = None, saved: Salvage | None = Non
     if found.indexed is not None:
         _close_indexes(found, found.end)
     _advance_crc(found, found.end)
-    _blank_early_messages(found)
     damaged.sort(key=lambda stretch: stretch.offset)
     if found.finished:
         _, _, stored = DATA_END.unpack(view.read(found.end, DATA_END.size))
@@ -130,6 +130,15 @@ def survey(view: View, known: Summary | None = None, saved: Salvage | None = Non
     found.loose.schemas, found.loose.channels = definitions.schemas, definitions.channels
     count_all(found.contents, found.loose, found.counts)
     return found
+
+
+def _is_chunked(known: Summary | None) -> bool | None:
+    """Whether the messages lie in chunks, by the summary; None if it does not say."""
+    if known is not None and known.contents.chunks:
+        return True
+    if known is not None and known.checked and known.statistics is not None:
+        return known.statistics.chunk_count > 0
+    return None
 
 
 def _take_start(found: Survey) -> int:
@@ -189,10 +198,15 @@ def _take_records(found: Survey, position: int) -> int:
 def _pass_over(found: Survey, position: int, at: RecordAt | None, reason: str) -> int:
     """Find the next record behind damage at `position`; returns where it lies."""
     claimed = at.offset + at.length if at is not None and found.wrong_length != position else 0
-    follower = found.resync.find(position, claimed)
     indexed = found.indexed
+    # A gap that is too small for a record of its own becomes a part of the damage before it.
+    behind_indexes = indexed is not None and indexed.inside is not None and position > indexed.start
+    joins = behind_indexes or bool(found.damaged and found.damaged[-1].end == position)
+    follower = found.resync.find(position, claimed, gap=1 if joins else HEADER.size)
+    is_small = follower is not None and follower < position + HEADER.size
     if indexed is not None and indexed.inside is not None:
-        if indexed.is_complete or found.resync.is_chunk_head(position):
+        is_apart = indexed.is_complete or found.resync.is_chunk_head(position)
+        if is_apart and not is_small:
             _close_indexes(found, position)
         else:
             found.faults.append(reason)
@@ -236,7 +250,7 @@ def _end_at_damage(found: Survey, position: int, reason: str) -> int:
 def _save(found: Survey, stretch: Stretch, rows: Rows) -> None:
     """Save what can be read of a damaged chunk, and note what is gone of it."""
     saved = Saved()
-    if found.saved is not None:
+    if found.saved is not None and found.resync.chunked is not False:
         saved = found.saved.save(
             found.view, stretch, rows, found.definitions, found.hashes, in_order=stretch is found.cut
         )
@@ -251,7 +265,7 @@ def _save(found: Survey, stretch: Stretch, rows: Rows) -> None:
     if saved.note:
         found.faults.append(saved.note)
     found.lost.uncounted += not (rows or saved.counted)
-    found.lost.bytes -= min(saved.size, stretch.length)
+    found.lost.bytes -= int(saved.share * stretch.length)
 
 
 def _take(found: Survey, at: RecordAt) -> None:
@@ -260,7 +274,10 @@ def _take(found: Survey, at: RecordAt) -> None:
     if at.opcode == Opcode.MESSAGE_INDEX:
         _take_index(found, at)
         return
-    if found.indexed is not None:
+    indexed = found.indexed
+    if at.opcode == Opcode.MESSAGE and indexed is not None and indexed.inside and not indexed.is_complete:
+        raise view.fault(at.offset, "a message lies among the message indexes of a chunk")
+    if indexed is not None:
         _close_indexes(found, at.offset)
     if at.opcode == Opcode.DATA_END and at.length == DATA_END.size:
         _advance_crc(found, at.offset)
@@ -309,9 +326,12 @@ def _take_loose(found: Survey, at: RecordAt) -> None:
     elif at.opcode == Opcode.MESSAGE and at.length >= MESSAGE.size:
         _, _, channel, _, time_ns, _ = MESSAGE.unpack(view.read(at.offset, MESSAGE.size))
         try:
-            found.definitions.need(view, at.offset, channel, strict=bool(found.resync.chunked))
+            found.definitions.need(view, at.offset, channel)
         except LogError:
-            found.lost.note(found.definitions.topic(channel), time_ns)
+            if found.resync.chunked:
+                found.lost.note(found.definitions.topic(channel), time_ns)
+            else:
+                found.homeless.append(at)
             raise
         found.resync.times_ns.append(time_ns)
     elif at.opcode in (Opcode.SCHEMA, Opcode.CHANNEL):
@@ -322,6 +342,8 @@ def _take_loose(found: Survey, at: RecordAt) -> None:
 
 def _take_chunk(found: Survey, at: RecordAt) -> None:
     view = found.view
+    if found.resync.chunked is False:
+        raise view.fault(at.offset, "a chunk lies in a log whose messages lie in none")
     head = parse_chunk_head(view, at.offset)[1]
     data = unpack(view, at.offset, head)
     inside = look_inside(view, at.offset, data)
@@ -391,23 +413,6 @@ def _index_rows(view: View, at: RecordAt) -> tuple[int, list[tuple[int, int]]]:
     body = view.read(at.offset, at.length)
     channel = int.from_bytes(body[HEADER.size : HEADER.size + 2], "little")
     return channel, list(ENTRY.iter_unpack(parse_message_index(view, body, 0, channel, at.offset)))
-
-
-def _blank_early_messages(found: Survey) -> None:
-    """Messages in no chunk that stand before the definition of their channel are not of this log.
-
-    They were taken because the summary knows the channel, and its definition might have been lost.
-    """
-    for channel, defined in found.definitions.late.items():
-        rows = found.loose.entries.get(channel, [])
-        for _, offset in rows:
-            if offset < defined:
-                length = HEADER.unpack(found.view.read(offset, HEADER.size))[1]
-                found.damaged.append(Stretch(offset, HEADER.size + length))
-                found.faults.append(f"at byte {offset}: a message is of a channel that is defined later")
-        found.loose.entries[channel] = [row for row in rows if row[1] > defined]
-        if not found.loose.entries[channel]:
-            del found.loose.entries[channel]
 
 
 def _close_indexes(found: Survey, stop: int) -> None:

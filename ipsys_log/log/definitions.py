@@ -2,6 +2,7 @@
 
 from collections.abc import Iterator
 from dataclasses import dataclass, field, replace
+from itertools import islice
 
 from mcap import records as mcap
 
@@ -14,6 +15,8 @@ from ipsys_log.log.view import View
 
 __all__ = ["Definitions", "placeholder"]
 
+_MOST_MISREAD = 100
+_MOST_ROOMS = 50  # stretches that are tried
 _LARGEST = 1 << 28  # bytes: what one definition may make us allocate
 
 
@@ -38,6 +41,7 @@ class Definitions:
     known: Inside = field(default_factory=Inside)
     _schema_at: dict[int, int] = field(default_factory=dict)  # where each schema is defined
     _sure: Contents | None = None
+    _full: int = 0  # so many of the first rooms are full
     _misread: list[mcap.Channel] = field(default_factory=list)
     _unused: dict[int, RecordAt] = field(default_factory=dict)  # records of channels without messages so far
 
@@ -69,7 +73,8 @@ class Definitions:
         assert isinstance(record, mcap.Channel)
         channel = record
         if self._contradicts(channel):
-            self._misread.append(channel)
+            if len(self._misread) < _MOST_MISREAD:
+                self._misread.append(channel)
             raise view.fault(at.offset, f"the definition of channel {channel.id} is damaged")
         if not self._has_schema(channel):
             self.known.channels.setdefault(channel.id, replace(channel, schema_id=0))
@@ -86,7 +91,8 @@ class Definitions:
         LogError
             A definition is lost and cannot be put back.
         """
-        for record in (*inside.schemas.values(), *inside.channels.values()):
+        records: list[mcap.Schema | mcap.Channel] = [*inside.schemas.values(), *inside.channels.values()]
+        for record in records:
             if not checked and self._contradicts(record):
                 raise view.fault(offset, "a definition in the chunk contradicts another one")
         for channel in inside.channels.values():
@@ -183,7 +189,10 @@ class Definitions:
 
     def _room_for(self, data: bytes, start: int) -> Stretch | None:
         """Put records into the first stretch from `start` on that has room for them."""
-        return next((room for room in self.rooms if room.offset >= start and room.define(data)), None)
+        while self._full < len(self.rooms) - 1 and self.rooms[self._full].is_full:
+            self._full += 1
+        rooms = islice(self.rooms, self._full, self._full + _MOST_ROOMS)
+        return next((room for room in rooms if room.offset >= start and room.define(data)), None)
 
     def _by_one_bit(self, channel_id: int) -> mcap.Channel | None:
         """The channel whose record differs in one bit of its id, and is good for nothing else."""

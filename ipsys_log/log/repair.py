@@ -1,5 +1,6 @@
 """Making a log whole again whose writer was killed, whose end was cut off, or which is damaged inside."""
 
+import errno
 import os
 import tempfile
 import zlib
@@ -91,7 +92,7 @@ def repair(path: str | os.PathLike[str], *, storage: Storage = DISK) -> RepairRe
         view = View(target, fd, status.st_size, status.st_size)
         _check_not_empty(view)
         known = _summary(view)
-        with tempfile.SpooledTemporaryFile(_IN_MEMORY, dir=target.parent) as spool:
+        with tempfile.SpooledTemporaryFile(_IN_MEMORY, dir=str(target.parent)) as spool:
             saved = Salvage(spool)
             found = survey(view, known, saved)
             if found.end < len(MAGIC):
@@ -107,9 +108,9 @@ def repair(path: str | os.PathLike[str], *, storage: Storage = DISK) -> RepairRe
             report = _rebuild(storage, view, found, saved, known)
         return replace(report, notes=(*notes, *report.notes), written_ns=status.st_mtime_ns)
     except OSError as error:
-        raise LogError(
-            f"{target} cannot be repaired ({error.strerror}): free some space and try again"
-        ) from None
+        full = error.errno in (errno.ENOSPC, errno.EDQUOT)
+        then = "free some space" if full else "see to its disk and folder"
+        raise LogError(f"{target} cannot be repaired ({error.strerror}): {then} and try again") from None
     finally:
         storage.close(fd)
 
@@ -209,7 +210,7 @@ def _emit_saved(end: _End, found: Survey, saved: Salvage) -> None:
 
 
 def _emit_homeless(end: _End, view: View, found: Survey) -> None:
-    """Messages in no chunk for whose definitions there was no room before them, behind these."""
+    """Messages in no chunk that cannot stay where they are, behind what defines their channels."""
     contents = found.contents
     for at in found.homeless:
         data = view.read(at.offset, at.length)

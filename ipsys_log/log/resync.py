@@ -39,7 +39,8 @@ _LONGEST_CHAIN = 256  # records
 _ENOUGH_MESSAGES = 3  # in a row, of channels that nobody defines
 _RECENT = 8  # messages: one of them may have got another time by damage
 _DAY_NS = 86_400 * 1_000_000_000
-_IN_VAIN = 64 << 20  # bytes of false chunks that are unpacked however small the log is
+_IN_VAIN = 64 << 20  # bytes that are looked at in vain however small the log is
+_STEP = 4096  # bytes: what a look at a small record costs
 _CHUNK = rb"\x06.{36}(?:\x00{4}|\x04\x00{3}zstd|\x03\x00{3}lz4)"
 _CHUNK_HEAD = re.compile(_CHUNK, re.DOTALL)
 _MESSAGE = re.compile(rb"(?=\x05.{3}\x00{5})", re.DOTALL)
@@ -69,7 +70,7 @@ class Resync:
 
     `chunked` says whether its messages lie in chunks (None: not known yet): then a message record that
     lies elsewhere is a piece of a damaged chunk. `channels` are the ids that are defined, `times_ns` the
-    log times of the last messages in no chunk. `budget` bounds the bytes that are unpacked in vain.
+    log times of the last messages in no chunk. `budget` bounds the bytes that are looked at in vain.
     """
 
     view: View
@@ -147,13 +148,18 @@ class Resync:
 
     def _leads_on(self, offset: int) -> bool:
         """Return whether a record of the data section lies there, as far as it and those behind it say."""
-        last = messages = stop = 0
+        last = messages = stop = steps = 0
         defined: set[int] = set()
         try:
             for at in islice(walk(self.view, offset, self.view.size), _LONGEST_CHAIN):
+                self.budget -= _STEP
+                steps += _STEP
+                if self.budget < 0:
+                    return False
                 messages += at.opcode == Opcode.MESSAGE
                 verdict = self._judge(at, messages, defined)
                 if verdict is not None:
+                    self.budget += steps if verdict else 0
                     return verdict
                 last, stop = at.opcode, at.offset + at.length
         except LogError:  # damage follows, or the end of what was written

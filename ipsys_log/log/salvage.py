@@ -204,7 +204,7 @@ def _records_of(view: View, stretch: Stretch) -> _Records | None:
     span = f"{format_time(start_ns)} to {format_time(end_ns)} UTC"
     if data_offset + packed <= stretch.end:
         try:
-            data = unpack(view, stretch.offset, parse_chunk_head(view, stretch.offset)[1])
+            data: Buffer = unpack(view, stretch.offset, parse_chunk_head(view, stretch.offset)[1])
         except LogError:
             pass
         else:

@@ -11,6 +11,7 @@ from ipsys_log.log.resync import PRIVATE
 
 __all__ = ["Stretch", "index_records"]
 
+_SHORTEST_DEFINITION = 23  # bytes: a schema without name and encoding
 _FILLER = Opcode.CHUNK | PRIVATE
 
 
@@ -29,6 +30,7 @@ class Stretch:
     chunk: int | None = None  # number of the chunk that `entries` belong to
     entries: Mapping[int, list[tuple[int, int]]] = field(default_factory=dict)
     definitions: list[bytes] = field(default_factory=list)
+    _taken: int = 0  # bytes of all this
 
     @property
     def end(self) -> int:
@@ -41,11 +43,18 @@ class Stretch:
         rest = self.end - start - len(data)
         return (data, offsets) if rest == 0 or rest >= HEADER.size else (b"", {})
 
+    @property
+    def is_full(self) -> bool:
+        """Whether not even the shortest definition fits in."""
+        return self.length - self._taken < _SHORTEST_DEFINITION
+
     def define(self, definitions: bytes) -> bool:
         """Take these records in if there is room for them."""
-        used = len(self.head) + len(self.indexes()[0]) + sum(map(len, self.definitions))
-        if used + len(definitions) > self.length:
+        if self._taken == 0:
+            self._taken = len(self.head) + len(self.indexes()[0])
+        if self._taken + len(definitions) > self.length:
             return False
+        self._taken += len(definitions)
         self.definitions.append(definitions)
         return True
 

@@ -91,7 +91,7 @@ class Survey:
     counts: dict[int, dict[int, int]] = field(default_factory=dict)
     hashes: dict[str, ChannelHash] = field(default_factory=dict)
     damaged: list[Stretch] = field(default_factory=list)
-    homeless: list[RecordAt] = field(default_factory=list)  # messages before which no definition has room
+    homeless: list[RecordAt] = field(default_factory=list)  # messages that cannot stay where they are
     wrong_heads: list[tuple[int, bytes]] = field(default_factory=list)  # what chunks say of their times
     cut: Stretch | None = None
     lost: Lost = field(default_factory=Lost)
@@ -310,6 +310,8 @@ def _check_length(found: Survey, at: RecordAt) -> None:
         inner = found.resync.find(at.offset)
         if inner is not None and inner != stop and inner < stop + HEADER.size:
             found.wrong_length = at.offset
+            if at.opcode == Opcode.MESSAGE and at.length >= MESSAGE.size and stop < inner:
+                found.homeless.append(at)  # it may be whole: what is left between them is too small to skip
             raise view.fault(at.offset, f"a record claims {at.length} bytes, which hold other records")
 
 

@@ -49,7 +49,7 @@ def rows_of(count: int) -> list[Row]:
     return rows
 
 
-def record_at(data: bytes, opcode: int, number: int = 0) -> tuple[int, int]:
+def record_at(data: bytes | bytearray, opcode: int, number: int = 0) -> tuple[int, int]:
     """Where a record of the data section begins and ends."""
     position = 8
     while position < len(data):

@@ -2,6 +2,8 @@
 
 import os
 import stat
+from bisect import bisect_left
+from collections.abc import Sequence
 from dataclasses import dataclass, field
 from pathlib import Path
 
@@ -18,6 +20,7 @@ class View:
     """The bytes of a log as they were when it was opened.
 
     From `tail_offset` on they come from `tail_fd` (a journal), where `tail_offset` lies at `tail_base`.
+    `patches` are bytes that a repair is about to write before `tail_offset`, each with its offset, sorted.
     ``pread`` and not ``mmap``: a file that shrinks under a mapping kills the process.
     """
 
@@ -28,6 +31,7 @@ class View:
     tail_fd: int = -1
     tail_base: int = 0
     bytes_read: int = 0
+    patches: Sequence[tuple[int, bytes]] = ()
     allowance: Allowance = field(init=False)
 
     def __post_init__(self) -> None:
@@ -41,9 +45,24 @@ class View:
         if offset < 0 or length < 0 or end > self.size:
             raise self.fault(offset, f"a record reaches {end - self.size} bytes beyond the end of the file")
         self.bytes_read += length
+        if self.patches:
+            return self._patched(offset, self._unpatched(offset, length))
         if end <= self.tail_offset:
             data = os.pread(self.fd, length, offset) if 0 < length < _MOST_PER_CALL else b""
             return data if len(data) == length else self._pread(self.fd, offset, length)
+        return self._unpatched(offset, length)
+
+    def _patched(self, offset: int, data: bytes) -> bytes:
+        end = offset + len(data)
+        first = bisect_left(self.patches, offset, key=lambda patch: patch[0] + len(patch[1]))
+        for at, new in self.patches[first:]:
+            if at >= end:
+                break
+            low, high = max(at, offset), min(at + len(new), end)
+            data = data[: low - offset] + new[low - at : high - at] + data[high - offset :]
+        return data
+
+    def _unpatched(self, offset: int, length: int) -> bytes:
         head = max(0, min(length, self.tail_offset - offset))
         parts = [self._pread(self.fd, offset, head)] if head else []
         if head < length:

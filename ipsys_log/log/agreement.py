@@ -40,7 +40,7 @@ def count_by_indexes(view: View) -> int:
     contents = load_contents(view)
     total = sum(map(len, contents.loose.values()))
     for chunk in contents.chunks:
-        total += sum(map(len, chunk_entries(view, chunk).values()))
+        total += sum(map(len, chunk_entries(view, chunk, {}).values()))
     return total
 
 

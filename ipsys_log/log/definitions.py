@@ -77,7 +77,6 @@ class Definitions:
                 self._misread.append(channel)
             raise view.fault(at.offset, f"the definition of channel {channel.id} is damaged")
         if not self._has_schema(channel):
-            self.known.channels.setdefault(channel.id, replace(channel, schema_id=0))
             raise view.fault(at.offset, f"channel {channel.id} has a schema that is not in the log")
         if channel.id not in self.channels:
             self._unused[channel.id] = at
@@ -97,7 +96,6 @@ class Definitions:
                 raise view.fault(offset, "a definition in the chunk contradicts another one")
         for channel in inside.channels.values():
             if channel.schema_id not in inside.schemas and not self._has_schema(channel):
-                self.known.channels.setdefault(channel.id, replace(channel, schema_id=0))
                 raise view.fault(offset, f"channel {channel.id} has a schema that is not in the log")
         for channel_id in inside.entries.keys() - inside.channels.keys():
             self.need(view, offset, channel_id)
@@ -167,10 +165,11 @@ class Definitions:
         known = self.known.schemas.get(key)
         schema = known or _empty_schema(key)
         room = self._room_for(as_bytes(schema), 0)
-        if room is None and known is None:
+        if room is None:  # both are put back later, where there is room for both
+            self.known.channels.setdefault(channel.id, channel if known else replace(channel, schema_id=0))
             return False
         self.schemas[key] = schema
-        self._schema_at[key] = room.offset if room else 0
+        self._schema_at[key] = room.offset
         return True
 
     def _put_back(self, channel: mcap.Channel) -> bool:

@@ -215,15 +215,14 @@ def _emit_saved(end: _End, found: Survey, saved: Salvage) -> None:
 def _emit_homeless(end: _End, view: View, found: Survey) -> None:
     """Messages in no chunk that cannot stay where they are, behind what defines their channels."""
     contents = found.contents
-    for at in found.homeless:
-        data = view.read(at.offset, at.length)
-        _, _, channel, _, time_ns, _ = MESSAGE.unpack_from(data)
-        for record in found.definitions.missing({channel}, found.definitions.known):
-            end.emit(as_bytes(record))
+    heads = [MESSAGE.unpack(view.read(at.offset, MESSAGE.size)) for at in found.homeless]
+    for record in found.definitions.missing({head[2] for head in heads}, found.definitions.known):
+        end.emit(as_bytes(record))
+    for at, (_, _, channel, _, time_ns, _) in zip(found.homeless, heads, strict=True):
         contents.loose.setdefault(channel, []).append((time_ns, end.offset))
         contents.count(channel, 1)
         contents.cover(time_ns, time_ns)
-        end.emit(data)
+        end.emit(view.read(at.offset, at.length))
 
 
 def _patches(found: Survey) -> list[Patch]:

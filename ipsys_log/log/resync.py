@@ -90,7 +90,10 @@ class Resync:
         if self.chunked is None and not self.times_ns:
             self.chunked = self._has_chunks(damaged)
         if damaged < claimed and self._leads_on(claimed):
-            return claimed
+            # Its length may be right; but a stray head may as well claim what lies behind it.
+            pattern = _CHUNK_HEAD if self.is_chunk_head(damaged) else _CANDIDATE
+            inner = self._find(pattern, damaged + gap, claimed)
+            return claimed if inner is None else inner
         return self._find(_CANDIDATE, damaged + gap)
 
     def _has_chunks(self, start: int) -> bool:
@@ -137,13 +140,17 @@ class Resync:
             pass
         return False
 
-    def _find(self, pattern: re.Pattern[bytes], start: int) -> int | None:
+    def _find(self, pattern: re.Pattern[bytes], start: int, end: int | None = None) -> int | None:
         view = self.view
-        for base in range(start, view.size, _BLOCK):
+        end = view.size if end is None else end
+        for base in range(start, end, _BLOCK):
             block = view.read(base, min(_BLOCK + _OVERLAP, view.size - base))
             for match in pattern.finditer(block):
-                if match.start() < _BLOCK and self._leads_on(base + match.start()):
-                    return base + match.start()
+                offset = base + match.start()
+                if match.start() >= _BLOCK or offset >= end:
+                    break
+                if self._leads_on(offset):
+                    return offset
         return None
 
     def _leads_on(self, offset: int) -> bool:

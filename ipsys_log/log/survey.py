@@ -375,7 +375,9 @@ def _check_definitions(view: View, offset: int, data: bytes) -> None:
     """Refuse a chunk without CRC whose definitions claim more or less than they hold."""
     for at in inner_records(view, offset, data):
         if at.opcode in (Opcode.SCHEMA, Opcode.CHANNEL):
-            exact(view, RecordAt(at.opcode, offset, at.length), data[at.offset : at.offset + at.length])
+            record = data[at.offset : at.offset + at.length]
+            if len(as_bytes(exact(view, RecordAt(at.opcode, offset, at.length), record))) != at.length:
+                raise view.fault(offset, "a definition in the chunk claims less than it holds")
 
 
 def _continue_hashes(found: Survey, inside: Inside, data: bytes) -> None:

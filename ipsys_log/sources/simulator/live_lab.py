@@ -10,17 +10,20 @@ from dataclasses import dataclass, replace
 from functools import lru_cache
 from threading import Lock
 
+import cv2
 import numpy as np
 
 from ipsys_log.errors import IpsysError
 from ipsys_log.messages import Rig, RigCamera, RigMarker
 from ipsys_log.rig_slips import dictionary_size
-from ipsys_log.sources.simulator.cameras import hang_cameras
+from ipsys_log.sources.simulator.cameras import Camera, hang_cameras
 from ipsys_log.sources.simulator.drive import Drive, plan_drive
+from ipsys_log.sources.simulator.patterns import true_corners
 from ipsys_log.sources.simulator.places import (
     REFERENCES,
     Place,
     choose_place,
+    place,
     seen_whole,
     tape_lengths_m,
 )
@@ -33,14 +36,16 @@ __all__ = ["LIVE_SETTINGS", "LiveLab", "live_rig", "plan_live_lab", "tape_sheet"
 
 # A laptop with two cores draws it and tracks in it: three cameras give 2.5 MB a second.
 LIVE_SETTINGS = LabSettings(
-    width=1280, height=720, rate_hz=10.0, stations=20, drive_s=4.0, noise_sigma=1.0, jpeg_quality=80
+    width=1280, height=720, rate_hz=10.0, stations=18, drive_s=4.0, noise_sigma=1.0, jpeg_quality=80
 )
-# Three of five lie on the floor, so that a camera can be aligned by them; the others lie on boxes.
-_HEIGHTS_M = (0.0, 0.1, 0.0, 0.2, 0.0)
+# Most markers lie on the floor, so that a camera can be aligned by them; the others lie on boxes.
+_RAISED_SHARE, _BOXES_M = 0.35, (0.1, 0.2)
 # Past the driving markers, one that lies has to keep clear of each of their places so many times a second.
 _CHECKED_HZ = 10
 # The places do not depend on the size of the frames, as long as these are wide.
 _WIDTH, _HEIGHT = 1920, 1080
+# A marker that is narrower in an image of this width may be missed in a smaller one.
+_NARROWEST_PX = 50.0
 
 _planning = Lock()
 
@@ -91,12 +96,29 @@ def _plan(settings: LabSettings) -> tuple[Drive, tuple[Place, ...]]:
         camera = min(cameras, key=lambda one: len(seen[one.name]))
         number = settings.markers + len(lying)
         _check_left(settings, number)
-        level = replace(settings, heights_m=(_HEIGHTS_M[len(lying) % len(_HEIGHTS_M)],))
-        where = choose_place(rng, level, cameras, camera, number, [*taken, *lying], seen[camera.name])
+        level = replace(settings, heights_m=(_next_height_m(lying, seen[camera.name]),))
+        others = [*taken, *lying]
+        where = choose_place(rng, level, cameras, camera, number, others, seen[camera.name], _is_wide)
         lying.append(where)
         for name in seen_whole(where, cameras, settings):
             seen[name].append(where)
     return drive, tuple(lying)
+
+
+def _next_height_m(lying: Sequence[Place], seen: Sequence[Place]) -> float:
+    """The height of the next marker: of those that a camera sees, the share of raised ones stays small."""
+    raised = sum(where.z_m > 0 for where in seen)
+    if raised >= _RAISED_SHARE * len(seen):
+        return 0.0
+    return _BOXES_M[sum(where.z_m > 0 for where in lying) % len(_BOXES_M)]
+
+
+def _is_wide(where: Place, camera: Camera, settings: LabSettings) -> bool:
+    """Whether a marker is wide enough in the image of a camera, which looks at it from the side."""
+    corners_px = true_corners(camera.lens, camera.camera_from_world, place(where, settings))
+    area_px = cv2.contourArea(corners_px.astype(np.float32))
+    longest_px = np.linalg.norm(np.roll(corners_px, -1, axis=0) - corners_px, axis=1).max()
+    return bool(area_px / longest_px >= _NARROWEST_PX)
 
 
 def _check_left(settings: LabSettings, number: int) -> None:

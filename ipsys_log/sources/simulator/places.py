@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 
 import numpy as np
@@ -192,6 +192,7 @@ def choose_place(
     marker_id: int,
     taken: Sequence[Place],
     before: Sequence[Place],
+    suits: Callable[[Place, Camera, LabSettings], bool] = lambda where, camera, settings: True,
 ) -> Place:
     """Choose a place in the view of a camera, far from those ``before``, clear of those that are ``taken``.
 
@@ -205,7 +206,7 @@ def choose_place(
         x_m, y_m = rng.uniform(0, FLOOR_M, 2)
         z_m, heading_rad = rng.choice(settings.heights_m), rng.uniform(-np.pi, np.pi)
         where = Place(marker_id, float(x_m), float(y_m), float(z_m), float(heading_rad))
-        if _fits(where, settings, cameras, camera, taken):
+        if _fits(where, settings, cameras, camera, taken) and suits(where, camera, settings):
             found.append(where)
         if len(found) == _CANDIDATES:
             break

@@ -1,0 +1,223 @@
+"""A first day without hardware: every command on the simulated lab, against what is true there."""
+
+from __future__ import annotations
+
+import csv
+import json
+import subprocess
+import sys
+from collections.abc import Iterator
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+from ipsys_log.cli.guide import PANELS
+from ipsys_log.log.session import Session
+from ipsys_log.messages import (
+    RIG_TOPIC,
+    CompressedImage,
+    Distance,
+    Measurement,
+    Message,
+    Rig,
+    Tracks,
+    calibration_topic,
+    image_topic,
+)
+from ipsys_log.rig import load_rig
+from ipsys_log.runs.output import write_log
+from ipsys_log.sources.simulator import hang_cameras
+from ipsys_log.sources.simulator.film import lab_film, shown_at
+from ipsys_log.sources.simulator.live_lab import LIVE_SETTINGS, plan_live_lab
+from ipsys_log.units import NS_PER_S
+from tests.conftest import Ipsys
+from tests.test_measure_now import Lab, measuring
+
+# A limit for one command on a busy machine; a quiet one takes seconds.
+PATIENCE_S = 900
+
+
+def errors_m(log: Path, run: str = "poly") -> np.ndarray:
+    """How far the tracks of a log are from where the simulated robots and markers truly are, (n,)."""
+    lab = plan_live_lab(LIVE_SETTINGS)
+    count = round(LIVE_SETTINGS.drive_s * LIVE_SETTINGS.rate_hz)
+    lying = {where.marker_id: where for where in lab.lying}
+    offsets = []
+    with Session([log]) as session:
+        for tracks in session.payloads(session.topics(Tracks, run)):
+            frame = round(tracks.timestamp * LIVE_SETTINGS.rate_hz / 1e9)
+            time_s = shown_at(frame, count) / LIVE_SETTINGS.rate_hz
+            for track in tracks.tracks:
+                true = lying.get(track.id) or lab.drive.place_at(track.id, time_s)
+                offsets.append((track.x_m - true.x_m, track.y_m - true.y_m, track.z_m - true.z_m))
+    return np.linalg.norm(np.array(offsets).reshape(-1, 3), axis=1)
+
+
+def sheet_rows(path: Path) -> list[Measurement]:
+    with path.open() as file:
+        return [
+            Measurement(
+                0,
+                f"m{row['marker']}",
+                marker_id=int(row["marker"]),
+                distances=tuple(Distance(name, float(row[f"d_{name}_cm"]) / 100) for name in "AB"),
+                side=row["side"],
+                height_m=float(row["height_cm"]) / 100,
+            )
+            for row in csv.DictReader(file)
+        ]
+
+
+def test_simulated_lab_gives_its_rig_and_its_tape(
+    ipsys: Ipsys, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.chdir(tmp_path)
+    done = ipsys("init", "lab.toml", "--simulated")
+    assert done.code == 0, done.err
+    rig = load_rig(tmp_path / "lab.toml")
+    assert [camera.source for camera in rig.cameras] == ["sim:red", "sim:white", "sim:black"]
+    lying = {where.marker_id: where for where in plan_live_lab(LIVE_SETTINGS).lying}
+    rows = sheet_rows(tmp_path / "lab_tape.csv")
+    assert sorted(row.marker_id or 0 for row in rows) == sorted(lying)
+    known = {point.name: point for point in rig.reference_points}
+    for row in rows:
+        where = lying[row.marker_id or 0]
+        assert rig.height_of(where.marker_id) == row.height_m == where.z_m
+        for tape in row.distances:
+            a = known[tape.reference]
+            assert abs(np.hypot(where.x_m - a.x_m, where.y_m - a.y_m) - tape.distance_m) < 0.001
+    before = (tmp_path / "lab_tape.csv").read_bytes()
+    assert "lab.toml: exists already" in ipsys("init", "--simulated").err
+    # Both files, or none.
+    (tmp_path / "lab.toml").unlink()
+    done = ipsys("init", "lab.toml", "--simulated")
+    assert (done.code, (tmp_path / "lab.toml").exists()) == (1, False)
+    assert "lab_tape.csv: exists already" in done.err
+    assert (tmp_path / "lab_tape.csv").read_bytes() == before
+    assert "exclude each other" in ipsys("init", "x.toml", "--simulated", "--from", "a.mcap").err
+
+
+def test_simulated_lab_is_measured_and_fitted(
+    ipsys: Ipsys, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """The thin way through the day, without its real time: the sheet fits the frames, to the centimetre."""
+    monkeypatch.chdir(tmp_path)
+    assert ipsys("init", "--simulated").code == 0
+    write_log(tmp_path / "day.mcap", seen_by_all(load_rig(tmp_path / "lab.toml")))
+    done = ipsys("measure", "day.mcap", "--csv", "lab_tape.csv")
+    assert done.code == 0, done.err
+    assert f"{len(sheet_rows(tmp_path / 'lab_tape.csv'))} places measured" in done.out
+    assert ipsys("replay", "day.mcap").code == 0
+    errors = errors_m(tmp_path / "day.mcap")
+    assert len(errors) > 150
+    assert np.median(errors) < 0.005
+    assert np.percentile(errors, 95) < 0.03
+
+
+def seen_by_all(rig: Rig) -> Iterator[Message]:
+    """Frames as all three cameras show them in half a second."""
+    step_ns = round(NS_PER_S / LIVE_SETTINGS.rate_hz)
+    start_ns = 1_700_000_000 * NS_PER_S
+    films = [lab_film(LIVE_SETTINGS, number, lambda: None) for number in range(3)]
+    yield Message(RIG_TOPIC, start_ns - step_ns, start_ns - step_ns, rig)
+    for number, camera in enumerate(hang_cameras(LIVE_SETTINGS)):
+        time_ns = start_ns - step_ns + 1 + number
+        yield Message(calibration_topic(camera.name), time_ns, time_ns, camera.lens, camera.name)
+    for frame in range(5):
+        time_ns = start_ns + frame * step_ns
+        for order, film in enumerate(films):
+            name = LIVE_SETTINGS.cameras[order]
+            data = film.draw(film.index_of(round(time_ns * LIVE_SETTINGS.rate_hz / NS_PER_S)))
+            image = CompressedImage(time_ns, name, data, "jpeg")
+            yield Message(image_topic(name), time_ns + 5_000_000 + order, time_ns, image, name)
+
+
+class Day:
+    """Runs commands as programs, in a folder, and remembers which."""
+
+    def __init__(self, folder: Path) -> None:
+        self.folder = folder
+        self.commands: set[str] = set()
+
+    def __call__(self, *arguments: object) -> str:
+        self.commands.add(str(arguments[0]))
+        done = subprocess.run(
+            [sys.executable, "-m", "ipsys_log", *map(str, arguments)],
+            cwd=self.folder,
+            capture_output=True,
+            text=True,
+            timeout=PATIENCE_S,
+            check=False,
+        )
+        assert done.returncode == 0, f"{arguments}: {done.stderr}"
+        assert "Traceback" not in done.stderr
+        return done.stdout
+
+
+@pytest.fixture(scope="module")
+def day(tmp_path_factory: pytest.TempPathFactory) -> Day:
+    return Day(tmp_path_factory.mktemp("day"))
+
+
+@pytest.mark.slow
+def test_every_command_of_the_first_day_works_without_hardware(day: Day) -> None:
+    day("init", "lab.toml", "--simulated")
+    day("markers", "--rig", "lab.toml")
+    day("cameras", "--rig", "lab.toml")
+    cameras = {camera.name: camera for camera in hang_cameras(LIVE_SETTINGS)}
+
+    board = ("--board", "6x4", "--camera", "red", "--seconds", 20)
+    (found,) = json.loads(day("calibrate", "--rig", "lab.toml", *board, "--json"))
+    assert abs(found["parameters"]["fx"] / cameras["red"].lens.K[0, 0] - 1) < 0.005
+    lenses = ("--calibration", "red=red.yaml")
+
+    aligned = json.loads(day("align", "--rig", "lab.toml", *lenses, "--json"))
+    for one in aligned["cameras"]:
+        down = cameras[one["camera"]].camera_from_world[:3, 2]
+        assert abs(one["tilt_deg"] - np.degrees(np.arccos(-down[2]))) < 0.3
+
+    day("record", "--rig", "lab.toml", *lenses, "-o", "session.mcap", "--seconds", 10)
+    day("measure", "session.mcap", "--csv", "lab_tape.csv")
+    day("replay", "session.mcap")
+    day("live", "--rig", "lab.toml", *lenses, "--model-from", "session.mcap", "-o", "a.mcap", "--seconds", 8)
+    errors = errors_m(day.folder / "a.mcap")
+    assert len(errors) > 100
+    assert np.median(errors) < 0.01
+    assert np.percentile(errors, 95) < 0.05
+
+    assert "a replay equals the log" in day("verify", "a.mcap")
+    day("latency", "a.mcap", "--plot", "latency.png")
+    day("diff", "a.mcap", "a.mcap")
+    day("repair", "a.mcap")
+    day("info", "a.mcap")
+    day("runs", "a.mcap")
+    day("view", "a.mcap", "--save", "a.rrd")
+    day("evaluate", "session.mcap", "--model", "poly", "--model", "best")
+    day("plan", "session.mcap", "--places", 2)
+    day("report", "session.mcap")
+    for stage in ("detect", "camera-frame", "fit", "locate", "fuse"):
+        day(stage, "session.mcap")
+    day("simulate", "-o", "s.mcap", "--width", 320, "--height", 180, "--stations", 1, "--drive-s", 0.2)
+    day.commands.add("import")  # needs data of others
+    assert day.commands == {name for names in PANELS.values() for name in names}
+
+
+@pytest.mark.slow
+def test_places_of_the_simulated_lab_are_measured_on_the_page(tmp_path: Path, ipsys: Ipsys) -> None:
+    """With cameras, as by phone: nobody has to hurry, for nothing is carried away."""
+    assert ipsys("init", tmp_path / "lab.toml", "--simulated").code == 0
+    rows = sheet_rows(tmp_path / "lab_tape.csv")
+    assert (
+        ipsys("record", "--rig", tmp_path / "lab.toml", "-o", tmp_path / "l.mcap", "--seconds", 1).code == 0
+    )
+    log = tmp_path / "places.mcap"
+    with measuring(Lab(tmp_path / "lab.toml", tmp_path / "l.mcap", rows), log) as (program, page):
+        for row in rows[:10]:
+            assert "saved" in page.measure(row)
+        program.terminate()
+        program.communicate(timeout=60)
+    with Session([log]) as session:
+        assert len(session.payloads(["/measurements"])) == 10
+    assert ipsys("replay", log, "--model", "best").code == 0
+    assert np.median(errors_m(log, "best")) < 0.02

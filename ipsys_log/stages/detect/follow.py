@@ -50,7 +50,7 @@ _SURE_PX = 0.08
 # Small markers, which only a thorough search finds, look much the same in both poses.
 _MUCH_BETTER = 0.9
 # In uneven light, a fit whose edges are spread by more may be off by as much.
-_DISTURBED_PX = 0.3
+_DISTURBED_PX = 0.5
 # From so many frames with markers it is known how blurred edges are.
 _BLURS = 10
 

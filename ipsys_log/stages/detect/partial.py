@@ -62,7 +62,7 @@ _CHEAPER, _ALIKE_POSES = 0.03, 0.06
 _SEEN, _SEEN_OF_ALL, _COST = 0.3, 0.4, 0.7
 _MOST_UNCERTAIN_PX = 1.0
 # In cells of fewer px, edges disturb one another.
-_LEAST_CELL_PX = 2.5
+_LEAST_CELL_PX = 2.2
 # Errors of neighbouring edges are alike, more than least squares takes them to be.
 _ALIKE = 1.7
 

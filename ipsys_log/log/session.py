@@ -230,7 +230,7 @@ class Session:
         return dict(zip(readers, found, strict=True))
 
     def _check_numbers(self) -> None:
-        """Refuse more runs or measurements than a lab has; each of them is a line, or an equation to solve."""
+        """Refuse more runs or measurements than a lab has: each is a line, or an equation to solve."""
         for reader in self.readers:
             for payload, what in ((Run, "runs"), (Measurement, "measurements")):
                 counts = [

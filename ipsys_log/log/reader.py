@@ -115,7 +115,7 @@ class LogReader:
         return self._view.allowance
 
     def check_number(self, number: int, what: str) -> None:
-        """Refuse a log with more channels, schemas or runs than a file of its size may have."""
+        """Refuse a log with more runs or measurements than a file of its size may have."""
         self._view.check_number(number, what)
 
     @property

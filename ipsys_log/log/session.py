@@ -61,6 +61,7 @@ class Session:
         self._stack = ExitStack()
         try:
             self.readers = [self._stack.enter_context(LogReader(path)) for path in paths]
+            self._check_numbers()
             self._check_overlaps()
             self.images = self._cameras(_IMAGES)
             self.calibrations = self._pair_calibrations(self._cameras((CameraCalibration,)))
@@ -208,9 +209,6 @@ class Session:
             for topic, channel in reader.channels.items()
             if channel.schema is not None and payload_type(channel.schema.name) is Run
         }
-        for reader in self.readers:
-            number = sum(reader.channels[topic].message_count for topic in topics & reader.channels.keys())
-            reader.check_number(number, "runs")
         return sorted(self.payloads(topics), key=lambda run: run.number)
 
     def _tell_apart(self) -> dict[LogReader, dict[str, str]]:
@@ -230,6 +228,17 @@ class Session:
             for reader in readers
         )
         return dict(zip(readers, found, strict=True))
+
+    def _check_numbers(self) -> None:
+        """Refuse more runs or measurements than a lab has: each is a line, or an equation to solve."""
+        for reader in self.readers:
+            for payload, what in ((Run, "runs"), (Measurement, "measurements")):
+                counts = [
+                    channel.message_count
+                    for channel in reader.channels.values()
+                    if channel.schema is not None and payload_type(channel.schema.name) is payload
+                ]
+                reader.check_number(sum(counts), what)
 
     def _check_overlaps(self) -> None:
         """Logs that follow one another are one; two that speak at once of one thing are not."""

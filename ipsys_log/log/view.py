@@ -82,7 +82,7 @@ class View:
         )
 
     def check_number(self, number: int, what: str) -> None:
-        """Refuse a log with more channels, schemas or runs than a file of its size may have."""
+        """Refuse a log with more channels, runs and the like than a file of its size may have."""
         if number > self.allowance.most_channels:
             raise self.refusal(f"it has {number} {what}, more than {self.allowance.most_channels}")
 

@@ -11,8 +11,9 @@ __all__ = ["damaged"]
 # Numbers and signs at which readers stumble.
 _NUMBERS = (0, 1, 0x7F, 0x80, 0xFF, 0x7FFF, 0xFFFF, 1 << 31, 1 << 32, 1 << 62, 1 << 63, (1 << 64) - 1)
 _TEXTS = (
-    b"nan", b"inf", b"-1", b"1e308", b"1e999", b"9" * 5000, b"\x1b[31m", b"\xff\xfe", b"\0", b"\n", b'"', b"'",
-    b"[" * 300, b"{" * 300, b",", b";", b"\xe2\x80\xae", b"-", b"0", b" " * 100, b"&a *a", b"<<:", b"!!", b"\\ud800",
+    b"nan", b"inf", b"-1", b"1e308", b"1e999", b"9" * 5000, b"\x1b[31m", b"\xff\xfe", b"\0", b"\n",
+    b'"', b"'", b"[" * 300, b"{" * 300, b",", b";", b"\xe2\x80\xae", b"-", b"0", b" " * 100, b"&a *a",
+    b"<<:", b"!!", b"\\ud800",
 )  # fmt: skip
 _PLACE = st.integers(0, 1 << 16)
 _EDIT = st.one_of(

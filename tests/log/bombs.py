@@ -17,11 +17,16 @@ from ipsys_log.messages import (
     CameraCalibration,
     CameraPoints,
     CompressedImage,
+    Distance,
     Event,
     Markers,
     Measurement,
     RawImage,
+    ReferencePoint,
+    Rig,
     Run,
+    Track,
+    Tracks,
 )
 
 __all__ = ["BOMBS", "Attack"]
@@ -148,6 +153,23 @@ def empty_messages(payload: bytes, kind: type, topic: str, times: int, chunks: i
             content += message(payload, start + number)
         attack.chunk(bytes(content), rows if indexed else None, span=(start, start + times - 1), count=times)
         start += times
+    return attack.finish()
+
+
+def with_rig(measurements: list[bytes]) -> bytes:
+    """Measurements that are each solved by least squares."""
+    attack = Attack()
+    attack.channel(Measurement, "/measurements")
+    content, rows = bytearray(), []
+    for number, payload in enumerate(measurements):
+        rows.append((number, len(content)))
+        content += message(payload, number)
+    attack.chunk(bytes(content), rows, span=(0, len(rows)))
+    points = tuple(ReferencePoint(name, x, x * x) for name, x in zip("ABC", (0.0, 1.0, 2.0), strict=True))
+    rig = Rig("lab", "DICT_4X4_100", 0.2, reference_points=points)
+    channel = attack.channel(Rig, "/rig")
+    attack.chunk(message(encode(rig), 0, channel), span=(0, 0), count=0)
+    attack.contents.counts[channel] = 1
     return attack.finish()
 
 
@@ -314,6 +336,8 @@ def images(data: bytes, times: int) -> bytes:
 _RECURSIVE = b"bad_type x\nstd_msgs/Header header\n" + b"=" * 80 + b"\nMSG: std_msgs/Header\nuint32 a\n"
 _EMPTY_ITEMS = b"a/E[] items\n" + b"=" * 80 + b"\nMSG: a/E\n\n"
 
+TAPES = (Distance("A", 1.5), Distance("B", 1.2), Distance("C", 3.0))
+
 BOMBS: dict[str, Callable[[], bytes]] = {
     "one chunk of 1 GiB, zstd": lambda: zeros("zstd", 1 << 30, 1, True),
     "one chunk of 1 GiB, zstd, no summary": lambda: zeros("zstd", 1 << 30, 1, False),
@@ -340,6 +364,12 @@ BOMBS: dict[str, Callable[[], bytes]] = {
     ),
     "40 k runs": lambda: empty_messages(b"", Run, "/runs/r/record", 1000, 40, True),
     "40 k measurements": lambda: empty_messages(b"", Measurement, "/measurements", 1000, 40, True),
+    "40 k tracks": lambda: empty_messages(
+        encode(Tracks(0, (Track("a", 1, 0.0, 0.0, 0.0),))), Tracks, "/truth/tracks", 1000, 40, True
+    ),
+    "20 k tapes": lambda: with_rig(
+        [encode(Measurement(0, str(n), None, 1, TAPES, None, 0.1)) for n in range(20_000)]
+    ),
     "one message 50 k times": lambda: same_message_again(50_000, 15 * MIB),
     "10 k nested messages": lambda: nested_messages(10_000, 15 * MIB),
     "65 k channels in a chunk": lambda: many_channels(65_000, True),

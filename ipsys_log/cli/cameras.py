@@ -19,7 +19,7 @@ __all__ = ["add_commands"]
 
 _NONE = """no cameras are attached by USB
   a network camera needs no list: put its address into the rig file, source = "rtsp://..." or "http://..."
-  without any camera, source = "sim:red" plays the simulated lab"""
+  without any camera, source = "sim:red" shows the simulated lab: ipsys init lab.toml --simulated"""
 
 
 def add_commands(app: typer.Typer) -> None:

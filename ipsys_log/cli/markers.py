@@ -33,8 +33,8 @@ Dictionary = Annotated[
     Optional[str],  # noqa: UP045
     typer.Option(
         metavar="NAME",
-        help="The dictionary: of the markers DICT_4X4_100 if neither this nor a rig names one, of a ChArUco "
-        "board DICT_4X4_50.",
+        help="The dictionary of --ids without a rig (otherwise DICT_4X4_100), and of a ChArUco board "
+        "(otherwise DICT_4X4_50).",
     ),
 ]
 BoardName = Annotated[
@@ -134,7 +134,6 @@ def _lab(rig: Path | None, length: float | None, dictionary: str | None) -> Rig:
 
     if rig is not None:
         lab = load_rig(rig)
-        lab = lab if dictionary is None else replace(lab, dictionary=dictionary.upper())
     elif length is None:
         raise IpsysError("--ids: give the side of the markers too, such as --length 0.1, or --rig lab.toml")
     else:

@@ -77,4 +77,5 @@ def _corners(points: list[Point]) -> NDArray[np.float64]:
     outline = np.array(points, dtype=np.float64)
     before, after = outline - np.roll(outline, 1, axis=0), np.roll(outline, -1, axis=0) - outline
     turns = before[:, 0] * after[:, 1] != before[:, 1] * after[:, 0]
-    return outline[turns]
+    corners: NDArray[np.float64] = outline[turns]
+    return corners

@@ -51,7 +51,7 @@ def errors_m(log: Path, run: str = "poly") -> np.ndarray:
             for track in tracks.tracks:
                 true = lying.get(track.id) or lab.drive.place_at(track.id, time_s)
                 offsets.append((track.x_m - true.x_m, track.y_m - true.y_m, track.z_m - true.z_m))
-    return np.linalg.norm(np.array(offsets).reshape(-1, 3), axis=1)
+    return np.asarray(np.linalg.norm(np.array(offsets).reshape(-1, 3), axis=1))
 
 
 def sheet_rows(path: Path) -> list[Measurement]:

@@ -37,7 +37,7 @@ def detected(page: Grey, dictionary: str) -> dict[int, NDArray[np.float64]]:
     parameters.cornerRefinementMethod = cv2.aruco.CORNER_REFINE_SUBPIX
     known = cv2.aruco.getPredefinedDictionary(getattr(cv2.aruco, dictionary))
     corners, ids, _ = cv2.aruco.ArucoDetector(known, parameters).detectMarkers(page)
-    numbers = [] if ids is None else np.ravel(ids).tolist()
+    numbers = [] if ids is None else [int(number) for number in np.ravel(ids)]
     return {
         number: np.asarray(corner, dtype=np.float64).reshape(4, 2) / PX_PER_MM
         for number, corner in zip(numbers, corners, strict=True)
@@ -45,7 +45,7 @@ def detected(page: Grey, dictionary: str) -> dict[int, NDArray[np.float64]]:
 
 
 def sides_mm(corners_mm: NDArray[np.float64]) -> NDArray[np.float64]:
-    return np.linalg.norm(np.roll(corners_mm, -1, axis=0) - corners_mm, axis=1)
+    return np.asarray(np.linalg.norm(np.roll(corners_mm, -1, axis=0) - corners_mm, axis=1))
 
 
 @pytest.mark.parametrize(

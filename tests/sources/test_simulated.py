@@ -171,7 +171,7 @@ def test_a_lab_that_cannot_be(source: str, said: str) -> None:
 
 def test_preparing_a_view_ends_between_two_steps() -> None:
     """An interrupt waits for one step of the work, not for all of it."""
-    calls = []
+    calls: list[None] = []
 
     def check() -> None:
         calls.append(None)

@@ -7,6 +7,8 @@ import time
 from collections.abc import Callable, Iterator
 from dataclasses import replace
 from functools import cache
+from itertools import zip_longest
+from math import inf
 from pathlib import Path
 from typing import Any
 
@@ -350,22 +352,33 @@ def test_live_with_late_frames_equals_replay(stalled: Path, calibration: Path) -
     assert stalled.read_bytes() == before
 
 
+def late_ranges(events: list[Event]) -> dict[str, list[tuple[float, float]]]:
+    """By camera from when to when frames came late: as its events say, two for each time."""
+    ranges: dict[str, list[tuple[float, float]]] = {}
+    for camera in {str(event.camera) for event in events}:
+        mine = [event for event in events if event.camera == camera]
+        for begins, ends in zip_longest(mine[::2], mine[1::2]):
+            assert begins.end is None
+            ranges.setdefault(camera, []).append((begins.start, ends.end if ends else inf))
+    return ranges
+
+
 def test_late_frames_are_named_and_in_no_track(stalled: Path) -> None:
     with Session([stalled]) as session:
         events = [e for e in session.payloads(["/events"]) if e.kind == STAMP_UNRELIABLE]
         tracks = session.payloads(["/runs/poly/tracks"])
         positions = list(session.messages(session.topics(Positions, "poly")))
         (fused,) = (run for run in session.runs() if run.stage == "fuse")
-    ends = {event.camera: event.end for event in events if event.end is not None}
-    assert set(ends) == {event.camera for event in events} == {"black", "red", "white"}
+    ranges = late_ranges(events)
+    for camera in ("black", "red", "white"):
+        assert any(end_ns - start_ns > 1.9e9 for start_ns, end_ns in ranges[camera])
     late = {
         m.publish_time_ns
         for m in positions
-        for e in events
-        if e.camera == m.camera and e.start <= m.publish_time_ns <= ends[e.camera]
+        if any(start_ns <= m.publish_time_ns <= end_ns for start_ns, end_ns in ranges[str(m.camera)])
     }
-    assert {one.timestamp for one in tracks} == {m.publish_time_ns for m in positions} - late
-    assert 3 <= len(late) < len(positions) - 3
+    assert len(late) >= 3
+    assert {one.timestamp for one in tracks} == {m.publish_time_ns for m in positions} - late != set()
     assert "/events" in {read.topic for read in fused.inputs}
 
 

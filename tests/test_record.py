@@ -325,6 +325,7 @@ def test_recorder_killed_at_once_keeps_rig_and_lenses(ipsys: Ipsys, tmp_path: Pa
     assert (lens.width, lens.K[0, 0]) == (640, 300.0)
 
 
+@pytest.mark.slow
 def test_recorder_that_stood_still_names_its_late_frames(
     pictures: tuple[Path, list[bytes]], tmp_path: Path
 ) -> None:

@@ -47,20 +47,21 @@ class Heartbeat:
         self._last_ns: int | None = None
         self._newest: Stall | None = None
         self._stopped = threading.Event()
-        self._thread = threading.Thread(target=self._run, name="heartbeat", daemon=True)
 
     def start(self) -> None:
         """Beat from a thread of its own."""
-        self._thread.start()
+        self._stopped.clear()
+        threading.Thread(target=self._run, name="heartbeat", daemon=True).start()
 
     def stop(self) -> None:
+        """End that thread."""
         self._stopped.set()
 
     def beat(self, now_ns: int) -> Stall | None:
         """Note a time, and return the newest stall. Any thread may: the first that runs again finds it."""
         with self._lock:
             if self._last_ns is not None and now_ns - self._last_ns > STALL_NS:
-                self._newest = Stall(self._last_ns, now_ns)
+                self._newest = Stall(self._last_ns + 1, now_ns)  # a frame may have come at the last time
             self._last_ns = max(now_ns, self._last_ns or now_ns)
             return self._newest
 

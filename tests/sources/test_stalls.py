@@ -59,7 +59,7 @@ def paced(start_ns: int, count: int, period_ns: int = 33 * MS) -> list[int]:
 
 def test_late_frames_lie_between_two_events() -> None:
     before = paced(NS_PER_S, 30)
-    stopped_ns, goes_on_ns = before[-1], before[-1] + 2 * NS_PER_S
+    stopped_ns, goes_on_ns = before[-1] + 1, before[-1] + 2 * NS_PER_S
     burst = paced(goes_on_ns, 20, 2 * MS)
     after = paced(burst[-1] + 20 * MS, 30)
     messages = recorded([*before, *burst, *after])
@@ -90,7 +90,7 @@ def test_recorder_that_stops_twice_says_the_whole_range() -> None:
     first = paced(before[-1] + NS_PER_S, 10, MS)
     second = paced(first[-1] + NS_PER_S, 10, MS)
     begins, ends = late_events(recorded([*before, *first, *second, *paced(second[-1] + 30 * MS, 20)]))
-    assert begins.start == ends.start == before[-1]
+    assert begins.start == ends.start == before[-1] + 1
     assert ends.end is not None
     assert ends.end > second[-1]
 
@@ -98,7 +98,7 @@ def test_recorder_that_stops_twice_says_the_whole_range() -> None:
 def test_frames_late_at_the_end_have_an_open_range() -> None:
     before = paced(NS_PER_S, 30)
     (begins,) = late_events(recorded([*before, *paced(before[-1] + NS_PER_S, 10, MS)]))
-    assert (begins.start, begins.end) == (before[-1], None)
+    assert (begins.start, begins.end) == (before[-1] + 1, None)
 
 
 @settings(max_examples=200, deadline=None)

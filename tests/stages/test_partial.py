@@ -62,7 +62,7 @@ def count_right(markers: Iterable[Marker], truth_px: dict[int, Array]) -> int:
 @pytest.mark.parametrize("name", LIGHTS)
 def test_edges_in_uneven_light_find_as_many_as_stock(name: str) -> None:
     score, by_stock = Score(), 0
-    for seed in range(3):
+    for seed in range(2):
         data, truth_px = lit_frame(VGA, LIGHTS[name].light, seed, length_m=SIDE_M, count=2)
         score.add(detect(VGA, data), truth_px, truth_px)
         by_stock += count_right(stock(data), truth_px)
@@ -111,13 +111,13 @@ def test_covariance_with_three_sides_holds_the_errors() -> None:
 
 def test_simulated_marker_with_glare_on_a_side_is_exact() -> None:
     """Glare is added to the picture, as light that saturates: another way than the drawing's."""
-    settings = LabSettings(stations=0, markers=3)
+    settings = LabSettings(stations=0, markers=3, width=960, height=540)
     camera = hang_cameras(settings)[0]
     drive = plan_drive(settings, [camera])
     places = [place(one, settings) for one in drive.places_at(1.0)]
     picture = render(prepare_view(camera, settings), places, settings, np.random.default_rng(0))
     truth_px = {p.id: true_corners(camera.lens, camera.camera_from_world, p) for p in places}
-    shown = {n: px for n, px in truth_px.items() if ((px > 20) & (px < [1900, 1060])).all()}
+    shown = {n: px for n, px in truth_px.items() if ((px > 20) & (px < [940, 520])).all()}
     assert shown
     levels = picture.astype(np.float64)
     y, x = np.mgrid[: levels.shape[0], : levels.shape[1]]
@@ -188,8 +188,8 @@ def test_partial_fit_is_never_that_of_another_marker() -> None:
     glare, _ = streak(300.0, 0.05)(VGA, one, np.random.default_rng(3))
     grey = draw(VGA, [one], Look(glare=glare))
     centre = one.centre_m / SIDE_M
-    fits = [fit_partly(grey, [Guess(n, one.axes, centre)], DICTIONARY, VGA) for n in range(100)]
-    assert [n for n, fit in enumerate(fits) if isinstance(fit, Fit)] == [5]
+    fits = [fit_partly(grey, [Guess(n, one.axes, centre)], DICTIONARY, VGA) for n in range(5, 100, 3)]
+    assert [isinstance(fit, Fit) for fit in fits] == [True] + [False] * (len(fits) - 1)
     noise = np.random.default_rng(0).integers(0, 255, grey.shape).astype(np.uint8)
     for empty in (np.full_like(grey, 150), noise):
         assert fit_partly(empty, [Guess(5, one.axes, centre)], DICTIONARY, VGA) is None

@@ -38,8 +38,8 @@ class Remarks:
         Raises
         ------
         IpsysError
-            For an ambiguous marker, where no frame can be decoded, or where no frame shows a marker of the
-            rig's.
+            For an ambiguous marker, where no frame can be decoded, or where no marker of the rig is in any
+            frame, or none that can be measured.
         """
         for message in messages:
             self._note(message)
@@ -77,10 +77,17 @@ class Remarks:
                 f"no marker of the rig is in any frame, but ids {', '.join(sorted(self._unknown))} are: add "
                 "them as [[markers]] to lab.toml and give it with --rig"
             )
+        rejected = self._events["rejected_marker"]
+        if rejected and not self._markers:
+            raise IpsysError(
+                f"no marker could be measured in {self._frames} frames, first: "
+                f"{_said(self._first['rejected_marker'])}: change the light or the place of the marker, or "
+                "print it on matt paper"
+            )
         if self._frames and not self._markers:
             raise IpsysError(
-                f"no marker was found in {self._frames} frames: were they printed from the dictionary in the "
-                "rig? Give the right one with --rig"
+                f"no marker was found in {self._frames} frames: are they printed from the dictionary in the "
+                "rig (give the right one with --rig), whole in the picture, in focus, and free of glare?"
             )
 
     def lines(self) -> tuple[str, ...]:

@@ -60,7 +60,8 @@ class Detect:
 
     Yields, for a frame, its :class:`Markers` and their drawing for viewers; or an :class:`Event`
     for a frame that cannot be decoded, or has suddenly another size than the lens. A marker id that
-    is seen twice in a frame, or is not in the rig, is left out and named by an event.
+    is seen twice in a frame, or is not in the rig, is left out and named by an event. A marker of the rig
+    that is seen and cannot be measured is named by an event with the reason, once for each reason.
 
     Parameters
     ----------
@@ -81,6 +82,7 @@ class Detect:
         self._following: dict[str | None, Follow] = {}
         self._videos: dict[str | None, Video] = {}
         self._said: dict[str | None, set[int | None]] = {}
+        self._rejected: set[tuple[str | None, int, str]] = set()
         # Cameras of which a frame has had the size of the lens.
         self._fitted: set[str | None] = set()
 
@@ -131,6 +133,7 @@ class Detect:
         self._fitted.add(message.camera)
         markers, events = _sift(found, self._rig, message)
         yield from self._unsaid(events)
+        yield from self._rejections(message, self._rig)
         yield Markers(message.publish_time_ns, markers, width, height)
         yield _drawing(message.publish_time_ns, markers)
 
@@ -183,6 +186,16 @@ class Detect:
                 yield event
             if event.kind == "unknown_marker":
                 said.add(event.marker_id)
+
+    def _rejections(self, message: Message, rig: Rig) -> Iterator[Event]:
+        """Name markers that are seen in a frame and cannot be measured, each reason once."""
+        following = self._following.get(message.camera)
+        for marker in following.rejections if following is not None else ():
+            said = message.camera, marker.id, marker.reason
+            if rig.knows(marker.id) and said not in self._rejected:
+                self._rejected.add(said)
+                text = f"{message.topic}: marker {marker.id} is seen and not measured: {marker.reason}"
+                yield Event(message.publish_time_ns, "rejected_marker", text, message.camera, marker.id)
 
 
 def check_corners(name: str) -> str:

@@ -68,10 +68,9 @@ _ALIKE = 1.7
 
 
 class Rejection(NamedTuple):
-    """A marker that is seen and cannot be measured, its corners (4, 2) in px, and the reason."""
+    """A marker that is seen and cannot be measured, and the reason, in words without figures that change."""
 
     id: int
-    corners_px: Array
     reason: str
 
 
@@ -244,20 +243,20 @@ class _Trial:
             return None
         if not agreement.clear:
             what = _hider(levels[0], view.prints)
-            return Rejection(self._id, corners_px[0], f"{what} hides too many of its cells")
+            return Rejection(self._id, f"{what} hides too many of its cells")
         cell_px = _width_px(corners_px[0]) / view.prints.cells
         if cell_px < _LEAST_CELL_PX:
-            reason = f"its cells are only {cell_px:.1f} px wide, and some of its edges are disturbed"
-            return Rejection(self._id, corners_px[0], reason)
+            reason = f"its cells are under {_LEAST_CELL_PX} px wide, and some of its edges are disturbed"
+            return Rejection(self._id, reason)
         weights = solved.weights[n]
         seen = [float(weights[side].sum() / side.sum()) for side in self._sides]
         lost = sum(share < _SEEN for share in seen)
         if lost > 1 or weights.sum() < _SEEN_OF_ALL * self._real.sum():
             where = f"{lost} of its 4 sides" if lost > 1 else "most of its edges"
-            return Rejection(self._id, corners_px[0], f"{_hider(levels[0], view.prints)} hides {where}")
+            return Rejection(self._id, f"{_hider(levels[0], view.prints)} hides {where}")
         covariance_px2 = self._covariance(solved, n, slopes[0])
         if solved.costs[n] > _COST or np.diag(covariance_px2).max() > _MOST_UNCERTAIN_PX**2:
-            return Rejection(self._id, corners_px[0], "its edges are too disturbed to fit a flat square")
+            return Rejection(self._id, "its edges are too disturbed to fit a flat square")
         pose = Guess(self._id, state.poses.rotations[n], state.poses.centres[n])
         spread_px = float(np.sqrt(solved.variance_px2(n)))
         offset_px = float(solved.unknowns[n, 6])

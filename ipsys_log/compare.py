@@ -12,9 +12,9 @@ import numpy as np
 from numpy.typing import NDArray
 
 from ipsys_log.messages import CameraPoints, Markers, Message, Positions, Tracks
-from ipsys_log.units import format_time
+from ipsys_log.units import NS_PER_S, format_time
 
-__all__ = ["Comparison", "Stored", "compare_channels"]
+__all__ = ["Comparison", "Extent", "Stored", "compare_channels", "explain_apart", "marker_ids"]
 
 Array = NDArray[np.float64]
 
@@ -42,6 +42,70 @@ class Comparison:
     @property
     def equal(self) -> bool:
         return self.left == self.right == self.same
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class Extent:
+    """The cameras, log times (n,) in ns ascending, and marker ids that one side of a comparison speaks of."""
+
+    cameras: frozenset[str]
+    times_ns: NDArray[np.int64]
+    ids: frozenset[int]
+
+
+def explain_apart(first: Extent, second: Extent) -> str | None:
+    """Return the reason why two sides have nothing in common that can be compared; None where they have.
+
+    Parameters
+    ----------
+    first, second : of what moves, frame by frame.
+    """
+    if not (len(first.times_ns) and len(second.times_ns)):
+        side = "second" if len(first.times_ns) else "first"
+        text = f"the {side} has no markers, points, positions or tracks: run 'ipsys replay' on its log"
+        return text if len(first.times_ns) or len(second.times_ns) else None
+    if first.cameras and second.cameras and not first.cameras & second.cameras:
+        sides = _names(first.cameras), _names(second.cameras)
+        return f"no camera in common: the first has {sides[0]}, the second {sides[1]}"
+    reason = _explain_times(first, second)
+    if reason is None and first.ids.isdisjoint(second.ids):
+        return f"no marker id in common: the first has {_names(first.ids)}, the second {_names(second.ids)}"
+    return reason
+
+
+def _explain_times(first: Extent, second: Extent) -> str | None:
+    """Return the reason why two sides have no frame in common; None where they have one."""
+    advice = "Compare logs of one recording"
+    if first.times_ns[-1] < second.times_ns[0] or second.times_ns[-1] < first.times_ns[0]:
+        sides = _range(first), _range(second)
+        return f"the time ranges do not overlap: the first has {sides[0]}, the second {sides[1]}. {advice}"
+    if not len(np.intersect1d(first.times_ns, second.times_ns)):
+        return (
+            "no frame in common: the time ranges overlap, but no two frames have the same log time. The "
+            f"nearest differ by {_nearest_ns(first, second) / NS_PER_S:.6f} s. {advice}"
+        )
+    return None
+
+
+def marker_ids(payload: Any) -> set[int]:
+    """Return the ids of the markers in a message of a run."""
+    return set(_values(payload))
+
+
+def _names(values: Iterable[Any]) -> str:
+    return ", ".join(map(str, sorted(values))) or "none"
+
+
+def _range(extent: Extent) -> str:
+    return f"{format_time(int(extent.times_ns[0]))} to {format_time(int(extent.times_ns[-1]))}"
+
+
+def _nearest_ns(first: Extent, second: Extent) -> int:
+    """Return the least difference between a time of one side and a time of the other."""
+    after = np.searchsorted(second.times_ns, first.times_ns).clip(1, len(second.times_ns) - 1)
+    before_ns, after_ns = second.times_ns[after - 1], second.times_ns[after]
+    nearest = np.minimum(np.abs(first.times_ns - before_ns), np.abs(first.times_ns - after_ns))
+    return int(nearest.min())
 
 
 # A message, and the bytes of its payload.

@@ -47,6 +47,8 @@ TRUTH_TOPIC = "/truth/tracks"
 
 # The kind of an event whose timestamp is the log time of a frame that no stage has seen when it was recorded.
 FRAME_SKIPPED = "frame_skipped"
+# The kind of an event that frames of a camera came late, and have their time of arrival.
+STAMP_UNRELIABLE = "stamp_unreliable"
 
 
 def image_topic(camera: str) -> str:
@@ -310,13 +312,19 @@ class Tracks:
 
 @dataclass(frozen=True, slots=True)
 class Event:
-    """Something that a reader of the log must know of, such as a corrupt frame."""
+    """Something that a reader of the log must know of, such as a corrupt frame.
+
+    ``start`` and ``end`` are the first and the last time of frames that an event of kind ``stamp_unreliable``
+    speaks of; without an end that is still to come.
+    """
 
     timestamp: TimeNs
     kind: str
     text: str
     camera: str | None = None
     marker_id: int | None = None
+    start: TimeNs | None = None
+    end: TimeNs | None = None
 
 
 @dataclass(frozen=True, slots=True)

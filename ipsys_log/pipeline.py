@@ -40,6 +40,7 @@ from threadpoolctl import threadpool_limits
 from ipsys_log.errors import IpsysError, LogError
 from ipsys_log.log.session import Session
 from ipsys_log.messages import (
+    EVENTS_TOPIC,
     CameraPoints,
     Evaluation,
     Event,
@@ -337,7 +338,7 @@ def _put_through(
             if message is TICK:
                 continue
             watch(message)
-            if type(message.payload) in TOPICS:
+            if type(message.payload) in TOPICS and message.topic != EVENTS_TOPIC:  # those are written already
                 log.put(message)
                 entry = ledger.entry(message)
                 if entry is not None:

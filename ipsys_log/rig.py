@@ -6,7 +6,7 @@ import json
 import math
 import re
 import tomllib
-from collections.abc import Iterable, Mapping
+from collections.abc import Collection, Iterable, Mapping
 from dataclasses import MISSING, fields, replace
 from difflib import get_close_matches
 from importlib.resources import files
@@ -22,6 +22,7 @@ __all__ = [
     "STAMPS",
     "check_name",
     "check_rig",
+    "check_rig_cameras",
     "example_toml",
     "hide_password",
     "hide_passwords",
@@ -33,6 +34,11 @@ Item = TypeVar("Item")
 
 # Markers are carried below the cameras; what is greater was meant in cm.
 _HIGHEST_M = 5.0
+_FARTHEST = 1e6  # m, px, s or Hz: no number of a lab is larger
+_LARGEST_INT = {"_ns": 2**62}  # by what a name ends with
+_LARGEST_ID = 2**31 - 1
+_LARGEST_FILE = 1 << 18  # bytes
+_LONGEST_LINE = 120  # characters of a line that an error repeats
 
 # What the time that a driver gives a frame can mean.
 STAMPS = ("start", "end")
@@ -63,6 +69,37 @@ def check_name(name: str, what: str) -> str:
     if not _NAME.fullmatch(name):
         raise IpsysError(f"{what} {name!r} must be small letters, digits and _, starting with a letter")
     return name
+
+
+def check_rig_cameras(rig: Rig, cameras: Collection[str], where: str) -> list[str]:
+    """See that a rig describes the cameras that it is used for.
+
+    Parameters
+    ----------
+    rig : without any camera it suits all.
+    cameras : names in the log or the pictures.
+    where : the rig file, for the message.
+
+    Returns
+    -------
+    A remark where some cameras are not described.
+
+    Raises
+    ------
+    IpsysError
+        Where the rig describes only other cameras.
+    """
+    described = [camera.name for camera in rig.cameras]
+    missing = sorted(set(cameras) - set(described))
+    if not described or not missing:
+        return []
+    if len(missing) == len(set(cameras)):
+        raise IpsysError(
+            f"{where}: describes the cameras {', '.join(described)}, but there are only "
+            f"{', '.join(missing)}. Give the rig of these, rename its cameras, or take out its [[cameras]]"
+        )
+    named = ", ".join(missing)
+    return [f"{where}: does not describe camera {named}; defaults are used, such as no rolling shutter"]
 
 
 def example_toml() -> str:
@@ -131,6 +168,8 @@ def load_rig(path: Path) -> Rig:
         that was meant in another unit.
     """
     try:
+        if path.stat().st_size > _LARGEST_FILE:
+            raise IpsysError(f"{path}: is too large for a rig file; write one with: ipsys init lab.toml")
         table = tomllib.loads(path.read_text(encoding="utf-8"))
     except OSError as error:
         raise IpsysError(f"{path}: cannot be read: {error.strerror}") from error
@@ -138,6 +177,11 @@ def load_rig(path: Path) -> Rig:
         raise IpsysError(f"{path}: is not a text file; write one with: ipsys init {path}") from error
     except tomllib.TOMLDecodeError as error:
         raise IpsysError(_not_toml(path, error)) from error
+    except (ValueError, RecursionError) as error:  # a number or nesting that Python's reader gives up on
+        raise IpsysError(
+            f"{path}: a number has thousands of digits, or tables lie thousands deep in one another; "
+            f"write a rig file with: ipsys init {path.name}"
+        ) from error
     for key, item in _ITEMS.items():
         rows = table.get(key, [])
         if not isinstance(rows, list):
@@ -156,7 +200,8 @@ def _not_toml(path: Path, error: tomllib.TOMLDecodeError) -> str:
     """What is wrong with a line, with the slips that are made most."""
     text = f"{path}: is not valid TOML: {error}"
     found = re.search(r"at line (\d+)", str(error))
-    line = path.read_text(encoding="utf-8").splitlines()[int(found[1]) - 1].strip() if found else ""
+    lines = path.read_text(encoding="utf-8").split("\n")
+    line = lines[int(found[1]) - 1].strip()[:_LONGEST_LINE] if found else ""
     if comma := re.search(r"= *(\d+),(\d+)\s*(#.*)?$", line):
         return f"{text}: {line}: a decimal comma? Write {comma[1]}.{comma[2]}"
     if bare := re.search(r"= *([^\s\"'\[{0-9][^#]*?)\s*(#.*)?$", line):
@@ -191,7 +236,17 @@ def check_rig(rig: Rig, where: str) -> Rig:
     _check_cameras(rig, where)
     _check_tape(rig, where)
     _check_heights(rig, where)
+    for item in (rig, rig.floor, *rig.markers, *rig.cameras, *rig.reference_points):
+        _check_numbers(item, where)
     return rig
+
+
+def _check_numbers(item: Any, where: str) -> None:
+    """Refuse numbers that are in no lab, before one of them spoils a computation."""
+    for field in fields(item) if item is not None else ():
+        value = getattr(item, field.name)
+        if isinstance(value, float) and not abs(value) <= _FARTHEST:
+            raise IpsysError(f"{where}: {field.name} is {value:g}; give a number of at most {_FARTHEST:.0f}")
 
 
 def _check_cameras(rig: Rig, where: str) -> None:
@@ -262,11 +317,21 @@ def _build(item: type[Item], row: Any, where: str) -> Item:
 def _value(kind: str, value: Any, where: str) -> Any:
     if kind.startswith("float"):
         if isinstance(value, bool) or not isinstance(value, (int, float)):
-            raise IpsysError(f"{where} must be a number, found {value!r}")
+            raise IpsysError(f"{where} must be a number, found {_shown(value)}")
+        if not abs(value) <= _FARTHEST:
+            raise IpsysError(f"{where} is {_shown(value)}; give a number of at most {_FARTHEST:.0f}")
         return float(value)
     if kind.startswith("int"):
         if isinstance(value, bool) or not isinstance(value, int) or value < 0:
-            raise IpsysError(f"{where} must be a whole number of at least 0, found {value!r}")
+            raise IpsysError(f"{where} must be a whole number of at least 0, found {_shown(value)}")
+        if value > (largest := _LARGEST_INT.get(where[-3:], _LARGEST_ID)):
+            raise IpsysError(f"{where} is {_shown(value)}; give a whole number of at most {largest}")
     elif kind.startswith("str") and not isinstance(value, str):
-        raise IpsysError(f"{where} must be text in quotes, found {value!r}")
+        raise IpsysError(f"{where} must be text in quotes, found {_shown(value)}")
     return value
+
+
+def _shown(value: Any) -> str:
+    """A value as an error repeats it."""
+    text = repr(value)
+    return text if len(text) <= _LONGEST_LINE else f"{text[:_LONGEST_LINE]} ..."

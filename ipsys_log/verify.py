@@ -7,9 +7,10 @@ from collections.abc import Callable, Collection, Iterator, Sequence
 from dataclasses import replace
 from pathlib import Path
 
+import numpy as np
 from threadpoolctl import threadpool_limits
 
-from ipsys_log.compare import Comparison, Stored, compare_channels
+from ipsys_log.compare import Comparison, Extent, Stored, compare_channels, explain_apart, marker_ids
 from ipsys_log.errors import IpsysError
 from ipsys_log.log.codec import encode
 from ipsys_log.log.session import Session
@@ -23,17 +24,20 @@ from ipsys_log.messages import (
     Model,
     Positions,
     Run,
+    Tracks,
 )
 from ipsys_log.pipeline import carry_out
 from ipsys_log.runs.request import Progress, Request
 from ipsys_log.runs.tasks import Task, plan_stage
 from ipsys_log.stages.camera_frame import PERIMETER
 
-__all__ = ["diff", "verify"]
+__all__ = ["diff", "explain_diff", "verify"]
 
 # What a model's run has among its parameters if the model was fitted to places of the same log.
 _FITTED_HERE = {"train", "seed"}
 _MODELS = ("fit", "evaluate")
+# What comes frame by frame.
+_MOVING = (Markers, CameraPoints, Positions, Tracks)
 
 
 def verify(
@@ -108,15 +112,39 @@ def diff(left: Path, right: Path, runs: tuple[str | None, str | None]) -> list[C
         Where a run is not there, or there is nothing that both have.
     """
     with Session([left]) as one, Session([right]) as other:
-        names = [_run_names(one, runs[0]), _run_names(other, runs[1])]
-        both = names[0] & names[1] if runs[0] is None else names[0]
-        if not both:
-            raise IpsysError(
-                f"{left} and {right} have no run of one name (see 'ipsys runs'); say which with --run"
-            )
-        ours = _derived(one, both, None)
-        theirs = _derived(other, both if runs[1] is None else names[1], runs[0])
+        first, second = _compared_runs(one, other, runs)
+        ours, theirs = _derived(one, first, None), _derived(other, second, runs[0])
         return compare_channels(ours, theirs)
+
+
+def explain_diff(left: Path, right: Path, runs: tuple[str | None, str | None]) -> str | None:
+    """Return the reason why two logs or two runs have nothing in common that can be compared; None where
+    they have something. The parameters are those of `diff`."""
+    with Session([left]) as one, Session([right]) as other:
+        first, second = _compared_runs(one, other, runs)
+        return explain_apart(_extent(one, first), _extent(other, second))
+
+
+def _compared_runs(
+    one: Session, other: Session, runs: tuple[str | None, str | None]
+) -> tuple[set[str], set[str]]:
+    names = [_run_names(one, runs[0]), _run_names(other, runs[1])]
+    both = names[0] & names[1] if runs[0] is None else names[0]
+    if not both:
+        raise IpsysError(
+            f"{one} and {other} have no run of one name (see 'ipsys runs'); say which with --run"
+        )
+    return both, both if runs[1] is None else names[1]
+
+
+def _extent(session: Session, runs: Collection[str]) -> Extent:
+    topics = [topic for run in runs for payload in _MOVING for topic in session.topics(payload, run)]
+    cameras, times_ns, ids = set(), set(), set()
+    for message in session.messages(topics):
+        times_ns.add(message.log_time_ns)
+        ids |= marker_ids(message.payload)
+        cameras |= {message.camera} - {None}
+    return Extent(frozenset(map(str, cameras)), np.array(sorted(times_ns), dtype=np.int64), frozenset(ids))
 
 
 def _run_names(session: Session, wanted: str | None) -> set[str]:

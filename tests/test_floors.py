@@ -11,7 +11,7 @@ import pytest
 PACKAGE = Path(__file__).resolve().parent.parent / "ipsys_log"
 
 FLOORS = {
-    "errors": 0, "messages": 0, "rig": 0, "rig_slips": 0, "units": 0,
+    "errors": 0, "messages": 0, "plain_text": 0, "rig": 0, "rig_slips": 0, "units": 0,
     "geometry": 1,
     "models": 2, "log": 2,
     "stages": 3, "offline": 3, "calibration": 3, "measuring": 3, "sources": 3, "sinks": 3, "formats": 3,

@@ -22,6 +22,7 @@ from ipsys_log.measuring.entry import Typed, read_typed
 from ipsys_log.measuring.scene import look
 from ipsys_log.messages import (
     FRAME_SKIPPED,
+    STAMP_UNRELIABLE,
     CameraCalibration,
     CompressedImage,
     Evaluation,
@@ -30,6 +31,7 @@ from ipsys_log.messages import (
     Markers,
     Measurement,
     Message,
+    Positions,
     Run,
     Tracks,
 )
@@ -308,6 +310,71 @@ def test_a_frame_that_was_exchanged_is_found(recorded: Path, tmp_path: Path) -> 
     )
     with pytest.raises(IpsysError, match=r"run edges was made from .* is out of date"):
         again(log)
+
+
+class Jumping(Clock):
+    """A clock that goes ahead at once, as that of a recorder that stood still meanwhile."""
+
+    ahead_ns = 0
+
+    def now_ns(self) -> int:
+        return super().now_ns() + self.ahead_ns
+
+
+@pytest.fixture(scope="session")
+def stalled(lab_log: Path, calibration: Path, tmp_path_factory: pytest.TempPathFactory) -> Path:
+    """Recorded from cameras without stamps by a program that stood still for 2 s after their tenth frame."""
+    target, clock = tmp_path_factory.mktemp("stalled") / "live.mcap", Jumping()
+    frames = {name: [*found[:10], *found[9:0:-1], *found[:10]] for name, found in sent(lab_log).items()}
+
+    def stand_still(camera: str, number: int) -> None:
+        if (camera, number) == (min(frames), 10):
+            clock.ahead_ns = 2_000_000_000
+
+    with Session([lab_log]) as session:
+        (rig,) = session.payloads(["/rig"])
+    attached = Attached(cameras(*frames), playing(frames, RATE_HZ, False, stand_still), clock)
+    settings = first_messages(rig, lenses(lab_log), attached.now_ns)
+    with attached:
+        pipeline.live(attached, settings, target, Request(model_from=calibration))
+    return target
+
+
+def test_live_with_late_frames_equals_replay(stalled: Path, calibration: Path) -> None:
+    found = again(stalled)
+    assert "/runs/poly/tracks" in {one.topic for one in found}
+    assert all(one.equal and one.left > 0 for one in found)
+    before = stalled.read_bytes()
+    outcomes = pipeline.replay([stalled], Request(model_from=calibration, as_live=True))
+    assert not any(one.fresh for one in outcomes)
+    assert stalled.read_bytes() == before
+
+
+def test_late_frames_are_named_and_in_no_track(stalled: Path) -> None:
+    with Session([stalled]) as session:
+        events = [e for e in session.payloads(["/events"]) if e.kind == STAMP_UNRELIABLE]
+        tracks = session.payloads(["/runs/poly/tracks"])
+        positions = list(session.messages(session.topics(Positions, "poly")))
+        (fused,) = (run for run in session.runs() if run.stage == "fuse")
+    ends = {event.camera: event.end for event in events if event.end is not None}
+    assert set(ends) == {event.camera for event in events} == {"black", "red", "white"}
+    late = {
+        m.publish_time_ns
+        for m in positions
+        for e in events
+        if e.camera == m.camera and e.start <= m.publish_time_ns <= ends[e.camera]
+    }
+    assert {one.timestamp for one in tracks} == {m.publish_time_ns for m in positions} - late
+    assert 3 <= len(late) < len(positions) - 3
+    assert "/events" in {read.topic for read in fused.inputs}
+
+
+def test_runs_of_logs_without_late_frames_read_no_events(overloaded: Path) -> None:
+    """They are the same runs as before there was such an event."""
+    with Session([overloaded]) as session:
+        assert session.count("/events") > 0
+        read = {read.topic for run in session.runs() for read in run.inputs if run.stage == "fuse"}
+    assert read == {"/rig"} | {topic for topic in read if topic.endswith("/positions")}
 
 
 @cache

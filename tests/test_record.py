@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import os
 import re
 import signal
 import subprocess
@@ -96,7 +97,8 @@ def test_frames_are_recorded_as_they_came_for_so_many_seconds(
         assert found[name] == [jpegs[(first + n) % 30] for n in range(len(found[name]))]
     with Session([tmp_path / "a.mcap"]) as session:
         assert session.payloads(["/rig"]) == [load_rig(rig)]
-        said = {event.text for event in session.payloads(session.topics(Event))}
+        events = session.payloads(session.topics(Event))
+        said = {event.text for event in events if event.kind == "camera_setting"}
     assert said == {
         f"camera {name}: sends no capture stamps; its frames get their time of arrival" for name in NAMES
     }
@@ -321,6 +323,48 @@ def test_recorder_killed_at_once_keeps_rig_and_lenses(ipsys: Ipsys, tmp_path: Pa
         assert session.payloads(["/rig"]) == [load_rig(rig)]
         (lens,) = session.payloads([session.calibrations["red"]])
     assert (lens.width, lens.K[0, 0]) == (640, 300.0)
+
+
+def test_recorder_that_stood_still_names_its_late_frames(
+    pictures: tuple[Path, list[bytes]], tmp_path: Path
+) -> None:
+    """Each picture says by its place in the loop when it was sent."""
+    log, (video, jpegs) = tmp_path / "a.mcap", pictures
+    with streams(video, tmp_path) as rig:
+        program = started("record", "--rig", rig, "-o", log)
+        wait_for(log, 500_000)
+        program.send_signal(signal.SIGSTOP)
+        os.waitid(os.P_PID, program.pid, os.WSTOPPED | os.WNOWAIT)
+        stopped_s = time.monotonic()
+        size = log.stat().st_size
+        while time.monotonic() < stopped_s + 1.5:
+            time.sleep(0.05)
+        program.send_signal(signal.SIGCONT)
+        wait_for(log, size + 2_000_000)
+        program.send_signal(signal.SIGINT)
+        _, err = program.communicate(timeout=20)
+    assert program.returncode == 0, err
+    with Session([log]) as session:
+        events = [e for e in session.payloads(["/events"]) if e.kind == "stamp_unreliable"]
+        images = {name: session.payloads([topic]) for name, topic in session.images.items()}
+    for name in NAMES:
+        ranges = [(e.start, e.end) for e in events if e.camera == name and e.end is not None]
+        assert any(end - start > 1.4e9 for start, end in ranges), err
+        late = late_by_s(images[name], jpegs)
+        unnamed = [
+            seconds
+            for image, seconds in zip(images[name], late, strict=True)
+            if not any(start <= image.timestamp <= end for start, end in ranges)
+        ]
+        assert max(late) > 0.8, "nothing came late: the test shows nothing"
+        assert max(unnamed) < 0.5
+
+
+def late_by_s(images: list[CompressedImage], jpegs: list[bytes]) -> list[float]:
+    """How much later than the first one each picture came than it was sent, at 30/s; none lost."""
+    first = jpegs.index(images[0].data)
+    assert [image.data for image in images] == [jpegs[(first + n) % 30] for n in range(len(images))]
+    return [(image.timestamp - images[0].timestamp) / 1e9 - n / 30 for n, image in enumerate(images)]
 
 
 def test_a_full_disk_ends_it_with_a_complete_log(

@@ -14,7 +14,17 @@ from scipy.spatial.transform import Rotation
 
 from ipsys_log.calibration.lens_models import LensModel, project_points
 
-__all__ = ["Corners", "Fit", "Normal", "adjust", "camera_points", "normal_equations", "residuals"]
+__all__ = [
+    "Corners",
+    "Fit",
+    "Normal",
+    "adjust",
+    "camera_points",
+    "corner_weights",
+    "normal_equations",
+    "reduce_to_lens",
+    "residuals",
+]
 
 Array = NDArray[np.float64]
 
@@ -91,6 +101,11 @@ def _weights(missed_px: Array, scale_px: float | None) -> tuple[Array, float]:
     return 1 / (1 + ratio), float(scale_px**2 * np.log1p(ratio).sum())
 
 
+def corner_weights(missed_px: Array, scale_px: float | None) -> Array:
+    """Return the weight of each corner, (n,): 1, or less for one that is far off."""
+    return _weights(missed_px, scale_px)[0]
+
+
 def _cost(model: LensModel, fit: Fit, corners: Corners, scale_px: float | None) -> float:
     return _weights(residuals(model, fit, corners), scale_px)[1] + float(model.pull @ fit.lens**2)
 
@@ -119,6 +134,15 @@ def normal_equations(
         (basis.T * model.pull) @ basis,
         basis.T @ (model.pull * fit.lens),
     )
+
+
+def reduce_to_lens(normal: Normal) -> tuple[Array, Array]:
+    """Return the equations of the lens without the poses: matrices (f, q, q) and gradients (f, q)."""
+    gradients = normal.pose_gradient[..., None]
+    solved = np.linalg.solve(normal.poses, np.concatenate([normal.between, gradients], axis=2))
+    transposed = normal.between.transpose(0, 2, 1)
+    matrices = normal.lens - transposed @ solved[:, :, :-1]
+    return matrices, normal.lens_gradient - (transposed @ solved[:, :, -1:])[..., 0]
 
 
 def _solve(normal: Normal, damping: float) -> tuple[Array, Array]:

@@ -9,13 +9,16 @@ import numpy as np
 from numpy.typing import NDArray
 
 from ipsys_log.calibration.boards import Board
-from ipsys_log.calibration.bundle import Corners, camera_points
+from ipsys_log.calibration.bundle import Corners, Fit, camera_points
 from ipsys_log.calibration.choose import Dropped, choose
 from ipsys_log.calibration.lens_models import LensModel
 from ipsys_log.calibration.look import Looked
 from ipsys_log.calibration.picture_coverage import Coverage, advice, measure_coverage
 from ipsys_log.calibration.sighting import Sighting
-from ipsys_log.calibration.solve import Solved, solve, tells_focal_length
+from ipsys_log.calibration.solve import Solved, rms_px, solve, tells_focal_length
+from ipsys_log.calibration.start import find_start
+from ipsys_log.calibration.two_cameras import find_two_cameras
+from ipsys_log.calibration.usable import MOST_RMS_PX, find_better_model, two_cameras_fault
 from ipsys_log.errors import IpsysError
 from ipsys_log.messages import CameraCalibration
 
@@ -23,7 +26,9 @@ __all__ = ["LEAST_PICTURES", "Calibrated", "calibrate"]
 
 Array = NDArray[np.float64]
 
-LEAST_PICTURES = 6
+LEAST_PICTURES = 5
+# Fewer than this tell nothing, even to a user who insists.
+_LEAST_INSISTED = 3
 # A focal length less sure than this is said to be so; coefficients are worth nothing beyond theirs.
 _UNSURE = 0.02
 _UNTOLD = 1.0
@@ -31,6 +36,8 @@ _UNTOLD = 1.0
 _OFF_PX = 1.0
 # Nor is a focal length a result that is no better known than this.
 _UNKNOWN = 0.1
+# Another grid in more pictures than this share is remarked on.
+_MANY_OTHERS = 0.2
 # Edges wider than this, in all pictures, are a camera in the dark or out of focus.
 _SOFT_PX = 2.5
 
@@ -50,6 +57,7 @@ class Calibrated:
     used : names and RMS in px of the pictures that the lens rests on.
     dropped : pictures with the board that were left out because they are bad, and why.
     spare : good pictures that show nothing new.
+    unseen : pictures in which the board was not seen, and what was.
     far_corners : single corners left out of pictures used.
     coverage, notes : where the board was, and what to do better.
     pixels, residuals_px : (n, 2), of all corners used.
@@ -68,6 +76,7 @@ class Calibrated:
     used: tuple[tuple[str, float], ...]
     dropped: tuple[Dropped, ...]
     spare: tuple[Dropped, ...]
+    unseen: tuple[Dropped, ...]
     far_corners: int
     coverage: Coverage
     notes: tuple[str, ...]
@@ -75,62 +84,121 @@ class Calibrated:
     residuals_px: Array
 
 
-def calibrate(camera: str, looked: Looked, board: Board, model: LensModel) -> Calibrated:
+def calibrate(
+    camera: str, looked: Looked, board: Board, model: LensModel, insist: bool = False
+) -> Calibrated:
     """The lens that the pictures tell.
+
+    Parameters
+    ----------
+    camera, looked, board, model : whose lens, what was seen of which board, and the kind of lens.
+    insist : whether to return a result that is too poor to use; a note then says why.
 
     Raises
     ------
     IpsysError
-        Where too few pictures are of use; it says what to add.
+        Where too few pictures are of use, they are of two cameras, or the lens misses the corners by far; it
+        says what to do.
     """
     chosen = choose(looked.sightings, board, looked.size_px)
     used = chosen.used
     bad = [*looked.unreadable, *chosen.bad]
-    _check_enough(camera, used, bad, looked)
+    faults = [_few_pictures(camera, used, bad, looked, insist)]
     corners = Corners(
         np.concatenate([board.points_m(s.ids) for s in used]),
         np.concatenate([s.pixels for s in used]),
         np.repeat(np.arange(len(used)), [len(s.ids) for s in used]),
         len(used),
     )
-    solved = _solved(camera, model, corners, looked.size_px)
+    start = _start(camera, model, corners, looked.size_px)
+    faults.append(_two_cameras(model, start, corners, used, looked.size_px))
+    _refuse(camera, faults, insist)
+    solved = _solved(camera, model, corners, looked.size_px, start)
     bad += [Dropped(used[left.picture].name, left.reason) for left in solved.left]
-    used = [used[n] for n in solved.pictures]
-    _check_enough(camera, used, bad, looked)
-    return _judged(camera, model, looked, used, solved, bad, chosen.spare)
+    kept = [used[n] for n in solved.pictures]
+    faults.append(_far_off(model, solved, corners, looked.size_px))
+    _refuse(camera, faults, insist)
+    faults.append(_few_pictures(camera, kept, bad, looked, insist))
+    notes = tuple(f"written only for --force: {fault}" for fault in faults if fault)
+    return _judged(camera, model, looked, kept, solved, bad, chosen.spare, notes)
 
 
-def _solved(camera: str, model: LensModel, corners: Corners, size_px: tuple[int, int]) -> Solved:
-    alike = IpsysError(
+def _refuse(camera: str, faults: list[str], insist: bool) -> None:
+    for fault in faults:
+        if fault and not insist:
+            raise IpsysError(f"camera {camera}: {fault}; or give --force")
+
+
+def _start(camera: str, model: LensModel, corners: Corners, size_px: tuple[int, int]) -> Fit:
+    try:
+        return find_start(model, corners, size_px)
+    except np.linalg.LinAlgError as error:
+        raise _alike(camera) from error
+
+
+def _alike(camera: str) -> IpsysError:
+    return IpsysError(
         f"camera {camera}: the pictures do not tell the lens, for they show the board in too few ways; "
         "tilt it to all sides, and hold it near and far and all over the image"
     )
+
+
+def _solved(camera: str, model: LensModel, corners: Corners, size_px: tuple[int, int], start: Fit) -> Solved:
     try:
-        solved = solve(model, corners, size_px)
+        solved = solve(model, corners, size_px, start)
     except np.linalg.LinAlgError as error:
-        raise alike from error
+        raise _alike(camera) from error
     sigmas = np.sqrt(np.diag(solved.covariance))
     if not (np.isfinite(solved.fit.lens).all() and np.isfinite(sigmas).all()):
-        raise alike
+        raise _alike(camera)
     if (sigmas[:2] > _UNKNOWN * solved.fit.lens[:2]).any() or not tells_focal_length(solved):
-        raise alike
+        raise _alike(camera)
     return solved
 
 
-def _check_enough(camera: str, used: list[Sighting], bad: list[Dropped], looked: Looked) -> None:
+def _two_cameras(
+    model: LensModel, start: Fit, corners: Corners, used: list[Sighting], size_px: tuple[int, int]
+) -> str:
+    names = [sighting.name for sighting in used]
+    split = find_two_cameras(model, start, corners, names)
+    if split is None:
+        return ""
+    # A lens of another kind needs no second camera.
+    better = find_better_model(model, corners, size_px, split.one_px)
+    if better is not None and better.rms_px < split.two_px:
+        return ""
+    return f"{two_cameras_fault(split, names)}; put the pictures of each into a folder of its own"
+
+
+def _far_off(model: LensModel, solved: Solved, corners: Corners, size_px: tuple[int, int]) -> str:
+    left_px = rms_px(solved)
+    if left_px <= MOST_RMS_PX:
+        return ""
+    better = find_better_model(model, corners, size_px, left_px)
+    todo = "see that the board is flat and its size right, and that the pictures are of one camera"
+    if better is not None:
+        todo = f"--lens {better.name} leaves {better.rms_px:.2f} px: use it"
+    return f"corners are {left_px:.1f} px off (RMS), too far for a lens that can be used; {todo}"
+
+
+def _few_pictures(camera: str, used: list[Sighting], bad: list[Dropped], looked: Looked, insist: bool) -> str:
+    """Return what is wrong where pictures are too few, if the user insists on them; else raise it."""
     if len(used) >= LEAST_PICTURES:
-        return
-    reasons = Counter(reason.split(":")[0] for _, reason in bad)
+        return ""
+    reasons = Counter(reason.split(":")[0] for _, reason in (*bad, *looked.unseen))
     why = f" ({'; '.join(f'{n} x {reason}' for reason, n in reasons.most_common(3))})" if reasons else ""
     todo = ["take at least 15, with the board all over the image and tilted to all sides"]
     if used:
         pixels = np.concatenate([s.pixels for s in used])
         coverage = measure_coverage(pixels, looked.size_px, np.stack([s.outline for s in used]))
         todo += [line.split(":")[0] for line in advice(coverage)[:1]]
-    raise IpsysError(
-        f"camera {camera}: only {len(used)} of {looked.count} pictures can be used{why}, but a lens needs "
+    fault = (
+        f"only {len(used)} of {looked.count} pictures can be used{why}, but a lens needs "
         f"{LEAST_PICTURES} or more; {'; '.join(todo)}"
     )
+    if insist and len(used) >= _LEAST_INSISTED:
+        return fault
+    raise IpsysError(f"camera {camera}: {fault}")
 
 
 def _judged(
@@ -141,6 +209,7 @@ def _judged(
     solved: Solved,
     bad: list[Dropped],
     spare: list[Dropped],
+    forced: tuple[str, ...],
 ) -> Calibrated:
     lens = solved.fit.lens
     k = np.array([[lens[0], 0, lens[2]], [0, lens[1], lens[3]], [0, 0, 1.0]])
@@ -164,9 +233,10 @@ def _judged(
         tuple((s.name, float(rms)) for s, rms in zip(used, each_px, strict=True)),
         tuple(bad),
         tuple(spare),
+        looked.unseen,
         solved.far_corners,
         coverage,
-        (*advice(coverage), *_doubts(model, solved), *_softness(used)),
+        (*forced, *advice(coverage), *_unseen(looked), *_doubts(model, solved), *_softness(used)),
         solved.corners.pixels,
         solved.residuals_px,
     )
@@ -179,12 +249,21 @@ def _covered(looked: Looked, used: list[Sighting], solved: Solved) -> Coverage:
     return measure_coverage(solved.corners.pixels, looked.size_px, outlines, normals, points_m)
 
 
+def _unseen(looked: Looked) -> list[str]:
+    """Return a note where another grid than the board is seen in many pictures."""
+    others = Counter(reason for _, reason in looked.unseen if "instead" in reason)
+    if sum(others.values()) <= _MANY_OTHERS * looked.count:
+        return []
+    reason, count = others.most_common(1)[0]
+    return [f"in {count} of {looked.count} pictures {reason}: see that --board is right"]
+
+
 def _doubts(model: LensModel, solved: Solved) -> list[str]:
     """What the numbers themselves say against the lens."""
     lens, sigmas, notes = solved.fit.lens, np.sqrt(np.diag(solved.covariance)), []
-    rms_px = float(np.sqrt((solved.residuals_px**2).sum(axis=1).mean()))
-    if rms_px > _OFF_PX:
-        notes.append(f"corners are {rms_px:.1f} px off: see that the board is flat, or try another --lens")
+    left_px = rms_px(solved)
+    if left_px > _OFF_PX:
+        notes.append(f"corners are {left_px:.1f} px off: see that the board is flat, or try another --lens")
     unsure = float((sigmas[:2] / lens[:2]).max())
     if unsure > _UNSURE:
         notes.append(

@@ -1,48 +1,53 @@
-"""What pictures show where the board that was asked for is not in them."""
+"""Which board pictures show, where it is not the one that was asked for."""
 
 from __future__ import annotations
 
+from collections import Counter
 from collections.abc import Callable, Iterator, Sequence
 from dataclasses import replace
+from functools import partial
 
 import numpy as np
 
 from ipsys_log.calibration.boards import Board
-from ipsys_log.calibration.sighting import Grey, find_board
+from ipsys_log.calibration.charuco_size import estimate_charuco_size
+from ipsys_log.calibration.chessboard import fits_in
+from ipsys_log.calibration.sighting import Grey, find_board, view_board
 from ipsys_log.errors import IpsysError
 
-__all__ = ["check_whole", "hint"]
+__all__ = ["check_charuco_size", "check_chessboard_size", "hint"]
+
+# Columns and rows of inner corners.
+Size = tuple[int, int]
 
 # One dictionary of each kind: the smaller ones are its beginning.
 _DICTIONARIES = (
     "DICT_4X4_1000", "DICT_5X5_1000", "DICT_6X6_1000", "DICT_7X7_1000", "DICT_ARUCO_ORIGINAL",
     "DICT_APRILTAG_36h11",
 )  # fmt: skip
+# A grid is that of a board if most pictures show it; else if such a share of them does, and two or more.
+_MOST, _SUPPORT, _LEAST_SUPPORT = 0.5, 0.2, 2
+# What a user says is refused where more than this share of the pictures says otherwise.
+_CONTRADICTED = 0.5
+_FORCE = "if the size is right, give --force"
 
 
 def hint(pictures: Sequence[Grey], board: Board, trying: Callable[[int, int], None]) -> str:
-    """The end of a sentence that says which other board is seen, or what to look after.
+    """Return the end of a sentence that says which other board is seen, or what to look after.
 
     Parameters
     ----------
     pictures : to look at.
     board : that is not in them.
-    trying : called with the other boards tried so far, and all of them: it takes a while.
+    trying : called with the other kinds of board tried so far, and all of them: it takes a while.
     """
-    if board.marker_scale is not None:
-        mirrored = [np.ascontiguousarray(grey[:, ::-1]) for grey in pictures]
-        seen = sum(find_board("", grey, board, thorough=False) is not None for grey in mirrored)
-        if seen:
-            return (
-                f"; but in a mirror it is, in {seen} of {len(pictures)} tried: the pictures are mirrored, as "
-                "webcam programs do; turn that off, and take them again"
-            )
-    others = list(_others(board))
-    for number, (other, option) in enumerate(others):
-        trying(number, len(others))
-        seen = sum(find_board("", grey, other, thorough=False) is not None for grey in pictures)
-        if seen:
-            return f"; but {other} is seen in {seen} of {len(pictures)} tried: give {option}"
+    if board.marker_scale is not None and (mirrored := _mirrored(pictures, board)):
+        return mirrored
+    searches = list(_searches(pictures, board))
+    for number, search in enumerate(searches):
+        trying(number, len(searches))
+        if answer := search():
+            return answer
     if board.marker_scale is None:
         return (
             "; give the inner corners, one less than the squares in each direction, and see that the whole "
@@ -51,48 +56,135 @@ def hint(pictures: Sequence[Grey], board: Board, trying: Callable[[int, int], No
     return "; give columns x rows of its squares, and the --dictionary that its markers are of"
 
 
-def check_whole(pictures: Sequence[Grey], board: Board, where: str) -> None:
-    """See that a chessboard is not a part of a larger one: whichever part is found, changes.
+def check_chessboard_size(sizes: Sequence[Size | None], board: Board, where: str) -> None:
+    """See that most pictures do not show a larger chessboard than was asked for.
+
+    Parameters
+    ----------
+    sizes : of the largest grid in each picture.
+    board : a chessboard.
+    where : the pictures come from.
 
     Raises
     ------
     IpsysError
-        Naming the larger one.
+        It names the larger board, the one that explains most corners.
     """
-    for more in ((1, 1), (1, 0), (0, 1)) if board.marker_scale is None else ():
-        larger = replace(board, columns=board.columns + more[0], rows=board.rows + more[1])
-        seen = sum(find_board("", grey, larger, thorough=False) is not None for grey in pictures)
-        if 2 * seen > len(pictures):
-            raise IpsysError(
-                f"{where}: {board} is seen, and it is a part of {larger}: "
-                f"give --board {larger.columns}x{larger.rows}"
-            )
-
-
-def _others(board: Board) -> Iterator[tuple[Board, str]]:
-    columns, rows = board.columns, board.rows
-    if board.marker_scale is None:
-        for dc, dr in ((-1, -1), (1, 1), (-1, 0), (0, -1), (1, 0), (0, 1)):
-            if min(columns + dc, rows + dr) >= 3:
-                other = replace(board, columns=columns + dc, rows=rows + dr)
-                yield other, f"--board {other.columns}x{other.rows}"
-        yield replace(board, inverted=not board.inverted), _inversion(board)
+    larger = _largest_board([size for size in sizes if size is None or _exceeds(size, board.grid)])
+    seen = sum(size is not None for size in sizes)
+    count = sum(size is not None and _exceeds(size, board.grid) for size in sizes)
+    if larger is None or count <= _CONTRADICTED * seen:
         return
-    turned = replace(board, columns=rows, rows=columns)
-    option = f"--board charuco:{rows}x{columns}"
-    inverted = _inversion(board)
-    for change, said in ((board, ""), (turned, option)):
-        for dictionary in dict.fromkeys((board.dictionary, *_DICTIONARIES)):
-            named = f"--dictionary {dictionary}" if dictionary != board.dictionary else ""
-            for turn, how in ((board.inverted, ""), (not board.inverted, inverted)):
-                other = replace(change, dictionary=dictionary, inverted=turn)
-                if other != board:
-                    yield other, " and ".join(word for word in (said, named, how) if word)
-    # With as many inner corners, or as many squares: a part of the larger one would be seen, too.
-    for less in (0, 1):
-        if min(columns, rows) - less >= 3:
-            plain = replace(board, columns=columns - less, rows=rows - less, marker_scale=None)
-            yield plain, f"--board {plain.columns}x{plain.rows}"
+    other = _sized(board, larger)
+    shown = sum(_same(size, larger) for size in sizes)
+    raise IpsysError(
+        f"{where}: {board} is a part of {other}, which {shown} of {seen} pictures of a board show: "
+        f"give --board {other.columns}x{other.rows}; {_FORCE}"
+    )
+
+
+def check_charuco_size(pictures: Sequence[Grey], board: Board, where: str) -> None:
+    """See that markers lie as on a ChArUco board of the size that was asked for.
+
+    Raises
+    ------
+    IpsysError
+        It names the size that the markers tell.
+    """
+    size = estimate_charuco_size([_as_printed(grey, board) for grey in pictures], board.dictionary)
+    if size is None or size.pictures <= _CONTRADICTED * len(pictures):
+        return
+    if size.columns == board.columns and size.rows <= board.rows:
+        return
+    rows = max(size.rows, board.rows) if size.columns == board.columns else size.rows
+    raise IpsysError(
+        f"{where}: the markers are those of {replace(board, columns=size.columns, rows=rows)} or more, in "
+        f"{size.pictures} of {len(pictures)} pictures tried, not of {board.columns} x {board.rows}: "
+        f"give --board charuco:{size.columns}x{rows}; {_FORCE}"
+    )
+
+
+def _mirrored(pictures: Sequence[Grey], board: Board) -> str:
+    turned = [np.ascontiguousarray(grey[:, ::-1]) for grey in pictures]
+    seen = sum(find_board("", grey, board, thorough=False) is not None for grey in turned)
+    if not seen:
+        return ""
+    return (
+        f"; but in a mirror it is, in {seen} of {len(pictures)} tried: the pictures are mirrored, as "
+        "webcam programs do; turn that off, and take them again"
+    )
+
+
+def _searches(pictures: Sequence[Grey], board: Board) -> Iterator[Callable[[], str]]:
+    """Return the searches for other boards, the likely ones first."""
+    inverted = replace(board, inverted=not board.inverted)
+    chessboards = [partial(_other_chessboard, pictures, kind, board) for kind in (board, inverted)]
+    markers = [
+        partial(_other_charuco, pictures, replace(kind, dictionary=name), board)
+        for name in dict.fromkeys((board.dictionary, *_DICTIONARIES))
+        for kind in (board, inverted)
+    ]
+    yield from [*chessboards, *markers] if board.marker_scale is None else [*markers, *chessboards]
+
+
+def _other_chessboard(pictures: Sequence[Grey], kind: Board, board: Board) -> str:
+    plain = replace(kind, columns=3, rows=3, marker_scale=None)
+    sizes = [view_board("", grey, plain, thorough=True).grid for grey in pictures]
+    size = _largest_board(sizes)
+    if size is None:
+        return ""
+    other = _sized(plain if board.marker_scale is not None else kind, size)
+    if other == board:
+        return ""
+    seen = sum(_same(shown, size) for shown in sizes)
+    option = f"--board {other.columns}x{other.rows}"
+    turn = f" and {_inversion(board)}" if kind.inverted != board.inverted else ""
+    return f"; but {other} is seen in {seen} of {len(pictures)} tried: give {option}{turn}"
+
+
+def _other_charuco(pictures: Sequence[Grey], kind: Board, board: Board) -> str:
+    size = estimate_charuco_size([_as_printed(grey, kind) for grey in pictures], kind.dictionary)
+    if size is None:
+        return ""
+    scale = board.marker_scale if board.marker_scale is not None else 0.75
+    other = replace(kind, columns=size.columns, rows=size.rows, marker_scale=scale)
+    options = [f"--board charuco:{other.columns}x{other.rows}"]
+    options = [] if board.marker_scale and other.grid == board.grid else options
+    options += [f"--dictionary {kind.dictionary}"] if kind.dictionary != board.dictionary else []
+    options += [_inversion(board)] if kind.inverted != board.inverted else []
+    if not options:
+        return ""
+    said = " and ".join(options)
+    return f"; but {other} is seen in {size.pictures} of {len(pictures)} tried: give {said}"
+
+
+def _largest_board(sizes: Sequence[Size | None]) -> Size | None:
+    """Return the largest grid that enough pictures show: parts of a board are seen, too."""
+    counts = Counter((max(size), min(size)) for size in sizes if size is not None)
+    for size, count in counts.most_common(1):
+        if count > _MOST * counts.total():
+            return size
+    least = max(_LEAST_SUPPORT, _SUPPORT * counts.total())
+    often = [size for size, count in counts.items() if count >= least]
+    return max(often or counts, key=lambda size: size[0] * size[1], default=None)
+
+
+def _sized(board: Board, size: Size) -> Board:
+    """Return the board of another size, as long in the same direction."""
+    columns, rows = (max(size), min(size)) if board.columns >= board.rows else (min(size), max(size))
+    return replace(board, columns=columns, rows=rows)
+
+
+def _exceeds(size: Size, other: Size) -> bool:
+    return fits_in(other, size) and not _same(size, other)
+
+
+def _same(size: Size | None, other: Size) -> bool:
+    return size is not None and sorted(size) == sorted(other)
+
+
+def _as_printed(grey: Grey, board: Board) -> Grey:
+    return np.asarray(255 - grey, dtype=np.uint8) if board.inverted else grey
 
 
 def _inversion(board: Board) -> str:

@@ -5,40 +5,52 @@ from __future__ import annotations
 from collections import Counter
 from collections.abc import Callable, Iterable, Sequence
 from dataclasses import dataclass
+from typing import NamedTuple
 
 from ipsys_log.calibration.boards import Board
+from ipsys_log.calibration.chessboard import fits_in
 from ipsys_log.calibration.choose import Dropped
-from ipsys_log.calibration.hints import check_whole, hint
-from ipsys_log.calibration.sighting import Grey, Sighting, find_board
+from ipsys_log.calibration.hints import check_charuco_size, check_chessboard_size, hint
+from ipsys_log.calibration.sighting import Grey, Sighting, View, view_board
 from ipsys_log.errors import IpsysError
 
-__all__ = ["Looked", "NotSeenError", "look"]
+__all__ = ["Looked", "NotSeenError", "Size", "check_sizes", "look"]
 
 # Up to so many pictures are looked at thoroughly: more come from a video, which has others.
 _THOROUGH = 100
 _HINTED = 8
-_CHECKED = 3
+_CHECKED = 8
 # Pictures of another size are left out where so many are of one.
 _MOST_ARE = 0.75
+_SIZES_NAMED, _EXAMPLES = 4, 2
 
 
 class NotSeenError(IpsysError):
     """A board that is in none of the pictures."""
 
 
-# Width and height in px; of a picture.
+# Width and height in px.
 Size = tuple[int, int]
-Sized = tuple[str, Size]
 
 
 @dataclass(frozen=True, slots=True, eq=False)
 class Looked:
-    """What was seen of the board: pictures looked at, their size, the sightings, and what was unreadable."""
+    """What was seen of the board: pictures looked at, their size, the sightings, what was unreadable, and
+    pictures in which the board was not seen."""
 
     count: int
     size_px: tuple[int, int]
     sightings: tuple[Sighting, ...]
     unreadable: tuple[Dropped, ...]
+    unseen: tuple[Dropped, ...] = ()
+
+
+class _Seen(NamedTuple):
+    """One readable picture: its name, its size in px, and what of the board it shows."""
+
+    name: str
+    size: Size
+    view: View
 
 
 def look(
@@ -48,6 +60,7 @@ def look(
     where: str,
     progress: Callable[[int], None] = lambda done: None,
     trying: Callable[[int, int], None] = lambda done, total: None,
+    insist: bool = False,
 ) -> Looked:
     """Look for the board in all pictures.
 
@@ -59,67 +72,99 @@ def look(
     where : they come from, for messages.
     progress : called with the pictures done.
     trying : called with the other boards looked for, and all of them, where this one is not seen.
+    insist : whether the size of the board is right, whatever the pictures show.
 
     Raises
     ------
     IpsysError
-        Where pictures are of several sizes, none of which most are of; none can be read; or the board is a
-        part of what is seen.
+        Where pictures are of several sizes, none of which most are of; none can be read; or most pictures
+        show a larger board.
     NotSeenError
         Where the board is in none of them; it says what is.
     """
     count = 0
-    sizes: list[Sized] = []
-    sightings: list[tuple[Size, Sighting]] = []
+    views: list[_Seen] = []
     unreadable: list[Dropped] = []
-    some: list[Grey] = []
-    shown: list[Grey] = []
+    without, shown = _Sample(_HINTED, total), _Sample(_CHECKED, total)
     for name, grey in pictures:
         count += 1
         if grey is None:
             unreadable.append(Dropped(name, "cannot be read"))
             continue
-        size = (grey.shape[1], grey.shape[0])
-        sizes.append((name, size))
-        sighting = find_board(name, grey, board, thorough=0 < total <= _THOROUGH)
-        if sighting is not None:
-            sightings.append((size, sighting))
-            shown += [grey] if len(shown) < _CHECKED else []
-        elif not sightings:
-            _remember(some, grey, count, total)
+        view = view_board(name, grey, board, thorough=0 < total <= _THOROUGH)
+        views.append(_Seen(name, (grey.shape[1], grey.shape[0]), view))
+        (without if view.sighting is None else shown).add(grey)
         progress(count)
-    if not sizes:
+    if not views:
         raise IpsysError(f"{where}: none of {count} pictures can be read")
-    usual, strange = _usual_size(sizes, where)
-    if not sightings:
-        found = hint(some, board, trying)
+    usual = check_sizes([(one.name, one.size) for one in views], where)
+    if all(one.view.sighting is None for one in views):
+        found = hint(without.pictures, board, trying)
         raise NotSeenError(f"{where}: {board} is not seen in any of {count} pictures{found}")
-    check_whole(shown, board, where)
-    seen = tuple(sighting for size, sighting in sightings if size == usual)
-    return Looked(count, usual, seen, (*unreadable, *strange))
+    if not insist and board.marker_scale is None:
+        check_chessboard_size([one.view.grid for one in views], board, where)
+    elif not insist:
+        check_charuco_size(shown.pictures, board, where)
+    ordinary = [one for one in views if one.size == usual]
+    seen = [one.view.sighting for one in ordinary if one.view.sighting is not None]
+    unseen = [Dropped(one.name, _reason(one.view, board)) for one in ordinary if one.view.sighting is None]
+    return Looked(count, usual, tuple(seen), (*unreadable, *_strange(views, usual)), tuple(unseen))
 
 
-def _usual_size(sizes: Sequence[Sized], where: str) -> tuple[Size, list[Dropped]]:
-    """The size that most pictures have, and the few of another; an error where these are not few."""
-    usual, many = Counter(size for _, size in sizes).most_common(1)[0]
-    strange = [(name, size) for name, size in sizes if size != usual]
-    if many < _MOST_ARE * len(sizes):
-        like = next(name for name, size in sizes if size == usual)
-        raise IpsysError(
-            f"{where}: {_sized(*strange[0])} and {_sized(like, usual)}; "
-            "a lens is calibrated at one size: take out one kind"
+def _reason(view: View, board: Board) -> str:
+    if view.grid is None:
+        return "the board is not seen"
+    columns, rows = view.grid
+    if fits_in(view.grid, board.grid):
+        return f"only {columns} x {rows} of its corners are seen"
+    return f"a grid of {columns} x {rows} corners is seen instead"
+
+
+def check_sizes(sizes: Sequence[tuple[str, Size]], where: str) -> Size:
+    """Return the size in px that most pictures have.
+
+    Parameters
+    ----------
+    sizes : name and size of each picture, at least one.
+    where : they come from.
+
+    Raises
+    ------
+    IpsysError
+        Where more than a few pictures are of another size.
+    """
+    counts = Counter(size for _, size in sizes).most_common()
+    if counts[0][1] >= _MOST_ARE * len(sizes):
+        return counts[0][0]
+    kinds = []
+    for size, count in counts[:_SIZES_NAMED]:
+        names = [name for name, other in sizes if other == size][:_EXAMPLES]
+        kinds.append(
+            f"{count} of {size[0]} x {size[1]} px ({', '.join(names)}{' ...' * (count > _EXAMPLES)})"
         )
+    kinds += [f"{len(counts) - len(kinds)} more"] * (len(counts) > len(kinds))
+    raise IpsysError(
+        f"{where}: pictures have {len(counts)} sizes: {'; '.join(kinds)}. "
+        "A lens is calibrated at one size: put the pictures of each size into a folder of their own"
+    )
+
+
+def _strange(views: Sequence[_Seen], usual: Size) -> list[Dropped]:
     reason = "is {} x {} px, most are {} x {}"
-    return usual, [Dropped(name, reason.format(*size, *usual)) for name, size in strange]
+    return [Dropped(one.name, reason.format(*one.size, *usual)) for one in views if one.size != usual]
 
 
-def _sized(name: str, size: Size) -> str:
-    return f"{name} is {size[0]} x {size[1]} px"
+class _Sample:
+    """A few pictures, spread over all of them."""
 
+    def __init__(self, wanted: int, total: int) -> None:
+        self.pictures: list[Grey] = []
+        self._stride, self._wanted, self._count = max(1, -(-total // (2 * wanted))), wanted, 0
 
-def _remember(some: list[Grey], grey: Grey, count: int, total: int) -> None:
-    """Keep a few pictures, spread over all of them, to find out what they show instead."""
-    if count % max(1, -(-total // _HINTED)) == 0:
-        some.append(grey)
-        if len(some) > 2 * _HINTED:
-            del some[::2]
+    def add(self, grey: Grey) -> None:
+        if self._count % self._stride == 0:
+            self.pictures.append(grey)
+            if len(self.pictures) > 2 * self._wanted:
+                del self.pictures[::2]
+                self._stride *= 2
+        self._count += 1

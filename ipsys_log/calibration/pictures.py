@@ -12,11 +12,13 @@ from typing import NamedTuple
 import cv2
 import numpy as np
 
+from ipsys_log.calibration.picture_size import read_picture_size
 from ipsys_log.calibration.sighting import Grey
 from ipsys_log.errors import FrameError, IpsysError
 from ipsys_log.log.session import Session
 from ipsys_log.messages import CompressedImage, CompressedVideo, RawImage
 from ipsys_log.rig import check_name
+from ipsys_log.stages.detect.picture_size import check_encoded
 from ipsys_log.stages.detect.video import Video
 
 __all__ = ["MOST_LOOKED_AT", "Pictures", "find_sources"]
@@ -33,14 +35,28 @@ _GREY_OF_RAW = {
 }  # fmt: skip
 
 
+def _no_sizes() -> list[tuple[str, tuple[int, int]]]:
+    return []
+
+
 class Pictures(NamedTuple):
-    """Pictures of one camera: how many there are about, and each with its name, or None for one that
-    cannot be read."""
+    """Pictures of one camera.
+
+    Attributes
+    ----------
+    camera, where : its name, and where the pictures come from.
+    total : how many there are about; 0 where that is not known.
+    read : returns each picture with its name, or None for one that cannot be read.
+    sizes : returns names and sizes in px as far as they are known before a picture is decoded.
+    requested : whether the user named this camera or its pictures, not only a log with others.
+    """
 
     camera: str
     where: str
     total: int
     read: Callable[[], Iterator[tuple[str, Grey | None]]]
+    sizes: Callable[[], list[tuple[str, tuple[int, int]]]] = _no_sizes
+    requested: bool = True
 
     @property
     def looked_at(self) -> int:
@@ -78,7 +94,14 @@ def _joined(camera: str, parts: list[Pictures]) -> Pictures:
         return parts[0]
     where = f"{parts[0].where} and {len(parts) - 1} more"
     total = sum(part.total for part in parts)
-    return Pictures(camera, where, total, lambda: chain.from_iterable(part.read() for part in parts))
+    return Pictures(
+        camera,
+        where,
+        total,
+        lambda: chain.from_iterable(part.read() for part in parts),
+        lambda: [sized for part in parts for sized in part.sizes()],
+        any(part.requested for part in parts),
+    )
 
 
 def _sources_of(path: Path, cameras: Sequence[str]) -> list[Pictures]:
@@ -87,10 +110,10 @@ def _sources_of(path: Path, cameras: Sequence[str]) -> list[Pictures]:
     if not path.is_file():
         raise IpsysError(f"{path}: there is no such log, folder, picture or video")
     if path.suffix.lower() == ".mcap":
-        return _log(path)
+        return _log(path, requested=bool(cameras))
     if path.suffix.lower() in _PICTURES:
         name = _camera_name(path.absolute().parent.name, path, cameras)
-        return [Pictures(name, str(path), 1, partial(_read_files, [path]))]
+        return [_of_files(name, path, [path])]
     if path.suffix.lower() in _VIDEOS:
         return [_video(path, cameras)]
     raise IpsysError(
@@ -112,14 +135,15 @@ def _folder(folder: Path, cameras: Sequence[str]) -> list[Pictures]:
     here = _files(folder)
     if here:
         name = _camera_name(folder.absolute().name, folder, cameras)
-        return [Pictures(name, str(folder), len(here), partial(_read_files, here))]
+        return [_of_files(name, folder, here)]
     subs = {sub: files for sub in sorted(folder.iterdir()) if sub.is_dir() and (files := _files(sub))}
     if not subs:
         raise IpsysError(f"{folder}: has no pictures ({', '.join(_PICTURES[:3])} ...)")
-    return [
-        Pictures(_camera_name(sub.name, sub, []), str(sub), len(files), partial(_read_files, files))
-        for sub, files in subs.items()
-    ]
+    return [_of_files(_camera_name(sub.name, sub, []), sub, files) for sub, files in subs.items()]
+
+
+def _of_files(camera: str, where: Path, files: list[Path]) -> Pictures:
+    return Pictures(camera, str(where), len(files), partial(_read_files, files), partial(_read_sizes, files))
 
 
 def _files(folder: Path) -> list[Path]:
@@ -137,6 +161,11 @@ def _read_files(files: Sequence[Path]) -> Iterator[tuple[str, Grey | None]]:
         yield path.name, _decode(path.read_bytes())
 
 
+def _read_sizes(files: Sequence[Path]) -> list[tuple[str, tuple[int, int]]]:
+    sizes = [(path.name, read_picture_size(path)) for path in _spread(files)]
+    return [(name, size) for name, size in sizes if size is not None]
+
+
 def _spread(files: Sequence[Path]) -> Sequence[Path]:
     return files[:: _stride(len(files))]
 
@@ -147,10 +176,11 @@ def _stride(total: int) -> int:
 
 def _decode(data: bytes) -> Grey | None:
     try:
+        check_encoded(data)
         # Turned as the sensor has it: a lens does not turn with the tag of a picture.
         flags = cv2.IMREAD_GRAYSCALE | cv2.IMREAD_IGNORE_ORIENTATION
         grey = cv2.imdecode(np.frombuffer(data, np.uint8), flags)
-    except cv2.error:  # OpenCV asserts on empty data
+    except (FrameError, cv2.error):  # OpenCV asserts on empty data
         return None
     return None if grey is None else np.asarray(grey, dtype=np.uint8)
 
@@ -186,16 +216,19 @@ def _grey(frame: Grey) -> Grey:
     return np.asarray(cv2.cvtColor(frame, cv2.COLOR_BGR2GRAY), dtype=np.uint8)
 
 
-def _log(path: Path) -> list[Pictures]:
+def _log(path: Path, requested: bool) -> list[Pictures]:
     with Session([path]) as session:
         topics = dict(session.images)
         counts = {camera: session.count(topic) for camera, topic in topics.items()}
         if not session.images:
             raise IpsysError(f"{path}: has no frames of any camera")
     return [
-        Pictures(c, f"{path}: camera {c}", counts[c], partial(_read_log, path, t, _stride(counts[c])))
+        Pictures(
+            c, f"{path}: camera {c}", counts[c], partial(_read_log, path, t, _stride(counts[c])),
+            requested=requested,
+        )
         for c, t in topics.items()
-    ]
+    ]  # fmt: skip
 
 
 def _read_log(path: Path, topic: str, stride: int) -> Iterator[tuple[str, Grey | None]]:
@@ -228,6 +261,8 @@ def _frame(frame: CompressedImage | RawImage) -> Grey | None:
     step = frame.step or frame.width * channels
     rows = np.frombuffer(frame.data, np.uint8)
     if not channels or step < frame.width * channels or rows.size < step * frame.height:
+        return None
+    if min(frame.width, frame.height) < 1:
         return None
     rows = rows[: step * frame.height].reshape(frame.height, step)[:, : frame.width * channels]
     pixels = np.ascontiguousarray(rows.reshape(frame.height, frame.width, channels))

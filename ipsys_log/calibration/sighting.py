@@ -4,15 +4,17 @@ from __future__ import annotations
 
 from dataclasses import dataclass
 from functools import lru_cache
+from typing import NamedTuple
 
 import cv2
 import numpy as np
 from numpy.typing import NDArray
 
 from ipsys_log.calibration.boards import Board
+from ipsys_log.calibration.chessboard import find_chessboard
 from ipsys_log.calibration.refine import refine_corners
 
-__all__ = ["LEAST_CORNERS", "Grey", "Sighting", "find_board"]
+__all__ = ["LEAST_CORNERS", "Grey", "Sighting", "View", "find_board", "view_board"]
 
 Array = NDArray[np.float64]
 Grey = NDArray[np.uint8]
@@ -21,8 +23,6 @@ Grey = NDArray[np.uint8]
 LEAST_CORNERS = 6
 # One or two corners are as often something else in the room.
 _SEEN = 4
-_LARGE_PX = 1600
-_THOROUGH = cv2.CALIB_CB_EXHAUSTIVE | cv2.CALIB_CB_NORMALIZE_IMAGE | cv2.CALIB_CB_ACCURACY
 # Where along an edge between two corners its sharpness is read, and how far beside it, in squares: within the
 # white around a marker.
 _ALONG = (0.3, 0.4, 0.5, 0.6, 0.7)
@@ -47,8 +47,21 @@ class Sighting:
     outline: Array
 
 
+class View(NamedTuple):
+    """A picture of a board: the sighting, or None; and of a chessboard, the columns and rows of the largest
+    grid of inner corners in it, or None."""
+
+    sighting: Sighting | None
+    grid: tuple[int, int] | None = None
+
+
 def find_board(name: str, grey: Grey, board: Board, thorough: bool) -> Sighting | None:
-    """Look for the board in a picture.
+    """Look for the board in a picture; see `view_board`."""
+    return view_board(name, grey, board, thorough).sighting
+
+
+def view_board(name: str, grey: Grey, board: Board, thorough: bool) -> View:
+    """Look for the board in a picture, and for what else a chessboard's corners say.
 
     Parameters
     ----------
@@ -59,14 +72,22 @@ def find_board(name: str, grey: Grey, board: Board, thorough: bool) -> Sighting 
 
     Returns
     -------
-    None where it is not seen. A ChArUco board may be seen in part, a chessboard only as a whole.
+    Without a sighting where the board is not seen. A ChArUco board may be seen in part, a chessboard only as
+    a whole.
     """
     if board.inverted:
         grey = np.asarray(255 - grey, dtype=np.uint8)
-    found = _chessboard(grey, board, thorough) if board.marker_scale is None else _charuco(grey, board)
-    if found is None:
-        return None
-    ids, pixels = found
+    if board.marker_scale is not None:
+        corners = _charuco(grey, board)
+        return View(None if corners is None else _sighting(name, grey, board, *corners))
+    view = find_chessboard(grey, board.grid, thorough)
+    if view.corners is None:
+        return View(None, view.size)
+    ids = np.arange(board.columns * board.rows)
+    return View(_sighting(name, grey, board, ids, view.corners.reshape(-1, 2)), view.size)
+
+
+def _sighting(name: str, grey: Grey, board: Board, ids: NDArray[np.intp], pixels: Array) -> Sighting:
     places = board.places(ids)
     if len(ids) < LEAST_CORNERS or min(len(set(column)) for column in places.T.tolist()) < 2:
         return Sighting(name, ids, pixels, 0.0, np.tile(pixels.mean(axis=0), (4, 1)))
@@ -74,20 +95,6 @@ def find_board(name: str, grey: Grey, board: Board, thorough: bool) -> Sighting 
     clear = _CLEAR if board.marker_scale is None else _CLEAR_MARKERS * (1 - board.marker_scale)
     pixels = refine_corners(grey, board.grid[0], ids, pixels, blur_px, clear)
     return Sighting(name, ids, pixels, blur_px, _outline(board, ids, pixels))
-
-
-def _chessboard(grey: Grey, board: Board, thorough: bool) -> tuple[NDArray[np.intp], Array] | None:
-    size = (board.columns, board.rows)
-    large = max(grey.shape) > _LARGE_PX
-    small = cv2.resize(grey, None, fx=0.5, fy=0.5, interpolation=cv2.INTER_AREA) if large else grey
-    # A large picture takes long; corners are refined in the whole of it anyway.
-    tries = [(small, 0)] + [(grey, 0)] * large + [(small, _THOROUGH)] * thorough
-    for picture, flags in tries:
-        seen, corners = cv2.findChessboardCornersSB(picture, size, flags=flags)
-        if seen:
-            pixels = np.asarray(corners, dtype=np.float64).reshape(-1, 2)
-            return np.arange(board.columns * board.rows), pixels if picture is grey else 2 * pixels + 0.5
-    return None
 
 
 def _charuco(grey: Grey, board: Board) -> tuple[NDArray[np.intp], Array] | None:

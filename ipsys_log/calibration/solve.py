@@ -13,7 +13,7 @@ from ipsys_log.calibration.lens_models import LensModel
 from ipsys_log.calibration.start import find_start, fitted_basis
 from ipsys_log.calibration.uncertainty import alike, lens_covariance
 
-__all__ = ["Left", "Solved", "solve", "tells_focal_length"]
+__all__ = ["Left", "Solved", "doubt_from_px", "rms_px", "solve", "tells_focal_length"]
 
 Array = NDArray[np.float64]
 
@@ -60,7 +60,7 @@ class Solved:
     square: bool
 
 
-def solve(model: LensModel, corners: Corners, size_px: tuple[int, int]) -> Solved:
+def solve(model: LensModel, corners: Corners, size_px: tuple[int, int], start: Fit | None = None) -> Solved:
     """The lens that corners of a board in several pictures tell.
 
     Parameters
@@ -68,8 +68,9 @@ def solve(model: LensModel, corners: Corners, size_px: tuple[int, int]) -> Solve
     model : the kind of lens.
     corners : of all pictures, at least 6 in each.
     size_px : width and height of the pictures.
+    start : a fit to start from; without it, one is looked for.
     """
-    start = find_start(model, corners, size_px)
+    start = start or find_start(model, corners, size_px)
     purged = _purge(model, start, corners, square=True)
     fit, covariance, groups, square = _finish(model, purged, size_px)
     if not square:
@@ -97,7 +98,7 @@ def _purge(model: LensModel, fit: Fit, corners: Corners, square: bool) -> _Purge
     """Fit, leave out what is far off, and fit again, until nothing is."""
     basis, pictures, left = fitted_basis(model, square), np.arange(corners.pictures), []
     for _ in range(_MOST_ROUNDS):
-        fit = adjust(model, fit, corners, basis, _scale_px(model, fit, corners))
+        fit = adjust(model, fit, corners, basis, doubt_from_px(model, fit, corners))
         kept, gone = _belonging(corners, residuals(model, fit, corners))
         if kept.all() or len(pictures) - len(gone) < 3:
             break
@@ -115,8 +116,8 @@ def _finish(model: LensModel, purged: _Purged, size_px: tuple[int, int]) -> tupl
     found = []
     for square in (False, True):
         basis = fitted_basis(model, square)
-        fit = adjust(model, start, corners, basis, _scale_px(model, start, corners))
-        covariance = lens_covariance(model, fit, corners, basis, _scale_px(model, fit, corners), groups)
+        fit = adjust(model, start, corners, basis, doubt_from_px(model, start, corners))
+        covariance = lens_covariance(model, fit, corners, basis, doubt_from_px(model, fit, corners), groups)
         found.append((fit, basis @ covariance @ basis.T, int(groups.max()) + 1, square))
     free, covariance = found[0][:2]
     ratio = np.array([1.0, -1.0]) / free.lens[:2]
@@ -133,7 +134,7 @@ def tells_focal_length(solved: Solved) -> bool:
     model, fit, corners = solved.model, solved.fit, solved.corners
     # Without what fx and fy have to themselves.
     rest = fitted_basis(model, square=True)[:, 1:]
-    scale_px = _scale_px(model, fit, corners)
+    scale_px = doubt_from_px(model, fit, corners)
     most = fit.cost + (_WORSE * _spread(solved.residuals_px)) ** 2
     for factor in _OTHER_FOCALS:
         lens, nearer = fit.lens * ([factor] * 2 + [1.0] * (len(fit.lens) - 2)), [1.0, 1.0, factor]
@@ -145,9 +146,14 @@ def tells_focal_length(solved: Solved) -> bool:
     return True
 
 
-def _scale_px(model: LensModel, fit: Fit, corners: Corners) -> float:
-    """From where on a corner is doubted."""
+def doubt_from_px(model: LensModel, fit: Fit, corners: Corners) -> float:
+    """Return the error in px from which on a corner counts for half or less."""
     return max(_DOUBTED * _spread(residuals(model, fit, corners)), _NEAR_PX)
+
+
+def rms_px(solved: Solved) -> float:
+    """Return the root of the mean squared distance between corners seen and projected, in px."""
+    return float(np.sqrt((solved.residuals_px**2).sum(axis=1).mean()))
 
 
 def _spread(missed_px: Array) -> float:

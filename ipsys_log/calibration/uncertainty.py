@@ -1,12 +1,20 @@
-"""How well a lens is known: from how it would change if pictures were left out."""
+"""How well a lens is known: by its change without some pictures, and with a richer model."""
 
 from __future__ import annotations
 
 import numpy as np
 from numpy.typing import NDArray
 
-from ipsys_log.calibration.bundle import Corners, Fit, normal_equations
+from ipsys_log.calibration.bundle import (
+    Corners,
+    Fit,
+    corner_weights,
+    normal_equations,
+    reduce_to_lens,
+    residuals,
+)
 from ipsys_log.calibration.lens_models import LensModel, project_points
+from ipsys_log.calibration.model_change import model_change
 from ipsys_log.calibration.picture_coverage import NEAR, group_outlines
 
 __all__ = ["alike", "lens_covariance"]
@@ -17,6 +25,8 @@ Array = NDArray[np.float64]
 # for a jackknife.
 _HALVINGS = 4
 _ENOUGH_GROUPS = 15
+# A jackknife of few groups is uncertain itself. It counts as much as least squares do at so many groups.
+_EQUAL_GROUPS = 8
 
 
 def alike(model: LensModel, fit: Fit, corners: Corners, size_px: tuple[int, int]) -> NDArray[np.intp]:
@@ -45,27 +55,50 @@ def lens_covariance(
     scale_px: float | None,
     groups: NDArray[np.intp],
 ) -> Array:
-    """Covariance (q, q) of the lens along ``basis``, by leaving out each group of pictures in turn.
+    """Return the covariance (q, q) of the lens along ``basis``.
 
-    Corners of one picture share errors (a board that is not flat, blur, a lens that is not quite of this
-    kind), and pictures differ in theirs. Taken for independent, they make a lens look too well known.
-    The jackknife over whole groups supposes nothing of this; each is left out in one linear step.
+    Corners of one picture share errors (a board that is not flat, blur), and pictures differ in theirs. Taken
+    for independent, they make a lens look too well known. A jackknife over whole groups supposes nothing of
+    this; each group is left out in one linear step. With few groups it is uncertain itself: seven pictures may
+    agree by chance. So it is drawn to the covariance of least squares, with the variance that the jackknife
+    shows over all parameters. Student's distribution of so many groups makes it wider. The shift that a
+    richer model shows is added.
 
     References
     ----------
     Efron and Stein, The jackknife estimate of variance, Annals of Statistics 1981.
     """
     normal = normal_equations(model, fit, corners, basis, scale_px)
-    gradients = normal.pose_gradient[..., None]
-    solved = np.linalg.solve(normal.poses, np.concatenate([normal.between, gradients], axis=2))
-    transposed = normal.between.transpose(0, 2, 1)
-    each = normal.lens - transposed @ solved[:, :, :-1]
-    gradient = normal.lens_gradient - (transposed @ solved[:, :, -1:])[..., 0]
-    of_group = (groups == np.arange(groups.max() + 1)[:, None]).astype(float)
-    whole = each.sum(axis=0) + normal.pull
-    without = whole - np.einsum("gf,fij->gij", of_group, each)
-    shifts = np.linalg.solve(without, (of_group @ gradient)[..., None])[..., 0]
-    count = len(of_group)
+    matrices, gradients = reduce_to_lens(normal)
+    whole = matrices.sum(axis=0) + normal.pull
+    jackknife = _jackknife(whole, matrices, gradients, groups)
+    inverse = np.linalg.inv(whole)
+    squares = inverse @ (whole - normal.pull) @ inverse
+    variance = _variance_px2(model, fit, corners, scale_px, basis.shape[1])
+    # Never less than the residuals say.
+    variance = max(variance, float(np.median(np.diag(jackknife) / np.diag(squares))))
+    count = int(groups.max()) + 1
+    share = count / (count + _EQUAL_GROUPS)
+    widening = (count - 1) / max(count - 3, 1)
+    covariance = widening * (share * jackknife + (1 - share) * variance * squares)
+    shift = model_change(model, fit, corners, basis, scale_px, variance)
     # A parameter that is drawn to 0 is off by as much as it is usually large.
-    drawn = np.linalg.solve(whole, normal.pull * (model.usual if np.isfinite(model.usual) else 0.0))
-    return np.asarray((count - 1) / count * shifts.T @ shifts + drawn @ drawn.T)
+    drawn = inverse @ (normal.pull * (model.usual if np.isfinite(model.usual) else 0.0))
+    return np.asarray(covariance + np.outer(shift, shift) + drawn @ drawn.T)
+
+
+def _jackknife(whole: Array, matrices: Array, gradients: Array, groups: NDArray[np.intp]) -> Array:
+    of_group = (groups == np.arange(groups.max() + 1)[:, None]).astype(float)
+    without = whole - np.einsum("gf,fij->gij", of_group, matrices)
+    shifts = np.linalg.solve(without, (of_group @ gradients)[..., None])[..., 0]
+    count = len(of_group)
+    return np.asarray((count - 1) / count * shifts.T @ shifts)
+
+
+def _variance_px2(
+    model: LensModel, fit: Fit, corners: Corners, scale_px: float | None, unknowns: int
+) -> float:
+    """Return the variance of a coordinate of a corner, if all corners were independent."""
+    missed_px = residuals(model, fit, corners)
+    squares = float(corner_weights(missed_px, scale_px) @ (missed_px**2).sum(axis=1))
+    return squares / max(missed_px.size - 6 * corners.pictures - unknowns, 1)

@@ -8,6 +8,8 @@ import textwrap
 
 __all__ = ["main"]
 
+_LONGEST_COMPLAINT = 100_000
+
 
 def main() -> None:
     """Run the command line; a fault of the input is one line on stderr and exit code 1."""
@@ -38,7 +40,9 @@ def main() -> None:
 
 
 def _complain(text: str) -> int:
-    line = f"ipsys: {text}"
+    from ipsys_log.plain_text import plain_text
+
+    line = "ipsys: " + plain_text(text, keep="\n", longest=_LONGEST_COMPLAINT)
     if sys.stderr.isatty():  # a file or a pipe gets one line
         width = shutil.get_terminal_size().columns
         line = "\n".join(_wrapped(one, width) for one in line.splitlines())

@@ -6,16 +6,18 @@ import json
 from collections.abc import Iterator
 from contextlib import contextmanager, nullcontext
 from pathlib import Path
-from typing import TYPE_CHECKING, Annotated, Optional
+from typing import TYPE_CHECKING, Annotated, Any, Optional
 
 import typer
 
 from ipsys_log.cli.cameras_now import Lab, prepared, recorded_now, say
 from ipsys_log.cli.console import console, progress_bar, remarks
 from ipsys_log.cli.options import AsJson
+from ipsys_log.cli.signals import note_kept, say_kept
 
 if TYPE_CHECKING:
     from ipsys_log.calibration.calibrate import Calibrated
+    from ipsys_log.calibration.cameras import Failure
 
 __all__ = ["add_commands"]
 
@@ -74,13 +76,22 @@ Formats = Annotated[
 Plot = Annotated[
     Path | None, typer.Option(metavar="FILE", help="Draw coverage and residuals: .png, .pdf, .svg or .jpg.")
 ]
-Force = Annotated[bool, typer.Option("--force", help="Write over files that exist.")]
+Force = Annotated[
+    bool,
+    typer.Option(
+        "--force",
+        help="Override four checks: that no file is overwritten; that most pictures show no larger board "
+        "than --board; that the result is usable (RMS of at most 2 px, 5 pictures or more); that all "
+        "pictures are of one camera.",
+    ),
+]
 
 
 def add_commands(app: typer.Typer) -> None:
     app.command()(calibrate)
 
 
+@say_kept(lambda written: f"written: {', '.join(written)}" if written else "no file was written")
 def calibrate(
     board: BoardName,
     sources: Sources = None,
@@ -100,14 +111,15 @@ def calibrate(
 ) -> None:
     """Find the lens of a camera from pictures of a chessboard or a ChArUco board.
 
-    One file for each camera that saw the board, with the name of the camera. Sharp pictures that differ are
-    chosen by themselves; two dozen from all parts of the picture are enough."""
+    One file for each camera that saw the board, with the name of the camera. Where a camera has no result,
+    those of the others are written, and the exit code is 1. Sharp pictures that differ are chosen by
+    themselves; two dozen from all parts of the picture are enough."""
     from ipsys_log.calibration.boards import parse_board
+    from ipsys_log.calibration.calibrate import Calibrated
     from ipsys_log.calibration.cameras import calibrate_cameras
     from ipsys_log.calibration.lens_models import find_lens
     from ipsys_log.calibration.pictures import find_sources
     from ipsys_log.formats.calibration_yaml import check_format
-    from ipsys_log.report.calibration import calibration_json
     from ipsys_log.report.files import check_picture
 
     model = find_lens(lens)
@@ -125,22 +137,52 @@ def calibrate(
         found = find_sources(taken, camera or [])
         targets = _targets([pictures.camera for pictures in found], output, names, force)
         with progress_bar() as progress:
-            lenses, unseen = calibrate_cameras(found, wanted, model, progress)
-    written = _write(lenses, targets)
-    if plot is not None:
+            outcomes = []
+            for outcome in calibrate_cameras(found, wanted, model, progress, insist=force):
+                outcomes.append(outcome)
+                if isinstance(outcome, Calibrated):
+                    _write(outcome, targets[outcome.camera])
+    lenses = [outcome for outcome in outcomes if isinstance(outcome, Calibrated)]
+    if plot is not None and lenses:
         _draw(lenses, plot)
-    for line in unseen:
-        remarks.print(line, style="yellow", markup=False)
+    _print_outcomes(outcomes, targets, plot, as_json, for_rig="opencv" in names)
+
+
+def _print_outcomes(
+    outcomes: list[Calibrated | Failure],
+    targets: dict[str, dict[str, Path]],
+    plot: Path | None,
+    as_json: bool,
+    for_rig: bool,
+) -> None:
+    """Print the results, then a line for each camera without one; exit with 1 if one is missing."""
+    from ipsys_log.calibration.cameras import Failure
+    from ipsys_log.errors import IpsysError
+
+    failures = [outcome for outcome in outcomes if isinstance(outcome, Failure)]
+    if len(failures) == len(outcomes) == 1:
+        raise IpsysError(failures[0].reason)
     if as_json:
-        shown = [
-            {**calibration_json(one), "files": [str(path) for path in written[one.camera]]} for one in lenses
-        ]
+        shown = [_json(outcome, targets) for outcome in outcomes]
         print(json.dumps(shown, indent=2, allow_nan=False))  # noqa: T201
-        return
-    for one in lenses:
-        _show(one, written[one.camera], "opencv" in names)
-    if plot is not None:
+    for outcome in [] if as_json else outcomes:
+        if not isinstance(outcome, Failure):
+            _show(outcome, list(targets[outcome.camera].values()), for_rig)
+    if plot is not None and len(failures) < len(outcomes) and not as_json:
         remarks.print(f"{plot} drawn", markup=False)
+    for failure in failures:
+        remarks.print(f"no file for {failure.camera}: {failure.reason}", style="yellow", markup=False)
+    if len(failures) == len(outcomes) or any(failure.expected for failure in failures):
+        raise typer.Exit(1)
+
+
+def _json(outcome: Calibrated | Failure, targets: dict[str, dict[str, Path]]) -> dict[str, Any]:
+    from ipsys_log.calibration.cameras import Failure
+    from ipsys_log.report.calibration import calibration_json
+
+    if isinstance(outcome, Failure):
+        return {"camera": outcome.camera, "error": outcome.reason, "files": []}
+    return {**calibration_json(outcome), "files": [str(path) for path in targets[outcome.camera].values()]}
 
 
 def _prepared_now(rig: Path | None, only: list[str] | None, board: str) -> Lab:
@@ -192,28 +234,28 @@ def _targets(cameras: list[str], output: Path, formats: list[str], force: bool) 
 
 def _check_free(path: Path, force: bool) -> None:
     from ipsys_log.errors import IpsysError
+    from ipsys_log.log.lock import dangling
 
+    if (text := dangling(path)) is not None:
+        raise IpsysError(text)
     if path.exists() and not force:
         raise IpsysError(f"{path}: exists already; choose another --output, or give --force to write over it")
 
 
-def _write(lenses: list[Calibrated], targets: dict[str, dict[str, Path]]) -> dict[str, list[Path]]:
-    """Write the files of all cameras; their paths by camera."""
+def _write(one: Calibrated, paths: dict[str, Path]) -> None:
+    """Write the files of a camera, one for each format."""
     from ipsys_log.formats.calibration_yaml import FORMATS
     from ipsys_log.report.files import write_files
 
-    contents: dict[Path, bytes] = {}
-    for one in lenses:
-        comment = (
-            f"ipsys calibrate: RMS {one.rms_px:.3f} px, median {one.median_px:.3f} px over {len(one.pixels)} "
-            f"corners of {len(one.used)} pictures"
-        )
-        sigmas = dict(zip(one.names, one.sigmas.tolist(), strict=True))
-        for name, path in targets[one.camera].items():
-            contents[path] = FORMATS[name][0](one.lens, sigmas, comment).encode()
+    comment = (
+        f"ipsys calibrate: RMS {one.rms_px:.3f} px, median {one.median_px:.3f} px over {len(one.pixels)} "
+        f"corners of {len(one.used)} pictures"
+    )
+    sigmas = dict(zip(one.names, one.sigmas.tolist(), strict=True))
+    contents = {path: FORMATS[name][0](one.lens, sigmas, comment).encode() for name, path in paths.items()}
     for folder in dict.fromkeys(path.parent for path in contents):
         write_files(folder, {path.name: data for path, data in contents.items() if path.parent == folder})
-    return {one.camera: list(targets[one.camera].values()) for one in lenses}
+        note_kept(", ".join(str(path) for path in contents if path.parent == folder))
 
 
 def _draw(lenses: list[Calibrated], plot: Path) -> None:

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import errno
 import os
 from collections.abc import Callable, Iterable, Iterator
 from contextlib import AbstractContextManager, ExitStack, contextmanager, nullcontext
@@ -108,17 +109,19 @@ def check_target(output: Path, force: bool, files: Iterable[tuple[str, Path]]) -
     """
     from ipsys_log.errors import IpsysError
     from ipsys_log.log.journal import journal_path
-    from ipsys_log.log.lock import check_free, open_locked
+    from ipsys_log.log.lock import check_free, check_locks, open_locked
     from ipsys_log.log.storage import DISK
     from ipsys_log.report.files import check_file
 
     try:
         journal_path(output).exists()
     except OSError as error:
-        raise IpsysError(f"-o {output}: {error.strerror}; give a shorter name") from error
+        shorter = "; give a shorter name" if error.errno == errno.ENAMETOOLONG else ""
+        raise IpsysError(f"-o {output}: {error.strerror}{shorter}") from error
     check_file(output, "-o", [])
     if not output.exists():
         check_free(output)
+        check_locks(output.parent)
     else:
         for what, path in files:
             if path.exists() and output.samefile(path):

@@ -74,18 +74,24 @@ def diff(
     from ipsys_log.errors import IpsysError
     from ipsys_log.report.cameras import comparison_json, comparison_table, first_difference
     from ipsys_log.verify import diff as compare
+    from ipsys_log.verify import explain_diff
 
     names: list[str | None] = list(run) if run else [None]
     if len(names) > 2:
         raise IpsysError("--run: name one run, or one of each log")
     if second is None and len(names) < 2:
         raise IpsysError("name a second log, or with --run twice two runs of one")
-    found = compare(first, second or first, (names[0], names[-1]))
+    sides = first, second or first, (names[0], names[-1])
+    found = compare(*sides)
+    # Where a distance could be measured, they have frames in common.
+    comparable = all(one.equal for one in found) or any(one.rms is not None for one in found)
+    why = None if comparable else explain_diff(*sides)
     if as_json:
-        print(json.dumps(comparison_json(found), indent=2))  # noqa: T201
+        reason = {} if why is None else {"nothing_in_common": why}
+        print(json.dumps({**comparison_json(found), **reason}, indent=2))  # noqa: T201
     else:
         console.print(comparison_table(found, ("first", "second")))
-        difference = first_difference(found)
+        difference = why or first_difference(found)
         console.print(
             "no difference" if difference is None else difference,
             style="green" if difference is None else "red",

@@ -4,12 +4,17 @@ from __future__ import annotations
 
 import logging
 import sys
-from collections.abc import Iterator, Sequence
+from collections import Counter
+from collections.abc import Iterable, Iterator, Sequence
 from contextlib import contextmanager
 from time import monotonic
-from typing import TYPE_CHECKING
+from typing import IO, TYPE_CHECKING, Any
 
-from rich.console import Console
+from rich.console import Console, ConsoleOptions, RenderableType
+from rich.segment import Segment
+from rich.text import Text
+
+from ipsys_log.plain_text import plain_text
 
 if TYPE_CHECKING:
     from ipsys_log.runs.records import Outcome
@@ -18,12 +23,38 @@ if TYPE_CHECKING:
 __all__ = ["console", "print_outcomes", "print_warnings", "progress_bar", "remarks"]
 
 # The stages that go through the frames, one message for each.
-_OF_FRAMES = ("detect", "camera-frame", "locate", "fuse")
+_OF_FRAMES = ("detect", "camera-frame", "locate", "fuse", "simulate")
 _DRAW_EVERY_S = 0.1
+# More runs of a stage than this are counted, not listed.
+_MANY_RUNS = 4
+_LONGEST = 10_000
 
-# In a window lines break between words; in a file or a pipe they do not break.
-console = Console(highlight=False, soft_wrap=not sys.stdout.isatty())
-remarks = Console(stderr=True, highlight=False, soft_wrap=not sys.stderr.isatty())
+
+class SafeConsole(Console):
+    """A console that obeys nothing in the text that it prints: no markup, and no control characters."""
+
+    def __init__(self, file: IO[str], *, stderr: bool = False) -> None:
+        # In a window lines break between words; in a file or a pipe they do not break.
+        super().__init__(
+            stderr=stderr, highlight=False, markup=False, emoji=False, soft_wrap=not file.isatty()
+        )
+
+    def render_str(self, text: str, **options: Any) -> Text:
+        """Return a text or a cell for measuring and printing; names of others stand in it."""
+        return super().render_str(_plain(text), **options)
+
+    def render(self, renderable: RenderableType, options: ConsoleOptions | None = None) -> Iterable[Segment]:
+        """Yield the pieces of anything to be printed, those of a `Text` included."""
+        for piece in super().render(renderable, options):
+            yield piece if piece.control else Segment(_plain(piece.text), piece.style)
+
+
+def _plain(text: str) -> str:
+    return plain_text(text, keep="\n", longest=_LONGEST)
+
+
+console = SafeConsole(sys.stdout)
+remarks = SafeConsole(sys.stderr, stderr=True)
 
 
 class _Remarks(logging.Handler):
@@ -97,11 +128,21 @@ def progress_bar() -> Iterator[Progress]:
 
 def print_outcomes(outcomes: Sequence[Outcome]) -> None:
     """What was done, what was found done, and what was left out."""
-    width = max((len(outcome.run) for outcome in outcomes), default=0)
-    for outcome in outcomes:
+    rest = _print_many(outcomes)
+    width = max((len(outcome.run) for outcome in rest), default=0)
+    for outcome in rest:
         count = "1 message" if outcome.messages == 1 else f"{outcome.messages} messages"
         state = count if outcome.fresh else "up to date"
         remarks.print(f"{outcome.stage:<13} run {outcome.run:<{width}} {state}")
         for remark in outcome.remarks:
-            # Names out of a log are not for rich to read as its markup.
-            remarks.print(f"  {remark}", style="yellow", markup=False)
+            remarks.print(f"  {remark}", style="yellow")
+
+
+def _print_many(outcomes: Sequence[Outcome]) -> list[Outcome]:
+    """Print one line for many runs of a stage without remarks; return the other outcomes."""
+    alike = Counter((outcome.stage, outcome.fresh) for outcome in outcomes if not outcome.remarks)
+    many = {kind for kind, count in alike.items() if count > _MANY_RUNS}
+    for stage, fresh in alike:
+        if (stage, fresh) in many:
+            remarks.print(f"{stage:<13} {alike[stage, fresh]} runs {'made' if fresh else 'up to date'}")
+    return [one for one in outcomes if one.remarks or (one.stage, one.fresh) not in many]

@@ -22,8 +22,10 @@ from ipsys_log.cli.options import (
     RigFile,
     cameras_of,
     load_calibrations,
+    load_matching_rig,
     log_option,
 )
+from ipsys_log.cli.signals import say_kept
 
 if TYPE_CHECKING:
     from ipsys_log.log.session import Session
@@ -106,6 +108,16 @@ OPTIONS: dict[str, tuple[Any, Any]] = {
         ],
         None,
     ),
+    "details": (
+        Annotated[
+            bool,
+            typer.Option(
+                "--details",
+                help="Print all figures, too: errors by camera, every outlier, models by number of points.",
+            ),
+        ],
+        False,
+    ),
     "plots": (
         Annotated[_Path, typer.Option(metavar="DIR", help="Write the paper's tables and figures, and more.")],
         None,
@@ -125,7 +137,7 @@ _FRAMES = (
     "as_json",
 )
 _DETECT = tuple(name for name in _FRAMES if name != "method")
-_MODELS = tuple(name for name in OPTIONS if name not in ("plot", "plots"))
+_MODELS = tuple(name for name in OPTIONS if name not in ("plot", "plots", "details"))
 EVALUATE = (*_MODELS, "plots")
 
 MORE = "\n\nWhat it needs and the log does not hold yet is made first."
@@ -144,7 +156,7 @@ _COMMANDS: dict[str, tuple[str, tuple[str, ...], str]] = {
     "fit": ("fit", _MODELS, f"Fit models to the measured places (poly, unless you say which).{MORE}"),
     "evaluate": (
         "evaluate",
-        EVALUATE,
+        (*EVALUATE, "details"),
         "Say how far models are off, how many places are enough, and which look wrongly measured.\n\n"
         "For all models, unless you say which; on places held out, and by cross-validation, which takes each "
         f"part of the places in turn.{MORE}",
@@ -182,14 +194,14 @@ def build_command(options: Mapping[str, tuple[Any, Any]], work: Callable[..., No
 
 
 def _request(logs: list[Path], **given: Any) -> Request:
-    from ipsys_log.rig import check_name, load_rig
+    from ipsys_log.rig import check_name
     from ipsys_log.runs.request import Request
 
     rig, run = given.pop("rig"), given.pop("run")
     models = tuple(given.pop("model", None) or ())
     return Request(
         models=models,
-        rig=load_rig(rig) if rig else None,
+        rig=load_matching_rig(rig, lambda: cameras_of(logs)),
         lenses=load_calibrations(given.pop("calibration", None), lambda: cameras_of(logs)),
         run=check_name(run, "--run") if run else None,
         **given,
@@ -208,13 +220,41 @@ def derived(
     from ipsys_log.pipeline import replay
     from ipsys_log.report.accuracy import read_accuracy
 
-    with progress_bar() as progress:
-        outcomes = replay(logs, _request(logs, **given), until, output, progress)
+    request = _request(logs, **given)
+    with say_kept(_kept_runs(logs, output)), progress_bar() as progress:
+        outcomes = replay(logs, request, until, output, progress)
     # A new log is only there if there was something to write.
     written = [output] if output is not None and output.exists() else []
     with Session([*logs, *written]) as session:
         yield session, outcomes, read_accuracy(session, outcomes)
     _remark(outcomes, [*logs, *written][-1] if kept else None)
+
+
+def _kept_runs(logs: list[Path], output: Path | None) -> Callable[[Sequence[str]], str]:
+    """Return what names the runs that an interrupted command has added."""
+    from ipsys_log.log.session import Session
+    from ipsys_log.runs.records import complete_runs
+
+    if output is not None:
+        return lambda _: f"{output} was not written: a new log is written when all is done"
+
+    def complete() -> dict[str, list[str]]:
+        stages: dict[str, list[str]] = {}
+        with Session(logs) as session:
+            for run in complete_runs(session):
+                stages.setdefault(run.run, []).append(run.stage)
+        return stages
+
+    before = complete()
+
+    def added(_: Sequence[str]) -> str:
+        new = {run: [s for s in stages if s not in before.get(run, ())] for run, stages in complete().items()}
+        named = "; ".join(f"{run} ({', '.join(stages)})" for run, stages in new.items() if stages)
+        if not named:
+            return f"{logs[-1]} is as it was: no run was complete"
+        return f"complete in {logs[-1]}: {named}. The same command continues there"
+
+    return added
 
 
 def _derive(
@@ -223,6 +263,7 @@ def _derive(
     as_json: bool,
     plot: Path | None = None,
     plots: Path | None = None,
+    details: bool = False,
     **given: Any,
 ) -> None:
     from ipsys_log.report.files import check_folder, check_picture
@@ -233,7 +274,10 @@ def _derive(
         check_folder(plots, "--plots")
     with derived(logs, until, **given) as (session, outcomes, accuracies):
         drawn = _draw(session, accuracies, plot, plots)
-    _print(outcomes, accuracies, as_json)
+    if as_json:
+        _print_json(outcomes, accuracies)
+    else:
+        _print(accuracies, details)
     for what in drawn:
         remarks.print(what)
 
@@ -257,16 +301,27 @@ def _draw(
     return drawn
 
 
-def _print(outcomes: Sequence[Outcome], accuracies: Sequence[Accuracy], as_json: bool) -> None:
+def _print_json(outcomes: Sequence[Outcome], accuracies: Sequence[Accuracy]) -> None:
     from ipsys_log.report.accuracy import accuracy_json
+    from ipsys_log.report.summary import answer_json
+
+    stages = [{"stage": o.stage, "run": o.run, "new": o.fresh, "messages": o.messages} for o in outcomes]
+    found = {**answer_json(accuracies), **accuracy_json(accuracies), "stages": stages}
+    print(json.dumps(found, indent=2, allow_nan=False))  # noqa: T201
+
+
+def _print(accuracies: Sequence[Accuracy], details: bool) -> None:
+    """Print the answer first, then one table, and on request all figures."""
+    from ipsys_log.report.summary import answer_text, models_table
     from ipsys_log.report.tables import accuracy_tables
 
-    if as_json:
-        stages = [{"stage": o.stage, "run": o.run, "new": o.fresh, "messages": o.messages} for o in outcomes]
-        print(json.dumps({**accuracy_json(accuracies), "stages": stages}, indent=2, allow_nan=False))  # noqa: T201
-    else:
-        for table in accuracy_tables(accuracies):
-            console.print(table)
+    parts = [answer_text(accuracies), models_table(accuracies)]
+    for part in [*parts, *(accuracy_tables(accuracies) if details else [])]:
+        if part is not None:
+            console.print(part)
+            console.print()
+    if accuracies and not details:
+        remarks.print("--details prints errors by camera, every outlier and models by number of points")
 
 
 def _remark(outcomes: list[Outcome], target: Path | None) -> None:

@@ -68,6 +68,7 @@ ipsys live --model-from calibration.mcap --model best --view -o b.mcap
 """,
     "evaluate": """
 ipsys evaluate calibration.mcap                    # all models
+ipsys evaluate calibration.mcap --details          # and all figures
 ipsys evaluate calibration.mcap --model poly --model best --plots figures
 """,
     "plan": """

@@ -12,6 +12,8 @@ from ipsys_log.cli.options import Calibrations, NewLog, RigFile
 
 __all__ = ["add_commands"]
 
+_MCAP_MAGIC = b"\x89MCAP"
+
 
 def add_commands(app: typer.Typer) -> None:
     group = typer.Typer(help="Turn the data of others into a log.", no_args_is_help=True)
@@ -26,6 +28,7 @@ def imsel(
     output: NewLog,
 ) -> None:
     """The measurements behind the paper (Ou et al., Robotica 2023): .mat files and camera YAMLs."""
+    _refuse_log(folder)
     from ipsys_log.formats.imsel import read_imsel
     from ipsys_log.runs.output import write_log
 
@@ -51,16 +54,17 @@ def images(
     ] = None,
 ) -> None:
     """A folder of pictures, one sub-folder per camera; without --times the n-th of each belong together."""
-    from ipsys_log.cli.options import load_calibrations
-    from ipsys_log.rig import load_rig
+    from ipsys_log.cli.options import load_calibrations, load_matching_rig
     from ipsys_log.runs.output import write_log
     from ipsys_log.sources.files import find_pictures, read_images
     from ipsys_log.sources.picture_times import find_times
 
+    _refuse_log(folder)
     pictures = find_pictures(folder)
     lenses = load_calibrations(calibration, lambda: pictures)
     taken_ns = find_times(pictures, times) if times else None
-    write_log(output, read_images(pictures, load_rig(rig) if rig else None, lenses, rate, taken_ns))
+    lab = load_matching_rig(rig, lambda: pictures)
+    write_log(output, read_images(pictures, lab, lenses, rate, taken_ns))
     if not times and len({len(paths) for paths in pictures.values()}) > 1:
         remarks.print("cameras have unequal numbers of pictures: the n-th of each are taken for one instant")
     counts = ", ".join(f"{len(paths)} of {camera}" for camera, paths in pictures.items())
@@ -79,18 +83,35 @@ def videos(
     ] = "2020-01-01T00:00:00Z",
 ) -> None:
     """Videos that begin at one instant. MJPEG, H.264 and H.265 go into the log as they are."""
-    from ipsys_log.cli.options import load_calibrations
-    from ipsys_log.rig import load_rig
+    from ipsys_log.cli.options import load_calibrations, load_matching_rig
     from ipsys_log.runs.output import write_log
     from ipsys_log.sources.picture_times import parse_start
     from ipsys_log.sources.videos import read_videos
 
+    for option in files:
+        _refuse_log(Path(option.rpartition("=")[2]))
     paths = _by_camera(files)
     lenses = load_calibrations(calibration, lambda: paths)
-    lab = load_rig(rig) if rig else None
+    lab = load_matching_rig(rig, lambda: paths)
     counts = write_log(output, read_videos(paths, lab, lenses, parse_start(start), remarks.print))
     text = ", ".join(f"{counts.get(f'/cameras/{camera}/image', 0)} of {camera}" for camera in paths)
     console.print(f"{output} written: frames: {text}")
+
+
+def _refuse_log(path: Path) -> None:
+    """Refuse a file that is a log already, by its first bytes."""
+    from ipsys_log.errors import IpsysError
+
+    try:
+        with path.open("rb") as file:
+            is_log = file.read(len(_MCAP_MAGIC)) == _MCAP_MAGIC
+    except OSError:
+        return  # a folder, or not there: what reads it says so
+    if is_log:
+        raise IpsysError(
+            f"{path}: is a log already and needs no import. See what it holds with: ipsys info {path}; "
+            f"then: ipsys replay {path}"
+        )
 
 
 def _by_camera(files: list[str]) -> dict[str, Path]:

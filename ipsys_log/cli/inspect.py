@@ -59,12 +59,17 @@ def repair(
     """
     from ipsys_log.errors import IpsysError
     from ipsys_log.log import repair as repair_log
+    from ipsys_log.log.session import Session
     from ipsys_log.report.repaired import repair_lines
-    from ipsys_log.restore import finish_runs
 
     for part in repair_lines(repair_log(log)):
         console.print(part, markup=False)
     try:
+        with Session([log]) as session:
+            if not session.run_names():
+                return  # nothing to finish, and no stage to import for it
+        from ipsys_log.restore import finish_runs
+
         with progress_bar() as progress:
             print_outcomes(finish_runs(log, progress))
     except IpsysError as error:  # the log itself is whole

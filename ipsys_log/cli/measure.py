@@ -22,6 +22,7 @@ from ipsys_log.cli.options import (
     RigFile,
     cameras_of,
     load_calibrations,
+    load_matching_rig,
     log_option,
 )
 from ipsys_log.cli.signals import allow_interrupt, runs_until_stopped, stop_on_signal
@@ -142,13 +143,13 @@ def _measure_log(
     corners: str | None,
     as_json: bool,
 ) -> None:
-    from ipsys_log.rig import load_rig
     from ipsys_log.runs.request import Request
     from ipsys_log.scenes.finished import opened_log
     from ipsys_log.scenes.sheets import add_sheet, check_sheet
 
     lenses = load_calibrations(calibration, lambda: cameras_of([log]))
-    request = Request(rig=load_rig(rig) if rig else None, lenses=lenses, corners=corners)
+    lab = load_matching_rig(rig, lambda: cameras_of([log]))
+    request = Request(rig=lab, lenses=lenses, corners=corners)
     if csv is not None:
         check_sheet(csv, log, request)
     with ExitStack() as stack:

@@ -31,6 +31,7 @@ __all__ = [
     "cameras_of",
     "load_calibrations",
     "load_lab",
+    "load_matching_rig",
     "log_option",
 ]
 
@@ -40,10 +41,32 @@ Logs = Annotated[
 ]
 
 
+# What is written by other options, or read: a log that is called so is a slip.
+_OTHER_FILES = (
+    *(".html", ".htm", ".csv", ".json", ".toml", ".yaml", ".yml", ".rrd"),
+    *(".png", ".pdf", ".svg", ".jpg", ".jpeg", ".webp"),
+)
+
+
 def _named_as_log(path: Path | None) -> Path | None:
-    """What a user calls a new log, with the ending that all logs have."""
+    """What a user calls a new log, with the ending that all logs have.
+
+    Raises
+    ------
+    IpsysError
+        For the name of another kind of file.
+    """
     if path is None or path.suffix == ".mcap" or path.is_dir():
         return path
+    if path.suffix.lower() in _OTHER_FILES:
+        from ipsys_log.errors import IpsysError
+
+        page = (
+            "; a page is what ipsys report writes, to --html FILE"
+            if path.suffix.lower() in (".html", ".htm")
+            else ""
+        )
+        raise IpsysError(f"-o {path}: -o is for a new log, which ends in .mcap{page}")
     named = path.with_name(f"{path.name}.mcap")
     remarks.print(f"-o {path}: the log is called {named}", markup=False)
     return named
@@ -145,6 +168,26 @@ def load_calibrations(
                 raise IpsysError(f"--calibration: two cameras of one name, {name!r}")
         lenses.update(found)
     return lenses
+
+
+def load_matching_rig(path: Path | None, cameras: Callable[[], Collection[str]]) -> Rig | None:
+    """Read a rig for cameras that are given by their pictures; None where no file is named.
+
+    A rig that describes some of the cameras is a remark.
+
+    Raises
+    ------
+    IpsysError
+        Where the rig cannot be read, or describes only other cameras.
+    """
+    if path is None:
+        return None
+    from ipsys_log.rig import check_rig_cameras, load_rig
+
+    rig = load_rig(path)
+    for text in check_rig_cameras(rig, cameras(), f"--rig {path}"):
+        remarks.print(text, style="yellow", markup=False)
+    return rig
 
 
 def load_lab(

@@ -3,17 +3,15 @@
 from __future__ import annotations
 
 import inspect
-from collections.abc import Callable, Iterator
+from collections.abc import Callable
 from pathlib import Path
-from typing import TYPE_CHECKING, Annotated, Any
+from typing import Annotated, Any
 
 import typer
 
 from ipsys_log.cli.console import console, progress_bar
 from ipsys_log.cli.options import NewLog
-
-if TYPE_CHECKING:
-    from ipsys_log.messages import Message
+from ipsys_log.cli.signals import say_kept
 
 __all__ = ["add_commands"]
 
@@ -112,6 +110,7 @@ def _write_new(texts: dict[Path, str]) -> None:
         Where a file exists.
     """
     from ipsys_log.errors import IpsysError
+    from ipsys_log.log.lock import dangling
 
     made: list[Path] = []
     try:
@@ -123,7 +122,9 @@ def _write_new(texts: dict[Path, str]) -> None:
         for path in made:
             path.unlink()
         if isinstance(error, FileExistsError):
-            raise IpsysError(f"{error.filename}: exists already; edit it, or give another name") from error
+            taken = Path(error.filename)
+            text = dangling(taken) or f"{taken}: exists already; edit it, or give another name"
+            raise IpsysError(text) from error
         raise
 
 
@@ -143,14 +144,9 @@ def simulate(output: Path, **settings: Any) -> None:
     from ipsys_log.runs.output import write_log
     from ipsys_log.sources.simulator import LabSettings, simulate
 
-    with progress_bar() as progress:
-
-        def counted() -> Iterator[Message]:
-            for done, message in enumerate(simulate(LabSettings(**settings)), 1):
-                progress("simulate", done, None)
-                yield message
-
-        counts = write_log(output, counted())
+    text = f"{output} was not written: a log of the simulated lab is written whole or not at all"
+    with say_kept(lambda _: text), progress_bar() as progress:
+        counts = write_log(output, simulate(LabSettings(**settings), progress))
     frames = sum(count for topic, count in counts.items() if topic.endswith("/image"))
     console.print(f"{output} written: {frames} frames, {counts.get('/measurements', 0)} measured places")
 

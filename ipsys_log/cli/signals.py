@@ -10,8 +10,9 @@ from __future__ import annotations
 
 import functools
 import signal
-from collections.abc import Callable
-from dataclasses import dataclass
+from collections.abc import Callable, Iterator, Sequence
+from contextlib import contextmanager
+from dataclasses import dataclass, field
 from types import FrameType
 from typing import Any, NoReturn
 
@@ -21,12 +22,14 @@ __all__ = [
     "allow_interrupt",
     "hold_signals",
     "interruptible",
+    "note_kept",
     "runs_until_stopped",
+    "say_kept",
     "stop_on_signal",
 ]
 
 _SIGNALS = (signal.SIGINT, signal.SIGTERM, signal.SIGHUP)
-_KEPT = "interrupted; stages that were complete are in the log, and nothing else was changed"
+_KEPT = "what was complete is kept, and nothing else was changed"
 
 
 class Interrupted(KeyboardInterrupt):
@@ -47,10 +50,12 @@ class InterruptError(Exception):
 
 @dataclass(slots=True)
 class _State:
-    """The signal that was noted, and the text of a normal end (None: an interrupt is a failure)."""
+    """The signal that was noted, the text of a normal end (None: an interrupt is a failure), and the results
+    that the command has kept so far."""
 
     noted: int | None = None
     normal_text: str | None = None
+    kept: list[str] = field(default_factory=list)
 
 
 _state = _State()
@@ -94,6 +99,29 @@ def stop_on_signal(stop: Callable[[], None]) -> None:
     _handle(end)
 
 
+def note_kept(result: str) -> None:
+    """Note a result that outlasts an interrupt, such as a file that was written."""
+    _state.kept.append(result)
+
+
+@contextmanager
+def say_kept(text: Callable[[Sequence[str]], str]) -> Iterator[None]:
+    """Say on an interrupt within the block, or within a function decorated with it, what was kept.
+
+    Parameters
+    ----------
+    text : is called after an interrupt with the results that `note_kept` has got in the block.
+    """
+    _state.kept.clear()
+    try:
+        yield
+    except Interrupted as interrupt:
+        if interrupt.exit_code == 0:
+            raise
+        words = f"interrupted; {text(tuple(_state.kept))}"
+        raise Interrupted(interrupt.exit_code, words) from None
+
+
 def runs_until_stopped(command: Callable[..., None]) -> Callable[..., None]:
     """Mark a command that calls `allow_interrupt` itself, as it may end normally on a signal."""
     command.runs_until_stopped = True  # type: ignore[attr-defined]
@@ -129,7 +157,7 @@ def _interrupt(number: int, _: FrameType | None = None) -> NoReturn:
     _state.normal_text = None
     if text is not None:
         raise Interrupted(0, text)
-    raise Interrupted(128 + number, _KEPT)
+    raise Interrupted(128 + number, f"interrupted; {_KEPT}")
 
 
 def _handle(handler: Callable[[int, FrameType | None], None]) -> None:

@@ -29,6 +29,9 @@ def add_commands(app: typer.Typer) -> None:
 def view(logs: Logs, run: Runs = None, save: Save = None) -> None:
     """Show frames with drawn markers, floor, measured places, positions and tracks over time, in Rerun."""
     from ipsys_log.log.session import Session
+
+    if save is not None:
+        _check_save(save, logs)
     from ipsys_log.sinks.rerun import write_recording
 
     with Session(logs) as session:
@@ -39,3 +42,13 @@ def view(logs: Logs, run: Runs = None, save: Save = None) -> None:
             remarks.print(f"{what:<21} run {named}")
     if save is not None:
         remarks.print(f"{save} written; look at it with: rerun {save}")
+
+
+def _check_save(save: Path, logs: list[Path]) -> None:
+    """See that a recording can be written, and that Rerun will open it by its name."""
+    from ipsys_log.errors import IpsysError
+    from ipsys_log.report.files import check_file
+
+    if save.suffix != ".rrd":
+        raise IpsysError(f"--save {save}: Rerun opens recordings that end in .rrd; name it {save.stem}.rrd")
+    check_file(save, "--save", logs)

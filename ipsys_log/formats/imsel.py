@@ -99,7 +99,7 @@ def _find(folder: Path, name: str) -> Path:
 def _load(path: Path) -> dict[str, Any]:
     try:
         return dict(scipy.io.loadmat(path))
-    except (OSError, ValueError, NotImplementedError, TypeError) as error:
+    except Exception as error:  # its reader ends with whatever a damaged file leads it to
         raise IpsysError(f"{path}: is not a MATLAB file that can be read: {error}") from error
 
 

@@ -29,6 +29,8 @@ DISTORTION_MODELS = {"kannala_brandt": 4, "plumb_bob": 5, "rational_polynomial":
 _CRITERIA = (cv2.TERM_CRITERIA_COUNT + cv2.TERM_CRITERIA_EPS, 100, 1e-12)
 
 _LOST_PX = 0.01
+_LARGEST = 1e9  # px, and a coefficient
+_WIDEST_PX = 65_535
 # Directions (u, v) nearer together than this are one.
 _SAME_RAY = 1e-3
 
@@ -49,18 +51,30 @@ def check_calibration(lens: CameraCalibration, where: str) -> CameraCalibration:
     if wanted is None:
         known = ", ".join(DISTORTION_MODELS)
         raise IpsysError(
-            f"{where}: distortion model {lens.distortion_model!r} is not known; use one of {known}"
+            f"{where}: distortion model {lens.distortion_model!r} is not known (known are {known}). "
+            f"{_advice(lens)}"
         )
     if lens.D.size != wanted:
         raise IpsysError(
-            f"{where}: {lens.distortion_model} takes {wanted} coefficients, found {lens.D.size}; "
-            "calibrate the camera again or mend the file"
+            f"{where}: {lens.distortion_model} takes {wanted} coefficients, found {lens.D.size}. "
+            f"{_advice(lens)}"
         )
-    if not (np.isfinite(lens.K).all() and np.isfinite(lens.D).all()):
-        raise IpsysError(f"{where}: its matrix or coefficients are no numbers; calibrate again")
+    if not (np.abs(lens.K) <= _LARGEST).all() or not (np.abs(lens.D) <= _LARGEST).all():
+        raise IpsysError(f"{where}: its matrix or coefficients are no numbers of a lens; calibrate again")
+    if not (0 < lens.width <= _WIDEST_PX and 0 < lens.height <= _WIDEST_PX):
+        raise IpsysError(
+            f"{where}: no image has {lens.width} x {lens.height} px; write the size in pixels into it"
+        )
     if not lens.K[0, 0] > 0 < lens.K[1, 1]:
         raise IpsysError(f"{where}: the camera matrix K has no positive focal lengths; calibrate again")
     return lens
+
+
+def _advice(lens: CameraCalibration) -> str:
+    """Return what to do about a calibration that cannot be used."""
+    name = lens.frame_id or "camera"
+    option = f"--calibration {name}={name}.yaml"
+    return f"Calibrate the camera with 'ipsys calibrate', and give the file with {option}"
 
 
 def check_size(lens: CameraCalibration, width: int, height: int, camera: str | None) -> None:

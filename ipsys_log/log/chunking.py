@@ -122,8 +122,10 @@ class ChunkBuilder:
         data: Buffer = self._record[CHUNK_HEAD_SIZE : self._end]
         size = len(data)
         crc = data_crc = zlib.crc32(self._record[self._crc_end : self._end], self._crc)
-        name = "zstd" if self.compress else ""
-        if self.compress:
+        # One huge message. Readers refuse what unpacks to very much more than the file.
+        compress = self.compress and size <= 2 * self.limits.size
+        name = "zstd" if compress else ""
+        if compress:
             data = zstandard.ZstdCompressor(level=_ZSTD_LEVEL).compress(data)
             data_crc = zlib.crc32(data)
         head = chunk_head(self._start_ns, self._end_ns, size, crc, name, len(data))
@@ -133,10 +135,10 @@ class ChunkBuilder:
             offset, length, self._start_ns, self._end_ns, name, len(data), size, len(indexes), offsets
         )
         whole_crc = zlib.crc32(indexes, extend(zlib.crc32(head), data, data_crc))
-        return ref, self._joined(head, data, indexes), whole_crc
+        return ref, self._joined(head, data, indexes, compress), whole_crc
 
-    def _joined(self, head: bytes, data: Buffer, indexes: bytes) -> Buffer:
-        if self.compress:
+    def _joined(self, head: bytes, data: Buffer, indexes: bytes, compressed: bool) -> Buffer:
+        if compressed:
             return b"".join((head, data, indexes))
         end = self._end + len(indexes)
         if end > len(self._record):

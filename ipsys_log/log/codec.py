@@ -21,6 +21,7 @@ from google.protobuf.timestamp_pb2 import Timestamp
 
 from ipsys_log import messages
 from ipsys_log.errors import LogError
+from ipsys_log.log.bounds import Items
 from ipsys_log.log.fields import fields_of, fill_proto, read_proto
 from ipsys_log.log.ros2 import ROS2_PAYLOADS, read_ros2
 
@@ -57,6 +58,7 @@ PAYLOADS: dict[str, type] = {
     },
 }
 _LONG = 32 << 10  # bytes
+_ITEMS_OF_ONE = 1 << 20
 _NAMES = {payload: name for name, payload in PAYLOADS.items()}
 
 
@@ -128,7 +130,9 @@ def _bytes_fields(kind: type) -> tuple[str, ...]:
     return tuple(name for name, hint in get_type_hints(kind).items() if hint is bytes)
 
 
-def decode(name: str, data: bytes, encoding: str = "protobuf", definition: bytes = b"") -> Any:
+def decode(
+    name: str, data: bytes, encoding: str = "protobuf", definition: bytes = b"", items: Items | None = None
+) -> Any:
     """The payload in ``data``, which the schema called ``name`` was written with.
 
     Parameters
@@ -137,33 +141,46 @@ def decode(name: str, data: bytes, encoding: str = "protobuf", definition: bytes
     data : the message.
     encoding : ``protobuf``, or in the logs of others ``json`` and ROS 2's ``cdr``.
     definition : of the schema, as the log has it, without which ``cdr`` cannot be read.
+    items : the parts of messages that may still be read; a million by default.
 
     Raises
     ------
+    BoundError
+        The message has more parts than `items` allows.
     LogError
         Where the schema or encoding is not known here, or the bytes are not a message of it.
     """
+    items = items or Items(_ITEMS_OF_ONE)
     if name in ROS2_PAYLOADS:
         if encoding != "cdr":
             raise LogError(f"messages of ROS 2 encoded as {encoding!r} are not read, only cdr")
-        return read_ros2(name, data, definition)
+        return read_ros2(name, data, definition, items)
     payload = PAYLOADS.get(name)
     if payload is None:
         raise LogError(f"its schema {name!r} is none that ipsys reads")
     try:
-        return read_proto(payload, _parse(_proto_class(name), data, encoding))
+        return read_proto(payload, _parse(_proto_class(name), data, encoding, items), items)
     except (DecodeError, json_format.ParseError, ValueError, TypeError, RecursionError) as error:
         raise LogError(f"a message is not a valid {name}: {error}") from error
 
 
-def _parse(proto_class: type[Proto], data: bytes, encoding: str) -> Proto:
+def _parse(proto_class: type[Proto], data: bytes, encoding: str, items: Items) -> Proto:
     if encoding == "protobuf":
         return proto_class.FromString(data)
     if encoding == "json":
-        return json_format.ParseDict(
-            _plain_times(json.loads(data)), proto_class(), ignore_unknown_fields=True
-        )
+        items.take(sum(map(data.count, (b",", b"{", b"["))))
+        return json_format.ParseDict(_read_json(data), proto_class(), ignore_unknown_fields=True)
     raise LogError(f"messages encoded as {encoding!r} are not read, only protobuf and json")
+
+
+def _read_json(data: bytes) -> Any:
+    """An object of JSON, whose texts can all be stored."""
+    value = json.loads(data)
+    if not isinstance(value, dict):
+        raise ValueError("it is no object")
+    if b"\\ud" in data.lower():  # half a character; protobuf's own reader fails on it
+        json.dumps(value, ensure_ascii=False).encode()
+    return _plain_times(value)
 
 
 def _plain_times(value: Any) -> Any:

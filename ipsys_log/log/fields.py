@@ -11,12 +11,15 @@ from typing import Annotated, Any, Union, get_args, get_origin, get_type_hints
 
 import numpy as np
 
+from ipsys_log.log.bounds import Items
+
 __all__ = ["NS", "fields_of", "fill_proto", "read_proto"]
 
 NS = 1_000_000_000
+_LATEST_NS = 1 << 63
 
 Fill = Callable[[Any, Any], None]
-Read = Callable[[Any], Any]
+Read = Callable[[Any, Items], Any]
 
 
 def fill_proto(payload_type: type, proto: Any, payload: Any) -> None:
@@ -27,9 +30,9 @@ def fill_proto(payload_type: type, proto: Any, payload: Any) -> None:
             fill(proto, value)
 
 
-def read_proto(payload_type: type, proto: Any) -> Any:
-    """The payload in a protobuf message."""
-    return payload_type(*(read(proto) for _, _, read in fields_of(payload_type)))
+def read_proto(payload_type: type, proto: Any, items: Items) -> Any:
+    """The payload in a protobuf message; its parts are taken from `items`."""
+    return payload_type(*(read(proto, items) for _, _, read in fields_of(payload_type)))
 
 
 @cache
@@ -45,8 +48,8 @@ def _converters(name: str, hint: Any) -> tuple[Fill, Read]:
         inner = next(h for h in get_args(hint) if h is not type(None))
         fill, read = _converters(name, inner)
         if get_origin(inner) is Annotated and isinstance(inner.__metadata__[0], tuple):
-            return fill, lambda proto: read(proto) if getattr(proto, name) else None
-        return fill, lambda proto: read(proto) if proto.HasField(name) else None
+            return fill, lambda proto, items: read(proto, items) if getattr(proto, name) else None
+        return fill, lambda proto, items: read(proto, items) if proto.HasField(name) else None
     if get_origin(hint) is Annotated:
         mark = hint.__metadata__[0]
         return _array(name, mark) if isinstance(mark, tuple) else _time(name)
@@ -58,10 +61,12 @@ def _converters(name: str, hint: Any) -> tuple[Fill, Read]:
 
 
 def _map(name: str) -> tuple[Fill, Read]:
-    return (
-        lambda proto, value: getattr(proto, name).update(value),
-        lambda proto: dict(sorted(getattr(proto, name).items())),
-    )
+    def read(proto: Any, items: Items) -> dict[Any, Any]:
+        pairs = getattr(proto, name)
+        items.take(len(pairs))
+        return dict(sorted(pairs.items()))
+
+    return lambda proto, value: getattr(proto, name).update(value), read
 
 
 def _nested(name: str, payload_type: Any) -> tuple[Fill, Read]:
@@ -69,11 +74,11 @@ def _nested(name: str, payload_type: Any) -> tuple[Fill, Read]:
         getattr(proto, name).SetInParent()
         fill_proto(payload_type, getattr(proto, name), value)
 
-    return fill, lambda proto: read_proto(payload_type, getattr(proto, name))
+    return fill, lambda proto, items: read_proto(payload_type, getattr(proto, name), items)
 
 
 def _scalar(name: str) -> tuple[Fill, Read]:
-    return lambda proto, value: setattr(proto, name, value), lambda proto: getattr(proto, name)
+    return lambda proto, value: setattr(proto, name, value), lambda proto, _: getattr(proto, name)
 
 
 def _array(name: str, shape: tuple[int, ...]) -> tuple[Fill, Read]:
@@ -82,7 +87,7 @@ def _array(name: str, shape: tuple[int, ...]) -> tuple[Fill, Read]:
     def fill(proto: Any, value: Any) -> None:
         getattr(proto, name).extend(np.asarray(value, dtype=np.float64).reshape(-1).tolist())
 
-    def read(proto: Any) -> Any:
+    def read(proto: Any, _: Items) -> Any:
         # A list of numbers is faster to read than the protobuf container.
         array = np.array(getattr(proto, name)[:], dtype=np.float64)
         if size is not None and array.size != size:
@@ -100,23 +105,33 @@ def _time(name: str) -> tuple[Fill, Read]:
         stamp.seconds, stamp.nanos = divmod(value, NS)
         stamp.SetInParent()
 
-    def read(proto: Any) -> int:
+    def read(proto: Any, _: Items) -> int:
         stamp = getattr(proto, name)
-        return int(stamp.seconds * NS + stamp.nanos)
+        time_ns = int(stamp.seconds * NS + stamp.nanos)
+        if not -_LATEST_NS <= time_ns < _LATEST_NS:
+            raise ValueError(f"{name} is {stamp.seconds} s, later than the year 2262")
+        return time_ns
 
     return fill, read
 
 
 def _repeated(name: str, item: Any) -> tuple[Fill, Read]:
+    def numbers(proto: Any, items: Items) -> tuple[Any, ...]:
+        values = getattr(proto, name)
+        items.take(len(values))
+        return tuple(values)
+
     if not is_dataclass(item):
-        return (
-            lambda proto, value: getattr(proto, name).extend(value),
-            lambda proto: tuple(getattr(proto, name)),
-        )
+        return lambda proto, value: getattr(proto, name).extend(value), numbers
     nested: Any = item
 
     def fill(proto: Any, value: Any) -> None:
         for one in value:
             fill_proto(nested, getattr(proto, name).add(), one)
 
-    return fill, lambda proto: tuple(read_proto(nested, one) for one in getattr(proto, name))
+    def read(proto: Any, items: Items) -> tuple[Any, ...]:
+        values = getattr(proto, name)
+        items.take(len(values))
+        return tuple(read_proto(nested, one, items) for one in values)
+
+    return fill, read

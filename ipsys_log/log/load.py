@@ -2,6 +2,7 @@
 
 import zlib
 from itertools import pairwise
+from typing import NamedTuple
 
 from mcap import records as mcap
 from mcap.opcode import Opcode
@@ -21,11 +22,34 @@ from ipsys_log.log.scan import scan
 from ipsys_log.log.summary import standing_data_end
 from ipsys_log.log.view import View
 
-__all__ = ["NoFooterError", "load_contents"]
+__all__ = ["NoFooterError", "Summary", "load_contents", "read_summary"]
 
 
 class NoFooterError(LogError):
     """A log has no end: its writer has not come to it yet, or never will."""
+
+
+class Summary(NamedTuple):
+    """The summary alone. `checked` says that its CRC is right (a summary may have none)."""
+
+    contents: Contents
+    statistics: mcap.Statistics | None
+    checked: bool
+
+
+def read_summary(view: View) -> Summary | None:
+    """Read the summary without a look at what stands before it; None if the log has none.
+
+    Raises
+    ------
+    LogError
+        The end of the log is missing or damaged.
+    """
+    footer_at, summary_start, checked = _footer(view)
+    if not summary_start:
+        return None
+    contents, statistics = _from_summary(view, summary_start, footer_at)
+    return Summary(contents, statistics, checked)
 
 
 def load_contents(view: View) -> Contents:
@@ -36,10 +60,12 @@ def load_contents(view: View) -> Contents:
     LogError
         The file is empty, not an MCAP, or is damaged; a `NoFooterError` where its end is missing.
     """
-    footer_at, summary_start = _footer(view)
+    _check_start(view)
+    footer_at, summary_start, _ = _footer(view)
     contents, complete = (None, False)
     if summary_start:
-        contents, complete = _from_summary(view, summary_start, footer_at)
+        contents, statistics = _from_summary(view, summary_start, footer_at)
+        complete = statistics is not None and _is_complete(contents, statistics)
     end = summary_start or footer_at
     data_end = end - DATA_END.size
     opcode, length, crc = DATA_END.unpack(view.read(data_end, DATA_END.size)) if data_end >= 8 else (0, 0, 0)
@@ -50,18 +76,25 @@ def load_contents(view: View) -> Contents:
         data_end = standing
     if contents is None or not complete or not _gaps_hold_no_messages(view, contents, data_end):
         contents = scan(view, data_end)
+    view.check_number(len(contents.channels), "channels")
+    view.check_number(len(contents.schemas), "schemas")
     contents.data_end, contents.data_crc, contents.cut_short = data_end, crc, standing is not None
     return contents
 
 
-def _footer(view: View) -> tuple[int, int]:
-    """Offset of the Footer record, and of the summary (0: none)."""
-    path = view.path
-    start = view.read(0, min(8, view.size))
+def _check_start(view: View) -> None:
+    start = view.read(0, min(len(MAGIC), view.size))
     if not start:
-        raise LogError(f"{path} is empty: nothing was ever written to it")
+        raise LogError(f"{view.path} is empty: nothing was ever written to it")
     if not MAGIC.startswith(start):
-        raise LogError(f"{path} is not an MCAP file (it starts with {start!r}): give a log ending in .mcap")
+        raise LogError(
+            f"{view.path} is not an MCAP file (it starts with {start!r}): give a log ending in .mcap"
+        )
+
+
+def _footer(view: View) -> tuple[int, int, bool]:
+    """Offset of the Footer record, offset of the summary (0: none), and whether a CRC confirms both."""
+    path = view.path
     at = view.size - len(MAGIC) - FOOTER.size
     tail = view.read(at, view.size - at) if at >= len(MAGIC) else b""
     if not tail.endswith(MAGIC) or FOOTER.unpack_from(tail)[:2] != (Opcode.FOOTER, 20):
@@ -76,11 +109,11 @@ def _footer(view: View) -> tuple[int, int]:
         summary = view.read(summary_start, at - summary_start + FOOTER.size - 4)
         if zlib.crc32(summary) != crc:
             raise view.fault(summary_start, "the CRC of the summary is wrong")
-    return at, summary_start
+    return at, summary_start, bool(summary_start and crc)
 
 
-def _from_summary(view: View, start: int, end: int) -> tuple[Contents, bool]:
-    """What the summary says, and whether that is all."""
+def _from_summary(view: View, start: int, end: int) -> tuple[Contents, mcap.Statistics | None]:
+    """What the summary says, and its Statistics record, without which it is not complete."""
     contents = Contents()
     statistics: mcap.Statistics | None = None
     data = view.read(start, end - start)
@@ -101,13 +134,13 @@ def _from_summary(view: View, start: int, end: int) -> tuple[Contents, bool]:
             channel = parse(mcap.Channel.read, view, at, body)
             contents.channels.setdefault(channel.id, channel)
     if statistics is None:
-        return contents, False
+        return contents, None
     contents.counts = dict(statistics.channel_message_counts)
     contents.attachment_count = statistics.attachment_count
     contents.metadata_count = statistics.metadata_count
     if statistics.message_count:
         contents.cover(statistics.message_start_time, statistics.message_end_time)
-    return contents, _is_complete(contents, statistics)
+    return contents, statistics
 
 
 def _is_complete(contents: Contents, statistics: mcap.Statistics) -> bool:

@@ -11,7 +11,7 @@ from ipsys_log.log.journal import journal_path
 from ipsys_log.log.storage import Storage
 from ipsys_log.log.view import open_for_reading
 
-__all__ = ["check_free", "check_locks", "is_being_written", "open_locked"]
+__all__ = ["check_free", "check_locks", "dangling", "is_being_written", "open_locked"]
 
 
 def open_locked(storage: Storage, path: Path, flags: int) -> int:
@@ -104,7 +104,14 @@ def check_free(path: Path) -> None:
 
 
 def _why_taken(path: Path) -> str:
-    if path.is_symlink() and not path.exists():
-        target = path.readlink()
-        return f"{path} is a link to {target}, which does not exist: remove it, or choose another name"
-    return f"{path} exists already and is never overwritten: choose another name"
+    return dangling(path) or f"{path} exists already and is never overwritten: choose another name"
+
+
+def dangling(path: Path) -> str | None:
+    """Return what is wrong with a path that is a link to nothing; None for any other.
+
+    It does not exist, and yet nothing can be made there.
+    """
+    if not path.is_symlink() or path.exists():
+        return None
+    return f"{path} is a link to {path.readlink()}, which does not exist: remove it, or choose another name"

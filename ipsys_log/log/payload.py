@@ -37,6 +37,7 @@ class Blocks:
     """The stretches of records read last, so that memory stays bounded however many chunks overlap."""
 
     capacity: int = _CACHE_BYTES
+    searched: dict[int, Entries] = field(default_factory=dict)  # rows of chunks without message indexes
     _held: "OrderedDict[tuple[int, int, int], bytes]" = field(default_factory=OrderedDict)
     _size: int = 0
 
@@ -72,12 +73,14 @@ class _Messages:
     runs: list[Run]
     fetch: Callable[[int, int], bytes]
     read: Callable[[int, int], bytes]
+    spare: int  # bytes that the messages still to come may take together: more, and they overlap
 
     def between(self, first: int, stop: int) -> Iterator[RawMessage]:
         """The messages of rows `first` to `stop`; what a record says must agree with the index."""
         # Where small messages are read, the time is spent here: no call to Python for most of them.
         unpack, topic_of = MESSAGE.unpack_from, self.topics.get
         data, low, size, fetched = b"", 0, 0, None
+        most = self.view.allowance.most_payload
         rows = slice(first, stop)
         for due, offset, run in zip(self.times[rows], self.offsets[rows], self.runs[rows], strict=True):
             if run is not fetched:
@@ -93,11 +96,16 @@ class _Messages:
             if time != due or opcode != _OPCODE or length < _SHORTEST or topic is None:
                 place = self.place or offset
                 raise self.view.fault(place, "a message index points to no message of its time")
+            if most < length < self.spare:
+                raise self.view.refusal(f"one of its messages has {length} bytes, more than {most}")
             end = start + HEAD_SIZE + length
             if end <= size:
                 payload = data[start + MESSAGE_HEAD_SIZE : end]
             else:
                 payload = self.read(offset + MESSAGE_HEAD_SIZE, offset + HEAD_SIZE + length)
+            self.spare -= length
+            if self.spare < 0:
+                raise self.view.fault(self.place, "its message indexes name bytes more than once")
             yield _new(RawMessage, (topic, time, published, payload))
 
 
@@ -138,7 +146,7 @@ def open_chunk(
     place, name, size = chunk.offset, chunk.compression, chunk.uncompressed_size
     packed = chunk.compressed_size
     check_compression(view, name)
-    entries = chunk_entries(view, chunk)
+    entries = chunk_entries(view, chunk, blocks.searched)
     rows = wanted_rows(entries, topics, span)
     records = _Records(view, chunk)
     if name and packed > _SMALL and packed > len(rows) * _SPARSE:
@@ -148,7 +156,7 @@ def open_chunk(
     else:
         stretches, fetch = runs(entries, rows, size), partial(blocks.fetch, place, records.read)
     times, offsets = rows.T.tolist()
-    messages = _Messages(view, topics, place, times, offsets, stretches, fetch, records.read)
+    messages = _Messages(view, topics, place, times, offsets, stretches, fetch, records.read, size)
     return Cursor(place, times, offsets, messages.between)
 
 
@@ -163,5 +171,5 @@ def open_loose(
     rows = wanted_rows(entries, topics, span)
     stretches, fetch = runs(entries, rows, end), partial(blocks.fetch, 0, read)
     times, offsets = rows.T.tolist()
-    messages = _Messages(view, topics, 0, times, offsets, stretches, fetch, read)
+    messages = _Messages(view, topics, 0, times, offsets, stretches, fetch, read, end)
     return Cursor(None, times, offsets, messages.between)

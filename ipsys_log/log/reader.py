@@ -14,6 +14,7 @@ from mcap import records as mcap
 from numpy.typing import NDArray
 
 from ipsys_log.errors import LogError
+from ipsys_log.log.bounds import Allowance
 from ipsys_log.log.channels import by_topic
 from ipsys_log.log.contents import Contents
 from ipsys_log.log.hashing import METADATA_NAME, ChannelHash, hashes_from_metadata
@@ -109,6 +110,15 @@ class LogReader:
         return self._view.bytes_read
 
     @property
+    def allowance(self) -> Allowance:
+        """How much work the log may cause."""
+        return self._view.allowance
+
+    def check_number(self, number: int, what: str) -> None:
+        """Refuse a log with more runs or measurements than a file of its size may have."""
+        self._view.check_number(number, what)
+
+    @property
     def data_end(self) -> int:
         """Where the data section ends: an append changes nothing before this byte."""
         return self._contents.data_end
@@ -159,7 +169,7 @@ class LogReader:
         parts = [rows for key, rows in as_rows(self._contents.loose).items() if key in wanted]
         for chunk in self._contents.chunks:
             if not chunk.index_offsets or not wanted.isdisjoint(chunk.index_offsets):
-                entries = chunk_entries(self._view, chunk, wanted)
+                entries = chunk_entries(self._view, chunk, self._blocks.searched, wanted)
                 parts += [rows for key, rows in entries.items() if key in wanted]
         times = np.concatenate([rows[:, 0] for rows in parts]) if parts else np.empty(0, np.uint64)
         return np.sort(times).astype(np.int64)

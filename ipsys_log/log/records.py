@@ -31,6 +31,7 @@ __all__ = [
     "RecordAt",
     "as_bytes",
     "chunk_head",
+    "exact",
     "parse",
     "parse_chunk_head",
     "parse_chunk_index",
@@ -123,6 +124,25 @@ def parse(read: Callable[[ReadDataStream], R], view: View, at: RecordAt, body: b
         return read(ReadDataStream(BytesIO(body)))
     except (McapError, struct.error, UnicodeDecodeError, OverflowError, MemoryError, ValueError) as error:
         raise view.fault(at.offset, f"the {_name(at.opcode)} record is not valid ({error!r})") from None
+
+
+_DEFINITIONS: dict[int, Callable[[ReadDataStream], mcap.McapRecord]] = {
+    Opcode.HEADER: mcap.Header.read,
+    Opcode.SCHEMA: mcap.Schema.read,
+    Opcode.CHANNEL: mcap.Channel.read,
+    Opcode.METADATA: mcap.Metadata.read,
+}
+
+
+def exact(view: View, at: RecordAt, data: bytes) -> mcap.McapRecord:
+    """The Header, Schema, Channel or Metadata record `data`; every length in it must be right.
+
+    What follows the fields that are known is left to later versions of the format.
+    """
+    record = parse(_DEFINITIONS[at.opcode], view, at, data[HEADER.size :])
+    if not data.startswith(as_bytes(record)[HEADER.size :], HEADER.size):
+        raise view.fault(at.offset, f"the {_name(at.opcode)} record claims lengths that it does not have")
+    return record
 
 
 def parse_chunk_index(view: View, at: RecordAt, body: bytes) -> ChunkRef:

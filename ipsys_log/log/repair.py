@@ -1,43 +1,51 @@
-"""Making a log whole again whose writer was killed, or whose end was cut off."""
+"""Making a log whole again whose writer was killed, whose end was cut off, or which is damaged inside."""
 
+import errno
 import os
+import tempfile
 import zlib
-from collections import Counter
 from collections.abc import Mapping, Sequence
 from contextlib import suppress
 from dataclasses import dataclass, field, replace
 from pathlib import Path
+from typing import IO, NamedTuple, overload
 
 from mcap import records as mcap
 from mcap.opcode import Opcode
 
 from ipsys_log.errors import LogError
-from ipsys_log.log.contents import Contents
-from ipsys_log.log.crc import Buffer
+from ipsys_log.log.agreement import count_by_indexes, disagreement
+from ipsys_log.log.bounds import BoundError
+from ipsys_log.log.crc import combine
+from ipsys_log.log.damaged import Change, Patch, check_room, discard, keep_old_bytes, overwrite, resume
 from ipsys_log.log.hashing import METADATA_NAME, metadata_of_hashes
 from ipsys_log.log.journal import replace_tail, roll_back
-from ipsys_log.log.load import load_contents
+from ipsys_log.log.load import Summary, read_summary
 from ipsys_log.log.lock import open_locked
-from ipsys_log.log.records import HEADER, MAGIC, ChunkRef, as_bytes, walk
-from ipsys_log.log.salvage import Salvage, salvage
-from ipsys_log.log.storage import DISK, Storage, write_all
+from ipsys_log.log.records import MAGIC, MESSAGE, as_bytes, walk
+from ipsys_log.log.salvage import Salvage
+from ipsys_log.log.storage import DISK, Storage
+from ipsys_log.log.stretch import index_records
 from ipsys_log.log.summary import tail_bytes
-from ipsys_log.log.survey import Survey, crc_of, survey
+from ipsys_log.log.survey import HEADER_RECORD, Survey, survey
 from ipsys_log.log.view import View
 
 __all__ = ["RepairReport", "repair"]
 
-_KEEP_BESIDE = 16 << 20  # bytes: a larger stretch that cannot be read is copied before it is cut off
 _BLOCK = 1 << 20
+_IN_MEMORY = 16 << 20  # bytes of saved messages; more than that lies in a file without a name
 
 
 @dataclass(frozen=True, slots=True)
 class RepairReport:
     """What `repair` found and did.
 
-    ``lost`` has, by topic, the log times in ns of messages known to be gone; ``bytes_lost`` counts bytes of
-    the data section that were dropped. ``cut_off`` says that the log had no end: what its writer had not
-    handed over yet when the file was last written, at ``written_ns``, is gone and not known.
+    ``lost`` has, by topic, the log times in ns of messages known to be gone, ``gone`` their numbers: these
+    may be known without the times. ``uncounted`` says that others may be gone, nobody knows how many.
+    ``unchecked`` messages were saved from damaged chunks, and no CRC says that they are right.
+    ``bytes_lost`` counts bytes of the data section that cannot be read; ``kept_in`` is the file that holds
+    all bytes that were taken out of the log. ``cut_off`` says that the log had no end: what its writer had
+    not handed over yet when the file was last written, at ``written_ns``, is gone and not known.
     """
 
     path: Path
@@ -49,115 +57,250 @@ class RepairReport:
     notes: tuple[str, ...] = ()
     cut_off: bool = False
     written_ns: int = 0
+    gone: Mapping[str, int] = field(default_factory=dict)
+    uncounted: bool = False
+    unchecked: int = 0
+    kept_in: Path | None = None
 
 
 def repair(path: str | os.PathLike[str], *, storage: Storage = DISK) -> RepairReport:
-    """Restore every complete chunk of a log in place, and say what was lost.
+    """Restore what is whole in a log, in place, and say what was lost.
 
-    An append that was cut short is rolled back. A log that is whole is left alone. Damaged chunks in the
-    middle are marked so that readers skip them. What is dropped in one piece and is larger than 16 MiB is
-    kept in ``<path>.lost``.
+    An append that was cut short is rolled back. A log that is whole is left alone. Damaged stretches become
+    records that every reader skips; what they defined, and the message indexes that were in them, is
+    written there again where it is known. What can be read of a damaged chunk is saved in a new one. All
+    bytes that are overwritten or cut off are kept in ``<path>.damaged`` (``.damaged_2`` if there is one of
+    an earlier repair).
+
+    The new log is read again before anything is changed: its indexes, its data section and its statistics
+    must give the same number of messages, and a second repair must find nothing to do. A whole log is
+    read once, a damaged one twice.
 
     Raises
     ------
     LogError
-        The file is empty or not an MCAP, or another process is writing it.
+        The file is empty or not an MCAP, another process is writing it, the disk has no room, or it cannot
+        be made whole. It stays as it was.
     """
     target = Path(path)
     fd = open_locked(storage, target, os.O_RDWR)
     try:
-        rolled_back = roll_back(storage, target, fd)
+        notes = ["an append that was cut short was rolled back"] if roll_back(storage, target, fd) else []
+        resumed = resume(storage, target, fd)
+        if resumed is not None:
+            notes.append("a repair that was cut short was completed")
         status = os.fstat(fd)
-        size = status.st_size
-        view = View(target, fd, size, size)
-        _check_magic(view)
+        view = View(target, fd, status.st_size, status.st_size)
+        _check_not_empty(view)
         known = _summary(view)
-        found = survey(view, known)
-        notes = ["an append that was cut short was rolled back"] if rolled_back else []
-        if known is not None and _is_whole(known, found):
-            return RepairReport(
-                target,
-                rolled_back,
-                0,
-                sum(found.contents.counts.values()),
-                found.contents.end_ns,
-                {},
-                tuple(notes),
-            )
-        return replace(_rebuild(storage, view, found, notes), written_ns=status.st_mtime_ns)
+        with tempfile.SpooledTemporaryFile(_IN_MEMORY, dir=str(target.parent)) as spool:
+            saved = Salvage(spool)
+            found = survey(view, known, saved)
+            if found.end < len(MAGIC):
+                start = view.read(0, min(len(MAGIC), view.size))
+                raise LogError(
+                    f"{target} is not an MCAP file (it starts with {start!r}): nothing was changed"
+                )
+            if not disagreement(view, found):
+                total = sum(found.contents.counts.values())
+                return RepairReport(
+                    target, bool(notes), 0, total, found.contents.end_ns, notes=tuple(notes), kept_in=resumed
+                )
+            report = _rebuild(storage, view, found, saved, known)
+        return replace(report, notes=(*notes, *report.notes), written_ns=status.st_mtime_ns)
     except OSError as error:
-        raise LogError(
-            f"{target} cannot be repaired ({error.strerror}): free some space and try again"
-        ) from None
+        full = error.errno in (errno.ENOSPC, errno.EDQUOT)
+        then = "free some space" if full else "see to its disk and folder"
+        raise LogError(f"{target} cannot be repaired ({error.strerror}): {then} and try again") from None
     finally:
         storage.close(fd)
 
 
-def _check_magic(view: View) -> None:
-    start = view.read(0, min(len(MAGIC), view.size))
-    if not start:
+def _check_not_empty(view: View) -> None:
+    if not view.size:
         raise LogError(f"{view.path} is empty: there is nothing to repair, delete it")
-    if start != MAGIC:
-        raise LogError(f"{view.path} is not an MCAP file (it starts with {start!r}): nothing was changed")
 
 
-def _summary(view: View) -> Contents | None:
+def _summary(view: View) -> Summary | None:
     try:
-        return load_contents(view)
+        return read_summary(view)
+    except BoundError:
+        raise
     except LogError:
         return None
 
 
-def _is_whole(theirs: Contents, found: Survey) -> bool:
-    if not found.finished or found.damaged or not found.crc_is_right:
-        return False
-    mine = found.contents
-    chunks = [_identity(chunk) for chunk in mine.chunks] == [_identity(chunk) for chunk in theirs.chunks]
-    indexes = all(
-        b.index_offsets in ({}, a.index_offsets) for a, b in zip(mine.chunks, theirs.chunks, strict=False)
-    )
-    counts = Counter(mine.counts) == Counter(theirs.counts)
-    return chunks and indexes and counts and theirs.data_end == found.end
+class _Plan(NamedTuple):
+    """The new log: what is overwritten, what the new end holds, and how many messages it must have."""
+
+    patches: list[Patch]
+    tail: IO[bytes]
+    tail_size: int
+    tail_crc: int
+    messages: int
 
 
-def _identity(chunk: ChunkRef) -> tuple[int | str, ...]:
-    """All that a reader goes by, but for the message indexes."""
-    sizes = (chunk.length, chunk.compressed_size, chunk.uncompressed_size)
-    return (chunk.offset, chunk.start_ns, chunk.end_ns, chunk.compression, *sizes)
+def _rebuild(
+    storage: Storage, view: View, found: Survey, saved: Salvage, known: Summary | None
+) -> RepairReport:
+    with tempfile.TemporaryFile(dir=view.path.parent) as tail:
+        plan = _plan(view, found, saved, tail)
+        _check(view, found, plan)
+        new_size = found.end + plan.tail_size
+        own_end = _own_end(view, found)
+        change = Change(plan.patches, found.end, new_size, plan.tail_crc, own_end, view.size)
+        kept_in = _commit(storage, view, change, plan)
+    return _report(view, found, saved, known, kept_in, own_end)
 
 
-def _rebuild(storage: Storage, view: View, found: Survey, notes: list[str]) -> RepairReport:
-    """Cut behind the last whole record, write what was saved, and a new summary."""
-    contents, size, start = found.contents, view.size, found.end
-    saved = Salvage() if found.finished else salvage(view, start, found)
-    bytes_lost = 0 if found.finished else max(0, size - start - saved.bytes_kept)
-    bytes_lost += sum(record.length for record in found.damaged)
-    behind = _own_end(view, found)
-    if behind < size:
-        bytes_lost += size - behind
-        kept_in = _copy_lost(storage, view, behind)
-        notes.append(f"{size - behind} bytes behind its end, perhaps another log, were kept in {kept_in}")
-    if not found.finished and size - start > _KEEP_BESIDE:
-        notes.append(
-            f"the {size - start} bytes from byte {start} on were kept in {_copy_lost(storage, view, start)}"
-        )
-    _blank(storage, view, found)
-    indexes = b"".join(_indexes(found))
-    kept = b"".join((indexes, *_saved_chunk(found, saved, start + len(indexes))))
-    contents.data_end = start + len(kept)
-    hashes = b"" if contents.loose else metadata_of_hashes(found.hashes, contents.data_end)
+def _plan(view: View, found: Survey, saved: Salvage, tail: IO[bytes]) -> _Plan:
+    """Work out the new log; nothing is changed yet."""
+    contents, start = found.contents, found.end
+    patches = _patches(found)
+    end = _End(tail, start, _crc_with(view, patches, start, found.crc))
+    if start == len(MAGIC):
+        end.emit(HEADER_RECORD)
+    if found.unindexed is not None:
+        data, offsets = index_records(found.unindexed.entries, end.offset)
+        contents.chunks[-1] = contents.chunks[-1]._replace(index_length=len(data), index_offsets=offsets)
+        end.emit(data)
+    _emit_saved(end, found, saved)
+    _emit_homeless(end, view, found)
+    found.definitions.complete()
+    contents.schemas, contents.channels = found.definitions.schemas, found.definitions.channels
+    hashes = b"" if contents.loose else metadata_of_hashes(found.hashes, end.offset)
     if hashes:
-        contents.metadata.append(mcap.MetadataIndex(contents.data_end, len(hashes), METADATA_NAME))
+        contents.metadata.append(mcap.MetadataIndex(end.offset, len(hashes), METADATA_NAME))
         contents.metadata_count += 1
-        contents.data_end += len(hashes)
-    contents.data_crc = zlib.crc32(kept + hashes, found.crc)
-    replace_tail(storage, view.path, view.fd, start, (kept, hashes, tail_bytes(contents)))
-    notes += [f"found: {fault}" for fault in found.faults]
-    kept_messages = sum(contents.counts.values())
-    lost, whole = found.lost.times_ns, found.finished
-    return RepairReport(
-        view.path, True, bytes_lost, kept_messages, contents.end_ns, lost, tuple(notes), not whole
-    )
+        end.emit(hashes)
+    contents.data_end, contents.data_crc = end.offset, end.data_crc
+    # With chunk indexes, other readers would look for messages in chunks only.
+    end.emit(tail_bytes(replace(contents, chunks=[]) if contents.loose else contents))
+    tail.flush()
+    return _Plan(patches, tail, end.offset - start, end.crc, sum(contents.counts.values()))
+
+
+@dataclass(slots=True)
+class _End:
+    """The new end of a log while it is put together; `data_crc` is that of the data section so far."""
+
+    file: IO[bytes]
+    offset: int
+    data_crc: int
+    crc: int = 0
+
+    def emit(self, data: bytes) -> None:
+        self.file.write(data)
+        self.offset += len(data)
+        self.crc, self.data_crc = zlib.crc32(data, self.crc), zlib.crc32(data, self.data_crc)
+
+
+def _emit_saved(end: _End, found: Survey, saved: Salvage) -> None:
+    """The saved messages, behind what defines their channels."""
+    saved.finish()
+    for record in found.definitions.missing(set(saved.counts), saved.inside):
+        end.emit(as_bytes(record))
+    contents, base = found.contents, end.offset
+    saved.spool.seek(0)
+    while block := saved.spool.read(_BLOCK):
+        end.emit(block)
+    for ref in saved.chunks:
+        offsets = {channel: offset + base for channel, offset in ref.index_offsets.items()}
+        contents.chunks.append(ref._replace(offset=ref.offset + base, index_offsets=offsets))
+        contents.cover(ref.start_ns, ref.end_ns)
+    for channel, number in saved.counts.items():
+        contents.count(channel, number)
+
+
+def _emit_homeless(end: _End, view: View, found: Survey) -> None:
+    """Messages in no chunk that cannot stay where they are, behind what defines their channels."""
+    contents = found.contents
+    heads = [MESSAGE.unpack(view.read(at.offset, MESSAGE.size)) for at in found.homeless]
+    for record in found.definitions.missing({head[2] for head in heads}, found.definitions.known):
+        end.emit(as_bytes(record))
+    for at, (_, _, channel, _, time_ns, _) in zip(found.homeless, heads, strict=True):
+        contents.loose.setdefault(channel, []).append((time_ns, end.offset))
+        contents.count(channel, 1)
+        contents.cover(time_ns, time_ns)
+        end.emit(view.read(at.offset, at.length))
+
+
+def _patches(found: Survey) -> list[Patch]:
+    chunks = found.contents.chunks
+    for stretch in found.damaged:
+        if stretch.chunk is not None:
+            data, offsets = stretch.indexes()
+            chunks[stretch.chunk] = chunks[stretch.chunk]._replace(
+                index_length=len(data), index_offsets=offsets
+            )
+    patches = [(stretch.offset, stretch.content()) for stretch in found.damaged]
+    return sorted([*patches, *found.wrong_heads])
+
+
+def _crc_with(view: View, patches: Sequence[Patch], end: int, crc: int) -> int:
+    """The CRC of the data section up to `end` with other bytes in it: it is linear in what differs."""
+    for offset, new in patches:
+        differs = zlib.crc32(view.read(offset, len(new))) ^ zlib.crc32(new)
+        crc ^= combine(differs, 0, end - offset - len(new))
+    return crc
+
+
+def _check(view: View, found: Survey, plan: _Plan) -> None:
+    """Read the new log before it is written: by its indexes, record by record, and by its statistics.
+
+    Raises
+    ------
+    LogError
+        They do not agree.
+    """
+    size = found.end + plan.tail_size
+    new = View(view.path, view.fd, size, found.end, plan.tail.fileno(), 0, patches=plan.patches)
+    again = survey(new, _summary(new))
+    streamed = sum(again.contents.counts.values())
+    what = disagreement(new, again)
+    if not what and not plan.messages == streamed == count_by_indexes(new):
+        what = f"{plan.messages} messages were saved, {streamed} would be read"
+    if what:
+        faults = "; ".join(found.faults[:3])
+        raise LogError(
+            f"{view.path} cannot be made whole ({what}) and was left as it was. Keep a copy. Found: {faults}"
+        )
+
+
+class _Blocks(Sequence[bytes]):
+    """A file as blocks of bytes, read when they are needed."""
+
+    def __init__(self, fd: int, size: int) -> None:
+        self._fd, self._size = fd, size
+
+    def __len__(self) -> int:
+        return len(range(0, self._size, _BLOCK))
+
+    @overload
+    def __getitem__(self, index: int) -> bytes: ...
+    @overload
+    def __getitem__(self, index: slice) -> list[bytes]: ...
+    def __getitem__(self, index: int | slice) -> bytes | list[bytes]:
+        if isinstance(index, slice):
+            return [self[number] for number in range(*index.indices(len(self)))]
+        if not 0 <= index < len(self):
+            raise IndexError(index)
+        return os.pread(self._fd, _BLOCK, index * _BLOCK)
+
+
+def _commit(storage: Storage, view: View, change: Change, plan: _Plan) -> Path | None:
+    """Keep the old bytes, then write the new log; a crash at any instant leaves the one or the other."""
+    path, fd = view.path, view.fd
+    check_room(path, change)
+    kept = keep_old_bytes(storage, view, change, os.fstat(fd).st_mtime_ns)
+    try:
+        replace_tail(storage, path, fd, change.start, _Blocks(plan.tail.fileno(), plan.tail_size))
+    except OSError:
+        with suppress(OSError):  # else whoever next writes does it
+            roll_back(storage, path, fd)
+            discard(storage, path)
+        raise
+    return overwrite(storage, path, fd, change.patches) if kept else None
 
 
 def _own_end(view: View, found: Survey) -> int:
@@ -170,55 +313,41 @@ def _own_end(view: View, found: Survey) -> int:
     return view.size
 
 
-def _indexes(found: Survey) -> list[bytes]:
-    """The missing message indexes of the last chunk."""
-    if found.unindexed is None:
-        return []
-    chunk = found.contents.chunks[-1]
-    at, offsets, pieces = found.end, {}, []
-    for channel, rows in found.unindexed.entries.items():
-        pieces.append(as_bytes(mcap.MessageIndex(channel, rows)))
-        offsets[channel], at = at, at + len(pieces[-1])
-    found.contents.chunks[-1] = ChunkRef(
-        chunk.offset, chunk.length, chunk.start_ns, chunk.end_ns, chunk.compression, chunk.compressed_size,
-        chunk.uncompressed_size, at - found.end, offsets,
-    )  # fmt: skip
-    return pieces
+def _report(
+    view: View, found: Survey, saved: Salvage, known: Summary | None, kept_in: Path | None, own_end: int
+) -> RepairReport:
+    contents = found.contents
+    notes = [f"found: {fault}" for fault in found.faults]
+    if found.finished and not found.crc_is_right and not found.damaged:
+        notes.append("found: the CRC of the data section is wrong; what is damaged in it is not known")
+    if own_end < view.size:
+        notes.append(f"{view.size - own_end} bytes behind its end, perhaps another log, were cut off")
+    gone, counted = _gone(found, known)
+    return RepairReport(
+        view.path,
+        True,
+        found.lost.bytes - sum(at.length for at in found.homeless) + view.size - own_end,
+        sum(contents.counts.values()),
+        contents.end_ns,
+        found.lost.times_ns,
+        tuple(notes),
+        cut_off=not found.finished and known is None,
+        gone=gone,
+        uncounted=found.lost.uncounted > 0 and not counted,
+        unchecked=saved.unchecked,
+        kept_in=kept_in,
+    )
 
 
-def _saved_chunk(found: Survey, saved: Salvage, offset: int) -> list[Buffer]:
-    built = saved.chunk.build(offset + sum(map(len, saved.definitions)))
-    if built is None:
-        return [*saved.definitions]
-    ref, data, _ = built
-    found.contents.chunks.append(ref)
-    found.contents.cover(ref.start_ns, ref.end_ns)
-    for channel, number in saved.chunk.counts.items():
-        found.contents.count(channel, number)
-    return [*saved.definitions, data]
-
-
-def _blank(storage: Storage, view: View, found: Survey) -> None:
-    """Make damaged stretches records of a private type, which every reader skips."""
-    for stretch in found.damaged:
-        head = HEADER.pack(Opcode.CHUNK | 0x80, stretch.length - HEADER.size)
-        write_all(storage, view.fd, head, stretch.offset)
-    if found.damaged:
-        storage.fsync(view.fd)
-        found.crc = crc_of(view, found.end)
-
-
-def _copy_lost(storage: Storage, view: View, start: int) -> Path:
-    beside, number = view.path.with_name(view.path.name + ".lost"), 1
-    while beside.exists():  # of an earlier repair, or one that was interrupted
-        number += 1
-        beside = view.path.with_name(f"{view.path.name}.lost_{number}")
-    fd = storage.open(beside, os.O_WRONLY | os.O_CREAT | os.O_EXCL)
-    try:
-        for offset in range(start, view.size, _BLOCK):
-            write_all(storage, fd, view.read(offset, min(_BLOCK, view.size - offset)), offset - start)
-        storage.fsync(fd)
-    finally:
-        storage.close(fd)
-    storage.fsync_directory(beside.parent)
-    return beside
+def _gone(found: Survey, known: Summary | None) -> tuple[dict[str, int], bool]:
+    """Numbers of lost messages by topic, and whether the summary says that these are all."""
+    gone = {topic: len(times_ns) for topic, times_ns in found.lost.times_ns.items()}
+    if known is None or not known.checked or known.statistics is None:
+        return gone, False
+    for channel, number in known.statistics.channel_message_counts.items():
+        record = known.contents.channels.get(channel)
+        missing = number - found.contents.counts.get(channel, 0)
+        if missing > 0:
+            topic = record.topic if record else f"channel {channel}"
+            gone[topic] = max(gone.get(topic, 0), missing)
+    return gone, True

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import re
 import struct
 from collections.abc import Callable
 from functools import cache
@@ -12,6 +13,7 @@ from mcap.records import Schema
 from mcap_ros2.decoder import DecoderFactory
 
 from ipsys_log.errors import LogError
+from ipsys_log.log.bounds import Items
 from ipsys_log.messages import CameraCalibration, CompressedImage, RawImage
 from ipsys_log.units import NS_PER_S
 
@@ -22,11 +24,26 @@ ROS2_PAYLOADS: dict[str, type] = {
     "sensor_msgs/msg/CompressedImage": CompressedImage,
     "sensor_msgs/msg/Image": RawImage,
 }
+# The definitions of ROS 2, the same from Foxy to Kilted.
+_FIELDS = {
+    "CameraInfo": "std_msgs/Header header\nuint32 height\nuint32 width\nstring distortion_model\n"
+    "float64[] d\nfloat64[9] k\nfloat64[9] r\nfloat64[12] p\nuint32 binning_x\nuint32 binning_y\n"
+    "sensor_msgs/RegionOfInterest roi\n",
+    "CompressedImage": "std_msgs/Header header\nstring format\nuint8[] data\n",
+    "Image": "std_msgs/Header header\nuint32 height\nuint32 width\nstring encoding\nuint8 is_bigendian\n"
+    "uint32 step\nuint8[] data\n",
+    "Header": "builtin_interfaces/Time stamp\nstring frame_id\n",
+    "RegionOfInterest": "uint32 x_offset\nuint32 y_offset\nuint32 height\nuint32 width\nbool do_rectify\n",
+}
+_NESTED = {"Header": "std_msgs", "RegionOfInterest": "sensor_msgs"}
+_PACKAGES = dict.fromkeys(_FIELDS, "sensor_msgs") | _NESTED
+_LONGEST_DEFINITION = 64 << 10  # bytes
+_BYTES_PER_NUMBER = 8
 # Names of models of a lens, where they are others than Foxglove's.
 _MODELS = {"equidistant": "kannala_brandt", "fisheye": "kannala_brandt"}
 
 
-def read_ros2(name: str, data: bytes, definition: bytes) -> Any:
+def read_ros2(name: str, data: bytes, definition: bytes, items: Items | None = None) -> Any:
     """The payload in a message of ROS 2.
 
     Parameters
@@ -34,15 +51,21 @@ def read_ros2(name: str, data: bytes, definition: bytes) -> Any:
     name : of the schema, such as ``sensor_msgs/msg/CompressedImage``.
     data : the message.
     definition : the schema as the log has it (``ros2msg``); empty where it has it in another form.
+    items : the numbers outside of images that may still be read.
 
     Raises
     ------
+    BoundError
+        The message has more numbers than `items` allows.
     LogError
         Where the definition is none of that form, or the bytes are not a message of it.
     """
     if not definition:
         raise LogError(f"its schema {name!r} is not given as .msg; convert the log: ros2 bag convert")
-    decoder = _decoder(name, definition)
+    _check_definition(name, definition)
+    decoder = _decoder(name)
+    if items is not None and ROS2_PAYLOADS[name] is CameraCalibration:
+        items.take(len(data) // _BYTES_PER_NUMBER)
     try:
         found = decoder(data)
         return _READ[name](found, _time_ns(found.header.stamp))
@@ -52,15 +75,42 @@ def read_ros2(name: str, data: bytes, definition: bytes) -> Any:
 
 
 @cache
-def _decoder(name: str, definition: bytes) -> Callable[[bytes], Any]:
-    try:
-        schema = Schema(id=1, name=name, encoding="ros2msg", data=definition)
-        decoder = DecoderFactory().decoder_for("cdr", schema)
-    # Its parser has exceptions of its own, which it does not export.
-    except Exception as error:
-        raise LogError(f"its schema {name!r} is not a .msg file of ROS 2: {error}") from error
+def _decoder(name: str) -> Callable[[bytes], Any]:
+    """Return the decoder of a message as ROS 2 defines it.
+
+    It is never made from the definition in a log: such a definition can ask for endless arrays of nothing.
+    """
+    parts = [name.removeprefix("sensor_msgs/msg/"), *_NESTED]
+    text = "\n".join(f"{'=' * 80}\nMSG: {_PACKAGES[part]}/{part}\n{_FIELDS[part]}" for part in parts)
+    data = text.partition("\n")[2].partition("\n")[2].encode()
+    decoder = DecoderFactory().decoder_for("cdr", Schema(id=1, name=name, encoding="ros2msg", data=data))
     assert decoder is not None
     return decoder
+
+
+@cache
+def _check_definition(name: str, definition: bytes) -> None:
+    """Refuse a definition whose fields are not those of ROS 2."""
+    if len(definition) > _LONGEST_DEFINITION:
+        raise LogError(f"its schema {name!r} is not a .msg file of ROS 2: it has {len(definition)} bytes")
+    main, *others = re.split(r"^=+\s*^MSG:", definition.decode(errors="replace"), flags=re.MULTILINE)
+    fields = {name.rsplit("/", maxsplit=1)[-1]: _fields(main)}
+    for other in others:
+        title, _, text = other.partition("\n")
+        fields[title.strip().split("/")[-1]] = _fields(text)
+    for part in (name.rsplit("/", maxsplit=1)[-1], *_NESTED):
+        if fields.get(part, _fields(_FIELDS[part])) != _fields(_FIELDS[part]):
+            raise LogError(
+                f"its schema {name!r} is not a .msg file of ROS 2, or {part} differs in it; "
+                "convert the log: ros2 bag convert"
+            )
+
+
+def _fields(text: str) -> list[tuple[str, str]]:
+    """Types, without their packages, and names of the fields of a message."""
+    lines = (line.partition("#")[0].split() for line in text.splitlines())
+    rows = [(line[0].split("/")[-1], line[-1]) for line in lines if line]
+    return [("Time" if kind == "time" else kind, field) for kind, field in rows]
 
 
 def _time_ns(stamp: Any) -> int:

@@ -26,11 +26,18 @@ def as_rows(entries: Mapping[int, list[tuple[int, int]]]) -> Entries:
     return {channel: np.array(rows, np.uint64).reshape(-1, 2) for channel, rows in entries.items()}
 
 
-def chunk_entries(view: View, chunk: ChunkRef, wanted: set[int] | None = None) -> Entries:
-    """The rows of a chunk's messages, from its message indexes if there are any."""
+def chunk_entries(
+    view: View, chunk: ChunkRef, searched: dict[int, Entries], wanted: set[int] | None = None
+) -> Entries:
+    """The rows of a chunk's messages, from its message indexes if there are any.
+
+    `searched` keeps, by offset, what was found in chunks without: each is searched once.
+    """
     if not chunk.index_offsets or not chunk.index_length:
-        data = unpack(view, chunk.offset, parse_chunk_head(view, chunk.offset)[1])
-        return as_rows(look_inside(view, chunk.offset, data).entries)
+        if chunk.offset not in searched:
+            data = unpack(view, chunk.offset, parse_chunk_head(view, chunk.offset)[1])
+            searched[chunk.offset] = as_rows(look_inside(view, chunk.offset, data).entries)
+        return searched[chunk.offset]
     start = chunk.offset + chunk.length
     data = view.read(start, chunk.index_length)
     entries = {}

@@ -1,99 +1,336 @@
-"""Complete messages in a chunk that was being written when its writer died."""
+"""Messages of a chunk that is cut off or damaged, as far as they can be believed."""
 
 import struct
 import zlib
+from collections.abc import Callable, Iterator, Mapping
 from dataclasses import dataclass, field
+from typing import IO, NamedTuple
 
+import lz4.frame
+import zstandard
 from mcap.opcode import Opcode
 
-from ipsys_log.log.chunking import ChunkBuilder, Limits
-from ipsys_log.log.chunks import LARGEST_CHUNK, look_inside
+from ipsys_log.errors import LogError
+from ipsys_log.log.chunking import IMAGES, ChunkBuilder
+from ipsys_log.log.chunks import Inside, look_inside, unpack
+from ipsys_log.log.definitions import Definitions, placeholder
 from ipsys_log.log.hashing import ChannelHash
-from ipsys_log.log.records import HEADER, MESSAGE
-from ipsys_log.log.survey import Survey
+from ipsys_log.log.records import HEADER, MESSAGE, ChunkRef, RecordAt, parse_chunk_head
+from ipsys_log.log.resync import PRIVATE
+from ipsys_log.log.stretch import Stretch
 from ipsys_log.log.view import View
 from ipsys_log.units import format_time
 
-__all__ = ["Salvage", "salvage"]
+__all__ = ["Rows", "Salvage", "Saved"]
 
 _SECTOR = 512
-_FIXED = struct.Struct("<BQQQQII")  # opcode, length, start, end, size, CRC, length of the compression's name
-_NO_LIMITS = Limits(LARGEST_CHUNK, 1 << 63)
+_MOST = 256 << 20  # bytes of one chunk that are looked at
+_READ = 1 << 20
+_PIECE = 256  # compressed bytes at a time: what came out of the pieces before an error is kept
+_BLOCK = 128 << 10  # the largest block of a zstd frame: damage spoils all of it
+_LARGEST_RATIO = 200  # nothing that is recorded compresses better
+_MOST_OF_LITTLE = 16 << 20  # bytes out of few: only above that the ratio counts
+_LARGEST_WINDOW = 128 << 20
+_HEAD = struct.Struct("<BQQQQII")  # opcode, length, start, end, size, CRC, length of the compression's name
+_SIZE = struct.Struct("<Q")
+
+Buffer = bytes | bytearray
+Rows = Mapping[int, list[tuple[int, int]]]  # by channel id: log time in ns, offset in the chunk
+
+
+class _Records(NamedTuple):
+    """The records of a damaged chunk, as far as they can be had.
+
+    `checked` says that all are there and their CRC is right, `is_wrong` that all are there and it is not.
+    `ends_early` says that not all are there: the rest is missing, or cannot be decoded. `size` is what the
+    chunk claims to hold.
+    """
+
+    data: Buffer
+    checked: bool
+    is_wrong: bool
+    ends_early: bool
+    compressed: bool
+    data_offset: int
+    size: int
+    span: str
+
+    def spoiled(self, offset: int) -> int:
+        """Return where the block or sector begins in which something at `offset` makes no sense."""
+        if self.compressed:
+            return offset - offset % _BLOCK
+        return max(0, offset - (self.data_offset + offset) % _SECTOR)
+
+
+class Saved(NamedTuple):
+    """What was saved of one stretch: channel ids and offsets in the chunk of the messages.
+
+    `torn` has channel id and log time of a message that is there in part. `counted` says that the stretch
+    held no other messages than these. `share` is the part of the stretch that was saved.
+    """
+
+    messages: frozenset[tuple[int, int]] = frozenset()
+    torn: tuple[tuple[int, int], ...] = ()
+    counted: bool = False
+    note: str = ""
+    share: float = 0.0
 
 
 @dataclass(slots=True)
 class Salvage:
-    """Messages saved into a new `chunk`; those known to be lost go to the survey."""
+    """Messages saved into new chunks, which lie in `spool` until the log has a place for them.
 
-    chunk: ChunkBuilder = field(default_factory=lambda: ChunkBuilder(_NO_LIMITS, compress=False))
-    definitions: list[bytes] = field(default_factory=list)
-    bytes_kept: int = 0
-
-
-def salvage(view: View, start: int, found: Survey) -> Salvage:
-    """Read what can be read of an uncompressed chunk that begins at `start` and is cut off.
-
-    Its CRC cannot be checked, because the rest is missing. A sector that never reached the disk reads as
-    zeros, so nothing is believed from the first such sector on.
+    `inside` holds what the damaged chunks define, `unchecked` counts messages whose CRC cannot be checked.
     """
-    saved = Salvage()
-    data = view.read(start, min(view.size - start, LARGEST_CHUNK))
-    if len(data) < _FIXED.size + 8:
-        return saved
-    opcode, length, start_ns, end_ns, _, _, name_length = _FIXED.unpack_from(data)
-    (claimed,) = struct.unpack_from("<Q", data, _FIXED.size)
-    whole = length + HEADER.size <= view.size - start
-    if opcode == Opcode.CHUNK and name_length and not whole:
-        found.faults.append(
-            f"messages of {format_time(start_ns)} to {format_time(end_ns)} UTC, compressed and cut off"
-        )
-    if opcode != Opcode.CHUNK or name_length or whole or claimed != length - _FIXED.size + 1:
-        return saved
-    end = _first_hole(data, start)
-    position = _FIXED.size + 8
-    while position + MESSAGE.size <= len(data):
-        position = _save_one(view, data, position, end, found, saved)
-    return saved
 
+    spool: IO[bytes]
+    chunks: list[ChunkRef] = field(default_factory=list)
+    counts: dict[int, int] = field(default_factory=dict)
+    inside: Inside = field(default_factory=Inside)
+    unchecked: int = 0
+    size: int = 0
+    _builder: ChunkBuilder = field(default_factory=lambda: ChunkBuilder(IMAGES, compress=False))
 
-def _save_one(view: View, data: bytes, position: int, end: int, found: Survey, saved: Salvage) -> int:
-    """Save or count the record at `position`; returns where the next one begins."""
-    if position + MESSAGE.size > end:
-        return len(data)
-    opcode, length, channel, sequence, time, published = MESSAGE.unpack_from(data, position)
-    stop: int = position + HEADER.size + length
-    known = found.contents.channels.get(channel)
-    if opcode in (Opcode.SCHEMA, Opcode.CHANNEL) and stop <= end:
-        _define(view, data[position:stop], found)
-        saved.definitions.append(data[position:stop])
-    elif opcode != Opcode.MESSAGE or known is None or length < MESSAGE.size - HEADER.size:
-        return len(data)
-    elif stop > end:
-        found.lost.note(known.topic, time)
-        return len(data)
-    else:
-        payload = data[position + MESSAGE.size : stop]
+    def save(
+        self,
+        view: View,
+        stretch: Stretch,
+        rows: Rows,
+        definitions: Definitions,
+        hashes: dict[str, ChannelHash],
+        *,
+        in_order: bool,
+    ) -> Saved:
+        """Save what can be believed of the chunk that begins with `stretch`, if that is one.
+
+        What is cut off ends with its last whole message. A sector that never reached the disk reads as
+        zeros: nothing is believed from there on. Where a record makes no sense, its whole sector is not
+        believed. Where the CRC is wrong and all records make sense, nobody knows which one is damaged, and
+        none is taken.
+
+        Parameters
+        ----------
+        rows
+            What the message indexes of the chunk name; a message must agree with them.
+        in_order
+            The saved messages stand where they stood, behind all others.
+        """
+        records = _records_of(view, stretch)
+        if records is None:
+            return Saved()
+        channels = definitions.channels | definitions.known.channels
+        messages, inside, torn, complete = _believable(view, records, rows, channels)
+        for key, value in inside.schemas.items():
+            self.inside.schemas.setdefault(key, value)
+            definitions.known.schemas.setdefault(key, value)
+        for key, channel in inside.channels.items():
+            self.inside.channels.setdefault(key, channel)
+            definitions.known.channels.setdefault(key, channel)
+        topics = {key: channel.topic for key, channel in (inside.channels | channels).items()}
+        for channel_id, start, stop in messages:
+            self._add(records.data, channel_id, start, stop, topics, hashes, in_order=in_order)
+        if not records.checked:
+            self.unchecked += len(messages)
+        note = _note(stretch, records, len(messages), complete=complete)
+        saved = frozenset((channel_id, start) for channel_id, start, _ in messages)
+        size = sum(stop - start for _, start, stop in messages)
+        part = size / max(records.size, size, 1) if records.compressed else min(1.0, size / stretch.length)
+        return Saved(saved, torn, complete or bool(rows), note, 1.0 if complete else part)
+
+    def finish(self) -> None:
+        """Put the last chunk into the spool."""
+        built = self._builder.build(0)
+        if built is None:
+            return
+        ref, data, _ = built
+        offsets = {channel: offset + self.size for channel, offset in ref.index_offsets.items()}
+        self.chunks.append(ref._replace(offset=self.size, index_offsets=offsets))
+        for channel, number in self._builder.counts.items():
+            self.counts[channel] = self.counts.get(channel, 0) + number
+        self.spool.write(data)
+        self.size += len(data)
+        self._builder.clear()
+
+    def _add(
+        self,
+        data: Buffer,
+        channel_id: int,
+        start: int,
+        stop: int,
+        topics: Mapping[int, str],
+        hashes: dict[str, ChannelHash],
+        *,
+        in_order: bool,
+    ) -> None:
+        _, _, _, sequence, time_ns, published_ns = MESSAGE.unpack_from(data, start)
+        payload = bytes(data[start + MESSAGE.size : stop])
         crc = zlib.crc32(payload)
-        saved.chunk.add(channel, sequence, time, published, payload, crc)
-        state = found.hashes.setdefault(known.topic, ChannelHash())
-        state.add_row(time, published, len(payload), crc)
-    saved.bytes_kept += stop - position
-    return stop
+        if self._builder.is_full(time_ns):
+            self.finish()
+        self._builder.add(channel_id, sequence, time_ns, published_ns, payload, crc)
+        topic = topics.get(channel_id) or placeholder(channel_id).topic
+        state = hashes.setdefault(topic, ChannelHash())
+        state.add_row(time_ns, published_ns, len(payload), crc)
+        state.valid &= in_order
 
 
-def _define(view: View, record: bytes, found: Survey) -> None:
-    inside = look_inside(view, 0, record)
-    found.contents.schemas = inside.schemas | found.contents.schemas
-    found.contents.channels = inside.channels | found.contents.channels
+def _note(stretch: Stretch, records: _Records, count: int, *, complete: bool) -> str:
+    where = f"the chunk at byte {stretch.offset} ({records.span})"
+    if records.checked:
+        return f"{where} is whole, but lacks definitions: its messages were copied"
+    if count:
+        which = "all" if complete else "the first"
+        return f"of {where}, {which} {count} messages were saved; their CRC cannot be checked"
+    if records.ends_early or not records.data:
+        return f"{where} holds no message that can be read"
+    return f"{where}: one of its messages is damaged and it is not known which, so that none was taken"
 
 
-def _first_hole(data: bytes, start: int) -> int:
-    """Where the first sector of zeros begins, in bytes from the start of `data`."""
+def _records_of(view: View, stretch: Stretch) -> _Records | None:
+    """Decode a chunk as far as that goes; None if there is none."""
+    head = view.read(stretch.offset, min(_HEAD.size + 4 + _SIZE.size, stretch.length))
+    if len(head) < _HEAD.size + _SIZE.size:
+        return None
+    opcode, length, start_ns, end_ns, size, crc, name_length = _HEAD.unpack_from(head)
+    name = head[_HEAD.size : _HEAD.size + min(name_length, 4)]
+    if opcode != Opcode.CHUNK or name_length > 4 or name not in (b"", b"zstd", b"lz4"):
+        return None
+    if len(head) < _HEAD.size + name_length + _SIZE.size:
+        return None
+    (packed,) = _SIZE.unpack_from(head, _HEAD.size + name_length)
+    data_offset = stretch.offset + _HEAD.size + name_length + _SIZE.size
+    if length + HEADER.size != data_offset - stretch.offset + packed:
+        return None
+    span = f"{format_time(start_ns)} to {format_time(end_ns)} UTC"
+    if data_offset + packed <= stretch.end:
+        try:
+            data: Buffer = unpack(view, stretch.offset, parse_chunk_head(view, stretch.offset)[1])
+        except LogError:
+            pass
+        else:
+            return _Records(data, crc != 0, False, False, bool(name), data_offset, size, span)
+    readable = _up_to_first_hole(view, data_offset, min(packed, stretch.end - data_offset))
+    data, ends_early = _decode(view, name, data_offset, readable)
+    ends_early |= readable < packed
+    is_right = zlib.crc32(data) == crc
+    checked = not ends_early and crc != 0 and is_right
+    is_wrong = not ends_early and crc != 0 and not is_right
+    return _Records(data, checked, is_wrong, ends_early, bool(name), data_offset, size, span)
+
+
+def _decode(view: View, name: bytes, offset: int, length: int) -> tuple[Buffer, bool]:
+    """What comes out of compressed bytes before they end or fail, and whether they failed; bounded."""
+    if not name:
+        return view.read(offset, min(length, _MOST)), length > _MOST
+    decompress = _decompressor(name)
+    data, read = bytearray(), 0
+    try:
+        for piece in _pieces(view, offset, length):
+            data += decompress(piece)
+            read += len(piece)
+            if len(data) > min(_MOST, max(_MOST_OF_LITTLE, _LARGEST_RATIO * read)):
+                return data, True
+    except (zstandard.ZstdError, RuntimeError, EOFError, ValueError):
+        return data, True
+    return data, False
+
+
+def _decompressor(name: bytes) -> Callable[[bytes], bytes]:
+    if name == b"zstd":
+        return zstandard.ZstdDecompressor(max_window_size=_LARGEST_WINDOW).decompressobj().decompress
+    decompress: Callable[[bytes], bytes] = lz4.frame.LZ4FrameDecompressor().decompress
+    return decompress
+
+
+def _pieces(view: View, offset: int, length: int) -> Iterator[bytes]:
+    for at in range(offset, offset + length, _READ):
+        block = view.read(at, min(_READ, offset + length - at))
+        for start in range(0, len(block), _PIECE):
+            yield block[start : start + _PIECE]
+
+
+def _up_to_first_hole(view: View, offset: int, length: int) -> int:
+    """The number of bytes before the first sector of zeros."""
     zeros = bytes(_SECTOR)
-    position = data.find(zeros)
-    while position >= 0:
-        sector = position + -(start + position) % _SECTOR
-        if data[sector : sector + _SECTOR] == zeros:
-            return sector
-        position = data.find(zeros, sector + 1)
-    return len(data)
+    sector = offset + -offset % _SECTOR
+    for start in range(sector, offset + length, _READ):
+        block = view.read(start, min(_READ, offset + length - start))
+        at = block.find(zeros)
+        while at >= 0:
+            hole = at + -at % _SECTOR
+            if block[hole : hole + _SECTOR] == zeros:
+                return start + hole - offset
+            at = block.find(zeros, hole + 1)
+    return length
+
+
+class _Found(NamedTuple):
+    """Messages (channel id, start, stop) and definitions that can be believed, and a message cut in two."""
+
+    messages: list[tuple[int, int, int]]
+    inside: Inside
+    torn: tuple[tuple[int, int], ...] = ()
+    is_all: bool = False
+
+
+def _believable(view: View, records: _Records, rows: Rows, channels: Mapping[int, object]) -> _Found:
+    data = records.data
+    named = {(channel, time_ns, offset) for channel, entries in rows.items() for time_ns, offset in entries}
+    inside, starts = Inside(), list[RecordAt]()
+    position, makes_sense = 0, True
+    while makes_sense and position + HEADER.size <= len(data):
+        at = RecordAt(*_head(data, position))
+        makes_sense = _makes_sense(view, data, at, inside)
+        if makes_sense and at.opcode == Opcode.MESSAGE and position + MESSAGE.size <= len(data):
+            _, _, channel, _, time_ns, _ = MESSAGE.unpack_from(data, position)
+            makes_sense = channel in channels or channel in inside.channels or records.checked
+            makes_sense &= channel not in rows or (channel, time_ns, position) in named
+        if not makes_sense or position + at.length > len(data):
+            break
+        starts.append(at)
+        position += at.length
+    return _up_to(records, inside, starts, position, makes_sense=makes_sense)
+
+
+def _head(data: Buffer, position: int) -> tuple[int, int, int]:
+    opcode, length = HEADER.unpack_from(data, position)
+    return opcode, position, HEADER.size + length
+
+
+def _makes_sense(view: View, data: Buffer, at: RecordAt, inside: Inside) -> bool:
+    """Whether the record may lie in a chunk; takes its definitions into `inside`."""
+    if at.opcode == Opcode.MESSAGE:
+        return MESSAGE.size <= at.length <= _MOST
+    if at.opcode not in (Opcode.SCHEMA, Opcode.CHANNEL):
+        return at.opcode >= PRIVATE
+    if at.offset + at.length <= len(data):
+        try:
+            more = look_inside(view, 0, bytes(data[at.offset : at.offset + at.length]))
+        except LogError:
+            return False
+        inside.schemas |= more.schemas
+        inside.channels |= more.channels
+    return True
+
+
+def _up_to(
+    records: _Records, inside: Inside, starts: list[RecordAt], position: int, *, makes_sense: bool
+) -> _Found:
+    """What of the records that make sense can be believed; those behind them begin at `position`."""
+    data = records.data
+    whole = position == len(data)
+    if not makes_sense or (not whole and not records.ends_early):
+        sound = records.spoiled(position)
+    else:
+        sound = len(data) if records.ends_early or not records.is_wrong else 0
+    messages = [
+        (MESSAGE.unpack_from(data, at.offset)[2], at.offset, at.offset + at.length)
+        for at in starts
+        if at.opcode == Opcode.MESSAGE and at.offset + at.length <= sound
+    ]
+    torn: tuple[tuple[int, int], ...] = ()
+    if sound == len(data) and position + MESSAGE.size <= sound and data[position] == Opcode.MESSAGE:
+        _, _, channel, _, time_ns, _ = MESSAGE.unpack_from(data, position)
+        torn = ((channel, time_ns),)
+    is_all = whole and sound == len(data) and not records.ends_early
+    return _Found(messages, inside if sound else Inside(), torn, is_all)

@@ -5,14 +5,12 @@ import struct
 from mcap import records as mcap
 from mcap.opcode import Opcode
 
-from ipsys_log.log.chunks import Inside, look_inside, unpack
+from ipsys_log.log.chunks import Inside, check_definition, look_inside, unpack
 from ipsys_log.log.contents import Contents
 from ipsys_log.log.records import HEADER, MAGIC, MESSAGE, ChunkRef, RecordAt, parse, parse_chunk_head, walk
 from ipsys_log.log.view import View
 
 __all__ = ["add_record", "count_all", "scan"]
-
-_LARGEST_RECORD = 1 << 30  # a definition or an index: what one record may make us allocate
 
 
 def scan(view: View, data_end: int) -> Contents:
@@ -58,8 +56,7 @@ def add_record(
 
 
 def _body(view: View, at: RecordAt) -> bytes:
-    if at.length > _LARGEST_RECORD:
-        raise view.fault(at.offset, f"a record of type {at.opcode} claims {at.length} bytes")
+    check_definition(view, at)
     return view.read(at.offset + HEADER.size, at.length - HEADER.size)
 
 

@@ -18,6 +18,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from ipsys_log.errors import LogError
+from ipsys_log.log.bounds import BoundError, Items
 from ipsys_log.log.codec import decode, payload_type
 from ipsys_log.log.measured_ids import other_ids, renamed
 from ipsys_log.log.reader import LogReader
@@ -37,6 +38,8 @@ from ipsys_log.messages import (
 __all__ = ["Session"]
 
 _IMAGES = (CompressedImage, CompressedVideo, RawImage)
+_ITEMS_OF_IMAGE = 16
+_LATEST_NS = 1 << 63
 
 
 class Session:
@@ -58,6 +61,7 @@ class Session:
         self._stack = ExitStack()
         try:
             self.readers = [self._stack.enter_context(LogReader(path)) for path in paths]
+            self._check_numbers()
             self._check_overlaps()
             self.images = self._cameras(_IMAGES)
             self.calibrations = self._pair_calibrations(self._cameras((CameraCalibration,)))
@@ -149,14 +153,17 @@ class Session:
         LogError
             For a message that is not what its channel's schema says, naming topic and file.
         """
-        streams = [self._decoded(reader, topics, start_ns, end_ns) for reader in self.readers]
+        streams = [self._decoded(reader, items, topics, start_ns, end_ns) for reader, items in self._items()]
         return heapq.merge(*streams, key=lambda message: message.log_time_ns)
 
     def stored(self, topics: Collection[str]) -> Iterator[tuple[Message, bytes]]:
         """As :meth:`messages`, each with the bytes that the log has of its payload."""
         streams = [
-            ((self._message(reader, raw), bytes(raw.data)) for raw in self._raw(reader, topics, None, None))
-            for reader in self.readers
+            (
+                (self._message(reader, raw, items), bytes(raw.data))
+                for raw in self._raw(reader, topics, None, None)
+            )
+            for reader, items in self._items()
         ]
         return heapq.merge(*streams, key=lambda row: row[0].log_time_ns)
 
@@ -166,18 +173,24 @@ class Session:
         here = [topic for topic in topics if topic in reader.channels]
         return reader.messages(here, start_ns, end_ns) if here else iter(())
 
+    def _items(self) -> list[tuple[LogReader, Items]]:
+        """The logs, with what one reading of each may take."""
+        return [(reader, Items(reader.allowance.most_items)) for reader in self.readers]
+
     def _decoded(
-        self, reader: LogReader, topics: Collection[str], start_ns: int | None, end_ns: int | None
+        self,
+        reader: LogReader,
+        items: Items,
+        topics: Collection[str],
+        start_ns: int | None,
+        end_ns: int | None,
     ) -> Iterator[Message]:
         for raw in self._raw(reader, topics, start_ns, end_ns):
-            yield self._message(reader, raw)
+            yield self._message(reader, raw, items)
 
-    def _message(self, reader: LogReader, raw: RawMessage) -> Message:
+    def _message(self, reader: LogReader, raw: RawMessage, items: Items) -> Message:
         channel = reader.channels[raw.topic]
-        try:
-            payload = _decode(channel, raw.data)
-        except LogError as error:
-            raise LogError(f"{reader.path}: {raw.topic} at {raw.log_time_ns} ns: {error}") from error
+        payload = _payload(reader, raw, items)
         if isinstance(payload, Measurement) and reader in self._ids:
             payload = renamed(payload, self._ids[reader])
         camera = self._camera_of.get(raw.topic) or camera_of_topic(raw.topic)
@@ -207,12 +220,25 @@ class Session:
         found = other_ids(
             [
                 one.payload
-                for one in self._decoded(reader, [MEASUREMENTS_TOPIC], None, None)
+                for one in self._decoded(
+                    reader, Items(reader.allowance.most_items), [MEASUREMENTS_TOPIC], None, None
+                )
                 if isinstance(one.payload, Measurement)
             ]
             for reader in readers
         )
         return dict(zip(readers, found, strict=True))
+
+    def _check_numbers(self) -> None:
+        """Refuse more runs or measurements than a lab has: each is a line, or an equation to solve."""
+        for reader in self.readers:
+            for payload, what in ((Run, "runs"), (Measurement, "measurements")):
+                counts = [
+                    channel.message_count
+                    for channel in reader.channels.values()
+                    if channel.schema is not None and payload_type(channel.schema.name) is payload
+                ]
+                reader.check_number(sum(counts), what)
 
     def _check_overlaps(self) -> None:
         """Logs that follow one another are one; two that speak at once of one thing are not."""
@@ -269,16 +295,35 @@ class Session:
             if topic in reader.channels:
                 raw = next(reader.messages([topic]), None)
                 if raw is not None:
-                    return str(_decode(reader.channels[topic], raw.data).frame_id)
+                    items = Items(reader.allowance.most_items)
+                    return str(_payload(reader, raw, items).frame_id)
         return ""
 
 
-def _decode(channel: Channel, data: bytes) -> Any:
+def _payload(reader: LogReader, raw: RawMessage, items: Items) -> Any:
+    """What a message holds; its fault is named with the log, the topic and the time."""
+    where = f"{reader.path}: {raw.topic} at {raw.log_time_ns} ns"
+    if max(raw.log_time_ns, raw.publish_time_ns) >= _LATEST_NS:
+        raise LogError(f"{where}: its time is later than the year 2262; the clock of its recorder was wrong")
+    try:
+        return _decode(reader, reader.channels[raw.topic], raw.data, items)
+    except BoundError as error:
+        raise BoundError(f"{where}: {error}") from error
+    except LogError as error:
+        raise LogError(f"{where}: {error}") from error
+
+
+def _decode(reader: LogReader, channel: Channel, data: bytes, items: Items) -> Any:
     schema = channel.schema
     if schema is None:
         return decode("", data, channel.message_encoding)
+    image = payload_type(schema.name) in _IMAGES
+    if image:
+        items.take(_ITEMS_OF_IMAGE)
+    elif len(data) > reader.allowance.most_structured:
+        raise BoundError(f"a message of {len(data)} bytes is refused: images may be so large, others not")
     definition = schema.data if schema.encoding == "ros2msg" else b""
-    return decode(schema.name, data, channel.message_encoding, definition)
+    return decode(schema.name, data, channel.message_encoding, definition, items)
 
 
 def _times(reader: LogReader, topic: str) -> NDArray[np.int64]:

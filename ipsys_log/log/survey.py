@@ -1,16 +1,17 @@
 """Checking every record of a log, finished or not: how far it is whole, and what it holds up to there."""
 
-import re
-import zlib
-from contextlib import suppress
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 
+from mcap import records as mcap
 from mcap.opcode import Opcode
 
 from ipsys_log.errors import LogError
-from ipsys_log.log.chunks import Inside, look_inside, unpack
+from ipsys_log.log.bounds import BoundError
+from ipsys_log.log.chunks import Inside, inner_records, look_inside, unpack
 from ipsys_log.log.contents import Contents
+from ipsys_log.log.definitions import Definitions
 from ipsys_log.log.hashing import ChannelHash
+from ipsys_log.log.load import Summary
 from ipsys_log.log.records import (
     DATA_END,
     ENTRY,
@@ -18,206 +19,402 @@ from ipsys_log.log.records import (
     MAGIC,
     MESSAGE,
     RecordAt,
+    as_bytes,
+    exact,
     parse_chunk_head,
     parse_message_index,
     walk,
 )
+from ipsys_log.log.resync import PRIVATE, Resync, attachment_crc, check_exact, crc_of, is_index
+from ipsys_log.log.salvage import Rows, Salvage, Saved
 from ipsys_log.log.scan import add_record, count_all
+from ipsys_log.log.stretch import Stretch
 from ipsys_log.log.view import View
 
-__all__ = ["Lost", "Survey", "crc_of", "survey"]
+__all__ = ["HEADER_RECORD", "Lost", "Survey", "survey"]
 
-_BLOCK = 1 << 20
-_HEAD_OVERLAP = 64
-# A chunk by its compression, or DataEnd with the record behind it: where to go on behind damage.
-_NEXT = re.compile(
-    rb"\x06.{36}(?:\x00{4}|\x04\x00{3}zstd|\x03\x00{3}lz4)|\x0f\x04\x00{7}.{4}[\x02\x03\x04\x08\x0b]",
-    re.DOTALL,
-)
-_DATA_SECTION = frozenset(
-    (
-        Opcode.SCHEMA,
-        Opcode.CHANNEL,
-        Opcode.MESSAGE,
-        Opcode.CHUNK,
-        Opcode.MESSAGE_INDEX,
-        Opcode.ATTACHMENT,
-        Opcode.METADATA,
-        Opcode.DATA_END,
-    )
-)
-_PRIVATE = 0x80  # types from here on are skipped by every reader
+HEADER_RECORD = as_bytes(mcap.Header("", "ipsys 1"))
+_LAG = 1 << 20  # bytes
+_DOUBTFUL = 4096  # bytes
+_LONGEST_HEADER = 1 << 20  # bytes
+_LOOSE = frozenset((Opcode.SCHEMA, Opcode.CHANNEL, Opcode.MESSAGE, Opcode.ATTACHMENT, Opcode.METADATA))
+# If such a record is damaged, it is known how many messages are lost with it: none, or one.
+_COUNTED = _LOOSE | {Opcode.MESSAGE_INDEX, Opcode.DATA_END}
 
 
 @dataclass(slots=True)
 class Lost:
-    """Messages that are known to be gone, by topic: their log times in ns."""
+    """Messages that are known to be gone, by topic: their log times in ns.
+
+    `uncounted` is the number of stretches of which nothing says how many messages they held, `bytes` how
+    many bytes cannot be read.
+    """
 
     times_ns: dict[str, list[int]] = field(default_factory=dict)
+    uncounted: int = 0
+    bytes: int = 0
 
     def note(self, topic: str, time_ns: int) -> None:
         self.times_ns.setdefault(topic, []).append(time_ns)
 
 
 @dataclass(slots=True)
+class _Indexed:
+    """The message indexes that follow a chunk (`inside`), or a damaged stretch that may have been one."""
+
+    start: int
+    inside: Inside | None = None
+    stretch: Stretch | None = None
+    rows: dict[int, list[tuple[int, int]]] = field(default_factory=dict)
+    offsets: dict[int, int] = field(default_factory=dict)
+    sound: bool = True
+
+    @property
+    def is_complete(self) -> bool:
+        return self.inside is not None and self.sound and self.rows.keys() >= self.inside.entries.keys()
+
+
+@dataclass(slots=True)
 class Survey:
     """What is whole: records up to `end`, except the stretches in `damaged`.
 
-    `lost` is what lay in damaged chunks whose message indexes are whole.
-    `finished` says that a DataEnd record lies at `end`. `faults` is what was found wrong. `unindexed`
-    holds the entries of the last chunk if it is the last record and its message indexes are missing.
+    `cut` is the unreadable end of a log without DataEnd; `finished` says that this record lies at `end`.
+    `saved` takes the messages that can be read of damaged chunks. `faults` is what was found wrong.
+    `unindexed` holds the entries of the last chunk if its message indexes are missing or cut off.
     """
 
+    view: View
+    resync: Resync
+    definitions: Definitions
+    saved: Salvage | None = None
     contents: Contents = field(default_factory=Contents)
     loose: Inside = field(default_factory=Inside)
     counts: dict[int, dict[int, int]] = field(default_factory=dict)
     hashes: dict[str, ChannelHash] = field(default_factory=dict)
-    damaged: list[RecordAt] = field(default_factory=list)
+    damaged: list[Stretch] = field(default_factory=list)
+    homeless: list[RecordAt] = field(default_factory=list)  # messages that cannot stay where they are
+    wrong_heads: list[tuple[int, bytes]] = field(default_factory=list)  # what chunks say of their times
+    cut: Stretch | None = None
     lost: Lost = field(default_factory=Lost)
     faults: list[str] = field(default_factory=list)
     unindexed: Inside | None = None
-    end: int = len(MAGIC)
+    end: int = 0
     crc: int = 0
     crc_is_right: bool = True
     finished: bool = False
-    _chunk: Inside | None = None  # the chunk whose message indexes are being read
-    _indexed: set[int] = field(default_factory=set)
+    crc_at: int = 0
+    wrong_length: int = -1  # a record whose length cannot be right
+    doubtful_to: int = 0  # behind damage, lengths that nothing confirms are looked at closely
+    indexed: _Indexed | None = None
 
 
-def survey(view: View, known: Contents | None = None) -> Survey:
+def survey(view: View, known: Summary | None = None, saved: Salvage | None = None) -> Survey:
     """Check the data section record by record; never believes a length, never raises for damage.
 
-    `known` is what the summary says, if there is one: it may define what the data section does not.
+    A log that asks for too much is refused with a `BoundError`: it need not be damaged, and is not repaired.
+
+    The file is read once. `known` is what the summary says, if there is one: it may define what the data
+    section does not. Without `saved`, damaged chunks are passed over.
     """
-    found = Survey()
-    if known is not None:
-        found.loose.schemas, found.loose.channels = dict(known.schemas), dict(known.channels)
-    position = len(MAGIC)
+    damaged: list[Stretch] = []
+    definitions = Definitions(known, damaged)
+    resync = Resync(view, definitions.channels, _is_chunked(known))
+    found = Survey(view, resync, definitions, saved, damaged=damaged)
+    position = _take_start(found)
     while position < view.size and not found.finished:
-        position = _stretch(view, found, position)
-    if found._chunk is not None and found._indexed != found._chunk.entries.keys():
-        _forget_indexes(found)
-        chunk = found.contents.chunks[-1]
-        if not found.finished and not any(bad.offset > chunk.offset for bad in found.damaged):
-            found.end, found.unindexed = chunk.offset + chunk.length, found._chunk
-    found.crc = crc_of(view, found.end)
+        position = _take_records(found, position)
+    if found.indexed is not None:
+        _close_indexes(found, found.end)
+    _advance_crc(found, found.end)
+    damaged.sort(key=lambda stretch: stretch.offset)
     if found.finished:
         _, _, stored = DATA_END.unpack(view.read(found.end, DATA_END.size))
         found.crc_is_right = stored in (0, found.crc)
+    found.loose.schemas, found.loose.channels = definitions.schemas, definitions.channels
     count_all(found.contents, found.loose, found.counts)
     return found
 
 
-def _stretch(view: View, found: Survey, position: int) -> int:
-    """Take records from `position` on up to the next damage; returns where to go on behind it."""
-    at = RecordAt(0, position, 0)
-    try:
-        for at in walk(view, position, view.size):
-            _take(view, found, at)
-            if found.finished:
-                return view.size
-            found.end = position = at.offset + at.length
-    except LogError as error:
-        found.faults.append(str(error).split(" is damaged ", 1)[-1].split(". Run:", 1)[0])
-    else:
-        return view.size
-    follower = _next_record(view, position, at.offset + at.length if at.offset == position else 0)
-    if follower is None:
-        return view.size
-    if at.opcode == Opcode.MESSAGE_INDEX and found._chunk is None:
-        _note_lost(view, found, at)
-    found.damaged.append(RecordAt(Opcode.CHUNK, position, follower - position))
-    return follower
-
-
-def _take(view: View, found: Survey, at: RecordAt) -> None:
-    """Check one record and take it in."""
-    if at.opcode == Opcode.MESSAGE_INDEX and found._chunk is not None:
-        found._indexed.add(_check_index(view, at, found._chunk))
-        add_record(view, found.contents, found.loose, found.counts, at)
-        return
-    if found._chunk is not None and found._indexed != found._chunk.entries.keys():
-        _forget_indexes(found)
-    found._chunk, found._indexed = None, set()
-    if at.opcode == Opcode.DATA_END and at.length == DATA_END.size:
-        found.finished = True
-    elif at.opcode == Opcode.CHUNK:
-        _take_chunk(view, found, at)
-    elif at.opcode in _DATA_SECTION:
-        if at.opcode == Opcode.ATTACHMENT:
-            _check_attachment(view, at)
-        add_record(view, found.contents, found.loose, found.counts, at)
-    elif at.opcode < _PRIVATE and not (at.opcode == Opcode.HEADER and at.offset == len(MAGIC)):
-        raise view.fault(at.offset, f"a record of type {at.opcode} has no place there")
-
-
-def _take_chunk(view: View, found: Survey, at: RecordAt) -> None:
-    data = unpack(view, at.offset, parse_chunk_head(view, at.offset)[1])
-    inside = look_inside(view, at.offset, data)
-    known = inside.channels.keys() | found.loose.channels.keys()
-    if not inside.entries.keys() <= known:
-        raise view.fault(at.offset, "the chunk holds messages of a channel whose definition is lost")
-    add_record(view, found.contents, found.loose, found.counts, at)
-    times = [time for rows in inside.entries.values() for time, _ in rows]
-    if times:  # what its head says may be wrong, and readers go by it
-        chunk = found.contents.chunks[-1]
-        found.contents.chunks[-1] = chunk._replace(start_ns=min(times), end_ns=max(times))
-    found.counts[at.offset] = {key: len(rows) for key, rows in inside.entries.items()}
-    found.loose.schemas = inside.schemas | found.loose.schemas
-    found.loose.channels = inside.channels | found.loose.channels
-    _continue_hashes(found, inside, data)
-    found._chunk = inside
-
-
-def _note_lost(view: View, found: Survey, at: RecordAt) -> None:
-    """Take in what a message index names, if it lies right behind a damaged chunk or another index."""
-    before = found.damaged[-1] if found.damaged else at
-    if before.offset + before.length == at.offset:
-        with suppress(LogError):
-            channel, rows = _index_rows(view, at)
-            known = found.loose.channels.get(channel)
-            for time_ns, _ in rows:
-                found.lost.note(known.topic if known else f"channel {channel}", time_ns)
-
-
-def _next_record(view: View, damaged: int, claimed: int) -> int | None:
-    """Where the next whole record begins behind a damaged one: where that one's length says, or a chunk."""
-    if claimed and _is_record(view, claimed):
-        return claimed
-    for base in range(damaged + HEADER.size, view.size, _BLOCK):
-        block = view.read(base, min(_BLOCK + _HEAD_OVERLAP, view.size - base))
-        for match in _NEXT.finditer(block):
-            if _is_record(view, base + match.start()):
-                return base + match.start()
+def _is_chunked(known: Summary | None) -> bool | None:
+    """Whether the messages lie in chunks, by the summary; None if it does not say."""
+    if known is not None and known.contents.chunks:
+        return True
+    if known is not None and known.checked and known.statistics is not None:
+        return known.statistics.chunk_count > 0
     return None
 
 
-def _is_record(view: View, offset: int) -> bool:
+def _take_start(found: Survey) -> int:
+    """Check the magic bytes and the Header record; returns where the records behind them begin."""
+    view, start = found.view, len(MAGIC)
+    behind, reason = _behind_header(view)
+    if view.read(0, min(start, view.size)) != MAGIC:
+        follower = start if behind > start else found.resync.find(start)
+        if follower is None:
+            return view.size
+        found.indexed = _Indexed(follower) if follower > start else None
+        head = MAGIC + (HEADER_RECORD if follower >= start + len(HEADER_RECORD) else b"")
+        _add_damage(found, Stretch(0, follower, head), "it does not begin as an MCAP file")
+        return max(follower, behind)
+    found.end = behind or start
+    if behind:
+        return behind
+    follower = found.resync.find(start)
+    if follower is None:
+        return start
+    head = HEADER_RECORD if follower >= start + len(HEADER_RECORD) else b""
+    return _add_damage(found, Stretch(start, follower - start, head), reason)
+
+
+def _behind_header(view: View) -> tuple[int, str]:
+    """Where the Header record ends: where it begins if there is none, 0 if it is damaged, and why."""
+    start = len(MAGIC)
     try:
-        at = next(walk(view, offset, view.size), None)
-        if at is not None and at.opcode == Opcode.CHUNK:
-            unpack(view, offset, parse_chunk_head(view, offset)[1])
-    except LogError:
-        return False
-    return at is not None and (at.opcode in _DATA_SECTION or at.opcode >= _PRIVATE)
+        at = next(walk(view, start, view.size), None)
+        if at is None or at.opcode != Opcode.HEADER:
+            return start, ""
+        if at.length > _LONGEST_HEADER:
+            raise view.fault(start, f"the HEADER record claims {at.length} bytes")
+        exact(view, at, view.read(start, at.length))
+    except LogError as error:
+        return 0, _reason(error)
+    return at.offset + at.length, ""
+
+
+def _take_records(found: Survey, position: int) -> int:
+    """Take records from `position` on up to the next damage; returns where to go on behind it."""
+    view = found.view
+    at = RecordAt(0, position, 0)
+    try:
+        for at in walk(view, position, view.size):
+            _take(found, at)
+            if found.finished:
+                return view.size
+            found.end = position = at.offset + at.length
+            if position - found.crc_at > _LAG:
+                _advance_crc(found, position if found.indexed is None else found.indexed.start)
+    except BoundError:
+        raise
+    except LogError as error:
+        return _pass_over(found, position, at if at.offset == position else None, _reason(error))
+    return view.size
+
+
+def _pass_over(found: Survey, position: int, at: RecordAt | None, reason: str) -> int:
+    """Find the next record behind damage at `position`; returns where it lies."""
+    claimed = at.offset + at.length if at is not None and found.wrong_length != position else 0
+    indexed = found.indexed
+    # A gap that is too small for a record of its own becomes a part of the damage before it.
+    behind_indexes = indexed is not None and indexed.inside is not None and position > indexed.start
+    joins = behind_indexes or bool(found.damaged and found.damaged[-1].end == position)
+    follower = found.resync.find(position, claimed, gap=1 if joins else HEADER.size)
+    is_small = follower is not None and follower < position + HEADER.size
+    if indexed is not None and indexed.inside is not None:
+        is_apart = indexed.is_complete or found.resync.is_chunk_head(position)
+        if is_apart and not is_small:
+            _close_indexes(found, position)
+        else:
+            found.faults.append(reason)
+            indexed.sound = False
+            found.end = found.view.size if follower is None else follower
+            return found.end
+    elif indexed is not None:
+        _close_indexes(found, position)
+    if follower is None:
+        return _end_at_damage(found, position, reason)
+    if at is None or at.opcode not in _COUNTED or follower != claimed:
+        found.indexed = _Indexed(follower)
+    return _add_damage(found, Stretch(position, follower - position), reason)
+
+
+def _add_damage(found: Survey, stretch: Stretch, reason: str) -> int:
+    found.faults.append(reason)
+    found.lost.bytes += stretch.length
+    if found.indexed is not None:
+        found.indexed.stretch = replace(stretch)
+    last = found.damaged[-1] if found.damaged else None
+    if last is not None and last.end == stretch.offset:  # one place for what was defined in both
+        last.length += stretch.length
+    else:
+        found.damaged.append(stretch)
+    found.end = stretch.end
+    found.doubtful_to = stretch.end + _DOUBTFUL
+    return stretch.end
+
+
+def _end_at_damage(found: Survey, position: int, reason: str) -> int:
+    """The rest of the log cannot be read as records; it may be a chunk that was being written."""
+    found.faults.append(reason)
+    found.end = position
+    found.cut = Stretch(position, found.view.size - position)
+    found.lost.bytes += found.cut.length
+    _save(found, found.cut, {})
+    return found.view.size
+
+
+def _save(found: Survey, stretch: Stretch, rows: Rows) -> None:
+    """Save what can be read of a damaged chunk, and note what is gone of it."""
+    saved = Saved()
+    if found.saved is not None and found.resync.chunked is not False:
+        saved = found.saved.save(
+            found.view, stretch, rows, found.definitions, found.hashes, in_order=stretch is found.cut
+        )
+    gone = [
+        (channel, time_ns)
+        for channel, entries in rows.items()
+        for time_ns, offset in entries
+        if (channel, offset) not in saved.messages
+    ]
+    for channel, time_ns in gone if rows else saved.torn:
+        found.lost.note(found.definitions.topic(channel), time_ns)
+    if saved.note:
+        found.faults.append(saved.note)
+    found.lost.uncounted += not (rows or saved.counted)
+    found.lost.bytes -= int(saved.share * stretch.length)
+
+
+def _take(found: Survey, at: RecordAt) -> None:
+    """Check one record and take it in."""
+    view = found.view
+    if at.opcode == Opcode.MESSAGE_INDEX:
+        _take_index(found, at)
+        return
+    indexed = found.indexed
+    if at.opcode == Opcode.MESSAGE and indexed is not None and indexed.inside and not indexed.is_complete:
+        raise view.fault(at.offset, "a message lies among the message indexes of a chunk")
+    if indexed is not None:
+        _close_indexes(found, at.offset)
+    if at.opcode == Opcode.DATA_END and at.length == DATA_END.size:
+        _advance_crc(found, at.offset)
+        if not found.resync.is_end(at.offset, found.crc):
+            raise view.fault(at.offset, "records follow behind a DataEnd record")
+        found.finished, found.end = True, at.offset
+    elif at.opcode == Opcode.CHUNK:
+        _take_chunk(found, at)
+    elif at.opcode in _LOOSE:
+        _take_loose(found, at)
+    elif at.opcode < PRIVATE:
+        raise view.fault(at.offset, f"a record of type {at.opcode} has no place there")
+    else:
+        _check_length(found, at)
+
+
+def _check_length(found: Survey, at: RecordAt) -> None:
+    """Refuse a record of which only the length can be wrong, if it swallows whole ones or stops short of one.
+
+    Where a record follows, its length is right; where none does, the damage may as well lie behind it.
+    """
+    view, stop = found.view, at.offset + at.length
+    follows = stop == view.size
+    if stop + HEADER.size <= view.size:
+        opcode, length = HEADER.unpack(view.read(stop, HEADER.size))
+        known = opcode in _LOOSE or opcode in _COUNTED or opcode == Opcode.CHUNK or opcode >= PRIVATE
+        follows = known and length <= view.size - stop - HEADER.size and at.offset >= found.doubtful_to
+        follows = follows or found.resync.is_chunk_head(stop)  # cut off, perhaps
+    if not follows:
+        inner = found.resync.find(at.offset)
+        if inner is not None and inner != stop and inner < stop + HEADER.size:
+            found.wrong_length = at.offset
+            if at.opcode == Opcode.MESSAGE and at.length >= MESSAGE.size and stop < inner:
+                found.homeless.append(at)  # it may be whole: what is left between them is too small to skip
+            raise view.fault(at.offset, f"a record claims {at.length} bytes, which hold other records")
+
+
+def _take_loose(found: Survey, at: RecordAt) -> None:
+    """A record in no chunk."""
+    view = found.view
+    _check_length(found, at)
+    if at.opcode == Opcode.METADATA:
+        check_exact(view, at)
+    elif at.opcode == Opcode.ATTACHMENT:
+        stored, crc = attachment_crc(view, at)
+        if stored != crc:
+            raise view.fault(at.offset, "the CRC of an attachment is wrong")
+    elif at.opcode == Opcode.MESSAGE and at.length >= MESSAGE.size:
+        _, _, channel, _, time_ns, _ = MESSAGE.unpack(view.read(at.offset, MESSAGE.size))
+        try:
+            found.definitions.need(view, at.offset, channel)
+        except LogError:
+            if found.resync.chunked:
+                found.lost.note(found.definitions.topic(channel), time_ns)
+            else:
+                found.homeless.append(at)
+            raise
+        found.resync.times_ns.append(time_ns)
+    elif at.opcode in (Opcode.SCHEMA, Opcode.CHANNEL):
+        found.definitions.take(view, at)
+        return
+    add_record(view, found.contents, found.loose, found.counts, at)
+
+
+def _take_chunk(found: Survey, at: RecordAt) -> None:
+    view = found.view
+    if found.resync.chunked is False:
+        raise view.fault(at.offset, "a chunk lies in a log whose messages lie in none")
+    head = parse_chunk_head(view, at.offset)[1]
+    data = unpack(view, at.offset, head)
+    inside = look_inside(view, at.offset, data)
+    if head.crc == 0:
+        _check_definitions(view, at.offset, data)
+    found.definitions.take_chunk(view, at.offset, inside, checked=head.crc != 0)
+    add_record(view, found.contents, found.loose, found.counts, at)
+    times = [time for rows in inside.entries.values() for time, _ in rows]
+    if times:  # what its head says may be wrong, and readers go by it
+        span = (min(times), max(times))
+        if span != (head.start_ns, head.end_ns):
+            found.wrong_heads.append((at.offset + HEADER.size, ENTRY.pack(*span)))
+        chunk = found.contents.chunks[-1]
+        found.contents.chunks[-1] = chunk._replace(start_ns=span[0], end_ns=span[1])
+    found.counts[at.offset] = {key: len(rows) for key, rows in inside.entries.items()}
+    _continue_hashes(found, inside, data)
+    found.resync.chunked = True
+    found.indexed = _Indexed(at.offset + at.length, inside)
+
+
+def _check_definitions(view: View, offset: int, data: bytes) -> None:
+    """Refuse a chunk without CRC whose definitions claim more or less than they hold."""
+    for at in inner_records(view, offset, data):
+        if at.opcode in (Opcode.SCHEMA, Opcode.CHANNEL):
+            record = data[at.offset : at.offset + at.length]
+            if len(as_bytes(exact(view, RecordAt(at.opcode, offset, at.length), record))) != at.length:
+                raise view.fault(offset, "a definition in the chunk claims less than it holds")
 
 
 def _continue_hashes(found: Survey, inside: Inside, data: bytes) -> None:
     rows = sorted((offset, key) for key, entries in inside.entries.items() for _, offset in entries)
     for offset, key in rows:
-        channel = found.loose.channels.get(key)
-        if channel is not None:
-            _, length, _, _, time, published = MESSAGE.unpack_from(data, offset)
-            payload = data[offset + MESSAGE.size : offset + HEADER.size + length]
-            found.hashes.setdefault(channel.topic, ChannelHash()).add(time, published, payload)
+        topic = found.definitions.channels[key].topic
+        _, length, _, _, time, published = MESSAGE.unpack_from(data, offset)
+        payload = data[offset + MESSAGE.size : offset + HEADER.size + length]
+        found.hashes.setdefault(topic, ChannelHash()).add(time, published, payload)
 
 
-def _check_index(view: View, at: RecordAt, inside: Inside) -> int:
-    """The channel of a MessageIndex record that agrees with its chunk."""
-    channel, rows = _index_rows(view, at)
-    if sorted(rows) != sorted(inside.entries.get(channel, [])):
-        raise view.fault(at.offset, "a MessageIndex record does not fit its chunk")
-    return channel
+def _take_index(found: Survey, at: RecordAt) -> None:
+    """A MessageIndex record: behind its chunk, or behind a damaged stretch, of which it then is a part."""
+    indexed = found.indexed
+    if indexed is None:
+        channel, rows = _index_rows(found.view, at)
+        for time_ns, _ in rows:
+            found.lost.note(found.definitions.topic(channel), time_ns)
+        _add_damage(found, Stretch(at.offset, at.length), "a MessageIndex record follows no chunk")
+        return
+    if not is_index(found.view, at):
+        raise found.view.fault(at.offset, "a MessageIndex record has another length than its entries")
+    try:
+        channel, rows = _index_rows(found.view, at)
+        if indexed.inside is not None:
+            fits = sorted(rows) == sorted(indexed.inside.entries.get(channel, []))
+            indexed.sound &= fits and channel in found.definitions.channels
+        indexed.sound &= channel not in indexed.rows
+        indexed.rows[channel] = rows
+        if rows:
+            indexed.offsets[channel] = at.offset
+    except LogError as error:
+        indexed.sound = False
+        found.faults.append(_reason(error))
+    if indexed.stretch is not None:
+        indexed.stretch.length += at.length
+        found.damaged[-1].length += at.length
 
 
 def _index_rows(view: View, at: RecordAt) -> tuple[int, list[tuple[int, int]]]:
@@ -227,24 +424,39 @@ def _index_rows(view: View, at: RecordAt) -> tuple[int, list[tuple[int, int]]]:
     return channel, list(ENTRY.iter_unpack(parse_message_index(view, body, 0, channel, at.offset)))
 
 
-def _check_attachment(view: View, at: RecordAt) -> None:
-    stored = int.from_bytes(view.read(at.offset + at.length - 4, 4), "little") if at.length > 13 else 0
-    if stored and crc_of(view, at.length - HEADER.size - 4, at.offset + HEADER.size) != stored:
-        raise view.fault(at.offset, "the CRC of an attachment is wrong")
+def _close_indexes(found: Survey, stop: int) -> None:
+    """All message indexes of a chunk, or of what may have been one, were seen."""
+    indexed, found.indexed = found.indexed, None
+    assert indexed is not None
+    if indexed.stretch is not None:
+        _save(found, indexed.stretch, indexed.rows)
+    elif indexed.inside is not None:
+        _close_chunk(found, indexed, indexed.inside, stop)
 
 
-def _forget_indexes(found: Survey) -> None:
-    """The last chunk has no complete set of message indexes: then it is read without them."""
+def _close_chunk(found: Survey, indexed: _Indexed, inside: Inside, stop: int) -> None:
     chunk = found.contents.chunks[-1]
-    found.contents.chunks[-1] = type(chunk)(
-        chunk.offset, chunk.length, chunk.start_ns, chunk.end_ns, chunk.compression, chunk.compressed_size,
-        chunk.uncompressed_size, 0, {},
-    )  # fmt: skip
+    if indexed.is_complete:
+        found.contents.chunks[-1] = chunk._replace(
+            index_length=stop - indexed.start, index_offsets=indexed.offsets
+        )
+        return
+    if stop == found.view.size:  # and so the log has no end: they are written anew with it
+        found.end = indexed.start
+        found.cut = Stretch(found.end, stop - found.end)
+        found.unindexed = inside
+    elif stop > indexed.start:
+        number = len(found.contents.chunks) - 1
+        stretch = Stretch(indexed.start, stop - indexed.start, chunk=number, entries=inside.entries)
+        found.damaged.append(stretch)
+        if indexed.sound:
+            found.faults.append("the message indexes of a chunk are not complete")
 
 
-def crc_of(view: View, length: int, start: int = 0) -> int:
-    """CRC-32 of a stretch of the file."""
-    crc = 0
-    for offset in range(start, start + length, _BLOCK):
-        crc = zlib.crc32(view.read(offset, min(_BLOCK, start + length - offset)), crc)
-    return crc
+def _advance_crc(found: Survey, position: int) -> None:
+    found.crc = crc_of(found.view, position - found.crc_at, found.crc_at, found.crc)
+    found.crc_at = position
+
+
+def _reason(error: LogError) -> str:
+    return str(error).split(" is damaged ", 1)[-1].split(". Run:", 1)[0]

@@ -2,10 +2,13 @@
 
 import os
 import stat
-from dataclasses import dataclass
+from bisect import bisect_left
+from collections.abc import Sequence
+from dataclasses import dataclass, field
 from pathlib import Path
 
 from ipsys_log.errors import LogError
+from ipsys_log.log.bounds import Allowance, BoundError
 
 __all__ = ["View", "open_for_reading"]
 
@@ -17,6 +20,7 @@ class View:
     """The bytes of a log as they were when it was opened.
 
     From `tail_offset` on they come from `tail_fd` (a journal), where `tail_offset` lies at `tail_base`.
+    `patches` are bytes that a repair is about to write before `tail_offset`, each with its offset, sorted.
     ``pread`` and not ``mmap``: a file that shrinks under a mapping kills the process.
     """
 
@@ -27,6 +31,11 @@ class View:
     tail_fd: int = -1
     tail_base: int = 0
     bytes_read: int = 0
+    patches: Sequence[tuple[int, bytes]] = ()
+    allowance: Allowance = field(init=False)
+
+    def __post_init__(self) -> None:
+        self.allowance = Allowance(self.size)
 
     def read(self, offset: int, length: int) -> bytes:
         """Exactly `length` bytes at `offset`; the length is checked against the file before allocating."""
@@ -36,9 +45,24 @@ class View:
         if offset < 0 or length < 0 or end > self.size:
             raise self.fault(offset, f"a record reaches {end - self.size} bytes beyond the end of the file")
         self.bytes_read += length
+        if self.patches:
+            return self._patched(offset, self._unpatched(offset, length))
         if end <= self.tail_offset:
             data = os.pread(self.fd, length, offset) if 0 < length < _MOST_PER_CALL else b""
             return data if len(data) == length else self._pread(self.fd, offset, length)
+        return self._unpatched(offset, length)
+
+    def _patched(self, offset: int, data: bytes) -> bytes:
+        end = offset + len(data)
+        first = bisect_left(self.patches, offset, key=lambda patch: patch[0] + len(patch[1]))
+        for at, new in self.patches[first:]:
+            if at >= end:
+                break
+            low, high = max(at, offset), min(at + len(new), end)
+            data = data[: low - offset] + new[low - at : high - at] + data[high - offset :]
+        return data
+
+    def _unpatched(self, offset: int, length: int) -> bytes:
         head = max(0, min(length, self.tail_offset - offset))
         parts = [self._pread(self.fd, offset, head)] if head else []
         if head < length:
@@ -49,6 +73,18 @@ class View:
     def fault(self, offset: int, what: str) -> LogError:
         """The error for damage found at `offset`."""
         return LogError(f"{self.path} is damaged at byte {offset}: {what}. Run: ipsys repair {self.path}")
+
+    def refusal(self, what: str) -> BoundError:
+        """The error for a log that asks for too much. Such a log need not be damaged."""
+        return BoundError(
+            f"{self.path} is refused: {what}. If it is a true recording, unpack it first: "
+            f"mcap decompress {self.path} -o unpacked.mcap"
+        )
+
+    def check_number(self, number: int, what: str) -> None:
+        """Refuse a log with more channels, runs and the like than a file of its size may have."""
+        if number > self.allowance.most_channels:
+            raise self.refusal(f"it has {number} {what}, more than {self.allowance.most_channels}")
 
     def close(self) -> None:
         for fd in (self.fd, self.tail_fd):

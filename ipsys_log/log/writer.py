@@ -13,6 +13,7 @@ from mcap import records as mcap
 from mcap.opcode import Opcode
 
 from ipsys_log.errors import LogError, disk_advice
+from ipsys_log.log.bounds import LARGEST_MESSAGE
 from ipsys_log.log.chunking import IMAGE_SCHEMAS, IMAGES, SMALL_APPENDED, SMALL_LIVE, ChunkBuilder, Limits
 from ipsys_log.log.contents import Contents, free_id
 from ipsys_log.log.hashing import METADATA_NAME, ChannelHash, metadata_of_hashes
@@ -196,8 +197,19 @@ class LogWriter:
         self._channels[topic] = (channel.id, self._images if image else self._small)
 
     def write(self, topic: str, log_time_ns: int, publish_time_ns: int, data: bytes) -> None:
-        """Add a message to a channel that was declared with `add_channel`; times in ns."""
+        """Add a message to a channel that was declared with `add_channel`; times in ns.
+
+        Raises
+        ------
+        LogError
+            The disk refuses it, or the message is larger than a chunk may be. The log goes on without it.
+        """
         self._check_open()
+        if len(data) > LARGEST_MESSAGE:
+            raise LogError(
+                f"{self.path}: a message on {topic} has {len(data)} bytes, more than the {LARGEST_MESSAGE} "
+                "that a log may hold: record smaller images"
+            )
         channel, builder = self._channels[topic]
         if self._small.is_full(log_time_ns):
             self.flush()  # what was made of a frame is never in the file before it
@@ -219,6 +231,11 @@ class LogWriter:
         self._check_open()
         for builder in (self._images, self._small):
             self._write_chunk(builder)
+
+    def sync(self) -> None:
+        """Wait until what a new log has written is on the disk. Any thread may, while another writes."""
+        if isinstance(self._output, Growing):
+            self._output.sync()
 
     def close(self) -> None:
         """Finish the log: summary, footer, fsync. A second call does nothing."""

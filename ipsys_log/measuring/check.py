@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import re
 from collections.abc import Iterable, Sequence
 from dataclasses import dataclass, replace
 
@@ -30,6 +31,8 @@ from ipsys_log.units import CM_PER_M
 __all__ = ["Checked", "check_entry", "next_id", "withdraw"]
 
 Array = NDArray[np.float64]
+
+_NUMBERED = re.compile(r"p[0-9]{1,18}")  # an id of a log may have thousands of digits
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -69,7 +72,7 @@ def next_id(history: Iterable[Measurement]) -> str:
     >>> next_id([Measurement(0, "p001"), Measurement(0, "p001_withdrawn", withdraws="p001")])
     'p002'
     """
-    numbers = [int(m.id[1:]) for m in history if m.id[:1] == "p" and m.id[1:].isdecimal()]
+    numbers = [int(m.id[1:]) for m in history if _NUMBERED.fullmatch(m.id)]
     return f"p{max(numbers, default=0) + 1:03d}"
 
 

@@ -22,6 +22,7 @@ __all__ = ["SheetRow", "find_stops", "name_columns", "read_sheet", "refuse_rows"
 _PLAIN = ("id", "marker", "side", "height_cm", "place", "time", "split", "note")
 _NEEDED = ("marker", "height_cm")
 _LARGEST = 4 << 20
+_MOST_DIGITS = 10
 _NUMBER = re.compile(r"[\d.]+")
 # A time read off a watch need not lie within the stretch to the second.
 _NEAR_NS = 2 * NS_PER_S
@@ -56,10 +57,10 @@ def read_sheet(path: Path, rig: Rig, start_ns: int) -> list[SheetRow]:
     lines = _read_lines(path)
     delimiter = ";" if lines and ";" in lines[0] else ","
     reader = csv.reader(lines, delimiter=delimiter)
-    columns = [name.strip() for name in next(reader, [])]
-    _check_columns(columns, rig, path)
     rows, faults = [], []
     try:
+        columns = [name.strip() for name in next(reader, [])]
+        _check_columns(columns, rig, path)
         for cells in reader:
             if not any(cell.strip() for cell in cells):
                 continue
@@ -223,8 +224,8 @@ def _row(line: int, cell: dict[str, str], start_ns: int) -> SheetRow:
         cell.get("id", ""),
     )
     place, time = cell.get("place", ""), cell.get("time", "")
-    if place and not (place.isascii() and place.isdecimal()):
-        raise IpsysError(f"place {place!r} is no whole number")
+    if place and not (place.isascii() and place.isdecimal() and len(place) < _MOST_DIGITS):
+        raise IpsysError(f"place {place[:_MOST_DIGITS]!r} is no whole number of places")
     return SheetRow(line, typed, int(place) if place else None, _time_ns(time, start_ns) if time else None)
 
 

@@ -15,7 +15,14 @@ from ipsys_log.offline.crossval import cross_validate, gather_places
 from ipsys_log.offline.fit import level_cameras
 from ipsys_log.offline.statistics import error_statistics
 
-__all__ = ["CROSS_VALIDATION", "HELD_OUT", "POOLED", "errors_cross_validated", "errors_held_out"]
+__all__ = [
+    "CROSS_VALIDATION",
+    "HELD_OUT",
+    "POOLED",
+    "count_repeats",
+    "errors_cross_validated",
+    "errors_held_out",
+]
 
 Array = NDArray[np.float64]
 
@@ -80,6 +87,26 @@ def errors_cross_validated(
     predicted = cross_validate(model.name, cameras, seed)
     found = {camera: (list(pairs[camera]), predicted[camera]) for camera in cameras}
     return _rows(model, found, truth, CROSS_VALIDATION)
+
+
+def count_repeats(row: CameraEvaluation, rows: Sequence[CameraEvaluation]) -> int | None:
+    """Return how many errors of each place a row rests on.
+
+    Parameters
+    ----------
+    row : of an evaluation.
+    rows : all of them; the row over all cameras has no residuals of its own, those of the cameras have.
+
+    Returns
+    -------
+    None where the log does not tell.
+    """
+    if row.scheme != CROSS_VALIDATION:
+        return 1
+    for other in rows:
+        if (other.scheme, other.against) == (row.scheme, row.against) and other.residuals:
+            return len(other.residuals) // other.error_2d.count
+    return None
 
 
 def _arrays(pairs: Sequence[Pair]) -> tuple[Array, Array]:

@@ -29,6 +29,7 @@ __all__ = [
 _STILL_ACROSS_M = 0.01
 _STILL_ALONG_M = 0.04
 _GAP_NS = 2 * NS_PER_S
+_FARTHEST_M = 10_000.0
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -40,7 +41,13 @@ class Sightings:
 
 
 def gather_sightings(messages: Iterable[Message]) -> dict[tuple[str, int], Sightings]:
-    """Camera points by camera and marker, ordered by the time they speak of: when the marker was exposed."""
+    """Camera points by camera and marker, ordered by the time they speak of: when the marker was exposed.
+
+    Raises
+    ------
+    IpsysError
+        For a point that is not a number, or farther away than any lab is wide.
+    """
     rows: dict[tuple[str, int], list[tuple[int, float, float, float]]] = {}
     for message in messages:
         if isinstance(message.payload, CameraPoints):
@@ -52,7 +59,13 @@ def gather_sightings(messages: Iterable[Message]) -> dict[tuple[str, int], Sight
     for key, values in rows.items():
         values.sort()
         times_ns = np.array([row[0] for row in values], dtype=np.int64)
-        sightings[key] = Sightings(times_ns, np.array([row[1:] for row in values], dtype=np.float64))
+        points_m = np.array([row[1:] for row in values], dtype=np.float64)
+        if not (np.abs(points_m) <= _FARTHEST_M).all():
+            raise IpsysError(
+                f"camera {key[0]}: a camera point of marker {key[1]} is no point in a lab; make the run "
+                "camera-frame again with --run and another name"
+            )
+        sightings[key] = Sightings(times_ns, points_m)
     return sightings
 
 

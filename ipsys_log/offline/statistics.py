@@ -7,7 +7,7 @@ from numpy.typing import NDArray
 
 from ipsys_log.messages import ErrorStatistics
 
-__all__ = ["error_statistics"]
+__all__ = ["error_statistics", "root_mean_square_m"]
 
 _RESAMPLES = 2000
 
@@ -58,3 +58,21 @@ def error_statistics(errors_m: NDArray[np.float64], independent: bool = True) ->
         low_m,
         high_m,
     )
+
+
+def root_mean_square_m(errors: ErrorStatistics, repeats: int = 1) -> float:
+    """Return the root-mean-square error (RMSE) in m, exactly, from the mean and the standard deviation.
+
+    Parameters
+    ----------
+    errors : of n places.
+    repeats : how many errors there are of each place; the standard deviation is that of all of them.
+
+    Examples
+    --------
+    >>> root_mean_square_m(error_statistics(np.array([0.01, 0.07])))
+    0.05
+    """
+    samples = errors.count * repeats
+    variance_m2 = 0.0 if errors.std_m is None else errors.std_m**2 * (samples - 1) / samples
+    return float(np.sqrt(errors.mean_m**2 + variance_m2))

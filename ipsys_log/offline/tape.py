@@ -23,6 +23,7 @@ _FINEST_M = 0.0001
 # The tape of a place that names none, only to tell how flatly its circles cross.
 _USUAL_TAPE_M = 0.003
 _FLAT_RATIO = 3.0
+_FARTHEST_M = 10_000.0
 
 
 @dataclass(frozen=True, slots=True)
@@ -101,8 +102,8 @@ def world_point(measurement: Measurement, rig: Rig) -> TapePoint:
     if given is None:
         return _solved(measurement, rig, where)
     world_m = np.array([given.x_m, given.y_m, given.z_m])
-    if not np.isfinite(world_m).all():
-        raise IpsysError(f"{where}: its world point {world_m.tolist()} m is no point; withdraw it")
+    _check_point(world_m, where)
+    _check_lengths(measurement, where)
     known = {point.name for point in rig.reference_points}
     if not measurement.distances or any(d.reference not in known for d in measurement.distances):
         return TapePoint(world_m, None, np.zeros(0))
@@ -184,6 +185,7 @@ def _solved(measurement: Measurement, rig: Rig, where: str) -> TapePoint:
         raise IpsysError(
             f"{where} has neither a world point nor two distances, or more, and a height; measure it again"
         )
+    _check_lengths(measurement, where)
     references_m = reference_points(measurement, rig)
     if len({distance.reference for distance in measurement.distances}) < 2:
         raise IpsysError(f"{where}: all its distances are from one reference point; measure from another too")
@@ -194,8 +196,7 @@ def _solved(measurement: Measurement, rig: Rig, where: str) -> TapePoint:
     except IpsysError as error:
         raise IpsysError(f"{where}: {error}") from error
     world_m = np.array([*floor.point_m, measurement.height_m])
-    if not np.isfinite(world_m).all():
-        raise IpsysError(f"{where}: its world point {world_m.tolist()} m is no point; withdraw it")
+    _check_point(world_m, where)
     return TapePoint(world_m, _with_height(floor.covariance_m2, measurement, where), floor.residuals_m)
 
 
@@ -216,7 +217,20 @@ def _with_height(floor_m2: Array | None, measurement: Measurement, where: str) -
     return covariance
 
 
+def _check_lengths(measurement: Measurement, where: str) -> None:
+    for distance in measurement.distances:
+        if not abs(distance.distance_m) <= _FARTHEST_M:
+            raise IpsysError(
+                f"{where}: a tape of {distance.distance_m:g} m lies in no lab; withdraw it and measure again"
+            )
+
+
+def _check_point(world_m: Array, where: str) -> None:
+    if not (np.abs(world_m) <= _FARTHEST_M).all():
+        raise IpsysError(f"{where}: its world point {world_m.tolist()} m is no point; withdraw it")
+
+
 def _check_sigma(sigma_m: float, where: str) -> float:
-    if not (np.isfinite(sigma_m) and sigma_m >= 0):
+    if not 0 <= sigma_m <= _FARTHEST_M:
         raise IpsysError(f"{where}: {sigma_m} m is no standard deviation; withdraw it and measure it again")
     return max(sigma_m, _FINEST_M)

@@ -7,7 +7,7 @@ from collections import Counter
 from collections.abc import Callable, Iterator
 from types import TracebackType
 
-from ipsys_log.messages import EVENTS_TOPIC, FRAME_SKIPPED, Event, Message
+from ipsys_log.messages import EVENTS_TOPIC, FRAME_SKIPPED, STAMP_UNRELIABLE, Event, Message
 from ipsys_log.recording.recorder import Source, Target, written
 from ipsys_log.recording.waiting import Waiting
 
@@ -68,7 +68,7 @@ class Backlog:
     def _record(self) -> None:
         try:
             for message in written(self._source, self._log):
-                if message is not None and message.camera is not None:
+                if message is not None and (message.camera is not None or _is_read(message)):
                     self._hand_on(message)
         except BaseException as fault:  # raised again where the messages are taken
             self._fault = fault
@@ -87,3 +87,8 @@ class Backlog:
             text = f"a frame of camera {camera} is recorded but was not looked at: the stages are too slow"
             event = Event(late.log_time_ns, FRAME_SKIPPED, text, camera)
             self._log.put(Message(EVENTS_TOPIC, self._now_ns(), event.timestamp, event))
+
+
+def _is_read(message: Message) -> bool:
+    """Whether a stage reads an event."""
+    return isinstance(message.payload, Event) and message.payload.kind == STAMP_UNRELIABLE

@@ -8,11 +8,11 @@ from collections.abc import Callable, Iterator
 from contextlib import ExitStack, contextmanager, suppress
 from pathlib import Path
 
-from ipsys_log.errors import LogError, WriteError
+from ipsys_log.errors import LogError, WriteError, is_full
 from ipsys_log.log import LogReader
 from ipsys_log.units import NS_PER_S, format_bytes
 
-__all__ = ["reserve", "reserved_bytes", "what_fitted"]
+__all__ = ["disk_fault", "reserve", "reserved_bytes", "what_failed", "what_fitted"]
 
 # Set aside on the disk, so that a log can be finished when the disk is full: what waits is written and looked
 # at, and the table of contents, which has some MB after some hours, is written twice. On a small disk half.
@@ -37,14 +37,29 @@ def reserve(path: Path) -> Iterator[Callable[[], None]]:
 
 
 def what_fitted(path: Path, error: WriteError) -> str:
-    """How far a log goes that was ended by a full disk."""
+    """How far a log goes that was ended by a disk that took no more."""
     try:
         with LogReader(path) as log:
             count, seconds = log.message_count, ((log.end_ns or 0) - (log.start_ns or 0)) / NS_PER_S
     except LogError:
         return str(error)
+    what = "the disk takes no more" if is_full(error.cause) else disk_fault(error.cause)
+    then = "Free some space, or record to another disk" if is_full(error.cause) else "Record to another disk"
     size = format_bytes(path.stat().st_size)
     return (
-        f"{path}: the disk takes no more; recording has stopped, and the log is complete with what fitted: "
-        f"{count} messages, {seconds:.1f} s, {size}. Free some space, or record to another disk"
+        f"{path}: {what}; recording has stopped, and the log is complete with what fitted: "
+        f"{count} messages, {seconds:.1f} s, {size}. {then}"
     )
+
+
+def what_failed(path: Path, fault: OSError) -> str:
+    """What is to be done with a log that a disk may not have kept."""
+    return (
+        f"{path}: {disk_fault(fault)} while this was recorded; some of it may be lost. To see what is whole: "
+        f"ipsys repair {path}. Record to another disk"
+    )
+
+
+def disk_fault(fault: OSError) -> str:
+    """A fault of the disk in words."""
+    return f"the disk has failed ({fault.strerror})"

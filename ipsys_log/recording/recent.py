@@ -8,6 +8,7 @@ from types import TracebackType
 from ipsys_log.errors import WriteError
 from ipsys_log.messages import FRAME_SKIPPED, CompressedImage, Event, Measurement, Message
 from ipsys_log.recording.recorder import Recording
+from ipsys_log.recording.syncer import Confirm
 from ipsys_log.units import NS_PER_S
 
 __all__ = ["Recent"]
@@ -52,6 +53,10 @@ class Recent:
     def full(self) -> WriteError | None:
         return self._log.full
 
+    @property
+    def fault(self) -> OSError | None:
+        return self._log.fault
+
     def put(self, message: Message) -> None:
         """Take the next message of a recording.
 
@@ -78,6 +83,10 @@ class Recent:
     def flush(self) -> None:
         """Hand to the disk what is written."""
         self._log.flush()
+
+    def sync(self, confirm: Confirm) -> None:
+        """Bring what was flushed onto the disk, and ``confirm`` it."""
+        self._log.sync(confirm)
 
     def _write(self, since_ns: int | None = None) -> None:
         """Write all that is held; of the frames those taken since then, None for none."""

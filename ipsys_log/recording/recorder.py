@@ -7,10 +7,11 @@ import threading
 from collections.abc import Callable, Generator, Iterable, Iterator, Mapping
 from contextlib import ExitStack, closing, contextmanager
 from dataclasses import replace
+from functools import partial
 from pathlib import Path
 from typing import Protocol
 
-from ipsys_log.errors import IpsysError, LogError, WriteError
+from ipsys_log.errors import IpsysError, LogError, WriteError, is_full
 from ipsys_log.geometry.lenses import scale_lens
 from ipsys_log.log import LogWriter
 from ipsys_log.log.journal import roll_back
@@ -18,15 +19,18 @@ from ipsys_log.log.lock import open_locked
 from ipsys_log.log.storage import DISK
 from ipsys_log.messages import (
     RIG_TOPIC,
+    STAMP_UNRELIABLE,
     CameraCalibration,
     CompressedImage,
     CompressedVideo,
+    Event,
     Measurement,
     Message,
     Rig,
     calibration_topic,
 )
-from ipsys_log.recording.full_disk import reserve, what_fitted
+from ipsys_log.recording.full_disk import disk_fault, reserve, what_failed, what_fitted
+from ipsys_log.recording.syncer import Confirm, Syncer
 from ipsys_log.runs.output import write_message
 
 __all__ = [
@@ -44,22 +48,38 @@ _SETTLE_S = 1.0
 
 
 class Source(Protocol):
-    """Messages, and None where nothing comes; after ``stop`` only what has come by then."""
+    """Messages, and None where nothing comes; after ``stop`` only what has come by then.
+
+    ``confirm`` is told from any thread that a measurement is on the disk, or what the disk said instead;
+    ``warn`` makes an event, and says it.
+    """
 
     def __iter__(self) -> Generator[Message | None, None, None]: ...
 
     def stop(self, why: str | None = None) -> None: ...
 
+    def confirm(self, message: Message, fault: OSError | None) -> None: ...
+
+    def warn(self, kind: str, text: str) -> None: ...
+
 
 class Target(Protocol):
-    """Where messages go, in the order of their log times; ``full`` is set when the disk was."""
+    """Where messages go, in the order of their log times.
+
+    ``full`` is set when the disk took no more, ``fault`` when it failed to keep what was written.
+    """
 
     @property
     def full(self) -> WriteError | None: ...
 
+    @property
+    def fault(self) -> OSError | None: ...
+
     def put(self, message: Message) -> None: ...
 
     def flush(self) -> None: ...
+
+    def sync(self, confirm: Confirm) -> None: ...
 
 
 class Recording:
@@ -72,12 +92,14 @@ class Recording:
     Attributes
     ----------
     counts : messages so far, by topic.
-    full : set when the disk was; what is set aside is in use then.
+    full : set when the disk took no more; what is set aside is in use then.
+    syncer : brings what is written onto the disk.
     """
 
     def __init__(self, writer: LogWriter, free: Callable[[], None]) -> None:
         self.counts: dict[str, int] = {}
         self.full: WriteError | None = None
+        self.syncer = Syncer(writer.sync)
         self._writer, self._free = writer, free
         self._lock = threading.Lock()
         self._torn = False
@@ -96,16 +118,27 @@ class Recording:
         """Hand everything to the disk."""
         self._write(self._writer.flush)
 
+    def sync(self, confirm: Confirm) -> None:
+        """Bring what was flushed onto the disk, and ``confirm`` it from another thread."""
+        self.syncer.soon(confirm)
+
+    @property
+    def fault(self) -> OSError | None:
+        """What the disk said when it first failed to keep what was written."""
+        return self.syncer.fault
+
     def check_disk(self) -> None:
         """See that all was written.
 
         Raises
         ------
         IpsysError
-            Where the disk was full: it says how far the log goes.
+            Where the disk was full, which says how far the log goes, or failed.
         """
         if self.full is not None:
             raise IpsysError(what_fitted(self._writer.path, self.full)) from self.full
+        if self.fault is not None:
+            raise IpsysError(what_failed(self._writer.path, self.fault)) from self.fault
 
     def settle(self) -> bool:
         """Write nothing more, whichever thread wants to; False where one is in the midst of it."""
@@ -126,23 +159,31 @@ class Recording:
 
 
 def written(source: Source, log: Target) -> Iterator[Message | None]:
-    """What a source gives, each message after it was written; a measurement is on the disk then.
+    """What a source gives, each message after it was written.
 
-    When the disk is full the source is stopped. What is no frame is still written, to what is set aside.
+    A measurement is confirmed as soon as it is on the disk. When the disk is full the source is stopped. What
+    is no frame is still written, to what is set aside.
     """
+    warned = False
     with closing(iter(source)) as messages:
         for message in messages:
+            if log.fault is not None and not warned:
+                warned = True
+                source.warn("disk_fault", f"{disk_fault(log.fault)}; what was written just now may be lost")
             if message is None:
                 log.flush()
             elif log.full is None or not isinstance(message.payload, (CompressedImage, CompressedVideo)):
                 log.put(message)
+                if isinstance(message.payload, Event) and message.payload.kind == STAMP_UNRELIABLE:
+                    log.flush()  # the frames that it speaks of are never in the file without it
                 if isinstance(message.payload, Measurement):
                     log.flush()
+                    log.sync(partial(source.confirm, message))
             else:
                 continue
             yield message
             if log.full is not None:
-                source.stop("the disk is full")
+                source.stop("the disk is full" if is_full(log.full.cause) else disk_fault(log.full.cause))
 
 
 @contextmanager
@@ -171,6 +212,7 @@ def recording(path: Path, settings: Iterable[Message] = (), overwrite: bool = Fa
                 for message in settings:
                     log.put(message)
                 log.flush()
+                held.enter_context(log.syncer)
                 yield log
             except KeyboardInterrupt as error:
                 if log.settle():

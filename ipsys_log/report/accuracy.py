@@ -18,7 +18,8 @@ from ipsys_log.messages import (
     Tracks,
 )
 from ipsys_log.models import MODELS, reads_height
-from ipsys_log.offline.errors import CROSS_VALIDATION, POOLED
+from ipsys_log.offline.errors import CROSS_VALIDATION, POOLED, count_repeats
+from ipsys_log.offline.statistics import root_mean_square_m
 from ipsys_log.offline.truth import gather_tracks, track_errors
 from ipsys_log.report.advice import Advice, Choice, advise
 from ipsys_log.runs.records import Outcome
@@ -43,6 +44,11 @@ class Accuracy:
         """The rows by cross-validation, or those of the places held out."""
         rows = self.evaluation.cameras if self.evaluation else ()
         return [row for row in rows if (row.scheme == CROSS_VALIDATION) == cross_validated]
+
+    def rmse_m(self, row: CameraEvaluation, errors: ErrorStatistics | None) -> float | None:
+        """Return the root-mean-square of a row's errors in space, or of those on the floor."""
+        repeats = count_repeats(row, self.evaluation.cameras if self.evaluation else ())
+        return None if errors is None or repeats is None else root_mean_square_m(errors, repeats)
 
 
 def read_accuracy(session: Session, outcomes: Sequence[Outcome]) -> list[Accuracy]:
@@ -104,7 +110,7 @@ def _model_json(accuracy: Accuracy) -> dict[str, Any]:
             place = place.setdefault("cross_validation", {})
         if row.against != "tape":
             place = place.setdefault(row.against, {})
-        place.update(_row_json(row))
+        place.update(_row_json(accuracy, row))
     found: dict[str, Any] = {"run": accuracy.run}
     if POOLED in cameras:
         found["pooled"] = cameras.pop(POOLED)
@@ -113,16 +119,16 @@ def _model_json(accuracy: Accuracy) -> dict[str, Any]:
         found["learning_curve"] = [_learning_json(point) for point in accuracy.evaluation.learning]
         found["suspects"] = [_suspect_json(suspect) for suspect in accuracy.evaluation.suspects]
     if accuracy.tracks is not None:
-        space, floor = map(_statistics, accuracy.tracks)
+        space, floor = (_statistics(errors, root_mean_square_m(errors)) for errors in accuracy.tracks)
         found["tracks"] = {"truth": {"3d": space, "2d": floor}}
     return found
 
 
-def _row_json(row: CameraEvaluation) -> dict[str, Any]:
+def _row_json(accuracy: Accuracy, row: CameraEvaluation) -> dict[str, Any]:
     found: dict[str, Any] = {}
     if row.error_3d is not None:
-        found["3d"] = _statistics(row.error_3d)
-    found["2d"] = _statistics(row.error_2d)
+        found["3d"] = _statistics(row.error_3d, accuracy.rmse_m(row, row.error_3d))
+    found["2d"] = _statistics(row.error_2d, accuracy.rmse_m(row, row.error_2d))
     if row.bias_m is not None:
         found["bias_cm"] = (row.bias_m * CM_PER_M).tolist()
     if row.within_68 is not None and row.within_95 is not None:
@@ -130,9 +136,10 @@ def _row_json(row: CameraEvaluation) -> dict[str, Any]:
     return found
 
 
-def _statistics(errors: ErrorStatistics) -> dict[str, float | int]:
+def _statistics(errors: ErrorStatistics, rmse_m: float | None) -> dict[str, float | int]:
     values = {
         "mean_cm": errors.mean_m,
+        "rmse_cm": rmse_m,
         "min_cm": errors.min_m,
         "max_cm": errors.max_m,
         "std_cm": errors.std_m,

@@ -179,16 +179,17 @@ def _sentences(
     """Which model with how many places, and what the others save."""
     if len({candidate.model for found in table.values() for candidate in found}) == 1:
         means_cm = [found[0].mean_m * CM_PER_M for _, found in sorted(table.items())]
+        name = next(iter(table.values()))[0].model
         yield (
-            f"{next(iter(table.values()))[0].model} is off by {means_cm[0]:.1f} cm with {min(table)} places "
-            f"for each camera, by {means_cm[-1]:.1f} cm with {max(table)}."
+            f"The mean error of {name} is {means_cm[0]:.1f} cm with {min(table)} points per camera, "
+            f"{means_cm[-1]:.1f} cm with {max(table)}."
         )
         return
     simple = {c.model for found in table.values() for c in found if c.model in _SIMPLE}
-    group, of = (SIMPLE, "Of rigid and poly use") if len(simple) > 1 else (ANY, "Use")
+    group, use = (SIMPLE, "Between rigid and poly, use") if len(simple) > 1 else (ANY, "Use")
     by_places = {places: found[group].model for places, found in choices.items() if group in found}
     if by_places:
-        yield f"{of} {_by_number(by_places)}."
+        yield f"{use} {_by_number(by_places)}."
     most = max(choices)
     for other, start in ((ANY, "The"), (TOLD, "Where the heights of the markers are known, the")):
         if SIMPLE in choices[most] and other in choices[most]:
@@ -196,7 +197,7 @@ def _sentences(
 
 
 def _by_number(models: Mapping[int, str]) -> str:
-    """``rigid with up to 20 places for each camera, poly from 30 on``."""
+    """``rigid with up to 20 points per camera, poly from 30 on``."""
     parts: list[tuple[str, list[int]]] = []
     for places, model in models.items():
         if parts and parts[-1][0] == model:
@@ -204,8 +205,8 @@ def _by_number(models: Mapping[int, str]) -> str:
         else:
             parts.append((model, [places]))
     if len(parts) == 1:
-        return f"{parts[0][0]} with any number of places from {min(models)} to {max(models)} for each camera"
-    first = f"{parts[0][0]} with up to {parts[0][1][-1]} places for each camera"
+        return f"{parts[0][0]} with any number of points from {min(models)} to {max(models)} per camera"
+    first = f"{parts[0][0]} with up to {parts[0][1][-1]} points per camera"
     middle = [f"{model} with {_span(places)}" for model, places in parts[1:-1]]
     return ", ".join([first, *middle, f"{parts[-1][0]} from {parts[-1][1][0]} on"])
 
@@ -224,6 +225,8 @@ def _saving(
     enough = [places for places, mean_m in sorted(means_m.items()) if mean_m <= usual.mean_m]
     if enough and enough[0] < most:
         usual_cm, least_cm = (f"{mean_m * CM_PER_M:.1f} cm" for mean_m in (usual.mean_m, means_m[most]))
-        more = "" if usual_cm == least_cm else f", and with {most} comes to {least_cm}"
-        saved = f"model {model} needs {enough[0]} places for what {usual.model} needs {most} for"
-        yield f"{start} {saved} ({usual_cm}){more}."
+        more = "" if usual_cm == least_cm else f"; with {most} its error is {least_cm}"
+        yield (
+            f"{start} model {model} with {enough[0]} points is as good as {usual.model} with {most} "
+            f"({usual_cm}){more}."
+        )

@@ -49,25 +49,25 @@ def calibration_lines(found: Calibrated) -> list[str]:
     if found.far_corners:
         corners = "corner" if found.far_corners == 1 else "corners"
         lines.append(f"left out: {found.far_corners} single {corners}, far off")
-    return lines + _dropped_lines(found.dropped)
+    return lines + _dropped_lines(found.dropped, "left out") + _dropped_lines(found.unseen, "not seen")
 
 
 def _degrees(angle_rad: float | None) -> str:
     return "?" if angle_rad is None else f"{math.degrees(angle_rad):.0f} degrees"
 
 
-def _dropped_lines(dropped: tuple[Dropped, ...]) -> list[str]:
-    """Each with its reason; many of one reason as one line."""
+def _dropped_lines(dropped: tuple[Dropped, ...], what: str) -> list[str]:
+    """Return what happened to pictures and why, a line for each reason, the most frequent first."""
     counts = Counter(drop.reason for drop in dropped)
     lines = []
-    for reason, count in counts.items():
+    for reason, count in counts.most_common():
         names = [drop.name for drop in dropped if drop.reason == reason]
         shown = ", ".join(names[:3]) + (f" and {count - 3} more" if count > 3 else "")
         # A reason is told of one picture.
         why = re.sub("^is ", "are ", reason) if count > 1 else reason
-        lines.append(f"left out: {shown}: {why}")
+        lines.append(f"{what}: {shown}: {why}")
     more = len(lines) - _SHOWN_DROPPED
-    return lines if more <= 1 else [*lines[:_SHOWN_DROPPED], f"left out: and so on, {more} more (see --json)"]
+    return lines if more <= 1 else [*lines[:_SHOWN_DROPPED], f"{what}: and so on, {more} more (see --json)"]
 
 
 def calibration_json(found: Calibrated) -> dict[str, Any]:
@@ -91,6 +91,7 @@ def calibration_json(found: Calibrated) -> dict[str, Any]:
             "used": [{"name": name, "rms_px": rms_px} for name, rms_px in found.used],
             "dropped": [drop._asdict() for drop in found.dropped],
             "not_needed": [drop._asdict() for drop in found.spare],
+            "not_seen": [drop._asdict() for drop in found.unseen],
         },
         "coverage": {
             "share": coverage.share,

@@ -13,6 +13,7 @@ from rich.text import Text
 from ipsys_log.log.session import Session
 from ipsys_log.log.topics import camera_of_topic
 from ipsys_log.messages import Run
+from ipsys_log.plain_text import plain_text
 from ipsys_log.units import NS_PER_S, format_bytes, format_time
 
 __all__ = ["contents_json", "contents_tables", "runs_json", "runs_table"]
@@ -63,7 +64,9 @@ def contents_json(session: Session) -> dict[str, Any]:
 def _lens(session: Session, camera: str) -> dict[str, Any] | None:
     if camera not in session.calibrations:
         return None
-    lens = session.payloads([session.calibrations[camera]])[-1]
+    topic = session.calibrations[camera]
+    *_, message = session.messages([topic], session.last([topic])[0])
+    lens = message.payload
     return {"width": lens.width, "height": lens.height, "model": lens.distortion_model}
 
 
@@ -135,7 +138,7 @@ def _cameras_table(found: dict[str, Any]) -> Table:
         channel, lens = found["channels"][row["images"]], row["lens"]
         text = Text("missing", style="yellow")
         if lens is not None:
-            text = Text(f"{lens['width']} x {lens['height']} px, {lens['model']}")
+            text = Text(plain_text(f"{lens['width']} x {lens['height']} px, {lens['model']}"))
         table.add_row(camera, str(channel["messages"]), _rate(channel), text)
     return table
 
@@ -153,11 +156,11 @@ def _channels_table(found: dict[str, Any]) -> Table:
         if topic.startswith("/runs/") and rest:
             if within != run:
                 run = within
-                table.add_row(Text(f"/runs/{run}/", style="bold"))
+                table.add_row(Text(plain_text(f"/runs/{run}/"), style="bold"))
             topic = f"  {rest}"  # noqa: PLW2901
         gaps = f"{row['gaps']} ({row['longest_gap_s']:.1f} s)" if row["gaps"] else ""
         schema = re.split(r"[./]", row["schema"] or "-")[-1]
-        table.add_row(Text(topic), str(row["messages"]), _rate(row), gaps, schema)
+        table.add_row(topic, str(row["messages"]), _rate(row), gaps, schema)
     return table
 
 

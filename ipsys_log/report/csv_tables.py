@@ -62,7 +62,7 @@ _STATISTICS = {
 def cross_validation_csv(findings: Findings) -> bytes:
     """A row for each model, camera (``all``: together) and what it is compared with."""
     header = ["method", "camera", "against", "places"]
-    header += [f"{name}_{space}_cm" for space in ("3d", "2d") for name in _STATISTICS]
+    header += [f"{name}_{space}_cm" for space in ("3d", "2d") for name in (*_STATISTICS, "rmse")]
     header += [f"bias_{axis}_cm" for axis in "xyz"] + ["within_68", "within_95"]
     rows = []
     for accuracy in findings.accuracies:
@@ -70,6 +70,7 @@ def cross_validation_csv(findings: Findings) -> bytes:
             cells = [accuracy.model, row.camera or "all", row.against, str(row.error_2d.count)]
             for errors in (row.error_3d, row.error_2d):
                 cells += [_cm(getattr(errors, name) if errors else None) for name in _STATISTICS.values()]
+                cells.append(_cm(accuracy.rmse_m(row, errors)))
             cells += map(_cm, [None] * 3 if row.bias_m is None else row.bias_m.tolist())
             cells += ["" if v is None else f"{v:.4f}" for v in (row.within_68, row.within_95)]
             rows.append(cells)

@@ -8,6 +8,7 @@ from collections.abc import Iterable, Mapping
 from pathlib import Path
 
 from ipsys_log.errors import IpsysError
+from ipsys_log.log.lock import dangling
 
 __all__ = ["PICTURES", "check_file", "check_folder", "check_picture", "write_files"]
 
@@ -25,6 +26,8 @@ def check_file(path: Path, option: str, logs: Iterable[Path]) -> None:
     """
     if any(log.exists() and path.exists() and path.samefile(log) for log in logs):
         raise IpsysError(f"{option} {path}: this is the log itself; name another file")
+    if (text := dangling(path)) is not None:
+        raise IpsysError(f"{option} {text}")
     if path.is_dir():
         raise IpsysError(f"{option} {path}: is a folder; name a file in it")
     if not path.parent.is_dir():

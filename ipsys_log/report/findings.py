@@ -15,7 +15,7 @@ from ipsys_log.report.accuracy import Accuracy
 from ipsys_log.report.advice import Advice, advise, told_height
 from ipsys_log.sinks.shown import rig_in_force
 
-__all__ = ["Findings", "Missed", "gather_findings", "overall"]
+__all__ = ["Findings", "Missed", "gather_findings", "in_space", "judged", "overall", "rank"]
 
 Array = NDArray[np.float64]
 
@@ -66,19 +66,15 @@ class Findings:
     @property
     def in_space(self) -> bool:
         """Whether errors are judged in space, or on the floor: where heights could not be learned."""
-        return all(row.error_3d is not None for found in self.evaluations for row in found.cameras)
+        return in_space(self.accuracies)
 
     def errors(self, row: CameraEvaluation) -> ErrorStatistics:
         """The errors of a row that models are judged by."""
-        return row.error_3d if self.in_space and row.error_3d is not None else row.error_2d
+        return judged(row, self.in_space)
 
     def ranked(self) -> list[Accuracy]:
         """The lowest mean error first; models that are told the height come last."""
-        return sorted(self.accuracies, key=self._rank)
-
-    def _rank(self, accuracy: Accuracy) -> tuple[bool, bool, float]:
-        row = overall(accuracy, True) or overall(accuracy, False)
-        return row is None, told_height(accuracy.model), self.errors(row).mean_m if row else np.inf
+        return rank(self.accuracies)
 
     def training_m(self) -> dict[str, Array]:
         """The places that models were fitted on, (n, 3) in m by camera."""
@@ -120,6 +116,28 @@ def _missed(row: CameraEvaluation) -> Missed:
         np.array([np.mean(found, axis=0) for found in offsets.values()]),
         np.array(lengths),
     )
+
+
+def in_space(accuracies: Sequence[Accuracy]) -> bool:
+    """Return whether errors are judged in space, or on the floor: where heights could not be learned."""
+    rows = [row for accuracy in accuracies if accuracy.evaluation for row in accuracy.evaluation.cameras]
+    return all(row.error_3d is not None for row in rows)
+
+
+def judged(row: CameraEvaluation, space: bool) -> ErrorStatistics:
+    """Return the errors of a row that models are judged by."""
+    return row.error_3d if space and row.error_3d is not None else row.error_2d
+
+
+def rank(accuracies: Sequence[Accuracy]) -> list[Accuracy]:
+    """Sort models: the lowest mean error first; those that are told the height come last."""
+    space = in_space(accuracies)
+
+    def place(accuracy: Accuracy) -> tuple[bool, bool, float]:
+        row = overall(accuracy, True) or overall(accuracy, False)
+        return row is None, told_height(accuracy.model), judged(row, space).mean_m if row else np.inf
+
+    return sorted(accuracies, key=place)
 
 
 def overall(accuracy: Accuracy, cross_validated: bool, against: str = "tape") -> CameraEvaluation | None:

@@ -13,6 +13,7 @@ from ipsys_log.messages import Run
 from ipsys_log.offline.crossval import FOLDS, REPEATS
 from ipsys_log.offline.learning import SUBSETS
 from ipsys_log.offline.tape import Measured
+from ipsys_log.plain_text import plain_text
 from ipsys_log.report import page, page_pictures, page_trust
 from ipsys_log.report.accuracy import Accuracy
 from ipsys_log.report.advice import TOLD_NOTE, told_height
@@ -42,6 +43,7 @@ def render_report(session: Session, accuracies: Sequence[Accuracy]) -> str:
     environment = Environment(
         loader=PackageLoader("ipsys_log", "report"),
         autoescape=True,  # names in a log are anybody's
+        finalize=_plain,
         undefined=StrictUndefined,
         trim_blocks=True,
         lstrip_blocks=True,
@@ -52,6 +54,13 @@ def render_report(session: Session, accuracies: Sequence[Accuracy]) -> str:
         **_drawn(findings),
         **_made(session, findings),
     )
+
+
+def _plain(value: Any) -> Any:
+    """Return what a page shows of a value: text without control characters, HTML of ours as it is."""
+    if not isinstance(value, str) or hasattr(value, "__html__"):
+        return value
+    return plain_text(value, keep="\n", longest=len(value))
 
 
 def _said(findings: Findings) -> dict[str, Any]:

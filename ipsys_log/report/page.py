@@ -109,8 +109,8 @@ def model_rows(findings: Findings, camera: str = POOLED) -> list[dict[str, Any]]
             "model": label(accuracy.model),
             "against": side,
             "several": len(against) > 1,
-            "held_out": _errors(found.get(False)),
-            "crossed": _errors(found.get(True)),
+            "held_out": _errors(accuracy, found.get(False)),
+            "crossed": _errors(accuracy, found.get(True)),
         }
         for accuracy in findings.ranked()
         for side in against
@@ -132,7 +132,7 @@ def _rows(accuracy: Accuracy, camera: str, against: str) -> dict[bool, CameraEva
     return {crossed: row for crossed, row in found.items() if row is not None}
 
 
-def _errors(row: CameraEvaluation | None) -> dict[str, str] | None:
+def _errors(accuracy: Accuracy, row: CameraEvaluation | None) -> dict[str, str] | None:
     if row is None:
         return None
     names = ("mean", "min", "max", "std", "median", "p95")
@@ -140,6 +140,7 @@ def _errors(row: CameraEvaluation | None) -> dict[str, str] | None:
     return {
         "n": str(floor.count),
         **{name: format_cm(getattr(space, f"{name}_m") if space else None) for name in names},
+        "rmse": format_cm(accuracy.rmse_m(row, space)),
         "interval": _interval(space) if space else "",
         "floor": format_cm(floor.mean_m),
         "floor_interval": _interval(floor),

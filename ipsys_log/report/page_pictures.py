@@ -70,10 +70,10 @@ def models_pictures(findings: Findings) -> list[Picture]:
 
 def residual_pictures(findings: Findings) -> list[Picture]:
     """Where on the floor the shown models are off, with one scale of floor, arrows and colours."""
-    pictures = []
     accuracies = shown_models(findings)
     if not accuracies:
-        return pictures
+        return []
+    pictures = []
     scale = residual_scale(findings, accuracies)
     for accuracy in accuracies:
         figure, axes = _figure(5.6)

@@ -13,6 +13,7 @@ from matplotlib.axes import Axes
 from matplotlib.figure import Figure
 from matplotlib.ticker import FixedLocator, FuncFormatter, NullLocator
 
+from ipsys_log.plain_text import plain_text
 from ipsys_log.report.palette import GRID
 
 __all__ = ["picture", "png", "scale_logarithmic", "set_ticks", "shorten", "strip", "svg_uri"]
@@ -63,7 +64,7 @@ def _saved(figure: Figure, **how: object) -> bytes:
 
 def shorten(name: str) -> str:
     """A name out of a log as a picture has room for it, on one line."""
-    plain = "".join(c if c.isprintable() else "\ufffd" for c in name)
+    plain = plain_text(name)
     return plain if len(plain) <= _LONGEST else f"{plain[: _LONGEST - 1]}…"
 
 

@@ -18,6 +18,7 @@ __all__ = ["repair_lines"]
 _FLUSH_NS = NS_PER_S
 # A file that was written so long after its last message was copied since, or recorded by another clock.
 _COPIED_NS = 10 * NS_PER_S
+_MOST_NOTES = 12
 
 
 def repair_lines(report: RepairReport) -> Iterator[str | Table]:
@@ -27,21 +28,53 @@ def repair_lines(report: RepairReport) -> Iterator[str | Table]:
         yield f"{report.path} repaired: {kept}, up to {format_time(report.last_kept_ns)} UTC"
     else:
         yield f"{report.path} {'repaired' if report.changed else 'is whole, nothing changed'}: {kept}"
-    if report.bytes_lost:
-        named = "these messages are gone" if report.lost else "no whole message is known to be gone"
-        yield f"{format_bytes(report.bytes_lost)} cannot be read; {named}{':' if report.lost else ''}"
-    if report.lost:
-        yield _lost_table(report)
-    yield from report.notes
+    yield from _about_the_loss(report)
+    if report.unchecked:
+        yield f"{report.unchecked} of them were saved from damaged chunks: no CRC says that they are right"
+    if report.kept_in is not None:
+        yield f"all bytes that were taken out are kept in {report.kept_in}"
+    yield from report.notes[:_MOST_NOTES]
+    if len(report.notes) > _MOST_NOTES:
+        yield f"and {len(report.notes) - _MOST_NOTES} places more"
+    if report.changed and report.messages_kept:
+        yield from _about_the_rig(report)
     if report.cut_off and report.messages_kept:
         yield from _about_the_end(report)
 
 
+def _about_the_loss(report: RepairReport) -> Iterator[str | Table]:
+    """How much cannot be read, and which messages are gone with it, as far as that is known."""
+    if not (report.bytes_lost or report.gone):
+        return
+    if report.gone and report.uncounted:
+        named = "these messages are gone, and others: how many is not known:"
+    elif report.gone:
+        named = "these messages are gone:"
+    elif report.uncounted:
+        named = "how many messages were in them is not known"
+    else:
+        named = "no message was in them"
+    yield f"{format_bytes(report.bytes_lost)} cannot be read; {named}"
+    if report.gone:
+        yield _lost_table(report)
+
+
 def _lost_table(report: RepairReport) -> Table:
     table = _table("channel", "gone", "from", "to (UTC)")
-    for topic, times_ns in sorted(report.lost.items()):
-        table.add_row(topic, str(len(times_ns)), _clock(min(times_ns)), _clock(max(times_ns)))
+    for topic, number in sorted(report.gone.items()):
+        times_ns = report.lost.get(topic, ())
+        span = (_clock(min(times_ns)), _clock(max(times_ns))) if len(times_ns) == number else ("", "")
+        table.add_row(topic, str(number), *span)
     return table
+
+
+def _about_the_rig(report: RepairReport) -> Iterator[str]:
+    with LogReader(report.path) as log:
+        schemas = [channel.schema for channel in log.channels.values() if channel.message_count]
+        images = any(schema is not None and schema.name in IMAGE_SCHEMAS for schema in schemas)
+        rig = log.channels.get("/rig")
+    if images and not (rig and rig.message_count):
+        yield "it has frames but no rig: give one to each command, as --rig lab.toml"
 
 
 def _about_the_end(report: RepairReport) -> Iterator[str | Table]:

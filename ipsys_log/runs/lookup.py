@@ -12,6 +12,7 @@ from ipsys_log.log.session import Session
 from ipsys_log.log.topics import run_of_topic
 from ipsys_log.messages import (
     FRAME_SKIPPED,
+    STAMP_UNRELIABLE,
     CameraPoints,
     Event,
     Markers,
@@ -34,6 +35,7 @@ __all__ = [
     "find_pairs",
     "fits_again",
     "fitted_in",
+    "has_late_frames",
     "held_out_ids",
     "measured",
     "rig_with_offsets",
@@ -143,6 +145,12 @@ def skipped_frames(session: Session) -> set[int]:
     """Log times of the frames that were recorded live and not looked at then."""
     events = session.payloads(session.topics(Event))
     return {event.timestamp for event in events if event.kind == FRAME_SKIPPED}
+
+
+def has_late_frames(session: Session) -> bool:
+    """Whether a log says of frames that they came late, so that their times are not right."""
+    events = session.payloads(session.topics(Event))
+    return any(event.kind == STAMP_UNRELIABLE for event in events)
 
 
 def rig_with_offsets(session: Session) -> Rig:

@@ -6,7 +6,7 @@ import os
 import secrets
 from collections import Counter
 from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
-from contextlib import contextmanager
+from contextlib import contextmanager, suppress
 from dataclasses import replace
 from pathlib import Path
 
@@ -14,6 +14,7 @@ from ipsys_log.errors import IpsysError, LogError
 from ipsys_log.log import LogReader, LogWriter, Schema
 from ipsys_log.log.codec import encode, schema_data, schema_name
 from ipsys_log.log.journal import journal_path
+from ipsys_log.log.lock import dangling
 from ipsys_log.log.session import Session
 from ipsys_log.log.storage import DISK
 from ipsys_log.messages import ChannelWritten, Message, Rig, Run
@@ -134,10 +135,13 @@ def _give_name(partial: Path, output: Path) -> None:
     except OSError:  # a filesystem without hard links
         _check_free(output)
         partial.rename(output)
-    DISK.fsync_directory(output.parent)
+    with suppress(OSError):  # it has its name, and all that is in it is safe
+        DISK.fsync_directory(output.parent)
 
 
 def _check_free(output: Path) -> None:
+    if (text := dangling(output)) is not None:
+        raise IpsysError(text)
     if output.exists():
         raise IpsysError(
             f"{output}: exists already; choose another name, or give it as an input to extend it"

@@ -14,6 +14,7 @@ from ipsys_log.messages import (
     CameraCalibration,
     ChannelWritten,
     CompressedVideo,
+    Event,
     Lens,
     Message,
     Model,
@@ -180,7 +181,7 @@ def inputs(session: Session, task: Task, progress: Progress) -> Iterator[Message
     skipped = skipped_frames(session) if task.as_live else set()
     for done, message in enumerate(session.messages(task.topics), 1):
         if message.log_time_ns not in skipped:
-            if message.topic != EVENTS_TOPIC:
+            if message.topic != EVENTS_TOPIC or Event in task.reads:
                 yield message
         elif isinstance(message.payload, CompressedVideo):
             # Those after it need it. What live passed over up to a keyframe, makes no difference.

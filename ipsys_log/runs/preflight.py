@@ -3,9 +3,11 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
+from dataclasses import replace
 from pathlib import Path
 
 from ipsys_log.errors import FitError, IpsysError
+from ipsys_log.geometry.lenses import check_calibration
 from ipsys_log.log.session import Session
 from ipsys_log.log.topics import camera_of_topic
 from ipsys_log.messages import CameraPoints, Markers, Rig
@@ -37,6 +39,8 @@ def check_inputs(paths: Sequence[Path], request: Request, models: Sequence[str],
         _check_overrides(session, request, cameras)
         if "camera-frame" in wanted:
             _check_lenses(session, request, cameras)
+        if request.corners != "stock" or "camera-frame" in wanted:
+            _check_distortion(session, request, cameras)
         if "fit" in wanted and request.model_from is None:
             _check_measurements(session, request, models)
         if "locate" in wanted:
@@ -106,6 +110,15 @@ def _check_lenses(session: Session, request: Request, cameras: set[str]) -> None
             f"{session}: camera {missing[0]} has no calibration; give one with "
             f"--calibration {missing[0]}=calibration.yaml"
         )
+
+
+def _check_distortion(session: Session, request: Request, cameras: set[str]) -> None:
+    """See that the calibrations that a log holds can be computed with, unless others are given."""
+    for name in sorted(cameras - set(request.lenses)):
+        topic = session.calibrations.get(name)
+        first = None if topic is None else next(iter(session.messages([topic])), None)
+        if first is not None:
+            check_calibration(replace(first.payload, frame_id=name), f"{session}: {topic}")
 
 
 def _check_measurements(session: Session, request: Request, models: Sequence[str]) -> None:

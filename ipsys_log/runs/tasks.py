@@ -40,6 +40,7 @@ from ipsys_log.runs.lookup import (
     find_pairs,
     fits_again,
     fitted_in,
+    has_late_frames,
     held_out_ids,
     measured,
     skipped_frames,
@@ -325,6 +326,8 @@ def _locate(session: Session, request: Request, points: str, model: str) -> Task
 def _fuse(session: Session, request: Request, positions: str) -> Task | str:
     rig, topics = _rig(session, request, "fuse")
     topics += session.topics(Positions, positions)
+    if has_late_frames(session):  # a log without any has the runs that it had
+        topics.append(EVENTS_TOPIC)
     writes = (Tracks, FrameTransforms)
     return Task("fuse", positions, tuple(topics), writes, fuse.READS, fuse.Fuse, per_camera=False, rig=rig)
 

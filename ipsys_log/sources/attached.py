@@ -10,12 +10,14 @@ import threading
 from collections import deque
 from collections.abc import Generator, Iterable, Sequence
 from contextlib import suppress
+from dataclasses import dataclass
 from types import TracebackType
 from typing import Any
 
 from ipsys_log.messages import EVENTS_TOPIC, CompressedImage, CompressedVideo, Event, Message, RigCamera
 from ipsys_log.sources.attendant import Arrival, Attendant, Shared
 from ipsys_log.sources.frames import Clock, Open, Say, SourceError
+from ipsys_log.sources.stalls import Heartbeat
 
 __all__ = ["Attached"]
 
@@ -23,8 +25,8 @@ __all__ = ["Attached"]
 _LIMIT_BYTES = 256 << 20
 _TICK_S = 0.1
 _REMEMBERED = 20_000
-# A disk that takes longer is no disk to measure onto; somebody waits for the answer.
-_SAVED_S = 5.0
+# A disk that takes longer is no disk to measure onto; a user waits for the answer.
+_SAVED_S = 10.0
 # Whoever interrupts does not wait longer for a camera that hangs.
 _LAST_S = 1.0
 
@@ -68,17 +70,18 @@ class Attached:
         self._limit_bytes, self._waiting_bytes = limit_bytes, 0
         self._waiting: deque[Arrival] = deque()
         self._arrived = threading.Condition()
-        # What somebody waits for.
-        self._unwritten: list[Arrival] = []
+        self._saving: list[_Saving] = []
         self._closed = self._ending = False
         self._why = "the recording has ended; measure in its log with: ipsys measure LOG"
         self._started, self._stopped = threading.Event(), threading.Event()
-        shared = Shared(open_source, clock, self._put, say, self._started, self._stopped)
+        self._heartbeat = Heartbeat(clock)
+        shared = Shared(open_source, clock, self._put, say, self._started, self._stopped, self._heartbeat)
         self._attendants = [Attendant(camera, shared) for camera in cameras]
         self.states = {one.name: by.state for one, by in zip(cameras, self._attendants, strict=True)}
 
     def __enter__(self) -> Attached:
         try:
+            self._heartbeat.start()
             for attendant in self._attendants:
                 attendant.thread.start()
             for attendant in self._attendants:
@@ -137,28 +140,43 @@ class Attached:
         self._add(Arrival(self.clock.now_ns(), topic, payload.timestamp, payload))
 
     def save(self, topic: str, payload: Any) -> None:
-        """Take something into the stream, and wait until it is written. Not for the thread that iterates.
+        """Take something into the stream, and wait until it is on the disk. Not for the thread that iterates.
 
         Raises
         ------
         SourceError
-            Where it was not written, and why.
+            Where it is not, and why.
         """
-        arrival = Arrival(self.clock.now_ns(), topic, payload.timestamp, payload)
+        saving = _Saving(Arrival(self.clock.now_ns(), topic, payload.timestamp, payload))
         with self._arrived:
-            self._add(arrival)
-            self._unwritten.append(arrival)
-            self._arrived.wait_for(lambda: self._closed or not _has(self._unwritten, arrival), _SAVED_S)
-            if not _has(self._unwritten, arrival):
-                return
-            self._unwritten = [one for one in self._unwritten if one is not arrival]
-            if self._closed:
-                raise SourceError(f"not saved: {self._why}")
-            waits = _has(self._waiting, arrival)
-            self._waiting = deque(one for one in self._waiting if one is not arrival)
+            self._add(saving.arrival)
+            self._saving.append(saving)
+            self._arrived.wait_for(
+                lambda: saving.confirmed or (self._closed and not saving.written), _SAVED_S
+            )
+            self._saving.remove(saving)
+            waits = _has(self._waiting, saving.arrival)
+            self._waiting = deque(one for one in self._waiting if one is not saving.arrival)
+            closed = self._closed
+        if saving.fault is not None:
+            raise SourceError(
+                f"maybe not saved: the disk has failed ({saving.fault.strerror}); record to another disk"
+            )
+        if saving.confirmed:
+            return
+        if closed and not saving.written:
+            raise SourceError(f"not saved: {self._why}")
         if waits:
             raise SourceError("not saved: the disk is too slow; try again")
         raise SourceError("maybe not saved: the disk does not answer; look into the log")
+
+    def confirm(self, message: Message, fault: OSError | None = None) -> None:
+        """Say that a message is on the disk, or what the disk said instead. Any thread may."""
+        with self._arrived:
+            for saving in self._saving:
+                if saving.log_time_ns == message.log_time_ns:
+                    saving.confirmed, saving.fault = True, fault
+            self._arrived.notify_all()
 
     def warn(self, kind: str, text: str) -> None:
         """An event of no camera, said at once too; only said where the stream has ended."""
@@ -199,13 +217,19 @@ class Attached:
             return arrival, self._closed
 
     def _note_written(self, arrival: Arrival) -> None:
-        if self._unwritten:
-            with self._arrived:
-                self._unwritten = [one for one in self._unwritten if one is not arrival]
-                self._arrived.notify_all()
+        for saving in self._saving_of(arrival):
+            saving.written = True
+
+    def _saving_of(self, arrival: Arrival) -> list[_Saving]:
+        if not self._saving:
+            return []
+        with self._arrived:
+            return [saving for saving in self._saving if saving.arrival is arrival]
 
     def _message(self, arrival: Arrival) -> Message:
         log_time_ns = self.now_ns()
+        for saving in self._saving_of(arrival):
+            saving.log_time_ns = log_time_ns
         if arrival.camera is not None:
             self.received_ns[log_time_ns] = arrival.received_ns
             if len(self.received_ns) > _REMEMBERED:
@@ -218,9 +242,21 @@ class Attached:
 
     def _end(self, seconds: float | None = None) -> None:
         self._stopped.set()
+        self._heartbeat.stop()
         for attendant in self._attendants:
             if attendant.thread.ident is not None:  # an interrupt may come before all were started
                 attendant.thread.join(seconds)
+
+
+@dataclass(eq=False, slots=True)
+class _Saving:
+    """What a caller of ``save`` waits for: written by the thread that iterates, then on the disk."""
+
+    arrival: Arrival
+    log_time_ns: int | None = None
+    written: bool = False
+    confirmed: bool = False
+    fault: OSError | None = None
 
 
 def _bytes_of(arrival: Arrival | None) -> int:

@@ -7,12 +7,13 @@ from collections.abc import Callable
 from dataclasses import dataclass
 from typing import Any, NamedTuple
 
-from ipsys_log.messages import EVENTS_TOPIC, Event, RigCamera, image_topic
+from ipsys_log.messages import EVENTS_TOPIC, STAMP_UNRELIABLE, Event, RigCamera, image_topic
 from ipsys_log.rig import hide_password
 from ipsys_log.sources.frames import Clock, Frame, Open, Say, SourceError, instant_ns
 from ipsys_log.sources.packets import can_begin, find_size
+from ipsys_log.sources.stalls import Heartbeat, LateFrames
 from ipsys_log.sources.videos import frame_payload
-from ipsys_log.units import NS_PER_S
+from ipsys_log.units import NS_PER_S, format_time
 
 __all__ = ["Arrival", "Attendant", "CameraState", "Shared"]
 
@@ -72,6 +73,7 @@ class Shared:
     say: Say
     started: threading.Event
     stopped: threading.Event
+    heartbeat: Heartbeat
 
 
 class Attendant:
@@ -93,6 +95,7 @@ class Attendant:
         self._said: set[str] = set()
         self._broken = False
         self._since_key = 0
+        self._late = LateFrames(shared.heartbeat, camera.rate_hz)
         self.thread = threading.Thread(target=self._attend, name=camera.name, daemon=True)
 
     def wait(self) -> None:
@@ -168,7 +171,9 @@ class Attendant:
         state.up, state.format = True, frame.format
         self._note_size(frame)
         time_ns = now_ns
-        if frame.time_ns is not None:
+        if frame.time_ns is None:
+            self._name_late(now_ns)
+        else:
             time_ns = instant_ns(frame.time_ns, camera)
             state.delay_s = (now_ns - time_ns) / NS_PER_S
         state.missed += frame.missed
@@ -178,6 +183,8 @@ class Attendant:
             return
         state.frames += 1
         state.bytes += len(frame.data)
+        if frame.time_ns is None and self._late.since_ns is not None:
+            self._name_caught_up()
         self._name_lost()
         self._begun.set()
         # What came before the slowest camera would only be late; one without a stamp is not known to be.
@@ -251,6 +258,29 @@ class Attendant:
             self._missed_before, self._missed_named_ns = state.missed, time_ns
             self._say("frames_missed", f"{missed} frames of camera {name} were lost before they came")
 
+    def _name_late(self, now_ns: int) -> None:
+        """Say before a frame without a stamp that it is late, and so are others after it."""
+        stall = self._late.take(now_ns)
+        if stall is None:
+            return
+        text = (
+            f"camera {self._camera.name}: the recorder stood still for "
+            f"{(stall.end_ns - stall.start_ns) / NS_PER_S:.1f} s; its frames come late now, and their times "
+            "are not right"
+        )
+        self._say(STAMP_UNRELIABLE, text, stall.start_ns)
+
+    def _name_caught_up(self) -> None:
+        """Say after the last frame that was late from when to when its times are not right."""
+        start_ns, end_ns = self._late.since_ns, self._late.last_ns
+        if start_ns is None or end_ns is None or not self._late.caught_up():
+            return
+        text = (
+            f"camera {self._camera.name}: its frames are in time again; those from {format_time(start_ns)} "
+            f"to {format_time(end_ns)} UTC came late"
+        )
+        self._say(STAMP_UNRELIABLE, text, start_ns, end_ns)
+
     def _say_setting(self, text: str) -> None:
         """What a camera refused, once, however often it is opened."""
         self._say_once("camera_setting", text)
@@ -260,8 +290,9 @@ class Attendant:
             self._said.add(text)
             self._say(kind, text)
 
-    def _say(self, kind: str, text: str) -> None:
+    def _say(self, kind: str, text: str, start_ns: int | None = None, end_ns: int | None = None) -> None:
         """An event of this camera, said at once too."""
         now_ns = self._shared.clock.now_ns()
-        self._shared.put(Arrival(now_ns, EVENTS_TOPIC, now_ns, Event(now_ns, kind, text, self._camera.name)))
+        event = Event(now_ns, kind, text, self._camera.name, None, start_ns, end_ns)
+        self._shared.put(Arrival(now_ns, EVENTS_TOPIC, now_ns, event))
         self._shared.say(text)

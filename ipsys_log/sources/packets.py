@@ -10,6 +10,7 @@ from typing import TYPE_CHECKING
 import simplejpeg
 
 from ipsys_log.sources.frames import Frame, SourceError
+from ipsys_log.stages.detect.picture_size import MOST_PIXELS
 
 if TYPE_CHECKING:
     from av.container import InputContainer
@@ -103,6 +104,7 @@ def _find_video_size(frame: Frame) -> tuple[int, int] | None:
     decoder = av.VideoCodecContext.create(codec, "r")
     assert isinstance(decoder, av.VideoCodecContext)
     decoder.thread_count = 1
+    decoder.options = {"max_pixels": str(MOST_PIXELS)}
     with suppress(av.error.FFmpegError):
         decoder.decode(av.Packet(frame.data))
     return (decoder.width, decoder.height) if decoder.width else None

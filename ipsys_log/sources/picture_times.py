@@ -45,7 +45,8 @@ def parse_time(text: str) -> int:
         number = Decimal(text)
     except InvalidOperation as error:
         raise ValueError(text) from error
-    whole_digits = len(str(int(number))) if number.is_finite() else 0
+    # The exponent of 1e999999999 is not to be written out.
+    whole_digits = number.adjusted() + 1 if number.is_finite() else 0
     if whole_digits not in _DIGITS or number < 0:
         raise ValueError(text)
     return int(number * _DIGITS[whole_digits])

@@ -24,6 +24,7 @@ from ipsys_log.messages import (
 )
 from ipsys_log.sources.frames import Say, SourceError
 from ipsys_log.sources.packets import find_video, name_format, pass_through
+from ipsys_log.stages.detect.picture_size import MOST_PIXELS
 from ipsys_log.units import NS_PER_S
 
 if TYPE_CHECKING:
@@ -105,6 +106,7 @@ def _passed(container: InputContainer, stream: VideoStream, name: str) -> Iterat
 
 def _encoded(container: InputContainer, stream: VideoStream) -> Iterator[Timed]:
     start: int | None = None
+    stream.codec_context.options = {"max_pixels": str(MOST_PIXELS)}
     for picture in container.decode(stream):
         if picture.pts is None or picture.time_base is None:
             continue

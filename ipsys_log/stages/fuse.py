@@ -10,6 +10,8 @@ from numpy.typing import NDArray
 
 from ipsys_log.errors import IpsysError
 from ipsys_log.messages import (
+    STAMP_UNRELIABLE,
+    Event,
     FrameTransform,
     FrameTransforms,
     Message,
@@ -24,7 +26,7 @@ from ipsys_log.messages import (
 
 __all__ = ["READS", "Fuse", "fuse_positions"]
 
-READS = (Rig, Positions)
+READS = (Rig, Positions, Event)
 
 
 class Fuse:
@@ -37,6 +39,8 @@ class Fuse:
     A pose speaks of the instant at which its marker was exposed: markers of a frame with time offsets
     (rolling shutter) go out as messages of their own, earlier ones first. Two such cameras see a robot in
     different rows, up to 30 ms apart; beyond the window they are not averaged either.
+
+    Frames that came late, as an event of their camera says, have wrong times: their positions are in no pose.
     """
 
     def __init__(self, run: str, window_ns: int = 5_000_000) -> None:
@@ -44,10 +48,17 @@ class Fuse:
         self._window_ns = window_ns
         self._rig: Rig | None = None
         self._latest: dict[int, dict[str, tuple[int, Position]]] = {}
+        # By camera, the first and the last time of the frames that came late last; None for no end so far.
+        self._late_ns: dict[str, tuple[int, int | None]] = {}
 
     def __call__(self, message: Message) -> Iterator[Any]:
         if isinstance(message.payload, Rig):
             self._rig = message.payload
+            return
+        if isinstance(message.payload, Event):
+            self._note_late(message.payload)
+            return
+        if self._is_late(message):
             return
         if self._rig is None:
             raise IpsysError("the log has no rig (robots and their markers): give one with --rig lab.toml")
@@ -58,6 +69,15 @@ class Fuse:
         for now_ns, tracks in sorted(at.items()):
             yield Tracks(now_ns, tuple(tracks))
             yield FrameTransforms(tuple(_transform(track, self._run, now_ns) for track in tracks))
+
+    def _note_late(self, event: Event) -> None:
+        if event.kind == STAMP_UNRELIABLE and event.camera is not None and event.start is not None:
+            self._late_ns[event.camera] = event.start, event.end
+
+    def _is_late(self, message: Message) -> bool:
+        start_ns, end_ns = self._late_ns.get(str(message.camera), (None, None))
+        time_ns = message.publish_time_ns
+        return start_ns is not None and start_ns <= time_ns and (end_ns is None or time_ns <= end_ns)
 
     def _track(self, position: Position, camera: str, now_ns: int, rig: Rig) -> Track:
         seen = self._latest.setdefault(position.id, {})

@@ -26,6 +26,7 @@ _FILES = {
     **{f"/{name}.js": (f"{name}.js", "text/javascript") for name in ("measure", "cameras", "floor", "make")},
 }
 _LARGEST = 16 << 10
+_MOST_DIGITS = 20
 # Pictures that were named to a page and may still be asked for.
 _KEPT = 30
 
@@ -36,7 +37,7 @@ def build_app(scene: Scene) -> Starlette:
     return Starlette(
         routes=[
             *(Route(path, _file(*found)) for path, found in _FILES.items()),
-            Route("/picture/{camera}/{time_ns:int}", questions.picture),
+            Route("/picture/{camera}/{time_ns}", questions.picture),
             Route("/api/scene", questions.scene),
             Route("/api/views", questions.views),
             Route("/api/check", questions.check, methods=["POST"]),
@@ -86,12 +87,12 @@ class _Questions:
                 self._pictures[view.camera, view.time_ns] = view.jpeg
         while len(self._pictures) > max(_KEPT, 2 * len(views)):
             del self._pictures[next(iter(self._pictures))]
-        marker = request.query_params.get("marker", "")
-        marker_id = int(marker) if marker.isascii() and marker.isdecimal() else None
+        marker_id = _whole_number(request.query_params.get("marker", ""))
         return JSONResponse(views_json(self._scene, views, marker_id))
 
     async def picture(self, request: Request) -> Response:
-        found = self._pictures.get((request.path_params["camera"], request.path_params["time_ns"]))
+        time_ns = _whole_number(request.path_params["time_ns"])
+        found = None if time_ns is None else self._pictures.get((request.path_params["camera"], time_ns))
         if found is None:
             return Response(status_code=404)
         # Its address names one picture for good.
@@ -131,10 +132,15 @@ class _Questions:
     def _stop(self, given: Any) -> int | None:
         if not self._scene.stops:
             return None
-        text = str(given)
-        if not (text.isascii() and text.isdecimal() and int(text) < len(self._scene.stops)):
-            raise IpsysError(f"there is no place {text} in this log")
-        return int(text)
+        number = _whole_number(str(given))
+        if number is None or number >= len(self._scene.stops):
+            raise IpsysError(f"there is no place {str(given)[:_MOST_DIGITS]} in this log")
+        return number
+
+
+def _whole_number(text: str) -> int | None:
+    """The number in a request; None for anything else, and for more digits than any number there has."""
+    return int(text) if text.isascii() and text.isdecimal() and len(text) <= _MOST_DIGITS else None
 
 
 async def _body(request: Request) -> dict[str, Any]:
@@ -145,7 +151,8 @@ async def _body(request: Request) -> dict[str, Any]:
             raise IpsysError("that is more than a place needs")
     try:
         body = json.loads(data)
-    except ValueError as error:
+        json.dumps(body, ensure_ascii=False).encode()  # half a character cannot be answered
+    except (ValueError, RecursionError) as error:
         raise IpsysError("this is not JSON") from error
     if not isinstance(body, dict):
         raise IpsysError("this is not a JSON object")

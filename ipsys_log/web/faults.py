@@ -20,6 +20,8 @@ class Faults:
 
     def add(self, error: BaseException) -> None:
         """Count an exception."""
+        while isinstance(error, BaseExceptionGroup) and len(error.exceptions) == 1:
+            (error,) = error.exceptions
         self.count += 1
         self.first = self.first or "".join(traceback.format_exception(error)).rstrip()
 

@@ -13,7 +13,7 @@ export function drawFloor(svg, lab, found, done, colours, choose) {
   };
   svg.setAttribute("viewBox", `${-PAD} ${-PAD} ${width * UNITS + 2 * PAD} ${depth * UNITS + 2 * PAD}`);
   const [w, h] = [width * UNITS, depth * UNITS];
-  const parts = [element("rect", { x: 0, y: 0, width: w, height: h, class: lab.floor ? "ground" : "" , fill: "#fff" })];
+  const parts = [element("rect", { x: 0, y: 0, width: w, height: h, class: lab.floor ? "ground" : "plain" })];
   for (let m = Math.ceil(x0); m < x0 + width; m++) {
     const [x] = at([m, 0]);
     if (x > 0) parts.push(element("line", { x1: x, x2: x, y1: 0, y2: h, class: "grid" }));
@@ -47,8 +47,8 @@ export function drawFloor(svg, lab, found, done, colours, choose) {
     parts.push(circle(found.point_m, 12, off ? "place off" : "place"));
     for (const one of found.predictions) {
       const [px, py] = at(one.point_m), stroke = colours[one.camera];
-      parts.push(element("line", { x1: x, y1: y, x2: px, y2: py, class: "predicted", stroke }));
-      parts.push(element("path", { d: `M${px - 9},${py - 9}l18,18m0,-18l-18,18`, class: "predicted", stroke }));
+      const d = `M${x},${y}L${px},${py}m-9,-9l18,18m0,-18l-18,18`;
+      parts.push(element("path", { d, class: "halo" }), element("path", { d, class: "predicted", stroke }));
     }
     parts.push(element("text", { x: x + 16, y: y - 12 }, found.id));
   }

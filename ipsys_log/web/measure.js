@@ -126,11 +126,12 @@ function show(answer) {
     ...answer.warnings.map((text) => make("p", { className: "warn" }, upper(text))),
   );
   const save = $("save"), doubtful = answer.warnings.length > 0;
-  // The button lies over what it saves: so it says what that is.
-  $("bar").className = answer.ready && !doubtful ? "ready" : "";
-  $("short").textContent = answer.ready && answer.point_m ? short(answer) : "";
+  // The verdict may be out of sight: the bar says in short what is saved, or what speaks against it.
+  const against = [...rest.map((fault) => fault.text), ...answer.warnings].map(upper);
+  $("bar").className = rest.length ? "bad" : doubtful ? "warn" : "";
+  $("short").replaceChildren(...against.map((text) => make("span", {}, text)));
+  if (!against.length && answer.ready && answer.point_m) $("short").textContent = short(answer);
   save.disabled = !answer.ready;
-  save.className = doubtful ? "warn" : "";
   save.textContent = answer.ready ? `Save ${answer.id}${doubtful ? " all the same" : ""}`
     : wrong.length && wrong.every((fault) => fault.field === "marker") && !missing.length ? "Wait: the marker has to lie still"
     : wrong.length && any ? "Not yet: see above" : missing.length && any ? `Still missing: ${missing.join(", ")}` : "Save";
@@ -271,7 +272,7 @@ const save = guarded(async () => {
   clear();
   refresh();
   inputs()[0].focus({ preventScroll: true });
-  scrollTo(0, 0);
+  for (const part of [document.querySelector("main"), $("entry")]) part.scrollTo(0, 0);
   if (stop !== null) await go(nextOpen());
 });
 

@@ -117,13 +117,16 @@ def test_info_fits_80_columns(ipsys: Ipsys, lab: Path, monkeypatch: pytest.Monke
 def test_evaluate_fits_80_columns(ipsys: Ipsys, lab: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     """In the terminal itself, with what a simulated lab has besides: the truth."""
     monkeypatch.setenv("COLUMNS", "80")
-    done = ipsys("evaluate", lab, "--model", "rigid", "--model", "poly", "--model", "rigid+poly")
+    models = ("--model", "rigid", "--model", "poly", "--model", "rigid+poly")
+    done = ipsys("evaluate", lab, *models, "--details")
     assert done.code == 0, done.err
     assert max(len(line) for line in done.out.splitlines()) <= 80, done.out
     for title in (
-        "Errors in cm, on places held out",
-        "By cross-validation",
-        "Which model with how many places",
+        "Best model: ",
+        "Against the ground truth: ",
+        "Errors in cm, held-out points",
+        "Errors in cm, cross-validated",
+        "Model by the number of points per camera",
     ):
         assert title in done.out
 

@@ -14,6 +14,7 @@ import pytest
 import zstandard
 from mcap import records as mcap
 from mcap.opcode import Opcode
+from mcap.reader import make_reader
 from mcap.writer import Writer
 
 from ipsys_log.errors import LogError
@@ -197,7 +198,7 @@ def test_a_bomb_is_not_unpacked(with_size: bool, tmp_path: Path) -> None:
     path = build(tmp_path / "bomb.mcap", contents, chunk)
     tracemalloc.start()
     try:
-        assert "the chunk" in fault_of(read_everything, path)
+        assert "chunk" in fault_of(read_everything, path)
         assert tracemalloc.get_traced_memory()[1] < 64 << 20
     finally:
         tracemalloc.stop()
@@ -425,5 +426,7 @@ def test_a_second_log_behind_the_first_is_kept_beside_it(tmp_path: Path) -> None
     report = repair(path)
     assert (report.messages_kept, report.bytes_lost) == (30, len(other))
     assert "perhaps another log" in str(report.notes)
-    assert (tmp_path / "joined.mcap.lost").read_bytes() == other
+    with (tmp_path / "joined.mcap.damaged").open("rb") as file:
+        kept = [attachment.data for attachment in make_reader(file).iter_attachments()]
+    assert kept[-1] == other
     assert stock_rows(path) == stock_rows(tmp_path / "a.mcap")

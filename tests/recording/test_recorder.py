@@ -59,12 +59,20 @@ class Sent:
 
     def __init__(self, messages: Generator[Message | None, None, None]) -> None:
         self._messages, self.whys = messages, list[str | None]()
+        self.confirmed: list[tuple[Message, OSError | None]] = []
+        self.warned: list[tuple[str, str]] = []
 
     def __iter__(self) -> Generator[Message | None, None, None]:
         return self._messages
 
     def stop(self, why: str | None = None) -> None:
         self.whys.append(why)
+
+    def confirm(self, message: Message, fault: OSError | None) -> None:
+        self.confirmed.append((message, fault))
+
+    def warn(self, kind: str, text: str) -> None:
+        self.warned.append((kind, text))
 
 
 def backlog(source: Generator[Message | None, None, None], log: Recording) -> Backlog:

@@ -56,7 +56,7 @@ def test_the_paper_s_data_ask_for_rigid_with_10_places_and_poly_from_30(paper: F
     used = {places: found[SIMPLE].model for places, found in advice.choices.items()}
     assert used[10] == "rigid"
     assert used[30] == used[40] == "poly"
-    assert advice.sentences[0].startswith("Of rigid and poly use rigid with up to ")
+    assert advice.sentences[0].startswith("Between rigid and poly, use rigid with up to ")
     assert "poly from" in advice.sentences[0]
 
 
@@ -75,9 +75,9 @@ def test_our_models_save_places_on_the_paper_s_data(data: Path, tmp_path: Path) 
     write_log(tmp_path / "imsel.mcap", read_imsel(data / "imsel"))
     advice = find(tmp_path / "imsel.mcap", ("rigid", "poly", "rayplane", "best")).advice
     assert advice is not None
-    assert advice.sentences[1].startswith("The model best needs 10 places for what poly needs 40 for")
+    assert advice.sentences[1].startswith("The model best with 10 points is as good as poly with 40")
     assert advice.sentences[2].startswith(
-        "Where the heights of the markers are known, the model rayplane needs 10 places"
+        "Where the heights of the markers are known, the model rayplane with 10 points"
     )
 
 
@@ -135,7 +135,7 @@ def test_the_paper_s_other_methods_are_no_reason_to_use_neither_rigid_nor_poly()
     assert {n: found[SIMPLE].model for n, found in advice.choices.items()} == {10: "rigid", 20: "poly"}
     assert {found[PAPER].model for found in advice.choices.values()} == {"kriging"}
     assert advice.sentences[0] == (
-        "Of rigid and poly use rigid with up to 10 places for each camera, poly from 20 on."
+        "Between rigid and poly, use rigid with up to 10 points per camera, poly from 20 on."
     )
     # Nothing is there that is not of the paper: a column of all would say the same again.
     assert advice.groups == [SIMPLE, PAPER]
@@ -165,4 +165,6 @@ def test_without_a_learning_curve_nothing_is_advised() -> None:
 def test_one_model_alone_is_said_with_what_more_places_bring() -> None:
     advice = advise([evaluation("best", {10: 3.0, 40: 1.5})])
     assert advice is not None
-    assert advice.sentences == ("best is off by 3.0 cm with 10 places for each camera, by 1.5 cm with 40.",)
+    assert advice.sentences == (
+        "The mean error of best is 3.0 cm with 10 points per camera, 1.5 cm with 40.",
+    )

@@ -20,6 +20,8 @@ from tests import labs
 from tests.conftest import Ipsys
 from tests.report.browser import visit
 from tests.report.conftest import lab_messages, many_models
+from tests.web.contrast import low_contrasts
+from tests.web.phone import phone
 
 EVIL = "<script>window.ran=true</script><img src='http://evil.example/x.png'>"
 
@@ -178,3 +180,42 @@ def test_a_model_of_another_log_has_a_page(ipsys: Ipsys, tmp_path: Path) -> None
     page = (tmp_path / "new.html").read_text()
     assert "held out" in page
     assert "How many places are enough" not in page
+
+
+TABLES = """[...document.querySelectorAll("table")].map(table => {
+  const scroll = table.parentElement, name = table.querySelector("tbody th");
+  scroll.scrollLeft = 9999;
+  const box = scroll.getBoundingClientRect(), start = name ? name.getBoundingClientRect().left : box.left;
+  return [table.scrollWidth - box.width, scroll.scrollLeft, Math.abs(start - box.left),
+    Boolean(table.closest("#models"))];
+})"""
+
+
+def test_page_fits_screens_and_follows_the_colour_scheme(page: str, tmp_path: Path) -> None:
+    file = tmp_path / "report.html"
+    file.write_text(page, encoding="utf-8")
+    with phone(tmp_path / "browser") as browser:
+        for size in ((390, 844), (1280, 800)):
+            browser.open(file.as_uri(), size)
+            browser.run("document.querySelectorAll('details').forEach(part => part.open = true)")
+            assert browser.run("document.scrollingElement.scrollWidth <= innerWidth")
+            tables = browser.run(TABLES)
+            assert len(tables) >= 6
+            for hidden_px, scrolled_px, name_px, is_of_models in tables:
+                # What does not fit is scrolled to, and the name of the row stays.
+                assert scrolled_px >= hidden_px - 1
+                assert name_px < 1
+                assert hidden_px < 1 or size[0] < 1280 or not is_of_models
+            backgrounds = {}
+            for scheme in ("light", "dark"):
+                browser.prefer(scheme)
+                assert low_contrasts(browser) == [], scheme
+                backgrounds[scheme] = browser.run("getComputedStyle(document.body).backgroundColor")
+                assert browser.run("getComputedStyle(document.images[0]).backgroundColor") == (
+                    "rgba(0, 0, 0, 0)" if scheme == "light" else "rgb(255, 255, 255)"
+                )
+            assert backgrounds["light"] == "rgb(255, 255, 255)" != backgrounds["dark"]
+        dark = {"name": "prefers-color-scheme", "value": "dark"}
+        browser.send("Emulation.setEmulatedMedia", media="print", features=[dark])
+        assert browser.run("getComputedStyle(document.body).backgroundColor") == "rgb(255, 255, 255)"
+        assert low_contrasts(browser) == []

@@ -5,15 +5,19 @@ from __future__ import annotations
 import csv
 import io
 import json
+from dataclasses import replace
 from itertools import combinations
 from pathlib import Path
 
 import cv2
+import numpy as np
 import pytest
 from matplotlib.figure import Figure
+from matplotlib.quiver import Quiver
 from matplotlib.text import Text
 
-from ipsys_log.report.accuracy import accuracy_json
+from ipsys_log.messages import Residual
+from ipsys_log.report.accuracy import Accuracy, accuracy_json
 from ipsys_log.report.csv_tables import cross_validation_csv, paper_csv
 from ipsys_log.report.findings import Findings
 from ipsys_log.report.learning_figure import learning_figure, published_figure
@@ -24,7 +28,7 @@ from ipsys_log.report.plots import write_plots
 from ipsys_log.report.residuals_figure import residuals_figure
 from ipsys_log.runs.output import write_log
 from tests.conftest import Ipsys
-from tests.report.conftest import find, lab_messages, many_models, only, with_accuracies
+from tests.report.conftest import find, lab_messages, many_models, only, scale, with_accuracies
 
 ALL_FILES = {
     "table_1.csv", "table_2.csv", "cross_validation.csv", "figure_9.png", "figure_10.png", "figure_11.png",
@@ -201,3 +205,39 @@ def test_evaluate_writes_them(ipsys: Ipsys, tmp_path: Path) -> None:
     assert found["recommendation"]["sentences"]
     assert (tmp_path / "plots/models.png").stat().st_size > 1000
     assert f"{tmp_path / 'plots'} has table_1.csv" in done.err
+
+
+def test_learning_marks_stand_at_their_numbers_of_places(paper: Findings) -> None:
+    findings = with_accuracies(paper, many_models(paper.accuracies))
+    for figure in (learning_figure(findings), published_figure(findings, True)):
+        for axes in figure.axes:
+            marked = [line for line in axes.lines if line.get_marker() != "None"]
+            assert len(marked) == len(findings.accuracies)
+            for line in marked:
+                places = np.asarray(line.get_xdata(), float)
+                assert np.array_equal(places, places.round())
+                assert line.get_transform() == axes.transData
+
+
+def test_residual_maps_of_two_models_share_their_scales(paper: Findings) -> None:
+    poly = next(accuracy for accuracy in paper.accuracies if accuracy.model == "poly")
+    assert poly.evaluation is not None
+    rows = tuple(replace(row, residuals=tuple(map(shrink, row.residuals))) for row in poly.evaluation.cameras)
+    better = replace(scale(poly.evaluation, 0.2), model="best")
+    better = replace(better, cameras=tuple(
+        replace(row, residuals=of.residuals) for row, of in zip(better.cameras, rows, strict=True)
+    ))  # fmt: skip
+    figure = residuals_figure(with_accuracies(paper, [poly, Accuracy("best", better, None)]))
+    left, right = (axes for axes in figure.axes if axes.get_title(loc="left"))
+    assert left.get_xlim() == right.get_xlim()
+    assert left.get_ylim() == right.get_ylim()
+    arrows = [next(part for part in axes.collections if isinstance(part, Quiver)) for axes in (left, right)]
+    assert arrows[0].scale == arrows[1].scale
+    assert arrows[0].get_clim() == arrows[1].get_clim()
+    assert left.get_title(loc="left").splitlines()[1] == right.get_title(loc="left").splitlines()[1]
+
+
+def shrink(residual: Residual) -> Residual:
+    """Return the residual with a fifth of its error."""
+    error_m = residual.predicted_m - residual.world_m
+    return replace(residual, predicted_m=residual.world_m + 0.2 * error_m)

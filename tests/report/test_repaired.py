@@ -101,3 +101,34 @@ def test_what_a_damaged_part_held_is_named(tmp_path: Path) -> None:
             (line,) = found(said, f"/cameras/{name}/image")
             assert int(line.split()[1]) == 50 - log.channels[f"/cameras/{name}/image"].message_count > 0
     assert not any("last written" in line for line in said)
+
+
+def test_bytes_cut_away_are_named_with_unknown_count(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.chdir(tmp_path)
+    cut = killed(recorded(Path("a.mcap"), 50), Path(), START_NS + 2_700_000_000)
+    data = bytearray(cut.read_bytes())
+    data[-9_000:] = b"\xff" * 9_000
+    cut.write_bytes(data)
+    said = lines(cut)
+    assert any("cannot be read; how many messages were in them is not known" in line for line in said)
+    assert "all bytes that were taken out are kept in cut.mcap.damaged" in said
+    assert not any("no whole message" in line for line in said)
+
+
+def test_messages_saved_without_crc_are_counted(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.chdir(tmp_path)
+    said = lines(killed(recorded(Path("a.mcap"), 50), Path(), START_NS + 2_700_000_000))
+    (line,) = (line for line in said if "saved from damaged chunks" in line)
+    assert 0 < int(line.split()[0]) < 100
+
+
+def test_frames_without_rig_are_named_with_a_way_out(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.chdir(tmp_path)
+    cut = killed(recorded(Path("a.mcap"), 50), Path(), START_NS + 2_700_000_000)
+    assert "it has frames but no rig: give one to each command, as --rig lab.toml" in lines(cut)
+    path = recorded(Path("b.mcap"), 5)
+    with LogWriter.append(path) as writer:
+        writer.add_channel("/rig", Schema("ipsys.v1.Rig", "protobuf", b""))
+        writer.write("/rig", START_NS, START_NS, b"rig")
+    path.write_bytes(path.read_bytes()[:-40])
+    assert not any("no rig" in line for line in lines(path))

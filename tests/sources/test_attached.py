@@ -234,6 +234,11 @@ def test_what_is_saved_is_written_by_then() -> None:
                 time.sleep(0.3)
                 assert not saved.done()
                 asked.append("written")
+                note = message
+            elif len(asked) == 1:
+                assert not saved.done(), "written, but not on the disk yet"
+                asked.append("on the disk")
+                attached.confirm(note)
             elif asked:
                 saved.result(1.0)
                 break

@@ -11,6 +11,7 @@ import numpy as np
 import pytest
 
 from ipsys_log.calibration.boards import parse_board
+from ipsys_log.calibration.calibrate import Calibrated
 from ipsys_log.calibration.cameras import calibrate_cameras
 from ipsys_log.calibration.lens_models import find_lens
 from ipsys_log.calibration.pictures import find_sources
@@ -146,7 +147,8 @@ def test_board_before_a_camera_gives_its_lens(text: str, tmp_path: Path) -> None
     for index in range(film.count):
         (folder / f"{index:03}.jpg").write_bytes(film.draw(index))
     board = parse_board(text, 0.03, 0.75, "DICT_4X4_50", False)
-    (result,), _ = calibrate_cameras(find_sources([folder], []), board, find_lens("fisheye"), lambda *_: None)
+    (result,) = calibrate_cameras(find_sources([folder], []), board, find_lens("fisheye"), lambda *_: None)
+    assert isinstance(result, Calibrated), result
     true = hang_cameras(seat.lab)[seat.number].lens
     assert result.rms_px < 0.1
     assert math.isclose(result.lens.K[0, 0], true.K[0, 0], rel_tol=0.005)

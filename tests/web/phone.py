@@ -57,13 +57,18 @@ class Phone:
             self.console.append(json.dumps(answer["params"]))
         return answer
 
-    def open(self, url: str) -> None:
+    def open(self, url: str, size_px: tuple[int, int] = (_WIDTH, _HEIGHT), scheme: str = "light") -> None:
+        """Open a page in a window of this size, in a colour scheme that the user prefers."""
+        self._session = None
         target = self.send("Target.createTarget", url="about:blank")["targetId"]
         self._session = self.send("Target.attachToTarget", targetId=target, flatten=True)["sessionId"]
+        width, height = size_px
+        is_phone = size_px == (_WIDTH, _HEIGHT)
         self.send(
             "Emulation.setDeviceMetricsOverride",
-            width=_WIDTH, height=_HEIGHT, deviceScaleFactor=2, mobile=True,
+            width=width, height=height, deviceScaleFactor=2 if is_phone else 1, mobile=is_phone,
         )  # fmt: skip
+        self.prefer(scheme)
         self.send("Emulation.setTouchEmulationEnabled", enabled=True)
         # Keys go to a page that has the focus, on a busy machine too.
         self.send("Emulation.setFocusEmulationEnabled", enabled=True)
@@ -71,6 +76,12 @@ class Phone:
             self.send(f"{domain}.enable")
         self.send("Page.navigate", url=url)
         self.wait("location.href !== 'about:blank' && document.readyState === 'complete'")
+
+    def prefer(self, scheme: str) -> None:
+        """Change the colour scheme that the user prefers; colours change at once."""
+        preferred = {"prefers-color-scheme": scheme, "prefers-reduced-motion": "reduce"}
+        features = [{"name": name, "value": value} for name, value in preferred.items()]
+        self.send("Emulation.setEmulatedMedia", features=features)
 
     def run(self, script: str) -> Any:
         """The value of an expression in the page."""

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import errno
 import http.client
 import json
 import re
@@ -10,16 +11,21 @@ import signal
 import socket
 import subprocess
 import sys
+import threading
 import time
 from collections.abc import Callable, Iterator
 from contextlib import ExitStack, closing, contextmanager
 from pathlib import Path
 
 import pytest
+import uvicorn
 
+from ipsys_log.cli.measure_now import say_faults
+from ipsys_log.errors import IpsysError
 from ipsys_log.log.session import Session
 from ipsys_log.measuring.scene import View
 from ipsys_log.web.connections import Limits, derive_limits
+from ipsys_log.web.faults import Faults
 from ipsys_log.web.serving import Served, serving
 from tests.test_measure_now import Lab, still_lab
 from tests.web.test_guard import Caller
@@ -94,7 +100,8 @@ def test_recorder_survives_idle_connections(still_lab: Lab, tmp_path: Path) -> N
             assert program.wait(PATIENCE_S) == 0, errors.read_text()
     assert "Traceback" not in errors.read_text()
     with Session([log]) as session:
-        assert not session.payloads(["/events"])
+        # A busy machine skips frames in processing; all are recorded.
+        assert {event.kind for event in session.payloads(["/events"])} <= {"frame_skipped"}
         assert all(session.count(topic) > 5 for topic in session.images.values())
 
 
@@ -155,26 +162,25 @@ def test_phone_keeps_its_connection_beside_new_ones() -> None:
                 assert phone.sock is own
 
 
-@pytest.mark.parametrize(
-    "start",
-    [
-        b"",
-        b"GET / HTTP/1.1\r\nHost: localhost\r\nX-Slow: ",
-        b"POST /api/check HTTP/1.1\r\nHost: localhost\r\nX-Ipsys: 1\r\nCookie: COOKIE\r\n"
-        b"Content-Length: 900\r\n\r\n{",
-        b"POST /api/check HTTP/1.1\r\nHost: localhost\r\nX-Ipsys: 1\r\nCookie: COOKIE\r\n"
-        b"Transfer-Encoding: chunked\r\n\r\n1\r\n{\r\n",
-        b"GET /api/scene HTTP/1.1\r\nHost: localhost\r\nCookie: COOKIE\r\n\r\n",
-        b"GET /api/scene HTTP/1.1\r\nHost: localhost\r\nCookie: COOKIE\r\n\r\nGET / HTTP/1.1\r\nX-Slow: ",
-    ],
-    ids=["nothing", "headers", "body", "chunks", "kept_alive", "second_request"],
-)
-def test_slow_request_is_closed(start: bytes) -> None:
-    with page_with(Limits(total=6, per_address=4, request_s=0.3)) as (caller, page):
+SLOW_REQUESTS = [
+    b"",
+    b"GET / HTTP/1.1\r\nHost: localhost\r\nX-Slow: ",
+    b"POST /api/check HTTP/1.1\r\nHost: localhost\r\nX-Ipsys: 1\r\nCookie: COOKIE\r\n"
+    b"Content-Length: 900\r\n\r\n{",
+    b"POST /api/check HTTP/1.1\r\nHost: localhost\r\nX-Ipsys: 1\r\nCookie: COOKIE\r\n"
+    b"Transfer-Encoding: chunked\r\n\r\n1\r\n{\r\n",
+    b"GET /api/scene HTTP/1.1\r\nHost: localhost\r\nCookie: COOKIE\r\n\r\n",
+    b"GET /api/scene HTTP/1.1\r\nHost: localhost\r\nCookie: COOKIE\r\n\r\nGET / HTTP/1.1\r\nX-Slow: ",
+]
+
+
+def test_slow_requests_are_closed() -> None:
+    with page_with(Limits(total=12, per_address=8, request_s=0.5)) as (caller, page):
         cookie = sign_in(caller).encode()
-        with connections(caller, 1) as (slow,):
-            slow.sendall(start.replace(b"COOKIE", cookie))
-            assert is_closed_by_page(slow)
+        with connections(caller, len(SLOW_REQUESTS)) as slow:
+            for connection, start in zip(slow, SLOW_REQUESTS, strict=True):
+                connection.sendall(start.replace(b"COOKIE", cookie))
+            assert all(map(is_closed_by_page, slow))
         assert page.faults.count == 0
 
 
@@ -228,6 +234,51 @@ def test_fault_of_the_page_is_kept_for_the_end(capfd: pytest.CaptureFixture[str]
         assert page.faults.count == 2
         assert page.faults.first.startswith("Traceback")
     assert capfd.readouterr() == ("", "")
+
+
+def test_faults_are_printed_when_the_command_ends(capsys: pytest.CaptureFixture[str]) -> None:
+    faults = Faults()
+    page = Served("http://127.0.0.1/", threading.Thread(), faults)
+    say_faults(page)
+    assert capsys.readouterr() == ("", "")
+    for text in ("[first]", "second"):
+        faults.add(ExceptionGroup("tasks", [ZeroDivisionError(text)]))
+    say_faults(page)
+    said = capsys.readouterr().err
+    assert "faults of ipsys in the measuring page: 2" in said
+    assert said.rstrip().endswith("ZeroDivisionError: [first]")
+
+
+def test_end_of_the_server_leaves_the_block_going(
+    monkeypatch: pytest.MonkeyPatch, capfd: pytest.CaptureFixture[str]
+) -> None:
+    is_broken = threading.Event()
+
+    async def tick(self: uvicorn.Server, counter: int) -> bool:
+        if is_broken.is_set():
+            raise ZeroDivisionError("a bug")
+        return self.should_exit
+
+    monkeypatch.setattr(uvicorn.Server, "on_tick", tick)
+    with serving(Recording(), port=0) as page:
+        is_broken.set()
+        page.thread.join(PATIENCE_S)
+        assert not page.thread.is_alive()
+        assert page.faults.count == 1
+        assert page.faults.first.endswith("ZeroDivisionError: a bug")
+    assert capfd.readouterr() == ("", "")
+
+
+def test_server_that_does_not_start_is_refused(monkeypatch: pytest.MonkeyPatch) -> None:
+    async def start(self: uvicorn.Server, sockets: object = None) -> None:
+        raise OSError(errno.EMFILE, "Too many open files")
+
+    monkeypatch.setattr(uvicorn.Server, "startup", start)
+    with (
+        pytest.raises(IpsysError, match=r"the page cannot be served: OSError: .* Too many open files"),
+        serving(Recording(), port=0),
+    ):
+        pass
 
 
 @pytest.mark.parametrize(("descriptors", "total"), [(64, 12), (256, 32), (1024, 64), (1 << 20, 64)])

@@ -149,6 +149,30 @@ def test_what_is_no_place_is_refused_in_words(here: Caller, scene: Recording, bo
     assert scene.done == []
 
 
+@pytest.mark.parametrize(
+    ("path", "body"),
+    [
+        ("/api/check", b"[" * 15_000),
+        ("/api/check", b'{"stop": ' + b"9" * 5_000 + b"}"),
+        ("/api/check", b'{"marker": "\\ud800", "distances": {"\\udc00": "1"}}'),
+        ("/api/undo", b'{"id": "\\ud800"}'),
+        ("/api/undo", b"\xff\xfe"),
+        ("/api/views?marker=" + "9" * 5_000, None),
+        ("/api/views?marker=%ED%A0%80", None),
+        ("/picture/red/" + "9" * 5_000, None),
+    ],
+)
+def test_request_beyond_all_bounds_gets_no_server_error(
+    here: Caller, scene: Recording, path: str, body: bytes | None, capfd: pytest.CaptureFixture[str]
+) -> None:
+    origin = f"http://{here.parts.netloc}"
+    method = "GET" if body is None else "POST"
+    status, _, _ = here.ask(method, path, body, X_Ipsys="1", Origin=origin)
+    assert status < 500
+    assert scene.done == []
+    assert "Traceback" not in capfd.readouterr().err
+
+
 def test_a_warning_has_to_be_seen_before_it_is_passed_over(here: Caller, scene: Recording) -> None:
     flat = {**PLACE, "distances": {"A": "330", "B": "87"}}
     status, text, _ = here.ask("POST", "/api/measure", flat, X_Ipsys="1")

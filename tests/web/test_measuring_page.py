@@ -255,7 +255,7 @@ def test_what_is_saved_stands_above_the_button_that_saves_it(hand: Phone) -> Non
         hand.type("#height", "10")
         hand.wait("document.querySelector('#save:enabled')")
         for top in (0, 250, 10_000):
-            hand.run(f"scrollTo(0, {top})")
+            hand.run(f"document.querySelector('main').scrollTo(0, {top})")
             assert hand.run(SEEN.format("#save"))
             assert hand.run(SEEN.format("#short"))
         said = hand.text("#short")

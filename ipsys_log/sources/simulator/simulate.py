@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterator, Sequence
+from collections.abc import Callable, Iterator, Sequence
 from concurrent.futures import ThreadPoolExecutor
 from dataclasses import dataclass
 from typing import Any
@@ -66,7 +66,10 @@ class Instant:
     measured: tuple[Measurement, ...] = ()
 
 
-def simulate(settings: LabSettings) -> Iterator[Message]:
+def simulate(
+    settings: LabSettings,
+    progress: Callable[[str, int, int], None] = lambda stage, done, total: None,
+) -> Iterator[Message]:
     """A session of the simulated lab, message by message, in log order.
 
     Equal settings give equal messages, byte for byte on the same versions of OpenCV and NumPy. No
@@ -75,6 +78,8 @@ def simulate(settings: LabSettings) -> Iterator[Message]:
     Parameters
     ----------
     settings : of the lab.
+    progress : called with what is done (the ``views`` of the cameras, then ``simulate``: frames), how many of
+        them, and how many there are.
 
     Yields
     ------
@@ -96,7 +101,7 @@ def simulate(settings: LabSettings) -> Iterator[Message]:
     """
     log_time_ns = EPOCH_NS
     latency_ns = _LATENCY_NS + round(exposed(0, settings.height - 1, settings)[1] * NS_PER_S)
-    for topic, payload, publish_time_ns, camera in _payloads(settings):
+    for topic, payload, publish_time_ns, camera in _payloads(settings, progress):
         log_time_ns = max(publish_time_ns + latency_ns, log_time_ns + 1)
         yield Message(topic, log_time_ns, publish_time_ns, payload, camera)
 
@@ -138,20 +143,29 @@ def drive_start_ns(settings: LabSettings, cameras: Sequence[Camera]) -> int:
     return _start_ns(settings, len(plan_stations(settings, cameras)))
 
 
-def _payloads(settings: LabSettings) -> Iterator[tuple[str, Any, int, str | None]]:
+def _payloads(
+    settings: LabSettings, progress: Callable[[str, int, int], None]
+) -> Iterator[tuple[str, Any, int, str | None]]:
     rig = build_rig(settings)
     cameras = hang_cameras(settings, EPOCH_NS)
     yield RIG_TOPIC, rig, EPOCH_NS, None
     for camera in cameras:
         yield calibration_topic(camera.name), camera.lens, EPOCH_NS, camera.name
     with ThreadPoolExecutor(len(cameras)) as pool:
-        views = list(pool.map(lambda camera: prepare_view(camera, settings), cameras))
-        for index, instant in enumerate(_instants(settings, cameras)):
+        progress("views", 0, len(cameras))
+        views = []
+        for view in pool.map(lambda camera: prepare_view(camera, settings), cameras):
+            views.append(view)
+            progress("views", len(views), len(cameras))
+        instants = list(_instants(settings, cameras))
+        for index, instant in enumerate(instants):
+            progress("simulate", index * len(views), len(instants) * len(views))
             yield TRUTH_TOPIC, _truth(instant, rig, cameras, settings), instant.time_ns, None
             for image in pool.map(_Shutter(settings, instant, index), range(len(views)), views):
                 yield image_topic(image.frame_id), image, instant.time_ns, image.frame_id
             for measurement in instant.measured:
                 yield MEASUREMENTS_TOPIC, measurement, measurement.timestamp, None
+        progress("simulate", len(instants) * len(views), len(instants) * len(views))
 
 
 @dataclass(frozen=True, slots=True)

@@ -13,6 +13,7 @@ from numpy.typing import NDArray
 from ipsys_log.errors import FrameError
 from ipsys_log.messages import CompressedImage, RawImage
 from ipsys_log.stages.detect.jpeg import cut_rows, read_layout, whole_rows
+from ipsys_log.stages.detect.picture_size import check_encoded, check_size
 
 __all__ = ["Grey", "decode_grey", "decode_rows", "levels_at"]
 
@@ -64,6 +65,7 @@ def decode_rows(
     if layout is None:
         grey = decode_grey(frame)
         return grey, [slice(0, len(grey))]
+    check_size(layout.width, layout.height, len(frame.data))
     memory: _Memory = _THREAD.__dict__.setdefault("memory", _Memory())
     if memory.pixels.shape != (layout.height, layout.width):
         memory.pixels = np.zeros((layout.height, layout.width), dtype=np.uint8)
@@ -92,6 +94,7 @@ def decode_grey(frame: CompressedImage | RawImage) -> Grey:
     """
     if isinstance(frame, RawImage):
         return _raw_grey(frame)
+    check_encoded(frame.data)
     if frame.data[:2] == b"\xff\xd8":
         return _decode_jpeg(frame.data)
     try:
@@ -130,7 +133,8 @@ def _raw_grey(frame: RawImage) -> Grey:
     channels, conversion = _RAW_TO_GREY[frame.encoding]
     rows = np.frombuffer(frame.data, np.uint8)
     step = frame.step or frame.width * channels  # some writers leave it out
-    if step < frame.width * channels or rows.size < step * frame.height or not rows.size:
+    too_few = step < frame.width * channels or rows.size < step * frame.height
+    if too_few or min(frame.width, frame.height) < 1:
         raise FrameError(f"{rows.size} bytes are too few for {frame.width} x {frame.height}")
     rows = rows[: step * frame.height].reshape(frame.height, step)
     pixels = rows[:, : frame.width * channels].reshape(frame.height, frame.width, channels)

@@ -46,6 +46,15 @@ _BLURRED = 0.6
 _SEEN = 0.6
 _EXACT_PX = 0.05
 _WRONG_CELLS = 1
+# Glare, a shadow or a cover may lie on a marker where a side lies off by this share of the edges' spread, or
+# where the black beside some edges is lighter than beside the others, by that share of the contrast. A few
+# may be: a neighbouring white cell reaches as far where cells are small.
+_SIDE_OFF, _LIGHTER = 0.85, 0.35
+_WIDE_SPREAD_PX, _SIDE_OFF_WIDE = 0.12, 0.6
+_LEAST_SPREAD_PX, _FEW, _SMALL_PX = 0.03, 3, 4.0
+# Or where edges are spread by more px. Where motion blurs them, or seems to, sides lie off by shares of the
+# blur's width, and what is beside an edge mixes with it.
+_SPREAD_PX, _LIGHTER_BLURRED = 0.3, 0.6
 
 
 def fit_edges(
@@ -85,6 +94,7 @@ def fit_edges(
     view = View(grey, lens, lay_out(dictionary, tuple(guess.id for guess in guesses)), row_time_s, blur_px)
     settled, (corners_px, slopes, levels) = _settle_all(view, guesses, edge_offset_px)
     good = settled.good & whole(corners_px, grey) & _same_cells(view.prints, levels)
+    uneven = _uneven(view.prints, settled, levels)
     covariances_px2 = slopes @ settled.covariances @ slopes.transpose(0, 2, 1)
     return [
         Fit(
@@ -94,6 +104,7 @@ def fit_edges(
             float(settled.edge_offsets_px[n]),
             float(settled.spreads_px[n]),
             float(settled.blurs_px[n]),
+            bool(uneven[n]),
         )
         if good[n]
         else None
@@ -102,16 +113,21 @@ def fit_edges(
 
 
 class _Settled(NamedTuple):
-    """Fitted poses; ``covariances`` (m, 6, 6) of the twists in the frames of the prints."""
+    """Fitted poses; ``covariances`` (m, 6, 6) of the twists in the frames of the prints; ``ends`` (m, s, 2)
+    are the levels at both ends of their profiles; ``cells_px`` (m,) is the least width of a cell, and
+    ``sides_off_px`` (m,) is the most that a side lies off."""
 
     poses: Poses
     edge_offsets_px: Array
     covariances: Array
     good: NDArray[np.bool_]
     heights: Array
+    cells_px: Array
     blurred: NDArray[np.bool_]
     spreads_px: Array
     blurs_px: Array
+    ends: Array
+    sides_off_px: Array
 
 
 def _settle_all(
@@ -169,7 +185,20 @@ def _settle(
     covariances: Array = np.linalg.inv(normal)[:, :6, :6] * variances_px2[:, None, None]
     enough = (seen.certainty > 0).sum(axis=1) > _SEEN * np.abs(view.prints.polarity).sum(axis=1)
     good = enough & (moved_px < _SETTLED_PX)
-    return _Settled(poses, found[:, 6], covariances, good, seen.heights, blurred, spread_px, seen.blurs_px)
+    sided = (left_px * view.prints.polarity * (seen.certainty > 0))[:, None] @ view.prints.by_side
+    return _Settled(
+        poses,
+        found[:, 6],
+        covariances,
+        good,
+        seen.heights,
+        seen.slopes.min(axis=1) / view.prints.cells,
+        blurred,
+        spread_px,
+        seen.blurs_px,
+        seen.ends,
+        np.abs(sided[:, 0]).max(axis=1),
+    )
 
 
 def _blurred(prints: Prints, heights: Array, levels: Array) -> NDArray[np.bool_]:
@@ -190,3 +219,22 @@ def _same_cells(prints: Prints, levels: Array) -> NDArray[np.bool_]:
     bright, dark = _bright_and_dark(prints, levels)
     wrong = np.count_nonzero((levels > ((bright + dark) / 2)[:, None]) != prints.white, axis=1)
     return np.asarray((wrong <= _WRONG_CELLS) & (bright - dark > LEAST_CONTRAST))
+
+
+def _uneven(prints: Prints, settled: _Settled, levels: Array) -> NDArray[np.bool_]:
+    """Return, (m,), where glare, a shadow or a cover may have moved some of the edges."""
+    real = prints.polarity != 0
+    black = np.where(prints.polarity > 0, settled.ends[..., 0], settled.ends[..., 1])
+    black = np.sort(np.where(real, black, -np.inf), axis=1)
+    middle = black.shape[1] - np.count_nonzero(real, axis=1) // 2
+    usual = np.take_along_axis(black, middle[:, None], axis=1)[:, 0]
+    bright, dark = _bright_and_dark(prints, levels)
+    lighter = (black[:, -_FEW] - usual) / np.maximum(bright - dark, LEAST_CONTRAST)
+    off = settled.sides_off_px / np.maximum(settled.spreads_px, _LEAST_SPREAD_PX)
+    sharp = (
+        ((lighter > _LIGHTER) & (settled.cells_px > _SMALL_PX))
+        | (off > _SIDE_OFF)
+        | (settled.spreads_px > _SPREAD_PX)
+    )
+    moving = (lighter > _LIGHTER_BLURRED) | (settled.spreads_px > _SPREAD_PX)
+    return np.where(settled.blurred.any(axis=1), moving, sharp)

@@ -14,7 +14,14 @@ from ipsys_log.geometry.square_pose import goes_around
 from ipsys_log.messages import CameraCalibration, CompressedImage, RawImage
 from ipsys_log.stages.detect.decode import Grey, decode_rows
 from ipsys_log.stages.detect.edges import Fit, Guess, fit_edges
-from ipsys_log.stages.detect.search import WHOLE, Candidate, search, search_thoroughly
+from ipsys_log.stages.detect.partial import Rejection, fit_partly
+from ipsys_log.stages.detect.search import (
+    WHOLE,
+    Candidate,
+    search,
+    search_leftovers,
+    search_thoroughly,
+)
 from ipsys_log.stages.detect.track import LONG_S, Track, extend, predict, same_speed
 from ipsys_log.stages.detect.watch import Watch
 from ipsys_log.units import NS_PER_S
@@ -40,6 +47,10 @@ _SAME_PX = 8.0
 _JUMP_PX = 3.0
 # Edges are that near to those of a fit whose pose is the right one of two.
 _SURE_PX = 0.08
+# Small markers, which only a thorough search finds, look much the same in both poses.
+_MUCH_BETTER = 0.9
+# In uneven light, a fit whose edges are spread by more may be off by as much.
+_DISTURBED_PX = 0.5
 # From so many frames with markers it is known how blurred edges are.
 _BLURS = 10
 
@@ -74,9 +85,17 @@ class Follow:
         self._changed: tuple[slice, slice] | None = None
         self._breadth_px = 0.0
         self._frames = -_STAGGER * number
-        self._last_ns = 0
+        self._last_ns: int | None = None
         self._blurs_px: list[float] = []
         self._tracks: list[Track] = []
+        self._rejections: list[Rejection] = []
+
+    @property
+    def rejections(self) -> list[Rejection]:
+        """Markers that are seen in the last frame and cannot be measured, sorted by id."""
+        fitted = {track[0].pose.id for track in self._tracks}
+        last = {one.id: one for one in self._rejections if one.id not in fitted}
+        return [last[n] for n in sorted(last)]
 
     def __call__(self, frame: CompressedImage | RawImage, time_ns: int) -> tuple[list[Fit], int, int]:
         """The markers in a frame, sorted by id, and the width and height of it; an id can occur twice.
@@ -96,8 +115,9 @@ class Follow:
             Where it is of another size than the lens.
         """
         turn = self._frames
-        gap_s = (time_ns - self._last_ns) / NS_PER_S
-        due = turn % _SEARCH_EVERY == 0 or not 0 < gap_s < LONG_S
+        fresh = self._last_ns is None or not 0 < (time_ns - self._last_ns) / NS_PER_S < LONG_S
+        due = turn % _SEARCH_EVERY == 0 or fresh
+        self._rejections = []
         grey, rows, seen, lost = self._look_again(frame, time_ns, due or turn % _WHOLE_EVERY == 0)
         # One that cannot be decoded is not looked at: its turn is the next one's.
         self._frames, self._last_ns = turn + 1, time_ns
@@ -106,6 +126,11 @@ class Follow:
         region = WHOLE if lost or due else self._changed
         if region is not None:
             fits = self._add(grey, fits, search(grey, self._dictionary, region))
+        if fresh:
+            # Nothing is known yet, and there may be no later frame in which to find what is missed now.
+            known_px = [fit.corners_px for fit in fits]
+            leftovers = search_leftovers(grey, self._dictionary, known_px)
+            fits = self._add(grey, fits, leftovers, _MUCH_BETTER)
         if turn % _THOROUGH_EVERY == _SEARCH_EVERY or lost - {fit.pose.id for fit in fits}:
             fits = self._add(grey, fits, search_thoroughly(grey, self._dictionary))
         elif turn % _SEARCH_EVERY == _SEARCH_EVERY // 2 and self._changed and len(fits) == len(seen):
@@ -130,10 +155,12 @@ class Follow:
         grey, rows = decode_rows(frame, None if whole else _rows(outlines_px, self._changed))
         check_size(self._lens, grey.shape[1], grey.shape[0], self._camera)
         tried = self._with_speed(grey, time_ns, guesses, self._fit(grey, guesses))
+        tried = self._partly(grey, [[guess] for guess in guesses], tried, near=True)
         if rows != [slice(0, len(grey))] and _jumped(outlines_px, tried):
             # Damage in a JPEG moves what comes after it, and is noticed only at its end.
             grey, rows = decode_rows(frame)
             tried = self._with_speed(grey, time_ns, guesses, self._fit(grey, guesses))
+            tried = self._partly(grey, [[guess] for guess in guesses], tried, near=True)
         seen = {n: fit for n, fit in enumerate(tried) if fit is not None}
         lost = {
             guess.id
@@ -158,10 +185,50 @@ class Follow:
         return fits
 
     def _fit_as_guessed(self, grey: Grey, guesses: Sequence[Guess]) -> list[Fit | None]:
-        known_px = float(np.mean(self._blurs_px).round(2)) if len(self._blurs_px) == _BLURS else None
         return fit_edges(
-            grey, guesses, self._dictionary, self._lens, self._edge_offset_px, self._row_time_s, known_px
+            grey,
+            guesses,
+            self._dictionary,
+            self._lens,
+            self._edge_offset_px,
+            self._row_time_s,
+            self._known_blur_px(),
         )
+
+    def _known_blur_px(self) -> float | None:
+        return float(np.mean(self._blurs_px).round(2)) if len(self._blurs_px) == _BLURS else None
+
+    def _partly(
+        self,
+        grey: Grey,
+        guesses: Sequence[Sequence[Guess]],
+        fits: Sequence[Fit | None],
+        near: bool = False,
+    ) -> list[Fit | None]:
+        """Return the fits, but for markers in uneven light those to what is visible of them."""
+        better = list(fits)
+        for n, (poses, fit) in enumerate(zip(guesses, fits, strict=True)):
+            if fit is not None and not fit.uneven:
+                continue
+            if not all(_inside(outline_px, grey) for outline_px in self._outlines(poses)):
+                continue
+            part = fit_partly(
+                grey,
+                poses,
+                self._dictionary,
+                self._lens,
+                self._edge_offset_px,
+                self._row_time_s,
+                self._known_blur_px(),
+                near,
+            )
+            if isinstance(part, Fit):
+                better[n] = part
+            elif fit is not None and (fit.spread_px > _DISTURBED_PX or fit.pose.blurred.any()):
+                better[n] = None
+            if isinstance(part, Rejection) and better[n] is None:
+                self._rejections.append(part)
+        return better
 
     def _with_speed(
         self, grey: Grey, frame_ns: int, guesses: Sequence[Guess], fits: list[Fit | None]
@@ -178,8 +245,14 @@ class Follow:
         better = dict(zip(again, self._fit(grey, list(again.values())), strict=True))
         return [better.get(n) or fit for n, fit in enumerate(fits)]
 
-    def _add(self, grey: Grey, fits: list[Fit], candidates: Iterable[Candidate]) -> list[Fit]:
-        """Fits, and those of candidates that are none of them."""
+    def _add(
+        self, grey: Grey, fits: list[Fit], candidates: Iterable[Candidate], better: float = 1.0
+    ) -> list[Fit]:
+        """Fits, and those of candidates that are none of them.
+
+        Of two poses that look alike the upright one is taken, unless the spread of the edges about the other
+        is less than ``better`` times that about it.
+        """
         new = [one for one in candidates if not _among(one.id, one.corners_px, fits)]
         upright, other = self._guess(new)
         found = self._fit(grey, upright)
@@ -187,8 +260,9 @@ class Follow:
         unsure = [n for n, fit in enumerate(found) if fit is None or fit.spread_px > _SURE_PX]
         for n, fit in zip(unsure, self._fit(grey, [other[n] for n in unsure]), strict=True):
             one = found[n]
-            if fit is not None and (one is None or fit.spread_px < one.spread_px):
+            if fit is not None and (one is None or fit.spread_px < better * one.spread_px):
                 found[n] = fit
+        found = self._partly(grey, list(zip(upright, other, strict=True)), found)
         fits = list(fits)
         for fit in found:
             if fit is not None and not _among(fit.pose.id, fit.corners_px, fits):

@@ -36,6 +36,7 @@ class Prints:
         cells, black border included.
     white : (m, c), which cells are white.
     by_axis : (m, s, 2), takes values at points to their means over the edges along y, and along x.
+    by_side : (m, s, 4), the same over the top, the right, the bottom and the left side of the square.
     by_colour : (m, c, 2), takes values at cells to their means over the white ones and the black ones.
     cells : how many lie along a side.
     """
@@ -48,6 +49,7 @@ class Prints:
     outline: Array
     white: NDArray[np.bool_]
     by_axis: Array
+    by_side: Array
     by_colour: Array
     cells: int
     reach: float
@@ -76,6 +78,7 @@ def lay_out(dictionary: str, marker_ids: tuple[int, ...]) -> Prints:
         _outline(cells),
         white.reshape(len(white), -1),
         _means(np.stack([real * (1 - level), real * level], axis=2)),
+        _means(real[..., None] * _on_sides(points, level)),
         _means(np.stack([white, ~white], axis=3).reshape(len(white), -1, 2).astype(np.float64)),
         cells,
         reach,
@@ -85,6 +88,13 @@ def lay_out(dictionary: str, marker_ids: tuple[int, ...]) -> Prints:
 
 def _means(shares: Array) -> Array:
     return np.asarray(shares / shares.sum(axis=1, keepdims=True))
+
+
+def _on_sides(points: Array, level: Array) -> NDArray[np.bool_]:
+    along_x, end = level == 1, 0.5 - 1e-6
+    x, y = points[..., 0], points[..., 1]
+    sides = [along_x & (y > end), ~along_x & (x > end), along_x & (y < -end), ~along_x & (x < -end)]
+    return np.stack(sides, axis=2)
 
 
 def _outline(cells: int) -> Array:

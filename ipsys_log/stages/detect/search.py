@@ -18,7 +18,7 @@ from numpy.typing import NDArray
 from ipsys_log.geometry.markers import white_cells
 from ipsys_log.stages.detect.decode import Grey, levels_at
 
-__all__ = ["WHOLE", "Candidate", "search", "search_thoroughly"]
+__all__ = ["WHOLE", "Candidate", "search", "search_leftovers", "search_thoroughly"]
 
 Array = NDArray[np.float64]
 
@@ -31,6 +31,16 @@ _BORDER_PX = 1
 _NEAR = (4, 4)
 _REFINE = (cv2.TERM_CRITERIA_COUNT + cv2.TERM_CRITERIA_EPS, 10, 0.05)
 _MISREAD = 3
+# Leftovers: the contrast within a square of the reduced picture, seen at every so many of its pixels; how far
+# around a marker its paper reaches, in sides; the smallest thing looked at, in steps; and where one search of
+# the whole picture is faster than many.
+_CONTRAST = 30
+_STEP = 3
+_AROUND = np.ones((5, 5), dtype=np.uint8)
+_PAPER = 0.35
+_LEAST = 2
+_CLEAR_PX = 12
+_MOST, _MANY = 0.4, 40
 # Rows and columns of a whole picture.
 WHOLE = (slice(None), slice(None))
 
@@ -81,6 +91,40 @@ def search_thoroughly(grey: Grey, dictionary: str, region: tuple[slice, slice] =
     return _placed(_candidates(found, ids), region)
 
 
+def search_leftovers(grey: Grey, dictionary: str, known_px: Iterable[Array]) -> list[Candidate]:
+    """Search thoroughly where a picture has contrast that no known marker, (4, 2) in px, explains."""
+    candidates = []
+    for region in _contrasts(grey, known_px):
+        candidates += search_thoroughly(grey, dictionary, region)
+    return candidates
+
+
+def _contrasts(grey: Grey, known_px: Iterable[Array]) -> list[tuple[slice, slice]]:
+    """Return rows and columns of what has the contrast of a marker, known markers excepted."""
+    small = np.ascontiguousarray(grey[_SHRINK // 2 :: _SHRINK, _SHRINK // 2 :: _SHRINK])
+    brightest, darkest = cv2.dilate(small, _AROUND), cv2.erode(small, _AROUND)
+    contrast = cv2.subtract(brightest, darkest)[::_STEP, ::_STEP] > _CONTRAST
+    scale = _SHRINK * _STEP
+    for corners_px in known_px:
+        low, high = corners_px.min(axis=0), corners_px.max(axis=0)
+        around = _PAPER * (high - low) + scale
+        left, top = np.maximum((low - around) / scale, 0).astype(int)
+        right, bottom = ((high + around) / scale).astype(int) + 1
+        contrast[top:bottom, left:right] = False
+    count, _, boxes, _ = cv2.connectedComponentsWithStats(contrast.astype(np.uint8))
+    if boxes[1:, 2].dot(boxes[1:, 3]) > _MOST * contrast.size or count > _MANY:
+        return [WHOLE]
+    spans = [(left, top, left + width, top + height) for left, top, width, height, _ in boxes[1:].tolist()]
+    return [
+        (
+            slice(max(top * scale - _CLEAR_PX, 0), bottom * scale + _CLEAR_PX),
+            slice(max(left * scale - _CLEAR_PX, 0), right * scale + _CLEAR_PX),
+        )
+        for left, top, right, bottom in spans
+        if min(right - left, bottom - top) >= _LEAST
+    ]
+
+
 def _candidates(found: Iterable[Any], ids: Any) -> list[Candidate]:
     # OpenCV 5 gives ids of shape (n,), OpenCV 4 of shape (n, 1), or None.
     numbers = [] if ids is None else np.ravel(ids).tolist()
@@ -108,6 +152,8 @@ def _quick_detector(dictionary: str) -> cv2.aruco.ArucoDetector:
 def _full_detector(dictionary: str) -> cv2.aruco.ArucoDetector:
     parameters = cv2.aruco.DetectorParameters()
     parameters.minDistanceToBorder = _BORDER_PX
+    # Bits are read from 8 px a cell instead of 4: finds more small and tilted markers.
+    parameters.perspectiveRemovePixelPerCell = 8
     return cv2.aruco.ArucoDetector(_known(dictionary), parameters)
 
 

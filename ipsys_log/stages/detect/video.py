@@ -10,6 +10,7 @@ from typing import TYPE_CHECKING
 from ipsys_log.errors import FrameError
 from ipsys_log.messages import CompressedVideo, RawImage
 from ipsys_log.stages.detect.frame_numbers import FrameNumbers
+from ipsys_log.stages.detect.picture_size import MOST_PIXELS
 
 if TYPE_CHECKING:
     from av.video.codeccontext import VideoCodecContext
@@ -167,5 +168,5 @@ def _open(codec: str) -> VideoCodecContext:
     decoder.thread_count = 1
     decoder.flags |= av.codec.context.Flags.low_delay
     # A picture with guessed pieces is none.
-    decoder.options = {"err_detect": "explode"}
+    decoder.options = {"err_detect": "explode", "max_pixels": str(MOST_PIXELS)}
     return decoder

@@ -1,0 +1,91 @@
+"""A chessboard in a picture: its corners, and the largest grid of corners that is there."""
+
+from __future__ import annotations
+
+from typing import NamedTuple
+
+import cv2
+import numpy as np
+from numpy.typing import NDArray
+
+from ipsys_log.calibration.chessboard_grid import complete_grid, crop_grid
+
+__all__ = ["ChessboardView", "find_chessboard", "fits_in"]
+
+Array = NDArray[np.float64]
+Grey = NDArray[np.uint8]
+# Columns and rows of inner corners.
+Size = tuple[int, int]
+
+_LARGE_PX = 1600
+_THOROUGH = cv2.CALIB_CB_EXHAUSTIVE | cv2.CALIB_CB_NORMALIZE_IMAGE | cv2.CALIB_CB_ACCURACY
+_SMALLEST = (3, 3)
+
+
+class ChessboardView(NamedTuple):
+    """Corners (rows, columns, 2) of a board of the size looked for, or None; and the size of the largest grid
+    of real corners, or None where there is none."""
+
+    corners: Array | None
+    size: Size | None
+
+
+class _Try(NamedTuple):
+    """One call of OpenCV's detector; ``flags`` with CALIB_CB_LARGER accept a larger grid."""
+
+    whole_picture: bool
+    size: Size
+    flags: int = 0
+
+
+def find_chessboard(grey: Grey, size: Size, thorough: bool) -> ChessboardView:
+    """Look for a chessboard, whatever is around it.
+
+    Parameters
+    ----------
+    grey : (height, width).
+    size : columns and rows of inner corners.
+    thorough : whether to look longer where the board is not seen at once.
+
+    Notes
+    -----
+    A board of this size is found turned by a quarter, too: its corners are the same ones.
+    """
+    large = max(grey.shape) > _LARGE_PX
+    # A large picture takes long; corners are refined in the whole of it anyway.
+    small = cv2.resize(grey, None, fx=0.5, fy=0.5, interpolation=cv2.INTER_AREA) if large else grey
+    largest: Size | None = None
+    for attempt in _tries(size, large, thorough):
+        picture = grey if attempt.whole_picture or not large else np.asarray(small, dtype=np.uint8)
+        grid = _grid(picture, attempt)
+        if grid is None:
+            continue
+        columns_rows = (grid.shape[1], grid.shape[0])
+        if fits_in(size, columns_rows):
+            corners = crop_grid(picture, grid, size)
+            return ChessboardView(corners if picture is grey else 2 * corners + 0.5, columns_rows)
+        if largest is None or np.prod(columns_rows) > np.prod(largest):
+            largest = columns_rows
+    return ChessboardView(None, largest)
+
+
+def fits_in(size: Size, other: Size) -> bool:
+    """Return whether a grid has room in another one, turned by a quarter or not."""
+    return min(size) <= min(other) and max(size) <= max(other)
+
+
+def _tries(size: Size, large: bool, thorough: bool) -> list[_Try]:
+    tries = [_Try(False, size), *([_Try(True, size)] * large)]
+    if thorough:
+        tries += [_Try(False, size, cv2.CALIB_CB_LARGER), _Try(False, _SMALLEST, cv2.CALIB_CB_LARGER)]
+        tries += [_Try(False, size, _THOROUGH)]
+    return tries
+
+
+def _grid(picture: Grey, attempt: _Try) -> Array | None:
+    """Return the real corners that one call leads to, (rows, columns, 2)."""
+    seen, corners, cells = cv2.findChessboardCornersSBWithMeta(picture, attempt.size, attempt.flags)
+    if not seen:
+        return None
+    rows, columns = cells.shape if attempt.flags & cv2.CALIB_CB_LARGER else attempt.size[::-1]
+    return complete_grid(picture, np.asarray(corners, dtype=np.float64).reshape(rows, columns, 2))

@@ -1,0 +1,154 @@
+"""Pictures of two cameras that are taken for one: two lenses explain far more of them than one does.
+
+Two groups of pictures are found as in k-means: each picture goes to the lens that misses its corners least,
+and each lens is fitted to its pictures. The groups to start from are those that pull the joint lens to
+opposite sides, and those that the names of the pictures suggest.
+"""
+
+from __future__ import annotations
+
+import re
+from collections.abc import Iterator, Sequence
+from typing import NamedTuple
+
+import numpy as np
+from numpy.typing import NDArray
+
+from ipsys_log.calibration.bundle import Corners, Fit, adjust, normal_equations, reduce_to_lens, residuals
+from ipsys_log.calibration.lens_models import LensModel
+from ipsys_log.calibration.solve import doubt_from_px
+from ipsys_log.calibration.start import fitted_basis
+
+__all__ = ["TwoCameras", "find_two_cameras"]
+
+Array = NDArray[np.float64]
+Group = NDArray[np.bool_]
+
+_LEAST_PICTURES = 4
+_DIRECTIONS, _ROUNDS, _STEPS, _POSE_STEPS = 3, 8, 8, 4
+# By how much the squared errors with one lens exceed those with two, as a share, for two cameras. Pictures of
+# one camera reach 0.37 (fisheye_chessboard), and fewer pictures for each parameter of the lens reach more.
+_GAIN, _GAIN_PER_PARAMETER = 0.4, 0.6
+# Where the names of the pictures tell the same groups, so much is enough, and so many pictures must agree.
+_NAMED_GAIN, _AGREE = 0.25, 0.9
+# The errors of one group are no more than so many times those of the other: it is no heap of bad pictures.
+_ALIKE = 3.0
+
+
+class TwoCameras(NamedTuple):
+    """The pictures of the second camera (f,), and the RMS in px with one lens and with two."""
+
+    second: Group
+    one_px: float
+    two_px: float
+
+
+class _Split(NamedTuple):
+    """The pictures of the second camera, and the squared errors of each picture in px^2, with two lenses."""
+
+    second: Group
+    errors: Array
+
+
+def find_two_cameras(
+    model: LensModel, start: Fit, corners: Corners, names: Sequence[str]
+) -> TwoCameras | None:
+    """Return the pictures of each camera where two lenses are needed; None for one camera.
+
+    Parameters
+    ----------
+    model : the kind of lens.
+    start : a fit to start from.
+    corners : of all pictures.
+    names : of the pictures, (f,).
+    """
+    if corners.pictures < 2 * _LEAST_PICTURES:
+        return None
+    basis = fitted_basis(model, square=False)
+    scale_px = doubt_from_px(model, start, corners)
+    fit = adjust(model, start, corners, basis, scale_px)
+    scale_px = doubt_from_px(model, fit, corners)
+    by_name = list(_name_groups(names))
+    seeds = [*by_name, *_opposite_pulls(model, fit, corners, basis, scale_px)]
+    splits = [_refine(model, fit, corners, basis, scale_px, seed) for seed in seeds]
+    best = min(
+        (split for split in splits if split is not None), key=lambda one: one.errors.sum(), default=None
+    )
+    if best is None:
+        return None
+    with_one = _errors(model, fit, corners, scale_px)
+    gain = float(with_one.sum() / best.errors.sum()) - 1
+    agreement = max((max(np.mean(best.second == g), np.mean(best.second != g)) for g in by_name), default=0.0)
+    needed = _GAIN + _GAIN_PER_PARAMETER * basis.shape[1] / corners.pictures
+    counts = corners.sums(np.ones(len(corners.picture)))
+    first_px, second_px = (_rms_px(best.errors[g], counts[g]) for g in (~best.second, best.second))
+    if gain < (_NAMED_GAIN if agreement >= _AGREE else needed):
+        return None
+    if max(first_px, second_px) > _ALIKE * min(first_px, second_px):
+        return None
+    return TwoCameras(best.second, _rms_px(with_one, counts), _rms_px(best.errors, counts))
+
+
+def _rms_px(errors: Array, counts: Array) -> float:
+    return float(np.sqrt(errors.sum() / counts.sum()))
+
+
+def _name_groups(names: Sequence[str]) -> Iterator[Group]:
+    """Return the pictures whose names are alike but for the last number, one kind after the other."""
+    kinds = np.array([re.sub(r"\d+(?=\D*$)", "", name) for name in names])
+    different = np.unique(kinds)
+    for kind in different[: len(different) - 1 if len(different) == 2 else _DIRECTIONS]:
+        group = kinds == kind
+        if min(group.sum(), (~group).sum()) >= _LEAST_PICTURES:
+            yield group
+
+
+def _opposite_pulls(
+    model: LensModel, fit: Fit, corners: Corners, basis: Array, scale_px: float
+) -> list[Group]:
+    """Return groups by the sign of each picture's pull at the lens, in the strongest directions."""
+    normal = normal_equations(model, fit, corners, basis, scale_px)
+    matrices, gradients = reduce_to_lens(normal)
+    values, vectors = np.linalg.eigh(matrices.sum(axis=0) + normal.pull)
+    whitened = gradients @ (vectors / np.sqrt(np.maximum(values, 1e-12 * values.max())))
+    pulls = np.linalg.svd(whitened, full_matrices=False)[0]
+    return [pulls[:, n] > 0 for n in range(min(_DIRECTIONS, pulls.shape[1]))]
+
+
+def _refine(
+    model: LensModel, fit: Fit, corners: Corners, basis: Array, scale_px: float, second: Group
+) -> _Split | None:
+    """Return the groups that two lenses settle on, or None where one has too few pictures."""
+    fits = [fit, fit]
+    for _ in range(_ROUNDS):
+        if min(second.sum(), (~second).sum()) < _LEAST_PICTURES:
+            return None
+        groups = (~second, second)
+        fits = [
+            _fit_group(model, old, corners, basis, scale_px, g) for old, g in zip(fits, groups, strict=True)
+        ]
+        first_errors, second_errors = (_errors(model, one, corners, scale_px) for one in fits)
+        nearer = second_errors < first_errors
+        if (nearer == second).all():
+            return _Split(second, np.where(second, second_errors, first_errors))
+        second = nearer
+    return None
+
+
+def _fit_group(
+    model: LensModel, fit: Fit, corners: Corners, basis: Array, scale_px: float, group: Group
+) -> Fit:
+    """Return the lens of a group of pictures, and with it the poses of all pictures."""
+    part, _ = corners.keep(group[corners.picture])
+    own = adjust(
+        model, Fit(fit.lens, fit.rotations[group], fit.places_m[group]), part, basis, scale_px, _STEPS
+    )
+    rotations, places_m = fit.rotations.copy(), fit.places_m.copy()
+    rotations[group], places_m[group] = own.rotations, own.places_m
+    return adjust(model, Fit(own.lens, rotations, places_m), corners, basis[:, :0], scale_px, _POSE_STEPS)
+
+
+def _errors(model: LensModel, fit: Fit, corners: Corners, scale_px: float) -> Array:
+    """Return the sum of the squared errors of each picture, (f,) in px^2; those far off count for less."""
+    squares = (residuals(model, fit, corners) ** 2).sum(axis=1)
+    return corners.sums(scale_px**2 * np.log1p(squares / scale_px**2))

@@ -1,0 +1,94 @@
+"""Whether the data section of a log, its indexes and its summary say the same."""
+
+from collections import Counter
+
+from mcap import records as mcap
+
+from ipsys_log.errors import LogError
+from ipsys_log.log.contents import Contents
+from ipsys_log.log.load import Summary, load_contents, read_summary
+from ipsys_log.log.records import ChunkRef
+from ipsys_log.log.rows import chunk_entries
+from ipsys_log.log.survey import Survey
+from ipsys_log.log.view import View
+
+__all__ = ["count_by_indexes", "disagreement"]
+
+
+def disagreement(view: View, found: Survey) -> str:
+    """Return in what a log disagrees with its own survey, "" if it is whole."""
+    try:
+        theirs, summary = load_contents(view), read_summary(view)
+    except LogError as error:
+        return str(error)
+    mine = found.contents
+    if not found.finished or found.damaged or not found.crc_is_right:
+        return "its data section is damaged"
+    if theirs.data_end != found.end:
+        return "its summary is that of another data section"
+    if Counter(mine.counts) != Counter(theirs.counts):
+        return (
+            f"its readers count {sum(theirs.counts.values())} messages, it holds {sum(mine.counts.values())}"
+        )
+    if not _same_chunks(theirs.chunks, mine.chunks):
+        return "its readers look for other chunks than it has"
+    return _summary_disagreement(summary, mine, found) if summary is not None else ""
+
+
+def count_by_indexes(view: View) -> int:
+    """Return the number of messages that a reader finds by the summary and the message indexes."""
+    contents = load_contents(view)
+    total = sum(map(len, contents.loose.values()))
+    for chunk in contents.chunks:
+        total += sum(map(len, chunk_entries(view, chunk, {}).values()))
+    return total
+
+
+def _summary_disagreement(summary: Summary, mine: Contents, found: Survey) -> str:
+    theirs, statistics, _ = summary
+    if theirs.chunks and not _same_chunks(theirs.chunks, mine.chunks):
+        return "its chunk indexes are not those of its chunks"
+    for kind, records, own in (
+        ("schema", theirs.schemas, found.definitions.schemas),
+        ("channel", theirs.channels, found.definitions.channels),
+    ):
+        if any(own.get(key, record) != record for key, record in records.items()):
+            return f"a {kind} is defined in two ways"
+        if records and not _used(kind, mine) <= records.keys():
+            return f"a {kind} is missing in its summary"
+    if theirs.attachments and _places(theirs.attachments) != _places(mine.attachments):
+        return "its attachment indexes are wrong"
+    if theirs.metadata and _places(theirs.metadata) != _places(mine.metadata):
+        return "its metadata indexes are wrong"
+    return "its statistics are wrong" if statistics and not _fits(statistics, mine) else ""
+
+
+def _used(kind: str, mine: Contents) -> set[int]:
+    """Ids of the channels that have messages, or of their schemas."""
+    used = {channel for channel, number in mine.counts.items() if number}
+    return used if kind == "channel" else {mine.channels[key].schema_id for key in used} - {0}
+
+
+def _places(records: list[mcap.AttachmentIndex] | list[mcap.MetadataIndex]) -> list[tuple[int, int, str]]:
+    return sorted((record.offset, record.length, record.name) for record in records)
+
+
+def _fits(statistics: mcap.Statistics, mine: Contents) -> bool:
+    counts = Counter(statistics.channel_message_counts) == Counter(mine.counts)
+    total = statistics.message_count == sum(mine.counts.values())
+    span = (statistics.message_start_time, statistics.message_end_time)
+    return counts and total and (not statistics.message_count or span == (mine.start_ns, mine.end_ns))
+
+
+def _same_chunks(theirs: list[ChunkRef], mine: list[ChunkRef]) -> bool:
+    return len(theirs) == len(mine) and all(map(_same_chunk, theirs, mine))
+
+
+def _same_chunk(theirs: ChunkRef, mine: ChunkRef) -> bool:
+    """All that a reader goes by; a writer may leave out the message indexes."""
+    lengths = (mine.index_length,) if theirs.index_offsets else (0, mine.index_length)
+    offsets = theirs.index_offsets in ({}, mine.index_offsets) and theirs.index_length in lengths
+    same = theirs._replace(index_length=0, index_offsets={}) == mine._replace(
+        index_length=0, index_offsets={}
+    )
+    return same and offsets

@@ -1,0 +1,210 @@
+"""Schemas and channels of a data section, in file order, and what stands in for those that were lost."""
+
+from collections.abc import Iterator
+from dataclasses import dataclass, field, replace
+from itertools import islice
+
+from mcap import records as mcap
+
+from ipsys_log.log.chunks import Inside
+from ipsys_log.log.contents import Contents
+from ipsys_log.log.load import Summary
+from ipsys_log.log.records import RecordAt, as_bytes, exact
+from ipsys_log.log.stretch import Stretch
+from ipsys_log.log.view import View
+
+__all__ = ["Definitions", "placeholder"]
+
+_MOST_MISREAD = 100
+_MOST_ROOMS = 50  # stretches that are tried
+_LARGEST = 1 << 28  # bytes: what one definition may make us allocate
+
+
+def placeholder(channel_id: int) -> mcap.Channel:
+    """Return a channel for messages whose own is lost; its record is no longer than any that it replaces."""
+    return mcap.Channel(channel_id, f"/lost/{channel_id}", "", {}, 0)
+
+
+@dataclass(slots=True)
+class Definitions:
+    """What is defined up to here, by id.
+
+    `known` is what the summary says, or a damaged chunk: it serves where the data section lacks something.
+    If the summary is checked by its CRC, a record that contradicts it is damaged. `rooms` are the damaged
+    stretches so far: what is lost is put back there.
+    """
+
+    summary: Summary | None
+    rooms: list[Stretch]
+    schemas: dict[int, mcap.Schema] = field(default_factory=dict)
+    channels: dict[int, mcap.Channel] = field(default_factory=dict)
+    known: Inside = field(default_factory=Inside)
+    _schema_at: dict[int, int] = field(default_factory=dict)  # where each schema is defined
+    _sure: Contents | None = None
+    _full: int = 0  # so many of the first rooms are full
+    _misread: list[mcap.Channel] = field(default_factory=list)
+    _unused: dict[int, RecordAt] = field(default_factory=dict)  # records of channels without messages so far
+
+    def __post_init__(self) -> None:
+        if self.summary is not None:
+            contents, statistics, checked = self.summary
+            self.known = Inside(dict(contents.schemas), dict(contents.channels))
+            counts = (len(contents.schemas), len(contents.channels))
+            if checked and statistics and counts == (statistics.schema_count, statistics.channel_count):
+                self._sure = contents
+
+    def take(self, view: View, at: RecordAt) -> None:
+        """Take in a Schema or Channel record that lies in no chunk.
+
+        Raises
+        ------
+        LogError
+            It cannot be parsed, or contradicts the summary or an earlier record.
+        """
+        if at.length > _LARGEST:
+            raise view.fault(at.offset, f"a definition claims {at.length} bytes")
+        record = exact(view, at, view.read(at.offset, at.length))
+        if isinstance(record, mcap.Schema):
+            if record.id == 0 or self._contradicts(record):
+                raise view.fault(at.offset, f"the definition of schema {record.id} is damaged")
+            self.schemas[record.id] = record
+            self._schema_at.setdefault(record.id, at.offset)
+            return
+        assert isinstance(record, mcap.Channel)
+        channel = record
+        if self._contradicts(channel):
+            if len(self._misread) < _MOST_MISREAD:
+                self._misread.append(channel)
+            raise view.fault(at.offset, f"the definition of channel {channel.id} is damaged")
+        if not self._has_schema(channel):
+            raise view.fault(at.offset, f"channel {channel.id} has a schema that is not in the log")
+        if channel.id not in self.channels:
+            self._unused[channel.id] = at
+        self.channels[channel.id] = channel
+
+    def take_chunk(self, view: View, offset: int, inside: Inside, *, checked: bool) -> None:
+        """Take in what a chunk defines, and see that all its messages have a channel.
+
+        Raises
+        ------
+        LogError
+            A definition is lost and cannot be put back.
+        """
+        records: list[mcap.Schema | mcap.Channel] = [*inside.schemas.values(), *inside.channels.values()]
+        for record in records:
+            if not checked and self._contradicts(record):
+                raise view.fault(offset, "a definition in the chunk contradicts another one")
+        for channel in inside.channels.values():
+            if channel.schema_id not in inside.schemas and not self._has_schema(channel):
+                raise view.fault(offset, f"channel {channel.id} has a schema that is not in the log")
+        for channel_id in inside.entries.keys() - inside.channels.keys():
+            self.need(view, offset, channel_id)
+        for key, schema in inside.schemas.items():
+            self.schemas.setdefault(key, schema)
+            self._schema_at.setdefault(key, offset)
+        self.channels |= {key: value for key, value in inside.channels.items() if key not in self.channels}
+
+    def need(self, view: View, offset: int, channel_id: int) -> None:
+        """See that the channel of a message at `offset` is defined: by what is known, or by a placeholder.
+
+        Raises
+        ------
+        LogError
+            No stretch before `offset` has room for the definition.
+        """
+        self._unused.pop(channel_id, None)
+        if channel_id in self.channels:
+            return
+        known = self.known.channels.get(channel_id) or self._by_one_bit(channel_id)
+        channel = known or placeholder(channel_id)
+        if not self._put_back(channel):
+            raise view.fault(offset, f"a message is of channel {channel_id}, whose definition is lost")
+        self.channels[channel_id] = channel
+
+    def topic(self, channel_id: int) -> str:
+        """Return the topic of a channel, its id where that is not known."""
+        channel = self.channels.get(channel_id) or self.known.channels.get(channel_id)
+        return channel.topic if channel else f"channel {channel_id}"
+
+    def missing(self, channel_ids: set[int], defined: Inside) -> Iterator[mcap.McapRecord]:
+        """Records that must stand before messages of these channels, which `defined` may define."""
+        schemas, channels = defined.schemas | self.known.schemas, defined.channels | self.known.channels
+        for channel_id in sorted(channel_ids - self.channels.keys()):
+            channel = channels.get(channel_id) or placeholder(channel_id)
+            if channel.schema_id and channel.schema_id not in self.schemas:
+                schema = schemas.get(channel.schema_id) or _empty_schema(channel.schema_id)
+                self.schemas[schema.id] = schema
+                yield schema
+            self.channels[channel_id] = channel
+            yield channel
+
+    def complete(self) -> None:
+        """Take over what the summary defines and no message has needed."""
+        for channel in self._sure.channels.values() if self._sure else ():
+            self.channels.setdefault(channel.id, channel)
+        for schema in self._sure.schemas.values() if self._sure else ():
+            self.schemas.setdefault(schema.id, schema)
+
+    def _contradicts(self, record: mcap.Schema | mcap.Channel) -> bool:
+        schema = isinstance(record, mcap.Schema)
+        mine: dict[int, mcap.Schema] | dict[int, mcap.Channel] = self.schemas if schema else self.channels
+        if record.id in mine and mine[record.id] != record:
+            return True
+        if self._sure is None:
+            return False
+        sure: dict[int, mcap.Schema] | dict[int, mcap.Channel] = (
+            self._sure.schemas if schema else self._sure.channels
+        )
+        return sure.get(record.id) != record
+
+    def _has_schema(self, channel: mcap.Channel) -> bool:
+        """Whether the schema of a channel is defined before it, or can be put back."""
+        key = channel.schema_id
+        if key == 0 or key in self.schemas:
+            return True
+        known = self.known.schemas.get(key)
+        schema = known or _empty_schema(key)
+        room = self._room_for(as_bytes(schema), 0)
+        if room is None:  # both are put back later, where there is room for both
+            self.known.channels.setdefault(channel.id, channel if known else replace(channel, schema_id=0))
+            return False
+        self.schemas[key] = schema
+        self._schema_at[key] = room.offset
+        return True
+
+    def _put_back(self, channel: mcap.Channel) -> bool:
+        """Write a channel into a damaged stretch: behind its schema, or together with it."""
+        key, data = channel.schema_id, as_bytes(channel)
+        if key == 0:
+            return self._room_for(data, 0) is not None
+        if key in self.schemas and self._room_for(data, self._schema_at.get(key, 0)) is not None:
+            return True
+        schema = self.schemas.get(key) or self.known.schemas.get(key) or _empty_schema(key)
+        room = self._room_for(as_bytes(schema) + data, 0)
+        if room is not None:
+            self.schemas[key] = schema
+            self._schema_at[key] = min(room.offset, self._schema_at.get(key, room.offset))
+        return room is not None
+
+    def _room_for(self, data: bytes, start: int) -> Stretch | None:
+        """Put records into the first stretch from `start` on that has room for them."""
+        while self._full < len(self.rooms) - 1 and self.rooms[self._full].is_full:
+            self._full += 1
+        rooms = islice(self.rooms, self._full, self._full + _MOST_ROOMS)
+        return next((room for room in rooms if room.offset >= start and room.define(data)), None)
+
+    def _by_one_bit(self, channel_id: int) -> mcap.Channel | None:
+        """The channel whose record differs in one bit of its id, and is good for nothing else."""
+        records = [record for record in self._misread if (record.id ^ channel_id).bit_count() == 1]
+        if not self.rooms:  # its record looks whole, but no message is of the channel that it defines
+            unused = [key for key in self._unused if (key ^ channel_id).bit_count() == 1]
+            records = [self.channels[key] for key in unused]
+            if len(records) == 1:
+                at = self._unused.pop(unused[0])
+                self.rooms.append(Stretch(at.offset, at.length))
+                del self.channels[unused[0]]
+        return replace(records[0], id=channel_id) if len(records) == 1 else None
+
+
+def _empty_schema(schema_id: int) -> mcap.Schema:
+    return mcap.Schema(schema_id, b"", "", "")

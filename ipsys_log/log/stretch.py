@@ -1,0 +1,86 @@
+"""Damaged stretches of a data section, and what a repair puts there in their place."""
+
+from collections.abc import Mapping
+from dataclasses import dataclass, field
+
+from mcap import records as mcap
+from mcap.opcode import Opcode
+
+from ipsys_log.log.records import HEADER, MAGIC, as_bytes
+from ipsys_log.log.resync import PRIVATE
+
+__all__ = ["Stretch", "index_records"]
+
+_SHORTEST_DEFINITION = 23  # bytes: a schema without name and encoding
+_FILLER = Opcode.CHUNK | PRIVATE
+
+
+@dataclass(slots=True)
+class Stretch:
+    """Bytes that are not whole records, from `offset` on.
+
+    In their place go `head` (the beginning of a file), the message indexes of the chunk before it
+    (`entries`), `definitions` that were lost, and a record of a private type over what is left, which every
+    reader skips. Of that only the first bytes are written; the others stay as they are.
+    """
+
+    offset: int
+    length: int
+    head: bytes = b""
+    chunk: int | None = None  # number of the chunk that `entries` belong to
+    entries: Mapping[int, list[tuple[int, int]]] = field(default_factory=dict)
+    definitions: list[bytes] = field(default_factory=list)
+    _taken: int = 0  # bytes of all this
+
+    @property
+    def end(self) -> int:
+        return self.offset + self.length
+
+    def indexes(self) -> tuple[bytes, dict[int, int]]:
+        """The message indexes to be written and where each will lie; none if there is no room for them."""
+        start = self.offset + len(self.head)
+        data, offsets = index_records(self.entries, start)
+        rest = self.end - start - len(data)
+        return (data, offsets) if rest == 0 or rest >= HEADER.size else (b"", {})
+
+    @property
+    def is_full(self) -> bool:
+        """Whether not even the shortest definition fits in."""
+        return self.length - self._taken < _SHORTEST_DEFINITION
+
+    def define(self, definitions: bytes) -> bool:
+        """Take these records in if there is room for them."""
+        if self._taken == 0:
+            self._taken = len(self.head) + len(self.indexes()[0])
+        if self._taken + len(definitions) > self.length:
+            return False
+        self._taken += len(definitions)
+        self.definitions.append(definitions)
+        return True
+
+    def content(self) -> bytes:
+        """The new bytes at `offset`: all of the stretch, or up to what stays as it is."""
+        data = b"".join((self.head, self.indexes()[0], *self.definitions))
+        rest = self.length - len(data)
+        if 0 < rest < HEADER.size:  # too little for a record of its own
+            return _padded(data, len(MAGIC) if self.offset == 0 else 0, rest)
+        return data + (HEADER.pack(_FILLER, rest - HEADER.size) if rest else b"")
+
+
+def _padded(data: bytes, start: int, rest: int) -> bytes:
+    """Lengthen the last record by zeros: a reader skips what follows the fields that it knows."""
+    last = start
+    while start < len(data):
+        last, start = start, start + HEADER.size + HEADER.unpack_from(data, start)[1]
+    opcode, length = HEADER.unpack_from(data, last)
+    return data[:last] + HEADER.pack(opcode, length + rest) + data[last + HEADER.size :] + bytes(rest)
+
+
+def index_records(entries: Mapping[int, list[tuple[int, int]]], offset: int) -> tuple[bytes, dict[int, int]]:
+    """The MessageIndex records of a chunk, to be written at `offset`, and where each lies by channel id."""
+    pieces: list[bytes] = []
+    offsets: dict[int, int] = {}
+    for channel, rows in entries.items():
+        pieces.append(as_bytes(mcap.MessageIndex(channel, rows)))
+        offsets[channel], offset = offset, offset + len(pieces[-1])
+    return b"".join(pieces), offsets

@@ -1,0 +1,47 @@
+"""Text of others, made safe to show."""
+
+from __future__ import annotations
+
+import unicodedata
+
+__all__ = ["plain_text"]
+
+# Control characters, invisible ones that change the direction of text, bytes of a file name that are not
+# UTF-8, and separators of lines.
+_UNSAFE = frozenset({"Cc", "Cf", "Cs", "Zl", "Zp"})
+_LONGEST = 2_000
+
+
+def plain_text(text: str, *, keep: str = "", longest: int = _LONGEST) -> str:
+    r"""Return `text` with control characters written as escapes, and cut where it is longer than `longest`.
+
+    Names in a log are of others. A terminal obeys an escape sequence in a name; it can hide text, or change
+    what is shown elsewhere.
+
+    Parameters
+    ----------
+    text : any text, such as the name of a run, a topic or a file.
+    keep : control characters that stay, such as the ends of lines.
+    longest : the most characters that are returned, before escapes.
+
+    Examples
+    --------
+    >>> plain_text("red\x1b[31m\u202e lab")
+    'red\\x1b[31m\\u202e lab'
+    """
+    if len(text) > longest:
+        text = f"{text[:longest]} ... ({len(text)} characters)"
+    if text.isprintable():
+        return text
+    return "".join(sign if sign in keep or _is_safe(sign) else _escape(sign) for sign in text)
+
+
+def _is_safe(sign: str) -> bool:
+    return unicodedata.category(sign) not in _UNSAFE
+
+
+def _escape(sign: str) -> str:
+    number = ord(sign)
+    if number < 0x100:
+        return f"\\x{number:02x}"
+    return f"\\u{number:04x}" if number < 0x10000 else f"\\U{number:08x}"

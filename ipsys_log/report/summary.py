@@ -1,0 +1,198 @@
+"""The answer of an evaluation: the model to use, its error, the outliers; and one table of all models."""
+
+from __future__ import annotations
+
+from collections.abc import Iterator, Sequence
+from typing import Any
+
+import numpy as np
+from rich.console import Group
+from rich.table import Table
+from rich.text import Text
+
+from ipsys_log.messages import CameraEvaluation, ErrorStatistics
+from ipsys_log.offline.errors import CROSS_VALIDATION, POOLED
+from ipsys_log.offline.evaluate import SCREENING
+from ipsys_log.offline.statistics import root_mean_square_m
+from ipsys_log.offline.yardstick import FEWEST
+from ipsys_log.report.accuracy import Accuracy, gather_suspects
+from ipsys_log.report.advice import TOLD_NOTE, advise, label, told_height
+from ipsys_log.report.cells import format_interval, name_cell, plain_table, wrap_text
+from ipsys_log.report.findings import in_space, judged, overall, rank
+from ipsys_log.units import CM_PER_M
+
+__all__ = ["answer_json", "answer_text", "models_table"]
+
+# The outliers that the answer explains; the others are named.
+_EXPLAINED = 3
+_TRUTH = "truth"
+
+
+def answer_text(accuracies: Sequence[Accuracy]) -> Group | None:
+    """Return the answer in sentences; None where nothing was judged."""
+    if not accuracies:
+        return None
+    best = rank(accuracies)[0]
+    lines: list[str | Text] = [*_best_lines(accuracies, best)]
+    if best.tracks is not None:
+        errors = best.tracks[0] if in_space(accuracies) else best.tracks[1]
+        lines.append(f"Tracks, against the ground truth: {_figures(errors, root_mean_square_m(errors))}.")
+    if any(accuracy.evaluation and accuracy.evaluation.cameras for accuracy in accuracies):
+        lines += _outlier_lines(accuracies)
+    advice = advise([accuracy.evaluation for accuracy in accuracies if accuracy.evaluation])
+    lines += advice.sentences if advice else ()
+    return Group(*(Text(wrap_text(line)) if isinstance(line, str) else line for line in lines))
+
+
+def _best_lines(accuracies: Sequence[Accuracy], best: Accuracy) -> Iterator[str | Text]:
+    row = overall(best, True) or overall(best, False)
+    if row is None:
+        return
+    space = in_space(accuracies)
+    several = len(accuracies) > 1
+    knows = ", told the height of each marker" if told_height(best.model) else ""
+    yield Text(f"{'Best model' if several else 'Model'}: {name_cell(best.model)}{knows}", style="bold")
+    yield f"Mean position error: {_figures(judged(row, space), best.rmse_m(row, judged(row, space)))}"
+    cameras = {found.camera for found in (best.evaluation.cameras if best.evaluation else ())} - {POOLED}
+    yield (
+        f"({'3D' if space and not told_height(best.model) else '2D'}, {_scheme(row)}: "
+        f"{_count(row.error_2d.count, 'point')} of {_count(len(cameras), 'camera')}; a camera's view of a "
+        "point counts as one)."
+    )
+    truth = overall(best, row.scheme == CROSS_VALIDATION, _TRUTH)
+    if truth is not None:
+        errors = judged(truth, space)
+        yield f"Against the ground truth: {_figures(errors, best.rmse_m(truth, errors))}."
+    told = [accuracy for accuracy in rank(accuracies) if told_height(accuracy.model)]
+    if told and told[0] is not best and (there := overall(told[0], True) or overall(told[0], False)):
+        errors = judged(there, space)
+        figures = _figures(errors, told[0].rmse_m(there, errors))
+        yield f"With known marker heights: {told[0].model}, {figures} (2D)."
+
+
+def _scheme(row: CameraEvaluation) -> str:
+    return "cross-validated" if row.scheme == CROSS_VALIDATION else "held out"
+
+
+def _count(number: int, what: str) -> str:
+    return f"{number} {what}{'' if number == 1 else 's'}"
+
+
+def _figures(errors: ErrorStatistics, rmse_m: float | None) -> str:
+    """Return the figures of errors in words."""
+    parts = [f"{_cm(errors.mean_m)} cm"]
+    if errors.mean_low_m is not None and errors.mean_high_m is not None:
+        parts[0] += f" (95 % CI {_cm(errors.mean_low_m)} to {_cm(errors.mean_high_m)})"
+    if rmse_m is not None:
+        parts.append(f"RMSE {_cm(rmse_m)} cm")
+    if errors.p95_m is not None:
+        parts.append(f"95 % below {_cm(errors.p95_m)} cm")
+    return ", ".join(parts)
+
+
+def _cm(value_m: float) -> str:
+    return f"{value_m * CM_PER_M:.1f}"
+
+
+def _outlier_lines(accuracies: Sequence[Accuracy]) -> Iterator[str | Text]:
+    """Yield the outliers, the worst first; the first ones with what would explain them."""
+    suspects = gather_suspects(accuracies)
+    if not suspects:
+        searched = "none" if any(map(_screened, accuracies)) else f"not searched: {_needed()}"
+        yield f"Outliers: {searched}."
+        return
+    yield f"Outliers: measure {_count(len(suspects), 'point')} again, the worst first:"
+    for suspect, _ in suspects[:_EXPLAINED]:
+        text = suspect.text or "nothing simple explains it"
+        name = name_cell(suspect.measurement).plain
+        yield Text(wrap_text(f"{name}, {_length(suspect.residual_m)} cm off: {text}.", indent="  "))
+    if rest := suspects[_EXPLAINED:]:
+        named = (f"{name_cell(s.measurement).plain} ({_length(s.residual_m)} cm)" for s, _ in rest)
+        yield Text(wrap_text(f"{', '.join(named)}.", indent="  "))
+
+
+def _length(residual_m: Any) -> str:
+    return _cm(float(np.linalg.norm(residual_m)))
+
+
+def _screened(accuracy: Accuracy) -> bool:
+    """Return whether a model has judged its points: only some models do, with enough points."""
+    rows = [row for row in accuracy.rows(True) if row.camera != POOLED]
+    return accuracy.model in SCREENING and any(row.error_2d.count >= FEWEST for row in rows)
+
+
+def _needed() -> str:
+    return f"that needs {FEWEST} points of a camera, and one of the models {', '.join(SCREENING)}"
+
+
+def answer_json(accuracies: Sequence[Accuracy]) -> dict[str, Any]:
+    """Return the answer as plain data, in cm; empty where nothing was judged."""
+    best = rank(accuracies)[0] if accuracies else None
+    row = None if best is None else overall(best, True) or overall(best, False)
+    if best is None or row is None:
+        return {}
+    errors = judged(row, in_space(accuracies))
+    rmse_m = best.rmse_m(row, errors)
+    figures = {"mean_cm": errors.mean_m * CM_PER_M} | (
+        {} if rmse_m is None else {"rmse_cm": rmse_m * CM_PER_M}
+    )
+    names = [suspect.measurement for suspect, _ in gather_suspects(accuracies)]
+    return {"answer": {"model": best.model, "scheme": row.scheme, **figures, "outliers": names}}
+
+
+def models_table(accuracies: Sequence[Accuracy]) -> Table | None:
+    """Return one row for each model, the best first, or for each camera of the only one; None without any."""
+    space = in_space(accuracies)
+    lines = [(accuracy, rows) for accuracy in rank(accuracies) for rows in _rows(accuracy, len(accuracies))]
+    if not lines:
+        return None
+    crossed = any(rows[True] for _, rows in lines)
+    kind, scheme = "3D" if space else "2D", "cross-validated" if crossed else "held out"
+    figures = [f"{kind} mean", "95 % CI", "RMSE", "p95", *(["2D mean", "RMSE"] if space else ["max"])]
+    held_out = crossed and any(rows[False] for _, rows in lines)
+    figures += [f"held out {kind}"] if held_out else []
+    by_camera = len(accuracies) == 1
+    table = plain_table(f"Errors in cm, {scheme}", ["camera" if by_camera else "model"], figures)
+    for accuracy, rows in lines:
+        row = rows[crossed] or rows[False]
+        assert row is not None
+        cells = _cells(accuracy, row, space)
+        cells += [_held_out(rows[False], space)] if held_out else []
+        table.add_row(name_cell((row.camera or "(all)") if by_camera else label(accuracy.model)), *cells)
+    if not by_camera and any(told_height(accuracy.model) for accuracy, _ in lines):
+        table.caption, table.caption_justify, table.caption_style = Text(TOLD_NOTE), "left", ""
+    return table
+
+
+def _rows(accuracy: Accuracy, models: int) -> list[dict[bool, CameraEvaluation | None]]:
+    """Return the rows against the tape, by whether they are cross-validated: of all cameras, or of each."""
+    if models > 1:
+        pooled = {crossed: overall(accuracy, crossed) for crossed in (True, False)}
+        return [pooled] if any(pooled.values()) else []
+    by_camera: dict[str, dict[bool, CameraEvaluation | None]] = {}
+    for crossed in (True, False):
+        for row in accuracy.rows(crossed):
+            if row.against != _TRUTH:
+                by_camera.setdefault(row.camera, {True: None, False: None})[crossed] = row
+    return list(by_camera.values())
+
+
+def _cells(accuracy: Accuracy, row: CameraEvaluation, space: bool) -> list[str]:
+    errors = judged(row, space)
+    cells = [_two(errors.mean_m), format_interval(errors), _two(accuracy.rmse_m(row, errors))]
+    cells.append(_two(errors.p95_m))
+    if space:
+        return [*cells, _two(row.error_2d.mean_m), _two(accuracy.rmse_m(row, row.error_2d))]
+    return [*cells, _two(errors.max_m)]
+
+
+def _held_out(row: CameraEvaluation | None, space: bool) -> str:
+    return "-" if row is None else _two(judged(row, space).mean_m)
+
+
+def _two(value_m: float | None) -> str:
+    """Return a length in cm with two digits behind the point, and none where a column would burst."""
+    if value_m is None:
+        return "-"
+    value_cm = value_m * CM_PER_M
+    return f"{value_cm:.2f}" if value_cm < 100 else f"{value_cm:.0f}"

@@ -1,0 +1,307 @@
+"""Fit a marker of which glare, a shadow or a cover hides a part: three good sides and the cells are a marker.
+
+Edges that are not where the others say, or not shaped as edges are, count for nothing. A side that is hidden
+along its whole length looks like a good one that lies elsewhere: the fit is therefore tried without each
+of the four sides, and the one that leaves the least is taken. The lens is known, so that a pose has six
+freedoms, which the other sides and the edges between cells determine; the corners beside a hidden side follow
+from the pose, and their covariance from that of the pose.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from typing import NamedTuple
+
+import numpy as np
+from numpy.typing import NDArray
+
+from ipsys_log.messages import CameraCalibration
+from ipsys_log.stages.detect.adjustment import (
+    Fit,
+    Guess,
+    into_poses,
+    known_unknowns,
+    moves,
+    outline,
+    solve,
+    whole,
+)
+from ipsys_log.stages.detect.decode import Grey
+from ipsys_log.stages.detect.pattern import compare_pattern
+from ipsys_log.stages.detect.prints import Prints, lay_out
+from ipsys_log.stages.detect.profiles import Poses, View, locate, read_profiles
+from ipsys_log.stages.detect.steps import (
+    TAPS,
+    Steps,
+    exact_steps,
+    masked_median,
+    rough_steps,
+    usual_blur,
+)
+
+__all__ = ["Rejection", "fit_partly"]
+
+Array = NDArray[np.float64]
+Mask = NDArray[np.bool_]
+
+# The sides of a square, and none.
+_WITHOUT = (None, 0, 1, 2, 3)
+_FAR_PX, _NEAR_PX, _OF_CELL = 12.0, 3.0, 0.45
+# Passes with far profiles, and with near ones: before the better of two poses is known, and after.
+_ROUGH, _EXACT, _FINAL = 3, 2, 2
+_REWEIGHTED = 3
+_SHORT_PX = 8.0
+# Tukey's biweight: where weights end, in standard deviations and at least.
+_CUT, _CUT_PX, _CUT_ROUGH, _CUT_ROUGH_OF_REACH = 4.0, 0.08, 3.0, (0.36, 0.24, 0.15)
+# Edges farther off than that, in px, cost as much as those that are not there.
+_COSTLY_PX = 0.4
+# A side is disturbed as a whole where it lies off by so many standard deviations, and px.
+_DISTURBED, _DISTURBED_PX = 6.0, 0.06
+_CHEAPER, _ALIKE_POSES = 0.03, 0.06
+# A side is seen by this share of its edges; all edges together by that; and what they may cost.
+_SEEN, _SEEN_OF_ALL, _COST = 0.3, 0.4, 0.7
+_MOST_UNCERTAIN_PX = 1.0
+# In cells of fewer px, edges disturb one another.
+_LEAST_CELL_PX = 2.2
+# Errors of neighbouring edges are alike, more than least squares takes them to be.
+_ALIKE = 1.7
+
+
+class Rejection(NamedTuple):
+    """A marker that is seen and cannot be measured, its corners (4, 2) in px, and the reason."""
+
+    id: int
+    corners_px: Array
+    reason: str
+
+
+def fit_partly(
+    grey: Grey,
+    guesses: Sequence[Guess],
+    dictionary: str,
+    lens: CameraCalibration,
+    edge_offset_px: float | None = None,
+    row_time_s: float = 0.0,
+    blur_px: float | None = None,
+    near: bool = False,
+) -> Fit | Rejection | None:
+    """Fit one marker to what is visible of it.
+
+    Parameters
+    ----------
+    guesses : poses that it may have, the likelier one first.
+    grey, dictionary, lens, edge_offset_px, row_time_s, blur_px : as for
+        :func:`ipsys_log.stages.detect.edges.fit_edges`.
+    near : whether the guesses are right to a pixel or two.
+
+    Returns
+    -------
+    The fit; a rejection where cells show this id and the pose cannot be determined; or None where there is no
+    such marker.
+    """
+    guesses = [guess for guess in guesses if into_poses([guess]).possible()[0]]
+    if not guesses:
+        return None
+    trial = _Trial(grey, lens, dictionary, guesses, edge_offset_px, row_time_s, blur_px, near)
+    return trial.judge(trial.settle())
+
+
+class _State(NamedTuple):
+    """Hypotheses: poses and motions (m, 3), and the side that each leaves out, (m,), -1 for none."""
+
+    poses: Poses
+    motions: Array
+    without: NDArray[np.int_]
+
+    def only(self, chosen: NDArray[np.intp]) -> _State:
+        poses = Poses(self.poses.rotations[chosen], self.poses.centres[chosen])
+        return _State(poses, self.motions[chosen], self.without[chosen])
+
+
+class _Solved(NamedTuple):
+    """Least squares of hypotheses: as for :func:`~ipsys_log.stages.detect.adjustment.solve`.
+
+    ``left_px`` (m, s) is left of the edges, ``costs`` (m,) is their mean cost, those of a side that is left
+    out excepted.
+    """
+
+    rows: Array
+    normal: Array
+    unknowns: Array
+    weights: Array
+    left_px: Array
+    clear: Mask
+    costs: Array
+    blur_px: float
+
+    def variance_px2(self, n: int) -> float:
+        """Return the variance of an edge's place about a fit."""
+        weights = self.weights[n]
+        freedoms = max(float(weights.sum()) - self.rows.shape[1], 1.0)
+        return float((weights * self.left_px[n] ** 2).sum()) / freedoms
+
+
+class _Trial:
+    """One marker, tried with several poses, and with and without each of its sides."""
+
+    def __init__(
+        self,
+        grey: Grey,
+        lens: CameraCalibration,
+        dictionary: str,
+        guesses: Sequence[Guess],
+        edge_offset_px: float | None,
+        row_time_s: float,
+        blur_px: float | None,
+        near: bool,
+    ) -> None:
+        self._grey, self._lens, self._dictionary = grey, lens, dictionary
+        self._row_time_s, self._blur_px = row_time_s, blur_px
+        self._guesses, self._id = guesses, guesses[0].id
+        self._unknowns = 9 if row_time_s else 7
+        self._edge_offset_px = edge_offset_px
+        self._first = _ROUGH - 1 if near else 0
+        prints = lay_out(dictionary, (self._id,))
+        self._sides = (prints.by_side[0] > 0).T
+        self._real = prints.polarity[0] != 0
+
+    def settle(self) -> tuple[_State, _Solved]:
+        """Return the five hypotheses of the better pose, and what is left of each."""
+        guesses = [guess for guess in self._guesses for _ in _WITHOUT]
+        self._known, self._hold = known_unknowns(guesses, self._edge_offset_px)
+        without = np.array([-1 if side is None else side for _ in self._guesses for side in _WITHOUT])
+        state = _State(into_poses(guesses), self._known[:, 7:], without)
+        for number in range(self._first, _ROUGH + _EXACT):
+            state, solved = self._move(state, number)
+        # Of poses that look alike the first is the likelier one.
+        costs = solved.costs.reshape(-1, len(_WITHOUT)).min(axis=1)
+        best = int(costs.argmin()) if costs.min() < costs[0] - _ALIKE_POSES else 0
+        chosen = np.arange(len(_WITHOUT)) + best * len(_WITHOUT)
+        self._known, self._hold = self._known[chosen], self._hold[chosen]
+        state = state.only(chosen)
+        for _ in range(_FINAL):
+            state, solved = self._move(state, _ROUGH + _EXACT)
+        return state, solved
+
+    def _move(self, state: _State, number: int) -> tuple[_State, _Solved]:
+        """Return hypotheses after one pass of least squares, and what it left before they moved."""
+        count = len(state.without)
+        view = View(
+            self._grey, self._lens, lay_out(self._dictionary, (self._id,) * count), self._row_time_s, None
+        )
+        sites = locate(view, state.poses, state.motions)
+        steps, blur_px, least_px = self._steps(view, sites, number)
+        used = np.where(state.without[:, None] >= 0, ~self._sides[state.without], True)
+        rows = moves(view.prints, state.poses.camera(), sites.slopes, sites.late)[:, : self._unknowns]
+        off_px = steps.off_px
+        if self._row_time_s:
+            off_px = off_px + (state.motions[:, None, :2] @ rows[:, 7:])[:, 0]
+        known, hold = self._known[:, : self._unknowns], self._hold[:, : self._unknowns]
+        clear = steps.clear & used
+        weights = clear.astype(np.float64)
+        for _ in range(_REWEIGHTED):
+            normal, unknowns = solve(rows, weights, off_px, known, hold)
+            left_px = off_px - (unknowns[:, None] @ rows)[:, 0]
+            spread_px = 1.4826 * masked_median(np.abs(left_px), clear)
+            cut_px = np.maximum((_CUT if number >= _ROUGH else _CUT_ROUGH) * spread_px, least_px)
+            weights = clear * _biweight(left_px / cut_px)
+        cost = np.where(clear, 1.0 - _biweight(left_px / _COSTLY_PX), 1.0)
+        counted = used & self._real
+        costs = (cost * counted).sum(axis=1) / counted.sum(axis=1)
+        shift_px = np.abs((unknowns[:, None, :6] @ rows[:, :6])[:, 0]).max(axis=1)
+        short = np.minimum(1.0, _SHORT_PX / np.maximum(shift_px, _SHORT_PX))
+        moved = state.poses.moved(unknowns[:, :6] * short[:, None])
+        poses = moved.where(moved.possible(), state.poses)
+        motions = state.motions
+        if self._row_time_s:
+            motions = np.concatenate([unknowns[:, 7:], motions[:, 2:]], axis=1)
+        solved = _Solved(rows, normal, unknowns, weights, left_px, steps.clear, costs, blur_px)
+        return _State(poses, motions, state.without), solved
+
+    def _steps(self, view: View, sites, number: int) -> tuple[Steps, float, float]:
+        """Return the steps at edges, how blurred they are, and where weights end at the nearest."""
+        farthest_px = _FAR_PX if number < _ROUGH else _NEAR_PX
+        cell_px = float(np.quantile(sites.slopes[0], 0.2)) / view.prints.cells
+        reach_px = round(min(max(_OF_CELL * cell_px, 0.8), farthest_px), 1)
+        profiles = read_profiles(view.grey, sites, np.full((len(sites.slopes), 1), reach_px), TAPS)
+        if number < _ROUGH:
+            return rough_steps(view.prints, profiles, reach_px), 0.0, _CUT_ROUGH_OF_REACH[number] * reach_px
+        blur_px = self._blur_px
+        if blur_px is None:
+            blur_px = usual_blur(view.prints, profiles[0], reach_px)
+            if number > _ROUGH:
+                self._blur_px = blur_px
+        return exact_steps(view.prints, profiles, reach_px, blur_px), blur_px, _CUT_PX
+
+    def judge(self, settled: tuple[_State, _Solved]) -> Fit | Rejection | None:
+        """Return what the best hypothesis is worth."""
+        state, solved = settled
+        n = self._choose(state, solved)
+        view = View(self._grey, self._lens, lay_out(self._dictionary, (self._id,)), self._row_time_s, None)
+        corners_px, slopes, levels = outline(view, state.only(np.array([n])).poses)
+        agreement = compare_pattern(levels[0], self._dictionary, self._id)
+        if not whole(corners_px, self._grey)[0] or not agreement.likely:
+            return None
+        if not agreement.clear:
+            what = _hider(levels[0], view.prints)
+            return Rejection(self._id, corners_px[0], f"{what} hides too many of its cells")
+        cell_px = _width_px(corners_px[0]) / view.prints.cells
+        if cell_px < _LEAST_CELL_PX:
+            reason = f"its cells are only {cell_px:.1f} px wide, and some of its edges are disturbed"
+            return Rejection(self._id, corners_px[0], reason)
+        weights = solved.weights[n]
+        seen = [float(weights[side].sum() / side.sum()) for side in self._sides]
+        lost = sum(share < _SEEN for share in seen)
+        if lost > 1 or weights.sum() < _SEEN_OF_ALL * self._real.sum():
+            where = f"{lost} of its 4 sides" if lost > 1 else "most of its edges"
+            return Rejection(self._id, corners_px[0], f"{_hider(levels[0], view.prints)} hides {where}")
+        covariance_px2 = self._covariance(solved, n, slopes[0])
+        if solved.costs[n] > _COST or np.diag(covariance_px2).max() > _MOST_UNCERTAIN_PX**2:
+            return Rejection(self._id, corners_px[0], "its edges are too disturbed to fit a flat square")
+        pose = Guess(self._id, state.poses.rotations[n], state.poses.centres[n])
+        spread_px = float(np.sqrt(solved.variance_px2(n)))
+        offset_px = float(solved.unknowns[n, 6])
+        return Fit(pose, corners_px[0], covariance_px2, offset_px, spread_px, solved.blur_px, True)
+
+    def _choose(self, state: _State, solved: _Solved) -> int:
+        """Return the hypothesis with all sides, or the one without a side that is disturbed as a whole."""
+        n = 1 + int(solved.costs[1:].argmin())
+        if solved.costs[0] > solved.costs[n] + _CHEAPER:
+            return n
+        side = self._sides[state.without[n]] & solved.clear[n]
+        if np.count_nonzero(side) < 2:
+            return 0
+        off_px = solved.left_px[n][side]
+        polarity = lay_out(self._dictionary, (self._id,)).polarity[0][side]
+        row = (solved.rows[n][:, side] * polarity).mean(axis=1)
+        mean_px = float((off_px * polarity).mean())
+        variance = 1 / len(off_px) + float(row @ np.linalg.solve(solved.normal[n], row))
+        sigma_px = float(np.sqrt(solved.variance_px2(n) * variance))
+        return n if abs(mean_px) > max(_DISTURBED * sigma_px, _DISTURBED_PX) else 0
+
+    def _covariance(self, solved: _Solved, n: int, slopes: Array) -> Array:
+        """Return the covariance (8, 8) of the corners, in px^2."""
+        inverse = np.linalg.inv(solved.normal[n])
+        rows, weights = solved.rows[n], solved.weights[n]
+        of_unknowns = inverse @ ((rows * weights**2) @ rows.T) @ inverse * solved.variance_px2(n)
+        return np.asarray(_ALIKE * slopes @ of_unknowns[:6, :6] @ slopes.T, dtype=np.float64)
+
+
+def _biweight(shares: Array) -> Array:
+    """Return Tukey's weights of residuals in shares of where weights end."""
+    return np.asarray((1.0 - np.minimum(shares * shares, 1.0)) ** 2)
+
+
+def _width_px(corners_px: Array) -> float:
+    """Return the width of a square seen foreshortened, corners (4, 2): its area over its longest side."""
+    (x, y), (next_x, next_y) = corners_px.T, np.roll(corners_px, -1, axis=0).T
+    longest = np.hypot(next_x - x, next_y - y).max()
+    return float(abs((x * next_y - next_x * y).sum()) / 2 / max(longest, 1e-9))
+
+
+def _hider(levels: Array, prints: Prints) -> str:
+    """Return what hides a part of a marker, by the levels of its cells."""
+    white = prints.white[0]
+    middle = (np.median(levels[white]) + np.median(levels[~white])) / 2
+    bright, dark = np.count_nonzero(levels[~white] > middle), np.count_nonzero(levels[white] < middle)
+    return "glare" if bright > dark else "a shadow or an object"

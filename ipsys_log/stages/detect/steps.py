@@ -1,0 +1,105 @@
+"""Steps in profiles across the edges of a print that may lie in glare, in a shadow or under a cover.
+
+A profile far to both sides shows about where an edge is. A near one shows it exactly, and by its shape
+whether it is one undisturbed edge: glare that begins there, or that saturates the white, leaves another.
+"""
+
+from __future__ import annotations
+
+from functools import cache
+from typing import NamedTuple
+
+import numpy as np
+from numpy.typing import NDArray
+from scipy.special import ndtr
+
+from ipsys_log.stages.detect.prints import Prints
+from ipsys_log.stages.detect.profiles import BLURS_PX, LEAST_CONTRAST
+
+__all__ = ["TAPS", "Steps", "exact_steps", "masked_median", "rough_steps", "usual_blur"]
+
+Array = NDArray[np.float64]
+
+TAPS = np.linspace(-1, 1, 13)
+# Of the median height: what rises by less is another thing, or none.
+_WEAK, _WEAK_ROUGH = 0.3, 0.25
+# RMS of a profile about its step, in heights of the step; and in medians of that over all edges.
+_MISSHAPEN, _MISSHAPEN_SURELY, _ODD = 0.02, 0.12, 3.0
+# An edge farther out in its profile is cut off.
+_CENTRAL = 0.6
+# Shorter profiles cannot tell a slope of the light from a step.
+_LONG_PX = 2.5
+
+
+class Steps(NamedTuple):
+    """By how much edges lie off, (m, s) in px, and which of them are clear, (m, s)."""
+
+    off_px: Array
+    clear: NDArray[np.bool_]
+
+
+def masked_median(values: Array, mask: NDArray[np.bool_]) -> Array:
+    """Return the medians, (m, 1), of what a mask shows of (m, s); 0.0 where it shows nothing."""
+    count = np.count_nonzero(mask, axis=1)
+    ordered = np.sort(np.where(mask, values, np.inf), axis=1)
+    median = np.take_along_axis(ordered, np.maximum(count - 1, 0)[:, None] // 2, axis=1)
+    return np.where(count[:, None] > 0, median, 0.0)
+
+
+def rough_steps(prints: Prints, profiles: Array, reach_px: float) -> Steps:
+    """Return the steepest rises of profiles (m, s, t) that reach far to both sides."""
+    rises = np.maximum((profiles[..., 2:] - profiles[..., :-2]) * prints.polarity[..., None], 0.0)
+    steepest = rises.argmax(axis=2)[..., None]
+    height = np.take_along_axis(rises, steepest, axis=2)[..., 0]
+    around = rises * (np.abs(np.arange(rises.shape[2]) - steepest) <= 1)
+    off_px = (around @ TAPS[1:-1]) / np.maximum(around.sum(axis=2), 1e-6) * reach_px
+    real = prints.polarity != 0
+    least = np.maximum(_WEAK_ROUGH * masked_median(height, real), LEAST_CONTRAST)
+    return Steps(off_px, real & (height > least))
+
+
+def exact_steps(prints: Prints, profiles: Array, reach_px: float, blur_px: float) -> Steps:
+    """Return where profiles (m, s, t) have a blurred step, on light that may slope."""
+    steps, inverse = _shapes(reach_px, blur_px)
+    fitted = profiles @ inverse.T
+    misshapen = np.sqrt(np.square(profiles - fitted @ steps.T).mean(axis=2))
+    height = fitted[..., 1] * prints.polarity
+    real = (prints.polarity != 0) & (height > LEAST_CONTRAST)
+    real &= height > _WEAK * masked_median(height, real)
+    misshapen = np.divide(misshapen, height, out=np.ones_like(height), where=real)
+    off_px = np.divide(fitted[..., 2], fitted[..., 1], out=np.zeros_like(height), where=real)
+    real &= (np.abs(off_px) < _CENTRAL * reach_px) & (misshapen < _MISSHAPEN_SURELY)
+    usual = masked_median(misshapen, real)
+    return Steps(off_px, real & (misshapen < np.maximum(_ODD * usual, _MISSHAPEN)))
+
+
+def usual_blur(prints: Prints, profiles: Array, reach_px: float) -> float:
+    """Return by how many px the edges of one marker are blurred, from profiles (s, t) across them."""
+    rising = profiles * prints.polarity[0][:, None]
+    heights = rising[:, -1] - rising[:, 0]
+    real = heights > LEAST_CONTRAST
+    real &= heights > 0.5 * masked_median(heights[None], real[None])[0]
+    if not real.any():
+        return BLURS_PX[len(BLURS_PX) // 5]
+    shapes = (rising[real] - rising[real].mean(axis=1)[:, None]) / heights[real][:, None]
+    left = _residues(reach_px) @ np.median(shapes, axis=0)
+    return BLURS_PX[int(np.square(left).sum(axis=1).argmin())]
+
+
+@cache
+def _residues(reach_px: float) -> Array:
+    """Return what the best step of each blur leaves of a profile, (blurs, t, t)."""
+    shapes = [_shapes(reach_px, blur_px) for blur_px in BLURS_PX]
+    return np.array([np.eye(len(TAPS)) - steps @ inverse for steps, inverse in shapes])
+
+
+@cache
+def _shapes(reach_px: float, blur_px: float) -> tuple[Array, Array]:
+    """Return foot, height, shift and slope of a blurred step as profiles, (t, 3 or 4), and their inverse."""
+    x = reach_px * TAPS / blur_px
+    bell = np.exp(-(x**2) / 2) / (np.sqrt(2 * np.pi) * blur_px)
+    columns = [np.ones_like(x), ndtr(x), -bell]
+    if reach_px >= _LONG_PX:
+        columns.append(TAPS)
+    steps = np.column_stack(columns)
+    return steps, np.linalg.pinv(steps)

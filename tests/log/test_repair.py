@@ -1,0 +1,341 @@
+"""A repair saves what can be saved, loses no byte, says what it does not know, and is done or not done."""
+
+import random
+import struct
+from collections.abc import Callable
+from pathlib import Path
+
+import lz4.frame
+import pytest
+import zstandard
+from mcap import records as mcap
+from mcap.opcode import Opcode
+from mcap.reader import make_reader
+from mcap.writer import CompressionType, Writer
+
+from ipsys_log.errors import LogError
+from ipsys_log.log import LogReader, repair
+from ipsys_log.log.records import MAGIC, as_bytes
+from tests.log.conftest import IMAGE, POINT, Row, as_row, create, linear_rows, stock_rows
+from tests.log.crash import Recorder, crashes
+from tests.log.damage import non_seeking_rows
+
+START_NS = 1_700_000_000_000_000_000
+
+
+def read(path: Path) -> list[Row]:
+    with LogReader(path) as reader:
+        return [as_row(message) for message in reader.messages()]
+
+
+def agree(path: Path) -> list[Row]:
+    """Read with all readers, which must find the same; repair it again, which must change nothing."""
+    rows = sorted(read(path))
+    for other in (stock_rows, linear_rows, non_seeking_rows):
+        assert sorted(other(path)) == rows
+    before = path.read_bytes()
+    assert not repair(path).changed
+    assert path.read_bytes() == before
+    return rows
+
+
+def rows_of(count: int) -> list[Row]:
+    chance = random.Random(count)
+    rows: list[Row] = []
+    for k in range(count):
+        now = START_NS + k * 50_000_000
+        rows.append(("/image/0", now, now, chance.randbytes(700)))
+        rows.append(("/points", now + 1, now, chance.randbytes(20)))
+    return rows
+
+
+def record_at(data: bytes | bytearray, opcode: int, number: int = 0) -> tuple[int, int]:
+    """Where a record of the data section begins and ends."""
+    position = 8
+    while position < len(data):
+        kind, length = struct.unpack_from("<BQ", data, position)
+        if kind == opcode:
+            if number == 0:
+                return position, position + 9 + length
+            number -= 1
+        position += 9 + length
+    raise AssertionError(opcode)
+
+
+def test_repair_zeroed_index_body_is_written_again(tmp_path: Path) -> None:
+    """A sector of zeros that begins inside a message index: an index of channel 0 without rows."""
+    rows = rows_of(200)
+    path = create(tmp_path / "a.mcap", rows)
+    data = bytearray(path.read_bytes())
+    start, end = record_at(data, Opcode.MESSAGE_INDEX)
+    data[start + 9 : min(end, start + 9 + 512)] = bytes(min(end, start + 9 + 512) - start - 9)
+    path.write_bytes(data)
+    report = repair(path)
+    assert agree(path) == sorted(rows)
+    assert (report.gone, report.uncounted) == ({}, False)
+
+
+@pytest.mark.parametrize("finished", [True, False])
+@pytest.mark.parametrize("what", ["schema id", "channel id", "schema record"])
+def test_repair_lost_definition_keeps_messages(what: str, finished: bool, tmp_path: Path) -> None:
+    """Under their topics where the summary says them, or where only one bit of an id differs."""
+    rows = rows_of(60)
+    path = create(tmp_path / "a.mcap", rows)
+    data = bytearray(path.read_bytes())
+    if not finished:
+        del data[record_at(data, Opcode.DATA_END)[0] :]
+    channel, _ = record_at(data, Opcode.CHANNEL)
+    schema, end = record_at(data, Opcode.SCHEMA)
+    if what == "schema record":
+        data[schema:end] = bytes(end - schema)
+    else:
+        data[channel + (11 if what == "schema id" else 9)] ^= 1 << 5
+    path.write_bytes(data)
+    repair(path)
+    got = agree(path)
+    assert [row[1:] for row in sorted(got, key=lambda row: row[1])] == [row[1:] for row in rows]
+    assert got == sorted(rows)
+    if finished:
+        with LogReader(path) as reader:
+            assert reader.channels["/image/0"].schema == IMAGE
+            assert reader.channels["/points"].schema == POINT
+
+
+def test_repair_zeroed_beginning_keeps_every_message(tmp_path: Path) -> None:
+    """Without a summary nobody knows the topics; the messages are there under others."""
+    rows = rows_of(60)
+    path = create(tmp_path / "a.mcap", rows)
+    data = bytearray(path.read_bytes())
+    end = record_at(data, Opcode.CHUNK)[0]
+    data[:end] = bytes(end)
+    path.write_bytes(data)
+    repair(path)
+    assert agree(path) == sorted(rows)
+    data = data[: record_at(MAGIC + bytes(path.read_bytes()[8:]), Opcode.DATA_END)[0]]
+    path.write_bytes(data)
+    repair(path)
+    assert [row[1:] for row in sorted(agree(path), key=lambda row: row[1])] == [row[1:] for row in rows]
+    with LogReader(path) as reader:
+        assert set(reader.channels) == {"/lost/1", "/lost/2"}
+
+
+def one_chunk_log(path: Path, compression: CompressionType, count: int = 3000) -> list[Row]:
+    chance = random.Random(5)
+    rows: list[Row] = []
+    with path.open("wb") as file:
+        writer = Writer(file, chunk_size=1 << 30, compression=compression)
+        writer.start()
+        channel = writer.register_channel("/a", "json", writer.register_schema("A", "jsonschema", b"{}"))
+        for k in range(count):
+            data = f'{{"x": {chance.random()}, "number": {k}}}'.encode()
+            writer.add_message(channel, START_NS + k, data, START_NS + k)
+            rows.append(("/a", START_NS + k, START_NS + k, data))
+        writer.finish()  # type: ignore[no-untyped-call]
+    return rows
+
+
+def whole_messages(data: bytes) -> int:
+    """Messages in the records of a chunk that ends somewhere."""
+    position = count = 0
+    while position + 9 <= len(data):
+        opcode, length = struct.unpack_from("<BQ", data, position)
+        position += 9 + length
+        count += opcode == Opcode.MESSAGE and position <= len(data)
+    return count
+
+
+NAMES = {CompressionType.ZSTD: "zstd", CompressionType.LZ4: "lz4", CompressionType.NONE: ""}
+UNPACK: dict[CompressionType, Callable[[bytes], bytes]] = {
+    CompressionType.ZSTD: lambda data: zstandard.ZstdDecompressor().decompressobj().decompress(data),
+    CompressionType.LZ4: lambda data: lz4.frame.LZ4FrameDecompressor().decompress(data),
+    CompressionType.NONE: lambda data: data,
+}
+
+
+@pytest.mark.parametrize("compression", CompressionType)
+def test_repair_cut_chunk_keeps_what_streams_out(compression: CompressionType, tmp_path: Path) -> None:
+    path = tmp_path / "a.mcap"
+    rows = one_chunk_log(path, compression, 8000)
+    data = path.read_bytes()
+    start, end = record_at(data, Opcode.CHUNK)
+    cut = start + (end - start) * 4 // 5
+    path.write_bytes(data[:cut])
+    expected = whole_messages(UNPACK[compression](data[start + 49 + len(NAMES[compression]) : cut]))
+    report = repair(path)
+    assert agree(path) == sorted(rows[:expected])
+    assert 5000 < expected < 8000
+    assert (report.messages_kept, report.unchecked) == (expected, expected)
+    assert report.uncounted
+    assert report.bytes_lost > 0
+    assert restored(path, report.kept_in, cut) == data[:cut]
+
+
+@pytest.mark.parametrize("compression", CompressionType)
+def test_repair_hole_in_chunk_keeps_its_beginning(compression: CompressionType, tmp_path: Path) -> None:
+    """In the middle of a log: what was in the chunk is known by its index, and saved up to the hole."""
+    path = tmp_path / "a.mcap"
+    rows = one_chunk_log(path, compression)
+    data = bytearray(path.read_bytes())
+    start, end = record_at(data, Opcode.CHUNK)
+    hole = (start + (end - start) * 3 // 4) // 512 * 512
+    data[hole : hole + 512] = bytes(512)
+    path.write_bytes(data)
+    report = repair(path)
+    got = agree(path)
+    assert got == rows[: len(got)]
+    assert len(got) > 1000
+    assert report.gone == {"/a": len(rows) - len(got)}
+    assert list(report.lost["/a"]) == [row[1] for row in rows[len(got) :]]
+    assert (report.uncounted, report.unchecked) == (False, len(got))
+    assert restored(path, report.kept_in, len(data)) == data
+
+
+def test_repair_wrong_crc_takes_no_message(tmp_path: Path) -> None:
+    """Nobody knows which message is damaged: none is taken for right, and all are named."""
+    path = tmp_path / "a.mcap"
+    rows = one_chunk_log(path, CompressionType.NONE, 50)
+    data = bytearray(path.read_bytes())
+    data[data.index(b'"number": 30')] ^= 1
+    path.write_bytes(data)
+    report = repair(path)
+    assert agree(path) == []
+    assert report.gone == {"/a": len(rows)}
+    assert "not known which" in str(report.notes)
+
+
+def restored(path: Path, kept_in: Path | None, size: int) -> bytes:
+    """The damaged log, from the repaired one and the bytes that were taken out."""
+    assert kept_in is not None
+    data = bytearray(path.read_bytes()[:size])
+    with kept_in.open("rb") as file:
+        pieces = [(int(a.name.split()[1]), a.data) for a in make_reader(file).iter_attachments()]
+    for offset, old in sorted(pieces):
+        data[offset : offset + len(old)] = old
+    return bytes(data)
+
+
+def test_repair_twice_keeps_the_bytes_of_both(tmp_path: Path) -> None:
+    path = create(tmp_path / "a.mcap", rows_of(80))
+    damaged = []
+    for number in (1, 3):
+        data = bytearray(path.read_bytes())
+        start, end = record_at(data, Opcode.CHUNK, number)
+        data[(start + end) // 2] ^= 0xFF
+        path.write_bytes(data)
+        damaged.append((bytes(data), repair(path).kept_in))
+    assert [kept.name for _, kept in damaged if kept] == ["a.mcap.damaged", "a.mcap.damaged_2"]
+    assert restored(path, damaged[1][1], len(damaged[1][0])) == damaged[1][0]
+
+
+def test_repair_without_room_changes_nothing(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    path = create(tmp_path / "a.mcap", rows_of(80))
+    data = path.read_bytes()[:-4000]
+    path.write_bytes(data)
+    monkeypatch.setattr("shutil.disk_usage", lambda _: type("Usage", (), {"free": 5_000})())
+    with pytest.raises(LogError, match=r"cannot be repaired: .* kept beside it.* free some space"):
+        repair(path)
+    assert path.read_bytes() == data
+    assert [*tmp_path.iterdir()] == [path]
+
+
+def test_repair_that_would_not_converge_is_not_done(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    path = create(tmp_path / "a.mcap", rows_of(80))
+    data = path.read_bytes()[:-4000]
+    path.write_bytes(data)
+    monkeypatch.setattr(repair_module_of(), "count_by_indexes", lambda _: 7)
+    with pytest.raises(LogError, match=r"cannot be made whole .*left as it was"):
+        repair(path)
+    assert path.read_bytes() == data
+    assert [*tmp_path.iterdir()] == [path]
+
+
+def repair_module_of() -> object:
+    import sys
+
+    return sys.modules["ipsys_log.log.repair"]
+
+
+def test_repair_cut_at_every_point_is_old_or_new(tmp_path: Path) -> None:
+    """A loss of power during a repair: repaired again, the log is what it would have been, and its old
+    bytes are kept."""
+    path = create(tmp_path / "a.mcap", rows_of(25))
+    data = bytearray(path.read_bytes())
+    start, end = record_at(data, Opcode.CHUNK, 1)
+    data[(start + end) // 2] ^= 0xFF
+    definition, stop = record_at(data, Opcode.SCHEMA)
+    data[definition:stop] = bytes(stop - definition)
+    old = bytes(data)
+    path.write_bytes(old)
+    storage = Recorder()
+    storage.know(path)
+    kept = repair(path, storage=storage).kept_in
+    assert kept is not None
+    new, kept_bytes = path.read_bytes(), restored(path, kept, len(old))
+    assert kept_bytes == old
+    folder = tmp_path / "crashed"
+    folder.mkdir()
+    log = folder / "a.mcap"
+    seen = set()
+    for cut, disk in crashes({"a.mcap": old}, storage.operations, random.Random(3), tries=3):
+        disk.store(folder)
+        if tuple(sorted((name, bytes(disk.files[number])) for name, number in disk.names.items())) in seen:
+            continue
+        repair(log)
+        assert log.read_bytes() == new, f"after {cut} operations"
+        names = sorted(file.name for file in folder.iterdir())
+        assert names == ["a.mcap", "a.mcap.damaged"], f"after {cut} operations"
+        assert restored(log, folder / "a.mcap.damaged", len(old)) == old
+        seen.add(cut)
+    assert len(seen) > 10
+
+
+def test_repair_record_types_that_stray_are_passed_over(tmp_path: Path) -> None:
+    """A second definition of one id, an index of no chunk, and a message of no channel."""
+    rows = rows_of(20)
+    path = create(tmp_path / "a.mcap", rows)
+    data = path.read_bytes()
+    at = record_at(data, Opcode.CHUNK)[0]
+    stray = as_bytes(
+        mcap.Channel(1, "/other", "protobuf", {}, 1),
+        mcap.MessageIndex(0, []),
+        mcap.Message(77, 5, b"x", 5, 0),
+    )
+    path.write_bytes(data[:at] + stray + data[at : record_at(data, Opcode.DATA_END)[0]])
+    repair(path)
+    assert agree(path) == sorted(rows)
+
+
+def test_repair_small_bomb_takes_little_memory(tmp_path: Path) -> None:
+    """A cut chunk of 1 GiB of zeros in 33 kB."""
+    import tracemalloc
+
+    path = create(tmp_path / "a.mcap", rows_of(5))
+    data = path.read_bytes()
+    end = record_at(data, Opcode.DATA_END)[0]
+    bomb = zstandard.ZstdCompressor().compress(bytes(1 << 30))
+    chunk = as_bytes(mcap.Chunk("zstd", bomb, 1, 1, 0, 1 << 30))
+    path.write_bytes(data[:end] + chunk[:-20])
+    tracemalloc.start()
+    try:
+        repair(path)
+        assert tracemalloc.get_traced_memory()[1] < 64 << 20
+    finally:
+        tracemalloc.stop()
+    assert len(agree(path)) == 10
+
+
+def test_repair_hash_of_channel_is_that_of_its_messages(tmp_path: Path) -> None:
+    """A run must not be told another input than it has."""
+    path = tmp_path / "a.mcap"
+    one_chunk_log(path, CompressionType.NONE)
+    data = bytearray(path.read_bytes())
+    start, end = record_at(data, Opcode.CHUNK)
+    hole = (start + (end - start) * 3 // 4) // 512 * 512
+    data[hole : hole + 512] = bytes(512)
+    path.write_bytes(data)
+    repair(path)
+    with LogReader(path) as reader:
+        stored = reader.channel_hash("/a")
+        again = create(tmp_path / "b.mcap", [as_row(message) for message in reader.messages()])
+    with LogReader(again) as reader:
+        assert reader.channel_hash("/a") == stored

@@ -1,0 +1,193 @@
+"""The answer of an evaluation comes first, fits a terminal, and has the figures of the JSON."""
+
+from __future__ import annotations
+
+import csv
+import io
+from collections.abc import Sequence
+from dataclasses import replace
+from pathlib import Path
+
+import numpy as np
+import pytest
+from hypothesis import given
+from hypothesis import strategies as st
+from rich.console import Console
+
+from ipsys_log.log.session import Session
+from ipsys_log.messages import CameraEvaluation, Suspect
+from ipsys_log.offline.errors import POOLED
+from ipsys_log.offline.statistics import error_statistics, root_mean_square_m
+from ipsys_log.pipeline import replay
+from ipsys_log.report.accuracy import Accuracy, accuracy_json, read_accuracy
+from ipsys_log.report.csv_tables import cross_validation_csv
+from ipsys_log.report.findings import Findings
+from ipsys_log.report.summary import answer_json, answer_text, models_table
+from ipsys_log.runs.output import write_log
+from ipsys_log.runs.request import Request
+from tests.conftest import Ipsys
+from tests.report.conftest import ALL_MODELS, lab_messages, many_models, only, rename_cameras, scale
+from tests.report.test_tables import with_truth
+
+NAMES = ("[bold]x[/nothing]", "a\x1b[31mb", "white_11", "m4", "m5")
+
+
+def printed(accuracies: Sequence[Accuracy], width: int = 80) -> str:
+    """The answer and its table, as on a terminal, which does not wrap for us."""
+    file = io.StringIO()
+    console = Console(file=file, width=width, highlight=False, soft_wrap=True)
+    for part in (answer_text(accuracies), models_table(accuracies)):
+        if part is not None:
+            console.print(part)
+    return file.getvalue()
+
+
+def with_suspects(accuracy: Accuracy, count: int) -> Accuracy:
+    """The same with made-up outliers, the first one the worst."""
+    assert accuracy.evaluation is not None
+    suspects = tuple(
+        Suspect(name, ("red",), np.array([0.1 - 0.01 * n, 0.0, 0.0]), 9.0, "side", f"{n}: it lies right")
+        for n, name in enumerate(NAMES[:count])
+    )
+    return replace(accuracy, evaluation=replace(accuracy.evaluation, suspects=suspects))
+
+
+def errors_of(rows: Sequence[CameraEvaluation], row: CameraEvaluation, axes: int) -> np.ndarray:
+    """The lengths of the residuals that a row rests on."""
+    own = [one for one in rows if (one.scheme, one.against) == (row.scheme, row.against)]
+    found = [r for one in own if row.camera in (POOLED, one.camera) for r in one.residuals]
+    return np.array([np.linalg.norm((r.predicted_m - r.world_m)[:axes]) for r in found])
+
+
+def test_rmse_is_that_of_the_residuals(paper: Findings) -> None:
+    models = accuracy_json(paper.accuracies)["models"]
+    checked = 0
+    for accuracy in paper.accuracies:
+        assert accuracy.evaluation is not None
+        rows, cameras = accuracy.evaluation.cameras, models[accuracy.model]["cameras"]
+        for row in rows:
+            place = cameras[row.camera] if row.camera else models[accuracy.model]["pooled"]
+            place = place["cross_validation"] if row.scheme == "cross_validation" else place
+            for kind, axes in (("3d", 3), ("2d", 2)):
+                wanted_cm = 100 * np.sqrt(np.mean(errors_of(rows, row, axes) ** 2))
+                assert place[kind]["rmse_cm"] == pytest.approx(wanted_cm, rel=1e-9)
+                checked += 1
+    assert checked == 2 * 2 * (3 + 1) * 2
+
+
+@given(st.lists(st.floats(1e-6, 10.0), min_size=1, max_size=30), st.integers(1, 4))
+def test_rmse_follows_from_mean_and_deviation(errors_m: list[float], repeats: int) -> None:
+    drawn = np.array([errors_m] * repeats) * np.linspace(1, 2, repeats)[:, None]
+    wanted_m = float(np.sqrt((drawn**2).mean()))
+    assert root_mean_square_m(error_statistics(drawn), repeats) == pytest.approx(wanted_m, rel=1e-9)
+
+
+def test_rmse_is_in_the_table_and_the_csv(paper: Findings) -> None:
+    found = accuracy_json(paper.accuracies)["models"]["poly"]["pooled"]["cross_validation"]
+    text = printed(paper.accuracies)
+    (row,) = [line for line in text.splitlines() if line.startswith("poly ")]
+    assert f"{found['3d']['rmse_cm']:.2f}" in row.split()
+    assert f"{found['2d']['rmse_cm']:.2f}" in row.split()
+    rows = csv.DictReader(io.StringIO(cross_validation_csv(paper).decode()))
+    (line,) = [one for one in rows if (one["method"], one["camera"]) == ("poly", "all")]
+    assert line["rmse_3d_cm"] == f"{found['3d']['rmse_cm']:.3f}"
+    assert line["rmse_2d_cm"] == f"{found['2d']['rmse_cm']:.3f}"
+
+
+def test_rmse_of_unknown_repeats_is_missing(paper: Findings) -> None:
+    accuracy = paper.accuracies[0]
+    assert accuracy.evaluation is not None
+    bare = tuple(replace(row, residuals=()) for row in accuracy.evaluation.cameras)
+    found = replace(accuracy, evaluation=replace(accuracy.evaluation, cameras=bare))
+    pooled = accuracy_json([found])["models"][accuracy.model]["pooled"]
+    assert "rmse_cm" not in pooled["cross_validation"]["3d"]
+    assert "rmse_cm" in pooled["3d"]
+    assert "-" in printed([found])
+
+
+def test_answer_names_model_error_and_outliers_first(paper: Findings) -> None:
+    accuracies = [with_suspects(a, 5) if a.model == "poly" else a for a in paper.accuracies]
+    first, *rest = printed(accuracies, 200).splitlines()
+    assert first == "Best model: poly"
+    found = accuracy_json(accuracies)["models"]["poly"]["pooled"]["cross_validation"]["3d"]
+    assert rest[0].startswith(f"Mean position error: {found['mean_cm']:.1f} cm (95 % CI ")
+    assert f"RMSE {found['rmse_cm']:.1f} cm" in rest[0]
+    text = "\n".join(rest)
+    outliers, errors = text.index("Outliers: measure 5 points again"), text.index("Errors in cm")
+    assert outliers < text.index("white_11, 8.0 cm off: 2: it lies right") < errors
+    assert outliers < text.index("m5 (6.0 cm)") < text.index("Between rigid and poly, use rigid") < errors
+    assert "\x1b" not in text
+    assert NAMES[0] in text
+    assert answer_json(accuracies)["answer"] == {
+        "model": "poly",
+        "scheme": "cross_validation",
+        "mean_cm": found["mean_cm"],
+        "rmse_cm": found["rmse_cm"],
+        "outliers": list(NAMES),
+    }
+
+
+@pytest.mark.parametrize("truth", [False, True])
+@pytest.mark.parametrize("factor", [1.0, 30.0])
+def test_answer_of_all_models_fits_a_window(paper: Findings, truth: bool, factor: float) -> None:
+    names = {"red": "north_east_corner", "white": "middle", "black": "south_west_corner"}
+    accuracies = [rename_cameras(with_suspects(a, 5), names) for a in many_models(paper.accuracies)]
+    accuracies = [replace(a, evaluation=scale(a.evaluation, factor)) for a in accuracies if a.evaluation]
+    text = printed([with_truth(a) for a in accuracies] if truth else accuracies)
+    lines = text.splitlines()
+    assert max(map(len, (line.rstrip() for line in lines))) <= 80, text
+    assert len(lines) <= 42, text
+    assert "…" not in text
+    assert text.count("Errors in cm") == 1
+    assert all(any(line.startswith(model) for line in lines) for model in ALL_MODELS)
+    assert "With known marker heights: rayplane, " in text
+    assert ("Against the ground truth: " in text) == truth
+
+
+def test_one_model_is_answered_by_camera(paper: Findings) -> None:
+    lines = printed(only(paper, "poly").accuracies).splitlines()
+    assert lines[0] == "Model: poly"
+    assert {line.split()[0] for line in lines[-4:]} == {"red", "white", "black", "(all)"}
+
+
+def test_outliers_that_were_not_searched_are_not_none(paper: Findings) -> None:
+    searched = printed([with_suspects(a, 0) for a in only(paper, "poly").accuracies])
+    assert "Outliers: none." in searched
+    unsearched = " ".join(printed(only(paper, "rigid").accuracies).split())
+    assert (
+        "Outliers: not searched: that needs 15 points of a camera, and one of the models poly" in unsearched
+    )
+
+
+def test_nothing_judged_is_answered_with_nothing() -> None:
+    assert answer_text([]) is None
+    assert models_table([]) is None
+    assert answer_json([]) == {}
+
+
+def test_evaluate_prints_the_rest_on_request(ipsys: Ipsys, tmp_path: Path) -> None:
+    log = tmp_path / "lab.mcap"
+    write_log(log, lab_messages())
+    models = ("--model", "rigid", "--model", "poly")
+    short, full = ipsys("evaluate", log, *models), ipsys("evaluate", log, *models, "--details")
+    assert short.code == full.code == 0
+    assert short.out.startswith("Best model: ")
+    assert full.out.startswith(short.out)
+    headings = ("held-out points", "Model by the number of points per camera")
+    assert [text in short.out for text in headings] == [False, False]
+    assert [text in full.out for text in headings] == [True, True]
+    assert "--details prints" in short.err
+    assert "--details prints" not in full.err
+    with Session([log]) as session:
+        (accuracy,) = read_accuracy(session, replay([log], Request(models=("poly",)), "evaluate"))
+    for row in accuracy.rows(False):
+        assert row.error_3d is not None
+        assert not row.camera or f"{100 * row.error_3d.max_m:.3f}" in full.out
+
+
+def test_many_runs_of_a_stage_are_counted(ipsys: Ipsys, tmp_path: Path) -> None:
+    log = tmp_path / "lab.mcap"
+    write_log(log, lab_messages())
+    models = [word for name in ("rigid", "poly", "rayplane", "best", "kriging") for word in ("--model", name)]
+    assert "fit           5 runs made" in ipsys("fit", log, *models).err
+    assert "fit           5 runs up to date" in ipsys("fit", log, *models).err

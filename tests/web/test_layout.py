@@ -1,0 +1,151 @@
+"""The measuring page's layout: nothing too wide, covered, out of sight or hard to see, on any screen."""
+
+from __future__ import annotations
+
+import fcntl
+import http.server
+import threading
+from collections.abc import Iterator
+from contextlib import contextmanager
+
+import pytest
+
+from ipsys_log.runs.request import Request
+from ipsys_log.scenes.finished import opened_log
+from ipsys_log.web.serving import serving
+from tests.conftest import Unmeasured
+from tests.web.contrast import low_contrasts
+from tests.web.phone import Phone, phone
+from tests.web.test_measuring_page import Recording, save, says, texts_at
+
+PHONE, DESKTOP = (390, 844), (1280, 800)
+
+# The boxes of elements as the user sees them: what a part that scrolls hides is not seen.
+BOXES = """(() => {
+  const seen = e => {
+    const b = e.getBoundingClientRect();
+    const box = [b.left, b.top, b.right, b.bottom];
+    for (let p = e.parentElement; p; p = p.parentElement) {
+      if (getComputedStyle(p).overflowY !== "auto") continue;
+      const c = p.getBoundingClientRect();
+      box[1] = Math.max(box[1], c.top);
+      box[3] = Math.min(box[3], c.bottom);
+    }
+    return box;
+  };
+  const boxes = selector => [...document.querySelectorAll(selector)].filter(e => e.getClientRects().length).map(seen);
+  return [boxes("input:not([type=radio]), fieldset span, select"), boxes("#notice, #save"), boxes("#save")[0],
+    document.scrollingElement.scrollWidth, innerWidth, innerHeight];
+})()"""  # noqa: E501
+
+
+@pytest.fixture(scope="module")
+def browser(tmp_path_factory: pytest.TempPathFactory) -> Iterator[Phone]:
+    with phone(tmp_path_factory.mktemp("layout")) as one:
+        yield one
+
+
+def meet(one: list[float], other: list[float]) -> bool:
+    across, along = (min(one[n + 2], other[n + 2]) - max(one[n], other[n]) for n in (0, 1))
+    return across > 0 and along > 0
+
+
+def check_screen(browser: Phone) -> None:
+    """Look at the page as it is now, in both colour schemes."""
+    fields, messages, button, width, screen_width, screen_height = browser.run(BOXES)
+    assert width <= screen_width
+    assert 0 <= button[1] < button[3] <= screen_height
+    assert fields
+    assert not [(field, message) for field in fields for message in messages if meet(field, message)]
+    for scheme in ("light", "dark"):
+        browser.prefer(scheme)
+        assert low_contrasts(browser) == [], scheme
+
+
+@pytest.mark.parametrize("size", [PHONE, DESKTOP], ids=["phone", "desktop"])
+def test_every_state_of_the_page_fits_the_screen(
+    browser: Phone, unmeasured: Unmeasured, size: tuple[int, int]
+) -> None:
+    log, tape = unmeasured
+    with opened_log(log, Request()) as scene, serving(scene, port=0) as page:
+        a, b, side, height = texts_at(scene, tape, 0)
+        browser.open(page.url, size)
+        says(browser, "#sight", "lies still")
+        check_screen(browser)
+        browser.type("#d-A", a)
+        browser.type("#d-B", "1.234")
+        says(browser, "#fault-d_B", "looks like metres")
+        check_screen(browser)
+        browser.run("document.querySelector('#d-B').value = ''")
+        browser.type("#d-B", "0.5")
+        says(browser, "#verdict", "No triangle has the sides")
+        check_screen(browser)
+        browser.run("document.querySelector('#d-B').value = ''")
+        browser.type("#d-B", b)
+        browser.tap(f"#sides label:nth-of-type({1 if side == 'left' else 2})")
+        browser.type("#height", "0.1")
+        says(browser, "#save", "all the same")
+        check_screen(browser)
+        browser.run("document.querySelector('#height').value = ''")
+        browser.type("#height", height)
+        with log.open("r+b") as other:
+            fcntl.flock(other, fcntl.LOCK_EX)
+            save(browser, "p001")
+            # A path is one long word.
+            says(browser, "#notice", "another process is writing it")
+            check_screen(browser)
+        save(browser, "p001")
+        says(browser, "#notice", "p001 is in the log")
+        check_screen(browser)
+        # Nothing that has to be typed needs scrolling.
+        assert browser.run(
+            "['main', '#entry'].every(part => document.querySelector(part).scrollTop === 0)"
+            "&& document.querySelector('#height').getBoundingClientRect().bottom"
+            " < document.querySelector('#bar').getBoundingClientRect().top"
+        )
+        browser.tap("#places button")
+        says(browser, "#places", "withdrawn")
+        check_screen(browser)
+
+
+def test_desktop_shows_cameras_and_entry_side_by_side(browser: Phone) -> None:
+    with serving(Recording(), port=0) as page:
+        browser.open(page.url, DESKTOP)
+        says(browser, "#sight", "lies still")
+        seen, entry = browser.run(
+            "['#floor', '#form'].map(part => document.querySelector(part).getBoundingClientRect())"
+            ".map(box => [box.left, box.right])"
+        )
+        assert seen[1] < entry[0]
+        assert entry[1] - seen[0] > 0.9 * DESKTOP[0]
+        assert browser.run(
+            "['#seen', '#entry'].map(part => document.querySelector(part))"
+            ".every(part => part.scrollHeight <= part.clientHeight)"
+        )
+
+
+@contextmanager
+def other_program() -> Iterator[str]:
+    """Another web page of this host; its cookie goes to all ports."""
+
+    class Handler(http.server.BaseHTTPRequestHandler):
+        def do_GET(self) -> None:
+            self.send_response(200)
+            self.send_header("Set-Cookie", 'foo={"a":"b"}; Path=/')
+            self.end_headers()
+
+        def log_message(self, *_: object) -> None:
+            pass
+
+    with http.server.ThreadingHTTPServer(("127.0.0.1", 0), Handler) as server:
+        threading.Thread(target=server.serve_forever, daemon=True).start()
+        yield f"http://127.0.0.1:{server.server_port}/"
+        server.shutdown()
+
+
+def test_cookie_of_another_program_locks_no_phone_out(browser: Phone) -> None:
+    with other_program() as other, serving(Recording(), "127.0.0.1", 0) as page:
+        browser.open(other)
+        browser.open(page.url)
+        assert browser.run("location.pathname + location.search") == "/"
+        says(browser, "#sight", "lies still")

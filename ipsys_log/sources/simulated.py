@@ -49,11 +49,11 @@ class _Stopped(Exception):  # noqa: N818
 class _Pictures:
     """The pictures of a film, drawn in a thread of its own in the order in which they are needed."""
 
-    def __init__(self, name: str, make_film: Callable[[Check], Film], frame_in: Callable[[int], int]) -> None:
+    def __init__(self, name: str, make_film: Callable[[Check], Film], timing: _Timing, clock: Clock) -> None:
         self._film: Film | None = None
         self._drawn: dict[int, bytes] = {}
         self._fault: BaseException | None = None
-        self._make_film, self._frame_in = make_film, frame_in
+        self._make_film, self._timing, self._clock = make_film, timing, clock
         self._stopped = Event()
         # No daemon: Python would end such a thread within OpenCV, and that aborts the program.
         Thread(target=self._work, name=f"draws {name}", daemon=False).start()
@@ -73,13 +73,17 @@ class _Pictures:
             took_ns = 0
             while (index := next_missing(film, self._drawn, self._frame_in(took_ns))) is not None:
                 self._check()
-                start_ns = time.monotonic_ns()
+                start_ns = self._clock.now_ns()
                 self._drawn[index] = film.draw(index)
-                took_ns = time.monotonic_ns() - start_ns
+                took_ns = self._clock.now_ns() - start_ns
         except _Stopped:
             return
         except BaseException as fault:  # raised again where the frames are taken
             self._fault = fault
+
+    def _frame_in(self, later_ns: int) -> int:
+        """Return the number of the first frame that is handed over after some time from now."""
+        return self._timing.frame_at(self._clock.now_ns() + later_ns) + 1
 
     def _check(self) -> None:
         # Python waits for this thread when the program ends, also where nobody was left to stop it.
@@ -121,10 +125,7 @@ def open_simulated(camera: RigCamera, clock: Clock, say: Say) -> Iterator[Iterat
             return lab_film(lab, seat.number, check)
         return board_film(lab, seat.number, seat.board, check)
 
-    def frame_in(later_ns: int) -> int:
-        return timing.frame_at(clock.now_ns() + later_ns) + 1
-
-    pictures = _Pictures(camera.name, make_film, frame_in)
+    pictures = _Pictures(camera.name, make_film, timing, clock)
     try:
         yield _play(pictures, timing, clock)
     finally:

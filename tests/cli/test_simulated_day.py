@@ -213,11 +213,11 @@ def test_places_of_the_simulated_lab_are_measured_on_the_page(tmp_path: Path, ip
     )
     log = tmp_path / "places.mcap"
     with measuring(Lab(tmp_path / "lab.toml", tmp_path / "l.mcap", rows), log) as (program, page):
-        for row in rows[:10]:
+        for row in rows[:16]:
             assert "saved" in page.measure(row)
         program.terminate()
         program.communicate(timeout=60)
     with Session([log]) as session:
-        assert len(session.payloads(["/measurements"])) == 10
+        assert len(session.payloads(["/measurements"])) == 16
     assert ipsys("replay", log, "--model", "best").code == 0
     assert np.median(errors_m(log, "best")) < 0.02

@@ -41,7 +41,7 @@ LIVE_SETTINGS = LabSettings(
 # Most markers lie on the floor, so that a camera can be aligned by them; the others lie on boxes.
 _RAISED_SHARE, _BOXES_M = 0.35, (0.1, 0.2)
 # Past the driving markers, one that lies has to keep clear of each of their places so many times a second.
-_CHECKED_HZ = 10
+_CHECKED_HZ = 5
 # The places do not depend on the size of the frames, as long as these are wide.
 _WIDTH, _HEIGHT = 1920, 1080
 # A marker that is narrower in an image of this width may be missed in a smaller one.

@@ -358,8 +358,9 @@ def late_ranges(events: list[Event]) -> dict[str, list[tuple[float, float]]]:
     for camera in {str(event.camera) for event in events}:
         mine = [event for event in events if event.camera == camera]
         for begins, ends in zip_longest(mine[::2], mine[1::2]):
-            assert begins.end is None
-            ranges.setdefault(camera, []).append((begins.start, ends.end if ends else inf))
+            assert (begins.start is None, begins.end) == (False, None)
+            end_ns = inf if ends is None else ends.end
+            ranges.setdefault(camera, []).append((begins.start or 0, end_ns or 0))
     return ranges
 
 

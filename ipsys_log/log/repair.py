@@ -1,6 +1,5 @@
 """Making a log whole again whose writer was killed, whose end was cut off, or which is damaged inside."""
 
-import errno
 import os
 import tempfile
 import zlib
@@ -13,7 +12,7 @@ from typing import IO, NamedTuple, overload
 from mcap import records as mcap
 from mcap.opcode import Opcode
 
-from ipsys_log.errors import LogError
+from ipsys_log.errors import LogError, disk_advice
 from ipsys_log.log.agreement import count_by_indexes, disagreement
 from ipsys_log.log.bounds import BoundError
 from ipsys_log.log.crc import combine
@@ -109,9 +108,7 @@ def repair(path: str | os.PathLike[str], *, storage: Storage = DISK) -> RepairRe
             report = _rebuild(storage, view, found, saved, known)
         return replace(report, notes=(*notes, *report.notes), written_ns=status.st_mtime_ns)
     except OSError as error:
-        full = error.errno in (errno.ENOSPC, errno.EDQUOT)
-        then = "free some space" if full else "see to its disk and folder"
-        raise LogError(f"{target} cannot be repaired ({error.strerror}): {then} and try again") from None
+        raise LogError(f"{target} cannot be repaired ({error.strerror}): {disk_advice(error)}") from None
     finally:
         storage.close(fd)
 

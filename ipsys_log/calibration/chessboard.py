@@ -10,7 +10,7 @@ from numpy.typing import NDArray
 
 from ipsys_log.calibration.chessboard_grid import complete_grid, crop_grid
 
-__all__ = ["ChessboardView", "find_chessboard", "fits_in"]
+__all__ = ["ChessboardView", "find_chessboard", "find_largest_grid", "fits_in"]
 
 Array = NDArray[np.float64]
 Grey = NDArray[np.uint8]
@@ -18,8 +18,9 @@ Grey = NDArray[np.uint8]
 Size = tuple[int, int]
 
 _LARGE_PX = 1600
-_THOROUGH = cv2.CALIB_CB_EXHAUSTIVE | cv2.CALIB_CB_NORMALIZE_IMAGE | cv2.CALIB_CB_ACCURACY
-_SMALLEST = (3, 3)
+_EXHAUSTIVE = cv2.CALIB_CB_EXHAUSTIVE | cv2.CALIB_CB_NORMALIZE_IMAGE | cv2.CALIB_CB_ACCURACY
+# A larger grid that begins with one of these: the detector may begin beside the board with some of them.
+_SEEDS = ((7, 5), (5, 4), (4, 3), (3, 3))
 
 
 class ChessboardView(NamedTuple):
@@ -64,8 +65,9 @@ def find_chessboard(grey: Grey, size: Size, thorough: bool) -> ChessboardView:
         if fits_in(size, columns_rows):
             corners = crop_grid(picture, grid, size)
             return ChessboardView(corners if picture is grey else 2 * corners + 0.5, columns_rows)
-        if largest is None or np.prod(columns_rows) > np.prod(largest):
-            largest = columns_rows
+        largest = _larger(largest, columns_rows)
+        if not fits_in(columns_rows, size):
+            break  # a board of another size
     return ChessboardView(None, largest)
 
 
@@ -74,11 +76,27 @@ def fits_in(size: Size, other: Size) -> bool:
     return min(size) <= min(other) and max(size) <= max(other)
 
 
+def find_largest_grid(grey: Grey) -> Size | None:
+    """Return columns and rows of the largest grid of inner corners in a picture, or None."""
+    scale = min(1.0, _LARGE_PX / max(grey.shape))
+    small = cv2.resize(grey, None, fx=scale, fy=scale, interpolation=cv2.INTER_AREA) if scale < 1 else grey
+    largest: Size | None = None
+    for seed in _SEEDS:
+        grid = _grid(np.asarray(small, dtype=np.uint8), _Try(False, seed, cv2.CALIB_CB_LARGER))
+        if grid is not None:
+            largest = _larger(largest, (grid.shape[1], grid.shape[0]))
+    return largest
+
+
+def _larger(one: Size | None, other: Size) -> Size:
+    return other if one is None or other[0] * other[1] > one[0] * one[1] else one
+
+
 def _tries(size: Size, large: bool, thorough: bool) -> list[_Try]:
     tries = [_Try(False, size), *([_Try(True, size)] * large)]
     if thorough:
-        tries += [_Try(False, size, cv2.CALIB_CB_LARGER), _Try(False, _SMALLEST, cv2.CALIB_CB_LARGER)]
-        tries += [_Try(False, size, _THOROUGH)]
+        tries += [_Try(False, first, cv2.CALIB_CB_LARGER) for first in (size, *_SEEDS)]
+        tries += [_Try(False, size, _EXHAUSTIVE)]
     return tries
 
 

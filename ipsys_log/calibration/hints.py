@@ -11,8 +11,8 @@ import numpy as np
 
 from ipsys_log.calibration.boards import Board
 from ipsys_log.calibration.charuco_size import estimate_charuco_size
-from ipsys_log.calibration.chessboard import fits_in
-from ipsys_log.calibration.sighting import Grey, find_board, view_board
+from ipsys_log.calibration.chessboard import find_largest_grid, fits_in
+from ipsys_log.calibration.sighting import Grey, find_board
 from ipsys_log.errors import IpsysError
 
 __all__ = ["check_charuco_size", "check_chessboard_size", "hint"]
@@ -32,7 +32,12 @@ _CONTRADICTED = 0.5
 _FORCE = "if the size is right, give --force"
 
 
-def hint(pictures: Sequence[Grey], board: Board, trying: Callable[[int, int], None]) -> str:
+def hint(
+    pictures: Sequence[Grey],
+    board: Board,
+    trying: Callable[[int, int], None],
+    sizes: Sequence[Size | None] = (),
+) -> str:
     """Return the end of a sentence that says which other board is seen, or what to look after.
 
     Parameters
@@ -40,7 +45,10 @@ def hint(pictures: Sequence[Grey], board: Board, trying: Callable[[int, int], No
     pictures : to look at.
     board : that is not in them.
     trying : called with the other kinds of board tried so far, and all of them: it takes a while.
+    sizes : of the largest chessboard in each picture, if that is known.
     """
+    if any(size is not None for size in sizes) and (answer := _name_size(sizes, board, board)):
+        return answer
     if board.marker_scale is not None and (mirrored := _mirrored(pictures, board)):
         return mirrored
     searches = list(_searches(pictures, board))
@@ -128,18 +136,21 @@ def _searches(pictures: Sequence[Grey], board: Board) -> Iterator[Callable[[], s
 
 
 def _other_chessboard(pictures: Sequence[Grey], kind: Board, board: Board) -> str:
-    plain = replace(kind, columns=3, rows=3, marker_scale=None)
-    sizes = [view_board("", grey, plain, thorough=True).grid for grey in pictures]
+    return _name_size([find_largest_grid(_as_printed(grey, kind)) for grey in pictures], kind, board)
+
+
+def _name_size(sizes: Sequence[Size | None], kind: Board, board: Board) -> str:
+    """Return which chessboard of a kind is seen instead of the one asked for; nothing where there is none."""
     size = _largest_board(sizes)
     if size is None:
         return ""
-    other = _sized(plain if board.marker_scale is not None else kind, size)
+    other = _sized(replace(kind, marker_scale=None), size)
     if other == board:
         return ""
     seen = sum(_same(shown, size) for shown in sizes)
     option = f"--board {other.columns}x{other.rows}"
     turn = f" and {_inversion(board)}" if kind.inverted != board.inverted else ""
-    return f"; but {other} is seen in {seen} of {len(pictures)} tried: give {option}{turn}"
+    return f"; but {other} is seen in {seen} of {len(sizes)} tried: give {option}{turn}"
 
 
 def _other_charuco(pictures: Sequence[Grey], kind: Board, board: Board) -> str:

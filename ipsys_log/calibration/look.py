@@ -99,7 +99,7 @@ def look(
         raise IpsysError(f"{where}: none of {count} pictures can be read")
     usual = check_sizes([(one.name, one.size) for one in views], where)
     if all(one.view.sighting is None for one in views):
-        found = hint(without.pictures, board, trying)
+        found = hint(without.pictures, board, trying, [one.view.grid for one in views])
         raise NotSeenError(f"{where}: {board} is not seen in any of {count} pictures{found}")
     if not insist and board.marker_scale is None:
         check_chessboard_size([one.view.grid for one in views], board, where)

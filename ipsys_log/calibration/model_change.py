@@ -28,6 +28,8 @@ Array = NDArray[np.float64]
 # How large the new terms usually are: the radial one at the farthest corner, in focal lengths, and the others
 # per square of the distance from the principal point.
 _RADIAL, _TANGENTIAL = 0.01, 0.003
+# Terms count from so many times the chi^2 on that noise has on average: by chance, in some 10 % of fits.
+_NOISE = 2.0
 # The power of the next radial term, over the last coefficient fitted.
 _NEXT_POWER = {"kannala_brandt": 10, "plumb_bob": 8, "rational_polynomial": 8}
 
@@ -44,7 +46,7 @@ def model_change(
 ) -> Array:
     """Return the shift of the lens along ``basis`` that a richer model shows, (q,).
 
-    It is drawn to 0 as far as noise alone would show as much: terms that are not significant shift nothing.
+    It is drawn to 0, the more so the less significant the terms are: noise alone mostly shifts nothing.
 
     Parameters
     ----------
@@ -53,7 +55,7 @@ def model_change(
 
     References
     ----------
-    James and Stein, Estimation with quadratic loss, 1961: the shrinkage 1 - k / chi^2.
+    James and Stein, Estimation with quadratic loss, 1961: the shrinkage 1 - c / chi^2.
     """
     lens_count = basis.shape[1]
     bent = model.bend(camera_points(fit, corners), fit.lens[4:])[0]
@@ -71,7 +73,7 @@ def model_change(
     posterior = np.linalg.inv(precision + np.diag(terms.usual**-2))
     size = -posterior @ pulled
     chi_squared, by_noise = float(pulled @ posterior @ pulled), float(np.trace(precision @ posterior))
-    share = max(0.0, 1 - by_noise / chi_squared) if chi_squared > 0 else 0.0
+    share = max(0.0, 1 - _NOISE * by_noise / chi_squared) if chi_squared > 0 else 0.0
     return np.asarray(-np.sqrt(share) * following @ size)
 
 

@@ -59,10 +59,10 @@ def lens_covariance(
 
     Corners of one picture share errors (a board that is not flat, blur), and pictures differ in theirs. Taken
     for independent, they make a lens look too well known. A jackknife over whole groups supposes nothing of
-    this; each group is left out in one linear step. With few groups it is uncertain itself: seven pictures may
-    agree by chance. So it is drawn to the covariance of least squares, with the variance that the jackknife
-    shows over all parameters. Student's distribution of so many groups makes it wider. The shift that a
-    richer model shows is added.
+    this; each group is left out in one linear step. With few groups it is uncertain itself: seven pictures
+    may agree by chance. So it is drawn to the covariance of least squares, with the variance that the
+    jackknife shows over all parameters. Student's distribution of so many groups makes it wider. The shift
+    that a richer model shows is added.
 
     References
     ----------

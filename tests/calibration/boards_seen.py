@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Callable
 
+import cv2
 import numpy as np
 from numpy.typing import NDArray
 from scipy.interpolate import PchipInterpolator
@@ -152,3 +153,55 @@ def chessboard_pattern(columns: int, rows: int, square_m: float) -> Callable[[Ar
         return np.where(inside & dark, 40.0, np.where(margin, 200.0, 120.0))
 
     return levels
+
+
+def striped_pattern(
+    columns: int, rows: int, square_m: float, margin: float, stripe: float = 1.0, phase: float = 0.0
+) -> Callable[[Array], Array]:
+    """Grey levels of a chessboard on paper with a margin in squares, over stripes along its rows.
+
+    The stripes are as dark and light as the squares, ``stripe`` squares wide and shifted by ``phase``.
+    """
+    board = chessboard_pattern(columns, rows, square_m)
+
+    def levels(places_m: Array) -> Array:
+        squares = places_m / square_m + np.array([columns + 1, rows + 1]) / 2
+        paper = ((squares >= -margin) & (squares < (columns + 1 + margin, rows + 1 + margin))).all(axis=1)
+        dark = np.floor((squares[:, 1] - phase) / stripe) % 2 == 0
+        return np.where(paper, board(places_m), np.where(dark, 40.0, 200.0))
+
+    return levels
+
+
+def pinhole_rays(lens: tuple[float, ...], pixels: Array) -> Array:
+    """Unit rays of pixels through a pinhole, by OpenCV."""
+    fx, fy, cx, cy, *k = lens
+    matrix = np.array([[fx, 0, cx], [0, fy, cy], [0, 0, 1.0]])
+    planar = cv2.undistortPoints(pixels.reshape(-1, 1, 2), matrix, np.array(k)).reshape(-1, 2)
+    rays = np.column_stack([planar, np.ones(len(planar))])
+    return np.asarray(rays / np.linalg.norm(rays, axis=1, keepdims=True))
+
+
+def photograph(
+    pattern: Callable[[Array], Array],
+    half_m: tuple[float, float],
+    lens: tuple[float, ...],
+    size_px: tuple[int, int],
+    count: int,
+    seed: int,
+    z_m: tuple[float, float],
+) -> list[NDArray[np.uint8]]:
+    """Pictures of a plane that is seen to ``half_m`` from its middle, at distances between ``z_m``."""
+    rng, pictures = np.random.default_rng(seed), []
+    ends = np.array([[x, y, 0.0] for x in (-half_m[0], half_m[0]) for y in (-half_m[1], half_m[1])])
+    while len(pictures) < count:
+        turn, _ = random_pose(rng, "pinhole")
+        z = rng.uniform(*z_m)
+        reach = np.array(size_px) / lens[0] / 2
+        place_m = np.array([*(rng.uniform(-0.8, 0.8, 2) * reach * z), z])
+        outline = pixels_of("pinhole", lens, ends @ turn.T + place_m)
+        if (outline < 4).any() or (outline > np.array(size_px) - 5).any():
+            continue
+        picture = render(lambda at: pinhole_rays(lens, at), turn, place_m, pattern, size_px, rng)
+        pictures.append(np.asarray(cv2.GaussianBlur(picture, (0, 0), 0.6), dtype=np.uint8))
+    return pictures

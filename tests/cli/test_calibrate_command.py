@@ -179,8 +179,12 @@ def test_a_video(ipsys: Ipsys, rendered: Path, tmp_path: Path) -> None:
     ("board", "said"),
     [
         ("7x5", "a chessboard of 6 x 4 inner corners is seen in"),
-        ("5x3", "it is a part of a chessboard of 6 x 4 inner corners: give --board 6x4"),
-        ("9x9", "give the inner corners, one less than the squares"),
+        (
+            "5x3",
+            "a part of a chessboard of 6 x 4 inner corners, which 6 of 6 pictures of a board show: give "
+            "--board 6x4; if the size is right, give --force",
+        ),
+        ("9x9", "but a chessboard of 6 x 4 inner corners is seen in 6 of 6 tried: give --board 6x4"),
         ("charuco:7x5", "but a chessboard of 6 x 4 inner corners is seen in 6 of 6 tried: give --board 6x4"),
         ("charuco:6x4", "but a chessboard of 6 x 4 inner corners is seen in 6 of 6 tried: give --board 6x4"),
     ],
@@ -195,15 +199,20 @@ def test_too_few_pictures(ipsys: Ipsys, red: Path, tmp_path: Path) -> None:
     for path in list(red.iterdir())[4:]:
         path.unlink()
     line = refused(ipsys, tmp_path, red, "--board", "6x4", "-o", tmp_path)
-    assert "only 4 of 4 pictures can be used, but a lens needs 6 or more" in line
+    assert "only 4 of 4 pictures can be used, but a lens needs 5 or more" in line
     assert "take at least 15" in line
 
 
-def test_pictures_of_two_sizes(ipsys: Ipsys, red: Path, tmp_path: Path) -> None:
+def test_pictures_of_two_sizes_are_refused_before_looking(
+    ipsys: Ipsys, red: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """No board is looked for, which takes long: the headers of the files say the size."""
     for n in range(9):
         cv2.imwrite(str(red / f"99{n}.png"), np.zeros((480, 640), np.uint8))
+    monkeypatch.setattr("ipsys_log.calibration.look.view_board", None)
     line = refused(ipsys, tmp_path, red, "--board", "6x4", "-o", tmp_path)
-    assert "990.png is 640 x 480 px and 0.png is 480 x 360 px; a lens is calibrated at one size" in line
+    assert "pictures have 2 sizes: 12 of 480 x 360 px (0.png, 1.png ...); 9 of 640 x 480 px (990.png" in line
+    assert "put the pictures of each size into a folder of their own" in line
 
 
 def test_a_stray_picture_of_another_size_is_left_out_and_named(
@@ -223,6 +232,63 @@ def test_a_picture_that_cannot_be_read_is_left_out_and_named(ipsys: Ipsys, red: 
     done = calibrate(ipsys, red, "--board", "6x4", "-o", tmp_path)
     assert done.code == 0, done.err
     assert "13.jpg: cannot be read" in done.out
+
+
+def test_bad_camera_does_not_cost_the_others(ipsys: Ipsys, red: Path, tmp_path: Path) -> None:
+    """Three good folders and one whose pictures are blurred."""
+    for name in ("blue", "green", "white"):
+        shutil.copytree(red, tmp_path / "all" / name)
+    for path in (tmp_path / "all" / "green").iterdir():
+        picture = cv2.imread(str(path))
+        assert picture is not None
+        cv2.imwrite(str(path), cv2.GaussianBlur(picture, (0, 0), 9))
+    done = calibrate(ipsys, tmp_path / "all", "--board", "6x4", "-o", tmp_path / "out", "--json")
+    assert done.code == 1
+    assert sorted(path.name for path in (tmp_path / "out").iterdir()) == ["blue.yaml", "white.yaml"]
+    lines = [line for line in done.err.splitlines() if line.startswith("no file for")]
+    assert len(lines) == 1
+    assert lines[0].startswith("no file for green: ")
+    blue, green, white = json.loads(done.out)
+    assert blue["parameters"] == white["parameters"]
+    assert green["camera"] == "green"
+    assert green["error"] == lines[0].removeprefix("no file for green: ")
+    assert green["files"] == []
+
+
+def test_every_bad_camera_is_named(ipsys: Ipsys, tmp_path: Path) -> None:
+    for name in ("blue", "green"):
+        (tmp_path / "all" / name).mkdir(parents=True)
+        cv2.imwrite(str(tmp_path / "all" / name / "1.png"), np.full((60, 80), 90, np.uint8))
+    done = calibrate(ipsys, tmp_path / "all", "--board", "6x4", "-o", tmp_path / "out")
+    assert done.code == 1
+    assert [line.split(":")[0] for line in done.err.splitlines()] == ["no file for blue", "no file for green"]
+    assert not (tmp_path / "out").exists()
+
+
+def test_pictures_without_the_board_are_named(ipsys: Ipsys, red: Path, tmp_path: Path) -> None:
+    cv2.imwrite(str(red / "98.png"), np.full(SIZE_PX[::-1], 90, np.uint8))
+    done = calibrate(ipsys, red, "--board", "6x4", "-o", tmp_path)
+    assert done.code == 0, done.err
+    assert "not seen: 98.png: the board is not seen" in done.out
+
+
+def test_poor_model_is_refused_and_another_named(ipsys: Ipsys, red: Path, tmp_path: Path) -> None:
+    board = ("--board", "6x4", "--lens", "pinhole", "-o", tmp_path)
+    line = refused(ipsys, tmp_path, red, *board)
+    assert re.search(r"corners are [\d.]+ px off \(RMS\).*--lens fisheye leaves 0\.\d+ px: use it", line)
+    assert "--force" in line
+    done = calibrate(ipsys, red, *board, "--force")
+    assert done.code == 0, done.err
+    assert "red: written only for --force: corners are" in done.err
+    assert (tmp_path / "red.yaml").is_file()
+
+
+def test_four_pictures_are_used_if_insisted_on(ipsys: Ipsys, red: Path, tmp_path: Path) -> None:
+    for path in sorted(red.iterdir())[4:]:
+        path.unlink()
+    done = calibrate(ipsys, red, "--board", "6x4", "-o", tmp_path, "--force")
+    assert done.code == 0, done.err
+    assert "written only for --force: only 4 of 4 pictures can be used" in done.err
 
 
 def test_sources_that_are_none(ipsys: Ipsys, red: Path, tmp_path: Path) -> None:

@@ -1,0 +1,50 @@
+"""Uncertainties of few pictures, and of lenses that are not of the model fitted, against the truth."""
+
+from __future__ import annotations
+
+import numpy as np
+import pytest
+from numpy.typing import NDArray
+
+from ipsys_log.calibration.lens_models import LENSES
+from ipsys_log.calibration.solve import solve
+from tests.calibration.boards_seen import SIZE_PX, TRUTH, seen
+
+# A lens whose elements are off its axis, which the fisheye model has no terms for.
+DECENTERED = (600.0, 600.0, 330.0, 230.0, -0.25, 0.1, 0.004, -0.006, -0.02)
+
+
+def squared_errors(
+    true: str, fitted: str, pictures: int, seeds: range, lens: tuple[float, ...] | None = None
+) -> NDArray[np.float64]:
+    """Squared errors of focal length and principal point in units of the variance, (seeds, 3)."""
+    rows = []
+    for seed in seeds:
+        corners = seen(true, np.random.default_rng(seed), pictures, lens=lens)
+        solved = solve(LENSES[fitted], corners, SIZE_PX)
+        errors = solved.fit.lens - np.pad(lens or TRUTH[true], (0, 99))[: len(solved.fit.lens)]
+        rows.append((errors**2 / np.diag(solved.covariance).clip(1e-12))[[0, 2, 3]])
+    return np.array(rows)
+
+
+@pytest.mark.parametrize("name", ["fisheye", "pinhole", "pinhole8"])
+def test_few_pictures_errors_are_as_stated(name: str) -> None:
+    """Seven pictures may agree by chance; a jackknife of seven takes that for certainty, up to 6 sigma."""
+    errors = squared_errors(name, name, 7, range(100, 130))
+    assert 0.2 < errors.mean() < 1.3, errors.mean(axis=0)
+    assert (errors < 4).mean() >= 0.93
+    assert errors.max() < 3.5**2
+
+
+@pytest.mark.parametrize("pictures", [7, 20])
+def test_lens_of_other_kind_errors_are_as_stated(pictures: int) -> None:
+    """With the jackknife alone, the mean is 3 to 4 for 20 pictures."""
+    errors = squared_errors("pinhole", "fisheye", pictures, range(100, 120), DECENTERED)
+    assert 0.3 < errors.mean() < 2.0, errors.mean(axis=0)
+    assert (errors < 4).mean() >= 0.9
+
+
+def test_lens_of_the_right_kind_is_stated_no_worse() -> None:
+    """Twenty pictures: what a richer model shows is noise, and hardly counts."""
+    errors = squared_errors("fisheye", "fisheye", 20, range(100, 120))
+    assert errors.mean() > 0.5

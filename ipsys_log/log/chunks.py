@@ -47,7 +47,7 @@ def unpack(view: View, offset: int, head: ChunkHead) -> bytes:
         if head.compression == "zstd":
             data = _unpack_zstd(data, head.uncompressed_size)
         elif head.compression == "lz4":
-            data = lz4.frame.LZ4FrameDecompressor().decompress(data, head.uncompressed_size + 1)
+            data = _unpack_lz4(data, head.uncompressed_size)
     except (zstandard.ZstdError, RuntimeError, EOFError, ValueError) as error:
         raise view.fault(offset, f"the chunk cannot be decompressed ({error})") from None
     if len(data) != head.uncompressed_size:
@@ -55,6 +55,14 @@ def unpack(view: View, offset: int, head: ChunkHead) -> bytes:
     if head.crc and zlib.crc32(data) != head.crc:
         raise view.fault(offset, "the CRC of the chunk is wrong")
     return data
+
+
+def _unpack_lz4(data: bytes, size: int) -> bytes:
+    decompressor = lz4.frame.LZ4FrameDecompressor()
+    records: bytes = decompressor.decompress(data, size + 1)
+    if len(records) == size and not decompressor.eof:  # other readers refuse it
+        raise ValueError("the frame has no end")
+    return records
 
 
 def _unpack_zstd(data: bytes, size: int) -> bytes:

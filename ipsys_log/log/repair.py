@@ -95,6 +95,8 @@ def repair(path: str | os.PathLike[str], *, storage: Storage = DISK) -> RepairRe
         with tempfile.SpooledTemporaryFile(_IN_MEMORY, dir=str(target.parent)) as spool:
             saved = Salvage(spool)
             found = survey(view, known, saved)
+            if found.loose.entries and not found.crc_is_right and not found.damaged:
+                found = survey(view, known, saved, doubtful=True)  # something is wrong, and looks right
             if found.end < len(MAGIC):
                 start = view.read(0, min(len(MAGIC), view.size))
                 raise LogError(
@@ -171,8 +173,7 @@ def _plan(view: View, found: Survey, saved: Salvage, tail: IO[bytes]) -> _Plan:
         contents.metadata_count += 1
         end.emit(hashes)
     contents.data_end, contents.data_crc = end.offset, end.data_crc
-    # With chunk indexes, other readers would look for messages in chunks only.
-    end.emit(tail_bytes(replace(contents, chunks=[]) if contents.loose else contents))
+    end.emit(tail_bytes(contents, index_chunks=not contents.loose))
     tail.flush()
     return _Plan(patches, tail, end.offset - start, end.crc, sum(contents.counts.values()))
 

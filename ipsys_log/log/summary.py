@@ -11,13 +11,17 @@ from ipsys_log.log.records import DATA_END, FOOTER, MAGIC, as_bytes
 __all__ = ["tail_bytes"]
 
 
-def tail_bytes(contents: Contents) -> bytes:
-    """Everything from ``contents.data_end`` to the end of the file."""
+def tail_bytes(contents: Contents, *, index_chunks: bool = True) -> bytes:
+    """Everything from ``contents.data_end`` to the end of the file.
+
+    With chunk indexes, other readers look for messages in chunks only: a log that also has messages in none
+    is written without (`index_chunks`).
+    """
     start = contents.data_end + DATA_END.size
     summary, offsets = b"", b""
     for opcode, records in _groups(contents):
         group = as_bytes(*records)
-        if group:
+        if group and (index_chunks or opcode != Opcode.CHUNK_INDEX):
             offsets += as_bytes(mcap.SummaryOffset(opcode, start + len(summary), len(group)))
             summary += group
     footer = FOOTER.pack(Opcode.FOOTER, 20, start, start + len(summary), 0)[:-4]

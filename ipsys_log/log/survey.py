@@ -107,16 +107,20 @@ class Survey:
     indexed: _Indexed | None = None
 
 
-def survey(view: View, known: Summary | None = None, saved: Salvage | None = None) -> Survey:
+def survey(
+    view: View, known: Summary | None = None, saved: Salvage | None = None, *, doubtful: bool = False
+) -> Survey:
     """Check the data section record by record; never believes a length, never raises for damage.
 
     The file is read once. `known` is what the summary says, if there is one: it may define what the data
-    section does not. Without `saved`, damaged chunks are passed over.
+    section does not. Without `saved`, damaged chunks are passed over. `doubtful` says that lengths that
+    nothing confirms are looked at closely.
     """
     damaged: list[Stretch] = []
     definitions = Definitions(known, damaged)
     resync = Resync(view, definitions.channels, _is_chunked(known))
     found = Survey(view, resync, definitions, saved, damaged=damaged)
+    found.doubtful_to = view.size if doubtful else 0
     position = _take_start(found)
     while position < view.size and not found.finished:
         position = _take_records(found, position)
@@ -233,7 +237,7 @@ def _add_damage(found: Survey, stretch: Stretch, reason: str) -> int:
     else:
         found.damaged.append(stretch)
     found.end = stretch.end
-    found.doubtful_to = stretch.end + _DOUBTFUL
+    found.doubtful_to = max(found.doubtful_to, stretch.end + _DOUBTFUL)
     return stretch.end
 
 

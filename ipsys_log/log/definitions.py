@@ -1,4 +1,4 @@
-"""Schemas and channels of a data section, in file order, and what stands in for those that were lost."""
+"""Schemas and channels of a data section, in file order, and the substitutes of those that were lost."""
 
 from collections.abc import Iterator, Mapping
 from dataclasses import dataclass, field, replace
@@ -27,7 +27,7 @@ def placeholder(channel_id: int) -> mcap.Channel:
 
 @dataclass(slots=True)
 class Definitions:
-    """What is defined up to here, by id.
+    """The definitions up to here, by id.
 
     `known` is what the summary says, or a damaged chunk: it serves where the data section lacks something.
     If the summary is checked by its CRC, a record that contradicts it is damaged. `rooms` are the damaged
@@ -130,7 +130,7 @@ class Definitions:
         return channel.topic if channel else f"channel {channel_id}"
 
     def missing(self, channel_ids: set[int], defined: Inside) -> Iterator[mcap.McapRecord]:
-        """Records that must stand before messages of these channels, which `defined` may define."""
+        """Yield records that must stand before messages of these channels, which `defined` may define."""
         schemas, channels = defined.schemas | self.known.schemas, defined.channels | self.known.channels
         for channel_id in sorted(channel_ids - self.channels.keys()):
             channel = channels.get(channel_id) or placeholder(channel_id)
@@ -166,7 +166,7 @@ class Definitions:
         return sure.get(record.id) != record
 
     def _has_schema(self, channel: mcap.Channel) -> bool:
-        """Whether the schema of a channel is defined before it, or can be put back."""
+        """Return whether the schema of a channel is defined before it, or can be put back."""
         key = channel.schema_id
         if key == 0 or key in self.schemas:
             return True
@@ -202,7 +202,7 @@ class Definitions:
         return next((room for room in rooms if room.offset >= start and room.define(data)), None)
 
     def _by_one_bit(self, channel_id: int) -> mcap.Channel | None:
-        """The channel whose record differs in one bit of its id, and is good for nothing else."""
+        """Return the channel whose record differs in one bit of its id, and has no messages."""
         records = [record for record in self._misread if (record.id ^ channel_id).bit_count() == 1]
         if not self.rooms:  # its record looks whole, but no message is of the channel that it defines
             unused = [key for key in self._unused if (key ^ channel_id).bit_count() == 1]

@@ -1,4 +1,4 @@
-"""Finding the next whole record behind damage, where no length can be believed."""
+"""Search for the next whole record behind damage, without trust in any length."""
 
 import re
 import struct

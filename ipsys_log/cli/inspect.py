@@ -54,6 +54,7 @@ def repair(
 ) -> None:
     """Restore all that is whole in a log, in place, say what is gone, and finish its runs.
 
+    All bytes that are taken out are kept in <log>.damaged. A log that cannot be made whole stays as it is.
     The frames that ipsys live or record --detect had recorded and not looked at when it was killed are looked
     at now. That makes the runs again, to see that they are right; Ctrl-C leaves it to ipsys replay.
     """

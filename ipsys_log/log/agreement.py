@@ -1,4 +1,4 @@
-"""Whether the data section of a log, its indexes and its summary say the same."""
+"""Comparison of a log's data section, indexes and summary, which must say the same."""
 
 from collections import Counter
 
@@ -6,10 +6,10 @@ from mcap import records as mcap
 
 from ipsys_log.errors import LogError
 from ipsys_log.log.contents import Contents
+from ipsys_log.log.findings import Survey
 from ipsys_log.log.load import Summary, load_contents, read_summary
 from ipsys_log.log.records import ChunkRef
 from ipsys_log.log.rows import chunk_entries
-from ipsys_log.log.survey import Survey
 from ipsys_log.log.view import View
 
 __all__ = ["count_by_indexes", "disagreement"]
@@ -64,7 +64,7 @@ def _summary_disagreement(summary: Summary, mine: Contents, found: Survey) -> st
 
 
 def _used(kind: str, mine: Contents) -> set[int]:
-    """Ids of the channels that have messages, or of their schemas."""
+    """Return the ids of the channels that have messages, or of their schemas."""
     used = {channel for channel, number in mine.counts.items() if number}
     return used if kind == "channel" else {mine.channels[key].schema_id for key in used} - {0}
 
@@ -85,7 +85,7 @@ def _same_chunks(theirs: list[ChunkRef], mine: list[ChunkRef]) -> bool:
 
 
 def _same_chunk(theirs: ChunkRef, mine: ChunkRef) -> bool:
-    """All that a reader goes by; a writer may leave out the message indexes."""
+    """Compare all that a reader goes by; a writer may leave out the message indexes."""
     lengths = (mine.index_length,) if theirs.index_offsets else (0, mine.index_length)
     offsets = theirs.index_offsets in ({}, mine.index_offsets) and theirs.index_length in lengths
     same = theirs._replace(index_length=0, index_offsets={}) == mine._replace(

@@ -105,7 +105,7 @@ def _pieces(compression: str, data: bytes, most: int) -> Iterator[bytes]:
     while most > 0 and not decompressor.eof:
         piece = decompressor.decompress(data, min(most, _PIECE))
         if not piece and decompressor.needs_input:
-            return
+            raise ValueError("the frame has no end")  # other readers refuse it
         data = b""
         most -= len(piece)
         yield piece

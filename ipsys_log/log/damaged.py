@@ -1,4 +1,4 @@
-"""What a repair takes out of a log, kept beside it, and the repair itself until it is complete.
+"""The bytes that a repair takes out of a log, kept beside it, and the state of an unfinished repair.
 
 ``<log>.damaged`` is an MCAP file. Its attachments are the bytes that were overwritten or cut off, each named
 after its place in the damaged log: put back there, they make the damaged log again. Its metadata record
@@ -6,8 +6,8 @@ says what was written instead. Until the repair is complete the file is called `
 
 - while it is written, and up to the instant at which the new end of the log is in place (the journal is
   gone), the old log counts;
-- after that the new one counts. What is overwritten before its end is overwritten then, and whoever repairs
-  next does what is left of it.
+- after that the new one counts. The bytes before its end are overwritten only then; the next repair completes
+  this if it was cut short.
 """
 
 import os
@@ -43,7 +43,7 @@ _SMALL = 64 << 10  # bytes: for heads and summaries
 
 @dataclass(frozen=True, slots=True)
 class Change:
-    """What a repair does to a log: overwrite `patches`, and put a new end in place of the old one.
+    """The changes of a repair: overwrite `patches`, and put a new end in place of the old one.
 
     The new end begins at `start`. `new_size` is the size of the log afterwards, `crc` the CRC-32 of its new
     end. `own_end` is where the damaged log ends: what lies behind that is not its own.
@@ -58,7 +58,7 @@ class Change:
 
     @property
     def old_pieces(self) -> list[tuple[int, int]]:
-        """Where the old bytes lie that the repair takes out: offset and end."""
+        """Offset and end of the old bytes that the repair takes out."""
         pieces = [(offset, offset + len(new)) for offset, new in self.patches]
         pieces += [(self.start, self.own_end), (self.own_end, self.old_size)]
         return [(start, end) for start, end in pieces if end > start]
@@ -201,7 +201,7 @@ def _write(storage: Storage, fd: int, view: View, change: Change, time_ns: int) 
 
 
 def _attachment(view: View, name: str, start: int, end: int, time_ns: int) -> Iterator[bytes]:
-    """An Attachment record, block by block."""
+    """Yield an Attachment record, block by block."""
     text = name.encode()
     fields = struct.pack("<QQI", time_ns, time_ns, len(text)) + text + struct.pack("<IQ", 0, end - start)
     yield HEADER.pack(Opcode.ATTACHMENT, len(fields) + end - start + 4) + fields
@@ -214,6 +214,6 @@ def _attachment(view: View, name: str, start: int, end: int, time_ns: int) -> It
 
 
 def _beside(path: Path, suffix: str) -> Path:
-    """A file beside the log itself, by whichever link that is opened."""
+    """Return the path of a file beside the log itself, by whichever link the log is opened."""
     real = Path(os.path.realpath(path)) if path.is_symlink() else path
     return real.with_name(real.name + suffix)

@@ -1,6 +1,6 @@
-"""Schemas and channels of a data section, in file order, and what stands in for those that were lost."""
+"""Schemas and channels of a data section, in file order, and the substitutes of those that were lost."""
 
-from collections.abc import Iterator
+from collections.abc import Iterator, Mapping
 from dataclasses import dataclass, field, replace
 from itertools import islice
 
@@ -27,7 +27,7 @@ def placeholder(channel_id: int) -> mcap.Channel:
 
 @dataclass(slots=True)
 class Definitions:
-    """What is defined up to here, by id.
+    """The definitions up to here, by id.
 
     `known` is what the summary says, or a damaged chunk: it serves where the data section lacks something.
     If the summary is checked by its CRC, a record that contradicts it is damaged. `rooms` are the damaged
@@ -41,6 +41,7 @@ class Definitions:
     known: Inside = field(default_factory=Inside)
     _schema_at: dict[int, int] = field(default_factory=dict)  # where each schema is defined
     _sure: Contents | None = None
+    _checked: set[tuple[bool, int]] = field(default_factory=set)  # schemas and channels by the CRC of a chunk
     _full: int = 0  # so many of the first rooms are full
     _misread: list[mcap.Channel] = field(default_factory=list)
     _unused: dict[int, RecordAt] = field(default_factory=dict)  # records of channels without messages so far
@@ -92,13 +93,15 @@ class Definitions:
         """
         records: list[mcap.Schema | mcap.Channel] = [*inside.schemas.values(), *inside.channels.values()]
         for record in records:
-            if not checked and self._contradicts(record):
+            if self._contradicts(record, checked=checked):
                 raise view.fault(offset, "a definition in the chunk contradicts another one")
         for channel in inside.channels.values():
             if channel.schema_id not in inside.schemas and not self._has_schema(channel):
                 raise view.fault(offset, f"channel {channel.id} has a schema that is not in the log")
         for channel_id in inside.entries.keys() - inside.channels.keys():
             self.need(view, offset, channel_id)
+        if checked:
+            self._checked |= {(isinstance(record, mcap.Schema), record.id) for record in records}
         for key, schema in inside.schemas.items():
             self.schemas.setdefault(key, schema)
             self._schema_at.setdefault(key, offset)
@@ -127,7 +130,7 @@ class Definitions:
         return channel.topic if channel else f"channel {channel_id}"
 
     def missing(self, channel_ids: set[int], defined: Inside) -> Iterator[mcap.McapRecord]:
-        """Records that must stand before messages of these channels, which `defined` may define."""
+        """Yield records that must stand before messages of these channels, which `defined` may define."""
         schemas, channels = defined.schemas | self.known.schemas, defined.channels | self.known.channels
         for channel_id in sorted(channel_ids - self.channels.keys()):
             channel = channels.get(channel_id) or placeholder(channel_id)
@@ -145,20 +148,25 @@ class Definitions:
         for schema in self._sure.schemas.values() if self._sure else ():
             self.schemas.setdefault(schema.id, schema)
 
-    def _contradicts(self, record: mcap.Schema | mcap.Channel) -> bool:
+    def is_stranger(self, inside: Inside) -> bool:
+        """Return whether a chunk with a right CRC defines something else under an id of this log."""
+        records: list[mcap.Schema | mcap.Channel] = [*inside.schemas.values(), *inside.channels.values()]
+        return any(self._contradicts(record, checked=True) for record in records)
+
+    def _contradicts(self, record: mcap.Schema | mcap.Channel, *, checked: bool = False) -> bool:
+        """Compare a definition with others; one that is `checked` by a CRC yields only to such ones."""
         schema = isinstance(record, mcap.Schema)
-        mine: dict[int, mcap.Schema] | dict[int, mcap.Channel] = self.schemas if schema else self.channels
-        if record.id in mine and mine[record.id] != record:
+        mine: Mapping[int, mcap.Schema | mcap.Channel] = self.schemas if schema else self.channels
+        is_sure = not checked or (schema, record.id) in self._checked
+        if is_sure and record.id in mine and mine[record.id] != record:
             return True
         if self._sure is None:
             return False
-        sure: dict[int, mcap.Schema] | dict[int, mcap.Channel] = (
-            self._sure.schemas if schema else self._sure.channels
-        )
+        sure: Mapping[int, mcap.Schema | mcap.Channel] = self._sure.schemas if schema else self._sure.channels
         return sure.get(record.id) != record
 
     def _has_schema(self, channel: mcap.Channel) -> bool:
-        """Whether the schema of a channel is defined before it, or can be put back."""
+        """Return whether the schema of a channel is defined before it, or can be put back."""
         key = channel.schema_id
         if key == 0 or key in self.schemas:
             return True
@@ -194,7 +202,7 @@ class Definitions:
         return next((room for room in rooms if room.offset >= start and room.define(data)), None)
 
     def _by_one_bit(self, channel_id: int) -> mcap.Channel | None:
-        """The channel whose record differs in one bit of its id, and is good for nothing else."""
+        """Return the channel whose record differs in one bit of its id, and has no messages."""
         records = [record for record in self._misread if (record.id ^ channel_id).bit_count() == 1]
         if not self.rooms:  # its record looks whole, but no message is of the channel that it defines
             unused = [key for key in self._unused if (key ^ channel_id).bit_count() == 1]

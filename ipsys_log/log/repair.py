@@ -1,4 +1,4 @@
-"""Making a log whole again whose writer was killed, whose end was cut off, or which is damaged inside."""
+"""Repair of a log whose writer was killed, whose end was cut off, or which is damaged inside."""
 
 import os
 import tempfile
@@ -17,6 +17,7 @@ from ipsys_log.log.agreement import count_by_indexes, disagreement
 from ipsys_log.log.bounds import BoundError
 from ipsys_log.log.crc import combine
 from ipsys_log.log.damaged import Change, Patch, check_room, discard, keep_old_bytes, overwrite, resume
+from ipsys_log.log.findings import Survey
 from ipsys_log.log.hashing import METADATA_NAME, metadata_of_hashes
 from ipsys_log.log.journal import replace_tail, roll_back
 from ipsys_log.log.load import Summary, read_summary
@@ -26,7 +27,7 @@ from ipsys_log.log.salvage import Salvage
 from ipsys_log.log.storage import DISK, Storage
 from ipsys_log.log.stretch import index_records
 from ipsys_log.log.summary import tail_bytes
-from ipsys_log.log.survey import HEADER_RECORD, Survey, survey
+from ipsys_log.log.survey import HEADER_RECORD, survey
 from ipsys_log.log.view import View
 
 __all__ = ["RepairReport", "repair"]
@@ -37,7 +38,7 @@ _IN_MEMORY = 16 << 20  # bytes of saved messages; more than that lies in a file 
 
 @dataclass(frozen=True, slots=True)
 class RepairReport:
-    """What `repair` found and did.
+    """The result of a repair.
 
     ``lost`` has, by topic, the log times in ns of messages known to be gone, ``gone`` their numbers: these
     may be known without the times. ``uncounted`` says that others may be gone, nobody knows how many.
@@ -95,6 +96,8 @@ def repair(path: str | os.PathLike[str], *, storage: Storage = DISK) -> RepairRe
         with tempfile.SpooledTemporaryFile(_IN_MEMORY, dir=str(target.parent)) as spool:
             saved = Salvage(spool)
             found = survey(view, known, saved)
+            if found.loose.entries and not found.crc_is_right and not found.damaged:
+                found = survey(view, known, saved, doubtful=True)  # something is wrong, and looks right
             if found.end < len(MAGIC):
                 start = view.read(0, min(len(MAGIC), view.size))
                 raise LogError(
@@ -171,8 +174,7 @@ def _plan(view: View, found: Survey, saved: Salvage, tail: IO[bytes]) -> _Plan:
         contents.metadata_count += 1
         end.emit(hashes)
     contents.data_end, contents.data_crc = end.offset, end.data_crc
-    # With chunk indexes, other readers would look for messages in chunks only.
-    end.emit(tail_bytes(replace(contents, chunks=[]) if contents.loose else contents))
+    end.emit(tail_bytes(contents, index_chunks=not contents.loose))
     tail.flush()
     return _Plan(patches, tail, end.offset - start, end.crc, sum(contents.counts.values()))
 
@@ -193,7 +195,7 @@ class _End:
 
 
 def _emit_saved(end: _End, found: Survey, saved: Salvage) -> None:
-    """The saved messages, behind what defines their channels."""
+    """Write the saved messages behind the definitions of their channels."""
     saved.finish()
     for record in found.definitions.missing(set(saved.counts), saved.inside):
         end.emit(as_bytes(record))
@@ -210,7 +212,7 @@ def _emit_saved(end: _End, found: Survey, saved: Salvage) -> None:
 
 
 def _emit_homeless(end: _End, view: View, found: Survey) -> None:
-    """Messages in no chunk that cannot stay where they are, behind what defines their channels."""
+    """Write messages in no chunk that cannot stay in place, behind the definitions of their channels."""
     contents = found.contents
     heads = [MESSAGE.unpack(view.read(at.offset, MESSAGE.size)) for at in found.homeless]
     for record in found.definitions.missing({head[2] for head in heads}, found.definitions.known):
@@ -235,7 +237,7 @@ def _patches(found: Survey) -> list[Patch]:
 
 
 def _crc_with(view: View, patches: Sequence[Patch], end: int, crc: int) -> int:
-    """The CRC of the data section up to `end` with other bytes in it: it is linear in what differs."""
+    """Return the CRC of the data section up to `end` after `patches`: it is linear in what differs."""
     for offset, new in patches:
         differs = zlib.crc32(view.read(offset, len(new))) ^ zlib.crc32(new)
         crc ^= combine(differs, 0, end - offset - len(new))
@@ -301,7 +303,7 @@ def _commit(storage: Storage, view: View, change: Change, plan: _Plan) -> Path |
 
 
 def _own_end(view: View, found: Survey) -> int:
-    """Where a finished log ends; what lies behind that is not its own."""
+    """Return the end of a finished log; bytes behind it are not its own."""
     if found.finished:
         with suppress(LogError):
             for at in walk(view, found.end, view.size):
@@ -337,7 +339,7 @@ def _report(
 
 
 def _gone(found: Survey, known: Summary | None) -> tuple[dict[str, int], bool]:
-    """Numbers of lost messages by topic, and whether the summary says that these are all."""
+    """Count the lost messages by topic, and say whether the summary confirms that these are all."""
     gone = {topic: len(times_ns) for topic, times_ns in found.lost.times_ns.items()}
     if known is None or not known.checked or known.statistics is None:
         return gone, False

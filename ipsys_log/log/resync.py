@@ -1,4 +1,4 @@
-"""Finding the next whole record behind damage, where no length can be believed."""
+"""Search for the next whole record behind damage, without trust in any length."""
 
 import re
 import struct
@@ -36,7 +36,7 @@ _OVERLAP = 64
 _LONGEST_HEAD = 1 << 16
 _NAME, _SIZE = struct.Struct("<I"), struct.Struct("<Q")
 _LONGEST_CHAIN = 256  # records
-_ENOUGH_MESSAGES = 3  # in a row, of channels that nobody defines
+_ENOUGH = 3  # messages and channels in a row, even if they do not belong together
 _RECENT = 8  # messages: one of them may have got another time by damage
 _DAY_NS = 86_400 * 1_000_000_000
 _IN_VAIN = 64 << 20  # bytes that are looked at in vain however small the log is
@@ -98,7 +98,8 @@ class Resync:
 
     def _has_chunks(self, start: int) -> bool:
         """Return whether messages behind `start` lie in chunks, as far as what is there tells it."""
-        if self.is_chunk_head(start) or self._find(_CHUNK_HEAD, start) is not None:
+        torn = start > len(MAGIC) and self.is_chunk_head(start)  # no chunk begins where the Header must be
+        if torn or self._find(_CHUNK_HEAD, start) is not None:
             return True
         self.chunked = False
         first = self._find(_MESSAGE, start)
@@ -205,7 +206,7 @@ class Resync:
         _, _, channel, _, time_ns, _ = MESSAGE.unpack(self.view.read(at.offset, MESSAGE.size))
         near = any(abs(time_ns - recent_ns) < _DAY_NS for recent_ns in self.times_ns)
         fits = channel in defined or (near and channel in self.channels)
-        return True if fits or messages >= _ENOUGH_MESSAGES else None
+        return True if fits or messages + len(defined) >= _ENOUGH else None
 
     def _is_whole_chunk(self, at: RecordAt) -> bool:
         view = self.view

@@ -63,7 +63,7 @@ class _Records(NamedTuple):
 
 
 class Saved(NamedTuple):
-    """What was saved of one stretch: channel ids and offsets in the chunk of the messages.
+    """The messages saved from one stretch: channel ids and offsets in the chunk of the messages.
 
     `torn` has channel id and log time of a message that is there in part. `counted` says that the stretch
     held no other messages than these. `share` is the part of the stretch that was saved.
@@ -120,6 +120,8 @@ class Salvage:
             return Saved()
         channels = definitions.channels | definitions.known.channels
         messages, inside, torn, complete = _believable(view, records, rows, channels)
+        if records.checked and definitions.is_stranger(inside):
+            return Saved(note=f"the chunk at byte {stretch.offset} is of another log")
         for key, value in inside.schemas.items():
             self.inside.schemas.setdefault(key, value)
             definitions.known.schemas.setdefault(key, value)
@@ -177,7 +179,7 @@ class Salvage:
 def _note(stretch: Stretch, records: _Records, count: int, *, complete: bool) -> str:
     where = f"the chunk at byte {stretch.offset} ({records.span})"
     if records.checked:
-        return f"{where} is whole, but lacks definitions: its messages were copied"
+        return f"of {where}, all {count} messages were copied: its CRC is right, but it cannot stay as it is"
     if count:
         which = "all" if complete else "the first"
         return f"of {where}, {which} {count} messages were saved; their CRC cannot be checked"
@@ -187,7 +189,7 @@ def _note(stretch: Stretch, records: _Records, count: int, *, complete: bool) ->
 
 
 def _records_of(view: View, stretch: Stretch) -> _Records | None:
-    """Decode a chunk as far as that goes; None if there is none."""
+    """Decode a chunk as far as possible; None if there is none."""
     head = view.read(stretch.offset, min(_HEAD.size + 4 + _SIZE.size, stretch.length))
     if len(head) < _HEAD.size + _SIZE.size:
         return None
@@ -219,7 +221,7 @@ def _records_of(view: View, stretch: Stretch) -> _Records | None:
 
 
 def _decode(view: View, name: bytes, offset: int, length: int) -> tuple[Buffer, bool]:
-    """What comes out of compressed bytes before they end or fail, and whether they failed; bounded."""
+    """Decode compressed bytes until they end or fail, and say whether they failed; bounded."""
     if not name:
         return view.read(offset, min(length, _MOST)), length > _MOST
     decompress = _decompressor(name)
@@ -250,7 +252,7 @@ def _pieces(view: View, offset: int, length: int) -> Iterator[bytes]:
 
 
 def _up_to_first_hole(view: View, offset: int, length: int) -> int:
-    """The number of bytes before the first sector of zeros."""
+    """Return the number of bytes before the first sector of zeros."""
     zeros = bytes(_SECTOR)
     sector = offset + -offset % _SECTOR
     for start in range(sector, offset + length, _READ):
@@ -298,7 +300,7 @@ def _head(data: Buffer, position: int) -> tuple[int, int, int]:
 
 
 def _makes_sense(view: View, data: Buffer, at: RecordAt, inside: Inside) -> bool:
-    """Whether the record may lie in a chunk; takes its definitions into `inside`."""
+    """Return whether the record may lie in a chunk; take its definitions into `inside`."""
     if at.opcode == Opcode.MESSAGE:
         return MESSAGE.size <= at.length <= _MOST
     if at.opcode not in (Opcode.SCHEMA, Opcode.CHANNEL):
@@ -316,7 +318,7 @@ def _makes_sense(view: View, data: Buffer, at: RecordAt, inside: Inside) -> bool
 def _up_to(
     records: _Records, inside: Inside, starts: list[RecordAt], position: int, *, makes_sense: bool
 ) -> _Found:
-    """What of the records that make sense can be believed; those behind them begin at `position`."""
+    """Select the records that can be believed; `position` is where the sensible ones end."""
     data = records.data
     whole = position == len(data)
     if not makes_sense or (not whole and not records.ends_early):

@@ -1,4 +1,4 @@
-"""Damaged stretches of a data section, and what a repair puts there in their place."""
+"""Damaged stretches of a data section, and the records that a repair puts in their place."""
 
 from collections.abc import Mapping
 from dataclasses import dataclass, field
@@ -37,7 +37,7 @@ class Stretch:
         return self.offset + self.length
 
     def indexes(self) -> tuple[bytes, dict[int, int]]:
-        """The message indexes to be written and where each will lie; none if there is no room for them."""
+        """Return the message indexes to be written and their offsets; none if there is no room for them."""
         start = self.offset + len(self.head)
         data, offsets = index_records(self.entries, start)
         rest = self.end - start - len(data)
@@ -45,7 +45,7 @@ class Stretch:
 
     @property
     def is_full(self) -> bool:
-        """Whether not even the shortest definition fits in."""
+        """True if not even the shortest definition fits in."""
         return self.length - self._taken < _SHORTEST_DEFINITION
 
     def define(self, definitions: bytes) -> bool:
@@ -59,7 +59,7 @@ class Stretch:
         return True
 
     def content(self) -> bytes:
-        """The new bytes at `offset`: all of the stretch, or up to what stays as it is."""
+        """Return the new bytes at `offset`: all of the stretch, or its beginning."""
         data = b"".join((self.head, self.indexes()[0], *self.definitions))
         rest = self.length - len(data)
         if 0 < rest < HEADER.size:  # too little for a record of its own
@@ -77,7 +77,7 @@ def _padded(data: bytes, start: int, rest: int) -> bytes:
 
 
 def index_records(entries: Mapping[int, list[tuple[int, int]]], offset: int) -> tuple[bytes, dict[int, int]]:
-    """The MessageIndex records of a chunk, to be written at `offset`, and where each lies by channel id."""
+    """Return the MessageIndex records of a chunk for `offset`, and the offset of each by channel id."""
     pieces: list[bytes] = []
     offsets: dict[int, int] = {}
     for channel, rows in entries.items():

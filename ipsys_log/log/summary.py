@@ -33,13 +33,17 @@ def standing_data_end(view: View, at: int) -> int | None:
     return mark[3] if mark[:3] == expected and len(MAGIC) <= mark[3] < at else None
 
 
-def tail_bytes(contents: Contents, offset: int | None = None) -> bytes:
-    """Return the tail of a log: DataEnd, summary and footer, at ``contents.data_end`` or another `offset`."""
+def tail_bytes(contents: Contents, offset: int | None = None, *, index_chunks: bool = True) -> bytes:
+    """Return the tail of a log: DataEnd, summary and footer, at ``contents.data_end`` or another `offset`.
+
+    With chunk indexes, other readers look for messages in chunks only: a log that also has messages in none
+    is written without (`index_chunks`).
+    """
     start = (contents.data_end if offset is None else offset) + DATA_END.size
     summary, offsets = b"", b""
     for opcode, records in _groups(contents):
         group = as_bytes(*records)
-        if group:
+        if group and (index_chunks or opcode != Opcode.CHUNK_INDEX):
             offsets += as_bytes(mcap.SummaryOffset(opcode, start + len(summary), len(group)))
             summary += group
     footer = FOOTER.pack(Opcode.FOOTER, 20, start, start + len(summary), 0)[:-4]

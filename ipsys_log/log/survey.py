@@ -1,6 +1,6 @@
-"""Checking every record of a log, finished or not: how far it is whole, and what it holds up to there."""
+"""Check of every record of a log, finished or not."""
 
-from dataclasses import dataclass, field, replace
+from dataclasses import replace
 
 from mcap import records as mcap
 from mcap.opcode import Opcode
@@ -8,8 +8,8 @@ from mcap.opcode import Opcode
 from ipsys_log.errors import LogError
 from ipsys_log.log.bounds import BoundError
 from ipsys_log.log.chunks import Inside, inner_records, look_inside, unpack
-from ipsys_log.log.contents import Contents
 from ipsys_log.log.definitions import Definitions
+from ipsys_log.log.findings import Indexed, Survey
 from ipsys_log.log.hashing import ChannelHash
 from ipsys_log.log.load import Summary
 from ipsys_log.log.records import (
@@ -31,7 +31,7 @@ from ipsys_log.log.scan import add_record, count_all
 from ipsys_log.log.stretch import Stretch
 from ipsys_log.log.view import View
 
-__all__ = ["HEADER_RECORD", "Lost", "Survey", "survey"]
+__all__ = ["HEADER_RECORD", "survey"]
 
 HEADER_RECORD = as_bytes(mcap.Header("", "ipsys 1"))
 _LAG = 1 << 20  # bytes
@@ -42,84 +42,22 @@ _LOOSE = frozenset((Opcode.SCHEMA, Opcode.CHANNEL, Opcode.MESSAGE, Opcode.ATTACH
 _COUNTED = _LOOSE | {Opcode.MESSAGE_INDEX, Opcode.DATA_END}
 
 
-@dataclass(slots=True)
-class Lost:
-    """Messages that are known to be gone, by topic: their log times in ns.
-
-    `uncounted` is the number of stretches of which nothing says how many messages they held, `bytes` how
-    many bytes cannot be read.
-    """
-
-    times_ns: dict[str, list[int]] = field(default_factory=dict)
-    uncounted: int = 0
-    bytes: int = 0
-
-    def note(self, topic: str, time_ns: int) -> None:
-        self.times_ns.setdefault(topic, []).append(time_ns)
-
-
-@dataclass(slots=True)
-class _Indexed:
-    """The message indexes that follow a chunk (`inside`), or a damaged stretch that may have been one."""
-
-    start: int
-    inside: Inside | None = None
-    stretch: Stretch | None = None
-    rows: dict[int, list[tuple[int, int]]] = field(default_factory=dict)
-    offsets: dict[int, int] = field(default_factory=dict)
-    sound: bool = True
-
-    @property
-    def is_complete(self) -> bool:
-        return self.inside is not None and self.sound and self.rows.keys() >= self.inside.entries.keys()
-
-
-@dataclass(slots=True)
-class Survey:
-    """What is whole: records up to `end`, except the stretches in `damaged`.
-
-    `cut` is the unreadable end of a log without DataEnd; `finished` says that this record lies at `end`.
-    `saved` takes the messages that can be read of damaged chunks. `faults` is what was found wrong.
-    `unindexed` holds the entries of the last chunk if its message indexes are missing or cut off.
-    """
-
-    view: View
-    resync: Resync
-    definitions: Definitions
-    saved: Salvage | None = None
-    contents: Contents = field(default_factory=Contents)
-    loose: Inside = field(default_factory=Inside)
-    counts: dict[int, dict[int, int]] = field(default_factory=dict)
-    hashes: dict[str, ChannelHash] = field(default_factory=dict)
-    damaged: list[Stretch] = field(default_factory=list)
-    homeless: list[RecordAt] = field(default_factory=list)  # messages that cannot stay where they are
-    wrong_heads: list[tuple[int, bytes]] = field(default_factory=list)  # what chunks say of their times
-    cut: Stretch | None = None
-    lost: Lost = field(default_factory=Lost)
-    faults: list[str] = field(default_factory=list)
-    unindexed: Inside | None = None
-    end: int = 0
-    crc: int = 0
-    crc_is_right: bool = True
-    finished: bool = False
-    crc_at: int = 0
-    wrong_length: int = -1  # a record whose length cannot be right
-    doubtful_to: int = 0  # behind damage, lengths that nothing confirms are looked at closely
-    indexed: _Indexed | None = None
-
-
-def survey(view: View, known: Summary | None = None, saved: Salvage | None = None) -> Survey:
+def survey(
+    view: View, known: Summary | None = None, saved: Salvage | None = None, *, doubtful: bool = False
+) -> Survey:
     """Check the data section record by record; never believes a length, never raises for damage.
 
     A log that asks for too much is refused with a `BoundError`: it need not be damaged, and is not repaired.
 
     The file is read once. `known` is what the summary says, if there is one: it may define what the data
-    section does not. Without `saved`, damaged chunks are passed over.
+    section does not. Without `saved`, damaged chunks are passed over. `doubtful` says that lengths that
+    nothing confirms are looked at closely.
     """
     damaged: list[Stretch] = []
     definitions = Definitions(known, damaged)
     resync = Resync(view, definitions.channels, _is_chunked(known))
     found = Survey(view, resync, definitions, saved, damaged=damaged)
+    found.doubtful_to = view.size if doubtful else 0
     position = _take_start(found)
     while position < view.size and not found.finished:
         position = _take_records(found, position)
@@ -136,7 +74,7 @@ def survey(view: View, known: Summary | None = None, saved: Salvage | None = Non
 
 
 def _is_chunked(known: Summary | None) -> bool | None:
-    """Whether the messages lie in chunks, by the summary; None if it does not say."""
+    """Return whether the messages lie in chunks, by the summary; None if it does not say."""
     if known is not None and known.contents.chunks:
         return True
     if known is not None and known.checked and known.statistics is not None:
@@ -145,14 +83,14 @@ def _is_chunked(known: Summary | None) -> bool | None:
 
 
 def _take_start(found: Survey) -> int:
-    """Check the magic bytes and the Header record; returns where the records behind them begin."""
+    """Check the magic bytes and the Header record; return the offset of the records behind them."""
     view, start = found.view, len(MAGIC)
     behind, reason = _behind_header(view)
     if view.read(0, min(start, view.size)) != MAGIC:
         follower = start if behind > start else found.resync.find(start)
         if follower is None:
             return view.size
-        found.indexed = _Indexed(follower) if follower > start else None
+        found.indexed = Indexed(follower) if follower > start else None
         head = MAGIC + (HEADER_RECORD if follower >= start + len(HEADER_RECORD) else b"")
         _add_damage(found, Stretch(0, follower, head), "it does not begin as an MCAP file")
         return max(follower, behind)
@@ -167,7 +105,7 @@ def _take_start(found: Survey) -> int:
 
 
 def _behind_header(view: View) -> tuple[int, str]:
-    """Where the Header record ends: where it begins if there is none, 0 if it is damaged, and why."""
+    """Return the end of the Header record, its place if there is none, 0 and the reason if it is damaged."""
     start = len(MAGIC)
     try:
         at = next(walk(view, start, view.size), None)
@@ -182,7 +120,7 @@ def _behind_header(view: View) -> tuple[int, str]:
 
 
 def _take_records(found: Survey, position: int) -> int:
-    """Take records from `position` on up to the next damage; returns where to go on behind it."""
+    """Take records from `position` on up to the next damage; return the offset behind it."""
     view = found.view
     at = RecordAt(0, position, 0)
     try:
@@ -201,7 +139,7 @@ def _take_records(found: Survey, position: int) -> int:
 
 
 def _pass_over(found: Survey, position: int, at: RecordAt | None, reason: str) -> int:
-    """Find the next record behind damage at `position`; returns where it lies."""
+    """Find the next record behind damage at `position`; return its offset."""
     claimed = at.offset + at.length if at is not None and found.wrong_length != position else 0
     indexed = found.indexed
     # A gap that is too small for a record of its own becomes a part of the damage before it.
@@ -223,7 +161,7 @@ def _pass_over(found: Survey, position: int, at: RecordAt | None, reason: str) -
     if follower is None:
         return _end_at_damage(found, position, reason)
     if at is None or at.opcode not in _COUNTED or follower != claimed:
-        found.indexed = _Indexed(follower)
+        found.indexed = Indexed(follower)
     return _add_damage(found, Stretch(position, follower - position), reason)
 
 
@@ -238,12 +176,12 @@ def _add_damage(found: Survey, stretch: Stretch, reason: str) -> int:
     else:
         found.damaged.append(stretch)
     found.end = stretch.end
-    found.doubtful_to = stretch.end + _DOUBTFUL
+    found.doubtful_to = max(found.doubtful_to, stretch.end + _DOUBTFUL)
     return stretch.end
 
 
 def _end_at_damage(found: Survey, position: int, reason: str) -> int:
-    """The rest of the log cannot be read as records; it may be a chunk that was being written."""
+    """End the survey at damage without records behind it, perhaps a chunk that was being written."""
     found.faults.append(reason)
     found.end = position
     found.cut = Stretch(position, found.view.size - position)
@@ -253,7 +191,7 @@ def _end_at_damage(found: Survey, position: int, reason: str) -> int:
 
 
 def _save(found: Survey, stretch: Stretch, rows: Rows) -> None:
-    """Save what can be read of a damaged chunk, and note what is gone of it."""
+    """Save the readable messages of a damaged chunk, and note the others as lost."""
     saved = Saved()
     if found.saved is not None and found.resync.chunked is not False:
         saved = found.saved.save(
@@ -321,7 +259,7 @@ def _check_length(found: Survey, at: RecordAt) -> None:
 
 
 def _take_loose(found: Survey, at: RecordAt) -> None:
-    """A record in no chunk."""
+    """Take in a record that lies in no chunk."""
     view = found.view
     _check_length(found, at)
     if at.opcode == Opcode.METADATA:
@@ -368,7 +306,7 @@ def _take_chunk(found: Survey, at: RecordAt) -> None:
     found.counts[at.offset] = {key: len(rows) for key, rows in inside.entries.items()}
     _continue_hashes(found, inside, data)
     found.resync.chunked = True
-    found.indexed = _Indexed(at.offset + at.length, inside)
+    found.indexed = Indexed(at.offset + at.length, inside)
 
 
 def _check_definitions(view: View, offset: int, data: bytes) -> None:
@@ -390,7 +328,7 @@ def _continue_hashes(found: Survey, inside: Inside, data: bytes) -> None:
 
 
 def _take_index(found: Survey, at: RecordAt) -> None:
-    """A MessageIndex record: behind its chunk, or behind a damaged stretch, of which it then is a part."""
+    """Take in a MessageIndex record: of the chunk before it, or of the damaged stretch before it."""
     indexed = found.indexed
     if indexed is None:
         channel, rows = _index_rows(found.view, at)
@@ -418,14 +356,14 @@ def _take_index(found: Survey, at: RecordAt) -> None:
 
 
 def _index_rows(view: View, at: RecordAt) -> tuple[int, list[tuple[int, int]]]:
-    """The channel of a MessageIndex record; log times and places of its messages."""
+    """Return the channel of a MessageIndex record; log times and offsets of its messages."""
     body = view.read(at.offset, at.length)
     channel = int.from_bytes(body[HEADER.size : HEADER.size + 2], "little")
     return channel, list(ENTRY.iter_unpack(parse_message_index(view, body, 0, channel, at.offset)))
 
 
 def _close_indexes(found: Survey, stop: int) -> None:
-    """All message indexes of a chunk, or of what may have been one, were seen."""
+    """Check the message indexes of a chunk, or of a damaged stretch, when all of them were seen."""
     indexed, found.indexed = found.indexed, None
     assert indexed is not None
     if indexed.stretch is not None:
@@ -434,7 +372,7 @@ def _close_indexes(found: Survey, stop: int) -> None:
         _close_chunk(found, indexed, indexed.inside, stop)
 
 
-def _close_chunk(found: Survey, indexed: _Indexed, inside: Inside, stop: int) -> None:
+def _close_chunk(found: Survey, indexed: Indexed, inside: Inside, stop: int) -> None:
     chunk = found.contents.chunks[-1]
     if indexed.is_complete:
         found.contents.chunks[-1] = chunk._replace(

@@ -1,0 +1,81 @@
+"""The result of a survey: which parts of a log are whole, which are damaged, and which messages are gone."""
+
+from dataclasses import dataclass, field
+
+from ipsys_log.log.chunks import Inside
+from ipsys_log.log.contents import Contents
+from ipsys_log.log.definitions import Definitions
+from ipsys_log.log.hashing import ChannelHash
+from ipsys_log.log.records import RecordAt
+from ipsys_log.log.resync import Resync
+from ipsys_log.log.salvage import Salvage
+from ipsys_log.log.stretch import Stretch
+from ipsys_log.log.view import View
+
+__all__ = ["Indexed", "Lost", "Survey"]
+
+
+@dataclass(slots=True)
+class Lost:
+    """Messages that are known to be gone, by topic: their log times in ns.
+
+    `uncounted` is the number of stretches of which nothing says how many messages they held, `bytes` how
+    many bytes cannot be read.
+    """
+
+    times_ns: dict[str, list[int]] = field(default_factory=dict)
+    uncounted: int = 0
+    bytes: int = 0
+
+    def note(self, topic: str, time_ns: int) -> None:
+        self.times_ns.setdefault(topic, []).append(time_ns)
+
+
+@dataclass(slots=True)
+class Indexed:
+    """The message indexes that follow a chunk (`inside`), or a damaged stretch that may have been one."""
+
+    start: int
+    inside: Inside | None = None
+    stretch: Stretch | None = None
+    rows: dict[int, list[tuple[int, int]]] = field(default_factory=dict)
+    offsets: dict[int, int] = field(default_factory=dict)
+    sound: bool = True
+
+    @property
+    def is_complete(self) -> bool:
+        return self.inside is not None and self.sound and self.rows.keys() >= self.inside.entries.keys()
+
+
+@dataclass(slots=True)
+class Survey:
+    """The whole records up to `end`, except the stretches in `damaged`.
+
+    `cut` is the unreadable end of a log without DataEnd; `finished` says that this record lies at `end`.
+    `saved` takes the messages that can be read of damaged chunks. `faults` is what was found wrong.
+    `unindexed` holds the entries of the last chunk if its message indexes are missing or cut off.
+    """
+
+    view: View
+    resync: Resync
+    definitions: Definitions
+    saved: Salvage | None = None
+    contents: Contents = field(default_factory=Contents)
+    loose: Inside = field(default_factory=Inside)
+    counts: dict[int, dict[int, int]] = field(default_factory=dict)
+    hashes: dict[str, ChannelHash] = field(default_factory=dict)
+    damaged: list[Stretch] = field(default_factory=list)
+    homeless: list[RecordAt] = field(default_factory=list)  # messages that cannot stay where they are
+    wrong_heads: list[tuple[int, bytes]] = field(default_factory=list)  # what chunks say of their times
+    cut: Stretch | None = None
+    lost: Lost = field(default_factory=Lost)
+    faults: list[str] = field(default_factory=list)
+    unindexed: Inside | None = None
+    end: int = 0
+    crc: int = 0
+    crc_is_right: bool = True
+    finished: bool = False
+    crc_at: int = 0
+    wrong_length: int = -1  # a record whose length cannot be right
+    doubtful_to: int = 0  # behind damage, lengths that nothing confirms are looked at closely
+    indexed: Indexed | None = None

@@ -8,6 +8,7 @@ import struct
 import subprocess
 import sys
 from collections.abc import Callable
+from contextlib import suppress
 from dataclasses import replace
 from pathlib import Path
 from typing import Any
@@ -15,10 +16,12 @@ from typing import Any
 import cv2
 import numpy as np
 import pytest
+import scipy.io
 from google.protobuf.timestamp_pb2 import Timestamp
 
 from ipsys_log.calibration.pictures import _decode
 from ipsys_log.errors import FrameError, IpsysError
+from ipsys_log.formats.matlab import read_mat
 from ipsys_log.formats.opencv_yaml import read_opencv_calibration
 from ipsys_log.geometry.lenses import check_calibration
 from ipsys_log.log.codec import decode, encode
@@ -303,3 +306,19 @@ def test_camera_point_outside_every_lab_is_refused(x_m: float) -> None:
 
 def test_next_id_after_an_endless_number_is_the_first() -> None:
     assert next_id([Measurement(0, "p" + "9" * 5_000), Measurement(0, "p٣")]) == "p001"
+
+
+def test_mat_file_with_an_unknown_type_does_not_end_the_process(tmp_path: Path) -> None:
+    path = tmp_path / "a.mat"
+    table = np.arange(12.0).reshape(4, 3)
+    for packed in (False, True):
+        for kind in (np.float64, np.float32, np.int16, np.uint8):
+            scipy.io.savemat(path, {"Xc_red": table.astype(kind), "n": 3.0}, do_compression=packed)
+            assert np.array_equal(read_mat(path)["Xc_red"], table)
+    scipy.io.savemat(path, {"Xc_red": table})
+    whole = path.read_bytes()
+    for at in range(128, len(whole) - 96, 4):
+        for value in (0, 8, 0xBA06, 0x5F6358, 1 << 31, (1 << 32) - 1):
+            path.write_bytes(whole[:at] + struct.pack("<I", value) + whole[at + 4 :])
+            with suppress(IpsysError):
+                read_mat(path)

@@ -11,10 +11,10 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
-import scipy.io
 from numpy.typing import NDArray
 
 from ipsys_log.errors import IpsysError
+from ipsys_log.formats.matlab import read_mat
 from ipsys_log.formats.opencv_yaml import read_opencv_calibration
 from ipsys_log.messages import (
     MEASUREMENTS_TOPIC,
@@ -65,7 +65,7 @@ def read_imsel(folder: Path) -> Iterator[Message]:
     IpsysError
         Where a file is missing or does not hold what it should.
     """
-    mats = {name: _load(_find(folder, f"{name}.mat")) for name in ("testing", *map(_training, SUBSETS))}
+    mats = {name: read_mat(_find(folder, f"{name}.mat")) for name in ("testing", *map(_training, SUBSETS))}
     lenses = {camera: _find(folder, f"{stem}_calib.yaml") for camera, stem in CAMERAS.items()}
     yield Message(RIG_TOPIC, START_NS, START_NS, _RIG)
     for number, (camera, path) in enumerate(lenses.items(), 1):
@@ -94,13 +94,6 @@ def _find(folder: Path, name: str) -> Path:
             f"{folder}: has no {name}; name the folder of the authors' data, or of their repository"
         )
     return found[0]
-
-
-def _load(path: Path) -> dict[str, Any]:
-    try:
-        return dict(scipy.io.loadmat(path))
-    except Exception as error:  # its reader ends with whatever a damaged file leads it to
-        raise IpsysError(f"{path}: is not a MATLAB file that can be read: {error}") from error
 
 
 def _array(mats: dict[str, dict[str, Any]], mat: str, name: str) -> NDArray[np.float64]:

@@ -164,9 +164,13 @@ def sheets() -> tuple[bytes, ...]:
 
 
 @cache
-def mat() -> bytes:
-    """A MATLAB file as the authors of the paper publish theirs."""
+def mat() -> tuple[bytes, ...]:
+    """MATLAB files as the authors of the paper publish theirs, and packed."""
+    tables = {f"X{kind}_red": np.arange(12.0).reshape(4, 3) for kind in "cw"}
     with TemporaryDirectory() as folder:
         path = Path(folder) / "a.mat"
-        scipy.io.savemat(path, {f"X{kind}_red": np.arange(12.0).reshape(4, 3) for kind in "cw"})
-        return path.read_bytes()
+        wholes = []
+        for packed in (False, True):
+            scipy.io.savemat(path, tables, do_compression=packed)
+            wholes.append(path.read_bytes())
+    return tuple(wholes)

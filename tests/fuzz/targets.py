@@ -19,7 +19,7 @@ from hypothesis import strategies as st
 
 from ipsys_log.calibration import pictures as calibration_pictures
 from ipsys_log.errors import IpsysError
-from ipsys_log.formats.imsel import _load
+from ipsys_log.formats.matlab import read_mat
 from ipsys_log.formats.opencv_yaml import read_opencv_calibration
 from ipsys_log.log import LogReader, LogWriter, repair
 from ipsys_log.log.codec import PAYLOADS, decode, encode, schema_name
@@ -115,9 +115,9 @@ def read_times(data: bytes) -> None:
         find_times({"red": [Path("red/1.jpg"), Path("red/2.jpg")]}, str(path))
 
 
-def read_mat(data: bytes) -> None:
+def read_tables(data: bytes) -> None:
     with file(data, "a.mat") as path:
-        _load(path)
+        read_mat(path)
 
 
 def decode_picture(data: bytes) -> None:
@@ -237,7 +237,7 @@ TARGETS: dict[str, Callable[[], Target]] = {
     "lens": lambda: (_lens_bytes(), read_lens),
     "sheet": lambda: (damaged(seeds.sheets()), read_measurements),
     "times": lambda: (damaged([b"file,time\nred/1.jpg,1700000000.5\nred/2.jpg,1700000001\n"]), read_times),
-    "mat": lambda: (damaged([seeds.mat()]), read_mat),
+    "mat": lambda: (damaged(seeds.mat()), read_tables),
     "picture": lambda: (damaged(seeds.pictures()), decode_picture),
     "video": lambda: (_video_bytes(), decode_video),
     "page": lambda: (_REQUEST, ask_page),

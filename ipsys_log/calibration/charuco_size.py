@@ -5,7 +5,7 @@ from __future__ import annotations
 from collections import Counter
 from collections.abc import Sequence
 from functools import cache
-from typing import NamedTuple
+from typing import Any, NamedTuple
 
 import cv2
 import numpy as np
@@ -81,11 +81,11 @@ def _size_of(ids: NDArray[np.intp], centres: Array) -> tuple[int, int] | None:
 
 
 def _at_place(places: Array, centres: Array) -> NDArray[np.bool_]:
-    homography, _ = cv2.findHomography(centres, places, cv2.RANSAC, _NEAR)
+    homography: Any = cv2.findHomography(centres, places, cv2.RANSAC, _NEAR)[0]
     if homography is None:
         return np.zeros(len(places), dtype=np.bool_)
     carried = np.column_stack([centres, np.ones(len(centres))]) @ homography.T
-    return np.linalg.norm(carried[:, :2] / carried[:, 2:] - places, axis=1) <= _NEAR
+    return np.asarray(np.linalg.norm(carried[:, :2] / carried[:, 2:] - places, axis=1) <= _NEAR)
 
 
 @cache

@@ -237,4 +237,4 @@ def _uneven(prints: Prints, settled: _Settled, levels: Array) -> NDArray[np.bool
         | (settled.spreads_px > _SPREAD_PX)
     )
     moving = (lighter > _LIGHTER_BLURRED) | (settled.spreads_px > _SPREAD_PX)
-    return np.where(settled.blurred.any(axis=1), moving, sharp)
+    return np.asarray(np.where(settled.blurred.any(axis=1), moving, sharp))

@@ -29,7 +29,7 @@ from ipsys_log.stages.detect.adjustment import (
 from ipsys_log.stages.detect.decode import Grey
 from ipsys_log.stages.detect.pattern import compare_pattern
 from ipsys_log.stages.detect.prints import Prints, lay_out
-from ipsys_log.stages.detect.profiles import Poses, View, locate, read_profiles
+from ipsys_log.stages.detect.profiles import Poses, Sites, View, locate, read_profiles
 from ipsys_log.stages.detect.steps import (
     TAPS,
     Steps,
@@ -137,7 +137,7 @@ class _Solved(NamedTuple):
         """Return the variance of an edge's place about a fit."""
         weights = self.weights[n]
         freedoms = max(float(weights.sum()) - self.rows.shape[1], 1.0)
-        return float((weights * self.left_px[n] ** 2).sum()) / freedoms
+        return float((weights * self.left_px[n] ** 2).sum() / freedoms)
 
 
 class _Trial:
@@ -217,7 +217,7 @@ class _Trial:
         solved = _Solved(rows, normal, unknowns, weights, left_px, steps.clear, costs, blur_px)
         return _State(poses, motions, state.without), solved
 
-    def _steps(self, view: View, sites, number: int) -> tuple[Steps, float, float]:
+    def _steps(self, view: View, sites: Sites, number: int) -> tuple[Steps, float, float]:
         """Return the steps at edges, how blurred they are, and where weights end at the nearest."""
         farthest_px = _FAR_PX if number < _ROUGH else _NEAR_PX
         cell_px = float(np.quantile(sites.slopes[0], 0.2)) / view.prints.cells

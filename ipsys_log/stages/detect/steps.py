@@ -80,10 +80,10 @@ def usual_blur(prints: Prints, profiles: Array, reach_px: float) -> float:
     real = heights > LEAST_CONTRAST
     real &= heights > 0.5 * masked_median(heights[None], real[None])[0]
     if not real.any():
-        return BLURS_PX[len(BLURS_PX) // 5]
+        return float(BLURS_PX[len(BLURS_PX) // 5])
     shapes = (rising[real] - rising[real].mean(axis=1)[:, None]) / heights[real][:, None]
     left = _residues(reach_px) @ np.median(shapes, axis=0)
-    return BLURS_PX[int(np.square(left).sum(axis=1).argmin())]
+    return float(BLURS_PX[int(np.square(left).sum(axis=1).argmin())])
 
 
 @cache

@@ -192,7 +192,8 @@ def photograph(
     z_m: tuple[float, float],
 ) -> list[NDArray[np.uint8]]:
     """Pictures of a plane that is seen to ``half_m`` from its middle, at distances between ``z_m``."""
-    rng, pictures = np.random.default_rng(seed), []
+    rng = np.random.default_rng(seed)
+    pictures: list[NDArray[np.uint8]] = []
     ends = np.array([[x, y, 0.0] for x in (-half_m[0], half_m[0]) for y in (-half_m[1], half_m[1])])
     while len(pictures) < count:
         turn, _ = random_pose(rng, "pinhole")

@@ -31,6 +31,10 @@ from tests.sources.streams import encode
 ROOT = Path(__file__).resolve().parent.parent
 # The command line installs handlers for these; a test gives them back.
 SIGNALS = (signal.SIGINT, signal.SIGTERM, signal.SIGHUP)
+# A runner in the background may ignore some; a program under test inherits that.
+for number in SIGNALS:
+    if signal.getsignal(number) is signal.SIG_IGN:
+        signal.signal(number, signal.SIG_DFL)
 # A program for Debian's own Python.
 collect_ignore = ["sources/rtsp_server.py"]
 

@@ -32,8 +32,8 @@ _LEAST_INSISTED = 3
 # A focal length less sure than this is said to be so; coefficients are worth nothing beyond theirs.
 _UNSURE = 0.02
 _UNTOLD = 1.0
-# A lens of the right kind, and a flat board, leave less.
-_OFF_PX = 1.0
+# A lens of the right kind, and a flat board, leave less than the second; above the first, others are tried.
+_TRY_OTHERS_PX, _OFF_PX = 0.4, 1.0
 # Nor is a focal length a result that is no better known than this.
 _UNKNOWN = 0.1
 # Another grid in more pictures than this share is remarked on.
@@ -218,6 +218,7 @@ def _judged(
     counts = solved.corners.sums(np.ones_like(distances))
     each_px = np.sqrt(solved.corners.sums(distances**2) / counts)
     coverage = _covered(looked, used, solved)
+    notes = _doubts(model, solved, looked.size_px)
     sigmas = np.sqrt(np.diag(solved.covariance))
     return Calibrated(
         camera,
@@ -236,7 +237,7 @@ def _judged(
         looked.unseen,
         solved.far_corners,
         coverage,
-        (*forced, *advice(coverage), *_unseen(looked), *_doubts(model, solved), *_softness(used)),
+        (*forced, *advice(coverage), *_unseen(looked), *notes, *_softness(used)),
         solved.corners.pixels,
         solved.residuals_px,
     )
@@ -258,12 +259,19 @@ def _unseen(looked: Looked) -> list[str]:
     return [f"in {count} of {looked.count} pictures {reason}: see that --board is right"]
 
 
-def _doubts(model: LensModel, solved: Solved) -> list[str]:
+def _doubts(model: LensModel, solved: Solved, size_px: tuple[int, int]) -> list[str]:
     """What the numbers themselves say against the lens."""
     lens, sigmas, notes = solved.fit.lens, np.sqrt(np.diag(solved.covariance)), []
     left_px = rms_px(solved)
-    if left_px > _OFF_PX:
-        notes.append(f"corners are {left_px:.1f} px off: see that the board is flat, or try another --lens")
+    if _TRY_OTHERS_PX < left_px <= MOST_RMS_PX:
+        better = find_better_model(model, solved.corners, size_px, left_px)
+        if better is not None:
+            notes.append(
+                f"corners are {left_px:.2f} px off; --lens {better.name} leaves {better.rms_px:.2f} px: "
+                "use it"
+            )
+        elif left_px > _OFF_PX:
+            notes.append(f"corners are {left_px:.1f} px off: see that the board is flat")
     unsure = float((sigmas[:2] / lens[:2]).max())
     if unsure > _UNSURE:
         notes.append(

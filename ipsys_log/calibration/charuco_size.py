@@ -81,11 +81,10 @@ def _size_of(ids: NDArray[np.intp], centres: Array) -> tuple[int, int] | None:
 
 
 def _at_place(places: Array, centres: Array) -> NDArray[np.bool_]:
-    homography: Any = cv2.findHomography(centres, places, cv2.RANSAC, _NEAR)[0]
-    if homography is None:
-        return np.zeros(len(places), dtype=np.bool_)
-    carried = np.column_stack([centres, np.ones(len(centres))]) @ homography.T
-    return np.asarray(np.linalg.norm(carried[:, :2] / carried[:, 2:] - places, axis=1) <= _NEAR)
+    """Return which markers a plane puts at their places, (n,); none where there is no such plane."""
+    result: Any = cv2.findHomography(centres, places, cv2.RANSAC, _NEAR)
+    homography, near = result
+    return np.zeros(len(places), np.bool_) if homography is None else np.ravel(near).astype(np.bool_)
 
 
 @cache

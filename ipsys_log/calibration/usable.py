@@ -17,7 +17,7 @@ __all__ = ["MOST_RMS_PX", "BetterModel", "find_better_model", "two_cameras_fault
 
 MOST_RMS_PX = 2.0
 # Another model is better that leaves so much less.
-_BETTER = 0.6
+_BETTER, _AS_WELL = 0.6, 1.1
 
 
 class BetterModel(NamedTuple):
@@ -42,8 +42,11 @@ def find_better_model(
         # A model that leaves out most pictures does not describe them.
         if 2 * len(solved.pictures) >= corners.pictures:
             tried.append(BetterModel(name, rms_px(solved)))
-    best = min(tried, key=lambda one: one.rms_px, default=None)
-    return best if best is not None and best.rms_px < _BETTER * left_px else None
+    least_px = min((one.rms_px for one in tried), default=np.inf)
+    if least_px >= _BETTER * left_px:
+        return None
+    # Of models that do as well, the first: it has fewer coefficients that are hard to tell apart.
+    return next(one for one in tried if one.rms_px <= _AS_WELL * least_px)
 
 
 def two_cameras_fault(split: TwoCameras, names: Sequence[str]) -> str:

@@ -12,7 +12,7 @@ from ipsys_log.calibration.lens_models import LENSES
 from ipsys_log.calibration.look import Looked
 from ipsys_log.calibration.sighting import Sighting
 from ipsys_log.errors import IpsysError
-from tests.calibration.boards_seen import SIZE_PX, TRUTH, grid_m, pixels_of
+from tests.calibration.boards_seen import SIZE_PX, TRUTH, grid_m, pixels_of, seen
 
 BOARD = Board(6, 4, 0.03)
 
@@ -96,7 +96,25 @@ def test_pictures_that_are_all_soft() -> None:
 
 def test_corners_that_are_far_off_are_said_to_be() -> None:
     looked = sightings(everywhere(), 0.5, noise_px=1.0)
-    assert any("try another --lens" in note for note in calibrated(looked).notes)
+    assert any("px off: see that the board is flat" in note for note in calibrated(looked).notes)
+
+
+def through_fisheye() -> Looked:
+    """Boards all over the picture of a fisheye, to 85 degrees from its axis."""
+    corners = seen("fisheye", np.random.default_rng(1)).pixels.reshape(-1, 24, 2)
+    views = [Sighting(f"{n}.png", np.arange(24), p, 0.8, p[[0, 5, 23, 18]]) for n, p in enumerate(corners)]
+    return Looked(len(views), SIZE_PX, tuple(views), ())
+
+
+def test_pinhole_on_a_fisheye_is_refused() -> None:
+    with pytest.raises(IpsysError, match=r"px off \(RMS\).*--lens fisheye leaves 0\.1\d px: use it; or give"):
+        calibrate("red", through_fisheye(), BOARD, LENSES["pinhole4"])
+
+
+def test_pinhole_on_a_fisheye_insisted_on_is_noted() -> None:
+    result = calibrate("red", through_fisheye(), BOARD, LENSES["pinhole4"], insist=True)
+    assert result.rms_px > 2
+    assert "written only for --force: corners are" in result.notes[0]
 
 
 def test_too_few_say_what_to_add() -> None:

@@ -272,15 +272,20 @@ def test_pictures_without_the_board_are_named(ipsys: Ipsys, red: Path, tmp_path:
     assert "not seen: 98.png: the board is not seen" in done.out
 
 
-def test_poor_model_is_refused_and_another_named(ipsys: Ipsys, red: Path, tmp_path: Path) -> None:
-    board = ("--board", "6x4", "--lens", "pinhole", "-o", tmp_path)
-    line = refused(ipsys, tmp_path, red, *board)
-    assert re.search(r"corners are [\d.]+ px off \(RMS\).*--lens fisheye leaves 0\.\d+ px: use it", line)
-    assert "--force" in line
-    done = calibrate(ipsys, red, *board, "--force")
-    assert done.code == 0, done.err
-    assert "red: written only for --force: corners are" in done.err
-    assert (tmp_path / "red.yaml").is_file()
+def test_better_model_is_named(ipsys: Ipsys, red: Path, tmp_path: Path) -> None:
+    done = calibrate(ipsys, red, "--board", "6x4", "--lens", "pinhole", "-o", tmp_path)
+    assert re.search(
+        r"corners are 0\.\d+ px off; --lens (fisheye|pinhole8) leaves 0\.0\d px: use it", done.err
+    )
+
+
+def test_pinhole_on_real_fisheye_is_refused(ipsys: Ipsys, data: Path, tmp_path: Path) -> None:
+    folder = data / "fisheye_chessboard"
+    done = ipsys("calibrate", folder, "--board", "6x4", "--lens", "pinhole", "-o", tmp_path)
+    assert done.code == 1
+    assert "corners are 3.7 px off (RMS)" in done.err
+    assert "--lens fisheye leaves 0.22 px: use it; or give --force" in done.err
+    assert list(tmp_path.iterdir()) == []
 
 
 def test_four_pictures_are_used_if_insisted_on(ipsys: Ipsys, red: Path, tmp_path: Path) -> None:

@@ -21,7 +21,7 @@ from ipsys_log.log.stretch import Stretch
 from ipsys_log.log.view import View
 from ipsys_log.units import format_time
 
-__all__ = ["Rows", "Salvage", "Saved"]
+__all__ = ["Rows", "Salvage", "Saved", "up_to_first_hole"]
 
 _SECTOR = 512
 _MOST = 256 << 20  # bytes of one chunk that are looked at
@@ -211,7 +211,7 @@ def _records_of(view: View, stretch: Stretch) -> _Records | None:
             pass
         else:
             return _Records(data, crc != 0, False, False, bool(name), data_offset, size, span)
-    readable = _up_to_first_hole(view, data_offset, min(packed, stretch.end - data_offset))
+    readable = up_to_first_hole(view, data_offset, min(packed, stretch.end - data_offset))
     data, ends_early = _decode(view, name, data_offset, readable)
     ends_early |= readable < packed
     is_right = zlib.crc32(data) == crc
@@ -251,7 +251,7 @@ def _pieces(view: View, offset: int, length: int) -> Iterator[bytes]:
             yield block[start : start + _PIECE]
 
 
-def _up_to_first_hole(view: View, offset: int, length: int) -> int:
+def up_to_first_hole(view: View, offset: int, length: int) -> int:
     """Return the number of bytes before the first sector of zeros."""
     zeros = bytes(_SECTOR)
     sector = offset + -offset % _SECTOR

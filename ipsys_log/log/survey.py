@@ -26,7 +26,7 @@ from ipsys_log.log.records import (
     walk,
 )
 from ipsys_log.log.resync import PRIVATE, Resync, attachment_crc, check_exact, crc_of, is_index
-from ipsys_log.log.salvage import Rows, Salvage, Saved
+from ipsys_log.log.salvage import Rows, Salvage, Saved, up_to_first_hole
 from ipsys_log.log.scan import add_record, count_all
 from ipsys_log.log.stretch import Stretch
 from ipsys_log.log.view import View
@@ -270,6 +270,8 @@ def _take_loose(found: Survey, at: RecordAt) -> None:
             raise view.fault(at.offset, "the CRC of an attachment is wrong")
     elif at.opcode == Opcode.MESSAGE and at.length >= MESSAGE.size:
         _, _, channel, _, time_ns, _ = MESSAGE.unpack(view.read(at.offset, MESSAGE.size))
+        if _has_lost_chunk_heads(found) and up_to_first_hole(view, at.offset, at.length) < at.length:
+            raise view.fault(at.offset, "a message holds a sector of zeros")
         try:
             found.definitions.need(view, at.offset, channel)
         except LogError:
@@ -283,6 +285,12 @@ def _take_loose(found: Survey, at: RecordAt) -> None:
         found.definitions.take(view, at)
         return
     add_record(view, found.contents, found.loose, found.counts, at)
+
+
+def _has_lost_chunk_heads(found: Survey) -> bool:
+    """Return whether messages in no chunk may be those of one: nothing tells, if both ends are lost."""
+    begins_late = bool(found.damaged) and found.damaged[0].offset == 0
+    return begins_late and found.definitions.summary is None
 
 
 def _take_chunk(found: Survey, at: RecordAt) -> None:

@@ -223,18 +223,16 @@ def _same_cells(prints: Prints, levels: Array) -> NDArray[np.bool_]:
 
 def _uneven(prints: Prints, settled: _Settled, levels: Array) -> NDArray[np.bool_]:
     """Return, (m,), where glare, a shadow or a cover may have moved some of the edges."""
-    real = prints.polarity != 0
     black = np.where(prints.polarity > 0, settled.ends[..., 0], settled.ends[..., 1])
-    black = np.sort(np.where(real, black, -np.inf), axis=1)
-    middle = black.shape[1] - np.count_nonzero(real, axis=1) // 2
-    usual = np.take_along_axis(black, middle[:, None], axis=1)[:, 0]
+    black[prints.polarity == 0] = -np.inf
+    black.sort(axis=1)
     bright, dark = _bright_and_dark(prints, levels)
-    lighter = (black[:, -_FEW] - usual) / np.maximum(bright - dark, LEAST_CONTRAST)
-    off = settled.sides_off_px / np.maximum(settled.spreads_px, _LEAST_SPREAD_PX)
-    sharp = (
-        ((lighter > _LIGHTER) & (settled.cells_px > _SMALL_PX))
-        | (off > _SIDE_OFF)
-        | (settled.spreads_px > _SPREAD_PX)
-    )
-    moving = (lighter > _LIGHTER_BLURRED) | (settled.spreads_px > _SPREAD_PX)
+    lighter = black[:, -_FEW] - black[:, black.shape[1] // 2]
+    lighter /= np.maximum(bright - dark, LEAST_CONTRAST)
+    spreads_px = settled.spreads_px
+    off = settled.sides_off_px / np.maximum(spreads_px, _LEAST_SPREAD_PX)
+    sharp = (lighter > _LIGHTER) & (settled.cells_px > _SMALL_PX)
+    sharp |= (off > _SIDE_OFF) | (spreads_px > _SPREAD_PX)
+    sharp |= (off > _SIDE_OFF_WIDE) & (spreads_px > _WIDE_SPREAD_PX)
+    moving = (lighter > _LIGHTER_BLURRED) | (spreads_px > _SPREAD_PX)
     return np.asarray(np.where(settled.blurred.any(axis=1), moving, sharp))

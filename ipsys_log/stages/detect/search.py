@@ -7,7 +7,7 @@ not a marker yet is read again at full size.
 
 from __future__ import annotations
 
-from collections.abc import Iterable
+from collections.abc import Iterable, Sequence
 from functools import cache
 from typing import Any, NamedTuple
 
@@ -31,15 +31,13 @@ _BORDER_PX = 1
 _NEAR = (4, 4)
 _REFINE = (cv2.TERM_CRITERIA_COUNT + cv2.TERM_CRITERIA_EPS, 10, 0.05)
 _MISREAD = 3
-# Leftovers: the contrast within a square of the reduced picture, seen at every so many of its pixels; how far
-# around a marker its paper reaches, in sides; the smallest thing looked at, in steps; and where one search of
-# the whole picture is faster than many.
+# Leftovers: the contrast between neighbouring samples, and the square that has it; how far around a marker
+# its paper reaches, in sides; and where one search of the whole picture is faster than many.
 _CONTRAST = 30
-_STEP = 3
-_AROUND = np.ones((5, 5), dtype=np.uint8)
+_STEP_PX, _COARSER = 6, 3
+_AROUND, _SQUARE = np.ones((3, 3), dtype=np.uint8), np.ones((4, 4), dtype=np.uint8)
 _PAPER = 0.35
-_LEAST = 2
-_CLEAR_PX = 12
+_CLEAR_PX = 24
 _MOST, _MANY = 0.4, 40
 # Rows and columns of a whole picture.
 WHOLE = (slice(None), slice(None))
@@ -91,7 +89,7 @@ def search_thoroughly(grey: Grey, dictionary: str, region: tuple[slice, slice] =
     return _placed(_candidates(found, ids), region)
 
 
-def search_leftovers(grey: Grey, dictionary: str, known_px: Iterable[Array]) -> list[Candidate]:
+def search_leftovers(grey: Grey, dictionary: str, known_px: Sequence[Array]) -> list[Candidate]:
     """Search thoroughly where a picture has contrast that no known marker, (4, 2) in px, explains."""
     candidates = []
     for region in _contrasts(grey, known_px):
@@ -99,30 +97,43 @@ def search_leftovers(grey: Grey, dictionary: str, known_px: Iterable[Array]) -> 
     return candidates
 
 
-def _contrasts(grey: Grey, known_px: Iterable[Array]) -> list[tuple[slice, slice]]:
-    """Return rows and columns of what has the contrast of a marker, known markers excepted."""
-    small = np.ascontiguousarray(grey[_SHRINK // 2 :: _SHRINK, _SHRINK // 2 :: _SHRINK])
-    brightest, darkest = cv2.dilate(small, _AROUND), cv2.erode(small, _AROUND)
-    contrast = cv2.subtract(brightest, darkest)[::_STEP, ::_STEP] > _CONTRAST
-    scale = _SHRINK * _STEP
-    for corners_px in known_px:
-        low, high = corners_px.min(axis=0), corners_px.max(axis=0)
-        around = _PAPER * (high - low) + scale
-        left, top = np.maximum((low - around) / scale, 0).astype(int)
-        right, bottom = ((high + around) / scale).astype(int) + 1
-        contrast[top:bottom, left:right] = False
-    count, _, boxes, _ = cv2.connectedComponentsWithStats(contrast.astype(np.uint8))
-    if boxes[1:, 2].dot(boxes[1:, 3]) > _MOST * contrast.size or count > _MANY:
+def _contrasts(grey: Grey, known_px: Sequence[Array]) -> list[tuple[slice, slice]]:
+    """Return rows and columns of what has the contrast of a marker, known markers excepted.
+
+    Lines and the edges of large things have contrast too, but not everywhere in a square.
+    """
+    fine = np.ascontiguousarray(grey[_STEP_PX // 2 :: _STEP_PX, _STEP_PX // 2 :: _STEP_PX])
+    # Cells of a large marker have no contrast in them at the fine scale.
+    coarse = np.ascontiguousarray(fine[_COARSER // 2 :: _COARSER, _COARSER // 2 :: _COARSER])
+    if not coarse.size:
         return [WHOLE]
-    spans = [(left, top, left + width, top + height) for left, top, width, height, _ in boxes[1:].tolist()]
-    return [
-        (
-            slice(max(top * scale - _CLEAR_PX, 0), bottom * scale + _CLEAR_PX),
-            slice(max(left * scale - _CLEAR_PX, 0), right * scale + _CLEAR_PX),
-        )
-        for left, top, right, bottom in spans
-        if min(right - left, bottom - top) >= _LEAST
-    ]
+    full = _squares(fine)
+    cv2.bitwise_or(
+        full, cv2.resize(_squares(coarse), full.shape[::-1], interpolation=cv2.INTER_NEAREST), full
+    )
+    if len(known_px):
+        known = np.asarray(known_px)
+        low, high = known.min(axis=1), known.max(axis=1)
+        around = _PAPER * (high - low) + _COARSER * _STEP_PX
+        spans = np.concatenate([np.maximum(low - around, 0), high + around + _STEP_PX], axis=1) / _STEP_PX
+        for left, top, right, bottom in spans.astype(int).tolist():
+            full[top:bottom, left:right] = 0
+    contours, _ = cv2.findContours(full, cv2.RETR_EXTERNAL, cv2.CHAIN_APPROX_SIMPLE)
+    boxes = [cv2.boundingRect(contour) for contour in contours]
+    if sum(width * height for *_, width, height in boxes) > _MOST * full.size or len(boxes) > _MANY:
+        return [WHOLE]
+    return [(_widened(top, height), _widened(left, width)) for left, top, width, height in boxes]
+
+
+def _squares(samples: Grey) -> Grey:
+    """Return 1 where a square lies in which samples have contrast everywhere."""
+    contrast = cv2.morphologyEx(samples, cv2.MORPH_GRADIENT, _AROUND)
+    high = cv2.threshold(contrast, _CONTRAST, 1, cv2.THRESH_BINARY)[1]
+    return np.asarray(cv2.morphologyEx(high, cv2.MORPH_OPEN, _SQUARE), dtype=np.uint8)
+
+
+def _widened(first: int, count: int) -> slice:
+    return slice(max(first * _STEP_PX - _CLEAR_PX, 0), (first + count) * _STEP_PX + _CLEAR_PX)
 
 
 def _candidates(found: Iterable[Any], ids: Any) -> list[Candidate]:

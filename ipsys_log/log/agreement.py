@@ -3,12 +3,14 @@
 from collections import Counter
 
 from mcap import records as mcap
+from mcap.opcode import Opcode
 
 from ipsys_log.errors import LogError
 from ipsys_log.log.contents import Contents
 from ipsys_log.log.findings import Survey
 from ipsys_log.log.load import Summary, load_contents, read_summary
-from ipsys_log.log.records import ChunkRef
+from ipsys_log.log.records import DATA_END, ChunkRef, exact, walk
+from ipsys_log.log.resync import PRIVATE
 from ipsys_log.log.rows import chunk_entries
 from ipsys_log.log.view import View
 
@@ -19,20 +21,22 @@ def disagreement(view: View, found: Survey) -> str:
     """Return in what a log disagrees with its own survey, "" if it is whole."""
     try:
         theirs, summary = load_contents(view), read_summary(view)
+        if summary is not None:
+            _check_lengths(view, theirs.data_end + DATA_END.size)
     except LogError as error:
-        return str(error)
+        return str(error).removeprefix(f"{view.path} ").split(". Run:", 1)[0]
     mine = found.contents
-    if not found.finished or found.damaged or not found.crc_is_right:
-        return "its data section is damaged"
-    if theirs.data_end != found.end:
-        return "its summary is that of another data section"
-    if Counter(mine.counts) != Counter(theirs.counts):
-        return (
-            f"its readers count {sum(theirs.counts.values())} messages, it holds {sum(mine.counts.values())}"
-        )
-    if not _same_chunks(theirs.chunks, mine.chunks):
-        return "its readers look for other chunks than it has"
-    return _summary_disagreement(summary, mine, found) if summary is not None else ""
+    counts = (
+        f"readers count {sum(theirs.counts.values())} messages, but there are {sum(mine.counts.values())}"
+    )
+    tests = (
+        (not found.finished or bool(found.damaged) or not found.crc_is_right, "its data section is damaged"),
+        (theirs.data_end != found.end, "its summary is that of another data section"),
+        (Counter(mine.counts) != Counter(theirs.counts), counts),
+        (not _same_chunks(theirs.chunks, mine.chunks), "readers look for other chunks than it has"),
+    )
+    what = next((what for is_wrong, what in tests if is_wrong), "")
+    return what if what or summary is None else _summary_disagreement(summary, mine, found)
 
 
 def count_by_indexes(view: View) -> int:
@@ -42,6 +46,15 @@ def count_by_indexes(view: View) -> int:
     for chunk in contents.chunks:
         total += sum(map(len, chunk_entries(view, chunk, {}).values()))
     return total
+
+
+def _check_lengths(view: View, start: int) -> None:
+    """Refuse a summary of which a reader that believes all lengths would read too much."""
+    for at in walk(view, start, view.size):
+        if at.opcode == Opcode.FOOTER:
+            return
+        if at.opcode < PRIVATE:
+            exact(view, at, view.read(at.offset, at.length))
 
 
 def _summary_disagreement(summary: Summary, mine: Contents, found: Survey) -> str:

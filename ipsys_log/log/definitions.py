@@ -1,8 +1,9 @@
 """Schemas and channels of a data section, in file order, and the substitutes of those that were lost."""
 
-from collections.abc import Iterator, Mapping
+from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import dataclass, field, replace
 from itertools import islice
+from typing import Any
 
 from mcap import records as mcap
 
@@ -42,6 +43,9 @@ class Definitions:
     _schema_at: dict[int, int] = field(default_factory=dict)  # where each schema is defined
     _sure: Contents | None = None
     _checked: set[tuple[bool, int]] = field(default_factory=set)  # schemas and channels by the CRC of a chunk
+    _places: dict[tuple[bool, int], RecordAt] = field(
+        default_factory=dict
+    )  # schemas and channels in no chunk
     _full: int = 0  # so many of the first rooms are full
     _misread: list[mcap.Channel] = field(default_factory=list)
     _unused: dict[int, RecordAt] = field(default_factory=dict)  # records of channels without messages so far
@@ -70,6 +74,7 @@ class Definitions:
                 raise view.fault(at.offset, f"the definition of schema {record.id} is damaged")
             self.schemas[record.id] = record
             self._schema_at.setdefault(record.id, at.offset)
+            self._places[True, record.id] = at
             return
         assert isinstance(record, mcap.Channel)
         channel = record
@@ -81,6 +86,7 @@ class Definitions:
             raise view.fault(at.offset, f"channel {channel.id} has a schema that is not in the log")
         if channel.id not in self.channels:
             self._unused[channel.id] = at
+            self._places[False, channel.id] = at
         self.channels[channel.id] = channel
 
     def take_chunk(self, view: View, offset: int, inside: Inside, *, checked: bool) -> None:
@@ -101,7 +107,7 @@ class Definitions:
         for channel_id in inside.entries.keys() - inside.channels.keys():
             self.need(view, offset, channel_id)
         if checked:
-            self._checked |= {(isinstance(record, mcap.Schema), record.id) for record in records}
+            self._confirm(records)
         for key, schema in inside.schemas.items():
             self.schemas.setdefault(key, schema)
             self._schema_at.setdefault(key, offset)
@@ -147,6 +153,18 @@ class Definitions:
             self.channels.setdefault(channel.id, channel)
         for schema in self._sure.schemas.values() if self._sure else ():
             self.schemas.setdefault(schema.id, schema)
+
+    def _confirm(self, records: Sequence[mcap.Schema | mcap.Channel]) -> None:
+        """Let definitions with a right CRC replace those that have none, and blank the records of these."""
+        for record in records:
+            key = (isinstance(record, mcap.Schema), record.id)
+            mine: dict[int, Any] = self.schemas if key[0] else self.channels
+            if key not in self._checked and mine.get(record.id, record) != record:
+                del mine[record.id]
+                at = self._places.get(key)
+                if at is not None:
+                    self.rooms.append(Stretch(at.offset, at.length))
+            self._checked.add(key)
 
     def is_stranger(self, inside: Inside) -> bool:
         """Return whether a chunk with a right CRC defines something else under an id of this log."""

@@ -126,20 +126,25 @@ def parse(read: Callable[[ReadDataStream], R], view: View, at: RecordAt, body: b
         raise view.fault(at.offset, f"the {_name(at.opcode)} record is not valid ({error!r})") from None
 
 
-_DEFINITIONS: dict[int, Callable[[ReadDataStream], mcap.McapRecord]] = {
+_READERS: dict[int, Callable[[ReadDataStream], mcap.McapRecord]] = {
     Opcode.HEADER: mcap.Header.read,
     Opcode.SCHEMA: mcap.Schema.read,
     Opcode.CHANNEL: mcap.Channel.read,
     Opcode.METADATA: mcap.Metadata.read,
+    Opcode.STATISTICS: mcap.Statistics.read,
+    Opcode.CHUNK_INDEX: mcap.ChunkIndex.read,
+    Opcode.ATTACHMENT_INDEX: mcap.AttachmentIndex.read,
+    Opcode.METADATA_INDEX: mcap.MetadataIndex.read,
+    Opcode.SUMMARY_OFFSET: mcap.SummaryOffset.read,
 }
 
 
 def exact(view: View, at: RecordAt, data: bytes) -> mcap.McapRecord:
-    """The Header, Schema, Channel or Metadata record `data`; every length in it must be right.
+    """Parse the record `data`, which is of none of the types that hold messages; its lengths must be right.
 
     What follows the fields that are known is left to later versions of the format.
     """
-    record = parse(_DEFINITIONS[at.opcode], view, at, data[HEADER.size :])
+    record = parse(_READERS[at.opcode], view, at, data[HEADER.size :])
     if not data.startswith(as_bytes(record)[HEADER.size :], HEADER.size):
         raise view.fault(at.offset, f"the {_name(at.opcode)} record claims lengths that it does not have")
     return record

@@ -103,13 +103,15 @@ def repair(path: str | os.PathLike[str], *, storage: Storage = DISK) -> RepairRe
                 raise LogError(
                     f"{target} is not an MCAP file (it starts with {start!r}): nothing was changed"
                 )
-            if not disagreement(view, found):
+            what = disagreement(view, found)
+            if not what:
                 total = sum(found.contents.counts.values())
                 return RepairReport(
                     target, bool(notes), 0, total, found.contents.end_ns, notes=tuple(notes), kept_in=resumed
                 )
             report = _rebuild(storage, view, found, saved, known)
-        return replace(report, notes=(*notes, *report.notes), written_ns=status.st_mtime_ns)
+        found_notes = report.notes or (f"found: {what}",)
+        return replace(report, notes=(*notes, *found_notes), written_ns=status.st_mtime_ns)
     except OSError as error:
         raise LogError(f"{target} cannot be repaired ({error.strerror}): {disk_advice(error)}") from None
     finally:

@@ -205,6 +205,7 @@ class Resync:
             return False
         _, _, channel, _, time_ns, _ = MESSAGE.unpack(self.view.read(at.offset, MESSAGE.size))
         near = any(abs(time_ns - recent_ns) < _DAY_NS for recent_ns in self.times_ns)
+        near |= not self.times_ns and messages > 1
         fits = channel in defined or (near and channel in self.channels)
         return True if fits or messages + len(defined) >= _ENOUGH else None
 

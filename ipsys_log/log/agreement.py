@@ -24,7 +24,7 @@ def disagreement(view: View, found: Survey) -> str:
         if summary is not None:
             _check_lengths(view, theirs.data_end + DATA_END.size)
     except LogError as error:
-        return str(error).removeprefix(f"{view.path} ").split(". Run:", 1)[0]
+        return str(error).split(" is damaged ", 1)[-1].split(". Run:", 1)[0]
     mine = found.contents
     counts = (
         f"readers count {sum(theirs.counts.values())} messages, but there are {sum(mine.counts.values())}"

@@ -85,7 +85,7 @@ def _is_chunked(known: Summary | None) -> bool | None:
 def _take_start(found: Survey) -> int:
     """Check the magic bytes and the Header record; return the offset of the records behind them."""
     view, start = found.view, len(MAGIC)
-    behind, reason = _behind_header(view)
+    behind, reason = _behind_header(found)
     if view.read(0, min(start, view.size)) != MAGIC:
         follower = start if behind > start else found.resync.find(start)
         if follower is None:
@@ -104,9 +104,9 @@ def _take_start(found: Survey) -> int:
     return _add_damage(found, Stretch(start, follower - start, head), reason)
 
 
-def _behind_header(view: View) -> tuple[int, str]:
+def _behind_header(found: Survey) -> tuple[int, str]:
     """Return the end of the Header record, its place if there is none, 0 and the reason if it is damaged."""
-    start = len(MAGIC)
+    view, start = found.view, len(MAGIC)
     try:
         at = next(walk(view, start, view.size), None)
         if at is None or at.opcode != Opcode.HEADER:
@@ -114,6 +114,7 @@ def _behind_header(view: View) -> tuple[int, str]:
         if at.length > _LONGEST_HEADER:
             raise view.fault(start, f"the HEADER record claims {at.length} bytes")
         exact(view, at, view.read(start, at.length))
+        _check_length(found, at)
     except LogError as error:
         return 0, _reason(error)
     return at.offset + at.length, ""

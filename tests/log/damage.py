@@ -358,7 +358,8 @@ def _check_readers(
     if strange and sample.checked:
         out.invented = strange
         # Without beginning and end nobody knows whether its messages lay in chunks, which have CRCs.
-        known = sample.summary is not None or not damaged.touches((0, 2 * SECTOR))
+        ends = sample.summary is not None and not damaged.touches(sample.summary)
+        known = ends or not damaged.touches((0, 2 * SECTOR))
         if not out.report.unchecked and known:
             out.complaints.append(f"{strange} messages were never written")
 

@@ -8,9 +8,21 @@ from dataclasses import dataclass, replace
 import numpy as np
 
 from ipsys_log.messages import CameraCalibration
-from tests.stages.drawing import Array, Look, Print, _project, corners_px, draw, jpeg, strewn
+from tests.stages.drawing import (
+    VGA,
+    Array,
+    Look,
+    Picture,
+    Print,
+    _project,
+    at_px,
+    corners_px,
+    draw,
+    jpeg,
+    strewn,
+)
 
-__all__ = ["LIGHTS", "Light", "lit_frame", "shadow", "spots", "streak"]
+__all__ = ["LIGHTS", "Light", "lit_frame", "marker_in_glare", "shadow", "spots", "streak"]
 
 # Corners in sides of the square, clockwise from the top left.
 _CORNERS = np.array([[-0.5, 0.5], [0.5, 0.5], [0.5, -0.5], [-0.5, -0.5]])
@@ -35,6 +47,13 @@ def lit_frame(
         glare, shade = glare + more, shade * remains
     picture = draw(lens, prints, replace(look, glare=glare, shade=shade))
     return jpeg(picture), {one.id: corners_px(lens, one) for one in prints}
+
+
+def marker_in_glare() -> Picture:
+    """Return a frame of marker 5 with glare over most of its cells."""
+    one = at_px(VGA, 5, (330, 240), 2.0, length_m=0.4)
+    x, y = _pixels(VGA)
+    return draw(VGA, [one], Look(glare=400 * np.exp(-((x - 340) ** 2 + (y - 250) ** 2) / (2 * 9.0**2))))
 
 
 def spots(level: float, breadth: float, where: str) -> Light:

@@ -42,7 +42,7 @@ from tests.stages.drawing import (
     jpeg,
     rig,
 )
-from tests.stages.lighting import LIGHTS, lit_frame, spots, streak
+from tests.stages.lighting import LIGHTS, lit_frame, marker_in_glare, spots, streak
 
 DICTIONARY = "DICT_4X4_100"
 # Of the small frames of the fast tests: cells of 13 px in the middle.
@@ -155,13 +155,6 @@ def test_tracked_marker_is_kept_while_glare_moves_over_it() -> None:
 # --- what is seen and cannot be measured --------------------------------------------------------
 
 
-def glaring(level: float = 400.0) -> Picture:
-    """Return a marker with glare over most of its cells."""
-    one = at_px(VGA, 5, (330, 240), 2.0, length_m=SIDE_M)
-    y, x = np.mgrid[: VGA.height, : VGA.width]
-    return draw(VGA, [one], Look(glare=level * np.exp(-((x - 340) ** 2 + (y - 250) ** 2) / (2 * 9.0**2))))
-
-
 def answers_to(pictures: Iterable[Picture]) -> list[object]:
     stage = Detect("edges")
     messages = [rig(), calibrated(VGA)]
@@ -170,7 +163,7 @@ def answers_to(pictures: Iterable[Picture]) -> list[object]:
 
 
 def test_marker_that_cannot_be_measured_is_named_once() -> None:
-    events = [one for one in answers_to([glaring()] * 3) if isinstance(one, Event)]
+    events = [one for one in answers_to([marker_in_glare()] * 3) if isinstance(one, Event)]
     assert [(one.kind, one.camera, one.marker_id) for one in events] == [("rejected_marker", "red", 5)]
     assert "marker 5 is seen and not measured: glare hides" in events[0].text
 

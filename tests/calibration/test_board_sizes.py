@@ -112,11 +112,11 @@ def test_part_of_a_board_insisted_on_is_used() -> None:
     assert {len(sighting.ids) for sighting in looked.sightings} == {30}
 
 
-@pytest.mark.parametrize("stated", ["7x5", "5x6", "4x7", "6x7", pytest.param("6x4", marks=pytest.mark.slow)])
+@pytest.mark.parametrize("stated", ["7x5", "5x6", "4x7", "6x7"])
 def test_charuco_of_other_size_is_named(stated: str) -> None:
-    """7x5 has as many markers, and 6x4 as many inner corners as a chessboard."""
+    """7x5 has as many markers; its rows are longer."""
     with pytest.raises(IpsysError, match=r"--board charuco:5x7"):
-        seen(charuco(5, 7), stated if stated == "6x4" else f"charuco:{stated}")
+        seen(charuco(5, 7), f"charuco:{stated}")
 
 
 def test_charuco_of_right_size_is_accepted() -> None:

@@ -24,7 +24,7 @@ from pathlib import Path
 from results import Report, command
 from rounds import Row
 from scenes import drawn
-from streams import Served, loops_of, serve
+from stream_server import Served, loops_of, serve
 
 from ipsys_log import pipeline
 from ipsys_log.log.session import Session

@@ -151,7 +151,7 @@ def test_some_markers_that_are_not_in_the_rig_are_left_out_and_named(ipsys: Ipsy
 
 
 def doubled(lab: Path, number: int = 3) -> tuple[Path, int]:
-    """The lab with one marker copied beside itself in one frame of the red camera."""
+    """The lab with two more copies of one marker in one frame of the red camera."""
     times: list[int] = []
 
     def change(message: Message) -> Message:
@@ -163,11 +163,11 @@ def doubled(lab: Path, number: int = 3) -> tuple[Path, int]:
         picture = cv2.imdecode(np.frombuffer(message.payload.data, np.uint8), cv2.IMREAD_COLOR)
         assert picture is not None
         dictionary = cv2.aruco.getPredefinedDictionary(cv2.aruco.DICT_4X4_100)
-        picture[:, :340] = 180
-        for x in (40, 200):
-            marker = cv2.aruco.generateImageMarker(dictionary, 4, 90)
-            picture[100:220, x : x + 120] = 255
-            picture[115:205, x + 15 : x + 105] = marker[..., None]
+        picture[200:340, 310:650] = 180
+        for x in (400, 490):  # in the middle, where the lens bends no line
+            marker = cv2.aruco.generateImageMarker(dictionary, 4, 42)
+            picture[240:300, x : x + 60] = 255
+            picture[249:291, x + 9 : x + 51] = marker[..., None]
         data = cv2.imencode(".jpg", picture)[1].tobytes()
         return replace(message, payload=replace(message.payload, data=data))
 

@@ -101,7 +101,7 @@ def test_live_reports_what_it_measured_without_a_stream(
 @pytest.fixture
 def streams(monkeypatch: pytest.MonkeyPatch) -> Any:
     monkeypatch.syspath_prepend(BENCHMARKS)
-    return importlib.import_module("streams")
+    return importlib.import_module("stream_server")
 
 
 # Listens as ffmpeg does, after a while; of the camera black never, of white it ends at once.

@@ -10,7 +10,7 @@ from typing import TYPE_CHECKING, Annotated, Any, Optional
 
 import typer
 
-from ipsys_log.cli.cameras_now import Lab, prepared, recorded_now, say
+from ipsys_log.cli.cameras_now import SENT_NOW, Lab, prepared, recorded_now, say
 from ipsys_log.cli.console import console, progress_bar, remarks
 from ipsys_log.cli.options import AsJson
 from ipsys_log.cli.signals import note_kept, say_kept
@@ -139,9 +139,12 @@ def calibrate(
         with progress_bar() as progress:
             outcomes = []
             for outcome in calibrate_cameras(found, wanted, model, progress, insist=force):
-                outcomes.append(outcome)
                 if isinstance(outcome, Calibrated):
                     _write(outcome, targets[outcome.camera])
+                    outcomes.append(outcome)
+                else:  # a log that was only taken for this is gone when the user reads the reason
+                    reason = outcome.reason.replace(str(taken[0]), SENT_NOW) if lab else outcome.reason
+                    outcomes.append(outcome._replace(reason=reason))
     lenses = [outcome for outcome in outcomes if isinstance(outcome, Calibrated)]
     if plot is not None and lenses:
         _draw(lenses, plot)

@@ -25,9 +25,21 @@ if TYPE_CHECKING:
     from ipsys_log.report.cameras import LiveStatus
     from ipsys_log.sources.attached import Attached
 
-__all__ = ["MODEL", "Lab", "check_target", "opened", "prepared", "recorded_now", "say", "shown_to"]
+__all__ = [
+    "MODEL",
+    "SENT_NOW",
+    "Lab",
+    "check_target",
+    "opened",
+    "prepared",
+    "recorded_now",
+    "say",
+    "shown_to",
+]
 
 
+# The name of a log that is only kept while the command runs.
+SENT_NOW = "what the cameras sent"
 # What a log is that is named by --model-from.
 MODEL = "the log with the model"
 # So much of what cameras send is kept of a place that is measured.
@@ -256,4 +268,4 @@ def recorded_now(lab: Lab, seconds: float, keep: Path | None = None) -> Iterator
         except IpsysError as error:
             if keep is not None:
                 raise
-            raise IpsysError(str(error).replace(str(log), "what the cameras sent")) from error
+            raise IpsysError(str(error).replace(str(log), SENT_NOW)) from error

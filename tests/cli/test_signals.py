@@ -130,7 +130,7 @@ def test_ignored_interrupt_stays_ignored_and_sigterm_stops(tmp_path: Path) -> No
     with start(*command, shell="trap '' INT;") as program:
         wait_for(log, 20_000)
         program.send_signal(signal.SIGINT)
-        wait_for(log, log.stat().st_size + 100_000)
+        wait_for(log, log.stat().st_size + 50_000)
         assert program.poll() is None
         program.send_signal(signal.SIGTERM)
         _, err = program.communicate(timeout=LIMIT_S)
@@ -141,7 +141,8 @@ def test_ignored_interrupt_stays_ignored_and_sigterm_stops(tmp_path: Path) -> No
 
 @pytest.mark.parametrize("number", [signal.SIGINT, signal.SIGTERM])
 def test_simulate_interrupted_leaves_no_partial_file(number: int, tmp_path: Path) -> None:
-    command = ("simulate", "-o", tmp_path / "lab.mcap", "--width", "320", "--height", "180")
+    size = ("--width", "320", "--height", "180", "--drive-s", "300")
+    command = ("simulate", "-o", tmp_path / "lab.mcap", *size)
     with start(*command) as program:
         wait_for(tmp_path / "lab.mcap.partial", 1)
         program.send_signal(number)
@@ -161,4 +162,4 @@ def test_closed_terminal_ends_a_recording_whole(tmp_path: Path) -> None:
     os.close(terminal)  # the kernel sends SIGHUP
     os.waitpid(child, 0)
     with LogReader(log) as reader:
-        assert reader.message_count > 10
+        assert reader.channels["/cameras/red/image"].message_count > 0

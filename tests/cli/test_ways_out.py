@@ -239,7 +239,8 @@ def interrupted_when(command: list[object], ready: Callable[[], bool]) -> tuple[
 def test_simulate_interrupted_says_that_nothing_was_written(tmp_path: Path) -> None:
     log = tmp_path / "lab.mcap"
     code, err = interrupted_when(
-        ["simulate", "-o", log, "--width", 640, "--height", 360], lambda: bool(list(tmp_path.iterdir()))
+        ["simulate", "-o", log, "--width", 640, "--height", 360, "--drive-s", 300],
+        lambda: bool(list(tmp_path.iterdir())),
     )
     assert code == 130
     assert f"ipsys: interrupted; {log} was not written" in err

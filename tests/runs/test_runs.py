@@ -143,9 +143,10 @@ def test_a_seed_changes_the_folds_and_nothing_else_where_places_are_labelled(
     assert {stage for stage, (_, new) in made.items() if new} == {"evaluate"}
     assert all(not new for _, new in runs_of(ipsys, "replay", paper, "--seed", 5).values())
     # What is shown is the new evaluation, once, with the tracks that are still right.
-    done = ipsys("replay", paper, "--seed", 5)
+    done = ipsys("replay", paper, "--seed", 5, "--details")
     assert done.out.count("(tracks)") == 1
-    assert done.out.count("red ") == 4
+    # One row in the summary, and one in each table of the details.
+    assert sum(line.split()[:1] == ["red"] for line in done.out.splitlines()) == 1 + 4
 
 
 def test_a_model_is_known_by_what_it_is_and_not_by_its_file(

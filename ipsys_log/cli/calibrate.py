@@ -137,7 +137,7 @@ def calibrate(
         found = find_sources(taken, camera or [])
         targets = _targets([pictures.camera for pictures in found], output, names, force)
         with progress_bar() as progress:
-            outcomes = []
+            outcomes: list[Calibrated | Failure] = []
             for outcome in calibrate_cameras(found, wanted, model, progress, insist=force):
                 if isinstance(outcome, Calibrated):
                     _write(outcome, targets[outcome.camera])

@@ -144,6 +144,8 @@ def exact(view: View, at: RecordAt, data: bytes) -> mcap.McapRecord:
 
     What follows the fields that are known is left to later versions of the format.
     """
+    if at.opcode not in _READERS:
+        raise view.fault(at.offset, f"a record of {_name(at.opcode)} has no place there")
     record = parse(_READERS[at.opcode], view, at, data[HEADER.size :])
     if not data.startswith(as_bytes(record)[HEADER.size :], HEADER.size):
         raise view.fault(at.offset, f"the {_name(at.opcode)} record claims lengths that it does not have")

@@ -160,11 +160,17 @@ class Definitions:
             key = (isinstance(record, mcap.Schema), record.id)
             mine: dict[int, Any] = self.schemas if key[0] else self.channels
             if key not in self._checked and mine.get(record.id, record) != record:
-                del mine[record.id]
-                at = self._places.get(key)
-                if at is not None:
-                    self.rooms.append(Stretch(at.offset, at.length))
+                self._blank(mine, key)
+                users = [c.id for c in self.channels.values() if key[0] and c.schema_id == record.id]
+                for channel_id in users:
+                    self._blank(self.channels, (False, channel_id))
             self._checked.add(key)
+
+    def _blank(self, mine: dict[int, Any], key: tuple[bool, int]) -> None:
+        del mine[key[1]]
+        at = self._places.pop(key, None)
+        if at is not None:
+            self.rooms.append(Stretch(at.offset, at.length))
 
     def is_stranger(self, inside: Inside) -> bool:
         """Return whether a chunk with a right CRC defines something else under an id of this log."""

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import heapq
 from collections.abc import Callable
 
 from ipsys_log.messages import Message
@@ -19,16 +20,27 @@ class Fading:
 
     def __init__(self, clear: Callable[[Entity, int, int], None]) -> None:
         self._clear = clear
-        self._seen: dict[Entity, tuple[int, int, int]] = {}
+        self._seen: dict[Entity, tuple[int, int]] = {}  # when it is overdue, in publish and in log time
+        # One entry for each entity, not later than it is overdue: it may have been seen again since.
+        self._checks: list[tuple[int, Entity]] = []
 
     def seen(self, entity: Entity, message: Message, fade_ns: int) -> None:
         """Note that something is drawn; with 0 it stays until the next time."""
-        if fade_ns > 0:
-            self._seen[entity] = (message.publish_time_ns, message.log_time_ns, fade_ns)
+        if fade_ns <= 0:
+            return
+        overdue_ns = message.log_time_ns + fade_ns
+        if entity not in self._seen:
+            heapq.heappush(self._checks, (overdue_ns, entity))
+        self._seen[entity] = (message.publish_time_ns + fade_ns, overdue_ns)
 
     def advance(self, log_time_ns: int) -> None:
         """Clear what is overdue by now."""
-        overdue = [e for e, (_, last_ns, fade_ns) in self._seen.items() if log_time_ns > last_ns + fade_ns]
-        for entity in overdue:
-            publish_ns, last_ns, fade_ns = self._seen.pop(entity)
-            self._clear(entity, publish_ns + fade_ns, last_ns + fade_ns)
+        while self._checks and self._checks[0][0] < log_time_ns:
+            _, entity = self._checks[0]
+            publish_ns, overdue_ns = self._seen[entity]
+            if overdue_ns < log_time_ns:
+                heapq.heappop(self._checks)
+                del self._seen[entity]
+                self._clear(entity, publish_ns, overdue_ns)
+            else:
+                heapq.heapreplace(self._checks, (overdue_ns, entity))

@@ -107,6 +107,7 @@ def _draw(session: Session, shown: Shown, recording: rr.RecordingStream, sent: C
     for number, message in enumerate(session.messages([*shown.frames, *shown.moving, *shown.events])):
         sink(message)
         if number % _BATCH == 0:
+            sink.flush()
             sent()
     sink.close()
     sent()

@@ -129,6 +129,7 @@ class LiveView:
             while (message := self._waiting.get()) is not None:
                 sink(message)
                 if self._waiting.empty() or isinstance(message.payload, Tracks):
+                    sink.flush()
                     write(stream.read() or b"")
             sink.close()
             write(stream.read() or b"")

@@ -2,12 +2,13 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Iterable, Mapping, Sequence
+from collections.abc import Callable, Hashable, Iterable, Mapping, Sequence
 from typing import Any
 
 import numpy as np
 import rerun as rr
 
+from ipsys_log.errors import IpsysError
 from ipsys_log.log.topics import run_of_topic
 from ipsys_log.messages import (
     TRUTH_TOPIC,
@@ -30,10 +31,14 @@ from ipsys_log.sinks.trails import Segment, Trails
 __all__ = ["RerunSink", "trail_entity"]
 
 Entity = tuple[str, ...]
+Kind = Any  # a class of what Rerun draws, such as rr.Points3D
+Fields = Mapping[str, Any]
 
 # Rerun counts pixels from the first pixel's corner, OpenCV from its centre.
 _CORNER_FROM_CENTRE_PX = 0.5
 _HEADING_M = 0.3
+_MOST_ROBOTS = 5000  # of all runs together: an ArUco dictionary has 1000 markers at most
+_LINE, _THIN, _DOT = (rr.Radius.ui_points(width) for width in (1.5, 0.75, 0.5))
 
 
 def tracks_entity(run: str | None) -> Entity:
@@ -70,9 +75,11 @@ class RerunSink:
         self._colours = camera_colours(cameras)
         self._fade_ns = fade_ns
         self._runs = tuple(runs)
-        self._robots: dict[tuple[str, str], int] = {}
+        self._robots: dict[tuple[str | None, str], int] = {}
+        self._waiting: dict[Entity, tuple[Kind, list[tuple[Message | Segment, Fields]]]] = {}
+        self._looks: dict[Entity, tuple[Hashable, int]] = {}  # and the publish time from which each holds
         self._fading = Fading(self._clear)
-        self._trails = Trails(self._draw_trail)
+        self._trails = Trails(self._draw_segment)
         self._draw: dict[type, Callable[[Message], None]] = {
             CompressedImage: self._draw_image,
             CompressedVideo: self._draw_image,
@@ -90,13 +97,19 @@ class RerunSink:
         if draw is not None:
             draw(message)
 
+    def flush(self) -> None:
+        """Draw what waited: many rows of an entity at once take a fraction of the time."""
+        for entity in list(self._waiting):
+            self._send(entity)
+
     def close(self) -> None:
-        """Draw what waited for the next message."""
+        """Draw everything that waited."""
         self._trails.close()
+        self.flush()
         self._recording.flush()
 
-    def _log(self, when: Message | Segment, entity: Entity, *what: Any) -> None:
-        self._log_at(when.publish_time_ns, when.log_time_ns, entity, *what)
+    def _log(self, message: Message, entity: Entity, *what: Any) -> None:
+        self._log_at(message.publish_time_ns, message.log_time_ns, entity, *what)
 
     def _log_at(self, publish_time_ns: int, log_time_ns: int, entity: Entity, *what: Any) -> None:
         # The time is set for each entity: a trail belongs to an earlier instant than what is drawn with it.
@@ -104,7 +117,43 @@ class RerunSink:
             self._recording.set_time(timeline, timestamp=np.datetime64(time_ns, "ns"))
         self._recording.log(list(entity), *what, strict=True)
 
+    def _log_moved(self, message: Message, entity: Entity, kind: Kind, moved: Fields, look: Fields) -> None:
+        """Draw where something is now, and its look only where that is new: it takes most of the time."""
+        key = str(look)
+        before, since_ns = self._looks.get(entity, (None, 0))
+        is_late = message.publish_time_ns < since_ns
+        if key == before and not is_late:
+            self._add(message, entity, kind, moved)
+            return
+        # Behind a late message it is not known which look is the newest one.
+        self._looks[entity] = (None, since_ns) if is_late else (key, message.publish_time_ns)
+        self._send(entity)
+        self._log(message, entity, kind.from_fields(**moved, **look))
+
+    def _add(self, when: Message | Segment, entity: Entity, kind: Kind, fields: Fields) -> None:
+        self._waiting.setdefault(entity, (kind, []))[1].append((when, fields))
+
+    def _send(self, entity: Entity) -> None:
+        """Draw the rows of an entity that waited."""
+        if entity not in self._waiting:
+            return
+        kind, rows = self._waiting.pop(entity)
+        times_ns = zip(*((when.publish_time_ns, when.log_time_ns) for when, _ in rows), strict=True)
+        timelines = [
+            rr.TimeColumn(timeline, timestamp=np.array(column_ns, dtype="datetime64[ns]"))
+            for timeline, column_ns in zip(TIMELINES, times_ns, strict=True)
+        ]
+        names = rows[0][1]
+        fields = {name: [item for _, row in rows for item in row[name]] for name in names}
+        lengths = [len(row[next(iter(names))]) for _, row in rows]
+        columns = kind.columns(**fields).partition(lengths)
+        path = rr.new_entity_path(list(entity))
+        rr.send_columns(path, timelines, columns, recording=self._recording)
+
     def _clear(self, entity: Entity, publish_time_ns: int, log_time_ns: int) -> None:
+        for part in (entity, (*entity, "ids"), (*entity, "heading")):
+            self._looks.pop(part, None)
+            self._send(part)
         self._log_at(publish_time_ns, log_time_ns, entity, rr.Clear(recursive=True))
 
     def _draw_image(self, message: Message) -> None:
@@ -121,17 +170,16 @@ class RerunSink:
         entity = ("cameras", str(message.camera), "image", "markers")
         markers = message.payload.markers
         if not markers:
-            self._log(message, entity, rr.Clear(recursive=True))
+            self._clear(entity, message.publish_time_ns, message.log_time_ns)
             return
         outlines = [np.vstack([m.corners_px, m.corners_px[:1]]) + _CORNER_FROM_CENTRE_PX for m in markers]
-        width = rr.Radius.ui_points(1.5)
-        self._log(message, entity, rr.LineStrips2D(outlines, colors=[MARKER_COLOUR], radii=width))
+        line = {"colors": [MARKER_COLOUR], "radii": [_LINE]}
+        self._log_moved(message, entity, rr.LineStrips2D, {"strips": outlines}, line)
         # A label in the middle would hide the marker; below a point at its lower edge it does not.
         below = [(outline[:4, 0].mean(), outline[:4, 1].max()) for outline in outlines]
         ids = [str(marker.id) for marker in markers]
-        dot = rr.Radius.ui_points(0.5)
-        points = rr.Points2D(below, labels=ids, colors=[MARKER_COLOUR], radii=dot, show_labels=True)
-        self._log(message, (*entity, "ids"), points)
+        label = {"labels": ids, "colors": [MARKER_COLOUR], "radii": [_DOT], "show_labels": [True]}
+        self._log_moved(message, (*entity, "ids"), rr.Points2D, {"positions": below}, label)
         self._fading.seen(entity, message, self._fade_ns.get(message.topic, 0))
 
     def _draw_positions(self, message: Message) -> None:
@@ -139,16 +187,16 @@ class RerunSink:
         entity = (*tracks_entity(run_of_topic(message.topic)), "positions", camera)
         positions = message.payload.positions
         if not positions:
-            self._log(message, entity, rr.Clear(recursive=True))
+            self._clear(entity, message.publish_time_ns, message.log_time_ns)
             return
-        points = rr.Points3D(
-            [(p.x_m, p.y_m, p.z_m) for p in positions],
-            colors=[self._colours[camera]],
-            radii=[0.02],
-            labels=[f"{p.id} ({camera})" for p in positions],
-            show_labels=False,
-        )
-        self._log(message, entity, points)
+        look = {
+            "colors": [self._colours[camera]],
+            "radii": [0.02],
+            "labels": [f"{p.id} ({camera})" for p in positions],
+            "show_labels": [False],
+        }
+        points = [(p.x_m, p.y_m, p.z_m) for p in positions]
+        self._log_moved(message, entity, rr.Points3D, {"positions": points}, look)
         self._fading.seen(entity, message, self._fade_ns.get(message.topic, 0))
 
     def _draw_tracks(self, message: Message) -> None:
@@ -166,19 +214,23 @@ class RerunSink:
         at = [(track.x_m, track.y_m, track.z_m)]
         radius = 0.03 if run is None else 0.05
         # The truth lies under the track: its name would hide the robot's.
-        points = rr.Points3D(at, colors=[colour], radii=[radius], labels=[label], show_labels=run is not None)
-        self._log(message, entity, points)
+        look = {"colors": [colour], "radii": [radius], "labels": [label], "show_labels": [run is not None]}
+        self._log_moved(message, entity, rr.Points3D, {"positions": at}, look)
+        heading = (*entity, "heading")
         if track.heading_rad is None:
-            self._log(message, (*entity, "heading"), rr.Clear(recursive=False))
+            if heading in self._looks:
+                self._clear(heading, message.publish_time_ns, message.log_time_ns)
             return
         ahead = [(_HEADING_M * np.cos(track.heading_rad), _HEADING_M * np.sin(track.heading_rad), 0.0)]
-        arrow = rr.Arrows3D(origins=at, vectors=ahead, colors=[colour], radii=[0.012])
-        self._log(message, (*entity, "heading"), arrow)
+        arrow = {"origins": at, "vectors": ahead}
+        self._log_moved(message, heading, rr.Arrows3D, arrow, {"colors": [colour], "radii": [0.012]})
 
     def _robot_colour(self, run: str | None, robot: str) -> tuple[int, int, int]:
-        if run is None:
-            return TRUTH_COLOUR
-        return robot_colour(self._robots.setdefault((run, robot), len(self._robots)))
+        if (run, robot) not in self._robots:
+            if len(self._robots) == _MOST_ROBOTS:
+                raise IpsysError(f"the tracks name more than {_MOST_ROBOTS} robots, which cannot be drawn")
+            self._robots[run, robot] = sum(of_run is not None for of_run, _ in self._robots)
+        return TRUTH_COLOUR if run is None else robot_colour(self._robots[run, robot])
 
     def _label(self, run: str | None, robot: str) -> str:
         if run is None or len(self._runs) < 2:
@@ -186,14 +238,14 @@ class RerunSink:
         # Runs put a robot at nearly one place: a line further down for each keeps them apart.
         return "\n" * self._runs.index(run) + f"{robot} ({run})"
 
-    def _draw_trail(self, key: tuple[str | None, str], segment: Segment) -> None:
+    def _draw_segment(self, key: tuple[str | None, str], segment: Segment) -> None:
         run, robot = key
-        line = rr.LineStrips3D(
-            [[segment.start_m, segment.end_m]],
-            colors=[self._robot_colour(run, robot)],
-            radii=rr.Radius.ui_points(0.75 if run is None else 1.5),
-        )
-        self._log(segment, (*tracks_entity(run), "trails"), line)
+        line = {
+            "strips": [[segment.start_m, segment.end_m]],
+            "colors": [self._robot_colour(run, robot)],
+            "radii": [_THIN if run is None else _LINE],
+        }
+        self._add(segment, (*tracks_entity(run), "trails"), rr.LineStrips3D, line)
 
     def _draw_event(self, message: Message) -> None:
         run = run_of_topic(message.topic)

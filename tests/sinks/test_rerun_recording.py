@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import subprocess
 import sys
-from collections.abc import Iterator
+from collections.abc import Iterable, Iterator
 from pathlib import Path
 from typing import Any
 
@@ -37,6 +37,7 @@ from ipsys_log.messages import (
 from ipsys_log.runs.output import write_log
 from ipsys_log.sinks.rerun import write_recording
 from ipsys_log.sinks.rerun_images import rerun_image
+from ipsys_log.sinks.rerun_sink import RerunSink
 
 START_NS = 1_700_000_000_000_000_001
 STEP_NS = 100_000_000
@@ -167,6 +168,82 @@ def test_each_robot_is_where_the_log_has_it(saved: Path) -> None:
         assert {row[0] for row in drawn} == set(TIMES_NS if robot == "robot_0" else TIMES_NS[:10])
         for time_ns, _, points in drawn:
             assert points[0][axis] == pytest.approx(start + 0.1 * TIMES_NS.index(time_ns), abs=1e-6)
+
+
+def looks_at(path: Path, entity: str, kind: str, moved: str, look: str) -> dict[int, Any]:
+    """The look in force wherever something is drawn, by publish time: None if a viewer has none."""
+    drawn = [(time_ns, 2, None) for time_ns, _, _ in rows(path, entity, f"{kind}:{moved}")]
+    given = [(time_ns, 1, value) for time_ns, _, value in rows(path, entity, f"{kind}:{look}")]
+    parents = ["/".join(entity.split("/")[:depth]) for depth in range(2, entity.count("/") + 2)]
+    cleared = [
+        (time_ns, 0, None) for parent in parents for time_ns, _, _ in rows(path, parent, "Clear:is_recursive")
+    ]
+    in_force: Any = None
+    found: dict[int, Any] = {}
+    for time_ns, what, value in sorted(drawn + given + cleared, key=lambda event: event[:2]):
+        if what == 2:
+            found[time_ns] = in_force
+        else:
+            in_force = value
+    return found
+
+
+def test_everything_drawn_has_its_look_again_after_it_went_away(saved: Path) -> None:
+    robot = "/world/runs/poly/robots/robot_0"
+    labels = looks_at(saved, robot, "Points3D", "positions", "labels")
+    assert labels == {time_ns: ["robot_0"] for time_ns in TIMES_NS}
+    assert None not in looks_at(saved, robot, "Points3D", "positions", "colors").values()
+    headings = looks_at(saved, f"{robot}/heading", "Arrows3D", "vectors", "colors")
+    assert headings.keys() == set(TIMES_NS)
+    assert None not in headings.values()
+    seen = [time_ns for time_ns in TIMES_NS if time_ns != TIMES_NS[3]]
+    ids = looks_at(saved, "/cameras/red/image/markers/ids", "Points2D", "positions", "labels")
+    assert ids == {time_ns: ["0"] for time_ns in seen}
+    positions = looks_at(saved, "/world/runs/poly/positions/red", "Points3D", "positions", "labels")
+    assert positions == {time_ns: ["0 (red)"] for time_ns in TIMES_NS}
+
+
+def drawn_by(path: Path, messages: Iterable[Message]) -> Path:
+    recording = rr.RecordingStream("ipsys", send_properties=False)
+    recording.set_log_time_enabled(False)
+    recording.set_log_tick_enabled(False)
+    recording.save(path)
+    sink = RerunSink(recording, CAMERAS, {}, ("poly",))
+    for message in messages:
+        sink(message)
+    sink.close()
+    recording.disconnect()
+    return path
+
+
+def test_look_of_late_message_holds_for_it_alone(tmp_path: Path) -> None:
+    """Positions of another marker come later than they were taken: each keeps its own label."""
+    taken = [(10, 0), (5, 1), (12, 0), (7, 1), (13, 0), (14, 0)]
+    messages = [
+        Message(
+            "/runs/poly/cameras/red/positions",
+            START_NS + number,
+            START_NS + time_ns,
+            Positions(START_NS + time_ns, (Position(marker, 1.0, 2.0, 0.1),)),
+            "red",
+        )
+        for number, (time_ns, marker) in enumerate(taken)
+    ]
+    saved = drawn_by(tmp_path / "late.rrd", messages)
+    labels = looks_at(saved, "/world/runs/poly/positions/red", "Points3D", "positions", "labels")
+    assert labels == {START_NS + time_ns: [f"{marker} (red)"] for time_ns, marker in taken}
+
+
+def test_robot_without_heading_loses_its_arrow(tmp_path: Path) -> None:
+    messages = [
+        Message("/runs/poly/tracks", time_ns, time_ns, Tracks(time_ns, (Track("a", 0, 1, 2, 0.1, heading),)))
+        for time_ns, heading in zip(TIMES_NS, (0.1, 0.2, None, None, 0.3), strict=False)
+    ]
+    saved = drawn_by(tmp_path / "a.rrd", messages)
+    arrow = "/world/runs/poly/robots/a/heading"
+    assert [row[0] for row in rows(saved, arrow, "Clear:is_recursive")] == [TIMES_NS[2]]
+    assert looks_at(saved, arrow, "Arrows3D", "vectors", "colors").keys() == {TIMES_NS[n] for n in (0, 1, 4)}
+    assert None not in looks_at(saved, arrow, "Arrows3D", "vectors", "colors").values()
 
 
 def test_what_is_no_longer_seen_goes_away(saved: Path) -> None:

@@ -1,16 +1,19 @@
 """Schemas and channels of a data section, in file order, and the substitutes of those that were lost."""
 
 from collections.abc import Iterator, Mapping, Sequence
+from contextlib import suppress
 from dataclasses import dataclass, field, replace
 from itertools import islice
 from typing import Any
 
 from mcap import records as mcap
+from mcap.opcode import Opcode
 
+from ipsys_log.errors import LogError
 from ipsys_log.log.chunks import Inside
 from ipsys_log.log.contents import Contents
 from ipsys_log.log.load import Summary
-from ipsys_log.log.records import RecordAt, as_bytes, exact
+from ipsys_log.log.records import MESSAGE, RecordAt, as_bytes, exact, walk
 from ipsys_log.log.stretch import Stretch
 from ipsys_log.log.view import View
 
@@ -49,6 +52,9 @@ class Definitions:
     _full: int = 0  # so many of the first rooms are full
     _misread: list[mcap.Channel] = field(default_factory=list)
     _unused: dict[int, RecordAt] = field(default_factory=dict)  # records of channels without messages so far
+    _doubtful: set[tuple[bool, int]] = field(default_factory=set)  # schemas and channels read behind damage
+    _strange: set[int] = field(default_factory=set)  # offsets of chunks that contradict
+    _lost: set[int] = field(default_factory=set)  # channels of messages, for which there was no room
 
     def __post_init__(self) -> None:
         if self.summary is not None:
@@ -58,8 +64,8 @@ class Definitions:
             if checked and statistics and counts == (statistics.schema_count, statistics.channel_count):
                 self._sure = contents
 
-    def take(self, view: View, at: RecordAt) -> None:
-        """Take in a Schema or Channel record that lies in no chunk.
+    def take(self, view: View, at: RecordAt, *, doubtful: bool = False) -> None:
+        """Take in a Schema or Channel record that lies in no chunk; `doubtful` where damage is near.
 
         Raises
         ------
@@ -75,6 +81,7 @@ class Definitions:
             self.schemas[record.id] = record
             self._schema_at.setdefault(record.id, at.offset)
             self._places[True, record.id] = at
+            self._note_doubt((True, record.id), doubtful=doubtful)
             return
         assert isinstance(record, mcap.Channel)
         channel = record
@@ -87,10 +94,22 @@ class Definitions:
         if channel.id not in self.channels:
             self._unused[channel.id] = at
             self._places[False, channel.id] = at
+        self._note_doubt((False, channel.id), doubtful=doubtful)
         self.channels[channel.id] = channel
 
-    def take_chunk(self, view: View, offset: int, inside: Inside, *, checked: bool) -> None:
+    def _note_doubt(self, key: tuple[bool, int], *, doubtful: bool) -> None:
+        if doubtful:
+            self._doubtful.add(key)
+        else:
+            self._doubtful.discard(key)
+
+    def take_chunk(
+        self, view: View, offset: int, inside: Inside, *, checked: bool, doubtful: bool = False
+    ) -> None:
         """Take in what a chunk defines, and see that all its messages have a channel.
+
+        A chunk that is `checked` by its CRC is believed more than definitions in no chunk. Only behind
+        damage (`doubtful`) it may be a piece of another log, and must agree with those before the damage.
 
         Raises
         ------
@@ -99,11 +118,14 @@ class Definitions:
         """
         records: list[mcap.Schema | mcap.Channel] = [*inside.schemas.values(), *inside.channels.values()]
         for record in records:
-            if self._contradicts(record, checked=checked):
+            if self._contradicts(record, checked=checked, doubtful=doubtful):
+                self._strange.add(offset)
                 raise view.fault(offset, "a definition in the chunk contradicts another one")
         for channel in inside.channels.values():
             if channel.schema_id not in inside.schemas and not self._has_schema(channel):
                 raise view.fault(offset, f"channel {channel.id} has a schema that is not in the log")
+        for channel_id in inside.entries:
+            self._unused.pop(channel_id, None)
         for channel_id in inside.entries.keys() - inside.channels.keys():
             self.need(view, offset, channel_id)
         if checked:
@@ -120,13 +142,17 @@ class Definitions:
         ------
         LogError
             No stretch before `offset` has room for the definition.
+        BoundError
+            The log has more channels than one of its size may have.
         """
         self._unused.pop(channel_id, None)
         if channel_id in self.channels:
             return
-        known = self.known.channels.get(channel_id) or self._by_one_bit(channel_id)
+        known = self.known.channels.get(channel_id) or self._by_one_bit(view, offset, channel_id)
         channel = known or placeholder(channel_id)
         if not self._put_back(channel):
+            self._lost.add(channel_id)
+            view.check_number(len(self.channels) + len(self._lost), "channels")
             raise view.fault(offset, f"a message is of channel {channel_id}, whose definition is lost")
         self.channels[channel_id] = channel
 
@@ -172,16 +198,24 @@ class Definitions:
         if at is not None:
             self.rooms.append(Stretch(at.offset, at.length))
 
-    def is_stranger(self, inside: Inside) -> bool:
+    def is_stranger(self, offset: int, inside: Inside) -> bool:
         """Return whether a chunk with a right CRC defines something else under an id of this log."""
+        if offset in self._strange:
+            return True
         records: list[mcap.Schema | mcap.Channel] = [*inside.schemas.values(), *inside.channels.values()]
         return any(self._contradicts(record, checked=True) for record in records)
 
-    def _contradicts(self, record: mcap.Schema | mcap.Channel, *, checked: bool = False) -> bool:
-        """Compare a definition with others; one that is `checked` by a CRC yields only to such ones."""
+    def _contradicts(
+        self, record: mcap.Schema | mcap.Channel, *, checked: bool = False, doubtful: bool = False
+    ) -> bool:
+        """Compare a definition with others; one that is `checked` by a CRC yields only to such ones.
+
+        Behind damage, where it is `doubtful`, it yields also to those that lie before the damage.
+        """
         schema = isinstance(record, mcap.Schema)
         mine: Mapping[int, mcap.Schema | mcap.Channel] = self.schemas if schema else self.channels
-        is_sure = not checked or (schema, record.id) in self._checked
+        key = (schema, record.id)
+        is_sure = not checked or key in self._checked or (doubtful and key not in self._doubtful)
         if is_sure and record.id in mine and mine[record.id] != record:
             return True
         if self._sure is None:
@@ -225,17 +259,31 @@ class Definitions:
         rooms = islice(self.rooms, self._full, self._full + _MOST_ROOMS)
         return next((room for room in rooms if room.offset >= start and room.define(data)), None)
 
-    def _by_one_bit(self, channel_id: int) -> mcap.Channel | None:
-        """Return the channel whose record differs in one bit of its id, and has no messages."""
+    def _by_one_bit(self, view: View, offset: int, channel_id: int) -> mcap.Channel | None:
+        """Return the channel whose record differs in one bit of its id, and has no messages.
+
+        If it has messages behind the one at `offset`, the id in that message is the one that is wrong.
+        """
         records = [record for record in self._misread if (record.id ^ channel_id).bit_count() == 1]
         if not self.rooms:  # its record looks whole, but no message is of the channel that it defines
-            unused = [key for key in self._unused if (key ^ channel_id).bit_count() == 1]
+            near = [key for key in self._unused if (key ^ channel_id).bit_count() == 1]
+            unused = [key for key in near if not _has_message(view, offset, key)]
             records = [self.channels[key] for key in unused]
             if len(records) == 1:
                 at = self._unused.pop(unused[0])
                 self.rooms.append(Stretch(at.offset, at.length))
                 del self.channels[unused[0]]
         return replace(records[0], id=channel_id) if len(records) == 1 else None
+
+
+def _has_message(view: View, start: int, channel_id: int) -> bool:
+    """Return whether a message of a channel lies in no chunk from `start` on, up to damage."""
+    with suppress(LogError):
+        for at in walk(view, start, view.size):
+            is_message = at.opcode == Opcode.MESSAGE and at.length >= MESSAGE.size
+            if is_message and MESSAGE.unpack(view.read(at.offset, MESSAGE.size))[2] == channel_id:
+                return True
+    return False
 
 
 def _empty_schema(schema_id: int) -> mcap.Schema:

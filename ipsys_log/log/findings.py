@@ -77,5 +77,6 @@ class Survey:
     finished: bool = False
     crc_at: int = 0
     wrong_length: int = -1  # a record whose length cannot be right
+    has_crcs: bool = False  # of the chunks so far
     doubtful_to: int = 0  # behind damage, lengths that nothing confirms are looked at closely
     indexed: Indexed | None = None

@@ -92,7 +92,7 @@ class Resync:
         if damaged < claimed and self._leads_on(claimed):
             # Its length may be right; but a stray head may as well claim what lies behind it.
             pattern = _CHUNK_HEAD if self.is_chunk_head(damaged) else _CANDIDATE
-            inner = self._find(pattern, damaged + gap, claimed)
+            inner = self._find(pattern, damaged + gap, claimed, into_damage=False)
             return claimed if inner is None else inner
         return self._find(_CANDIDATE, damaged + gap)
 
@@ -104,6 +104,7 @@ class Resync:
         self.chunked = False
         first = self._find(_MESSAGE, start)
         if first is None:
+            self.chunked = True
             return self._find(_INDEX, start) is not None
         with suppress(LogError):
             for at in walk(self.view, first, self.view.size):
@@ -141,7 +142,9 @@ class Resync:
             pass
         return False
 
-    def _find(self, pattern: re.Pattern[bytes], start: int, end: int | None = None) -> int | None:
+    def _find(
+        self, pattern: re.Pattern[bytes], start: int, end: int | None = None, *, into_damage: bool = True
+    ) -> int | None:
         view = self.view
         end = view.size if end is None else end
         for base in range(start, end, _BLOCK):
@@ -150,13 +153,16 @@ class Resync:
                 offset = base + match.start()
                 if match.start() >= _BLOCK or offset >= end:
                     break
-                if self._leads_on(offset):
+                if self._leads_on(offset, into_damage=into_damage):
                     return offset
         return None
 
-    def _leads_on(self, offset: int) -> bool:
-        """Return whether a record of the data section lies there, as far as it and those behind it say."""
-        last = messages = stop = steps = 0
+    def _leads_on(self, offset: int, *, into_damage: bool = True) -> bool:
+        """Return whether a record of the data section lies there, as far as it and those behind it say.
+
+        With `into_damage`, records may count as whole although damage follows them.
+        """
+        last = messages = start = stop = steps = 0
         defined: set[int] = set()
         try:
             for at in islice(walk(self.view, offset, self.view.size), _LONGEST_CHAIN):
@@ -169,9 +175,13 @@ class Resync:
                 if verdict is not None:
                     self.budget += steps if verdict else 0
                     return verdict
-                last, stop = at.opcode, at.offset + at.length
+                last, start, stop = at.opcode, at.offset, at.offset + at.length
         except LogError:  # damage follows, or the end of what was written
-            return last in _DEFINITIONS or (last == Opcode.MESSAGE_INDEX and self.is_chunk_head(stop))
+            if last == Opcode.MESSAGE_INDEX:
+                return into_damage and self.is_chunk_head(stop)
+            if last == Opcode.MESSAGE:
+                return into_damage and self._are_message_heads(start, stop)
+            return into_damage and last in _DEFINITIONS
         return last > 0
 
     def _judge(self, at: RecordAt, messages: int, defined: set[int]) -> bool | None:
@@ -197,17 +207,40 @@ class Resync:
             return (stored == crc) if stored else None
         if at.opcode == Opcode.DATA_END:
             return at.length == DATA_END.size
-        skipped = at.opcode >= PRIVATE or (at.opcode == Opcode.MESSAGE_INDEX and is_index(view, at))
-        return None if skipped else False
+        may_index = at.opcode == Opcode.MESSAGE_INDEX and self.chunked is not False
+        return None if at.opcode >= PRIVATE or (may_index and is_index(view, at)) else False
 
     def _judge_message(self, at: RecordAt, messages: int, defined: set[int]) -> bool | None:
         if self.chunked or at.length < MESSAGE.size:
             return False
         _, _, channel, _, time_ns, _ = MESSAGE.unpack(self.view.read(at.offset, MESSAGE.size))
-        near = any(abs(time_ns - recent_ns) < _DAY_NS for recent_ns in self.times_ns)
-        near |= not self.times_ns and messages > 1
+        near = self._is_near(time_ns) or (not self.times_ns and messages > 1)
         fits = channel in defined or (near and channel in self.channels)
         return True if fits or messages + len(defined) >= _ENOUGH else None
+
+    def fits(self, channel: int, time_ns: int) -> bool:
+        """Return whether a message is of a channel that is defined, or of about the time of the last ones."""
+        return channel in self.channels or not self.times_ns or self._is_near(time_ns)
+
+    def _is_near(self, time_ns: int) -> bool:
+        return any(abs(time_ns - recent_ns) < _DAY_NS for recent_ns in self.times_ns)
+
+    def _are_message_heads(self, first: int, second: int) -> bool:
+        """Return whether messages of about the same time begin at both offsets; the second may be cut off.
+
+        The channel of one of them must be defined.
+        """
+        if self.chunked or second + MESSAGE.size > self.view.size:
+            return False
+        heads = [MESSAGE.unpack(self.view.read(offset, MESSAGE.size)) for offset in (first, second)]
+        (_, _, channel, _, time_ns, _), (opcode, length, next_channel, _, next_ns, _) = heads
+        is_head = opcode == Opcode.MESSAGE and length >= MESSAGE.size - HEADER.size
+        is_defined = channel in self.channels or next_channel in self.channels
+        return is_head and is_defined and abs(next_ns - time_ns) < _DAY_NS
+
+    def holds_chunk(self, at: RecordAt) -> bool:
+        """Return whether a whole chunk begins within a record."""
+        return self._find(_CHUNK_HEAD, at.offset + HEADER.size, at.offset + at.length) is not None
 
     def _is_whole_chunk(self, at: RecordAt) -> bool:
         view = self.view

@@ -120,7 +120,7 @@ class Salvage:
             return Saved()
         channels = definitions.channels | definitions.known.channels
         messages, inside, torn, complete = _believable(view, records, rows, channels)
-        if records.checked and definitions.is_stranger(inside):
+        if records.checked and definitions.is_stranger(stretch.offset, inside):
             return Saved(note=f"the chunk at byte {stretch.offset} is of another log")
         for key, value in inside.schemas.items():
             self.inside.schemas.setdefault(key, value)

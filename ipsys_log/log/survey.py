@@ -273,6 +273,10 @@ def _take_loose(found: Survey, at: RecordAt) -> None:
         _, _, channel, _, time_ns, _ = MESSAGE.unpack(view.read(at.offset, MESSAGE.size))
         if _has_lost_chunk_heads(found) and up_to_first_hole(view, at.offset, at.length) < at.length:
             raise view.fault(at.offset, "a message holds a sector of zeros")
+        if at.offset < found.doubtful_to and not found.resync.fits(channel, time_ns):
+            raise view.fault(
+                at.offset, "a message behind damage is of an unknown channel and of another time"
+            )
         try:
             found.definitions.need(view, at.offset, channel)
         except LogError:
@@ -283,7 +287,7 @@ def _take_loose(found: Survey, at: RecordAt) -> None:
             raise
         found.resync.times_ns.append(time_ns)
     elif at.opcode in (Opcode.SCHEMA, Opcode.CHANNEL):
-        found.definitions.take(view, at)
+        found.definitions.take(view, at, doubtful=at.offset < found.doubtful_to)
         return
     add_record(view, found.contents, found.loose, found.counts, at)
 
@@ -303,7 +307,11 @@ def _take_chunk(found: Survey, at: RecordAt) -> None:
     inside = look_inside(view, at.offset, data)
     if head.crc == 0:
         _check_definitions(view, at.offset, data)
-    found.definitions.take_chunk(view, at.offset, inside, checked=head.crc != 0)
+        if found.has_crcs:
+            _check_without_crc(found, at)
+    found.has_crcs |= head.crc != 0
+    is_doubtful = at.offset < found.doubtful_to
+    found.definitions.take_chunk(view, at.offset, inside, checked=head.crc != 0, doubtful=is_doubtful)
     add_record(view, found.contents, found.loose, found.counts, at)
     times = [time for rows in inside.entries.values() for time, _ in rows]
     if times:  # what its head says may be wrong, and readers go by it
@@ -314,8 +322,20 @@ def _take_chunk(found: Survey, at: RecordAt) -> None:
         found.contents.chunks[-1] = chunk._replace(start_ns=span[0], end_ns=span[1])
     found.counts[at.offset] = {key: len(rows) for key, rows in inside.entries.items()}
     _continue_hashes(found, inside, data)
-    found.resync.chunked = True
+    if not found.resync.times_ns:  # else messages lie in chunks and beside them
+        found.resync.chunked = True
     found.indexed = Indexed(at.offset + at.length, inside)
+
+
+def _check_without_crc(found: Survey, at: RecordAt) -> None:
+    """Refuse a chunk that has no CRC, among chunks that have one, where it may be of another log."""
+    if found.resync.holds_chunk(at):
+        found.wrong_length = at.offset
+        raise found.view.fault(at.offset, "a chunk without CRC holds another chunk")
+    if at.offset < found.doubtful_to:
+        raise found.view.fault(
+            at.offset, "a chunk without CRC follows damage in a log whose chunks have CRCs"
+        )
 
 
 def _check_definitions(view: View, offset: int, data: bytes) -> None:
@@ -339,6 +359,8 @@ def _continue_hashes(found: Survey, inside: Inside, data: bytes) -> None:
 def _take_index(found: Survey, at: RecordAt) -> None:
     """Take in a MessageIndex record: of the chunk before it, or of the damaged stretch before it."""
     indexed = found.indexed
+    if found.resync.chunked is False:
+        raise found.view.fault(at.offset, "a MessageIndex record lies in a log without chunks")
     if indexed is None:
         channel, rows = _index_rows(found.view, at)
         for time_ns, _ in rows:
@@ -347,6 +369,7 @@ def _take_index(found: Survey, at: RecordAt) -> None:
         return
     if not is_index(found.view, at):
         raise found.view.fault(at.offset, "a MessageIndex record has another length than its entries")
+    _check_length(found, at)
     try:
         channel, rows = _index_rows(found.view, at)
         if indexed.inside is not None:

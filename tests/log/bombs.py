@@ -1,10 +1,13 @@
 """Small files that ask for much: time, memory, or both. None is larger than 1 MB."""
 
 import struct
+import tempfile
 from collections.abc import Callable
 from dataclasses import dataclass, field
+from pathlib import Path
 
 import lz4.frame
+import numpy as np
 import zstandard
 from mcap import records as mcap
 from mcap.opcode import Opcode
@@ -19,8 +22,12 @@ from ipsys_log.messages import (
     CompressedImage,
     Distance,
     Event,
+    Marker,
     Markers,
     Measurement,
+    Message,
+    Position,
+    Positions,
     RawImage,
     ReferencePoint,
     Rig,
@@ -28,10 +35,12 @@ from ipsys_log.messages import (
     Track,
     Tracks,
 )
+from ipsys_log.runs.output import write_log
 
 __all__ = ["BOMBS", "Attack"]
 
 MIB = 1 << 20
+CORNERS_PX = np.array([(1.0, 1.0), (9.0, 1.0), (9.0, 9.0), (1.0, 9.0)])
 Rows = list[tuple[int, int]]
 
 
@@ -154,6 +163,34 @@ def empty_messages(payload: bytes, kind: type, topic: str, times: int, chunks: i
         attack.chunk(bytes(content), rows if indexed else None, span=(start, start + times - 1), count=times)
         start += times
     return attack.finish()
+
+
+def of_run(number: int, stage: str, payload: Markers | Positions, name: str) -> bytes:
+    """One message of a run very often, with the record that makes it a run, in a log of our own."""
+    topic = f"/runs/r/cameras/a/{name}"
+    with tempfile.TemporaryDirectory() as folder:
+        path = Path(folder) / "log.mcap"
+        run = Message("/runs/r/record", number, number, Run(number, "r", stage, number=1))
+        write_log(path, [*(Message(topic, n, n, payload, "a") for n in range(number)), run])
+        return path.read_bytes()
+
+
+def many_robots(number: int) -> bytes:
+    """Tracks, each of a robot of its own."""
+    attack = Attack()
+    attack.channel(Tracks, "/truth/tracks")
+    content, rows = bytearray(), []
+    for n in range(number):
+        rows.append((n, len(content)))
+        content += message(encode(Tracks(n, (Track(str(n), 1, 0.0, 0.0, 0.0),))), n)
+    attack.chunk(bytes(content), rows, span=(0, number - 1), count=number)
+    return attack.finish()
+
+
+def lost_channels(number: int) -> bytes:
+    """Messages in no chunk, each of a channel of its own that is not defined."""
+    messages = (as_bytes(mcap.Message(n + 1, n, b"", n, n)) for n in range(number))
+    return MAGIC + as_bytes(mcap.Header("", "")) + b"".join(messages)
 
 
 def with_rig(measurements: list[bytes]) -> bytes:
@@ -370,6 +407,12 @@ BOMBS: dict[str, Callable[[], bytes]] = {
     "20 k tapes": lambda: with_rig(
         [encode(Measurement(0, str(n), None, 1, TAPES, None, 0.1)) for n in range(20_000)]
     ),
+    "35 k markers": lambda: of_run(35_000, "detect", Markers(0, (Marker(7, CORNERS_PX),), 64, 48), "markers"),
+    "35 k positions": lambda: of_run(
+        35_000, "locate", Positions(0, (Position(7, 1.0, 2.0, 0.1),)), "positions"
+    ),
+    "tracks of a new robot in each message": lambda: many_robots(20_000),
+    "messages of 30 k lost channels": lambda: lost_channels(30_000),
     "one message 50 k times": lambda: same_message_again(50_000, 15 * MIB),
     "10 k nested messages": lambda: nested_messages(10_000, 15 * MIB),
     "65 k channels in a chunk": lambda: many_channels(65_000, True),

@@ -16,6 +16,7 @@ from collections import Counter
 from collections.abc import Callable, Iterable, Iterator
 from dataclasses import dataclass, field
 from io import BytesIO
+from itertools import islice
 from pathlib import Path
 from typing import Any, cast
 
@@ -399,18 +400,22 @@ def _check_restored(path: Path, damaged: bytes, out: Outcome) -> None:
         out.complaints.append("the old bytes are not all kept")
 
 
-def run(seed: int, cases: int, show: Callable[[str], None] = lambda _: None) -> Counter[str]:
-    """Repair `cases` damaged logs; the totals, with every complaint under "complaints"."""
+def cases(seed: int) -> Iterator[tuple[Sample, Damaged, Sample]]:
+    """Yield logs, what damage made of them, and the log whose sectors may have got into them; without end."""
     chance = random.Random(seed)
+    while True:
+        pool = samples(chance.randrange(1 << 30))
+        for _ in range(400):
+            sample, other = chance.choice(pool), chance.choice(pool)
+            yield sample, damage(sample, chance, chance.choice((1, 1, 2)), other.data), other
+
+
+def run(seed: int, number: int, show: Callable[[str], None] = lambda _: None) -> Counter[str]:
+    """Repair `number` damaged logs; the totals, with every complaint under "complaints"."""
     totals: Counter[str] = Counter()
-    pool: list[Sample] = []
     with tempfile.TemporaryDirectory(dir="/dev/shm" if Path("/dev/shm").is_dir() else None) as name:
         path = Path(name) / "log.mcap"
-        for case in range(cases):
-            if case % 400 == 0:
-                pool = samples(chance.randrange(1 << 30))
-            sample, other = chance.choice(pool), chance.choice(pool)
-            damaged = damage(sample, chance, chance.choice((1, 1, 2)), other.data)
+        for case, (sample, damaged, other) in enumerate(islice(cases(seed), number)):
             out = check(path, sample, damaged, other)
             totals += Counter(
                 cases=1, changed=out.changed, refused=bool(out.refused), owed=out.owed, kept=out.kept,

@@ -105,14 +105,8 @@ def line(command: str, path: Path) -> list[object]:
     return [command, path, *(["--save", path.with_suffix(".rrd")] if command == "view" else [])]
 
 
-# Rerun takes 0.35 ms for each track, and true logs hold nearly as many tracks in a megabyte.
-TOO_DENSE = pytest.mark.xfail(reason="view draws 40,000 tracks in about 15 s", strict=True)
-
-
 @pytest.mark.slow
-@pytest.mark.parametrize(
-    "name", [pytest.param(name, marks=TOO_DENSE if name == "40 k tracks" else ()) for name in BOMBS]
-)
+@pytest.mark.parametrize("name", BOMBS)
 def test_commands_on_a_small_file_stay_within_bounds(
     name: str, tmp_path: Path, plain: dict[str, Cost]
 ) -> None:

@@ -5,10 +5,31 @@ the same as a script.
 """
 
 import os
+from itertools import islice
+from pathlib import Path
 
 import pytest
 
-from tests.log.damage import run
+from tests.log.damage import cases, check, run
+
+# What longer runs found: seed, number of the case, log and damage.
+HARD = [
+    (71, 1795, "no CRC: swapped in at 2048"),  # indexes of another log swallow the head of a chunk
+    (72, 2305, "unchunked: swapped in at 7680"),  # and of a message, in a log without chunks
+    (72, 8057, "unchunked, data CRC: cut at 2329, swapped in at 512"),
+    (61, 2806, "no CRC: cut at 3916, swapped in at 512"),  # definitions of another log in an attachment
+    (62, 8102, "unchunked: cut at 3264, duplicated 1536 at 512"),  # one whole message between both
+    (51, 733, "appended: zeroed at 1536, swapped in at 25088"),
+    (92, 7827, "no statistics: cut at 10390, swapped in at 1024"),  # a head half of another log's
+    (92, 8604, "killed: swapped in at 14848, flipped at 11844"),  # a whole chunk of another log
+    (93, 1545, "unchunked, data CRC: cut at 14735, swapped in at 13824"),  # the end of another log
+    (
+        101,
+        3223,
+        "unchunked, data CRC: duplicated 13312 at 22528, flipped at 1396",
+    ),  # a channel id in a message
+    (93, 2517, "no index: swapped in at 11776"),  # a chunk without CRC, half of another log's
+]
 
 
 def test_repair_after_natural_damage_converges() -> None:
@@ -27,3 +48,11 @@ def test_repair_after_much_damage_converges() -> None:
         complaints.append,
     )
     assert complaints == []
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize(("seed", "number", "what"), HARD, ids=[what for _, _, what in HARD])
+def test_repair_after_hard_damage_converges(seed: int, number: int, what: str, tmp_path: Path) -> None:
+    sample, damaged, other = next(islice(cases(seed), number, None))
+    assert f"{sample.name}: {', '.join(damaged.done)}" == what
+    assert check(tmp_path / "log.mcap", sample, damaged, other).complaints == []

@@ -109,7 +109,8 @@ class Definitions:
         """Take in what a chunk defines, and see that all its messages have a channel.
 
         A chunk that is `checked` by its CRC is believed more than definitions in no chunk. Only behind
-        damage (`doubtful`) it may be a piece of another log, and must agree with those before the damage.
+        damage (`doubtful`) it may be a piece of another log, and must agree with those before
+        the damage that had messages.
 
         Raises
         ------
@@ -210,18 +211,27 @@ class Definitions:
     ) -> bool:
         """Compare a definition with others; one that is `checked` by a CRC yields only to such ones.
 
-        Behind damage, where it is `doubtful`, it yields also to those that lie before the damage.
+        Behind damage, where it is `doubtful`, it yields also to those before the damage that had messages.
         """
         schema = isinstance(record, mcap.Schema)
         mine: Mapping[int, mcap.Schema | mcap.Channel] = self.schemas if schema else self.channels
         key = (schema, record.id)
-        is_sure = not checked or key in self._checked or (doubtful and key not in self._doubtful)
+        is_sure = not checked or key in self._checked
+        is_sure |= doubtful and key not in self._doubtful and self._is_used(key)
         if is_sure and record.id in mine and mine[record.id] != record:
             return True
         if self._sure is None:
             return False
         sure: Mapping[int, mcap.Schema | mcap.Channel] = self._sure.schemas if schema else self._sure.channels
         return sure.get(record.id) != record
+
+    def _is_used(self, key: tuple[bool, int]) -> bool:
+        """Return whether a message needed this schema or channel."""
+        is_schema, record_id = key
+        used = self.channels.keys() - self._unused.keys()
+        if is_schema:
+            return any(self.channels[channel_id].schema_id == record_id for channel_id in used)
+        return record_id in used
 
     def _has_schema(self, channel: mcap.Channel) -> bool:
         """Return whether the schema of a channel is defined before it, or can be put back."""

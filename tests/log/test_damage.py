@@ -28,6 +28,7 @@ HARD = [
         3223,
         "unchunked, data CRC: duplicated 13312 at 22528, flipped at 1396",
     ),  # a channel id in a message
+    (101, 6904, "repeated definitions: swapped in at 0"),  # the beginning of another log
     (93, 2517, "no index: swapped in at 11776"),  # a chunk without CRC, half of another log's
 ]
 

@@ -104,13 +104,20 @@ class Definitions:
             self._doubtful.discard(key)
 
     def take_chunk(
-        self, view: View, offset: int, inside: Inside, *, checked: bool, doubtful: bool = False
+        self,
+        view: View,
+        offset: int,
+        inside: Inside,
+        *,
+        checked: bool,
+        doubtful: bool = False,
+        alone: bool = False,
     ) -> None:
         """Take in what a chunk defines, and see that all its messages have a channel.
 
-        A chunk that is `checked` by its CRC is believed more than definitions in no chunk. Only behind
-        damage (`doubtful`) it may be a piece of another log, and must agree with those before
-        the damage that had messages.
+        A chunk that is `checked` by its CRC is believed more than definitions in no chunk. Only near damage
+        (`doubtful`) it may be a piece of another log: then it must agree with those before the damage that
+        had messages, and with all of them if damage follows it too (`alone`).
 
         Raises
         ------
@@ -119,7 +126,7 @@ class Definitions:
         """
         records: list[mcap.Schema | mcap.Channel] = [*inside.schemas.values(), *inside.channels.values()]
         for record in records:
-            if self._contradicts(record, checked=checked, doubtful=doubtful):
+            if self._contradicts(record, checked=checked, doubtful=doubtful, alone=alone):
                 self._strange.add(offset)
                 raise view.fault(offset, "a definition in the chunk contradicts another one")
         for channel in inside.channels.values():
@@ -207,17 +214,22 @@ class Definitions:
         return any(self._contradicts(record, checked=True) for record in records)
 
     def _contradicts(
-        self, record: mcap.Schema | mcap.Channel, *, checked: bool = False, doubtful: bool = False
+        self,
+        record: mcap.Schema | mcap.Channel,
+        *,
+        checked: bool = False,
+        doubtful: bool = False,
+        alone: bool = False,
     ) -> bool:
         """Compare a definition with others; one that is `checked` by a CRC yields only to such ones.
 
-        Behind damage, where it is `doubtful`, it yields also to those before the damage that had messages.
+        See `take_chunk` for those near damage.
         """
         schema = isinstance(record, mcap.Schema)
         mine: Mapping[int, mcap.Schema | mcap.Channel] = self.schemas if schema else self.channels
         key = (schema, record.id)
         is_sure = not checked or key in self._checked
-        is_sure |= doubtful and key not in self._doubtful and self._is_used(key)
+        is_sure |= doubtful and key not in self._doubtful and (alone or self._is_used(key))
         if is_sure and record.id in mine and mine[record.id] != record:
             return True
         if self._sure is None:

@@ -89,7 +89,7 @@ class Resync:
         """
         if self.chunked is None and not self.times_ns:
             self.chunked = self._has_chunks(damaged)
-        if damaged < claimed and self._leads_on(claimed):
+        if damaged < claimed and self.leads_on(claimed):
             # Its length may be right; but a stray head may as well claim what lies behind it.
             pattern = _CHUNK_HEAD if self.is_chunk_head(damaged) else _CANDIDATE
             inner = self._find(pattern, damaged + gap, claimed, into_damage=False)
@@ -153,11 +153,11 @@ class Resync:
                 offset = base + match.start()
                 if match.start() >= _BLOCK or offset >= end:
                     break
-                if self._leads_on(offset, into_damage=into_damage):
+                if self.leads_on(offset, into_damage=into_damage):
                     return offset
         return None
 
-    def _leads_on(self, offset: int, *, into_damage: bool = True) -> bool:
+    def leads_on(self, offset: int, *, into_damage: bool = True) -> bool:
         """Return whether a record of the data section lies there, as far as it and those behind it say.
 
         With `into_damage`, records may count as whole although damage follows them.

@@ -310,8 +310,11 @@ def _take_chunk(found: Survey, at: RecordAt) -> None:
         if found.has_crcs:
             _check_without_crc(found, at)
     found.has_crcs |= head.crc != 0
-    is_doubtful = at.offset < found.doubtful_to
-    found.definitions.take_chunk(view, at.offset, inside, checked=head.crc != 0, doubtful=is_doubtful)
+    stop, is_doubtful = at.offset + at.length, at.offset < found.doubtful_to
+    is_alone = is_doubtful and stop < view.size and not found.resync.leads_on(stop)
+    found.definitions.take_chunk(
+        view, at.offset, inside, checked=head.crc != 0, doubtful=is_doubtful, alone=is_alone
+    )
     add_record(view, found.contents, found.loose, found.counts, at)
     times = [time for rows in inside.entries.values() for time, _ in rows]
     if times:  # what its head says may be wrong, and readers go by it
@@ -324,7 +327,7 @@ def _take_chunk(found: Survey, at: RecordAt) -> None:
     _continue_hashes(found, inside, data)
     if not found.resync.times_ns:  # else messages lie in chunks and beside them
         found.resync.chunked = True
-    found.indexed = Indexed(at.offset + at.length, inside)
+    found.indexed = Indexed(stop, inside)
 
 
 def _check_without_crc(found: Survey, at: RecordAt) -> None:

@@ -79,7 +79,10 @@ def write_files(folder: Path, files: Mapping[str, bytes]) -> None:
         for (path, partial), content in zip(partials.items(), files.values(), strict=True):
             if path.is_dir():
                 raise IpsysError(f"{path}: is a folder; move it away")
-            partial.write_bytes(content)
+            with partial.open("wb") as file:
+                file.write(content)
+                file.flush()
+                os.fsync(file.fileno())  # else a power cut may leave a new name with nothing in it
         for path, partial in partials.items():
             partial.replace(path)
     finally:

@@ -153,8 +153,13 @@ def _open(address: str, where: str) -> InputContainer:
     host = urlsplit(address).hostname
     try:
         socket.getaddrinfo(host, None)
-    except OSError as error:
-        raise SourceError(f"{where}: there is no host {host!r}; check the address") from error
+    except socket.gaierror as error:
+        if error.errno == socket.EAI_NONAME:
+            raise SourceError(f"{where}: there is no host {host!r}; check the address") from error
+        raise SourceError(
+            f"{where}: the name {host!r} cannot be looked up ({error.strerror}); check the network, "
+            "or write the address as a number"
+        ) from error
     return av.open(address, options=dict(_OPTIONS), timeout=_SILENT_S)
 
 

@@ -29,6 +29,7 @@ HARD = [
         "unchunked, data CRC: duplicated 13312 at 22528, flipped at 1396",
     ),  # a channel id in a message
     (101, 6904, "repeated definitions: swapped in at 0"),  # the beginning of another log
+    (103, 3192, "killed: swapped in at 6144"),  # a whole chunk of another log in the first one
     (93, 2517, "no index: swapped in at 11776"),  # a chunk without CRC, half of another log's
 ]
 

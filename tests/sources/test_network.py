@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import http.server
 import re
+import socket
 import threading
 import time
 from collections.abc import Iterator
@@ -164,8 +165,20 @@ def test_nobody_listens() -> None:
     with pytest.raises(SourceError, match=f"admin:[*]+@{address}: refuses the connection") as error:
         take(f"http://admin:secret@{address}", 1)
     assert "secret" not in str(error.value)
-    with pytest.raises(SourceError, match=r"there is no host 'no-such\.invalid'"):
+    with pytest.raises(SourceError, match=r"'no-such\.invalid'"):
         take("rtsp://no-such.invalid/live", 1)
+
+
+@pytest.mark.parametrize(
+    ("code", "said"), [(socket.EAI_NONAME, "there is no host"), (socket.EAI_AGAIN, "check the network")]
+)
+def test_name_that_leads_nowhere_says_why(code: int, said: str, monkeypatch: pytest.MonkeyPatch) -> None:
+    def fail(*_: object) -> None:
+        raise socket.gaierror(code, "as the resolver says")
+
+    monkeypatch.setattr("socket.getaddrinfo", fail)
+    with pytest.raises(SourceError, match=said):
+        take("rtsp://camera.lab/live", 1)
 
 
 def test_a_stream_that_falls_silent_is_left_at_once(tmp_path: Path) -> None:

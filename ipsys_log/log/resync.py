@@ -162,16 +162,16 @@ class Resync:
 
         With `into_damage`, records may count as whole although damage follows them.
         """
-        last = messages = start = stop = steps = 0
+        last = start = stop = steps = 0
         defined: set[int] = set()
+        times_ns: list[int] = []  # of messages
         try:
             for at in islice(walk(self.view, offset, self.view.size), _LONGEST_CHAIN):
                 self.budget -= _STEP
                 steps += _STEP
                 if self.budget < 0:
                     return False
-                messages += at.opcode == Opcode.MESSAGE
-                verdict = self._judge(at, messages, defined)
+                verdict = self._judge(at, times_ns, defined)
                 if verdict is not None:
                     self.budget += steps if verdict else 0
                     return verdict
@@ -180,11 +180,12 @@ class Resync:
             if last == Opcode.MESSAGE_INDEX:
                 return into_damage and self.is_chunk_head(stop)
             if last == Opcode.MESSAGE:
-                return into_damage and self._are_message_heads(start, stop)
+                heads = self._is_series(times_ns, stop) or self._are_message_heads(start, stop)
+                return into_damage and heads
             return into_damage and last in _DEFINITIONS
         return last > 0
 
-    def _judge(self, at: RecordAt, messages: int, defined: set[int]) -> bool | None:
+    def _judge(self, at: RecordAt, times_ns: list[int], defined: set[int]) -> bool | None:
         """Return whether a record proves that it and those before it are whole; None: the next one decides.
 
         Raises
@@ -196,7 +197,7 @@ class Resync:
         if at.opcode == Opcode.CHUNK:
             return self.chunked is not False and self._is_whole_chunk(at)
         if at.opcode == Opcode.MESSAGE:
-            return self._judge_message(at, messages, defined)
+            return self._judge_message(at, times_ns, defined)
         if at.opcode in _DEFINITIONS:
             check_exact(view, at, HEADER.size - 1)
             if at.opcode == Opcode.CHANNEL:
@@ -210,13 +211,14 @@ class Resync:
         may_index = at.opcode == Opcode.MESSAGE_INDEX and self.chunked is not False
         return None if at.opcode >= PRIVATE or (may_index and is_index(view, at)) else False
 
-    def _judge_message(self, at: RecordAt, messages: int, defined: set[int]) -> bool | None:
+    def _judge_message(self, at: RecordAt, times_ns: list[int], defined: set[int]) -> bool | None:
         if self.chunked or at.length < MESSAGE.size:
             return False
         _, _, channel, _, time_ns, _ = MESSAGE.unpack(self.view.read(at.offset, MESSAGE.size))
-        near = self._is_near(time_ns) or (not self.times_ns and messages > 1)
+        times_ns.append(time_ns)
+        near = self._is_near(time_ns) or (not self.times_ns and len(times_ns) > 1)
         fits = channel in defined or (near and channel in self.channels)
-        return True if fits or messages + len(defined) >= _ENOUGH else None
+        return True if fits or len(times_ns) + len(defined) >= _ENOUGH else None
 
     def fits(self, channel: int, time_ns: int) -> bool:
         """Return whether a message is of a channel that is defined, or of about the time of the last ones."""
@@ -224,6 +226,11 @@ class Resync:
 
     def _is_near(self, time_ns: int) -> bool:
         return any(abs(time_ns - recent_ns) < _DAY_NS for recent_ns in self.times_ns)
+
+    def _is_series(self, times_ns: list[int], stop: int) -> bool:
+        """Return whether messages are of about the same time, and the head of another one follows them."""
+        near = len(times_ns) > 1 and max(times_ns) - min(times_ns) < _DAY_NS
+        return near and stop < self.view.size and self.view.read(stop, 1) == bytes([Opcode.MESSAGE])
 
     def _are_message_heads(self, first: int, second: int) -> bool:
         """Return whether messages of about the same time begin at both offsets; the second may be cut off.

@@ -30,6 +30,7 @@ HARD = [
     ),  # a channel id in a message
     (101, 6904, "repeated definitions: swapped in at 0"),  # the beginning of another log
     (103, 3192, "killed: swapped in at 6144"),  # a whole chunk of another log in the first one
+    (103, 8041, "unchunked: cut at 1214, zeroed at 512"),  # two small messages between both
     (93, 2517, "no index: swapped in at 11776"),  # a chunk without CRC, half of another log's
 ]
 

@@ -70,12 +70,14 @@ class Resync:
 
     `chunked` says whether its messages lie in chunks (None: not known yet): then a message record that
     lies elsewhere is a piece of a damaged chunk. `channels` are the ids that are defined, `times_ns` the
-    log times of the last messages in no chunk. `budget` bounds the bytes that are looked at in vain.
+    log times of the last messages in no chunk, `span_ns` that of all messages, where the summary says it.
+    `budget` bounds the bytes that are looked at in vain.
     """
 
     view: View
     channels: Container[int] = ()
     chunked: bool | None = None
+    span_ns: tuple[int, int] | None = None
     times_ns: deque[int] = field(default_factory=lambda: deque(maxlen=_RECENT))
     budget: int = field(init=False)
 
@@ -225,6 +227,8 @@ class Resync:
         return channel in self.channels or not self.times_ns or self._is_near(time_ns)
 
     def _is_near(self, time_ns: int) -> bool:
+        if self.span_ns is not None and self.span_ns[0] - _DAY_NS < time_ns < self.span_ns[1] + _DAY_NS:
+            return True
         return any(abs(time_ns - recent_ns) < _DAY_NS for recent_ns in self.times_ns)
 
     def _is_series(self, times_ns: list[int], stop: int) -> bool:

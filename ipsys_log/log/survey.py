@@ -1,5 +1,6 @@
 """Check of every record of a log, finished or not."""
 
+from collections import ChainMap
 from dataclasses import replace
 
 from mcap import records as mcap
@@ -55,7 +56,8 @@ def survey(
     """
     damaged: list[Stretch] = []
     definitions = Definitions(known, damaged)
-    resync = Resync(view, definitions.channels, _is_chunked(known))
+    channels = ChainMap[int, mcap.Channel](definitions.channels, definitions.known.channels)
+    resync = Resync(view, channels, _is_chunked(known), _span_ns(known))
     found = Survey(view, resync, definitions, saved, damaged=damaged)
     found.doubtful_to = view.size if doubtful else 0
     position = _take_start(found)
@@ -80,6 +82,13 @@ def _is_chunked(known: Summary | None) -> bool | None:
     if known is not None and known.checked and known.statistics is not None:
         return known.statistics.chunk_count > 0
     return None
+
+
+def _span_ns(known: Summary | None) -> tuple[int, int] | None:
+    """Return the log times of the first and the last message, if the summary says them and is right."""
+    if known is None or not known.checked or known.statistics is None or not known.statistics.message_count:
+        return None
+    return known.statistics.message_start_time, known.statistics.message_end_time
 
 
 def _take_start(found: Survey) -> int:

@@ -31,6 +31,8 @@ HARD = [
     (101, 6904, "repeated definitions: swapped in at 0"),  # the beginning of another log
     (103, 3192, "killed: swapped in at 6144"),  # a whole chunk of another log in the first one
     (103, 8041, "unchunked: cut at 1214, zeroed at 512"),  # two small messages between both
+    (103, 8506, "unchunked: zeroed at 2560, duplicated 18432 at 512"),  # the first message between both
+    (103, 9171, "unchunked, data CRC: duplicated 20480 at 1536, zeroed at 512"),
     (93, 2517, "no index: swapped in at 11776"),  # a chunk without CRC, half of another log's
 ]
 

@@ -27,7 +27,7 @@ from ipsys_log.units import NS_PER_S
 from tests.conftest import Ipsys, Unmeasured
 from tests.test_measure import foreign_read
 
-PATIENCE_S = 40.0
+PATIENCE_S = 240.0
 HEAD = ("measure", "--port", "0", "--rig")
 
 
@@ -81,7 +81,7 @@ class Page:
         data = None if body is None else json.dumps(body).encode()
         request = urllib.request.Request(self._url + "api/" + path, data, {"X-Ipsys": "1"})
         try:
-            with urllib.request.urlopen(request, timeout=10) as answer:
+            with urllib.request.urlopen(request, timeout=PATIENCE_S) as answer:
                 found: dict[str, Any] = json.load(answer)
         except urllib.error.HTTPError as error:
             found = json.load(error)
@@ -148,7 +148,7 @@ def test_places_are_measured_on_the_page_until_it_is_told_to_end(
         assert page.ask("undo", {"id": "p002"})["withdrawn"] == "p002"
         time.sleep(3)  # of which nothing is kept
         program.send_signal(number)
-        out, err = program.communicate(timeout=20)
+        out, err = program.communicate(timeout=PATIENCE_S)
     assert program.returncode == 0, err
     assert "Traceback" not in err
     assert f"6 places measured into {log}, 1 withdrawn" in out
@@ -166,7 +166,7 @@ def test_what_was_measured_survives_a_kill(ipsys: Ipsys, still_lab: Lab, tmp_pat
         page.measure(still_lab.tape[0])
         time.sleep(0.5)
         program.kill()
-        program.communicate(timeout=20)
+        program.communicate(timeout=PATIENCE_S)
     assert "ipsys repair" in ipsys("info", log).err
     assert ipsys("repair", log).code == 0
     assert [row.id for row in foreign_read(log)] == ["p001"]
@@ -185,7 +185,7 @@ def test_a_kill_before_the_first_place_leaves_rig_and_lenses(
     log = tmp_path / "places.mcap"
     with measuring(still_lab, log) as (program, _):
         program.kill()
-        program.communicate(timeout=20)
+        program.communicate(timeout=PATIENCE_S)
     assert ipsys("repair", log).code == 0
     with Session([log]) as session:
         assert session.count("/rig") == 1

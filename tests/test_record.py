@@ -22,6 +22,8 @@ from tests.conftest import Ipsys, small_disk
 from tests.sources.streams import encode, free_port, make_jpegs, serve
 
 NAMES = ("red", "white", "black")
+# Nothing takes so long, however busy the machine is.
+LIMIT_S = 240
 
 
 @pytest.fixture(scope="module")
@@ -59,7 +61,7 @@ def started(*arguments: object) -> subprocess.Popen[str]:
 
 
 def wait_for(log: Path, size: int) -> None:
-    until = time.monotonic() + 30
+    until = time.monotonic() + LIMIT_S
     while not log.exists() or log.stat().st_size < size:
         assert time.monotonic() < until, "nothing is recorded"
         time.sleep(0.05)
@@ -156,7 +158,7 @@ def test_it_ends_cleanly_when_it_is_told_to(
         program = started("record", "--rig", rig, "-o", log)
         wait_for(log, 500_000)
         program.send_signal(number)
-        out, err = program.communicate(timeout=20)
+        out, err = program.communicate(timeout=LIMIT_S)
     assert program.returncode == 0, err
     assert f"{log} written" in out
     assert all(len(found) > 10 for found in frames(log).values())
@@ -227,7 +229,7 @@ def test_a_second_interrupt_ends_what_hangs_and_the_log_is_kept(
         assert program.poll() is None
         program.send_signal(signal.SIGINT)
         try:
-            _, err = program.communicate(timeout=10)
+            _, err = program.communicate(timeout=LIMIT_S)
         finally:
             program.kill()
     assert program.returncode == code, err
@@ -269,7 +271,7 @@ def test_who_interrupts_does_not_wait_for_a_lab_to_be_drawn(tmp_path: Path) -> N
     begun_s = time.monotonic()
     program.send_signal(signal.SIGINT)
     try:
-        _, err = program.communicate(timeout=60)
+        _, err = program.communicate(timeout=LIMIT_S)
     finally:
         program.kill()
     assert (program.returncode, "Traceback" in err) == (0, False), err
@@ -280,7 +282,7 @@ def test_who_interrupts_does_not_wait_for_a_lab_to_be_drawn(tmp_path: Path) -> N
 
 
 def test_a_signal_may_come_at_any_moment() -> None:
-    subprocess.run([sys.executable, "-c", ENDING], timeout=20, check=True)
+    subprocess.run([sys.executable, "-c", ENDING], timeout=LIMIT_S, check=True)
 
 
 def test_a_recorder_that_is_killed_loses_its_last_second_at_most(
@@ -293,7 +295,7 @@ def test_a_recorder_that_is_killed_loses_its_last_second_at_most(
         time.sleep(4)
         killed_ns = time.time_ns()
         program.kill()
-        program.communicate(timeout=20)
+        program.communicate(timeout=LIMIT_S)
     done = ipsys("info", log)
     assert done.code == 1
     assert f"Run: ipsys repair {log}" in done.err
@@ -316,7 +318,7 @@ def test_recorder_killed_at_once_keeps_rig_and_lenses(ipsys: Ipsys, tmp_path: Pa
     program = started("record", "--rig", rig, "-o", log)
     wait_for(log, 1_000_000)  # the first chunk of frames, less than 0.1 s of them
     program.kill()
-    program.communicate(timeout=20)
+    program.communicate(timeout=LIMIT_S)
     assert ipsys("repair", log).code == 0
     with Session([log]) as session:
         assert session.count(image_topic("red")) > 0
@@ -343,7 +345,7 @@ def test_recorder_that_stood_still_names_its_late_frames(
         program.send_signal(signal.SIGCONT)
         wait_for(log, size + 2_000_000)
         program.send_signal(signal.SIGINT)
-        _, err = program.communicate(timeout=20)
+        _, err = program.communicate(timeout=LIMIT_S)
     assert program.returncode == 0, err
     with Session([log]) as session:
         events = [e for e in session.payloads(["/events"]) if e.kind == "stamp_unreliable"]

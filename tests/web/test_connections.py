@@ -33,7 +33,7 @@ from tests.web.test_measuring_page import Recording
 
 __all__ = ["still_lab"]
 
-PATIENCE_S = 40.0
+PATIENCE_S = 240.0
 DESCRIPTORS = 128
 IDLE_CONNECTIONS = 300
 

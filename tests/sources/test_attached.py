@@ -14,12 +14,14 @@ import numpy as np
 import pytest
 import simplejpeg
 
-from ipsys_log.messages import CompressedImage, Event, Message, RigCamera
+from ipsys_log.messages import STAMP_UNRELIABLE, CompressedImage, Event, Message, RigCamera
 from ipsys_log.sources import attached as attached_module
 from ipsys_log.sources.attached import Attached
 from ipsys_log.sources.frames import Clock, Frame, Open, Say, SourceError
 from tests.playing import cameras, playing
 
+# Nothing takes so long, however busy the machine is.
+LIMIT_S = 240.0
 FRAMES = {name: [f"{name} {n}".encode() for n in range(20)] for name in ("red", "white", "black")}
 
 
@@ -29,7 +31,9 @@ def messages(attached: Attached) -> list[Message]:
 
 
 def events(found: list[Message]) -> list[Event]:
-    return [message.payload for message in found if isinstance(message.payload, Event)]
+    """Return the events but for those of a busy machine, on which this program stands still at times."""
+    payloads = [message.payload for message in found if isinstance(message.payload, Event)]
+    return [event for event in payloads if event.kind != STAMP_UNRELIABLE]
 
 
 def data_of(found: list[Message], camera: str) -> list[bytes]:
@@ -303,33 +307,34 @@ def test_early_frames_do_not_pile_up_while_another_camera_opens() -> None:
 def test_frames_without_stamps_do_not_wait_for_another_camera_to_get_a_false_time(format: str) -> None:
     """A stream that cannot be stopped: what is not taken waits in the socket, and comes late."""
     picture, key = b"\0\0\1\x41", b"\0\0\1\x67\0\0\1\x65"
-    begin_s: list[float] = []
+    taken_15, asked_ns = threading.Event(), list[int]()
 
     @contextmanager
     def opened(camera: RigCamera, clock: Clock, say: Say) -> Iterator[Iterator[Frame | None]]:
-        def sent() -> Iterator[Frame | None]:
-            begin_s.append(time.monotonic())
-            for n in range(40):
-                if camera.name == "late" and n == 0:
-                    time.sleep(0.8)
-                sent_s = begin_s[0] + n / 20
-                time.sleep(max(sent_s - time.monotonic(), 0))
-                yield Frame((picture if n % 10 else key) + b"%03d" % n, format, None)
+        def late() -> Iterator[Frame | None]:
+            taken_15.wait(LIMIT_S)
+            yield Frame(key, format, None)
 
-        yield sent()
+        def early() -> Iterator[Frame | None]:
+            for n in range(40):
+                if n == 15:
+                    taken_15.set()
+                    assert attached._started.wait(LIMIT_S)
+                asked_ns.append(clock.now_ns())
+                yield Frame((picture if n % 10 else key) + b"%03d" % n, format, None)
+            asked_ns.append(clock.now_ns())
+
+        yield early() if camera.name == "early" else late()
 
     attached = Attached(cameras("early", "late"), opened, Clock())
     with attached:
         found = [message for message in attached if message is not None and message.camera == "early"]
-    start_ns = found[0].publish_time_ns
     numbers = [int(message.payload.data[-3:]) for message in found]
-    # Frame n was sent n / 20 s after the first.
-    late_s = [(m.publish_time_ns - start_ns) / 1e9 - n / 20 for m, n in zip(found, numbers, strict=True)]
-    assert max(late_s) < 0.1
-    assert numbers[0] == 0
-    # A video goes on where it can be read.
-    assert numbers[1] == 20 if format == "h264" else 15 <= numbers[1] <= 19
-    assert numbers[1:] == list(range(numbers[1], 40))
+    # Those that came before the other camera are thrown away; a video goes on where it can be read.
+    assert numbers == [0, *range(20 if format == "h264" else 15, 40)]
+    # Each has the time at which it came: before the next one was asked for.
+    for message, n in zip(found, numbers, strict=True):
+        assert asked_ns[n] <= message.publish_time_ns <= asked_ns[n + 1]
 
 
 def test_a_video_without_keyframes_is_said_once_and_kept(monkeypatch: pytest.MonkeyPatch) -> None:

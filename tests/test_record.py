@@ -323,7 +323,7 @@ def test_recorder_killed_at_once_keeps_rig_and_lenses(ipsys: Ipsys, tmp_path: Pa
         f'[[cameras]]\nname = "red"\nsource = "file:{played}"\ncalibration = "red.yaml"\n'
     )
     program = started("record", "--rig", rig, "-o", log)
-    wait_for(log, 1_000_000)  # the first chunks of frames
+    wait_for(log, 8_000_000)  # the first chunk of frames is whole: it spans a second at most
     program.kill()
     program.communicate(timeout=LIMIT_S)
     assert ipsys("repair", log).code == 0

@@ -2,14 +2,20 @@
 
 from __future__ import annotations
 
+import threading
 import time
+from collections import Counter
 from collections.abc import Callable, Iterator, Mapping, Sequence
 from contextlib import contextmanager
 
-from ipsys_log.messages import RigCamera
+from ipsys_log.messages import CompressedImage, Message, RigCamera
 from ipsys_log.sources.frames import Clock, Frame, Open, Say
+from ipsys_log.units import NS_PER_S
 
-__all__ = ["cameras", "playing"]
+__all__ = ["SteppedClock", "cameras", "playing"]
+
+_LIMIT_S = 240.0
+_READING_NS = 1000
 
 
 def cameras(*names: str) -> list[RigCamera]:
@@ -44,3 +50,39 @@ def playing(
         yield sent()
 
     return opened
+
+
+class SteppedClock(Clock):
+    """A clock that frames move on, not real time: a busy machine skips none, and stamps are exact.
+
+    Give ``before`` to `playing`, with an infinite rate, and ``watch`` to what looks at the frames. Frame n is
+    sent when all cameras' frames n - 1 were looked at; the time is then n / ``rate_hz`` after the start.
+    """
+
+    def __init__(self, names: Sequence[str], rate_hz: float) -> None:
+        super().__init__()
+        self._names, self._step_ns = tuple(names), round(NS_PER_S / rate_hz)
+        self._start_ns = self._now_ns = super().now_ns()
+        self._seen: Counter[str] = Counter()
+        self._changed = threading.Condition()
+
+    def now_ns(self) -> int:
+        with self._changed:
+            self._now_ns += _READING_NS
+            return self._now_ns
+
+    def before(self, _: str, number: int) -> None:
+        """Wait until frame ``number`` may be sent, and move on to its time."""
+        with self._changed:
+            looked_at = self._changed.wait_for(
+                lambda: all(self._seen[name] >= number for name in self._names), _LIMIT_S
+            )
+            assert looked_at, f"frames {number - 1} were not looked at: {self._seen}"
+            self._now_ns = max(self._now_ns, self._start_ns + number * self._step_ns)
+
+    def watch(self, message: Message | None) -> None:
+        """Note that a frame was looked at."""
+        if message is not None and isinstance(message.payload, CompressedImage):
+            with self._changed:
+                self._seen[str(message.camera)] += 1
+                self._changed.notify_all()

@@ -389,10 +389,10 @@ def test_the_page_is_served_until_it_is_interrupted(unmeasured: Unmeasured) -> N
         assert served.stdout is not None
         assert served.stderr is not None
         url = served.stdout.readline().removeprefix("open ").strip()
-        with urllib.request.urlopen(url, timeout=10) as page:
+        with urllib.request.urlopen(url, timeout=240) as page:
             assert "<title>ipsys measure</title>" in page.read().decode()
         served.send_signal(signal.SIGINT)
-        out, err = served.communicate(timeout=20)
+        out, err = served.communicate(timeout=240)
     assert served.returncode == 0
     assert out == f"0 places measured into {unmeasured.log}\n"
     assert "Traceback" not in err

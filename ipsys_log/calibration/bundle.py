@@ -12,7 +12,7 @@ import numpy as np
 from numpy.typing import NDArray
 from scipy.spatial.transform import Rotation
 
-from ipsys_log.calibration.lens_models import LensModel, project_points
+from ipsys_log.calibration.lens_models import LensModel, project_points, project_with_slopes
 
 __all__ = [
     "Corners",
@@ -89,7 +89,7 @@ def camera_points(fit: Fit, corners: Corners) -> Array:
 
 def residuals(model: LensModel, fit: Fit, corners: Corners) -> Array:
     """By how much the fit misses the corners seen, (n, 2) in px."""
-    return project_points(model, fit.lens, camera_points(fit, corners))[0] - corners.pixels
+    return project_points(model, fit.lens, camera_points(fit, corners)) - corners.pixels
 
 
 def _weights(missed_px: Array, scale_px: float | None) -> tuple[Array, float]:
@@ -115,25 +115,39 @@ def normal_equations(
 ) -> Normal:
     """What a step is solved from; ``basis`` (p, q) has the directions in which the lens may change."""
     points_m = camera_points(fit, corners)
-    pixels, by_point, by_lens = project_points(model, fit.lens, points_m)
+    pixels, by_point, by_lens = project_with_slopes(model, fit.lens, points_m)
     missed_px = pixels - corners.pixels
-    root = np.sqrt(_weights(missed_px, scale_px)[0])[:, None, None]
     x, y, z = (points_m - fit.places_m[corners.picture]).T
-    zero = np.zeros_like(x)
+    # Columns: the lens (q), a turn and a shift of the board (6), and the residual.
+    count = basis.shape[1]
+    rows = np.empty((len(points_m), 2, count + 7))
+    rows[..., :count] = by_lens @ basis
     # A small turn w moves a point by w x (R X).
-    turning = np.stack([zero, z, -y, -z, zero, x, y, -x, zero], axis=1).reshape(-1, 3, 3)
-    by_pose = np.concatenate([by_point @ turning, by_point], axis=2) * root
-    by_lens = by_lens @ basis * root
-    missed = missed_px * root[..., 0]
+    by_x, by_y, by_z = (by_point[..., n] for n in range(3))
+    x, y, z = x[:, None], y[:, None], z[:, None]
+    rows[..., count] = by_z * y - by_y * z
+    rows[..., count + 1] = by_x * z - by_z * x
+    rows[..., count + 2] = by_y * x - by_x * y
+    rows[..., count + 3 : count + 6] = by_point
+    rows[..., count + 6] = missed_px
+    rows *= np.sqrt(_weights(missed_px, scale_px)[0])[:, None, None]
+    squares = np.stack([_squares(part) for part in np.split(rows, corners.starts[1:])])
+    lens, pose = slice(count), slice(count, count + 6)
     return Normal(
-        corners.sums(np.einsum("nki,nkj->nij", by_lens, by_lens)),
-        corners.sums(np.einsum("nki,nk->ni", by_lens, missed)),
-        corners.sums(np.einsum("nki,nkj->nij", by_pose, by_pose)),
-        corners.sums(np.einsum("nki,nk->ni", by_pose, missed)),
-        corners.sums(np.einsum("nki,nkj->nij", by_pose, by_lens)),
+        squares[:, lens, lens],
+        squares[:, lens, -1],
+        squares[:, pose, pose],
+        squares[:, pose, -1],
+        squares[:, pose, lens],
         (basis.T * model.pull) @ basis,
         basis.T @ (model.pull * fit.lens),
     )
+
+
+def _squares(rows: Array) -> Array:
+    """Return the products (m, m) of the columns of the rows (n, 2, m) of one picture."""
+    flat = rows.reshape(-1, rows.shape[2])
+    return np.asarray(flat.T @ flat)
 
 
 def reduce_to_lens(normal: Normal) -> tuple[Array, Array]:

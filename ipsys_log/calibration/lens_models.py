@@ -13,7 +13,7 @@ from numpy.typing import NDArray
 
 from ipsys_log.errors import IpsysError
 
-__all__ = ["LENSES", "LensModel", "find_lens", "project_points"]
+__all__ = ["LENSES", "LensModel", "find_lens", "project_points", "project_with_slopes"]
 
 Array = NDArray[np.float64]
 
@@ -27,14 +27,16 @@ _PULL_PX = 0.1
 class LensModel(NamedTuple):
     """A kind of lens: the name in the log, what its coefficients are called, how many of them are fitted.
 
-    Those that are not fitted stay 0. ``usual`` is how large coefficients usually are, where pictures may not
-    tell them from one another: a common factor above and below a fraction bends nothing.
+    Those that are not fitted stay 0. ``bend`` returns the image of points at a focal length of 1,
+    ``bend_with_slopes`` also its derivatives. ``usual`` is how large coefficients usually are, where pictures
+    may not tell them from one another: a common factor above and below a fraction bends nothing.
     """
 
     distortion_model: str
     coefficients: tuple[str, ...]
     fitted: int
-    bend: Callable[[Array, Array], tuple[Array, Array, Array]]
+    bend: Callable[[Array, Array], Array]
+    bend_with_slopes: Callable[[Array, Array], tuple[Array, Array, Array]]
     usual: float = np.inf
 
     @property
@@ -50,20 +52,30 @@ class LensModel(NamedTuple):
         return np.array([0.0] * 4 + [strength] * len(self.coefficients))
 
 
-def project_points(model: LensModel, parameters: Array, points_m: Array) -> tuple[Array, Array, Array]:
-    """Pixels of points, and how they change with the point and with the lens.
+def project_points(model: LensModel, parameters: Array, points_m: Array) -> Array:
+    """Return the pixels of points, (n, 2).
 
     Parameters
     ----------
     model : the kind of lens.
     parameters : (p,), as ``model.names`` says.
     points_m : (n, 3), in the frame of the camera; for a fisheye also beside and behind it.
+    """
+    return np.asarray(model.bend(points_m, parameters[4:]) * parameters[:2] + parameters[2:4])
+
+
+def project_with_slopes(model: LensModel, parameters: Array, points_m: Array) -> tuple[Array, Array, Array]:
+    """Return the pixels of points, and how they change with the point and with the lens.
+
+    Parameters
+    ----------
+    model, parameters, points_m : as for ``project_points``.
 
     Returns
     -------
     Pixels (n, 2), their derivatives by the point (n, 2, 3), in px/m, and by the parameters (n, 2, p).
     """
-    bent, by_point, by_coefficients = model.bend(points_m, parameters[4:])
+    bent, by_point, by_coefficients = model.bend_with_slopes(points_m, parameters[4:])
     focal_px = parameters[:2]
     by_parameters = np.zeros((len(points_m), 2, parameters.size))
     by_parameters[:, 0, 0], by_parameters[:, 1, 1] = bent.T
@@ -72,69 +84,111 @@ def project_points(model: LensModel, parameters: Array, points_m: Array) -> tupl
     return bent * focal_px + parameters[2:4], by_point * focal_px[:, None], by_parameters
 
 
-def _bend_fisheye(points_m: Array, k: Array) -> tuple[Array, Array, Array]:
-    """Kannala and Brandt (PAMI 2006), in OpenCV's form: the angle from the axis bends, not its tangent.
-
-    The angle is atan2(r, z), so that it goes on beyond 90 degrees.
-    """
+def _fisheye_angle(points_m: Array) -> tuple[Array, Array, Array, Array]:
+    """Return the squared length of points, their distance from the axis, the angle, and its square."""
     x, y, z = points_m.T
     square = x * x + y * y + z * z
     r = np.maximum(np.hypot(x, y), 1e-9 * np.sqrt(square))
     theta = np.arctan2(r, z)
-    powers = theta[:, None] ** np.array([3, 5, 7, 9])
-    bent = theta + powers @ k
-    slope = 1 + (theta[:, None] ** np.array([2, 4, 6, 8]) * np.array([3, 5, 7, 9])) @ k
+    return square, r, theta, theta * theta
+
+
+def _bend_fisheye(points_m: Array, k: Array) -> Array:
+    """Kannala and Brandt (PAMI 2006), in OpenCV's form: the angle from the axis bends, not its tangent.
+
+    The angle is atan2(r, z), so that it goes on beyond 90 degrees.
+    """
+    _, r, theta, t2 = _fisheye_angle(points_m)
+    bent = theta * (1 + t2 * (k[0] + t2 * (k[1] + t2 * (k[2] + t2 * k[3]))))
+    return np.asarray(points_m[:, :2] * (bent / r)[:, None])
+
+
+def _bend_fisheye_with_slopes(points_m: Array, k: Array) -> tuple[Array, Array, Array]:
+    """Return what ``_bend_fisheye`` does, and its derivatives by the point and by the coefficients."""
+    square, r, theta, t2 = _fisheye_angle(points_m)
+    bent = theta * (1 + t2 * (k[0] + t2 * (k[1] + t2 * (k[2] + t2 * k[3]))))
+    slope = 1 + t2 * (3 * k[0] + t2 * (5 * k[1] + t2 * (7 * k[2] + t2 * 9 * k[3])))
     scale = bent / r
     # d scale / d (x, y, z), of bent(theta(r, z)) / r(x, y).
+    x, y, z = points_m.T
     along_r = (slope * z / square - scale) / r**2
     by_scale = np.stack([along_r * x, along_r * y, -slope / square], axis=1)
     planar = points_m[:, :2]
     by_point = planar[:, :, None] * by_scale[:, None, :]
     by_point[:, 0, 0] += scale
     by_point[:, 1, 1] += scale
-    directions = planar / r[:, None]
-    return planar * scale[:, None], by_point, directions[:, :, None] * powers[:, None, :]
+    by_k = np.empty((len(points_m), 2, 4))
+    step = planar * (theta / r)[:, None]
+    for n in range(4):
+        step = step * t2[:, None]
+        by_k[:, :, n] = step
+    return planar * scale[:, None], by_point, by_k
 
 
-def _bend_pinhole(points_m: Array, k: Array) -> tuple[Array, Array, Array]:
+def _planar(points_m: Array) -> tuple[Array, Array]:
+    """Return points of the plane at depth 1, (2, n), and the depths (n,) that they were divided by."""
+    x, y, z = points_m.T
+    depth_m = np.maximum(z, _LEAST_DEPTH * np.sqrt(x * x + y * y + z * z) + _TINY)
+    return np.stack([x / depth_m, y / depth_m]), depth_m
+
+
+def _eight(k: Array) -> list[float]:
+    return [*k.tolist(), *[0.0] * (8 - k.size)]
+
+
+def _bend_pinhole(points_m: Array, k: Array) -> Array:
     """Brown's radial and tangential terms, as OpenCV has them: k1 k2 p1 p2 k3, and a divisor k4 k5 k6."""
-    z = np.maximum(points_m[:, 2], _LEAST_DEPTH * np.linalg.norm(points_m, axis=1) + _TINY)
-    a, b = (points_m[:, :2] / z[:, None]).T
-    k1, k2, p1, p2, k3, k4, k5, k6 = np.append(k, np.zeros(8 - k.size))
+    (a, b), _ = _planar(points_m)
+    k1, k2, p1, p2, k3, k4, k5, k6 = _eight(k)
     r2 = a * a + b * b
-    powers = r2[:, None] ** np.array([1, 2, 3])
-    top, bottom = 1 + powers @ np.array([k1, k2, k3]), 1 + powers @ np.array([k4, k5, k6])
-    radial = top / bottom
-    climb = np.column_stack([np.ones_like(r2), 2 * r2, 3 * r2 * r2])
-    slope = 2 * (climb @ np.array([k1, k2, k3]) - radial * (climb @ np.array([k4, k5, k6]))) / bottom
-    ab = np.stack([a, b], axis=1)
-    bent = ab * radial[:, None]
-    bent[:, 0] += 2 * p1 * a * b + p2 * (r2 + 2 * a * a)
-    bent[:, 1] += p1 * (r2 + 2 * b * b) + 2 * p2 * a * b
-    by_ab = ab[:, :, None] * ab[:, None, :] * slope[:, None, None]
-    by_ab[:, 0, 0] += radial + 2 * p1 * b + 6 * p2 * a
-    by_ab[:, 1, 1] += radial + 6 * p1 * b + 2 * p2 * a
-    cross = 2 * p1 * a + 2 * p2 * b
-    by_ab[:, 0, 1] += cross
-    by_ab[:, 1, 0] += cross
-    by_point = np.concatenate([by_ab, -by_ab @ ab[:, :, None]], axis=2) / z[:, None, None]
-    rise = powers[:, None, :] * (ab / bottom[:, None])[:, :, None]
-    tangential = np.stack(
-        [np.stack([2 * a * b, r2 + 2 * a * a], axis=1), np.stack([r2 + 2 * b * b, 2 * a * b], axis=1)], axis=1
-    )
-    fall = -rise * radial[:, None, None]
-    by_k = np.concatenate([rise[:, :, :2], tangential, rise[:, :, 2:], fall], axis=2)
+    radial = (1 + r2 * (k1 + r2 * (k2 + r2 * k3))) / (1 + r2 * (k4 + r2 * (k5 + r2 * k6)))
+    bent = np.empty((len(points_m), 2))
+    bent[:, 0] = a * radial + 2 * p1 * a * b + p2 * (r2 + 2 * a * a)
+    bent[:, 1] = b * radial + p1 * (r2 + 2 * b * b) + 2 * p2 * a * b
+    return bent
+
+
+def _bend_pinhole_with_slopes(points_m: Array, k: Array) -> tuple[Array, Array, Array]:
+    """Return what ``_bend_pinhole`` does, and its derivatives by the point and by the coefficients."""
+    (a, b), depth_m = _planar(points_m)
+    k1, k2, p1, p2, k3, k4, k5, k6 = _eight(k)
+    r2, two_ab = a * a + b * b, 2 * a * b
+    bottom = 1 + r2 * (k4 + r2 * (k5 + r2 * k6))
+    radial = (1 + r2 * (k1 + r2 * (k2 + r2 * k3))) / bottom
+    climb = k1 + r2 * (2 * k2 + r2 * 3 * k3) - radial * (k4 + r2 * (2 * k5 + r2 * 3 * k6))
+    slope = 2 * climb / bottom
+    of_p1, of_p2 = r2 + 2 * b * b, r2 + 2 * a * a
+    bent = np.empty((len(points_m), 2))
+    bent[:, 0] = a * radial + p1 * two_ab + p2 * of_p2
+    bent[:, 1] = b * radial + p1 * of_p1 + p2 * two_ab
+    by_point = np.empty((len(points_m), 2, 3))
+    by_point[:, 0, 0] = a * a * slope + radial + 2 * p1 * b + 6 * p2 * a
+    by_point[:, 1, 1] = b * b * slope + radial + 6 * p1 * b + 2 * p2 * a
+    by_point[:, 0, 1] = by_point[:, 1, 0] = a * b * slope + 2 * p1 * a + 2 * p2 * b
+    by_point[:, :, 2] = -(by_point[:, :, 0] * a[:, None] + by_point[:, :, 1] * b[:, None])
+    by_point /= depth_m[:, None, None]
+    by_k = np.empty((len(points_m), 2, 8))
+    for axis, along in enumerate((a, b)):
+        rise = along / bottom
+        # k1 k2 k3 above the fraction, k4 k5 k6 below it.
+        for above, below in ((0, 5), (1, 6), (4, 7)):
+            rise = rise * r2
+            by_k[:, axis, above], by_k[:, axis, below] = rise, -rise * radial
+    by_k[:, 0, 2], by_k[:, 0, 3] = two_ab, of_p2
+    by_k[:, 1, 2], by_k[:, 1, 3] = of_p1, two_ab
     return bent, by_point, by_k[:, :, : k.size]
 
 
+_FISHEYE = (_bend_fisheye, _bend_fisheye_with_slopes)
+_PINHOLE = (_bend_pinhole, _bend_pinhole_with_slopes)
 _FIVE = ("k1", "k2", "p1", "p2", "k3")
 
 # By the name a user gives.
 LENSES = {
-    "fisheye": LensModel("kannala_brandt", ("k1", "k2", "k3", "k4"), 4, _bend_fisheye),
-    "pinhole": LensModel("plumb_bob", _FIVE, 5, _bend_pinhole),
-    "pinhole4": LensModel("plumb_bob", _FIVE, 4, _bend_pinhole),
-    "pinhole8": LensModel("rational_polynomial", (*_FIVE, "k4", "k5", "k6"), 8, _bend_pinhole, 2.0),
+    "fisheye": LensModel("kannala_brandt", ("k1", "k2", "k3", "k4"), 4, *_FISHEYE),
+    "pinhole": LensModel("plumb_bob", _FIVE, 5, *_PINHOLE),
+    "pinhole4": LensModel("plumb_bob", _FIVE, 4, *_PINHOLE),
+    "pinhole8": LensModel("rational_polynomial", (*_FIVE, "k4", "k5", "k6"), 8, *_PINHOLE, 2.0),
 }
 
 

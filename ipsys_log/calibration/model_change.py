@@ -58,7 +58,7 @@ def model_change(
     James and Stein, Estimation with quadratic loss, 1961: the shrinkage 1 - c / chi^2.
     """
     lens_count = basis.shape[1]
-    bent = model.bend(camera_points(fit, corners), fit.lens[4:])[0]
+    bent = model.bend(camera_points(fit, corners), fit.lens[4:])
     terms = _terms(model, bent)
     richer, richer_fit, richer_basis = _enrich(model, fit, basis, terms)
     normal = normal_equations(richer, richer_fit, corners, richer_basis, scale_px)
@@ -100,11 +100,11 @@ def _enrich(model: LensModel, fit: Fit, basis: Array, terms: _Terms) -> tuple[Le
     count = len(terms.usual)
 
     def bend(points_m: Array, k: Array) -> tuple[Array, Array, Array]:
-        bent, by_point, by_coefficients = model.bend(points_m, k[:-count])
+        bent, by_point, by_coefficients = model.bend_with_slopes(points_m, k[:-count])
         return bent, by_point, np.concatenate([by_coefficients, terms.displacements], axis=2)
 
     names = tuple(f"e{n}" for n in range(count))
-    richer = model._replace(coefficients=(*model.coefficients, *names), bend=bend)
+    richer = model._replace(coefficients=(*model.coefficients, *names), bend_with_slopes=bend)
     wider = np.zeros((len(basis) + count, basis.shape[1] + count))
     wider[: len(basis), : basis.shape[1]] = basis
     wider[len(basis) :, basis.shape[1] :] = np.eye(count)

@@ -37,7 +37,7 @@ def alike(model: LensModel, fit: Fit, corners: Corners, size_px: tuple[int, int]
     low, high = corners.board_m.min(axis=0), corners.board_m.max(axis=0)
     outline_m = np.array([[x, y, 0.0] for x in (low[0], high[0]) for y in (low[1], high[1])])
     seen_m = np.einsum("fij,kj->fki", fit.rotations, outline_m) + fit.places_m[:, None]
-    outlines = project_points(model, fit.lens, seen_m.reshape(-1, 3))[0].reshape(-1, 4, 2)
+    outlines = project_points(model, fit.lens, seen_m.reshape(-1, 3)).reshape(-1, 4, 2)
     near_px = NEAR * float(np.hypot(*size_px))
     for _ in range(_HALVINGS):
         groups = group_outlines(outlines, near_px)

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Callable, Iterator
 from concurrent.futures import ThreadPoolExecutor
-from contextlib import contextmanager, suppress
+from contextlib import contextmanager
 from functools import partial
 from pathlib import Path
 from time import sleep
@@ -12,7 +12,7 @@ from typing import TYPE_CHECKING, Any
 
 from ipsys_log.cli.cameras_now import MODEL, Lab, check_target, opened, prepared, shown_to
 from ipsys_log.cli.console import console, remarks
-from ipsys_log.cli.signals import allow_interrupt
+from ipsys_log.cli.signals import allow_interrupt, suppress_interrupt
 
 if TYPE_CHECKING:
     from ipsys_log.messages import Measurement, Message, Model
@@ -122,7 +122,7 @@ def _ask_beside(work: Callable[[], Any], scene: LiveScene, cameras: Attached) ->
     with ThreadPoolExecutor(1) as pool:
         working = pool.submit(work)
         try:
-            with suppress(KeyboardInterrupt):
+            with suppress_interrupt():
                 while not (working.done() or any(view.points for view in scene.views(None))):
                     sleep(_TURN_S)
                 sleep(_LOOK_S)

@@ -4,12 +4,16 @@ A signal goes through three states. Until the command is known it is only noted 
 interrupts (`allow_interrupt`), or it stops the cameras and the command ends in order (`stop_on_signal`). The
 first signal of a command that runs until it is stopped gives exit code 0; every other one gives 128 plus its
 number, as shells do. A signal that the process inherited as ignored stays ignored (``nohup``).
+
+An interrupt is an exception, and code of others may swallow it: the import of an extension module does. So it
+is raised again until it arrives.
 """
 
 from __future__ import annotations
 
 import functools
 import signal
+import sys
 from collections.abc import Callable, Iterator, Sequence
 from contextlib import contextmanager
 from dataclasses import dataclass, field
@@ -26,9 +30,11 @@ __all__ = [
     "runs_until_stopped",
     "say_kept",
     "stop_on_signal",
+    "suppress_interrupt",
 ]
 
 _SIGNALS = (signal.SIGINT, signal.SIGTERM, signal.SIGHUP)
+_AGAIN_S = 0.5
 _KEPT = "what was complete is kept, and nothing else was changed"
 
 
@@ -50,11 +56,12 @@ class InterruptError(Exception):
 
 @dataclass(slots=True)
 class _State:
-    """The signal that was noted, the text of a normal end (None: an interrupt is a failure), and the results
-    that the command has kept so far."""
+    """The signal that was noted, the text of a normal end (None: an interrupt is a failure), the interrupt
+    that has not arrived yet, and the results that the command has kept so far."""
 
     noted: int | None = None
     normal_text: str | None = None
+    raised: Interrupted | None = None
     kept: list[str] = field(default_factory=list)
 
 
@@ -63,6 +70,7 @@ _state = _State()
 
 def hold_signals() -> None:
     """Note signals without any effect, until the command says what they mean."""
+    _settle()
     _state.noted, _state.normal_text = None, None
     _handle(_note)
 
@@ -122,6 +130,15 @@ def say_kept(text: Callable[[Sequence[str]], str]) -> Iterator[None]:
         raise Interrupted(interrupt.exit_code, words) from None
 
 
+@contextmanager
+def suppress_interrupt() -> Iterator[None]:
+    """End the block on an interrupt, and go on after it."""
+    try:
+        yield
+    except KeyboardInterrupt:
+        _settle()
+
+
 def runs_until_stopped(command: Callable[..., None]) -> Callable[..., None]:
     """Mark a command that calls `allow_interrupt` itself, as it may end normally on a signal."""
     command.runs_until_stopped = True  # type: ignore[attr-defined]
@@ -138,6 +155,7 @@ def interruptible(command: Callable[..., Any]) -> Callable[..., Any]:
                 allow_interrupt()
             return command(*arguments, **options)
         except Interrupted as interrupt:
+            _settle()
             raise InterruptError(interrupt.exit_code, interrupt.text) from None
         finally:
             hold_signals()  # the command has ended: a late signal changes neither its exit code nor its words
@@ -156,8 +174,31 @@ def _interrupt(number: int, _: FrameType | None = None) -> NoReturn:
     _state.noted, text = None, _state.normal_text
     _state.normal_text = None
     if text is not None:
-        raise Interrupted(0, text)
-    raise Interrupted(128 + number, f"interrupted; {_KEPT}")
+        _state.raised = Interrupted(0, text)
+    else:
+        _state.raised = Interrupted(128 + number, f"interrupted; {_KEPT}")
+    signal.signal(signal.SIGALRM, _interrupt_again)
+    signal.setitimer(signal.ITIMER_REAL, _AGAIN_S, _AGAIN_S)
+    raise _state.raised
+
+
+def _interrupt_again(*_: object) -> None:
+    """Raise an interrupt again that is not on its way any more."""
+    error = sys.exception()
+    while error is not None:
+        if isinstance(error, Interrupted):
+            return  # it is: some block cleans up
+        error = error.__context__
+    if _state.raised is not None:
+        raise Interrupted(_state.raised.exit_code, _state.raised.text)
+
+
+def _settle() -> None:
+    """Note that the interrupt has arrived."""
+    if _state.raised is not None:
+        signal.setitimer(signal.ITIMER_REAL, 0)
+        signal.signal(signal.SIGALRM, signal.SIG_DFL)
+        _state.raised = None
 
 
 def _handle(handler: Callable[[int, FrameType | None], None]) -> None:

@@ -7,7 +7,7 @@ import numpy as np
 import pytest
 from numpy.typing import NDArray
 
-from ipsys_log.calibration.lens_models import LENSES, find_lens, project_points
+from ipsys_log.calibration.lens_models import LENSES, find_lens, project_points, project_with_slopes
 from ipsys_log.errors import IpsysError
 from tests.calibration.boards_seen import TRUTH, pixels_of
 
@@ -25,13 +25,13 @@ def test_pixels_are_those_of_opencv(name: str) -> None:
     k = np.array([[lens[0], 0, lens[2]], [0, lens[1], lens[3]], [0, 0, 1]])
     project = cv2.fisheye.projectPoints if name == "fisheye" else cv2.projectPoints
     expected, _ = project(points().reshape(-1, 1, 3), STILL, STILL, k, lens[4:])
-    pixels, _, _ = project_points(LENSES[name], lens, points())
+    pixels = project_points(LENSES[name], lens, points())
     np.testing.assert_allclose(pixels, np.reshape(expected, (-1, 2)), atol=1e-9)
 
 
 def test_a_fisheye_sees_what_is_beside_and_behind_it() -> None:
     beyond = points() * (1.0, 1.0, -0.3)
-    pixels, _, _ = project_points(LENSES["fisheye"], np.array(TRUTH["fisheye"]), beyond)
+    pixels = project_points(LENSES["fisheye"], np.array(TRUTH["fisheye"]), beyond)
     np.testing.assert_allclose(pixels, pixels_of("fisheye", TRUTH["fisheye"], beyond), atol=1e-9)
     # Farther from the middle than anything before the camera.
     middle = TRUTH["fisheye"][2:4]
@@ -43,18 +43,18 @@ def test_derivatives(name: str) -> None:
     model, lens, here = LENSES[name], np.array(TRUTH[name]), points(1)
     if name == "fisheye":
         here[:10, 2] *= -1
-    _, by_point, by_lens = project_points(model, lens, here)
+    _, by_point, by_lens = project_with_slopes(model, lens, here)
     step = 1e-6
     for n, axis in enumerate(np.eye(3) * step):
-        ahead, behind = (project_points(model, lens, here + sign * axis)[0] for sign in (1, -1))
+        ahead, behind = (project_points(model, lens, here + sign * axis) for sign in (1, -1))
         np.testing.assert_allclose(by_point[:, :, n], (ahead - behind) / (2 * step), rtol=1e-5, atol=1e-4)
     for n, axis in enumerate(np.eye(lens.size) * step):
-        ahead, behind = (project_points(model, lens + sign * axis, here)[0] for sign in (1, -1))
+        ahead, behind = (project_points(model, lens + sign * axis, here) for sign in (1, -1))
         np.testing.assert_allclose(by_lens[:, :, n], (ahead - behind) / (2 * step), rtol=1e-5, atol=1e-4)
 
 
 def test_the_axis_itself_is_the_middle() -> None:
-    pixels, by_point, _ = project_points(
+    pixels, by_point, _ = project_with_slopes(
         LENSES["fisheye"], np.array(TRUTH["fisheye"]), np.array([[0.0, 0.0, 2.0]])
     )
     np.testing.assert_allclose(pixels[0], TRUTH["fisheye"][2:4])

@@ -27,7 +27,7 @@ def squared_errors(
     return np.array(rows)
 
 
-@pytest.mark.parametrize("name", ["fisheye", "pinhole", "pinhole8"])
+@pytest.mark.parametrize("name", ["fisheye", pytest.param("pinhole", marks=pytest.mark.slow), "pinhole8"])
 def test_few_pictures_errors_are_as_stated(name: str) -> None:
     """Seven pictures may agree by chance; a jackknife of seven takes that for certainty, up to 6 sigma."""
     errors = squared_errors(name, name, 7, range(100, 130))
@@ -36,7 +36,7 @@ def test_few_pictures_errors_are_as_stated(name: str) -> None:
     assert errors.max() < 3.5**2
 
 
-@pytest.mark.parametrize("pictures", [7, 20])
+@pytest.mark.parametrize("pictures", [pytest.param(7, marks=pytest.mark.slow), 20])
 def test_lens_of_other_kind_errors_are_as_stated(pictures: int) -> None:
     """With the jackknife alone, the mean is 3 to 4 for 20 pictures."""
     errors = squared_errors("pinhole", "fisheye", pictures, range(100, 120), DECENTERED)

@@ -63,7 +63,7 @@ def test_a_terminal_gets_no_escape_out_of_a_log(hostile: Path) -> None:
     ours, theirs = pty.openpty()
     environment = os.environ | {"TERM": "xterm-256color", "COLUMNS": "200", "PYTHONPATH": str(ROOT)}
     command = [sys.executable, "-m", "ipsys_log", "runs", str(hostile)]
-    done = subprocess.run(command, stdout=theirs, stderr=theirs, env=environment, check=False, timeout=60)
+    done = subprocess.run(command, stdout=theirs, stderr=theirs, env=environment, check=False, timeout=240)
     os.close(theirs)
     shown = b""
     try:

@@ -15,7 +15,9 @@ import pytest
 
 from ipsys_log.log.session import Session
 from ipsys_log.messages import CameraCalibration, Measurement, Message, Model, Rig
+from ipsys_log.pipeline import replay
 from ipsys_log.runs.output import write_log
+from ipsys_log.runs.request import Request
 from tests.conftest import ROOT, Ipsys, data_section
 
 PAPER = ROOT / "sample_logs" / "paper_lab.mcap"
@@ -25,6 +27,20 @@ PAPER = ROOT / "sample_logs" / "paper_lab.mcap"
 def paper(tmp_path: Path) -> Path:
     """The paper's layout without frames."""
     return Path(shutil.copy(PAPER, tmp_path / "paper.mcap"))
+
+
+@pytest.fixture(scope="module")
+def fitted_log(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    """The paper's layout with the model that a plan is made for, to be copied before it is changed."""
+    path = Path(shutil.copy(PAPER, tmp_path_factory.mktemp("fitted") / "paper.mcap"))
+    replay([path], Request(models=("best",)), until="fit")
+    return path
+
+
+@pytest.fixture
+def fitted(fitted_log: Path, tmp_path: Path) -> Path:
+    """A copy of it."""
+    return Path(shutil.copy(fitted_log, tmp_path / "paper.mcap"))
 
 
 @pytest.fixture
@@ -93,8 +109,8 @@ def test_the_plan_is_a_table_and_a_headline(
     assert size == paper.stat().st_size
 
 
-def test_the_plan_as_json(ipsys: Ipsys, paper: Path) -> None:
-    found = planned(ipsys, paper, "--places", 3)
+def test_the_plan_as_json(ipsys: Ipsys, fitted: Path) -> None:
+    found = planned(ipsys, fitted, "--places", 3)
     assert (found["model"], found["run"]) == ("best", "best")
     assert [place["number"] for place in found["places"]] == [1, 2, 3]
     before_cm = found["mean_before_cm"]
@@ -117,28 +133,28 @@ def test_the_plan_as_json(ipsys: Ipsys, paper: Path) -> None:
     assert any("little" in note for note in found["notes"])
 
 
-def test_heights_and_models_as_asked_for(ipsys: Ipsys, paper: Path) -> None:
-    found = planned(ipsys, paper, "--height-m", "0.12", "--places", 2)
+def test_heights_and_models_as_asked_for(ipsys: Ipsys, fitted: Path) -> None:
+    found = planned(ipsys, fitted, "--height-m", "0.12", "--places", 2)
     assert {place["height_m"] for place in found["places"]} == {0.12}
-    found = planned(ipsys, paper, "--height-m", "0.12", "--height-m", "0", "--places", 2)
+    found = planned(ipsys, fitted, "--height-m", "0.12", "--height-m", "0", "--places", 2)
     # Most places were measured nearer to 12 cm: the floor itself has its turn.
     assert {place["height_m"] for place in found["places"]} == {0.0}
     for model in ("poly", "rigid+poly", "rayplane"):
-        rig = paper.with_name("lab.toml")
+        rig = fitted.with_name("lab.toml")
         if model == "rayplane":
-            ipsys("init", rig, "--from", paper)
+            ipsys("init", rig, "--from", fitted)
             rig.write_text(rig.read_text().replace("marker_height_m = 0.1\n", "marker_height_m = 0.2\n"))
         found = planned(
-            ipsys, paper, "--model", model, *(["--rig", rig] if rig.exists() else []), "--places", 1
+            ipsys, fitted, "--model", model, *(["--rig", rig] if rig.exists() else []), "--places", 1
         )
         assert found["model"] == model
         # The error is that of the markers as robots carry them, where the rig knows it.
         assert found["marker_height_m"] == pytest.approx(0.2 if model == "rayplane" else 0.1, abs=0.02)
 
 
-def test_the_picture(ipsys: Ipsys, paper: Path) -> None:
-    drawn = paper.with_name("plan.png")
-    done = ipsys("plan", paper, "--plot", drawn, "--places", 7)
+def test_the_picture(ipsys: Ipsys, fitted: Path) -> None:
+    drawn = fitted.with_name("plan.png")
+    done = ipsys("plan", fitted, "--plot", drawn, "--places", 7)
     assert done.code == 0, done.err
     picture = cv2.imread(str(drawn))
     assert picture is not None
@@ -147,7 +163,7 @@ def test_the_picture(ipsys: Ipsys, paper: Path) -> None:
     # The same floor twice, with other errors on it.
     same = (left == right).all(axis=2).mean()
     assert 0.1 < same < 0.99
-    assert sorted(path.name for path in paper.parent.iterdir()) == ["paper.mcap", "plan.png"]
+    assert sorted(path.name for path in fitted.parent.iterdir()) == ["paper.mcap", "plan.png"]
 
 
 def test_the_authors_ten_places_want_more_where_there_are_none(ipsys: Ipsys, authors: Path) -> None:
@@ -232,31 +248,30 @@ def test_what_the_log_lacks_is_noted(ipsys: Ipsys, authors: Path) -> None:
     assert "no two reference points" in notes
 
 
-def test_with_three_reference_points_no_side_is_told(ipsys: Ipsys, paper: Path) -> None:
-    rig = paper.with_name("lab.toml")
-    ipsys("init", rig, "--from", paper)
+def test_with_three_reference_points_no_side_is_told(ipsys: Ipsys, fitted: Path) -> None:
+    rig = fitted.with_name("lab.toml")
+    ipsys("init", rig, "--from", fitted)
     rig.write_text(rig.read_text() + '\n[[reference_points]]\nname = "corner"\nx_m = 0.0\ny_m = 0.0\n')
-    found = planned(ipsys, paper, "--rig", rig, "--places", 1)
+    found = planned(ipsys, fitted, "--rig", rig, "--places", 1)
     (place,) = found["places"]
     assert place["side"] is None
     assert place["distances_m"]["corner"] == pytest.approx(np.hypot(place["x_m"], place["y_m"]))
-    done = ipsys("plan", paper, "--rig", rig, "--places", 1)
+    done = ipsys("plan", fitted, "--rig", rig, "--places", 1)
     assert "with this place" in done.out
     assert "corner" in done.out
 
 
-def test_no_marker_is_laid_on_a_reference_point(ipsys: Ipsys, paper: Path) -> None:
-    rig = paper.with_name("lab.toml")
-    ipsys("init", rig, "--from", paper)
-    (best,) = planned(ipsys, paper, "--rig", rig, "--places", 1)["places"]
+def test_no_marker_is_laid_on_a_reference_point(ipsys: Ipsys, fitted: Path) -> None:
+    rig = fitted.with_name("lab.toml")
+    ipsys("init", rig, "--from", fitted)
+    (best,) = planned(ipsys, fitted, "--rig", rig, "--places", 1)["places"]
     x_m, y_m = best["x_m"], best["y_m"]
     rig.write_text(rig.read_text() + f'\n[[reference_points]]\nname = "C"\nx_m = {x_m}\ny_m = {y_m}\n')
-    (other,) = planned(ipsys, paper, "--rig", rig, "--places", 1)["places"]
+    (other,) = planned(ipsys, fitted, "--rig", rig, "--places", 1)["places"]
     assert 0.1 < other["distances_m"]["C"] < 0.5
 
 
-def test_a_model_that_was_copied_in_can_be_planned_for(ipsys: Ipsys, paper: Path, tmp_path: Path) -> None:
-    assert ipsys("fit", paper, "--model", "best").code == 0
+def test_a_model_that_was_copied_in_can_be_planned_for(ipsys: Ipsys, fitted: Path, tmp_path: Path) -> None:
     other = rewrite(Path(shutil.copy(PAPER, tmp_path / "other.mcap")), drop_measured)
-    assert ipsys("fit", other, "--model", "best", "--model-from", paper).code == 0
-    assert planned(ipsys, other)["places"] == planned(ipsys, paper)["places"]
+    assert ipsys("fit", other, "--model", "best", "--model-from", fitted).code == 0
+    assert planned(ipsys, other)["places"] == planned(ipsys, fitted)["places"]

@@ -7,16 +7,20 @@ import shutil
 import signal
 import subprocess
 import sys
+import time
+from collections.abc import Iterator
+from contextlib import suppress
 from pathlib import Path
 
 import pytest
 
+from ipsys_log.cli.signals import InterruptError, interruptible
 from ipsys_log.log import LogReader
-from tests.conftest import ROOT, Ipsys
+from tests.conftest import ROOT, SIGNALS, Ipsys
 from tests.test_record import wait_for
 
 SAMPLE = ROOT / "sample_logs" / "small_lab.mcap"
-LIMIT_S = 60
+LIMIT_S = 240
 
 # Runs the command line, and sends a signal to itself at the n-th file or module that the command opens.
 AT_EVENT = """
@@ -70,6 +74,50 @@ def sample_rig(folder: Path) -> Path:
         '[[cameras]]\nname = "red"\nsource = "sim:red"\nwidth = 320\nheight = 180\n'
     )
     return rig
+
+
+@pytest.fixture
+def handlers() -> Iterator[None]:
+    """Give back the handlers of signals that a test installs."""
+    before = {number: signal.getsignal(number) for number in SIGNALS}
+    yield
+    for number, handler in before.items():
+        signal.signal(number, handler)
+
+
+@pytest.mark.usefixtures("handlers")
+def test_interrupt_swallowed_by_a_library_comes_again() -> None:
+    """As while NumPy loads its random numbers: there an exception is lost."""
+
+    @interruptible
+    def command() -> None:
+        with suppress(BaseException):
+            signal.raise_signal(signal.SIGTERM)
+        until = time.monotonic() + LIMIT_S
+        while time.monotonic() < until:
+            time.sleep(0.01)
+
+    with pytest.raises(InterruptError) as caught:
+        command()
+    assert caught.value.exit_code == 128 + signal.SIGTERM
+
+
+@pytest.mark.usefixtures("handlers")
+def test_interrupt_does_not_interrupt_what_cleans_up() -> None:
+    cleaned: list[bool] = []
+
+    @interruptible
+    def command() -> None:
+        try:
+            signal.raise_signal(signal.SIGTERM)
+        finally:
+            time.sleep(1.2)
+            cleaned.append(True)
+
+    with pytest.raises(InterruptError):
+        command()
+    assert cleaned == [True]
+    assert signal.getitimer(signal.ITIMER_REAL) == (0.0, 0.0)
 
 
 @pytest.mark.parametrize("number", [signal.SIGINT, signal.SIGTERM])

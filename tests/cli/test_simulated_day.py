@@ -216,7 +216,7 @@ def test_places_of_the_simulated_lab_are_measured_on_the_page(tmp_path: Path, ip
         for row in rows[:16]:
             assert "saved" in page.measure(row)
         program.terminate()
-        program.communicate(timeout=60)
+        program.communicate(timeout=240)
     with Session([log]) as session:
         assert len(session.payloads(["/measurements"])) == 16
     assert ipsys("replay", log, "--model", "best").code == 0

@@ -26,7 +26,7 @@ from ipsys_log.sources.simulator import LabSettings, simulate
 from tests.conftest import ROOT, Ipsys
 from tests.test_bad_input import refused, rewrite
 
-LIMIT_S = 120.0
+LIMIT_S = 240.0
 PAPER_LAB = ROOT / "sample_logs" / "paper_lab.mcap"
 
 

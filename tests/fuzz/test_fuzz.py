@@ -16,7 +16,6 @@ def test_damaged_input_ends_with_success_or_one_line(name: str) -> None:
 
     @settings(
         max_examples=_CASES,
-        deadline=None,
         database=None,
         phases=(Phase.generate, Phase.shrink),
         suppress_health_check=list(HealthCheck),

@@ -93,7 +93,7 @@ def read_with_node() -> Callable[[Path], tuple[int, int, int]]:
 
     def read(path: Path) -> tuple[int, int, int]:
         script = [str(Path(__file__).with_name("read_all.mjs")), str(home), str(path)]
-        done = subprocess.run(["node", *script], capture_output=True, text=True, timeout=60, check=False)
+        done = subprocess.run(["node", *script], capture_output=True, text=True, timeout=240, check=False)
         assert done.returncode == 0, done.stderr
         count, crc, streamed = (int(word) for word in done.stdout.split())
         return count, crc, streamed
@@ -115,7 +115,7 @@ def _install(home: Path) -> None:
         "@mcap/support",
     ]
     try:
-        done = subprocess.run(command, capture_output=True, text=True, timeout=180, check=False)
+        done = subprocess.run(command, capture_output=True, text=True, timeout=240, check=False)
     except (FileNotFoundError, subprocess.TimeoutExpired) as error:
         pytest.skip(f"@mcap/core cannot be installed: {error}")
     if done.returncode:

@@ -21,7 +21,7 @@ ROWS = st.lists(
 )
 
 
-@settings(max_examples=150, deadline=None)
+@settings(max_examples=150)
 @given(st.lists(ROWS, min_size=1, max_size=4), st.integers(0, 10**10), st.integers(0, 10**11))
 def test_sessions(sessions: list[list[Row]], start: int, length: int) -> None:
     with tempfile.TemporaryDirectory() as folder:
@@ -56,7 +56,7 @@ def hash_of(rows: list[Row]) -> str:
     return state.digest.hex()
 
 
-@settings(max_examples=60, deadline=None)
+@settings(max_examples=60)
 @given(ROWS, st.data())
 def test_repair_of_any_beginning(rows: list[Row], data: st.DataObject) -> None:
     """A log cut anywhere is repaired to a part of each channel, in the order in which it was written."""

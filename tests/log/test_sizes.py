@@ -33,7 +33,7 @@ def any_rows(draw: st.DrawFn) -> list[Row]:
     return rows
 
 
-@settings(max_examples=60, deadline=None)
+@settings(max_examples=60)
 @given(any_rows(), any_rows())
 def test_own_logs(first: list[Row], second: list[Row]) -> None:
     with tempfile.TemporaryDirectory() as folder:
@@ -45,7 +45,7 @@ def test_own_logs(first: list[Row], second: list[Row]) -> None:
         assert not repair(path).changed
 
 
-@settings(max_examples=60, deadline=None)
+@settings(max_examples=60)
 @given(any_rows(), st.sampled_from(list(CompressionType)), st.sampled_from([100, 300_000, 4 << 20]))
 def test_foreign_logs(rows: list[Row], compression: CompressionType, chunk_size: int) -> None:
     with tempfile.TemporaryDirectory() as folder:
@@ -72,7 +72,6 @@ def check(path: Path, rows: list[Row]) -> None:
             assert reader.channel_hash(topic) == hash_of(mine)
 
 
-@settings(deadline=None)
 @given(st.lists(st.integers(0, 5 * 10**9), max_size=20))
 def test_no_chunk_spans_a_second(times: list[int]) -> None:
     """Whether time goes forward or back: a reader then opens few chunks at once."""

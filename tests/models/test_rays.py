@@ -20,7 +20,7 @@ def error_cm(predicted: np.ndarray, world: np.ndarray, axes: int = 3) -> float:
 
 
 @given(st.integers(0, 10_000))
-@settings(max_examples=25, deadline=None)
+@settings(max_examples=25)
 def test_without_noise_pose_lens_and_places_come_back(seed: int) -> None:
     rng = np.random.default_rng(seed)
     camera = labs.camera(rng, along=0.0, across=0.0)

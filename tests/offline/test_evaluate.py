@@ -214,8 +214,14 @@ def regions(name: str, along: float, seeds: Sequence[int]) -> tuple[float, float
     return tuple(float(np.mean([w[share] for w in within])) for share in (0.68, 0.95))  # type: ignore[return-value]
 
 
-@pytest.mark.parametrize("along", [0.0004, 0.003])
-@pytest.mark.parametrize("name", ["poly", "rayplane", "best"])
+@pytest.mark.parametrize(
+    ("name", "along"),
+    [
+        ("poly", 0.0004), ("poly", 0.003), ("rayplane", 0.003), ("best", 0.0004),
+        pytest.param("rayplane", 0.0004, marks=pytest.mark.slow),
+        pytest.param("best", 0.003, marks=pytest.mark.slow),
+    ],
+)  # fmt: skip
 def test_covariances_hold_the_truth_as_often_as_they_say(name: str, along: float) -> None:
     """One session's tape errors are common to all its positions: only many sessions can tell."""
     within_68, within_95 = regions(name, along, range(40))

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 from collections.abc import Generator, Iterator
 from dataclasses import replace
 from itertools import pairwise
@@ -44,11 +45,10 @@ from ipsys_log.runs.request import Request
 from ipsys_log.scenes.live import LiveScene
 from ipsys_log.sources.attached import Attached
 from ipsys_log.sources.attendant import CameraState
-from ipsys_log.sources.frames import Clock
 from ipsys_log.units import NS_PER_S
 from tests import labs
 from tests.conftest import Ipsys
-from tests.playing import cameras, playing
+from tests.playing import SteppedClock, cameras, playing
 from tests.recording.test_recorder import Noted
 from tests.test_live import lenses
 from tests.test_measure import as_typed
@@ -273,11 +273,17 @@ def test_the_places_are_those_of_a_whole_recording_from_a_few_frames(
     places, whole = tmp_path / "places.mcap", tmp_path / "whole.mcap"
     sent = stretched(lab_log, 18)
     rig, tape = tape_of(lab_log)
-    attached = Noting(cameras(*sent), playing(sent, RATE_HZ), Clock())
+    clock = SteppedClock(list(sent), RATE_HZ)
+    attached = Noting(cameras(*sent), playing(sent, math.inf, before=clock.before), clock)
     with attached:
         settings = first_messages(rig, lenses(lab_log), attached.now_ns)
         hand = Hand(LiveScene(rig, None, attached.states, attached.save), tape)
-        pipeline.measure(attached, settings, places, Request(), hand)
+
+        def watch(message: Message | None) -> None:
+            hand(message)
+            clock.watch(message)
+
+        pipeline.measure(attached, settings, places, Request(), watch)
     history = hand.scene.history()
     gone = {one.withdraws for one in history}
     names = {one.id for one in history if one.withdraws is None} - gone

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 
-from hypothesis import given, settings
+from hypothesis import given
 from hypothesis import strategies as st
 
 from ipsys_log.messages import CompressedVideo, Message, SkippedVideo, image_topic
@@ -62,7 +62,6 @@ steps = st.lists(st.tuples(st.sampled_from("ab"), st.booleans(), st.integers(0, 
 
 
 @given(steps, st.integers(1, 40))
-@settings(deadline=None)
 def test_whatever_comes_each_frame_is_searched_or_named_and_can_be_decoded(
     came: list[tuple[str, bool, int]], every: int
 ) -> None:

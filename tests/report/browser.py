@@ -79,7 +79,7 @@ def visit(page: str, width: int, folder: Path) -> Visit:
             f"--window-size={max(width, 500)},1000", "--virtual-time-budget=5000", "--dump-dom",
             frame.as_uri(),
         ],
-        capture_output=True, text=True, check=True, timeout=120,
+        capture_output=True, text=True, check=True, timeout=240,
     )  # fmt: skip
     match = re.search(r'<pre id="found">(.*?)</pre>', done.stdout, re.DOTALL)
     assert match is not None, done.stderr

@@ -159,7 +159,7 @@ def test_black_cells_have_no_seams(ipsys: Ipsys, tmp_path: Path) -> None:
 
 
 @given(st.lists(st.lists(st.booleans(), min_size=5, max_size=5), min_size=1, max_size=5))
-@settings(max_examples=60, deadline=None)
+@settings(max_examples=60)
 def test_outlines_enclose_the_black_cells(rows: list[list[bool]]) -> None:
     """By the shoelace formula: the area of the black; by each cell's centre: inside or outside."""
     black = np.array(rows)

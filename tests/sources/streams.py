@@ -71,7 +71,7 @@ def serve(*options: str, port: int) -> Iterator[subprocess.Popen[bytes]]:
 def _await_listening(port: int) -> None:
     """Without connecting: FFmpeg takes the first client, and only that."""
     local = f"0100007F:{port:04X}"
-    until = time.monotonic() + 10
+    until = time.monotonic() + 240
     while time.monotonic() < until:
         rows = [line.split() for line in Path("/proc/net/tcp").read_text().splitlines()[1:]]
         if any(row[1] == local and row[3] == "0A" for row in rows):  # 0A: it listens

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import threading
 import time
-from collections.abc import Iterator
+from collections.abc import Callable, Iterator
 from concurrent.futures import ThreadPoolExecutor
 from contextlib import contextmanager
 from functools import partial
@@ -14,12 +14,14 @@ import numpy as np
 import pytest
 import simplejpeg
 
-from ipsys_log.messages import CompressedImage, Event, Message, RigCamera
+from ipsys_log.messages import STAMP_UNRELIABLE, CompressedImage, Event, Message, RigCamera
 from ipsys_log.sources import attached as attached_module
 from ipsys_log.sources.attached import Attached
 from ipsys_log.sources.frames import Clock, Frame, Open, Say, SourceError
 from tests.playing import cameras, playing
 
+# Nothing takes so long, however busy the machine is.
+LIMIT_S = 240.0
 FRAMES = {name: [f"{name} {n}".encode() for n in range(20)] for name in ("red", "white", "black")}
 
 
@@ -29,7 +31,16 @@ def messages(attached: Attached) -> list[Message]:
 
 
 def events(found: list[Message]) -> list[Event]:
-    return [message.payload for message in found if isinstance(message.payload, Event)]
+    """Return the events but for those of a busy machine, on which this program stands still at times."""
+    payloads = [message.payload for message in found if isinstance(message.payload, Event)]
+    return [event for event in payloads if event.kind != STAMP_UNRELIABLE]
+
+
+def wait_until(true: Callable[[], bool]) -> None:
+    end_s = time.monotonic() + LIMIT_S
+    while not true():
+        assert time.monotonic() < end_s, "nothing happens"
+        time.sleep(0.005)
 
 
 def data_of(found: list[Message], camera: str) -> list[bytes]:
@@ -38,10 +49,12 @@ def data_of(found: list[Message], camera: str) -> list[bytes]:
 
 
 def test_every_frame_comes_as_it_was_and_log_times_increase() -> None:
+    begun_ns = time.monotonic_ns()
     found = messages(Attached(cameras(*FRAMES), playing(FRAMES, 200.0), Clock()))
+    most_ns = time.monotonic_ns() - begun_ns + 1_000_000
     assert {name: data_of(found, name) for name in FRAMES} == FRAMES
     assert all(one.log_time_ns < other.log_time_ns for one, other in pairwise(found))
-    assert all(0 < message.log_time_ns - message.publish_time_ns < 1e9 for message in found)
+    assert all(0 < message.log_time_ns - message.publish_time_ns < most_ns for message in found)
 
 
 def test_log_times_are_utc() -> None:
@@ -52,18 +65,26 @@ def test_log_times_are_utc() -> None:
 
 def test_a_camera_without_stamps_has_the_time_of_arrival() -> None:
     """That at which its thread had the frame, however long it waited then; and no delay is claimed."""
-    attached = Attached(cameras("red"), playing(FRAMES, 200.0, stamped=False), Clock())
+    sent_ns: list[int] = []
+    clock = Clock()
+
+    def before(_: str, number: int) -> None:
+        if number == 1:  # until then frames without stamps are thrown away
+            assert attached._started.wait(LIMIT_S)
+        sent_ns.append(clock.now_ns())
+
+    attached = Attached(cameras("red"), playing(FRAMES, 200.0, False, before), clock)
     with attached:
-        time.sleep(0.3)
-        taken_ns = time.time_ns()
+        wait_until(lambda: attached.states["red"].frames == 20)
+        taken_ns = clock.now_ns()
         frames = [message for message in attached if message is not None and message.camera == "red"]
     assert len(frames) == 20
     assert all(message.publish_time_ns < taken_ns < message.log_time_ns for message in frames)
     assert all(
         attached.received_ns[m.log_time_ns] == m.publish_time_ns == m.payload.timestamp for m in frames
     )
-    steps_ns = [other.publish_time_ns - one.publish_time_ns for one, other in pairwise(frames[1:])]
-    assert 2e6 < sum(steps_ns) / len(steps_ns) < 8e6
+    for (sent, following), message in zip(pairwise([*sent_ns, taken_ns]), frames, strict=True):
+        assert sent <= message.publish_time_ns <= following
     assert attached.states["red"].delay_s is None
 
 
@@ -110,6 +131,7 @@ def test_a_camera_that_sends_nothing_is_named_without_its_password(monkeypatch: 
 
 def test_a_camera_that_vanishes_is_tried_again_while_the_others_go_on() -> None:
     tries: list[float] = []
+    gone: list[float] = []
 
     @contextmanager
     def opened(camera: RigCamera, clock: Clock, say: Say) -> Iterator[Iterator[Frame | None]]:
@@ -118,6 +140,7 @@ def test_a_camera_that_vanishes_is_tried_again_while_the_others_go_on() -> None:
                 time.sleep(0.02)
                 yield Frame(b"%d" % n, "jpeg", clock.now_ns())
             if camera.name == "red" and len(tries) < 3:
+                gone.append(time.monotonic())
                 raise SourceError("camera red: /dev/video0 has gone")
             for _ in range(40 if camera.name == "white" else 0):
                 time.sleep(0.05)
@@ -126,6 +149,7 @@ def test_a_camera_that_vanishes_is_tried_again_while_the_others_go_on() -> None:
         if camera.name == "red":
             tries.append(time.monotonic())
             if len(tries) == 2:
+                gone.append(time.monotonic())
                 raise SourceError("camera red: there is no /dev/video0")
         yield sent()
 
@@ -136,7 +160,7 @@ def test_a_camera_that_vanishes_is_tried_again_while_the_others_go_on() -> None:
     assert "has gone; trying again" in said[0].text
     assert len(data_of(found, "red")) == 10
     assert len(data_of(found, "white")) == 45
-    assert tries[2] - tries[1] > tries[1] - tries[0]
+    assert tries[2] - gone[1] > tries[1] - gone[0]
 
 
 def changing(*visits: list[Frame]) -> Open:
@@ -187,14 +211,22 @@ def test_pictures_of_another_size_are_said_once_for_each_change() -> None:
 
 def test_what_the_disk_cannot_take_is_dropped_by_name_and_memory_stays_bounded() -> None:
     frames = {"red": [bytes([n]) * 1000 for n in range(40)]}
-    attached = Attached(cameras("red"), playing(frames, 500.0), Clock(), limit_bytes=10_000)
+    many_sent, some_written = threading.Event(), threading.Event()
+
+    def before(_: str, number: int) -> None:
+        if number == 25:
+            many_sent.set()
+            some_written.wait(LIMIT_S)
+
+    attached = Attached(cameras("red"), playing(frames, 500.0, before=before), Clock(), limit_bytes=10_000)
     found: list[Message] = []
     with attached:
         for message in attached:
             if message is not None:
-                if not found:
-                    time.sleep(0.05)
+                many_sent.wait(LIMIT_S)
                 found.append(message)
+            if len(found) == 8:
+                some_written.set()
     kept, dropped = data_of(found, "red"), attached.states["red"].dropped
     assert len(kept) + dropped == 40
     assert 5 < dropped < 35
@@ -240,7 +272,7 @@ def test_what_is_saved_is_written_by_then() -> None:
                 asked.append("on the disk")
                 attached.confirm(note)
             elif asked:
-                saved.result(1.0)
+                saved.result(LIMIT_S)
                 break
         assert asked
 
@@ -256,7 +288,7 @@ def test_what_is_not_written_is_not_saved_and_it_is_said_why() -> None:
                 attached.stop("the disk is full")
                 messages.close()  # it could not be written
         with pytest.raises(SourceError, match="not saved: the disk is full"):
-            saved.result(1.0)
+            saved.result(LIMIT_S)
         with pytest.raises(SourceError, match="not saved: the disk is full"):
             attached.save("/note", Event(6, "note", "late"))
 
@@ -274,7 +306,7 @@ def test_what_was_dropped_at_the_end_is_named_too() -> None:
     frames = {"red": [bytes(1000)] * 40}
     attached = Attached(cameras("red"), playing(frames, 500.0), Clock(), limit_bytes=10_000)
     with attached:
-        time.sleep(0.2)
+        wait_until(lambda: attached.states["red"].dropped > 0)
         attached.stop()
         found = [message for message in attached if message is not None]
     (event,) = events(found)
@@ -287,15 +319,19 @@ def test_early_frames_do_not_pile_up_while_another_camera_opens() -> None:
     @contextmanager
     def opened(camera: RigCamera, clock: Clock, say: Say) -> Iterator[Iterator[Frame | None]]:
         def sent() -> Iterator[Frame | None]:
+            if camera.name == "late":
+                wait_until(lambda: attached.states["early"].frames > 0)
+                time.sleep(0.3)
+                waiting.append(attached.states["early"].frames)
             for n in range(5):
-                time.sleep(0.3 if camera.name == "late" and n == 0 else 0.01)
                 yield Frame(b"%d" % n, "jpeg", clock.now_ns())
 
         yield sent()
 
+    waiting: list[int] = []
     attached = Attached(cameras("early", "late"), opened, Clock())
     with attached:
-        assert attached.states["early"].frames == 1
+        assert waiting == [1]
         assert len([message for message in attached if message is not None]) == 10
 
 
@@ -303,33 +339,34 @@ def test_early_frames_do_not_pile_up_while_another_camera_opens() -> None:
 def test_frames_without_stamps_do_not_wait_for_another_camera_to_get_a_false_time(format: str) -> None:
     """A stream that cannot be stopped: what is not taken waits in the socket, and comes late."""
     picture, key = b"\0\0\1\x41", b"\0\0\1\x67\0\0\1\x65"
-    begin_s: list[float] = []
+    taken_15, asked_ns = threading.Event(), list[int]()
 
     @contextmanager
     def opened(camera: RigCamera, clock: Clock, say: Say) -> Iterator[Iterator[Frame | None]]:
-        def sent() -> Iterator[Frame | None]:
-            begin_s.append(time.monotonic())
-            for n in range(40):
-                if camera.name == "late" and n == 0:
-                    time.sleep(0.8)
-                sent_s = begin_s[0] + n / 20
-                time.sleep(max(sent_s - time.monotonic(), 0))
-                yield Frame((picture if n % 10 else key) + b"%03d" % n, format, None)
+        def late() -> Iterator[Frame | None]:
+            taken_15.wait(LIMIT_S)
+            yield Frame(key, format, None)
 
-        yield sent()
+        def early() -> Iterator[Frame | None]:
+            for n in range(40):
+                if n == 15:
+                    taken_15.set()
+                    assert attached._started.wait(LIMIT_S)
+                asked_ns.append(clock.now_ns())
+                yield Frame((picture if n % 10 else key) + b"%03d" % n, format, None)
+            asked_ns.append(clock.now_ns())
+
+        yield early() if camera.name == "early" else late()
 
     attached = Attached(cameras("early", "late"), opened, Clock())
     with attached:
         found = [message for message in attached if message is not None and message.camera == "early"]
-    start_ns = found[0].publish_time_ns
     numbers = [int(message.payload.data[-3:]) for message in found]
-    # Frame n was sent n / 20 s after the first.
-    late_s = [(m.publish_time_ns - start_ns) / 1e9 - n / 20 for m, n in zip(found, numbers, strict=True)]
-    assert max(late_s) < 0.1
-    assert numbers[0] == 0
-    # A video goes on where it can be read.
-    assert numbers[1] == 20 if format == "h264" else 15 <= numbers[1] <= 19
-    assert numbers[1:] == list(range(numbers[1], 40))
+    # Those that came before the other camera are thrown away; a video goes on where it can be read.
+    assert numbers == [0, *range(20 if format == "h264" else 15, 40)]
+    # Each has the time at which it came: before the next one was asked for.
+    for message, n in zip(found, numbers, strict=True):
+        assert asked_ns[n] <= message.publish_time_ns <= asked_ns[n + 1]
 
 
 def test_a_video_without_keyframes_is_said_once_and_kept(monkeypatch: pytest.MonkeyPatch) -> None:
@@ -345,6 +382,8 @@ def test_what_came_before_a_fault_is_given_out() -> None:
     def broken(camera: str, number: int) -> None:
         if camera == "red" and number == 5:
             raise ZeroDivisionError("a bug")
+        if camera == "white" and number == 10:
+            wait_until(lambda: bool(said))
 
     found: list[Message] = []
     said: list[str] = []
@@ -363,13 +402,20 @@ def test_what_came_before_a_fault_is_given_out() -> None:
 
 
 def test_stopping_gives_out_what_has_come() -> None:
-    attached = Attached(cameras("red"), playing(FRAMES, 100.0), Clock())
+    stopped = threading.Event()
+
+    def before(_: str, number: int) -> None:
+        if number == 10:
+            stopped.wait(LIMIT_S)
+
+    attached = Attached(cameras("red"), playing(FRAMES, 100.0, before=before), Clock())
     found = []
     with attached:
         for message in attached:
             found.append(message)
             if len(found) == 5:
                 attached.stop()
+                stopped.set()
     assert 5 <= len(found) < 20
 
 

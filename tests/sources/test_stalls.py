@@ -101,7 +101,7 @@ def test_frames_late_at_the_end_have_an_open_range() -> None:
     assert (begins.start, begins.end) == (before[-1] + 1, None)
 
 
-@settings(max_examples=200, deadline=None)
+@settings(max_examples=200)
 @given(
     st.floats(5, 60), st.floats(0.3, 5), st.integers(0, 200), st.floats(0.0002, 0.004),
     st.lists(st.floats(-0.15, 0.15), min_size=40, max_size=40),

@@ -27,7 +27,7 @@ SAMPLINGS = {
     "4:4:0": cv2.IMWRITE_JPEG_SAMPLING_FACTOR_440,
     "4:4:4": cv2.IMWRITE_JPEG_SAMPLING_FACTOR_444,
 }
-ENOUGH = settings(max_examples=60, deadline=None, derandomize=True)
+ENOUGH = settings(max_examples=60, derandomize=True)
 
 
 def colourful(width: int, height: int, seed: int) -> Picture:

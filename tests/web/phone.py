@@ -16,7 +16,7 @@ from typing import Any
 from tests.report.browser import chromium
 
 _WIDTH, _HEIGHT = 390, 844
-_PATIENCE_S = 20.0
+_PATIENCE_S = 120.0
 # Two taps at one place that follow one another faster are one double tap.
 _DOUBLE_TAP_S = 0.35
 

@@ -277,7 +277,7 @@ def test_the_places_are_those_of_a_whole_recording_from_a_few_frames(
     with attached:
         settings = first_messages(rig, lenses(lab_log), attached.now_ns)
         hand = Hand(LiveScene(rig, None, attached.states, attached.save), tape)
-        pipeline.measure(attached, settings, places, Request(), hand)
+        pipeline.measure(attached, settings, places, Request(), [hand])
     history = hand.scene.history()
     gone = {one.withdraws for one in history}
     names = {one.id for one in history if one.withdraws is None} - gone

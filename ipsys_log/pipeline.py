@@ -53,6 +53,7 @@ from ipsys_log.messages import (
     Tracks,
 )
 from ipsys_log.recording.backlog import TICK, Backlog
+from ipsys_log.recording.consumers import Consumer, Consumers
 from ipsys_log.recording.latency import Ledger
 from ipsys_log.recording.plan import check_pictures, plan_live
 from ipsys_log.recording.recent import Recent
@@ -83,8 +84,6 @@ TOPICS: dict[type, str] = {
     Event: "/runs/{run}/events",
 }
 
-# Is shown messages on their way, and None where nothing comes.
-Watch = Callable[[Message | None], None]
 Map = Callable[[Callable[[Message], Any], Iterable[Message]], Iterable[Any]]
 
 
@@ -199,7 +198,7 @@ def record(
     source: Source,
     settings: Iterable[Message],
     target: Path,
-    watch: Watch = lambda one: None,
+    consumers: Sequence[Consumer] = (),
     overwrite: bool = False,
 ) -> Mapping[str, int]:
     """Write what cameras send to a new log; returns how many messages went to each topic.
@@ -208,18 +207,22 @@ def record(
     ----------
     source : messages, and None where nothing comes.
     settings : written first: rig and lenses.
-    watch : is shown everything after it was written, and None where nothing came.
+    consumers : each is shown everything after it was written, and None where nothing came.
     overwrite : put it in place of a log that is there.
 
     Raises
     ------
     IpsysError
         Where the log cannot be written; what it holds by then is a complete log.
+    Exception
+        What the first of ``consumers`` raised, after the recording has ended: it cannot end it.
     """
+    show = Consumers(consumers, source.warn)
     with recording(target, settings, overwrite) as log:
         for arrived in written(source, log):
-            watch(arrived)
+            show(arrived)
     log.check_disk()
+    show.check()
     return log.counts
 
 
@@ -228,7 +231,7 @@ def measure(
     settings: Sequence[Message],
     target: Path,
     request: Request,
-    watch: Watch,
+    consumers: Sequence[Consumer],
     overwrite: bool = False,
 ) -> Mapping[str, int]:
     """Look for markers in what cameras send, and write what is measured to a new log, with its frames.
@@ -241,7 +244,7 @@ def measure(
     ----------
     settings : written first: rig and lenses.
     request : corners.
-    watch : is shown every frame that the stages have seen, its markers and camera points.
+    consumers : each is shown every frame that the stages have seen, its markers and camera points.
 
     Returns
     -------
@@ -251,8 +254,11 @@ def measure(
     ------
     IpsysError
         For cameras that send no pictures but video, or a log that cannot be written; what it holds is kept.
+    Exception
+        What the first of ``consumers`` raised, after the log is complete.
     """
     check_pictures(cameras.states)
+    show = Consumers(consumers, cameras.warn)
     plan = plan_live(cameras.states, settings, request, "camera-frame")
     detect, camera_frame = (Stage(*row) for row in plan.rows)
     with (
@@ -263,8 +269,9 @@ def measure(
     ):
         for message in run(run(chain(settings, frames), [detect], in_threads), [camera_frame]):
             if message is not TICK:
-                watch(message)
+                show(message)
     log.check_disk()
+    show.check()
     return log.counts
 
 
@@ -274,7 +281,7 @@ def live(
     target: Path,
     request: Request,
     until: str = "fuse",
-    watch: Watch = lambda one: None,
+    consumers: Sequence[Consumer] = (),
     overwrite: bool = False,
 ) -> list[Outcome]:
     """Write what cameras send to a new log, and what the stages make of it: the run of a replay.
@@ -287,7 +294,8 @@ def live(
     settings : written first: rig and lenses.
     request : corners, method and, for fuse, ``model_from``.
     until : detect, camera-frame or fuse.
-    watch : is shown every frame that the stages have seen, and what they make of it.
+    consumers : each is shown every frame that the stages have seen, and what they make of it, after it was
+        written.
 
     Returns
     -------
@@ -297,9 +305,12 @@ def live(
     ------
     IpsysError
         Where the other log has no such model, or the log cannot be written; what it holds is kept.
+    Exception
+        What the first of ``consumers`` raised, after the log is complete: it cannot end the recording.
     """
     plan = plan_live(cameras.states, settings, request, until)
     first = (*settings, *plan.copies(cameras.now_ns))
+    show = Consumers(consumers, cameras.warn)
     with (
         threadpool_limits(1, user_api="blas"),
         recording(target, first, overwrite) as log,
@@ -307,12 +318,12 @@ def live(
     ):
         stages = [Stage(*row) for row in plan.rows]
         ledger = Ledger(cameras.clock.now_ns, cameras.received_ns)
-        fault = _put_through(chain(settings, frames), stages, ledger, log, watch)
+        fault = _put_through(chain(settings, frames), stages, ledger, log, show)
         if fault is not None:
             cameras.warn("stages_stopped", f"{fault}; frames are recorded all the same")
             for message in frames:
                 if message is not TICK:
-                    watch(message)
+                    show(message)
     if fault is not None:
         raise IpsysError(f"{fault}; {target} has all frames: replay it") from fault
     if frames.skipped:
@@ -321,15 +332,17 @@ def live(
             f"ipsys replay {target} looks at all, with --as-live at those that were looked at"
         )
     try:
-        return sign(target, replace(plan.request, as_live=bool(frames.skipped)), plan.runs)
+        outcomes = sign(target, replace(plan.request, as_live=bool(frames.skipped)), plan.runs)
     finally:
         log.check_disk()
+    show.check()
+    return outcomes
 
 
 def _put_through(
-    frames: Iterable[Message], stages: Sequence[Stage], ledger: Ledger, log: Recording, watch: Watch
+    frames: Iterable[Message], stages: Sequence[Stage], ledger: Ledger, log: Recording, show: Consumers
 ) -> IpsysError | None:
-    """Write what the stages make of frames as they come; returns what a stage stopped with."""
+    """Write what the stages make of frames as they come, then show it; returns what a stage stopped with."""
     made = ledger.note("detected", Markers, run(frames, stages[:1], in_threads))
     made = ledger.note("located", Positions, run(made, stages[1:3]))
     made = ledger.note("fused", Tracks, run(made, stages[3:]))
@@ -337,12 +350,12 @@ def _put_through(
         for message in made:
             if message is TICK:
                 continue
-            watch(message)
             if type(message.payload) in TOPICS and message.topic != EVENTS_TOPIC:  # those are written already
                 log.put(message)
                 entry = ledger.entry(message)
                 if entry is not None:
                     log.put(entry)
+            show(message)
     except (LogError, SourceError):
         raise
     except IpsysError as fault:

@@ -6,7 +6,7 @@ import shutil
 import time
 from collections.abc import Callable, Iterator
 from dataclasses import replace
-from functools import cache
+from functools import cache, partial
 from itertools import zip_longest
 from math import inf
 from pathlib import Path
@@ -37,6 +37,7 @@ from ipsys_log.messages import (
     Run,
     Tracks,
 )
+from ipsys_log.recording.consumers import Consumer
 from ipsys_log.recording.recorder import first_messages
 from ipsys_log.runs.lookup import find_pairs
 from ipsys_log.runs.lookup import measured as measured_places
@@ -102,7 +103,7 @@ def recorded(lab_log: Path, calibration: Path, tmp_path_factory: pytest.TempPath
     attached = Attached(cameras(*frames), playing(frames, inf, before=clock.before), clock)
     settings = first_messages(rig, lenses(lab_log), attached.now_ns)
     with attached:
-        pipeline.live(attached, settings, target, Request(model_from=calibration), watch=clock.watch)
+        pipeline.live(attached, settings, target, Request(model_from=calibration), consumers=[clock.watch])
     return target
 
 
@@ -303,7 +304,49 @@ def test_a_stage_that_stops_does_not_stop_the_recording(
         ]
 
 
-def test_a_frame_that_was_exchanged_is_found(recorded: Path, tmp_path: Path) -> None:
+class Failing:
+    """A consumer that fails at its n-th message, and is shown none after that."""
+
+    def __init__(self, number: int) -> None:
+        self.left = number
+
+    def __call__(self, _: Message | None) -> None:
+        assert self.left > 0, "it is shown more after it failed"
+        self.left -= 1
+        if not self.left:
+            raise ZeroDivisionError("a fault\nin the display")
+
+
+@pytest.mark.parametrize("number", [1, 20])
+@pytest.mark.parametrize("stages", [False, True])
+def test_consumer_that_fails_ends_no_recording(
+    lab_log: Path, calibration: Path, tmp_path: Path, stages: bool, number: int
+) -> None:
+    target = tmp_path / "x.mcap"
+    attached, settings = attached_to(lab_log, 30.0)
+    seen: list[Message | None] = []
+    consumers: list[Consumer] = [Failing(number), seen.append]
+    request = Request(model_from=calibration)
+    live = partial(pipeline.live, attached, settings, target, request)
+    act = live if stages else partial(pipeline.record, attached, settings, target)
+    with attached, pytest.raises(ZeroDivisionError, match="in the display"):
+        act(consumers=consumers)
+    with Session([target]) as session:
+        frames = {name: session.count(topic) for name, topic in session.images.items()}
+        assert frames == {name: len(found) for name, found in sent(lab_log).items()}
+        assert [e.text for e in session.payloads(["/events"]) if e.kind == "sink_stopped"] == [
+            "the display stopped (a fault in the display); the recording goes on"
+        ]
+        signed = {run.stage for run in session.runs()}
+        assert signed == ({"detect", "camera-frame", "fit", "locate", "fuse"} if stages else set())
+        skipped = [e for e in session.payloads(["/events"]) if e.kind == FRAME_SKIPPED]
+    images = [one for one in seen if one is not None and isinstance(one.payload, CompressedImage)]
+    assert len(images) + len(skipped) == sum(frames.values())
+    if stages:
+        assert all(one.equal for one in again(target))
+
+
+def test_frame_that_was_exchanged_is_found(recorded: Path, tmp_path: Path) -> None:
     log = tampered(
         recorded,
         tmp_path / "tampered.mcap",
@@ -546,7 +589,7 @@ def test_a_place_is_measured_while_it_is_recorded_and_a_model_is_fitted_to_it(
                 saved.add(marker_id)
 
         settings = first_messages(rig, lenses(lab_log), attached.now_ns)
-        pipeline.live(attached, settings, target, Request(), "camera-frame", measure)
+        pipeline.live(attached, settings, target, Request(), "camera-frame", [measure])
     assert len(saved) >= 3
     with Session([target]) as session:
         assert [m.marker_id for m in session.payloads(["/measurements"])] == [

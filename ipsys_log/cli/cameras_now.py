@@ -20,7 +20,6 @@ from ipsys_log.units import format_bytes
 
 if TYPE_CHECKING:
     from ipsys_log.messages import CameraCalibration, Message, Rig, RigCamera
-    from ipsys_log.pipeline import Watch
     from ipsys_log.recording.disk_room import DiskRoom
     from ipsys_log.report.cameras import LiveStatus
     from ipsys_log.sources.attached import Attached
@@ -34,7 +33,6 @@ __all__ = [
     "prepared",
     "recorded_now",
     "say",
-    "shown_to",
 ]
 
 
@@ -209,17 +207,6 @@ def _say_room(lab: Lab, attached: Attached, room: DiskRoom, seconds: float | Non
         say(advice)
 
 
-def shown_to(first: Watch, second: Watch | None) -> Watch:
-    """Show what passes to one or to both."""
-
-    def watch(message: Message | None) -> None:
-        first(message)
-        if second is not None:
-            second(message)
-
-    return watch
-
-
 @contextmanager
 def _ended(stop: Callable[[], None], seconds: float | None, on_signal: bool = True) -> Iterator[None]:
     """Stop in order after some time, and on the first signal: what has come by then is written."""
@@ -259,7 +246,7 @@ def recorded_now(lab: Lab, seconds: float, keep: Path | None = None) -> Iterator
         doing = None if keep else f"looking for {seconds:g} s"
         try:
             with opened(lab, log, seconds, doing, until_stopped=False) as (cameras, settings, status):
-                pipeline.record(cameras, settings, log, status)
+                pipeline.record(cameras, settings, log, [status])
         except Interrupted as interrupt:
             kept = f"{keep} has the frames until then" if keep and keep.exists() else "no frame was kept"
             raise Interrupted(interrupt.exit_code, f"interrupted; {kept}") from None

@@ -10,7 +10,7 @@ from pathlib import Path
 from time import sleep
 from typing import TYPE_CHECKING, Any
 
-from ipsys_log.cli.cameras_now import MODEL, Lab, check_target, opened, prepared, shown_to
+from ipsys_log.cli.cameras_now import MODEL, Lab, check_target, opened, prepared
 from ipsys_log.cli.console import console, remarks
 from ipsys_log.cli.signals import allow_interrupt, suppress_interrupt
 
@@ -42,6 +42,7 @@ def measure_now(
 ) -> list[Measurement]:
     """Measure places into a new log with a second of frames of each; what was measured and withdrawn."""
     from ipsys_log import pipeline
+    from ipsys_log.recording.consumers import Consumer
     from ipsys_log.runs.request import Request
 
     lab, request = prepared(rig, camera, calibration), Request(corners=corners)
@@ -56,8 +57,8 @@ def measure_now(
     doing = f"measuring into {output}; {ends} ends it"
     with opened(lab, output, None, doing, not terminal) as (cameras, settings, status):
         scene = live_scene(settings, cameras, model)
-        watch = shown_to(status, scene)
-        work = partial(pipeline.measure, cameras, settings, output, request, watch, force)
+        consumers: list[Consumer] = [status, scene]
+        work = partial(pipeline.measure, cameras, settings, output, request, consumers, force)
         if terminal:
             _ask_beside(work, scene, cameras)
         else:

@@ -8,7 +8,7 @@ from typing import TYPE_CHECKING, Annotated, Optional
 
 import typer
 
-from ipsys_log.cli.cameras_now import MODEL, check_target, opened, prepared, say, shown_to
+from ipsys_log.cli.cameras_now import MODEL, check_target, opened, prepared, say
 from ipsys_log.cli.console import remarks
 from ipsys_log.cli.options import (
     Calibrations,
@@ -93,12 +93,11 @@ def record(
         if measure:
             scene = live_scene(settings, cameras, model)
             with served(scene, host, port):
-                watch = shown_to(status, scene)
-                pipeline.live(cameras, settings, output, request, "camera-frame", watch, force)
+                pipeline.live(cameras, settings, output, request, "camera-frame", [status, scene], force)
         elif detect:
-            pipeline.live(cameras, settings, output, request, "detect", status, force)
+            pipeline.live(cameras, settings, output, request, "detect", [status], force)
         else:
-            pipeline.record(cameras, settings, output, status, force)
+            pipeline.record(cameras, settings, output, [status], force)
 
 
 @runs_until_stopped
@@ -125,6 +124,7 @@ def live(
     """Track robots now: record, and take every frame through all stages up to fuse, until Ctrl-C."""
     allow_interrupt(_NOT_BEGUN)
     from ipsys_log import pipeline
+    from ipsys_log.recording.consumers import Consumer
     from ipsys_log.recording.plan import check_start
     from ipsys_log.runs.request import Request
 
@@ -138,7 +138,8 @@ def live(
         opened(lab, output, seconds) as (cameras, settings, status),
         _viewed(settings, cameras, request) if view else nullcontext() as viewer,
     ):
-        pipeline.live(cameras, settings, output, request, "fuse", shown_to(status, viewer), force)
+        consumers: list[Consumer] = [status] if viewer is None else [status, viewer]
+        pipeline.live(cameras, settings, output, request, "fuse", consumers, force)
 
 
 def _viewed(settings: list[Message], cameras: Attached, request: Request) -> LiveView:

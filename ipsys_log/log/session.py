@@ -202,14 +202,17 @@ class Session:
         return [message.payload for message in self.messages(topics)]
 
     def runs(self) -> list[Run]:
-        """What the stages have written so far, oldest first."""
-        topics = {
+        """Return the records of the stages, oldest first: log by log as they were given, then by number."""
+        return [run for reader, items in self._items() for run in self._runs_in(reader, items)]
+
+    def _runs_in(self, reader: LogReader, items: Items) -> list[Run]:
+        topics = [
             topic
-            for reader in self.readers
             for topic, channel in reader.channels.items()
             if channel.schema is not None and payload_type(channel.schema.name) is Run
-        }
-        return sorted(self.payloads(topics), key=lambda run: run.number)
+        ]
+        found = [message.payload for message in self._decoded(reader, items, topics, None, None)]
+        return sorted(found, key=lambda run: run.number)
 
     def _tell_apart(self) -> dict[LogReader, dict[str, str]]:
         """The ids of measurements that an earlier log has too, and those that they have here."""

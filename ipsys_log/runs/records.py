@@ -65,7 +65,7 @@ def _essence(run: Run) -> bytes:
 
 
 def complete_runs(session: Session) -> list[Run]:
-    """The records whose channels are all there, oldest first."""
+    """Return the records whose channels are all there, oldest first."""
     return [
         run
         for run in session.runs()
@@ -74,9 +74,9 @@ def complete_runs(session: Session) -> list[Run]:
 
 
 def find_run(session: Session, wanted: Run, name: str | None = None) -> str | None:
-    """Name of the first complete run that has done just what ``wanted`` would do, if there is one."""
+    """Return the name of the newest complete run that has done just what ``wanted`` would do, if any."""
     essence = _essence(wanted)
-    for run in complete_runs(session):
+    for run in reversed(complete_runs(session)):
         if run.stage == wanted.stage and name in (None, run.run) and _essence(run) == essence:
             return run.run
     return None

@@ -278,12 +278,7 @@ def test_the_places_are_those_of_a_whole_recording_from_a_few_frames(
     with attached:
         settings = first_messages(rig, lenses(lab_log), attached.now_ns)
         hand = Hand(LiveScene(rig, None, attached.states, attached.save), tape)
-
-        def watch(message: Message | None) -> None:
-            hand(message)
-            clock.watch(message)
-
-        pipeline.measure(attached, settings, places, Request(), watch)
+        pipeline.measure(attached, settings, places, Request(), [hand, clock.watch])
     history = hand.scene.history()
     gone = {one.withdraws for one in history}
     names = {one.id for one in history if one.withdraws is None} - gone

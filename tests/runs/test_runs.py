@@ -76,6 +76,24 @@ def robots(folder: Path, log: Path, prefix: str) -> Path:
     return path
 
 
+def test_newest_run_is_found_again(ipsys: Ipsys, paper: Path) -> None:
+    ipsys("replay", paper)
+    made = runs_of(ipsys, "replay", paper, "--run", "again")
+    assert made["fit"] == made["fuse"] == ("again", True)
+    found = runs_of(ipsys, "replay", paper)
+    assert {found[stage] for stage in ("fit", "evaluate", "locate", "fuse")} == {("again", False)}
+
+
+def test_run_of_last_log_is_newest_whatever_its_number(ipsys: Ipsys, paper: Path, tmp_path: Path) -> None:
+    """Two results of one recording: the one in the log that is given last counts."""
+    low, high = tmp_path / "low.mcap", tmp_path / "high.mcap"
+    ipsys("camera-frame", paper)
+    assert runs_of(ipsys, "replay", paper, "-o", low, "--run", "low")["fuse"] == ("low", True)
+    assert runs_of(ipsys, "replay", paper, low, "-o", high, "--run", "high")["fuse"] == ("high", True)
+    assert runs_of(ipsys, "replay", paper, low, high)["fuse"] == ("high", False)
+    assert runs_of(ipsys, "replay", paper, high, low)["fuse"] == ("low", False)
+
+
 def test_a_run_holds_only_what_belongs_together(ipsys: Ipsys, paper: Path, tmp_path: Path) -> None:
     ipsys("replay", paper)
     renamed = runs_of(ipsys, "replay", paper, "--rig", robots(tmp_path, paper, "ada"))

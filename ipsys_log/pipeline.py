@@ -150,7 +150,7 @@ def replay(
     IpsysError
         For anything in the input that the user has to mend.
     """
-    models = wanted_models(request, until)
+    models = wanted_models(request, until, paths)
     check_inputs(paths, request, models, until)
     outcomes: list[Outcome] = []
     # The matrices are small: threads of BLAS would only wait for one another.

@@ -2,8 +2,9 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterable, Mapping
+from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import replace
+from pathlib import Path
 
 import numpy as np
 
@@ -50,8 +51,11 @@ __all__ = [
 MIN_OFFSETS, LEAST_OFFSET_PX = 10, 0.05
 
 
-def wanted_models(request: Request, until: str) -> tuple[str, ...]:
-    """The models to fit or apply.
+def wanted_models(request: Request, until: str, paths: Sequence[Path] = ()) -> tuple[str, ...]:
+    """Return the names of the models to fit or apply.
+
+    Those of the request; without any, ``poly`` or another one of ``model_from``; those that were copied into
+    the logs of ``paths``, where these have no measurements to fit to; all, to evaluate; ``poly``.
 
     Raises
     ------
@@ -64,8 +68,13 @@ def wanted_models(request: Request, until: str) -> tuple[str, ...]:
         return request.models
     if request.model_from is not None:
         with Session([request.model_from]) as other:
-            held = {other.payloads([topic])[-1].name for topic in _model_topics(other)}
-            return ("poly" if "poly" in held else fitted_in(other, None)[0].name,)
+            names = {other.payloads([topic])[-1].name for topic in _model_topics(other)}
+            return ("poly" if "poly" in names else fitted_in(other, None)[0].name,)
+    if paths:
+        with Session(paths) as session:
+            held = _copied_models(session)
+        if held:
+            return held
     return tuple(MODELS) if until == "evaluate" else ("poly",)
 
 
@@ -88,6 +97,13 @@ def fitted_in(other: Session, name: str | None) -> tuple[Model, str]:
 
 def _model_topics(session: Session) -> list[str]:
     return [t for run in complete_runs(session) if run.stage == "fit" for t in session.topics(Model, run.run)]
+
+
+def _copied_models(session: Session) -> tuple[str, ...]:
+    """Return the names of the models that were copied into a log without measurements, oldest first."""
+    if session.topics(Measurement):
+        return ()
+    return tuple(dict.fromkeys(session.payloads([topic])[-1].name for topic in _model_topics(session)))
 
 
 def copied_run(session: Session, model: str) -> str | None:

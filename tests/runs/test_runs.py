@@ -20,6 +20,7 @@ from ipsys_log.messages import (
     CameraPoints,
     Event,
     Markers,
+    Measurement,
     Message,
     Model,
     Rig,
@@ -74,6 +75,18 @@ def robots(folder: Path, log: Path, prefix: str) -> Path:
     path = folder / f"{prefix}.toml"
     path.write_text(text)
     return path
+
+
+def test_models_that_were_copied_in_are_used_without_measurements(
+    ipsys: Ipsys, paper: Path, tmp_path: Path
+) -> None:
+    calibration = tmp_path / "calibration.mcap"
+    bare = without(paper, lambda message: isinstance(message.payload, Measurement))
+    ipsys("replay", paper, "--model", "rigid", "-o", calibration)
+    first = runs_of(ipsys, "replay", bare, "--model-from", calibration, "--model", "rigid")
+    assert first["fuse"] == ("rigid", True)
+    found = runs_of(ipsys, "replay", bare)
+    assert {found[stage] for stage in ("locate", "fuse")} == {("rigid", False)}
 
 
 def test_newest_run_is_found_again(ipsys: Ipsys, paper: Path) -> None:

@@ -156,7 +156,7 @@ def _settle(
     doubt: Array | float = 1.0
     for _ in range(_PASSES):
         seen = measure(view, poses, motions, wide)
-        rows = moves(view.prints, poses.camera(), seen.slopes, seen.late)[:, :unknowns]
+        rows = moves(view.prints, poses.camera(), seen.slopes, seen.late, unknowns)
         # Edges were looked for where they are at the speed known so far.
         off_px = seen.off_px
         if view.row_time_s:
@@ -191,12 +191,12 @@ def _settle(
         found[:, 6],
         covariances,
         good,
-        seen.heights,
+        seen.heights(view.prints),
         seen.slopes.min(axis=1) / view.prints.cells,
         blurred,
         spread_px,
         seen.blurs_px,
-        seen.ends,
+        seen.ends(),
         np.abs(sided[:, 0]).max(axis=1),
     )
 

@@ -99,10 +99,21 @@ def fit_partly(
     such marker.
     """
     guesses = [guess for guess in guesses if into_poses([guess]).possible()[0]]
-    if not guesses:
+    if not guesses or not _resemble(grey, lens, dictionary, guesses):
         return None
     trial = _Trial(grey, lens, dictionary, guesses, edge_offset_px, row_time_s, blur_px, near)
     return trial.judge(trial.settle())
+
+
+def _resemble(grey: Grey, lens: CameraCalibration, dictionary: str, guesses: Sequence[Guess]) -> bool:
+    """Return whether cells look like this marker from any pose: a fit that takes long would fail otherwise.
+
+    A fit settles only from less than half a cell aside, where the middles of cells are still in them.
+    """
+    marker_id = guesses[0].id
+    view = View(grey, lens, lay_out(dictionary, (marker_id,) * len(guesses)), 0.0, None)
+    *_, levels = outline(view, into_poses(guesses))
+    return any(compare_pattern(row, dictionary, marker_id).possible for row in levels)
 
 
 class _State(NamedTuple):
@@ -191,7 +202,7 @@ class _Trial:
         sites = locate(view, state.poses, state.motions)
         steps, blur_px, least_px = self._steps(view, sites, number)
         used = np.where(state.without[:, None] >= 0, ~self._sides[state.without], True)
-        rows = moves(view.prints, state.poses.camera(), sites.slopes, sites.late)[:, : self._unknowns]
+        rows = moves(view.prints, state.poses.camera(), sites.slopes, sites.late, self._unknowns)
         off_px = steps.off_px
         if self._row_time_s:
             off_px = off_px + (state.motions[:, None, :2] @ rows[:, 7:])[:, 0]

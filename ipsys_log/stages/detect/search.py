@@ -63,6 +63,8 @@ def search(grey: Grey, dictionary: str, region: tuple[slice, slice] = WHOLE) -> 
 
 
 def _placed(found: list[Candidate], region: tuple[slice, slice]) -> list[Candidate]:
+    if region == WHOLE or not found:
+        return found
     origin = np.array([region[1].start or 0, region[0].start or 0], dtype=np.float64)
     return [one._replace(corners_px=one.corners_px + origin) for one in found]
 
@@ -107,10 +109,10 @@ def _contrasts(grey: Grey, known_px: Sequence[Array]) -> list[tuple[slice, slice
     coarse = np.ascontiguousarray(fine[_COARSER // 2 :: _COARSER, _COARSER // 2 :: _COARSER])
     if not coarse.size:
         return [WHOLE]
-    full = _squares(fine)
-    cv2.bitwise_or(
-        full, cv2.resize(_squares(coarse), full.shape[::-1], interpolation=cv2.INTER_NEAREST), full
-    )
+    full, wide = _squares(fine), _squares(coarse)
+    if cv2.countNonZero(wide):
+        wide = cv2.resize(wide, full.shape[::-1], interpolation=cv2.INTER_NEAREST)
+        cv2.bitwise_or(full, wide, full)
     if len(known_px):
         known = np.asarray(known_px)
         low, high = known.min(axis=1), known.max(axis=1)
@@ -118,6 +120,8 @@ def _contrasts(grey: Grey, known_px: Sequence[Array]) -> list[tuple[slice, slice
         spans = np.concatenate([np.maximum(low - around, 0), high + around + _STEP_PX], axis=1) / _STEP_PX
         for left, top, right, bottom in spans.astype(int).tolist():
             full[top:bottom, left:right] = 0
+    if not cv2.countNonZero(full):
+        return []
     contours, _ = cv2.findContours(full, cv2.RETR_EXTERNAL, cv2.CHAIN_APPROX_SIMPLE)
     boxes = [cv2.boundingRect(contour) for contour in contours]
     if sum(width * height for *_, width, height in boxes) > _MOST * full.size or len(boxes) > _MANY:

@@ -39,6 +39,8 @@ _AROUND, _SQUARE = np.ones((3, 3), dtype=np.uint8), np.ones((4, 4), dtype=np.uin
 _PAPER = 0.35
 _CLEAR_PX = 24
 _MOST, _MANY = 0.4, 40
+# Of the contrast: what is darker is the black of a marker.
+_AS_BLACK = 0.1
 # Rows and columns of a whole picture.
 WHOLE = (slice(None), slice(None))
 
@@ -126,7 +128,28 @@ def _contrasts(grey: Grey, known_px: Sequence[Array]) -> list[tuple[slice, slice
     boxes = [cv2.boundingRect(contour) for contour in contours]
     if sum(width * height for *_, width, height in boxes) > _MOST * full.size or len(boxes) > _MANY:
         return [WHOLE]
-    return [(_widened(top, height), _widened(left, width)) for left, top, width, height in boxes]
+    return [
+        (_widened(top, height), _widened(left, width))
+        for left, top, width, height in boxes
+        if not _is_cut(grey, fine, left, top, left + width, top + height)
+    ]
+
+
+def _is_cut(grey: Grey, fine: Grey, left: int, top: int, right: int, bottom: int) -> bool:
+    """Return whether a marker in a box of samples goes on beyond the picture: its black meets the border.
+
+    Around a whole marker there is its white margin, or at least the floor.
+    """
+    height, width = fine.shape
+    rows = slice(top * _STEP_PX, bottom * _STEP_PX)
+    columns = slice(left * _STEP_PX, right * _STEP_PX)
+    lines = [grey[0, columns]] * (top == 0) + [grey[-1, columns]] * (bottom == height)
+    lines += [grey[rows, 0]] * (left == 0) + [grey[rows, -1]] * (right == width)
+    if not lines:
+        return False
+    box = fine[top:bottom, left:right]
+    darkest, brightest = int(box.min()), int(box.max())
+    return min(int(line.min()) for line in lines) < darkest + _AS_BLACK * (brightest - darkest)
 
 
 def _squares(samples: Grey) -> Grey:

@@ -93,8 +93,9 @@ def fit_edges(
         return []
     view = View(grey, lens, lay_out(dictionary, tuple(guess.id for guess in guesses)), row_time_s, blur_px)
     settled, (corners_px, slopes, levels) = _settle_all(view, guesses, edge_offset_px)
-    good = settled.good & whole(corners_px, grey) & _same_cells(view.prints, levels)
-    uneven = _uneven(view.prints, settled, levels)
+    colours = _bright_and_dark(view.prints, levels)
+    good = settled.good & whole(corners_px, grey) & _same_cells(view.prints, levels, colours)
+    uneven = _uneven(view.prints, settled, colours)
     covariances_px2 = slopes @ settled.covariances @ slopes.transpose(0, 2, 1)
     return [
         Fit(
@@ -214,19 +215,19 @@ def _bright_and_dark(prints: Prints, levels: Array) -> tuple[Array, Array]:
     return bright, dark
 
 
-def _same_cells(prints: Prints, levels: Array) -> NDArray[np.bool_]:
+def _same_cells(prints: Prints, levels: Array, colours: tuple[Array, Array]) -> NDArray[np.bool_]:
     """Whether cells are white and black as they should be, (m,), from their grey levels (m, c)."""
-    bright, dark = _bright_and_dark(prints, levels)
+    bright, dark = colours
     wrong = np.count_nonzero((levels > ((bright + dark) / 2)[:, None]) != prints.white, axis=1)
     return np.asarray((wrong <= _WRONG_CELLS) & (bright - dark > LEAST_CONTRAST))
 
 
-def _uneven(prints: Prints, settled: _Settled, levels: Array) -> NDArray[np.bool_]:
+def _uneven(prints: Prints, settled: _Settled, colours: tuple[Array, Array]) -> NDArray[np.bool_]:
     """Return, (m,), where glare, a shadow or a cover may have moved some of the edges."""
     black = np.where(prints.polarity > 0, settled.ends[..., 0], settled.ends[..., 1])
     black[prints.polarity == 0] = -np.inf
     black.sort(axis=1)
-    bright, dark = _bright_and_dark(prints, levels)
+    bright, dark = colours
     lighter = black[:, -_FEW] - black[:, black.shape[1] // 2]
     lighter /= np.maximum(bright - dark, LEAST_CONTRAST)
     spreads_px = settled.spreads_px

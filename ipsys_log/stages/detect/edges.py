@@ -172,7 +172,10 @@ def _settle(
         moved = poses.moved(found[:, :6] * short[:, None])
         # What is no marker may run away, behind the camera even: it stays, and never settles.
         possible = moved.possible()
-        poses, moved_px = moved.where(possible, poses), np.where(possible, moved_px, np.inf)
+        if possible.all():
+            poses = moved
+        else:
+            poses, moved_px = moved.where(possible, poses), np.where(possible, moved_px, np.inf)
         if view.row_time_s:
             motions = np.concatenate([found[:, 7:], motions[:, 2:]], axis=1)
         spread_px = np.sqrt((weights * left_px**2).sum(axis=1) / np.maximum(weights.sum(axis=1), 1e-9))

@@ -14,7 +14,7 @@ from ipsys_log.geometry.square_pose import goes_around
 from ipsys_log.messages import CameraCalibration, CompressedImage, RawImage
 from ipsys_log.stages.detect.decode import Grey, decode_rows
 from ipsys_log.stages.detect.edges import Fit, Guess, fit_edges
-from ipsys_log.stages.detect.partial import Rejection, fit_partly
+from ipsys_log.stages.detect.partial import Rejection, fit_partly, resembles
 from ipsys_log.stages.detect.search import (
     WHOLE,
     Candidate,
@@ -213,6 +213,8 @@ class Follow:
             if fit is not None and not fit.uneven:
                 continue
             if not all(_inside(outline_px, grey) for outline_px in self._outlines(poses)):
+                continue
+            if fit is None and not resembles(grey, self._lens, self._dictionary, poses):
                 continue
             part = fit_partly(
                 grey,

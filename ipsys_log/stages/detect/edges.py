@@ -130,6 +130,16 @@ class _Settled(NamedTuple):
     ends: Array
     sides_off_px: Array
 
+    def where(self, good: NDArray[np.bool_], other: _Settled) -> _Settled:
+        """Return these fits where they are good, and others where not."""
+        if not good.any():
+            return other
+        chosen = [
+            np.where(good.reshape(-1, *[1] * (one.ndim - 1)), one, two)
+            for one, two in zip(self[1:], other[1:], strict=True)
+        ]
+        return _Settled(self.poses.where(good, other.poses), *chosen)
+
 
 def _settle_all(
     view: View, guesses: Sequence[Guess], edge_offset_px: float | None
@@ -139,7 +149,16 @@ def _settle_all(
     seen = outline(view, settled.poses)
     more = _blurred(view.prints, settled.heights, seen[2]) & ~settled.blurred
     if more.any():
-        settled = _settle(view, guesses, edge_offset_px, settled.blurred | more)
+        sharp = settled.blurred
+        settled = _settle(view, guesses, edge_offset_px, sharp | more)
+        # Where a guess is far off, edges only seem to be blurred. From the pose that is found so, they are not.
+        nearer = [
+            guess._replace(rotation=settled.poses.rotations[n], centre=settled.poses.centres[n])
+            for n, guess in enumerate(guesses)
+        ]
+        again = _settle(view, nearer, edge_offset_px, sharp)
+        blurred = _blurred(view.prints, again.heights, outline(view, again.poses)[2]) & ~sharp
+        settled = again.where(more.any(axis=1) & again.good & ~blurred.any(axis=1), settled)
         seen = outline(view, settled.poses)
     return settled, seen
 

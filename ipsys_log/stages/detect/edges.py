@@ -151,7 +151,7 @@ def _settle_all(
     if more.any():
         sharp = settled.blurred
         settled = _settle(view, guesses, edge_offset_px, sharp | more)
-        # Where a guess is far off, edges only seem to be blurred. From the pose that is found so, they are not.
+        # Where a guess is far off, sharp edges seem to be blurred. From the pose found so, they do not.
         nearer = [
             guess._replace(rotation=settled.poses.rotations[n], centre=settled.poses.centres[n])
             for n, guess in enumerate(guesses)

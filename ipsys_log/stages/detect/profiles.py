@@ -228,7 +228,7 @@ def _blurs(view: View, profiles: Array, reaches_px: Array, wide: bool) -> Array:
     means = (view.prints.polarity[:, None] @ profiles)[:, 0]
     left = [_residues(reach_px) @ mean for reach_px, mean in zip(reaches_px.tolist(), means, strict=True)]
     squares = np.square(left).reshape(len(profiles), len(BLURS_PX), -1)
-    return BLURS_PX[squares.sum(axis=2).argmin(axis=1)]
+    return np.asarray(BLURS_PX[squares.sum(axis=2).argmin(axis=1)], dtype=np.float64)
 
 
 @cache

@@ -136,8 +136,8 @@ def _contrasts(grey: Grey, samples: Grey, known_px: Sequence[Array]) -> list[tup
         # Coarse samples that lie in it as a whole.
         wide[_inner(rows, down), _inner(columns, right)] = 0
     if cv2.countNonZero(wide):
-        wide = cv2.resize(wide, full.shape[::-1], interpolation=cv2.INTER_NEAREST)
-        cv2.bitwise_or(full, wide, full)
+        widened = cv2.resize(wide, full.shape[::-1], interpolation=cv2.INTER_NEAREST)
+        cv2.bitwise_or(full, widened, full)
     for rows, columns in known:
         full[rows, columns] = 0
     if not cv2.countNonZero(full):

@@ -151,16 +151,32 @@ def _settle_all(
     if more.any():
         sharp = settled.blurred
         settled = _settle(view, guesses, edge_offset_px, sharp | more)
-        # Where a guess is far off, sharp edges seem to be blurred. From the pose found so, they do not.
-        nearer = [
-            guess._replace(rotation=settled.poses.rotations[n], centre=settled.poses.centres[n])
-            for n, guess in enumerate(guesses)
-        ]
-        again = _settle(view, nearer, edge_offset_px, sharp)
-        blurred = _blurred(view.prints, again.heights, outline(view, again.poses)[2]) & ~sharp
-        settled = again.where(more.any(axis=1) & again.good & ~blurred.any(axis=1), settled)
+        if (more.any(axis=1) & settled.good).any():
+            settled = _sharpened(view, guesses, edge_offset_px, sharp, settled)
         seen = outline(view, settled.poses)
     return settled, seen
+
+
+def _sharpened(
+    view: View,
+    guesses: Sequence[Guess],
+    edge_offset_px: float | None,
+    blurred: NDArray[np.bool_],
+    settled: _Settled,
+) -> _Settled:
+    """Return the fits, but sharp ones where only axes that are ``blurred`` (m, 2) still are from their poses.
+
+    Where a guess is far off, sharp edges seem to be blurred.
+    """
+    poses = settled.poses
+    nearer = [
+        guess._replace(rotation=poses.rotations[n], centre=poses.centres[n])
+        for n, guess in enumerate(guesses)
+    ]
+    sharp = _settle(view, nearer, edge_offset_px, blurred)
+    more = _blurred(view.prints, sharp.heights, outline(view, sharp.poses)[2]) & ~blurred
+    seemed = (settled.blurred & ~blurred).any(axis=1)
+    return sharp.where(seemed & settled.good & sharp.good & ~more.any(axis=1), settled)
 
 
 def _settle(

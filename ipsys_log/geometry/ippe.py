@@ -11,6 +11,9 @@ __all__ = ["solve_squares"]
 
 Array = NDArray[np.float64]
 
+_UNIT_CORNERS = marker_corners(1.0)[:, :2]
+_UNIT = np.eye(2)
+
 
 def solve_squares(uv: Array, lengths_m: Array) -> tuple[Array, Array]:
     """IPPE's two poses of square markers: by formula, and exact where the corners are.
@@ -60,22 +63,24 @@ def solve_squares(uv: Array, lengths_m: Array) -> tuple[Array, Array]:
 
 def _homography(uv: Array, lengths_m: Array) -> tuple[Array, Array]:
     """At the centres of markers: slopes of (u, v) by the marker's x and y, (n, 2, 2), and (u, v), (n, 2)."""
-    corners_m = marker_corners(1.0)[:, :2] * lengths_m[:, None, None]
+    corners_m = _UNIT_CORNERS * lengths_m[:, None, None]
     equations = np.zeros((len(uv), 4, 2, 8))
     equations[:, :, 0, 0:2] = equations[:, :, 1, 3:5] = corners_m
     equations[:, :, 0, 2] = equations[:, :, 1, 5] = 1
     equations[..., 6:] = -uv[..., None] * corners_m[:, :, None]
     found = _solve(equations.reshape(-1, 8, 8), uv.reshape(-1, 8, 1))[..., 0]
-    centre_uv = found[:, [2, 5]]
-    return found[:, [[0, 1], [3, 4]]] - centre_uv[:, :, None] * found[:, None, 6:], centre_uv
+    affine = found[:, :6].reshape(-1, 2, 3)
+    centre_uv = affine[:, :, 2]
+    return affine[:, :, :2] - centre_uv[:, :, None] * found[:, None, 6:], centre_uv
 
 
 def _along_view(uv: Array) -> Array:
     """Rotations (n, 3, 3) that take the optical axis to the direction of (u, v), the shortest way."""
-    away = np.column_stack([uv, np.ones(len(uv))])
-    away /= np.linalg.norm(away, axis=1)[:, None]
-    turns = np.zeros((len(uv), 3, 3))
-    turns[:, :2, :2] = np.eye(2) - away[:, :2, None] * away[:, None, :2] / (1 + away[:, 2, None, None])
+    away = np.ones((len(uv), 3))
+    away[:, :2] = uv
+    away /= np.sqrt((away * away).sum(axis=1))[:, None]
+    turns = np.empty((len(uv), 3, 3))
+    turns[:, :2, :2] = _UNIT - away[:, :2, None] * away[:, None, :2] / (1 + away[:, 2, None, None])
     turns[:, :, 2], turns[:, 2, :2] = away, -away[:, :2]
     return turns
 

@@ -189,12 +189,15 @@ def project(points_m: NDArray[np.float64], lens: CameraCalibration) -> NDArray[n
     -------
     (n, 2), in px of the raw image.
     """
-    points = np.ascontiguousarray(points_m, dtype=np.float64).reshape(-1, 1, 3)
-    still = np.zeros(3)
+    points = np.ascontiguousarray(points_m, dtype=np.float64).reshape(-1, 3)
     if lens.distortion_model == "kannala_brandt":
-        pixels, _ = cv2.fisheye.projectPoints(points, still, still, lens.K, lens.D)
-    else:
-        pixels, _ = cv2.projectPoints(points, still, still, lens.K, lens.D)
+        depths = points[:, 2:]
+        if not depths.all():
+            # As projectPoints does.
+            depths = np.where(depths == 0.0, 1.0, depths)
+        return _distort(points[:, :2] / depths, lens)
+    still = np.zeros(3)
+    pixels, _ = cv2.projectPoints(points.reshape(-1, 1, 3), still, still, lens.K, lens.D)
     return np.asarray(pixels, dtype=np.float64).reshape(-1, 2)
 
 

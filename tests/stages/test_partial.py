@@ -89,14 +89,8 @@ def scored_at_full_size(name: str) -> tuple[Score, int, list[Array]]:
     return score, by_stock, errors
 
 
-ONE_STRETCHED = pytest.mark.xfail(
-    strict=True, reason="1 of 40 markers is stretched by 0.9 px, 5 times its sigma: 0.115 px RMS in all"
-)
-FULL_SIZE = [pytest.param(name, marks=ONE_STRETCHED if name == "soft glare, edge" else ()) for name in LIGHTS]
-
-
 @pytest.mark.slow
-@pytest.mark.parametrize("name", FULL_SIZE)
+@pytest.mark.parametrize("name", LIGHTS)
 def test_edges_in_uneven_light_are_exact_at_full_size(name: str) -> None:
     score, by_stock, _ = scored_at_full_size(name)
     assert score.wrong == []

@@ -87,7 +87,7 @@ def known_unknowns(guesses: Sequence[Guess], edge_offset_px: float | None) -> tu
     return known, hold
 
 
-def moves(prints: Prints, camera: Array, slopes: Array, late: Array) -> Array:
+def moves(prints: Prints, camera: Array, slopes: Array, late: Array, unknowns: int) -> Array:
     """Return how far points on edges are seen to move along their axis, in px per unit of an unknown.
 
     Parameters
@@ -97,11 +97,11 @@ def moves(prints: Prints, camera: Array, slopes: Array, late: Array) -> Array:
 
     Returns
     -------
-    (m, 9, s).
+    (m, u, s), for 7 unknowns or 9.
     """
     x, y, level = prints.points[..., 0], prints.points[..., 1], prints.level
     aside = (np.where(level, y - camera[:, 1:2], x - camera[:, :1]) / camera[:, 2:]) * slopes
-    rows = np.empty((len(level), 9, level.shape[1]))
+    rows = np.empty((len(level), unknowns, level.shape[1]))
     np.multiply(slopes, level, out=rows[:, 1])
     np.subtract(slopes, rows[:, 1], out=rows[:, 0])
     rows[:, 2] = aside
@@ -109,8 +109,9 @@ def moves(prints: Prints, camera: Array, slopes: Array, late: Array) -> Array:
     np.multiply(aside, -x, out=rows[:, 4])
     np.multiply(slopes, prints.swirl, out=rows[:, 5])
     np.negative(prints.polarity, out=rows[:, 6])
-    np.multiply(late, level, out=rows[:, 8])
-    np.subtract(late, rows[:, 8], out=rows[:, 7])
+    if unknowns > 7:
+        np.multiply(late, level, out=rows[:, 8])
+        np.subtract(late, rows[:, 8], out=rows[:, 7])
     return rows
 
 

@@ -93,8 +93,9 @@ def fit_edges(
         return []
     view = View(grey, lens, lay_out(dictionary, tuple(guess.id for guess in guesses)), row_time_s, blur_px)
     settled, (corners_px, slopes, levels) = _settle_all(view, guesses, edge_offset_px)
-    good = settled.good & whole(corners_px, grey) & _same_cells(view.prints, levels)
-    uneven = _uneven(view.prints, settled, levels)
+    colours = _bright_and_dark(view.prints, levels)
+    good = settled.good & whole(corners_px, grey) & _same_cells(view.prints, levels, colours)
+    uneven = _uneven(view.prints, settled, colours)
     covariances_px2 = slopes @ settled.covariances @ slopes.transpose(0, 2, 1)
     return [
         Fit(
@@ -129,6 +130,16 @@ class _Settled(NamedTuple):
     ends: Array
     sides_off_px: Array
 
+    def where(self, good: NDArray[np.bool_], other: _Settled) -> _Settled:
+        """Return these fits where they are good, and others where not."""
+        if not good.any():
+            return other
+        chosen = [
+            np.where(good.reshape(-1, *[1] * (one.ndim - 1)), one, two)
+            for one, two in zip(self[1:], other[1:], strict=True)
+        ]
+        return _Settled(self.poses.where(good, other.poses), *chosen)
+
 
 def _settle_all(
     view: View, guesses: Sequence[Guess], edge_offset_px: float | None
@@ -138,9 +149,34 @@ def _settle_all(
     seen = outline(view, settled.poses)
     more = _blurred(view.prints, settled.heights, seen[2]) & ~settled.blurred
     if more.any():
-        settled = _settle(view, guesses, edge_offset_px, settled.blurred | more)
+        sharp = settled.blurred
+        settled = _settle(view, guesses, edge_offset_px, sharp | more)
+        if (more.any(axis=1) & settled.good).any():
+            settled = _sharpened(view, guesses, edge_offset_px, sharp, settled)
         seen = outline(view, settled.poses)
     return settled, seen
+
+
+def _sharpened(
+    view: View,
+    guesses: Sequence[Guess],
+    edge_offset_px: float | None,
+    blurred: NDArray[np.bool_],
+    settled: _Settled,
+) -> _Settled:
+    """Return the fits, but sharp ones where only axes that are ``blurred`` (m, 2) still are from their poses.
+
+    Where a guess is far off, sharp edges seem to be blurred.
+    """
+    poses = settled.poses
+    nearer = [
+        guess._replace(rotation=poses.rotations[n], centre=poses.centres[n])
+        for n, guess in enumerate(guesses)
+    ]
+    sharp = _settle(view, nearer, edge_offset_px, blurred)
+    more = _blurred(view.prints, sharp.heights, outline(view, sharp.poses)[2]) & ~blurred
+    seemed = (settled.blurred & ~blurred).any(axis=1)
+    return sharp.where(seemed & settled.good & sharp.good & ~more.any(axis=1), settled)
 
 
 def _settle(
@@ -156,7 +192,7 @@ def _settle(
     doubt: Array | float = 1.0
     for _ in range(_PASSES):
         seen = measure(view, poses, motions, wide)
-        rows = moves(view.prints, poses.camera(), seen.slopes, seen.late)[:, :unknowns]
+        rows = moves(view.prints, poses.camera(), seen.slopes, seen.late, unknowns)
         # Edges were looked for where they are at the speed known so far.
         off_px = seen.off_px
         if view.row_time_s:
@@ -171,7 +207,10 @@ def _settle(
         moved = poses.moved(found[:, :6] * short[:, None])
         # What is no marker may run away, behind the camera even: it stays, and never settles.
         possible = moved.possible()
-        poses, moved_px = moved.where(possible, poses), np.where(possible, moved_px, np.inf)
+        if possible.all():
+            poses = moved
+        else:
+            poses, moved_px = moved.where(possible, poses), np.where(possible, moved_px, np.inf)
         if view.row_time_s:
             motions = np.concatenate([found[:, 7:], motions[:, 2:]], axis=1)
         spread_px = np.sqrt((weights * left_px**2).sum(axis=1) / np.maximum(weights.sum(axis=1), 1e-9))
@@ -191,12 +230,12 @@ def _settle(
         found[:, 6],
         covariances,
         good,
-        seen.heights,
+        seen.heights(view.prints),
         seen.slopes.min(axis=1) / view.prints.cells,
         blurred,
         spread_px,
         seen.blurs_px,
-        seen.ends,
+        seen.ends(),
         np.abs(sided[:, 0]).max(axis=1),
     )
 
@@ -214,19 +253,19 @@ def _bright_and_dark(prints: Prints, levels: Array) -> tuple[Array, Array]:
     return bright, dark
 
 
-def _same_cells(prints: Prints, levels: Array) -> NDArray[np.bool_]:
+def _same_cells(prints: Prints, levels: Array, colours: tuple[Array, Array]) -> NDArray[np.bool_]:
     """Whether cells are white and black as they should be, (m,), from their grey levels (m, c)."""
-    bright, dark = _bright_and_dark(prints, levels)
+    bright, dark = colours
     wrong = np.count_nonzero((levels > ((bright + dark) / 2)[:, None]) != prints.white, axis=1)
     return np.asarray((wrong <= _WRONG_CELLS) & (bright - dark > LEAST_CONTRAST))
 
 
-def _uneven(prints: Prints, settled: _Settled, levels: Array) -> NDArray[np.bool_]:
+def _uneven(prints: Prints, settled: _Settled, colours: tuple[Array, Array]) -> NDArray[np.bool_]:
     """Return, (m,), where glare, a shadow or a cover may have moved some of the edges."""
     black = np.where(prints.polarity > 0, settled.ends[..., 0], settled.ends[..., 1])
     black[prints.polarity == 0] = -np.inf
     black.sort(axis=1)
-    bright, dark = _bright_and_dark(prints, levels)
+    bright, dark = colours
     lighter = black[:, -_FEW] - black[:, black.shape[1] // 2]
     lighter /= np.maximum(bright - dark, LEAST_CONTRAST)
     spreads_px = settled.spreads_px

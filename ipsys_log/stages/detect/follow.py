@@ -14,10 +14,11 @@ from ipsys_log.geometry.square_pose import goes_around
 from ipsys_log.messages import CameraCalibration, CompressedImage, RawImage
 from ipsys_log.stages.detect.decode import Grey, decode_rows
 from ipsys_log.stages.detect.edges import Fit, Guess, fit_edges
-from ipsys_log.stages.detect.partial import Rejection, fit_partly
+from ipsys_log.stages.detect.partial import Rejection, fit_partly, resembles
 from ipsys_log.stages.detect.search import (
     WHOLE,
     Candidate,
+    sample,
     search,
     search_leftovers,
     search_thoroughly,
@@ -124,12 +125,13 @@ class Follow:
         fits = list(seen.values())
         self._changed = self._watch.changed(grey, rows, [fit.corners_px for fit in fits], self._breadth_px)
         region = WHOLE if lost or due else self._changed
+        samples = sample(grey) if fresh else None
         if region is not None:
-            fits = self._add(grey, fits, search(grey, self._dictionary, region))
-        if fresh:
+            fits = self._add(grey, fits, search(grey, self._dictionary, region, samples))
+        if samples is not None:
             # Nothing is known yet, and there may be no later frame in which to find what is missed now.
             known_px = [fit.corners_px for fit in fits]
-            leftovers = search_leftovers(grey, self._dictionary, known_px)
+            leftovers = search_leftovers(grey, self._dictionary, samples, known_px)
             fits = self._add(grey, fits, leftovers, _MUCH_BETTER)
         if turn % _THOROUGH_EVERY == _SEARCH_EVERY or lost - {fit.pose.id for fit in fits}:
             fits = self._add(grey, fits, search_thoroughly(grey, self._dictionary))
@@ -212,6 +214,8 @@ class Follow:
                 continue
             if not all(_inside(outline_px, grey) for outline_px in self._outlines(poses)):
                 continue
+            if fit is None and not resembles(grey, self._lens, self._dictionary, poses):
+                continue
             part = fit_partly(
                 grey,
                 poses,
@@ -254,6 +258,8 @@ class Follow:
         is less than ``better`` times that about it.
         """
         new = [one for one in candidates if not _among(one.id, one.corners_px, fits)]
+        if not new:
+            return fits
         upright, other = self._guess(new)
         found = self._fit(grey, upright)
         # Where a marker lies as robots carry it, there is no need to try the pose that looks like it.

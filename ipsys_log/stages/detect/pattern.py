@@ -40,9 +40,14 @@ class Agreement(NamedTuple):
         return self.own >= _AGREES and self.own >= self.next + _CLEARLY
 
     @property
+    def possible(self) -> bool:
+        """Whether the cells may be those of this marker, about where it is."""
+        return self.own >= _ALIKE
+
+    @property
     def likely(self) -> bool:
         """Whether the cells look like those of this marker rather than of another."""
-        return self.own >= _ALIKE and self.own > self.next
+        return self.possible and self.own > self.next
 
 
 def compare_pattern(levels: Array, dictionary: str, marker_id: int) -> Agreement:

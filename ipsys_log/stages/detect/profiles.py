@@ -38,7 +38,7 @@ _NEAR_PX, _FAR_PX, _OF_CELL = 3.0, 12.0, 0.45
 _TAPS = np.linspace(-1, 1, 7)
 # Of a blurred step: what optics, pixels and JPEG do to an edge.
 USUAL_BLUR_PX = 0.8
-BLURS_PX = tuple(np.arange(0.5, 2.35, 0.05).round(2).tolist())
+BLURS_PX = np.arange(0.5, 2.35, 0.05).round(2)
 # Wider edges than that tell less.
 _SHARP_PX = 4.0
 # Edges of less than this share of the mean contrast are covered, or in glare.
@@ -110,18 +110,27 @@ class Seen(NamedTuple):
     """What is seen of the edges of prints, (m, s) each.
 
     ``off_px`` is by how much they lie off, along their axis; ``certainty`` from 1.0 to 0.0 for edges that
-    are not there. ``slopes`` and ``late`` are as in :class:`Sites`. ``heights`` are the grey levels by which
-    they rise within the usual blur; ``blurs_px`` (m,) are theirs. ``ends`` (m, s, 2) are the levels at both
-    ends of a profile.
+    are not there. ``slopes`` and ``late`` are as in :class:`Sites`. ``blurs_px`` (m,) are those of the edges.
+    ``profiles`` (m, s, t) are grey levels across the edges, of those that are not wide to ``near_px`` (m,) on
+    each side.
     """
 
     off_px: Array
     certainty: Array
     slopes: Array
     late: Array
-    heights: Array
     blurs_px: Array
-    ends: Array
+    profiles: Array
+    near_px: Array
+
+    def heights(self, prints: Prints) -> Array:
+        """Return the grey levels by which edges rise within the usual blur, (m, s)."""
+        usual = np.array([_template(reach_px, USUAL_BLUR_PX)[:, :1] for reach_px in self.near_px.tolist()])
+        return np.asarray((self.profiles @ usual)[..., 0] * prints.polarity)
+
+    def ends(self) -> Array:
+        """Return the levels at both ends of profiles, (m, s, 2)."""
+        return self.profiles[..., :: len(_TAPS) - 1]
 
 
 def locate(view: View, poses: Poses, motions: Array) -> Sites:
@@ -138,8 +147,9 @@ def locate(view: View, poses: Poses, motions: Array) -> Sites:
     middle = ends_px[:, 0] + across
     lengths_px = np.maximum(np.hypot(across[..., 0], across[..., 1]), 1e-6)
     slopes = lengths_px / prints.reach
-    late = slopes * (middle[..., 1] - points_px[:, -1:, 1]) * view.row_time_s
+    late = np.zeros_like(slopes)
     if view.row_time_s:
+        late = slopes * (middle[..., 1] - points_px[:, -1:, 1]) * view.row_time_s
         speed = np.where(prints.level, motions[:, 1:2], motions[:, :1]) + prints.swirl * motions[:, 2:]
         middle = middle + (late * speed / lengths_px)[..., None] * across
     return Sites(middle, across, lengths_px, slopes, late)
@@ -169,29 +179,27 @@ def measure(view: View, poses: Poses, motions: Array, wide: NDArray[np.bool_]) -
     """
     prints = view.prints
     sites = locate(view, poses, motions)
-    farthest_px = np.clip(_OF_CELL * sites.slopes.min(axis=1) / prints.cells, 0.5, _FAR_PX)
+    farthest_px = np.minimum(np.maximum(_OF_CELL * sites.slopes.min(axis=1) / prints.cells, 0.5), _FAR_PX)
     near_px = np.minimum(_NEAR_PX, farthest_px).round(1)
     reaches_px = near_px[:, None]
-    if wide.any():
+    widened = bool(wide.any())
+    if widened:
         wide_edges = np.where(prints.level, wide[:, 1:], wide[:, :1])
         reaches_px = np.where(wide_edges, farthest_px[:, None], reaches_px)
     profiles = read_profiles(view.grey, sites, reaches_px, _TAPS)
-    blurs_px = _blurs(view, profiles, near_px, bool(wide.any()))
+    blurs_px = _blurs(view, profiles, near_px, widened)
     shapes = list(zip(near_px.tolist(), blurs_px.tolist(), strict=True))
     fitted = profiles @ np.array([_template(reach_px, blur_px) for reach_px, blur_px in shapes])
     height = fitted[..., 0] * prints.polarity
-    usual = np.array([_template(reach_px, USUAL_BLUR_PX)[:, :1] for reach_px in near_px.tolist()])
-    sharp = (profiles @ usual)[..., 0] * prints.polarity
     present = height > np.maximum(_WEAK * height.mean(axis=1), LEAST_CONTRAST)[:, None]
     off_px = np.divide(fitted[..., 1], fitted[..., 0], out=np.zeros_like(height), where=present)
     certainty = present.astype(np.float64)
-    if wide.any():
+    if widened:
         by_area, width_px, shown = _by_area(prints, profiles, reaches_px)
         off_px = np.where(wide_edges, by_area, off_px)
         certainty = np.where(wide_edges, shown * np.minimum(1.0, _SHARP_PX / width_px) ** 2, certainty)
     off_px = np.minimum(np.maximum(off_px, -reaches_px), reaches_px)
-    ends = profiles[..., :: len(_TAPS) - 1]
-    return Seen(off_px, certainty, sites.slopes, sites.late, sharp, blurs_px, ends)
+    return Seen(off_px, certainty, sites.slopes, sites.late, blurs_px, profiles, near_px)
 
 
 def _by_area(prints: Prints, profiles: Array, reaches_px: Array) -> tuple[Array, Array, Array]:
@@ -219,14 +227,15 @@ def _blurs(view: View, profiles: Array, reaches_px: Array, wide: bool) -> Array:
         return np.full(len(profiles), view.blur_px or USUAL_BLUR_PX)
     means = (view.prints.polarity[:, None] @ profiles)[:, 0]
     left = [_residues(reach_px) @ mean for reach_px, mean in zip(reaches_px.tolist(), means, strict=True)]
-    return np.asarray(np.array(BLURS_PX)[np.square(left).sum(axis=2).argmin(axis=1)])
+    squares = np.square(left).reshape(len(profiles), len(BLURS_PX), -1)
+    return np.asarray(BLURS_PX[squares.sum(axis=2).argmin(axis=1)], dtype=np.float64)
 
 
 @cache
 def _residues(reach_px: float) -> Array:
-    """What the best step of each blur leaves of a profile, (blurs, taps, taps)."""
-    steps = [_step(reach_px, blur_px) for blur_px in BLURS_PX]
-    return np.array([np.eye(len(_TAPS)) - step @ np.linalg.pinv(step) for step in steps])
+    """What the best step of each blur leaves of a profile, (blurs * taps, taps)."""
+    steps = [_step(reach_px, blur_px) for blur_px in BLURS_PX.tolist()]
+    return np.concatenate([np.eye(len(_TAPS)) - step @ np.linalg.pinv(step) for step in steps])
 
 
 @cache

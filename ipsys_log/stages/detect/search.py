@@ -18,7 +18,7 @@ from numpy.typing import NDArray
 from ipsys_log.geometry.markers import white_cells
 from ipsys_log.stages.detect.decode import Grey, levels_at
 
-__all__ = ["WHOLE", "Candidate", "search", "search_leftovers", "search_thoroughly"]
+__all__ = ["WHOLE", "Candidate", "sample", "search", "search_leftovers", "search_thoroughly"]
 
 Array = NDArray[np.float64]
 
@@ -34,11 +34,14 @@ _MISREAD = 3
 # Leftovers: the contrast between neighbouring samples, and the square that has it; how far around a marker
 # its paper reaches, in sides; and where one search of the whole picture is faster than many.
 _CONTRAST = 30
-_STEP_PX, _COARSER = 6, 3
+_FINER, _COARSER = 2, 3
+_STEP_PX = _FINER * _SHRINK
 _AROUND, _SQUARE = np.ones((3, 3), dtype=np.uint8), np.ones((4, 4), dtype=np.uint8)
 _PAPER = 0.35
 _CLEAR_PX = 24
 _MOST, _MANY = 0.4, 40
+# Of the contrast: what is darker is the black of a marker.
+_AS_BLACK = 0.1
 # Rows and columns of a whole picture.
 WHOLE = (slice(None), slice(None))
 
@@ -50,7 +53,18 @@ class Candidate(NamedTuple):
     corners_px: Array
 
 
-def search(grey: Grey, dictionary: str, region: tuple[slice, slice] = WHOLE) -> list[Candidate]:
+def sample(grey: Grey) -> Grey:
+    """Return the reduced picture: sample k is pixel 3 k + 1."""
+    # Whole pixels, not means: three times as fast, and as good where cells are wider than that.
+    return np.ascontiguousarray(grey[_SHRINK // 2 :: _SHRINK, _SHRINK // 2 :: _SHRINK])
+
+
+def search(
+    grey: Grey,
+    dictionary: str,
+    region: tuple[slice, slice] = WHOLE,
+    samples: Grey | None = None,
+) -> list[Candidate]:
     """Markers in a picture, roughly.
 
     Parameters
@@ -58,25 +72,26 @@ def search(grey: Grey, dictionary: str, region: tuple[slice, slice] = WHOLE) -> 
     grey : (height, width).
     dictionary : OpenCV's name, such as DICT_4X4_100.
     region : rows and columns to search.
+    samples : those of the region, where they are known.
     """
-    return _placed(_search(np.ascontiguousarray(grey[region]), dictionary), region)
+    part = np.ascontiguousarray(grey[region])
+    return _placed(_search(part, sample(part) if samples is None else samples, dictionary), region)
 
 
 def _placed(found: list[Candidate], region: tuple[slice, slice]) -> list[Candidate]:
+    if region == WHOLE or not found:
+        return found
     origin = np.array([region[1].start or 0, region[0].start or 0], dtype=np.float64)
     return [one._replace(corners_px=one.corners_px + origin) for one in found]
 
 
-def _search(grey: Grey, dictionary: str) -> list[Candidate]:
-    # Whole pixels, not means: three times as fast, and as good where cells are wider than that.
-    small = np.ascontiguousarray(grey[_SHRINK // 2 :: _SHRINK, _SHRINK // 2 :: _SHRINK])
+def _search(grey: Grey, small: Grey, dictionary: str) -> list[Candidate]:
     if not small.size:
         return []
     found, ids, rejected = _quick_detector(dictionary).detectMarkers(small)
     squares = [*found, *rejected]
     if not squares:
         return []
-    # Sample k of the reduced picture is pixel 3 k + 1.
     rough = np.concatenate(squares).reshape(-1, 1, 2) * np.float32(_SHRINK) + np.float32(_SHRINK // 2)
     corners_px = cv2.cornerSubPix(grey, rough, _NEAR, (-1, -1), _REFINE).reshape(-1, 4, 2).astype(np.float64)
     read = len(found)
@@ -89,40 +104,87 @@ def search_thoroughly(grey: Grey, dictionary: str, region: tuple[slice, slice] =
     return _placed(_candidates(found, ids), region)
 
 
-def search_leftovers(grey: Grey, dictionary: str, known_px: Sequence[Array]) -> list[Candidate]:
-    """Search thoroughly where a picture has contrast that no known marker, (4, 2) in px, explains."""
+def search_leftovers(
+    grey: Grey, dictionary: str, samples: Grey, known_px: Sequence[Array]
+) -> list[Candidate]:
+    """Search thoroughly where a picture has contrast that no known marker, (4, 2) in px, explains.
+
+    Parameters
+    ----------
+    samples : of the picture, from :func:`sample`.
+    """
     candidates = []
-    for region in _contrasts(grey, known_px):
+    for region in _contrasts(grey, samples, known_px):
         candidates += search_thoroughly(grey, dictionary, region)
     return candidates
 
 
-def _contrasts(grey: Grey, known_px: Sequence[Array]) -> list[tuple[slice, slice]]:
+def _contrasts(grey: Grey, samples: Grey, known_px: Sequence[Array]) -> list[tuple[slice, slice]]:
     """Return rows and columns of what has the contrast of a marker, known markers excepted.
 
     Lines and the edges of large things have contrast too, but not everywhere in a square.
     """
-    fine = np.ascontiguousarray(grey[_STEP_PX // 2 :: _STEP_PX, _STEP_PX // 2 :: _STEP_PX])
+    fine = np.ascontiguousarray(samples[_FINER // 2 :: _FINER, _FINER // 2 :: _FINER])
     # Cells of a large marker have no contrast in them at the fine scale.
     coarse = np.ascontiguousarray(fine[_COARSER // 2 :: _COARSER, _COARSER // 2 :: _COARSER])
     if not coarse.size:
         return [WHOLE]
-    full = _squares(fine)
-    cv2.bitwise_or(
-        full, cv2.resize(_squares(coarse), full.shape[::-1], interpolation=cv2.INTER_NEAREST), full
-    )
-    if len(known_px):
-        known = np.asarray(known_px)
-        low, high = known.min(axis=1), known.max(axis=1)
-        around = _PAPER * (high - low) + _COARSER * _STEP_PX
-        spans = np.concatenate([np.maximum(low - around, 0), high + around + _STEP_PX], axis=1) / _STEP_PX
-        for left, top, right, bottom in spans.astype(int).tolist():
-            full[top:bottom, left:right] = 0
+    full, wide = _squares(fine), _squares(coarse)
+    known = _spans(known_px)
+    down, right = wide.shape[0] / full.shape[0], wide.shape[1] / full.shape[1]
+    for rows, columns in known:
+        # Coarse samples that lie in it as a whole.
+        wide[_inner(rows, down), _inner(columns, right)] = 0
+    if cv2.countNonZero(wide):
+        widened = cv2.resize(wide, full.shape[::-1], interpolation=cv2.INTER_NEAREST)
+        cv2.bitwise_or(full, widened, full)
+    for rows, columns in known:
+        full[rows, columns] = 0
+    if not cv2.countNonZero(full):
+        return []
     contours, _ = cv2.findContours(full, cv2.RETR_EXTERNAL, cv2.CHAIN_APPROX_SIMPLE)
     boxes = [cv2.boundingRect(contour) for contour in contours]
     if sum(width * height for *_, width, height in boxes) > _MOST * full.size or len(boxes) > _MANY:
         return [WHOLE]
-    return [(_widened(top, height), _widened(left, width)) for left, top, width, height in boxes]
+    return [
+        (_widened(top, height), _widened(left, width))
+        for left, top, width, height in boxes
+        if not _is_cut(grey, fine, left, top, left + width, top + height)
+    ]
+
+
+def _spans(known_px: Sequence[Array]) -> list[tuple[slice, slice]]:
+    """Return rows and columns of the samples that show known markers, their paper included."""
+    if not len(known_px):
+        return []
+    known = np.asarray(known_px)
+    low, high = known.min(axis=1), known.max(axis=1)
+    around = _PAPER * (high - low) + _COARSER * _STEP_PX
+    spans = np.concatenate([np.maximum(low - around, 0), high + around + _STEP_PX], axis=1) / _STEP_PX
+    return [
+        (slice(top, bottom), slice(left, right)) for left, top, right, bottom in spans.astype(int).tolist()
+    ]
+
+
+def _inner(span: slice, scale: float) -> slice:
+    return slice(int(span.start * scale) + 1, int(span.stop * scale))
+
+
+def _is_cut(grey: Grey, fine: Grey, left: int, top: int, right: int, bottom: int) -> bool:
+    """Return whether a marker in a box of samples goes on beyond the picture: its black meets the border.
+
+    Around a whole marker there is its white margin, or at least the floor.
+    """
+    height, width = fine.shape
+    rows = slice(top * _STEP_PX, bottom * _STEP_PX)
+    columns = slice(left * _STEP_PX, right * _STEP_PX)
+    lines = [grey[0, columns]] * (top == 0) + [grey[-1, columns]] * (bottom == height)
+    lines += [grey[rows, 0]] * (left == 0) + [grey[rows, -1]] * (right == width)
+    if not lines:
+        return False
+    box = fine[top:bottom, left:right]
+    darkest, brightest = int(box.min()), int(box.max())
+    return min(int(line.min()) for line in lines) < darkest + _AS_BLACK * (brightest - darkest)
 
 
 def _squares(samples: Grey) -> Grey:

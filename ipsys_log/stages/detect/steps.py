@@ -89,7 +89,7 @@ def usual_blur(prints: Prints, profiles: Array, reach_px: float) -> float:
 @cache
 def _residues(reach_px: float) -> Array:
     """Return what the best step of each blur leaves of a profile, (blurs, t, t)."""
-    shapes = [_shapes(reach_px, blur_px) for blur_px in BLURS_PX]
+    shapes = [_shapes(reach_px, blur_px) for blur_px in BLURS_PX.tolist()]
     return np.array([np.eye(len(TAPS)) - steps @ inverse for steps, inverse in shapes])
 
 

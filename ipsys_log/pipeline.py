@@ -133,13 +133,17 @@ def replay(
     until: str = "fuse",
     output: Path | None = None,
     progress: Progress = lambda stage, done, total: None,
+    say: Callable[[str], None] = lambda text: None,
 ) -> list[Outcome]:
     """Compute what a log lacks, up to a stage, and append it; or write it to a new log.
+
+    What is out of date is computed again, as a new run beside the old one.
 
     Parameters
     ----------
     paths : the logs, read as one; results go to the last of them, or to ``output``.
     until : the last stage. On the way to fuse models are evaluated too, where places are held out.
+    say : is told, before it is computed, what is out of date and why.
 
     Returns
     -------
@@ -165,7 +169,7 @@ def replay(
                 if isinstance(task, str):
                     return task
                 make = partial(carry_out, progress=progress)
-                outcomes.append(perform(session, target, task, request, until, make))
+                outcomes.append(perform(session, target, task, request, until, make, say))
             return outcomes[-1].run
 
         points = do("camera-frame", markers=do("detect"))

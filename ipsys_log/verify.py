@@ -28,13 +28,12 @@ from ipsys_log.messages import (
 )
 from ipsys_log.pipeline import carry_out
 from ipsys_log.runs.request import Progress, Request
+from ipsys_log.runs.states import Recorded, is_fitted_here, recorded_stages
 from ipsys_log.runs.tasks import Task, plan_stage
 from ipsys_log.stages.camera_frame import PERIMETER
 
 __all__ = ["diff", "explain_diff", "verify"]
 
-# What a model's run has among its parameters if the model was fitted to places of the same log.
-_FITTED_HERE = {"train", "seed"}
 _MODELS = ("fit", "evaluate")
 # What comes frame by frame.
 _MOVING = (Markers, CameraPoints, Positions, Tracks)
@@ -46,7 +45,8 @@ def verify(
     """Make every run again, from its recorded input, and compare.
 
     A model that was copied in cannot be made again, nor can what was evaluated of it; what was made with it
-    can. Nor can a model since when places were measured or withdrawn, which is said.
+    can. Nor can a model since when places were measured or withdrawn, or what another version has made, which
+    is said; later stages are made again from what is recorded.
 
     Parameters
     ----------
@@ -60,22 +60,31 @@ def verify(
     Raises
     ------
     IpsysError
-        Where there is no such run, or it was made from something that the log no longer holds.
+        Where there is no such run, nothing of it can be verified, or it was made from something that the log
+        no longer holds.
     """
     with Session(paths) as session, threadpool_limits(1, user_api="blas"):
         names = session.run_names() if run is None else session.run_names() & {run}
-        records = [one for one in session.runs() if one.run in names and _from_this_log(one)]
+        recorded = [one for one in recorded_stages(session) if one.run.run in names]
+        records = [one.run for one in recorded if not _is_of_copied_model(one.run)]
         if not records:
             raise IpsysError(
                 f"{session}: has no {'run' if run is None else f'run {run}'} to verify; "
                 "make one with 'ipsys replay', or see 'ipsys runs'"
             )
-        found = []
         checked = {output.topic for one in records for output in one.outputs}
+        repeated = [
+            one.run
+            for one in recorded
+            if one.run in records
+            and not _is_of_other_version(one, say)
+            and _is_up_to_date(session, one.run, checked, say)
+        ]
+        if not repeated:
+            raise IpsysError(f"{session}: nothing of its runs can be verified; see 'ipsys runs'")
+        found = []
         for name in sorted(names):
-            stages = [
-                one for one in records if one.run == name and _is_up_to_date(session, one, checked, say)
-            ]
+            stages = [one for one in repeated if one.run == name]
             topics = {output.topic for one in stages for output in one.outputs}
             # Stages can share a channel, that of events.
             made = heapq.merge(
@@ -85,8 +94,16 @@ def verify(
         return sorted([*found, *_unrecorded(session, names)], key=lambda one: one.topic)
 
 
-def _from_this_log(run: Run) -> bool:
-    return run.stage not in _MODELS or bool(run.parameters.keys() & _FITTED_HERE)
+def _is_of_copied_model(run: Run) -> bool:
+    """Return whether a stage copied a model of another log in, or evaluated such a one."""
+    return run.stage in _MODELS and not is_fitted_here(run)
+
+
+def _is_of_other_version(one: Recorded, say: Callable[[str], None]) -> bool:
+    """Return whether a stage was made by another version, which is said."""
+    if one.is_of_other_version:
+        say(f"run {one.run.run}: {one.run.stage} is {one.state}; it is not verified")
+    return one.is_of_other_version
 
 
 def _unrecorded(session: Session, names: Collection[str]) -> list[Comparison]:

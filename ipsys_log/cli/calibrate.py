@@ -10,8 +10,8 @@ from typing import TYPE_CHECKING, Annotated, Any, Optional
 
 import typer
 
-from ipsys_log.cli.cameras_now import SENT_NOW, Lab, prepared, recorded_now, say
-from ipsys_log.cli.console import console, progress_bar, remarks
+from ipsys_log.cli.cameras_now import SENT_NOW, Lab, prepared, recorded_now
+from ipsys_log.cli.console import console, progress_bar, remarks, say
 from ipsys_log.cli.options import AsJson
 from ipsys_log.cli.signals import note_kept, say_kept
 

@@ -13,7 +13,7 @@ from threading import TIMEOUT_MAX, Timer
 from time import monotonic
 from typing import TYPE_CHECKING, NamedTuple
 
-from ipsys_log.cli.console import console, remarks
+from ipsys_log.cli.console import console, remarks, say
 from ipsys_log.cli.options import load_lab
 from ipsys_log.cli.signals import Interrupted, stop_on_signal
 from ipsys_log.units import format_bytes
@@ -32,7 +32,6 @@ __all__ = [
     "opened",
     "prepared",
     "recorded_now",
-    "say",
 ]
 
 
@@ -55,11 +54,6 @@ class Lab(NamedTuple):
     @property
     def names(self) -> list[str]:
         return [camera.name for camera in self.cameras]
-
-
-def say(text: str) -> None:
-    """A remark, as it is."""
-    remarks.print(text, markup=False)
 
 
 def prepared(

@@ -20,7 +20,7 @@ if TYPE_CHECKING:
     from ipsys_log.runs.records import Outcome
     from ipsys_log.runs.request import Progress
 
-__all__ = ["console", "print_outcomes", "print_warnings", "progress_bar", "remarks"]
+__all__ = ["console", "print_outcomes", "print_warnings", "progress_bar", "remarks", "say"]
 
 # The stages that go through the frames, one message for each.
 _OF_FRAMES = ("detect", "camera-frame", "locate", "fuse", "simulate")
@@ -124,6 +124,11 @@ def progress_bar() -> Iterator[Progress]:
             bar.update(bars[stage], completed=done, rate=rate)
 
         yield show
+
+
+def say(text: str) -> None:
+    """Print a remark as it is, beside the results."""
+    remarks.print(text, markup=False)
 
 
 def print_outcomes(outcomes: Sequence[Outcome]) -> None:

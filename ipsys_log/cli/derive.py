@@ -12,7 +12,7 @@ from typing import TYPE_CHECKING, Annotated, Any, Optional
 
 import typer
 
-from ipsys_log.cli.console import console, print_outcomes, progress_bar, remarks
+from ipsys_log.cli.console import console, print_outcomes, progress_bar, remarks, say
 from ipsys_log.cli.options import (
     AsJson,
     Calibrations,
@@ -222,7 +222,7 @@ def derived(
 
     request = _request(logs, **given)
     with say_kept(_kept_runs(logs, output)), progress_bar() as progress:
-        outcomes = replay(logs, request, until, output, progress)
+        outcomes = replay(logs, request, until, output, progress, say)
     # A new log is only there if there was something to write.
     written = [output] if output is not None and output.exists() else []
     with Session([*logs, *written]) as session:

@@ -37,12 +37,16 @@ def info(logs: Logs, as_json: AsJson = False) -> None:
 
 
 def runs(logs: Logs, as_json: AsJson = False) -> None:
-    """Show the runs of a log: stage, what it was made from, with which parameters, by which ipsys."""
+    """Show the runs of a log: stage, inputs, parameters, version of ipsys, and whether it is up to date.
+
+    The state is: current; out of date, with the reason (replay computes it again as a new run); not
+    repeatable (what it was made from is not in the log); unfinished (its writer was stopped).
+    """
     from ipsys_log.log.session import Session
-    from ipsys_log.report.contents import runs_json, runs_table
+    from ipsys_log.report.contents import runs_table, states_json
 
     with Session(logs) as session:
-        found = runs_json(session)
+        found = states_json(session)
     if as_json:
         print(json.dumps(found, indent=2))  # noqa: T201
     else:

@@ -10,7 +10,7 @@ from typing import TYPE_CHECKING, Annotated, Optional
 
 import typer
 
-from ipsys_log.cli.console import console, progress_bar, remarks
+from ipsys_log.cli.console import console, progress_bar, remarks, say
 from ipsys_log.cli.options import (
     AsJson,
     Calibrations,
@@ -154,7 +154,7 @@ def _measure_log(
         check_sheet(csv, log, request)
     with ExitStack() as stack:
         with progress_bar() as progress:
-            scene = stack.enter_context(opened_log(log, request, progress))
+            scene = stack.enter_context(opened_log(log, request, progress, say))
         if places:
             _show_places(scene, as_json)
             return

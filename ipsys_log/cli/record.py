@@ -8,8 +8,8 @@ from typing import TYPE_CHECKING, Annotated, Optional
 
 import typer
 
-from ipsys_log.cli.cameras_now import MODEL, check_target, opened, prepared, say
-from ipsys_log.cli.console import remarks
+from ipsys_log.cli.cameras_now import MODEL, check_target, opened, prepared
+from ipsys_log.cli.console import remarks, say
 from ipsys_log.cli.options import (
     Calibrations,
     Corners,

@@ -7,7 +7,7 @@ from typing import Annotated, Optional
 
 import typer
 
-from ipsys_log.cli.console import remarks
+from ipsys_log.cli.console import remarks, say
 from ipsys_log.cli.options import Logs
 
 __all__ = ["add_commands"]
@@ -32,10 +32,13 @@ def view(logs: Logs, run: Runs = None, save: Save = None) -> None:
 
     if save is not None:
         _check_save(save, logs)
+    from ipsys_log.runs.states import out_of_date_lines
     from ipsys_log.sinks.rerun import write_recording
 
     with Session(logs) as session:
         shown = write_recording(session, run or (), save)
+        for line in out_of_date_lines(session, [shown.markers, *shown.runs]):
+            say(line)
     for what, names in (("markers", [shown.markers]), ("positions and tracks", shown.runs)):
         named = ", ".join(name for name in names if name)
         if named:

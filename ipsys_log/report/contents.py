@@ -14,9 +14,10 @@ from ipsys_log.log.session import Session
 from ipsys_log.log.topics import camera_of_topic
 from ipsys_log.messages import Run
 from ipsys_log.plain_text import plain_text
+from ipsys_log.runs.states import recorded_stages
 from ipsys_log.units import NS_PER_S, format_bytes, format_time
 
-__all__ = ["contents_json", "contents_tables", "runs_json", "runs_table"]
+__all__ = ["contents_json", "contents_tables", "runs_json", "runs_table", "states_json"]
 
 # A gap is a silence of this many times the usual distance between messages of one camera. Those of several
 # are not evenly spaced: there it is a silence of so long.
@@ -91,8 +92,17 @@ def _channel(session: Session, topic: str) -> dict[str, Any]:
     }
 
 
+def states_json(session: Session) -> list[dict[str, Any]]:
+    """Return the rows of `runs_json`, each with its state and the version of its stage."""
+    states = [
+        {"state": one.state, "stage_version": one.stage_version, "out_of_date": one.out_of_date}
+        for one in recorded_stages(session)
+    ]
+    return [row | state for row, state in zip(runs_json(session), states, strict=True)]
+
+
 def runs_json(session: Session) -> list[dict[str, Any]]:
-    """The runs of a log, one row per stage, as plain data."""
+    """Return the runs of a log, one row per stage, as plain data."""
     return [
         {
             "run": run.run,
@@ -169,13 +179,16 @@ def _rate(channel: dict[str, Any]) -> str:
 
 
 def runs_table(runs: list[dict[str, Any]]) -> Table:
-    """One row per stage of a run."""
-    table = _table("Runs", "run", "stage", "from", "parameters", "count", "ipsys", right=("count",))
+    """Return a table with one row per stage of a run, and its state where that is known."""
+    states = ["state"] if any("state" in run for run in runs) else []
+    columns = ("run", "stage", "from", "parameters", "count", "ipsys", *states)
+    table = _table("Runs", *columns, right=("count",))
     for run in runs:
         given = [f"{key}={value}" for key, value in run["parameters"].items()]
         given += [f"other {name}" for name in run["overrides"]]
         count = sum(output["messages"] for output in run["outputs"])
         sources = ", ".join(run["input_runs"]) or "-"
         version = run["fingerprint"].get("ipsys_log", "-")
-        table.add_row(run["run"], run["stage"], sources, ", ".join(given) or "-", str(count), version)
+        state = [run["state"]] if states else []
+        table.add_row(run["run"], run["stage"], sources, ", ".join(given) or "-", str(count), version, *state)
     return table

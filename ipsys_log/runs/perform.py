@@ -30,6 +30,7 @@ from ipsys_log.runs.records import Outcome, check_run_name, find_run, fingerprin
 from ipsys_log.runs.remarks import Remarks
 from ipsys_log.runs.request import Progress, Request
 from ipsys_log.runs.resume import OtherContentError, cut_short, without_held
+from ipsys_log.runs.states import Recorded, method_of, recorded_stages
 from ipsys_log.runs.tasks import Task, plan_stage
 
 __all__ = ["SHARED_STAGES", "inputs", "perform", "record_of", "sign", "signed_copy"]
@@ -40,10 +41,19 @@ SHARED_STAGES = ("detect", "camera-frame")
 Make = Callable[[Task, Session, str], Iterable[Message]]
 
 
-def perform(session: Session, target: Path, task: Task, request: Request, until: str, make: Make) -> Outcome:
+def perform(
+    session: Session,
+    target: Path,
+    task: Task,
+    request: Request,
+    until: str,
+    make: Make,
+    say: Callable[[str], None] = lambda text: None,
+) -> Outcome:
     """Find the run that has done ``task``, or ``make`` it and append it to ``target``.
 
-    A run that was cut short is completed, if what it holds is what is made now.
+    A run that was cut short is completed, if what it holds is what is made now. Where the newest run of such
+    a task is out of date, that is said before a new one is made beside it.
     """
     # A name given by the user is for what was asked for, not for the detection on the way to it.
     named = task.stage == until or (task.stage not in SHARED_STAGES and until not in SHARED_STAGES)
@@ -52,6 +62,7 @@ def perform(session: Session, target: Path, task: Task, request: Request, until:
     found = find_run(session, record, name)
     if found is not None:
         return Outcome(task.stage, found, fresh=False)
+    _say_renewal(session, task, record, say)
     number = max((run.number for run in session.runs()), default=0) + 1
     record = replace(record, fingerprint=fingerprint(), number=number)
     remarks: tuple[str, ...] = ()
@@ -67,6 +78,22 @@ def perform(session: Session, target: Path, task: Task, request: Request, until:
         check_run_name(session, task.stage, name, task.writes)
     outcome = _append(session, target, task, replace(record, run=name), {}, request, make)
     return replace(outcome, remarks=(*remarks, *outcome.remarks))
+
+
+def _say_renewal(session: Session, task: Task, record: Run, say: Callable[[str], None]) -> None:
+    """Say that the newest run of a task is out of date, and how much is computed again."""
+    method = method_of(session, record)
+
+    def is_such(one: Recorded) -> bool:
+        is_same = (one.run.stage, one.method) == (task.stage, method)
+        # Where the positions are other ones, the stage that made them has said so.
+        return is_same and (task.stage != "fuse" or one.run.input_runs == record.input_runs)
+
+    such = [one for one in recorded_stages(session) if is_such(one)]
+    if such and such[-1].out_of_date:
+        frames = sum(session.count(topic) for topic in task.topics if topic in session.images.values())
+        much = f" for {frames} frames" if frames else ""
+        say(f"{task.stage} is computed again{much}; run {such[-1].run.run} is {such[-1].state}")
 
 
 def _append(

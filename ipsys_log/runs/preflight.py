@@ -18,7 +18,8 @@ from ipsys_log.rig import check_rig
 from ipsys_log.runs.lookup import can_evaluate, copied_run, fitted_in, measured
 from ipsys_log.runs.records import newest_run
 from ipsys_log.runs.request import Request
-from ipsys_log.runs.tasks import STAGES
+from ipsys_log.runs.states import recorded_stages
+from ipsys_log.runs.tasks import STAGES, usual_corners
 
 __all__ = ["check_inputs"]
 
@@ -49,6 +50,17 @@ def check_inputs(paths: Sequence[Path], request: Request, models: Sequence[str],
             _check_model(session, request, models, cameras)
         if until == "evaluate":
             _check_evaluation(session, request, models)
+        _check_versions(session, request, models, wanted)
+
+
+def _check_versions(session: Session, request: Request, models: Sequence[str], wanted: Sequence[str]) -> None:
+    """See that nothing that newer software has made would be made again by this one."""
+    corners = request.corners or usual_corners(session.images, {*session.calibrations, *request.lenses})
+    methods = {"detect": {corners}, "camera-frame": {request.method}, "fuse": {""}}
+    for one in recorded_stages(session):
+        is_asked = one.run.stage in wanted and one.method in methods.get(one.run.stage, models)
+        if one.is_newer and is_asked:
+            raise IpsysError(f"{session}: run {one.run.run}, stage {one.run.stage}: {one.state}")
 
 
 def _check_request(paths: Sequence[Path], request: Request, models: Sequence[str]) -> None:

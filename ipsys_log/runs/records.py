@@ -22,6 +22,7 @@ __all__ = [
     "find_run",
     "fingerprint",
     "free_name",
+    "is_complete",
     "newest_run",
     "read_channels",
 ]
@@ -66,11 +67,12 @@ def _essence(run: Run) -> bytes:
 
 def complete_runs(session: Session) -> list[Run]:
     """Return the records whose channels are all there, oldest first."""
-    return [
-        run
-        for run in session.runs()
-        if all(session.count(output.topic) >= output.messages for output in run.outputs)
-    ]
+    return [run for run in session.runs() if is_complete(session, run)]
+
+
+def is_complete(session: Session, run: Run) -> bool:
+    """Return whether all that a stage wrote is in the log."""
+    return all(session.count(output.topic) >= output.messages for output in run.outputs)
 
 
 def find_run(session: Session, wanted: Run, name: str | None = None) -> str | None:

@@ -49,6 +49,7 @@ from ipsys_log.runs.lookup import (
 )
 from ipsys_log.runs.records import newest_run, read_channels
 from ipsys_log.runs.request import Request
+from ipsys_log.runs.versions import version_parameters
 from ipsys_log.stages import camera_frame, detect, fuse, locate
 
 __all__ = ["STAGES", "Task", "copy_model", "model_run", "plan_stage", "points_run", "usual_corners"]
@@ -151,7 +152,11 @@ def _detect(session: Session, request: Request) -> Task | str:
         detect.READS,
         lambda run: detect.Detect(corners),
         decodes_frames=True,
-        parameters={"corners": corners, **({"as_live": "yes"} if as_live else {})},
+        parameters={
+            "corners": corners,
+            **({"as_live": "yes"} if as_live else {}),
+            **version_parameters("detect", corners),
+        },
         rig=rig,
         lenses=lenses,
         as_live=as_live,
@@ -183,7 +188,10 @@ def _camera_frame(session: Session, request: Request, markers: str) -> Task | st
         camera_frame.READS,
         lambda run: camera_frame.CameraFrame(request.method),
         # Logs from before there was a choice have no such parameter.
-        parameters={} if default else {"method": request.method},
+        parameters={
+            **({} if default else {"method": request.method}),
+            **version_parameters("camera-frame", request.method),
+        },
         rig=rig,
         lenses=lenses,
     )
@@ -229,7 +237,8 @@ def _fit(session: Session, request: Request, points: str, model: str) -> Task | 
         )
         return fitted
 
-    parameters = {"model": model, **split_parameters(session, request)}
+    split_by = split_parameters(session, request)
+    parameters = {"model": model, **split_by, **version_parameters("fit", model)}
     return Task(
         "fit", base, tuple(topics), (Model,), compute=compute, parameters=parameters, rig=rig, notes=notes
     )
@@ -303,6 +312,7 @@ def _evaluate(session: Session, request: Request, points: str, model: str) -> Ta
     if again:
         folds = {"folds": str(FOLDS), "repeats": str(REPEATS), "seed": str(request.seed)}
         parameters = {**split_parameters(session, request), **folds}
+    parameters |= version_parameters("evaluate", name)
     return Task(
         "evaluate",
         model,
@@ -319,8 +329,16 @@ def _locate(session: Session, request: Request, points: str, model: str) -> Task
     fitted: Model = session.payloads(session.topics(Model, model))[-1]
     rig, topics = _rig(session, request, "locate") if reads_height(fitted.name) else (None, [])
     topics += [*session.topics(CameraPoints, points), *session.topics(Model, model)]
-    writes, step = (Positions,), lambda run: locate.Locate(fitted)
-    return Task("locate", model, tuple(topics), writes, locate.READS, step, rig=rig)
+    return Task(
+        "locate",
+        model,
+        tuple(topics),
+        (Positions,),
+        locate.READS,
+        lambda run: locate.Locate(fitted),
+        parameters=version_parameters("locate", fitted.name),
+        rig=rig,
+    )
 
 
 def _fuse(session: Session, request: Request, positions: str) -> Task | str:
@@ -328,8 +346,17 @@ def _fuse(session: Session, request: Request, positions: str) -> Task | str:
     topics += session.topics(Positions, positions)
     if has_late_frames(session):  # a log without any has the runs that it had
         topics.append(EVENTS_TOPIC)
-    writes = (Tracks, FrameTransforms)
-    return Task("fuse", positions, tuple(topics), writes, fuse.READS, fuse.Fuse, per_camera=False, rig=rig)
+    return Task(
+        "fuse",
+        positions,
+        tuple(topics),
+        (Tracks, FrameTransforms),
+        fuse.READS,
+        fuse.Fuse,
+        per_camera=False,
+        parameters=version_parameters("fuse"),
+        rig=rig,
+    )
 
 
 _PLANS: dict[str, Callable[..., Task | str]] = {

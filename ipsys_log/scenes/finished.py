@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterator, Mapping, Sequence
+from collections.abc import Callable, Iterator, Mapping, Sequence
 from contextlib import contextmanager
 from pathlib import Path
 from typing import Any
@@ -33,6 +33,7 @@ from ipsys_log.pipeline import replay
 from ipsys_log.runs.output import write_messages
 from ipsys_log.runs.records import newest_run
 from ipsys_log.runs.request import Progress, Request
+from ipsys_log.runs.states import out_of_date_lines
 from ipsys_log.stages.detect import decode_grey
 from ipsys_log.stages.detect.video import decode_last
 from ipsys_log.units import NS_PER_S
@@ -52,6 +53,7 @@ def opened_log(
     path: Path,
     request: Request,
     progress: Progress = lambda stage, done, total: None,
+    say: Callable[[str], None] = lambda text: None,
 ) -> Iterator[FinishedLog]:
     """Open a log for measuring; markers and camera points that it lacks are made and appended first.
 
@@ -59,6 +61,7 @@ def opened_log(
     ----------
     path : a finished log.
     request : its rig and lenses are used instead of the log's.
+    say : is told which of its runs are out of date.
 
     Raises
     ------
@@ -76,8 +79,10 @@ def opened_log(
             raise IpsysError(
                 f"{path}: its reference points change on the way; give those that hold with --rig"
             )
-    replay([path], request, "camera-frame", progress=progress)
+    replay([path], request, "camera-frame", progress=progress, say=say)
     with Session([path]) as session:
+        for line in out_of_date_lines(session, [newest_run(session, Model)]):
+            say(line)
         yield FinishedLog(path, session, rigs[-1])
 
 

@@ -1,0 +1,126 @@
+"""The state of recorded runs: whether this software would make the same of the log as it is now."""
+
+from __future__ import annotations
+
+from collections.abc import Collection, Iterable
+from dataclasses import dataclass, replace
+
+from ipsys_log.log.session import Session
+from ipsys_log.log.topics import camera_of_topic, run_of_topic
+from ipsys_log.messages import MEASUREMENTS_TOPIC, RIG_TOPIC, ChannelRead, Model, Run
+from ipsys_log.runs.records import is_complete
+from ipsys_log.runs.versions import VERSIONS, recorded_version, versioned_names
+from ipsys_log.stages.camera_frame import PERIMETER
+
+__all__ = ["Recorded", "is_fitted_here", "method_of", "out_of_date_lines", "recorded_stages"]
+
+_CURRENT = "current"
+# A model that was fitted to measurements of the same log has one of these parameters.
+_FITTED_HERE = frozenset(("train", "seed"))
+
+
+@dataclass(frozen=True, slots=True)
+class Recorded:
+    """A stage of a run, and its state.
+
+    Attributes
+    ----------
+    run : the record of the stage.
+    method : its corner method, camera-point method or model; "" where the stage has none.
+    state : ``current``, ``out of date: <reason>``, ``not repeatable``, ``unfinished``, or what to do where
+        newer software has made it.
+    out_of_date : the software, the log or an input run has changed since, and the stage can be repeated.
+    is_newer : newer software has made it.
+    """
+
+    run: Run
+    method: str
+    state: str = _CURRENT
+    out_of_date: bool = False
+    is_newer: bool = False
+
+    @property
+    def is_of_other_version(self) -> bool:
+        """Whether older or newer software has made it, which need not give the same."""
+        names = versioned_names(self.run.stage, self.method)
+        return any(recorded_version(self.run, name) != VERSIONS[name] for name in names)
+
+    @property
+    def stage_version(self) -> int:
+        """The version of the stage that made it."""
+        return recorded_version(self.run, self.run.stage)
+
+
+def recorded_stages(session: Session) -> list[Recorded]:
+    """Return every recorded stage with its state, oldest first."""
+    found: list[Recorded] = []
+    for run in session.runs():
+        stale = {one.run.run for one in found if one.out_of_date}
+        found.append(_judge(session, Recorded(run, method_of(session, run)), stale))
+    return found
+
+
+def out_of_date_lines(session: Session, names: Iterable[str | None]) -> list[str]:
+    """Return a line for each run of these names that is out of date, with its first such stage."""
+    lines: dict[str, str] = {}
+    wanted = set(names)
+    for one in recorded_stages(session):
+        if one.run.run in wanted and (one.out_of_date or one.is_newer):
+            lines.setdefault(one.run.run, f"run {one.run.run}: {one.run.stage} is {one.state}")
+    return [line if "update" in line else f"{line}; ipsys replay makes it again" for line in lines.values()]
+
+
+def is_fitted_here(run: Run) -> bool:
+    """Return whether a model was fitted, or evaluated, with measurements of the same log."""
+    return bool(run.parameters.keys() & _FITTED_HERE)
+
+
+def method_of(session: Session, run: Run) -> str:
+    """Return the corner method, camera-point method or model of a stage; "" where it has none."""
+    if run.stage == "detect":
+        return run.parameters.get("corners", "")
+    if run.stage == "camera-frame":
+        return run.parameters.get("method", PERIMETER)
+    if run.stage == "fit":
+        return run.parameters.get("model", "")
+    if run.stage in ("evaluate", "locate"):
+        read = {read.topic for read in run.inputs}
+        models = [topic for topic in read if topic in session.topics(Model, run_of_topic(topic))]
+        return str(session.payloads(models)[-1].name) if models else ""
+    return ""
+
+
+def _judge(session: Session, one: Recorded, stale: Collection[str]) -> Recorded:
+    """Return a stage with its state; ``stale`` are the runs before it that are out of date."""
+    run = one.run
+    if not is_complete(session, run):
+        return replace(one, state="unfinished")
+    versions = [(name, recorded_version(run, name)) for name in versioned_names(run.stage, one.method)]
+    for name, version in versions:
+        if version > VERSIONS[name]:
+            text = f"made by {name} {version}, this is {name} {VERSIONS[name]}: update ipsys"
+            return replace(one, state=text, is_newer=True)
+    is_copied = run.stage == "fit" and not is_fitted_here(run)
+    if is_copied or any(read.messages and not session.count(read.topic) for read in run.inputs):
+        return replace(one, state="not repeatable")
+    reasons = [
+        f"made by {name} {version}, this is {name} {VERSIONS[name]}"
+        for name, version in versions
+        if version < VERSIONS[name]
+    ]
+    reasons += [f"input {name} is" for name in run.input_runs if name in stale]
+    reasons += [_change(read) for read in run.inputs if _has_changed(session, read)]
+    return replace(one, state=f"out of date: {reasons[0]}", out_of_date=True) if reasons else one
+
+
+def _has_changed(session: Session, read: ChannelRead) -> bool:
+    return session.count(read.topic) != read.messages or session.hash(read.topic) != read.hash
+
+
+def _change(read: ChannelRead) -> str:
+    camera = camera_of_topic(read.topic)
+    if read.topic == MEASUREMENTS_TOPIC:
+        return "measurements changed"
+    if read.topic == RIG_TOPIC:
+        return "the rig changed"
+    return f"the lens of {camera} changed" if read.topic.endswith("/calibration") else f"{read.topic} changed"

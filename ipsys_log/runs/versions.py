@@ -1,0 +1,52 @@
+"""Versions of the stages, of their methods and of the models.
+
+A version is raised by one with each change after which the output differs for the same input. A run names
+the versions that it was made by among its parameters; it does not name version 1. Versions of packages make
+no run out of date: they are in its fingerprint.
+"""
+
+from __future__ import annotations
+
+from ipsys_log.messages import Run
+
+__all__ = ["VERSIONS", "recorded_version", "version_parameters", "versioned_names"]
+
+VERSIONS: dict[str, int] = {
+    "detect": 1,
+    "edges": 1,
+    "stock": 1,
+    "camera-frame": 1,
+    "perimeter": 1,
+    "pose": 1,
+    "fit": 1,
+    "rigid": 1,
+    "poly": 1,
+    "ann": 1,
+    "kriging": 1,
+    "kriging-regression": 1,
+    "rayplane": 1,
+    "best": 1,
+    "evaluate": 1,
+    "locate": 1,
+    "fuse": 1,
+}
+_MOST_DIGITS = 6
+
+
+def version_parameters(stage: str, method: str = "") -> dict[str, str]:
+    """Return the parameters of a run that name the versions of a stage and its method or model.
+
+    A hybrid such as ``rigid+poly`` has the versions of its parts.
+    """
+    return {name: str(VERSIONS[name]) for name in versioned_names(stage, method) if VERSIONS[name] != 1}
+
+
+def versioned_names(stage: str, method: str = "") -> list[str]:
+    """Return what has a version in a stage, the stage first."""
+    return [name for name in (stage, *method.split("+")) if name in VERSIONS]
+
+
+def recorded_version(run: Run, name: str) -> int:
+    """Return the version of a stage, method or model that a run was made by."""
+    text = run.parameters.get(name, "1")
+    return int(text) if text.isascii() and text.isdigit() and len(text) <= _MOST_DIGITS else 1

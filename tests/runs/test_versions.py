@@ -1,0 +1,200 @@
+"""Versions of stages: what older software made is told from what this one makes, and made again beside it."""
+
+from __future__ import annotations
+
+import json
+import shutil
+from pathlib import Path
+from typing import Any
+
+import pytest
+
+from ipsys_log.log import LogWriter
+from ipsys_log.log.session import Session
+from ipsys_log.models import MODELS
+from ipsys_log.runs import records
+from ipsys_log.runs.tasks import STAGES
+from ipsys_log.runs.versions import VERSIONS, recorded_version, version_parameters
+from ipsys_log.stages.camera_frame import METHODS
+from ipsys_log.stages.detect import CORNERS
+from tests.conftest import ROOT, Ipsys
+
+Rows = dict[tuple[str, str], dict[str, Any]]
+
+
+@pytest.fixture(scope="module")
+def replayed(lab_log: Path, tmp_path_factory: pytest.TempPathFactory) -> Path:
+    from ipsys_log.pipeline import replay
+    from ipsys_log.runs.request import Request
+
+    path = tmp_path_factory.mktemp("versions") / "lab.mcap"
+    shutil.copy(lab_log, path)
+    replay([path], Request())
+    return path
+
+
+@pytest.fixture
+def log(replayed: Path, tmp_path: Path) -> Path:
+    """A copy of a log with all stages up to fuse."""
+    return Path(shutil.copy(replayed, tmp_path / "lab.mcap"))
+
+
+def states(ipsys: Ipsys, log: Path) -> Rows:
+    done = ipsys("runs", log, "--json")
+    assert done.code == 0, done.err
+    return {(row["run"], row["stage"]): row for row in json.loads(done.out)}
+
+
+def made(ipsys: Ipsys, *arguments: object) -> dict[str, tuple[str, bool]]:
+    done = ipsys("replay", *arguments, "--json")
+    assert done.code == 0, done.err
+    return {row["stage"]: (row["run"], row["new"]) for row in json.loads(done.out)["stages"]}
+
+
+def test_everything_that_computes_has_a_version() -> None:
+    parts = {part for model in MODELS for part in model.split("+")}
+    assert VERSIONS.keys() == {*STAGES, *CORNERS, *METHODS, *parts}
+    assert min(VERSIONS.values()) >= 1
+
+
+def test_version_is_named_from_the_second_on(monkeypatch: pytest.MonkeyPatch) -> None:
+    assert version_parameters("fit", "rigid+kriging") == {}
+    monkeypatch.setitem(VERSIONS, "kriging", 3)
+    assert version_parameters("fit", "rigid+kriging") == {"kriging": "3"}
+    assert version_parameters("fuse") == {}
+
+
+def test_current_runs_are_found_again(ipsys: Ipsys, log: Path) -> None:
+    rows = states(ipsys, log)
+    assert {row["state"] for row in rows.values()} == {"current"}
+    assert {(row["stage_version"], row["out_of_date"]) for row in rows.values()} == {(1, False)}
+    assert not any(new for _, new in made(ipsys, log).values())
+
+
+@pytest.mark.parametrize("changed", ["detect", "edges"])
+def test_changed_stage_is_done_again_beside_the_old_run(
+    changed: str, ipsys: Ipsys, log: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setitem(VERSIONS, changed, 2)
+    rows = states(ipsys, log)
+    reason = f"out of date: made by {changed} 1, this is {changed} 2"
+    assert rows["edges", "detect"]["state"] == reason
+    assert rows["edges", "camera-frame"]["state"] == "out of date: input edges is"
+    assert rows["poly", "fuse"]["state"] == "out of date: input poly is"
+    assert all(row["out_of_date"] for row in rows.values())
+    done = ipsys("replay", log)
+    assert done.code == 0
+    with Session([log]) as session:
+        frames = sum(session.count(topic) for topic in session.images.values())
+    assert f"detect is computed again for {frames} frames; run edges is {reason}" in done.err
+    rows = states(ipsys, log)
+    assert rows["edges_2", "detect"]["parameters"][changed] == "2"
+    assert rows["edges_2", "detect"]["stage_version"] == (2 if changed == "detect" else 1)
+    assert rows["poly_2", "fuse"]["state"] == "current"
+    assert rows["poly", "fuse"]["out_of_date"]
+    assert not any(new for _, new in made(ipsys, log).values())
+
+
+def test_changed_model_leaves_the_detection_alone(
+    ipsys: Ipsys, log: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setitem(VERSIONS, "poly", 2)
+    found = made(ipsys, log)
+    assert {stage: new for stage, (_, new) in found.items()} == {
+        "detect": False,
+        "camera-frame": False,
+        "fit": True,
+        "evaluate": True,
+        "locate": True,
+        "fuse": True,
+    }
+    assert found["fuse"][0] == "poly_2"
+
+
+def test_run_of_newer_software_is_never_replaced(
+    ipsys: Ipsys, log: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    with monkeypatch.context() as newer:
+        newer.setitem(VERSIONS, "detect", 3)
+        made(ipsys, log)
+    monkeypatch.setitem(VERSIONS, "detect", 2)
+    before = log.read_bytes()
+    done = ipsys("replay", log)
+    assert done.code == 1
+    assert "run edges_2, stage detect: made by detect 3, this is detect 2: update ipsys" in done.err
+    assert log.read_bytes() == before
+    assert states(ipsys, log)["edges_2", "detect"]["out_of_date"] is False
+
+
+def test_verify_names_what_another_version_made_and_verifies_the_rest(
+    ipsys: Ipsys, log: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setitem(VERSIONS, "detect", 2)
+    done = ipsys("verify", log)
+    assert done.code == 0, done.out
+    assert (
+        "run edges: detect is out of date: made by detect 1, this is detect 2; it is not verified" in done.err
+    )
+    assert "/runs/poly/tracks" in ipsys("verify", log, "--json").out
+    for name in STAGES:
+        monkeypatch.setitem(VERSIONS, name, 2)
+    done = ipsys("verify", log)
+    assert done.code == 1
+    assert "nothing of its runs can be verified" in done.err
+
+
+def test_versions_of_packages_make_nothing_out_of_date(
+    ipsys: Ipsys, log: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setattr(records, "_versions", lambda: (("ipsys_log", "99.0"), ("numpy", "99.0")))
+    assert not any(new for _, new in made(ipsys, log).values())
+
+
+def test_measurement_since_makes_the_model_out_of_date(ipsys: Ipsys, log: Path, tmp_path: Path) -> None:
+    from ipsys_log.measuring.check import withdraw
+    from ipsys_log.messages import Message
+    from ipsys_log.runs.output import append_messages
+
+    with Session([log]) as session:
+        last, time_ns = session.payloads(["/measurements"])[-1], session.end_ns + 1
+    append_messages(log, [Message("/measurements", time_ns, time_ns, withdraw([last], last.id))])
+    rows = states(ipsys, log)
+    assert rows["edges", "camera-frame"]["state"] == "current"
+    assert rows["poly", "fit"]["state"] == "out of date: measurements changed"
+    assert rows["poly", "fuse"]["state"] == "out of date: input poly is"
+    done = ipsys("view", log, "--save", tmp_path / "a.rrd")
+    assert "run poly: fit is out of date: measurements changed; ipsys replay makes it again" in done.err
+    assert "fit is computed again; run poly is out of date: measurements changed" in ipsys("replay", log).err
+
+
+def test_run_without_its_inputs_is_not_repeatable_and_later_stages_go_on(
+    ipsys: Ipsys, tmp_path: Path
+) -> None:
+    log = Path(shutil.copy(ROOT / "sample_logs" / "paper_lab.mcap", tmp_path / "paper.mcap"))
+    first = states(ipsys, log)
+    assert first
+    assert {row["state"] for row in first.values()} == {"not repeatable"}
+    assert made(ipsys, log)["fuse"] == ("poly", True)
+    assert states(ipsys, log)["poly", "fuse"]["state"] == "current"
+
+
+def test_unfinished_run_is_said_to_be(ipsys: Ipsys, log: Path, tmp_path: Path) -> None:
+    short = tmp_path / "short.mcap"
+    with Session([log]) as session, LogWriter.create(short) as writer:
+        from ipsys_log.runs.output import write_message
+
+        left = 3
+        for message in session.messages({t for reader in session.readers for t in reader.channels}):
+            if message.topic == "/runs/poly/tracks":
+                left -= 1
+                if left < 0:
+                    continue
+            write_message(writer, message, {})
+    assert states(ipsys, short)["poly", "fuse"]["state"] == "unfinished"
+
+
+@pytest.mark.parametrize("text", ["", "two", "-1", "9" * 5000, "²"])
+def test_senseless_version_in_a_log_counts_as_the_first(text: str) -> None:
+    from ipsys_log.messages import Run
+
+    assert recorded_version(Run(0, "a", "detect", parameters={"detect": text}), "detect") == 1

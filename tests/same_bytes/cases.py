@@ -160,6 +160,7 @@ def _made() -> Iterator[Case]:
             ipsys("fit unmeasured.mcap --json"),
         ),
     )
+    yield Case("cameras", ("live.toml", "lab.mcap"), (ipsys("cameras --rig live.toml --json"),))
     yield Case("rig-of-a-log", ("lab.mcap",), (ipsys("init rig.toml --from lab.mcap"),))
 
 

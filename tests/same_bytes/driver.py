@@ -29,6 +29,7 @@ LIBRARIES = (
 )
 HERE = Path(__file__).resolve().parent
 LONGEST_S = 600
+MODIFIED_S = 1_700_001_000
 
 
 def main() -> None:
@@ -53,6 +54,8 @@ def run_case(case: dict[str, Any], inputs: Path, work: Path, tree: str) -> dict[
             shutil.copytree(inputs / name, folder / name)
         else:
             shutil.copy(inputs / name, folder / name)
+    for path in folder.rglob("*"):
+        os.utime(path, (MODIFIED_S, MODIFIED_S))  # repair keeps it
     codes = []
     for number, step in enumerate(case["steps"]):
         out, err = said / f"{number}.out", said / f"{number}.err"

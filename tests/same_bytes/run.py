@@ -15,8 +15,8 @@ A line of the allow file is CASE PLACE REASON. CASE and PLACE are patterns of a 
 is a topic, a path in JSON such as stages.3.run, the name of another file, exit-code, or for a whole log:
 order, schemas, bytes. The report names lines that allow nothing.
 
-Nothing is masked. Both commits run with the same environment variables, with relative paths in folders of the
-same names, and record with a scripted clock. Exit code: 0 equal, 1 different, 2 usage.
+Nothing is masked. Both commits run with the same environment variables, relative paths, and modification times
+of input files, and record with a scripted clock. Exit code: 0 equal, 1 different, 2 usage.
 """
 
 from __future__ import annotations

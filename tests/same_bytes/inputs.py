@@ -22,12 +22,12 @@ from mcap.writer import Writer
 from tests.same_bytes.cases import Case, ipsys
 from tests.same_bytes.differences import Log, decode, read_log
 
-__all__ = ["Inputs", "MissingInputError"]
+__all__ = ["MADE", "Inputs", "MissingInputError", "UnmadeInputError"]
 
 _LAB = "--width 960 --height 540 --markers 8 --stations 20 --frames-per-station 2 --rate-hz 5 --drive-s 1"
 _START = "--rig live.toml --calibration lab.mcap"
 # What the old commit makes: the inputs, and the command.
-_COMMANDS: dict[str, Case] = {
+MADE: dict[str, Case] = {
     "lab.mcap": Case("lab", (), (ipsys(f"simulate -o lab.mcap {_LAB}"),)),
     "fitted.mcap": Case("fitted", ("lab.mcap",), (ipsys("locate lab.mcap {models} -o fitted.mcap"),)),
     "lab.toml": Case("rig", ("lab.mcap",), (ipsys("init lab.toml --from lab.mcap"),)),
@@ -43,7 +43,11 @@ _COMMANDS: dict[str, Case] = {
 
 
 class MissingInputError(Exception):
-    """An input that is not at hand or cannot be made."""
+    """An input that is not at hand, such as public data."""
+
+
+class UnmadeInputError(Exception):
+    """An input that the old commit fails to make."""
 
 
 class Inputs:
@@ -64,7 +68,9 @@ class Inputs:
         Raises
         ------
         MissingInputError
-            For what cannot be made.
+            For what is not at hand.
+        UnmadeInputError
+            For what the old commit fails to make.
         """
         for name in names:
             if not (self.folder / name).exists():
@@ -76,12 +82,13 @@ class Inputs:
             if path.is_file():
                 shutil.copy(path, self.folder / name)
                 return
-        if name in _COMMANDS:
-            case = _COMMANDS[name]
+        if name in MADE:
+            case = MADE[name]
+            command = " ".join(case.steps[0].arguments)
             self.make(case.inputs)
             made = self._run(case) / name
             if not made.is_file():
-                raise MissingInputError(f"{name}: the old commit does not make it; see {made.parent}.said")
+                raise UnmadeInputError(f"{name}: the old commit does not make it: ipsys {command}")
             shutil.copy(made, self.folder / name)
         elif name in _DERIVED:
             sources, derive = _DERIVED[name]

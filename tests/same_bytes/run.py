@@ -15,8 +15,8 @@ A line of the allow file is CASE PLACE REASON. CASE and PLACE are patterns of a 
 is a topic, a path in JSON such as stages.3.run, the name of another file, exit-code, or for a whole log:
 order, schemas, bytes. The report names lines that allow nothing.
 
-Nothing is masked. Both commits run with the same environment variables, relative paths, and modification times
-of input files, and record with a scripted clock. Exit code: 0 equal, 1 different, 2 usage.
+Nothing is masked. Both commits run with the same environment variables, relative paths and modification times
+of input files. They record with a scripted clock. Exit code: 0 equal, 1 different, 2 usage.
 """
 
 from __future__ import annotations
@@ -45,7 +45,7 @@ from tests.same_bytes.differences import (
     compare_json,
     compare_logs,
 )
-from tests.same_bytes.inputs import Inputs, MissingInputError
+from tests.same_bytes.inputs import Inputs, MissingInputError, UnmadeInputError
 
 __all__ = ["CaseResult", "compare_case", "main", "report_lines"]
 
@@ -193,7 +193,9 @@ def report_lines(
     states = [result.state for result in results]
     different, ran = states.count("DIFFERENT"), len(states) - states.count("skipped")
     files = sum(result.files for result in results)
-    answer = f"DIFFERENT: {different} of {ran} cases" if different else f"equal: {ran} cases, {files} files"
+    answer = f"equal: {ran} cases, {files} files" if ran else "nothing compared"
+    if different:
+        answer = f"DIFFERENT: {different} of {ran} cases"
     notes = [f"{states.count(name)} {name}" for name in ("allowed", "skipped") if name in states]
     yield f"{answer}; {commits[0][:10]} -> {commits[1][:10]}; {', '.join([*notes, f'{seconds:.0f} s'])}"
     yield ""
@@ -266,17 +268,20 @@ def _compare(
         print(line, file=sys.stderr, flush=True)  # noqa: T201
 
     def prepare(case: Case) -> Path:
-        return sides[0].run([case], inputs.folder, show)[case.name].folder
+        sides[0].run([case], inputs.folder, show)
+        return sides[0].folder / "work" / case.name
 
     inputs = Inputs(folder / "inputs", sides[0].tree, prepare)
     inputs.folder.mkdir()
-    skipped: dict[str, str] = {}
+    unready: dict[str, CaseResult] = {}
     for case in cases:
         try:
             inputs.make(case.inputs)
         except MissingInputError as error:
-            skipped[case.name] = str(error)
-    ready = [case for case in cases if case.name not in skipped]
+            unready[case.name] = CaseResult(case.name, skipped=str(error))
+        except UnmadeInputError as error:
+            unready[case.name] = CaseResult(case.name, differences=[Difference("inputs", str(error))])
+    ready = [case for case in cases if case.name not in unready]
     outcomes: dict[str, Mapping[str, Outcome]] = {}
 
     def run(side: Side) -> None:
@@ -288,12 +293,7 @@ def _compare(
         if at_once == 1 or n == len(threads) - 1:
             thread.join()
     threads[0].join()
-    return [
-        CaseResult(case.name, skipped=skipped[case.name])
-        if case.name in skipped
-        else _result(case, outcomes, allowed)
-        for case in cases
-    ]
+    return [unready.get(case.name) or _result(case, outcomes, allowed) for case in cases]
 
 
 def _result(case: Case, outcomes: Mapping[str, Mapping[str, Outcome]], allowed: AllowList) -> CaseResult:
@@ -354,6 +354,8 @@ def main(arguments: Sequence[str] | None = None) -> int:
     else:
         for line in report_lines(results, options.commits, time.monotonic() - start_s, unused):
             print(_fitting(line))  # noqa: T201
+    if all(result.skipped is not None for result in results):
+        return 2
     return 1 if any(result.differences for result in results) else 0
 
 

@@ -20,6 +20,7 @@ from tests.conftest import ROOT
 from tests.same_bytes.allowed import AllowList, AllowListError
 from tests.same_bytes.cases import CASES, Case, ipsys
 from tests.same_bytes.differences import Difference, compare_json, compare_logs
+from tests.same_bytes.inputs import MADE, Inputs, MissingInputError, UnmadeInputError
 from tests.same_bytes.run import CaseResult, Outcome, compare_case, main, report_lines
 
 Row = tuple[str, int, Message]
@@ -203,7 +204,17 @@ def test_the_report_begins_with_the_answer() -> None:
 
 
 def test_cases_have_names_of_their_own() -> None:
-    assert len({case.name for case in CASES}) == len(CASES)
+    names = [case.name for case in (*CASES, *MADE.values())]
+    assert len(set(names)) == len(names)
+
+
+def test_inputs_not_at_hand_and_not_made_are_told_apart(tmp_path: Path) -> None:
+    (tmp_path / "inputs").mkdir()
+    inputs = Inputs(tmp_path / "inputs", tmp_path / "tree", lambda case: tmp_path / case.name)
+    with pytest.raises(MissingInputError, match=r"v9_9_9\.mcap"):
+        inputs.make(["v9_9_9.mcap"])
+    with pytest.raises(UnmadeInputError, match=r"lab\.mcap: the old commit does not make it: ipsys simulate"):
+        inputs.make(["sheet.csv"])
 
 
 @pytest.mark.parametrize("wrong", [["no-such-commit", "HEAD"], ["HEAD", "HEAD", "--only", "no-such-case"]])

@@ -33,11 +33,13 @@ from pathlib import Path
 __all__ = ["install"]
 
 _START_NS, _SINCE_BOOT_NS = 1_700_000_000_000_000_000, 1_000_000_000_000
-_LOOKS, _LOOK_S = 4, 0.003
+_LOOKS, _LOOK_S = 3, 0.003
 _LONGEST_S = 60.0
 
 _real_sleep, _real_start = time.sleep, threading.Thread.start
+_real_clock_ns = time.clock_gettime_ns
 _looking = threading.Lock()
+_conductors: set[int] = set()
 
 
 class _Script:
@@ -73,17 +75,23 @@ def install() -> None:
     script = _Script()
     script.numbers[threading.get_ident()] = 0
 
+    starting: list[threading.Thread] = []
+
     def start(thread: threading.Thread) -> None:
+        starting.append(thread)
         _real_start(thread)
         script.numbers.setdefault(thread.ident or 0, len(script.numbers))
         _wait_until_quiet()
+        starting.remove(thread)
 
     def conduct() -> None:
+        _conductors.add(threading.get_native_id())
         while True:
             _real_sleep(_LOOK_S)
             if script.sleepers:
                 _wait_until_quiet()
-                script.wake_next()
+                if not starting:  # who starts a thread waits too, but goes on by itself
+                    script.wake_next()
 
     conductor = threading.Thread(target=conduct, name="conductor", daemon=True)
     _real_start(conductor)
@@ -103,23 +111,33 @@ def _wait_until_quiet() -> None:
     """Return when no other thread of this process runs or could run."""
     with _looking:
         me, quiet, looked = threading.get_native_id(), 0, 0
+        before = _threads(me)
         while quiet < _LOOKS:
             _real_sleep(_LOOK_S)
-            quiet = quiet + 1 if all(state == "S" for state in _states(me)) else 0
+            now = _threads(me)
+            quiet = quiet + 1 if now == before and {state for state, _ in now.values()} <= {"S"} else 0
+            before = now
             looked += 1
             if looked * _LOOK_S > _LONGEST_S:
                 print("same-bytes: the threads of a recording do not come to rest", file=sys.stderr)  # noqa: T201
                 os._exit(75)
 
 
-def _states(but: int) -> list[str]:
-    """The state of each other thread: S where it waits for something that may be interrupted."""
-    found = []
+def _threads(but: int) -> dict[int, tuple[str, int]]:
+    """The state of each other thread, S where it waits, and its processor time in ns.
+
+    The state alone is not enough: a thread that waits for the interpreter's lock, because this thread has it,
+    is in the state S too. But it runs while this thread sleeps, and that shows in its time.
+    """
+    found = {}
     for task in Path("/proc/self/task").iterdir():
-        if task.name == str(but):
+        number = int(task.name)
+        if number == but or number in _conductors:
             continue
         try:
-            found.append((task / "stat").read_text().rpartition(")")[2].split()[0])
+            state = (task / "stat").read_text().rpartition(")")[2].split()[0]
+            # The clock of a thread by its number: CPUCLOCK_PERTHREAD and CPUCLOCK_SCHED of Linux.
+            found[number] = state, _real_clock_ns((~number << 3) | 6)
         except OSError:  # it has ended meanwhile
             continue
     return found

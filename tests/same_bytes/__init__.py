@@ -1,0 +1,1 @@
+"""Compare what two commits compute, byte for byte: ``scripts/same-bytes OLD NEW``."""

@@ -1,0 +1,42 @@
+"""The output of every stage, held to what it was: a change without a higher version is seen here."""
+
+from __future__ import annotations
+
+import json
+from typing import Any
+
+import numpy as np
+import pytest
+
+from ipsys_log.runs.versions import VERSIONS
+from tests.runs.stage_output import COMBINATIONS, EXPECTED, TOLERANCES, computed, environment, kind_of
+
+
+@pytest.fixture(scope="module")
+def expected() -> Any:
+    return json.loads(EXPECTED.read_text())
+
+
+def test_output_belongs_to_these_versions(expected: Any) -> None:
+    """Raise a version when the output changes, and write the file anew in the same commit."""
+    assert expected["versions"] == VERSIONS
+
+
+@pytest.mark.parametrize(
+    ("corners", "method"),
+    [
+        pytest.param(*one, marks=() if one == ("edges", "perimeter") else pytest.mark.slow)
+        for one in COMBINATIONS
+    ],
+)
+def test_output_of_stages_is_what_it_was(corners: str, method: str, expected: Any) -> None:
+    found, before = computed(corners, method), expected[f"{corners} {method}"]
+    assert found.keys() == before.keys()
+    counts = {topic: row["messages"] for topic, row in found.items()}
+    assert counts == {topic: row["messages"] for topic, row in before.items()}
+    if environment() == expected["environment"]:
+        changed = [topic for topic, row in found.items() if row["sha256"] != before[topic]["sha256"]]
+        assert changed == []
+    for topic, row in found.items():
+        for now, then in zip(row.get("numbers", ()), before[topic].get("numbers", ()), strict=True):
+            np.testing.assert_allclose(now, then, rtol=0, atol=TOLERANCES[kind_of(topic)], err_msg=topic)

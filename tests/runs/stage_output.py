@@ -35,18 +35,18 @@ LOG, EXPECTED = GOLDEN / "stages.mcap", GOLDEN / "stages.json"
 COMBINATIONS = [(corners, method) for corners in CORNERS for method in METHODS]
 _SAMPLES = 4  # messages of a channel whose numbers are kept
 _DIGITS = 9
-# By kind of channel: how far its numbers (px, m, rad) may be from the kept ones in another environment. Corners
+# By kind of channel: how far its numbers (px, m, rad) may be from those kept, in another environment. Corners
 # move by up to 0.15 px between OpenCV 4.14 and 5; a neural network moves by more than what it is fitted to.
 TOLERANCES = {"markers": 0.2, "camera_points": 0.02, "positions": 0.05, "tracks": 0.05}
 # Two environments with equal values here give equal bytes.
-_COUNTS = ("numpy", "scipy", "scikit-learn", "opencv-python-headless", "simplejpeg", "machine", "blas")
+_RELEVANT = ("numpy", "scipy", "scikit-learn", "opencv-python-headless", "simplejpeg", "machine", "blas")
 
 Channels = dict[str, dict[str, Any]]
 
 
 def environment() -> dict[str, str]:
     """Return what of the environment the bytes of a result can depend on."""
-    return {key: value for key, value in fingerprint().items() if key in _COUNTS}
+    return {key: value for key, value in fingerprint().items() if key in _RELEVANT}
 
 
 def computed(corners: str, method: str) -> Channels:

@@ -1,7 +1,6 @@
 """Check of every record of a log, finished or not."""
 
 from collections import ChainMap
-from dataclasses import replace
 
 from mcap import records as mcap
 from mcap.opcode import Opcode
@@ -13,6 +12,7 @@ from ipsys_log.log.definitions import Definitions
 from ipsys_log.log.findings import Indexed, Survey
 from ipsys_log.log.hashing import ChannelHash
 from ipsys_log.log.load import Summary
+from ipsys_log.log.passing import COUNTED, LOOSE, add_damage, close_indexes, pass_over
 from ipsys_log.log.records import (
     DATA_END,
     ENTRY,
@@ -27,7 +27,7 @@ from ipsys_log.log.records import (
     walk,
 )
 from ipsys_log.log.resync import PRIVATE, Resync, attachment_crc, check_exact, crc_of, is_index
-from ipsys_log.log.salvage import Rows, Salvage, Saved, up_to_first_hole
+from ipsys_log.log.salvage import Salvage, up_to_first_hole
 from ipsys_log.log.scan import add_record, count_all
 from ipsys_log.log.stretch import Stretch
 from ipsys_log.log.view import View
@@ -36,11 +36,7 @@ __all__ = ["HEADER_RECORD", "survey"]
 
 HEADER_RECORD = as_bytes(mcap.Header("", "ipsys 1"))
 _LAG = 1 << 20  # bytes
-_DOUBTFUL = 4096  # bytes
 _LONGEST_HEADER = 1 << 20  # bytes
-_LOOSE = frozenset((Opcode.SCHEMA, Opcode.CHANNEL, Opcode.MESSAGE, Opcode.ATTACHMENT, Opcode.METADATA))
-# If such a record is damaged, it is known how many messages are lost with it: none, or one.
-_COUNTED = _LOOSE | {Opcode.MESSAGE_INDEX, Opcode.DATA_END}
 
 
 def survey(
@@ -64,7 +60,7 @@ def survey(
     while position < view.size and not found.finished:
         position = _take_records(found, position)
     if found.indexed is not None:
-        _close_indexes(found, found.end)
+        close_indexes(found, found.end)
     _advance_crc(found, found.end)
     damaged.sort(key=lambda stretch: stretch.offset)
     if found.finished:
@@ -101,7 +97,7 @@ def _take_start(found: Survey) -> int:
             return view.size
         found.indexed = Indexed(follower) if follower > start else None
         head = MAGIC + (HEADER_RECORD if follower >= start + len(HEADER_RECORD) else b"")
-        _add_damage(found, Stretch(0, follower, head), "it does not begin as an MCAP file")
+        add_damage(found, Stretch(0, follower, head), "it does not begin as an MCAP file")
         return max(follower, behind)
     found.end = behind or start
     if behind:
@@ -110,7 +106,7 @@ def _take_start(found: Survey) -> int:
     if follower is None:
         return start
     head = HEADER_RECORD if follower >= start + len(HEADER_RECORD) else b""
-    return _add_damage(found, Stretch(start, follower - start, head), reason)
+    return add_damage(found, Stretch(start, follower - start, head), reason)
 
 
 def _behind_header(found: Survey) -> tuple[int, str]:
@@ -144,81 +140,8 @@ def _take_records(found: Survey, position: int) -> int:
     except BoundError:
         raise
     except LogError as error:
-        return _pass_over(found, position, at if at.offset == position else None, _reason(error))
+        return pass_over(found, position, at if at.offset == position else None, _reason(error))
     return view.size
-
-
-def _pass_over(found: Survey, position: int, at: RecordAt | None, reason: str) -> int:
-    """Find the next record behind damage at `position`; return its offset."""
-    claimed = at.offset + at.length if at is not None and found.wrong_length != position else 0
-    indexed = found.indexed
-    # A gap that is too small for a record of its own becomes a part of the damage before it.
-    behind_indexes = indexed is not None and indexed.inside is not None and position > indexed.start
-    joins = behind_indexes or bool(found.damaged and found.damaged[-1].end == position)
-    follower = found.resync.find(position, claimed, gap=1 if joins else HEADER.size)
-    is_small = follower is not None and follower < position + HEADER.size
-    if indexed is not None and indexed.inside is not None:
-        is_apart = indexed.is_complete or found.resync.is_chunk_head(position)
-        if is_apart and not is_small:
-            _close_indexes(found, position)
-        else:
-            found.faults.append(reason)
-            indexed.sound = False
-            found.end = found.view.size if follower is None else follower
-            return found.end
-    elif indexed is not None:
-        _close_indexes(found, position)
-    if follower is None:
-        return _end_at_damage(found, position, reason)
-    if at is None or at.opcode not in _COUNTED or follower != claimed:
-        found.indexed = Indexed(follower)
-    return _add_damage(found, Stretch(position, follower - position), reason)
-
-
-def _add_damage(found: Survey, stretch: Stretch, reason: str) -> int:
-    found.faults.append(reason)
-    found.lost.bytes += stretch.length
-    if found.indexed is not None:
-        found.indexed.stretch = replace(stretch)
-    last = found.damaged[-1] if found.damaged else None
-    if last is not None and last.end == stretch.offset:  # one place for what was defined in both
-        last.length += stretch.length
-    else:
-        found.damaged.append(stretch)
-    found.end = stretch.end
-    found.doubtful_to = max(found.doubtful_to, stretch.end + _DOUBTFUL)
-    return stretch.end
-
-
-def _end_at_damage(found: Survey, position: int, reason: str) -> int:
-    """End the survey at damage without records behind it, perhaps a chunk that was being written."""
-    found.faults.append(reason)
-    found.end = position
-    found.cut = Stretch(position, found.view.size - position)
-    found.lost.bytes += found.cut.length
-    _save(found, found.cut, {})
-    return found.view.size
-
-
-def _save(found: Survey, stretch: Stretch, rows: Rows) -> None:
-    """Save the readable messages of a damaged chunk, and note the others as lost."""
-    saved = Saved()
-    if found.saved is not None and found.resync.chunked is not False:
-        saved = found.saved.save(
-            found.view, stretch, rows, found.definitions, found.hashes, in_order=stretch is found.cut
-        )
-    gone = [
-        (channel, time_ns)
-        for channel, entries in rows.items()
-        for time_ns, offset in entries
-        if (channel, offset) not in saved.messages
-    ]
-    for channel, time_ns in gone if rows else saved.torn:
-        found.lost.note(found.definitions.topic(channel), time_ns)
-    if saved.note:
-        found.faults.append(saved.note)
-    found.lost.uncounted += not (rows or saved.counted)
-    found.lost.bytes -= int(saved.share * stretch.length)
 
 
 def _take(found: Survey, at: RecordAt) -> None:
@@ -231,7 +154,7 @@ def _take(found: Survey, at: RecordAt) -> None:
     if at.opcode == Opcode.MESSAGE and indexed is not None and indexed.inside and not indexed.is_complete:
         raise view.fault(at.offset, "a message lies among the message indexes of a chunk")
     if indexed is not None:
-        _close_indexes(found, at.offset)
+        close_indexes(found, at.offset)
     if at.opcode == Opcode.DATA_END and at.length == DATA_END.size:
         _advance_crc(found, at.offset)
         if not found.resync.is_end(at.offset, found.crc):
@@ -239,7 +162,7 @@ def _take(found: Survey, at: RecordAt) -> None:
         found.finished, found.end = True, at.offset
     elif at.opcode == Opcode.CHUNK:
         _take_chunk(found, at)
-    elif at.opcode in _LOOSE:
+    elif at.opcode in LOOSE:
         _take_loose(found, at)
     elif at.opcode < PRIVATE:
         raise view.fault(at.offset, f"a record of type {at.opcode} has no place there")
@@ -256,7 +179,7 @@ def _check_length(found: Survey, at: RecordAt) -> None:
     follows = stop == view.size
     if stop + HEADER.size <= view.size:
         opcode, length = HEADER.unpack(view.read(stop, HEADER.size))
-        known = opcode in _LOOSE or opcode in _COUNTED or opcode == Opcode.CHUNK or opcode >= PRIVATE
+        known = opcode in LOOSE or opcode in COUNTED or opcode == Opcode.CHUNK or opcode >= PRIVATE
         follows = known and length <= view.size - stop - HEADER.size and at.offset >= found.doubtful_to
         follows = follows or found.resync.is_chunk_head(stop)  # cut off, perhaps
     if not follows:
@@ -377,7 +300,7 @@ def _take_index(found: Survey, at: RecordAt) -> None:
         channel, rows = _index_rows(found.view, at)
         for time_ns, _ in rows:
             found.lost.note(found.definitions.topic(channel), time_ns)
-        _add_damage(found, Stretch(at.offset, at.length), "a MessageIndex record follows no chunk")
+        add_damage(found, Stretch(at.offset, at.length), "a MessageIndex record follows no chunk")
         return
     if not is_index(found.view, at):
         raise found.view.fault(at.offset, "a MessageIndex record has another length than its entries")
@@ -404,35 +327,6 @@ def _index_rows(view: View, at: RecordAt) -> tuple[int, list[tuple[int, int]]]:
     body = view.read(at.offset, at.length)
     channel = int.from_bytes(body[HEADER.size : HEADER.size + 2], "little")
     return channel, list(ENTRY.iter_unpack(parse_message_index(view, body, 0, channel, at.offset)))
-
-
-def _close_indexes(found: Survey, stop: int) -> None:
-    """Check the message indexes of a chunk, or of a damaged stretch, when all of them were seen."""
-    indexed, found.indexed = found.indexed, None
-    assert indexed is not None
-    if indexed.stretch is not None:
-        _save(found, indexed.stretch, indexed.rows)
-    elif indexed.inside is not None:
-        _close_chunk(found, indexed, indexed.inside, stop)
-
-
-def _close_chunk(found: Survey, indexed: Indexed, inside: Inside, stop: int) -> None:
-    chunk = found.contents.chunks[-1]
-    if indexed.is_complete:
-        found.contents.chunks[-1] = chunk._replace(
-            index_length=stop - indexed.start, index_offsets=indexed.offsets
-        )
-        return
-    if stop == found.view.size:  # and so the log has no end: they are written anew with it
-        found.end = indexed.start
-        found.cut = Stretch(found.end, stop - found.end)
-        found.unindexed = inside
-    elif stop > indexed.start:
-        number = len(found.contents.chunks) - 1
-        stretch = Stretch(indexed.start, stop - indexed.start, chunk=number, entries=inside.entries)
-        found.damaged.append(stretch)
-        if indexed.sound:
-            found.faults.append("the message indexes of a chunk are not complete")
 
 
 def _advance_crc(found: Survey, position: int) -> None:

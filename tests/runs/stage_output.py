@@ -2,7 +2,7 @@
 
     python -m tests.runs.stage_output
 
-writes ``tests/golden/stages.json`` anew: the versions of stages, methods and models, the environment, and for
+writes ``tests/golden/stages/expected.json`` anew: the versions of stages, methods and models, the environment, and for
 each channel the hash of its bytes and some of its numbers. A hash that changes without a higher version is a
 mistake.
 """
@@ -30,8 +30,8 @@ from ipsys_log.runs.versions import VERSIONS
 from ipsys_log.stages.camera_frame import METHODS
 from ipsys_log.stages.detect import CORNERS
 
-GOLDEN = Path(__file__).parents[1] / "golden"
-LOG, EXPECTED = GOLDEN / "stages.mcap", GOLDEN / "stages.json"
+GOLDEN = Path(__file__).parents[1] / "golden" / "stages"
+LOG, EXPECTED = GOLDEN / "frames.mcap", GOLDEN / "expected.json"
 COMBINATIONS = [(corners, method) for corners in CORNERS for method in METHODS]
 _SAMPLES = 4  # messages of a channel whose numbers are kept
 _DIGITS = 9

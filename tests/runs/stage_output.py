@@ -2,9 +2,9 @@
 
     python -m tests.runs.stage_output
 
-writes ``tests/golden/stages/expected.json`` anew: the versions of stages, methods and models, the environment,
-and for each channel the hash of its bytes and some of its numbers. A hash that changes without a higher version
-is a mistake.
+writes ``tests/golden/stages/expected.json`` anew: the versions of stages, methods and models, the
+environment, and for each channel the hash of its bytes and some of its numbers. A hash that changes without a
+higher version is a mistake.
 """
 
 from __future__ import annotations

@@ -330,15 +330,15 @@ def live(
                     show(message)
     if fault is not None:
         raise IpsysError(f"{fault}; {target} has all frames: replay it") from fault
+    try:
+        outcomes = sign(target, replace(plan.request, as_live=bool(frames.skipped)), plan.runs)
+    finally:
+        log.check_disk()
     if frames.skipped:
         cameras.say(
             f"{frames.skipped.total()} frames are recorded but were not looked at: the stages were too slow. "
             f"ipsys replay {target} looks at all, with --as-live at those that were looked at"
         )
-    try:
-        outcomes = sign(target, replace(plan.request, as_live=bool(frames.skipped)), plan.runs)
-    finally:
-        log.check_disk()
     show.check()
     return outcomes
 

@@ -186,8 +186,8 @@ def _interrupt_again(*_: object) -> None:
     """Raise an interrupt again that is not on its way any more."""
     error = sys.exception()
     while error is not None:
-        if isinstance(error, Interrupted):
-            return  # it is: some block cleans up
+        if isinstance(error, (Interrupted, GeneratorExit)):
+            return  # it is: some block, or a generator that it has ended, cleans up
         error = error.__context__
     if _state.raised is not None:
         raise Interrupted(_state.raised.exit_code, _state.raised.text)

@@ -102,10 +102,12 @@ def keep_old_bytes(storage: Storage, view: View, change: Change, time_ns: int) -
     return True
 
 
-def discard(storage: Storage, path: Path) -> None:
-    """Remove what `keep_old_bytes` wrote for a repair that was given up."""
+def discard(storage: Storage, path: Path, fd: int) -> None:
+    """Remove what `keep_old_bytes` wrote for a repair that was given up, unless its new end is in place."""
+    partial = _beside(path, ".damaged.partial")
     with suppress(OSError):
-        storage.unlink(_beside(path, ".damaged.partial"))
+        if _committed_patches(partial, path, fd) is None:
+            storage.unlink(partial)
 
 
 def overwrite(storage: Storage, path: Path, fd: int, patches: Sequence[Patch]) -> Path:

@@ -74,6 +74,7 @@ class Survey:
     end: int = 0
     crc: int = 0
     crc_is_right: bool = True
+    has_crc: bool = False  # of the data section
     finished: bool = False
     crc_at: int = 0
     wrong_length: int = -1  # a record whose length cannot be right

@@ -117,6 +117,10 @@ class Pending:
             replace_tail(self.storage, self.path, self.fd, self.start, pieces, self.standing)
         except OSError as error:
             self._settle(error, tail)
+        except BaseException:  # an interrupt: the old log, or the new one where that is complete
+            with suppress(OSError):
+                roll_back(self.storage, self.path, self.fd)
+            raise
 
     def _settle(self, error: OSError, tail: bytes) -> None:
         """Say which log stands after a fault of the disk, the old one if possible.

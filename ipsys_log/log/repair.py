@@ -296,10 +296,10 @@ def _commit(storage: Storage, view: View, change: Change, plan: _Plan) -> Path |
     kept = keep_old_bytes(storage, view, change, os.fstat(fd).st_mtime_ns)
     try:
         replace_tail(storage, path, fd, change.start, _Blocks(plan.tail.fileno(), plan.tail_size))
-    except OSError:
-        with suppress(OSError):  # else whoever next writes does it
+    except BaseException:  # of the disk, or an interrupt
+        with suppress(OSError):  # else the next writer does it
             roll_back(storage, path, fd)
-            discard(storage, path)
+            discard(storage, path, fd)
         raise
     return overwrite(storage, path, fd, change.patches) if kept else None
 
@@ -324,6 +324,8 @@ def _report(
     if own_end < view.size:
         notes.append(f"{view.size - own_end} bytes behind its end, perhaps another log, were cut off")
     gone, counted = _gone(found, known)
+    # Without a CRC and a summary nothing tells whether whole records were taken out of it.
+    is_unsure = found.finished and not (found.has_crc and found.crc_is_right)
     return RepairReport(
         view.path,
         True,
@@ -334,7 +336,7 @@ def _report(
         tuple(notes),
         cut_off=not found.finished and known is None,
         gone=gone,
-        uncounted=found.lost.uncounted > 0 and not counted,
+        uncounted=not counted and (found.lost.uncounted > 0 or is_unsure),
         unchecked=saved.unchecked,
         kept_in=kept_in,
     )

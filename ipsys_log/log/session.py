@@ -158,14 +158,14 @@ class Session:
 
     def stored(self, topics: Collection[str]) -> Iterator[tuple[Message, bytes]]:
         """As :meth:`messages`, each with the bytes that the log has of its payload."""
-        streams = [
-            (
-                (self._message(reader, raw, items), bytes(raw.data))
-                for raw in self._raw(reader, topics, None, None)
-            )
-            for reader, items in self._items()
-        ]
+        streams = [self._stored(reader, items, topics) for reader, items in self._items()]
         return heapq.merge(*streams, key=lambda row: row[0].log_time_ns)
+
+    def _stored(
+        self, reader: LogReader, items: Items, topics: Collection[str]
+    ) -> Iterator[tuple[Message, bytes]]:
+        for raw in self._raw(reader, topics, None, None):
+            yield self._message(reader, raw, items), bytes(raw.data)
 
     def _raw(
         self, reader: LogReader, topics: Collection[str], start_ns: int | None, end_ns: int | None

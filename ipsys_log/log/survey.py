@@ -66,6 +66,7 @@ def survey(
     if found.finished:
         _, _, stored = DATA_END.unpack(view.read(found.end, DATA_END.size))
         found.crc_is_right = stored in (0, found.crc)
+        found.has_crc = stored != 0
     found.loose.schemas, found.loose.channels = definitions.schemas, definitions.channels
     count_all(found.contents, found.loose, found.counts)
     return found
@@ -151,7 +152,8 @@ def _take(found: Survey, at: RecordAt) -> None:
         _take_index(found, at)
         return
     indexed = found.indexed
-    if at.opcode == Opcode.MESSAGE and indexed is not None and indexed.inside and not indexed.is_complete:
+    is_among = indexed is not None and indexed.inside is not None and not indexed.is_complete
+    if at.opcode == Opcode.MESSAGE and is_among and found.resync.chunked:
         raise view.fault(at.offset, "a message lies among the message indexes of a chunk")
     if indexed is not None:
         close_indexes(found, at.offset)
@@ -218,6 +220,8 @@ def _take_loose(found: Survey, at: RecordAt) -> None:
                 found.homeless.append(at)
             raise
         found.resync.times_ns.append(time_ns)
+        if found.resync.chunked and at.offset >= found.doubtful_to:
+            found.resync.chunked = None  # its messages lie in chunks and beside them
     elif at.opcode in (Opcode.SCHEMA, Opcode.CHANNEL):
         found.definitions.take(view, at, doubtful=at.offset < found.doubtful_to)
         return
@@ -257,7 +261,7 @@ def _take_chunk(found: Survey, at: RecordAt) -> None:
         found.contents.chunks[-1] = chunk._replace(start_ns=span[0], end_ns=span[1])
     found.counts[at.offset] = {key: len(rows) for key, rows in inside.entries.items()}
     _continue_hashes(found, inside, data)
-    if not found.resync.times_ns:  # else messages lie in chunks and beside them
+    if not found.resync.times_ns:  # else its messages lie in chunks and beside them
         found.resync.chunked = True
     found.indexed = Indexed(stop, inside)
 

@@ -101,14 +101,21 @@ def _model_topics(session: Session) -> list[str]:
 
 def _copied_models(session: Session) -> tuple[str, ...]:
     """Return the names of the models that were copied into a log without measurements, oldest first."""
-    if session.topics(Measurement):
+    if _has_measurements(session):
         return ()
     return tuple(dict.fromkeys(session.payloads([topic])[-1].name for topic in _model_topics(session)))
 
 
+def _has_measurements(session: Session) -> bool:
+    """Return whether a measurement was entered and not withdrawn."""
+    entered: list[Measurement] = session.payloads(session.topics(Measurement))
+    gone = {one.withdraws for one in entered}
+    return any(one.withdraws is None and one.id not in gone for one in entered)
+
+
 def copied_run(session: Session, model: str) -> str | None:
     """The run of a model that was copied into a log without measurements, the newest one."""
-    if session.topics(Measurement):
+    if _has_measurements(session):
         return None
     for topic in reversed(_model_topics(session)):
         if session.payloads([topic])[-1].name == model:

@@ -16,6 +16,7 @@ from ipsys_log.offline.pairs import split
 from ipsys_log.offline.tape import world_point
 from ipsys_log.rig import check_rig
 from ipsys_log.runs.lookup import can_evaluate, copied_run, fitted_in, measured
+from ipsys_log.runs.perform import SHARED_STAGES
 from ipsys_log.runs.records import newest_run
 from ipsys_log.runs.request import Request
 from ipsys_log.runs.states import recorded_stages
@@ -51,6 +52,7 @@ def check_inputs(paths: Sequence[Path], request: Request, models: Sequence[str],
         if until == "evaluate":
             _check_evaluation(session, request, models)
         _check_versions(session, request, models, wanted)
+        _check_run_name(session, request, until)
 
 
 def _check_versions(session: Session, request: Request, models: Sequence[str], wanted: Sequence[str]) -> None:
@@ -61,6 +63,17 @@ def _check_versions(session: Session, request: Request, models: Sequence[str], w
         is_asked = one.run.stage in wanted and one.method in methods.get(one.run.stage, models)
         if one.is_newer and is_asked:
             raise IpsysError(f"{session}: run {one.run.run}, stage {one.run.stage}: {one.state}")
+
+
+def _check_run_name(session: Session, request: Request, until: str) -> None:
+    """See that the run of the name that the user gives is not an older one of other inputs."""
+    for one in recorded_stages(session):
+        is_named = one.run.stage == until or not {one.run.stage, until} & set(SHARED_STAGES)
+        if one.run.run == request.run and one.out_of_date and is_named:
+            raise IpsysError(
+                f"run {request.run} already has the stage {one.run.stage}, which is {one.state}; use another "
+                "--run name"
+            )
 
 
 def _check_request(paths: Sequence[Path], request: Request, models: Sequence[str]) -> None:

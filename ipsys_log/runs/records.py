@@ -120,8 +120,8 @@ def check_run_name(session: Session, stage: str, name: str, writes: Sequence[typ
 
 
 def newest_run(session: Session, payload: type) -> str | None:
-    """The complete run that wrote a type of payload last."""
+    """Return the run whose newest complete stage wrote a type of payload."""
     for run in reversed(complete_runs(session)):
-        if session.topics(payload, run.run):
+        if {output.topic for output in run.outputs} & set(session.topics(payload, run.run)):
             return run.run
     return None

@@ -43,7 +43,7 @@ class Recorded:
     def is_of_other_version(self) -> bool:
         """Whether older or newer software has made it, which need not give the same."""
         names = versioned_names(self.run.stage, self.method)
-        return any(recorded_version(self.run, name) != VERSIONS[name] for name in names)
+        return any(recorded_version(self.run, name) != VERSIONS.get(name) for name in names)
 
     @property
     def stage_version(self) -> int:
@@ -53,11 +53,14 @@ class Recorded:
 
 def recorded_stages(session: Session) -> list[Recorded]:
     """Return every recorded stage with its state, oldest first."""
-    found: list[Recorded] = []
-    for run in session.runs():
-        stale = {one.run.run for one in found if one.out_of_date}
-        found.append(_judge(session, Recorded(run, method_of(session, run)), stale))
-    return found
+    stages = [_judge(session, Recorded(run, method_of(session, run))) for run in session.runs()]
+    stale: set[str] = set()  # topics that stages wrote which are out of date
+    while True:
+        more = {output.topic for one in stages if one.out_of_date for output in one.run.outputs} - stale
+        if not more:
+            return stages
+        stale |= more
+        stages = [_judge_inputs(one, stale) for one in stages]
 
 
 def out_of_date_lines(session: Session, names: Iterable[str | None]) -> list[str]:
@@ -65,7 +68,8 @@ def out_of_date_lines(session: Session, names: Iterable[str | None]) -> list[str
     lines: dict[str, str] = {}
     wanted = set(names)
     for one in recorded_stages(session):
-        if one.run.run in wanted and (one.out_of_date or one.is_newer):
+        is_shown = one.run.run in wanted and one.run.stage != "evaluate"
+        if is_shown and (one.out_of_date or one.is_newer):
             lines.setdefault(one.run.run, f"run {one.run.run}: {one.run.stage} is {one.state}")
     return [line if "update" in line else f"{line}; ipsys replay makes it again" for line in lines.values()]
 
@@ -90,27 +94,35 @@ def method_of(session: Session, run: Run) -> str:
     return ""
 
 
-def _judge(session: Session, one: Recorded, stale: Collection[str]) -> Recorded:
-    """Return a stage with its state; ``stale`` are the runs before it that are out of date."""
+def _judge(session: Session, one: Recorded) -> Recorded:
+    """Return a stage with its state, as far as its own record and the log tell it."""
     run = one.run
     if not is_complete(session, run):
         return replace(one, state="unfinished")
-    versions = [(name, recorded_version(run, name)) for name in versioned_names(run.stage, one.method)]
-    for name, version in versions:
-        if version > VERSIONS[name]:
-            text = f"made by {name} {version}, this is {name} {VERSIONS[name]}: update ipsys"
-            return replace(one, state=text, is_newer=True)
+    names = versioned_names(run.stage, one.method)
+    for name in names:
+        version = recorded_version(run, name)
+        if version > VERSIONS.get(name, 0):
+            here = f"this is {name} {VERSIONS[name]}" if name in VERSIONS else "which is not known here"
+            return replace(one, state=f"made by {name} {version}, {here}: update ipsys", is_newer=True)
     is_copied = run.stage == "fit" and not is_fitted_here(run)
     if is_copied or any(read.messages and not session.count(read.topic) for read in run.inputs):
         return replace(one, state="not repeatable")
     reasons = [
-        f"made by {name} {version}, this is {name} {VERSIONS[name]}"
-        for name, version in versions
-        if version < VERSIONS[name]
+        f"made by {name} {recorded_version(run, name)}, this is {name} {VERSIONS[name]}"
+        for name in names
+        if recorded_version(run, name) < VERSIONS[name]
     ]
-    reasons += [f"input {name} is" for name in run.input_runs if name in stale]
     reasons += [_change(read) for read in run.inputs if _has_changed(session, read)]
     return replace(one, state=f"out of date: {reasons[0]}", out_of_date=True) if reasons else one
+
+
+def _judge_inputs(one: Recorded, stale: Collection[str]) -> Recorded:
+    """Return a stage that was current as out of date, if it read a ``stale`` topic."""
+    names = [str(run_of_topic(read.topic)) for read in one.run.inputs if read.topic in stale]
+    if one.state != _CURRENT or not names:
+        return one
+    return replace(one, state=f"out of date: input {names[0]} is", out_of_date=True)
 
 
 def _has_changed(session: Session, read: ChannelRead) -> bool:

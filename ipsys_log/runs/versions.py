@@ -38,12 +38,13 @@ def version_parameters(stage: str, method: str = "") -> dict[str, str]:
 
     A hybrid such as ``rigid+poly`` has the versions of its parts.
     """
-    return {name: str(VERSIONS[name]) for name in versioned_names(stage, method) if VERSIONS[name] != 1}
+    versions = [(name, VERSIONS.get(name, 1)) for name in versioned_names(stage, method)]
+    return {name: str(version) for name, version in versions if version != 1}
 
 
 def versioned_names(stage: str, method: str = "") -> list[str]:
     """Return what has a version in a stage, the stage first."""
-    return [name for name in (stage, *method.split("+")) if name in VERSIONS]
+    return [stage, *(part for part in method.split("+") if part)]
 
 
 def recorded_version(run: Run, name: str) -> int:

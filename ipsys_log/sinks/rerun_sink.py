@@ -2,8 +2,8 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Hashable, Iterable, Mapping, Sequence
-from typing import Any
+from collections.abc import Callable, Iterable, Mapping, Sequence
+from typing import Any, NamedTuple
 
 import numpy as np
 import rerun as rr
@@ -51,6 +51,23 @@ def trail_entity(run: str | None) -> str:
     return "/".join((*tracks_entity(run), "trails"))
 
 
+class _Look(NamedTuple):
+    """The look of an entity, the publish time from which it holds, and that at which it was drawn last.
+
+    Without a key the look is not known: it is drawn again.
+    """
+
+    key: str | None
+    since_ns: int
+    last_ns: int
+    is_drawn: bool = True
+
+
+_NO_LOOK = _Look(None, 0, 0, is_drawn=False)
+# What may be drawn below an entity that is cleared.
+_PARTS = (("ids",), ("heading",), ("markers",), ("markers", "ids"))
+
+
 class RerunSink:
     """Draw messages, in log order, into a recording.
 
@@ -77,7 +94,7 @@ class RerunSink:
         self._runs = tuple(runs)
         self._robots: dict[tuple[str | None, str], int] = {}
         self._waiting: dict[Entity, tuple[Kind, list[tuple[Message | Segment, Fields]]]] = {}
-        self._looks: dict[Entity, tuple[Hashable, int]] = {}  # and the publish time from which each holds
+        self._looks: dict[Entity, _Look] = {}
         self._fading = Fading(self._clear)
         self._trails = Trails(self._draw_segment)
         self._draw: dict[type, Callable[[Message], None]] = {
@@ -119,14 +136,16 @@ class RerunSink:
 
     def _log_moved(self, message: Message, entity: Entity, kind: Kind, moved: Fields, look: Fields) -> None:
         """Draw where something is now, and its look only where that is new: it takes most of the time."""
-        key = str(look)
-        before, since_ns = self._looks.get(entity, (None, 0))
-        is_late = message.publish_time_ns < since_ns
-        if key == before and not is_late:
+        key, time_ns = str(look), message.publish_time_ns
+        before = self._looks.get(entity, _NO_LOOK)
+        last_ns, is_late = max(before.last_ns, time_ns), time_ns < before.since_ns
+        if key == before.key and not is_late:
+            self._looks[entity] = before._replace(last_ns=last_ns)
             self._add(message, entity, kind, moved)
             return
         # Behind a late message it is not known which look is the newest one.
-        self._looks[entity] = (None, since_ns) if is_late else (key, message.publish_time_ns)
+        now = _Look(None, before.since_ns, last_ns) if is_late else _Look(key, time_ns, last_ns)
+        self._looks[entity] = now
         self._send(entity)
         self._log(message, entity, kind.from_fields(**moved, **look))
 
@@ -150,9 +169,16 @@ class RerunSink:
         path = rr.new_entity_path(list(entity))
         rr.send_columns(path, timelines, columns, recording=self._recording)
 
+    def _clear_now(self, message: Message, entity: Entity) -> None:
+        """Clear what is drawn, unless something later is drawn already."""
+        look = self._looks.get(entity, _NO_LOOK)
+        if look.is_drawn and message.publish_time_ns >= look.last_ns:
+            self._clear(entity, message.publish_time_ns, message.log_time_ns)
+
     def _clear(self, entity: Entity, publish_time_ns: int, log_time_ns: int) -> None:
-        for part in (entity, (*entity, "ids"), (*entity, "heading")):
-            self._looks.pop(part, None)
+        for part in (entity, *((*entity, *below) for below in _PARTS)):
+            if part in self._looks:
+                self._looks[part] = _Look(None, publish_time_ns, publish_time_ns, is_drawn=False)
             self._send(part)
         self._log_at(publish_time_ns, log_time_ns, entity, rr.Clear(recursive=True))
 
@@ -170,7 +196,7 @@ class RerunSink:
         entity = ("cameras", str(message.camera), "image", "markers")
         markers = message.payload.markers
         if not markers:
-            self._clear(entity, message.publish_time_ns, message.log_time_ns)
+            self._clear_now(message, entity)
             return
         outlines = [np.vstack([m.corners_px, m.corners_px[:1]]) + _CORNER_FROM_CENTRE_PX for m in markers]
         line = {"colors": [MARKER_COLOUR], "radii": [_LINE]}
@@ -187,7 +213,7 @@ class RerunSink:
         entity = (*tracks_entity(run_of_topic(message.topic)), "positions", camera)
         positions = message.payload.positions
         if not positions:
-            self._clear(entity, message.publish_time_ns, message.log_time_ns)
+            self._clear_now(message, entity)
             return
         look = {
             "colors": [self._colours[camera]],
@@ -218,8 +244,7 @@ class RerunSink:
         self._log_moved(message, entity, rr.Points3D, {"positions": at}, look)
         heading = (*entity, "heading")
         if track.heading_rad is None:
-            if heading in self._looks:
-                self._clear(heading, message.publish_time_ns, message.log_time_ns)
+            self._clear_now(message, heading)
             return
         ahead = [(_HEADING_M * np.cos(track.heading_rad), _HEADING_M * np.sin(track.heading_rad), 0.0)]
         arrow = {"origins": at, "vectors": ahead}

@@ -196,3 +196,38 @@ def test_journal_of_the_first_format_still_brings_the_old_log_back(path: Path) -
 
 def is_write(operation: Operation, file: int) -> bool:
     return operation.kind == "write" and operation.file == file
+
+
+class Interrupting:
+    """A disk during whose n-th operation the user interrupts."""
+
+    def __init__(self, number: int) -> None:
+        self.left = number
+
+    def __getattr__(self, name: str) -> Any:
+        def operation(*arguments: Any) -> Any:
+            result = getattr(DISK, name)(*arguments)
+            if name not in ("open", "close"):
+                self.left -= 1
+                if self.left == 0:
+                    raise KeyboardInterrupt
+            return result
+
+        return operation
+
+
+def test_interrupted_append_leaves_the_old_log_or_the_new_one(path: Path) -> None:
+    """Neither a journal nor a longer file stays behind, so that no other command has to mend it."""
+    old, ends = path.read_bytes(), set()
+    for number in range(1, 100):
+        path.write_bytes(old)
+        try:
+            append(path, NEW, cast(Storage, Interrupting(number)))
+        except KeyboardInterrupt:
+            assert [*path.parent.iterdir()] == [path]
+            ends.add(len(rows_of(path)))
+            assert (path.read_bytes() == old) == (len(rows_of(path)) == len(OLD))
+            continue
+        break
+    assert ends == {len(OLD), len(OLD) + len(NEW)}
+    assert number > 8

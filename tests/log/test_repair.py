@@ -2,6 +2,7 @@
 
 import random
 import struct
+import zlib
 from collections.abc import Callable
 from pathlib import Path
 
@@ -188,6 +189,52 @@ def test_repair_hole_in_chunk_keeps_its_beginning(compression: CompressionType, 
     assert list(report.lost["/a"]) == [row[1] for row in rows[len(got) :]]
     assert (report.uncounted, report.unchecked) == (False, len(got))
     assert restored(path, report.kept_in, len(data)) == data
+
+
+def log_with_loose_messages(path: Path) -> list[Row]:
+    """Chunks, each with its message indexes, and messages between them; no summary."""
+    rows, data = [], as_bytes(mcap.Header("", "other"), mcap.Channel(1, "/a", "json", {}, 0))
+    data = MAGIC + data + as_bytes(mcap.Channel(2, "/b", "json", {}, 0))
+    for number in range(6):
+        now = START_NS + number * 10**9
+        entries: dict[int, list[tuple[int, int]]] = {1: [], 2: []}
+        inside = b""
+        for k in range(10):
+            entries[1 + k % 2].append((now + k, len(inside)))
+            inside += as_bytes(mcap.Message(1 + k % 2, now + k, b"inside" * 9, now, k))
+        data += as_bytes(mcap.Chunk("", inside, now + 9, now, zlib.crc32(inside), len(inside)))
+        data += as_bytes(*(mcap.MessageIndex(channel, found) for channel, found in entries.items()))
+        for k in range(10, 16):
+            data += as_bytes(mcap.Message(1 + k % 2, now + k, b"beside" * 9, now, k))
+        texts = [b"inside"] * 10 + [b"beside"] * 6
+        rows += [(("/a", "/b")[k % 2], now + k, now, text * 9) for k, text in enumerate(texts)]
+    path.write_bytes(data + as_bytes(mcap.DataEnd(0), mcap.Footer(0, 0, 0)) + MAGIC)
+    return rows
+
+
+@pytest.mark.parametrize("at", [9, 0, 14])
+@pytest.mark.parametrize("number", [2, 5, 7])
+def test_repair_damaged_index_costs_no_loose_message(at: int, number: int, tmp_path: Path) -> None:
+    """One bit of its channel, its type or its length, in a log with messages in chunks and beside them."""
+    path = tmp_path / "mixed.mcap"
+    rows = log_with_loose_messages(path)
+    data = bytearray(path.read_bytes())
+    data[record_at(data, Opcode.MESSAGE_INDEX, number)[0] + at] ^= 0x40
+    path.write_bytes(data)
+    repair(path, storage=QUICK)
+    assert agree(path) == sorted(rows)
+
+
+def test_repair_says_that_it_does_not_know_what_was_taken_out(tmp_path: Path) -> None:
+    """A whole chunk is missing, with its indexes: the summary is elsewhere, and no CRC fits."""
+    path = create(tmp_path / "log.mcap", rows_of(60))
+    data = path.read_bytes()
+    start, _ = record_at(data, Opcode.CHUNK, 1)
+    stop, _ = record_at(data, Opcode.CHUNK, 2)
+    path.write_bytes(data[:start] + data[stop:])
+    report = repair(path, storage=QUICK)
+    assert report.uncounted
+    agree(path)
 
 
 def test_repair_wrong_crc_takes_no_message(tmp_path: Path) -> None:

@@ -28,7 +28,7 @@ from ipsys_log.messages import (
     Tracks,
 )
 from ipsys_log.rig import load_rig
-from ipsys_log.runs.output import write_log, write_messages
+from ipsys_log.runs.output import append_messages, write_log, write_messages
 from tests.conftest import ROOT, Ipsys
 
 PAPER = ROOT / "sample_logs" / "paper_lab.mcap"
@@ -87,6 +87,15 @@ def test_models_that_were_copied_in_are_used_without_measurements(
     assert first["fuse"] == ("rigid", True)
     found = runs_of(ipsys, "replay", bare)
     assert {found[stage] for stage in ("locate", "fuse")} == {("rigid", False)}
+    # One that was entered and withdrawn is none.
+    with Session([paper]) as session, Session([bare]) as other:
+        entered: Measurement = session.payloads(["/measurements"])[0]
+        time_ns = other.end_ns + 1
+    typed = [entered, Measurement(entered.timestamp, "w1", withdraws=entered.id)]
+    append_messages(
+        bare, [Message("/measurements", time_ns + n, time_ns, one) for n, one in enumerate(typed)]
+    )
+    assert runs_of(ipsys, "replay", bare)["fuse"] == ("rigid", False)
 
 
 def test_newest_run_is_found_again(ipsys: Ipsys, paper: Path) -> None:

@@ -95,6 +95,64 @@ def test_changed_stage_is_done_again_beside_the_old_run(
     assert not any(new for _, new in made(ipsys, log).values())
 
 
+@pytest.mark.parametrize("changed", ["camera-frame", "perimeter", "fit", "evaluate", "locate", "fuse"])
+def test_after_a_replay_all_that_it_used_is_current(
+    changed: str, ipsys: Ipsys, log: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setitem(VERSIONS, changed, 2)
+    before = states(ipsys, log)
+    used = made(ipsys, log)
+    rows = states(ipsys, log)
+    assert {rows[run, stage]["state"] for stage, (run, _) in used.items()} == {"current"}
+    assert not any(new for _, new in made(ipsys, log).values())
+    # What was made again is what had been said to be out of date, and nothing else.
+    assert {stage for (_, stage), row in before.items() if row["out_of_date"]} == {
+        stage for stage, (_, new) in used.items() if new
+    }
+
+
+def test_name_of_a_run_that_is_out_of_date_is_refused_first(
+    ipsys: Ipsys, log: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    made(ipsys, log, "--run", "mine")
+    monkeypatch.setitem(VERSIONS, "detect", 2)
+    before = log.read_bytes()
+    done = ipsys("replay", log, "--run", "mine")
+    assert done.code == 1
+    assert "run mine already has the stage fit, which is out of date: input edges is; use another" in done.err
+    assert log.read_bytes() == before
+
+
+def test_stages_that_are_not_known_here_are_left_alone(ipsys: Ipsys, log: Path) -> None:
+    from ipsys_log.messages import Message, Run
+    from ipsys_log.runs.output import append_messages
+
+    with Session([log]) as session:
+        time_ns = session.end_ns + 1
+    run = Run(time_ns, "poly", "smooth", input_runs=("poly",), number=99)
+    append_messages(log, [Message("/runs/poly/record", time_ns, time_ns, run)])
+    state = "made by smooth 1, which is not known here: update ipsys"
+    assert states(ipsys, log)["poly", "smooth"]["state"] == state
+    done = ipsys("verify", log)
+    assert (done.code, state in done.err) == (0, True)
+
+
+def test_state_does_not_depend_on_the_order_of_logs(
+    ipsys: Ipsys, lab: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    first, last = tmp_path / "first.mcap", tmp_path / "last.mcap"
+    assert ipsys("camera-frame", lab, "-o", first).code == 0
+    assert ipsys("replay", lab, first, "-o", last).code == 0
+    assert ipsys("verify", last, first, lab).code == 0
+    monkeypatch.setitem(VERSIONS, "perimeter", 2)
+    found = [
+        {(row["run"], row["stage"]): row["state"] for row in json.loads(ipsys("runs", *logs, "--json").out)}
+        for logs in ((lab, first, last), (last, first, lab))
+    ]
+    assert found[0] == found[1]
+    assert found[0]["poly", "fuse"] == "out of date: input poly is"
+
+
 def test_changed_model_leaves_the_detection_alone(
     ipsys: Ipsys, log: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:

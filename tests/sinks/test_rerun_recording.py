@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import subprocess
 import sys
-from collections.abc import Iterable, Iterator
+from collections.abc import Iterable, Iterator, Mapping
 from pathlib import Path
 from typing import Any
 
@@ -203,12 +203,15 @@ def test_everything_drawn_has_its_look_again_after_it_went_away(saved: Path) -> 
     assert positions == {time_ns: ["0 (red)"] for time_ns in TIMES_NS}
 
 
-def drawn_by(path: Path, messages: Iterable[Message]) -> Path:
+MARKER = (Marker(0, corners_px(0)),)
+
+
+def drawn_by(path: Path, messages: Iterable[Message], fade_ns: Mapping[str, int] | None = None) -> Path:
     recording = rr.RecordingStream("ipsys", send_properties=False)
     recording.set_log_time_enabled(False)
     recording.set_log_tick_enabled(False)
     recording.save(path)
-    sink = RerunSink(recording, CAMERAS, {}, ("poly",))
+    sink = RerunSink(recording, CAMERAS, fade_ns or {}, ("poly",))
     for message in messages:
         sink(message)
     sink.close()
@@ -232,6 +235,39 @@ def test_look_of_late_message_holds_for_it_alone(tmp_path: Path) -> None:
     saved = drawn_by(tmp_path / "late.rrd", messages)
     labels = looks_at(saved, "/world/runs/poly/positions/red", "Points3D", "positions", "labels")
     assert labels == {START_NS + time_ns: [f"{marker} (red)"] for time_ns, marker in taken}
+
+
+def test_late_message_clears_nothing_that_was_drawn_after_it(tmp_path: Path) -> None:
+    topic = "/runs/edges/cameras/red/markers"
+    taken = [(10, True), (12, True), (11, False), (13, True), (9, False), (14, True), (15, False), (16, True)]
+    messages = [
+        Message(
+            topic, START_NS + n, START_NS + t, Markers(START_NS + t, MARKER if seen else (), 64, 48), "red"
+        )
+        for n, (t, seen) in enumerate(taken)
+    ]
+    saved = drawn_by(tmp_path / "late.rrd", messages)
+    entity = "/cameras/red/image/markers"
+    ids = looks_at(saved, f"{entity}/ids", "Points2D", "positions", "labels")
+    assert ids == {START_NS + t: ["0"] for t, seen in taken if seen}
+    assert [row[0] - START_NS for row in rows(saved, entity, "Clear:is_recursive")] == [15]
+
+
+def test_markers_have_their_look_again_after_their_image_went_away(tmp_path: Path) -> None:
+    def frame(time_ns: int) -> Message:
+        return Message(
+            "/cameras/red/image", time_ns, time_ns, CompressedImage(time_ns, "red", jpeg(1), "jpeg"), "red"
+        )
+
+    def markers(time_ns: int) -> Message:
+        payload = Markers(time_ns, MARKER, 64, 48)
+        return Message("/runs/edges/cameras/red/markers", time_ns, time_ns, payload, "red")
+
+    late_ns = START_NS + 20 * STEP_NS
+    messages = [frame(START_NS), markers(START_NS), frame(late_ns), markers(late_ns)]
+    saved = drawn_by(tmp_path / "a.rrd", messages, {"/cameras/red/image": 10 * STEP_NS})
+    ids = looks_at(saved, "/cameras/red/image/markers/ids", "Points2D", "positions", "labels")
+    assert ids == {START_NS: ["0"], late_ns: ["0"]}
 
 
 def test_robot_without_heading_loses_its_arrow(tmp_path: Path) -> None:

@@ -56,9 +56,9 @@ def disk_advice(error: OSError) -> str:
     if is_full(error):
         return "free some space and try again"
     if error.errno == errno.EROFS:
-        return "the disk takes no writes now (it may have had a fault): mount it for writing, or use another"
+        return "the disk is read-only (perhaps after a fault): mount it for writing, or use another disk"
     if error.errno == errno.EFBIG:
         return "files of this size are not possible there: use a disk with another file system"
     if error.errno in (errno.EACCES, errno.EPERM):
-        return "ask for the right to write there, or use another folder"
+        return "ask for write permission there, or use another folder"
     return "the disk or its connection is at fault: copy the log to another disk, and try again there"

@@ -96,7 +96,7 @@ def check_rig_cameras(rig: Rig, cameras: Collection[str], where: str) -> list[st
     if len(missing) == len(set(cameras)):
         raise IpsysError(
             f"{where}: describes the cameras {', '.join(described)}, but there are only "
-            f"{', '.join(missing)}. Give the rig of these, rename its cameras, or take out its [[cameras]]"
+            f"{', '.join(missing)}. Give the rig of these, rename its cameras, or remove its [[cameras]]"
         )
     named = ", ".join(missing)
     return [f"{where}: does not describe camera {named}; defaults are used, such as no rolling shutter"]
@@ -179,7 +179,7 @@ def load_rig(path: Path) -> Rig:
         raise IpsysError(_not_toml(path, error)) from error
     except (ValueError, RecursionError) as error:  # a number or nesting that Python's reader gives up on
         raise IpsysError(
-            f"{path}: a number has thousands of digits, or tables lie thousands deep in one another; "
+            f"{path}: a number has thousands of digits, or tables are nested thousands deep; "
             f"write a rig file with: ipsys init {path.name}"
         ) from error
     for key, item in _ITEMS.items():

@@ -149,7 +149,7 @@ def _compared_runs(
     both = names[0] & names[1] if runs[0] is None else names[0]
     if not both:
         raise IpsysError(
-            f"{one} and {other} have no run of one name (see 'ipsys runs'); say which with --run"
+            f"{one} and {other} have no run of the same name (see 'ipsys runs'); give the runs with --run"
         )
     return both, both if runs[1] is None else names[1]
 

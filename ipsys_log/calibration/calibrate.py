@@ -167,7 +167,7 @@ def _two_cameras(
     better = find_better_model(model, corners, size_px, split.one_px)
     if better is not None and better.rms_px < split.two_px:
         return ""
-    return f"{two_cameras_fault(split, names)}; put the pictures of each into a folder of its own"
+    return f"{two_cameras_fault(split, names)}; put the pictures of each camera into a separate folder"
 
 
 def _far_off(model: LensModel, solved: Solved, corners: Corners, size_px: tuple[int, int]) -> str:
@@ -175,10 +175,10 @@ def _far_off(model: LensModel, solved: Solved, corners: Corners, size_px: tuple[
     if left_px <= MOST_RMS_PX:
         return ""
     better = find_better_model(model, corners, size_px, left_px)
-    todo = "see that the board is flat and its size right, and that the pictures are of one camera"
+    todo = "check that the board is flat, that its size is right, and that all pictures are of one camera"
     if better is not None:
         todo = f"--lens {better.name} leaves {better.rms_px:.2f} px: use it"
-    return f"corners are {left_px:.1f} px off (RMS), too far for a lens that can be used; {todo}"
+    return f"the RMS reprojection error is {left_px:.1f} px, too large for a usable calibration; {todo}"
 
 
 def _few_pictures(camera: str, used: list[Sighting], bad: list[Dropped], looked: Looked, insist: bool) -> str:
@@ -193,7 +193,7 @@ def _few_pictures(camera: str, used: list[Sighting], bad: list[Dropped], looked:
         coverage = measure_coverage(pixels, looked.size_px, np.stack([s.outline for s in used]))
         todo += [line.split(":")[0] for line in advice(coverage)[:1]]
     fault = (
-        f"only {len(used)} of {looked.count} pictures can be used{why}, but a lens needs "
+        f"only {len(used)} of {looked.count} pictures can be used{why}, but a calibration needs "
         f"{LEAST_PICTURES} or more; {'; '.join(todo)}"
     )
     if insist and len(used) >= _LEAST_INSISTED:
@@ -256,7 +256,7 @@ def _unseen(looked: Looked) -> list[str]:
     if sum(others.values()) <= _MANY_OTHERS * looked.count:
         return []
     reason, count = others.most_common(1)[0]
-    return [f"in {count} of {looked.count} pictures {reason}: see that --board is right"]
+    return [f"in {count} of {looked.count} pictures {reason}: check --board"]
 
 
 def _doubts(model: LensModel, solved: Solved, size_px: tuple[int, int]) -> list[str]:
@@ -267,11 +267,11 @@ def _doubts(model: LensModel, solved: Solved, size_px: tuple[int, int]) -> list[
         better = find_better_model(model, solved.corners, size_px, left_px)
         if better is not None:
             notes.append(
-                f"corners are {left_px:.2f} px off; --lens {better.name} leaves {better.rms_px:.2f} px: "
-                "use it"
+                f"the RMS reprojection error is {left_px:.2f} px; --lens {better.name} leaves "
+                f"{better.rms_px:.2f} px: use it"
             )
         elif left_px > _OFF_PX:
-            notes.append(f"corners are {left_px:.1f} px off: see that the board is flat")
+            notes.append(f"the RMS reprojection error is {left_px:.1f} px: check that the board is flat")
     unsure = float((sigmas[:2] / lens[:2]).max())
     if unsure > _UNSURE:
         notes.append(

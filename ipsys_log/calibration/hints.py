@@ -106,8 +106,8 @@ def check_charuco_size(pictures: Sequence[Grey], board: Board, where: str) -> No
         return
     rows = max(size.rows, board.rows) if size.columns == board.columns else size.rows
     raise IpsysError(
-        f"{where}: the markers are those of {replace(board, columns=size.columns, rows=rows)} or more, in "
-        f"{size.pictures} of {len(pictures)} pictures tried, not of {board.columns} x {board.rows}: "
+        f"{where}: {size.pictures} of {len(pictures)} tried pictures have the markers of "
+        f"{replace(board, columns=size.columns, rows=rows)} or more, not of {board.columns} x {board.rows}: "
         f"give --board charuco:{size.columns}x{rows}; {_FORCE}"
     )
 
@@ -118,8 +118,8 @@ def _mirrored(pictures: Sequence[Grey], board: Board) -> str:
     if not seen:
         return ""
     return (
-        f"; but in a mirror it is, in {seen} of {len(pictures)} tried: the pictures are mirrored, as "
-        "webcam programs do; turn that off, and take them again"
+        f"; but it is seen mirrored in {seen} of {len(pictures)} tried: webcam programs may mirror pictures; "
+        "turn that off, and take the pictures again"
     )
 
 

@@ -145,7 +145,7 @@ def check_sizes(sizes: Sequence[tuple[str, Size]], where: str) -> Size:
     kinds += [f"{len(counts) - len(kinds)} more"] * (len(counts) > len(kinds))
     raise IpsysError(
         f"{where}: pictures have {len(counts)} sizes: {'; '.join(kinds)}. "
-        "A lens is calibrated at one size: put the pictures of each size into a folder of their own"
+        "A calibration needs one size: put the pictures of each size into a separate folder"
     )
 
 

@@ -53,8 +53,8 @@ def two_cameras_fault(split: TwoCameras, names: Sequence[str]) -> str:
     """Return what is wrong with pictures of two cameras, and the pictures of each."""
     groups = ", ".join(_named(names, split.second == second) for second in (False, True))
     return (
-        f"the pictures are of two cameras, or of two settings of zoom or focus: {groups}; one lens leaves "
-        f"{split.one_px:.2f} px, two leave {split.two_px:.2f}"
+        f"the pictures are of two cameras, or of two settings of zoom or focus: {groups}; one set of "
+        f"intrinsics leaves {split.one_px:.2f} px, two leave {split.two_px:.2f}"
     )
 
 

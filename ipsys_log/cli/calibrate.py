@@ -80,9 +80,8 @@ Force = Annotated[
     bool,
     typer.Option(
         "--force",
-        help="Override four checks: that no file is overwritten; that most pictures show no larger board "
-        "than --board; that the result is usable (RMS of at most 2 px, 5 pictures or more); that all "
-        "pictures are of one camera.",
+        help="Override four checks: no file is overwritten; most pictures show no larger board than --board; "
+        "the result is usable (RMS of at most 2 px, 5 pictures or more); all pictures are of one camera.",
     ),
 ]
 
@@ -109,11 +108,11 @@ def calibrate(
     force: Force = False,
     as_json: AsJson = False,
 ) -> None:
-    """Find the lens of a camera from pictures of a chessboard or a ChArUco board.
+    """Calibrate camera intrinsics from pictures of a chessboard or a ChArUco board.
 
-    One file for each camera that saw the board, with the name of the camera. Where a camera has no result,
-    those of the others are written, and the exit code is 1. Sharp pictures that differ are chosen by
-    themselves; two dozen from all parts of the picture are enough."""
+    Writes one file for each camera that saw the board, with the name of the camera. If a camera has no
+    result, the files of the others are written, and the exit code is 1. Sharp, different pictures are
+    selected automatically; two dozen with the board in all parts of the image are enough."""
     from ipsys_log.calibration.boards import parse_board
     from ipsys_log.calibration.calibrate import Calibrated
     from ipsys_log.calibration.cameras import calibrate_cameras

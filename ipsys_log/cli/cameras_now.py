@@ -193,7 +193,7 @@ def _say_room(lab: Lab, attached: Attached, room: DiskRoom, seconds: float | Non
     if doing and not (seconds is not None and room.is_short(seconds)):
         if seconds is None:
             place, free = format_bytes(round(_PLACE_S * room.bytes_per_s)), format_bytes(room.free_bytes)
-            say(f"about {place} for each place; {free} free in {room.folder}")
+            say(f"about {place} for each point; {free} free in {room.folder}")
         return
     short = room.is_short(seconds)
     remarks.print(room.describe(seconds), style="bold red" if short else None, markup=False)
@@ -242,7 +242,11 @@ def recorded_now(lab: Lab, seconds: float, keep: Path | None = None) -> Iterator
             with opened(lab, log, seconds, doing, until_stopped=False) as (cameras, settings, status):
                 pipeline.record(cameras, settings, log, [status])
         except Interrupted as interrupt:
-            kept = f"{keep} has the frames until then" if keep and keep.exists() else "no frame was kept"
+            kept = (
+                f"{keep} has the frames up to the interruption"
+                if keep and keep.exists()
+                else "no frame was kept"
+            )
             raise Interrupted(interrupt.exit_code, f"interrupted; {kept}") from None
         try:
             yield log

@@ -236,7 +236,7 @@ def _kept_runs(logs: list[Path], output: Path | None) -> Callable[[Sequence[str]
     from ipsys_log.runs.records import complete_runs
 
     if output is not None:
-        return lambda _: f"{output} was not written: a new log is written when all is done"
+        return lambda _: f"{output} was not written: a new log is written only when all stages are done"
 
     def complete() -> dict[str, list[str]]:
         stages: dict[str, list[str]] = {}
@@ -251,7 +251,7 @@ def _kept_runs(logs: list[Path], output: Path | None) -> Callable[[Sequence[str]
         new = {run: [s for s in stages if s not in before.get(run, ())] for run, stages in complete().items()}
         named = "; ".join(f"{run} ({', '.join(stages)})" for run, stages in new.items() if stages)
         if not named:
-            return f"{logs[-1]} is as it was: no run was complete"
+            return f"{logs[-1]} is unchanged: no run was complete"
         return f"complete in {logs[-1]}: {named}. The same command continues there"
 
     return added

@@ -177,6 +177,8 @@ def _agreed_to_withdraw(measurement: Measurement) -> bool:
     tapes = ", ".join(f"{tape.reference} {tape.distance_m * CM_PER_M:.1f}" for tape in measurement.distances)
     text = f"{measurement.id} (marker {measurement.marker_id}{': ' if tapes else ''}{tapes})"
     try:
-        return agreed(f"nothing measured in this session; {text} is of an earlier one. Withdraw it?", False)
+        return agreed(
+            f"nothing measured in this session; {text} is of an earlier session. Withdraw it?", False
+        )
     except LetterError:
         return False

@@ -61,11 +61,7 @@ def _named_as_log(path: Path | None) -> Path | None:
     if path.suffix.lower() in _OTHER_FILES:
         from ipsys_log.errors import IpsysError
 
-        page = (
-            "; a page is what ipsys report writes, to --html FILE"
-            if path.suffix.lower() in (".html", ".htm")
-            else ""
-        )
+        page = "; ipsys report --html FILE writes a page" if path.suffix.lower() in (".html", ".htm") else ""
         raise IpsysError(f"-o {path}: -o is for a new log, which ends in .mcap{page}")
     named = path.with_name(f"{path.name}.mcap")
     remarks.print(f"-o {path}: the log is called {named}", markup=False)

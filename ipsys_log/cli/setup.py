@@ -96,7 +96,7 @@ def _init_simulated(path: Path) -> None:
     _write_new({path: _SIMULATED + rig_toml(live_rig(LIVE_SETTINGS)), tape: tape_sheet(lying)})
     console.print(f"{path} written: the simulated lab, with three cameras", markup=False)
     console.print(
-        f"{tape} written: what a tape reads at the {len(lying)} markers that lie still there", markup=False
+        f"{tape} written: the tape measurements of its {len(lying)} stationary markers", markup=False
     )
     console.print(f"then: ipsys align --rig {path}", markup=False)
 
@@ -144,7 +144,7 @@ def simulate(output: Path, **settings: Any) -> None:
     from ipsys_log.runs.output import write_log
     from ipsys_log.sources.simulator import LabSettings, simulate
 
-    text = f"{output} was not written: a log of the simulated lab is written whole or not at all"
+    text = f"{output} was not written: the log of a simulated lab is written completely or not at all"
     with say_kept(lambda _: text), progress_bar() as progress:
         counts = write_log(output, simulate(LabSettings(**settings), progress))
     frames = sum(count for topic, count in counts.items() if topic.endswith("/image"))

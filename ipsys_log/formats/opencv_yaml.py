@@ -51,7 +51,7 @@ def read_opencv_calibration(path: Path, camera: str, time_ns: int = 0) -> Camera
     if k is None or d is None or k.size != 9 or not width or not height:
         raise IpsysError(f"{path}: lacks the camera matrix, the distortion coefficients or the image size")
     if width < 0 or height < 0:
-        raise IpsysError(f"{path}: its image width or height is no number of pixels, 1 to {_WIDEST_PX}")
+        raise IpsysError(f"{path}: its image width or height must be 1 to {_WIDEST_PX} pixels")
     model = _MODEL_OF_NAME.get(named, named) or _MODEL_OF_COUNT.get(d.size, f"with {d.size} coefficients")
     if model == "plumb_bob" and d.size == 4:
         d = np.append(d, 0.0)  # k3 is often left out

@@ -60,10 +60,10 @@ def check_calibration(lens: CameraCalibration, where: str) -> CameraCalibration:
             f"{_advice(lens)}"
         )
     if not (np.abs(lens.K) <= _LARGEST).all() or not (np.abs(lens.D) <= _LARGEST).all():
-        raise IpsysError(f"{where}: its matrix or coefficients are no numbers of a lens; calibrate again")
+        raise IpsysError(f"{where}: its matrix or coefficients are not valid; calibrate again")
     if not (0 < lens.width <= _WIDEST_PX and 0 < lens.height <= _WIDEST_PX):
         raise IpsysError(
-            f"{where}: no image has {lens.width} x {lens.height} px; write the size in pixels into it"
+            f"{where}: {lens.width} x {lens.height} px is no image size; write the size in pixels into it"
         )
     if not lens.K[0, 0] > 0 < lens.K[1, 1]:
         raise IpsysError(f"{where}: the camera matrix K has no positive focal lengths; calibrate again")

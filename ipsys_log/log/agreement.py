@@ -31,9 +31,9 @@ def disagreement(view: View, found: Survey) -> str:
     )
     tests = (
         (not found.finished or bool(found.damaged) or not found.crc_is_right, "its data section is damaged"),
-        (theirs.data_end != found.end, "its summary is that of another data section"),
+        (theirs.data_end != found.end, "its summary belongs to another data section"),
         (Counter(mine.counts) != Counter(theirs.counts), counts),
-        (not _same_chunks(theirs.chunks, mine.chunks), "readers look for other chunks than it has"),
+        (not _same_chunks(theirs.chunks, mine.chunks), "its chunks are not those that readers expect"),
     )
     what = next((what for is_wrong, what in tests if is_wrong), "")
     return what if what or summary is None else _summary_disagreement(summary, mine, found)
@@ -60,7 +60,7 @@ def _check_lengths(view: View, start: int) -> None:
 def _summary_disagreement(summary: Summary, mine: Contents, found: Survey) -> str:
     theirs, statistics, _ = summary
     if theirs.chunks and not _same_chunks(theirs.chunks, mine.chunks):
-        return "its chunk indexes are not those of its chunks"
+        return "its chunk indexes do not match its chunks"
     for kind, records, own in (
         ("schema", theirs.schemas, found.definitions.schemas),
         ("channel", theirs.channels, found.definitions.channels),

@@ -119,7 +119,7 @@ def inner_records(view: View, offset: int, data: bytes) -> Iterator[RecordAt]:
             raise view.fault(offset, "the last record in the chunk is cut off")
         opcode, length = HEADER.unpack_from(data, position)
         if opcode == 0:
-            raise view.fault(offset, "there is no record in the chunk where one must be")
+            raise view.fault(offset, "a record is missing in the chunk")
         if length > len(data) - position - HEADER.size:
             raise view.fault(offset, "a record in the chunk reaches beyond its end")
         yield RecordAt(opcode, position, HEADER.size + length)

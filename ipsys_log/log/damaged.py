@@ -78,7 +78,7 @@ def check_room(path: Path, change: Change) -> None:
     free = shutil.disk_usage(_beside(path, "").parent).free
     if free < needed:
         raise LogError(
-            f"{path} cannot be repaired: {format_bytes(old)} that are taken out of it are kept beside it. "
+            f"{path} cannot be repaired: a file beside it must keep the {format_bytes(old)} taken out. "
             f"That needs {format_bytes(needed)}, but {format_bytes(free)} are free: free some space"
         )
 

@@ -74,7 +74,11 @@ class Growing:
                 self.path, self.target = self.target, None
             self.storage.fsync_directory(self.path.parent)
         except OSError as error:
-            then = "nothing was written" if self.target is not None else "it is complete, but maybe not safe"
+            then = (
+                "nothing was written"
+                if self.target is not None
+                else "it is complete, but perhaps not on the disk"
+            )
             raise cannot_write(self.target or self.path, error, f"{then}: {disk_advice(error)}") from None
 
     def sync(self) -> None:
@@ -132,16 +136,16 @@ class Pending:
         if size == self.offset + len(tail) and os.pread(self.fd, len(tail), self.offset) == tail:
             # The file gets its size last: all was written, and only that it is safe was not confirmed.
             _logger.warning(
-                "%s: the messages are in the log, but the disk did not confirm it (%s): copy it to another",
+                "%s: the messages are in the log, but the disk did not confirm it (%s): copy it elsewhere",
                 self.path, error.strerror,
             )  # fmt: skip
             return
         if size == self.size:
-            then = f"the log stays as it was: {disk_advice(error)}"
+            then = f"the log is unchanged: {disk_advice(error)}"
         else:
             then = (
-                f"nothing that was recorded is lost, and ipsys reads the log as it was, by "
-                f"{self.path.name}.journal beside it; {disk_advice(error)}, and run: ipsys repair {self.path}"
+                f"no recorded data are lost, and ipsys can read the old log with {self.path.name}.journal "
+                f"beside it; {disk_advice(error)}, and run: ipsys repair {self.path}"
             )
         raise cannot_write(self.path, error, then) from None
 

@@ -235,7 +235,7 @@ def _open(path: Path) -> tuple[View, Contents]:
         if fault is None and (held or _stood_still(view, before)):
             if (held or contents.cut_short) and not is_being_written(path):
                 _logger.warning(
-                    "%s: an append to it was cut short; it is read as it was before. Mend it with: "
+                    "%s: an append to it was interrupted; ipsys reads the old log. Repair it with: "
                     "ipsys repair %s",
                     path, path,
                 )  # fmt: skip

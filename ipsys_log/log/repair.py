@@ -85,10 +85,10 @@ def repair(path: str | os.PathLike[str], *, storage: Storage = DISK) -> RepairRe
     target = Path(path)
     fd = open_locked(storage, target, os.O_RDWR)
     try:
-        notes = ["an append that was cut short was rolled back"] if roll_back(storage, target, fd) else []
+        notes = ["an interrupted append was rolled back"] if roll_back(storage, target, fd) else []
         resumed = resume(storage, target, fd)
         if resumed is not None:
-            notes.append("a repair that was cut short was completed")
+            notes.append("an interrupted repair was completed")
         status = os.fstat(fd)
         view = View(target, fd, status.st_size, status.st_size)
         _check_not_empty(view)
@@ -264,7 +264,7 @@ def _check(view: View, found: Survey, plan: _Plan) -> None:
     if what:
         faults = "; ".join(found.faults[:3])
         raise LogError(
-            f"{view.path} cannot be made whole ({what}) and was left as it was. Keep a copy. Found: {faults}"
+            f"{view.path} cannot be repaired ({what}) and was not changed. Keep a copy. Found: {faults}"
         )
 
 
@@ -320,9 +320,9 @@ def _report(
     contents = found.contents
     notes = [f"found: {fault}" for fault in found.faults]
     if found.finished and not found.crc_is_right and not found.damaged:
-        notes.append("found: the CRC of the data section is wrong; what is damaged in it is not known")
+        notes.append("found: the CRC of the data section is wrong; the damaged part is not known")
     if own_end < view.size:
-        notes.append(f"{view.size - own_end} bytes behind its end, perhaps another log, were cut off")
+        notes.append(f"{view.size - own_end} bytes after its end, perhaps another log, were cut off")
     gone, counted = _gone(found, known)
     return RepairReport(
         view.path,

@@ -257,7 +257,7 @@ class Resync:
         view = self.view
         self.budget -= at.length
         if self.budget < 0:
-            raise view.fault(at.offset, "too much of it looks like chunks and is none")
+            raise view.fault(at.offset, "too many of its bytes look like chunks and are none")
         look_inside(view, at.offset, unpack(view, at.offset, parse_chunk_head(view, at.offset)[1]))
         self.budget += at.length
         return True

@@ -121,7 +121,7 @@ class Salvage:
         channels = definitions.channels | definitions.known.channels
         messages, inside, torn, complete = _believable(view, records, rows, channels)
         if records.checked and definitions.is_stranger(stretch.offset, inside):
-            return Saved(note=f"the chunk at byte {stretch.offset} is of another log")
+            return Saved(note=f"the chunk at byte {stretch.offset} belongs to another log")
         for key, value in inside.schemas.items():
             self.inside.schemas.setdefault(key, value)
             definitions.known.schemas.setdefault(key, value)
@@ -179,13 +179,13 @@ class Salvage:
 def _note(stretch: Stretch, records: _Records, count: int, *, complete: bool) -> str:
     where = f"the chunk at byte {stretch.offset} ({records.span})"
     if records.checked:
-        return f"of {where}, all {count} messages were copied: its CRC is right, but it cannot stay as it is"
+        return f"all {count} messages of {where} were copied: its CRC is right, but it cannot stay in place"
     if count:
         which = "all" if complete else "the first"
-        return f"of {where}, {which} {count} messages were saved; their CRC cannot be checked"
+        return f"{which} {count} messages of {where} were saved; their CRC cannot be checked"
     if records.ends_early or not records.data:
         return f"{where} holds no message that can be read"
-    return f"{where}: one of its messages is damaged and it is not known which, so that none was taken"
+    return f"{where}: an unknown one of its messages is damaged, so that none was saved"
 
 
 def _records_of(view: View, stretch: Stretch) -> _Records | None:

@@ -324,7 +324,7 @@ def _decode(reader: LogReader, channel: Channel, data: bytes, items: Items) -> A
     if image:
         items.take(_ITEMS_OF_IMAGE)
     elif len(data) > reader.allowance.most_structured:
-        raise BoundError(f"a message of {len(data)} bytes is refused: images may be so large, others not")
+        raise BoundError(f"a message of {len(data)} bytes is refused: only images may be so large")
     definition = schema.data if schema.encoding == "ros2msg" else b""
     return decode(schema.name, data, channel.message_encoding, definition, items)
 

@@ -235,7 +235,7 @@ def _take(found: Survey, at: RecordAt) -> None:
     if at.opcode == Opcode.DATA_END and at.length == DATA_END.size:
         _advance_crc(found, at.offset)
         if not found.resync.is_end(at.offset, found.crc):
-            raise view.fault(at.offset, "records follow behind a DataEnd record")
+            raise view.fault(at.offset, "records follow after a DataEnd record")
         found.finished, found.end = True, at.offset
     elif at.opcode == Opcode.CHUNK:
         _take_chunk(found, at)
@@ -283,9 +283,7 @@ def _take_loose(found: Survey, at: RecordAt) -> None:
         if _has_lost_chunk_heads(found) and up_to_first_hole(view, at.offset, at.length) < at.length:
             raise view.fault(at.offset, "a message holds a sector of zeros")
         if at.offset < found.doubtful_to and not found.resync.fits(channel, time_ns):
-            raise view.fault(
-                at.offset, "a message behind damage is of an unknown channel and of another time"
-            )
+            raise view.fault(at.offset, "a message after damage has an unknown channel and another time")
         try:
             found.definitions.need(view, at.offset, channel)
         except LogError:
@@ -310,7 +308,7 @@ def _has_lost_chunk_heads(found: Survey) -> bool:
 def _take_chunk(found: Survey, at: RecordAt) -> None:
     view = found.view
     if found.resync.chunked is False:
-        raise view.fault(at.offset, "a chunk lies in a log whose messages lie in none")
+        raise view.fault(at.offset, "a chunk lies in a log that has its messages outside of chunks")
     head = parse_chunk_head(view, at.offset)[1]
     data = unpack(view, at.offset, head)
     inside = look_inside(view, at.offset, data)

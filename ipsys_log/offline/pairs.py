@@ -62,8 +62,8 @@ def gather_sightings(messages: Iterable[Message]) -> dict[tuple[str, int], Sight
         points_m = np.array([row[1:] for row in values], dtype=np.float64)
         if not (np.abs(points_m) <= _FARTHEST_M).all():
             raise IpsysError(
-                f"camera {key[0]}: a camera point of marker {key[1]} is no point in a lab; make the run "
-                "camera-frame again with --run and another name"
+                f"camera {key[0]}: a camera point of marker {key[1]} is not a possible point; run "
+                "camera-frame again, with --run and another name"
             )
         sightings[key] = Sightings(times_ns, points_m)
     return sightings

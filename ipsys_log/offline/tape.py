@@ -221,13 +221,13 @@ def _check_lengths(measurement: Measurement, where: str) -> None:
     for distance in measurement.distances:
         if not abs(distance.distance_m) <= _FARTHEST_M:
             raise IpsysError(
-                f"{where}: a tape of {distance.distance_m:g} m lies in no lab; withdraw it and measure again"
+                f"{where}: a tape of {distance.distance_m:g} m is too long; withdraw it and measure again"
             )
 
 
 def _check_point(world_m: Array, where: str) -> None:
     if not (np.abs(world_m) <= _FARTHEST_M).all():
-        raise IpsysError(f"{where}: its world point {world_m.tolist()} m is no point; withdraw it")
+        raise IpsysError(f"{where}: its world point {world_m.tolist()} m is impossible; withdraw it")
 
 
 def _check_sigma(sigma_m: float, where: str) -> float:

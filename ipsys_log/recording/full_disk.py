@@ -43,11 +43,11 @@ def what_fitted(path: Path, error: WriteError) -> str:
             count, seconds = log.message_count, ((log.end_ns or 0) - (log.start_ns or 0)) / NS_PER_S
     except LogError:
         return str(error)
-    what = "the disk takes no more" if is_full(error.cause) else disk_fault(error.cause)
+    what = "the disk is full" if is_full(error.cause) else disk_fault(error.cause)
     then = "Free some space, or record to another disk" if is_full(error.cause) else "Record to another disk"
     size = format_bytes(path.stat().st_size)
     return (
-        f"{path}: {what}; recording has stopped, and the log is complete with what fitted: "
+        f"{path}: {what}; recording has stopped, and the log is complete up to then: "
         f"{count} messages, {seconds:.1f} s, {size}. {then}"
     )
 
@@ -55,7 +55,7 @@ def what_fitted(path: Path, error: WriteError) -> str:
 def what_failed(path: Path, fault: OSError) -> str:
     """What is to be done with a log that a disk may not have kept."""
     return (
-        f"{path}: {disk_fault(fault)} while this was recorded; some of it may be lost. To see what is whole: "
+        f"{path}: {disk_fault(fault)} during the recording; messages may be lost. To check the log: "
         f"ipsys repair {path}. Record to another disk"
     )
 

@@ -164,7 +164,7 @@ def _advice_table(advice: Advice) -> Group:
             str(places), *(_choice(found[group]) if group in found else "-" for group in advice.groups)
         )
     lower = any(one.lowest != one.model for found in advice.choices.values() for one in found.values())
-    note = "In brackets: the lowest mean error, where a simpler model is as good within the noise."
+    note = "In brackets: the lowest mean error, if a simpler model is as good within the noise."
     return Group(title, table, *([Text(wrap_text(note))] if lower else []))
 
 

@@ -157,7 +157,8 @@ def parse_source(camera: RigCamera) -> Seat:
             continue
         if key not in known:
             raise IpsysError(
-                f"camera {camera.name}: the simulated lab has no setting {key!r}: board, {', '.join(known)}"
+                f"camera {camera.name}: the simulated lab has no setting {key!r}; "
+                f"it has board, {', '.join(known)}"
             )
         try:
             values[key] = known[key](text)

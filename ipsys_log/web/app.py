@@ -66,7 +66,7 @@ async def _gone(_: Request, __: Exception) -> Response:
 
 
 async def _failed(_: Request, error: Exception) -> Response:
-    text = f"a fault of ipsys: {type(error).__name__}: {error}; the terminal says more when the command ends"
+    text = f"a fault of ipsys: {type(error).__name__}: {error}; the terminal shows more when the command ends"
     return JSONResponse({"error": text}, 500)
 
 

@@ -65,7 +65,7 @@ class Guard:
             if scope["method"] == "GET" and scope["path"] == "/" and self._fits(given):
                 return self._welcome(scope)
             if not any(map(self._fits, self._cookies(headers, scope))):
-                return _refuse("open the page by the whole address that ipsys has printed")
+                return _refuse("open the page with the full address that ipsys printed")
         if scope["method"] not in ("GET", "HEAD"):
             origin = headers.get("origin")
             if headers.get(HEADER) != "1" or (origin is not None and origin != f"http://{host}"):

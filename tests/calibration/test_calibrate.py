@@ -96,7 +96,7 @@ def test_pictures_that_are_all_soft() -> None:
 
 def test_corners_that_are_far_off_are_said_to_be() -> None:
     looked = sightings(everywhere(), 0.5, noise_px=1.0)
-    assert any("px off: see that the board is flat" in note for note in calibrated(looked).notes)
+    assert any("px: check that the board is flat" in note for note in calibrated(looked).notes)
 
 
 def through_fisheye() -> Looked:
@@ -107,7 +107,7 @@ def through_fisheye() -> Looked:
 
 
 def test_pinhole_on_a_fisheye_is_refused() -> None:
-    with pytest.raises(IpsysError, match=r"px off \(RMS\).*--lens fisheye leaves 0\.1\d px: use it; or give"):
+    with pytest.raises(IpsysError, match=r"error is .*--lens fisheye leaves 0\.1\d px: use it; or give"):
         calibrate("red", through_fisheye(), BOARD, LENSES["pinhole4"])
 
 

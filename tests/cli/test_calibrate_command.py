@@ -199,7 +199,7 @@ def test_too_few_pictures(ipsys: Ipsys, red: Path, tmp_path: Path) -> None:
     for path in list(red.iterdir())[4:]:
         path.unlink()
     line = refused(ipsys, tmp_path, red, "--board", "6x4", "-o", tmp_path)
-    assert "only 4 of 4 pictures can be used, but a lens needs 5 or more" in line
+    assert "only 4 of 4 pictures can be used, but a calibration needs 5 or more" in line
     assert "take at least 15" in line
 
 
@@ -212,7 +212,7 @@ def test_pictures_of_two_sizes_are_refused_before_looking(
     monkeypatch.setattr("ipsys_log.calibration.look.view_board", None)
     line = refused(ipsys, tmp_path, red, "--board", "6x4", "-o", tmp_path)
     assert "pictures have 2 sizes: 12 of 480 x 360 px (0.png, 1.png ...); 9 of 640 x 480 px (990.png" in line
-    assert "put the pictures of each size into a folder of their own" in line
+    assert "put the pictures of each size into a separate folder" in line
 
 
 def test_a_stray_picture_of_another_size_is_left_out_and_named(

@@ -18,7 +18,7 @@ __all__ = ["count_by_indexes", "disagreement"]
 
 
 def disagreement(view: View, found: Survey) -> str:
-    """Return in what a log disagrees with its own survey, "" if it is whole."""
+    """Return the first disagreement of a log with its survey, "" if there is none."""
     try:
         theirs, summary = load_contents(view), read_summary(view)
         if summary is not None:
@@ -49,7 +49,7 @@ def count_by_indexes(view: View) -> int:
 
 
 def _check_lengths(view: View, start: int) -> None:
-    """Refuse a summary of which a reader that believes all lengths would read too much."""
+    """Refuse a summary with wrong lengths: a reader that trusts them would read too much."""
     for at in walk(view, start, view.size):
         if at.opcode == Opcode.FOOTER:
             return
@@ -98,7 +98,7 @@ def _same_chunks(theirs: list[ChunkRef], mine: list[ChunkRef]) -> bool:
 
 
 def _same_chunk(theirs: ChunkRef, mine: ChunkRef) -> bool:
-    """Compare all that a reader goes by; a writer may leave out the message indexes."""
+    """Compare all fields that readers use; a writer may leave out the message indexes."""
     lengths = (mine.index_length,) if theirs.index_offsets else (0, mine.index_length)
     offsets = theirs.index_offsets in ({}, mine.index_offsets) and theirs.index_length in lengths
     same = theirs._replace(index_length=0, index_offsets={}) == mine._replace(

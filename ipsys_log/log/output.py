@@ -82,7 +82,7 @@ class Growing:
             raise cannot_write(self.target or self.path, error, f"{then}: {disk_advice(error)}") from None
 
     def sync(self) -> None:
-        """Wait until what was written is on the disk. Any thread may call it while another one writes."""
+        """Wait until the written bytes are on the disk. Any thread may call it while another one writes."""
         self.storage.fsync(self.fd)
 
     def abandon(self) -> None:
@@ -123,18 +123,18 @@ class Pending:
             self._settle(error, tail)
 
     def _settle(self, error: OSError, tail: bytes) -> None:
-        """Say which log stands after a fault of the disk, the old one if possible.
+        """Roll back after a disk fault if possible, and report which log is valid.
 
         Raises
         ------
         WriteError
-            Unless the new one stands.
+            The new log is not valid.
         """
-        with suppress(OSError):  # else whoever next writes does it
+        with suppress(OSError):  # else the next writer does it
             roll_back(self.storage, self.path, self.fd)
         size = os.fstat(self.fd).st_size
         if size == self.offset + len(tail) and os.pread(self.fd, len(tail), self.offset) == tail:
-            # The file gets its size last: all was written, and only that it is safe was not confirmed.
+            # The file gets its size last: all bytes were written, but the sync was not confirmed.
             _logger.warning(
                 "%s: the messages are in the log, but the disk did not confirm it (%s): copy it elsewhere",
                 self.path, error.strerror,
@@ -161,6 +161,6 @@ def _extend(so_far: int, data: Buffer, crc: int | None) -> int:
 
 
 def cannot_write(path: Path, error: OSError, then: str) -> WriteError:
-    """Return the error of a disk that refused, with what follows from that."""
+    """Return the error for a failed write; `then` says what follows from it."""
     text = f"{path} cannot be written ({error.strerror or os.strerror(error.errno or 0)}): {then}"
     return WriteError(text, error)

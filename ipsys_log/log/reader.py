@@ -111,11 +111,11 @@ class LogReader:
 
     @property
     def allowance(self) -> Allowance:
-        """How much work the log may cause."""
+        """The limits of the work to read the log."""
         return self._view.allowance
 
     def check_number(self, number: int, what: str) -> None:
-        """Refuse a log with more runs or measurements than a file of its size may have."""
+        """Refuse a log with more runs or measurements than its file size allows."""
         self._view.check_number(number, what)
 
     @property
@@ -164,7 +164,7 @@ class LogReader:
         return in_log_order(pending, lambda at: view.fault(at, "a message is older than its chunk says"))
 
     def times(self, topic: str) -> NDArray[np.int64]:
-        """Log times of a topic in ns, sorted, shape (N,); read from the indexes alone."""
+        """Return the log times of a topic in ns, sorted, shape (N,); read from the indexes alone."""
         wanted = set(self._topics_by_id([topic]))
         parts = [rows for key, rows in as_rows(self._contents.loose).items() if key in wanted]
         for chunk in self._contents.chunks:
@@ -217,7 +217,7 @@ def stored_hashes(view: View, contents: Contents) -> dict[str, ChannelHash]:
 
 
 def _open(path: Path) -> tuple[View, Contents]:
-    """Open a consistent state: the old log while a journal holds, else a file that stood still meanwhile."""
+    """Open a consistent state: the old log while its journal is valid, else an unchanging file."""
     fault: LogError | None = None
     for _ in range(_ATTEMPTS):
         fd = open_for_reading(path)

@@ -140,9 +140,9 @@ _READERS: dict[int, Callable[[ReadDataStream], mcap.McapRecord]] = {
 
 
 def exact(view: View, at: RecordAt, data: bytes) -> mcap.McapRecord:
-    """Parse the record `data`, which is of none of the types that hold messages; its lengths must be right.
+    """Parse the record `data`, of any type without messages; its lengths must be right.
 
-    What follows the fields that are known is left to later versions of the format.
+    Bytes after the known fields are ignored: later versions of the format may add fields.
     """
     if at.opcode not in _READERS:
         raise view.fault(at.offset, f"a record of {_name(at.opcode)} has no place there")

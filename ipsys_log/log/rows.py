@@ -29,9 +29,9 @@ def as_rows(entries: Mapping[int, list[tuple[int, int]]]) -> Entries:
 def chunk_entries(
     view: View, chunk: ChunkRef, searched: dict[int, Entries], wanted: set[int] | None = None
 ) -> Entries:
-    """The rows of a chunk's messages, from its message indexes if there are any.
+    """Return the rows of a chunk's messages, from its message indexes if there are any.
 
-    `searched` keeps, by offset, what was found in chunks without: each is searched once.
+    `searched` caches, by offset, the rows of chunks without indexes: each is searched once.
     """
     if not chunk.index_offsets or not chunk.index_length:
         if chunk.offset not in searched:

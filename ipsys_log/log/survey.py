@@ -39,20 +39,20 @@ _LAG = 1 << 20  # bytes
 _DOUBTFUL = 4096  # bytes
 _LONGEST_HEADER = 1 << 20  # bytes
 _LOOSE = frozenset((Opcode.SCHEMA, Opcode.CHANNEL, Opcode.MESSAGE, Opcode.ATTACHMENT, Opcode.METADATA))
-# If such a record is damaged, it is known how many messages are lost with it: none, or one.
+# If such a record is damaged, the number of lost messages is known: none, or one.
 _COUNTED = _LOOSE | {Opcode.MESSAGE_INDEX, Opcode.DATA_END}
 
 
 def survey(
     view: View, known: Summary | None = None, saved: Salvage | None = None, *, doubtful: bool = False
 ) -> Survey:
-    """Check the data section record by record; never believes a length, never raises for damage.
+    """Check the data section record by record, without trusting lengths or raising errors for damage.
 
-    A log that asks for too much is refused with a `BoundError`: it need not be damaged, and is not repaired.
+    A log that exceeds the limits is refused with a `BoundError`: it may be undamaged, and is not repaired.
 
-    The file is read once. `known` is what the summary says, if there is one: it may define what the data
-    section does not. Without `saved`, damaged chunks are passed over. `doubtful` says that lengths that
-    nothing confirms are looked at closely.
+    The file is read once. `known` is the summary, if there is one: it may have definitions that the data
+    section lacks. Without `saved`, damaged chunks are skipped. With `doubtful`, unconfirmed lengths are
+    checked closely.
     """
     damaged: list[Stretch] = []
     definitions = Definitions(known, damaged)
@@ -76,7 +76,7 @@ def survey(
 
 
 def _is_chunked(known: Summary | None) -> bool | None:
-    """Return whether the messages lie in chunks, by the summary; None if it does not say."""
+    """Return whether the messages lie in chunks by the summary; None if it does not tell."""
     if known is not None and known.contents.chunks:
         return True
     if known is not None and known.checked and known.statistics is not None:
@@ -85,14 +85,14 @@ def _is_chunked(known: Summary | None) -> bool | None:
 
 
 def _span_ns(known: Summary | None) -> tuple[int, int] | None:
-    """Return the log times of the first and the last message, if the summary says them and is right."""
+    """Return the log times of the first and the last message, if the summary has them and is right."""
     if known is None or not known.checked or known.statistics is None or not known.statistics.message_count:
         return None
     return known.statistics.message_start_time, known.statistics.message_end_time
 
 
 def _take_start(found: Survey) -> int:
-    """Check the magic bytes and the Header record; return the offset of the records behind them."""
+    """Check the magic bytes and the Header record; return the offset of the records after them."""
     view, start = found.view, len(MAGIC)
     behind, reason = _behind_header(found)
     if view.read(0, min(start, view.size)) != MAGIC:
@@ -114,7 +114,7 @@ def _take_start(found: Survey) -> int:
 
 
 def _behind_header(found: Survey) -> tuple[int, str]:
-    """Return the end of the Header record, its place if there is none, 0 and the reason if it is damaged."""
+    """Return the end of the Header record (its offset if it is missing), or 0 and the fault if damaged."""
     view, start = found.view, len(MAGIC)
     try:
         at = next(walk(view, start, view.size), None)
@@ -130,7 +130,7 @@ def _behind_header(found: Survey) -> tuple[int, str]:
 
 
 def _take_records(found: Survey, position: int) -> int:
-    """Take records from `position` on up to the next damage; return the offset behind it."""
+    """Check the records from `position` up to the next damage; return the offset after it."""
     view = found.view
     at = RecordAt(0, position, 0)
     try:
@@ -149,10 +149,10 @@ def _take_records(found: Survey, position: int) -> int:
 
 
 def _pass_over(found: Survey, position: int, at: RecordAt | None, reason: str) -> int:
-    """Find the next record behind damage at `position`; return its offset."""
+    """Find the next record after damage at `position`; return its offset."""
     claimed = at.offset + at.length if at is not None and found.wrong_length != position else 0
     indexed = found.indexed
-    # A gap that is too small for a record of its own becomes a part of the damage before it.
+    # A gap that is too small for a separate record becomes a part of the damage before it.
     behind_indexes = indexed is not None and indexed.inside is not None and position > indexed.start
     joins = behind_indexes or bool(found.damaged and found.damaged[-1].end == position)
     follower = found.resync.find(position, claimed, gap=1 if joins else HEADER.size)
@@ -181,7 +181,7 @@ def _add_damage(found: Survey, stretch: Stretch, reason: str) -> int:
     if found.indexed is not None:
         found.indexed.stretch = replace(stretch)
     last = found.damaged[-1] if found.damaged else None
-    if last is not None and last.end == stretch.offset:  # one place for what was defined in both
+    if last is not None and last.end == stretch.offset:  # one stretch for the definitions of both
         last.length += stretch.length
     else:
         found.damaged.append(stretch)
@@ -191,7 +191,7 @@ def _add_damage(found: Survey, stretch: Stretch, reason: str) -> int:
 
 
 def _end_at_damage(found: Survey, position: int, reason: str) -> int:
-    """End the survey at damage without records behind it, perhaps a chunk that was being written."""
+    """End the survey at damage without later records, perhaps in an unfinished chunk."""
     found.faults.append(reason)
     found.end = position
     found.cut = Stretch(position, found.view.size - position)
@@ -222,7 +222,7 @@ def _save(found: Survey, stretch: Stretch, rows: Rows) -> None:
 
 
 def _take(found: Survey, at: RecordAt) -> None:
-    """Check one record and take it in."""
+    """Check one record and add it."""
     view = found.view
     if at.opcode == Opcode.MESSAGE_INDEX:
         _take_index(found, at)
@@ -248,9 +248,9 @@ def _take(found: Survey, at: RecordAt) -> None:
 
 
 def _check_length(found: Survey, at: RecordAt) -> None:
-    """Refuse a record of which only the length can be wrong, if it swallows whole ones or stops short of one.
+    """Refuse a record whose wrong length includes whole records, or ends before one.
 
-    Where a record follows, its length is right; where none does, the damage may as well lie behind it.
+    If a record follows, the length is right; if none does, the damage may also be after it.
     """
     view, stop = found.view, at.offset + at.length
     follows = stop == view.size
@@ -264,12 +264,12 @@ def _check_length(found: Survey, at: RecordAt) -> None:
         if inner is not None and inner != stop and inner < stop + HEADER.size:
             found.wrong_length = at.offset
             if at.opcode == Opcode.MESSAGE and at.length >= MESSAGE.size and stop < inner:
-                found.homeless.append(at)  # it may be whole: what is left between them is too small to skip
+                found.homeless.append(at)  # it may be whole: the gap between them is too small to skip
             raise view.fault(at.offset, f"a record claims {at.length} bytes, which hold other records")
 
 
 def _take_loose(found: Survey, at: RecordAt) -> None:
-    """Take in a record that lies in no chunk."""
+    """Add a record outside of chunks."""
     view = found.view
     _check_length(found, at)
     if at.opcode == Opcode.METADATA:
@@ -300,7 +300,7 @@ def _take_loose(found: Survey, at: RecordAt) -> None:
 
 
 def _has_lost_chunk_heads(found: Survey) -> bool:
-    """Return whether messages in no chunk may be those of one: nothing tells, if both ends are lost."""
+    """Return whether messages outside of chunks may belong to one: unknown if both ends are lost."""
     begins_late = bool(found.damaged) and found.damaged[0].offset == 0
     return begins_late and found.definitions.summary is None
 
@@ -332,13 +332,13 @@ def _take_chunk(found: Survey, at: RecordAt) -> None:
         found.contents.chunks[-1] = chunk._replace(start_ns=span[0], end_ns=span[1])
     found.counts[at.offset] = {key: len(rows) for key, rows in inside.entries.items()}
     _continue_hashes(found, inside, data)
-    if not found.resync.times_ns:  # else messages lie in chunks and beside them
+    if not found.resync.times_ns:  # else messages lie in chunks and outside of them
         found.resync.chunked = True
     found.indexed = Indexed(stop, inside)
 
 
 def _check_without_crc(found: Survey, at: RecordAt) -> None:
-    """Refuse a chunk that has no CRC, among chunks that have one, where it may be of another log."""
+    """Refuse a chunk without CRC among chunks with CRC, if it may belong to another log."""
     if found.resync.holds_chunk(at):
         found.wrong_length = at.offset
         raise found.view.fault(at.offset, "a chunk without CRC holds another chunk")
@@ -349,7 +349,7 @@ def _check_without_crc(found: Survey, at: RecordAt) -> None:
 
 
 def _check_definitions(view: View, offset: int, data: bytes) -> None:
-    """Refuse a chunk without CRC whose definitions claim more or less than they hold."""
+    """Refuse a chunk without CRC whose definitions have wrong lengths."""
     for at in inner_records(view, offset, data):
         if at.opcode in (Opcode.SCHEMA, Opcode.CHANNEL):
             record = data[at.offset : at.offset + at.length]
@@ -367,7 +367,7 @@ def _continue_hashes(found: Survey, inside: Inside, data: bytes) -> None:
 
 
 def _take_index(found: Survey, at: RecordAt) -> None:
-    """Take in a MessageIndex record: of the chunk before it, or of the damaged stretch before it."""
+    """Add a MessageIndex record: of the chunk before it, or of the damaged stretch before it."""
     indexed = found.indexed
     if found.resync.chunked is False:
         raise found.view.fault(at.offset, "a MessageIndex record lies in a log without chunks")
@@ -405,7 +405,7 @@ def _index_rows(view: View, at: RecordAt) -> tuple[int, list[tuple[int, int]]]:
 
 
 def _close_indexes(found: Survey, stop: int) -> None:
-    """Check the message indexes of a chunk, or of a damaged stretch, when all of them were seen."""
+    """Check the message indexes of a chunk, or of a damaged stretch, after all of them are read."""
     indexed, found.indexed = found.indexed, None
     assert indexed is not None
     if indexed.stretch is not None:
@@ -421,7 +421,7 @@ def _close_chunk(found: Survey, indexed: Indexed, inside: Inside, stop: int) -> 
             index_length=stop - indexed.start, index_offsets=indexed.offsets
         )
         return
-    if stop == found.view.size:  # and so the log has no end: they are written anew with it
+    if stop == found.view.size:  # and the log has no end: they are written again with it
         found.end = indexed.start
         found.cut = Stretch(found.end, stop - found.end)
         found.unindexed = inside

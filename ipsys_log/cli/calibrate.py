@@ -141,7 +141,7 @@ def calibrate(
                 if isinstance(outcome, Calibrated):
                     _write(outcome, targets[outcome.camera])
                     outcomes.append(outcome)
-                else:  # a log that was only taken for this is gone when the user reads the reason
+                else:  # a temporary log is deleted before the user reads the reason
                     reason = outcome.reason.replace(str(taken[0]), SENT_NOW) if lab else outcome.reason
                     outcomes.append(outcome._replace(reason=reason))
     lenses = [outcome for outcome in outcomes if isinstance(outcome, Calibrated)]
@@ -188,7 +188,7 @@ def _json(outcome: Calibrated | Failure, targets: dict[str, dict[str, Path]]) ->
 
 
 def _prepared_now(rig: Path | None, only: list[str] | None, board: str) -> Lab:
-    """The cameras to look at; before simulated ones the board is held that they are calibrated with."""
+    """Return the cameras to calibrate; simulated ones show the calibration board."""
     from ipsys_log.errors import IpsysError
     from ipsys_log.sources.simulated import show_board
 

@@ -212,7 +212,7 @@ def _request(logs: list[Path], **given: Any) -> Request:
 def derived(
     logs: list[Path], until: str, output: Path | None = None, kept: bool = True, **given: Any
 ) -> Iterator[tuple[Session, list[Outcome], list[Accuracy]]]:
-    """Do the stages up to ``until``; the session with the results, what was done, and how accurate it is.
+    """Run the stages up to ``until``; yield the session with the results, the outcomes, and the accuracy.
 
     A log that is not ``kept`` is not named.
     """
@@ -231,7 +231,7 @@ def derived(
 
 
 def _kept_runs(logs: list[Path], output: Path | None) -> Callable[[Sequence[str]], str]:
-    """Return what names the runs that an interrupted command has added."""
+    """Return a function that names the runs that an interrupted command has added."""
     from ipsys_log.log.session import Session
     from ipsys_log.runs.records import complete_runs
 

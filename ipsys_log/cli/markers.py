@@ -122,7 +122,7 @@ def _marker_prints(
 
 
 def _lab(rig: Path | None, length: float | None, dictionary: str | None) -> Rig:
-    """The rig, or one that holds only a dictionary and a length."""
+    """Return the rig, or one with only a dictionary and a length."""
     from dataclasses import replace
 
     from ipsys_log.errors import IpsysError
@@ -145,12 +145,12 @@ def _lab(rig: Path | None, length: float | None, dictionary: str | None) -> Rig:
 
 
 def _parse_ids(text: str, dictionary: str) -> list[int]:
-    """The ids of a list such as ``1,2,5-9``, each once.
+    """Parse a list of ids such as ``1,2,5-9``; each id occurs once.
 
     Raises
     ------
     IpsysError
-        For what is no list, or an id that the dictionary does not have.
+        The text is no list, or has an id that the dictionary does not have.
     """
     from ipsys_log.errors import IpsysError
     from ipsys_log.rig_slips import dictionary_size

@@ -107,7 +107,7 @@ def _write_new(texts: dict[Path, str]) -> None:
     Raises
     ------
     IpsysError
-        Where a file exists.
+        A file exists.
     """
     from ipsys_log.errors import IpsysError
     from ipsys_log.log.lock import dangling
@@ -138,9 +138,9 @@ def _rig_of(log: Path) -> str:
 
 
 def simulate(output: Path, **settings: Any) -> None:
-    """Render a lab with known truth: places measured by tape, then a drive.
+    """Render a lab with ground truth: points measured by tape, then a drive.
 
-    As it stands it is the lab of the paper: three cameras about 2.1 m above a floor of 4.88 m."""
+    By default it is the lab of the paper: three cameras about 2.1 m above a floor of 4.88 m."""
     from ipsys_log.runs.output import write_log
     from ipsys_log.sources.simulator import LabSettings, simulate
 

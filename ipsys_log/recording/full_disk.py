@@ -20,13 +20,13 @@ _RESERVE_BYTES = 64 << 20
 
 
 def reserved_bytes(free_bytes: int) -> int:
-    """Return how much of what is free on a disk is set aside for the end of a log."""
+    """Return the part of the free bytes on a disk that is reserved for the end of a log."""
     return min(_RESERVE_BYTES, free_bytes // 2)
 
 
 @contextmanager
 def reserve(path: Path) -> Iterator[Callable[[], None]]:
-    """Some of the disk; what is yielded gives it back. It has no name: it cannot be left behind."""
+    """Reserve disk space in an unnamed file; call the yielded function to release it."""
     with ExitStack() as held:
         with suppress(OSError):  # a file system that cannot, or a disk that is full already
             if hasattr(os, "O_TMPFILE"):
@@ -37,7 +37,7 @@ def reserve(path: Path) -> Iterator[Callable[[], None]]:
 
 
 def what_fitted(path: Path, error: WriteError) -> str:
-    """How far a log goes that was ended by a disk that took no more."""
+    """Describe a log that ended because the disk was full or failed."""
     try:
         with LogReader(path) as log:
             count, seconds = log.message_count, ((log.end_ns or 0) - (log.start_ns or 0)) / NS_PER_S
@@ -53,7 +53,7 @@ def what_fitted(path: Path, error: WriteError) -> str:
 
 
 def what_failed(path: Path, fault: OSError) -> str:
-    """What is to be done with a log that a disk may not have kept."""
+    """Describe what to do with a log that may be incomplete on a failed disk."""
     return (
         f"{path}: {disk_fault(fault)} during the recording; messages may be lost. To check the log: "
         f"ipsys repair {path}. Record to another disk"
@@ -61,5 +61,5 @@ def what_failed(path: Path, fault: OSError) -> str:
 
 
 def disk_fault(fault: OSError) -> str:
-    """A fault of the disk in words."""
+    """Describe a fault of the disk."""
     return f"the disk has failed ({fault.strerror})"

@@ -85,7 +85,7 @@ class Recent:
         self._log.flush()
 
     def sync(self, confirm: Confirm) -> None:
-        """Bring what was flushed onto the disk, and ``confirm`` it."""
+        """Sync the flushed messages to the disk, and ``confirm`` it."""
         self._log.sync(confirm)
 
     def _write(self, since_ns: int | None = None) -> None:

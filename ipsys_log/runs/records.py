@@ -66,17 +66,17 @@ def _essence(run: Run) -> bytes:
 
 
 def complete_runs(session: Session) -> list[Run]:
-    """Return the records whose channels are all there, oldest first."""
+    """Return the records whose channels are all in the log, oldest first."""
     return [run for run in session.runs() if is_complete(session, run)]
 
 
 def is_complete(session: Session, run: Run) -> bool:
-    """Return whether all that a stage wrote is in the log."""
+    """Return whether all channels of a stage are in the log."""
     return all(session.count(output.topic) >= output.messages for output in run.outputs)
 
 
 def find_run(session: Session, wanted: Run, name: str | None = None) -> str | None:
-    """Return the name of the newest complete run that has done just what ``wanted`` would do, if any."""
+    """Return the name of the newest complete run with the inputs and parameters of ``wanted``, if any."""
     essence = _essence(wanted)
     for run in reversed(complete_runs(session)):
         if run.stage == wanted.stage and name in (None, run.run) and _essence(run) == essence:

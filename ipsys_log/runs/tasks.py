@@ -344,7 +344,7 @@ def _locate(session: Session, request: Request, points: str, model: str) -> Task
 def _fuse(session: Session, request: Request, positions: str) -> Task | str:
     rig, topics = _rig(session, request, "fuse")
     topics += session.topics(Positions, positions)
-    if has_late_frames(session):  # a log without any has the runs that it had
+    if has_late_frames(session):  # a log without such events keeps its runs
         topics.append(EVENTS_TOPIC)
     return Task(
         "fuse",

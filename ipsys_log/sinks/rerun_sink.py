@@ -31,7 +31,7 @@ from ipsys_log.sinks.trails import Segment, Trails
 __all__ = ["RerunSink", "trail_entity"]
 
 Entity = tuple[str, ...]
-Kind = Any  # a class of what Rerun draws, such as rr.Points3D
+Kind = Any  # a Rerun archetype, such as rr.Points3D
 Fields = Mapping[str, Any]
 
 # Rerun counts pixels from the first pixel's corner, OpenCV from its centre.
@@ -77,7 +77,7 @@ class RerunSink:
         self._runs = tuple(runs)
         self._robots: dict[tuple[str | None, str], int] = {}
         self._waiting: dict[Entity, tuple[Kind, list[tuple[Message | Segment, Fields]]]] = {}
-        self._looks: dict[Entity, tuple[Hashable, int]] = {}  # and the publish time from which each holds
+        self._looks: dict[Entity, tuple[Hashable, int]] = {}  # and the publish time from which each is valid
         self._fading = Fading(self._clear)
         self._trails = Trails(self._draw_segment)
         self._draw: dict[type, Callable[[Message], None]] = {
@@ -98,12 +98,12 @@ class RerunSink:
             draw(message)
 
     def flush(self) -> None:
-        """Draw what waited: many rows of an entity at once take a fraction of the time."""
+        """Draw the waiting rows: many rows of an entity at once take a fraction of the time."""
         for entity in list(self._waiting):
             self._send(entity)
 
     def close(self) -> None:
-        """Draw everything that waited."""
+        """Draw all waiting rows."""
         self._trails.close()
         self.flush()
         self._recording.flush()
@@ -118,14 +118,14 @@ class RerunSink:
         self._recording.log(list(entity), *what, strict=True)
 
     def _log_moved(self, message: Message, entity: Entity, kind: Kind, moved: Fields, look: Fields) -> None:
-        """Draw where something is now, and its look only where that is new: it takes most of the time."""
+        """Draw the position of an entity, and its appearance only if that is new: that takes most time."""
         key = str(look)
         before, since_ns = self._looks.get(entity, (None, 0))
         is_late = message.publish_time_ns < since_ns
         if key == before and not is_late:
             self._add(message, entity, kind, moved)
             return
-        # Behind a late message it is not known which look is the newest one.
+        # After a late message, the newest appearance is not known.
         self._looks[entity] = (None, since_ns) if is_late else (key, message.publish_time_ns)
         self._send(entity)
         self._log(message, entity, kind.from_fields(**moved, **look))
@@ -134,7 +134,7 @@ class RerunSink:
         self._waiting.setdefault(entity, (kind, []))[1].append((when, fields))
 
     def _send(self, entity: Entity) -> None:
-        """Draw the rows of an entity that waited."""
+        """Draw the waiting rows of an entity."""
         if entity not in self._waiting:
             return
         kind, rows = self._waiting.pop(entity)

@@ -92,8 +92,8 @@ class Guard:
     def _cookies(self, headers: Headers, scope: Scope) -> Iterator[str]:
         """Yield the values of our cookie.
 
-        Other programs on this host send theirs along, in any form. A strict parser (``http.cookies``) drops
-        the whole header for one of them.
+        The header also has cookies of other programs on this host, in any form. A strict parser
+        (``http.cookies``) drops the whole header for one bad cookie.
         """
         for header in headers.getlist("cookie"):
             for pair in header.split(";"):

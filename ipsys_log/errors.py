@@ -27,7 +27,7 @@ class LogError(IpsysError):
 
 
 class WriteError(LogError):
-    """A disk that takes no more, or takes nothing. ``cause`` is what the operating system said."""
+    """A disk that is full or cannot be written to. ``cause`` is the error of the operating system."""
 
     def __init__(self, text: str, cause: OSError) -> None:
         super().__init__(text)
@@ -47,12 +47,12 @@ class SizeError(IpsysError):
 
 
 def is_full(error: OSError) -> bool:
-    """Return whether a disk, or what the user may have of it, is full."""
+    """Return whether a disk, or the quota of the user, is full."""
     return error.errno in (errno.ENOSPC, errno.EDQUOT)
 
 
 def disk_advice(error: OSError) -> str:
-    """Return what to do about a disk that cannot be written to, by what the operating system said."""
+    """Return what to do about a disk that cannot be written to, by the error of the operating system."""
     if is_full(error):
         return "free some space and try again"
     if error.errno == errno.EROFS:

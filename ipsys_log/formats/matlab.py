@@ -1,6 +1,6 @@
 """Tables of numbers in a MATLAB file (version 5).
 
-SciPy's reader believes the types and flags that a file names: wrong ones end the process.
+SciPy's reader trusts the types and flags in a file: wrong ones crash the process.
 Layout: "MAT-File Format", The MathWorks, chapter 1.
 """
 
@@ -35,7 +35,7 @@ def read_mat(path: Path) -> dict[str, NDArray[np.float64]]:
     Raises
     ------
     IpsysError
-        The file cannot be read, is of another version, or holds something else than tables of real numbers.
+        The file cannot be read, has another version, or holds other data than tables of real numbers.
     """
     try:
         data = path.read_bytes()
@@ -66,7 +66,7 @@ def _matrices(data: bytes) -> Iterator[bytes]:
 
 
 def _table(matrix: bytes) -> tuple[str, NDArray[np.float64]]:
-    """Name and numbers, from flags, dimensions, name and numbers: each has a tag, and fills 8 bytes."""
+    """Parse flags, dimensions, name and numbers: each has a tag and is padded to 8 bytes."""
     parts = list(_parts(matrix))
     if [kind for kind, _ in parts[:-1]] != [_FLAGS, _DIMENSIONS, _TEXT] or parts[-1][0] not in _NUMBERS:
         raise ValueError("a table lacks some of its parts")

@@ -41,12 +41,12 @@ class Sightings:
 
 
 def gather_sightings(messages: Iterable[Message]) -> dict[tuple[str, int], Sightings]:
-    """Camera points by camera and marker, ordered by the time they speak of: when the marker was exposed.
+    """Return camera points by camera and marker, ordered by the time of exposure of the marker.
 
     Raises
     ------
     IpsysError
-        For a point that is not a number, or farther away than any lab is wide.
+        A point is not a number, or is farther away than any lab is wide.
     """
     rows: dict[tuple[str, int], list[tuple[int, float, float, float]]] = {}
     for message in messages:

@@ -62,15 +62,15 @@ class FlatPlace:
 
 
 def world_point(measurement: Measurement, rig: Rig) -> TapePoint:
-    """The world point of a measurement, as given or by eq. (25), and its covariance.
+    """Return the world point of a measurement, as given or by eq. (25), and its covariance.
 
     The sigma of a distance is its own, else the rig's; that of the height its own, else 1 mm.
 
     Parameters
     ----------
-    measurement : with a world point, or two or more distances, the height, and the side where the
-        reference points lie on one line.
-    rig : for the reference points and the tape; not looked at where there is only a world point.
+    measurement : with a world point, or two or more distances, the height, and the side if the reference
+        points lie on one line.
+    rig : for the reference points and the tape; not used if there is only a world point.
 
     Returns
     -------
@@ -79,7 +79,7 @@ def world_point(measurement: Measurement, rig: Rig) -> TapePoint:
     Raises
     ------
     IpsysError
-        Where the measurement forms no point, or names unknown reference points.
+        The measurement forms no point, or names unknown reference points.
 
     References
     ----------

@@ -43,7 +43,7 @@ def repair_lines(report: RepairReport) -> Iterator[str | Table]:
 
 
 def _about_the_loss(report: RepairReport) -> Iterator[str | Table]:
-    """How much cannot be read, and which messages are gone with it, as far as that is known."""
+    """Yield the number of unreadable bytes, and the lost messages as far as they are known."""
     if not (report.bytes_lost or report.gone):
         return
     if report.gone and report.uncounted:

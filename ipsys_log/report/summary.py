@@ -95,7 +95,7 @@ def _cm(value_m: float) -> str:
 
 
 def _outlier_lines(accuracies: Sequence[Accuracy]) -> Iterator[str | Text]:
-    """Yield the outliers, the worst first; the first ones with what would explain them."""
+    """Yield the outliers, the worst first; the first ones with a possible explanation."""
     suspects = gather_suspects(accuracies)
     if not suspects:
         searched = "none" if any(map(_screened, accuracies)) else f"not searched: {_needed()}"
@@ -191,7 +191,7 @@ def _held_out(row: CameraEvaluation | None, space: bool) -> str:
 
 
 def _two(value_m: float | None) -> str:
-    """Return a length in cm with two digits behind the point, and none where a column would burst."""
+    """Return a length in cm with two decimals, or none if a column would be too wide."""
     if value_m is None:
         return "-"
     value_cm = value_m * CM_PER_M

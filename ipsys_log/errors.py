@@ -1,4 +1,4 @@
-"""What went wrong in the user's input, in one line: what, where, and what to do."""
+"""Errors in the user's input, in one line: what is wrong, where, and what to do."""
 
 import errno
 

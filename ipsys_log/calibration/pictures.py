@@ -60,7 +60,7 @@ class Pictures(NamedTuple):
 
     @property
     def looked_at(self) -> int:
-        """How many of them are read; 0 where that is not known."""
+        """Number of pictures that are read; 0 if it is not known."""
         return -(-self.total // _stride(self.total))
 
 

@@ -162,7 +162,7 @@ def _spread(missed_px: Array) -> float:
 
 
 def _belonging(corners: Corners, missed_px: Array) -> tuple[NDArray[np.bool_], list[Left]]:
-    """Which corners belong to the fit, (n,), and the pictures that do not."""
+    """Return a mask of the corners of the fit, (n,), and the pictures that are left out."""
     distances = np.linalg.norm(missed_px, axis=1)
     near = distances <= max(_FAR_CORNER * _spread(missed_px), _NEAR_PX)
     counts = corners.sums(np.ones_like(distances))

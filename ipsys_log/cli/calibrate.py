@@ -212,7 +212,7 @@ def _taken_now(lab: Lab, seconds: float) -> Iterator[list[Path]]:
 
 
 def _targets(cameras: list[str], output: Path, formats: list[str], force: bool) -> dict[str, dict[str, Path]]:
-    """Where the file of each camera and format goes; an error where it cannot."""
+    """Return the path of the file of each camera and format; raise if it cannot be written."""
     from ipsys_log.errors import IpsysError
     from ipsys_log.formats.calibration_yaml import FORMATS
     from ipsys_log.report.files import check_file, check_folder

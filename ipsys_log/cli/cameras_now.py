@@ -44,7 +44,7 @@ _PLACE_S = 1.5
 
 
 class Lab(NamedTuple):
-    """What is to be opened: the rig, its cameras, their lenses by name, and what these are read from."""
+    """The cameras to open: the rig, its cameras, their intrinsics by name, and the files of these."""
 
     rig: Rig
     cameras: list[RigCamera]

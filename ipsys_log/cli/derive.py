@@ -325,7 +325,7 @@ def _print(accuracies: Sequence[Accuracy], details: bool) -> None:
 
 
 def _remark(outcomes: list[Outcome], target: Path | None) -> None:
-    """What was done, and where it is."""
+    """Print what was done, and the log with the results."""
     print_outcomes(outcomes)
     if target is None:
         return

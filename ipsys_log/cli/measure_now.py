@@ -85,7 +85,7 @@ def ready_to_measure(lab: Lab, request: Request, model_from: Path | None) -> Mod
 
 
 def live_scene(settings: list[Message], cameras: Attached, model: Model | None) -> LiveScene:
-    """What the cameras see now, to measure on."""
+    """Make the scene of the live cameras, for measuring."""
     from ipsys_log.scenes.live import LiveScene
 
     return LiveScene(settings[0].payload, model, cameras.states, cameras.save)

@@ -1,4 +1,4 @@
-"""What is inside a chunk: decompression within bounds, and its records."""
+"""Contents of a chunk: decompression within limits, and its records."""
 
 import threading
 import zlib

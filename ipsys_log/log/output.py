@@ -1,4 +1,4 @@
-"""Where a writer's bytes go: into a file that grows, or into memory until an append is complete."""
+"""Destinations of a writer's bytes: a growing file, or memory until an append is complete."""
 
 import logging
 import os

@@ -120,7 +120,7 @@ class LogReader:
 
     @property
     def data_end(self) -> int:
-        """Where the data section ends: an append changes nothing before this byte."""
+        """The end of the data section: an append changes nothing before this byte."""
         return self._contents.data_end
 
     def messages(

@@ -58,7 +58,7 @@ R = TypeVar("R")
 
 
 class RecordAt(NamedTuple):
-    """Where a record lies: `offset` of its opcode, `length` with its 9 bytes of head."""
+    """The position of a record: `offset` of its opcode, `length` with its 9 bytes of head."""
 
     opcode: int
     offset: int
@@ -66,7 +66,7 @@ class RecordAt(NamedTuple):
 
 
 class ChunkRef(NamedTuple):
-    """What a ChunkIndex record says. `index_offsets` maps channel ids to their MessageIndex records."""
+    """The contents of a ChunkIndex record. `index_offsets` maps channel ids to their MessageIndex records."""
 
     offset: int
     length: int

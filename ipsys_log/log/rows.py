@@ -1,4 +1,4 @@
-"""Where the messages of a chunk lie, as its message indexes say it, and what to read to get at them."""
+"""Positions of the messages of a chunk by its message indexes, and the reads that they need."""
 
 from bisect import bisect_right
 from collections.abc import Mapping

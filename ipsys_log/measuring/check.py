@@ -1,4 +1,4 @@
-"""Whether a place can be right, before it is written down: triangle, floor, cameras, model."""
+"""Plausibility check of a measurement before it is saved: triangle, floor, cameras, model."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""What looks wrong with a place: off the floor, flat tapes, a model that has it elsewhere."""
+"""Warnings on a measurement: off the floor, flat tapes, another prediction by the model."""
 
 from __future__ import annotations
 

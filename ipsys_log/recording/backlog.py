@@ -1,4 +1,4 @@
-"""What is recorded and waits for the stages, which may be slower."""
+"""Recorded frames that wait for the stages, which may be slower."""
 
 from __future__ import annotations
 

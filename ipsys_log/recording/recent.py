@@ -1,4 +1,4 @@
-"""Of what cameras send, into a log what was measured: the last seconds wait, most of them to be forgotten."""
+"""Buffer of recent frames: those around a measurement are written to the log, the others discarded."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""What cameras send now, into a log: written first, looked at after."""
+"""Recording of cameras into a log: frames are written first, processed later."""
 
 from __future__ import annotations
 
@@ -269,7 +269,7 @@ def fitting_lenses(
 def first_messages(
     rig: Rig, lenses: Mapping[str, CameraCalibration], now_ns: Callable[[], int]
 ) -> list[Message]:
-    """What a log begins with: the rig, and the lenses by camera."""
+    """The first messages of a log: the rig, and the intrinsics by camera."""
     time_ns = now_ns()
     found = [Message(RIG_TOPIC, time_ns, time_ns, rig)]
     for camera, lens in sorted(lenses.items()):

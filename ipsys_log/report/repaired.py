@@ -1,4 +1,4 @@
-"""What a repair has brought back, and what is gone, in words."""
+"""The result of a repair in words: saved and lost messages."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""What a log holds that models are made of: measured places, and models that were fitted or copied in."""
+"""Model inputs in a log: measured points, and models that were fitted or copied into it."""
 
 from __future__ import annotations
 
@@ -153,7 +153,7 @@ def split_parameters(session: Session, request: Request) -> dict[str, str]:
 
 
 def find_pairs(session: Session, points: str, places: list[Measured]) -> dict[str, list[Pair]]:
-    """What each camera saw of the measured places."""
+    """Return the observations of the measured points by camera."""
     sightings = gather_sightings(session.messages(session.topics(CameraPoints, points)))
     return build_pairs(sightings, places)
 

@@ -1,4 +1,4 @@
-"""What can be said to be wrong before anything is computed."""
+"""Checks of the input before any computation."""
 
 from __future__ import annotations
 

@@ -30,7 +30,7 @@ __all__ = [
 
 @dataclass(frozen=True, slots=True)
 class Outcome:
-    """What became of one stage: the run that holds it, whether it was made just now, what to know of it."""
+    """The outcome of a stage: its run, whether it was made now, and remarks."""
 
     stage: str
     run: str
@@ -56,12 +56,12 @@ def fingerprint() -> dict[str, str]:
 
 
 def read_channels(session: Session, topics: Iterable[str]) -> tuple[ChannelRead, ...]:
-    """What a stage reads, known again by its content (law 4 of the log)."""
+    """An input of a stage, identified by its content (law 4 of the log)."""
     return tuple(ChannelRead(topic, session.count(topic), session.hash(topic)) for topic in sorted(topics))
 
 
 def _essence(run: Run) -> bytes:
-    """What makes two runs of a stage the same: everything but names, times and the environment."""
+    """The identity of a run of a stage: all except names, times and the environment."""
     return encode(replace(run, timestamp=0, run="", fingerprint={}, input_runs=(), outputs=(), number=0))
 
 

@@ -1,4 +1,4 @@
-"""What a user should know of a stage, and what a user has to decide before it is written."""
+"""Remarks on a stage, and decisions that a user has to make before it is written."""
 
 from __future__ import annotations
 

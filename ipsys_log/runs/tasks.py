@@ -1,4 +1,4 @@
-"""What each stage reads of a log, and what makes its result what it is: the plan of a replay."""
+"""The plan of a replay: the inputs and the parameters of each stage."""
 
 from __future__ import annotations
 

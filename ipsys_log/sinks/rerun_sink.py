@@ -42,7 +42,7 @@ _LINE, _THIN, _DOT = (rr.Radius.ui_points(width) for width in (1.5, 0.75, 0.5))
 
 
 def tracks_entity(run: str | None) -> Entity:
-    """Where the tracks of a run are drawn; without a run the truth."""
+    """Return the entity path of the tracks of a run; without a run, that of the ground truth."""
     return ("world", "truth") if run is None else ("world", "runs", run)
 
 

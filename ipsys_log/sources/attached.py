@@ -108,7 +108,7 @@ class Attached:
         self._ending = True
 
     def __iter__(self) -> Generator[Message | None, None, None]:
-        """Who asks for the next message has written the last one; who stops asking closes this."""
+        """Requesting the next message acknowledges the previous write; ending the iteration closes this."""
         try:
             while True:
                 if self._ending:
@@ -250,7 +250,7 @@ class Attached:
 
 @dataclass(eq=False, slots=True)
 class _Saving:
-    """What a caller of ``save`` waits for: written by the thread that iterates, then on the disk."""
+    """The state that a caller of ``save`` waits for: written by the iterating thread, then on the disk."""
 
     arrival: Arrival
     log_time_ns: int | None = None

@@ -1,4 +1,4 @@
-"""Who may use the page: whoever knows the token, through an address of this machine, from the page itself."""
+"""Access control of the page: by the token, an address of this machine, and the origin of the request."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""What stays the same between the frames of a camera: its rays, the floor, the noise of its sensor."""
+"""Constant data of the frames of a camera: its rays, the floor, the noise of its sensor."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""What is printed on a marker: where black meets white, and the colours of its cells."""
+"""The printed pattern of a marker: its edges between black and white, and the colours of its cells."""
 
 from __future__ import annotations
 

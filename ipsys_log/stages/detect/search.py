@@ -231,7 +231,7 @@ def _full_detector(dictionary: str) -> cv2.aruco.ArucoDetector:
 
 
 def _read(grey: Grey, corners: Array, dictionary: str) -> list[Candidate]:
-    """Which of the squares (n, 4, 2) are markers, by their cells."""
+    """Return the markers among the squares (n, 4, 2), by their cells."""
     if not len(corners):
         return []
     words, places = _words(dictionary)

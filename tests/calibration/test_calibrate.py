@@ -114,7 +114,7 @@ def test_pinhole_on_a_fisheye_is_refused() -> None:
 def test_pinhole_on_a_fisheye_insisted_on_is_noted() -> None:
     result = calibrate("red", through_fisheye(), BOARD, LENSES["pinhole4"], insist=True)
     assert result.rms_px > 2
-    assert "written only for --force: corners are" in result.notes[0]
+    assert "written only for --force: the RMS reprojection error is" in result.notes[0]
 
 
 def test_too_few_say_what_to_add() -> None:

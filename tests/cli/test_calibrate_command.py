@@ -274,16 +274,14 @@ def test_pictures_without_the_board_are_named(ipsys: Ipsys, red: Path, tmp_path:
 
 def test_better_model_is_named(ipsys: Ipsys, red: Path, tmp_path: Path) -> None:
     done = calibrate(ipsys, red, "--board", "6x4", "--lens", "pinhole", "-o", tmp_path)
-    assert re.search(
-        r"corners are 0\.\d+ px off; --lens (fisheye|pinhole8) leaves 0\.0\d px: use it", done.err
-    )
+    assert re.search(r"error is 0\.\d+ px; --lens (fisheye|pinhole8) leaves 0\.0\d px: use it", done.err)
 
 
 def test_pinhole_on_real_fisheye_is_refused(ipsys: Ipsys, data: Path, tmp_path: Path) -> None:
     folder = data / "fisheye_chessboard"
     done = ipsys("calibrate", folder, "--board", "6x4", "--lens", "pinhole", "-o", tmp_path)
     assert done.code == 1
-    assert "corners are 3.7 px off (RMS)" in done.err
+    assert "the RMS reprojection error is 3.7 px" in done.err
     assert "--lens fisheye leaves 0.22 px: use it; or give --force" in done.err
     assert list(tmp_path.iterdir()) == []
 

@@ -41,7 +41,7 @@ class Recorded:
 
     @property
     def is_of_other_version(self) -> bool:
-        """Whether older or newer software made it, with perhaps another result."""
+        """Return whether older or newer software made it, with perhaps another result."""
         names = versioned_names(self.run.stage, self.method)
         return any(recorded_version(self.run, name) != VERSIONS[name] for name in names)
 

@@ -36,17 +36,17 @@ class Agreement(NamedTuple):
 
     @property
     def clear(self) -> bool:
-        """Whether the cells match this marker and no other."""
+        """Return whether the cells match this marker and no other."""
         return self.own >= _AGREES and self.own >= self.next + _CLEARLY
 
     @property
     def possible(self) -> bool:
-        """Whether the cells may match this marker, near its pose."""
+        """Return whether the cells may match this marker, near its pose."""
         return self.own >= _ALIKE
 
     @property
     def likely(self) -> bool:
-        """Whether the cells look like those of this marker rather than of another."""
+        """Return whether the cells look like those of this marker rather than of another."""
         return self.possible and self.own > self.next
 
 

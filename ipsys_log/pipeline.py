@@ -324,7 +324,7 @@ def live(
         ledger = Ledger(cameras.clock.now_ns, cameras.received_ns)
         fault = _put_through(chain(settings, frames), stages, ledger, log, show)
         if fault is not None:
-            cameras.warn("stages_stopped", f"{fault}; frames are still recorded")
+            cameras.warn("stages_stopped", f"{fault}; frames are recorded all the same")
             for message in frames:
                 if message is not TICK:
                     show(message)

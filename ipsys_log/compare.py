@@ -46,7 +46,7 @@ class Comparison:
 
 @dataclass(frozen=True, slots=True, eq=False)
 class Extent:
-    """The cameras, log times (n,) in ns ascending, and marker ids that one side of a comparison speaks of."""
+    """The cameras, ascending log times (n,) in ns, and marker ids of one side of a comparison."""
 
     cameras: frozenset[str]
     times_ns: NDArray[np.int64]
@@ -54,7 +54,7 @@ class Extent:
 
 
 def explain_apart(first: Extent, second: Extent) -> str | None:
-    """Return the reason why two sides have nothing in common that can be compared; None where they have.
+    """Return the reason why two sides have nothing in common to compare; None if they have.
 
     Parameters
     ----------
@@ -74,7 +74,7 @@ def explain_apart(first: Extent, second: Extent) -> str | None:
 
 
 def _explain_times(first: Extent, second: Extent) -> str | None:
-    """Return the reason why two sides have no frame in common; None where they have one."""
+    """Return the reason why two sides have no frame in common; None if they have one."""
     advice = "Compare logs of one recording"
     if first.times_ns[-1] < second.times_ns[0] or second.times_ns[-1] < first.times_ns[0]:
         sides = _range(first), _range(second)

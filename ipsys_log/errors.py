@@ -1,4 +1,4 @@
-"""What went wrong in the user's input, in one line: what, where, and what to do."""
+"""Errors in the user's input, in one line: what is wrong, where, and what to do."""
 
 import errno
 
@@ -27,7 +27,7 @@ class LogError(IpsysError):
 
 
 class WriteError(LogError):
-    """A disk that takes no more, or takes nothing. ``cause`` is what the operating system said."""
+    """A disk that is full or cannot be written to. ``cause`` is the error of the operating system."""
 
     def __init__(self, text: str, cause: OSError) -> None:
         super().__init__(text)
@@ -47,18 +47,18 @@ class SizeError(IpsysError):
 
 
 def is_full(error: OSError) -> bool:
-    """Return whether a disk, or what the user may have of it, is full."""
+    """Return whether a disk, or the quota of the user, is full."""
     return error.errno in (errno.ENOSPC, errno.EDQUOT)
 
 
 def disk_advice(error: OSError) -> str:
-    """Return what to do about a disk that cannot be written to, by what the operating system said."""
+    """Return what to do about a disk that cannot be written to, by the error of the operating system."""
     if is_full(error):
         return "free some space and try again"
     if error.errno == errno.EROFS:
-        return "the disk takes no writes now (it may have had a fault): mount it for writing, or use another"
+        return "the disk is read-only (perhaps after a fault): mount it for writing, or use another disk"
     if error.errno == errno.EFBIG:
         return "files of this size are not possible there: use a disk with another file system"
     if error.errno in (errno.EACCES, errno.EPERM):
-        return "ask for the right to write there, or use another folder"
+        return "ask for write permission there, or use another folder"
     return "the disk or its connection is at fault: copy the log to another disk, and try again there"

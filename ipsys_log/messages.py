@@ -47,7 +47,7 @@ TRUTH_TOPIC = "/truth/tracks"
 
 # The kind of an event whose timestamp is the log time of a frame that no stage has seen when it was recorded.
 FRAME_SKIPPED = "frame_skipped"
-# The kind of an event that frames of a camera came late, and have their time of arrival.
+# The kind of an event for late frames of a camera that have their time of arrival.
 STAMP_UNRELIABLE = "stamp_unreliable"
 
 
@@ -312,10 +312,10 @@ class Tracks:
 
 @dataclass(frozen=True, slots=True)
 class Event:
-    """Something that a reader of the log must know of, such as a corrupt frame.
+    """An event that a reader of the log must know, such as a corrupt frame.
 
-    ``start`` and ``end`` are the first and the last time of frames that an event of kind ``stamp_unreliable``
-    speaks of; without an end that is still to come.
+    ``start`` and ``end`` are the first and the last time of the frames that an event of kind
+    ``stamp_unreliable`` affects; without ``end``, the last time is not known yet.
     """
 
     timestamp: TimeNs

@@ -137,13 +137,13 @@ def replay(
 ) -> list[Outcome]:
     """Compute what a log lacks, up to a stage, and append it; or write it to a new log.
 
-    What is out of date is computed again, as a new run beside the old one.
+    Results that are out of date are computed again, as a new run beside the old one.
 
     Parameters
     ----------
     paths : the logs, read as one; results go to the last of them, or to ``output``.
-    until : the last stage. On the way to fuse models are evaluated too, where places are held out.
-    say : is told, before it is computed, what is out of date and why.
+    until : the last stage. With fuse, models are also evaluated if points are held out.
+    say : called before the computation, with the runs that are out of date and the reason.
 
     Returns
     -------
@@ -152,7 +152,7 @@ def replay(
     Raises
     ------
     IpsysError
-        For anything in the input that the user has to mend.
+        The input has a fault that the user must correct.
     """
     models = wanted_models(request, until, paths)
     check_inputs(paths, request, models, until)
@@ -161,7 +161,7 @@ def replay(
     with opened_target(paths, output) as (logs, target), threadpool_limits(1, user_api="blas"):
 
         def do(stage: str, **given: str) -> str:
-            """Do a stage, or find it done; the name of the run that holds it, if there is one."""
+            """Run a stage, or find its result; return the name of its run, if there is one."""
             if STAGES.index(stage) > STAGES.index(until):
                 return ""
             with Session(logs) as session:
@@ -205,7 +205,7 @@ def record(
     consumers: Sequence[Consumer] = (),
     overwrite: bool = False,
 ) -> Mapping[str, int]:
-    """Write what cameras send to a new log; returns how many messages went to each topic.
+    """Write the messages of cameras to a new log; return the number of messages of each topic.
 
     Parameters
     ----------
@@ -217,9 +217,9 @@ def record(
     Raises
     ------
     IpsysError
-        Where the log cannot be written; what it holds by then is a complete log.
+        The log cannot be written; it is complete up to then.
     Exception
-        What the first of ``consumers`` raised, after the recording has ended: it cannot end it.
+        The error of the first failed consumer, after the recording has ended: it cannot end it.
     """
     show = Consumers(consumers, source.warn)
     with recording(target, settings, overwrite) as log:
@@ -238,11 +238,11 @@ def measure(
     consumers: Sequence[Consumer],
     overwrite: bool = False,
 ) -> Mapping[str, int]:
-    """Look for markers in what cameras send, and write what is measured to a new log, with its frames.
+    """Detect markers in the frames of cameras, and write measurements with their frames to a new log.
 
-    A measurement that comes through the cameras' stream brings along those of the second in which its marker
-    lay still; all others are looked at and forgotten. What the stages make is only shown: a replay makes it
-    from the frames.
+    A measurement in the cameras' stream keeps the frames of the second in which its marker was stationary;
+    all others are processed and discarded. Results of the stages are only shown: a replay computes them from
+    the frames.
 
     Parameters
     ----------
@@ -288,10 +288,10 @@ def live(
     consumers: Sequence[Consumer] = (),
     overwrite: bool = False,
 ) -> list[Outcome]:
-    """Write what cameras send to a new log, and what the stages make of it: the run of a replay.
+    """Write the messages of cameras to a new log with the results of the stages: the run of a replay.
 
-    Every frame is in the log before a stage sees it. What is skipped because the stages are too slow is named
-    by events; a replay ``as_live`` passes over the same frames and gives the same bytes.
+    Every frame is in the log before a stage sees it. Events name the frames that are skipped because the
+    stages are too slow; a replay ``as_live`` skips the same frames and gives the same bytes.
 
     Parameters
     ----------
@@ -346,7 +346,7 @@ def live(
 def _put_through(
     frames: Iterable[Message], stages: Sequence[Stage], ledger: Ledger, log: Recording, show: Consumers
 ) -> IpsysError | None:
-    """Write what the stages make of frames as they come, then show it; returns what a stage stopped with."""
+    """Write the results of the stages for incoming frames, then show them; return the error of a stage."""
     made = ledger.note("detected", Markers, run(frames, stages[:1], in_threads))
     made = ledger.note("located", Positions, run(made, stages[1:3]))
     made = ledger.note("fused", Tracks, run(made, stages[3:]))

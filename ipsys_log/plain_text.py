@@ -1,4 +1,4 @@
-"""Text of others, made safe to show."""
+"""Conversion of untrusted text into text that is safe to print."""
 
 from __future__ import annotations
 
@@ -13,10 +13,10 @@ _LONGEST = 2_000
 
 
 def plain_text(text: str, *, keep: str = "", longest: int = _LONGEST) -> str:
-    r"""Return `text` with control characters written as escapes, and cut where it is longer than `longest`.
+    r"""Return `text` with control characters as escapes, cut to `longest` characters.
 
-    Names in a log are of others. A terminal obeys an escape sequence in a name; it can hide text, or change
-    what is shown elsewhere.
+    Names in a log are untrusted. A terminal executes an escape sequence in a name; it can hide text, or
+    change other text.
 
     Parameters
     ----------

@@ -72,22 +72,22 @@ def check_name(name: str, what: str) -> str:
 
 
 def check_rig_cameras(rig: Rig, cameras: Collection[str], where: str) -> list[str]:
-    """See that a rig describes the cameras that it is used for.
+    """Check that a rig describes the cameras that it is used for.
 
     Parameters
     ----------
-    rig : without any camera it suits all.
+    rig : without cameras it fits all.
     cameras : names in the log or the pictures.
     where : the rig file, for the message.
 
     Returns
     -------
-    A remark where some cameras are not described.
+    A remark if some cameras are not described.
 
     Raises
     ------
     IpsysError
-        Where the rig describes only other cameras.
+        The rig describes only other cameras.
     """
     described = [camera.name for camera in rig.cameras]
     missing = sorted(set(cameras) - set(described))
@@ -96,7 +96,7 @@ def check_rig_cameras(rig: Rig, cameras: Collection[str], where: str) -> list[st
     if len(missing) == len(set(cameras)):
         raise IpsysError(
             f"{where}: describes the cameras {', '.join(described)}, but there are only "
-            f"{', '.join(missing)}. Give the rig of these, rename its cameras, or take out its [[cameras]]"
+            f"{', '.join(missing)}. Give the rig of these, rename its cameras, or remove its [[cameras]]"
         )
     named = ", ".join(missing)
     return [f"{where}: does not describe camera {named}; defaults are used, such as no rolling shutter"]
@@ -164,8 +164,8 @@ def load_rig(path: Path) -> Rig:
     Raises
     ------
     IpsysError
-        Where it cannot be read, is not TOML, has unknown or missing keys, contradicts itself, or has a value
-        that was meant in another unit.
+        The file cannot be read, is not TOML, has unknown or missing keys, contradicts itself, or has a value
+        in a wrong unit.
     """
     try:
         if path.stat().st_size > _LARGEST_FILE:
@@ -177,9 +177,9 @@ def load_rig(path: Path) -> Rig:
         raise IpsysError(f"{path}: is not a text file; write one with: ipsys init {path}") from error
     except tomllib.TOMLDecodeError as error:
         raise IpsysError(_not_toml(path, error)) from error
-    except (ValueError, RecursionError) as error:  # a number or nesting that Python's reader gives up on
+    except (ValueError, RecursionError) as error:  # a number or nesting that Python's parser refuses
         raise IpsysError(
-            f"{path}: a number has thousands of digits, or tables lie thousands deep in one another; "
+            f"{path}: a number has thousands of digits, or tables are nested thousands deep; "
             f"write a rig file with: ipsys init {path.name}"
         ) from error
     for key, item in _ITEMS.items():
@@ -197,7 +197,7 @@ def load_rig(path: Path) -> Rig:
 
 
 def _not_toml(path: Path, error: tomllib.TOMLDecodeError) -> str:
-    """What is wrong with a line, with the slips that are made most."""
+    """Return the fault of a line, with hints on the most frequent mistakes."""
     text = f"{path}: is not valid TOML: {error}"
     found = re.search(r"at line (\d+)", str(error))
     lines = path.read_text(encoding="utf-8").split("\n")
@@ -215,8 +215,8 @@ def check_rig(rig: Rig, where: str) -> Rig:
     Raises
     ------
     IpsysError
-        For two cameras, markers or reference points of one name, two reference points at one place, a
-        bad name, a length or sigma that is not positive, or a height that no robot has.
+        Two cameras, markers or reference points have the same name, two reference points the same position; a
+        name is bad, a length or sigma is not positive, or a height is impossible.
     """
     for camera in rig.cameras:
         check_name(camera.name, f"{where}: camera name")
@@ -242,7 +242,7 @@ def check_rig(rig: Rig, where: str) -> Rig:
 
 
 def _check_numbers(item: Any, where: str) -> None:
-    """Refuse numbers that are in no lab, before one of them spoils a computation."""
+    """Refuse numbers that are impossible in a lab, before one of them spoils a computation."""
     for field in fields(item) if item is not None else ():
         value = getattr(item, field.name)
         if isinstance(value, float) and not abs(value) <= _FARTHEST:
@@ -332,6 +332,6 @@ def _value(kind: str, value: Any, where: str) -> Any:
 
 
 def _shown(value: Any) -> str:
-    """A value as an error repeats it."""
+    """Return a value for an error message."""
     text = repr(value)
     return text if len(text) <= _LONGEST_LINE else f"{text[:_LONGEST_LINE]} ..."

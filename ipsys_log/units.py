@@ -41,7 +41,7 @@ def format_bytes(count: int) -> str:
 
 
 def format_duration(seconds: float) -> str:
-    """A time that passes, in the unit that gives it the fewest digits.
+    """Return a duration in the unit with the fewest digits.
 
     Examples
     --------

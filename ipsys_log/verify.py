@@ -35,23 +35,23 @@ from ipsys_log.stages.camera_frame import PERIMETER
 __all__ = ["diff", "explain_diff", "verify"]
 
 _MODELS = ("fit", "evaluate")
-# What comes frame by frame.
+# Payloads that come frame by frame.
 _MOVING = (Markers, CameraPoints, Positions, Tracks)
 
 
 def verify(
     paths: Sequence[Path], run: str | None, progress: Progress, say: Callable[[str], None] = lambda text: None
 ) -> list[Comparison]:
-    """Make every run again, from its recorded input, and compare.
+    """Repeat every run from its recorded input, and compare.
 
-    A model that was copied in cannot be made again, nor can what was evaluated of it; what was made with it
-    can. Nor can a model since when places were measured or withdrawn, or what another version has made, which
-    is said; later stages are made again from what is recorded.
+    A model that was copied from another log cannot be repeated, nor its evaluation; results made with it can.
+    A model cannot be repeated if measurements were added or withdrawn since. Results of another version are
+    not repeated either, with a remark. Later stages are repeated from the recorded channels.
 
     Parameters
     ----------
-    run : only this one; None: all.
-    say : is told what is not made again.
+    run : only this run; None: all.
+    say : called with the runs that are not repeated.
 
     Returns
     -------
@@ -60,8 +60,7 @@ def verify(
     Raises
     ------
     IpsysError
-        Where there is no such run, nothing of it can be verified, or it was made from something that the log
-        no longer holds.
+        There is no such run, nothing of it can be verified, or its inputs are no longer in the log.
     """
     with Session(paths) as session, threadpool_limits(1, user_api="blas"):
         names = session.run_names() if run is None else session.run_names() & {run}
@@ -95,12 +94,12 @@ def verify(
 
 
 def _is_of_copied_model(run: Run) -> bool:
-    """Return whether a stage copied a model of another log in, or evaluated such a one."""
+    """Return whether a stage copied a model from another log, or evaluated such a model."""
     return run.stage in _MODELS and not is_fitted_here(run)
 
 
 def _is_of_other_version(one: Recorded, say: Callable[[str], None]) -> bool:
-    """Return whether a stage was made by another version, which is said."""
+    """Return whether another version made a stage, and print a remark if so."""
     if one.is_of_other_version:
         say(f"run {one.run.run}: {one.run.stage} is {one.state}; it is not verified")
     return one.is_of_other_version
@@ -121,12 +120,12 @@ def diff(left: Path, right: Path, runs: tuple[str | None, str | None]) -> list[C
 
     Parameters
     ----------
-    runs : of the left and of the right log; None: all that both have.
+    runs : of the left and of the right log; None: all common runs.
 
     Raises
     ------
     IpsysError
-        Where a run is not there, or there is nothing that both have.
+        A run does not exist, or the logs have no run in common.
     """
     with Session([left]) as one, Session([right]) as other:
         first, second = _compared_runs(one, other, runs)
@@ -149,7 +148,7 @@ def _compared_runs(
     both = names[0] & names[1] if runs[0] is None else names[0]
     if not both:
         raise IpsysError(
-            f"{one} and {other} have no run of one name (see 'ipsys runs'); say which with --run"
+            f"{one} and {other} have no run of the same name (see 'ipsys runs'); give the runs with --run"
         )
     return both, both if runs[1] is None else names[1]
 

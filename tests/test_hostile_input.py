@@ -264,7 +264,7 @@ def test_tape_of_any_length_is_one_line(ipsys: Ipsys, lab: Path, length_m: float
         assert done.code in (0, 1)
         assert "Traceback" not in done.err
     assert ipsys("fit", log).code == 1
-    assert "lies in no lab" in ipsys("fit", log).err
+    assert "m is too long" in ipsys("fit", log).err
     assert log.read_bytes() == before
 
 

@@ -385,7 +385,7 @@ def test_a_full_disk_ends_it_with_a_complete_log(
             done = ipsys("record", "--rig", rig, "-o", disk / "a.mcap", "--seconds", "60")
         found = frames(disk / "a.mcap")
     assert done.code == 1
-    assert "the disk takes no more; recording has stopped, and the log is complete" in done.err
+    assert "the disk is full; recording has stopped, and the log is complete" in done.err
     assert all(len(jpegs) > 5 for jpegs in found.values())
 
 

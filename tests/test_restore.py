@@ -256,7 +256,7 @@ def test_a_full_disk_ends_live_with_runs_that_are_signed(
             frames = sum(session.count(topic) for topic in session.images.values())
             markers = sum(session.count(topic) for topic in session.topics(Markers, "edges"))
     assert program.returncode == 1, out
-    assert "the disk takes no more; recording has stopped, and the log is complete" in err
+    assert "the disk is full; recording has stopped, and the log is complete" in err
     assert verified.out.endswith("a replay equals the log\n")
     assert "nothing to do: all of it is up to date" in replayed.err
     assert frames >= markers > 50

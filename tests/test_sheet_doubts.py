@@ -170,7 +170,7 @@ def test_undo_in_the_terminal_asks_for_older_points(
             return [m.id for m in active_measurements(log_now.payloads(log_now.topics(Measurement)))]
 
     said = session("u", "", "q")
-    assert "is of an earlier one. Withdraw it? [y/N]" in said
+    assert "is of an earlier session. Withdraw it? [y/N]" in said
     assert "nothing is withdrawn" in said
     session("u", "q", "q")
     assert left() == ["p001", "p002"]

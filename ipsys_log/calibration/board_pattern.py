@@ -1,6 +1,6 @@
-"""The pattern of a calibration board: which squares are black, and which markers stand in the others.
+"""The pattern of a calibration board: its black squares, and the markers in the others.
 
-The layout is that of OpenCV since 4.6: the square at the top left is black, whatever the number of rows.
+The layout is that of OpenCV since 4.6: the square at the top left is black for any number of rows.
 """
 
 from __future__ import annotations
@@ -16,7 +16,7 @@ __all__ = ["BoardMarker", "black_squares", "board_markers"]
 
 
 class BoardMarker(NamedTuple):
-    """A marker of a ChArUco board, and the square that it stands in."""
+    """A marker of a ChArUco board, and its square."""
 
     id: int
     row: int
@@ -24,7 +24,7 @@ class BoardMarker(NamedTuple):
 
 
 def black_squares(board: Board) -> NDArray[np.bool_]:
-    """Return which squares are black, (rows, columns), the top row first.
+    """Return a mask of the black squares, (rows, columns), the top row first.
 
     Examples
     --------

@@ -88,7 +88,7 @@ def camera_points(fit: Fit, corners: Corners) -> Array:
 
 
 def residuals(model: LensModel, fit: Fit, corners: Corners) -> Array:
-    """By how much the fit misses the corners seen, (n, 2) in px."""
+    """Return the reprojection residuals of the corners, (n, 2) in px."""
     return project_points(model, fit.lens, camera_points(fit, corners)) - corners.pixels
 
 
@@ -102,7 +102,7 @@ def _weights(missed_px: Array, scale_px: float | None) -> tuple[Array, float]:
 
 
 def corner_weights(missed_px: Array, scale_px: float | None) -> Array:
-    """Return the weight of each corner, (n,): 1, or less for one that is far off."""
+    """Return the weight of each corner, (n,): 1, or less for an outlier."""
     return _weights(missed_px, scale_px)[0]
 
 
@@ -113,12 +113,12 @@ def _cost(model: LensModel, fit: Fit, corners: Corners, scale_px: float | None) 
 def normal_equations(
     model: LensModel, fit: Fit, corners: Corners, basis: Array, scale_px: float | None
 ) -> Normal:
-    """What a step is solved from; ``basis`` (p, q) has the directions in which the lens may change."""
+    """The equations of a step; ``basis`` (p, q) has the free directions of the lens parameters."""
     points_m = camera_points(fit, corners)
     pixels, by_point, by_lens = project_with_slopes(model, fit.lens, points_m)
     missed_px = pixels - corners.pixels
     x, y, z = (points_m - fit.places_m[corners.picture]).T
-    # Columns: the lens (q), a turn and a shift of the board (6), and the residual.
+    # Columns: the lens parameters (q), rotation and translation of the board (6), and the residual.
     count = basis.shape[1]
     rows = np.empty((len(points_m), 2, count + 7))
     rows[..., :count] = by_lens @ basis
@@ -151,7 +151,7 @@ def _squares(rows: Array) -> Array:
 
 
 def reduce_to_lens(normal: Normal) -> tuple[Array, Array]:
-    """Return the equations of the lens without the poses: matrices (f, q, q) and gradients (f, q)."""
+    """Return the equations of the lens parameters, poses eliminated: matrices (f, q, q), gradients (f, q)."""
     gradients = normal.pose_gradient[..., None]
     solved = np.linalg.solve(normal.poses, np.concatenate([normal.between, gradients], axis=2))
     transposed = normal.between.transpose(0, 2, 1)

@@ -27,16 +27,16 @@ __all__ = ["LEAST_PICTURES", "Calibrated", "calibrate"]
 Array = NDArray[np.float64]
 
 LEAST_PICTURES = 5
-# Fewer than this tell nothing, even to a user who insists.
+# Fewer are refused even with --force.
 _LEAST_INSISTED = 3
 # A focal length less sure than this is said to be so; coefficients are worth nothing beyond theirs.
 _UNSURE = 0.02
 _UNTOLD = 1.0
-# A lens of the right kind, and a flat board, leave less than the second; above the first, others are tried.
+# The right lens model and a flat board leave less than the second; above the first, others are tried.
 _TRY_OTHERS_PX, _OFF_PX = 0.4, 1.0
 # Nor is a focal length a result that is no better known than this.
 _UNKNOWN = 0.1
-# Another grid in more pictures than this share is remarked on.
+# Remark on another grid in more pictures than this share.
 _MANY_OTHERS = 0.2
 # Edges wider than this, in all pictures, are a camera in the dark or out of focus.
 _SOFT_PX = 2.5
@@ -44,23 +44,23 @@ _SOFT_PX = 2.5
 
 @dataclass(frozen=True, slots=True, eq=False)
 class Calibrated:
-    """A lens and how good it is.
+    """The intrinsics of a camera and their quality.
 
     Attributes
     ----------
-    camera, lens : whose, and the lens.
-    names, values, sigmas : of its parameters, with their standard deviations; 0 of what was not fitted.
-    square : whether fx and fy were taken for one number.
-    rms_px, median_px : of the distances in the image between corners seen and projected: the root of the
-        mean of dx^2 + dy^2, over all corners of all pictures used.
-    looked, seen : pictures looked at, and those in which the board was seen.
-    used : names and RMS in px of the pictures that the lens rests on.
-    dropped : pictures with the board that were left out because they are bad, and why.
+    camera, lens : name of the camera, and its intrinsics.
+    names, values, sigmas : of its parameters, with their standard deviations; 0 if not fitted.
+    square : whether fx = fy was assumed.
+    rms_px, median_px : of the reprojection errors: the root of the mean of dx^2 + dy^2, over all corners of
+        all used pictures.
+    looked, seen : numbers of examined pictures, and of those that show the board.
+    used : names and RMS in px of the pictures of the fit.
+    dropped : bad pictures with the board that were left out, and the reasons.
     spare : good pictures that show nothing new.
-    unseen : pictures in which the board was not seen, and what was.
-    far_corners : single corners left out of pictures used.
-    coverage, notes : where the board was, and what to do better.
-    pixels, residuals_px : (n, 2), of all corners used.
+    unseen : pictures without the board, and what they show.
+    far_corners : single outlier corners left out of used pictures.
+    coverage, notes : positions of the board, and advice.
+    pixels, residuals_px : (n, 2), of all used corners.
     """
 
     camera: str
@@ -87,17 +87,17 @@ class Calibrated:
 def calibrate(
     camera: str, looked: Looked, board: Board, model: LensModel, insist: bool = False
 ) -> Calibrated:
-    """The lens that the pictures tell.
+    """Estimate the intrinsics of a camera from its pictures.
 
     Parameters
     ----------
-    camera, looked, board, model : whose lens, what was seen of which board, and the kind of lens.
-    insist : whether to return a result that is too poor to use; a note then says why.
+    camera, looked, board, model : name of the camera, sightings, board, and lens model.
+    insist : return a result that is too poor to use, with a note that gives the reason.
 
     Raises
     ------
     IpsysError
-        Where too few pictures are of use, they are of two cameras, or the lens misses the corners by far; it
+        Too few pictures are usable, they are of two cameras, or the reprojection error is large; the text
         says what to do.
     """
     chosen = choose(looked.sightings, board, looked.size_px)
@@ -163,11 +163,11 @@ def _two_cameras(
     split = find_two_cameras(model, start, corners, names)
     if split is None:
         return ""
-    # A lens of another kind needs no second camera.
+    # Another lens model may explain the pictures without a second camera.
     better = find_better_model(model, corners, size_px, split.one_px)
     if better is not None and better.rms_px < split.two_px:
         return ""
-    return f"{two_cameras_fault(split, names)}; put the pictures of each into a folder of its own"
+    return f"{two_cameras_fault(split, names)}; put the pictures of each camera into a separate folder"
 
 
 def _far_off(model: LensModel, solved: Solved, corners: Corners, size_px: tuple[int, int]) -> str:
@@ -175,14 +175,14 @@ def _far_off(model: LensModel, solved: Solved, corners: Corners, size_px: tuple[
     if left_px <= MOST_RMS_PX:
         return ""
     better = find_better_model(model, corners, size_px, left_px)
-    todo = "see that the board is flat and its size right, and that the pictures are of one camera"
+    todo = "check that the board is flat, that its size is right, and that all pictures are of one camera"
     if better is not None:
         todo = f"--lens {better.name} leaves {better.rms_px:.2f} px: use it"
-    return f"corners are {left_px:.1f} px off (RMS), too far for a lens that can be used; {todo}"
+    return f"the RMS reprojection error is {left_px:.1f} px, too large for a usable calibration; {todo}"
 
 
 def _few_pictures(camera: str, used: list[Sighting], bad: list[Dropped], looked: Looked, insist: bool) -> str:
-    """Return what is wrong where pictures are too few, if the user insists on them; else raise it."""
+    """Return the fault of too few pictures, "" if they are enough; raise it unless the user insists."""
     if len(used) >= LEAST_PICTURES:
         return ""
     reasons = Counter(reason.split(":")[0] for _, reason in (*bad, *looked.unseen))
@@ -193,7 +193,7 @@ def _few_pictures(camera: str, used: list[Sighting], bad: list[Dropped], looked:
         coverage = measure_coverage(pixels, looked.size_px, np.stack([s.outline for s in used]))
         todo += [line.split(":")[0] for line in advice(coverage)[:1]]
     fault = (
-        f"only {len(used)} of {looked.count} pictures can be used{why}, but a lens needs "
+        f"only {len(used)} of {looked.count} pictures can be used{why}, but a calibration needs "
         f"{LEAST_PICTURES} or more; {'; '.join(todo)}"
     )
     if insist and len(used) >= _LEAST_INSISTED:
@@ -251,27 +251,27 @@ def _covered(looked: Looked, used: list[Sighting], solved: Solved) -> Coverage:
 
 
 def _unseen(looked: Looked) -> list[str]:
-    """Return a note where another grid than the board is seen in many pictures."""
+    """Return a note if many pictures show another grid than the board."""
     others = Counter(reason for _, reason in looked.unseen if "instead" in reason)
     if sum(others.values()) <= _MANY_OTHERS * looked.count:
         return []
     reason, count = others.most_common(1)[0]
-    return [f"in {count} of {looked.count} pictures {reason}: see that --board is right"]
+    return [f"in {count} of {looked.count} pictures {reason}: check --board"]
 
 
 def _doubts(model: LensModel, solved: Solved, size_px: tuple[int, int]) -> list[str]:
-    """What the numbers themselves say against the lens."""
+    """Return notes on doubts about the result, from its numbers."""
     lens, sigmas, notes = solved.fit.lens, np.sqrt(np.diag(solved.covariance)), []
     left_px = rms_px(solved)
     if _TRY_OTHERS_PX < left_px <= MOST_RMS_PX:
         better = find_better_model(model, solved.corners, size_px, left_px)
         if better is not None:
             notes.append(
-                f"corners are {left_px:.2f} px off; --lens {better.name} leaves {better.rms_px:.2f} px: "
-                "use it"
+                f"the RMS reprojection error is {left_px:.2f} px; --lens {better.name} leaves "
+                f"{better.rms_px:.2f} px: use it"
             )
         elif left_px > _OFF_PX:
-            notes.append(f"corners are {left_px:.1f} px off: see that the board is flat")
+            notes.append(f"the RMS reprojection error is {left_px:.1f} px: check that the board is flat")
     unsure = float((sigmas[:2] / lens[:2]).max())
     if unsure > _UNSURE:
         notes.append(

@@ -1,4 +1,4 @@
-"""The intrinsics of several cameras: each for itself, so that a bad one does not cost the others."""
+"""The intrinsics of several cameras, each estimated separately: a bad one does not affect the others."""
 
 from __future__ import annotations
 
@@ -21,7 +21,7 @@ Progress = Callable[[str, int, int | None], None]
 class Failure(NamedTuple):
     """A camera without a result: the reason in one line, and whether the user expects a result.
 
-    None is expected of a camera of a log that does not show the board at all, unless the user names it.
+    No result is expected for a camera of a log that never shows the board, unless the user names it.
     """
 
     camera: str
@@ -36,14 +36,14 @@ def calibrate_cameras(
     progress: Progress = lambda stage, done, total: None,
     insist: bool = False,
 ) -> Iterator[Calibrated | Failure]:
-    """Calibrate each camera, and yield its result as soon as it is there.
+    """Calibrate each camera, and yield its result as soon as it is ready.
 
     Parameters
     ----------
     sources : the pictures of each camera.
-    board, model : what to look for, and the kind of lens.
-    progress : called with the camera, the pictures done, and all of them.
-    insist : whether to take the board for what it is said to be, and results that are poor.
+    board, model : the board to search for, and the lens model.
+    progress : called with the camera, the number of pictures done, and their total.
+    insist : accept the given board size, and poor results.
     """
     for pictures in sources:
         try:

@@ -1,4 +1,4 @@
-"""The size of a ChArUco board from the ids of its markers and where they are in pictures."""
+"""The size of a ChArUco board from the ids and positions of its markers in pictures."""
 
 from __future__ import annotations
 
@@ -16,16 +16,16 @@ __all__ = ["CharucoSize", "estimate_charuco_size"]
 Array = NDArray[np.float64]
 Grey = NDArray[np.uint8]
 
-# Squares in a row, of the boards that are tried, and the most rows of one.
+# Squares in a row of the tried boards, and the largest number of rows.
 _COLUMNS, _MOST_ROWS = range(3, 25), 25
-# Markers that say how long a row is, at least; of those in a picture, the share that is at its place.
+# Least number of markers to tell the length of a row; least share of a picture's markers at their place.
 _LEAST_MARKERS, _AT_PLACE = 6, 0.75
-# A marker is at its place that is no farther from it, in squares: a lens bends the board.
+# Largest distance of a marker from its place, in squares: lens distortion bends the board.
 _NEAR = 0.3
 
 
 class CharucoSize(NamedTuple):
-    """Columns and rows of squares, and in how many pictures so many columns are seen."""
+    """Columns and rows of squares, and the number of pictures with so many columns."""
 
     columns: int
     rows: int
@@ -33,14 +33,14 @@ class CharucoSize(NamedTuple):
 
 
 def estimate_charuco_size(pictures: Sequence[Grey], dictionary: str) -> CharucoSize | None:
-    """Return the size of the board that explains most markers; None where there is none.
+    """Return the size of the board that explains most markers; None if there is none.
 
-    A row has as many columns as put the markers of a picture in a plane, each at the place of its id. The
-    last row is that of the highest id, so that rows beyond the pictures are not counted.
+    The number of columns is the one for which the markers of a picture lie in a plane, each at the place of
+    its id. The last row is that of the highest id, so rows outside of the pictures are not counted.
 
     Parameters
     ----------
-    pictures : grey, with black and white as the dictionary has them.
+    pictures : grey, not inverted.
     dictionary : by OpenCV's name.
     """
     number = getattr(cv2.aruco, dictionary)
@@ -57,13 +57,13 @@ def estimate_charuco_size(pictures: Sequence[Grey], dictionary: str) -> CharucoS
     if not rows_by_columns:
         return None
     columns, rows = max(rows_by_columns.items(), key=lambda item: len(item[1]))
-    # One marker that was misread must not add rows.
+    # One misread marker must not add rows.
     often = [row for row, count in Counter(rows).items() if count > 1 or len(rows) == 1] or rows
     return CharucoSize(columns, max(often), len(rows))
 
 
 def _size_of(ids: NDArray[np.intp], centres: Array) -> tuple[int, int] | None:
-    """Return columns and rows that put most markers of a picture at their places."""
+    """Return the columns and rows for which most markers of a picture are at their places."""
     best: tuple[int, int] | None = None
     most = max(_LEAST_MARKERS, _AT_PLACE * len(ids)) - 0.5
     for columns in _COLUMNS:
@@ -81,7 +81,7 @@ def _size_of(ids: NDArray[np.intp], centres: Array) -> tuple[int, int] | None:
 
 
 def _at_place(places: Array, centres: Array) -> NDArray[np.bool_]:
-    """Return which markers a plane puts at their places, (n,); none where there is no such plane."""
+    """Return a mask of the markers at their places in a plane, (n,); all False if there is no such plane."""
     result: Any = cv2.findHomography(centres, places, cv2.RANSAC, _NEAR)
     homography, near = result
     return np.zeros(len(places), np.bool_) if homography is None else np.ravel(near).astype(np.bool_)

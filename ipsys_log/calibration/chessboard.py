@@ -1,4 +1,4 @@
-"""A chessboard in a picture: its corners, and the largest grid of corners that is there."""
+"""Detection of a chessboard in a picture: its corners, and the largest grid of corners."""
 
 from __future__ import annotations
 
@@ -24,8 +24,7 @@ _SEEDS = ((7, 5), (5, 4), (4, 3), (3, 3))
 
 
 class ChessboardView(NamedTuple):
-    """Corners (rows, columns, 2) of a board of the size looked for, or None; and the size of the largest grid
-    of real corners, or None where there is none."""
+    """Corners (rows, columns, 2) of a board of the wanted size, and the size of the largest grid; or None."""
 
     corners: Array | None
     size: Size | None
@@ -40,20 +39,20 @@ class _Try(NamedTuple):
 
 
 def find_chessboard(grey: Grey, size: Size, thorough: bool) -> ChessboardView:
-    """Look for a chessboard, whatever is around it.
+    """Detect a chessboard in any surroundings.
 
     Parameters
     ----------
     grey : (height, width).
     size : columns and rows of inner corners.
-    thorough : whether to look longer where the board is not seen at once.
+    thorough : search longer if the board is not found at once.
 
     Notes
     -----
-    A board of this size is found turned by a quarter, too: its corners are the same ones.
+    A board turned by 90 degrees is found, too: it has the same corners.
     """
     large = max(grey.shape) > _LARGE_PX
-    # A large picture takes long; corners are refined in the whole of it anyway.
+    # A large picture takes long; corners are refined at full size anyway.
     small = cv2.resize(grey, None, fx=0.5, fy=0.5, interpolation=cv2.INTER_AREA) if large else grey
     largest: Size | None = None
     for attempt in _tries(size, large, thorough):
@@ -72,7 +71,7 @@ def find_chessboard(grey: Grey, size: Size, thorough: bool) -> ChessboardView:
 
 
 def fits_in(size: Size, other: Size) -> bool:
-    """Return whether a grid has room in another one, turned by a quarter or not."""
+    """Return whether a grid fits into another one, turned by 90 degrees or not."""
     return min(size) <= min(other) and max(size) <= max(other)
 
 
@@ -101,7 +100,7 @@ def _tries(size: Size, large: bool, thorough: bool) -> list[_Try]:
 
 
 def _grid(picture: Grey, attempt: _Try) -> Array | None:
-    """Return the real corners that one call leads to, (rows, columns, 2)."""
+    """Return the real corners found from one call, (rows, columns, 2)."""
     seen, corners, cells = cv2.findChessboardCornersSBWithMeta(picture, attempt.size, attempt.flags)
     if not seen:
         return None

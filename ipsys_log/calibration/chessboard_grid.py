@@ -1,8 +1,8 @@
-"""Grids of chessboard corners: remove rows that are no corners, add rows that the detector missed.
+"""Grids of chessboard corners: remove false rows, add rows that the detector missed.
 
-A detector that knows a size finds it, also where the edge of the paper before a dark background looks like
-one more row. An inner corner has a whole square on each of its four sides, black and white in turn. The edge
-of the paper does not: beyond it the squares do not go on.
+A detector for a given size may take the edge of the paper before a dark background for one more row. An inner
+corner has four whole squares around it, alternately black and white. The edge of the paper does not: the
+squares end there.
 """
 
 from __future__ import annotations
@@ -16,9 +16,9 @@ __all__ = ["complete_grid", "crop_grid"]
 Array = NDArray[np.float64]
 Grey = NDArray[np.uint8]
 
-# A grid needs so many rows, and no board has more.
+# Least and largest number of rows of a grid.
 _LEAST, _MOST = 3, 100
-# Where each of the four squares around a corner is read, in squares from the corner: deep inside, and close
+# Sample points in the four squares around a corner, in squares from the corner: deep inside, and close
 # to each of its two edges. Nearer to the corner, blur counts; farther, outer squares may be narrower.
 _DEEP, _CLOSE = (0.2, 0.32, 0.45), (0.06, 0.12)
 _READINGS = (
@@ -28,19 +28,19 @@ _READINGS = (
 )
 # Blur makes a close reading useless in which black and white differ by less than this share of what they do.
 _BLURRED = 0.3
-# A corner is whole whose contrast is this share of the usual one; a row is real if so many of its corners
+# A corner is whole if its contrast is this share of the usual one; a row is real if so many of its corners
 # are whole.
 _WHOLE, _REAL = 0.35, 0.6
-# Levels between black and white below which nothing is a board.
+# Least difference of grey levels between black and white of a board.
 _LEAST_CONTRAST = 8.0
-# The rows next to it that an added row is compared with, and itself.
+# Number of rows to compare: the added row and those next to it.
 _COMPARED = 4
-# A corner of an added row is sought this far from where it should be, in squares.
+# Search distance for a corner of an added row from its predicted position, in squares.
 _REACH = 0.25
 
 
 def complete_grid(grey: Grey, corners: Array) -> Array | None:
-    """Return the largest grid of real corners that a detected grid leads to.
+    """Return the largest grid of real corners, starting from a detected grid.
 
     Parameters
     ----------
@@ -49,7 +49,7 @@ def complete_grid(grey: Grey, corners: Array) -> Array | None:
 
     Returns
     -------
-    (rows, columns, 2) in px, or None where fewer than 3 x 3 corners are real.
+    (rows, columns, 2) in px, or None if fewer than 3 x 3 corners are real.
     """
     grid = _trim(grey, corners)
     return None if grid is None else _grow(grey, grid)
@@ -84,7 +84,7 @@ def _turn(grid: Array, side: int) -> Array:
 
 
 def _add_row(grey: Grey, grid: Array) -> Array | None:
-    """Return the grid with one more row before its first, or None where there is no such row."""
+    """Return the grid with one more row before its first, or None if there is no such row."""
     expected = 3 * grid[0] - 3 * grid[1] + grid[2]
     spacing_px = np.linalg.norm(grid[0] - grid[1], axis=1)
     height, width = grey.shape
@@ -107,7 +107,7 @@ def _edge_shares(whole: NDArray[np.bool_]) -> Array:
 
 
 def _whole(grey: Grey, grid: Array) -> NDArray[np.bool_]:
-    """Return which corners have a square on each side, black and white in turn: (rows, columns)."""
+    """Return a mask (rows, columns) of corners between four squares, alternately black and white."""
     padded = _pad(grid)
     deep, *close = (_contrasts(grey, padded, np.array(points)) for points in _READINGS)
     usual = float(np.median(deep))
@@ -120,9 +120,9 @@ def _whole(grey: Grey, grid: Array) -> NDArray[np.bool_]:
 
 
 def _contrasts(grey: Grey, padded: Array, points: Array) -> Array:
-    """Return by how much the darker white square around each corner is lighter than the lighter black one.
+    """Return the contrast of the darker white square to the lighter black square around each corner.
 
-    The colours are those that the place in the grid asks for, so that a corner of other colours is negative:
+    The position in the grid decides the colours, so a corner of opposite colours is negative. The result is
     (rows, columns), in grey levels, read at ``points`` (k, 2) in squares.
     """
     levels = np.stack([_square_levels(grey, padded, step, points) for step in _SQUARES])
@@ -138,7 +138,7 @@ _SQUARES = ((-1, -1), (-1, 1), (1, 1), (1, -1))
 
 
 def _pad(grid: Array) -> Array:
-    """Return a grid with one more row and column on each side, as far away as the last ones are."""
+    """Return a grid with one more row and column on each side, at the spacing of the last ones."""
     for _ in range(2):
         grid = np.concatenate([[2 * grid[0] - grid[1]], grid, [2 * grid[-1] - grid[-2]]]).swapaxes(0, 1)
     return grid
@@ -157,17 +157,17 @@ def _square_levels(grey: Grey, padded: Array, step: tuple[int, int], points: Arr
 
 
 def crop_grid(grey: Grey, grid: Array, size: tuple[int, int]) -> Array:
-    """Return the part of a grid that has so many columns and rows, without the outer rows of least contrast.
+    """Return the part of a grid with the given size, without the outer rows of least contrast.
 
     Parameters
     ----------
     grey : (height, width).
-    grid : (rows, columns, 2) in px, at least of that size one way round.
+    grid : (rows, columns, 2) in px, at least of that size, perhaps turned by 90 degrees.
     size : columns and rows.
 
     Returns
     -------
-    (rows, columns, 2) in px: columns to the right of the rows' direction, as a board is seen from its front.
+    (rows, columns, 2) in px: columns to the right of the rows' direction, as in a view of the front.
     """
     columns, rows = size
     if not (grid.shape[0] >= rows and grid.shape[1] >= columns):

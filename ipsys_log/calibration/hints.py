@@ -1,4 +1,4 @@
-"""Which board pictures show, where it is not the one that was asked for."""
+"""Hints for pictures that show another board than the given one."""
 
 from __future__ import annotations
 
@@ -25,9 +25,9 @@ _DICTIONARIES = (
     "DICT_4X4_1000", "DICT_5X5_1000", "DICT_6X6_1000", "DICT_7X7_1000", "DICT_ARUCO_ORIGINAL",
     "DICT_APRILTAG_36h11",
 )  # fmt: skip
-# A grid is that of a board if most pictures show it; else if such a share of them does, and two or more.
+# A grid belongs to a board if most pictures show it, or at least this share and two or more.
 _MOST, _SUPPORT, _LEAST_SUPPORT = 0.5, 0.2, 2
-# What a user says is refused where more than this share of the pictures says otherwise.
+# The size given by a user is refused if more than this share of the pictures contradicts it.
 _CONTRADICTED = 0.5
 _FORCE = "if the size is right, give --force"
 
@@ -38,13 +38,13 @@ def hint(
     trying: Callable[[int, int], None],
     sizes: Sequence[Size | None] = (),
 ) -> str:
-    """Return the end of a sentence that says which other board is seen, or what to look after.
+    """Return the end of a sentence that names the board that is seen, or says what to check.
 
     Parameters
     ----------
-    pictures : to look at.
-    board : that is not in them.
-    trying : called with the other kinds of board tried so far, and all of them: it takes a while.
+    pictures : to examine.
+    board : the board that is not found.
+    trying : called with the number of other kinds of board tried so far, and their total: it takes a while.
     sizes : of the largest chessboard in each picture, if that is known.
     """
     if any(size is not None for size in sizes) and (answer := _name_size(sizes, board, board)):
@@ -65,18 +65,18 @@ def hint(
 
 
 def check_chessboard_size(sizes: Sequence[Size | None], board: Board, where: str) -> None:
-    """See that most pictures do not show a larger chessboard than was asked for.
+    """Check that most pictures do not show a larger chessboard than the given one.
 
     Parameters
     ----------
     sizes : of the largest grid in each picture.
     board : a chessboard.
-    where : the pictures come from.
+    where : source of the pictures, for messages.
 
     Raises
     ------
     IpsysError
-        It names the larger board, the one that explains most corners.
+        Most do; the text names the larger board that explains most corners.
     """
     larger = _largest_board([size for size in sizes if size is None or _exceeds(size, board.grid)])
     seen = sum(size is not None for size in sizes)
@@ -92,12 +92,12 @@ def check_chessboard_size(sizes: Sequence[Size | None], board: Board, where: str
 
 
 def check_charuco_size(pictures: Sequence[Grey], board: Board, where: str) -> None:
-    """See that markers lie as on a ChArUco board of the size that was asked for.
+    """Check that markers lie as on a ChArUco board of the given size.
 
     Raises
     ------
     IpsysError
-        It names the size that the markers tell.
+        They do not; the text names the size by the markers.
     """
     size = estimate_charuco_size([_as_printed(grey, board) for grey in pictures], board.dictionary)
     if size is None or size.pictures <= _CONTRADICTED * len(pictures):
@@ -106,8 +106,8 @@ def check_charuco_size(pictures: Sequence[Grey], board: Board, where: str) -> No
         return
     rows = max(size.rows, board.rows) if size.columns == board.columns else size.rows
     raise IpsysError(
-        f"{where}: the markers are those of {replace(board, columns=size.columns, rows=rows)} or more, in "
-        f"{size.pictures} of {len(pictures)} pictures tried, not of {board.columns} x {board.rows}: "
+        f"{where}: {size.pictures} of {len(pictures)} tried pictures have the markers of "
+        f"{replace(board, columns=size.columns, rows=rows)} or more, not of {board.columns} x {board.rows}: "
         f"give --board charuco:{size.columns}x{rows}; {_FORCE}"
     )
 
@@ -118,8 +118,8 @@ def _mirrored(pictures: Sequence[Grey], board: Board) -> str:
     if not seen:
         return ""
     return (
-        f"; but in a mirror it is, in {seen} of {len(pictures)} tried: the pictures are mirrored, as "
-        "webcam programs do; turn that off, and take them again"
+        f"; but it is seen mirrored in {seen} of {len(pictures)} tried: webcam programs may mirror pictures; "
+        "turn that off, and take the pictures again"
     )
 
 
@@ -140,7 +140,7 @@ def _other_chessboard(pictures: Sequence[Grey], kind: Board, board: Board) -> st
 
 
 def _name_size(sizes: Sequence[Size | None], kind: Board, board: Board) -> str:
-    """Return which chessboard of a kind is seen instead of the one asked for; nothing where there is none."""
+    """Return the text on a chessboard of a kind that is seen instead of the given one, if any."""
     size = _largest_board(sizes)
     if size is None:
         return ""
@@ -170,7 +170,7 @@ def _other_charuco(pictures: Sequence[Grey], kind: Board, board: Board) -> str:
 
 
 def _largest_board(sizes: Sequence[Size | None]) -> Size | None:
-    """Return the largest grid that enough pictures show: parts of a board are seen, too."""
+    """Return the largest grid that enough pictures show; some pictures show only parts of a board."""
     counts = Counter((max(size), min(size)) for size in sizes if size is not None)
     for size, count in counts.most_common(1):
         if count > _MOST * counts.total():

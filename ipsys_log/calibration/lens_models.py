@@ -25,11 +25,11 @@ _PULL_PX = 0.1
 
 
 class LensModel(NamedTuple):
-    """A kind of lens: the name in the log, what its coefficients are called, how many of them are fitted.
+    """A lens model: its name in the log, the names of its coefficients, and how many of them are fitted.
 
     Those that are not fitted stay 0. ``bend`` returns the image of points at a focal length of 1,
-    ``bend_with_slopes`` also its derivatives. ``usual`` is how large coefficients usually are, where pictures
-    may not tell them from one another: a common factor above and below a fraction bends nothing.
+    ``bend_with_slopes`` also its derivatives. ``usual`` is the usual size of coefficients that pictures may
+    not tell apart: a common factor of numerator and denominator has no effect.
     """
 
     distortion_model: str
@@ -57,15 +57,15 @@ def project_points(model: LensModel, parameters: Array, points_m: Array) -> Arra
 
     Parameters
     ----------
-    model : the kind of lens.
+    model : the lens model.
     parameters : (p,), as ``model.names`` says.
-    points_m : (n, 3), in the frame of the camera; for a fisheye also beside and behind it.
+    points_m : (n, 3), in camera coordinates; for a fisheye also beside and behind it.
     """
     return np.asarray(model.bend(points_m, parameters[4:]) * parameters[:2] + parameters[2:4])
 
 
 def project_with_slopes(model: LensModel, parameters: Array, points_m: Array) -> tuple[Array, Array, Array]:
-    """Return the pixels of points, and how they change with the point and with the lens.
+    """Return the pixels of points, and their derivatives by the point and by the lens parameters.
 
     Parameters
     ----------
@@ -94,9 +94,9 @@ def _fisheye_angle(points_m: Array) -> tuple[Array, Array, Array, Array]:
 
 
 def _bend_fisheye(points_m: Array, k: Array) -> Array:
-    """Kannala and Brandt (PAMI 2006), in OpenCV's form: the angle from the axis bends, not its tangent.
+    """Apply Kannala and Brandt's model (PAMI 2006), in OpenCV's form: it distorts the angle from the axis.
 
-    The angle is atan2(r, z), so that it goes on beyond 90 degrees.
+    The angle is atan2(r, z), so that it may exceed 90 degrees.
     """
     _, r, theta, t2 = _fisheye_angle(points_m)
     bent = theta * (1 + t2 * (k[0] + t2 * (k[1] + t2 * (k[2] + t2 * k[3]))))
@@ -104,7 +104,7 @@ def _bend_fisheye(points_m: Array, k: Array) -> Array:
 
 
 def _bend_fisheye_with_slopes(points_m: Array, k: Array) -> tuple[Array, Array, Array]:
-    """Return what ``_bend_fisheye`` does, and its derivatives by the point and by the coefficients."""
+    """Return the result of ``_bend_fisheye``, and its derivatives by the point and by the coefficients."""
     square, r, theta, t2 = _fisheye_angle(points_m)
     bent = theta * (1 + t2 * (k[0] + t2 * (k[1] + t2 * (k[2] + t2 * k[3]))))
     slope = 1 + t2 * (3 * k[0] + t2 * (5 * k[1] + t2 * (7 * k[2] + t2 * 9 * k[3])))
@@ -126,7 +126,7 @@ def _bend_fisheye_with_slopes(points_m: Array, k: Array) -> tuple[Array, Array, 
 
 
 def _planar(points_m: Array) -> tuple[Array, Array]:
-    """Return points of the plane at depth 1, (2, n), and the depths (n,) that they were divided by."""
+    """Return points in the plane at depth 1, (2, n), and their original depths (n,)."""
     x, y, z = points_m.T
     depth_m = np.maximum(z, _LEAST_DEPTH * np.sqrt(x * x + y * y + z * z) + _TINY)
     return np.stack([x / depth_m, y / depth_m]), depth_m
@@ -137,7 +137,7 @@ def _eight(k: Array) -> list[float]:
 
 
 def _bend_pinhole(points_m: Array, k: Array) -> Array:
-    """Brown's radial and tangential terms, as OpenCV has them: k1 k2 p1 p2 k3, and a divisor k4 k5 k6."""
+    """Apply Brown's radial and tangential terms in OpenCV's form: k1 k2 p1 p2 k3, and a divisor k4 k5 k6."""
     (a, b), _ = _planar(points_m)
     k1, k2, p1, p2, k3, k4, k5, k6 = _eight(k)
     r2 = a * a + b * b
@@ -149,7 +149,7 @@ def _bend_pinhole(points_m: Array, k: Array) -> Array:
 
 
 def _bend_pinhole_with_slopes(points_m: Array, k: Array) -> tuple[Array, Array, Array]:
-    """Return what ``_bend_pinhole`` does, and its derivatives by the point and by the coefficients."""
+    """Return the result of ``_bend_pinhole``, and its derivatives by the point and by the coefficients."""
     (a, b), depth_m = _planar(points_m)
     k1, k2, p1, p2, k3, k4, k5, k6 = _eight(k)
     r2, two_ab = a * a + b * b, 2 * a * b
@@ -170,7 +170,7 @@ def _bend_pinhole_with_slopes(points_m: Array, k: Array) -> tuple[Array, Array, 
     by_k = np.empty((len(points_m), 2, 8))
     for axis, along in enumerate((a, b)):
         rise = along / bottom
-        # k1 k2 k3 above the fraction, k4 k5 k6 below it.
+        # k1 k2 k3 in the numerator, k4 k5 k6 in the denominator.
         for above, below in ((0, 5), (1, 6), (4, 7)):
             rise = rise * r2
             by_k[:, axis, above], by_k[:, axis, below] = rise, -rise * radial

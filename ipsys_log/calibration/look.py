@@ -35,8 +35,7 @@ Size = tuple[int, int]
 
 @dataclass(frozen=True, slots=True, eq=False)
 class Looked:
-    """What was seen of the board: pictures looked at, their size, the sightings, what was unreadable, and
-    pictures in which the board was not seen."""
+    """All pictures of a camera: number, size, sightings, unreadable pictures, pictures without the board."""
 
     count: int
     size_px: tuple[int, int]
@@ -46,7 +45,7 @@ class Looked:
 
 
 class _Seen(NamedTuple):
-    """One readable picture: its name, its size in px, and what of the board it shows."""
+    """One readable picture: its name, its size in px, and the view of the board."""
 
     name: str
     size: Size
@@ -62,25 +61,25 @@ def look(
     trying: Callable[[int, int], None] = lambda done, total: None,
     insist: bool = False,
 ) -> Looked:
-    """Look for the board in all pictures.
+    """Detect the board in all pictures.
 
     Parameters
     ----------
-    pictures : names and grey pictures, None for one that cannot be read.
-    board : what to look for.
-    total : how many there are about; 0 where that is not known.
-    where : they come from, for messages.
-    progress : called with the pictures done.
-    trying : called with the other boards looked for, and all of them, where this one is not seen.
-    insist : whether the size of the board is right, whatever the pictures show.
+    pictures : names and grey pictures, None for an unreadable one.
+    board : to search for.
+    total : approximate number of pictures; 0 if it is not known.
+    where : source of the pictures, for messages.
+    progress : called with the number of pictures done.
+    trying : called with the number of other boards tried, and their total, if this one is not seen.
+    insist : accept the size of the board, even if the pictures contradict it.
 
     Raises
     ------
     IpsysError
-        Where pictures are of several sizes, none of which most are of; none can be read; or most pictures
+        Pictures have several sizes, and no size has the majority; no picture can be read; or most pictures
         show a larger board.
     NotSeenError
-        Where the board is in none of them; it says what is.
+        No picture shows the board; the text says what they show.
     """
     count = 0
     views: list[_Seen] = []
@@ -126,12 +125,12 @@ def check_sizes(sizes: Sequence[tuple[str, Size]], where: str) -> Size:
     Parameters
     ----------
     sizes : name and size of each picture, at least one.
-    where : they come from.
+    where : source of the pictures, for messages.
 
     Raises
     ------
     IpsysError
-        Where more than a few pictures are of another size.
+        More than a few pictures have another size.
     """
     counts = Counter(size for _, size in sizes).most_common()
     if counts[0][1] >= _MOST_ARE * len(sizes):
@@ -145,7 +144,7 @@ def check_sizes(sizes: Sequence[tuple[str, Size]], where: str) -> Size:
     kinds += [f"{len(counts) - len(kinds)} more"] * (len(counts) > len(kinds))
     raise IpsysError(
         f"{where}: pictures have {len(counts)} sizes: {'; '.join(kinds)}. "
-        "A lens is calibrated at one size: put the pictures of each size into a folder of their own"
+        "A calibration needs one size: put the pictures of each size into a separate folder"
     )
 
 
@@ -155,7 +154,7 @@ def _strange(views: Sequence[_Seen], usual: Size) -> list[Dropped]:
 
 
 class _Sample:
-    """A few pictures, spread over all of them."""
+    """Return a few pictures, spread over all of them."""
 
     def __init__(self, wanted: int, total: int) -> None:
         self.pictures: list[Grey] = []

@@ -1,8 +1,8 @@
-"""The error of a lens that is not quite of its model: what a richer model would change.
+"""The error of an imperfect lens model: the change that a richer model would make.
 
-The richer model has one more radial term and the terms that lens elements off their axis or tilted ones add
-(decentering and thin prism: Brown 1966; Weng, Cohen and Herniou, PAMI 1992), as far as the model lacks them.
-One linear step from the fit shows how large they are, and how far they would move the other parameters.
+The richer model has one more radial term and the terms of displaced or tilted lens elements (decentering and
+thin prism: Brown 1966; Weng, Cohen and Herniou, PAMI 1992), as far as the model lacks them. One linear step
+from the fit shows their size, and the change of the other parameters.
 """
 
 from __future__ import annotations
@@ -25,10 +25,10 @@ __all__ = ["model_change"]
 
 Array = NDArray[np.float64]
 
-# How large the new terms usually are: the radial one at the farthest corner, in focal lengths, and the others
+# Usual size of the new terms: the radial one at the farthest corner, in focal lengths, and the others
 # per square of the distance from the principal point.
 _RADIAL, _TANGENTIAL = 0.01, 0.003
-# Terms count from so many times the chi^2 on that noise has on average: by chance, in some 10 % of fits.
+# Terms count from so many times the mean chi^2 of noise on: by chance, in some 10 % of fits.
 _NOISE = 2.0
 # The power of the next radial term, over the last coefficient fitted.
 _NEXT_POWER = {"kannala_brandt": 10, "plumb_bob": 8, "rational_polynomial": 8}
@@ -44,14 +44,14 @@ class _Terms(NamedTuple):
 def model_change(
     model: LensModel, fit: Fit, corners: Corners, basis: Array, scale_px: float | None, variance: float
 ) -> Array:
-    """Return the shift of the lens along ``basis`` that a richer model shows, (q,).
+    """Return the change of the lens parameters along ``basis`` with a richer model, (q,).
 
-    It is drawn to 0, the more so the less significant the terms are: noise alone mostly shifts nothing.
+    It shrinks to 0 for less significant terms: noise alone mostly causes no change.
 
     Parameters
     ----------
     model, fit, corners, basis, scale_px : as fitted.
-    variance : of a coordinate of a corner, in px^2, with what corners of a picture share.
+    variance : of a coordinate of a corner, in px^2, with the errors that corners of a picture share.
 
     References
     ----------
@@ -66,7 +66,7 @@ def model_change(
     whole = matrices.sum(axis=0) + normal.pull
     gradient = gradients.sum(axis=0) + normal.pull_gradient
     of_lens, of_terms = slice(lens_count), slice(lens_count, None)
-    # The lens follows the terms by this much.
+    # Change of the lens parameters with the terms.
     following = np.linalg.solve(whole[of_lens, of_lens], whole[of_lens, of_terms])
     precision = (whole[of_terms, of_terms] - whole[of_terms, of_lens] @ following) / variance
     pulled = (gradient[of_terms] - following.T @ gradient[of_lens]) / variance

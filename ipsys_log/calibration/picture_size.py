@@ -15,9 +15,9 @@ _PNG = b"\x89PNG\r\n\x1a\n"
 
 
 def read_picture_size(path: Path) -> tuple[int, int] | None:
-    """Return width and height in px that the header of a JPEG or PNG file states.
+    """Return width and height in px from the header of a JPEG or PNG file.
 
-    None for a file of another kind, or one whose header cannot be read.
+    None for another kind of file, or for an unreadable header.
     """
     try:
         with path.open("rb") as file:

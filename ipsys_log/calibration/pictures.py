@@ -44,10 +44,10 @@ class Pictures(NamedTuple):
 
     Attributes
     ----------
-    camera, where : its name, and where the pictures come from.
-    total : how many there are about; 0 where that is not known.
-    read : returns each picture with its name, or None for one that cannot be read.
-    sizes : returns names and sizes in px as far as they are known before a picture is decoded.
+    camera, where : its name, and the source of the pictures.
+    total : approximate number of pictures; 0 if it is not known.
+    read : returns each picture with its name, or None for an unreadable one.
+    sizes : returns names and sizes in px, if they are known before decoding.
     requested : whether the user named this camera or its pictures, not only a log with others.
     """
 
@@ -60,7 +60,7 @@ class Pictures(NamedTuple):
 
     @property
     def looked_at(self) -> int:
-        """How many of them are read; 0 where that is not known."""
+        """Number of pictures that are read; 0 if it is not known."""
         return -(-self.total // _stride(self.total))
 
 
@@ -131,7 +131,7 @@ def _camera_name(text: str, path: Path, cameras: Sequence[str]) -> str:
 
 
 def _folder(folder: Path, cameras: Sequence[str]) -> list[Pictures]:
-    """The pictures in a folder are of one camera; those in its sub-folders of one each."""
+    """Return the pictures in a folder as one camera, and those in its sub-folders as one camera each."""
     here = _files(folder)
     if here:
         name = _camera_name(folder.absolute().name, folder, cameras)

@@ -48,32 +48,31 @@ class Sighting:
 
 
 class View(NamedTuple):
-    """A picture of a board: the sighting, or None; and of a chessboard, the columns and rows of the largest
-    grid of inner corners in it, or None."""
+    """A sighting, or None; for a chessboard also columns and rows of the largest grid of inner corners."""
 
     sighting: Sighting | None
     grid: tuple[int, int] | None = None
 
 
 def find_board(name: str, grey: Grey, board: Board, thorough: bool) -> Sighting | None:
-    """Look for the board in a picture; see `view_board`."""
+    """Detect the board in a picture; see `view_board`."""
     return view_board(name, grey, board, thorough).sighting
 
 
 def view_board(name: str, grey: Grey, board: Board, thorough: bool) -> View:
-    """Look for the board in a picture, and for what else a chessboard's corners say.
+    """Detect the board in a picture, and the largest grid of a chessboard.
 
     Parameters
     ----------
     name : of the picture.
     grey : (height, width).
-    board : what to look for.
-    thorough : whether to look a second time, longer, where a chessboard is not seen at once.
+    board : to search for.
+    thorough : search a second time, longer, if a chessboard is not found at once.
 
     Returns
     -------
-    Without a sighting where the board is not seen. A ChArUco board may be seen in part, a chessboard only as
-    a whole.
+    The view, without a sighting if the board is not found. A ChArUco board may be partly visible, a
+    chessboard must be completely visible.
     """
     if board.inverted:
         grey = np.asarray(255 - grey, dtype=np.uint8)

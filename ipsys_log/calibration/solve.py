@@ -61,14 +61,14 @@ class Solved:
 
 
 def solve(model: LensModel, corners: Corners, size_px: tuple[int, int], start: Fit | None = None) -> Solved:
-    """The lens that corners of a board in several pictures tell.
+    """Estimate the intrinsics from corners of a board in several pictures.
 
     Parameters
     ----------
-    model : the kind of lens.
+    model : the lens model.
     corners : of all pictures, at least 6 in each.
     size_px : width and height of the pictures.
-    start : a fit to start from; without it, one is looked for.
+    start : a fit to start from; without it, one is searched for.
     """
     start = start or find_start(model, corners, size_px)
     purged = _purge(model, start, corners, square=True)
@@ -95,7 +95,7 @@ class _Purged(NamedTuple):
 
 
 def _purge(model: LensModel, fit: Fit, corners: Corners, square: bool) -> _Purged:
-    """Fit, leave out what is far off, and fit again, until nothing is."""
+    """Fit, leave out outliers, and fit again, until there are none."""
     basis, pictures, left = fitted_basis(model, square), np.arange(corners.pictures), []
     for _ in range(_MOST_ROUNDS):
         fit = adjust(model, fit, corners, basis, doubt_from_px(model, fit, corners))
@@ -110,7 +110,7 @@ def _purge(model: LensModel, fit: Fit, corners: Corners, square: bool) -> _Purge
 
 
 def _finish(model: LensModel, purged: _Purged, size_px: tuple[int, int]) -> tuple[Fit, Array, int, bool]:
-    """The last fit, its covariance (p, p), from how many groups; and whether fx = fy, as mostly."""
+    """Return the last fit, its covariance (p, p), the number of groups, and whether fx = fy was assumed."""
     start, corners = purged.fit, purged.corners
     groups = alike(model, start, corners, size_px)
     found = []
@@ -127,9 +127,9 @@ def _finish(model: LensModel, purged: _Purged, size_px: tuple[int, int]) -> tupl
 
 
 def tells_focal_length(solved: Solved) -> bool:
-    """Whether another focal length, by three tenths, would fit worse, whatever else of the lens gives way.
+    """Return whether a focal length that differs by 30 % fits worse, with all other parameters free.
 
-    Where the pictures hardly tell it, the cost is no parabola, and a standard deviation says too little.
+    If the pictures hardly determine it, the cost is no parabola, and a standard deviation is too small.
     """
     model, fit, corners = solved.model, solved.fit, solved.corners
     # Without what fx and fy have to themselves.
@@ -147,12 +147,12 @@ def tells_focal_length(solved: Solved) -> bool:
 
 
 def doubt_from_px(model: LensModel, fit: Fit, corners: Corners) -> float:
-    """Return the error in px from which on a corner counts for half or less."""
+    """Return the error in px from which a corner has at most half the weight."""
     return max(_DOUBTED * _spread(residuals(model, fit, corners)), _NEAR_PX)
 
 
 def rms_px(solved: Solved) -> float:
-    """Return the root of the mean squared distance between corners seen and projected, in px."""
+    """Return the RMS reprojection error in px."""
     return float(np.sqrt((solved.residuals_px**2).sum(axis=1).mean()))
 
 
@@ -162,7 +162,7 @@ def _spread(missed_px: Array) -> float:
 
 
 def _belonging(corners: Corners, missed_px: Array) -> tuple[NDArray[np.bool_], list[Left]]:
-    """Which corners belong to the fit, (n,), and the pictures that do not."""
+    """Return a mask of the corners of the fit, (n,), and the pictures that are left out."""
     distances = np.linalg.norm(missed_px, axis=1)
     near = distances <= max(_FAR_CORNER * _spread(missed_px), _NEAR_PX)
     counts = corners.sums(np.ones_like(distances))

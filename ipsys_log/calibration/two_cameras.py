@@ -1,8 +1,8 @@
-"""Pictures of two cameras that are taken for one: two lenses explain far more of them than one does.
+"""Detection of pictures of two cameras: two sets of intrinsics fit them far better than one.
 
-Two groups of pictures are found as in k-means: each picture goes to the lens that misses its corners least,
-and each lens is fitted to its pictures. The groups to start from are those that pull the joint lens to
-opposite sides, and those that the names of the pictures suggest.
+Two groups of pictures are found as in k-means: each picture goes to the intrinsics with the least
+reprojection error, and each set of intrinsics is fitted to its pictures. The first groups are pictures with
+opposite gradients at the joint fit, and pictures with similar names.
 """
 
 from __future__ import annotations
@@ -26,17 +26,17 @@ Group = NDArray[np.bool_]
 
 _LEAST_PICTURES = 4
 _DIRECTIONS, _ROUNDS, _STEPS, _POSE_STEPS = 3, 8, 8, 4
-# By how much the squared errors with one lens exceed those with two, as a share, for two cameras. Pictures of
-# one camera reach 0.37 (fisheye_chessboard), and fewer pictures for each parameter of the lens reach more.
+# Least relative excess of the squared errors with one set of intrinsics for two cameras. Pictures of
+# one camera reach 0.37 (fisheye_chessboard), and fewer pictures per parameter reach more.
 _GAIN, _GAIN_PER_PARAMETER = 0.4, 0.6
-# Where the names of the pictures tell the same groups, so much is enough, and so many pictures must agree.
+# If the names of the pictures show the same groups, this is enough, and so many pictures must agree.
 _NAMED_GAIN, _AGREE = 0.25, 0.9
-# The errors of one group are no more than so many times those of the other: it is no heap of bad pictures.
+# Largest ratio of the errors of the groups: a group with larger errors consists of bad pictures.
 _ALIKE = 3.0
 
 
 class TwoCameras(NamedTuple):
-    """The pictures of the second camera (f,), and the RMS in px with one lens and with two."""
+    """The pictures of the second camera (f,), and the RMS in px with one and two sets of intrinsics."""
 
     second: Group
     one_px: float
@@ -44,7 +44,7 @@ class TwoCameras(NamedTuple):
 
 
 class _Split(NamedTuple):
-    """The pictures of the second camera, and the squared errors of each picture in px^2, with two lenses."""
+    """The pictures of the second camera, and the squared errors of each picture in px^2."""
 
     second: Group
     errors: Array
@@ -53,11 +53,11 @@ class _Split(NamedTuple):
 def find_two_cameras(
     model: LensModel, start: Fit, corners: Corners, names: Sequence[str]
 ) -> TwoCameras | None:
-    """Return the pictures of each camera where two lenses are needed; None for one camera.
+    """Return the pictures of each camera if there are two cameras; None for one camera.
 
     Parameters
     ----------
-    model : the kind of lens.
+    model : the lens model.
     start : a fit to start from.
     corners : of all pictures.
     names : of the pictures, (f,).
@@ -106,7 +106,7 @@ def _name_groups(names: Sequence[str]) -> Iterator[Group]:
 def _opposite_pulls(
     model: LensModel, fit: Fit, corners: Corners, basis: Array, scale_px: float
 ) -> list[Group]:
-    """Return groups by the sign of each picture's pull at the lens, in the strongest directions."""
+    """Return groups by the sign of each picture's gradient, in the strongest directions."""
     normal = normal_equations(model, fit, corners, basis, scale_px)
     matrices, gradients = reduce_to_lens(normal)
     values, vectors = np.linalg.eigh(matrices.sum(axis=0) + normal.pull)
@@ -118,7 +118,7 @@ def _opposite_pulls(
 def _refine(
     model: LensModel, fit: Fit, corners: Corners, basis: Array, scale_px: float, second: Group
 ) -> _Split | None:
-    """Return the groups that two lenses settle on, or None where one has too few pictures."""
+    """Return the converged groups, or None if one has too few pictures."""
     fits = [fit, fit]
     for _ in range(_ROUNDS):
         if min(second.sum(), (~second).sum()) < _LEAST_PICTURES:
@@ -138,7 +138,7 @@ def _refine(
 def _fit_group(
     model: LensModel, fit: Fit, corners: Corners, basis: Array, scale_px: float, group: Group
 ) -> Fit:
-    """Return the lens of a group of pictures, and with it the poses of all pictures."""
+    """Return the intrinsics of a group of pictures, and the poses of all pictures with them."""
     part, _ = corners.keep(group[corners.picture])
     own = adjust(
         model, Fit(fit.lens, fit.rotations[group], fit.places_m[group]), part, basis, scale_px, _STEPS
@@ -149,6 +149,6 @@ def _fit_group(
 
 
 def _errors(model: LensModel, fit: Fit, corners: Corners, scale_px: float) -> Array:
-    """Return the sum of the squared errors of each picture, (f,) in px^2; those far off count for less."""
+    """Return the sum of the squared errors of each picture, (f,) in px^2; outliers have less weight."""
     squares = (residuals(model, fit, corners) ** 2).sum(axis=1)
     return corners.sums(scale_px**2 * np.log1p(squares / scale_px**2))

@@ -1,4 +1,4 @@
-"""How well a lens is known: by its change without some pictures, and with a richer model."""
+"""Uncertainty of intrinsics: by their change without some pictures, and with a richer model."""
 
 from __future__ import annotations
 
@@ -25,14 +25,14 @@ Array = NDArray[np.float64]
 # for a jackknife.
 _HALVINGS = 4
 _ENOUGH_GROUPS = 15
-# A jackknife of few groups is uncertain itself. It counts as much as least squares do at so many groups.
+# A jackknife of few groups is uncertain itself. At so many groups it has the weight of least squares.
 _EQUAL_GROUPS = 8
 
 
 def alike(model: LensModel, fit: Fit, corners: Corners, size_px: tuple[int, int]) -> NDArray[np.intp]:
-    """The group of each picture, (f,): those that show the board at nearly the same place.
+    """Return the group of each picture, (f,): a group shows the board in nearly the same pose.
 
-    Frames of a video that follow one another have the same errors, not new ones.
+    Successive frames of a video have the same errors, not new ones.
     """
     low, high = corners.board_m.min(axis=0), corners.board_m.max(axis=0)
     outline_m = np.array([[x, y, 0.0] for x in (low[0], high[0]) for y in (low[1], high[1])])
@@ -55,14 +55,14 @@ def lens_covariance(
     scale_px: float | None,
     groups: NDArray[np.intp],
 ) -> Array:
-    """Return the covariance (q, q) of the lens along ``basis``.
+    """Return the covariance (q, q) of the lens parameters along ``basis``.
 
-    Corners of one picture share errors (a board that is not flat, blur), and pictures differ in theirs. Taken
-    for independent, they make a lens look too well known. A jackknife over whole groups supposes nothing of
-    this; each group is left out in one linear step. With few groups it is uncertain itself: seven pictures
-    may agree by chance. So it is drawn to the covariance of least squares, with the variance that the
-    jackknife shows over all parameters. Student's distribution of so many groups makes it wider. The shift
-    that a richer model shows is added.
+    Corners of one picture share errors (a bent board, blur), and these differ between pictures. If the errors
+    are assumed to be independent, the covariance is too small. A jackknife over whole groups needs no such
+    assumption; each group is left out in one linear step. With few groups it is uncertain itself: seven
+    pictures may agree by chance. So it is averaged with the covariance of least squares, with the variance
+    that the jackknife shows over all parameters. Student's distribution for the number of groups makes it
+    wider. The change that a richer model shows is added.
 
     References
     ----------
@@ -75,14 +75,14 @@ def lens_covariance(
     inverse = np.linalg.inv(whole)
     squares = inverse @ (whole - normal.pull) @ inverse
     variance = _variance_px2(model, fit, corners, scale_px, basis.shape[1])
-    # Never less than the residuals say.
+    # Not less than the residuals show.
     variance = max(variance, float(np.median(np.diag(jackknife) / np.diag(squares))))
     count = int(groups.max()) + 1
     share = count / (count + _EQUAL_GROUPS)
     widening = (count - 1) / max(count - 3, 1)
     covariance = widening * (share * jackknife + (1 - share) * variance * squares)
     shift = model_change(model, fit, corners, basis, scale_px, variance)
-    # A parameter that is drawn to 0 is off by as much as it is usually large.
+    # A parameter with a prior at 0 has an error of its usual size.
     drawn = inverse @ (normal.pull * (model.usual if np.isfinite(model.usual) else 0.0))
     return np.asarray(covariance + np.outer(shift, shift) + drawn @ drawn.T)
 
@@ -98,7 +98,7 @@ def _jackknife(whole: Array, matrices: Array, gradients: Array, groups: NDArray[
 def _variance_px2(
     model: LensModel, fit: Fit, corners: Corners, scale_px: float | None, unknowns: int
 ) -> float:
-    """Return the variance of a coordinate of a corner, if all corners were independent."""
+    """Return the variance of a coordinate of a corner, for independent corners."""
     missed_px = residuals(model, fit, corners)
     squares = float(corner_weights(missed_px, scale_px) @ (missed_px**2).sum(axis=1))
     return squares / max(missed_px.size - 6 * corners.pictures - unknowns, 1)

@@ -1,4 +1,4 @@
-"""Results that are too poor to use: pictures of two cameras, too few pictures, a model of another kind."""
+"""Results that are too poor to use: pictures of two cameras, too few pictures, a wrong lens model."""
 
 from __future__ import annotations
 
@@ -16,12 +16,12 @@ from ipsys_log.calibration.two_cameras import TwoCameras
 __all__ = ["MOST_RMS_PX", "BetterModel", "find_better_model", "two_cameras_fault"]
 
 MOST_RMS_PX = 2.0
-# Another model is better that leaves so much less.
+# Another model is better if its error is less than this share.
 _BETTER, _AS_WELL = 0.6, 1.1
 
 
 class BetterModel(NamedTuple):
-    """The name of a lens model, and the RMS that it leaves in px."""
+    """The name of a lens model, and its RMS reprojection error in px."""
 
     name: str
     rms_px: float
@@ -30,7 +30,7 @@ class BetterModel(NamedTuple):
 def find_better_model(
     model: LensModel, corners: Corners, size_px: tuple[int, int], left_px: float
 ) -> BetterModel | None:
-    """Return the model that misses the same corners least, if that is far less than ``left_px``."""
+    """Return the model with the least error for the same corners, if it is far less than ``left_px``."""
     tried = []
     for name, other in LENSES.items():
         if other == model:
@@ -45,16 +45,16 @@ def find_better_model(
     least_px = min((one.rms_px for one in tried), default=np.inf)
     if least_px >= _BETTER * left_px:
         return None
-    # Of models that do as well, the first: it has fewer coefficients that are hard to tell apart.
+    # The first of the equally good models: it has fewer coefficients that are hard to tell apart.
     return next(one for one in tried if one.rms_px <= _AS_WELL * least_px)
 
 
 def two_cameras_fault(split: TwoCameras, names: Sequence[str]) -> str:
-    """Return what is wrong with pictures of two cameras, and the pictures of each."""
+    """Return the fault text for pictures of two cameras, with the pictures of each."""
     groups = ", ".join(_named(names, split.second == second) for second in (False, True))
     return (
-        f"the pictures are of two cameras, or of two settings of zoom or focus: {groups}; one lens leaves "
-        f"{split.one_px:.2f} px, two leave {split.two_px:.2f}"
+        f"the pictures are of two cameras, or of two settings of zoom or focus: {groups}; one set of "
+        f"intrinsics leaves {split.one_px:.2f} px, two leave {split.two_px:.2f}"
     )
 
 

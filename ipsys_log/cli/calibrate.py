@@ -80,9 +80,8 @@ Force = Annotated[
     bool,
     typer.Option(
         "--force",
-        help="Override four checks: that no file is overwritten; that most pictures show no larger board "
-        "than --board; that the result is usable (RMS of at most 2 px, 5 pictures or more); that all "
-        "pictures are of one camera.",
+        help="Override four checks: no file is overwritten; most pictures show no larger board than --board; "
+        "the result is usable (RMS of at most 2 px, 5 pictures or more); all pictures are of one camera.",
     ),
 ]
 
@@ -109,11 +108,11 @@ def calibrate(
     force: Force = False,
     as_json: AsJson = False,
 ) -> None:
-    """Find the lens of a camera from pictures of a chessboard or a ChArUco board.
+    """Calibrate camera intrinsics from pictures of a chessboard or a ChArUco board.
 
-    One file for each camera that saw the board, with the name of the camera. Where a camera has no result,
-    those of the others are written, and the exit code is 1. Sharp pictures that differ are chosen by
-    themselves; two dozen from all parts of the picture are enough."""
+    Writes one file for each camera that saw the board, with the name of the camera. If a camera has no
+    result, the files of the others are written, and the exit code is 1. Sharp, different pictures are
+    selected automatically; two dozen with the board in all parts of the image are enough."""
     from ipsys_log.calibration.boards import parse_board
     from ipsys_log.calibration.calibrate import Calibrated
     from ipsys_log.calibration.cameras import calibrate_cameras
@@ -142,7 +141,7 @@ def calibrate(
                 if isinstance(outcome, Calibrated):
                     _write(outcome, targets[outcome.camera])
                     outcomes.append(outcome)
-                else:  # a log that was only taken for this is gone when the user reads the reason
+                else:  # a temporary log is deleted before the user reads the reason
                     reason = outcome.reason.replace(str(taken[0]), SENT_NOW) if lab else outcome.reason
                     outcomes.append(outcome._replace(reason=reason))
     lenses = [outcome for outcome in outcomes if isinstance(outcome, Calibrated)]
@@ -189,7 +188,7 @@ def _json(outcome: Calibrated | Failure, targets: dict[str, dict[str, Path]]) ->
 
 
 def _prepared_now(rig: Path | None, only: list[str] | None, board: str) -> Lab:
-    """The cameras to look at; before simulated ones the board is held that they are calibrated with."""
+    """Return the cameras to calibrate; simulated ones show the calibration board."""
     from ipsys_log.errors import IpsysError
     from ipsys_log.sources.simulated import show_board
 
@@ -213,7 +212,7 @@ def _taken_now(lab: Lab, seconds: float) -> Iterator[list[Path]]:
 
 
 def _targets(cameras: list[str], output: Path, formats: list[str], force: bool) -> dict[str, dict[str, Path]]:
-    """Where the file of each camera and format goes; an error where it cannot."""
+    """Return the path of the file of each camera and format; raise if it cannot be written."""
     from ipsys_log.errors import IpsysError
     from ipsys_log.formats.calibration_yaml import FORMATS
     from ipsys_log.report.files import check_file, check_folder

@@ -1,4 +1,4 @@
-"""What is attached: ``ipsys cameras``."""
+"""Attached cameras: ``ipsys cameras``."""
 
 from __future__ import annotations
 

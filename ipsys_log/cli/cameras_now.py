@@ -35,16 +35,16 @@ __all__ = [
 ]
 
 
-# The name of a log that is only kept while the command runs.
+# The name of a log that exists only while the command runs.
 SENT_NOW = "what the cameras sent"
 # What a log is that is named by --model-from.
 MODEL = "the log with the model"
-# So much of what cameras send is kept of a place that is measured.
+# Duration of the frames that are kept of a measured point.
 _PLACE_S = 1.5
 
 
 class Lab(NamedTuple):
-    """What is to be opened: the rig, its cameras, their lenses by name, and what these are read from."""
+    """The cameras to open: the rig, its cameras, their intrinsics by name, and the files of these."""
 
     rig: Rig
     cameras: list[RigCamera]
@@ -99,17 +99,17 @@ def _files(rig: Path, cameras: list[RigCamera], calibration: list[str] | None) -
 
 
 def check_target(output: Path, force: bool, files: Iterable[tuple[str, Path]]) -> None:
-    """See that a log can be written.
+    """Check that a log can be written.
 
     Parameters
     ----------
-    files : what is read meanwhile, by what it is: it is not to be overwritten.
+    files : the input files with their names in messages: they must not be overwritten.
 
     Raises
     ------
     IpsysError
-        Where there is one already, or its folder is not there, or takes no files or none of that name; with
-        ``force`` where another process is writing it.
+        The log exists, its folder does not exist, or the folder takes no files or none of that name; with
+        ``force``, if another process is writing it.
     """
     from ipsys_log.errors import IpsysError
     from ipsys_log.log.journal import journal_path
@@ -144,18 +144,18 @@ def opened(
     panel: bool = True,
     until_stopped: bool = True,
 ) -> Iterator[tuple[Attached, list[Message], LiveStatus]]:
-    """Cameras that send, what is written first, and what is shown on the screen meanwhile.
+    """Open the cameras; yield them, the first messages of the log, and the status on the screen.
 
     Parameters
     ----------
-    doing : said at the beginning, where it is not recording; then nothing is said of frames at the end.
+    doing : text for the beginning if this is no recording; then the end has no text on frames.
     panel : whether the screen is free for a table of the cameras.
     until_stopped : a signal stops the cameras, and the command ends in order; otherwise it interrupts.
 
     Raises
     ------
     IpsysError
-        Where a camera cannot be opened, or its frames do not fit its lens.
+        A camera cannot be opened, or its frames do not fit its intrinsics.
     """
     from ipsys_log.recording.disk_room import expected_bytes_per_s, free_room
     from ipsys_log.recording.monitor import Monitor
@@ -172,7 +172,7 @@ def opened(
         lenses = fitting_lenses(lab.lenses, sizes_px, say)
         stack.enter_context(_ended(attached.stop, seconds, until_stopped))
         expected = expected_bytes_per_s(lab.cameras, attached.states)
-        # What is not a recording grows only where something is measured.
+        # A log that is no recording grows only with measured points.
         growing = None if doing and seconds is None else expected
         monitor = stack.enter_context(Monitor(lab.rig))
         status = LiveStatus(attached.states, monitor, output, monotonic, growing)
@@ -186,14 +186,14 @@ def opened(
 
 
 def _say_room(lab: Lab, attached: Attached, room: DiskRoom, seconds: float | None, doing: str | None) -> None:
-    """Say, before it begins, how large the recording gets and how long the disk lasts.
+    """Print the expected size of the recording and how long the disk lasts, before it begins.
 
-    Cameras that are only looked at for some seconds need no word, unless the disk is too small even for that.
+    If frames are taken only for some seconds, nothing is printed, unless the disk is too small for that.
     """
     if doing and not (seconds is not None and room.is_short(seconds)):
         if seconds is None:
             place, free = format_bytes(round(_PLACE_S * room.bytes_per_s)), format_bytes(room.free_bytes)
-            say(f"about {place} for each place; {free} free in {room.folder}")
+            say(f"about {place} for each point; {free} free in {room.folder}")
         return
     short = room.is_short(seconds)
     remarks.print(room.describe(seconds), style="bold red" if short else None, markup=False)
@@ -203,7 +203,7 @@ def _say_room(lab: Lab, attached: Attached, room: DiskRoom, seconds: float | Non
 
 @contextmanager
 def _ended(stop: Callable[[], None], seconds: float | None, on_signal: bool = True) -> Iterator[None]:
-    """Stop in order after some time, and on the first signal: what has come by then is written."""
+    """Stop in order after some time, or on the first signal: messages that arrived before are written."""
     if on_signal:
         stop_on_signal(stop)
     timer = Timer(TIMEOUT_MAX if seconds is None else seconds, stop)
@@ -225,12 +225,12 @@ def _on_screen(status: LiveStatus) -> AbstractContextManager[object]:
 
 @contextmanager
 def recorded_now(lab: Lab, seconds: float, keep: Path | None = None) -> Iterator[Path]:
-    """A log of what cameras send in the next seconds; without ``keep`` only for as long as the block lasts.
+    """Record the cameras for some seconds; without ``keep`` the log is deleted after the block.
 
     Raises
     ------
     IpsysError
-        Where the cameras do not send. What the block complains of is not said of a file that nobody knows.
+        The cameras do not send. Errors of the block do not name the temporary file.
     """
     from ipsys_log import pipeline
     from ipsys_log.errors import IpsysError
@@ -242,7 +242,11 @@ def recorded_now(lab: Lab, seconds: float, keep: Path | None = None) -> Iterator
             with opened(lab, log, seconds, doing, until_stopped=False) as (cameras, settings, status):
                 pipeline.record(cameras, settings, log, [status])
         except Interrupted as interrupt:
-            kept = f"{keep} has the frames until then" if keep and keep.exists() else "no frame was kept"
+            kept = (
+                f"{keep} has the frames up to the interruption"
+                if keep and keep.exists()
+                else "no frame was kept"
+            )
             raise Interrupted(interrupt.exit_code, f"interrupted; {kept}") from None
         try:
             yield log

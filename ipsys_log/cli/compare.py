@@ -33,7 +33,7 @@ def verify(
 ) -> None:
     """Make every run of a log again from what it read, and compare each channel byte for byte.
 
-    Frames that were skipped live are passed over. Ends with 1 where anything differs."""
+    Frames that were skipped live are passed over. Exits with code 1 if anything differs."""
     from ipsys_log.report.cameras import comparison_json, comparison_table, first_difference
     from ipsys_log.verify import verify as verify_runs
 
@@ -68,9 +68,9 @@ def diff(
     ] = None,
     as_json: AsJson = False,
 ) -> None:
-    """Compare the runs of two logs, or two runs of one, channel by channel: where they differ, by how much.
+    """Compare the runs of two logs, or two runs of one log, channel by channel, and print the differences.
 
-    Ends with 1 where anything differs."""
+    Exits with code 1 if anything differs."""
     from ipsys_log.errors import IpsysError
     from ipsys_log.report.cameras import comparison_json, comparison_table, first_difference
     from ipsys_log.verify import diff as compare
@@ -83,7 +83,7 @@ def diff(
         raise IpsysError("name a second log, or with --run twice two runs of one")
     sides = first, second or first, (names[0], names[-1])
     found = compare(*sides)
-    # Where a distance could be measured, they have frames in common.
+    # If a distance could be measured, they have frames in common.
     comparable = all(one.equal for one in found) or any(one.rms is not None for one in found)
     why = None if comparable else explain_diff(*sides)
     if as_json:

@@ -1,4 +1,4 @@
-"""How the commands speak: results on stdout, progress and remarks on stderr."""
+"""Output of the commands: results on stdout, progress and remarks on stderr."""
 
 from __future__ import annotations
 
@@ -31,7 +31,7 @@ _LONGEST = 10_000
 
 
 class SafeConsole(Console):
-    """A console that obeys nothing in the text that it prints: no markup, and no control characters."""
+    """A console that prints text literally: no markup, and no control characters."""
 
     def __init__(self, file: IO[str], *, stderr: bool = False) -> None:
         # In a window lines break between words; in a file or a pipe they do not break.
@@ -40,11 +40,11 @@ class SafeConsole(Console):
         )
 
     def render_str(self, text: str, **options: Any) -> Text:
-        """Return a text or a cell for measuring and printing; names of others stand in it."""
+        """Return a text or a cell for measuring and printing; it may contain untrusted names."""
         return super().render_str(_plain(text), **options)
 
     def render(self, renderable: RenderableType, options: ConsoleOptions | None = None) -> Iterable[Segment]:
-        """Yield the pieces of anything to be printed, those of a `Text` included."""
+        """Yield the segments of a renderable, including those of a `Text`."""
         for piece in super().render(renderable, options):
             yield piece if piece.control else Segment(_plain(piece.text), piece.style)
 
@@ -58,7 +58,7 @@ remarks = SafeConsole(sys.stderr, stderr=True)
 
 
 class _Remarks(logging.Handler):
-    """Prints what the package warns of, each text once."""
+    """A handler that prints the warnings of the package, each text once."""
 
     def __init__(self) -> None:
         super().__init__(logging.WARNING)
@@ -127,12 +127,12 @@ def progress_bar() -> Iterator[Progress]:
 
 
 def say(text: str) -> None:
-    """Print a remark as it is, beside the results."""
+    """Print a remark unchanged, beside the results."""
     remarks.print(text, markup=False)
 
 
 def print_outcomes(outcomes: Sequence[Outcome]) -> None:
-    """What was done, what was found done, and what was left out."""
+    """Print the stages that were done, found up to date, or left out."""
     rest = _print_many(outcomes)
     width = max((len(outcome.run) for outcome in rest), default=0)
     for outcome in rest:

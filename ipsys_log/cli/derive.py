@@ -212,7 +212,7 @@ def _request(logs: list[Path], **given: Any) -> Request:
 def derived(
     logs: list[Path], until: str, output: Path | None = None, kept: bool = True, **given: Any
 ) -> Iterator[tuple[Session, list[Outcome], list[Accuracy]]]:
-    """Do the stages up to ``until``; the session with the results, what was done, and how accurate it is.
+    """Run the stages up to ``until``; yield the session with the results, the outcomes, and the accuracy.
 
     A log that is not ``kept`` is not named.
     """
@@ -231,12 +231,12 @@ def derived(
 
 
 def _kept_runs(logs: list[Path], output: Path | None) -> Callable[[Sequence[str]], str]:
-    """Return what names the runs that an interrupted command has added."""
+    """Return a function that names the runs that an interrupted command has added."""
     from ipsys_log.log.session import Session
     from ipsys_log.runs.records import complete_runs
 
     if output is not None:
-        return lambda _: f"{output} was not written: a new log is written when all is done"
+        return lambda _: f"{output} was not written: a new log is written only when all stages are done"
 
     def complete() -> dict[str, list[str]]:
         stages: dict[str, list[str]] = {}
@@ -251,7 +251,7 @@ def _kept_runs(logs: list[Path], output: Path | None) -> Callable[[Sequence[str]
         new = {run: [s for s in stages if s not in before.get(run, ())] for run, stages in complete().items()}
         named = "; ".join(f"{run} ({', '.join(stages)})" for run, stages in new.items() if stages)
         if not named:
-            return f"{logs[-1]} is as it was: no run was complete"
+            return f"{logs[-1]} is unchanged: no run was complete"
         return f"complete in {logs[-1]}: {named}. The same command continues there"
 
     return added
@@ -325,7 +325,7 @@ def _print(accuracies: Sequence[Accuracy], details: bool) -> None:
 
 
 def _remark(outcomes: list[Outcome], target: Path | None) -> None:
-    """What was done, and where it is."""
+    """Print what was done, and the log with the results."""
     print_outcomes(outcomes)
     if target is None:
         return

@@ -43,9 +43,9 @@ def ask_places(scene: Scene) -> None:
 
 
 def _ask_place(scene: Scene, stop: int | None, saved: list[str]) -> str | Measurement:
-    """Ask until a place is measured or skipped: ``s``, ``q`` to end, or what was undone.
+    """Ask until a point is measured or skipped; return ``s``, ``q`` to end, or the undone measurement.
 
-    ``saved`` has the ids that this session has measured, the last one last.
+    ``saved`` has the ids that this session has measured, the newest last.
     """
     typed: Typed | None = None
     while True:
@@ -66,7 +66,7 @@ def _ask_place(scene: Scene, stop: int | None, saved: list[str]) -> str | Measur
 
 
 def _measure(scene: Scene, stop: int | None, before: Typed | None, saved: list[str]) -> Typed | None:
-    """Ask for one place and append it; what was typed where it is to be asked for again."""
+    """Ask for one point and append it; return the typed texts if the point must be asked for again."""
     from ipsys_log.errors import IpsysError
 
     typed = _ask(scene, stop, before)
@@ -144,9 +144,9 @@ def _show(checked: Checked) -> None:
 
 
 def _undo(scene: Scene, saved: list[str]) -> Measurement | None:
-    """Withdraw the last measurement that counts, and return it; None where none is withdrawn.
+    """Withdraw the last valid measurement, and return it; None if none is withdrawn.
 
-    One that this session has not measured is only withdrawn where the user agrees.
+    A measurement of an earlier session is withdrawn only if the user agrees.
     """
     from ipsys_log.errors import IpsysError
     from ipsys_log.measuring.check import withdraw
@@ -177,6 +177,8 @@ def _agreed_to_withdraw(measurement: Measurement) -> bool:
     tapes = ", ".join(f"{tape.reference} {tape.distance_m * CM_PER_M:.1f}" for tape in measurement.distances)
     text = f"{measurement.id} (marker {measurement.marker_id}{': ' if tapes else ''}{tapes})"
     try:
-        return agreed(f"nothing measured in this session; {text} is of an earlier one. Withdraw it?", False)
+        return agreed(
+            f"nothing measured in this session; {text} is of an earlier session. Withdraw it?", False
+        )
     except LetterError:
         return False

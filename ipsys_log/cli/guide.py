@@ -1,4 +1,4 @@
-"""What the help says beyond each command: in which order to use them, and examples."""
+"""Additional help texts: the order of the commands, and examples."""
 
 from __future__ import annotations
 

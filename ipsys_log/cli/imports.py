@@ -106,7 +106,7 @@ def _refuse_log(path: Path) -> None:
         with path.open("rb") as file:
             is_log = file.read(len(_MCAP_MAGIC)) == _MCAP_MAGIC
     except OSError:
-        return  # a folder, or not there: what reads it says so
+        return  # a folder, or missing: the importer reports it
     if is_log:
         raise IpsysError(
             f"{path}: is a log already and needs no import. See what it holds with: ipsys info {path}; "

@@ -40,7 +40,7 @@ def runs(logs: Logs, as_json: AsJson = False) -> None:
     """Show the runs of a log: stage, inputs, parameters, version of ipsys, and whether it is up to date.
 
     The state is: current; out of date, with the reason (replay computes it again as a new run); not
-    repeatable (what it was made from is not in the log); unfinished (its writer was stopped).
+    repeatable (its inputs are not in the log); unfinished (its writer was stopped).
     """
     from ipsys_log.log.session import Session
     from ipsys_log.report.contents import runs_table, states_json
@@ -56,11 +56,11 @@ def runs(logs: Logs, as_json: AsJson = False) -> None:
 def repair(
     log: Annotated[Path, typer.Argument(help="A log whose writer was killed, or that was cut off.")],
 ) -> None:
-    """Restore all that is whole in a log, in place, say what is gone, and finish its runs.
+    """Repair a log in place: keep all whole records, report what is gone, and finish its runs.
 
-    All bytes that are taken out are kept in <log>.damaged. A log that cannot be made whole stays as it is.
-    The frames that ipsys live or record --detect had recorded and not looked at when it was killed are looked
-    at now. That makes the runs again, to see that they are right; Ctrl-C leaves it to ipsys replay.
+    All bytes that are taken out are kept in <log>.damaged. A log that cannot be repaired is not changed. If
+    ipsys live or record --detect was killed, its recorded frames without results are processed now. This
+    repeats the runs to check them; Ctrl-C leaves it to ipsys replay.
     """
     from ipsys_log.errors import IpsysError
     from ipsys_log.log import repair as repair_log

@@ -21,42 +21,41 @@ RigNow = Annotated[
 ]
 Ids = Annotated[
     Optional[str],  # noqa: UP045
-    typer.Option(
-        metavar="LIST", help="Print these ids, as 1,2,3 or 0-9; with --rig instead of those of the rig."
-    ),
+    typer.Option(metavar="LIST", help="Print these ids, such as 1,2,3 or 0-9, instead of those of the rig."),
 ]
 Length = Annotated[
     Optional[float],  # noqa: UP045
-    typer.Option(metavar="METRES", help="Side of the black square, in m; with --rig instead of its lengths."),
+    typer.Option(metavar="METRES", help="Side of the black square, in m, instead of the lengths of the rig."),
 ]
 Dictionary = Annotated[
     Optional[str],  # noqa: UP045
     typer.Option(
         metavar="NAME",
-        help="The dictionary of --ids without a rig (otherwise DICT_4X4_100), and of a ChArUco board "
-        "(otherwise DICT_4X4_50).",
+        help="Dictionary of --ids without a rig (default: DICT_4X4_100) and of a ChArUco board "
+        "(default: DICT_4X4_50).",
     ),
 ]
 BoardName = Annotated[
     Optional[str],  # noqa: UP045
     typer.Option(
         metavar="COLUMNSxROWS",
-        help="Print a board for ipsys calibrate: the inner corners of a chessboard, as 6x4, or the "
-        "squares of a ChArUco board, as charuco:4x5.",
+        help="Print a board for ipsys calibrate, by the inner corners of a chessboard, such as 6x4, or the "
+        "squares of a ChArUco board, such as charuco:4x5.",
     ),
 ]
 Square = Annotated[float, typer.Option(metavar="METRES", help="Side of a board's square, in m.")]
 MarkerScale = Annotated[
-    float, typer.Option(metavar="SHARE", help="Side of a ChArUco board's markers, as a share of a square's.")
+    float,
+    typer.Option(metavar="SHARE", help="Side of a ChArUco marker, as a fraction of the side of a square."),
 ]
 PageName = Annotated[
     Optional[str],  # noqa: UP045
     typer.Option(
-        "--page", metavar="NAME", help="a4, letter or a3. Without it: a4, or a3 where that is too small."
+        "--page", metavar="NAME", help="Paper: a4, letter or a3. Default: a4, or a3 if a4 is too small."
     ),
 ]
 Output = Annotated[Path, typer.Option("--output", "-o", metavar="FILE", help="The PDF to write.")]
-Force = Annotated[bool, typer.Option("--force", help="Write over a file that exists.")]
+Force = Annotated[bool, typer.Option("--force", help="Overwrite an existing file.")]
 
 _DICTIONARY, _BOARD_DICTIONARY = "DICT_4X4_100", "DICT_4X4_50"
 _MOST = 2000
@@ -78,7 +77,7 @@ def markers(
     output: Output = Path("markers.pdf"),
     force: Force = False,
 ) -> None:
-    """Draw markers and calibration boards as a PDF at true size, with a ruler to check the print by.
+    """Draw markers and calibration boards as a PDF at true size, with a ruler to check the print.
 
     Each marker has its white margin, cutting marks, its id and an arrow to its front: the direction of its
     heading. Print at 100 % ("actual size"), and measure the ruler: it is 10 cm long."""
@@ -87,10 +86,10 @@ def markers(
     from ipsys_log.report.print_pages import choose_paper, draw_pages, lay_out
 
     if output.suffix.lower() != ".pdf":
-        raise IpsysError(f"--output {output}: only PDF keeps the size; let the name end in .pdf")
+        raise IpsysError(f"--output {output}: only PDF keeps the true size; use a name that ends in .pdf")
     check_file(output, "--output", [])
     if output.exists() and not force:
-        raise IpsysError(f"{output}: exists already; give another name, or --force to write over it")
+        raise IpsysError(f"{output}: exists already; give another name, or --force to overwrite it")
     prints = _marker_prints(rig, ids, length, dictionary) if rig or ids else []
     if board is not None:
         prints.append(_board(board, square, marker_scale, dictionary or _BOARD_DICTIONARY))
@@ -103,7 +102,7 @@ def markers(
     console.print(f"{output} written: {count} of {paper.name}, {_contents(prints)}", markup=False)
     if page is None and paper.name != "A4":
         console.print(
-            "A4 is too small for them. A copy shop prints A3; --length 0.14 gives markers that fit onto A4",
+            "A4 is too small. A copy shop prints A3; --length 0.14 gives markers that fit onto A4",
             markup=False,
         )
     console.print('print it at 100 % ("actual size"), and measure the ruler: 10 cm', markup=False)
@@ -123,7 +122,7 @@ def _marker_prints(
 
 
 def _lab(rig: Path | None, length: float | None, dictionary: str | None) -> Rig:
-    """The rig, or one that holds only a dictionary and a length."""
+    """Return the rig, or one with only a dictionary and a length."""
     from dataclasses import replace
 
     from ipsys_log.errors import IpsysError
@@ -146,12 +145,12 @@ def _lab(rig: Path | None, length: float | None, dictionary: str | None) -> Rig:
 
 
 def _parse_ids(text: str, dictionary: str) -> list[int]:
-    """The ids of a list such as ``1,2,5-9``, each once.
+    """Parse a list of ids such as ``1,2,5-9``; each id occurs once.
 
     Raises
     ------
     IpsysError
-        For what is no list, or an id that the dictionary does not have.
+        The text is no list, or has an id that the dictionary does not have.
     """
     from ipsys_log.errors import IpsysError
     from ipsys_log.rig_slips import dictionary_size

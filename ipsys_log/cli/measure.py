@@ -88,11 +88,11 @@ def measure(
 ) -> None:
     """Enter tape measurements: on a page for the phone, in the terminal, or from a sheet.
 
-    With --rig lab.toml -o places.mcap it looks through the cameras until Ctrl-C, and writes about a second of
-    frames of each place that is measured. With a finished LOG it goes through the places where a marker
-    lies still, and appends what is measured.
+    With --rig lab.toml -o places.mcap it uses the live cameras until Ctrl-C, and writes about a second of
+    frames for each measured point. With a finished LOG it goes through the stationary intervals of the
+    markers, and appends the measurements.
 
-    Either way what is typed is checked at once. Undo withdraws a measurement; nothing is erased.
+    Each entry is checked at once. Undo withdraws a measurement; nothing is erased.
     """
     ends = csv is not None or places
     allow_interrupt(None if ends else "stopped; every saved point is in the log")
@@ -181,7 +181,7 @@ def serve_page(scene: Scene, host: str | None, port: int) -> None:
     from ipsys_log.cli.measure_now import say_faults
     from ipsys_log.web.serving import qr_code, serving
 
-    signals: list[None] = []  # a list, as an Event takes a lock that the interrupted thread may hold
+    signals: list[None] = []  # a list: an Event takes a lock that the interrupted thread may hold
     stop_on_signal(lambda: signals.append(None))
     with serving(scene, host, port) as page:
         if host is not None:

@@ -40,7 +40,7 @@ def measure_now(
     host: str | None,
     port: int,
 ) -> list[Measurement]:
-    """Measure places into a new log with a second of frames of each; what was measured and withdrawn."""
+    """Measure points into a new log, each with a second of frames; return the measurements."""
     from ipsys_log import pipeline
     from ipsys_log.recording.consumers import Consumer
     from ipsys_log.runs.request import Request
@@ -85,7 +85,7 @@ def ready_to_measure(lab: Lab, request: Request, model_from: Path | None) -> Mod
 
 
 def live_scene(settings: list[Message], cameras: Attached, model: Model | None) -> LiveScene:
-    """What the cameras see now, to measure on."""
+    """Make the scene of the live cameras, for measuring."""
     from ipsys_log.scenes.live import LiveScene
 
     return LiveScene(settings[0].payload, model, cameras.states, cameras.save)
@@ -93,7 +93,7 @@ def live_scene(settings: list[Message], cameras: Attached, model: Model | None) 
 
 @contextmanager
 def served(scene: LiveScene, host: str | None, port: int) -> Iterator[None]:
-    """The page on which places are measured, for as long as the block lasts."""
+    """Serve the measuring page until the block ends."""
     from ipsys_log.web.serving import qr_code, serving
 
     with serving(scene, host, port) as page:
@@ -107,7 +107,7 @@ def served(scene: LiveScene, host: str | None, port: int) -> Iterator[None]:
 
 
 def say_faults(page: Served) -> None:
-    """Say what went wrong in the page's server: at the end, the screen is free for a traceback."""
+    """Print the faults of the page's server at the end, when the screen is free for a traceback."""
     if page.faults.count:
         remarks.print(
             f"faults of ipsys in the measuring page: {page.faults.count}; the first one:", style="red"
@@ -116,10 +116,10 @@ def say_faults(page: Served) -> None:
 
 
 def _ask_beside(work: Callable[[], Any], scene: LiveScene, cameras: Attached) -> None:
-    """Ask in the terminal while the work goes on in a thread, and stop the cameras after that."""
+    """Ask in the terminal while the work runs in a thread, and stop the cameras after that."""
     from ipsys_log.cli.dialog import ask_places
 
-    allow_interrupt("stopped; every saved point is in the log")  # an open question ends, too
+    allow_interrupt("stopped; every saved point is in the log")  # this also ends an open question
     with ThreadPoolExecutor(1) as pool:
         working = pool.submit(work)
         try:

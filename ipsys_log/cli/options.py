@@ -41,7 +41,7 @@ Logs = Annotated[
 ]
 
 
-# What is written by other options, or read: a log that is called so is a slip.
+# Endings of other input and output files: a log of that name is a mistake.
 _OTHER_FILES = (
     *(".html", ".htm", ".csv", ".json", ".toml", ".yaml", ".yml", ".rrd"),
     *(".png", ".pdf", ".svg", ".jpg", ".jpeg", ".webp"),
@@ -49,23 +49,19 @@ _OTHER_FILES = (
 
 
 def _named_as_log(path: Path | None) -> Path | None:
-    """What a user calls a new log, with the ending that all logs have.
+    """Return the path of a new log, with the ending of logs.
 
     Raises
     ------
     IpsysError
-        For the name of another kind of file.
+        The name is that of another kind of file.
     """
     if path is None or path.suffix == ".mcap" or path.is_dir():
         return path
     if path.suffix.lower() in _OTHER_FILES:
         from ipsys_log.errors import IpsysError
 
-        page = (
-            "; a page is what ipsys report writes, to --html FILE"
-            if path.suffix.lower() in (".html", ".htm")
-            else ""
-        )
+        page = "; ipsys report --html FILE writes a page" if path.suffix.lower() in (".html", ".htm") else ""
         raise IpsysError(f"-o {path}: -o is for a new log, which ends in .mcap{page}")
     named = path.with_name(f"{path.name}.mcap")
     remarks.print(f"-o {path}: the log is called {named}", markup=False)
@@ -171,14 +167,14 @@ def load_calibrations(
 
 
 def load_matching_rig(path: Path | None, cameras: Callable[[], Collection[str]]) -> Rig | None:
-    """Read a rig for cameras that are given by their pictures; None where no file is named.
+    """Read a rig for cameras that are given by their pictures; None if no file is named.
 
-    A rig that describes some of the cameras is a remark.
+    A rig that describes only some of the cameras causes a remark.
 
     Raises
     ------
     IpsysError
-        Where the rig cannot be read, or describes only other cameras.
+        The rig cannot be read, or describes only other cameras.
     """
     if path is None:
         return None

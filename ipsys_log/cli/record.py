@@ -121,7 +121,7 @@ def live(
     seconds: Seconds = None,
     force: Force = False,
 ) -> None:
-    """Track robots now: record, and take every frame through all stages up to fuse, until Ctrl-C."""
+    """Track robots live: record, and process every frame by all stages up to fuse, until Ctrl-C."""
     allow_interrupt(_NOT_BEGUN)
     from ipsys_log import pipeline
     from ipsys_log.recording.consumers import Consumer

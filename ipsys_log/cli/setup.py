@@ -96,7 +96,7 @@ def _init_simulated(path: Path) -> None:
     _write_new({path: _SIMULATED + rig_toml(live_rig(LIVE_SETTINGS)), tape: tape_sheet(lying)})
     console.print(f"{path} written: the simulated lab, with three cameras", markup=False)
     console.print(
-        f"{tape} written: what a tape reads at the {len(lying)} markers that lie still there", markup=False
+        f"{tape} written: the tape measurements of its {len(lying)} stationary markers", markup=False
     )
     console.print(f"then: ipsys align --rig {path}", markup=False)
 
@@ -107,7 +107,7 @@ def _write_new(texts: dict[Path, str]) -> None:
     Raises
     ------
     IpsysError
-        Where a file exists.
+        A file exists.
     """
     from ipsys_log.errors import IpsysError
     from ipsys_log.log.lock import dangling
@@ -138,13 +138,13 @@ def _rig_of(log: Path) -> str:
 
 
 def simulate(output: Path, **settings: Any) -> None:
-    """Render a lab with known truth: places measured by tape, then a drive.
+    """Render a lab with ground truth: points measured by tape, then a drive.
 
-    As it stands it is the lab of the paper: three cameras about 2.1 m above a floor of 4.88 m."""
+    By default it is the lab of the paper: three cameras about 2.1 m above a floor of 4.88 m."""
     from ipsys_log.runs.output import write_log
     from ipsys_log.sources.simulator import LabSettings, simulate
 
-    text = f"{output} was not written: a log of the simulated lab is written whole or not at all"
+    text = f"{output} was not written: the log of a simulated lab is written completely or not at all"
     with say_kept(lambda _: text), progress_bar() as progress:
         counts = write_log(output, simulate(LabSettings(**settings), progress))
     frames = sum(count for topic, count in counts.items() if topic.endswith("/image"))

@@ -1,12 +1,12 @@
-"""Signals that end a command: when they take effect, and the exit code that they give.
+"""Signals that end a command: the time of their effect, and their exit code.
 
-A signal goes through three states. Until the command is known it is only noted (`hold_signals`). Then it
-interrupts (`allow_interrupt`), or it stops the cameras and the command ends in order (`stop_on_signal`). The
-first signal of a command that runs until it is stopped gives exit code 0; every other one gives 128 plus its
-number, as shells do. A signal that the process inherited as ignored stays ignored (``nohup``).
+Until the command is known, a signal is only noted (`hold_signals`). Then it interrupts (`allow_interrupt`),
+or it stops the cameras and the command ends in order (`stop_on_signal`). The first signal of a command that
+runs until it is stopped gives exit code 0; every other one gives 128 plus its number, as shells do. A signal
+that the process inherited as ignored stays ignored (``nohup``).
 
-An interrupt is an exception, and code of others may swallow it: the import of an extension module does. So it
-is raised again until it arrives.
+An interrupt is an exception, and other packages may suppress it: the import of an extension module does. So
+it is raised again until it arrives.
 """
 
 from __future__ import annotations
@@ -35,11 +35,11 @@ __all__ = [
 
 _SIGNALS = (signal.SIGINT, signal.SIGTERM, signal.SIGHUP)
 _AGAIN_S = 0.5
-_KEPT = "what was complete is kept, and nothing else was changed"
+_KEPT = "complete results are kept, and nothing else was changed"
 
 
 class Interrupted(KeyboardInterrupt):
-    """A signal that interrupts the main thread; it carries its exit code and what the user reads."""
+    """A signal that interrupts the main thread, with its exit code and its message."""
 
     def __init__(self, exit_code: int, text: str) -> None:
         super().__init__(text)
@@ -69,7 +69,7 @@ _state = _State()
 
 
 def hold_signals() -> None:
-    """Note signals without any effect, until the command says what they mean."""
+    """Note signals without any effect, until the command sets their effect."""
     _settle()
     _state.noted, _state.normal_text = None, None
     _handle(_note)
@@ -108,17 +108,17 @@ def stop_on_signal(stop: Callable[[], None]) -> None:
 
 
 def note_kept(result: str) -> None:
-    """Note a result that outlasts an interrupt, such as a file that was written."""
+    """Note a result that remains after an interrupt, such as a written file."""
     _state.kept.append(result)
 
 
 @contextmanager
 def say_kept(text: Callable[[Sequence[str]], str]) -> Iterator[None]:
-    """Say on an interrupt within the block, or within a function decorated with it, what was kept.
+    """Report the kept results on an interrupt within the block, or within a decorated function.
 
     Parameters
     ----------
-    text : is called after an interrupt with the results that `note_kept` has got in the block.
+    text : is called after an interrupt with the results that `note_kept` noted in the block.
     """
     _state.kept.clear()
     try:
@@ -146,7 +146,7 @@ def runs_until_stopped(command: Callable[..., None]) -> Callable[..., None]:
 
 
 def interruptible(command: Callable[..., Any]) -> Callable[..., Any]:
-    """Wrap a command: signals interrupt it, and what they raise passes the argument parser."""
+    """Wrap a command: signals interrupt it, and their exceptions pass the argument parser."""
 
     @functools.wraps(command)
     def run(*arguments: Any, **options: Any) -> Any:
@@ -158,7 +158,7 @@ def interruptible(command: Callable[..., Any]) -> Callable[..., Any]:
             _settle()
             raise InterruptError(interrupt.exit_code, interrupt.text) from None
         finally:
-            hold_signals()  # the command has ended: a late signal changes neither its exit code nor its words
+            hold_signals()  # the command has ended: a late signal has no effect on it
 
     return run
 
@@ -183,7 +183,7 @@ def _interrupt(number: int, _: FrameType | None = None) -> NoReturn:
 
 
 def _interrupt_again(*_: object) -> None:
-    """Raise an interrupt again that is not on its way any more."""
+    """Raise an interrupt again if it was suppressed."""
     error = sys.exception()
     while error is not None:
         if isinstance(error, (Interrupted, GeneratorExit)):

@@ -48,7 +48,7 @@ def view(logs: Logs, run: Runs = None, save: Save = None) -> None:
 
 
 def _check_save(save: Path, logs: list[Path]) -> None:
-    """See that a recording can be written, and that Rerun will open it by its name."""
+    """Check that a recording can be written, and that Rerun will open it by its name."""
     from ipsys_log.errors import IpsysError
     from ipsys_log.report.files import check_file
 

@@ -55,15 +55,15 @@ _RIG = Rig(
 
 
 def read_imsel(folder: Path) -> Iterator[Message]:
-    """The authors' rig, lenses, camera points and measured places, in log order.
+    """Yield the authors' rig, intrinsics, camera points and measured points, in log order.
 
-    A place is measured for one camera, and gets a second of its own. The 40 training places are
-    labelled ``train``, the published subsets ``train_10`` to ``train_40``, the others ``test``.
+    Each point is measured for one camera, and gets a separate second. The 40 training points are labelled
+    ``train``, the published subsets ``train_10`` to ``train_40``, the others ``test``.
 
     Raises
     ------
     IpsysError
-        Where a file is missing or does not hold what it should.
+        A file is missing or has wrong contents.
     """
     mats = {name: read_mat(_find(folder, f"{name}.mat")) for name in ("testing", *map(_training, SUBSETS))}
     lenses = {camera: _find(folder, f"{stem}_calib.yaml") for camera, stem in CAMERAS.items()}

@@ -1,6 +1,6 @@
 """Tables of numbers in a MATLAB file (version 5).
 
-SciPy's reader believes the types and flags that a file names: wrong ones end the process.
+SciPy's reader trusts the types and flags in a file: wrong ones crash the process.
 Layout: "MAT-File Format", The MathWorks, chapter 1.
 """
 
@@ -35,7 +35,7 @@ def read_mat(path: Path) -> dict[str, NDArray[np.float64]]:
     Raises
     ------
     IpsysError
-        The file cannot be read, is of another version, or holds something else than tables of real numbers.
+        The file cannot be read, has another version, or holds other data than tables of real numbers.
     """
     try:
         data = path.read_bytes()
@@ -61,22 +61,22 @@ def _matrices(data: bytes) -> Iterator[bytes]:
             kind, size = _TAG.unpack_from(whole)
             body = whole[_TAG.size :]
         if kind != _MATRIX or len(body) != size:
-            raise ValueError("it holds something else than tables")
+            raise ValueError("it holds data other than tables")
         yield body
 
 
 def _table(matrix: bytes) -> tuple[str, NDArray[np.float64]]:
-    """Name and numbers, from flags, dimensions, name and numbers: each has a tag, and fills 8 bytes."""
+    """Parse flags, dimensions, name and numbers: each has a tag and is padded to 8 bytes."""
     parts = list(_parts(matrix))
     if [kind for kind, _ in parts[:-1]] != [_FLAGS, _DIMENSIONS, _TEXT] or parts[-1][0] not in _NUMBERS:
-        raise ValueError("a table has not the parts of one")
+        raise ValueError("a table lacks some of its parts")
     (_, flags), (_, sizes), (_, name), (kind, numbers) = parts
     if len(flags) != 8 or flags[0] not in _CLASSES or flags[1]:
-        raise ValueError("it holds something else than real numbers")
+        raise ValueError("it holds data other than real numbers")
     rows, columns = struct.unpack("<ii", sizes)
     values = np.frombuffer(numbers, _NUMBERS[kind])
     if min(rows, columns) < 0 or rows * columns != len(values):
-        raise ValueError("a table has another size than its numbers")
+        raise ValueError("the size of a table does not match its numbers")
     return name.decode(), values.astype(np.float64).reshape((rows, columns), order="F")
 
 

@@ -27,15 +27,15 @@ _MODEL_OF_COUNT = {4: "kannala_brandt", 5: "plumb_bob", 8: "rational_polynomial"
 
 
 def read_opencv_calibration(path: Path, camera: str, time_ns: int = 0) -> CameraCalibration:
-    """A lens from a FileStorage YAML, XML or JSON file, or a ``camera_info`` YAML of ROS.
+    """Read intrinsics from a FileStorage YAML, XML or JSON file, or a ``camera_info`` YAML of ROS.
 
-    The distortion model is the one named in the file; where none is, four coefficients are those of the
-    fisheye (k1..k4), five and eight those of the pinhole.
+    The file names the distortion model. If it does not, four coefficients are those of the fisheye (k1..k4),
+    five and eight those of the pinhole.
 
     Raises
     ------
     IpsysError
-        Where the file cannot be read or lacks the matrix, the coefficients or the image size.
+        The file cannot be read, or lacks the matrix, the coefficients or the image size.
     """
     if not path.is_file():
         raise IpsysError(f"{path}: there is no such calibration file; 'ipsys calibrate' writes one")
@@ -51,7 +51,7 @@ def read_opencv_calibration(path: Path, camera: str, time_ns: int = 0) -> Camera
     if k is None or d is None or k.size != 9 or not width or not height:
         raise IpsysError(f"{path}: lacks the camera matrix, the distortion coefficients or the image size")
     if width < 0 or height < 0:
-        raise IpsysError(f"{path}: its image width or height is no number of pixels, 1 to {_WIDEST_PX}")
+        raise IpsysError(f"{path}: its image width or height must be 1 to {_WIDEST_PX} pixels")
     model = _MODEL_OF_NAME.get(named, named) or _MODEL_OF_COUNT.get(d.size, f"with {d.size} coefficients")
     if model == "plumb_bob" and d.size == 4:
         d = np.append(d, 0.0)  # k3 is often left out
@@ -60,11 +60,11 @@ def read_opencv_calibration(path: Path, camera: str, time_ns: int = 0) -> Camera
 
 
 def _as_file_storage(path: Path) -> str:
-    """OpenCV reads YAML only with its own first line, which ROS leaves out."""
+    """Add the first line that OpenCV requires in YAML; ROS does not write it."""
     if path.stat().st_size > _LARGEST_FILE:
         raise ValueError("too large")
     text = path.read_text(encoding="utf-8")
-    # OpenCV's reader calls itself for each level, and has no bound.
+    # OpenCV's reader is recursive for each level, without a limit.
     if sum(map(text.count, "[{<")) > _MOST_BRACKETS or "\0" in text:
         raise ValueError("too many levels")
     is_yaml = path.suffix.lower() in (".yaml", ".yml")
@@ -78,7 +78,7 @@ def _matrix(storage: cv2.FileStorage, names: tuple[str, ...]) -> NDArray[np.floa
         if data.isSeq() and data.size() <= _MOST_NUMBERS:
             return np.array([data.at(i).real() for i in range(data.size())])
         if node.isMap():
-            # The size is claimed in the file, and taken in memory.
+            # OpenCV allocates the size that the file states.
             rows, columns = (node.getNode(key).real() for key in ("rows", "cols"))
             if not (0 < rows <= _MOST_NUMBERS and 0 < columns <= _MOST_NUMBERS):
                 raise ValueError("a matrix of another size")

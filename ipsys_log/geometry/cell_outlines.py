@@ -22,7 +22,7 @@ def cell_outlines(black: NDArray[np.bool_]) -> list[NDArray[np.float64]]:
     """Trace the edges between black and white cells into closed polygons.
 
     Neighbouring black cells share one polygon, so that no renderer leaves a light seam between them. The
-    outlines of holes run the other way round: filled by the nonzero rule, together they are the black cells.
+    outlines of holes have the opposite direction, so that the nonzero rule fills exactly the black cells.
 
     Parameters
     ----------

@@ -75,7 +75,7 @@ def _homography(uv: Array, lengths_m: Array) -> tuple[Array, Array]:
 
 
 def _along_view(uv: Array) -> Array:
-    """Rotations (n, 3, 3) that take the optical axis to the direction of (u, v), the shortest way."""
+    """Return the smallest rotations (n, 3, 3) from the optical axis to the direction of (u, v)."""
     away = np.ones((len(uv), 3))
     away[:, :2] = uv
     away /= np.sqrt((away * away).sum(axis=1))[:, None]

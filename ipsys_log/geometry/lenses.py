@@ -39,13 +39,13 @@ _undistort_pinhole = getattr(cv2, "undistortPointsIter", cv2.undistortPoints)
 
 
 def check_calibration(lens: CameraCalibration, where: str) -> CameraCalibration:
-    """Return ``lens`` if it can be computed with.
+    """Return ``lens`` if it is valid.
 
     Raises
     ------
     IpsysError
-        Naming ``where``, for an unknown distortion model, a wrong number of coefficients, or a
-        focal length that is not positive.
+        The distortion model is unknown, the number of coefficients is wrong, or a focal length is not
+        positive; the text names ``where``.
     """
     wanted = DISTORTION_MODELS.get(lens.distortion_model)
     if wanted is None:
@@ -60,10 +60,10 @@ def check_calibration(lens: CameraCalibration, where: str) -> CameraCalibration:
             f"{_advice(lens)}"
         )
     if not (np.abs(lens.K) <= _LARGEST).all() or not (np.abs(lens.D) <= _LARGEST).all():
-        raise IpsysError(f"{where}: its matrix or coefficients are no numbers of a lens; calibrate again")
+        raise IpsysError(f"{where}: its matrix or coefficients are not valid; calibrate again")
     if not (0 < lens.width <= _WIDEST_PX and 0 < lens.height <= _WIDEST_PX):
         raise IpsysError(
-            f"{where}: no image has {lens.width} x {lens.height} px; write the size in pixels into it"
+            f"{where}: {lens.width} x {lens.height} px is no image size; write the size in pixels into it"
         )
     if not lens.K[0, 0] > 0 < lens.K[1, 1]:
         raise IpsysError(f"{where}: the camera matrix K has no positive focal lengths; calibrate again")
@@ -71,7 +71,7 @@ def check_calibration(lens: CameraCalibration, where: str) -> CameraCalibration:
 
 
 def _advice(lens: CameraCalibration) -> str:
-    """Return what to do about a calibration that cannot be used."""
+    """Return the advice for an invalid calibration."""
     name = lens.frame_id or "camera"
     option = f"--calibration {name}={name}.yaml"
     return f"Calibrate the camera with 'ipsys calibrate', and give the file with {option}"
@@ -139,7 +139,7 @@ def undistort(points_px: NDArray[np.float64], lens: CameraCalibration) -> NDArra
 
     Returns
     -------
-    (n, 2), without unit; NaN where no ray of the lens meets the pixel, beyond what was calibrated.
+    (n, 2), without unit; NaN if no ray of the lens meets the pixel, outside of the calibrated area.
 
     References
     ----------
@@ -178,7 +178,7 @@ def _distort(points_uv: NDArray[np.float64], lens: CameraCalibration) -> NDArray
 
 
 def project(points_m: NDArray[np.float64], lens: CameraCalibration) -> NDArray[np.float64]:
-    """Pixels of points in the frame of the camera.
+    """Return the pixels of points in camera coordinates.
 
     Parameters
     ----------

@@ -18,7 +18,7 @@ __all__ = ["count_by_indexes", "disagreement"]
 
 
 def disagreement(view: View, found: Survey) -> str:
-    """Return in what a log disagrees with its own survey, "" if it is whole."""
+    """Return the first disagreement of a log with its survey, "" if there is none."""
     try:
         theirs, summary = load_contents(view), read_summary(view)
         if summary is not None:
@@ -31,9 +31,9 @@ def disagreement(view: View, found: Survey) -> str:
     )
     tests = (
         (not found.finished or bool(found.damaged) or not found.crc_is_right, "its data section is damaged"),
-        (theirs.data_end != found.end, "its summary is that of another data section"),
+        (theirs.data_end != found.end, "its summary belongs to another data section"),
         (Counter(mine.counts) != Counter(theirs.counts), counts),
-        (not _same_chunks(theirs.chunks, mine.chunks), "readers look for other chunks than it has"),
+        (not _same_chunks(theirs.chunks, mine.chunks), "its chunks are not those that readers expect"),
     )
     what = next((what for is_wrong, what in tests if is_wrong), "")
     return what if what or summary is None else _summary_disagreement(summary, mine, found)
@@ -49,7 +49,7 @@ def count_by_indexes(view: View) -> int:
 
 
 def _check_lengths(view: View, start: int) -> None:
-    """Refuse a summary of which a reader that believes all lengths would read too much."""
+    """Refuse a summary with wrong lengths: a reader that trusts them would read too much."""
     for at in walk(view, start, view.size):
         if at.opcode == Opcode.FOOTER:
             return
@@ -60,7 +60,7 @@ def _check_lengths(view: View, start: int) -> None:
 def _summary_disagreement(summary: Summary, mine: Contents, found: Survey) -> str:
     theirs, statistics, _ = summary
     if theirs.chunks and not _same_chunks(theirs.chunks, mine.chunks):
-        return "its chunk indexes are not those of its chunks"
+        return "its chunk indexes do not match its chunks"
     for kind, records, own in (
         ("schema", theirs.schemas, found.definitions.schemas),
         ("channel", theirs.channels, found.definitions.channels),
@@ -98,7 +98,7 @@ def _same_chunks(theirs: list[ChunkRef], mine: list[ChunkRef]) -> bool:
 
 
 def _same_chunk(theirs: ChunkRef, mine: ChunkRef) -> bool:
-    """Compare all that a reader goes by; a writer may leave out the message indexes."""
+    """Compare all fields that readers use; a writer may leave out the message indexes."""
     lengths = (mine.index_length,) if theirs.index_offsets else (0, mine.index_length)
     offsets = theirs.index_offsets in ({}, mine.index_offsets) and theirs.index_length in lengths
     same = theirs._replace(index_length=0, index_offsets={}) == mine._replace(

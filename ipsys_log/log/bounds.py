@@ -1,4 +1,4 @@
-"""Bounds on what a log may ask for, in proportion to the size of its file.
+"""Limits on the work to read a log, in proportion to the size of its file.
 
 A compressor stores a gigabyte of zeros in 33 kB, and half a million empty messages in one. Recorded
 logs stay far below every bound: they hold 2 to 4 bytes unpacked for each byte of the file, and a message
@@ -22,7 +22,7 @@ __all__ = [
 
 _MIB = 1 << 20
 LARGEST_CHUNK = 256 * _MIB  # bytes, uncompressed
-LARGEST_MESSAGE = LARGEST_CHUNK - 8 * _MIB  # bytes: leaves room for what its chunk holds already
+LARGEST_MESSAGE = LARGEST_CHUNK - 8 * _MIB  # bytes: leaves room for the earlier messages of its chunk
 LARGEST_DEFINITION = 4 * _MIB  # bytes of a schema, a channel or a metadata record
 _ANY_RATIO = 16 * _MIB  # bytes: a chunk up to this size may be compressed to any extent
 _HIGHEST_RATIO = 200
@@ -36,7 +36,7 @@ _BYTES_PER_ITEM = 4
 
 
 class BoundError(LogError):
-    """A log that asks for more time or memory than a file of its size may."""
+    """A log that needs more time or memory than the limit for its file size."""
 
 
 def chunk_excess(packed: int, unpacked: int) -> str:

@@ -112,17 +112,17 @@ class ChunkBuilder:
         return {channel: len(entries) // 2 for channel, entries in self._entries.items()}
 
     def build(self, offset: int) -> tuple[ChunkRef, Buffer, int] | None:
-        """The chunk to be written at `offset` with its message indexes, and the CRC-32 of these bytes.
+        """Return the chunk for `offset` with its message indexes, and the CRC-32 of these bytes.
 
-        None if it holds no message. The bytes hold until a message is added; call `clear` once they are
-        where they belong.
+        None if it holds no message. The bytes are valid until a message is added; call `clear` after they are
+        written.
         """
         if not self._entries:
             return None
         data: Buffer = self._record[CHUNK_HEAD_SIZE : self._end]
         size = len(data)
         crc = data_crc = zlib.crc32(self._record[self._crc_end : self._end], self._crc)
-        # One huge message. Readers refuse what unpacks to very much more than the file.
+        # One huge message. Readers refuse chunks that unpack to far more than the file size.
         compress = self.compress and size <= 2 * self.limits.size
         name = "zstd" if compress else ""
         if compress:

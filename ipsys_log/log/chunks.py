@@ -1,4 +1,4 @@
-"""What is inside a chunk: decompression within bounds, and its records."""
+"""Contents of a chunk: decompression within limits, and its records."""
 
 import threading
 import zlib
@@ -27,7 +27,7 @@ class _PerThread(threading.local):
 
 
 _DECOMPRESSORS = _PerThread()
-_PIECE = 4 << 20  # bytes decompressed at once where the size of the result is not known
+_PIECE = 4 << 20  # bytes decompressed at once if the size of the result is not known
 _DEFINITIONS = (Opcode.SCHEMA, Opcode.CHANNEL)
 _FAULTS = (zstandard.ZstdError, RuntimeError, EOFError, ValueError)
 
@@ -47,7 +47,7 @@ def unpack(view: View, offset: int, head: ChunkHead) -> bytes:
     Raises
     ------
     BoundError
-        The chunk truly holds more than it may. A chunk that only claims so is damaged.
+        The chunk really holds more than the limit. A chunk that only claims so is damaged.
     LogError
         The chunk is damaged.
     """
@@ -78,7 +78,7 @@ def _decompress(view: View, offset: int, head: ChunkHead, data: bytes, excess: s
     frame_size = zstandard.frame_content_size(data) if head.compression == "zstd" else -1
     if frame_size not in (-1, size):
         raise ValueError("the frame claims another size than the chunk")
-    # A claim that is too large is damage, unless the frame agrees or so much can be decompressed.
+    # A size above the limit is damage, unless the frame states it too or so many bytes decompress.
     proof = min(size, LARGEST_CHUNK + 1) if excess and frame_size == -1 else 0
     held = sum(map(len, _pieces(head.compression, data, proof)))
     beyond = view.allowance.unpack(offset, held if excess else size)
@@ -88,7 +88,7 @@ def _decompress(view: View, offset: int, head: ChunkHead, data: bytes, excess: s
         raise ValueError(f"it claims {size} bytes and holds {held}")
     if head.compression == "zstd":
         return _DECOMPRESSORS.zstd.decompress(data, max_output_size=max(size, 1))
-    unpacked = BytesIO()  # grows in place, and hands its bytes over without a copy
+    unpacked = BytesIO()  # grows in place, and gives its bytes without a copy
     unpacked.writelines(_pieces("lz4", data, size + 1))
     return unpacked.getvalue()
 
@@ -112,14 +112,14 @@ def _pieces(compression: str, data: bytes, most: int) -> Iterator[bytes]:
 
 
 def inner_records(view: View, offset: int, data: bytes) -> Iterator[RecordAt]:
-    """The records inside the chunk at `offset`; their offsets count from the chunk's first record."""
+    """Yield the records inside the chunk at `offset`; their offsets count from the chunk's first record."""
     position = 0
     while position < len(data):
         if position + HEADER.size > len(data):
             raise view.fault(offset, "the last record in the chunk is cut off")
         opcode, length = HEADER.unpack_from(data, position)
         if opcode == 0:
-            raise view.fault(offset, "there is no record in the chunk where one must be")
+            raise view.fault(offset, "a record is missing in the chunk")
         if length > len(data) - position - HEADER.size:
             raise view.fault(offset, "a record in the chunk reaches beyond its end")
         yield RecordAt(opcode, position, HEADER.size + length)
@@ -135,7 +135,7 @@ class Inside:
     entries: dict[int, list[tuple[int, int]]] = field(default_factory=dict)
 
     def add(self, view: View, at: RecordAt, where: int, body: bytes) -> None:
-        """Take in one record of type Schema, Channel or Message; others are ignored."""
+        """Add one record of type Schema, Channel or Message; others are ignored."""
         if at.opcode == Opcode.MESSAGE:
             if len(body) < MESSAGE.size - HEADER.size:
                 raise view.fault(where, "a Message record is too short")
@@ -152,13 +152,13 @@ class Inside:
 
 
 def check_definition(view: View, at: RecordAt) -> None:
-    """Refuse a record that must be read as a whole and is too large for that."""
+    """Refuse a record that is too large to be read as a whole."""
     if at.length > LARGEST_DEFINITION:
         raise view.refusal(f"one of its definitions has {at.length} bytes, more than {LARGEST_DEFINITION}")
 
 
 def look_inside(view: View, offset: int, data: bytes) -> Inside:
-    """Definitions and message entries of the decompressed chunk `data`, which lies at `offset`."""
+    """Return definitions and message entries of the decompressed chunk `data` at `offset`."""
     inside, number = Inside(), 0
     left = view.allowance.records_left(offset)
     for number, at in enumerate(inner_records(view, offset, data), 1):

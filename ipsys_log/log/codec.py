@@ -133,7 +133,7 @@ def _bytes_fields(kind: type) -> tuple[str, ...]:
 def decode(
     name: str, data: bytes, encoding: str = "protobuf", definition: bytes = b"", items: Items | None = None
 ) -> Any:
-    """The payload in ``data``, which the schema called ``name`` was written with.
+    """Decode the payload in ``data``, a message of the schema ``name``.
 
     Parameters
     ----------
@@ -148,7 +148,7 @@ def decode(
     BoundError
         The message has more parts than `items` allows.
     LogError
-        Where the schema or encoding is not known here, or the bytes are not a message of it.
+        The schema or encoding is not known here, or the bytes are not a message of it.
     """
     items = items or Items(_ITEMS_OF_ONE)
     if name in ROS2_PAYLOADS:
@@ -174,11 +174,11 @@ def _parse(proto_class: type[Proto], data: bytes, encoding: str, items: Items) -
 
 
 def _read_json(data: bytes) -> Any:
-    """An object of JSON, whose texts can all be stored."""
+    """Parse a JSON object; all its texts must be valid UTF-8."""
     value = json.loads(data)
     if not isinstance(value, dict):
         raise ValueError("it is no object")
-    if b"\\ud" in data.lower():  # half a character; protobuf's own reader fails on it
+    if b"\\ud" in data.lower():  # half of a surrogate pair; protobuf's own reader fails on it
         json.dumps(value, ensure_ascii=False).encode()
     return _plain_times(value)
 

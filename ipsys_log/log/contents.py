@@ -18,8 +18,8 @@ class Contents:
     """Schemas and channels by id, chunks, and the counts that go into the Statistics record.
 
     `loose` holds the messages that lie in no chunk: per channel id (log time in ns, file offset).
-    `data_end` is where the data end, `data_crc` their CRC (0: not computed). The DataEnd record lies there,
-    unless an append was `cut_short`.
+    `data_end` is the offset of the end of the data, `data_crc` their CRC (0: not computed). The DataEnd
+    record lies there, unless an append was interrupted (`cut_short`).
     """
 
     schemas: dict[int, mcap.Schema] = field(default_factory=dict)
@@ -38,7 +38,7 @@ class Contents:
     cut_short: bool = False
 
     def copy(self) -> "Contents":
-        """Return one that does not change when this one grows."""
+        """Return a copy that does not change when this one grows."""
         fields = ("schemas", "channels", "chunks", "attachments", "metadata", "counts", "loose")
         return replace(self, **{name: copy(getattr(self, name)) for name in fields})
 

@@ -1,13 +1,12 @@
-"""The bytes that a repair takes out of a log, kept beside it, and the state of an unfinished repair.
+"""Storage of the bytes that a repair takes out of a log, and the state of an unfinished repair.
 
 ``<log>.damaged`` is an MCAP file. Its attachments are the bytes that were overwritten or cut off, each named
-after its place in the damaged log: put back there, they make the damaged log again. Its metadata record
-says what was written instead. Until the repair is complete the file is called ``<log>.damaged.partial``:
+after its byte range in the damaged log. Written back there, they restore the damaged log. Its metadata record
+lists the new bytes. Until the repair is complete the file is called ``<log>.damaged.partial``:
 
-- while it is written, and up to the instant at which the new end of the log is in place (the journal is
-  gone), the old log counts;
-- after that the new one counts. The bytes before its end are overwritten only then; the next repair completes
-  this if it was cut short.
+- the old log is valid until the new end of the log is in place (the journal is gone);
+- after that the new log is valid. Only then the bytes before its end are overwritten; the next repair
+  completes this if it was interrupted.
 """
 
 import os
@@ -43,10 +42,10 @@ _SMALL = 64 << 10  # bytes: for heads and summaries
 
 @dataclass(frozen=True, slots=True)
 class Change:
-    """The changes of a repair: overwrite `patches`, and put a new end in place of the old one.
+    """The changes of a repair: overwrite `patches`, and replace the end of the log.
 
     The new end begins at `start`. `new_size` is the size of the log afterwards, `crc` the CRC-32 of its new
-    end. `own_end` is where the damaged log ends: what lies behind that is not its own.
+    end. `own_end` is the end of the damaged log: bytes after it belong to something else.
     """
 
     patches: Sequence[Patch]
@@ -58,7 +57,7 @@ class Change:
 
     @property
     def old_pieces(self) -> list[tuple[int, int]]:
-        """Offset and end of the old bytes that the repair takes out."""
+        """Offset and end of each range of old bytes that the repair takes out."""
         pieces = [(offset, offset + len(new)) for offset, new in self.patches]
         pieces += [(self.start, self.own_end), (self.own_end, self.old_size)]
         return [(start, end) for start, end in pieces if end > start]
@@ -78,7 +77,7 @@ def check_room(path: Path, change: Change) -> None:
     free = shutil.disk_usage(_beside(path, "").parent).free
     if free < needed:
         raise LogError(
-            f"{path} cannot be repaired: {format_bytes(old)} that are taken out of it are kept beside it. "
+            f"{path} cannot be repaired: a file beside it must keep the {format_bytes(old)} taken out. "
             f"That needs {format_bytes(needed)}, but {format_bytes(free)} are free: free some space"
         )
 
@@ -111,7 +110,7 @@ def discard(storage: Storage, path: Path, fd: int) -> None:
 
 
 def overwrite(storage: Storage, path: Path, fd: int, patches: Sequence[Patch]) -> Path:
-    """Overwrite the damaged stretches of a log whose new end is in place; returns ``<log>.damaged``."""
+    """Overwrite the damaged ranges of a log after its new end is in place; return ``<log>.damaged``."""
     for offset, new in patches:
         write_all(storage, fd, new, offset)
     if patches:
@@ -126,9 +125,9 @@ def overwrite(storage: Storage, path: Path, fd: int, patches: Sequence[Patch]) -
 
 
 def resume(storage: Storage, path: Path, fd: int) -> Path | None:
-    """Complete a repair whose new end is in place, forget one that did not come so far.
+    """Complete a repair if its new end is in place, else discard it.
 
-    Returns ``<log>.damaged`` if there was one to complete. The caller holds the exclusive lock.
+    Returns ``<log>.damaged`` if a repair was completed. The caller holds the exclusive lock.
     """
     partial = _beside(path, ".damaged.partial")
     if not partial.exists():
@@ -149,7 +148,7 @@ def _committed_patches(partial: Path, path: Path, fd: int) -> list[Patch] | None
             for key, value in values.items()
             if key.startswith("bytes ")
         ]
-    except (LogError, KeyError, ValueError):  # it is not whole: then the log was not touched
+    except (LogError, KeyError, ValueError):  # it is incomplete: then the log was not changed
         return None
     size = os.fstat(fd).st_size
     log = View(path, fd, size, size)
@@ -216,6 +215,6 @@ def _attachment(view: View, name: str, start: int, end: int, time_ns: int) -> It
 
 
 def _beside(path: Path, suffix: str) -> Path:
-    """Return the path of a file beside the log itself, by whichever link the log is opened."""
+    """Return the path of a file beside the log itself, also if the log is opened through a link."""
     real = Path(os.path.realpath(path)) if path.is_symlink() else path
     return real.with_name(real.name + suffix)

@@ -1,4 +1,4 @@
-"""Schemas and channels of a data section, in file order, and the substitutes of those that were lost."""
+"""Schemas and channels of a data section, in file order, with substitutes for lost ones."""
 
 from collections.abc import Iterator, Mapping, Sequence
 from contextlib import suppress
@@ -21,21 +21,21 @@ __all__ = ["Definitions", "placeholder"]
 
 _MOST_MISREAD = 100
 _MOST_ROOMS = 50  # stretches that are tried
-_LARGEST = 1 << 28  # bytes: what one definition may make us allocate
+_LARGEST = 1 << 28  # bytes: limit of the memory for one definition
 
 
 def placeholder(channel_id: int) -> mcap.Channel:
-    """Return a channel for messages whose own is lost; its record is no longer than any that it replaces."""
+    """Return a substitute for a lost channel; its record is no longer than any that it replaces."""
     return mcap.Channel(channel_id, f"/lost/{channel_id}", "", {}, 0)
 
 
 @dataclass(slots=True)
 class Definitions:
-    """The definitions up to here, by id.
+    """The definitions up to the present offset, by id.
 
-    `known` is what the summary says, or a damaged chunk: it serves where the data section lacks something.
-    If the summary is checked by its CRC, a record that contradicts it is damaged. `rooms` are the damaged
-    stretches so far: what is lost is put back there.
+    `known` holds definitions of the summary or of damaged chunks; they replace those missing in the data
+    section. If the CRC of the summary is right, a record that contradicts it is damaged. `rooms` are the
+    damaged stretches so far: lost definitions are written there.
     """
 
     summary: Summary | None
@@ -43,18 +43,18 @@ class Definitions:
     schemas: dict[int, mcap.Schema] = field(default_factory=dict)
     channels: dict[int, mcap.Channel] = field(default_factory=dict)
     known: Inside = field(default_factory=Inside)
-    _schema_at: dict[int, int] = field(default_factory=dict)  # where each schema is defined
+    _schema_at: dict[int, int] = field(default_factory=dict)  # offset of the definition of each schema
     _sure: Contents | None = None
     _checked: set[tuple[bool, int]] = field(default_factory=set)  # schemas and channels by the CRC of a chunk
     _places: dict[tuple[bool, int], RecordAt] = field(
         default_factory=dict
     )  # schemas and channels in no chunk
-    _full: int = 0  # so many of the first rooms are full
+    _full: int = 0  # number of the first rooms that are full
     _misread: list[mcap.Channel] = field(default_factory=list)
     _unused: dict[int, RecordAt] = field(default_factory=dict)  # records of channels without messages so far
-    _doubtful: set[tuple[bool, int]] = field(default_factory=set)  # schemas and channels read behind damage
+    _doubtful: set[tuple[bool, int]] = field(default_factory=set)  # schemas and channels read after damage
     _strange: set[int] = field(default_factory=set)  # offsets of chunks that contradict
-    _lost: set[int] = field(default_factory=set)  # channels of messages, for which there was no room
+    _lost: set[int] = field(default_factory=set)  # channels of messages for which no room was left
 
     def __post_init__(self) -> None:
         if self.summary is not None:
@@ -65,7 +65,7 @@ class Definitions:
                 self._sure = contents
 
     def take(self, view: View, at: RecordAt, *, doubtful: bool = False) -> None:
-        """Take in a Schema or Channel record that lies in no chunk; `doubtful` where damage is near.
+        """Add a Schema or Channel record outside of chunks; `doubtful` if damage is near.
 
         Raises
         ------
@@ -113,16 +113,16 @@ class Definitions:
         doubtful: bool = False,
         alone: bool = False,
     ) -> None:
-        """Take in what a chunk defines, and see that all its messages have a channel.
+        """Add the definitions of a chunk, and check that all its messages have a channel.
 
-        A chunk that is `checked` by its CRC is believed more than definitions in no chunk. Only near damage
-        (`doubtful`) it may be a piece of another log: then it must agree with those before the damage that
-        had messages, and with all of them if damage follows it too (`alone`).
+        A chunk that is `checked` by its CRC takes precedence over definitions outside of chunks. Near damage
+        (`doubtful`) it may be a piece of another log. Then it must agree with the definitions before the
+        damage that had messages, and with all of them if damage follows it too (`alone`).
 
         Raises
         ------
         LogError
-            A definition is lost and cannot be put back.
+            A definition is lost and cannot be restored.
         """
         records: list[mcap.Schema | mcap.Channel] = [*inside.schemas.values(), *inside.channels.values()]
         for record in records:
@@ -144,14 +144,14 @@ class Definitions:
         self.channels |= {key: value for key, value in inside.channels.items() if key not in self.channels}
 
     def need(self, view: View, offset: int, channel_id: int) -> None:
-        """See that the channel of a message at `offset` is defined: by what is known, or by a placeholder.
+        """Ensure that the channel of a message at `offset` is defined, if necessary by a placeholder.
 
         Raises
         ------
         LogError
             No stretch before `offset` has room for the definition.
         BoundError
-            The log has more channels than one of its size may have.
+            The log has more channels than its file size allows.
         """
         self._unused.pop(channel_id, None)
         if channel_id in self.channels:
@@ -165,7 +165,7 @@ class Definitions:
         self.channels[channel_id] = channel
 
     def topic(self, channel_id: int) -> str:
-        """Return the topic of a channel, its id where that is not known."""
+        """Return the topic of a channel, or its id if the topic is not known."""
         channel = self.channels.get(channel_id) or self.known.channels.get(channel_id)
         return channel.topic if channel else f"channel {channel_id}"
 
@@ -182,14 +182,14 @@ class Definitions:
             yield channel
 
     def complete(self) -> None:
-        """Take over what the summary defines and no message has needed."""
+        """Add the definitions of the summary that no message has needed."""
         for channel in self._sure.channels.values() if self._sure else ():
             self.channels.setdefault(channel.id, channel)
         for schema in self._sure.schemas.values() if self._sure else ():
             self.schemas.setdefault(schema.id, schema)
 
     def _confirm(self, records: Sequence[mcap.Schema | mcap.Channel]) -> None:
-        """Let definitions with a right CRC replace those that have none, and blank the records of these."""
+        """Replace definitions without CRC by those with a right CRC, and blank the records of the former."""
         for record in records:
             key = (isinstance(record, mcap.Schema), record.id)
             mine: dict[int, Any] = self.schemas if key[0] else self.channels
@@ -207,7 +207,7 @@ class Definitions:
             self.rooms.append(Stretch(at.offset, at.length))
 
     def is_stranger(self, offset: int, inside: Inside) -> bool:
-        """Return whether a chunk with a right CRC defines something else under an id of this log."""
+        """Return whether a chunk with a right CRC defines an id of this log differently."""
         if offset in self._strange:
             return True
         records: list[mcap.Schema | mcap.Channel] = [*inside.schemas.values(), *inside.channels.values()]
@@ -221,7 +221,7 @@ class Definitions:
         doubtful: bool = False,
         alone: bool = False,
     ) -> bool:
-        """Compare a definition with others; one that is `checked` by a CRC yields only to such ones.
+        """Return whether others contradict a definition; a `checked` one yields only to `checked` ones.
 
         See `take_chunk` for those near damage.
         """
@@ -246,14 +246,14 @@ class Definitions:
         return record_id in used
 
     def _has_schema(self, channel: mcap.Channel) -> bool:
-        """Return whether the schema of a channel is defined before it, or can be put back."""
+        """Return whether the schema of a channel is defined before it, or can be restored."""
         key = channel.schema_id
         if key == 0 or key in self.schemas:
             return True
         known = self.known.schemas.get(key)
         schema = known or _empty_schema(key)
         room = self._room_for(as_bytes(schema), 0)
-        if room is None:  # both are put back later, where there is room for both
+        if room is None:  # both are restored later, in a stretch with room for both
             self.known.channels.setdefault(channel.id, channel if known else replace(channel, schema_id=0))
             return False
         self.schemas[key] = schema
@@ -261,7 +261,7 @@ class Definitions:
         return True
 
     def _put_back(self, channel: mcap.Channel) -> bool:
-        """Write a channel into a damaged stretch: behind its schema, or together with it."""
+        """Write a channel into a damaged stretch: after its schema, or together with it."""
         key, data = channel.schema_id, as_bytes(channel)
         if key == 0:
             return self._room_for(data, 0) is not None
@@ -284,10 +284,10 @@ class Definitions:
     def _by_one_bit(self, view: View, offset: int, channel_id: int) -> mcap.Channel | None:
         """Return the channel whose record differs in one bit of its id, and has no messages.
 
-        If it has messages behind the one at `offset`, the id in that message is the one that is wrong.
+        If it has messages after the one at `offset`, the id in that message is wrong.
         """
         records = [record for record in self._misread if (record.id ^ channel_id).bit_count() == 1]
-        if not self.rooms:  # its record looks whole, but no message is of the channel that it defines
+        if not self.rooms:  # its record looks whole, but its channel has no messages
             near = [key for key in self._unused if (key ^ channel_id).bit_count() == 1]
             unused = [key for key in near if not _has_message(view, offset, key)]
             records = [self.channels[key] for key in unused]
@@ -299,7 +299,7 @@ class Definitions:
 
 
 def _has_message(view: View, start: int, channel_id: int) -> bool:
-    """Return whether a message of a channel lies in no chunk from `start` on, up to damage."""
+    """Return whether a message of a channel lies outside of chunks, from `start` up to the next damage."""
     with suppress(LogError):
         for at in walk(view, start, view.size):
             is_message = at.opcode == Opcode.MESSAGE and at.length >= MESSAGE.size

@@ -31,7 +31,7 @@ def fill_proto(payload_type: type, proto: Any, payload: Any) -> None:
 
 
 def read_proto(payload_type: type, proto: Any, items: Items) -> Any:
-    """The payload in a protobuf message; its parts are taken from `items`."""
+    """Decode the payload in a protobuf message; its parts are counted in `items`."""
     return payload_type(*(read(proto, items) for _, _, read in fields_of(payload_type)))
 
 
@@ -43,7 +43,7 @@ def fields_of(payload_type: type) -> tuple[tuple[str, Fill, Read], ...]:
 
 
 def _converters(name: str, hint: Any) -> tuple[Fill, Read]:
-    """How a field is put into a protobuf message, and taken out of one."""
+    """Conversion of a field into a protobuf message and back."""
     if get_origin(hint) in (Union, types.UnionType):
         inner = next(h for h in get_args(hint) if h is not type(None))
         fill, read = _converters(name, inner)

@@ -19,8 +19,8 @@ __all__ = ["Indexed", "Lost", "Survey"]
 class Lost:
     """Messages that are known to be gone, by topic: their log times in ns.
 
-    `uncounted` is the number of stretches of which nothing says how many messages they held, `bytes` how
-    many bytes cannot be read.
+    `uncounted` is the number of stretches with an unknown number of messages, `bytes` the number of
+    unreadable bytes.
     """
 
     times_ns: dict[str, list[int]] = field(default_factory=dict)
@@ -52,7 +52,7 @@ class Survey:
     """The whole records up to `end`, except the stretches in `damaged`.
 
     `cut` is the unreadable end of a log without DataEnd; `finished` says that this record lies at `end`.
-    `saved` takes the messages that can be read of damaged chunks. `faults` is what was found wrong.
+    `saved` takes the readable messages of damaged chunks. `faults` lists the faults in words.
     `unindexed` holds the entries of the last chunk if its message indexes are missing or cut off.
     """
 
@@ -65,7 +65,7 @@ class Survey:
     counts: dict[int, dict[int, int]] = field(default_factory=dict)
     hashes: dict[str, ChannelHash] = field(default_factory=dict)
     damaged: list[Stretch] = field(default_factory=list)
-    homeless: list[RecordAt] = field(default_factory=list)  # messages that cannot stay where they are
+    homeless: list[RecordAt] = field(default_factory=list)  # messages that cannot stay at their offset
     wrong_heads: list[tuple[int, bytes]] = field(default_factory=list)  # what chunks say of their times
     cut: Stretch | None = None
     lost: Lost = field(default_factory=Lost)
@@ -77,7 +77,7 @@ class Survey:
     has_crc: bool = False  # of the data section
     finished: bool = False
     crc_at: int = 0
-    wrong_length: int = -1  # a record whose length cannot be right
+    wrong_length: int = -1  # a record with an impossible length
     has_crcs: bool = False  # of the chunks so far
-    doubtful_to: int = 0  # behind damage, lengths that nothing confirms are looked at closely
+    doubtful_to: int = 0  # after damage, unconfirmed lengths are checked closely
     indexed: Indexed | None = None

@@ -2,12 +2,12 @@
 
 Two things protect the old log meanwhile:
 
-- A *standing* tail: a copy of the old table of contents beyond the new end of the file. Programs that read
-  a log from its end, and know nothing of journals, find the old log by it until the file is cut to its new
+- A *standing* tail: a copy of the old summary after the new end of the file. Other programs read a log from
+  its end, without the journal. They find the old log by this copy until the file is truncated to its new
   size.
-- The journal ``<path>.journal``: the old tail. While it is whole and the file has not got its new size, the
-  old log counts: readers take the tail from it, and the next holder of the exclusive lock puts the tail back.
-  A torn journal means that the file itself was not touched yet.
+- The journal ``<path>.journal``: the old tail. The old log is valid while the journal is whole and the file
+  does not have its new size. Readers take the tail from the journal, and the next holder of the exclusive
+  lock restores the tail. A torn journal means that the file itself was not changed yet.
 
 ``docs/decisions/append-order.md`` has the order of writes, and why.
 """
@@ -31,7 +31,7 @@ __all__ = ["Journal", "attach_journal", "journal_path", "read_journal", "replace
 _MAGIC = b"\x89IPSYSJ2"
 # Magic; sizes of the file: old, new, meanwhile; tail offset; bytes before the tail: count, CRC; tail length.
 _HEAD = struct.Struct("<8sQQQQIIQ")
-# The first format has no third size: by it the old log counts until the journal is gone.
+# The first format has no third size: the old log is valid until the journal is gone.
 _EARLIER_MAGIC = b"\x89IPSYSJ1"
 _EARLIER_HEAD = struct.Struct("<8sQQQIIQ")
 _CRC = struct.Struct("<I")
@@ -43,7 +43,7 @@ _logger = logging.getLogger(__name__)
 
 @dataclass(frozen=True, slots=True)
 class Journal:
-    """A whole journal that belongs to its file, which is not complete."""
+    """A whole journal of an incomplete file."""
 
     old_size: int
     tail_offset: int
@@ -75,9 +75,9 @@ def _crc(fd: int, offset: int, length: int) -> int | None:
 
 
 def read_journal(fd: int, journal_fd: int) -> Journal | None:
-    """Return the journal in `journal_fd` if the old log in `fd` counts by it.
+    """Return the journal in `journal_fd` if it makes the old log in `fd` valid.
 
-    None where it is torn, where it belongs to another file, and where the new log is complete.
+    None if it is torn, if it belongs to another file, or if the new log is complete.
     """
     start = os.pread(journal_fd, _HEAD.size, 0)
     earlier = start.startswith(_EARLIER_MAGIC)
@@ -95,13 +95,13 @@ def read_journal(fd: int, journal_fd: int) -> Journal | None:
         and _crc(fd, tail_offset - before, before) == before_crc
         and not _went_on(fd, (old_size, *sizes))
     )
-    # The file gets its new size last, when all else is on the disk.
+    # The file gets its new size last, after all other data are on the disk.
     complete = not earlier and os.fstat(fd).st_size == sizes[0]
     return Journal(old_size, tail_offset, head.size) if whole and not complete else None
 
 
 def _went_on(fd: int, sizes: tuple[int, ...]) -> bool:
-    """Whether the file is a finished log of none of the sizes: repaired and extended under another name."""
+    """Return whether the file is a finished log of another size: repaired and extended under another name."""
     size = os.fstat(fd).st_size
     return size not in sizes and os.pread(fd, len(MAGIC), max(0, size - len(MAGIC))) == MAGIC
 
@@ -132,17 +132,17 @@ def replace_tail(
     pieces: Sequence[bytes],
     standing: Callable[[int], bytes] = lambda at: b"\0",
 ) -> None:
-    """Replace everything from `offset` on by `pieces`, crash-safe. The caller holds the exclusive lock.
+    """Replace all bytes from `offset` on by `pieces`, crash-safe. The caller holds the exclusive lock.
 
     Parameters
     ----------
-    standing : makes the bytes that stand meanwhile at an offset beyond the old and the new end: a copy of the
-        old tail, by which other programs find the old log. Without one they find none.
+    standing : makes the bytes for an offset after the old and the new end: a copy of the old tail. Other
+        programs need it to find the old log meanwhile.
 
     Raises
     ------
     OSError
-        Before the new tail is on the disk; `roll_back` then tells which log stands.
+        A write failed before the new tail is on the disk; `roll_back` then tells which log is valid.
     """
     new_size = offset + sum(map(len, pieces))
     beyond = max(os.fstat(fd).st_size, new_size)
@@ -158,7 +158,7 @@ def replace_tail(
     storage.fsync(fd)
     try:
         _drop(storage, path)
-    except OSError as error:  # from here on the new log counts, with a journal or without
+    except OSError as error:  # from here on the new log is valid, with a journal or without
         _logger.warning(
             "%s: the messages are in the log, but %s cannot be removed (%s)",
             path, journal_path(path).name, error.strerror,
@@ -166,7 +166,7 @@ def replace_tail(
 
 
 def roll_back(storage: Storage, path: Path, fd: int) -> bool:
-    """Undo an append that was cut short; the caller holds the exclusive lock.
+    """Undo an interrupted append; the caller holds the exclusive lock.
 
     Returns
     -------
@@ -175,7 +175,7 @@ def roll_back(storage: Storage, path: Path, fd: int) -> bool:
     Raises
     ------
     OSError
-        The journal stays, and with it the old log.
+        A write failed; the journal stays, and the old log remains valid.
     """
     journal_file = journal_path(path)
     try:
@@ -194,7 +194,7 @@ def roll_back(storage: Storage, path: Path, fd: int) -> bool:
 
 
 def _put_back(storage: Storage, fd: int, journal_fd: int, journal: Journal) -> None:
-    """Write the old tail while the standing one is still behind it, and only then cut that off."""
+    """Write the old tail while the standing tail is still after it, and only then truncate the file."""
     offset = journal.tail_offset
     for data in _blocks(journal_fd, journal.tail_base, journal.old_size - offset):
         write_all(storage, fd, data, offset)

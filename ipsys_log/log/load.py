@@ -30,7 +30,7 @@ class NoFooterError(LogError):
 
 
 class Summary(NamedTuple):
-    """The summary alone. `checked` says that its CRC is right (a summary may have none)."""
+    """The summary of a log. `checked` says that its CRC is right (a summary may have none)."""
 
     contents: Contents
     statistics: mcap.Statistics | None
@@ -38,7 +38,7 @@ class Summary(NamedTuple):
 
 
 def read_summary(view: View) -> Summary | None:
-    """Read the summary without a look at what stands before it; None if the log has none.
+    """Read only the summary; None if the log has none.
 
     Raises
     ------
@@ -53,12 +53,12 @@ def read_summary(view: View) -> Summary | None:
 
 
 def load_contents(view: View) -> Contents:
-    """The table of contents of a finished log.
+    """Read the table of contents of a finished log.
 
     Raises
     ------
     LogError
-        The file is empty, not an MCAP, or is damaged; a `NoFooterError` where its end is missing.
+        The file is empty, no MCAP file, or damaged; a `NoFooterError` if its end is missing.
     """
     _check_start(view)
     footer_at, summary_start, _ = _footer(view)
@@ -93,7 +93,7 @@ def _check_start(view: View) -> None:
 
 
 def _footer(view: View) -> tuple[int, int, bool]:
-    """Offset of the Footer record, offset of the summary (0: none), and whether a CRC confirms both."""
+    """Return the offsets of the footer and the summary (0: none), and whether a CRC confirms both."""
     path = view.path
     at = view.size - len(MAGIC) - FOOTER.size
     tail = view.read(at, view.size - at) if at >= len(MAGIC) else b""
@@ -113,7 +113,7 @@ def _footer(view: View) -> tuple[int, int, bool]:
 
 
 def _from_summary(view: View, start: int, end: int) -> tuple[Contents, mcap.Statistics | None]:
-    """What the summary says, and its Statistics record, without which it is not complete."""
+    """Parse the summary, and its Statistics record, without which it is not complete."""
     contents = Contents()
     statistics: mcap.Statistics | None = None
     data = view.read(start, end - start)

@@ -21,7 +21,7 @@ def open_locked(storage: Storage, path: Path, flags: int) -> int:
     ------
     LogError
         The file cannot be opened, another process is writing it, or its file system has no locks. A file that
-        this made is removed then.
+        this call created is removed.
     """
     try:
         fd = storage.open(path, flags)
@@ -57,12 +57,12 @@ def _without_locks(path: Path, error: OSError) -> str:
 
 
 def check_locks(folder: Path) -> None:
-    """See that files in a folder can be locked, before there is work that would be lost.
+    """Check that files in a folder can be locked, before any work is done.
 
     Raises
     ------
     LogError
-        Where they cannot. A folder that takes no files at all is not judged.
+        They cannot be locked. A folder that is not writable is not checked.
     """
     with suppress(OSError), tempfile.TemporaryFile(dir=folder) as file:
         try:
@@ -74,8 +74,8 @@ def check_locks(folder: Path) -> None:
 def is_being_written(path: Path) -> bool:
     """Return whether another process holds the lock.
 
-    This takes the lock itself for an instant, and a writer that begins in it is refused. So it is asked
-    only of logs without an end, to which nobody can append, and of those that have a journal.
+    The check takes the lock for an instant, and refuses a writer that starts then. So call it only for logs
+    without an end, to which no program can append, and for logs with a journal.
     """
     fd = open_for_reading(path)
     try:
@@ -90,7 +90,7 @@ def is_being_written(path: Path) -> bool:
 
 
 def check_free(path: Path) -> None:
-    """Refuse a path for a new log if something lies there, or a journal of a log that is gone."""
+    """Refuse a path for a new log if a file exists there, or a journal of a deleted log."""
     try:
         taken, orphan = os.path.lexists(path), journal_path(path).exists()
     except OSError as error:
@@ -108,9 +108,9 @@ def _why_taken(path: Path) -> str:
 
 
 def dangling(path: Path) -> str | None:
-    """Return what is wrong with a path that is a link to nothing; None for any other.
+    """Return an error text for a path that is a broken link; None for any other path.
 
-    It does not exist, and yet nothing can be made there.
+    Such a path does not exist, but no file can be created there.
     """
     if not path.is_symlink() or path.exists():
         return None

@@ -1,4 +1,4 @@
-"""Where a writer's bytes go: into a file that grows, or into memory until an append is complete."""
+"""Destinations of a writer's bytes: a growing file, or memory until an append is complete."""
 
 import logging
 import os
@@ -74,11 +74,15 @@ class Growing:
                 self.path, self.target = self.target, None
             self.storage.fsync_directory(self.path.parent)
         except OSError as error:
-            then = "nothing was written" if self.target is not None else "it is complete, but maybe not safe"
+            then = (
+                "nothing was written"
+                if self.target is not None
+                else "it is complete, but perhaps not on the disk"
+            )
             raise cannot_write(self.target or self.path, error, f"{then}: {disk_advice(error)}") from None
 
     def sync(self) -> None:
-        """Wait until what was written is on the disk. Any thread may call it while another one writes."""
+        """Wait until the written bytes are on the disk. Any thread may call it while another one writes."""
         self.storage.fsync(self.fd)
 
     def abandon(self) -> None:
@@ -123,29 +127,29 @@ class Pending:
             raise
 
     def _settle(self, error: OSError, tail: bytes) -> None:
-        """Say which log stands after a fault of the disk, the old one if possible.
+        """Roll back after a disk fault if possible, and report which log is valid.
 
         Raises
         ------
         WriteError
-            Unless the new one stands.
+            The new log is not valid.
         """
-        with suppress(OSError):  # else whoever next writes does it
+        with suppress(OSError):  # else the next writer does it
             roll_back(self.storage, self.path, self.fd)
         size = os.fstat(self.fd).st_size
         if size == self.offset + len(tail) and os.pread(self.fd, len(tail), self.offset) == tail:
-            # The file gets its size last: all was written, and only that it is safe was not confirmed.
+            # The file gets its size last: all bytes were written, but the sync was not confirmed.
             _logger.warning(
-                "%s: the messages are in the log, but the disk did not confirm it (%s): copy it to another",
+                "%s: the messages are in the log, but the disk did not confirm it (%s): copy it elsewhere",
                 self.path, error.strerror,
             )  # fmt: skip
             return
         if size == self.size:
-            then = f"the log stays as it was: {disk_advice(error)}"
+            then = f"the log is unchanged: {disk_advice(error)}"
         else:
             then = (
-                f"nothing that was recorded is lost, and ipsys reads the log as it was, by "
-                f"{self.path.name}.journal beside it; {disk_advice(error)}, and run: ipsys repair {self.path}"
+                f"no recorded data are lost, and ipsys can read the old log with {self.path.name}.journal "
+                f"beside it; {disk_advice(error)}, and run: ipsys repair {self.path}"
             )
         raise cannot_write(self.path, error, then) from None
 
@@ -161,6 +165,6 @@ def _extend(so_far: int, data: Buffer, crc: int | None) -> int:
 
 
 def cannot_write(path: Path, error: OSError, then: str) -> WriteError:
-    """Return the error of a disk that refused, with what follows from that."""
+    """Return the error for a failed write; `then` says what follows from it."""
     text = f"{path} cannot be written ({error.strerror or os.strerror(error.errno or 0)}): {then}"
     return WriteError(text, error)

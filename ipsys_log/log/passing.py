@@ -13,16 +13,16 @@ from ipsys_log.log.stretch import Stretch
 __all__ = ["COUNTED", "LOOSE", "add_damage", "close_indexes", "pass_over"]
 
 LOOSE = frozenset((Opcode.SCHEMA, Opcode.CHANNEL, Opcode.MESSAGE, Opcode.ATTACHMENT, Opcode.METADATA))
-# If such a record is damaged, it is known how many messages are lost with it: none, or one.
+# If such a record is damaged, the number of lost messages is known: none, or one.
 COUNTED = LOOSE | {Opcode.MESSAGE_INDEX, Opcode.DATA_END}
 _DOUBTFUL = 4096  # bytes
 
 
 def pass_over(found: Survey, position: int, at: RecordAt | None, reason: str) -> int:
-    """Find the next record behind damage at `position`; return its offset."""
+    """Find the next record after damage at `position`; return its offset."""
     claimed = at.offset + at.length if at is not None and found.wrong_length != position else 0
     indexed = found.indexed
-    # A gap that is too small for a record of its own becomes a part of the damage before it.
+    # A gap that is too small for a separate record becomes a part of the damage before it.
     behind_indexes = indexed is not None and indexed.inside is not None and position > indexed.start
     joins = behind_indexes or bool(found.damaged and found.damaged[-1].end == position)
     follower = found.resync.find(position, claimed, gap=1 if joins else HEADER.size)
@@ -52,7 +52,7 @@ def add_damage(found: Survey, stretch: Stretch, reason: str) -> int:
     if found.indexed is not None:
         found.indexed.stretch = replace(stretch)
     last = found.damaged[-1] if found.damaged else None
-    if last is not None and last.end == stretch.offset:  # one place for what was defined in both
+    if last is not None and last.end == stretch.offset:  # one stretch for the definitions of both
         last.length += stretch.length
     else:
         found.damaged.append(stretch)
@@ -62,7 +62,7 @@ def add_damage(found: Survey, stretch: Stretch, reason: str) -> int:
 
 
 def _end_at_damage(found: Survey, position: int, reason: str) -> int:
-    """End the survey at damage without records behind it, perhaps a chunk that was being written."""
+    """End the survey at damage without later records, perhaps in an unfinished chunk."""
     found.faults.append(reason)
     found.end = position
     found.cut = Stretch(position, found.view.size - position)
@@ -93,7 +93,7 @@ def _save(found: Survey, stretch: Stretch, rows: Rows) -> None:
 
 
 def close_indexes(found: Survey, stop: int) -> None:
-    """Check the message indexes of a chunk, or of a damaged stretch, when all of them were seen."""
+    """Check the message indexes of a chunk, or of a damaged stretch, after all of them are read."""
     indexed, found.indexed = found.indexed, None
     assert indexed is not None
     if indexed.stretch is not None:
@@ -109,7 +109,7 @@ def _close_chunk(found: Survey, indexed: Indexed, inside: Inside, stop: int) -> 
             index_length=stop - indexed.start, index_offsets=indexed.offsets
         )
         return
-    if stop == found.view.size:  # and so the log has no end: they are written anew with it
+    if stop == found.view.size:  # and the log has no end: they are written again with it
         found.end = indexed.start
         found.cut = Stretch(found.end, stop - found.end)
         found.unindexed = inside

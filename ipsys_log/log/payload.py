@@ -73,10 +73,10 @@ class _Messages:
     runs: list[Run]
     fetch: Callable[[int, int], bytes]
     read: Callable[[int, int], bytes]
-    spare: int  # bytes that the messages still to come may take together: more, and they overlap
+    spare: int  # bytes that the remaining messages may have together: if there are more, messages overlap
 
     def between(self, first: int, stop: int) -> Iterator[RawMessage]:
-        """The messages of rows `first` to `stop`; what a record says must agree with the index."""
+        """Yield the messages of rows `first` to `stop`; each record must agree with the index."""
         # Where small messages are read, the time is spent here: no call to Python for most of them.
         unpack, topic_of = MESSAGE.unpack_from, self.topics.get
         data, low, size, fetched = b"", 0, 0, None

@@ -111,16 +111,16 @@ class LogReader:
 
     @property
     def allowance(self) -> Allowance:
-        """How much work the log may cause."""
+        """The limits of the work to read the log."""
         return self._view.allowance
 
     def check_number(self, number: int, what: str) -> None:
-        """Refuse a log with more runs or measurements than a file of its size may have."""
+        """Refuse a log with more runs or measurements than its file size allows."""
         self._view.check_number(number, what)
 
     @property
     def data_end(self) -> int:
-        """Where the data section ends: an append changes nothing before this byte."""
+        """The end of the data section: an append changes nothing before this byte."""
         return self._contents.data_end
 
     def messages(
@@ -164,7 +164,7 @@ class LogReader:
         return in_log_order(pending, lambda at: view.fault(at, "a message is older than its chunk says"))
 
     def times(self, topic: str) -> NDArray[np.int64]:
-        """Log times of a topic in ns, sorted, shape (N,); read from the indexes alone."""
+        """Return the log times of a topic in ns, sorted, shape (N,); read from the indexes alone."""
         wanted = set(self._topics_by_id([topic]))
         parts = [rows for key, rows in as_rows(self._contents.loose).items() if key in wanted]
         for chunk in self._contents.chunks:
@@ -217,7 +217,7 @@ def stored_hashes(view: View, contents: Contents) -> dict[str, ChannelHash]:
 
 
 def _open(path: Path) -> tuple[View, Contents]:
-    """Open a consistent state: the old log while a journal holds, else a file that stood still meanwhile."""
+    """Open a consistent state: the old log while its journal is valid, else an unchanging file."""
     fault: LogError | None = None
     for _ in range(_ATTEMPTS):
         fd = open_for_reading(path)
@@ -235,7 +235,7 @@ def _open(path: Path) -> tuple[View, Contents]:
         if fault is None and (held or _stood_still(view, before)):
             if (held or contents.cut_short) and not is_being_written(path):
                 _logger.warning(
-                    "%s: an append to it was cut short; it is read as it was before. Mend it with: "
+                    "%s: an append to it was interrupted; ipsys reads the old log. Repair it with: "
                     "ipsys repair %s",
                     path, path,
                 )  # fmt: skip

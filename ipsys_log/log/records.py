@@ -58,7 +58,7 @@ R = TypeVar("R")
 
 
 class RecordAt(NamedTuple):
-    """Where a record lies: `offset` of its opcode, `length` with its 9 bytes of head."""
+    """The position of a record: `offset` of its opcode, `length` with its 9 bytes of head."""
 
     opcode: int
     offset: int
@@ -66,7 +66,7 @@ class RecordAt(NamedTuple):
 
 
 class ChunkRef(NamedTuple):
-    """What a ChunkIndex record says. `index_offsets` maps channel ids to their MessageIndex records."""
+    """The contents of a ChunkIndex record. `index_offsets` maps channel ids to their MessageIndex records."""
 
     offset: int
     length: int
@@ -140,9 +140,9 @@ _READERS: dict[int, Callable[[ReadDataStream], mcap.McapRecord]] = {
 
 
 def exact(view: View, at: RecordAt, data: bytes) -> mcap.McapRecord:
-    """Parse the record `data`, which is of none of the types that hold messages; its lengths must be right.
+    """Parse the record `data`, of any type without messages; its lengths must be right.
 
-    What follows the fields that are known is left to later versions of the format.
+    Bytes after the known fields are ignored: later versions of the format may add fields.
     """
     if at.opcode not in _READERS:
         raise view.fault(at.offset, f"a record of {_name(at.opcode)} has no place there")

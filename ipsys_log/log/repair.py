@@ -33,19 +33,19 @@ from ipsys_log.log.view import View
 __all__ = ["RepairReport", "repair"]
 
 _BLOCK = 1 << 20
-_IN_MEMORY = 16 << 20  # bytes of saved messages; more than that lies in a file without a name
+_IN_MEMORY = 16 << 20  # bytes of saved messages in memory; more go to an unnamed file
 
 
 @dataclass(frozen=True, slots=True)
 class RepairReport:
     """The result of a repair.
 
-    ``lost`` has, by topic, the log times in ns of messages known to be gone, ``gone`` their numbers: these
-    may be known without the times. ``uncounted`` says that others may be gone, nobody knows how many.
-    ``unchecked`` messages were saved from damaged chunks, and no CRC says that they are right.
-    ``bytes_lost`` counts bytes of the data section that cannot be read; ``kept_in`` is the file that holds
-    all bytes that were taken out of the log. ``cut_off`` says that the log had no end: what its writer had
-    not handed over yet when the file was last written, at ``written_ns``, is gone and not known.
+    ``lost`` has, by topic, the log times in ns of messages known to be gone, ``gone`` their numbers: the
+    numbers may be known without the times. ``uncounted`` says that an unknown number of others may be gone.
+    ``unchecked`` messages were saved from damaged chunks, and no CRC confirms them. ``bytes_lost``
+    counts bytes of the data section that cannot be read; ``kept_in`` is the file that holds all bytes that
+    were taken out of the log. ``cut_off`` says that the log had no end: messages that its writer still held
+    at the last write, at ``written_ns``, are gone and unknown.
     """
 
     path: Path
@@ -64,13 +64,12 @@ class RepairReport:
 
 
 def repair(path: str | os.PathLike[str], *, storage: Storage = DISK) -> RepairReport:
-    """Restore what is whole in a log, in place, and say what was lost.
+    """Repair a log in place: keep all whole records, and report the lost messages.
 
-    An append that was cut short is rolled back. A log that is whole is left alone. Damaged stretches become
-    records that every reader skips; what they defined, and the message indexes that were in them, is
-    written there again where it is known. What can be read of a damaged chunk is saved in a new one. All
-    bytes that are overwritten or cut off are kept in ``<path>.damaged`` (``.damaged_2`` if there is one of
-    an earlier repair).
+    An interrupted append is rolled back. A whole log is not changed. Damaged stretches become records that
+    every reader skips. Their definitions and message indexes are written there again if they are known. The
+    readable messages of a damaged chunk are saved in a new one. All bytes that are overwritten or cut off are
+    kept in ``<path>.damaged`` (``.damaged_2`` if there is one of an earlier repair).
 
     The new log is read again before anything is changed: its indexes, its data section and its statistics
     must give the same number of messages, and a second repair must find nothing to do. A whole log is
@@ -79,16 +78,16 @@ def repair(path: str | os.PathLike[str], *, storage: Storage = DISK) -> RepairRe
     Raises
     ------
     LogError
-        The file is empty or not an MCAP, another process is writing it, the disk has no room, or it cannot
-        be made whole. It stays as it was.
+        The file is empty or no MCAP file, another process is writing it, the disk has no room, or the log
+        cannot be repaired. The file is not changed.
     """
     target = Path(path)
     fd = open_locked(storage, target, os.O_RDWR)
     try:
-        notes = ["an append that was cut short was rolled back"] if roll_back(storage, target, fd) else []
+        notes = ["an interrupted append was rolled back"] if roll_back(storage, target, fd) else []
         resumed = resume(storage, target, fd)
         if resumed is not None:
-            notes.append("a repair that was cut short was completed")
+            notes.append("an interrupted repair was completed")
         status = os.fstat(fd)
         view = View(target, fd, status.st_size, status.st_size)
         _check_not_empty(view)
@@ -97,7 +96,7 @@ def repair(path: str | os.PathLike[str], *, storage: Storage = DISK) -> RepairRe
             saved = Salvage(spool)
             found = survey(view, known, saved)
             if found.loose.entries and not found.crc_is_right and not found.damaged:
-                found = survey(view, known, saved, doubtful=True)  # something is wrong, and looks right
+                found = survey(view, known, saved, doubtful=True)  # damage that the survey does not see
             if found.end < len(MAGIC):
                 start = view.read(0, min(len(MAGIC), view.size))
                 raise LogError(
@@ -133,7 +132,7 @@ def _summary(view: View) -> Summary | None:
 
 
 class _Plan(NamedTuple):
-    """The new log: what is overwritten, what the new end holds, and how many messages it must have."""
+    """The new log: the patches, the new end, and the number of messages that it must have."""
 
     patches: list[Patch]
     tail: IO[bytes]
@@ -156,7 +155,7 @@ def _rebuild(
 
 
 def _plan(view: View, found: Survey, saved: Salvage, tail: IO[bytes]) -> _Plan:
-    """Work out the new log; nothing is changed yet."""
+    """Plan the new log; nothing is changed yet."""
     contents, start = found.contents, found.end
     patches = _patches(found)
     end = _End(tail, start, _crc_with(view, patches, start, found.crc))
@@ -183,7 +182,7 @@ def _plan(view: View, found: Survey, saved: Salvage, tail: IO[bytes]) -> _Plan:
 
 @dataclass(slots=True)
 class _End:
-    """The new end of a log while it is put together; `data_crc` is that of the data section so far."""
+    """The new end of a log while it is built; `data_crc` is the CRC of the data section so far."""
 
     file: IO[bytes]
     offset: int
@@ -197,7 +196,7 @@ class _End:
 
 
 def _emit_saved(end: _End, found: Survey, saved: Salvage) -> None:
-    """Write the saved messages behind the definitions of their channels."""
+    """Write the saved messages after the definitions of their channels."""
     saved.finish()
     for record in found.definitions.missing(set(saved.counts), saved.inside):
         end.emit(as_bytes(record))
@@ -214,7 +213,7 @@ def _emit_saved(end: _End, found: Survey, saved: Salvage) -> None:
 
 
 def _emit_homeless(end: _End, view: View, found: Survey) -> None:
-    """Write messages in no chunk that cannot stay in place, behind the definitions of their channels."""
+    """Write messages outside of chunks that cannot stay in place, after the definitions of their channels."""
     contents = found.contents
     heads = [MESSAGE.unpack(view.read(at.offset, MESSAGE.size)) for at in found.homeless]
     for record in found.definitions.missing({head[2] for head in heads}, found.definitions.known):
@@ -239,7 +238,7 @@ def _patches(found: Survey) -> list[Patch]:
 
 
 def _crc_with(view: View, patches: Sequence[Patch], end: int, crc: int) -> int:
-    """Return the CRC of the data section up to `end` after `patches`: it is linear in what differs."""
+    """Return the CRC of the data section up to `end` after `patches`: it is linear in the changed bytes."""
     for offset, new in patches:
         differs = zlib.crc32(view.read(offset, len(new))) ^ zlib.crc32(new)
         crc ^= combine(differs, 0, end - offset - len(new))
@@ -247,12 +246,12 @@ def _crc_with(view: View, patches: Sequence[Patch], end: int, crc: int) -> int:
 
 
 def _check(view: View, found: Survey, plan: _Plan) -> None:
-    """Read the new log before it is written: by its indexes, record by record, and by its statistics.
+    """Check the new log before it is written: by its indexes, record by record, and by its statistics.
 
     Raises
     ------
     LogError
-        They do not agree.
+        The numbers of messages do not agree.
     """
     size = found.end + plan.tail_size
     new = View(view.path, view.fd, size, found.end, plan.tail.fileno(), 0, patches=plan.patches)
@@ -264,7 +263,7 @@ def _check(view: View, found: Survey, plan: _Plan) -> None:
     if what:
         faults = "; ".join(found.faults[:3])
         raise LogError(
-            f"{view.path} cannot be made whole ({what}) and was left as it was. Keep a copy. Found: {faults}"
+            f"{view.path} cannot be repaired ({what}) and was not changed. Keep a copy. Found: {faults}"
         )
 
 
@@ -290,7 +289,7 @@ class _Blocks(Sequence[bytes]):
 
 
 def _commit(storage: Storage, view: View, change: Change, plan: _Plan) -> Path | None:
-    """Keep the old bytes, then write the new log; a crash at any instant leaves the one or the other."""
+    """Keep the old bytes, then write the new log; a crash at any instant leaves the old or the new log."""
     path, fd = view.path, view.fd
     check_room(path, change)
     kept = keep_old_bytes(storage, view, change, os.fstat(fd).st_mtime_ns)
@@ -305,7 +304,7 @@ def _commit(storage: Storage, view: View, change: Change, plan: _Plan) -> Path |
 
 
 def _own_end(view: View, found: Survey) -> int:
-    """Return the end of a finished log; bytes behind it are not its own."""
+    """Return the end of a finished log; bytes after it belong to something else."""
     if found.finished:
         with suppress(LogError):
             for at in walk(view, found.end, view.size):
@@ -320,9 +319,9 @@ def _report(
     contents = found.contents
     notes = [f"found: {fault}" for fault in found.faults]
     if found.finished and not found.crc_is_right and not found.damaged:
-        notes.append("found: the CRC of the data section is wrong; what is damaged in it is not known")
+        notes.append("found: the CRC of the data section is wrong; the damaged part is not known")
     if own_end < view.size:
-        notes.append(f"{view.size - own_end} bytes behind its end, perhaps another log, were cut off")
+        notes.append(f"{view.size - own_end} bytes after its end, perhaps another log, were cut off")
     gone, counted = _gone(found, known)
     # Without a CRC and a summary nothing tells whether whole records were taken out of it.
     is_unsure = found.finished and not (found.has_crc and found.crc_is_right)

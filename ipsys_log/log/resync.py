@@ -1,4 +1,4 @@
-"""Search for the next whole record behind damage, without trust in any length."""
+"""Search for the next whole record after damage, without trusting any length."""
 
 import re
 import struct
@@ -37,15 +37,15 @@ _LONGEST_HEAD = 1 << 16
 _NAME, _SIZE = struct.Struct("<I"), struct.Struct("<Q")
 _LONGEST_CHAIN = 256  # records
 _ENOUGH = 3  # messages and channels in a row, even if they do not belong together
-_RECENT = 8  # messages: one of them may have got another time by damage
+_RECENT = 8  # messages: damage may have changed the time of one of them
 _DAY_NS = 86_400 * 1_000_000_000
-_IN_VAIN = 64 << 20  # bytes that are looked at in vain however small the log is
-_STEP = 4096  # bytes: what a look at a small record costs
+_IN_VAIN = 64 << 20  # bytes that may be searched without result, however small the log is
+_STEP = 4096  # bytes: the cost of a check of a small record
 _CHUNK = rb"\x06.{36}(?:\x00{4}|\x04\x00{3}zstd|\x03\x00{3}lz4)"
 _CHUNK_HEAD = re.compile(_CHUNK, re.DOTALL)
 _MESSAGE = re.compile(rb"(?=\x05.{3}\x00{5})", re.DOTALL)
 _INDEX = re.compile(rb"(?=\x07.{3}\x00{5})", re.DOTALL)
-# A chunk by its compression, DataEnd with the record behind it, or another record of less than 16 MiB.
+# A chunk by its compression, DataEnd with the next record, or another record of less than 16 MiB.
 _CANDIDATE = re.compile(
     rb"(?=" + _CHUNK + rb"|\x0f\x04\x00{7}.{4}[\x02\x03\x04\x08\x0b]|[\x03\x04\x05\x07\x09\x0c].{3}\x00{5})",
     re.DOTALL,
@@ -68,10 +68,10 @@ _IN_SUMMARY = frozenset(
 class Resync:
     """A search for records in one log.
 
-    `chunked` says whether its messages lie in chunks (None: not known yet): then a message record that
-    lies elsewhere is a piece of a damaged chunk. `channels` are the ids that are defined, `times_ns` the
-    log times of the last messages in no chunk, `span_ns` that of all messages, where the summary says it.
-    `budget` bounds the bytes that are looked at in vain.
+    `chunked` says whether its messages lie in chunks (None: not known yet). If they do, a message record
+    elsewhere is a piece of a damaged chunk. `channels` are the defined ids, `times_ns` the log times of the
+    last messages outside of chunks, `span_ns` the time range of all messages, if the summary has it. `budget`
+    limits the bytes that are searched without result.
     """
 
     view: View
@@ -85,21 +85,22 @@ class Resync:
         self.budget = _IN_VAIN + 4 * self.view.size
 
     def find(self, damaged: int, claimed: int = 0, gap: int = HEADER.size) -> int | None:
-        """Return where the next whole record begins behind the damaged one, None if there is none.
+        """Return the offset of the next whole record after the damaged one, None if there is none.
 
-        `claimed` is where that one ends by its own length, if it has one; it takes at least `gap` bytes.
+        `claimed` is the end of the damaged record by its own length, if it has one; it takes at least `gap`
+        bytes.
         """
         if self.chunked is None and not self.times_ns:
             self.chunked = self._has_chunks(damaged)
         if damaged < claimed and self.leads_on(claimed):
-            # Its length may be right; but a stray head may as well claim what lies behind it.
+            # Its length may be right; but a stray head may also claim the bytes after it.
             pattern = _CHUNK_HEAD if self.is_chunk_head(damaged) else _CANDIDATE
             inner = self._find(pattern, damaged + gap, claimed, into_damage=False)
             return claimed if inner is None else inner
         return self._find(_CANDIDATE, damaged + gap)
 
     def _has_chunks(self, start: int) -> bool:
-        """Return whether messages behind `start` lie in chunks, as far as what is there tells it."""
+        """Return whether messages after `start` lie in chunks, as far as the bytes there tell it."""
         torn = start > len(MAGIC) and self.is_chunk_head(start)  # no chunk begins where the Header must be
         if torn or self._find(_CHUNK_HEAD, start) is not None:
             return True
@@ -115,14 +116,14 @@ class Resync:
         return False
 
     def is_chunk_head(self, offset: int) -> bool:
-        """Return whether what lies there looks like the beginning of a chunk, whole or not."""
+        """Return whether the bytes look like the beginning of a chunk, whole or not."""
         head = self.view.read(offset, min(_OVERLAP, self.view.size - offset))
         return _CHUNK_HEAD.match(head) is not None
 
     def is_end(self, offset: int, crc: int) -> bool:
         """Return whether the DataEnd record at `offset` ends this log: a stray copy of a sector may hold one.
 
-        `crc` is that of the data section up to there.
+        `crc` is the CRC of the data section up to `offset`.
         """
         stored = DATA_END.unpack(self.view.read(offset, DATA_END.size))[2]
         if (stored and stored == crc) or self._leads_to_footer(offset + DATA_END.size):
@@ -160,7 +161,7 @@ class Resync:
         return None
 
     def leads_on(self, offset: int, *, into_damage: bool = True) -> bool:
-        """Return whether a record of the data section lies there, as far as it and those behind it say.
+        """Return whether a record of the data section begins there, judged by it and the next records.
 
         With `into_damage`, records may count as whole although damage follows them.
         """
@@ -188,12 +189,12 @@ class Resync:
         return last > 0
 
     def _judge(self, at: RecordAt, times_ns: list[int], defined: set[int]) -> bool | None:
-        """Return whether a record proves that it and those before it are whole; None: the next one decides.
+        """Return whether a record proves that it and earlier ones are whole; None: the next one decides.
 
         Raises
         ------
         LogError
-            It is damaged.
+            The record is damaged.
         """
         view = self.view
         if at.opcode == Opcode.CHUNK:
@@ -223,7 +224,7 @@ class Resync:
         return True if fits or len(times_ns) + len(defined) >= _ENOUGH else None
 
     def fits(self, channel: int, time_ns: int) -> bool:
-        """Return whether a message is of a channel that is defined, or of about the time of the last ones."""
+        """Return whether a message has a defined channel, or about the time of the last messages."""
         return channel in self.channels or not self.times_ns or self._is_near(time_ns)
 
     def _is_near(self, time_ns: int) -> bool:
@@ -232,7 +233,7 @@ class Resync:
         return any(abs(time_ns - recent_ns) < _DAY_NS for recent_ns in self.times_ns)
 
     def _is_series(self, times_ns: list[int], stop: int) -> bool:
-        """Return whether messages are of about the same time, and the head of another one follows them."""
+        """Return whether messages have about the same time, and the head of another one follows them."""
         near = len(times_ns) > 1 and max(times_ns) - min(times_ns) < _DAY_NS
         return near and stop < self.view.size and self.view.read(stop, 1) == bytes([Opcode.MESSAGE])
 
@@ -257,7 +258,7 @@ class Resync:
         view = self.view
         self.budget -= at.length
         if self.budget < 0:
-            raise view.fault(at.offset, "too much of it looks like chunks and is none")
+            raise view.fault(at.offset, "too many of its bytes look like chunks and are none")
         look_inside(view, at.offset, unpack(view, at.offset, parse_chunk_head(view, at.offset)[1]))
         self.budget += at.length
         return True
@@ -280,12 +281,12 @@ def check_exact(view: View, at: RecordAt, padding: int | None = None) -> None:
 
 
 def attachment_crc(view: View, at: RecordAt) -> tuple[int, int]:
-    """Return the CRC that an attachment states (0: none), and the one that it has.
+    """Return the stated CRC of an attachment (0: none), and its computed CRC.
 
     Raises
     ------
     LogError
-        Its lengths are not right.
+        Its lengths are wrong.
     """
     head = view.read(at.offset, min(at.length, _LONGEST_HEAD))
     try:

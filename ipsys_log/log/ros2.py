@@ -44,13 +44,13 @@ _MODELS = {"equidistant": "kannala_brandt", "fisheye": "kannala_brandt"}
 
 
 def read_ros2(name: str, data: bytes, definition: bytes, items: Items | None = None) -> Any:
-    """The payload in a message of ROS 2.
+    """Decode the payload in a message of ROS 2.
 
     Parameters
     ----------
     name : of the schema, such as ``sensor_msgs/msg/CompressedImage``.
     data : the message.
-    definition : the schema as the log has it (``ros2msg``); empty where it has it in another form.
+    definition : the schema in the log (``ros2msg``); empty if it has another form.
     items : the numbers outside of images that may still be read.
 
     Raises
@@ -58,7 +58,7 @@ def read_ros2(name: str, data: bytes, definition: bytes, items: Items | None = N
     BoundError
         The message has more numbers than `items` allows.
     LogError
-        Where the definition is none of that form, or the bytes are not a message of it.
+        The definition does not have that form, or the bytes are not a message of it.
     """
     if not definition:
         raise LogError(f"its schema {name!r} is not given as .msg; convert the log: ros2 bag convert")
@@ -78,7 +78,7 @@ def read_ros2(name: str, data: bytes, definition: bytes, items: Items | None = N
 def _decoder(name: str) -> Callable[[bytes], Any]:
     """Return the decoder of a message as ROS 2 defines it.
 
-    It is never made from the definition in a log: such a definition can ask for endless arrays of nothing.
+    It never uses the definition in a log: such a definition can require endless arrays of empty elements.
     """
     parts = [name.removeprefix("sensor_msgs/msg/"), *_NESTED]
     text = "\n".join(f"{'=' * 80}\nMSG: {_PACKAGES[part]}/{part}\n{_FIELDS[part]}" for part in parts)
@@ -107,7 +107,7 @@ def _check_definition(name: str, definition: bytes) -> None:
 
 
 def _fields(text: str) -> list[tuple[str, str]]:
-    """Types, without their packages, and names of the fields of a message."""
+    """Return the types (without packages) and names of the fields of a message."""
     lines = (line.partition("#")[0].split() for line in text.splitlines())
     rows = [(line[0].split("/")[-1], line[-1]) for line in lines if line]
     return [("Time" if kind == "time" else kind, field) for kind, field in rows]

@@ -1,4 +1,4 @@
-"""Where the messages of a chunk lie, as its message indexes say it, and what to read to get at them."""
+"""Positions of the messages of a chunk by its message indexes, and the reads that they need."""
 
 from bisect import bisect_right
 from collections.abc import Mapping
@@ -29,9 +29,9 @@ def as_rows(entries: Mapping[int, list[tuple[int, int]]]) -> Entries:
 def chunk_entries(
     view: View, chunk: ChunkRef, searched: dict[int, Entries], wanted: set[int] | None = None
 ) -> Entries:
-    """The rows of a chunk's messages, from its message indexes if there are any.
+    """Return the rows of a chunk's messages, from its message indexes if there are any.
 
-    `searched` keeps, by offset, what was found in chunks without: each is searched once.
+    `searched` caches, by offset, the rows of chunks without indexes: each is searched once.
     """
     if not chunk.index_offsets or not chunk.index_length:
         if chunk.offset not in searched:

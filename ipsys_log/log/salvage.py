@@ -1,4 +1,4 @@
-"""Messages of a chunk that is cut off or damaged, as far as they can be believed."""
+"""Recovery of plausible messages from a chunk that is cut off or damaged."""
 
 import struct
 import zlib
@@ -24,12 +24,12 @@ from ipsys_log.units import format_time
 __all__ = ["Rows", "Salvage", "Saved", "up_to_first_hole"]
 
 _SECTOR = 512
-_MOST = 256 << 20  # bytes of one chunk that are looked at
+_MOST = 256 << 20  # bytes: limit for one chunk
 _READ = 1 << 20
-_PIECE = 256  # compressed bytes at a time: what came out of the pieces before an error is kept
+_PIECE = 256  # compressed bytes at a time: the output of the pieces before an error is kept
 _BLOCK = 128 << 10  # the largest block of a zstd frame: damage spoils all of it
-_LARGEST_RATIO = 200  # nothing that is recorded compresses better
-_MOST_OF_LITTLE = 16 << 20  # bytes out of few: only above that the ratio counts
+_LARGEST_RATIO = 200  # no recorded data compress better
+_MOST_OF_LITTLE = 16 << 20  # bytes of output: the ratio counts only above this
 _LARGEST_WINDOW = 128 << 20
 _HEAD = struct.Struct("<BQQQQII")  # opcode, length, start, end, size, CRC, length of the compression's name
 _SIZE = struct.Struct("<Q")
@@ -39,11 +39,11 @@ Rows = Mapping[int, list[tuple[int, int]]]  # by channel id: log time in ns, off
 
 
 class _Records(NamedTuple):
-    """The records of a damaged chunk, as far as they can be had.
+    """The records of a damaged chunk, as far as they can be decoded.
 
-    `checked` says that all are there and their CRC is right, `is_wrong` that all are there and it is not.
-    `ends_early` says that not all are there: the rest is missing, or cannot be decoded. `size` is what the
-    chunk claims to hold.
+    `checked` says that all records are there with a right CRC, `is_wrong` that all are there with a wrong
+    CRC. `ends_early` says that the rest is missing, or cannot be decoded. `size` is the stated size of the
+    chunk in bytes.
     """
 
     data: Buffer
@@ -56,7 +56,7 @@ class _Records(NamedTuple):
     span: str
 
     def spoiled(self, offset: int) -> int:
-        """Return where the block or sector begins in which something at `offset` makes no sense."""
+        """Return the start of the block or sector that holds the implausible bytes at `offset`."""
         if self.compressed:
             return offset - offset % _BLOCK
         return max(0, offset - (self.data_offset + offset) % _SECTOR)
@@ -65,8 +65,8 @@ class _Records(NamedTuple):
 class Saved(NamedTuple):
     """The messages saved from one stretch: channel ids and offsets in the chunk of the messages.
 
-    `torn` has channel id and log time of a message that is there in part. `counted` says that the stretch
-    held no other messages than these. `share` is the part of the stretch that was saved.
+    `torn` has the channel id and log time of an incomplete message. `counted` says that the stretch held no
+    other messages. `share` is the saved fraction of the stretch.
     """
 
     messages: frozenset[tuple[int, int]] = frozenset()
@@ -78,7 +78,7 @@ class Saved(NamedTuple):
 
 @dataclass(slots=True)
 class Salvage:
-    """Messages saved into new chunks, which lie in `spool` until the log has a place for them.
+    """Messages saved into new chunks, which are kept in `spool` until they are written to the log.
 
     `inside` holds what the damaged chunks define, `unchecked` counts messages whose CRC cannot be checked.
     """
@@ -101,19 +101,19 @@ class Salvage:
         *,
         in_order: bool,
     ) -> Saved:
-        """Save what can be believed of the chunk that begins with `stretch`, if that is one.
+        """Save the plausible messages of the chunk that begins with `stretch`, if it is a chunk.
 
-        What is cut off ends with its last whole message. A sector that never reached the disk reads as
-        zeros: nothing is believed from there on. Where a record makes no sense, its whole sector is not
-        believed. Where the CRC is wrong and all records make sense, nobody knows which one is damaged, and
-        none is taken.
+        A chunk that is cut off ends with its last whole message. A sector that never reached the disk reads
+        as zeros: all data from there on are rejected. If a record is not plausible, its whole sector is
+        rejected. If the CRC is wrong and all records are plausible, the damaged one is unknown, and none is
+        saved.
 
         Parameters
         ----------
         rows
-            What the message indexes of the chunk name; a message must agree with them.
+            The entries of the chunk's message indexes; a message must agree with them.
         in_order
-            The saved messages stand where they stood, behind all others.
+            The saved messages keep their position, after all others.
         """
         records = _records_of(view, stretch)
         if records is None:
@@ -121,7 +121,7 @@ class Salvage:
         channels = definitions.channels | definitions.known.channels
         messages, inside, torn, complete = _believable(view, records, rows, channels)
         if records.checked and definitions.is_stranger(stretch.offset, inside):
-            return Saved(note=f"the chunk at byte {stretch.offset} is of another log")
+            return Saved(note=f"the chunk at byte {stretch.offset} belongs to another log")
         for key, value in inside.schemas.items():
             self.inside.schemas.setdefault(key, value)
             definitions.known.schemas.setdefault(key, value)
@@ -140,7 +140,7 @@ class Salvage:
         return Saved(saved, torn, complete or bool(rows), note, 1.0 if complete else part)
 
     def finish(self) -> None:
-        """Put the last chunk into the spool."""
+        """Write the last chunk into the spool."""
         built = self._builder.build(0)
         if built is None:
             return
@@ -179,13 +179,13 @@ class Salvage:
 def _note(stretch: Stretch, records: _Records, count: int, *, complete: bool) -> str:
     where = f"the chunk at byte {stretch.offset} ({records.span})"
     if records.checked:
-        return f"of {where}, all {count} messages were copied: its CRC is right, but it cannot stay as it is"
+        return f"all {count} messages of {where} were copied: its CRC is right, but it cannot stay in place"
     if count:
         which = "all" if complete else "the first"
-        return f"of {where}, {which} {count} messages were saved; their CRC cannot be checked"
+        return f"{which} {count} messages of {where} were saved; their CRC cannot be checked"
     if records.ends_early or not records.data:
         return f"{where} holds no message that can be read"
-    return f"{where}: one of its messages is damaged and it is not known which, so that none was taken"
+    return f"{where}: an unknown one of its messages is damaged, so that none was saved"
 
 
 def _records_of(view: View, stretch: Stretch) -> _Records | None:
@@ -221,7 +221,7 @@ def _records_of(view: View, stretch: Stretch) -> _Records | None:
 
 
 def _decode(view: View, name: bytes, offset: int, length: int) -> tuple[Buffer, bool]:
-    """Decode compressed bytes until they end or fail, and say whether they failed; bounded."""
+    """Decode compressed bytes until they end or fail; return whether they failed; bounded."""
     if not name:
         return view.read(offset, min(length, _MOST)), length > _MOST
     decompress = _decompressor(name)
@@ -267,7 +267,7 @@ def up_to_first_hole(view: View, offset: int, length: int) -> int:
 
 
 class _Found(NamedTuple):
-    """Messages (channel id, start, stop) and definitions that can be believed, and a message cut in two."""
+    """Return the plausible messages (channel id, start, stop) and definitions, and an incomplete message."""
 
     messages: list[tuple[int, int, int]]
     inside: Inside
@@ -300,7 +300,7 @@ def _head(data: Buffer, position: int) -> tuple[int, int, int]:
 
 
 def _makes_sense(view: View, data: Buffer, at: RecordAt, inside: Inside) -> bool:
-    """Return whether the record may lie in a chunk; take its definitions into `inside`."""
+    """Return whether the record may lie in a chunk; add its definitions to `inside`."""
     if at.opcode == Opcode.MESSAGE:
         return MESSAGE.size <= at.length <= _MOST
     if at.opcode not in (Opcode.SCHEMA, Opcode.CHANNEL):
@@ -318,7 +318,7 @@ def _makes_sense(view: View, data: Buffer, at: RecordAt, inside: Inside) -> bool
 def _up_to(
     records: _Records, inside: Inside, starts: list[RecordAt], position: int, *, makes_sense: bool
 ) -> _Found:
-    """Select the records that can be believed; `position` is where the sensible ones end."""
+    """Select the plausible records; `position` is their end."""
     data = records.data
     whole = position == len(data)
     if not makes_sense or (not whole and not records.ends_early):

@@ -146,18 +146,18 @@ class Session:
     def messages(
         self, topics: Collection[str], start_ns: int | None = None, end_ns: int | None = None
     ) -> Iterator[Message]:
-        """Decoded messages of some topics in log order, from ``start_ns`` to before ``end_ns``.
+        """Yield the decoded messages of some topics in log order, from ``start_ns`` to before ``end_ns``.
 
         Raises
         ------
         LogError
-            For a message that is not what its channel's schema says, naming topic and file.
+            A message does not match the schema of its channel; the text names topic and file.
         """
         streams = [self._decoded(reader, items, topics, start_ns, end_ns) for reader, items in self._items()]
         return heapq.merge(*streams, key=lambda message: message.log_time_ns)
 
     def stored(self, topics: Collection[str]) -> Iterator[tuple[Message, bytes]]:
-        """As :meth:`messages`, each with the bytes that the log has of its payload."""
+        """Yield the same as :meth:`messages`, each with the encoded bytes of its payload."""
         streams = [self._stored(reader, items, topics) for reader, items in self._items()]
         return heapq.merge(*streams, key=lambda row: row[0].log_time_ns)
 
@@ -174,7 +174,7 @@ class Session:
         return reader.messages(here, start_ns, end_ns) if here else iter(())
 
     def _items(self) -> list[tuple[LogReader, Items]]:
-        """The logs, with what one reading of each may take."""
+        """Return the logs, each with the limits for one reading."""
         return [(reader, Items(reader.allowance.most_items)) for reader in self.readers]
 
     def _decoded(
@@ -202,7 +202,7 @@ class Session:
         return [message.payload for message in self.messages(topics)]
 
     def runs(self) -> list[Run]:
-        """Return the records of the stages, oldest first: log by log as they were given, then by number."""
+        """Return the records of the stages, oldest first: in the order of the given logs, then by number."""
         return [run for reader, items in self._items() for run in self._runs_in(reader, items)]
 
     def _runs_in(self, reader: LogReader, items: Items) -> list[Run]:
@@ -215,7 +215,7 @@ class Session:
         return sorted(found, key=lambda run: run.number)
 
     def _tell_apart(self) -> dict[LogReader, dict[str, str]]:
-        """The ids of measurements that an earlier log has too, and those that they have here."""
+        """Return the ids of measurements that an earlier log has too, and their ids here."""
         readers = [reader for reader in self.readers if len(_times(reader, MEASUREMENTS_TOPIC))]
         if len(readers) < 2:
             return {}
@@ -233,7 +233,7 @@ class Session:
         return dict(zip(readers, found, strict=True))
 
     def _check_numbers(self) -> None:
-        """Refuse more runs or measurements than a lab has: each is a line, or an equation to solve."""
+        """Refuse more runs or measurements than a lab has: each costs a line, or an equation."""
         for reader in self.readers:
             for payload, what in ((Run, "runs"), (Measurement, "measurements")):
                 counts = [
@@ -304,7 +304,7 @@ class Session:
 
 
 def _payload(reader: LogReader, raw: RawMessage, items: Items) -> Any:
-    """What a message holds; its fault is named with the log, the topic and the time."""
+    """Decode a message; its error names the log, the topic and the time."""
     where = f"{reader.path}: {raw.topic} at {raw.log_time_ns} ns"
     if max(raw.log_time_ns, raw.publish_time_ns) >= _LATEST_NS:
         raise LogError(f"{where}: its time is later than the year 2262; the clock of its recorder was wrong")
@@ -324,7 +324,7 @@ def _decode(reader: LogReader, channel: Channel, data: bytes, items: Items) -> A
     if image:
         items.take(_ITEMS_OF_IMAGE)
     elif len(data) > reader.allowance.most_structured:
-        raise BoundError(f"a message of {len(data)} bytes is refused: images may be so large, others not")
+        raise BoundError(f"a message of {len(data)} bytes is refused: only images may be so large")
     definition = schema.data if schema.encoding == "ros2msg" else b""
     return decode(schema.name, data, channel.message_encoding, definition, items)
 

@@ -1,4 +1,4 @@
-"""Damaged stretches of a data section, and the records that a repair puts in their place."""
+"""Damaged stretches of a data section, and the records that replace them in a repair."""
 
 from collections.abc import Mapping
 from dataclasses import dataclass, field
@@ -17,20 +17,20 @@ _FILLER = Opcode.CHUNK | PRIVATE
 
 @dataclass(slots=True)
 class Stretch:
-    """Bytes that are not whole records, from `offset` on.
+    """A range of bytes from `offset` on that are not whole records.
 
-    In their place go `head` (the beginning of a file), the message indexes of the chunk before it
-    (`entries`), `definitions` that were lost, and a record of a private type over what is left, which every
-    reader skips. Of that only the first bytes are written; the others stay as they are.
+    They are replaced by `head` (the beginning of a file), the message indexes of the chunk before it
+    (`entries`), lost `definitions`, and a record of a private type over the rest, which every reader skips.
+    Only the first bytes of that record are written; the others are not changed.
     """
 
     offset: int
     length: int
     head: bytes = b""
-    chunk: int | None = None  # number of the chunk that `entries` belong to
+    chunk: int | None = None  # number of the chunk of `entries`
     entries: Mapping[int, list[tuple[int, int]]] = field(default_factory=dict)
     definitions: list[bytes] = field(default_factory=list)
-    _taken: int = 0  # bytes of all this
+    _taken: int = 0  # bytes of all of these
 
     @property
     def end(self) -> int:
@@ -45,11 +45,11 @@ class Stretch:
 
     @property
     def is_full(self) -> bool:
-        """True if not even the shortest definition fits in."""
+        """True if not even the shortest definition fits."""
         return self.length - self._taken < _SHORTEST_DEFINITION
 
     def define(self, definitions: bytes) -> bool:
-        """Take these records in if there is room for them."""
+        """Add these records if there is room for them."""
         if self._taken == 0:
             self._taken = len(self.head) + len(self.indexes()[0])
         if self._taken + len(definitions) > self.length:
@@ -62,13 +62,13 @@ class Stretch:
         """Return the new bytes at `offset`: all of the stretch, or its beginning."""
         data = b"".join((self.head, self.indexes()[0], *self.definitions))
         rest = self.length - len(data)
-        if 0 < rest < HEADER.size:  # too little for a record of its own
+        if 0 < rest < HEADER.size:  # too small for a separate record
             return _padded(data, len(MAGIC) if self.offset == 0 else 0, rest)
         return data + (HEADER.pack(_FILLER, rest - HEADER.size) if rest else b"")
 
 
 def _padded(data: bytes, start: int, rest: int) -> bytes:
-    """Lengthen the last record by zeros: a reader skips what follows the fields that it knows."""
+    """Pad the last record with zeros: readers skip bytes after the fields that they know."""
     last = start
     while start < len(data):
         last, start = start, start + HEADER.size + HEADER.unpack_from(data, start)[1]

@@ -12,20 +12,20 @@ from ipsys_log.log.view import View
 
 __all__ = ["STANDING", "standing_bytes", "standing_data_end", "tail_bytes"]
 
-# Before the tail of a log that stands beyond new data: a record of a private type, and where its data end.
+# Precedes a tail after new data: a record of a private type with the offset of the end of the old data.
 STANDING = struct.Struct("<BQ8sQ")
 _STANDING_TYPE, _STANDING_NAME = 0x80 | Opcode.DATA_END, b"standing"
 
 
 def standing_bytes(contents: Contents, offset: int) -> bytes:
-    """Return the tail of a log as it stands at `offset` while new data are written before it."""
+    """Return the temporary tail of a log at `offset`, for the time while new data are written before it."""
     length = STANDING.size - HEADER.size
     mark = STANDING.pack(_STANDING_TYPE, length, _STANDING_NAME, contents.data_end)
     return mark + tail_bytes(contents, offset + len(mark))
 
 
 def standing_data_end(view: View, at: int) -> int | None:
-    """Return where the data end if the DataEnd record at `at` stands beyond new data, else None."""
+    """Return the end of the data if the DataEnd record at `at` belongs to a temporary tail, else None."""
     if at < len(MAGIC) + STANDING.size:
         return None
     mark = STANDING.unpack(view.read(at - STANDING.size, STANDING.size))
@@ -36,8 +36,8 @@ def standing_data_end(view: View, at: int) -> int | None:
 def tail_bytes(contents: Contents, offset: int | None = None, *, index_chunks: bool = True) -> bytes:
     """Return the tail of a log: DataEnd, summary and footer, at ``contents.data_end`` or another `offset`.
 
-    With chunk indexes, other readers look for messages in chunks only: a log that also has messages in none
-    is written without (`index_chunks`).
+    With chunk indexes, other readers search for messages only in chunks. So a log that also has messages
+    outside of chunks gets none (`index_chunks`).
     """
     start = (contents.data_end if offset is None else offset) + DATA_END.size
     summary, offsets = b"", b""

@@ -42,13 +42,13 @@ _LONGEST_HEADER = 1 << 20  # bytes
 def survey(
     view: View, known: Summary | None = None, saved: Salvage | None = None, *, doubtful: bool = False
 ) -> Survey:
-    """Check the data section record by record; never believes a length, never raises for damage.
+    """Check the data section record by record, without trusting lengths or raising errors for damage.
 
-    A log that asks for too much is refused with a `BoundError`: it need not be damaged, and is not repaired.
+    A log that exceeds the limits is refused with a `BoundError`: it may be undamaged, and is not repaired.
 
-    The file is read once. `known` is what the summary says, if there is one: it may define what the data
-    section does not. Without `saved`, damaged chunks are passed over. `doubtful` says that lengths that
-    nothing confirms are looked at closely.
+    The file is read once. `known` is the summary, if there is one: it may have definitions that the data
+    section lacks. Without `saved`, damaged chunks are skipped. With `doubtful`, unconfirmed lengths are
+    checked closely.
     """
     damaged: list[Stretch] = []
     definitions = Definitions(known, damaged)
@@ -73,7 +73,7 @@ def survey(
 
 
 def _is_chunked(known: Summary | None) -> bool | None:
-    """Return whether the messages lie in chunks, by the summary; None if it does not say."""
+    """Return whether the messages lie in chunks by the summary; None if it does not tell."""
     if known is not None and known.contents.chunks:
         return True
     if known is not None and known.checked and known.statistics is not None:
@@ -82,14 +82,14 @@ def _is_chunked(known: Summary | None) -> bool | None:
 
 
 def _span_ns(known: Summary | None) -> tuple[int, int] | None:
-    """Return the log times of the first and the last message, if the summary says them and is right."""
+    """Return the log times of the first and the last message, if the summary has them and is right."""
     if known is None or not known.checked or known.statistics is None or not known.statistics.message_count:
         return None
     return known.statistics.message_start_time, known.statistics.message_end_time
 
 
 def _take_start(found: Survey) -> int:
-    """Check the magic bytes and the Header record; return the offset of the records behind them."""
+    """Check the magic bytes and the Header record; return the offset of the records after them."""
     view, start = found.view, len(MAGIC)
     behind, reason = _behind_header(found)
     if view.read(0, min(start, view.size)) != MAGIC:
@@ -111,7 +111,7 @@ def _take_start(found: Survey) -> int:
 
 
 def _behind_header(found: Survey) -> tuple[int, str]:
-    """Return the end of the Header record, its place if there is none, 0 and the reason if it is damaged."""
+    """Return the end of the Header record (its offset if it is missing), or 0 and the fault if damaged."""
     view, start = found.view, len(MAGIC)
     try:
         at = next(walk(view, start, view.size), None)
@@ -127,7 +127,7 @@ def _behind_header(found: Survey) -> tuple[int, str]:
 
 
 def _take_records(found: Survey, position: int) -> int:
-    """Take records from `position` on up to the next damage; return the offset behind it."""
+    """Check the records from `position` up to the next damage; return the offset after it."""
     view = found.view
     at = RecordAt(0, position, 0)
     try:
@@ -146,7 +146,7 @@ def _take_records(found: Survey, position: int) -> int:
 
 
 def _take(found: Survey, at: RecordAt) -> None:
-    """Check one record and take it in."""
+    """Check one record and add it."""
     view = found.view
     if at.opcode == Opcode.MESSAGE_INDEX:
         _take_index(found, at)
@@ -160,7 +160,7 @@ def _take(found: Survey, at: RecordAt) -> None:
     if at.opcode == Opcode.DATA_END and at.length == DATA_END.size:
         _advance_crc(found, at.offset)
         if not found.resync.is_end(at.offset, found.crc):
-            raise view.fault(at.offset, "records follow behind a DataEnd record")
+            raise view.fault(at.offset, "records follow after a DataEnd record")
         found.finished, found.end = True, at.offset
     elif at.opcode == Opcode.CHUNK:
         _take_chunk(found, at)
@@ -173,9 +173,9 @@ def _take(found: Survey, at: RecordAt) -> None:
 
 
 def _check_length(found: Survey, at: RecordAt) -> None:
-    """Refuse a record of which only the length can be wrong, if it swallows whole ones or stops short of one.
+    """Refuse a record whose wrong length includes whole records, or ends before one.
 
-    Where a record follows, its length is right; where none does, the damage may as well lie behind it.
+    If a record follows, the length is right; if none does, the damage may also be after it.
     """
     view, stop = found.view, at.offset + at.length
     follows = stop == view.size
@@ -189,12 +189,12 @@ def _check_length(found: Survey, at: RecordAt) -> None:
         if inner is not None and inner != stop and inner < stop + HEADER.size:
             found.wrong_length = at.offset
             if at.opcode == Opcode.MESSAGE and at.length >= MESSAGE.size and stop < inner:
-                found.homeless.append(at)  # it may be whole: what is left between them is too small to skip
+                found.homeless.append(at)  # it may be whole: the gap between them is too small to skip
             raise view.fault(at.offset, f"a record claims {at.length} bytes, which hold other records")
 
 
 def _take_loose(found: Survey, at: RecordAt) -> None:
-    """Take in a record that lies in no chunk."""
+    """Add a record outside of chunks."""
     view = found.view
     _check_length(found, at)
     if at.opcode == Opcode.METADATA:
@@ -208,9 +208,7 @@ def _take_loose(found: Survey, at: RecordAt) -> None:
         if _has_lost_chunk_heads(found) and up_to_first_hole(view, at.offset, at.length) < at.length:
             raise view.fault(at.offset, "a message holds a sector of zeros")
         if at.offset < found.doubtful_to and not found.resync.fits(channel, time_ns):
-            raise view.fault(
-                at.offset, "a message behind damage is of an unknown channel and of another time"
-            )
+            raise view.fault(at.offset, "a message after damage has an unknown channel and another time")
         try:
             found.definitions.need(view, at.offset, channel)
         except LogError:
@@ -229,7 +227,7 @@ def _take_loose(found: Survey, at: RecordAt) -> None:
 
 
 def _has_lost_chunk_heads(found: Survey) -> bool:
-    """Return whether messages in no chunk may be those of one: nothing tells, if both ends are lost."""
+    """Return whether messages outside of chunks may belong to one: unknown if both ends are lost."""
     begins_late = bool(found.damaged) and found.damaged[0].offset == 0
     return begins_late and found.definitions.summary is None
 
@@ -237,7 +235,7 @@ def _has_lost_chunk_heads(found: Survey) -> bool:
 def _take_chunk(found: Survey, at: RecordAt) -> None:
     view = found.view
     if found.resync.chunked is False:
-        raise view.fault(at.offset, "a chunk lies in a log whose messages lie in none")
+        raise view.fault(at.offset, "a chunk lies in a log that has its messages outside of chunks")
     head = parse_chunk_head(view, at.offset)[1]
     data = unpack(view, at.offset, head)
     inside = look_inside(view, at.offset, data)
@@ -267,7 +265,7 @@ def _take_chunk(found: Survey, at: RecordAt) -> None:
 
 
 def _check_without_crc(found: Survey, at: RecordAt) -> None:
-    """Refuse a chunk that has no CRC, among chunks that have one, where it may be of another log."""
+    """Refuse a chunk without CRC among chunks with CRC, if it may belong to another log."""
     if found.resync.holds_chunk(at):
         found.wrong_length = at.offset
         raise found.view.fault(at.offset, "a chunk without CRC holds another chunk")
@@ -278,7 +276,7 @@ def _check_without_crc(found: Survey, at: RecordAt) -> None:
 
 
 def _check_definitions(view: View, offset: int, data: bytes) -> None:
-    """Refuse a chunk without CRC whose definitions claim more or less than they hold."""
+    """Refuse a chunk without CRC whose definitions have wrong lengths."""
     for at in inner_records(view, offset, data):
         if at.opcode in (Opcode.SCHEMA, Opcode.CHANNEL):
             record = data[at.offset : at.offset + at.length]
@@ -296,7 +294,7 @@ def _continue_hashes(found: Survey, inside: Inside, data: bytes) -> None:
 
 
 def _take_index(found: Survey, at: RecordAt) -> None:
-    """Take in a MessageIndex record: of the chunk before it, or of the damaged stretch before it."""
+    """Add a MessageIndex record: of the chunk before it, or of the damaged stretch before it."""
     indexed = found.indexed
     if found.resync.chunked is False:
         raise found.view.fault(at.offset, "a MessageIndex record lies in a log without chunks")

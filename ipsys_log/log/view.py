@@ -17,9 +17,9 @@ _MOST_PER_CALL = 1 << 30
 
 @dataclass(slots=True)
 class View:
-    """The bytes of a log as they were when it was opened.
+    """The bytes of a log at the time when it was opened.
 
-    From `tail_offset` on they come from `tail_fd` (a journal), where `tail_offset` lies at `tail_base`.
+    From `tail_offset` on, bytes come from `tail_fd` (a journal), which has `tail_offset` at `tail_base`.
     `patches` are bytes that a repair is about to write before `tail_offset`, each with its offset, sorted.
     ``pread`` and not ``mmap``: a file that shrinks under a mapping kills the process.
     """
@@ -38,7 +38,7 @@ class View:
         self.allowance = Allowance(self.size)
 
     def read(self, offset: int, length: int) -> bytes:
-        """Exactly `length` bytes at `offset`; the length is checked against the file before allocating."""
+        """Read exactly `length` bytes at `offset`; check the length against the file before allocation."""
         if self.fd < 0:
             raise ValueError(f"{self.path}: read after close")
         end = offset + length
@@ -75,14 +75,14 @@ class View:
         return LogError(f"{self.path} is damaged at byte {offset}: {what}. Run: ipsys repair {self.path}")
 
     def refusal(self, what: str) -> BoundError:
-        """The error for a log that asks for too much. Such a log need not be damaged."""
+        """Return the error for a log that exceeds the limits. Such a log may be undamaged."""
         return BoundError(
             f"{self.path} is refused: {what}. If it is a true recording, unpack it first: "
             f"mcap decompress {self.path} -o unpacked.mcap"
         )
 
     def check_number(self, number: int, what: str) -> None:
-        """Refuse a log with more channels, runs and the like than a file of its size may have."""
+        """Refuse a log with more channels, runs or similar items than its file size allows."""
         if number > self.allowance.most_channels:
             raise self.refusal(f"it has {number} {what}, more than {self.allowance.most_channels}")
 

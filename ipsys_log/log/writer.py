@@ -76,11 +76,11 @@ class LogWriter:
         path
             A file that does not exist yet.
         atomic
-            False: the file grows in place, so that what a killed recorder has written stays there, and
-            an exception in the with-block finishes the log with what it holds. True: the log is written
-            as ``<path>.partial`` and renamed when it is complete; an exception leaves no file.
+            False: the file grows in place, so that the data of a killed recorder stay there, and an exception
+            in the with-block finishes the log with its messages so far. True: the log is written as
+            ``<path>.partial`` and renamed when it is complete; an exception leaves no file.
         storage
-            The operations on files; only tests give another one.
+            The operations on files; only tests replace it.
 
         Raises
         ------
@@ -94,7 +94,7 @@ class LogWriter:
         output = Growing(storage, file, fd, target if atomic else None)
         try:
             if atomic:
-                storage.truncate(fd, 0)  # what an earlier writer of this name left when it was killed
+                storage.truncate(fd, 0)  # the rest of an earlier writer of this name that was killed
             storage.fsync_directory(file.parent)
             output.emit(MAGIC + as_bytes(mcap.Header("", LIBRARY)))
         except BaseException as error:
@@ -111,8 +111,8 @@ class LogWriter:
     def append(cls, path: str | os.PathLike[str], *, storage: Storage = DISK) -> Self:
         """Continue a finished log in place.
 
-        The exclusive lock is held until `close`. The file is not touched before that, and an exception
-        in the with-block leaves it as it was. A crash at any instant leaves the old log or the new one.
+        The exclusive lock is held until `close`. The file is not changed before that, and an exception in the
+        with-block leaves it unchanged. A crash at any instant leaves the old log or the new one.
 
         Raises
         ------
@@ -149,7 +149,7 @@ class LogWriter:
             self.abandon()
 
     def move(self, path: Path) -> None:
-        """Give a new log another name, in one step in place of what is there; it is written on there."""
+        """Rename a new log, replacing an existing file in one step; writing continues there."""
         output = self._output
         if not isinstance(output, Growing):
             raise ValueError(f"{self.path}: an append stays where it is")
@@ -157,7 +157,7 @@ class LogWriter:
         self.path = output.path = path
         with suppress(
             OSError
-        ):  # it has the name; a name that a power cut takes away again is that of the old log
+        ):  # the rename is done; after a power cut the name may belong to the old log again
             output.storage.fsync_directory(path.parent)
 
     def add_channel(
@@ -202,7 +202,7 @@ class LogWriter:
         Raises
         ------
         LogError
-            The disk refuses it, or the message is larger than a chunk may be. The log goes on without it.
+            The disk refuses it, or the message is too large for a chunk. The log continues without it.
         """
         self._check_open()
         if len(data) > LARGEST_MESSAGE:
@@ -233,7 +233,7 @@ class LogWriter:
             self._write_chunk(builder)
 
     def sync(self) -> None:
-        """Wait until what a new log has written is on the disk. Any thread may, while another writes."""
+        """Wait until the written data of a new log are on the disk; any thread may call this."""
         if isinstance(self._output, Growing):
             self._output.sync()
 

@@ -1,4 +1,4 @@
-"""Whether a place can be right, before it is written down: triangle, floor, cameras, model."""
+"""Plausibility check of a measurement before it is saved: triangle, floor, cameras, model."""
 
 from __future__ import annotations
 
@@ -32,18 +32,18 @@ __all__ = ["Checked", "check_entry", "next_id", "withdraw"]
 
 Array = NDArray[np.float64]
 
-_NUMBERED = re.compile(r"p[0-9]{1,18}")  # an id of a log may have thousands of digits
+_NUMBERED = re.compile(r"p[0-9]{1,18}")  # an id in a log may have thousands of digits
 
 
 @dataclass(frozen=True, slots=True, eq=False)
 class Checked:
-    """What follows from an entry.
+    """The result of the check of an entry.
 
-    ``faults`` keep it out of the log, ``warnings`` are to be looked at first. Warnings that are ``imprecise``
-    are no mistakes: the point is only known badly. ``point_m`` (3,) is the world point, ``sigma_m`` how well
-    the tape knows it where it knows it least, ``residuals_m`` by reference point where there are more than
-    two. ``sides_m`` are both places (3,) where the side is not told yet. ``measurement`` is None where
-    there are faults.
+    ``faults`` keep it out of the log, ``warnings`` must be confirmed first. Warnings that are ``imprecise``
+    are no mistakes: the point only has a large uncertainty. ``point_m`` (3,) is the world point, ``sigma_m``
+    its largest standard deviation by the tape, ``residuals_m`` those of the distances by reference point, if
+    there are more than two. ``sides_m`` are both possible points (3,) if the side is not given yet.
+    ``measurement`` is None if there are faults.
     """
 
     id: str
@@ -65,7 +65,7 @@ class Checked:
 
 
 def next_id(history: Iterable[Measurement]) -> str:
-    """The next free id: p001, p002 ... One that was withdrawn is not used again.
+    """Return the next free id: p001, p002 ... A withdrawn id is not used again.
 
     Examples
     --------
@@ -99,16 +99,16 @@ def check_entry(
     model: Model | None = None,
     model_name: str = THE_MODEL,
 ) -> Checked:
-    """Whether a place can be right, and the measurement that it makes.
+    """Check whether an entry is plausible, and make its measurement.
 
     Parameters
     ----------
     entry, faults : from :func:`~ipsys_log.measuring.entry.read_typed`.
-    rig : that holds now.
-    sight : what the cameras say of the marker, None where it is not known which.
-    history : what was measured and withdrawn so far.
+    rig : the present one.
+    sight : the observations of the marker, None if the marker is not known.
+    history : measurements and withdrawals so far.
     model : the present one, to compare with.
-    model_name : its name in a doubt.
+    model_name : its name in a warning.
     """
     name = entry.id or next_id(history)
     found = [*faults, *_identity_faults(entry, sight, history)]
@@ -223,7 +223,7 @@ def _repeat_warnings(
 
 
 def _apart_from(other: Measurement, fixed: TapePoint, rig: Rig) -> str:
-    """Return the distance to another measurement in words; nothing where that one forms no point."""
+    """Return the distance to another measurement in words; "" if that one forms no point."""
     try:
         other_m = world_point(other, rig).world_m
     except IpsysError:

@@ -1,4 +1,4 @@
-"""What looks wrong with a place: off the floor, flat tapes, a model that has it elsewhere."""
+"""Warnings on a measurement: off the floor, flat tapes, another prediction by the model."""
 
 from __future__ import annotations
 
@@ -29,7 +29,7 @@ __all__ = [
 
 Array = NDArray[np.float64]
 
-# The name of a model out of a log, in a doubt.
+# The name of a model from a log, in a warning.
 THE_MODEL = "the model"
 # Without a sigma in the rig, only to tell how well a place is known.
 _USUAL_TAPE_M = 0.003
@@ -57,7 +57,7 @@ def _outside_m(point_m: Array, rig: Rig) -> float:
 
 
 def doubt_floor(read: Measurement, fixed: TapePoint, rig: Rig) -> tuple[bool | None, list[str]]:
-    """Whether a place lies on the floor, None where there is none in the rig; and what to say of it."""
+    """Return whether a point lies on the floor (None without a floor in the rig), and a warning."""
     if rig.floor is None:
         return None, []
     outside_m = _outside_m(fixed.world_m, rig)
@@ -73,7 +73,7 @@ def doubt_floor(read: Measurement, fixed: TapePoint, rig: Rig) -> tuple[bool | N
 
 
 def doubt_tapes(read: Measurement, fixed: TapePoint, rig: Rig) -> list[str]:
-    """Return a doubt where distances contradict one another."""
+    """Return a warning if distances contradict one another."""
     sigma_m = with_tape(rig).tape_sigma_m or _USUAL_TAPE_M
     worst = int(np.abs(fixed.residuals_m).argmax())
     off_m = float(abs(fixed.residuals_m[worst]))
@@ -83,7 +83,7 @@ def doubt_tapes(read: Measurement, fixed: TapePoint, rig: Rig) -> list[str]:
 
 
 def doubt_crossing(read: Measurement, rig: Rig) -> list[str]:
-    """Return a doubt where the tapes cross too flatly to know the point well."""
+    """Return a warning if the tapes cross at an angle that is too flat."""
     return [
         f"{_tapes(read)}: the tapes cross at {flat.angle_deg:.0f} degrees only, so that the point is known "
         f"to {(flat.sigma_m or 0.0) * CM_PER_M:.1f} cm; another place, or a third reference point, is better"
@@ -105,7 +105,7 @@ def doubt_model(
     predictions: Sequence[Prediction],
     model_name: str = THE_MODEL,
 ) -> list[str]:
-    """Return a doubt where the model puts the point elsewhere, with the slip that explains it."""
+    """Return a warning if the model predicts another point, with the mistake that explains it."""
     if not predictions:
         return []
     predicted_m = np.mean([one.world_m for one in predictions], axis=0)

@@ -1,4 +1,4 @@
-"""A model of measurements that were entered together, so that each is judged by the others."""
+"""A model of measurements that were entered together, to check each by the others."""
 
 from __future__ import annotations
 
@@ -15,7 +15,7 @@ from ipsys_log.offline.yardstick import FEWEST
 
 __all__ = ["OTHER_ROWS", "fit_neighbours"]
 
-# Their name in a doubt.
+# Their name in a warning.
 OTHER_ROWS = "the other rows"
 # Fits in milliseconds, and follows the points closely enough to see an error of some centimetres.
 _MODEL = "poly"
@@ -26,12 +26,12 @@ def fit_neighbours(seen: Sequence[tuple[Measurement, Sight]], rig: Rig) -> Model
 
     Parameters
     ----------
-    seen : measurements, each with what the cameras saw of its marker.
+    seen : measurements, each with the observations of its marker.
     rig : of all of them.
 
     Returns
     -------
-    None where no camera saw enough of them to say what is usual.
+    None if no camera saw enough of them.
     """
     pairs = _pairs(seen, rig)
     if not pairs:

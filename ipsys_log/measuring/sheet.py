@@ -40,19 +40,19 @@ class SheetRow:
 
 
 def read_sheet(path: Path, rig: Rig, start_ns: int) -> list[SheetRow]:
-    """The rows of a sheet.
+    """Read the rows of a sheet.
 
     Parameters
     ----------
-    path : of the sheet: UTF-8, cells parted by commas, or by semicolons (then a comma may be a decimal one).
-    rig : whose reference points name the columns ``d_A_cm``, ``d_B_cm`` ...
-    start_ns : when the log begins; a plain number as ``time`` is in seconds after that.
+    path : of the sheet: UTF-8, cells separated by commas, or by semicolons (then with decimal commas, too).
+    rig : its reference points name the columns ``d_A_cm``, ``d_B_cm`` ...
+    start_ns : start of the log; a plain number as ``time`` is in seconds after it.
 
     Raises
     ------
     IpsysError
-        Where it cannot be read, for a column that is missing, unknown or there twice, and for all that is
-        wrong with a row by itself; every bad one by its line.
+        The sheet cannot be read, a column is missing, unknown or repeated, or rows are invalid; the text
+        names each bad row by its line.
     """
     lines = _read_lines(path)
     delimiter = ";" if lines and ";" in lines[0] else ","
@@ -110,7 +110,7 @@ def refuse_rows(
 
 
 def name_columns(text: str, rig: Rig) -> str:
-    """A remark on a place, its distances named as the columns of a sheet.
+    """Return a remark on a point, with the column names of a sheet for its distances.
 
     Examples
     --------

@@ -90,16 +90,16 @@ def errors_cross_validated(
 
 
 def count_repeats(row: CameraEvaluation, rows: Sequence[CameraEvaluation]) -> int | None:
-    """Return how many errors of each place a row rests on.
+    """Return the number of errors of each point in a row.
 
     Parameters
     ----------
     row : of an evaluation.
-    rows : all of them; the row over all cameras has no residuals of its own, those of the cameras have.
+    rows : all of them; the row over all cameras has no residuals, those of the cameras have.
 
     Returns
     -------
-    None where the log does not tell.
+    None if the log does not tell.
     """
     if row.scheme != CROSS_VALIDATION:
         return 1

@@ -41,12 +41,12 @@ class Sightings:
 
 
 def gather_sightings(messages: Iterable[Message]) -> dict[tuple[str, int], Sightings]:
-    """Camera points by camera and marker, ordered by the time they speak of: when the marker was exposed.
+    """Return camera points by camera and marker, ordered by the time of exposure of the marker.
 
     Raises
     ------
     IpsysError
-        For a point that is not a number, or farther away than any lab is wide.
+        A point is not a number, or is farther away than any lab is wide.
     """
     rows: dict[tuple[str, int], list[tuple[int, float, float, float]]] = {}
     for message in messages:
@@ -62,8 +62,8 @@ def gather_sightings(messages: Iterable[Message]) -> dict[tuple[str, int], Sight
         points_m = np.array([row[1:] for row in values], dtype=np.float64)
         if not (np.abs(points_m) <= _FARTHEST_M).all():
             raise IpsysError(
-                f"camera {key[0]}: a camera point of marker {key[1]} is no point in a lab; make the run "
-                "camera-frame again with --run and another name"
+                f"camera {key[0]}: a camera point of marker {key[1]} is not a possible point; run "
+                "camera-frame again, with --run and another name"
             )
         sightings[key] = Sightings(times_ns, points_m)
     return sightings

@@ -66,7 +66,7 @@ def root_mean_square_m(errors: ErrorStatistics, repeats: int = 1) -> float:
     Parameters
     ----------
     errors : of n places.
-    repeats : how many errors there are of each place; the standard deviation is that of all of them.
+    repeats : number of errors of each point; the standard deviation is that of all of them.
 
     Examples
     --------

@@ -62,15 +62,15 @@ class FlatPlace:
 
 
 def world_point(measurement: Measurement, rig: Rig) -> TapePoint:
-    """The world point of a measurement, as given or by eq. (25), and its covariance.
+    """Return the world point of a measurement, as given or by eq. (25), and its covariance.
 
     The sigma of a distance is its own, else the rig's; that of the height its own, else 1 mm.
 
     Parameters
     ----------
-    measurement : with a world point, or two or more distances, the height, and the side where the
-        reference points lie on one line.
-    rig : for the reference points and the tape; not looked at where there is only a world point.
+    measurement : with a world point, or two or more distances, the height, and the side if the reference
+        points lie on one line.
+    rig : for the reference points and the tape; not used if there is only a world point.
 
     Returns
     -------
@@ -79,7 +79,7 @@ def world_point(measurement: Measurement, rig: Rig) -> TapePoint:
     Raises
     ------
     IpsysError
-        Where the measurement forms no point, or names unknown reference points.
+        The measurement forms no point, or names unknown reference points.
 
     References
     ----------
@@ -221,13 +221,13 @@ def _check_lengths(measurement: Measurement, where: str) -> None:
     for distance in measurement.distances:
         if not abs(distance.distance_m) <= _FARTHEST_M:
             raise IpsysError(
-                f"{where}: a tape of {distance.distance_m:g} m lies in no lab; withdraw it and measure again"
+                f"{where}: a tape of {distance.distance_m:g} m is too long; withdraw it and measure again"
             )
 
 
 def _check_point(world_m: Array, where: str) -> None:
     if not (np.abs(world_m) <= _FARTHEST_M).all():
-        raise IpsysError(f"{where}: its world point {world_m.tolist()} m is no point; withdraw it")
+        raise IpsysError(f"{where}: its world point {world_m.tolist()} m is impossible; withdraw it")
 
 
 def _check_sigma(sigma_m: float, where: str) -> float:

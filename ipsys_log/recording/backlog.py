@@ -1,4 +1,4 @@
-"""What is recorded and waits for the stages, which may be slower."""
+"""Recorded frames that wait for the stages, which may be slower."""
 
 from __future__ import annotations
 
@@ -90,5 +90,5 @@ class Backlog:
 
 
 def _is_read(message: Message) -> bool:
-    """Whether a stage reads an event."""
+    """Return whether a stage reads an event."""
     return isinstance(message.payload, Event) and message.payload.kind == STAMP_UNRELIABLE

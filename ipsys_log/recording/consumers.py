@@ -1,4 +1,4 @@
-"""Those that are shown what was recorded: none of them can end the recording."""
+"""Consumers of recorded messages, such as displays: none of them can end the recording."""
 
 from __future__ import annotations
 
@@ -8,17 +8,17 @@ from ipsys_log.messages import Message
 
 __all__ = ["Consumer", "Consumers"]
 
-# Is shown messages after they were written, and None where nothing comes.
+# Gets messages after they were written, and None if nothing comes.
 Consumer = Callable[[Message | None], None]
 
 
 class Consumers:
-    """Show messages to several consumers. One that raises is left out from then on.
+    """Pass messages to several consumers. A consumer that raises gets no more messages.
 
     Parameters
     ----------
-    consumers : each is shown every message.
-    warn : makes an event of a kind and a text, and says it.
+    consumers : each gets every message.
+    warn : makes an event of a kind and a text, and prints it.
     """
 
     def __init__(self, consumers: Sequence[Consumer], warn: Callable[[str, str], None]) -> None:
@@ -29,13 +29,13 @@ class Consumers:
         for consumer in tuple(self._consumers):
             try:
                 consumer(message)
-            except Exception as fault:  # whatever it is, the frames are worth more
+            except Exception as fault:  # any error: the frames are more important
                 self._fault = self._fault or fault
                 self._consumers.remove(consumer)
                 text = " ".join(str(fault).split()) or "no word"
                 self._warn("sink_stopped", f"the display stopped ({text}); the recording goes on")
 
     def check(self) -> None:
-        """Raise what the first consumer stopped with, if one did."""
+        """Raise the error of the first consumer that failed, if one did."""
         if self._fault is not None:
             raise self._fault

@@ -14,9 +14,9 @@ from ipsys_log.units import format_bytes, format_duration
 
 __all__ = ["SHORT_S", "DiskRoom", "expected_bytes_per_s", "free_room"]
 
-# A disk that lasts no longer is warned of.
+# Warn of a disk that lasts no longer.
 SHORT_S = 600.0
-# From here on it is worth saying how a recording gets smaller.
+# From this rate on, advise how to make the recording smaller.
 _LARGE_BYTES_PER_S = 500e6 / 60
 _USUAL_RATE_HZ = 30.0
 # H.264 of cameras takes some 6 Mbit/s at 1920 x 1080 and 30 frames/s. A first frame tells little of it.
@@ -25,13 +25,13 @@ _VIDEO_BYTES_PER_PX = 0.0125
 
 @dataclass(frozen=True, slots=True)
 class DiskRoom:
-    """What is free for a recording, and how fast it fills.
+    """Free disk space for a recording, and the rate at which it fills.
 
     Attributes
     ----------
-    folder : where the recording is written to.
-    free_bytes : what it can take.
-    bytes_per_s : of all cameras; 0 where that is not known.
+    folder : of the recording.
+    free_bytes : space for the recording.
+    bytes_per_s : of all cameras; 0 if it is not known.
     """
 
     folder: Path
@@ -40,19 +40,19 @@ class DiskRoom:
 
     @property
     def lasts_s(self) -> float | None:
-        """How long the disk lasts; None where the rate is not known."""
+        """Seconds until the disk is full; None if the rate is not known."""
         return self.free_bytes / self.bytes_per_s if self.bytes_per_s > 0 else None
 
     def is_short(self, seconds: float | None = None) -> bool:
-        """Return whether the disk is full before ``seconds``, or before 10 minutes where no end is set."""
+        """Return whether the disk is full before ``seconds``, or before 10 minutes if no end is set."""
         return self.lasts_s is not None and self.lasts_s < (SHORT_S if seconds is None else seconds)
 
     def describe(self, seconds: float | None = None) -> str:
-        """Say how large the recording gets, and how long the disk lasts.
+        """Describe the size of the recording, and how long the disk lasts.
 
         Parameters
         ----------
-        seconds : after which the recording stops by itself.
+        seconds : duration of the recording; None if no end is set.
 
         Examples
         --------
@@ -70,7 +70,7 @@ class DiskRoom:
         return f"about {size}; {format_bytes(self.free_bytes)} free in {self.folder}: {ends}"
 
     def advise(self, cameras: Iterable[RigCamera], states: Mapping[str, CameraState]) -> str | None:
-        """Say what makes a recording smaller; None where it is small and the disk lasts."""
+        """Return advice to make a recording smaller; None if it is small and the disk lasts."""
         if self.bytes_per_s < _LARGE_BYTES_PER_S and not self.is_short():
             return None
         rate_hz = max((camera.rate_hz or _USUAL_RATE_HZ for camera in cameras), default=_USUAL_RATE_HZ)
@@ -82,11 +82,11 @@ class DiskRoom:
 
 
 def expected_bytes_per_s(cameras: Iterable[RigCamera], states: Mapping[str, CameraState]) -> float:
-    """Estimate what cameras will send, from their first frames and the rates that the rig asks for.
+    """Estimate the data rate of cameras from their first frames and the rates in the rig.
 
     Parameters
     ----------
-    cameras : a camera without a rate is taken to send 30 frames/s.
+    cameras : a camera without a rate is assumed to send 30 frames/s.
     states : of the cameras, by name, once each has sent a frame.
 
     Examples
@@ -103,7 +103,7 @@ def expected_bytes_per_s(cameras: Iterable[RigCamera], states: Mapping[str, Came
 
 
 def free_room(target: Path, bytes_per_s: float) -> DiskRoom:
-    """Return the room for a log that is not begun yet."""
+    """Return the free space for a log that does not exist yet."""
     folder = target.absolute().parent
     free_bytes = shutil.disk_usage(folder).free
     return DiskRoom(folder, free_bytes - reserved_bytes(free_bytes), bytes_per_s)

@@ -20,13 +20,13 @@ _RESERVE_BYTES = 64 << 20
 
 
 def reserved_bytes(free_bytes: int) -> int:
-    """Return how much of what is free on a disk is set aside for the end of a log."""
+    """Return the part of the free bytes on a disk that is reserved for the end of a log."""
     return min(_RESERVE_BYTES, free_bytes // 2)
 
 
 @contextmanager
 def reserve(path: Path) -> Iterator[Callable[[], None]]:
-    """Some of the disk; what is yielded gives it back. It has no name: it cannot be left behind."""
+    """Reserve disk space in an unnamed file; call the yielded function to release it."""
     with ExitStack() as held:
         with suppress(OSError):  # a file system that cannot, or a disk that is full already
             if hasattr(os, "O_TMPFILE"):
@@ -37,29 +37,29 @@ def reserve(path: Path) -> Iterator[Callable[[], None]]:
 
 
 def what_fitted(path: Path, error: WriteError) -> str:
-    """How far a log goes that was ended by a disk that took no more."""
+    """Describe a log that ended because the disk was full or failed."""
     try:
         with LogReader(path) as log:
             count, seconds = log.message_count, ((log.end_ns or 0) - (log.start_ns or 0)) / NS_PER_S
     except LogError:
         return str(error)
-    what = "the disk takes no more" if is_full(error.cause) else disk_fault(error.cause)
+    what = "the disk is full" if is_full(error.cause) else disk_fault(error.cause)
     then = "Free some space, or record to another disk" if is_full(error.cause) else "Record to another disk"
     size = format_bytes(path.stat().st_size)
     return (
-        f"{path}: {what}; recording has stopped, and the log is complete with what fitted: "
+        f"{path}: {what}; recording has stopped, and the log is complete up to then: "
         f"{count} messages, {seconds:.1f} s, {size}. {then}"
     )
 
 
 def what_failed(path: Path, fault: OSError) -> str:
-    """What is to be done with a log that a disk may not have kept."""
+    """Describe what to do with a log that may be incomplete on a failed disk."""
     return (
-        f"{path}: {disk_fault(fault)} while this was recorded; some of it may be lost. To see what is whole: "
+        f"{path}: {disk_fault(fault)} during the recording; messages may be lost. To check the log: "
         f"ipsys repair {path}. Record to another disk"
     )
 
 
 def disk_fault(fault: OSError) -> str:
-    """A fault of the disk in words."""
+    """Describe a fault of the disk."""
     return f"the disk has failed ({fault.strerror})"

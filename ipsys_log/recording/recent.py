@@ -1,4 +1,4 @@
-"""Of what cameras send, into a log what was measured: the last seconds wait, most of them to be forgotten."""
+"""Buffer of recent frames: those around a measurement are written to the log, the others discarded."""
 
 from __future__ import annotations
 
@@ -85,7 +85,7 @@ class Recent:
         self._log.flush()
 
     def sync(self, confirm: Confirm) -> None:
-        """Bring what was flushed onto the disk, and ``confirm`` it."""
+        """Sync the flushed messages to the disk, and ``confirm`` it."""
         self._log.sync(confirm)
 
     def _write(self, since_ns: int | None = None) -> None:

@@ -1,4 +1,4 @@
-"""What cameras send now, into a log: written first, looked at after."""
+"""Recording of cameras into a log: frames are written first, processed later."""
 
 from __future__ import annotations
 
@@ -48,10 +48,10 @@ _SETTLE_S = 1.0
 
 
 class Source(Protocol):
-    """Messages, and None where nothing comes; after ``stop`` only what has come by then.
+    """Messages, and None if nothing comes; after ``stop`` only those that arrived before.
 
-    ``confirm`` is told from any thread that a measurement is on the disk, or what the disk said instead;
-    ``warn`` makes an event, and says it.
+    ``confirm`` is called from any thread when a measurement is on the disk, or with the error of the disk;
+    ``warn`` makes an event, and prints it.
     """
 
     def __iter__(self) -> Generator[Message | None, None, None]: ...
@@ -64,9 +64,9 @@ class Source(Protocol):
 
 
 class Target(Protocol):
-    """Where messages go, in the order of their log times.
+    """Destination of messages, in the order of their log times.
 
-    ``full`` is set when the disk took no more, ``fault`` when it failed to keep what was written.
+    ``full`` is set when the disk is full, ``fault`` when it failed to keep written messages.
     """
 
     @property
@@ -83,17 +83,17 @@ class Target(Protocol):
 
 
 class Recording:
-    """A log that is being written, by several threads. Made by :func:`recording`.
+    """A log that several threads write. Made by :func:`recording`.
 
     Parameters
     ----------
-    free : gives back what is set aside on the disk.
+    free : releases the reserved disk space.
 
     Attributes
     ----------
     counts : messages so far, by topic.
-    full : set when the disk took no more; what is set aside is in use then.
-    syncer : brings what is written onto the disk.
+    full : set when the disk is full; the reserved space is in use then.
+    syncer : syncs the log to the disk.
     """
 
     def __init__(self, writer: LogWriter, free: Callable[[], None]) -> None:
@@ -119,21 +119,21 @@ class Recording:
         self._write(self._writer.flush)
 
     def sync(self, confirm: Confirm) -> None:
-        """Bring what was flushed onto the disk, and ``confirm`` it from another thread."""
+        """Sync the flushed messages to the disk, and ``confirm`` it from another thread."""
         self.syncer.soon(confirm)
 
     @property
     def fault(self) -> OSError | None:
-        """What the disk said when it first failed to keep what was written."""
+        """The first error of the disk when it failed to keep written messages."""
         return self.syncer.fault
 
     def check_disk(self) -> None:
-        """See that all was written.
+        """Check that all messages were written.
 
         Raises
         ------
         IpsysError
-            Where the disk was full, which says how far the log goes, or failed.
+            The disk was full or failed; the text describes the log.
         """
         if self.full is not None:
             raise IpsysError(what_fitted(self._writer.path, self.full)) from self.full
@@ -159,10 +159,10 @@ class Recording:
 
 
 def written(source: Source, log: Target) -> Iterator[Message | None]:
-    """What a source gives, each message after it was written.
+    """Yield the messages of a source, each after it was written.
 
-    A measurement is confirmed as soon as it is on the disk. When the disk is full the source is stopped. What
-    is no frame is still written, to what is set aside.
+    A measurement is confirmed as soon as it is on the disk. When the disk is full the source is stopped.
+    Other messages than frames are still written, to the reserved space.
     """
     warned = False
     with closing(iter(source)) as messages:
@@ -175,7 +175,7 @@ def written(source: Source, log: Target) -> Iterator[Message | None]:
             elif log.full is None or not isinstance(message.payload, (CompressedImage, CompressedVideo)):
                 log.put(message)
                 if isinstance(message.payload, Event) and message.payload.kind == STAMP_UNRELIABLE:
-                    log.flush()  # the frames that it speaks of are never in the file without it
+                    log.flush()  # the file never has the affected frames without this event
                 if isinstance(message.payload, Measurement):
                     log.flush()
                     log.sync(partial(source.confirm, message))
@@ -188,21 +188,21 @@ def written(source: Source, log: Target) -> Iterator[Message | None]:
 
 @contextmanager
 def recording(path: Path, settings: Iterable[Message] = (), overwrite: bool = False) -> Iterator[Recording]:
-    """A new log that keeps what it has, whatever ends the block.
+    """Write a new log that keeps its messages even if an exception ends the block.
 
     Parameters
     ----------
-    settings : all that frames need to be understood: rig, lenses, models. They are in the file before the
-        block begins, however soon the recorder is killed.
-    overwrite : put it in place of one that is there, unless another process is writing that. The old one is
-        gone only when the new one stands.
+    settings : rig, intrinsics and models of the recording. They are in the file before the block begins, even
+        if the recorder is killed soon.
+    overwrite : replace an existing log, unless another process is writing it. The old log is deleted only
+        after the new one exists.
 
     Raises
     ------
     LogError
-        Where there is such a file, or it cannot be made.
+        The file exists, or cannot be created.
     IpsysError
-        Where the disk is so full that the log could not be ended as it should.
+        The disk has too little space to finish the log properly.
     """
     created = _create(path, overwrite)
     try:
@@ -269,7 +269,7 @@ def fitting_lenses(
 def first_messages(
     rig: Rig, lenses: Mapping[str, CameraCalibration], now_ns: Callable[[], int]
 ) -> list[Message]:
-    """What a log begins with: the rig, and the lenses by camera."""
+    """The first messages of a log: the rig, and the intrinsics by camera."""
     time_ns = now_ns()
     found = [Message(RIG_TOPIC, time_ns, time_ns, rig)]
     for camera, lens in sorted(lenses.items()):

@@ -1,4 +1,4 @@
-"""Bringing what is recorded onto the disk every few seconds, beside the thread that writes it."""
+"""Periodic sync of a recording to the disk, in a separate thread."""
 
 from __future__ import annotations
 
@@ -8,28 +8,28 @@ from types import TracebackType
 
 __all__ = ["SYNC_EVERY_S", "Confirm", "Syncer"]
 
-# What a power cut costs, beside the second that waits to be written and the time that a sync takes.
+# Data lost in a power cut, plus the second that waits to be written and the duration of a sync.
 SYNC_EVERY_S = 2.0
-# A user who interrupts does not wait longer for a disk that hangs.
+# After an interrupt, a hanging disk delays the end by at most this time.
 _LAST_S = 1.0
 
-# Is told that what was written before is on the disk, or what the disk said instead.
+# Called when the data written before are on the disk, or with the error of the disk.
 Confirm = Callable[[OSError | None], None]
 
 
 class Syncer:
-    """A thread that syncs a file every few seconds, and at once when it is asked. A context manager.
+    """A thread that syncs a file every few seconds, and at once on request. A context manager.
 
-    The thread that writes never waits for it: a sync that takes long only makes the next one late.
+    The writing thread never waits for it: a long sync only delays the next one.
 
     Parameters
     ----------
-    sync : brings onto the disk what was written before it is called.
+    sync : syncs the data written before the call.
     every_s : time from the end of a sync to the begin of the next.
 
     Attributes
     ----------
-    fault : what the disk said when a sync failed first: what was written before may be lost.
+    fault : the error of the first failed sync: data written before it may be lost.
     """
 
     def __init__(self, sync: Callable[[], None], every_s: float = SYNC_EVERY_S) -> None:
@@ -53,7 +53,7 @@ class Syncer:
         self._thread.join(_LAST_S if isinstance(error, KeyboardInterrupt) else None)
 
     def soon(self, confirm: Confirm) -> None:
-        """Sync at once, or when the sync that goes on has ended, and ``confirm`` it from the thread."""
+        """Sync at once, or after the running sync, and ``confirm`` it from the thread."""
         with self._changed:
             self._asked.append(confirm)
             self._changed.notify()

@@ -46,7 +46,7 @@ class Accuracy:
         return [row for row in rows if (row.scheme == CROSS_VALIDATION) == cross_validated]
 
     def rmse_m(self, row: CameraEvaluation, errors: ErrorStatistics | None) -> float | None:
-        """Return the root-mean-square of a row's errors in space, or of those on the floor."""
+        """Return the RMSE of a row in space, or on the floor."""
         repeats = count_repeats(row, self.evaluation.cameras if self.evaluation else ())
         return None if errors is None or repeats is None else root_mean_square_m(errors, repeats)
 

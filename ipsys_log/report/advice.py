@@ -176,7 +176,7 @@ def _rank(model: str) -> int:
 def _sentences(
     choices: Mapping[int, Mapping[str, Choice]], table: Mapping[int, Sequence[_Candidate]]
 ) -> Iterable[str]:
-    """Which model with how many places, and what the others save."""
+    """Return advice on the model by the number of points."""
     if len({candidate.model for found in table.values() for candidate in found}) == 1:
         means_cm = [found[0].mean_m * CM_PER_M for _, found in sorted(table.items())]
         name = next(iter(table.values()))[0].model
@@ -218,7 +218,7 @@ def _span(places: Sequence[int]) -> str:
 def _saving(
     start: str, model: str, usual: Choice, most: int, table: Mapping[int, Sequence[_Candidate]]
 ) -> Iterable[str]:
-    """From how few places a model is as good as the usual one is with most of them."""
+    """Return the least number of points with which a model is as good as the usual one with most points."""
     if model == usual.model:
         return
     means_m = {places: c.mean_m for places, found in table.items() for c in found if c.model == model}

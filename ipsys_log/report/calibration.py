@@ -36,7 +36,7 @@ def calibration_table(found: Calibrated) -> Table:
 
 
 def calibration_lines(found: Calibrated) -> list[str]:
-    """How good it is, and what was left out."""
+    """Return lines on the quality of the result, and on the data that were left out."""
     coverage, counts = found.coverage, [f"{len(found.used)} used"]
     counts += [f"{len(found.dropped)} bad"] if found.dropped else []
     counts += [f"{len(found.spare)} not needed"] if found.spare else []
@@ -57,7 +57,7 @@ def _degrees(angle_rad: float | None) -> str:
 
 
 def _dropped_lines(dropped: tuple[Dropped, ...], what: str) -> list[str]:
-    """Return what happened to pictures and why, a line for each reason, the most frequent first."""
+    """Return a line for each reason why pictures were left out, the most frequent first."""
     counts = Counter(drop.reason for drop in dropped)
     lines = []
     for reason, count in counts.most_common():

@@ -31,21 +31,21 @@ __all__ = [
     "robots_table",
 ]
 
-# After so long the rate at which a log grows is known better than it was expected.
+# After this time, the measured growth of a log is better than the estimate.
 _SETTLED_S = 5.0
 # More robots than these do not fit into a window of 24 lines; as many ids of markers fit into a line.
 _MOST_ROBOTS, _MOST_IDS = 10, 8
 
 
 class LiveStatus:
-    """What is shown on the screen while cameras send.
+    """The display on the terminal while cameras send.
 
     Parameters
     ----------
     states, monitor : of the cameras.
     target : the log that is written.
     now_s : a clock for rates.
-    expected_bytes_per_s : of the log, until it can be measured; None where it does not grow with the time.
+    expected_bytes_per_s : of the log, until it can be measured; None if it does not grow with time.
     """
 
     def __init__(
@@ -83,7 +83,7 @@ class LiveStatus:
         return Group(*parts)
 
     def _disk(self, took_s: float) -> Text:
-        """The size of the log, and how long the disk lasts at the rate at which the log has grown."""
+        """Return the size of the log, and how long the disk lasts at its measured growth."""
         size = self._target.stat().st_size if self._target.exists() else 0
         folder = self._target.absolute().parent
         free = shutil.disk_usage(folder).free

@@ -29,12 +29,12 @@ def plain_table(title: str, names: Iterable[str], figures: Iterable[str] = ()) -
 
 
 def name_cell(text: str) -> Text:
-    """Return a name out of a log, with nothing in it that a terminal or a table would obey."""
+    """Return a name from a log, without control characters for a terminal or a table."""
     return Text(plain_text(text))
 
 
 def wrap_text(text: str, indent: str = "") -> str:
-    """Break lines between words so that they fit; what follows is indented as the first line."""
+    """Wrap lines between words; later lines have the indentation of the first."""
     parts = (
         wrap(part, _WIDTH, initial_indent=indent, subsequent_indent=indent) for part in text.splitlines()
     )

@@ -17,12 +17,12 @@ PICTURES = (".png", ".pdf", ".svg", ".jpg", ".jpeg", ".webp")
 
 
 def check_file(path: Path, option: str, logs: Iterable[Path]) -> None:
-    """See that a file can be written, before there is work that would be lost.
+    """Check that a file can be written, before any work is done.
 
     Raises
     ------
     IpsysError
-        Where it cannot, or where it is one of the logs.
+        It cannot be written, or it is one of the logs.
     """
     if any(log.exists() and path.exists() and path.samefile(log) for log in logs):
         raise IpsysError(f"{option} {path}: this is the log itself; name another file")
@@ -82,7 +82,7 @@ def write_files(folder: Path, files: Mapping[str, bytes]) -> None:
             with partial.open("wb") as file:
                 file.write(content)
                 file.flush()
-                os.fsync(file.fileno())  # else a power cut may leave a new name with nothing in it
+                os.fsync(file.fileno())  # else a power cut may leave an empty file under the new name
         for path, partial in partials.items():
             partial.replace(path)
     finally:

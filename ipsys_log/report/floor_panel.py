@@ -104,7 +104,7 @@ def draw_ground(axes: Axes, rig: Rig | None, around_m: Sequence[NDArray[np.float
 
 
 class Square(NamedTuple):
-    """The part of the floor that a map shows: its middle (2,) and half of its side, in m.
+    """The part of the floor on a map: its centre (2,) and half of its side, in m.
 
     Square axes of a square part have the same scale both ways.
     """
@@ -193,8 +193,7 @@ def _draw_errors(axes: Axes, scene: Scene, styles: Mapping[str, tuple[str, str]]
 
 
 def exaggeration(errors_m: Sequence[NDArray[np.float64]], span_m: float) -> int:
-    """How many times as long errors (n, 2 or 3) are drawn on a map of this width, so that most of them are
-    seen and none covers much of the floor."""
+    """Return the scale of errors (n, 2 or 3) on a map: most are visible, none covers much of the floor."""
     usual_m = float(np.quantile(np.linalg.norm(np.array(errors_m)[:, :2], axis=1), 0.9))
     fitting = [factor for factor in _FACTORS if factor * usual_m <= _ARROW_SHARE * span_m]
     return fitting[-1] if fitting else 1

@@ -1,4 +1,4 @@
-"""Prints on pages of paper, as a PDF at true size: cutting marks, captions, and a ruler to check by."""
+"""Prints on pages of paper, as a PDF at true size, with cutting marks, captions and a ruler."""
 
 from __future__ import annotations
 
@@ -58,7 +58,7 @@ PAPERS = {
 
 @dataclass(frozen=True, slots=True, eq=False)
 class Placed:
-    """A print on a page: where the top left of its black is, in mm from the bottom left of the page."""
+    """A print on a page, with the top left of its black in mm from the bottom left of the page."""
 
     what: Print
     x_mm: float
@@ -79,7 +79,7 @@ def choose_paper(prints: Sequence[Print], name: str | None) -> Paper:
     Raises
     ------
     IpsysError
-        For a name that is not known, or a print that is too large: how large it can be.
+        The name is not known, or a print is too large; the text gives the largest size.
     """
     if name is not None and name.lower() not in PAPERS:
         raise IpsysError(f"--page {name}: is none of {', '.join(PAPERS)}")
@@ -137,7 +137,7 @@ def _size_mm(what: Print) -> tuple[float, float]:
 
 
 def _orientation(what: Print, paper: Paper) -> Paper | None:
-    """Return the paper as the print fits onto it, upright or, for a board, turned; None where it does not."""
+    """Return the paper, upright or, for a board, turned; None if the print does not fit."""
     width_mm, height_mm = _size_mm(what)
     for turned in (paper, paper.turned()) if what.is_board else (paper,):
         room_mm = turned.room_mm
@@ -194,7 +194,7 @@ def _blank(paper: Paper) -> tuple[Figure, Axes]:
 
 
 def _draw_black(axes: Axes, placed: Placed) -> None:
-    """One path for all that is black, so that nothing of it is drawn twice."""
+    """Draw all black parts as one path, so that no part is drawn twice."""
     loops = [np.vstack([polygon, polygon[:1]]) for polygon in placed.what.polygons]
     codes = [
         code
@@ -206,7 +206,7 @@ def _draw_black(axes: Axes, placed: Placed) -> None:
 
 
 def _draw_marker_text(axes: Axes, placed: Placed) -> None:
-    """Below the margin: an arrow that points to the front of the marker, and what it is."""
+    """Draw an arrow to the front of the marker below the margin, and the caption."""
     what = placed.what
     width_mm = _size_mm(what)[0]
     left_mm = placed.x_mm + what.width_mm / 2 - width_mm / 2 + 1.5

@@ -1,4 +1,4 @@
-"""Markers and calibration boards that are printed: what is black on them, and how much paper they take."""
+"""Markers and calibration boards for printing: their black polygons, and their size on paper."""
 
 from __future__ import annotations
 
@@ -30,12 +30,12 @@ class Print:
 
     Attributes
     ----------
-    name : as an error calls it.
-    polygons : what is black, each (n, 2): x to the right and y down, from the top left of the black.
+    name : for error messages.
+    polygons : the black parts, each (n, 2): x to the right and y down, from the top left of the black.
     width_mm, height_mm : of the black.
     margin_mm : of white around it.
     lines : of text beside it.
-    is_board : a board has a page of its own.
+    is_board : a board has a separate page.
     """
 
     name: str
@@ -76,9 +76,9 @@ def rig_prints(rig: Rig, ids: Sequence[int] | None = None, length_m: float | Non
 
 
 def board_print(board: Board, text: str) -> Print:
-    """Return the print of a calibration board; ``text`` is what ``ipsys calibrate --board`` calls it.
+    """Return the print of a calibration board; ``text`` is its name for ``ipsys calibrate --board``.
 
-    The layout is that which ``ipsys calibrate`` and OpenCV since 4.6 look for.
+    The layout is that of ``ipsys calibrate`` and OpenCV since 4.6.
     """
     square_mm = board.square_m * MM_PER_M
     squares = black_squares(board)

@@ -1,4 +1,4 @@
-"""What a repair has brought back, and what is gone, in words."""
+"""The result of a repair in words: saved and lost messages."""
 
 from __future__ import annotations
 
@@ -30,12 +30,12 @@ def repair_lines(report: RepairReport) -> Iterator[str | Table]:
         yield f"{report.path} {'repaired' if report.changed else 'is whole, nothing changed'}: {kept}"
     yield from _about_the_loss(report)
     if report.unchecked:
-        yield f"{report.unchecked} of them were saved from damaged chunks: no CRC says that they are right"
+        yield f"{report.unchecked} of them were saved from damaged chunks: no CRC confirms them"
     if report.kept_in is not None:
         yield f"all bytes that were taken out are kept in {report.kept_in}"
     yield from report.notes[:_MOST_NOTES]
     if len(report.notes) > _MOST_NOTES:
-        yield f"and {len(report.notes) - _MOST_NOTES} places more"
+        yield f"and {len(report.notes) - _MOST_NOTES} more places"
     if report.changed and report.messages_kept:
         yield from _about_the_rig(report)
     if report.cut_off and report.messages_kept:
@@ -43,15 +43,15 @@ def repair_lines(report: RepairReport) -> Iterator[str | Table]:
 
 
 def _about_the_loss(report: RepairReport) -> Iterator[str | Table]:
-    """How much cannot be read, and which messages are gone with it, as far as that is known."""
+    """Yield the number of unreadable bytes, and the lost messages as far as they are known."""
     if not (report.bytes_lost or report.gone):
         return
     if report.gone and report.uncounted:
-        named = "these messages are gone, and others: how many is not known:"
+        named = "these messages are gone, and an unknown number of others:"
     elif report.gone:
         named = "these messages are gone:"
     elif report.uncounted:
-        named = "how many messages were in them is not known"
+        named = "the number of messages in them is not known"
     else:
         named = "no message was in them"
     yield f"{format_bytes(report.bytes_lost)} cannot be read; {named}"

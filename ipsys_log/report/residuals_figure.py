@@ -61,7 +61,7 @@ def residual_scale(findings: Findings, accuracies: Sequence[Accuracy]) -> Residu
     lengths_cm = np.concatenate([_lengths_cm(findings, each) for each in missed])
     square = square_around(findings.rig, [places_m])
     factor = exaggeration(list(errors_m), 2 * square.half)
-    # Make room for the arrows, as far as that keeps the floor large.
+    # Make room for the arrows, while the floor stays large.
     reach_m = 1.01 * np.abs(places_m + factor * errors_m - square.middle).max()
     half_m = float(np.clip(reach_m, square.half, _WIDER * square.half))
     return ResidualScale(float(np.quantile(lengths_cm, 0.95)), factor, Square(square.middle, half_m))

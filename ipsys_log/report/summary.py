@@ -50,7 +50,7 @@ def _best_lines(accuracies: Sequence[Accuracy], best: Accuracy) -> Iterator[str 
         return
     space = in_space(accuracies)
     several = len(accuracies) > 1
-    knows = ", told the height of each marker" if told_height(best.model) else ""
+    knows = ", with known marker heights" if told_height(best.model) else ""
     yield Text(f"{'Best model' if several else 'Model'}: {name_cell(best.model)}{knows}", style="bold")
     yield f"Mean position error: {_figures(judged(row, space), best.rmse_m(row, judged(row, space)))}"
     cameras = {found.camera for found in (best.evaluation.cameras if best.evaluation else ())} - {POOLED}
@@ -95,7 +95,7 @@ def _cm(value_m: float) -> str:
 
 
 def _outlier_lines(accuracies: Sequence[Accuracy]) -> Iterator[str | Text]:
-    """Yield the outliers, the worst first; the first ones with what would explain them."""
+    """Yield the outliers, the worst first; the first ones with a possible explanation."""
     suspects = gather_suspects(accuracies)
     if not suspects:
         searched = "none" if any(map(_screened, accuracies)) else f"not searched: {_needed()}"
@@ -103,7 +103,7 @@ def _outlier_lines(accuracies: Sequence[Accuracy]) -> Iterator[str | Text]:
         return
     yield f"Outliers: measure {_count(len(suspects), 'point')} again, the worst first:"
     for suspect, _ in suspects[:_EXPLAINED]:
-        text = suspect.text or "nothing simple explains it"
+        text = suspect.text or "no simple mistake explains it"
         name = name_cell(suspect.measurement).plain
         yield Text(wrap_text(f"{name}, {_length(suspect.residual_m)} cm off: {text}.", indent="  "))
     if rest := suspects[_EXPLAINED:]:
@@ -191,7 +191,7 @@ def _held_out(row: CameraEvaluation | None, space: bool) -> str:
 
 
 def _two(value_m: float | None) -> str:
-    """Return a length in cm with two digits behind the point, and none where a column would burst."""
+    """Return a length in cm with two decimals, or none if a column would be too wide."""
     if value_m is None:
         return "-"
     value_cm = value_m * CM_PER_M

@@ -21,7 +21,7 @@ from ipsys_log.units import CM_PER_M
 
 __all__ = ["accuracy_tables"]
 
-# A longer name of a model goes on in the next line, where there is one.
+# A longer model name continues in the next line, if there is one.
 _NAME_WIDTH = 14
 _FOUND_BY_WIDTH = 18
 # The camera of a row over all cameras.
@@ -80,7 +80,7 @@ def _named(accuracy: Accuracy, rows: Sequence[tuple[str, str, list[str]]]) -> li
 
 
 def _break(name: str, lines: int) -> list[str]:
-    """Break a long name behind ``+`` and ``-`` into as many lines as there are."""
+    """Break a long name after ``+`` and ``-`` into the given number of lines."""
     parts = re.findall(r"[^+-]+[+-]?", name)
     if len(name) <= _NAME_WIDTH or lines < 2 or len(parts) < 2:
         return [name]
@@ -164,7 +164,7 @@ def _advice_table(advice: Advice) -> Group:
             str(places), *(_choice(found[group]) if group in found else "-" for group in advice.groups)
         )
     lower = any(one.lowest != one.model for found in advice.choices.values() for one in found.values())
-    note = "In brackets: the lowest mean error, where a simpler model is as good within the noise."
+    note = "In brackets: the lowest mean error, if a simpler model is as good within the noise."
     return Group(title, table, *([Text(wrap_text(note))] if lower else []))
 
 

@@ -1,4 +1,4 @@
-"""What a log holds that models are made of: measured places, and models that were fitted or copied in."""
+"""Model inputs in a log: measured points, and models that were fitted or copied into it."""
 
 from __future__ import annotations
 
@@ -54,13 +54,14 @@ MIN_OFFSETS, LEAST_OFFSET_PX = 10, 0.05
 def wanted_models(request: Request, until: str, paths: Sequence[Path] = ()) -> tuple[str, ...]:
     """Return the names of the models to fit or apply.
 
-    Those of the request; without any, ``poly`` or another one of ``model_from``; those that were copied into
-    the logs of ``paths``, where these have no measurements to fit to; all, to evaluate; ``poly``.
+    The first that applies: the models of the request; ``poly`` or another one of ``model_from``; the models
+    that were copied into the logs of ``paths``, if these have no measurements to fit to; all models, to
+    evaluate; ``poly``.
 
     Raises
     ------
     IpsysError
-        For a name that is not in the table, or a log that has no fitted model to apply.
+        A name is not in the table, or a log has no fitted model to apply.
     """
     for name in request.models:
         create(name)
@@ -159,7 +160,7 @@ def split_parameters(session: Session, request: Request) -> dict[str, str]:
 
 
 def find_pairs(session: Session, points: str, places: list[Measured]) -> dict[str, list[Pair]]:
-    """What each camera saw of the measured places."""
+    """Return the observations of the measured points by camera."""
     sightings = gather_sightings(session.messages(session.topics(CameraPoints, points)))
     return build_pairs(sightings, places)
 
@@ -171,7 +172,7 @@ def skipped_frames(session: Session) -> set[int]:
 
 
 def has_late_frames(session: Session) -> bool:
-    """Whether a log says of frames that they came late, so that their times are not right."""
+    """Return whether a log has events about late frames with wrong times."""
     events = session.payloads(session.topics(Event))
     return any(event.kind == STAMP_UNRELIABLE for event in events)
 

@@ -126,7 +126,7 @@ def opened_target(paths: Sequence[Path], output: Path | None) -> Iterator[tuple[
 
 
 def _give_name(partial: Path, output: Path) -> None:
-    """Rename without overwriting what another process may have put there meanwhile."""
+    """Rename without overwriting a file that another process may have created meanwhile."""
     try:
         os.link(partial, output)
     except FileExistsError:
@@ -135,7 +135,7 @@ def _give_name(partial: Path, output: Path) -> None:
     except OSError:  # a filesystem without hard links
         _check_free(output)
         partial.rename(output)
-    with suppress(OSError):  # it has its name, and all that is in it is safe
+    with suppress(OSError):  # the file has its name, and all its data are safe
         DISK.fsync_directory(output.parent)
 
 

@@ -52,8 +52,8 @@ def perform(
 ) -> Outcome:
     """Find the run that has done ``task``, or ``make`` it and append it to ``target``.
 
-    A run that was cut short is completed, if what it holds is what is made now. Where the newest run of such
-    a task is out of date, that is said before a new one is made beside it.
+    An interrupted run is completed, if its content equals the present result. If the newest run of such a
+    task is out of date, a remark says so before a new run is made.
     """
     # A name given by the user is for what was asked for, not for the detection on the way to it.
     named = task.stage == until or (task.stage not in SHARED_STAGES and until not in SHARED_STAGES)
@@ -81,12 +81,12 @@ def perform(
 
 
 def _say_renewal(session: Session, task: Task, record: Run, say: Callable[[str], None]) -> None:
-    """Say that the newest run of a task is out of date, and how much is computed again."""
+    """Print that the newest run of a task is out of date, and how much is computed again."""
     method = method_of(session, record)
 
     def is_such(one: Recorded) -> bool:
         is_same = (one.run.stage, one.method) == (task.stage, method)
-        # Where the positions are other ones, the stage that made them has said so.
+        # If the positions have changed, the stage that made them has reported it.
         return is_same and (task.stage != "fuse" or one.run.input_runs == record.input_runs)
 
     such = [one for one in recorded_stages(session) if is_such(one)]
@@ -194,10 +194,10 @@ def record_of(session: Session, task: Task) -> Run:
 
 
 def inputs(session: Session, task: Task, progress: Progress) -> Iterator[Message]:
-    """What a causal stage is sent: what holds before the first frame, then its channels in log order.
+    """Yield the input of a causal stage: settings before the first frame, then its channels in log order.
 
-    The first rig and lenses of the log hold from its start, also where they were recorded a little
-    later; what the user gave instead of them comes first.
+    The first rig and intrinsics of the log are valid from its start, even if they were recorded a little
+    later. Settings given by the user come first.
     """
     yield from _settings(session, task.lenses, task.rig)
     for topic in sorted(task.topics):

@@ -1,4 +1,4 @@
-"""What can be said to be wrong before anything is computed."""
+"""Checks of the input before any computation."""
 
 from __future__ import annotations
 
@@ -26,12 +26,12 @@ __all__ = ["check_inputs"]
 
 
 def check_inputs(paths: Sequence[Path], request: Request, models: Sequence[str], until: str) -> None:
-    """Look at what the stages up to ``until`` need.
+    """Check the inputs of the stages up to ``until``.
 
     Raises
     ------
     IpsysError
-        For the first thing that is missing or cannot be right, and what to do about it.
+        An input is missing or invalid; the text names the first one and what to do.
     """
     wanted = STAGES[: STAGES.index(until) + 1]
     _check_request(paths, request, models)
@@ -56,7 +56,7 @@ def check_inputs(paths: Sequence[Path], request: Request, models: Sequence[str],
 
 
 def _check_versions(session: Session, request: Request, models: Sequence[str], wanted: Sequence[str]) -> None:
-    """See that nothing that newer software has made would be made again by this one."""
+    """Check that this software would not repeat a result of newer software."""
     corners = request.corners or usual_corners(session.images, {*session.calibrations, *request.lenses})
     methods = {"detect": {corners}, "camera-frame": {request.method}, "fuse": {""}}
     for one in recorded_stages(session):
@@ -138,7 +138,7 @@ def _check_lenses(session: Session, request: Request, cameras: set[str]) -> None
 
 
 def _check_distortion(session: Session, request: Request, cameras: set[str]) -> None:
-    """See that the calibrations that a log holds can be computed with, unless others are given."""
+    """Check that the calibrations in a log are valid, unless others are given."""
     for name in sorted(cameras - set(request.lenses)):
         topic = session.calibrations.get(name)
         first = None if topic is None else next(iter(session.messages([topic])), None)

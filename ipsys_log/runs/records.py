@@ -30,7 +30,7 @@ __all__ = [
 
 @dataclass(frozen=True, slots=True)
 class Outcome:
-    """What became of one stage: the run that holds it, whether it was made just now, what to know of it."""
+    """The outcome of a stage: its run, whether it was made now, and remarks."""
 
     stage: str
     run: str
@@ -56,27 +56,27 @@ def fingerprint() -> dict[str, str]:
 
 
 def read_channels(session: Session, topics: Iterable[str]) -> tuple[ChannelRead, ...]:
-    """What a stage reads, known again by its content (law 4 of the log)."""
+    """An input of a stage, identified by its content (law 4 of the log)."""
     return tuple(ChannelRead(topic, session.count(topic), session.hash(topic)) for topic in sorted(topics))
 
 
 def _essence(run: Run) -> bytes:
-    """What makes two runs of a stage the same: everything but names, times and the environment."""
+    """The identity of a run of a stage: all except names, times and the environment."""
     return encode(replace(run, timestamp=0, run="", fingerprint={}, input_runs=(), outputs=(), number=0))
 
 
 def complete_runs(session: Session) -> list[Run]:
-    """Return the records whose channels are all there, oldest first."""
+    """Return the records whose channels are all in the log, oldest first."""
     return [run for run in session.runs() if is_complete(session, run)]
 
 
 def is_complete(session: Session, run: Run) -> bool:
-    """Return whether all that a stage wrote is in the log."""
+    """Return whether all channels of a stage are in the log."""
     return all(session.count(output.topic) >= output.messages for output in run.outputs)
 
 
 def find_run(session: Session, wanted: Run, name: str | None = None) -> str | None:
-    """Return the name of the newest complete run that has done just what ``wanted`` would do, if any."""
+    """Return the name of the newest complete run with the inputs and parameters of ``wanted``, if any."""
     essence = _essence(wanted)
     for run in reversed(complete_runs(session)):
         if run.stage == wanted.stage and name in (None, run.run) and _essence(run) == essence:

@@ -1,4 +1,4 @@
-"""What a user should know of a stage, and what a user has to decide before it is written."""
+"""Remarks on a stage, and decisions that a user has to make before it is written."""
 
 from __future__ import annotations
 
@@ -33,13 +33,13 @@ class Remarks:
         self._offsets_px: dict[str, array[float]] = {}
 
     def watch(self, messages: Iterable[Message]) -> Iterator[Message]:
-        """The messages, unchanged.
+        """Yield the messages, unchanged.
 
         Raises
         ------
         IpsysError
-            For an ambiguous marker, where no frame can be decoded, or where no marker of the rig is in any
-            frame, or none that can be measured.
+            A marker is ambiguous, no frame can be decoded, or no frame shows a marker of the rig that can be
+            measured.
         """
         for message in messages:
             self._note(message)

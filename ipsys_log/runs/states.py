@@ -1,4 +1,4 @@
-"""The state of recorded runs: whether this software would make the same of the log as it is now."""
+"""The state of recorded runs: whether this software would compute the same from the log."""
 
 from __future__ import annotations
 
@@ -26,11 +26,11 @@ class Recorded:
     Attributes
     ----------
     run : the record of the stage.
-    method : its corner method, camera-point method or model; "" where the stage has none.
-    state : ``current``, ``out of date: <reason>``, ``not repeatable``, ``unfinished``, or what to do where
-        newer software has made it.
+    method : its corner method, camera-point method or model; "" if the stage has none.
+    state : ``current``, ``out of date: <reason>``, ``not repeatable``, ``unfinished``, or what to do if newer
+        software made it.
     out_of_date : the software, the log or an input run has changed since, and the stage can be repeated.
-    is_newer : newer software has made it.
+    is_newer : newer software made it.
     """
 
     run: Run
@@ -41,7 +41,7 @@ class Recorded:
 
     @property
     def is_of_other_version(self) -> bool:
-        """Whether older or newer software has made it, which need not give the same."""
+        """Return whether older or newer software made it, with perhaps another result."""
         names = versioned_names(self.run.stage, self.method)
         return any(recorded_version(self.run, name) != VERSIONS.get(name) for name in names)
 
@@ -80,7 +80,7 @@ def is_fitted_here(run: Run) -> bool:
 
 
 def method_of(session: Session, run: Run) -> str:
-    """Return the corner method, camera-point method or model of a stage; "" where it has none."""
+    """Return the corner method, camera-point method or model of a stage; "" if it has none."""
     if run.stage == "detect":
         return run.parameters.get("corners", "")
     if run.stage == "camera-frame":

@@ -1,4 +1,4 @@
-"""What each stage reads of a log, and what makes its result what it is: the plan of a replay."""
+"""The plan of a replay: the inputs and the parameters of each stage."""
 
 from __future__ import annotations
 
@@ -344,7 +344,7 @@ def _locate(session: Session, request: Request, points: str, model: str) -> Task
 def _fuse(session: Session, request: Request, positions: str) -> Task | str:
     rig, topics = _rig(session, request, "fuse")
     topics += session.topics(Positions, positions)
-    if has_late_frames(session):  # a log without any has the runs that it had
+    if has_late_frames(session):  # a log without such events keeps its runs
         topics.append(EVENTS_TOPIC)
     return Task(
         "fuse",

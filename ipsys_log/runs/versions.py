@@ -1,8 +1,7 @@
 """Versions of the stages, of their methods and of the models.
 
-A version is raised by one with each change after which the output differs for the same input. A run names
-the versions that it was made by among its parameters; it does not name version 1. Versions of packages make
-no run out of date: they are in its fingerprint.
+A version rises by one with each change of the output for the same input. The parameters of a run name its
+versions, except version 1. Versions of packages make no run out of date: they are in its fingerprint.
 """
 
 from __future__ import annotations
@@ -43,11 +42,11 @@ def version_parameters(stage: str, method: str = "") -> dict[str, str]:
 
 
 def versioned_names(stage: str, method: str = "") -> list[str]:
-    """Return what has a version in a stage, the stage first."""
+    """Return the parts of a stage that have versions, the stage first."""
     return [stage, *(part for part in method.split("+") if part)]
 
 
 def recorded_version(run: Run, name: str) -> int:
-    """Return the version of a stage, method or model that a run was made by."""
+    """Return the version of a stage, method or model that made a run."""
     text = run.parameters.get(name, "1")
     return int(text) if text.isascii() and text.isdigit() and len(text) <= _MOST_DIGITS else 1

@@ -55,19 +55,19 @@ def opened_log(
     progress: Progress = lambda stage, done, total: None,
     say: Callable[[str], None] = lambda text: None,
 ) -> Iterator[FinishedLog]:
-    """Open a log for measuring; markers and camera points that it lacks are made and appended first.
+    """Open a log for measuring; missing markers and camera points are computed and appended first.
 
     Parameters
     ----------
     path : a finished log.
     request : its rig and lenses are used instead of the log's.
-    say : is told which of its runs are out of date.
+    say : called with the runs that are out of date.
 
     Raises
     ------
     IpsysError
-        For a log that cannot be written to, a rig without two reference points, or a log in which no marker
-        of the rig lies still.
+        The log cannot be written to, the rig lacks two reference points, or no marker of the rig is
+        stationary in the log.
     """
     with LogWriter.append(path) as writer:
         writer.abandon()

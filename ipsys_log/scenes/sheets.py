@@ -22,7 +22,7 @@ __all__ = ["add_sheet", "check_sheet"]
 
 @dataclass(frozen=True, slots=True, eq=False)
 class _Row:
-    """A row of a sheet, what the cameras saw of it, and what follows; ``stop`` says why they saw nothing."""
+    """A row of a sheet, the observations of its marker, and the result; ``stop`` says why there are none."""
 
     line: int
     entry: Entry
@@ -52,16 +52,16 @@ def add_sheet(scene: FinishedLog, path: Path, insist: bool = False) -> list[str]
     ----------
     scene : the log.
     path : of the sheet.
-    insist : write rows all the same that look wrong and can be right.
+    insist : also write rows that look wrong but may be right.
 
     Returns
     -------
-    What is known badly, and what looks wrong in rows that were insisted on, by line.
+    Remarks on uncertain points, and on rows that look wrong but were written, by line.
 
     Raises
     ------
     IpsysError
-        Naming every bad row by its line, with what contradicts it.
+        Rows are bad; the text names each by its line, with the contradiction.
     """
     rows = list(_sighted(scene, read_sheet(path, scene.rig, scene.start_ns)))
     model, name = scene.model, THE_MODEL
@@ -87,7 +87,7 @@ def _by_line(rows: Sequence[_Row], texts: Sequence[Sequence[str]], rig: Rig) -> 
 
 
 def _sighted(scene: FinishedLog, rows: Sequence[SheetRow]) -> Iterator[_Row]:
-    """Find the stretch of each row, and what the cameras saw of its marker then."""
+    """Find the stationary interval of each row, and the observations of its marker then."""
     read = [read_typed(row.typed, scene.rig) for row in rows]
     stops = find_stops(rows, scene.stops, [entry.marker_id for entry, _ in read])
     for row, (entry, faults), stop in zip(rows, read, stops, strict=True):
@@ -119,7 +119,7 @@ def _fit(scene: FinishedLog, rows: Sequence[_Row], checked: Sequence[Checked]) -
 def _doubts(
     rows: Sequence[_Row], checked: Sequence[Checked], scene: FinishedLog, model: Model | None
 ) -> list[list[str]]:
-    """Return what contradicts each row; with the other such row that its numbers fit, if there is one."""
+    """Return the contradictions of each row, and another such row that its numbers fit, if there is one."""
     doubtful = [row for row, one in zip(rows, checked, strict=True) if one.contradictions]
     doubts = []
     for row, one in zip(rows, checked, strict=True):
@@ -132,7 +132,7 @@ def _doubts(
 
 
 def _fits(row: _Row, other: _Row, scene: FinishedLog, model: Model | None) -> bool:
-    """Return True where the numbers of a row fit what the cameras saw at another row."""
+    """Return True if the numbers of a row fit the observations of another row."""
     if other is row or other.sight is None:
         return False
     entry = replace(row.entry, marker_id=other.entry.marker_id, id=None)

@@ -20,12 +20,12 @@ class Fading:
 
     def __init__(self, clear: Callable[[Entity, int, int], None]) -> None:
         self._clear = clear
-        self._seen: dict[Entity, tuple[int, int]] = {}  # when it is overdue, in publish and in log time
-        # One entry for each entity, not later than it is overdue: it may have been seen again since.
+        self._seen: dict[Entity, tuple[int, int]] = {}  # expiry time, in publish and in log time
+        # One entry for each entity, not later than its expiry: it may have been drawn again since.
         self._checks: list[tuple[int, Entity]] = []
 
     def seen(self, entity: Entity, message: Message, fade_ns: int) -> None:
-        """Note that something is drawn; with 0 it stays until the next time."""
+        """Note that an entity is drawn; with 0 it stays until it is drawn again."""
         if fade_ns <= 0:
             return
         overdue_ns = message.log_time_ns + fade_ns
@@ -34,7 +34,7 @@ class Fading:
         self._seen[entity] = (message.publish_time_ns + fade_ns, overdue_ns)
 
     def advance(self, log_time_ns: int) -> None:
-        """Clear what is overdue by now."""
+        """Clear the expired entities."""
         while self._checks and self._checks[0][0] < log_time_ns:
             _, entity = self._checks[0]
             publish_ns, overdue_ns = self._seen[entity]

@@ -92,7 +92,7 @@ def _stream(session: Session, shown: Shown, write: Callable[[bytes], object]) ->
 
 
 def _draw(session: Session, shown: Shown, recording: rr.RecordingStream, sent: Callable[[], object]) -> None:
-    """Draw all of a session; ``sent`` is called now and then, and at the end."""
+    """Draw a whole session; ``sent`` is called repeatedly, and at the end."""
     rig = rig_in_force(session, [run for run in (shown.markers, *shown.runs) if run])
     measurements = session.payloads(session.topics(Measurement))
     places, faults = measured_places(measurements, rig)

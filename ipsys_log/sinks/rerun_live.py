@@ -1,4 +1,4 @@
-"""What happens now, in Rerun: messages on their way into a viewer, in a thread of its own."""
+"""Live display in Rerun: a separate thread sends messages to a viewer."""
 
 from __future__ import annotations
 

@@ -31,7 +31,7 @@ from ipsys_log.sinks.trails import Segment, Trails
 __all__ = ["RerunSink", "trail_entity"]
 
 Entity = tuple[str, ...]
-Kind = Any  # a class of what Rerun draws, such as rr.Points3D
+Kind = Any  # a Rerun archetype, such as rr.Points3D
 Fields = Mapping[str, Any]
 
 # Rerun counts pixels from the first pixel's corner, OpenCV from its centre.
@@ -42,7 +42,7 @@ _LINE, _THIN, _DOT = (rr.Radius.ui_points(width) for width in (1.5, 0.75, 0.5))
 
 
 def tracks_entity(run: str | None) -> Entity:
-    """Where the tracks of a run are drawn; without a run the truth."""
+    """Return the entity path of the tracks of a run; without a run, that of the ground truth."""
     return ("world", "truth") if run is None else ("world", "runs", run)
 
 
@@ -115,12 +115,12 @@ class RerunSink:
             draw(message)
 
     def flush(self) -> None:
-        """Draw what waited: many rows of an entity at once take a fraction of the time."""
+        """Draw the waiting rows: many rows of an entity at once take a fraction of the time."""
         for entity in list(self._waiting):
             self._send(entity)
 
     def close(self) -> None:
-        """Draw everything that waited."""
+        """Draw all waiting rows."""
         self._trails.close()
         self.flush()
         self._recording.flush()
@@ -135,7 +135,7 @@ class RerunSink:
         self._recording.log(list(entity), *what, strict=True)
 
     def _log_moved(self, message: Message, entity: Entity, kind: Kind, moved: Fields, look: Fields) -> None:
-        """Draw where something is now, and its look only where that is new: it takes most of the time."""
+        """Draw the position of an entity, and its appearance only if that is new: that takes most time."""
         key, time_ns = str(look), message.publish_time_ns
         before = self._looks.get(entity, _NO_LOOK)
         last_ns, is_late = max(before.last_ns, time_ns), time_ns < before.since_ns
@@ -143,7 +143,7 @@ class RerunSink:
             self._looks[entity] = before._replace(last_ns=last_ns)
             self._add(message, entity, kind, moved)
             return
-        # Behind a late message it is not known which look is the newest one.
+        # After a late message, the newest appearance is not known.
         now = _Look(None, before.since_ns, last_ns) if is_late else _Look(key, time_ns, last_ns)
         self._looks[entity] = now
         self._send(entity)
@@ -153,7 +153,7 @@ class RerunSink:
         self._waiting.setdefault(entity, (kind, []))[1].append((when, fields))
 
     def _send(self, entity: Entity) -> None:
-        """Draw the rows of an entity that waited."""
+        """Draw the waiting rows of an entity."""
         if entity not in self._waiting:
             return
         kind, rows = self._waiting.pop(entity)

@@ -25,7 +25,7 @@ __all__ = ["Attached"]
 _LIMIT_BYTES = 256 << 20
 _TICK_S = 0.1
 _REMEMBERED = 20_000
-# A disk that takes longer is no disk to measure onto; a user waits for the answer.
+# Longest wait of the user for the disk when a point is saved.
 _SAVED_S = 10.0
 # Whoever interrupts does not wait longer for a camera that hangs.
 _LAST_S = 1.0
@@ -108,7 +108,7 @@ class Attached:
         self._ending = True
 
     def __iter__(self) -> Generator[Message | None, None, None]:
-        """Who asks for the next message has written the last one; who stops asking closes this."""
+        """Requesting the next message acknowledges the previous write; ending the iteration closes this."""
         try:
             while True:
                 if self._ending:
@@ -171,7 +171,7 @@ class Attached:
         raise SourceError("maybe not saved: the disk does not answer; look into the log")
 
     def confirm(self, message: Message, fault: OSError | None = None) -> None:
-        """Say that a message is on the disk, or what the disk said instead. Any thread may."""
+        """Report that a message is on the disk, or the error of the disk. Any thread may call it."""
         with self._arrived:
             for saving in self._saving:
                 if saving.log_time_ns == message.log_time_ns:
@@ -244,13 +244,13 @@ class Attached:
         self._stopped.set()
         self._heartbeat.stop()
         for attendant in self._attendants:
-            if attendant.thread.ident is not None:  # an interrupt may come before all were started
+            if attendant.thread.ident is not None:  # an interrupt may come before all threads were started
                 attendant.thread.join(seconds)
 
 
 @dataclass(eq=False, slots=True)
 class _Saving:
-    """What a caller of ``save`` waits for: written by the thread that iterates, then on the disk."""
+    """The state that a caller of ``save`` waits for: written by the iterating thread, then on the disk."""
 
     arrival: Arrival
     log_time_ns: int | None = None

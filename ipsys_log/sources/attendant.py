@@ -259,7 +259,7 @@ class Attendant:
             self._say("frames_missed", f"{missed} frames of camera {name} were lost before they came")
 
     def _name_late(self, now_ns: int) -> None:
-        """Say before a frame without a stamp that it is late, and so are others after it."""
+        """Make an event before the first late frame without a stamp."""
         stall = self._late.take(now_ns)
         if stall is None:
             return
@@ -271,7 +271,7 @@ class Attendant:
         self._say(STAMP_UNRELIABLE, text, stall.start_ns)
 
     def _name_caught_up(self) -> None:
-        """Say after the last frame that was late from when to when its times are not right."""
+        """Make an event after the last late frame, with the range of the wrong times."""
         start_ns, end_ns = self._late.since_ns, self._late.last_ns
         if start_ns is None or end_ns is None or not self._late.caught_up():
             return
@@ -291,7 +291,7 @@ class Attendant:
             self._say(kind, text)
 
     def _say(self, kind: str, text: str, start_ns: int | None = None, end_ns: int | None = None) -> None:
-        """An event of this camera, said at once too."""
+        """Make an event of this camera, and print it at once."""
         now_ns = self._shared.clock.now_ns()
         event = Event(now_ns, kind, text, self._camera.name, None, start_ns, end_ns)
         self._shared.put(Arrival(now_ns, EVENTS_TOPIC, now_ns, event))

@@ -54,12 +54,12 @@ def check_devices(cameras: Iterable[RigCamera]) -> None:
 
 
 def check_sources(cameras: Iterable[RigCamera]) -> None:
-    """See that each camera has a source that something here can open, as far as its text shows.
+    """Check that each camera has a source that can be opened, as far as its text shows.
 
     Raises
     ------
     IpsysError
-        Otherwise; also where a file or a device is not there.
+        A source is invalid, or its file or device does not exist.
     """
     for camera in cameras:
         source = str(camera.source)

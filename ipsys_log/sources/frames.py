@@ -28,20 +28,20 @@ class Frame(NamedTuple):
     missed: int = 0
 
 
-# More than two clocks can differ when they are read one after the other.
+# More than the difference of two clocks that are read one after the other.
 _LEAST_SLEEP_NS = NS_PER_S // 100
 
 
 class Clock:
     """UTC that never jumps back: the monotonic clock, anchored to UTC once.
 
-    The monotonic clock stands while the machine sleeps; what it slept is added.
+    The monotonic clock stops while the machine sleeps; the time of the sleep is added.
     """
 
     def __init__(self) -> None:
         self._offset_ns = time.time_ns() - time.monotonic_ns()
         self._asleep_ns = _asleep_ns()
-        # From which time of the monotonic clock on how much is added.
+        # Start time on the monotonic clock, and the offset from then on.
         self._sleeps_ns = [(0, 0)]
         self._read_ns = time.monotonic_ns()
 
@@ -53,13 +53,13 @@ class Clock:
         return self.of_monotonic_ns(self._read_ns)
 
     def of_monotonic_ns(self, monotonic_ns: int) -> int:
-        """A stamp of the monotonic clock, as V4L2's are, in UTC."""
+        """Return a stamp of the monotonic clock, such as V4L2's, in UTC."""
         slept_ns = next(slept for since, slept in reversed(self._sleeps_ns) if since <= monotonic_ns)
         return monotonic_ns + self._offset_ns + slept_ns
 
 
 def _asleep_ns() -> int:
-    """How long the machine has slept since it was started; 0 where the system does not tell."""
+    """Return the time that the machine has slept since its start; 0 if the system does not tell."""
     if not hasattr(time, "CLOCK_BOOTTIME"):
         return 0
     return time.clock_gettime_ns(time.CLOCK_BOOTTIME) - time.monotonic_ns()

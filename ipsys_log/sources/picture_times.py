@@ -23,12 +23,12 @@ _ISO = re.compile(r"(\d{4}-\d\d-\d\d)[T_ ](\d\d)[:.-](\d\d)[:.-](\d\d)([.,]\d{1,
 
 
 def parse_time(text: str) -> int:
-    """A time in ns since 1970: ns, us, ms or s since then, or ISO 8601 (UTC unless it says otherwise).
+    """Return a time in ns since 1970: from ns, us, ms or s since then, or ISO 8601 (UTC by default).
 
     Raises
     ------
     ValueError
-        Where it is none of these.
+        The text is none of these.
 
     Examples
     --------
@@ -45,7 +45,7 @@ def parse_time(text: str) -> int:
         number = Decimal(text)
     except InvalidOperation as error:
         raise ValueError(text) from error
-    # The exponent of 1e999999999 is not to be written out.
+    # The exponent of 1e999999999 must not be expanded.
     whole_digits = number.adjusted() + 1 if number.is_finite() else 0
     if whole_digits not in _DIGITS or number < 0:
         raise ValueError(text)

@@ -30,12 +30,12 @@ __all__ = ["Seat", "lens_of", "open_simulated", "parse_source", "show_board"]
 
 _TURN_S = 0.4
 _LATENCY_NS = 4_000_000
-# Of a board that a source asks for. The size of its squares scales nothing that a lens has.
+# Squares of a board that a source names. Intrinsics do not depend on their size.
 _SQUARE_M, _MARKER_SCALE, _DICTIONARY = 0.03, 0.75, "DICT_4X4_50"
 
 
 class Seat(NamedTuple):
-    """What a simulated camera looks at: a lab, by which of its cameras, and a board before it, if any."""
+    """The scene of a simulated camera: a lab, the number of its camera, and a board before it, if any."""
 
     lab: LabSettings
     number: int
@@ -43,11 +43,11 @@ class Seat(NamedTuple):
 
 
 class _Stopped(Exception):  # noqa: N818
-    """Nobody needs the pictures any more."""
+    """The pictures are not needed any more."""
 
 
 class _Pictures:
-    """The pictures of a film, drawn in a thread of its own in the order in which they are needed."""
+    """The pictures of a film, rendered by a separate thread in the order of their use."""
 
     def __init__(self, name: str, make_film: Callable[[Check], Film], timing: _Timing, clock: Clock) -> None:
         self._film: Film | None = None
@@ -62,7 +62,7 @@ class _Pictures:
         self._stopped.set()
 
     def picture(self, frame: int) -> bytes | None:
-        """Return what a frame shows; None where that is not drawn yet."""
+        """Return the picture of a frame; None if it is not rendered yet."""
         if self._fault is not None:
             raise self._fault
         return None if self._film is None else self._drawn.get(self._film.index_of(frame))
@@ -95,10 +95,10 @@ class _Pictures:
 def open_simulated(camera: RigCamera, clock: Clock, say: Say) -> Iterator[Iterator[Frame | None]]:
     """The frames of a simulated camera, as :data:`~ipsys_log.sources.frames.Open` says.
 
-    Most markers of the lab lie still; the others drive to and fro. Or a board is held before the camera.
-    Each picture is drawn once, in a thread of its own, and shown again and again; a frame whose picture is
-    not drawn yet does not come. Which picture a frame shows follows from the clock alone: all cameras of a
-    lab see the robots at the same places, in whatever process.
+    Most markers of the lab are stationary; the others drive to and fro. Or a board is shown before the
+    camera. Each picture is rendered once, by a separate thread, and shown repeatedly. A frame is skipped if
+    its picture is not rendered yet. The clock alone decides the picture of a frame: all cameras of a lab see
+    the robots at the same places, in all processes.
 
     Parameters
     ----------
@@ -133,12 +133,12 @@ def open_simulated(camera: RigCamera, clock: Clock, say: Say) -> Iterator[Iterat
 
 
 def parse_source(camera: RigCamera) -> Seat:
-    """Parse what a source says: the lab, which of its cameras, and the board before it.
+    """Parse a source: the lab, the camera, and the board before it.
 
     Raises
     ------
     IpsysError
-        Where the lab has no such camera, or no such setting or board, or the value is none.
+        The lab has no such camera, setting or board, or a value is invalid.
 
     Examples
     --------
@@ -157,7 +157,8 @@ def parse_source(camera: RigCamera) -> Seat:
             continue
         if key not in known:
             raise IpsysError(
-                f"camera {camera.name}: the simulated lab has no setting {key!r}: board, {', '.join(known)}"
+                f"camera {camera.name}: the simulated lab has no setting {key!r}; "
+                f"it has board, {', '.join(known)}"
             )
         try:
             values[key] = known[key](text)
@@ -199,19 +200,19 @@ def show_board(camera: RigCamera, board: str) -> RigCamera:
 
 
 def lens_of(camera: RigCamera) -> CameraCalibration:
-    """The lens through which a simulated camera sees.
+    """Return the intrinsics of a simulated camera.
 
     Raises
     ------
     IpsysError
-        Where there is no such camera in the simulated lab.
+        The simulated lab has no such camera.
     """
     lab, number, _ = parse_source(camera)
     return replace(hang_cameras(lab)[number].lens, frame_id=camera.name)
 
 
 class _Timing(NamedTuple):
-    """When frames are exposed, stamped and handed over."""
+    """Times at which frames are exposed, stamped and delivered."""
 
     # Times since 1970 are too long for floating point.
     period_ns: Fraction
@@ -233,7 +234,7 @@ class _Timing(NamedTuple):
 def _play(pictures: _Pictures, timing: _Timing, clock: Clock) -> Iterator[Frame | None]:
     frame = 0
     while True:
-        # A reader that comes late has missed some.
+        # A late reader has missed some.
         frame = max(frame + 1, timing.frame_at(clock.now_ns()))
         time_ns = round(frame * timing.period_ns)
         while (left_s := (time_ns - (clock.now_ns() - timing.behind_ns)) / NS_PER_S) > 0:

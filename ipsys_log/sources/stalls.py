@@ -1,8 +1,8 @@
-"""Times at which the recorder stood still, and the frames that came late because of that.
+"""Detection of stalls of the recorder, and of the late frames that follow them.
 
-A program that is stopped, swapped out or asleep with its machine reads nothing. What cameras send meanwhile
-waits in buffers and comes in a burst afterwards. Frames with a capture stamp keep their time; others get that
-of their arrival, which is wrong until the burst is over.
+A program that is stopped, swapped out or asleep with its machine reads nothing. Frames wait in buffers
+meanwhile, and arrive in a burst afterwards. Frames with a capture stamp keep their time. The others get the
+time of their arrival, which is wrong until the burst is over.
 """
 
 from __future__ import annotations
@@ -17,10 +17,10 @@ from ipsys_log.units import NS_PER_S
 
 __all__ = ["STALL_NS", "Heartbeat", "LateFrames", "Stall"]
 
-# Threads of a busy machine wait less long. Robots are slow: at 1 m/s that is 25 cm.
+# Longer than threads of a busy machine wait. A robot at 1 m/s moves 25 cm in this time.
 STALL_NS = NS_PER_S // 4
 _BEAT_S = 0.05
-# The camera's usual pace is the median of so many intervals; it is back when so many in a row are as long.
+# The usual interval of a camera is the median of so many; it is back after so many usual ones in a row.
 _USUAL, _AGAIN = 60, 5
 _LIKE_BEFORE = 0.7
 _FASTEST_HZ = 60.0
@@ -34,11 +34,11 @@ class Stall(NamedTuple):
 
 
 class Heartbeat:
-    """Notes the time again and again; where it was not noted for long, the recorder stood still.
+    """A thread that notes the time periodically; a long gap means that the recorder stood still.
 
     Parameters
     ----------
-    clock : goes on while the machine sleeps.
+    clock : continues while the machine sleeps.
     """
 
     def __init__(self, clock: Clock) -> None:
@@ -49,16 +49,16 @@ class Heartbeat:
         self._stopped = threading.Event()
 
     def start(self) -> None:
-        """Beat from a thread of its own."""
+        """Note the time in a separate thread."""
         self._stopped.clear()
         threading.Thread(target=self._run, name="heartbeat", daemon=True).start()
 
     def stop(self) -> None:
-        """End that thread."""
+        """Stop the thread."""
         self._stopped.set()
 
     def beat(self, now_ns: int) -> Stall | None:
-        """Note a time, and return the newest stall. Any thread may: the first that runs again finds it."""
+        """Note a time, and return the newest stall. The first thread that runs again finds it."""
         with self._lock:
             if self._last_ns is not None and now_ns - self._last_ns > STALL_NS:
                 self._newest = Stall(self._last_ns + 1, now_ns)  # a frame may have come at the last time
@@ -71,17 +71,17 @@ class Heartbeat:
 
 
 class LateFrames:
-    """Tells for one camera without capture stamps which of its frames come late after a stall.
+    """A detector of the late frames after a stall, for one camera without capture stamps.
 
-    From a stall on they do, until frames come at the camera's usual pace again.
+    Frames are late from a stall on, until they come at the camera's usual rate again.
 
     Parameters
     ----------
-    rate_hz : of the camera, for as long as no pace is known.
+    rate_hz : of the camera, used until its usual rate is known.
 
     Attributes
     ----------
-    since_ns : when the stall began that frames are late from, None while they are in time.
+    since_ns : start of the stall that made frames late, None while they are in time.
     last_ns : arrival of the last frame.
     """
 
@@ -95,10 +95,10 @@ class LateFrames:
         self._after_ns: deque[int] = deque(maxlen=_AGAIN)
 
     def take(self, now_ns: int) -> Stall | None:
-        """Take the arrival of a frame; returns a stall that it is the first to be late from."""
+        """Note the arrival of a frame; return a stall if this is its first late frame."""
         stall, before_ns = self._heartbeat.beat(now_ns), self.last_ns
         self.last_ns = now_ns
-        if before_ns is None:  # what was before the first frame is over
+        if before_ns is None:  # a stall before the first frame does not matter
             self._stall = stall
             return None
         if stall is not None and stall != self._stall:
@@ -114,7 +114,7 @@ class LateFrames:
         return None
 
     def caught_up(self) -> bool:
-        """Return whether the frames that were late have all come; then the next ones are in time."""
+        """Return whether all late frames have arrived; then the next ones are in time."""
         usual_ns = median(self._usual_ns) if len(self._usual_ns) >= _AGAIN else self._least_ns
         if (
             self.since_ns is None

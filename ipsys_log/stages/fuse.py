@@ -36,11 +36,11 @@ class Fuse:
     that saw the robot within ``window_ns``: at 2 m/s a robot moves 1 cm in 5 ms, so cameras that do
     not run in step are not averaged. Cameras that do give a pose each, the last of them from all.
 
-    A pose speaks of the instant at which its marker was exposed: markers of a frame with time offsets
+    A pose is valid for the instant at which its marker was exposed: markers of a frame with time offsets
     (rolling shutter) go out as messages of their own, earlier ones first. Two such cameras see a robot in
     different rows, up to 30 ms apart; beyond the window they are not averaged either.
 
-    Frames that came late, as an event of their camera says, have wrong times: their positions are in no pose.
+    Late frames, named by an event of their camera, have wrong times: their positions are in no pose.
     """
 
     def __init__(self, run: str, window_ns: int = 5_000_000) -> None:
@@ -48,7 +48,7 @@ class Fuse:
         self._window_ns = window_ns
         self._rig: Rig | None = None
         self._latest: dict[int, dict[str, tuple[int, Position]]] = {}
-        # By camera, the first and the last time of the frames that came late last; None for no end so far.
+        # By camera, the start and end time of its last late frames; None if there is no end yet.
         self._late_ns: dict[str, tuple[int, int | None]] = {}
 
     def __call__(self, message: Message) -> Iterator[Any]:

@@ -32,7 +32,7 @@ _KEPT = 30
 
 
 def build_app(scene: Scene) -> Starlette:
-    """The page of a scene, without a guard; its questions under ``/api``."""
+    """Return the page of a scene, without a guard; its requests are under ``/api``."""
     questions = _Questions(scene)
     return Starlette(
         routes=[
@@ -62,11 +62,11 @@ async def _refused(_: Request, error: Exception) -> Response:
 
 
 async def _gone(_: Request, __: Exception) -> Response:
-    return Response(status_code=400)  # nobody reads it
+    return Response(status_code=400)  # the client has gone
 
 
 async def _failed(_: Request, error: Exception) -> Response:
-    text = f"a fault of ipsys: {type(error).__name__}: {error}; the terminal says more when the command ends"
+    text = f"a fault of ipsys: {type(error).__name__}: {error}; the terminal shows more when the command ends"
     return JSONResponse({"error": text}, 500)
 
 
@@ -139,7 +139,7 @@ class _Questions:
 
 
 def _whole_number(text: str) -> int | None:
-    """The number in a request; None for anything else, and for more digits than any number there has."""
+    """Return the number in a request; None for other values, and for too many digits."""
     return int(text) if text.isascii() and text.isdecimal() and len(text) <= _MOST_DIGITS else None
 
 
@@ -151,7 +151,7 @@ async def _body(request: Request) -> dict[str, Any]:
             raise IpsysError("that is more than a place needs")
     try:
         body = json.loads(data)
-        json.dumps(body, ensure_ascii=False).encode()  # half a character cannot be answered
+        json.dumps(body, ensure_ascii=False).encode()  # half of a surrogate pair cannot be sent
     except (ValueError, RecursionError) as error:
         raise IpsysError("this is not JSON") from error
     if not isinstance(body, dict):

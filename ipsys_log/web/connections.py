@@ -1,4 +1,4 @@
-"""Connections to the page: bounded in number and time, so that a recorder keeps its descriptors."""
+"""Connections to the page: limited in number and time, so that a recorder keeps its descriptors."""
 
 from __future__ import annotations
 
@@ -14,7 +14,7 @@ from uvicorn.server import ServerState
 
 __all__ = ["Connections", "Limits", "derive_limits"]
 
-# Cameras, the log and libraries of a recorder need the others.
+# Cameras, the log and libraries of a recorder need the other descriptors.
 _SHARE_OF_DESCRIPTORS = 8
 _MIN_TOTAL, _MAX_TOTAL = 12, 64
 # A browser opens up to six.
@@ -26,7 +26,7 @@ _RETRY_S = 0.2
 
 
 class Limits(NamedTuple):
-    """Bounds on open connections.
+    """Limits of open connections.
 
     Attributes
     ----------
@@ -64,7 +64,7 @@ class Connections:
         while True:
             try:
                 peer, _ = await loop.sock_accept(listening)
-            except OSError:  # no descriptor is left, or the caller has gone already
+            except OSError:  # no descriptor is left, or the client has gone already
                 await asyncio.sleep(_RETRY_S)
                 continue
             try:
@@ -74,12 +74,12 @@ class Connections:
             await asyncio.sleep(_PAUSE_S)
 
     def abort(self) -> None:
-        """Close all connections without waiting for their callers."""
+        """Close all connections without waiting for their clients."""
         for connection in list(self._addresses):
             connection.abort()
 
     def add(self, connection: _Connection, address: str) -> None:
-        """Add a new connection, and close the one that has to make room for it."""
+        """Add a new connection, and close another one to make room if necessary."""
         self._addresses[connection] = address
         neighbours = [other for other, its in self._addresses.items() if its == address]
         if len(neighbours) > self._limits.per_address:
@@ -95,14 +95,14 @@ class Connections:
         return _Connection(self, self._limits.request_s, self._config, self._state)
 
     def _close_oldest(self, connections: Iterable[_Connection]) -> None:
-        # The new connection has no answer yet: where all others have one, it goes itself.
+        # The new connection has no answer yet: if all others have one, it is closed itself.
         oldest = next(connection for connection in connections if not connection.is_answered)
         self.remove(oldest)
         oldest.abort()
 
 
 class _Connection(H11Protocol):
-    """One connection; aborted when an answer takes too long, whoever is the slow one."""
+    """A connection; aborted when an answer takes too long, because of either side."""
 
     def __init__(self, owner: Connections, request_s: float, config: Config, state: ServerState) -> None:
         super().__init__(config, state, {})
@@ -127,7 +127,7 @@ class _Connection(H11Protocol):
         super().connection_lost(exc)
 
     def abort(self) -> None:
-        """Close the connection at once; an answer that the caller has not taken is lost."""
+        """Close the connection at once; an unread answer is lost."""
         self.transport.abort()
 
     def _restart_timer(self) -> None:

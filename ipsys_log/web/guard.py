@@ -1,4 +1,4 @@
-"""Who may use the page: whoever knows the token, through an address of this machine, from the page itself."""
+"""Access control of the page: by the token, an address of this machine, and the origin of the request."""
 
 from __future__ import annotations
 
@@ -65,7 +65,7 @@ class Guard:
             if scope["method"] == "GET" and scope["path"] == "/" and self._fits(given):
                 return self._welcome(scope)
             if not any(map(self._fits, self._cookies(headers, scope))):
-                return _refuse("open the page by the whole address that ipsys has printed")
+                return _refuse("open the page with the full address that ipsys printed")
         if scope["method"] not in ("GET", "HEAD"):
             origin = headers.get("origin")
             if headers.get(HEADER) != "1" or (origin is not None and origin != f"http://{host}"):
@@ -92,8 +92,8 @@ class Guard:
     def _cookies(self, headers: Headers, scope: Scope) -> Iterator[str]:
         """Yield the values of our cookie.
 
-        Other programs on this host send theirs along, in any form. A strict parser (``http.cookies``) drops
-        the whole header for one of them.
+        The header also has cookies of other programs on this host, in any form. A strict parser
+        (``http.cookies``) drops the whole header for one bad cookie.
         """
         for header in headers.getlist("cookie"):
             for pair in header.split(";"):

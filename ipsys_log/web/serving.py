@@ -29,9 +29,9 @@ _LOOPBACK = "127.0.0.1"
 _STEP_S = 0.02
 _TURN_S = 0.1
 _BACKLOG = 128
-# Cookies of other programs on this machine come along: a browser sends 4 kB of each.
+# A browser also sends cookies of other programs on this machine, up to 4 kB each.
 _MAX_HEADER_BYTES = 64 << 10
-# The screen belongs to a recording: what the server has to say is kept by Faults.
+# The screen belongs to a recording: Faults keeps the messages of the server.
 _SILENT: dict[str, Any] = {
     "version": 1,
     "disable_existing_loggers": False,
@@ -62,15 +62,14 @@ def serving(
 
     Parameters
     ----------
-    host : the address to listen on; None: this machine alone, without a token.
-    port : 0 takes any that is free.
+    host : the address to listen on; None: only this machine, without a token.
+    port : 0 takes any free port.
     limits : of connections; None: as many as a recorder can spare.
 
     Raises
     ------
     IpsysError
-        For a port that is taken or not allowed, a host that is not of this machine, or a server that does
-        not start.
+        The port is taken or not allowed, the host is not of this machine, or the server does not start.
     """
     token = None if host is None else secrets.token_urlsafe(12)
     with _listen(host or _LOOPBACK, port) as listening:
@@ -98,7 +97,7 @@ def serving(
 
 
 def _run(server: uvicorn.Server, listening: socket.socket, limits: Limits, faults: Faults) -> None:
-    """Serve until ``server.should_exit``. A fault ends this thread and nothing else."""
+    """Serve until ``server.should_exit``. A fault ends only this thread."""
     try:
         asyncio.run(_serve(server, listening, limits, faults))
     except Exception as error:

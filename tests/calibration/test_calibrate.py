@@ -96,7 +96,7 @@ def test_pictures_that_are_all_soft() -> None:
 
 def test_corners_that_are_far_off_are_said_to_be() -> None:
     looked = sightings(everywhere(), 0.5, noise_px=1.0)
-    assert any("px off: see that the board is flat" in note for note in calibrated(looked).notes)
+    assert any("px: check that the board is flat" in note for note in calibrated(looked).notes)
 
 
 def through_fisheye() -> Looked:
@@ -107,14 +107,14 @@ def through_fisheye() -> Looked:
 
 
 def test_pinhole_on_a_fisheye_is_refused() -> None:
-    with pytest.raises(IpsysError, match=r"px off \(RMS\).*--lens fisheye leaves 0\.1\d px: use it; or give"):
+    with pytest.raises(IpsysError, match=r"error is .*--lens fisheye leaves 0\.1\d px: use it; or give"):
         calibrate("red", through_fisheye(), BOARD, LENSES["pinhole4"])
 
 
 def test_pinhole_on_a_fisheye_insisted_on_is_noted() -> None:
     result = calibrate("red", through_fisheye(), BOARD, LENSES["pinhole4"], insist=True)
     assert result.rms_px > 2
-    assert "written only for --force: corners are" in result.notes[0]
+    assert "written only for --force: the RMS reprojection error is" in result.notes[0]
 
 
 def test_too_few_say_what_to_add() -> None:

@@ -199,7 +199,7 @@ def test_too_few_pictures(ipsys: Ipsys, red: Path, tmp_path: Path) -> None:
     for path in list(red.iterdir())[4:]:
         path.unlink()
     line = refused(ipsys, tmp_path, red, "--board", "6x4", "-o", tmp_path)
-    assert "only 4 of 4 pictures can be used, but a lens needs 5 or more" in line
+    assert "only 4 of 4 pictures can be used, but a calibration needs 5 or more" in line
     assert "take at least 15" in line
 
 
@@ -212,7 +212,7 @@ def test_pictures_of_two_sizes_are_refused_before_looking(
     monkeypatch.setattr("ipsys_log.calibration.look.view_board", None)
     line = refused(ipsys, tmp_path, red, "--board", "6x4", "-o", tmp_path)
     assert "pictures have 2 sizes: 12 of 480 x 360 px (0.png, 1.png ...); 9 of 640 x 480 px (990.png" in line
-    assert "put the pictures of each size into a folder of their own" in line
+    assert "put the pictures of each size into a separate folder" in line
 
 
 def test_a_stray_picture_of_another_size_is_left_out_and_named(
@@ -274,16 +274,14 @@ def test_pictures_without_the_board_are_named(ipsys: Ipsys, red: Path, tmp_path:
 
 def test_better_model_is_named(ipsys: Ipsys, red: Path, tmp_path: Path) -> None:
     done = calibrate(ipsys, red, "--board", "6x4", "--lens", "pinhole", "-o", tmp_path)
-    assert re.search(
-        r"corners are 0\.\d+ px off; --lens (fisheye|pinhole8) leaves 0\.0\d px: use it", done.err
-    )
+    assert re.search(r"error is 0\.\d+ px; --lens (fisheye|pinhole8) leaves 0\.0\d px: use it", done.err)
 
 
 def test_pinhole_on_real_fisheye_is_refused(ipsys: Ipsys, data: Path, tmp_path: Path) -> None:
     folder = data / "fisheye_chessboard"
     done = ipsys("calibrate", folder, "--board", "6x4", "--lens", "pinhole", "-o", tmp_path)
     assert done.code == 1
-    assert "corners are 3.7 px off (RMS)" in done.err
+    assert "the RMS reprojection error is 3.7 px" in done.err
     assert "--lens fisheye leaves 0.22 px: use it; or give --force" in done.err
     assert list(tmp_path.iterdir()) == []
 

@@ -113,7 +113,7 @@ def test_rig_of_other_cameras_is_refused(ipsys: Ipsys, lab: Path) -> None:
     for command in (("detect", lab), ("measure", lab, "--places")):
         line = refused(ipsys, lab, *command, "--rig", rig)
         assert "describes the cameras left, right, but there are only black, red, white" in line
-        assert "rename its cameras, or take out its [[cameras]]" in line
+        assert "rename its cameras, or remove its [[cameras]]" in line
 
 
 def test_rig_of_some_cameras_is_a_remark(ipsys: Ipsys, lab: Path) -> None:

@@ -317,7 +317,7 @@ def check(path: Path, sample: Sample, damaged: Damaged, other: Sample) -> Outcom
         out.refused = str(error).replace(str(path), "log")
         if path.read_bytes() != damaged.data or [*path.parent.iterdir()] != [path]:
             out.complaints.append("a refused log was changed")
-        if owed or "cannot be made whole" in out.refused:
+        if owed or "was not changed. Keep a copy" in out.refused:
             out.complaints.append(f"refused: {out.refused}")
         return out
     out.changed = out.report.changed

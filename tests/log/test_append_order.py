@@ -95,8 +95,8 @@ def test_reading_command_names_repair_for_an_append_cut_short(ipsys: Ipsys, path
         done = ipsys("info", path)
         assert done.code == 0
         lines = done.err.splitlines()
-        assert lines in ([], [f"{path}: an append to it was cut short; it is read as it was before. "
-                              f"Mend it with: ipsys repair {path}"])  # fmt: skip
+        assert lines in ([], [f"{path}: an append to it was interrupted; ipsys reads the old log. "
+                              f"Repair it with: ipsys repair {path}"])  # fmt: skip
         said.append(bool(lines))
         if lines:
             with LogWriter.append(path) as other:  # another process is at it, and mends it itself
@@ -159,9 +159,9 @@ def test_words_after_a_failed_append_are_true(
         storage = Failing(first, error, for_good)
         fault = error_of_append(path, storage)
         if fault:
-            assert "as it was" in fault
+            assert "the log is unchanged" in fault or "the old log" in fault
             assert ("free some space" in fault) == (error == errno.ENOSPC)
-            assert ("stays as it was" in fault) == (path.read_bytes() == whole)
+            assert ("the log is unchanged" in fault) == (path.read_bytes() == whole)
             assert ("ipsys repair" in fault) == (path.read_bytes() != whole)
             assert len(rows_of(path)) == len(OLD)
             said.add("not put back" if "ipsys repair" in fault else "as it was")

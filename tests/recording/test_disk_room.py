@@ -77,7 +77,7 @@ def test_measuring_says_what_a_place_takes(
     with opening(rig_that_plays(lab), tmp_path / "a.mcap", None, "measuring") as status:
         line, _ = status_line(status)
     assert line.endswith("left on the disk")
-    said = re.search(r"about ([\d.]+) MB for each place; [\d.]+ [GT]B free in", capsys.readouterr().err)
+    said = re.search(r"about ([\d.]+) MB for each point; [\d.]+ [GT]B free in", capsys.readouterr().err)
     assert said is not None
     assert math.isclose(float(said[1]) * 1e6, 1.5 * 30 * first_bytes(lab), abs_tol=0.06e6)
 

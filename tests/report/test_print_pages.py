@@ -190,7 +190,7 @@ def test_outlines_enclose_the_black_cells(rows: list[list[bool]]) -> None:
         (("--ids", "1", "--length", "0.1", "--page", "a5"), "--page a5: is none of a4, letter, a3"),
         (("--board", "20x10"), "make its squares smaller, with --square"),
         (("--board", "6"), "write the inner corners of a chessboard as 6x4"),
-        (("--ids", "1", "--length", "0.1", "-o", "m.png"), "only PDF keeps the size"),
+        (("--ids", "1", "--length", "0.1", "-o", "m.png"), "only PDF keeps the true size"),
     ],
 )
 def test_impossible_prints_are_refused(

@@ -110,7 +110,7 @@ def test_bytes_cut_away_are_named_with_unknown_count(tmp_path: Path, monkeypatch
     data[-9_000:] = b"\xff" * 9_000
     cut.write_bytes(data)
     said = lines(cut)
-    assert any("cannot be read; how many messages were in them is not known" in line for line in said)
+    assert any("cannot be read; the number of messages in them is not known" in line for line in said)
     assert "all bytes that were taken out are kept in cut.mcap.damaged" in said
     assert not any("no whole message" in line for line in said)
 

@@ -75,7 +75,7 @@ def test_without_the_token_nothing_is_told(shared: Caller, path: str) -> None:
     for attempt in ({}, {"Cookie": f"{cookie}={wrong}"}, {"Cookie": f"{cookie}="}, {"Cookie": "\xff=;;"}):
         status, text, _ = shared.ask("GET", path, **attempt)
         assert status == 403
-        assert "the whole address that ipsys has printed" in text
+        assert "the full address that ipsys printed" in text
     assert shared.ask("GET", f"{path}?token={wrong}")[0] == 403
 
 

@@ -32,12 +32,12 @@ _TRIES = 60
 
 
 def board_cells(board: Board) -> tuple[NDArray[np.bool_], float]:
-    """Return which cells of a print of a board are black, white margin included, and a cell's side in m.
+    """Return a mask of the black cells of a printed board, with its white margin, and a cell's side in m.
 
     Raises
     ------
     IpsysError
-        For a ChArUco board whose markers' cells do not divide a square evenly.
+        The cells of the markers of a ChArUco board do not divide a square evenly.
     """
     per_square = _cells_per_square(board)
     black = black_squares(board).repeat(per_square, axis=0).repeat(per_square, axis=1)
@@ -113,7 +113,7 @@ def _hold(
 
 
 def _facing(ray: Array) -> Array:
-    """Axes (3, 3) of a board that faces the camera, in camera coordinates; its y axis is up in the image."""
+    """Return the axes (3, 3), in camera coordinates, of a board that faces the camera, y up in the image."""
     right = np.cross([0.0, 1.0, 0.0], ray)
     right /= np.linalg.norm(right)
     return np.column_stack([right, np.cross(-ray, right), -ray])

@@ -1,4 +1,4 @@
-"""The frames that a live simulated camera shows over and over, drawn one by one while it shows them."""
+"""The repeated frames of a live simulated camera, rendered one by one while they are shown."""
 
 from __future__ import annotations
 
@@ -19,13 +19,13 @@ from ipsys_log.sources.simulator.views import View, prepare_view
 
 __all__ = ["Film", "board_film", "lab_film", "next_missing", "shown_at"]
 
-# A board is held still for so long in each pose.
+# Duration of each pose of a board.
 _HOLD_S = 0.6
 
 
 @dataclass(frozen=True, slots=True, eq=False)
 class Film:
-    """Pictures of a camera, and which of them each frame shows.
+    """Pictures of a camera, and the picture of each frame.
 
     ``draw`` makes the JPEG picture of an index from 0 to ``count``; ``index_of`` tells the index for the
     number of a frame since 1970, so that all cameras of a lab agree. It repeats after ``period`` frames.
@@ -38,13 +38,13 @@ class Film:
 
 
 def lab_film(settings: LabSettings, number: int, check: Check) -> Film:
-    """Return the film of one camera of the live lab: markers lie still, and others drive to and fro.
+    """Return the film of one camera of the live lab, with stationary markers and driving ones.
 
     Parameters
     ----------
-    settings : of the lab; ``drive_s`` is how long the robots drive in one direction.
+    settings : of the lab; the robots drive for ``drive_s`` in one direction.
     number : which of its cameras.
-    check : called between the steps; what it raises ends the work.
+    check : called between the steps; its exceptions end the work.
     """
     lab = plan_live_lab(settings)
     count = max(round(settings.drive_s * settings.rate_hz), 1)
@@ -59,7 +59,7 @@ def lab_film(settings: LabSettings, number: int, check: Check) -> Film:
 
 
 def board_film(settings: LabSettings, number: int, board: Board, check: Check) -> Film:
-    """Return the film of a camera before which a calibration board is held, in one pose after the other.
+    """Return the film of a camera with a calibration board, in one pose after the other.
 
     Parameters
     ----------
@@ -78,7 +78,7 @@ def board_film(settings: LabSettings, number: int, board: Board, check: Check) -
 
 
 def shown_at(frame: int, count: int) -> int:
-    """Which of ``count`` drawn frames the frame of a number shows: to and fro.
+    """Return which of ``count`` pictures a frame shows, by its number: to and fro.
 
     Examples
     --------

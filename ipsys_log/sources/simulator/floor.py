@@ -19,7 +19,7 @@ __all__ = ["Check", "lay_floor", "pixel_rays"]
 
 Array = NDArray[np.float64]
 Plane = NDArray[np.float32]
-# Called between two steps of long work; what it raises ends the work.
+# Called between two steps of long work; its exceptions end the work.
 Check = Callable[[], None]
 
 # A step of the work, so that an interrupt need not wait for all of it, and what it needs stays in the caches.
@@ -37,8 +37,8 @@ def pixel_rays(lens: CameraCalibration, border_px: int, check: Check = lambda: N
 
     Parameters
     ----------
-    lens, border_px : of the camera; how wide the border is.
-    check : called between the steps; what it raises ends the work.
+    lens, border_px : of the camera; the width of the border.
+    check : called between the steps; its exceptions end the work.
 
     Returns
     -------
@@ -57,7 +57,7 @@ def pixel_rays(lens: CameraCalibration, border_px: int, check: Check = lambda: N
 def lay_floor(settings: LabSettings, camera: Camera, rays: Array, check: Check = lambda: None) -> Plane:
     """Grey levels of the empty floor, (h, w), for the rays of a camera (h, w, 2).
 
-    ``check`` is called between the steps; what it raises ends the work.
+    ``check`` is called between the steps; its exceptions end the work.
     """
     floor = np.empty(rays.shape[:2], dtype=np.float32)
     for first in range(0, len(rays), _ROWS):

@@ -1,6 +1,6 @@
-"""The simulated lab that cameras see live: most markers lie still for good, a few drive to and fro.
+"""The simulated lab of live cameras: most markers are stationary, a few drive to and fro.
 
-Nobody has to hurry: a marker can be aligned by, and measured, whenever a command looks.
+A stationary marker can be used for alignment and measured at any time.
 """
 
 from __future__ import annotations
@@ -38,9 +38,9 @@ __all__ = ["LIVE_SETTINGS", "LiveLab", "live_rig", "plan_live_lab", "tape_sheet"
 LIVE_SETTINGS = LabSettings(
     width=1280, height=720, rate_hz=10.0, stations=18, drive_s=4.0, noise_sigma=1.0, jpeg_quality=80
 )
-# Most markers lie on the floor, so that a camera can be aligned by them; the others lie on boxes.
+# Most markers lie on the floor, for the alignment of cameras; the others lie on boxes.
 _RAISED_SHARE, _BOXES_M = 0.35, (0.1, 0.2)
-# Past the driving markers, one that lies has to keep clear of each of their places so many times a second.
+# Samples per second of the driving markers' paths; stationary markers keep clear of these places.
 _CHECKED_HZ = 5
 # The places do not depend on the size of the frames, as long as these are wide.
 _WIDTH, _HEIGHT = 1920, 1080
@@ -52,7 +52,7 @@ _planning = Lock()
 
 @dataclass(frozen=True, slots=True, eq=False)
 class LiveLab:
-    """Where markers are: those with the ids from ``settings.markers`` on lie still, the others drive."""
+    """Places of markers: those with ids from ``settings.markers`` on are stationary, the others drive."""
 
     settings: LabSettings
     drive: Drive
@@ -60,16 +60,16 @@ class LiveLab:
 
 
 def plan_live_lab(settings: LabSettings) -> LiveLab:
-    """Plan a lab in which each camera sees about ``settings.stations`` markers that lie still.
+    """Plan a lab in which each camera sees about ``settings.stations`` stationary markers.
 
     Parameters
     ----------
-    settings : the places follow from them but for the size, rate and quality of the frames.
+    settings : all determine the places, except the size, rate and quality of the frames.
 
     Raises
     ------
     IpsysError
-        Where there is no room for so many markers.
+        The lab has no room for so many markers.
 
     Examples
     --------
@@ -106,7 +106,7 @@ def _plan(settings: LabSettings) -> tuple[Drive, tuple[Place, ...]]:
 
 
 def _next_height_m(lying: Sequence[Place], seen: Sequence[Place]) -> float:
-    """The height of the next marker: of those that a camera sees, the share of raised ones stays small."""
+    """Return the height of the next marker: each camera sees only a small share of raised markers."""
     raised = sum(where.z_m > 0 for where in seen)
     if raised >= _RAISED_SHARE * len(seen):
         return 0.0
@@ -114,7 +114,7 @@ def _next_height_m(lying: Sequence[Place], seen: Sequence[Place]) -> float:
 
 
 def _is_wide(where: Place, camera: Camera, settings: LabSettings) -> bool:
-    """Whether a marker is wide enough in the image of a camera, which looks at it from the side."""
+    """Return whether a marker is wide enough in the image of a camera with a slanted view."""
     corners_px = true_corners(camera.lens, camera.camera_from_world, place(where, settings))
     area_px = cv2.contourArea(corners_px.astype(np.float32))
     longest_px = np.linalg.norm(np.roll(corners_px, -1, axis=0) - corners_px, axis=1).max()
@@ -122,7 +122,7 @@ def _is_wide(where: Place, camera: Camera, settings: LabSettings) -> bool:
 
 
 def _check_left(settings: LabSettings, number: int) -> None:
-    """See that the dictionary has a marker of this number."""
+    """Check that the dictionary has a marker of this number."""
     size = dictionary_size(settings.dictionary)
     if size is not None and number >= size:
         raise IpsysError(
@@ -144,7 +144,7 @@ def live_rig(settings: LabSettings) -> Rig:
 
 
 def tape_sheet(lying: Sequence[Place]) -> str:
-    """Return what tape and ruler read at markers that lie still, as ``ipsys measure --csv`` reads it.
+    """Return the tape and ruler readings of stationary markers, as a sheet for ``ipsys measure --csv``.
 
     Examples
     --------

@@ -100,7 +100,7 @@ def plan_stations(settings: LabSettings, cameras: Sequence[Camera]) -> list[tupl
     Raises
     ------
     IpsysError
-        Where there is no room for another marker.
+        The floor has no room for another marker.
     """
     rng = stream(settings.seed, Purpose.PLACES)
     seen: dict[str, list[Place]] = {camera.name: [] for camera in cameras}
@@ -170,7 +170,7 @@ def tape_lengths_m(where: Place) -> Array:
 
 
 def _tape(where: Place, sigma_m: float, rng: np.random.Generator) -> Array:
-    """Two distances that close a triangle with AB; who reads one that does not reads again."""
+    """Draw two distances that form a triangle with AB; invalid readings are repeated."""
     a, b = REFERENCES
     true_m = tape_lengths_m(where)
     base_m = np.hypot(b.x_m - a.x_m, b.y_m - a.y_m)
@@ -199,7 +199,7 @@ def choose_place(
     Raises
     ------
     IpsysError
-        Where there is no room for the marker.
+        The view has no room for the marker.
     """
     found: list[Place] = []
     for _ in range(_DRAWS):

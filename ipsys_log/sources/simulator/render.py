@@ -22,7 +22,7 @@ __all__ = ["Print", "encode_jpeg", "expose", "lay_down", "render"]
 
 Plane = NDArray[np.float32]
 Image = NDArray[np.uint8]
-# What can be in a frame.
+# Objects in a frame.
 Print = Placed | PlacedBoard | Moving
 
 # Grey levels that a warm lamp takes from the blue of the floor and adds to its red.

@@ -1,4 +1,4 @@
-"""What stays the same between the frames of a camera: its rays, the floor, the noise of its sensor."""
+"""Constant data of the frames of a camera: its rays, the floor, the noise of its sensor."""
 
 from __future__ import annotations
 
@@ -24,7 +24,7 @@ FIELD_PX = 192
 
 @dataclass(frozen=True, slots=True, eq=False)
 class View:
-    """What stays the same between the frames of a camera.
+    """The constant data of the frames of a camera.
 
     ``rays`` (h + 2 border, w + 2 border, 2) are normalized coordinates of pixels, ``floor`` (h, w) is
     the light from the empty floor behind the optics, ``noise`` a field that is larger than a frame by
@@ -41,7 +41,7 @@ class View:
 
 
 def prepare_view(camera: Camera, settings: LabSettings, check: Check = lambda: None) -> View:
-    """Everything about a camera's frames that does not change with the markers."""
+    """Compute all data of a camera's frames that do not depend on the markers."""
     border_px = int(np.ceil(4 * settings.psf_sigma_px)) + 2
     rays = pixel_rays(camera.lens, border_px, check)
     behind = to_light(lay_floor(settings, camera, rays, check), settings)

@@ -58,10 +58,10 @@ _GREEN = Color(0.1, 0.9, 0.3, 1.0)
 class Detect:
     """The stage *detect*, one for all cameras.
 
-    Yields, for a frame, its :class:`Markers` and their drawing for viewers; or an :class:`Event`
-    for a frame that cannot be decoded, or has suddenly another size than the lens. A marker id that
-    is seen twice in a frame, or is not in the rig, is left out and named by an event. A marker of the rig
-    that is seen and cannot be measured is named by an event with the reason, once for each reason.
+    Yields, for a frame, its :class:`Markers` and their drawing for viewers. For a frame that cannot be
+    decoded, or that suddenly has another size than the calibration, it yields an :class:`Event`. A marker id
+    that is seen twice in a frame, or is not in the rig, is left out and named by an event. An event also
+    names a marker of the rig that is seen and cannot be measured, once for each reason.
 
     Parameters
     ----------
@@ -71,8 +71,8 @@ class Detect:
     Raises
     ------
     IpsysError
-        For a frame before there is a rig or, with ``edges``, a calibration of its camera; and where a
-        camera's first one is of another size than the calibration's.
+        A frame comes before the rig or, with ``edges``, before the calibration of its camera; or the first
+        frame of a camera has another size than its calibration.
     """
 
     def __init__(self, corners: str = EDGES) -> None:
@@ -188,7 +188,7 @@ class Detect:
                 said.add(event.marker_id)
 
     def _rejections(self, message: Message, rig: Rig) -> Iterator[Event]:
-        """Name markers that are seen in a frame and cannot be measured, each reason once."""
+        """Yield events for markers that are seen and cannot be measured, once for each reason."""
         following = self._following.get(message.camera)
         for marker in following.rejections if following is not None else ():
             said = message.camera, marker.id, marker.reason

@@ -1,8 +1,8 @@
-"""Least squares of a marker's pose: its unknowns, how edges move with them, and the outline that follows.
+"""Least squares of a marker's pose: unknowns, derivatives of the edges, and the resulting outline.
 
-Unknown are a twist in the frame of the print, the edge offset and, where rows take time, the speed along the
-print. What a turn and shift do is computed in the plane of the print, where it needs no lens: a point x of
-the plane that moves by d is seen, from the camera at c, at x + d_xy + (x - c)_xy d_z / c_z.
+The unknowns are a twist in print coordinates, the edge offset and, with a rolling shutter, the speed along
+the print. The effect of rotation and translation is computed in the plane of the print, without lens
+distortion. The camera at c sees a point x of the plane that moves by d at x + d_xy + (x - c)_xy d_z / c_z.
 """
 
 from __future__ import annotations
@@ -22,8 +22,8 @@ __all__ = ["Fit", "Guess", "into_poses", "known_unknowns", "moves", "outline", "
 
 Array = NDArray[np.float64]
 
-# Squared pixels per squared unit of each unknown that hold it to what was known: shift and turn, edge offset,
-# speed. A tilt that shows in nothing, of a marker right below the camera, stays what it is.
+# Prior weights: squared pixels per squared unit of each unknown: translation and rotation, edge offset,
+# speed. An unobservable tilt, of a marker right below the camera, keeps its value.
 _HOLD = np.array([1e-6, 1e-6, 1e-6, 1e-2, 1e-2, 1e-6, 1e-6, 1e-5, 1e-5])
 _HOLD_GIVEN, _HOLD_SPEED = 1e9, 1e-1
 
@@ -31,10 +31,10 @@ _SHARP = np.zeros(2, dtype=bool)
 
 
 class Guess(NamedTuple):
-    """About where a marker is: ``rotation`` (3, 3) and ``centre`` (3,) take its frame to the camera's.
+    """An approximate marker pose: ``rotation`` (3, 3) and ``centre`` (3,) map marker to camera coordinates.
 
-    Lengths are in sides of its black square, whatever that measures: a picture does not say. ``motion`` (3,)
-    is its speed along its own x and y, per s, and its turn about its normal in rad/s; None where not known.
+    Lengths are in sides of its black square, because a picture does not tell the scale. ``motion`` (3,) is
+    its speed along its own x and y, per s, and its rotation about its normal in rad/s; None if not known.
     ``blurred`` (2,) says whether its motion blurs edges across its x, and across its y.
     """
 
@@ -46,8 +46,8 @@ class Guess(NamedTuple):
 
 
 class Fit(NamedTuple):
-    """A marker's pose, with the covariance (8, 8) of its corners x0 y0 .. x3 y3; by how much edges of black
-    lie inside the black; how far edges are from where the fit has them (RMS); and how blurred they are.
+    """A marker's pose, with the covariance (8, 8) of its corners x0 y0 .. x3 y3, the edge offset into the
+    black, the RMS residual of the edges, and their blur.
 
     ``uneven`` says that glare, a shadow or a cover may have moved some of the edges.
     """
@@ -77,7 +77,7 @@ def solve(rows: Array, weights: Array, off_px: Array, known: Array, hold: Array)
 
 
 def known_unknowns(guesses: Sequence[Guess], edge_offset_px: float | None) -> tuple[Array, Array]:
-    """Return what is known of the unknowns and the turn, (m, 10), and how firmly it is held, (m, 9)."""
+    """Return the prior of the unknowns and the rotation, (m, 10), and its weights, (m, 9)."""
     known, hold = np.zeros((len(guesses), 10)), np.tile(_HOLD, (len(guesses), 1))
     if edge_offset_px is not None:
         known[:, 6], hold[:, 6] = edge_offset_px, _HOLD_GIVEN
@@ -88,11 +88,11 @@ def known_unknowns(guesses: Sequence[Guess], edge_offset_px: float | None) -> tu
 
 
 def moves(prints: Prints, camera: Array, slopes: Array, late: Array, unknowns: int) -> Array:
-    """Return how far points on edges are seen to move along their axis, in px per unit of an unknown.
+    """Return the image motion of points on edges along their axis, in px per unit of an unknown.
 
     Parameters
     ----------
-    camera : (m, 3), in the frames of the prints.
+    camera : (m, 3), in print coordinates.
     slopes, late : (m, s), as in :class:`~ipsys_log.stages.detect.profiles.Sites`.
 
     Returns
@@ -116,7 +116,7 @@ def moves(prints: Prints, camera: Array, slopes: Array, late: Array, unknowns: i
 
 
 def outline(view: View, poses: Poses) -> tuple[Array, Array, Array]:
-    """Return corners (m, 4, 2) in px, how they move with a twist (m, 8, 6), and levels of cells (m, c)."""
+    """Return corners (m, 4, 2) in px, their derivatives by a twist (m, 8, 6), and levels of cells (m, c)."""
     points, count = view.prints.outline, len(poses.centres)
     px = project(poses.into_camera(points).reshape(-1, 3), view.lens).reshape(count, -1, 2)
     per_unit = np.stack([px[:, 4:8] - px[:, :4], px[:, 8:12] - px[:, :4]], axis=3) / view.prints.nudge

@@ -44,12 +44,12 @@ _THREAD = threading.local()
 def decode_rows(
     frame: CompressedImage | RawImage, rows: Sequence[slice] | None = None
 ) -> tuple[Grey, list[slice]]:
-    """The grey picture in a frame, or at least some rows of it.
+    """Decode the grey picture of a frame, or at least some rows of it.
 
     Parameters
     ----------
     frame : as recorded.
-    rows : those wanted; None for all. Where not all are, a JPEG is not checked as strictly.
+    rows : the rows to decode; None for all. With fewer, a JPEG is checked less strictly.
 
     Returns
     -------
@@ -85,12 +85,12 @@ def decode_rows(
 
 
 def decode_grey(frame: CompressedImage | RawImage) -> Grey:
-    """The grey picture in a frame, (height, width).
+    """Decode the grey picture of a frame, (height, width).
 
     Raises
     ------
     FrameError
-        Where the data is damaged: a JPEG is decoded strictly, so that half a picture is no picture.
+        The data are damaged: a JPEG is decoded strictly, and an incomplete picture is refused.
     """
     if isinstance(frame, RawImage):
         return _raw_grey(frame)

@@ -46,14 +46,14 @@ _BLURRED = 0.6
 _SEEN = 0.6
 _EXACT_PX = 0.05
 _WRONG_CELLS = 1
-# Glare, a shadow or a cover may lie on a marker where a side lies off by this share of the edges' spread, or
-# where the black beside some edges is lighter than beside the others, by that share of the contrast. A few
+# Signs of glare, a shadow or a cover: a side is displaced by this share of the edges' spread, or the black
+# beside some edges is lighter than beside the others, by that share of the contrast. A few edges
 # may be: a neighbouring white cell reaches as far where cells are small.
 _SIDE_OFF, _LIGHTER = 0.85, 0.35
 _WIDE_SPREAD_PX, _SIDE_OFF_WIDE = 0.12, 0.6
 _LEAST_SPREAD_PX, _FEW, _SMALL_PX = 0.03, 3, 4.0
-# Or where edges are spread by more px. Where motion blurs them, or seems to, sides lie off by shares of the
-# blur's width, and what is beside an edge mixes with it.
+# Or the edges are spread by more px. If motion blurs them, or seems to, sides are displaced by shares of the
+# blur's width, and the surroundings of an edge mix with it.
 _SPREAD_PX, _LIGHTER_BLURRED = 0.3, 0.6
 
 
@@ -66,23 +66,23 @@ def fit_edges(
     row_time_s: float = 0.0,
     blur_px: float | None = None,
 ) -> list[Fit | None]:
-    """Fit markers to the picture of them.
+    """Fit marker poses to a picture.
 
     Parameters
     ----------
     grey : (height, width).
-    guesses : markers and about where they are, to some pixels.
+    guesses : markers and their approximate poses, to some pixels.
     dictionary : OpenCV's name, such as DICT_4X4_100.
     lens : of the camera.
-    edge_offset_px : by how much edges of black lie inside the black; None: found with each marker.
-    row_time_s : between the exposures of two rows. Markers are given as they were when the row of their
-        middle was exposed.
-    blur_px : of edges in pictures of this camera; None: what these look like.
+    edge_offset_px : offset of edges into the black; None: estimated with each marker.
+    row_time_s : between the exposures of two rows. Poses are valid for the exposure of the row of the marker
+        centre.
+    blur_px : of edges in pictures of this camera; None: estimated from these.
 
     Returns
     -------
-    For each guess the fit, or None where there is no such marker: the fit does not settle, edges are
-    missing, a corner lies outside of the picture, or the cells are not those of this id.
+    For each guess the fit, or None if there is no such marker: the fit does not converge, edges are missing,
+    a corner lies outside of the picture, or the cells do not match this id.
     """
     possible = into_poses(guesses).possible() if guesses else np.ones(0, dtype=bool)
     if not possible.all():
@@ -114,9 +114,9 @@ def fit_edges(
 
 
 class _Settled(NamedTuple):
-    """Fitted poses; ``covariances`` (m, 6, 6) of the twists in the frames of the prints; ``ends`` (m, s, 2)
-    are the levels at both ends of their profiles; ``cells_px`` (m,) is the least width of a cell, and
-    ``sides_off_px`` (m,) is the most that a side lies off."""
+    """Fitted poses; ``covariances`` (m, 6, 6) of the twists in print coordinates; ``ends`` (m, s, 2), levels
+    at both ends of the profiles; ``cells_px`` (m,), least width of a cell; ``sides_off_px`` (m,), largest
+    displacement of a side."""
 
     poses: Poses
     edge_offsets_px: Array
@@ -131,7 +131,7 @@ class _Settled(NamedTuple):
     sides_off_px: Array
 
     def where(self, good: NDArray[np.bool_], other: _Settled) -> _Settled:
-        """Return these fits where they are good, and others where not."""
+        """Return the good ones of these fits, and others instead of the rest."""
         if not good.any():
             return other
         chosen = [
@@ -144,7 +144,7 @@ class _Settled(NamedTuple):
 def _settle_all(
     view: View, guesses: Sequence[Guess], edge_offset_px: float | None
 ) -> tuple[_Settled, tuple[Array, Array, Array]]:
-    """Settle markers, again if edges turn out to be blurred; and the outlines of them."""
+    """Fit markers until they converge, again if edges are blurred; return them with their outlines."""
     settled = _settle(view, guesses, edge_offset_px, np.array([guess.blurred for guess in guesses]))
     seen = outline(view, settled.poses)
     more = _blurred(view.prints, settled.heights, seen[2]) & ~settled.blurred
@@ -164,9 +164,9 @@ def _sharpened(
     blurred: NDArray[np.bool_],
     settled: _Settled,
 ) -> _Settled:
-    """Return the fits, but sharp ones where only axes that are ``blurred`` (m, 2) still are from their poses.
+    """Return the fits; sharp ones if only ``blurred`` axes (m, 2) stay blurred in a fit from their poses.
 
-    Where a guess is far off, sharp edges seem to be blurred.
+    If a guess is far off, sharp edges seem to be blurred.
     """
     poses = settled.poses
     nearer = [
@@ -182,7 +182,7 @@ def _sharpened(
 def _settle(
     view: View, guesses: Sequence[Guess], edge_offset_px: float | None, blurred: NDArray[np.bool_]
 ) -> _Settled:
-    """Move markers until they settle; ``blurred`` (m, 2) says across which of their axes edges are."""
+    """Move markers until they converge; ``blurred`` (m, 2) marks the axes across which edges are blurred."""
     poses = into_poses(guesses)
     # Unknown are a twist, the edge offset and, where rows take time, the speed along the print.
     unknowns = 9 if view.row_time_s else 7
@@ -254,14 +254,14 @@ def _bright_and_dark(prints: Prints, levels: Array) -> tuple[Array, Array]:
 
 
 def _same_cells(prints: Prints, levels: Array, colours: tuple[Array, Array]) -> NDArray[np.bool_]:
-    """Whether cells are white and black as they should be, (m,), from their grey levels (m, c)."""
+    """Return whether cells have the right colours, (m,), from their grey levels (m, c)."""
     bright, dark = colours
     wrong = np.count_nonzero((levels > ((bright + dark) / 2)[:, None]) != prints.white, axis=1)
     return np.asarray((wrong <= _WRONG_CELLS) & (bright - dark > LEAST_CONTRAST))
 
 
 def _uneven(prints: Prints, settled: _Settled, colours: tuple[Array, Array]) -> NDArray[np.bool_]:
-    """Return, (m,), where glare, a shadow or a cover may have moved some of the edges."""
+    """Return the markers (m,) with edges that glare, a shadow or a cover may have moved."""
     black = np.where(prints.polarity > 0, settled.ends[..., 0], settled.ends[..., 1])
     black[prints.polarity == 0] = -np.inf
     black.sort(axis=1)

@@ -48,9 +48,9 @@ _SAME_PX = 8.0
 _JUMP_PX = 3.0
 # Edges are that near to those of a fit whose pose is the right one of two.
 _SURE_PX = 0.08
-# Small markers, which only a thorough search finds, look much the same in both poses.
+# Small markers, found only by a thorough search, look nearly the same in both poses.
 _MUCH_BETTER = 0.9
-# In uneven light, a fit whose edges are spread by more may be off by as much.
+# In uneven light, a fit with a larger spread of edges may have an error of that size.
 _DISTURBED_PX = 0.5
 # From so many frames with markers it is known how blurred edges are.
 _BLURS = 10
@@ -99,7 +99,7 @@ class Follow:
         return [last[n] for n in sorted(last)]
 
     def __call__(self, frame: CompressedImage | RawImage, time_ns: int) -> tuple[list[Fit], int, int]:
-        """The markers in a frame, sorted by id, and the width and height of it; an id can occur twice.
+        """Return the markers in a frame, sorted by id, and its width and height; an id can occur twice.
 
         A frame that raises an error changes nothing for those after it.
 
@@ -129,7 +129,7 @@ class Follow:
         if region is not None:
             fits = self._add(grey, fits, search(grey, self._dictionary, region, samples))
         if samples is not None:
-            # Nothing is known yet, and there may be no later frame in which to find what is missed now.
+            # Nothing is known yet, and no later frame may show the markers that are missed now.
             known_px = [fit.corners_px for fit in fits]
             leftovers = search_leftovers(grey, self._dictionary, samples, known_px)
             fits = self._add(grey, fits, leftovers, _MUCH_BETTER)
@@ -145,12 +145,12 @@ class Follow:
     def _look_again(
         self, frame: CompressedImage | RawImage, time_ns: int, whole: bool
     ) -> tuple[Grey, list[slice], dict[int, Fit], set[int]]:
-        """What has become of the markers of the last frame.
+        """Follow the markers of the last frame.
 
         Returns
         -------
-        The picture and which rows of it are good, the fits by the number of their track, and the ids of
-        markers that are not where they should be; then the picture is whole.
+        The picture and its decoded rows, the fits by the number of their track, and the ids of markers that
+        are not at their predicted position; if there are any, the picture is decoded as a whole.
         """
         guesses = [predict(track, time_ns) for track in self._tracks]
         outlines_px = self._outlines(guesses)
@@ -207,7 +207,7 @@ class Follow:
         fits: Sequence[Fit | None],
         near: bool = False,
     ) -> list[Fit | None]:
-        """Return the fits, but for markers in uneven light those to what is visible of them."""
+        """Return the fits; those of markers in uneven light are replaced by fits to their visible edges."""
         better = list(fits)
         for n, (poses, fit) in enumerate(zip(guesses, fits, strict=True)):
             if fit is not None and not fit.uneven:
@@ -252,10 +252,10 @@ class Follow:
     def _add(
         self, grey: Grey, fits: list[Fit], candidates: Iterable[Candidate], better: float = 1.0
     ) -> list[Fit]:
-        """Fits, and those of candidates that are none of them.
+        """Return fits, and those of the candidates that are not among them.
 
-        Of two poses that look alike the upright one is taken, unless the spread of the edges about the other
-        is less than ``better`` times that about it.
+        If two poses look alike, the upright one is selected, unless the spread of the edges about the other
+        is less than ``better`` times its own.
         """
         new = [one for one in candidates if not _among(one.id, one.corners_px, fits)]
         if not new:

@@ -1,10 +1,10 @@
-"""Fit a marker of which glare, a shadow or a cover hides a part: three good sides and the cells are a marker.
+"""Fit of a marker that glare, a shadow or a cover hides in part, from three good sides and the cells.
 
-Edges that are not where the others say, or not shaped as edges are, count for nothing. A side that is hidden
-along its whole length looks like a good one that lies elsewhere: the fit is therefore tried without each
-of the four sides, and the one that leaves the least is taken. The lens is known, so that a pose has six
-freedoms, which the other sides and the edges between cells determine; the corners beside a hidden side follow
-from the pose, and their covariance from that of the pose.
+Edges that contradict the others, or do not have the shape of an edge, get no weight. A side that is hidden
+along its whole length looks like a good side at another place. The fit is therefore tried without each of the
+four sides, and the one with the least residuals is selected. The intrinsics are known, so a pose has six
+degrees of freedom. The other sides and the edges between cells determine them. The corners beside a hidden
+side follow from the pose, and their covariance from that of the pose.
 """
 
 from __future__ import annotations
@@ -47,38 +47,38 @@ Mask = NDArray[np.bool_]
 # The sides of a square, and none.
 _WITHOUT = (None, 0, 1, 2, 3)
 _FAR_PX, _NEAR_PX, _OF_CELL = 12.0, 3.0, 0.45
-# Passes with far profiles, and with near ones: before the better of two poses is known, and after.
+# Passes with far profiles and with near ones, before and after the selection of the better of two poses.
 _ROUGH, _EXACT, _FINAL = 3, 2, 2
 _REWEIGHTED = 3
 _SHORT_PX = 8.0
-# Tukey's biweight: where weights end, in standard deviations and at least.
+# Tukey's biweight: the residual from which weights are 0, in standard deviations, and its minimum.
 _CUT, _CUT_PX, _CUT_ROUGH, _CUT_ROUGH_OF_REACH = 4.0, 0.08, 3.0, (0.36, 0.24, 0.15)
-# Edges farther off than that, in px, cost as much as those that are not there.
+# Edges with larger residuals, in px, cost as much as missing ones.
 _COSTLY_PX = 0.4
-# A side is disturbed as a whole where it lies off by so many standard deviations, and px.
+# A side is disturbed as a whole if it is displaced by so many standard deviations, and px.
 _DISTURBED, _DISTURBED_PX = 6.0, 0.06
 _CHEAPER, _ALIKE_POSES = 0.03, 0.06
-# A side is seen by this share of its edges; all edges together by that; and what they may cost.
+# Least share of visible edges of a side, and of all edges together; and their largest cost.
 _SEEN, _SEEN_OF_ALL, _COST = 0.3, 0.4, 0.7
 _MOST_UNCERTAIN_PX = 1.0
 # In cells of fewer px, edges disturb one another.
 _LEAST_CELL_PX = 2.2
-# Errors of neighbouring edges are alike, more than least squares takes them to be.
+# Errors of neighbouring edges are correlated; least squares assumes that they are not.
 _ALIKE = 1.7
 
 
 class Rejection(NamedTuple):
-    """A marker that is seen and cannot be measured, and the reason, in words without figures that change."""
+    """A marker that is seen and cannot be measured, and the reason, in words without changing figures."""
 
     id: int
     reason: str
 
 
 def resembles(grey: Grey, lens: CameraCalibration, dictionary: str, guesses: Sequence[Guess]) -> bool:
-    """Return whether cells look like those of one marker from any of the poses that it may have.
+    """Return whether cells look like those of a marker, for any of its possible poses.
 
-    Where they do not, and the ordinary fit has failed, there is no such marker: the partial fit, which takes
-    as long as ten others, has found none in any of 315 drawn frames.
+    If they do not, and the ordinary fit has failed, there is no such marker: the partial fit takes as long as
+    ten others, and found none in any of 315 rendered frames.
     """
     guesses = [guess for guess in guesses if into_poses([guess]).possible()[0]]
     if not guesses:
@@ -99,19 +99,19 @@ def fit_partly(
     blur_px: float | None = None,
     near: bool = False,
 ) -> Fit | Rejection | None:
-    """Fit one marker to what is visible of it.
+    """Fit one marker to its visible edges.
 
     Parameters
     ----------
-    guesses : poses that it may have, the likelier one first.
+    guesses : possible poses, the likelier one first.
     grey, dictionary, lens, edge_offset_px, row_time_s, blur_px : as for
         :func:`ipsys_log.stages.detect.edges.fit_edges`.
     near : whether the guesses are right to a pixel or two.
 
     Returns
     -------
-    The fit; a rejection where cells show this id and the pose cannot be determined; or None where there is no
-    such marker.
+    The fit; a rejection if cells show this id and the pose cannot be determined; or None if there is no such
+    marker.
     """
     guesses = [guess for guess in guesses if into_poses([guess]).possible()[0]]
     if not guesses:
@@ -135,8 +135,8 @@ class _State(NamedTuple):
 class _Solved(NamedTuple):
     """Least squares of hypotheses: as for :func:`~ipsys_log.stages.detect.adjustment.solve`.
 
-    ``left_px`` (m, s) is left of the edges, ``costs`` (m,) is their mean cost, those of a side that is left
-    out excepted.
+    ``left_px`` (m, s) are the residuals of the edges, ``costs`` (m,) their mean cost, without those of the
+    omitted side.
     """
 
     rows: Array
@@ -149,14 +149,14 @@ class _Solved(NamedTuple):
     blur_px: float
 
     def variance_px2(self, n: int) -> float:
-        """Return the variance of an edge's place about a fit."""
+        """Return the variance of the position of an edge about a fit."""
         weights = self.weights[n]
         freedoms = max(float(weights.sum()) - self.rows.shape[1], 1.0)
         return float((weights * self.left_px[n] ** 2).sum() / freedoms)
 
 
 class _Trial:
-    """One marker, tried with several poses, and with and without each of its sides."""
+    """Fits of one marker with several poses, and with and without each of its sides."""
 
     def __init__(
         self,
@@ -180,14 +180,14 @@ class _Trial:
         self._real = prints.polarity[0] != 0
 
     def settle(self) -> tuple[_State, _Solved]:
-        """Return the five hypotheses of the better pose, and what is left of each."""
+        """Return the five hypotheses of the better pose, and the residuals of each."""
         guesses = [guess for guess in self._guesses for _ in _WITHOUT]
         self._known, self._hold = known_unknowns(guesses, self._edge_offset_px)
         without = np.array([-1 if side is None else side for _ in self._guesses for side in _WITHOUT])
         state = _State(into_poses(guesses), self._known[:, 7:], without)
         for number in range(self._first, _ROUGH + _EXACT):
             state, solved = self._move(state, number)
-        # Of poses that look alike the first is the likelier one.
+        # If poses look alike, the first is the likelier one.
         costs = solved.costs.reshape(-1, len(_WITHOUT)).min(axis=1)
         best = int(costs.argmin()) if costs.min() < costs[0] - _ALIKE_POSES else 0
         chosen = np.arange(len(_WITHOUT)) + best * len(_WITHOUT)
@@ -198,7 +198,7 @@ class _Trial:
         return state, solved
 
     def _move(self, state: _State, number: int) -> tuple[_State, _Solved]:
-        """Return hypotheses after one pass of least squares, and what it left before they moved."""
+        """Return hypotheses after one pass of least squares, and the residuals before it."""
         count = len(state.without)
         view = View(
             self._grey, self._lens, lay_out(self._dictionary, (self._id,) * count), self._row_time_s, None
@@ -233,7 +233,7 @@ class _Trial:
         return _State(poses, motions, state.without), solved
 
     def _steps(self, view: View, sites: Sites, number: int) -> tuple[Steps, float, float]:
-        """Return the steps at edges, how blurred they are, and where weights end at the nearest."""
+        """Return the steps at edges, their blur, and the least residual from which weights may be 0."""
         farthest_px = _FAR_PX if number < _ROUGH else _NEAR_PX
         cell_px = float(np.quantile(sites.slopes[0], 0.2)) / view.prints.cells
         reach_px = round(min(max(_OF_CELL * cell_px, 0.8), farthest_px), 1)
@@ -302,19 +302,19 @@ class _Trial:
 
 
 def _biweight(shares: Array) -> Array:
-    """Return Tukey's weights of residuals in shares of where weights end."""
+    """Return Tukey's weights of residuals that are scaled to the residual of weight 0."""
     return np.asarray((1.0 - np.minimum(shares * shares, 1.0)) ** 2)
 
 
 def _width_px(corners_px: Array) -> float:
-    """Return the width of a square seen foreshortened, corners (4, 2): its area over its longest side."""
+    """Return the width of a foreshortened square, corners (4, 2): its area over its longest side."""
     (x, y), (next_x, next_y) = corners_px.T, np.roll(corners_px, -1, axis=0).T
     longest = np.hypot(next_x - x, next_y - y).max()
     return float(abs((x * next_y - next_x * y).sum()) / 2 / max(longest, 1e-9))
 
 
 def _hider(levels: Array, prints: Prints) -> str:
-    """Return what hides a part of a marker, by the levels of its cells."""
+    """Return the name of the cause that hides a part of a marker, by the levels of its cells."""
     white = prints.white[0]
     middle = (np.median(levels[white]) + np.median(levels[~white])) / 2
     bright, dark = np.count_nonzero(levels[~white] > middle), np.count_nonzero(levels[white] < middle)

@@ -1,7 +1,7 @@
 """Agreement of grey levels with the cells of a marker where light is uneven.
 
-Under glare or half in a shadow no single level divides black from white. Neighbouring cells still differ
-where the print changes its colour, and hardly differ where it does not.
+Under glare or half in a shadow, no single threshold separates black from white. Neighbouring cells still
+differ if the print changes its colour between them, and hardly differ if it does not.
 """
 
 from __future__ import annotations
@@ -20,7 +20,7 @@ __all__ = ["Agreement", "compare_pattern"]
 
 Array = NDArray[np.float64]
 
-# Cells differ where their levels do by this share of the print's contrast.
+# Cells differ if their levels differ by this share of the print's contrast.
 _DIFFERENT = 0.25
 _AGREES, _CLEARLY, _ALIKE = 0.5, 0.1, 0.3
 
@@ -28,7 +28,7 @@ _AGREES, _CLEARLY, _ALIKE = 0.5, 0.1, 0.3
 class Agreement(NamedTuple):
     """The share of neighbouring cells that agree with a marker, minus that of those that contradict it.
 
-    ``own`` is that with the marker in question, ``next`` the greatest with any other, or with any turned one.
+    ``own`` is the share for the tested marker, ``next`` the greatest for any other or any turned one.
     """
 
     own: float
@@ -36,22 +36,22 @@ class Agreement(NamedTuple):
 
     @property
     def clear(self) -> bool:
-        """Whether the cells are those of this marker and of no other."""
+        """Return whether the cells match this marker and no other."""
         return self.own >= _AGREES and self.own >= self.next + _CLEARLY
 
     @property
     def possible(self) -> bool:
-        """Whether the cells may be those of this marker, about where it is."""
+        """Return whether the cells may match this marker, near its pose."""
         return self.own >= _ALIKE
 
     @property
     def likely(self) -> bool:
-        """Whether the cells look like those of this marker rather than of another."""
+        """Return whether the cells look like those of this marker rather than of another."""
         return self.possible and self.own > self.next
 
 
 def compare_pattern(levels: Array, dictionary: str, marker_id: int) -> Agreement:
-    """Return how well grey levels agree with the cells of a marker.
+    """Return the agreement of grey levels with the cells of a marker.
 
     Parameters
     ----------
@@ -66,7 +66,7 @@ def compare_pattern(levels: Array, dictionary: str, marker_id: int) -> Agreement
     if contrast < LEAST_CONTRAST:
         return Agreement(0.0, 0.0)
     signs = np.sign(rises) * (np.abs(rises) > _DIFFERENT * contrast)
-    # Like signs agree, unlike ones contradict; a step that does not show says nothing.
+    # Equal signs agree, opposite signs contradict; an invisible step counts for neither.
     agreements = words @ signs + (words == 0) @ np.where(signs == 0, 1.0, -1.0)
     agreements /= len(signs)
     own = float(agreements[4 * marker_id])

@@ -1,4 +1,4 @@
-"""The size that an encoded picture claims, before memory is taken for it."""
+"""Check of the stated size of an encoded picture, before memory is allocated."""
 
 from __future__ import annotations
 
@@ -9,14 +9,14 @@ __all__ = ["MOST_PIXELS", "check_encoded", "check_size"]
 MOST_PIXELS = 1 << 27  # 134 million
 # A JPEG has at least one bit for each block of 8 x 8 px.
 _JPEG_PIXELS_PER_BYTE = 512
-# SOF0 to SOF15, but for the tables and the extension that lie between them.
+# SOF0 to SOF15, except the tables and the extension between them.
 _JPEG_FRAMES = frozenset(range(0xC0, 0xD0)) - {0xC4, 0xC8, 0xCC}
 _JPEG_SCAN = 0xDA
 _PNG = b"\x89PNG\r\n\x1a\n"
 
 
 def check_encoded(data: bytes) -> None:
-    """Refuse a JPEG or PNG whose head claims more pixels than it can have.
+    """Refuse a JPEG or PNG whose header states more pixels than it can have.
 
     Raises
     ------
@@ -31,7 +31,7 @@ def check_encoded(data: bytes) -> None:
 
 
 def check_size(width: int, height: int, jpeg_bytes: int | None = None) -> None:
-    """Refuse a size in px; that of a JPEG also where it is too large for so many bytes.
+    """Refuse a size in px that is too large, also for the number of bytes of a JPEG.
 
     Raises
     ------
@@ -45,7 +45,7 @@ def check_size(width: int, height: int, jpeg_bytes: int | None = None) -> None:
 
 
 def _jpeg_size(data: bytes) -> tuple[int, int]:
-    """Width and height in the first frame header; (0, 0) where there is none before the pixels."""
+    """Return width and height in the first frame header; (0, 0) if there is none before the pixels."""
     at = 2
     while at + 9 <= len(data) and data[at] == 0xFF and data[at + 1] != _JPEG_SCAN:
         if data[at + 1] == 0xFF:  # a fill byte

@@ -1,4 +1,4 @@
-"""What is printed on a marker: where black meets white, and the colours of its cells."""
+"""The printed pattern of a marker: its edges between black and white, and the colours of its cells."""
 
 from __future__ import annotations
 
@@ -28,17 +28,17 @@ class Prints:
     ----------
     points : (m, s, 2), points on the edges between black and white of m markers.
     ends : (m, 2 s + 1, 2), ``reach`` before and behind each of them, across the edge; and the middle.
-    level : (m, s), 0.0 where the edge runs along y and so says something of x; else 1.0.
-    swirl : (m, s), how far a point moves across its edge where the marker turns about its middle.
+    level : (m, s), 0.0 if the edge runs along y and so measures x; else 1.0.
+    swirl : (m, s), motion of a point across its edge when the marker turns about its centre.
     polarity : (m, s), 1.0 where white lies towards the greater coordinate, else -1.0; 0.0 for a point that
-        is there only because another marker has more.
+        pads the array, because another marker has more.
     outline : (12 + c, 2), the corners, the same moved by ``nudge`` in x, and in y, and the middles of the
         cells, black border included.
     white : (m, c), which cells are white.
-    by_axis : (m, s, 2), takes values at points to their means over the edges along y, and along x.
+    by_axis : (m, s, 2), maps values at points to their means over the edges along y, and along x.
     by_side : (m, s, 4), the same over the top, the right, the bottom and the left side of the square.
-    by_colour : (m, c, 2), takes values at cells to their means over the white ones and the black ones.
-    cells : how many lie along a side.
+    by_colour : (m, c, 2), maps values at cells to their means over the white ones and the black ones.
+    cells : number of cells along a side.
     """
 
     points: Array
@@ -58,7 +58,7 @@ class Prints:
 
 @lru_cache(maxsize=1024)
 def lay_out(dictionary: str, marker_ids: tuple[int, ...]) -> Prints:
-    """The prints of markers; ``dictionary`` is OpenCV's name, such as DICT_4X4_100."""
+    """Return the prints of markers; ``dictionary`` is OpenCV's name, such as DICT_4X4_100."""
     edges = [_edges(dictionary, marker_id) for marker_id in marker_ids]
     most = max(len(rows) for rows in edges)
     rows = np.stack(

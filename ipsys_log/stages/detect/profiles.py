@@ -92,7 +92,7 @@ class Poses(NamedTuple):
 
 
 class Sites(NamedTuple):
-    """Places of edges in a picture: ``middle`` (m, s, 2) in px, and ``across`` (m, s, 2) from there over
+    """Positions of edges in a picture: ``middle`` (m, s, 2) in px, and ``across`` (m, s, 2) from there over
     the edge, ``lengths_px`` (m, s) long.
 
     ``slopes`` (m, s) are px per side of the print, and ``late`` (m, s) px per speed along their axis, for
@@ -107,12 +107,11 @@ class Sites(NamedTuple):
 
 
 class Seen(NamedTuple):
-    """What is seen of the edges of prints, (m, s) each.
+    """Observed edges of prints, (m, s) each.
 
-    ``off_px`` is by how much they lie off, along their axis; ``certainty`` from 1.0 to 0.0 for edges that
-    are not there. ``slopes`` and ``late`` are as in :class:`Sites`. ``blurs_px`` (m,) are those of the edges.
-    ``profiles`` (m, s, t) are grey levels across the edges, of those that are not wide to ``near_px`` (m,) on
-    each side.
+    ``off_px`` is their displacement along their axis; ``certainty`` goes from 1.0 to 0.0 for missing edges.
+    ``slopes`` and ``late`` are as in :class:`Sites`. ``blurs_px`` (m,) is the blur of the edges. ``profiles``
+    (m, s, t) are grey levels across the edges, to ``near_px`` (m,) on each side if they are not wide.
     """
 
     off_px: Array
@@ -134,7 +133,7 @@ class Seen(NamedTuple):
 
 
 def locate(view: View, poses: Poses, motions: Array) -> Sites:
-    """Return where edges should be seen.
+    """Return the predicted positions of edges.
 
     Parameters
     ----------
@@ -160,7 +159,7 @@ def read_profiles(grey: Grey, sites: Sites, reaches_px: Array, taps: Array) -> A
 
     Parameters
     ----------
-    reaches_px : (m, 1) or (m, s), how far profiles reach to each side.
+    reaches_px : (m, 1) or (m, s), reach of profiles to each side.
     taps : (t,), in shares of that.
     """
     places = (reaches_px / sites.lengths_px)[..., None] * taps
@@ -170,12 +169,12 @@ def read_profiles(grey: Grey, sites: Sites, reaches_px: Array, taps: Array) -> A
 
 
 def measure(view: View, poses: Poses, motions: Array, wide: NDArray[np.bool_]) -> Seen:
-    """Profiles across the edges, near where they should be.
+    """Measure profiles across the edges, near their predicted positions.
 
     Parameters
     ----------
     motions : (m, 3), as in :class:`~ipsys_log.stages.detect.adjustment.Guess`.
-    wide : (m, 2), whether to look far to both sides, across edges along y and along x.
+    wide : (m, 2), whether profiles reach far to both sides, across edges along y and along x.
     """
     prints = view.prints
     sites = locate(view, poses, motions)
@@ -222,7 +221,7 @@ def _by_area(prints: Prints, profiles: Array, reaches_px: Array) -> tuple[Array,
 
 
 def _blurs(view: View, profiles: Array, reaches_px: Array, wide: bool) -> Array:
-    """By how much the edges of each marker are blurred, in px: what leaves least of their mean profile."""
+    """Estimate the blur of the edges of each marker in px, by the least residual of the mean profile."""
     if view.blur_px is not None or wide:
         return np.full(len(profiles), view.blur_px or USUAL_BLUR_PX)
     means = (view.prints.polarity[:, None] @ profiles)[:, 0]
@@ -233,7 +232,7 @@ def _blurs(view: View, profiles: Array, reaches_px: Array, wide: bool) -> Array:
 
 @cache
 def _residues(reach_px: float) -> Array:
-    """What the best step of each blur leaves of a profile, (blurs * taps, taps)."""
+    """Return the residual matrix of a profile about the best step of each blur, (blurs * taps, taps)."""
     steps = [_step(reach_px, blur_px) for blur_px in BLURS_PX.tolist()]
     return np.concatenate([np.eye(len(_TAPS)) - step @ np.linalg.pinv(step) for step in steps])
 

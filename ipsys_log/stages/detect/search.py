@@ -40,7 +40,7 @@ _AROUND, _SQUARE = np.ones((3, 3), dtype=np.uint8), np.ones((4, 4), dtype=np.uin
 _PAPER = 0.35
 _CLEAR_PX = 24
 _MOST, _MANY = 0.4, 40
-# Of the contrast: what is darker is the black of a marker.
+# Share of the contrast: darker samples are the black of a marker.
 _AS_BLACK = 0.1
 # Rows and columns of a whole picture.
 WHOLE = (slice(None), slice(None))
@@ -65,14 +65,14 @@ def search(
     region: tuple[slice, slice] = WHOLE,
     samples: Grey | None = None,
 ) -> list[Candidate]:
-    """Markers in a picture, roughly.
+    """Find markers in a picture, with approximate corners.
 
     Parameters
     ----------
     grey : (height, width).
     dictionary : OpenCV's name, such as DICT_4X4_100.
     region : rows and columns to search.
-    samples : those of the region, where they are known.
+    samples : of the region, if they are known.
     """
     part = np.ascontiguousarray(grey[region])
     return _placed(_search(part, sample(part) if samples is None else samples, dictionary), region)
@@ -107,7 +107,7 @@ def search_thoroughly(grey: Grey, dictionary: str, region: tuple[slice, slice] =
 def search_leftovers(
     grey: Grey, dictionary: str, samples: Grey, known_px: Sequence[Array]
 ) -> list[Candidate]:
-    """Search thoroughly where a picture has contrast that no known marker, (4, 2) in px, explains.
+    """Search thoroughly in areas whose contrast no known marker, (4, 2) in px, explains.
 
     Parameters
     ----------
@@ -120,7 +120,7 @@ def search_leftovers(
 
 
 def _contrasts(grey: Grey, samples: Grey, known_px: Sequence[Array]) -> list[tuple[slice, slice]]:
-    """Return rows and columns of what has the contrast of a marker, known markers excepted.
+    """Return rows and columns of areas with the contrast of a marker, without known markers.
 
     Lines and the edges of large things have contrast too, but not everywhere in a square.
     """
@@ -133,7 +133,7 @@ def _contrasts(grey: Grey, samples: Grey, known_px: Sequence[Array]) -> list[tup
     known = _spans(known_px)
     down, right = wide.shape[0] / full.shape[0], wide.shape[1] / full.shape[1]
     for rows, columns in known:
-        # Coarse samples that lie in it as a whole.
+        # Coarse samples that lie completely in it.
         wide[_inner(rows, down), _inner(columns, right)] = 0
     if cv2.countNonZero(wide):
         widened = cv2.resize(wide, full.shape[::-1], interpolation=cv2.INTER_NEAREST)
@@ -171,9 +171,9 @@ def _inner(span: slice, scale: float) -> slice:
 
 
 def _is_cut(grey: Grey, fine: Grey, left: int, top: int, right: int, bottom: int) -> bool:
-    """Return whether a marker in a box of samples goes on beyond the picture: its black meets the border.
+    """Return whether the picture cuts off a marker in a box of samples: its black meets the border.
 
-    Around a whole marker there is its white margin, or at least the floor.
+    A whole marker has its white margin around it, or at least the floor.
     """
     height, width = fine.shape
     rows = slice(top * _STEP_PX, bottom * _STEP_PX)
@@ -188,7 +188,7 @@ def _is_cut(grey: Grey, fine: Grey, left: int, top: int, right: int, bottom: int
 
 
 def _squares(samples: Grey) -> Grey:
-    """Return 1 where a square lies in which samples have contrast everywhere."""
+    """Return a mask of the squares whose samples have contrast everywhere."""
     contrast = cv2.morphologyEx(samples, cv2.MORPH_GRADIENT, _AROUND)
     high = cv2.threshold(contrast, _CONTRAST, 1, cv2.THRESH_BINARY)[1]
     return np.asarray(cv2.morphologyEx(high, cv2.MORPH_OPEN, _SQUARE), dtype=np.uint8)
@@ -231,7 +231,7 @@ def _full_detector(dictionary: str) -> cv2.aruco.ArucoDetector:
 
 
 def _read(grey: Grey, corners: Array, dictionary: str) -> list[Candidate]:
-    """Which of the squares (n, 4, 2) are markers, by their cells."""
+    """Return the markers among the squares (n, 4, 2), by their cells."""
     if not len(corners):
         return []
     words, places = _words(dictionary)

@@ -1,7 +1,8 @@
-"""Steps in profiles across the edges of a print that may lie in glare, in a shadow or under a cover.
+"""Steps in profiles across the edges of a print that glare, a shadow or a cover may disturb.
 
-A profile far to both sides shows about where an edge is. A near one shows it exactly, and by its shape
-whether it is one undisturbed edge: glare that begins there, or that saturates the white, leaves another.
+A profile far to both sides shows the approximate position of an edge. A near one shows the exact position.
+Its shape shows whether it is one undisturbed edge: glare that begins there, or saturates the white, gives
+another shape.
 """
 
 from __future__ import annotations
@@ -21,9 +22,9 @@ __all__ = ["TAPS", "Steps", "exact_steps", "masked_median", "rough_steps", "usua
 Array = NDArray[np.float64]
 
 TAPS = np.linspace(-1, 1, 13)
-# Of the median height: what rises by less is another thing, or none.
+# Share of the median height: a lower rise is no edge of the print.
 _WEAK, _WEAK_ROUGH = 0.3, 0.25
-# RMS of a profile about its step, in heights of the step; and in medians of that over all edges.
+# RMS of a profile about its step, relative to the step height; and to the median of that over all edges.
 _MISSHAPEN, _MISSHAPEN_SURELY, _ODD = 0.02, 0.12, 3.0
 # An edge farther out in its profile is cut off.
 _CENTRAL = 0.6
@@ -32,14 +33,14 @@ _LONG_PX = 2.5
 
 
 class Steps(NamedTuple):
-    """By how much edges lie off, (m, s) in px, and which of them are clear, (m, s)."""
+    """Displacements of edges, (m, s) in px, and which of them are clear, (m, s)."""
 
     off_px: Array
     clear: NDArray[np.bool_]
 
 
 def masked_median(values: Array, mask: NDArray[np.bool_]) -> Array:
-    """Return the medians, (m, 1), of what a mask shows of (m, s); 0.0 where it shows nothing."""
+    """Return the medians, (m, 1), of the masked values (m, s); 0.0 if there are none."""
     count = np.count_nonzero(mask, axis=1)
     ordered = np.sort(np.where(mask, values, np.inf), axis=1)
     median = np.take_along_axis(ordered, np.maximum(count - 1, 0)[:, None] // 2, axis=1)
@@ -59,7 +60,7 @@ def rough_steps(prints: Prints, profiles: Array, reach_px: float) -> Steps:
 
 
 def exact_steps(prints: Prints, profiles: Array, reach_px: float, blur_px: float) -> Steps:
-    """Return where profiles (m, s, t) have a blurred step, on light that may slope."""
+    """Return the positions of a blurred step in profiles (m, s, t), with a gradient of the light."""
     steps, inverse = _shapes(reach_px, blur_px)
     fitted = profiles @ inverse.T
     misshapen = np.sqrt(np.square(profiles - fitted @ steps.T).mean(axis=2))
@@ -74,7 +75,7 @@ def exact_steps(prints: Prints, profiles: Array, reach_px: float, blur_px: float
 
 
 def usual_blur(prints: Prints, profiles: Array, reach_px: float) -> float:
-    """Return by how many px the edges of one marker are blurred, from profiles (s, t) across them."""
+    """Return the blur of the edges of one marker in px, from profiles (s, t) across them."""
     rising = profiles * prints.polarity[0][:, None]
     heights = rising[:, -1] - rising[:, 0]
     real = heights > LEAST_CONTRAST
@@ -88,7 +89,7 @@ def usual_blur(prints: Prints, profiles: Array, reach_px: float) -> float:
 
 @cache
 def _residues(reach_px: float) -> Array:
-    """Return what the best step of each blur leaves of a profile, (blurs, t, t)."""
+    """Return the matrices of the residuals of a profile about the best step of each blur, (blurs, t, t)."""
     shapes = [_shapes(reach_px, blur_px) for blur_px in BLURS_PX.tolist()]
     return np.array([np.eye(len(TAPS)) - steps @ inverse for steps, inverse in shapes])
 

@@ -210,6 +210,12 @@ def _is_up_to_date(session: Session, run: Run, checked: Collection[str], say: Ca
         count = session.count(read.topic)
         if read.topic in checked or (count == read.messages and session.hash(read.topic) == read.hash):
             continue
+        if count == 0:
+            say(
+                f"run {run.run}: {run.stage} is not verified: {read.topic}, which it has read, is not in "
+                f"{session}; give the log that has it, too"
+            )
+            return False
         text = (
             f"run {run.run} was made from {read.messages} messages of {read.topic}, and these "
             f"are not what the log holds now ({count} messages): it is out of date"

@@ -234,6 +234,9 @@ def test_run_without_its_inputs_is_not_repeatable_and_later_stages_go_on(
     assert {row["state"] for row in first.values()} == {"not repeatable"}
     assert made(ipsys, log)["fuse"] == ("poly", True)
     assert states(ipsys, log)["poly", "fuse"]["state"] == "current"
+    done = ipsys("verify", log)
+    assert (done.code, "detect is not verified: /cameras/" in done.err) == (0, True)
+    assert "/runs/poly/tracks" in ipsys("verify", log, "--json").out
 
 
 def test_unfinished_run_is_said_to_be(ipsys: Ipsys, log: Path, tmp_path: Path) -> None:

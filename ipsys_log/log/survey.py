@@ -207,6 +207,8 @@ def _take_loose(found: Survey, at: RecordAt) -> None:
         _, _, channel, _, time_ns, _ = MESSAGE.unpack(view.read(at.offset, MESSAGE.size))
         if _has_lost_chunk_heads(found) and up_to_first_hole(view, at.offset, at.length) < at.length:
             raise view.fault(at.offset, "a message holds a sector of zeros")
+        if at.offset < found.doubtful_to and found.resync.chunked:
+            raise view.fault(at.offset, "a message outside of chunks follows damage in a log with chunks")
         if at.offset < found.doubtful_to and not found.resync.fits(channel, time_ns):
             raise view.fault(at.offset, "a message after damage has an unknown channel and another time")
         try:

@@ -33,6 +33,7 @@ HARD = [
     (103, 8041, "unchunked: cut at 1214, zeroed at 512"),  # two small messages between both
     (103, 8506, "unchunked: zeroed at 2560, duplicated 18432 at 512"),  # the first message between both
     (103, 9171, "unchunked, data CRC: duplicated 20480 at 1536, zeroed at 512"),
+    (202, 9307, "no statistics: flipped at 1715, swapped in at 1024"),  # a message of a log without chunks
     (93, 2517, "no index: swapped in at 11776"),  # a chunk without CRC, half of another log's
 ]
 

@@ -120,8 +120,13 @@ def check_run_name(session: Session, stage: str, name: str, writes: Sequence[typ
 
 
 def newest_run(session: Session, payload: type) -> str | None:
-    """Return the run whose newest complete stage wrote a type of payload."""
+    """Return the run whose newest complete stage wrote a type of payload.
+
+    Imported channels are of no recorded stage: they count with any complete stage of their run.
+    """
+    recorded = {output.topic for run in session.runs() for output in run.outputs}
     for run in reversed(complete_runs(session)):
-        if {output.topic for output in run.outputs} & set(session.topics(payload, run.run)):
+        topics = set(session.topics(payload, run.run))
+        if topics and (topics.isdisjoint(recorded) or topics & {output.topic for output in run.outputs}):
             return run.run
     return None

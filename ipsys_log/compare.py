@@ -21,8 +21,8 @@ Array = NDArray[np.float64]
 
 @dataclass(frozen=True, slots=True)
 class Comparison:
-    """Of one channel: messages on both sides, how many of them speak of one frame, how many of these are the
-    same byte for byte, and the first that is not.
+    """Counts of one channel: messages on both sides, those of the same frame, those that are equal byte for
+    byte; and the first difference.
 
     ``rms`` and ``greatest`` are distances between what both sides have, in ``unit``: of corners in px, of
     points in m. None where there is nothing to measure.
@@ -145,7 +145,7 @@ _Group = tuple[int, dict[str, list[_Row]]]
 def _together(
     left: Iterator[_Group], right: Iterator[_Group]
 ) -> Iterator[tuple[dict[str, list[_Row]], dict[str, list[_Row]]]]:
-    """What both sides have of each log time; nothing where only one has any."""
+    """Yield the rows of both sides for each log time; an empty dictionary for a side without any."""
     one, other = next(left, None), next(right, None)
     while one is not None or other is not None:
         if other is None or (one is not None and one[0] < other[0]):
@@ -162,7 +162,7 @@ def _together(
 
 @dataclass(slots=True)
 class _Tally:
-    """What has been found of one channel so far; distances in px of markers, in m of everything else."""
+    """Counts and differences of one channel so far; in px for markers, in m for all else."""
 
     left: int = 0
     right: int = 0
@@ -202,7 +202,7 @@ class _Tally:
 
 
 def _values(payload: Any) -> dict[int, Array]:
-    """What can be measured, by marker: (n, 2) in px or (1, 3) in m."""
+    """Return the coordinates by marker id: (n, 2) in px or (1, 3) in m."""
     if isinstance(payload, Markers):
         return {marker.id: marker.corners_px for marker in payload.markers}
     points: tuple[Any, ...] = ()
@@ -216,7 +216,7 @@ def _values(payload: Any) -> dict[int, Array]:
 
 
 def _said(left: _Row | None, right: _Row | None) -> str:
-    """Where two messages differ, in words."""
+    """Describe the difference of two messages."""
     if left is None or right is None:
         there = left or right
         assert there is not None

@@ -147,7 +147,7 @@ class Rig:
         return f"marker_{marker_id}"
 
     def knows(self, marker_id: int) -> bool:
-        """Whether an id is in use here: listed, or nothing is listed."""
+        """Return whether an id is in use here: listed, or nothing is listed."""
         return not self.markers or any(marker.id == marker_id for marker in self.markers)
 
 

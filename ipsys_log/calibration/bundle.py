@@ -52,7 +52,7 @@ class Corners:
         return np.asarray(np.add.reduceat(values, self.starts, axis=0))
 
     def keep(self, kept: NDArray[np.bool_]) -> tuple[Corners, NDArray[np.intp]]:
-        """Those corners only, and which pictures still have any."""
+        """Return only these corners, and the pictures that still have some."""
         left, numbers = np.unique(self.picture[kept], return_inverse=True)
         return Corners(self.board_m[kept], self.pixels[kept], numbers, len(left)), left
 
@@ -229,7 +229,7 @@ def _tried(
     damping: float,
     scale_px: float | None,
 ) -> Fit | None:
-    """Where a step leads, or None where there is no such place."""
+    """Return the result of a step, or None if there is none."""
     try:
         lens_step, pose_steps = _solve(normal, damping)
     except np.linalg.LinAlgError:

@@ -158,7 +158,7 @@ def _edge_width_px(grey: Grey, board: Board, ids: NDArray[np.intp], pixels: Arra
 
 
 def _slopes(grey: Grey, ends: Array, reach_px: float) -> Array:
-    """How steep edges between pairs of corners (n, 2, 2) are, in levels per px, up to ``reach_px`` aside."""
+    """Return the slopes of edges between corners (n, 2, 2), in levels per px, up to ``reach_px`` aside."""
     along = ends[:, 1] - ends[:, 0]
     across = np.stack([-along[:, 1], along[:, 0]], axis=1) / np.linalg.norm(along, axis=1, keepdims=True)
     offsets = np.arange(-reach_px, reach_px + 1e-9, _STEP_PX)

@@ -205,7 +205,7 @@ def _show_count(log: Path, added: Sequence[Measurement], as_json: bool) -> None:
 
 
 def _show_next(log: Path, history: Sequence[Measurement]) -> None:
-    """What to do with the places that a log has now."""
+    """Print the next step for the points that a log has now."""
     from ipsys_log.models import min_pairs
     from ipsys_log.offline.pairs import active_measurements
 

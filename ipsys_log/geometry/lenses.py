@@ -124,7 +124,7 @@ def scale_lens(lens: CameraCalibration, width: int, height: int, where: str) -> 
 
 
 def same_lens(one: CameraCalibration, other: CameraCalibration) -> bool:
-    """Whether two calibrations map pixels to rays alike, whatever their times and frames."""
+    """Return whether two calibrations map pixels to rays alike; their times and frames may differ."""
     sizes = [(lens.width, lens.height, lens.distortion_model) for lens in (one, other)]
     return sizes[0] == sizes[1] and np.array_equal(one.K, other.K) and np.array_equal(one.D, other.D)
 
@@ -202,7 +202,7 @@ def project(points_m: NDArray[np.float64], lens: CameraCalibration) -> NDArray[n
 
 
 def in_picture(points_m: NDArray[np.float64], lens: CameraCalibration) -> NDArray[np.bool_]:
-    """Which points in the frame of the camera lie in its picture, (n,).
+    """Return whether points in camera coordinates lie in the image, (n,).
 
     Parameters
     ----------

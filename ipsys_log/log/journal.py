@@ -51,8 +51,7 @@ class Journal:
 
 
 def journal_path(path: Path) -> Path:
-    """Where the journal of the log at `path` lies while its tail is replaced: beside the file itself, by
-    whichever link it is opened."""
+    """Return the path of the journal of a log: beside the file itself, even if a link is opened."""
     real = Path(os.path.realpath(path))
     return real.with_name(real.name + ".journal")
 

@@ -198,7 +198,7 @@ def _identity_faults(entry: Entry, sight: Sight | None, history: Sequence[Measur
 
 
 def _here_before(read: Measurement, sight: Sight | None, history: Sequence[Measurement]) -> list[Measurement]:
-    """What counts of this marker at this place: in the same stretch, or where cameras see it still."""
+    """Return the measurements of this marker here: of one stationary interval, or seen there."""
     seen = sight.measured_as if sight else ()
     own = [m for m in active_measurements(history) if m.marker_id == read.marker_id]
     return [m for m in own if _overlap(m, read) or m.id in seen]
@@ -242,7 +242,7 @@ def _overlap(one: Measurement, other: Measurement) -> bool:
 
 
 def _both_sides(read: Measurement, rig: Rig) -> tuple[tuple[tuple[str, Array], ...], list[Fault]]:
-    """Where it would be on either side; or why the tapes do not meet."""
+    """Return the points on both sides, or the reason why the tape distances do not meet."""
     try:
         places = tuple((side, world_point(replace(read, side=side), rig).world_m) for side in SIDES)
     except IpsysError as error:

@@ -48,7 +48,7 @@ def with_tape(rig: Rig) -> Rig:
 
 
 def _outside_m(point_m: Array, rig: Rig) -> float:
-    """How far a point lies outside of the floor, 0 inside."""
+    """Return how far a point lies outside of the floor, 0 inside."""
     if rig.floor is None:
         return 0.0
     size_m = np.array([rig.floor.width_m, rig.floor.depth_m])
@@ -92,7 +92,7 @@ def doubt_crossing(read: Measurement, rig: Rig) -> list[str]:
 
 
 def floor_sigma_m(fixed: TapePoint) -> float | None:
-    """How well the tape knows a place in the direction in which it knows it least, in m."""
+    """Return how well the tape knows a place in the direction in which it knows it least, in m."""
     if fixed.covariance_m2 is None:
         return None
     return float(np.sqrt(np.linalg.eigvalsh(fixed.covariance_m2[:2, :2])[-1]))

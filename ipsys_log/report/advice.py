@@ -106,7 +106,7 @@ class _Candidate:
     noise_m: float
 
     def like(self, other: _Candidate) -> bool:
-        """Whether the difference is within the noise."""
+        """Return whether the difference is within the noise."""
         return bool(self.mean_m - other.mean_m <= _CONFIDENCE * np.hypot(self.noise_m, other.noise_m))
 
 

@@ -120,7 +120,7 @@ class LiveStatus:
 
 
 def robots_table(tracks: Mapping[str, Track]) -> Table:
-    """Where the robots are: first those that have a name, and no more than fit into a window."""
+    """Return where the robots are: first those that have a name, and no more than fit into a window."""
     table = Table(box=None, pad_edge=False)
     for heading in ("robot", "x cm", "y cm", "z cm", "heading", "cameras"):
         table.add_column(heading, justify="left" if heading in ("robot", "cameras") else "right")
@@ -175,7 +175,7 @@ def _markers(look: Look) -> Text:
 
 
 def latency_table(steps: Mapping[str, Percentiles]) -> Group:
-    """How long each step took, in ms."""
+    """Return how long each step took, in ms."""
     table = Table(box=None, pad_edge=False, title="Milliseconds for each step", title_justify="left")
     table.add_column("step")
     for heading in ("median", "90 %", "99 %", "longest"):
@@ -204,7 +204,7 @@ def comparison_table(found: Sequence[Comparison], sides: tuple[str, str]) -> Tab
 
 
 def first_difference(found: Sequence[Comparison]) -> str | None:
-    """Where two sides differ first, in words; None where they do not."""
+    """Return where two sides differ first, in words; None where they do not."""
     apart = [one for one in found if not one.equal]
     if not apart:
         return None
@@ -225,5 +225,5 @@ def _distance(value: float | None, unit: str | None) -> str:
 
 
 def comparison_json(found: Sequence[Comparison]) -> dict[str, Any]:
-    """Whether all is equal, and each channel."""
+    """Return whether all is equal, and each channel."""
     return {"equal": all(one.equal for one in found), "channels": [asdict(one) for one in found]}

@@ -102,7 +102,7 @@ def _about_the_end(report: RepairReport) -> Iterator[str | Table]:
 
 
 def _gone(times_ns: Sequence[int], end_ns: int | None) -> str:
-    """How many messages of a steady channel may have come from its last one to the end."""
+    """Return how many messages of a steady channel may have come from its last one to the end."""
     if end_ns is None or len(times_ns) < 2:
         return "not known"
     rate_hz = (len(times_ns) - 1) * NS_PER_S / max(times_ns[-1] - times_ns[0], 1)

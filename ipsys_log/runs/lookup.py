@@ -149,7 +149,7 @@ def can_evaluate(session: Session, request: Request, model: str) -> bool:
 
 
 def fits_again(session: Session, request: Request, model: str) -> bool:
-    """Whether a model is fitted to this log's places, so that it can be fitted to fewer of them."""
+    """Return whether a model is fitted to this log's places, so that it can be fitted to fewer of them."""
     return request.model_from is None and copied_run(session, model) is None
 
 

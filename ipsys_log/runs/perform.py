@@ -33,7 +33,7 @@ from ipsys_log.runs.resume import OtherContentError, cut_short, without_held
 from ipsys_log.runs.states import Recorded, method_of, recorded_stages
 from ipsys_log.runs.tasks import Task, plan_stage
 
-__all__ = ["SHARED_STAGES", "inputs", "perform", "record_of", "sign", "signed_copy"]
+__all__ = ["SHARED_STAGES", "has_given_name", "inputs", "perform", "record_of", "sign", "signed_copy"]
 
 # The stages whose runs serve every model.
 SHARED_STAGES = ("detect", "camera-frame")
@@ -55,9 +55,7 @@ def perform(
     An interrupted run is completed, if its content equals the present result. If the newest run of such a
     task is out of date, a remark says so before a new run is made.
     """
-    # A name given by the user is for what was asked for, not for the detection on the way to it.
-    named = task.stage == until or (task.stage not in SHARED_STAGES and until not in SHARED_STAGES)
-    name = request.run if named else None
+    name = request.run if has_given_name(task.stage, until) else None
     record = record_of(session, task)
     found = find_run(session, record, name)
     if found is not None:
@@ -78,6 +76,11 @@ def perform(
         check_run_name(session, task.stage, name, task.writes)
     outcome = _append(session, target, task, replace(record, run=name), {}, request, make)
     return replace(outcome, remarks=(*remarks, *outcome.remarks))
+
+
+def has_given_name(stage: str, until: str) -> bool:
+    """Return whether the run name of the user is for a stage: not for the detection before the last stage."""
+    return stage == until or not {stage, until} & set(SHARED_STAGES)
 
 
 def _say_renewal(session: Session, task: Task, record: Run, say: Callable[[str], None]) -> None:

@@ -16,10 +16,10 @@ from ipsys_log.offline.pairs import split
 from ipsys_log.offline.tape import world_point
 from ipsys_log.rig import check_rig
 from ipsys_log.runs.lookup import can_evaluate, copied_run, fitted_in, measured
-from ipsys_log.runs.perform import SHARED_STAGES
+from ipsys_log.runs.perform import has_given_name
 from ipsys_log.runs.records import newest_run
 from ipsys_log.runs.request import Request
-from ipsys_log.runs.states import recorded_stages
+from ipsys_log.runs.states import made_by_newer, method_of, recorded_stages
 from ipsys_log.runs.tasks import STAGES, usual_corners
 
 __all__ = ["check_inputs"]
@@ -59,17 +59,16 @@ def _check_versions(session: Session, request: Request, models: Sequence[str], w
     """Check that this software would not repeat a result of newer software."""
     corners = request.corners or usual_corners(session.images, {*session.calibrations, *request.lenses})
     methods = {"detect": {corners}, "camera-frame": {request.method}, "fuse": {""}}
-    for one in recorded_stages(session):
-        is_asked = one.run.stage in wanted and one.method in methods.get(one.run.stage, models)
-        if one.is_newer and is_asked:
-            raise IpsysError(f"{session}: run {one.run.run}, stage {one.run.stage}: {one.state}")
+    for run in session.runs():
+        newer = made_by_newer(session, run) if run.stage in wanted else ""
+        if newer and method_of(session, run) in methods.get(run.stage, models):
+            raise IpsysError(f"{session}: run {run.run}, stage {run.stage}: {newer}")
 
 
 def _check_run_name(session: Session, request: Request, until: str) -> None:
-    """See that the run of the name that the user gives is not an older one of other inputs."""
-    for one in recorded_stages(session):
-        is_named = one.run.stage == until or not {one.run.stage, until} & set(SHARED_STAGES)
-        if one.run.run == request.run and one.out_of_date and is_named:
+    """Check that the run name of the user is not that of a run that is out of date."""
+    for one in recorded_stages(session) if request.run is not None else ():
+        if one.run.run == request.run and one.out_of_date and has_given_name(one.run.stage, until):
             raise IpsysError(
                 f"run {request.run} already has the stage {one.run.stage}, which is {one.state}; use another "
                 "--run name"

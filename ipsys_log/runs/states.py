@@ -12,7 +12,7 @@ from ipsys_log.runs.records import is_complete
 from ipsys_log.runs.versions import VERSIONS, recorded_version, versioned_names
 from ipsys_log.stages.camera_frame import PERIMETER
 
-__all__ = ["Recorded", "is_fitted_here", "method_of", "out_of_date_lines", "recorded_stages"]
+__all__ = ["Recorded", "is_fitted_here", "made_by_newer", "method_of", "out_of_date_lines", "recorded_stages"]
 
 _CURRENT = "current"
 # A model that was fitted to measurements of the same log has one of these parameters.
@@ -70,8 +70,19 @@ def out_of_date_lines(session: Session, names: Iterable[str | None]) -> list[str
     for one in recorded_stages(session):
         is_shown = one.run.run in wanted and one.run.stage != "evaluate"
         if is_shown and (one.out_of_date or one.is_newer):
-            lines.setdefault(one.run.run, f"run {one.run.run}: {one.run.stage} is {one.state}")
-    return [line if "update" in line else f"{line}; ipsys replay makes it again" for line in lines.values()]
+            advice = "" if one.is_newer else "; ipsys replay makes it again"
+            lines.setdefault(one.run.run, f"run {one.run.run}: {one.run.stage} is {one.state}{advice}")
+    return list(lines.values())
+
+
+def made_by_newer(session: Session, run: Run) -> str:
+    """Return the state of a stage that newer software made; "" for any other. Channels are not read."""
+    for name in versioned_names(run.stage, method_of(session, run)):
+        version = recorded_version(run, name)
+        if version > VERSIONS.get(name, 0):
+            here = f"this is {name} {VERSIONS[name]}" if name in VERSIONS else "which is not known here"
+            return f"made by {name} {version}, {here}: update ipsys"
+    return ""
 
 
 def is_fitted_here(run: Run) -> bool:
@@ -99,12 +110,9 @@ def _judge(session: Session, one: Recorded) -> Recorded:
     run = one.run
     if not is_complete(session, run):
         return replace(one, state="unfinished")
+    if newer := made_by_newer(session, run):
+        return replace(one, state=newer, is_newer=True)
     names = versioned_names(run.stage, one.method)
-    for name in names:
-        version = recorded_version(run, name)
-        if version > VERSIONS.get(name, 0):
-            here = f"this is {name} {VERSIONS[name]}" if name in VERSIONS else "which is not known here"
-            return replace(one, state=f"made by {name} {version}, {here}: update ipsys", is_newer=True)
     is_copied = run.stage == "fit" and not is_fitted_here(run)
     if is_copied or any(read.messages and not session.count(read.topic) for read in run.inputs):
         return replace(one, state="not repeatable")

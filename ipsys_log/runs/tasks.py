@@ -245,7 +245,7 @@ def _fit(session: Session, request: Request, points: str, model: str) -> Task | 
 
 
 def usual_corners(cameras: Iterable[str], with_lens: Collection[str]) -> str:
-    """How corners are found unless it is said: by edges if all cameras have a lens."""
+    """Return how corners are found unless it is said: by edges if all cameras have a lens."""
     return detect.EDGES if set(cameras) <= set(with_lens) else detect.STOCK
 
 

@@ -213,7 +213,7 @@ def _message(measurement: Measurement, earlier: Sequence[Message]) -> Message:
 
 
 def _find_stops(sightings: Mapping[tuple[str, int], Sightings], rig: Rig) -> list[Stop]:
-    """Where the rig's markers lie still, in order of time."""
+    """Return where the rig's markers lie still, in order of time."""
     stops = []
     for marker_id in sorted({marker_id for _, marker_id in sightings}):
         if rig.knows(marker_id):
@@ -223,7 +223,7 @@ def _find_stops(sightings: Mapping[tuple[str, int], Sightings], rig: Rig) -> lis
 
 
 def _sees(message: Message, here: Stop) -> bool:
-    """Whether camera points have the marker of a stretch within it."""
+    """Return whether camera points have the marker of a stretch within it."""
     return any(
         point.id == here.marker_id
         and here.start_ns <= message.publish_time_ns + (point.time_offset_ns or 0) <= here.end_ns

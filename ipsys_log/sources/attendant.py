@@ -196,7 +196,7 @@ class Attendant:
             pass
 
     def _is_early(self, frame: Frame) -> bool:
-        """Whether a frame came before the recording began, but for the first; or needs one that did.
+        """Return whether a frame came before the recording began, but for the first; or needs one that did.
 
         Without a stamp it can only be dated by its arrival, so it must not wait: until then such frames are
         thrown away. Files and the simulator give stamps, and wait.

@@ -101,7 +101,7 @@ def _read(camera: RigCamera, clock: Clock, say: Say, queue: _Queue, stop: Event)
 
 
 def _put(queue: _Queue, item: Frame | SourceError | None, stop: Event) -> bool:
-    """Whether it was wanted."""
+    """Return whether it was wanted."""
     while not stop.is_set():
         try:
             queue.put(item, timeout=_TURN_S)

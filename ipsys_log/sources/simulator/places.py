@@ -75,7 +75,7 @@ def seen_whole(where: Place, cameras: Sequence[Camera], settings: LabSettings) -
 def overlap(
     first: Array, second: Array, cameras: Sequence[Camera], settings: LabSettings
 ) -> NDArray[np.bool_]:
-    """Whether prints at two places, (..., 3) in m, might cover one another in any image: (...).
+    """Return whether prints at two places, (..., 3) in m, might cover one another in any image: (...).
 
     The disc around a print throws a shadow on the floor from where a camera hangs; shadows that are
     apart are apart in its image.

@@ -237,7 +237,7 @@ class Follow:
     def _with_speed(
         self, grey: Grey, frame_ns: int, guesses: Sequence[Guess], fits: list[Fit | None]
     ) -> list[Fit | None]:
-        """Where rows take time, the same fits with the speeds that follow from them."""
+        """Return the same fits, with the speeds that follow from them if rows take time."""
         if not self._row_time_s:
             return fits
         again = {}

@@ -68,7 +68,7 @@ class Poses(NamedTuple):
         return points @ self.rotations[:, :, :2].transpose(0, 2, 1) + self.centres[:, None]
 
     def camera(self) -> Array:
-        """Where the camera is in the frames of the prints: (m, 3)."""
+        """Return the camera positions in the frames of the prints, (m, 3)."""
         return -(self.centres[:, None] @ self.rotations)[:, 0]
 
     def moved(self, twists: Array) -> Poses:

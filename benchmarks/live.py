@@ -27,11 +27,11 @@ from scenes import drawn
 from stream_server import Served, loops_of, serve
 
 from ipsys_log import pipeline
-from ipsys_log.log.session import Session
+from ipsys_log.analysis.latency import latency_percentiles, recorded_latencies, step_times_s
+from ipsys_log.log.dataset import Session
 from ipsys_log.messages import FRAME_SKIPPED, CompressedImage, Event
-from ipsys_log.recording.latency import latency_percentiles, recorded_latencies, step_times_s
-from ipsys_log.runs.request import Request
-from ipsys_log.sources.simulator import LabSettings
+from ipsys_log.runs.options import Request
+from ipsys_log.simulation.settings import LabSettings
 
 __all__ = ["measure"]
 

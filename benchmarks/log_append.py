@@ -15,7 +15,9 @@ import tempfile
 import time
 from pathlib import Path
 
-from ipsys_log.log import LogReader, LogWriter, Schema
+from ipsys_log.log.reader import LogReader
+from ipsys_log.log.types import Schema
+from ipsys_log.log.writer import LogWriter
 
 IMAGE_BYTES = 300_000
 CHANNELS = 9

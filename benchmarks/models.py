@@ -18,18 +18,18 @@ from pathlib import Path
 import numpy as np
 from threadpoolctl import threadpool_limits
 
-from ipsys_log.formats.imsel import read_imsel
-from ipsys_log.log.session import Session
+from ipsys_log.analysis.cross_validation import cross_validate, gather_places
+from ipsys_log.analysis.learning import labelled_subsets
+from ipsys_log.analysis.pairs import Measured, build_pairs, gather_sightings
+from ipsys_log.analysis.statistics import error_statistics
+from ipsys_log.exchange.imsel import read_imsel
+from ipsys_log.log.dataset import Session
 from ipsys_log.messages import CameraPoints, Pair
-from ipsys_log.models import MODELS
-from ipsys_log.offline.crossval import cross_validate, gather_places
-from ipsys_log.offline.evaluate import Study, evaluate_model
-from ipsys_log.offline.fit import fit_model
-from ipsys_log.offline.learning import labelled_subsets
-from ipsys_log.offline.pairs import Measured, build_pairs, gather_sightings
-from ipsys_log.offline.statistics import error_statistics
-from ipsys_log.runs.lookup import measured
+from ipsys_log.models.table import MODELS
 from ipsys_log.runs.output import write_log
+from ipsys_log.runs.select import measured
+from ipsys_log.stages.evaluate import Study, evaluate_model
+from ipsys_log.stages.fit import fit_model
 
 # Best was chosen with other folds.
 FIRST_SEED = 1000

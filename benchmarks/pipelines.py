@@ -13,7 +13,7 @@ import simplejpeg
 from numpy.typing import NDArray
 from rounds import Turn
 
-from ipsys_log.log.session import Session
+from ipsys_log.log.dataset import Session
 from ipsys_log.messages import CameraCalibration, Markers, Message, Rig
 from ipsys_log.stages import detect
 from ipsys_log.stages.detect import Detect
@@ -185,7 +185,7 @@ def one_by_one(
 def threaded(path: Path, ranges: Sequence[tuple[int, int]]) -> Turn:
     """Ours as :func:`ipsys_log.pipeline.replay` runs it: a thread for each camera."""
     # Late: the whole package comes with it, and the other contenders start without.
-    from ipsys_log.pipeline import Stage, in_threads, run
+    from ipsys_log.runs.stream import Stage, in_threads, run
 
     cv2.setNumThreads(1)
     session, rig, lenses = _opened(path)

@@ -27,7 +27,7 @@ from results import Report, command
 from rounds import Contender, Row, Turn, race, ratio_row
 from scenes import CACHE, drawn, lengthened
 
-from ipsys_log.sources.simulator import LabSettings
+from ipsys_log.simulation.settings import LabSettings
 
 __all__ = ["measure"]
 
@@ -37,7 +37,7 @@ _CAMERAS = 3
 
 def _whole(path: Path) -> Turn:
     from ipsys_log.pipeline import replay
-    from ipsys_log.runs.request import Request
+    from ipsys_log.runs.options import Request
 
     target = path.with_name("replayed.mcap")
     target.unlink(missing_ok=True)
@@ -59,9 +59,9 @@ def _whole(path: Path) -> Turn:
 
 
 def _detection(path: Path) -> Turn:
-    from ipsys_log.log.session import Session
+    from ipsys_log.log.dataset import Session
     from ipsys_log.messages import CameraCalibration, Rig
-    from ipsys_log.pipeline import Stage, in_threads, run
+    from ipsys_log.runs.stream import Stage, in_threads, run
     from ipsys_log.stages import detect
 
     stage = Stage("bench", detect.READS, detect.Detect(detect.EDGES))
@@ -174,7 +174,7 @@ def measure(options: argparse.Namespace) -> Report:
 
 
 def _frames(path: Path) -> int:
-    from ipsys_log.log.session import Session
+    from ipsys_log.log.dataset import Session
 
     with Session([path]) as session:
         return sum(session.count(topic) for topic in session.images.values())

@@ -13,12 +13,15 @@ import cv2
 import numpy as np
 from numpy.typing import NDArray
 
-from ipsys_log.log.session import Session
+from ipsys_log import simulation
+from ipsys_log.geometry.patterns import true_corners
+from ipsys_log.log.dataset import Session
 from ipsys_log.messages import CompressedImage, Message, Tracks
 from ipsys_log.runs.output import write_log
-from ipsys_log.sources import simulator
-from ipsys_log.sources.simulator import LabSettings, hang_cameras, simulate, true_corners
-from ipsys_log.sources.simulator.places import Place, place
+from ipsys_log.simulation.calibration_points import Place, place
+from ipsys_log.simulation.cameras import hang_cameras
+from ipsys_log.simulation.lab import simulate
+from ipsys_log.simulation.settings import LabSettings
 
 __all__ = ["CACHE", "Truth", "blocks", "drawn", "lengthened", "truth", "with_restarts"]
 
@@ -41,7 +44,7 @@ def drawn(settings: LabSettings) -> Path:
     """The log of a session of the simulated lab, drawn if it is not there yet."""
     # Another simulator or another JPEG encoder gives other frames.
     key = hashlib.blake2b(f"{settings} {cv2.__version__}".encode(), digest_size=8)
-    for source in sorted(Path(simulator.__file__).parent.glob("*.py")):
+    for source in sorted(Path(simulation.__file__).parent.glob("*.py")):
         key.update(source.read_bytes())
     path = CACHE / f"{key.hexdigest()}.mcap"
     if not path.exists():

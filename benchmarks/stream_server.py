@@ -15,8 +15,8 @@ from typing import Any
 import cv2
 import numpy as np
 
-from ipsys_log.log.session import Session
-from ipsys_log.rig import rig_toml
+from ipsys_log.log.dataset import Session
+from ipsys_log.rig.file import rig_toml
 
 __all__ = ["Served", "loops_of", "serve"]
 

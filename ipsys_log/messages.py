@@ -109,7 +109,7 @@ class Floor:
 
 @dataclass(frozen=True, slots=True)
 class Rig:
-    """The lab, as ``lab.toml`` and the channel ``/rig`` hold it (see :mod:`ipsys_log.rig`)."""
+    """The lab, as ``lab.toml`` and the channel ``/rig`` hold it (see :mod:`ipsys_log.rig.file`)."""
 
     name: str
     dictionary: str

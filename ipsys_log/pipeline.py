@@ -27,104 +27,41 @@ there, as long as the stages keep up, to them (``waiting``).
 
 from __future__ import annotations
 
-import builtins
-from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
-from dataclasses import dataclass, replace
+from collections.abc import Callable, Iterable, Mapping, Sequence
+from dataclasses import replace
 from functools import partial
 from itertools import chain
 from pathlib import Path
-from typing import Any
 
 from threadpoolctl import threadpool_limits
 
+from ipsys_log.analysis.latency import Ledger
+from ipsys_log.capture.backlog import TICK, Backlog
+from ipsys_log.capture.frames import SourceError
+from ipsys_log.capture.live_plan import check_pictures, plan_live
+from ipsys_log.capture.multiplexer import Attached
+from ipsys_log.capture.recent_frames import Recent
+from ipsys_log.capture.recorder import Recording, Source, recording, written
 from ipsys_log.errors import IpsysError, LogError
-from ipsys_log.log.session import Session
+from ipsys_log.log.dataset import Session
 from ipsys_log.messages import (
     EVENTS_TOPIC,
-    CameraPoints,
-    Evaluation,
-    Event,
-    FrameTransforms,
-    ImageAnnotations,
     Markers,
     Message,
-    Model,
     Positions,
     Tracks,
 )
-from ipsys_log.recording.backlog import TICK, Backlog
-from ipsys_log.recording.consumers import Consumer, Consumers
-from ipsys_log.recording.latency import Ledger
-from ipsys_log.recording.plan import check_pictures, plan_live
-from ipsys_log.recording.recent import Recent
-from ipsys_log.recording.recorder import Recording, Source, recording, written
-from ipsys_log.runs.lookup import wanted_models
+from ipsys_log.runs.checks import check_inputs
+from ipsys_log.runs.execute import carry_out, perform, sign
+from ipsys_log.runs.graph import STAGES, plan_stage
+from ipsys_log.runs.options import Progress, Request
 from ipsys_log.runs.output import opened_target
-from ipsys_log.runs.perform import inputs, perform, sign
-from ipsys_log.runs.preflight import check_inputs
-from ipsys_log.runs.records import Outcome
-from ipsys_log.runs.request import Progress, Request
-from ipsys_log.runs.tasks import STAGES, Task, plan_stage
-from ipsys_log.runs.threads import in_threads
-from ipsys_log.sources.attached import Attached
-from ipsys_log.sources.frames import SourceError
+from ipsys_log.runs.provenance import Outcome
+from ipsys_log.runs.select import wanted_models
+from ipsys_log.runs.stream import TOPICS, Stage, in_threads, run
+from ipsys_log.sinks.sink import Consumer, Consumers
 
-__all__ = ["TOPICS", "Stage", "carry_out", "in_threads", "live", "measure", "record", "replay", "run"]
-
-# Where a payload goes within its run.
-TOPICS: dict[type, str] = {
-    Markers: "/runs/{run}/cameras/{camera}/markers",
-    ImageAnnotations: "/runs/{run}/cameras/{camera}/annotations",
-    CameraPoints: "/runs/{run}/cameras/{camera}/camera_points",
-    Model: "/runs/{run}/model",
-    Evaluation: "/runs/{run}/evaluation",
-    Positions: "/runs/{run}/cameras/{camera}/positions",
-    Tracks: "/runs/{run}/tracks",
-    FrameTransforms: "/runs/{run}/poses",
-    Event: "/runs/{run}/events",
-}
-
-Map = Callable[[Callable[[Message], Any], Iterable[Message]], Iterable[Any]]
-
-
-@dataclass(frozen=True, slots=True)
-class Stage:
-    """A causal stage: the run it writes to, which payloads it reads, and its step.
-
-    A stage that remembers something across cameras is not ``per_camera``: it takes one message after
-    the other, whatever the map.
-    """
-
-    run: str
-    reads: tuple[type, ...]
-    step: Callable[[Message], Iterable[Any]]
-    per_camera: bool = True
-
-
-def run(source: Iterable[Message], stages: Sequence[Stage], map: Map = map) -> Iterator[Message]:
-    """Send every message of a source through the stages, and yield it and what they make of it.
-
-    What a stage makes has the log time of the message it was made from, and follows it at once; the
-    next stage sees both. Its publish time is its own timestamp. With ``map`` as :func:`in_threads`,
-    cameras use the cores in parallel and the order stays the same.
-    """
-    for stage in stages:
-        source = _through(stage, source, map)
-    yield from source
-
-
-def _through(stage: Stage, source: Iterable[Message], map: Map) -> Iterator[Message]:
-    def work(message: Message) -> tuple[Message, list[Any]]:
-        return message, list(stage.step(message)) if isinstance(message.payload, stage.reads) else []
-
-    for message, payloads in (map if stage.per_camera else builtins.map)(work, source):
-        yield message
-        for payload in payloads:
-            topic = TOPICS[type(payload)].format(run=stage.run, camera=message.camera)
-            # Transforms have their times one by one; drawings on a frame have that of the frame.
-            stamped = payload.transforms[0] if isinstance(payload, FrameTransforms) else payload
-            time_ns = getattr(stamped, "timestamp", message.publish_time_ns)
-            yield Message(topic, message.log_time_ns, time_ns, payload, message.camera)
+__all__ = ["live", "measure", "record", "replay"]
 
 
 def replay(
@@ -179,23 +116,6 @@ def replay(
                 do("evaluate", points=points, model=model)
             do("fuse", positions=do("locate", points=points, model=model))
     return outcomes
-
-
-def carry_out(task: Task, session: Session, name: str, progress: Progress) -> Iterator[Message]:
-    """The messages of a task's run: its causal stage over the log, or one computed from all of it."""
-    if task.step is None:
-        assert task.compute is not None
-        payload, (log_time_ns, _) = (
-            task.compute(session, partial(progress, task.stage)),
-            session.last(task.topics),
-        )
-        yield Message(TOPICS[type(payload)].format(run=name), log_time_ns, payload.timestamp, payload)
-        return
-    stage = Stage(name, task.reads, task.step(name), task.per_camera)
-    # Threads that run Python wait for one another, and a stage takes longer in them than without.
-    for message in run(inputs(session, task, progress), [stage], in_threads if task.decodes_frames else map):
-        if isinstance(message.payload, task.writes):
-            yield message
 
 
 def record(

@@ -5,13 +5,13 @@ from __future__ import annotations
 from collections.abc import Iterator, Mapping
 from pathlib import Path
 
-from ipsys_log.log.session import Session
+from ipsys_log.log.dataset import Session
 from ipsys_log.messages import CameraPoints, Markers, Model, Positions, Tracks
 from ipsys_log.pipeline import replay
-from ipsys_log.runs.lookup import skipped_frames
-from ipsys_log.runs.records import Outcome, newest_run
-from ipsys_log.runs.request import Progress, Request
-from ipsys_log.runs.tasks import points_run
+from ipsys_log.runs.graph import points_run
+from ipsys_log.runs.options import Progress, Request
+from ipsys_log.runs.provenance import Outcome, newest_run
+from ipsys_log.runs.select import skipped_frames
 from ipsys_log.stages.camera_frame import METHODS, PERIMETER
 from ipsys_log.stages.detect import CORNERS
 

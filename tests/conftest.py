@@ -19,15 +19,16 @@ from hypothesis import HealthCheck, settings
 # As the pipeline does, and before numpy is there: small matrices, and one process for each core.
 os.environ.setdefault("OPENBLAS_NUM_THREADS", "1")
 
+from ipsys_log.capture.video_files import open_video
 from ipsys_log.cli import main
-from ipsys_log.log.session import Session
+from ipsys_log.log.dataset import Session
 from ipsys_log.messages import CompressedVideo, Measurement, Message
 from ipsys_log.pipeline import replay
+from ipsys_log.runs.options import Request
 from ipsys_log.runs.output import write_log
-from ipsys_log.runs.request import Request
-from ipsys_log.sources.simulator import LabSettings, simulate
-from ipsys_log.sources.videos import open_video
-from tests.sources.streams import encode
+from ipsys_log.simulation.lab import simulate
+from ipsys_log.simulation.settings import LabSettings
+from tests.capture.streams import encode
 
 ROOT = Path(__file__).resolve().parent.parent
 # The command line installs handlers for these; a test gives them back.

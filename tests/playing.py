@@ -8,8 +8,8 @@ from collections import Counter
 from collections.abc import Callable, Iterator, Mapping, Sequence
 from contextlib import contextmanager
 
+from ipsys_log.capture.frames import Clock, Frame, Open, Say
 from ipsys_log.messages import CompressedImage, Message, RigCamera
-from ipsys_log.sources.frames import Clock, Frame, Open, Say
 from ipsys_log.units import NS_PER_S
 
 __all__ = ["SteppedClock", "cameras", "playing"]

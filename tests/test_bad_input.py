@@ -13,17 +13,8 @@ import cv2
 import numpy as np
 import pytest
 
-from ipsys_log.log.session import Session
-from ipsys_log.messages import (
-    CompressedImage,
-    Distance,
-    Event,
-    Markers,
-    Measurement,
-    Message,
-    Rig,
-    RigMarker,
-)
+from ipsys_log.log.dataset import Session
+from ipsys_log.messages import CompressedImage, Distance, Event, Markers, Measurement, Message, Rig, RigMarker
 from ipsys_log.runs.output import write_log
 from ipsys_log.units import format_time
 from tests.conftest import Ipsys

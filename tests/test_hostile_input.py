@@ -19,15 +19,17 @@ import pytest
 import scipy.io
 from google.protobuf.timestamp_pb2 import Timestamp
 
-from ipsys_log.calibration.pictures import _decode
+from ipsys_log.analysis.pairs import gather_sightings
+from ipsys_log.calibration.images import _decode
 from ipsys_log.errors import FrameError, IpsysError
-from ipsys_log.formats.matlab import read_mat
-from ipsys_log.formats.opencv_yaml import read_opencv_calibration
+from ipsys_log.exchange.matlab import read_mat
+from ipsys_log.exchange.opencv_yaml import read_opencv_calibration
+from ipsys_log.exchange.picture_times import find_times, parse_time
 from ipsys_log.geometry.lenses import check_calibration
+from ipsys_log.images.decode import decode_rows
+from ipsys_log.images.picture_size import check_encoded
 from ipsys_log.log.codec import decode, encode
-from ipsys_log.log.session import Session
-from ipsys_log.measuring.check import next_id
-from ipsys_log.measuring.sheet import read_sheet
+from ipsys_log.log.dataset import Session
 from ipsys_log.messages import (
     CameraCalibration,
     CameraPoint,
@@ -40,13 +42,11 @@ from ipsys_log.messages import (
     Rig,
     RigMarker,
 )
-from ipsys_log.offline.pairs import gather_sightings
-from ipsys_log.rig import check_rig, load_rig
+from ipsys_log.rig.file import check_rig, load_rig
 from ipsys_log.runs.output import write_log
-from ipsys_log.sources.picture_times import find_times, parse_time
 from ipsys_log.stages.detect import decode_grey
-from ipsys_log.stages.detect.decode import decode_rows
-from ipsys_log.stages.detect.picture_size import check_encoded
+from ipsys_log.survey.checks import next_id
+from ipsys_log.survey.sheet import read_sheet
 from tests.conftest import ROOT, Ipsys
 from tests.log.bombs import jpeg_head
 
@@ -149,7 +149,7 @@ def test_lens_file_of_many_levels_is_one_line(tmp_path: Path, name: str, text: s
     path.write_text(text, errors="surrogateescape")
     code = (
         "import sys, pathlib\nfrom ipsys_log.errors import IpsysError\n"
-        "from ipsys_log.formats.opencv_yaml import read_opencv_calibration as read\n"
+        "from ipsys_log.exchange.opencv_yaml import read_opencv_calibration as read\n"
         "try: read(pathlib.Path(sys.argv[1]), 'red')\nexcept IpsysError as error: print(error)\n"
     )
     done = subprocess.run(
@@ -271,7 +271,7 @@ def test_tape_of_any_length_is_one_line(ipsys: Ipsys, lab: Path, length_m: float
 @pytest.mark.parametrize("time_ns", [1 << 63, (1 << 64) - 1])
 def test_time_from_two_to_the_63_on_is_one_line(ipsys: Ipsys, lab: Path, time_ns: int) -> None:
     """Rerun and NumPy count nanoseconds with 63 bits."""
-    from ipsys_log.log import LogWriter
+    from ipsys_log.log.writer import LogWriter
 
     with LogWriter.append(lab) as log:
         schema = None

@@ -15,13 +15,14 @@ from typing import Any
 import pytest
 
 from ipsys_log import pipeline
-from ipsys_log.compare import Comparison
+from ipsys_log.analysis.differences import Comparison
+from ipsys_log.capture.frames import Clock
+from ipsys_log.capture.multiplexer import Attached
+from ipsys_log.capture.recorder import first_messages
 from ipsys_log.errors import IpsysError
-from ipsys_log.log import LogReader, LogWriter
-from ipsys_log.log.session import Session
-from ipsys_log.measuring.check import check_entry, withdraw
-from ipsys_log.measuring.entry import Typed, read_typed
-from ipsys_log.measuring.scene import look
+from ipsys_log.log.dataset import Session
+from ipsys_log.log.reader import LogReader
+from ipsys_log.log.writer import LogWriter
 from ipsys_log.messages import (
     FRAME_SKIPPED,
     STAMP_UNRELIABLE,
@@ -37,17 +38,17 @@ from ipsys_log.messages import (
     Run,
     Tracks,
 )
-from ipsys_log.recording.consumers import Consumer
-from ipsys_log.recording.recorder import first_messages
-from ipsys_log.runs.lookup import find_pairs
-from ipsys_log.runs.lookup import measured as measured_places
+from ipsys_log.runs.options import Request
 from ipsys_log.runs.output import append_messages, write_log
-from ipsys_log.runs.request import Request
-from ipsys_log.scenes.live import LiveScene
-from ipsys_log.sources.attached import Attached
-from ipsys_log.sources.frames import Clock
+from ipsys_log.runs.select import find_pairs
+from ipsys_log.runs.select import measured as measured_places
+from ipsys_log.runs.verify import diff, verify
+from ipsys_log.sinks.sink import Consumer
 from ipsys_log.stages.detect import Detect
-from ipsys_log.verify import diff, verify
+from ipsys_log.survey.checks import check_entry, withdraw
+from ipsys_log.survey.entry import Typed, read_typed
+from ipsys_log.survey.live import LiveScene
+from ipsys_log.survey.scene import look
 from tests.conftest import Ipsys
 from tests.playing import SteppedClock, cameras, playing
 

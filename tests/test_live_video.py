@@ -12,17 +12,17 @@ from typing import Any
 import pytest
 
 from ipsys_log import pipeline
-from ipsys_log.log.session import Session
+from ipsys_log.capture.frames import Clock
+from ipsys_log.capture.multiplexer import Attached
+from ipsys_log.capture.network import open_network
+from ipsys_log.capture.recorder import first_messages
+from ipsys_log.images.video import Video, is_keyframe
+from ipsys_log.log.dataset import Session
 from ipsys_log.messages import FRAME_SKIPPED, CompressedVideo, Message, RigCamera
-from ipsys_log.recording.recorder import first_messages
-from ipsys_log.runs.request import Request
-from ipsys_log.sources.attached import Attached
-from ipsys_log.sources.frames import Clock
-from ipsys_log.sources.network import open_network
+from ipsys_log.runs.options import Request
+from ipsys_log.runs.verify import verify
 from ipsys_log.stages.detect import Detect
-from ipsys_log.stages.detect.video import Video, is_keyframe
-from ipsys_log.verify import verify
-from tests.sources.streams import encode, free_port, serve
+from tests.capture.streams import encode, free_port, serve
 
 H264 = ("-c:v", "libx264", "-preset", "ultrafast", "-g", "20", "-bf", "0", "-pix_fmt", "yuv420p")
 H265 = ("-c:v", "libx265", "-preset", "ultrafast", "-x265-params", "keyint=20:bframes=0:log-level=none")

@@ -22,16 +22,16 @@ from google.protobuf.descriptor_pool import DescriptorPool
 from google.protobuf.message_factory import GetMessageClass
 from mcap.reader import make_reader
 
+from ipsys_log.analysis.pairs import active_measurements
 from ipsys_log.cli.dialog import ask_places
 from ipsys_log.errors import IpsysError, LogError
-from ipsys_log.log.session import Session
-from ipsys_log.measuring.check import check_entry, withdraw
-from ipsys_log.measuring.entry import Typed, read_typed
-from ipsys_log.measuring.scene import look
+from ipsys_log.log.dataset import Session
 from ipsys_log.messages import MEASUREMENTS_TOPIC, Measurement, Model, Pair
-from ipsys_log.offline.pairs import active_measurements
-from ipsys_log.runs.request import Request
-from ipsys_log.scenes.finished import opened_log
+from ipsys_log.runs.options import Request
+from ipsys_log.survey.checks import check_entry, withdraw
+from ipsys_log.survey.entry import Typed, read_typed
+from ipsys_log.survey.from_log import opened_log
+from ipsys_log.survey.scene import look
 from tests.conftest import Ipsys, Unmeasured, data_section
 from tests.test_bad_input import refused, rewrite
 

@@ -20,7 +20,7 @@ from typing import Any, NamedTuple
 
 import pytest
 
-from ipsys_log.log.session import Session
+from ipsys_log.log.dataset import Session
 from ipsys_log.messages import CompressedImage, Measurement, Message
 from ipsys_log.runs.output import write_log
 from ipsys_log.units import NS_PER_S

@@ -94,7 +94,7 @@ def test_the_marker_in_the_36_photographs(ipsys: Ipsys, data: Path, tmp_path: Pa
     rig.write_text('name = "photos"\ndictionary = "DICT_4X4_1000"\nmarker_length_m = 0.1\n')
     assert ipsys("import", "images", tmp_path / "photos", "-o", log, "--rig", rig).code == 0
     assert ipsys("detect", log).code == 0
-    from ipsys_log.log.session import Session
+    from ipsys_log.log.dataset import Session
     from ipsys_log.messages import Markers
 
     with Session([log]) as session:

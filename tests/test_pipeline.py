@@ -15,8 +15,9 @@ import cv2
 import numpy as np
 import pytest
 
+from ipsys_log.analysis.pairs import active_measurements
 from ipsys_log.log.codec import encode
-from ipsys_log.log.session import Session
+from ipsys_log.log.dataset import Session
 from ipsys_log.messages import (
     CameraPoints,
     CompressedImage,
@@ -28,11 +29,11 @@ from ipsys_log.messages import (
     Rig,
     Tracks,
 )
-from ipsys_log.offline.pairs import active_measurements
-from ipsys_log.pipeline import Stage, in_threads, replay, run
-from ipsys_log.rig import load_rig
+from ipsys_log.pipeline import replay
+from ipsys_log.rig.file import load_rig
+from ipsys_log.runs.options import Request
 from ipsys_log.runs.output import write_log
-from ipsys_log.runs.request import Request
+from ipsys_log.runs.stream import Stage, in_threads, run
 from tests.conftest import Ipsys, data_section
 
 RIG_TOML = """
@@ -286,7 +287,7 @@ def test_one_camera_alone(ipsys: Ipsys, lab: Path, tmp_path: Path, camera: str) 
 
 
 def test_new_measurements_make_the_model_out_of_date(ipsys: Ipsys, lab: Path) -> None:
-    from ipsys_log.log import LogWriter
+    from ipsys_log.log.writer import LogWriter
     from ipsys_log.messages import Measurement
     from ipsys_log.runs.output import write_messages
 

@@ -15,12 +15,12 @@ from pathlib import Path
 
 import pytest
 
-from ipsys_log.log.session import Session
+from ipsys_log.log.dataset import Session
 from ipsys_log.messages import CompressedImage, Event, Message, image_topic
-from ipsys_log.rig import load_rig
+from ipsys_log.rig.file import load_rig
 from ipsys_log.runs.output import write_log
+from tests.capture.streams import encode, free_port, make_jpegs, serve
 from tests.conftest import Ipsys, small_disk
-from tests.sources.streams import encode, free_port, make_jpegs, serve
 
 NAMES = ("red", "white", "black")
 # Nothing takes so long, however busy the machine is.

@@ -14,15 +14,17 @@ from pathlib import Path
 import pytest
 
 from ipsys_log import pipeline
-from ipsys_log.log import LogReader, LogWriter, repair
+from ipsys_log.log.dataset import Session
+from ipsys_log.log.reader import LogReader
 from ipsys_log.log.records import ChunkRef
-from ipsys_log.log.session import Session
+from ipsys_log.log.repair import repair
+from ipsys_log.log.writer import LogWriter
 from ipsys_log.messages import FRAME_SKIPPED, Event, Markers, Message, Tracks
 from ipsys_log.restore import finish_runs
+from ipsys_log.runs.options import Request
 from ipsys_log.runs.output import write_message
-from ipsys_log.runs.request import Request
+from ipsys_log.runs.verify import verify
 from ipsys_log.stages.detect import Detect
-from ipsys_log.verify import verify
 from tests.conftest import Ipsys, small_disk
 from tests.test_live import calibration, go_live, recorded, slow  # noqa: F401
 

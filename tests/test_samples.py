@@ -10,7 +10,7 @@ import numpy as np
 import pytest
 
 from ipsys_log.log.codec import encode
-from ipsys_log.log.session import Session
+from ipsys_log.log.dataset import Session
 from ipsys_log.messages import Positions
 from tests.conftest import ROOT, Ipsys
 

@@ -10,9 +10,9 @@ import numpy as np
 import pytest
 import scipy.io
 
-from ipsys_log.log.session import Session
+from ipsys_log.log.dataset import Session
 from ipsys_log.messages import Message, Model, Positions, Rig, RigMarker
-from ipsys_log.rig import rig_toml
+from ipsys_log.rig.file import rig_toml
 from ipsys_log.runs.output import write_log
 from tests import labs
 from tests.conftest import Ipsys
@@ -109,7 +109,7 @@ def test_a_model_that_is_told_the_height_needs_it_in_the_rig(ipsys: Ipsys, tmp_p
 
 def test_a_position_outside_the_measured_volume_says_so(tmp_path: Path) -> None:
     from ipsys_log.messages import CameraPoint, CameraPoints
-    from ipsys_log.offline.fit import fit_model
+    from ipsys_log.stages.fit import fit_model
     from ipsys_log.stages.locate import Locate
 
     rng = np.random.default_rng(0)
@@ -132,8 +132,8 @@ def test_a_position_outside_the_measured_volume_says_so(tmp_path: Path) -> None:
 
 def test_a_model_out_of_a_log_predicts_what_it_predicted(ipsys: Ipsys, tmp_path: Path) -> None:
     """To 1e-9 m, for every model in the table, by way of the numbers in the log."""
-    from ipsys_log.models import MODELS, Places, fit_cameras, inputs
     from ipsys_log.models.applied import AppliedModel
+    from ipsys_log.models.table import MODELS, Places, fit_cameras, inputs
 
     log = made(tmp_path / "lab.mcap", labels=lambda n: ("train",))
     options = [option for name in MODELS for option in ("--model", name)]

@@ -20,17 +20,17 @@ from numpy.typing import NDArray
 from rerun.chunk import RrdReader
 
 from ipsys_log import pipeline
-from ipsys_log.log.session import Session
+from ipsys_log.capture import status
+from ipsys_log.capture.camera_thread import CameraState
+from ipsys_log.capture.status import Monitor
+from ipsys_log.images.video import is_keyframe
+from ipsys_log.log.dataset import Session
 from ipsys_log.messages import CompressedVideo, Markers, Message, Tracks
-from ipsys_log.recording import monitor
-from ipsys_log.recording.monitor import Monitor
-from ipsys_log.runs.request import Request
-from ipsys_log.scenes.finished import opened_log
-from ipsys_log.scenes.live import LiveScene
-from ipsys_log.sinks.rerun import write_recording
-from ipsys_log.sinks.rerun_live import LiveView, Write
-from ipsys_log.sources.attendant import CameraState
-from ipsys_log.stages.detect.video import is_keyframe
+from ipsys_log.runs.options import Request
+from ipsys_log.sinks.rerun.live import LiveView, Write
+from ipsys_log.sinks.rerun.recording import write_recording
+from ipsys_log.survey.from_log import opened_log
+from ipsys_log.survey.live import LiveScene
 
 Grey = NDArray[np.uint8]
 
@@ -125,7 +125,7 @@ def test_while_recording_the_last_keyframe_is_shown_with_its_own_markers(video: 
 def test_the_monitor_looks_at_keyframes(video: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     pipeline.replay([video], Request(), "detect")
     found = found_markers(video)
-    monkeypatch.setattr(monitor, "_EVERY_S", 3600.0)
+    monkeypatch.setattr(status, "_EVERY_S", 3600.0)
     with Session([video]) as session:
         (rig,) = session.payloads(["/rig"])
         frames = list(session.messages([session.images["red"]]))

@@ -1,1 +1,1 @@
-"""Before there are positions: what a lens does, and how a camera hangs."""
+"""Camera intrinsics from images of a calibration board."""

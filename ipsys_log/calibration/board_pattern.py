@@ -10,7 +10,7 @@ from typing import NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 
-from ipsys_log.calibration.boards import Board
+from ipsys_log.calibration.board import Board
 
 __all__ = ["BoardMarker", "black_squares", "board_markers"]
 

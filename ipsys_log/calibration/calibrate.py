@@ -8,13 +8,13 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import NDArray
 
-from ipsys_log.calibration.boards import Board
-from ipsys_log.calibration.bundle import Corners, Fit, camera_points
-from ipsys_log.calibration.choose import Dropped, choose
+from ipsys_log.calibration.board import Board
+from ipsys_log.calibration.board_detection import Sighting
+from ipsys_log.calibration.board_search import Looked
+from ipsys_log.calibration.bundle_adjustment import Corners, Fit, camera_points
+from ipsys_log.calibration.image_selection import Dropped, choose
 from ipsys_log.calibration.lens_models import LensModel
-from ipsys_log.calibration.look import Looked
 from ipsys_log.calibration.picture_coverage import Coverage, advice, measure_coverage
-from ipsys_log.calibration.sighting import Sighting
 from ipsys_log.calibration.solve import Solved, rms_px, solve, tells_focal_length
 from ipsys_log.calibration.start import find_start
 from ipsys_log.calibration.two_cameras import find_two_cameras

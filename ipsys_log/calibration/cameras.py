@@ -6,11 +6,11 @@ from collections.abc import Callable, Iterator, Sequence
 from functools import partial
 from typing import NamedTuple
 
-from ipsys_log.calibration.boards import Board
+from ipsys_log.calibration.board import Board
+from ipsys_log.calibration.board_search import NotSeenError, check_sizes, look
 from ipsys_log.calibration.calibrate import Calibrated, calibrate
+from ipsys_log.calibration.images import Pictures
 from ipsys_log.calibration.lens_models import LensModel
-from ipsys_log.calibration.look import NotSeenError, check_sizes, look
-from ipsys_log.calibration.pictures import Pictures
 from ipsys_log.errors import IpsysError
 
 __all__ = ["Failure", "calibrate_cameras"]

@@ -12,7 +12,7 @@ from typing import NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 
-from ipsys_log.calibration.bundle import (
+from ipsys_log.calibration.bundle_adjustment import (
     Corners,
     Fit,
     camera_points,

@@ -8,7 +8,7 @@ from typing import NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 
-from ipsys_log.calibration.bundle import Corners, Fit, adjust, residuals
+from ipsys_log.calibration.bundle_adjustment import Corners, Fit, adjust, residuals
 from ipsys_log.calibration.lens_models import LensModel
 from ipsys_log.calibration.start import find_start, fitted_basis
 from ipsys_log.calibration.uncertainty import alike, lens_covariance

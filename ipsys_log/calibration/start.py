@@ -11,7 +11,7 @@ from itertools import pairwise
 import numpy as np
 from numpy.typing import NDArray
 
-from ipsys_log.calibration.bundle import Corners, Fit, adjust
+from ipsys_log.calibration.bundle_adjustment import Corners, Fit, adjust
 from ipsys_log.calibration.lens_models import LensModel
 
 __all__ = ["find_start", "fitted_basis", "pose_from_rays"]

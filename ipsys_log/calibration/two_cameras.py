@@ -14,7 +14,14 @@ from typing import NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 
-from ipsys_log.calibration.bundle import Corners, Fit, adjust, normal_equations, reduce_to_lens, residuals
+from ipsys_log.calibration.bundle_adjustment import (
+    Corners,
+    Fit,
+    adjust,
+    normal_equations,
+    reduce_to_lens,
+    residuals,
+)
 from ipsys_log.calibration.lens_models import LensModel
 from ipsys_log.calibration.solve import doubt_from_px
 from ipsys_log.calibration.start import fitted_basis

@@ -5,7 +5,7 @@ from __future__ import annotations
 import numpy as np
 from numpy.typing import NDArray
 
-from ipsys_log.calibration.bundle import (
+from ipsys_log.calibration.bundle_adjustment import (
     Corners,
     Fit,
     corner_weights,

@@ -8,7 +8,7 @@ from typing import NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 
-from ipsys_log.calibration.bundle import Corners
+from ipsys_log.calibration.bundle_adjustment import Corners
 from ipsys_log.calibration.lens_models import LENSES, LensModel
 from ipsys_log.calibration.solve import rms_px, solve
 from ipsys_log.calibration.two_cameras import TwoCameras

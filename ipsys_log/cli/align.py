@@ -8,9 +8,8 @@ from typing import TYPE_CHECKING, Annotated, Any, Optional
 
 import typer
 
-from ipsys_log.cli.cameras_now import Lab, check_target, prepared, recorded_now
 from ipsys_log.cli.console import console, remarks
-from ipsys_log.cli.derive import derived
+from ipsys_log.cli.open_cameras import Lab, check_target, prepared, recorded_now
 from ipsys_log.cli.options import (
     AsJson,
     Calibrations,
@@ -20,6 +19,7 @@ from ipsys_log.cli.options import (
     load_calibrations,
     log_option,
 )
+from ipsys_log.cli.stages import derived
 
 if TYPE_CHECKING:
     from ipsys_log.report.alignment import AlignedLab
@@ -91,9 +91,9 @@ def _prepared_now(
     rig: Path | None, calibration: list[str] | None, corners: str | None, output: Path | None
 ) -> Lab:
     """The cameras to look at, when everything is said that can be said before they are opened."""
+    from ipsys_log.capture.live_plan import check_start
     from ipsys_log.errors import IpsysError
-    from ipsys_log.recording.plan import check_start
-    from ipsys_log.runs.request import Request
+    from ipsys_log.runs.options import Request
 
     if rig is None:
         raise IpsysError("name a log, or give --rig lab.toml to take what its cameras send now")
@@ -105,12 +105,12 @@ def _prepared_now(
 
 
 def _align(logs: list[Path], options: dict[str, Any], plot: Path | None, as_json: bool) -> None:
-    from ipsys_log.log.session import Session
+    from ipsys_log.log.dataset import Session
     from ipsys_log.messages import CameraPoints, Markers, Rig
     from ipsys_log.report.alignment import read_alignment
-    from ipsys_log.rig import load_rig
-    from ipsys_log.runs.records import newest_run
-    from ipsys_log.sinks.shown import rig_in_force
+    from ipsys_log.rig.file import load_rig
+    from ipsys_log.runs.provenance import newest_run
+    from ipsys_log.sinks.selection import rig_in_force
 
     given = load_rig(options["rig"]) if options["rig"] else None
     lenses = load_calibrations(options["calibration"], lambda: cameras_of(logs))
@@ -127,10 +127,10 @@ def _align(logs: list[Path], options: dict[str, Any], plot: Path | None, as_json
 
 
 def _show(lab: AlignedLab, plot: Path | None, as_json: bool) -> None:
-    from ipsys_log.report.alignment_words import alignment_json, alignment_table, coverage_lines
+    from ipsys_log.report.alignment_text import alignment_json, alignment_table, coverage_lines
 
     if plot is not None:
-        from ipsys_log.report.alignment_picture import draw_alignment
+        from ipsys_log.report.alignment_figure import draw_alignment
 
         draw_alignment(lab, plot)
     if as_json:

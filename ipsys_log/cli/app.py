@@ -9,7 +9,6 @@ from ipsys_log.cli import (
     calibrate,
     cameras,
     compare,
-    derive,
     imports,
     inspect,
     markers,
@@ -18,6 +17,7 @@ from ipsys_log.cli import (
     record,
     report,
     setup,
+    stages,
     view,
 )
 from ipsys_log.cli.guide import arrange
@@ -35,7 +35,7 @@ app = typer.Typer(
     context_settings={"help_option_names": ["-h", "--help"]},
 )
 _MODULES = (
-    *(setup, markers, cameras, calibrate, align, imports, record, measure, derive),
+    *(setup, markers, cameras, calibrate, align, imports, record, measure, stages),
     *(plan, report, inspect, compare, view),
 )
 for module in _MODULES:

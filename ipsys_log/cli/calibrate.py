@@ -10,8 +10,8 @@ from typing import TYPE_CHECKING, Annotated, Any, Optional
 
 import typer
 
-from ipsys_log.cli.cameras_now import SENT_NOW, Lab, prepared, recorded_now
 from ipsys_log.cli.console import console, progress_bar, remarks, say
+from ipsys_log.cli.open_cameras import SENT_NOW, Lab, prepared, recorded_now
 from ipsys_log.cli.options import AsJson
 from ipsys_log.cli.signals import note_kept, say_kept
 
@@ -113,12 +113,12 @@ def calibrate(
     Writes one file for each camera that saw the board, with the name of the camera. If a camera has no
     result, the files of the others are written, and the exit code is 1. Sharp, different pictures are
     selected automatically; two dozen with the board in all parts of the image are enough."""
-    from ipsys_log.calibration.boards import parse_board
+    from ipsys_log.calibration.board import parse_board
     from ipsys_log.calibration.calibrate import Calibrated
     from ipsys_log.calibration.cameras import calibrate_cameras
+    from ipsys_log.calibration.images import find_sources
     from ipsys_log.calibration.lens_models import find_lens
-    from ipsys_log.calibration.pictures import find_sources
-    from ipsys_log.formats.calibration_yaml import check_format
+    from ipsys_log.exchange.calibration_yaml import check_format
     from ipsys_log.report.files import check_picture
 
     model = find_lens(lens)
@@ -189,8 +189,8 @@ def _json(outcome: Calibrated | Failure, targets: dict[str, dict[str, Path]]) ->
 
 def _prepared_now(rig: Path | None, only: list[str] | None, board: str) -> Lab:
     """Return the cameras to calibrate; simulated ones show the calibration board."""
+    from ipsys_log.capture.simulated import show_board
     from ipsys_log.errors import IpsysError
-    from ipsys_log.sources.simulated import show_board
 
     if rig is None:
         raise IpsysError(
@@ -214,7 +214,7 @@ def _taken_now(lab: Lab, seconds: float) -> Iterator[list[Path]]:
 def _targets(cameras: list[str], output: Path, formats: list[str], force: bool) -> dict[str, dict[str, Path]]:
     """Return the path of the file of each camera and format; raise if it cannot be written."""
     from ipsys_log.errors import IpsysError
-    from ipsys_log.formats.calibration_yaml import FORMATS
+    from ipsys_log.exchange.calibration_yaml import FORMATS
     from ipsys_log.report.files import check_file, check_folder
 
     if output.suffix.lower() in (".yaml", ".yml"):
@@ -246,7 +246,7 @@ def _check_free(path: Path, force: bool) -> None:
 
 def _write(one: Calibrated, paths: dict[str, Path]) -> None:
     """Write the files of a camera, one for each format."""
-    from ipsys_log.formats.calibration_yaml import FORMATS
+    from ipsys_log.exchange.calibration_yaml import FORMATS
     from ipsys_log.report.files import write_files
 
     comment = (
@@ -262,8 +262,8 @@ def _write(one: Calibrated, paths: dict[str, Path]) -> None:
 
 def _draw(lenses: list[Calibrated], plot: Path) -> None:
     from ipsys_log.report.calibration_figure import calibration_figure
+    from ipsys_log.report.figures import picture
     from ipsys_log.report.files import write_files
-    from ipsys_log.report.pictures import picture
 
     write_files(plot.parent, {plot.name: picture(calibration_figure(lenses), plot, 110)})
 

@@ -13,7 +13,7 @@ from ipsys_log.cli.console import console
 from ipsys_log.cli.options import AsJson
 
 if TYPE_CHECKING:
-    from ipsys_log.sources.usb_tree import Attached
+    from ipsys_log.capture.usb_bus import Attached
 
 __all__ = ["add_commands"]
 
@@ -36,13 +36,13 @@ def cameras(
     """List the cameras attached by USB: device, modes, bus and hub; and whether USB carries them all at once.
 
     Without a rig that is reckoned with each at its largest mode. Cameras on the network are not listed."""
+    from ipsys_log.capture.bandwidth import advise, demands_of
     from ipsys_log.errors import IpsysError
-    from ipsys_log.rig import load_rig
-    from ipsys_log.sources.bandwidth import advise, demands_of
+    from ipsys_log.rig.file import load_rig
 
     if sys.platform != "linux":
         raise IpsysError("ipsys cameras: only Linux lists them; elsewhere they are usb:0, usb:1 and so on")
-    from ipsys_log.sources.usb_tree import find_cameras
+    from ipsys_log.capture.usb_bus import find_cameras
 
     found = find_cameras()
     advice = advise(demands_of(found, load_rig(rig) if rig else None))

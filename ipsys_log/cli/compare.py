@@ -13,7 +13,7 @@ from ipsys_log.cli.console import console, progress_bar, remarks
 from ipsys_log.cli.options import AsJson, Logs
 
 if TYPE_CHECKING:
-    from ipsys_log.compare import Comparison
+    from ipsys_log.analysis.differences import Comparison
 
 __all__ = ["add_commands"]
 
@@ -35,7 +35,7 @@ def verify(
 
     Frames that were skipped live are passed over. Exits with code 1 if anything differs."""
     from ipsys_log.report.cameras import comparison_json, comparison_table, first_difference
-    from ipsys_log.verify import verify as verify_runs
+    from ipsys_log.runs.verify import verify as verify_runs
 
     with progress_bar() as progress:
         found = verify_runs(logs, run, progress, lambda text: remarks.print(text, markup=False))
@@ -73,8 +73,8 @@ def diff(
     Exits with code 1 if anything differs."""
     from ipsys_log.errors import IpsysError
     from ipsys_log.report.cameras import comparison_json, comparison_table, first_difference
-    from ipsys_log.verify import diff as compare
-    from ipsys_log.verify import explain_diff
+    from ipsys_log.runs.verify import diff as compare
+    from ipsys_log.runs.verify import explain_diff
 
     names: list[str | None] = list(run) if run else [None]
     if len(names) > 2:
@@ -111,7 +111,7 @@ def latency(
     """Show how long each step took when a log was recorded live, from the frame to its position."""
     from dataclasses import asdict
 
-    from ipsys_log.recording.latency import latency_percentiles, recorded_latencies, step_times_s
+    from ipsys_log.analysis.latency import latency_percentiles, recorded_latencies, step_times_s
     from ipsys_log.report.cameras import latency_table
     from ipsys_log.report.files import check_picture
 

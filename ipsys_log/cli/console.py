@@ -17,8 +17,8 @@ from rich.text import Text
 from ipsys_log.plain_text import plain_text
 
 if TYPE_CHECKING:
-    from ipsys_log.runs.records import Outcome
-    from ipsys_log.runs.request import Progress
+    from ipsys_log.runs.options import Progress
+    from ipsys_log.runs.provenance import Outcome
 
 __all__ = ["console", "print_outcomes", "print_warnings", "progress_bar", "remarks", "say"]
 

@@ -9,18 +9,18 @@ from ipsys_log.cli.console import console
 from ipsys_log.cli.questions import HELP, LetterError, agreed, answer, ask_marker, ask_numbers
 
 if TYPE_CHECKING:
-    from ipsys_log.measuring.check import Checked
-    from ipsys_log.measuring.entry import Typed
-    from ipsys_log.measuring.scene import Scene
     from ipsys_log.messages import Measurement
+    from ipsys_log.survey.checks import Checked
+    from ipsys_log.survey.entry import Typed
+    from ipsys_log.survey.scene import Scene
 
 __all__ = ["ask_places"]
 
 
 def ask_places(scene: Scene) -> None:
     """Go through the places that are not measured yet; of a recording, through what is there, until ``q``."""
-    from ipsys_log.measuring.entry import check_references
-    from ipsys_log.offline.pairs import active_measurements
+    from ipsys_log.analysis.pairs import active_measurements
+    from ipsys_log.survey.entry import check_references
 
     check_references(scene.rig)
     with suppress(ImportError):  # arrow keys, where there is one
@@ -96,9 +96,9 @@ def _measure(scene: Scene, stop: int | None, before: Typed | None, saved: list[s
 
 
 def _check(scene: Scene, stop: int | None, typed: Typed) -> Checked:
-    from ipsys_log.measuring.check import check_entry
-    from ipsys_log.measuring.entry import read_typed
-    from ipsys_log.measuring.scene import look
+    from ipsys_log.survey.checks import check_entry
+    from ipsys_log.survey.entry import read_typed
+    from ipsys_log.survey.scene import look
 
     entry, faults = read_typed(typed, scene.rig)
     sight = None if entry.marker_id is None else look(scene.views(stop), entry.marker_id)
@@ -106,7 +106,7 @@ def _check(scene: Scene, stop: int | None, typed: Typed) -> Checked:
 
 
 def _ask(scene: Scene, stop: int | None, before: Typed | None) -> Typed:
-    from ipsys_log.measuring.scene import look, visible_markers
+    from ipsys_log.survey.scene import look, visible_markers
 
     console.print()
     if stop is None:
@@ -148,9 +148,9 @@ def _undo(scene: Scene, saved: list[str]) -> Measurement | None:
 
     A measurement of an earlier session is withdrawn only if the user agrees.
     """
+    from ipsys_log.analysis.pairs import active_measurements
     from ipsys_log.errors import IpsysError
-    from ipsys_log.measuring.check import withdraw
-    from ipsys_log.offline.pairs import active_measurements
+    from ipsys_log.survey.checks import withdraw
 
     active = {measurement.id: measurement for measurement in active_measurements(scene.history())}
     if not active:

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-import inspect
+from inspect import cleandoc
 
 import typer
 
@@ -118,4 +118,4 @@ def arrange(app: typer.Typer) -> None:
 
 def _unwrapped(text: str) -> str:
     """A help whose paragraphs are one line each: the window breaks them."""
-    return "\n\n".join(" ".join(one.split()) for one in inspect.cleandoc(text).split("\n\n"))
+    return "\n\n".join(" ".join(one.split()) for one in cleandoc(text).split("\n\n"))

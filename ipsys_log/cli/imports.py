@@ -29,7 +29,7 @@ def imsel(
 ) -> None:
     """The measurements behind the paper (Ou et al., Robotica 2023): .mat files and camera YAMLs."""
     _refuse_log(folder)
-    from ipsys_log.formats.imsel import read_imsel
+    from ipsys_log.exchange.imsel import read_imsel
     from ipsys_log.runs.output import write_log
 
     counts = write_log(output, read_imsel(folder))
@@ -55,9 +55,9 @@ def images(
 ) -> None:
     """A folder of pictures, one sub-folder per camera; without --times the n-th of each belong together."""
     from ipsys_log.cli.options import load_calibrations, load_matching_rig
+    from ipsys_log.exchange.image_folders import find_pictures, read_images
+    from ipsys_log.exchange.picture_times import find_times
     from ipsys_log.runs.output import write_log
-    from ipsys_log.sources.files import find_pictures, read_images
-    from ipsys_log.sources.picture_times import find_times
 
     _refuse_log(folder)
     pictures = find_pictures(folder)
@@ -83,10 +83,10 @@ def videos(
     ] = "2020-01-01T00:00:00Z",
 ) -> None:
     """Videos that begin at one instant. MJPEG, H.264 and H.265 go into the log as they are."""
+    from ipsys_log.capture.video_files import read_videos
     from ipsys_log.cli.options import load_calibrations, load_matching_rig
+    from ipsys_log.exchange.picture_times import parse_start
     from ipsys_log.runs.output import write_log
-    from ipsys_log.sources.picture_times import parse_start
-    from ipsys_log.sources.videos import read_videos
 
     for option in files:
         _refuse_log(Path(option.rpartition("=")[2]))
@@ -116,7 +116,7 @@ def _refuse_log(path: Path) -> None:
 
 def _by_camera(files: list[str]) -> dict[str, Path]:
     from ipsys_log.errors import IpsysError
-    from ipsys_log.rig import check_name
+    from ipsys_log.rig.file import check_name
 
     paths: dict[str, Path] = {}
     for option in files:

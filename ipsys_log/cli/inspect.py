@@ -22,7 +22,7 @@ def add_commands(app: typer.Typer) -> None:
 
 def info(logs: Logs, as_json: AsJson = False) -> None:
     """Show cameras, channels, counts, rates, gaps and runs of a log."""
-    from ipsys_log.log.session import Session
+    from ipsys_log.log.dataset import Session
     from ipsys_log.report.contents import contents_json, contents_tables
 
     with Session(logs) as session:
@@ -42,7 +42,7 @@ def runs(logs: Logs, as_json: AsJson = False) -> None:
     The state is: current; out of date, with the reason (replay computes it again as a new run); not
     repeatable (its inputs are not in the log); unfinished (its writer was stopped).
     """
-    from ipsys_log.log.session import Session
+    from ipsys_log.log.dataset import Session
     from ipsys_log.report.contents import runs_table, states_json
 
     with Session(logs) as session:
@@ -63,9 +63,9 @@ def repair(
     repeats the runs to check them; Ctrl-C leaves it to ipsys replay.
     """
     from ipsys_log.errors import IpsysError
-    from ipsys_log.log import repair as repair_log
-    from ipsys_log.log.session import Session
-    from ipsys_log.report.repaired import repair_lines
+    from ipsys_log.log.dataset import Session
+    from ipsys_log.log.repair import repair as repair_log
+    from ipsys_log.report.repair import repair_lines
 
     for part in repair_lines(repair_log(log)):
         console.print(part, markup=False)

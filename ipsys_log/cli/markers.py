@@ -127,8 +127,8 @@ def _lab(rig: Path | None, length: float | None, dictionary: str | None) -> Rig:
 
     from ipsys_log.errors import IpsysError
     from ipsys_log.messages import Rig
-    from ipsys_log.rig import check_rig, load_rig
-    from ipsys_log.rig_slips import check_slips
+    from ipsys_log.rig.checks import check_slips
+    from ipsys_log.rig.file import check_rig, load_rig
     from ipsys_log.stages.detect import marker_detector
 
     if rig is not None:
@@ -153,7 +153,7 @@ def _parse_ids(text: str, dictionary: str) -> list[int]:
         The text is no list, or has an id that the dictionary does not have.
     """
     from ipsys_log.errors import IpsysError
-    from ipsys_log.rig_slips import dictionary_size
+    from ipsys_log.rig.checks import dictionary_size
 
     ids: list[int] = []
     for part in text.split(","):
@@ -168,7 +168,7 @@ def _parse_ids(text: str, dictionary: str) -> list[int]:
 
 
 def _board(text: str, square: float, marker_scale: float, dictionary: str) -> Print:
-    from ipsys_log.calibration.boards import parse_board
+    from ipsys_log.calibration.board import parse_board
     from ipsys_log.report.prints import board_print
 
     return board_print(parse_board(text, square, marker_scale, dictionary, False), text)

@@ -28,9 +28,9 @@ from ipsys_log.cli.options import (
 from ipsys_log.cli.signals import allow_interrupt, runs_until_stopped, stop_on_signal
 
 if TYPE_CHECKING:
-    from ipsys_log.measuring.scene import Scene
     from ipsys_log.messages import Measurement
-    from ipsys_log.scenes.finished import FinishedLog
+    from ipsys_log.survey.from_log import FinishedLog
+    from ipsys_log.survey.scene import Scene
 
 __all__ = ["add_commands", "serve_page"]
 
@@ -114,7 +114,7 @@ def measure(
     _refuse("a finished log; name it", csv=csv, places=places)
     if rig is None or output is None:
         raise IpsysError("name a finished log, or give --rig lab.toml -o places.mcap to measure with cameras")
-    from ipsys_log.cli.measure_now import measure_now
+    from ipsys_log.cli.measure_live import measure_now
 
     measured = measure_now(output, rig, camera, calibration, corners, model_from, force, terminal, host, port)
     _show_count(output, measured, as_json)
@@ -143,9 +143,9 @@ def _measure_log(
     corners: str | None,
     as_json: bool,
 ) -> None:
-    from ipsys_log.runs.request import Request
-    from ipsys_log.scenes.finished import opened_log
-    from ipsys_log.scenes.sheets import add_sheet, check_sheet
+    from ipsys_log.runs.options import Request
+    from ipsys_log.survey.add_sheet import add_sheet, check_sheet
+    from ipsys_log.survey.from_log import opened_log
 
     lenses = load_calibrations(calibration, lambda: cameras_of([log]))
     lab = load_matching_rig(rig, lambda: cameras_of([log]))
@@ -178,8 +178,8 @@ def _measure_log(
 
 def serve_page(scene: Scene, host: str | None, port: int) -> None:
     """Serve the page until it is interrupted."""
-    from ipsys_log.cli.measure_now import say_faults
-    from ipsys_log.web.serving import qr_code, serving
+    from ipsys_log.cli.measure_live import say_faults
+    from ipsys_log.web.server import qr_code, serving
 
     signals: list[None] = []  # a list: an Event takes a lock that the interrupted thread may hold
     stop_on_signal(lambda: signals.append(None))
@@ -206,8 +206,8 @@ def _show_count(log: Path, added: Sequence[Measurement], as_json: bool) -> None:
 
 def _show_next(log: Path, history: Sequence[Measurement]) -> None:
     """Print the next step for the points that a log has now."""
-    from ipsys_log.models import min_pairs
-    from ipsys_log.offline.pairs import active_measurements
+    from ipsys_log.analysis.pairs import active_measurements
+    from ipsys_log.models.table import min_pairs
 
     count = len(active_measurements(history))
     if not count:

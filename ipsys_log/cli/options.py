@@ -143,8 +143,8 @@ def load_calibrations(
         For an option of another form, or a file that holds no calibration.
     """
     from ipsys_log.errors import IpsysError
-    from ipsys_log.formats.lens_file import read_lens
-    from ipsys_log.log.session import Session
+    from ipsys_log.exchange.calibration_files import read_lens
+    from ipsys_log.log.dataset import Session
 
     lenses: dict[str, CameraCalibration] = {}
     for option in options or []:
@@ -178,7 +178,7 @@ def load_matching_rig(path: Path | None, cameras: Callable[[], Collection[str]])
     """
     if path is None:
         return None
-    from ipsys_log.rig import check_rig_cameras, load_rig
+    from ipsys_log.rig.file import check_rig_cameras, load_rig
 
     rig = load_rig(path)
     for text in check_rig_cameras(rig, cameras(), f"--rig {path}"):
@@ -199,10 +199,10 @@ def load_lab(
     IpsysError
         Where the rig has no such camera, or none with a source.
     """
+    from ipsys_log.capture.simulated import lens_of
     from ipsys_log.errors import IpsysError
-    from ipsys_log.formats.lens_file import read_lens
-    from ipsys_log.rig import load_rig
-    from ipsys_log.sources.simulated import lens_of
+    from ipsys_log.exchange.calibration_files import read_lens
+    from ipsys_log.rig.file import load_rig
     from ipsys_log.stages.detect import marker_detector
 
     lab = load_rig(rig)
@@ -237,7 +237,7 @@ def load_lab(
 
 def cameras_of(logs: list[Path]) -> set[str]:
     """The cameras that logs have frames or anything derived of."""
-    from ipsys_log.log.session import Session
+    from ipsys_log.log.dataset import Session
     from ipsys_log.log.topics import camera_of_topic
 
     with Session(logs) as session:

@@ -11,8 +11,8 @@ from typing import TYPE_CHECKING, Annotated, Any, Optional
 import typer
 
 from ipsys_log.cli.console import console, remarks
-from ipsys_log.cli.derive import derived
 from ipsys_log.cli.options import AsJson, Calibrations, Logs, RigFile, cameras_of, load_calibrations
+from ipsys_log.cli.stages import derived
 
 if TYPE_CHECKING:
     from rich.table import Table
@@ -68,9 +68,9 @@ def plan(
     from ipsys_log.messages import Rig
     from ipsys_log.report.files import check_picture
     from ipsys_log.report.plan import plan_floor
-    from ipsys_log.rig import load_rig
-    from ipsys_log.runs.lookup import copied_run
-    from ipsys_log.sinks.shown import rig_in_force
+    from ipsys_log.rig.file import load_rig
+    from ipsys_log.runs.select import copied_run
+    from ipsys_log.sinks.selection import rig_in_force
 
     given = load_rig(rig) if rig else None
     lenses = load_calibrations(calibration, lambda: cameras_of(logs))
@@ -88,7 +88,7 @@ def plan(
 
 
 def _show(found: PlannedFloor, plot: Path | None, as_json: bool) -> None:
-    from ipsys_log.report.plan_picture import draw_plan
+    from ipsys_log.report.plan_figure import draw_plan
 
     if plot is not None:
         draw_plan(found, plot)
@@ -106,9 +106,9 @@ def _show(found: PlannedFloor, plot: Path | None, as_json: bool) -> None:
 def _check(logs: list[Path], rig: Rig | None, model: str, places: int, heights_m: Sequence[float]) -> None:
     """See that there is something to plan, before anything is fitted."""
     from ipsys_log.errors import IpsysError
-    from ipsys_log.log.session import Session
+    from ipsys_log.log.dataset import Session
     from ipsys_log.messages import Rig
-    from ipsys_log.runs.lookup import copied_run, measured
+    from ipsys_log.runs.select import copied_run, measured
 
     if not 1 <= places <= _MOST_PLACES:
         raise IpsysError(

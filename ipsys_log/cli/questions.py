@@ -10,8 +10,8 @@ import typer
 from ipsys_log.cli.console import console
 
 if TYPE_CHECKING:
-    from ipsys_log.measuring.entry import Entry, Fault, Typed
     from ipsys_log.messages import Rig
+    from ipsys_log.survey.entry import Entry, Fault, Typed
 
     # Of an answer: what it says, and what is wrong.
     Read = Callable[[str], tuple[Entry, list[Fault]]]
@@ -59,14 +59,14 @@ def agreed(question: str, usual: bool) -> bool:
 
 def ask_marker(rig: Rig, usual: str) -> str:
     """Ask for a marker until it is one of the rig."""
-    from ipsys_log.measuring.entry import Typed, read_typed
+    from ipsys_log.survey.entry import Typed, read_typed
 
     return _ask("marker", "marker", usual, lambda given: read_typed(Typed(given, {}), rig))
 
 
 def ask_numbers(rig: Rig, marker: str, before: Typed | None) -> Typed:
     """Ask for distances, side and height of a place; Enter keeps what was typed before."""
-    from ipsys_log.measuring.entry import Typed, needs_side, read_typed
+    from ipsys_log.survey.entry import Typed, needs_side, read_typed
 
     distances = _ask_distances(rig, dict(before.distances) if before else {})
     given = [name for name, text in distances.items() if text]
@@ -82,8 +82,8 @@ def ask_numbers(rig: Rig, marker: str, before: Typed | None) -> Typed:
 
 def _ask_distances(rig: Rig, distances: dict[str, str]) -> dict[str, str]:
     """Ask until they can be those of one place, as far as distances alone tell."""
-    from ipsys_log.measuring.check import check_entry
-    from ipsys_log.measuring.entry import Typed, read_typed
+    from ipsys_log.survey.checks import check_entry
+    from ipsys_log.survey.entry import Typed, read_typed
 
     def of(name: str) -> Read:
         return lambda given: read_typed(Typed("", {name: given}), rig)

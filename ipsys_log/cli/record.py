@@ -8,8 +8,8 @@ from typing import TYPE_CHECKING, Annotated, Optional
 
 import typer
 
-from ipsys_log.cli.cameras_now import MODEL, check_target, opened, prepared
 from ipsys_log.cli.console import remarks, say
+from ipsys_log.cli.open_cameras import MODEL, check_target, opened, prepared
 from ipsys_log.cli.options import (
     Calibrations,
     Corners,
@@ -25,10 +25,10 @@ from ipsys_log.cli.options import (
 from ipsys_log.cli.signals import allow_interrupt, runs_until_stopped
 
 if TYPE_CHECKING:
+    from ipsys_log.capture.multiplexer import Attached
     from ipsys_log.messages import Message
-    from ipsys_log.runs.request import Request
-    from ipsys_log.sinks.rerun_live import LiveView
-    from ipsys_log.sources.attached import Attached
+    from ipsys_log.runs.options import Request
+    from ipsys_log.sinks.rerun.live import LiveView
 
 __all__ = ["add_commands"]
 
@@ -66,10 +66,10 @@ def record(
     """Record the frames of the cameras as they come, until Ctrl-C."""
     allow_interrupt(_NOT_BEGUN)
     from ipsys_log import pipeline
-    from ipsys_log.cli.measure_now import live_scene, ready_to_measure, served
+    from ipsys_log.capture.live_plan import check_start
+    from ipsys_log.cli.measure_live import live_scene, ready_to_measure, served
     from ipsys_log.errors import IpsysError
-    from ipsys_log.recording.plan import check_start
-    from ipsys_log.runs.request import Request
+    from ipsys_log.runs.options import Request
 
     if model_from is not None and not measure:
         raise IpsysError(f"--model-from {model_from}: has no effect without --measure; to track: ipsys live")
@@ -78,7 +78,7 @@ def record(
     check_target(output, force, read)
     request = Request(corners=corners)
     if measure:
-        from ipsys_log.web.serving import check_free
+        from ipsys_log.web.server import check_free
 
         model = ready_to_measure(lab, request, model_from)
         check_free(host, port)
@@ -124,9 +124,9 @@ def live(
     """Track robots live: record, and process every frame by all stages up to fuse, until Ctrl-C."""
     allow_interrupt(_NOT_BEGUN)
     from ipsys_log import pipeline
-    from ipsys_log.recording.consumers import Consumer
-    from ipsys_log.recording.plan import check_start
-    from ipsys_log.runs.request import Request
+    from ipsys_log.capture.live_plan import check_start
+    from ipsys_log.runs.options import Request
+    from ipsys_log.sinks.sink import Consumer
 
     lab = prepared(rig, camera, calibration)
     check_target(output, force, [*lab.files, (MODEL, model_from)])
@@ -143,9 +143,9 @@ def live(
 
 
 def _viewed(settings: list[Message], cameras: Attached, request: Request) -> LiveView:
-    from ipsys_log.runs.lookup import wanted_models
-    from ipsys_log.runs.tasks import model_run
-    from ipsys_log.sinks.rerun_live import LiveView
+    from ipsys_log.runs.graph import model_run
+    from ipsys_log.runs.select import wanted_models
+    from ipsys_log.sinks.rerun.live import LiveView
 
     (model,) = wanted_models(request, "fuse")
     return LiveView(settings[0].payload, cameras.states, model_run(model), say)

@@ -8,7 +8,7 @@ from typing import Annotated, Any, Optional
 import typer
 
 from ipsys_log.cli.console import console
-from ipsys_log.cli.derive import EVALUATE, MORE, build_command, derived, options_of
+from ipsys_log.cli.stages import EVALUATE, MORE, build_command, derived, options_of
 
 __all__ = ["add_commands"]
 

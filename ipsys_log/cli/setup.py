@@ -71,7 +71,7 @@ def init(
 ) -> None:
     """Write a rig file to edit: markers, cameras, reference points, floor. With comments, or from a log."""
     from ipsys_log.errors import IpsysError
-    from ipsys_log.rig import HIDDEN, example_toml
+    from ipsys_log.rig.file import HIDDEN, example_toml
 
     if simulated:
         if log is not None:
@@ -88,8 +88,8 @@ def init(
 
 
 def _init_simulated(path: Path) -> None:
-    from ipsys_log.rig import rig_toml
-    from ipsys_log.sources.simulator.live_lab import LIVE_SETTINGS, live_rig, plan_live_lab, tape_sheet
+    from ipsys_log.rig.file import rig_toml
+    from ipsys_log.simulation.live_lab import LIVE_SETTINGS, live_rig, plan_live_lab, tape_sheet
 
     tape = path.with_name(f"{path.stem}_tape.csv")
     lying = plan_live_lab(LIVE_SETTINGS).lying
@@ -129,9 +129,9 @@ def _write_new(texts: dict[Path, str]) -> None:
 
 
 def _rig_of(log: Path) -> str:
-    from ipsys_log.log.session import Session
-    from ipsys_log.rig import rig_toml
-    from ipsys_log.runs.lookup import rig_with_offsets
+    from ipsys_log.log.dataset import Session
+    from ipsys_log.rig.file import rig_toml
+    from ipsys_log.runs.select import rig_with_offsets
 
     with Session([log]) as session:
         return rig_toml(rig_with_offsets(session))
@@ -142,7 +142,8 @@ def simulate(output: Path, **settings: Any) -> None:
 
     By default it is the lab of the paper: three cameras about 2.1 m above a floor of 4.88 m."""
     from ipsys_log.runs.output import write_log
-    from ipsys_log.sources.simulator import LabSettings, simulate
+    from ipsys_log.simulation.lab import simulate
+    from ipsys_log.simulation.settings import LabSettings
 
     text = f"{output} was not written: the log of a simulated lab is written completely or not at all"
     with say_kept(lambda _: text), progress_bar() as progress:

@@ -28,12 +28,12 @@ def add_commands(app: typer.Typer) -> None:
 
 def view(logs: Logs, run: Runs = None, save: Save = None) -> None:
     """Show frames with drawn markers, floor, measured places, positions and tracks over time, in Rerun."""
-    from ipsys_log.log.session import Session
+    from ipsys_log.log.dataset import Session
 
     if save is not None:
         _check_save(save, logs)
     from ipsys_log.runs.states import out_of_date_lines
-    from ipsys_log.sinks.rerun import write_recording
+    from ipsys_log.sinks.rerun.recording import write_recording
 
     with Session(logs) as session:
         shown = write_recording(session, run or (), save)

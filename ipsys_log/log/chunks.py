@@ -13,8 +13,8 @@ from mcap.opcode import Opcode
 
 from ipsys_log.errors import LogError
 from ipsys_log.log.bounds import LARGEST_CHUNK, LARGEST_DEFINITION, chunk_excess
+from ipsys_log.log.byte_source import View
 from ipsys_log.log.records import HEADER, MESSAGE, ChunkHead, RecordAt, parse
-from ipsys_log.log.view import View
 
 __all__ = ["Inside", "check_compression", "check_definition", "inner_records", "look_inside", "unpack"]
 

@@ -22,7 +22,7 @@ from google.protobuf.timestamp_pb2 import Timestamp
 from ipsys_log import messages
 from ipsys_log.errors import LogError
 from ipsys_log.log.bounds import Items
-from ipsys_log.log.fields import fields_of, fill_proto, read_proto
+from ipsys_log.log.protobuf_fields import fields_of, fill_proto, read_proto
 from ipsys_log.log.ros2 import ROS2_PAYLOADS, read_ros2
 
 __all__ = ["PAYLOADS", "decode", "encode", "payload_type", "schema_data", "schema_name"]

@@ -8,7 +8,7 @@ from bisect import bisect_right
 from collections.abc import Iterator
 from dataclasses import dataclass, field
 
-from ipsys_log.log.view import View
+from ipsys_log.log.byte_source import View
 
 __all__ = ["EqualBlocks", "RawBlocks", "find_blocks"]
 

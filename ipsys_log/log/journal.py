@@ -22,9 +22,9 @@ from dataclasses import dataclass
 from itertools import chain
 from pathlib import Path
 
+from ipsys_log.log.byte_source import View
 from ipsys_log.log.records import MAGIC
 from ipsys_log.log.storage import Storage, write_all
-from ipsys_log.log.view import View
 
 __all__ = ["Journal", "attach_journal", "journal_path", "read_journal", "replace_tail", "roll_back"]
 

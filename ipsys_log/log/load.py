@@ -8,19 +8,11 @@ from mcap import records as mcap
 from mcap.opcode import Opcode
 
 from ipsys_log.errors import LogError
+from ipsys_log.log.byte_source import View
 from ipsys_log.log.contents import Contents
-from ipsys_log.log.records import (
-    DATA_END,
-    FOOTER,
-    HEADER,
-    MAGIC,
-    parse,
-    parse_chunk_index,
-    walk,
-)
+from ipsys_log.log.records import DATA_END, FOOTER, HEADER, MAGIC, parse, parse_chunk_index, walk
 from ipsys_log.log.scan import scan
 from ipsys_log.log.summary import standing_data_end
-from ipsys_log.log.view import View
 
 __all__ = ["NoFooterError", "Summary", "load_contents", "read_summary"]
 

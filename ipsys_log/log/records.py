@@ -13,7 +13,7 @@ from mcap.data_stream import ReadDataStream, RecordBuilder
 from mcap.exceptions import McapError
 from mcap.opcode import Opcode
 
-from ipsys_log.log.view import View
+from ipsys_log.log.byte_source import View
 
 __all__ = [
     "CHUNK_HEAD_SIZE",

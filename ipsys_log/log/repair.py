@@ -13,22 +13,30 @@ from mcap import records as mcap
 from mcap.opcode import Opcode
 
 from ipsys_log.errors import LogError, disk_advice
-from ipsys_log.log.agreement import count_by_indexes, disagreement
 from ipsys_log.log.bounds import BoundError
+from ipsys_log.log.byte_source import View
 from ipsys_log.log.crc import combine
-from ipsys_log.log.damaged import Change, Patch, check_room, discard, keep_old_bytes, overwrite, resume
-from ipsys_log.log.findings import Survey
+from ipsys_log.log.damage.agreement import count_by_indexes, disagreement
+from ipsys_log.log.damage.findings import Survey
+from ipsys_log.log.damage.kept_bytes import (
+    Change,
+    Patch,
+    check_room,
+    discard,
+    keep_old_bytes,
+    overwrite,
+    resume,
+)
+from ipsys_log.log.damage.regions import index_records
+from ipsys_log.log.damage.salvage import Salvage
+from ipsys_log.log.damage.survey import HEADER_RECORD, survey
 from ipsys_log.log.hashing import METADATA_NAME, metadata_of_hashes
 from ipsys_log.log.journal import replace_tail, roll_back
 from ipsys_log.log.load import Summary, read_summary
 from ipsys_log.log.lock import open_locked
 from ipsys_log.log.records import MAGIC, MESSAGE, as_bytes, walk
-from ipsys_log.log.salvage import Salvage
 from ipsys_log.log.storage import DISK, Storage
-from ipsys_log.log.stretch import index_records
 from ipsys_log.log.summary import tail_bytes
-from ipsys_log.log.survey import HEADER_RECORD, survey
-from ipsys_log.log.view import View
 
 __all__ = ["RepairReport", "repair"]
 

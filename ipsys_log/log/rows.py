@@ -6,9 +6,9 @@ from collections.abc import Mapping
 import numpy as np
 from numpy.typing import NDArray
 
+from ipsys_log.log.byte_source import View
 from ipsys_log.log.chunks import look_inside, unpack
 from ipsys_log.log.records import ChunkRef, parse_chunk_head, parse_message_index
-from ipsys_log.log.view import View
 
 __all__ = ["ALWAYS", "Entries", "Rows", "Run", "as_rows", "chunk_entries", "runs", "wanted_rows"]
 

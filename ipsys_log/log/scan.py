@@ -5,10 +5,10 @@ import struct
 from mcap import records as mcap
 from mcap.opcode import Opcode
 
+from ipsys_log.log.byte_source import View
 from ipsys_log.log.chunks import Inside, check_definition, look_inside, unpack
 from ipsys_log.log.contents import Contents
 from ipsys_log.log.records import HEADER, MAGIC, MESSAGE, ChunkRef, RecordAt, parse, parse_chunk_head, walk
-from ipsys_log.log.view import View
 
 __all__ = ["add_record", "count_all", "scan"]
 

@@ -6,9 +6,9 @@ import zlib
 from mcap import records as mcap
 from mcap.opcode import Opcode
 
+from ipsys_log.log.byte_source import View
 from ipsys_log.log.contents import Contents
 from ipsys_log.log.records import DATA_END, FOOTER, HEADER, MAGIC, as_bytes
-from ipsys_log.log.view import View
 
 __all__ = ["STANDING", "standing_bytes", "standing_data_end", "tail_bytes"]
 

@@ -14,7 +14,15 @@ from mcap.opcode import Opcode
 
 from ipsys_log.errors import LogError, disk_advice
 from ipsys_log.log.bounds import LARGEST_MESSAGE
-from ipsys_log.log.chunking import IMAGE_SCHEMAS, IMAGES, SMALL_APPENDED, SMALL_LIVE, ChunkBuilder, Limits
+from ipsys_log.log.byte_source import View
+from ipsys_log.log.chunk_builder import (
+    IMAGE_SCHEMAS,
+    IMAGES,
+    SMALL_APPENDED,
+    SMALL_LIVE,
+    ChunkBuilder,
+    Limits,
+)
 from ipsys_log.log.contents import Contents, free_id
 from ipsys_log.log.hashing import METADATA_NAME, ChannelHash, metadata_of_hashes
 from ipsys_log.log.journal import roll_back
@@ -26,7 +34,6 @@ from ipsys_log.log.records import HEADER, MAGIC, MESSAGE, as_bytes
 from ipsys_log.log.storage import DISK, Storage
 from ipsys_log.log.summary import standing_bytes, tail_bytes
 from ipsys_log.log.types import Schema
-from ipsys_log.log.view import View
 
 __all__ = ["LogWriter"]
 

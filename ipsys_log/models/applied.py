@@ -6,7 +6,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from ipsys_log.messages import CameraModel
-from ipsys_log.models import inputs, predict_array, restore
+from ipsys_log.models.table import inputs, predict_array, restore
 from ipsys_log.models.uncertainty import Uncertainty, Volume
 
 __all__ = ["AppliedModel"]

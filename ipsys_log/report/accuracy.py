@@ -6,7 +6,10 @@ from collections.abc import Sequence
 from dataclasses import dataclass
 from typing import Any
 
-from ipsys_log.log.session import Session
+from ipsys_log.analysis.accuracy import CROSS_VALIDATION, POOLED, count_repeats
+from ipsys_log.analysis.ground_truth import gather_tracks, track_errors
+from ipsys_log.analysis.statistics import root_mean_square_m
+from ipsys_log.log.dataset import Session
 from ipsys_log.messages import (
     TRUTH_TOPIC,
     CameraEvaluation,
@@ -17,12 +20,9 @@ from ipsys_log.messages import (
     Suspect,
     Tracks,
 )
-from ipsys_log.models import MODELS, reads_height
-from ipsys_log.offline.errors import CROSS_VALIDATION, POOLED, count_repeats
-from ipsys_log.offline.statistics import root_mean_square_m
-from ipsys_log.offline.truth import gather_tracks, track_errors
+from ipsys_log.models.table import MODELS, reads_height
 from ipsys_log.report.advice import Advice, Choice, advise
-from ipsys_log.runs.records import Outcome
+from ipsys_log.runs.provenance import Outcome
 from ipsys_log.units import CM_PER_M
 
 __all__ = ["Accuracy", "accuracy_json", "gather_suspects", "read_accuracy"]

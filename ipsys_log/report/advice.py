@@ -21,9 +21,9 @@ from dataclasses import dataclass
 
 import numpy as np
 
+from ipsys_log.analysis.accuracy import CROSS_VALIDATION, POOLED
 from ipsys_log.messages import Evaluation
-from ipsys_log.models import MODELS, reads_height
-from ipsys_log.offline.errors import CROSS_VALIDATION, POOLED
+from ipsys_log.models.table import MODELS, reads_height
 from ipsys_log.report.learning import CurvePoint, has_published, mean_curve
 from ipsys_log.units import CM_PER_M
 

@@ -8,19 +8,19 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from ipsys_log.calibration.alignment import Alignment, align_camera
-from ipsys_log.calibration.coverage import Coverage, Hung, Overlap, cover_floor, find_overlaps
-from ipsys_log.calibration.joined import join_cameras
-from ipsys_log.calibration.still import find_lying
+from ipsys_log.analysis.alignment import Alignment, align_camera
+from ipsys_log.analysis.coverage import Coverage, Hung, Overlap, cover_floor, find_overlaps
+from ipsys_log.analysis.joined import join_cameras
+from ipsys_log.analysis.pairs import Measured
+from ipsys_log.analysis.still import find_lying
 from ipsys_log.errors import IpsysError
 from ipsys_log.geometry.lenses import undistort
 from ipsys_log.geometry.poses import invert_pose, make_pose
-from ipsys_log.log.session import Session
+from ipsys_log.log.dataset import Session
 from ipsys_log.messages import CameraCalibration, CameraPoints, Measurement, Model, Pair, Rig
 from ipsys_log.models.rigid import rigid_transform
-from ipsys_log.offline.pairs import Measured
-from ipsys_log.runs.lookup import find_pairs, measured
-from ipsys_log.runs.records import newest_run
+from ipsys_log.runs.provenance import newest_run
+from ipsys_log.runs.select import find_pairs, measured
 from ipsys_log.units import CM_PER_M
 
 __all__ = ["AlignedLab", "read_alignment"]

@@ -10,7 +10,7 @@ from typing import Any
 from rich.table import Table
 
 from ipsys_log.calibration.calibrate import Calibrated
-from ipsys_log.calibration.choose import Dropped
+from ipsys_log.calibration.image_selection import Dropped
 
 __all__ = ["calibration_json", "calibration_lines", "calibration_table"]
 

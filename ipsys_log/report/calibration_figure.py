@@ -11,8 +11,8 @@ from matplotlib.colors import ListedColormap
 from matplotlib.figure import Figure
 
 from ipsys_log.calibration.calibrate import Calibrated
+from ipsys_log.report.figures import shorten, strip
 from ipsys_log.report.palette import NOTE, REST
-from ipsys_log.report.pictures import shorten, strip
 
 __all__ = ["calibration_figure"]
 

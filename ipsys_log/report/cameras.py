@@ -13,12 +13,12 @@ from rich.console import Group
 from rich.table import Table
 from rich.text import Text
 
-from ipsys_log.compare import Comparison
+from ipsys_log.analysis.differences import Comparison
+from ipsys_log.analysis.latency import Percentiles
+from ipsys_log.capture.camera_thread import CameraState
+from ipsys_log.capture.disk import DiskRoom
+from ipsys_log.capture.status import Look, Monitor
 from ipsys_log.messages import Message, Track, Tracks
-from ipsys_log.recording.disk_room import DiskRoom
-from ipsys_log.recording.latency import Percentiles
-from ipsys_log.recording.monitor import Look, Monitor
-from ipsys_log.sources.attendant import CameraState
 from ipsys_log.units import CM_PER_M, format_bytes, format_duration
 
 __all__ = [

@@ -10,7 +10,7 @@ import numpy as np
 from rich.table import Table
 from rich.text import Text
 
-from ipsys_log.log.session import Session
+from ipsys_log.log.dataset import Session
 from ipsys_log.log.topics import camera_of_topic
 from ipsys_log.messages import Run
 from ipsys_log.plain_text import plain_text

@@ -8,12 +8,12 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import NDArray
 
-from ipsys_log.log.session import Session
+from ipsys_log.analysis.accuracy import POOLED
+from ipsys_log.log.dataset import Session
 from ipsys_log.messages import CameraEvaluation, ErrorStatistics, Evaluation, Model, Rig
-from ipsys_log.offline.errors import POOLED
 from ipsys_log.report.accuracy import Accuracy
 from ipsys_log.report.advice import Advice, advise, told_height
-from ipsys_log.sinks.shown import rig_in_force
+from ipsys_log.sinks.selection import rig_in_force
 
 __all__ = ["Findings", "Missed", "gather_findings", "in_space", "judged", "overall", "rank"]
 

@@ -14,11 +14,11 @@ from matplotlib.quiver import Quiver
 from matplotlib.ticker import MultipleLocator
 from numpy.typing import NDArray
 
+from ipsys_log.analysis.accuracy import CROSS_VALIDATION
+from ipsys_log.analysis.places import Place
 from ipsys_log.messages import CameraEvaluation, Evaluation, ReferencePoint, Rig
-from ipsys_log.offline.errors import CROSS_VALIDATION
-from ipsys_log.offline.places import Place
+from ipsys_log.report.figures import shorten
 from ipsys_log.report.palette import GRID, REST, robot_colour
-from ipsys_log.report.pictures import shorten
 from ipsys_log.units import CM_PER_M
 
 __all__ = [

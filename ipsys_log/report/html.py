@@ -7,18 +7,18 @@ from typing import Any
 
 from jinja2 import Environment, PackageLoader, StrictUndefined
 
+from ipsys_log.analysis.cross_validation import FOLDS, REPEATS
+from ipsys_log.analysis.learning import SUBSETS
+from ipsys_log.analysis.tape import Measured
 from ipsys_log.errors import IpsysError
-from ipsys_log.log.session import Session
+from ipsys_log.log.dataset import Session
 from ipsys_log.messages import Run
-from ipsys_log.offline.crossval import FOLDS, REPEATS
-from ipsys_log.offline.learning import SUBSETS
-from ipsys_log.offline.tape import Measured
 from ipsys_log.plain_text import plain_text
-from ipsys_log.report import page, page_pictures, page_trust
+from ipsys_log.report import html_figures, html_sections, page_trust
 from ipsys_log.report.accuracy import Accuracy
 from ipsys_log.report.advice import TOLD_NOTE, told_height
 from ipsys_log.report.findings import Findings, gather_findings
-from ipsys_log.runs.lookup import measured
+from ipsys_log.runs.select import measured
 from ipsys_log.units import format_time
 
 __all__ = ["render_report"]
@@ -65,10 +65,10 @@ def _plain(value: Any) -> Any:
 
 def _said(findings: Findings) -> dict[str, Any]:
     return {
-        "head": page.headline(findings),
-        "advice": page.advice_rows(findings),
-        "models": page.model_rows(findings),
-        "by_camera": [(camera, page.model_rows(findings, camera)) for camera in findings.cameras],
+        "head": html_sections.headline(findings),
+        "advice": html_sections.advice_rows(findings),
+        "models": html_sections.model_rows(findings),
+        "by_camera": [(camera, html_sections.model_rows(findings, camera)) for camera in findings.cameras],
         "told_note": TOLD_NOTE if any(map(told_height, findings.models)) else "",
         "suspects": page_trust.suspects(findings),
         "coverage": page_trust.coverage(findings),
@@ -85,11 +85,11 @@ def _measured(session: Session, findings: Findings) -> list[Measured]:
 
 def _drawn(findings: Findings) -> dict[str, Any]:
     return {
-        "models_pictures": page_pictures.models_pictures(findings),
-        "residual_pictures": page_pictures.residual_pictures(findings),
-        "learning_pictures": page_pictures.learning_pictures(findings),
-        "published_pictures": page_pictures.published_pictures(findings),
-        "coverage_picture": page_pictures.coverage_picture(findings),
+        "models_pictures": html_figures.models_pictures(findings),
+        "residual_pictures": html_figures.residual_pictures(findings),
+        "learning_pictures": html_figures.learning_pictures(findings),
+        "published_pictures": html_figures.published_pictures(findings),
+        "coverage_picture": html_figures.coverage_picture(findings),
     }
 
 

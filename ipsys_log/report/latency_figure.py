@@ -10,9 +10,9 @@ from matplotlib.axes import Axes
 from matplotlib.figure import Figure
 from numpy.typing import NDArray
 
+from ipsys_log.report.figures import picture, strip
 from ipsys_log.report.files import write_files
 from ipsys_log.report.palette import NOTE
-from ipsys_log.report.pictures import picture, strip
 
 __all__ = ["draw_latency"]
 
@@ -27,7 +27,7 @@ def draw_latency(times_s: Mapping[str, NDArray[np.float64]], path: Path) -> None
 
     Parameters
     ----------
-    times_s : of :func:`ipsys_log.recording.latency.step_times_s`.
+    times_s : of :func:`ipsys_log.analysis.latency.step_times_s`.
     path : the picture, of the kind that its suffix says.
     """
     figure = Figure(figsize=(12, 6), dpi=100)

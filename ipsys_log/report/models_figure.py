@@ -11,9 +11,9 @@ from matplotlib.lines import Line2D
 from ipsys_log.messages import CameraEvaluation, ErrorStatistics
 from ipsys_log.report.accuracy import Accuracy
 from ipsys_log.report.advice import TOLD_NOTE, label, told_height
+from ipsys_log.report.figures import scale_logarithmic, strip
 from ipsys_log.report.findings import Findings, overall
 from ipsys_log.report.palette import NOTE, model_styles
-from ipsys_log.report.pictures import scale_logarithmic, strip
 from ipsys_log.units import CM_PER_M
 
 __all__ = ["HELD_OUT", "draw_models", "models_figure", "models_note"]

@@ -9,13 +9,13 @@ import numpy as np
 from matplotlib.path import Path as Outline
 from numpy.typing import NDArray
 
+from ipsys_log.analysis.tape import Measured, flat_places
 from ipsys_log.messages import CameraEvaluation
-from ipsys_log.offline.tape import Measured, flat_places
 from ipsys_log.report.accuracy import gather_suspects
 from ipsys_log.report.advice import label
 from ipsys_log.report.findings import Findings, overall
-from ipsys_log.report.page import format_cm, in_order
-from ipsys_log.report.places_figure import hull_m
+from ipsys_log.report.html_sections import format_cm, in_order
+from ipsys_log.report.points_figure import hull_m
 from ipsys_log.units import CM_PER_M
 
 __all__ = ["calibration", "coverage", "flat_rows", "suspects"]

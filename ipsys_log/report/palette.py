@@ -8,7 +8,7 @@ from __future__ import annotations
 from collections.abc import Iterable
 from typing import Any, NamedTuple
 
-from ipsys_log.sinks.palette import assign_colours
+from ipsys_log.sinks.rerun.palette import assign_colours
 
 __all__ = ["GRID", "NOTE", "REST", "TEST", "ModelStyle", "camera_styles", "model_styles", "robot_colour"]
 

@@ -25,7 +25,7 @@ from ipsys_log.report.floor_panel import (
     show_square,
     square_around,
 )
-from ipsys_log.report.places_figure import draw_hulls
+from ipsys_log.report.points_figure import draw_hulls
 from ipsys_log.units import CM_PER_M
 
 Array = NDArray[np.float64]

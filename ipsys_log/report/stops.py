@@ -6,8 +6,8 @@ from typing import Any
 
 from rich.table import Table
 
-from ipsys_log.offline.pairs import active_measurements
-from ipsys_log.scenes.finished import FinishedLog
+from ipsys_log.analysis.pairs import active_measurements
+from ipsys_log.survey.from_log import FinishedLog
 from ipsys_log.units import NS_PER_S, format_time
 
 __all__ = ["stops_json", "stops_table"]

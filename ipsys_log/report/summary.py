@@ -10,15 +10,15 @@ from rich.console import Group
 from rich.table import Table
 from rich.text import Text
 
+from ipsys_log.analysis.accuracy import CROSS_VALIDATION, POOLED
+from ipsys_log.analysis.consistency import FEWEST_POINTS
+from ipsys_log.analysis.statistics import root_mean_square_m
 from ipsys_log.messages import CameraEvaluation, ErrorStatistics
-from ipsys_log.offline.errors import CROSS_VALIDATION, POOLED
-from ipsys_log.offline.evaluate import SCREENING
-from ipsys_log.offline.statistics import root_mean_square_m
-from ipsys_log.offline.yardstick import FEWEST
 from ipsys_log.report.accuracy import Accuracy, gather_suspects
 from ipsys_log.report.advice import TOLD_NOTE, advise, label, told_height
 from ipsys_log.report.cells import format_interval, name_cell, plain_table, wrap_text
 from ipsys_log.report.findings import in_space, judged, overall, rank
+from ipsys_log.stages.evaluate import SCREENING
 from ipsys_log.units import CM_PER_M
 
 __all__ = ["answer_json", "answer_text", "models_table"]
@@ -118,11 +118,11 @@ def _length(residual_m: Any) -> str:
 def _screened(accuracy: Accuracy) -> bool:
     """Return whether a model has judged its points: only some models do, with enough points."""
     rows = [row for row in accuracy.rows(True) if row.camera != POOLED]
-    return accuracy.model in SCREENING and any(row.error_2d.count >= FEWEST for row in rows)
+    return accuracy.model in SCREENING and any(row.error_2d.count >= FEWEST_POINTS for row in rows)
 
 
 def _needed() -> str:
-    return f"that needs {FEWEST} points of a camera, and one of the models {', '.join(SCREENING)}"
+    return f"that needs {FEWEST_POINTS} points of a camera, and one of the models {', '.join(SCREENING)}"
 
 
 def answer_json(accuracies: Sequence[Accuracy]) -> dict[str, Any]:

@@ -11,9 +11,9 @@ from rich.console import Group
 from rich.table import Table
 from rich.text import Text
 
+from ipsys_log.analysis.accuracy import POOLED
+from ipsys_log.analysis.statistics import root_mean_square_m
 from ipsys_log.messages import CameraEvaluation, ErrorStatistics
-from ipsys_log.offline.errors import POOLED
-from ipsys_log.offline.statistics import root_mean_square_m
 from ipsys_log.report.accuracy import Accuracy, gather_suspects
 from ipsys_log.report.advice import GROUPS, TOLD_NOTE, Advice, Choice, advise, label, told_height
 from ipsys_log.report.cells import format_interval, name_cell, plain_table, wrap_text

@@ -10,8 +10,8 @@ from statistics import median
 from ipsys_log.errors import IpsysError
 from ipsys_log.log.topics import camera_of_topic
 from ipsys_log.messages import Event, Markers, Message, Positions
-from ipsys_log.runs.lookup import LEAST_OFFSET_PX, MIN_OFFSETS
-from ipsys_log.runs.tasks import Task
+from ipsys_log.runs.graph import Task
+from ipsys_log.runs.select import LEAST_OFFSET_PX, MIN_OFFSETS
 from ipsys_log.units import format_time
 
 __all__ = ["Remarks"]

@@ -6,9 +6,9 @@ from collections.abc import Collection, Iterable, Iterator
 from pathlib import Path
 
 from ipsys_log.log.codec import encode
-from ipsys_log.log.session import Session
+from ipsys_log.log.dataset import Session
 from ipsys_log.messages import Event, Message
-from ipsys_log.runs.tasks import Task
+from ipsys_log.runs.graph import Task
 from ipsys_log.units import format_time
 
 __all__ = ["OtherContentError", "cut_short", "without_held"]

@@ -5,10 +5,10 @@ from __future__ import annotations
 from collections.abc import Collection, Iterable
 from dataclasses import dataclass, replace
 
-from ipsys_log.log.session import Session
+from ipsys_log.log.dataset import Session
 from ipsys_log.log.topics import camera_of_topic, run_of_topic
 from ipsys_log.messages import MEASUREMENTS_TOPIC, RIG_TOPIC, ChannelRead, Model, Run
-from ipsys_log.runs.records import is_complete
+from ipsys_log.runs.provenance import is_complete
 from ipsys_log.runs.versions import VERSIONS, recorded_version, versioned_names
 from ipsys_log.stages.camera_frame import PERIMETER
 

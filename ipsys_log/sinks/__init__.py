@@ -1,1 +1,1 @@
-"""Where messages go: they are consumed here, and nothing is answered."""
+"""Sinks: consumers of messages."""

@@ -1,1 +1,1 @@
-"""Causal steps of the pipeline: a message in, payloads out. They know no files and no clocks."""
+"""Stages of the pipeline: each reads channels and writes channels. They know no files and no clocks."""

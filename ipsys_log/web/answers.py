@@ -7,13 +7,13 @@ from typing import Any
 
 import numpy as np
 
+from ipsys_log.analysis.pairs import active_measurements
+from ipsys_log.analysis.places import measured_places
 from ipsys_log.geometry.multilateration import sides_alike
-from ipsys_log.measuring.check import Checked, next_id
-from ipsys_log.measuring.scene import Scene, Stop, View, look, visible_markers
 from ipsys_log.messages import Measurement
-from ipsys_log.offline.pairs import active_measurements
-from ipsys_log.offline.places import measured_places
 from ipsys_log.report.palette import camera_styles
+from ipsys_log.survey.checks import Checked, next_id
+from ipsys_log.survey.scene import Scene, Stop, View, look, visible_markers
 from ipsys_log.units import CM_PER_M, NS_PER_S
 
 __all__ = ["checked_json", "history_json", "scene_json", "views_json"]

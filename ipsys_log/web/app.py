@@ -13,9 +13,9 @@ from starlette.responses import JSONResponse, Response
 from starlette.routing import Route
 
 from ipsys_log.errors import IpsysError
-from ipsys_log.measuring.check import Checked, check_entry, withdraw
-from ipsys_log.measuring.entry import Typed, read_typed
-from ipsys_log.measuring.scene import Scene, look
+from ipsys_log.survey.checks import Checked, check_entry, withdraw
+from ipsys_log.survey.entry import Typed, read_typed
+from ipsys_log.survey.scene import Scene, look
 from ipsys_log.web.answers import checked_json, history_json, scene_json, views_json
 
 __all__ = ["build_app"]

@@ -11,7 +11,7 @@ from scipy.interpolate import PchipInterpolator
 from scipy.ndimage import maximum_filter, minimum_filter
 from scipy.spatial.transform import Rotation
 
-from ipsys_log.calibration.bundle import Corners
+from ipsys_log.calibration.bundle_adjustment import Corners
 
 Array = NDArray[np.float64]
 

@@ -6,11 +6,11 @@ import numpy as np
 import pytest
 from scipy.spatial.transform import Rotation
 
-from ipsys_log.calibration.boards import Board
+from ipsys_log.calibration.board import Board
+from ipsys_log.calibration.board_detection import Sighting
+from ipsys_log.calibration.board_search import Looked
 from ipsys_log.calibration.calibrate import Calibrated, calibrate
 from ipsys_log.calibration.lens_models import LENSES
-from ipsys_log.calibration.look import Looked
-from ipsys_log.calibration.sighting import Sighting
 from ipsys_log.errors import IpsysError
 from tests.calibration.boards_seen import SIZE_PX, TRUTH, grid_m, pixels_of, seen
 

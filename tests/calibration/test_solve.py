@@ -9,7 +9,7 @@ import numpy as np
 import pytest
 from numpy.typing import NDArray
 
-from ipsys_log.calibration.bundle import Corners
+from ipsys_log.calibration.bundle_adjustment import Corners
 from ipsys_log.calibration.lens_models import LENSES
 from ipsys_log.calibration.solve import Solved, solve
 from ipsys_log.calibration.start import find_start, pose_from_rays

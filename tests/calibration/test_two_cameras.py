@@ -6,12 +6,12 @@ import numpy as np
 import pytest
 from numpy.typing import NDArray
 
-from ipsys_log.calibration.boards import Board
-from ipsys_log.calibration.bundle import Corners
+from ipsys_log.calibration.board import Board
+from ipsys_log.calibration.board_detection import Sighting
+from ipsys_log.calibration.board_search import Looked
+from ipsys_log.calibration.bundle_adjustment import Corners
 from ipsys_log.calibration.calibrate import Calibrated, calibrate
 from ipsys_log.calibration.lens_models import LENSES
-from ipsys_log.calibration.look import Looked
-from ipsys_log.calibration.sighting import Sighting
 from ipsys_log.calibration.start import find_start
 from ipsys_log.calibration.two_cameras import TwoCameras, find_two_cameras
 from ipsys_log.errors import IpsysError

@@ -14,8 +14,9 @@ import numpy as np
 import pytest
 from numpy.typing import NDArray
 
+from ipsys_log.geometry.patterns import Placed
 from ipsys_log.geometry.poses import lay_flat, look_down
-from ipsys_log.log.session import Session
+from ipsys_log.log.dataset import Session
 from ipsys_log.messages import (
     RIG_TOPIC,
     CompressedImage,
@@ -28,16 +29,11 @@ from ipsys_log.messages import (
     image_topic,
 )
 from ipsys_log.runs.output import write_log
-from ipsys_log.sources.simulator import (
-    EPOCH_NS,
-    Camera,
-    LabSettings,
-    Placed,
-    encode_jpeg,
-    hang_cameras,
-    prepare_view,
-    render,
-)
+from ipsys_log.simulation.cameras import Camera, hang_cameras
+from ipsys_log.simulation.lab import EPOCH_NS
+from ipsys_log.simulation.render import encode_jpeg, render
+from ipsys_log.simulation.settings import LabSettings
+from ipsys_log.simulation.views import prepare_view
 from tests.conftest import Ipsys, data_section
 from tests.ladder import follow
 

@@ -14,9 +14,9 @@ import cv2
 import numpy as np
 import pytest
 
-from ipsys_log.calibration.pictures import find_sources
-from ipsys_log.formats.opencv_yaml import read_opencv_calibration
-from ipsys_log.log.session import Session
+from ipsys_log.calibration.images import find_sources
+from ipsys_log.exchange.opencv_yaml import read_opencv_calibration
+from ipsys_log.log.dataset import Session
 from ipsys_log.messages import CompressedImage, CompressedVideo, Message, image_topic
 from ipsys_log.runs.output import write_log
 from tests.calibration.boards_seen import (
@@ -26,8 +26,8 @@ from tests.calibration.boards_seen import (
     random_pose,
     render,
 )
+from tests.capture.streams import ffmpeg
 from tests.conftest import Done, Ipsys
-from tests.sources.streams import ffmpeg
 
 SIZE_PX = (480, 360)
 LENS = (140.0, 140.0, 243.0, 178.0, -0.02, 0.01, -0.004, 0.0005)
@@ -209,7 +209,7 @@ def test_pictures_of_two_sizes_are_refused_before_looking(
     """No board is looked for, which takes long: the headers of the files say the size."""
     for n in range(9):
         cv2.imwrite(str(red / f"99{n}.png"), np.zeros((480, 640), np.uint8))
-    monkeypatch.setattr("ipsys_log.calibration.look.view_board", None)
+    monkeypatch.setattr("ipsys_log.calibration.board_search.view_board", None)
     line = refused(ipsys, tmp_path, red, "--board", "6x4", "-o", tmp_path)
     assert "pictures have 2 sizes: 12 of 480 x 360 px (0.png, 1.png ...); 9 of 640 x 480 px (990.png" in line
     assert "put the pictures of each size into a separate folder" in line
@@ -369,7 +369,7 @@ def test_a_recorded_video_gives_the_lens_of_its_pictures(
     # What is lost between the two is rounding of grey levels.
     assert np.abs(np.subtract(*lenses)).max() < 0.05
     # Of a long one not each is looked at; those that are need the others.
-    monkeypatch.setattr("ipsys_log.calibration.pictures.MOST_LOOKED_AT", 4)
+    monkeypatch.setattr("ipsys_log.calibration.images.MOST_LOOKED_AT", 4)
     (some,) = find_sources([log], [])
     looked_at = [grey for _, grey in some.read()]
     assert len(looked_at) == 4

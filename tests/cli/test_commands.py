@@ -10,9 +10,9 @@ from pathlib import Path
 import pytest
 
 from ipsys_log.cli.setup import SETTINGS
-from ipsys_log.log import LogWriter
-from ipsys_log.rig import check_rig, load_rig
-from ipsys_log.sources.simulator import LabSettings
+from ipsys_log.log.writer import LogWriter
+from ipsys_log.rig.file import check_rig, load_rig
+from ipsys_log.simulation.settings import LabSettings
 from tests.conftest import ROOT, Ipsys
 
 COMMANDS = [

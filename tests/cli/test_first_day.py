@@ -11,9 +11,9 @@ import typer.main
 
 from ipsys_log.cli.app import app
 from ipsys_log.cli.guide import EXAMPLES, PANELS
-from ipsys_log.log.session import Session
+from ipsys_log.log.dataset import Session
 from ipsys_log.pipeline import replay
-from ipsys_log.runs.request import Request
+from ipsys_log.runs.options import Request
 from tests.conftest import Ipsys
 
 RIG = """name = "lab"

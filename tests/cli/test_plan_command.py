@@ -13,11 +13,11 @@ import cv2
 import numpy as np
 import pytest
 
-from ipsys_log.log.session import Session
+from ipsys_log.log.dataset import Session
 from ipsys_log.messages import CameraCalibration, Measurement, Message, Model, Rig
 from ipsys_log.pipeline import replay
+from ipsys_log.runs.options import Request
 from ipsys_log.runs.output import write_log
-from ipsys_log.runs.request import Request
 from tests.conftest import ROOT, Ipsys, data_section
 
 PAPER = ROOT / "sample_logs" / "paper_lab.mcap"

@@ -15,7 +15,7 @@ from pathlib import Path
 import pytest
 
 from ipsys_log.cli.signals import InterruptError, interruptible
-from ipsys_log.log import LogReader
+from ipsys_log.log.reader import LogReader
 from tests.conftest import ROOT, SIGNALS, Ipsys
 from tests.test_record import wait_for
 

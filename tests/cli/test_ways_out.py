@@ -17,12 +17,13 @@ from pathlib import Path
 import numpy as np
 import pytest
 
+from ipsys_log.analysis.differences import Extent, explain_apart
 from ipsys_log.cli.signals import Interrupted, note_kept, say_kept
-from ipsys_log.compare import Extent, explain_apart
-from ipsys_log.log.session import Session
+from ipsys_log.log.dataset import Session
 from ipsys_log.messages import CameraCalibration, CameraPoints, Markers, Message, Positions, Rig
 from ipsys_log.runs.output import write_log
-from ipsys_log.sources.simulator import LabSettings, simulate
+from ipsys_log.simulation.lab import simulate
+from ipsys_log.simulation.settings import LabSettings
 from tests.conftest import ROOT, Ipsys
 from tests.test_bad_input import refused, rewrite
 
@@ -278,7 +279,7 @@ def test_calibrate_interrupted_names_the_files_written(
             note_kept(name)
         signal.raise_signal(signal.SIGINT)
 
-    monkeypatch.setattr("ipsys_log.calibration.pictures.find_sources", interrupt)
+    monkeypatch.setattr("ipsys_log.calibration.images.find_sources", interrupt)
     done = ipsys("calibrate", tmp_path, "--board", "6x4")
     assert done.code == 130
     said = f"written: {', '.join(files)}" if files else "no file was written"

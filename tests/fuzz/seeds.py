@@ -12,9 +12,10 @@ import numpy as np
 import scipy.io
 from mcap.opcode import Opcode
 
-from ipsys_log.formats.calibration_yaml import kalibr_yaml, opencv_yaml, ros_yaml
-from ipsys_log.log import LogWriter, Schema
+from ipsys_log.exchange.calibration_yaml import kalibr_yaml, opencv_yaml, ros_yaml
 from ipsys_log.log.codec import encode, schema_data, schema_name
+from ipsys_log.log.types import Schema
+from ipsys_log.log.writer import LogWriter
 from ipsys_log.messages import (
     CameraCalibration,
     CameraPoint,
@@ -37,7 +38,7 @@ from ipsys_log.messages import (
     Track,
     Tracks,
 )
-from ipsys_log.rig import rig_toml
+from ipsys_log.rig.file import rig_toml
 from tests.log.bombs import Attack, message
 
 __all__ = ["RIG", "lens_files", "logs", "mat", "payloads", "pictures", "rig_files", "sheets"]

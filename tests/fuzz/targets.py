@@ -17,19 +17,21 @@ from urllib.parse import quote
 
 from hypothesis import strategies as st
 
-from ipsys_log.calibration import pictures as calibration_pictures
+from ipsys_log.calibration import images as calibration_pictures
 from ipsys_log.errors import IpsysError
-from ipsys_log.formats.matlab import read_mat
-from ipsys_log.formats.opencv_yaml import read_opencv_calibration
-from ipsys_log.log import LogReader, LogWriter, repair
+from ipsys_log.exchange.matlab import read_mat
+from ipsys_log.exchange.opencv_yaml import read_opencv_calibration
+from ipsys_log.exchange.picture_times import find_times
+from ipsys_log.images.decode import decode_grey, decode_rows
+from ipsys_log.images.video import Video
 from ipsys_log.log.codec import PAYLOADS, decode, encode, schema_name
-from ipsys_log.log.session import Session
-from ipsys_log.measuring.sheet import read_sheet
+from ipsys_log.log.dataset import Session
+from ipsys_log.log.reader import LogReader
+from ipsys_log.log.repair import repair
+from ipsys_log.log.writer import LogWriter
 from ipsys_log.messages import CompressedImage, CompressedVideo
-from ipsys_log.rig import load_rig
-from ipsys_log.sources.picture_times import find_times
-from ipsys_log.stages.detect.decode import decode_grey, decode_rows
-from ipsys_log.stages.detect.video import Video
+from ipsys_log.rig.file import load_rig
+from ipsys_log.survey.sheet import read_sheet
 from ipsys_log.web.app import build_app
 from tests.fuzz import seeds
 from tests.fuzz.damage import damaged

@@ -11,8 +11,9 @@ from mcap import records as mcap
 from mcap.reader import make_reader
 from mcap.stream_reader import StreamReader
 
-from ipsys_log.log import LogWriter, RawMessage, Schema
 from ipsys_log.log.storage import DISK, Storage
+from ipsys_log.log.types import RawMessage, Schema
+from ipsys_log.log.writer import LogWriter
 
 IMAGE = Schema("foxglove.CompressedImage", "protobuf", b"image definition")
 POINT = Schema("ipsys.v1.Position", "protobuf", b"point definition")

@@ -6,8 +6,9 @@ from pathlib import Path
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from ipsys_log.log import LogReader, repair
 from ipsys_log.log.hashing import ChannelHash
+from ipsys_log.log.reader import LogReader
+from ipsys_log.log.repair import repair
 from tests.log.conftest import Row, append, as_row, create, linear_rows, stock_rows
 
 ROWS = st.lists(

@@ -15,8 +15,9 @@ from mcap.reader import make_reader
 from mcap.writer import CompressionType, Writer
 
 from ipsys_log.errors import LogError
-from ipsys_log.log import LogReader, repair
+from ipsys_log.log.reader import LogReader
 from ipsys_log.log.records import MAGIC, as_bytes
+from ipsys_log.log.repair import repair
 from tests.log.conftest import IMAGE, POINT, Row, as_row, create, linear_rows, stock_rows
 from tests.log.crash import Recorder, crashes
 from tests.log.damage import QUICK, non_seeking_rows

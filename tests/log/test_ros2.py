@@ -14,8 +14,8 @@ from rosbags.rosbag2 import StoragePlugin, Writer
 from rosbags.typesys import Stores, get_typestore
 
 from ipsys_log.errors import LogError
+from ipsys_log.log.dataset import Session
 from ipsys_log.log.ros2 import read_ros2
-from ipsys_log.log.session import Session
 from ipsys_log.messages import CameraCalibration, CompressedImage, RawImage
 from tests.conftest import Ipsys
 from tests.test_foreign_logs import RIG, picture

@@ -6,7 +6,8 @@ from pathlib import Path
 
 sys.path.insert(0, str(Path(__file__).parents[2]))
 
-from ipsys_log.log import LogReader, LogWriter
+from ipsys_log.log.reader import LogReader
+from ipsys_log.log.writer import LogWriter
 from tests.log.conftest import IMAGE, POINT, append
 from tests.log.test_together import FIRST, PER_SESSION, session
 

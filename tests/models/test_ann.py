@@ -14,9 +14,9 @@ from sklearn.pipeline import Pipeline
 from sklearn.utils.estimator_checks import check_estimator
 
 from ipsys_log.errors import FitError
-from ipsys_log.models import create
 from ipsys_log.models.ann import NeuralNetwork, _slopes, network
 from ipsys_log.models.rigid import RigidTransform
+from ipsys_log.models.table import create
 from tests.models.test_rays import authors_pairs, error_cm
 
 
@@ -110,7 +110,7 @@ def test_the_papers_figures(data: Path, hybrid: bool, limit_cm: float) -> None:
 def test_all_nine_methods_can_be_fitted_to_the_published_subsets(data: Path, subset: int) -> None:
     import scipy.io
 
-    from ipsys_log.models import MODELS
+    from ipsys_log.models.table import MODELS
 
     training = scipy.io.loadmat(data / "imsel" / f"training_{subset}.mat")
     for name in [name for name in MODELS if name not in ("rayplane", "best")]:

@@ -11,8 +11,8 @@ from sklearn.exceptions import SkipTestWarning
 from sklearn.utils.estimator_checks import check_estimator
 
 from ipsys_log.errors import FitError
-from ipsys_log.models import create, parameters, restore
 from ipsys_log.models.kriging import Kriging, _correlations, _gls, _squared_gaps, most_likely
+from ipsys_log.models.table import create, parameters, restore
 from tests import labs
 from tests.models.test_rays import authors_pairs, error_cm
 

@@ -19,9 +19,9 @@ from sklearn.preprocessing import PolynomialFeatures
 from sklearn.utils.estimator_checks import check_estimator
 
 from ipsys_log.errors import FitError, IpsysError
-from ipsys_log.models import MODELS, create, inputs, min_pairs, parameters, predict_array, restore
 from ipsys_log.models.poly import PolynomialRegression
 from ipsys_log.models.rigid import rigid_transform
+from ipsys_log.models.table import MODELS, create, inputs, min_pairs, parameters, predict_array, restore
 
 
 def places(seed: int, count: int = 40, noise_m: float = 0.01) -> tuple[Any, Any]:

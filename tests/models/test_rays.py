@@ -11,7 +11,7 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 from sklearn.model_selection import KFold
 
-from ipsys_log.models import Places, create, fit_cameras, inputs, tied_cameras
+from ipsys_log.models.table import Places, create, fit_cameras, inputs, tied_cameras
 from tests import labs
 
 

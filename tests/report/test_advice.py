@@ -8,7 +8,7 @@ from pathlib import Path
 
 import pytest
 
-from ipsys_log.formats.imsel import read_imsel
+from ipsys_log.exchange.imsel import read_imsel
 from ipsys_log.messages import CameraEvaluation, ErrorStatistics, Evaluation, LearningPoint
 from ipsys_log.report.advice import ANY, PAPER, SIMPLE, TOLD, advise
 from ipsys_log.report.findings import Findings

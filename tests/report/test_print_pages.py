@@ -12,9 +12,9 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 from numpy.typing import NDArray
 
-from ipsys_log.calibration.boards import parse_board
-from ipsys_log.calibration.sighting import find_board
-from ipsys_log.geometry.cell_outlines import cell_outlines
+from ipsys_log.calibration.board import parse_board
+from ipsys_log.calibration.board_detection import find_board
+from ipsys_log.geometry.marker_cells import cell_outlines
 from ipsys_log.geometry.markers import white_cells
 from tests.conftest import Ipsys
 

@@ -7,7 +7,7 @@ from pathlib import Path
 import pytest
 
 from ipsys_log.errors import LogError
-from ipsys_log.log import LogWriter
+from ipsys_log.log.writer import LogWriter
 from ipsys_log.messages import CompressedImage, CompressedVideo, Message
 from ipsys_log.runs.output import write_messages
 

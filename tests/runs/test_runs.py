@@ -12,9 +12,9 @@ from typing import Any
 import numpy as np
 import pytest
 
-from ipsys_log.log import LogWriter
-from ipsys_log.log.session import Session
+from ipsys_log.log.dataset import Session
 from ipsys_log.log.topics import run_of_topic
+from ipsys_log.log.writer import LogWriter
 from ipsys_log.messages import (
     CameraCalibration,
     CameraPoints,
@@ -27,7 +27,7 @@ from ipsys_log.messages import (
     Run,
     Tracks,
 )
-from ipsys_log.rig import load_rig
+from ipsys_log.rig.file import load_rig
 from ipsys_log.runs.output import append_messages, write_log, write_messages
 from tests.conftest import ROOT, Ipsys
 

@@ -9,11 +9,11 @@ from typing import Any
 
 import pytest
 
-from ipsys_log.log import LogWriter
-from ipsys_log.log.session import Session
-from ipsys_log.models import MODELS
-from ipsys_log.runs import records
-from ipsys_log.runs.tasks import STAGES
+from ipsys_log.log.dataset import Session
+from ipsys_log.log.writer import LogWriter
+from ipsys_log.models.table import MODELS
+from ipsys_log.runs import provenance
+from ipsys_log.runs.graph import STAGES
 from ipsys_log.runs.versions import VERSIONS, recorded_version, version_parameters
 from ipsys_log.stages.camera_frame import METHODS
 from ipsys_log.stages.detect import CORNERS
@@ -25,7 +25,7 @@ Rows = dict[tuple[str, str], dict[str, Any]]
 @pytest.fixture(scope="module")
 def replayed(lab_log: Path, tmp_path_factory: pytest.TempPathFactory) -> Path:
     from ipsys_log.pipeline import replay
-    from ipsys_log.runs.request import Request
+    from ipsys_log.runs.options import Request
 
     path = tmp_path_factory.mktemp("versions") / "lab.mcap"
     shutil.copy(lab_log, path)
@@ -204,14 +204,14 @@ def test_verify_names_what_another_version_made_and_verifies_the_rest(
 def test_versions_of_packages_make_nothing_out_of_date(
     ipsys: Ipsys, log: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    monkeypatch.setattr(records, "_versions", lambda: (("ipsys_log", "99.0"), ("numpy", "99.0")))
+    monkeypatch.setattr(provenance, "_versions", lambda: (("ipsys_log", "99.0"), ("numpy", "99.0")))
     assert not any(new for _, new in made(ipsys, log).values())
 
 
 def test_measurement_since_makes_the_model_out_of_date(ipsys: Ipsys, log: Path, tmp_path: Path) -> None:
-    from ipsys_log.measuring.check import withdraw
     from ipsys_log.messages import Message
     from ipsys_log.runs.output import append_messages
+    from ipsys_log.survey.checks import withdraw
 
     with Session([log]) as session:
         last, time_ns = session.payloads(["/measurements"])[-1], session.end_ns + 1

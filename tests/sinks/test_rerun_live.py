@@ -12,11 +12,11 @@ import pytest
 from rerun.chunk import RrdReader
 
 from ipsys_log.errors import IpsysError
-from ipsys_log.log.session import Session
+from ipsys_log.log.dataset import Session
 from ipsys_log.messages import CompressedImage, Message, Tracks
 from ipsys_log.pipeline import replay
-from ipsys_log.runs.request import Request
-from ipsys_log.sinks.rerun_live import LiveView
+from ipsys_log.runs.options import Request
+from ipsys_log.sinks.rerun.live import LiveView
 
 Write = Callable[[bytes], object]
 

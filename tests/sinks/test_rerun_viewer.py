@@ -9,8 +9,8 @@ from pathlib import Path
 import pytest
 
 from ipsys_log.errors import IpsysError
-from ipsys_log.sinks import rerun_viewer
-from ipsys_log.sinks.rerun_viewer import check_screen, show_in_viewer, viewer_command
+from ipsys_log.sinks.rerun import rerun_viewer
+from ipsys_log.sinks.rerun.rerun_viewer import check_screen, show_in_viewer, viewer_command
 
 
 @pytest.fixture

@@ -13,7 +13,7 @@ import pytest
 from ipsys_log.errors import IpsysError
 from ipsys_log.geometry.lenses import undistort
 from ipsys_log.geometry.markers import camera_point, heading
-from ipsys_log.log.session import Session
+from ipsys_log.log.dataset import Session
 from ipsys_log.messages import (
     CameraCalibration,
     CameraPoint,
@@ -25,8 +25,8 @@ from ipsys_log.messages import (
     Rig,
     RigMarker,
 )
+from ipsys_log.runs.options import Request
 from ipsys_log.runs.output import write_log
-from ipsys_log.runs.request import Request
 from ipsys_log.stages.camera_frame import METHODS, CameraFrame
 from tests.conftest import ROOT, Ipsys
 from tests.geometry.squares import CENTRE, EDGE, FISHEYE, LENSES, MIDWAY, Array, corners_px, turned

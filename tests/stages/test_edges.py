@@ -11,22 +11,15 @@ from typing import Any
 import numpy as np
 import pytest
 
+from ipsys_log.geometry.patterns import true_corners
 from ipsys_log.messages import CameraCalibration, CompressedImage, Marker, RigCamera, Tracks
-from ipsys_log.sources.simulator import (
-    EPOCH_NS,
-    Camera,
-    LabSettings,
-    View,
-    drive_start_ns,
-    encode_jpeg,
-    hang_cameras,
-    plan_drive,
-    prepare_view,
-    render,
-    simulate,
-    true_corners,
-)
-from ipsys_log.sources.simulator.places import Place, place, seen_whole
+from ipsys_log.simulation.calibration_points import Place, place, seen_whole
+from ipsys_log.simulation.cameras import Camera, hang_cameras
+from ipsys_log.simulation.drive import plan_drive
+from ipsys_log.simulation.lab import EPOCH_NS, drive_start_ns, simulate
+from ipsys_log.simulation.render import encode_jpeg, render
+from ipsys_log.simulation.settings import LabSettings
+from ipsys_log.simulation.views import View, prepare_view
 from ipsys_log.stages.detect.edges import Guess, fit_edges
 from ipsys_log.stages.detect.follow import Follow
 from ipsys_log.units import NS_PER_S

@@ -15,7 +15,7 @@ from ipsys_log.messages import (
     Rig,
     Tracks,
 )
-from ipsys_log.pipeline import Stage, run
+from ipsys_log.runs.stream import Stage, run
 from ipsys_log.stages import fuse
 
 

@@ -20,8 +20,8 @@ from ipsys_log.messages import (
     Rig,
     RigMarker,
 )
-from ipsys_log.offline.fit import fit_model
 from ipsys_log.stages.detect import Detect, decode_grey
+from ipsys_log.stages.fit import fit_model
 from ipsys_log.stages.fuse import Fuse, fuse_positions
 from ipsys_log.stages.locate import Locate
 

@@ -10,8 +10,9 @@ from typing import Any
 import numpy as np
 import pytest
 
+from ipsys_log.analysis.ground_truth import gather_tracks, track_errors
 from ipsys_log.log.codec import encode
-from ipsys_log.log.session import Session
+from ipsys_log.log.dataset import Session
 from ipsys_log.messages import (
     RIG_TOPIC,
     TRUTH_TOPIC,
@@ -31,13 +32,15 @@ from ipsys_log.messages import (
     Tracks,
     Vector3,
 )
-from ipsys_log.offline.fit import fit_model
-from ipsys_log.offline.truth import gather_tracks, track_errors
-from ipsys_log.pipeline import Stage, replay, run
+from ipsys_log.pipeline import replay
+from ipsys_log.runs.options import Request
 from ipsys_log.runs.output import write_log
-from ipsys_log.runs.request import Request
-from ipsys_log.sources.simulator import LabSettings, drive_start_ns, hang_cameras, simulate
+from ipsys_log.runs.stream import Stage, run
+from ipsys_log.simulation.cameras import hang_cameras
+from ipsys_log.simulation.lab import drive_start_ns, simulate
+from ipsys_log.simulation.settings import LabSettings
 from ipsys_log.stages import fuse, locate
+from ipsys_log.stages.fit import fit_model
 
 MS = 1_000_000
 RIG = Message(RIG_TOPIC, 0, 0, Rig("lab", "DICT_4X4_100", 0.2, tuple(RigMarker(n) for n in range(9))))

@@ -20,15 +20,15 @@ from pathlib import Path
 import pytest
 import uvicorn
 
-from ipsys_log.cli.measure_now import say_faults
+from ipsys_log.cli.measure_live import say_faults
 from ipsys_log.errors import IpsysError
-from ipsys_log.log.session import Session
-from ipsys_log.measuring.scene import View
+from ipsys_log.log.dataset import Session
+from ipsys_log.survey.scene import View
 from ipsys_log.web.connections import Limits, derive_limits
 from ipsys_log.web.faults import Faults
-from ipsys_log.web.serving import Served, serving
+from ipsys_log.web.server import Served, serving
 from tests.test_measure_now import Lab, still_lab
-from tests.web.test_guard import Caller
+from tests.web.test_access import Caller
 from tests.web.test_measuring_page import Recording
 
 __all__ = ["still_lab"]

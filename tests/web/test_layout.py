@@ -10,9 +10,9 @@ from contextlib import contextmanager
 
 import pytest
 
-from ipsys_log.runs.request import Request
-from ipsys_log.scenes.finished import opened_log
-from ipsys_log.web.serving import serving
+from ipsys_log.runs.options import Request
+from ipsys_log.survey.from_log import opened_log
+from ipsys_log.web.server import serving
 from tests.conftest import Unmeasured
 from tests.web.contrast import low_contrasts
 from tests.web.phone import Phone, phone

@@ -11,8 +11,7 @@ import numpy as np
 import pytest
 
 from ipsys_log.errors import LogError
-from ipsys_log.log.session import Session
-from ipsys_log.measuring.scene import Stop, View
+from ipsys_log.log.dataset import Session
 from ipsys_log.messages import (
     CameraPoint,
     CameraPoints,
@@ -24,9 +23,10 @@ from ipsys_log.messages import (
     Rig,
     RigMarker,
 )
-from ipsys_log.runs.request import Request
-from ipsys_log.scenes.finished import FinishedLog, opened_log
-from ipsys_log.web.serving import serving
+from ipsys_log.runs.options import Request
+from ipsys_log.survey.from_log import FinishedLog, opened_log
+from ipsys_log.survey.scene import Stop, View
+from ipsys_log.web.server import serving
 from tests import labs
 from tests.conftest import Ipsys, Unmeasured
 from tests.test_measure import as_typed, foreign_read

@@ -12,6 +12,8 @@ import numpy as np
 
 from ipsys_log.errors import FrameError, IpsysError, SizeError
 from ipsys_log.geometry.lenses import check_calibration, check_size, same_lens
+from ipsys_log.images.decode import decode_grey
+from ipsys_log.images.video import Video
 from ipsys_log.messages import (
     CameraCalibration,
     Color,
@@ -30,11 +32,9 @@ from ipsys_log.messages import (
     SkippedVideo,
     TextAnnotation,
 )
-from ipsys_log.stages.detect.decode import decode_grey
 from ipsys_log.stages.detect.edges import Fit
 from ipsys_log.stages.detect.follow import Follow
 from ipsys_log.stages.detect.stock import detect_markers, marker_detector
-from ipsys_log.stages.detect.video import Video
 from ipsys_log.units import NS_PER_S
 
 __all__ = [

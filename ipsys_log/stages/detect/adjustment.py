@@ -14,7 +14,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from ipsys_log.geometry.lenses import project
-from ipsys_log.stages.detect.decode import Grey, levels_at
+from ipsys_log.images.decode import Grey, levels_at
 from ipsys_log.stages.detect.prints import Prints
 from ipsys_log.stages.detect.profiles import Poses, View
 

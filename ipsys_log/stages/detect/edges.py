@@ -17,6 +17,7 @@ from typing import NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 
+from ipsys_log.images.decode import Grey
 from ipsys_log.messages import CameraCalibration
 from ipsys_log.stages.detect.adjustment import (
     Fit,
@@ -28,7 +29,6 @@ from ipsys_log.stages.detect.adjustment import (
     solve,
     whole,
 )
-from ipsys_log.stages.detect.decode import Grey
 from ipsys_log.stages.detect.prints import Prints, lay_out
 from ipsys_log.stages.detect.profiles import LEAST_CONTRAST, Poses, View, measure
 

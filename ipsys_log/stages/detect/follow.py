@@ -11,9 +11,11 @@ from ipsys_log.geometry.ippe import solve_squares
 from ipsys_log.geometry.lenses import check_size, project, undistort
 from ipsys_log.geometry.markers import marker_corners
 from ipsys_log.geometry.square_pose import goes_around
+from ipsys_log.images.decode import Grey, decode_rows
 from ipsys_log.messages import CameraCalibration, CompressedImage, RawImage
-from ipsys_log.stages.detect.decode import Grey, decode_rows
+from ipsys_log.stages.detect.changes import Watch
 from ipsys_log.stages.detect.edges import Fit, Guess, fit_edges
+from ipsys_log.stages.detect.motion import LONG_S, Track, extend, predict, same_speed
 from ipsys_log.stages.detect.partial import Rejection, fit_partly, resembles
 from ipsys_log.stages.detect.search import (
     WHOLE,
@@ -23,8 +25,6 @@ from ipsys_log.stages.detect.search import (
     search_leftovers,
     search_thoroughly,
 )
-from ipsys_log.stages.detect.track import LONG_S, Track, extend, predict, same_speed
-from ipsys_log.stages.detect.watch import Watch
 from ipsys_log.units import NS_PER_S
 
 __all__ = ["Follow"]

@@ -15,6 +15,7 @@ from typing import NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 
+from ipsys_log.images.decode import Grey
 from ipsys_log.messages import CameraCalibration
 from ipsys_log.stages.detect.adjustment import (
     Fit,
@@ -26,11 +27,10 @@ from ipsys_log.stages.detect.adjustment import (
     solve,
     whole,
 )
-from ipsys_log.stages.detect.decode import Grey
 from ipsys_log.stages.detect.pattern import compare_pattern
 from ipsys_log.stages.detect.prints import Prints, lay_out
 from ipsys_log.stages.detect.profiles import Poses, Sites, View, locate, read_profiles
-from ipsys_log.stages.detect.steps import (
+from ipsys_log.stages.detect.uneven_light import (
     TAPS,
     Steps,
     exact_steps,

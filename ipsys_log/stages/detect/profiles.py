@@ -11,8 +11,8 @@ from scipy.special import ndtr
 
 from ipsys_log.geometry.lenses import project
 from ipsys_log.geometry.poses import rotation
+from ipsys_log.images.decode import Grey, levels_at
 from ipsys_log.messages import CameraCalibration
-from ipsys_log.stages.detect.decode import Grey, levels_at
 from ipsys_log.stages.detect.prints import Prints
 
 __all__ = [

@@ -16,7 +16,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from ipsys_log.geometry.markers import white_cells
-from ipsys_log.stages.detect.decode import Grey, levels_at
+from ipsys_log.images.decode import Grey, levels_at
 
 __all__ = ["WHOLE", "Candidate", "sample", "search", "search_leftovers", "search_thoroughly"]
 

@@ -6,8 +6,8 @@ import cv2
 import numpy as np
 
 from ipsys_log.errors import IpsysError
+from ipsys_log.images.decode import Grey
 from ipsys_log.messages import Marker
-from ipsys_log.stages.detect.decode import Grey
 
 __all__ = ["detect_markers", "marker_detector"]
 

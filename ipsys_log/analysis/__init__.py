@@ -1,0 +1,1 @@
+"""Analysis of measurements, runs and cameras: arrays and messages in, results out."""

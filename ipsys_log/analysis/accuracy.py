@@ -1,0 +1,194 @@
+"""How far a model is off on places that it was not fitted on (eq. 26, 27)."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping, Sequence
+
+import numpy as np
+from numpy.typing import NDArray
+from scipy.stats import chi2
+
+from ipsys_log.analysis.cross_validation import cross_validate, gather_places
+from ipsys_log.analysis.pairs import level_cameras
+from ipsys_log.analysis.statistics import error_statistics
+from ipsys_log.messages import CameraEvaluation, CameraModel, Model, Pair, Residual
+from ipsys_log.models.applied import AppliedModel
+from ipsys_log.models.table import reads_height
+
+__all__ = [
+    "CROSS_VALIDATION",
+    "HELD_OUT",
+    "POOLED",
+    "count_repeats",
+    "errors_cross_validated",
+    "errors_held_out",
+]
+
+Array = NDArray[np.float64]
+
+HELD_OUT = "held_out"
+CROSS_VALIDATION = "cross_validation"
+# The camera of a row that has all of them together.
+POOLED = ""
+# Shares of a region of the covariance that are looked at.
+_REGIONS = (0.68, 0.95)
+
+
+def errors_held_out(
+    model: Model, held_out: Mapping[str, Sequence[Pair]], truth: Mapping[str, Array]
+) -> list[CameraEvaluation]:
+    """Errors of a model on held-out places, against the tape and, where there is one, the truth.
+
+    Parameters
+    ----------
+    model : fitted.
+    held_out : measured places by camera; those that the model was fitted on after all do not count.
+    truth : true world points (3,) in m by id of the measurement; empty outside a simulated lab.
+
+    Returns
+    -------
+    A row for each camera that has held-out places, and one for all of them where there are several.
+    """
+    found = {}
+    for camera in model.cameras:
+        used = {pair.measurement: pair.world_m for pair in camera.pairs}
+        pairs = [
+            pair
+            for pair in held_out.get(camera.camera, ())
+            if not np.array_equal(used.get(pair.measurement, ()), pair.world_m)
+        ]
+        if pairs:
+            applied = AppliedModel(model.name, camera)
+            points_m, world_m = _arrays(pairs)
+            found[camera.camera] = (pairs, applied.predict(points_m, world_m[:, 2])[None])
+    return _rows(model, found, truth, HELD_OUT)
+
+
+def errors_cross_validated(
+    model: Model, pairs: Mapping[str, Sequence[Pair]], truth: Mapping[str, Array], seed: int
+) -> list[CameraEvaluation]:
+    """Errors by repeated cross-validation over all measured places: the honest figure.
+
+    A published split can flatter: which places are held out decides how many of them lie at the edge.
+
+    Parameters
+    ----------
+    model : its name says what is fitted to each fold, its covariances what the errors are compared with.
+    pairs : all measured places by camera.
+    truth : as in :func:`errors_held_out`.
+    seed : of the folds.
+
+    Raises
+    ------
+    FitError
+        Where a fold leaves too few places to fit to.
+    """
+    cameras = gather_places(pairs)
+    predicted = cross_validate(model.name, cameras, seed)
+    found = {camera: (list(pairs[camera]), predicted[camera]) for camera in cameras}
+    return _rows(model, found, truth, CROSS_VALIDATION)
+
+
+def count_repeats(row: CameraEvaluation, rows: Sequence[CameraEvaluation]) -> int | None:
+    """Return the number of errors of each point in a row.
+
+    Parameters
+    ----------
+    row : of an evaluation.
+    rows : all of them; the row over all cameras has no residuals, those of the cameras have.
+
+    Returns
+    -------
+    None if the log does not tell.
+    """
+    if row.scheme != CROSS_VALIDATION:
+        return 1
+    for other in rows:
+        if (other.scheme, other.against) == (row.scheme, row.against) and other.residuals:
+            return len(other.residuals) // other.error_2d.count
+    return None
+
+
+def _arrays(pairs: Sequence[Pair]) -> tuple[Array, Array]:
+    return np.array([pair.camera_m for pair in pairs]), np.array([pair.world_m for pair in pairs])
+
+
+def _rows(
+    model: Model,
+    found: Mapping[str, tuple[list[Pair], Array]],
+    truth: Mapping[str, Array],
+    scheme: str,
+) -> list[CameraEvaluation]:
+    """Rows of errors; ``found`` has the pairs of each camera and what was predicted, (repeats, n, 3)."""
+    fitted = {camera.camera: camera for camera in model.cameras}
+    level = level_cameras(model)
+    rows: list[CameraEvaluation] = []
+    for against in ("tape", "truth"):
+        compared: list[tuple[Array, Array | None]] = []
+        for camera, (pairs, predicted_m) in found.items():
+            known = {p.measurement: p.world_m for p in pairs} if against == "tape" else truth
+            keep = [n for n, pair in enumerate(pairs) if pair.measurement in known]
+            if not keep:
+                continue
+            kept = [pairs[n] for n in keep]
+            targets_m = np.array([known[pair.measurement] for pair in kept])
+            offsets_m = predicted_m[:, keep] - targets_m
+            squares = _squares(model.name, fitted.get(camera), kept, offsets_m, against, camera in level)
+            residuals = tuple(
+                Residual(pair.measurement, target, point)
+                for repeat in predicted_m[:, keep]
+                for pair, target, point in zip(kept, targets_m, repeat, strict=True)
+            )
+            rows.append(_row(camera, against, scheme, offsets_m, squares, residuals, camera in level))
+            compared.append((offsets_m, squares))
+        if len(compared) > 1:
+            offsets_m = np.concatenate([offsets for offsets, _ in compared], axis=1)
+            known_squares = [s for _, s in compared if s is not None]
+            squares = np.concatenate(known_squares, axis=1) if len(known_squares) == len(compared) else None
+            rows.append(_row(POOLED, against, scheme, offsets_m, squares, (), bool(level)))
+    return rows
+
+
+def _row(
+    camera: str,
+    against: str,
+    scheme: str,
+    offsets_m: Array,
+    shares: Array | None,
+    residuals: tuple[Residual, ...],
+    level: bool,
+) -> CameraEvaluation:
+    within = [None, None] if shares is None else [float((shares <= region).mean()) for region in _REGIONS]
+    return CameraEvaluation(
+        camera,
+        against,
+        # Where all places have one height, an error in space would only look like one.
+        None if level else error_statistics(np.linalg.norm(offsets_m, axis=2)),  # eq. (26)
+        error_statistics(np.linalg.norm(offsets_m[:, :, :2], axis=2)),  # eq. (27)
+        residuals,
+        scheme,
+        offsets_m.reshape(-1, 3).mean(axis=0),
+        within[0],
+        within[1],
+    )
+
+
+def _squares(
+    name: str, camera: CameraModel | None, pairs: Sequence[Pair], offsets_m: Array, against: str, level: bool
+) -> Array | None:
+    """The smallest region of the covariance that holds each error, as a share, (repeats, n)."""
+    if camera is None:
+        return None
+    points_m, world_m = _arrays(pairs)
+    covariances = AppliedModel(name, camera).covariances(points_m, world_m[:, 2])
+    if covariances is None:
+        return None
+    if against == "tape":
+        tape = [np.zeros((3, 3)) if p.world_covariance_m2 is None else p.world_covariance_m2 for p in pairs]
+        covariances = covariances + np.array(tape)
+    # A height that was given, or is the only one, has no error.
+    size = 2 if level or reads_height(name) else 3
+    inverse = np.linalg.inv(covariances[:, :size, :size])
+    squares = np.einsum("rni,nij,rnj->rn", offsets_m[:, :, :size], inverse, offsets_m[:, :, :size])
+    shares: Array = chi2.cdf(squares, size)
+    return shares

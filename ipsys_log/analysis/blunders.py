@@ -1,0 +1,171 @@
+"""The slips that are made with tape, ruler and pencil, and what each would have made of a place."""
+
+from __future__ import annotations
+
+from collections.abc import Iterator
+from dataclasses import dataclass, replace
+from itertools import combinations
+
+import numpy as np
+from numpy.typing import NDArray
+
+from ipsys_log.analysis.tape import reference_points
+from ipsys_log.errors import IpsysError
+from ipsys_log.geometry.multilateration import multilaterate, side_of, sides_alike
+from ipsys_log.geometry.trilateration import SIDES
+from ipsys_log.messages import Distance, Measurement, Rig, WorldPoint
+from ipsys_log.units import CM_PER_M
+
+__all__ = ["Slip", "possible_slips"]
+
+Array = NDArray[np.float64]
+
+# A prediction may lie a little below the floor; a marker does not.
+_LOWEST_M = -0.03
+# A correction below this is told to the millimetre.
+_FINE_M = 0.02
+
+
+@dataclass(frozen=True, slots=True)
+class Slip:
+    """What may have gone wrong: ``kind`` as in a Suspect, ``text`` in words, ``corrected`` without it."""
+
+    kind: str
+    text: str
+    corrected: Measurement
+
+
+def possible_slips(measurement: Measurement, rig: Rig, predicted_m: Array) -> list[list[Slip]]:
+    """What may have gone wrong with a measurement, the simplest first.
+
+    Parameters
+    ----------
+    measurement : whose world point is in doubt. Where it has no tape distances, they are those from
+        its world point to the first two reference points.
+    rig : in force when it was measured.
+    predicted_m : (3,), where it is by all the others.
+
+    Returns
+    -------
+    Groups of slips, those of a group equally simple: a wrong side or two exchanged distances; both; one
+    distance or the height, each such that it fits the prediction best.
+
+    Examples
+    --------
+    >>> from ipsys_log.messages import ReferencePoint
+    >>> points = (ReferencePoint("A", 0.0, 0.0), ReferencePoint("B", 2.0, 0.0))
+    >>> rig = Rig("lab", "DICT_4X4_100", 0.2, reference_points=points)
+    >>> tape = (Distance("A", 1.600), Distance("B", 1.414))
+    >>> read = Measurement(0, "a", distances=tape, side="left", height_m=0.0)
+    >>> slips = possible_slips(read, rig, np.array([1.0, 1.0, 0.0]))
+    >>> [[slip.kind for slip in group] for group in slips]
+    [['side', 'swapped'], ['swapped'], ['distance', 'distance', 'height']]
+    >>> slips[2][0].text
+    'the distance to A reads 1.600 m; 1.41 m, 19 cm less, would fit'
+    """
+    taped = _as_taped(measurement, rig)
+    if taped is None:
+        return [_height_slips(measurement, predicted_m)]
+    references_m = reference_points(taped, rig)
+    sides = list(_side_slips(taped, references_m))
+    swaps = list(_swaps(taped))
+    both = [
+        replace(side, kind=swap.kind, text=f"{swap.text}, and {side.text}")
+        for swap in swaps
+        for side in _side_slips(swap.corrected, references_m)
+    ]
+    # A distance that nobody read comes from the world point.
+    says = "reads" if measurement.distances else "comes to"
+    distances = list(_distance_slips(taped, references_m, predicted_m, says))
+    return [sides + swaps, both, distances + _height_slips(taped, predicted_m)]
+
+
+def _as_taped(measurement: Measurement, rig: Rig) -> Measurement | None:
+    """The measurement by its distances alone; None where there are none and nowhere to measure from."""
+    known = {point.name for point in rig.reference_points}
+    point = measurement.point
+    if point is None:
+        return measurement
+    height_m = point.z_m if measurement.height_m is None else measurement.height_m
+    world_m = np.array([point.x_m, point.y_m])
+    taped = measurement
+    named = {distance.reference for distance in measurement.distances}
+    if len(named) < 2 or not named <= known:
+        if len(rig.reference_points) < 2:
+            return None
+        tapes = tuple(
+            Distance(p.name, float(np.hypot(*(world_m - [p.x_m, p.y_m])))) for p in rig.reference_points[:2]
+        )
+        taped = replace(measurement, distances=tapes, side=None)
+    side = taped.side or side_of(world_m, reference_points(taped, rig))
+    return replace(taped, point=None, side=side, height_m=height_m)
+
+
+def _side_slips(taped: Measurement, references_m: Array) -> Iterator[Slip]:
+    if taped.side in SIDES and sides_alike(references_m):
+        other = "right" if taped.side == "left" else "left"
+        first = taped.distances[0].reference
+        second = next(tape.reference for tape in taped.distances if tape.reference != first)
+        text = f"it lies {other} of the line from {first} to {second}, not {taped.side}"
+        yield Slip("side", text, replace(taped, side=other))
+
+
+def _swaps(taped: Measurement) -> Iterator[Slip]:
+    tapes = taped.distances
+    for i, j in combinations(range(len(tapes)), 2):
+        one = replace(tapes[i], distance_m=tapes[j].distance_m)
+        other = replace(tapes[j], distance_m=tapes[i].distance_m)
+        swapped = [*tapes]
+        swapped[i], swapped[j] = one, other
+        text = (
+            f"the distances to {one.reference} and {other.reference} look exchanged: "
+            f"{one.distance_m:.3f} m to {one.reference} and {other.distance_m:.3f} m to {other.reference} fit"
+        )
+        yield Slip("swapped", text, replace(taped, distances=tuple(swapped)))
+
+
+def _distance_slips(taped: Measurement, references_m: Array, predicted_m: Array, says: str) -> Iterator[Slip]:
+    for wrong, tape in enumerate(taped.distances):
+        rest = [n for n in range(len(references_m)) if n != wrong]
+        rest_m = np.array([taped.distances[n].distance_m for n in rest])
+        try:
+            point_m = _nearest(references_m[rest], rest_m, predicted_m[:2])
+        except IpsysError:
+            continue
+        right_m = float(np.hypot(*(point_m - references_m[wrong])))
+        text = f"the distance to {tape.reference} {says} {_correction(tape.distance_m, right_m)}"
+        tapes = [*taped.distances]
+        tapes[wrong] = replace(tape, distance_m=right_m)
+        yield Slip("distance", text, replace(taped, distances=tuple(tapes)))
+
+
+def _nearest(references_m: Array, distances_m: Array, predicted_m: Array) -> Array:
+    """Of the points at the given distances from the reference points, the one nearest to a prediction."""
+    if len(references_m) == 1:
+        towards_m = predicted_m - references_m[0]
+        point_m: Array = references_m[0] + towards_m * (distances_m[0] / max(np.hypot(*towards_m), 1e-9))
+        return point_m
+    sides = SIDES if sides_alike(references_m) else (None,)
+    found = [multilaterate(references_m, distances_m, None, side).point_m for side in sides]
+    return min(found, key=lambda point_m: float(np.hypot(*(point_m - predicted_m))))
+
+
+def _height_slips(measurement: Measurement, predicted_m: Array) -> list[Slip]:
+    height_m, right_m = measurement.height_m, float(predicted_m[2])
+    point = measurement.point
+    if point is None:
+        corrected = replace(measurement, height_m=right_m)
+    else:
+        height_m = point.z_m
+        corrected = replace(measurement, point=WorldPoint(point.x_m, point.y_m, right_m))
+    if height_m is None or right_m < _LOWEST_M:
+        return []
+    return [Slip("height", f"the height reads {_correction(height_m, right_m)}", corrected)]
+
+
+def _correction(read_m: float, right_m: float) -> str:
+    """In words; to the centimetre, as cameras know it, but for where the tapes make much of less."""
+    off_m = right_m - read_m
+    digits = 0 if abs(off_m) >= _FINE_M else 1
+    change = f"{abs(off_m) * CM_PER_M:.{digits}f} cm {'more' if off_m > 0 else 'less'}"
+    return f"{read_m:.3f} m; {right_m:.{digits + 2}f} m, {change}, would fit"

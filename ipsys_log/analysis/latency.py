@@ -1,0 +1,113 @@
+"""The latency ledger: when each step of a position was done, by the wall clock."""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
+from dataclasses import dataclass
+from pathlib import Path
+
+import numpy as np
+from numpy.typing import NDArray
+
+from ipsys_log.errors import IpsysError
+from ipsys_log.log.dataset import Session
+from ipsys_log.messages import LATENCY_TOPIC, Latency, Message, Tracks
+from ipsys_log.units import NS_PER_S
+
+__all__ = ["STEPS", "Ledger", "Percentiles", "latency_percentiles", "recorded_latencies", "step_times_s"]
+
+STEPS = ("captured", "received", "detected", "located", "fused", "published")
+_REMEMBERED = 20_000
+
+
+class Ledger:
+    """Notes the times of frames on their way. Telemetry: no stage sees it.
+
+    Parameters
+    ----------
+    now_ns : the wall clock.
+    received_ns : when frames came, by log time.
+    """
+
+    def __init__(self, now_ns: Callable[[], int], received_ns: Mapping[int, int]) -> None:
+        self._now_ns, self._received_ns = now_ns, received_ns
+        self._times_ns: dict[int, dict[str, int]] = {}
+
+    def note(self, step: str, payload: type, messages: Iterable[Message]) -> Iterator[Message]:
+        """The messages, unchanged; one with such a payload is a step done for the frame of its log time."""
+        for message in messages:
+            if isinstance(message.payload, payload):
+                self._times_ns.setdefault(message.log_time_ns, {})[step] = self._now_ns()
+                if len(self._times_ns) > _REMEMBERED:
+                    del self._times_ns[next(iter(self._times_ns))]
+            yield message
+
+    def entry(self, message: Message) -> Message | None:
+        """The times of a position that has just been published; None for any other message."""
+        times_ns = self._times_ns.get(message.log_time_ns, {})
+        received_ns = self._received_ns.get(message.log_time_ns)
+        if not isinstance(message.payload, Tracks) or received_ns is None:
+            return None
+        latency = Latency(
+            message.publish_time_ns,
+            str(message.camera),
+            received_ns,
+            times_ns["detected"],
+            times_ns["located"],
+            times_ns["fused"],
+            self._now_ns(),
+        )
+        return Message(LATENCY_TOPIC, message.log_time_ns, message.publish_time_ns, latency, message.camera)
+
+
+def recorded_latencies(paths: Sequence[Path]) -> list[Latency]:
+    """The ledger in a log.
+
+    Raises
+    ------
+    IpsysError
+        Where there is none.
+    """
+    with Session(paths) as session:
+        found: list[Latency] = session.payloads(session.topics(Latency))
+        if not found:
+            raise IpsysError(f"{session}: holds no latencies; only 'ipsys live' writes them")
+    return found
+
+
+def step_times_s(entries: Iterable[Latency]) -> dict[str, NDArray[np.float64]]:
+    """How long each step took, and ``total`` from receiving a frame to publishing, in s.
+
+    ``received`` is from the exposure to the arrival of a frame, what camera and cable take; cameras that give
+    no capture stamps say nothing of it.
+    """
+    times_ns = np.array([[getattr(one, _field(step)) for step in STEPS] for one in entries], dtype=np.int64)
+    times_ns = times_ns.reshape(-1, len(STEPS))
+    took_s = np.diff(times_ns, axis=1) / NS_PER_S
+    found = {step: took_s[:, n] for n, step in enumerate(STEPS[1:])}
+    found["received"] = found["received"][found["received"] > 0]
+    return {**found, "total": (times_ns[:, -1] - times_ns[:, 1]) / NS_PER_S}
+
+
+def _field(step: str) -> str:
+    return "timestamp" if step == "captured" else step
+
+
+@dataclass(frozen=True, slots=True)
+class Percentiles:
+    """Of one step, in s."""
+
+    median_s: float
+    p90_s: float
+    p99_s: float
+    max_s: float
+
+
+def latency_percentiles(times_s: Mapping[str, NDArray[np.float64]]) -> dict[str, Percentiles]:
+    """Median, 90th and 99th percentile and maximum of each step."""
+    found = {}
+    for step, values in times_s.items():
+        if len(values):
+            median_s, p90_s, p99_s, max_s = np.percentile(values, [50, 90, 99, 100]).tolist()
+            found[step] = Percentiles(median_s, p90_s, p99_s, max_s)
+    return found

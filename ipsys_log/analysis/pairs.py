@@ -1,0 +1,261 @@
+"""Measured places: which measurements count, where they are, and what the cameras saw there."""
+
+from __future__ import annotations
+
+from collections.abc import Iterable, Mapping
+from dataclasses import dataclass
+
+import numpy as np
+from numpy.typing import NDArray
+
+from ipsys_log.analysis.tape import Measured, world_point
+from ipsys_log.errors import IpsysError
+from ipsys_log.messages import CameraPoints, Measurement, Message, Model, Pair, Rig
+from ipsys_log.units import NS_PER_S
+
+__all__ = [
+    "Measured",
+    "Sightings",
+    "active_measurements",
+    "build_pairs",
+    "gather_sightings",
+    "level_cameras",
+    "measured_in_order",
+    "split",
+    "still_interval",
+]
+
+# A marker lies still while it stays within these of where it was when it was measured: above the
+# noise of plain sub-pixel corners (about 1 mm across and 5 mm along the view at 2 m).
+_STILL_ACROSS_M = 0.01
+_STILL_ALONG_M = 0.04
+_GAP_NS = 2 * NS_PER_S
+_FARTHEST_M = 10_000.0
+# Heights that differ by less are one: what a ruler and uneven boards give.
+_ONE_HEIGHT_M = 0.005
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class Sightings:
+    """What one camera saw of one marker: ``times_ns`` (n,) ascending, ``points_m`` (n, 3)."""
+
+    times_ns: NDArray[np.int64]
+    points_m: NDArray[np.float64]
+
+
+def gather_sightings(messages: Iterable[Message]) -> dict[tuple[str, int], Sightings]:
+    """Return camera points by camera and marker, ordered by the time of exposure of the marker.
+
+    Raises
+    ------
+    IpsysError
+        A point is not a number, or is farther away than any lab is wide.
+    """
+    rows: dict[tuple[str, int], list[tuple[int, float, float, float]]] = {}
+    for message in messages:
+        if isinstance(message.payload, CameraPoints):
+            for p in message.payload.points:
+                key = (str(message.camera), p.id)
+                time_ns = message.publish_time_ns + (p.time_offset_ns or 0)
+                rows.setdefault(key, []).append((time_ns, p.x_m, p.y_m, p.z_m))
+    sightings = {}
+    for key, values in rows.items():
+        values.sort()
+        times_ns = np.array([row[0] for row in values], dtype=np.int64)
+        points_m = np.array([row[1:] for row in values], dtype=np.float64)
+        if not (np.abs(points_m) <= _FARTHEST_M).all():
+            raise IpsysError(
+                f"camera {key[0]}: a camera point of marker {key[1]} is not a possible point; run "
+                "camera-frame again, with --run and another name"
+            )
+        sightings[key] = Sightings(times_ns, points_m)
+    return sightings
+
+
+def measured_in_order(messages: Iterable[Message], override: Rig | None) -> list[Measured]:
+    """The measurements that have not been withdrawn, each with its rig.
+
+    Parameters
+    ----------
+    messages : rigs and measurements, in log order; the first rig holds for what was measured before it.
+    override : a rig that holds for all of them instead.
+
+    Raises
+    ------
+    IpsysError
+        Where two measurements have one id, one lacks its marker, or there is no rig.
+    """
+    rigs: list[Rig] = [override] if override is not None else []
+    found: list[tuple[Measurement, int]] = []
+    for message in messages:
+        if isinstance(message.payload, Rig) and override is None:
+            rigs.append(message.payload)
+        elif isinstance(message.payload, Measurement):
+            found.append((message.payload, max(len(rigs) - 1, 0)))
+    active = {measurement.id for measurement in active_measurements(m for m, _ in found)}
+    if found and not rigs:
+        raise IpsysError("the log has no rig (reference points, markers): give one with --rig lab.toml")
+    # Of an id that was withdrawn and measured again, the last one counts.
+    last = {m.id: Measured(m, rigs[number]) for m, number in found if m.withdraws is None}
+    return [place for name, place in last.items() if name in active]
+
+
+def active_measurements(measurements: Iterable[Measurement]) -> list[Measurement]:
+    """The measurements that have not been withdrawn, in the order they were made.
+
+    Raises
+    ------
+    IpsysError
+        Where two measurements have one id, or one lacks its marker.
+    """
+    active: dict[str, Measurement] = {}
+    for measurement in measurements:
+        if measurement.withdraws is not None:
+            active.pop(measurement.withdraws, None)
+            continue
+        if measurement.id in active:
+            raise IpsysError(f"two measurements have the id {measurement.id!r}; withdraw one of them")
+        if measurement.marker_id is None:
+            raise IpsysError(f"measurement {measurement.id} names no marker; withdraw it and measure again")
+        active[measurement.id] = measurement
+    return list(active.values())
+
+
+def still_interval(sightings: Sightings, time_ns: int) -> tuple[int, int] | None:
+    """The stretch around a time in which a marker does not move.
+
+    Parameters
+    ----------
+    sightings : of one marker by one camera.
+    time_ns : when it was measured.
+
+    Returns
+    -------
+    First and last time in ns, both included; None where the camera did not see the marker within
+    two seconds of ``time_ns``.
+    """
+    if len(sightings.times_ns) == 0:
+        return None
+    anchor = int(np.abs(sightings.times_ns - time_ns).argmin())
+    if abs(int(sightings.times_ns[anchor]) - time_ns) > _GAP_NS:
+        return None
+    moved = np.abs(sightings.points_m - sightings.points_m[anchor])
+    still = (np.hypot(moved[:, 0], moved[:, 1]) <= _STILL_ACROSS_M) & (moved[:, 2] <= _STILL_ALONG_M)
+    joined = np.diff(sightings.times_ns) <= _GAP_NS
+    first = last = anchor
+    while first > 0 and still[first - 1] and joined[first - 1]:
+        first -= 1
+    while last + 1 < len(still) and still[last + 1] and joined[last]:
+        last += 1
+    return int(sightings.times_ns[first]), int(sightings.times_ns[last])
+
+
+def build_pairs(
+    sightings: Mapping[tuple[str, int], Sightings], places: Iterable[Measured]
+) -> dict[str, list[Pair]]:
+    """For each camera, the measured places that it saw.
+
+    Parameters
+    ----------
+    sightings : by camera and marker, from :func:`gather_sightings`.
+    places : those that count, from :func:`measured_in_order`.
+
+    Returns
+    -------
+    dict from camera to pairs: the mean camera point over the still interval, and the world point with
+    its covariance where that is known.
+
+    Raises
+    ------
+    IpsysError
+        For a marker that is not in the rig or never seen, a measurement that gives no point, or a pair that
+        was entered twice.
+    """
+    cameras = sorted({camera for camera, _ in sightings})
+    seen_ids = sorted({marker_id for _, marker_id in sightings})
+    pairs: dict[str, list[Pair]] = {camera: [] for camera in cameras}
+    for place in places:
+        measurement, rig = place.measurement, place.rig
+        marker_id = measurement.marker_id
+        assert marker_id is not None  # active_measurements has seen to it
+        if not rig.knows(marker_id) or marker_id not in seen_ids:
+            raise IpsysError(
+                f"measurement {measurement.id} names marker {marker_id}, which "
+                f"{'no camera saw' if rig.knows(marker_id) else 'is not in the rig'} "
+                f"(seen: {', '.join(map(str, seen_ids)) or 'none'}); correct the id or the rig"
+            )
+        fixed = world_point(measurement, rig)
+        for camera in cameras:
+            found = _mean_point(sightings.get((camera, marker_id)), measurement)
+            if found is not None:
+                mean_m, frames = found
+                row = (measurement.id, marker_id, mean_m, fixed.world_m, frames, fixed.covariance_m2)
+                pairs[camera].append(Pair(*row))
+    for camera, entered in pairs.items():
+        _check_twins(camera, entered)
+    return pairs
+
+
+def _check_twins(camera: str, pairs: Iterable[Pair]) -> None:
+    """One pair entered twice counts double, and is known where it is held out."""
+    seen: dict[bytes, str] = {}
+    for pair in pairs:
+        twin = seen.setdefault(pair.camera_m.tobytes() + pair.world_m.tobytes(), pair.measurement)
+        if twin != pair.measurement:
+            raise IpsysError(
+                f"camera {camera}: measurements {twin} and {pair.measurement} are one and the same pair, to "
+                "the last digit; withdraw one of them"
+            )
+
+
+def _mean_point(
+    sightings: Sightings | None, measurement: Measurement
+) -> tuple[NDArray[np.float64], int] | None:
+    if sightings is None:
+        return None
+    if measurement.still is not None:
+        interval: tuple[int, int] | None = (measurement.still.start, measurement.still.end)
+    else:
+        interval = still_interval(sightings, measurement.timestamp)
+    if interval is None:
+        return None
+    within = (sightings.times_ns >= interval[0]) & (sightings.times_ns <= interval[1])
+    if not within.any():
+        return None
+    return sightings.points_m[within].mean(axis=0), int(within.sum())
+
+
+def split(measurements: Iterable[Measurement], train: str, seed: int) -> tuple[set[str], set[str]]:
+    """Ids of the measurements to fit on, and of those held out.
+
+    Parameters
+    ----------
+    measurements : those that count.
+    train : the label of the subset to fit on; ``test`` is the label of those held out.
+    seed : where no measurement has a label, a fifth of them is held out at random.
+
+    Raises
+    ------
+    IpsysError
+        Where measurements are labelled, but none with ``train``.
+    """
+    measurements = list(measurements)
+    labels = sorted({label for m in measurements for label in m.splits} - {"test"})
+    if train == "test":
+        raise IpsysError("--train test: these places are held out to evaluate on; fit on other ones")
+    if not any(m.splits for m in measurements):
+        ids = np.array(sorted(m.id for m in measurements))
+        shuffled = np.random.default_rng(seed).permutation(ids).tolist()
+        held_out = len(shuffled) // 5
+        return set(shuffled[held_out:]), set(shuffled[:held_out])
+    if train not in labels:
+        known = f"use --train with one of {', '.join(labels)}" if labels else "label some to fit on"
+        raise IpsysError(f"no measurement is labelled {train!r}; {known}")
+    fitted = {m.id for m in measurements if train in m.splits}
+    return fitted, {m.id for m in measurements if "test" in m.splits} - fitted
+
+
+def level_cameras(model: Model) -> dict[str, float]:
+    """The cameras whose places all have one height, with that height in m: it cannot be learned there."""
+    heights = {c.camera: np.array([pair.world_m[2] for pair in c.pairs]) for c in model.cameras}
+    return {name: float(h.mean()) for name, h in heights.items() if np.ptp(h) < _ONE_HEIGHT_M}

@@ -1,0 +1,224 @@
+"""The next places to measure: those that bring the predicted error over the floor down most.
+
+A model's predicted error falls with the leverage of a position among the fitted places, and a new place
+lowers it all over the view of each camera that sees it, the more the better the tape knows the place.
+Greedy I-optimal design picks, one after the other, the place after which the mean error is least.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Sequence
+from dataclasses import dataclass, replace
+
+import numpy as np
+from numpy.typing import NDArray
+from scipy.spatial import cKDTree
+
+from ipsys_log.analysis.views import View
+from ipsys_log.errors import IpsysError
+from ipsys_log.models.uncertainty import leverage_terms
+
+__all__ = ["Plan", "PlannedPlace", "mean_length", "plan_places"]
+
+Array = NDArray[np.float64]
+Mask = NDArray[np.bool_]
+# The variance of x plus that of y, (n,), of places (n, 3) that are measured.
+Tape = Callable[[Array], Array]
+
+# So near to a known place another one may err alike; another that does this share as much is better.
+_BESIDE_M = 0.2
+_ALMOST = 0.9
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class PlannedPlace:
+    """A place to measure: ``point_m`` (3,), the ``cameras`` that see it, and the predicted error, its mean
+    over the floor, before and after it is measured: those before it are by then."""
+
+    point_m: Array
+    cameras: tuple[str, ...]
+    mean_before_m: float
+    mean_after_m: float
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class Plan:
+    """Places to measure, in order, and what they do.
+
+    Attributes
+    ----------
+    places : the first one does most.
+    before_m, after_m : (n,), predicted error at each point of the floor: the smallest of the cameras that
+        see it; NaN where none does.
+    seen : (n,) by camera.
+    """
+
+    places: tuple[PlannedPlace, ...]
+    before_m: Array
+    after_m: Array
+    seen: dict[str, Mask]
+
+
+def plan_places(
+    views: Sequence[View], floor_m: Array, candidates_m: Array, tape_m2: Tape, radius_m: float, count: int
+) -> Plan:
+    """Choose the places to measure next.
+
+    The heights of the candidates take turns, so that none is measured much less than the others.
+
+    Parameters
+    ----------
+    views : the fitted cameras.
+    floor_m : (n, 3), points that the error is averaged over, as far as a camera sees them.
+    candidates_m : (c, 3), where a marker could be laid.
+    tape_m2 : how well the tape knows a place.
+    radius_m : of the disc about a marker that a camera must see.
+    count : how many places.
+
+    Raises
+    ------
+    IpsysError
+        Where there are no candidates, or no camera sees a marker at their height or on the floor.
+
+    References
+    ----------
+    V-optimality, also called I-: Atkinson, Donev and Tobias, Optimum Experimental Designs, 2007, ch. 10.
+
+    Examples
+    --------
+    >>> from ipsys_log.geometry.poses import invert_pose, look_down, transform
+    >>> from ipsys_log.models.uncertainty import Uncertainty
+    >>> pose = look_down(np.array([0.0, 0.0, 2.0]))
+    >>> floor_m = np.array([[x, y, 0.0] for x in (-1.0, 0.0, 1.0) for y in (-0.5, 0.0, 0.5)])
+    >>> fitted_m = np.delete(floor_m, 7, axis=0)
+    >>> unsure = Uncertainty(3e-4, 1e-4, 1.0, 1e-5 * np.eye(3), transform(pose, fitted_m))
+    >>> def predict(points_m, heights_m):
+    ...     return transform(invert_pose(pose), points_m)
+    >>> view = View("over", pose, np.zeros(3), None, predict, unsure, fitted_m)
+    >>> plan = plan_places([view], floor_m, floor_m, lambda at_m: np.full(len(at_m), 1e-5), 0.1, 1)
+    >>> plan.places[0].point_m.tolist()
+    [1.0, 0.0, 0.0]
+    """
+    if not len(candidates_m):
+        raise IpsysError("the floor has no room to lay a marker on; correct width_m and depth_m in lab.toml")
+    shares = [_Share(view, floor_m, candidates_m, tape_m2, radius_m) for view in views]
+    on_floor, near = (np.any([getattr(s, what) for s in shares], axis=0) for what in ("on_floor", "near"))
+    seen_m = np.concatenate([floor_m[on_floor, 2], candidates_m[near, 2]])
+    for height_m in np.setdiff1d(np.concatenate([floor_m[:, 2], candidates_m[:, 2]]), seen_m):
+        raise IpsysError(f"no camera sees a whole marker {height_m:g} m above the floor; give another height")
+    fitted_m = np.unique(np.vstack([view.fitted_m for view in views]), axis=0)
+    apart_m: Array = np.asarray(cKDTree(fitted_m[:, :2]).query(candidates_m[:, :2])[0])
+    levels, level = np.unique(candidates_m[:, 2], return_inverse=True)
+    used = np.bincount(np.abs(fitted_m[:, 2:] - levels).argmin(axis=1), minlength=len(levels))
+    before_m = after_m = _least(shares, len(floor_m))
+    places = []
+    for _ in range(count):
+        allowed, mean_m = near & (used[level] == used.min()), float(np.nanmean(after_m))
+        best = _choose(_means_with_each(shares, after_m, allowed), mean_m, apart_m)
+        used[level[best]] += 1
+        apart_m = np.minimum(apart_m, np.linalg.norm(candidates_m[:, :2] - candidates_m[best, :2], axis=1))
+        for share in shares:
+            share.add(best)
+        after_m = _least(shares, len(floor_m))
+        cameras = tuple(view.camera for view, share in zip(views, shares, strict=True) if share.near[best])
+        places.append(PlannedPlace(candidates_m[best], cameras, mean_m, float(np.nanmean(after_m))))
+    seen = {view.camera: share.on_floor for view, share in zip(views, shares, strict=True)}
+    return Plan(tuple(places), before_m, after_m, seen)
+
+
+class _Share:
+    """What one camera sees of floor and candidates, and its leverage there, kept up as places are added."""
+
+    def __init__(self, view: View, floor_m: Array, candidates_m: Array, tape_m2: Tape, radius_m: float):
+        self.on_floor, self.near = view.sees(floor_m, radius_m), view.sees(candidates_m, radius_m)
+        fitted = leverage_terms(view.uncertainty.points_m)
+        self._inverse = np.asarray(np.linalg.inv(fitted.T @ fitted + 1e-9 * np.eye(6)), dtype=np.float64)
+        self._noise_m2, fit_m2, self._floor_terms = _parts(view, floor_m[self.on_floor])
+        self._fit_m2 = fit_m2 / _leverage(self._floor_terms, self._inverse)
+        noise_m2, _, self._terms = _parts(view, candidates_m[self.near])
+        usual_m2 = np.median(tape_m2(view.fitted_m) + _parts(view, view.fitted_m)[0][:2].sum(axis=0))
+        # A fit takes all places for alike: one that is known better than usual counts as one, not more.
+        known_m2 = tape_m2(candidates_m[self.near]) + noise_m2[:2].sum(axis=0)
+        self._weights = usual_m2 / np.maximum(known_m2, usual_m2)
+
+    def errors(self) -> Array:
+        """Predicted error (r,) at the points of the floor that it sees."""
+        return mean_length(self._noise_m2 + self._fit_m2 * _leverage(self._floor_terms, self._inverse))
+
+    def errors_with_each(self, allowed: Mask) -> Array:
+        """The same, (r, c), were each of the candidates that it sees and that are ``allowed`` measured."""
+        terms, weights = self._terms[allowed[self.near]], self._weights[allowed[self.near]]
+        gain = weights / (1 + weights * _leverage(terms, self._inverse))
+        lower = (self._floor_terms @ self._inverse @ terms.T) ** 2 * gain
+        leverage = (_leverage(self._floor_terms, self._inverse)[:, None] - lower).astype(np.float32)
+        noise_m2, fit_m2 = (part[..., None].astype(np.float32) for part in (self._noise_m2, self._fit_m2))
+        return mean_length(noise_m2 + fit_m2 * leverage)
+
+    def add(self, candidate: int) -> None:
+        """Count a candidate as measured (Sherman and Morrison's formula)."""
+        if self.near[candidate]:
+            row = int(self.near[:candidate].sum())
+            terms, weight = self._terms[row], self._weights[row]
+            step = self._inverse @ terms
+            self._inverse -= np.outer(step, step) * (weight / (1 + weight * (terms @ step)))
+
+
+def _parts(view: View, world_m: Array) -> tuple[Array, Array, Array]:
+    """Variances of x and y and their covariance, (3, n), that no place can lower, and those that rest on the
+    fit; and the terms (n, 6) of the leverage."""
+    if not len(world_m):
+        return np.zeros((3, 0)), np.zeros((3, 0)), np.zeros((0, 6))
+    points_m, certain = view.points(world_m), replace(view.uncertainty, fit=np.zeros((3, 3)))
+    whole_m2, noise_m2 = (
+        one.covariances(view.predict, points_m, world_m[:, 2])[:, [0, 1, 0], [0, 1, 1]].T
+        for one in (view.uncertainty, certain)
+    )
+    return noise_m2, whole_m2 - noise_m2, leverage_terms(points_m)
+
+
+def _leverage(terms: Array, inverse: Array) -> Array:
+    return np.asarray(np.einsum("ni,ij,nj->n", terms, inverse, terms))
+
+
+def mean_length(covariance: Array) -> Array:
+    """Mean length of an error in the plane, from (3, ...): the variances of x and y, and their covariance.
+
+    It is sqrt(2 / pi) times a quarter of the perimeter of the ellipse of standard deviations; that by
+    Ramanujan's first formula, 0.5 % short for a needle.
+
+    Examples
+    --------
+    >>> float(mean_length(np.array([1.0, 1.0, 0.0])).round(4))  # sqrt(pi / 2)
+    1.2533
+    """
+    both = covariance[0] + covariance[1]
+    root = np.sqrt(np.maximum(covariance[0] * covariance[1] - covariance[2] ** 2, 0))
+    perimeter = 3 * np.sqrt(both + 2 * root) - np.sqrt(3 * both + 10 * root)
+    return np.asarray(float(np.sqrt(np.pi / 8)) * perimeter)
+
+
+def _least(shares: Sequence[_Share], count: int) -> Array:
+    """The smallest error of the cameras at each point of the floor, (n,); NaN where none sees it."""
+    least_m = np.full(count, np.nan)
+    for share in shares:
+        least_m[share.on_floor] = np.fmin(least_m[share.on_floor], share.errors())
+    return least_m
+
+
+def _means_with_each(shares: Sequence[_Share], now_m: Array, allowed: Mask) -> Array:
+    """The mean error over the floor were each candidate measured, (c,); infinite for those not allowed."""
+    least_m = np.repeat(now_m[:, None].astype(np.float32), allowed.sum(), axis=1)
+    column = np.cumsum(allowed) - 1
+    for share in shares:
+        where = np.ix_(share.on_floor.nonzero()[0], column[share.near & allowed])
+        least_m[where] = np.fmin(least_m[where], share.errors_with_each(allowed))
+    means_m = np.full(len(allowed), np.inf)
+    means_m[allowed] = np.nanmean(least_m, axis=0, dtype=np.float64)
+    return means_m
+
+
+def _choose(means_m: Array, now_m: float, apart_m: Array) -> int:
+    """The best candidate; one beside a known place only where it does clearly more than those elsewhere."""
+    elsewhere = np.where(apart_m >= _BESIDE_M, means_m, np.inf)
+    best, other = int(means_m.argmin()), int(elsewhere.argmin())
+    return other if now_m - elsewhere[other] >= _ALMOST * (now_m - means_m[best]) else best

@@ -1,0 +1,173 @@
+"""The board in a picture: its corners, and how sharp it is."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from functools import lru_cache
+from typing import NamedTuple
+
+import cv2
+import numpy as np
+from numpy.typing import NDArray
+
+from ipsys_log.calibration.board import Board
+from ipsys_log.calibration.chessboard import find_chessboard
+from ipsys_log.calibration.refine import refine_corners
+
+__all__ = ["LEAST_CORNERS", "Grey", "Sighting", "View", "find_board", "view_board"]
+
+Array = NDArray[np.float64]
+Grey = NDArray[np.uint8]
+
+# What a pose can be told from, with something left to check it.
+LEAST_CORNERS = 6
+# One or two corners are as often something else in the room.
+_SEEN = 4
+# Where along an edge between two corners its sharpness is read, and how far beside it, in squares: within the
+# white around a marker.
+_ALONG = (0.3, 0.4, 0.5, 0.6, 0.7)
+_BESIDE, _BESIDE_MARKERS = 0.3, 0.12
+_STEP_PX, _PIXEL = 0.5, 2
+# How far beside an edge nothing else is seen, in squares; of the white between it and a marker, a part.
+_CLEAR, _CLEAR_MARKERS = 0.3, 0.32
+_LEAST_SLOPE = 0.1
+# No corner of the board is farther from those seen than so many times what they span.
+_FARTHEST = 3.0
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class Sighting:
+    """The board in a picture called ``name``: ids (n,) and pixels (n, 2) of its corners, width of its edges
+    in px (a standard deviation), and its outline (4, 2) in px, seen or not."""
+
+    name: str
+    ids: NDArray[np.intp]
+    pixels: Array
+    blur_px: float
+    outline: Array
+
+
+class View(NamedTuple):
+    """A sighting, or None; for a chessboard also columns and rows of the largest grid of inner corners."""
+
+    sighting: Sighting | None
+    grid: tuple[int, int] | None = None
+
+
+def find_board(name: str, grey: Grey, board: Board, thorough: bool) -> Sighting | None:
+    """Detect the board in a picture; see `view_board`."""
+    return view_board(name, grey, board, thorough).sighting
+
+
+def view_board(name: str, grey: Grey, board: Board, thorough: bool) -> View:
+    """Detect the board in a picture, and the largest grid of a chessboard.
+
+    Parameters
+    ----------
+    name : of the picture.
+    grey : (height, width).
+    board : to search for.
+    thorough : search a second time, longer, if a chessboard is not found at once.
+
+    Returns
+    -------
+    The view, without a sighting if the board is not found. A ChArUco board may be partly visible, a
+    chessboard must be completely visible.
+    """
+    if board.inverted:
+        grey = np.asarray(255 - grey, dtype=np.uint8)
+    if board.marker_scale is not None:
+        corners = _charuco(grey, board)
+        return View(None if corners is None else _sighting(name, grey, board, *corners))
+    view = find_chessboard(grey, board.grid, thorough)
+    if view.corners is None:
+        return View(None, view.size)
+    ids = np.arange(board.columns * board.rows)
+    return View(_sighting(name, grey, board, ids, view.corners.reshape(-1, 2)), view.size)
+
+
+def _sighting(name: str, grey: Grey, board: Board, ids: NDArray[np.intp], pixels: Array) -> Sighting:
+    places = board.places(ids)
+    if len(ids) < LEAST_CORNERS or min(len(set(column)) for column in places.T.tolist()) < 2:
+        return Sighting(name, ids, pixels, 0.0, np.tile(pixels.mean(axis=0), (4, 1)))
+    blur_px = _edge_width_px(grey, board, ids, pixels)
+    clear = _CLEAR if board.marker_scale is None else _CLEAR_MARKERS * (1 - board.marker_scale)
+    pixels = refine_corners(grey, board.grid[0], ids, pixels, blur_px, clear)
+    return Sighting(name, ids, pixels, blur_px, _outline(board, ids, pixels))
+
+
+def _charuco(grey: Grey, board: Board) -> tuple[NDArray[np.intp], Array] | None:
+    # OpenCV before 4.6 printed boards of an even number of rows with a white square first.
+    for legacy in (False, True) if board.rows % 2 == 0 else (False,):
+        corners, ids, _, _ = _charuco_detector(board, legacy).detectBoard(grey)
+        if ids is not None and len(ids) >= _SEEN:
+            return np.asarray(ids, dtype=np.intp).ravel(), np.asarray(corners, dtype=np.float64).reshape(
+                -1, 2
+            )
+    return None
+
+
+@lru_cache(maxsize=32)
+def _charuco_detector(board: Board, legacy: bool) -> cv2.aruco.CharucoDetector:
+    dictionary = cv2.aruco.getPredefinedDictionary(getattr(cv2.aruco, board.dictionary))
+    side_m = board.square_m * (board.marker_scale or 0.0)
+    printed = cv2.aruco.CharucoBoard((board.columns, board.rows), board.square_m, side_m, dictionary)
+    printed.setLegacyPattern(legacy)
+    return cv2.aruco.CharucoDetector(printed)
+
+
+def _outline(board: Board, ids: NDArray[np.intp], pixels: Array) -> Array:
+    """The four outer corners, (4, 2); those not seen about where they would be without distortion."""
+    columns, rows = board.grid
+    ends = np.array([0, columns - 1, columns * rows - 1, columns * (rows - 1)])
+    at = dict(zip(ids.tolist(), pixels, strict=True))
+    if all(end in at for end in ends.tolist()):
+        return np.array([at[end] for end in ends.tolist()])
+    places, middle = board.places(ids), pixels.mean(axis=0)
+    found, _ = cv2.findHomography(places, pixels)
+    carried = np.column_stack([board.places(ends), np.ones(4)]) @ (np.eye(3) if found is None else found).T
+    # Beyond the horizon there is nothing.
+    reach_px = _FARTHEST * float(np.ptp(pixels, axis=0).max())
+    outline = carried[:, :2] / np.maximum(carried[:, 2:], 1e-9)
+    return np.asarray(np.clip(outline, middle - reach_px, middle + reach_px))
+
+
+def _edge_width_px(grey: Grey, board: Board, ids: NDArray[np.intp], pixels: Array) -> float:
+    """The standard deviation of the blur across the edges of squares, the greater one of both directions.
+
+    A step from black to white, blurred by a normal distribution, is steepest by its height over
+    sqrt(2 pi) standard deviations. Its height is that of black and white on the board, for a profile that a
+    marker cuts short may reach neither.
+    """
+    (left, top), (right, bottom) = np.maximum(np.round([pixels.min(axis=0), pixels.max(axis=0)]), 0).astype(
+        int
+    )
+    black, white = np.percentile(grey[top : bottom + 1, left : right + 1], [10, 90])
+    at = dict(zip(ids.tolist(), pixels, strict=True))
+    beside = _BESIDE if board.marker_scale is None else _BESIDE_MARKERS
+    columns = board.grid[0]
+    widths = []
+    for step, other in ((1, columns), (columns, 1)):
+        pairs = [(at[i], at[i + step]) for i in at if i + step in at and (step > 1 or (i + 1) % columns)]
+        # How far it is to the next edge beside.
+        spacing = [np.linalg.norm(at[i] - at[i + other]) for i in at if i + other in at]
+        if pairs and spacing:
+            reach_px = max(beside * float(np.median(spacing)), 2.0)
+            widths.append((white - black) / (np.sqrt(2 * np.pi) * _slopes(grey, np.array(pairs), reach_px)))
+    return max((float(np.median(found)) for found in widths), default=0.0)
+
+
+def _slopes(grey: Grey, ends: Array, reach_px: float) -> Array:
+    """Return the slopes of edges between corners (n, 2, 2), in levels per px, up to ``reach_px`` aside."""
+    along = ends[:, 1] - ends[:, 0]
+    across = np.stack([-along[:, 1], along[:, 0]], axis=1) / np.linalg.norm(along, axis=1, keepdims=True)
+    offsets = np.arange(-reach_px, reach_px + 1e-9, _STEP_PX)
+    start = ends[:, :1] + along[:, None] * np.array(_ALONG)[:, None]
+    at = (start[:, :, None] + across[:, None, None] * offsets[:, None]).astype(np.float32)
+    rows = at.reshape(-1, len(offsets), 2)
+    levels = cv2.remap(
+        grey, rows[..., 0], rows[..., 1], cv2.INTER_LINEAR, borderMode=cv2.BORDER_REPLICATE
+    ).astype(np.float64)
+    # Over a whole pixel, or noise would look steep.
+    rises = np.abs(levels[:, _PIXEL:] - levels[:, :-_PIXEL]).max(axis=1) / (_PIXEL * _STEP_PX)
+    return np.asarray(np.median(rises.reshape(len(ends), -1), axis=1) + _LEAST_SLOPE)

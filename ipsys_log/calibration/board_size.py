@@ -1,0 +1,202 @@
+"""Hints for pictures that show another board than the given one."""
+
+from __future__ import annotations
+
+from collections import Counter
+from collections.abc import Callable, Iterator, Sequence
+from dataclasses import replace
+from functools import partial
+
+import numpy as np
+
+from ipsys_log.calibration.board import Board
+from ipsys_log.calibration.board_detection import Grey, find_board
+from ipsys_log.calibration.charuco_size import estimate_charuco_size
+from ipsys_log.calibration.chessboard import find_largest_grid, fits_in
+from ipsys_log.errors import IpsysError
+
+__all__ = ["check_charuco_size", "check_chessboard_size", "hint"]
+
+# Columns and rows of inner corners.
+Size = tuple[int, int]
+
+# One dictionary of each kind: the smaller ones are its beginning.
+_DICTIONARIES = (
+    "DICT_4X4_1000", "DICT_5X5_1000", "DICT_6X6_1000", "DICT_7X7_1000", "DICT_ARUCO_ORIGINAL",
+    "DICT_APRILTAG_36h11",
+)  # fmt: skip
+# A grid belongs to a board if most pictures show it, or at least this share and two or more.
+_MOST, _SUPPORT, _LEAST_SUPPORT = 0.5, 0.2, 2
+# The size given by a user is refused if more than this share of the pictures contradicts it.
+_CONTRADICTED = 0.5
+_FORCE = "if the size is right, give --force"
+
+
+def hint(
+    pictures: Sequence[Grey],
+    board: Board,
+    trying: Callable[[int, int], None],
+    sizes: Sequence[Size | None] = (),
+) -> str:
+    """Return the end of a sentence that names the board that is seen, or says what to check.
+
+    Parameters
+    ----------
+    pictures : to examine.
+    board : the board that is not found.
+    trying : called with the number of other kinds of board tried so far, and their total: it takes a while.
+    sizes : of the largest chessboard in each picture, if that is known.
+    """
+    if any(size is not None for size in sizes) and (answer := _name_size(sizes, board, board)):
+        return answer
+    if board.marker_scale is not None and (mirrored := _mirrored(pictures, board)):
+        return mirrored
+    searches = list(_searches(pictures, board))
+    for number, search in enumerate(searches):
+        trying(number, len(searches))
+        if answer := search():
+            return answer
+    if board.marker_scale is None:
+        return (
+            "; give the inner corners, one less than the squares in each direction, and see that the whole "
+            "board is in the picture, with a white margin"
+        )
+    return "; give columns x rows of its squares, and the --dictionary that its markers are of"
+
+
+def check_chessboard_size(sizes: Sequence[Size | None], board: Board, where: str) -> None:
+    """Check that most pictures do not show a larger chessboard than the given one.
+
+    Parameters
+    ----------
+    sizes : of the largest grid in each picture.
+    board : a chessboard.
+    where : source of the pictures, for messages.
+
+    Raises
+    ------
+    IpsysError
+        Most do; the text names the larger board that explains most corners.
+    """
+    larger = _largest_board([size for size in sizes if size is None or _exceeds(size, board.grid)])
+    seen = sum(size is not None for size in sizes)
+    count = sum(size is not None and _exceeds(size, board.grid) for size in sizes)
+    if larger is None or count <= _CONTRADICTED * seen:
+        return
+    other = _sized(board, larger)
+    shown = sum(_same(size, larger) for size in sizes)
+    raise IpsysError(
+        f"{where}: {board} is a part of {other}, which {shown} of {seen} pictures of a board show: "
+        f"give --board {other.columns}x{other.rows}; {_FORCE}"
+    )
+
+
+def check_charuco_size(pictures: Sequence[Grey], board: Board, where: str) -> None:
+    """Check that markers lie as on a ChArUco board of the given size.
+
+    Raises
+    ------
+    IpsysError
+        They do not; the text names the size by the markers.
+    """
+    size = estimate_charuco_size([_as_printed(grey, board) for grey in pictures], board.dictionary)
+    if size is None or size.pictures <= _CONTRADICTED * len(pictures):
+        return
+    if size.columns == board.columns and size.rows <= board.rows:
+        return
+    rows = max(size.rows, board.rows) if size.columns == board.columns else size.rows
+    raise IpsysError(
+        f"{where}: {size.pictures} of {len(pictures)} tried pictures have the markers of "
+        f"{replace(board, columns=size.columns, rows=rows)} or more, not of {board.columns} x {board.rows}: "
+        f"give --board charuco:{size.columns}x{rows}; {_FORCE}"
+    )
+
+
+def _mirrored(pictures: Sequence[Grey], board: Board) -> str:
+    turned = [np.ascontiguousarray(grey[:, ::-1]) for grey in pictures]
+    seen = sum(find_board("", grey, board, thorough=False) is not None for grey in turned)
+    if not seen:
+        return ""
+    return (
+        f"; but it is seen mirrored in {seen} of {len(pictures)} tried: webcam programs may mirror pictures; "
+        "turn that off, and take the pictures again"
+    )
+
+
+def _searches(pictures: Sequence[Grey], board: Board) -> Iterator[Callable[[], str]]:
+    """Return the searches for other boards, the likely ones first."""
+    inverted = replace(board, inverted=not board.inverted)
+    chessboards = [partial(_other_chessboard, pictures, kind, board) for kind in (board, inverted)]
+    markers = [
+        partial(_other_charuco, pictures, replace(kind, dictionary=name), board)
+        for name in dict.fromkeys((board.dictionary, *_DICTIONARIES))
+        for kind in (board, inverted)
+    ]
+    yield from [*chessboards, *markers] if board.marker_scale is None else [*markers, *chessboards]
+
+
+def _other_chessboard(pictures: Sequence[Grey], kind: Board, board: Board) -> str:
+    return _name_size([find_largest_grid(_as_printed(grey, kind)) for grey in pictures], kind, board)
+
+
+def _name_size(sizes: Sequence[Size | None], kind: Board, board: Board) -> str:
+    """Return the text on a chessboard of a kind that is seen instead of the given one, if any."""
+    size = _largest_board(sizes)
+    if size is None:
+        return ""
+    other = _sized(replace(kind, marker_scale=None), size)
+    if other == board:
+        return ""
+    seen = sum(_same(shown, size) for shown in sizes)
+    option = f"--board {other.columns}x{other.rows}"
+    turn = f" and {_inversion(board)}" if kind.inverted != board.inverted else ""
+    return f"; but {other} is seen in {seen} of {len(sizes)} tried: give {option}{turn}"
+
+
+def _other_charuco(pictures: Sequence[Grey], kind: Board, board: Board) -> str:
+    size = estimate_charuco_size([_as_printed(grey, kind) for grey in pictures], kind.dictionary)
+    if size is None:
+        return ""
+    scale = board.marker_scale if board.marker_scale is not None else 0.75
+    other = replace(kind, columns=size.columns, rows=size.rows, marker_scale=scale)
+    options = [f"--board charuco:{other.columns}x{other.rows}"]
+    options = [] if board.marker_scale and other.grid == board.grid else options
+    options += [f"--dictionary {kind.dictionary}"] if kind.dictionary != board.dictionary else []
+    options += [_inversion(board)] if kind.inverted != board.inverted else []
+    if not options:
+        return ""
+    said = " and ".join(options)
+    return f"; but {other} is seen in {size.pictures} of {len(pictures)} tried: give {said}"
+
+
+def _largest_board(sizes: Sequence[Size | None]) -> Size | None:
+    """Return the largest grid that enough pictures show; some pictures show only parts of a board."""
+    counts = Counter((max(size), min(size)) for size in sizes if size is not None)
+    for size, count in counts.most_common(1):
+        if count > _MOST * counts.total():
+            return size
+    least = max(_LEAST_SUPPORT, _SUPPORT * counts.total())
+    often = [size for size, count in counts.items() if count >= least]
+    return max(often or counts, key=lambda size: size[0] * size[1], default=None)
+
+
+def _sized(board: Board, size: Size) -> Board:
+    """Return the board of another size, as long in the same direction."""
+    columns, rows = (max(size), min(size)) if board.columns >= board.rows else (min(size), max(size))
+    return replace(board, columns=columns, rows=rows)
+
+
+def _exceeds(size: Size, other: Size) -> bool:
+    return fits_in(other, size) and not _same(size, other)
+
+
+def _same(size: Size | None, other: Size) -> bool:
+    return size is not None and sorted(size) == sorted(other)
+
+
+def _as_printed(grey: Grey, board: Board) -> Grey:
+    return np.asarray(255 - grey, dtype=np.uint8) if board.inverted else grey
+
+
+def _inversion(board: Board) -> str:
+    return "it without --inverted" if board.inverted else "--inverted"

@@ -1,0 +1,271 @@
+"""Pictures of a board: from logs, folders, picture files and videos, camera by camera."""
+
+from __future__ import annotations
+
+import re
+from collections.abc import Callable, Iterator, Sequence
+from functools import partial
+from itertools import chain
+from pathlib import Path
+from typing import NamedTuple
+
+import cv2
+import numpy as np
+
+from ipsys_log.calibration.board_detection import Grey
+from ipsys_log.errors import FrameError, IpsysError
+from ipsys_log.images.picture_size import check_encoded
+from ipsys_log.images.picture_size_part import read_picture_size
+from ipsys_log.images.video import Video
+from ipsys_log.log.dataset import Session
+from ipsys_log.messages import CompressedImage, CompressedVideo, RawImage
+from ipsys_log.rig.file import check_name
+
+__all__ = ["MOST_LOOKED_AT", "Pictures", "find_sources"]
+
+# Of a long recording, so many pictures are looked at, evenly spread.
+MOST_LOOKED_AT = 400
+
+_PICTURES = (".jpg", ".jpeg", ".png", ".webp", ".bmp", ".tif", ".tiff", ".pgm", ".ppm")
+_VIDEOS = (".mp4", ".avi", ".mov", ".mkv", ".m4v", ".webm", ".mpg", ".mpeg", ".mjpeg", ".mjpg")
+_GREY_OF_RAW = {
+    "mono8": (1, None), "8UC1": (1, None),
+    "rgb8": (3, cv2.COLOR_RGB2GRAY), "bgr8": (3, cv2.COLOR_BGR2GRAY), "8UC3": (3, cv2.COLOR_BGR2GRAY),
+    "rgba8": (4, cv2.COLOR_RGBA2GRAY), "bgra8": (4, cv2.COLOR_BGRA2GRAY),
+}  # fmt: skip
+
+
+def _no_sizes() -> list[tuple[str, tuple[int, int]]]:
+    return []
+
+
+class Pictures(NamedTuple):
+    """Pictures of one camera.
+
+    Attributes
+    ----------
+    camera, where : its name, and the source of the pictures.
+    total : approximate number of pictures; 0 if it is not known.
+    read : returns each picture with its name, or None for an unreadable one.
+    sizes : returns names and sizes in px, if they are known before decoding.
+    requested : whether the user named this camera or its pictures, not only a log with others.
+    """
+
+    camera: str
+    where: str
+    total: int
+    read: Callable[[], Iterator[tuple[str, Grey | None]]]
+    sizes: Callable[[], list[tuple[str, tuple[int, int]]]] = _no_sizes
+    requested: bool = True
+
+    @property
+    def looked_at(self) -> int:
+        """Number of pictures that are read; 0 if it is not known."""
+        return -(-self.total // _stride(self.total))
+
+
+def find_sources(paths: Sequence[Path], cameras: Sequence[str]) -> list[Pictures]:
+    """The pictures in logs (``.mcap``), folders, picture files and videos, by camera.
+
+    Parameters
+    ----------
+    paths : what the user named. Several of one camera are read as one.
+    cameras : of a log, only these; of anything else, the one name of its camera.
+
+    Raises
+    ------
+    IpsysError
+        Where there is nothing that can be read, or a camera has no name.
+    """
+    found = [pictures for path in paths for pictures in _sources_of(path, cameras)]
+    by_camera: dict[str, list[Pictures]] = {}
+    for pictures in found:
+        by_camera.setdefault(pictures.camera, []).append(pictures)
+    missing = [camera for camera in cameras if camera not in by_camera]
+    if missing:
+        known = ", ".join(by_camera)
+        raise IpsysError(f"--camera {missing[0]}: there are no frames of such a camera (only of {known})")
+    wanted = {c: parts for c, parts in by_camera.items() if not cameras or c in cameras}
+    return [_joined(camera, parts) for camera, parts in wanted.items()]
+
+
+def _joined(camera: str, parts: list[Pictures]) -> Pictures:
+    if len(parts) == 1:
+        return parts[0]
+    where = f"{parts[0].where} and {len(parts) - 1} more"
+    total = sum(part.total for part in parts)
+    return Pictures(
+        camera,
+        where,
+        total,
+        lambda: chain.from_iterable(part.read() for part in parts),
+        lambda: [sized for part in parts for sized in part.sizes()],
+        any(part.requested for part in parts),
+    )
+
+
+def _sources_of(path: Path, cameras: Sequence[str]) -> list[Pictures]:
+    if path.is_dir():
+        return _folder(path, cameras)
+    if not path.is_file():
+        raise IpsysError(f"{path}: there is no such log, folder, picture or video")
+    if path.suffix.lower() == ".mcap":
+        return _log(path, requested=bool(cameras))
+    if path.suffix.lower() in _PICTURES:
+        name = _camera_name(path.absolute().parent.name, path, cameras)
+        return [_of_files(name, path, [path])]
+    if path.suffix.lower() in _VIDEOS:
+        return [_video(path, cameras)]
+    raise IpsysError(
+        f"{path}: is neither a log (.mcap), a picture ({_PICTURES[0]} ...) nor a video ({_VIDEOS[0]} ...)"
+    )
+
+
+def _camera_name(text: str, path: Path, cameras: Sequence[str]) -> str:
+    if len(cameras) > 1:
+        raise IpsysError(f"{path}: is of one camera; give one --camera, or calibrate one after the other")
+    if cameras:
+        return check_name(cameras[0], "--camera")
+    name = re.sub(r"[^a-z0-9]+", "_", text.lower()).strip("_")
+    return name if name[:1].isalpha() else f"camera_{name}".rstrip("_")
+
+
+def _folder(folder: Path, cameras: Sequence[str]) -> list[Pictures]:
+    """Return the pictures in a folder as one camera, and those in its sub-folders as one camera each."""
+    here = _files(folder)
+    if here:
+        name = _camera_name(folder.absolute().name, folder, cameras)
+        return [_of_files(name, folder, here)]
+    subs = {sub: files for sub in sorted(folder.iterdir()) if sub.is_dir() and (files := _files(sub))}
+    if not subs:
+        raise IpsysError(f"{folder}: has no pictures ({', '.join(_PICTURES[:3])} ...)")
+    return [_of_files(_camera_name(sub.name, sub, []), sub, files) for sub, files in subs.items()]
+
+
+def _of_files(camera: str, where: Path, files: list[Path]) -> Pictures:
+    return Pictures(camera, str(where), len(files), partial(_read_files, files), partial(_read_sizes, files))
+
+
+def _files(folder: Path) -> list[Path]:
+    files = [path for path in folder.iterdir() if path.is_file() and path.suffix.lower() in _PICTURES]
+    return sorted((path for path in files if not path.name.startswith(".")), key=_by_number)
+
+
+def _by_number(path: Path) -> list[tuple[int, str]]:
+    parts = re.split(r"(\d+)", path.name.lower())
+    return [(int(part), "") if part.isdecimal() else (-1, part) for part in parts]
+
+
+def _read_files(files: Sequence[Path]) -> Iterator[tuple[str, Grey | None]]:
+    for path in _spread(files):
+        yield path.name, _decode(path.read_bytes())
+
+
+def _read_sizes(files: Sequence[Path]) -> list[tuple[str, tuple[int, int]]]:
+    sizes = [(path.name, read_picture_size(path)) for path in _spread(files)]
+    return [(name, size) for name, size in sizes if size is not None]
+
+
+def _spread(files: Sequence[Path]) -> Sequence[Path]:
+    return files[:: _stride(len(files))]
+
+
+def _stride(total: int) -> int:
+    return max(1, -(-total // MOST_LOOKED_AT))
+
+
+def _decode(data: bytes) -> Grey | None:
+    try:
+        check_encoded(data)
+        # Turned as the sensor has it: a lens does not turn with the tag of a picture.
+        flags = cv2.IMREAD_GRAYSCALE | cv2.IMREAD_IGNORE_ORIENTATION
+        grey = cv2.imdecode(np.frombuffer(data, np.uint8), flags)
+    except (FrameError, cv2.error):  # OpenCV asserts on empty data
+        return None
+    return None if grey is None else np.asarray(grey, dtype=np.uint8)
+
+
+def _video(path: Path, cameras: Sequence[str]) -> Pictures:
+    video = cv2.VideoCapture(str(path))
+    total, opened = int(video.get(cv2.CAP_PROP_FRAME_COUNT)), video.isOpened()
+    video.release()
+    if not opened:
+        raise IpsysError(f"{path}: is no video that can be read; convert it to H.264 in an .mp4")
+    name = _camera_name(path.stem, path, cameras)
+    return Pictures(name, str(path), max(total, 0), partial(_read_video, path, _stride(total)))
+
+
+def _read_video(path: Path, stride: int) -> Iterator[tuple[str, Grey | None]]:
+    video = cv2.VideoCapture(str(path))
+    # A picture stays as the sensor has it, whatever the video says of how to hold it.
+    video.set(cv2.CAP_PROP_ORIENTATION_AUTO, 0)
+    try:
+        number = 0
+        while video.grab():
+            if number % stride == 0:
+                seen, frame = video.retrieve()
+                yield f"frame {number}", _grey(np.asarray(frame, dtype=np.uint8)) if seen else None
+            number += 1
+    finally:
+        video.release()
+
+
+def _grey(frame: Grey) -> Grey:
+    if frame.ndim == 2:
+        return frame
+    return np.asarray(cv2.cvtColor(frame, cv2.COLOR_BGR2GRAY), dtype=np.uint8)
+
+
+def _log(path: Path, requested: bool) -> list[Pictures]:
+    with Session([path]) as session:
+        topics = dict(session.images)
+        counts = {camera: session.count(topic) for camera, topic in topics.items()}
+        if not session.images:
+            raise IpsysError(f"{path}: has no frames of any camera")
+    return [
+        Pictures(
+            c, f"{path}: camera {c}", counts[c], partial(_read_log, path, t, _stride(counts[c])),
+            requested=requested,
+        )
+        for c, t in topics.items()
+    ]  # fmt: skip
+
+
+def _read_log(path: Path, topic: str, stride: int) -> Iterator[tuple[str, Grey | None]]:
+    with Session([path]) as session:
+        video: Video | None = None
+        for number, message in enumerate(session.messages([topic])):
+            frame, wanted = message.payload, number % stride == 0
+            if isinstance(frame, CompressedVideo):
+                video = video or Video(frame.format)
+                if wanted:
+                    frame = _of_video(video, frame)
+                else:
+                    video.pass_over(frame)
+            if wanted:
+                seconds = (message.publish_time_ns - session.start_ns) * 1e-9
+                yield f"at {seconds:.2f} s", None if frame is None else _frame(frame)
+
+
+def _of_video(video: Video, frame: CompressedVideo) -> RawImage | None:
+    try:
+        return video(frame)
+    except FrameError:
+        return None
+
+
+def _frame(frame: CompressedImage | RawImage) -> Grey | None:
+    if isinstance(frame, CompressedImage):
+        return _decode(frame.data)
+    channels, conversion = _GREY_OF_RAW.get(frame.encoding, (0, None))
+    step = frame.step or frame.width * channels
+    rows = np.frombuffer(frame.data, np.uint8)
+    if not channels or step < frame.width * channels or rows.size < step * frame.height:
+        return None
+    if min(frame.width, frame.height) < 1:
+        return None
+    rows = rows[: step * frame.height].reshape(frame.height, step)[:, : frame.width * channels]
+    pixels = np.ascontiguousarray(rows.reshape(frame.height, frame.width, channels))
+    if conversion is None:
+        return pixels[..., 0]
+    return np.asarray(cv2.cvtColor(pixels, conversion), dtype=np.uint8)

@@ -1,0 +1,1 @@
+"""Capture: cameras, their threads, and the recorder."""

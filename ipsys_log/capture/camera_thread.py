@@ -1,0 +1,298 @@
+"""The thread of one camera: takes what it sends, for as long as it does, and again when it is back."""
+
+from __future__ import annotations
+
+import threading
+from collections.abc import Callable
+from dataclasses import dataclass
+from typing import Any, NamedTuple
+
+from ipsys_log.capture.frames import Clock, Frame, Open, Say, SourceError, instant_ns
+from ipsys_log.capture.stalls import Heartbeat, LateFrames
+from ipsys_log.capture.video_files import frame_payload
+from ipsys_log.capture.video_packets import can_begin, find_size
+from ipsys_log.messages import EVENTS_TOPIC, STAMP_UNRELIABLE, Event, RigCamera, image_topic
+from ipsys_log.rig.file import hide_password
+from ipsys_log.units import NS_PER_S, format_time
+
+__all__ = ["Arrival", "Attendant", "CameraState", "Shared"]
+
+# A camera that opens and then sends nothing is not there.
+_FIRST_FRAME_S = 10.0
+# The simulator draws its frames first, however busy the machine is.
+_DRAW_S = 120.0
+_RETRY_S, _LONGEST_RETRY_S = 0.5, 8.0
+_TURN_S = 0.1
+# So long a frame without a stamp may wait for the recording to begin: it would get a false time.
+_EARLY_S = 0.01
+# Frames of a video, 20 s or so, among which each camera that is set up well has a keyframe.
+_KEYLESS = 600
+# A camera that loses frames all the time is not named more often.
+_NAMED_EVERY_NS = NS_PER_S
+
+
+@dataclass(slots=True)
+class CameraState:
+    """What has come of a camera so far.
+
+    ``dropped`` frames came and never reached the log, ``missed`` ones were lost before they came, as far as
+    the camera's driver counts. ``format`` of its frames is such as jpeg or h264, ``size_px`` their width and
+    height, as soon as one tells, and ``delay_s`` the time from exposure to arrival of the last one, where it
+    has a capture stamp.
+    """
+
+    frames: int = 0
+    bytes: int = 0
+    dropped: int = 0
+    missed: int = 0
+    up: bool = False
+    finished: bool = False
+    format: str | None = None
+    size_px: tuple[int, int] | None = None
+    delay_s: float | None = None
+
+
+class Arrival(NamedTuple):
+    """A message but for its log time, and when it came."""
+
+    received_ns: int
+    topic: str
+    publish_time_ns: int
+    payload: Any
+    camera: str | None = None
+
+
+@dataclass(frozen=True, slots=True)
+class Shared:
+    """What the threads of all cameras have in common: ``put`` takes an arrival, or says that there is no room
+    for a frame; nothing but the first frames is taken before ``started``, and nothing after ``stopped``."""
+
+    open_source: Open
+    clock: Clock
+    put: Callable[[Arrival], bool]
+    say: Say
+    started: threading.Event
+    stopped: threading.Event
+    heartbeat: Heartbeat
+
+
+class Attendant:
+    """Attends to a camera, in a thread of its own.
+
+    Attributes
+    ----------
+    state : what has come so far.
+    fault : what the thread ended with, if it was not the end of the source.
+    """
+
+    def __init__(self, camera: RigCamera, shared: Shared) -> None:
+        self.state = CameraState()
+        self.fault: BaseException | None = None
+        self._camera, self._shared = camera, shared
+        self._opened, self._begun = threading.Event(), threading.Event()
+        self._lost_ns: int | None = None
+        self._dropped_before = self._missed_before = self._missed_named_ns = 0
+        self._said: set[str] = set()
+        self._broken = False
+        self._since_key = 0
+        self._late = LateFrames(shared.heartbeat, camera.rate_hz)
+        self.thread = threading.Thread(target=self._attend, name=camera.name, daemon=True)
+
+    def wait(self) -> None:
+        """Until the first frame has come.
+
+        Raises
+        ------
+        SourceError
+            Where the camera cannot be opened, or sends nothing.
+        """
+        self._opened.wait()
+        simulated = str(self._camera.source).startswith("sim:")
+        begun = self._begun.wait(_DRAW_S if simulated else _FIRST_FRAME_S)
+        if self.fault is not None:
+            raise self.fault
+        if not begun:
+            raise SourceError(
+                f"camera {self._camera.name}: {hide_password(str(self._camera.source))} sends no frames; "
+                "look whether another program uses it"
+            )
+
+    def _attend(self) -> None:
+        retry_s, stopped = _RETRY_S, self._shared.stopped
+        try:
+            while not stopped.is_set():
+                before = self.state.frames
+                lost = self._take_all()
+                if lost is None:
+                    break
+                if not self._begun.is_set():
+                    raise lost
+                retry_s = _RETRY_S if self.state.frames > before else min(2 * retry_s, _LONGEST_RETRY_S)
+                stopped.wait(retry_s)
+        except BaseException as fault:  # whoever opens the cameras, or takes the messages, is to see it
+            self.fault = fault
+            if self._begun.is_set():
+                # The others may go on for hours; where it came from is shown when they have ended.
+                text = f"camera {self._camera.name}: the program failed ({fault!r}); nothing more comes of it"
+                self._say("camera_failed", text)
+        finally:
+            self._name_lost(now=True)
+            self.state.up, self.state.finished = False, True
+            self._opened.set()
+            self._begun.set()
+
+    def _take_all(self) -> SourceError | None:
+        """Frames until the source has ended (None), or the camera has gone."""
+        shared = self._shared
+        try:
+            with shared.open_source(self._camera, shared.clock, self._say_setting) as frames:
+                self._opened.set()
+                for frame in frames:
+                    if shared.stopped.is_set():
+                        break
+                    if frame is not None:
+                        self._count_since_key(frame)
+                    if frame is not None and not self._is_early(frame):
+                        self._take(frame)
+        except SourceError as error:
+            if self.state.up:
+                self.state.up, self._lost_ns = False, shared.clock.now_ns()
+                self._say("camera_lost", f"{error}; trying again")
+            return error
+        return None
+
+    def _take(self, frame: Frame) -> None:
+        state, camera, now_ns = self.state, self._camera, self._shared.clock.now_ns()
+        self._check_format(frame)
+        if self._lost_ns is not None:
+            gone_s = (now_ns - self._lost_ns) / NS_PER_S
+            self._lost_ns = None
+            self._say("camera_back", f"camera {camera.name} is back after {gone_s:.1f} s")
+        state.up, state.format = True, frame.format
+        self._note_size(frame)
+        time_ns = now_ns
+        if frame.time_ns is None:
+            self._name_late(now_ns)
+        else:
+            time_ns = instant_ns(frame.time_ns, camera)
+            state.delay_s = (now_ns - time_ns) / NS_PER_S
+        state.missed += frame.missed
+        payload = frame_payload(time_ns, camera.name, frame.data, frame.format)
+        if not self._shared.put(Arrival(now_ns, image_topic(camera.name), time_ns, payload, camera.name)):
+            state.dropped += 1
+            return
+        state.frames += 1
+        state.bytes += len(frame.data)
+        if frame.time_ns is None and self._late.since_ns is not None:
+            self._name_caught_up()
+        self._name_lost()
+        self._begun.set()
+        # What came before the slowest camera would only be late; one without a stamp is not known to be.
+        while (
+            frame.time_ns is not None
+            and not self._shared.started.wait(_TURN_S)
+            and not self._shared.stopped.is_set()
+        ):
+            pass
+
+    def _is_early(self, frame: Frame) -> bool:
+        """Return whether a frame came before the recording began, but for the first; or needs one that did.
+
+        Without a stamp it can only be dated by its arrival, so it must not wait: until then such frames are
+        thrown away. Files and the simulator give stamps, and wait.
+        """
+        if not self._begun.is_set():
+            return False
+        if frame.time_ns is None and not self._shared.started.wait(_EARLY_S):
+            self._broken = True
+            return True
+        self._broken = self._broken and 0 < self._since_key < _KEYLESS
+        return self._broken
+
+    def _count_since_key(self, frame: Frame) -> None:
+        """Say where a video has no keyframes: it cannot be read on from a frame that was skipped."""
+        self._since_key = 0 if can_begin(frame) else self._since_key + 1
+        if self._since_key == _KEYLESS:
+            text = (
+                f"camera {self._camera.name}: no keyframe in {_KEYLESS} frames; after one that is skipped "
+                "or damaged nothing can be looked at; set its keyframe interval (GOP) to a second or two"
+            )
+            self._say_once("no_keyframes", text)
+
+    def _check_format(self, frame: Frame) -> None:
+        """See that a frame is of the format of those before it: a channel of a log holds only one."""
+        before, name = self.state.format, self._camera.name
+        if before in (None, frame.format):
+            return
+        text = (
+            f"camera {name}: sends {frame.format} now, and {before} before, and no log holds both; "
+            f"set it back to {before}, or begin a new recording"
+        )
+        if not self.state.up:
+            self._say_once("camera_lost", f"{text}; trying again")
+        raise SourceError(text)
+
+    def _note_size(self, frame: Frame) -> None:
+        """Keep the size of the pictures, and say where it changes; of a video only the first is known."""
+        before = self.state.size_px
+        if before is not None and frame.format != "jpeg":
+            return
+        size_px = find_size(frame)
+        if size_px is None or size_px == before:
+            return
+        self.state.size_px = size_px
+        if before is not None:
+            now, then = (f"{width} x {height} px" for width, height in (size_px, before))
+            text = f"camera {self._camera.name}: its pictures are {now} now, and were {then}; calibrations "
+            self._say("camera_size", f"{text}are for one size: set it back")
+
+    def _name_lost(self, now: bool = False) -> None:
+        """Frames that are not in the log, since they were last named."""
+        state, name = self.state, self._camera.name
+        if dropped := state.dropped - self._dropped_before:
+            self._dropped_before = state.dropped
+            self._say("frames_dropped", f"{dropped} frames of camera {name} dropped: the disk is too slow")
+        time_ns = self._shared.clock.now_ns()
+        missed = state.missed - self._missed_before
+        if missed and (now or time_ns - self._missed_named_ns >= _NAMED_EVERY_NS):
+            self._missed_before, self._missed_named_ns = state.missed, time_ns
+            self._say("frames_missed", f"{missed} frames of camera {name} were lost before they came")
+
+    def _name_late(self, now_ns: int) -> None:
+        """Make an event before the first late frame without a stamp."""
+        stall = self._late.take(now_ns)
+        if stall is None:
+            return
+        text = (
+            f"camera {self._camera.name}: the recorder stood still for "
+            f"{(stall.end_ns - stall.start_ns) / NS_PER_S:.1f} s; its frames come late now, and their times "
+            "are not right"
+        )
+        self._say(STAMP_UNRELIABLE, text, stall.start_ns)
+
+    def _name_caught_up(self) -> None:
+        """Make an event after the last late frame, with the range of the wrong times."""
+        start_ns, end_ns = self._late.since_ns, self._late.last_ns
+        if start_ns is None or end_ns is None or not self._late.caught_up():
+            return
+        text = (
+            f"camera {self._camera.name}: its frames are in time again; those from {format_time(start_ns)} "
+            f"to {format_time(end_ns)} UTC came late"
+        )
+        self._say(STAMP_UNRELIABLE, text, start_ns, end_ns)
+
+    def _say_setting(self, text: str) -> None:
+        """What a camera refused, once, however often it is opened."""
+        self._say_once("camera_setting", text)
+
+    def _say_once(self, kind: str, text: str) -> None:
+        if text not in self._said:
+            self._said.add(text)
+            self._say(kind, text)
+
+    def _say(self, kind: str, text: str, start_ns: int | None = None, end_ns: int | None = None) -> None:
+        """Make an event of this camera, and print it at once."""
+        now_ns = self._shared.clock.now_ns()
+        event = Event(now_ns, kind, text, self._camera.name, None, start_ns, end_ns)
+        self._shared.put(Arrival(now_ns, EVENTS_TOPIC, now_ns, event))
+        self._shared.say(text)

@@ -1,0 +1,269 @@
+"""Cameras that send now, as one source of messages.
+
+Each camera has a thread that puts what comes into one queue and does nothing else. Messages get their log
+time at one place, where they are taken out of it.
+"""
+
+from __future__ import annotations
+
+import threading
+from collections import deque
+from collections.abc import Generator, Iterable, Sequence
+from contextlib import suppress
+from dataclasses import dataclass
+from types import TracebackType
+from typing import Any
+
+from ipsys_log.capture.camera_thread import Arrival, Attendant, Shared
+from ipsys_log.capture.frames import Clock, Open, Say, SourceError
+from ipsys_log.capture.stalls import Heartbeat
+from ipsys_log.messages import EVENTS_TOPIC, CompressedImage, CompressedVideo, Event, Message, RigCamera
+
+__all__ = ["Attached"]
+
+# What may wait to be written: some seconds of three cameras, and no more of the memory than that.
+_LIMIT_BYTES = 256 << 20
+_TICK_S = 0.1
+_REMEMBERED = 20_000
+# Longest wait of the user for the disk when a point is saved.
+_SAVED_S = 10.0
+# Whoever interrupts does not wait longer for a camera that hangs.
+_LAST_S = 1.0
+
+
+class Attached:
+    """Cameras of a rig that send frames now. A context manager; iterate over it once.
+
+    Yields messages in the order of their log times, which strictly increase, and None ten times a second
+    while nothing comes. It ends when all cameras have (files do), or after :meth:`stop`.
+
+    Parameters
+    ----------
+    cameras : each with a source.
+    open_source : opens any of them.
+    clock : the one that all stamps are of.
+    say : is told at once what becomes an event too: settings refused, a camera lost or back, frames dropped.
+    limit_bytes : what may wait in memory; frames beyond that are dropped, counted and named by an event.
+
+    Attributes
+    ----------
+    states : by the name of a camera.
+    received_ns : when the last frames came, by log time.
+
+    Raises
+    ------
+    SourceError
+        On entering, where a camera cannot be opened or sends nothing.
+    """
+
+    def __init__(
+        self,
+        cameras: Sequence[RigCamera],
+        open_source: Open,
+        clock: Clock,
+        say: Say = lambda text: None,
+        limit_bytes: int = _LIMIT_BYTES,
+    ) -> None:
+        self.clock, self.say = clock, say
+        self.received_ns: dict[int, int] = {}
+        self._last_ns = 0
+        self._limit_bytes, self._waiting_bytes = limit_bytes, 0
+        self._waiting: deque[Arrival] = deque()
+        self._arrived = threading.Condition()
+        self._saving: list[_Saving] = []
+        self._closed = self._ending = False
+        self._why = "the recording has ended; measure in its log with: ipsys measure LOG"
+        self._started, self._stopped = threading.Event(), threading.Event()
+        self._heartbeat = Heartbeat(clock)
+        shared = Shared(open_source, clock, self._put, say, self._started, self._stopped, self._heartbeat)
+        self._attendants = [Attendant(camera, shared) for camera in cameras]
+        self.states = {one.name: by.state for one, by in zip(cameras, self._attendants, strict=True)}
+
+    def __enter__(self) -> Attached:
+        try:
+            self._heartbeat.start()
+            for attendant in self._attendants:
+                attendant.thread.start()
+            for attendant in self._attendants:
+                attendant.wait()
+        except BaseException:
+            self._end()
+            raise
+        self._started.set()
+        return self
+
+    def __exit__(
+        self, kind: type[BaseException] | None, error: BaseException | None, trace: TracebackType | None
+    ) -> None:
+        self._end(_LAST_S if isinstance(error, KeyboardInterrupt) else None)
+
+    def stop(self, why: str | None = None) -> None:
+        """Take no more frames; what has come is still given out. A signal handler may call it: no lock.
+
+        Parameters
+        ----------
+        why : said to whoever comes too late.
+        """
+        self._why = why or self._why
+        self._ending = True
+
+    def __iter__(self) -> Generator[Message | None, None, None]:
+        """Requesting the next message acknowledges the previous write; ending the iteration closes this."""
+        try:
+            while True:
+                if self._ending:
+                    self._stopped.set()
+                arrival, ended = self._take()
+                if ended:
+                    break
+                if arrival is None:
+                    yield None
+                    continue
+                yield self._message(arrival)
+                self._note_written(arrival)
+        finally:
+            with self._arrived:
+                self._closed = True
+                self._arrived.notify_all()
+        for attendant in self._attendants:
+            if attendant.fault is not None:
+                raise attendant.fault
+
+    def add(self, topic: str, payload: Any) -> None:
+        """Take something else into the stream, such as an event: it gets its log time as frames do.
+
+        Raises
+        ------
+        SourceError
+            Where the stream has ended: nobody would write it down.
+        """
+        self._add(Arrival(self.clock.now_ns(), topic, payload.timestamp, payload))
+
+    def save(self, topic: str, payload: Any) -> None:
+        """Take something into the stream, and wait until it is on the disk. Not for the thread that iterates.
+
+        Raises
+        ------
+        SourceError
+            Where it is not, and why.
+        """
+        saving = _Saving(Arrival(self.clock.now_ns(), topic, payload.timestamp, payload))
+        with self._arrived:
+            self._add(saving.arrival)
+            self._saving.append(saving)
+            self._arrived.wait_for(
+                lambda: saving.confirmed or (self._closed and not saving.written), _SAVED_S
+            )
+            self._saving.remove(saving)
+            waits = _has(self._waiting, saving.arrival)
+            self._waiting = deque(one for one in self._waiting if one is not saving.arrival)
+            closed = self._closed
+        if saving.fault is not None:
+            raise SourceError(
+                f"maybe not saved: the disk has failed ({saving.fault.strerror}); record to another disk"
+            )
+        if saving.confirmed:
+            return
+        if closed and not saving.written:
+            raise SourceError(f"not saved: {self._why}")
+        if waits:
+            raise SourceError("not saved: the disk is too slow; try again")
+        raise SourceError("maybe not saved: the disk does not answer; look into the log")
+
+    def confirm(self, message: Message, fault: OSError | None = None) -> None:
+        """Report that a message is on the disk, or the error of the disk. Any thread may call it."""
+        with self._arrived:
+            for saving in self._saving:
+                if saving.log_time_ns == message.log_time_ns:
+                    saving.confirmed, saving.fault = True, fault
+            self._arrived.notify_all()
+
+    def warn(self, kind: str, text: str) -> None:
+        """An event of no camera, said at once too; only said where the stream has ended."""
+        with suppress(SourceError):
+            self.add(EVENTS_TOPIC, Event(self.clock.now_ns(), kind, text))
+        self.say(text)
+
+    def now_ns(self) -> int:
+        """A log time for what is not of a camera: later than all before."""
+        self._last_ns = max(self.clock.now_ns(), self._last_ns + 1)
+        return self._last_ns
+
+    def _put(self, arrival: Arrival) -> bool:
+        """Let something wait; False for a frame that there is no room for."""
+        size = _bytes_of(arrival)
+        with self._arrived:
+            if size and self._waiting_bytes + size > self._limit_bytes:
+                return False
+            self._waiting_bytes += size
+            self._waiting.append(arrival)
+            self._arrived.notify_all()
+        return True
+
+    def _add(self, arrival: Arrival) -> None:
+        with self._arrived:
+            if self._closed:
+                raise SourceError(f"not saved: {self._why}")
+            self._put(arrival)
+
+    def _take(self) -> tuple[Arrival | None, bool]:
+        """What has waited longest, and whether there will never be more."""
+        with self._arrived:
+            if not self._waiting and not self._done():
+                self._arrived.wait(_TICK_S)
+            arrival = self._waiting.popleft() if self._waiting else None
+            self._waiting_bytes -= _bytes_of(arrival)
+            self._closed = self._closed or (arrival is None and self._done())
+            return arrival, self._closed
+
+    def _note_written(self, arrival: Arrival) -> None:
+        for saving in self._saving_of(arrival):
+            saving.written = True
+
+    def _saving_of(self, arrival: Arrival) -> list[_Saving]:
+        if not self._saving:
+            return []
+        with self._arrived:
+            return [saving for saving in self._saving if saving.arrival is arrival]
+
+    def _message(self, arrival: Arrival) -> Message:
+        log_time_ns = self.now_ns()
+        for saving in self._saving_of(arrival):
+            saving.log_time_ns = log_time_ns
+        if arrival.camera is not None:
+            self.received_ns[log_time_ns] = arrival.received_ns
+            if len(self.received_ns) > _REMEMBERED:
+                del self.received_ns[next(iter(self.received_ns))]
+        _, topic, publish_time_ns, payload, camera = arrival
+        return Message(topic, log_time_ns, publish_time_ns, payload, camera)
+
+    def _done(self) -> bool:
+        return all(state.finished for state in self.states.values())
+
+    def _end(self, seconds: float | None = None) -> None:
+        self._stopped.set()
+        self._heartbeat.stop()
+        for attendant in self._attendants:
+            if attendant.thread.ident is not None:  # an interrupt may come before all threads were started
+                attendant.thread.join(seconds)
+
+
+@dataclass(eq=False, slots=True)
+class _Saving:
+    """The state that a caller of ``save`` waits for: written by the iterating thread, then on the disk."""
+
+    arrival: Arrival
+    log_time_ns: int | None = None
+    written: bool = False
+    confirmed: bool = False
+    fault: OSError | None = None
+
+
+def _bytes_of(arrival: Arrival | None) -> int:
+    """What a frame takes; nothing else counts."""
+    frame = None if arrival is None else arrival.payload
+    return len(frame.data) if isinstance(frame, (CompressedImage, CompressedVideo)) else 0
+
+
+def _has(arrivals: Iterable[Arrival], arrival: Arrival) -> bool:
+    return any(one is arrival for one in arrivals)

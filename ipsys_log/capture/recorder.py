@@ -1,0 +1,279 @@
+"""Recording of cameras into a log: frames are written first, processed later."""
+
+from __future__ import annotations
+
+import os
+import threading
+from collections.abc import Callable, Generator, Iterable, Iterator, Mapping
+from contextlib import ExitStack, closing, contextmanager
+from dataclasses import replace
+from functools import partial
+from pathlib import Path
+from typing import Protocol
+
+from ipsys_log.capture.full_disk import disk_fault, reserve, what_failed, what_fitted
+from ipsys_log.capture.syncer import Confirm, Syncer
+from ipsys_log.errors import IpsysError, LogError, WriteError, is_full
+from ipsys_log.geometry.lenses import scale_lens
+from ipsys_log.log.journal import roll_back
+from ipsys_log.log.lock import open_locked
+from ipsys_log.log.storage import DISK
+from ipsys_log.log.writer import LogWriter
+from ipsys_log.messages import (
+    RIG_TOPIC,
+    STAMP_UNRELIABLE,
+    CameraCalibration,
+    CompressedImage,
+    CompressedVideo,
+    Event,
+    Measurement,
+    Message,
+    Rig,
+    calibration_topic,
+)
+from ipsys_log.runs.output import write_message
+
+__all__ = [
+    "Recording",
+    "Source",
+    "Target",
+    "first_messages",
+    "fitting_lenses",
+    "recording",
+    "written",
+]
+
+# Whoever interrupts does not wait longer for a write.
+_SETTLE_S = 1.0
+
+
+class Source(Protocol):
+    """Messages, and None if nothing comes; after ``stop`` only those that arrived before.
+
+    ``confirm`` is called from any thread when a measurement is on the disk, or with the error of the disk;
+    ``warn`` makes an event, and prints it.
+    """
+
+    def __iter__(self) -> Generator[Message | None, None, None]: ...
+
+    def stop(self, why: str | None = None) -> None: ...
+
+    def confirm(self, message: Message, fault: OSError | None) -> None: ...
+
+    def warn(self, kind: str, text: str) -> None: ...
+
+
+class Target(Protocol):
+    """Destination of messages, in the order of their log times.
+
+    ``full`` is set when the disk is full, ``fault`` when it failed to keep written messages.
+    """
+
+    @property
+    def full(self) -> WriteError | None: ...
+
+    @property
+    def fault(self) -> OSError | None: ...
+
+    def put(self, message: Message) -> None: ...
+
+    def flush(self) -> None: ...
+
+    def sync(self, confirm: Confirm) -> None: ...
+
+
+class Recording:
+    """A log that several threads write. Made by :func:`recording`.
+
+    Parameters
+    ----------
+    free : releases the reserved disk space.
+
+    Attributes
+    ----------
+    counts : messages so far, by topic.
+    full : set when the disk is full; the reserved space is in use then.
+    syncer : syncs the log to the disk.
+    """
+
+    def __init__(self, writer: LogWriter, free: Callable[[], None]) -> None:
+        self.counts: dict[str, int] = {}
+        self.full: WriteError | None = None
+        self.syncer = Syncer(writer.sync)
+        self._writer, self._free = writer, free
+        self._lock = threading.Lock()
+        self._torn = False
+
+    def put(self, message: Message) -> None:
+        """Write a message. No chunk spans more than a second: a recorder that is killed loses no more.
+
+        Raises
+        ------
+        WriteError
+            Where the disk is full, and what was set aside is used up too.
+        """
+        self._write(lambda: write_message(self._writer, message, self.counts))
+
+    def flush(self) -> None:
+        """Hand everything to the disk."""
+        self._write(self._writer.flush)
+
+    def sync(self, confirm: Confirm) -> None:
+        """Sync the flushed messages to the disk, and ``confirm`` it from another thread."""
+        self.syncer.soon(confirm)
+
+    @property
+    def fault(self) -> OSError | None:
+        """The first error of the disk when it failed to keep written messages."""
+        return self.syncer.fault
+
+    def check_disk(self) -> None:
+        """Check that all messages were written.
+
+        Raises
+        ------
+        IpsysError
+            The disk was full or failed; the text describes the log.
+        """
+        if self.full is not None:
+            raise IpsysError(what_fitted(self._writer.path, self.full)) from self.full
+        if self.fault is not None:
+            raise IpsysError(what_failed(self._writer.path, self.fault)) from self.fault
+
+    def settle(self) -> bool:
+        """Write nothing more, whichever thread wants to; False where one is in the midst of it."""
+        return self._lock.acquire(timeout=_SETTLE_S) and not self._torn
+
+    def _write(self, write: Callable[[], None]) -> None:
+        with self._lock:
+            self._torn = True
+            try:
+                write()
+            except WriteError as error:
+                if self.full is not None:
+                    raise
+                self.full = error
+                self._free()
+                write()
+            self._torn = False
+
+
+def written(source: Source, log: Target) -> Iterator[Message | None]:
+    """Yield the messages of a source, each after it was written.
+
+    A measurement is confirmed as soon as it is on the disk. When the disk is full the source is stopped.
+    Other messages than frames are still written, to the reserved space.
+    """
+    warned = False
+    with closing(iter(source)) as messages:
+        for message in messages:
+            if log.fault is not None and not warned:
+                warned = True
+                source.warn("disk_fault", f"{disk_fault(log.fault)}; what was written just now may be lost")
+            if message is None:
+                log.flush()
+            elif log.full is None or not isinstance(message.payload, (CompressedImage, CompressedVideo)):
+                log.put(message)
+                if isinstance(message.payload, Event) and message.payload.kind == STAMP_UNRELIABLE:
+                    log.flush()  # the file never has the affected frames without this event
+                if isinstance(message.payload, Measurement):
+                    log.flush()
+                    log.sync(partial(source.confirm, message))
+            else:
+                continue
+            yield message
+            if log.full is not None:
+                source.stop("the disk is full" if is_full(log.full.cause) else disk_fault(log.full.cause))
+
+
+@contextmanager
+def recording(path: Path, settings: Iterable[Message] = (), overwrite: bool = False) -> Iterator[Recording]:
+    """Write a new log that keeps its messages even if an exception ends the block.
+
+    Parameters
+    ----------
+    settings : rig, intrinsics and models of the recording. They are in the file before the block begins, even
+        if the recorder is killed soon.
+    overwrite : replace an existing log, unless another process is writing it. The old log is deleted only
+        after the new one exists.
+
+    Raises
+    ------
+    LogError
+        The file exists, or cannot be created.
+    IpsysError
+        The disk has too little space to finish the log properly.
+    """
+    created = _create(path, overwrite)
+    try:
+        with ExitStack() as held:
+            log = Recording(held.enter_context(created), held.enter_context(reserve(path)))
+            try:
+                for message in settings:
+                    log.put(message)
+                log.flush()
+                held.enter_context(log.syncer)
+                yield log
+            except KeyboardInterrupt as error:
+                if log.settle():
+                    raise
+                held.pop_all()  # a log that is torn cannot be ended, and what hangs would hang here too
+                text = (
+                    f"{path}: interrupted while it was written; see what it holds with: ipsys repair {path}"
+                )
+                raise IpsysError(text) from error
+    except WriteError as error:
+        raise IpsysError(what_fitted(path, error)) from error
+
+
+def _create(path: Path, overwrite: bool) -> LogWriter:
+    if not (overwrite and path.exists()):
+        return LogWriter.create(path)
+    old = open_locked(DISK, path, os.O_RDWR)
+    try:
+        roll_back(DISK, path, old)  # what was left over of an append is not of the new log
+        partial = path.with_name(f"{path.name}.new")
+        partial.unlink(missing_ok=True)  # who made it was killed: the lock is ours
+        try:
+            writer = LogWriter.create(partial)
+            writer.move(path)
+        except (OSError, WriteError) as error:
+            partial.unlink(missing_ok=True)
+            raise LogError(f"{path}: is as it was, a new one cannot be made: {error}") from error
+        return writer
+    finally:
+        os.close(old)
+
+
+def fitting_lenses(
+    lenses: Mapping[str, CameraCalibration],
+    sizes_px: Mapping[str, tuple[int, int] | None],
+    say: Callable[[str], None],
+) -> dict[str, CameraCalibration]:
+    """Lenses for the frames that cameras send, scaled where these are of another size, which is said.
+
+    Raises
+    ------
+    IpsysError
+        Where frames have another shape.
+    """
+    fitting = {}
+    for camera, lens in lenses.items():
+        width, height = sizes_px.get(camera) or (lens.width, lens.height)
+        fitting[camera] = scale_lens(lens, width, height, f"camera {camera}")
+        if width != lens.width:
+            say(f"camera {camera}: its calibration is scaled from {lens.width} to {width} px of width")
+    return fitting
+
+
+def first_messages(
+    rig: Rig, lenses: Mapping[str, CameraCalibration], now_ns: Callable[[], int]
+) -> list[Message]:
+    """The first messages of a log: the rig, and the intrinsics by camera."""
+    time_ns = now_ns()
+    found = [Message(RIG_TOPIC, time_ns, time_ns, rig)]
+    for camera, lens in sorted(lenses.items()):
+        time_ns = now_ns()
+        stamped = replace(lens, timestamp=time_ns)
+        found.append(Message(calibration_topic(camera), time_ns, time_ns, stamped, camera))
+    return found

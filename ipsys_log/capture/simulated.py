@@ -1,0 +1,245 @@
+"""The simulated lab as live cameras: ``sim:red`` is its camera *red*, in real time."""
+
+from __future__ import annotations
+
+import math
+import time
+from collections.abc import Callable, Iterator
+from contextlib import contextmanager
+from dataclasses import fields, replace
+from fractions import Fraction
+from threading import Event, Thread, main_thread
+from typing import NamedTuple
+from urllib.parse import parse_qsl, urlencode
+
+from ipsys_log.calibration.board import Board, parse_board
+from ipsys_log.capture.asked import Given, say_refused
+from ipsys_log.capture.frames import Clock, Frame, Say
+from ipsys_log.errors import IpsysError
+from ipsys_log.messages import CameraCalibration, RigCamera
+from ipsys_log.simulation.board import board_cells
+from ipsys_log.simulation.cameras import hang_cameras
+from ipsys_log.simulation.film import Film, board_film, lab_film, next_missing
+from ipsys_log.simulation.floor import Check
+from ipsys_log.simulation.live_lab import LIVE_SETTINGS
+from ipsys_log.simulation.settings import LabSettings
+from ipsys_log.simulation.shutter import exposed
+from ipsys_log.units import NS_PER_S
+
+__all__ = ["Seat", "lens_of", "open_simulated", "parse_source", "show_board"]
+
+_TURN_S = 0.4
+_LATENCY_NS = 4_000_000
+# Squares of a board that a source names. Intrinsics do not depend on their size.
+_SQUARE_M, _MARKER_SCALE, _DICTIONARY = 0.03, 0.75, "DICT_4X4_50"
+
+
+class Seat(NamedTuple):
+    """The scene of a simulated camera: a lab, the number of its camera, and a board before it, if any."""
+
+    lab: LabSettings
+    number: int
+    board: Board | None = None
+
+
+class _Stopped(Exception):  # noqa: N818
+    """The pictures are not needed any more."""
+
+
+class _Pictures:
+    """The pictures of a film, rendered by a separate thread in the order of their use."""
+
+    def __init__(self, name: str, make_film: Callable[[Check], Film], timing: _Timing, clock: Clock) -> None:
+        self._film: Film | None = None
+        self._drawn: dict[int, bytes] = {}
+        self._fault: BaseException | None = None
+        self._make_film, self._timing, self._clock = make_film, timing, clock
+        self._stopped = Event()
+        # No daemon: Python would end such a thread within OpenCV, and that aborts the program.
+        Thread(target=self._work, name=f"draws {name}", daemon=False).start()
+
+    def stop(self) -> None:
+        self._stopped.set()
+
+    def picture(self, frame: int) -> bytes | None:
+        """Return the picture of a frame; None if it is not rendered yet."""
+        if self._fault is not None:
+            raise self._fault
+        return None if self._film is None else self._drawn.get(self._film.index_of(frame))
+
+    def _work(self) -> None:
+        try:
+            self._film = film = self._make_film(self._check)
+            took_ns = 0
+            while (index := next_missing(film, self._drawn, self._frame_in(took_ns))) is not None:
+                self._check()
+                start_ns = self._clock.now_ns()
+                self._drawn[index] = film.draw(index)
+                took_ns = self._clock.now_ns() - start_ns
+        except _Stopped:
+            return
+        except BaseException as fault:  # raised again where the frames are taken
+            self._fault = fault
+
+    def _frame_in(self, later_ns: int) -> int:
+        """Return the number of the first frame that is handed over after some time from now."""
+        return self._timing.frame_at(self._clock.now_ns() + later_ns) + 1
+
+    def _check(self) -> None:
+        # Python waits for this thread when the program ends, also where nobody was left to stop it.
+        if self._stopped.is_set() or not main_thread().is_alive():
+            raise _Stopped
+
+
+@contextmanager
+def open_simulated(camera: RigCamera, clock: Clock, say: Say) -> Iterator[Iterator[Frame | None]]:
+    """The frames of a simulated camera, as :data:`~ipsys_log.capture.frames.Open` says.
+
+    Most markers of the lab are stationary; the others drive to and fro. Or a board is shown before the
+    camera. Each picture is rendered once, by a separate thread, and shown repeatedly. A frame is skipped if
+    its picture is not rendered yet. The clock alone decides the picture of a frame: all cameras of a lab see
+    the robots at the same places, in all processes.
+
+    Parameters
+    ----------
+    camera : its ``source`` is ``sim:`` and the name of the camera in the lab, and may set what
+        ``ipsys simulate`` can, and a board: ``sim:red?seed=3&markers=5``, ``sim:red?board=6x4``. Size and
+        rate are those of the rig.
+    clock : tells which frame is shown.
+    say : told what the camera shows.
+
+    Raises
+    ------
+    IpsysError
+        Where the lab has no such camera, or no such setting.
+    """
+    seat = parse_source(camera)
+    lab = seat.lab
+    say_refused(camera, Given(lab.width, lab.height, lab.rate_hz), say)
+    shown = "the simulated lab" if seat.board is None else f"{seat.board} in the simulated lab"
+    say(f"camera {camera.name}: shows {shown}, {lab.width} x {lab.height} px, {lab.rate_hz:g} frames/s")
+    timing = _Timing.of(lab, camera.stamp)
+
+    def make_film(check: Check) -> Film:
+        if seat.board is None:
+            return lab_film(lab, seat.number, check)
+        return board_film(lab, seat.number, seat.board, check)
+
+    pictures = _Pictures(camera.name, make_film, timing, clock)
+    try:
+        yield _play(pictures, timing, clock)
+    finally:
+        pictures.stop()
+
+
+def parse_source(camera: RigCamera) -> Seat:
+    """Parse a source: the lab, the camera, and the board before it.
+
+    Raises
+    ------
+    IpsysError
+        The lab has no such camera, setting or board, or a value is invalid.
+
+    Examples
+    --------
+    >>> seat = parse_source(RigCamera("left", source="sim:white?seed=3&board=6x4", width=960, height=540))
+    >>> seat.lab.seed, seat.lab.width, seat.lab.cameras[seat.number], str(seat.board)
+    (3, 960, 'white', 'a chessboard of 6 x 4 inner corners')
+    """
+    name, _, query = (camera.source or "").partition(":")[2].partition("?")
+    asked = {"width": camera.width, "height": camera.height, "rate_hz": camera.rate_hz}
+    values: dict[str, int | float] = {key: value for key, value in asked.items() if value is not None}
+    known = {f.name: type(f.default) for f in fields(LabSettings) if isinstance(f.default, (int, float))}
+    board = None
+    for key, text in parse_qsl(query, keep_blank_values=True):
+        if key == "board":
+            board = _parse_board(camera, text)
+            continue
+        if key not in known:
+            raise IpsysError(
+                f"camera {camera.name}: the simulated lab has no setting {key!r}; "
+                f"it has board, {', '.join(known)}"
+            )
+        try:
+            values[key] = known[key](text)
+        except ValueError as error:
+            raise IpsysError(f"camera {camera.name}: {key}={text} is no number") from error
+    settings = replace(LIVE_SETTINGS, **values)  # type: ignore[arg-type]
+    if name not in settings.cameras:
+        names = ", ".join(f"sim:{other}" for other in settings.cameras)
+        raise IpsysError(
+            f"camera {camera.name}: the simulated lab has no camera {name!r}; write one of {names}"
+        )
+    return Seat(settings, settings.cameras.index(name), board)
+
+
+def _parse_board(camera: RigCamera, text: str) -> Board:
+    try:
+        board = parse_board(text, _SQUARE_M, _MARKER_SCALE, _DICTIONARY, False)
+        board_cells(board)
+    except IpsysError as error:
+        raise IpsysError(f"camera {camera.name}: {str(error).replace('--board ', 'board=')}") from error
+    return board
+
+
+def show_board(camera: RigCamera, board: str) -> RigCamera:
+    """Return a simulated camera with a board held before it, unless its source names one; others as they are.
+
+    Examples
+    --------
+    >>> show_board(RigCamera("red", source="sim:red?seed=3"), "6x4").source
+    'sim:red?seed=3&board=6x4'
+    >>> show_board(RigCamera("red", source="usb:0"), "6x4").source
+    'usb:0'
+    """
+    source = str(camera.source)
+    if not source.startswith("sim:") or parse_source(camera).board is not None:
+        return camera
+    joint = "&" if "?" in source else "?"
+    return replace(camera, source=f"{source}{joint}{urlencode({'board': board}, safe=':')}")
+
+
+def lens_of(camera: RigCamera) -> CameraCalibration:
+    """Return the intrinsics of a simulated camera.
+
+    Raises
+    ------
+    IpsysError
+        The simulated lab has no such camera.
+    """
+    lab, number, _ = parse_source(camera)
+    return replace(hang_cameras(lab)[number].lens, frame_id=camera.name)
+
+
+class _Timing(NamedTuple):
+    """Times at which frames are exposed, stamped and delivered."""
+
+    # Times since 1970 are too long for floating point.
+    period_ns: Fraction
+    stamp_ns: int
+    behind_ns: int
+
+    @classmethod
+    def of(cls, lab: LabSettings, stamp: str | None) -> _Timing:
+        # A driver stamps the start of the first row's exposure, or the end of the last one's.
+        start_s, end_s = exposed(0, lab.height - 1, lab)
+        stamp_ns = round({"start": start_s, "end": end_s}.get(stamp or "", 0.0) * NS_PER_S)
+        return cls(NS_PER_S / Fraction(lab.rate_hz), stamp_ns, round(end_s * NS_PER_S) + _LATENCY_NS)
+
+    def frame_at(self, now_ns: int) -> int:
+        """Return the number of the last frame that has been handed over by a time."""
+        return math.floor((now_ns - self.behind_ns) / self.period_ns)
+
+
+def _play(pictures: _Pictures, timing: _Timing, clock: Clock) -> Iterator[Frame | None]:
+    frame = 0
+    while True:
+        # A late reader has missed some.
+        frame = max(frame + 1, timing.frame_at(clock.now_ns()))
+        time_ns = round(frame * timing.period_ns)
+        while (left_s := (time_ns - (clock.now_ns() - timing.behind_ns)) / NS_PER_S) > 0:
+            time.sleep(min(left_s, _TURN_S))
+            if left_s > _TURN_S:
+                yield None
+        data = pictures.picture(frame)
+        yield None if data is None else Frame(data, "jpeg", time_ns + timing.stamp_ns)

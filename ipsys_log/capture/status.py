@@ -1,0 +1,114 @@
+"""What a person at the cameras wants to know: a look at a frame of each, about once a second."""
+
+from __future__ import annotations
+
+import threading
+from collections import Counter
+from dataclasses import dataclass
+from types import TracebackType
+
+import cv2
+import numpy as np
+
+from ipsys_log.errors import FrameError
+from ipsys_log.images.video import decode_keyframe, is_keyframe
+from ipsys_log.messages import CompressedImage, CompressedVideo, Message, Rig
+from ipsys_log.stages.detect import decode_grey
+from ipsys_log.stages.detect.search import search
+
+__all__ = ["Look", "Monitor"]
+
+_EVERY_S = 1.0
+# Mean grey level of a picture in which nothing can be seen, and its spread behind a cap.
+_DARK, _FLAT = 20.0, 4.0
+# Of the best sharpness that a camera had: below that something moves, or the exposure is too long.
+_BLURRED = 0.4
+_SHRINK = 3
+
+
+@dataclass(frozen=True, slots=True)
+class Look:
+    """One frame of a camera: ids of the rig's markers in it, and of others, mean brightness 0 to 255,
+    sharpness relative to the best so far, and what is wrong with it, in words."""
+
+    markers: tuple[int, ...]
+    strange: tuple[int, ...]
+    brightness: float
+    sharpness: float
+    warnings: tuple[str, ...]
+
+
+class Monitor:
+    """Looks at a frame of each camera now and then, in a thread of its own; of a video at keyframes, which
+    need no others. A context manager.
+
+    Parameters
+    ----------
+    rig : which markers there are.
+
+    Attributes
+    ----------
+    looks : the last one of each camera.
+    """
+
+    def __init__(self, rig: Rig) -> None:
+        self.looks: dict[str, Look] = {}
+        self._rig = rig
+        self._newest: dict[str, CompressedImage | CompressedVideo] = {}
+        self._best: dict[str, float] = {}
+        self._ended = threading.Event()
+        self._thread = threading.Thread(target=self._watch, name="monitor", daemon=True)
+
+    def __enter__(self) -> Monitor:
+        self._thread.start()
+        return self
+
+    def __exit__(
+        self, kind: type[BaseException] | None, error: BaseException | None, trace: TracebackType | None
+    ) -> None:
+        self._ended.set()
+        self._thread.join()
+
+    def __call__(self, message: Message | None) -> None:
+        """Be shown what is recorded."""
+        if message is None or not isinstance(message.payload, (CompressedImage, CompressedVideo)):
+            return
+        if isinstance(message.payload, CompressedImage) or is_keyframe(message.payload):
+            self._newest[str(message.camera)] = message.payload
+
+    def _watch(self) -> None:
+        while not self._ended.wait(_EVERY_S):
+            for camera, image in list(self._newest.items()):
+                self.looks[camera] = self._look(camera, image)
+
+    def _look(self, camera: str, image: CompressedImage | CompressedVideo) -> Look:
+        try:
+            grey = decode_grey(decode_keyframe(image) if isinstance(image, CompressedVideo) else image)
+        except FrameError as error:
+            return Look((), (), 0.0, 0.0, (f"a frame cannot be decoded: {error}",))
+        seen = Counter(one.id for one in search(grey, self._rig.dictionary))
+        counts = {n: count for n, count in seen.items() if self._rig.knows(n)}
+        strange = tuple(sorted(set(seen) - set(counts)))
+        small = grey[::_SHRINK, ::_SHRINK]
+        brightness, spread = float(small.mean()), float(small.std())
+        fine = float(cv2.Laplacian(np.ascontiguousarray(small), cv2.CV_32F).std()) / max(spread, 1.0)
+        best = self._best[camera] = max(self._best.get(camera, 0.0), fine)
+        sharpness = fine / max(best, 1e-9)
+        warnings = [f"marker {n} is seen {count} times" for n, count in sorted(counts.items()) if count > 1]
+        if brightness < _DARK or spread < _FLAT:
+            warnings.append("the picture is dark or empty: is the lens covered?")
+        elif sharpness < _BLURRED:
+            warnings.append("blurred: give it more light, or a fixed exposure_s in lab.toml")
+        if strange:
+            warnings.append(_unknown(strange))
+        return Look(tuple(sorted(counts)), strange, brightness, sharpness, tuple(warnings))
+
+
+def _unknown(ids: tuple[int, ...]) -> str:
+    """What to do about markers that are in the picture and not in the rig."""
+    names = ", ".join(map(str, ids))
+    if len(ids) == 1:
+        which, todo = f"marker {names} is", "to track it"
+    else:
+        which, todo = f"markers {names} are", "to track them"
+    return f"{which} seen, but not in the rig; {todo} add the line [[markers]] to it, and below id = {ids[0]}"

@@ -1,0 +1,256 @@
+"""Cameras of a rig that are opened for a command; first everything is said that can be said before."""
+
+from __future__ import annotations
+
+import errno
+import os
+from collections.abc import Callable, Iterable, Iterator
+from contextlib import AbstractContextManager, ExitStack, contextmanager, nullcontext
+from dataclasses import replace
+from pathlib import Path
+from tempfile import TemporaryDirectory
+from threading import TIMEOUT_MAX, Timer
+from time import monotonic
+from typing import TYPE_CHECKING, NamedTuple
+
+from ipsys_log.cli.console import console, remarks, say
+from ipsys_log.cli.options import load_lab
+from ipsys_log.cli.signals import Interrupted, stop_on_signal
+from ipsys_log.units import format_bytes
+
+if TYPE_CHECKING:
+    from ipsys_log.capture.disk import DiskRoom
+    from ipsys_log.capture.multiplexer import Attached
+    from ipsys_log.messages import CameraCalibration, Message, Rig, RigCamera
+    from ipsys_log.report.cameras import LiveStatus
+
+__all__ = [
+    "MODEL",
+    "SENT_NOW",
+    "Lab",
+    "check_target",
+    "opened",
+    "prepared",
+    "recorded_now",
+]
+
+
+# The name of a log that exists only while the command runs.
+SENT_NOW = "what the cameras sent"
+# What a log is that is named by --model-from.
+MODEL = "the log with the model"
+# Duration of the frames that are kept of a measured point.
+_PLACE_S = 1.5
+
+
+class Lab(NamedTuple):
+    """The cameras to open: the rig, its cameras, their intrinsics by name, and the files of these."""
+
+    rig: Rig
+    cameras: list[RigCamera]
+    lenses: dict[str, CameraCalibration]
+    files: list[tuple[str, Path]]
+
+    @property
+    def names(self) -> list[str]:
+        return [camera.name for camera in self.cameras]
+
+
+def prepared(
+    rig: Path, only: list[str] | None, calibration: list[str] | None, with_lenses: bool = True
+) -> Lab:
+    """The cameras of a rig file; nothing is opened yet.
+
+    Parameters
+    ----------
+    only : the names of some cameras; otherwise all that have a source.
+    with_lenses : read the lenses that the rig names, too; not where they are still to be made.
+
+    Raises
+    ------
+    IpsysError
+        For what is wrong with the rig, the source of a camera, or the file of a lens.
+    """
+    from ipsys_log.capture.devices import check_devices, check_sources, usb_advice
+
+    described, cameras, lenses = load_lab(rig, calibration, only or (), with_lenses)
+    lab = Lab(described, cameras, lenses, _files(rig, cameras, calibration))
+    check_devices(lab.cameras)
+    check_sources(lab.cameras)
+    for line in usb_advice(replace(lab.rig, cameras=tuple(lab.cameras))):
+        remarks.print(line, style="yellow", markup=False)
+    for camera in lab.cameras:
+        if camera.width and camera.height and camera.width < camera.height:
+            text = f"camera {camera.name}: {camera.width} x {camera.height} px is upright"
+            remarks.print(f"{text}: are width and height exchanged?", style="yellow", markup=False)
+    return lab
+
+
+def _files(rig: Path, cameras: list[RigCamera], calibration: list[str] | None) -> list[tuple[str, Path]]:
+    from ipsys_log.capture.played import file_of
+
+    found = [("a calibration", Path(one.rpartition("=")[2])) for one in calibration or ()]
+    for one in cameras:
+        if one.calibration is not None:
+            found.append((f"the lens of camera {one.name}", rig.parent / one.calibration))
+        if str(one.source).startswith("file:"):
+            found.append((f"what camera {one.name} plays", file_of(str(one.source))[0]))
+    return found
+
+
+def check_target(output: Path, force: bool, files: Iterable[tuple[str, Path]]) -> None:
+    """Check that a log can be written.
+
+    Parameters
+    ----------
+    files : the input files with their names in messages: they must not be overwritten.
+
+    Raises
+    ------
+    IpsysError
+        The log exists, its folder does not exist, or the folder takes no files or none of that name; with
+        ``force``, if another process is writing it.
+    """
+    from ipsys_log.errors import IpsysError
+    from ipsys_log.log.journal import journal_path
+    from ipsys_log.log.lock import check_free, check_locks, open_locked
+    from ipsys_log.log.storage import DISK
+    from ipsys_log.report.files import check_file
+
+    try:
+        journal_path(output).exists()
+    except OSError as error:
+        shorter = "; give a shorter name" if error.errno == errno.ENAMETOOLONG else ""
+        raise IpsysError(f"-o {output}: {error.strerror}{shorter}") from error
+    check_file(output, "-o", [])
+    if not output.exists():
+        check_free(output)
+        check_locks(output.parent)
+    else:
+        for what, path in files:
+            if path.exists() and output.samefile(path):
+                raise IpsysError(f"-o {output}: is {what}; give another name")
+        if not force:
+            raise IpsysError(f"{output}: exists already; give another name, or --force to overwrite it")
+        os.close(open_locked(DISK, output, os.O_RDWR))
+
+
+@contextmanager
+def opened(
+    lab: Lab,
+    output: Path,
+    seconds: float | None,
+    doing: str | None = None,
+    panel: bool = True,
+    until_stopped: bool = True,
+) -> Iterator[tuple[Attached, list[Message], LiveStatus]]:
+    """Open the cameras; yield them, the first messages of the log, and the status on the screen.
+
+    Parameters
+    ----------
+    doing : text for the beginning if this is no recording; then the end has no text on frames.
+    panel : whether the screen is free for a table of the cameras.
+    until_stopped : a signal stops the cameras, and the command ends in order; otherwise it interrupts.
+
+    Raises
+    ------
+    IpsysError
+        A camera cannot be opened, or its frames do not fit its intrinsics.
+    """
+    from ipsys_log.capture.devices import open_source
+    from ipsys_log.capture.disk import expected_bytes_per_s, free_room
+    from ipsys_log.capture.frames import Clock
+    from ipsys_log.capture.multiplexer import Attached
+    from ipsys_log.capture.recorder import first_messages, fitting_lenses
+    from ipsys_log.capture.status import Monitor
+    from ipsys_log.report.cameras import LiveStatus
+
+    with ExitStack() as stack:
+        with remarks.status("opening " + ", ".join(lab.names)):
+            attached = stack.enter_context(Attached(lab.cameras, open_source, Clock(), say))
+        sizes_px = {name: state.size_px for name, state in attached.states.items()}
+        lenses = fitting_lenses(lab.lenses, sizes_px, say)
+        stack.enter_context(_ended(attached.stop, seconds, until_stopped))
+        expected = expected_bytes_per_s(lab.cameras, attached.states)
+        # A log that is no recording grows only with measured points.
+        growing = None if doing and seconds is None else expected
+        monitor = stack.enter_context(Monitor(lab.rig))
+        status = LiveStatus(attached.states, monitor, output, monotonic, growing)
+        _say_room(lab, attached, free_room(output, expected), seconds, doing)
+        say(doing or f"recording into {output}; Ctrl-C ends it")
+        if panel:
+            stack.enter_context(_on_screen(status))
+        yield attached, first_messages(lab.rig, lenses, attached.now_ns), status
+    for line in () if doing else status.summary():
+        console.print(line, markup=False)
+
+
+def _say_room(lab: Lab, attached: Attached, room: DiskRoom, seconds: float | None, doing: str | None) -> None:
+    """Print the expected size of the recording and how long the disk lasts, before it begins.
+
+    If frames are taken only for some seconds, nothing is printed, unless the disk is too small for that.
+    """
+    if doing and not (seconds is not None and room.is_short(seconds)):
+        if seconds is None:
+            place, free = format_bytes(round(_PLACE_S * room.bytes_per_s)), format_bytes(room.free_bytes)
+            say(f"about {place} for each point; {free} free in {room.folder}")
+        return
+    short = room.is_short(seconds)
+    remarks.print(room.describe(seconds), style="bold red" if short else None, markup=False)
+    if advice := room.advise(lab.cameras, attached.states):
+        say(advice)
+
+
+@contextmanager
+def _ended(stop: Callable[[], None], seconds: float | None, on_signal: bool = True) -> Iterator[None]:
+    """Stop in order after some time, or on the first signal: messages that arrived before are written."""
+    if on_signal:
+        stop_on_signal(stop)
+    timer = Timer(TIMEOUT_MAX if seconds is None else seconds, stop)
+    timer.daemon = True
+    timer.start()
+    try:
+        yield
+    finally:
+        timer.cancel()
+
+
+def _on_screen(status: LiveStatus) -> AbstractContextManager[object]:
+    from rich.live import Live
+
+    if not remarks.is_terminal:
+        return nullcontext()
+    return Live(get_renderable=status.show, console=remarks, transient=True, refresh_per_second=2)
+
+
+@contextmanager
+def recorded_now(lab: Lab, seconds: float, keep: Path | None = None) -> Iterator[Path]:
+    """Record the cameras for some seconds; without ``keep`` the log is deleted after the block.
+
+    Raises
+    ------
+    IpsysError
+        The cameras do not send. Errors of the block do not name the temporary file.
+    """
+    from ipsys_log import pipeline
+    from ipsys_log.errors import IpsysError
+
+    with TemporaryDirectory(prefix="ipsys-") as folder:
+        log = keep or Path(folder) / "now.mcap"
+        doing = None if keep else f"looking for {seconds:g} s"
+        try:
+            with opened(lab, log, seconds, doing, until_stopped=False) as (cameras, settings, status):
+                pipeline.record(cameras, settings, log, [status])
+        except Interrupted as interrupt:
+            kept = (
+                f"{keep} has the frames up to the interruption"
+                if keep and keep.exists()
+                else "no frame was kept"
+            )
+            raise Interrupted(interrupt.exit_code, f"interrupted; {kept}") from None
+        try:
+            yield log
+        except IpsysError as error:
+            if keep is not None:
+                raise
+            raise IpsysError(str(error).replace(str(log), SENT_NOW)) from error

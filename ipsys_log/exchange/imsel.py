@@ -1,0 +1,143 @@
+"""The measurements that the authors of the paper published, as messages of a log.
+
+The folder is that of the data alone, or a clone of their repository
+(https://github.com/iMSEL-USC/Indoor-Positioning-System-iMSEL).
+"""
+
+from __future__ import annotations
+
+from collections.abc import Iterator
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from ipsys_log.errors import IpsysError
+from ipsys_log.exchange.matlab import read_mat
+from ipsys_log.exchange.opencv_yaml import read_opencv_calibration
+from ipsys_log.messages import (
+    MEASUREMENTS_TOPIC,
+    RIG_TOPIC,
+    CameraPoint,
+    CameraPoints,
+    Floor,
+    Interval,
+    Measurement,
+    Message,
+    ReferencePoint,
+    Rig,
+    RigCamera,
+    RigMarker,
+    Run,
+    WorldPoint,
+    calibration_topic,
+)
+from ipsys_log.units import CM_PER_M, NS_PER_S
+
+__all__ = ["read_imsel"]
+
+CAMERAS = {"red": "cam_gnt", "white": "cam_wht", "black": "cam_blk_new_2"}
+SUBSETS = (10, 20, 30, 40)
+
+# The places were measured before the paper was submitted; no time was published. Each gets a second.
+START_NS = 1_640_995_200 * NS_PER_S  # 2022-01-01
+
+_RIG = Rig(
+    name="imsel",
+    dictionary="DICT_4X4_100",
+    marker_length_m=0.20,
+    markers=(RigMarker(0, robot="robot_0"),),
+    cameras=tuple(RigCamera(name) for name in CAMERAS),
+    reference_points=(ReferencePoint("A", 1.2192, 2.4384), ReferencePoint("B", 3.6576, 2.4384)),
+    floor=Floor(4.8768, 4.8768),
+)
+
+
+def read_imsel(folder: Path) -> Iterator[Message]:
+    """Yield the authors' rig, intrinsics, camera points and measured points, in log order.
+
+    Each point is measured for one camera, and gets a separate second. The 40 training points are labelled
+    ``train``, the published subsets ``train_10`` to ``train_40``, the others ``test``.
+
+    Raises
+    ------
+    IpsysError
+        A file is missing or has wrong contents.
+    """
+    mats = {name: read_mat(_find(folder, f"{name}.mat")) for name in ("testing", *map(_training, SUBSETS))}
+    lenses = {camera: _find(folder, f"{stem}_calib.yaml") for camera, stem in CAMERAS.items()}
+    yield Message(RIG_TOPIC, START_NS, START_NS, _RIG)
+    for number, (camera, path) in enumerate(lenses.items(), 1):
+        time_ns = START_NS + number
+        lens = read_opencv_calibration(path, camera, time_ns)
+        yield Message(calibration_topic(camera), time_ns, time_ns, lens, camera)
+    time_ns = START_NS
+    for camera in CAMERAS:
+        for number, (point_m, world_m, splits) in enumerate(_places(mats, camera)):
+            time_ns += NS_PER_S
+            yield from _place(camera, f"{camera}_{number:02d}", time_ns, point_m, world_m, splits)
+    run = Run(timestamp=time_ns, run="imsel", stage="import", parameters={"format": "imsel"})
+    yield Message("/runs/imsel/record", time_ns + 2, time_ns, run)
+
+
+def _training(count: int) -> str:
+    return f"training_{count}"
+
+
+def _find(folder: Path, name: str) -> Path:
+    if not folder.is_dir():
+        raise IpsysError(f"{folder}: there is no such folder; name that of the authors' .mat files")
+    found = sorted(folder.rglob(name), key=lambda path: (len(path.parts), path))
+    if not found:
+        raise IpsysError(
+            f"{folder}: has no {name}; name the folder of the authors' data, or of their repository"
+        )
+    return found[0]
+
+
+def _array(mats: dict[str, dict[str, Any]], mat: str, name: str) -> NDArray[np.float64]:
+    array = mats[mat].get(name)
+    if array is None or np.ndim(array) != 2 or np.shape(array)[1] != 3 or not np.isfinite(array).all():
+        raise IpsysError(f"{mat}.mat: {name} is not a table of three columns of numbers")
+    return np.asarray(array, dtype=np.float64) / CM_PER_M
+
+
+def _places(
+    mats: dict[str, dict[str, Any]], camera: str
+) -> Iterator[tuple[NDArray[np.float64], NDArray[np.float64], tuple[str, ...]]]:
+    """Camera point, world point (m) and labels of each place: the training pairs, then the others."""
+    largest = _training(SUBSETS[-1])
+    subsets = {
+        f"train_{n}": {tuple(row) for row in _array(mats, _training(n), f"Xc_{camera}").tolist()}
+        for n in SUBSETS
+    }
+    points, worlds = _array(mats, largest, f"Xc_{camera}"), _array(mats, largest, f"Xw_{camera}")
+    for point, world in zip(points, worlds, strict=True):
+        labels = [label for label, rows in subsets.items() if tuple(point.tolist()) in rows]
+        yield point, world, ("train", *labels)
+    points, worlds = (_array(mats, "testing", f"X{kind}_{camera}_test") for kind in "cw")
+    for point, world in zip(points, worlds, strict=True):
+        yield point, world, ("test",)
+
+
+def _place(
+    camera: str,
+    name: str,
+    time_ns: int,
+    point_m: NDArray[np.float64],
+    world_m: NDArray[np.float64],
+    splits: tuple[str, ...],
+) -> Iterator[Message]:
+    points = CameraPoints(time_ns, (CameraPoint(0, *point_m.tolist()),))
+    yield Message(f"/runs/imsel/cameras/{camera}/camera_points", time_ns, time_ns, points, camera)
+    measurement = Measurement(
+        timestamp=time_ns,
+        id=name,
+        marker_id=0,
+        height_m=float(world_m[2]),
+        still=Interval(time_ns, time_ns),
+        point=WorldPoint(*world_m.tolist()),
+        splits=splits,
+    )
+    yield Message(MEASUREMENTS_TOPIC, time_ns + 1, time_ns, measurement)

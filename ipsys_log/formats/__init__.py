@@ -1,1 +1,0 @@
-"""Data of others, in and out: what they wrote, as messages."""

@@ -1,0 +1,1 @@
+"""Images: JPEG and video, decoded within limits."""

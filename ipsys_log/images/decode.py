@@ -1,0 +1,143 @@
+"""Frames to grey pictures."""
+
+from __future__ import annotations
+
+import threading
+from collections.abc import Sequence
+
+import cv2
+import numpy as np
+import simplejpeg
+from numpy.typing import NDArray
+
+from ipsys_log.errors import FrameError
+from ipsys_log.images.jpeg import cut_rows, read_layout, whole_rows
+from ipsys_log.images.picture_size import check_encoded, check_size
+from ipsys_log.messages import CompressedImage, RawImage
+
+__all__ = ["Grey", "decode_grey", "decode_rows", "levels_at"]
+
+Grey = NDArray[np.uint8]
+
+_RAW_TO_GREY = {
+    "mono8": (1, None),
+    "8UC1": (1, None),
+    "rgb8": (3, cv2.COLOR_RGB2GRAY),
+    "bgr8": (3, cv2.COLOR_BGR2GRAY),
+    "8UC3": (3, cv2.COLOR_BGR2GRAY),
+    "rgba8": (4, cv2.COLOR_RGBA2GRAY),
+    "bgra8": (4, cv2.COLOR_BGRA2GRAY),
+}
+
+
+class _Memory:
+    """What a thread decodes into, again and again: new memory would cost more than to fill it."""
+
+    def __init__(self) -> None:
+        self.pixels = np.zeros((0, 0), dtype=np.uint8)
+        self.bytes = bytearray()
+
+
+_THREAD = threading.local()
+
+
+def decode_rows(
+    frame: CompressedImage | RawImage, rows: Sequence[slice] | None = None
+) -> tuple[Grey, list[slice]]:
+    """Decode the grey picture of a frame, or at least some rows of it.
+
+    Parameters
+    ----------
+    frame : as recorded.
+    rows : the rows to decode; None for all. With fewer, a JPEG is checked less strictly.
+
+    Returns
+    -------
+    The picture (height, width), good until this thread decodes the next one, and the rows of it that were
+    decoded; the others are black.
+
+    Raises
+    ------
+    FrameError
+        Where the data is damaged.
+    """
+    layout = read_layout(frame.data) if isinstance(frame, CompressedImage) else None
+    if layout is None:
+        grey = decode_grey(frame)
+        return grey, [slice(0, len(grey))]
+    check_size(layout.width, layout.height, len(frame.data))
+    memory: _Memory = _THREAD.__dict__.setdefault("memory", _Memory())
+    if memory.pixels.shape != (layout.height, layout.width):
+        memory.pixels = np.zeros((layout.height, layout.width), dtype=np.uint8)
+    grey = memory.pixels
+    if rows is None:
+        _decode_jpeg(frame.data, grey)
+        return grey, [slice(0, layout.height)]
+    shown = whole_rows(layout, rows)
+    # What an earlier picture left there, of another camera even, is not to be seen.
+    starts, stops = [part.start for part in shown], [part.stop for part in shown]
+    for low, high in zip([0, *stops], [*starts, layout.height], strict=True):
+        grey[low:high] = 0
+    for piece, part in zip(cut_rows(frame.data, layout, shown, memory.bytes), shown, strict=True):
+        # Without restart markers, what follows the last row that is wanted looks like damage.
+        _decode_jpeg(piece, grey[part], strict=layout.interval > 0)
+    return grey, shown
+
+
+def decode_grey(frame: CompressedImage | RawImage) -> Grey:
+    """Decode the grey picture of a frame, (height, width).
+
+    Raises
+    ------
+    FrameError
+        The data are damaged: a JPEG is decoded strictly, and an incomplete picture is refused.
+    """
+    if isinstance(frame, RawImage):
+        return _raw_grey(frame)
+    check_encoded(frame.data)
+    if frame.data[:2] == b"\xff\xd8":
+        return _decode_jpeg(frame.data)
+    try:
+        decoded = cv2.imdecode(np.frombuffer(frame.data, np.uint8), cv2.IMREAD_GRAYSCALE)
+    except cv2.error:  # OpenCV asserts on empty data
+        decoded = None
+    if decoded is None:
+        raise FrameError(f"{len(frame.data)} bytes that are no picture ({frame.format or 'no format given'})")
+    return np.asarray(decoded, dtype=np.uint8)
+
+
+def _decode_jpeg(
+    data: bytes | bytearray | memoryview, pixels: Grey | None = None, strict: bool = True
+) -> Grey:
+    """Decode a JPEG, into ``pixels`` where they are given."""
+    try:
+        grey: Grey = simplejpeg.decode_jpeg(data, colorspace="GRAY", buffer=pixels, strict=strict)[..., 0]
+    except ValueError as error:
+        raise FrameError(str(error)) from error
+    return grey
+
+
+def levels_at(grey: Grey, x: NDArray[np.float32], y: NDArray[np.float32]) -> NDArray[np.float64]:
+    """Grey levels at pixels, between them linearly; of the shape (..., n) of x and y, both contiguous."""
+    rows = (-1, x.shape[-1])
+    levels = cv2.remap(
+        grey, x.reshape(rows), y.reshape(rows), cv2.INTER_LINEAR, borderMode=cv2.BORDER_REPLICATE
+    )
+    return np.asarray(levels, dtype=np.float64).reshape(x.shape)
+
+
+def _raw_grey(frame: RawImage) -> Grey:
+    if frame.encoding not in _RAW_TO_GREY:
+        known = ", ".join(_RAW_TO_GREY)
+        raise FrameError(f"pixel encoding {frame.encoding!r} is not read (only {known})")
+    channels, conversion = _RAW_TO_GREY[frame.encoding]
+    rows = np.frombuffer(frame.data, np.uint8)
+    step = frame.step or frame.width * channels  # some writers leave it out
+    too_few = step < frame.width * channels or rows.size < step * frame.height
+    if too_few or min(frame.width, frame.height) < 1:
+        raise FrameError(f"{rows.size} bytes are too few for {frame.width} x {frame.height}")
+    rows = rows[: step * frame.height].reshape(frame.height, step)
+    pixels = rows[:, : frame.width * channels].reshape(frame.height, frame.width, channels)
+    if conversion is None:
+        return np.ascontiguousarray(pixels[..., 0])
+    return np.asarray(cv2.cvtColor(np.ascontiguousarray(pixels), conversion), dtype=np.uint8)

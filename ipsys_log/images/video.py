@@ -1,0 +1,172 @@
+"""Pictures of a video, one message after the other."""
+
+from __future__ import annotations
+
+import re
+from collections.abc import Iterable
+from contextlib import suppress
+from typing import TYPE_CHECKING
+
+from ipsys_log.errors import FrameError
+from ipsys_log.images.frame_numbers import FrameNumbers
+from ipsys_log.images.picture_size import MOST_PIXELS
+from ipsys_log.messages import CompressedVideo, RawImage
+
+if TYPE_CHECKING:
+    from av.video.codeccontext import VideoCodecContext
+    from av.video.frame import VideoFrame
+
+__all__ = ["VIDEO_FORMATS", "Video", "decode_keyframe", "decode_last", "is_keyframe"]
+
+# As the log names them, and FFmpeg.
+VIDEO_FORMATS = {"h264": "h264", "h265": "hevc"}
+# The head of a unit of Annex B: the start code, and the byte that holds its type.
+_UNIT = re.compile(rb"\x00\x00\x01(.)", re.DOTALL)
+
+
+class Video:
+    """Decodes the video of one camera, message by message: each picture needs those before it, up to the
+    last keyframe. What came before that has no effect, damage neither.
+
+    Parameters
+    ----------
+    format : ``h264`` or ``h265``.
+
+    Raises
+    ------
+    FrameError
+        For any other format.
+    """
+
+    def __init__(self, format: str) -> None:
+        if format not in VIDEO_FORMATS:
+            raise FrameError(f"video format {format!r} is not read (only {', '.join(VIDEO_FORMATS)})")
+        self._decoder = _open(VIDEO_FORMATS[format])
+        self._begun = self._keyed = False
+        self._fault: str | None = None
+        self._misses = FrameNumbers() if format == "h264" else lambda data: False
+
+    def __call__(self, frame: CompressedVideo) -> RawImage | None:
+        """The picture of a message, in grey; None before the first keyframe.
+
+        Raises
+        ------
+        FrameError
+            Where the data is damaged, or that of a frame since the last keyframe was, or the picture comes
+            only with later messages.
+        """
+        picture = self._decode(frame)
+        if picture is None:
+            return None
+        plane = picture.reformat(format="gray").planes[0]
+        size = picture.width, picture.height
+        return RawImage(frame.timestamp, frame.frame_id, *size, "mono8", plane.line_size, bytes(plane))
+
+    def pass_over(self, frame: CompressedVideo) -> None:
+        """Decode a message only for those after it; damage is not named."""
+        with suppress(FrameError):
+            self._decode(frame)
+
+    def _decode(self, frame: CompressedVideo) -> VideoFrame | None:
+        missing = self._misses(frame.data)
+        if is_keyframe(frame):
+            self._begun = self._keyed = True
+            self._fault = None
+        elif self._keyed and self._fault is not None:
+            # What a decoder puts into the holes is left over from anywhere: no two runs would agree.
+            raise FrameError(f"needs a frame before it that gave no picture ({self._fault})")
+        try:
+            if missing:
+                raise FrameError("a frame before it is missing")
+            return self._next(frame)
+        except FrameError as error:
+            self._fault = str(error)
+            raise
+
+    def _next(self, frame: CompressedVideo) -> VideoFrame | None:
+        import av
+
+        try:
+            pictures = self._decoder.decode(av.Packet(frame.data))
+        except av.error.FFmpegError as error:
+            if not self._begun:
+                return None
+            raise FrameError(
+                f"{len(frame.data)} bytes that are no {frame.format} ({error.strerror})"
+            ) from error
+        if not pictures and self._decoder.has_b_frames:
+            raise FrameError("its picture needs a later one; turn off B-frames in the camera")
+        if not pictures and not self._begun:
+            return None
+        if not pictures or pictures[-1].is_corrupt:
+            raise FrameError(f"{len(frame.data)} bytes of {frame.format} that are no whole picture")
+        self._begun = True
+        return pictures[-1]
+
+
+def is_keyframe(frame: CompressedVideo) -> bool:
+    """Whether a frame needs none before it.
+
+    Examples
+    --------
+    >>> is_keyframe(CompressedVideo(0, "red", bytes.fromhex("00000001 65 88"), "h264"))
+    True
+    """
+    wide = frame.format == "h265"
+    for match in _UNIT.finditer(frame.data):
+        kind = match[1][0] >> 1 & 0x3F if wide else match[1][0] & 0x1F
+        # Pieces of pictures: of H.264 1 to 5, of H.265 0 to 31, 16 to 23 of those that a reader can begin at.
+        if kind < 32 if wide else 1 <= kind <= 5:
+            return 16 <= kind <= 23 if wide else kind == 5
+    return False
+
+
+def decode_keyframe(frame: CompressedVideo) -> RawImage:
+    """The picture in a keyframe, in grey.
+
+    Raises
+    ------
+    FrameError
+        Where it is none, or damaged.
+    """
+    picture = Video(frame.format)(frame)
+    if picture is None:
+        raise FrameError(f"{len(frame.data)} bytes of {frame.format} that are no keyframe")
+    return picture
+
+
+def decode_last(backwards: Iterable[CompressedVideo]) -> RawImage | None:
+    """The picture in a frame, in grey, whatever that needs; None where there is no keyframe before it.
+
+    Parameters
+    ----------
+    backwards : this frame, the one before it, and so on; taken up to the first keyframe.
+
+    Raises
+    ------
+    FrameError
+        Where it is damaged, or one that it needs.
+    """
+    needed: list[CompressedVideo] = []
+    for frame in backwards:
+        needed.append(frame)
+        if is_keyframe(frame):
+            break
+    last, *before = needed
+    video = Video(last.format)
+    for frame in reversed(before):
+        video.pass_over(frame)
+    return video(last)
+
+
+def _open(codec: str) -> VideoCodecContext:
+    import av
+
+    decoder = av.VideoCodecContext.create(codec, "r")
+    assert isinstance(decoder, av.VideoCodecContext)
+    # A picture for each packet, at once: several threads would hold some back.
+    decoder.thread_count = 1
+    decoder.flags |= av.codec.context.Flags.low_delay
+    # A picture with guessed pieces is none.
+    decoder.options = {"err_detect": "explode", "max_pixels": str(MOST_PIXELS)}
+    return decoder

@@ -1,0 +1,175 @@
+"""Getting at the messages of one chunk while reading no more of it than is needed."""
+
+from collections import OrderedDict
+from collections.abc import Callable, Iterator, Mapping
+from dataclasses import dataclass, field
+from functools import partial
+
+from mcap.opcode import Opcode
+
+from ipsys_log.log.byte_source import View
+from ipsys_log.log.chunks import check_compression, unpack
+from ipsys_log.log.frames import EqualBlocks, RawBlocks, find_blocks
+from ipsys_log.log.order import Cursor
+from ipsys_log.log.records import (
+    CHUNK_HEAD_SIZE,
+    HEAD_SIZE,
+    MESSAGE,
+    MESSAGE_HEAD_SIZE,
+    ChunkRef,
+    parse_chunk_head,
+)
+from ipsys_log.log.rows import Entries, Run, chunk_entries, runs, wanted_rows
+from ipsys_log.log.types import RawMessage
+
+__all__ = ["Blocks", "open_chunk", "open_loose"]
+
+_CACHE_BYTES = 64 << 20
+_SMALL = 64 << 10  # bytes: a compressed chunk below this is unpacked without looking at its blocks
+_SPARSE = 4096  # bytes per wanted message: with fewer, the chunk is unpacked as well
+_OPCODE = int(Opcode.MESSAGE)
+_SHORTEST = MESSAGE_HEAD_SIZE - HEAD_SIZE  # bytes: the length of a Message record without payload
+_new = tuple.__new__  # RawMessage(...) goes through a function in Python and takes twice as long
+
+
+@dataclass(slots=True)
+class Blocks:
+    """The stretches of records read last, so that memory stays bounded however many chunks overlap."""
+
+    capacity: int = _CACHE_BYTES
+    searched: dict[int, Entries] = field(default_factory=dict)  # rows of chunks without message indexes
+    _held: "OrderedDict[tuple[int, int, int], bytes]" = field(default_factory=OrderedDict)
+    _size: int = 0
+
+    def fetch(self, place: int, read: Callable[[int, int], bytes], low: int, high: int) -> bytes:
+        """Bytes `low` to `high` of the chunk at `place`, by `read` if they are not held."""
+        if low == high:
+            return b""
+        key = (place, low, high)
+        data = self._held.get(key)
+        if data is not None:
+            self._held.move_to_end(key)
+            return data
+        data = read(low, high)
+        self._held[key] = data
+        self._size += len(data)
+        while self._size > self.capacity and len(self._held) > 1:
+            self._size -= len(self._held.popitem(last=False)[1])
+        return data
+
+
+@dataclass(slots=True)
+class _Messages:
+    """The wanted messages of one chunk, by row: `runs` says which stretch to `fetch` for each beforehand.
+
+    `read` reads what does not lie in its stretch.
+    """
+
+    view: View
+    topics: Mapping[int, str]
+    place: int  # the chunk's offset, 0 for messages in no chunk
+    times: list[int]
+    offsets: list[int]
+    runs: list[Run]
+    fetch: Callable[[int, int], bytes]
+    read: Callable[[int, int], bytes]
+    spare: int  # bytes that the remaining messages may have together: if there are more, messages overlap
+
+    def between(self, first: int, stop: int) -> Iterator[RawMessage]:
+        """Yield the messages of rows `first` to `stop`; each record must agree with the index."""
+        # Where small messages are read, the time is spent here: no call to Python for most of them.
+        unpack, topic_of = MESSAGE.unpack_from, self.topics.get
+        data, low, size, fetched = b"", 0, 0, None
+        most = self.view.allowance.most_payload
+        rows = slice(first, stop)
+        for due, offset, run in zip(self.times[rows], self.offsets[rows], self.runs[rows], strict=True):
+            if run is not fetched:
+                data, low, fetched = self.fetch(*run), run[0], run
+                size = len(data)
+            start = offset - low
+            if start + MESSAGE_HEAD_SIZE <= size:
+                opcode, length, channel, _, time, published = unpack(data, start)
+            else:
+                head = self.read(offset, offset + MESSAGE_HEAD_SIZE)
+                opcode, length, channel, _, time, published = unpack(head)
+            topic = topic_of(channel)
+            if time != due or opcode != _OPCODE or length < _SHORTEST or topic is None:
+                place = self.place or offset
+                raise self.view.fault(place, "a message index points to no message of its time")
+            if most < length < self.spare:
+                raise self.view.refusal(f"one of its messages has {length} bytes, more than {most}")
+            end = start + HEAD_SIZE + length
+            if end <= size:
+                payload = data[start + MESSAGE_HEAD_SIZE : end]
+            else:
+                payload = self.read(offset + MESSAGE_HEAD_SIZE, offset + HEAD_SIZE + length)
+            self.spare -= length
+            if self.spare < 0:
+                raise self.view.fault(self.place, "its message indexes name bytes more than once")
+            yield _new(RawMessage, (topic, time, published, payload))
+
+
+@dataclass(slots=True)
+class _Records:
+    """The records of one chunk, by their offsets in it, read in place where that is possible."""
+
+    view: View
+    chunk: ChunkRef
+    raw: EqualBlocks | RawBlocks | None = None
+    whole: bytes | None = None
+
+    def read(self, low: int, high: int) -> bytes:
+        chunk = self.chunk
+        if low < 0 or high > chunk.uncompressed_size:
+            raise self.view.fault(chunk.offset, "a message reaches beyond the end of its chunk")
+        if not chunk.compression:
+            return self.view.read(chunk.offset + CHUNK_HEAD_SIZE + low, high - low)
+        data = self.raw.read(low, high) if self.raw is not None else None
+        if data is None:
+            data = self.unpacked()[low:high]
+        if len(data) != high - low:
+            raise self.view.fault(chunk.offset, "a message reaches beyond the end of its chunk")
+        return data
+
+    def unpacked(self, *_: int) -> bytes:
+        """All of it, decompressed once and held while messages are due: chunks may overlap in time."""
+        if self.whole is None:
+            at = self.chunk.offset
+            self.whole = unpack(self.view, at, parse_chunk_head(self.view, at)[1])
+        return self.whole
+
+
+def open_chunk(
+    view: View, blocks: Blocks, chunk: ChunkRef, topics: Mapping[int, str], span: tuple[int, int]
+) -> Cursor:
+    """A cursor over the messages of the channels in `topics` with start <= log time <= end."""
+    place, name, size = chunk.offset, chunk.compression, chunk.uncompressed_size
+    packed = chunk.compressed_size
+    check_compression(view, name)
+    entries = chunk_entries(view, chunk, blocks.searched)
+    rows = wanted_rows(entries, topics, span)
+    records = _Records(view, chunk)
+    if name and packed > _SMALL and packed > len(rows) * _SPARSE:
+        records.raw = find_blocks(view, name, place + CHUNK_HEAD_SIZE + len(name), packed, size)
+    if name and records.raw is None:
+        stretches, fetch = [(0, size)] * len(rows), records.unpacked
+    else:
+        stretches, fetch = runs(entries, rows, size), partial(blocks.fetch, place, records.read)
+    times, offsets = rows.T.tolist()
+    messages = _Messages(view, topics, place, times, offsets, stretches, fetch, records.read, size)
+    return Cursor(place, times, offsets, messages.between)
+
+
+def open_loose(
+    view: View, blocks: Blocks, entries: Entries, topics: Mapping[int, str], span: tuple[int, int], end: int
+) -> Cursor:
+    """The same for messages that lie in no chunk; `end` is where the data section ends."""
+
+    def read(low: int, high: int) -> bytes:
+        return view.read(low, high - low)
+
+    rows = wanted_rows(entries, topics, span)
+    stretches, fetch = runs(entries, rows, end), partial(blocks.fetch, 0, read)
+    times, offsets = rows.T.tolist()
+    messages = _Messages(view, topics, 0, times, offsets, stretches, fetch, read, end)
+    return Cursor(None, times, offsets, messages.between)

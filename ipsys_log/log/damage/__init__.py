@@ -1,0 +1,1 @@
+"""Damaged logs: their survey, and the messages that can be saved."""

@@ -1,0 +1,107 @@
+"""Comparison of a log's data section, indexes and summary, which must say the same."""
+
+from collections import Counter
+
+from mcap import records as mcap
+from mcap.opcode import Opcode
+
+from ipsys_log.errors import LogError
+from ipsys_log.log.byte_source import View
+from ipsys_log.log.contents import Contents
+from ipsys_log.log.damage.findings import Survey
+from ipsys_log.log.damage.resync import PRIVATE
+from ipsys_log.log.load import Summary, load_contents, read_summary
+from ipsys_log.log.records import DATA_END, ChunkRef, exact, walk
+from ipsys_log.log.rows import chunk_entries
+
+__all__ = ["count_by_indexes", "disagreement"]
+
+
+def disagreement(view: View, found: Survey) -> str:
+    """Return the first disagreement of a log with its survey, "" if there is none."""
+    try:
+        theirs, summary = load_contents(view), read_summary(view)
+        if summary is not None:
+            _check_lengths(view, theirs.data_end + DATA_END.size)
+    except LogError as error:
+        return str(error).split(" is damaged ", 1)[-1].split(". Run:", 1)[0]
+    mine = found.contents
+    counts = (
+        f"readers count {sum(theirs.counts.values())} messages, but there are {sum(mine.counts.values())}"
+    )
+    tests = (
+        (not found.finished or bool(found.damaged) or not found.crc_is_right, "its data section is damaged"),
+        (theirs.data_end != found.end, "its summary belongs to another data section"),
+        (Counter(mine.counts) != Counter(theirs.counts), counts),
+        (not _same_chunks(theirs.chunks, mine.chunks), "its chunks are not those that readers expect"),
+    )
+    what = next((what for is_wrong, what in tests if is_wrong), "")
+    return what if what or summary is None else _summary_disagreement(summary, mine, found)
+
+
+def count_by_indexes(view: View) -> int:
+    """Return the number of messages that a reader finds by the summary and the message indexes."""
+    contents = load_contents(view)
+    total = sum(map(len, contents.loose.values()))
+    for chunk in contents.chunks:
+        total += sum(map(len, chunk_entries(view, chunk, {}).values()))
+    return total
+
+
+def _check_lengths(view: View, start: int) -> None:
+    """Refuse a summary with wrong lengths: a reader that trusts them would read too much."""
+    for at in walk(view, start, view.size):
+        if at.opcode == Opcode.FOOTER:
+            return
+        if at.opcode < PRIVATE:
+            exact(view, at, view.read(at.offset, at.length))
+
+
+def _summary_disagreement(summary: Summary, mine: Contents, found: Survey) -> str:
+    theirs, statistics, _ = summary
+    if theirs.chunks and not _same_chunks(theirs.chunks, mine.chunks):
+        return "its chunk indexes do not match its chunks"
+    for kind, records, own in (
+        ("schema", theirs.schemas, found.definitions.schemas),
+        ("channel", theirs.channels, found.definitions.channels),
+    ):
+        if any(own.get(key, record) != record for key, record in records.items()):
+            return f"a {kind} is defined in two ways"
+        if records and not _used(kind, mine) <= records.keys():
+            return f"a {kind} is missing in its summary"
+    if theirs.attachments and _places(theirs.attachments) != _places(mine.attachments):
+        return "its attachment indexes are wrong"
+    if theirs.metadata and _places(theirs.metadata) != _places(mine.metadata):
+        return "its metadata indexes are wrong"
+    return "its statistics are wrong" if statistics and not _fits(statistics, mine) else ""
+
+
+def _used(kind: str, mine: Contents) -> set[int]:
+    """Return the ids of the channels that have messages, or of their schemas."""
+    used = {channel for channel, number in mine.counts.items() if number}
+    return used if kind == "channel" else {mine.channels[key].schema_id for key in used} - {0}
+
+
+def _places(records: list[mcap.AttachmentIndex] | list[mcap.MetadataIndex]) -> list[tuple[int, int, str]]:
+    return sorted((record.offset, record.length, record.name) for record in records)
+
+
+def _fits(statistics: mcap.Statistics, mine: Contents) -> bool:
+    counts = Counter(statistics.channel_message_counts) == Counter(mine.counts)
+    total = statistics.message_count == sum(mine.counts.values())
+    span = (statistics.message_start_time, statistics.message_end_time)
+    return counts and total and (not statistics.message_count or span == (mine.start_ns, mine.end_ns))
+
+
+def _same_chunks(theirs: list[ChunkRef], mine: list[ChunkRef]) -> bool:
+    return len(theirs) == len(mine) and all(map(_same_chunk, theirs, mine))
+
+
+def _same_chunk(theirs: ChunkRef, mine: ChunkRef) -> bool:
+    """Compare all fields that readers use; a writer may leave out the message indexes."""
+    lengths = (mine.index_length,) if theirs.index_offsets else (0, mine.index_length)
+    offsets = theirs.index_offsets in ({}, mine.index_offsets) and theirs.index_length in lengths
+    same = theirs._replace(index_length=0, index_offsets={}) == mine._replace(
+        index_length=0, index_offsets={}
+    )
+    return same and offsets

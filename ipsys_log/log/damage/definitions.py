@@ -1,0 +1,312 @@
+"""Schemas and channels of a data section, in file order, with substitutes for lost ones."""
+
+from collections.abc import Iterator, Mapping, Sequence
+from contextlib import suppress
+from dataclasses import dataclass, field, replace
+from itertools import islice
+from typing import Any
+
+from mcap import records as mcap
+from mcap.opcode import Opcode
+
+from ipsys_log.errors import LogError
+from ipsys_log.log.byte_source import View
+from ipsys_log.log.chunks import Inside
+from ipsys_log.log.contents import Contents
+from ipsys_log.log.damage.regions import Stretch
+from ipsys_log.log.load import Summary
+from ipsys_log.log.records import MESSAGE, RecordAt, as_bytes, exact, walk
+
+__all__ = ["Definitions", "placeholder"]
+
+_MOST_MISREAD = 100
+_MOST_ROOMS = 50  # stretches that are tried
+_LARGEST = 1 << 28  # bytes: limit of the memory for one definition
+
+
+def placeholder(channel_id: int) -> mcap.Channel:
+    """Return a substitute for a lost channel; its record is no longer than any that it replaces."""
+    return mcap.Channel(channel_id, f"/lost/{channel_id}", "", {}, 0)
+
+
+@dataclass(slots=True)
+class Definitions:
+    """The definitions up to the present offset, by id.
+
+    `known` holds definitions of the summary or of damaged chunks; they replace those missing in the data
+    section. If the CRC of the summary is right, a record that contradicts it is damaged. `rooms` are the
+    damaged stretches so far: lost definitions are written there.
+    """
+
+    summary: Summary | None
+    rooms: list[Stretch]
+    schemas: dict[int, mcap.Schema] = field(default_factory=dict)
+    channels: dict[int, mcap.Channel] = field(default_factory=dict)
+    known: Inside = field(default_factory=Inside)
+    _schema_at: dict[int, int] = field(default_factory=dict)  # offset of the definition of each schema
+    _sure: Contents | None = None
+    _checked: set[tuple[bool, int]] = field(default_factory=set)  # schemas and channels by the CRC of a chunk
+    _places: dict[tuple[bool, int], RecordAt] = field(
+        default_factory=dict
+    )  # schemas and channels in no chunk
+    _full: int = 0  # number of the first rooms that are full
+    _misread: list[mcap.Channel] = field(default_factory=list)
+    _unused: dict[int, RecordAt] = field(default_factory=dict)  # records of channels without messages so far
+    _doubtful: set[tuple[bool, int]] = field(default_factory=set)  # schemas and channels read after damage
+    _strange: set[int] = field(default_factory=set)  # offsets of chunks that contradict
+    _lost: set[int] = field(default_factory=set)  # channels of messages for which no room was left
+
+    def __post_init__(self) -> None:
+        if self.summary is not None:
+            contents, statistics, checked = self.summary
+            self.known = Inside(dict(contents.schemas), dict(contents.channels))
+            counts = (len(contents.schemas), len(contents.channels))
+            if checked and statistics and counts == (statistics.schema_count, statistics.channel_count):
+                self._sure = contents
+
+    def take(self, view: View, at: RecordAt, *, doubtful: bool = False) -> None:
+        """Add a Schema or Channel record outside of chunks; `doubtful` if damage is near.
+
+        Raises
+        ------
+        LogError
+            It cannot be parsed, or contradicts the summary or an earlier record.
+        """
+        if at.length > _LARGEST:
+            raise view.fault(at.offset, f"a definition claims {at.length} bytes")
+        record = exact(view, at, view.read(at.offset, at.length))
+        if isinstance(record, mcap.Schema):
+            if record.id == 0 or self._contradicts(record):
+                raise view.fault(at.offset, f"the definition of schema {record.id} is damaged")
+            self.schemas[record.id] = record
+            self._schema_at.setdefault(record.id, at.offset)
+            self._places[True, record.id] = at
+            self._note_doubt((True, record.id), doubtful=doubtful)
+            return
+        assert isinstance(record, mcap.Channel)
+        channel = record
+        if self._contradicts(channel):
+            if len(self._misread) < _MOST_MISREAD:
+                self._misread.append(channel)
+            raise view.fault(at.offset, f"the definition of channel {channel.id} is damaged")
+        if not self._has_schema(channel):
+            raise view.fault(at.offset, f"channel {channel.id} has a schema that is not in the log")
+        if channel.id not in self.channels:
+            self._unused[channel.id] = at
+            self._places[False, channel.id] = at
+        self._note_doubt((False, channel.id), doubtful=doubtful)
+        self.channels[channel.id] = channel
+
+    def _note_doubt(self, key: tuple[bool, int], *, doubtful: bool) -> None:
+        if doubtful:
+            self._doubtful.add(key)
+        else:
+            self._doubtful.discard(key)
+
+    def take_chunk(
+        self,
+        view: View,
+        offset: int,
+        inside: Inside,
+        *,
+        checked: bool,
+        doubtful: bool = False,
+        alone: bool = False,
+    ) -> None:
+        """Add the definitions of a chunk, and check that all its messages have a channel.
+
+        A chunk that is `checked` by its CRC takes precedence over definitions outside of chunks. Near damage
+        (`doubtful`) it may be a piece of another log. Then it must agree with the definitions before the
+        damage that had messages, and with all of them if damage follows it too (`alone`).
+
+        Raises
+        ------
+        LogError
+            A definition is lost and cannot be restored.
+        """
+        records: list[mcap.Schema | mcap.Channel] = [*inside.schemas.values(), *inside.channels.values()]
+        for record in records:
+            if self._contradicts(record, checked=checked, doubtful=doubtful, alone=alone):
+                self._strange.add(offset)
+                raise view.fault(offset, "a definition in the chunk contradicts another one")
+        for channel in inside.channels.values():
+            if channel.schema_id not in inside.schemas and not self._has_schema(channel):
+                raise view.fault(offset, f"channel {channel.id} has a schema that is not in the log")
+        for channel_id in inside.entries:
+            self._unused.pop(channel_id, None)
+        for channel_id in inside.entries.keys() - inside.channels.keys():
+            self.need(view, offset, channel_id)
+        if checked:
+            self._confirm(records)
+        for key, schema in inside.schemas.items():
+            self.schemas.setdefault(key, schema)
+            self._schema_at.setdefault(key, offset)
+        self.channels |= {key: value for key, value in inside.channels.items() if key not in self.channels}
+
+    def need(self, view: View, offset: int, channel_id: int) -> None:
+        """Ensure that the channel of a message at `offset` is defined, if necessary by a placeholder.
+
+        Raises
+        ------
+        LogError
+            No stretch before `offset` has room for the definition.
+        BoundError
+            The log has more channels than its file size allows.
+        """
+        self._unused.pop(channel_id, None)
+        if channel_id in self.channels:
+            return
+        known = self.known.channels.get(channel_id) or self._by_one_bit(view, offset, channel_id)
+        channel = known or placeholder(channel_id)
+        if not self._put_back(channel):
+            self._lost.add(channel_id)
+            view.check_number(len(self.channels) + len(self._lost), "channels")
+            raise view.fault(offset, f"a message is of channel {channel_id}, whose definition is lost")
+        self.channels[channel_id] = channel
+
+    def topic(self, channel_id: int) -> str:
+        """Return the topic of a channel, or its id if the topic is not known."""
+        channel = self.channels.get(channel_id) or self.known.channels.get(channel_id)
+        return channel.topic if channel else f"channel {channel_id}"
+
+    def missing(self, channel_ids: set[int], defined: Inside) -> Iterator[mcap.McapRecord]:
+        """Yield records that must stand before messages of these channels, which `defined` may define."""
+        schemas, channels = defined.schemas | self.known.schemas, defined.channels | self.known.channels
+        for channel_id in sorted(channel_ids - self.channels.keys()):
+            channel = channels.get(channel_id) or placeholder(channel_id)
+            if channel.schema_id and channel.schema_id not in self.schemas:
+                schema = schemas.get(channel.schema_id) or _empty_schema(channel.schema_id)
+                self.schemas[schema.id] = schema
+                yield schema
+            self.channels[channel_id] = channel
+            yield channel
+
+    def complete(self) -> None:
+        """Add the definitions of the summary that no message has needed."""
+        for channel in self._sure.channels.values() if self._sure else ():
+            self.channels.setdefault(channel.id, channel)
+        for schema in self._sure.schemas.values() if self._sure else ():
+            self.schemas.setdefault(schema.id, schema)
+
+    def _confirm(self, records: Sequence[mcap.Schema | mcap.Channel]) -> None:
+        """Replace definitions without CRC by those with a right CRC, and blank the records of the former."""
+        for record in records:
+            key = (isinstance(record, mcap.Schema), record.id)
+            mine: dict[int, Any] = self.schemas if key[0] else self.channels
+            if key not in self._checked and mine.get(record.id, record) != record:
+                self._blank(mine, key)
+                users = [c.id for c in self.channels.values() if key[0] and c.schema_id == record.id]
+                for channel_id in users:
+                    self._blank(self.channels, (False, channel_id))
+            self._checked.add(key)
+
+    def _blank(self, mine: dict[int, Any], key: tuple[bool, int]) -> None:
+        del mine[key[1]]
+        at = self._places.pop(key, None)
+        if at is not None:
+            self.rooms.append(Stretch(at.offset, at.length))
+
+    def is_stranger(self, offset: int, inside: Inside) -> bool:
+        """Return whether a chunk with a right CRC defines an id of this log differently."""
+        if offset in self._strange:
+            return True
+        records: list[mcap.Schema | mcap.Channel] = [*inside.schemas.values(), *inside.channels.values()]
+        return any(self._contradicts(record, checked=True) for record in records)
+
+    def _contradicts(
+        self,
+        record: mcap.Schema | mcap.Channel,
+        *,
+        checked: bool = False,
+        doubtful: bool = False,
+        alone: bool = False,
+    ) -> bool:
+        """Return whether others contradict a definition; a `checked` one yields only to `checked` ones.
+
+        See `take_chunk` for those near damage.
+        """
+        schema = isinstance(record, mcap.Schema)
+        mine: Mapping[int, mcap.Schema | mcap.Channel] = self.schemas if schema else self.channels
+        key = (schema, record.id)
+        is_sure = not checked or key in self._checked
+        is_sure |= doubtful and key not in self._doubtful and (alone or self._is_used(key))
+        if is_sure and record.id in mine and mine[record.id] != record:
+            return True
+        if self._sure is None:
+            return False
+        sure: Mapping[int, mcap.Schema | mcap.Channel] = self._sure.schemas if schema else self._sure.channels
+        return sure.get(record.id) != record
+
+    def _is_used(self, key: tuple[bool, int]) -> bool:
+        """Return whether a message needed this schema or channel."""
+        is_schema, record_id = key
+        used = self.channels.keys() - self._unused.keys()
+        if is_schema:
+            return any(self.channels[channel_id].schema_id == record_id for channel_id in used)
+        return record_id in used
+
+    def _has_schema(self, channel: mcap.Channel) -> bool:
+        """Return whether the schema of a channel is defined before it, or can be restored."""
+        key = channel.schema_id
+        if key == 0 or key in self.schemas:
+            return True
+        known = self.known.schemas.get(key)
+        schema = known or _empty_schema(key)
+        room = self._room_for(as_bytes(schema), 0)
+        if room is None:  # both are restored later, in a stretch with room for both
+            self.known.channels.setdefault(channel.id, channel if known else replace(channel, schema_id=0))
+            return False
+        self.schemas[key] = schema
+        self._schema_at[key] = room.offset
+        return True
+
+    def _put_back(self, channel: mcap.Channel) -> bool:
+        """Write a channel into a damaged stretch: after its schema, or together with it."""
+        key, data = channel.schema_id, as_bytes(channel)
+        if key == 0:
+            return self._room_for(data, 0) is not None
+        if key in self.schemas and self._room_for(data, self._schema_at.get(key, 0)) is not None:
+            return True
+        schema = self.schemas.get(key) or self.known.schemas.get(key) or _empty_schema(key)
+        room = self._room_for(as_bytes(schema) + data, 0)
+        if room is not None:
+            self.schemas[key] = schema
+            self._schema_at[key] = min(room.offset, self._schema_at.get(key, room.offset))
+        return room is not None
+
+    def _room_for(self, data: bytes, start: int) -> Stretch | None:
+        """Put records into the first stretch from `start` on that has room for them."""
+        while self._full < len(self.rooms) - 1 and self.rooms[self._full].is_full:
+            self._full += 1
+        rooms = islice(self.rooms, self._full, self._full + _MOST_ROOMS)
+        return next((room for room in rooms if room.offset >= start and room.define(data)), None)
+
+    def _by_one_bit(self, view: View, offset: int, channel_id: int) -> mcap.Channel | None:
+        """Return the channel whose record differs in one bit of its id, and has no messages.
+
+        If it has messages after the one at `offset`, the id in that message is wrong.
+        """
+        records = [record for record in self._misread if (record.id ^ channel_id).bit_count() == 1]
+        if not self.rooms:  # its record looks whole, but its channel has no messages
+            near = [key for key in self._unused if (key ^ channel_id).bit_count() == 1]
+            unused = [key for key in near if not _has_message(view, offset, key)]
+            records = [self.channels[key] for key in unused]
+            if len(records) == 1:
+                at = self._unused.pop(unused[0])
+                self.rooms.append(Stretch(at.offset, at.length))
+                del self.channels[unused[0]]
+        return replace(records[0], id=channel_id) if len(records) == 1 else None
+
+
+def _has_message(view: View, start: int, channel_id: int) -> bool:
+    """Return whether a message of a channel lies outside of chunks, from `start` up to the next damage."""
+    with suppress(LogError):
+        for at in walk(view, start, view.size):
+            is_message = at.opcode == Opcode.MESSAGE and at.length >= MESSAGE.size
+            if is_message and MESSAGE.unpack(view.read(at.offset, MESSAGE.size))[2] == channel_id:
+                return True
+    return False
+
+
+def _empty_schema(schema_id: int) -> mcap.Schema:
+    return mcap.Schema(schema_id, b"", "", "")

@@ -1,0 +1,170 @@
+"""Models from camera to world coordinates: scikit-learn estimators and one table of their names.
+
+A fitted model travels as named arrays (:func:`parameters`, :func:`restore`), never as a pickle.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Mapping
+from functools import cache
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+from sklearn.pipeline import Pipeline
+
+from ipsys_log.errors import FitError, IpsysError
+from ipsys_log.models.ann import NeuralNetwork
+from ipsys_log.models.kriging import Kriging
+from ipsys_log.models.poly import PolynomialRegression
+from ipsys_log.models.ray_models import RayDepth
+from ipsys_log.models.rayplane import RayPlane
+from ipsys_log.models.rays import Places, tied
+from ipsys_log.models.rigid import RigidTransform
+
+__all__ = [
+    "MODELS",
+    "Places",
+    "create",
+    "fit_cameras",
+    "inputs",
+    "min_pairs",
+    "parameters",
+    "predict_array",
+    "reads_height",
+    "restore",
+    "tied_cameras",
+]
+
+# Those of the paper in the order of its tables: RT, PR, RT+PR, ANN, RT+ANN, KI, RT+KI, KR, RT+KR. A hybrid
+# feeds the first one's output to the second.
+MODELS: dict[str, Callable[[], Any]] = {
+    "rigid": RigidTransform,
+    "poly": PolynomialRegression,
+    "rigid+poly": lambda: _after_rigid("poly", PolynomialRegression()),
+    "ann": NeuralNetwork,
+    "rigid+ann": lambda: _after_rigid("ann", NeuralNetwork()),
+    "kriging": Kriging,
+    "rigid+kriging": lambda: _after_rigid("kriging", Kriging()),
+    "kriging-regression": lambda: Kriging(noisy=True),
+    "rigid+kriging-regression": lambda: _after_rigid("kriging-regression", Kriging(noisy=True)),
+    "rayplane": RayPlane,
+    "best": RayDepth,
+}
+
+
+def _after_rigid(name: str, second: Any) -> Pipeline:
+    return Pipeline([("rigid", RigidTransform()), (name, second)])
+
+
+def create(name: str) -> Any:
+    """An unfitted estimator by its name in :data:`MODELS`.
+
+    Raises
+    ------
+    IpsysError
+        For a name that is not in the table.
+    """
+    if name not in MODELS:
+        raise IpsysError(f"model {name!r} is not known; use one of {', '.join(MODELS)}")
+    return MODELS[name]()
+
+
+def min_pairs(name: str) -> int:
+    """How many measured places a model needs at least."""
+    return max(int(step.min_pairs) for _, step in _steps(create(name)))
+
+
+@cache
+def reads_height(name: str) -> bool:
+    """Whether a model needs the height at which a marker is carried."""
+    return any(getattr(step, "reads_height", False) for _, step in _steps(create(name)))
+
+
+def inputs(name: str, points_m: NDArray[np.float64], heights_m: NDArray[np.float64]) -> NDArray[np.float64]:
+    """What a model predicts from: camera points (n, 3), and heights (n,) where it needs them."""
+    return np.column_stack([points_m, heights_m]) if reads_height(name) else points_m
+
+
+def predict_array(estimator: Any, points: NDArray[np.float64]) -> NDArray[np.float64]:
+    """``estimator.predict(points)``, for an array (n, d) of numbers that needs no checks.
+
+    For the few points of a frame scikit-learn's checks take ten times as long as a model. An estimator that
+    has no ``predict_array`` of its own still makes them.
+    """
+    for _, step in _steps(estimator):
+        points = getattr(step, "predict_array", step.predict)(points)
+    return points
+
+
+def fit_cameras(name: str, cameras: Mapping[str, Places]) -> dict[str, Any]:
+    """A fitted estimator for each camera, from the places that it saw.
+
+    Physical models are fitted to all cameras at once: places that two of them saw tie them together.
+
+    Raises
+    ------
+    FitError
+        Where the places do not determine a model, naming the camera.
+    """
+    models = {camera: create(name) for camera in cameras}
+    if (fit_jointly := getattr(MODELS[name], "fit_jointly", None)) is not None:
+        return dict(zip(models, fit_jointly([*models.values()], [*cameras.values()]), strict=True))
+    for camera, places in cameras.items():
+        try:
+            models[camera].fit(inputs(name, places.points_m, places.world_m[:, 2]), places.world_m)
+        except FitError as error:
+            raise FitError(f"camera {camera}: {error}") from error
+    return models
+
+
+def tied_cameras(name: str, cameras: Mapping[str, Places]) -> list[list[str]]:
+    """The cameras by groups whose models depend on one another's places."""
+    names = list(cameras)
+    if not hasattr(MODELS[name], "fit_jointly"):
+        return [[camera] for camera in names]
+    return [[names[i] for i in group] for group in tied(list(cameras.values()))]
+
+
+def parameters(estimator: Any) -> dict[str, NDArray[np.float64]]:
+    """The fitted parameters of an estimator, by names such as ``rigid.rotation``.
+
+    Examples
+    --------
+    >>> points = np.array([[0.0, 0, 0], [1, 0, 0], [0, 1, 0]])
+    >>> model = create("rigid").fit(points, points + 1)
+    >>> sorted(parameters(model))
+    ['rotation', 'translation']
+    >>> restore("rigid", parameters(model)).predict(points[:1]).round(9).tolist()
+    [[1.0, 1.0, 1.0]]
+    """
+    return {
+        prefix + attribute.rstrip("_"): np.asarray(getattr(step, attribute), dtype=np.float64)
+        for prefix, step in _steps(estimator)
+        for attribute in step.fitted
+    }
+
+
+def restore(name: str, arrays: Mapping[str, NDArray[np.float64]]) -> Any:
+    """The estimator called ``name`` with the parameters that :func:`parameters` gave.
+
+    Raises
+    ------
+    IpsysError
+        For an unknown model, or one that lacks a parameter.
+    """
+    estimator = create(name)
+    for prefix, step in _steps(estimator):
+        step.n_features_in_ = 4 if getattr(step, "reads_height", False) else 3
+        for attribute in step.fitted:
+            key = prefix + attribute.rstrip("_")
+            if key not in arrays:
+                raise IpsysError(f"the stored model {name} has no parameter {key!r}; fit it again")
+            setattr(step, attribute, np.array(arrays[key], dtype=np.float64))
+    return estimator
+
+
+def _steps(estimator: Any) -> list[tuple[str, Any]]:
+    if isinstance(estimator, Pipeline):
+        return [(f"{name}.", step) for name, step in estimator.steps]
+    return [("", estimator)]

@@ -1,1 +1,0 @@
-"""Steps that need the whole log: tables in, messages out."""

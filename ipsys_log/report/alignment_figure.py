@@ -1,0 +1,167 @@
+"""How the cameras hang as one picture: the floor as they see it, and which way to tilt each one."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Mapping
+from pathlib import Path
+
+import numpy as np
+from matplotlib.axes import Axes
+from matplotlib.colors import ListedColormap
+from matplotlib.figure import Figure
+from numpy.typing import NDArray
+
+from ipsys_log.analysis.alignment import Alignment
+from ipsys_log.analysis.coverage import Coverage
+from ipsys_log.geometry.lenses import project
+from ipsys_log.messages import CameraCalibration
+from ipsys_log.report.alignment import AlignedLab
+from ipsys_log.report.figures import picture, shorten
+from ipsys_log.report.files import write_files
+from ipsys_log.report.floor_panel import draw_ground
+from ipsys_log.report.palette import NOTE, REST, camera_styles
+from ipsys_log.units import CM_PER_M
+
+__all__ = ["draw_alignment"]
+
+Array = NDArray[np.float64]
+
+_DPI = 100
+_FLOOR_IN, _PANEL_IN, _GAP_IN = 5.6, 3.4, 0.55
+_ROWS, _ROW_IN = 3, 2.4
+# Seen by one camera, by more, and where a marker is whole in no picture.
+_ONE, _MORE, _NONE = "#EAF1F8", "#C3D6E8", "#F2B8A0"
+_LEVEL, _TILTED = "#00734D", "#B3261E"
+_NEAR, _FAR = "#0072B2", "#D55E00"
+
+
+def draw_alignment(lab: AlignedLab, path: Path) -> None:
+    """Draw: on the left the floor map, where it is known; on the right each camera's picture with
+    its markers, by how much Zc there is off the middle one, and an arrow to where it has to look.
+
+    Parameters
+    ----------
+    path : the picture, of the kind that its suffix says, in place of one that is there already.
+    """
+    floor = lab.coverage is not None
+    columns = -(-len(lab.alignments) // _ROWS)
+    left_in = _FLOOR_IN + 1.5 if floor else 0.4
+    rows = _ROWS if floor else min(len(lab.alignments), _ROWS)
+    size = (left_in + columns * (_PANEL_IN + _GAP_IN), 0.3 + _ROW_IN * rows)
+    figure = Figure(figsize=size, dpi=_DPI)
+    if lab.coverage is not None:
+        axes = figure.add_axes((0.65 / size[0], 1.0 / size[1], _FLOOR_IN / size[0], _FLOOR_IN / size[1]))
+        _draw_floor(axes, lab, lab.coverage)
+        handles, labels = axes.get_legend_handles_labels()
+        where = (0.5 / size[0], 0.05 / size[1])
+        figure.legend(handles, labels, loc=where, ncols=3, fontsize=8, frameon=False)
+    for number, alignment in enumerate(lab.alignments):
+        column, row = divmod(number, _ROWS)
+        x_in, y_in = left_in + column * (_PANEL_IN + _GAP_IN), size[1] - 0.15 - (row + 1) * _ROW_IN
+        height_in = _PANEL_IN * 9 / 16
+        box = (x_in / size[0], y_in / size[1], _PANEL_IN / size[0], height_in / size[1])
+        _draw_picture(figure.add_axes(box), alignment, lab.lenses)
+    write_files(path.parent, {path.name: picture(figure, path, _DPI)})
+
+
+def _draw_floor(axes: Axes, lab: AlignedLab, coverage: Coverage) -> None:
+    draw_ground(axes, lab.rig, [])
+    axes.grid(visible=False)
+    counts = np.sum([*coverage.whole.values()], axis=0)
+    half_m = (coverage.xs_m[1] - coverage.xs_m[0]) / 2
+    frame = (
+        coverage.xs_m[0] - half_m, coverage.xs_m[-1] + half_m,
+        coverage.ys_m[0] - half_m, coverage.ys_m[-1] + half_m,
+    )  # fmt: skip
+    shades = ListedColormap([_NONE, _ONE, _MORE])
+    # A marker that hangs over the edge need not be seen.
+    shown = np.ma.masked_where((counts == 0) & ~coverage.fits, np.minimum(counts, 2))
+    axes.imshow(shown, cmap=shades, vmin=0, vmax=2, origin="lower", extent=frame, zorder=0.5)
+    for colour, text in ((_ONE, "whole in one picture"), (_MORE, "in two or more"), (_NONE, "in none")):
+        axes.plot([], [], "s", ms=9, mfc=colour, mec=REST, label=text)
+    styles = camera_styles(one.camera for one in lab.hung)
+    for one in lab.hung:
+        colour, shape = styles[one.camera]
+        # Beyond the floor nothing was looked at: its edge closes the outline.
+        seen = np.pad(coverage.whole[one.camera].astype(float), 1)
+        around_m = [
+            np.concatenate([[v[0] - half_m], v, [v[-1] + half_m]]) for v in (coverage.xs_m, coverage.ys_m)
+        ]
+        axes.contour(*around_m, seen, levels=[0.5], colors=[colour], linewidths=1.8, zorder=3)
+        axes.plot(*one.foot_m, shape, color=colour, ms=7, mec="white", zorder=5, label=shorten(one.camera))
+    for overlap in coverage.overlaps:
+        good, width_cm = overlap.width_m >= coverage.diagonal_m, overlap.width_m * CM_PER_M
+        text = f"pictures overlap {width_cm:.0f} cm" if width_cm > 0 else f"gap of {-width_cm:.0f} cm"
+        axes.annotate(
+            text, overlap.at_m.tolist(), ha="center", va="center",
+            fontsize=8, color=_LEVEL if good else _TILTED, weight="bold", zorder=6,
+            bbox={"boxstyle": "round,pad=0.2", "fc": "white", "ec": "none", "alpha": 0.85},
+        )  # fmt: skip
+    height = f", {coverage.height_m * CM_PER_M:.0f} cm above the floor" if coverage.height_m else ""
+    axes.set_title(f"Where a marker is whole in a picture, by its middle{height}", loc="left", fontsize=10)
+
+
+def _draw_picture(axes: Axes, one: Alignment, lenses: Mapping[str, CameraCalibration]) -> None:
+    colour = {None: "black", True: _LEVEL, False: _TILTED}[one.level]
+    state = {None: "tilt not known", True: "level", False: "to be tilted"}[one.level]
+    spread = "" if one.spread_m is None else f", spread {one.spread_m * CM_PER_M:.1f} cm"
+    axes.set_title(f"{shorten(one.camera)}: {state}{spread}", loc="left", fontsize=10, color=colour)
+    axes.set(xticks=[], yticks=[])
+    lens = lenses.get(one.camera)
+    if lens is None:
+        axes.annotate("no calibration", (0.5, 0.5), xycoords="axes fraction", ha="center", color=NOTE)
+        return
+    axes.set(xlim=(0, lens.width), ylim=(lens.height, 0), aspect="equal")
+    # The optical axis, which is to stand upright on the floor.
+    axes.plot(*lens.K[:2, 2], "+", color=REST, ms=12, zorder=1)
+    if one.lying:
+        _draw_depths(axes, one, lens)
+    for lying, _ in one.raised:
+        x, y = project(lying.point_m[None], lens)[0]
+        axes.plot(x, y, "x", color=NOTE, ms=6, zorder=3)
+        axes.annotate(
+            f"{lying.marker_id} left out", (x, y), (7, 0), textcoords="offset points", va="center",
+            fontsize=8, color=NOTE,
+        )  # fmt: skip
+    if one.level is False and one.down is not None:
+        _draw_arrow(axes, one, lens)
+
+
+def _draw_depths(axes: Axes, one: Alignment, lens: CameraCalibration) -> None:
+    points_m = np.array([lying.point_m for lying in one.lying])
+    depths_m = points_m[:, 2] + np.array([lying.height_m for lying in one.lying])
+    off_cm = ((depths_m - np.median(depths_m)) * CM_PER_M).round(1) + 0.0  # no -0.0
+    few = len(off_cm) <= 12
+    for (x, y), cm, lying in zip(project(points_m, lens), off_cm, one.lying, strict=True):
+        hue = REST if abs(cm) < 0.5 else _FAR if cm > 0 else _NEAR
+        axes.plot(x, y, "o", color=hue, ms=5 if few else min(9, 2 + 0.7 * abs(cm)), alpha=0.9, zorder=2)
+        if few:
+            up = y > lens.height / 2
+            axes.annotate(
+                f"{lying.marker_id}: {cm:+.1f}", (x, y), (0, 6 if up else -6), textcoords="offset points",
+                ha="center", va="bottom" if up else "top", fontsize=8, color=NOTE, annotation_clip=False,
+            )  # fmt: skip
+    axes.annotate(
+        "Zc in cm off the middle one: orange farther, blue nearer", (0, -0.02), xycoords="axes fraction",
+        va="top", fontsize=7, color=NOTE,
+    )  # fmt: skip
+
+
+def _draw_arrow(axes: Axes, one: Alignment, lens: CameraCalibration) -> None:
+    """To where it has to look; its length says nothing."""
+    assert one.down is not None
+    assert one.tilt_rad is not None
+    start = lens.K[:2, 2]
+    direction = one.down[:2] / max(float(np.hypot(*one.down[:2])), 1e-9)
+    end = start + 0.3 * lens.height * direction
+    axes.annotate(
+        "", end.tolist(), start.tolist(), zorder=4,
+        arrowprops={"arrowstyle": "-|>", "color": _TILTED, "lw": 2.2, "shrinkA": 0, "shrinkB": 0},
+    )  # fmt: skip
+    beyond = start + 0.4 * lens.height * direction
+    axes.annotate(
+        f"{math.degrees(one.tilt_rad):.1f}°", beyond.tolist(), ha="center", va="center", fontsize=9,
+        color=_TILTED, weight="bold", zorder=5,
+        bbox={"boxstyle": "round,pad=0.15", "fc": "white", "ec": "none"},
+    )  # fmt: skip

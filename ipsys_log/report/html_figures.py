@@ -1,0 +1,132 @@
+"""The pictures of a session's page: narrow enough for a telephone, each with what it needs to be read."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from typing import Any
+
+from matplotlib.axes import Axes
+from matplotlib.figure import Figure
+from matplotlib.lines import Line2D
+
+from ipsys_log.report.advice import label
+from ipsys_log.report.figures import svg_uri
+from ipsys_log.report.findings import Findings
+from ipsys_log.report.learning import has_published
+from ipsys_log.report.learning_figure import Curves, camera_curves, curves_picture, limits_cm, mean_curves
+from ipsys_log.report.models_figure import HELD_OUT, draw_models, models_note
+from ipsys_log.report.points_figure import draw_coverage
+from ipsys_log.report.residuals_figure import draw_residuals, residual_scale, shown_models
+
+__all__ = [
+    "coverage_picture",
+    "learning_pictures",
+    "models_pictures",
+    "published_pictures",
+    "residual_pictures",
+]
+
+_WIDTH_IN = 4.7
+_SPACE = {True: "in space", False: "on the floor"}
+
+Picture = dict[str, Any]
+
+
+def _picture(figure: Figure, caption: str) -> Picture:
+    width_in, height_in = figure.get_size_inches()
+    # The size in pixels keeps the place of a picture while the page loads.
+    size = {"width": round(96 * width_in), "height": round(96 * height_in)}
+    return {"uri": svg_uri(figure), "caption": caption, **size}
+
+
+def _figure(height_in: float) -> tuple[Figure, Axes]:
+    figure = Figure(figsize=(_WIDTH_IN, height_in), layout="constrained")
+    axes = figure.add_subplot()
+    axes.tick_params(labelsize=8)
+    return figure, axes
+
+
+def _spaces(findings: Findings) -> tuple[bool, ...]:
+    return (True, False) if findings.in_space else (False,)
+
+
+def models_pictures(findings: Findings) -> list[Picture]:
+    """Models side by side, in space and on the floor."""
+    pictures = []
+    ranked = findings.ranked()
+    for in_space in _spaces(findings):
+        figure, axes = _figure(1.4 + 0.27 * len(ranked))
+        draw_models(axes, ranked, in_space)
+        handles = [Line2D([], [], color="black", marker="o", ms=5, lw=2), Line2D([], [], **HELD_OUT)]  # type: ignore[arg-type]
+        figure.legend(
+            handles, ["cross-validation, 95 % interval", "held-out places"],
+            loc="outside lower center", ncols=2, frameon=False, fontsize=8,
+        )  # fmt: skip
+        note = models_note(ranked)
+        caption = f"Mean error {_SPACE[in_space]} of each model" + (f" ({note})" if note else "")
+        pictures.append(_picture(figure, caption))
+    return pictures
+
+
+def residual_pictures(findings: Findings) -> list[Picture]:
+    """Where on the floor the shown models are off, with one scale of floor, arrows and colours."""
+    accuracies = shown_models(findings)
+    if not accuracies:
+        return []
+    pictures = []
+    scale = residual_scale(findings, accuracies)
+    for accuracy in accuracies:
+        figure, axes = _figure(5.6)
+        arrows = draw_residuals(axes, findings, accuracy, scale)
+        bar = figure.colorbar(
+            arrows, ax=axes, location="bottom", shrink=0.75, pad=0.02, extend="max", aspect=30
+        )
+        bar.set_label(f"error {_SPACE[findings.in_space]} in cm", fontsize=9)
+        bar.ax.tick_params(labelsize=8)
+        caption = (
+            f"Errors of {label(accuracy.model)}: an arrow goes from the measured place to the position, seen "
+            "from above and drawn longer than it is; dashed, the floor that a camera's places lie around"
+        )
+        pictures.append(_picture(figure, caption))
+    return pictures
+
+
+def learning_pictures(findings: Findings) -> list[Picture]:
+    """The mean over all cameras on random subsets, in space and on the floor."""
+    text = "Mean error {} over all cameras, fitted on random subsets; bars: one standard deviation"
+    return _curves_pictures(
+        {text.format(_SPACE[in_space]): mean_curves(findings, in_space) for in_space in _spaces(findings)}
+    )
+
+
+def published_pictures(findings: Findings) -> list[Picture]:
+    """Each camera on the labelled subsets, where there are such: figures 10 and 11 of the paper."""
+    text = "Mean error {} of camera {} at the held-out places, fitted on the labelled subsets"
+    if not has_published(findings.evaluations):
+        return []
+    return _curves_pictures(
+        {
+            text.format(_SPACE[in_space], camera): camera_curves(findings, camera, in_space)
+            for in_space in _spaces(findings)
+            for camera in findings.cameras
+        }
+    )
+
+
+def _curves_pictures(panels: Mapping[str, Curves]) -> list[Picture]:
+    """A picture for each caption, all with one scale."""
+    limits = limits_cm(panels.values())
+    return [
+        _picture(curves_picture(curves, _WIDTH_IN, limits), caption)
+        for caption, curves in panels.items()
+        if curves
+    ]
+
+
+def coverage_picture(findings: Findings) -> Picture | None:
+    """The floor that lies around no camera's places."""
+    if not findings.training_m():
+        return None
+    figure, axes = _figure(5.2)
+    draw_coverage(axes, findings)
+    return _picture(figure, "Places that the models were fitted on; hatched, the floor around which none lie")

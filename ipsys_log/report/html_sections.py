@@ -1,0 +1,148 @@
+"""What the page of a session says, as plain text and numbers for its template."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from typing import Any
+
+from ipsys_log.analysis.accuracy import POOLED
+from ipsys_log.messages import CameraEvaluation, ErrorStatistics
+from ipsys_log.report.accuracy import Accuracy
+from ipsys_log.report.advice import GROUPS, Choice, label, told_height
+from ipsys_log.report.findings import Findings, overall
+from ipsys_log.units import CM_PER_M
+
+__all__ = ["advice_rows", "format_cm", "headline", "in_order", "model_rows"]
+
+_TRUTH = "truth"
+
+
+def format_cm(value_m: float | None, digits: int = 2) -> str:
+    """A length in cm, or a dash where it is not known."""
+    return "–" if value_m is None else f"{value_m * CM_PER_M:.{digits}f}"
+
+
+def _interval(errors: ErrorStatistics) -> str:
+    if errors.mean_low_m is None or errors.mean_high_m is None:
+        return ""
+    return f"{format_cm(errors.mean_low_m)} to {format_cm(errors.mean_high_m)}"
+
+
+def headline(findings: Findings) -> dict[str, Any]:
+    """The best model, how good it is, and what that rests on."""
+    ranked = findings.ranked()
+    best = ranked[0]
+    row = overall(best, True) or overall(best, False)
+    assert row is not None  # a model without any row was not evaluated
+    errors, truth = findings.errors(row), overall(best, bool(best.rows(True)), _TRUTH)
+    told = [accuracy for accuracy in ranked if told_height(accuracy.model) and accuracy is not best]
+    return {
+        "model": label(best.model),
+        "mean": format_cm(errors.mean_m, 1),
+        "interval": [
+            format_cm(end_m, 1) for end_m in (errors.mean_low_m, errors.mean_high_m) if end_m is not None
+        ],
+        "in_space": findings.in_space,
+        "crossed": bool(best.rows(True)),
+        "count": errors.count,
+        "counts": _counts(best),
+        "floor": format_cm(row.error_2d.mean_m, 1),
+        "p95": format_cm(errors.p95_m, 1),
+        "truth": format_cm(findings.errors(truth).mean_m, 2) if truth else None,
+        "told": [(label(accuracy.model), _overall_mean(findings, accuracy)) for accuracy in told[:1]],
+        "fitted": [(camera, len(points_m)) for camera, points_m in in_order(findings, findings.training_m())],
+        "cameras": findings.cameras,
+    }
+
+
+def _counts(accuracy: Accuracy) -> list[str]:
+    """How many places errors were judged at."""
+    schemes = {"by cross-validation": overall(accuracy, True), "held out": overall(accuracy, False)}
+    return [f"{row.error_2d.count} {name}" for name, row in schemes.items() if row]
+
+
+def _overall_mean(findings: Findings, accuracy: Accuracy) -> str:
+    row = overall(accuracy, True) or overall(accuracy, False)
+    return format_cm(findings.errors(row).mean_m if row else None, 1)
+
+
+def in_order(findings: Findings, by_camera: Mapping[str, Any]) -> list[tuple[str, Any]]:
+    """By camera, in the order of the rig."""
+    rest = sorted(set(by_camera) - {*findings.cameras})
+    return [(name, by_camera[name]) for name in (*findings.cameras, *rest) if name in by_camera]
+
+
+def advice_rows(findings: Findings) -> dict[str, Any] | None:
+    """What to use with how many places; the groups that say something, as columns."""
+    advice = findings.advice
+    if advice is None:
+        return None
+    return {
+        "published": advice.published,
+        "in_space": advice.in_space,
+        "groups": [GROUPS[group] for group in advice.groups],
+        "rows": [
+            (places, [_choice(found.get(group)) for group in advice.groups])
+            for places, found in advice.choices.items()
+        ],
+        "sentences": advice.sentences,
+    }
+
+
+def _choice(choice: Choice | None) -> dict[str, str] | None:
+    if choice is None:
+        return None
+    other = choice.lowest if choice.lowest != choice.model else ""
+    return {
+        "model": choice.model,
+        "mean": format_cm(choice.mean_m),
+        "lowest": other,
+        "lowest_mean": format_cm(choice.lowest_mean_m),
+    }
+
+
+def model_rows(findings: Findings, camera: str = POOLED) -> list[dict[str, Any]]:
+    """A row for each model and what it is compared with: of one camera, or of all, the best first."""
+    against = [a for a in ("tape", _TRUTH) if any(_rows(f, camera, a) for f in findings.accuracies)]
+    return [
+        {
+            "model": label(accuracy.model),
+            "against": side,
+            "several": len(against) > 1,
+            "held_out": _errors(accuracy, found.get(False)),
+            "crossed": _errors(accuracy, found.get(True)),
+        }
+        for accuracy in findings.ranked()
+        for side in against
+        if (found := _rows(accuracy, camera, side))
+    ]
+
+
+def _rows(accuracy: Accuracy, camera: str, against: str) -> dict[bool, CameraEvaluation]:
+    """By whether it is that of cross-validation."""
+    if camera == POOLED:
+        found = {crossed: overall(accuracy, crossed, against) for crossed in (False, True)}
+    else:
+        found = {
+            crossed: next(
+                (r for r in accuracy.rows(crossed) if (r.camera, r.against) == (camera, against)), None
+            )
+            for crossed in (False, True)
+        }
+    return {crossed: row for crossed, row in found.items() if row is not None}
+
+
+def _errors(accuracy: Accuracy, row: CameraEvaluation | None) -> dict[str, str] | None:
+    if row is None:
+        return None
+    names = ("mean", "min", "max", "std", "median", "p95")
+    space, floor = row.error_3d, row.error_2d
+    return {
+        "n": str(floor.count),
+        **{name: format_cm(getattr(space, f"{name}_m") if space else None) for name in names},
+        "rmse": format_cm(accuracy.rmse_m(row, space)),
+        "interval": _interval(space) if space else "",
+        "floor": format_cm(floor.mean_m),
+        "floor_interval": _interval(floor),
+        "floor_max": format_cm(floor.max_m),
+    }

@@ -1,0 +1,115 @@
+"""Where models were fitted and tested: figure 9 of the paper, and the floor that no place vouches for."""
+
+from __future__ import annotations
+
+from typing import Any
+
+import numpy as np
+from matplotlib.axes import Axes
+from matplotlib.figure import Figure
+from matplotlib.patches import Polygon
+from matplotlib.ticker import MaxNLocator
+from numpy.typing import NDArray
+from scipy.spatial import ConvexHull, QhullError
+
+from ipsys_log.report.figures import shorten
+from ipsys_log.report.findings import Findings
+from ipsys_log.report.floor_panel import draw_ground
+from ipsys_log.report.palette import NOTE, TEST, camera_styles
+
+__all__ = ["draw_coverage", "draw_hulls", "hull_m", "places_figure"]
+
+Array = NDArray[np.float64]
+
+
+def places_figure(findings: Findings) -> Figure:
+    """Training places in black and test places in red, in space and from above."""
+    figure = Figure(figsize=(11.5, 5.6), layout="constrained")
+    training_m, test_m = (
+        np.vstack([np.empty((0, 3)), *points_m.values()])
+        for points_m in (findings.training_m(), findings.test_m())
+    )
+    space: Any = figure.add_subplot(1, 2, 1, projection="3d")
+    above = figure.add_subplot(1, 2, 2)
+    _draw_space(space, findings, training_m, test_m)
+    draw_ground(above, findings.rig, [points_m[:, :2] for points_m in (training_m, test_m) if len(points_m)])
+    for points_m, look in zip((training_m, test_m), _LOOKS, strict=True):
+        above.plot(*points_m[:, :2].T, ls="none", **look)
+    above.set_title("from above", fontsize=10, loc="left")
+    handles, labels = above.get_legend_handles_labels()
+    counted = [f"{len(training_m)} {labels[0]}", f"{len(test_m)} {labels[1]}"]
+    figure.legend(handles, counted, loc="outside lower center", ncols=2, frameon=False)
+    return figure
+
+
+_LOOKS: tuple[dict[str, Any], ...] = (
+    {"marker": "o", "color": "black", "ms": 4.5, "label": "training pairs (a place as one camera sees it)"},
+    {"marker": "^", "color": TEST, "ms": 6, "label": "test pairs"},
+)
+
+
+def _draw_space(axes: Any, findings: Findings, training_m: Array, test_m: Array) -> None:
+    for points_m, look in zip((training_m, test_m), _LOOKS, strict=True):
+        axes.plot(*points_m.T, ls="none", **look)
+        # A line down to the floor says where in the picture's depth a place is.
+        for x, y, z in points_m.tolist():
+            axes.plot([x, x], [y, y], [0, z], color=look["color"], lw=0.6, alpha=0.35)
+    floor = findings.rig.floor if findings.rig else None
+    if floor is not None:
+        corners = np.array([(0, 0), (1, 0), (1, 1), (0, 1), (0, 0)]) * (floor.width_m, floor.depth_m)
+        axes.plot(*corners.T, np.zeros(5), color="black", lw=1.2)
+    high_m = max(
+        (float(points_m[:, 2].max()) for points_m in (training_m, test_m) if len(points_m)), default=1
+    )
+    axes.set(xlabel="x in m", ylabel="y in m", zlabel="z in m", zlim=(0, 1.05 * high_m))
+    axes.zaxis.set_major_locator(MaxNLocator(4, steps=[1, 2, 5, 10]))
+    axes.zaxis.labelpad = 8
+    axes.set_box_aspect((1, 1, 0.5), zoom=1.08)
+    axes.view_init(elev=26, azim=-60)
+    axes.set_title("in space", fontsize=10, loc="left")
+
+
+def hull_m(points_m: Array) -> Array | None:
+    """Corners (k, 2) of the smallest convex part of the floor with all places (n, 2 or 3) in it."""
+    try:
+        return points_m[:, :2][ConvexHull(points_m[:, :2]).vertices]
+    except (QhullError, ValueError):
+        return None  # fewer than three, or on one line
+
+
+def draw_hulls(axes: Axes, findings: Findings, fill: bool = False) -> None:
+    """Outline for each camera the part of the floor that its places lie around."""
+    styles = camera_styles(findings.cameras)
+    for camera, points_m in findings.training_m().items():
+        corners_m = hull_m(points_m)
+        if corners_m is not None:
+            colour, _ = styles.get(camera, (NOTE, "o"))
+            if fill:
+                axes.add_patch(Polygon(corners_m, fc="white", ec="none", zorder=1.5))
+            axes.add_patch(
+                Polygon(
+                    corners_m,
+                    fill=False,
+                    ec=colour,
+                    lw=1.3,
+                    ls="--",
+                    zorder=2.2,
+                    label=f"camera {shorten(camera)}",
+                )
+            )
+
+
+def draw_coverage(axes: Axes, findings: Findings) -> None:
+    """Hatch the floor that lies around no camera's places."""
+    training_m = findings.training_m()
+    draw_ground(axes, findings.rig, [points_m[:, :2] for points_m in training_m.values()])
+    floor = findings.rig.floor if findings.rig else None
+    if floor is not None:
+        corners = np.array([(0, 0), (1, 0), (1, 1), (0, 1)]) * (floor.width_m, floor.depth_m)
+        axes.add_patch(Polygon(corners, fc="#F1F1F1", ec="#9A9A9A", hatch="///", lw=0, zorder=1.2))
+    draw_hulls(axes, findings, fill=True)
+    styles = camera_styles(findings.cameras)
+    for camera, points_m in training_m.items():
+        colour, shape = styles.get(camera, (NOTE, "o"))
+        axes.plot(*points_m[:, :2].T, shape, color=colour, ms=4, alpha=0.8, zorder=3)
+    axes.legend(loc="upper center", bbox_to_anchor=(0.5, -0.12), ncols=3, frameon=False, fontsize=9)

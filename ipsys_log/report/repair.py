@@ -1,0 +1,122 @@
+"""The result of a repair in words: saved and lost messages."""
+
+from __future__ import annotations
+
+from collections.abc import Iterator, Sequence
+from math import ceil
+
+from rich.table import Table
+
+from ipsys_log.log.chunk_builder import IMAGE_SCHEMAS
+from ipsys_log.log.reader import LogReader
+from ipsys_log.log.repair import RepairReport
+from ipsys_log.log.topics import run_of_topic
+from ipsys_log.units import NS_PER_S, format_bytes, format_time
+
+__all__ = ["repair_lines"]
+
+# A recorder hands over what it has at least so often.
+_FLUSH_NS = NS_PER_S
+# A file that was written so long after its last message was copied since, or recorded by another clock.
+_COPIED_NS = 10 * NS_PER_S
+_MOST_NOTES = 12
+
+
+def repair_lines(report: RepairReport) -> Iterator[str | Table]:
+    """Lines and tables, at most 80 columns wide as long as topics and paths are short."""
+    kept = f"{report.messages_kept} messages" if report.messages_kept else "no message"
+    if report.changed and report.last_kept_ns is not None:
+        yield f"{report.path} repaired: {kept}, up to {format_time(report.last_kept_ns)} UTC"
+    else:
+        yield f"{report.path} {'repaired' if report.changed else 'is whole, nothing changed'}: {kept}"
+    yield from _about_the_loss(report)
+    if report.unchecked:
+        yield f"{report.unchecked} of them were saved from damaged chunks: no CRC confirms them"
+    if report.kept_in is not None:
+        yield f"all bytes that were taken out are kept in {report.kept_in}"
+    yield from report.notes[:_MOST_NOTES]
+    if len(report.notes) > _MOST_NOTES:
+        yield f"and {len(report.notes) - _MOST_NOTES} more places"
+    if report.changed and report.messages_kept:
+        yield from _about_the_rig(report)
+    if report.cut_off and report.messages_kept:
+        yield from _about_the_end(report)
+
+
+def _about_the_loss(report: RepairReport) -> Iterator[str | Table]:
+    """Yield the number of unreadable bytes, and the lost messages as far as they are known."""
+    if not (report.bytes_lost or report.gone):
+        return
+    if report.gone and report.uncounted:
+        named = "these messages are gone, and an unknown number of others:"
+    elif report.gone:
+        named = "these messages are gone:"
+    elif report.uncounted:
+        named = "the number of messages in them is not known"
+    else:
+        named = "no message was in them"
+    yield f"{format_bytes(report.bytes_lost)} cannot be read; {named}"
+    if report.gone:
+        yield _lost_table(report)
+
+
+def _lost_table(report: RepairReport) -> Table:
+    table = _table("channel", "gone", "from", "to (UTC)")
+    for topic, number in sorted(report.gone.items()):
+        times_ns = report.lost.get(topic, ())
+        span = (_clock(min(times_ns)), _clock(max(times_ns))) if len(times_ns) == number else ("", "")
+        table.add_row(topic, str(number), *span)
+    return table
+
+
+def _about_the_rig(report: RepairReport) -> Iterator[str]:
+    with LogReader(report.path) as log:
+        schemas = [channel.schema for channel in log.channels.values() if channel.message_count]
+        images = any(schema is not None and schema.name in IMAGE_SCHEMAS for schema in schemas)
+        rig = log.channels.get("/rig")
+    if images and not (rig and rig.message_count):
+        yield "it has frames but no rig: give one to each command, as --rig lab.toml"
+
+
+def _about_the_end(report: RepairReport) -> Iterator[str | Table]:
+    """The last message of each recorded channel, and how many may have come after it."""
+    assert report.last_kept_ns is not None
+    late_ns = report.written_ns - report.last_kept_ns
+    copied = not -_FLUSH_NS < late_ns < _COPIED_NS
+    end_ns = None if copied else report.written_ns + _FLUSH_NS
+    table = _table("channel", "messages", "last (UTC)", "gone, at most")
+    with LogReader(report.path) as log:
+        for topic, channel in sorted(log.channels.items()):
+            if run_of_topic(topic) is None and channel.message_count:
+                images = channel.schema is not None and channel.schema.name in IMAGE_SCHEMAS
+                times_ns = [int(time_ns) for time_ns in log.times(topic)]
+                gone = _gone(times_ns, end_ns) if images else ""
+                table.add_row(topic, str(len(times_ns)), _clock(times_ns[-1]), gone)
+    yield table
+    if copied:
+        yield "Its end is gone. When it ended is not known: the file was copied since."
+    else:
+        yield (
+            f"The file was last written at {_clock(report.written_ns)} UTC. What came after that is gone:\n"
+            "at most about a second, as a recorder writes at least once a second."
+        )
+
+
+def _gone(times_ns: Sequence[int], end_ns: int | None) -> str:
+    """Return how many messages of a steady channel may have come from its last one to the end."""
+    if end_ns is None or len(times_ns) < 2:
+        return "not known"
+    rate_hz = (len(times_ns) - 1) * NS_PER_S / max(times_ns[-1] - times_ns[0], 1)
+    return f"{ceil(max(end_ns - times_ns[-1], 0) * rate_hz / NS_PER_S)} at {rate_hz:.1f}/s"
+
+
+def _table(*headings: str) -> Table:
+    table = Table(box=None, pad_edge=False)
+    for heading in headings:
+        table.add_column(heading, justify="left" if heading == "channel" else "right")
+    return table
+
+
+def _clock(time_ns: int) -> str:
+    """The time of day."""
+    return format_time(time_ns).partition(" ")[2]

@@ -1,0 +1,1 @@
+"""The rig file: cameras, robots and markers of a lab."""

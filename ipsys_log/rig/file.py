@@ -1,0 +1,337 @@
+"""The rig file ``lab.toml``: read, checked, and written as a commented example."""
+
+from __future__ import annotations
+
+import json
+import math
+import re
+import tomllib
+from collections.abc import Collection, Iterable, Mapping
+from dataclasses import MISSING, fields, replace
+from difflib import get_close_matches
+from importlib.resources import files
+from pathlib import Path
+from typing import Any, TypeVar
+
+from ipsys_log.errors import IpsysError
+from ipsys_log.messages import Floor, ReferencePoint, Rig, RigCamera, RigMarker
+from ipsys_log.rig.checks import check_slips
+
+__all__ = [
+    "HIDDEN",
+    "STAMPS",
+    "check_name",
+    "check_rig",
+    "check_rig_cameras",
+    "example_toml",
+    "hide_password",
+    "hide_passwords",
+    "load_rig",
+    "rig_toml",
+]
+
+Item = TypeVar("Item")
+
+# Markers are carried below the cameras; what is greater was meant in cm.
+_HIGHEST_M = 5.0
+_FARTHEST = 1e6  # m, px, s or Hz: no number of a lab is larger
+_LARGEST_INT = {"_ns": 2**62}  # by what a name ends with
+_LARGEST_ID = 2**31 - 1
+_LARGEST_FILE = 1 << 18  # bytes
+_LONGEST_LINE = 120  # characters of a line that an error repeats
+
+# What the time that a driver gives a frame can mean.
+STAMPS = ("start", "end")
+
+# Stands for a password where it may be read by others.
+HIDDEN = "***"
+# A host with a dot and its port, and then a path or query: no user and password.
+_PORT = r"(?![^/?@:\[]*\.[^/?@:\[]*:[0-9]+(?:/[^@?]*)?(?:\?|$))"
+# Up to the last @: a password may have any sign in it. A lone name may be a token. Or a part of the query.
+_PASSWORDS = (
+    re.compile(rf"(?<=://){_PORT}(?P<before>[^/?@:\[]*:).*(?=@)"),
+    re.compile(r"(?<=://)(?P<before>)[^/?@:\[]+(?=@)"),
+    re.compile(r"(?P<before>(?:(?:pas|pw|psw|token|auth|secret)[\w-]*|key)=)[^&]+", re.IGNORECASE),
+)
+
+_NAME = re.compile(r"[a-z][a-z0-9_]*")
+_ITEMS = {"markers": RigMarker, "cameras": RigCamera, "reference_points": ReferencePoint}
+
+
+def check_name(name: str, what: str) -> str:
+    """Return ``name`` if it can be the name of a camera, run or robot.
+
+    Raises
+    ------
+    IpsysError
+        Otherwise; such names become parts of topics.
+    """
+    if not _NAME.fullmatch(name):
+        raise IpsysError(f"{what} {name!r} must be small letters, digits and _, starting with a letter")
+    return name
+
+
+def check_rig_cameras(rig: Rig, cameras: Collection[str], where: str) -> list[str]:
+    """Check that a rig describes the cameras that it is used for.
+
+    Parameters
+    ----------
+    rig : without cameras it fits all.
+    cameras : names in the log or the pictures.
+    where : the rig file, for the message.
+
+    Returns
+    -------
+    A remark if some cameras are not described.
+
+    Raises
+    ------
+    IpsysError
+        The rig describes only other cameras.
+    """
+    described = [camera.name for camera in rig.cameras]
+    missing = sorted(set(cameras) - set(described))
+    if not described or not missing:
+        return []
+    if len(missing) == len(set(cameras)):
+        raise IpsysError(
+            f"{where}: describes the cameras {', '.join(described)}, but there are only "
+            f"{', '.join(missing)}. Give the rig of these, rename its cameras, or remove its [[cameras]]"
+        )
+    named = ", ".join(missing)
+    return [f"{where}: does not describe camera {named}; defaults are used, such as no rolling shutter"]
+
+
+def example_toml() -> str:
+    """The commented ``lab.toml`` that ``ipsys init`` writes: the lab of the paper."""
+    return files("ipsys_log.rig").joinpath("lab.toml").read_text(encoding="utf-8")
+
+
+def rig_toml(rig: Rig) -> str:
+    """A rig as the text of a rig file, which :func:`load_rig` reads back.
+
+    Examples
+    --------
+    >>> print(rig_toml(Rig("lab", "DICT_4X4_100", 0.2, (RigMarker(3, robot="ada"),))))
+    name = "lab"
+    dictionary = "DICT_4X4_100"
+    marker_length_m = 0.2
+    <BLANKLINE>
+    [[markers]]
+    id = 3
+    robot = "ada"
+    <BLANKLINE>
+    """
+    lines = _toml_rows(rig)
+    if rig.floor is not None:
+        lines += ["", "[floor]", *_toml_rows(rig.floor)]
+    for key in _ITEMS:
+        for item in getattr(rig, key):
+            lines += ["", f"[[{key}]]", *_toml_rows(item)]
+    return "\n".join(lines) + "\n"
+
+
+def hide_password(address: str) -> str:
+    """An address as it may be shown, and stand in a log.
+
+    Examples
+    --------
+    >>> hide_password("rtsp://admin:secret@10.0.0.7:554/live")
+    'rtsp://admin:***@10.0.0.7:554/live'
+    >>> hide_password("http://10.0.0.7:80/video?user=admin&pwd=secret")
+    'http://10.0.0.7:80/video?user=admin&pwd=***'
+    """
+    for password in _PASSWORDS:
+        address = password.sub(rf"\g<before>{HIDDEN}", address)
+    return address
+
+
+def hide_passwords(rig: Rig) -> Rig:
+    """A rig without the passwords in its cameras' sources."""
+    cameras = (replace(one, source=one.source and hide_password(one.source)) for one in rig.cameras)
+    return replace(rig, cameras=tuple(cameras))
+
+
+def _toml_rows(item: Any) -> list[str]:
+    values = [(f.name, getattr(item, f.name)) for f in fields(item)]
+    # A JSON string is a TOML string; so are numbers.
+    return [f"{name} = {json.dumps(value)}" for name, value in values if isinstance(value, (str, int, float))]
+
+
+def load_rig(path: Path) -> Rig:
+    """Read and check a rig file.
+
+    Raises
+    ------
+    IpsysError
+        The file cannot be read, is not TOML, has unknown or missing keys, contradicts itself, or has a value
+        in a wrong unit.
+    """
+    try:
+        if path.stat().st_size > _LARGEST_FILE:
+            raise IpsysError(f"{path}: is too large for a rig file; write one with: ipsys init lab.toml")
+        table = tomllib.loads(path.read_text(encoding="utf-8"))
+    except OSError as error:
+        raise IpsysError(f"{path}: cannot be read: {error.strerror}") from error
+    except UnicodeDecodeError as error:
+        raise IpsysError(f"{path}: is not a text file; write one with: ipsys init {path}") from error
+    except tomllib.TOMLDecodeError as error:
+        raise IpsysError(_not_toml(path, error)) from error
+    except (ValueError, RecursionError) as error:  # a number or nesting that Python's parser refuses
+        raise IpsysError(
+            f"{path}: a number has thousands of digits, or tables are nested thousands deep; "
+            f"write a rig file with: ipsys init {path.name}"
+        ) from error
+    for key, item in _ITEMS.items():
+        rows = table.get(key, [])
+        if not isinstance(rows, list):
+            raise IpsysError(f"{path}: {key} must be a list of tables, written [[{key}]]")
+        table[key] = tuple(
+            _build(item, row, f"{path}: [[{key}]] number {n}") for n, row in enumerate(rows, 1)
+        )
+    if "floor" in table:
+        table["floor"] = _build(Floor, table["floor"], f"{path}: [floor]")
+    rig = check_rig(_build(Rig, table, str(path)), str(path))
+    check_slips(rig, str(path))
+    return rig
+
+
+def _not_toml(path: Path, error: tomllib.TOMLDecodeError) -> str:
+    """Return the fault of a line, with hints on the most frequent mistakes."""
+    text = f"{path}: is not valid TOML: {error}"
+    found = re.search(r"at line (\d+)", str(error))
+    lines = path.read_text(encoding="utf-8").split("\n")
+    line = lines[int(found[1]) - 1].strip()[:_LONGEST_LINE] if found else ""
+    if comma := re.search(r"= *(\d+),(\d+)\s*(#.*)?$", line):
+        return f"{text}: {line}: a decimal comma? Write {comma[1]}.{comma[2]}"
+    if bare := re.search(r"= *([^\s\"'\[{0-9][^#]*?)\s*(#.*)?$", line):
+        return f'{text}: {line}: text stands in quotes; write "{bare[1]}"'
+    return f"{text}: {line}" if line else text
+
+
+def check_rig(rig: Rig, where: str) -> Rig:
+    """Return ``rig`` if it does not contradict itself.
+
+    Raises
+    ------
+    IpsysError
+        Two cameras, markers or reference points have the same name, two reference points the same position; a
+        name is bad, a length or sigma is not positive, or a height is impossible.
+    """
+    for camera in rig.cameras:
+        check_name(camera.name, f"{where}: camera name")
+    for marker in rig.markers:
+        if marker.robot is not None:
+            check_name(marker.robot, f"{where}: robot name")
+    _check_unique((camera.name for camera in rig.cameras), f"{where}: two cameras have the name")
+    _check_unique((marker.id for marker in rig.markers), f"{where}: two markers have the id")
+    _check_unique((marker.robot for marker in rig.markers if marker.robot), f"{where}: two markers on robot")
+    _check_unique((p.name for p in rig.reference_points), f"{where}: two reference points have the name")
+    lengths = [rig.marker_length_m, *(m.length_m for m in rig.markers if m.length_m is not None)]
+    if rig.floor is not None:
+        lengths += [rig.floor.width_m, rig.floor.depth_m]
+    for length in lengths:
+        if not (math.isfinite(length) and length > 0):
+            raise IpsysError(f"{where}: {length} m is not a length; marker and floor sizes must be above 0")
+    _check_cameras(rig, where)
+    _check_tape(rig, where)
+    _check_heights(rig, where)
+    for item in (rig, rig.floor, *rig.markers, *rig.cameras, *rig.reference_points):
+        _check_numbers(item, where)
+    return rig
+
+
+def _check_numbers(item: Any, where: str) -> None:
+    """Refuse numbers that are impossible in a lab, before one of them spoils a computation."""
+    for field in fields(item) if item is not None else ():
+        value = getattr(item, field.name)
+        if isinstance(value, float) and not abs(value) <= _FARTHEST:
+            raise IpsysError(f"{where}: {field.name} is {value:g}; give a number of at most {_FARTHEST:.0f}")
+
+
+def _check_cameras(rig: Rig, where: str) -> None:
+    for camera in rig.cameras:
+        for key in ("width", "height", "rate_hz", "exposure_s"):
+            value = getattr(camera, key)
+            if value is not None and not (math.isfinite(value) and value > 0):
+                raise IpsysError(f"{where}: camera {camera.name}: {key} is {value}; it must be above 0")
+        if camera.stamp not in (None, *STAMPS):
+            raise IpsysError(
+                f"{where}: camera {camera.name}: stamp is {camera.stamp!r}; write "
+                + " or ".join(f'"{name}"' for name in STAMPS)
+            )
+    sources = (hide_password(camera.source) for camera in rig.cameras if camera.source)
+    _check_unique(sources, f"{where}: two cameras have the source")
+
+
+def _check_tape(rig: Rig, where: str) -> None:
+    for point in rig.reference_points:
+        if not (math.isfinite(point.x_m) and math.isfinite(point.y_m)):
+            raise IpsysError(
+                f"{where}: reference point {point.name!r} has the coordinates {point.x_m} and {point.y_m}; "
+                "give numbers in m"
+            )
+    # To the millimetre: nearer together than that two of them are one, written down twice.
+    at_m = ((round(point.x_m, 3), round(point.y_m, 3)) for point in rig.reference_points)
+    _check_unique(at_m, f"{where}: two reference points are at")
+    sigma_m = rig.tape_sigma_m
+    if sigma_m is not None and not (math.isfinite(sigma_m) and sigma_m > 0):
+        raise IpsysError(f"{where}: tape_sigma_m = {sigma_m} m is no standard deviation; it must be above 0")
+
+
+def _check_heights(rig: Rig, where: str) -> None:
+    heights = {"marker_height_m": rig.marker_height_m}
+    heights |= {f"height_m of marker {marker.id}": marker.height_m for marker in rig.markers}
+    for what, height_m in heights.items():
+        if height_m is not None and not 0 <= height_m <= _HIGHEST_M:
+            raise IpsysError(
+                f"{where}: {what} is {height_m} m; give the height above the floor in m, 0 to {_HIGHEST_M:g}"
+                + (f"; {height_m / 100:g} if that is cm" if 0 < height_m / 100 <= _HIGHEST_M else "")
+            )
+
+
+def _check_unique(names: Iterable[object], what: str) -> None:
+    seen: set[object] = set()
+    for name in names:
+        if name in seen:
+            raise IpsysError(f"{what} {name!r}; give each its own")
+        seen.add(name)
+
+
+def _build(item: type[Item], row: Any, where: str) -> Item:
+    """``item`` from a TOML table whose keys are its fields."""
+    if not isinstance(row, Mapping):
+        raise IpsysError(f"{where}: must be a table")
+    known = {f.name: f for f in fields(item)}  # type: ignore[arg-type]
+    unknown = sorted(set(row) - set(known))
+    if unknown:
+        like = get_close_matches(unknown[0], known, 1)
+        meant = f"; was {like[0]} meant?" if like else f"; known are {', '.join(known)}"
+        raise IpsysError(f"{where}: unknown key {unknown[0]!r}{meant}")
+    missing = [n for n, f in known.items() if f.default is MISSING and n not in row]
+    if missing:
+        raise IpsysError(f"{where}: {missing[0]} is missing")
+    return item(**{name: _value(str(known[name].type), row[name], f"{where}: {name}") for name in row})
+
+
+def _value(kind: str, value: Any, where: str) -> Any:
+    if kind.startswith("float"):
+        if isinstance(value, bool) or not isinstance(value, (int, float)):
+            raise IpsysError(f"{where} must be a number, found {_shown(value)}")
+        if not abs(value) <= _FARTHEST:
+            raise IpsysError(f"{where} is {_shown(value)}; give a number of at most {_FARTHEST:.0f}")
+        return float(value)
+    if kind.startswith("int"):
+        if isinstance(value, bool) or not isinstance(value, int) or value < 0:
+            raise IpsysError(f"{where} must be a whole number of at least 0, found {_shown(value)}")
+        if value > (largest := _LARGEST_INT.get(where[-3:], _LARGEST_ID)):
+            raise IpsysError(f"{where} is {_shown(value)}; give a whole number of at most {largest}")
+    elif kind.startswith("str") and not isinstance(value, str):
+        raise IpsysError(f"{where} must be text in quotes, found {_shown(value)}")
+    return value
+
+
+def _shown(value: Any) -> str:
+    """Return a value for an error message."""
+    text = repr(value)
+    return text if len(text) <= _LONGEST_LINE else f"{text[:_LONGEST_LINE]} ..."

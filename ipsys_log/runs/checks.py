@@ -1,0 +1,212 @@
+"""Checks of the input before any computation."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import replace
+from pathlib import Path
+
+from ipsys_log.analysis.pairs import split
+from ipsys_log.analysis.tape import world_point
+from ipsys_log.errors import FitError, IpsysError
+from ipsys_log.geometry.lenses import check_calibration
+from ipsys_log.log.dataset import Session
+from ipsys_log.log.topics import camera_of_topic
+from ipsys_log.messages import CameraPoints, Markers, Rig
+from ipsys_log.models.table import min_pairs, reads_height
+from ipsys_log.rig.file import check_rig
+from ipsys_log.runs.execute import has_given_name
+from ipsys_log.runs.graph import STAGES, usual_corners
+from ipsys_log.runs.options import Request
+from ipsys_log.runs.provenance import newest_run
+from ipsys_log.runs.select import can_evaluate, copied_run, fitted_in, measured
+from ipsys_log.runs.states import made_by_newer, method_of, recorded_stages
+
+__all__ = ["check_inputs"]
+
+
+def check_inputs(paths: Sequence[Path], request: Request, models: Sequence[str], until: str) -> None:
+    """Check the inputs of the stages up to ``until``.
+
+    Raises
+    ------
+    IpsysError
+        An input is missing or invalid; the text names the first one and what to do.
+    """
+    wanted = STAGES[: STAGES.index(until) + 1]
+    _check_request(paths, request, models)
+    with Session(paths) as session:
+        _check_rigs(session, request)
+        cameras = _cameras(session, wanted)
+        _check_overrides(session, request, cameras)
+        if "camera-frame" in wanted:
+            _check_lenses(session, request, cameras)
+        if request.corners != "stock" or "camera-frame" in wanted:
+            _check_distortion(session, request, cameras)
+        if "fit" in wanted and request.model_from is None:
+            _check_measurements(session, request, models)
+        if "locate" in wanted:
+            _check_heights(session, request, models)
+        if "locate" in wanted and request.model_from is not None:
+            _check_model(session, request, models, cameras)
+        if until == "evaluate":
+            _check_evaluation(session, request, models)
+        _check_versions(session, request, models, wanted)
+        _check_run_name(session, request, until)
+
+
+def _check_versions(session: Session, request: Request, models: Sequence[str], wanted: Sequence[str]) -> None:
+    """Check that this software would not repeat a result of newer software."""
+    corners = request.corners or usual_corners(session.images, {*session.calibrations, *request.lenses})
+    methods = {"detect": {corners}, "camera-frame": {request.method}, "fuse": {""}}
+    for run in session.runs():
+        newer = made_by_newer(session, run) if run.stage in wanted else ""
+        if newer and method_of(session, run) in methods.get(run.stage, models):
+            raise IpsysError(f"{session}: run {run.run}, stage {run.stage}: {newer}")
+
+
+def _check_run_name(session: Session, request: Request, until: str) -> None:
+    """Check that the run name of the user is not that of a run that is out of date."""
+    for one in recorded_stages(session) if request.run is not None else ():
+        if one.run.run == request.run and one.out_of_date and has_given_name(one.run.stage, until):
+            raise IpsysError(
+                f"run {request.run} already has the stage {one.run.stage}, which is {one.state}; use another "
+                "--run name"
+            )
+
+
+def _check_request(paths: Sequence[Path], request: Request, models: Sequence[str]) -> None:
+    if request.run is not None and len(models) > 1:
+        raise IpsysError(
+            f"--run {request.run} is the name of one run, but {len(models)} models are asked for; "
+            "say which with --model"
+        )
+    if request.model_from is None:
+        return
+    if any(request.model_from.resolve() == path.resolve() for path in paths):
+        raise IpsysError(f"--model-from {request.model_from}: this is the log itself; leave --model-from out")
+    if request.train != "train":
+        raise IpsysError(f"--train {request.train} has no effect with --model-from; leave one of them out")
+
+
+def _check_rigs(session: Session, request: Request) -> None:
+    for topic in session.topics(Rig):
+        for rig in session.payloads([topic]):
+            check_rig(rig, f"{session}: {topic}")
+    if request.rig is None and not session.topics(Rig):
+        raise IpsysError(
+            f"{session}: has no rig (markers, reference points); write one with 'ipsys init lab.toml' "
+            "and give it with --rig lab.toml"
+        )
+
+
+def _cameras(session: Session, wanted: Sequence[str]) -> set[str]:
+    """The cameras whose markers are to be seen through a lens; none where there are only camera points."""
+    if session.images:
+        return set(session.images)
+    markers = newest_run(session, Markers)
+    if markers is not None and wanted != ("detect",):
+        return {str(camera_of_topic(topic)) for topic in session.topics(Markers, markers)}
+    if wanted == ("detect",) or newest_run(session, CameraPoints) is None:
+        unread = session.unread_images()
+        also = f"; {', '.join(unread)} cannot be read by this version" if unread else ""
+        raise IpsysError(f"{session}: has no images to detect markers in{also}")
+    return set()
+
+
+def _check_overrides(session: Session, request: Request, cameras: set[str]) -> None:
+    """What cannot take effect is not passed over in silence."""
+    known = ", ".join(sorted(cameras)) if cameras else "none whose markers are in the log"
+    for name in sorted(set(request.lenses) - cameras):
+        raise IpsysError(f"--calibration {name}: the log has no such camera (it has {known})")
+    if request.rig is not None and not cameras:
+        held = session.payloads(session.topics(Rig))
+        if any(rig.marker_length_m != request.rig.marker_length_m for rig in held):
+            raise IpsysError(
+                "--rig: another marker length cannot take effect, the log has camera points but no markers"
+            )
+
+
+def _check_lenses(session: Session, request: Request, cameras: set[str]) -> None:
+    missing = sorted(cameras - set(request.lenses) - set(session.calibrations))
+    if missing:
+        raise IpsysError(
+            f"{session}: camera {missing[0]} has no calibration; give one with "
+            f"--calibration {missing[0]}=calibration.yaml"
+        )
+
+
+def _check_distortion(session: Session, request: Request, cameras: set[str]) -> None:
+    """Check that the calibrations in a log are valid, unless others are given."""
+    for name in sorted(cameras - set(request.lenses)):
+        topic = session.calibrations.get(name)
+        first = None if topic is None else next(iter(session.messages([topic])), None)
+        if first is not None:
+            check_calibration(replace(first.payload, frame_id=name), f"{session}: {topic}")
+
+
+def _check_measurements(session: Session, request: Request, models: Sequence[str]) -> None:
+    places = measured(session, request.rig)
+    if not places and all(copied_run(session, model) for model in models):
+        return
+    if not places:
+        raise FitError(
+            f"{session}: has no measurements to fit a model to; enter some with "
+            f"'ipsys measure {session.paths[-1]}', or apply a model of another log with --model-from "
+            "calibration.mcap"
+        )
+    train, _ = split([place.measurement for place in places], request.train, request.seed)
+    for place in places:
+        world_point(place.measurement, place.rig)
+        marker_id = place.measurement.marker_id
+        if marker_id is not None and not place.rig.knows(marker_id):
+            known = ", ".join(str(marker.id) for marker in place.rig.markers)
+            raise IpsysError(
+                f"measurement {place.measurement.id} names marker {marker_id}, which is not in the rig "
+                f"(it has {known}); correct lab.toml and give it with --rig"
+            )
+    for model in models:
+        if len(train) < min_pairs(model):
+            raise FitError(
+                f"{session}: {model} needs at least {min_pairs(model)} measured places for each camera, "
+                f"found {len(train)} in all; measure more"
+                + ("" if model == "rigid" else ", or use --model rigid")
+            )
+
+
+def _check_model(session: Session, request: Request, models: Sequence[str], cameras: set[str]) -> None:
+    assert request.model_from is not None
+    if not cameras:
+        run = newest_run(session, CameraPoints)
+        cameras = {str(camera_of_topic(topic)) for topic in session.topics(CameraPoints, run)}
+    with Session([request.model_from]) as other:
+        for name in models:
+            model, _ = fitted_in(other, name)
+            fitted = {camera.camera for camera in model.cameras}
+            if not fitted & cameras:
+                raise IpsysError(
+                    f"--model-from {request.model_from}: its model is of the cameras "
+                    f"{', '.join(sorted(fitted))}, the log has {', '.join(sorted(cameras))}"
+                )
+
+
+def _check_heights(session: Session, request: Request, models: Sequence[str]) -> None:
+    """A model that reads the height of a marker needs one for each that may be seen."""
+    rigs = [request.rig] if request.rig is not None else session.payloads(session.topics(Rig))
+    for name in models:
+        for rig in rigs:
+            missing = [m.id for m in rig.markers if rig.height_of(m.id) is None]
+            if reads_height(name) and (missing or (not rig.markers and rig.marker_height_m is None)):
+                which = f"marker {missing[0]} is" if missing else "the markers are"
+                raise IpsysError(
+                    f"{session}: {name} needs the height at which {which} carried: write marker_height_m "
+                    "into lab.toml ('ipsys init lab.toml --from LOG' writes the log's) and give it with --rig"
+                )
+
+
+def _check_evaluation(session: Session, request: Request, models: Sequence[str]) -> None:
+    if not any(can_evaluate(session, request, model) for model in models):
+        raise IpsysError(
+            f"{session}: no measured place is held out to evaluate on, and there are too few (of "
+            f"{len(measured(session, request.rig))}) to take turns; label some 'test', or measure more"
+        )

@@ -1,0 +1,257 @@
+"""Do one stage on a log: find the run that has done it already, or compute and append it."""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Iterable, Iterator, Mapping
+from dataclasses import replace
+from functools import partial
+from pathlib import Path
+
+from ipsys_log.log.dataset import Session
+from ipsys_log.log.topics import run_of_topic
+from ipsys_log.messages import (
+    EVENTS_TOPIC,
+    RIG_TOPIC,
+    CameraCalibration,
+    ChannelWritten,
+    CompressedVideo,
+    Event,
+    Lens,
+    Message,
+    Model,
+    Rig,
+    Run,
+    SkippedVideo,
+    calibration_topic,
+)
+from ipsys_log.rig.file import hide_passwords
+from ipsys_log.runs.graph import Task, plan_stage
+from ipsys_log.runs.options import Progress, Request
+from ipsys_log.runs.output import append_messages, append_run, record_message
+from ipsys_log.runs.provenance import Outcome, check_run_name, find_run, fingerprint, free_name, read_channels
+from ipsys_log.runs.remarks import Remarks
+from ipsys_log.runs.resume import OtherContentError, cut_short, without_held
+from ipsys_log.runs.select import skipped_frames
+from ipsys_log.runs.states import Recorded, method_of, recorded_stages
+from ipsys_log.runs.stream import TOPICS, Stage, in_threads, run
+
+__all__ = [
+    "SHARED_STAGES",
+    "carry_out",
+    "has_given_name",
+    "inputs",
+    "perform",
+    "record_of",
+    "sign",
+    "signed_copy",
+]
+
+# The stages whose runs serve every model.
+SHARED_STAGES = ("detect", "camera-frame")
+
+Make = Callable[[Task, Session, str], Iterable[Message]]
+
+
+def perform(
+    session: Session,
+    target: Path,
+    task: Task,
+    request: Request,
+    until: str,
+    make: Make,
+    say: Callable[[str], None] = lambda text: None,
+) -> Outcome:
+    """Find the run that has done ``task``, or ``make`` it and append it to ``target``.
+
+    An interrupted run is completed, if its content equals the present result. If the newest run of such a
+    task is out of date, a remark says so before a new run is made.
+    """
+    name = request.run if has_given_name(task.stage, until) else None
+    record = record_of(session, task)
+    found = find_run(session, record, name)
+    if found is not None:
+        return Outcome(task.stage, found, fresh=False)
+    _say_renewal(session, task, record, say)
+    number = max((run.number for run in session.runs()), default=0) + 1
+    record = replace(record, fingerprint=fingerprint(), number=number)
+    remarks: tuple[str, ...] = ()
+    given = name or task.base
+    if held := cut_short(session, target, task, given):
+        try:
+            return _append(session, target, task, replace(record, run=given), held, request, make)
+        except OtherContentError as other:
+            remarks = (f"run {given} was cut short, and is left so: {other}",)
+    if name is None:
+        name = free_name(session, record, task.base, task.writes)
+    else:
+        check_run_name(session, task.stage, name, task.writes)
+    outcome = _append(session, target, task, replace(record, run=name), {}, request, make)
+    return replace(outcome, remarks=(*remarks, *outcome.remarks))
+
+
+def has_given_name(stage: str, until: str) -> bool:
+    """Return whether the run name of the user is for a stage: not for the detection before the last stage."""
+    return stage == until or not {stage, until} & set(SHARED_STAGES)
+
+
+def _say_renewal(session: Session, task: Task, record: Run, say: Callable[[str], None]) -> None:
+    """Print that the newest run of a task is out of date, and how much is computed again."""
+    method = method_of(session, record)
+
+    def is_such(one: Recorded) -> bool:
+        is_same = (one.run.stage, one.method) == (task.stage, method)
+        # If the positions have changed, the stage that made them has reported it.
+        return is_same and (task.stage != "fuse" or one.run.input_runs == record.input_runs)
+
+    such = [one for one in recorded_stages(session) if is_such(one)]
+    if such and such[-1].out_of_date:
+        frames = sum(session.count(topic) for topic in task.topics if topic in session.images.values())
+        much = f" for {frames} frames" if frames else ""
+        say(f"{task.stage} is computed again{much}; run {such[-1].run.run} is {such[-1].state}")
+
+
+def _append(
+    session: Session,
+    target: Path,
+    task: Task,
+    record: Run,
+    held: Mapping[str, int],
+    request: Request,
+    make: Make,
+) -> Outcome:
+    """Make a run, append what of it is not held, and its record."""
+    log_time_ns, publish_time_ns = session.last(task.topics)
+    remarks = Remarks(task, request.skip_ambiguous)
+    made = append_run(
+        target,
+        replace(record, timestamp=publish_time_ns),
+        log_time_ns,
+        lambda: without_held(session, held, remarks.watch(make(task, session, record.run))),
+        held,
+    )
+    count = sum(output.messages for output in made.outputs)
+    return Outcome(task.stage, record.run, True, count, remarks.lines())
+
+
+def sign(path: Path, request: Request, runs: Mapping[str, str]) -> list[Outcome]:
+    """Append the records of stages that have written their channels already, live.
+
+    Parameters
+    ----------
+    runs : by stage, in order, the run it has written to; that of fit was signed when the model was copied.
+    """
+    records, outcomes = [], []
+    with Session([path]) as session:
+        first = max((run.number for run in session.runs()), default=0) + 1
+        for number, (stage, name) in enumerate(runs.items(), first):
+            if stage == "fit":
+                outcomes.append(Outcome(stage, name, True, 1))
+                continue
+            task = plan_stage(stage, session, request, **_given(stage, runs))
+            assert isinstance(task, Task), f"{stage} was not done live"
+            outputs = tuple(
+                ChannelWritten(topic, session.count(topic))
+                for topic in sorted(t for payload in task.writes for t in session.topics(payload, name))
+            )
+            log_time_ns, time_ns = session.last(task.topics)
+            record = replace(record_of(session, task), run=name, outputs=outputs, number=number)
+            record = replace(record, timestamp=time_ns, fingerprint=fingerprint())
+            records.append(record_message(record, log_time_ns))
+            outcomes.append(Outcome(stage, name, True, sum(output.messages for output in outputs)))
+    append_messages(path, records)
+    return outcomes
+
+
+def signed_copy(task: Task, model: Model, now_ns: Callable[[], int]) -> list[Message]:
+    """The messages that copy a model into a log that is begun: the model, and the record of its run."""
+    at = f"/runs/{task.base}/model"
+    record = Run(
+        timestamp=model.timestamp,
+        run=task.base,
+        stage=task.stage,
+        parameters=dict(task.parameters),
+        fingerprint=fingerprint(),
+        input_runs=task.input_runs,
+        inputs=task.foreign,
+        outputs=(ChannelWritten(at, 1),),
+        number=1,
+    )
+    return [Message(at, now_ns(), model.timestamp, model), record_message(record, now_ns())]
+
+
+def _given(stage: str, runs: Mapping[str, str]) -> dict[str, str]:
+    """What :func:`ipsys_log.runs.graph.plan_stage` has to be told of the stages before."""
+    if stage == "camera-frame":
+        return {"markers": runs["detect"]}
+    if stage == "locate":
+        return {"points": runs["camera-frame"], "model": runs["fit"]}
+    return {"positions": runs["locate"]} if stage == "fuse" else {}
+
+
+def record_of(session: Session, task: Task) -> Run:
+    """The record of a task, but for its name, its time and what it wrote."""
+    lenses = tuple(
+        Lens(name, lens.width, lens.height, lens.distortion_model, lens.D, lens.K)
+        for name, lens in sorted(task.lenses.items())
+    )
+    input_runs = {run for topic in task.topics if (run := run_of_topic(topic))} | set(task.input_runs)
+    return Run(
+        timestamp=0,
+        run="",
+        stage=task.stage,
+        parameters=dict(task.parameters),
+        rig=task.rig and hide_passwords(task.rig),
+        lenses=lenses,
+        input_runs=tuple(sorted(input_runs)),
+        inputs=(*read_channels(session, task.topics), *task.foreign),
+    )
+
+
+def inputs(session: Session, task: Task, progress: Progress) -> Iterator[Message]:
+    """Yield the input of a causal stage: settings before the first frame, then its channels in log order.
+
+    The first rig and intrinsics of the log are valid from its start, even if they were recorded a little
+    later. Settings given by the user come first.
+    """
+    yield from _settings(session, task.lenses, task.rig)
+    for topic in sorted(task.topics):
+        if topic in (*session.topics(Rig), *session.calibrations.values()):
+            yield next(session.messages([topic]))
+    total = sum(session.count(topic) for topic in task.topics)
+    progress(task.stage, 0, total)
+    skipped = skipped_frames(session) if task.as_live else set()
+    for done, message in enumerate(session.messages(task.topics), 1):
+        if message.log_time_ns not in skipped:
+            if message.topic != EVENTS_TOPIC or Event in task.reads:
+                yield message
+        elif isinstance(message.payload, CompressedVideo):
+            # Those after it need it. What live passed over up to a keyframe, makes no difference.
+            yield replace(message, payload=SkippedVideo(message.payload))
+        progress(task.stage, done, total)
+
+
+def _settings(
+    session: Session, lenses: Mapping[str, CameraCalibration], rig: Rig | None
+) -> Iterator[Message]:
+    start_ns = session.start_ns
+    if rig is not None:
+        yield Message(RIG_TOPIC, start_ns, start_ns, rig)
+    for camera, lens in lenses.items():
+        yield Message(calibration_topic(camera), start_ns, start_ns, lens, camera)
+
+
+def carry_out(task: Task, session: Session, name: str, progress: Progress) -> Iterator[Message]:
+    """The messages of a task's run: its causal stage over the log, or one computed from all of it."""
+    if task.step is None:
+        assert task.compute is not None
+        payload, (log_time_ns, _) = (
+            task.compute(session, partial(progress, task.stage)),
+            session.last(task.topics),
+        )
+        yield Message(TOPICS[type(payload)].format(run=name), log_time_ns, payload.timestamp, payload)
+        return
+    stage = Stage(name, task.reads, task.step(name), task.per_camera)
+    # Threads that run Python wait for one another, and a stage takes longer in them than without.
+    for message in run(inputs(session, task, progress), [stage], in_threads if task.decodes_frames else map):
+        if isinstance(message.payload, task.writes):
+            yield message

@@ -1,0 +1,132 @@
+"""The bookkeeping of runs: which exist, which are still right, what the next one is called."""
+
+from __future__ import annotations
+
+import platform
+from collections.abc import Iterable, Sequence
+from dataclasses import dataclass, replace
+from functools import cache
+from importlib.metadata import version
+
+import threadpoolctl
+
+from ipsys_log.errors import IpsysError
+from ipsys_log.log.codec import encode
+from ipsys_log.log.dataset import Session
+from ipsys_log.messages import ChannelRead, Run
+
+__all__ = [
+    "Outcome",
+    "check_run_name",
+    "complete_runs",
+    "find_run",
+    "fingerprint",
+    "free_name",
+    "is_complete",
+    "newest_run",
+    "read_channels",
+]
+
+
+@dataclass(frozen=True, slots=True)
+class Outcome:
+    """The outcome of a stage: its run, whether it was made now, and remarks."""
+
+    stage: str
+    run: str
+    fresh: bool
+    messages: int = 0
+    remarks: tuple[str, ...] = ()
+
+
+@cache
+def _versions() -> tuple[tuple[str, str], ...]:
+    packages = ("ipsys_log", "numpy", "scipy", "scikit-learn", "opencv-python-headless", "simplejpeg")
+    return (("python", platform.python_version()), *((name, version(name)) for name in packages))
+
+
+def fingerprint() -> dict[str, str]:
+    """The environment that the digits of a result can depend on: versions and BLAS kernel."""
+    kernels = {
+        f"{library.get('internal_api')} {library.get('version')} {library.get('architecture', '')}".strip()
+        for library in threadpoolctl.threadpool_info()
+        if library.get("user_api") == "blas"
+    }
+    return {**dict(_versions()), "machine": platform.machine(), "blas": ", ".join(sorted(kernels))}
+
+
+def read_channels(session: Session, topics: Iterable[str]) -> tuple[ChannelRead, ...]:
+    """An input of a stage, identified by its content (law 4 of the log)."""
+    return tuple(ChannelRead(topic, session.count(topic), session.hash(topic)) for topic in sorted(topics))
+
+
+def _essence(run: Run) -> bytes:
+    """The identity of a run of a stage: all except names, times and the environment."""
+    return encode(replace(run, timestamp=0, run="", fingerprint={}, input_runs=(), outputs=(), number=0))
+
+
+def complete_runs(session: Session) -> list[Run]:
+    """Return the records whose channels are all in the log, oldest first."""
+    return [run for run in session.runs() if is_complete(session, run)]
+
+
+def is_complete(session: Session, run: Run) -> bool:
+    """Return whether all channels of a stage are in the log."""
+    return all(session.count(output.topic) >= output.messages for output in run.outputs)
+
+
+def find_run(session: Session, wanted: Run, name: str | None = None) -> str | None:
+    """Return the name of the newest complete run with the inputs and parameters of ``wanted``, if any."""
+    essence = _essence(wanted)
+    for run in reversed(complete_runs(session)):
+        if run.stage == wanted.stage and name in (None, run.run) and _essence(run) == essence:
+            return run.run
+    return None
+
+
+def free_name(session: Session, record: Run, base: str, writes: Sequence[type]) -> str:
+    """The name for a new run: ``base``, or ``base_2``, ``base_3`` ... where that is taken.
+
+    A stage joins the run that it reads from, as long as that does not have the stage; any other name
+    must be new, so that a run holds only what belongs together.
+    """
+    taken = session.run_names()
+    joins = base in record.input_runs and not _has_stage(session, record.stage, base, writes)
+    if joins or base not in taken:
+        return base
+    number = 2
+    while f"{base}_{number}" in taken:
+        number += 1
+    return f"{base}_{number}"
+
+
+def _has_stage(session: Session, stage: str, name: str, writes: Sequence[type]) -> bool:
+    """By its record, or by a channel that such a stage writes, whoever made it."""
+    recorded = any((run.run, run.stage) == (name, stage) for run in session.runs())
+    return recorded or bool(session.topics(writes[0], name))
+
+
+def check_run_name(session: Session, stage: str, name: str, writes: Sequence[type]) -> str:
+    """Return the name that a user gave a run, if the run does not have that stage yet.
+
+    Raises
+    ------
+    IpsysError
+        Otherwise.
+    """
+    if _has_stage(session, stage, name, writes):
+        raise IpsysError(f"run {name} already has the stage {stage} from other input; use another --run name")
+    return name
+
+
+def newest_run(session: Session, payload: type) -> str | None:
+    """Return the run whose newest complete stage wrote a type of payload.
+
+    Imported channels are of no recorded stage: they count with any complete stage of their run.
+    """
+    recorded = {output.topic for run in session.runs() for output in run.outputs}
+    for run in reversed(complete_runs(session)):
+        topics = set(session.topics(payload, run.run))
+        if topics and (topics.isdisjoint(recorded) or topics & {output.topic for output in run.outputs}):
+            return run.run
+    return None

@@ -1,0 +1,277 @@
+"""The proof that a log replays: every run made again from what it read, and compared byte for byte."""
+
+from __future__ import annotations
+
+import heapq
+from collections.abc import Callable, Collection, Iterator, Sequence
+from dataclasses import replace
+from pathlib import Path
+
+import numpy as np
+from threadpoolctl import threadpool_limits
+
+from ipsys_log.analysis.differences import (
+    Comparison,
+    Extent,
+    Stored,
+    compare_channels,
+    explain_apart,
+    marker_ids,
+)
+from ipsys_log.errors import IpsysError
+from ipsys_log.log.codec import encode
+from ipsys_log.log.dataset import Session
+from ipsys_log.log.topics import run_of_topic
+from ipsys_log.messages import (
+    CameraCalibration,
+    CameraPoints,
+    FrameTransforms,
+    Markers,
+    Message,
+    Model,
+    Positions,
+    Run,
+    Tracks,
+)
+from ipsys_log.runs.execute import carry_out
+from ipsys_log.runs.graph import Task, plan_stage
+from ipsys_log.runs.options import Progress, Request
+from ipsys_log.runs.states import Recorded, is_fitted_here, recorded_stages
+from ipsys_log.stages.camera_frame import PERIMETER
+
+__all__ = ["diff", "explain_diff", "verify"]
+
+_MODELS = ("fit", "evaluate")
+# Payloads that come frame by frame.
+_MOVING = (Markers, CameraPoints, Positions, Tracks)
+
+
+def verify(
+    paths: Sequence[Path], run: str | None, progress: Progress, say: Callable[[str], None] = lambda text: None
+) -> list[Comparison]:
+    """Repeat every run from its recorded input, and compare.
+
+    A model that was copied from another log cannot be repeated, nor its evaluation; results made with it can.
+    A model cannot be repeated if measurements were added or withdrawn since. Results of another version are
+    not repeated either, with a remark. Later stages are repeated from the recorded channels.
+
+    Parameters
+    ----------
+    run : only this run; None: all.
+    say : called with the runs that are not repeated.
+
+    Returns
+    -------
+    One comparison for each derived channel; the log is on the left.
+
+    Raises
+    ------
+    IpsysError
+        There is no such run, nothing of it can be verified, or its inputs are no longer in the log.
+    """
+    with Session(paths) as session, threadpool_limits(1, user_api="blas"):
+        names = session.run_names() if run is None else session.run_names() & {run}
+        recorded = [one for one in recorded_stages(session) if one.run.run in names]
+        records = [one.run for one in recorded if not _is_of_copied_model(one.run)]
+        if not records:
+            raise IpsysError(
+                f"{session}: has no {'run' if run is None else f'run {run}'} to verify; "
+                "make one with 'ipsys replay', or see 'ipsys runs'"
+            )
+        checked = {output.topic for one in records for output in one.outputs}
+        repeated = [
+            one.run
+            for one in recorded
+            if one.run in records
+            and not _is_of_other_version(one, say)
+            and _is_up_to_date(session, one.run, checked, say)
+        ]
+        if not repeated:
+            raise IpsysError(f"{session}: nothing of its runs can be verified; see 'ipsys runs'")
+        found = []
+        for name in sorted(names):
+            stages = [one for one in repeated if one.run == name]
+            topics = {output.topic for one in stages for output in one.outputs}
+            # Stages can share a channel, that of events.
+            made = heapq.merge(
+                *(_made_again(session, one, progress) for one in stages), key=lambda row: row[0].log_time_ns
+            )
+            found += compare_channels(session.stored(sorted(topics)), made)
+        return sorted([*found, *_unrecorded(session, names)], key=lambda one: one.topic)
+
+
+def _is_of_copied_model(run: Run) -> bool:
+    """Return whether a stage copied a model from another log, or evaluated such a model."""
+    return run.stage in _MODELS and not is_fitted_here(run)
+
+
+def _is_of_other_version(one: Recorded, say: Callable[[str], None]) -> bool:
+    """Return whether another version made a stage, and print a remark if so."""
+    if one.is_of_other_version:
+        say(f"run {one.run.run}: {one.run.stage} is {one.state}; it is not verified")
+    return one.is_of_other_version
+
+
+def _unrecorded(session: Session, names: Collection[str]) -> list[Comparison]:
+    """Channels of runs that no record says anything of."""
+    known = {output.topic for one in session.runs() for output in one.outputs}
+    return [
+        Comparison(topic, session.count(topic), 0, 0, 0, "no record says how it was made", 0)
+        for topic in sorted({topic for reader in session.readers for topic in reader.channels} - known)
+        if run_of_topic(topic) in names and not topic.endswith("/record") and session.count(topic)
+    ]
+
+
+def diff(left: Path, right: Path, runs: tuple[str | None, str | None]) -> list[Comparison]:
+    """Compare the derived channels of two logs, or of two runs.
+
+    Parameters
+    ----------
+    runs : of the left and of the right log; None: all common runs.
+
+    Raises
+    ------
+    IpsysError
+        A run does not exist, or the logs have no run in common.
+    """
+    with Session([left]) as one, Session([right]) as other:
+        first, second = _compared_runs(one, other, runs)
+        ours, theirs = _derived(one, first, None), _derived(other, second, runs[0])
+        return compare_channels(ours, theirs)
+
+
+def explain_diff(left: Path, right: Path, runs: tuple[str | None, str | None]) -> str | None:
+    """Return the reason why two logs or two runs have nothing in common that can be compared; None where
+    they have something. The parameters are those of `diff`."""
+    with Session([left]) as one, Session([right]) as other:
+        first, second = _compared_runs(one, other, runs)
+        return explain_apart(_extent(one, first), _extent(other, second))
+
+
+def _compared_runs(
+    one: Session, other: Session, runs: tuple[str | None, str | None]
+) -> tuple[set[str], set[str]]:
+    names = [_run_names(one, runs[0]), _run_names(other, runs[1])]
+    both = names[0] & names[1] if runs[0] is None else names[0]
+    if not both:
+        raise IpsysError(
+            f"{one} and {other} have no run of the same name (see 'ipsys runs'); give the runs with --run"
+        )
+    return both, both if runs[1] is None else names[1]
+
+
+def _extent(session: Session, runs: Collection[str]) -> Extent:
+    topics = [topic for run in runs for payload in _MOVING for topic in session.topics(payload, run)]
+    cameras, times_ns, ids = set(), set(), set()
+    for message in session.messages(topics):
+        times_ns.add(message.log_time_ns)
+        ids |= marker_ids(message.payload)
+        cameras |= {message.camera} - {None}
+    return Extent(frozenset(map(str, cameras)), np.array(sorted(times_ns), dtype=np.int64), frozenset(ids))
+
+
+def _run_names(session: Session, wanted: str | None) -> set[str]:
+    names = session.run_names()
+    if wanted is not None and wanted not in names:
+        raise IpsysError(f"{session}: has no run {wanted}; it has {', '.join(sorted(names)) or 'none'}")
+    return names if wanted is None else {wanted}
+
+
+def _derived(session: Session, runs: set[str], called: str | None) -> Iterator[Stored]:
+    """What runs have written, but for their records; as that of a run ``called`` otherwise.
+
+    Models come first, and without a time: one that was copied in has the time at which it was.
+    """
+    topics = {
+        topic
+        for reader in session.readers
+        for topic in reader.channels
+        if run_of_topic(topic) in runs and not topic.endswith("/record")
+    }
+    models = topics & {topic for run in runs for topic in session.topics(Model, run)}
+    for message, data in session.stored(models):
+        yield replace(_called(message, called), log_time_ns=0, publish_time_ns=0), data
+    for message, data in session.stored(topics - models):
+        other = _called(message, called)
+        yield other, data if other.payload is message.payload else encode(other.payload)
+
+
+def _called(message: Message, run: str | None) -> Message:
+    """A message as one of another run, whose name stands in its topic and in the frames of robots."""
+    if run is None:
+        return message
+    name, payload = run_of_topic(message.topic), message.payload
+    if isinstance(payload, FrameTransforms):
+        payload = FrameTransforms(
+            tuple(
+                replace(one, child_frame_id=one.child_frame_id.replace(f"{name}/", f"{run}/", 1))
+                for one in payload.transforms
+            )
+        )
+    return replace(message, topic=message.topic.replace(f"/runs/{name}/", f"/runs/{run}/"), payload=payload)
+
+
+def _is_up_to_date(session: Session, run: Run, checked: Collection[str], say: Callable[[str], None]) -> bool:
+    """Whether a stage can be made again; where what it read is ``checked`` itself, the faults show there."""
+    for read in run.inputs:
+        count = session.count(read.topic)
+        if read.topic in checked or (count == read.messages and session.hash(read.topic) == read.hash):
+            continue
+        if count == 0:
+            say(
+                f"run {run.run}: {run.stage} is not verified: {read.topic}, which it has read, is not in "
+                f"{session}; give the log that has it, too"
+            )
+            return False
+        text = (
+            f"run {run.run} was made from {read.messages} messages of {read.topic}, and these "
+            f"are not what the log holds now ({count} messages): it is out of date"
+        )
+        if run.stage in _MODELS:
+            say(f"{text}; its {run.stage} is not verified: ipsys replay makes it again")
+            return False
+        raise IpsysError(f"{session}: {text}, or the log it was made from has to be given too")
+    return True
+
+
+def _made_again(session: Session, run: Run, progress: Progress) -> Iterator[Stored]:
+    task = plan_stage(run.stage, session, _request(run), **_given(session, run))
+    if isinstance(task, Task):
+        for message in carry_out(task, session, run.run, progress):
+            yield message, encode(message.payload)
+
+
+def _request(run: Run) -> Request:
+    lenses = {
+        one.camera: CameraCalibration(
+            0, one.camera, one.width, one.height, one.distortion_model, one.d, one.k
+        )
+        for one in run.lenses
+    }
+    return Request(
+        rig=run.rig,
+        lenses=lenses,
+        corners=run.parameters.get("corners"),
+        method=run.parameters.get("method", PERIMETER),
+        train=run.parameters.get("train", "train"),
+        seed=int(run.parameters.get("seed", "0")),
+        as_live="as_live" in run.parameters,
+    )
+
+
+def _given(session: Session, run: Run) -> dict[str, str]:
+    """The runs that it has read from, as the plan wants them."""
+    read = {read.topic for read in run.inputs}
+
+    def source(payload: type) -> str:
+        names = {name for name in session.run_names() if read & set(session.topics(payload, name))}
+        return names.pop() if names else ""
+
+    return {
+        "detect": {},
+        "camera-frame": {"markers": source(Markers)},
+        "fit": {"points": source(CameraPoints), "model": run.parameters.get("model", "")},
+        "evaluate": {"points": source(CameraPoints), "model": source(Model)},
+        "locate": {"points": source(CameraPoints), "model": source(Model)},
+        "fuse": {"positions": source(Positions)},
+    }[run.stage]

@@ -1,0 +1,244 @@
+"""Where the markers lie while they are measured, and what tape and ruler say of it."""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Sequence
+from dataclasses import dataclass
+
+import numpy as np
+from numpy.typing import NDArray
+
+from ipsys_log.errors import IpsysError
+from ipsys_log.geometry.patterns import Placed, black_cells, print_outline
+from ipsys_log.geometry.poses import lay_flat
+from ipsys_log.messages import Distance, Interval, Measurement, ReferencePoint
+from ipsys_log.simulation.cameras import FLOOR_M, Camera, sees
+from ipsys_log.simulation.seeds import Purpose, stream
+from ipsys_log.simulation.settings import LabSettings
+
+__all__ = [
+    "REFERENCES",
+    "Place",
+    "choose_place",
+    "measure",
+    "overlap",
+    "place",
+    "plan_stations",
+    "seen_whole",
+    "split",
+    "tape_lengths_m",
+]
+
+Array = NDArray[np.float64]
+
+REFERENCES = (ReferencePoint("A", 1.2192, 2.4384), ReferencePoint("B", 3.6576, 2.4384))
+_DRAWS = 4000
+# A place is the one of so many that lies farthest from the places before it.
+_CANDIDATES = 4
+_TEST_SHARE = 0.2
+
+
+@dataclass(frozen=True, slots=True)
+class Place:
+    """A marker on the floor, facing up: its centre in world m, its heading in rad."""
+
+    marker_id: int
+    x_m: float
+    y_m: float
+    z_m: float
+    heading_rad: float
+
+
+@dataclass(frozen=True, slots=True)
+class Station:
+    """A place to be measured; ``camera`` is the one it was chosen for."""
+
+    place: Place
+    camera: str
+
+
+def place(where: Place, settings: LabSettings) -> Placed:
+    """The print at a place."""
+    return Placed(
+        where.marker_id,
+        settings.marker_length_m,
+        lay_flat(where.x_m, where.y_m, where.z_m, where.heading_rad),
+    )
+
+
+def seen_whole(where: Place, cameras: Sequence[Camera], settings: LabSettings) -> tuple[str, ...]:
+    """Names of the cameras whose image holds the whole print, white margin included."""
+    outline_m = print_outline(place(where, settings), settings.dictionary)
+    return tuple(camera.name for camera in cameras if sees(camera, outline_m).all())
+
+
+def overlap(
+    first: Array, second: Array, cameras: Sequence[Camera], settings: LabSettings
+) -> NDArray[np.bool_]:
+    """Return whether prints at two places, (..., 3) in m, might cover one another in any image: (...).
+
+    The disc around a print throws a shadow on the floor from where a camera hangs; shadows that are
+    apart are apart in its image.
+    """
+    cells = len(black_cells(settings.dictionary, 0))
+    radius_m = settings.marker_length_m * cells / (cells - 2) / np.sqrt(2)
+    met = np.zeros(np.broadcast_shapes(first.shape, second.shape)[:-1], dtype=bool)
+    for camera in cameras:
+        eye_m = camera.origin_m
+        growth = [eye_m[2] / (eye_m[2] - point[..., 2:]) for point in (first, second)]
+        shadows = [
+            eye_m[:2] + g * (p[..., :2] - eye_m[:2]) for g, p in zip(growth, (first, second), strict=True)
+        ]
+        apart_m = np.linalg.norm(shadows[0] - shadows[1], axis=-1)
+        met |= apart_m < 1.05 * radius_m * (growth[0] + growth[1])[..., 0]
+    return met
+
+
+def plan_stations(settings: LabSettings, cameras: Sequence[Camera]) -> list[tuple[Station, ...]]:
+    """Sets of places, one of each marker, until every camera sees about ``settings.stations`` places.
+
+    Raises
+    ------
+    IpsysError
+        The floor has no room for another marker.
+    """
+    rng = stream(settings.seed, Purpose.PLACES)
+    seen: dict[str, list[Place]] = {camera.name: [] for camera in cameras}
+    sets: list[tuple[Station, ...]] = []
+    while min(map(len, seen.values())) < settings.stations:
+        stations: list[Station] = []
+        for marker_id in range(settings.markers):
+            camera = min(cameras, key=lambda one: len(seen[one.name]))
+            taken = [station.place for station in stations]
+            where = choose_place(rng, settings, cameras, camera, marker_id, taken, seen[camera.name])
+            stations.append(Station(where, camera.name))
+            for name in seen_whole(where, cameras, settings):
+                seen[name].append(where)
+        sets.append(tuple(stations))
+    return sets
+
+
+def split(sets: Sequence[tuple[Station, ...]], seed: int) -> list[tuple[str, ...]]:
+    """The split that each station belongs to, in order: a fifth of each camera's is held out."""
+    rng = stream(seed, Purpose.SPLIT)
+    cameras = [station.camera for stations in sets for station in stations]
+    splits: list[tuple[str, ...]] = [("train",)] * len(cameras)
+    for camera in dict.fromkeys(cameras):
+        own = [index for index, name in enumerate(cameras) if name == camera]
+        for index in rng.permutation(own)[: round(_TEST_SHARE * len(own))]:
+            splits[index] = ("test",)
+    return splits
+
+
+def measure(
+    where: Place, settings: LabSettings, index: int, times_ns: Sequence[int], splits: tuple[str, ...]
+) -> Measurement:
+    """A place as measured by hand: the distances from A and B in the plane of the floor, the height.
+
+    Parameters
+    ----------
+    where : the truth.
+    settings : the sigmas of tape and ruler.
+    index : number of the measurement; every other one names its still interval.
+    times_ns : instants of the frames in which it lies there.
+    splits : what it is for.
+    """
+    rng = stream(settings.seed, Purpose.TAPE, index)
+    distances = _tape(where, settings.tape_sigma_m, rng)
+    readout_ns = (settings.height - 1) * settings.row_time_ns
+    # What lies on the floor needs no ruler.
+    height_m = where.z_m + (rng.normal(0.0, settings.ruler_sigma_m) if where.z_m else 0.0)
+    return Measurement(
+        timestamp=times_ns[len(times_ns) // 2],
+        id=f"s{index:03d}",
+        marker_id=where.marker_id,
+        distances=tuple(
+            Distance(reference.name, float(distance_m), settings.tape_sigma_m)
+            for reference, distance_m in zip(REFERENCES, distances, strict=True)
+        ),
+        side="left" if where.y_m >= REFERENCES[0].y_m else "right",
+        height_m=float(height_m),
+        height_sigma_m=settings.ruler_sigma_m,
+        still=Interval(times_ns[0], times_ns[-1] + readout_ns) if index % 2 == 0 else None,
+        splits=splits,
+    )
+
+
+def tape_lengths_m(where: Place) -> Array:
+    """Return the true distances of a place from A and B in the plane of the floor, (2,)."""
+    return np.array([np.hypot(where.x_m - p.x_m, where.y_m - p.y_m) for p in REFERENCES])
+
+
+def _tape(where: Place, sigma_m: float, rng: np.random.Generator) -> Array:
+    """Draw two distances that form a triangle with AB; invalid readings are repeated."""
+    a, b = REFERENCES
+    true_m = tape_lengths_m(where)
+    base_m = np.hypot(b.x_m - a.x_m, b.y_m - a.y_m)
+    for _ in range(1000):
+        read_m = true_m + rng.normal(0.0, sigma_m, 2)
+        if (read_m > 0).all() and abs(read_m[0] - read_m[1]) < base_m < read_m.sum():
+            return read_m
+    raise IpsysError(
+        f"simulator: tape_sigma_m = {sigma_m:g} m closes no triangle at "
+        f"({where.x_m:.2f}, {where.y_m:.2f}) m; set a smaller one or a larger tape_angle_deg"
+    )
+
+
+def choose_place(
+    rng: np.random.Generator,
+    settings: LabSettings,
+    cameras: Sequence[Camera],
+    camera: Camera,
+    marker_id: int,
+    taken: Sequence[Place],
+    before: Sequence[Place],
+    suits: Callable[[Place, Camera, LabSettings], bool] = lambda where, camera, settings: True,
+) -> Place:
+    """Choose a place in the view of a camera, far from those ``before``, clear of those that are ``taken``.
+
+    Raises
+    ------
+    IpsysError
+        The view has no room for the marker.
+    """
+    found: list[Place] = []
+    for _ in range(_DRAWS):
+        x_m, y_m = rng.uniform(0, FLOOR_M, 2)
+        z_m, heading_rad = rng.choice(settings.heights_m), rng.uniform(-np.pi, np.pi)
+        where = Place(marker_id, float(x_m), float(y_m), float(z_m), float(heading_rad))
+        if _fits(where, settings, cameras, camera, taken) and suits(where, camera, settings):
+            found.append(where)
+        if len(found) == _CANDIDATES:
+            break
+    if not found:
+        raise IpsysError(
+            f"simulator: no room for marker {marker_id} beside {len(taken)} others in the view of "
+            f"{camera.name!r}; set fewer or smaller markers"
+        )
+    return max(found, key=lambda where: _distance(where, before))
+
+
+def _fits(
+    where: Place, settings: LabSettings, cameras: Sequence[Camera], camera: Camera, taken: Sequence[Place]
+) -> bool:
+    if not sees(camera, _centre(where)[None])[0] or _tape_angle_deg(where) < settings.tape_angle_deg:
+        return False
+    if camera.name not in seen_whole(where, (camera,), settings):
+        return False
+    others = np.array([_centre(other) for other in taken]).reshape(-1, 3)
+    return not overlap(_centre(where), others, cameras, settings).any()
+
+
+def _tape_angle_deg(where: Place) -> float:
+    """Angle in 0..90 degrees at which the lines from A and B cross: flat triangles tell little."""
+    to_a, to_b = (np.array([where.x_m - p.x_m, where.y_m - p.y_m]) for p in REFERENCES)
+    cross = abs(to_a[0] * to_b[1] - to_a[1] * to_b[0])
+    return float(np.degrees(np.arcsin(min(cross / (np.hypot(*to_a) * np.hypot(*to_b)), 1.0))))
+
+
+def _centre(where: Place) -> Array:
+    return np.array([where.x_m, where.y_m, where.z_m])
+
+
+def _distance(where: Place, before: Sequence[Place]) -> float:
+    return min((np.hypot(where.x_m - p.x_m, where.y_m - p.y_m) for p in before), default=np.inf)

@@ -1,0 +1,140 @@
+"""The cameras of the simulated lab: lenses like the paper's, hung so that they cover the floor."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import numpy as np
+from numpy.typing import NDArray
+
+from ipsys_log.errors import IpsysError
+from ipsys_log.geometry.lenses import project
+from ipsys_log.geometry.poses import look_down, transform
+from ipsys_log.messages import CameraCalibration
+from ipsys_log.simulation.seeds import Purpose, stream
+from ipsys_log.simulation.settings import LabSettings
+
+__all__ = ["FLOOR_M", "Camera", "hang_cameras", "sees"]
+
+Array = NDArray[np.float64]
+
+FLOOR_M = 4.88
+# Outermost cameras hang this far from the wall; with three of them, 1.59 m lie between two.
+_FROM_WALL_M = 0.85
+_TRIES = 5000
+# Sizes at 1920 px of width; distortion about that of the paper's lenses.
+_FOCAL_PX = (1150.0, 1165.0)
+_OFF_CENTRE_PX = 60.0
+_DISTORTION = np.array([-0.13, 0.01, -0.03, 0.02])
+_DISTORTION_SPREAD = np.array([0.008, 0.006, 0.006, 0.004])
+_WIDEST_RAD = 1.4
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class Camera:
+    """A lens in its place: ``camera_from_world`` is (4, 4)."""
+
+    name: str
+    lens: CameraCalibration
+    camera_from_world: Array
+
+    @property
+    def origin_m(self) -> Array:
+        """Where it hangs in the world, (3,)."""
+        origin: Array = -self.camera_from_world[:3, :3].T @ self.camera_from_world[:3, 3]
+        return origin
+
+
+def hang_cameras(settings: LabSettings, time_ns: int = 0) -> tuple[Camera, ...]:
+    """The cameras in a row over the middle of the floor.
+
+    Parameters
+    ----------
+    settings : of the lab.
+    time_ns : of the calibrations.
+
+    Raises
+    ------
+    IpsysError
+        Where no lens and tilt lets a camera see its part of the floor.
+    """
+    count = len(settings.cameras)
+    spacing_m = (FLOOR_M - 2 * _FROM_WALL_M) / max(count - 1, 2)
+    ys_m = FLOOR_M / 2 + spacing_m * (np.arange(count) - (count - 1) / 2)
+    return tuple(_hang(settings, index, float(y_m), spacing_m, time_ns) for index, y_m in enumerate(ys_m))
+
+
+def sees(camera: Camera, points_m: Array) -> NDArray[np.bool_]:
+    """Which points of the world, (n, 3) in m, lie in the image: (n,)."""
+    points_c = transform(camera.camera_from_world, points_m)
+    # Beyond the widest angle the polynomial of the lens means nothing.
+    in_front = np.hypot(points_c[:, 0], points_c[:, 1]) < np.tan(_WIDEST_RAD) * points_c[:, 2]
+    px = project(np.where(in_front[:, None], points_c, [0.0, 0.0, 1.0]), camera.lens)
+    last = np.array([camera.lens.width - 1, camera.lens.height - 1])
+    inside: NDArray[np.bool_] = in_front & (px >= 0).all(axis=1) & (px <= last).all(axis=1)
+    return inside
+
+
+def _hang(settings: LabSettings, index: int, y_m: float, spacing_m: float, time_ns: int) -> Camera:
+    """Turn and shift a camera until it sees its part of the floor, as one does on a ladder."""
+    rng = stream(settings.seed, Purpose.CAMERA, index)
+    name = settings.cameras[index]
+    wanted_m = _part_of_floor(settings, y_m, spacing_m)
+    for _ in range(_TRIES):
+        lens = _draw_lens(rng, settings, name, time_ns)
+        tilt = np.radians(rng.uniform(*settings.tilt_deg))
+        towards = rng.uniform(0, 2 * np.pi)
+        tilt_rad = tilt * np.array([np.cos(towards), np.sin(towards), 0.0])
+        nudge_m = rng.uniform(-1, 1, 3) * [0.02, 0.02, 0.04]
+        origin_m = np.array([FLOOR_M / 2, y_m, settings.mount_height_m]) + nudge_m
+        camera = Camera(name, lens, look_down(origin_m, tilt_rad))
+        if _reaches(lens) and sees(camera, wanted_m).all():
+            return camera
+    raise IpsysError(
+        f"simulator: camera {name!r} cannot see its part of the floor from {settings.mount_height_m:g} m "
+        f"with a tilt of {settings.tilt_deg[0]:g} to {settings.tilt_deg[1]:g} degrees; "
+        "tilt it less, hang it higher, or use a frame of 16:9 and lower markers"
+    )
+
+
+def _part_of_floor(settings: LabSettings, y_m: float, spacing_m: float) -> Array:
+    """Points that a camera has to see: its strip of the floor, and the overlap above it.
+
+    Halfway to its neighbour it sees half a marker more, corner to corner, at the greatest height.
+    """
+    across = np.linspace(0, FLOOR_M, 13)
+    along = np.clip(y_m + _FROM_WALL_M * np.linspace(-1, 1, 5), 0, FLOOR_M)
+    top_m = max(*settings.heights_m, settings.drive_height_m)
+    reach_m = spacing_m / 2 + settings.marker_length_m / np.sqrt(2)
+    # A marker at a height near a wall may fall out of the image; the measured places take care.
+    across_top = np.linspace(0.15 * FLOOR_M, 0.85 * FLOOR_M, 9)
+    along_top = y_m + reach_m * np.linspace(-1, 1, 3)
+    low = np.stack(np.meshgrid(across, along, [0.0]), axis=-1).reshape(-1, 3)
+    high = np.stack(np.meshgrid(across_top, along_top, [top_m]), axis=-1).reshape(-1, 3)
+    return np.vstack([low, high])
+
+
+def _draw_lens(rng: np.random.Generator, settings: LabSettings, name: str, time_ns: int) -> CameraCalibration:
+    scale = settings.width / 1920
+    fx = scale * rng.uniform(*_FOCAL_PX)
+    fy = fx * rng.uniform(0.998, 1.002)
+    cx, cy = (np.array([settings.width, settings.height]) - 1) / 2 + scale * _OFF_CENTRE_PX * rng.uniform(
+        -1, 1, 2
+    )
+    K = np.array([[fx, 0.0, cx], [0.0, fy, cy], [0.0, 0.0, 1.0]])
+    D = _DISTORTION + _DISTORTION_SPREAD * rng.uniform(-1, 1, 4)
+    P = np.hstack([K, np.zeros((3, 1))])
+    return CameraCalibration(
+        time_ns, name, settings.width, settings.height, "kannala_brandt", D, K, np.eye(3), P
+    )
+
+
+def _reaches(lens: CameraCalibration) -> bool:
+    """Whether the lens is monotone up to an angle that lies outside of the image."""
+    theta = np.linspace(0, _WIDEST_RAD, 200)
+    powers = theta[:, None] ** np.array([2, 4, 6, 8])
+    slope = 1 + powers @ (np.array([3, 5, 7, 9]) * lens.D)
+    widest = theta[-1] * (1 + powers[-1] @ lens.D)
+    frame = np.array([[0, 0], [lens.width, 0], [0, lens.height], [lens.width, lens.height]])
+    corner = np.linalg.norm((frame - lens.K[:2, 2]) / lens.K.diagonal()[:2], axis=1).max()
+    return bool(slope.min() > 0.1 and widest > 1.05 * corner)

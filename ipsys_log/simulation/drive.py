@@ -1,0 +1,114 @@
+"""Robots that drive one behind the other along a smooth closed path over the whole floor.
+
+The path does not cross itself, so that a convoy never meets itself however long it drives.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass, replace
+
+import numpy as np
+from numpy.typing import NDArray
+
+from ipsys_log.simulation.calibration_points import Place, overlap
+from ipsys_log.simulation.cameras import FLOOR_M, Camera
+from ipsys_log.simulation.seeds import Purpose, stream
+from ipsys_log.simulation.settings import LabSettings
+
+__all__ = ["Drive", "plan_drive"]
+
+Array = NDArray[np.float64]
+
+# Of the path from the walls: near enough for the edge of the images, and seen whole everywhere.
+_FROM_WALL_M = 0.55
+# A robot gathers speed within about this time.
+_START_S = 0.4
+_TRIES = 200
+_ARMS = 5
+# Mean reach, and the share of a second harmonic that rounds the bends between the arms.
+_MEAN, _ROUND = 0.7, 0.18
+# A robot slows down in bends so as not to turn faster than this.
+_TURN_RAD_S = 2.5
+_CHECKED_HZ = 10
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class Drive:
+    """A star with five rounded arms, and how far ahead on it each marker starts, in s.
+
+    ``times_s`` (n,) is when a robot passes the angles ``phases_rad`` (n,) of the path.
+    """
+
+    height_m: float
+    mirrored: bool
+    ahead_s: dict[int, float]
+    times_s: Array
+    phases_rad: Array
+
+    def places_at(self, time_s: float) -> tuple[Place, ...]:
+        """Where the markers are, a time after the start; before it they stand there."""
+        return tuple(self.place_at(marker_id, time_s) for marker_id in self.ahead_s)
+
+    def place_at(self, marker_id: int, time_s: float) -> Place:
+        """Where one of them is."""
+        (x_m, y_m), (dx, dy) = self._follow(self.ahead_s[marker_id], np.array([max(time_s, 0.0)]))
+        heading_rad = float(np.arctan2(dy[0], dx[0]))
+        return Place(marker_id, float(x_m[0]), float(y_m[0]), self.height_m, heading_rad)
+
+    def track(self, ahead_s: float, times_s: Array) -> Array:
+        """Centres of a marker at times (n,): (n, 3) in m."""
+        (x_m, y_m), _ = self._follow(ahead_s, times_s)
+        return np.stack([x_m, y_m, np.full_like(x_m, self.height_m)], axis=1)
+
+    def _follow(self, ahead_s: float, times_s: Array) -> tuple[tuple[Array, Array], tuple[Array, Array]]:
+        driven_s = times_s - _START_S * (1 - np.exp(-times_s / _START_S))
+        phase = np.interp((ahead_s + driven_s) % self.times_s[-1], self.times_s, self.phases_rad)
+        return _figure(phase, self.mirrored)
+
+
+def plan_drive(settings: LabSettings, cameras: Sequence[Camera]) -> Drive:
+    """Markers on the path, as many of them as never cover one another; marker 0 starts at a wall."""
+    rng = stream(settings.seed, Purpose.DRIVE)
+    mirrored = bool(rng.integers(2))
+    empty = Drive(settings.drive_height_m, mirrored, {}, *_timetable(settings.drive_speed_m_s))
+    times_s = np.arange(0, settings.drive_s + 1 / _CHECKED_HZ, 1 / _CHECKED_HZ)
+    ahead_s, tracks_m = {0: 0.0}, [empty.track(0.0, times_s)]
+    for marker_id in range(1, settings.markers):
+        for start_s in rng.uniform(0, empty.times_s[-1], _TRIES).tolist():
+            track_m = empty.track(start_s, times_s)
+            if not any(overlap(track_m, other_m, cameras, settings).any() for other_m in tracks_m):
+                ahead_s[marker_id] = start_s
+                tracks_m.append(track_m)
+                break
+    return replace(empty, ahead_s=ahead_s)
+
+
+def _timetable(speed_m_s: float) -> tuple[Array, Array]:
+    """When a robot passes which angle of the path, from the wall by the first camera: s and rad."""
+    phases_rad = -np.pi / 2 + np.linspace(0, 2 * np.pi, 20_001)
+    (x_m, y_m), (dx, dy) = _figure(phases_rad, False)
+    step_m = np.hypot(np.diff(x_m), np.diff(y_m))
+    turn_rad = np.abs(np.diff(np.unwrap(np.arctan2(dy, dx))))
+    step_s = np.hypot(step_m / speed_m_s, turn_rad / _TURN_RAD_S)
+    return np.concatenate([[0.0], np.cumsum(step_s)]), phases_rad
+
+
+def _figure(phase: Array, mirrored: bool) -> tuple[tuple[Array, Array], tuple[Array, Array]]:
+    """Points of the path at angles (n,), in m, and their derivatives by the angle.
+
+    Between the arms the path comes back to near the middle; the arms end on a square with rounded
+    corners, so that they reach the edges of all images.
+    """
+    side = -1.0 if mirrored else 1.0
+    cos, sin = np.cos(phase), np.sin(phase)
+    corner = cos**4 + sin**4
+    arm = _ARMS * (phase + np.pi / 2)
+    swing = (1 - _MEAN) / (1 + (1 - _MEAN) * _ROUND)
+    wave = 1 - swing * (1 - np.cos(arm) + _ROUND * (1 - np.cos(2 * arm)))
+    wave_slope = -swing * _ARMS * (np.sin(arm) + 2 * _ROUND * np.sin(2 * arm))
+    size_m = (FLOOR_M / 2 - _FROM_WALL_M) * corner**-0.25
+    reach_m = size_m * wave
+    slope_m = size_m * (wave * (cos**3 * sin - sin**3 * cos) / corner + wave_slope)
+    point_m = (FLOOR_M / 2 + side * reach_m * cos, FLOOR_M / 2 + reach_m * sin)
+    return point_m, (side * (slope_m * cos - reach_m * sin), slope_m * sin + reach_m * cos)

@@ -1,0 +1,237 @@
+"""The simulated session: rig, lenses, measured places, driving robots, and the truth of it all."""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Iterator, Sequence
+from concurrent.futures import ThreadPoolExecutor
+from dataclasses import dataclass
+from typing import Any
+
+from ipsys_log.geometry.patterns import Moving, Placed
+from ipsys_log.messages import (
+    MEASUREMENTS_TOPIC,
+    RIG_TOPIC,
+    TRUTH_TOPIC,
+    CompressedImage,
+    Floor,
+    Measurement,
+    Message,
+    Rig,
+    RigCamera,
+    RigMarker,
+    Track,
+    Tracks,
+    calibration_topic,
+    image_topic,
+)
+from ipsys_log.simulation.calibration_points import (
+    REFERENCES,
+    Place,
+    measure,
+    place,
+    plan_stations,
+    seen_whole,
+    split,
+)
+from ipsys_log.simulation.cameras import FLOOR_M, Camera, hang_cameras
+from ipsys_log.simulation.drive import Drive, plan_drive
+from ipsys_log.simulation.render import encode_jpeg, render
+from ipsys_log.simulation.seeds import Purpose, stream
+from ipsys_log.simulation.settings import LabSettings
+from ipsys_log.simulation.shutter import exposed
+from ipsys_log.simulation.views import View, prepare_view
+from ipsys_log.units import NS_PER_S
+
+__all__ = ["EPOCH_NS", "build_rig", "drive_start_ns", "driving", "simulate"]
+
+# When the simulated clock starts: 2023-11-14 22:13:20 UTC.
+EPOCH_NS = 1_700_000_000 * NS_PER_S
+# While the markers are carried to their next places, nobody records.
+_PAUSE_NS = 3 * NS_PER_S
+# From the end of the exposure of the last row to the arrival of the frame.
+_LATENCY_NS = 4_000_000
+
+
+@dataclass(frozen=True, slots=True)
+class Instant:
+    """One moment at which all cameras take a frame; what was measured by then comes after it.
+
+    ``places`` is where the markers are at ``time_ns``, the middle of the exposure of the first row;
+    ``prints`` are they as the cameras see them.
+    """
+
+    time_ns: int
+    places: tuple[Place, ...]
+    prints: tuple[Placed | Moving, ...]
+    measured: tuple[Measurement, ...] = ()
+
+
+def simulate(
+    settings: LabSettings,
+    progress: Callable[[str, int, int], None] = lambda stage, done, total: None,
+) -> Iterator[Message]:
+    """A session of the simulated lab, message by message, in log order.
+
+    Equal settings give equal messages, byte for byte on the same versions of OpenCV and NumPy. No
+    clock is read: the simulated one starts at :data:`EPOCH_NS`.
+
+    Parameters
+    ----------
+    settings : of the lab.
+    progress : called with what is done (the ``views`` of the cameras, then ``simulate``: frames), how many of
+        them, and how many there are.
+
+    Yields
+    ------
+    Message
+        The rig; a calibration per camera; then, per instant, the truth, a frame per camera and the
+        measurements that were made. ``publish_time_ns`` is the instant: of a frame, the middle of the
+        exposure of its first row.
+
+    Raises
+    ------
+    IpsysError
+        Where the settings contradict themselves.
+
+    Examples
+    --------
+    >>> lab = LabSettings(width=640, height=360, cameras=("red",), markers=1, stations=1, drive_s=0.0)
+    >>> [message.topic for message in simulate(lab)][:4]
+    ['/rig', '/cameras/red/calibration', '/truth/tracks', '/cameras/red/image']
+    """
+    log_time_ns = EPOCH_NS
+    latency_ns = _LATENCY_NS + round(exposed(0, settings.height - 1, settings)[1] * NS_PER_S)
+    for topic, payload, publish_time_ns, camera in _payloads(settings, progress):
+        log_time_ns = max(publish_time_ns + latency_ns, log_time_ns + 1)
+        yield Message(topic, log_time_ns, publish_time_ns, payload, camera)
+
+
+def build_rig(settings: LabSettings) -> Rig:
+    """The rig of the simulated lab; each marker is on a robot of its own."""
+    return Rig(
+        name="simulated_lab",
+        dictionary=settings.dictionary,
+        marker_length_m=settings.marker_length_m,
+        markers=tuple(RigMarker(index, robot=f"robot_{index}") for index in range(settings.markers)),
+        cameras=tuple(RigCamera(name, row_time_ns=settings.row_time_ns or None) for name in settings.cameras),
+        reference_points=REFERENCES,
+        floor=Floor(FLOOR_M, FLOOR_M),
+        marker_height_m=settings.drive_height_m,
+        tape_sigma_m=settings.tape_sigma_m or None,
+    )
+
+
+def drive_start_ns(settings: LabSettings, cameras: Sequence[Camera]) -> int:
+    """When the robots start: the true places at a time are ``drive.places_at`` of the seconds since then.
+
+    Parameters
+    ----------
+    settings : of the lab.
+    cameras : from :func:`~ipsys_log.simulation.cameras.hang_cameras`.
+
+    Returns
+    -------
+    The time of the first frame of the drive, in ns.
+
+    Examples
+    --------
+    >>> lab = LabSettings(stations=0, drive_s=2.0, markers=1)
+    >>> cameras = hang_cameras(lab)
+    >>> (drive_start_ns(lab, cameras) - EPOCH_NS) / NS_PER_S
+    1.0
+    """
+    return _start_ns(settings, len(plan_stations(settings, cameras)))
+
+
+def _payloads(
+    settings: LabSettings, progress: Callable[[str, int, int], None]
+) -> Iterator[tuple[str, Any, int, str | None]]:
+    rig = build_rig(settings)
+    cameras = hang_cameras(settings, EPOCH_NS)
+    yield RIG_TOPIC, rig, EPOCH_NS, None
+    for camera in cameras:
+        yield calibration_topic(camera.name), camera.lens, EPOCH_NS, camera.name
+    with ThreadPoolExecutor(len(cameras)) as pool:
+        progress("views", 0, len(cameras))
+        views = []
+        for view in pool.map(lambda camera: prepare_view(camera, settings), cameras):
+            views.append(view)
+            progress("views", len(views), len(cameras))
+        instants = list(_instants(settings, cameras))
+        for index, instant in enumerate(instants):
+            progress("simulate", index * len(views), len(instants) * len(views))
+            yield TRUTH_TOPIC, _truth(instant, rig, cameras, settings), instant.time_ns, None
+            for image in pool.map(_Shutter(settings, instant, index), range(len(views)), views):
+                yield image_topic(image.frame_id), image, instant.time_ns, image.frame_id
+            for measurement in instant.measured:
+                yield MEASUREMENTS_TOPIC, measurement, measurement.timestamp, None
+        progress("simulate", len(instants) * len(views), len(instants) * len(views))
+
+
+@dataclass(frozen=True, slots=True)
+class _Shutter:
+    """Takes the frames of an instant; which thread takes which makes no difference."""
+
+    settings: LabSettings
+    instant: Instant
+    index: int
+
+    def __call__(self, number: int, view: View) -> CompressedImage:
+        rng = stream(self.settings.seed, Purpose.FRAME, number, self.index)
+        data = encode_jpeg(render(view, self.instant.prints, self.settings, rng), self.settings)
+        return CompressedImage(self.instant.time_ns, view.camera.name, data, "jpeg")
+
+
+def _instants(settings: LabSettings, cameras: Sequence[Camera]) -> Iterator[Instant]:
+    sets = plan_stations(settings, cameras)
+    splits = split(sets, settings.seed)
+    for number, stations in enumerate(sets):
+        places = tuple(station.place for station in stations)
+        lying = tuple(place(where, settings) for where in places)
+        times_ns = _times(settings, _start_ns(settings, number), settings.frames_per_station)
+        first = number * settings.markers
+        measured = tuple(
+            measure(where, settings, index, times_ns, splits[index])
+            for index, where in enumerate(places, first)
+        )
+        for time_ns in times_ns[:-1]:
+            yield Instant(time_ns, places, lying)
+        yield Instant(times_ns[-1], places, lying, measured)
+    drive, start_ns = plan_drive(settings, cameras), _start_ns(settings, len(sets))
+    for time_ns in _times(settings, start_ns, round(settings.drive_s * settings.rate_hz)):
+        time_s = (time_ns - start_ns) / NS_PER_S
+        prints = tuple(driving(drive, marker_id, time_s, settings) for marker_id in drive.ahead_s)
+        yield Instant(time_ns, drive.places_at(time_s), prints)
+
+
+def driving(drive: Drive, marker_id: int, time_s: float, settings: LabSettings) -> Moving:
+    """A marker on the drive, for the frame of a time after its start."""
+    return lambda since_s: place(drive.place_at(marker_id, time_s + since_s), settings)
+
+
+def _start_ns(settings: LabSettings, number: int) -> int:
+    """When the markers lie at a set of stations for the first time; after the last set the drive starts."""
+    last_ns = _times(settings, 0, settings.frames_per_station)[-1]
+    return EPOCH_NS + NS_PER_S + number * (last_ns + _PAUSE_NS)
+
+
+def _times(settings: LabSettings, start_ns: int, count: int) -> list[int]:
+    return [start_ns + round(index * NS_PER_S / settings.rate_hz) for index in range(count)]
+
+
+def _truth(instant: Instant, rig: Rig, cameras: Sequence[Camera], settings: LabSettings) -> Tracks:
+    return Tracks(
+        instant.time_ns,
+        tuple(
+            Track(
+                robot=rig.robot_of(where.marker_id),
+                id=where.marker_id,
+                x_m=where.x_m,
+                y_m=where.y_m,
+                z_m=where.z_m,
+                heading_rad=where.heading_rad,
+                cameras=seen_whole(where, cameras, settings),
+            )
+            for where in instant.places
+        ),
+    )

@@ -1,0 +1,188 @@
+"""What share of each pixel's light comes from a print, and from the black on it.
+
+A print is piecewise constant. It is drawn on four by four samples per pixel: a sample is sent through
+the exact inverse of the lens onto the plane of the marker and takes the mean over its own footprint
+of the pattern there, so that edges which run along pixel rows stay exact as well. The optics' blur
+acts on the samples, and the sixteen of a pixel are averaged.
+
+A print that moves is drawn so at many instants of the exposure, and each row of pixels takes its own
+mean of them (:mod:`ipsys_log.simulation.shutter`).
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import cv2
+import numpy as np
+from numpy.typing import NDArray
+
+from ipsys_log.geometry.lenses import project
+from ipsys_log.geometry.patterns import Moving, Placed, PlacedBoard, print_outline, printed_cells
+from ipsys_log.geometry.poses import transform
+from ipsys_log.simulation.settings import LabSettings
+from ipsys_log.simulation.shutter import exposed, instants, row_shares
+from ipsys_log.simulation.views import View
+
+__all__ = ["Box", "Shares", "find_shares"]
+
+Array = NDArray[np.float64]
+Plane = NDArray[np.float32]
+Box = tuple[slice, slice]
+
+_SAMPLES = 4
+# Over the time of a frame, a motion between so many instants is as good as straight.
+_PATH_INSTANTS = 9
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class Shares:
+    """Of the light in a box of ``View.rays``: ``cover`` from a print, ``dark`` from its black, (h, w)."""
+
+    box: Box
+    cover: Plane
+    dark: Plane
+
+
+def find_shares(view: View, placed: Placed | PlacedBoard | Moving, settings: LabSettings) -> Shares | None:
+    """Of a print; None where it is not in the frame."""
+    if isinstance(placed, (Placed, PlacedBoard)):
+        return _still(view, placed, settings)
+    if not (settings.row_time_ns or settings.exposure_s):
+        return _still(view, placed(0.0), settings)
+    return _moving(view, placed, settings)
+
+
+def _still(view: View, placed: Placed | PlacedBoard, settings: LabSettings) -> Shares | None:
+    box = _box_of(view, placed, settings)
+    return None if box is None else Shares(box, *_print_shares(view, placed, box, settings))
+
+
+def _moving(view: View, moving: Moving, settings: LabSettings) -> Shares | None:
+    """In each row the mean over the exposure of the row."""
+    path = _path(view, moving, settings)
+    if path is None:
+        return None
+    whole, speed_px_s = path
+    rows = np.arange(whole[0].start, whole[0].stop) - view.border_px
+    seen = np.clip(rows[[0, -1]], 0, view.camera.lens.height - 1).tolist()
+    times_s = instants(*exposed(seen[0], seen[1], settings), speed_px_s, settings)
+    cover, dark = np.zeros((2, len(rows), whole[1].stop - whole[1].start), dtype=np.float32)
+    for time_s, weights in zip(times_s.tolist(), row_shares(times_s, rows, settings), strict=True):
+        placed = moving(time_s)
+        box = _part(_box_of(view, placed, settings), whole, weights, settings)
+        if box is None:
+            continue
+        inside = tuple(slice(s.start - w.start, s.stop - w.start) for s, w in zip(box, whole, strict=True))
+        weight = weights[inside[0], None].astype(np.float32)
+        for total, share in zip((cover, dark), _print_shares(view, placed, box, settings), strict=True):
+            total[inside] += weight * share
+    return Shares(whole, cover, dark)
+
+
+def _path(view: View, moving: Moving, settings: LabSettings) -> tuple[Box, float] | None:
+    """Where a moving print is during a frame, and how fast its fastest point is, in px/s."""
+    start_s, end_s = exposed(0, view.camera.lens.height - 1, settings)
+    outlines_px = []
+    for time_s in np.linspace(start_s, end_s, _PATH_INSTANTS).tolist():
+        outline_px = _outline_px(view, moving(time_s), settings)
+        if outline_px is None:
+            return None
+        outlines_px.append(outline_px)
+    box = _box(view, np.concatenate(outlines_px), settings)
+    steps_px = np.linalg.norm(np.diff(outlines_px, axis=0), axis=-1)
+    return None if box is None else (box, float(steps_px.max()) * (_PATH_INSTANTS - 1) / (end_s - start_s))
+
+
+def _part(box: Box | None, whole: Box, weights: Array, settings: LabSettings) -> Box | None:
+    """The part of a box in which rows of weight, and what blurs into them, lie; None if there is none.
+
+    ``weights`` (h,) are of the rows of ``whole``.
+    """
+    counted = whole[0].start + np.flatnonzero(weights)
+    if box is None or not len(counted) or counted[-1] < box[0].start or counted[0] >= box[0].stop:
+        return None
+    around = _around_px(settings)
+    first, last = int(counted[0]) - around, int(counted[-1]) + around
+    return (
+        slice(max(box[0].start, whole[0].start, first), min(box[0].stop, whole[0].stop, last + 1)),
+        slice(max(box[1].start, whole[1].start), min(box[1].stop, whole[1].stop)),
+    )
+
+
+def _box_of(view: View, placed: Placed | PlacedBoard, settings: LabSettings) -> Box | None:
+    outline_px = _outline_px(view, placed, settings)
+    return None if outline_px is None else _box(view, outline_px, settings)
+
+
+def _outline_px(view: View, placed: Placed | PlacedBoard, settings: LabSettings) -> Array | None:
+    """Points around a print, (n, 2); None if not all of them lie before the camera."""
+    outline_m = print_outline(placed, settings.dictionary)
+    outline_m = transform(view.camera.camera_from_world, outline_m)
+    return None if (outline_m[:, 2] <= 0).any() else project(outline_m, view.camera.lens)
+
+
+def _around_px(settings: LabSettings) -> int:
+    """How far the blur reaches."""
+    return int(np.ceil(4 * settings.psf_sigma_px)) + 2
+
+
+def _box(view: View, px: Array, settings: LabSettings) -> Box | None:
+    """Rows and columns of ``view.rays`` around points (n, 2), blur included; None outside of the frame."""
+    around = _around_px(settings)
+    low = np.floor(px.min(axis=0)).astype(int) - around + view.border_px
+    high = np.ceil(px.max(axis=0)).astype(int) + around + 1 + view.border_px
+    height, width = view.rays.shape[:2]
+    rows = slice(max(int(low[1]), 0), min(int(high[1]), height))
+    cols = slice(max(int(low[0]), 0), min(int(high[0]), width))
+    border = view.border_px
+    if rows.stop <= border or cols.stop <= border or rows.start >= height - border:
+        return None
+    return None if cols.start >= width - border else (rows, cols)
+
+
+def _print_shares(
+    view: View, placed: Placed | PlacedBoard, box: Box, settings: LabSettings
+) -> tuple[Plane, Plane]:
+    """Shares of a pixel's light that come from the print, and from its black cells: (h, w) each."""
+    black, cells_per_m = printed_cells(placed, settings.dictionary)
+    columns, rows, pixel_cells = _cells_of(view, placed.world_from_marker, box, black.shape, cells_per_m)
+    fine = (rows.shape[1] * _SAMPLES, rows.shape[0] * _SAMPLES)
+    # One texel is one sample wide: the ramp between two texels is the mean over a sample's footprint.
+    texels = [int(np.clip(round(_SAMPLES / size), 4, 512)) for size in pixel_cells]
+    x = cv2.resize(columns * texels[0] - 0.5, fine, interpolation=cv2.INTER_LINEAR).astype(np.float32)
+    y = cv2.resize(rows * texels[1] - 0.5, fine, interpolation=cv2.INTER_LINEAR).astype(np.float32)
+    shares = []
+    for pattern in (np.ones_like(black), black):
+        texture = pattern.astype(np.float32).repeat(texels[1], axis=0).repeat(texels[0], axis=1)
+        share = cv2.remap(texture, x, y, cv2.INTER_LINEAR, borderMode=cv2.BORDER_CONSTANT, borderValue=0)
+        if settings.psf_sigma_px:
+            share = cv2.GaussianBlur(share, (0, 0), settings.psf_sigma_px * _SAMPLES)
+        size = (columns.shape[1], columns.shape[0])
+        shares.append(np.asarray(cv2.resize(share, size, interpolation=cv2.INTER_AREA), dtype=np.float32))
+    return shares[0], shares[1]
+
+
+def _cells_of(
+    view: View, world_from_marker: Array, box: Box, shape: tuple[int, ...], cells_per_m: float
+) -> tuple[Array, Array, tuple[float, float]]:
+    """Where the pixels of a box lie on a print, in cells from its top left: column and row, (h, w).
+
+    Also by how many columns and rows a step of one pixel takes one further, at most.
+    """
+    camera_from_marker = view.camera.camera_from_world @ world_from_marker
+    plane = np.linalg.inv(camera_from_marker[:3, [0, 1, 3]])
+    uv = view.rays[box]
+    x, y, w = (plane[i, 0] * uv[..., 0] + plane[i, 1] * uv[..., 1] + plane[i, 2] for i in range(3))
+    # Rays that pass the plane, and prints seen from behind, show nothing.
+    seen = w > 1e-6 if camera_from_marker[:3, 2] @ camera_from_marker[:3, 3] < 0 else np.zeros_like(w, bool)
+    scale = cells_per_m / np.where(seen, w, 1.0)
+    columns = np.where(seen, shape[1] / 2 + x * scale, -1e4)
+    rows = np.where(seen, shape[0] / 2 - y * scale, -1e4)
+    middle = (
+        slice(uv.shape[0] // 2 - 1, uv.shape[0] // 2 + 1),
+        slice(uv.shape[1] // 2 - 1, uv.shape[1] // 2 + 1),
+    )
+    step_column = max(float(np.abs(np.diff(columns[middle], axis=axis)).max()) for axis in (0, 1))
+    step_row = max(float(np.abs(np.diff(rows[middle], axis=axis)).max()) for axis in (0, 1))
+    return columns, rows, (max(step_column, 1e-6), max(step_row, 1e-6))

@@ -1,0 +1,120 @@
+"""Frames of printed markers on a floor, with edges that are exact to a few thousandths of a pixel.
+
+The light from each print (:mod:`ipsys_log.simulation.pixel_shares`) is laid over that of the floor by
+its blurred coverage; gamma, noise and rounding follow.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import replace
+
+import cv2
+import numpy as np
+from numpy.typing import NDArray
+
+from ipsys_log.geometry.patterns import Moving, Placed, PlacedBoard
+from ipsys_log.simulation.pixel_shares import Box, find_shares
+from ipsys_log.simulation.settings import LabSettings
+from ipsys_log.simulation.views import FIELD_PX, View, to_light
+
+__all__ = ["Print", "encode_jpeg", "expose", "lay_down", "render"]
+
+Plane = NDArray[np.float32]
+Image = NDArray[np.uint8]
+# Objects in a frame.
+Print = Placed | PlacedBoard | Moving
+
+# Grey levels that a warm lamp takes from the blue of the floor and adds to its red.
+_BLUE, _RED = 9, 6
+
+
+def render(
+    view: View, placed: Sequence[Print], settings: LabSettings, rng: np.random.Generator | None
+) -> Image:
+    """A frame with markers in it.
+
+    Parameters
+    ----------
+    view : of the camera, from :func:`~ipsys_log.simulation.views.prepare_view`.
+    placed : the markers; where two overlap, the later one lies on top. One that moves is a function
+        of the time in s since the time of the frame: the middle of the exposure of its first row.
+    settings : the grey levels, blur, gamma and dictionary of the scene; row time and exposure.
+    rng : draws the piece of sensor noise; None for a frame without noise.
+
+    Returns
+    -------
+    (height, width, 3), BGR. Markers and their grey value are untinted.
+    """
+    grey, bare = _compose(view, placed, settings)
+    if rng is not None and settings.noise_sigma:
+        top, left = rng.integers(0, FIELD_PX, 2)
+        piece = view.noise[top : top + grey.shape[0], left : left + grey.shape[1]]
+        levels = cv2.add(grey, piece, dtype=cv2.CV_8U)
+    else:
+        levels = cv2.add(grey, np.zeros_like(grey), dtype=cv2.CV_8U)
+    blue = cv2.subtract(levels, cv2.convertScaleAbs(bare, alpha=_BLUE))
+    red = cv2.add(levels, cv2.convertScaleAbs(bare, alpha=_RED))
+    return np.asarray(cv2.merge([blue, levels, red]), dtype=np.uint8)
+
+
+def expose(view: View, placed: Sequence[Print], settings: LabSettings) -> Plane:
+    """Grey levels of a frame before noise and rounding, (height, width).
+
+    Parameters
+    ----------
+    view, placed, settings : as for :func:`render`.
+    """
+    return _compose(view, placed, settings)[0]
+
+
+def lay_down(view: View, placed: Sequence[Placed], settings: LabSettings) -> View:
+    """Return a view whose floor shows prints that never move, so that no frame has to draw them again."""
+    grey, bare = _compose(view, placed, settings)
+    return replace(view, floor=to_light(grey, settings), bare=bare)
+
+
+def encode_jpeg(image: Image, settings: LabSettings) -> bytes:
+    """A frame as a camera sends it: JPEG with chroma at half the width (4:2:2)."""
+    options = [
+        *(cv2.IMWRITE_JPEG_QUALITY, settings.jpeg_quality),
+        *(cv2.IMWRITE_JPEG_SAMPLING_FACTOR, cv2.IMWRITE_JPEG_SAMPLING_FACTOR_422),
+    ]
+    return bytes(cv2.imencode(".jpg", image, options)[1])
+
+
+def _compose(view: View, placed: Sequence[Print], settings: LabSettings) -> tuple[Plane, Plane]:
+    """Grey levels of a frame, and the share of floor in each pixel, both (h, w)."""
+    grey = _levels(view.floor, settings)
+    bare = np.ones_like(grey) if view.bare is None else view.bare.copy()
+    white, black = (to_light(np.float32(level), settings) for level in (settings.white, settings.black))
+    for one in placed:
+        shares = find_shares(view, one, settings)
+        if shares is None:
+            continue
+        rows, cols, inner = _inside(view, shares.box)
+        cover, dark = shares.cover[inner], shares.dark[inner]
+        # Where two prints meet, the upper one lies on what is there already.
+        met = (bare[rows, cols] < 1).any()
+        below = to_light(grey[rows, cols], settings) if met else view.floor[rows, cols]
+        patch = below * (1 - cover) + white * cover - (white - black) * dark
+        grey[rows, cols] = _levels(patch, settings)
+        bare[rows, cols] *= 1 - cover
+    return grey, bare
+
+
+def _inside(view: View, box: Box) -> tuple[slice, slice, Box]:
+    """A box without the border: where it lies in the frame, and which part of it is kept."""
+    frame, kept = [], []
+    for part, size in zip(box, view.floor.shape, strict=True):
+        start, stop = part.start - view.border_px, part.stop - view.border_px
+        first, last = max(start, 0), min(stop, size)
+        frame.append(slice(first, last))
+        kept.append(slice(first - start, last - start))
+    return frame[0], frame[1], (kept[0], kept[1])
+
+
+def _levels(light: Plane, settings: LabSettings) -> Plane:
+    if settings.gamma == 1.0:
+        return light.copy()
+    return np.asarray(255.0 * (np.maximum(light, 0) / 255.0) ** (1 / settings.gamma), dtype=np.float32)

@@ -1,0 +1,154 @@
+"""What can be set about the simulated lab."""
+
+from __future__ import annotations
+
+import math
+from dataclasses import dataclass
+
+import cv2
+
+from ipsys_log.errors import IpsysError
+from ipsys_log.rig.file import check_name
+
+__all__ = ["LabSettings"]
+
+# Name of a setting: lowest and highest value that the scene can be drawn with.
+_RANGES = {
+    "seed": (0, 2**63 - 1),
+    "width": (160, 7680),
+    "height": (120, 4320),
+    "marker_length_m": (0.02, 1.0),
+    "markers": (1, 1000),
+    "stations": (0, 100_000),
+    "frames_per_station": (1, 10_000),
+    "rate_hz": (1.0, 240.0),
+    "row_time_ns": (0, 500_000),
+    "exposure_s": (0.0, 1.0),
+    "drive_s": (0.0, 86_400.0),
+    "drive_speed_m_s": (0.01, 5.0),
+    "drive_height_m": (0.0, 1.0),
+    "psf_sigma_px": (0.0, 5.0),
+    "black": (0.0, 255.0),
+    "white": (0.0, 255.0),
+    "floor": (0.0, 255.0),
+    "noise_sigma": (0.0, 50.0),
+    "gamma": (0.5, 4.0),
+    "jpeg_quality": (1, 100),
+    "mount_height_m": (1.0, 10.0),
+    "tape_sigma_m": (0.0, 0.2),
+    "ruler_sigma_m": (0.0, 0.1),
+    "tape_angle_deg": (0.0, 60.0),
+}
+
+
+@dataclass(frozen=True, slots=True)
+class LabSettings:
+    """The simulated lab; as it stands, that of the paper (sect. 3) with several markers at once.
+
+    Attributes
+    ----------
+    seed : everything random follows from it.
+    width, height : of a frame, in px; the focal length scales with the width (1160 px at 1920).
+    cameras : names, in the order of the world's y.
+    dictionary, marker_length_m, markers : OpenCV's name; side of the black square; how many at once,
+        with the ids 0, 1, ...
+    stations : about how many measured places each camera sees.
+    frames_per_station : frames of each camera while the markers lie still.
+    heights_m : at which markers are measured.
+    rate_hz : frames per second, of each camera.
+    row_time_ns : between the exposures of two rows (rolling shutter; 31000 is typical); 0 for all at once.
+    exposure_s : of each row, which blurs what moves (1/60 is typical); 0 for no blur. The time of a frame
+        is the middle of the exposure of its first row.
+    drive_s, drive_speed_m_s, drive_height_m : of the robots that drive after the stations.
+    psf_sigma_px : of the Gaussian point-spread of the optics; a pixel then integrates over its area.
+    black, white, floor : grey levels 0..255 as they stand in the frame, whatever the gamma.
+    noise_sigma : of the sensor, in grey levels as they stand in the frame.
+    gamma : a frame holds ``255 * (light / 255) ** (1 / gamma)``; blur acts on the light.
+    jpeg_quality : of the 4:2:2 JPEG frames.
+    mount_height_m, tilt_deg : of the cameras: about how high they hang; range of their tilts.
+    tape_sigma_m, ruler_sigma_m : of a measured distance and of a measured height.
+    tape_angle_deg : no place is measured where the two tapes meet at a flatter angle than this.
+
+    Raises
+    ------
+    IpsysError
+        For a value that no lab can have.
+    """
+
+    seed: int = 0
+    width: int = 1920
+    height: int = 1080
+    cameras: tuple[str, ...] = ("red", "white", "black")
+    dictionary: str = "DICT_4X4_100"
+    marker_length_m: float = 0.20
+    markers: int = 3
+    stations: int = 50
+    frames_per_station: int = 5
+    heights_m: tuple[float, ...] = (0.0, 0.05, 0.10, 0.15, 0.20)
+    rate_hz: float = 30.0
+    row_time_ns: int = 0
+    exposure_s: float = 0.0
+    drive_s: float = 15.0
+    drive_speed_m_s: float = 0.5
+    drive_height_m: float = 0.10
+    psf_sigma_px: float = 0.7
+    black: float = 35.0
+    white: float = 205.0
+    floor: float = 150.0
+    noise_sigma: float = 2.0
+    gamma: float = 1.0
+    jpeg_quality: int = 90
+    mount_height_m: float = 2.1
+    tilt_deg: tuple[float, float] = (0.5, 2.0)
+    tape_sigma_m: float = 0.003
+    ruler_sigma_m: float = 0.001
+    tape_angle_deg: float = 15.0
+
+    def __post_init__(self) -> None:
+        for name, (low, high) in _RANGES.items():
+            _check_range(name, getattr(self, name), low, high)
+        for value in self.heights_m:
+            _check_range("heights_m", value, 0.0, 1.0)
+        if not self.heights_m:
+            raise IpsysError("simulator setting heights_m is empty; give at least one height in m")
+        if self.black >= self.white:
+            raise IpsysError(
+                f"simulator setting black ({self.black:g}) must be below white ({self.white:g}); swap them"
+            )
+        if not self.stations and not self.drive_s:
+            raise IpsysError("simulator: nothing to show with stations = 0 and drive_s = 0; set one of them")
+        _check_tilt(self.tilt_deg)
+        _check_cameras(self.cameras)
+        _check_dictionary(self.dictionary, self.markers)
+
+
+def _check_range(name: str, value: float, low: float, high: float) -> None:
+    if not (math.isfinite(value) and low <= value <= high):
+        raise IpsysError(f"simulator setting {name} is {value!r}; give a value between {low:g} and {high:g}")
+
+
+def _check_tilt(tilt_deg: tuple[float, float]) -> None:
+    low, high = tilt_deg
+    if not (0.0 <= low <= high <= 45.0):
+        raise IpsysError(
+            f"simulator setting tilt_deg is {tilt_deg!r}; give the least and the most tilt, "
+            "both between 0 and 45 degrees"
+        )
+
+
+def _check_cameras(cameras: tuple[str, ...]) -> None:
+    if not cameras:
+        raise IpsysError("simulator setting cameras is empty; name at least one camera")
+    for camera in cameras:
+        check_name(camera, "simulator: camera name")
+    if len(set(cameras)) < len(cameras):
+        raise IpsysError(f"simulator: two cameras of one name in {', '.join(cameras)}; give each its own")
+
+
+def _check_dictionary(name: str, markers: int) -> None:
+    known = getattr(cv2.aruco, name, None) if name.startswith("DICT_") else None
+    if not isinstance(known, int):
+        raise IpsysError(f"simulator: OpenCV has no marker dictionary {name!r}; use one such as DICT_4X4_100")
+    size = len(cv2.aruco.getPredefinedDictionary(known).bytesList)
+    if markers > size:
+        raise IpsysError(f"simulator: {name} has {size} markers, {markers} are wanted; set fewer markers")

@@ -1,0 +1,1 @@
+"""Recordings and live display in Rerun."""

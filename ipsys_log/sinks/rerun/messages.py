@@ -1,0 +1,279 @@
+"""Messages into a Rerun recording, one after the other."""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Iterable, Mapping, Sequence
+from typing import Any, NamedTuple
+
+import numpy as np
+import rerun as rr
+
+from ipsys_log.errors import IpsysError
+from ipsys_log.log.topics import run_of_topic
+from ipsys_log.messages import (
+    TRUTH_TOPIC,
+    CompressedImage,
+    CompressedVideo,
+    Event,
+    Markers,
+    Message,
+    Positions,
+    RawImage,
+    Track,
+    Tracks,
+)
+from ipsys_log.sinks.rerun.fading import Fading
+from ipsys_log.sinks.rerun.palette import MARKER_COLOUR, TRUTH_COLOUR, camera_colours, robot_colour
+from ipsys_log.sinks.rerun.rerun_images import rerun_image
+from ipsys_log.sinks.rerun.scene import TIMELINES
+from ipsys_log.sinks.rerun.trails import Segment, Trails
+
+__all__ = ["RerunSink", "trail_entity"]
+
+Entity = tuple[str, ...]
+Kind = Any  # a Rerun archetype, such as rr.Points3D
+Fields = Mapping[str, Any]
+
+# Rerun counts pixels from the first pixel's corner, OpenCV from its centre.
+_CORNER_FROM_CENTRE_PX = 0.5
+_HEADING_M = 0.3
+_MOST_ROBOTS = 5000  # of all runs together: an ArUco dictionary has 1000 markers at most
+_LINE, _THIN, _DOT = (rr.Radius.ui_points(width) for width in (1.5, 0.75, 0.5))
+
+
+def tracks_entity(run: str | None) -> Entity:
+    """Return the entity path of the tracks of a run; without a run, that of the ground truth."""
+    return ("world", "truth") if run is None else ("world", "runs", run)
+
+
+def trail_entity(run: str | None) -> str:
+    """Path of the trails of a run's robots; without a run of the truth."""
+    return "/".join((*tracks_entity(run), "trails"))
+
+
+class _Look(NamedTuple):
+    """The look of an entity, the publish time from which it holds, and that at which it was drawn last.
+
+    Without a key the look is not known: it is drawn again.
+    """
+
+    key: str | None
+    since_ns: int
+    last_ns: int
+    is_drawn: bool = True
+
+
+_NO_LOOK = _Look(None, 0, 0, is_drawn=False)
+# What may be drawn below an entity that is cleared.
+_PARTS = (("ids",), ("heading",), ("markers",), ("markers", "ids"))
+
+
+class RerunSink:
+    """Draw messages, in log order, into a recording.
+
+    What is no longer seen goes away, ``fade_ns`` of its topic after its last message.
+
+    Parameters
+    ----------
+    recording : an explicit stream, so that nothing of Rerun's global state is touched.
+    cameras : all there are, so that each has its colour whoever comes first.
+    fade_ns : by topic; without one, the last of a topic stays.
+    runs : those drawn. Where there are several, a robot has a colour and a line of text for each.
+    """
+
+    def __init__(
+        self,
+        recording: rr.RecordingStream,
+        cameras: Iterable[str],
+        fade_ns: Mapping[str, int],
+        runs: Sequence[str] = (),
+    ) -> None:
+        self._recording = recording
+        self._colours = camera_colours(cameras)
+        self._fade_ns = fade_ns
+        self._runs = tuple(runs)
+        self._robots: dict[tuple[str | None, str], int] = {}
+        self._waiting: dict[Entity, tuple[Kind, list[tuple[Message | Segment, Fields]]]] = {}
+        self._looks: dict[Entity, _Look] = {}
+        self._fading = Fading(self._clear)
+        self._trails = Trails(self._draw_segment)
+        self._draw: dict[type, Callable[[Message], None]] = {
+            CompressedImage: self._draw_image,
+            CompressedVideo: self._draw_image,
+            RawImage: self._draw_image,
+            Markers: self._draw_markers,
+            Positions: self._draw_positions,
+            Tracks: self._draw_tracks,
+            Event: self._draw_event,
+        }
+
+    def __call__(self, message: Message) -> None:
+        """Draw a message; one of a type that is not drawn is passed over."""
+        self._fading.advance(message.log_time_ns)
+        draw = self._draw.get(type(message.payload))
+        if draw is not None:
+            draw(message)
+
+    def flush(self) -> None:
+        """Draw the waiting rows: many rows of an entity at once take a fraction of the time."""
+        for entity in list(self._waiting):
+            self._send(entity)
+
+    def close(self) -> None:
+        """Draw all waiting rows."""
+        self._trails.close()
+        self.flush()
+        self._recording.flush()
+
+    def _log(self, message: Message, entity: Entity, *what: Any) -> None:
+        self._log_at(message.publish_time_ns, message.log_time_ns, entity, *what)
+
+    def _log_at(self, publish_time_ns: int, log_time_ns: int, entity: Entity, *what: Any) -> None:
+        # The time is set for each entity: a trail belongs to an earlier instant than what is drawn with it.
+        for timeline, time_ns in zip(TIMELINES, (publish_time_ns, log_time_ns), strict=True):
+            self._recording.set_time(timeline, timestamp=np.datetime64(time_ns, "ns"))
+        self._recording.log(list(entity), *what, strict=True)
+
+    def _log_moved(self, message: Message, entity: Entity, kind: Kind, moved: Fields, look: Fields) -> None:
+        """Draw the position of an entity, and its appearance only if that is new: that takes most time."""
+        key, time_ns = str(look), message.publish_time_ns
+        before = self._looks.get(entity, _NO_LOOK)
+        last_ns, is_late = max(before.last_ns, time_ns), time_ns < before.since_ns
+        if key == before.key and not is_late:
+            self._looks[entity] = before._replace(last_ns=last_ns)
+            self._add(message, entity, kind, moved)
+            return
+        # After a late message, the newest appearance is not known.
+        now = _Look(None, before.since_ns, last_ns) if is_late else _Look(key, time_ns, last_ns)
+        self._looks[entity] = now
+        self._send(entity)
+        self._log(message, entity, kind.from_fields(**moved, **look))
+
+    def _add(self, when: Message | Segment, entity: Entity, kind: Kind, fields: Fields) -> None:
+        self._waiting.setdefault(entity, (kind, []))[1].append((when, fields))
+
+    def _send(self, entity: Entity) -> None:
+        """Draw the waiting rows of an entity."""
+        if entity not in self._waiting:
+            return
+        kind, rows = self._waiting.pop(entity)
+        times_ns = zip(*((when.publish_time_ns, when.log_time_ns) for when, _ in rows), strict=True)
+        timelines = [
+            rr.TimeColumn(timeline, timestamp=np.array(column_ns, dtype="datetime64[ns]"))
+            for timeline, column_ns in zip(TIMELINES, times_ns, strict=True)
+        ]
+        names = rows[0][1]
+        fields = {name: [item for _, row in rows for item in row[name]] for name in names}
+        lengths = [len(row[next(iter(names))]) for _, row in rows]
+        columns = kind.columns(**fields).partition(lengths)
+        path = rr.new_entity_path(list(entity))
+        rr.send_columns(path, timelines, columns, recording=self._recording)
+
+    def _clear_now(self, message: Message, entity: Entity) -> None:
+        """Clear what is drawn, unless something later is drawn already."""
+        look = self._looks.get(entity, _NO_LOOK)
+        if look.is_drawn and message.publish_time_ns >= look.last_ns:
+            self._clear(entity, message.publish_time_ns, message.log_time_ns)
+
+    def _clear(self, entity: Entity, publish_time_ns: int, log_time_ns: int) -> None:
+        for part in (entity, *((*entity, *below) for below in _PARTS)):
+            if part in self._looks:
+                self._looks[part] = _Look(None, publish_time_ns, publish_time_ns, is_drawn=False)
+            self._send(part)
+        self._log_at(publish_time_ns, log_time_ns, entity, rr.Clear(recursive=True))
+
+    def _draw_image(self, message: Message) -> None:
+        entity = ("cameras", str(message.camera), "image")
+        try:
+            self._log(message, entity, rerun_image(message.payload))
+        except ValueError as error:
+            self._log(message, entity, rr.Clear(recursive=False))
+            self._log(message, ("events", "frames"), rr.TextLog(f"{message.topic}: {error}", level="WARN"))
+            return
+        self._fading.seen(entity, message, self._fade_ns.get(message.topic, 0))
+
+    def _draw_markers(self, message: Message) -> None:
+        entity = ("cameras", str(message.camera), "image", "markers")
+        markers = message.payload.markers
+        if not markers:
+            self._clear_now(message, entity)
+            return
+        outlines = [np.vstack([m.corners_px, m.corners_px[:1]]) + _CORNER_FROM_CENTRE_PX for m in markers]
+        line = {"colors": [MARKER_COLOUR], "radii": [_LINE]}
+        self._log_moved(message, entity, rr.LineStrips2D, {"strips": outlines}, line)
+        # A label in the middle would hide the marker; below a point at its lower edge it does not.
+        below = [(outline[:4, 0].mean(), outline[:4, 1].max()) for outline in outlines]
+        ids = [str(marker.id) for marker in markers]
+        label = {"labels": ids, "colors": [MARKER_COLOUR], "radii": [_DOT], "show_labels": [True]}
+        self._log_moved(message, (*entity, "ids"), rr.Points2D, {"positions": below}, label)
+        self._fading.seen(entity, message, self._fade_ns.get(message.topic, 0))
+
+    def _draw_positions(self, message: Message) -> None:
+        camera = str(message.camera)
+        entity = (*tracks_entity(run_of_topic(message.topic)), "positions", camera)
+        positions = message.payload.positions
+        if not positions:
+            self._clear_now(message, entity)
+            return
+        look = {
+            "colors": [self._colours[camera]],
+            "radii": [0.02],
+            "labels": [f"{p.id} ({camera})" for p in positions],
+            "show_labels": [False],
+        }
+        points = [(p.x_m, p.y_m, p.z_m) for p in positions]
+        self._log_moved(message, entity, rr.Points3D, {"positions": points}, look)
+        self._fading.seen(entity, message, self._fade_ns.get(message.topic, 0))
+
+    def _draw_tracks(self, message: Message) -> None:
+        run = None if message.topic == TRUTH_TOPIC else run_of_topic(message.topic)
+        fade_ns = self._fade_ns.get(message.topic, 0)
+        for track in message.payload.tracks:
+            entity = (*tracks_entity(run), "robots", track.robot)
+            self._draw_robot(message, entity, run, track)
+            self._fading.seen(entity, message, fade_ns)
+            self._trails.add((run, track.robot), message, (track.x_m, track.y_m, track.z_m), fade_ns)
+
+    def _draw_robot(self, message: Message, entity: Entity, run: str | None, track: Track) -> None:
+        colour = self._robot_colour(run, track.robot)
+        label = self._label(run, track.robot)
+        at = [(track.x_m, track.y_m, track.z_m)]
+        radius = 0.03 if run is None else 0.05
+        # The truth lies under the track: its name would hide the robot's.
+        look = {"colors": [colour], "radii": [radius], "labels": [label], "show_labels": [run is not None]}
+        self._log_moved(message, entity, rr.Points3D, {"positions": at}, look)
+        heading = (*entity, "heading")
+        if track.heading_rad is None:
+            self._clear_now(message, heading)
+            return
+        ahead = [(_HEADING_M * np.cos(track.heading_rad), _HEADING_M * np.sin(track.heading_rad), 0.0)]
+        arrow = {"origins": at, "vectors": ahead}
+        self._log_moved(message, heading, rr.Arrows3D, arrow, {"colors": [colour], "radii": [0.012]})
+
+    def _robot_colour(self, run: str | None, robot: str) -> tuple[int, int, int]:
+        if (run, robot) not in self._robots:
+            if len(self._robots) == _MOST_ROBOTS:
+                raise IpsysError(f"the tracks name more than {_MOST_ROBOTS} robots, which cannot be drawn")
+            self._robots[run, robot] = sum(of_run is not None for of_run, _ in self._robots)
+        return TRUTH_COLOUR if run is None else robot_colour(self._robots[run, robot])
+
+    def _label(self, run: str | None, robot: str) -> str:
+        if run is None or len(self._runs) < 2:
+            return f"{robot} (truth)" if run is None else robot
+        # Runs put a robot at nearly one place: a line further down for each keeps them apart.
+        return "\n" * self._runs.index(run) + f"{robot} ({run})"
+
+    def _draw_segment(self, key: tuple[str | None, str], segment: Segment) -> None:
+        run, robot = key
+        line = {
+            "strips": [[segment.start_m, segment.end_m]],
+            "colors": [self._robot_colour(run, robot)],
+            "radii": [_THIN if run is None else _LINE],
+        }
+        self._add(segment, (*tracks_entity(run), "trails"), rr.LineStrips3D, line)
+
+    def _draw_event(self, message: Message) -> None:
+        run = run_of_topic(message.topic)
+        event = message.payload
+        text = rr.TextLog(f"{event.kind.replace('_', ' ')}: {event.text}", level="WARN")
+        self._log(message, ("events", run or "recorded"), text)

@@ -1,0 +1,113 @@
+"""A session in Rerun: frames with their markers, the floor, positions and tracks over time."""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Sequence
+from pathlib import Path
+
+import rerun as rr
+
+from ipsys_log.analysis.places import measured_places
+from ipsys_log.errors import IpsysError
+from ipsys_log.log.dataset import Session
+from ipsys_log.messages import MEASUREMENTS_TOPIC, TRUTH_TOPIC, Measurement
+from ipsys_log.sinks.rerun.messages import RerunSink, trail_entity
+from ipsys_log.sinks.rerun.rerun_viewer import show_in_viewer
+from ipsys_log.sinks.rerun.scene import draw_places, draw_rig, layout
+from ipsys_log.sinks.selection import Shown, choose_runs, fade_ns, rig_in_force
+
+__all__ = ["write_recording"]
+
+# Frames are kept longer than positions: between two places of a calibration nothing may be recorded.
+_FRAME_FACTOR = 10
+# Messages between two writes to the viewer: enough to keep it busy, little to hold.
+_BATCH = 64
+
+
+def write_recording(session: Session, runs: Sequence[str] = (), save: Path | None = None) -> Shown:
+    """Show a session in the Rerun viewer until its window is closed, or save it for the viewer.
+
+    Parameters
+    ----------
+    session : open logs.
+    runs : names of the runs to show; the newest complete ones where empty.
+    save : an ``.rrd`` file to write instead of opening a window; it has its name only when complete.
+
+    Returns
+    -------
+    What is shown.
+
+    Raises
+    ------
+    IpsysError
+        For logs with nothing to show, an unknown run, or, without ``save``, no screen.
+    """
+    shown = choose_runs(session, runs)
+    if not (shown.frames or shown.moving or session.count(MEASUREMENTS_TOPIC)):
+        raise IpsysError(
+            f"{session}: nothing to show: no frames, markers, positions or measured places; "
+            "ipsys info says what it holds"
+        )
+    if save is None:
+        show_in_viewer(lambda write: _stream(session, shown, write))
+        return shown
+    partial = save.with_name(save.name + ".partial")
+    partial.touch()  # what is wrong with the path is said here, not by Rerun
+    try:
+        _save(session, shown, partial)
+        partial.replace(save)
+    finally:
+        partial.unlink(missing_ok=True)
+    return shown
+
+
+def _recording(session: Session) -> rr.RecordingStream:
+    """A stream of its own, without the clock and the counter that Rerun adds to each message."""
+    recording = rr.RecordingStream("ipsys", send_properties=False)
+    recording.set_log_time_enabled(False)
+    recording.set_log_tick_enabled(False)
+    recording.send_recording_name(", ".join(path.stem for path in session.paths))
+    return recording
+
+
+def _save(session: Session, shown: Shown, path: Path) -> None:
+    recording = _recording(session)
+    try:
+        try:
+            recording.save(path)
+        except RuntimeError as error:
+            raise IpsysError(f"{path}: cannot be written: {error}") from error
+        _draw(session, shown, recording, lambda: None)
+    finally:
+        recording.disconnect()
+
+
+def _stream(session: Session, shown: Shown, write: Callable[[bytes], object]) -> None:
+    recording = _recording(session)
+    try:
+        stream = rr.binary_stream(recording)
+        _draw(session, shown, recording, lambda: write(stream.read() or b""))
+    finally:
+        recording.disconnect()
+
+
+def _draw(session: Session, shown: Shown, recording: rr.RecordingStream, sent: Callable[[], object]) -> None:
+    """Draw a whole session; ``sent`` is called repeatedly, and at the end."""
+    rig = rig_in_force(session, [run for run in (shown.markers, *shown.runs) if run])
+    measurements = session.payloads(session.topics(Measurement))
+    places, faults = measured_places(measurements, rig)
+    trails = [trail_entity(run) for run in (*shown.runs, *([None] if TRUTH_TOPIC in shown.moving else []))]
+    recording.send_blueprint(layout(shown.cameras, trails, rig, events=bool(shown.events or faults)))
+    draw_rig(recording, rig)
+    draw_places(recording, places)
+    for fault in faults:
+        recording.log("events/measurements", rr.TextLog(fault, level="WARN"))
+    fades = fade_ns(session, shown.frames, _FRAME_FACTOR) | fade_ns(session, shown.moving)
+    sink = RerunSink(recording, (*shown.cameras, *shown.others), fades, shown.runs)
+    for number, message in enumerate(session.messages([*shown.frames, *shown.moving, *shown.events])):
+        sink(message)
+        if number % _BATCH == 0:
+            sink.flush()
+            sent()
+    sink.close()
+    sent()

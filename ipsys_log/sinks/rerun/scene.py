@@ -1,0 +1,134 @@
+"""What stands still in a Rerun recording: the floor, the measured places, and how it is laid out."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Iterable, Sequence
+
+import numpy as np
+import rerun as rr
+import rerun.blueprint as rrb
+
+from ipsys_log.analysis.places import KINDS, Place
+from ipsys_log.messages import Floor, Rig
+from ipsys_log.sinks.rerun.palette import KIND_COLOURS
+
+__all__ = ["TIMELINES", "draw_places", "draw_rig", "layout"]
+
+# The first one is what the values speak of, and the one that is shown.
+TIMELINES = ("publish_time", "log_time")
+
+_GRID_M = 0.5
+_MOST_LINES = 100
+_TRAIL_S = 15.0
+_GREY = (60, 60, 60)
+_LIGHT = (150, 150, 150)
+
+
+def draw_rig(recording: rr.RecordingStream, rig: Rig | None) -> None:
+    """The floor with its grid, the axes and the reference points; nothing that the rig does not have."""
+    recording.log("world", rr.ViewCoordinates.RIGHT_HAND_Z_UP, static=True)
+    if rig is None:
+        return
+    if rig.floor is not None and math.isfinite(rig.floor.width_m + rig.floor.depth_m):
+        _draw_floor(recording, rig.floor)
+    if rig.reference_points:
+        points = rr.Points3D(
+            [(p.x_m, p.y_m, 0.0) for p in rig.reference_points],
+            labels=[p.name for p in rig.reference_points],
+            colors=[(255, 255, 255)],
+            radii=[0.03],
+            show_labels=True,
+        )
+        recording.log("world/reference_points", points, static=True)
+
+
+def _draw_floor(recording: rr.RecordingStream, floor: Floor) -> None:
+    width_m, depth_m = floor.width_m, floor.depth_m
+    outline = [(0, 0, 0), (width_m, 0, 0), (width_m, depth_m, 0), (0, depth_m, 0), (0, 0, 0)]
+    thin, thick = rr.Radius.ui_points(0.5), rr.Radius.ui_points(1.5)
+    recording.log("world/floor", rr.LineStrips3D([outline], colors=[_LIGHT], radii=thick), static=True)
+    step_m = _GRID_M
+    while max(width_m, depth_m) / step_m > _MOST_LINES:
+        step_m *= 2
+    across = [[(x, 0, 0), (x, depth_m, 0)] for x in np.arange(step_m, width_m, step_m)]
+    along = [[(0, y, 0), (width_m, y, 0)] for y in np.arange(step_m, depth_m, step_m)]
+    if across or along:
+        lines = rr.LineStrips3D([*across, *along], colors=[_GREY], radii=thin)
+        recording.log("world/floor/grid", lines, static=True)
+    axes = rr.Arrows3D(
+        origins=[(0, 0, 0), (0, 0, 0)],
+        vectors=[(step_m, 0, 0), (0, step_m, 0)],
+        colors=[(235, 95, 60), (0, 180, 130)],
+        radii=[0.012],
+        labels=["x", "y"],
+        show_labels=True,
+    )
+    recording.log("world/floor/axes", axes, static=True)
+
+
+def draw_places(recording: rr.RecordingStream, places: Iterable[Place]) -> None:
+    """The measured places, one entity for each kind, with their ids as labels that show on demand."""
+    places = list(places)
+    for kind in KINDS:
+        here = [place for place in places if place.kind == kind]
+        if here:
+            points = rr.Points3D(
+                [place.point_m for place in here],
+                labels=[place.id for place in here],
+                colors=[KIND_COLOURS[kind]],
+                radii=[0.025],
+                show_labels=False,
+            )
+            recording.log(["world", "places", kind], points, static=True)
+
+
+def layout(cameras: Sequence[str], trails: Sequence[str], rig: Rig | None, events: bool) -> rrb.Blueprint:
+    """Cameras on the left, the floor from above on the right, events below it.
+
+    Parameters
+    ----------
+    cameras : those with frames or markers.
+    trails : paths of the entities whose last seconds are shown together.
+    """
+    right: list[rrb.View | rrb.Container] = [_floor_view(trails, rig)]
+    if events:
+        right.append(rrb.TextLogView(origin="/events", name="Events"))
+    floor = rrb.Vertical(*right, row_shares=[5, 1][: len(right)])
+    views = [rrb.Spatial2DView(origin=f"/cameras/{camera}", name=camera) for camera in cameras]
+    # Frames are wide: up to three of them are best one above the other, beside a square floor.
+    columns = 1 if len(views) <= 3 else 2
+    whole = (
+        rrb.Horizontal(rrb.Grid(*views, grid_columns=columns), floor, column_shares=[2, 3])
+        if views
+        else floor
+    )
+    return rrb.Blueprint(
+        whole,
+        rrb.TimePanel(state="collapsed", timeline=TIMELINES[0]),
+        rrb.SelectionPanel(state="collapsed"),
+        rrb.BlueprintPanel(state="collapsed"),
+        auto_views=False,
+    )
+
+
+def _floor_view(trails: Sequence[str], rig: Rig | None) -> rrb.Spatial3DView:
+    now = rrb.TimeRangeBoundary.cursor_relative()
+    since = rrb.TimeRangeBoundary.cursor_relative(seconds=-_TRAIL_S)
+    ranges = rrb.VisibleTimeRanges(
+        [rrb.VisibleTimeRange(timeline=timeline, start=since, end=now) for timeline in TIMELINES]
+    )
+    eye = None
+    if rig is not None and rig.floor is not None:
+        width_m, depth_m = rig.floor.width_m, rig.floor.depth_m
+        middle = (width_m / 2, depth_m / 2, 0.0)
+        # Straight down, upward of the picture along y as on the plan that the tape was read from.
+        above = (width_m / 2, depth_m / 2, 1.15 * max(width_m, depth_m))
+        eye = rrb.EyeControls3D(position=above, look_target=middle, eye_up=(0.0, 1.0, 0.0))
+    return rrb.Spatial3DView(
+        origin="/world",
+        name="Floor",
+        overrides=dict.fromkeys(trails, ranges),
+        line_grid=False,
+        eye_controls=eye,
+    )

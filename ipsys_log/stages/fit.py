@@ -1,0 +1,147 @@
+"""Fit a model to each camera's measured places."""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Mapping, Sequence
+
+import numpy as np
+from numpy.typing import NDArray
+
+from ipsys_log.analysis.cross_validation import deal, gather_places, predict_without
+from ipsys_log.errors import FitError
+from ipsys_log.messages import CameraModel, Model, Noise, Pair, Parameter
+from ipsys_log.models.table import Places, fit_cameras, inputs, min_pairs, parameters
+from ipsys_log.models.uncertainty import Uncertainty, estimate_uncertainty
+
+__all__ = ["fit_model"]
+
+Array = NDArray[np.float64]
+
+# No hand-held tape is better than this; it keeps the covariance of a flat data set invertible.
+_FLOOR_SIGMA_M = 0.001
+
+# Nearer together than this two places are one; nearer to a line than this (RMS) they lie on it.
+_SAME_PLACE_M = 0.01
+_BESIDE_LINE_M = 0.03
+# Groups of places that the uncertainty is found with, by leaving out one after the other.
+_GROUPS = 10
+
+
+def fit_model(
+    name: str,
+    pairs: Mapping[str, Sequence[Pair]],
+    time_ns: int,
+    progress: Callable[[int, int], None] = lambda done, total: None,
+) -> Model:
+    """Fit the model called ``name`` for each camera that has pairs.
+
+    Parameters
+    ----------
+    name : of the table of models, such as ``poly``.
+    pairs : measured places by camera; a camera without any is left out.
+    time_ns : of the last input.
+    progress : called with the fits done, and all there are.
+
+    Returns
+    -------
+    Model : with each camera's parameters, pairs, the covariance of its left-out errors, and what the
+        covariance of a position is made of; these two only where there are more pairs than needed.
+
+    Raises
+    ------
+    FitError
+        Where a camera has fewer pairs than the model needs, or none has any.
+    """
+    cameras = gather_places(pairs)
+    if not cameras:
+        raise FitError(
+            "no camera saw any of the measured places to fit on; measure places in the cameras' view"
+        )
+    for camera, places in cameras.items():
+        _check_count(name, camera, places)
+        _check_spread(name, camera, places.world_m)
+    models = fit_cameras(name, cameras)
+    without = _predict_without_groups(name, cameras, progress)
+    fitted = []
+    for camera, places in cameras.items():
+        arrays = parameters(models[camera])
+        stored = tuple(
+            Parameter(key, array.shape, array.reshape(-1)) for key, array in sorted(arrays.items())
+        )
+        covariance, noise = None, None
+        if without is not None:
+            residuals, groups = _left_out(places, without[0], without[1][camera])
+            covariance = residuals.T @ residuals / len(residuals) + _FLOOR_SIGMA_M**2 * np.eye(3)
+            tape_m2 = np.array([_tape(pair) for pair in pairs[camera]])
+            noise = _noise(name, models[camera], places, tape_m2, without[1][camera], groups)
+        fitted.append(CameraModel(camera, stored, covariance, tuple(pairs[camera]), noise))
+    return Model(time_ns, name, tuple(fitted))
+
+
+def _check_count(name: str, camera: str, places: Places) -> None:
+    needed = min_pairs(name)
+    if len(places.names) < needed:
+        other = "" if name == "rigid" else ", or use --model rigid, which needs 3"
+        raise FitError(
+            f"camera {camera}: {name} needs at least {needed} measured places, found {len(places.names)}; "
+            f"measure more{other}"
+        )
+
+
+def _check_spread(name: str, camera: str, targets: Array) -> None:
+    """Places that differ by no more than the tape's error say nothing new."""
+    different = len(np.unique(np.round(targets / _SAME_PLACE_M), axis=0))
+    if different < min_pairs(name):
+        raise FitError(
+            f"camera {camera}: {name} needs at least {min_pairs(name)} different places, found {different} "
+            f"in {len(targets)} measurements; measure elsewhere too"
+        )
+    beside_m = np.linalg.svd(targets - targets.mean(axis=0), compute_uv=False)[1] / np.sqrt(len(targets))
+    if beside_m < _BESIDE_LINE_M:
+        raise FitError(
+            f"camera {camera}: the {len(targets)} measured places lie on one line; measure some beside it"
+        )
+
+
+def _predict_without_groups(
+    name: str, cameras: Mapping[str, Places], progress: Callable[[int, int], None]
+) -> tuple[list[frozenset[str]], dict[str, Array]] | None:
+    """The groups, and what models without each predict, (g, n, 3) by camera; None for too few places."""
+    fewest = min(len(places.names) for places in cameras.values())
+    if fewest <= min_pairs(name):
+        return None
+    most = max(len(places.names) for places in cameras.values())
+    groups = deal(cameras, min(most, _GROUPS), np.random.default_rng(0))
+    predicted = []
+    for done, group in enumerate(groups, 1):
+        try:
+            predicted.append(predict_without(name, cameras, group))
+        except FitError:
+            return None
+        progress(done, len(groups))
+    return groups, {camera: np.array([found[camera] for found in predicted]) for camera in cameras}
+
+
+def _left_out(
+    places: Places, groups: Sequence[frozenset[str]], without: Array
+) -> tuple[Array, NDArray[np.int64]]:
+    """Errors (n, 3) of the models that had not seen a place, and the group (n,) of each."""
+    index = np.array([next(g for g, group in enumerate(groups) if name in group) for name in places.names])
+    return without[index, np.arange(len(index))] - places.world_m, index
+
+
+def _tape(pair: Pair) -> Array:
+    return np.zeros((3, 3)) if pair.world_covariance_m2 is None else pair.world_covariance_m2
+
+
+def _noise(
+    name: str, estimator: object, places: Places, tape_m2: Array, without: Array, groups: NDArray[np.int64]
+) -> Noise | None:
+    def predict(points_m: Array, heights_m: Array) -> Array:
+        world_m: Array = estimator.predict(inputs(name, points_m, heights_m))  # type: ignore[attr-defined]
+        return world_m
+
+    found: Uncertainty = estimate_uncertainty(
+        predict, places.points_m, places.world_m, tape_m2, without, groups
+    )
+    return Noise(found.along, found.across, found.growth, found.fit)

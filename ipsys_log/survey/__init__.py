@@ -1,0 +1,1 @@
+"""Calibration points: entry and checks of tape measurements, in logs and while cameras send."""

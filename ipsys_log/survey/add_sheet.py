@@ -1,0 +1,140 @@
+"""A sheet of measurements into a finished log: all of its rows, or none."""
+
+from __future__ import annotations
+
+from collections.abc import Iterator, Sequence
+from dataclasses import dataclass, replace
+from pathlib import Path
+
+from ipsys_log.log.dataset import Session
+from ipsys_log.messages import Measurement, Model, Rig
+from ipsys_log.runs.options import Request
+from ipsys_log.survey.blunders import THE_MODEL
+from ipsys_log.survey.checks import Checked, check_entry
+from ipsys_log.survey.entry import Entry, Fault, read_typed
+from ipsys_log.survey.from_log import FinishedLog, rigs_of
+from ipsys_log.survey.neighbours import OTHER_ROWS, fit_neighbours
+from ipsys_log.survey.scene import Sight, look
+from ipsys_log.survey.sheet import SheetRow, find_stops, name_columns, read_sheet, refuse_rows
+
+__all__ = ["add_sheet", "check_sheet"]
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class _Row:
+    """A row of a sheet, the observations of its marker, and the result; ``stop`` says why there are none."""
+
+    line: int
+    entry: Entry
+    faults: Sequence[Fault]
+    stop: str
+    sight: Sight | None
+
+
+def check_sheet(path: Path, log: Path, request: Request) -> None:
+    """See that a sheet can be read, before the long work on a log begins.
+
+    Raises
+    ------
+    IpsysError
+        See :func:`~ipsys_log.survey.sheet.read_sheet`.
+    """
+    with Session([log]) as session:
+        rigs = rigs_of(session, request)
+        if rigs:
+            read_sheet(path, rigs[-1], session.start_ns)
+
+
+def add_sheet(scene: FinishedLog, path: Path, insist: bool = False) -> list[str]:
+    """Append the measurements of a sheet: all of them, or none.
+
+    Parameters
+    ----------
+    scene : the log.
+    path : of the sheet.
+    insist : also write rows that look wrong but may be right.
+
+    Returns
+    -------
+    Remarks on uncertain points, and on rows that look wrong but were written, by line.
+
+    Raises
+    ------
+    IpsysError
+        Rows are bad; the text names each by its line, with the contradiction.
+    """
+    rows = list(_sighted(scene, read_sheet(path, scene.rig, scene.start_ns)))
+    model, name = scene.model, THE_MODEL
+    checked = _check(scene, rows, model, name)
+    if model is None:  # then the rows can contradict one another
+        model, name = _fit(scene, rows, checked), OTHER_ROWS
+        checked = checked if model is None else _check(scene, rows, model, name)
+    faults = [(row.line, row.stop) for row in rows if row.stop]
+    faults += _by_line(rows, [[fault.text for fault in one.faults] for one in checked], scene.rig)
+    doubts = _by_line(rows, _doubts(rows, checked, scene, model), scene.rig)
+    refuse_rows(path, faults, () if insist else doubts)
+    scene.add([one.measurement for one in checked if one.measurement is not None])
+    ids = {row.line: one.id for row, one in zip(rows, checked, strict=True)}
+    imprecise = _by_line(rows, [one.imprecise for one in checked], scene.rig)
+    return [f"line {line}: {ids[line]}: {text}" for line, text in sorted(doubts + imprecise)]
+
+
+def _by_line(rows: Sequence[_Row], texts: Sequence[Sequence[str]], rig: Rig) -> list[tuple[int, str]]:
+    """Name the columns of a sheet in remarks on its rows."""
+    return [
+        (row.line, name_columns(text, rig)) for row, held in zip(rows, texts, strict=True) for text in held
+    ]
+
+
+def _sighted(scene: FinishedLog, rows: Sequence[SheetRow]) -> Iterator[_Row]:
+    """Find the stationary interval of each row, and the observations of its marker then."""
+    read = [read_typed(row.typed, scene.rig) for row in rows]
+    stops = find_stops(rows, scene.stops, [entry.marker_id for entry, _ in read])
+    for row, (entry, faults), stop in zip(rows, read, stops, strict=True):
+        sight = None
+        if isinstance(stop, int) and entry.marker_id is not None:
+            sight = look(scene.views(stop), entry.marker_id)
+        yield _Row(row.line, entry, faults, stop if isinstance(stop, str) else "", sight)
+
+
+def _check(scene: FinishedLog, rows: Sequence[_Row], model: Model | None, name: str) -> list[Checked]:
+    """Check each row as the page does, after those above it."""
+    history, found = [*scene.history()], []
+    for row in rows:
+        one = check_entry(row.entry, row.faults, scene.rig, row.sight, history, model, name)
+        history += [] if one.measurement is None else [one.measurement]
+        found.append(one)
+    return found
+
+
+def _fit(scene: FinishedLog, rows: Sequence[_Row], checked: Sequence[Checked]) -> Model | None:
+    """Return a model of the rows themselves, without those that contradict it."""
+    seen: list[tuple[Measurement, Sight]] = []
+    for row, one in zip(rows, checked, strict=True):
+        if one.measurement is not None and row.sight is not None:
+            seen.append((one.measurement, row.sight))
+    return fit_neighbours(seen, scene.rig)
+
+
+def _doubts(
+    rows: Sequence[_Row], checked: Sequence[Checked], scene: FinishedLog, model: Model | None
+) -> list[list[str]]:
+    """Return the contradictions of each row, and another such row that its numbers fit, if there is one."""
+    doubtful = [row for row, one in zip(rows, checked, strict=True) if one.contradictions]
+    doubts = []
+    for row, one in zip(rows, checked, strict=True):
+        other = next((r for r in doubtful if one.contradictions and _fits(row, r, scene, model)), None)
+        hint = (
+            "" if other is None else f"; its numbers fit line {other.line} (marker {other.entry.marker_id})"
+        )
+        doubts.append([text + hint for text in one.contradictions])
+    return doubts
+
+
+def _fits(row: _Row, other: _Row, scene: FinishedLog, model: Model | None) -> bool:
+    """Return True if the numbers of a row fit the observations of another row."""
+    if other is row or other.sight is None:
+        return False
+    entry = replace(row.entry, marker_id=other.entry.marker_id, id=None)
+    one = check_entry(entry, (), scene.rig, other.sight, (), model)
+    return bool(one.predictions) and one.measurement is not None and not one.contradictions

@@ -1,0 +1,257 @@
+"""Plausibility check of a measurement before it is saved: triangle, floor, cameras, model."""
+
+from __future__ import annotations
+
+import re
+from collections.abc import Iterable, Sequence
+from dataclasses import dataclass, replace
+
+import numpy as np
+from numpy.typing import NDArray
+
+from ipsys_log.analysis.pairs import active_measurements
+from ipsys_log.analysis.tape import TapePoint, reference_points, world_point
+from ipsys_log.errors import IpsysError
+from ipsys_log.geometry.trilateration import SIDES
+from ipsys_log.messages import Measurement, Model, Rig
+from ipsys_log.survey.blunders import (
+    THE_MODEL,
+    doubt_crossing,
+    doubt_floor,
+    doubt_model,
+    doubt_tapes,
+    floor_sigma_m,
+    with_tape,
+)
+from ipsys_log.survey.entry import Entry, Fault
+from ipsys_log.survey.predict import Prediction, predict
+from ipsys_log.survey.scene import Sight
+from ipsys_log.units import CM_PER_M
+
+__all__ = ["Checked", "check_entry", "next_id", "withdraw"]
+
+Array = NDArray[np.float64]
+
+_NUMBERED = re.compile(r"p[0-9]{1,18}")  # an id in a log may have thousands of digits
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class Checked:
+    """The result of the check of an entry.
+
+    ``faults`` keep it out of the log, ``warnings`` must be confirmed first. Warnings that are ``imprecise``
+    are no mistakes: the point only has a large uncertainty. ``point_m`` (3,) is the world point, ``sigma_m``
+    its largest standard deviation by the tape, ``residuals_m`` those of the distances by reference point, if
+    there are more than two. ``sides_m`` are both possible points (3,) if the side is not given yet.
+    ``measurement`` is None if there are faults.
+    """
+
+    id: str
+    faults: tuple[Fault, ...] = ()
+    warnings: tuple[str, ...] = ()
+    point_m: Array | None = None
+    sigma_m: float | None = None
+    residuals_m: tuple[tuple[str, float], ...] = ()
+    on_floor: bool | None = None
+    predictions: tuple[Prediction, ...] = ()
+    sides_m: tuple[tuple[str, Array], ...] = ()
+    measurement: Measurement | None = None
+    imprecise: tuple[str, ...] = ()
+
+    @property
+    def contradictions(self) -> tuple[str, ...]:
+        """The warnings that may be mistakes."""
+        return tuple(text for text in self.warnings if text not in self.imprecise)
+
+
+def next_id(history: Iterable[Measurement]) -> str:
+    """Return the next free id: p001, p002 ... A withdrawn id is not used again.
+
+    Examples
+    --------
+    >>> next_id([Measurement(0, "p001"), Measurement(0, "p001_withdrawn", withdraws="p001")])
+    'p002'
+    """
+    numbers = [int(m.id[1:]) for m in history if _NUMBERED.fullmatch(m.id)]
+    return f"p{max(numbers, default=0) + 1:03d}"
+
+
+def withdraw(history: Sequence[Measurement], name: str) -> Measurement:
+    """The message that withdraws a measurement; nothing is erased.
+
+    Raises
+    ------
+    IpsysError
+        Where there is none of that id, or it is withdrawn already.
+    """
+    for measurement in active_measurements(history):
+        if measurement.id == name:
+            return Measurement(measurement.timestamp, f"{name}_withdrawn", withdraws=name)
+    raise IpsysError(f"there is no measurement {name} to withdraw; it is withdrawn already, or never was")
+
+
+def check_entry(
+    entry: Entry,
+    faults: Sequence[Fault],
+    rig: Rig,
+    sight: Sight | None,
+    history: Sequence[Measurement],
+    model: Model | None = None,
+    model_name: str = THE_MODEL,
+) -> Checked:
+    """Check whether an entry is plausible, and make its measurement.
+
+    Parameters
+    ----------
+    entry, faults : from :func:`~ipsys_log.survey.entry.read_typed`.
+    rig : the present one.
+    sight : the observations of the marker, None if the marker is not known.
+    history : measurements and withdrawals so far.
+    model : the present one, to compare with.
+    model_name : its name in a warning.
+    """
+    name = entry.id or next_id(history)
+    found = [*faults, *_identity_faults(entry, sight, history)]
+    warnings = list(entry.doubts)
+    read = _measurement(entry, name, sight)
+    given = {fault.field for fault in found}
+    apart = _apart(read, rig)
+    if apart is not None:
+        # That one of them may be in metres is then why.
+        return Checked(name, (*found, Fault("", "; ".join([apart, *entry.doubts]))))
+    missing = {"side", "height", ""} & given or {f for f in given if f.startswith("d_")}
+    if missing == {"side"} and len(entry.distances) >= 2 and entry.height_m is not None:
+        sides_m, fault = _both_sides(read, rig)
+        return Checked(name, tuple(found + fault), tuple(warnings), sides_m=sides_m)
+    if missing or len(entry.distances) < 2 or entry.height_m is None:
+        return Checked(name, tuple(found), tuple(warnings))
+    try:
+        # A usual tape tells how flatly the circles cross; what is written down has no sigma of its own.
+        fixed = world_point(read, with_tape(rig))
+    except IpsysError as error:
+        why = "; ".join([_without_id(error, name), *entry.doubts])
+        return Checked(name, (*found, Fault("", why)))
+    on_floor, remark = doubt_floor(read, fixed, rig)
+    flat = doubt_crossing(read, rig)
+    warnings += [*remark, *doubt_tapes(read, fixed, rig), *flat]
+    earlier = _here_before(read, sight, history)
+    found += _twin_faults(read, earlier)
+    warnings += _repeat_warnings(read, fixed, rig, earlier) if read.still else []
+    predictions = predict(model, sight.points_m, fixed.world_m) if model and sight else ()
+    warnings += doubt_model(read, fixed, rig, predictions, model_name)
+    return Checked(
+        name,
+        tuple(found),
+        tuple(dict.fromkeys(warnings)),
+        fixed.world_m,
+        floor_sigma_m(fixed),
+        _residuals(read, fixed),
+        on_floor,
+        predictions,
+        measurement=None if found else read,
+        imprecise=tuple(flat),
+    )
+
+
+def _measurement(entry: Entry, name: str, sight: Sight | None) -> Measurement:
+    still = sight.still if sight else None
+    time_ns = 0 if still is None else still.start + (still.end - still.start) // 2
+    return Measurement(
+        time_ns,
+        name,
+        marker_id=entry.marker_id,
+        distances=entry.distances,
+        side=entry.side,
+        height_m=entry.height_m,
+        still=still,
+        splits=entry.splits,
+    )
+
+
+def _apart(read: Measurement, rig: Rig) -> str | None:
+    """Why two tapes do not meet, named as they were asked for: of side and height nothing need be known."""
+    if len(read.distances) != 2:
+        return None
+    first_m, second_m = reference_points(read, rig)
+    base_m = float(np.hypot(*(second_m - first_m)))
+    one, other = read.distances
+    if abs(one.distance_m - other.distance_m) <= base_m <= one.distance_m + other.distance_m:
+        return None
+    tapes = (f"distance to {d.reference} = {d.distance_m * CM_PER_M:g} cm" for d in (one, other))
+    return (
+        f"no triangle has the sides {one.reference} to {other.reference} = {base_m * CM_PER_M:.1f} cm, "
+        f"{' and '.join(tapes)}; read both again"
+    )
+
+
+def _without_id(error: IpsysError, name: str) -> str:
+    return str(error).removeprefix(f"measurement {name}").removeprefix(": ").strip()
+
+
+def _identity_faults(entry: Entry, sight: Sight | None, history: Sequence[Measurement]) -> list[Fault]:
+    found = []
+    if entry.id is not None and any(entry.id in (m.id, m.withdraws) for m in history):
+        found.append(Fault("id", f"id {entry.id} was used before; leave it out for the next free one"))
+    if sight is not None and sight.still is None:
+        found.append(Fault("marker", sight.text))
+    return found
+
+
+def _here_before(read: Measurement, sight: Sight | None, history: Sequence[Measurement]) -> list[Measurement]:
+    """Return the measurements of this marker here: of one stationary interval, or seen there."""
+    seen = sight.measured_as if sight else ()
+    own = [m for m in active_measurements(history) if m.marker_id == read.marker_id]
+    return [m for m in own if _overlap(m, read) or m.id in seen]
+
+
+def _twin_faults(read: Measurement, earlier: Sequence[Measurement]) -> list[Fault]:
+    """The same place typed twice, to the last digit."""
+    for other in earlier:
+        same = (other.side, other.height_m) == (read.side, read.height_m)
+        if same and _tapes(other) == _tapes(read):
+            return [Fault("", f"this is {other.id} once more, with the very same numbers")]
+    return []
+
+
+def _repeat_warnings(
+    read: Measurement, fixed: TapePoint, rig: Rig, earlier: Sequence[Measurement]
+) -> list[str]:
+    if not earlier:
+        return []
+    names = ", ".join(f"{m.id}{_apart_from(m, fixed, rig)}" for m in earlier)
+    return [f"marker {read.marker_id} is measured here already, as {names}; if this is better, undo that one"]
+
+
+def _apart_from(other: Measurement, fixed: TapePoint, rig: Rig) -> str:
+    """Return the distance to another measurement in words; "" if that one forms no point."""
+    try:
+        other_m = world_point(other, rig).world_m
+    except IpsysError:
+        return ""
+    return f" ({float(np.linalg.norm(other_m - fixed.world_m)) * CM_PER_M:.1f} cm away)"
+
+
+def _tapes(measurement: Measurement) -> list[tuple[str, float]]:
+    return [(tape.reference, tape.distance_m) for tape in measurement.distances]
+
+
+def _overlap(one: Measurement, other: Measurement) -> bool:
+    spans = [(m.still.start, m.still.end) if m.still else (m.timestamp, m.timestamp) for m in (one, other)]
+    (start, end), (first, last) = spans
+    return start <= last and first <= end
+
+
+def _both_sides(read: Measurement, rig: Rig) -> tuple[tuple[tuple[str, Array], ...], list[Fault]]:
+    """Return the points on both sides, or the reason why the tape distances do not meet."""
+    try:
+        places = tuple((side, world_point(replace(read, side=side), rig).world_m) for side in SIDES)
+    except IpsysError as error:
+        return (), [Fault("", _without_id(error, read.id))]
+    return places, []
+
+
+def _residuals(read: Measurement, fixed: TapePoint) -> tuple[tuple[str, float], ...]:
+    if len(read.distances) < 3:
+        return ()
+    names = (tape.reference for tape in read.distances)
+    return tuple(zip(names, fixed.residuals_m.tolist(), strict=True))

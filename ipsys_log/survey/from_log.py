@@ -1,0 +1,231 @@
+"""Measuring on a finished log: its places one after the other, and measurements appended at their time."""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Iterator, Mapping, Sequence
+from contextlib import contextmanager
+from pathlib import Path
+from typing import Any
+
+import cv2
+import numpy as np
+
+from ipsys_log.analysis.pairs import Sightings, gather_sightings
+from ipsys_log.analysis.stationary import still_stretches
+from ipsys_log.errors import FrameError, IpsysError, LogError
+from ipsys_log.images.video import decode_last
+from ipsys_log.log.dataset import Session
+from ipsys_log.log.topics import camera_of_topic
+from ipsys_log.log.writer import LogWriter
+from ipsys_log.messages import (
+    MEASUREMENTS_TOPIC,
+    CameraPoints,
+    CompressedImage,
+    CompressedVideo,
+    Markers,
+    Measurement,
+    Message,
+    Model,
+    Rig,
+)
+from ipsys_log.pipeline import replay
+from ipsys_log.runs.options import Progress, Request
+from ipsys_log.runs.output import write_messages
+from ipsys_log.runs.provenance import newest_run
+from ipsys_log.runs.states import out_of_date_lines
+from ipsys_log.stages.detect import decode_grey
+from ipsys_log.survey.entry import check_references
+from ipsys_log.survey.scene import Stop, View
+from ipsys_log.units import NS_PER_S
+
+__all__ = ["FinishedLog", "opened_log", "rigs_of"]
+
+# How far the log time of a frame can lie from the time that its geometry speaks of, and how far before the
+# exposure of a marker that of its frame.
+_LATE_NS = 2 * NS_PER_S
+_ROLLING_NS = NS_PER_S // 10
+# Stretches whose pictures are kept: each is asked for with every key that is typed.
+_KEPT = 4
+
+
+@contextmanager
+def opened_log(
+    path: Path,
+    request: Request,
+    progress: Progress = lambda stage, done, total: None,
+    say: Callable[[str], None] = lambda text: None,
+) -> Iterator[FinishedLog]:
+    """Open a log for measuring; missing markers and camera points are computed and appended first.
+
+    Parameters
+    ----------
+    path : a finished log.
+    request : its rig and lenses are used instead of the log's.
+    say : called with the runs that are out of date.
+
+    Raises
+    ------
+    IpsysError
+        The log cannot be written to, the rig lacks two reference points, or no marker of the rig is
+        stationary in the log.
+    """
+    with LogWriter.append(path) as writer:
+        writer.abandon()
+    with Session([path]) as session:
+        rigs = rigs_of(session, request)
+        if rigs:
+            check_references(rigs[-1])
+        if len({rig.reference_points for rig in rigs}) > 1:
+            raise IpsysError(
+                f"{path}: its reference points change on the way; give those that hold with --rig"
+            )
+    replay([path], request, "camera-frame", progress=progress, say=say)
+    with Session([path]) as session:
+        for line in out_of_date_lines(session, [newest_run(session, Model)]):
+            say(line)
+        yield FinishedLog(path, session, rigs[-1])
+
+
+class FinishedLog:
+    """A finished log as a :class:`~ipsys_log.survey.scene.Scene`."""
+
+    def __init__(self, path: Path, session: Session, rig: Rig) -> None:
+        self.path, self.rig = path, rig
+        self._session = session
+        self.start_ns = session.start_ns
+        self._topics: dict[type, list[str]] = {
+            payload: _newest(session, payload) for payload in (CameraPoints, Markers)
+        }
+        cameras = {str(camera_of_topic(topic)) for topic in self._topics[CameraPoints]}
+        self._cameras = sorted({*session.images, *cameras})
+        self._seen: dict[int, list[View]] = {}
+        models = session.payloads(_newest(session, Model))
+        self.model: Model | None = models[-1] if models else None
+        self._history = list(session.messages(session.topics(Measurement)))
+        self.stops = _find_stops(gather_sightings(session.messages(self._topics[CameraPoints])), rig)
+        if not self.stops:
+            raise IpsysError(
+                f"{path}: no marker of the rig lies still in it for two frames or longer: there is nothing "
+                "to measure; lay markers down while recording"
+            )
+
+    def views(self, stop: int | None) -> list[View]:
+        """What each camera saw in a stretch, and its picture from the middle of it."""
+        number = stop or 0
+        if number not in self._seen:
+            while len(self._seen) >= _KEPT:
+                del self._seen[next(iter(self._seen))]
+            self._seen[number] = [self._view(camera, self.stops[number]) for camera in self._cameras]
+        return self._seen[number]
+
+    def history(self) -> list[Measurement]:
+        return [message.payload for message in self._history]
+
+    def add(self, measurements: Sequence[Measurement]) -> None:
+        """Append measurements at the time of their stretch, withdrawals after what they withdraw.
+
+        Raises
+        ------
+        LogError
+            Where the log is locked or cannot be written to; or another process measured in it meanwhile: that
+            is then in the history, and the same can be added again.
+        """
+        with LogWriter.append(self.path) as writer:
+            others = self._of_others()
+            if others:
+                self._history += others
+                names = ", ".join(one.payload.id for one in others)
+                raise LogError(
+                    f"somebody else measured in this log meanwhile ({names}), so this is not written yet: "
+                    "look again, and repeat it"
+                )
+            added: list[Message] = []
+            for measurement in measurements:
+                added.append(_message(measurement, [*self._history, *added]))
+            write_messages(writer, added)
+        self._history += added
+
+    def _of_others(self) -> list[Message]:
+        """What other processes have measured since it was looked last."""
+        known = {(one.payload.id, one.payload.withdraws) for one in self._history}
+        with Session([self.path]) as now:
+            found = now.messages(now.topics(Measurement))
+            return [one for one in found if (one.payload.id, one.payload.withdraws) not in known]
+
+    def _view(self, camera: str, here: Stop) -> View:
+        middle_ns = here.start_ns + (here.end_ns - here.start_ns) // 2
+        seen = [m for m in self._within(CameraPoints, camera, here) if _sees(m, here)]
+        found = self._within(Markers, camera, here)
+        marked = min(found, key=lambda m: abs(m.publish_time_ns - middle_ns), default=None)
+        jpeg = self._picture(camera, marked.log_time_ns if marked else middle_ns)
+        return View(
+            camera,
+            marked.publish_time_ns if marked else middle_ns,
+            jpeg,
+            marked.payload if marked else None,
+            tuple(message.payload for message in seen),
+        )
+
+    def _within(self, payload: type, camera: str, here: Stop) -> list[Message]:
+        """Messages of a camera that speak of a stretch."""
+        topics = [topic for topic in self._topics[payload] if camera_of_topic(topic) == camera]
+        found = self._session.messages(topics, here.start_ns - _LATE_NS, here.end_ns + _LATE_NS)
+        return [m for m in found if here.start_ns - _ROLLING_NS <= m.publish_time_ns <= here.end_ns]
+
+    def _picture(self, camera: str, log_time_ns: int) -> bytes | None:
+        """The frame of a log time, or the nearest one, as a JPEG."""
+        topic = self._session.images.get(camera)
+        if topic is None:
+            return None
+        times_ns = np.concatenate([r.times(topic) for r in self._session.readers if topic in r.channels])
+        nearest_ns = int(times_ns[np.abs(times_ns - log_time_ns).argmin()])
+        frame = self._frame(topic, nearest_ns)
+        if isinstance(frame, CompressedImage) and frame.data[:2] == b"\xff\xd8":
+            return frame.data
+        try:
+            if isinstance(frame, CompressedVideo):
+                before = times_ns[times_ns <= nearest_ns][::-1].tolist()
+                frame = decode_last(self._frame(topic, time_ns) for time_ns in before)
+            return None if frame is None else cv2.imencode(".jpg", decode_grey(frame))[1].tobytes()
+        except FrameError:
+            return None
+
+    def _frame(self, topic: str, log_time_ns: int) -> Any:
+        return next(self._session.messages([topic], log_time_ns, log_time_ns + 1)).payload
+
+
+def rigs_of(session: Session, request: Request) -> list[Rig]:
+    """The rigs of a log, or the one that holds instead; the last one is measured with."""
+    return [request.rig] if request.rig is not None else session.payloads(session.topics(Rig))
+
+
+def _newest(session: Session, payload: type) -> list[str]:
+    run = newest_run(session, payload)
+    return session.topics(payload, run) if run else []
+
+
+def _message(measurement: Measurement, earlier: Sequence[Message]) -> Message:
+    """At the end of its stretch; but what is said of an id is said in order."""
+    end_ns = measurement.timestamp if measurement.still is None else measurement.still.end
+    names = {measurement.id, measurement.withdraws}
+    same = [m.log_time_ns + 1 for m in earlier if {m.payload.id, m.payload.withdraws} & (names - {None})]
+    return Message(MEASUREMENTS_TOPIC, max([end_ns, *same]), measurement.timestamp, measurement)
+
+
+def _find_stops(sightings: Mapping[tuple[str, int], Sightings], rig: Rig) -> list[Stop]:
+    """Return where the rig's markers lie still, in order of time."""
+    stops = []
+    for marker_id in sorted({marker_id for _, marker_id in sightings}):
+        if rig.knows(marker_id):
+            seen = {camera: found for (camera, one), found in sightings.items() if one == marker_id}
+            stops += [Stop(marker_id, *stretch) for stretch in still_stretches(seen)]
+    return sorted(stops, key=lambda stop: (stop.start_ns, stop.marker_id))
+
+
+def _sees(message: Message, here: Stop) -> bool:
+    """Return whether camera points have the marker of a stretch within it."""
+    return any(
+        point.id == here.marker_id
+        and here.start_ns <= message.publish_time_ns + (point.time_offset_ns or 0) <= here.end_ns
+        for point in message.payload.points
+    )

@@ -1,0 +1,247 @@
+"""A sheet of tape measurements, CSV, as it is filled in beside the floor: see docs/measuring.md."""
+
+from __future__ import annotations
+
+import csv
+import math
+import re
+from collections.abc import Iterator, Sequence
+from dataclasses import dataclass
+from datetime import UTC, datetime
+from pathlib import Path
+
+from ipsys_log.errors import IpsysError
+from ipsys_log.messages import Rig
+from ipsys_log.survey.checks import check_entry
+from ipsys_log.survey.entry import Typed, read_typed
+from ipsys_log.survey.scene import Stop
+from ipsys_log.units import NS_PER_S
+
+__all__ = ["SheetRow", "find_stops", "name_columns", "read_sheet", "refuse_rows"]
+
+_PLAIN = ("id", "marker", "side", "height_cm", "place", "time", "split", "note")
+_NEEDED = ("marker", "height_cm")
+_LARGEST = 4 << 20
+_MOST_DIGITS = 10
+_NUMBER = re.compile(r"[\d.]+")
+# A time read off a watch need not lie within the stretch to the second.
+_NEAR_NS = 2 * NS_PER_S
+
+
+@dataclass(frozen=True, slots=True)
+class SheetRow:
+    """One place: the line it stands on, what is written there, and what says which stretch it is: ``place``,
+    its number in the log, or ``time_ns``; else it is the next one of its marker."""
+
+    line: int
+    typed: Typed
+    place: int | None = None
+    time_ns: int | None = None
+
+
+def read_sheet(path: Path, rig: Rig, start_ns: int) -> list[SheetRow]:
+    """Read the rows of a sheet.
+
+    Parameters
+    ----------
+    path : of the sheet: UTF-8, cells separated by commas, or by semicolons (then with decimal commas, too).
+    rig : its reference points name the columns ``d_A_cm``, ``d_B_cm`` ...
+    start_ns : start of the log; a plain number as ``time`` is in seconds after it.
+
+    Raises
+    ------
+    IpsysError
+        The sheet cannot be read, a column is missing, unknown or repeated, or rows are invalid; the text
+        names each bad row by its line.
+    """
+    lines = _read_lines(path)
+    delimiter = ";" if lines and ";" in lines[0] else ","
+    reader = csv.reader(lines, delimiter=delimiter)
+    rows, faults = [], []
+    try:
+        columns = [name.strip() for name in next(reader, [])]
+        _check_columns(columns, rig, path)
+        for cells in reader:
+            if not any(cell.strip() for cell in cells):
+                continue
+            if len(cells) > len(columns):
+                why = f"{len(cells)} cells, but {len(columns)} columns{_comma_advice(delimiter)}"
+                faults.append((reader.line_num, why))
+                continue
+            cell = dict(zip(columns, (text.strip() for text in cells), strict=False))
+            if _NUMBER.fullmatch(cell.get("side", "")):
+                why = f"side {cell['side']!r}: write left or right{_comma_advice(delimiter)}"
+                faults.append((reader.line_num, why))
+                continue
+            try:
+                rows.append(_row(reader.line_num, cell, start_ns))
+            except IpsysError as error:
+                faults.append((reader.line_num, str(error)))
+    except csv.Error as error:
+        raise IpsysError(f"{path}: line {reader.line_num}: {error}") from error
+    for row in rows:
+        alone = check_entry(*read_typed(row.typed, rig), rig, None, ())
+        faults += [(row.line, name_columns(fault.text, rig)) for fault in alone.faults]
+    refuse_rows(path, faults)
+    if not rows:
+        raise IpsysError(f"{path}: holds no measurements below its header")
+    return rows
+
+
+def _comma_advice(delimiter: str) -> str:
+    """Why a row may have come apart."""
+    return "; a decimal comma? Write a point: 212.7" if delimiter == "," else ""
+
+
+def refuse_rows(
+    path: Path, faults: Sequence[tuple[int, str]], doubts: Sequence[tuple[int, str]] = ()
+) -> None:
+    """Name every bad row by its line, and each that looks wrong.
+
+    Raises
+    ------
+    IpsysError
+        Where there is one.
+    """
+    if faults or doubts:
+        named = "".join(f"\n  line {line}: {text}" for line, text in sorted([*faults, *doubts]))
+        insist = "" if faults else ", or write it as it is with --force"
+        raise IpsysError(f"{path}: nothing was written; correct the sheet{insist}:{named}")
+
+
+def name_columns(text: str, rig: Rig) -> str:
+    """Return a remark on a point, with the column names of a sheet for its distances.
+
+    Examples
+    --------
+    >>> from ipsys_log.messages import ReferencePoint
+    >>> points = (ReferencePoint("A", 0.0, 0.0), ReferencePoint("B", 2.0, 0.0))
+    >>> name_columns("the distances to A and B look exchanged", Rig("lab", "", 0.2, reference_points=points))
+    'd_A_cm and d_B_cm look exchanged'
+    """
+    one = "|".join(re.escape(point.name) for point in rig.reference_points)
+    each = re.compile(rf"\b({one})\b(?=, | and |$)")
+    text = re.sub(
+        rf"\bthe distances to ((?:(?:{one}), )*(?:{one}) and (?:{one}))\b",
+        lambda names: each.sub(r"d_\1_cm", names[1]),
+        text,
+    )
+    text = re.sub(rf"\b(?:the )?distance to ({one})\b", r"d_\1_cm", text)
+    text = re.sub(r"\bit lies (left|right) of the line\b", r"side: it lies \1 of the line", text)
+    return re.sub(r"\b(?:the )?height(?=:|\?| reads| and)", "height_cm", text)
+
+
+def find_stops(
+    rows: Sequence[SheetRow], stops: Sequence[Stop], markers: Sequence[int | None]
+) -> Iterator[int | str]:
+    """The stretch of each row, as index of ``stops``; or in words why there is none.
+
+    A row is told apart by its ``place``, else by its ``time``; else the rows of a marker must be as many as
+    the stretches in which it lies still, and are taken in this order.
+
+    Parameters
+    ----------
+    rows : of the sheet.
+    stops : of the log.
+    markers : of each row, None where it is not known.
+    """
+    in_order: dict[int, list[int]] = {}
+    for row, marker_id in zip(rows, markers, strict=True):
+        if marker_id is not None and row.place is None and row.time_ns is None:
+            in_order.setdefault(marker_id, []).append(row.line)
+    for row, marker_id in zip(rows, markers, strict=True):
+        if marker_id is None:
+            yield ""
+            continue
+        own = [n for n, stop in enumerate(stops) if stop.marker_id == marker_id]
+        if not own:
+            seen = ", ".join(map(str, sorted({stop.marker_id for stop in stops}))) or "none"
+            yield f"marker {marker_id} lies still before no camera (those that do: {seen})"
+        elif row.place is not None:
+            yield _numbered(row.place, marker_id, stops)
+        elif row.time_ns is not None:
+            yield _timed(row.time_ns, marker_id, stops)
+        elif len(own) != len(in_order[marker_id]):
+            yield (
+                f"marker {marker_id} lies still {len(own)} times, but {len(in_order[marker_id])} rows name "
+                "no place or time: fill in place, as ipsys measure LOG --places numbers them"
+            )
+        else:
+            yield own[in_order[marker_id].index(row.line)]
+
+
+def _numbered(place: int, marker_id: int, stops: Sequence[Stop]) -> int | str:
+    if not 1 <= place <= len(stops):
+        return f"place {place} is none of 1 to {len(stops)}"
+    other = stops[place - 1].marker_id
+    return place - 1 if other == marker_id else f"place {place} is one of marker {other}, not {marker_id}"
+
+
+def _timed(time_ns: int, marker_id: int, stops: Sequence[Stop]) -> int | str:
+    def away_ns(number: int) -> int:
+        return max(stops[number].start_ns - time_ns, time_ns - stops[number].end_ns, 0)
+
+    nearest = min((n for n, stop in enumerate(stops) if stop.marker_id == marker_id), key=away_ns)
+    if away_ns(nearest) > _NEAR_NS:
+        return f"marker {marker_id} does not lie still then; nearest is place {nearest + 1}"
+    return nearest
+
+
+def _read_lines(path: Path) -> list[str]:
+    try:
+        if path.stat().st_size > _LARGEST:
+            raise IpsysError(f"{path}: is too large for a sheet of measurements")
+        return path.read_text(encoding="utf-8-sig").splitlines(keepends=True)
+    except OSError as error:
+        raise IpsysError(f"{path}: cannot be read: {error.strerror}") from error
+    except UnicodeDecodeError as error:
+        raise IpsysError(f"{path}: is not a text file; save the sheet as CSV, in UTF-8") from error
+
+
+def _check_columns(columns: Sequence[str], rig: Rig, path: Path) -> None:
+    distances = [f"d_{point.name}_cm" for point in rig.reference_points]
+    known = [*_PLAIN[:2], *distances, *_PLAIN[2:]]
+    for name in columns:
+        if name not in known:
+            raise IpsysError(f"{path}: line 1: unknown column {name!r}; known are {', '.join(known)}")
+        if columns.count(name) > 1:
+            raise IpsysError(f"{path}: line 1: two columns have the name {name!r}")
+    missing = [name for name in _NEEDED if name not in columns]
+    if len(set(distances) & set(columns)) < 2:
+        missing += distances[:2]
+    if missing:
+        raise IpsysError(f"{path}: line 1: the column {missing[0]} is missing; known are {', '.join(known)}")
+
+
+def _row(line: int, cell: dict[str, str], start_ns: int) -> SheetRow:
+    distances = {n[2:-3]: text for n, text in cell.items() if n.startswith("d_") and n.endswith("_cm")}
+    typed = Typed(
+        cell.get("marker", ""),
+        distances,
+        cell.get("side", ""),
+        cell.get("height_cm", ""),
+        cell.get("split", ""),
+        cell.get("id", ""),
+    )
+    place, time = cell.get("place", ""), cell.get("time", "")
+    if place and not (place.isascii() and place.isdecimal() and len(place) < _MOST_DIGITS):
+        raise IpsysError(f"place {place[:_MOST_DIGITS]!r} is no whole number of places")
+    return SheetRow(line, typed, int(place) if place else None, _time_ns(time, start_ns) if time else None)
+
+
+def _time_ns(text: str, start_ns: int) -> int:
+    """Seconds from the start of the log, or a date and time; UTC where it names no zone."""
+    try:
+        seconds = float(text.replace(",", "."))
+        if math.isfinite(seconds) and abs(seconds) < 1e9:
+            return start_ns + round(seconds * NS_PER_S)
+    except ValueError:
+        pass
+    try:
+        moment = datetime.fromisoformat(text)
+        moment = moment if moment.tzinfo else moment.replace(tzinfo=UTC)
+        return int((moment - datetime.fromtimestamp(0, UTC)).total_seconds() * 1e6) * 1000
+    except (ValueError, OverflowError):
+        raise IpsysError(
+            f"time {text!r} is neither seconds from the start of the log nor like 2026-05-04 10:15:30"
+        ) from None

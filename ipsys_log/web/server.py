@@ -1,0 +1,179 @@
+"""The server of the page, in a thread of its own beside whatever else goes on."""
+
+from __future__ import annotations
+
+import asyncio
+import errno
+import ipaddress
+import secrets
+import socket
+from collections.abc import Callable, Iterator
+from contextlib import contextmanager
+from dataclasses import dataclass
+from threading import Thread
+from typing import Any
+
+import cv2
+import uvicorn
+
+from ipsys_log.errors import IpsysError
+from ipsys_log.survey.scene import Scene
+from ipsys_log.web.access import Guard
+from ipsys_log.web.app import build_app
+from ipsys_log.web.connections import Connections, Limits, derive_limits
+from ipsys_log.web.faults import Faults
+
+__all__ = ["Served", "check_free", "qr_code", "serving"]
+
+_LOOPBACK = "127.0.0.1"
+_STEP_S = 0.02
+_TURN_S = 0.1
+_BACKLOG = 128
+# A browser also sends cookies of other programs on this machine, up to 4 kB each.
+_MAX_HEADER_BYTES = 64 << 10
+# The screen belongs to a recording: Faults keeps the messages of the server.
+_SILENT: dict[str, Any] = {
+    "version": 1,
+    "disable_existing_loggers": False,
+    "handlers": {"none": {"class": "logging.NullHandler"}},
+    "loggers": {name: {"handlers": ["none"], "propagate": False} for name in ("uvicorn", "asyncio")},
+}
+
+
+@dataclass(frozen=True, slots=True)
+class Served:
+    """A page that is served: its address, with the token where one is needed."""
+
+    url: str
+    thread: Thread
+    faults: Faults
+
+    def wait(self, stopped: Callable[[], bool]) -> None:
+        """Wait until the server ends, or until `stopped` is true."""
+        while self.thread.is_alive() and not stopped():
+            self.thread.join(_TURN_S)
+
+
+@contextmanager
+def serving(
+    scene: Scene, host: str | None = None, port: int = 8000, limits: Limits | None = None
+) -> Iterator[Served]:
+    """Serve the page of a scene until the with-block is left.
+
+    Parameters
+    ----------
+    host : the address to listen on; None: only this machine, without a token.
+    port : 0 takes any free port.
+    limits : of connections; None: as many as a recorder can spare.
+
+    Raises
+    ------
+    IpsysError
+        The port is taken or not allowed, the host is not of this machine, or the server does not start.
+    """
+    token = None if host is None else secrets.token_urlsafe(12)
+    with _listen(host or _LOOPBACK, port) as listening:
+        names = {socket.gethostname().lower(), f"{socket.gethostname().lower()}.local"}
+        names |= {host.lower()} if host else set()
+        faults = Faults()
+        config = uvicorn.Config(
+            faults.watch_app(Guard(build_app(scene), frozenset(names), token)),
+            log_config=_SILENT, access_log=False, lifespan="off", ws="none", http="h11", loop="asyncio",
+            server_header=False, timeout_graceful_shutdown=1, h11_max_incomplete_event_size=_MAX_HEADER_BYTES,
+        )  # fmt: skip
+        server = uvicorn.Server(config)
+        run = (server, listening, limits or derive_limits(), faults)
+        thread = Thread(target=_run, args=run, name="page", daemon=True)
+        thread.start()
+        while thread.is_alive() and not server.started:
+            thread.join(_STEP_S)
+        if not server.started:
+            raise IpsysError(f"the page cannot be served: {faults.first.splitlines()[-1]}")
+        try:
+            yield Served(_url(host, listening.getsockname()[1], token), thread, faults)
+        finally:
+            server.should_exit = True
+            thread.join()
+
+
+def _run(server: uvicorn.Server, listening: socket.socket, limits: Limits, faults: Faults) -> None:
+    """Serve until ``server.should_exit``. A fault ends only this thread."""
+    try:
+        asyncio.run(_serve(server, listening, limits, faults))
+    except Exception as error:
+        faults.add(error)
+
+
+async def _serve(server: uvicorn.Server, listening: socket.socket, limits: Limits, faults: Faults) -> None:
+    faults.watch_loop(asyncio.get_running_loop())
+    listening.setblocking(False)
+    server.config.load()
+    connections = Connections(limits, server.config, server.server_state)
+    async with asyncio.TaskGroup() as tasks:
+        accepting = tasks.create_task(connections.accept(listening))
+        try:
+            await server.serve(sockets=[])
+        finally:
+            accepting.cancel()
+            connections.abort()
+
+
+def check_free(host: str | None, port: int) -> None:
+    """See that a page can be served there.
+
+    Raises
+    ------
+    IpsysError
+        As :func:`serving`.
+    """
+    _listen(host or _LOOPBACK, port).close()
+
+
+def _listen(host: str, port: int) -> socket.socket:
+    try:
+        family, *_, address = socket.getaddrinfo(host, port, type=socket.SOCK_STREAM)[0]
+        return socket.create_server(address[:2], family=family, backlog=_BACKLOG)
+    except socket.gaierror as error:
+        raise IpsysError(f"--host {host}: is no address of this machine; 0.0.0.0 is all of them") from error
+    except OverflowError as error:
+        raise IpsysError(f"--port {port}: give one of 1024 to 65535") from error
+    except OSError as error:
+        if error.errno == errno.EADDRINUSE:
+            raise IpsysError(f"--port {port}: is in use by another program; give another one") from error
+        if error.errno == errno.EACCES:
+            raise IpsysError(f"--port {port}: is not allowed; give one of 1024 to 65535") from error
+        raise IpsysError(f"--host {host}: cannot be listened on: {error.strerror}") from error
+
+
+def _url(host: str | None, port: int, token: str | None) -> str:
+    name = host or _LOOPBACK
+    try:
+        if ipaddress.ip_address(name).is_unspecified:
+            name = _address()
+    except ValueError:
+        pass
+    if ":" in name:
+        name = f"[{name}]"
+    return f"http://{name}:{port}/" + (f"?token={token}" if token else "")
+
+
+def _address() -> str:
+    """The address of this machine in its network: the one that it would send from. Nothing is sent."""
+    with socket.socket(socket.AF_INET, socket.SOCK_DGRAM) as probe:
+        try:
+            probe.connect(("192.0.2.1", 9))  # RFC 5737: an address for examples
+            return str(probe.getsockname()[0])
+        except OSError:
+            return socket.gethostname()
+
+
+def qr_code(text: str) -> str:
+    """A QR code in half blocks, to be shown light on dark or dark on light alike."""
+    modules = cv2.QRCodeEncoder.create().encode(text) == 0
+    if len(modules) % 2:
+        modules = cv2.copyMakeBorder(modules.astype("uint8"), 0, 1, 0, 0, cv2.BORDER_CONSTANT, value=0) == 1
+    blocks = {(False, False): "█", (True, False): "▄", (False, True): "▀", (True, True): " "}
+    return "\n".join(
+        "".join(blocks[bool(top), bool(low)] for top, low in zip(*rows, strict=True))
+        for rows in zip(modules[::2], modules[1::2], strict=True)
+    )

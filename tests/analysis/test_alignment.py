@@ -1,0 +1,244 @@
+"""The tilt of a camera from markers on the floor, against tilts that were put in."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Iterator, Sequence
+
+import numpy as np
+import pytest
+from numpy.typing import NDArray
+
+from ipsys_log.analysis.alignment import LEVEL_M, Alignment, align_camera
+from ipsys_log.analysis.still import Lying, find_lying
+from ipsys_log.geometry.markers import camera_point, marker_corners
+from ipsys_log.geometry.poses import lay_flat, look_down, rotation, transform
+from ipsys_log.messages import CameraPoint, CameraPoints, Interval, Measurement
+from ipsys_log.report.alignment_text import advise
+from ipsys_log.units import NS_PER_S
+from tests.ladder import follow
+
+Array = NDArray[np.float64]
+
+ORIGIN_M = np.array([2.4, 1.0, 2.1])
+# Under the camera, out to the edges of its picture.
+PLACES_M = np.array([(0.6, 0.3), (4.2, 0.3), (4.2, 1.7), (0.6, 1.7), (2.0, 1.1), (3.1, 0.6)])
+
+
+def hang(tilt_deg: float, towards_deg: float) -> Array:
+    """``camera_from_world`` of a camera turned about an axis of its own picture."""
+    towards = math.radians(towards_deg)
+    return look_down(ORIGIN_M, math.radians(tilt_deg) * np.array([math.cos(towards), math.sin(towards), 0.0]))
+
+
+def lay(
+    camera_from_world: Array, noise_m: float = 0.0, heights_m: Sequence[float] = (), seed: int = 0
+) -> list[Lying]:
+    """Markers at :data:`PLACES_M` as the camera has them; what they stand on is known to nobody."""
+    rng = np.random.default_rng(seed)
+    heights = np.zeros(len(PLACES_M))
+    heights[: len(heights_m)] = heights_m
+    points_m = transform(camera_from_world, np.column_stack([PLACES_M, heights]))
+    # Most of the noise of a camera point is along the view.
+    points_m *= 1 + noise_m / points_m[:, 2:] * rng.normal(size=(len(points_m), 1))
+    return [Lying(n, point_m, np.zeros((3, 3))) for n, point_m in enumerate(points_m)]
+
+
+def degrees(angle_rad: float | None) -> float:
+    assert angle_rad is not None
+    return math.degrees(angle_rad)
+
+
+@pytest.mark.parametrize("tilt_deg", [0.0, 2.0, 5.0])
+@pytest.mark.parametrize("towards_deg", [0, 45, 100, 200, 290])
+def test_a_known_tilt_comes_back_and_the_advice_mends_it(tilt_deg: float, towards_deg: float) -> None:
+    camera = hang(tilt_deg, towards_deg)
+    found = align_camera("red", lay(camera, 0.003))
+    assert degrees(found.tilt_rad) == pytest.approx(tilt_deg, abs=0.2)
+    assert found.down is not None
+    # The plumb line itself, not only how far it is off.
+    assert math.degrees(math.acos(min(1.0, float(found.down @ -camera[:3, 2])))) < 0.2
+    assert degrees(found.sigma_rad) < 0.2
+    assert found.spread_m is not None
+    assert found.left_m is not None
+    assert found.left_m < 0.02
+    if tilt_deg == 0:
+        assert found.level
+        assert advise(found).startswith("nothing: it is level, the spread is under 5 cm")
+        return
+    assert found.level == (found.spread_m < LEVEL_M)
+    if tilt_deg == 5:
+        assert not found.level
+    if not found.level:
+        after = align_camera("red", lay(follow(advise(found), camera), 0.003, seed=1))
+        assert after.level
+        assert degrees(after.tilt_rad) < 0.2
+
+
+@pytest.mark.parametrize(
+    ("axis", "says"),
+    [
+        # Turned about the axis to the right of the picture, a camera looks further to its top.
+        ((1, 0), "towards the bottom of its picture, by 3.0 degrees (11 cm on the floor)"),
+        ((-1, 0), "towards the top of its picture, by 3.0 degrees (11 cm on the floor)"),
+        ((0, 1), "towards the left of its picture, by 3.0 degrees (11 cm on the floor)"),
+        ((0, -1), "towards the right of its picture, by 3.0 degrees (11 cm on the floor)"),
+    ],
+)
+def test_the_words(axis: tuple[float, float], says: str) -> None:
+    camera_turned = rotation(np.radians(3.0) * np.array([*axis, 0.0]))
+    points_m = transform(look_down(ORIGIN_M), np.column_stack([PLACES_M, np.zeros(len(PLACES_M))]))
+    # The axes of the camera are turned: what it sees turns the other way.
+    found = align_camera(
+        "red", [Lying(n, p, np.zeros((3, 3))) for n, p in enumerate(points_m @ camera_turned)]
+    )
+    assert advise(found) == f"tilt it so that it looks further {says}"
+
+
+def by_eq_3(camera_from_world: Array) -> list[Lying]:
+    lying = []
+    for n, (x_m, y_m) in enumerate(PLACES_M):
+        corners_m = transform(camera_from_world @ lay_flat(x_m, y_m, 0.0, 0.3 * n), marker_corners(0.2))
+        lying.append(Lying(n, camera_point(corners_m[:, :2] / corners_m[:, 2:], 0.2), np.zeros((3, 3))))
+    return lying
+
+
+@pytest.mark.parametrize("towards_deg", [0, 70])
+def test_eq_3_overstates_a_tilt_by_half(towards_deg: float) -> None:
+    """Why camera points by the pose of the marker are used."""
+    camera = hang(1.0, towards_deg)
+    assert degrees(align_camera("red", by_eq_3(camera)).tilt_rad) == pytest.approx(1.5, abs=0.05)
+    assert degrees(align_camera("red", lay(camera)).tilt_rad) == pytest.approx(1.0, abs=1e-6)
+
+
+def test_a_marker_on_a_box_is_named_and_left_out() -> None:
+    for raised in range(5):
+        heights_m = [0.05 if n == raised else 0.0 for n in range(6)]
+        found = align_camera("red", lay(hang(2.0, 30), 0.002, heights_m))
+        ((lying, above_m),) = found.raised
+        assert lying.marker_id == raised
+        assert above_m == pytest.approx(0.05, abs=0.01)
+        assert degrees(found.tilt_rad) == pytest.approx(2.0, abs=0.2)
+    flat = align_camera("red", lay(hang(2.0, 30), 0.002))
+    assert flat.raised == ()
+
+
+def test_of_four_markers_nobody_can_tell_which_is_on_a_box() -> None:
+    found = align_camera("red", lay(hang(0.0, 0), 0.001, [0.08])[:4])
+    assert found.raised == ()
+    assert found.uneven_m == pytest.approx(0.04, abs=0.005)
+    assert align_camera("red", lay(hang(3.0, 0), 0.001)[:4]).uneven_m is None
+
+
+def test_a_height_that_was_measured_is_brought_down() -> None:
+    camera = hang(4.0, 130)
+    lying = lay(camera, 0.0, [0.2, 0.0, 0.1, 0.15])
+    known = [
+        Lying(one.marker_id, one.point_m, one.covariance_m2, height_m)
+        for one, height_m in zip(lying, [0.2, 0.0, 0.1, 0.15, 0.0, 0.0], strict=True)
+    ]
+    found = align_camera("red", known)
+    assert degrees(found.tilt_rad) == pytest.approx(4.0, abs=1e-3)
+    assert found.left_m == pytest.approx(0.0, abs=1e-4)
+    assert found.height_m == pytest.approx(2.1)
+    assert found.raised == ()
+
+
+def test_one_and_two_markers_and_markers_on_a_line() -> None:
+    camera = hang(5.0, 90)  # to the left or right of the picture
+    lying = lay(camera)
+    assert "none lies still" in advise(align_camera("red", []))
+    one = align_camera("red", lying[:1])
+    assert (one.spread_m, one.level, one.tilt_rad) == (None, None, None)
+    assert "lay three or more markers" in advise(one)
+    two = align_camera("red", lying[:2])
+    assert two.axes == 1
+    assert degrees(two.tilt_rad) == pytest.approx(5.0, abs=0.1)
+    assert "along the line of its markers only" in advise(two)
+    across = align_camera("red", lying[1:3])
+    assert degrees(across.tilt_rad) < 0.5  # across it they know nothing
+    assert across.spread_m is not None
+    assert across.spread_m < LEVEL_M
+    assert across.level is None  # not green: it hangs askew by 5 degrees
+    assert advise(across).startswith("lay one aside of the line of its markers")
+    assert two.level is False
+    line = [
+        Lying(n, lying[0].point_m + n * (lying[1].point_m - lying[0].point_m) / 5, np.zeros((3, 3)))
+        for n in range(6)
+    ]
+    assert align_camera("red", line).axes == 1
+    near = [lying[0], Lying(1, lying[0].point_m + np.array([0.05, 0, 0]), np.zeros((3, 3)))]
+    assert align_camera("red", near).axes == 0
+    assert align_camera("red", near).level is None  # not green, whatever the spread
+    assert "further apart" in advise(align_camera("red", near))
+
+
+def test_what_a_tilt_does_not_mend_is_said() -> None:
+    """A lens that was calibrated badly bends the floor."""
+    lying = lay(hang(0.0, 0))
+    bowl = [
+        Lying(
+            one.marker_id,
+            one.point_m * (1 + 0.05 * float(one.point_m[0] ** 2 + one.point_m[1] ** 2) / 4),
+            one.covariance_m2,
+        )
+        for one in lying
+    ]
+    found = align_camera("red", bowl)
+    assert found.level is False
+    assert "calibrate its lens again" in advise(found)
+
+
+def test_the_uncertainty_is_that_of_the_scatter() -> None:
+    misses, sigmas_deg = [], []
+    for seed in range(200):
+        found: Alignment = align_camera("red", lay(hang(3.0, 20), 0.01, seed=seed))
+        assert found.down is not None
+        misses.append(found.down + hang(3.0, 20)[:3, 2])
+        sigmas_deg.append(degrees(found.sigma_rad))
+    # In the direction that is known worst, variance for variance.
+    off_rad = np.sqrt(np.mean(np.square(misses), axis=0)).max()
+    assert 0.8 < np.degrees(off_rad) / np.sqrt(np.mean(np.square(sigmas_deg))) < 1.2
+    # More of what scatters so is not named as lying elsewhere than chance has it.
+    named = [len(align_camera("red", lay(hang(3.0, 20), 0.01, seed=seed)).raised) for seed in range(200)]
+    assert np.mean(np.array(named) > 0) < 0.1
+
+
+def carried(places_m: Sequence[Array]) -> Iterator[CameraPoints]:
+    """A marker that lies a second at each place, and is lifted and carried to the next one in between."""
+    time_ns = 0
+    for here_m, next_m in zip(places_m, [*places_m[1:], None], strict=True):
+        for _ in range(30):
+            yield CameraPoints(time_ns, (CameraPoint(7, *here_m.tolist()),))
+            time_ns += NS_PER_S // 30
+        for part in np.linspace(0.02, 0.98, 50) if next_m is not None else ():
+            at_m = (1 - part) * here_m + part * next_m - [0, 0, 0.6 * part * (1 - part)]
+            yield CameraPoints(time_ns, (CameraPoint(7, *at_m.tolist()),))
+            time_ns += NS_PER_S // 30
+
+
+def test_one_marker_at_one_place_after_the_other() -> None:
+    camera = hang(4.0, 200)
+    places_m = [one.point_m for one in lay(camera)]
+    lying = find_lying(carried(places_m))
+    assert len(lying) == len(places_m)
+    assert np.abs(np.array([one.point_m for one in lying]) - places_m).max() < 1e-9
+    assert {one.marker_id for one in lying} == {7}
+    assert degrees(align_camera("red", lying).tilt_rad) == pytest.approx(4.0, abs=0.01)
+
+
+def test_a_frame_for_each_place_is_enough_where_there_is_time_between() -> None:
+    places_m = [one.point_m for one in lay(hang(4.0, 200))]
+    frames = [CameraPoints(n * 3 * NS_PER_S, (CameraPoint(7, *p.tolist()),)) for n, p in enumerate(places_m)]
+    assert len(find_lying(frames)) == len(places_m)
+    # A robot that drives by lies nowhere.
+    passing = [CameraPoints(n * NS_PER_S // 10, (CameraPoint(7, 0.1 * n, 0.0, 2.0),)) for n in range(20)]
+    assert find_lying(passing) == []
+
+
+def test_a_measured_height_belongs_to_its_time() -> None:
+    frames = [CameraPoints(n * 3 * NS_PER_S, (CameraPoint(7, 0.3 * n, 0.0, 2.0),)) for n in range(3)]
+    still = Interval(3 * NS_PER_S, 3 * NS_PER_S)
+    other = Measurement(0, "b", marker_id=8, height_m=0.4, still=still)
+    measured = Measurement(3 * NS_PER_S, "a", marker_id=7, height_m=0.15, still=still)
+    assert [one.height_m for one in find_lying(frames, [other, measured])] == [0.0, 0.15, 0.0]

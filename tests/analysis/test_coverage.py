@@ -1,0 +1,87 @@
+"""What of the floor cameras see, against a camera that is a closed form and against every corner."""
+
+from __future__ import annotations
+
+import numpy as np
+import pytest
+from numpy.typing import NDArray
+
+from ipsys_log.analysis.coverage import Hung, cover_floor
+from ipsys_log.geometry.markers import marker_corners
+from ipsys_log.geometry.poses import lay_flat, look_down, transform
+from ipsys_log.messages import CameraCalibration, Floor
+from ipsys_log.simulation.cameras import Camera, hang_cameras, sees
+from ipsys_log.simulation.settings import LabSettings
+
+Array = NDArray[np.float64]
+
+FLOOR = Floor(2.0, 3.0)
+
+
+def pinhole(camera: str, x_m: float, y_m: float, height_m: float = 2.0) -> Hung:
+    """Sees 2.4 m x 1.6 m of the floor from 2 m above it."""
+    K = np.array([[1000.0, 0, 600], [0, 1000, 400], [0, 0, 1]])
+    lens = CameraCalibration(0, camera, 1201, 801, "plumb_bob", np.zeros(5), K)
+    return Hung(camera, lens, look_down(np.array([x_m, y_m, height_m])))
+
+
+@pytest.mark.parametrize(("apart_m", "width_m"), [(1.1, 0.5), (1.4, 0.2), (1.7, -0.1)])
+def test_two_cameras_that_look_straight_down(apart_m: float, width_m: float) -> None:
+    cameras = [pinhole("red", 1.0, 1.5 - apart_m / 2), pinhole("white", 1.0, 1.5 + apart_m / 2)]
+    found = cover_floor(FLOOR, cameras, 0.2, 0.0)
+    (overlap,) = found.overlaps
+    assert overlap.cameras == ("red", "white")
+    assert overlap.width_m == pytest.approx(width_m, abs=0.02)
+    assert overlap.at_m[1] == pytest.approx(1.5, abs=0.02)
+    diagonal_m = 0.2 * np.sqrt(2)
+    assert found.diagonal_m == pytest.approx(diagonal_m)
+    # A strip in the middle; and at both ends of the floor where its last bit is not seen.
+    strip_m = max(0.0, diagonal_m - width_m)
+    middle = [patch for patch in found.broken if abs((patch.low_m + patch.high_m)[1] / 2 - 1.5) < 0.1]
+    assert [patch.area_m2 for patch in middle] == (
+        [pytest.approx(1.8 * strip_m, rel=0.12)] if strip_m else []
+    )
+    unseen_m = max(0.0, -width_m)
+    inner = [patch for patch in found.unseen if abs((patch.low_m + patch.high_m)[1] / 2 - 1.5) < 0.1]
+    assert [patch.area_m2 for patch in inner] == ([pytest.approx(2 * unseen_m, rel=0.12)] if unseen_m else [])
+
+
+def test_higher_markers_are_seen_on_less_of_the_floor() -> None:
+    cameras = [pinhole("red", 1.0, 0.95), pinhole("white", 1.0, 2.05)]
+    widths_m = [cover_floor(FLOOR, cameras, 0.2, height_m).overlaps[0].width_m for height_m in (0.0, 0.2)]
+    assert widths_m == [pytest.approx(0.5, abs=0.02), pytest.approx(0.34, abs=0.02)]
+
+
+def test_only_neighbours_overlap() -> None:
+    cameras = [pinhole(name, 1.0, y_m) for name, y_m in (("a", 0.5), ("b", 1.5), ("c", 2.5))]
+    overlaps = cover_floor(FLOOR, cameras, 0.2, 0.0).overlaps
+    assert [overlap.cameras for overlap in overlaps] == [("a", "b"), ("b", "c")]
+
+
+def whole(camera: Camera, places_m: Array, length_m: float) -> NDArray[np.bool_]:
+    """Whether all corners of a marker are in the picture at each of many headings, corner by corner."""
+    found = np.ones(len(places_m), dtype=bool)
+    for heading_rad in np.linspace(0, np.pi / 2, 16, endpoint=False):
+        corners_m = transform(lay_flat(0, 0, 0, float(heading_rad)), marker_corners(length_m))
+        for corner_m in corners_m:
+            found &= sees(camera, places_m + corner_m)
+    return found
+
+
+def test_a_fisheye_that_is_tilted_against_every_corner_of_a_marker() -> None:
+    lab = LabSettings(cameras=("red",), tilt_deg=(4.0, 6.0), mount_height_m=2.4)
+    (camera,) = hang_cameras(lab)
+    hung = Hung("red", camera.lens, camera.camera_from_world)
+    found = cover_floor(Floor(4.88, 4.88), [hung], 0.2, 0.1)
+    mask = found.whole["red"]
+    step = 5
+    xs_m, ys_m = np.meshgrid(found.xs_m[::step], found.ys_m[::step])
+    places_m = np.column_stack([xs_m.ravel(), ys_m.ravel(), np.full(xs_m.size, 0.1)])
+    sampled = mask[::step, ::step].ravel()
+    # A marker that is larger or smaller by 2 cm bounds what the grid may say.
+    surely, maybe = whole(camera, places_m, 0.22), whole(camera, places_m, 0.18)
+    assert 0.1 < surely.mean() < maybe.mean() < 0.9
+    assert sampled[surely].all()
+    assert not sampled[~maybe].any()
+    seen = sees(camera, places_m * [1, 1, 0])
+    assert sum(patch.area_m2 for patch in found.unseen) == pytest.approx((~seen).mean() * 4.88**2, rel=0.02)

@@ -1,0 +1,59 @@
+"""Cameras joined without a tape, against where they hang."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+
+import numpy as np
+from numpy.typing import NDArray
+
+from ipsys_log.analysis.alignment import align_camera
+from ipsys_log.analysis.coverage import Hung
+from ipsys_log.analysis.joined import join_cameras
+from ipsys_log.analysis.still import Lying
+from ipsys_log.geometry.poses import invert_pose, look_down, make_pose, rotation, transform
+from ipsys_log.messages import CameraCalibration
+
+Array = NDArray[np.float64]
+
+NONE = np.zeros((3, 3))
+LENS = CameraCalibration(0, "any", 1201, 801, "plumb_bob", np.zeros(5), np.diag([1000.0, 1000, 1]))
+# Tilted, at two heights, and the second one turned about the plumb line besides.
+RED = look_down(np.array([0.0, 0.0, 2.0]), np.array([0.03, -0.02, 0.0]))
+WHITE = make_pose(rotation(np.array([0.0, 0.0, 2.5])), np.zeros(3)) @ look_down(
+    np.array([0.3, 1.4, 2.3]), np.array([-0.01, 0.04, 0.0])
+)
+FLOOR_M = {
+    "red": [(-1, -0.6), (1, -0.6), (-1, 0.7), (0.9, 0.7)],
+    "white": [(-1, 0.7), (0.9, 0.7), (-0.8, 2), (1, 2)],
+}
+
+
+def lying(camera: str, pose: Array) -> list[Lying]:
+    places_m = np.array([(*xy, 0.0) for xy in FLOOR_M[camera]])
+    ids = [0, 1, 2, 3] if camera == "red" else [2, 3, 4, 5]
+    return [Lying(n, p, NONE) for n, p in zip(ids, transform(pose, places_m), strict=True)]
+
+
+def joined(red: list[Lying], white: list[Lying]) -> list[Hung]:
+    alignments = [align_camera("red", red), align_camera("white", white)]
+    return join_cameras(alignments, {"red": LENS, "white": LENS})
+
+
+def test_two_markers_that_both_see_are_enough() -> None:
+    red, white = joined(lying("red", RED), lying("white", WHITE))
+    found = red.camera_from_world @ invert_pose(white.camera_from_world)
+    assert np.abs(found - RED @ invert_pose(WHITE)).max() < 1e-6
+    assert np.abs(invert_pose(red.camera_from_world)[2] - invert_pose(RED)[2]).max() < 1e-6
+
+
+def test_markers_that_are_not_the_same_join_nothing() -> None:
+    red, white = lying("red", RED), lying("white", WHITE)
+    assert joined(red, white[1:]) == []
+    later = [replace(one, start_ns=10, end_ns=20) for one in white]
+    assert joined(red, later) == []
+    moved = [
+        replace(one, point_m=one.point_m + np.array([0.2, 0, 0])) if one.marker_id == 2 else one
+        for one in white
+    ]
+    assert joined(red, moved) == []

@@ -1,0 +1,223 @@
+"""Corners and sharpness in rendered pictures, where the truth is known; and which pictures are chosen."""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from functools import cache
+
+import cv2
+import numpy as np
+import pytest
+from numpy.typing import NDArray
+from scipy.ndimage import gaussian_filter
+
+from ipsys_log.calibration.board import Board, parse_board
+from ipsys_log.calibration.board_detection import Sighting, find_board
+from ipsys_log.calibration.board_search import look
+from ipsys_log.calibration.image_selection import MOST_PICTURES, choose
+from ipsys_log.errors import IpsysError
+from tests.calibration.boards_seen import Array, chessboard_pattern, pixels_of, random_pose, render
+
+PINHOLE = (600.0, 600.0, 319.5, 239.5, 0.0, 0.0, 0.0, 0.0, 0.0)
+CHESSBOARD = Board(6, 4, 0.03)
+CHARUCO = Board(5, 4, 0.03, 0.75, "DICT_4X4_50")
+
+
+def straight_rays(pixels: Array) -> Array:
+    rays = np.column_stack([(pixels - PINHOLE[2:4]) / PINHOLE[:2], np.ones(len(pixels))])
+    return np.asarray(rays / np.linalg.norm(rays, axis=1, keepdims=True))
+
+
+def charuco_pattern(board: Board, legacy: bool = False) -> Callable[[Array], Array]:
+    """Grey levels of places on a ChArUco board, as OpenCV prints it, or did before 4.6."""
+    dictionary = cv2.aruco.getPredefinedDictionary(getattr(cv2.aruco, board.dictionary))
+    printed = cv2.aruco.CharucoBoard((board.columns, board.rows), 1.0, board.marker_scale or 0, dictionary)
+    printed.setLegacyPattern(legacy)
+    picture = printed.generateImage((board.columns * 240, board.rows * 240))
+    size = np.array([board.columns, board.rows])
+
+    def levels(places_m: Array) -> Array:
+        squares = places_m / board.square_m + size / 2
+        inside = ((squares >= 0) & (squares < size)).all(axis=1)
+        column, row = np.clip(squares * 240, 0, size * 240 - 1).astype(int).T
+        margin = ((squares >= -0.7) & (squares < size + 0.7)).all(axis=1)
+        return np.where(inside, 40 + picture[row, column] / 255 * 160, np.where(margin, 200.0, 120.0))
+
+    return levels
+
+
+@cache
+def scene(board: Board, seed: int, z_m: float, legacy: bool) -> tuple[NDArray[np.uint8], Array]:
+    """A sharp picture of a board, and its true corners."""
+    rng = np.random.default_rng(seed)
+    turn, place_m = random_pose(rng, "pinhole")
+    place_m = np.array([0.1 * place_m[0], 0.1 * place_m[1], z_m])
+    if board.marker_scale is None:
+        pattern = chessboard_pattern(board.columns, board.rows, board.square_m)
+    else:
+        pattern = charuco_pattern(board, legacy)
+    picture = render(straight_rays, turn, place_m, pattern, (640, 480), rng)
+    corners = board.points_m(np.arange(board.grid[0] * board.grid[1])) @ turn.T + place_m
+    return picture, pixels_of("pinhole", PINHOLE, corners)
+
+
+def drawn(
+    board: Board, seed: int, blur_px: float, gamma: float = 1.0, z_m: float = 0.42, legacy: bool = False
+) -> tuple[NDArray[np.uint8], Array]:
+    """A picture of a board as a camera takes it, and its true corners."""
+    picture, truth = scene(board, seed, z_m, legacy)
+    light = gaussian_filter(picture.astype(float), blur_px)
+    return np.round(255 * (light / 255) ** (1 / gamma)).astype(np.uint8), truth
+
+
+@pytest.mark.parametrize("board", [CHESSBOARD, CHARUCO], ids=["chessboard", "charuco"])
+@pytest.mark.parametrize("gamma", [1.0, 2.2])
+def test_corners_are_where_they_are(board: Board, gamma: float) -> None:
+    """Squares of 26 px; OpenCV's own corners are off by 0.07 to 0.08 px here."""
+    errors = []
+    for seed in range(3):
+        picture, truth = drawn(board, seed, blur_px=0.7, gamma=gamma, z_m=0.7)
+        sighting = find_board("a", picture, board, thorough=True)
+        assert sighting is not None
+        # A chessboard of even and even corners looks the same upside down.
+        turned = [truth[sighting.ids], truth[::-1][sighting.ids]]
+        distances = [np.linalg.norm(sighting.pixels - corners, axis=1) for corners in turned]
+        errors.append(min(distances, key=lambda each: float(np.median(each))))
+    rms_px = np.sqrt((np.concatenate(errors) ** 2).mean())
+    assert rms_px < 0.055
+    assert np.concatenate(errors).max() < 0.15
+
+
+@pytest.mark.parametrize("board", [CHESSBOARD, CHARUCO], ids=["chessboard", "charuco"])
+def test_the_blur_of_a_picture_is_measured(board: Board) -> None:
+    widths = []
+    for blur_px in (0.7, 1.5):
+        sighting = find_board("a", drawn(board, 1, blur_px)[0], board, thorough=True)
+        assert sighting is not None
+        widths.append(sighting.blur_px)
+    # The pixel itself is 0.29 px wide.
+    assert widths[0] == pytest.approx(np.hypot(0.7, 0.29), abs=0.2)
+    assert widths[1] == pytest.approx(np.hypot(1.5, 0.29), abs=0.4)
+
+
+def test_a_blur_in_one_direction_is_a_blur() -> None:
+    picture, _ = drawn(CHESSBOARD, 1, 0.7)
+    moved = cv2.blur(picture, (9, 1))
+    sighting = find_board("a", np.asarray(moved, dtype=np.uint8), CHESSBOARD, thorough=True)
+    assert sighting is not None
+    assert sighting.blur_px > 2.0
+
+
+def test_an_inverted_board() -> None:
+    picture, _ = drawn(CHARUCO, 2, 0.7)
+    negative = np.asarray(255 - picture, dtype=np.uint8)
+    assert find_board("a", negative, CHARUCO, thorough=False) is None
+    inverted = parse_board("charuco:5x4", 0.03, 0.75, "DICT_4X4_50", True)
+    sighting = find_board("a", negative, inverted, thorough=False)
+    assert sighting is not None
+    assert len(sighting.ids) == 12
+
+
+def test_a_large_picture_is_searched_at_half_its_size_and_refined_at_its_own() -> None:
+    picture, truth = drawn(CHESSBOARD, 1, 0.7)
+    large = np.asarray(cv2.resize(picture, None, fx=3, fy=3, interpolation=cv2.INTER_CUBIC), dtype=np.uint8)
+    sighting = find_board("a", large, CHESSBOARD, thorough=False)
+    assert sighting is not None
+    off = [np.linalg.norm(sighting.pixels - (3 * corners + 1), axis=1) for corners in (truth, truth[::-1])]
+    assert min(float(each.max()) for each in off) < 0.3
+
+
+def test_a_board_as_opencv_printed_it_before_4_6() -> None:
+    """Of an even number of rows, it begins with a white square."""
+    picture, truth = drawn(CHARUCO, 2, 0.7, legacy=True)
+    assert (picture != drawn(CHARUCO, 2, 0.7)[0]).mean() > 0.1
+    sighting = find_board("a", picture, CHARUCO, thorough=False)
+    assert sighting is not None
+    assert len(sighting.ids) == 12
+    assert np.abs(sighting.pixels - truth[sighting.ids]).max() < 0.15
+
+
+def test_mirrored_pictures_are_said_to_be() -> None:
+    """Markers are not found in a mirror. A chessboard is, and looks as it always does."""
+    pictures = [np.ascontiguousarray(drawn(CHARUCO, seed, 0.7)[0][:, ::-1]) for seed in range(2)]
+    said = "it is seen mirrored in 2 of 2 tried"
+    with pytest.raises(IpsysError, match=said):
+        look([("a", pictures[0]), ("b", pictures[1])], CHARUCO, 2, "red")
+
+
+def test_pictures_of_the_same_name_of_which_one_has_another_size() -> None:
+    """Two folders of one camera may have pictures of one name."""
+    grey = drawn(CHARUCO, 0, 0.7)[0]
+    small = np.ascontiguousarray(grey[100:, 100:])
+    looked = look([("a", grey), ("a", small), ("a", grey), ("a", grey)], CHARUCO, 4, "red")
+    assert len(looked.sightings) == 3
+    assert looked.unreadable == (("a", "is 540 x 380 px, most are 640 x 480"),)
+
+
+def sighting(name: str, x: float, y: float, blur_px: float = 0.8, count: int = 24) -> Sighting:
+    """A board of 100 x 60 px with its upper left corner at x, y."""
+    ids = np.arange(count)
+    pixels = CHESSBOARD.places(ids) * 20 + (x, y)
+    outline = np.array([[0.0, 0], [100, 0], [100, 60], [0, 60]]) + np.array([x, y])
+    return Sighting(name, ids, pixels, blur_px, outline)
+
+
+def test_blurred_pictures_and_those_with_few_corners_are_dropped_with_the_reason() -> None:
+    seen = [sighting(str(n), 30 * n, 10) for n in range(10)]
+    seen += [sighting("shaken", 100, 200, blur_px=3.5), sighting("half", 200, 200, count=4)]
+    seen += [sighting("row", 300, 200, count=6)]
+    chosen = choose(seen, CHESSBOARD, (640, 480))
+    assert len(chosen.used) == 10
+    reasons = dict(chosen.bad)
+    assert reasons["shaken"] == "blurred: edges are 3.5 px wide, in the sharp pictures 0.8"
+    assert reasons["half"] == "only 4 corners are seen"
+    assert reasons["row"] == "its corners lie on one line"
+
+
+def test_of_hundreds_of_frames_some_dozens_that_differ_are_chosen() -> None:
+    """A board that lies still for most of a video, and then goes all over the image."""
+    still = [sighting(f"still {n}", 300, 200) for n in range(200)]
+    moving = [sighting(f"{x} {y}", x, y) for x in range(0, 540, 20) for y in range(0, 420, 20)]
+    chosen = choose([*still, *moving], CHESSBOARD, (640, 480))
+    assert len(chosen.used) == MOST_PICTURES
+    assert sum(s.name.startswith("still") for s in chosen.used) <= 1
+    corners = np.concatenate([s.pixels for s in chosen.used])
+    assert corners.min(axis=0).tolist() == [0, 0]
+    assert corners.max(axis=0).tolist() == [620, 460]
+    assert "nearly as" in chosen.spare[0].reason
+
+
+def test_of_two_that_show_the_same_the_sharp_one_is_chosen() -> None:
+    seen = [sighting(f"{x}", x, 10, blur_px=0.8 + (x % 2)) for x in range(400)]
+    chosen = choose(seen, CHESSBOARD, (640, 480))
+    assert np.mean([s.blur_px < 1 for s in chosen.used]) > 0.9
+
+
+@pytest.mark.parametrize(
+    ("text", "said"),
+    [
+        ("6", "write the inner corners of a chessboard as 6x4"),
+        ("charuco:5", "charuco:4x5"),
+        ("2x9", "3 to 100 inner corners"),
+        ("charuco:50x50", "has 50 markers, the board 1250"),
+    ],
+)
+def test_boards_that_cannot_be(text: str, said: str) -> None:
+    with pytest.raises(IpsysError, match=said):
+        parse_board(text, 0.03, 0.75, "DICT_4X4_50", False)
+
+
+def test_a_chessboard_that_was_taken_for_a_charuco_board_is_named_while_others_are_tried() -> None:
+    pictures = [(f"{seed}", drawn(CHESSBOARD, seed, 1.0)[0]) for seed in range(3)]
+    tried: list[tuple[int, int]] = []
+    with pytest.raises(IpsysError, match="but a chessboard of 6 x 4 inner corners is seen in 3 of 3 tried"):
+        look(
+            pictures,
+            Board(7, 5, 0.03, 0.75),
+            3,
+            "red",
+            trying=lambda done, total: tried.append((done, total)),
+        )
+    assert tried[0][0] == 0
+    assert len(tried) > 3
+    assert {total for _, total in tried} == {tried[0][1]}

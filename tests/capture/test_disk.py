@@ -1,0 +1,153 @@
+"""How large a recording gets, and how long the disk lasts: said before it begins, and while it goes on."""
+
+from __future__ import annotations
+
+import math
+import re
+import shutil
+from collections import namedtuple
+from collections.abc import Iterator
+from contextlib import contextmanager
+from pathlib import Path
+
+import pytest
+
+from ipsys_log.capture.camera_thread import CameraState
+from ipsys_log.capture.disk import DiskRoom, expected_bytes_per_s, free_room
+from ipsys_log.capture.status import Monitor
+from ipsys_log.cli.open_cameras import opened, prepared
+from ipsys_log.log.dataset import Session
+from ipsys_log.messages import Rig, RigCamera
+from ipsys_log.report.cameras import LiveStatus
+from tests.conftest import Ipsys, small_disk
+
+RIG = Rig("lab", "DICT_4X4_100", 0.2)
+Usage = namedtuple("Usage", "total used free")
+
+
+def rig_that_plays(lab: Path, more: str = "") -> Path:
+    path = lab.parent / "lab.toml"
+    text = 'name = "lab"\ndictionary = "DICT_4X4_100"\nmarker_length_m = 0.2\n'
+    for name in ("red", "white"):
+        text += (
+            f'[[cameras]]\nname = "{name}"\nsource = "file:{lab}?{name}"\ncalibration = "{lab.name}"\n{more}'
+        )
+    path.write_text(text)
+    return path
+
+
+def status_line(status: LiveStatus) -> tuple[str, str]:
+    """The last line that is shown while recording, and its style."""
+    text = status.show().renderables[-1]
+    return str(text), str(text.style)  # type: ignore[union-attr]
+
+
+@contextmanager
+def opening(rig: Path, log: Path, seconds: float | None, doing: str | None = None) -> Iterator[LiveStatus]:
+    """The cameras opened as a command opens them; nothing is written."""
+    with opened(prepared(rig, None, None), log, seconds, doing) as (cameras, _, status):
+        yield status
+        cameras.stop()
+        log.touch()
+
+
+def first_bytes(lab: Path) -> int:
+    """Of the first frames of both cameras together."""
+    with Session([lab]) as session:
+        return sum(len(session.payloads([session.images[name]])[0].data) for name in ("red", "white"))
+
+
+@pytest.mark.parametrize("command", [("record",), ("record", "--detect")])
+def test_room_is_said_before_the_recording_begins(
+    ipsys: Ipsys, lab: Path, tmp_path: Path, command: tuple[str, ...]
+) -> None:
+    rig = rig_that_plays(lab, "rate_hz = 5\n")
+    done = ipsys(*command, "--rig", rig, "-o", tmp_path / "a.mcap", "--seconds", "2")
+    assert done.code == 0, done.err
+    said = re.search(r"about ([\d.]+) MB in 2 s; [\d.]+ [GT]B free in \S+: enough for", done.err)
+    assert said is not None, done.err
+    assert said.start() < done.err.index("recording into")
+    assert math.isclose(float(said[1]) * 1e6, 2 * 5 * first_bytes(lab), abs_tol=0.06e6)
+
+
+def test_measuring_says_what_a_place_takes(
+    capsys: pytest.CaptureFixture[str], lab: Path, tmp_path: Path
+) -> None:
+    """No rate: what is not measured is not kept."""
+    with opening(rig_that_plays(lab), tmp_path / "a.mcap", None, "measuring") as status:
+        line, _ = status_line(status)
+    assert line.endswith("left on the disk")
+    said = re.search(r"about ([\d.]+) MB for each point; [\d.]+ [GT]B free in", capsys.readouterr().err)
+    assert said is not None
+    assert math.isclose(float(said[1]) * 1e6, 1.5 * 30 * first_bytes(lab), abs_tol=0.06e6)
+
+
+def test_small_disk_is_warned_of_before_the_start(
+    capsys: pytest.CaptureFixture[str], lab: Path, tmp_path: Path
+) -> None:
+    """On a disk of its own: 20 MB, of which half is set aside for the end of the log."""
+    rig = rig_that_plays(lab, "rate_hz = 30\n")
+    with small_disk(tmp_path / "disk", 20) as disk:
+        with opening(rig, disk / "a.mcap", None):
+            said = capsys.readouterr().err
+        assert re.search(rf"a minute; 10.5 MB free in {disk}: full after 2 s", said)
+        assert "to make it smaller: a lower rate_hz in lab.toml (15 halves it)" in said
+        with opening(rig, disk / "b.mcap", 1.0):
+            assert re.search(r"MB in 1 s; .*: enough for 2 s", capsys.readouterr().err)
+        # Cameras that are only looked at: nothing is said, but where even that does not fit.
+        with opening(rig, disk / "c.mcap", 1.0, "looking for 1 s"):
+            assert "free in" not in capsys.readouterr().err
+        with opening(rig, disk / "d.mcap", 60.0, "looking for 60 s"):
+            assert "full after 2 s" in capsys.readouterr().err
+
+
+def test_line_on_the_screen_is_corrected_by_what_came(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """Expected were 10 MB/s; measured are 2 MB/s: the same disk lasts five times as long."""
+    log = tmp_path / "a.mcap"
+    log.write_bytes(bytes(20_000_000))
+    monkeypatch.setattr(shutil, "disk_usage", lambda _: Usage(10**12, 0, 6_000_000_000))
+    now_s = [0.0]
+    with Monitor(RIG) as monitor:
+        status = LiveStatus({}, monitor, log, lambda: now_s[0], 10e6)
+        now_s[0] = 1.0
+        assert status_line(status) == ("1 s, 20.0 MB; 6.0 GB left on the disk: 10 minutes", "")
+        now_s[0] = 10.0
+        assert status_line(status) == ("10 s, 20.0 MB; 6.0 GB left on the disk: 50 minutes", "")
+        monkeypatch.setattr(shutil, "disk_usage", lambda _: Usage(10**12, 0, 600_000_000))
+        line, style = status_line(status)
+        assert line.endswith("600.0 MB left on the disk: 5 minutes")
+        assert "red" in style
+
+
+def test_expected_rate_is_that_of_the_rig_and_the_first_frames() -> None:
+    cameras = [RigCamera("red", rate_hz=15.0), RigCamera("white"), RigCamera("gate", rate_hz=30.0)]
+    states = {
+        "red": CameraState(frames=2, bytes=200_000, format="jpeg", size_px=(1280, 720)),
+        "white": CameraState(frames=1, bytes=50_000, format="jpeg", size_px=(640, 480)),
+        # A first frame of a video is a keyframe, which says little.
+        "gate": CameraState(frames=1, bytes=400_000, format="h264", size_px=(1920, 1080)),
+    }
+    video = expected_bytes_per_s(cameras[2:], states)
+    assert 4e6 / 8 < video < 10e6 / 8
+    assert expected_bytes_per_s(cameras, states) == 15 * 100_000 + 30 * 50_000 + video
+
+
+def test_advice_only_where_a_recording_is_large_or_the_disk_small(tmp_path: Path) -> None:
+    cameras = [RigCamera("red", rate_hz=30.0)]
+    jpeg, video = (CameraState(1, 1, format=name) for name in ("jpeg", "h264"))
+    assert DiskRoom(tmp_path, 10**12, 1e6).advise(cameras, {"red": jpeg}) is None
+    advice = DiskRoom(tmp_path, 10**12, 25e6).advise(cameras, {"red": jpeg})
+    assert advice is not None
+    assert "JPEG quality or H.264" in advice
+    assert "ipsys measure" in advice
+    short = DiskRoom(tmp_path, 10**8, 1e6).advise(cameras, {"red": video})
+    assert short is not None
+    assert "JPEG" not in short
+
+
+def test_room_leaves_out_what_is_set_aside(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(shutil, "disk_usage", lambda _: Usage(10**12, 0, 10**9))
+    assert free_room(tmp_path / "a.mcap", 1.0).free_bytes == 10**9 - (64 << 20)
+    assert free_room(tmp_path / "a.mcap", 0.0).lasts_s is None

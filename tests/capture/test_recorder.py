@@ -1,0 +1,236 @@
+"""Frames in the log before anything else, and what waits for the stages."""
+
+from __future__ import annotations
+
+import errno
+import threading
+import time
+from collections.abc import Generator, Iterator
+from itertools import pairwise
+from pathlib import Path
+
+import pytest
+
+from ipsys_log.capture.backlog import TICK, Backlog
+from ipsys_log.capture.recorder import Recording, recording, written
+from ipsys_log.errors import IpsysError, LogError
+from ipsys_log.log.dataset import Session
+from ipsys_log.log.repair import repair
+from ipsys_log.log.storage import Disk
+from ipsys_log.log.writer import LogWriter
+from ipsys_log.messages import (
+    FRAME_SKIPPED,
+    MEASUREMENTS_TOPIC,
+    RIG_TOPIC,
+    CompressedImage,
+    Event,
+    Measurement,
+    Message,
+    Model,
+    Rig,
+    image_topic,
+)
+
+
+def frame(number: int, camera: str = "red") -> Message:
+    image = CompressedImage(number, camera, b"%d" % number, "jpeg")
+    return Message(image_topic(camera), 1000 + number, number, image, camera)
+
+
+class Noted(Recording):
+    """Notes what is put into it."""
+
+    def __init__(self, writer: LogWriter) -> None:
+        super().__init__(writer, lambda: None)
+        self.noted: list[Message] = []
+
+    def put(self, message: Message) -> None:
+        super().put(message)
+        self.noted.append(message)
+
+
+@pytest.fixture
+def log(tmp_path: Path) -> Iterator[Noted]:
+    with LogWriter.create(tmp_path / "a.mcap") as writer:
+        yield Noted(writer)
+
+
+class Sent:
+    """What cameras send, from a generator; notes why they were stopped."""
+
+    def __init__(self, messages: Generator[Message | None, None, None]) -> None:
+        self._messages, self.whys = messages, list[str | None]()
+        self.confirmed: list[tuple[Message, OSError | None]] = []
+        self.warned: list[tuple[str, str]] = []
+
+    def __iter__(self) -> Generator[Message | None, None, None]:
+        return self._messages
+
+    def stop(self, why: str | None = None) -> None:
+        self.whys.append(why)
+
+    def confirm(self, message: Message, fault: OSError | None) -> None:
+        self.confirmed.append((message, fault))
+
+    def warn(self, kind: str, text: str) -> None:
+        self.warned.append((kind, text))
+
+
+def backlog(source: Generator[Message | None, None, None], log: Recording) -> Backlog:
+    return Backlog(Sent(source), log, lambda: 10_000)
+
+
+def test_a_frame_is_in_the_log_before_a_stage_sees_it_and_a_tick_follows(log: Noted) -> None:
+    def source() -> Generator[Message | None, None, None]:
+        for number in range(3):
+            time.sleep(0.05)
+            yield frame(number)
+            yield None
+
+    seen = []
+    with backlog(source(), log) as frames:
+        for message in frames:
+            assert message is TICK or message in log.noted
+            seen.append(message)
+    assert [message is TICK for message in seen] == [False, True] * 3
+
+
+def test_the_oldest_frames_are_skipped_and_named_by_their_log_times(log: Noted) -> None:
+    def source() -> Generator[Message | None, None, None]:
+        yield from (frame(number) for number in range(10))
+        yield from (frame(number, "white") for number in range(10, 12))
+
+    with backlog(source(), log) as frames:
+        time.sleep(0.2)
+        seen = [message for message in frames if message is not TICK]
+    assert [message.payload.timestamp for message in seen] == [7, 8, 9, 10, 11]
+    events = [m.payload for m in log.noted if isinstance(m.payload, Event)]
+    assert {event.kind for event in events} == {FRAME_SKIPPED}
+    assert [event.timestamp for event in events] == [1000 + n for n in range(7)]
+    assert len([m for m in log.noted if isinstance(m.payload, CompressedImage)]) == 12
+
+
+def test_a_fault_of_the_recorder_is_raised_where_frames_are_taken(log: Noted) -> None:
+    def source() -> Generator[Message | None, None, None]:
+        yield frame(0)
+        raise ZeroDivisionError("a bug")
+
+    with pytest.raises(ZeroDivisionError), backlog(source(), log) as frames:
+        assert [message for message in frames if message is not TICK] == [frame(0)]
+
+
+def test_settings_are_in_the_file_before_the_first_frame(tmp_path: Path) -> None:
+    """As a recorder leaves them that is killed at once: rig, lens and the model of a live run."""
+    path, killed = tmp_path / "a.mcap", tmp_path / "killed.mcap"
+    rig = Rig("lab", "DICT_4X4_100", 0.2)
+    settings = [Message(RIG_TOPIC, 1, 1, rig), Message("/runs/poly/model", 2, 2, Model(2, "poly", ()))]
+    with recording(path, settings) as log:
+        killed.write_bytes(path.read_bytes())
+        log.put(frame(0))
+    repair(killed)
+    with Session([killed]) as session:
+        assert session.payloads([RIG_TOPIC]) == [rig]
+        assert session.count("/runs/poly/model") == 1
+
+
+class FullDisk(Disk):
+    """Takes 100 kB, and more when something is freed."""
+
+    freed = threading.Event()
+
+    def pwrite(self, fd: int, data: bytes | memoryview, offset: int) -> int:
+        if offset + len(data) > 100_000 and not self.freed.is_set():
+            raise OSError(errno.ENOSPC, "No space left on device")
+        return Disk.pwrite(self, fd, data, offset)
+
+
+def test_on_a_full_disk_what_waits_is_written_but_for_frames_and_nothing_more_is_taken(
+    tmp_path: Path,
+) -> None:
+    disk, path = FullDisk(), tmp_path / "a.mcap"
+
+    def source() -> Generator[Message | None, None, None]:
+        for number in range(200):
+            big = CompressedImage(number, "red", bytes(30_000), "jpeg")
+            yield Message(image_topic("red"), number * 10**8, number, big, "red")
+            place = Measurement(number, f"p{number}")
+            yield Message(MEASUREMENTS_TOPIC, number * 10**8 + 1, number, place)
+
+    sent = Sent(source())
+    with LogWriter.create(path, storage=disk) as writer:
+        log, sizes = Recording(writer, disk.freed.set), [0]
+        for message in written(sent, log):
+            if message is not None and isinstance(message.payload, Measurement):
+                sizes.append(path.stat().st_size)
+    with Session([path]) as session:
+        assert len(session.payloads([MEASUREMENTS_TOPIC])) == 200
+        assert 2 <= session.count(image_topic("red")) <= 4
+    assert all(one < other for one, other in pairwise(sizes)), "a measurement is not on the disk at once"
+    assert set(sent.whys) == {"the disk is full"}
+
+
+def test_a_log_that_is_being_written_is_not_overwritten(tmp_path: Path) -> None:
+    path = tmp_path / "a.mcap"
+    with recording(path) as first:
+        first.put(frame(0))
+        with pytest.raises(LogError), recording(path, overwrite=True):
+            pass
+        first.put(frame(1))
+    with recording(path, overwrite=True) as second:
+        second.put(frame(2))
+    assert second.counts == {image_topic("red"): 1}
+
+
+def test_the_old_log_is_there_until_the_new_one_stands(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    path = tmp_path / "a.mcap"
+    with recording(path) as first:
+        first.put(frame(0))
+    old = path.read_bytes()
+
+    def broken(self: LogWriter, path: Path) -> None:
+        raise PermissionError(errno.EPERM, "Operation not permitted")
+
+    with monkeypatch.context() as patch:
+        patch.setattr(LogWriter, "move", broken)
+        with pytest.raises(IpsysError, match="Operation not permitted"), recording(path, overwrite=True):
+            pass
+    assert (path.read_bytes(), list(tmp_path.iterdir())) == (old, [path])
+    (tmp_path / "a.mcap.new").write_bytes(b"left by one that was killed")
+    with recording(path, overwrite=True) as second:
+        second.put(frame(1))
+        # Nobody else makes a log there meanwhile, nor is there an instant without one.
+        with pytest.raises(LogError, match="another process"), recording(path, overwrite=True):
+            pass
+    with Session([path]) as session:
+        assert [one.timestamp for one in session.payloads([image_topic("red")])] == [1]
+    assert list(tmp_path.iterdir()) == [path]
+
+
+@pytest.mark.parametrize("whole", [True, False])
+def test_a_journal_that_was_left_over_does_not_outlive_its_log(tmp_path: Path, whole: bool) -> None:
+    path, journal = tmp_path / "a.mcap", tmp_path / "a.mcap.journal"
+    with recording(path) as first:
+        first.put(frame(0))
+    if whole:
+        writer = LogWriter.append(path, storage=Killed())
+        writer.add_channel("/a", None, "json")
+        writer.write("/a", 1, 1, b"{}")
+        with pytest.raises(KeyboardInterrupt):
+            writer.close()
+        assert journal.stat().st_size > 100
+    else:
+        journal.write_bytes(b"torn")
+    with recording(path, overwrite=True) as second:
+        second.put(frame(1))
+    with Session([path]) as session:
+        assert [one.timestamp for one in session.payloads([image_topic("red")])] == [1]
+    assert not journal.exists()
+
+
+class Killed(Disk):
+    """Is killed when a journal stands."""
+
+    def truncate(self, fd: int, size: int) -> None:  # noqa: ARG002
+        raise KeyboardInterrupt

@@ -1,0 +1,174 @@
+"""What is recorded gets onto the disk every few seconds, and nothing waits for that but a measured point."""
+
+from __future__ import annotations
+
+import errno
+import threading
+from collections.abc import Generator
+from concurrent.futures import ThreadPoolExecutor
+from pathlib import Path
+from typing import Any, cast
+
+import pytest
+
+from ipsys_log.capture.frames import Clock, SourceError
+from ipsys_log.capture.multiplexer import Attached
+from ipsys_log.capture.recorder import Recording, recording, written
+from ipsys_log.capture.syncer import SYNC_EVERY_S, Syncer
+from ipsys_log.errors import IpsysError
+from ipsys_log.log.dataset import Session
+from ipsys_log.log.storage import DISK, Storage
+from ipsys_log.log.writer import LogWriter
+from ipsys_log.messages import MEASUREMENTS_TOPIC, Measurement, Message, image_topic
+from tests.capture.test_recorder import Sent, frame
+from tests.playing import cameras, playing
+
+LIMIT_S = 240.0
+
+
+class Slow:
+    """A disk on which a sync takes until it is let through, and then fails if there is an error."""
+
+    def __init__(self, error: int | None = None) -> None:
+        self.syncing, self.let_through = threading.Event(), threading.Event()
+        self.error = error
+        if error is not None:
+            self.let_through.set()
+
+    def __getattr__(self, name: str) -> Any:
+        return getattr(DISK, name)
+
+    def fsync(self, fd: int) -> None:
+        self.syncing.set()
+        assert self.let_through.wait(LIMIT_S)
+        if self.error is not None:
+            raise OSError(self.error, "Input/output error")
+        DISK.fsync(fd)
+
+
+def on(disk: Slow, path: Path) -> LogWriter:
+    return LogWriter.create(path, storage=cast(Storage, disk))
+
+
+def place(number: int) -> Message:
+    return Message(MEASUREMENTS_TOPIC, 1000 + number, number, Measurement(number, f"p{number}"))
+
+
+def test_slow_sync_holds_up_no_frame_and_no_order(tmp_path: Path) -> None:
+    disk, path = Slow(), tmp_path / "a.mcap"
+
+    def source() -> Generator[Message | None, None, None]:
+        yield place(0)
+        assert disk.syncing.wait(LIMIT_S)
+        for number in range(1, 301):
+            yield frame(number)
+        yield None  # nothing comes: all is flushed
+        size = path.stat().st_size
+        yield frame(301)
+        assert size > 300 * 60, "frames wait for the disk"
+        assert sent.confirmed == []
+        disk.let_through.set()
+
+    sent = Sent(source())
+    with on(disk, path) as writer:
+        log = Recording(writer, lambda: None)
+        with log.syncer:
+            for _ in written(sent, log):
+                pass
+    assert [(message.payload.id, fault) for message, fault in sent.confirmed] == [("p0", None)]
+    with Session([path]) as session:
+        frames = session.payloads([image_topic("red")])
+    assert [int(one.data) for one in frames] == list(range(1, 302))
+
+
+def test_recording_is_synced_without_being_asked() -> None:
+    assert SYNC_EVERY_S <= 5
+    synced = threading.Semaphore(0)
+    with Syncer(synced.release, every_s=0.001):
+        for _ in range(5):
+            assert synced.acquire(timeout=LIMIT_S)
+
+
+def test_recording_syncs_while_it_is_open(tmp_path: Path) -> None:
+    synced = threading.Event()
+    with recording(tmp_path / "a.mcap") as log:
+        log.sync(lambda fault: synced.set() if fault is None else None)
+        assert synced.wait(LIMIT_S)
+
+
+def test_point_is_saved_when_it_is_on_the_disk(tmp_path: Path) -> None:
+    disk = Slow()
+    attached = Attached(cameras("red"), playing({"red": [b"a"] * 2000}, 100.0), Clock())
+    with on(disk, tmp_path / "a.mcap") as writer, ThreadPoolExecutor(1) as page:
+        log = Recording(writer, lambda: None)
+        with attached, log.syncer:
+            saved = page.submit(attached.save, MEASUREMENTS_TOPIC, Measurement(5, "p001"))
+            after = 0
+            for message in written(attached, log):
+                after += disk.syncing.is_set() and message is not None
+                if after == 10:
+                    assert not saved.done(), "written, but not on the disk"
+                    disk.let_through.set()
+                    saved.result(LIMIT_S)
+                    attached.stop()
+    assert after >= 10
+
+
+def test_point_that_comes_last_is_confirmed_at_the_end(tmp_path: Path) -> None:
+    attached = Attached(cameras("red"), playing({"red": [b"a"] * 2000}, 100.0), Clock())
+    disk = Slow()
+    with on(disk, tmp_path / "a.mcap") as writer, ThreadPoolExecutor(1) as page:
+        log = Recording(writer, lambda: None)
+        with attached, log.syncer:
+            saved = page.submit(attached.save, MEASUREMENTS_TOPIC, Measurement(5, "p001"))
+            for message in written(attached, log):
+                if message is not None and message.topic == MEASUREMENTS_TOPIC:
+                    attached.stop()
+            assert not saved.done()
+            disk.let_through.set()
+        saved.result(LIMIT_S)
+
+
+def test_fault_of_a_sync_is_said_once_and_at_the_end(tmp_path: Path) -> None:
+    disk, path = Slow(errno.EIO), tmp_path / "a.mcap"
+
+    def source() -> Generator[Message | None, None, None]:
+        yield place(0)
+        assert confirmed.wait(LIMIT_S)
+        for number in range(1, 20):
+            yield place(number)
+
+    class Confirmed(Sent):
+        def confirm(self, message: Message, fault: OSError | None) -> None:
+            super().confirm(message, fault)
+            confirmed.set()
+
+    confirmed = threading.Event()
+    sent = Confirmed(source())
+    with on(disk, path) as writer:
+        log = Recording(writer, lambda: None)
+        with log.syncer:
+            for _ in written(sent, log):
+                pass
+        disk.error = None
+    assert [kind for kind, _ in sent.warned] == ["disk_fault"]
+    assert "the disk has failed (Input/output error)" in sent.warned[0][1]
+    assert sent.confirmed[0][1] is not None
+    with pytest.raises(IpsysError, match=r"Input/output error.*may be lost.*ipsys repair") as caught:
+        log.check_disk()
+    assert "space" not in str(caught.value)
+
+
+def test_point_on_a_failing_disk_is_not_called_saved(tmp_path: Path) -> None:
+    disk = Slow(errno.EIO)
+    attached = Attached(cameras("red"), playing({"red": [b"a"] * 2000}, 100.0), Clock())
+    with on(disk, tmp_path / "a.mcap") as writer, ThreadPoolExecutor(1) as page:
+        log = Recording(writer, lambda: None)
+        with attached, log.syncer:
+            saved = page.submit(attached.save, MEASUREMENTS_TOPIC, Measurement(5, "p001"))
+            saved.add_done_callback(lambda _: attached.stop())
+            for _ in written(attached, log):
+                pass
+        disk.error = None
+        with pytest.raises(SourceError, match=r"maybe not saved: the disk has failed \(Input/output error\)"):
+            saved.result(LIMIT_S)

@@ -1,0 +1,234 @@
+"""Cameras on USB: no camera is needed, :mod:`tests.capture.camera_driver` answers for the kernel."""
+
+from __future__ import annotations
+
+import errno
+import sys
+import time
+from itertools import islice
+from pathlib import Path
+
+import av
+import cv2
+import numpy as np
+import pytest
+import simplejpeg
+from numpy.typing import NDArray
+
+from ipsys_log.capture import opencv_camera, v4l2, v4l2_camera
+from ipsys_log.capture.frames import Clock, Frame, SourceError
+from ipsys_log.capture.usb import open_usb
+from ipsys_log.messages import RigCamera
+from tests.capture.camera_driver import Driver
+
+pytestmark = pytest.mark.skipif(sys.platform != "linux", reason="Video for Linux")
+
+
+@pytest.fixture
+def driver(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Driver:
+    driver = Driver(tmp_path / "video0")
+    monkeypatch.setattr(v4l2, "ioctl", driver)
+    return driver
+
+
+def ask(driver: Driver, **asked: float | str | None) -> RigCamera:
+    return RigCamera("red", source=f"usb:{driver.path}", **asked)  # type: ignore[arg-type]
+
+
+def test_requests_are_those_of_the_kernel() -> None:
+    """As a C program prints them that includes linux/videodev2.h, on 64 bits."""
+    numbers = {
+        "QUERYCAP": 0x80685600, "ENUM_FMT": 0xC0405602, "S_FMT": 0xC0D05605, "REQBUFS": 0xC0145608,
+        "QUERYBUF": 0xC0585609, "QBUF": 0xC058560F, "DQBUF": 0xC0585611, "STREAMON": 0x40045612,
+        "STREAMOFF": 0x40045613, "G_PARM": 0xC0CC5615, "S_PARM": 0xC0CC5616, "G_CTRL": 0xC008561B,
+        "S_CTRL": 0xC008561C, "ENUM_FRAMESIZES": 0xC02C564A, "ENUM_FRAMEINTERVALS": 0xC034564B,
+    }  # fmt: skip
+    assert {name: getattr(v4l2, name) for name in numbers} == numbers
+    buffer = v4l2.Buffer
+    assert (buffer.seconds.offset, buffer.offset.offset, buffer.length.offset) == (24, 64, 72)
+    assert v4l2.Format.width.offset == 8
+
+
+def test_frames_are_the_cameras_bytes_with_the_drivers_stamps(driver: Driver) -> None:
+    # More than there are buffers, so that each is handed back; an empty frame is none.
+    pictures = [bytes([n]) * (1000 + n) for n in range(20)]
+    driver.frames.extend([*pictures[:3], b"", *pictures[3:]])
+    clock = Clock()
+    said: list[str] = []
+    with open_usb(ask(driver, width=1920, height=1080, rate_hz=30.0), clock, said.append) as frames:
+        came = list(islice((frame for frame in frames if frame), 20))
+    del driver.stamps_ns[3]
+    expected = [clock.of_monotonic_ns(stamp // 1000 * 1000) for stamp in driver.stamps_ns]
+    assert [frame[:3] for frame in came] == [
+        (data, "jpeg", time) for data, time in zip(pictures, expected, strict=True)
+    ]
+    assert [n for n, frame in enumerate(came) if frame.missed] == [3]  # that with the empty one before it
+    assert not driver.streaming
+    assert said == ['camera red: the driver stamps the start of a frame; put into the rig: stamp = "start"']
+
+
+@pytest.mark.parametrize(
+    ("numbers", "missed"),
+    [
+        ((0, 1, 2, 3), (0, 0, 0, 0)),
+        ((7, 8, 11, 12), (0, 0, 2, 0)),
+        ((2**32 - 2, 2**32 - 1, 1, 2), (0, 0, 1, 0)),
+        ((0, 0, 0, 0), (0, 0, 0, 0)),  # it does not count
+        ((500, 501, 0, 1), (0, 0, 0, 0)),  # it counts anew
+    ],
+)
+def test_frames_that_the_driver_lost_are_told(
+    driver: Driver, numbers: tuple[int, ...], missed: tuple[int, ...]
+) -> None:
+    driver.frames.extend([b"x"] * 4)
+    driver.numbers = iter(numbers)
+    with open_usb(ask(driver), Clock(), lambda _: None) as frames:
+        assert tuple(frame.missed for frame in islice((one for one in frames if one), 4)) == missed
+
+
+def test_while_nothing_comes_it_says_so_and_at_last_gives_up(
+    driver: Driver, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setattr(v4l2_camera, "_SILENT_S", 1.0)
+    with open_usb(ask(driver), Clock(), lambda _: None) as frames:
+        assert [next(frames), next(frames)] == [None, None]
+        with pytest.raises(SourceError, match=r"camera red: .*video0: sends no frames; plug it in anew"):
+            list(frames)
+
+
+@pytest.mark.parametrize(("mode", "bad"), [("MJPG", b""), ("YUYV", b""), ("YUYV", b"half a picture")])
+def test_a_camera_that_hands_over_nothing_of_use_has_gone(
+    driver: Driver, monkeypatch: pytest.MonkeyPatch, mode: str, bad: bytes
+) -> None:
+    monkeypatch.setattr(v4l2_camera, "_SILENT_S", 0.2)
+    driver.modes = {mode: [(64, 48, [30])]}
+    driver.frames.extend([bad] * 300_000)
+    start_s = time.monotonic()
+    with (
+        open_usb(ask(driver, width=64, height=48), Clock(), lambda _: None) as frames,
+        pytest.raises(SourceError, match="sends no frames"),
+    ):
+        list(frames)
+    assert time.monotonic() - start_s < 2
+
+
+def test_a_camera_through_opencv_that_is_pulled_out_may_come_back() -> None:
+    frames = opencv_camera._frames(cv2.VideoCapture(), "camera red: usb:0")
+    with pytest.raises(SourceError, match="camera red: usb:0: sends no frames"):
+        next(frames)
+
+
+def test_what_the_camera_refuses_is_said(driver: Driver) -> None:
+    said: list[str] = []
+    asked = ask(
+        driver, width=1900, height=1000, rate_hz=60.0, exposure_s=1.0, focus=12.0, gain=50.0, stamp="end"
+    )
+    driver.frames.append(b"x")
+    with open_usb(asked, Clock(), said.append) as frames:
+        next(frames)
+    assert said == [
+        "camera red: asked for 1900 x 1000 px, gives 1920 x 1080",
+        "camera red: asked for 60 frames/s, gives 30",
+        "camera red: asked for 1 s of exposure, gives 0.5",
+        "camera red: asked for 12 of focus, which it does not let us set",
+        "camera red: the driver stamps the start of a frame, the rig says: end",
+    ]
+    assert driver.controls[0x9A0901][2] == 1  # the exposure is by hand
+
+
+def test_what_it_takes_is_not_said(driver: Driver) -> None:
+    said: list[str] = []
+    driver.flags = v4l2.STAMP_MONOTONIC
+    driver.frames.append(b"x")
+    asked = ask(driver, width=1280, height=720, rate_hz=60.0, exposure_s=0.005, gain=10.0, stamp="end")
+    with open_usb(asked, Clock(), said.append) as frames:
+        next(frames)
+    assert said == []
+    assert driver.size == (1280, 720)
+    assert driver.rate == (1, 60)
+    assert driver.controls[0x9A0902][2] == 50
+    assert driver.controls[0x980913][2] == 10
+
+
+def test_a_stamp_of_another_clock_is_none(driver: Driver) -> None:
+    said: list[str] = []
+    driver.flags = 0
+    driver.frames.append(b"x")
+    with open_usb(ask(driver), Clock(), said.append) as frames:
+        assert next(frames) == Frame(b"x", "jpeg", None)
+    assert "by another clock" in said[0]
+
+
+def test_a_camera_that_is_pulled_out(driver: Driver) -> None:
+    driver.frames.extend([b"x", OSError(errno.ENODEV, "No such device")])
+    with open_usb(ask(driver), Clock(), lambda _: None) as frames:
+        assert next(frames)
+        with pytest.raises(SourceError, match=r"camera red: .*video0: has gone; is its cable plugged in"):
+            next(frames)
+
+
+def test_a_bus_that_is_full(driver: Driver) -> None:
+    driver.no_room = True
+    with (
+        pytest.raises(SourceError, match="its USB bus has no room left"),
+        open_usb(ask(driver), Clock(), lambda _: None),
+    ):
+        pass
+
+
+def test_a_camera_of_no_known_format(driver: Driver) -> None:
+    driver.modes = {"H264": [(1920, 1080, [30])], "BA81": [(1920, 1080, [30])]}
+    with (
+        pytest.raises(SourceError, match="offers only H264, BA81; a camera that gives MJPG is needed"),
+        open_usb(ask(driver), Clock(), lambda _: None),
+    ):
+        pass
+
+
+def raw(name: str, picture: NDArray[np.uint8], stride: int) -> bytes:
+    """A picture as FFmpeg's own converter lays it out, its rows padded."""
+    frame = av.VideoFrame.from_ndarray(picture, format="bgr24")
+    kind = {"YUYV": "yuyv422", "UYVY": "uyvy422", "NV12": "nv12", "GREY": "gray"}[name]
+    planes = frame.reformat(format=kind, dst_color_range="JPEG").planes
+    padded = b""
+    for plane in planes:
+        rows = np.frombuffer(bytes(plane), np.uint8).reshape(plane.height, plane.line_size)
+        rows = rows[:, : min(stride, plane.line_size)]
+        padded += np.pad(rows, ((0, 0), (0, stride - rows.shape[1])), constant_values=99).tobytes()
+    return padded
+
+
+@pytest.mark.parametrize(("name", "stride"), [("YUYV", 640), ("YUYV", 704), ("UYVY", 640), ("NV12", 320),
+                                              ("NV12", 384), ("GREY", 320), ("GREY", 352)])  # fmt: skip
+def test_pictures_of_a_camera_without_jpeg_are_encoded_once(driver: Driver, name: str, stride: int) -> None:
+    driver.modes, driver.stride, driver.size = {name: [(320, 240, [30])]}, stride, (320, 240)
+    y, x = np.indices((240, 320))
+    picture = np.stack([x * 255 // 319, y * 255 // 239, 128 + 100 * np.sin(x / 20)], axis=2).astype(np.uint8)
+    whole = raw(name, picture, stride)
+    driver.frames.extend([whole, whole[:-1000], whole])
+    said: list[str] = []
+    with open_usb(ask(driver, stamp="start"), Clock(), said.append) as frames:
+        came = list(islice((frame for frame in frames if frame), 2))
+    assert [frame.format for frame in came] == ["jpeg", "jpeg"]
+    assert came[0].time_ns is not None
+    shown = simplejpeg.decode_jpeg(came[0].data, colorspace="BGR").astype(float)
+    grey = cv2.cvtColor(picture, cv2.COLOR_BGR2GRAY).astype(float)
+    assert shown.shape == (240, 320, 3)
+    assert np.abs(shown @ [0.114, 0.587, 0.299] - grey).max() < 8
+    assert np.abs(shown - (grey[..., None] if name == "GREY" else picture)).mean() < 3
+    assert said == [
+        f"camera red: gives no MJPG; its {name} pictures are encoded as JPEG once",
+        "camera red: sends pictures that are not whole; they are left out",
+    ]
+
+
+@pytest.mark.parametrize(
+    ("source", "said"), [("usb:/nowhere/video9", "no such device"), ("usb:/dev/null", "is no camera")]
+)
+def test_what_is_no_camera(source: str, said: str) -> None:
+    """With the real kernel."""
+    with (
+        pytest.raises(SourceError, match=said),
+        open_usb(RigCamera("red", source=source), Clock(), lambda _: None),
+    ):
+        pass

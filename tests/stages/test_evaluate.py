@@ -1,0 +1,265 @@
+"""Errors by eq. (26) and (27) on places held out and by cross-validation; learning curves; covariances."""
+
+from __future__ import annotations
+
+import statistics
+from collections.abc import Mapping, Sequence
+
+import numpy as np
+import pytest
+from scipy.stats import chi2
+
+from ipsys_log.analysis.accuracy import POOLED, errors_cross_validated, errors_held_out
+from ipsys_log.analysis.cross_validation import deal, gather_places, leave_one_out, predict_without
+from ipsys_log.analysis.ground_truth import gather_tracks, track_errors
+from ipsys_log.analysis.learning import labelled_subsets, learning_curve, published_curve
+from ipsys_log.analysis.statistics import error_statistics
+from ipsys_log.errors import FitError
+from ipsys_log.messages import Message, Pair, Track, Tracks
+from ipsys_log.models.applied import AppliedModel
+from ipsys_log.models.table import Places, min_pairs
+from ipsys_log.stages.fit import fit_model
+from tests import labs
+
+POINTS = np.random.default_rng(0).uniform((-2, -1, 1.9), (2, 1, 2.1), (14, 3))
+
+
+def pairs(offset: np.ndarray) -> list[Pair]:
+    return [Pair(f"m{n}", 0, point, point + offset, 1) for n, point in enumerate(POINTS)]
+
+
+def lab(seed: int, count: int = 40, **noise: float) -> tuple[list[Pair], np.ndarray, np.ndarray]:
+    """Measured pairs of one camera; camera points and world points of a drive in the same view."""
+    rng = np.random.default_rng(seed)
+    camera, world = labs.camera(rng, **noise), labs.places(rng, count)
+    tape, covariances = labs.measure(world, rng)
+    drive = np.column_stack([rng.uniform(0.4, 4.4, 300), rng.uniform(0.3, 1.5, 300), np.full(300, 0.1)])
+    return labs.pairs(camera.see(world, rng), tape, covariances), camera.see(drive, rng), drive
+
+
+def test_statistics_are_those_of_the_standard_library() -> None:
+    errors = [0.01, 0.025, 0.013, 0.07]
+    found = error_statistics(np.array(errors))
+    assert found.count == 4
+    assert found.mean_m == pytest.approx(statistics.mean(errors))
+    assert found.median_m == pytest.approx(statistics.median(errors))
+    assert found.std_m == pytest.approx(statistics.stdev(errors))
+    assert (found.min_m, found.max_m) == (0.01, 0.07)
+    single = error_statistics(np.array([0.01]))
+    assert (single.std_m, single.mean_low_m) == (None, None)
+
+
+def test_the_interval_of_the_mean_holds_it_as_often_as_it_says() -> None:
+    rng = np.random.default_rng(0)
+    held = 0
+    for _ in range(300):
+        found = error_statistics(rng.gamma(2.0, 0.005, 50))
+        assert found.mean_low_m is not None
+        assert found.mean_high_m is not None
+        held += found.mean_low_m <= 0.01 <= found.mean_high_m
+    assert 0.90 <= held / 300 <= 0.98
+
+
+def test_repeats_at_one_place_do_not_make_the_mean_more_certain() -> None:
+    errors = np.random.default_rng(1).gamma(2.0, 0.005, 30)
+    once, four_times = error_statistics(errors), error_statistics(np.tile(errors, (4, 1)))
+    assert four_times.count == 30
+    assert (four_times.mean_low_m, four_times.mean_high_m) == pytest.approx(
+        (once.mean_low_m, once.mean_high_m), rel=1e-9
+    )
+
+
+def test_errors_in_space_and_on_the_floor() -> None:
+    model = fit_model("rigid", {"red": pairs(np.zeros(3))}, 0)
+    (row,) = errors_held_out(model, {"red": pairs(np.array([0.03, 0.04, 0.12]))}, {})
+    assert (row.against, row.scheme) == ("tape", "held_out")
+    assert row.error_3d is not None
+    assert row.error_3d.mean_m == pytest.approx(0.13)
+    assert row.error_2d.mean_m == pytest.approx(0.05)
+    assert row.bias_m is not None
+    np.testing.assert_allclose(row.bias_m, np.array([-0.03, -0.04, -0.12]))
+
+
+def test_the_truth_is_compared_where_it_is_known() -> None:
+    model = fit_model("rigid", {"red": pairs(np.zeros(3))}, 0)
+    truth = {"m0": POINTS[0], "m5": POINTS[5] + [0, 0, 0.01]}
+    rows = {row.against: row for row in errors_held_out(model, {"red": pairs(np.ones(3))}, truth)}
+    assert rows["truth"].error_3d is not None
+    assert rows["truth"].error_3d.count == 2
+    assert rows["truth"].error_3d.max_m == pytest.approx(0.01)
+    assert rows["tape"].error_2d.count == 14
+
+
+def test_all_cameras_together_are_one_row_more() -> None:
+    model = fit_model("rigid", {"red": pairs(np.zeros(3)), "white": pairs(np.zeros(3))}, 0)
+    held_out = {"red": pairs(np.array([0.01, 0, 0])), "white": pairs(np.array([0.03, 0, 0]))[:7]}
+    rows = {row.camera: row for row in errors_held_out(model, held_out, {})}
+    assert set(rows) == {"red", "white", POOLED}
+    assert rows[POOLED].error_2d.mean_m == pytest.approx((14 * 0.01 + 7 * 0.03) / 21)
+    only = errors_held_out(model, {"white": pairs(np.ones(3))}, {})
+    assert [row.camera for row in only] == ["white"]
+
+
+def test_places_that_the_model_was_fitted_on_are_not_held_out() -> None:
+    """As where a model is applied to the very log that it was made from."""
+    model = fit_model("rigid", {"red": pairs(np.zeros(3))}, 0)
+    assert errors_held_out(model, {"red": pairs(np.zeros(3))}, {}) == []
+
+
+def test_where_all_places_have_one_height_there_is_no_error_in_space() -> None:
+    rng = np.random.default_rng(0)
+    world = labs.places(rng, 20, heights=(0.1,))
+    tape, covariances = labs.measure(world, rng)
+    tape[:, 2] = 0.1
+    model = fit_model("poly", {"red": labs.pairs(labs.camera(rng).see(world, rng), tape, covariances)}, 0)
+    rows = errors_cross_validated(model, {"red": list(model.cameras[0].pairs)}, {}, 0)
+    assert [(row.error_3d, row.error_2d.count) for row in rows] == [(None, 20)]
+
+
+def test_cross_validation_is_that_of_a_loop_written_out() -> None:
+    found, _, _ = lab(0, 23)
+    model = fit_model("poly", {"red": found}, 0)
+    (row,) = errors_cross_validated(model, {"red": found}, {}, seed=7)
+    by_place: dict[str, list[float]] = {}
+    for residual in row.residuals:
+        error = float(np.linalg.norm(residual.predicted_m - residual.world_m))
+        by_place.setdefault(residual.measurement, []).append(error)
+    assert {len(errors) for errors in by_place.values()} == {4}
+    # No place is predicted by a model that has seen it: it never comes near its own residual of the fit.
+    applied = AppliedModel("poly", model.cameras[0])
+    points, world = (np.array([getattr(p, f) for p in found]) for f in ("camera_m", "world_m"))
+    inside = np.linalg.norm(applied.predict(points, world[:, 2]) - world, axis=1)
+    assert row.error_3d is not None
+    assert row.error_3d.mean_m > 1.3 * inside.mean()
+    again = errors_cross_validated(model, {"red": found}, {}, seed=8)
+    assert again[0].error_3d != row.error_3d
+
+
+def test_a_place_seen_by_two_cameras_is_held_out_from_both() -> None:
+    def seen(*names: str) -> Places:
+        return Places(np.zeros((len(names), 3)), np.zeros((len(names), 3)), names)
+
+    cameras = {
+        "red": seen(*(f"r{n}" for n in range(20)), *(f"b{n}" for n in range(5))),
+        "white": seen(*(f"w{n}" for n in range(15)), *(f"b{n}" for n in range(5))),
+    }
+    folds = deal(cameras, 5, np.random.default_rng(0))
+    assert sorted(name for fold in folds for name in fold) == sorted(
+        {name for places in cameras.values() for name in places.names}
+    )
+    for places in cameras.values():
+        sizes = [len(fold & set(places.names)) for fold in folds]
+        assert max(sizes) - min(sizes) <= 1
+
+
+def test_leave_one_out_is_a_fit_without_the_place() -> None:
+    found, _, _ = lab(1, 16)
+    cameras = gather_places({"red": found})
+    left_out = leave_one_out("poly", cameras)(frozenset({"m03"}))["red"]
+    rest = {"red": [p for p in found if p.measurement not in ("m03", "m05")]}
+    applied = AppliedModel("poly", fit_model("poly", rest, 0).cameras[0])
+    np.testing.assert_allclose(
+        left_out["m05"], applied.predict(found[5].camera_m[None], np.zeros(1))[0], atol=1e-9
+    )
+    assert set(left_out) == {p.measurement for p in found}
+
+
+def test_more_places_make_a_better_model_and_the_curve_says_so() -> None:
+    found, _, _ = lab(2, 60)
+    curve = [p for points in learning_curve("poly", gather_places({"red": found}), 0) for p in points]
+    assert [p.pairs for p in curve] == [10, 15, 20, 30, 40]
+    assert curve[0].mean_3d_m > 3 * curve[-1].mean_3d_m
+    assert all(p.std_3d_m is not None and p.subsets == 10 for p in curve)
+
+
+def test_published_subsets_are_fitted_and_looked_at_where_the_paper_does() -> None:
+    found, _, _ = lab(3, 30)
+    cameras = gather_places({"red": found})
+    names = [p.measurement for p in found]
+    (point,) = published_curve("poly", cameras, {"train_12": set(names[:12])}, set(names[20:]))
+    assert (point.pairs, point.label) == (12, "train_12")
+    predicted = predict_without("poly", cameras, set(names[12:]))["red"][20:]
+    errors = np.linalg.norm(predicted - cameras["red"].world_m[20:], axis=1)
+    assert point.mean_3d_m == pytest.approx(errors.mean())
+    assert labelled_subsets([]) == {}
+
+
+def test_the_covariance_is_of_errors_that_the_fit_has_not_seen() -> None:
+    rng = np.random.default_rng(1)
+    noisy = [
+        Pair(p.measurement, 0, p.camera_m, p.world_m + rng.normal(0, 0.01, 3), 1) for p in pairs(np.zeros(3))
+    ]
+    covariance = fit_model("poly", {"red": noisy}, 0).cameras[0].covariance_m2
+    assert covariance is not None
+    # With 14 pairs for 10 parameters the fit looks good and is not.
+    assert np.sqrt(np.trace(covariance) / 3) > 0.015
+    few = fit_model("poly", {"red": noisy[:10]}, 0).cameras[0]
+    assert (few.covariance_m2, few.noise) == (None, None)
+
+
+def regions(name: str, along: float, seeds: Sequence[int]) -> tuple[float, float]:
+    """Shares of the true places of drives within the 68 % and 95 % regions of their positions."""
+    size = 2 if name == "rayplane" else 3
+    within: list[Mapping[float, float]] = []
+    for seed in seeds:
+        found, points, world = lab(seed, along=along)
+        camera = fit_model(name, {"red": found}, 0).cameras[0]
+        applied = AppliedModel(name, camera)
+        covariances = applied.covariances(points, world[:, 2])
+        assert covariances is not None
+        offsets = (applied.predict(points, world[:, 2]) - world)[:, :size]
+        inverse = np.linalg.inv(covariances[:, :size, :size])
+        squares = np.einsum("ni,nij,nj->n", offsets, inverse, offsets)
+        within.append({share: float((squares <= chi2.ppf(share, size)).mean()) for share in (0.68, 0.95)})
+    return tuple(float(np.mean([w[share] for w in within])) for share in (0.68, 0.95))  # type: ignore[return-value]
+
+
+@pytest.mark.parametrize(
+    ("name", "along"),
+    [
+        ("poly", 0.0004), ("poly", 0.003), ("rayplane", 0.003), ("best", 0.0004),
+        pytest.param("rayplane", 0.0004, marks=pytest.mark.slow),
+        pytest.param("best", 0.003, marks=pytest.mark.slow),
+    ],
+)  # fmt: skip
+def test_covariances_hold_the_truth_as_often_as_they_say(name: str, along: float) -> None:
+    """One session's tape errors are common to all its positions: only many sessions can tell."""
+    within_68, within_95 = regions(name, along, range(40))
+    assert 0.60 <= within_68 <= 0.76
+    assert 0.90 <= within_95 <= 0.98
+
+
+def test_the_covariance_of_a_model_that_misfits_knows_most_of_it() -> None:
+    """What rigid leaves of the lens is no noise: it is the same everywhere near by, and has no Gaussian."""
+    within_68, within_95 = regions("rigid", 0.0004, range(40))
+    assert 0.55 <= within_68 <= 0.76
+    assert 0.80 <= within_95 <= 0.98
+
+
+def test_away_from_the_measured_places_a_position_is_less_certain() -> None:
+    found, _, _ = lab(5)
+    inner = [p for p in found if 1.0 < p.world_m[0] < 3.8]
+    applied = AppliedModel("poly", fit_model("poly", {"red": inner}, 0).cameras[0])
+    middle, edge = np.array([[0.0, 0.0, 2.0]]), np.array([[2.3, 0.0, 2.0]])
+    sizes = [np.trace(applied.covariances(p, np.zeros(1))[0]) for p in (middle, edge)]  # type: ignore[index]
+    assert sizes[1] > 9 * sizes[0]
+
+
+def test_places_of_a_fold_too_few_to_fit_are_an_error() -> None:
+    found, _, _ = lab(7, min_pairs("poly") + 1)
+    with pytest.raises(FitError):
+        predict_without("rigid", gather_places({"red": found}), {p.measurement for p in found[2:]})
+
+
+def tracked(time_ns: int, x_m: float) -> Message:
+    return Message("t", time_ns, time_ns, Tracks(time_ns, (Track("robot_0", 0, x_m, 0.0, 0.0),)))
+
+
+def test_the_last_pose_of_an_instant_counts() -> None:
+    truth = gather_tracks([tracked(1, 0.0), tracked(2, 1.0)])
+    tracks = gather_tracks([tracked(1, 0.5), tracked(1, 0.01), tracked(2, 1.02), tracked(3, 9.0)])
+    found = track_errors(tracks, truth)
+    assert found is not None
+    assert found[0].count == 2
+    assert found[0].mean_m == pytest.approx(0.015)
+    assert track_errors(tracks, {}) is None

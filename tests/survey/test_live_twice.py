@@ -1,0 +1,74 @@
+"""Measured while cameras send: whether a marker lies where it was measured before."""
+
+from __future__ import annotations
+
+import numpy as np
+
+from ipsys_log.capture.camera_thread import CameraState
+from ipsys_log.messages import CameraPoint, CameraPoints, CompressedImage, Markers, Message
+from ipsys_log.survey.checks import Checked, check_entry, withdraw
+from ipsys_log.survey.entry import Typed, read_typed
+from ipsys_log.survey.live import LiveScene
+from ipsys_log.survey.scene import look
+from ipsys_log.units import NS_PER_S
+from tests import labs
+
+PLACE = Typed("0", {"A": "170", "B": "190"}, "left", "10")
+BETTER = Typed("0", {"A": "171", "B": "190"}, "left", "10")
+
+
+class Lab:
+    """A marker before one camera, ten times a second, with the noise of plain corners."""
+
+    def __init__(self) -> None:
+        self.scene = LiveScene(labs.RIG, None, {"red": CameraState(up=True)}, lambda topic, payload: None)
+        self._frame, self._rng = 0, np.random.default_rng(3)
+
+    def show(self, seconds: float, x_m: float) -> None:
+        for _ in range(round(seconds * 10)):
+            self._frame += 1
+            taken_ns = self._frame * NS_PER_S // 10
+            x, y, z = np.array([x_m, 0.2, 2.0]) + self._rng.normal(0, [0.0005, 0.0005, 0.003])
+            points = CameraPoints(taken_ns, (CameraPoint(0, x, y, z),))
+            image = CompressedImage(taken_ns, "red", b"", "jpeg")
+            for payload in (image, Markers(taken_ns, (), 960, 540), points):
+                self.scene(Message("", taken_ns, taken_ns, payload, "red"))
+
+    def check(self, typed: Typed) -> Checked:
+        scene = self.scene
+        sight = look(scene.views(None), 0)
+        return check_entry(*read_typed(typed, scene.rig), scene.rig, sight, scene.history())
+
+    def save(self, typed: Typed) -> None:
+        checked = self.check(typed)
+        assert checked.measurement is not None
+        self.scene.add([checked.measurement])
+
+
+def test_a_marker_that_has_not_moved_since_it_was_measured() -> None:
+    lab = Lab()
+    lab.show(2, 0.1)
+    assert lab.check(PLACE).warnings == ()
+    lab.save(PLACE)
+    lab.show(4, 0.1)  # so that the seconds of both have nothing in common
+    assert "this is p001 once more" in lab.check(PLACE).faults[0].text
+    (text,) = lab.check(BETTER).warnings
+    assert "marker 0 is measured here already, as p001" in text
+    lab.save(BETTER)
+    lab.show(2, 0.1)
+    (text,) = lab.check(Typed("0", {"A": "172", "B": "190"}, "left", "10")).warnings
+    assert "as p001 (2.0 cm away), p002 (1.0 cm away)" in text
+    for name in ("p001", "p002"):
+        lab.scene.add([withdraw(lab.scene.history(), name)])
+    assert lab.check(BETTER).warnings == ()
+
+
+def test_a_marker_that_was_moved_on_by_a_little() -> None:
+    lab = Lab()
+    lab.show(2, 0.1)
+    lab.save(PLACE)
+    lab.show(2, 0.13)
+    assert lab.check(BETTER).warnings == ()
+    # Back where it was: the place is the same, however it got there.
+    lab.show(2, 0.1)
+    assert "measured here already" in lab.check(BETTER).warnings[0]

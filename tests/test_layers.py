@@ -1,0 +1,103 @@
+"""Imports go down the layers, never up or between neighbours; stages never import each other."""
+
+from __future__ import annotations
+
+import ast
+from collections.abc import Iterator
+from pathlib import Path
+
+import pytest
+
+PACKAGE = Path(__file__).resolve().parent.parent / "ipsys_log"
+
+LAYERS = (
+    ("errors",), ("units", "plain_text"), ("messages",), ("geometry", "rig"), ("images",), ("models", "log"),
+    ("calibration",), ("analysis",), ("stages",), ("runs",), ("simulation",), ("capture",),
+    ("exchange", "sinks"), ("pipeline",), ("restore",), ("survey",), ("report",), ("web",), ("cli",),
+    ("__main__", "__init__"),
+)  # fmt: skip
+LAYER = {name: level for level, names in enumerate(LAYERS) for name in names}
+
+
+def imports(source: str) -> Iterator[str]:
+    """Dotted names within the package that a source imports."""
+    for node in ast.walk(ast.parse(source)):
+        names = []
+        if isinstance(node, ast.ImportFrom) and node.module and node.level == 0:
+            names = [node.module, *(f"{node.module}.{alias.name}" for alias in node.names)]
+        elif isinstance(node, ast.Import):
+            names = [alias.name for alias in node.names]
+        yield from (name for name in names if name.startswith("ipsys_log."))
+
+
+def fault(module: str, imported: str) -> str | None:
+    """Explain why ``module`` must not import ``imported``; both dotted, without the package."""
+    importer, target = module.split("."), imported.split(".")
+    if target[0] not in LAYER:
+        return None  # a name of the package itself
+    if importer[0] == target[0] == "stages":
+        if len(importer) > 1 and len(target) > 1 and importer[1] != target[1]:
+            return f"stage {module} imports stage {imported}"
+    elif importer[0] != target[0] and LAYER[target[0]] >= LAYER[importer[0]]:
+        return f"{module} (layer {LAYER[importer[0]]}) imports {imported} (layer {LAYER[target[0]]})"
+    return None
+
+
+def modules() -> list[tuple[str, Path]]:
+    found = []
+    for path in sorted(PACKAGE.rglob("*.py")):
+        parts = path.relative_to(PACKAGE).with_suffix("").parts
+        found.append((".".join(parts), path))
+    return found
+
+
+@pytest.mark.parametrize(("module", "path"), modules(), ids=[name for name, _ in modules()])
+def test_imports_go_down(module: str, path: Path) -> None:
+    wrong = [fault(module, name.removeprefix("ipsys_log.")) for name in imports(path.read_text())]
+    assert [text for text in wrong if text] == []
+
+
+@pytest.mark.parametrize(
+    ("module", "imported"),
+    [
+        ("geometry.markers", "log.reader"),
+        ("stages.detect", "pipeline"),
+        ("stages.detect", "stages.locate"),
+        ("log.reader", "models.poly"),
+        ("runs.graph", "capture.backlog"),
+        ("geometry.markers", "rig.file"),
+        ("messages", "geometry"),
+    ],
+)
+def test_the_guard_sees_an_import_that_goes_up(module: str, imported: str) -> None:
+    assert fault(module, imported) is not None
+
+
+def test_every_module_has_a_layer() -> None:
+    assert {name.split(".")[0] for name, _ in modules()} <= set(LAYER)
+
+
+CLOCKS = {"time", "time_ns", "monotonic", "monotonic_ns", "perf_counter", "perf_counter_ns", "now", "utcnow"}
+
+
+def clocks(source: str) -> set[str]:
+    """Calls in a source that read a clock: ``time.time()``, ``datetime.now()`` and the like."""
+    called = (node.func for node in ast.walk(ast.parse(source)) if isinstance(node, ast.Call))
+    return {
+        f"{call.value.id}.{call.attr}"
+        for call in called
+        if isinstance(call, ast.Attribute) and isinstance(call.value, ast.Name)
+        if call.value.id in ("time", "datetime") and call.attr in CLOCKS
+    }
+
+
+def test_nothing_but_a_source_reads_a_clock() -> None:
+    """Law 2: a stage that read a clock would not replay. Sources have one, all the same one."""
+    reading = {name for name, path in modules() if clocks(path.read_text())}
+    assert reading == {"capture.frames"}
+
+
+def test_the_guard_sees_a_clock() -> None:
+    assert clocks("import time\nstamp = time.time_ns()") == {"time.time_ns"}
+    assert clocks("from datetime import datetime\nstamp = datetime.now()") == {"datetime.now"}
+    assert clocks("import time\ntime.sleep(1)") == set()

@@ -15,8 +15,8 @@ import tempfile
 import time
 from pathlib import Path
 
+from ipsys_log.log.contents import Schema
 from ipsys_log.log.reader import LogReader
-from ipsys_log.log.types import Schema
 from ipsys_log.log.writer import LogWriter
 
 IMAGE_BYTES = 300_000

@@ -21,8 +21,8 @@ from results import Report, command
 from rounds import Contender, Row, Turn, race, ratio_row
 from scenes import CACHE
 
+from ipsys_log.log.contents import Schema
 from ipsys_log.log.reader import LogReader
-from ipsys_log.log.types import Schema
 from ipsys_log.log.writer import LogWriter
 
 IMAGE_BYTES = 300_000

@@ -24,8 +24,8 @@ from rounds import Contender, Row, Turn, race, ratio_row
 from scenes import CACHE
 
 from ipsys_log.log.codec import encode, schema_data
+from ipsys_log.log.contents import Schema
 from ipsys_log.log.reader import LogReader
-from ipsys_log.log.types import Schema
 from ipsys_log.log.writer import LogWriter
 from ipsys_log.messages import CompressedImage
 

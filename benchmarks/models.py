@@ -18,10 +18,9 @@ from pathlib import Path
 import numpy as np
 from threadpoolctl import threadpool_limits
 
-from ipsys_log.analysis.cross_validation import cross_validate, gather_places
-from ipsys_log.analysis.learning import labelled_subsets
+from ipsys_log.analysis.accuracy import error_statistics
+from ipsys_log.analysis.cross_validation import cross_validate, gather_places, labelled_subsets
 from ipsys_log.analysis.pairs import Measured, build_pairs, gather_sightings
-from ipsys_log.analysis.statistics import error_statistics
 from ipsys_log.exchange.imsel import read_imsel
 from ipsys_log.log.dataset import Session
 from ipsys_log.messages import CameraPoints, Pair

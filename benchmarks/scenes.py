@@ -14,7 +14,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from ipsys_log import simulation
-from ipsys_log.geometry.patterns import true_corners
+from ipsys_log.geometry.marker_cells import true_corners
 from ipsys_log.log.dataset import Session
 from ipsys_log.messages import CompressedImage, Message, Tracks
 from ipsys_log.runs.output import write_log

@@ -44,13 +44,7 @@ from ipsys_log.capture.recent_frames import Recent
 from ipsys_log.capture.recorder import Recording, Source, recording, written
 from ipsys_log.errors import IpsysError, LogError
 from ipsys_log.log.dataset import Session
-from ipsys_log.messages import (
-    EVENTS_TOPIC,
-    Markers,
-    Message,
-    Positions,
-    Tracks,
-)
+from ipsys_log.messages import EVENTS_TOPIC, Markers, Message, Positions, Tracks
 from ipsys_log.runs.checks import check_inputs
 from ipsys_log.runs.execute import carry_out, perform, sign
 from ipsys_log.runs.graph import STAGES, plan_stage

@@ -22,12 +22,11 @@ from google.protobuf.timestamp_pb2 import Timestamp
 from ipsys_log.analysis.pairs import gather_sightings
 from ipsys_log.calibration.images import _decode
 from ipsys_log.errors import FrameError, IpsysError
-from ipsys_log.exchange.matlab import read_mat
-from ipsys_log.exchange.opencv_yaml import read_opencv_calibration
-from ipsys_log.exchange.picture_times import find_times, parse_time
+from ipsys_log.exchange.calibration_files import read_opencv_calibration
+from ipsys_log.exchange.image_folders import find_times, parse_time
+from ipsys_log.exchange.imsel import read_mat
 from ipsys_log.geometry.lenses import check_calibration
-from ipsys_log.images.decode import decode_rows
-from ipsys_log.images.picture_size import check_encoded
+from ipsys_log.images.decode import check_encoded, decode_rows
 from ipsys_log.log.codec import decode, encode
 from ipsys_log.log.dataset import Session
 from ipsys_log.messages import (
@@ -149,7 +148,7 @@ def test_lens_file_of_many_levels_is_one_line(tmp_path: Path, name: str, text: s
     path.write_text(text, errors="surrogateescape")
     code = (
         "import sys, pathlib\nfrom ipsys_log.errors import IpsysError\n"
-        "from ipsys_log.exchange.opencv_yaml import read_opencv_calibration as read\n"
+        "from ipsys_log.exchange.calibration_files import read_opencv_calibration as read\n"
         "try: read(pathlib.Path(sys.argv[1]), 'red')\nexcept IpsysError as error: print(error)\n"
     )
     done = subprocess.run(

@@ -132,8 +132,7 @@ def test_a_position_outside_the_measured_volume_says_so(tmp_path: Path) -> None:
 
 def test_a_model_out_of_a_log_predicts_what_it_predicted(ipsys: Ipsys, tmp_path: Path) -> None:
     """To 1e-9 m, for every model in the table, by way of the numbers in the log."""
-    from ipsys_log.models.applied import AppliedModel
-    from ipsys_log.models.table import MODELS, Places, fit_cameras, inputs
+    from ipsys_log.models.table import MODELS, AppliedModel, Places, fit_cameras, inputs
 
     log = made(tmp_path / "lab.mcap", labels=lambda n: ("train",))
     options = [option for name in MODELS for option in ("--model", name)]

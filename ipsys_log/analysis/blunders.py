@@ -11,8 +11,7 @@ from numpy.typing import NDArray
 
 from ipsys_log.analysis.tape import reference_points
 from ipsys_log.errors import IpsysError
-from ipsys_log.geometry.multilateration import multilaterate, side_of, sides_alike
-from ipsys_log.geometry.trilateration import SIDES
+from ipsys_log.geometry.trilateration import SIDES, multilaterate, side_of, sides_alike
 from ipsys_log.messages import Distance, Measurement, Rig, WorldPoint
 from ipsys_log.units import CM_PER_M
 

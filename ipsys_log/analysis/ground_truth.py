@@ -7,8 +7,8 @@ from collections.abc import Iterable, Mapping
 import numpy as np
 from numpy.typing import NDArray
 
+from ipsys_log.analysis.accuracy import error_statistics
 from ipsys_log.analysis.pairs import Measured, Sightings, still_interval
-from ipsys_log.analysis.statistics import error_statistics
 from ipsys_log.messages import ErrorStatistics, Message, Tracks
 from ipsys_log.units import NS_PER_S
 

@@ -9,7 +9,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from ipsys_log.errors import IpsysError
-from ipsys_log.geometry.multilateration import crossing_angle, multilaterate, tape_covariance
+from ipsys_log.geometry.trilateration import crossing_angle, multilaterate, tape_covariance
 from ipsys_log.messages import Measurement, Rig
 
 __all__ = ["FlatPlace", "Measured", "TapePoint", "flat_places", "reference_points", "world_point"]

@@ -1,9 +1,15 @@
-"""Boards to calibrate with: what they are, and where their corners lie."""
+"""Boards to calibrate with: what they are, and where their corners lie.
+
+The pattern of a calibration board: its black squares, and the markers in the others.
+
+The layout is that of OpenCV since 4.6: the square at the top left is black for any number of rows.
+"""
 
 from __future__ import annotations
 
 import re
 from dataclasses import dataclass
+from typing import NamedTuple
 
 import cv2
 import numpy as np
@@ -11,7 +17,7 @@ from numpy.typing import NDArray
 
 from ipsys_log.errors import IpsysError
 
-__all__ = ["Board", "parse_board"]
+__all__ = ["Board", "BoardMarker", "black_squares", "board_markers", "parse_board"]
 
 _FORM = re.compile(r"(?P<kind>charuco:|chessboard:)?(?P<columns>\d{1,3})[x×](?P<rows>\d{1,3})")
 _MOST = 100
@@ -109,3 +115,39 @@ def _check_dictionary(board: Board) -> None:
         raise IpsysError(
             f"--dictionary {board.dictionary}: has {known} markers, the board {markers}; name a larger one"
         )
+
+
+class BoardMarker(NamedTuple):
+    """A marker of a ChArUco board, and its square."""
+
+    id: int
+    row: int
+    column: int
+
+
+def black_squares(board: Board) -> NDArray[np.bool_]:
+    """Return a mask of the black squares, (rows, columns), the top row first.
+
+    Examples
+    --------
+    >>> black_squares(Board(3, 3, 0.03)).astype(int).tolist()
+    [[1, 0, 1, 0], [0, 1, 0, 1], [1, 0, 1, 0], [0, 1, 0, 1]]
+    """
+    columns, rows = (size + 1 for size in board.grid)
+    row, column = np.indices((rows, columns))
+    black: NDArray[np.bool_] = (row + column) % 2 == 0
+    return black
+
+
+def board_markers(board: Board) -> list[BoardMarker]:
+    """Return the markers of a ChArUco board, row by row; of a chessboard none.
+
+    Examples
+    --------
+    >>> board_markers(Board(3, 3, 0.03, 0.75))[:2]
+    [BoardMarker(id=0, row=0, column=1), BoardMarker(id=1, row=1, column=0)]
+    """
+    if board.marker_scale is None:
+        return []
+    white = np.argwhere(~black_squares(board)).tolist()
+    return [BoardMarker(number, row, column) for number, (row, column) in enumerate(white)]

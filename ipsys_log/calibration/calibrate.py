@@ -1,28 +1,37 @@
-"""The lens of a camera from what was seen of a board: choose, solve, judge."""
+"""The lens of a camera from what was seen of a board: choose, solve, judge.
+
+The intrinsics of several cameras, each estimated separately: a bad one does not affect the others.
+"""
 
 from __future__ import annotations
 
 from collections import Counter
+from collections.abc import Callable, Iterator, Sequence
 from dataclasses import dataclass
+from functools import partial
+from typing import NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
 
 from ipsys_log.calibration.board import Board
 from ipsys_log.calibration.board_detection import Sighting
-from ipsys_log.calibration.board_search import Looked
+from ipsys_log.calibration.board_search import Looked, NotSeenError, check_sizes, look
 from ipsys_log.calibration.bundle_adjustment import Corners, Fit, camera_points
-from ipsys_log.calibration.image_selection import Dropped, choose
+from ipsys_log.calibration.image_selection import Coverage, Dropped, advice, choose, measure_coverage
+from ipsys_log.calibration.images import Pictures
 from ipsys_log.calibration.lens_models import LensModel
-from ipsys_log.calibration.picture_coverage import Coverage, advice, measure_coverage
-from ipsys_log.calibration.solve import Solved, rms_px, solve, tells_focal_length
-from ipsys_log.calibration.start import find_start
-from ipsys_log.calibration.two_cameras import find_two_cameras
-from ipsys_log.calibration.usable import MOST_RMS_PX, find_better_model, two_cameras_fault
+from ipsys_log.calibration.solve import Solved, find_start, rms_px, solve, tells_focal_length
+from ipsys_log.calibration.two_cameras import (
+    MOST_RMS_PX,
+    find_better_model,
+    find_two_cameras,
+    two_cameras_fault,
+)
 from ipsys_log.errors import IpsysError
 from ipsys_log.messages import CameraCalibration
 
-__all__ = ["LEAST_PICTURES", "Calibrated", "calibrate"]
+__all__ = ["LEAST_PICTURES", "Calibrated", "Failure", "calibrate", "calibrate_cameras"]
 
 Array = NDArray[np.float64]
 
@@ -290,3 +299,58 @@ def _softness(used: list[Sighting]) -> list[str]:
         f"edges are {soft_px:.1f} px wide in all pictures: more light, a shorter exposure or a sharper focus "
         "would help"
     ]
+
+
+Progress = Callable[[str, int, int | None], None]
+
+
+class Failure(NamedTuple):
+    """A camera without a result: the reason in one line, and whether the user expects a result.
+
+    No result is expected for a camera of a log that never shows the board, unless the user names it.
+    """
+
+    camera: str
+    reason: str
+    expected: bool
+
+
+def calibrate_cameras(
+    sources: Sequence[Pictures],
+    board: Board,
+    model: LensModel,
+    progress: Progress = lambda stage, done, total: None,
+    insist: bool = False,
+) -> Iterator[Calibrated | Failure]:
+    """Calibrate each camera, and yield its result as soon as it is ready.
+
+    Parameters
+    ----------
+    sources : the pictures of each camera.
+    board, model : the board to search for, and the lens model.
+    progress : called with the camera, the number of pictures done, and their total.
+    insist : accept the given board size, and poor results.
+    """
+    for pictures in sources:
+        try:
+            yield _calibrate_one(pictures, board, model, progress, insist)
+        except IpsysError as error:
+            expected = pictures.requested or not isinstance(error, NotSeenError)
+            yield Failure(pictures.camera, str(error), expected)
+
+
+def _calibrate_one(
+    pictures: Pictures, board: Board, model: LensModel, progress: Progress, insist: bool
+) -> Calibrated:
+    camera, count = pictures.camera, pictures.looked_at or None
+    progress(camera, 0, count)
+    sizes = pictures.sizes()
+    if sizes:
+        check_sizes(sizes, pictures.where)
+    looked = look(
+        pictures.read(), board, pictures.total, pictures.where,
+        lambda done: progress(camera, done, count),
+        partial(progress, "other boards"),
+        insist,
+    )  # fmt: skip
+    return calibrate(camera, looked, board, model, insist)

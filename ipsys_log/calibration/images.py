@@ -14,8 +14,7 @@ import numpy as np
 
 from ipsys_log.calibration.board_detection import Grey
 from ipsys_log.errors import FrameError, IpsysError
-from ipsys_log.images.picture_size import check_encoded
-from ipsys_log.images.picture_size_part import read_picture_size
+from ipsys_log.images.decode import check_encoded, read_picture_size
 from ipsys_log.images.video import Video
 from ipsys_log.log.dataset import Session
 from ipsys_log.messages import CompressedImage, CompressedVideo, RawImage

@@ -1,18 +1,159 @@
-"""The size that a recording will have, and how long the disk lasts."""
+"""The size that a recording will have, and how long the disk lasts.
+
+Periodic sync of a recording to the disk, in a separate thread.
+
+A disk that takes no more while a log is written to it.
+"""
 
 from __future__ import annotations
 
+import os
 import shutil
-from collections.abc import Iterable, Mapping
+import threading
+from collections.abc import Callable, Iterable, Iterator, Mapping
+from contextlib import ExitStack, contextmanager, suppress
 from dataclasses import dataclass
 from pathlib import Path
+from types import TracebackType
 
 from ipsys_log.capture.camera_thread import CameraState
-from ipsys_log.capture.full_disk import reserved_bytes
+from ipsys_log.errors import LogError, WriteError, is_full
+from ipsys_log.log.reader import LogReader
 from ipsys_log.messages import RigCamera
-from ipsys_log.units import format_bytes, format_duration
+from ipsys_log.units import NS_PER_S, format_bytes, format_duration
 
-__all__ = ["SHORT_S", "DiskRoom", "expected_bytes_per_s", "free_room"]
+__all__ = [
+    "SHORT_S",
+    "SYNC_EVERY_S",
+    "Confirm",
+    "DiskRoom",
+    "Syncer",
+    "disk_fault",
+    "expected_bytes_per_s",
+    "free_room",
+    "reserve",
+    "reserved_bytes",
+    "what_failed",
+    "what_fitted",
+]
+
+# Data lost in a power cut, plus the second that waits to be written and the duration of a sync.
+SYNC_EVERY_S = 2.0
+# After an interrupt, a hanging disk delays the end by at most this time.
+_LAST_S = 1.0
+
+# Called when the data written before are on the disk, or with the error of the disk.
+Confirm = Callable[[OSError | None], None]
+
+
+class Syncer:
+    """A thread that syncs a file every few seconds, and at once on request. A context manager.
+
+    The writing thread never waits for it: a long sync only delays the next one.
+
+    Parameters
+    ----------
+    sync : syncs the data written before the call.
+    every_s : time from the end of a sync to the begin of the next.
+
+    Attributes
+    ----------
+    fault : the error of the first failed sync: data written before it may be lost.
+    """
+
+    def __init__(self, sync: Callable[[], None], every_s: float = SYNC_EVERY_S) -> None:
+        self.fault: OSError | None = None
+        self._sync, self._every_s = sync, every_s
+        self._asked: list[Confirm] = []
+        self._ended = False
+        self._changed = threading.Condition()
+        self._thread = threading.Thread(target=self._run, name="syncer", daemon=True)
+
+    def __enter__(self) -> Syncer:
+        self._thread.start()
+        return self
+
+    def __exit__(
+        self, kind: type[BaseException] | None, error: BaseException | None, trace: TracebackType | None
+    ) -> None:
+        with self._changed:
+            self._ended = True
+            self._changed.notify()
+        self._thread.join(_LAST_S if isinstance(error, KeyboardInterrupt) else None)
+
+    def soon(self, confirm: Confirm) -> None:
+        """Sync at once, or after the running sync, and ``confirm`` it from the thread."""
+        with self._changed:
+            self._asked.append(confirm)
+            self._changed.notify()
+
+    def _run(self) -> None:
+        while True:
+            with self._changed:
+                self._changed.wait_for(lambda: self._asked or self._ended, self._every_s)
+                asked, self._asked = self._asked, []
+                if self._ended and not asked:
+                    return
+            fault: OSError | None = None
+            try:
+                self._sync()
+            except OSError as error:
+                fault = error
+                self.fault = self.fault or error
+            for confirm in asked:
+                confirm(fault)
+
+
+# Set aside on the disk, so that a log can be finished when the disk is full: what waits is written and looked
+# at, and the table of contents, which has some MB after some hours, is written twice. On a small disk half.
+_RESERVE_BYTES = 64 << 20
+
+
+def reserved_bytes(free_bytes: int) -> int:
+    """Return the part of the free bytes on a disk that is reserved for the end of a log."""
+    return min(_RESERVE_BYTES, free_bytes // 2)
+
+
+@contextmanager
+def reserve(path: Path) -> Iterator[Callable[[], None]]:
+    """Reserve disk space in an unnamed file; call the yielded function to release it."""
+    with ExitStack() as held:
+        with suppress(OSError):  # a file system that cannot, or a disk that is full already
+            if hasattr(os, "O_TMPFILE"):
+                fd = os.open(path.parent, os.O_TMPFILE | os.O_RDWR)
+                held.callback(os.close, fd)
+                os.posix_fallocate(fd, 0, reserved_bytes(shutil.disk_usage(path.parent).free))
+        yield held.close
+
+
+def what_fitted(path: Path, error: WriteError) -> str:
+    """Describe a log that ended because the disk was full or failed."""
+    try:
+        with LogReader(path) as log:
+            count, seconds = log.message_count, ((log.end_ns or 0) - (log.start_ns or 0)) / NS_PER_S
+    except LogError:
+        return str(error)
+    what = "the disk is full" if is_full(error.cause) else disk_fault(error.cause)
+    then = "Free some space, or record to another disk" if is_full(error.cause) else "Record to another disk"
+    size = format_bytes(path.stat().st_size)
+    return (
+        f"{path}: {what}; recording has stopped, and the log is complete up to then: "
+        f"{count} messages, {seconds:.1f} s, {size}. {then}"
+    )
+
+
+def what_failed(path: Path, fault: OSError) -> str:
+    """Describe what to do with a log that may be incomplete on a failed disk."""
+    return (
+        f"{path}: {disk_fault(fault)} during the recording; messages may be lost. To check the log: "
+        f"ipsys repair {path}. Record to another disk"
+    )
+
+
+def disk_fault(fault: OSError) -> str:
+    """Describe a fault of the disk."""
+    return f"the disk has failed ({fault.strerror})"
+
 
 # Warn of a disk that lasts no longer.
 SHORT_S = 600.0

@@ -5,8 +5,8 @@ from __future__ import annotations
 from collections import deque
 from types import TracebackType
 
+from ipsys_log.capture.disk import Confirm
 from ipsys_log.capture.recorder import Recording
-from ipsys_log.capture.syncer import Confirm
 from ipsys_log.errors import WriteError
 from ipsys_log.messages import FRAME_SKIPPED, CompressedImage, Event, Measurement, Message
 from ipsys_log.units import NS_PER_S

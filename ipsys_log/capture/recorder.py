@@ -11,13 +11,11 @@ from functools import partial
 from pathlib import Path
 from typing import Protocol
 
-from ipsys_log.capture.full_disk import disk_fault, reserve, what_failed, what_fitted
-from ipsys_log.capture.syncer import Confirm, Syncer
+from ipsys_log.capture.disk import Confirm, Syncer, disk_fault, reserve, what_failed, what_fitted
 from ipsys_log.errors import IpsysError, LogError, WriteError, is_full
 from ipsys_log.geometry.lenses import scale_lens
-from ipsys_log.log.journal import roll_back
+from ipsys_log.log.journal import DISK, roll_back
 from ipsys_log.log.lock import open_locked
-from ipsys_log.log.storage import DISK
 from ipsys_log.log.writer import LogWriter
 from ipsys_log.messages import (
     RIG_TOPIC,

@@ -13,17 +13,15 @@ from typing import NamedTuple
 from urllib.parse import parse_qsl, urlencode
 
 from ipsys_log.calibration.board import Board, parse_board
-from ipsys_log.capture.asked import Given, say_refused
-from ipsys_log.capture.frames import Clock, Frame, Say
+from ipsys_log.capture.frames import Clock, Frame, Given, Say, say_refused
 from ipsys_log.errors import IpsysError
 from ipsys_log.messages import CameraCalibration, RigCamera
 from ipsys_log.simulation.board import board_cells
 from ipsys_log.simulation.cameras import hang_cameras
-from ipsys_log.simulation.film import Film, board_film, lab_film, next_missing
 from ipsys_log.simulation.floor import Check
-from ipsys_log.simulation.live_lab import LIVE_SETTINGS
+from ipsys_log.simulation.live_lab import LIVE_SETTINGS, Film, board_film, lab_film, next_missing
+from ipsys_log.simulation.pixel_shares import exposed
 from ipsys_log.simulation.settings import LabSettings
-from ipsys_log.simulation.shutter import exposed
 from ipsys_log.units import NS_PER_S
 
 __all__ = ["Seat", "lens_of", "open_simulated", "parse_source", "show_board"]

@@ -1,16 +1,170 @@
-"""The cameras attached to this machine, and where on USB they hang, as sysfs has it."""
+"""The cameras attached to this machine, and where on USB they hang, as sysfs has it.
+
+Whether the cameras on a USB bus ask for more than it carries, and what would fit.
+"""
 
 from __future__ import annotations
 
+import math
 import os
-from collections.abc import Iterator
+from collections import defaultdict
+from collections.abc import Callable, Iterator, Sequence
 from contextlib import suppress
 from pathlib import Path
 from typing import NamedTuple
 
 from ipsys_log.capture import v4l2
+from ipsys_log.capture.frames import device_of
+from ipsys_log.messages import Rig, RigCamera
 
-__all__ = ["Attached", "Mode", "Plug", "find_cameras", "list_modes"]
+__all__ = ["Attached", "Demand", "Mode", "Plug", "advise", "demands_of", "find_cameras", "list_modes"]
+
+# USB 2 gives at most 80 % of a microframe of 125 us to transfers at fixed times (USB 2.0, 5.6.4): of the 7500
+# bytes that 480 Mbit/s are, 6000.
+_MICROFRAMES_PER_S = 8000
+_CARRIES = 6000
+_USB_2_MBIT_S = 480
+# A packet takes so many bytes more on the wire (USB 2.0, 5.6.3), and holds at most so many of its own.
+_HEAD = 38
+_PACKET = 1024
+# JPEG of a busy scene at the quality cameras use takes up to 2 bit per pixel; other formats, bytes per pixel.
+_JPEG_BYTES_PER_PX = 0.25
+_BYTES_PER_PX = {"YUYV": 2.0, "UYVY": 2.0, "NV12": 1.5, "GREY": 1.0}
+_RATES_HZ = (60, 30, 25, 20, 15, 10, 5)
+_SIZES = (
+    (1920, 1080),
+    (1600, 1200),
+    (1280, 960),
+    (1280, 720),
+    (1024, 768),
+    (800, 600),
+    (640, 480),
+    (640, 360),
+)
+
+
+class Demand(NamedTuple):
+    """A camera as it is to run.
+
+    ``bus`` is the number of its USB bus; ``hub`` says what it is plugged into; ``most`` is how many bytes it
+    can reserve in each microframe, as its descriptors tell.
+    """
+
+    camera: str
+    bus: int
+    speed_mbit_s: float
+    hub: str
+    format: str
+    width: int
+    height: int
+    rate_hz: float
+    most: int = 3 * _PACKET
+
+
+def demands_of(attached: Sequence[Attached], rig: Rig | None) -> list[Demand]:
+    """What the cameras on USB will ask for: what the rig says or, without one, each its largest JPEG mode.
+
+    Parameters
+    ----------
+    attached : from :func:`~ipsys_log.capture.usb_bus.find_cameras`.
+    rig : only its cameras are to run, where it is given.
+    """
+    wanted: list[tuple[Attached, str, RigCamera | None]]
+    if rig is None:
+        wanted = [(camera, camera.device, None) for camera in attached]
+    else:
+        by_path = {Path(camera.device).resolve(): camera for camera in attached}
+        named = [camera for camera in rig.cameras if (camera.source or "").startswith("usb:")]
+        paths = ((camera, Path(device_of(camera.source or "")).resolve()) for camera in named)
+        wanted = [(by_path[path], camera.name, camera) for camera, path in paths if path in by_path]
+    demands = []
+    for camera, name, asked in wanted:
+        modes = [mode for mode in camera.modes if mode.format in ("MJPG", "JPEG")] or camera.modes
+        if camera.plug is None or not modes:
+            continue
+        mode = max(modes, key=lambda mode: (mode.width * mode.height, mode.rate_hz))
+        width, height = (asked.width, asked.height) if asked else (None, None)
+        rate_hz = (asked.rate_hz if asked else None) or mode.rate_hz
+        bus, _, speed_mbit_s, hub, most = camera.plug
+        size = (width or mode.width, height or mode.height)
+        demands.append(Demand(name, bus, speed_mbit_s, hub, mode.format, *size, rate_hz, most))
+    return demands
+
+
+def advise(demands: Sequence[Demand]) -> list[str]:
+    """A line for each bus that its cameras may ask too much of: who, where, how much, and what would fit.
+
+    Many cameras reserve as much as they can, whatever they send; that these may not start is said too.
+
+    Parameters
+    ----------
+    demands : all cameras that are to run at once.
+
+    Examples
+    --------
+    >>> three = [Demand(name, 1, 480, "a hub", "MJPG", 1920, 1080, 30.0) for name in ("a", "b", "c")]
+    >>> print(advise(three)[0])
+    cameras a, b and c share USB bus 1 (a hub) and need 48.5 MB/s of its 48: plug one into another bus, or ask for 25 frames/s of each, or for 1600 x 1200 px
+    """  # noqa: E501
+    by_bus = defaultdict(list)
+    for demand in demands:
+        if demand.speed_mbit_s <= _USB_2_MBIT_S:
+            by_bus[demand.bus].append(demand)
+    lines = (_explain(bus, shared) for bus, shared in sorted(by_bus.items()))
+    return [line for line in lines if line]
+
+
+def _explain(bus: int, shared: Sequence[Demand]) -> str | None:
+    *names, last = sorted(demand.camera for demand in shared)
+    hubs = ", ".join(sorted({demand.hub for demand in shared}))
+    who = f"cameras {', '.join(names)} and {last} share" if names else f"camera {last} is alone on"
+    needed, most = (_wire_bytes(shared, each) for each in (_needed, lambda demand: demand.most))
+    carries = f"MB/s of its {_CARRIES * _MICROFRAMES_PER_S / 1e6:.0f}"
+    if needed > _CARRIES:
+        ways = ["plug one into another bus"] if names else []
+        ways += _smaller(shared)
+        wanted = f"need {_mb_s(needed)}" if names else f"needs {_mb_s(needed)}"
+        return f"{who} USB bus {bus} ({hubs}) and {wanted} {carries}: {', or '.join(ways)}"
+    if names and most > _CARRIES:
+        return (
+            f"{who} USB bus {bus} ({hubs}) and may reserve {_mb_s(most)} {carries}: "
+            "if one of them does not start, plug it into another bus"
+        )
+    return None
+
+
+def _mb_s(per_microframe: int) -> str:
+    return f"{per_microframe * _MICROFRAMES_PER_S / 1e6:.1f}"
+
+
+def _smaller(shared: Sequence[Demand]) -> list[str]:
+    """The highest rate, and the largest size, at which all would fit; and a format that takes less."""
+    ways = []
+    for rate_hz in _RATES_HZ:
+        slower = [demand._replace(rate_hz=min(rate_hz, demand.rate_hz)) for demand in shared]
+        if _wire_bytes(slower, _needed) <= _CARRIES:
+            ways.append(f"ask for {rate_hz} frames/s" + (" of each" if len(shared) > 1 else ""))
+            break
+    largest = max(demand.width * demand.height for demand in shared)
+    for width, height in _SIZES:
+        less = [demand._replace(width=width, height=height) for demand in shared]
+        if width * height < largest and _wire_bytes(less, _needed) <= _CARRIES:
+            ways.append(f"{'' if ways else 'ask '}for {width} x {height} px")
+            break
+    if any(demand.format in _BYTES_PER_PX for demand in shared):
+        ways.append("take a camera that gives MJPG")
+    return ways
+
+
+def _needed(demand: Demand) -> int:
+    per_px = _BYTES_PER_PX.get(demand.format, _JPEG_BYTES_PER_PX)
+    return math.ceil(demand.width * demand.height * demand.rate_hz * per_px / _MICROFRAMES_PER_S)
+
+
+def _wire_bytes(shared: Sequence[Demand], own: Callable[[Demand], int]) -> int:
+    """Bytes of a microframe that cameras take up on the wire, with the packets' heads."""
+    return sum(own(demand) + _HEAD * math.ceil(own(demand) / _PACKET) for demand in shared)
+
 
 _INTERFACE, _ENDPOINT = 4, 5
 _VIDEO_STREAMING = (14, 2)

@@ -10,7 +10,7 @@ from typing import TYPE_CHECKING
 import simplejpeg
 
 from ipsys_log.capture.frames import Frame, SourceError
-from ipsys_log.images.picture_size import MOST_PIXELS
+from ipsys_log.images.decode import MOST_PIXELS
 
 if TYPE_CHECKING:
     from av.container import InputContainer

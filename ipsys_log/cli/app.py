@@ -1,6 +1,11 @@
-"""All commands."""
+"""All commands.
+
+Additional help texts: the order of the commands, and examples.
+"""
 
 from __future__ import annotations
+
+from inspect import cleandoc
 
 import typer
 
@@ -20,8 +25,122 @@ from ipsys_log.cli import (
     stages,
     view,
 )
-from ipsys_log.cli.guide import arrange
 from ipsys_log.cli.signals import interruptible
+
+__all__ = ["EXAMPLES", "PANELS", "arrange"]
+
+# The commands as ``ipsys --help`` lists them.
+PANELS: dict[str, tuple[str, ...]] = {
+    "The first day, in this order": (
+        *("init", "markers", "cameras", "calibrate", "align", "record", "measure", "replay", "live"),
+    ),
+    "How good it is, and where to measure next": ("evaluate", "plan", "report"),
+    "Look into a log": ("info", "runs", "view", "verify", "diff", "latency", "repair"),
+    "The stages of replay, one by one": ("detect", "camera-frame", "fit", "locate", "fuse"),
+    "Without cameras of your own": ("simulate", "import"),
+}
+
+# Each line is a command and what it is for; at most 76 columns.
+EXAMPLES: dict[str, str] = {
+    "init": """
+ipsys init lab.toml                      # an example with comments
+ipsys init lab.toml --from monday.mcap   # the rig that a log holds
+ipsys init lab.toml --simulated          # to try all commands
+""",
+    "markers": """
+ipsys markers --rig lab.toml                # all markers of the rig
+ipsys markers --ids 0-11 --length 0.08 --page letter
+ipsys markers --board 6x4 -o board.pdf      # for ipsys calibrate
+""",
+    "cameras": """
+ipsys cameras                    # a source for lab.toml, for each camera
+ipsys cameras --rig lab.toml     # can USB carry what it asks for?
+""",
+    "calibrate": """
+ipsys calibrate photos/red --board 6x4              # a folder: red.yaml
+ipsys calibrate --rig lab.toml --board 6x4          # what cameras send now
+ipsys calibrate red.mp4 --board charuco:4x5 --camera red --plot red.png
+""",
+    "align": """
+ipsys align --rig lab.toml                     # what the cameras see now
+ipsys align monday.mcap --plot alignment.png   # of a log, with a picture
+""",
+    "record": """
+ipsys record -o monday.mcap                      # the cameras of lab.toml
+ipsys record -o calibration.mcap --measure       # and enter the tape
+ipsys record -o calibration.mcap --measure --host 0.0.0.0    # by phone
+ipsys record -o short.mcap --camera red --seconds 10
+""",
+    "measure": """
+ipsys measure --rig lab.toml -o cal.mcap --host 0.0.0.0    # by phone, now
+ipsys measure calibration.mcap                     # in a finished log
+ipsys measure calibration.mcap --terminal          # here, no page
+ipsys measure calibration.mcap --csv places.csv    # from a sheet
+""",
+    "replay": """
+ipsys replay calibration.mcap                      # fit and evaluate poly
+ipsys replay calibration.mcap --model best --plot floor.png
+ipsys replay monday.mcap --model-from calibration.mcap
+ipsys replay calibration.mcap --rig lab.toml       # with a mended rig
+""",
+    "live": """
+ipsys live --model-from calibration.mcap -o monday.mcap
+ipsys live --model-from calibration.mcap --model best --view -o b.mcap
+""",
+    "evaluate": """
+ipsys evaluate calibration.mcap                    # all models
+ipsys evaluate calibration.mcap --details          # and all figures
+ipsys evaluate calibration.mcap --model poly --model best --plots figures
+""",
+    "plan": """
+ipsys plan calibration.mcap --places 5 --plot next.png
+""",
+    "report": """
+ipsys report calibration.mcap                      # calibration.html
+""",
+    "info": """
+ipsys info monday.mcap
+""",
+    "verify": """
+ipsys verify monday.mcap                           # all of its runs
+""",
+    "diff": """
+ipsys diff monday.mcap tuesday.mcap
+ipsys diff monday.mcap --run poly --run best
+""",
+    "latency": """
+ipsys latency monday.mcap --plot latency.pdf
+""",
+    "repair": """
+ipsys repair monday.mcap
+""",
+    "simulate": """
+ipsys simulate -o lab.mcap --stations 25 --frames-per-station 2 --drive-s 4
+""",
+}
+
+
+def arrange(app: typer.Typer) -> None:
+    """Put the commands into their panels, in this order, and the examples below their help."""
+    order = [name for names in PANELS.values() for name in names]
+    panel_of = {name: panel for panel, names in PANELS.items() for name in names}
+    for command in app.registered_commands:
+        assert command.callback is not None
+        command.name = command.name or command.callback.__name__
+        command.rich_help_panel = panel_of[command.name]
+        command.help = _unwrapped(command.help or command.callback.__doc__ or "")
+        if command.name in EXAMPLES:
+            lines = EXAMPLES[command.name].strip().splitlines()
+            command.epilog = "Examples\n\n" + "\n".join(f"    {line}" for line in lines)
+    app.registered_commands.sort(key=lambda command: order.index(str(command.name)))
+    for group in app.registered_groups:
+        group.rich_help_panel = panel_of[str(group.name)]
+
+
+def _unwrapped(text: str) -> str:
+    """A help whose paragraphs are one line each: the window breaks them."""
+    return "\n\n".join(" ".join(one.split()) for one in cleandoc(text).split("\n\n"))
+
 
 app = typer.Typer(
     name="ipsys",

@@ -16,8 +16,7 @@ from ipsys_log.cli.options import AsJson
 from ipsys_log.cli.signals import note_kept, say_kept
 
 if TYPE_CHECKING:
-    from ipsys_log.calibration.calibrate import Calibrated
-    from ipsys_log.calibration.cameras import Failure
+    from ipsys_log.calibration.calibrate import Calibrated, Failure
 
 __all__ = ["add_commands"]
 
@@ -114,11 +113,10 @@ def calibrate(
     result, the files of the others are written, and the exit code is 1. Sharp, different pictures are
     selected automatically; two dozen with the board in all parts of the image are enough."""
     from ipsys_log.calibration.board import parse_board
-    from ipsys_log.calibration.calibrate import Calibrated
-    from ipsys_log.calibration.cameras import calibrate_cameras
+    from ipsys_log.calibration.calibrate import Calibrated, calibrate_cameras
     from ipsys_log.calibration.images import find_sources
     from ipsys_log.calibration.lens_models import find_lens
-    from ipsys_log.exchange.calibration_yaml import check_format
+    from ipsys_log.exchange.calibration_files import check_format
     from ipsys_log.report.files import check_picture
 
     model = find_lens(lens)
@@ -158,7 +156,7 @@ def _print_outcomes(
     for_rig: bool,
 ) -> None:
     """Print the results, then a line for each camera without one; exit with 1 if one is missing."""
-    from ipsys_log.calibration.cameras import Failure
+    from ipsys_log.calibration.calibrate import Failure
     from ipsys_log.errors import IpsysError
 
     failures = [outcome for outcome in outcomes if isinstance(outcome, Failure)]
@@ -179,7 +177,7 @@ def _print_outcomes(
 
 
 def _json(outcome: Calibrated | Failure, targets: dict[str, dict[str, Path]]) -> dict[str, Any]:
-    from ipsys_log.calibration.cameras import Failure
+    from ipsys_log.calibration.calibrate import Failure
     from ipsys_log.report.calibration import calibration_json
 
     if isinstance(outcome, Failure):
@@ -214,7 +212,7 @@ def _taken_now(lab: Lab, seconds: float) -> Iterator[list[Path]]:
 def _targets(cameras: list[str], output: Path, formats: list[str], force: bool) -> dict[str, dict[str, Path]]:
     """Return the path of the file of each camera and format; raise if it cannot be written."""
     from ipsys_log.errors import IpsysError
-    from ipsys_log.exchange.calibration_yaml import FORMATS
+    from ipsys_log.exchange.calibration_files import FORMATS
     from ipsys_log.report.files import check_file, check_folder
 
     if output.suffix.lower() in (".yaml", ".yml"):
@@ -246,7 +244,7 @@ def _check_free(path: Path, force: bool) -> None:
 
 def _write(one: Calibrated, paths: dict[str, Path]) -> None:
     """Write the files of a camera, one for each format."""
-    from ipsys_log.exchange.calibration_yaml import FORMATS
+    from ipsys_log.exchange.calibration_files import FORMATS
     from ipsys_log.report.files import write_files
 
     comment = (
@@ -261,7 +259,7 @@ def _write(one: Calibrated, paths: dict[str, Path]) -> None:
 
 
 def _draw(lenses: list[Calibrated], plot: Path) -> None:
-    from ipsys_log.report.calibration_figure import calibration_figure
+    from ipsys_log.report.calibration import calibration_figure
     from ipsys_log.report.figures import picture
     from ipsys_log.report.files import write_files
 

@@ -36,7 +36,7 @@ def cameras(
     """List the cameras attached by USB: device, modes, bus and hub; and whether USB carries them all at once.
 
     Without a rig that is reckoned with each at its largest mode. Cameras on the network are not listed."""
-    from ipsys_log.capture.bandwidth import advise, demands_of
+    from ipsys_log.capture.usb_bus import advise, demands_of
     from ipsys_log.errors import IpsysError
     from ipsys_log.rig.file import load_rig
 

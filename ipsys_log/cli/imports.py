@@ -55,8 +55,7 @@ def images(
 ) -> None:
     """A folder of pictures, one sub-folder per camera; without --times the n-th of each belong together."""
     from ipsys_log.cli.options import load_calibrations, load_matching_rig
-    from ipsys_log.exchange.image_folders import find_pictures, read_images
-    from ipsys_log.exchange.picture_times import find_times
+    from ipsys_log.exchange.image_folders import find_pictures, find_times, read_images
     from ipsys_log.runs.output import write_log
 
     _refuse_log(folder)
@@ -85,7 +84,7 @@ def videos(
     """Videos that begin at one instant. MJPEG, H.264 and H.265 go into the log as they are."""
     from ipsys_log.capture.video_files import read_videos
     from ipsys_log.cli.options import load_calibrations, load_matching_rig
-    from ipsys_log.exchange.picture_times import parse_start
+    from ipsys_log.exchange.image_folders import parse_start
     from ipsys_log.runs.output import write_log
 
     for option in files:

@@ -222,7 +222,7 @@ def _show_next(log: Path, history: Sequence[Measurement]) -> None:
 
 
 def _show_places(scene: FinishedLog, as_json: bool) -> None:
-    from ipsys_log.report.stops import stops_json, stops_table
+    from ipsys_log.report.contents import stops_json, stops_table
 
     found = stops_json(scene)
     if as_json:

@@ -87,7 +87,7 @@ def prepared(
 
 
 def _files(rig: Path, cameras: list[RigCamera], calibration: list[str] | None) -> list[tuple[str, Path]]:
-    from ipsys_log.capture.played import file_of
+    from ipsys_log.capture.video_files import file_of
 
     found = [("a calibration", Path(one.rpartition("=")[2])) for one in calibration or ()]
     for one in cameras:
@@ -112,9 +112,8 @@ def check_target(output: Path, force: bool, files: Iterable[tuple[str, Path]]) -
         ``force``, if another process is writing it.
     """
     from ipsys_log.errors import IpsysError
-    from ipsys_log.log.journal import journal_path
+    from ipsys_log.log.journal import DISK, journal_path
     from ipsys_log.log.lock import check_free, check_locks, open_locked
-    from ipsys_log.log.storage import DISK
     from ipsys_log.report.files import check_file
 
     try:

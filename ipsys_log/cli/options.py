@@ -237,8 +237,8 @@ def load_lab(
 
 def cameras_of(logs: list[Path]) -> set[str]:
     """The cameras that logs have frames or anything derived of."""
+    from ipsys_log.log.contents import camera_of_topic
     from ipsys_log.log.dataset import Session
-    from ipsys_log.log.topics import camera_of_topic
 
     with Session(logs) as session:
         derived = {camera_of_topic(topic) for reader in session.readers for topic in reader.channels}

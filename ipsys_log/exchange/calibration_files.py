@@ -1,16 +1,217 @@
-"""A lens out of whatever file a user has it in: a calibration of OpenCV or ROS, or a log."""
+"""A lens out of whatever file a user has it in: a calibration of OpenCV or ROS, or a log.
+
+Camera calibrations in OpenCV's FileStorage format, as the authors publish theirs, or in that of ROS.
+
+Lenses as the files that OpenCV, ROS and Kalibr read.
+"""
 
 from __future__ import annotations
 
+from collections.abc import Callable, Iterable, Mapping
 from dataclasses import replace
 from pathlib import Path
 
+import cv2
+import numpy as np
+from numpy.typing import NDArray
+
 from ipsys_log.errors import IpsysError
-from ipsys_log.exchange.opencv_yaml import read_opencv_calibration
+from ipsys_log.geometry.lenses import check_calibration
 from ipsys_log.log.dataset import Session
 from ipsys_log.messages import CameraCalibration
 
-__all__ = ["read_lens"]
+__all__ = [
+    "FORMATS",
+    "check_format",
+    "kalibr_yaml",
+    "opencv_yaml",
+    "read_lens",
+    "read_opencv_calibration",
+    "ros_yaml",
+]
+
+# Names under which programs write the camera matrix, the coefficients and the size.
+_K = ("mtx", "camera_matrix", "K", "cameraMatrix", "Camera_Matrix")
+_D = ("dist", "distortion_coefficients", "D", "distCoeffs", "dist_coeff", "Distortion_Coefficients")
+_WIDTH, _HEIGHT = ("img_width", "image_width", "width"), ("img_height", "image_height", "height")
+_LARGEST_FILE = 1 << 20  # bytes
+_MOST_BRACKETS = 1_000
+_MOST_NUMBERS = 100
+_WIDEST_PX = 65_535
+_MODEL_OF_NAME = {"equidistant": "kannala_brandt", "fisheye": "kannala_brandt", "": ""}
+_MODEL_OF_COUNT = {4: "kannala_brandt", 5: "plumb_bob", 8: "rational_polynomial"}
+
+
+def read_opencv_calibration(path: Path, camera: str, time_ns: int = 0) -> CameraCalibration:
+    """Read intrinsics from a FileStorage YAML, XML or JSON file, or a ``camera_info`` YAML of ROS.
+
+    The file names the distortion model. If it does not, four coefficients are those of the fisheye (k1..k4),
+    five and eight those of the pinhole.
+
+    Raises
+    ------
+    IpsysError
+        The file cannot be read, or lacks the matrix, the coefficients or the image size.
+    """
+    if not path.is_file():
+        raise IpsysError(f"{path}: there is no such calibration file; 'ipsys calibrate' writes one")
+    try:
+        storage = cv2.FileStorage(_as_file_storage(path), cv2.FILE_STORAGE_READ | cv2.FILE_STORAGE_MEMORY)
+        k, d = _read_matrix(storage, _K), _read_matrix(storage, _D)
+        width, height = _number(storage, _WIDTH), _number(storage, _HEIGHT)
+        named = _text(storage, "distortion_model")
+    except OSError as error:
+        raise IpsysError(f"{path}: cannot be read: {error.strerror}") from error
+    except (cv2.error, SystemError, ValueError) as error:
+        raise IpsysError(f"{path}: is not a calibration in OpenCV's YAML format") from error
+    if k is None or d is None or k.size != 9 or not width or not height:
+        raise IpsysError(f"{path}: lacks the camera matrix, the distortion coefficients or the image size")
+    if width < 0 or height < 0:
+        raise IpsysError(f"{path}: its image width or height must be 1 to {_WIDEST_PX} pixels")
+    model = _MODEL_OF_NAME.get(named, named) or _MODEL_OF_COUNT.get(d.size, f"with {d.size} coefficients")
+    if model == "plumb_bob" and d.size == 4:
+        d = np.append(d, 0.0)  # k3 is often left out
+    lens = CameraCalibration(time_ns, camera, width, height, model, d.reshape(-1), k.reshape(3, 3))
+    return check_calibration(lens, str(path))
+
+
+def _as_file_storage(path: Path) -> str:
+    """Add the first line that OpenCV requires in YAML; ROS does not write it."""
+    if path.stat().st_size > _LARGEST_FILE:
+        raise ValueError("too large")
+    text = path.read_text(encoding="utf-8")
+    # OpenCV's reader is recursive for each level, without a limit.
+    if sum(map(text.count, "[{<")) > _MOST_BRACKETS or "\0" in text:
+        raise ValueError("too many levels")
+    is_yaml = path.suffix.lower() in (".yaml", ".yml")
+    return text if not is_yaml or text.startswith("%YAML") else f"%YAML:1.0\n---\n{text}"
+
+
+def _read_matrix(storage: cv2.FileStorage, names: tuple[str, ...]) -> NDArray[np.float64] | None:
+    for name in names:
+        node = storage.getNode(name)
+        data = node.getNode("data") if node.isMap() else node
+        if data.isSeq() and data.size() <= _MOST_NUMBERS:
+            return np.array([data.at(i).real() for i in range(data.size())])
+        if node.isMap():
+            # OpenCV allocates the size that the file states.
+            rows, columns = (node.getNode(key).real() for key in ("rows", "cols"))
+            if not (0 < rows <= _MOST_NUMBERS and 0 < columns <= _MOST_NUMBERS):
+                raise ValueError("a matrix of another size")
+            return np.asarray(node.mat(), dtype=np.float64)
+    return None
+
+
+def _number(storage: cv2.FileStorage, names: tuple[str, ...]) -> int:
+    for name in names:
+        node = storage.getNode(name)
+        if not node.empty():
+            size_px = node.real() if node.isInt() or node.isReal() else 0.0
+            return int(size_px) if 0 < size_px <= _WIDEST_PX else -1
+    return 0
+
+
+def _text(storage: cv2.FileStorage, name: str) -> str:
+    node = storage.getNode(name)
+    return str(node.string()) if node.isString() else ""
+
+
+def opencv_yaml(lens: CameraCalibration, sigmas: Mapping[str, float], comment: str) -> str:
+    """A FileStorage YAML: matrix, coefficients, image size, and the standard deviations by name.
+
+    Parameters
+    ----------
+    lens : what is written.
+    sigmas : by name of the parameter, fx to the last coefficient.
+    comment : for the first lines.
+    """
+    known = [f"   {name}: {value!r}" for name, value in sigmas.items()]
+    lines = [
+        "%YAML:1.0",
+        "---",
+        *(f"# {line}" for line in comment.splitlines()),
+        f"image_width: {lens.width}",
+        f"image_height: {lens.height}",
+        f"camera_name: {lens.frame_id}",
+        *_matrix("camera_matrix", 3, 3, lens.K.ravel(), tag=True),
+        f"distortion_model: {lens.distortion_model}",
+        *_matrix("distortion_coefficients", lens.D.size, 1, lens.D, tag=True),
+        "# One standard deviation of each; 0 was not fitted.",
+        "standard_deviations:",
+        *known,
+    ]
+    return "\n".join(lines) + "\n"
+
+
+def ros_yaml(lens: CameraCalibration, sigmas: Mapping[str, float], comment: str) -> str:  # noqa: ARG001
+    """A ``camera_info`` YAML; ROS calls the fisheye ``equidistant``."""
+    model = "equidistant" if lens.distortion_model == "kannala_brandt" else lens.distortion_model
+    projection = np.column_stack([lens.K, np.zeros(3)])
+    lines = [
+        *(f"# {line}" for line in comment.splitlines()),
+        f"image_width: {lens.width}",
+        f"image_height: {lens.height}",
+        f"camera_name: {lens.frame_id}",
+        *_matrix("camera_matrix", 3, 3, lens.K.ravel()),
+        f"distortion_model: {model}",
+        *_matrix("distortion_coefficients", 1, lens.D.size, lens.D),
+        *_matrix("rectification_matrix", 3, 3, np.eye(3).ravel()),
+        *_matrix("projection_matrix", 3, 4, projection.ravel()),
+    ]
+    return "\n".join(lines) + "\n"
+
+
+def kalibr_yaml(lens: CameraCalibration, sigmas: Mapping[str, float], comment: str) -> str:  # noqa: ARG001
+    """A ``camchain`` YAML of one camera; :func:`check_format` says which lenses Kalibr has."""
+    fisheye = lens.distortion_model == "kannala_brandt"
+    intrinsics = [lens.K[0, 0], lens.K[1, 1], lens.K[0, 2], lens.K[1, 2]]
+    lines = [
+        *(f"# {line}" for line in comment.splitlines()),
+        "cam0:",
+        "  camera_model: pinhole",
+        f"  intrinsics: {_row(intrinsics)}",
+        f"  distortion_model: {'equidistant' if fisheye else 'radtan'}",
+        f"  distortion_coeffs: {_row(lens.D[:4])}",
+        f"  resolution: [{lens.width}, {lens.height}]",
+        f"  rostopic: /cameras/{lens.frame_id}/image",
+        "  cam_overlaps: []",
+    ]
+    return "\n".join(lines) + "\n"
+
+
+# By the name a user gives: what writes it, and what is added to the name of the camera.
+FORMATS: dict[str, tuple[Callable[[CameraCalibration, Mapping[str, float], str], str], str]] = {
+    "opencv": (opencv_yaml, ""),
+    "ros": (ros_yaml, "_ros"),
+    "kalibr": (kalibr_yaml, "_kalibr"),
+}
+
+
+def check_format(name: str, lens_name: str) -> None:
+    """See that there is such a format and that it has the kind of lens, ``fisheye``, ``pinhole4`` ...
+
+    Raises
+    ------
+    IpsysError
+        Otherwise.
+    """
+    if name not in FORMATS:
+        raise IpsysError(f"--format {name}: there is no such format; use one of {', '.join(FORMATS)}")
+    if name == "kalibr" and lens_name not in ("fisheye", "pinhole4"):
+        raise IpsysError(
+            f"--format kalibr: Kalibr has four coefficients, --lens {lens_name} has more; "
+            "use --lens fisheye or --lens pinhole4"
+        )
+
+
+def _matrix(name: str, rows: int, columns: int, values: Iterable[float], tag: bool = False) -> list[str]:
+    first = [f"{name}: !!opencv-matrix", f"   rows: {rows}", f"   cols: {columns}", "   dt: d"]
+    plain = [f"{name}:", f"   rows: {rows}", f"   cols: {columns}"]
+    return [*(first if tag else plain), f"   data: {_row(values)}"]
+
+
+def _row(values: Iterable[float]) -> str:
+    return f"[{', '.join(repr(float(value)) for value in values)}]"
 
 
 def read_lens(path: Path, camera: str) -> CameraCalibration:

@@ -1,9 +1,15 @@
-"""Folders of pictures as a source of frames."""
+"""Folders of pictures as a source of frames.
+
+When pictures were taken: from their names, or from a table.
+"""
 
 from __future__ import annotations
 
+import csv
 import re
 from collections.abc import Iterator, Mapping
+from datetime import UTC, datetime
+from decimal import Decimal, InvalidOperation
 from pathlib import Path
 
 from ipsys_log.errors import IpsysError
@@ -19,7 +25,114 @@ from ipsys_log.messages import (
 from ipsys_log.rig.file import check_name
 from ipsys_log.units import NS_PER_S
 
-__all__ = ["FORMATS", "find_pictures", "read_images"]
+__all__ = ["FORMATS", "find_pictures", "find_times", "parse_start", "parse_time", "read_images"]
+
+NAMES = "names"
+_COLUMNS = ("file", "time")
+# A whole number says by its length what it counts: seconds since 1970 have 10 digits until 2286.
+_DIGITS = {19: 1, 16: 1_000, 13: 1_000_000, 10: NS_PER_S}
+# In the names of files there are no colons.
+_ISO = re.compile(r"(\d{4}-\d\d-\d\d)[T_ ](\d\d)[:.-](\d\d)[:.-](\d\d)([.,]\d{1,9})?(Z|[+-]\d\d:?\d\d)?")
+
+
+def parse_time(text: str) -> int:
+    """Return a time in ns since 1970: from ns, us, ms or s since then, or ISO 8601 (UTC by default).
+
+    Raises
+    ------
+    ValueError
+        The text is none of these.
+
+    Examples
+    --------
+    >>> parse_time("1700000000.25") == parse_time("1700000000250") == parse_time("2023-11-14T22-13-20.25")
+    True
+    """
+    if match := _ISO.fullmatch(text):
+        date, hour, minute, second, rest, zone = match.groups()
+        zone = "+00:00" if zone in (None, "Z") else zone
+        whole = datetime.fromisoformat(f"{date}T{hour}:{minute}:{second}{zone}")
+        nanoseconds = int(rest[1:].ljust(9, "0")) if rest else 0
+        return round((whole - datetime(1970, 1, 1, tzinfo=UTC)).total_seconds()) * NS_PER_S + nanoseconds
+    try:
+        number = Decimal(text)
+    except InvalidOperation as error:
+        raise ValueError(text) from error
+    # The exponent of 1e999999999 must not be expanded.
+    whole_digits = number.adjusted() + 1 if number.is_finite() else 0
+    if whole_digits not in _DIGITS or number < 0:
+        raise ValueError(text)
+    return int(number * _DIGITS[whole_digits])
+
+
+def find_times(pictures: Mapping[str, list[Path]], times: str) -> dict[Path, int]:
+    """When pictures were taken, in ns since 1970.
+
+    Parameters
+    ----------
+    pictures : by camera, from :func:`~ipsys_log.exchange.image_folders.find_pictures`.
+    times : ``names``, or a CSV file with the columns ``file`` (such as ``red/0001.jpg``) and ``time``.
+
+    Raises
+    ------
+    IpsysError
+        Where a picture has no time, or a time cannot be read, or two of one camera have the same.
+    """
+    if times == NAMES:
+        found = {path: _time(path.stem, str(path)) for paths in pictures.values() for path in paths}
+    else:
+        found = _read_table(Path(times), pictures)
+    for paths in pictures.values():
+        seen: dict[int, Path] = {}
+        for path in paths:
+            if path not in found:
+                raise IpsysError(f"{times}: has no row for {path.parent.name}/{path.name}; add it")
+            other = seen.setdefault(found[path], path)
+            if other is not path:
+                raise IpsysError(f"{path}: has the time of {other.name}; give each picture its own")
+    return found
+
+
+def parse_start(text: str) -> int:
+    """The time that ``--start`` gives.
+
+    Raises
+    ------
+    IpsysError
+        Where it is none.
+    """
+    return _time(text, "--start")
+
+
+def _time(text: str, where: str) -> int:
+    try:
+        return parse_time(text)
+    except ValueError as error:
+        raise IpsysError(
+            f"{where}: {text!r} is no time; write s, ms, us or ns since 1970, or 2024-05-31T12:30:00.25Z"
+        ) from error
+
+
+def _read_table(table: Path, pictures: Mapping[str, list[Path]]) -> dict[Path, int]:
+    by_name = {f"{path.parent.name}/{path.name}": path for paths in pictures.values() for path in paths}
+    found = {}
+    try:
+        with table.open(newline="", encoding="utf-8-sig") as file:
+            rows = csv.DictReader(file)
+            if not set(_COLUMNS) <= set(rows.fieldnames or ()):
+                raise IpsysError(f"{table}: its first line must name the columns {' and '.join(_COLUMNS)}")
+            for row in rows:
+                where = f"{table}: line {rows.line_num}"
+                path = by_name.get(row["file"] or "")
+                if path is None:
+                    raise IpsysError(f"{where}: no picture is called {row['file']!r}; write red/0001.jpg")
+                found[path] = _time(row["time"] or "", where)
+    except OSError as error:
+        raise IpsysError(f"{table}: cannot be read: {error.strerror}") from error
+    except (UnicodeDecodeError, csv.Error) as error:
+        raise IpsysError(f"{table}: is not a CSV file: {error}") from error
+    return found
+
 
 # By file name; the bytes go into the log as they are.
 FORMATS = {".jpg": "jpeg", ".jpeg": "jpeg", ".png": "png", ".webp": "webp"}
@@ -76,7 +189,7 @@ def read_images(
     pictures : by camera, from :func:`find_pictures`.
     rig, lenses : written first, where given; lenses by camera.
     rate_hz : pictures per second.
-    times_ns : when each was taken, from :func:`~ipsys_log.exchange.picture_times.find_times`; then there is
+    times_ns : when each was taken, from :func:`~ipsys_log.exchange.image_folders.find_times`; then there is
         no rate.
 
     Raises

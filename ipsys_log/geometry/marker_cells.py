@@ -1,11 +1,109 @@
-"""Outlines of the black parts of a grid of cells."""
+"""Outlines of the black parts of a grid of cells.
+
+Printed markers: where their corners are, and what is black on them.
+"""
 
 from __future__ import annotations
+
+from collections.abc import Callable
+from dataclasses import dataclass
+from functools import cache
 
 import numpy as np
 from numpy.typing import NDArray
 
-__all__ = ["cell_outlines"]
+from ipsys_log.geometry.lenses import project
+from ipsys_log.geometry.markers import marker_corners, white_cells
+from ipsys_log.geometry.poses import transform
+from ipsys_log.messages import CameraCalibration
+
+__all__ = [
+    "Moving",
+    "Placed",
+    "PlacedBoard",
+    "black_cells",
+    "cell_outlines",
+    "print_outline",
+    "printed_cells",
+    "true_corners",
+]
+
+Array = NDArray[np.float64]
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class Placed:
+    """A printed marker in the world.
+
+    ``length_m`` is the side of its black square; a white margin of one cell is printed around it.
+    ``world_from_marker`` is (4, 4), the marker's frame that of
+    :func:`ipsys_log.geometry.markers.marker_corners`: it may lie at any angle.
+    """
+
+    id: int
+    length_m: float
+    world_from_marker: Array
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class PlacedBoard:
+    """A printed calibration board in the world.
+
+    ``cells`` (rows, columns) is True where the print is black, its white margin included, top row first;
+    ``cell_m`` is the side of a cell. ``world_from_marker`` is (4, 4); the board's frame has its origin in
+    the centre of the print, x to the right, y up and z towards the viewer.
+    """
+
+    cells: NDArray[np.bool_]
+    cell_m: float
+    world_from_marker: Array
+
+
+# A print by the time in s since the time of the frame.
+Moving = Callable[[float], Placed]
+
+
+@cache
+def black_cells(dictionary: str, marker_id: int) -> NDArray[np.bool_]:
+    """Which cells of the print are black, (n + 2, n + 2) with the white margin, top row first."""
+    black: NDArray[np.bool_] = np.pad(~white_cells(dictionary, marker_id), 1)
+    black.flags.writeable = False
+    return black
+
+
+def printed_cells(placed: Placed | PlacedBoard, dictionary: str) -> tuple[NDArray[np.bool_], float]:
+    """Return which cells of a print are black, (rows, columns), margin included, and cells per m."""
+    if isinstance(placed, PlacedBoard):
+        return placed.cells, 1 / placed.cell_m
+    cells = black_cells(dictionary, placed.id)
+    return cells, (len(cells) - 2) / placed.length_m
+
+
+def print_outline(placed: Placed | PlacedBoard, dictionary: str, per_side: int = 8) -> Array:
+    """Points around the edge of the print, white margin included, (4 per_side, 3) in world m."""
+    cells, cells_per_m = printed_cells(placed, dictionary)
+    corners = marker_corners(1 / cells_per_m) * [cells.shape[1], cells.shape[0], 1]
+    step = np.linspace(0, 1, per_side, endpoint=False)[None, :, None]
+    sides = corners[:, None] + step * (np.roll(corners, -1, axis=0) - corners)[:, None]
+    return transform(placed.world_from_marker, sides.reshape(-1, 3))
+
+
+def true_corners(lens: CameraCalibration, camera_from_world: Array, placed: Placed) -> Array:
+    """Pixels of the corners of the black square, in OpenCV's order, as no detector finds them.
+
+    Parameters
+    ----------
+    lens : of the camera.
+    camera_from_world : (4, 4), its pose.
+    placed : the marker.
+
+    Returns
+    -------
+    (4, 2), in px, (0, 0) the centre of the first pixel; clockwise from the marker's own top left.
+    """
+    camera_from_marker = camera_from_world @ placed.world_from_marker
+    return project(transform(camera_from_marker, marker_corners(placed.length_m)), lens)
+
 
 Point = tuple[int, int]
 

@@ -1,9 +1,16 @@
-"""Frames to grey pictures."""
+"""Frames to grey pictures.
+
+The size of a picture from the first bytes of its file, without decoding it.
+
+Check of the stated size of an encoded picture, before memory is allocated.
+"""
 
 from __future__ import annotations
 
+import struct
 import threading
 from collections.abc import Sequence
+from pathlib import Path
 
 import cv2
 import numpy as np
@@ -12,10 +19,95 @@ from numpy.typing import NDArray
 
 from ipsys_log.errors import FrameError
 from ipsys_log.images.jpeg import cut_rows, read_layout, whole_rows
-from ipsys_log.images.picture_size import check_encoded, check_size
 from ipsys_log.messages import CompressedImage, RawImage
 
-__all__ = ["Grey", "decode_grey", "decode_rows", "levels_at"]
+__all__ = [
+    "MOST_PIXELS",
+    "Grey",
+    "check_encoded",
+    "check_size",
+    "decode_grey",
+    "decode_rows",
+    "levels_at",
+    "read_picture_size",
+]
+
+# An embedded thumbnail may come before the size of a JPEG.
+_FIRST_BYTES = 1 << 18
+_PNG = b"\x89PNG\r\n\x1a\n"
+
+
+def read_picture_size(path: Path) -> tuple[int, int] | None:
+    """Return width and height in px from the header of a JPEG or PNG file.
+
+    None for another kind of file, or for an unreadable header.
+    """
+    try:
+        with path.open("rb") as file:
+            data = file.read(_FIRST_BYTES)
+    except OSError:
+        return None
+    if data.startswith(_PNG) and data[12:16] == b"IHDR" and len(data) >= 24:
+        width, height = struct.unpack(">II", data[16:24])
+        return int(width), int(height)
+    if not data.startswith(b"\xff\xd8"):
+        return None
+    try:
+        height, width, _, _ = simplejpeg.decode_jpeg_header(data, strict=False)
+    except (ValueError, KeyError):  # KeyError: it found no colour space
+        return None
+    return int(width), int(height)
+
+
+MOST_PIXELS = 1 << 27  # 134 million
+# A JPEG has at least one bit for each block of 8 x 8 px.
+_JPEG_PIXELS_PER_BYTE = 512
+# SOF0 to SOF15, except the tables and the extension between them.
+_JPEG_FRAMES = frozenset(range(0xC0, 0xD0)) - {0xC4, 0xC8, 0xCC}
+_JPEG_SCAN = 0xDA
+
+
+def check_encoded(data: bytes) -> None:
+    """Refuse a JPEG or PNG whose header states more pixels than it can have.
+
+    Raises
+    ------
+    FrameError
+        It claims more than `MOST_PIXELS`, or more than its bytes can code.
+    """
+    if data[:2] == b"\xff\xd8":
+        width, height = _jpeg_size(data)
+        check_size(width, height, len(data))
+    elif data[:8] == _PNG and len(data) >= 24:
+        check_size(int.from_bytes(data[16:20], "big"), int.from_bytes(data[20:24], "big"))
+
+
+def check_size(width: int, height: int, jpeg_bytes: int | None = None) -> None:
+    """Refuse a size in px that is too large, also for the number of bytes of a JPEG.
+
+    Raises
+    ------
+    FrameError
+        See :func:`check_encoded`.
+    """
+    if width * height > MOST_PIXELS:
+        raise FrameError(f"a picture of {width} x {height} px, more than {MOST_PIXELS} in all")
+    if jpeg_bytes is not None and width * height > _JPEG_PIXELS_PER_BYTE * jpeg_bytes:
+        raise FrameError(f"{jpeg_bytes} bytes are too few for a JPEG of {width} x {height} px")
+
+
+def _jpeg_size(data: bytes) -> tuple[int, int]:
+    """Return width and height in the first frame header; (0, 0) if there is none before the pixels."""
+    at = 2
+    while at + 9 <= len(data) and data[at] == 0xFF and data[at + 1] != _JPEG_SCAN:
+        if data[at + 1] == 0xFF:  # a fill byte
+            at += 1
+            continue
+        if data[at + 1] in _JPEG_FRAMES:
+            return int.from_bytes(data[at + 7 : at + 9], "big"), int.from_bytes(data[at + 5 : at + 7], "big")
+        at += 2 + int.from_bytes(data[at + 2 : at + 4], "big")
+    return 0, 0
+
 
 Grey = NDArray[np.uint8]
 

@@ -7,7 +7,7 @@ from dataclasses import dataclass, field
 import zstandard
 from mcap.opcode import Opcode
 
-from ipsys_log.log.crc import WORTH_COMBINING, Buffer, combine, extend
+from ipsys_log.log.hashing import WORTH_COMBINING, Buffer, combine, extend
 from ipsys_log.log.records import (
     CHUNK_HEAD_SIZE,
     HEAD_SIZE,

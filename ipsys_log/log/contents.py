@@ -1,14 +1,117 @@
-"""The table of contents of a log, as the summary of an MCAP file holds it."""
+"""The table of contents of a log, as the summary of an MCAP file holds it.
 
+What stands in a topic: a run, a camera.
+
+What a log is made of, as the rest of the program sees it.
+
+The channels of a log by topic: other programs write several channels of one topic.
+"""
+
+from __future__ import annotations
+
+import re
 from collections.abc import Mapping
 from copy import copy
 from dataclasses import dataclass, field, replace
+from types import MappingProxyType
+from typing import NamedTuple
 
 from mcap import records as mcap
 
 from ipsys_log.log.records import ChunkRef
 
-__all__ = ["Contents", "free_id"]
+__all__ = [
+    "Channel",
+    "Contents",
+    "RawMessage",
+    "Schema",
+    "by_topic",
+    "camera_of_topic",
+    "clean_name",
+    "foreign_camera",
+    "free_id",
+    "run_of_topic",
+]
+
+_OWN = re.compile(r"(?:/runs/(?P<run>[a-z][a-z0-9_]*))?/cameras/(?P<camera>[a-z][a-z0-9_]*)/[a-z_]+")
+_RUN = re.compile(r"/runs/(?P<run>[a-z][a-z0-9_]*)/")
+# What a topic's last parts say of an image, and not of which camera took it.
+_GENERIC = re.compile(
+    r"(image|images|raw|rect|color|colour|mono|compressed|calibration|camera_info|info|jpeg)"
+    r"(_(raw|rect|color|colour|mono|compressed))*"
+)
+
+
+def camera_of_topic(topic: str) -> str | None:
+    """The camera in a topic of our own, such as ``/runs/stock/cameras/red/markers``."""
+    match = _OWN.fullmatch(topic)
+    return match["camera"] if match else None
+
+
+def run_of_topic(topic: str) -> str | None:
+    """The run in a topic, or None for what was recorded."""
+    match = _RUN.match(topic)
+    return match["run"] if match else None
+
+
+def foreign_camera(topic: str) -> str:
+    """The camera in a topic of somebody else's, such as ``/robot/front/image_raw/compressed``."""
+    parts = topic.strip("/").split("/")
+    while len(parts) > 1 and _GENERIC.fullmatch(clean_name(parts[-1])):
+        parts.pop()
+    return clean_name("/".join(parts))
+
+
+def clean_name(text: str) -> str:
+    """A name as cameras have them, out of any text."""
+    name = re.sub(r"[^a-z0-9]+", "_", text.lower()).strip("_")
+    return name if name[:1].isalpha() else f"camera_{name}".rstrip("_")
+
+
+@dataclass(frozen=True, slots=True)
+class Schema:
+    """The type of a channel's messages.
+
+    Parameters
+    ----------
+    name
+        Full name of the message type, for example ``foxglove.CompressedImage``.
+    encoding
+        How ``data`` is written, for example ``protobuf`` (a ``FileDescriptorSet``).
+    data
+        The definition itself.
+    """
+
+    name: str
+    encoding: str
+    data: bytes
+
+
+@dataclass(frozen=True, slots=True)
+class Channel:
+    """One topic of a log.
+
+    ``schema`` is None for a channel that has none. ``message_count`` counts the whole log.
+    """
+
+    topic: str
+    schema: Schema | None
+    message_encoding: str
+    metadata: Mapping[str, str]
+    message_count: int
+
+
+class RawMessage(NamedTuple):
+    """One message, payload not decoded. Times are in ns.
+
+    A tuple, because a frozen dataclass takes four times as long to make, and there are many of them.
+    """
+
+    topic: str
+    log_time_ns: int
+    publish_time_ns: int
+    data: bytes
+
 
 _LARGEST_ID = 0xFFFF
 
@@ -37,7 +140,7 @@ class Contents:
     data_crc: int = 0
     cut_short: bool = False
 
-    def copy(self) -> "Contents":
+    def copy(self) -> Contents:
         """Return a copy that does not change when this one grows."""
         fields = ("schemas", "channels", "chunks", "attachments", "metadata", "counts", "loose")
         return replace(self, **{name: copy(getattr(self, name)) for name in fields})
@@ -58,3 +161,32 @@ def free_id(known: Mapping[int, object]) -> int | None:
     if above <= _LARGEST_ID:
         return above
     return next((key for key in range(1, _LARGEST_ID + 1) if key not in known), None)
+
+
+def by_topic(contents: Contents) -> tuple[Mapping[str, Channel], Mapping[str, str]]:
+    """Channels by topic, and in what the channels of one topic differ, where they do."""
+    channels: dict[str, Channel] = {}
+    conflicts: dict[str, str] = {}
+    for key, record in sorted(contents.channels.items()):
+        found = contents.schemas.get(record.schema_id)
+        schema = Schema(found.name, found.encoding, found.data) if found else None
+        count = contents.counts.get(key, 0)
+        first = channels.get(record.topic)
+        if first is None:
+            metadata = MappingProxyType(dict(record.metadata))
+            channels[record.topic] = Channel(record.topic, schema, record.message_encoding, metadata, count)
+            continue
+        if (_kind(first.schema), first.message_encoding) != (_kind(schema), record.message_encoding):
+            conflicts[record.topic] = _difference(record.topic, first, schema, record.message_encoding)
+        channels[record.topic] = replace(first, message_count=first.message_count + count)
+    return MappingProxyType(channels), MappingProxyType(conflicts)
+
+
+def _kind(schema: Schema | None) -> tuple[str, str] | None:
+    """What must agree: a later version of a message has more fields under the same name."""
+    return (schema.name, schema.encoding) if schema else None
+
+
+def _difference(topic: str, first: Channel, schema: Schema | None, encoding: str) -> str:
+    names = [f"{s.name} ({s.encoding})" if s else "no schema" for s in (first.schema, schema)]
+    return f"channels of {topic} differ: {names[0]} as {first.message_encoding}, {names[1]} as {encoding}"

@@ -2,14 +2,17 @@
 
 Own logs name their cameras in their topics. In the logs of others, images and calibrations are
 known by their schema, and a camera's name is made from the topic or the frame they share.
+
+Measurements of several logs that are read as one: each log begins at p001.
 """
 
 from __future__ import annotations
 
 import heapq
 import re
-from collections.abc import Collection, Iterator, Sequence
+from collections.abc import Collection, Iterable, Iterator, Mapping, Sequence
 from contextlib import ExitStack
+from dataclasses import replace
 from pathlib import Path
 from types import TracebackType
 from typing import Any
@@ -20,10 +23,15 @@ from numpy.typing import NDArray
 from ipsys_log.errors import LogError
 from ipsys_log.log.bounds import BoundError, Items
 from ipsys_log.log.codec import decode, payload_type
-from ipsys_log.log.measured_ids import other_ids, renamed
+from ipsys_log.log.contents import (
+    Channel,
+    RawMessage,
+    camera_of_topic,
+    clean_name,
+    foreign_camera,
+    run_of_topic,
+)
 from ipsys_log.log.reader import LogReader
-from ipsys_log.log.topics import camera_of_topic, clean_name, foreign_camera, run_of_topic
-from ipsys_log.log.types import Channel, RawMessage
 from ipsys_log.messages import (
     MEASUREMENTS_TOPIC,
     CameraCalibration,
@@ -35,7 +43,43 @@ from ipsys_log.messages import (
     Run,
 )
 
-__all__ = ["Session"]
+__all__ = ["Session", "other_ids", "renamed"]
+
+
+def other_ids(logs: Iterable[Iterable[Measurement]]) -> list[dict[str, str]]:
+    """New ids where an earlier log has the same: for each log, the new one by the old one.
+
+    Parameters
+    ----------
+    logs : the measurements of each log; the earliest log first.
+
+    Examples
+    --------
+    >>> other_ids([[Measurement(0, "p001")], [Measurement(9, "p001"), Measurement(9, "p002")]])
+    [{}, {'p001': 'p001_2'}]
+    """
+    taken: set[str] = set()
+    found = []
+    for number, measurements in enumerate(logs, 1):
+        here = list(dict.fromkeys(one.id for one in measurements))
+        new: dict[str, str] = {}
+        for name in here:
+            if name in taken:
+                new[name] = f"{name}_{number}"
+        taken.update(new.get(name, name) for name in here)
+        found.append(new)
+    return found
+
+
+def renamed(measurement: Measurement, ids: Mapping[str, str]) -> Measurement:
+    """A measurement, or the end of one, under the new ids of its log."""
+    withdrawn = measurement.withdraws
+    return replace(
+        measurement,
+        id=ids.get(measurement.id, measurement.id),
+        withdraws=None if withdrawn is None else ids.get(withdrawn, withdrawn),
+    )
+
 
 _IMAGES = (CompressedImage, CompressedVideo, RawImage)
 _ITEMS_OF_IMAGE = 16

@@ -8,8 +8,7 @@ from pathlib import Path
 
 from ipsys_log.errors import LogError
 from ipsys_log.log.byte_source import open_for_reading
-from ipsys_log.log.journal import journal_path
-from ipsys_log.log.storage import Storage
+from ipsys_log.log.journal import Storage, journal_path
 
 __all__ = ["check_free", "check_locks", "dangling", "is_being_written", "open_locked"]
 

@@ -7,7 +7,7 @@ from dataclasses import dataclass
 from itertools import chain
 from typing import NamedTuple
 
-from ipsys_log.log.types import RawMessage
+from ipsys_log.log.contents import RawMessage
 
 __all__ = ["Cursor", "Pending", "in_log_order"]
 

@@ -10,9 +10,8 @@ from pathlib import Path
 from typing import Protocol
 
 from ipsys_log.errors import LogError, WriteError, disk_advice
-from ipsys_log.log.crc import Buffer, extend
-from ipsys_log.log.journal import replace_tail, roll_back
-from ipsys_log.log.storage import Storage, write_all
+from ipsys_log.log.hashing import Buffer, extend
+from ipsys_log.log.journal import Storage, replace_tail, roll_back, write_all
 
 __all__ = ["Growing", "Output", "Pending", "cannot_write"]
 

@@ -16,17 +16,14 @@ from numpy.typing import NDArray
 from ipsys_log.errors import LogError
 from ipsys_log.log.bounds import Allowance
 from ipsys_log.log.byte_source import View, open_for_reading
-from ipsys_log.log.channels import by_topic
-from ipsys_log.log.chunk_messages import Blocks, open_chunk, open_loose
-from ipsys_log.log.contents import Contents
+from ipsys_log.log.chunk_messages import ALWAYS, Blocks, as_rows, chunk_entries, open_chunk, open_loose
+from ipsys_log.log.contents import Contents, RawMessage, by_topic
 from ipsys_log.log.hashing import METADATA_NAME, ChannelHash, hashes_from_metadata
 from ipsys_log.log.journal import attach_journal
-from ipsys_log.log.load import NoFooterError, load_contents
 from ipsys_log.log.lock import is_being_written
 from ipsys_log.log.order import Pending, in_log_order
 from ipsys_log.log.records import HEADER, parse, walk
-from ipsys_log.log.rows import ALWAYS, as_rows, chunk_entries
-from ipsys_log.log.types import RawMessage
+from ipsys_log.log.summary import NoFooterError, load_contents
 
 __all__ = ["LogReader", "stored_hashes"]
 

@@ -15,7 +15,6 @@ from mcap.opcode import Opcode
 from ipsys_log.errors import LogError, disk_advice
 from ipsys_log.log.bounds import BoundError
 from ipsys_log.log.byte_source import View
-from ipsys_log.log.crc import combine
 from ipsys_log.log.damage.agreement import count_by_indexes, disagreement
 from ipsys_log.log.damage.findings import Survey
 from ipsys_log.log.damage.kept_bytes import (
@@ -30,13 +29,11 @@ from ipsys_log.log.damage.kept_bytes import (
 from ipsys_log.log.damage.regions import index_records
 from ipsys_log.log.damage.salvage import Salvage
 from ipsys_log.log.damage.survey import HEADER_RECORD, survey
-from ipsys_log.log.hashing import METADATA_NAME, metadata_of_hashes
-from ipsys_log.log.journal import replace_tail, roll_back
-from ipsys_log.log.load import Summary, read_summary
+from ipsys_log.log.hashing import METADATA_NAME, combine, metadata_of_hashes
+from ipsys_log.log.journal import DISK, Storage, replace_tail, roll_back
 from ipsys_log.log.lock import open_locked
 from ipsys_log.log.records import MAGIC, MESSAGE, as_bytes, walk
-from ipsys_log.log.storage import DISK, Storage
-from ipsys_log.log.summary import tail_bytes
+from ipsys_log.log.summary import Summary, read_summary, tail_bytes
 
 __all__ = ["RepairReport", "repair"]
 

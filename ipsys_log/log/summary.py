@@ -1,16 +1,32 @@
-"""The end of a log as bytes: DataEnd, summary, footer."""
+"""Loading the table of contents: from the summary where that is complete, else from the records.
+
+The end of a log as bytes: DataEnd, summary, footer.
+"""
 
 import struct
 import zlib
+from itertools import pairwise
+from typing import NamedTuple
 
 from mcap import records as mcap
 from mcap.opcode import Opcode
 
+from ipsys_log.errors import LogError
 from ipsys_log.log.byte_source import View
 from ipsys_log.log.contents import Contents
-from ipsys_log.log.records import DATA_END, FOOTER, HEADER, MAGIC, as_bytes
+from ipsys_log.log.records import DATA_END, FOOTER, HEADER, MAGIC, as_bytes, parse, parse_chunk_index, walk
+from ipsys_log.log.scan import scan
 
-__all__ = ["STANDING", "standing_bytes", "standing_data_end", "tail_bytes"]
+__all__ = [
+    "STANDING",
+    "NoFooterError",
+    "Summary",
+    "load_contents",
+    "read_summary",
+    "standing_bytes",
+    "standing_data_end",
+    "tail_bytes",
+]
 
 # Precedes a tail after new data: a record of a private type with the offset of the end of the old data.
 STANDING = struct.Struct("<BQ8sQ")
@@ -75,3 +91,149 @@ def _statistics(contents: Contents) -> mcap.Statistics:
         metadata_count=contents.metadata_count,
         schema_count=len(contents.schemas),
     )
+
+
+class NoFooterError(LogError):
+    """A log has no end: its writer has not come to it yet, or never will."""
+
+
+class Summary(NamedTuple):
+    """The summary of a log. `checked` says that its CRC is right (a summary may have none)."""
+
+    contents: Contents
+    statistics: mcap.Statistics | None
+    checked: bool
+
+
+def read_summary(view: View) -> Summary | None:
+    """Read only the summary; None if the log has none.
+
+    Raises
+    ------
+    LogError
+        The end of the log is missing or damaged.
+    """
+    footer_at, summary_start, checked = _footer(view)
+    if not summary_start:
+        return None
+    contents, statistics = _from_summary(view, summary_start, footer_at)
+    return Summary(contents, statistics, checked)
+
+
+def load_contents(view: View) -> Contents:
+    """Read the table of contents of a finished log.
+
+    Raises
+    ------
+    LogError
+        The file is empty, no MCAP file, or damaged; a `NoFooterError` if its end is missing.
+    """
+    _check_start(view)
+    footer_at, summary_start, _ = _footer(view)
+    contents, complete = (None, False)
+    if summary_start:
+        contents, statistics = _from_summary(view, summary_start, footer_at)
+        complete = statistics is not None and _is_complete(contents, statistics)
+    end = summary_start or footer_at
+    data_end = end - DATA_END.size
+    opcode, length, crc = DATA_END.unpack(view.read(data_end, DATA_END.size)) if data_end >= 8 else (0, 0, 0)
+    if (opcode, length) != (Opcode.DATA_END, 4):
+        raise view.fault(max(data_end, 0), "there is no DataEnd record before the summary")
+    standing = standing_data_end(view, data_end)
+    if standing is not None:
+        data_end = standing
+    if contents is None or not complete or not _gaps_hold_no_messages(view, contents, data_end):
+        contents = scan(view, data_end)
+    view.check_number(len(contents.channels), "channels")
+    view.check_number(len(contents.schemas), "schemas")
+    contents.data_end, contents.data_crc, contents.cut_short = data_end, crc, standing is not None
+    return contents
+
+
+def _check_start(view: View) -> None:
+    start = view.read(0, min(len(MAGIC), view.size))
+    if not start:
+        raise LogError(f"{view.path} is empty: nothing was ever written to it")
+    if not MAGIC.startswith(start):
+        raise LogError(
+            f"{view.path} is not an MCAP file (it starts with {start!r}): give a log ending in .mcap"
+        )
+
+
+def _footer(view: View) -> tuple[int, int, bool]:
+    """Return the offsets of the footer and the summary (0: none), and whether a CRC confirms both."""
+    path = view.path
+    at = view.size - len(MAGIC) - FOOTER.size
+    tail = view.read(at, view.size - at) if at >= len(MAGIC) else b""
+    if not tail.endswith(MAGIC) or FOOTER.unpack_from(tail)[:2] != (Opcode.FOOTER, 20):
+        raise NoFooterError(
+            f"{path} has no end: its recorder was killed, or the file was cut off. What it holds can be "
+            f"saved. Run: ipsys repair {path}"
+        )
+    _, _, summary_start, _, crc = FOOTER.unpack_from(tail)
+    if summary_start and not len(MAGIC) < summary_start <= at:
+        raise view.fault(at, f"the footer says that the summary starts at byte {summary_start}")
+    if summary_start and crc:
+        summary = view.read(summary_start, at - summary_start + FOOTER.size - 4)
+        if zlib.crc32(summary) != crc:
+            raise view.fault(summary_start, "the CRC of the summary is wrong")
+    return at, summary_start, bool(summary_start and crc)
+
+
+def _from_summary(view: View, start: int, end: int) -> tuple[Contents, mcap.Statistics | None]:
+    """Parse the summary, and its Statistics record, without which it is not complete."""
+    contents = Contents()
+    statistics: mcap.Statistics | None = None
+    data = view.read(start, end - start)
+    for at in walk(view, start, end):
+        body = data[at.offset - start + HEADER.size : at.offset - start + at.length]
+        if at.opcode == Opcode.STATISTICS:
+            statistics = parse(mcap.Statistics.read, view, at, body)
+        elif at.opcode == Opcode.CHUNK_INDEX:
+            contents.chunks.append(parse_chunk_index(view, at, body))
+        elif at.opcode == Opcode.ATTACHMENT_INDEX:
+            contents.attachments.append(parse(mcap.AttachmentIndex.read, view, at, body))
+        elif at.opcode == Opcode.METADATA_INDEX:
+            contents.metadata.append(parse(mcap.MetadataIndex.read, view, at, body))
+        elif at.opcode == Opcode.SCHEMA:
+            schema = parse(mcap.Schema.read, view, at, body)
+            contents.schemas.setdefault(schema.id, schema)
+        elif at.opcode == Opcode.CHANNEL:
+            channel = parse(mcap.Channel.read, view, at, body)
+            contents.channels.setdefault(channel.id, channel)
+    if statistics is None:
+        return contents, None
+    contents.counts = dict(statistics.channel_message_counts)
+    contents.attachment_count = statistics.attachment_count
+    contents.metadata_count = statistics.metadata_count
+    if statistics.message_count:
+        contents.cover(statistics.message_start_time, statistics.message_end_time)
+    return contents, statistics
+
+
+def _is_complete(contents: Contents, statistics: mcap.Statistics) -> bool:
+    known = contents.channels.keys()
+    return (
+        len(known) == statistics.channel_count
+        and contents.counts.keys() <= known
+        and all(c.schema_id == 0 or c.schema_id in contents.schemas for c in contents.channels.values())
+        and len(contents.chunks) == statistics.chunk_count
+        and all(chunk.index_offsets.keys() <= known for chunk in contents.chunks)
+        and (statistics.chunk_count > 0 or statistics.message_count == 0)
+        and sum(contents.counts.values()) == statistics.message_count
+        and len(contents.metadata) == statistics.metadata_count
+        and len(contents.attachments) == statistics.attachment_count
+    )
+
+
+def _gaps_hold_no_messages(view: View, contents: Contents, data_end: int) -> bool:
+    """True if all messages lie in the indexed chunks: what lies between them is small, and walked."""
+    extents = sorted((chunk.offset, chunk.end) for chunk in contents.chunks)
+    edges = [(0, len(MAGIC)), *extents, (data_end, data_end)]
+    for (_, start), (end, _) in pairwise(edges):
+        if start > end:
+            raise view.fault(end, "two chunks overlap, or one reaches into the summary")
+        for at in walk(view, start, end):
+            if at.opcode in (Opcode.MESSAGE, Opcode.CHUNK):
+                return False
+    return True

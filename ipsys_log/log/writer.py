@@ -23,17 +23,14 @@ from ipsys_log.log.chunk_builder import (
     ChunkBuilder,
     Limits,
 )
-from ipsys_log.log.contents import Contents, free_id
+from ipsys_log.log.contents import Contents, Schema, free_id
 from ipsys_log.log.hashing import METADATA_NAME, ChannelHash, metadata_of_hashes
-from ipsys_log.log.journal import roll_back
-from ipsys_log.log.load import load_contents
+from ipsys_log.log.journal import DISK, Storage, roll_back
 from ipsys_log.log.lock import check_free, open_locked
 from ipsys_log.log.output import Growing, Output, Pending, cannot_write
 from ipsys_log.log.reader import stored_hashes
 from ipsys_log.log.records import HEADER, MAGIC, MESSAGE, as_bytes
-from ipsys_log.log.storage import DISK, Storage
-from ipsys_log.log.summary import standing_bytes, tail_bytes
-from ipsys_log.log.types import Schema
+from ipsys_log.log.summary import load_contents, standing_bytes, tail_bytes
 
 __all__ = ["LogWriter"]
 

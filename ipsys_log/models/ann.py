@@ -1,4 +1,7 @@
-"""Small neural networks from the frame of a camera to the world (sect. 2.2.3 of the paper)."""
+"""Small neural networks from the frame of a camera to the world (sect. 2.2.3 of the paper).
+
+Inputs and outputs of unit variance.
+"""
 
 from __future__ import annotations
 
@@ -10,9 +13,23 @@ from sklearn.base import BaseEstimator, MultiOutputMixin, RegressorMixin
 from sklearn.utils.validation import check_is_fitted, validate_data
 
 from ipsys_log.errors import FitError
-from ipsys_log.models.scaling import spread
 
-__all__ = ["NeuralNetwork", "network", "train_networks"]
+__all__ = ["NeuralNetwork", "network", "spread", "train_networks"]
+
+
+def spread(values: NDArray[np.float64]) -> NDArray[np.float64]:
+    """Standard deviation of each column, (d,) of (n, d); 1 where a column does not vary.
+
+    Examples
+    --------
+    >>> spread(np.array([[0.0, 5.0], [2.0, 5.0]])).tolist()
+    [1.0, 1.0]
+    """
+    deviation = values.std(axis=0)
+    # Rounding leaves a trace of variance in a column of equal numbers.
+    level = deviation <= 1e-12 * np.abs(values).max(axis=0)
+    return np.where(level, 1.0, deviation)
+
 
 Array = NDArray[np.float64]
 

@@ -14,7 +14,7 @@ from sklearn.base import BaseEstimator, MultiOutputMixin, RegressorMixin
 from sklearn.utils.validation import check_is_fitted, validate_data
 
 from ipsys_log.errors import FitError
-from ipsys_log.models.scaling import spread
+from ipsys_log.models.ann import spread
 
 __all__ = ["Kriging", "most_likely"]
 

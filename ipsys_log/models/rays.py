@@ -15,7 +15,7 @@ from scipy.optimize import least_squares
 from scipy.spatial.transform import Rotation
 
 from ipsys_log.errors import FitError
-from ipsys_log.geometry.planes import meet_height
+from ipsys_log.geometry.lenses import meet_height
 from ipsys_log.models.rigid import rigid_transform
 
 __all__ = ["Bearings", "Places", "directions", "fit_bearings", "tied"]

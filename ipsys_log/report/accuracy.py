@@ -6,9 +6,8 @@ from collections.abc import Sequence
 from dataclasses import dataclass
 from typing import Any
 
-from ipsys_log.analysis.accuracy import CROSS_VALIDATION, POOLED, count_repeats
+from ipsys_log.analysis.accuracy import CROSS_VALIDATION, POOLED, count_repeats, root_mean_square_m
 from ipsys_log.analysis.ground_truth import gather_tracks, track_errors
-from ipsys_log.analysis.statistics import root_mean_square_m
 from ipsys_log.log.dataset import Session
 from ipsys_log.messages import (
     TRUTH_TOPIC,

@@ -8,11 +8,10 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from ipsys_log.analysis.alignment import Alignment, align_camera
+from ipsys_log.analysis.alignment import Alignment, align_camera, join_cameras
 from ipsys_log.analysis.coverage import Coverage, Hung, Overlap, cover_floor, find_overlaps
-from ipsys_log.analysis.joined import join_cameras
 from ipsys_log.analysis.pairs import Measured
-from ipsys_log.analysis.still import find_lying
+from ipsys_log.analysis.stationary import find_lying
 from ipsys_log.errors import IpsysError
 from ipsys_log.geometry.lenses import undistort
 from ipsys_log.geometry.poses import invert_pose, make_pose

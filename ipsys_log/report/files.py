@@ -1,16 +1,107 @@
-"""Files for people: wholly written or not there, and never in place of a log."""
+"""Files for people: wholly written or not there, and never in place of a log.
+
+Tables for a spreadsheet, in cm with the digits of the paper.
+"""
 
 from __future__ import annotations
 
+import csv
+import io
 import os
 import tempfile
-from collections.abc import Iterable, Mapping
+from collections.abc import Iterable, Mapping, Sequence
 from pathlib import Path
 
 from ipsys_log.errors import IpsysError
 from ipsys_log.log.lock import dangling
+from ipsys_log.messages import CameraEvaluation, ErrorStatistics
+from ipsys_log.report.findings import Findings
+from ipsys_log.units import CM_PER_M
 
-__all__ = ["PICTURES", "check_file", "check_folder", "check_picture", "write_files"]
+__all__ = [
+    "PICTURES",
+    "check_file",
+    "check_folder",
+    "check_picture",
+    "cross_validation_csv",
+    "paper_csv",
+    "write_files",
+]
+
+# Names of the paper's methods, as its Tables I and II have them.
+_PAPER_NAMES = {
+    "rigid": "RT",
+    "poly": "PR",
+    "rigid+poly": "RT + PR",
+    "ann": "ANN",
+    "rigid+ann": "RT + ANN",
+    "kriging": "KI",
+    "rigid+kriging": "RT + KI",
+    "kriging-regression": "KR",
+    "rigid+kriging-regression": "RT + KR",
+}
+_FIGURES = {"mean": "mean_m", "min": "min_m", "max": "max_m", "std": "std_m"}
+
+
+def paper_csv(findings: Findings, in_space: bool) -> bytes:
+    """Table I of the paper (errors in space) or Table II (on the floor): a row for each model.
+
+    The columns are those of the paper: the mean of each camera, then their lower bounds, upper bounds and
+    standard deviations, on the places held out, against the tape. What is not known is empty.
+    """
+    header = ["method", "paper"] + [f"{figure}_cm_{c}" for figure in _FIGURES for c in findings.cameras]
+    rows = []
+    for accuracy in findings.accuracies:
+        by_camera = {row.camera: row for row in accuracy.rows(False) if row.against == "tape"}
+        errors = [_errors(by_camera.get(camera), in_space) for camera in findings.cameras]
+        cells = [_cm(getattr(e, name) if e else None) for name in _FIGURES.values() for e in errors]
+        rows.append([accuracy.model, _PAPER_NAMES.get(accuracy.model, ""), *cells])
+    return _csv(header, rows)
+
+
+def _errors(row: CameraEvaluation | None, in_space: bool) -> ErrorStatistics | None:
+    return None if row is None else row.error_3d if in_space else row.error_2d
+
+
+_STATISTICS = {
+    "mean": "mean_m",
+    "mean_low": "mean_low_m",
+    "mean_high": "mean_high_m",
+    "min": "min_m",
+    "median": "median_m",
+    "p95": "p95_m",
+    "max": "max_m",
+    "std": "std_m",
+}
+
+
+def cross_validation_csv(findings: Findings) -> bytes:
+    """A row for each model, camera (``all``: together) and what it is compared with."""
+    header = ["method", "camera", "against", "places"]
+    header += [f"{name}_{space}_cm" for space in ("3d", "2d") for name in (*_STATISTICS, "rmse")]
+    header += [f"bias_{axis}_cm" for axis in "xyz"] + ["within_68", "within_95"]
+    rows = []
+    for accuracy in findings.accuracies:
+        for row in accuracy.rows(True):
+            cells = [accuracy.model, row.camera or "all", row.against, str(row.error_2d.count)]
+            for errors in (row.error_3d, row.error_2d):
+                cells += [_cm(getattr(errors, name) if errors else None) for name in _STATISTICS.values()]
+                cells.append(_cm(accuracy.rmse_m(row, errors)))
+            cells += map(_cm, [None] * 3 if row.bias_m is None else row.bias_m.tolist())
+            cells += ["" if v is None else f"{v:.4f}" for v in (row.within_68, row.within_95)]
+            rows.append(cells)
+    return _csv(header, rows)
+
+
+def _cm(value_m: float | None) -> str:
+    return "" if value_m is None else f"{value_m * CM_PER_M:.3f}"
+
+
+def _csv(header: Sequence[str], rows: Iterable[Sequence[str]]) -> bytes:
+    text = io.StringIO()
+    csv.writer(text, lineterminator="\n").writerows([header, *rows])
+    return text.getvalue().encode()
+
 
 # How the name of a picture may end; it is written as that.
 PICTURES = (".png", ".pdf", ".svg", ".jpg", ".jpeg", ".webp")

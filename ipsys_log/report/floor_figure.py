@@ -1,29 +1,250 @@
-"""A session as one picture: the floor to scale, and how far each model is off."""
+"""A session as one picture: the floor to scale, and how far each model is off.
+
+The floor to scale: measured places with their errors, and the ways of the robots.
+"""
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass
+from itertools import islice
 from pathlib import Path
+from typing import Any, NamedTuple
 
 import numpy as np
+from matplotlib.axes import Axes
 from matplotlib.figure import Figure
+from matplotlib.patches import Rectangle
+from matplotlib.quiver import Quiver
+from matplotlib.ticker import MultipleLocator
 from numpy.typing import NDArray
 
+from ipsys_log.analysis.accuracy import CROSS_VALIDATION
 from ipsys_log.analysis.ground_truth import gather_tracks
-from ipsys_log.analysis.places import measured_places
+from ipsys_log.analysis.pairs import Place, measured_places
 from ipsys_log.errors import IpsysError
 from ipsys_log.log.dataset import Session
-from ipsys_log.messages import TRUTH_TOPIC, Measurement, Rig, Tracks
+from ipsys_log.messages import (
+    TRUTH_TOPIC,
+    CameraEvaluation,
+    Evaluation,
+    Measurement,
+    ReferencePoint,
+    Rig,
+    Tracks,
+)
 from ipsys_log.report.accuracy import Accuracy
 from ipsys_log.report.errors_figure import count_rows, draw_errors
-from ipsys_log.report.figures import picture
+from ipsys_log.report.figures import GRID, REST, camera_styles, picture, robot_colour, shorten
 from ipsys_log.report.files import write_files
-from ipsys_log.report.floor_panel import Scene, draw_floor
-from ipsys_log.report.palette import camera_styles
 from ipsys_log.runs.provenance import newest_run
 from ipsys_log.sinks.selection import rig_in_force
+from ipsys_log.units import CM_PER_M
 
-__all__ = ["draw_session"]
+__all__ = [
+    "Scene",
+    "Square",
+    "draw_arrows",
+    "draw_floor",
+    "draw_ground",
+    "draw_key",
+    "draw_session",
+    "exaggeration",
+    "show_square",
+    "square_around",
+]
+
+_GRID_M = 0.5
+# Arrows are drawn so much longer that most of them span less than this part of the floor.
+_ARROW_SHARE = 0.1
+_KEY_SHARE = 0.03
+_FACTORS = (1, 2, 5, 10, 20, 50, 100, 200, 500)
+_MOST_ROBOTS = 6
+
+Lines = Mapping[str, NDArray[np.float64]]
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class Scene:
+    """What is drawn of a session; tracks and truth as (n, 2) in m by robot, with NaN where a line breaks."""
+
+    rig: Rig | None
+    places: Sequence[Place]
+    run: str | None
+    evaluation: Evaluation | None
+    tracks: Lines
+    truth: Lines
+
+    def rows(self) -> list[CameraEvaluation]:
+        """Residuals to draw as arrows: against the tape, which every lab has."""
+        rows = self.evaluation.cameras if self.evaluation else ()
+        return [
+            row for row in rows if row.against == "tape" and row.residuals and row.scheme != CROSS_VALIDATION
+        ]
+
+
+def draw_floor(axes: Axes, scene: Scene, styles: Mapping[str, tuple[str, str]]) -> None:
+    """Draw all of a scene.
+
+    Parameters
+    ----------
+    styles : colour and marker shape by camera.
+    """
+    around_m = [place.point_m[:2] for place in scene.places]
+    if not around_m and not (scene.rig and scene.rig.floor):
+        lines = (*scene.tracks.values(), *scene.truth.values())
+        around_m = [line[~np.isnan(line).any(axis=1)] for line in lines]
+    draw_ground(axes, scene.rig, around_m)
+    _draw_tracks(axes, scene)
+    _draw_places(axes, scene)
+    title = _draw_errors(axes, scene, styles)
+    axes.set_title(title, loc="left", fontsize=10)
+
+
+def draw_ground(axes: Axes, rig: Rig | None, around_m: Sequence[NDArray[np.float64]]) -> None:
+    """Draw the floor to scale with its reference points.
+
+    Parameters
+    ----------
+    rig : for floor and points; without one the picture has room for what is in ``around_m``.
+    around_m : points (2,) or (n, 2) on the floor that are to be seen.
+    """
+    floor = rig.floor if rig else None
+    if floor is not None:
+        axes.add_patch(
+            Rectangle((0, 0), floor.width_m, floor.depth_m, fill=False, ec="black", lw=1.5, zorder=1)
+        )
+    square = square_around(rig, around_m)
+    show_square(axes, square)
+    axes.set(aspect="equal", xlabel="x in m", ylabel="y in m")
+    axes.xaxis.set_major_locator(_steps(square.half))
+    axes.yaxis.set_major_locator(_steps(square.half))
+    axes.grid(color=GRID, lw=0.7)
+    axes.set_axisbelow(True)
+    _draw_references(axes, rig.reference_points if rig else ())
+
+
+class Square(NamedTuple):
+    """The part of the floor on a map: its centre (2,) and half of its side, in m.
+
+    Square axes of a square part have the same scale both ways.
+    """
+
+    middle: NDArray[np.float64]
+    half: float
+
+
+def square_around(rig: Rig | None, around_m: Sequence[NDArray[np.float64]]) -> Square:
+    """Return the square that has room for the rig's floor and for points (2,) or (n, 2)."""
+    points_m = [*around_m]
+    if rig is not None and rig.floor is not None:
+        points_m += [np.zeros(2), np.array([rig.floor.width_m, rig.floor.depth_m])]
+    together_m = np.vstack(points_m)
+    low, high = together_m.min(axis=0), together_m.max(axis=0)
+    return Square((low + high) / 2, max(0.54 * float((high - low).max()), 0.25))
+
+
+def show_square(axes: Axes, square: Square) -> None:
+    """Set the limits of a map."""
+    (x, y), half = square
+    axes.set(xlim=(x - half, x + half), ylim=(y - half, y + half))
+
+
+def _draw_references(axes: Axes, points: Sequence[ReferencePoint]) -> None:
+    for point in points:
+        axes.plot(point.x_m, point.y_m, "+", color="black", ms=11, mew=1.6, zorder=5)
+        axes.annotate(
+            shorten(point.name), (point.x_m, point.y_m), (5, 5), textcoords="offset points", weight="bold",
+            parse_math=False, clip_on=True, in_layout=False,
+        )  # fmt: skip
+
+
+def _steps(half_m: float) -> MultipleLocator:
+    step_m = _GRID_M
+    while half_m / step_m > 8:
+        step_m *= 2
+    return MultipleLocator(step_m)
+
+
+def _draw_tracks(axes: Axes, scene: Scene) -> None:
+    names = sorted({*scene.tracks, *scene.truth})
+    colours = {name: robot_colour(number) for number, name in enumerate(names)}
+    for name, line in scene.truth.items():
+        axes.plot(*line.T, "--", color="black", lw=0.8, zorder=2.5, label="_" + name)
+    for name, line in scene.tracks.items():
+        axes.plot(*line.T, "-", color=colours[name], lw=1.6, zorder=2)
+        # Where a robot only stood, there is no line to see.
+        axes.plot(*line.T, ".", color=colours[name], ms=2.2, zorder=2)
+    for name in islice(scene.tracks, _MOST_ROBOTS):
+        axes.plot([], [], "-", color=colours[name], lw=1.6, label=name)
+    if len(scene.tracks) > _MOST_ROBOTS:
+        axes.plot([], [], "-", color=REST, label=f"{len(scene.tracks) - _MOST_ROBOTS} more robots")
+    if scene.truth:
+        axes.plot([], [], "--", color="black", lw=0.8, label="truth")
+
+
+def _draw_places(axes: Axes, scene: Scene) -> None:
+    tested = {residual.measurement for row in scene.rows() for residual in row.residuals}
+    rest = [place for place in scene.places if place.id not in tested]
+    for kind, colour in (("training", REST), ("measured", REST), ("test", "#6A6A6A")):
+        points_m = np.array([place.point_m[:2] for place in rest if place.kind == kind])
+        if len(points_m):
+            name = "held out, not seen" if kind == "test" and scene.evaluation else f"{kind} place"
+            fill = "none" if kind == "test" else colour
+            axes.plot(*points_m.T, "o", color=colour, mfc=fill, ms=3.5, zorder=3, label=name)
+
+
+def _draw_errors(axes: Axes, scene: Scene, styles: Mapping[str, tuple[str, str]]) -> str:
+    """The arrows; returns the title that says what they are."""
+    rows = scene.rows()
+    if not rows or scene.evaluation is None:
+        return f"The floor, tracks of run {scene.run}" if scene.tracks else "The floor"
+    residuals = [residual for row in rows for residual in row.residuals]
+    span_m = axes.get_xlim()[1] - axes.get_xlim()[0]
+    factor = exaggeration([r.predicted_m - r.world_m for r in residuals], span_m)
+    for row in rows:
+        colour, shape = styles[row.camera]
+        start_m = np.array([residual.world_m[:2] for residual in row.residuals])
+        error_m = np.array([residual.predicted_m[:2] for residual in row.residuals]) - start_m
+        axes.plot(*start_m.T, shape, color=colour, ms=4.5, zorder=4, label=f"held out, {row.camera}")
+        arrows = draw_arrows(axes, start_m, error_m, factor, color=colour)
+    draw_key(axes, arrows, factor)
+    times = f", drawn {factor} times as long" if factor > 1 else ""
+    return f"Errors of {scene.evaluation.model} on held-out places{times}"
+
+
+def exaggeration(errors_m: Sequence[NDArray[np.float64]], span_m: float) -> int:
+    """Return the scale of errors (n, 2 or 3) on a map: most are visible, none covers much of the floor."""
+    usual_m = float(np.quantile(np.linalg.norm(np.array(errors_m)[:, :2], axis=1), 0.9))
+    fitting = [factor for factor in _FACTORS if factor * usual_m <= _ARROW_SHARE * span_m]
+    return fitting[-1] if fitting else 1
+
+
+def draw_arrows(
+    axes: Axes,
+    start_m: NDArray[np.float64],
+    error_m: NDArray[np.float64],
+    factor: int,
+    *values: Any,
+    **look: Any,
+) -> Quiver:
+    """Draw errors (n, 2) at places (n, 2), so many times as long; ``values`` (n,) give them a colour each."""
+    return axes.quiver(
+        *start_m.T, *error_m.T, *values, angles="xy", scale_units="xy", scale=1 / factor, width=0.0035,
+        headwidth=4, headlength=5, headaxislength=4.5, minlength=0, zorder=4, **look,
+    )  # fmt: skip
+
+
+def draw_key(axes: Axes, arrows: Quiver, factor: int) -> None:
+    """An arrow at the top right of the axes that says how long 1 cm, or some more, is drawn."""
+    span_m = axes.get_xlim()[1] - axes.get_xlim()[0]
+    size_cm = next((cm for cm in (1, 2, 5, 10, 20) if factor * cm / CM_PER_M > _KEY_SHARE * span_m), 50)
+    length_m = size_cm / CM_PER_M
+    axes.quiverkey(
+        arrows, 0.99 - factor * length_m / span_m / 2, 1.028, length_m, f"{size_cm} cm", labelpos="W",
+        coordinates="axes", color="black",
+    )  # fmt: skip
+
 
 _DPI = 100
 # Of the floor's axes: how far below the top of the picture, and how long a side.

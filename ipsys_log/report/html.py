@@ -7,14 +7,13 @@ from typing import Any
 
 from jinja2 import Environment, PackageLoader, StrictUndefined
 
-from ipsys_log.analysis.cross_validation import FOLDS, REPEATS
-from ipsys_log.analysis.learning import SUBSETS
+from ipsys_log.analysis.cross_validation import FOLDS, REPEATS, SUBSETS
 from ipsys_log.analysis.tape import Measured
 from ipsys_log.errors import IpsysError
 from ipsys_log.log.dataset import Session
 from ipsys_log.messages import Run
 from ipsys_log.plain_text import plain_text
-from ipsys_log.report import html_figures, html_sections, page_trust
+from ipsys_log.report import html_figures, html_sections
 from ipsys_log.report.accuracy import Accuracy
 from ipsys_log.report.advice import TOLD_NOTE, told_height
 from ipsys_log.report.findings import Findings, gather_findings
@@ -50,7 +49,7 @@ def render_report(session: Session, accuracies: Sequence[Accuracy]) -> str:
     )
     return environment.get_template("session.html").render(
         **_said(findings),
-        flat=page_trust.flat_rows(_measured(session, findings)),
+        flat=html_sections.flat_rows(_measured(session, findings)),
         **_drawn(findings),
         **_made(session, findings),
     )
@@ -70,9 +69,9 @@ def _said(findings: Findings) -> dict[str, Any]:
         "models": html_sections.model_rows(findings),
         "by_camera": [(camera, html_sections.model_rows(findings, camera)) for camera in findings.cameras],
         "told_note": TOLD_NOTE if any(map(told_height, findings.models)) else "",
-        "suspects": page_trust.suspects(findings),
-        "coverage": page_trust.coverage(findings),
-        "calibration": page_trust.calibration(findings),
+        "suspects": html_sections.suspects(findings),
+        "coverage": html_sections.coverage(findings),
+        "calibration": html_sections.calibration(findings),
     }
 
 

@@ -9,14 +9,19 @@ from matplotlib.axes import Axes
 from matplotlib.figure import Figure
 from matplotlib.lines import Line2D
 
-from ipsys_log.report.advice import label
+from ipsys_log.report.advice import has_published, label
 from ipsys_log.report.figures import svg_uri
 from ipsys_log.report.findings import Findings
-from ipsys_log.report.learning import has_published
 from ipsys_log.report.learning_figure import Curves, camera_curves, curves_picture, limits_cm, mean_curves
-from ipsys_log.report.models_figure import HELD_OUT, draw_models, models_note
+from ipsys_log.report.paper_figures import (
+    HELD_OUT,
+    draw_models,
+    draw_residuals,
+    models_note,
+    residual_scale,
+    shown_models,
+)
 from ipsys_log.report.points_figure import draw_coverage
-from ipsys_log.report.residuals_figure import draw_residuals, residual_scale, shown_models
 
 __all__ = [
     "coverage_picture",

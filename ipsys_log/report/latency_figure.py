@@ -10,9 +10,8 @@ from matplotlib.axes import Axes
 from matplotlib.figure import Figure
 from numpy.typing import NDArray
 
-from ipsys_log.report.figures import picture, strip
+from ipsys_log.report.figures import NOTE, picture, strip
 from ipsys_log.report.files import write_files
-from ipsys_log.report.palette import NOTE
 
 __all__ = ["draw_latency"]
 

@@ -10,11 +10,17 @@ from matplotlib.figure import Figure
 from matplotlib.lines import Line2D
 from matplotlib.transforms import ScaledTranslation
 
-from ipsys_log.report.advice import TOLD_NOTE, label, told_height
-from ipsys_log.report.figures import scale_logarithmic, set_ticks, shorten, strip
+from ipsys_log.report.advice import TOLD_NOTE, Curve, CurvePoint, camera_curve, label, mean_curve, told_height
+from ipsys_log.report.figures import (
+    NOTE,
+    ModelStyle,
+    model_styles,
+    scale_logarithmic,
+    set_ticks,
+    shorten,
+    strip,
+)
 from ipsys_log.report.findings import Findings
-from ipsys_log.report.learning import Curve, CurvePoint, camera_curve, mean_curve
-from ipsys_log.report.palette import NOTE, ModelStyle, model_styles
 from ipsys_log.units import CM_PER_M
 
 __all__ = [

@@ -1,22 +1,208 @@
-"""The tables and figures of the paper, and some more, as files of a folder."""
+"""The tables and figures of the paper, and some more, as files of a folder.
+
+Where on the floor a model is off, and by how much.
+
+Models side by side: how far off they are, and how certain that is.
+"""
 
 from __future__ import annotations
 
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 from pathlib import Path
+from typing import NamedTuple
+
+import numpy as np
+from matplotlib import colormaps
+from matplotlib.axes import Axes
+from matplotlib.colors import ListedColormap, Normalize
+from matplotlib.figure import Figure
+from matplotlib.lines import Line2D
+from matplotlib.quiver import Quiver
+from numpy.typing import NDArray
 
 from ipsys_log.errors import IpsysError
-from ipsys_log.report.csv_tables import cross_validation_csv, paper_csv
-from ipsys_log.report.figures import png
-from ipsys_log.report.files import write_files
-from ipsys_log.report.findings import Findings
-from ipsys_log.report.learning import has_published
+from ipsys_log.messages import CameraEvaluation, ErrorStatistics
+from ipsys_log.report.accuracy import Accuracy
+from ipsys_log.report.advice import TOLD_NOTE, has_published, label, told_height
+from ipsys_log.report.figures import NOTE, model_styles, png, scale_logarithmic, strip
+from ipsys_log.report.files import cross_validation_csv, paper_csv, write_files
+from ipsys_log.report.findings import Findings, Missed, overall
+from ipsys_log.report.floor_figure import (
+    Square,
+    draw_arrows,
+    draw_ground,
+    draw_key,
+    exaggeration,
+    show_square,
+    square_around,
+)
 from ipsys_log.report.learning_figure import learning_figure, mean_curves, published_figure
-from ipsys_log.report.models_figure import models_figure
-from ipsys_log.report.points_figure import places_figure
-from ipsys_log.report.residuals_figure import residuals_figure, shown_models
+from ipsys_log.report.points_figure import draw_hulls, places_figure
+from ipsys_log.units import CM_PER_M
 
-__all__ = ["write_plots"]
+__all__ = [
+    "HELD_OUT",
+    "ResidualScale",
+    "draw_models",
+    "draw_residuals",
+    "models_figure",
+    "models_note",
+    "residual_scale",
+    "residuals_figure",
+    "shown_models",
+    "write_plots",
+]
+
+Array = NDArray[np.float64]
+
+
+# From pale for a small error to dark for a large one, which any colour vision sees.
+_COLOURS = ListedColormap(colormaps["magma_r"](np.linspace(0.2, 0.95, 256)))
+# So much wider at most the picture may be than the floor for the sake of an arrow.
+_WIDER = 1.12
+
+
+class ResidualScale(NamedTuple):
+    """Scales of floor maps: the error in cm that has the last colour, the arrows' factor, the floor shown."""
+
+    most_cm: float
+    factor: int
+    square: Square
+
+
+def shown_models(findings: Findings) -> list[Accuracy]:
+    """``poly``, which everybody knows, and the best of all that need no height; with residuals."""
+    ranked = [accuracy for accuracy in findings.ranked() if findings.missed(accuracy)]
+    named = [accuracy for accuracy in ranked if accuracy.model == "poly"]
+    return list(dict.fromkeys([*named, *ranked[:1]]))
+
+
+def residual_scale(findings: Findings, accuracies: Sequence[Accuracy]) -> ResidualScale:
+    """Return the scale that shows all these models alike: maps side by side are compared by eye."""
+    missed = [missed for accuracy in accuracies for missed in findings.missed(accuracy)]
+    places_m = np.vstack([each.world_m[:, :2] for each in missed])
+    errors_m = np.vstack([each.offsets_m[:, :2] for each in missed])
+    lengths_cm = np.concatenate([_lengths_cm(findings, each) for each in missed])
+    square = square_around(findings.rig, [places_m])
+    factor = exaggeration(list(errors_m), 2 * square.half)
+    # Make room for the arrows, while the floor stays large.
+    reach_m = 1.01 * np.abs(places_m + factor * errors_m - square.middle).max()
+    half_m = float(np.clip(reach_m, square.half, _WIDER * square.half))
+    return ResidualScale(float(np.quantile(lengths_cm, 0.95)), factor, Square(square.middle, half_m))
+
+
+def residuals_figure(findings: Findings) -> Figure:
+    """A floor for each model that is shown, with one scale of colours."""
+    accuracies = shown_models(findings)
+    figure = Figure(figsize=(5.6 * len(accuracies) + 0.9, 6.6), layout="constrained")
+    scale = residual_scale(findings, accuracies)
+    panels = figure.subplots(1, len(accuracies), squeeze=False)[0]
+    for axes, accuracy in zip(panels, accuracies, strict=True):
+        arrows = draw_residuals(axes, findings, accuracy, scale)
+    bar = figure.colorbar(arrows, ax=list(panels), shrink=0.8, pad=0.02, extend="max")
+    bar.set_label(f"error {'in space' if findings.in_space else 'on the floor'} in cm")
+    handles, labels = panels[0].get_legend_handles_labels()
+    if handles:
+        figure.legend(
+            handles, labels, loc="outside lower center", ncols=3 * len(panels), frameon=False, fontsize=9,
+            title="the floor that a camera's places lie around", title_fontsize=9,
+        )  # fmt: skip
+    return figure
+
+
+def draw_residuals(axes: Axes, findings: Findings, accuracy: Accuracy, scale: ResidualScale) -> Quiver:
+    """Draw one model's mean error at each place as an arrow on the floor, coloured by its length in space."""
+    missed = findings.missed(accuracy)
+    places_m = np.vstack([found.world_m[:, :2] for found in missed])
+    errors_m = np.vstack([found.offsets_m[:, :2] for found in missed])
+    lengths_cm = np.concatenate([_lengths_cm(findings, found) for found in missed])
+    draw_ground(axes, findings.rig, [places_m])
+    draw_hulls(axes, findings)
+    show_square(axes, scale.square)
+    factor = scale.factor
+    # The largest last, on top of the others.
+    order = np.argsort(lengths_cm, kind="stable")
+    places_m, errors_m, lengths_cm = places_m[order], errors_m[order], lengths_cm[order]
+    look = {"cmap": _COLOURS, "norm": Normalize(0, scale.most_cm)}
+    arrows = draw_arrows(axes, places_m, errors_m, factor, lengths_cm, **look)
+    x_m, y_m = places_m.T
+    axes.scatter(x_m, y_m, c=lengths_cm, s=14, zorder=3.5, lw=0, **look)  # type: ignore[arg-type]
+    draw_key(axes, arrows, factor)
+    scheme = "by cross-validation" if accuracy.rows(True) else "on held-out places"
+    times = f"drawn {factor} times as long" if factor > 1 else ""
+    axes.set_title(f"{label(accuracy.model)}: errors {scheme}\n{times}", loc="left", fontsize=10)
+    return arrows
+
+
+def _lengths_cm(findings: Findings, missed: Missed) -> Array:
+    return missed.lengths_m[:, 0 if findings.in_space else 1] * CM_PER_M
+
+
+_LOG_RATIO = 10.0
+_ROW_IN = 0.34
+HELD_OUT = {"marker": "D", "mfc": "white", "mec": NOTE, "ms": 5.5, "mew": 1.2, "ls": "none"}
+
+
+def models_figure(findings: Findings) -> Figure:
+    """A row for each model, the best on top: the mean with its interval, in space and on the floor."""
+    spaces = (True, False) if findings.in_space else (False,)
+    ranked = findings.ranked()
+    figure = Figure(figsize=(1.8 + 4.2 * len(spaces), 1.7 + _ROW_IN * len(ranked)), layout="constrained")
+    panels = figure.subplots(1, len(spaces), sharex=True, sharey=True, squeeze=False)[0]
+    for axes, in_space in zip(panels, spaces, strict=True):
+        draw_models(axes, ranked, in_space)
+        axes.set_title("in space" if in_space else "on the floor", fontsize=10, loc="left")
+    dot = Line2D([], [], color="black", marker="o", ms=6, lw=2)
+    held_out = Line2D([], [], **HELD_OUT)  # type: ignore[arg-type]
+    figure.legend(
+        [dot, held_out], ["by cross-validation, with the 95 % interval", "on held-out places"],
+        loc="outside lower center", ncols=2, frameon=False, fontsize=9,
+    )  # fmt: skip
+    if note := models_note(ranked):
+        figure.suptitle(note, x=0.01, ha="left", fontsize=9, color=NOTE)
+    return figure
+
+
+def models_note(accuracies: Sequence[Accuracy]) -> str:
+    """What the mark at the names of some models means; empty where there are none."""
+    return TOLD_NOTE if any(told_height(accuracy.model) for accuracy in accuracies) else ""
+
+
+def draw_models(axes: Axes, ranked: Sequence[Accuracy], in_space: bool) -> None:
+    """Draw a row for each model, the first on top; the scale is that of errors in space and on the floor."""
+    styles = model_styles(accuracy.model for accuracy in ranked)
+    for y, accuracy in enumerate(ranked):
+        crossed = _errors(overall(accuracy, True), in_space)
+        held_out = _errors(overall(accuracy, False), in_space)
+        if crossed is not None:
+            colour = styles[accuracy.model].colour
+            axes.plot(_ends_cm(crossed), [y, y], color=colour, lw=2.4, solid_capstyle="butt", zorder=3)
+            axes.plot(crossed.mean_m * CM_PER_M, y, "o", color=colour, ms=6.5, zorder=3.5)
+        if held_out is not None:
+            axes.plot(held_out.mean_m * CM_PER_M, y, zorder=4, **HELD_OUT)  # type: ignore[arg-type]
+    rows = [overall(accuracy, scheme) for accuracy in ranked for scheme in (True, False)]
+    shown = [errors for row in rows if row for errors in (row.error_3d, row.error_2d) if errors]
+    ends_cm = [end for errors in shown for end in _ends_cm(errors)]
+    if ends_cm and max(ends_cm) > _LOG_RATIO * min(ends_cm):
+        scale_logarithmic(axes, "x", min(ends_cm) / 1.3, max(ends_cm) * 1.3)
+    else:
+        axes.set_xlim(0, 1.08 * max(ends_cm, default=1.0))
+    axes.set_yticks(range(len(ranked)), [label(accuracy.model) for accuracy in ranked])
+    axes.set_ylim(len(ranked) - 0.4, -0.6)
+    axes.set_xlabel("mean error in cm")
+    axes.tick_params(axis="y", length=0)
+    strip(axes, "x")
+    axes.spines["left"].set_visible(False)
+
+
+def _errors(row: CameraEvaluation | None, in_space: bool) -> ErrorStatistics | None:
+    return None if row is None else row.error_3d if in_space else row.error_2d
+
+
+def _ends_cm(errors: ErrorStatistics) -> list[float]:
+    """Of the confidence interval of the mean, or the mean itself."""
+    ends_m = (errors.mean_low_m, errors.mean_high_m)
+    return [(errors.mean_m if end_m is None else end_m) * CM_PER_M for end_m in ends_m]
 
 
 def _always(findings: Findings) -> bool:

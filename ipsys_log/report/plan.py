@@ -9,15 +9,14 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import NDArray
 
-from ipsys_log.analysis.plan import Plan, plan_places
-from ipsys_log.analysis.views import View
+from ipsys_log.analysis.plan import Plan, View, plan_places
 from ipsys_log.errors import IpsysError
-from ipsys_log.geometry.multilateration import sides_alike, tape_covariance
 from ipsys_log.geometry.poses import invert_pose, make_pose
+from ipsys_log.geometry.trilateration import sides_alike, tape_covariance
 from ipsys_log.log.dataset import Session
 from ipsys_log.messages import CameraCalibration, CameraModel, Measurement, Model, Rig
-from ipsys_log.models.applied import AppliedModel
 from ipsys_log.models.rigid import rigid_transform
+from ipsys_log.models.table import AppliedModel
 from ipsys_log.models.uncertainty import Uncertainty
 from ipsys_log.units import CM_PER_M
 

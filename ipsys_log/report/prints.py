@@ -9,8 +9,7 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import NDArray
 
-from ipsys_log.calibration.board import Board
-from ipsys_log.calibration.board_pattern import black_squares, board_markers
+from ipsys_log.calibration.board import Board, black_squares, board_markers
 from ipsys_log.geometry.marker_cells import cell_outlines
 from ipsys_log.geometry.markers import white_cells
 from ipsys_log.messages import Rig

@@ -8,9 +8,9 @@ from math import ceil
 from rich.table import Table
 
 from ipsys_log.log.chunk_builder import IMAGE_SCHEMAS
+from ipsys_log.log.contents import run_of_topic
 from ipsys_log.log.reader import LogReader
 from ipsys_log.log.repair import RepairReport
-from ipsys_log.log.topics import run_of_topic
 from ipsys_log.units import NS_PER_S, format_bytes, format_time
 
 __all__ = ["repair_lines"]

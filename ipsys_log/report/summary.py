@@ -10,14 +10,13 @@ from rich.console import Group
 from rich.table import Table
 from rich.text import Text
 
-from ipsys_log.analysis.accuracy import CROSS_VALIDATION, POOLED
+from ipsys_log.analysis.accuracy import CROSS_VALIDATION, POOLED, root_mean_square_m
 from ipsys_log.analysis.consistency import FEWEST_POINTS
-from ipsys_log.analysis.statistics import root_mean_square_m
 from ipsys_log.messages import CameraEvaluation, ErrorStatistics
 from ipsys_log.report.accuracy import Accuracy, gather_suspects
 from ipsys_log.report.advice import TOLD_NOTE, advise, label, told_height
-from ipsys_log.report.cells import format_interval, name_cell, plain_table, wrap_text
 from ipsys_log.report.findings import in_space, judged, overall, rank
+from ipsys_log.report.tables import format_interval, name_cell, plain_table, wrap_text
 from ipsys_log.stages.evaluate import SCREENING
 from ipsys_log.units import CM_PER_M
 

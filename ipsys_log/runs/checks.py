@@ -10,8 +10,8 @@ from ipsys_log.analysis.pairs import split
 from ipsys_log.analysis.tape import world_point
 from ipsys_log.errors import FitError, IpsysError
 from ipsys_log.geometry.lenses import check_calibration
+from ipsys_log.log.contents import camera_of_topic
 from ipsys_log.log.dataset import Session
-from ipsys_log.log.topics import camera_of_topic
 from ipsys_log.messages import CameraPoints, Markers, Rig
 from ipsys_log.models.table import min_pairs, reads_height
 from ipsys_log.rig.file import check_rig

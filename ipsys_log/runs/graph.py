@@ -6,9 +6,8 @@ from collections.abc import Callable, Collection, Iterable, Mapping
 from dataclasses import dataclass, field
 from typing import Any
 
-from ipsys_log.analysis.cross_validation import FOLDS, REPEATS
+from ipsys_log.analysis.cross_validation import FOLDS, REPEATS, labelled_subsets
 from ipsys_log.analysis.ground_truth import gather_tracks, true_points
-from ipsys_log.analysis.learning import labelled_subsets
 from ipsys_log.analysis.pairs import level_cameras, split
 from ipsys_log.errors import IpsysError
 from ipsys_log.geometry.lenses import same_lens
@@ -33,7 +32,7 @@ from ipsys_log.messages import (
 )
 from ipsys_log.models.table import reads_height
 from ipsys_log.runs.options import Request
-from ipsys_log.runs.provenance import newest_run, read_channels
+from ipsys_log.runs.provenance import newest_run, read_channels, version_parameters
 from ipsys_log.runs.select import (
     can_evaluate,
     copied_run,
@@ -47,7 +46,6 @@ from ipsys_log.runs.select import (
     split_parameters,
     unused_places,
 )
-from ipsys_log.runs.versions import version_parameters
 from ipsys_log.stages import camera_frame, detect, fuse, locate
 from ipsys_log.stages.evaluate import Study, evaluate_model
 from ipsys_log.stages.fit import fit_model

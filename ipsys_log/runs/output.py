@@ -12,12 +12,11 @@ from pathlib import Path
 
 from ipsys_log.errors import IpsysError, LogError
 from ipsys_log.log.codec import encode, schema_data, schema_name
+from ipsys_log.log.contents import Schema
 from ipsys_log.log.dataset import Session
-from ipsys_log.log.journal import journal_path
+from ipsys_log.log.journal import DISK, journal_path
 from ipsys_log.log.lock import dangling
 from ipsys_log.log.reader import LogReader
-from ipsys_log.log.storage import DISK
-from ipsys_log.log.types import Schema
 from ipsys_log.log.writer import LogWriter
 from ipsys_log.messages import ChannelWritten, Message, Rig, Run
 from ipsys_log.rig.file import hide_passwords

@@ -8,7 +8,7 @@ from collections.abc import Iterable, Iterator
 from statistics import median
 
 from ipsys_log.errors import IpsysError
-from ipsys_log.log.topics import camera_of_topic
+from ipsys_log.log.contents import camera_of_topic
 from ipsys_log.messages import Event, Markers, Message, Positions
 from ipsys_log.runs.graph import Task
 from ipsys_log.runs.select import LEAST_OFFSET_PX, MIN_OFFSETS

@@ -11,8 +11,8 @@ import numpy as np
 from ipsys_log.analysis.cross_validation import FOLDS
 from ipsys_log.analysis.pairs import Measured, build_pairs, gather_sightings, measured_in_order, split
 from ipsys_log.errors import IpsysError
+from ipsys_log.log.contents import run_of_topic
 from ipsys_log.log.dataset import Session
-from ipsys_log.log.topics import run_of_topic
 from ipsys_log.messages import (
     FRAME_SKIPPED,
     STAMP_UNRELIABLE,

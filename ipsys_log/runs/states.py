@@ -5,11 +5,10 @@ from __future__ import annotations
 from collections.abc import Collection, Iterable
 from dataclasses import dataclass, replace
 
+from ipsys_log.log.contents import camera_of_topic, run_of_topic
 from ipsys_log.log.dataset import Session
-from ipsys_log.log.topics import camera_of_topic, run_of_topic
 from ipsys_log.messages import MEASUREMENTS_TOPIC, RIG_TOPIC, ChannelRead, Model, Run
-from ipsys_log.runs.provenance import is_complete
-from ipsys_log.runs.versions import VERSIONS, recorded_version, versioned_names
+from ipsys_log.runs.provenance import VERSIONS, is_complete, recorded_version, versioned_names
 from ipsys_log.stages.camera_frame import PERIMETER
 
 __all__ = ["Recorded", "is_fitted_here", "made_by_newer", "method_of", "out_of_date_lines", "recorded_stages"]

@@ -20,8 +20,8 @@ from ipsys_log.analysis.differences import (
 )
 from ipsys_log.errors import IpsysError
 from ipsys_log.log.codec import encode
+from ipsys_log.log.contents import run_of_topic
 from ipsys_log.log.dataset import Session
-from ipsys_log.log.topics import run_of_topic
 from ipsys_log.messages import (
     CameraCalibration,
     CameraPoints,

@@ -5,16 +5,14 @@ from __future__ import annotations
 import numpy as np
 from numpy.typing import NDArray
 
-from ipsys_log.calibration.board import Board
-from ipsys_log.calibration.board_pattern import black_squares, board_markers
+from ipsys_log.calibration.board import Board, black_squares, board_markers
 from ipsys_log.errors import IpsysError
 from ipsys_log.geometry.lenses import undistort
+from ipsys_log.geometry.marker_cells import PlacedBoard, print_outline
 from ipsys_log.geometry.markers import white_cells
-from ipsys_log.geometry.patterns import PlacedBoard, print_outline
 from ipsys_log.geometry.poses import invert_pose, make_pose, rotation
 from ipsys_log.simulation.cameras import Camera, sees
-from ipsys_log.simulation.seeds import Purpose, stream
-from ipsys_log.simulation.settings import LabSettings
+from ipsys_log.simulation.settings import LabSettings, Purpose, stream
 
 __all__ = ["POSES", "board_cells", "hold_board"]
 

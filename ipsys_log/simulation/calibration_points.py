@@ -9,12 +9,11 @@ import numpy as np
 from numpy.typing import NDArray
 
 from ipsys_log.errors import IpsysError
-from ipsys_log.geometry.patterns import Placed, black_cells, print_outline
+from ipsys_log.geometry.marker_cells import Placed, black_cells, print_outline
 from ipsys_log.geometry.poses import lay_flat
 from ipsys_log.messages import Distance, Interval, Measurement, ReferencePoint
 from ipsys_log.simulation.cameras import FLOOR_M, Camera, sees
-from ipsys_log.simulation.seeds import Purpose, stream
-from ipsys_log.simulation.settings import LabSettings
+from ipsys_log.simulation.settings import LabSettings, Purpose, stream
 
 __all__ = [
     "REFERENCES",

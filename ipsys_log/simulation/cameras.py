@@ -11,8 +11,7 @@ from ipsys_log.errors import IpsysError
 from ipsys_log.geometry.lenses import project
 from ipsys_log.geometry.poses import look_down, transform
 from ipsys_log.messages import CameraCalibration
-from ipsys_log.simulation.seeds import Purpose, stream
-from ipsys_log.simulation.settings import LabSettings
+from ipsys_log.simulation.settings import LabSettings, Purpose, stream
 
 __all__ = ["FLOOR_M", "Camera", "hang_cameras", "sees"]
 

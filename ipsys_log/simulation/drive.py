@@ -13,8 +13,7 @@ from numpy.typing import NDArray
 
 from ipsys_log.simulation.calibration_points import Place, overlap
 from ipsys_log.simulation.cameras import FLOOR_M, Camera
-from ipsys_log.simulation.seeds import Purpose, stream
-from ipsys_log.simulation.settings import LabSettings
+from ipsys_log.simulation.settings import LabSettings, Purpose, stream
 
 __all__ = ["Drive", "plan_drive"]
 

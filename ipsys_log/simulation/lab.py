@@ -7,7 +7,7 @@ from concurrent.futures import ThreadPoolExecutor
 from dataclasses import dataclass
 from typing import Any
 
-from ipsys_log.geometry.patterns import Moving, Placed
+from ipsys_log.geometry.marker_cells import Moving, Placed
 from ipsys_log.messages import (
     MEASUREMENTS_TOPIC,
     RIG_TOPIC,
@@ -35,11 +35,10 @@ from ipsys_log.simulation.calibration_points import (
 )
 from ipsys_log.simulation.cameras import FLOOR_M, Camera, hang_cameras
 from ipsys_log.simulation.drive import Drive, plan_drive
+from ipsys_log.simulation.floor import View, prepare_view
+from ipsys_log.simulation.pixel_shares import exposed
 from ipsys_log.simulation.render import encode_jpeg, render
-from ipsys_log.simulation.seeds import Purpose, stream
-from ipsys_log.simulation.settings import LabSettings
-from ipsys_log.simulation.shutter import exposed
-from ipsys_log.simulation.views import View, prepare_view
+from ipsys_log.simulation.settings import LabSettings, Purpose, stream
 from ipsys_log.units import NS_PER_S
 
 __all__ = ["EPOCH_NS", "build_rig", "drive_start_ns", "driving", "simulate"]

@@ -13,10 +13,10 @@ import cv2
 import numpy as np
 from numpy.typing import NDArray
 
-from ipsys_log.geometry.patterns import Moving, Placed, PlacedBoard
+from ipsys_log.geometry.marker_cells import Moving, Placed, PlacedBoard
+from ipsys_log.simulation.floor import FIELD_PX, View, to_light
 from ipsys_log.simulation.pixel_shares import Box, find_shares
 from ipsys_log.simulation.settings import LabSettings
-from ipsys_log.simulation.views import FIELD_PX, View, to_light
 
 __all__ = ["Print", "encode_jpeg", "expose", "lay_down", "render"]
 
@@ -36,7 +36,7 @@ def render(
 
     Parameters
     ----------
-    view : of the camera, from :func:`~ipsys_log.simulation.views.prepare_view`.
+    view : of the camera, from :func:`~ipsys_log.simulation.floor.prepare_view`.
     placed : the markers; where two overlap, the later one lies on top. One that moves is a function
         of the time in s since the time of the frame: the middle of the exposure of its first row.
     settings : the grey levels, blur, gamma and dictionary of the scene; row time and exposure.

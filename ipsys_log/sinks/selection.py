@@ -8,8 +8,8 @@ from dataclasses import dataclass
 import numpy as np
 
 from ipsys_log.errors import IpsysError
+from ipsys_log.log.contents import camera_of_topic
 from ipsys_log.log.dataset import Session
-from ipsys_log.log.topics import camera_of_topic
 from ipsys_log.messages import (
     EVENTS_TOPIC,
     RIG_TOPIC,

@@ -10,9 +10,15 @@ import numpy as np
 from numpy.typing import NDArray
 
 from ipsys_log.errors import IpsysError
-from ipsys_log.geometry.corner_noise import check_covariance, pixel_slopes, whiten
 from ipsys_log.geometry.lenses import check_calibration, check_size, undistort
-from ipsys_log.geometry.markers import camera_point, camera_point_slopes, heading
+from ipsys_log.geometry.markers import (
+    camera_point,
+    camera_point_slopes,
+    check_covariance,
+    heading,
+    pixel_slopes,
+    whiten,
+)
 from ipsys_log.geometry.square_pose import fit_squares, goes_around, reprojection_px
 from ipsys_log.messages import (
     CameraCalibration,

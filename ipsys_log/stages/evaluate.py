@@ -9,8 +9,14 @@ import numpy as np
 from numpy.typing import NDArray
 
 from ipsys_log.analysis.accuracy import errors_cross_validated, errors_held_out
-from ipsys_log.analysis.cross_validation import FOLDS, gather_places, leave_one_out
-from ipsys_log.analysis.learning import learning_curve, learning_sizes, published_curve
+from ipsys_log.analysis.cross_validation import (
+    FOLDS,
+    gather_places,
+    learning_curve,
+    learning_sizes,
+    leave_one_out,
+    published_curve,
+)
 from ipsys_log.analysis.outliers import find_suspects
 from ipsys_log.analysis.pairs import Measured
 from ipsys_log.errors import FitError

@@ -10,8 +10,7 @@ from numpy.typing import NDArray
 
 from ipsys_log.errors import IpsysError
 from ipsys_log.messages import CameraPoint, CameraPoints, Message, Model, Position, Positions, Rig
-from ipsys_log.models.applied import AppliedModel
-from ipsys_log.models.table import reads_height
+from ipsys_log.models.table import AppliedModel, reads_height
 
 __all__ = ["READS", "Locate"]
 

@@ -13,8 +13,7 @@ from ipsys_log.survey.blunders import THE_MODEL
 from ipsys_log.survey.checks import Checked, check_entry
 from ipsys_log.survey.entry import Entry, Fault, read_typed
 from ipsys_log.survey.from_log import FinishedLog, rigs_of
-from ipsys_log.survey.neighbours import OTHER_ROWS, fit_neighbours
-from ipsys_log.survey.scene import Sight, look
+from ipsys_log.survey.scene import OTHER_ROWS, Sight, fit_neighbours, look
 from ipsys_log.survey.sheet import SheetRow, find_stops, name_columns, read_sheet, refuse_rows
 
 __all__ = ["add_sheet", "check_sheet"]

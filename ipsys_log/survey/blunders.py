@@ -11,10 +11,9 @@ from numpy.typing import NDArray
 from ipsys_log.analysis.blunders import possible_slips
 from ipsys_log.analysis.tape import Measured, TapePoint, flat_places, reference_points, world_point
 from ipsys_log.errors import IpsysError
-from ipsys_log.geometry.multilateration import sides_alike
-from ipsys_log.geometry.trilateration import SIDES
+from ipsys_log.geometry.trilateration import SIDES, sides_alike
 from ipsys_log.messages import Measurement, Rig
-from ipsys_log.survey.predict import Prediction
+from ipsys_log.survey.scene import Prediction
 from ipsys_log.units import CM_PER_M
 
 __all__ = [

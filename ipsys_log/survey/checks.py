@@ -24,8 +24,7 @@ from ipsys_log.survey.blunders import (
     with_tape,
 )
 from ipsys_log.survey.entry import Entry, Fault
-from ipsys_log.survey.predict import Prediction, predict
-from ipsys_log.survey.scene import Sight
+from ipsys_log.survey.scene import Prediction, Sight, predict
 from ipsys_log.units import CM_PER_M
 
 __all__ = ["Checked", "check_entry", "next_id", "withdraw"]

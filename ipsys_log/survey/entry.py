@@ -10,8 +10,7 @@ from typing import NamedTuple
 import numpy as np
 
 from ipsys_log.errors import IpsysError
-from ipsys_log.geometry.multilateration import sides_alike
-from ipsys_log.geometry.trilateration import SIDES
+from ipsys_log.geometry.trilateration import SIDES, sides_alike
 from ipsys_log.messages import Distance, ReferencePoint, Rig
 from ipsys_log.units import CM_PER_M
 

@@ -14,8 +14,8 @@ from ipsys_log.analysis.pairs import Sightings, gather_sightings
 from ipsys_log.analysis.stationary import still_stretches
 from ipsys_log.errors import FrameError, IpsysError, LogError
 from ipsys_log.images.video import decode_last
+from ipsys_log.log.contents import camera_of_topic
 from ipsys_log.log.dataset import Session
-from ipsys_log.log.topics import camera_of_topic
 from ipsys_log.log.writer import LogWriter
 from ipsys_log.messages import (
     MEASUREMENTS_TOPIC,

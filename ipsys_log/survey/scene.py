@@ -1,20 +1,96 @@
-"""What measuring is done on, a recording or a finished log, and what its cameras say of a marker."""
+"""What measuring is done on, a recording or a finished log, and what its cameras say of a marker.
+
+Where the present model has a marker, beside where the tape has it.
+
+A model of measurements that were entered together, to check each by the others.
+"""
 
 from __future__ import annotations
 
 from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import dataclass
+from functools import lru_cache
 from typing import Protocol
 
 import numpy as np
 from numpy.typing import NDArray
 
+from ipsys_log.analysis.consistency import FEWEST_POINTS
+from ipsys_log.analysis.cross_validation import gather_places, leave_one_out
+from ipsys_log.analysis.outliers import find_suspects
 from ipsys_log.analysis.stationary import FEWEST_FRAMES, lies_at, lies_still
-from ipsys_log.messages import CameraPoints, Interval, Markers, Measurement, Model, Rig
+from ipsys_log.analysis.tape import Measured, world_point
+from ipsys_log.errors import FitError, IpsysError
+from ipsys_log.messages import CameraPoints, Interval, Markers, Measurement, Model, Pair, Rig
+from ipsys_log.models.table import AppliedModel
+from ipsys_log.stages.fit import fit_model
 
-__all__ = ["Scene", "Sight", "Stop", "View", "look", "visible_markers"]
+__all__ = [
+    "OTHER_ROWS",
+    "Prediction",
+    "Scene",
+    "Sight",
+    "Stop",
+    "View",
+    "fit_neighbours",
+    "look",
+    "predict",
+    "visible_markers",
+]
 
 Array = NDArray[np.float64]
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class Prediction:
+    """Where the model of a camera has the marker, ``world_m`` (3,), and ``off_m`` how far from the tape.
+
+    ``sigma_m`` is the model's own in the worst direction, ``inside`` whether the place lies among those
+    that it was fitted to; None where the model does not say.
+    """
+
+    camera: str
+    world_m: Array
+    off_m: float
+    sigma_m: float | None
+    inside: bool | None
+
+
+def predict(model: Model, points_m: Mapping[str, Array], world_m: Array) -> tuple[Prediction, ...]:
+    """What the model of each camera that saw the marker says.
+
+    Parameters
+    ----------
+    model : out of a log.
+    points_m : mean camera point (3,) by camera.
+    world_m : (3,), by tape and ruler; models that need the height of the marker get it from here.
+    """
+    applied = _applied(model)
+    heights_m = np.array([world_m[2]])
+    found = []
+    for camera, point_m in sorted(points_m.items()):
+        if camera not in applied:
+            continue
+        one, here_m = applied[camera], point_m[None]
+        there_m = one.predict(here_m, heights_m)
+        if not np.isfinite(there_m).all():
+            continue
+        covariances_m2 = one.covariances(here_m, heights_m)
+        sigma_m = None
+        if covariances_m2 is not None:
+            sigma_m = float(np.sqrt(np.linalg.eigvalsh(covariances_m2[0])[-1]))
+        sigmas_m = np.zeros(1) if covariances_m2 is None else np.sqrt(covariances_m2[:, 2, 2])
+        inside = one.inside(here_m, there_m, sigmas_m)
+        off_m = float(np.linalg.norm(there_m[0] - world_m))
+        found.append(
+            Prediction(camera, there_m[0], off_m, sigma_m, None if inside is None else bool(inside[0]))
+        )
+    return tuple(found)
+
+
+@lru_cache(maxsize=2)
+def _applied(model: Model) -> dict[str, AppliedModel]:
+    return {camera.camera: AppliedModel(model.name, camera) for camera in model.cameras}
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -161,3 +237,54 @@ def visible_markers(views: Iterable[View], rig: Rig) -> list[int]:
     """The rig's markers that some camera sees, sorted."""
     found = {point.id for view in views for points in view.points for point in points.points}
     return sorted(one for one in found if rig.knows(one))
+
+
+# Their name in a warning.
+OTHER_ROWS = "the other rows"
+# Fits in milliseconds, and follows the points closely enough to see an error of some centimetres.
+_MODEL = "poly"
+
+
+def fit_neighbours(seen: Sequence[tuple[Measurement, Sight]], rig: Rig) -> Model | None:
+    """Fit a model to measurements, without those that contradict the rest.
+
+    Parameters
+    ----------
+    seen : measurements, each with the observations of its marker.
+    rig : of all of them.
+
+    Returns
+    -------
+    None if no camera saw enough of them.
+    """
+    pairs = _pairs(seen, rig)
+    if not pairs:
+        return None
+    places = [Measured(measurement, rig) for measurement, _ in seen]
+    within = {pair.measurement for held in pairs.values() for pair in held}
+    try:
+        suspects = find_suspects(
+            leave_one_out(_MODEL, gather_places(pairs)),
+            [place for place in places if place.measurement.id in within],
+        )
+        wrong = {suspect.measurement for suspect in suspects}
+        kept = {camera: [p for p in held if p.measurement not in wrong] for camera, held in pairs.items()}
+        return fit_model(
+            _MODEL, {camera: held for camera, held in kept.items() if len(held) >= FEWEST_POINTS}, 0
+        )
+    except FitError:
+        return None
+
+
+def _pairs(seen: Sequence[tuple[Measurement, Sight]], rig: Rig) -> dict[str, list[Pair]]:
+    """Pair camera points and world points, by camera; a camera with few of them is left out."""
+    pairs: dict[str, list[Pair]] = {}
+    for measurement, sight in seen:
+        try:
+            fixed = world_point(measurement, rig)
+        except IpsysError:
+            continue
+        for camera, point_m in sight.points_m.items():
+            row = (measurement.id, sight.marker_id, point_m, fixed.world_m, 1, fixed.covariance_m2)
+            pairs.setdefault(camera, []).append(Pair(*row))
+    return {camera: held for camera, held in pairs.items() if len(held) >= FEWEST_POINTS}

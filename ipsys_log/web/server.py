@@ -1,4 +1,7 @@
-"""The server of the page, in a thread of its own beside whatever else goes on."""
+"""The server of the page, in a thread of its own beside whatever else goes on.
+
+Faults of the page's server: kept for the end of the command, because the screen belongs to a recording.
+"""
 
 from __future__ import annotations
 
@@ -7,6 +10,7 @@ import errno
 import ipaddress
 import secrets
 import socket
+import traceback
 from collections.abc import Callable, Iterator
 from contextlib import contextmanager
 from dataclasses import dataclass
@@ -15,15 +19,50 @@ from typing import Any
 
 import cv2
 import uvicorn
+from starlette.types import ASGIApp, Receive, Scope, Send
 
 from ipsys_log.errors import IpsysError
 from ipsys_log.survey.scene import Scene
 from ipsys_log.web.access import Guard
 from ipsys_log.web.app import build_app
 from ipsys_log.web.connections import Connections, Limits, derive_limits
-from ipsys_log.web.faults import Faults
 
-__all__ = ["Served", "check_free", "qr_code", "serving"]
+__all__ = ["Faults", "Served", "check_free", "qr_code", "serving"]
+
+
+class Faults:
+    """Unexpected exceptions in the server's thread: their number, and the first one's traceback."""
+
+    def __init__(self) -> None:
+        self.count = 0
+        self.first = ""
+
+    def add(self, error: BaseException) -> None:
+        """Count an exception."""
+        while isinstance(error, BaseExceptionGroup) and len(error.exceptions) == 1:
+            (error,) = error.exceptions
+        self.count += 1
+        self.first = self.first or "".join(traceback.format_exception(error)).rstrip()
+
+    def watch_loop(self, loop: asyncio.AbstractEventLoop) -> None:
+        """Count exceptions that nothing else in an event loop handles."""
+
+        def handle(_: asyncio.AbstractEventLoop, context: dict[str, Any]) -> None:
+            self.add(context.get("exception") or RuntimeError(str(context.get("message"))))
+
+        loop.set_exception_handler(handle)
+
+    def watch_app(self, app: ASGIApp) -> ASGIApp:
+        """Count exceptions of an app; the server answers such a request with the status 500."""
+
+        async def call(scope: Scope, receive: Receive, send: Send) -> None:
+            try:
+                await app(scope, receive, send)
+            except Exception as error:
+                self.add(error)
+
+        return call
+
 
 _LOOPBACK = "127.0.0.1"
 _STEP_S = 0.02

@@ -10,7 +10,7 @@ import pytest
 from numpy.typing import NDArray
 
 from ipsys_log.analysis.alignment import LEVEL_M, Alignment, align_camera
-from ipsys_log.analysis.still import Lying, find_lying
+from ipsys_log.analysis.stationary import Lying, find_lying
 from ipsys_log.geometry.markers import camera_point, marker_corners
 from ipsys_log.geometry.poses import lay_flat, look_down, rotation, transform
 from ipsys_log.messages import CameraPoint, CameraPoints, Interval, Measurement

@@ -7,10 +7,9 @@ from dataclasses import replace
 import numpy as np
 from numpy.typing import NDArray
 
-from ipsys_log.analysis.alignment import align_camera
+from ipsys_log.analysis.alignment import align_camera, join_cameras
 from ipsys_log.analysis.coverage import Hung
-from ipsys_log.analysis.joined import join_cameras
-from ipsys_log.analysis.still import Lying
+from ipsys_log.analysis.stationary import Lying
 from ipsys_log.geometry.poses import invert_pose, look_down, make_pose, rotation, transform
 from ipsys_log.messages import CameraCalibration
 

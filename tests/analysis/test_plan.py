@@ -10,12 +10,11 @@ import pytest
 from numpy.typing import NDArray
 from scipy.special import ellipe
 
-from ipsys_log.analysis.plan import Plan, mean_length, plan_places
-from ipsys_log.analysis.views import View
+from ipsys_log.analysis.plan import Plan, View, mean_length, plan_places
 from ipsys_log.errors import IpsysError
 from ipsys_log.geometry.lenses import undistort
-from ipsys_log.geometry.multilateration import tape_covariance
 from ipsys_log.geometry.poses import invert_pose, lay_flat, look_down, transform
+from ipsys_log.geometry.trilateration import tape_covariance
 from ipsys_log.messages import CameraCalibration, Pair
 from ipsys_log.models.table import Places, fit_cameras, inputs
 from ipsys_log.models.uncertainty import Uncertainty

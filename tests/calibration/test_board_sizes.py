@@ -11,8 +11,7 @@ from numpy.typing import NDArray
 from ipsys_log.calibration.board import Board, parse_board
 from ipsys_log.calibration.board_search import Looked, look
 from ipsys_log.calibration.calibrate import calibrate
-from ipsys_log.calibration.chessboard import find_chessboard
-from ipsys_log.calibration.chessboard_grid import complete_grid
+from ipsys_log.calibration.chessboard import complete_grid, find_chessboard
 from ipsys_log.calibration.lens_models import LENSES
 from ipsys_log.errors import IpsysError
 from tests.calibration.boards_seen import chessboard_pattern, photograph, striped_pattern

@@ -11,8 +11,7 @@ from numpy.typing import NDArray
 
 from ipsys_log.calibration.bundle_adjustment import Corners
 from ipsys_log.calibration.lens_models import LENSES
-from ipsys_log.calibration.solve import Solved, solve
-from ipsys_log.calibration.start import find_start, pose_from_rays
+from ipsys_log.calibration.solve import Solved, find_start, pose_from_rays, solve
 from tests.calibration.boards_seen import SIZE_PX, TRUTH, grid_m, random_pose, seen
 
 

@@ -12,7 +12,7 @@ from ipsys_log.calibration.board_search import Looked
 from ipsys_log.calibration.bundle_adjustment import Corners
 from ipsys_log.calibration.calibrate import Calibrated, calibrate
 from ipsys_log.calibration.lens_models import LENSES
-from ipsys_log.calibration.start import find_start
+from ipsys_log.calibration.solve import find_start
 from ipsys_log.calibration.two_cameras import TwoCameras, find_two_cameras
 from ipsys_log.errors import IpsysError
 from tests.calibration.boards_seen import SIZE_PX, TRUTH, seen

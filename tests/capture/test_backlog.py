@@ -7,7 +7,7 @@ from collections.abc import Sequence
 from hypothesis import given
 from hypothesis import strategies as st
 
-from ipsys_log.capture.waiting import Waiting
+from ipsys_log.capture.backlog import Waiting
 from ipsys_log.messages import CompressedVideo, Message, SkippedVideo, image_topic
 
 KEY, OTHER = bytes.fromhex("00000001 67 00000001 65 88"), bytes.fromhex("00000001 41 9a")

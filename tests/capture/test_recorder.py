@@ -15,8 +15,8 @@ from ipsys_log.capture.backlog import TICK, Backlog
 from ipsys_log.capture.recorder import Recording, recording, written
 from ipsys_log.errors import IpsysError, LogError
 from ipsys_log.log.dataset import Session
+from ipsys_log.log.journal import Disk
 from ipsys_log.log.repair import repair
-from ipsys_log.log.storage import Disk
 from ipsys_log.log.writer import LogWriter
 from ipsys_log.messages import (
     FRAME_SKIPPED,

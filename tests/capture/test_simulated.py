@@ -11,21 +11,19 @@ import numpy as np
 import pytest
 
 from ipsys_log.calibration.board import parse_board
-from ipsys_log.calibration.calibrate import Calibrated
-from ipsys_log.calibration.cameras import calibrate_cameras
+from ipsys_log.calibration.calibrate import Calibrated, calibrate_cameras
 from ipsys_log.calibration.images import find_sources
 from ipsys_log.calibration.lens_models import find_lens
 from ipsys_log.capture.frames import Clock, Frame
 from ipsys_log.capture.simulated import open_simulated, parse_source
 from ipsys_log.errors import IpsysError
-from ipsys_log.geometry.patterns import true_corners
+from ipsys_log.geometry.marker_cells import true_corners
 from ipsys_log.messages import CompressedImage, RigCamera
 from ipsys_log.simulation.board import POSES
 from ipsys_log.simulation.calibration_points import place
 from ipsys_log.simulation.cameras import hang_cameras
-from ipsys_log.simulation.film import board_film, lab_film, shown_at
-from ipsys_log.simulation.live_lab import plan_live_lab
-from ipsys_log.simulation.views import prepare_view
+from ipsys_log.simulation.floor import prepare_view
+from ipsys_log.simulation.live_lab import board_film, lab_film, plan_live_lab, shown_at
 from ipsys_log.stages.detect import decode_grey, detect_markers
 from ipsys_log.units import NS_PER_S
 

@@ -11,13 +11,13 @@ from typing import Any, cast
 
 import pytest
 
+from ipsys_log.capture.disk import SYNC_EVERY_S, Syncer
 from ipsys_log.capture.frames import Clock, SourceError
 from ipsys_log.capture.multiplexer import Attached
 from ipsys_log.capture.recorder import Recording, recording, written
-from ipsys_log.capture.syncer import SYNC_EVERY_S, Syncer
 from ipsys_log.errors import IpsysError
 from ipsys_log.log.dataset import Session
-from ipsys_log.log.storage import DISK, Storage
+from ipsys_log.log.journal import DISK, Storage
 from ipsys_log.log.writer import LogWriter
 from ipsys_log.messages import MEASUREMENTS_TOPIC, Measurement, Message, image_topic
 from tests.capture.test_recorder import Sent, frame

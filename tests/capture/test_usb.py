@@ -15,9 +15,9 @@ import pytest
 import simplejpeg
 from numpy.typing import NDArray
 
-from ipsys_log.capture import opencv_camera, v4l2, v4l2_camera
+from ipsys_log.capture import devices, v4l2, v4l2_camera
+from ipsys_log.capture.devices import open_usb
 from ipsys_log.capture.frames import Clock, Frame, SourceError
-from ipsys_log.capture.usb import open_usb
 from ipsys_log.messages import RigCamera
 from tests.capture.camera_driver import Driver
 
@@ -113,7 +113,7 @@ def test_a_camera_that_hands_over_nothing_of_use_has_gone(
 
 
 def test_a_camera_through_opencv_that_is_pulled_out_may_come_back() -> None:
-    frames = opencv_camera._frames(cv2.VideoCapture(), "camera red: usb:0")
+    frames = devices._frames(cv2.VideoCapture(), "camera red: usb:0")
     with pytest.raises(SourceError, match="camera red: usb:0: sends no frames"):
         next(frames)
 

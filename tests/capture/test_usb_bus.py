@@ -12,8 +12,7 @@ from typing import Any
 import pytest
 
 from ipsys_log.capture import usb_bus, v4l2
-from ipsys_log.capture.bandwidth import Demand, advise, demands_of
-from ipsys_log.capture.usb_bus import Mode, Plug, find_cameras
+from ipsys_log.capture.usb_bus import Demand, Mode, Plug, advise, demands_of, find_cameras
 from ipsys_log.messages import Rig, RigCamera
 from tests.capture.camera_driver import Driver
 from tests.conftest import Ipsys

@@ -12,8 +12,7 @@ import simplejpeg
 from ipsys_log.capture.devices import open_source
 from ipsys_log.capture.frames import Clock, Frame, SourceError
 from ipsys_log.errors import IpsysError
-from ipsys_log.exchange.image_folders import find_pictures, read_images
-from ipsys_log.exchange.picture_times import find_times, parse_time
+from ipsys_log.exchange.image_folders import find_pictures, find_times, parse_time, read_images
 from ipsys_log.log.dataset import Session
 from ipsys_log.messages import CompressedImage, CompressedVideo, RigCamera
 from ipsys_log.units import NS_PER_S

@@ -14,7 +14,7 @@ import numpy as np
 import pytest
 from numpy.typing import NDArray
 
-from ipsys_log.geometry.patterns import Placed
+from ipsys_log.geometry.marker_cells import Placed
 from ipsys_log.geometry.poses import lay_flat, look_down
 from ipsys_log.log.dataset import Session
 from ipsys_log.messages import (
@@ -30,10 +30,10 @@ from ipsys_log.messages import (
 )
 from ipsys_log.runs.output import write_log
 from ipsys_log.simulation.cameras import Camera, hang_cameras
+from ipsys_log.simulation.floor import prepare_view
 from ipsys_log.simulation.lab import EPOCH_NS
 from ipsys_log.simulation.render import encode_jpeg, render
 from ipsys_log.simulation.settings import LabSettings
-from ipsys_log.simulation.views import prepare_view
 from tests.conftest import Ipsys, data_section
 from tests.ladder import follow
 

@@ -15,7 +15,7 @@ import numpy as np
 import pytest
 
 from ipsys_log.calibration.images import find_sources
-from ipsys_log.exchange.opencv_yaml import read_opencv_calibration
+from ipsys_log.exchange.calibration_files import read_opencv_calibration
 from ipsys_log.log.dataset import Session
 from ipsys_log.messages import CompressedImage, CompressedVideo, Message, image_topic
 from ipsys_log.runs.output import write_log

@@ -9,8 +9,7 @@ from pathlib import Path
 import pytest
 import typer.main
 
-from ipsys_log.cli.app import app
-from ipsys_log.cli.guide import EXAMPLES, PANELS
+from ipsys_log.cli.app import EXAMPLES, PANELS, app
 from ipsys_log.log.dataset import Session
 from ipsys_log.pipeline import replay
 from ipsys_log.runs.options import Request

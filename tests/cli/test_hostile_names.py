@@ -14,8 +14,8 @@ from hypothesis import given
 from hypothesis import strategies as st
 
 from ipsys_log.log.codec import encode, schema_data
+from ipsys_log.log.contents import Schema
 from ipsys_log.log.dataset import Session
-from ipsys_log.log.types import Schema
 from ipsys_log.log.writer import LogWriter
 from ipsys_log.messages import Message, Run
 from ipsys_log.plain_text import plain_text

@@ -12,7 +12,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from ipsys_log.cli.guide import PANELS
+from ipsys_log.cli.app import PANELS
 from ipsys_log.log.dataset import Session
 from ipsys_log.messages import (
     RIG_TOPIC,
@@ -28,8 +28,7 @@ from ipsys_log.messages import (
 from ipsys_log.rig.file import load_rig
 from ipsys_log.runs.output import write_log
 from ipsys_log.simulation.cameras import hang_cameras
-from ipsys_log.simulation.film import lab_film, shown_at
-from ipsys_log.simulation.live_lab import LIVE_SETTINGS, plan_live_lab
+from ipsys_log.simulation.live_lab import LIVE_SETTINGS, lab_film, plan_live_lab, shown_at
 from ipsys_log.units import NS_PER_S
 from tests.conftest import Ipsys
 from tests.test_measure_now import Lab, measuring

@@ -10,8 +10,13 @@ import pytest
 from ruamel.yaml import YAML
 
 from ipsys_log.errors import IpsysError
-from ipsys_log.exchange.calibration_yaml import check_format, kalibr_yaml, opencv_yaml, ros_yaml
-from ipsys_log.exchange.opencv_yaml import read_opencv_calibration
+from ipsys_log.exchange.calibration_files import (
+    check_format,
+    kalibr_yaml,
+    opencv_yaml,
+    read_opencv_calibration,
+    ros_yaml,
+)
 from ipsys_log.geometry.lenses import same_lens
 from ipsys_log.messages import CameraCalibration
 

@@ -8,7 +8,7 @@ import numpy as np
 import pytest
 
 from ipsys_log.errors import IpsysError
-from ipsys_log.exchange.opencv_yaml import read_opencv_calibration
+from ipsys_log.exchange.calibration_files import read_opencv_calibration
 
 ROS = """image_width: 640
 image_height: 480

@@ -12,9 +12,9 @@ import numpy as np
 import scipy.io
 from mcap.opcode import Opcode
 
-from ipsys_log.exchange.calibration_yaml import kalibr_yaml, opencv_yaml, ros_yaml
+from ipsys_log.exchange.calibration_files import kalibr_yaml, opencv_yaml, ros_yaml
 from ipsys_log.log.codec import encode, schema_data, schema_name
-from ipsys_log.log.types import Schema
+from ipsys_log.log.contents import Schema
 from ipsys_log.log.writer import LogWriter
 from ipsys_log.messages import (
     CameraCalibration,

@@ -19,9 +19,9 @@ from hypothesis import strategies as st
 
 from ipsys_log.calibration import images as calibration_pictures
 from ipsys_log.errors import IpsysError
-from ipsys_log.exchange.matlab import read_mat
-from ipsys_log.exchange.opencv_yaml import read_opencv_calibration
-from ipsys_log.exchange.picture_times import find_times
+from ipsys_log.exchange.calibration_files import read_opencv_calibration
+from ipsys_log.exchange.image_folders import find_times
+from ipsys_log.exchange.imsel import read_mat
 from ipsys_log.images.decode import decode_grey, decode_rows
 from ipsys_log.images.video import Video
 from ipsys_log.log.codec import PAYLOADS, decode, encode, schema_name

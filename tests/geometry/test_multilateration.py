@@ -12,8 +12,13 @@ from numpy.typing import NDArray
 from scipy.optimize import least_squares
 
 from ipsys_log.errors import IpsysError
-from ipsys_log.geometry.multilateration import crossing_angle, multilaterate, sides_alike, tape_covariance
-from ipsys_log.geometry.trilateration import trilaterate
+from ipsys_log.geometry.trilateration import (
+    crossing_angle,
+    multilaterate,
+    sides_alike,
+    tape_covariance,
+    trilaterate,
+)
 
 Array = NDArray[np.float64]
 

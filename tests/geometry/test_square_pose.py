@@ -8,11 +8,15 @@ import pytest
 from scipy.optimize import least_squares
 from scipy.spatial.transform import Rotation
 
-from ipsys_log.geometry.corner_noise import pixel_slopes, whiten
-from ipsys_log.geometry.ippe import solve_squares
 from ipsys_log.geometry.lenses import undistort
-from ipsys_log.geometry.markers import camera_point, marker_corners
-from ipsys_log.geometry.square_pose import SquarePoses, fit_squares, goes_around, reprojection_px
+from ipsys_log.geometry.markers import camera_point, marker_corners, pixel_slopes, whiten
+from ipsys_log.geometry.square_pose import (
+    SquarePoses,
+    fit_squares,
+    goes_around,
+    reprojection_px,
+    solve_squares,
+)
 from ipsys_log.messages import CameraCalibration
 from tests.geometry.squares import (
     CENTRE,

@@ -11,8 +11,8 @@ from mcap import records as mcap
 from mcap.reader import make_reader
 from mcap.stream_reader import StreamReader
 
-from ipsys_log.log.storage import DISK, Storage
-from ipsys_log.log.types import RawMessage, Schema
+from ipsys_log.log.contents import RawMessage, Schema
+from ipsys_log.log.journal import DISK, Storage
 from ipsys_log.log.writer import LogWriter
 
 IMAGE = Schema("foxglove.CompressedImage", "protobuf", b"image definition")

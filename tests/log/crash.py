@@ -13,7 +13,7 @@ from dataclasses import dataclass, field
 from itertools import pairwise
 from pathlib import Path
 
-from ipsys_log.log.storage import DISK
+from ipsys_log.log.journal import DISK
 
 SECTOR = 512
 

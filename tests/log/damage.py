@@ -27,10 +27,10 @@ from mcap.stream_reader import StreamReader, breakup_chunk
 from mcap.writer import CompressionType, IndexType, Writer
 
 from ipsys_log.errors import LogError
+from ipsys_log.log.journal import DISK, Storage
 from ipsys_log.log.reader import LogReader
 from ipsys_log.log.records import MAGIC, as_bytes
 from ipsys_log.log.repair import RepairReport, repair
-from ipsys_log.log.storage import DISK, Storage
 from ipsys_log.log.writer import LogWriter
 from tests.log.conftest import IMAGE, POINT, Row, as_row, linear_rows, stock_rows, write_rows
 

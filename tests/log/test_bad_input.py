@@ -18,15 +18,13 @@ from mcap.reader import make_reader
 from mcap.writer import Writer
 
 from ipsys_log.errors import LogError
-from ipsys_log.log.contents import Contents
-from ipsys_log.log.journal import journal_path
+from ipsys_log.log.contents import Contents, Schema
+from ipsys_log.log.journal import DISK, Storage, journal_path
 from ipsys_log.log.lock import check_locks
 from ipsys_log.log.reader import LogReader
 from ipsys_log.log.records import MAGIC, ChunkRef, as_bytes
 from ipsys_log.log.repair import repair
-from ipsys_log.log.storage import DISK, Storage
 from ipsys_log.log.summary import tail_bytes
-from ipsys_log.log.types import Schema
 from ipsys_log.log.writer import LogWriter
 from tests.log.conftest import Row, append, create, stock_rows
 from tests.log.crash import Recorder

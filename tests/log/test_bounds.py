@@ -17,10 +17,10 @@ from hypothesis import strategies as st
 from ipsys_log.errors import IpsysError, LogError
 from ipsys_log.log.bounds import LARGEST_CHUNK, LARGEST_MESSAGE, Allowance, BoundError, chunk_excess
 from ipsys_log.log.codec import encode, schema_data
+from ipsys_log.log.contents import Schema
 from ipsys_log.log.dataset import Session
 from ipsys_log.log.reader import LogReader
 from ipsys_log.log.repair import repair
-from ipsys_log.log.types import Schema
 from ipsys_log.log.writer import LogWriter
 from ipsys_log.messages import Markers, RawImage
 from tests.conftest import ROOT

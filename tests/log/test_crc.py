@@ -6,7 +6,7 @@ from random import Random
 from hypothesis import given
 from hypothesis import strategies as st
 
-from ipsys_log.log.crc import WORTH_COMBINING, combine, extend
+from ipsys_log.log.hashing import WORTH_COMBINING, combine, extend
 
 CRCS = st.integers(0, (1 << 32) - 1)
 

@@ -10,12 +10,11 @@ from mcap.reader import make_reader
 from mcap.writer import CompressionType, IndexType, Writer
 
 from ipsys_log.errors import LogError
-from ipsys_log.log.contents import Contents
+from ipsys_log.log.contents import Contents, Schema
 from ipsys_log.log.reader import LogReader
 from ipsys_log.log.records import MAGIC, as_bytes
 from ipsys_log.log.repair import repair
 from ipsys_log.log.summary import tail_bytes
-from ipsys_log.log.types import Schema
 from ipsys_log.log.writer import LogWriter
 from tests.log.conftest import Row, append, as_row, linear_rows, stock_rows
 

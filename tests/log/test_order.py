@@ -6,8 +6,8 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
+from ipsys_log.log.contents import RawMessage
 from ipsys_log.log.order import Cursor, Pending, in_log_order
-from ipsys_log.log.types import RawMessage
 
 Chunk = tuple[int, list[int]]  # how long before its first message it says to start, and log times
 CHUNKS = st.lists(st.tuples(st.integers(0, 3), st.lists(st.integers(3, 30), max_size=8)), max_size=8)

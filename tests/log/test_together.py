@@ -15,11 +15,10 @@ from ipsys_log.errors import LogError
 from ipsys_log.log import reader as reader_module
 from ipsys_log.log.byte_source import View
 from ipsys_log.log.contents import Contents
-from ipsys_log.log.journal import journal_path, replace_tail
-from ipsys_log.log.load import load_contents
+from ipsys_log.log.journal import Disk, journal_path, replace_tail
 from ipsys_log.log.reader import LogReader
 from ipsys_log.log.repair import repair
-from ipsys_log.log.storage import Disk
+from ipsys_log.log.summary import load_contents
 from tests.log.conftest import Row, append, as_row, create, linear_rows, stock_rows
 
 PER_SESSION = 5

@@ -14,7 +14,7 @@ from matplotlib.axes import Axes
 from matplotlib.figure import Figure
 from matplotlib.text import Text
 
-from ipsys_log.analysis.statistics import error_statistics
+from ipsys_log.analysis.accuracy import error_statistics
 from ipsys_log.errors import IpsysError
 from ipsys_log.log.dataset import Session
 from ipsys_log.messages import (
@@ -34,9 +34,8 @@ from ipsys_log.messages import (
 )
 from ipsys_log.report.accuracy import Accuracy
 from ipsys_log.report.errors_figure import count_rows, draw_errors
-from ipsys_log.report.floor_figure import draw_session
-from ipsys_log.report.floor_panel import Scene, draw_floor
-from ipsys_log.report.palette import camera_styles
+from ipsys_log.report.figures import camera_styles
+from ipsys_log.report.floor_figure import Scene, draw_floor, draw_session
 from ipsys_log.runs.output import write_log
 
 RIG = Rig(

@@ -18,14 +18,12 @@ from matplotlib.text import Text
 
 from ipsys_log.messages import Residual
 from ipsys_log.report.accuracy import Accuracy, accuracy_json
-from ipsys_log.report.csv_tables import cross_validation_csv, paper_csv
 from ipsys_log.report.figures import png
+from ipsys_log.report.files import cross_validation_csv, paper_csv
 from ipsys_log.report.findings import Findings
 from ipsys_log.report.learning_figure import learning_figure, published_figure
-from ipsys_log.report.models_figure import models_figure
-from ipsys_log.report.paper_figures import write_plots
+from ipsys_log.report.paper_figures import models_figure, residuals_figure, write_plots
 from ipsys_log.report.points_figure import places_figure
-from ipsys_log.report.residuals_figure import residuals_figure
 from ipsys_log.runs.output import write_log
 from tests.conftest import Ipsys
 from tests.report.conftest import find, lab_messages, many_models, only, scale, with_accuracies

@@ -10,9 +10,9 @@ from pathlib import Path
 import pytest
 from rich.console import Console
 
+from ipsys_log.log.contents import Schema
 from ipsys_log.log.reader import LogReader
 from ipsys_log.log.repair import repair
-from ipsys_log.log.types import Schema
 from ipsys_log.log.writer import LogWriter
 from ipsys_log.report.repair import repair_lines
 

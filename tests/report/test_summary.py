@@ -14,13 +14,12 @@ from hypothesis import given
 from hypothesis import strategies as st
 from rich.console import Console
 
-from ipsys_log.analysis.accuracy import POOLED
-from ipsys_log.analysis.statistics import error_statistics, root_mean_square_m
+from ipsys_log.analysis.accuracy import POOLED, error_statistics, root_mean_square_m
 from ipsys_log.log.dataset import Session
 from ipsys_log.messages import CameraEvaluation, Suspect
 from ipsys_log.pipeline import replay
 from ipsys_log.report.accuracy import Accuracy, accuracy_json, read_accuracy
-from ipsys_log.report.csv_tables import cross_validation_csv
+from ipsys_log.report.files import cross_validation_csv
 from ipsys_log.report.findings import Findings
 from ipsys_log.report.summary import answer_json, answer_text, models_table
 from ipsys_log.runs.options import Request

@@ -12,8 +12,8 @@ from typing import Any
 import numpy as np
 import pytest
 
+from ipsys_log.log.contents import run_of_topic
 from ipsys_log.log.dataset import Session
-from ipsys_log.log.topics import run_of_topic
 from ipsys_log.log.writer import LogWriter
 from ipsys_log.messages import (
     CameraCalibration,

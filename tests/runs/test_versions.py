@@ -14,7 +14,7 @@ from ipsys_log.log.writer import LogWriter
 from ipsys_log.models.table import MODELS
 from ipsys_log.runs import provenance
 from ipsys_log.runs.graph import STAGES
-from ipsys_log.runs.versions import VERSIONS, recorded_version, version_parameters
+from ipsys_log.runs.provenance import VERSIONS, recorded_version, version_parameters
 from ipsys_log.stages.camera_frame import METHODS
 from ipsys_log.stages.detect import CORNERS
 from tests.conftest import ROOT, Ipsys

@@ -9,7 +9,7 @@ import numpy as np
 import pytest
 
 from ipsys_log.errors import IpsysError
-from ipsys_log.geometry.patterns import Placed, true_corners
+from ipsys_log.geometry.marker_cells import Placed, true_corners
 from ipsys_log.geometry.trilateration import trilaterate
 from ipsys_log.log.codec import encode
 from ipsys_log.messages import CameraCalibration, CompressedImage, Measurement, Message, Rig, Tracks

@@ -8,12 +8,12 @@ import pytest
 from numpy.typing import NDArray
 from scipy.ndimage import gaussian_filter
 
-from ipsys_log.geometry.patterns import Placed, true_corners
+from ipsys_log.geometry.marker_cells import Placed, true_corners
 from ipsys_log.geometry.poses import lay_flat, make_pose, rotation
 from ipsys_log.simulation.cameras import Camera, hang_cameras
+from ipsys_log.simulation.floor import View, prepare_view
 from ipsys_log.simulation.render import encode_jpeg, expose, render
 from ipsys_log.simulation.settings import LabSettings
-from ipsys_log.simulation.views import View, prepare_view
 
 Array = NDArray[np.float64]
 LENGTH_M = 0.2

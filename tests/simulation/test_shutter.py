@@ -8,16 +8,16 @@ import pytest
 from numpy.typing import NDArray
 from scipy.ndimage import uniform_filter1d
 
-from ipsys_log.geometry.patterns import Moving, Placed, true_corners
+from ipsys_log.geometry.marker_cells import Moving, Placed, true_corners
 from ipsys_log.geometry.poses import lay_flat, look_down
 from ipsys_log.messages import CameraCalibration, CompressedImage, Message, Rig, Tracks
 from ipsys_log.simulation.calibration_points import place
 from ipsys_log.simulation.cameras import Camera, hang_cameras
 from ipsys_log.simulation.drive import Drive, plan_drive
+from ipsys_log.simulation.floor import prepare_view
 from ipsys_log.simulation.lab import EPOCH_NS, drive_start_ns, simulate
 from ipsys_log.simulation.render import expose
 from ipsys_log.simulation.settings import LabSettings
-from ipsys_log.simulation.views import prepare_view
 
 Array = NDArray[np.float64]
 

@@ -35,9 +35,8 @@ from ipsys_log.messages import (
     Tracks,
 )
 from ipsys_log.runs.output import write_log
-from ipsys_log.sinks.rerun.messages import RerunSink
+from ipsys_log.sinks.rerun.messages import RerunSink, rerun_image
 from ipsys_log.sinks.rerun.recording import write_recording
-from ipsys_log.sinks.rerun.rerun_images import rerun_image
 
 START_NS = 1_700_000_000_000_000_001
 STEP_NS = 100_000_000

@@ -11,15 +11,15 @@ from typing import Any
 import numpy as np
 import pytest
 
-from ipsys_log.geometry.patterns import true_corners
+from ipsys_log.geometry.marker_cells import true_corners
 from ipsys_log.messages import CameraCalibration, CompressedImage, Marker, RigCamera, Tracks
 from ipsys_log.simulation.calibration_points import Place, place, seen_whole
 from ipsys_log.simulation.cameras import Camera, hang_cameras
 from ipsys_log.simulation.drive import plan_drive
+from ipsys_log.simulation.floor import View, prepare_view
 from ipsys_log.simulation.lab import EPOCH_NS, drive_start_ns, simulate
 from ipsys_log.simulation.render import encode_jpeg, render
 from ipsys_log.simulation.settings import LabSettings
-from ipsys_log.simulation.views import View, prepare_view
 from ipsys_log.stages.detect.edges import Guess, fit_edges
 from ipsys_log.stages.detect.follow import Follow
 from ipsys_log.units import NS_PER_S

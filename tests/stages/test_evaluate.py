@@ -9,15 +9,20 @@ import numpy as np
 import pytest
 from scipy.stats import chi2
 
-from ipsys_log.analysis.accuracy import POOLED, errors_cross_validated, errors_held_out
-from ipsys_log.analysis.cross_validation import deal, gather_places, leave_one_out, predict_without
+from ipsys_log.analysis.accuracy import POOLED, error_statistics, errors_cross_validated, errors_held_out
+from ipsys_log.analysis.cross_validation import (
+    deal,
+    gather_places,
+    labelled_subsets,
+    learning_curve,
+    leave_one_out,
+    predict_without,
+    published_curve,
+)
 from ipsys_log.analysis.ground_truth import gather_tracks, track_errors
-from ipsys_log.analysis.learning import labelled_subsets, learning_curve, published_curve
-from ipsys_log.analysis.statistics import error_statistics
 from ipsys_log.errors import FitError
 from ipsys_log.messages import Message, Pair, Track, Tracks
-from ipsys_log.models.applied import AppliedModel
-from ipsys_log.models.table import Places, min_pairs
+from ipsys_log.models.table import AppliedModel, Places, min_pairs
 from ipsys_log.stages.fit import fit_model
 from tests import labs
 

@@ -9,18 +9,18 @@ import cv2
 import numpy as np
 import pytest
 
-from ipsys_log.geometry.patterns import true_corners
+from ipsys_log.geometry.marker_cells import true_corners
 from ipsys_log.messages import CompressedImage, Event, Marker
 from ipsys_log.simulation.calibration_points import place
 from ipsys_log.simulation.cameras import hang_cameras
 from ipsys_log.simulation.drive import plan_drive
+from ipsys_log.simulation.floor import prepare_view
 from ipsys_log.simulation.render import encode_jpeg, render
 from ipsys_log.simulation.settings import LabSettings
-from ipsys_log.simulation.views import prepare_view
 from ipsys_log.stages.detect import Detect, decode_grey, detect_markers
 from ipsys_log.stages.detect.adjustment import Fit, Guess
 from ipsys_log.stages.detect.partial import fit_partly
-from ipsys_log.stages.detect.pattern import compare_pattern
+from ipsys_log.stages.detect.uneven_light import compare_pattern
 from tests.stages.drawing import (
     FISHEYE,
     VGA,

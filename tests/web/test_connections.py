@@ -25,8 +25,7 @@ from ipsys_log.errors import IpsysError
 from ipsys_log.log.dataset import Session
 from ipsys_log.survey.scene import View
 from ipsys_log.web.connections import Limits, derive_limits
-from ipsys_log.web.faults import Faults
-from ipsys_log.web.server import Served, serving
+from ipsys_log.web.server import Faults, Served, serving
 from tests.test_measure_now import Lab, still_lab
 from tests.web.test_access import Caller
 from tests.web.test_measuring_page import Recording

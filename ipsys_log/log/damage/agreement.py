@@ -7,12 +7,12 @@ from mcap.opcode import Opcode
 
 from ipsys_log.errors import LogError
 from ipsys_log.log.byte_source import View
+from ipsys_log.log.chunk_messages import chunk_entries
 from ipsys_log.log.contents import Contents
 from ipsys_log.log.damage.findings import Survey
 from ipsys_log.log.damage.resync import PRIVATE
-from ipsys_log.log.load import Summary, load_contents, read_summary
 from ipsys_log.log.records import DATA_END, ChunkRef, exact, walk
-from ipsys_log.log.rows import chunk_entries
+from ipsys_log.log.summary import Summary, load_contents, read_summary
 
 __all__ = ["count_by_indexes", "disagreement"]
 

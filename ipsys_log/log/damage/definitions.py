@@ -14,8 +14,8 @@ from ipsys_log.log.byte_source import View
 from ipsys_log.log.chunks import Inside
 from ipsys_log.log.contents import Contents
 from ipsys_log.log.damage.regions import Stretch
-from ipsys_log.log.load import Summary
 from ipsys_log.log.records import MESSAGE, RecordAt, as_bytes, exact, walk
+from ipsys_log.log.summary import Summary
 
 __all__ = ["Definitions", "placeholder"]
 

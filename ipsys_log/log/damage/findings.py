@@ -1,6 +1,11 @@
-"""The result of a survey: which parts of a log are whole, which are damaged, and which messages are gone."""
+"""The result of a survey: which parts of a log are whole, which are damaged, and which messages are gone.
 
-from dataclasses import dataclass, field
+Damage that a survey meets: its extent, the messages saved of it, and the message indexes behind it.
+"""
+
+from dataclasses import dataclass, field, replace
+
+from mcap.opcode import Opcode
 
 from ipsys_log.log.byte_source import View
 from ipsys_log.log.chunks import Inside
@@ -8,11 +13,11 @@ from ipsys_log.log.contents import Contents
 from ipsys_log.log.damage.definitions import Definitions
 from ipsys_log.log.damage.regions import Stretch
 from ipsys_log.log.damage.resync import Resync
-from ipsys_log.log.damage.salvage import Salvage
+from ipsys_log.log.damage.salvage import Rows, Salvage, Saved
 from ipsys_log.log.hashing import ChannelHash
-from ipsys_log.log.records import RecordAt
+from ipsys_log.log.records import HEADER, RecordAt
 
-__all__ = ["Indexed", "Lost", "Survey"]
+__all__ = ["COUNTED", "LOOSE", "Indexed", "Lost", "Survey", "add_damage", "close_indexes", "pass_over"]
 
 
 @dataclass(slots=True)
@@ -81,3 +86,112 @@ class Survey:
     has_crcs: bool = False  # of the chunks so far
     doubtful_to: int = 0  # after damage, unconfirmed lengths are checked closely
     indexed: Indexed | None = None
+
+
+LOOSE = frozenset((Opcode.SCHEMA, Opcode.CHANNEL, Opcode.MESSAGE, Opcode.ATTACHMENT, Opcode.METADATA))
+# If such a record is damaged, the number of lost messages is known: none, or one.
+COUNTED = LOOSE | {Opcode.MESSAGE_INDEX, Opcode.DATA_END}
+_DOUBTFUL = 4096  # bytes
+
+
+def pass_over(found: Survey, position: int, at: RecordAt | None, reason: str) -> int:
+    """Find the next record after damage at `position`; return its offset."""
+    claimed = at.offset + at.length if at is not None and found.wrong_length != position else 0
+    indexed = found.indexed
+    # A gap that is too small for a separate record becomes a part of the damage before it.
+    behind_indexes = indexed is not None and indexed.inside is not None and position > indexed.start
+    joins = behind_indexes or bool(found.damaged and found.damaged[-1].end == position)
+    follower = found.resync.find(position, claimed, gap=1 if joins else HEADER.size)
+    is_small = follower is not None and follower < position + HEADER.size
+    if indexed is not None and indexed.inside is not None:
+        is_apart = indexed.is_complete or found.resync.is_chunk_head(position)
+        if is_apart and not is_small:
+            close_indexes(found, position)
+        else:
+            found.faults.append(reason)
+            indexed.sound = False
+            found.end = found.view.size if follower is None else follower
+            return found.end
+    elif indexed is not None:
+        close_indexes(found, position)
+    if follower is None:
+        return _end_at_damage(found, position, reason)
+    if at is None or at.opcode not in COUNTED or follower != claimed:
+        found.indexed = Indexed(follower)
+    return add_damage(found, Stretch(position, follower - position), reason)
+
+
+def add_damage(found: Survey, stretch: Stretch, reason: str) -> int:
+    """Note a damaged stretch; return its end."""
+    found.faults.append(reason)
+    found.lost.bytes += stretch.length
+    if found.indexed is not None:
+        found.indexed.stretch = replace(stretch)
+    last = found.damaged[-1] if found.damaged else None
+    if last is not None and last.end == stretch.offset:  # one stretch for the definitions of both
+        last.length += stretch.length
+    else:
+        found.damaged.append(stretch)
+    found.end = stretch.end
+    found.doubtful_to = max(found.doubtful_to, stretch.end + _DOUBTFUL)
+    return stretch.end
+
+
+def _end_at_damage(found: Survey, position: int, reason: str) -> int:
+    """End the survey at damage without later records, perhaps in an unfinished chunk."""
+    found.faults.append(reason)
+    found.end = position
+    found.cut = Stretch(position, found.view.size - position)
+    found.lost.bytes += found.cut.length
+    _save(found, found.cut, {})
+    return found.view.size
+
+
+def _save(found: Survey, stretch: Stretch, rows: Rows) -> None:
+    """Save the readable messages of a damaged chunk, and note the others as lost."""
+    saved = Saved()
+    if found.saved is not None and found.resync.chunked is not False:
+        saved = found.saved.save(
+            found.view, stretch, rows, found.definitions, found.hashes, in_order=stretch is found.cut
+        )
+    gone = [
+        (channel, time_ns)
+        for channel, entries in rows.items()
+        for time_ns, offset in entries
+        if (channel, offset) not in saved.messages
+    ]
+    for channel, time_ns in gone if rows else saved.torn:
+        found.lost.note(found.definitions.topic(channel), time_ns)
+    if saved.note:
+        found.faults.append(saved.note)
+    found.lost.uncounted += not (rows or saved.counted)
+    found.lost.bytes -= int(saved.share * stretch.length)
+
+
+def close_indexes(found: Survey, stop: int) -> None:
+    """Check the message indexes of a chunk, or of a damaged stretch, after all of them are read."""
+    indexed, found.indexed = found.indexed, None
+    assert indexed is not None
+    if indexed.stretch is not None:
+        _save(found, indexed.stretch, indexed.rows)
+    elif indexed.inside is not None:
+        _close_chunk(found, indexed, indexed.inside, stop)
+
+
+def _close_chunk(found: Survey, indexed: Indexed, inside: Inside, stop: int) -> None:
+    chunk = found.contents.chunks[-1]
+    if indexed.is_complete:
+        found.contents.chunks[-1] = chunk._replace(
+            index_length=stop - indexed.start, index_offsets=indexed.offsets
+        )
+        return
+    if stop == found.view.size:  # and the log has no end: they are written again with it
+        found.end = indexed.start
+        found.cut = Stretch(found.end, stop - found.end)
+        found.unindexed = inside
+    elif stop > indexed.start:
+        number = len(found.contents.chunks) - 1
+        stretch = Stretch(indexed.start, stop - indexed.start, chunk=number, entries=inside.entries)
+        found.damaged.append(stretch)
+        if indexed.sound:
+            found.faults.append("the message indexes of a chunk are not complete")

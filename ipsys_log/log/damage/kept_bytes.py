@@ -25,10 +25,9 @@ from ipsys_log.errors import LogError
 from ipsys_log.log.byte_source import View, open_for_reading
 from ipsys_log.log.contents import Contents
 from ipsys_log.log.damage.resync import crc_of
-from ipsys_log.log.load import read_summary
+from ipsys_log.log.journal import Storage, write_all
 from ipsys_log.log.records import HEADER, MAGIC, as_bytes, parse, walk
-from ipsys_log.log.storage import Storage, write_all
-from ipsys_log.log.summary import tail_bytes
+from ipsys_log.log.summary import read_summary, tail_bytes
 from ipsys_log.units import format_bytes
 
 __all__ = ["Change", "Patch", "check_room", "discard", "keep_old_bytes", "overwrite", "resume"]

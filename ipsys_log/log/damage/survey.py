@@ -10,13 +10,19 @@ from ipsys_log.log.bounds import BoundError
 from ipsys_log.log.byte_source import View
 from ipsys_log.log.chunks import Inside, inner_records, look_inside, unpack
 from ipsys_log.log.damage.definitions import Definitions
-from ipsys_log.log.damage.findings import Indexed, Survey
-from ipsys_log.log.damage.passing import COUNTED, LOOSE, add_damage, close_indexes, pass_over
+from ipsys_log.log.damage.findings import (
+    COUNTED,
+    LOOSE,
+    Indexed,
+    Survey,
+    add_damage,
+    close_indexes,
+    pass_over,
+)
 from ipsys_log.log.damage.regions import Stretch
 from ipsys_log.log.damage.resync import PRIVATE, Resync, attachment_crc, check_exact, crc_of, is_index
 from ipsys_log.log.damage.salvage import Salvage, up_to_first_hole
 from ipsys_log.log.hashing import ChannelHash
-from ipsys_log.log.load import Summary
 from ipsys_log.log.records import (
     DATA_END,
     ENTRY,
@@ -31,6 +37,7 @@ from ipsys_log.log.records import (
     walk,
 )
 from ipsys_log.log.scan import add_record, count_all
+from ipsys_log.log.summary import Summary
 
 __all__ = ["HEADER_RECORD", "survey"]
 

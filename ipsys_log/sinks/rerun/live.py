@@ -23,7 +23,7 @@ from ipsys_log.messages import (
     image_topic,
 )
 from ipsys_log.sinks.rerun.messages import RerunSink, trail_entity
-from ipsys_log.sinks.rerun.rerun_viewer import check_screen, show_in_viewer
+from ipsys_log.sinks.rerun.recording import check_screen, show_in_viewer
 from ipsys_log.sinks.rerun.scene import draw_rig, layout
 from ipsys_log.units import NS_PER_S
 

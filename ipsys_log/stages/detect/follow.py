@@ -7,10 +7,9 @@ from collections.abc import Iterable, Sequence
 import numpy as np
 from numpy.typing import NDArray
 
-from ipsys_log.geometry.ippe import solve_squares
 from ipsys_log.geometry.lenses import check_size, project, undistort
 from ipsys_log.geometry.markers import marker_corners
-from ipsys_log.geometry.square_pose import goes_around
+from ipsys_log.geometry.square_pose import goes_around, solve_squares
 from ipsys_log.images.decode import Grey, decode_rows
 from ipsys_log.messages import CameraCalibration, CompressedImage, RawImage
 from ipsys_log.stages.detect.changes import Watch

@@ -27,12 +27,12 @@ from ipsys_log.stages.detect.adjustment import (
     solve,
     whole,
 )
-from ipsys_log.stages.detect.pattern import compare_pattern
 from ipsys_log.stages.detect.prints import Prints, lay_out
 from ipsys_log.stages.detect.profiles import Poses, Sites, View, locate, read_profiles
 from ipsys_log.stages.detect.uneven_light import (
     TAPS,
     Steps,
+    compare_pattern,
     exact_steps,
     masked_median,
     rough_steps,

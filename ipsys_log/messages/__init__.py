@@ -1,0 +1,125 @@
+"""What travels through the pipeline: frozen payloads, each a mirror of one schema of the log.
+
+A field here has the name of the field in the schema; :mod:`ipsys_log.log.codec` turns one into the
+other by these names and types. Lengths are metres, angles radians, times nanoseconds since 1970
+(UTC). What is missing is ``None`` or empty, never 0 and never NaN.
+"""
+
+from ipsys_log.messages.channels import (
+    EVENTS_TOPIC,
+    LATENCY_TOPIC,
+    MEASUREMENTS_TOPIC,
+    RIG_TOPIC,
+    TRUTH_TOPIC,
+    calibration_topic,
+    image_topic,
+)
+from ipsys_log.messages.events import FRAME_SKIPPED, STAMP_UNRELIABLE, Event, Latency
+from ipsys_log.messages.images import (
+    Color,
+    CompressedImage,
+    CompressedVideo,
+    ImageAnnotations,
+    Point2,
+    PointsAnnotation,
+    RawImage,
+    SkippedVideo,
+    TextAnnotation,
+)
+from ipsys_log.messages.markers import CameraPoint, CameraPoints, Marker, MarkerPose, Markers
+from ipsys_log.messages.measurements import Distance, Interval, Measurement, WorldPoint
+from ipsys_log.messages.message import Corners, Floats, Mat33, Mat34, Mat88, Message, TimeNs, Vec3
+from ipsys_log.messages.models import (
+    CameraEvaluation,
+    CameraModel,
+    ErrorStatistics,
+    Evaluation,
+    LearningPoint,
+    Model,
+    Noise,
+    Pair,
+    Parameter,
+    Residual,
+    Suspect,
+)
+from ipsys_log.messages.rig import CameraCalibration, Floor, ReferencePoint, Rig, RigCamera, RigMarker
+from ipsys_log.messages.runs import ChannelRead, ChannelWritten, Lens, Run
+from ipsys_log.messages.tracks import (
+    FrameTransform,
+    FrameTransforms,
+    Position,
+    Positions,
+    Quaternion,
+    Track,
+    Tracks,
+    Vector3,
+)
+
+__all__ = [
+    "EVENTS_TOPIC",
+    "FRAME_SKIPPED",
+    "LATENCY_TOPIC",
+    "MEASUREMENTS_TOPIC",
+    "RIG_TOPIC",
+    "STAMP_UNRELIABLE",
+    "TRUTH_TOPIC",
+    "CameraCalibration",
+    "CameraEvaluation",
+    "CameraModel",
+    "CameraPoint",
+    "CameraPoints",
+    "ChannelRead",
+    "ChannelWritten",
+    "Color",
+    "CompressedImage",
+    "CompressedVideo",
+    "Corners",
+    "Distance",
+    "ErrorStatistics",
+    "Evaluation",
+    "Event",
+    "Floats",
+    "Floor",
+    "FrameTransform",
+    "FrameTransforms",
+    "ImageAnnotations",
+    "Interval",
+    "Latency",
+    "LearningPoint",
+    "Lens",
+    "Marker",
+    "MarkerPose",
+    "Markers",
+    "Mat33",
+    "Mat34",
+    "Mat88",
+    "Measurement",
+    "Message",
+    "Model",
+    "Noise",
+    "Pair",
+    "Parameter",
+    "Point2",
+    "PointsAnnotation",
+    "Position",
+    "Positions",
+    "Quaternion",
+    "RawImage",
+    "ReferencePoint",
+    "Residual",
+    "Rig",
+    "RigCamera",
+    "RigMarker",
+    "Run",
+    "SkippedVideo",
+    "Suspect",
+    "TextAnnotation",
+    "TimeNs",
+    "Track",
+    "Tracks",
+    "Vec3",
+    "Vector3",
+    "WorldPoint",
+    "calibration_topic",
+    "image_topic",
+]

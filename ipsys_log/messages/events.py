@@ -1,0 +1,45 @@
+"""Payloads about the recording: events and latencies."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+from ipsys_log.messages.message import TimeNs
+
+__all__ = ["FRAME_SKIPPED", "STAMP_UNRELIABLE", "Event", "Latency"]
+
+# The kind of an event whose timestamp is the log time of a frame that no stage has seen when it was recorded.
+FRAME_SKIPPED = "frame_skipped"
+# The kind of an event for late frames of a camera that have their time of arrival.
+STAMP_UNRELIABLE = "stamp_unreliable"
+
+
+@dataclass(frozen=True, slots=True)
+class Event:
+    """An event that a reader of the log must know, such as a corrupt frame.
+
+    ``start`` and ``end`` are the first and the last time of the frames that an event of kind
+    ``stamp_unreliable`` affects; without ``end``, the last time is not known yet.
+    """
+
+    timestamp: TimeNs
+    kind: str
+    text: str
+    camera: str | None = None
+    marker_id: int | None = None
+    start: TimeNs | None = None
+    end: TimeNs | None = None
+
+
+@dataclass(frozen=True, slots=True)
+class Latency:
+    """When the steps from a frame to its positions were done, by the wall clock. Telemetry: no stage reads
+    it."""
+
+    timestamp: TimeNs
+    camera: str
+    received: TimeNs
+    detected: TimeNs
+    located: TimeNs
+    fused: TimeNs
+    published: TimeNs

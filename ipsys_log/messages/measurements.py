@@ -1,0 +1,46 @@
+"""Payloads of the tape measurements: calibration points."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+from ipsys_log.messages.message import TimeNs
+
+__all__ = ["Distance", "Interval", "Measurement", "WorldPoint"]
+
+
+@dataclass(frozen=True, slots=True)
+class Distance:
+    reference: str
+    distance_m: float
+    sigma_m: float | None = None
+
+
+@dataclass(frozen=True, slots=True)
+class Interval:
+    start: TimeNs
+    end: TimeNs
+
+
+@dataclass(frozen=True, slots=True)
+class WorldPoint:
+    x_m: float
+    y_m: float
+    z_m: float
+
+
+@dataclass(frozen=True, slots=True)
+class Measurement:
+    """One place of one marker, measured by hand; or, with ``withdraws``, the end of one."""
+
+    timestamp: TimeNs
+    id: str
+    withdraws: str | None = None
+    marker_id: int | None = None
+    distances: tuple[Distance, ...] = ()
+    side: str | None = None
+    height_m: float | None = None
+    height_sigma_m: float | None = None
+    still: Interval | None = None
+    point: WorldPoint | None = None
+    splits: tuple[str, ...] = ()

@@ -1,0 +1,33 @@
+"""Message: a payload on a topic, and the types of the fields of payloads."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from typing import Annotated, Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+__all__ = ["Corners", "Floats", "Mat33", "Mat34", "Mat88", "Message", "TimeNs", "Vec3"]
+
+TimeNs = Annotated[int, "google.protobuf.Timestamp"]
+Floats = Annotated[NDArray[np.float64], (-1,)]
+Vec3 = Annotated[NDArray[np.float64], (3,)]
+Mat33 = Annotated[NDArray[np.float64], (3, 3)]
+Mat34 = Annotated[NDArray[np.float64], (3, 4)]
+Corners = Annotated[NDArray[np.float64], (4, 2)]
+Mat88 = Annotated[NDArray[np.float64], (8, 8)]
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class Message:
+    """A payload on a topic, with the two times of the log.
+
+    ``camera`` is the camera it belongs to, or None: the rig, a measurement, a track.
+    """
+
+    topic: str
+    log_time_ns: int
+    publish_time_ns: int
+    payload: Any
+    camera: str | None = None

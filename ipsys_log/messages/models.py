@@ -1,0 +1,155 @@
+"""Payloads of the models: fitted models, and their evaluation."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+from ipsys_log.messages.message import Floats, Mat33, TimeNs, Vec3
+
+__all__ = [
+    "CameraEvaluation",
+    "CameraModel",
+    "ErrorStatistics",
+    "Evaluation",
+    "LearningPoint",
+    "Model",
+    "Noise",
+    "Pair",
+    "Parameter",
+    "Residual",
+    "Suspect",
+]
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class Parameter:
+    """A named array of a model: ``values`` in C order of ``shape``."""
+
+    name: str
+    shape: tuple[int, ...]
+    values: Floats
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class Pair:
+    """A measured place: mean camera point of the still marker, and its world point."""
+
+    measurement: str
+    marker_id: int
+    camera_m: Vec3
+    world_m: Vec3
+    frames: int
+    world_covariance_m2: Mat33 | None = None
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class Noise:
+    """What a position's covariance is made of, see :mod:`ipsys_log.models.uncertainty`.
+
+    ``along`` is the relative error of a depth, ``across`` that of (u, v), ``growth`` the power by which
+    they grow; ``fit`` the covariance of (u, v, ln Zc) that has the effect of the uncertainty of the fit.
+    """
+
+    along: float
+    across: float
+    growth: float
+    fit: Mat33
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class CameraModel:
+    camera: str
+    parameters: tuple[Parameter, ...]
+    covariance_m2: Mat33 | None = None
+    pairs: tuple[Pair, ...] = ()
+    noise: Noise | None = None
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class Model:
+    timestamp: TimeNs
+    name: str
+    cameras: tuple[CameraModel, ...]
+
+
+@dataclass(frozen=True, slots=True)
+class ErrorStatistics:
+    """Of a set of distances; ``std_m`` with count - 1, as in Tables I and II. ``mean_low_m`` and
+    ``mean_high_m`` are the 95 % confidence interval of the mean."""
+
+    count: int
+    mean_m: float
+    min_m: float
+    max_m: float
+    std_m: float | None = None
+    median_m: float | None = None
+    p95_m: float | None = None
+    mean_low_m: float | None = None
+    mean_high_m: float | None = None
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class Residual:
+    measurement: str
+    world_m: Vec3
+    predicted_m: Vec3
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class CameraEvaluation:
+    """Errors of one camera (``""``: of all) against the ``tape`` or, in a simulated lab, the ``truth``.
+
+    ``scheme`` is ``held_out`` (also where absent) or ``cross_validation``; the latter has a residual
+    for each place and repeat, repeat by repeat. ``within_68`` and ``within_95`` are the shares of them
+    within these regions of their covariance.
+    """
+
+    camera: str
+    against: str
+    error_3d: ErrorStatistics | None
+    error_2d: ErrorStatistics
+    residuals: tuple[Residual, ...] = ()
+    scheme: str | None = None
+    bias_m: Vec3 | None = None
+    within_68: float | None = None
+    within_95: float | None = None
+
+
+@dataclass(frozen=True, slots=True)
+class LearningPoint:
+    """Mean errors of models fitted on ``pairs`` places: of the subset called ``label``, or of random ones."""
+
+    camera: str
+    pairs: int
+    mean_3d_m: float
+    mean_2d_m: float
+    subsets: int
+    label: str | None = None
+    std_3d_m: float | None = None
+    std_2d_m: float | None = None
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class Suspect:
+    """A measurement that disagrees with the model fitted without it, and what would explain it.
+
+    ``residual_m`` is predicted minus measured, the mean over ``cameras``; ``score`` its length in units
+    of the usual one; ``kind`` one of ``side``, ``swapped``, ``distance``, ``height``, or None.
+    """
+
+    measurement: str
+    cameras: tuple[str, ...]
+    residual_m: Vec3
+    score: float
+    kind: str | None = None
+    text: str | None = None
+    corrected_m: Vec3 | None = None
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class Evaluation:
+    timestamp: TimeNs
+    model: str
+    cameras: tuple[CameraEvaluation, ...]
+    learning: tuple[LearningPoint, ...] = ()
+    suspects: tuple[Suspect, ...] = ()

@@ -1,0 +1,88 @@
+"""Payloads in world coordinates: positions of each camera, tracks of robots, transforms for viewers."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+from ipsys_log.messages.message import Mat33, TimeNs
+
+__all__ = [
+    "FrameTransform",
+    "FrameTransforms",
+    "Position",
+    "Positions",
+    "Quaternion",
+    "Track",
+    "Tracks",
+    "Vector3",
+]
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class Position:
+    """A marker in the world, as one camera has it; ``inside`` the volume of the measured places or not."""
+
+    id: int
+    x_m: float
+    y_m: float
+    z_m: float
+    heading_rad: float | None = None
+    covariance_m2: Mat33 | None = None
+    inside: bool | None = None
+    time_offset_ns: int | None = None
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class Positions:
+    timestamp: TimeNs
+    positions: tuple[Position, ...]
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class Track:
+    """A robot in the world, from all the cameras that saw it."""
+
+    robot: str
+    id: int
+    x_m: float
+    y_m: float
+    z_m: float
+    heading_rad: float | None = None
+    covariance_m2: Mat33 | None = None
+    cameras: tuple[str, ...] = ()
+    inside: bool | None = None
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class Tracks:
+    timestamp: TimeNs
+    tracks: tuple[Track, ...]
+
+
+@dataclass(frozen=True, slots=True)
+class Vector3:
+    x: float
+    y: float
+    z: float
+
+
+@dataclass(frozen=True, slots=True)
+class Quaternion:
+    x: float
+    y: float
+    z: float
+    w: float
+
+
+@dataclass(frozen=True, slots=True)
+class FrameTransform:
+    timestamp: TimeNs
+    parent_frame_id: str
+    child_frame_id: str
+    translation: Vector3
+    rotation: Quaternion
+
+
+@dataclass(frozen=True, slots=True)
+class FrameTransforms:
+    transforms: tuple[FrameTransform, ...]

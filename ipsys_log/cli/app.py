@@ -20,10 +20,8 @@ from ipsys_log.cli import (
     measure,
     plan,
     record,
-    report,
     setup,
     stages,
-    view,
 )
 from ipsys_log.cli.signals import interruptible
 
@@ -155,7 +153,7 @@ app = typer.Typer(
 )
 _MODULES = (
     *(setup, markers, cameras, calibrate, align, imports, record, measure, stages),
-    *(plan, report, inspect, compare, view),
+    *(plan, inspect, compare),
 )
 for module in _MODULES:
     module.add_commands(app)

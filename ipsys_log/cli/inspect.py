@@ -1,23 +1,44 @@
-"""Look at a log: ``ipsys info``, ``ipsys runs``, ``ipsys view``, ``ipsys repair``."""
+"""Commands that show or repair a log: ``ipsys info``, ``runs``, ``view``, ``report`` and ``repair``."""
 
 from __future__ import annotations
 
 import json
 from pathlib import Path
-from typing import Annotated
+from typing import Annotated, Any, Optional
 
 import typer
 
-from ipsys_log.cli.console import console, print_outcomes, progress_bar, remarks
+from ipsys_log.cli.console import console, print_outcomes, progress_bar, remarks, say
 from ipsys_log.cli.options import AsJson, Logs
+from ipsys_log.cli.stages import EVALUATE, MORE, build_command, derived, options_of
 
 __all__ = ["add_commands"]
+
+Runs = Annotated[
+    Optional[list[str]],  # noqa: UP045
+    typer.Option("--run", metavar="NAME", help="A run to show, instead of the newest; repeat for several."),
+]
+Save = Annotated[
+    Path | None,
+    typer.Option("--save", metavar="FILE", help="Write a Rerun recording (.rrd); needs no screen."),
+]
+_HTML = (
+    Annotated[
+        Optional[Path],  # noqa: UP045
+        typer.Option("--html", metavar="FILE", help="The page, instead of the log's name with .html."),
+    ],
+    None,
+)
+_HELP = f"Write one HTML page that says how good the models of a log are; it needs no network.{MORE}"
 
 
 def add_commands(app: typer.Typer) -> None:
     app.command()(info)
     app.command()(runs)
     app.command()(repair)
+    app.command()(view)
+    names = [name for name in EVALUATE if name not in ("as_json", "plots")]
+    app.command("report", help=_HELP)(build_command({**options_of(names), "html": _HTML}, _report))
 
 
 def info(logs: Logs, as_json: AsJson = False) -> None:
@@ -79,3 +100,45 @@ def repair(
             print_outcomes(finish_runs(log, progress))
     except IpsysError as error:  # the log itself is whole
         remarks.print(f"its runs cannot be finished: {error}", style="yellow", markup=False)
+
+
+def view(logs: Logs, run: Runs = None, save: Save = None) -> None:
+    """Show frames with drawn markers, floor, measured places, positions and tracks over time, in Rerun."""
+    from ipsys_log.log.dataset import Session
+
+    if save is not None:
+        _check_save(save, logs)
+    from ipsys_log.runs.states import out_of_date_lines
+    from ipsys_log.sinks.rerun.recording import write_recording
+
+    with Session(logs) as session:
+        shown = write_recording(session, run or (), save)
+        for line in out_of_date_lines(session, [shown.markers, *shown.runs]):
+            say(line)
+    for what, names in (("markers", [shown.markers]), ("positions and tracks", shown.runs)):
+        named = ", ".join(name for name in names if name)
+        if named:
+            remarks.print(f"{what:<21} run {named}")
+    if save is not None:
+        remarks.print(f"{save} written; look at it with: rerun {save}")
+
+
+def _check_save(save: Path, logs: list[Path]) -> None:
+    """Check that a recording can be written, and that Rerun will open it by its name."""
+    from ipsys_log.errors import IpsysError
+    from ipsys_log.report.files import check_file
+
+    if save.suffix != ".rrd":
+        raise IpsysError(f"--save {save}: Rerun opens recordings that end in .rrd; name it {save.stem}.rrd")
+    check_file(save, "--save", logs)
+
+
+def _report(logs: list[Path], output: Path | None, html: Path | None, **given: Any) -> None:
+    from ipsys_log.report.files import check_file, write_files
+    from ipsys_log.report.html import render_report
+
+    target = html or (output or logs[-1]).with_suffix(".html")
+    check_file(target, "--html", [*logs, *([output] if output else [])])
+    with derived(logs, "evaluate", output, **given) as (session, _, accuracies):
+        write_files(target.parent, {target.name: render_report(session, accuracies).encode()})
+    console.print(f"{target} written: open it in a browser", markup=False)

@@ -1,7 +1,4 @@
-"""How far a model is off on places that it was not fitted on (eq. 26, 27).
-
-Figures for how far positions are off.
-"""
+"""Errors of models on held-out and cross-validated points (eq. 26, 27), and their statistics."""
 
 from __future__ import annotations
 

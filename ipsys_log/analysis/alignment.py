@@ -1,7 +1,4 @@
-"""How a camera hangs above the floor: its tilt, from markers that lie there (sect. 3 of the paper).
-
-Cameras in one frame without a tape: by the plumb line of each, and markers that two of them see.
-"""
+"""Camera poses above the floor, from markers that lie on it (sect. 3 of the paper)."""
 
 from __future__ import annotations
 

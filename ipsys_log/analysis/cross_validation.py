@@ -1,7 +1,4 @@
-"""Models fitted without some of the places: cross-validation and leave-one-out.
-
-How many places are enough: the error by the number of places that a model is fitted on.
-"""
+"""Models fitted without some calibration points: cross-validation, leave-one-out, learning curves."""
 
 from __future__ import annotations
 

@@ -1,7 +1,4 @@
-"""Measured places: which measurements count, where they are, and what the cameras saw there.
-
-Measured places as they are drawn: where they are, and what they are for.
-"""
+"""Calibration points: the valid measurements, their world points, and the camera points seen there."""
 
 from __future__ import annotations
 

@@ -1,10 +1,8 @@
-"""The next places to measure: those that bring the predicted error over the floor down most.
+"""The next calibration points: those that reduce the predicted error over the floor most.
 
 A model's predicted error falls with the leverage of a position among the fitted places, and a new place
 lowers it all over the view of each camera that sees it, the more the better the tape knows the place.
 Greedy I-optimal design picks, one after the other, the place after which the mean error is least.
-
-What a fitted camera sees of the world: the way back from a place to its image.
 """
 
 from __future__ import annotations

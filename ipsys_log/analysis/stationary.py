@@ -1,7 +1,4 @@
-"""Where a marker lies still: in what cameras saw of it over a whole log, or over the last second.
-
-Where markers lay still while a camera looked on.
-"""
+"""Stationary intervals of markers: over a whole log, and over the last second."""
 
 from __future__ import annotations
 

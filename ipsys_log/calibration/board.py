@@ -1,6 +1,4 @@
-"""Boards to calibrate with: what they are, and where their corners lie.
-
-The pattern of a calibration board: its black squares, and the markers in the others.
+"""Calibration boards: their kinds, their patterns, and the positions of their corners.
 
 The layout is that of OpenCV since 4.6: the square at the top left is black for any number of rows.
 """

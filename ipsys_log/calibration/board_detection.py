@@ -1,6 +1,4 @@
-"""The board in a picture: its corners, and how sharp it is.
-
-Corners of squares from the edges that meet in them.
+"""Detection of a board in an image: its corners to sub-pixel accuracy, and its sharpness.
 
 Around a corner there is little to see, and on a ChArUco board markers come near it. Its four edges are
 long. A camera's gamma and the markers' borders shift an edge towards its white side, or its black one;

@@ -1,7 +1,4 @@
-"""Hints for pictures that show another board than the given one.
-
-The size of a ChArUco board from the ids and positions of its markers in pictures.
-"""
+"""Estimates of the size of a board, and hints for images that show another board than the stated one."""
 
 from __future__ import annotations
 

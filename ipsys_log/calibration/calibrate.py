@@ -1,7 +1,4 @@
-"""The lens of a camera from what was seen of a board: choose, solve, judge.
-
-The intrinsics of several cameras, each estimated separately: a bad one does not affect the others.
-"""
+"""Intrinsic calibration of one camera, and of several, each of them separately."""
 
 from __future__ import annotations
 

@@ -1,6 +1,4 @@
-"""Detection of a chessboard in a picture: its corners, and the largest grid of corners.
-
-Grids of chessboard corners: remove false rows, add rows that the detector missed.
+"""Detection of a chessboard in an image: its corners, without false rows, and the largest grid of them.
 
 A detector for a given size may take the edge of the paper before a dark background for one more row. An inner
 corner has four whole squares around it, alternately black and white. The edge of the paper does not: the

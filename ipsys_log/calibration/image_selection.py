@@ -1,7 +1,4 @@
-"""Which pictures a lens is fitted to: sharp ones, that differ, and not more than are needed.
-
-Where in the image, and how tilted, the board was seen: what a lens rests on, and what to add.
-"""
+"""Selection of the images for a calibration: sharp ones that differ and cover the image."""
 
 from __future__ import annotations
 

@@ -1,6 +1,4 @@
-"""From corners to a lens: start, robust fit, what does not belong left out, uncertainty.
-
-A lens and poses to start from, when nothing is known of the focal length.
+"""Camera intrinsics from corners: initial values, robust fit, removal of outliers, uncertainty.
 
 Several focal lengths are tried. With each, a corner is a ray, and the plane of the board follows from
 the rays alone, which may come from the side or from behind: nothing is divided by a depth.

@@ -1,10 +1,8 @@
-"""Detection of pictures of two cameras: two sets of intrinsics fit them far better than one.
+"""Results that are too poor to use: images of two cameras, too few images, a wrong lens model.
 
 Two groups of pictures are found as in k-means: each picture goes to the intrinsics with the least
 reprojection error, and each set of intrinsics is fitted to its pictures. The first groups are pictures with
 opposite gradients at the joint fit, and pictures with similar names.
-
-Results that are too poor to use: pictures of two cameras, too few pictures, a wrong lens model.
 """
 
 from __future__ import annotations

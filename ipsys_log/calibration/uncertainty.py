@@ -1,6 +1,4 @@
-"""Uncertainty of intrinsics: by their change without some pictures, and with a richer model.
-
-The error of an imperfect lens model: the change that a richer model would make.
+"""Uncertainty of intrinsics: their change without some images, and with a richer lens model.
 
 The richer model has one more radial term and the terms of displaced or tilted lens elements (decentering and
 thin prism: Brown 1966; Weng, Cohen and Herniou, PAMI 1992), as far as the model lacks them. One linear step

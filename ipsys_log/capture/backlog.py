@@ -1,7 +1,4 @@
-"""Recorded frames that wait for the stages, which may be slower.
-
-Frames that wait for the stages, and which of them are skipped where there are too many.
-"""
+"""Recorded frames that wait for the stages, and the frames that are skipped where too many wait."""
 
 from __future__ import annotations
 

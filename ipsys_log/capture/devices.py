@@ -1,9 +1,4 @@
-"""Which opener a camera's ``source`` in the rig is for.
-
-Cameras through OpenCV, where there is no Video for Linux.
-
-Cameras on USB: through Video for Linux, elsewhere through OpenCV.
-"""
+"""The openers of cameras by the ``source`` in the rig: USB, network, files, simulation."""
 
 from __future__ import annotations
 

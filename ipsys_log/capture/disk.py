@@ -1,9 +1,4 @@
-"""The size that a recording will have, and how long the disk lasts.
-
-Periodic sync of a recording to the disk, in a separate thread.
-
-A disk that takes no more while a log is written to it.
-"""
+"""The disk of a recording: its remaining time, periodic sync, and a full disk."""
 
 from __future__ import annotations
 

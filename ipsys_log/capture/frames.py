@@ -1,7 +1,4 @@
-"""What a camera hands over, whatever it is attached by.
-
-What a camera was asked for, and what it gives.
-"""
+"""Frames of cameras, and the differences between the requested and the actual settings."""
 
 from __future__ import annotations
 

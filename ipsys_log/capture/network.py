@@ -1,9 +1,7 @@
-"""Cameras on the network: RTSP, MJPEG over HTTP, and whatever else FFmpeg opens by an address.
+"""Cameras on the network: RTSP, MJPEG over HTTP, and every address that FFmpeg opens.
 
 Packets are handed on as they came, never decoded: JPEG pictures, or H.264 and H.265 as Annex B with the
 parameter sets before each keyframe, which is what ``foxglove.CompressedVideo`` asks for.
-
-The time at which a network camera says it took a frame.
 """
 
 from __future__ import annotations

@@ -1,7 +1,4 @@
-"""The cameras attached to this machine, and where on USB they hang, as sysfs has it.
-
-Whether the cameras on a USB bus ask for more than it carries, and what would fit.
-"""
+"""The USB bus: attached cameras, their modes, and the bandwidth that they need."""
 
 from __future__ import annotations
 

@@ -1,7 +1,4 @@
-"""Frames from a camera by Video for Linux: its own JPEG bytes, if it has any, with the driver's stamps.
-
-Pictures of cameras that give no JPEG: encoded once, as Video for Linux lays them out.
-"""
+"""Frames from a camera by Video for Linux, with the driver's stamps: its JPEG bytes, or encoded once."""
 
 from __future__ import annotations
 

@@ -1,7 +1,4 @@
-"""Video files as frames.
-
-A video or a log as a live camera: ``file:red.mp4``, ``file:session.mcap``, in real time.
-"""
+"""Video files as frames, and as live cameras in real time."""
 
 from __future__ import annotations
 

@@ -1,7 +1,4 @@
-"""All commands.
-
-Additional help texts: the order of the commands, and examples.
-"""
+"""The command ``ipsys``: all commands, their order, and examples."""
 
 from __future__ import annotations
 

@@ -1,7 +1,4 @@
-"""Measuring in the terminal: one question after the other.
-
-The questions of a place in the terminal: each answer is checked at once, only a bad one asked anew.
-"""
+"""Entry of calibration points in the terminal: one question after the other, each answer checked."""
 
 from __future__ import annotations
 

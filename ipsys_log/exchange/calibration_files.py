@@ -1,9 +1,4 @@
-"""A lens out of whatever file a user has it in: a calibration of OpenCV or ROS, or a log.
-
-Camera calibrations in OpenCV's FileStorage format, as the authors publish theirs, or in that of ROS.
-
-Lenses as the files that OpenCV, ROS and Kalibr read.
-"""
+"""Camera calibrations as the files of OpenCV, ROS and Kalibr: read and written."""
 
 from __future__ import annotations
 

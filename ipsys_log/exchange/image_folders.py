@@ -1,7 +1,4 @@
-"""Folders of pictures as a source of frames.
-
-When pictures were taken: from their names, or from a table.
-"""
+"""Folders of images as messages, with the times from their names or from a table."""
 
 from __future__ import annotations
 

@@ -3,8 +3,6 @@
 The folder is that of the data alone, or a clone of their repository
 (https://github.com/iMSEL-USC/Indoor-Positioning-System-iMSEL).
 
-Tables of numbers in a MATLAB file (version 5).
-
 SciPy's reader trusts the types and flags in a file: wrong ones crash the process.
 Layout: "MAT-File Format", The MathWorks, chapter 1.
 """

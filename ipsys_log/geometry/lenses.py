@@ -1,7 +1,4 @@
-"""From pixels to normalized image coordinates and back, through the lens.
-
-Where rays meet horizontal planes.
-"""
+"""Lens models: pixels to rays and back, and the points where rays meet horizontal planes."""
 
 from __future__ import annotations
 

@@ -1,7 +1,4 @@
-"""Outlines of the black parts of a grid of cells.
-
-Printed markers: where their corners are, and what is black on them.
-"""
+"""Printed markers: their corners, their black cells, and the outlines of these."""
 
 from __future__ import annotations
 

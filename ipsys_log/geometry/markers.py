@@ -1,7 +1,4 @@
-"""Where a square marker lies in the frame of its camera (sect. 2.1 of the paper).
-
-The noise of a marker's corners, and what the lens makes of it.
-"""
+"""Square markers: camera points and headings (sect. 2.1 of the paper), and the noise of their corners.
 
 from __future__ import annotations
 

@@ -1,7 +1,4 @@
-"""Both poses that explain the four corners of a square marker, tilted as it may be.
-
-The two poses of a square marker by formula: infinitesimal plane-based pose estimation.
-"""
+"""Both poses of a square marker that explain its four corners."""
 
 from __future__ import annotations
 

@@ -1,7 +1,4 @@
-"""The world point from two or more tape distances by least squares, and how well the tape knows it.
-
-The world point of a place on the floor from two tape distances (eq. 25 of the paper).
-"""
+"""World points from tape distances (eq. 25 of the paper), by least squares, and their covariance."""
 
 from __future__ import annotations
 

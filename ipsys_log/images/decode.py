@@ -1,9 +1,4 @@
-"""Frames to grey pictures.
-
-The size of a picture from the first bytes of its file, without decoding it.
-
-Check of the stated size of an encoded picture, before memory is allocated.
-"""
+"""Decoding of images to grey pixels, after a check of the stated size."""
 
 from __future__ import annotations
 

@@ -1,6 +1,4 @@
-"""Pictures of a video, one message after the other.
-
-Whether frames of H.264 are missing, by the numbers that they count themselves with.
+"""Decoding of video frames, one message after the other, and detection of missing frames.
 
 FFmpeg fills the place of a frame that was lost with the one before it, and says nothing.
 

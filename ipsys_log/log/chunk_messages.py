@@ -1,7 +1,4 @@
-"""Getting at the messages of one chunk while reading no more of it than is needed.
-
-Positions of the messages of a chunk by its message indexes, and the reads that they need.
-"""
+"""Messages of one chunk: their positions by the message indexes, and the fewest reads for them."""
 
 from bisect import bisect_right
 from collections import OrderedDict

@@ -1,6 +1,4 @@
-"""Contents of a chunk: decompression within limits, and its records.
-
-Reading parts of a compressed chunk in place.
+"""Contents of a chunk: decompression within limits, its records, and reads in place.
 
 Images do not compress: the compressors store them as raw blocks inside their frames. A message that
 lies in raw blocks can be read straight from the file. Frame formats: RFC 8878 (zstd), lz4_Frame_format.md.

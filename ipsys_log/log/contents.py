@@ -1,11 +1,4 @@
-"""The table of contents of a log, as the summary of an MCAP file holds it.
-
-What stands in a topic: a run, a camera.
-
-What a log is made of, as the rest of the program sees it.
-
-The channels of a log by topic: other programs write several channels of one topic.
-"""
+"""The table of contents of a log: schemas, channels, chunks, counts, and the parts of topics."""
 
 from __future__ import annotations
 

@@ -1,9 +1,7 @@
-"""One or several logs as one stream of decoded messages, whoever wrote them.
+"""One or several logs as one stream of decoded messages, from any recorder.
 
 Own logs name their cameras in their topics. In the logs of others, images and calibrations are
 known by their schema, and a camera's name is made from the topic or the frame they share.
-
-Measurements of several logs that are read as one: each log begins at p001.
 """
 
 from __future__ import annotations

@@ -1,9 +1,7 @@
-"""Hashes of channels: what a run read, without reading the images again.
+"""Hashes of channels from the CRC-32 of their messages, without reading the images again.
 
 A digest is a chain over the messages in log order, so that it does not depend on chunks or files, and
 can be continued when a channel grows.
-
-The CRC-32 of bytes that follow one another from the CRCs of the parts, without reading them again.
 
 An image's CRC is worked out once and serves its channel's hash, its chunk and the data section.
 """

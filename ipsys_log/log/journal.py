@@ -1,4 +1,4 @@
-"""Replacing the tail of a file so that a crash at any instant leaves the old log or the new one.
+"""Replacement of the tail of a file: a crash at any instant leaves the old log or the new one.
 
 Two things protect the old log meanwhile:
 
@@ -10,8 +10,6 @@ Two things protect the old log meanwhile:
   lock restores the tail. A torn journal means that the file itself was not changed yet.
 
 ``docs/decisions/append-order.md`` has the order of writes, and why.
-
-Every operation by which a log file changes, in one place, so that tests can record and cut them.
 """
 
 import logging

@@ -1,7 +1,4 @@
-"""Loading the table of contents: from the summary where that is complete, else from the records.
-
-The end of a log as bytes: DataEnd, summary, footer.
-"""
+"""The table of contents of a log file: from its summary where that is complete, else from its records."""
 
 import struct
 import zlib

@@ -1,7 +1,4 @@
-"""Small neural networks from the frame of a camera to the world (sect. 2.2.3 of the paper).
-
-Inputs and outputs of unit variance.
-"""
+"""Neural networks from camera points to world points (sect. 2.2.3 of the paper)."""
 
 from __future__ import annotations
 

@@ -1,7 +1,4 @@
-"""Rays and corrected depths: the physical model for markers of unknown height.
-
-Known height: a marker lies where its ray meets the height at which it is carried.
-"""
+"""Models on rays: ``raydepth`` corrects the depth, ``rayplane`` uses the known height of a marker."""
 
 from __future__ import annotations
 

@@ -1,8 +1,6 @@
-"""Models from camera to world coordinates: scikit-learn estimators and one table of their names.
+"""The table of models, their parameters as named arrays, and models applied to points.
 
 A fitted model travels as named arrays (:func:`parameters`, :func:`restore`), never as a pickle.
-
-A model out of a log, ready to be applied.
 """
 
 from __future__ import annotations

@@ -1,4 +1,4 @@
-"""How many places to measure, and which model to use with so many.
+"""Advice on the number of calibration points and on the model, from learning curves.
 
 The rule: of the models of a group the simplest one whose mean error is within the noise of the lowest
 (the one-standard-error rule of Breiman et al., with a 95 % interval of the difference for the one standard
@@ -12,8 +12,6 @@ difference for noise than noise for a difference.
 References
 ----------
 Breiman et al., Classification and Regression Trees, 1984, sect. 3.4.3.
-
-Learning curves as they are drawn and judged: the mean error by the number of places.
 """
 
 from __future__ import annotations

@@ -1,7 +1,4 @@
-"""A calibration in words, as a table and as JSON.
-
-Where the corners were, and by how much a lens misses them.
-"""
+"""A camera calibration as text, table, JSON and figure."""
 
 from __future__ import annotations
 

@@ -1,7 +1,4 @@
-"""What a log holds: cameras, channels, rates, gaps and runs.
-
-Where markers lie still in a log, numbered as a sheet of measurements names them.
-"""
+"""The contents of a log: cameras, channels, rates, gaps, runs and stationary intervals."""
 
 from __future__ import annotations
 

@@ -1,6 +1,4 @@
-"""Figures to bytes, the same for the same figure: no time of writing, no random names inside.
-
-Colours and shapes of cameras, robots and models on white paper, apart for any colour vision.
+"""Figures as bytes, equal for equal figures, and the colours and symbols of figures.
 
 The hues are those of Okabe and Ito (2008), without their yellow, which white paper swallows.
 """

@@ -1,7 +1,4 @@
-"""Files for people: wholly written or not there, and never in place of a log.
-
-Tables for a spreadsheet, in cm with the digits of the paper.
-"""
+"""Output files: written wholly or not at all, never in place of a log; tables in cm."""
 
 from __future__ import annotations
 

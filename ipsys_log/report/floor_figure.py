@@ -1,7 +1,4 @@
-"""A session as one picture: the floor to scale, and how far each model is off.
-
-The floor to scale: measured places with their errors, and the ways of the robots.
-"""
+"""The floor to scale: calibration points with their errors, and the tracks of robots."""
 
 from __future__ import annotations
 

@@ -1,7 +1,4 @@
-"""What the page of a session says, as plain text and numbers for its template.
-
-What the page of a session says of what to be careful with: places, regions, and the model's own word.
-"""
+"""Sections of the HTML page: text and numbers for its templates, and their caveats."""
 
 from __future__ import annotations
 

@@ -1,9 +1,4 @@
-"""The tables and figures of the paper, and some more, as files of a folder.
-
-Where on the floor a model is off, and by how much.
-
-Models side by side: how far off they are, and how certain that is.
-"""
+"""The tables and figures of the paper, and some more, as files of a folder."""
 
 from __future__ import annotations
 

@@ -1,7 +1,4 @@
-"""All figures of an evaluation: tables of at most 80 columns.
-
-Cells and text of tables on a terminal of 80 columns.
-"""
+"""Tables of an evaluation, and cells that fit a terminal of 80 columns."""
 
 from __future__ import annotations
 

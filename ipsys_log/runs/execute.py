@@ -1,7 +1,4 @@
-"""Do one stage on a log: find the run that has done it already, or compute and append it.
-
-Runs that were cut short: what a recorder had written when it was killed stays, if it is right.
-"""
+"""Execution of one stage on a log: find its run, complete it, or compute and append it."""
 
 from __future__ import annotations
 

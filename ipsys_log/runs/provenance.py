@@ -1,6 +1,4 @@
-"""The bookkeeping of runs: which exist, which are still right, what the next one is called.
-
-Versions of the stages, of their methods and of the models.
+"""Provenance of runs: their names, inputs, fingerprints, and the versions of their stages.
 
 A version rises by one with each change of the output for the same input. The parameters of a run name its
 versions, except version 1. Versions of packages make no run out of date: they are in its fingerprint.

@@ -1,7 +1,4 @@
-"""The empty floor as a camera sees it: eight wooden boards (sect. 3 of the paper) on concrete.
-
-Constant data of the frames of a camera: its rays, the floor, the noise of its sensor.
-"""
+"""Images of the empty floor: eight wooden boards (sect. 3 of the paper) on concrete."""
 
 from __future__ import annotations
 

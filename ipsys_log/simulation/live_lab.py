@@ -1,8 +1,6 @@
 """The simulated lab of live cameras: most markers are stationary, a few drive to and fro.
 
 A stationary marker can be used for alignment and measured at any time.
-
-The repeated frames of a live simulated camera, rendered one by one while they are shown.
 """
 
 from __future__ import annotations

@@ -1,4 +1,4 @@
-"""What share of each pixel's light comes from a print, and from the black on it.
+"""The share of each pixel that a print covers, and its black cells, while it may move.
 
 A print is piecewise constant. It is drawn on four by four samples per pixel: a sample is sent through
 the exact inverse of the lens onto the plane of the marker and takes the mean over its own footprint
@@ -7,8 +7,6 @@ acts on the samples, and the sixteen of a pixel are averaged.
 
 A print that moves is drawn so at many instants of the exposure, and each row of pixels takes its own
 mean of them (:mod:`ipsys_log.simulation.pixel_shares`).
-
-When the rows of a frame are exposed, and how much each instant of a motion counts in each row.
 
 The time of a frame is the middle of the exposure of its first row, row 0; row r is exposed
 ``exposure_s`` long around ``r * row_time_ns`` after it. Between the instants at which a moving print

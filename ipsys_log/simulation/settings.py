@@ -1,7 +1,4 @@
-"""What can be set about the simulated lab.
-
-One stream of random numbers per purpose, so that a change to one leaves the others as they are.
-"""
+"""Settings of the simulated lab, and its random numbers."""
 
 from __future__ import annotations
 

@@ -1,9 +1,4 @@
-"""What measuring is done on, a recording or a finished log, and what its cameras say of a marker.
-
-Where the present model has a marker, beside where the tape has it.
-
-A model of measurements that were entered together, to check each by the others.
-"""
+"""The scene of a survey: a log or live cameras, and the predictions of its markers."""
 
 from __future__ import annotations
 

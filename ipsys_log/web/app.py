@@ -1,7 +1,4 @@
-"""The page and its questions: one at a time, so that a scene need not know of threads.
-
-What the page is told: lengths in m to be drawn, in cm to be read.
-"""
+"""The measuring page: its requests, one at a time, and their answers."""
 
 from __future__ import annotations
 

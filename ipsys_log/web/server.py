@@ -1,7 +1,4 @@
-"""The server of the page, in a thread of its own beside whatever else goes on.
-
-Faults of the page's server: kept for the end of the command, because the screen belongs to a recording.
-"""
+"""The server of the measuring page in a separate thread, and its faults."""
 
 from __future__ import annotations
 

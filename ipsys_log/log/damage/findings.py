@@ -1,7 +1,4 @@
-"""The result of a survey: which parts of a log are whole, which are damaged, and which messages are gone.
-
-Damage that a survey meets: its extent, the messages saved of it, and the message indexes behind it.
-"""
+"""Findings of a survey: whole and damaged parts of a log, and its lost messages."""
 
 from dataclasses import dataclass, field, replace
 

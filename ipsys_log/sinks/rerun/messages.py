@@ -1,7 +1,4 @@
-"""Messages into a Rerun recording, one after the other.
-
-Frames as Rerun takes them: encoded ones as they are, raw ones without the padding of their rows.
-"""
+"""Messages as Rerun entities, one after the other."""
 
 from __future__ import annotations
 

@@ -1,7 +1,4 @@
-"""A session in Rerun: frames with their markers, the floor, positions and tracks over time.
-
-The Rerun viewer as a process of its own, fed through a pipe.
-"""
+"""A recording for Rerun: images with markers, the floor, positions and tracks; and its viewer."""
 
 from __future__ import annotations
 

@@ -1,6 +1,4 @@
-"""What stands still in a Rerun recording: the floor, the measured places, and how it is laid out.
-
-Colours that stay apart, for people with any colour vision, on a dark ground.
+"""The static part of a Rerun recording: floor, calibration points, layout and colours.
 
 The hues are those of Okabe and Ito (2008), lightened where a dark ground asks for it.
 """

@@ -1,7 +1,4 @@
-"""Where robots came from: one line from each instant to the next.
-
-Take away what is no longer seen, instead of letting it freeze for ever.
-"""
+"""Trails of robots, and the removal of entities that are no longer seen."""
 
 from __future__ import annotations
 

@@ -1,10 +1,8 @@
-"""Steps in profiles across the edges of a print that glare, a shadow or a cover may disturb.
+"""Markers in uneven light: edges that glare, a shadow or a cover disturbs, and the colours of cells.
 
 A profile far to both sides shows the approximate position of an edge. A near one shows the exact position.
 Its shape shows whether it is one undisturbed edge: glare that begins there, or saturates the white, gives
 another shape.
-
-Agreement of grey levels with the cells of a marker where light is uneven.
 
 Under glare or half in a shadow, no single threshold separates black from white. Neighbouring cells still
 differ if the print changes its colour between them, and hardly differ if it does not.

@@ -1,4 +1,4 @@
-"""Square markers: camera points and headings (sect. 2.1 of the paper), and the noise of their corners.
+"""Square markers: camera points and headings (sect. 2.1 of the paper), and the noise of their corners."""
 
 from __future__ import annotations
 

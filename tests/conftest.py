@@ -41,7 +41,7 @@ for number in SIGNALS:
 settings.register_profile("any_machine", deadline=None, suppress_health_check=[HealthCheck.too_slow])
 settings.load_profile("any_machine")
 # A program for Debian's own Python.
-collect_ignore = ["sources/rtsp_server.py"]
+collect_ignore = ["capture/rtsp_server.py"]
 
 
 class Done(NamedTuple):

@@ -29,7 +29,8 @@ from stream_server import Served, loops_of, serve
 from ipsys_log import pipeline
 from ipsys_log.analysis.latency import latency_percentiles, recorded_latencies, step_times_s
 from ipsys_log.log.dataset import Session
-from ipsys_log.messages import FRAME_SKIPPED, CompressedImage, Event
+from ipsys_log.messages import FRAME_SKIPPED, CompressedImage
+from ipsys_log.messages.channels import EVENTS
 from ipsys_log.runs.options import Request
 from ipsys_log.simulation.settings import LabSettings
 
@@ -102,7 +103,7 @@ def _rates(log: Path, cameras: Iterable[str]) -> dict[str, tuple[int, float, int
 
 def _events(log: Path, kind: str) -> int:
     with Session([log]) as session:
-        return sum(event.kind == kind for event in session.payloads(session.topics(Event)))
+        return sum(event.kind == kind for event in session.payloads(session.topics(EVENTS)))
 
 
 def _record(

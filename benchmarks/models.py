@@ -23,7 +23,8 @@ from ipsys_log.analysis.cross_validation import cross_validate, gather_places, l
 from ipsys_log.analysis.pairs import Measured, build_pairs, gather_sightings
 from ipsys_log.exchange.imsel import read_imsel
 from ipsys_log.log.dataset import Session
-from ipsys_log.messages import CameraPoints, Pair
+from ipsys_log.messages import Pair
+from ipsys_log.messages.channels import CAMERA_POINTS
 from ipsys_log.models.table import MODELS
 from ipsys_log.runs.output import write_log
 from ipsys_log.runs.select import measured
@@ -40,7 +41,7 @@ def read(folder: Path) -> tuple[dict[str, list[Pair]], list[Measured]]:
         write_log(log, read_imsel(folder))
         with Session([log]) as session:
             places = measured(session, None)
-            points = gather_sightings(session.messages(session.topics(CameraPoints, "imsel")))
+            points = gather_sightings(session.messages(session.topics(CAMERA_POINTS, "imsel")))
     return build_pairs(points, places), places
 
 

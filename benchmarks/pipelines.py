@@ -14,7 +14,8 @@ from numpy.typing import NDArray
 from rounds import Turn
 
 from ipsys_log.log.dataset import Session
-from ipsys_log.messages import CameraCalibration, Markers, Message, Rig
+from ipsys_log.messages import Markers, Message, Rig
+from ipsys_log.messages.channels import CALIBRATIONS, RIG
 from ipsys_log.stages import detect
 from ipsys_log.stages.detect import Detect
 
@@ -152,8 +153,8 @@ FINDERS: dict[str, Callable[[Message, dict[str, Message]], Finder]] = {
 
 def _opened(path: Path) -> tuple[Session, Message, dict[str, Message]]:
     session = Session([path])
-    (rig,) = session.messages(session.topics(Rig))
-    lenses = {str(one.camera): one for one in session.messages(session.topics(CameraCalibration))}
+    (rig,) = session.messages(session.topics(RIG))
+    lenses = {str(one.camera): one for one in session.messages(session.topics(CALIBRATIONS))}
     return session, rig, lenses
 
 

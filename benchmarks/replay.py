@@ -27,6 +27,7 @@ from results import Report, command
 from rounds import Contender, Row, Turn, race, ratio_row
 from scenes import CACHE, drawn, lengthened
 
+from ipsys_log.messages.channels import CALIBRATIONS, RIG
 from ipsys_log.simulation.settings import LabSettings
 
 __all__ = ["measure"]
@@ -60,7 +61,6 @@ def _whole(path: Path) -> Turn:
 
 def _detection(path: Path) -> Turn:
     from ipsys_log.log.dataset import Session
-    from ipsys_log.messages import CameraCalibration, Rig
     from ipsys_log.runs.stream import Stage, in_threads, run
     from ipsys_log.stages import detect
 
@@ -68,7 +68,7 @@ def _detection(path: Path) -> Turn:
 
     def turn(_number: int) -> int:
         with Session([path]) as session:
-            topics = [*session.topics(Rig), *session.topics(CameraCalibration), *session.images.values()]
+            topics = [*session.topics(RIG), *session.topics(CALIBRATIONS), *session.images.values()]
             return sum(1 for _ in run(session.messages(topics), [stage], in_threads))
 
     return turn

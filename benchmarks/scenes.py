@@ -16,7 +16,8 @@ from numpy.typing import NDArray
 from ipsys_log import simulation
 from ipsys_log.geometry.marker_cells import true_corners
 from ipsys_log.log.dataset import Session
-from ipsys_log.messages import CompressedImage, Message, Tracks
+from ipsys_log.messages import CompressedImage, Message
+from ipsys_log.messages.channels import TRUTH
 from ipsys_log.runs.output import write_log
 from ipsys_log.simulation.calibration_points import Place, place
 from ipsys_log.simulation.cameras import hang_cameras
@@ -81,7 +82,7 @@ def _restarted(path: Path, rows: int) -> Iterator[Message]:
 def blocks(path: Path, instants: int) -> list[tuple[int, int]]:
     """Half-open ranges of log time in ns, each of so many frames of every camera."""
     with Session([path]) as session:
-        starts = [message.log_time_ns for message in session.messages(session.topics(Tracks))]
+        starts = [message.log_time_ns for message in session.messages(session.topics(TRUTH))]
         firsts = starts[::instants]
         return list(zip(firsts, [*firsts[1:], session.end_ns + 1], strict=True))
 
@@ -91,7 +92,7 @@ def truth(path: Path, settings: LabSettings) -> dict[tuple[str, int], Truth]:
     cameras = hang_cameras(settings)
     found = {}
     with Session([path]) as session:
-        for tracks in session.payloads(session.topics(Tracks)):
+        for tracks in session.payloads(session.topics(TRUTH)):
             for camera in cameras:
                 px = {}
                 for track in tracks.tracks:

@@ -43,16 +43,20 @@ from ipsys_log.capture.multiplexer import Attached
 from ipsys_log.capture.recent_frames import Recent
 from ipsys_log.capture.recorder import Recording, Source, recording, written
 from ipsys_log.errors import IpsysError, LogError
+from ipsys_log.log.contents import run_of_topic
 from ipsys_log.log.dataset import Session
-from ipsys_log.messages import EVENTS_TOPIC, Markers, Message, Positions, Tracks
+from ipsys_log.messages import Message
+from ipsys_log.messages.channels import EVALUATION, MODEL, RUN_EVENTS, Channel
+from ipsys_log.messages.stage import Stage
+from ipsys_log.models.table import MODELS
 from ipsys_log.runs.checks import check_inputs
 from ipsys_log.runs.execute import carry_out, perform, sign
-from ipsys_log.runs.graph import STAGES, plan_stage
+from ipsys_log.runs.graph import Task, copy_model, is_of_model, plan_stage, stages_until
 from ipsys_log.runs.options import Progress, Request
 from ipsys_log.runs.output import opened_target
 from ipsys_log.runs.provenance import Outcome
 from ipsys_log.runs.select import wanted_models
-from ipsys_log.runs.stream import TOPICS, Stage, in_threads, run
+from ipsys_log.runs.stream import WiredStage, in_threads, run
 from ipsys_log.sinks.sink import Consumer, Consumers
 
 __all__ = ["live", "measure", "record", "replay"]
@@ -61,7 +65,7 @@ __all__ = ["live", "measure", "record", "replay"]
 def replay(
     paths: Sequence[Path],
     request: Request,
-    until: str = "fuse",
+    until: str | None = None,
     output: Path | None = None,
     progress: Progress = lambda stage, done, total: None,
     say: Callable[[str], None] = lambda text: None,
@@ -73,7 +77,7 @@ def replay(
     Parameters
     ----------
     paths : the logs, read as one; results go to the last of them, or to ``output``.
-    until : the last stage. With fuse, models are also evaluated if points are held out.
+    until : the last stage; None: all stages. With fuse, models are also evaluated if points are held out.
     say : called before the computation, with the runs that are out of date and the reason.
 
     Returns
@@ -85,30 +89,36 @@ def replay(
     IpsysError
         The input has a fault that the user must correct.
     """
-    models = wanted_models(request, until, paths)
-    check_inputs(paths, request, models, until)
+    stages = stages_until(until)
+    models = wanted_models(request, paths, tuple(MODELS) if EVALUATION in stages[-1].writes else ("poly",))
+    check_inputs(paths, request, models, stages)
     outcomes: list[Outcome] = []
     # The matrices are small: threads of BLAS would only wait for one another.
     with opened_target(paths, output) as (logs, target), threadpool_limits(1, user_api="blas"):
 
-        def do(stage: str, **given: str) -> str:
-            """Run a stage, or find its result; return the name of its run, if there is one."""
-            if STAGES.index(stage) > STAGES.index(until):
-                return ""
+        def do(stage: Stage, inputs: dict[Channel, str], model: str | None = None) -> None:
+            """Run a stage, or find its result; note its run as that of the channels that it writes."""
             with Session(logs) as session:
-                task = plan_stage(stage, session, request, **given)
-                if isinstance(task, str):
-                    return task
-                make = partial(carry_out, progress=progress)
-                outcomes.append(perform(session, target, task, request, until, make, say))
-            return outcomes[-1].run
+                if MODEL in stage.writes and request.model_from is not None:
+                    task: Task | str = copy_model(request, str(model))[0]
+                else:
+                    options = request.options(model)
+                    task = plan_stage(stage, session, options, inputs, request.rig, request.lenses)
+                if isinstance(task, Task):
+                    make = partial(carry_out, progress=progress)
+                    outcomes.append(perform(session, target, task, request, stages[-1], make, say))
+                    task = outcomes[-1].run
+            inputs.update({channel: task for channel in stage.writes if channel is not RUN_EVENTS})
 
-        points = do("camera-frame", markers=do("detect"))
-        for name in models:
-            model = do("fit", points=points, model=name)
-            if until != "locate":
-                do("evaluate", points=points, model=model)
-            do("fuse", positions=do("locate", points=points, model=model))
+        shared: dict[Channel, str] = {}
+        for stage in stages:
+            if not is_of_model(stage):
+                do(stage, shared)
+        for model in models:
+            inputs = dict(shared)
+            for stage in stages:
+                if is_of_model(stage):
+                    do(stage, inputs, model)
     return outcomes
 
 
@@ -178,14 +188,13 @@ def measure(
     check_pictures(cameras.states)
     show = Consumers(consumers, cameras.warn)
     plan = plan_live(cameras.states, settings, request, "camera-frame")
-    detect, camera_frame = (Stage(*row) for row in plan.rows)
     with (
         threadpool_limits(1, user_api="blas"),
         recording(target, settings, overwrite) as log,
         Recent(log) as recent,
         Backlog(cameras, recent, cameras.now_ns) as frames,
     ):
-        for message in run(run(chain(settings, frames), [detect], in_threads), [camera_frame]):
+        for message in _through(plan.stages, chain(settings, frames)):
             if message is not TICK:
                 show(message)
     log.check_disk()
@@ -234,9 +243,8 @@ def live(
         recording(target, first, overwrite) as log,
         Backlog(cameras, log, cameras.now_ns) as frames,
     ):
-        stages = [Stage(*row) for row in plan.rows]
         ledger = Ledger(cameras.clock.now_ns, cameras.received_ns)
-        fault = _put_through(chain(settings, frames), stages, ledger, log, show)
+        fault = _put_through(chain(settings, frames), plan.stages, ledger, log, show)
         if fault is not None:
             cameras.warn("stages_stopped", f"{fault}; frames are recorded all the same")
             for message in frames:
@@ -245,7 +253,7 @@ def live(
     if fault is not None:
         raise IpsysError(f"{fault}; {target} has all frames: replay it") from fault
     try:
-        outcomes = sign(target, replace(plan.request, as_live=bool(frames.skipped)), plan.runs)
+        outcomes = sign(target, replace(plan.request, as_live=bool(frames.skipped)).options(), plan.runs)
     finally:
         log.check_disk()
     if frames.skipped:
@@ -257,18 +265,26 @@ def live(
     return outcomes
 
 
+def _through(
+    stages: Sequence[WiredStage], source: Iterable[Message], ledger: Ledger | None = None
+) -> Iterable[Message]:
+    """Send messages through live stages; note the time of each step."""
+    for wired in stages:
+        source = run(source, [wired], in_threads if wired.stage.in_threads else map)
+        if ledger is not None:
+            source = ledger.note(wired.stage.writes[0], wired.run, source)
+    return source
+
+
 def _put_through(
-    frames: Iterable[Message], stages: Sequence[Stage], ledger: Ledger, log: Recording, show: Consumers
+    frames: Iterable[Message], stages: Sequence[WiredStage], ledger: Ledger, log: Recording, show: Consumers
 ) -> IpsysError | None:
     """Write the results of the stages for incoming frames, then show them; return the error of a stage."""
-    made = ledger.note("detected", Markers, run(frames, stages[:1], in_threads))
-    made = ledger.note("located", Positions, run(made, stages[1:3]))
-    made = ledger.note("fused", Tracks, run(made, stages[3:]))
     try:
-        for message in made:
+        for message in _through(stages, frames, ledger):
             if message is TICK:
                 continue
-            if type(message.payload) in TOPICS and message.topic != EVENTS_TOPIC:  # those are written already
+            if run_of_topic(message.topic) is not None:  # all else is written already
                 log.put(message)
                 entry = ledger.entry(message)
                 if entry is not None:

@@ -6,14 +6,13 @@ from collections.abc import Iterator, Mapping
 from pathlib import Path
 
 from ipsys_log.log.dataset import Session
-from ipsys_log.messages import CameraPoints, Markers, Model, Positions, Tracks
+from ipsys_log.messages.channels import CAMERA_POINTS, EVENTS, MARKERS, MODEL, POSITIONS, TRACKS
 from ipsys_log.pipeline import replay
-from ipsys_log.runs.graph import points_run
 from ipsys_log.runs.options import Progress, Request
 from ipsys_log.runs.provenance import Outcome, newest_run
-from ipsys_log.runs.select import skipped_frames
-from ipsys_log.stages.camera_frame import METHODS, PERIMETER
-from ipsys_log.stages.detect import CORNERS
+from ipsys_log.stages import camera_frame, detect, fuse, locate
+from ipsys_log.stages.camera_frame import METHODS, PERIMETER, points_run
+from ipsys_log.stages.detect import CORNERS, skipped_frames
 
 __all__ = ["finish_runs", "unfinished_runs"]
 
@@ -31,16 +30,16 @@ def unfinished_runs(session: Session) -> dict[str, str]:
 def _live_runs(session: Session) -> Iterator[tuple[str, str]]:
     """Stages and their runs, as they are called live, as far as the log has them."""
     for corners in CORNERS:
-        if session.topics(Markers, corners):
-            yield "detect", corners
+        if session.topics(MARKERS, corners):
+            yield detect.STAGE.name, corners
     for points, _, _ in _POINTS:
-        if session.topics(CameraPoints, points):
-            yield "camera-frame", points
+        if session.topics(CAMERA_POINTS, points):
+            yield camera_frame.STAGE.name, points
     for run in sorted(session.run_names()):
-        if session.topics(Model, run) and session.topics(Positions, run):
-            yield "locate", run
-            if session.topics(Tracks, run):
-                yield "fuse", run
+        if session.topics(MODEL, run) and session.topics(POSITIONS, run):
+            yield locate.STAGE.name, run
+            if session.topics(TRACKS, run):
+                yield fuse.STAGE.name, run
 
 
 def finish_runs(path: Path, progress: Progress) -> list[Outcome]:
@@ -68,15 +67,15 @@ def finish_runs(path: Path, progress: Progress) -> list[Outcome]:
 
 def _request(session: Session, left: Mapping[str, str]) -> Request:
     """What was asked for live, by the names of the runs."""
-    points = left.get("camera-frame") or newest_run(session, CameraPoints)
-    live = (left.get("detect"), PERIMETER)
+    points = left.get(camera_frame.STAGE.name) or newest_run(session, CAMERA_POINTS)
+    live = (left.get(detect.STAGE.name), PERIMETER)
     corners, method = next(((corners, method) for run, corners, method in _POINTS if run == points), live)
-    run = left.get("locate") or left.get("fuse")
-    models = session.payloads(session.topics(Model, run)) if run else []
+    run = left.get(locate.STAGE.name) or left.get(fuse.STAGE.name)
+    models = session.payloads(session.topics(MODEL, run)) if run else []
     return Request(
         models=tuple(model.name for model in models[-1:]),
         corners=corners,
         method=method,
-        as_live=bool(skipped_frames(session)),
+        as_live=bool(skipped_frames(session.payloads(session.topics(EVENTS)))),
         skip_ambiguous=True,
     )

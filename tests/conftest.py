@@ -23,6 +23,7 @@ from ipsys_log.capture.video_files import open_video
 from ipsys_log.cli import main
 from ipsys_log.log.dataset import Session
 from ipsys_log.messages import CompressedVideo, Measurement, Message
+from ipsys_log.messages.channels import MEASUREMENTS
 from ipsys_log.pipeline import replay
 from ipsys_log.runs.options import Request
 from ipsys_log.runs.output import write_log
@@ -161,7 +162,7 @@ def unmeasured_log(lab_log: Path, tmp_path_factory: pytest.TempPathFactory) -> U
     """The small simulated session without its measurements, to be copied before it is changed."""
     path = tmp_path_factory.mktemp("unmeasured") / "lab.mcap"
     with Session([lab_log]) as session:
-        tape = session.payloads(session.topics(Measurement))
+        tape = session.payloads(session.topics(MEASUREMENTS))
         topics = [topic for reader in session.readers for topic in reader.channels]
         messages = session.messages(topics)
         write_log(path, (m for m in messages if not isinstance(m.payload, Measurement)))

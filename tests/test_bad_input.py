@@ -14,7 +14,8 @@ import numpy as np
 import pytest
 
 from ipsys_log.log.dataset import Session
-from ipsys_log.messages import CompressedImage, Distance, Event, Markers, Measurement, Message, Rig, RigMarker
+from ipsys_log.messages import CompressedImage, Distance, Measurement, Message, Rig, RigMarker
+from ipsys_log.messages.channels import MARKERS, RUN_EVENTS
 from ipsys_log.runs.output import write_log
 from ipsys_log.units import format_time
 from tests.conftest import Ipsys
@@ -133,8 +134,8 @@ def test_some_markers_that_are_not_in_the_rig_are_left_out_and_named(ipsys: Ipsy
     assert done.code == 0
     assert "unknown marker" in done.err
     with Session([log]) as session:
-        seen = {m.id for p in session.payloads(session.topics(Markers, "edges")) for m in p.markers}
-        events = session.payloads(session.topics(Event, "edges"))
+        seen = {m.id for p in session.payloads(session.topics(MARKERS, "edges")) for m in p.markers}
+        events = session.payloads(session.topics(RUN_EVENTS, "edges"))
     assert seen == {0, 1, 2, 3, 4, 6, 7}
     # Once for each camera, not for each frame.
     assert sorted(str(event.camera) for event in events) == ["black", "red", "white"]
@@ -274,7 +275,7 @@ def test_a_corrupt_jpeg_in_the_middle(ipsys: Ipsys, lab: Path, damage: str) -> N
     with Session([log]) as session:
         images = session.count("/cameras/white/image")
         seen = [m.log_time_ns for m in session.messages(["/runs/edges/cameras/white/markers"])]
-        events = session.payloads(session.topics(Event, "edges"))
+        events = session.payloads(session.topics(RUN_EVENTS, "edges"))
     assert len(seen) == images - 1
     assert times[10] not in seen
     assert [(event.kind, event.camera) for event in events] == [("corrupt_frame", "white")]

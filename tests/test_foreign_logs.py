@@ -19,7 +19,7 @@ from mcap.reader import make_reader
 from mcap.writer import CompressionType, Writer
 
 from ipsys_log.log.dataset import Session
-from ipsys_log.messages import CameraPoints, Markers
+from ipsys_log.messages.channels import CAMERA_POINTS, MARKERS
 from tests.conftest import Ipsys, data_section
 
 RIG = 'name = "other"\ndictionary = "DICT_4X4_100"\nmarker_length_m = 0.2\n'
@@ -122,8 +122,8 @@ def test_detect_and_camera_frame(
             points = session.payloads([f"/runs/edges/cameras/{camera}/camera_points"])
             assert len(points) == 5
             assert points[0].points[0].z_m == pytest.approx(0.2 * 500 / 100, rel=0.02)
-        assert session.topics(Markers, "edges")
-        assert session.topics(CameraPoints, "edges")
+        assert session.topics(MARKERS, "edges")
+        assert session.topics(CAMERA_POINTS, "edges")
     with log.open("rb") as file:
         reader = make_reader(file, validate_crcs=True)
         assert sum(1 for _ in reader.iter_messages()) > len(messages)

@@ -34,10 +34,10 @@ from ipsys_log.messages import (
     Markers,
     Measurement,
     Message,
-    Positions,
     Run,
     Tracks,
 )
+from ipsys_log.messages.channels import POSITIONS, RECORD
 from ipsys_log.runs.options import Request
 from ipsys_log.runs.output import append_messages, write_log
 from ipsys_log.runs.select import find_pairs
@@ -412,7 +412,7 @@ def test_late_frames_are_named_and_in_no_track(stalled: Path) -> None:
     with Session([stalled]) as session:
         events = [e for e in session.payloads(["/events"]) if e.kind == STAMP_UNRELIABLE]
         tracks = session.payloads(["/runs/poly/tracks"])
-        positions = list(session.messages(session.topics(Positions, "poly")))
+        positions = list(session.messages(session.topics(POSITIONS, "poly")))
         (fused,) = (run for run in session.runs() if run.stage == "fuse")
     ranges = late_ranges(events)
     for camera in ("black", "red", "white"):
@@ -548,7 +548,7 @@ def test_the_latency_ledger_as_table_and_picture(ipsys: Ipsys, recorded: Path, t
     assert note == "total: from the arrival of a frame to its position"
     assert (tmp_path / "latency.png").read_bytes()[:4] == b"\x89PNG"
     with Session([recorded]) as session:
-        assert [run.stage for run in session.payloads(session.topics(Run, "edges"))] == [
+        assert [run.stage for run in session.payloads(session.topics(RECORD, "edges"))] == [
             "detect",
             "camera-frame",
         ]

@@ -26,7 +26,8 @@ from ipsys_log.analysis.pairs import active_measurements
 from ipsys_log.cli.dialog import ask_places
 from ipsys_log.errors import IpsysError, LogError
 from ipsys_log.log.dataset import Session
-from ipsys_log.messages import MEASUREMENTS_TOPIC, Measurement, Model, Pair
+from ipsys_log.messages import MEASUREMENTS_TOPIC, Measurement, Pair
+from ipsys_log.messages.channels import MEASUREMENTS, MODEL
 from ipsys_log.runs.options import Request
 from ipsys_log.survey.checks import check_entry, withdraw
 from ipsys_log.survey.entry import Typed, read_typed
@@ -83,7 +84,7 @@ def foreign_read(path: Path) -> list[Row]:
 def pairs_of(log: Path) -> dict[tuple[str, int, tuple[float, ...]], Pair]:
     """What each camera saw of each place, by camera, marker and camera point in nm."""
     with Session([log]) as session:
-        model = session.payloads(session.topics(Model, "poly"))[-1]
+        model = session.payloads(session.topics(MODEL, "poly"))[-1]
     return {
         (camera.camera, pair.marker_id, tuple((pair.camera_m * 1e9).round())): pair
         for camera in model.cameras
@@ -121,7 +122,7 @@ def test_every_place_of_a_session_is_found_and_paired_as_if_measured_while_recor
 
 def fitted_ids(log: Path, run: str) -> set[str]:
     with Session([log]) as session:
-        model = session.payloads(session.topics(Model, run))[-1]
+        model = session.payloads(session.topics(MODEL, run))[-1]
     return {pair.measurement for camera in model.cameras for pair in camera.pairs}
 
 
@@ -356,7 +357,7 @@ def test_a_bad_answer_in_the_terminal_costs_that_answer_only(
         assert text in said
     assert said.count("a begins the place anew") == 1
     with Session([log]) as session:
-        (saved,) = session.payloads(session.topics(Measurement))
+        (saved,) = session.payloads(session.topics(MEASUREMENTS))
     assert as_typed(saved).distances == first.distances
 
 

@@ -22,6 +22,7 @@ import pytest
 
 from ipsys_log.log.dataset import Session
 from ipsys_log.messages import CompressedImage, Measurement, Message
+from ipsys_log.messages.channels import MEASUREMENTS
 from ipsys_log.runs.output import write_log
 from ipsys_log.units import NS_PER_S
 from tests.conftest import Ipsys, Unmeasured
@@ -46,7 +47,7 @@ def still_lab(lab_log: Path, tmp_path_factory: pytest.TempPathFactory) -> Lab:
     with Session([lab_log]) as session:
         start_ns = session.start_ns
         tape = [
-            m for m in session.payloads(session.topics(Measurement)) if m.timestamp < start_ns + 2 * 10**9
+            m for m in session.payloads(session.topics(MEASUREMENTS)) if m.timestamp < start_ns + 2 * 10**9
         ]
         shown = {name: session.payloads([topic])[:2] for name, topic in session.images.items()}
         lines = ['name = "lab"\ndictionary = "DICT_4X4_100"\nmarker_length_m = 0.2']
@@ -174,7 +175,7 @@ def test_what_was_measured_survives_a_kill(ipsys: Ipsys, still_lab: Lab, tmp_pat
     assert ipsys("repair", log).code == 0
     assert [row.id for row in foreign_read(log)] == ["p001"]
     with Session([log]) as session:
-        (one,) = session.payloads(session.topics(Measurement))
+        (one,) = session.payloads(session.topics(MEASUREMENTS))
         assert one.still is not None
         for topic in session.images.values():
             times_ns = [m.publish_time_ns for m in session.messages([topic])]

@@ -9,6 +9,7 @@ from pathlib import Path
 
 import pytest
 
+from ipsys_log.messages.channels import MARKERS
 from tests.conftest import Ipsys
 
 METHODS = {"RT": "rigid", "PR": "poly", "RT+PR": "rigid+poly"}
@@ -95,10 +96,9 @@ def test_the_marker_in_the_36_photographs(ipsys: Ipsys, data: Path, tmp_path: Pa
     assert ipsys("import", "images", tmp_path / "photos", "-o", log, "--rig", rig).code == 0
     assert ipsys("detect", log).code == 0
     from ipsys_log.log.dataset import Session
-    from ipsys_log.messages import Markers
 
     with Session([log]) as session:
-        seen = session.payloads(session.topics(Markers, "stock"))
+        seen = session.payloads(session.topics(MARKERS, "stock"))
     assert len(seen) == 36
     assert {marker.id for frame in seen for marker in frame.markers} == {0}
     # OpenCV's default settings find it in 31.

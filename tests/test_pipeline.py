@@ -19,16 +19,14 @@ from ipsys_log.analysis.pairs import active_measurements
 from ipsys_log.log.codec import encode
 from ipsys_log.log.dataset import Session
 from ipsys_log.messages import (
-    CameraPoints,
     CompressedImage,
     Markers,
     Measurement,
     Message,
-    Model,
     Positions,
     Rig,
-    Tracks,
 )
+from ipsys_log.messages.channels import CAMERA_POINTS, MODEL, TRACKS
 from ipsys_log.pipeline import replay
 from ipsys_log.rig.file import load_rig
 from ipsys_log.runs.options import Request
@@ -202,7 +200,7 @@ def test_a_mistyped_marker_length_is_put_right_as_a_new_run(ipsys: Ipsys, lab: P
     assert stages["fit"] == ("poly_2", True)
     with Session([lab]) as session:
         old, new = (
-            [p.z_m for m in session.payloads(session.topics(CameraPoints, run)) for p in m.points]
+            [p.z_m for m in session.payloads(session.topics(CAMERA_POINTS, run)) for p in m.points]
             for run in ("edges", "edges_2")
         )
     np.testing.assert_allclose(np.array(new) / np.array(old), 0.9, rtol=1e-12)
@@ -259,7 +257,7 @@ def test_a_model_of_another_log_is_applied_and_copied_in(ipsys: Ipsys, lab: Path
     with Session([lab]) as session:
         kept = ["/rig", *session.images.values(), *session.calibrations.values()]
         write_log(drive, session.messages(kept))
-        original = session.payloads(session.topics(Model, "poly"))[0]
+        original = session.payloads(session.topics(MODEL, "poly"))[0]
     done = ipsys("replay", drive)  # it has no measurements of its own
     assert done.code == 1
     assert f"enter some with 'ipsys measure {drive}', or apply a model of another log" in done.err
@@ -268,8 +266,8 @@ def test_a_model_of_another_log_is_applied_and_copied_in(ipsys: Ipsys, lab: Path
     assert "evaluate" not in stages
     lab.unlink()  # the log needs no other file
     with Session([drive]) as session:
-        assert encode(session.payloads(session.topics(Model, "poly"))[0]) == encode(original)
-        assert session.payloads(session.topics(Tracks, "poly"))
+        assert encode(session.payloads(session.topics(MODEL, "poly"))[0]) == encode(original)
+        assert session.payloads(session.topics(TRACKS, "poly"))
 
 
 @pytest.mark.parametrize("camera", ["red", "black"])
@@ -282,7 +280,7 @@ def test_one_camera_alone(ipsys: Ipsys, lab: Path, tmp_path: Path, camera: str) 
     assert done.code == 0, done.err
     assert list(json.loads(done.out)["models"]["poly"]["cameras"]) == [camera]
     with Session([alone]) as session:
-        tracks = session.payloads(session.topics(Tracks, "poly"))
+        tracks = session.payloads(session.topics(TRACKS, "poly"))
     assert {track.cameras for message in tracks for track in message.tracks} == {(camera,)}
 
 
@@ -302,7 +300,7 @@ def test_new_measurements_make_the_model_out_of_date(ipsys: Ipsys, lab: Path) ->
     assert stages["camera-frame"] == ("edges", False)
     assert stages["fit"] == ("poly_2", True)
     with Session([lab]) as session:
-        old, new = (session.payloads(session.topics(Model, run))[0] for run in ("poly", "poly_2"))
+        old, new = (session.payloads(session.topics(MODEL, run))[0] for run in ("poly", "poly_2"))
     used = [{pair.measurement for camera in model.cameras for pair in camera.pairs} for model in (old, new)]
     assert used[0] - used[1] == {withdrawn.id}
 

@@ -16,7 +16,8 @@ from pathlib import Path
 import pytest
 
 from ipsys_log.log.dataset import Session
-from ipsys_log.messages import CompressedImage, Event, Message, image_topic
+from ipsys_log.messages import CompressedImage, Message, image_topic
+from ipsys_log.messages.channels import EVENTS
 from ipsys_log.rig.file import load_rig
 from ipsys_log.runs.output import write_log
 from tests.capture.streams import encode, free_port, make_jpegs, serve
@@ -100,7 +101,7 @@ def test_frames_are_recorded_as_they_came_for_so_many_seconds(
         assert found[name] == [jpegs[(first + n) % 30] for n in range(len(found[name]))]
     with Session([tmp_path / "a.mcap"]) as session:
         assert session.payloads(["/rig"]) == [load_rig(rig)]
-        events = session.payloads(session.topics(Event))
+        events = session.payloads(session.topics(EVENTS))
         said = {event.text for event in events if event.kind == "camera_setting"}
     assert said == {
         f"camera {name}: sends no capture stamps; its frames get their time of arrival" for name in NAMES

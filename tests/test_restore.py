@@ -19,7 +19,8 @@ from ipsys_log.log.reader import LogReader
 from ipsys_log.log.records import ChunkRef
 from ipsys_log.log.repair import repair
 from ipsys_log.log.writer import LogWriter
-from ipsys_log.messages import FRAME_SKIPPED, Event, Markers, Message, Tracks
+from ipsys_log.messages import FRAME_SKIPPED, Message, Tracks
+from ipsys_log.messages.channels import EVENTS, MARKERS
 from ipsys_log.restore import finish_runs
 from ipsys_log.runs.options import Request
 from ipsys_log.runs.output import write_message
@@ -157,7 +158,7 @@ def test_frames_that_nobody_had_looked_at_are_looked_at(
     repair(cut)
     with Session([cut]) as session:
         frames = sum(session.count(topic) for topic in session.images.values())
-        markers = sum(session.count(topic) for topic in session.topics(Markers, "edges"))
+        markers = sum(session.count(topic) for topic in session.topics(MARKERS, "edges"))
         assert frames > markers > 0
     assert finish(cut) == [
         ("detect", "edges"),
@@ -167,7 +168,7 @@ def test_frames_that_nobody_had_looked_at_are_looked_at(
     ]
     assert equal(cut)
     with Session([cut]) as session, Session([recorded]) as whole:
-        assert sum(session.count(topic) for topic in session.topics(Markers, "edges")) == frames
+        assert sum(session.count(topic) for topic in session.topics(MARKERS, "edges")) == frames
         ours, theirs = (s.payloads(["/runs/poly/tracks"]) for s in (session, whole))
         assert [one.timestamp for one in ours] == [one.timestamp for one in theirs[: len(ours)]]
     assert finish(cut) == []
@@ -235,9 +236,9 @@ def test_frames_that_were_skipped_stay_skipped(
     assert finish(cut) == LIVE
     assert equal(cut)
     with Session([cut]) as session:
-        skipped = [e for e in session.payloads(session.topics(Event)) if e.kind == "frame_skipped"]
+        skipped = [e for e in session.payloads(session.topics(EVENTS)) if e.kind == "frame_skipped"]
         frames = sum(session.count(topic) for topic in session.images.values())
-        markers = sum(session.count(topic) for topic in session.topics(Markers, "edges"))
+        markers = sum(session.count(topic) for topic in session.topics(MARKERS, "edges"))
     assert len(skipped) > 5
     assert markers == frames - len(skipped)
 
@@ -256,7 +257,7 @@ def test_a_full_disk_ends_live_with_runs_that_are_signed(
         assert equal(log)
         with Session([log]) as session:
             frames = sum(session.count(topic) for topic in session.images.values())
-            markers = sum(session.count(topic) for topic in session.topics(Markers, "edges"))
+            markers = sum(session.count(topic) for topic in session.topics(MARKERS, "edges"))
     assert program.returncode == 1, out
     assert "the disk is full; recording has stopped, and the log is complete" in err
     assert verified.out.endswith("a replay equals the log\n")

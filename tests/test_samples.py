@@ -11,7 +11,7 @@ import pytest
 
 from ipsys_log.log.codec import encode
 from ipsys_log.log.dataset import Session
-from ipsys_log.messages import Positions
+from ipsys_log.messages.channels import POSITIONS
 from tests.conftest import ROOT, Ipsys
 
 SAMPLES = ROOT / "sample_logs"
@@ -45,13 +45,13 @@ def test_a_log_of_an_earlier_release(ipsys: Ipsys, tmp_path: Path, path: Path) -
         assert len(messages) == sum(reader.message_count for reader in session.readers)
         assert all(isinstance(encode(message.payload), bytes) for message in messages)
         assert {run.run for run in session.runs()} == {"edges", "poly", "rigid", "best"}
-        before = session.payloads(session.topics(Positions, "poly"))
+        before = session.payloads(session.topics(POSITIONS, "poly"))
     # What it holds is still right, and computing it again gives the same to a tenth of a micrometre.
     assert "nothing to do" in ipsys("replay", log).err
     again = tmp_path / "again.mcap"
     assert ipsys("replay", log, "--run", "again", "-o", again).code == 0
     with Session([log, again]) as session:
-        after = session.payloads(session.topics(Positions, "again"))
+        after = session.payloads(session.topics(POSITIONS, "again"))
     for one, other in zip(before, after, strict=True):
         for p, q in zip(one.positions, other.positions, strict=True):
             np.testing.assert_allclose((p.x_m, p.y_m, p.z_m), (q.x_m, q.y_m, q.z_m), atol=1e-7)

@@ -11,7 +11,8 @@ import pytest
 import scipy.io
 
 from ipsys_log.log.dataset import Session
-from ipsys_log.messages import Message, Model, Positions, Rig, RigMarker
+from ipsys_log.messages import Message, Model, Rig, RigMarker
+from ipsys_log.messages.channels import MODEL, POSITIONS
 from ipsys_log.rig.file import rig_toml
 from ipsys_log.runs.output import write_log
 from tests import labs
@@ -87,7 +88,7 @@ def test_where_all_heights_are_equal_the_floor_is_what_can_be_learned(ipsys: Ips
         assert validated["2d"]["mean_cm"] < 1.5
     assert ipsys("locate", log, "--model", "best").code == 0
     with Session([log]) as session:
-        for payload in session.payloads(session.topics(Positions, "best")):
+        for payload in session.payloads(session.topics(POSITIONS, "best")):
             assert payload.positions[0].z_m == pytest.approx(0.1, abs=1e-6)
 
 
@@ -102,7 +103,7 @@ def test_a_model_that_is_told_the_height_needs_it_in_the_rig(ipsys: Ipsys, tmp_p
     rig.write_text(rig_toml(replace(labs.RIG, markers=(RigMarker(0, robot="ada", height_m=0.12),))))
     assert ipsys("replay", log, "--model", "rayplane", "--rig", rig).code == 0
     with Session([log]) as session:
-        positions = session.payloads(session.topics(Positions, "rayplane"))
+        positions = session.payloads(session.topics(POSITIONS, "rayplane"))
     assert {round(p.positions[0].z_m, 9) for p in positions} == {0.12}
     assert np.sqrt(positions[0].positions[0].covariance_m2[2, 2]) < 0.002
 
@@ -141,7 +142,7 @@ def test_a_model_out_of_a_log_predicts_what_it_predicted(ipsys: Ipsys, tmp_path:
         models: list[Model] = [
             session.payloads([topic])[-1]
             for run in session.runs()
-            for topic in session.topics(Model, run.run)
+            for topic in session.topics(MODEL, run.run)
         ]
     assert {model.name for model in models} == set(MODELS)
     for model in models:

@@ -25,7 +25,8 @@ from ipsys_log.capture.camera_thread import CameraState
 from ipsys_log.capture.status import Monitor
 from ipsys_log.images.video import is_keyframe
 from ipsys_log.log.dataset import Session
-from ipsys_log.messages import CompressedVideo, Markers, Message, Tracks
+from ipsys_log.messages import CompressedVideo, Markers, Message
+from ipsys_log.messages.channels import TRACKS
 from ipsys_log.runs.options import Request
 from ipsys_log.sinks.rerun.live import LiveView, Write
 from ipsys_log.sinks.rerun.recording import write_recording
@@ -76,7 +77,7 @@ def test_positions_are_those_of_the_pictures(video: Path, lab: Path) -> None:
             tracks.append(
                 {
                     (payload.timestamp, track.robot): (track.x_m, track.y_m)
-                    for payload in session.payloads(session.topics(Tracks, "poly"))
+                    for payload in session.payloads(session.topics(TRACKS, "poly"))
                     for track in payload.tracks
                 }
             )

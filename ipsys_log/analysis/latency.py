@@ -10,14 +10,18 @@ import numpy as np
 from numpy.typing import NDArray
 
 from ipsys_log.errors import IpsysError
+from ipsys_log.log.contents import run_of_topic
 from ipsys_log.log.dataset import Session
-from ipsys_log.messages import LATENCY_TOPIC, Latency, Message, Tracks
+from ipsys_log.messages import LATENCY_TOPIC, Latency, Message
+from ipsys_log.messages.channels import LATENCY, MARKERS, POSITIONS, TRACKS, Channel
 from ipsys_log.units import NS_PER_S
 
 __all__ = ["STEPS", "Ledger", "Percentiles", "latency_percentiles", "recorded_latencies", "step_times_s"]
 
 STEPS = ("captured", "received", "detected", "located", "fused", "published")
 _REMEMBERED = 20_000
+# The step that is done when a message of a channel is made.
+_STEP_OF = {MARKERS: "detected", POSITIONS: "located", TRACKS: "fused"}
 
 
 class Ledger:
@@ -31,13 +35,20 @@ class Ledger:
 
     def __init__(self, now_ns: Callable[[], int], received_ns: Mapping[int, int]) -> None:
         self._now_ns, self._received_ns = now_ns, received_ns
-        self._times_ns: dict[int, dict[str, int]] = {}
+        # By log time of the frame, the times of its steps; those of each model by the run of that model.
+        self._times_ns: dict[int, dict[tuple[str, str], int]] = {}
 
-    def note(self, step: str, payload: type, messages: Iterable[Message]) -> Iterator[Message]:
-        """The messages, unchanged; one with such a payload is a step done for the frame of its log time."""
+    def note(self, channel: Channel, run: str, messages: Iterable[Message]) -> Iterator[Message]:
+        """Yield the messages, unchanged. One of this channel is a step done for the frame of its log time."""
+        step, payloads = _STEP_OF.get(channel), channel.payloads
         for message in messages:
-            if isinstance(message.payload, payload):
-                self._times_ns.setdefault(message.log_time_ns, {})[step] = self._now_ns()
+            if (
+                step is not None
+                and isinstance(message.payload, payloads)
+                and run_of_topic(message.topic) == run
+            ):
+                of_model = "" if step == "detected" else run
+                self._times_ns.setdefault(message.log_time_ns, {})[step, of_model] = self._now_ns()
                 if len(self._times_ns) > _REMEMBERED:
                     del self._times_ns[next(iter(self._times_ns))]
             yield message
@@ -46,15 +57,16 @@ class Ledger:
         """The times of a position that has just been published; None for any other message."""
         times_ns = self._times_ns.get(message.log_time_ns, {})
         received_ns = self._received_ns.get(message.log_time_ns)
-        if not isinstance(message.payload, Tracks) or received_ns is None:
+        run = run_of_topic(message.topic) or ""
+        if message.topic != TRACKS.topic_of(run) or received_ns is None:
             return None
         latency = Latency(
             message.publish_time_ns,
             str(message.camera),
             received_ns,
-            times_ns["detected"],
-            times_ns["located"],
-            times_ns["fused"],
+            times_ns["detected", ""],
+            times_ns["located", run],
+            times_ns["fused", run],
             self._now_ns(),
         )
         return Message(LATENCY_TOPIC, message.log_time_ns, message.publish_time_ns, latency, message.camera)
@@ -69,7 +81,7 @@ def recorded_latencies(paths: Sequence[Path]) -> list[Latency]:
         Where there is none.
     """
     with Session(paths) as session:
-        found: list[Latency] = session.payloads(session.topics(Latency))
+        found: list[Latency] = session.payloads(session.topics(LATENCY))
         if not found:
             raise IpsysError(f"{session}: holds no latencies; only 'ipsys live' writes them")
     return found

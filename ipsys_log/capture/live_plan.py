@@ -2,38 +2,77 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Collection, Iterable, Mapping, Sequence
-from dataclasses import replace
+from collections.abc import Callable, Collection, Iterator, Mapping, Sequence
+from dataclasses import dataclass, replace
 from typing import Any, NamedTuple
 
 from ipsys_log.capture.camera_thread import CameraState
 from ipsys_log.errors import IpsysError
 from ipsys_log.messages import CameraCalibration, Message, Model, Rig
+from ipsys_log.messages.channels import CAMERA_POINTS, MODEL, RUN_EVENTS, Channel, channel_of
+from ipsys_log.messages.stage import Plan, Stage
 from ipsys_log.models.table import reads_height
-from ipsys_log.runs.execute import signed_copy
-from ipsys_log.runs.graph import Task, copy_model, model_run, points_run, usual_corners
+from ipsys_log.runs.execute import LiveRun, signed_copy
+from ipsys_log.runs.graph import Task, copy_model, is_of_model, stages_until
 from ipsys_log.runs.options import Request
 from ipsys_log.runs.select import wanted_models
-from ipsys_log.stages import camera_frame, detect, fuse, locate
+from ipsys_log.runs.stream import WiredStage, wire
+from ipsys_log.stages.detect import usual_corners
 
 __all__ = ["LivePlan", "check_model", "check_pictures", "check_start", "plan_live"]
-
-# The run a stage writes to, the payloads it reads, its step, and whether it takes each camera by itself.
-Row = tuple[str, tuple[type, ...], Callable[[Message], Iterable[Any]], bool]
 
 
 class LivePlan(NamedTuple):
     """A live run: the request with all that it leaves open, the models of another log with the tasks that
-    copy them in, by stage the run that a replay would write to, and the causal ones of these stages."""
+    copy them in, the runs in the order of their records, and the causal stages."""
 
     request: Request
     copied: list[tuple[Task, Model]]
-    runs: dict[str, str]
-    rows: list[Row]
+    runs: list[LiveRun]
+    stages: list[WiredStage]
 
     def copies(self, now_ns: Callable[[], int]) -> list[Message]:
-        """The models, as their runs, with log times from ``now_ns``."""
-        return [message for task, model in self.copied for message in signed_copy(task, model, now_ns)]
+        """Return the models, as their runs, with log times from ``now_ns``."""
+        return [
+            message
+            for number, (task, model) in enumerate(self.copied, 1)
+            for message in signed_copy(task, model, number, now_ns)
+        ]
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class _LiveView:
+    """The view of a stage on cameras that send: nothing is recorded yet but the rig and the intrinsics.
+
+    ``model`` is the one that the stage applies.
+    """
+
+    cameras: Collection[str]
+    lenses: Collection[str]
+    settings: Sequence[Message]
+    inputs: Mapping[Channel, str]
+    model: Model | None
+    rig: Rig | None = None
+
+    def run(self, channel: Channel) -> str:
+        return self.inputs.get(channel, "")
+
+    def messages(self, *channels: Channel) -> Iterator[Message]:
+        return (one for one in self.settings if channel_of(one.topic, type(one.payload)) in channels)
+
+    def payloads(self, channel: Channel) -> list[Any]:
+        if channel is MODEL:
+            return [] if self.model is None else [self.model]
+        return [message.payload for message in self.messages(channel)]
+
+    def last_ns(self, *channels: Channel) -> int:
+        return max((message.publish_time_ns for message in self.messages(*channels)), default=0)
+
+    def newest(self, _channel: Channel, /) -> str:
+        return ""
+
+    def copied(self, _channel: Channel, /) -> Iterator[tuple[str, Any]]:
+        return iter(())
 
 
 def plan_live(
@@ -53,7 +92,7 @@ def plan_live(
     copied = _copied(request, until)
     models = [model for _, model in copied]
     _check(rig, cameras, lenses, models, until)
-    return LivePlan(request, copied, *_stages(request, models, until))
+    return LivePlan(request, copied, *_wire(cameras, settings, lenses, request, copied, until))
 
 
 def check_start(
@@ -102,7 +141,12 @@ def check_model(model: Model, cameras: Collection[str]) -> None:
 
 def _copied(request: Request, until: str) -> list[tuple[Task, Model]]:
     """The models of another log that are applied, with the tasks that copy them in; none before locate."""
-    return [copy_model(request, name) for name in wanted_models(request, "fuse")] if until == "fuse" else []
+    reads_model = any(MODEL in stage.reads for stage in _causal(until))
+    return [copy_model(request, name) for name in wanted_models(request)] if reads_model else []
+
+
+def _causal(until: str) -> list[Stage]:
+    return [stage for stage in stages_until(until) if stage.causal]
 
 
 def _check(
@@ -110,7 +154,7 @@ def _check(
 ) -> None:
     """See that the stages will not have to stop later."""
     missing = sorted(set(cameras) - set(lenses))
-    if missing and until != "detect":
+    if missing and any(CAMERA_POINTS in stage.writes for stage in _causal(until)):
         name = missing[0]
         raise IpsysError(
             f'camera {name} has no lens: write calibration = "{name}.yaml" into lab.toml, or give '
@@ -142,17 +186,35 @@ def check_pictures(cameras: Mapping[str, CameraState]) -> None:
             )
 
 
-def _stages(request: Request, models: Sequence[Model], until: str) -> tuple[dict[str, str], list[Row]]:
-    corners = str(request.corners)
-    points = points_run(corners, request.method)
-    runs = {"detect": corners}
-    rows: list[Row] = [(corners, detect.READS, detect.Detect(corners), True)]
-    if until != "detect":
-        runs["camera-frame"] = points
-        rows.append((points, camera_frame.READS, camera_frame.CameraFrame(request.method), True))
-    for model in models:
-        name = model_run(model.name)
-        runs |= {"fit": name, "locate": name, "fuse": name}
-        rows.append((name, locate.READS, locate.Locate(model), True))
-        rows.append((name, fuse.READS, fuse.Fuse(name), False))
-    return runs, rows
+def _wire(
+    cameras: Collection[str],
+    settings: Sequence[Message],
+    lenses: Collection[str],
+    request: Request,
+    copied: Sequence[tuple[Task, Model]],
+    until: str,
+) -> tuple[list[LiveRun], list[WiredStage]]:
+    """Return the runs of a live recording, and its stages, each wired to the runs that it reads."""
+    runs: list[LiveRun] = []
+    stages: list[WiredStage] = []
+
+    def add(stage: Stage, inputs: dict[Channel, str], model: Model | None) -> None:
+        options = request.options(model.name if model else None)
+        plan = stage.plan(_LiveView(cameras, lenses, settings, inputs, model), options)
+        assert isinstance(plan, Plan), f"{stage.name} cannot run live"
+        assert plan.step is not None
+        stages.append(wire(stage, plan.run, inputs, plan.step(plan.run)))
+        runs.append(LiveRun(stage, plan.run, dict(inputs)))
+        inputs.update({channel: plan.run for channel in stage.writes if channel is not RUN_EVENTS})
+
+    shared: dict[Channel, str] = {}
+    for stage in _causal(until):
+        if not is_of_model(stage):
+            add(stage, shared, None)
+    for task, model in copied:
+        inputs = {**shared, MODEL: task.run}
+        runs.append(LiveRun(task.stage, task.run, {}, copied=True))
+        for stage in _causal(until):
+            if is_of_model(stage):
+                add(stage, inputs, model)
+    return runs, stages

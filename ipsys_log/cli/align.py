@@ -20,6 +20,7 @@ from ipsys_log.cli.options import (
     log_option,
 )
 from ipsys_log.cli.stages import derived
+from ipsys_log.messages.channels import CAMERA_POINTS, MARKERS, RIG
 
 if TYPE_CHECKING:
     from ipsys_log.report.alignment import AlignedLab
@@ -106,7 +107,6 @@ def _prepared_now(
 
 def _align(logs: list[Path], options: dict[str, Any], plot: Path | None, as_json: bool) -> None:
     from ipsys_log.log.dataset import Session
-    from ipsys_log.messages import CameraPoints, Markers, Rig
     from ipsys_log.report.alignment import read_alignment
     from ipsys_log.rig.file import load_rig
     from ipsys_log.runs.provenance import newest_run
@@ -115,13 +115,13 @@ def _align(logs: list[Path], options: dict[str, Any], plot: Path | None, as_json
     given = load_rig(options["rig"]) if options["rig"] else None
     lenses = load_calibrations(options["calibration"], lambda: cameras_of(logs))
     with Session(logs) as session:
-        bare = not session.images and newest_run(session, Markers) is None
+        bare = not session.images and newest_run(session, MARKERS) is None
     method = "perimeter" if bare else "pose"
     with derived(logs, "camera-frame", method=method, run=None, **options) as (session, outcomes, _):
         made = [outcome.run for outcome in outcomes if outcome.stage == "camera-frame"]
-        run = made[-1] if made else str(newest_run(session, CameraPoints))
+        run = made[-1] if made else str(newest_run(session, CAMERA_POINTS))
         held = {camera: session.payloads([topic])[-1] for camera, topic in session.calibrations.items()}
-        in_force = given or rig_in_force(session, [run]) or session.payloads(session.topics(Rig))[-1]
+        in_force = given or rig_in_force(session, [run]) or session.payloads(session.topics(RIG))[-1]
         lab = read_alignment(session, run, in_force, {**held, **lenses})
     _show(lab, plot, as_json)
 

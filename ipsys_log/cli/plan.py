@@ -13,6 +13,7 @@ import typer
 from ipsys_log.cli.console import console, remarks
 from ipsys_log.cli.options import AsJson, Calibrations, Logs, RigFile, cameras_of, load_calibrations
 from ipsys_log.cli.stages import derived
+from ipsys_log.messages.channels import RIG
 
 if TYPE_CHECKING:
     from rich.table import Table
@@ -65,7 +66,6 @@ def plan(
 
     A model that the log does not hold yet is fitted first, to the places measured so far.
     """
-    from ipsys_log.messages import Rig
     from ipsys_log.report.files import check_picture
     from ipsys_log.report.plan import plan_floor
     from ipsys_log.rig.file import load_rig
@@ -82,7 +82,7 @@ def plan(
         fitted = [outcome.run for outcome in outcomes if outcome.stage == "fit"]
         run = fitted[-1] if fitted else str(copied_run(session, model))
         held = {camera: session.payloads([topic])[-1] for camera, topic in session.calibrations.items()}
-        in_force = given or rig_in_force(session, [run]) or session.payloads(session.topics(Rig))[-1]
+        in_force = given or rig_in_force(session, [run]) or session.payloads(session.topics(RIG))[-1]
         found = plan_floor(session, run, in_force, {**held, **lenses}, places, height_m or ())
     _show(found, plot, as_json)
 
@@ -105,24 +105,25 @@ def _show(found: PlannedFloor, plot: Path | None, as_json: bool) -> None:
 
 def _check(logs: list[Path], rig: Rig | None, model: str, places: int, heights_m: Sequence[float]) -> None:
     """See that there is something to plan, before anything is fitted."""
+    from ipsys_log.analysis.calibration_points import measured
     from ipsys_log.errors import IpsysError
     from ipsys_log.log.dataset import Session
-    from ipsys_log.messages import Rig
-    from ipsys_log.runs.select import copied_run, measured
+    from ipsys_log.runs.select import copied_run
+    from ipsys_log.runs.view import LogView
 
     if not 1 <= places <= _MOST_PLACES:
         raise IpsysError(
             f"--places {places}: plan 1 to {_MOST_PLACES} places at a time, and again when these are measured"
         )
     with Session(logs) as session:
-        rigs = [rig] if rig is not None else session.payloads(session.topics(Rig))
+        rigs = [rig] if rig is not None else session.payloads(session.topics(RIG))
         spans_m = [max(one.floor.width_m, one.floor.depth_m) for one in rigs if one.floor is not None]
         for height_m in heights_m:
             if not (math.isfinite(height_m) and 0 <= height_m <= max(spans_m, default=_HIGHEST_M)):
                 raise IpsysError(
                     f"--height-m {height_m:g}: no marker is laid there in this lab; give metres, such as 0.15"
                 )
-        if not measured(session, rig) and copied_run(session, model) is None:
+        if not measured(LogView(session, rig=rig)) and copied_run(session, model) is None:
             raise IpsysError(
                 f"{session}: no place is measured yet, so there is nothing to plan from: first measure about "
                 "10 places, spread over the view of each camera out to its edges, at the heights in use"

@@ -143,9 +143,9 @@ def live(
 
 
 def _viewed(settings: list[Message], cameras: Attached, request: Request) -> LiveView:
-    from ipsys_log.runs.graph import model_run
     from ipsys_log.runs.select import wanted_models
     from ipsys_log.sinks.rerun.live import LiveView
+    from ipsys_log.stages.fit import model_run
 
-    (model,) = wanted_models(request, "fuse")
+    (model,) = wanted_models(request)
     return LiveView(settings[0].payload, cameras.states, model_run(model), say)

@@ -14,10 +14,10 @@ from mcap import records as mcap
 from ipsys_log.log.records import ChunkRef
 
 __all__ = [
-    "Channel",
     "Contents",
     "RawMessage",
     "Schema",
+    "StoredChannel",
     "by_topic",
     "camera_of_topic",
     "clean_name",
@@ -81,7 +81,7 @@ class Schema:
 
 
 @dataclass(frozen=True, slots=True)
-class Channel:
+class StoredChannel:
     """One topic of a log.
 
     ``schema`` is None for a channel that has none. ``message_count`` counts the whole log.
@@ -156,9 +156,9 @@ def free_id(known: Mapping[int, object]) -> int | None:
     return next((key for key in range(1, _LARGEST_ID + 1) if key not in known), None)
 
 
-def by_topic(contents: Contents) -> tuple[Mapping[str, Channel], Mapping[str, str]]:
+def by_topic(contents: Contents) -> tuple[Mapping[str, StoredChannel], Mapping[str, str]]:
     """Channels by topic, and in what the channels of one topic differ, where they do."""
-    channels: dict[str, Channel] = {}
+    channels: dict[str, StoredChannel] = {}
     conflicts: dict[str, str] = {}
     for key, record in sorted(contents.channels.items()):
         found = contents.schemas.get(record.schema_id)
@@ -167,7 +167,9 @@ def by_topic(contents: Contents) -> tuple[Mapping[str, Channel], Mapping[str, st
         first = channels.get(record.topic)
         if first is None:
             metadata = MappingProxyType(dict(record.metadata))
-            channels[record.topic] = Channel(record.topic, schema, record.message_encoding, metadata, count)
+            channels[record.topic] = StoredChannel(
+                record.topic, schema, record.message_encoding, metadata, count
+            )
             continue
         if (_kind(first.schema), first.message_encoding) != (_kind(schema), record.message_encoding):
             conflicts[record.topic] = _difference(record.topic, first, schema, record.message_encoding)
@@ -180,6 +182,6 @@ def _kind(schema: Schema | None) -> tuple[str, str] | None:
     return (schema.name, schema.encoding) if schema else None
 
 
-def _difference(topic: str, first: Channel, schema: Schema | None, encoding: str) -> str:
+def _difference(topic: str, first: StoredChannel, schema: Schema | None, encoding: str) -> str:
     names = [f"{s.name} ({s.encoding})" if s else "no schema" for s in (first.schema, schema)]
     return f"channels of {topic} differ: {names[0]} as {first.message_encoding}, {names[1]} as {encoding}"

@@ -22,23 +22,22 @@ from ipsys_log.errors import LogError
 from ipsys_log.log.bounds import BoundError, Items
 from ipsys_log.log.codec import decode, payload_type
 from ipsys_log.log.contents import (
-    Channel,
     RawMessage,
+    StoredChannel,
     camera_of_topic,
     clean_name,
     foreign_camera,
     run_of_topic,
 )
 from ipsys_log.log.reader import LogReader
-from ipsys_log.messages import (
+from ipsys_log.messages import Measurement, Message, Run
+from ipsys_log.messages.channels import (
+    CALIBRATIONS,
+    IMAGES,
     MEASUREMENTS_TOPIC,
-    CameraCalibration,
-    CompressedImage,
-    CompressedVideo,
-    Measurement,
-    Message,
-    RawImage,
-    Run,
+    RECORD,
+    Channel,
+    channel_of,
 )
 
 __all__ = ["Session", "other_ids", "renamed"]
@@ -79,7 +78,6 @@ def renamed(measurement: Measurement, ids: Mapping[str, str]) -> Measurement:
     )
 
 
-_IMAGES = (CompressedImage, CompressedVideo, RawImage)
 _ITEMS_OF_IMAGE = 16
 _LATEST_NS = 1 << 63
 
@@ -101,12 +99,13 @@ class Session:
     def __init__(self, paths: Sequence[Path]) -> None:
         self.paths = list(paths)
         self._stack = ExitStack()
+        self._channels: dict[tuple[str, str], Channel | None] = {}
         try:
             self.readers = [self._stack.enter_context(LogReader(path)) for path in paths]
             self._check_numbers()
             self._check_overlaps()
-            self.images = self._cameras(_IMAGES)
-            self.calibrations = self._pair_calibrations(self._cameras((CameraCalibration,)))
+            self.images = self._cameras(IMAGES)
+            self.calibrations = self._pair_calibrations(self._cameras(CALIBRATIONS))
             self._camera_of = {
                 topic: name for topics in (self.images, self.calibrations) for name, topic in topics.items()
             }
@@ -135,19 +134,25 @@ class Session:
     def end_ns(self) -> int:
         return max((r.end_ns for r in self.readers if r.end_ns is not None), default=0)
 
-    def topics(self, payload: type, run: str | None = None) -> list[str]:
-        """Topics of a type of payload: of one run, or with None outside of all runs."""
+    def topics(self, channel: Channel, run: str | None = None) -> list[str]:
+        """Return the topics of a channel that have messages: of one run, or with None outside of all runs."""
         return sorted(
             {
                 topic
                 for reader in self.readers
-                for topic, channel in reader.channels.items()
-                if channel.schema is not None
-                and payload_type(channel.schema.name) is payload
-                and channel.message_count > 0
+                for topic, stored in reader.channels.items()
+                if stored.message_count > 0
+                and self._channel_of(topic, stored) is channel
                 and run_of_topic(topic) == run
             }
         )
+
+    def _channel_of(self, topic: str, stored: StoredChannel) -> Channel | None:
+        schema = stored.schema.name if stored.schema is not None else ""
+        key = topic, schema
+        if key not in self._channels:
+            self._channels[key] = channel_of(topic, payload_type(schema) if schema else None)
+        return self._channels[key]
 
     def last(self, topics: Collection[str]) -> tuple[int, int]:
         """Log time and publish time of the last message of some topics; the start where there is none."""
@@ -248,11 +253,7 @@ class Session:
         return [run for reader, items in self._items() for run in self._runs_in(reader, items)]
 
     def _runs_in(self, reader: LogReader, items: Items) -> list[Run]:
-        topics = [
-            topic
-            for topic, channel in reader.channels.items()
-            if channel.schema is not None and payload_type(channel.schema.name) is Run
-        ]
+        topics = [t for t, stored in reader.channels.items() if self._channel_of(t, stored) is RECORD]
         found = [message.payload for message in self._decoded(reader, items, topics, None, None)]
         return sorted(found, key=lambda run: run.number)
 
@@ -287,7 +288,7 @@ class Session:
 
     def _check_overlaps(self) -> None:
         """Logs that follow one another are one; two that speak at once of one thing are not."""
-        images = {topic for payload in _IMAGES for topic in self.topics(payload)}
+        images = set(self.topics(IMAGES))
         first: dict[str, LogReader] = {}
         for reader in self.readers:
             for topic in reader.channels:
@@ -305,11 +306,11 @@ class Session:
                         "that run again with --run and another name"
                     )
 
-    def _cameras(self, payloads: tuple[type, ...]) -> dict[str, str]:
-        """Topic by camera; where a camera has topics of several types, the first type's."""
+    def _cameras(self, channel: Channel) -> dict[str, str]:
+        """Return the topic by camera; if a camera has topics of several types, that of the first type."""
         cameras: dict[str, str] = {}
-        for payload in payloads:
-            topics = self.topics(payload)
+        for payload in channel.payloads:
+            topics = [topic for topic in self.topics(channel) if self._has_payload(topic, payload)]
             names = [camera_of_topic(topic) or foreign_camera(topic) for topic in topics]
             found: dict[str, str] = {}
             for topic, name in zip(topics, names, strict=True):
@@ -323,6 +324,10 @@ class Session:
                 found[camera] = topic
             cameras = found | cameras
         return cameras
+
+    def _has_payload(self, topic: str, payload: type) -> bool:
+        stored = (reader.channels[topic] for reader in self.readers if topic in reader.channels)
+        return any(one.schema is not None and payload_type(one.schema.name) is payload for one in stored)
 
     def _pair_calibrations(self, found: dict[str, str]) -> dict[str, str]:
         """Give each calibration the name of its camera: by topic, else by a shared frame."""
@@ -358,11 +363,11 @@ def _payload(reader: LogReader, raw: RawMessage, items: Items) -> Any:
         raise LogError(f"{where}: {error}") from error
 
 
-def _decode(reader: LogReader, channel: Channel, data: bytes, items: Items) -> Any:
+def _decode(reader: LogReader, channel: StoredChannel, data: bytes, items: Items) -> Any:
     schema = channel.schema
     if schema is None:
         return decode("", data, channel.message_encoding)
-    image = payload_type(schema.name) in _IMAGES
+    image = payload_type(schema.name) in IMAGES.payloads
     if image:
         items.take(_ITEMS_OF_IMAGE)
     elif len(data) > reader.allowance.most_structured:

@@ -1,27 +1,167 @@
-"""Topics of the recorded channels."""
+"""The channels of a log, in one table: their topics, their payloads, and how a reader recognises them."""
 
 from __future__ import annotations
 
+import re
+from dataclasses import dataclass
+
+from ipsys_log.messages.events import Event, Latency
+from ipsys_log.messages.images import (
+    CompressedImage,
+    CompressedVideo,
+    ImageAnnotations,
+    RawImage,
+    SkippedVideo,
+)
+from ipsys_log.messages.markers import CameraPoints, Markers
+from ipsys_log.messages.measurements import Measurement
+from ipsys_log.messages.models import Evaluation, Model
+from ipsys_log.messages.rig import CameraCalibration, Rig
+from ipsys_log.messages.runs import Run
+from ipsys_log.messages.tracks import FrameTransforms, Positions, Tracks
+
 __all__ = [
+    "ANNOTATIONS",
+    "CALIBRATIONS",
+    "CAMERA_POINTS",
+    "CHANNELS",
+    "EVALUATION",
+    "EVENTS",
     "EVENTS_TOPIC",
+    "IMAGES",
+    "LATENCY",
     "LATENCY_TOPIC",
+    "MARKERS",
+    "MEASUREMENTS",
     "MEASUREMENTS_TOPIC",
+    "MODEL",
+    "POSES",
+    "POSITIONS",
+    "RECORD",
+    "RIG",
     "RIG_TOPIC",
+    "RUN_EVENTS",
+    "TRACKS",
+    "TRUTH",
     "TRUTH_TOPIC",
+    "Channel",
     "calibration_topic",
+    "channel_of",
     "image_topic",
 ]
 
-RIG_TOPIC = "/rig"
-MEASUREMENTS_TOPIC = "/measurements"
-EVENTS_TOPIC = "/events"
-LATENCY_TOPIC = "/latency"
-TRUTH_TOPIC = "/truth/tracks"
+
+@dataclass(frozen=True, slots=True, kw_only=True, eq=False)
+class Channel:
+    """A channel: what it is, in every log and for every stage. Two channels may have one payload type.
+
+    Attributes
+    ----------
+    name : unique in the table.
+    topic : pattern of its topics, with ``{run}`` and ``{camera}``.
+    payloads : types of its messages.
+    by_schema : a topic of another name, outside of all runs, is this channel if it has such a payload. Other
+        programs name their topics as they like.
+    """
+
+    name: str
+    topic: str
+    payloads: tuple[type, ...]
+    by_schema: bool = False
+
+    def __repr__(self) -> str:
+        return f"<channel {self.name}>"
+
+    @property
+    def is_derived(self) -> bool:
+        """Whether a stage writes it, in a run."""
+        return self.topic.startswith("/runs/")
+
+    def topic_of(self, run: str | None = None, camera: str | None = None) -> str:
+        """Return the topic of a run and a camera."""
+        return self.topic.format(run=run, camera=camera)
+
+
+RIG = Channel(name="rig", topic="/rig", payloads=(Rig,), by_schema=True)
+# A skipped frame of a video is in no log: the frame itself is, and an event names it.
+IMAGES = Channel(
+    name="images",
+    topic="/cameras/{camera}/image",
+    payloads=(CompressedImage, CompressedVideo, RawImage, SkippedVideo),
+    by_schema=True,
+)
+CALIBRATIONS = Channel(
+    name="calibrations",
+    topic="/cameras/{camera}/calibration",
+    payloads=(CameraCalibration,),
+    by_schema=True,
+)
+MEASUREMENTS = Channel(name="measurements", topic="/measurements", payloads=(Measurement,), by_schema=True)
+EVENTS = Channel(name="events", topic="/events", payloads=(Event,), by_schema=True)
+LATENCY = Channel(name="latency", topic="/latency", payloads=(Latency,), by_schema=True)
+TRUTH = Channel(name="truth", topic="/truth/tracks", payloads=(Tracks,), by_schema=True)
+
+RECORD = Channel(name="record", topic="/runs/{run}/record", payloads=(Run,))
+MARKERS = Channel(name="markers", topic="/runs/{run}/cameras/{camera}/markers", payloads=(Markers,))
+ANNOTATIONS = Channel(
+    name="annotations", topic="/runs/{run}/cameras/{camera}/annotations", payloads=(ImageAnnotations,)
+)
+CAMERA_POINTS = Channel(
+    name="camera_points", topic="/runs/{run}/cameras/{camera}/camera_points", payloads=(CameraPoints,)
+)
+MODEL = Channel(name="model", topic="/runs/{run}/model", payloads=(Model,))
+EVALUATION = Channel(name="evaluation", topic="/runs/{run}/evaluation", payloads=(Evaluation,))
+POSITIONS = Channel(name="positions", topic="/runs/{run}/cameras/{camera}/positions", payloads=(Positions,))
+TRACKS = Channel(name="tracks", topic="/runs/{run}/tracks", payloads=(Tracks,))
+POSES = Channel(name="poses", topic="/runs/{run}/poses", payloads=(FrameTransforms,))
+# The one channel that several stages of a run write.
+RUN_EVENTS = Channel(name="run_events", topic="/runs/{run}/events", payloads=(Event,))
+
+CHANNELS: tuple[Channel, ...] = (
+    *(RIG, IMAGES, CALIBRATIONS, MEASUREMENTS, EVENTS, LATENCY, TRUTH),
+    *(RECORD, MARKERS, ANNOTATIONS, CAMERA_POINTS, MODEL, EVALUATION, POSITIONS, TRACKS, POSES, RUN_EVENTS),
+)
+
+RIG_TOPIC = RIG.topic
+MEASUREMENTS_TOPIC = MEASUREMENTS.topic
+EVENTS_TOPIC = EVENTS.topic
+LATENCY_TOPIC = LATENCY.topic
+TRUTH_TOPIC = TRUTH.topic
+
+_NAME = "[a-z][a-z0-9_]*"
+_TOPIC = re.compile(rf"(?P<run>/runs/{_NAME})?(?P<camera>/cameras/{_NAME})?(?P<rest>/.*)", re.DOTALL)
 
 
 def image_topic(camera: str) -> str:
-    return f"/cameras/{camera}/image"
+    """Return the topic of the images of a camera."""
+    return IMAGES.topic_of(camera=camera)
 
 
 def calibration_topic(camera: str) -> str:
-    return f"/cameras/{camera}/calibration"
+    """Return the topic of the intrinsics of a camera."""
+    return CALIBRATIONS.topic_of(camera=camera)
+
+
+def channel_of(topic: str, payload: type | None) -> Channel | None:
+    """Return the channel of a topic with messages of a type; None if the table has none.
+
+    The name of the topic decides. Outside of all runs, the payload decides where no name fits.
+
+    Examples
+    --------
+    >>> channel_of("/runs/poly/tracks", Tracks)
+    <channel tracks>
+    >>> channel_of("/front/image_raw", RawImage)
+    <channel images>
+    """
+    match = _TOPIC.fullmatch(topic)
+    if match is None or payload is None:
+        return None
+    pattern = (
+        f"{'/runs/{run}' * bool(match['run'])}{'/cameras/{camera}' * bool(match['camera'])}{match['rest']}"
+    )
+    fitting = [channel for channel in CHANNELS if payload in channel.payloads]
+    named = next((channel for channel in fitting if channel.topic == pattern), None)
+    if named is not None or match["run"]:
+        return named
+    return next((channel for channel in fitting if channel.by_schema), None)

@@ -25,6 +25,7 @@ from ipsys_log.models.uncertainty import Uncertainty, Volume
 
 __all__ = [
     "MODELS",
+    "MODEL_VERSIONS",
     "AppliedModel",
     "Places",
     "create",
@@ -52,6 +53,17 @@ MODELS: dict[str, Callable[[], Any]] = {
     "rigid+kriging-regression": lambda: _after_rigid("kriging-regression", Kriging(noisy=True)),
     "rayplane": RayPlane,
     "best": RayDepth,
+}
+
+# The versions of the parts of models; one rises by one with each change of the fitted parameters.
+MODEL_VERSIONS = {
+    "rigid": 1,
+    "poly": 1,
+    "ann": 1,
+    "kriging": 1,
+    "kriging-regression": 1,
+    "rayplane": 1,
+    "best": 1,
 }
 
 

@@ -15,10 +15,9 @@ from ipsys_log.messages import (
     ErrorStatistics,
     Evaluation,
     LearningPoint,
-    Model,
     Suspect,
-    Tracks,
 )
+from ipsys_log.messages.channels import EVALUATION, MODEL, TRACKS
 from ipsys_log.models.table import MODELS, reads_height
 from ipsys_log.report.advice import Advice, Choice, advise
 from ipsys_log.runs.provenance import Outcome
@@ -55,11 +54,11 @@ def read_accuracy(session: Session, outcomes: Sequence[Outcome]) -> list[Accurac
     found = []
     for evaluated, fused in _run_pairs(outcomes):
         run = evaluated or fused
-        evaluations = session.payloads(session.topics(Evaluation, run))
+        evaluations = session.payloads(session.topics(EVALUATION, run))
         tracks = None
         if fused and session.count(TRUTH_TOPIC):
             tracks = track_errors(
-                gather_tracks(session.messages(session.topics(Tracks, fused))),
+                gather_tracks(session.messages(session.topics(TRACKS, fused))),
                 gather_tracks(session.messages([TRUTH_TOPIC])),
                 carried=_told_heights(session, fused),
             )
@@ -85,7 +84,7 @@ def _run_pairs(outcomes: Sequence[Outcome]) -> list[tuple[str, str]]:
 
 
 def _told_heights(session: Session, run: str) -> bool:
-    models = session.payloads(session.topics(Model, run))
+    models = session.payloads(session.topics(MODEL, run))
     return bool(models) and models[-1].name in MODELS and reads_height(models[-1].name)
 
 

@@ -9,6 +9,7 @@ from dataclasses import dataclass
 import numpy as np
 
 from ipsys_log.analysis.alignment import Alignment, align_camera, join_cameras
+from ipsys_log.analysis.calibration_points import find_pairs, measured
 from ipsys_log.analysis.coverage import Coverage, Hung, Overlap, cover_floor, find_overlaps
 from ipsys_log.analysis.pairs import Measured
 from ipsys_log.analysis.stationary import find_lying
@@ -17,9 +18,10 @@ from ipsys_log.geometry.lenses import undistort
 from ipsys_log.geometry.poses import invert_pose, make_pose
 from ipsys_log.log.dataset import Session
 from ipsys_log.messages import CameraCalibration, CameraPoints, Measurement, Model, Pair, Rig
+from ipsys_log.messages.channels import CAMERA_POINTS, MODEL
 from ipsys_log.models.rigid import rigid_transform
 from ipsys_log.runs.provenance import newest_run
-from ipsys_log.runs.select import find_pairs, measured
+from ipsys_log.runs.view import LogView
 from ipsys_log.units import CM_PER_M
 
 __all__ = ["AlignedLab", "read_alignment"]
@@ -69,7 +71,7 @@ def read_alignment(session: Session, run: str, rig: Rig, lenses: Lenses) -> Alig
     notes: list[str] = []
     measurements, pairs = _measured(session, run, rig, notes)
     frames: dict[str, list[CameraPoints]] = {camera: [] for camera in lenses}
-    for message in session.messages(session.topics(CameraPoints, run)):
+    for message in session.messages(session.topics(CAMERA_POINTS, run)):
         frames.setdefault(str(message.camera), []).append(message.payload)
     alignments = tuple(
         align_camera(camera, find_lying(seen, measurements)) for camera, seen in sorted(frames.items())
@@ -99,15 +101,16 @@ def _measured(
     """What was measured, and what each camera saw of it; else what the newest model was fitted on."""
     places: list[Measured] = []
     try:
-        places = measured(session, rig)
-        pairs = find_pairs(session, run, places)
+        view = LogView(session, {CAMERA_POINTS: run}, rig)
+        places = measured(view)
+        pairs = find_pairs(view, places)
     except IpsysError as error:
         # A slip of the tape must not keep anybody from hanging a camera; heights are by the ruler.
         notes.append(f"the measured places were left out: {error}")
         return [place.measurement for place in places], {}
-    fitted = newest_run(session, Model)
+    fitted = newest_run(session, MODEL)
     if not places and fitted is not None:
-        model: Model = session.payloads(session.topics(Model, fitted))[-1]
+        model: Model = session.payloads(session.topics(MODEL, fitted))[-1]
         return [], {camera.camera: camera.pairs for camera in model.cameras}
     return [place.measurement for place in places], pairs
 

@@ -11,6 +11,7 @@ from numpy.typing import NDArray
 from ipsys_log.analysis.accuracy import POOLED
 from ipsys_log.log.dataset import Session
 from ipsys_log.messages import CameraEvaluation, ErrorStatistics, Evaluation, Model, Rig
+from ipsys_log.messages.channels import MODEL
 from ipsys_log.report.accuracy import Accuracy
 from ipsys_log.report.advice import Advice, advise, told_height
 from ipsys_log.sinks.selection import rig_in_force
@@ -169,7 +170,7 @@ def _model(session: Session, run: str) -> Model | None:
     """The model that a run evaluated: its own, or that of a run that it read."""
     records = [record for record in session.runs() if (record.run, record.stage) == (run, "evaluate")]
     for name in (run, *(source for record in records for source in record.input_runs)):
-        if topics := session.topics(Model, name):
+        if topics := session.topics(MODEL, name):
             model: Model = session.payloads(topics)[-1]
             return model
     return None

@@ -25,11 +25,10 @@ from ipsys_log.messages import (
     TRUTH_TOPIC,
     CameraEvaluation,
     Evaluation,
-    Measurement,
     ReferencePoint,
     Rig,
-    Tracks,
 )
+from ipsys_log.messages.channels import MEASUREMENTS, TRACKS, TRUTH
 from ipsys_log.report.accuracy import Accuracy
 from ipsys_log.report.errors_figure import count_rows, draw_errors
 from ipsys_log.report.figures import GRID, REST, camera_styles, picture, robot_colour, shorten
@@ -292,11 +291,11 @@ def draw_session(session: Session, accuracies: Sequence[Accuracy], path: Path) -
 def _gather(session: Session, accuracies: Sequence[Accuracy]) -> Scene:
     evaluated = [accuracy for accuracy in accuracies if accuracy.evaluation is not None]
     runs = [accuracy.run for accuracy in (evaluated or accuracies)]
-    run = runs[0] if runs else newest_run(session, Tracks)
+    run = runs[0] if runs else newest_run(session, TRACKS)
     rig = rig_in_force(session, [run] if run else [])
-    places, _ = measured_places(session.payloads(session.topics(Measurement)), rig)
-    topics = session.topics(Tracks, run) if run else []
-    truth = [TRUTH_TOPIC] if TRUTH_TOPIC in session.topics(Tracks) else []
+    places, _ = measured_places(session.payloads(session.topics(MEASUREMENTS)), rig)
+    topics = session.topics(TRACKS, run) if run else []
+    truth = [TRUTH_TOPIC] if TRUTH_TOPIC in session.topics(TRUTH) else []
     scene = Scene(
         rig,
         places,

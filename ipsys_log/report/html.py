@@ -7,6 +7,7 @@ from typing import Any
 
 from jinja2 import Environment, PackageLoader, StrictUndefined
 
+from ipsys_log.analysis.calibration_points import measured
 from ipsys_log.analysis.cross_validation import FOLDS, REPEATS, SUBSETS
 from ipsys_log.analysis.tape import Measured
 from ipsys_log.errors import IpsysError
@@ -17,7 +18,7 @@ from ipsys_log.report import html_figures, html_sections
 from ipsys_log.report.accuracy import Accuracy
 from ipsys_log.report.advice import TOLD_NOTE, told_height
 from ipsys_log.report.findings import Findings, gather_findings
-from ipsys_log.runs.select import measured
+from ipsys_log.runs.view import LogView
 from ipsys_log.units import format_time
 
 __all__ = ["render_report"]
@@ -79,7 +80,7 @@ def _measured(session: Session, findings: Findings) -> list[Measured]:
     """The places that count, with the rig that the evaluation was told to use, or their own."""
     runs = [accuracy.run for accuracy in findings.accuracies]
     told = [record.rig for record in session.runs() if record.run in runs and record.rig is not None]
-    return measured(session, told[-1] if told else None)
+    return measured(LogView(session, rig=told[-1] if told else None))
 
 
 def _drawn(findings: Findings) -> dict[str, Any]:

@@ -14,7 +14,8 @@ from ipsys_log.errors import IpsysError
 from ipsys_log.geometry.poses import invert_pose, make_pose
 from ipsys_log.geometry.trilateration import sides_alike, tape_covariance
 from ipsys_log.log.dataset import Session
-from ipsys_log.messages import CameraCalibration, CameraModel, Measurement, Model, Rig
+from ipsys_log.messages import CameraCalibration, CameraModel, Model, Rig
+from ipsys_log.messages.channels import MEASUREMENTS, MODEL
 from ipsys_log.models.rigid import rigid_transform
 from ipsys_log.models.table import AppliedModel
 from ipsys_log.models.uncertainty import Uncertainty
@@ -92,7 +93,7 @@ def plan_floor(
     IpsysError
         Where no camera sees a marker of such a height anywhere on the floor.
     """
-    model: Model = session.payloads(session.topics(Model, run))[-1]
+    model: Model = session.payloads(session.topics(MODEL, run))[-1]
     views = [
         fitted_view(model.name, camera, lenses.get(camera.camera)) for camera in model.cameras if camera.pairs
     ]
@@ -177,7 +178,7 @@ def _references(rig: Rig) -> Array:
 def _tape(session: Session, rig: Rig) -> Callable[[Array], Array]:
     """The variance of x plus that of y at places (n, 3); 0 where nothing is known of the tape's start."""
     known_m = _references(rig)
-    payloads = session.payloads(session.topics(Measurement)) if rig.tape_sigma_m is None else []
+    payloads = session.payloads(session.topics(MEASUREMENTS)) if rig.tape_sigma_m is None else []
     named_m = [d.sigma_m for measurement in payloads for d in measurement.distances if d.sigma_m]
     sigma_m = rig.tape_sigma_m or float(np.median(named_m or _USUAL_TAPE_M))
 

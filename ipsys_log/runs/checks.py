@@ -2,73 +2,90 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Collection, Sequence
 from dataclasses import replace
 from pathlib import Path
 
-from ipsys_log.analysis.pairs import split
+from ipsys_log.analysis.calibration_points import measured, split_ids
 from ipsys_log.analysis.tape import world_point
 from ipsys_log.errors import FitError, IpsysError
 from ipsys_log.geometry.lenses import check_calibration
 from ipsys_log.log.contents import camera_of_topic
 from ipsys_log.log.dataset import Session
-from ipsys_log.messages import CameraPoints, Markers, Rig
+from ipsys_log.messages.channels import (
+    CAMERA_POINTS,
+    EVALUATION,
+    MARKERS,
+    MODEL,
+    POSITIONS,
+    RIG,
+    Channel,
+)
+from ipsys_log.messages.stage import Stage
 from ipsys_log.models.table import min_pairs, reads_height
 from ipsys_log.rig.file import check_rig
 from ipsys_log.runs.execute import has_given_name
-from ipsys_log.runs.graph import STAGES, usual_corners
+from ipsys_log.runs.graph import method_of, stage_named
 from ipsys_log.runs.options import Request
 from ipsys_log.runs.provenance import newest_run
-from ipsys_log.runs.select import can_evaluate, copied_run, fitted_in, measured
-from ipsys_log.runs.states import made_by_newer, method_of, recorded_stages
+from ipsys_log.runs.select import copied_run, fitted_in
+from ipsys_log.runs.states import made_by_newer, recorded_stages
+from ipsys_log.runs.view import LogView
+from ipsys_log.stages.detect import usual_corners
+from ipsys_log.stages.evaluate import can_evaluate
 
 __all__ = ["check_inputs"]
 
 
-def check_inputs(paths: Sequence[Path], request: Request, models: Sequence[str], until: str) -> None:
-    """Check the inputs of the stages up to ``until``.
+def check_inputs(
+    paths: Sequence[Path], request: Request, models: Sequence[str], stages: Sequence[Stage]
+) -> None:
+    """Check the inputs of some stages; the last one is the purpose of the command.
 
     Raises
     ------
     IpsysError
         An input is missing or invalid; the text names the first one and what to do.
     """
-    wanted = STAGES[: STAGES.index(until) + 1]
+    written = {channel for stage in stages for channel in stage.writes}
     _check_request(paths, request, models)
     with Session(paths) as session:
         _check_rigs(session, request)
-        cameras = _cameras(session, wanted)
+        cameras = _cameras(session, written)
         _check_overrides(session, request, cameras)
-        if "camera-frame" in wanted:
+        if CAMERA_POINTS in written:
             _check_lenses(session, request, cameras)
-        if request.corners != "stock" or "camera-frame" in wanted:
+        if request.corners != "stock" or CAMERA_POINTS in written:
             _check_distortion(session, request, cameras)
-        if "fit" in wanted and request.model_from is None:
+        if MODEL in written and request.model_from is None:
             _check_measurements(session, request, models)
-        if "locate" in wanted:
+        if POSITIONS in written:
             _check_heights(session, request, models)
-        if "locate" in wanted and request.model_from is not None:
+        if POSITIONS in written and request.model_from is not None:
             _check_model(session, request, models, cameras)
-        if until == "evaluate":
+        if EVALUATION in stages[-1].writes:
             _check_evaluation(session, request, models)
-        _check_versions(session, request, models, wanted)
-        _check_run_name(session, request, until)
+        _check_versions(session, request, models, stages)
+        _check_run_name(session, request, stages[-1])
 
 
-def _check_versions(session: Session, request: Request, models: Sequence[str], wanted: Sequence[str]) -> None:
+def _check_versions(
+    session: Session, request: Request, models: Sequence[str], stages: Sequence[Stage]
+) -> None:
     """Check that this software would not repeat a result of newer software."""
     corners = request.corners or usual_corners(session.images, {*session.calibrations, *request.lenses})
-    methods = {"detect": {corners}, "camera-frame": {request.method}, "fuse": {""}}
+    wanted = {corners, request.method, *models, ""}
     for run in session.runs():
-        newer = made_by_newer(session, run) if run.stage in wanted else ""
-        if newer and method_of(session, run) in methods.get(run.stage, models):
+        newer = made_by_newer(session, run) if stage_named(run.stage) in stages else ""
+        if newer and method_of(session, run) in wanted:
             raise IpsysError(f"{session}: run {run.run}, stage {run.stage}: {newer}")
 
 
-def _check_run_name(session: Session, request: Request, until: str) -> None:
+def _check_run_name(session: Session, request: Request, until: Stage) -> None:
     """Check that the run name of the user is not that of a run that is out of date."""
     for one in recorded_stages(session) if request.run is not None else ():
-        if one.run.run == request.run and one.out_of_date and has_given_name(one.run.stage, until):
+        stage = stage_named(one.run.stage)
+        if one.run.run == request.run and one.out_of_date and stage and has_given_name(stage, until):
             raise IpsysError(
                 f"run {request.run} already has the stage {one.run.stage}, which is {one.state}; use another "
                 "--run name"
@@ -90,24 +107,24 @@ def _check_request(paths: Sequence[Path], request: Request, models: Sequence[str
 
 
 def _check_rigs(session: Session, request: Request) -> None:
-    for topic in session.topics(Rig):
+    for topic in session.topics(RIG):
         for rig in session.payloads([topic]):
             check_rig(rig, f"{session}: {topic}")
-    if request.rig is None and not session.topics(Rig):
+    if request.rig is None and not session.topics(RIG):
         raise IpsysError(
             f"{session}: has no rig (markers, reference points); write one with 'ipsys init lab.toml' "
             "and give it with --rig lab.toml"
         )
 
 
-def _cameras(session: Session, wanted: Sequence[str]) -> set[str]:
+def _cameras(session: Session, written: Collection[Channel]) -> set[str]:
     """The cameras whose markers are to be seen through a lens; none where there are only camera points."""
     if session.images:
         return set(session.images)
-    markers = newest_run(session, Markers)
-    if markers is not None and wanted != ("detect",):
-        return {str(camera_of_topic(topic)) for topic in session.topics(Markers, markers)}
-    if wanted == ("detect",) or newest_run(session, CameraPoints) is None:
+    markers = newest_run(session, MARKERS)
+    if markers is not None and CAMERA_POINTS in written:
+        return {str(camera_of_topic(topic)) for topic in session.topics(MARKERS, markers)}
+    if CAMERA_POINTS not in written or newest_run(session, CAMERA_POINTS) is None:
         unread = session.unread_images()
         also = f"; {', '.join(unread)} cannot be read by this version" if unread else ""
         raise IpsysError(f"{session}: has no images to detect markers in{also}")
@@ -120,7 +137,7 @@ def _check_overrides(session: Session, request: Request, cameras: set[str]) -> N
     for name in sorted(set(request.lenses) - cameras):
         raise IpsysError(f"--calibration {name}: the log has no such camera (it has {known})")
     if request.rig is not None and not cameras:
-        held = session.payloads(session.topics(Rig))
+        held = session.payloads(session.topics(RIG))
         if any(rig.marker_length_m != request.rig.marker_length_m for rig in held):
             raise IpsysError(
                 "--rig: another marker length cannot take effect, the log has camera points but no markers"
@@ -146,7 +163,7 @@ def _check_distortion(session: Session, request: Request, cameras: set[str]) -> 
 
 
 def _check_measurements(session: Session, request: Request, models: Sequence[str]) -> None:
-    places = measured(session, request.rig)
+    places = measured(LogView(session, rig=request.rig))
     if not places and all(copied_run(session, model) for model in models):
         return
     if not places:
@@ -155,7 +172,7 @@ def _check_measurements(session: Session, request: Request, models: Sequence[str
             f"'ipsys measure {session.paths[-1]}', or apply a model of another log with --model-from "
             "calibration.mcap"
         )
-    train, _ = split([place.measurement for place in places], request.train, request.seed)
+    train, _ = split_ids([place.measurement for place in places], request.options())
     for place in places:
         world_point(place.measurement, place.rig)
         marker_id = place.measurement.marker_id
@@ -177,8 +194,8 @@ def _check_measurements(session: Session, request: Request, models: Sequence[str
 def _check_model(session: Session, request: Request, models: Sequence[str], cameras: set[str]) -> None:
     assert request.model_from is not None
     if not cameras:
-        run = newest_run(session, CameraPoints)
-        cameras = {str(camera_of_topic(topic)) for topic in session.topics(CameraPoints, run)}
+        run = newest_run(session, CAMERA_POINTS)
+        cameras = {str(camera_of_topic(topic)) for topic in session.topics(CAMERA_POINTS, run)}
     with Session([request.model_from]) as other:
         for name in models:
             model, _ = fitted_in(other, name)
@@ -192,7 +209,7 @@ def _check_model(session: Session, request: Request, models: Sequence[str], came
 
 def _check_heights(session: Session, request: Request, models: Sequence[str]) -> None:
     """A model that reads the height of a marker needs one for each that may be seen."""
-    rigs = [request.rig] if request.rig is not None else session.payloads(session.topics(Rig))
+    rigs = [request.rig] if request.rig is not None else session.payloads(session.topics(RIG))
     for name in models:
         for rig in rigs:
             missing = [m.id for m in rig.markers if rig.height_of(m.id) is None]
@@ -205,8 +222,9 @@ def _check_heights(session: Session, request: Request, models: Sequence[str]) ->
 
 
 def _check_evaluation(session: Session, request: Request, models: Sequence[str]) -> None:
-    if not any(can_evaluate(session, request, model) for model in models):
+    view = LogView(session, rig=request.rig)
+    if not any(can_evaluate(view, request.options(), model) for model in models):
         raise IpsysError(
             f"{session}: no measured place is held out to evaluate on, and there are too few (of "
-            f"{len(measured(session, request.rig))}) to take turns; label some 'test', or measure more"
+            f"{len(measured(view))}) to take turns; label some 'test', or measure more"
         )

@@ -2,16 +2,16 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Collection, Iterable, Iterator, Mapping
+from collections.abc import Callable, Collection, Iterable, Iterator, Mapping, Sequence
 from dataclasses import replace
 from functools import partial
 from pathlib import Path
+from typing import NamedTuple
 
 from ipsys_log.log.codec import encode
 from ipsys_log.log.contents import run_of_topic
 from ipsys_log.log.dataset import Session
 from ipsys_log.messages import (
-    EVENTS_TOPIC,
     RIG_TOPIC,
     CameraCalibration,
     ChannelWritten,
@@ -25,19 +25,21 @@ from ipsys_log.messages import (
     SkippedVideo,
     calibration_topic,
 )
+from ipsys_log.messages.channels import EVENTS, MODEL, RIG, Channel, channel_of
+from ipsys_log.messages.stage import Stage
 from ipsys_log.rig.file import hide_passwords
-from ipsys_log.runs.graph import Task, plan_stage
+from ipsys_log.runs.graph import Task, is_of_model, method_of, plan_stage
 from ipsys_log.runs.options import Progress, Request
 from ipsys_log.runs.output import append_messages, append_run, record_message
 from ipsys_log.runs.provenance import Outcome, check_run_name, find_run, fingerprint, free_name, read_channels
 from ipsys_log.runs.remarks import Remarks
-from ipsys_log.runs.select import skipped_frames
-from ipsys_log.runs.states import Recorded, method_of, recorded_stages
-from ipsys_log.runs.stream import TOPICS, Stage, in_threads, run
+from ipsys_log.runs.states import Recorded, recorded_stages
+from ipsys_log.runs.stream import in_threads, run, wire
+from ipsys_log.stages.detect import skipped_frames
 from ipsys_log.units import format_time
 
 __all__ = [
-    "SHARED_STAGES",
+    "LiveRun",
     "OtherContentError",
     "carry_out",
     "cut_short",
@@ -57,10 +59,10 @@ class OtherContentError(Exception):
 
 def cut_short(session: Session, target: Path, task: Task, run: str) -> dict[str, int]:
     """What a run in ``target`` holds of a stage that has not signed it: messages by topic, or nothing."""
-    signed = any((one.run, one.stage) == (run, task.stage) for one in session.runs())
-    if signed or task.step is None or not session.topics(task.writes[0], run):
+    signed = any((one.run, one.stage) == (run, task.stage.name) for one in session.runs())
+    if signed or task.step is None or not session.topics(task.stage.writes[0], run):
         return {}
-    topics = [topic for payload in task.writes for topic in session.topics(payload, run)]
+    topics = [topic for channel in task.stage.writes for topic in session.topics(channel, run)]
     here = {topic for reader in session.readers if reader.path == target for topic in reader.channels}
     return {topic: session.count(topic) for topic in topics} if here.issuperset(topics) else {}
 
@@ -109,9 +111,6 @@ def _refuse(left: Iterable[Message]) -> None:
             raise OtherContentError(f"{one.topic} is another one at {format_time(one.log_time_ns)}")
 
 
-# The stages whose runs serve every model.
-SHARED_STAGES = ("detect", "camera-frame")
-
 Make = Callable[[Task, Session, str], Iterable[Message]]
 
 
@@ -120,7 +119,7 @@ def perform(
     target: Path,
     task: Task,
     request: Request,
-    until: str,
+    until: Stage,
     make: Make,
     say: Callable[[str], None] = lambda text: None,
 ) -> Outcome:
@@ -133,28 +132,28 @@ def perform(
     record = record_of(session, task)
     found = find_run(session, record, name)
     if found is not None:
-        return Outcome(task.stage, found, fresh=False)
+        return Outcome(task.stage.name, found, fresh=False)
     _say_renewal(session, task, record, say)
     number = max((run.number for run in session.runs()), default=0) + 1
     record = replace(record, fingerprint=fingerprint(), number=number)
     remarks: tuple[str, ...] = ()
-    given = name or task.base
+    given = name or task.run
     if held := cut_short(session, target, task, given):
         try:
             return _append(session, target, task, replace(record, run=given), held, request, make)
         except OtherContentError as other:
             remarks = (f"run {given} was cut short, and is left so: {other}",)
     if name is None:
-        name = free_name(session, record, task.base, task.writes)
+        name = free_name(session, record, task.run, task.stage.writes)
     else:
-        check_run_name(session, task.stage, name, task.writes)
+        check_run_name(session, task.stage.name, name, task.stage.writes)
     outcome = _append(session, target, task, replace(record, run=name), {}, request, make)
     return replace(outcome, remarks=(*remarks, *outcome.remarks))
 
 
-def has_given_name(stage: str, until: str) -> bool:
-    """Return whether the run name of the user is for a stage: not for the detection before the last stage."""
-    return stage == until or not {stage, until} & set(SHARED_STAGES)
+def has_given_name(stage: Stage, until: Stage) -> bool:
+    """Return whether the run name of the user is for a stage: the last one, or all stages of the model."""
+    return stage is until or (is_of_model(stage) and is_of_model(until))
 
 
 def _say_renewal(session: Session, task: Task, record: Run, say: Callable[[str], None]) -> None:
@@ -162,15 +161,15 @@ def _say_renewal(session: Session, task: Task, record: Run, say: Callable[[str],
     method = method_of(session, record)
 
     def is_such(one: Recorded) -> bool:
-        is_same = (one.run.stage, one.method) == (task.stage, method)
-        # If the positions have changed, the stage that made them has reported it.
-        return is_same and (task.stage != "fuse" or one.run.input_runs == record.input_runs)
+        is_same = (one.run.stage, one.method) == (task.stage.name, method)
+        # A stage without methods differs by its input only: the writer of that has reported the change.
+        return is_same and (bool(method) or one.run.input_runs == record.input_runs)
 
     such = [one for one in recorded_stages(session) if is_such(one)]
     if such and such[-1].out_of_date:
         frames = sum(session.count(topic) for topic in task.topics if topic in session.images.values())
         much = f" for {frames} frames" if frames else ""
-        say(f"{task.stage} is computed again{much}; run {such[-1].run.run} is {such[-1].state}")
+        say(f"{task.stage.name} is computed again{much}; run {such[-1].run.run} is {such[-1].state}")
 
 
 def _append(
@@ -193,62 +192,64 @@ def _append(
         held,
     )
     count = sum(output.messages for output in made.outputs)
-    return Outcome(task.stage, record.run, True, count, remarks.lines())
+    return Outcome(task.stage.name, record.run, True, count, remarks.lines())
 
 
-def sign(path: Path, request: Request, runs: Mapping[str, str]) -> list[Outcome]:
+class LiveRun(NamedTuple):
+    """A run that a stage writes live, and by derived channel the runs that it reads; ``copied`` is a run that
+    was copied from another log and has its record."""
+
+    stage: Stage
+    run: str
+    inputs: Mapping[Channel, str]
+    copied: bool = False
+
+
+def sign(path: Path, options: Mapping[str, str], runs: Sequence[LiveRun]) -> list[Outcome]:
     """Append the records of stages that have written their channels already, live.
 
     Parameters
     ----------
-    runs : by stage, in order, the run it has written to; that of fit was signed when the model was copied.
+    options : of the stages, by name.
+    runs : in order.
     """
     records, outcomes = [], []
     with Session([path]) as session:
         first = max((run.number for run in session.runs()), default=0) + 1
-        for number, (stage, name) in enumerate(runs.items(), first):
-            if stage == "fit":
-                outcomes.append(Outcome(stage, name, True, 1))
+        for number, (stage, name, inputs, copied) in enumerate(runs, first):
+            if copied:
+                outcomes.append(Outcome(stage.name, name, True, 1))
                 continue
-            task = plan_stage(stage, session, request, **_given(stage, runs))
-            assert isinstance(task, Task), f"{stage} was not done live"
+            task = plan_stage(stage, session, options, inputs)
+            assert isinstance(task, Task), f"{stage.name} was not done live"
             outputs = tuple(
                 ChannelWritten(topic, session.count(topic))
-                for topic in sorted(t for payload in task.writes for t in session.topics(payload, name))
+                for topic in sorted(t for channel in stage.writes for t in session.topics(channel, name))
             )
             log_time_ns, time_ns = session.last(task.topics)
             record = replace(record_of(session, task), run=name, outputs=outputs, number=number)
             record = replace(record, timestamp=time_ns, fingerprint=fingerprint())
             records.append(record_message(record, log_time_ns))
-            outcomes.append(Outcome(stage, name, True, sum(output.messages for output in outputs)))
+            outcomes.append(Outcome(stage.name, name, True, sum(output.messages for output in outputs)))
     append_messages(path, records)
     return outcomes
 
 
-def signed_copy(task: Task, model: Model, now_ns: Callable[[], int]) -> list[Message]:
-    """The messages that copy a model into a log that is begun: the model, and the record of its run."""
-    at = f"/runs/{task.base}/model"
+def signed_copy(task: Task, model: Model, number: int, now_ns: Callable[[], int]) -> list[Message]:
+    """Return the messages that copy a model into a new log: the model, and the record of its run."""
+    at = MODEL.topic_of(task.run)
     record = Run(
         timestamp=model.timestamp,
-        run=task.base,
-        stage=task.stage,
+        run=task.run,
+        stage=task.stage.name,
         parameters=dict(task.parameters),
         fingerprint=fingerprint(),
         input_runs=task.input_runs,
         inputs=task.foreign,
         outputs=(ChannelWritten(at, 1),),
-        number=1,
+        number=number,
     )
     return [Message(at, now_ns(), model.timestamp, model), record_message(record, now_ns())]
-
-
-def _given(stage: str, runs: Mapping[str, str]) -> dict[str, str]:
-    """What :func:`ipsys_log.runs.graph.plan_stage` has to be told of the stages before."""
-    if stage == "camera-frame":
-        return {"markers": runs["detect"]}
-    if stage == "locate":
-        return {"points": runs["camera-frame"], "model": runs["fit"]}
-    return {"positions": runs["locate"]} if stage == "fuse" else {}
 
 
 def record_of(session: Session, task: Task) -> Run:
@@ -261,7 +262,7 @@ def record_of(session: Session, task: Task) -> Run:
     return Run(
         timestamp=0,
         run="",
-        stage=task.stage,
+        stage=task.stage.name,
         parameters=dict(task.parameters),
         rig=task.rig and hide_passwords(task.rig),
         lenses=lenses,
@@ -278,19 +279,20 @@ def inputs(session: Session, task: Task, progress: Progress) -> Iterator[Message
     """
     yield from _settings(session, task.lenses, task.rig)
     for topic in sorted(task.topics):
-        if topic in (*session.topics(Rig), *session.calibrations.values()):
+        if topic in (*session.topics(RIG), *session.calibrations.values()):
             yield next(session.messages([topic]))
     total = sum(session.count(topic) for topic in task.topics)
-    progress(task.stage, 0, total)
-    skipped = skipped_frames(session) if task.as_live else set()
+    progress(task.stage.name, 0, total)
+    skipped = (
+        skipped_frames(session.payloads(session.topics(EVENTS))) if "as_live" in task.parameters else set()
+    )
     for done, message in enumerate(session.messages(task.topics), 1):
         if message.log_time_ns not in skipped:
-            if message.topic != EVENTS_TOPIC or Event in task.reads:
-                yield message
+            yield message
         elif isinstance(message.payload, CompressedVideo):
             # Those after it need it. What live passed over up to a keyframe, makes no difference.
             yield replace(message, payload=SkippedVideo(message.payload))
-        progress(task.stage, done, total)
+        progress(task.stage.name, done, total)
 
 
 def _settings(
@@ -304,17 +306,23 @@ def _settings(
 
 
 def carry_out(task: Task, session: Session, name: str, progress: Progress) -> Iterator[Message]:
-    """The messages of a task's run: its causal stage over the log, or one computed from all of it."""
+    """Yield the messages of a task's run: its causal stage over the log, or one computed from all of it."""
     if task.step is None:
         assert task.compute is not None
-        payload, (log_time_ns, _) = (
-            task.compute(session, partial(progress, task.stage)),
-            session.last(task.topics),
-        )
-        yield Message(TOPICS[type(payload)].format(run=name), log_time_ns, payload.timestamp, payload)
+        payload = task.compute(partial(progress, task.stage.name))
+        log_time_ns, _ = session.last(task.topics)
+        topic = task.stage.channel_for(type(payload)).topic_of(name)
+        yield Message(topic, log_time_ns, payload.timestamp, payload)
         return
-    stage = Stage(name, task.reads, task.step(name), task.per_camera)
+    wired = wire(task.stage, name, task.inputs, task.step(name))
+    written = {(channel, name) for channel in task.stage.writes}
+    is_written: dict[tuple[str, type], bool] = {}
     # Threads that run Python wait for one another, and a stage takes longer in them than without.
-    for message in run(inputs(session, task, progress), [stage], in_threads if task.decodes_frames else map):
-        if isinstance(message.payload, task.writes):
+    for message in run(
+        inputs(session, task, progress), [wired], in_threads if task.stage.in_threads else map
+    ):
+        key = message.topic, type(message.payload)
+        if key not in is_written:
+            is_written[key] = (channel_of(*key), run_of_topic(message.topic)) in written
+        if is_written[key]:
             yield message

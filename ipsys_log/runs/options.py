@@ -32,6 +32,7 @@ class Request:
     method : how camera points are made of markers: ``perimeter`` or ``pose``.
     as_live : pass over the frames that were skipped when the log was recorded live.
     skip_ambiguous : go on where a marker id is seen twice in a frame, without that marker.
+    parameters : further options of stages, by name.
 
     Raises
     ------
@@ -50,8 +51,23 @@ class Request:
     method: str = PERIMETER
     as_live: bool = False
     skip_ambiguous: bool = False
+    parameters: Mapping[str, str] = field(default_factory=dict)
 
     def __post_init__(self) -> None:
         if self.corners is not None:
             check_corners(self.corners)
         check_method(self.method)
+
+    def options(self, model: str | None = None) -> dict[str, str]:
+        """Return the options of stages by name, for one model."""
+        options = {
+            "corners": self.corners or "",
+            "method": self.method,
+            "model": model or "",
+            "train": self.train,
+            "seed": str(self.seed),
+            "as_live": "yes" if self.as_live else "",
+            "model_from": "yes" if self.model_from is not None else "",
+            **self.parameters,
+        }
+        return {name: value for name, value in options.items() if value}

@@ -18,9 +18,9 @@ from ipsys_log.errors import IpsysError
 from ipsys_log.log.codec import encode
 from ipsys_log.log.dataset import Session
 from ipsys_log.messages import ChannelRead, Run
+from ipsys_log.messages.channels import Channel
 
 __all__ = [
-    "VERSIONS",
     "Outcome",
     "check_run_name",
     "complete_runs",
@@ -31,44 +31,9 @@ __all__ = [
     "newest_run",
     "read_channels",
     "recorded_version",
-    "version_parameters",
-    "versioned_names",
 ]
 
-VERSIONS: dict[str, int] = {
-    "detect": 1,
-    "edges": 1,
-    "stock": 1,
-    "camera-frame": 1,
-    "perimeter": 1,
-    "pose": 1,
-    "fit": 1,
-    "rigid": 1,
-    "poly": 1,
-    "ann": 1,
-    "kriging": 1,
-    "kriging-regression": 1,
-    "rayplane": 1,
-    "best": 1,
-    "evaluate": 1,
-    "locate": 1,
-    "fuse": 1,
-}
 _MOST_DIGITS = 6
-
-
-def version_parameters(stage: str, method: str = "") -> dict[str, str]:
-    """Return the parameters of a run that name the versions of a stage and its method or model.
-
-    A hybrid such as ``rigid+poly`` has the versions of its parts.
-    """
-    versions = [(name, VERSIONS.get(name, 1)) for name in versioned_names(stage, method)]
-    return {name: str(version) for name, version in versions if version != 1}
-
-
-def versioned_names(stage: str, method: str = "") -> list[str]:
-    """Return the parts of a stage that have versions, the stage first."""
-    return [stage, *(part for part in method.split("+") if part)]
 
 
 def recorded_version(run: Run, name: str) -> int:
@@ -133,7 +98,7 @@ def find_run(session: Session, wanted: Run, name: str | None = None) -> str | No
     return None
 
 
-def free_name(session: Session, record: Run, base: str, writes: Sequence[type]) -> str:
+def free_name(session: Session, record: Run, base: str, writes: Sequence[Channel]) -> str:
     """The name for a new run: ``base``, or ``base_2``, ``base_3`` ... where that is taken.
 
     A stage joins the run that it reads from, as long as that does not have the stage; any other name
@@ -149,13 +114,13 @@ def free_name(session: Session, record: Run, base: str, writes: Sequence[type]) 
     return f"{base}_{number}"
 
 
-def _has_stage(session: Session, stage: str, name: str, writes: Sequence[type]) -> bool:
+def _has_stage(session: Session, stage: str, name: str, writes: Sequence[Channel]) -> bool:
     """By its record, or by a channel that such a stage writes, whoever made it."""
     recorded = any((run.run, run.stage) == (name, stage) for run in session.runs())
     return recorded or bool(session.topics(writes[0], name))
 
 
-def check_run_name(session: Session, stage: str, name: str, writes: Sequence[type]) -> str:
+def check_run_name(session: Session, stage: str, name: str, writes: Sequence[Channel]) -> str:
     """Return the name that a user gave a run, if the run does not have that stage yet.
 
     Raises
@@ -168,14 +133,14 @@ def check_run_name(session: Session, stage: str, name: str, writes: Sequence[typ
     return name
 
 
-def newest_run(session: Session, payload: type) -> str | None:
-    """Return the run whose newest complete stage wrote a type of payload.
+def newest_run(session: Session, channel: Channel) -> str | None:
+    """Return the run whose newest complete stage wrote a channel.
 
     Imported channels are of no recorded stage: they count with any complete stage of their run.
     """
     recorded = {output.topic for run in session.runs() for output in run.outputs}
     for run in reversed(complete_runs(session)):
-        topics = set(session.topics(payload, run.run))
+        topics = set(session.topics(channel, run.run))
         if topics and (topics.isdisjoint(recorded) or topics & {output.topic for output in run.outputs}):
             return run.run
     return None

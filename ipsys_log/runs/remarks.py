@@ -10,6 +10,7 @@ from statistics import median
 from ipsys_log.errors import IpsysError
 from ipsys_log.log.contents import camera_of_topic
 from ipsys_log.messages import Event, Markers, Message, Positions
+from ipsys_log.messages.channels import MARKERS, POSITIONS
 from ipsys_log.runs.graph import Task
 from ipsys_log.runs.select import LEAST_OFFSET_PX, MIN_OFFSETS
 from ipsys_log.units import format_time
@@ -44,7 +45,7 @@ class Remarks:
         for message in messages:
             self._note(message)
             yield message
-        if self._task.stage == "detect":
+        if MARKERS in self._task.stage.writes:
             self._check_detection()
 
     def _note(self, message: Message) -> None:
@@ -96,10 +97,10 @@ class Remarks:
             f"{count} x {kind.replace('_', ' ')}, first: {_said(self._first[kind])}"
             for kind, count in sorted(self._events.items())
         ]
-        if self._task.stage == "detect":
+        if MARKERS in self._task.stage.writes:
             lines.insert(0, f"{self._markers} markers in {self._frames} frames")
             lines += self._about_offsets()
-        if self._task.stage == "locate":
+        if POSITIONS in self._task.stage.writes:
             cameras = {camera_of_topic(topic) for topic in self._task.topics} - {None}
             lines += [f"camera {name} has no model" for name in sorted(map(str, cameras - self._located))]
         return (*lines, *self._task.notes)

@@ -7,11 +7,12 @@ from dataclasses import dataclass, replace
 
 from ipsys_log.log.contents import camera_of_topic, run_of_topic
 from ipsys_log.log.dataset import Session
-from ipsys_log.messages import MEASUREMENTS_TOPIC, RIG_TOPIC, ChannelRead, Model, Run
-from ipsys_log.runs.provenance import VERSIONS, is_complete, recorded_version, versioned_names
-from ipsys_log.stages.camera_frame import PERIMETER
+from ipsys_log.messages import MEASUREMENTS_TOPIC, RIG_TOPIC, ChannelRead, Run
+from ipsys_log.messages.channels import EVALUATION, MODEL
+from ipsys_log.runs.graph import VERSIONS, method_of, versioned_names, writes
+from ipsys_log.runs.provenance import is_complete, recorded_version
 
-__all__ = ["Recorded", "is_fitted_here", "made_by_newer", "method_of", "out_of_date_lines", "recorded_stages"]
+__all__ = ["Recorded", "is_fitted_here", "made_by_newer", "out_of_date_lines", "recorded_stages"]
 
 _CURRENT = "current"
 # A model that was fitted to measurements of the same log has one of these parameters.
@@ -67,7 +68,7 @@ def out_of_date_lines(session: Session, names: Iterable[str | None]) -> list[str
     lines: dict[str, str] = {}
     wanted = set(names)
     for one in recorded_stages(session):
-        is_shown = one.run.run in wanted and one.run.stage != "evaluate"
+        is_shown = one.run.run in wanted and not writes(one.run, EVALUATION)
         if is_shown and (one.out_of_date or one.is_newer):
             advice = "" if one.is_newer else "; ipsys replay makes it again"
             lines.setdefault(one.run.run, f"run {one.run.run}: {one.run.stage} is {one.state}{advice}")
@@ -89,21 +90,6 @@ def is_fitted_here(run: Run) -> bool:
     return bool(run.parameters.keys() & _FITTED_HERE)
 
 
-def method_of(session: Session, run: Run) -> str:
-    """Return the corner method, camera-point method or model of a stage; "" if it has none."""
-    if run.stage == "detect":
-        return run.parameters.get("corners", "")
-    if run.stage == "camera-frame":
-        return run.parameters.get("method", PERIMETER)
-    if run.stage == "fit":
-        return run.parameters.get("model", "")
-    if run.stage in ("evaluate", "locate"):
-        read = {read.topic for read in run.inputs}
-        models = [topic for topic in read if topic in session.topics(Model, run_of_topic(topic))]
-        return str(session.payloads(models)[-1].name) if models else ""
-    return ""
-
-
 def _judge(session: Session, one: Recorded) -> Recorded:
     """Return a stage with its state, as far as its own record and the log tell it."""
     run = one.run
@@ -112,7 +98,7 @@ def _judge(session: Session, one: Recorded) -> Recorded:
     if newer := made_by_newer(session, run):
         return replace(one, state=newer, is_newer=True)
     names = versioned_names(run.stage, one.method)
-    is_copied = run.stage == "fit" and not is_fitted_here(run)
+    is_copied = writes(run, MODEL) and not is_fitted_here(run)
     if is_copied or any(read.messages and not session.count(read.topic) for read in run.inputs):
         return replace(one, state="not repeatable")
     reasons = [

@@ -4,63 +4,61 @@ from __future__ import annotations
 
 import builtins
 from collections import deque
-from collections.abc import Callable, Iterable, Iterator, Sequence
+from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
 from concurrent.futures import Future, ThreadPoolExecutor
 from contextlib import ExitStack
 from dataclasses import dataclass
-from typing import Any
+from typing import Any, NamedTuple
 
 import cv2
 
-from ipsys_log.messages import (
-    CameraPoints,
-    Evaluation,
-    Event,
-    FrameTransforms,
-    ImageAnnotations,
-    Markers,
-    Message,
-    Model,
-    Positions,
-    Tracks,
-)
+from ipsys_log.log.contents import run_of_topic
+from ipsys_log.messages import FrameTransforms, Message
+from ipsys_log.messages.channels import Channel, channel_of
+from ipsys_log.messages.stage import Stage, Step
 
-__all__ = ["TOPICS", "Stage", "in_threads", "run"]
-
-# Where a payload goes within its run.
-TOPICS: dict[type, str] = {
-    Markers: "/runs/{run}/cameras/{camera}/markers",
-    ImageAnnotations: "/runs/{run}/cameras/{camera}/annotations",
-    CameraPoints: "/runs/{run}/cameras/{camera}/camera_points",
-    Model: "/runs/{run}/model",
-    Evaluation: "/runs/{run}/evaluation",
-    Positions: "/runs/{run}/cameras/{camera}/positions",
-    Tracks: "/runs/{run}/tracks",
-    FrameTransforms: "/runs/{run}/poses",
-    Event: "/runs/{run}/events",
-}
+__all__ = ["Route", "WiredStage", "in_threads", "run", "wire"]
 
 Map = Callable[[Callable[[Message], Any], Iterable[Message]], Iterable[Any]]
 
 
-@dataclass(frozen=True, slots=True)
-class Stage:
-    """A causal stage: the run it writes to, which payloads it reads, and its step.
+class Route(NamedTuple):
+    """A channel of one run; the run is None for a recorded channel."""
 
-    A stage that remembers something across cameras is not ``per_camera``: it takes one message after
-    the other, whatever the map.
+    channel: Channel
+    run: str | None
+
+
+@dataclass(frozen=True, slots=True)
+class WiredStage:
+    """A causal stage in a stream: the run that it writes, the routes that it reads, and its step.
+
+    A stage that remembers something across cameras is not ``per_camera``: it takes one message after the
+    other, whatever the map.
     """
 
+    stage: Stage
     run: str
-    reads: tuple[type, ...]
-    step: Callable[[Message], Iterable[Any]]
-    per_camera: bool = True
+    reads: frozenset[Route]
+    step: Step
+
+    def topic_of(self, payload: Any, camera: str | None) -> str:
+        """Return the topic that a payload of this stage goes to."""
+        return self.stage.channel_for(type(payload)).topic_of(self.run, camera)
 
 
-def run(source: Iterable[Message], stages: Sequence[Stage], map: Map = map) -> Iterator[Message]:
+def wire(stage: Stage, run: str, inputs: Mapping[Channel, str], step: Step) -> WiredStage:
+    """Wire a causal stage: it reads the recorded channels of its row, and derived ones of ``inputs``."""
+    reads = {
+        Route(channel, inputs.get(channel, "") if channel.is_derived else None) for channel in stage.reads
+    }
+    return WiredStage(stage, run, frozenset(reads), step)
+
+
+def run(source: Iterable[Message], stages: Sequence[WiredStage], map: Map = map) -> Iterator[Message]:
     """Send every message of a source through the stages, and yield it and what they make of it.
 
-    What a stage makes has the log time of the message it was made from, and follows it at once; the
+    A derived message has the log time of the message that it was made from, and follows it at once; the
     next stage sees both. Its publish time is its own timestamp. With ``map`` as :func:`in_threads`,
     cameras use the cores in parallel and the order stays the same.
     """
@@ -69,17 +67,23 @@ def run(source: Iterable[Message], stages: Sequence[Stage], map: Map = map) -> I
     yield from source
 
 
-def _through(stage: Stage, source: Iterable[Message], map: Map) -> Iterator[Message]:
-    def work(message: Message) -> tuple[Message, list[Any]]:
-        return message, list(stage.step(message)) if isinstance(message.payload, stage.reads) else []
+def _through(wired: WiredStage, source: Iterable[Message], map: Map) -> Iterator[Message]:
+    is_read: dict[tuple[str, type], bool] = {}
 
-    for message, payloads in (map if stage.per_camera else builtins.map)(work, source):
+    def work(message: Message) -> tuple[Message, list[Any]]:
+        key = message.topic, type(message.payload)
+        if key not in is_read:
+            channel = channel_of(*key)
+            is_read[key] = channel is not None and Route(channel, run_of_topic(message.topic)) in wired.reads
+        return message, list(wired.step(message)) if is_read[key] else []
+
+    for message, payloads in (map if wired.stage.per_camera else builtins.map)(work, source):
         yield message
         for payload in payloads:
-            topic = TOPICS[type(payload)].format(run=stage.run, camera=message.camera)
-            # Transforms have their times one by one; drawings on a frame have that of the frame.
+            # Transforms have their times one by one; drawings on an image have that of the image.
             stamped = payload.transforms[0] if isinstance(payload, FrameTransforms) else payload
             time_ns = getattr(stamped, "timestamp", message.publish_time_ns)
+            topic = wired.topic_of(payload, message.camera)
             yield Message(topic, message.log_time_ns, time_ns, payload, message.camera)
 
 

@@ -22,28 +22,17 @@ from ipsys_log.errors import IpsysError
 from ipsys_log.log.codec import encode
 from ipsys_log.log.contents import run_of_topic
 from ipsys_log.log.dataset import Session
-from ipsys_log.messages import (
-    CameraCalibration,
-    CameraPoints,
-    FrameTransforms,
-    Markers,
-    Message,
-    Model,
-    Positions,
-    Run,
-    Tracks,
-)
+from ipsys_log.messages import CameraCalibration, FrameTransforms, Message, Run
+from ipsys_log.messages.channels import CAMERA_POINTS, EVALUATION, MARKERS, MODEL, POSITIONS, TRACKS
 from ipsys_log.runs.execute import carry_out
-from ipsys_log.runs.graph import Task, plan_stage
-from ipsys_log.runs.options import Progress, Request
+from ipsys_log.runs.graph import Task, input_runs, plan_stage, stage_named, writes
+from ipsys_log.runs.options import Progress
 from ipsys_log.runs.states import Recorded, is_fitted_here, recorded_stages
-from ipsys_log.stages.camera_frame import PERIMETER
 
 __all__ = ["diff", "explain_diff", "verify"]
 
-_MODELS = ("fit", "evaluate")
-# Payloads that come frame by frame.
-_MOVING = (Markers, CameraPoints, Positions, Tracks)
+# Channels with a message for each image.
+_MOVING = (MARKERS, CAMERA_POINTS, POSITIONS, TRACKS)
 
 
 def verify(
@@ -102,7 +91,12 @@ def verify(
 
 def _is_of_copied_model(run: Run) -> bool:
     """Return whether a stage copied a model from another log, or evaluated such a model."""
-    return run.stage in _MODELS and not is_fitted_here(run)
+    return _is_of_model(run) and not is_fitted_here(run)
+
+
+def _is_of_model(run: Run) -> bool:
+    """Return whether a stage fits a model, or evaluates it: these depend on all measurements."""
+    return writes(run, MODEL) or writes(run, EVALUATION)
 
 
 def _is_of_other_version(one: Recorded, say: Callable[[str], None]) -> bool:
@@ -161,7 +155,7 @@ def _compared_runs(
 
 
 def _extent(session: Session, runs: Collection[str]) -> Extent:
-    topics = [topic for run in runs for payload in _MOVING for topic in session.topics(payload, run)]
+    topics = [topic for run in runs for channel in _MOVING for topic in session.topics(channel, run)]
     cameras, times_ns, ids = set(), set(), set()
     for message in session.messages(topics):
         times_ns.add(message.log_time_ns)
@@ -188,7 +182,7 @@ def _derived(session: Session, runs: set[str], called: str | None) -> Iterator[S
         for topic in reader.channels
         if run_of_topic(topic) in runs and not topic.endswith("/record")
     }
-    models = topics & {topic for run in runs for topic in session.topics(Model, run)}
+    models = topics & {topic for run in runs for topic in session.topics(MODEL, run)}
     for message, data in session.stored(models):
         yield replace(_called(message, called), log_time_ns=0, publish_time_ns=0), data
     for message, data in session.stored(topics - models):
@@ -227,7 +221,7 @@ def _is_up_to_date(session: Session, run: Run, checked: Collection[str], say: Ca
             f"run {run.run} was made from {read.messages} messages of {read.topic}, and these "
             f"are not what the log holds now ({count} messages): it is out of date"
         )
-        if run.stage in _MODELS:
+        if _is_of_model(run):
             say(f"{text}; its {run.stage} is not verified: ipsys replay makes it again")
             return False
         raise IpsysError(f"{session}: {text}, or the log it was made from has to be given too")
@@ -235,43 +229,18 @@ def _is_up_to_date(session: Session, run: Run, checked: Collection[str], say: Ca
 
 
 def _made_again(session: Session, run: Run, progress: Progress) -> Iterator[Stored]:
-    task = plan_stage(run.stage, session, _request(run), **_given(session, run))
+    stage = stage_named(run.stage)
+    task = plan_stage(stage, session, run.parameters, input_runs(run), run.rig, _lenses(run)) if stage else ""
     if isinstance(task, Task):
         for message in carry_out(task, session, run.run, progress):
             yield message, encode(message.payload)
 
 
-def _request(run: Run) -> Request:
-    lenses = {
+def _lenses(run: Run) -> dict[str, CameraCalibration]:
+    """Return the intrinsics that replaced those of the log in a run."""
+    return {
         one.camera: CameraCalibration(
             0, one.camera, one.width, one.height, one.distortion_model, one.d, one.k
         )
         for one in run.lenses
     }
-    return Request(
-        rig=run.rig,
-        lenses=lenses,
-        corners=run.parameters.get("corners"),
-        method=run.parameters.get("method", PERIMETER),
-        train=run.parameters.get("train", "train"),
-        seed=int(run.parameters.get("seed", "0")),
-        as_live="as_live" in run.parameters,
-    )
-
-
-def _given(session: Session, run: Run) -> dict[str, str]:
-    """The runs that it has read from, as the plan wants them."""
-    read = {read.topic for read in run.inputs}
-
-    def source(payload: type) -> str:
-        names = {name for name in session.run_names() if read & set(session.topics(payload, name))}
-        return names.pop() if names else ""
-
-    return {
-        "detect": {},
-        "camera-frame": {"markers": source(Markers)},
-        "fit": {"points": source(CameraPoints), "model": run.parameters.get("model", "")},
-        "evaluate": {"points": source(CameraPoints), "model": source(Model)},
-        "locate": {"points": source(CameraPoints), "model": source(Model)},
-        "fuse": {"positions": source(Positions)},
-    }[run.stage]

@@ -14,13 +14,10 @@ from ipsys_log.messages import (
     EVENTS_TOPIC,
     RIG_TOPIC,
     TRUTH_TOPIC,
-    Event,
-    Markers,
-    Positions,
     Rig,
     Run,
-    Tracks,
 )
+from ipsys_log.messages.channels import EVENTS, MARKERS, POSITIONS, RUN_EVENTS, TRACKS, TRUTH
 from ipsys_log.units import NS_PER_S
 
 __all__ = ["Shown", "choose_runs", "fade_ns", "rig_in_force"]
@@ -57,8 +54,8 @@ def choose_runs(session: Session, names: Sequence[str] = ()) -> Shown:
     for name in names:
         if name not in there:
             raise IpsysError(f"{session}: there is no run {name!r} (there are: {', '.join(there) or 'none'})")
-    located = [run for run in there if session.topics(Tracks, run) or session.topics(Positions, run)]
-    marked = [run for run in there if session.topics(Markers, run)]
+    located = [run for run in there if session.topics(TRACKS, run) or session.topics(POSITIONS, run)]
+    marked = [run for run in there if session.topics(MARKERS, run)]
     if names:
         sources = _sources(records, names)
         markers = _newest(records, [run for run in marked if run in sources])
@@ -86,12 +83,14 @@ def _sources(records: Sequence[Run], names: Sequence[str]) -> set[str]:
 
 
 def _topics(session: Session, markers: str | None, runs: Sequence[str]) -> Shown:
-    marked = session.topics(Markers, markers) if markers else []
-    located = [topic for run in runs for topic in session.topics(Positions, run)]
-    tracked = [topic for run in runs for topic in session.topics(Tracks, run)]
-    truth = [TRUTH_TOPIC] if TRUTH_TOPIC in session.topics(Tracks) else []
-    events = [topic for run in dict.fromkeys([markers, *runs]) if run for topic in session.topics(Event, run)]
-    recorded = [topic for topic in session.topics(Event) if topic == EVENTS_TOPIC]
+    marked = session.topics(MARKERS, markers) if markers else []
+    located = [topic for run in runs for topic in session.topics(POSITIONS, run)]
+    tracked = [topic for run in runs for topic in session.topics(TRACKS, run)]
+    truth = [TRUTH_TOPIC] if TRUTH_TOPIC in session.topics(TRUTH) else []
+    events = [
+        topic for run in dict.fromkeys([markers, *runs]) if run for topic in session.topics(RUN_EVENTS, run)
+    ]
+    recorded = [topic for topic in session.topics(EVENTS) if topic == EVENTS_TOPIC]
     cameras = {*session.images, *(str(camera_of_topic(topic)) for topic in marked)}
     others = {str(camera_of_topic(topic)) for topic in located} - cameras
     return Shown(

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Iterator, Sequence
+from collections.abc import Callable, Iterator, Mapping, Sequence
 from typing import Any, NamedTuple
 
 import cv2
@@ -31,10 +31,11 @@ from ipsys_log.messages import (
     Message,
     Rig,
 )
+from ipsys_log.messages.channels import CALIBRATIONS, CAMERA_POINTS, MARKERS, RIG, RUN_EVENTS
+from ipsys_log.messages.stage import Plan, Stage, View
 
-__all__ = ["METHODS", "PERIMETER", "READS", "CameraFrame", "check_method"]
+__all__ = ["METHODS", "PERIMETER", "STAGE", "CameraFrame", "check_method", "points_run"]
 
-READS = (Rig, CameraCalibration, Markers)
 PERIMETER = "perimeter"
 
 Array = NDArray[np.float64]
@@ -206,3 +207,35 @@ def check_method(name: str) -> str:
     if name not in METHODS:
         raise IpsysError(f"method {name!r} is not known; use one of {', '.join(METHODS)}")
     return name
+
+
+def points_run(markers: str, method: str) -> str:
+    """Return the name of a run of camera points: the run of its markers, with the method."""
+    return markers if method == PERIMETER else f"{markers}_{method}"
+
+
+def _plan(view: View, options: Mapping[str, str]) -> Plan | str:
+    method = options.get("method", PERIMETER)
+    markers = view.run(MARKERS)
+    if not markers:
+        if method != PERIMETER:
+            raise IpsysError(f"--method {method}: cannot take effect, the log has no markers")
+        return view.newest(CAMERA_POINTS)
+    return Plan(
+        run=points_run(markers, method),
+        # Logs from before there was a choice have no such parameter.
+        parameters={} if method == PERIMETER else {"method": method},
+        reads=(RIG, MARKERS, CALIBRATIONS),
+        step=lambda run: CameraFrame(method),
+    )
+
+
+STAGE = Stage(
+    name="camera-frame",
+    versions={"camera-frame": 1, PERIMETER: 1, "pose": 1},
+    reads=(RIG, CALIBRATIONS, MARKERS),
+    writes=(CAMERA_POINTS, RUN_EVENTS),
+    plan=_plan,
+    rig_part=lambda rig: (rig.marker_length_m, {(m.id, rig.length_of(m.id)) for m in rig.markers}),
+    method=lambda parameters, view: parameters.get("method", PERIMETER),
+)

@@ -9,21 +9,33 @@ import numpy as np
 from numpy.typing import NDArray
 
 from ipsys_log.analysis.accuracy import errors_cross_validated, errors_held_out
+from ipsys_log.analysis.calibration_points import (
+    find_pairs,
+    has_measurements,
+    held_out_ids,
+    measured,
+    split_parameters,
+)
 from ipsys_log.analysis.cross_validation import (
     FOLDS,
+    REPEATS,
     gather_places,
+    labelled_subsets,
     learning_curve,
     learning_sizes,
     leave_one_out,
     published_curve,
 )
+from ipsys_log.analysis.ground_truth import gather_tracks, true_points
 from ipsys_log.analysis.outliers import find_suspects
 from ipsys_log.analysis.pairs import Measured
 from ipsys_log.errors import FitError
 from ipsys_log.messages import Evaluation, LearningPoint, Model, Pair, Suspect
+from ipsys_log.messages.channels import CAMERA_POINTS, EVALUATION, MEASUREMENTS, MODEL, RIG, TRUTH
+from ipsys_log.messages.stage import Plan, Progress, Stage, View
 from ipsys_log.models.table import Places, min_pairs
 
-__all__ = ["SCREENING", "Study", "evaluate_model"]
+__all__ = ["SCREENING", "STAGE", "Study", "can_evaluate", "evaluate_model"]
 
 # The models that measurements are checked with: of those that fit in milliseconds the ones that follow
 # the places closely enough to see an error of some centimetres.
@@ -110,3 +122,67 @@ def _suspects(name: str, cameras: Mapping[str, Places], places: Sequence[Measure
         return find_suspects(leave_one_out(name, cameras), [p for p in places if p.measurement.id in seen])
     except FitError:
         return ()
+
+
+def can_evaluate(view: View, options: Mapping[str, str], model: str) -> bool:
+    """Return whether a model has held-out points, or enough points for cross-validation."""
+    measurements = [point.measurement for point in measured(view)]
+    enough = len(measurements) - -(-len(measurements) // FOLDS) >= min_pairs(model)
+    held_out = held_out_ids(measurements, options)
+    return bool(held_out) or (_is_fitted_here(view, options, model) and enough)
+
+
+def _is_fitted_here(view: View, options: Mapping[str, str], model: str) -> bool:
+    """Return whether a model is fitted to points of this log, so that it can be fitted to fewer of them."""
+    if "model_from" in options:
+        return False
+    return has_measurements(view) or all(copy.name != model for _, copy in view.copied(MODEL))
+
+
+def _plan(view: View, options: Mapping[str, str]) -> Plan | str:
+    model: Model = view.payloads(MODEL)[-1]
+    if not can_evaluate(view, options, model.name):
+        return ""
+    again = _is_fitted_here(view, options, model.name)
+    seed = options.get("seed", "0")
+    reads = (RIG, CAMERA_POINTS, MODEL, MEASUREMENTS, TRUTH)
+    notes: list[str] = []
+
+    def compute(progress: Progress) -> Evaluation:
+        points = measured(view)
+        measurements = [point.measurement for point in points]
+        study = Study(
+            points,
+            find_pairs(view, points),
+            held_out_ids(measurements, options),
+            labelled_subsets(measurements),
+            true_points(points, gather_tracks(view.messages(TRUTH))),
+            int(seed) if again else None,
+        )
+        return evaluate_model(model, study, view.last_ns(*reads), notes, progress)
+
+    folds = {"folds": str(FOLDS), "repeats": str(REPEATS), "seed": seed}
+    return Plan(
+        run=view.run(MODEL),
+        parameters={**split_parameters(view, options), **folds} if again else {},
+        reads=reads,
+        compute=compute,
+        notes=notes,
+    )
+
+
+def _method(_parameters: Mapping[str, str], view: View) -> str:
+    models = view.payloads(MODEL)
+    return models[-1].name if models else ""
+
+
+STAGE = Stage(
+    name="evaluate",
+    versions={"evaluate": 1},
+    reads=(RIG, CAMERA_POINTS, MODEL, MEASUREMENTS, TRUTH),
+    writes=(EVALUATION,),
+    plan=_plan,
+    rig_part=lambda rig: (rig.reference_points, {m.id for m in rig.markers}),
+    method=_method,
+    causal=False,
+)

@@ -7,13 +7,23 @@ from collections.abc import Callable, Mapping, Sequence
 import numpy as np
 from numpy.typing import NDArray
 
+from ipsys_log.analysis.calibration_points import (
+    find_pairs,
+    has_measurements,
+    measured,
+    split_ids,
+    split_parameters,
+)
 from ipsys_log.analysis.cross_validation import deal, gather_places, predict_without
+from ipsys_log.analysis.pairs import level_cameras
 from ipsys_log.errors import FitError
 from ipsys_log.messages import CameraModel, Model, Noise, Pair, Parameter
-from ipsys_log.models.table import Places, fit_cameras, inputs, min_pairs, parameters
+from ipsys_log.messages.channels import CAMERA_POINTS, MEASUREMENTS, MODEL, RIG
+from ipsys_log.messages.stage import Plan, Progress, Stage, View
+from ipsys_log.models.table import MODEL_VERSIONS, Places, fit_cameras, inputs, min_pairs, parameters
 from ipsys_log.models.uncertainty import Uncertainty, estimate_uncertainty
 
-__all__ = ["fit_model"]
+__all__ = ["STAGE", "fit_model", "model_run"]
 
 Array = NDArray[np.float64]
 
@@ -145,3 +155,67 @@ def _noise(
         predict, places.points_m, places.world_m, tape_m2, without, groups
     )
     return Noise(found.along, found.across, found.growth, found.fit)
+
+
+def model_run(model: str) -> str:
+    """Return the name of the run of a model, unless it is taken."""
+    return model.replace("+", "_").replace("-", "_")
+
+
+def _plan(view: View, options: Mapping[str, str]) -> Plan | str:
+    name = options["model"]
+    if not has_measurements(view):
+        copied = next((run for run, model in view.copied(MODEL) if model.name == name), None)
+        if copied is not None:
+            return copied
+    notes: list[str] = []
+
+    def compute(progress: Progress) -> Model:
+        points = measured(view)
+        train, _ = split_ids([point.measurement for point in points], options)
+        pairs = {
+            camera: [pair for pair in seen if pair.measurement in train]
+            for camera, seen in find_pairs(view, points).items()
+        }
+        fitted = fit_model(name, pairs, view.last_ns(RIG, CAMERA_POINTS, MEASUREMENTS), progress)
+        notes.extend(_unused_points(pairs, train))
+        notes.extend(
+            f"camera {camera}: all measured places are {height_m:.3f} m high, so heights cannot be learned: "
+            "its model is good in x and y, and says that height"
+            for camera, height_m in level_cameras(fitted).items()
+        )
+        return fitted
+
+    return Plan(
+        run=model_run(name),
+        parameters={"model": name, **split_parameters(view, options)},
+        reads=(RIG, CAMERA_POINTS, MEASUREMENTS),
+        compute=compute,
+        notes=notes,
+    )
+
+
+def _unused_points(pairs: Mapping[str, list[Pair]], train: set[str]) -> list[str]:
+    """Return remarks on points that no camera saw, and on cameras that saw no point."""
+    seen = {pair.measurement for found in pairs.values() for pair in found}
+    unseen = sorted(train - seen)
+    lines = [
+        f"camera {name} saw no measured place: it has no model" for name, found in pairs.items() if not found
+    ]
+    if unseen:
+        names = ", ".join(unseen[:5]) + (" ..." if len(unseen) > 5 else "")
+        lines.append(f"{len(unseen)} of {len(train)} measured places were seen still by no camera: {names}")
+    return lines
+
+
+STAGE = Stage(
+    name="fit",
+    versions={"fit": 1, **MODEL_VERSIONS},
+    reads=(RIG, CAMERA_POINTS, MEASUREMENTS),
+    writes=(MODEL,),
+    plan=_plan,
+    rig_part=lambda rig: (rig.reference_points, {m.id for m in rig.markers}),
+    method=lambda parameters, view: parameters.get("model", ""),
+    causal=False,
+    of_model=True,
+)

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterator
+from collections.abc import Iterator, Mapping
 from typing import Any
 
 import numpy as np
@@ -16,17 +16,16 @@ from ipsys_log.messages import (
     FrameTransforms,
     Message,
     Position,
-    Positions,
     Quaternion,
     Rig,
     Track,
     Tracks,
     Vector3,
 )
+from ipsys_log.messages.channels import EVENTS, POSES, POSITIONS, RIG, TRACKS
+from ipsys_log.messages.stage import Plan, Stage, View
 
-__all__ = ["READS", "Fuse", "fuse_positions"]
-
-READS = (Rig, Positions, Event)
+__all__ = ["STAGE", "Fuse", "fuse_positions"]
 
 
 class Fuse:
@@ -161,3 +160,25 @@ def _transform(track: Track, run: str, time_ns: int) -> FrameTransform:
         Vector3(track.x_m, track.y_m, track.z_m),
         Quaternion(0.0, 0.0, float(np.sin(half_rad)), float(np.cos(half_rad))),
     )
+
+
+def _plan(view: View, _options: Mapping[str, str]) -> Plan:
+    has_late_frames = any(event.kind == STAMP_UNRELIABLE for event in view.payloads(EVENTS))
+    return Plan(
+        run=view.run(POSITIONS),
+        parameters={},
+        # A log without such events keeps its runs.
+        reads=(RIG, POSITIONS, *([EVENTS] if has_late_frames else [])),
+        step=Fuse,
+    )
+
+
+STAGE = Stage(
+    name="fuse",
+    versions={"fuse": 1},
+    reads=(RIG, POSITIONS, EVENTS),
+    writes=(TRACKS, POSES),
+    plan=_plan,
+    rig_part=lambda rig: {(m.id, m.robot) for m in rig.markers},
+    per_camera=False,
+)

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterator
+from collections.abc import Iterator, Mapping
 from typing import Any
 
 import numpy as np
@@ -10,13 +10,13 @@ from numpy.typing import NDArray
 
 from ipsys_log.errors import IpsysError
 from ipsys_log.messages import CameraPoint, CameraPoints, Message, Model, Position, Positions, Rig
+from ipsys_log.messages.channels import CAMERA_POINTS, MODEL, POSITIONS, RIG
+from ipsys_log.messages.stage import Plan, Stage, View
 from ipsys_log.models.table import AppliedModel, reads_height
 
-__all__ = ["READS", "Locate"]
+__all__ = ["STAGE", "Locate"]
 
 Array = NDArray[np.float64]
-
-READS = (Rig, CameraPoints)
 
 # Far enough for the digits, near enough for the curvature of a model.
 _STEP_M = 0.01
@@ -36,6 +36,8 @@ class Locate:
     def __call__(self, message: Message) -> Iterator[Any]:
         if isinstance(message.payload, Rig):
             self._rig = message.payload
+            return
+        if not isinstance(message.payload, CameraPoints):  # the model, which it has already
             return
         applied = self._cameras.get(str(message.camera))
         if applied is not None:
@@ -83,3 +85,29 @@ def _positions(
         for n, (point, (x_m, y_m, z_m)) in enumerate(zip(points, world.tolist(), strict=True))
         if np.isfinite(world[n]).all()
     )
+
+
+def _plan(view: View, _options: Mapping[str, str]) -> Plan:
+    model: Model = view.payloads(MODEL)[-1]
+    return Plan(
+        run=view.run(MODEL),
+        parameters={},
+        reads=(*([RIG] if reads_height(model.name) else []), CAMERA_POINTS, MODEL),
+        step=lambda run: Locate(model),
+    )
+
+
+def _method(_parameters: Mapping[str, str], view: View) -> str:
+    models = view.payloads(MODEL)
+    return models[-1].name if models else ""
+
+
+STAGE = Stage(
+    name="locate",
+    versions={"locate": 1},
+    reads=(RIG, CAMERA_POINTS, MODEL),
+    writes=(POSITIONS,),
+    plan=_plan,
+    rig_part=lambda rig: (rig.marker_height_m, {(m.id, m.height_m) for m in rig.markers}),
+    method=_method,
+)

@@ -19,15 +19,14 @@ from ipsys_log.log.dataset import Session
 from ipsys_log.log.writer import LogWriter
 from ipsys_log.messages import (
     MEASUREMENTS_TOPIC,
-    CameraPoints,
     CompressedImage,
     CompressedVideo,
-    Markers,
     Measurement,
     Message,
     Model,
     Rig,
 )
+from ipsys_log.messages.channels import CAMERA_POINTS, MARKERS, MEASUREMENTS, MODEL, RIG, Channel
 from ipsys_log.pipeline import replay
 from ipsys_log.runs.options import Progress, Request
 from ipsys_log.runs.output import write_messages
@@ -81,7 +80,7 @@ def opened_log(
             )
     replay([path], request, "camera-frame", progress=progress, say=say)
     with Session([path]) as session:
-        for line in out_of_date_lines(session, [newest_run(session, Model)]):
+        for line in out_of_date_lines(session, [newest_run(session, MODEL)]):
             say(line)
         yield FinishedLog(path, session, rigs[-1])
 
@@ -93,16 +92,16 @@ class FinishedLog:
         self.path, self.rig = path, rig
         self._session = session
         self.start_ns = session.start_ns
-        self._topics: dict[type, list[str]] = {
-            payload: _newest(session, payload) for payload in (CameraPoints, Markers)
+        self._topics: dict[Channel, list[str]] = {
+            channel: _newest(session, channel) for channel in (CAMERA_POINTS, MARKERS)
         }
-        cameras = {str(camera_of_topic(topic)) for topic in self._topics[CameraPoints]}
+        cameras = {str(camera_of_topic(topic)) for topic in self._topics[CAMERA_POINTS]}
         self._cameras = sorted({*session.images, *cameras})
         self._seen: dict[int, list[View]] = {}
-        models = session.payloads(_newest(session, Model))
+        models = session.payloads(_newest(session, MODEL))
         self.model: Model | None = models[-1] if models else None
-        self._history = list(session.messages(session.topics(Measurement)))
-        self.stops = _find_stops(gather_sightings(session.messages(self._topics[CameraPoints])), rig)
+        self._history = list(session.messages(session.topics(MEASUREMENTS)))
+        self.stops = _find_stops(gather_sightings(session.messages(self._topics[CAMERA_POINTS])), rig)
         if not self.stops:
             raise IpsysError(
                 f"{path}: no marker of the rig lies still in it for two frames or longer: there is nothing "
@@ -149,13 +148,13 @@ class FinishedLog:
         """What other processes have measured since it was looked last."""
         known = {(one.payload.id, one.payload.withdraws) for one in self._history}
         with Session([self.path]) as now:
-            found = now.messages(now.topics(Measurement))
+            found = now.messages(now.topics(MEASUREMENTS))
             return [one for one in found if (one.payload.id, one.payload.withdraws) not in known]
 
     def _view(self, camera: str, here: Stop) -> View:
         middle_ns = here.start_ns + (here.end_ns - here.start_ns) // 2
-        seen = [m for m in self._within(CameraPoints, camera, here) if _sees(m, here)]
-        found = self._within(Markers, camera, here)
+        seen = [m for m in self._within(CAMERA_POINTS, camera, here) if _sees(m, here)]
+        found = self._within(MARKERS, camera, here)
         marked = min(found, key=lambda m: abs(m.publish_time_ns - middle_ns), default=None)
         jpeg = self._picture(camera, marked.log_time_ns if marked else middle_ns)
         return View(
@@ -166,9 +165,9 @@ class FinishedLog:
             tuple(message.payload for message in seen),
         )
 
-    def _within(self, payload: type, camera: str, here: Stop) -> list[Message]:
+    def _within(self, channel: Channel, camera: str, here: Stop) -> list[Message]:
         """Messages of a camera that speak of a stretch."""
-        topics = [topic for topic in self._topics[payload] if camera_of_topic(topic) == camera]
+        topics = [topic for topic in self._topics[channel] if camera_of_topic(topic) == camera]
         found = self._session.messages(topics, here.start_ns - _LATE_NS, here.end_ns + _LATE_NS)
         return [m for m in found if here.start_ns - _ROLLING_NS <= m.publish_time_ns <= here.end_ns]
 
@@ -196,12 +195,12 @@ class FinishedLog:
 
 def rigs_of(session: Session, request: Request) -> list[Rig]:
     """The rigs of a log, or the one that holds instead; the last one is measured with."""
-    return [request.rig] if request.rig is not None else session.payloads(session.topics(Rig))
+    return [request.rig] if request.rig is not None else session.payloads(session.topics(RIG))
 
 
-def _newest(session: Session, payload: type) -> list[str]:
-    run = newest_run(session, payload)
-    return session.topics(payload, run) if run else []
+def _newest(session: Session, channel: Channel) -> list[str]:
+    run = newest_run(session, channel)
+    return session.topics(channel, run) if run else []
 
 
 def _message(measurement: Measurement, earlier: Sequence[Message]) -> Message:

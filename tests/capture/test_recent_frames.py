@@ -32,11 +32,11 @@ from ipsys_log.messages import (
     Markers,
     Measurement,
     Message,
-    Model,
     Pair,
     Rig,
     image_topic,
 )
+from ipsys_log.messages.channels import MEASUREMENTS, MODEL
 from ipsys_log.runs.options import Request
 from ipsys_log.runs.output import write_log
 from ipsys_log.runs.select import find_pairs
@@ -207,7 +207,7 @@ def tape_of(lab_log: Path) -> tuple[Rig, dict[tuple[int, bytes], Measurement]]:
     with Session([lab_log]) as session:
         (rig,) = session.payloads(["/rig"])
         found = {}
-        for one in session.payloads(session.topics(Measurement)):
+        for one in session.payloads(session.topics(MEASUREMENTS)):
             for topic in session.images.values():
                 for message in session.messages([topic]):
                     if abs(message.publish_time_ns - one.timestamp) < NS_PER_S:
@@ -259,7 +259,7 @@ def pairs(log: Path) -> dict[tuple[str, str], Pair]:
     """What each camera saw of each place."""
     with Session([log]) as session:
         found = find_pairs(session, "edges", measured_places(session, None))
-        (model,) = session.payloads(session.topics(Model, "rigid"))
+        (model,) = session.payloads(session.topics(MODEL, "rigid"))
     seen = {(camera, pair.measurement): pair for camera, of_camera in found.items() for pair in of_camera}
     fitted = {(camera.camera, pair.measurement) for camera in model.cameras for pair in camera.pairs}
     assert fitted

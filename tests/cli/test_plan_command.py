@@ -14,7 +14,8 @@ import numpy as np
 import pytest
 
 from ipsys_log.log.dataset import Session
-from ipsys_log.messages import CameraCalibration, Measurement, Message, Model, Rig
+from ipsys_log.messages import CameraCalibration, Measurement, Message, Rig
+from ipsys_log.messages.channels import MEASUREMENTS, MODEL
 from ipsys_log.pipeline import replay
 from ipsys_log.runs.options import Request
 from ipsys_log.runs.output import write_log
@@ -103,7 +104,7 @@ def test_the_plan_is_a_table_and_a_headline(
     assert "fit           run best  1 message\n" in done.err
     assert data_section(paper).startswith(section)
     with Session([paper]) as session:
-        assert session.topics(Model, "best") == ["/runs/best/model"]
+        assert session.topics(MODEL, "best") == ["/runs/best/model"]
     again, size = ipsys("plan", paper), paper.stat().st_size
     assert again.out == done.out
     assert size == paper.stat().st_size
@@ -169,7 +170,7 @@ def test_the_picture(ipsys: Ipsys, fitted: Path) -> None:
 def test_the_authors_ten_places_want_more_where_there_are_none(ipsys: Ipsys, authors: Path) -> None:
     found = planned(ipsys, authors, "--train", "train_10", "--places", 6)
     with Session([authors]) as session:
-        measurements = session.payloads(session.topics(Measurement))
+        measurements = session.payloads(session.topics(MEASUREMENTS))
     points = [m.point for m in measurements if "train_10" in m.splits]
     measured_m = np.array([(p.x_m, p.y_m) for p in points])
     planned_m = np.array([(place["x_m"], place["y_m"]) for place in found["places"]])

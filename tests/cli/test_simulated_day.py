@@ -21,10 +21,10 @@ from ipsys_log.messages import (
     Measurement,
     Message,
     Rig,
-    Tracks,
     calibration_topic,
     image_topic,
 )
+from ipsys_log.messages.channels import TRACKS
 from ipsys_log.rig.file import load_rig
 from ipsys_log.runs.output import write_log
 from ipsys_log.simulation.cameras import hang_cameras
@@ -44,7 +44,7 @@ def errors_m(log: Path, run: str = "poly") -> np.ndarray:
     lying = {where.marker_id: where for where in lab.lying}
     offsets = []
     with Session([log]) as session:
-        for tracks in session.payloads(session.topics(Tracks, run)):
+        for tracks in session.payloads(session.topics(TRACKS, run)):
             frame = round(tracks.timestamp * LIVE_SETTINGS.rate_hz / 1e9)
             time_s = shown_at(frame, count) / LIVE_SETTINGS.rate_hz
             for track in tracks.tracks:

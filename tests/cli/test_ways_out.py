@@ -20,7 +20,8 @@ import pytest
 from ipsys_log.analysis.differences import Extent, explain_apart
 from ipsys_log.cli.signals import Interrupted, note_kept, say_kept
 from ipsys_log.log.dataset import Session
-from ipsys_log.messages import CameraCalibration, CameraPoints, Markers, Message, Positions, Rig
+from ipsys_log.messages import CameraCalibration, CameraPoints, Markers, Message, Positions
+from ipsys_log.messages.channels import RIG
 from ipsys_log.runs.output import write_log
 from ipsys_log.simulation.lab import simulate
 from ipsys_log.simulation.settings import LabSettings
@@ -97,7 +98,7 @@ def rig_file(lab: Path, *cameras: str) -> Path:
     path.unlink(missing_ok=True)
     text = ['name = "lab"', 'dictionary = "DICT_4X4_100"', "marker_length_m = 0.2"]
     with Session([lab]) as session:
-        for point in session.payloads(session.topics(Rig))[0].reference_points:
+        for point in session.payloads(session.topics(RIG))[0].reference_points:
             text += [
                 "[[reference_points]]",
                 f'name = "{point.name}"',

@@ -17,16 +17,13 @@ from ipsys_log.log.dataset import Session
 from ipsys_log.log.writer import LogWriter
 from ipsys_log.messages import (
     CameraCalibration,
-    CameraPoints,
-    Event,
-    Markers,
     Measurement,
     Message,
-    Model,
     Rig,
     Run,
     Tracks,
 )
+from ipsys_log.messages.channels import CAMERA_POINTS, MARKERS, MODEL, RIG, RUN_EVENTS
 from ipsys_log.rig.file import load_rig
 from ipsys_log.runs.output import append_messages, write_log, write_messages
 from tests.conftest import ROOT, Ipsys
@@ -66,7 +63,7 @@ def change(log: Path, edit: Callable[[Any], Any]) -> Path:
 def robots(folder: Path, log: Path, prefix: str) -> Path:
     """A rig file that differs from the log's in the names of the robots only."""
     with Session([log]) as session:
-        rig = session.payloads(session.topics(Rig))[0]
+        rig = session.payloads(session.topics(RIG))[0]
     text = f'name = "a"\ndictionary = "{rig.dictionary}"\nmarker_length_m = {rig.marker_length_m}\n'
     for p in rig.reference_points:
         text += f'[[reference_points]]\nname = "{p.name}"\nx_m = {p.x_m}\ny_m = {p.y_m}\n'
@@ -273,13 +270,13 @@ def test_a_rig_recorded_later_does_not_change_what_was_measured_before(ipsys: Ip
     ipsys("replay", paper)
     with Session([paper]) as session:
         rig, end_ns = session.payloads(["/rig"])[0], session.end_ns
-        old = session.payloads(session.topics(Model, "poly"))[0]
+        old = session.payloads(session.topics(MODEL, "poly"))[0]
     moved = replace(rig, reference_points=tuple(replace(p, x_m=p.x_m + 0.1) for p in rig.reference_points))
     with LogWriter.append(paper) as writer:
         write_messages(writer, [Message("/rig", end_ns + 1, end_ns + 1, moved)])
     assert ipsys("replay", paper).code == 0
     with Session([paper]) as session:
-        new = session.payloads(session.topics(Model, "poly_2"))[0]
+        new = session.payloads(session.topics(MODEL, "poly_2"))[0]
     for one, other in zip(old.cameras, new.cameras, strict=True):
         for p, q in zip(one.parameters, other.parameters, strict=True):
             np.testing.assert_array_equal(p.values, q.values)
@@ -297,8 +294,8 @@ def test_a_marker_beyond_the_lens_is_left_out_and_named(ipsys: Ipsys, paper: Pat
     assert done.code == 0, done.err
     assert "outside lens" in done.err
     with Session([log]) as session:
-        points = [p for m in session.payloads(session.topics(CameraPoints, "edges")) for p in m.points]
-        events = session.payloads(session.topics(Event, "edges"))
+        points = [p for m in session.payloads(session.topics(CAMERA_POINTS, "edges")) for p in m.points]
+        events = session.payloads(session.topics(RUN_EVENTS, "edges"))
     assert {event.camera for event in events} == {"red"}
     assert all(np.isfinite([p.x_m, p.y_m, p.z_m]).all() and abs(p.z_m) < 10 for p in points)
 
@@ -306,8 +303,8 @@ def test_a_marker_beyond_the_lens_is_left_out_and_named(ipsys: Ipsys, paper: Pat
 def test_a_model_and_its_evaluation_speak_of_the_last_input(ipsys: Ipsys, lab: Path) -> None:
     ipsys("replay", lab)
     with Session([lab]) as session:
-        inputs = list(session.messages([*session.topics(CameraPoints, "edges"), "/measurements", "/rig"]))
-        (model,) = session.messages(session.topics(Model, "poly"))
+        inputs = list(session.messages([*session.topics(CAMERA_POINTS, "edges"), "/measurements", "/rig"]))
+        (model,) = session.messages(session.topics(MODEL, "poly"))
     assert (model.log_time_ns, model.publish_time_ns) == (inputs[-1].log_time_ns, inputs[-1].publish_time_ns)
     assert model.payload.timestamp == model.publish_time_ns
 
@@ -371,7 +368,7 @@ def test_the_rig_taken_out_says_what_a_camera_does_to_edges(ipsys: Ipsys, tmp_pa
     # With it, every marker has the same.
     assert ipsys("detect", lab, "--rig", path).code == 0
     with Session([lab]) as session:
-        (topic,) = session.topics(Markers, "edges_2")[:1]
+        (topic,) = session.topics(MARKERS, "edges_2")[:1]
         found = {m.edge_offset_px for p in session.payloads([topic]) for m in p.markers}
     assert len(found) <= 1 or np.ptp(list(found)) < 1e-3
 

@@ -25,6 +25,7 @@ from ipsys_log.messages import (
     Rig,
     RigMarker,
 )
+from ipsys_log.messages.channels import CAMERA_POINTS
 from ipsys_log.runs.options import Request
 from ipsys_log.runs.output import write_log
 from ipsys_log.stages.camera_frame import METHODS, CameraFrame
@@ -197,7 +198,7 @@ def test_another_method_is_another_run(ipsys: Ipsys, tmp_path: Path) -> None:
     with Session([log]) as session:
         parameters = {r.run: r.parameters for r in session.runs() if r.stage == "camera-frame"}
         assert parameters == {"edges": {}, "edges_pose": {"method": "pose"}}
-        by_pose = session.payloads(session.topics(CameraPoints, "edges_pose"))
+        by_pose = session.payloads(session.topics(CAMERA_POINTS, "edges_pose"))
         assert all(len(point.poses) == 2 for frame in by_pose for point in frame.points)
 
 

@@ -32,6 +32,7 @@ from ipsys_log.messages import (
     Tracks,
     Vector3,
 )
+from ipsys_log.messages.channels import TRACKS
 from ipsys_log.pipeline import replay
 from ipsys_log.runs.options import Request
 from ipsys_log.runs.output import write_log
@@ -139,7 +140,7 @@ def drive_error_m(log: Path, rig: Rig | None) -> float:
     fused = replay([log], Request(models=("rayplane",), rig=rig))[-1]
     start_ns = drive_start_ns(ROLLING, hang_cameras(ROLLING))
     with Session([log]) as session:
-        made = list(session.messages(session.topics(Tracks, fused.run)))
+        made = list(session.messages(session.topics(TRACKS, fused.run)))
         tracks = gather_tracks(m for m in made if m.publish_time_ns >= start_ns)
         found = track_errors(tracks, gather_tracks(session.messages([TRUTH_TOPIC])))
     assert found is not None

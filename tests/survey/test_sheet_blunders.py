@@ -14,6 +14,7 @@ import pytest
 from ipsys_log.analysis.pairs import active_measurements
 from ipsys_log.log.dataset import Session
 from ipsys_log.messages import Measurement, Rig
+from ipsys_log.messages.channels import MEASUREMENTS
 from ipsys_log.runs.options import Request
 from ipsys_log.survey.entry import Typed
 from ipsys_log.survey.from_log import opened_log
@@ -167,7 +168,7 @@ def test_undo_in_the_terminal_asks_for_older_points(
 
     def left() -> list[str]:
         with Session([log]) as log_now:
-            return [m.id for m in active_measurements(log_now.payloads(log_now.topics(Measurement)))]
+            return [m.id for m in active_measurements(log_now.payloads(log_now.topics(MEASUREMENTS)))]
 
     said = session("u", "", "q")
     assert "is of an earlier session. Withdraw it? [y/N]" in said

@@ -23,6 +23,7 @@ from ipsys_log.messages import (
     Rig,
     RigMarker,
 )
+from ipsys_log.messages.channels import MEASUREMENTS
 from ipsys_log.runs.options import Request
 from ipsys_log.survey.from_log import FinishedLog, opened_log
 from ipsys_log.survey.scene import Stop, View
@@ -319,7 +320,7 @@ def test_place_after_place_in_through_the_token(hand: Phone, unmeasured: Unmeasu
             says(hand, "#places", f"p00{number + 1}")
         stops = scene.stops[:5]
     with Session([log]) as session:
-        saved = session.payloads(session.topics(Measurement))
+        saved = session.payloads(session.topics(MEASUREMENTS))
     for stop, one in zip(stops, sorted(saved, key=lambda m: str(m.id)), strict=True):
         (meant,) = [m for m in tape if stop.covers(m)]
         assert stop.covers(one)

@@ -17,7 +17,8 @@ import rerun as rr
 from ipsys_log.analysis.pairs import measured_places
 from ipsys_log.errors import IpsysError
 from ipsys_log.log.dataset import Session
-from ipsys_log.messages import MEASUREMENTS_TOPIC, TRUTH_TOPIC, Measurement
+from ipsys_log.messages import MEASUREMENTS_TOPIC, TRUTH_TOPIC
+from ipsys_log.messages.channels import MEASUREMENTS
 from ipsys_log.sinks.rerun.messages import RerunSink, trail_entity
 from ipsys_log.sinks.rerun.scene import draw_places, draw_rig, layout
 from ipsys_log.sinks.selection import Shown, choose_runs, fade_ns, rig_in_force
@@ -183,7 +184,7 @@ def _stream(session: Session, shown: Shown, write: Callable[[bytes], object]) ->
 def _draw(session: Session, shown: Shown, recording: rr.RecordingStream, sent: Callable[[], object]) -> None:
     """Draw a whole session; ``sent`` is called repeatedly, and at the end."""
     rig = rig_in_force(session, [run for run in (shown.markers, *shown.runs) if run])
-    measurements = session.payloads(session.topics(Measurement))
+    measurements = session.payloads(session.topics(MEASUREMENTS))
     places, faults = measured_places(measurements, rig)
     trails = [trail_entity(run) for run in (*shown.runs, *([None] if TRUTH_TOPIC in shown.moving else []))]
     recording.send_blueprint(layout(shown.cameras, trails, rig, events=bool(shown.events or faults)))

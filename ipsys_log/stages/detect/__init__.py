@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections import Counter
-from collections.abc import Iterator
+from collections.abc import Collection, Iterable, Iterator, Mapping
 from contextlib import suppress
 from dataclasses import replace
 from typing import Any
@@ -15,9 +15,9 @@ from ipsys_log.geometry.lenses import check_calibration, check_size, same_lens
 from ipsys_log.images.decode import decode_grey
 from ipsys_log.images.video import Video
 from ipsys_log.messages import (
+    FRAME_SKIPPED,
     CameraCalibration,
     Color,
-    CompressedImage,
     CompressedVideo,
     Event,
     ImageAnnotations,
@@ -26,12 +26,21 @@ from ipsys_log.messages import (
     Message,
     Point2,
     PointsAnnotation,
-    RawImage,
     Rig,
     RigCamera,
     SkippedVideo,
     TextAnnotation,
 )
+from ipsys_log.messages.channels import (
+    ANNOTATIONS,
+    CALIBRATIONS,
+    EVENTS,
+    IMAGES,
+    MARKERS,
+    RIG,
+    RUN_EVENTS,
+)
+from ipsys_log.messages.stage import Plan, Stage, View
 from ipsys_log.stages.detect.edges import Fit
 from ipsys_log.stages.detect.follow import Follow
 from ipsys_log.stages.detect.stock import detect_markers, marker_detector
@@ -40,16 +49,17 @@ from ipsys_log.units import NS_PER_S
 __all__ = [
     "CORNERS",
     "EDGES",
-    "READS",
+    "STAGE",
     "STOCK",
     "Detect",
     "check_corners",
     "decode_grey",
     "detect_markers",
     "marker_detector",
+    "skipped_frames",
+    "usual_corners",
 ]
 
-READS = (Rig, CameraCalibration, CompressedImage, CompressedVideo, SkippedVideo, RawImage)
 EDGES, STOCK = CORNERS = ("edges", "stock")
 
 _GREEN = Color(0.1, 0.9, 0.3, 1.0)
@@ -103,7 +113,7 @@ class Detect:
         elif isinstance(payload, SkippedVideo):
             with suppress(FrameError):
                 self._video(message.camera, payload.frame).pass_over(payload.frame)
-        else:
+        elif not isinstance(payload, Event):  # events only say which frames a replay as live skips
             yield from self._frame(message)
 
     def _frame(self, message: Message) -> Iterator[Any]:
@@ -256,3 +266,64 @@ def _drawing(time_ns: int, markers: tuple[Marker, ...]) -> ImageAnnotations:
             for n, corners in shifted
         ),
     )
+
+
+def usual_corners(cameras: Iterable[str], with_lens: Collection[str]) -> str:
+    """Return the corner method that is used if none is named: edges if all cameras have intrinsics."""
+    return EDGES if set(cameras) <= set(with_lens) else STOCK
+
+
+def skipped_frames(events: Iterable[Event]) -> set[int]:
+    """Return the log times in ns of the frames that live processing skipped."""
+    return {event.timestamp for event in events if event.kind == FRAME_SKIPPED}
+
+
+def _plan(view: View, options: Mapping[str, str]) -> Plan | str:
+    if not view.cameras:
+        return view.newest(MARKERS)
+    corners = options.get("corners") or usual_corners(view.cameras, view.lenses)
+    skipped = skipped_frames(view.payloads(EVENTS))
+    as_live = "as_live" in options and bool(skipped)
+    without = sorted(set(view.cameras) - set(view.lenses))
+    notes = [] if options.get("corners") else [_why_stock(name) for name in without]
+    if skipped and not as_live:
+        notes.append(
+            f"{len(skipped)} frames that were skipped live are looked at too, which makes another run; "
+            "--as-live passes over them"
+        )
+    return Plan(
+        run=corners,
+        parameters={"corners": corners, **({"as_live": "yes"} if as_live else {})},
+        reads=(
+            RIG,
+            *([CALIBRATIONS] if corners == EDGES else []),
+            *([EVENTS] if as_live else []),
+            IMAGES,
+        ),
+        step=lambda run: Detect(corners),
+        notes=notes,
+    )
+
+
+def _why_stock(camera: str) -> str:
+    return (
+        f"camera {camera} has no calibration: corners are found as with --corners stock, ten times less "
+        f"exact than with --calibration {camera}=calibration.yaml"
+    )
+
+
+def _rig_part(rig: Rig) -> object:
+    shutters = {(camera.name, camera.row_time_ns, camera.edge_offset_px) for camera in rig.cameras}
+    return rig.dictionary, {m.id for m in rig.markers}, {one for one in shutters if any(one[1:])}
+
+
+STAGE = Stage(
+    name="detect",
+    versions={"detect": 1, EDGES: 1, STOCK: 1},
+    reads=(RIG, CALIBRATIONS, IMAGES, EVENTS),
+    writes=(MARKERS, ANNOTATIONS, RUN_EVENTS),
+    plan=_plan,
+    rig_part=_rig_part,
+    method=lambda parameters, view: parameters.get("corners", ""),
+    in_threads=True,
+)

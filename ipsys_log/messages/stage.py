@@ -1,0 +1,115 @@
+"""The row of a stage: the channels that it reads and writes, and the ways to plan and to carry out a run."""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Collection, Iterable, Iterator, Mapping
+from dataclasses import dataclass, field
+from typing import Any, Protocol
+
+from ipsys_log.messages.channels import Channel
+from ipsys_log.messages.message import Message
+from ipsys_log.messages.rig import Rig
+
+__all__ = ["Plan", "Progress", "Stage", "Step", "View"]
+
+# From a message to payloads; called with the messages in log order.
+Step = Callable[[Message], Iterable[Any]]
+# Called with the steps done, and the number of all steps.
+Progress = Callable[[int, int], None]
+
+
+class View(Protocol):
+    """What a stage may know of a log: its channels, those of runs from the runs that the stage reads."""
+
+    @property
+    def rig(self) -> Rig | None:
+        """The rig that replaces the one of the log, if any."""
+
+    @property
+    def cameras(self) -> Collection[str]:
+        """The names of the cameras with images."""
+
+    @property
+    def lenses(self) -> Collection[str]:
+        """The names of the cameras with intrinsics, of the log or given in their place."""
+
+    def run(self, channel: Channel, /) -> str:
+        """Return the run that the stage reads of a derived channel; "" if there is none."""
+
+    def messages(self, *channels: Channel) -> Iterator[Message]:
+        """Yield the messages of some channels in log order."""
+
+    def payloads(self, channel: Channel, /) -> list[Any]:
+        """Return the payloads of a channel."""
+
+    def last_ns(self, *channels: Channel) -> int:
+        """Return the publish time of the last message of some channels."""
+
+    def newest(self, channel: Channel, /) -> str:
+        """Return the newest complete run with a channel; "" if there is none."""
+
+    def copied(self, channel: Channel, /) -> Iterator[tuple[str, Any]]:
+        """Yield the complete runs with a channel, newest first, each with its last payload."""
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class Plan:
+    """What one run of a stage is: everything that makes its result what it is.
+
+    Attributes
+    ----------
+    run : its name, unless that is taken.
+    parameters : those on which the result depends, as the record of the run holds them.
+    reads : the channels of the row that a run with these parameters reads.
+    step : makes the step of a causal stage for a run of a given name; or
+    compute : returns the one payload of a stage that needs the whole log.
+    notes : remarks for the user; ``compute`` may add some.
+    """
+
+    run: str
+    parameters: Mapping[str, str]
+    reads: tuple[Channel, ...]
+    step: Callable[[str], Step] | None = None
+    compute: Callable[[Progress], Any] | None = None
+    notes: list[str] = field(default_factory=list)
+
+
+@dataclass(frozen=True, slots=True, kw_only=True, eq=False)
+class Stage:
+    """The row of a stage: all that the rest of the program knows about it.
+
+    Attributes
+    ----------
+    name : as its command and its records have it.
+    versions : of the stage and of its methods, by name. A version rises by one with each change of the output
+        for the same input.
+    reads : channels that its steps get; of recorded channels all, of derived ones those of one run.
+    writes : channels, the first is its purpose. Each has other payload types than the others.
+    plan : plans a run from a log and the options of the user, by name; or returns the name of a run that
+        serves in its place, "" if there is none.
+    rig_part : the part of the rig on which the result depends.
+    method : the method or model of a run, from its parameters and its view; "" for a stage without methods.
+    causal : it has steps: live tracking can run it.
+    per_camera : a step sees the messages of one camera only, so that cameras can be processed in parallel.
+    in_threads : its work is done outside of Python: one thread for each camera pays off.
+    of_model : each model has its own run of it, and so of the stages that read it.
+    """
+
+    name: str
+    versions: Mapping[str, int]
+    reads: tuple[Channel, ...]
+    writes: tuple[Channel, ...]
+    plan: Callable[[View, Mapping[str, str]], Plan | str]
+    rig_part: Callable[[Rig], Any]
+    method: Callable[[Mapping[str, str], View], str] = lambda parameters, view: ""
+    causal: bool = True
+    per_camera: bool = True
+    in_threads: bool = False
+    of_model: bool = False
+
+    def __repr__(self) -> str:
+        return f"<stage {self.name}>"
+
+    def channel_for(self, payload: type) -> Channel:
+        """Return the channel that the stage writes payloads of a type to."""
+        return next(channel for channel in self.writes if payload in channel.payloads)

@@ -1,0 +1,79 @@
+"""The view of a stage on a log: its channels, with what the user gives in place of the log's own."""
+
+from __future__ import annotations
+
+from collections.abc import Iterator, Mapping
+from dataclasses import dataclass, field
+from typing import Any
+
+from ipsys_log.log.dataset import Session
+from ipsys_log.messages import CameraCalibration, Message, Rig
+from ipsys_log.messages.channels import CALIBRATIONS, IMAGES, RIG, Channel
+from ipsys_log.runs.provenance import complete_runs, newest_run
+
+__all__ = ["LogView"]
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class LogView:
+    """The view of a stage on open logs.
+
+    Attributes
+    ----------
+    inputs : by derived channel, the run that the stage reads.
+    rig, given_lenses : in place of those of the log.
+    """
+
+    session: Session
+    inputs: Mapping[Channel, str] = field(default_factory=dict)
+    rig: Rig | None = None
+    given_lenses: Mapping[str, CameraCalibration] = field(default_factory=dict)
+
+    @property
+    def cameras(self) -> set[str]:
+        """The names of the cameras with images."""
+        return set(self.session.images)
+
+    @property
+    def lenses(self) -> set[str]:
+        """The names of the cameras with intrinsics, of the log or given in their place."""
+        return {*self.session.calibrations, *self.given_lenses}
+
+    def run(self, channel: Channel) -> str:
+        """Return the run that the stage reads of a derived channel; "" if there is none."""
+        return self.inputs.get(channel, "")
+
+    def topics(self, channel: Channel) -> list[str]:
+        """Return the topics of a channel in the log; those that are replaced are left out."""
+        if channel is RIG:
+            return [] if self.rig is not None else self.session.topics(RIG)
+        if channel is CALIBRATIONS:
+            held = self.session.calibrations.items()
+            return [topic for camera, topic in held if camera not in self.given_lenses]
+        if channel is IMAGES:
+            return list(self.session.images.values())
+        return self.session.topics(channel, self.run(channel) if channel.is_derived else None)
+
+    def messages(self, *channels: Channel) -> Iterator[Message]:
+        """Yield the messages of some channels in log order."""
+        return self.session.messages([topic for channel in channels for topic in self.topics(channel)])
+
+    def payloads(self, channel: Channel) -> list[Any]:
+        """Return the payloads of a channel."""
+        return self.session.payloads(self.topics(channel))
+
+    def last_ns(self, *channels: Channel) -> int:
+        """Return the publish time of the last message of some channels."""
+        return self.session.last([topic for channel in channels for topic in self.topics(channel)])[1]
+
+    def newest(self, channel: Channel) -> str:
+        """Return the newest complete run with a channel; "" if there is none."""
+        return newest_run(self.session, channel) or ""
+
+    def copied(self, channel: Channel) -> Iterator[tuple[str, Any]]:
+        """Yield the complete runs with a channel, newest first, each with its last payload."""
+        for run in reversed(complete_runs(self.session)):
+            written = {output.topic for output in run.outputs}
+            for topic in reversed(self.session.topics(channel, run.run)):
+                if topic in written:
+                    yield run.run, self.session.payloads([topic])[-1]

@@ -171,13 +171,13 @@ import os, sys, time
 from contextlib import contextmanager
 from pathlib import Path
 from ipsys_log import pipeline
-from ipsys_log.cli import cameras_now
+from ipsys_log.cli import open_cameras
 from ipsys_log.cli.signals import InterruptError, interruptible, runs_until_stopped
 from ipsys_log.errors import IpsysError
-from ipsys_log.log.storage import Disk
+from ipsys_log.log.journal import Disk
 from ipsys_log.messages import RigCamera
-from ipsys_log.sources.attached import Attached
-from ipsys_log.sources.frames import Clock, Frame
+from ipsys_log.capture.multiplexer import Attached
+from ipsys_log.capture.frames import Clock, Frame
 
 what, pwrite = sys.argv[2], Disk.pwrite
 
@@ -206,7 +206,7 @@ def stop(attached):
 @runs_until_stopped
 def record():
     with Attached([RigCamera("red", source="a:1")], opened, Clock()) as attached:
-        with cameras_now._ended(lambda: stop(attached), None):
+        with open_cameras._ended(lambda: stop(attached), None):
             pipeline.record(attached, [], Path(sys.argv[1]))
 
 Disk.pwrite = hanging
@@ -250,12 +250,12 @@ def test_a_second_interrupt_ends_what_hangs_and_the_log_is_kept(
 
 ENDING = """
 import signal, time
-from ipsys_log.cli import cameras_now
-from ipsys_log.sources.attached import Attached
-from ipsys_log.sources.frames import Clock
+from ipsys_log.cli import open_cameras
+from ipsys_log.capture.multiplexer import Attached
+from ipsys_log.capture.frames import Clock
 
 attached = Attached([], None, Clock())
-with cameras_now._ended(attached.stop, None):
+with open_cameras._ended(attached.stop, None):
     handler = signal.getsignal(signal.SIGINT)
     signal.signal(signal.SIGALRM, lambda *_: handler(signal.SIGINT, None))
     signal.setitimer(signal.ITIMER_REAL, 0.002, 0.002)

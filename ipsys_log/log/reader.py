@@ -69,7 +69,8 @@ class LogReader:
     Examples
     --------
     >>> from tempfile import TemporaryDirectory
-    >>> from ipsys_log.log import LogWriter, Schema
+    >>> from ipsys_log.log.contents import Schema
+    >>> from ipsys_log.log.writer import LogWriter
     >>> with TemporaryDirectory() as folder:
     ...     with LogWriter.create(Path(folder) / "a.mcap") as log:
     ...         log.add_channel("/a", Schema("A", "jsonschema", b"{}"), "json")

@@ -46,7 +46,7 @@ class LogWriter:
     Examples
     --------
     >>> from tempfile import TemporaryDirectory
-    >>> from ipsys_log.log import LogReader
+    >>> from ipsys_log.log.reader import LogReader
     >>> with TemporaryDirectory() as folder:
     ...     path = Path(folder) / "a.mcap"
     ...     with LogWriter.create(path) as log:

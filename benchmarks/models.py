@@ -19,6 +19,7 @@ import numpy as np
 from threadpoolctl import threadpool_limits
 
 from ipsys_log.analysis.accuracy import error_statistics
+from ipsys_log.analysis.calibration_points import measured
 from ipsys_log.analysis.cross_validation import cross_validate, gather_places, labelled_subsets
 from ipsys_log.analysis.pairs import Measured, build_pairs, gather_sightings
 from ipsys_log.exchange.imsel import read_imsel
@@ -27,7 +28,7 @@ from ipsys_log.messages import Pair
 from ipsys_log.messages.channels import CAMERA_POINTS
 from ipsys_log.models.table import MODELS
 from ipsys_log.runs.output import write_log
-from ipsys_log.runs.select import measured
+from ipsys_log.runs.view import LogView
 from ipsys_log.stages.evaluate import Study, evaluate_model
 from ipsys_log.stages.fit import fit_model
 
@@ -40,7 +41,7 @@ def read(folder: Path) -> tuple[dict[str, list[Pair]], list[Measured]]:
         log = Path(work) / "imsel.mcap"
         write_log(log, read_imsel(folder))
         with Session([log]) as session:
-            places = measured(session, None)
+            places = measured(LogView(session))
             points = gather_sightings(session.messages(session.topics(CAMERA_POINTS, "imsel")))
     return build_pairs(points, places), places
 

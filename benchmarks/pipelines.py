@@ -36,7 +36,7 @@ _REFINE = (cv2.TERM_CRITERIA_COUNT + cv2.TERM_CRITERIA_EPS, 40, 0.001)
 
 def _fed(stage: Callable[[Message], Any], message: Message) -> list[tuple[int, Corners]]:
     """The corners that a stage makes of a message, none of what it does not read."""
-    if not isinstance(message.payload, detect.READS):
+    if not any(isinstance(message.payload, channel.payloads) for channel in detect.STAGE.reads):
         return []
     found = [payload for payload in stage(message) if isinstance(payload, Markers)]
     return [(marker.id, marker.corners_px) for markers in found for marker in markers.markers]
@@ -186,11 +186,11 @@ def one_by_one(
 def threaded(path: Path, ranges: Sequence[tuple[int, int]]) -> Turn:
     """Ours as :func:`ipsys_log.pipeline.replay` runs it: a thread for each camera."""
     # Late: the whole package comes with it, and the other contenders start without.
-    from ipsys_log.runs.stream import Stage, in_threads, run
+    from ipsys_log.runs.stream import in_threads, run, wire
 
     cv2.setNumThreads(1)
     session, rig, lenses = _opened(path)
-    stage = Stage("bench", detect.READS, Detect(OURS))
+    stage = wire(detect.STAGE, "bench", {}, Detect(OURS))
     for _ in run([rig, *lenses.values()], [stage]):
         pass
 

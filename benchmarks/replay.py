@@ -61,10 +61,10 @@ def _whole(path: Path) -> Turn:
 
 def _detection(path: Path) -> Turn:
     from ipsys_log.log.dataset import Session
-    from ipsys_log.runs.stream import Stage, in_threads, run
+    from ipsys_log.runs.stream import in_threads, run, wire
     from ipsys_log.stages import detect
 
-    stage = Stage("bench", detect.READS, detect.Detect(detect.EDGES))
+    stage = wire(detect.STAGE, "bench", {}, detect.Detect(detect.EDGES))
 
     def turn(_number: int) -> int:
         with Session([path]) as session:

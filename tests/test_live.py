@@ -15,6 +15,8 @@ from typing import Any
 import pytest
 
 from ipsys_log import pipeline
+from ipsys_log.analysis.calibration_points import find_pairs
+from ipsys_log.analysis.calibration_points import measured as measured_places
 from ipsys_log.analysis.differences import Comparison
 from ipsys_log.capture.frames import Clock
 from ipsys_log.capture.multiplexer import Attached
@@ -37,12 +39,11 @@ from ipsys_log.messages import (
     Run,
     Tracks,
 )
-from ipsys_log.messages.channels import POSITIONS, RECORD
+from ipsys_log.messages.channels import CAMERA_POINTS, POSITIONS, RECORD
 from ipsys_log.runs.options import Request
 from ipsys_log.runs.output import append_messages, write_log
-from ipsys_log.runs.select import find_pairs
-from ipsys_log.runs.select import measured as measured_places
 from ipsys_log.runs.verify import diff, verify
+from ipsys_log.runs.view import LogView
 from ipsys_log.sinks.sink import Consumer
 from ipsys_log.stages.detect import Detect
 from ipsys_log.survey.checks import check_entry, withdraw
@@ -596,7 +597,8 @@ def test_a_place_is_measured_while_it_is_recorded_and_a_model_is_fitted_to_it(
         assert [m.marker_id for m in session.payloads(["/measurements"])] == [
             m.marker_id for m in scene.history()
         ]
-        places = find_pairs(session, "edges", measured_places(session, None))
+        view = LogView(session, {CAMERA_POINTS: "edges"})
+        places = find_pairs(view, measured_places(view))
     seen = {pair.measurement for found in places.values() for pair in found}
     assert seen == {m.id for m in scene.history()}
     assert all(one.equal for one in again(target))

@@ -26,13 +26,14 @@ from ipsys_log.messages import (
     Positions,
     Rig,
 )
-from ipsys_log.messages.channels import CAMERA_POINTS, MODEL, TRACKS
+from ipsys_log.messages.channels import CAMERA_POINTS, IMAGES, MARKERS, MODEL, POSITIONS, TRACKS
 from ipsys_log.pipeline import replay
 from ipsys_log.rig.file import load_rig
 from ipsys_log.runs.options import Request
 from ipsys_log.runs.output import write_log
-from ipsys_log.runs.stream import Stage, in_threads, run
+from ipsys_log.runs.stream import in_threads, run
 from tests.conftest import Ipsys, data_section
+from tests.wiring import wired
 
 RIG_TOML = """
 name = "simulated"
@@ -80,7 +81,10 @@ def test_run_puts_what_a_stage_makes_behind_what_it_was_made_of() -> None:
     def located(message: Message) -> Iterator[Any]:
         yield Positions(message.publish_time_ns, ())
 
-    stages = [Stage("a", (CompressedImage,), seen), Stage("b", (Markers,), located)]
+    stages = [
+        wired("a", (IMAGES,), (MARKERS,), seen),
+        wired("b", (MARKERS,), (POSITIONS,), located, {MARKERS: "a"}),
+    ]
     made = list(run(frames(3), stages))
     assert [message.topic for message in made] == [
         "/rig",
@@ -105,7 +109,7 @@ def test_threads_change_the_speed_and_not_the_order() -> None:
         last[message.camera] = message.log_time_ns
         yield Markers(message.publish_time_ns, (), 1, 1)
 
-    stage = Stage("a", (CompressedImage,), slow)
+    stage = wired("a", (IMAGES,), (MARKERS,), slow)
     plain = [(m.topic, m.log_time_ns) for m in run(frames(60), [stage])]
     last.clear()
     threaded = [(m.topic, m.log_time_ns) for m in run(frames(60), [stage], in_threads)]
@@ -120,7 +124,7 @@ def test_a_stage_across_cameras_takes_one_message_after_the_other() -> None:
         order.append(message.log_time_ns)
         yield Markers(message.publish_time_ns, (), 1, 1)
 
-    list(run(frames(30), [Stage("a", (CompressedImage,), across, per_camera=False)], in_threads))
+    list(run(frames(30), [wired("a", (IMAGES,), (MARKERS,), across, per_camera=False)], in_threads))
     assert order == sorted(order)
 
 
@@ -141,7 +145,7 @@ def test_a_thread_that_fails_is_heard_and_the_rest_is_left() -> None:
 
     threads = cv2.getNumThreads()
     with pytest.raises(ValueError, match="a bug"):
-        list(run(frames(60), [Stage("a", (CompressedImage,), failing)], in_threads))
+        list(run(frames(60), [wired("a", (IMAGES,), (MARKERS,), failing)], in_threads))
     assert cv2.getNumThreads() == threads
 
 

@@ -12,6 +12,8 @@ import numpy as np
 import pytest
 
 from ipsys_log import pipeline
+from ipsys_log.analysis.calibration_points import find_pairs
+from ipsys_log.analysis.calibration_points import measured as measured_places
 from ipsys_log.capture.camera_thread import CameraState
 from ipsys_log.capture.live_plan import check_pictures
 from ipsys_log.capture.multiplexer import Attached
@@ -36,11 +38,10 @@ from ipsys_log.messages import (
     Rig,
     image_topic,
 )
-from ipsys_log.messages.channels import MEASUREMENTS, MODEL
+from ipsys_log.messages.channels import CAMERA_POINTS, MEASUREMENTS, MODEL
 from ipsys_log.runs.options import Request
 from ipsys_log.runs.output import write_log
-from ipsys_log.runs.select import find_pairs
-from ipsys_log.runs.select import measured as measured_places
+from ipsys_log.runs.view import LogView
 from ipsys_log.survey.checks import check_entry, withdraw
 from ipsys_log.survey.entry import read_typed
 from ipsys_log.survey.live import LiveScene
@@ -258,7 +259,8 @@ class Hand:
 def pairs(log: Path) -> dict[tuple[str, str], Pair]:
     """What each camera saw of each place."""
     with Session([log]) as session:
-        found = find_pairs(session, "edges", measured_places(session, None))
+        view = LogView(session, {CAMERA_POINTS: "edges"})
+        found = find_pairs(view, measured_places(view))
         (model,) = session.payloads(session.topics(MODEL, "rigid"))
     seen = {(camera, pair.measurement): pair for camera, of_camera in found.items() for pair in of_camera}
     fitted = {(camera.camera, pair.measurement) for camera in model.cameras for pair in camera.pairs}

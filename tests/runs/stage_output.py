@@ -24,8 +24,9 @@ import numpy as np
 from ipsys_log import pipeline
 from ipsys_log.log.dataset import Session
 from ipsys_log.models.table import MODELS
+from ipsys_log.runs.graph import VERSIONS
 from ipsys_log.runs.options import Request
-from ipsys_log.runs.provenance import VERSIONS, fingerprint
+from ipsys_log.runs.provenance import fingerprint
 from ipsys_log.stages.camera_frame import METHODS
 from ipsys_log.stages.detect import CORNERS
 

@@ -13,8 +13,8 @@ from ipsys_log.log.dataset import Session
 from ipsys_log.log.writer import LogWriter
 from ipsys_log.models.table import MODELS
 from ipsys_log.runs import provenance
-from ipsys_log.runs.graph import STAGES
-from ipsys_log.runs.provenance import VERSIONS, recorded_version, version_parameters
+from ipsys_log.runs.graph import STAGES, VERSIONS, version_parameters
+from ipsys_log.runs.provenance import recorded_version
 from ipsys_log.stages.camera_frame import METHODS
 from ipsys_log.stages.detect import CORNERS
 from tests.conftest import ROOT, Ipsys
@@ -53,7 +53,7 @@ def made(ipsys: Ipsys, *arguments: object) -> dict[str, tuple[str, bool]]:
 
 def test_everything_that_computes_has_a_version() -> None:
     parts = {part for model in MODELS for part in model.split("+")}
-    assert VERSIONS.keys() == {*STAGES, *CORNERS, *METHODS, *parts}
+    assert VERSIONS.keys() == {*(stage.name for stage in STAGES), *CORNERS, *METHODS, *parts}
     assert min(VERSIONS.values()) >= 1
 
 
@@ -194,7 +194,7 @@ def test_verify_names_what_another_version_made_and_verifies_the_rest(
         "run edges: detect is out of date: made by detect 1, this is detect 2; it is not verified" in done.err
     )
     assert "/runs/poly/tracks" in ipsys("verify", log, "--json").out
-    for name in STAGES:
+    for name in (stage.name for stage in STAGES):
         monkeypatch.setitem(VERSIONS, name, 2)
     done = ipsys("verify", log)
     assert done.code == 1

@@ -15,7 +15,8 @@ from ipsys_log.messages import (
     Rig,
     Tracks,
 )
-from ipsys_log.runs.stream import Stage, run
+from ipsys_log.messages.channels import POSITIONS
+from ipsys_log.runs.stream import run, wire
 from ipsys_log.stages import fuse
 
 
@@ -31,7 +32,7 @@ def late(time_ns: int, start_ns: int, end_ns: int | None = None, kind: str = STA
 
 def times_of_tracks(messages: Sequence[Message]) -> list[int]:
     rig = Message(RIG_TOPIC, 0, 0, Rig("lab", "DICT_4X4_100", 0.2))
-    made = run([rig, *messages], [Stage("poly", fuse.READS, fuse.Fuse("poly"), per_camera=False)])
+    made = run([rig, *messages], [wire(fuse.STAGE, "poly", {POSITIONS: "poly"}, fuse.Fuse("poly"))])
     return [message.payload.timestamp for message in made if isinstance(message.payload, Tracks)]
 
 
@@ -53,7 +54,7 @@ def test_late_frame_is_not_averaged_into_another_camera() -> None:
     far = Positions(61, (Position(1, 9.0, 9.0, 0.0),))
     other = Message("/runs/poly/cameras/white/positions", 61, 61, far, "white")
     rig = Message(RIG_TOPIC, 0, 0, Rig("lab", "DICT_4X4_100", 0.2))
-    stage = Stage("poly", fuse.READS, fuse.Fuse("poly"), per_camera=False)
+    stage = wire(fuse.STAGE, "poly", {POSITIONS: "poly"}, fuse.Fuse("poly"))
     made = run([rig, late(50, 20), place(60), other], [stage])
     (tracks,) = (message.payload for message in made if isinstance(message.payload, Tracks))
     assert (tracks.tracks[0].x_m, tracks.tracks[0].cameras) == (9.0, ("white",))

@@ -32,11 +32,11 @@ from ipsys_log.messages import (
     Tracks,
     Vector3,
 )
-from ipsys_log.messages.channels import TRACKS
+from ipsys_log.messages.channels import POSITIONS, TRACKS
 from ipsys_log.pipeline import replay
 from ipsys_log.runs.options import Request
 from ipsys_log.runs.output import write_log
-from ipsys_log.runs.stream import Stage, run
+from ipsys_log.runs.stream import run, wire
 from ipsys_log.simulation.cameras import hang_cameras
 from ipsys_log.simulation.lab import drive_start_ns, simulate
 from ipsys_log.simulation.settings import LabSettings
@@ -59,11 +59,12 @@ def frame(time_ns: int, camera: str, *offsets_ns: int | None) -> Message:
     """Positions of markers 0, 1, ... as a camera has them; it puts them at x = 0, or 1 if it is white."""
     x_m = 1.0 if camera == "white" else 0.0
     seen = tuple(Position(n, x_m, 0.0, 0.0, time_offset_ns=each) for n, each in enumerate(offsets_ns))
-    return Message("t", time_ns + 40 * MS, time_ns, Positions(time_ns, seen), camera)
+    topic = POSITIONS.topic_of("poly", camera)
+    return Message(topic, time_ns + 40 * MS, time_ns, Positions(time_ns, seen), camera)
 
 
 def fused(*frames: Message) -> list[Message]:
-    stage = Stage("poly", fuse.READS, fuse.Fuse("poly"), per_camera=False)
+    stage = wire(fuse.STAGE, "poly", {POSITIONS: "poly"}, fuse.Fuse("poly"))
     return [m for m in run([RIG, *frames], [stage]) if isinstance(m.payload, Tracks | FrameTransforms)]
 
 

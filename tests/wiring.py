@@ -1,0 +1,36 @@
+"""Stages for tests, wired by hand."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+
+from ipsys_log.messages.channels import Channel
+from ipsys_log.messages.stage import Plan, Stage, Step, View
+from ipsys_log.runs.stream import WiredStage, wire
+
+__all__ = ["wired"]
+
+
+def wired(
+    run: str,
+    reads: tuple[Channel, ...],
+    writes: tuple[Channel, ...],
+    step: Step,
+    inputs: Mapping[Channel, str] | None = None,
+    per_camera: bool = True,
+) -> WiredStage:
+    """Wire a step to channels; ``inputs`` are the runs of the derived ones."""
+
+    def plan(view: View, options: Mapping[str, str]) -> Plan:
+        raise AssertionError("a stage that is wired by hand is not planned")
+
+    stage = Stage(
+        name="test",
+        versions={},
+        reads=reads,
+        writes=writes,
+        plan=plan,
+        rig_part=lambda rig: rig,
+        per_camera=per_camera,
+    )
+    return wire(stage, run, inputs or {}, step)

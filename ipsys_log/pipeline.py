@@ -45,6 +45,7 @@ from ipsys_log.capture.recorder import Recording, Source, recording, written
 from ipsys_log.errors import IpsysError, LogError
 from ipsys_log.log.contents import run_of_topic
 from ipsys_log.log.dataset import Session
+from ipsys_log.log.known_contents import one_reading
 from ipsys_log.messages import Message
 from ipsys_log.messages.channels import EVALUATION, MODEL, RUN_EVENTS, Channel
 from ipsys_log.messages.stage import Stage
@@ -62,6 +63,7 @@ from ipsys_log.sinks.sink import Consumer, Consumers
 __all__ = ["live", "measure", "record", "replay"]
 
 
+@one_reading()
 def replay(
     paths: Sequence[Path],
     request: Request,

@@ -2,7 +2,10 @@
 
 from __future__ import annotations
 
+import functools
+from collections.abc import Callable
 from inspect import cleandoc
+from typing import Any
 
 import typer
 
@@ -137,6 +140,19 @@ def _unwrapped(text: str) -> str:
     return "\n\n".join(" ".join(one.split()) for one in cleandoc(text).split("\n\n"))
 
 
+def _with_one_reading(command: Callable[..., Any]) -> Callable[..., Any]:
+    """Wrap a command: it parses the summary of each log once."""
+
+    @functools.wraps(command)
+    def run(*arguments: Any, **options: Any) -> Any:
+        from ipsys_log.log.known_contents import one_reading
+
+        with one_reading():
+            return command(*arguments, **options)
+
+    return run
+
+
 app = typer.Typer(
     name="ipsys",
     help="Indoor positioning with cheap cameras and ArUco markers. Everything is a channel in an MCAP log: "
@@ -158,7 +174,7 @@ arrange(app)
 for typer_app in (app, *(group.typer_instance for group in app.registered_groups)):
     for command in typer_app.registered_commands if typer_app else ():
         if command.callback is not None:
-            command.callback = interruptible(command.callback)
+            command.callback = interruptible(_with_one_reading(command.callback))
 
 
 def _print_version(wanted: bool) -> None:

@@ -20,10 +20,11 @@ from ipsys_log.log.chunk_messages import ALWAYS, Blocks, as_rows, chunk_entries,
 from ipsys_log.log.contents import Contents, RawMessage, by_topic
 from ipsys_log.log.hashing import METADATA_NAME, ChannelHash, hashes_from_metadata
 from ipsys_log.log.journal import attach_journal
+from ipsys_log.log.known_contents import contents_of
 from ipsys_log.log.lock import is_being_written
 from ipsys_log.log.order import Pending, in_log_order
 from ipsys_log.log.records import HEADER, parse, walk
-from ipsys_log.log.summary import NoFooterError, load_contents
+from ipsys_log.log.summary import NoFooterError
 
 __all__ = ["LogReader", "stored_hashes"]
 
@@ -224,7 +225,7 @@ def _open(path: Path) -> tuple[View, Contents]:
         held = attach_journal(view)
         fault = None
         try:
-            contents = load_contents(view)
+            contents = contents_of(view)
         except LogError as error:
             fault = error
         except BaseException:

@@ -26,11 +26,12 @@ from ipsys_log.log.chunk_builder import (
 from ipsys_log.log.contents import Contents, Schema, free_id
 from ipsys_log.log.hashing import METADATA_NAME, ChannelHash, metadata_of_hashes
 from ipsys_log.log.journal import DISK, Storage, roll_back
+from ipsys_log.log.known_contents import contents_of, note_contents
 from ipsys_log.log.lock import check_free, open_locked
 from ipsys_log.log.output import Growing, Output, Pending, cannot_write
 from ipsys_log.log.reader import stored_hashes
 from ipsys_log.log.records import HEADER, MAGIC, MESSAGE, as_bytes
-from ipsys_log.log.summary import load_contents, standing_bytes, tail_bytes
+from ipsys_log.log.summary import standing_bytes, tail_bytes
 
 __all__ = ["LogWriter"]
 
@@ -129,7 +130,7 @@ class LogWriter:
             roll_back(storage, target, fd)
             size = os.fstat(fd).st_size
             view = View(target, fd, size, size)
-            contents = load_contents(view)
+            contents = contents_of(view)
             stored = stored_hashes(view, contents)
         except BaseException:
             storage.close(fd)
@@ -271,6 +272,7 @@ class LogWriter:
             output.emit(hashes)
         contents.data_end, contents.data_crc = output.offset, output.crc or 0
         output.finish(tail_bytes(contents))
+        note_contents(output.fd, contents)
 
     def _keeps_what_it_has(self) -> bool:
         return isinstance(self._output, Growing) and self._output.target is None

@@ -22,6 +22,7 @@ from ipsys_log.errors import IpsysError
 from ipsys_log.log.codec import encode
 from ipsys_log.log.contents import run_of_topic
 from ipsys_log.log.dataset import Session
+from ipsys_log.log.known_contents import one_reading
 from ipsys_log.messages import CameraCalibration, FrameTransforms, Message, Run
 from ipsys_log.messages.channels import CAMERA_POINTS, EVALUATION, MARKERS, MODEL, POSITIONS, TRACKS
 from ipsys_log.runs.execute import carry_out
@@ -35,6 +36,7 @@ __all__ = ["diff", "explain_diff", "verify"]
 _MOVING = (MARKERS, CAMERA_POINTS, POSITIONS, TRACKS)
 
 
+@one_reading()
 def verify(
     paths: Sequence[Path], run: str | None, progress: Progress, say: Callable[[str], None] = lambda text: None
 ) -> list[Comparison]:

@@ -108,9 +108,11 @@ def live(
     ],
     rig: RigNow = Path("lab.toml"),
     model: Annotated[
-        Optional[str],  # noqa: UP045
+        Optional[list[str]],  # noqa: UP045
         typer.Option(
-            "--model", metavar="NAME", help="Which of its models, such as best; poly if it has that."
+            "--model",
+            metavar="NAME",
+            help="Which of its models, such as best; repeat it for several. Default: poly if it has that.",
         ),
     ] = None,
     camera: Only = None,
@@ -130,8 +132,7 @@ def live(
 
     lab = prepared(rig, camera, calibration)
     check_target(output, force, [*lab.files, (MODEL, model_from)])
-    models = () if model is None else (model,)
-    request = Request(models=models, model_from=model_from, corners=corners, method=method)
+    request = Request(models=tuple(dict.fromkeys(model or ())), model_from=model_from, corners=corners, method=method)
     for line in check_start(lab.rig, lab.names, lab.lenses, request, "fuse"):
         remarks.print(line, style="yellow", markup=False)
     with (
@@ -147,5 +148,5 @@ def _viewed(settings: list[Message], cameras: Attached, request: Request) -> Liv
     from ipsys_log.sinks.rerun.live import LiveView
     from ipsys_log.stages.fit import model_run
 
-    (model,) = wanted_models(request)
-    return LiveView(settings[0].payload, cameras.states, model_run(model), say)
+    first, *_ = wanted_models(request)
+    return LiveView(settings[0].payload, cameras.states, model_run(first), say)

@@ -1,4 +1,4 @@
-"""Comparison of a log's data section, indexes and summary, which must say the same."""
+"""Comparison of the data section, the indexes and the summary of a log, which must agree."""
 
 from collections import Counter
 
@@ -35,8 +35,8 @@ def disagreement(view: View, found: Survey) -> str:
         (Counter(mine.counts) != Counter(theirs.counts), counts),
         (not _same_chunks(theirs.chunks, mine.chunks), "its chunks are not those that readers expect"),
     )
-    what = next((what for is_wrong, what in tests if is_wrong), "")
-    return what if what or summary is None else _summary_disagreement(summary, mine, found)
+    difference = next((difference for is_wrong, difference in tests if is_wrong), "")
+    return difference if difference or summary is None else _summary_disagreement(summary, mine, found)
 
 
 def count_by_indexes(view: View) -> int:
@@ -50,11 +50,11 @@ def count_by_indexes(view: View) -> int:
 
 def _check_lengths(view: View, start: int) -> None:
     """Refuse a summary with wrong lengths: a reader that trusts them would read too much."""
-    for at in walk(view, start, view.size):
-        if at.opcode == Opcode.FOOTER:
+    for record_at in walk(view, start, view.size):
+        if record_at.opcode == Opcode.FOOTER:
             return
-        if at.opcode < PRIVATE:
-            exact(view, at, view.read(at.offset, at.length))
+        if record_at.opcode < PRIVATE:
+            exact(view, record_at, view.read(record_at.offset, record_at.length))
 
 
 def _summary_disagreement(summary: Summary, mine: Contents, found: Survey) -> str:

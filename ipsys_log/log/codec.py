@@ -118,7 +118,7 @@ def _encode_around(payload: Any, long: str) -> bytes:
 
 
 def _varint(number: int) -> bytes:
-    """Encode a number, seven bits per byte, lowest first; the highest bit is set in all bytes but the last."""
+    """Encode a number in bytes of seven bits, lowest first; all but the last have the highest bit set."""
     parts = []
     while number > 127:
         parts.append(number & 127 | 128)

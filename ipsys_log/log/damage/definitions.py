@@ -33,9 +33,9 @@ def placeholder(channel_id: int) -> mcap.Channel:
 class Definitions:
     """The definitions up to the current offset, by id.
 
-    `known` holds definitions of the summary or of damaged chunks; they replace missing definitions of
-    the data section. If the CRC of the summary is right, a record that contradicts it is damaged. `rooms` are the
-    damaged stretches so far: lost definitions are written there.
+    `known` holds definitions of the summary or of damaged chunks; they replace missing definitions of the
+    data section. If the CRC of the summary is right, a record that contradicts it is damaged. `rooms` are
+    the damaged stretches so far: lost definitions are written there.
     """
 
     summary: Summary | None

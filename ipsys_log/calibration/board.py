@@ -50,8 +50,8 @@ class Board:
     @property
     def grid(self) -> tuple[int, int]:
         """The numbers of inner corners from left to right, and from top to bottom."""
-        less = 0 if self.marker_scale is None else 1
-        return self.columns - less, self.rows - less
+        difference = 0 if self.marker_scale is None else 1
+        return self.columns - difference, self.rows - difference
 
     def places(self, ids: NDArray[np.intp]) -> NDArray[np.float64]:
         """Return the column and the row of each corner, (n, 2)."""

@@ -57,11 +57,11 @@ def refine_corners(
     -------
     (n, 2) in px; a corner without visible edges does not move.
     """
-    moved = pixels.copy()
+    positions = pixels.copy()
     for _ in range(_ROUNDS):
-        arms = _arms(columns, ids, moved)
-        moved = _crossed(grey, arms, moved, blur_px, clear)
-    return moved
+        arms = _arms(columns, ids, positions)
+        positions = _crossed(grey, arms, positions, blur_px, clear)
+    return positions
 
 
 def _arms(columns: int, ids: NDArray[np.intp], pixels: Array) -> Array:
@@ -94,7 +94,7 @@ def _crossed(grey: Grey, arms: Array, pixels: Array, blur_px: float, clear: floa
     lengths = np.linalg.norm(arms, axis=3)
     spacing = np.nanmin(lengths, axis=(1, 2), initial=np.inf)
     usable = np.isfinite(arms).all(axis=(1, 2, 3)) & (spacing * clear >= _LEAST_REACH_PX / 2)
-    moved = pixels.copy()
+    positions = pixels.copy()
     for n in np.flatnonzero(usable):
         reach_px = max(_REACH * spacing[n], _BLURS * blur_px)
         reach_px = float(np.clip(min(reach_px, clear * spacing[n]), _LEAST_REACH_PX, _MOST_REACH_PX))
@@ -103,30 +103,30 @@ def _crossed(grey: Grey, arms: Array, pixels: Array, blur_px: float, clear: floa
             continue
         shift = np.linalg.solve(np.array(normals), np.array(offsets, dtype=np.float64))
         if np.linalg.norm(shift) <= max(_MOST_SHIFT * spacing[n], 0.5):
-            moved[n] = pixels[n] + shift
-    return moved
+            positions[n] = pixels[n] + shift
+    return positions
 
 
 def _offset(grey: Grey, corner: Array, pair: Array, reach_px: float) -> tuple[Array, float | None]:
     """Return the normal (2,) of the edge along ``pair``, and its distance from the corner, if visible."""
-    along = pair[1] - pair[0]
-    along = along / np.linalg.norm(along)
-    normal = np.array([-along[1], along[0]])
+    direction = pair[1] - pair[0]
+    direction = direction / np.linalg.norm(direction)
+    normal = np.array([-direction[1], direction[0]])
     points = np.concatenate([corner + _ALONG_EDGE[:, None] * arm for arm in pair])
     steps = _steps(grey, points, normal, reach_px)
     if steps is None:
         return normal, None
-    beside_px, seen = steps
-    t = (points - corner) @ along
+    beside_px, visible = steps
+    t = (points - corner) @ direction
     # Lens distortion bends the edge.
     terms = np.column_stack([np.ones_like(t), t, t * t])
-    return normal, _intercept(terms, beside_px + (points - corner) @ normal, seen)
+    return normal, _intercept(terms, beside_px + (points - corner) @ normal, visible)
 
 
 def _steps(grey: Grey, on: Array, normal: Array, reach_px: float) -> tuple[Array, NDArray[np.bool_]] | None:
     """Return the distance of the black-white step from each point (n, 2), and a mask of valid points."""
-    beside = np.arange(-reach_px, reach_px + 1e-9, _STEP_PX)
-    positions = (on[:, None] + beside[:, None] * normal).astype(np.float32)
+    distances = np.arange(-reach_px, reach_px + 1e-9, _STEP_PX)
+    positions = (on[:, None] + distances[:, None] * normal).astype(np.float32)
     levels = cv2.remap(
         grey, positions[..., 0], positions[..., 1], cv2.INTER_LINEAR, borderMode=cv2.BORDER_REPLICATE
     )
@@ -138,10 +138,10 @@ def _steps(grey: Grey, on: Array, normal: Array, reach_px: float) -> tuple[Array
         return None
     slopes = np.maximum(slopes * np.repeat(np.sign(heights), half)[:, None], 0.0)
     weights = slopes.sum(axis=1)
-    seen = weights > _FAINT * np.median(weights)
-    if seen.reshape(2, half).sum(axis=1).min() < half // 2:
+    visible = weights > _FAINT * np.median(weights)
+    if visible.reshape(2, half).sum(axis=1).min() < half // 2:
         return None
-    return (slopes @ ((beside[1:] + beside[:-1]) / 2)) / np.maximum(weights, 1e-9), seen
+    return (slopes @ ((distances[1:] + distances[:-1]) / 2)) / np.maximum(weights, 1e-9), visible
 
 
 def _intercept(terms: Array, found: Array, seen: NDArray[np.bool_]) -> float:
@@ -162,7 +162,7 @@ _SEEN = 4
 _ALONG = (0.3, 0.4, 0.5, 0.6, 0.7)
 _BESIDE, _BESIDE_MARKERS = 0.3, 0.12
 _STEP_PX, _PIXEL = 0.5, 2
-# Width beside an edge without other edges, in squares; with markers, a share of the white between markers.
+# Width beside an edge without other edges, in squares; with markers, as a factor of 1 - marker_scale.
 _CLEAR, _CLEAR_MARKERS = 0.3, 0.32
 _LEAST_SLOPE = 0.1
 # Largest distance of a board corner from the visible corners, as a multiple of their extent.
@@ -208,7 +208,7 @@ def view_board(name: str, grey: Grey, board: Board, thorough: bool) -> View:
 
     Returns
     -------
-    The view, without a sighting if the board is not found. A ChArUco board may be partly visible, a
+    The view, without a sighting if the board is not detected. A ChArUco board may be partly visible, a
     chessboard must be completely visible.
     """
     if board.inverted:
@@ -284,29 +284,31 @@ def _edge_width_px(grey: Grey, board: Board, ids: NDArray[np.intp], pixels: Arra
     )
     black, white = np.percentile(grey[top : bottom + 1, left : right + 1], [10, 90])
     by_id = dict(zip(ids.tolist(), pixels, strict=True))
-    beside = _BESIDE if board.marker_scale is None else _BESIDE_MARKERS
+    reach_share = _BESIDE if board.marker_scale is None else _BESIDE_MARKERS
     columns = board.grid[0]
     widths = []
-    for step, other in ((1, columns), (columns, 1)):
+    for step, other_step in ((1, columns), (columns, 1)):
         pairs = [
             (by_id[i], by_id[i + step])
             for i in by_id
             if i + step in by_id and (step > 1 or (i + 1) % columns)
         ]
         # Distances to the next parallel edge.
-        spacing = [np.linalg.norm(by_id[i] - by_id[i + other]) for i in by_id if i + other in by_id]
+        spacing = [np.linalg.norm(by_id[i] - by_id[i + other_step]) for i in by_id if i + other_step in by_id]
         if pairs and spacing:
-            reach_px = max(beside * float(np.median(spacing)), 2.0)
+            reach_px = max(reach_share * float(np.median(spacing)), 2.0)
             widths.append((white - black) / (np.sqrt(2 * np.pi) * _slopes(grey, np.array(pairs), reach_px)))
     return max((float(np.median(values)) for values in widths), default=0.0)
 
 
 def _slopes(grey: Grey, ends: Array, reach_px: float) -> Array:
     """Return the slopes of edges between corners (n, 2, 2), in levels per px, up to ``reach_px`` beside."""
-    along = ends[:, 1] - ends[:, 0]
-    across = np.stack([-along[:, 1], along[:, 0]], axis=1) / np.linalg.norm(along, axis=1, keepdims=True)
+    directions = ends[:, 1] - ends[:, 0]
+    across = np.stack([-directions[:, 1], directions[:, 0]], axis=1) / np.linalg.norm(
+        directions, axis=1, keepdims=True
+    )
     offsets = np.arange(-reach_px, reach_px + 1e-9, _STEP_PX)
-    start = ends[:, :1] + along[:, None] * np.array(_ALONG)[:, None]
+    start = ends[:, :1] + directions[:, None] * np.array(_ALONG)[:, None]
     positions = (start[:, :, None] + across[:, None, None] * offsets[:, None]).astype(np.float32)
     rows = positions.reshape(-1, len(offsets), 2)
     levels = cv2.remap(

@@ -96,7 +96,7 @@ def look(
         progress(count)
     if not views:
         raise IpsysError(f"{where}: none of {count} pictures can be read")
-    usual = check_sizes([(viewed.name, viewed.size) for viewed in views], where)
+    usual_size = check_sizes([(viewed.name, viewed.size) for viewed in views], where)
     if all(viewed.view.sighting is None for viewed in views):
         hint_text = hint(without.pictures, board, trying, [viewed.view.grid for viewed in views])
         raise NotSeenError(f"{where}: {board} is not seen in any of {count} pictures{hint_text}")
@@ -104,14 +104,16 @@ def look(
         check_chessboard_size([viewed.view.grid for viewed in views], board, where)
     elif not insist:
         check_charuco_size(shown.pictures, board, where)
-    ordinary = [viewed for viewed in views if viewed.size == usual]
-    seen = [viewed.view.sighting for viewed in ordinary if viewed.view.sighting is not None]
+    ordinary = [viewed for viewed in views if viewed.size == usual_size]
+    sightings = [viewed.view.sighting for viewed in ordinary if viewed.view.sighting is not None]
     unseen = [
         Dropped(viewed.name, _reason(viewed.view, board))
         for viewed in ordinary
         if viewed.view.sighting is None
     ]
-    return Looked(count, usual, tuple(seen), (*unreadable, *_strange(views, usual)), tuple(unseen))
+    return Looked(
+        count, usual_size, tuple(sightings), (*unreadable, *_strange(views, usual_size)), tuple(unseen)
+    )
 
 
 def _reason(view: View, board: Board) -> str:

@@ -161,15 +161,15 @@ def check_chessboard_size(sizes: Sequence[Size | None], board: Board, where: str
         Most images show a larger board; the text names the board that explains most corners.
     """
     larger = _largest_board([size for size in sizes if size is None or _exceeds(size, board.grid)])
-    seen = sum(size is not None for size in sizes)
+    total = sum(size is not None for size in sizes)
     count = sum(size is not None and _exceeds(size, board.grid) for size in sizes)
-    if larger is None or count <= _CONTRADICTED * seen:
+    if larger is None or count <= _CONTRADICTED * total:
         return
-    other = _sized(board, larger)
+    larger_board = _sized(board, larger)
     shown = sum(_same(size, larger) for size in sizes)
     raise IpsysError(
-        f"{where}: {board} is a part of {other}, which {shown} of {seen} pictures of a board show: "
-        f"give --board {other.columns}x{other.rows}; {_FORCE}"
+        f"{where}: {board} is a part of {larger_board}, which {shown} of {total} pictures of a board show: "
+        f"give --board {larger_board.columns}x{larger_board.rows}; {_FORCE}"
     )
 
 
@@ -195,8 +195,8 @@ def check_charuco_size(pictures: Sequence[Grey], board: Board, where: str) -> No
 
 
 def _mirrored(pictures: Sequence[Grey], board: Board) -> str:
-    turned = [np.ascontiguousarray(grey[:, ::-1]) for grey in pictures]
-    seen = sum(find_board("", grey, board, thorough=False) is not None for grey in turned)
+    mirrored = [np.ascontiguousarray(grey[:, ::-1]) for grey in pictures]
+    seen = sum(find_board("", grey, board, thorough=False) is not None for grey in mirrored)
     if not seen:
         return ""
     return (
@@ -226,13 +226,13 @@ def _name_size(sizes: Sequence[Size | None], kind: Board, board: Board) -> str:
     size = _largest_board(sizes)
     if size is None:
         return ""
-    other = _sized(replace(kind, marker_scale=None), size)
-    if other == board:
+    seen_board = _sized(replace(kind, marker_scale=None), size)
+    if seen_board == board:
         return ""
-    seen = sum(_same(shown, size) for shown in sizes)
-    option = f"--board {other.columns}x{other.rows}"
+    seen_count = sum(_same(shown, size) for shown in sizes)
+    option = f"--board {seen_board.columns}x{seen_board.rows}"
     turn = f" and {_inversion(board)}" if kind.inverted != board.inverted else ""
-    return f"; but {other} is seen in {seen} of {len(sizes)} tried: give {option}{turn}"
+    return f"; but {seen_board} is seen in {seen_count} of {len(sizes)} tried: give {option}{turn}"
 
 
 def _other_charuco(pictures: Sequence[Grey], kind: Board, board: Board) -> str:
@@ -240,15 +240,15 @@ def _other_charuco(pictures: Sequence[Grey], kind: Board, board: Board) -> str:
     if size is None:
         return ""
     scale = board.marker_scale if board.marker_scale is not None else 0.75
-    other = replace(kind, columns=size.columns, rows=size.rows, marker_scale=scale)
-    options = [f"--board charuco:{other.columns}x{other.rows}"]
-    options = [] if board.marker_scale and other.grid == board.grid else options
+    seen_board = replace(kind, columns=size.columns, rows=size.rows, marker_scale=scale)
+    options = [f"--board charuco:{seen_board.columns}x{seen_board.rows}"]
+    options = [] if board.marker_scale and seen_board.grid == board.grid else options
     options += [f"--dictionary {kind.dictionary}"] if kind.dictionary != board.dictionary else []
     options += [_inversion(board)] if kind.inverted != board.inverted else []
     if not options:
         return ""
     options_text = " and ".join(options)
-    return f"; but {other} is seen in {size.pictures} of {len(pictures)} tried: give {options_text}"
+    return f"; but {seen_board} is seen in {size.pictures} of {len(pictures)} tried: give {options_text}"
 
 
 def _largest_board(sizes: Sequence[Size | None]) -> Size | None:

@@ -78,7 +78,7 @@ class Normal:
 
     ``lens`` (f, q, q) and ``lens_gradient`` (f, q) are the parts of the intrinsics for each image. ``poses``
     (f, 6, 6) and ``pose_gradient`` (f, 6) are the parts of the poses, ``between`` (f, 6, q) are the mixed
-    parts. ``pull`` (q, q) and ``pull_gradient`` (q,) are the prior that draws the intrinsics to 0.
+    parts. ``pull`` (q, q) and ``pull_gradient`` (q,) are the prior that draws coefficients to 0.
     """
 
     lens: Array
@@ -154,7 +154,7 @@ def normal_equations(
 
 
 def _squares(rows: Array) -> Array:
-    """Return the products (m, m) of the columns of the rows (n, 2, m) of one picture."""
+    """Return the products (m, m) of the columns of the rows (n, 2, m) of one image."""
     flat = rows.reshape(-1, rows.shape[2])
     return np.asarray(flat.T @ flat)
 

@@ -123,12 +123,12 @@ def calibrate(
     _refuse(camera, faults, insist)
     solved = _solved(camera, model, corners, looked.size_px, start)
     bad += [Dropped(used[excluded.picture].name, excluded.reason) for excluded in solved.left]
-    kept = [used[n] for n in solved.pictures]
+    fitted = [used[n] for n in solved.pictures]
     faults.append(_far_off(model, solved, corners, looked.size_px))
     _refuse(camera, faults, insist)
-    faults.append(_few_pictures(camera, kept, bad, looked, insist))
+    faults.append(_few_pictures(camera, fitted, bad, looked, insist))
     notes = tuple(f"written only for --force: {fault}" for fault in faults if fault)
-    return _judged(camera, model, looked, kept, solved, bad, chosen.spare, notes)
+    return _judged(camera, model, looked, fitted, solved, bad, chosen.spare, notes)
 
 
 def _refuse(camera: str, faults: list[str], insist: bool) -> None:

@@ -277,8 +277,8 @@ def _tries(size: Size, large: bool, thorough: bool) -> list[_Try]:
 
 def _grid(picture: Grey, attempt: _Try) -> Array | None:
     """Return the real corners from one call of the detector, (rows, columns, 2), or None."""
-    seen, corners, cells = cv2.findChessboardCornersSBWithMeta(picture, attempt.size, attempt.flags)
-    if not seen:
+    is_detected, corners, cells = cv2.findChessboardCornersSBWithMeta(picture, attempt.size, attempt.flags)
+    if not is_detected:
         return None
     rows, columns = cells.shape if attempt.flags & cv2.CALIB_CB_LARGER else attempt.size[::-1]
     return complete_grid(picture, np.asarray(corners, dtype=np.float64).reshape(rows, columns, 2))

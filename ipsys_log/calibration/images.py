@@ -91,11 +91,11 @@ def find_sources(paths: Sequence[Path], cameras: Sequence[str]) -> list[Pictures
 def _joined(camera: str, parts: list[Pictures]) -> Pictures:
     if len(parts) == 1:
         return parts[0]
-    where = f"{parts[0].where} and {len(parts) - 1} more"
+    source = f"{parts[0].where} and {len(parts) - 1} more"
     total = sum(part.total for part in parts)
     return Pictures(
         camera,
-        where,
+        source,
         total,
         lambda: chain.from_iterable(part.read() for part in parts),
         lambda: [sized for part in parts for sized in part.sizes()],
@@ -202,8 +202,8 @@ def _read_video(path: Path, stride: int) -> Iterator[tuple[str, Grey | None]]:
         number = 0
         while video.grab():
             if number % stride == 0:
-                seen, frame = video.retrieve()
-                yield f"frame {number}", _grey(np.asarray(frame, dtype=np.uint8)) if seen else None
+                is_decoded, frame = video.retrieve()
+                yield f"frame {number}", _grey(np.asarray(frame, dtype=np.uint8)) if is_decoded else None
             number += 1
     finally:
         video.release()

@@ -25,7 +25,7 @@ _PULL_PX = 0.1
 
 
 class LensModel(NamedTuple):
-    """A lens model: its name in the log, the names of its coefficients, and the number of fitted ones.
+    """A lens model: its name in the log, its coefficient names, and the number of fitted coefficients.
 
     The other coefficients stay 0. ``bend`` returns the image of points at a focal length of 1,
     ``bend_with_slopes`` also its derivatives. ``usual`` is the usual size of coefficients that images may not

@@ -62,23 +62,25 @@ def find_start(model: LensModel, corners: Corners, size_px: tuple[int, int]) -> 
     shares = _FOCAL_SHARES[model.distortion_model]
     posed = [_posed(model, corners, size_px, share * longer) for share in shares]
     # A fit of the poses and the focal length is enough to sort out bad start values.
-    tried = [_freed(model, fit, corners, _FIRST) for fit in posed]
-    best = _best(model, tried, corners)
+    fits = [_freed(model, fit, corners, _FIRST) for fit in posed]
+    best = _best(model, fits, corners)
     if shares[0] / _FLED <= best.lens[0] / longer <= shares[-1] * _FLED:
         return best
     # Boards with little tilt look almost the same at a far shorter focal length with even less tilt. Without
     # distortion coefficients the wrong fit may have the lower cost, so the second try fits them first.
-    tried = [_bent(model, fit, corners) for fit in posed]
-    return min(best, _best(model, tried, corners), key=lambda fit: fit.cost)
+    fits = [_bent(model, fit, corners) for fit in posed]
+    return min(best, _best(model, fits, corners), key=lambda fit: fit.cost)
 
 
 def _best(model: LensModel, tried: list[Fit], corners: Corners) -> Fit:
     """Return the best result of the most promising fits; use only one of several similar fits."""
-    kept: list[Fit] = []
+    promising: list[Fit] = []
     for fit in sorted(tried, key=lambda fit: fit.cost):
-        is_similar = any(_near(fit.cost, other.cost) and _near(fit.lens[0], other.lens[0]) for other in kept)
-        kept += [] if is_similar or len(kept) == _KEPT else [fit]
-    return min((_freed(model, fit, corners, _THEN) for fit in kept), key=lambda fit: fit.cost)
+        is_similar = any(
+            _near(fit.cost, other.cost) and _near(fit.lens[0], other.lens[0]) for other in promising
+        )
+        promising += [] if is_similar or len(promising) == _KEPT else [fit]
+    return min((_freed(model, fit, corners, _THEN) for fit in promising), key=lambda fit: fit.cost)
 
 
 def _near(one: float, other: float) -> bool:
@@ -112,7 +114,7 @@ def _bent(model: LensModel, fit: Fit, corners: Corners) -> Fit:
 
 
 def fitted_basis(model: LensModel, square: bool) -> Array:
-    """Return the free directions of the intrinsics, (p, q); fx and fy share one if pixels are square."""
+    """Return the free directions of the intrinsics, (p, q); a common one for fx and fy if ``square``."""
     basis = np.eye(len(model.names))[:, : 4 + model.fitted]
     if square:
         basis[1, 0] = 1.0
@@ -166,8 +168,8 @@ def pose_from_rays(board_m: Array, rays: Array) -> tuple[Array, Array]:
 
 # The median of a two-dimensional normal distance, in standard deviations of one coordinate.
 _MEDIAN = float(np.sqrt(2 * np.log(2)))
-# A corner has half the weight at the first error, and is left out above the second, in standard deviations.
-# An image is left out if its RMS is larger than the usual RMS by the third, a factor.
+# Errors of a corner with half the weight, and of an outlier corner, in standard deviations; RMS of an image
+# that is left out, as a multiple of the usual RMS.
 _DOUBTED = 5.0
 _FAR_CORNER = 12.0
 _FAR_PICTURE = 3.5
@@ -175,7 +177,8 @@ _LEAST_CORNERS = 6
 _MOST_ROUNDS = 8
 # A smaller error is never an outlier: pixels are not more accurate.
 _NEAR_PX = 0.05
-# Pixels count as square, unless fx and fy differ by this share and by three standard deviations, or by ten.
+# Pixels count as square, unless fx and fy differ by this share and by three standard deviations, or by ten
+# standard deviations.
 _SQUARE, _SURE, _QUITE_SURE = 0.01, 3.0, 10.0
 # Factors of other focal lengths to try, least difference of their fits in standard deviations, and steps.
 _OTHER_FOCALS, _WORSE, _OTHER_STEPS = (0.7, 1.3), 3.0, 40
@@ -212,7 +215,7 @@ class Solved:
 
 
 def solve(model: LensModel, corners: Corners, size_px: tuple[int, int], start: Fit | None = None) -> Solved:
-    """Estimate the intrinsics from corners of a board in several pictures.
+    """Estimate the intrinsics from corners of a board in several images.
 
     Parameters
     ----------
@@ -228,11 +231,11 @@ def solve(model: LensModel, corners: Corners, size_px: tuple[int, int], start: F
         # Outliers of the fit with square pixels may fit now.
         purged = _purge(model, start, corners, square=False)
         fit, covariance, groups, square = _finish(model, purged, size_px)
-    kept = purged.corners
-    far_count = int(np.isin(corners.picture, purged.pictures).sum()) - len(kept.picture)
-    residuals_px = residuals(model, fit, kept)
+    used_corners = purged.corners
+    far = int(np.isin(corners.picture, purged.pictures).sum()) - len(used_corners.picture)
+    residuals_px = residuals(model, fit, used_corners)
     return Solved(
-        model, fit, covariance, kept, purged.pictures, residuals_px, purged.left, far_count, groups, square
+        model, fit, covariance, used_corners, purged.pictures, residuals_px, purged.left, far, groups, square
     )  # fmt: skip
 
 
@@ -247,17 +250,17 @@ class _Purged(NamedTuple):
 
 def _purge(model: LensModel, fit: Fit, corners: Corners, square: bool) -> _Purged:
     """Fit, leave out outliers, and fit again, until there are no outliers."""
-    basis, pictures, left = fitted_basis(model, square), np.arange(corners.pictures), []
+    basis, pictures, left_out = fitted_basis(model, square), np.arange(corners.pictures), []
     for _ in range(_MOST_ROUNDS):
         fit = adjust(model, fit, corners, basis, doubt_from_px(model, fit, corners))
-        kept, excluded = _belonging(corners, residuals(model, fit, corners))
-        if kept.all() or len(pictures) - len(excluded) < 3:
+        keep_mask, excluded = _belonging(corners, residuals(model, fit, corners))
+        if keep_mask.all() or len(pictures) - len(excluded) < 3:
             break
-        left += [Left(int(pictures[g.picture]), g.reason) for g in excluded]
-        corners, remaining = corners.keep(kept)
+        left_out += [Left(int(pictures[g.picture]), g.reason) for g in excluded]
+        corners, remaining = corners.keep(keep_mask)
         pictures = pictures[remaining]
         fit = Fit(fit.lens, fit.rotations[remaining], fit.places_m[remaining])
-    return _Purged(fit, corners, pictures, tuple(left))
+    return _Purged(fit, corners, pictures, tuple(left_out))
 
 
 def _finish(model: LensModel, purged: _Purged, size_px: tuple[int, int]) -> tuple[Fit, Array, int, bool]:

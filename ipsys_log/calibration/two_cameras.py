@@ -170,8 +170,8 @@ def _errors(model: LensModel, fit: Fit, corners: Corners, scale_px: float) -> Ar
 
 
 MOST_RMS_PX = 2.0
-# Another model is better if its error is less than this share of the error; models up to this factor are
-# equally good.
+# Another model is better if its error is less than the first share of the error. Models with errors up to the
+# second factor are equally good.
 _BETTER, _AS_WELL = 0.6, 1.1
 
 

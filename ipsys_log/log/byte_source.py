@@ -111,7 +111,7 @@ class View:
 
 
 def open_for_reading(path: Path) -> int:
-    """Open a file for reading; return its file descriptor, or raise a `LogError` of one line."""
+    """Open a file for reading; return its file descriptor, or raise a one-line `LogError`."""
     try:
         fd = os.open(path, os.O_RDONLY | os.O_CLOEXEC | os.O_NONBLOCK)
     except FileNotFoundError:

@@ -112,19 +112,19 @@ def find_blocks(
     if compression == "zstd" and len(head) == _HEAD and head.startswith(_ZSTD_MAGIC):
         flags, single = head[4], head[4] >> 5 & 1
         first = offset + 5 + (1 - single) + (0, 1, 2, 4)[flags & 3] + (single, 2, 4, 8)[flags >> 6]
-        block, before, extra, after = _ZSTD_BLOCK, 3, 3, (flags >> 2 & 1) * 4
+        block, block_head, extra, frame_tail = _ZSTD_BLOCK, 3, 3, (flags >> 2 & 1) * 4
         blocks = _zstd_blocks(view, first, end)
     elif compression == "lz4" and len(head) == _HEAD and head.startswith(_LZ4_MAGIC):
         flags = head[4]
         first = offset + 7 + (flags >> 3 & 1) * 8 + (flags & 1) * 4
         checksum = (flags >> 4 & 1) * 4
-        block, before = 1 << (8 + 2 * (head[5] >> 4 & 7)), 4
-        extra, after = 4 + checksum, 4 + (flags >> 2 & 1) * 4
+        block, block_head = 1 << (8 + 2 * (head[5] >> 4 & 7)), 4
+        extra, frame_tail = 4 + checksum, 4 + (flags >> 2 & 1) * 4
         blocks = _lz4_blocks(view, first, end, checksum)
     else:
         return None
-    if end - first - after == content + extra * -(-content // block):
-        return EqualBlocks(view, first, block, before, extra)
+    if end - first - frame_tail == content + extra * -(-content // block):
+        return EqualBlocks(view, first, block, block_head, extra)
     return RawBlocks(view, blocks)
 
 
@@ -185,7 +185,7 @@ def unpack(view: View, offset: int, head: ChunkHead) -> bytes:
     Raises
     ------
     BoundError
-        The chunk really holds more than the limit. A chunk with only a too large stated size is damaged.
+        The chunk really holds more than the limit. If only its stated size is too large, it is damaged.
     LogError
         The chunk is damaged.
     """

@@ -36,7 +36,7 @@ _GENERIC = re.compile(
 
 
 def camera_of_topic(topic: str) -> str | None:
-    """Return the camera in an ipsys topic, such as ``/runs/stock/cameras/red/markers``; None without one."""
+    """Return the camera in an ipsys topic, such as ``/runs/stock/cameras/red/markers``; or None."""
     match = _OWN.fullmatch(topic)
     return match["camera"] if match else None
 

@@ -117,7 +117,7 @@ class ChannelHash:
 
 
 def metadata_of_hashes(hashes: dict[str, ChannelHash], offset: int) -> bytes:
-    """Return the Metadata record for `offset` that stores the valid ones of `hashes` by topic.
+    """Return the Metadata record for `offset` that stores the valid hashes in `hashes` by topic.
 
     The record holds its own offset. A tool that copies records to other offsets may change the log and not
     update the hashes. Then the stored offset is wrong, and readers ignore the hashes.

@@ -152,15 +152,15 @@ def read_journal(fd: int, journal_fd: int) -> Journal | None:
     head = _EARLIER_HEAD if earlier else _HEAD
     if len(start) < head.size:
         return None
-    magic, old_size, *sizes, tail_offset, before, before_crc, tail_length = head.unpack_from(start)
+    magic, old_size, *sizes, tail_offset, bytes_before, before_crc, tail_length = head.unpack_from(start)
     body = head.size + tail_length
     whole = (
         magic in (_MAGIC, _EARLIER_MAGIC)
         and tail_offset + tail_length == old_size
-        and before == min(_BEFORE, tail_offset)
+        and bytes_before == min(_BEFORE, tail_offset)
         and os.fstat(journal_fd).st_size == body + _CRC.size
         and os.pread(journal_fd, _CRC.size, body) == _CRC.pack(_crc(journal_fd, 0, body) or 0)
-        and _crc(fd, tail_offset - before, before) == before_crc
+        and _crc(fd, tail_offset - bytes_before, bytes_before) == before_crc
         and not _went_on(fd, (old_size, *sizes))
     )
     # The file gets its new size last, after all other data are on the disk.
@@ -280,9 +280,9 @@ def _put_back(storage: Storage, fd: int, journal_fd: int, journal: Journal) -> N
 
 def _write_journal(storage: Storage, path: Path, fd: int, offset: int, sizes: tuple[int, int]) -> None:
     size = os.fstat(fd).st_size
-    before = min(_BEFORE, offset)
-    before_crc = _crc(fd, offset - before, before) or 0
-    head = _HEAD.pack(_MAGIC, size, *sizes, offset, before, before_crc, size - offset)
+    bytes_before = min(_BEFORE, offset)
+    before_crc = _crc(fd, offset - bytes_before, bytes_before) or 0
+    head = _HEAD.pack(_MAGIC, size, *sizes, offset, bytes_before, before_crc, size - offset)
     journal_fd = storage.open(journal_path(path), os.O_RDWR | os.O_CREAT | os.O_TRUNC)
     try:
         position, crc = 0, 0

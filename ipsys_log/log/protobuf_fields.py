@@ -37,7 +37,7 @@ def read_proto(payload_type: type, proto: Any, items: Items) -> Any:
 
 @cache
 def fields_of(payload_type: type) -> tuple[tuple[str, Fill, Read], ...]:
-    """Return for each field of a payload: its name, the function that fills it, and the one that reads it."""
+    """Return for each field of a payload: its name, its fill function and its read function."""
     hints = get_type_hints(payload_type, include_extras=True)
     return tuple((f.name, *_converters(f.name, hints[f.name])) for f in fields(payload_type))
 

@@ -49,7 +49,8 @@ class LogReader:
     channels : Mapping[str, Channel]
         The channels by topic.
     conflicts : Mapping[str, str]
-        The topics whose channels differ in schema or encoding, with the difference. They cannot be read.
+        The topics whose channels differ in schema or encoding, with the difference. They cannot be read as
+        one channel.
     start_ns, end_ns : int or None
         Log times of the first and the last message.
     message_count : int

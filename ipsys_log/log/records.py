@@ -110,7 +110,7 @@ class ChunkHead(NamedTuple):
 
 
 def as_bytes(*records: mcap.McapRecord) -> bytes:
-    """Return the bytes of the records in a file."""
+    """Return the records as the bytes of a file."""
     builder = RecordBuilder()  # type: ignore[no-untyped-call, unused-ignore]
     for record in records:
         record.write(builder)

@@ -76,9 +76,9 @@ def repair(path: str | os.PathLike[str], *, storage: Storage = DISK) -> RepairRe
     readable messages of a damaged chunk are saved in a new chunk. All bytes that are overwritten or cut off
     are kept in ``<path>.damaged`` (``.damaged_2`` if an earlier repair left such a file).
 
-    The new log is read again before anything is changed: its indexes, its data section and its statistics
-    must give the same number of messages, and a second repair must find nothing to do. A whole log is
-    read once, a damaged log twice.
+    The new log is read again before the file is changed. Its indexes, its data section and its statistics
+    must give the same number of messages. A second repair must find no damage. A whole log is read once, a
+    damaged log twice.
 
     Raises
     ------
@@ -168,7 +168,7 @@ def _rebuild(
 
 
 def _plan(view: View, found: Survey, saved: Salvage, tail: IO[bytes]) -> _Plan:
-    """Plan the new log; nothing is changed yet."""
+    """Plan the new log; the file is not changed yet."""
     contents, start = found.contents, found.end
     patches = _patches(found)
     end = _End(tail, start, _crc_with(view, patches, start, found.crc))
@@ -305,7 +305,7 @@ def _commit(storage: Storage, view: View, change: Change, plan: _Plan) -> Path |
     """Keep the old bytes, then write the new log; a crash at any instant leaves the old or the new log."""
     path, fd = view.path, view.fd
     check_room(path, change)
-    kept = keep_old_bytes(storage, view, change, os.fstat(fd).st_mtime_ns)
+    has_old_bytes = keep_old_bytes(storage, view, change, os.fstat(fd).st_mtime_ns)
     try:
         replace_tail(storage, path, fd, change.start, _Blocks(plan.tail.fileno(), plan.tail_size))
     except BaseException:  # a disk error, or an interrupt
@@ -313,7 +313,7 @@ def _commit(storage: Storage, view: View, change: Change, plan: _Plan) -> Path |
             roll_back(storage, path, fd)
             discard(storage, path, fd)
         raise
-    return overwrite(storage, path, fd, change.patches) if kept else None
+    return overwrite(storage, path, fd, change.patches) if has_old_bytes else None
 
 
 def _own_end(view: View, found: Survey) -> int:
@@ -335,7 +335,7 @@ def _report(
         notes.append("found: the CRC of the data section is wrong; the damaged part is not known")
     if own_end < view.size:
         notes.append(f"{view.size - own_end} bytes after its end, perhaps another log, were cut off")
-    gone, counted = _gone(found, known)
+    lost_counts, counted = _gone(found, known)
     # Without a CRC and a summary, a removal of whole records cannot be detected.
     is_unsure = found.finished and not (found.has_crc and found.crc_is_right)
     return RepairReport(
@@ -347,7 +347,7 @@ def _report(
         found.lost.times_ns,
         tuple(notes),
         cut_off=not found.finished and known is None,
-        gone=gone,
+        gone=lost_counts,
         uncounted=not counted and (found.lost.uncounted > 0 or is_unsure),
         unchecked=saved.unchecked,
         kept_in=kept_in,
@@ -356,13 +356,13 @@ def _report(
 
 def _gone(found: Survey, known: Summary | None) -> tuple[dict[str, int], bool]:
     """Return the number of lost messages by topic, and whether the summary confirms these numbers."""
-    gone = {topic: len(times_ns) for topic, times_ns in found.lost.times_ns.items()}
+    lost_counts = {topic: len(times_ns) for topic, times_ns in found.lost.times_ns.items()}
     if known is None or not known.checked or known.statistics is None:
-        return gone, False
+        return lost_counts, False
     for channel, number in known.statistics.channel_message_counts.items():
         record = known.contents.channels.get(channel)
         missing = number - found.contents.counts.get(channel, 0)
         if missing > 0:
             topic = record.topic if record else f"channel {channel}"
-            gone[topic] = max(gone.get(topic, 0), missing)
-    return gone, True
+            lost_counts[topic] = max(lost_counts.get(topic, 0), missing)
+    return lost_counts, True

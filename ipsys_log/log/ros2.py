@@ -51,7 +51,7 @@ def read_ros2(name: str, data: bytes, definition: bytes, items: Items | None = N
     name : the name of the schema, such as ``sensor_msgs/msg/CompressedImage``.
     data : the message.
     definition : the schema in the log (``ros2msg``); empty if it has another form.
-    items : the count of numbers outside of images that may still be read.
+    items : how many numbers outside of images may still be read.
 
     Raises
     ------
@@ -90,7 +90,7 @@ def _decoder(name: str) -> Callable[[bytes], Any]:
 
 @cache
 def _check_definition(name: str, definition: bytes) -> None:
-    """Refuse a definition whose fields are not those of ROS 2."""
+    """Refuse a definition whose fields differ from the fields of ROS 2."""
     if len(definition) > _LONGEST_DEFINITION:
         raise LogError(f"its schema {name!r} is not a .msg file of ROS 2: it has {len(definition)} bytes")
     main, *others = re.split(r"^=+\s*^MSG:", definition.decode(errors="replace"), flags=re.MULTILINE)
@@ -118,7 +118,7 @@ def _time_ns(stamp: Any) -> int:
 
 
 def _read_compressed(found: Any, time_ns: int) -> CompressedImage:
-    # ROS also writes "bgr8; jpeg compressed bgr8" as format. The first bytes tell the real format.
+    # ROS also writes "bgr8; jpeg compressed bgr8" as format. The first bytes show the real format.
     heads = {b"\xff\xd8": "jpeg", b"\x89P": "png"}
     kind = heads.get(bytes(found.data[:2]), found.format)
     return CompressedImage(time_ns, found.header.frame_id, bytes(found.data), kind)

@@ -80,8 +80,8 @@ class LogWriter:
         path
             A file that does not exist yet.
         atomic
-            False: the file grows in place, so that the data of a killed recorder stay there, and an exception
-            in the with-block finishes the log with its messages so far. True: the log is written as
+            False: the file grows in place, so that the data of a killed recorder stay there. An exception in
+            the with-block finishes the log with its messages so far. True: the log is written as
             ``<path>.partial`` and renamed when it is complete; an exception leaves no file.
         storage
             The operations on files; only tests replace it.
@@ -115,8 +115,8 @@ class LogWriter:
     def append(cls, path: str | os.PathLike[str], *, storage: Storage = DISK) -> Self:
         """Continue a finished log in place.
 
-        The exclusive lock is held until `close`. The file is not changed before that, and an exception in the
-        with-block leaves it unchanged. A crash at any instant leaves the old log or the new one.
+        The writer keeps the exclusive lock until `close`. The file is not changed before that. An exception
+        in the with-block leaves it unchanged. A crash at any instant leaves the old log or the new one.
 
         Raises
         ------

@@ -191,9 +191,9 @@ class Definitions:
         """Replace definitions without CRC by definitions with a right CRC; blank the replaced records."""
         for record in records:
             key = (isinstance(record, mcap.Schema), record.id)
-            mine: dict[int, Any] = self.schemas if key[0] else self.channels
-            if key not in self._checked and mine.get(record.id, record) != record:
-                self._blank(mine, key)
+            defined: dict[int, Any] = self.schemas if key[0] else self.channels
+            if key not in self._checked and defined.get(record.id, record) != record:
+                self._blank(defined, key)
                 users = [c.id for c in self.channels.values() if key[0] and c.schema_id == record.id]
                 for channel_id in users:
                     self._blank(self.channels, (False, channel_id))
@@ -225,11 +225,11 @@ class Definitions:
         Only `checked` definitions count against a `checked` record. See `take_chunk` for records near damage.
         """
         schema = isinstance(record, mcap.Schema)
-        mine: Mapping[int, mcap.Schema | mcap.Channel] = self.schemas if schema else self.channels
+        defined: Mapping[int, mcap.Schema | mcap.Channel] = self.schemas if schema else self.channels
         key = (schema, record.id)
         is_sure = not checked or key in self._checked
         is_sure |= doubtful and key not in self._doubtful and (alone or self._is_used(key))
-        if is_sure and record.id in mine and mine[record.id] != record:
+        if is_sure and record.id in defined and defined[record.id] != record:
             return True
         if self._sure is None:
             return False

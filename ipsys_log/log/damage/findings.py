@@ -86,7 +86,7 @@ class Survey:
 
 
 LOOSE = frozenset((Opcode.SCHEMA, Opcode.CHANNEL, Opcode.MESSAGE, Opcode.ATTACHMENT, Opcode.METADATA))
-# If such a record is damaged, the number of lost messages is known: none, or one.
+# If such a record is damaged, the number of lost messages is known: zero or one.
 COUNTED = LOOSE | {Opcode.MESSAGE_INDEX, Opcode.DATA_END}
 _DOUBTFUL = 4096  # bytes
 
@@ -151,13 +151,13 @@ def _save(found: Survey, stretch: Stretch, rows: Rows) -> None:
         saved = found.saved.save(
             found.view, stretch, rows, found.definitions, found.hashes, in_order=stretch is found.cut
         )
-    gone = [
+    lost_messages = [
         (channel, time_ns)
         for channel, entries in rows.items()
         for time_ns, offset in entries
         if (channel, offset) not in saved.messages
     ]
-    for channel, time_ns in gone if rows else saved.torn:
+    for channel, time_ns in lost_messages if rows else saved.torn:
         found.lost.note(found.definitions.topic(channel), time_ns)
     if saved.note:
         found.faults.append(saved.note)

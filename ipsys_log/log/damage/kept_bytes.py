@@ -1,7 +1,7 @@
 """Storage of the bytes that a repair takes out of a log, and the state of an unfinished repair.
 
 ``<log>.damaged`` is an MCAP file. Its attachments are the bytes that were overwritten or cut off, each named
-after its byte range in the damaged log. To write them back to these ranges restores the damaged log. The
+after its byte range in the damaged log. If they are written back there, the damaged log is restored. The
 metadata record of the file lists the new bytes. Until the repair is complete, the file has the name
 ``<log>.damaged.partial``:
 
@@ -64,7 +64,7 @@ class Change:
 
 
 def check_room(path: Path, change: Change) -> None:
-    """Refuse a repair for which the disk has no room, before anything is changed.
+    """Refuse a repair for which the disk has no room, before any change.
 
     Raises
     ------

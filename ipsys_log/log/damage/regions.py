@@ -20,8 +20,8 @@ class Stretch:
     """A byte range from `offset` on that does not consist of whole records.
 
     A repair replaces it by `head` (the beginning of a file), the message indexes of the chunk before it
-    (`entries`), lost `definitions`, and a record of a private type over the rest, which every reader skips.
-    Only the first bytes of this record are written; its other bytes are not changed.
+    (`entries`), and lost `definitions`. A record of a private type fills the rest; every reader skips this
+    record. Only the first bytes of this record are written; its other bytes are not changed.
     """
 
     offset: int

@@ -39,7 +39,7 @@ _LONGEST_CHAIN = 256  # records
 _ENOUGH = 3  # messages and channels in a row, even if they do not belong together
 _RECENT = 8  # messages: damage may have changed the time of one of them
 _DAY_NS = 86_400 * 1_000_000_000
-_IN_VAIN = 64 << 20  # bytes: minimum that may be searched without result
+_IN_VAIN = 64 << 20  # bytes: limit of the search without result in a small log
 _STEP = 4096  # bytes: the cost of a check of a small record
 _CHUNK = rb"\x06.{36}(?:\x00{4}|\x04\x00{3}zstd|\x03\x00{3}lz4)"
 _CHUNK_HEAD = re.compile(_CHUNK, re.DOTALL)
@@ -69,9 +69,9 @@ class Resync:
     """A search for records in one log.
 
     `chunked` says whether its messages lie in chunks (None: not known yet). If they do, a message record
-    elsewhere is a piece of a damaged chunk. `channels` are the defined ids, `times_ns` the log times of the
-    last messages outside of chunks, `span_ns` the time range of all messages, if the summary has it. `budget`
-    limits the bytes that are searched without result.
+    elsewhere is a piece of a damaged chunk. `channels` are the defined ids. `times_ns` are the log times of
+    the last messages outside of chunks. `span_ns` is the time range of all messages, if the summary has it.
+    `budget` limits the bytes that are searched without result.
     """
 
     view: View
@@ -85,7 +85,7 @@ class Resync:
         self.budget = _IN_VAIN + 4 * self.view.size
 
     def find(self, damaged: int, claimed: int = 0, gap: int = HEADER.size) -> int | None:
-        """Return the offset of the next whole record after the damaged one, None if there is none.
+        """Return the offset of the next whole record after the damaged record, None if there is none.
 
         `claimed` is the end of the damaged record by its own length, 0 if there is none. The damaged record
         takes at least `gap` bytes.
@@ -93,7 +93,7 @@ class Resync:
         if self.chunked is None and not self.times_ns:
             self.chunked = self._has_chunks(damaged)
         if damaged < claimed and self.leads_on(claimed):
-            # Its length may be right, but the head may also be a stray copy that includes later bytes.
+            # Its length may be right, but a stray copy of a head may also claim the bytes after it.
             pattern = _CHUNK_HEAD if self.is_chunk_head(damaged) else _CANDIDATE
             inner = self._find(pattern, damaged + gap, claimed, into_damage=False)
             return claimed if inner is None else inner
@@ -137,9 +137,12 @@ class Resync:
                 if record_at.opcode == Opcode.FOOTER and record_at.length == FOOTER.size:
                     summary = FOOTER.unpack(self.view.read(record_at.offset, FOOTER.size))[2]
                     stop = record_at.offset + record_at.length
-                    behind = self.view.read(stop, min(2 * len(MAGIC), self.view.size - stop))
-                    # A stray copy without summary looks the same, but is not at the end of a file.
-                    return behind in (MAGIC, 2 * MAGIC) or (summary == start and behind.startswith(MAGIC))
+                    following = self.view.read(stop, min(2 * len(MAGIC), self.view.size - stop))
+                    # A stray copy without summary has the same bytes. But neither the end of the file nor
+                    # another log follows it.
+                    return following in (MAGIC, 2 * MAGIC) or (
+                        summary == start and following.startswith(MAGIC)
+                    )
                 if record_at.opcode not in _IN_SUMMARY and record_at.opcode < PRIVATE:
                     return False
         except LogError:
@@ -190,7 +193,9 @@ class Resync:
         return last > 0
 
     def _judge(self, at: RecordAt, times_ns: list[int], defined: set[int]) -> bool | None:
-        """Return whether a record proves that it and earlier ones are whole; None: the next one decides.
+        """Return whether a record proves that it and earlier records are whole.
+
+        None means that the next record decides.
 
         Raises
         ------

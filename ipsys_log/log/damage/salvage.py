@@ -65,7 +65,7 @@ class _Records(NamedTuple):
 class Saved(NamedTuple):
     """The messages saved from one stretch: the channel id and the offset in the chunk of each message.
 
-    `torn` has the channel id and log time of an incomplete message. `counted` says that the stretch held no
+    `torn` has the channel id and log time of an incomplete message. `counted` says that the stretch has no
     other messages. `share` is the saved fraction of the stretch.
     """
 
@@ -80,7 +80,8 @@ class Saved(NamedTuple):
 class Salvage:
     """Messages saved into new chunks, which are kept in `spool` until they are written to the log.
 
-    `inside` holds what the damaged chunks define, `unchecked` counts messages whose CRC cannot be checked.
+    `inside` has the definitions of the damaged chunks. `unchecked` counts messages whose CRC cannot be
+    checked.
     """
 
     spool: IO[bytes]
@@ -141,10 +142,10 @@ class Salvage:
 
     def finish(self) -> None:
         """Write the last chunk into the spool."""
-        built = self._builder.build(0)
-        if built is None:
+        chunk = self._builder.build(0)
+        if chunk is None:
             return
-        ref, data, _ = built
+        ref, data, _ = chunk
         offsets = {channel: offset + self.size for channel, offset in ref.index_offsets.items()}
         self.chunks.append(ref._replace(offset=self.size, index_offsets=offsets))
         for channel, number in self._builder.counts.items():
@@ -312,11 +313,11 @@ def _makes_sense(view: View, data: Buffer, at: RecordAt, inside: Inside) -> bool
         return at.opcode >= PRIVATE
     if at.offset + at.length <= len(data):
         try:
-            more = look_inside(view, 0, bytes(data[at.offset : at.offset + at.length]))
+            record_inside = look_inside(view, 0, bytes(data[at.offset : at.offset + at.length]))
         except LogError:
             return False
-        inside.schemas |= more.schemas
-        inside.channels |= more.channels
+        inside.schemas |= record_inside.schemas
+        inside.channels |= record_inside.channels
     return True
 
 

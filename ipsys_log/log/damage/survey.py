@@ -98,18 +98,18 @@ def _span_ns(known: Summary | None) -> tuple[int, int] | None:
 def _take_start(found: Survey) -> int:
     """Check the magic bytes and the Header record; return the offset of the records after them."""
     view, start = found.view, len(MAGIC)
-    behind, reason = _behind_header(found)
+    header_end, reason = _behind_header(found)
     if view.read(0, min(start, view.size)) != MAGIC:
-        follower = start if behind > start else found.resync.find(start)
+        follower = start if header_end > start else found.resync.find(start)
         if follower is None:
             return view.size
         found.indexed = Indexed(follower) if follower > start else None
         head = MAGIC + (HEADER_RECORD if follower >= start + len(HEADER_RECORD) else b"")
         add_damage(found, Stretch(0, follower, head), "it does not begin as an MCAP file")
-        return max(follower, behind)
-    found.end = behind or start
-    if behind:
-        return behind
+        return max(follower, header_end)
+    found.end = header_end or start
+    if header_end:
+        return header_end
     follower = found.resync.find(start)
     if follower is None:
         return start
@@ -180,7 +180,7 @@ def _take(found: Survey, at: RecordAt) -> None:
 
 
 def _check_length(found: Survey, at: RecordAt) -> None:
-    """Refuse a record whose wrong length includes whole records, or ends before one.
+    """Refuse a record whose wrong length includes whole records, or ends before a whole record.
 
     If a record follows, the length is right. If no record follows, the damage may also be after this record.
     """

@@ -158,7 +158,7 @@ LEAST_CORNERS = 6
 # Least number of detected corners: one or two corners are often other objects in the room.
 _SEEN = 4
 # Sample positions for the sharpness of an edge: along the edge between two corners, and largest distance
-# beside the edge, in squares, within the white border of a marker.
+# beside the edge, in squares. The samples stay within the white border of a marker.
 _ALONG = (0.3, 0.4, 0.5, 0.6, 0.7)
 _BESIDE, _BESIDE_MARKERS = 0.3, 0.12
 _STEP_PX, _PIXEL = 0.5, 2

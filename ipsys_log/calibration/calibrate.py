@@ -36,7 +36,7 @@ LEAST_PICTURES = 5
 # Fewer images are refused even with --force.
 _LEAST_INSISTED = 3
 # A note is written for a focal length with a larger relative standard deviation, and for coefficients with a
-# larger standard deviation, which makes them useless.
+# larger standard deviation. Such coefficients are useless.
 _UNSURE = 0.02
 _UNTOLD = 1.0
 # RMS errors: above the first, other lens models are tried; the right lens model and a flat board leave less

@@ -168,7 +168,7 @@ def pose_from_rays(board_m: Array, rays: Array) -> tuple[Array, Array]:
 
 # The median of a two-dimensional normal distance, in standard deviations of one coordinate.
 _MEDIAN = float(np.sqrt(2 * np.log(2)))
-# Errors of a corner with half the weight, and of an outlier corner, in standard deviations; RMS of an image
+# Errors of a corner with half the weight, and of an outlier corner, in standard deviations. RMS of an image
 # that is left out, as a multiple of the usual RMS.
 _DOUBTED = 5.0
 _FAR_CORNER = 12.0

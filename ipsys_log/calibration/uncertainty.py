@@ -1,8 +1,8 @@
 """Uncertainty of intrinsics: their change without some images, and with a richer lens model.
 
-The richer model has one more radial term and the terms of displaced or tilted lens elements (decentering and
-thin prism: Brown 1966; Weng, Cohen and Herniou, PAMI 1992), as far as the model lacks them. One linear step
-from the fit shows their size, and the change of the other parameters.
+The richer model adds terms that the model lacks: one more radial term, and the terms of displaced or tilted
+lens elements. These are decentering and thin prism (Brown 1966; Weng, Cohen and Herniou, PAMI 1992). One
+linear step from the fit shows their size, and the change of the other parameters.
 """
 
 from __future__ import annotations
@@ -28,7 +28,7 @@ __all__ = ["alike", "lens_covariance", "model_change"]
 
 Array = NDArray[np.float64]
 
-# Usual size of the new terms: the radial term at the farthest corner, in focal lengths, and the other terms
+# Usual size of the new terms. The radial term is at the farthest corner, in focal lengths. The other terms are
 # per square of the distance from the principal point.
 _RADIAL, _TANGENTIAL = 0.01, 0.003
 # Terms count from this multiple of the mean chi^2 of noise on. Noise reaches it in about 10 % of fits.

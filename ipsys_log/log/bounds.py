@@ -1,7 +1,7 @@
 """Limits on the work to read a log, in proportion to the size of its file.
 
 A compressor stores 1 GB of zeros in 33 kB, and half a million empty messages in about 1 kB. Recorded
-logs stay far below every limit: each byte of the file unpacks to 2 to 4 bytes, and a message takes
+logs stay far below every limit. Each byte of their file unpacks to 2 to 4 bytes, and a message takes
 170 bytes or more.
 """
 

@@ -300,17 +300,14 @@ def look_inside(view: View, offset: int, data: bytes) -> Inside:
     """Return the definitions and message entries of the decompressed chunk `data` at `offset`."""
     inside, number = Inside(), 0
     left = view.allowance.records_left(offset)
-    for number, record_at in enumerate(inner_records(view, offset, data), 1):
+    for number, record in enumerate(inner_records(view, offset, data), 1):
         if number > left:
             raise view.refusal(f"its chunks hold more than {view.allowance.most_records} records")
-        if record_at.opcode in _DEFINITIONS:
-            check_definition(view, record_at)
-        head = MESSAGE.size if record_at.opcode == Opcode.MESSAGE else record_at.length
+        if record.opcode in _DEFINITIONS:
+            check_definition(view, record)
+        head = MESSAGE.size if record.opcode == Opcode.MESSAGE else record.length
         inside.add(
-            view,
-            record_at,
-            offset,
-            data[record_at.offset + HEADER.size : record_at.offset + min(head, record_at.length)],
+            view, record, offset, data[record.offset + HEADER.size : record.offset + min(head, record.length)]
         )
     view.allowance.count_records(offset, number)
     return inside

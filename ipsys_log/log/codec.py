@@ -1,7 +1,7 @@
 """Conversion of payloads to bytes and back, by the fields of the schemas.
 
-Every payload of :mod:`ipsys_log.messages` mirrors one protobuf schema: a schema of this project from
-the descriptor set in the package, or a well-known schema of Foxglove. The mapping is derived once per
+Every payload of :mod:`ipsys_log.messages` mirrors one protobuf schema. The schema comes from the
+descriptor set of this package, or is a well-known schema of Foxglove. The mapping is derived once per
 type from the type hints, so no field is defined twice. Numbers are stored without rounding (doubles).
 So a payload that is read back equals the written payload, bit for bit.
 """

@@ -84,7 +84,7 @@ class LogWriter:
             the with-block finishes the log with its messages so far. True: the log is written as
             ``<path>.partial`` and renamed when it is complete; an exception leaves no file.
         storage
-            The operations on files; only tests replace it.
+            The operations on files; only tests replace them.
 
         Raises
         ------

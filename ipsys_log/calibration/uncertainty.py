@@ -28,8 +28,8 @@ __all__ = ["alike", "lens_covariance", "model_change"]
 
 Array = NDArray[np.float64]
 
-# Usual size of the new terms. The radial term is at the farthest corner, in focal lengths. The other terms are
-# per square of the distance from the principal point.
+# Usual size of the new terms. The radial term is at the farthest corner, in focal lengths. The other terms
+# are per square of the distance from the principal point.
 _RADIAL, _TANGENTIAL = 0.01, 0.003
 # Terms count from this multiple of the mean chi^2 of noise on. Noise reaches it in about 10 % of fits.
 _NOISE = 2.0

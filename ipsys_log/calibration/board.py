@@ -1,6 +1,6 @@
 """Calibration boards: their kinds, their patterns, and the positions of their corners.
 
-The layout is that of OpenCV since 4.6: the square at the top left is black for any number of rows.
+The layout follows OpenCV 4.6 and later: the square at the top left is black for any number of rows.
 """
 
 from __future__ import annotations
@@ -27,10 +27,10 @@ class Board:
 
     Attributes
     ----------
-    columns, rows : of a chessboard's inner corners; of a ChArUco board's squares.
-    square_m : the side of a square. It scales the places of the board, not the lens.
-    marker_scale : side of a ChArUco board's markers, in squares; None: a chessboard, without markers.
-    dictionary : of the markers, by OpenCV's name.
+    columns, rows : numbers of inner corners of a chessboard, or of squares of a ChArUco board.
+    square_m : side of a square in m. It scales the positions of the board, not the intrinsics.
+    marker_scale : side of the markers of a ChArUco board, in squares; None for a chessboard without markers.
+    dictionary : name of the marker dictionary in OpenCV.
     inverted : whether black and white are exchanged.
     """
 
@@ -49,27 +49,27 @@ class Board:
 
     @property
     def grid(self) -> tuple[int, int]:
-        """Inner corners from left to right, and from top to bottom."""
-        less = 0 if self.marker_scale is None else 1
-        return self.columns - less, self.rows - less
+        """The numbers of inner corners from left to right, and from top to bottom."""
+        difference = 0 if self.marker_scale is None else 1
+        return self.columns - difference, self.rows - difference
 
     def places(self, ids: NDArray[np.intp]) -> NDArray[np.float64]:
-        """Column and row of corners, (n, 2)."""
+        """Return the column and the row of each corner, (n, 2)."""
         return np.column_stack([ids % self.grid[0], ids // self.grid[0]]).astype(np.float64)
 
     def points_m(self, ids: NDArray[np.intp]) -> NDArray[np.float64]:
-        """Corners on the board, (n, 3) in m: x along its rows, y down its columns, from the middle."""
-        middle = (np.array(self.grid) - 1) / 2
-        return np.column_stack([(self.places(ids) - middle) * self.square_m, np.zeros(len(ids))])
+        """Return the corners on the board, (n, 3) in m: x along rows, y down columns, 0 at the center."""
+        center = (np.array(self.grid) - 1) / 2
+        return np.column_stack([(self.places(ids) - center) * self.square_m, np.zeros(len(ids))])
 
 
 def parse_board(text: str, square_m: float, marker_scale: float, dictionary: str, inverted: bool) -> Board:
-    """The board that ``6x4`` or ``charuco:4x5`` stands for.
+    """Return the board for a text such as ``6x4`` or ``charuco:4x5``.
 
     Raises
     ------
     IpsysError
-        Where it stands for none.
+        The text or another value is not valid.
 
     Examples
     --------
@@ -88,8 +88,8 @@ def parse_board(text: str, square_m: float, marker_scale: float, dictionary: str
     charuco = match["kind"] == "charuco:"
     least = 3
     if not (least <= columns <= _MOST and least <= rows <= _MOST):
-        what = "squares" if charuco else "inner corners"
-        raise IpsysError(f"--board {text}: a board has {least} to {_MOST} {what} in each direction")
+        unit = "squares" if charuco else "inner corners"
+        raise IpsysError(f"--board {text}: a board has {least} to {_MOST} {unit} in each direction")
     if not 1e-4 <= square_m <= 10:
         raise IpsysError(f"--square {square_m:g}: give the side of a square in metres, such as 0.03")
     if not charuco:
@@ -138,7 +138,7 @@ def black_squares(board: Board) -> NDArray[np.bool_]:
 
 
 def board_markers(board: Board) -> list[BoardMarker]:
-    """Return the markers of a ChArUco board, row by row; of a chessboard none.
+    """Return the markers of a ChArUco board, row by row; a chessboard has none.
 
     Examples
     --------

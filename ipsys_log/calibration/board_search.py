@@ -1,4 +1,4 @@
-"""Look for a board in pictures, whatever they come from."""
+"""Search for a board in images from any source."""
 
 from __future__ import annotations
 
@@ -16,17 +16,17 @@ from ipsys_log.errors import IpsysError
 
 __all__ = ["Looked", "NotSeenError", "Size", "check_sizes", "look"]
 
-# Up to so many pictures are looked at thoroughly: more come from a video, which has others.
+# Up to this number of images, the search is thorough. More images come from a video, which has enough images.
 _THOROUGH = 100
 _HINTED = 8
 _CHECKED = 8
-# Pictures of another size are left out where so many are of one.
+# Images of another size are left out if at least this share of the images has one size.
 _MOST_ARE = 0.75
 _SIZES_NAMED, _EXAMPLES = 4, 2
 
 
 class NotSeenError(IpsysError):
-    """A board that is in none of the pictures."""
+    """A board that no image shows."""
 
 
 # Width and height in px.
@@ -35,7 +35,7 @@ Size = tuple[int, int]
 
 @dataclass(frozen=True, slots=True, eq=False)
 class Looked:
-    """All pictures of a camera: number, size, sightings, unreadable pictures, pictures without the board."""
+    """All images of a camera: number, size, sightings, unreadable images, and images without the board."""
 
     count: int
     size_px: tuple[int, int]
@@ -45,7 +45,7 @@ class Looked:
 
 
 class _Seen(NamedTuple):
-    """One readable picture: its name, its size in px, and the view of the board."""
+    """One readable image: its name, its size in px, and the view of the board."""
 
     name: str
     size: Size
@@ -61,25 +61,25 @@ def look(
     trying: Callable[[int, int], None] = lambda done, total: None,
     insist: bool = False,
 ) -> Looked:
-    """Detect the board in all pictures.
+    """Detect the board in all images.
 
     Parameters
     ----------
-    pictures : names and grey pictures, None for an unreadable one.
-    board : to search for.
-    total : approximate number of pictures; 0 if it is not known.
-    where : source of the pictures, for messages.
-    progress : called with the number of pictures done.
-    trying : called with the number of other boards tried, and their total, if this one is not seen.
-    insist : accept the size of the board, even if the pictures contradict it.
+    pictures : names and grey images, None for an unreadable image.
+    board : the board to search for.
+    total : approximate number of images; 0 if it is not known.
+    where : source of the images, for messages.
+    progress : called with the number of searched images.
+    trying : called with the number of other boards tried, and their total, if no image shows the board.
+    insist : accept the size of the board, even if the images contradict it.
 
     Raises
     ------
     IpsysError
-        Pictures have several sizes, and no size has the majority; no picture can be read; or most pictures
+        Images have several sizes, and no size has the majority; no image can be read; or most images
         show a larger board.
     NotSeenError
-        No picture shows the board; the text says what they show.
+        No image shows the board; the text says which board the images show.
     """
     count = 0
     views: list[_Seen] = []
@@ -96,18 +96,24 @@ def look(
         progress(count)
     if not views:
         raise IpsysError(f"{where}: none of {count} pictures can be read")
-    usual = check_sizes([(one.name, one.size) for one in views], where)
-    if all(one.view.sighting is None for one in views):
-        found = hint(without.pictures, board, trying, [one.view.grid for one in views])
-        raise NotSeenError(f"{where}: {board} is not seen in any of {count} pictures{found}")
+    usual_size = check_sizes([(viewed.name, viewed.size) for viewed in views], where)
+    if all(viewed.view.sighting is None for viewed in views):
+        hint_text = hint(without.pictures, board, trying, [viewed.view.grid for viewed in views])
+        raise NotSeenError(f"{where}: {board} is not seen in any of {count} pictures{hint_text}")
     if not insist and board.marker_scale is None:
-        check_chessboard_size([one.view.grid for one in views], board, where)
+        check_chessboard_size([viewed.view.grid for viewed in views], board, where)
     elif not insist:
         check_charuco_size(shown.pictures, board, where)
-    ordinary = [one for one in views if one.size == usual]
-    seen = [one.view.sighting for one in ordinary if one.view.sighting is not None]
-    unseen = [Dropped(one.name, _reason(one.view, board)) for one in ordinary if one.view.sighting is None]
-    return Looked(count, usual, tuple(seen), (*unreadable, *_strange(views, usual)), tuple(unseen))
+    ordinary = [viewed for viewed in views if viewed.size == usual_size]
+    sightings = [viewed.view.sighting for viewed in ordinary if viewed.view.sighting is not None]
+    unseen = [
+        Dropped(viewed.name, _reason(viewed.view, board))
+        for viewed in ordinary
+        if viewed.view.sighting is None
+    ]
+    return Looked(
+        count, usual_size, tuple(sightings), (*unreadable, *_strange(views, usual_size)), tuple(unseen)
+    )
 
 
 def _reason(view: View, board: Board) -> str:
@@ -120,17 +126,17 @@ def _reason(view: View, board: Board) -> str:
 
 
 def check_sizes(sizes: Sequence[tuple[str, Size]], where: str) -> Size:
-    """Return the size in px that most pictures have.
+    """Return the size in px that most images have.
 
     Parameters
     ----------
-    sizes : name and size of each picture, at least one.
-    where : source of the pictures, for messages.
+    sizes : name and size of each image, at least one.
+    where : source of the images, for messages.
 
     Raises
     ------
     IpsysError
-        More than a few pictures have another size.
+        More than a few images have another size.
     """
     counts = Counter(size for _, size in sizes).most_common()
     if counts[0][1] >= _MOST_ARE * len(sizes):
@@ -150,11 +156,13 @@ def check_sizes(sizes: Sequence[tuple[str, Size]], where: str) -> Size:
 
 def _strange(views: Sequence[_Seen], usual: Size) -> list[Dropped]:
     reason = "is {} x {} px, most are {} x {}"
-    return [Dropped(one.name, reason.format(*one.size, *usual)) for one in views if one.size != usual]
+    return [
+        Dropped(viewed.name, reason.format(*viewed.size, *usual)) for viewed in views if viewed.size != usual
+    ]
 
 
 class _Sample:
-    """Return a few pictures, spread over all of them."""
+    """A small sample of images, spread over all images."""
 
     def __init__(self, wanted: int, total: int) -> None:
         self.pictures: list[Grey] = []

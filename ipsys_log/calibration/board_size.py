@@ -22,14 +22,14 @@ __all__ = ["CharucoSize", "check_charuco_size", "check_chessboard_size", "estima
 Array = NDArray[np.float64]
 # Squares in a row of the tried boards, and the largest number of rows.
 _COLUMNS, _MOST_ROWS = range(3, 25), 25
-# Least number of markers to tell the length of a row; least share of a picture's markers at their place.
+# Least number of markers to find the row length; least share of the markers of an image at their positions.
 _LEAST_MARKERS, _AT_PLACE = 6, 0.75
-# Largest distance of a marker from its place, in squares: lens distortion bends the board.
+# Largest distance of a marker from its position, in squares: lens distortion bends the board.
 _NEAR = 0.3
 
 
 class CharucoSize(NamedTuple):
-    """Columns and rows of squares, and the number of pictures with so many columns."""
+    """Columns and rows of squares, and the number of images with so many columns."""
 
     columns: int
     rows: int
@@ -39,13 +39,13 @@ class CharucoSize(NamedTuple):
 def estimate_charuco_size(pictures: Sequence[Grey], dictionary: str) -> CharucoSize | None:
     """Return the size of the board that explains most markers; None if there is none.
 
-    The number of columns is the one for which the markers of a picture lie in a plane, each at the place of
-    its id. The last row is that of the highest id, so rows outside of the pictures are not counted.
+    With the right number of columns, the markers of an image lie in a plane, each at the position of its id.
+    The highest id gives the last row, so rows outside of the images are not counted.
 
     Parameters
     ----------
-    pictures : grey, not inverted.
-    dictionary : by OpenCV's name.
+    pictures : grey images, not inverted.
+    dictionary : name of the marker dictionary in OpenCV.
     """
     number = getattr(cv2.aruco, dictionary)
     detector = cv2.aruco.ArucoDetector(cv2.aruco.getPredefinedDictionary(number))
@@ -67,11 +67,11 @@ def estimate_charuco_size(pictures: Sequence[Grey], dictionary: str) -> CharucoS
 
 
 def _size_of(ids: NDArray[np.intp], centres: Array) -> tuple[int, int] | None:
-    """Return the columns and rows for which most markers of a picture are at their places."""
+    """Return the columns and rows for which most markers of an image are at their positions."""
     best: tuple[int, int] | None = None
     most = max(_LEAST_MARKERS, _AT_PLACE * len(ids)) - 0.5
     for columns in _COLUMNS:
-        # OpenCV before 4.6 printed boards of an even number of rows with a white square first.
+        # OpenCV before 4.6 printed boards with an even number of rows with a white square at the top left.
         for first in (1, 0):
             places = _marker_places(columns, first)
             known = ids < len(places)
@@ -85,7 +85,7 @@ def _size_of(ids: NDArray[np.intp], centres: Array) -> tuple[int, int] | None:
 
 
 def _at_place(places: Array, centres: Array) -> NDArray[np.bool_]:
-    """Return a mask of the markers at their places in a plane, (n,); all False if there is no such plane."""
+    """Return a mask of the markers at their positions in a plane, (n,); all False if there is no plane."""
     result: Any = cv2.findHomography(centres, places, cv2.RANSAC, _NEAR)
     homography, near = result
     return np.zeros(len(places), np.bool_) if homography is None else np.ravel(near).astype(np.bool_)
@@ -102,14 +102,14 @@ def _marker_places(columns: int, first: int) -> Array:
 # Columns and rows of inner corners.
 Size = tuple[int, int]
 
-# One dictionary of each kind: the smaller ones are its beginning.
+# One dictionary of each kind: smaller dictionaries are the beginning of a larger one.
 _DICTIONARIES = (
     "DICT_4X4_1000", "DICT_5X5_1000", "DICT_6X6_1000", "DICT_7X7_1000", "DICT_ARUCO_ORIGINAL",
     "DICT_APRILTAG_36h11",
 )  # fmt: skip
-# A grid belongs to a board if most pictures show it, or at least this share and two or more.
+# A grid belongs to a board if most images show it, or at least this share and two or more images.
 _MOST, _SUPPORT, _LEAST_SUPPORT = 0.5, 0.2, 2
-# The size given by a user is refused if more than this share of the pictures contradicts it.
+# The size from the user is refused if more than this share of the images contradicts it.
 _CONTRADICTED = 0.5
 _FORCE = "if the size is right, give --force"
 
@@ -120,14 +120,14 @@ def hint(
     trying: Callable[[int, int], None],
     sizes: Sequence[Size | None] = (),
 ) -> str:
-    """Return the end of a sentence that names the board that is seen, or says what to check.
+    """Return the end of an error text: the board in the images, or advice for a check.
 
     Parameters
     ----------
-    pictures : to examine.
-    board : the board that is not found.
-    trying : called with the number of other kinds of board tried so far, and their total: it takes a while.
-    sizes : of the largest chessboard in each picture, if that is known.
+    pictures : the images to examine.
+    board : the board that no image shows.
+    trying : called with the number of other kinds of board tried so far, and their total: the search is slow.
+    sizes : size of the largest chessboard in each image, if it is known.
     """
     if any(size is not None for size in sizes) and (answer := _name_size(sizes, board, board)):
         return answer
@@ -147,39 +147,39 @@ def hint(
 
 
 def check_chessboard_size(sizes: Sequence[Size | None], board: Board, where: str) -> None:
-    """Check that most pictures do not show a larger chessboard than the given one.
+    """Check that most images do not show a larger chessboard than the given board.
 
     Parameters
     ----------
-    sizes : of the largest grid in each picture.
+    sizes : size of the largest grid in each image.
     board : a chessboard.
-    where : source of the pictures, for messages.
+    where : source of the images, for messages.
 
     Raises
     ------
     IpsysError
-        Most do; the text names the larger board that explains most corners.
+        Most images show a larger board; the text names the board that explains most corners.
     """
     larger = _largest_board([size for size in sizes if size is None or _exceeds(size, board.grid)])
-    seen = sum(size is not None for size in sizes)
+    total = sum(size is not None for size in sizes)
     count = sum(size is not None and _exceeds(size, board.grid) for size in sizes)
-    if larger is None or count <= _CONTRADICTED * seen:
+    if larger is None or count <= _CONTRADICTED * total:
         return
-    other = _sized(board, larger)
+    larger_board = _sized(board, larger)
     shown = sum(_same(size, larger) for size in sizes)
     raise IpsysError(
-        f"{where}: {board} is a part of {other}, which {shown} of {seen} pictures of a board show: "
-        f"give --board {other.columns}x{other.rows}; {_FORCE}"
+        f"{where}: {board} is a part of {larger_board}, which {shown} of {total} pictures of a board show: "
+        f"give --board {larger_board.columns}x{larger_board.rows}; {_FORCE}"
     )
 
 
 def check_charuco_size(pictures: Sequence[Grey], board: Board, where: str) -> None:
-    """Check that markers lie as on a ChArUco board of the given size.
+    """Check that the markers have the positions of a ChArUco board of the given size.
 
     Raises
     ------
     IpsysError
-        They do not; the text names the size by the markers.
+        The markers have other positions; the text names the board size that fits the markers.
     """
     size = estimate_charuco_size([_as_printed(grey, board) for grey in pictures], board.dictionary)
     if size is None or size.pictures <= _CONTRADICTED * len(pictures):
@@ -195,8 +195,8 @@ def check_charuco_size(pictures: Sequence[Grey], board: Board, where: str) -> No
 
 
 def _mirrored(pictures: Sequence[Grey], board: Board) -> str:
-    turned = [np.ascontiguousarray(grey[:, ::-1]) for grey in pictures]
-    seen = sum(find_board("", grey, board, thorough=False) is not None for grey in turned)
+    mirrored = [np.ascontiguousarray(grey[:, ::-1]) for grey in pictures]
+    seen = sum(find_board("", grey, board, thorough=False) is not None for grey in mirrored)
     if not seen:
         return ""
     return (
@@ -206,7 +206,7 @@ def _mirrored(pictures: Sequence[Grey], board: Board) -> str:
 
 
 def _searches(pictures: Sequence[Grey], board: Board) -> Iterator[Callable[[], str]]:
-    """Return the searches for other boards, the likely ones first."""
+    """Yield the searches for other boards, the likely boards first."""
     inverted = replace(board, inverted=not board.inverted)
     chessboards = [partial(_other_chessboard, pictures, kind, board) for kind in (board, inverted)]
     markers = [
@@ -222,17 +222,17 @@ def _other_chessboard(pictures: Sequence[Grey], kind: Board, board: Board) -> st
 
 
 def _name_size(sizes: Sequence[Size | None], kind: Board, board: Board) -> str:
-    """Return the text on a chessboard of a kind that is seen instead of the given one, if any."""
+    """Return the text on a chessboard that the images show instead of the given board, or ""."""
     size = _largest_board(sizes)
     if size is None:
         return ""
-    other = _sized(replace(kind, marker_scale=None), size)
-    if other == board:
+    seen_board = _sized(replace(kind, marker_scale=None), size)
+    if seen_board == board:
         return ""
-    seen = sum(_same(shown, size) for shown in sizes)
-    option = f"--board {other.columns}x{other.rows}"
+    seen_count = sum(_same(shown, size) for shown in sizes)
+    option = f"--board {seen_board.columns}x{seen_board.rows}"
     turn = f" and {_inversion(board)}" if kind.inverted != board.inverted else ""
-    return f"; but {other} is seen in {seen} of {len(sizes)} tried: give {option}{turn}"
+    return f"; but {seen_board} is seen in {seen_count} of {len(sizes)} tried: give {option}{turn}"
 
 
 def _other_charuco(pictures: Sequence[Grey], kind: Board, board: Board) -> str:
@@ -240,19 +240,19 @@ def _other_charuco(pictures: Sequence[Grey], kind: Board, board: Board) -> str:
     if size is None:
         return ""
     scale = board.marker_scale if board.marker_scale is not None else 0.75
-    other = replace(kind, columns=size.columns, rows=size.rows, marker_scale=scale)
-    options = [f"--board charuco:{other.columns}x{other.rows}"]
-    options = [] if board.marker_scale and other.grid == board.grid else options
+    seen_board = replace(kind, columns=size.columns, rows=size.rows, marker_scale=scale)
+    options = [f"--board charuco:{seen_board.columns}x{seen_board.rows}"]
+    options = [] if board.marker_scale and seen_board.grid == board.grid else options
     options += [f"--dictionary {kind.dictionary}"] if kind.dictionary != board.dictionary else []
     options += [_inversion(board)] if kind.inverted != board.inverted else []
     if not options:
         return ""
-    said = " and ".join(options)
-    return f"; but {other} is seen in {size.pictures} of {len(pictures)} tried: give {said}"
+    options_text = " and ".join(options)
+    return f"; but {seen_board} is seen in {size.pictures} of {len(pictures)} tried: give {options_text}"
 
 
 def _largest_board(sizes: Sequence[Size | None]) -> Size | None:
-    """Return the largest grid that enough pictures show; some pictures show only parts of a board."""
+    """Return the largest grid that enough images show; some images show only parts of a board."""
     counts = Counter((max(size), min(size)) for size in sizes if size is not None)
     for size, count in counts.most_common(1):
         if count > _MOST * counts.total():
@@ -263,7 +263,7 @@ def _largest_board(sizes: Sequence[Size | None]) -> Size | None:
 
 
 def _sized(board: Board, size: Size) -> Board:
-    """Return the board of another size, as long in the same direction."""
+    """Return the board with another size; its longer direction stays the same."""
     columns, rows = (max(size), min(size)) if board.columns >= board.rows else (min(size), max(size))
     return replace(board, columns=columns, rows=rows)
 

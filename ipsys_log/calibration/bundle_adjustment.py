@@ -1,7 +1,8 @@
-"""Lens and places of the board at once, by least squares over all corners: a bundle adjustment.
+"""Bundle adjustment: joint least squares of intrinsics and board poses over all corners.
 
-Each picture has a pose of its own that touches no other picture's corners, so that its six unknowns are
-eliminated before the lens is solved for (the Schur complement): a step costs as much as the corners are many.
+The pose of an image affects only the corners of this image. So the six unknowns of each pose are
+eliminated before the solution for the intrinsics (Schur complement). The cost of a step grows linearly with
+the number of corners.
 """
 
 from __future__ import annotations
@@ -34,8 +35,12 @@ _MOST_DAMPING = 1e12
 
 @dataclass(frozen=True, slots=True, eq=False)
 class Corners:
-    """All corners of all pictures: ``board_m`` (n, 3), ``pixels`` (n, 2), and the number of the picture
-    (n,), ascending, each from 0 to ``pictures`` - 1 at least once."""
+    """All corners of all images.
+
+    ``board_m`` (n, 3) has the positions on the board, ``pixels`` (n, 2) the positions in the image.
+    ``picture`` (n,) has the number of the image, in ascending order. Each number from 0 to ``pictures`` - 1
+    occurs at least once.
+    """
 
     board_m: Array
     pixels: Array
@@ -44,22 +49,22 @@ class Corners:
 
     @property
     def starts(self) -> NDArray[np.intp]:
-        """The first corner of each picture."""
+        """The index of the first corner of each image."""
         return np.searchsorted(self.picture, np.arange(self.pictures))
 
     def sums(self, values: Array) -> Array:
-        """Sums over each picture's corners, (pictures, ...)."""
+        """Return the sums of ``values`` over the corners of each image, (pictures, ...)."""
         return np.asarray(np.add.reduceat(values, self.starts, axis=0))
 
     def keep(self, kept: NDArray[np.bool_]) -> tuple[Corners, NDArray[np.intp]]:
-        """Return only these corners, and the pictures that still have some."""
-        left, numbers = np.unique(self.picture[kept], return_inverse=True)
-        return Corners(self.board_m[kept], self.pixels[kept], numbers, len(left)), left
+        """Return the corners of the mask ``kept`` (n,), and the numbers of images that still have corners."""
+        remaining, numbers = np.unique(self.picture[kept], return_inverse=True)
+        return Corners(self.board_m[kept], self.pixels[kept], numbers, len(remaining)), remaining
 
 
 @dataclass(frozen=True, slots=True, eq=False)
 class Fit:
-    """A lens (p,) and, for each picture, the board in the frame of the camera: (f, 3, 3) and (f, 3) in m."""
+    """The intrinsics (p,), and each board pose in camera coordinates: (f, 3, 3) and (f, 3) in m."""
 
     lens: Array
     rotations: Array
@@ -69,8 +74,12 @@ class Fit:
 
 @dataclass(frozen=True, slots=True, eq=False)
 class Normal:
-    """Normal equations of the weighted corners: for the lens (q, q), (q,) of each picture, the poses
-    (f, 6, 6), (f, 6), and between them (f, 6, q); and what draws the lens to 0, (q, q), (q,)."""
+    """The normal equations of the weighted corners.
+
+    ``lens`` (f, q, q) and ``lens_gradient`` (f, q) are the parts of the intrinsics for each image. ``poses``
+    (f, 6, 6) and ``pose_gradient`` (f, 6) are the parts of the poses, ``between`` (f, 6, q) are the mixed
+    parts. ``pull`` (q, q) and ``pull_gradient`` (q,) are the prior that draws coefficients to 0.
+    """
 
     lens: Array
     lens_gradient: Array
@@ -82,9 +91,9 @@ class Normal:
 
 
 def camera_points(fit: Fit, corners: Corners) -> Array:
-    """The corners in the frame of the camera, (n, 3) in m."""
-    turned = np.einsum("nij,nj->ni", fit.rotations[corners.picture], corners.board_m)
-    return np.asarray(turned + fit.places_m[corners.picture])
+    """Return the corners in camera coordinates, (n, 3) in m."""
+    rotated = np.einsum("nij,nj->ni", fit.rotations[corners.picture], corners.board_m)
+    return np.asarray(rotated + fit.places_m[corners.picture])
 
 
 def residuals(model: LensModel, fit: Fit, corners: Corners) -> Array:
@@ -93,7 +102,7 @@ def residuals(model: LensModel, fit: Fit, corners: Corners) -> Array:
 
 
 def _weights(missed_px: Array, scale_px: float | None) -> tuple[Array, float]:
-    """Weights of the corners and the cost, by Cauchy's loss, or by plain squares without a scale."""
+    """Return the weights of the corners and the cost, by Cauchy's loss, or by squares without a scale."""
     squares = (missed_px**2).sum(axis=1)
     if scale_px is None:
         return np.ones(len(squares)), float(squares.sum())
@@ -113,16 +122,16 @@ def _cost(model: LensModel, fit: Fit, corners: Corners, scale_px: float | None) 
 def normal_equations(
     model: LensModel, fit: Fit, corners: Corners, basis: Array, scale_px: float | None
 ) -> Normal:
-    """The equations of a step; ``basis`` (p, q) has the free directions of the lens parameters."""
+    """Return the normal equations of a step; ``basis`` (p, q) has the free directions of the intrinsics."""
     points_m = camera_points(fit, corners)
     pixels, by_point, by_lens = project_with_slopes(model, fit.lens, points_m)
     missed_px = pixels - corners.pixels
     x, y, z = (points_m - fit.places_m[corners.picture]).T
-    # Columns: the lens parameters (q), rotation and translation of the board (6), and the residual.
+    # Columns: the intrinsics (q), rotation and translation of the board (6), and the residual.
     count = basis.shape[1]
     rows = np.empty((len(points_m), 2, count + 7))
     rows[..., :count] = by_lens @ basis
-    # A small turn w moves a point by w x (R X).
+    # A small rotation w moves a point by w x (R X).
     by_x, by_y, by_z = (by_point[..., n] for n in range(3))
     x, y, z = x[:, None], y[:, None], z[:, None]
     rows[..., count] = by_z * y - by_y * z
@@ -145,13 +154,13 @@ def normal_equations(
 
 
 def _squares(rows: Array) -> Array:
-    """Return the products (m, m) of the columns of the rows (n, 2, m) of one picture."""
+    """Return the products (m, m) of the columns of the rows (n, 2, m) of one image."""
     flat = rows.reshape(-1, rows.shape[2])
     return np.asarray(flat.T @ flat)
 
 
 def reduce_to_lens(normal: Normal) -> tuple[Array, Array]:
-    """Return the equations of the lens parameters, poses eliminated: matrices (f, q, q), gradients (f, q)."""
+    """Return the equations of the intrinsics without the poses: matrices (f, q, q), gradients (f, q)."""
     gradients = normal.pose_gradient[..., None]
     solved = np.linalg.solve(normal.poses, np.concatenate([normal.between, gradients], axis=2))
     transposed = normal.between.transpose(0, 2, 1)
@@ -160,7 +169,7 @@ def reduce_to_lens(normal: Normal) -> tuple[Array, Array]:
 
 
 def _solve(normal: Normal, damping: float) -> tuple[Array, Array]:
-    """A damped step of the lens (q,) and of the poses (f, 6)."""
+    """Return a damped step of the intrinsics (q,) and of the poses (f, 6)."""
     poses = normal.poses + damping * _diagonals(normal.poses)
     lens = normal.lens.sum(axis=0) + normal.pull
     lens = lens + damping * np.diag(np.diag(lens))
@@ -190,14 +199,14 @@ def adjust(
     scale_px: float | None,
     most_steps: int = 100,
 ) -> Fit:
-    """The least cost near ``start``, by Levenberg and Marquardt's damped steps.
+    """Minimise the cost near ``start`` by the damped steps of Levenberg and Marquardt; return the fit.
 
     Parameters
     ----------
-    model, start, corners : what is fitted to what.
-    basis : (p, q), the directions in which the lens may change; (p, 0) holds it.
-    scale_px : of Cauchy's loss, which lets corners that are far off count for little; None: plain squares.
-    most_steps : after which it ends where it is.
+    model, start, corners : the lens model, the first fit, and the corners to fit.
+    basis : (p, q), the directions in which the intrinsics may change; (p, 0) keeps them constant.
+    scale_px : scale of Cauchy's loss, which gives outliers a small weight; None: plain squares.
+    most_steps : the largest number of steps.
 
     References
     ----------
@@ -208,14 +217,14 @@ def adjust(
     while steps < most_steps and damping < _MOST_DAMPING:
         steps += 1
         normal = normal_equations(model, fit, corners, basis, scale_px)
-        before = fit.cost
+        cost_before = fit.cost
         while damping < _MOST_DAMPING:
-            tried = _tried(model, fit, corners, basis, normal, damping, scale_px)
-            if tried is not None and tried.cost <= before:
-                fit, damping = tried, max(damping / 10, 1e-12)
+            trial = _tried(model, fit, corners, basis, normal, damping, scale_px)
+            if trial is not None and trial.cost <= cost_before:
+                fit, damping = trial, max(damping / 10, 1e-12)
                 break
             damping *= 8
-        if before - fit.cost <= _LEAST_GAIN * before:
+        if cost_before - fit.cost <= _LEAST_GAIN * cost_before:
             break
     return fit
 
@@ -234,9 +243,9 @@ def _tried(
         lens_step, pose_steps = _solve(normal, damping)
     except np.linalg.LinAlgError:
         return None
-    tried = _moved(fit, basis @ lens_step, pose_steps)
-    if not (np.isfinite(tried.lens).all() and (tried.lens[:2] > 0).all()):
+    trial = _moved(fit, basis @ lens_step, pose_steps)
+    if not (np.isfinite(trial.lens).all() and (trial.lens[:2] > 0).all()):
         return None
     with np.errstate(over="ignore", invalid="ignore"):
-        cost = _cost(model, tried, corners, scale_px)
-    return replace(tried, cost=cost) if np.isfinite(cost) else None
+        cost = _cost(model, trial, corners, scale_px)
+    return replace(trial, cost=cost) if np.isfinite(cost) else None

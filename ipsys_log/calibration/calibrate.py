@@ -1,4 +1,4 @@
-"""Intrinsic calibration of one camera, and of several, each of them separately."""
+"""Intrinsic calibration of one camera, or of several cameras separately."""
 
 from __future__ import annotations
 
@@ -33,18 +33,20 @@ __all__ = ["LEAST_PICTURES", "Calibrated", "Failure", "calibrate", "calibrate_ca
 Array = NDArray[np.float64]
 
 LEAST_PICTURES = 5
-# Fewer are refused even with --force.
+# Fewer images are refused even with --force.
 _LEAST_INSISTED = 3
-# A focal length less sure than this is said to be so; coefficients are worth nothing beyond theirs.
+# A note is written for a focal length with a larger relative standard deviation, and for coefficients with a
+# larger standard deviation. Such coefficients are useless.
 _UNSURE = 0.02
 _UNTOLD = 1.0
-# The right lens model and a flat board leave less than the second; above the first, others are tried.
+# RMS errors: above the first, other lens models are tried; the right lens model and a flat board leave less
+# than the second.
 _TRY_OTHERS_PX, _OFF_PX = 0.4, 1.0
-# Nor is a focal length a result that is no better known than this.
+# A focal length with a larger relative standard deviation is not a result.
 _UNKNOWN = 0.1
-# Remark on another grid in more pictures than this share.
+# A note is written if more than this share of the images shows another grid.
 _MANY_OTHERS = 0.2
-# Edges wider than this, in all pictures, are a camera in the dark or out of focus.
+# If the edges in all images are wider than this, the scene is too dark or the camera is out of focus.
 _SOFT_PX = 2.5
 
 
@@ -55,16 +57,16 @@ class Calibrated:
     Attributes
     ----------
     camera, lens : name of the camera, and its intrinsics.
-    names, values, sigmas : of its parameters, with their standard deviations; 0 if not fitted.
+    names, values, sigmas : of the parameters; the standard deviations are 0 if not fitted.
     square : whether fx = fy was assumed.
     rms_px, median_px : of the reprojection errors: the root of the mean of dx^2 + dy^2, over all corners of
-        all used pictures.
-    looked, seen : numbers of examined pictures, and of those that show the board.
-    used : names and RMS in px of the pictures of the fit.
-    dropped : bad pictures with the board that were left out, and the reasons.
-    spare : good pictures that show nothing new.
-    unseen : pictures without the board, and what they show.
-    far_corners : single outlier corners left out of used pictures.
+        all used images.
+    looked, seen : numbers of examined images, and of images that show the board.
+    used : names and RMS in px of the images in the fit.
+    dropped : bad images with the board that were left out, and the reasons.
+    spare : good images that add no information.
+    unseen : images without the board, and their contents.
+    far_corners : number of single outlier corners that were left out of used images.
     coverage, notes : positions of the board, and advice.
     pixels, residuals_px : (n, 2), of all used corners.
     """
@@ -93,7 +95,7 @@ class Calibrated:
 def calibrate(
     camera: str, looked: Looked, board: Board, model: LensModel, insist: bool = False
 ) -> Calibrated:
-    """Estimate the intrinsics of a camera from its pictures.
+    """Estimate the intrinsics of a camera from its images.
 
     Parameters
     ----------
@@ -103,8 +105,8 @@ def calibrate(
     Raises
     ------
     IpsysError
-        Too few pictures are usable, they are of two cameras, or the reprojection error is large; the text
-        says what to do.
+        Too few images are usable, the images are of two cameras, or the reprojection error is large; the
+        text says what to do.
     """
     chosen = choose(looked.sightings, board, looked.size_px)
     used = chosen.used
@@ -120,13 +122,13 @@ def calibrate(
     faults.append(_two_cameras(model, start, corners, used, looked.size_px))
     _refuse(camera, faults, insist)
     solved = _solved(camera, model, corners, looked.size_px, start)
-    bad += [Dropped(used[left.picture].name, left.reason) for left in solved.left]
-    kept = [used[n] for n in solved.pictures]
+    bad += [Dropped(used[excluded.picture].name, excluded.reason) for excluded in solved.left]
+    fitted = [used[n] for n in solved.pictures]
     faults.append(_far_off(model, solved, corners, looked.size_px))
     _refuse(camera, faults, insist)
-    faults.append(_few_pictures(camera, kept, bad, looked, insist))
+    faults.append(_few_pictures(camera, fitted, bad, looked, insist))
     notes = tuple(f"written only for --force: {fault}" for fault in faults if fault)
-    return _judged(camera, model, looked, kept, solved, bad, chosen.spare, notes)
+    return _judged(camera, model, looked, fitted, solved, bad, chosen.spare, notes)
 
 
 def _refuse(camera: str, faults: list[str], insist: bool) -> None:
@@ -169,7 +171,7 @@ def _two_cameras(
     split = find_two_cameras(model, start, corners, names)
     if split is None:
         return ""
-    # Another lens model may explain the pictures without a second camera.
+    # Another lens model may explain the images without a second camera.
     better = find_better_model(model, corners, size_px, split.one_px)
     if better is not None and better.rms_px < split.two_px:
         return ""
@@ -188,18 +190,20 @@ def _far_off(model: LensModel, solved: Solved, corners: Corners, size_px: tuple[
 
 
 def _few_pictures(camera: str, used: list[Sighting], bad: list[Dropped], looked: Looked, insist: bool) -> str:
-    """Return the fault of too few pictures, "" if they are enough; raise it unless the user insists."""
+    """Return the fault of too few images, "" if there are enough; raise it unless the user insists."""
     if len(used) >= LEAST_PICTURES:
         return ""
     reasons = Counter(reason.split(":")[0] for _, reason in (*bad, *looked.unseen))
-    why = f" ({'; '.join(f'{n} x {reason}' for reason, n in reasons.most_common(3))})" if reasons else ""
+    reasons_text = (
+        f" ({'; '.join(f'{n} x {reason}' for reason, n in reasons.most_common(3))})" if reasons else ""
+    )
     todo = ["take at least 15, with the board all over the image and tilted to all sides"]
     if used:
         pixels = np.concatenate([s.pixels for s in used])
         coverage = measure_coverage(pixels, looked.size_px, np.stack([s.outline for s in used]))
         todo += [line.split(":")[0] for line in advice(coverage)[:1]]
     fault = (
-        f"only {len(used)} of {looked.count} pictures can be used{why}, but a calibration needs "
+        f"only {len(used)} of {looked.count} pictures can be used{reasons_text}, but a calibration needs "
         f"{LEAST_PICTURES} or more; {'; '.join(todo)}"
     )
     if insist and len(used) >= _LEAST_INSISTED:
@@ -257,7 +261,7 @@ def _covered(looked: Looked, used: list[Sighting], solved: Solved) -> Coverage:
 
 
 def _unseen(looked: Looked) -> list[str]:
-    """Return a note if many pictures show another grid than the board."""
+    """Return a note if many images show another grid than the board."""
     others = Counter(reason for _, reason in looked.unseen if "instead" in reason)
     if sum(others.values()) <= _MANY_OTHERS * looked.count:
         return []
@@ -266,7 +270,7 @@ def _unseen(looked: Looked) -> list[str]:
 
 
 def _doubts(model: LensModel, solved: Solved, size_px: tuple[int, int]) -> list[str]:
-    """Return notes on doubts about the result, from its numbers."""
+    """Return notes on weak points of the result, from its numbers."""
     lens, sigmas, notes = solved.fit.lens, np.sqrt(np.diag(solved.covariance)), []
     left_px = rms_px(solved)
     if _TRY_OTHERS_PX < left_px <= MOST_RMS_PX:
@@ -304,7 +308,8 @@ Progress = Callable[[str, int, int | None], None]
 class Failure(NamedTuple):
     """A camera without a result: the reason in one line, and whether the user expects a result.
 
-    No result is expected for a camera of a log that never shows the board, unless the user names it.
+    The user expects no result for a camera of a log that never shows the board, unless the user names the
+    camera.
     """
 
     camera: str
@@ -323,9 +328,9 @@ def calibrate_cameras(
 
     Parameters
     ----------
-    sources : the pictures of each camera.
+    sources : the images of each camera.
     board, model : the board to search for, and the lens model.
-    progress : called with the camera, the number of pictures done, and their total.
+    progress : called with the camera, the number of searched images, and their total.
     insist : accept the given board size, and poor results.
     """
     for pictures in sources:

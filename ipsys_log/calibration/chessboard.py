@@ -1,8 +1,8 @@
 """Detection of a chessboard in an image: its corners, without false rows, and the largest grid of them.
 
-A detector for a given size may take the edge of the paper before a dark background for one more row. An inner
-corner has four whole squares around it, alternately black and white. The edge of the paper does not: the
-squares end there.
+A detector for a given size may mistake the edge of the paper on a dark background for one more row. An inner
+corner has four whole squares around it, alternately black and white. A corner at the edge of the paper does
+not have four whole squares.
 """
 
 from __future__ import annotations
@@ -21,21 +21,22 @@ Grey = NDArray[np.uint8]
 # Least and largest number of rows of a grid.
 _LEAST, _MOST = 3, 100
 # Sample points in the four squares around a corner, in squares from the corner: deep inside, and close
-# to each of its two edges. Nearer to the corner, blur counts; farther, outer squares may be narrower.
+# to each of its two edges. Blur disturbs points nearer to the corner. Points farther away may lie outside
+# of the outer squares, which may be narrower.
 _DEEP, _CLOSE = (0.2, 0.32, 0.45), (0.06, 0.12)
 _READINGS = (
     [(a, b) for a in _DEEP for b in _DEEP],
     *([(close, b) for b in _DEEP] for close in _CLOSE),
     *([(a, close) for a in _DEEP] for close in _CLOSE),
 )
-# Blur makes a close reading useless in which black and white differ by less than this share of what they do.
+# Blur makes close sample points useless if their contrast is less than this share of the usual contrast.
 _BLURRED = 0.3
-# A corner is whole if its contrast is this share of the usual one; a row is real if so many of its corners
-# are whole.
+# A corner is whole if its contrast is at least this share of the usual contrast. A row is real if at least
+# this share of its corners is whole.
 _WHOLE, _REAL = 0.35, 0.6
 # Least difference of grey levels between black and white of a board.
 _LEAST_CONTRAST = 8.0
-# Number of rows to compare: the added row and those next to it.
+# Number of rows to compare: the added row and the rows next to it.
 _COMPARED = 4
 # Search distance for a corner of an added row from its predicted position, in squares.
 _REACH = 0.25
@@ -46,7 +47,7 @@ def complete_grid(grey: Grey, corners: Array) -> Array | None:
 
     Parameters
     ----------
-    grey : (height, width).
+    grey : the image, (height, width).
     corners : (rows, columns, 2) in px.
 
     Returns
@@ -58,7 +59,7 @@ def complete_grid(grey: Grey, corners: Array) -> Array | None:
 
 
 def _trim(grey: Grey, grid: Array) -> Array | None:
-    """Remove outer rows and columns, the worst one first, until all are real."""
+    """Remove outer rows and columns, the worst first, until all are real; return None if too few are left."""
     while min(grid.shape[:2]) >= _LEAST:
         shares = _edge_shares(_whole(grey, grid))
         worst = int(np.argmin(shares))
@@ -115,17 +116,17 @@ def _whole(grey: Grey, grid: Array) -> NDArray[np.bool_]:
     usual = float(np.median(deep))
     whole = deep >= max(_WHOLE * usual, _LEAST_CONTRAST)
     for contrasts in close:
-        middle = float(np.median(contrasts))
-        if middle >= _BLURRED * usual:
-            whole &= contrasts >= _WHOLE * middle
+        median = float(np.median(contrasts))
+        if median >= _BLURRED * usual:
+            whole &= contrasts >= _WHOLE * median
     return np.asarray(whole)
 
 
 def _contrasts(grey: Grey, padded: Array, points: Array) -> Array:
     """Return the contrast of the darker white square to the lighter black square around each corner.
 
-    The position in the grid decides the colours, so a corner of opposite colours is negative. The result is
-    (rows, columns), in grey levels, read at ``points`` (k, 2) in squares.
+    The position in the grid gives the expected colours, so a corner with opposite colours has a negative
+    contrast. The result is (rows, columns), in grey levels, sampled at ``points`` (k, 2) in squares.
     """
     levels = np.stack([_square_levels(grey, padded, step, points) for step in _SQUARES])
     first = np.minimum(levels[0], levels[2]) - np.maximum(levels[1], levels[3])
@@ -135,12 +136,12 @@ def _contrasts(grey: Grey, padded: Array, points: Array) -> Array:
     return np.asarray(max(ways, key=lambda contrasts: float(np.median(contrasts))))
 
 
-# Squares around a corner, one after the other in a circle: steps down and to the right.
+# Squares around a corner, in circular order: steps down and to the right.
 _SQUARES = ((-1, -1), (-1, 1), (1, 1), (1, -1))
 
 
 def _pad(grid: Array) -> Array:
-    """Return a grid with one more row and column on each side, at the spacing of the last ones."""
+    """Return a grid with one more row and column on each side, at the spacing of its outer lines."""
     for _ in range(2):
         grid = np.concatenate([[2 * grid[0] - grid[1]], grid, [2 * grid[-1] - grid[-2]]]).swapaxes(0, 1)
     return grid
@@ -152,24 +153,26 @@ def _square_levels(grey: Grey, padded: Array, step: tuple[int, int], points: Arr
     corner = padded[1:-1, 1:-1]
     down = padded[1 + step[0] : 1 + step[0] + rows, 1:-1] - corner
     right = padded[1:-1, 1 + step[1] : 1 + step[1] + columns] - corner
-    at = corner[..., None, :] + points[:, :1] * down[..., None, :] + points[:, 1:] * right[..., None, :]
-    maps = at.reshape(rows, -1, 2).astype(np.float32)
+    positions = (
+        corner[..., None, :] + points[:, :1] * down[..., None, :] + points[:, 1:] * right[..., None, :]
+    )
+    maps = positions.reshape(rows, -1, 2).astype(np.float32)
     levels = cv2.remap(grey, maps[..., 0], maps[..., 1], cv2.INTER_LINEAR, borderMode=cv2.BORDER_REPLICATE)
     return np.asarray(levels.reshape(rows, columns, -1).mean(axis=2, dtype=np.float64))
 
 
 def crop_grid(grey: Grey, grid: Array, size: tuple[int, int]) -> Array:
-    """Return the part of a grid with the given size, without the outer rows of least contrast.
+    """Return the part of a grid with the given size; remove the outer rows of least contrast.
 
     Parameters
     ----------
-    grey : (height, width).
-    grid : (rows, columns, 2) in px, at least of that size, perhaps turned by 90 degrees.
+    grey : the image, (height, width).
+    grid : (rows, columns, 2) in px, at least of the given size, perhaps turned by 90 degrees.
     size : columns and rows.
 
     Returns
     -------
-    (rows, columns, 2) in px: columns to the right of the rows' direction, as in a view of the front.
+    (rows, columns, 2) in px, with rows and columns in the order of a front view, not mirrored.
     """
     columns, rows = size
     if not (grid.shape[0] >= rows and grid.shape[1] >= columns):
@@ -192,19 +195,19 @@ Size = tuple[int, int]
 
 _LARGE_PX = 1600
 _EXHAUSTIVE = cv2.CALIB_CB_EXHAUSTIVE | cv2.CALIB_CB_NORMALIZE_IMAGE | cv2.CALIB_CB_ACCURACY
-# A larger grid that begins with one of these: the detector may begin beside the board with some of them.
+# First sizes for the search of a larger grid. With some sizes the detector may begin beside the board.
 _SEEDS = ((7, 5), (5, 4), (4, 3), (3, 3))
 
 
 class ChessboardView(NamedTuple):
-    """Corners (rows, columns, 2) of a board of the wanted size, and the size of the largest grid; or None."""
+    """The corners (rows, columns, 2) of a board of the wanted size; the size of the largest grid; or None."""
 
     corners: Array | None
     size: Size | None
 
 
 class _Try(NamedTuple):
-    """One call of OpenCV's detector; ``flags`` with CALIB_CB_LARGER accept a larger grid."""
+    """One call of OpenCV's detector; with CALIB_CB_LARGER in ``flags``, a larger grid is accepted."""
 
     whole_picture: bool
     size: Size
@@ -216,16 +219,16 @@ def find_chessboard(grey: Grey, size: Size, thorough: bool) -> ChessboardView:
 
     Parameters
     ----------
-    grey : (height, width).
+    grey : the image, (height, width).
     size : columns and rows of inner corners.
-    thorough : search longer if the board is not found at once.
+    thorough : search longer if the first search does not find the board.
 
     Notes
     -----
-    A board turned by 90 degrees is found, too: it has the same corners.
+    The function also detects a board turned by 90 degrees: it has the same corners.
     """
     large = max(grey.shape) > _LARGE_PX
-    # A large picture takes long; corners are refined at full size anyway.
+    # The search in a large image takes long, and later steps refine the corners at full size.
     small = cv2.resize(grey, None, fx=0.5, fy=0.5, interpolation=cv2.INTER_AREA) if large else grey
     largest: Size | None = None
     for attempt in _tries(size, large, thorough):
@@ -244,12 +247,12 @@ def find_chessboard(grey: Grey, size: Size, thorough: bool) -> ChessboardView:
 
 
 def fits_in(size: Size, other: Size) -> bool:
-    """Return whether a grid fits into another one, turned by 90 degrees or not."""
+    """Return whether a grid fits into another grid, turned by 90 degrees or not."""
     return min(size) <= min(other) and max(size) <= max(other)
 
 
 def find_largest_grid(grey: Grey) -> Size | None:
-    """Return columns and rows of the largest grid of inner corners in a picture, or None."""
+    """Return columns and rows of the largest grid of inner corners in an image, or None."""
     scale = min(1.0, _LARGE_PX / max(grey.shape))
     small = cv2.resize(grey, None, fx=scale, fy=scale, interpolation=cv2.INTER_AREA) if scale < 1 else grey
     largest: Size | None = None
@@ -273,9 +276,9 @@ def _tries(size: Size, large: bool, thorough: bool) -> list[_Try]:
 
 
 def _grid(picture: Grey, attempt: _Try) -> Array | None:
-    """Return the real corners found from one call, (rows, columns, 2)."""
-    seen, corners, cells = cv2.findChessboardCornersSBWithMeta(picture, attempt.size, attempt.flags)
-    if not seen:
+    """Return the real corners from one call of the detector, (rows, columns, 2), or None."""
+    is_detected, corners, cells = cv2.findChessboardCornersSBWithMeta(picture, attempt.size, attempt.flags)
+    if not is_detected:
         return None
     rows, columns = cells.shape if attempt.flags & cv2.CALIB_CB_LARGER else attempt.size[::-1]
     return complete_grid(picture, np.asarray(corners, dtype=np.float64).reshape(rows, columns, 2))

@@ -1,4 +1,4 @@
-"""Selection of the images for a calibration: sharp ones that differ and cover the image."""
+"""Selection of the images for a calibration: sharp images with different board poses and good coverage."""
 
 from __future__ import annotations
 
@@ -27,21 +27,25 @@ __all__ = [
 Array = NDArray[np.float64]
 
 _CELLS = (8, 6)
-# A strip along each side of the image, as a share of it, is where distortion shows most.
+# Width of a strip along each side of the image, as a share of the image. Distortion is largest there.
 _STRIP = 0.15
 _ENOUGH_SHARE = 0.6
 _ENOUGH_TILT = np.radians(25)
 _ENOUGH_TILTED = 3
 _ENOUGH_PLACES = 10
-# Boards nearer to one another than this share of the image's diagonal show the same.
+# Boards that differ by less than this share of the image diagonal give the same information.
 NEAR = 0.03
 
 
 @dataclass(frozen=True, slots=True)
 class Coverage:
-    """Of all corners used: the ``share`` of the image (in 8 x 6 cells) that has any; sides of the image
-    near which there is none; how many boards are ``tilted`` by 25 degrees or more; how many ``places`` of the
-    board differ by 3 % of the image; and the greatest angle from the optical axis, or None."""
+    """The coverage of the image and of the board poses by all used corners.
+
+    ``share`` is the share of the image (in 8 x 6 cells) with corners, ``empty_sides`` are the sides of the
+    image without corners. ``tilted`` counts the boards with a tilt of 25 degrees or more, ``places`` the
+    board positions that differ by 3 % of the image. ``widest_rad`` is the greatest angle of a corner from
+    the optical axis, or None.
+    """
 
     share: float
     empty_sides: tuple[str, ...]
@@ -57,15 +61,15 @@ def measure_coverage(
     normals: Array | None = None,
     points_m: Array | None = None,
 ) -> Coverage:
-    """Where the board was seen.
+    """Return the coverage of the image and of the board poses.
 
     Parameters
     ----------
-    pixels : (n, 2), all corners.
-    size_px : width and height.
-    outlines : (f, 4, 2) in px, of the boards.
-    normals : (f, 3), of the boards in the frame of the camera, where known.
-    points_m : (n, 3), the corners in the frame of the camera, where known.
+    pixels : all corners, (n, 2).
+    size_px : width and height of the image.
+    outlines : outlines of the boards, (f, 4, 2) in px.
+    normals : normals of the boards in camera coordinates, (f, 3), if known.
+    points_m : the corners in camera coordinates, (n, 3), if known.
     """
     size = np.array(size_px, dtype=np.float64)
     relative = (pixels + 0.5) / size
@@ -89,7 +93,10 @@ def measure_coverage(
 
 
 def group_outlines(outlines: Array, near_px: float) -> NDArray[np.intp]:
-    """The group of each outline (f, 4, 2): that of the nearest first one of a group, or its own."""
+    """Return the group of each outline (f, 4, 2).
+
+    An outline joins the group with the nearest first outline, or starts a new group.
+    """
     groups: list[int] = []
     leaders: list[Array] = []
     for outline in outlines:
@@ -103,7 +110,7 @@ def group_outlines(outlines: Array, near_px: float) -> NDArray[np.intp]:
 
 
 def advice(coverage: Coverage) -> list[str]:
-    """What to add to the pictures, in words; nothing where they are good."""
+    """Return advice on additional images; an empty list if the images are good."""
     lines = []
     if coverage.empty_sides:
         *most, last = coverage.empty_sides
@@ -123,22 +130,22 @@ def advice(coverage: Coverage) -> list[str]:
 
 
 MOST_PICTURES = 50
-# Edges so much wider than those of the sharp half are blurred, if they are as wide as this.
+# Edges are blurred if they are wider than edges in sharp images by this factor, and wider than this limit.
 _BLURRED = 2.2
 _BLURRED_PX = 1.8
-# A board that moved less than this share of the image's diagonal shows nothing new.
+# A board that moves by less than this share of the image diagonal gives no new information.
 _SAME = 0.0005
 
 
 class Dropped(NamedTuple):
-    """A picture that is not used, and why."""
+    """An image that is not used, and the reason."""
 
     name: str
     reason: str
 
 
 class Chosen(NamedTuple):
-    """Pictures to fit to, those that are bad, and those that are good but show nothing new."""
+    """The images for the fit, the bad images, and good images that give no new information."""
 
     used: list[Sighting]
     bad: list[Dropped]
@@ -146,16 +153,16 @@ class Chosen(NamedTuple):
 
 
 def choose(sightings: Sequence[Sighting], board: Board, size_px: tuple[int, int]) -> Chosen:
-    """Choose among the pictures in which the board was seen.
+    """Choose images for the calibration from all images that show the board.
 
-    Where there are more than are needed, each next one is that whose board lies farthest from all boards
-    chosen so far, blurred ones counting for less: outlines that are far apart differ in place, size,
-    turn or tilt.
+    If there are more images than necessary, the next image is the image whose board is farthest from all
+    chosen boards. Distances of blurred images have less weight. Outlines that are far apart differ in
+    position, size, rotation or tilt.
 
     Parameters
     ----------
-    sightings : in the order of the pictures.
-    board, size_px : what was seen, and width and height of the pictures.
+    sightings : detections of the board, in the order of the images.
+    board, size_px : the board, and width and height of the images.
     """
     bad, good = [], []
     usual_px = _usual_blur_px(sightings)
@@ -186,7 +193,7 @@ def _fault(sighting: Sighting, board: Board, usual_px: float) -> str | None:
 
 
 def _spread(good: Sequence[Sighting], usual_px: float, same_px: float) -> tuple[list[int], list[Dropped]]:
-    """Numbers of the pictures to use, and the others with what they are like."""
+    """Return the numbers of the images to use, and the other images with the names of similar images."""
     outlines = np.stack([s.outline for s in good])
     sharp = np.array([min(1.0, usual_px / s.blur_px) if s.blur_px > 0 else 1.0 for s in good])
     order = [int(np.argmax(sharp * [len(s.ids) for s in good]))]
@@ -197,9 +204,9 @@ def _spread(good: Sequence[Sighting], usual_px: float, same_px: float) -> tuple[
         if distances[farthest] <= same_px:
             break
         order.append(farthest)
-        anew = _distances_px(outlines, outlines[farthest])
-        nearest[anew < distances] = farthest
-        distances = np.minimum(distances, anew)
+        new_distances = _distances_px(outlines, outlines[farthest])
+        nearest[new_distances < distances] = farthest
+        distances = np.minimum(distances, new_distances)
     used = set(order)
     spare = [
         Dropped(s.name, f"shows the board nearly as {good[nearest[n]].name} does")
@@ -210,5 +217,5 @@ def _spread(good: Sequence[Sighting], usual_px: float, same_px: float) -> tuple[
 
 
 def _distances_px(outlines: NDArray[np.float64], other: NDArray[np.float64]) -> NDArray[np.float64]:
-    """Mean distance of the four corners of each outline (n, 4, 2) from those of another."""
+    """Return the mean distance of the four corners of each outline (n, 4, 2) from another outline."""
     return np.asarray(np.linalg.norm(outlines - other, axis=2).mean(axis=1))

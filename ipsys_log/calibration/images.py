@@ -1,4 +1,4 @@
-"""Pictures of a board: from logs, folders, picture files and videos, camera by camera."""
+"""Images of a board from logs, folders, image files and videos, for each camera."""
 
 from __future__ import annotations
 
@@ -22,7 +22,7 @@ from ipsys_log.rig.file import check_name
 
 __all__ = ["MOST_LOOKED_AT", "Pictures", "find_sources"]
 
-# Of a long recording, so many pictures are looked at, evenly spread.
+# Largest number of images to examine in a long recording, evenly spread.
 MOST_LOOKED_AT = 400
 
 _PICTURES = (".jpg", ".jpeg", ".png", ".webp", ".bmp", ".tif", ".tiff", ".pgm", ".ppm")
@@ -39,15 +39,15 @@ def _no_sizes() -> list[tuple[str, tuple[int, int]]]:
 
 
 class Pictures(NamedTuple):
-    """Pictures of one camera.
+    """The images of one camera.
 
     Attributes
     ----------
-    camera, where : its name, and the source of the pictures.
-    total : approximate number of pictures; 0 if it is not known.
-    read : returns each picture with its name, or None for an unreadable one.
+    camera, where : name of the camera, and the source of the images.
+    total : approximate number of images; 0 if it is not known.
+    read : returns each image with its name; None for an unreadable image.
     sizes : returns names and sizes in px, if they are known before decoding.
-    requested : whether the user named this camera or its pictures, not only a log with others.
+    requested : whether the user named this camera or its images, and not only a log with several cameras.
     """
 
     camera: str
@@ -59,26 +59,26 @@ class Pictures(NamedTuple):
 
     @property
     def looked_at(self) -> int:
-        """Number of pictures that are read; 0 if it is not known."""
+        """The number of images to read; 0 if it is not known."""
         return -(-self.total // _stride(self.total))
 
 
 def find_sources(paths: Sequence[Path], cameras: Sequence[str]) -> list[Pictures]:
-    """The pictures in logs (``.mcap``), folders, picture files and videos, by camera.
+    """Return the images in logs (``.mcap``), folders, image files and videos, by camera.
 
     Parameters
     ----------
-    paths : what the user named. Several of one camera are read as one.
-    cameras : of a log, only these; of anything else, the one name of its camera.
+    paths : the sources that the user named. Several sources of one camera are read as one source.
+    cameras : for a log, the cameras to read; for another source, the one name of its camera.
 
     Raises
     ------
     IpsysError
-        Where there is nothing that can be read, or a camera has no name.
+        A source cannot be read, a requested camera has no images, or a camera has no valid name.
     """
-    found = [pictures for path in paths for pictures in _sources_of(path, cameras)]
+    sources = [pictures for path in paths for pictures in _sources_of(path, cameras)]
     by_camera: dict[str, list[Pictures]] = {}
-    for pictures in found:
+    for pictures in sources:
         by_camera.setdefault(pictures.camera, []).append(pictures)
     missing = [camera for camera in cameras if camera not in by_camera]
     if missing:
@@ -91,11 +91,11 @@ def find_sources(paths: Sequence[Path], cameras: Sequence[str]) -> list[Pictures
 def _joined(camera: str, parts: list[Pictures]) -> Pictures:
     if len(parts) == 1:
         return parts[0]
-    where = f"{parts[0].where} and {len(parts) - 1} more"
+    source = f"{parts[0].where} and {len(parts) - 1} more"
     total = sum(part.total for part in parts)
     return Pictures(
         camera,
-        where,
+        source,
         total,
         lambda: chain.from_iterable(part.read() for part in parts),
         lambda: [sized for part in parts for sized in part.sizes()],
@@ -130,11 +130,11 @@ def _camera_name(text: str, path: Path, cameras: Sequence[str]) -> str:
 
 
 def _folder(folder: Path, cameras: Sequence[str]) -> list[Pictures]:
-    """Return the pictures in a folder as one camera, and those in its sub-folders as one camera each."""
-    here = _files(folder)
-    if here:
+    """Return the images in a folder as one camera, or without images, each sub-folder as one camera."""
+    folder_files = _files(folder)
+    if folder_files:
         name = _camera_name(folder.absolute().name, folder, cameras)
-        return [_of_files(name, folder, here)]
+        return [_of_files(name, folder, folder_files)]
     subs = {sub: files for sub in sorted(folder.iterdir()) if sub.is_dir() and (files := _files(sub))}
     if not subs:
         raise IpsysError(f"{folder}: has no pictures ({', '.join(_PICTURES[:3])} ...)")
@@ -176,7 +176,7 @@ def _stride(total: int) -> int:
 def _decode(data: bytes) -> Grey | None:
     try:
         check_encoded(data)
-        # Turned as the sensor has it: a lens does not turn with the tag of a picture.
+        # Keep the orientation of the sensor: the lens does not turn with the orientation tag of an image.
         flags = cv2.IMREAD_GRAYSCALE | cv2.IMREAD_IGNORE_ORIENTATION
         grey = cv2.imdecode(np.frombuffer(data, np.uint8), flags)
     except (FrameError, cv2.error):  # OpenCV asserts on empty data
@@ -196,14 +196,14 @@ def _video(path: Path, cameras: Sequence[str]) -> Pictures:
 
 def _read_video(path: Path, stride: int) -> Iterator[tuple[str, Grey | None]]:
     video = cv2.VideoCapture(str(path))
-    # A picture stays as the sensor has it, whatever the video says of how to hold it.
+    # Keep the orientation of the sensor; ignore the orientation tag of the video.
     video.set(cv2.CAP_PROP_ORIENTATION_AUTO, 0)
     try:
         number = 0
         while video.grab():
             if number % stride == 0:
-                seen, frame = video.retrieve()
-                yield f"frame {number}", _grey(np.asarray(frame, dtype=np.uint8)) if seen else None
+                is_decoded, frame = video.retrieve()
+                yield f"frame {number}", _grey(np.asarray(frame, dtype=np.uint8)) if is_decoded else None
             number += 1
     finally:
         video.release()

@@ -1,6 +1,6 @@
-"""The lenses that can be calibrated: pixels of points in the frame of the camera, with derivatives.
+"""Lens models of the calibration: pixels of points in camera coordinates, with derivatives.
 
-The parameters of a lens are one row: fx, fy, cx, cy in px, then the coefficients in OpenCV's order.
+The intrinsic parameters are one row: fx, fy, cx, cy in px, then the coefficients in the order of OpenCV.
 """
 
 from __future__ import annotations
@@ -17,19 +17,19 @@ __all__ = ["LENSES", "LensModel", "find_lens", "project_points", "project_with_s
 
 Array = NDArray[np.float64]
 
-# Points nearer to the plane of a pinhole than this share of their distance have no place in its picture.
+# Least depth of a point for a pinhole model, as a share of its distance. Other points have no image.
 _LEAST_DEPTH = 1e-3
 _TINY = 1e-12
-# Far less than what corners say, and enough where they say nothing.
+# The prior is much weaker than the corners, but enough if the corners give no information.
 _PULL_PX = 0.1
 
 
 class LensModel(NamedTuple):
-    """A lens model: its name in the log, the names of its coefficients, and how many of them are fitted.
+    """A lens model: its name in the log, its coefficient names, and the number of fitted coefficients.
 
-    Those that are not fitted stay 0. ``bend`` returns the image of points at a focal length of 1,
-    ``bend_with_slopes`` also its derivatives. ``usual`` is the usual size of coefficients that pictures may
-    not tell apart: a common factor of numerator and denominator has no effect.
+    The other coefficients stay 0. ``bend`` returns the image of points at a focal length of 1,
+    ``bend_with_slopes`` also its derivatives. ``usual`` is the usual size of coefficients that images may not
+    determine separately: a common factor of numerator and denominator has no effect.
     """
 
     distortion_model: str
@@ -41,13 +41,15 @@ class LensModel(NamedTuple):
 
     @property
     def names(self) -> tuple[str, ...]:
-        """All parameters, in order."""
+        """The names of all parameters, in order."""
         return ("fx", "fy", "cx", "cy", *self.coefficients)
 
     @property
     def pull(self) -> Array:
-        """By how much each parameter is drawn to 0, (p,): the square of a residual of ``_PULL_PX`` when it is
-        as large as usual."""
+        """The weight of the prior that draws each parameter to 0, (p,).
+
+        A coefficient of the usual size costs the square of a residual of ``_PULL_PX``.
+        """
         strength = (_PULL_PX / self.usual) ** 2
         return np.array([0.0] * 4 + [strength] * len(self.coefficients))
 
@@ -58,14 +60,14 @@ def project_points(model: LensModel, parameters: Array, points_m: Array) -> Arra
     Parameters
     ----------
     model : the lens model.
-    parameters : (p,), as ``model.names`` says.
-    points_m : (n, 3), in camera coordinates; for a fisheye also beside and behind it.
+    parameters : (p,), in the order of ``model.names``.
+    points_m : (n, 3), in camera coordinates; for a fisheye also beside and behind the camera.
     """
     return np.asarray(model.bend(points_m, parameters[4:]) * parameters[:2] + parameters[2:4])
 
 
 def project_with_slopes(model: LensModel, parameters: Array, points_m: Array) -> tuple[Array, Array, Array]:
-    """Return the pixels of points, and their derivatives by the point and by the lens parameters.
+    """Return the pixels of points, and their derivatives by the point and by the intrinsic parameters.
 
     Parameters
     ----------
@@ -94,7 +96,7 @@ def _fisheye_angle(points_m: Array) -> tuple[Array, Array, Array, Array]:
 
 
 def _bend_fisheye(points_m: Array, k: Array) -> Array:
-    """Apply Kannala and Brandt's model (PAMI 2006), in OpenCV's form: it distorts the angle from the axis.
+    """Apply the model of Kannala and Brandt (PAMI 2006) in OpenCV's form: it distorts the angle to the axis.
 
     The angle is atan2(r, z), so that it may exceed 90 degrees.
     """
@@ -183,7 +185,7 @@ _FISHEYE = (_bend_fisheye, _bend_fisheye_with_slopes)
 _PINHOLE = (_bend_pinhole, _bend_pinhole_with_slopes)
 _FIVE = ("k1", "k2", "p1", "p2", "k3")
 
-# By the name a user gives.
+# The lens models by their name in the option --lens.
 LENSES = {
     "fisheye": LensModel("kannala_brandt", ("k1", "k2", "k3", "k4"), 4, *_FISHEYE),
     "pinhole": LensModel("plumb_bob", _FIVE, 5, *_PINHOLE),
@@ -193,12 +195,12 @@ LENSES = {
 
 
 def find_lens(name: str) -> LensModel:
-    """The kind of lens of a name.
+    """Return the lens model with a name.
 
     Raises
     ------
     IpsysError
-        Where there is none.
+        There is no lens model with this name.
     """
     if name not in LENSES:
         raise IpsysError(f"--lens {name}: there is no such lens; use one of {', '.join(LENSES)}")

@@ -1,7 +1,7 @@
 """Camera intrinsics from corners: initial values, robust fit, removal of outliers, uncertainty.
 
-Several focal lengths are tried. With each, a corner is a ray, and the plane of the board follows from
-the rays alone, which may come from the side or from behind: nothing is divided by a depth.
+The search tries several focal lengths. With a focal length, each corner gives a ray, and the rays give the
+plane of the board. No equation divides by a depth, so the rays may also come from the side or from behind.
 """
 
 from __future__ import annotations
@@ -31,54 +31,56 @@ __all__ = [
 
 Array = NDArray[np.float64]
 
-# Of the longer side of the image: from 200 degrees to a long lens.
+# Shares of the longer image side: from a field of view of 200 degrees to a telephoto lens.
 _FOCAL_SHARES = {
     "kannala_brandt": (0.2, 0.26, 0.34, 0.45, 0.6, 0.8, 1.1, 1.6),
     "plumb_bob": (0.35, 0.5, 0.7, 1.0, 1.4, 2.0, 3.0),
 }
 _FOCAL_SHARES["rational_polynomial"] = _FOCAL_SHARES["plumb_bob"]
 _SCALE_PX = 2.0
-# How many unknowns of the lens (None: all), for how many steps: poses, focal length, middle, the rest.
+# Number of free intrinsics (None: all), and number of steps: poses, focal length, principal point, the rest.
 _FIRST = ((0, 10), (1, 15))
 _THEN = ((3, 30), (None, 60))
 _KEPT = 4
-# A focal length so many times beyond those tried is none.
+# A focal length is not valid if it lies outside of the tried range by this factor.
 _FLED = 3.0
 _HELD_STEPS = 30
-# Fits so near in cost and focal length lead to the same place.
+# Fits with a smaller relative difference in cost and in focal length lead to the same result.
 _ALIKE = 0.02
 
 
 def find_start(model: LensModel, corners: Corners, size_px: tuple[int, int]) -> Fit:
-    """The best of the fits that several focal lengths lead to, of focal length and middle alone.
+    """Return the best of the fits from several focal lengths.
 
     Parameters
     ----------
-    model : the kind of lens.
-    corners : of all pictures.
-    size_px : width and height.
+    model : the lens model.
+    corners : corners of all images.
+    size_px : width and height of the images.
     """
     longer = max(size_px)
     shares = _FOCAL_SHARES[model.distortion_model]
     posed = [_posed(model, corners, size_px, share * longer) for share in shares]
-    # The focal length alone shows which of them are hopeless.
-    tried = [_freed(model, fit, corners, _FIRST) for fit in posed]
-    best = _best(model, tried, corners)
+    # A fit of the poses and the focal length is enough to sort out bad start values.
+    fits = [_freed(model, fit, corners, _FIRST) for fit in posed]
+    best = _best(model, fits, corners)
     if shares[0] / _FLED <= best.lens[0] / longer <= shares[-1] * _FLED:
         return best
-    # Boards that are hardly tilted look much the same at a far shorter focal length, tilted less still. While
-    # lines may not bend, that looks better; so let them bend first.
-    tried = [_bent(model, fit, corners) for fit in posed]
-    return min(best, _best(model, tried, corners), key=lambda fit: fit.cost)
+    # Boards with little tilt look almost the same at a far shorter focal length with even less tilt. Without
+    # distortion coefficients the wrong fit may have the lower cost, so the second try fits them first.
+    fits = [_bent(model, fit, corners) for fit in posed]
+    return min(best, _best(model, fits, corners), key=lambda fit: fit.cost)
 
 
 def _best(model: LensModel, tried: list[Fit], corners: Corners) -> Fit:
-    """The best that the most promising fits lead to, each of those that are alike but once."""
-    kept: list[Fit] = []
+    """Return the best result of the most promising fits; use only one of several similar fits."""
+    promising: list[Fit] = []
     for fit in sorted(tried, key=lambda fit: fit.cost):
-        alike = any(_near(fit.cost, one.cost) and _near(fit.lens[0], one.lens[0]) for one in kept)
-        kept += [] if alike or len(kept) == _KEPT else [fit]
-    return min((_freed(model, fit, corners, _THEN) for fit in kept), key=lambda fit: fit.cost)
+        is_similar = any(
+            _near(fit.cost, other.cost) and _near(fit.lens[0], other.lens[0]) for other in promising
+        )
+        promising += [] if is_similar or len(promising) == _KEPT else [fit]
+    return min((_freed(model, fit, corners, _THEN) for fit in promising), key=lambda fit: fit.cost)
 
 
 def _near(one: float, other: float) -> bool:
@@ -86,7 +88,7 @@ def _near(one: float, other: float) -> bool:
 
 
 def _posed(model: LensModel, corners: Corners, size_px: tuple[int, int], focal_px: float) -> Fit:
-    """Poses that follow from a focal length."""
+    """Return a fit with the given focal length, and with the poses that follow from it."""
     lens = np.zeros(len(model.names))
     lens[:4] = focal_px, focal_px, (size_px[0] - 1) / 2, (size_px[1] - 1) / 2
     rays = _rays(model, lens, corners.pixels)
@@ -96,7 +98,7 @@ def _posed(model: LensModel, corners: Corners, size_px: tuple[int, int], focal_p
 
 
 def _freed(model: LensModel, fit: Fit, corners: Corners, plan: tuple[tuple[int | None, int], ...]) -> Fit:
-    """A fit by ever more unknowns of the lens, each for so many steps."""
+    """Fit in stages with more and more free intrinsics; ``plan`` has their number and the number of steps."""
     basis = fitted_basis(model, square=True)
     for unknowns, steps in plan:
         fit = adjust(model, fit, corners, basis[:, :unknowns], _SCALE_PX, steps)
@@ -104,7 +106,7 @@ def _freed(model: LensModel, fit: Fit, corners: Corners, plan: tuple[tuple[int |
 
 
 def _bent(model: LensModel, fit: Fit, corners: Corners) -> Fit:
-    """A fit of all but the focal length."""
+    """Fit all parameters except the focal length."""
     basis = fitted_basis(model, square=True)
     return adjust(
         model, _freed(model, fit, corners, _FIRST[:1]), corners, basis[:, 1:], _SCALE_PX, _HELD_STEPS
@@ -112,7 +114,7 @@ def _bent(model: LensModel, fit: Fit, corners: Corners) -> Fit:
 
 
 def fitted_basis(model: LensModel, square: bool) -> Array:
-    """The directions in which a lens may change, (p, q); one for fx and fy together if pixels are square."""
+    """Return the free directions of the intrinsics, (p, q); a common one for fx and fy if ``square``."""
     basis = np.eye(len(model.names))[:, : 4 + model.fitted]
     if square:
         basis[1, 0] = 1.0
@@ -121,18 +123,18 @@ def fitted_basis(model: LensModel, square: bool) -> Array:
 
 
 def _rays(model: LensModel, lens: Array, pixels: Array) -> Array:
-    """Unit rays of pixels through a lens without distortion, (n, 3)."""
+    """Return the unit rays of pixels without lens distortion, (n, 3)."""
     planar = (pixels - lens[2:4]) / lens[:2]
     if model.distortion_model != "kannala_brandt":
         rays = np.column_stack([planar, np.ones(len(planar))])
         return np.asarray(rays / np.linalg.norm(rays, axis=1, keepdims=True))
-    # An angle of more than half a turn is none.
+    # An angle above 180 degrees is not possible.
     angle = np.minimum(np.linalg.norm(planar, axis=1), 0.98 * np.pi)
     return np.column_stack([planar * np.sinc(angle / np.pi)[:, None], np.cos(angle)])
 
 
 def pose_from_rays(board_m: Array, rays: Array) -> tuple[Array, Array]:
-    """The board in the frame of the camera from the rays to its corners.
+    """Estimate the board pose in camera coordinates from the rays to its corners.
 
     Parameters
     ----------
@@ -141,11 +143,11 @@ def pose_from_rays(board_m: Array, rays: Array) -> tuple[Array, Array]:
 
     Returns
     -------
-    Rotation (3, 3) and place (3,) in m.
+    Rotation (3, 3) and position (3,) in m.
     """
-    middle = board_m[:, :2].mean(axis=0)
-    spread = float(np.abs(board_m[:, :2] - middle).max())
-    plane = np.column_stack([(board_m[:, :2] - middle) / spread, np.ones(len(board_m))])
+    center = board_m[:, :2].mean(axis=0)
+    spread = float(np.abs(board_m[:, :2] - center).max())
+    plane = np.column_stack([(board_m[:, :2] - center) / spread, np.ones(len(board_m))])
     # ray x (H p) = 0, linear in the nine numbers of H.
     x, y, z = rays.T
     zero = np.zeros_like(x)
@@ -154,34 +156,37 @@ def pose_from_rays(board_m: Array, rays: Array) -> tuple[Array, Array]:
     h = np.linalg.svd(rows, full_matrices=False)[2][-1].reshape(3, 3)
     if np.einsum("ni,ij,nj->", rays, h, plane) < 0:
         h = -h
-    one, two = h[:, 0] / spread, h[:, 1] / spread
-    scale = 2 / (np.linalg.norm(one) + np.linalg.norm(two))
-    axes = np.column_stack([one * scale, two * scale, np.cross(one, two) * scale**2])
+    first_axis, second_axis = h[:, 0] / spread, h[:, 1] / spread
+    scale = 2 / (np.linalg.norm(first_axis) + np.linalg.norm(second_axis))
+    axes = np.column_stack(
+        [first_axis * scale, second_axis * scale, np.cross(first_axis, second_axis) * scale**2]
+    )
     u, _, v = np.linalg.svd(axes)
-    turn = u @ np.diag([1.0, 1.0, np.linalg.det(u @ v)]) @ v
-    return turn, h[:, 2] * scale - turn[:, :2] @ middle
+    rotation = u @ np.diag([1.0, 1.0, np.linalg.det(u @ v)]) @ v
+    return rotation, h[:, 2] * scale - rotation[:, :2] @ center
 
 
 # The median of a two-dimensional normal distance, in standard deviations of one coordinate.
 _MEDIAN = float(np.sqrt(2 * np.log(2)))
-# Corners count for half that are so many standard deviations off, and are left out so many off;
-# a picture is left out whose RMS is so many times the usual one.
+# Errors of a corner with half the weight, and of an outlier corner, in standard deviations. RMS of an image
+# that is left out, as a multiple of the usual RMS.
 _DOUBTED = 5.0
 _FAR_CORNER = 12.0
 _FAR_PICTURE = 3.5
 _LEAST_CORNERS = 6
 _MOST_ROUNDS = 8
-# Nothing is far off that is this near: pixels are no better.
+# A smaller error is never an outlier: pixels are not more accurate.
 _NEAR_PX = 0.05
-# Pixels are square unless the pictures say otherwise: by this and by three standard deviations, or by ten.
+# Pixels count as square, unless fx and fy differ by this share and by three standard deviations, or by ten
+# standard deviations.
 _SQUARE, _SURE, _QUITE_SURE = 0.01, 3.0, 10.0
-# What focal length is tried against that found, and by how many standard deviations it has to fit worse.
+# Factors of other focal lengths to try, least difference of their fits in standard deviations, and steps.
 _OTHER_FOCALS, _WORSE, _OTHER_STEPS = (0.7, 1.3), 3.0, 40
 
 
 @dataclass(frozen=True, slots=True, eq=False)
 class Left:
-    """A picture that the fit left out: its number, and why."""
+    """An image that the fit left out: its number, and the reason."""
 
     picture: int
     reason: str
@@ -189,9 +194,13 @@ class Left:
 
 @dataclass(frozen=True, slots=True, eq=False)
 class Solved:
-    """A lens, its covariance (p, p), the corners it rests on, which pictures they are of, and their
-    residuals (n, 2) in px; pictures left out, how many single corners of the others, and how many groups of
-    pictures differ; whether fx and fy are one number."""
+    """The result of a calibration.
+
+    ``covariance`` (p, p) is the covariance of the intrinsics. ``corners`` are the corners of the fit,
+    ``pictures`` the numbers of their images, ``residuals_px`` (n, 2) their residuals in px. ``left`` lists
+    the images that were left out, ``far_corners`` counts the single corners left out of other images.
+    ``groups`` is the number of groups of images that differ. ``square`` says that fx and fy are one number.
+    """
 
     model: LensModel
     fit: Fit
@@ -206,32 +215,32 @@ class Solved:
 
 
 def solve(model: LensModel, corners: Corners, size_px: tuple[int, int], start: Fit | None = None) -> Solved:
-    """Estimate the intrinsics from corners of a board in several pictures.
+    """Estimate the intrinsics from corners of a board in several images.
 
     Parameters
     ----------
     model : the lens model.
-    corners : of all pictures, at least 6 in each.
-    size_px : width and height of the pictures.
-    start : a fit to start from; without it, one is searched for.
+    corners : corners of all images, at least 6 in each image.
+    size_px : width and height of the images.
+    start : the first fit; without it, the function searches for a first fit.
     """
     start = start or find_start(model, corners, size_px)
     purged = _purge(model, start, corners, square=True)
     fit, covariance, groups, square = _finish(model, purged, size_px)
     if not square:
-        # What did not belong to square pixels may well belong now.
+        # Outliers of the fit with square pixels may fit now.
         purged = _purge(model, start, corners, square=False)
         fit, covariance, groups, square = _finish(model, purged, size_px)
-    kept = purged.corners
-    far = int(np.isin(corners.picture, purged.pictures).sum()) - len(kept.picture)
-    missed_px = residuals(model, fit, kept)
+    used_corners = purged.corners
+    far = int(np.isin(corners.picture, purged.pictures).sum()) - len(used_corners.picture)
+    residuals_px = residuals(model, fit, used_corners)
     return Solved(
-        model, fit, covariance, kept, purged.pictures, missed_px, purged.left, far, groups, square
+        model, fit, covariance, used_corners, purged.pictures, residuals_px, purged.left, far, groups, square
     )  # fmt: skip
 
 
 class _Purged(NamedTuple):
-    """A fit to what belongs together, of which pictures, and those that were left out."""
+    """A fit without outliers, with its corners and images, and the images that were left out."""
 
     fit: Fit
     corners: Corners
@@ -240,44 +249,45 @@ class _Purged(NamedTuple):
 
 
 def _purge(model: LensModel, fit: Fit, corners: Corners, square: bool) -> _Purged:
-    """Fit, leave out outliers, and fit again, until there are none."""
-    basis, pictures, left = fitted_basis(model, square), np.arange(corners.pictures), []
+    """Fit, leave out outliers, and fit again, until there are no outliers."""
+    basis, pictures, left_out = fitted_basis(model, square), np.arange(corners.pictures), []
     for _ in range(_MOST_ROUNDS):
         fit = adjust(model, fit, corners, basis, doubt_from_px(model, fit, corners))
-        kept, gone = _belonging(corners, residuals(model, fit, corners))
-        if kept.all() or len(pictures) - len(gone) < 3:
+        keep_mask, excluded = _belonging(corners, residuals(model, fit, corners))
+        if keep_mask.all() or len(pictures) - len(excluded) < 3:
             break
-        left += [Left(int(pictures[g.picture]), g.reason) for g in gone]
-        corners, still = corners.keep(kept)
-        pictures = pictures[still]
-        fit = Fit(fit.lens, fit.rotations[still], fit.places_m[still])
-    return _Purged(fit, corners, pictures, tuple(left))
+        left_out += [Left(int(pictures[g.picture]), g.reason) for g in excluded]
+        corners, remaining = corners.keep(keep_mask)
+        pictures = pictures[remaining]
+        fit = Fit(fit.lens, fit.rotations[remaining], fit.places_m[remaining])
+    return _Purged(fit, corners, pictures, tuple(left_out))
 
 
 def _finish(model: LensModel, purged: _Purged, size_px: tuple[int, int]) -> tuple[Fit, Array, int, bool]:
     """Return the last fit, its covariance (p, p), the number of groups, and whether fx = fy was assumed."""
     start, corners = purged.fit, purged.corners
     groups = alike(model, start, corners, size_px)
-    found = []
+    results = []
     for square in (False, True):
         basis = fitted_basis(model, square)
         fit = adjust(model, start, corners, basis, doubt_from_px(model, start, corners))
         covariance = lens_covariance(model, fit, corners, basis, doubt_from_px(model, fit, corners), groups)
-        found.append((fit, basis @ covariance @ basis.T, int(groups.max()) + 1, square))
-    free, covariance = found[0][:2]
+        results.append((fit, basis @ covariance @ basis.T, int(groups.max()) + 1, square))
+    free, covariance = results[0][:2]
     ratio = np.array([1.0, -1.0]) / free.lens[:2]
     sigma = float(np.sqrt(ratio @ covariance[:2, :2] @ ratio))
     off = abs(float(np.log(free.lens[0] / free.lens[1])))
-    return found[0] if off > max(_SURE * sigma, min(_SQUARE, _QUITE_SURE * sigma)) else found[1]
+    return results[0] if off > max(_SURE * sigma, min(_SQUARE, _QUITE_SURE * sigma)) else results[1]
 
 
 def tells_focal_length(solved: Solved) -> bool:
     """Return whether a focal length that differs by 30 % fits worse, with all other parameters free.
 
-    If the pictures hardly determine it, the cost is no parabola, and a standard deviation is too small.
+    If the images hardly determine the focal length, the cost is not a parabola, and the standard deviation is
+    too small.
     """
     model, fit, corners = solved.model, solved.fit, solved.corners
-    # Without what fx and fy have to themselves.
+    # All free directions except the focal length.
     rest = fitted_basis(model, square=True)[:, 1:]
     scale_px = doubt_from_px(model, fit, corners)
     most = fit.cost + (_WORSE * _spread(solved.residuals_px)) ** 2
@@ -302,26 +312,26 @@ def rms_px(solved: Solved) -> float:
 
 
 def _spread(missed_px: Array) -> float:
-    """Standard deviation of one coordinate, whatever a few corners do."""
+    """Return the standard deviation of one coordinate; a few outliers have no effect."""
     return float(np.median(np.linalg.norm(missed_px, axis=1))) / _MEDIAN
 
 
 def _belonging(corners: Corners, missed_px: Array) -> tuple[NDArray[np.bool_], list[Left]]:
-    """Return a mask of the corners of the fit, (n,), and the pictures that are left out."""
+    """Return a mask of the corners of the fit, (n,), and the images that are left out."""
     distances = np.linalg.norm(missed_px, axis=1)
     near = distances <= max(_FAR_CORNER * _spread(missed_px), _NEAR_PX)
     counts = corners.sums(np.ones_like(distances))
     remaining = corners.sums(near.astype(float))
-    # Single corners aside, a picture as a whole may be off.
+    # An image may also have large errors as a whole, without its single outlier corners.
     rest_px = np.sqrt(corners.sums(distances**2 * near) / np.maximum(remaining, 1))
     usual_px = float(np.median(rest_px))
     scattered = remaining < np.maximum(_LEAST_CORNERS, counts / 2)
     off = rest_px > max(_FAR_PICTURE * usual_px, _NEAR_PX)
-    gone = []
+    excluded = []
     for n in np.flatnonzero(scattered | off):
         if scattered[n]:
             reason = f"corners far off: {counts[n] - remaining[n]:.0f} of {counts[n]:.0f}"
         else:
             reason = f"does not fit: its corners are {rest_px[n]:.2f} px off, usually {usual_px:.2f}"
-        gone.append(Left(int(n), reason))
-    return near & ~(scattered | off)[corners.picture], gone
+        excluded.append(Left(int(n), reason))
+    return near & ~(scattered | off)[corners.picture], excluded

@@ -1,8 +1,8 @@
 """Results that are too poor to use: images of two cameras, too few images, a wrong lens model.
 
-Two groups of pictures are found as in k-means: each picture goes to the intrinsics with the least
-reprojection error, and each set of intrinsics is fitted to its pictures. The first groups are pictures with
-opposite gradients at the joint fit, and pictures with similar names.
+The search for two groups of images works like k-means. Each image goes to the intrinsics with the least
+reprojection error, and each set of intrinsics is fitted to its images. The first groups are images with
+opposite gradients at the joint fit, and images with similar names.
 """
 
 from __future__ import annotations
@@ -39,17 +39,17 @@ Group = NDArray[np.bool_]
 
 _LEAST_PICTURES = 4
 _DIRECTIONS, _ROUNDS, _STEPS, _POSE_STEPS = 3, 8, 8, 4
-# Least relative excess of the squared errors with one set of intrinsics for two cameras. Pictures of
-# one camera reach 0.37 (fisheye_chessboard), and fewer pictures per parameter reach more.
+# Least relative excess of the squared errors with one set of intrinsics for two cameras. Images of
+# one camera reach 0.37 (fisheye_chessboard), and fewer images per parameter reach more.
 _GAIN, _GAIN_PER_PARAMETER = 0.4, 0.6
-# If the names of the pictures show the same groups, this is enough, and so many pictures must agree.
+# Least excess if the names of the images show the same groups, and least share of images that agree.
 _NAMED_GAIN, _AGREE = 0.25, 0.9
-# Largest ratio of the errors of the groups: a group with larger errors consists of bad pictures.
+# Largest ratio of the errors of the groups: a group with larger errors consists of bad images.
 _ALIKE = 3.0
 
 
 class TwoCameras(NamedTuple):
-    """The pictures of the second camera (f,), and the RMS in px with one and two sets of intrinsics."""
+    """The images of the second camera (f,), and the RMS in px with one and two sets of intrinsics."""
 
     second: Group
     one_px: float
@@ -57,7 +57,7 @@ class TwoCameras(NamedTuple):
 
 
 class _Split(NamedTuple):
-    """The pictures of the second camera, and the squared errors of each picture in px^2."""
+    """The images of the second camera, and the squared errors of each image in px^2."""
 
     second: Group
     errors: Array
@@ -66,14 +66,14 @@ class _Split(NamedTuple):
 def find_two_cameras(
     model: LensModel, start: Fit, corners: Corners, names: Sequence[str]
 ) -> TwoCameras | None:
-    """Return the pictures of each camera if there are two cameras; None for one camera.
+    """Return the images of each camera if there are two cameras; None for one camera.
 
     Parameters
     ----------
     model : the lens model.
-    start : a fit to start from.
-    corners : of all pictures.
-    names : of the pictures, (f,).
+    start : the first fit.
+    corners : corners of all images.
+    names : names of the images, (f,).
     """
     if corners.pictures < 2 * _LEAST_PICTURES:
         return None
@@ -107,7 +107,7 @@ def _rms_px(errors: Array, counts: Array) -> float:
 
 
 def _name_groups(names: Sequence[str]) -> Iterator[Group]:
-    """Return the pictures whose names are alike but for the last number, one kind after the other."""
+    """Yield groups of images whose names differ only in the last number."""
     kinds = np.array([re.sub(r"\d+(?=\D*$)", "", name) for name in names])
     different = np.unique(kinds)
     for kind in different[: len(different) - 1 if len(different) == 2 else _DIRECTIONS]:
@@ -119,7 +119,7 @@ def _name_groups(names: Sequence[str]) -> Iterator[Group]:
 def _opposite_pulls(
     model: LensModel, fit: Fit, corners: Corners, basis: Array, scale_px: float
 ) -> list[Group]:
-    """Return groups by the sign of each picture's gradient, in the strongest directions."""
+    """Return groups by the sign of the gradient of each image, in the strongest directions."""
     normal = normal_equations(model, fit, corners, basis, scale_px)
     matrices, gradients = reduce_to_lens(normal)
     values, vectors = np.linalg.eigh(matrices.sum(axis=0) + normal.pull)
@@ -131,7 +131,7 @@ def _opposite_pulls(
 def _refine(
     model: LensModel, fit: Fit, corners: Corners, basis: Array, scale_px: float, second: Group
 ) -> _Split | None:
-    """Return the converged groups, or None if one has too few pictures."""
+    """Return the converged groups, or None if a group has too few images."""
     fits = [fit, fit]
     for _ in range(_ROUNDS):
         if min(second.sum(), (~second).sum()) < _LEAST_PICTURES:
@@ -140,7 +140,7 @@ def _refine(
         fits = [
             _fit_group(model, old, corners, basis, scale_px, g) for old, g in zip(fits, groups, strict=True)
         ]
-        first_errors, second_errors = (_errors(model, one, corners, scale_px) for one in fits)
+        first_errors, second_errors = (_errors(model, group_fit, corners, scale_px) for group_fit in fits)
         nearer = second_errors < first_errors
         if (nearer == second).all():
             return _Split(second, np.where(second, second_errors, first_errors))
@@ -151,24 +151,27 @@ def _refine(
 def _fit_group(
     model: LensModel, fit: Fit, corners: Corners, basis: Array, scale_px: float, group: Group
 ) -> Fit:
-    """Return the intrinsics of a group of pictures, and the poses of all pictures with them."""
+    """Return the intrinsics of a group of images, and the poses of all images with these intrinsics."""
     part, _ = corners.keep(group[corners.picture])
-    own = adjust(
+    group_fit = adjust(
         model, Fit(fit.lens, fit.rotations[group], fit.places_m[group]), part, basis, scale_px, _STEPS
     )
     rotations, places_m = fit.rotations.copy(), fit.places_m.copy()
-    rotations[group], places_m[group] = own.rotations, own.places_m
-    return adjust(model, Fit(own.lens, rotations, places_m), corners, basis[:, :0], scale_px, _POSE_STEPS)
+    rotations[group], places_m[group] = group_fit.rotations, group_fit.places_m
+    return adjust(
+        model, Fit(group_fit.lens, rotations, places_m), corners, basis[:, :0], scale_px, _POSE_STEPS
+    )
 
 
 def _errors(model: LensModel, fit: Fit, corners: Corners, scale_px: float) -> Array:
-    """Return the sum of the squared errors of each picture, (f,) in px^2; outliers have less weight."""
+    """Return the sum of the squared errors of each image, (f,) in px^2; outliers have less weight."""
     squares = (residuals(model, fit, corners) ** 2).sum(axis=1)
     return corners.sums(scale_px**2 * np.log1p(squares / scale_px**2))
 
 
 MOST_RMS_PX = 2.0
-# Another model is better if its error is less than this share.
+# Another model is better if its error is less than the first share of the error. Models with errors up to the
+# second factor are equally good.
 _BETTER, _AS_WELL = 0.6, 1.1
 
 
@@ -183,7 +186,7 @@ def find_better_model(
     model: LensModel, corners: Corners, size_px: tuple[int, int], left_px: float
 ) -> BetterModel | None:
     """Return the model with the least error for the same corners, if it is far less than ``left_px``."""
-    tried = []
+    candidates = []
     for name, other in LENSES.items():
         if other == model:
             continue
@@ -191,18 +194,18 @@ def find_better_model(
             solved = solve(other, corners, size_px)
         except np.linalg.LinAlgError:
             continue
-        # A model that leaves out most pictures does not describe them.
+        # A model that leaves out most images does not describe them.
         if 2 * len(solved.pictures) >= corners.pictures:
-            tried.append(BetterModel(name, rms_px(solved)))
-    least_px = min((one.rms_px for one in tried), default=np.inf)
+            candidates.append(BetterModel(name, rms_px(solved)))
+    least_px = min((candidate.rms_px for candidate in candidates), default=np.inf)
     if least_px >= _BETTER * left_px:
         return None
-    # The first of the equally good models: it has fewer coefficients that are hard to tell apart.
-    return next(one for one in tried if one.rms_px <= _AS_WELL * least_px)
+    # The first of the equally good models has fewer coefficients that are hard to determine.
+    return next(candidate for candidate in candidates if candidate.rms_px <= _AS_WELL * least_px)
 
 
 def two_cameras_fault(split: TwoCameras, names: Sequence[str]) -> str:
-    """Return the fault text for pictures of two cameras, with the pictures of each."""
+    """Return the fault text for images of two cameras, with the images of each camera."""
     groups = ", ".join(_named(names, split.second == second) for second in (False, True))
     return (
         f"the pictures are of two cameras, or of two settings of zoom or focus: {groups}; one set of "

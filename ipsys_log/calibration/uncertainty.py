@@ -1,8 +1,8 @@
 """Uncertainty of intrinsics: their change without some images, and with a richer lens model.
 
-The richer model has one more radial term and the terms of displaced or tilted lens elements (decentering and
-thin prism: Brown 1966; Weng, Cohen and Herniou, PAMI 1992), as far as the model lacks them. One linear step
-from the fit shows their size, and the change of the other parameters.
+The richer model adds terms that the model lacks: one more radial term, and the terms of displaced or tilted
+lens elements. These are decentering and thin prism (Brown 1966; Weng, Cohen and Herniou, PAMI 1992). One
+linear step from the fit shows their size, and the change of the other parameters.
 """
 
 from __future__ import annotations
@@ -28,12 +28,12 @@ __all__ = ["alike", "lens_covariance", "model_change"]
 
 Array = NDArray[np.float64]
 
-# Usual size of the new terms: the radial one at the farthest corner, in focal lengths, and the others
-# per square of the distance from the principal point.
+# Usual size of the new terms. The radial term is at the farthest corner, in focal lengths. The other terms
+# are per square of the distance from the principal point.
 _RADIAL, _TANGENTIAL = 0.01, 0.003
-# Terms count from so many times the mean chi^2 of noise on: by chance, in some 10 % of fits.
+# Terms count from this multiple of the mean chi^2 of noise on. Noise reaches it in about 10 % of fits.
 _NOISE = 2.0
-# The power of the next radial term, over the last coefficient fitted.
+# The power of the next radial term, after the last fitted coefficient.
 _NEXT_POWER = {"kannala_brandt": 10, "plumb_bob": 8, "rational_polynomial": 8}
 
 
@@ -47,14 +47,14 @@ class _Terms(NamedTuple):
 def model_change(
     model: LensModel, fit: Fit, corners: Corners, basis: Array, scale_px: float | None, variance: float
 ) -> Array:
-    """Return the change of the lens parameters along ``basis`` with a richer model, (q,).
+    """Return the change of the intrinsics along ``basis`` with a richer model, (q,).
 
-    It shrinks to 0 for less significant terms: noise alone mostly causes no change.
+    The change shrinks to 0 for less significant terms: noise alone mostly causes no change.
 
     Parameters
     ----------
-    model, fit, corners, basis, scale_px : as fitted.
-    variance : of a coordinate of a corner, in px^2, with the errors that corners of a picture share.
+    model, fit, corners, basis, scale_px : the values of the fit.
+    variance : variance of a corner coordinate in px^2, with the errors that the corners of an image share.
 
     References
     ----------
@@ -69,7 +69,7 @@ def model_change(
     whole = matrices.sum(axis=0) + normal.pull
     gradient = gradients.sum(axis=0) + normal.pull_gradient
     of_lens, of_terms = slice(lens_count), slice(lens_count, None)
-    # Change of the lens parameters with the terms.
+    # Change of the intrinsics with the terms.
     following = np.linalg.solve(whole[of_lens, of_lens], whole[of_lens, of_terms])
     precision = (whole[of_terms, of_terms] - whole[of_terms, of_lens] @ following) / variance
     pulled = (gradient[of_terms] - following.T @ gradient[of_lens]) / variance
@@ -99,7 +99,7 @@ def _terms(model: LensModel, bent: Array) -> _Terms:
 
 
 def _enrich(model: LensModel, fit: Fit, basis: Array, terms: _Terms) -> tuple[LensModel, Fit, Array]:
-    """Return the richer model at the corners fitted, the same fit in it, and the basis with the terms."""
+    """Return the richer model at the fitted corners, the same fit in it, and the basis with the terms."""
     count = len(terms.usual)
 
     def bend(points_m: Array, k: Array) -> tuple[Array, Array, Array]:
@@ -114,18 +114,18 @@ def _enrich(model: LensModel, fit: Fit, basis: Array, terms: _Terms) -> tuple[Le
     return richer, Fit(np.append(fit.lens, np.zeros(count)), fit.rotations, fit.places_m), wider
 
 
-# Boards that are near show the same; or those half as far apart and so on, until there are enough groups
-# for a jackknife.
+# Near boards form one group. The limit of the distance is halved up to so many times, until there are enough
+# groups for a jackknife.
 _HALVINGS = 4
 _ENOUGH_GROUPS = 15
-# A jackknife of few groups is uncertain itself. At so many groups it has the weight of least squares.
+# A jackknife of few groups is uncertain itself. With so many groups it has the weight of least squares.
 _EQUAL_GROUPS = 8
 
 
 def alike(model: LensModel, fit: Fit, corners: Corners, size_px: tuple[int, int]) -> NDArray[np.intp]:
-    """Return the group of each picture, (f,): a group shows the board in nearly the same pose.
+    """Return the group of each image, (f,): a group shows the board in nearly the same pose.
 
-    Successive frames of a video have the same errors, not new ones.
+    Successive frames of a video have the same errors, so they give no new information.
     """
     low, high = corners.board_m.min(axis=0), corners.board_m.max(axis=0)
     outline_m = np.array([[x, y, 0.0] for x in (low[0], high[0]) for y in (low[1], high[1])])
@@ -148,14 +148,14 @@ def lens_covariance(
     scale_px: float | None,
     groups: NDArray[np.intp],
 ) -> Array:
-    """Return the covariance (q, q) of the lens parameters along ``basis``.
+    """Return the covariance (q, q) of the intrinsics along ``basis``.
 
-    Corners of one picture share errors (a bent board, blur), and these differ between pictures. If the errors
-    are assumed to be independent, the covariance is too small. A jackknife over whole groups needs no such
-    assumption; each group is left out in one linear step. With few groups it is uncertain itself: seven
-    pictures may agree by chance. So it is averaged with the covariance of least squares, with the variance
-    that the jackknife shows over all parameters. Student's distribution for the number of groups makes it
-    wider. The change that a richer model shows is added.
+    Corners of one image share errors (a bent board, blur), and these errors differ between images. With
+    the assumption of independent errors, the covariance is too small. A jackknife over whole groups needs
+    no such assumption; each group is left out in one linear step. With few groups the jackknife is
+    uncertain itself: seven images may agree by chance. So it is averaged with the covariance of least
+    squares, with the variance that the jackknife shows over all parameters. Student's distribution for
+    the number of groups makes it wider. The change that a richer model shows is added.
 
     References
     ----------
@@ -168,7 +168,7 @@ def lens_covariance(
     inverse = np.linalg.inv(whole)
     squares = inverse @ (whole - normal.pull) @ inverse
     variance = _variance_px2(model, fit, corners, scale_px, basis.shape[1])
-    # Not less than the residuals show.
+    # The variance is not less than the residuals show.
     variance = max(variance, float(np.median(np.diag(jackknife) / np.diag(squares))))
     count = int(groups.max()) + 1
     share = count / (count + _EQUAL_GROUPS)
@@ -191,7 +191,7 @@ def _jackknife(whole: Array, matrices: Array, gradients: Array, groups: NDArray[
 def _variance_px2(
     model: LensModel, fit: Fit, corners: Corners, scale_px: float | None, unknowns: int
 ) -> float:
-    """Return the variance of a coordinate of a corner, for independent corners."""
+    """Return the variance of a corner coordinate in px^2, for independent corners."""
     missed_px = residuals(model, fit, corners)
     squares = float(corner_weights(missed_px, scale_px) @ (missed_px**2).sum(axis=1))
     return squares / max(missed_px.size - 6 * corners.pictures - unknowns, 1)

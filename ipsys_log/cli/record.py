@@ -132,7 +132,8 @@ def live(
 
     lab = prepared(rig, camera, calibration)
     check_target(output, force, [*lab.files, (MODEL, model_from)])
-    request = Request(models=tuple(dict.fromkeys(model or ())), model_from=model_from, corners=corners, method=method)
+    models = tuple(dict.fromkeys(model or ()))
+    request = Request(models=models, model_from=model_from, corners=corners, method=method)
     for line in check_start(lab.rig, lab.names, lab.lenses, request, "fuse"):
         remarks.print(line, style="yellow", markup=False)
     with (

@@ -1,8 +1,8 @@
 """Limits on the work to read a log, in proportion to the size of its file.
 
-A compressor stores a gigabyte of zeros in 33 kB, and half a million empty messages in one. Recorded
-logs stay far below every bound: they hold 2 to 4 bytes unpacked for each byte of the file, and a message
-takes 170 bytes or more.
+A compressor stores 1 GB of zeros in 33 kB, and half a million empty messages in about 1 kB. Recorded
+logs stay far below every limit. Each byte of their file unpacks to 2 to 4 bytes, and a message takes
+170 bytes or more.
 """
 
 from dataclasses import dataclass, field
@@ -22,11 +22,11 @@ __all__ = [
 
 _MIB = 1 << 20
 LARGEST_CHUNK = 256 * _MIB  # bytes, uncompressed
-LARGEST_MESSAGE = LARGEST_CHUNK - 8 * _MIB  # bytes: leaves room for the earlier messages of its chunk
+LARGEST_MESSAGE = LARGEST_CHUNK - 8 * _MIB  # bytes: the rest of the chunk is for earlier messages
 LARGEST_DEFINITION = 4 * _MIB  # bytes of a schema, a channel or a metadata record
-_ANY_RATIO = 16 * _MIB  # bytes: a chunk up to this size may be compressed to any extent
+_ANY_RATIO = 16 * _MIB  # bytes: a chunk up to this size may have any compression ratio
 _HIGHEST_RATIO = 200
-_UNPACKED = 128 * _MIB  # bytes that the chunks of any file may hold together
+_UNPACKED = 128 * _MIB  # bytes: the limit for all chunks of a small file together
 _RECORDS = 20_000
 _BYTES_PER_RECORD = 8
 _CHANNELS = 1_000
@@ -40,7 +40,7 @@ class BoundError(LogError):
 
 
 def chunk_excess(packed: int, unpacked: int) -> str:
-    """Return why a chunk of `packed` bytes that holds `unpacked` bytes is refused, or "" if it is not.
+    """Return the reason to refuse a chunk of `packed` bytes that unpacks to `unpacked` bytes, else "".
 
     Examples
     --------
@@ -49,17 +49,17 @@ def chunk_excess(packed: int, unpacked: int) -> str:
     >>> chunk_excess(33_000, 3 << 20)
     ''
     """
-    what = f"a chunk of {format_bytes(packed)} claims to hold {format_bytes(unpacked)}, more than"
+    claim = f"a chunk of {format_bytes(packed)} claims to hold {format_bytes(unpacked)}, more than"
     if unpacked > LARGEST_CHUNK:
-        return f"{what} {format_bytes(LARGEST_CHUNK)}"
+        return f"{claim} {format_bytes(LARGEST_CHUNK)}"
     if unpacked > _ANY_RATIO and unpacked > _HIGHEST_RATIO * packed:
-        return f"{what} {_HIGHEST_RATIO} times its size"
+        return f"{claim} {_HIGHEST_RATIO} times its size"
     return ""
 
 
 @dataclass(slots=True)
 class Allowance:
-    """The work that a file of `size` bytes may cause. Each chunk counts once, however often it is read."""
+    """The limits of the work for a file of `size` bytes. Each chunk counts once, even if it is read again."""
 
     size: int
     _unpacked: dict[int, int] = field(default_factory=dict)
@@ -69,36 +69,42 @@ class Allowance:
 
     @property
     def most_unpacked(self) -> int:
-        """Bytes that the compressed chunks may hold together."""
+        """The limit for all compressed chunks together, in bytes after decompression."""
         return _UNPACKED + _HIGHEST_RATIO * max(0, self.size - _MIB)
 
     @property
     def most_records(self) -> int:
-        """Records that may lie in chunks without a message index."""
+        """The limit for the number of records in chunks without a message index."""
         return _RECORDS + self.size // _BYTES_PER_RECORD
 
     @property
     def most_channels(self) -> int:
-        """Channels, and likewise schemas and runs."""
+        """The limit for the number of channels; also for the number of schemas, and of runs."""
         return _CHANNELS + self.size // _BYTES_PER_CHANNEL
 
     @property
     def most_payload(self) -> int:
-        """Bytes of one message in a compressed chunk."""
+        """The limit for one message in a compressed chunk, in bytes."""
         return _ANY_RATIO + 4 * self.size
 
     @property
     def most_structured(self) -> int:
-        """Bytes of one message that is not an image: its parts take many times its size in memory."""
+        """The limit for one message that is not an image, in bytes.
+
+        The parts of such a message take many times its size in memory.
+        """
         return 2 * _MIB + self.size
 
     @property
     def most_items(self) -> int:
-        """Parts of messages, such as the markers of a frame, in one reading of the log."""
+        """The limit for the message parts in one read of the log, such as the markers of a frame."""
         return _ITEMS + self.size // _BYTES_PER_ITEM
 
     def unpack(self, offset: int, size: int) -> str:
-        """Count `size` bytes unpacked from the chunk at `offset`; return why that is too much, or ""."""
+        """Count `size` bytes unpacked from the chunk at `offset`.
+
+        Return an error text if the file exceeds its limit, else "".
+        """
         self._total_unpacked += size - self._unpacked.get(offset, 0)
         self._unpacked[offset] = size
         if self._total_unpacked <= self.most_unpacked:
@@ -106,7 +112,7 @@ class Allowance:
         return f"its chunks hold more than {format_bytes(self.most_unpacked)}"
 
     def records_left(self, offset: int) -> int:
-        """Return how many records the chunk at `offset` may hold."""
+        """Return the number of records that the chunk at `offset` may hold."""
         return self.most_records - self._total_records + self._records.get(offset, 0)
 
     def count_records(self, offset: int, number: int) -> None:
@@ -117,7 +123,7 @@ class Allowance:
 
 @dataclass(slots=True)
 class Items:
-    """A counter of the parts of messages that are still allowed, such as the markers of a frame."""
+    """A counter of the message parts that are still allowed, such as the markers of a frame."""
 
     left: int
 
@@ -127,7 +133,7 @@ class Items:
         Raises
         ------
         BoundError
-            More than are left.
+            `number` is larger than the number of parts left.
         """
         self.left -= number
         if self.left < 0:

@@ -1,4 +1,4 @@
-"""Reading a file by position, with the tail that an unfinished append may have replaced."""
+"""Reads of a log file by position; an unfinished append takes the old tail from its journal."""
 
 import os
 import stat
@@ -19,9 +19,10 @@ _MOST_PER_CALL = 1 << 30
 class View:
     """The bytes of a log at the time when it was opened.
 
-    From `tail_offset` on, bytes come from `tail_fd` (a journal), which has `tail_offset` at `tail_base`.
-    `patches` are bytes that a repair is about to write before `tail_offset`, each with its offset, sorted.
-    ``pread`` and not ``mmap``: a file that shrinks under a mapping kills the process.
+    Bytes from `tail_offset` on come from `tail_fd` (a journal). In the journal they begin at `tail_base`.
+    `patches` are pairs (offset, bytes), sorted by offset. A repair is about to write these bytes before
+    `tail_offset`. The class uses ``pread`` and not ``mmap``: if a mapped file shrinks, the operating system
+    kills the process.
     """
 
     path: Path
@@ -55,23 +56,25 @@ class View:
     def _patched(self, offset: int, data: bytes) -> bytes:
         end = offset + len(data)
         first = bisect_left(self.patches, offset, key=lambda patch: patch[0] + len(patch[1]))
-        for at, new in self.patches[first:]:
-            if at >= end:
+        for patch_offset, new in self.patches[first:]:
+            if patch_offset >= end:
                 break
-            low, high = max(at, offset), min(at + len(new), end)
-            data = data[: low - offset] + new[low - at : high - at] + data[high - offset :]
+            low, high = max(patch_offset, offset), min(patch_offset + len(new), end)
+            data = (
+                data[: low - offset] + new[low - patch_offset : high - patch_offset] + data[high - offset :]
+            )
         return data
 
     def _unpatched(self, offset: int, length: int) -> bytes:
         head = max(0, min(length, self.tail_offset - offset))
         parts = [self._pread(self.fd, offset, head)] if head else []
         if head < length:
-            at = self.tail_base + offset + head - self.tail_offset
-            parts.append(self._pread(self.tail_fd, at, length - head))
+            tail_position = self.tail_base + offset + head - self.tail_offset
+            parts.append(self._pread(self.tail_fd, tail_position, length - head))
         return parts[0] if len(parts) == 1 else b"".join(parts)
 
     def fault(self, offset: int, what: str) -> LogError:
-        """The error for damage found at `offset`."""
+        """Return the error for damage at `offset`."""
         return LogError(f"{self.path} is damaged at byte {offset}: {what}. Run: ipsys repair {self.path}")
 
     def refusal(self, what: str) -> BoundError:
@@ -97,18 +100,18 @@ class View:
         if len(data) == length:
             return data
         parts = [data]
-        got = len(data)
-        while data and got < length:
-            data = os.pread(fd, min(length - got, _MOST_PER_CALL), offset + got)
+        length_read = len(data)
+        while data and length_read < length:
+            data = os.pread(fd, min(length - length_read, _MOST_PER_CALL), offset + length_read)
             parts.append(data)
-            got += len(data)
-        if got < length:
-            raise self.fault(offset + got, "the file became shorter while it was read")
+            length_read += len(data)
+        if length_read < length:
+            raise self.fault(offset + length_read, "the file became shorter while it was read")
         return b"".join(parts)
 
 
 def open_for_reading(path: Path) -> int:
-    """A file descriptor, or the operating system's refusal as one line."""
+    """Open a file for reading; return its file descriptor, or raise a one-line `LogError`."""
     try:
         fd = os.open(path, os.O_RDONLY | os.O_CLOEXEC | os.O_NONBLOCK)
     except FileNotFoundError:

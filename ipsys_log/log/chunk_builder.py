@@ -1,4 +1,4 @@
-"""Collecting messages into chunks with their message indexes."""
+"""A builder that collects messages into chunks, with their message indexes."""
 
 import zlib
 from array import array
@@ -39,7 +39,7 @@ IMAGE_SCHEMAS = frozenset(
 
 @dataclass(frozen=True, slots=True)
 class Limits:
-    """When a chunk is full: bytes of records, or ns of log time from its first message."""
+    """The limits of a full chunk: bytes of records, or ns of log time from its first message."""
 
     size: int
     span_ns: int
@@ -53,11 +53,11 @@ SMALL_APPENDED = Limits(1 << 20, 60 * _SECOND)
 
 @dataclass(slots=True)
 class ChunkBuilder:
-    """One chunk being filled.
+    """A chunk under construction.
 
-    `_record` is the Chunk record as it will stand in the file: room for its head, then messages up to
-    `_end`. It is kept from chunk to chunk: memory in use costs less than what the kernel must hand out
-    anew. `_crc` is the CRC-32 of the messages up to `_crc_end`.
+    `_record` has the layout of the Chunk record in the file: room for its head, then messages up to
+    `_end`. The next chunk reuses this memory, because new memory from the kernel costs more time.
+    `_crc` is the CRC-32 of the messages up to `_crc_end`.
     """
 
     limits: Limits
@@ -80,18 +80,20 @@ class ChunkBuilder:
             self._start_ns = log_time_ns
         elif log_time_ns > self._end_ns:
             self._end_ns = log_time_ns
-        at = self._end
+        position = self._end
         entries = self._entries.get(channel)
         if entries is None:
             entries = self._entries[channel] = array("Q")
         entries.append(log_time_ns)
-        entries.append(at - CHUNK_HEAD_SIZE)
-        start = at + MESSAGE_HEAD_SIZE
+        entries.append(position - CHUNK_HEAD_SIZE)
+        start = position + MESSAGE_HEAD_SIZE
         end = start + len(data)
         if end > len(self._record):
             self._make_room(end)
-        length = end - at - HEAD_SIZE
-        MESSAGE.pack_into(self._record, at, _OPCODE, length, channel, sequence, log_time_ns, publish_time_ns)
+        length = end - position - HEAD_SIZE
+        MESSAGE.pack_into(
+            self._record, position, _OPCODE, length, channel, sequence, log_time_ns, publish_time_ns
+        )
         self._record[start:end] = data
         self._end = end
         if len(data) >= WORTH_COMBINING:
@@ -99,7 +101,7 @@ class ChunkBuilder:
             self._crc_end = end
 
     def is_full(self, now_ns: int) -> bool:
-        """True if the chunk must be written before a message of `now_ns` is added."""
+        """Return whether the chunk must be written before a message with log time `now_ns` is added."""
         return bool(self._entries) and (
             self._end - CHUNK_HEAD_SIZE >= self.limits.size
             or now_ns - self._start_ns >= self.limits.span_ns
@@ -108,21 +110,22 @@ class ChunkBuilder:
 
     @property
     def counts(self) -> dict[int, int]:
-        """Messages per channel id."""
+        """The number of messages by channel id."""
         return {channel: len(entries) // 2 for channel, entries in self._entries.items()}
 
     def build(self, offset: int) -> tuple[ChunkRef, Buffer, int] | None:
         """Return the chunk for `offset` with its message indexes, and the CRC-32 of these bytes.
 
-        None if it holds no message. The bytes are valid until a message is added; call `clear` after they are
-        written.
+        Return None if the chunk holds no message. The bytes are valid until the next message is added. Call
+        `clear` after writing them.
         """
         if not self._entries:
             return None
         data: Buffer = self._record[CHUNK_HEAD_SIZE : self._end]
         size = len(data)
         crc = data_crc = zlib.crc32(self._record[self._crc_end : self._end], self._crc)
-        # One huge message. Readers refuse chunks that unpack to far more than the file size.
+        # A larger chunk holds one huge message. Readers refuse chunks that unpack to far more than the file
+        # size, so it is not compressed.
         compress = self.compress and size <= 2 * self.limits.size
         name = "zstd" if compress else ""
         if compress:
@@ -148,11 +151,11 @@ class ChunkBuilder:
         return self._record[:end]
 
     def _indexes(self, at: int) -> tuple[bytes, dict[int, int]]:
-        """The MessageIndex records to be written at offset `at`, and where each lies by channel id."""
+        """Return the MessageIndex records for offset `at`, and the offset of each record by channel id."""
         parts: list[bytes] = []
         offsets: dict[int, int] = {}
         for channel, entries in self._entries.items():
-            rows = entries.tobytes()  # little-endian machines only, like the rest of this floor
+            rows = entries.tobytes()  # little-endian machines only, like the rest of this package
             parts += (INDEX_HEAD.pack(Opcode.MESSAGE_INDEX, 6 + len(rows), channel, len(rows)), rows)
             offsets[channel], at = at, at + INDEX_HEAD.size + len(rows)
         return b"".join(parts), offsets

@@ -1,4 +1,4 @@
-"""Messages of one chunk: their positions by the message indexes, and the fewest reads for them."""
+"""Messages of one chunk: their positions from the message indexes, and reads with few system calls."""
 
 from bisect import bisect_right
 from collections import OrderedDict
@@ -39,13 +39,13 @@ __all__ = [
 ]
 
 ALWAYS = (0, (1 << 64) - 1)  # ns
-_GAP = 4096  # bytes: reading across less than this costs less than another system call
+_GAP = 4096  # bytes: to read a smaller gap costs less than another system call
 _RUN = 256 << 10  # bytes read at once
-_LONG = 16 << 10  # bytes: copying a message once more costs more than another system call
+_LONG = 16 << 10  # bytes: to copy a longer message costs more than another system call
 
 Rows = NDArray[np.uint64]  # shape (N, 2): log time in ns, offset in the chunk or the file
 Entries = Mapping[int, Rows]  # by channel id
-Run = tuple[int, int]  # where a stretch begins and ends
+Run = tuple[int, int]  # start and end of a byte range
 
 
 def as_rows(entries: Mapping[int, list[tuple[int, int]]]) -> Entries:
@@ -57,7 +57,7 @@ def chunk_entries(
 ) -> Entries:
     """Return the rows of a chunk's messages, from its message indexes if there are any.
 
-    `searched` caches, by offset, the rows of chunks without indexes: each is searched once.
+    `searched` caches the rows of chunks without indexes by chunk offset. So each such chunk is searched once.
     """
     if not chunk.index_offsets or not chunk.index_length:
         if chunk.offset not in searched:
@@ -75,22 +75,22 @@ def chunk_entries(
 
 
 def wanted_rows(entries: Entries, topics: Mapping[int, str], span: tuple[int, int]) -> Rows:
-    """The rows of the channels in `topics` with start <= log time <= end, sorted by time and offset."""
-    found = [rows for channel, rows in entries.items() if channel in topics]
-    if not found:
+    """Return the rows of channels in `topics` with start <= log time <= end, sorted by time and offset."""
+    parts = [rows for channel, rows in entries.items() if channel in topics]
+    if not parts:
         return np.empty((0, 2), np.uint64)
-    rows = found[0] if len(found) == 1 else np.concatenate(found)
+    rows = parts[0] if len(parts) == 1 else np.concatenate(parts)
     if span != ALWAYS:
         rows = rows[(rows[:, 0] >= span[0]) & (rows[:, 0] <= span[1])]
     return rows[np.lexsort((rows[:, 1], rows[:, 0]))]
 
 
 def runs(entries: Entries, wanted: Rows, end: int) -> list[Run]:
-    """For each wanted row the stretch to read, the same object for all that lie in it.
+    """Return the byte range to read for each wanted row; rows in the same range share one object.
 
-    Neighbours that lie close together are read at once. An index does not say how long a message is; it
-    ends where the next one begins at the latest. A long message has an empty run: it is read when its
-    head has said how long it is, and not copied out of anything.
+    Messages that lie close together are read at once. An index does not have the length of a message. A
+    message ends at the start of the next message or before. A long message has an empty range: it is read
+    without a copy, after its head has given its length.
     """
     starts = sorted({offset for rows in entries.values() for offset in rows[:, 1].tolist()})
     starts.append(end)
@@ -114,16 +114,16 @@ def runs(entries: Entries, wanted: Rows, end: int) -> list[Run]:
 
 
 _CACHE_BYTES = 64 << 20
-_SMALL = 64 << 10  # bytes: a compressed chunk below this is unpacked without looking at its blocks
-_SPARSE = 4096  # bytes per wanted message: with fewer, the chunk is unpacked as well
+_SMALL = 64 << 10  # bytes: a smaller compressed chunk is unpacked as a whole, without a search for its blocks
+_SPARSE = 4096  # bytes per wanted message: a chunk with fewer is unpacked as a whole too
 _OPCODE = int(Opcode.MESSAGE)
 _SHORTEST = MESSAGE_HEAD_SIZE - HEAD_SIZE  # bytes: the length of a Message record without payload
-_new = tuple.__new__  # RawMessage(...) goes through a function in Python and takes twice as long
+_new = tuple.__new__  # RawMessage(...) calls a Python function and takes twice as long
 
 
 @dataclass(slots=True)
 class Blocks:
-    """The stretches of records read last, so that memory stays bounded however many chunks overlap."""
+    """A cache of the byte ranges read last. Its memory is bounded, even if many chunks overlap in time."""
 
     capacity: int = _CACHE_BYTES
     searched: dict[int, Entries] = field(default_factory=dict)  # rows of chunks without message indexes
@@ -131,7 +131,7 @@ class Blocks:
     _size: int = 0
 
     def fetch(self, place: int, read: Callable[[int, int], bytes], low: int, high: int) -> bytes:
-        """Bytes `low` to `high` of the chunk at `place`, by `read` if they are not held."""
+        """Return bytes `low` to `high` of the chunk at `place`; call `read` if they are not in the cache."""
         if low == high:
             return b""
         key = (place, low, high)
@@ -149,9 +149,9 @@ class Blocks:
 
 @dataclass(slots=True)
 class _Messages:
-    """The wanted messages of one chunk, by row: `runs` says which stretch to `fetch` for each beforehand.
+    """The wanted messages of one chunk, by row.
 
-    `read` reads what does not lie in its stretch.
+    `runs` has the byte range to `fetch` first for each message. `read` reads bytes outside of this range.
     """
 
     view: View
@@ -162,16 +162,18 @@ class _Messages:
     runs: list[Run]
     fetch: Callable[[int, int], bytes]
     read: Callable[[int, int], bytes]
-    spare: int  # bytes that the remaining messages may have together: if there are more, messages overlap
+    spare: int  # bytes: limit for the remaining messages together; if they have more, messages overlap
 
     def between(self, first: int, stop: int) -> Iterator[RawMessage]:
         """Yield the messages of rows `first` to `stop`; each record must agree with the index."""
-        # Where small messages are read, the time is spent here: no call to Python for most of them.
+        # Reading small messages spends its time here. So most of them need no call of a Python function.
         unpack, topic_of = MESSAGE.unpack_from, self.topics.get
         data, low, size, fetched = b"", 0, 0, None
-        most = self.view.allowance.most_payload
+        largest = self.view.allowance.most_payload
         rows = slice(first, stop)
-        for due, offset, run in zip(self.times[rows], self.offsets[rows], self.runs[rows], strict=True):
+        for indexed_time, offset, run in zip(
+            self.times[rows], self.offsets[rows], self.runs[rows], strict=True
+        ):
             if run is not fetched:
                 data, low, fetched = self.fetch(*run), run[0], run
                 size = len(data)
@@ -182,11 +184,11 @@ class _Messages:
                 head = self.read(offset, offset + MESSAGE_HEAD_SIZE)
                 opcode, length, channel, _, time, published = unpack(head)
             topic = topic_of(channel)
-            if time != due or opcode != _OPCODE or length < _SHORTEST or topic is None:
-                place = self.place or offset
-                raise self.view.fault(place, "a message index points to no message of its time")
-            if most < length < self.spare:
-                raise self.view.refusal(f"one of its messages has {length} bytes, more than {most}")
+            if time != indexed_time or opcode != _OPCODE or length < _SHORTEST or topic is None:
+                fault_offset = self.place or offset
+                raise self.view.fault(fault_offset, "a message index points to no message of its time")
+            if largest < length < self.spare:
+                raise self.view.refusal(f"one of its messages has {length} bytes, more than {largest}")
             end = start + HEAD_SIZE + length
             if end <= size:
                 payload = data[start + MESSAGE_HEAD_SIZE : end]
@@ -200,7 +202,7 @@ class _Messages:
 
 @dataclass(slots=True)
 class _Records:
-    """The records of one chunk, by their offsets in it, read in place where that is possible."""
+    """The records of one chunk, by their offsets in the chunk. They are read in place if possible."""
 
     view: View
     chunk: ChunkRef
@@ -221,44 +223,47 @@ class _Records:
         return data
 
     def unpacked(self, *_: int) -> bytes:
-        """All of it, decompressed once and held while messages are due: chunks may overlap in time."""
+        """Return all records, decompressed once.
+
+        They stay in memory until the last message is read, because chunks may overlap in time.
+        """
         if self.whole is None:
-            at = self.chunk.offset
-            self.whole = unpack(self.view, at, parse_chunk_head(self.view, at)[1])
+            offset = self.chunk.offset
+            self.whole = unpack(self.view, offset, parse_chunk_head(self.view, offset)[1])
         return self.whole
 
 
 def open_chunk(
     view: View, blocks: Blocks, chunk: ChunkRef, topics: Mapping[int, str], span: tuple[int, int]
 ) -> Cursor:
-    """A cursor over the messages of the channels in `topics` with start <= log time <= end."""
-    place, name, size = chunk.offset, chunk.compression, chunk.uncompressed_size
+    """Return a cursor over the messages of the channels in `topics` with start <= log time <= end."""
+    offset, name, size = chunk.offset, chunk.compression, chunk.uncompressed_size
     packed = chunk.compressed_size
     check_compression(view, name)
     entries = chunk_entries(view, chunk, blocks.searched)
     rows = wanted_rows(entries, topics, span)
     records = _Records(view, chunk)
     if name and packed > _SMALL and packed > len(rows) * _SPARSE:
-        records.raw = find_blocks(view, name, place + CHUNK_HEAD_SIZE + len(name), packed, size)
+        records.raw = find_blocks(view, name, offset + CHUNK_HEAD_SIZE + len(name), packed, size)
     if name and records.raw is None:
-        stretches, fetch = [(0, size)] * len(rows), records.unpacked
+        ranges, fetch = [(0, size)] * len(rows), records.unpacked
     else:
-        stretches, fetch = runs(entries, rows, size), partial(blocks.fetch, place, records.read)
+        ranges, fetch = runs(entries, rows, size), partial(blocks.fetch, offset, records.read)
     times, offsets = rows.T.tolist()
-    messages = _Messages(view, topics, place, times, offsets, stretches, fetch, records.read, size)
-    return Cursor(place, times, offsets, messages.between)
+    messages = _Messages(view, topics, offset, times, offsets, ranges, fetch, records.read, size)
+    return Cursor(offset, times, offsets, messages.between)
 
 
 def open_loose(
     view: View, blocks: Blocks, entries: Entries, topics: Mapping[int, str], span: tuple[int, int], end: int
 ) -> Cursor:
-    """The same for messages that lie in no chunk; `end` is where the data section ends."""
+    """Return a cursor over messages that lie in no chunk; `end` is the end offset of the data section."""
 
     def read(low: int, high: int) -> bytes:
         return view.read(low, high - low)
 
     rows = wanted_rows(entries, topics, span)
-    stretches, fetch = runs(entries, rows, end), partial(blocks.fetch, 0, read)
+    ranges, fetch = runs(entries, rows, end), partial(blocks.fetch, 0, read)
     times, offsets = rows.T.tolist()
-    messages = _Messages(view, topics, 0, times, offsets, stretches, fetch, read, end)
+    messages = _Messages(view, topics, 0, times, offsets, ranges, fetch, read, end)
     return Cursor(None, times, offsets, messages.between)

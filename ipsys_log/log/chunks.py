@@ -1,7 +1,7 @@
 """Contents of a chunk: decompression within limits, its records, and reads in place.
 
-Images do not compress: the compressors store them as raw blocks inside their frames. A message that
-lies in raw blocks can be read straight from the file. Frame formats: RFC 8878 (zstd), lz4_Frame_format.md.
+Images do not compress: the compressors store them as raw blocks inside their frames. A message in raw
+blocks can be read directly from the file. Frame formats: RFC 8878 (zstd), lz4_Frame_format.md.
 """
 
 import threading
@@ -35,7 +35,7 @@ __all__ = [
 
 _ZSTD_MAGIC = (0xFD2FB528).to_bytes(4, "little")
 _LZ4_MAGIC = (0x184D2204).to_bytes(4, "little")
-_ZSTD_BLOCK = 128 << 10  # the most that one block holds, and what compressors put into each but the last
+_ZSTD_BLOCK = 128 << 10  # bytes: limit of a block; compressors fill every block but the last
 _HEAD = 24  # more than the longest frame head of both formats
 
 
@@ -48,11 +48,11 @@ class _Block:
 
 @dataclass(frozen=True, slots=True)
 class EqualBlocks:
-    """A frame of raw blocks that are all full but the last; the first begins at `offset` in the file.
+    """A compressed frame of raw blocks; all but the last are full, the first begins at `offset` in the file.
 
-    A compressor never makes a block longer. So if the length of the frame is the sum over raw blocks,
-    they are. Should a crafted frame deceive, no message of the time in the index is found: that is
-    checked for every message.
+    A compressor never makes a block longer than its content. So all blocks are raw if the length of the
+    frame is the sum over raw blocks. A crafted frame may break this rule. Readers detect such a frame: they
+    check for every message that the record has the time in the index.
     """
 
     view: View
@@ -62,29 +62,29 @@ class EqualBlocks:
     extra: int  # head and checksum
 
     def read(self, start: int, end: int) -> bytes | None:
-        """Bytes `start` to `end` of the uncompressed chunk."""
+        """Return bytes `start` to `end` of the uncompressed chunk."""
         first = start // self.size
-        at = self.offset + self.head + first * self.extra
+        shift = self.offset + self.head + first * self.extra
         if end <= (first + 1) * self.size:
-            return self.view.read(at + start, end - start)
+            return self.view.read(shift + start, end - start)
         parts = []
         while start < end:
             stop = min(end, (first + 1) * self.size)
-            parts.append(self.view.read(at + start, stop - start))
-            first, at, start = first + 1, at + self.extra, stop
+            parts.append(self.view.read(shift + start, stop - start))
+            first, shift, start = first + 1, shift + self.extra, stop
         return b"".join(parts)
 
 
 @dataclass(slots=True)
 class RawBlocks:
-    """The raw blocks at the beginning of a frame, found one by one as far as they are asked for."""
+    """The raw blocks at the beginning of a compressed frame, located one by one when a read needs them."""
 
     view: View
     _blocks: Iterator[_Block]
     _known: list[_Block] = field(default_factory=list)
 
     def read(self, start: int, end: int) -> bytes | None:
-        """Bytes `start` to `end` of the uncompressed chunk, None if they do not all lie in raw blocks."""
+        """Return bytes `start` to `end` of the uncompressed chunk; None if some lie outside of raw blocks."""
         known = self._known
         while not known or known[-1].start + known[-1].length < end:
             block = next(self._blocks, None)
@@ -103,28 +103,28 @@ class RawBlocks:
 def find_blocks(
     view: View, compression: str, offset: int, size: int, content: int
 ) -> EqualBlocks | RawBlocks | None:
-    """How to read parts of the frame of `size` bytes at `offset`, which holds `content` bytes.
+    """Return a reader for parts of the frame of `size` bytes at `offset`, which holds `content` bytes.
 
-    None if the frame is not of a format known here.
+    Return None if the format of the frame is not known here.
     """
     head = view.read(offset, min(_HEAD, size))
     end = offset + size
     if compression == "zstd" and len(head) == _HEAD and head.startswith(_ZSTD_MAGIC):
         flags, single = head[4], head[4] >> 5 & 1
         first = offset + 5 + (1 - single) + (0, 1, 2, 4)[flags & 3] + (single, 2, 4, 8)[flags >> 6]
-        block, before, extra, after = _ZSTD_BLOCK, 3, 3, (flags >> 2 & 1) * 4
+        block, block_head, extra, frame_tail = _ZSTD_BLOCK, 3, 3, (flags >> 2 & 1) * 4
         blocks = _zstd_blocks(view, first, end)
     elif compression == "lz4" and len(head) == _HEAD and head.startswith(_LZ4_MAGIC):
         flags = head[4]
         first = offset + 7 + (flags >> 3 & 1) * 8 + (flags & 1) * 4
         checksum = (flags >> 4 & 1) * 4
-        block, before = 1 << (8 + 2 * (head[5] >> 4 & 7)), 4
-        extra, after = 4 + checksum, 4 + (flags >> 2 & 1) * 4
+        block, block_head = 1 << (8 + 2 * (head[5] >> 4 & 7)), 4
+        extra, frame_tail = 4 + checksum, 4 + (flags >> 2 & 1) * 4
         blocks = _lz4_blocks(view, first, end, checksum)
     else:
         return None
-    if end - first - after == content + extra * -(-content // block):
-        return EqualBlocks(view, first, block, before, extra)
+    if end - first - frame_tail == content + extra * -(-content // block):
+        return EqualBlocks(view, first, block, block_head, extra)
     return RawBlocks(view, blocks)
 
 
@@ -155,14 +155,17 @@ def _lz4_blocks(view: View, offset: int, end: int, checksum: int) -> Iterator[_B
 
 
 class _PerThread(threading.local):
-    """To make one takes longer than a small chunk does; two threads must not share one."""
+    """A decompressor for each thread: two threads must not share a decompressor.
+
+    To create a decompressor takes longer than to decompress a small chunk.
+    """
 
     def __init__(self) -> None:
         self.zstd = zstandard.ZstdDecompressor()
 
 
 _DECOMPRESSORS = _PerThread()
-_PIECE = 4 << 20  # bytes decompressed at once if the size of the result is not known
+_PIECE = 4 << 20  # bytes: decompressed at once if the size of the result is not known
 _DEFINITIONS = (Opcode.SCHEMA, Opcode.CHANNEL)
 _FAULTS = (zstandard.ZstdError, RuntimeError, EOFError, ValueError)
 
@@ -182,7 +185,7 @@ def unpack(view: View, offset: int, head: ChunkHead) -> bytes:
     Raises
     ------
     BoundError
-        The chunk really holds more than the limit. A chunk that only claims so is damaged.
+        The chunk really holds more than the limit. If only its stated size is too large, it is damaged.
     LogError
         The chunk is damaged.
     """
@@ -209,27 +212,28 @@ def unpack(view: View, offset: int, head: ChunkHead) -> bytes:
 
 def _decompress(view: View, offset: int, head: ChunkHead, data: bytes, excess: str) -> bytes:
     size = head.uncompressed_size
-    # The library believes the frame's own size before max_output_size, and allocates it.
+    # The library uses the size in the frame instead of max_output_size, and allocates so much memory.
     frame_size = zstandard.frame_content_size(data) if head.compression == "zstd" else -1
     if frame_size not in (-1, size):
         raise ValueError("the frame claims another size than the chunk")
-    # A size above the limit is damage, unless the frame states it too or so many bytes decompress.
+    # A size above the limit is damage, unless the frame states the same size, or the data unpack to more
+    # than the limit.
     proof = min(size, LARGEST_CHUNK + 1) if excess and frame_size == -1 else 0
-    held = sum(map(len, _pieces(head.compression, data, proof)))
-    beyond = view.allowance.unpack(offset, held if excess else size)
-    if beyond or (excess and held == proof):
-        raise view.refusal(excess or beyond)
+    unpacked_size = sum(map(len, _pieces(head.compression, data, proof)))
+    allowance_excess = view.allowance.unpack(offset, unpacked_size if excess else size)
+    if allowance_excess or (excess and unpacked_size == proof):
+        raise view.refusal(excess or allowance_excess)
     if excess:
-        raise ValueError(f"it claims {size} bytes and holds {held}")
+        raise ValueError(f"it claims {size} bytes and holds {unpacked_size}")
     if head.compression == "zstd":
         return _DECOMPRESSORS.zstd.decompress(data, max_output_size=max(size, 1))
-    unpacked = BytesIO()  # grows in place, and gives its bytes without a copy
+    unpacked = BytesIO()  # grows in place, and returns its bytes without a copy
     unpacked.writelines(_pieces("lz4", data, size + 1))
     return unpacked.getvalue()
 
 
 def _pieces(compression: str, data: bytes, most: int) -> Iterator[bytes]:
-    """Decompress up to `most` bytes, a piece at a time."""
+    """Yield up to `most` decompressed bytes, piece by piece."""
     if compression == "zstd":
         with _DECOMPRESSORS.zstd.stream_reader(data) as reader:
             while most > 0 and (piece := reader.read(min(most, _PIECE))):
@@ -240,7 +244,7 @@ def _pieces(compression: str, data: bytes, most: int) -> Iterator[bytes]:
     while most > 0 and not decompressor.eof:
         piece = decompressor.decompress(data, min(most, _PIECE))
         if not piece and decompressor.needs_input:
-            raise ValueError("the frame has no end")  # other readers refuse it
+            raise ValueError("the frame has no end")  # other readers refuse such a frame
         data = b""
         most -= len(piece)
         yield piece
@@ -263,14 +267,14 @@ def inner_records(view: View, offset: int, data: bytes) -> Iterator[RecordAt]:
 
 @dataclass(slots=True)
 class Inside:
-    """Everything that a chunk (or a data section without chunks) defines and holds."""
+    """The definitions and message entries of a chunk, or of a data section without chunks."""
 
     schemas: dict[int, mcap.Schema] = field(default_factory=dict)
     channels: dict[int, mcap.Channel] = field(default_factory=dict)
     entries: dict[int, list[tuple[int, int]]] = field(default_factory=dict)
 
     def add(self, view: View, at: RecordAt, where: int, body: bytes) -> None:
-        """Add one record of type Schema, Channel or Message; others are ignored."""
+        """Add one record of type Schema, Channel or Message; ignore other types."""
         if at.opcode == Opcode.MESSAGE:
             if len(body) < MESSAGE.size - HEADER.size:
                 raise view.fault(where, "a Message record is too short")
@@ -293,15 +297,17 @@ def check_definition(view: View, at: RecordAt) -> None:
 
 
 def look_inside(view: View, offset: int, data: bytes) -> Inside:
-    """Return definitions and message entries of the decompressed chunk `data` at `offset`."""
+    """Return the definitions and message entries of the decompressed chunk `data` at `offset`."""
     inside, number = Inside(), 0
     left = view.allowance.records_left(offset)
-    for number, at in enumerate(inner_records(view, offset, data), 1):
+    for number, record in enumerate(inner_records(view, offset, data), 1):
         if number > left:
             raise view.refusal(f"its chunks hold more than {view.allowance.most_records} records")
-        if at.opcode in _DEFINITIONS:
-            check_definition(view, at)
-        head = MESSAGE.size if at.opcode == Opcode.MESSAGE else at.length
-        inside.add(view, at, offset, data[at.offset + HEADER.size : at.offset + min(head, at.length)])
+        if record.opcode in _DEFINITIONS:
+            check_definition(view, record)
+        head = MESSAGE.size if record.opcode == Opcode.MESSAGE else record.length
+        inside.add(
+            view, record, offset, data[record.offset + HEADER.size : record.offset + min(head, record.length)]
+        )
     view.allowance.count_records(offset, number)
     return inside

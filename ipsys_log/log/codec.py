@@ -1,9 +1,9 @@
-"""Payloads to bytes and back, by the fields of the schemas.
+"""Conversion of payloads to bytes and back, by the fields of the schemas.
 
-Every payload of :mod:`ipsys_log.messages` mirrors one protobuf schema: its own from the descriptor
-set that ships with the package, or a well-known one of Foxglove. The mapping is worked out once
-per type from the type hints; nothing is written down twice. Numbers are stored as they are
-(doubles), so that a payload read back equals the payload written, bit for bit.
+Every payload of :mod:`ipsys_log.messages` mirrors one protobuf schema. The schema comes from the
+descriptor set of this package, or is a well-known schema of Foxglove. The mapping is derived once per
+type from the type hints, so no field is defined twice. Numbers are stored without rounding (doubles).
+So a payload that is read back equals the written payload, bit for bit.
 """
 
 from __future__ import annotations
@@ -27,7 +27,7 @@ from ipsys_log.log.ros2 import ROS2_PAYLOADS, read_ros2
 
 __all__ = ["PAYLOADS", "decode", "encode", "payload_type", "schema_data", "schema_name"]
 
-# The payloads that have a channel of their own, by the name of their schema.
+# The payloads with separate channels, by the name of their schema.
 PAYLOADS: dict[str, type] = {
     **{
         f"foxglove.{payload.__name__}": payload
@@ -63,12 +63,12 @@ _NAMES = {payload: name for name, payload in PAYLOADS.items()}
 
 
 def schema_name(payload: type) -> str:
-    """Name of the schema that a type of payload is written with, such as ``ipsys.v1.Markers``."""
+    """Return the name of the schema for a type of payload, such as ``ipsys.v1.Markers``."""
     return _NAMES[payload]
 
 
 def payload_type(name: str) -> type | None:
-    """The type of payload that messages of a schema are read into, whoever wrote them; None for none."""
+    """Return the type of payload for messages of a schema, from any program; None if there is no type."""
     return PAYLOADS.get(name) or ROS2_PAYLOADS.get(name)
 
 
@@ -92,9 +92,10 @@ def encode(payload: Any) -> bytes:
 
 
 def _encode_around(payload: Any, long: str) -> bytes:
-    """The same bytes, with the long field set between those of lower and those of higher number.
+    """Serialise a payload with one long field of bytes; return the same bytes as protobuf.
 
-    Protobuf would copy an image three times; a field of bytes stands in a message as it is.
+    The long field is joined between the fields with lower numbers and the fields with higher numbers. A
+    message contains a field of bytes without change. Protobuf would copy an image three times.
     """
     kind: type = type(payload)
     proto_class = _proto_class(schema_name(kind))
@@ -105,7 +106,7 @@ def _encode_around(payload: Any, long: str) -> bytes:
         if name != long and value is not None:
             fill(lower if numbers[name] < numbers[long] else higher, value)
     data = getattr(payload, long)
-    head = _varint(numbers[long] << 3 | 2) + _varint(len(data))  # 2: the length comes first
+    head = _varint(numbers[long] << 3 | 2) + _varint(len(data))  # 2: the length comes before the data
     return b"".join(
         (
             lower.SerializeToString(deterministic=True),
@@ -117,7 +118,7 @@ def _encode_around(payload: Any, long: str) -> bytes:
 
 
 def _varint(number: int) -> bytes:
-    """Seven bits to a byte, the lowest first; all but the last have the highest bit set."""
+    """Encode a number in bytes of seven bits, lowest first; all but the last have the highest bit set."""
     parts = []
     while number > 127:
         parts.append(number & 127 | 128)
@@ -137,18 +138,18 @@ def decode(
 
     Parameters
     ----------
-    name : of the schema.
+    name : the name of the schema.
     data : the message.
-    encoding : ``protobuf``, or in the logs of others ``json`` and ROS 2's ``cdr``.
-    definition : of the schema, as the log has it, without which ``cdr`` cannot be read.
-    items : the parts of messages that may still be read; a million by default.
+    encoding : ``protobuf``. Logs of other programs also have ``json``, and ``cdr`` of ROS 2.
+    definition : the definition of the schema in the log; ``cdr`` cannot be read without it.
+    items : the number of message parts that may still be read; a million by default.
 
     Raises
     ------
     BoundError
         The message has more parts than `items` allows.
     LogError
-        The schema or encoding is not known here, or the bytes are not a message of it.
+        The schema or encoding is not known here, or the bytes are not a valid message of the schema.
     """
     items = items or Items(_ITEMS_OF_ONE)
     if name in ROS2_PAYLOADS:
@@ -178,13 +179,13 @@ def _read_json(data: bytes) -> Any:
     value = json.loads(data)
     if not isinstance(value, dict):
         raise ValueError("it is no object")
-    if b"\\ud" in data.lower():  # half of a surrogate pair; protobuf's own reader fails on it
+    if b"\\ud" in data.lower():  # half of a surrogate pair; the reader of protobuf fails on it
         json.dumps(value, ensure_ascii=False).encode()
     return _plain_times(value)
 
 
 def _plain_times(value: Any) -> Any:
-    """Foxglove's JSON has times as {sec, nsec}, protobuf's has them as text."""
+    """Convert the times {sec, nsec} in the JSON of Foxglove into text, the form in the JSON of protobuf."""
     if isinstance(value, list):
         return [_plain_times(item) for item in value]
     if not isinstance(value, dict):
@@ -196,8 +197,8 @@ def _plain_times(value: Any) -> Any:
 
 @cache
 def schema_data(name: str) -> bytes:
-    """The ``FileDescriptorSet`` of a schema with all that it imports, as MCAP wants it."""
-    found = descriptor_pb2.FileDescriptorSet()
+    """Return the ``FileDescriptorSet`` of a schema with all its imports, the form that MCAP needs."""
+    descriptors = descriptor_pb2.FileDescriptorSet()
     seen: set[str] = set()
 
     def add(file: Any) -> None:
@@ -206,10 +207,10 @@ def schema_data(name: str) -> bytes:
         seen.add(file.name)
         for dependency in file.dependencies:
             add(dependency)
-        file.CopyToProto(found.file.add())
+        file.CopyToProto(descriptors.file.add())
 
     add(_proto_class(name).DESCRIPTOR.file)
-    return found.SerializeToString(deterministic=True)
+    return descriptors.SerializeToString(deterministic=True)
 
 
 @cache

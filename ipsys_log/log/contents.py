@@ -28,7 +28,7 @@ __all__ = [
 
 _OWN = re.compile(r"(?:/runs/(?P<run>[a-z][a-z0-9_]*))?/cameras/(?P<camera>[a-z][a-z0-9_]*)/[a-z_]+")
 _RUN = re.compile(r"/runs/(?P<run>[a-z][a-z0-9_]*)/")
-# What a topic's last parts say of an image, and not of which camera took it.
+# The last parts of a topic that describe the image, and not its camera.
 _GENERIC = re.compile(
     r"(image|images|raw|rect|color|colour|mono|compressed|calibration|camera_info|info|jpeg)"
     r"(_(raw|rect|color|colour|mono|compressed))*"
@@ -36,19 +36,19 @@ _GENERIC = re.compile(
 
 
 def camera_of_topic(topic: str) -> str | None:
-    """The camera in a topic of our own, such as ``/runs/stock/cameras/red/markers``."""
+    """Return the camera in an ipsys topic, such as ``/runs/stock/cameras/red/markers``; or None."""
     match = _OWN.fullmatch(topic)
     return match["camera"] if match else None
 
 
 def run_of_topic(topic: str) -> str | None:
-    """The run in a topic, or None for what was recorded."""
+    """Return the run in a topic; None for a recorded topic."""
     match = _RUN.match(topic)
     return match["run"] if match else None
 
 
 def foreign_camera(topic: str) -> str:
-    """The camera in a topic of somebody else's, such as ``/robot/front/image_raw/compressed``."""
+    """Return the camera in a topic of another program, such as ``/robot/front/image_raw/compressed``."""
     parts = topic.strip("/").split("/")
     while len(parts) > 1 and _GENERIC.fullmatch(clean_name(parts[-1])):
         parts.pop()
@@ -56,7 +56,7 @@ def foreign_camera(topic: str) -> str:
 
 
 def clean_name(text: str) -> str:
-    """A name as cameras have them, out of any text."""
+    """Return a valid camera name made from any text."""
     name = re.sub(r"[^a-z0-9]+", "_", text.lower()).strip("_")
     return name if name[:1].isalpha() else f"camera_{name}".rstrip("_")
 
@@ -70,9 +70,9 @@ class Schema:
     name
         Full name of the message type, for example ``foxglove.CompressedImage``.
     encoding
-        How ``data`` is written, for example ``protobuf`` (a ``FileDescriptorSet``).
+        The format of ``data``, for example ``protobuf`` (a ``FileDescriptorSet``).
     data
-        The definition itself.
+        The definition.
     """
 
     name: str
@@ -84,7 +84,7 @@ class Schema:
 class StoredChannel:
     """One topic of a log.
 
-    ``schema`` is None for a channel that has none. ``message_count`` counts the whole log.
+    ``schema`` is None for a channel without schema. ``message_count`` counts the messages in the whole log.
     """
 
     topic: str
@@ -97,7 +97,7 @@ class StoredChannel:
 class RawMessage(NamedTuple):
     """One message, payload not decoded. Times are in ns.
 
-    A tuple, because a frozen dataclass takes four times as long to make, and there are many of them.
+    The class is a tuple: to create a frozen dataclass takes four times as long, and a log has many messages.
     """
 
     topic: str
@@ -114,8 +114,8 @@ class Contents:
     """Schemas and channels by id, chunks, and the counts that go into the Statistics record.
 
     `loose` holds the messages that lie in no chunk: per channel id (log time in ns, file offset).
-    `data_end` is the offset of the end of the data, `data_crc` their CRC (0: not computed). The DataEnd
-    record lies there, unless an append was interrupted (`cut_short`).
+    `data_end` is the offset of the end of the data, `data_crc` the CRC of the data (0: not computed). The
+    DataEnd record lies at `data_end`, unless an append was interrupted (`cut_short`).
     """
 
     schemas: dict[int, mcap.Schema] = field(default_factory=dict)
@@ -134,7 +134,7 @@ class Contents:
     cut_short: bool = False
 
     def copy(self) -> Contents:
-        """Return a copy that does not change when this one grows."""
+        """Return a copy that does not change when these contents grow."""
         fields = ("schemas", "channels", "chunks", "attachments", "metadata", "counts", "loose")
         return replace(self, **{name: copy(getattr(self, name)) for name in fields})
 
@@ -143,13 +143,13 @@ class Contents:
         self.counts[channel_id] = self.counts.get(channel_id, 0) + messages
 
     def cover(self, start_ns: int, end_ns: int) -> None:
-        """Stretch the time range of the log over `start_ns` to `end_ns`."""
+        """Extend the time range of the log to include `start_ns` and `end_ns`."""
         self.start_ns = start_ns if self.start_ns is None else min(self.start_ns, start_ns)
         self.end_ns = end_ns if self.end_ns is None else max(self.end_ns, end_ns)
 
 
 def free_id(known: Mapping[int, object]) -> int | None:
-    """The lowest id above all known ones, or a free one below, or None."""
+    """Return the lowest id above all known ids, else a free id below, else None."""
     above = max(known, default=0) + 1
     if above <= _LARGEST_ID:
         return above
@@ -157,12 +157,14 @@ def free_id(known: Mapping[int, object]) -> int | None:
 
 
 def by_topic(contents: Contents) -> tuple[Mapping[str, StoredChannel], Mapping[str, str]]:
-    """Channels by topic, and in what the channels of one topic differ, where they do."""
+    """Return the channels by topic, and by topic the differences between channels of one topic, if any."""
     channels: dict[str, StoredChannel] = {}
     conflicts: dict[str, str] = {}
     for key, record in sorted(contents.channels.items()):
-        found = contents.schemas.get(record.schema_id)
-        schema = Schema(found.name, found.encoding, found.data) if found else None
+        schema_record = contents.schemas.get(record.schema_id)
+        schema = (
+            Schema(schema_record.name, schema_record.encoding, schema_record.data) if schema_record else None
+        )
         count = contents.counts.get(key, 0)
         first = channels.get(record.topic)
         if first is None:
@@ -178,7 +180,10 @@ def by_topic(contents: Contents) -> tuple[Mapping[str, StoredChannel], Mapping[s
 
 
 def _kind(schema: Schema | None) -> tuple[str, str] | None:
-    """What must agree: a later version of a message has more fields under the same name."""
+    """Return the parts of a schema that must agree.
+
+    A later version of a message has more fields under the same name.
+    """
     return (schema.name, schema.encoding) if schema else None
 
 

@@ -1,9 +1,9 @@
 """Hashes of channels from the CRC-32 of their messages, without reading the images again.
 
-A digest is a chain over the messages in log order, so that it does not depend on chunks or files, and
-can be continued when a channel grows.
+A digest is a chain over the messages in log order. So it does not depend on chunks or files, and it can be
+continued when a channel grows.
 
-An image's CRC is worked out once and serves its channel's hash, its chunk and the data section.
+The CRC of an image is computed once. The hash of its channel, its chunk and the data section all use it.
 """
 
 import hashlib
@@ -28,18 +28,18 @@ __all__ = [
 ]
 
 Buffer = bytes | memoryview
-WORTH_COMBINING = 32 << 10  # bytes: reading fewer once more costs less
+WORTH_COMBINING = 32 << 10  # bytes: for shorter data, a second read costs less
 
-# For each byte of a CRC, the lowest first, what becomes of it: 256 values each.
+# For each byte of a CRC, the lowest first: the result for each of its 256 values.
 Tables = tuple[list[int], list[int], list[int], list[int]]
 
 
 def combine(first: int, second: int, length: int) -> int:
-    """CRC-32 of two stretches of bytes, the second of `length` bytes directly behind the first.
+    """Return the CRC-32 of two joined byte strings from their CRCs; the second has `length` bytes.
 
-    The same as ``crc32_combine`` of zlib, which Python does not offer: but for a constant, a CRC is linear
-    in the bits of the text, and `length` more bytes act on it as so many zero bytes would. They are
-    appended in powers of two. About 5 µs for an image.
+    The result is the same as from ``crc32_combine`` of zlib, which Python does not offer. Except for a
+    constant, a CRC is linear in the bits of the data. So `length` more bytes change the first CRC like
+    `length` zero bytes. The zero bytes are appended in powers of two. This takes about 5 µs for an image.
 
     Examples
     --------
@@ -55,7 +55,7 @@ def combine(first: int, second: int, length: int) -> int:
 
 
 def extend(first: int, data: Buffer, crc: int) -> int:
-    """`combine` for `data`, whose CRC-32 is `crc`, by whichever way costs less."""
+    """Return the CRC-32 `first` continued by `data`, whose CRC-32 is `crc`; choose the faster method."""
     return zlib.crc32(data, first) if len(data) < WORTH_COMBINING else combine(first, crc, len(data))
 
 
@@ -66,7 +66,7 @@ def _apply(tables: Tables, crc: int) -> int:
 
 @cache
 def _append_zeros(power: int) -> Tables:
-    """What appending 2**power zero bytes makes of a CRC, without the constant."""
+    """Return the tables that append 2**power zero bytes to a CRC, without the constant."""
     if power == 0:
         of_bit = [zlib.crc32(b"\0", 1 << bit) ^ zlib.crc32(b"\0") for bit in range(32)]
     else:
@@ -76,7 +76,7 @@ def _append_zeros(power: int) -> Tables:
 
 
 def _sums(of_bit: list[int]) -> list[int]:
-    """The value for each byte from those for its eight bits."""
+    """Return the value for each byte, from the values for its eight bits."""
     sums = [0]
     for value in of_bit:
         sums += [value ^ lower for lower in sums]
@@ -90,10 +90,10 @@ _PREFIX = "hash:"
 
 @dataclass(slots=True)
 class ChannelHash:
-    """The chain after `count` messages, the last one at `last_ns`.
+    """The hash chain of a channel after `count` messages; `last_ns` is the log time of the last message.
 
-    `valid` is False once a message came that is older than the last one: then the chain is not in log
-    order, and only reading the channel gives its hash.
+    `valid` becomes False if a message is older than the message before it. Then the chain is not in log
+    order, and the hash needs a read of the whole channel.
     """
 
     count: int = 0
@@ -106,7 +106,7 @@ class ChannelHash:
         self.add_row(log_time_ns, publish_time_ns, len(data), zlib.crc32(data))
 
     def add_row(self, log_time_ns: int, publish_time_ns: int, length: int, crc: int) -> None:
-        """The same for a message of which the length and the CRC-32 are known."""
+        """Continue the chain by one message, given by the length and the CRC-32 of its data."""
         if log_time_ns < self.last_ns:
             self.valid = False
         self.count += 1
@@ -117,10 +117,10 @@ class ChannelHash:
 
 
 def metadata_of_hashes(hashes: dict[str, ChannelHash], offset: int) -> bytes:
-    """The Metadata record that stores the valid ones of `hashes`, by topic, to be written at `offset`.
+    """Return the Metadata record for `offset` that stores the valid hashes in `hashes` by topic.
 
-    It holds its own offset: a tool that copies records to other places changes the log without knowing
-    of the hashes, which are then not believed.
+    The record holds its own offset. A tool that copies records to other offsets may change the log and not
+    update the hashes. Then the stored offset is wrong, and readers ignore the hashes.
     """
     values = {"offset": str(offset)}
     for topic, state in hashes.items():
@@ -130,10 +130,10 @@ def metadata_of_hashes(hashes: dict[str, ChannelHash], offset: int) -> bytes:
 
 
 def hashes_from_metadata(record: mcap.Metadata, offset: int) -> dict[str, ChannelHash]:
-    """The hashes stored in `record`, which was found at `offset`; none if it was moved or is not ours."""
-    found: dict[str, ChannelHash] = {}
+    """Return the hashes in `record` at `offset`; none if the record was moved, or is not from ipsys."""
+    hashes: dict[str, ChannelHash] = {}
     if record.name != METADATA_NAME or record.metadata.get("offset") != str(offset):
-        return found
+        return hashes
     for key, value in record.metadata.items():
         if key.startswith(_PREFIX):
             try:
@@ -142,5 +142,5 @@ def hashes_from_metadata(record: mcap.Metadata, offset: int) -> dict[str, Channe
             except ValueError:
                 continue
             if len(state.digest) == 16:
-                found[key.removeprefix(_PREFIX)] = state
-    return found
+                hashes[key.removeprefix(_PREFIX)] = state
+    return hashes

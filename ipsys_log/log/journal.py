@@ -1,6 +1,6 @@
 """Replacement of the tail of a file: a crash at any instant leaves the old log or the new one.
 
-Two things protect the old log meanwhile:
+Two copies protect the old log during the replacement:
 
 - A *standing* tail: a copy of the old summary after the new end of the file. Other programs read a log from
   its end, without the journal. They find the old log by this copy until the file is truncated to its new
@@ -9,7 +9,7 @@ Two things protect the old log meanwhile:
   does not have its new size. Readers take the tail from the journal, and the next holder of the exclusive
   lock restores the tail. A torn journal means that the file itself was not changed yet.
 
-``docs/decisions/append-order.md`` has the order of writes, and why.
+``docs/decisions/append-order.md`` has the order of writes, and the reasons.
 """
 
 import logging
@@ -41,7 +41,7 @@ __all__ = [
 
 
 class Storage(Protocol):
-    """The operations that change files. Reading goes straight to ``os.pread``."""
+    """The operations that change files. Reads call ``os.pread`` directly."""
 
     def open(self, path: Path, flags: int) -> int: ...
     def close(self, fd: int) -> None: ...
@@ -55,7 +55,7 @@ class Storage(Protocol):
 
 @dataclass(frozen=True, slots=True)
 class Disk:
-    """The real thing."""
+    """The real file system."""
 
     def open(self, path: Path, flags: int) -> int:
         return os.open(path, flags | os.O_CLOEXEC, 0o666)
@@ -90,7 +90,7 @@ DISK: Storage = Disk()
 
 
 def write_all(storage: Storage, fd: int, data: bytes | memoryview, offset: int) -> None:
-    """Write the whole of `data`: one system call may take less (a signal, 2 GiB, a nearly full disk)."""
+    """Write all of `data`; one system call may write less (a signal, 2 GiB, a nearly full disk)."""
     rest = memoryview(data)
     while rest:
         written = storage.pwrite(fd, rest, offset)
@@ -98,9 +98,9 @@ def write_all(storage: Storage, fd: int, data: bytes | memoryview, offset: int) 
 
 
 _MAGIC = b"\x89IPSYSJ2"
-# Magic; sizes of the file: old, new, meanwhile; tail offset; bytes before the tail: count, CRC; tail length.
+# Magic; sizes of the file: old, new, temporary; tail offset; bytes before the tail: count, CRC; tail length.
 _HEAD = struct.Struct("<8sQQQQIIQ")
-# The first format has no third size: the old log is valid until the journal is gone.
+# The first format has no third size: the old log is valid until the journal is removed.
 _EARLIER_MAGIC = b"\x89IPSYSJ1"
 _EARLIER_HEAD = struct.Struct("<8sQQQIIQ")
 _CRC = struct.Struct("<I")
@@ -112,7 +112,7 @@ _logger = logging.getLogger(__name__)
 
 @dataclass(frozen=True, slots=True)
 class Journal:
-    """A whole journal of an incomplete file."""
+    """A whole journal of a file that is not completely replaced."""
 
     old_size: int
     tail_offset: int
@@ -120,7 +120,7 @@ class Journal:
 
 
 def journal_path(path: Path) -> Path:
-    """Return the path of the journal of a log: beside the file itself, even if a link is opened."""
+    """Return the path of the journal of a log: beside the log file, even if `path` is a link to it."""
     real = Path(os.path.realpath(path))
     return real.with_name(real.name + ".journal")
 
@@ -135,7 +135,7 @@ def _blocks(fd: int, offset: int, length: int) -> Iterator[bytes]:
 
 
 def _crc(fd: int, offset: int, length: int) -> int | None:
-    """CRC-32 of a stretch, None if the file ends before it does."""
+    """Return the CRC-32 of a byte range; None if the file ends before the range."""
     crc = 0
     for data in _blocks(fd, offset, length):
         crc, length = zlib.crc32(data, crc), length - len(data)
@@ -145,22 +145,22 @@ def _crc(fd: int, offset: int, length: int) -> int | None:
 def read_journal(fd: int, journal_fd: int) -> Journal | None:
     """Return the journal in `journal_fd` if it makes the old log in `fd` valid.
 
-    None if it is torn, if it belongs to another file, or if the new log is complete.
+    Return None if the journal is torn or belongs to another file, or if the new log is complete.
     """
     start = os.pread(journal_fd, _HEAD.size, 0)
     earlier = start.startswith(_EARLIER_MAGIC)
     head = _EARLIER_HEAD if earlier else _HEAD
     if len(start) < head.size:
         return None
-    magic, old_size, *sizes, tail_offset, before, before_crc, tail_length = head.unpack_from(start)
+    magic, old_size, *sizes, tail_offset, bytes_before, before_crc, tail_length = head.unpack_from(start)
     body = head.size + tail_length
     whole = (
         magic in (_MAGIC, _EARLIER_MAGIC)
         and tail_offset + tail_length == old_size
-        and before == min(_BEFORE, tail_offset)
+        and bytes_before == min(_BEFORE, tail_offset)
         and os.fstat(journal_fd).st_size == body + _CRC.size
         and os.pread(journal_fd, _CRC.size, body) == _CRC.pack(_crc(journal_fd, 0, body) or 0)
-        and _crc(fd, tail_offset - before, before) == before_crc
+        and _crc(fd, tail_offset - bytes_before, bytes_before) == before_crc
         and not _went_on(fd, (old_size, *sizes))
     )
     # The file gets its new size last, after all other data are on the disk.
@@ -169,13 +169,19 @@ def read_journal(fd: int, journal_fd: int) -> Journal | None:
 
 
 def _went_on(fd: int, sizes: tuple[int, ...]) -> bool:
-    """Return whether the file is a finished log of another size: repaired and extended under another name."""
+    """Return whether the file is a finished log of another size.
+
+    Such a log was repaired and extended under another name.
+    """
     size = os.fstat(fd).st_size
     return size not in sizes and os.pread(fd, len(MAGIC), max(0, size - len(MAGIC))) == MAGIC
 
 
 def attach_journal(view: View) -> bool:
-    """Let `view` show the old log if a whole journal lies beside it. Takes no lock, changes nothing."""
+    """Make `view` show the old log if there is a whole journal beside it; return whether there is one.
+
+    The function takes no lock and changes no file.
+    """
     try:
         journal_fd = os.open(journal_path(view.path), os.O_RDONLY | os.O_CLOEXEC | os.O_NONBLOCK)
     except OSError:
@@ -204,19 +210,19 @@ def replace_tail(
 
     Parameters
     ----------
-    standing : makes the bytes for an offset after the old and the new end: a copy of the old tail. Other
-        programs need it to find the old log meanwhile.
+    standing : returns a copy of the old tail for an offset after the old and the new end. Other programs
+        need this copy to find the old log during the replacement.
 
     Raises
     ------
     OSError
-        A write failed before the new tail is on the disk; `roll_back` then tells which log is valid.
+        A write failed before the new tail is on the disk. `roll_back` then decides which log is valid.
     """
     new_size = offset + sum(map(len, pieces))
     beyond = max(os.fstat(fd).st_size, new_size)
-    stands = standing(beyond)
-    _write_journal(storage, path, fd, offset, (new_size, beyond + len(stands)))
-    write_all(storage, fd, stands, beyond)
+    standing_tail = standing(beyond)
+    _write_journal(storage, path, fd, offset, (new_size, beyond + len(standing_tail)))
+    write_all(storage, fd, standing_tail, beyond)
     storage.fsync(fd)
     for piece in pieces:
         write_all(storage, fd, piece, offset)
@@ -226,7 +232,7 @@ def replace_tail(
     storage.fsync(fd)
     try:
         _drop(storage, path)
-    except OSError as error:  # from here on the new log is valid, with a journal or without
+    except OSError as error:  # from here on the new log is valid, with or without a journal
         _logger.warning(
             "%s: the messages are in the log, but %s cannot be removed (%s)",
             path, journal_path(path).name, error.strerror,
@@ -238,7 +244,8 @@ def roll_back(storage: Storage, path: Path, fd: int) -> bool:
 
     Returns
     -------
-    True if there was one. An append that only lacks the removal of its journal is completed instead.
+    True if an append was undone. If only the removal of the journal is missing, the append is completed
+    instead.
 
     Raises
     ------
@@ -262,7 +269,7 @@ def roll_back(storage: Storage, path: Path, fd: int) -> bool:
 
 
 def _put_back(storage: Storage, fd: int, journal_fd: int, journal: Journal) -> None:
-    """Write the old tail while the standing tail is still after it, and only then truncate the file."""
+    """Write the old tail while the standing tail still follows it. Truncate the file after that."""
     offset = journal.tail_offset
     for data in _blocks(journal_fd, journal.tail_base, journal.old_size - offset):
         write_all(storage, fd, data, offset)
@@ -273,16 +280,16 @@ def _put_back(storage: Storage, fd: int, journal_fd: int, journal: Journal) -> N
 
 def _write_journal(storage: Storage, path: Path, fd: int, offset: int, sizes: tuple[int, int]) -> None:
     size = os.fstat(fd).st_size
-    before = min(_BEFORE, offset)
-    before_crc = _crc(fd, offset - before, before) or 0
-    head = _HEAD.pack(_MAGIC, size, *sizes, offset, before, before_crc, size - offset)
+    bytes_before = min(_BEFORE, offset)
+    before_crc = _crc(fd, offset - bytes_before, bytes_before) or 0
+    head = _HEAD.pack(_MAGIC, size, *sizes, offset, bytes_before, before_crc, size - offset)
     journal_fd = storage.open(journal_path(path), os.O_RDWR | os.O_CREAT | os.O_TRUNC)
     try:
-        at, crc = 0, 0
+        position, crc = 0, 0
         for data in chain((head,), _blocks(fd, offset, size - offset)):
-            write_all(storage, journal_fd, data, at)
-            at, crc = at + len(data), zlib.crc32(data, crc)
-        write_all(storage, journal_fd, _CRC.pack(crc), at)
+            write_all(storage, journal_fd, data, position)
+            position, crc = position + len(data), zlib.crc32(data, crc)
+        write_all(storage, journal_fd, _CRC.pack(crc), position)
         storage.fsync(journal_fd)
     finally:
         storage.close(journal_fd)

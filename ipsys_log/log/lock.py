@@ -1,4 +1,4 @@
-"""The exclusive lock of a log: whoever writes holds it. Readers never wait for it."""
+"""The exclusive lock of a log. A writer holds the lock; readers never wait for it."""
 
 import fcntl
 import os
@@ -61,7 +61,7 @@ def check_locks(folder: Path) -> None:
     Raises
     ------
     LogError
-        They cannot be locked. A folder that is not writable is not checked.
+        The files cannot be locked. A folder that is not writable is not checked.
     """
     with suppress(OSError), tempfile.TemporaryFile(dir=folder) as file:
         try:
@@ -73,8 +73,8 @@ def check_locks(folder: Path) -> None:
 def is_being_written(path: Path) -> bool:
     """Return whether another process holds the lock.
 
-    The check takes the lock for an instant, and refuses a writer that starts then. So call it only for logs
-    without an end, to which no program can append, and for logs with a journal.
+    The check takes the lock for an instant. A writer that starts in this instant fails. So call the function
+    only for logs with a journal, and for logs without an end, to which no program can append.
     """
     fd = open_for_reading(path)
     try:

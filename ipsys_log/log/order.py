@@ -1,4 +1,4 @@
-"""Log order: by log time, then by place in the file."""
+"""Log order: by log time, then by offset in the file."""
 
 import heapq
 from bisect import bisect_left
@@ -16,9 +16,10 @@ _NEVER = 1 << 64  # ns, later than any log time
 
 @dataclass(slots=True)
 class Cursor:
-    """The wanted messages of one chunk, in log order; `between` gives those of a range of rows.
+    """The wanted messages of one chunk, in log order; `between` yields the messages of a range of rows.
 
-    `place` is the offset of the chunk, None if the messages lie in none: then theirs count.
+    `place` is the offset of the chunk. It is None for messages outside of chunks: then the offsets of the
+    messages define their order.
     """
 
     place: int | None
@@ -27,13 +28,13 @@ class Cursor:
     between: Callable[[int, int], Iterator[RawMessage]]
 
     def key(self, row: int) -> tuple[int, int, int]:
-        """Where message `row` stands in log order."""
+        """Return the sort key of message `row` for log order."""
         offset = self.offsets[row]
         return self.times[row], offset if self.place is None else self.place, offset
 
 
 class Pending(NamedTuple):
-    """A chunk that is opened when its time has come: no earlier, so that a log is never loaded whole."""
+    """A chunk that is opened only when its start time is reached, so that a log is never loaded whole."""
 
     start_ns: int
     offset: int
@@ -43,13 +44,13 @@ class Pending(NamedTuple):
 def in_log_order(pending: Sequence[Pending], fault: Callable[[int], Exception]) -> Iterator[RawMessage]:
     """Merge chunks, which may overlap in time, into one stream.
 
-    `fault` makes the error for a chunk (by its offset) that holds a message from before its own start.
+    `fault` returns the error for a chunk, given by its offset, with a message before the start of the chunk.
     """
     return chain.from_iterable(_turns(pending, fault))
 
 
 def _turns(pending: Sequence[Pending], fault: Callable[[int], Exception]) -> Iterator[Iterator[RawMessage]]:
-    """The stream, cut where the next message comes from another chunk."""
+    """Yield the stream in parts; a new part begins if the next message comes from another chunk."""
     waiting = sorted(pending, key=lambda chunk: (chunk.start_ns, chunk.offset))
     heap: list[tuple[tuple[int, int, int], int, Cursor]] = []
     opened, last_ns = 0, 0
@@ -62,14 +63,14 @@ def _turns(pending: Sequence[Pending], fault: Callable[[int], Exception]) -> Ite
                 heapq.heappush(heap, (cursor.key(0), 0, cursor))
         if not heap:
             return
-        (time, place, _), row, cursor = heapq.heappop(heap)
+        (time, offset, _), row, cursor = heapq.heappop(heap)
         if time < last_ns:
-            raise fault(place)
-        # It is this chunk's turn up to the first message that another one has, or may have.
-        until = heap[0][0][0] if heap else _NEVER
-        if opened < len(waiting) and waiting[opened].start_ns < until:
-            until = waiting[opened].start_ns
-        stop = bisect_left(cursor.times, until, row + 1)
+            raise fault(offset)
+        # Yield messages of this chunk up to the first message that another chunk has, or may have.
+        until_ns = heap[0][0][0] if heap else _NEVER
+        if opened < len(waiting) and waiting[opened].start_ns < until_ns:
+            until_ns = waiting[opened].start_ns
+        stop = bisect_left(cursor.times, until_ns, row + 1)
         yield cursor.between(row, stop)
         last_ns = cursor.times[stop - 1]
         if stop < len(cursor.times):

@@ -19,9 +19,9 @@ _logger = logging.getLogger(__name__)
 
 
 class Output(Protocol):
-    """The end of the data section. `crc` is None where the log does not keep one.
+    """The end of the data section. `crc` is None if the log keeps no CRC.
 
-    `emit` is told the CRC-32 of large data, so that it is not worked out twice.
+    Callers give the CRC-32 of large data to `emit`, so that it is not computed twice.
     """
 
     @property
@@ -36,9 +36,9 @@ class Output(Protocol):
 
 @dataclass(slots=True)
 class Growing:
-    """A new file. Each piece is handed to the operating system at once.
+    """A new file. Each piece of data goes to the operating system at once.
 
-    With a `target` the file is renamed to it when it is complete, and removed when it is abandoned.
+    With a `target`, the complete file is renamed to `target`, and an abandoned file is removed.
     """
 
     storage: Storage
@@ -54,9 +54,9 @@ class Growing:
             write_all(self.storage, self.fd, data, self.offset)
         except OSError as error:
             self._failed = True
-            kept = f"what it holds so far can be saved with: ipsys repair {self.path}"
-            then = kept if self.target is None else f"nothing was written: {disk_advice(error)}"
-            raise cannot_write(self.target or self.path, error, then) from None
+            advice = f"what it holds so far can be saved with: ipsys repair {self.path}"
+            outcome = advice if self.target is None else f"nothing was written: {disk_advice(error)}"
+            raise cannot_write(self.target or self.path, error, outcome) from None
         self.offset += len(data)
         self.crc = _extend(self.crc or 0, data, crc)
 
@@ -73,15 +73,15 @@ class Growing:
                 self.path, self.target = self.target, None
             self.storage.fsync_directory(self.path.parent)
         except OSError as error:
-            then = (
+            outcome = (
                 "nothing was written"
                 if self.target is not None
                 else "it is complete, but perhaps not on the disk"
             )
-            raise cannot_write(self.target or self.path, error, f"{then}: {disk_advice(error)}") from None
+            raise cannot_write(self.target or self.path, error, f"{outcome}: {disk_advice(error)}") from None
 
     def sync(self) -> None:
-        """Wait until the written bytes are on the disk. Any thread may call it while another one writes."""
+        """Wait until the written bytes are on the disk. Any thread may call this during a write."""
         self.storage.fsync(self.fd)
 
     def abandon(self) -> None:
@@ -95,7 +95,7 @@ class Growing:
 
 @dataclass(slots=True)
 class Pending:
-    """An append: nothing touches the file until `finish`."""
+    """An append. The file does not change before `finish`."""
 
     storage: Storage
     path: Path
@@ -108,7 +108,7 @@ class Pending:
     _pieces: list[bytes] = field(default_factory=list)
 
     def emit(self, data: Buffer, crc: int | None = None) -> None:
-        self._pieces.append(bytes(data))  # a chunk's memory is used again
+        self._pieces.append(bytes(data))  # the memory of a chunk is used again
         self.offset += len(data)
         self.crc = None if self.crc is None else _extend(self.crc, data, crc)
 
@@ -120,7 +120,7 @@ class Pending:
             replace_tail(self.storage, self.path, self.fd, self.start, pieces, self.standing)
         except OSError as error:
             self._settle(error, tail)
-        except BaseException:  # an interrupt: the old log, or the new one where that is complete
+        except BaseException:  # an interrupt: keep the old log, or the new log if it is complete
             with suppress(OSError):
                 roll_back(self.storage, self.path, self.fd)
             raise
@@ -133,24 +133,24 @@ class Pending:
         WriteError
             The new log is not valid.
         """
-        with suppress(OSError):  # else the next writer does it
+        with suppress(OSError):  # after a failure the next writer rolls back
             roll_back(self.storage, self.path, self.fd)
         size = os.fstat(self.fd).st_size
         if size == self.offset + len(tail) and os.pread(self.fd, len(tail), self.offset) == tail:
-            # The file gets its size last: all bytes were written, but the sync was not confirmed.
+            # The file gets its size last: all bytes are written, but the disk did not confirm the sync.
             _logger.warning(
                 "%s: the messages are in the log, but the disk did not confirm it (%s): copy it elsewhere",
                 self.path, error.strerror,
             )  # fmt: skip
             return
         if size == self.size:
-            then = f"the log is unchanged: {disk_advice(error)}"
+            outcome = f"the log is unchanged: {disk_advice(error)}"
         else:
-            then = (
+            outcome = (
                 f"no recorded data are lost, and ipsys can read the old log with {self.path.name}.journal "
                 f"beside it; {disk_advice(error)}, and run: ipsys repair {self.path}"
             )
-        raise cannot_write(self.path, error, then) from None
+        raise cannot_write(self.path, error, outcome) from None
 
     def abandon(self) -> None:
         self._pieces.clear()
@@ -164,6 +164,6 @@ def _extend(so_far: int, data: Buffer, crc: int | None) -> int:
 
 
 def cannot_write(path: Path, error: OSError, then: str) -> WriteError:
-    """Return the error for a failed write; `then` says what follows from it."""
+    """Return the error for a failed write; `then` describes the consequence."""
     text = f"{path} cannot be written ({error.strerror or os.strerror(error.errno or 0)}): {then}"
     return WriteError(text, error)

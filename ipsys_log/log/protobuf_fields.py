@@ -1,4 +1,4 @@
-"""Payloads to protobuf messages and back, field by field, as the type hints say."""
+"""Conversion of payloads to protobuf messages and back, field by field, from the type hints."""
 
 from __future__ import annotations
 
@@ -23,7 +23,7 @@ Read = Callable[[Any, Items], Any]
 
 
 def fill_proto(payload_type: type, proto: Any, payload: Any) -> None:
-    """Put a payload into a protobuf message of its schema."""
+    """Write the fields of a payload into a protobuf message of its schema."""
     for name, fill, _ in fields_of(payload_type):
         value = getattr(payload, name)
         if value is not None:
@@ -37,13 +37,13 @@ def read_proto(payload_type: type, proto: Any, items: Items) -> Any:
 
 @cache
 def fields_of(payload_type: type) -> tuple[tuple[str, Fill, Read], ...]:
-    """The names of a payload's fields, and how each is put into a protobuf message and taken out of one."""
+    """Return for each field of a payload: its name, its fill function and its read function."""
     hints = get_type_hints(payload_type, include_extras=True)
     return tuple((f.name, *_converters(f.name, hints[f.name])) for f in fields(payload_type))
 
 
 def _converters(name: str, hint: Any) -> tuple[Fill, Read]:
-    """Conversion of a field into a protobuf message and back."""
+    """Return the functions that write a field into a protobuf message and read it back."""
     if get_origin(hint) in (Union, types.UnionType):
         inner = next(h for h in get_args(hint) if h is not type(None))
         fill, read = _converters(name, inner)
@@ -126,12 +126,12 @@ def _repeated(name: str, item: Any) -> tuple[Fill, Read]:
     nested: Any = item
 
     def fill(proto: Any, value: Any) -> None:
-        for one in value:
-            fill_proto(nested, getattr(proto, name).add(), one)
+        for element in value:
+            fill_proto(nested, getattr(proto, name).add(), element)
 
     def read(proto: Any, items: Items) -> tuple[Any, ...]:
         values = getattr(proto, name)
         items.take(len(values))
-        return tuple(read_proto(nested, one, items) for one in values)
+        return tuple(read_proto(nested, element, items) for element in values)
 
     return fill, read

@@ -1,4 +1,4 @@
-"""Reading a log: by its indexes, in log order, while somebody else may be appending to it."""
+"""A reader of logs: by their indexes, in log order, also while another process appends."""
 
 import logging
 import os
@@ -37,8 +37,8 @@ _PAUSE_S = 0.02
 class LogReader:
     """A finished log, open for reading.
 
-    Several channels of one topic, as other programs write them, are read as one. A reader stays right
-    while somebody appends: it shows the log as it was when it was opened.
+    Other programs write several channels with one topic. They are read as one channel. A reader stays
+    consistent while another process appends: it shows the log at the time of opening.
 
     Parameters
     ----------
@@ -48,9 +48,10 @@ class LogReader:
     Attributes
     ----------
     channels : Mapping[str, Channel]
-        By topic.
+        The channels by topic.
     conflicts : Mapping[str, str]
-        Topics whose channels differ in schema or encoding, and how. They cannot be read as one.
+        The topics whose channels differ in schema or encoding, with the difference. They cannot be read as
+        one channel.
     start_ns, end_ns : int or None
         Log times of the first and the last message.
     message_count : int
@@ -58,7 +59,7 @@ class LogReader:
     compressions : Mapping[str, int]
         Number of chunks by compression ("" means none).
     size : int
-        Bytes of the file.
+        Size of the file in bytes.
     bytes_read : int
         Bytes read from it so far.
 
@@ -105,7 +106,7 @@ class LogReader:
 
     @property
     def bytes_read(self) -> int:
-        """Bytes read from the file so far, its table of contents included."""
+        """The number of bytes read from the file so far, with its table of contents."""
         return self._view.bytes_read
 
     @property
@@ -119,7 +120,7 @@ class LogReader:
 
     @property
     def data_end(self) -> int:
-        """The end of the data section: an append changes nothing before this byte."""
+        """The end of the data section; an append changes no byte before it."""
         return self._contents.data_end
 
     def messages(
@@ -128,12 +129,12 @@ class LogReader:
         start_ns: int | None = None,
         end_ns: int | None = None,
     ) -> Iterator[RawMessage]:
-        """Messages in log order: by log time, then by place in the file.
+        """Return the messages in log order: by log time, then by offset in the file.
 
         Parameters
         ----------
         topics
-            Only these; None means all. A topic that the log does not have gives no message.
+            The topics to read; None means all topics. A topic that is not in the log has no messages.
         start_ns, end_ns
             Half-open range of log time in ns: start <= log time < end.
 
@@ -174,10 +175,10 @@ class LogReader:
         return np.sort(times).astype(np.int64)
 
     def channel_hash(self, topic: str) -> str:
-        """Hash over times and payloads of a channel in log order, in hexadecimal.
+        """Return the hash over times and payloads of a channel in log order, in hexadecimal.
 
-        It is the same however the messages are spread over chunks and files. What the writer stored is
-        used if it fits the log; else the channel is read once.
+        The hash does not depend on the chunks and files of the messages. The stored hash of the writer is
+        used if it matches the log; else the channel is read once.
 
         Raises
         ------
@@ -204,25 +205,25 @@ class LogReader:
 
 
 def stored_hashes(view: View, contents: Contents) -> dict[str, ChannelHash]:
-    """The hashes that writers left in the log, the newest per topic."""
-    found: dict[str, ChannelHash] = {}
+    """Return the hashes that writers stored in the log, the newest per topic."""
+    hashes: dict[str, ChannelHash] = {}
     for index in sorted(contents.metadata, key=lambda record: record.offset):
         if index.name == METADATA_NAME and index.offset + HEADER.size <= contents.data_end:
-            at = next(walk(view, index.offset, contents.data_end))
-            body = view.read(at.offset + HEADER.size, at.length - HEADER.size)
-            record = parse(mcap.Metadata.read, view, at, body)
-            found |= hashes_from_metadata(record, index.offset)
-    return found
+            record_at = next(walk(view, index.offset, contents.data_end))
+            body = view.read(record_at.offset + HEADER.size, record_at.length - HEADER.size)
+            record = parse(mcap.Metadata.read, view, record_at, body)
+            hashes |= hashes_from_metadata(record, index.offset)
+    return hashes
 
 
 def _open(path: Path) -> tuple[View, Contents]:
-    """Open a consistent state: the old log while its journal is valid, else an unchanging file."""
+    """Open a log in a consistent state: the old log if its journal is valid, else an unchanging file."""
     fault: LogError | None = None
     for _ in range(_ATTEMPTS):
         fd = open_for_reading(path)
-        before = os.fstat(fd)
-        view = View(path, fd, before.st_size, before.st_size)
-        held = attach_journal(view)
+        status_before = os.fstat(fd)
+        view = View(path, fd, status_before.st_size, status_before.st_size)
+        has_journal = attach_journal(view)
         fault = None
         try:
             contents = contents_of(view)
@@ -231,17 +232,17 @@ def _open(path: Path) -> tuple[View, Contents]:
         except BaseException:
             view.close()
             raise
-        if fault is None and (held or _stood_still(view, before)):
-            if (held or contents.cut_short) and not is_being_written(path):
+        if fault is None and (has_journal or _stood_still(view, status_before)):
+            if (has_journal or contents.cut_short) and not is_being_written(path):
                 _logger.warning(
                     "%s: an append to it was interrupted; ipsys reads the old log. Repair it with: "
                     "ipsys repair %s",
                     path, path,
                 )  # fmt: skip
             return view, contents
-        moved = not held and not _stood_still(view, before)
+        has_changed = not has_journal and not _stood_still(view, status_before)
         view.close()
-        if fault is not None and not moved:
+        if fault is not None and not has_changed:
             break
         time.sleep(_PAUSE_S)
     if fault is None or (isinstance(fault, NoFooterError) and is_being_written(path)):

@@ -1,6 +1,6 @@
 """MCAP records: bounded parsing of untrusted bytes, and bytes of new records.
 
-Layouts as in the MCAP specification, https://mcap.dev/spec. The record classes are those of ``mcap``.
+The layouts follow the MCAP specification, https://mcap.dev/spec. The record classes come from ``mcap``.
 """
 
 import struct
@@ -44,7 +44,7 @@ HEADER = struct.Struct("<BQ")  # opcode, length of the rest
 MESSAGE = struct.Struct("<BQHIQQ")  # opcode, length, channel, sequence, log time, publish time
 DATA_END = struct.Struct("<BQI")
 FOOTER = struct.Struct("<BQQQI")
-ENTRY = struct.Struct("<QQ")  # of a message index: log time in ns, offset in the chunk
+ENTRY = struct.Struct("<QQ")  # in a message index: log time in ns, offset in the chunk
 INDEX_HEAD = struct.Struct("<BQHI")  # opcode, length, channel, bytes of entries
 HEAD_SIZE = HEADER.size
 MESSAGE_HEAD_SIZE = MESSAGE.size  # bytes from a message's opcode to its payload
@@ -58,7 +58,7 @@ R = TypeVar("R")
 
 
 class RecordAt(NamedTuple):
-    """The position of a record: `offset` of its opcode, `length` with its 9 bytes of head."""
+    """The position of a record: the `offset` of its opcode, and its `length` with the head of 9 bytes."""
 
     opcode: int
     offset: int
@@ -80,7 +80,7 @@ class ChunkRef(NamedTuple):
 
     @property
     def end(self) -> int:
-        """Offset of the first byte after the chunk's message indexes."""
+        """The offset of the first byte after the message indexes of the chunk."""
         return self.offset + self.length + self.index_length
 
     def as_record(self) -> mcap.ChunkIndex:
@@ -98,7 +98,7 @@ class ChunkRef(NamedTuple):
 
 
 class ChunkHead(NamedTuple):
-    """The fields in front of a chunk's data, which lies at `data_offset` in the file."""
+    """The fields before the data of a chunk; the data begin at `data_offset` in the file."""
 
     start_ns: int
     end_ns: int
@@ -110,7 +110,7 @@ class ChunkHead(NamedTuple):
 
 
 def as_bytes(*records: mcap.McapRecord) -> bytes:
-    """The records as they stand in a file."""
+    """Return the records as the bytes of a file."""
     builder = RecordBuilder()  # type: ignore[no-untyped-call, unused-ignore]
     for record in records:
         record.write(builder)
@@ -119,7 +119,7 @@ def as_bytes(*records: mcap.McapRecord) -> bytes:
 
 
 def parse(read: Callable[[ReadDataStream], R], view: View, at: RecordAt, body: bytes) -> R:
-    """One record by ``mcap``'s own `read`; it cannot reach beyond `body`, whatever lengths it claims."""
+    """Parse one record with a `read` of ``mcap``; wrong lengths in the record cannot reach beyond `body`."""
     try:
         return read(ReadDataStream(BytesIO(body)))
     except (McapError, struct.error, UnicodeDecodeError, OverflowError, MemoryError, ValueError) as error:
@@ -153,7 +153,7 @@ def exact(view: View, at: RecordAt, data: bytes) -> mcap.McapRecord:
 
 
 def parse_chunk_index(view: View, at: RecordAt, body: bytes) -> ChunkRef:
-    """A ChunkIndex record; much faster than field by field, and there is one per chunk."""
+    """Parse a ChunkIndex record, much faster than field by field; each chunk has such a record."""
     try:
         start, end, offset, length, map_length = _CHUNK_INDEX.unpack_from(body)
         rest = _CHUNK_INDEX.size + map_length
@@ -167,28 +167,28 @@ def parse_chunk_index(view: View, at: RecordAt, body: bytes) -> ChunkRef:
 
 
 def parse_chunk_head(view: View, offset: int) -> tuple[RecordAt, ChunkHead]:
-    """The head of the Chunk record at `offset`, checked against its own length and the file's."""
+    """Parse the head of the Chunk record at `offset`; check it with the lengths of record and file."""
     data = view.read(offset, min(HEADER.size + _CHUNK.size + 4 + _LONGEST_NAME + 8, view.size - offset))
     try:
         opcode, length = HEADER.unpack_from(data)
         start, end, size, crc = _CHUNK.unpack_from(data, HEADER.size)
-        at = HEADER.size + _CHUNK.size
-        (name_length,) = struct.unpack_from("<I", data, at)
-        name = _short_name(data[at + 4 : at + 4 + min(name_length, _LONGEST_NAME + 1)])
-        at += 4 + name_length
-        (data_size,) = struct.unpack_from("<Q", data, at)
+        position = HEADER.size + _CHUNK.size
+        (name_length,) = struct.unpack_from("<I", data, position)
+        name = _short_name(data[position + 4 : position + 4 + min(name_length, _LONGEST_NAME + 1)])
+        position += 4 + name_length
+        (data_size,) = struct.unpack_from("<Q", data, position)
     except (struct.error, ValueError) as error:
         raise view.fault(offset, f"the Chunk record is not valid ({error})") from None
-    if opcode != Opcode.CHUNK or at + 8 + data_size != HEADER.size + length:
+    if opcode != Opcode.CHUNK or position + 8 + data_size != HEADER.size + length:
         raise view.fault(offset, "there is no Chunk record where one must be")
     if offset + HEADER.size + length > view.size:
         raise view.fault(offset, "the Chunk record reaches beyond the end of the file")
-    head = ChunkHead(start, end, size, crc, name, offset + at + 8, data_size)
+    head = ChunkHead(start, end, size, crc, name, offset + position + 8, data_size)
     return RecordAt(opcode, offset, HEADER.size + length), head
 
 
 def chunk_head(start_ns: int, end_ns: int, size: int, crc: int, compression: str, data_size: int) -> bytes:
-    """A Chunk record up to its data of `data_size` bytes, which are `size` when decompressed."""
+    """Return a Chunk record without its data, which have `data_size` bytes and unpack to `size` bytes."""
     name = compression.encode()
     fields = _CHUNK.pack(start_ns, end_ns, size, crc)
     fields += struct.pack("<I", len(name)) + name + struct.pack("<Q", data_size)
@@ -196,7 +196,7 @@ def chunk_head(start_ns: int, end_ns: int, size: int, crc: int, compression: str
 
 
 def parse_message_index(view: View, data: bytes, position: int, channel_id: int, at: int) -> bytes:
-    """Entries of the record at `position` in `data`, each an `ENTRY`."""
+    """Return the entries of the record at `position` in `data`; each has the layout of `ENTRY`."""
     if 0 <= position <= len(data) - INDEX_HEAD.size:
         opcode, length, channel, size = INDEX_HEAD.unpack_from(data, position)
         end = position + INDEX_HEAD.size + size
@@ -207,7 +207,7 @@ def parse_message_index(view: View, data: bytes, position: int, channel_id: int,
 
 
 def walk(view: View, start: int, end: int) -> Iterator[RecordAt]:
-    """The records from `start` to `end`, by their heads only."""
+    """Yield the positions of the records from `start` to `end`; read only their heads."""
     block, base = b"", start
     while start < end:
         if start + HEADER.size > base + len(block) or start < base:

@@ -45,12 +45,12 @@ _IN_MEMORY = 16 << 20  # bytes of saved messages in memory; more go to an unname
 class RepairReport:
     """The result of a repair.
 
-    ``lost`` has, by topic, the log times in ns of messages known to be gone, ``gone`` their numbers: the
-    numbers may be known without the times. ``uncounted`` says that an unknown number of others may be gone.
-    ``unchecked`` messages were saved from damaged chunks, and no CRC confirms them. ``bytes_lost``
-    counts bytes of the data section that cannot be read; ``kept_in`` is the file that holds all bytes that
-    were taken out of the log. ``cut_off`` says that the log had no end: messages that its writer still held
-    at the last write, at ``written_ns``, are gone and unknown.
+    ``lost`` has the log times in ns of lost messages by topic, ``gone`` the number of lost messages by topic.
+    A number may be known without the times. ``uncounted`` says that an unknown number of other messages may
+    be lost. ``unchecked`` counts messages that were saved from damaged chunks without a CRC to confirm them.
+    ``bytes_lost`` counts bytes of the data section that cannot be read. ``kept_in`` is the file with all
+    bytes that were taken out of the log. ``cut_off`` says that the log had no end. Then the messages in the
+    memory of its writer at the last write (``written_ns``) are lost and unknown.
     """
 
     path: Path
@@ -73,12 +73,12 @@ def repair(path: str | os.PathLike[str], *, storage: Storage = DISK) -> RepairRe
 
     An interrupted append is rolled back. A whole log is not changed. Damaged stretches become records that
     every reader skips. Their definitions and message indexes are written there again if they are known. The
-    readable messages of a damaged chunk are saved in a new one. All bytes that are overwritten or cut off are
-    kept in ``<path>.damaged`` (``.damaged_2`` if there is one of an earlier repair).
+    readable messages of a damaged chunk are saved in a new chunk. All bytes that are overwritten or cut off
+    are kept in ``<path>.damaged`` (``.damaged_2`` if an earlier repair left such a file).
 
-    The new log is read again before anything is changed: its indexes, its data section and its statistics
-    must give the same number of messages, and a second repair must find nothing to do. A whole log is
-    read once, a damaged one twice.
+    The new log is read again before the file is changed. Its indexes, its data section and its statistics
+    must give the same number of messages. A second repair must find no damage. A whole log is read once, a
+    damaged log twice.
 
     Raises
     ------
@@ -99,23 +99,31 @@ def repair(path: str | os.PathLike[str], *, storage: Storage = DISK) -> RepairRe
         known = _summary(view)
         with tempfile.SpooledTemporaryFile(_IN_MEMORY, dir=str(target.parent)) as spool:
             saved = Salvage(spool)
-            found = survey(view, known, saved)
-            if found.loose.entries and not found.crc_is_right and not found.damaged:
-                found = survey(view, known, saved, doubtful=True)  # damage that the survey does not see
-            if found.end < len(MAGIC):
+            findings = survey(view, known, saved)
+            if findings.loose.entries and not findings.crc_is_right and not findings.damaged:
+                findings = survey(
+                    view, known, saved, doubtful=True
+                )  # there is damage that the survey does not see
+            if findings.end < len(MAGIC):
                 start = view.read(0, min(len(MAGIC), view.size))
                 raise LogError(
                     f"{target} is not an MCAP file (it starts with {start!r}): nothing was changed"
                 )
-            what = disagreement(view, found)
-            if not what:
-                total = sum(found.contents.counts.values())
+            difference = disagreement(view, findings)
+            if not difference:
+                total = sum(findings.contents.counts.values())
                 return RepairReport(
-                    target, bool(notes), 0, total, found.contents.end_ns, notes=tuple(notes), kept_in=resumed
+                    target,
+                    bool(notes),
+                    0,
+                    total,
+                    findings.contents.end_ns,
+                    notes=tuple(notes),
+                    kept_in=resumed,
                 )
-            report = _rebuild(storage, view, found, saved, known)
-        found_notes = report.notes or (f"found: {what}",)
-        return replace(report, notes=(*notes, *found_notes), written_ns=status.st_mtime_ns)
+            report = _rebuild(storage, view, findings, saved, known)
+        report_notes = report.notes or (f"found: {difference}",)
+        return replace(report, notes=(*notes, *report_notes), written_ns=status.st_mtime_ns)
     except OSError as error:
         raise LogError(f"{target} cannot be repaired ({error.strerror}): {disk_advice(error)}") from None
     finally:
@@ -160,7 +168,7 @@ def _rebuild(
 
 
 def _plan(view: View, found: Survey, saved: Salvage, tail: IO[bytes]) -> _Plan:
-    """Plan the new log; nothing is changed yet."""
+    """Plan the new log; the file is not changed yet."""
     contents, start = found.contents, found.end
     patches = _patches(found)
     end = _End(tail, start, _crc_with(view, patches, start, found.crc))
@@ -220,14 +228,14 @@ def _emit_saved(end: _End, found: Survey, saved: Salvage) -> None:
 def _emit_homeless(end: _End, view: View, found: Survey) -> None:
     """Write messages outside of chunks that cannot stay in place, after the definitions of their channels."""
     contents = found.contents
-    heads = [MESSAGE.unpack(view.read(at.offset, MESSAGE.size)) for at in found.homeless]
+    heads = [MESSAGE.unpack(view.read(record_at.offset, MESSAGE.size)) for record_at in found.homeless]
     for record in found.definitions.missing({head[2] for head in heads}, found.definitions.known):
         end.emit(as_bytes(record))
-    for at, (_, _, channel, _, time_ns, _) in zip(found.homeless, heads, strict=True):
+    for record_at, (_, _, channel, _, time_ns, _) in zip(found.homeless, heads, strict=True):
         contents.loose.setdefault(channel, []).append((time_ns, end.offset))
         contents.count(channel, 1)
         contents.cover(time_ns, time_ns)
-        end.emit(view.read(at.offset, at.length))
+        end.emit(view.read(record_at.offset, record_at.length))
 
 
 def _patches(found: Survey) -> list[Patch]:
@@ -260,15 +268,15 @@ def _check(view: View, found: Survey, plan: _Plan) -> None:
     """
     size = found.end + plan.tail_size
     new = View(view.path, view.fd, size, found.end, plan.tail.fileno(), 0, patches=plan.patches)
-    again = survey(new, _summary(new))
-    streamed = sum(again.contents.counts.values())
-    what = disagreement(new, again)
-    if not what and not plan.messages == streamed == count_by_indexes(new):
-        what = f"{plan.messages} messages were saved, {streamed} would be read"
-    if what:
+    new_findings = survey(new, _summary(new))
+    streamed = sum(new_findings.contents.counts.values())
+    difference = disagreement(new, new_findings)
+    if not difference and not plan.messages == streamed == count_by_indexes(new):
+        difference = f"{plan.messages} messages were saved, {streamed} would be read"
+    if difference:
         faults = "; ".join(found.faults[:3])
         raise LogError(
-            f"{view.path} cannot be repaired ({what}) and was not changed. Keep a copy. Found: {faults}"
+            f"{view.path} cannot be repaired ({difference}) and was not changed. Keep a copy. Found: {faults}"
         )
 
 
@@ -297,24 +305,24 @@ def _commit(storage: Storage, view: View, change: Change, plan: _Plan) -> Path |
     """Keep the old bytes, then write the new log; a crash at any instant leaves the old or the new log."""
     path, fd = view.path, view.fd
     check_room(path, change)
-    kept = keep_old_bytes(storage, view, change, os.fstat(fd).st_mtime_ns)
+    has_old_bytes = keep_old_bytes(storage, view, change, os.fstat(fd).st_mtime_ns)
     try:
         replace_tail(storage, path, fd, change.start, _Blocks(plan.tail.fileno(), plan.tail_size))
-    except BaseException:  # of the disk, or an interrupt
-        with suppress(OSError):  # else the next writer does it
+    except BaseException:  # a disk error, or an interrupt
+        with suppress(OSError):  # after a failure the next writer rolls back
             roll_back(storage, path, fd)
             discard(storage, path, fd)
         raise
-    return overwrite(storage, path, fd, change.patches) if kept else None
+    return overwrite(storage, path, fd, change.patches) if has_old_bytes else None
 
 
 def _own_end(view: View, found: Survey) -> int:
-    """Return the end of a finished log; bytes after it belong to something else."""
+    """Return the end of a finished log; later bytes are not a part of the log."""
     if found.finished:
         with suppress(LogError):
-            for at in walk(view, found.end, view.size):
-                if at.opcode == Opcode.FOOTER:
-                    return min(at.offset + at.length + len(MAGIC), view.size)
+            for record_at in walk(view, found.end, view.size):
+                if record_at.opcode == Opcode.FOOTER:
+                    return min(record_at.offset + record_at.length + len(MAGIC), view.size)
     return view.size
 
 
@@ -327,19 +335,19 @@ def _report(
         notes.append("found: the CRC of the data section is wrong; the damaged part is not known")
     if own_end < view.size:
         notes.append(f"{view.size - own_end} bytes after its end, perhaps another log, were cut off")
-    gone, counted = _gone(found, known)
-    # Without a CRC and a summary nothing tells whether whole records were taken out of it.
+    lost_counts, counted = _gone(found, known)
+    # Without a CRC and a summary, a removal of whole records cannot be detected.
     is_unsure = found.finished and not (found.has_crc and found.crc_is_right)
     return RepairReport(
         view.path,
         True,
-        found.lost.bytes - sum(at.length for at in found.homeless) + view.size - own_end,
+        found.lost.bytes - sum(record_at.length for record_at in found.homeless) + view.size - own_end,
         sum(contents.counts.values()),
         contents.end_ns,
         found.lost.times_ns,
         tuple(notes),
         cut_off=not found.finished and known is None,
-        gone=gone,
+        gone=lost_counts,
         uncounted=not counted and (found.lost.uncounted > 0 or is_unsure),
         unchecked=saved.unchecked,
         kept_in=kept_in,
@@ -347,14 +355,14 @@ def _report(
 
 
 def _gone(found: Survey, known: Summary | None) -> tuple[dict[str, int], bool]:
-    """Count the lost messages by topic, and say whether the summary confirms that these are all."""
-    gone = {topic: len(times_ns) for topic, times_ns in found.lost.times_ns.items()}
+    """Return the number of lost messages by topic, and whether the summary confirms these numbers."""
+    lost_counts = {topic: len(times_ns) for topic, times_ns in found.lost.times_ns.items()}
     if known is None or not known.checked or known.statistics is None:
-        return gone, False
+        return lost_counts, False
     for channel, number in known.statistics.channel_message_counts.items():
         record = known.contents.channels.get(channel)
         missing = number - found.contents.counts.get(channel, 0)
         if missing > 0:
             topic = record.topic if record else f"channel {channel}"
-            gone[topic] = max(gone.get(topic, 0), missing)
-    return gone, True
+            lost_counts[topic] = max(lost_counts.get(topic, 0), missing)
+    return lost_counts, True

@@ -1,4 +1,4 @@
-"""Messages of ROS 2 (CDR) as the payloads they correspond to: pictures and lenses."""
+"""Conversion of ROS 2 messages (CDR) into payloads: images and camera intrinsics."""
 
 from __future__ import annotations
 
@@ -39,7 +39,7 @@ _NESTED = {"Header": "std_msgs", "RegionOfInterest": "sensor_msgs"}
 _PACKAGES = dict.fromkeys(_FIELDS, "sensor_msgs") | _NESTED
 _LONGEST_DEFINITION = 64 << 10  # bytes
 _BYTES_PER_NUMBER = 8
-# Names of models of a lens, where they are others than Foxglove's.
+# Names of lens distortion models that differ from the names of Foxglove.
 _MODELS = {"equidistant": "kannala_brandt", "fisheye": "kannala_brandt"}
 
 
@@ -48,17 +48,17 @@ def read_ros2(name: str, data: bytes, definition: bytes, items: Items | None = N
 
     Parameters
     ----------
-    name : of the schema, such as ``sensor_msgs/msg/CompressedImage``.
+    name : the name of the schema, such as ``sensor_msgs/msg/CompressedImage``.
     data : the message.
     definition : the schema in the log (``ros2msg``); empty if it has another form.
-    items : the numbers outside of images that may still be read.
+    items : how many numbers outside of images may still be read.
 
     Raises
     ------
     BoundError
         The message has more numbers than `items` allows.
     LogError
-        The definition does not have that form, or the bytes are not a message of it.
+        The definition is not a valid ``ros2msg``, or the bytes are not a valid message of the schema.
     """
     if not definition:
         raise LogError(f"its schema {name!r} is not given as .msg; convert the log: ros2 bag convert")
@@ -67,9 +67,9 @@ def read_ros2(name: str, data: bytes, definition: bytes, items: Items | None = N
     if items is not None and ROS2_PAYLOADS[name] is CameraCalibration:
         items.take(len(data) // _BYTES_PER_NUMBER)
     try:
-        found = decoder(data)
-        return _READ[name](found, _time_ns(found.header.stamp))
-    # struct.error is one of those that the decoder, which checks nothing, ends with.
+        message = decoder(data)
+        return _READ[name](message, _time_ns(message.header.stamp))
+    # The decoder checks nothing. Invalid bytes raise one of these errors, such as struct.error.
     except (struct.error, ValueError, TypeError, IndexError, AttributeError) as error:
         raise LogError(f"a message is not a valid {name}: {error}") from error
 
@@ -90,7 +90,7 @@ def _decoder(name: str) -> Callable[[bytes], Any]:
 
 @cache
 def _check_definition(name: str, definition: bytes) -> None:
-    """Refuse a definition whose fields are not those of ROS 2."""
+    """Refuse a definition whose fields differ from the fields of ROS 2."""
     if len(definition) > _LONGEST_DEFINITION:
         raise LogError(f"its schema {name!r} is not a .msg file of ROS 2: it has {len(definition)} bytes")
     main, *others = re.split(r"^=+\s*^MSG:", definition.decode(errors="replace"), flags=re.MULTILINE)
@@ -118,7 +118,7 @@ def _time_ns(stamp: Any) -> int:
 
 
 def _read_compressed(found: Any, time_ns: int) -> CompressedImage:
-    # ROS writes "bgr8; jpeg compressed bgr8" too; the bytes tell.
+    # ROS also writes "bgr8; jpeg compressed bgr8" as format. The first bytes show the real format.
     heads = {b"\xff\xd8": "jpeg", b"\x89P": "png"}
     kind = heads.get(bytes(found.data[:2]), found.format)
     return CompressedImage(time_ns, found.header.frame_id, bytes(found.data), kind)

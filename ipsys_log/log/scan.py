@@ -14,22 +14,22 @@ __all__ = ["add_record", "count_all", "scan"]
 
 
 def scan(view: View, data_end: int) -> Contents:
-    """Read the heads of all records in the data section, and the inside of chunks where that is needed."""
+    """Read the heads of all records in the data section, and the contents of chunks if necessary."""
     contents, loose = Contents(), Inside()
     counts: dict[int, dict[int, int]] = {}  # per chunk offset, from its MessageIndex records
-    for at in walk(view, len(MAGIC), data_end):
-        add_record(view, contents, loose, counts, at)
+    for record_at in walk(view, len(MAGIC), data_end):
+        add_record(view, contents, loose, counts, record_at)
     inside = [chunk for chunk in contents.chunks if not counts[chunk.offset]]
     known = contents.channels.keys() | loose.channels.keys()
     if any(not (channels.keys() <= known) for channels in counts.values()):
         inside = contents.chunks
     for chunk in inside:
-        found = look_inside(
+        chunk_inside = look_inside(
             view, chunk.offset, unpack(view, chunk.offset, parse_chunk_head(view, chunk.offset)[1])
         )
-        contents.schemas = found.schemas | contents.schemas
-        contents.channels = found.channels | contents.channels
-        counts[chunk.offset] = {key: len(rows) for key, rows in found.entries.items()}
+        contents.schemas = chunk_inside.schemas | contents.schemas
+        contents.channels = chunk_inside.channels | contents.channels
+        counts[chunk.offset] = {key: len(rows) for key, rows in chunk_inside.entries.items()}
     count_all(contents, loose, counts)
     return contents
 
@@ -37,7 +37,7 @@ def scan(view: View, data_end: int) -> Contents:
 def add_record(
     view: View, contents: Contents, loose: Inside, counts: dict[int, dict[int, int]], at: RecordAt
 ) -> None:
-    """Take one record of the data section into `contents`."""
+    """Add one record of the data section to `contents`."""
     if at.opcode == Opcode.CHUNK:
         _, head = parse_chunk_head(view, at.offset)
         start, end, size = head.start_ns, head.end_ns, head.uncompressed_size
@@ -76,7 +76,7 @@ def _add_message_index(
 
 
 def _add_index(view: View, contents: Contents, at: RecordAt) -> None:
-    """An attachment or a metadata record into the indexes; of an attachment only the head is read."""
+    """Add an attachment or a metadata record to the indexes; read only the head of an attachment."""
     if at.opcode == Opcode.METADATA:
         metadata = parse(mcap.Metadata.read, view, at, _body(view, at))
         contents.metadata.append(mcap.MetadataIndex(at.offset, at.length, metadata.name))
@@ -97,7 +97,7 @@ def _add_index(view: View, contents: Contents, at: RecordAt) -> None:
 
 
 def count_all(contents: Contents, loose: Inside, counts: dict[int, dict[int, int]]) -> None:
-    """Fill in definitions, counts and the time range, when all records were taken in."""
+    """Fill in definitions, counts and the time range after all records were added."""
     contents.schemas = loose.schemas | contents.schemas
     contents.channels = loose.channels | contents.channels
     contents.loose = loose.entries

@@ -1,4 +1,4 @@
-"""The table of contents of a log file: from its summary where that is complete, else from its records."""
+"""The table of contents of a log file, from its summary if it is complete, else from its records."""
 
 import struct
 import zlib
@@ -25,7 +25,7 @@ __all__ = [
     "tail_bytes",
 ]
 
-# Precedes a tail after new data: a record of a private type with the offset of the end of the old data.
+# The record before a standing tail: a private type, with the offset of the end of the old data.
 STANDING = struct.Struct("<BQ8sQ")
 _STANDING_TYPE, _STANDING_NAME = 0x80 | Opcode.DATA_END, b"standing"
 
@@ -49,8 +49,8 @@ def standing_data_end(view: View, at: int) -> int | None:
 def tail_bytes(contents: Contents, offset: int | None = None, *, index_chunks: bool = True) -> bytes:
     """Return the tail of a log: DataEnd, summary and footer, at ``contents.data_end`` or another `offset`.
 
-    With chunk indexes, other readers search for messages only in chunks. So a log that also has messages
-    outside of chunks gets none (`index_chunks`).
+    If a log has chunk indexes, other readers search for messages only in chunks. So a log that also has
+    messages outside of chunks gets no chunk indexes (`index_chunks`).
     """
     start = (contents.data_end if offset is None else offset) + DATA_END.size
     summary, offsets = b"", b""
@@ -91,11 +91,11 @@ def _statistics(contents: Contents) -> mcap.Statistics:
 
 
 class NoFooterError(LogError):
-    """A log has no end: its writer has not come to it yet, or never will."""
+    """A log without an end: its writer is still running, or was killed."""
 
 
 class Summary(NamedTuple):
-    """The summary of a log. `checked` says that its CRC is right (a summary may have none)."""
+    """The summary of a log. `checked` says that its CRC is right (a summary may have no CRC)."""
 
     contents: Contents
     statistics: mcap.Statistics | None
@@ -160,43 +160,43 @@ def _check_start(view: View) -> None:
 def _footer(view: View) -> tuple[int, int, bool]:
     """Return the offsets of the footer and the summary (0: none), and whether a CRC confirms both."""
     path = view.path
-    at = view.size - len(MAGIC) - FOOTER.size
-    tail = view.read(at, view.size - at) if at >= len(MAGIC) else b""
+    footer_at = view.size - len(MAGIC) - FOOTER.size
+    tail = view.read(footer_at, view.size - footer_at) if footer_at >= len(MAGIC) else b""
     if not tail.endswith(MAGIC) or FOOTER.unpack_from(tail)[:2] != (Opcode.FOOTER, 20):
         raise NoFooterError(
             f"{path} has no end: its recorder was killed, or the file was cut off. What it holds can be "
             f"saved. Run: ipsys repair {path}"
         )
     _, _, summary_start, _, crc = FOOTER.unpack_from(tail)
-    if summary_start and not len(MAGIC) < summary_start <= at:
-        raise view.fault(at, f"the footer says that the summary starts at byte {summary_start}")
+    if summary_start and not len(MAGIC) < summary_start <= footer_at:
+        raise view.fault(footer_at, f"the footer says that the summary starts at byte {summary_start}")
     if summary_start and crc:
-        summary = view.read(summary_start, at - summary_start + FOOTER.size - 4)
+        summary = view.read(summary_start, footer_at - summary_start + FOOTER.size - 4)
         if zlib.crc32(summary) != crc:
             raise view.fault(summary_start, "the CRC of the summary is wrong")
-    return at, summary_start, bool(summary_start and crc)
+    return footer_at, summary_start, bool(summary_start and crc)
 
 
 def _from_summary(view: View, start: int, end: int) -> tuple[Contents, mcap.Statistics | None]:
-    """Parse the summary, and its Statistics record, without which it is not complete."""
+    """Parse the summary and its Statistics record. A summary without this record is not complete."""
     contents = Contents()
     statistics: mcap.Statistics | None = None
     data = view.read(start, end - start)
-    for at in walk(view, start, end):
-        body = data[at.offset - start + HEADER.size : at.offset - start + at.length]
-        if at.opcode == Opcode.STATISTICS:
-            statistics = parse(mcap.Statistics.read, view, at, body)
-        elif at.opcode == Opcode.CHUNK_INDEX:
-            contents.chunks.append(parse_chunk_index(view, at, body))
-        elif at.opcode == Opcode.ATTACHMENT_INDEX:
-            contents.attachments.append(parse(mcap.AttachmentIndex.read, view, at, body))
-        elif at.opcode == Opcode.METADATA_INDEX:
-            contents.metadata.append(parse(mcap.MetadataIndex.read, view, at, body))
-        elif at.opcode == Opcode.SCHEMA:
-            schema = parse(mcap.Schema.read, view, at, body)
+    for record_at in walk(view, start, end):
+        body = data[record_at.offset - start + HEADER.size : record_at.offset - start + record_at.length]
+        if record_at.opcode == Opcode.STATISTICS:
+            statistics = parse(mcap.Statistics.read, view, record_at, body)
+        elif record_at.opcode == Opcode.CHUNK_INDEX:
+            contents.chunks.append(parse_chunk_index(view, record_at, body))
+        elif record_at.opcode == Opcode.ATTACHMENT_INDEX:
+            contents.attachments.append(parse(mcap.AttachmentIndex.read, view, record_at, body))
+        elif record_at.opcode == Opcode.METADATA_INDEX:
+            contents.metadata.append(parse(mcap.MetadataIndex.read, view, record_at, body))
+        elif record_at.opcode == Opcode.SCHEMA:
+            schema = parse(mcap.Schema.read, view, record_at, body)
             contents.schemas.setdefault(schema.id, schema)
-        elif at.opcode == Opcode.CHANNEL:
-            channel = parse(mcap.Channel.read, view, at, body)
+        elif record_at.opcode == Opcode.CHANNEL:
+            channel = parse(mcap.Channel.read, view, record_at, body)
             contents.channels.setdefault(channel.id, channel)
     if statistics is None:
         return contents, None
@@ -224,13 +224,16 @@ def _is_complete(contents: Contents, statistics: mcap.Statistics) -> bool:
 
 
 def _gaps_hold_no_messages(view: View, contents: Contents, data_end: int) -> bool:
-    """True if all messages lie in the indexed chunks: what lies between them is small, and walked."""
+    """Return whether all messages lie in the indexed chunks.
+
+    The gaps between the chunks are small, so all their records are checked.
+    """
     extents = sorted((chunk.offset, chunk.end) for chunk in contents.chunks)
     edges = [(0, len(MAGIC)), *extents, (data_end, data_end)]
     for (_, start), (end, _) in pairwise(edges):
         if start > end:
             raise view.fault(end, "two chunks overlap, or one reaches into the summary")
-        for at in walk(view, start, end):
-            if at.opcode in (Opcode.MESSAGE, Opcode.CHUNK):
+        for record_at in walk(view, start, end):
+            if record_at.opcode in (Opcode.MESSAGE, Opcode.CHUNK):
                 return False
     return True

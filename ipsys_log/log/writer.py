@@ -1,4 +1,4 @@
-"""Writing a new log and appending to a finished one: one object for both."""
+"""A writer for new logs, and for appends to finished logs."""
 
 import os
 import zlib
@@ -39,7 +39,7 @@ LIBRARY = "ipsys 1"  # fixed, so that the same messages give the same bytes
 
 
 class LogWriter:
-    """Writes messages into a new log (`create`) or at the end of a finished one (`append`).
+    """A writer of messages into a new log (`create`) or at the end of a finished log (`append`).
 
     Image channels go into uncompressed chunks of about 4 MiB, all others into compressed chunks of
     their own. The same calls give the same bytes. Use it as a context manager.
@@ -74,18 +74,18 @@ class LogWriter:
 
     @classmethod
     def create(cls, path: str | os.PathLike[str], *, atomic: bool = False, storage: Storage = DISK) -> Self:
-        """Begin a new log.
+        """Create a new log.
 
         Parameters
         ----------
         path
             A file that does not exist yet.
         atomic
-            False: the file grows in place, so that the data of a killed recorder stay there, and an exception
-            in the with-block finishes the log with its messages so far. True: the log is written as
+            False: the file grows in place, so that the data of a killed recorder stay there. An exception in
+            the with-block finishes the log with its messages so far. True: the log is written as
             ``<path>.partial`` and renamed when it is complete; an exception leaves no file.
         storage
-            The operations on files; only tests replace it.
+            The operations on files; only tests replace them.
 
         Raises
         ------
@@ -99,16 +99,16 @@ class LogWriter:
         output = Growing(storage, file, fd, target if atomic else None)
         try:
             if atomic:
-                storage.truncate(fd, 0)  # the rest of an earlier writer of this name that was killed
+                storage.truncate(fd, 0)  # an earlier writer of this file was killed: remove its data
             storage.fsync_directory(file.parent)
             output.emit(MAGIC + as_bytes(mcap.Header("", LIBRARY)))
         except BaseException as error:
-            with suppress(OSError):  # it holds nothing
+            with suppress(OSError):  # the file has no messages
                 storage.unlink(file)
             output.close()
             if isinstance(error, OSError):
-                then = f"nothing was written: {disk_advice(error)}"
-                raise cannot_write(target, error, then) from None
+                outcome = f"nothing was written: {disk_advice(error)}"
+                raise cannot_write(target, error, outcome) from None
             raise
         return cls(target, output, Contents(), SMALL_LIVE)
 
@@ -116,8 +116,8 @@ class LogWriter:
     def append(cls, path: str | os.PathLike[str], *, storage: Storage = DISK) -> Self:
         """Continue a finished log in place.
 
-        The exclusive lock is held until `close`. The file is not changed before that, and an exception in the
-        with-block leaves it unchanged. A crash at any instant leaves the old log or the new one.
+        The writer keeps the exclusive lock until `close`. The file is not changed before that. An exception
+        in the with-block leaves it unchanged. A crash at any instant leaves the old log or the new one.
 
         Raises
         ------
@@ -154,15 +154,14 @@ class LogWriter:
             self.abandon()
 
     def move(self, path: Path) -> None:
-        """Rename a new log, replacing an existing file in one step; writing continues there."""
+        """Rename a new log, and replace an existing file in one step; later writes go to the new name."""
         output = self._output
         if not isinstance(output, Growing):
             raise ValueError(f"{self.path}: an append stays where it is")
         output.storage.rename(self.path, path)
         self.path = output.path = path
-        with suppress(
-            OSError
-        ):  # the rename is done; after a power cut the name may belong to the old log again
+        # The rename is done. After a power cut the name may belong to the old log again.
+        with suppress(OSError):
             output.storage.fsync_directory(path.parent)
 
     def add_channel(
@@ -174,8 +173,8 @@ class LogWriter:
     ) -> None:
         """Declare a channel; a second call with the same schema does nothing.
 
-        When appending, a channel of the same topic and schema that the log has is continued. Where the
-        schema has grown since, the topic goes on in a channel of its own, which readers read as one.
+        An append continues a channel of the log with the same topic and schema. If the schema now has more
+        fields, the append adds a second channel for the topic. Readers read both as one channel.
 
         Raises
         ------
@@ -207,7 +206,8 @@ class LogWriter:
         Raises
         ------
         LogError
-            The disk refuses it, or the message is too large for a chunk. The log continues without it.
+            The disk refuses the write, or the message is too large for a chunk. The log continues without
+            this message.
         """
         self._check_open()
         if len(data) > LARGEST_MESSAGE:
@@ -217,7 +217,7 @@ class LogWriter:
             )
         channel, builder = self._channels[topic]
         if self._small.is_full(log_time_ns):
-            self.flush()  # what was made of a frame is never in the file before it
+            self.flush()  # so a result is never in the file before its frame
         elif self._images.is_full(log_time_ns):
             self._write_chunk(self._images)
         state = self._hashes.get(topic)
@@ -232,7 +232,7 @@ class LogWriter:
             builder.add(channel, sequence, log_time_ns, publish_time_ns, data, crc)
 
     def flush(self) -> None:
-        """Write what is buffered as complete chunks; a recorder calls this at least every second."""
+        """Write the buffered messages as complete chunks; a recorder calls this at least every second."""
         self._check_open()
         for builder in (self._images, self._small):
             self._write_chunk(builder)
@@ -257,7 +257,7 @@ class LogWriter:
             self._output.close()
 
     def abandon(self) -> None:
-        """Give up: an append leaves the log as it was, an atomic new log leaves no file."""
+        """Discard the writes: an append leaves the log unchanged, an atomic new log leaves no file."""
         if self._open:
             self._open = False
             self._output.abandon()
@@ -314,10 +314,10 @@ class LogWriter:
         return stored if stored.count == count else ChannelHash(count, valid=False)
 
     def _write_chunk(self, builder: ChunkBuilder) -> None:
-        built = builder.build(self._output.offset)
-        if built is None:
+        chunk = builder.build(self._output.offset)
+        if chunk is None:
             return
-        ref, data, crc = built
+        ref, data, crc = chunk
         self._output.emit(data, crc)
         self._contents.chunks.append(ref)
         self._contents.cover(ref.start_ns, ref.end_ns)
@@ -326,7 +326,7 @@ class LogWriter:
         builder.clear()
 
     def _write_loose(self, channel: int, sequence: int, log_ns: int, publish_ns: int, data: bytes) -> None:
-        # The old messages lie in no chunk. Chunk indexes for the new ones alone would hide the old ones.
+        # The old messages lie in no chunk. Chunk indexes only for new messages would hide the old messages.
         length = MESSAGE.size - HEADER.size + len(data)
         head = MESSAGE.pack(Opcode.MESSAGE, length, channel, sequence, log_ns, publish_ns)
         self._output.emit(head + data)

@@ -1,4 +1,4 @@
-"""Comparison of a log's data section, indexes and summary, which must say the same."""
+"""Comparison of the data section, the indexes and the summary of a log, which must agree."""
 
 from collections import Counter
 
@@ -20,23 +20,23 @@ __all__ = ["count_by_indexes", "disagreement"]
 def disagreement(view: View, found: Survey) -> str:
     """Return the first disagreement of a log with its survey, "" if there is none."""
     try:
-        theirs, summary = load_contents(view), read_summary(view)
+        loaded, summary = load_contents(view), read_summary(view)
         if summary is not None:
-            _check_lengths(view, theirs.data_end + DATA_END.size)
+            _check_lengths(view, loaded.data_end + DATA_END.size)
     except LogError as error:
         return str(error).split(" is damaged ", 1)[-1].split(". Run:", 1)[0]
-    mine = found.contents
+    surveyed = found.contents
     counts = (
-        f"readers count {sum(theirs.counts.values())} messages, but there are {sum(mine.counts.values())}"
+        f"readers count {sum(loaded.counts.values())} messages, but there are {sum(surveyed.counts.values())}"
     )
     tests = (
         (not found.finished or bool(found.damaged) or not found.crc_is_right, "its data section is damaged"),
-        (theirs.data_end != found.end, "its summary belongs to another data section"),
-        (Counter(mine.counts) != Counter(theirs.counts), counts),
-        (not _same_chunks(theirs.chunks, mine.chunks), "its chunks are not those that readers expect"),
+        (loaded.data_end != found.end, "its summary belongs to another data section"),
+        (Counter(surveyed.counts) != Counter(loaded.counts), counts),
+        (not _same_chunks(loaded.chunks, surveyed.chunks), "its chunks are not those that readers expect"),
     )
-    what = next((what for is_wrong, what in tests if is_wrong), "")
-    return what if what or summary is None else _summary_disagreement(summary, mine, found)
+    difference = next((difference for is_wrong, difference in tests if is_wrong), "")
+    return difference if difference or summary is None else _summary_disagreement(summary, surveyed, found)
 
 
 def count_by_indexes(view: View) -> int:
@@ -50,22 +50,22 @@ def count_by_indexes(view: View) -> int:
 
 def _check_lengths(view: View, start: int) -> None:
     """Refuse a summary with wrong lengths: a reader that trusts them would read too much."""
-    for at in walk(view, start, view.size):
-        if at.opcode == Opcode.FOOTER:
+    for record_at in walk(view, start, view.size):
+        if record_at.opcode == Opcode.FOOTER:
             return
-        if at.opcode < PRIVATE:
-            exact(view, at, view.read(at.offset, at.length))
+        if record_at.opcode < PRIVATE:
+            exact(view, record_at, view.read(record_at.offset, record_at.length))
 
 
 def _summary_disagreement(summary: Summary, mine: Contents, found: Survey) -> str:
     theirs, statistics, _ = summary
     if theirs.chunks and not _same_chunks(theirs.chunks, mine.chunks):
         return "its chunk indexes do not match its chunks"
-    for kind, records, own in (
+    for kind, records, defined in (
         ("schema", theirs.schemas, found.definitions.schemas),
         ("channel", theirs.channels, found.definitions.channels),
     ):
-        if any(own.get(key, record) != record for key, record in records.items()):
+        if any(defined.get(key, record) != record for key, record in records.items()):
             return f"a {kind} is defined in two ways"
         if records and not _used(kind, mine) <= records.keys():
             return f"a {kind} is missing in its summary"

@@ -1,4 +1,4 @@
-"""Schemas and channels of a data section, in file order, with substitutes for lost ones."""
+"""Schemas and channels of a data section, in file order, with substitutes for lost definitions."""
 
 from collections.abc import Iterator, Mapping, Sequence
 from contextlib import suppress
@@ -25,17 +25,17 @@ _LARGEST = 1 << 28  # bytes: limit of the memory for one definition
 
 
 def placeholder(channel_id: int) -> mcap.Channel:
-    """Return a substitute for a lost channel; its record is no longer than any that it replaces."""
+    """Return a substitute for a lost channel; its record is not longer than any record that it replaces."""
     return mcap.Channel(channel_id, f"/lost/{channel_id}", "", {}, 0)
 
 
 @dataclass(slots=True)
 class Definitions:
-    """The definitions up to the present offset, by id.
+    """The definitions up to the current offset, by id.
 
-    `known` holds definitions of the summary or of damaged chunks; they replace those missing in the data
-    section. If the CRC of the summary is right, a record that contradicts it is damaged. `rooms` are the
-    damaged stretches so far: lost definitions are written there.
+    `known` holds definitions of the summary or of damaged chunks; they replace missing definitions of the
+    data section. If the CRC of the summary is right, a record that contradicts it is damaged. `rooms` are
+    the damaged stretches so far: lost definitions are written there.
     """
 
     summary: Summary | None
@@ -45,15 +45,13 @@ class Definitions:
     known: Inside = field(default_factory=Inside)
     _schema_at: dict[int, int] = field(default_factory=dict)  # offset of the definition of each schema
     _sure: Contents | None = None
-    _checked: set[tuple[bool, int]] = field(default_factory=set)  # schemas and channels by the CRC of a chunk
-    _places: dict[tuple[bool, int], RecordAt] = field(
-        default_factory=dict
-    )  # schemas and channels in no chunk
+    _checked: set[tuple[bool, int]] = field(default_factory=set)  # schemas and channels with a right CRC
+    _places: dict[tuple[bool, int], RecordAt] = field(default_factory=dict)  # definitions in no chunk
     _full: int = 0  # number of the first rooms that are full
     _misread: list[mcap.Channel] = field(default_factory=list)
     _unused: dict[int, RecordAt] = field(default_factory=dict)  # records of channels without messages so far
     _doubtful: set[tuple[bool, int]] = field(default_factory=set)  # schemas and channels read after damage
-    _strange: set[int] = field(default_factory=set)  # offsets of chunks that contradict
+    _strange: set[int] = field(default_factory=set)  # offsets of chunks that contradict other definitions
     _lost: set[int] = field(default_factory=set)  # channels of messages for which no room was left
 
     def __post_init__(self) -> None:
@@ -65,12 +63,12 @@ class Definitions:
                 self._sure = contents
 
     def take(self, view: View, at: RecordAt, *, doubtful: bool = False) -> None:
-        """Add a Schema or Channel record outside of chunks; `doubtful` if damage is near.
+        """Add a Schema or Channel record outside of chunks; `doubtful` says that damage is near.
 
         Raises
         ------
         LogError
-            It cannot be parsed, or contradicts the summary or an earlier record.
+            The record cannot be parsed, or contradicts the summary or an earlier record.
         """
         if at.length > _LARGEST:
             raise view.fault(at.offset, f"a definition claims {at.length} bytes")
@@ -116,8 +114,9 @@ class Definitions:
         """Add the definitions of a chunk, and check that all its messages have a channel.
 
         A chunk that is `checked` by its CRC takes precedence over definitions outside of chunks. Near damage
-        (`doubtful`) it may be a piece of another log. Then it must agree with the definitions before the
-        damage that had messages, and with all of them if damage follows it too (`alone`).
+        (`doubtful`) the chunk may be a piece of another log. Then it must agree with the definitions before
+        the damage that have messages. If damage also follows the chunk (`alone`), it must agree with all
+        definitions before the damage.
 
         Raises
         ------
@@ -170,7 +169,7 @@ class Definitions:
         return channel.topic if channel else f"channel {channel_id}"
 
     def missing(self, channel_ids: set[int], defined: Inside) -> Iterator[mcap.McapRecord]:
-        """Yield records that must stand before messages of these channels, which `defined` may define."""
+        """Yield the records that must come before messages of these channels; `defined` may have them."""
         schemas, channels = defined.schemas | self.known.schemas, defined.channels | self.known.channels
         for channel_id in sorted(channel_ids - self.channels.keys()):
             channel = channels.get(channel_id) or placeholder(channel_id)
@@ -182,19 +181,19 @@ class Definitions:
             yield channel
 
     def complete(self) -> None:
-        """Add the definitions of the summary that no message has needed."""
+        """Add the definitions of the summary that no message needs."""
         for channel in self._sure.channels.values() if self._sure else ():
             self.channels.setdefault(channel.id, channel)
         for schema in self._sure.schemas.values() if self._sure else ():
             self.schemas.setdefault(schema.id, schema)
 
     def _confirm(self, records: Sequence[mcap.Schema | mcap.Channel]) -> None:
-        """Replace definitions without CRC by those with a right CRC, and blank the records of the former."""
+        """Replace definitions without CRC by definitions with a right CRC; blank the replaced records."""
         for record in records:
             key = (isinstance(record, mcap.Schema), record.id)
-            mine: dict[int, Any] = self.schemas if key[0] else self.channels
-            if key not in self._checked and mine.get(record.id, record) != record:
-                self._blank(mine, key)
+            defined: dict[int, Any] = self.schemas if key[0] else self.channels
+            if key not in self._checked and defined.get(record.id, record) != record:
+                self._blank(defined, key)
                 users = [c.id for c in self.channels.values() if key[0] and c.schema_id == record.id]
                 for channel_id in users:
                     self._blank(self.channels, (False, channel_id))
@@ -202,9 +201,9 @@ class Definitions:
 
     def _blank(self, mine: dict[int, Any], key: tuple[bool, int]) -> None:
         del mine[key[1]]
-        at = self._places.pop(key, None)
-        if at is not None:
-            self.rooms.append(Stretch(at.offset, at.length))
+        record_at = self._places.pop(key, None)
+        if record_at is not None:
+            self.rooms.append(Stretch(record_at.offset, record_at.length))
 
     def is_stranger(self, offset: int, inside: Inside) -> bool:
         """Return whether a chunk with a right CRC defines an id of this log differently."""
@@ -221,16 +220,16 @@ class Definitions:
         doubtful: bool = False,
         alone: bool = False,
     ) -> bool:
-        """Return whether others contradict a definition; a `checked` one yields only to `checked` ones.
+        """Return whether other definitions contradict a record.
 
-        See `take_chunk` for those near damage.
+        Only `checked` definitions count against a `checked` record. See `take_chunk` for records near damage.
         """
         schema = isinstance(record, mcap.Schema)
-        mine: Mapping[int, mcap.Schema | mcap.Channel] = self.schemas if schema else self.channels
+        defined: Mapping[int, mcap.Schema | mcap.Channel] = self.schemas if schema else self.channels
         key = (schema, record.id)
         is_sure = not checked or key in self._checked
         is_sure |= doubtful and key not in self._doubtful and (alone or self._is_used(key))
-        if is_sure and record.id in mine and mine[record.id] != record:
+        if is_sure and record.id in defined and defined[record.id] != record:
             return True
         if self._sure is None:
             return False
@@ -238,7 +237,7 @@ class Definitions:
         return sure.get(record.id) != record
 
     def _is_used(self, key: tuple[bool, int]) -> bool:
-        """Return whether a message needed this schema or channel."""
+        """Return whether a message needs this schema or channel."""
         is_schema, record_id = key
         used = self.channels.keys() - self._unused.keys()
         if is_schema:
@@ -282,9 +281,9 @@ class Definitions:
         return next((room for room in rooms if room.offset >= start and room.define(data)), None)
 
     def _by_one_bit(self, view: View, offset: int, channel_id: int) -> mcap.Channel | None:
-        """Return the channel whose record differs in one bit of its id, and has no messages.
+        """Return the channel without messages whose id differs from `channel_id` in one bit.
 
-        If it has messages after the one at `offset`, the id in that message is wrong.
+        If this channel has messages after the message at `offset`, the id in that message is wrong.
         """
         records = [record for record in self._misread if (record.id ^ channel_id).bit_count() == 1]
         if not self.rooms:  # its record looks whole, but its channel has no messages
@@ -292,8 +291,8 @@ class Definitions:
             unused = [key for key in near if not _has_message(view, offset, key)]
             records = [self.channels[key] for key in unused]
             if len(records) == 1:
-                at = self._unused.pop(unused[0])
-                self.rooms.append(Stretch(at.offset, at.length))
+                record_at = self._unused.pop(unused[0])
+                self.rooms.append(Stretch(record_at.offset, record_at.length))
                 del self.channels[unused[0]]
         return replace(records[0], id=channel_id) if len(records) == 1 else None
 
@@ -301,9 +300,9 @@ class Definitions:
 def _has_message(view: View, start: int, channel_id: int) -> bool:
     """Return whether a message of a channel lies outside of chunks, from `start` up to the next damage."""
     with suppress(LogError):
-        for at in walk(view, start, view.size):
-            is_message = at.opcode == Opcode.MESSAGE and at.length >= MESSAGE.size
-            if is_message and MESSAGE.unpack(view.read(at.offset, MESSAGE.size))[2] == channel_id:
+        for record_at in walk(view, start, view.size):
+            is_message = record_at.opcode == Opcode.MESSAGE and record_at.length >= MESSAGE.size
+            if is_message and MESSAGE.unpack(view.read(record_at.offset, MESSAGE.size))[2] == channel_id:
                 return True
     return False
 

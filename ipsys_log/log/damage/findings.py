@@ -19,7 +19,7 @@ __all__ = ["COUNTED", "LOOSE", "Indexed", "Lost", "Survey", "add_damage", "close
 
 @dataclass(slots=True)
 class Lost:
-    """Messages that are known to be gone, by topic: their log times in ns.
+    """The lost messages: their log times in ns, by topic.
 
     `uncounted` is the number of stretches with an unknown number of messages, `bytes` the number of
     unreadable bytes.
@@ -35,7 +35,7 @@ class Lost:
 
 @dataclass(slots=True)
 class Indexed:
-    """The message indexes that follow a chunk (`inside`), or a damaged stretch that may have been one."""
+    """The message indexes after a chunk (`inside`), or after a damaged stretch that may have been a chunk."""
 
     start: int
     inside: Inside | None = None
@@ -53,8 +53,8 @@ class Indexed:
 class Survey:
     """The whole records up to `end`, except the stretches in `damaged`.
 
-    `cut` is the unreadable end of a log without DataEnd; `finished` says that this record lies at `end`.
-    `saved` takes the readable messages of damaged chunks. `faults` lists the faults in words.
+    `cut` is the unreadable end of a log without DataEnd; `finished` says that DataEnd lies at `end`.
+    `saved` collects the readable messages of damaged chunks. `faults` lists the faults in words.
     `unindexed` holds the entries of the last chunk if its message indexes are missing or cut off.
     """
 
@@ -68,7 +68,7 @@ class Survey:
     hashes: dict[str, ChannelHash] = field(default_factory=dict)
     damaged: list[Stretch] = field(default_factory=list)
     homeless: list[RecordAt] = field(default_factory=list)  # messages that cannot stay at their offset
-    wrong_heads: list[tuple[int, bytes]] = field(default_factory=list)  # what chunks say of their times
+    wrong_heads: list[tuple[int, bytes]] = field(default_factory=list)  # offset, right time range
     cut: Stretch | None = None
     lost: Lost = field(default_factory=Lost)
     faults: list[str] = field(default_factory=list)
@@ -76,17 +76,17 @@ class Survey:
     end: int = 0
     crc: int = 0
     crc_is_right: bool = True
-    has_crc: bool = False  # of the data section
+    has_crc: bool = False  # the data section has a CRC
     finished: bool = False
     crc_at: int = 0
     wrong_length: int = -1  # a record with an impossible length
-    has_crcs: bool = False  # of the chunks so far
-    doubtful_to: int = 0  # after damage, unconfirmed lengths are checked closely
+    has_crcs: bool = False  # a chunk so far has a CRC
+    doubtful_to: int = 0  # offset: before it, unconfirmed lengths are checked closely
     indexed: Indexed | None = None
 
 
 LOOSE = frozenset((Opcode.SCHEMA, Opcode.CHANNEL, Opcode.MESSAGE, Opcode.ATTACHMENT, Opcode.METADATA))
-# If such a record is damaged, the number of lost messages is known: none, or one.
+# If such a record is damaged, the number of lost messages is known: zero or one.
 COUNTED = LOOSE | {Opcode.MESSAGE_INDEX, Opcode.DATA_END}
 _DOUBTFUL = 4096  # bytes
 
@@ -125,7 +125,7 @@ def add_damage(found: Survey, stretch: Stretch, reason: str) -> int:
     if found.indexed is not None:
         found.indexed.stretch = replace(stretch)
     last = found.damaged[-1] if found.damaged else None
-    if last is not None and last.end == stretch.offset:  # one stretch for the definitions of both
+    if last is not None and last.end == stretch.offset:  # join both, so that definitions have more room
         last.length += stretch.length
     else:
         found.damaged.append(stretch)
@@ -151,13 +151,13 @@ def _save(found: Survey, stretch: Stretch, rows: Rows) -> None:
         saved = found.saved.save(
             found.view, stretch, rows, found.definitions, found.hashes, in_order=stretch is found.cut
         )
-    gone = [
+    lost_messages = [
         (channel, time_ns)
         for channel, entries in rows.items()
         for time_ns, offset in entries
         if (channel, offset) not in saved.messages
     ]
-    for channel, time_ns in gone if rows else saved.torn:
+    for channel, time_ns in lost_messages if rows else saved.torn:
         found.lost.note(found.definitions.topic(channel), time_ns)
     if saved.note:
         found.faults.append(saved.note)
@@ -182,7 +182,7 @@ def _close_chunk(found: Survey, indexed: Indexed, inside: Inside, stop: int) -> 
             index_length=stop - indexed.start, index_offsets=indexed.offsets
         )
         return
-    if stop == found.view.size:  # and the log has no end: they are written again with it
+    if stop == found.view.size:  # the log has no end: the repair writes it with these indexes
         found.end = indexed.start
         found.cut = Stretch(found.end, stop - found.end)
         found.unindexed = inside

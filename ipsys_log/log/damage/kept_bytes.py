@@ -1,12 +1,13 @@
 """Storage of the bytes that a repair takes out of a log, and the state of an unfinished repair.
 
 ``<log>.damaged`` is an MCAP file. Its attachments are the bytes that were overwritten or cut off, each named
-after its byte range in the damaged log. Written back there, they restore the damaged log. Its metadata record
-lists the new bytes. Until the repair is complete the file is called ``<log>.damaged.partial``:
+after its byte range in the damaged log. If they are written back there, the damaged log is restored. The
+metadata record of the file lists the new bytes. Until the repair is complete, the file has the name
+``<log>.damaged.partial``:
 
-- the old log is valid until the new end of the log is in place (the journal is gone);
-- after that the new log is valid. Only then the bytes before its end are overwritten; the next repair
-  completes this if it was interrupted.
+- the old log is valid until the new end of the log is in place (the journal is removed);
+- after that the new log is valid. Only then the repair overwrites the bytes before the new end. If this is
+  interrupted, the next repair completes it.
 """
 
 import os
@@ -44,7 +45,7 @@ class Change:
     """The changes of a repair: overwrite `patches`, and replace the end of the log.
 
     The new end begins at `start`. `new_size` is the size of the log afterwards, `crc` the CRC-32 of its new
-    end. `own_end` is the end of the damaged log: bytes after it belong to something else.
+    end. `own_end` is the end of the damaged log: later bytes are not a part of the log.
     """
 
     patches: Sequence[Patch]
@@ -56,14 +57,14 @@ class Change:
 
     @property
     def old_pieces(self) -> list[tuple[int, int]]:
-        """Offset and end of each range of old bytes that the repair takes out."""
+        """The offset and the end of each range of old bytes that the repair takes out."""
         pieces = [(offset, offset + len(new)) for offset, new in self.patches]
         pieces += [(self.start, self.own_end), (self.own_end, self.old_size)]
         return [(start, end) for start, end in pieces if end > start]
 
 
 def check_room(path: Path, change: Change) -> None:
-    """Refuse a repair for which the disk has no room, before anything is changed.
+    """Refuse a repair for which the disk has no room, before any change.
 
     Raises
     ------
@@ -82,7 +83,7 @@ def check_room(path: Path, change: Change) -> None:
 
 
 def keep_old_bytes(storage: Storage, view: View, change: Change, time_ns: int) -> bool:
-    """Write ``<log>.damaged.partial`` and sync it; False if nothing is taken out."""
+    """Write ``<log>.damaged.partial`` and sync it; return False if no bytes are taken out."""
     if not change.old_pieces:
         return False
     path = _beside(view.path, ".damaged.partial")
@@ -101,7 +102,7 @@ def keep_old_bytes(storage: Storage, view: View, change: Change, time_ns: int) -
 
 
 def discard(storage: Storage, path: Path, fd: int) -> None:
-    """Remove what `keep_old_bytes` wrote for a repair that was given up, unless its new end is in place."""
+    """Remove the file of `keep_old_bytes` after a failed repair, unless the new end is in place."""
     partial = _beside(path, ".damaged.partial")
     with suppress(OSError):
         if _committed_patches(partial, path, fd) is None:
@@ -114,19 +115,19 @@ def overwrite(storage: Storage, path: Path, fd: int, patches: Sequence[Patch]) -
         write_all(storage, fd, new, offset)
     if patches:
         storage.fsync(fd)
-    kept, number = _beside(path, ".damaged"), 1
-    while kept.exists():  # of an earlier repair
+    kept_path, number = _beside(path, ".damaged"), 1
+    while kept_path.exists():  # from an earlier repair
         number += 1
-        kept = _beside(path, f".damaged_{number}")
-    storage.rename(_beside(path, ".damaged.partial"), kept)
-    storage.fsync_directory(kept.parent)
-    return kept
+        kept_path = _beside(path, f".damaged_{number}")
+    storage.rename(_beside(path, ".damaged.partial"), kept_path)
+    storage.fsync_directory(kept_path.parent)
+    return kept_path
 
 
 def resume(storage: Storage, path: Path, fd: int) -> Path | None:
     """Complete a repair if its new end is in place, else discard it.
 
-    Returns ``<log>.damaged`` if a repair was completed. The caller holds the exclusive lock.
+    Return ``<log>.damaged`` if a repair was completed, else None. The caller holds the exclusive lock.
     """
     partial = _beside(path, ".damaged.partial")
     if not partial.exists():
@@ -147,7 +148,7 @@ def _committed_patches(partial: Path, path: Path, fd: int) -> list[Patch] | None
             for key, value in values.items()
             if key.startswith("bytes ")
         ]
-    except (LogError, KeyError, ValueError):  # it is incomplete: then the log was not changed
+    except (LogError, KeyError, ValueError):  # the file is incomplete: so the log was not changed
         return None
     size = os.fstat(fd).st_size
     log = View(path, fd, size, size)
@@ -165,9 +166,9 @@ def _read_metadata(partial: Path) -> dict[str, str]:
         if summary is None:
             return {}
         for index in summary.contents.metadata:
-            at = next(walk(view, index.offset, size))
-            body = view.read(at.offset + HEADER.size, at.length - HEADER.size)
-            return dict(parse(mcap.Metadata.read, view, at, body).metadata)
+            record_at = next(walk(view, index.offset, size))
+            body = view.read(record_at.offset + HEADER.size, record_at.length - HEADER.size)
+            return dict(parse(mcap.Metadata.read, view, record_at, body).metadata)
         return {}
     finally:
         os.close(fd)
@@ -191,7 +192,7 @@ def _write(storage: Storage, fd: int, view: View, change: Change, time_ns: int) 
         )
     contents.attachment_count = len(contents.attachments)
     values = {"start": str(change.start), "new_size": str(change.new_size), "crc": str(change.crc)}
-    values |= {f"bytes {at}": new.hex() for at, new in change.patches}
+    values |= {f"bytes {patch_offset}": new.hex() for patch_offset, new in change.patches}
     metadata = as_bytes(mcap.Metadata(_METADATA_NAME, values))
     contents.metadata.append(mcap.MetadataIndex(offset, len(metadata), _METADATA_NAME))
     contents.metadata_count = 1

@@ -17,11 +17,11 @@ _FILLER = Opcode.CHUNK | PRIVATE
 
 @dataclass(slots=True)
 class Stretch:
-    """A range of bytes from `offset` on that are not whole records.
+    """A byte range from `offset` on that does not consist of whole records.
 
-    They are replaced by `head` (the beginning of a file), the message indexes of the chunk before it
-    (`entries`), lost `definitions`, and a record of a private type over the rest, which every reader skips.
-    Only the first bytes of that record are written; the others are not changed.
+    A repair replaces it by `head` (the beginning of a file), the message indexes of the chunk before it
+    (`entries`), and lost `definitions`. A record of a private type fills the rest; every reader skips this
+    record. Only the first bytes of this record are written; its other bytes are not changed.
     """
 
     offset: int
@@ -30,7 +30,7 @@ class Stretch:
     chunk: int | None = None  # number of the chunk of `entries`
     entries: Mapping[int, list[tuple[int, int]]] = field(default_factory=dict)
     definitions: list[bytes] = field(default_factory=list)
-    _taken: int = 0  # bytes of all of these
+    _taken: int = 0  # bytes: total size of the replacements above
 
     @property
     def end(self) -> int:
@@ -45,7 +45,7 @@ class Stretch:
 
     @property
     def is_full(self) -> bool:
-        """True if not even the shortest definition fits."""
+        """Return whether the stretch has no room for the shortest definition."""
         return self.length - self._taken < _SHORTEST_DEFINITION
 
     def define(self, definitions: bytes) -> bool:

@@ -30,7 +30,7 @@ from ipsys_log.log.records import (
 
 __all__ = ["PRIVATE", "Resync", "attachment_crc", "check_exact", "crc_of", "is_index"]
 
-PRIVATE = 0x80  # types from here on are skipped by every reader
+PRIVATE = 0x80  # every reader skips unknown types from this value on
 _BLOCK = 1 << 20
 _OVERLAP = 64
 _LONGEST_HEAD = 1 << 16
@@ -39,7 +39,7 @@ _LONGEST_CHAIN = 256  # records
 _ENOUGH = 3  # messages and channels in a row, even if they do not belong together
 _RECENT = 8  # messages: damage may have changed the time of one of them
 _DAY_NS = 86_400 * 1_000_000_000
-_IN_VAIN = 64 << 20  # bytes that may be searched without result, however small the log is
+_IN_VAIN = 64 << 20  # bytes: limit of the search without result in a small log
 _STEP = 4096  # bytes: the cost of a check of a small record
 _CHUNK = rb"\x06.{36}(?:\x00{4}|\x04\x00{3}zstd|\x03\x00{3}lz4)"
 _CHUNK_HEAD = re.compile(_CHUNK, re.DOTALL)
@@ -69,9 +69,9 @@ class Resync:
     """A search for records in one log.
 
     `chunked` says whether its messages lie in chunks (None: not known yet). If they do, a message record
-    elsewhere is a piece of a damaged chunk. `channels` are the defined ids, `times_ns` the log times of the
-    last messages outside of chunks, `span_ns` the time range of all messages, if the summary has it. `budget`
-    limits the bytes that are searched without result.
+    elsewhere is a piece of a damaged chunk. `channels` are the defined ids. `times_ns` are the log times of
+    the last messages outside of chunks. `span_ns` is the time range of all messages, if the summary has it.
+    `budget` limits the bytes that are searched without result.
     """
 
     view: View
@@ -85,23 +85,23 @@ class Resync:
         self.budget = _IN_VAIN + 4 * self.view.size
 
     def find(self, damaged: int, claimed: int = 0, gap: int = HEADER.size) -> int | None:
-        """Return the offset of the next whole record after the damaged one, None if there is none.
+        """Return the offset of the next whole record after the damaged record, None if there is none.
 
-        `claimed` is the end of the damaged record by its own length, if it has one; it takes at least `gap`
-        bytes.
+        `claimed` is the end of the damaged record by its own length, 0 if there is none. The damaged record
+        takes at least `gap` bytes.
         """
         if self.chunked is None and not self.times_ns:
             self.chunked = self._has_chunks(damaged)
         if damaged < claimed and self.leads_on(claimed):
-            # Its length may be right; but a stray head may also claim the bytes after it.
+            # Its length may be right, but a stray copy of a head may also claim the bytes after it.
             pattern = _CHUNK_HEAD if self.is_chunk_head(damaged) else _CANDIDATE
             inner = self._find(pattern, damaged + gap, claimed, into_damage=False)
             return claimed if inner is None else inner
         return self._find(_CANDIDATE, damaged + gap)
 
     def _has_chunks(self, start: int) -> bool:
-        """Return whether messages after `start` lie in chunks, as far as the bytes there tell it."""
-        torn = start > len(MAGIC) and self.is_chunk_head(start)  # no chunk begins where the Header must be
+        """Return whether messages after `start` lie in chunks, judged from the bytes after `start`."""
+        torn = start > len(MAGIC) and self.is_chunk_head(start)  # no chunk begins at the offset of the Header
         if torn or self._find(_CHUNK_HEAD, start) is not None:
             return True
         self.chunked = False
@@ -110,9 +110,9 @@ class Resync:
             self.chunked = True
             return self._find(_INDEX, start) is not None
         with suppress(LogError):
-            for at in walk(self.view, first, self.view.size):
-                if at.opcode == Opcode.MESSAGE_INDEX:
-                    return is_index(self.view, at)
+            for record_at in walk(self.view, first, self.view.size):
+                if record_at.opcode == Opcode.MESSAGE_INDEX:
+                    return is_index(self.view, record_at)
         return False
 
     def is_chunk_head(self, offset: int) -> bool:
@@ -121,9 +121,10 @@ class Resync:
         return _CHUNK_HEAD.match(head) is not None
 
     def is_end(self, offset: int, crc: int) -> bool:
-        """Return whether the DataEnd record at `offset` ends this log: a stray copy of a sector may hold one.
+        """Return whether the DataEnd record at `offset` ends this log.
 
-        `crc` is the CRC of the data section up to `offset`.
+        A stray copy of a sector may also hold such a record. `crc` is the CRC of the data section up to
+        `offset`.
         """
         stored = DATA_END.unpack(self.view.read(offset, DATA_END.size))[2]
         if (stored and stored == crc) or self._leads_to_footer(offset + DATA_END.size):
@@ -132,14 +133,17 @@ class Resync:
 
     def _leads_to_footer(self, start: int) -> bool:
         try:
-            for at in walk(self.view, start, self.view.size):
-                if at.opcode == Opcode.FOOTER and at.length == FOOTER.size:
-                    summary = FOOTER.unpack(self.view.read(at.offset, FOOTER.size))[2]
-                    stop = at.offset + at.length
-                    behind = self.view.read(stop, min(2 * len(MAGIC), self.view.size - stop))
-                    # Without a summary a stray copy says the same, but ends neither a file nor before one.
-                    return behind in (MAGIC, 2 * MAGIC) or (summary == start and behind.startswith(MAGIC))
-                if at.opcode not in _IN_SUMMARY and at.opcode < PRIVATE:
+            for record_at in walk(self.view, start, self.view.size):
+                if record_at.opcode == Opcode.FOOTER and record_at.length == FOOTER.size:
+                    summary = FOOTER.unpack(self.view.read(record_at.offset, FOOTER.size))[2]
+                    stop = record_at.offset + record_at.length
+                    following = self.view.read(stop, min(2 * len(MAGIC), self.view.size - stop))
+                    # A stray copy without summary has the same bytes. But neither the end of the file nor
+                    # another log follows it.
+                    return following in (MAGIC, 2 * MAGIC) or (
+                        summary == start and following.startswith(MAGIC)
+                    )
+                if record_at.opcode not in _IN_SUMMARY and record_at.opcode < PRIVATE:
                     return False
         except LogError:
             pass
@@ -161,7 +165,7 @@ class Resync:
         return None
 
     def leads_on(self, offset: int, *, into_damage: bool = True) -> bool:
-        """Return whether a record of the data section begins there, judged by it and the next records.
+        """Return whether a record of the data section begins at `offset`, judged by it and the next records.
 
         With `into_damage`, records may count as whole although damage follows them.
         """
@@ -169,17 +173,17 @@ class Resync:
         defined: set[int] = set()
         times_ns: list[int] = []  # of messages
         try:
-            for at in islice(walk(self.view, offset, self.view.size), _LONGEST_CHAIN):
+            for record_at in islice(walk(self.view, offset, self.view.size), _LONGEST_CHAIN):
                 self.budget -= _STEP
                 steps += _STEP
                 if self.budget < 0:
                     return False
-                verdict = self._judge(at, times_ns, defined)
+                verdict = self._judge(record_at, times_ns, defined)
                 if verdict is not None:
                     self.budget += steps if verdict else 0
                     return verdict
-                last, start, stop = at.opcode, at.offset, at.offset + at.length
-        except LogError:  # damage follows, or the end of what was written
+                last, start, stop = record_at.opcode, record_at.offset, record_at.offset + record_at.length
+        except LogError:  # damage follows, or the end of the written data
             if last == Opcode.MESSAGE_INDEX:
                 return into_damage and self.is_chunk_head(stop)
             if last == Opcode.MESSAGE:
@@ -189,7 +193,9 @@ class Resync:
         return last > 0
 
     def _judge(self, at: RecordAt, times_ns: list[int], defined: set[int]) -> bool | None:
-        """Return whether a record proves that it and earlier ones are whole; None: the next one decides.
+        """Return whether a record proves that it and earlier records are whole.
+
+        None means that the next record decides.
 
         Raises
         ------
@@ -233,7 +239,7 @@ class Resync:
         return any(abs(time_ns - recent_ns) < _DAY_NS for recent_ns in self.times_ns)
 
     def _is_series(self, times_ns: list[int], stop: int) -> bool:
-        """Return whether messages have about the same time, and the head of another one follows them."""
+        """Return whether messages have about the same time, and the head of another message follows them."""
         near = len(times_ns) > 1 and max(times_ns) - min(times_ns) < _DAY_NS
         return near and stop < self.view.size and self.view.read(stop, 1) == bytes([Opcode.MESSAGE])
 
@@ -286,7 +292,7 @@ def attachment_crc(view: View, at: RecordAt) -> tuple[int, int]:
     Raises
     ------
     LogError
-        Its lengths are wrong.
+        The record has wrong lengths.
     """
     head = view.read(at.offset, min(at.length, _LONGEST_HEAD))
     try:
@@ -302,7 +308,7 @@ def attachment_crc(view: View, at: RecordAt) -> tuple[int, int]:
 
 
 def crc_of(view: View, length: int, start: int = 0, crc: int = 0) -> int:
-    """Return the CRC-32 of a stretch of the file, continued from `crc`."""
+    """Return the CRC-32 of a byte range of the file, continued from `crc`."""
     for offset in range(start, start + length, _BLOCK):
         crc = zlib.crc32(view.read(offset, min(_BLOCK, start + length - offset)), crc)
     return crc

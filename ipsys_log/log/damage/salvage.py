@@ -41,9 +41,9 @@ Rows = Mapping[int, list[tuple[int, int]]]  # by channel id: log time in ns, off
 class _Records(NamedTuple):
     """The records of a damaged chunk, as far as they can be decoded.
 
-    `checked` says that all records are there with a right CRC, `is_wrong` that all are there with a wrong
-    CRC. `ends_early` says that the rest is missing, or cannot be decoded. `size` is the stated size of the
-    chunk in bytes.
+    `checked` says that all records are present with a right CRC, `is_wrong` that all are present with a
+    wrong CRC. `ends_early` says that the rest is missing, or cannot be decoded. `size` is the stated size
+    of the chunk in bytes.
     """
 
     data: Buffer
@@ -63,9 +63,9 @@ class _Records(NamedTuple):
 
 
 class Saved(NamedTuple):
-    """The messages saved from one stretch: channel ids and offsets in the chunk of the messages.
+    """The messages saved from one stretch: the channel id and the offset in the chunk of each message.
 
-    `torn` has the channel id and log time of an incomplete message. `counted` says that the stretch held no
+    `torn` has the channel id and log time of an incomplete message. `counted` says that the stretch has no
     other messages. `share` is the saved fraction of the stretch.
     """
 
@@ -80,7 +80,8 @@ class Saved(NamedTuple):
 class Salvage:
     """Messages saved into new chunks, which are kept in `spool` until they are written to the log.
 
-    `inside` holds what the damaged chunks define, `unchecked` counts messages whose CRC cannot be checked.
+    `inside` has the definitions of the damaged chunks. `unchecked` counts messages whose CRC cannot be
+    checked.
     """
 
     spool: IO[bytes]
@@ -101,12 +102,12 @@ class Salvage:
         *,
         in_order: bool,
     ) -> Saved:
-        """Save the plausible messages of the chunk that begins with `stretch`, if it is a chunk.
+        """Save the plausible messages of the chunk that begins with `stretch`, if there is a chunk.
 
         A chunk that is cut off ends with its last whole message. A sector that never reached the disk reads
-        as zeros: all data from there on are rejected. If a record is not plausible, its whole sector is
-        rejected. If the CRC is wrong and all records are plausible, the damaged one is unknown, and none is
-        saved.
+        as zeros: all data from this sector on are rejected. If a record is not plausible, its whole sector
+        is rejected. If the CRC is wrong and all records are plausible, the damaged record is unknown. Then
+        no message is saved.
 
         Parameters
         ----------
@@ -141,10 +142,10 @@ class Salvage:
 
     def finish(self) -> None:
         """Write the last chunk into the spool."""
-        built = self._builder.build(0)
-        if built is None:
+        chunk = self._builder.build(0)
+        if chunk is None:
             return
-        ref, data, _ = built
+        ref, data, _ = chunk
         offsets = {channel: offset + self.size for channel, offset in ref.index_offsets.items()}
         self.chunks.append(ref._replace(offset=self.size, index_offsets=offsets))
         for channel, number in self._builder.counts.items():
@@ -177,19 +178,21 @@ class Salvage:
 
 
 def _note(stretch: Stretch, records: _Records, count: int, *, complete: bool) -> str:
-    where = f"the chunk at byte {stretch.offset} ({records.span})"
+    chunk_text = f"the chunk at byte {stretch.offset} ({records.span})"
     if records.checked:
-        return f"all {count} messages of {where} were copied: its CRC is right, but it cannot stay in place"
+        return (
+            f"all {count} messages of {chunk_text} were copied: its CRC is right, but it cannot stay in place"
+        )
     if count:
-        which = "all" if complete else "the first"
-        return f"{which} {count} messages of {where} were saved; their CRC cannot be checked"
+        count_text = "all" if complete else "the first"
+        return f"{count_text} {count} messages of {chunk_text} were saved; their CRC cannot be checked"
     if records.ends_early or not records.data:
-        return f"{where} holds no message that can be read"
-    return f"{where}: an unknown one of its messages is damaged, so that none was saved"
+        return f"{chunk_text} holds no message that can be read"
+    return f"{chunk_text}: an unknown one of its messages is damaged, so that none was saved"
 
 
 def _records_of(view: View, stretch: Stretch) -> _Records | None:
-    """Decode a chunk as far as possible; None if there is none."""
+    """Decode a chunk as far as possible; return None if there is no chunk."""
     head = view.read(stretch.offset, min(_HEAD.size + 4 + _SIZE.size, stretch.length))
     if len(head) < _HEAD.size + _SIZE.size:
         return None
@@ -221,7 +224,10 @@ def _records_of(view: View, stretch: Stretch) -> _Records | None:
 
 
 def _decode(view: View, name: bytes, offset: int, length: int) -> tuple[Buffer, bool]:
-    """Decode compressed bytes until they end or fail; return whether they failed; bounded."""
+    """Decode compressed bytes up to their end, an error, or the size limit.
+
+    Return the data, and whether an error or the limit stopped the decoder.
+    """
     if not name:
         return view.read(offset, min(length, _MOST)), length > _MOST
     decompress = _decompressor(name)
@@ -245,8 +251,8 @@ def _decompressor(name: bytes) -> Callable[[bytes], bytes]:
 
 
 def _pieces(view: View, offset: int, length: int) -> Iterator[bytes]:
-    for at in range(offset, offset + length, _READ):
-        block = view.read(at, min(_READ, offset + length - at))
+    for position in range(offset, offset + length, _READ):
+        block = view.read(position, min(_READ, offset + length - position))
         for start in range(0, len(block), _PIECE):
             yield block[start : start + _PIECE]
 
@@ -257,17 +263,17 @@ def up_to_first_hole(view: View, offset: int, length: int) -> int:
     sector = offset + -offset % _SECTOR
     for start in range(sector, offset + length, _READ):
         block = view.read(start, min(_READ, offset + length - start))
-        at = block.find(zeros)
-        while at >= 0:
-            hole = at + -at % _SECTOR
+        position = block.find(zeros)
+        while position >= 0:
+            hole = position + -position % _SECTOR
             if block[hole : hole + _SECTOR] == zeros:
                 return start + hole - offset
-            at = block.find(zeros, hole + 1)
+            position = block.find(zeros, hole + 1)
     return length
 
 
 class _Found(NamedTuple):
-    """Return the plausible messages (channel id, start, stop) and definitions, and an incomplete message."""
+    """The plausible messages (channel id, start, stop) and definitions, and an incomplete message."""
 
     messages: list[tuple[int, int, int]]
     inside: Inside
@@ -281,16 +287,16 @@ def _believable(view: View, records: _Records, rows: Rows, channels: Mapping[int
     inside, starts = Inside(), list[RecordAt]()
     position, makes_sense = 0, True
     while makes_sense and position + HEADER.size <= len(data):
-        at = RecordAt(*_head(data, position))
-        makes_sense = _makes_sense(view, data, at, inside)
-        if makes_sense and at.opcode == Opcode.MESSAGE and position + MESSAGE.size <= len(data):
+        record_at = RecordAt(*_head(data, position))
+        makes_sense = _makes_sense(view, data, record_at, inside)
+        if makes_sense and record_at.opcode == Opcode.MESSAGE and position + MESSAGE.size <= len(data):
             _, _, channel, _, time_ns, _ = MESSAGE.unpack_from(data, position)
             makes_sense = channel in channels or channel in inside.channels or records.checked
             makes_sense &= channel not in rows or (channel, time_ns, position) in named
-        if not makes_sense or position + at.length > len(data):
+        if not makes_sense or position + record_at.length > len(data):
             break
-        starts.append(at)
-        position += at.length
+        starts.append(record_at)
+        position += record_at.length
     return _up_to(records, inside, starts, position, makes_sense=makes_sense)
 
 
@@ -307,11 +313,11 @@ def _makes_sense(view: View, data: Buffer, at: RecordAt, inside: Inside) -> bool
         return at.opcode >= PRIVATE
     if at.offset + at.length <= len(data):
         try:
-            more = look_inside(view, 0, bytes(data[at.offset : at.offset + at.length]))
+            record_inside = look_inside(view, 0, bytes(data[at.offset : at.offset + at.length]))
         except LogError:
             return False
-        inside.schemas |= more.schemas
-        inside.channels |= more.channels
+        inside.schemas |= record_inside.schemas
+        inside.channels |= record_inside.channels
     return True
 
 
@@ -326,9 +332,13 @@ def _up_to(
     else:
         sound = len(data) if records.ends_early or not records.is_wrong else 0
     messages = [
-        (MESSAGE.unpack_from(data, at.offset)[2], at.offset, at.offset + at.length)
-        for at in starts
-        if at.opcode == Opcode.MESSAGE and at.offset + at.length <= sound
+        (
+            MESSAGE.unpack_from(data, record_at.offset)[2],
+            record_at.offset,
+            record_at.offset + record_at.length,
+        )
+        for record_at in starts
+        if record_at.opcode == Opcode.MESSAGE and record_at.offset + record_at.length <= sound
     ]
     torn: tuple[tuple[int, int], ...] = ()
     if sound == len(data) and position + MESSAGE.size <= sound and data[position] == Opcode.MESSAGE:

@@ -51,7 +51,7 @@ def survey(
 ) -> Survey:
     """Check the data section record by record, without trusting lengths or raising errors for damage.
 
-    A log that exceeds the limits is refused with a `BoundError`: it may be undamaged, and is not repaired.
+    A log that exceeds the limits is refused with a `BoundError`: it may be undamaged, so it is not repaired.
 
     The file is read once. `known` is the summary, if there is one: it may have definitions that the data
     section lacks. Without `saved`, damaged chunks are skipped. With `doubtful`, unconfirmed lengths are
@@ -61,26 +61,26 @@ def survey(
     definitions = Definitions(known, damaged)
     channels = ChainMap[int, mcap.Channel](definitions.channels, definitions.known.channels)
     resync = Resync(view, channels, _is_chunked(known), _span_ns(known))
-    found = Survey(view, resync, definitions, saved, damaged=damaged)
-    found.doubtful_to = view.size if doubtful else 0
-    position = _take_start(found)
-    while position < view.size and not found.finished:
-        position = _take_records(found, position)
-    if found.indexed is not None:
-        close_indexes(found, found.end)
-    _advance_crc(found, found.end)
+    findings = Survey(view, resync, definitions, saved, damaged=damaged)
+    findings.doubtful_to = view.size if doubtful else 0
+    position = _take_start(findings)
+    while position < view.size and not findings.finished:
+        position = _take_records(findings, position)
+    if findings.indexed is not None:
+        close_indexes(findings, findings.end)
+    _advance_crc(findings, findings.end)
     damaged.sort(key=lambda stretch: stretch.offset)
-    if found.finished:
-        _, _, stored = DATA_END.unpack(view.read(found.end, DATA_END.size))
-        found.crc_is_right = stored in (0, found.crc)
-        found.has_crc = stored != 0
-    found.loose.schemas, found.loose.channels = definitions.schemas, definitions.channels
-    count_all(found.contents, found.loose, found.counts)
-    return found
+    if findings.finished:
+        _, _, stored = DATA_END.unpack(view.read(findings.end, DATA_END.size))
+        findings.crc_is_right = stored in (0, findings.crc)
+        findings.has_crc = stored != 0
+    findings.loose.schemas, findings.loose.channels = definitions.schemas, definitions.channels
+    count_all(findings.contents, findings.loose, findings.counts)
+    return findings
 
 
 def _is_chunked(known: Summary | None) -> bool | None:
-    """Return whether the messages lie in chunks by the summary; None if it does not tell."""
+    """Return whether the messages lie in chunks according to the summary; None if it has no such data."""
     if known is not None and known.contents.chunks:
         return True
     if known is not None and known.checked and known.statistics is not None:
@@ -98,18 +98,18 @@ def _span_ns(known: Summary | None) -> tuple[int, int] | None:
 def _take_start(found: Survey) -> int:
     """Check the magic bytes and the Header record; return the offset of the records after them."""
     view, start = found.view, len(MAGIC)
-    behind, reason = _behind_header(found)
+    header_end, reason = _behind_header(found)
     if view.read(0, min(start, view.size)) != MAGIC:
-        follower = start if behind > start else found.resync.find(start)
+        follower = start if header_end > start else found.resync.find(start)
         if follower is None:
             return view.size
         found.indexed = Indexed(follower) if follower > start else None
         head = MAGIC + (HEADER_RECORD if follower >= start + len(HEADER_RECORD) else b"")
         add_damage(found, Stretch(0, follower, head), "it does not begin as an MCAP file")
-        return max(follower, behind)
-    found.end = behind or start
-    if behind:
-        return behind
+        return max(follower, header_end)
+    found.end = header_end or start
+    if header_end:
+        return header_end
     follower = found.resync.find(start)
     if follower is None:
         return start
@@ -121,34 +121,34 @@ def _behind_header(found: Survey) -> tuple[int, str]:
     """Return the end of the Header record (its offset if it is missing), or 0 and the fault if damaged."""
     view, start = found.view, len(MAGIC)
     try:
-        at = next(walk(view, start, view.size), None)
-        if at is None or at.opcode != Opcode.HEADER:
+        record_at = next(walk(view, start, view.size), None)
+        if record_at is None or record_at.opcode != Opcode.HEADER:
             return start, ""
-        if at.length > _LONGEST_HEADER:
-            raise view.fault(start, f"the HEADER record claims {at.length} bytes")
-        exact(view, at, view.read(start, at.length))
-        _check_length(found, at)
+        if record_at.length > _LONGEST_HEADER:
+            raise view.fault(start, f"the HEADER record claims {record_at.length} bytes")
+        exact(view, record_at, view.read(start, record_at.length))
+        _check_length(found, record_at)
     except LogError as error:
         return 0, _reason(error)
-    return at.offset + at.length, ""
+    return record_at.offset + record_at.length, ""
 
 
 def _take_records(found: Survey, position: int) -> int:
     """Check the records from `position` up to the next damage; return the offset after it."""
     view = found.view
-    at = RecordAt(0, position, 0)
+    record_at = RecordAt(0, position, 0)
     try:
-        for at in walk(view, position, view.size):
-            _take(found, at)
+        for record_at in walk(view, position, view.size):
+            _take(found, record_at)
             if found.finished:
                 return view.size
-            found.end = position = at.offset + at.length
+            found.end = position = record_at.offset + record_at.length
             if position - found.crc_at > _LAG:
                 _advance_crc(found, position if found.indexed is None else found.indexed.start)
     except BoundError:
         raise
     except LogError as error:
-        return pass_over(found, position, at if at.offset == position else None, _reason(error))
+        return pass_over(found, position, record_at if record_at.offset == position else None, _reason(error))
     return view.size
 
 
@@ -180,9 +180,9 @@ def _take(found: Survey, at: RecordAt) -> None:
 
 
 def _check_length(found: Survey, at: RecordAt) -> None:
-    """Refuse a record whose wrong length includes whole records, or ends before one.
+    """Refuse a record whose wrong length includes whole records, or ends before a whole record.
 
-    If a record follows, the length is right; if none does, the damage may also be after it.
+    If a record follows, the length is right. If no record follows, the damage may also be after this record.
     """
     view, stop = found.view, at.offset + at.length
     follows = stop == view.size
@@ -190,7 +190,7 @@ def _check_length(found: Survey, at: RecordAt) -> None:
         opcode, length = HEADER.unpack(view.read(stop, HEADER.size))
         known = opcode in LOOSE or opcode in COUNTED or opcode == Opcode.CHUNK or opcode >= PRIVATE
         follows = known and length <= view.size - stop - HEADER.size and at.offset >= found.doubtful_to
-        follows = follows or found.resync.is_chunk_head(stop)  # cut off, perhaps
+        follows = follows or found.resync.is_chunk_head(stop)  # perhaps a chunk that is cut off
     if not follows:
         inner = found.resync.find(at.offset)
         if inner is not None and inner != stop and inner < stop + HEADER.size:
@@ -228,7 +228,7 @@ def _take_loose(found: Survey, at: RecordAt) -> None:
             raise
         found.resync.times_ns.append(time_ns)
         if found.resync.chunked and at.offset >= found.doubtful_to:
-            found.resync.chunked = None  # its messages lie in chunks and beside them
+            found.resync.chunked = None  # the log has messages in chunks and outside of chunks
     elif at.opcode in (Opcode.SCHEMA, Opcode.CHANNEL):
         found.definitions.take(view, at, doubtful=at.offset < found.doubtful_to)
         return
@@ -236,7 +236,10 @@ def _take_loose(found: Survey, at: RecordAt) -> None:
 
 
 def _has_lost_chunk_heads(found: Survey) -> bool:
-    """Return whether messages outside of chunks may belong to one: unknown if both ends are lost."""
+    """Return whether messages outside of chunks may be from a chunk with a lost head.
+
+    This is unknown if both ends of the log are lost.
+    """
     begins_late = bool(found.damaged) and found.damaged[0].offset == 0
     return begins_late and found.definitions.summary is None
 
@@ -260,7 +263,7 @@ def _take_chunk(found: Survey, at: RecordAt) -> None:
     )
     add_record(view, found.contents, found.loose, found.counts, at)
     times = [time for rows in inside.entries.values() for time, _ in rows]
-    if times:  # what its head says may be wrong, and readers go by it
+    if times:  # the times in its head may be wrong, and readers use them
         span = (min(times), max(times))
         if span != (head.start_ns, head.end_ns):
             found.wrong_heads.append((at.offset + HEADER.size, ENTRY.pack(*span)))
@@ -268,7 +271,7 @@ def _take_chunk(found: Survey, at: RecordAt) -> None:
         found.contents.chunks[-1] = chunk._replace(start_ns=span[0], end_ns=span[1])
     found.counts[at.offset] = {key: len(rows) for key, rows in inside.entries.items()}
     _continue_hashes(found, inside, data)
-    if not found.resync.times_ns:  # else its messages lie in chunks and beside them
+    if not found.resync.times_ns:  # else the log has messages in chunks and outside of chunks
         found.resync.chunked = True
     found.indexed = Indexed(stop, inside)
 
@@ -286,10 +289,13 @@ def _check_without_crc(found: Survey, at: RecordAt) -> None:
 
 def _check_definitions(view: View, offset: int, data: bytes) -> None:
     """Refuse a chunk without CRC whose definitions have wrong lengths."""
-    for at in inner_records(view, offset, data):
-        if at.opcode in (Opcode.SCHEMA, Opcode.CHANNEL):
-            record = data[at.offset : at.offset + at.length]
-            if len(as_bytes(exact(view, RecordAt(at.opcode, offset, at.length), record))) != at.length:
+    for record_at in inner_records(view, offset, data):
+        if record_at.opcode in (Opcode.SCHEMA, Opcode.CHANNEL):
+            record = data[record_at.offset : record_at.offset + record_at.length]
+            if (
+                len(as_bytes(exact(view, RecordAt(record_at.opcode, offset, record_at.length), record)))
+                != record_at.length
+            ):
                 raise view.fault(offset, "a definition in the chunk claims less than it holds")
 
 
@@ -303,7 +309,7 @@ def _continue_hashes(found: Survey, inside: Inside, data: bytes) -> None:
 
 
 def _take_index(found: Survey, at: RecordAt) -> None:
-    """Add a MessageIndex record: of the chunk before it, or of the damaged stretch before it."""
+    """Add a MessageIndex record to the chunk, or to the damaged stretch, before it."""
     indexed = found.indexed
     if found.resync.chunked is False:
         raise found.view.fault(at.offset, "a MessageIndex record lies in a log without chunks")
@@ -334,7 +340,7 @@ def _take_index(found: Survey, at: RecordAt) -> None:
 
 
 def _index_rows(view: View, at: RecordAt) -> tuple[int, list[tuple[int, int]]]:
-    """Return the channel of a MessageIndex record; log times and offsets of its messages."""
+    """Return the channel of a MessageIndex record, and the log times and offsets of its messages."""
     body = view.read(at.offset, at.length)
     channel = int.from_bytes(body[HEADER.size : HEADER.size + 2], "little")
     return channel, list(ENTRY.iter_unpack(parse_message_index(view, body, 0, channel, at.offset)))

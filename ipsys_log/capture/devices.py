@@ -70,7 +70,7 @@ def _set(device: cv2.VideoCapture, camera: RigCamera) -> Given:
             device.set(key, 0.0)
     # The drivers take log2 of the exposure in s.
     exposure = None if camera.exposure_s is None else float(np.log2(camera.exposure_s))
-    asked = {
+    requested = {
         cv2.CAP_PROP_FRAME_WIDTH: camera.width,
         cv2.CAP_PROP_FRAME_HEIGHT: camera.height,
         cv2.CAP_PROP_FPS: camera.rate_hz,
@@ -78,8 +78,8 @@ def _set(device: cv2.VideoCapture, camera: RigCamera) -> Given:
         cv2.CAP_PROP_FOCUS: camera.focus,
         cv2.CAP_PROP_GAIN: camera.gain,
     }
-    accepted = {key: value is not None and device.set(key, float(value)) for key, value in asked.items()}
-    actual = {key: device.get(key) for key in asked}
+    accepted = {key: value is not None and device.set(key, float(value)) for key, value in requested.items()}
+    actual = {key: device.get(key) for key in requested}
     return Given(
         int(actual[cv2.CAP_PROP_FRAME_WIDTH]),
         int(actual[cv2.CAP_PROP_FRAME_HEIGHT]),
@@ -150,11 +150,11 @@ def check_devices(cameras: Iterable[RigCamera]) -> None:
     IpsysError
         Two cameras are the same device. The text names both.
     """
-    known: dict[Path, str] = {}
+    names: dict[Path, str] = {}
     for camera in cameras:
         if camera.source and camera.source.startswith("usb:"):
             device = Path(device_of(camera.source)).resolve()
-            other = known.setdefault(device, camera.name)
+            other = names.setdefault(device, camera.name)
             if other != camera.name:
                 raise IpsysError(
                     f"cameras {other} and {camera.name} are one device, {device}; give each its own"
@@ -219,6 +219,6 @@ def _opener(camera: RigCamera) -> Open:
     if opener is None:
         if shown.startswith("/dev/"):
             raise IpsysError(f'camera {camera.name}: source {shown!r}: write it as "usb:{shown}"')
-        known = ", ".join(f"{scheme}:" for scheme in OPENERS)
-        raise IpsysError(f"camera {camera.name}: source {shown!r} is none of {known}")
+        schemes = ", ".join(f"{scheme}:" for scheme in OPENERS)
+        raise IpsysError(f"camera {camera.name}: source {shown!r} is none of {schemes}")
     return opener

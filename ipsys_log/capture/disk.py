@@ -86,8 +86,8 @@ class Syncer:
         while True:
             with self._changed:
                 self._changed.wait_for(lambda: self._asked or self._ended, self._every_s)
-                asked, self._asked = self._asked, []
-                if self._ended and not asked:
+                requests, self._asked = self._asked, []
+                if self._ended and not requests:
                     return
             fault: OSError | None = None
             try:
@@ -95,12 +95,12 @@ class Syncer:
             except OSError as error:
                 fault = error
                 self.fault = self.fault or error
-            for confirm in asked:
+            for confirm in requests:
                 confirm(fault)
 
 
 # Disk space reserved to finish a log when the disk is full. The end of a log needs it for the waiting
-# messages, for their results, and for the table of contents, which is written twice. That table has some
+# messages, for their results, and for the table of contents, which is written twice. The table has some
 # MB after some hours. On a small disk, half of the free space is reserved.
 _RESERVE_BYTES = 64 << 20
 

@@ -179,25 +179,25 @@ def _frames(camera: RigCamera, clock: Clock, say: Say) -> Iterator[Frame]:
     """Yield frames until the camera is disconnected; :func:`_read` calls it in its thread."""
     import av
 
-    where = f"camera {camera.name}: {hide_password(camera.source or '')}"
+    label = f"camera {camera.name}: {hide_password(camera.source or '')}"
     try:
-        with _open(camera.source or "", where) as container:
-            stream = find_video(container, where)
+        with _open(camera.source or "", label) as container:
+            stream = find_video(container, label)
             codec = stream.codec_context
             name = name_format(stream)
             if name is None:
-                raise SourceError(f"{where}: is {codec.name} video; set the camera to MJPEG, H.264 or H.265")
+                raise SourceError(f"{label}: is {codec.name} video; set the camera to MJPEG, H.264 or H.265")
             rate_hz = float(stream.average_rate) if stream.average_rate else None
             say_refused(camera, Given(codec.width, codec.height, rate_hz), say)
             stamps = Stamps(camera.name, clock, say, _PATIENCE if container.format.name == "rtsp" else 1)
             # A stream that stops within a packet has ended. This is no error of the data.
             with suppress(av.error.InvalidDataError):
-                for packet in pass_through(_heard(container.demux(stream), clock, where), stream):
+                for packet in pass_through(_heard(container.demux(stream), clock, label), stream):
                     yield Frame(bytes(packet), name, stamps.of(packet))
             # The stream of a connected camera does not end. After an error, the camera is opened again.
-            raise SourceError(f"{where}: the stream has ended")
+            raise SourceError(f"{label}: the stream has ended")
     except av.error.FFmpegError as error:
-        raise SourceError(f"{where}: {_explain(error)}") from error
+        raise SourceError(f"{label}: {_explain(error)}") from error
 
 
 def _heard(packets: Iterable[Packet[VideoStream]], clock: Clock, where: str) -> Iterator[Packet[VideoStream]]:
@@ -231,7 +231,7 @@ def _explain(error: Exception) -> str:
     """Describe an error of FFmpeg for the user, and the remedy."""
     import av
 
-    known = {
+    explanations = {
         av.error.ConnectionRefusedError: "refuses the connection; is the camera on, and the port right?",
         av.error.HTTPNotFoundError: "the camera has no such path; look it up in the camera's manual",
         av.error.HTTPUnauthorizedError: "asks for a password, or another; put user:password@ before the host",
@@ -241,7 +241,7 @@ def _explain(error: Exception) -> str:
         av.error.TimeoutError: "does not answer; is the camera on, and the network up?",
         av.error.ProtocolNotFoundError: "is of a protocol that FFmpeg does not know; use rtsp:// or http://",
     }
-    for kind, text in known.items():
+    for kind, text in explanations.items():
         if isinstance(error, kind):
             return text
     return f"cannot be read ({getattr(error, 'strerror', None) or error}); try the address in another player"

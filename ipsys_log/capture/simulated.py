@@ -147,19 +147,21 @@ def parse_source(camera: RigCamera) -> Seat:
     name, _, query = (camera.source or "").partition(":")[2].partition("?")
     requested = {"width": camera.width, "height": camera.height, "rate_hz": camera.rate_hz}
     values: dict[str, int | float] = {key: value for key, value in requested.items() if value is not None}
-    known = {f.name: type(f.default) for f in fields(LabSettings) if isinstance(f.default, (int, float))}
+    setting_types = {
+        f.name: type(f.default) for f in fields(LabSettings) if isinstance(f.default, (int, float))
+    }
     board = None
     for key, text in parse_qsl(query, keep_blank_values=True):
         if key == "board":
             board = _parse_board(camera, text)
             continue
-        if key not in known:
+        if key not in setting_types:
             raise IpsysError(
                 f"camera {camera.name}: the simulated lab has no setting {key!r}; "
-                f"it has board, {', '.join(known)}"
+                f"it has board, {', '.join(setting_types)}"
             )
         try:
-            values[key] = known[key](text)
+            values[key] = setting_types[key](text)
         except ValueError as error:
             raise IpsysError(f"camera {camera.name}: {key}={text} is no number") from error
     settings = replace(LIVE_SETTINGS, **values)  # type: ignore[arg-type]

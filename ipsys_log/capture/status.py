@@ -45,7 +45,7 @@ class Look:
 class Monitor:
     """The live check of all cameras, in a separate thread. A context manager.
 
-    The thread analyses one frame of each camera about once a second. Of a video, it analyses only keyframes,
+    The thread analyses one frame of each camera about once a second. In a video, it analyses only keyframes,
     which can be decoded without other frames.
 
     Parameters

@@ -67,16 +67,16 @@ def demands_of(attached: Sequence[Attached], rig: Rig | None) -> list[Demand]:
     attached : cameras from :func:`~ipsys_log.capture.usb_bus.find_cameras`.
     rig : rig of the cameras that run; None if all attached cameras run.
     """
-    wanted: list[tuple[Attached, str, RigCamera | None]]
+    requests: list[tuple[Attached, str, RigCamera | None]]
     if rig is None:
-        wanted = [(camera, camera.device, None) for camera in attached]
+        requests = [(camera, camera.device, None) for camera in attached]
     else:
         by_path = {Path(camera.device).resolve(): camera for camera in attached}
-        named = [camera for camera in rig.cameras if (camera.source or "").startswith("usb:")]
-        paths = ((camera, Path(device_of(camera.source or "")).resolve()) for camera in named)
-        wanted = [(by_path[path], camera.name, camera) for camera, path in paths if path in by_path]
+        usb_cameras = [camera for camera in rig.cameras if (camera.source or "").startswith("usb:")]
+        paths = ((camera, Path(device_of(camera.source or "")).resolve()) for camera in usb_cameras)
+        requests = [(by_path[path], camera.name, camera) for camera, path in paths if path in by_path]
     demands = []
-    for camera, name, rig_camera in wanted:
+    for camera, name, rig_camera in requests:
         modes = [mode for mode in camera.modes if mode.format in ("MJPG", "JPEG")] or camera.modes
         if camera.plug is None or not modes:
             continue
@@ -122,8 +122,8 @@ def _explain(bus: int, shared: Sequence[Demand]) -> str | None:
     if needed > _CARRIES:
         ways = ["plug one into another bus"] if names else []
         ways += _smaller(shared)
-        wanted = f"need {_mb_s(needed)}" if names else f"needs {_mb_s(needed)}"
-        return f"{subject} USB bus {bus} ({hubs}) and {wanted} {carries}: {', or '.join(ways)}"
+        demand_text = f"need {_mb_s(needed)}" if names else f"needs {_mb_s(needed)}"
+        return f"{subject} USB bus {bus} ({hubs}) and {demand_text} {carries}: {', or '.join(ways)}"
     if names and most > _CARRIES:
         return (
             f"{subject} USB bus {bus} ({hubs}) and may reserve {_mb_s(most)} {carries}: "
@@ -181,8 +181,8 @@ class Mode(NamedTuple):
 class Plug(NamedTuple):
     """The USB connection of a camera.
 
-    It has the bus, the port of the bus, the speed, the hub, and the most bytes that the camera can reserve
-    in a microframe.
+    The fields are the bus, the port of the bus, the speed, the hub, and the most bytes that the camera can
+    reserve in a microframe.
     """
 
     bus: int

@@ -67,7 +67,7 @@ class FrameInterval(ctypes.Structure):
 
 
 class Format(ctypes.Structure):
-    # The fields after "_" are a union with pointers. It begins at byte 8.
+    # The fields after "_" are a union with pointers, which begins at byte 8.
     _fields_ = (
         ("type", c_uint32), ("_", c_uint32), ("width", c_uint32), ("height", c_uint32),
         ("pixelformat", c_uint32), ("field", c_uint32), ("bytesperline", c_uint32),

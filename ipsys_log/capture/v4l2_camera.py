@@ -114,14 +114,14 @@ def open_v4l2(camera: RigCamera, clock: Clock, say: Say) -> Iterator[Iterator[Fr
         The camera cannot be opened. The iterator raises it when the camera is disconnected.
     """
     path = device_of(camera.source or "")
-    where = f"camera {camera.name}: {path}"
+    label = f"camera {camera.name}: {path}"
     with ExitStack() as stack:
-        with _faults(where):
+        with _faults(label):
             device = os.open(path, os.O_RDWR | os.O_NONBLOCK)
             stack.callback(os.close, device)
             if not v4l2.is_camera(device):
                 raise OSError(errno.ENOTTY, "")
-            actual, layout = _set_up(device, camera, where)
+            actual, layout = _set_up(device, camera, label)
             say_refused(camera, actual, say)
             if layout is not None:
                 note = f"its {layout.format} pictures are encoded as JPEG once"
@@ -129,7 +129,7 @@ def open_v4l2(camera: RigCamera, clock: Clock, say: Say) -> Iterator[Iterator[Fr
             buffers = _map_buffers(device, stack)
             v4l2.call(device, v4l2.STREAMON, v4l2.Int(v4l2.VIDEO_CAPTURE))
             stack.callback(_stop, device)
-        yield _frames(_Capture(camera, where, device, buffers, layout), clock, say)
+        yield _frames(_Capture(camera, label, device, buffers, layout), clock, say)
 
 
 @contextmanager
@@ -147,9 +147,9 @@ def _set_up(device: int, camera: RigCamera, where: str) -> tuple[Given, Layout |
     name = next((name for name in (*_JPEG, *RAW_FORMATS) if name in offers), None)
     if name is None:
         raise SourceError(f"{where}: offers only {', '.join(offers)}; a camera that gives MJPG is needed")
-    wanted = v4l2.Format(type=v4l2.VIDEO_CAPTURE, pixelformat=v4l2.fourcc(name))
-    wanted.width, wanted.height = camera.width or 1920, camera.height or 1080
-    format = v4l2.call(device, v4l2.S_FMT, wanted)
+    requested = v4l2.Format(type=v4l2.VIDEO_CAPTURE, pixelformat=v4l2.fourcc(name))
+    requested.width, requested.height = camera.width or 1920, camera.height or 1080
+    format = v4l2.call(device, v4l2.S_FMT, requested)
     if format.pixelformat != v4l2.fourcc(name):
         raise SourceError(
             f"{where}: does not give {name} at {camera.width} x {camera.height}; take another size"

@@ -182,7 +182,7 @@ def open_played(camera: RigCamera, clock: Clock, say: Say) -> Iterator[Iterator[
 
     Parameters
     ----------
-    camera : its ``source`` is ``file:`` and a video or a log. Of a log, the camera with the same name is
+    camera : its ``source`` is ``file:`` and a video or a log. From a log, the camera with the same name is
         played, or the camera in the source: ``file:session.mcap?red``.
     clock : gives the stamps, as if the frames were taken now.
     say : called if the images are encoded again.
@@ -192,16 +192,16 @@ def open_played(camera: RigCamera, clock: Clock, say: Say) -> Iterator[Iterator[
     SourceError
         The file cannot be read, or a log has no such camera.
     """
-    path, wanted = check_played(camera)
+    path, camera_name = check_played(camera)
     if path.suffix != ".mcap":
         with open_video(path, say) as frames:
             yield _play(frames, clock)
         return
     with Session([path]) as session:
-        topic = session.images.get(wanted or camera.name)
+        topic = session.images.get(camera_name or camera.name)
         if topic is None:
-            known = ", ".join(f"{path}?{other}" for other in session.images) or "none"
-            raise SourceError(f"camera {camera.name}: {path}: has no such camera; it has: {known}")
+            names = ", ".join(f"{path}?{other}" for other in session.images) or "none"
+            raise SourceError(f"camera {camera.name}: {path}: has no such camera; it has: {names}")
         yield _play(_recorded(session, topic), clock)
 
 
@@ -213,10 +213,10 @@ def check_played(camera: RigCamera) -> tuple[Path, str]:
     SourceError
         The file does not exist.
     """
-    path, wanted = file_of(camera.source or "")
+    path, camera_name = file_of(camera.source or "")
     if not path.is_file():
         raise SourceError(f"camera {camera.name}: {path}: there is no such file")
-    return path, wanted
+    return path, camera_name
 
 
 def file_of(source: str) -> tuple[Path, str]:
@@ -228,8 +228,8 @@ def file_of(source: str) -> tuple[Path, str]:
     >>> path.name, camera
     ('session.mcap', 'red')
     """
-    name, _, wanted = source.partition(":")[2].partition("?")
-    return Path(name), wanted
+    name, _, camera_name = source.partition(":")[2].partition("?")
+    return Path(name), camera_name
 
 
 def _recorded(session: Session, topic: str) -> Iterator[Timed]:

@@ -91,7 +91,7 @@ def pass_through(
 def find_size(frame: Frame) -> tuple[int, int] | None:
     """Return width and height of a frame, in px; None if the frame does not hold them.
 
-    Of a video, only keyframes hold them.
+    In a video, only keyframes hold them.
     """
     if frame.format == "jpeg":
         with suppress(ValueError, KeyError):  # a damaged frame gives no size

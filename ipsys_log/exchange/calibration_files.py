@@ -214,7 +214,7 @@ def _row(values: Iterable[float]) -> str:
 def read_lens(path: Path, camera: str) -> CameraCalibration:
     """Read the intrinsics of a camera from a YAML file of OpenCV or ROS, or from a log (``.mcap``).
 
-    Of a log, the newest calibration of the camera is read. If the log holds the calibration of a single
+    From a log, the newest calibration of the camera is read. If the log holds the calibration of a single
     camera, this camera may have another name.
 
     Raises

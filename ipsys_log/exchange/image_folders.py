@@ -120,11 +120,11 @@ def _read_table(table: Path, pictures: Mapping[str, list[Path]]) -> dict[Path, i
             if not set(_COLUMNS) <= set(rows.fieldnames or ()):
                 raise IpsysError(f"{table}: its first line must name the columns {' and '.join(_COLUMNS)}")
             for row in rows:
-                where = f"{table}: line {rows.line_num}"
+                label = f"{table}: line {rows.line_num}"
                 path = by_name.get(row["file"] or "")
                 if path is None:
-                    raise IpsysError(f"{where}: no picture is called {row['file']!r}; write red/0001.jpg")
-                times_ns[path] = _time(row["time"] or "", where)
+                    raise IpsysError(f"{label}: no picture is called {row['file']!r}; write red/0001.jpg")
+                times_ns[path] = _time(row["time"] or "", label)
     except OSError as error:
         raise IpsysError(f"{table}: cannot be read: {error.strerror}") from error
     except (UnicodeDecodeError, csv.Error) as error:
@@ -157,8 +157,10 @@ def find_pictures(folder: Path) -> dict[str, list[Path]]:
         files = [path for path in sub.iterdir() if path.is_file() and not path.name.startswith(".")]
         unreadable = sorted(path for path in files if path.suffix.lower() in OTHER_FORMATS)
         if unreadable:
-            known = ", ".join(FORMATS)
-            raise IpsysError(f"{unreadable[0]}: only {known} are read; convert the picture, or take it out")
+            suffixes = ", ".join(FORMATS)
+            raise IpsysError(
+                f"{unreadable[0]}: only {suffixes} are read; convert the picture, or take it out"
+            )
         images = [path for path in files if path.suffix.lower() in FORMATS]
         if images:
             name = check_name(sub.name, f"{sub}: rename the folder; camera name")
@@ -201,8 +203,8 @@ def read_images(
         raise IpsysError(f"--rate {rate_hz:g}: give pictures per second, above 0")
     strange = sorted(set(lenses) - set(pictures))
     if strange:
-        known = ", ".join(pictures)
-        raise IpsysError(f"--calibration {strange[0]}: there are no pictures of such a camera (only {known})")
+        names = ", ".join(pictures)
+        raise IpsysError(f"--calibration {strange[0]}: there are no pictures of such a camera (only {names})")
     taken_ns = times_ns if times_ns is not None else _even_times(pictures, rate_hz)
     # Messages of the same instant get log times 1 ns apart.
     log_ns = min(taken_ns.values()) - len(lenses) - 1 if times_ns is not None else START_NS

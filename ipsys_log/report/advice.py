@@ -71,7 +71,7 @@ def has_published(evaluations: Sequence[Evaluation]) -> bool:
         for point in evaluation.learning
         if point.label is not None
     }
-    return any(len({size for camera, size in sizes if camera == own}) > 1 for own, _ in sizes)
+    return any(len({size for camera, size in sizes if camera == this_camera}) > 1 for this_camera, _ in sizes)
 
 
 def camera_curve(evaluation: Evaluation, camera: str, published: bool, in_space: bool) -> Curve:
@@ -105,9 +105,9 @@ def _sorted(points: Iterable[CurvePoint]) -> Curve:
 def _point(points: Sequence[LearningPoint], places: int, in_space: bool) -> CurvePoint:
     means_m = [point.mean_3d_m if in_space else point.mean_2d_m for point in points]
     stds_m = [point.std_3d_m if in_space else point.std_2d_m for point in points]
-    known = [std_m for std_m in stds_m if std_m is not None]
+    known_stds_m = [std_m for std_m in stds_m if std_m is not None]
     # Cameras see different points, so their spreads are independent.
-    std_m = float(np.linalg.norm(known)) / len(points) if len(known) == len(points) else None
+    std_m = float(np.linalg.norm(known_stds_m)) / len(points) if len(known_stds_m) == len(points) else None
     return CurvePoint(places, float(np.mean(means_m)), std_m, min(point.subsets for point in points))
 
 

@@ -125,8 +125,8 @@ def _notes(alignment: Alignment, lens: CameraCalibration | None) -> Iterator[str
         heights_m.setdefault(lying.marker_id, []).append(above_m)
     for marker_id, all_m in heights_m.items():
         mean_cm = float(np.mean(all_m)) * CM_PER_M
-        where = f"{abs(mean_cm):.0f} cm {'above' if mean_cm > 0 else 'below'} the plane of the others"
-        yield f"{name}: marker {marker_id} lies {where}, and was left out; lay it on the floor"
+        position = f"{abs(mean_cm):.0f} cm {'above' if mean_cm > 0 else 'below'} the plane of the others"
+        yield f"{name}: marker {marker_id} lies {position}, and was left out; lay it on the floor"
     if alignment.uneven_m is not None:
         yield (
             f"{name}: its markers do not lie on one plane (off by {alignment.uneven_m * CM_PER_M:.0f} cm): "

@@ -57,8 +57,8 @@ def draw_alignment(lab: AlignedLab, path: Path) -> None:
         axes = figure.add_axes((0.65 / size[0], 1.0 / size[1], _FLOOR_IN / size[0], _FLOOR_IN / size[1]))
         _draw_floor(axes, lab, lab.coverage)
         handles, labels = axes.get_legend_handles_labels()
-        where = (0.5 / size[0], 0.05 / size[1])
-        figure.legend(handles, labels, loc=where, ncols=3, fontsize=8, frameon=False)
+        location = (0.5 / size[0], 0.05 / size[1])
+        figure.legend(handles, labels, loc=location, ncols=3, fontsize=8, frameon=False)
     for number, alignment in enumerate(lab.alignments):
         column, row = divmod(number, _ROWS)
         x_in, y_in = left_in + column * (_PANEL_IN + _GAP_IN), size[1] - 0.15 - (row + 1) * _ROW_IN

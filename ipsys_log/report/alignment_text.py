@@ -63,8 +63,8 @@ def _turns(alignment: Alignment) -> str:
         if abs(turn := math.degrees(turn_rad)) >= _LEAST_DEG:
             suffix = "" if parts else " of its picture"
             parts.append(f"towards the {more if turn_rad > 0 else less}{suffix}, by {abs(turn):.1f} degrees")
-    where = _on_floor(alignment)
-    return f"tilt it so that it looks further {' and '.join(parts)}{where}" if parts else ""
+    shift = _on_floor(alignment)
+    return f"tilt it so that it looks further {' and '.join(parts)}{shift}" if parts else ""
 
 
 def _on_floor(alignment: Alignment) -> str:
@@ -132,27 +132,27 @@ def _patch_line(patches: Sequence[Patch], floor_m2: float, good: str, bad: str) 
     if not patches:
         return good, True
     total_m2 = sum(patch.area_m2 for patch in patches)
-    where = "; ".join(
+    position = "; ".join(
         f"x {p.low_m[0]:.2f} to {p.high_m[0]:.2f}, y {p.low_m[1]:.2f} to {p.high_m[1]:.2f}"
         for p in patches[:_MOST_PATCHES]
     )
     more = f"; {len(patches) - _MOST_PATCHES} more" if len(patches) > _MOST_PATCHES else ""
     area = f"{total_m2:.2f} m² of the floor ({100 * total_m2 / floor_m2:.2g} %)"
-    return (f"{bad} {area}" if " with " in bad else f"{area} are {bad}") + f": {where}{more}", False
+    return (f"{bad} {area}" if " with " in bad else f"{area} are {bad}") + f": {position}{more}", False
 
 
 def _overlap_line(overlap: Overlap, diagonal_m: float, placed: bool) -> tuple[str, bool]:
-    both, (x_m, y_m) = " and ".join(overlap.cameras), overlap.at_m.tolist()
+    names, (x_m, y_m) = " and ".join(overlap.cameras), overlap.at_m.tolist()
     needed = f"a marker needs {diagonal_m * CM_PER_M:.0f} cm, corner to corner"
     width_cm = overlap.width_m * CM_PER_M
     if overlap.width_m >= diagonal_m:
-        return f"{both} overlap by {width_cm:.0f} cm or more: enough, {needed}", True
+        return f"{names} overlap by {width_cm:.0f} cm or more: enough, {needed}", True
     fault = (
         f"overlap by {width_cm:.0f} cm only" if overlap.width_m > 0 else f"leave a gap of {-width_cm:.0f} cm"
     )
     end = "one that crosses there is whole in neither picture"
-    where = f", at x {x_m:.2f}, y {y_m:.2f}" if placed else ""
-    return f"{both} {fault}{where}: {needed}; {end}", False
+    position = f", at x {x_m:.2f}, y {y_m:.2f}" if placed else ""
+    return f"{names} {fault}{position}: {needed}; {end}", False
 
 
 def alignment_json(lab: AlignedLab) -> dict[str, Any]:
@@ -178,7 +178,7 @@ def alignment_json(lab: AlignedLab) -> dict[str, Any]:
 
 def _camera_json(one: Alignment) -> dict[str, Any]:
     right_rad, bottom_rad = one.turns_rad
-    known = one.down is not None
+    is_known = one.down is not None
     return {
         "camera": one.camera,
         "places": len(one.lying),
@@ -189,8 +189,8 @@ def _camera_json(one: Alignment) -> dict[str, Any]:
         "level": one.level,
         "tilt_deg": _scaled(one.tilt_rad, math.degrees(1)),
         "tilt_sigma_deg": _scaled(one.sigma_rad, math.degrees(1)),
-        "look_further_right_deg": math.degrees(right_rad) if known else None,
-        "look_further_down_deg": math.degrees(bottom_rad) if known else None,
+        "look_further_right_deg": math.degrees(right_rad) if is_known else None,
+        "look_further_down_deg": math.degrees(bottom_rad) if is_known else None,
         "known_directions": one.axes,
         "height_m": one.height_m,
         "advice": advise(one),

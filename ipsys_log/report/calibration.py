@@ -44,8 +44,8 @@ def _draw_image(axes: Axes, found: Calibrated) -> None:
     """Draw every detected corner, with an arrow to its projection by the fitted intrinsics."""
     width, height = found.lens.width, found.lens.height
     lengths = np.linalg.norm(found.residuals_px, axis=1)
-    wanted = _ARROW * width / max(float(np.median(lengths)), 1e-9)
-    factor = max((f for f in _FACTORS if f <= wanted), default=1)
+    ideal = _ARROW * width / max(float(np.median(lengths)), 1e-9)
+    factor = max((f for f in _FACTORS if f <= ideal), default=1)
     top = float(np.quantile(lengths, 0.98))
     order = np.argsort(lengths, kind="stable")
     arrows = axes.quiver(

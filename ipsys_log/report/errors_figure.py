@@ -108,8 +108,8 @@ def draw_errors(
     axes.set_yticks(heights, [_name(row) for row in rows], fontsize=size)
     _name_models(axes, rows, heights, size, bar_in)
     _print_figures(axes, rows, heights, size)
-    where = "in space" if _in_space(accuracies) else "on the floor"
-    axes.set_title(f"Errors {where} on held-out places", loc="left", fontsize=10, pad=size + 12)
+    space = "in space" if _in_space(accuracies) else "on the floor"
+    axes.set_title(f"Errors {space} on held-out places", loc="left", fontsize=10, pad=size + 12)
     axes.annotate(
         _note(rows), (0, 0), (0, -38), xycoords="axes fraction", textcoords="offset points", fontsize=8,
         color="#505050", va="top",

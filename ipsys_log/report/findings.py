@@ -154,8 +154,8 @@ def gather_findings(session: Session, accuracies: Sequence[Accuracy]) -> Finding
     rig = rig_in_force(session, [accuracy.run for accuracy in evaluated])
     evaluations = [accuracy.evaluation for accuracy in evaluated if accuracy.evaluation]
     cameras = {row.camera for evaluation in evaluations for row in evaluation.cameras} - {POOLED}
-    named = [camera.name for camera in rig.cameras] if rig else []
-    ordered = [name for name in named if name in cameras]
+    rig_cameras = [camera.name for camera in rig.cameras] if rig else []
+    ordered = [name for name in rig_cameras if name in cameras]
     models = {accuracy.model: _model(session, accuracy.run) for accuracy in evaluated}
     return Findings(
         rig,

@@ -116,12 +116,12 @@ def _span(start: str, end: str) -> str:
 
 def _sources(records: Sequence[Run], names: Sequence[str]) -> list[Run]:
     """Return the records of some runs up to their evaluation, and the records of all their input runs."""
-    known: set[str] = set()
+    collected: set[str] = set()
     waiting = [*names]
     while waiting:
         name = waiting.pop()
-        if name not in known:
-            known.add(name)
+        if name not in collected:
+            collected.add(name)
             waiting += [source for record in records if record.run == name for source in record.input_runs]
     later = ("locate", "fuse")
-    return [record for record in records if record.run in known and record.stage not in later]
+    return [record for record in records if record.run in collected and record.stage not in later]

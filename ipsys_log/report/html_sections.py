@@ -51,7 +51,7 @@ def headline(findings: Findings) -> dict[str, Any]:
     row = overall(best, True) or overall(best, False)
     assert row is not None  # a model without any row was not evaluated
     errors, truth = findings.errors(row), overall(best, bool(best.rows(True)), _TRUTH)
-    told = [accuracy for accuracy in ranked if told_height(accuracy.model) and accuracy is not best]
+    height_models = [accuracy for accuracy in ranked if told_height(accuracy.model) and accuracy is not best]
     return {
         "model": label(best.model),
         "mean": format_cm(errors.mean_m, 1),
@@ -65,7 +65,9 @@ def headline(findings: Findings) -> dict[str, Any]:
         "floor": format_cm(row.error_2d.mean_m, 1),
         "p95": format_cm(errors.p95_m, 1),
         "truth": format_cm(findings.errors(truth).mean_m, 2) if truth else None,
-        "told": [(label(accuracy.model), _overall_mean(findings, accuracy)) for accuracy in told[:1]],
+        "told": [
+            (label(accuracy.model), _overall_mean(findings, accuracy)) for accuracy in height_models[:1]
+        ],
         "fitted": [(camera, len(points_m)) for camera, points_m in in_order(findings, findings.training_m())],
         "cameras": findings.cameras,
     }
@@ -235,16 +237,18 @@ def calibration(findings: Findings) -> list[dict[str, Any]]:
         schemes = {
             name: overall(accuracy, crossed) for name, crossed in (("crossed", True), ("held_out", False))
         }
-        known = {name: row for name, row in schemes.items() if row is not None and row.within_68 is not None}
-        if known:
+        known_rows = {
+            name: row for name, row in schemes.items() if row is not None and row.within_68 is not None
+        }
+        if known_rows:
             rows.append(
                 {
                     "model": label(accuracy.model),
                     **{
                         name: (_percent(row.within_68), _percent(row.within_95))
-                        for name, row in known.items()
+                        for name, row in known_rows.items()
                     },
-                    "verdict": _verdict(next(iter(known.values()))),
+                    "verdict": _verdict(next(iter(known_rows.values()))),
                 }
             )
     return rows

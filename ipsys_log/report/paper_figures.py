@@ -248,7 +248,7 @@ def write_plots(findings: Findings, folder: Path) -> list[str]:
     IpsysError
         No model was evaluated.
     """
-    files = {name: draw(findings) for name, (wanted, draw) in _FILES.items() if wanted(findings)}
+    files = {name: draw(findings) for name, (has_data, draw) in _FILES.items() if has_data(findings)}
     if not files:
         raise IpsysError(
             f"{folder}: nothing to draw: no model was evaluated, for no place is held out; measure some"

@@ -42,10 +42,10 @@ def draw_plan(found: PlannedFloor, path: Path) -> None:
     top_cm = float(np.nanquantile(plan.before_m, 0.98)) * CM_PER_M
     means = means_cm(plan.places[0].mean_before_m, plan.places[-1].mean_after_m)
     panels = zip((0.6, 6.9), (plan.before_m, plan.after_m), ("Now", after_title), means, strict=True)
-    for left_in, error_m, when, mean_cm in panels:
+    for left_in, error_m, heading, mean_cm in panels:
         axes = figure.add_axes((left_in / 14, 0.93 / 7, _SIDE_IN / 14, _SIDE_IN / 7))
         shades = _draw_floor(axes, found, error_m * CM_PER_M, top_cm)
-        axes.set_title(f"{when}: {mean_cm} cm", loc="left", fontsize=11)
+        axes.set_title(f"{heading}: {mean_cm} cm", loc="left", fontsize=11)
     box = figure.add_axes((12.7 / 14, 0.93 / 7, 0.18 / 14, _SIDE_IN / 7))
     figure.colorbar(shades, cax=box, extend="max", label="predicted error in x and y, in cm")
     title = f"Where to measure next: predicted mean error of the model {found.model} over the floor, "

@@ -25,8 +25,8 @@ _EDGE_MM = 10.0
 _FOOT_MM = 15.0
 RULER_MM = 100.0
 _RULER_Y_MM = _EDGE_MM + 5.0
-# Height of the caption below a marker (an arrow to its front, and three lines of text), gap between two prints
-# for the cutting marks, and smallest width of the paper of a marker.
+# Height of the caption below a marker (an arrow to its front, and three lines of text). Gap between two
+# prints, for the cutting marks. Smallest width of the paper of a marker.
 _CAPTION_MM, _GAP_MM, _NARROWEST_MM = 8.0, 6.0, 34.0
 _MARK_MM, _MARK_PT = 2.0, 0.3
 _GREY = "0.35"

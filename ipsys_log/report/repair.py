@@ -48,14 +48,14 @@ def _about_the_loss(report: RepairReport) -> Iterator[str | Table]:
     if not (report.bytes_lost or report.gone):
         return
     if report.gone and report.uncounted:
-        named = "these messages are gone, and an unknown number of others:"
+        ending = "these messages are gone, and an unknown number of others:"
     elif report.gone:
-        named = "these messages are gone:"
+        ending = "these messages are gone:"
     elif report.uncounted:
-        named = "the number of messages in them is not known"
+        ending = "the number of messages in them is not known"
     else:
-        named = "no message was in them"
-    yield f"{format_bytes(report.bytes_lost)} cannot be read; {named}"
+        ending = "no message was in them"
+    yield f"{format_bytes(report.bytes_lost)} cannot be read; {ending}"
     if report.gone:
         yield _lost_table(report)
 

@@ -64,11 +64,15 @@ def _best_lines(accuracies: Sequence[Accuracy], best: Accuracy) -> Iterator[str 
     if truth is not None:
         errors = judged(truth, space)
         yield f"Against the ground truth: {_figures(errors, best.rmse_m(truth, errors))}."
-    told = [accuracy for accuracy in rank(accuracies) if told_height(accuracy.model)]
-    if told and told[0] is not best and (told_row := overall(told[0], True) or overall(told[0], False)):
+    height_models = [accuracy for accuracy in rank(accuracies) if told_height(accuracy.model)]
+    if (
+        height_models
+        and height_models[0] is not best
+        and (told_row := overall(height_models[0], True) or overall(height_models[0], False))
+    ):
         errors = judged(told_row, space)
-        figures = _figures(errors, told[0].rmse_m(told_row, errors))
-        yield f"With known marker heights: {told[0].model}, {figures} (2D)."
+        figures = _figures(errors, height_models[0].rmse_m(told_row, errors))
+        yield f"With known marker heights: {height_models[0].model}, {figures} (2D)."
 
 
 def _scheme(row: CameraEvaluation) -> str:
@@ -108,8 +112,8 @@ def _outlier_lines(accuracies: Sequence[Accuracy]) -> Iterator[str | Text]:
         name = name_cell(suspect.measurement).plain
         yield Text(wrap_text(f"{name}, {_length(suspect.residual_m)} cm off: {text}.", indent="  "))
     if rest := suspects[_EXPLAINED:]:
-        named = (f"{name_cell(s.measurement).plain} ({_length(s.residual_m)} cm)" for s, _ in rest)
-        yield Text(wrap_text(f"{', '.join(named)}.", indent="  "))
+        texts = (f"{name_cell(s.measurement).plain} ({_length(s.residual_m)} cm)" for s, _ in rest)
+        yield Text(wrap_text(f"{', '.join(texts)}.", indent="  "))
 
 
 def _length(residual_m: Any) -> str:

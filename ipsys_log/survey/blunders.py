@@ -109,10 +109,10 @@ def doubt_model(
         return []
     predicted_m = np.mean([prediction.world_m for prediction in predictions], axis=0)
     off_m = float(np.linalg.norm(predicted_m - fixed.world_m))
-    known = [prediction for prediction in predictions if prediction.inside is not False]
+    inside = [prediction for prediction in predictions if prediction.inside is not False]
     sigma_m = max((prediction.sigma_m or 0.0 for prediction in predictions), default=0.0)
     bound_m = max(
-        _ASTRAY_M if known else _ASTRAY_OUTSIDE_M,
+        _ASTRAY_M if inside else _ASTRAY_OUTSIDE_M,
         _SIGMAS * float(np.hypot(sigma_m, floor_sigma_m(fixed) or 0.0)),
     )
     if off_m <= bound_m:

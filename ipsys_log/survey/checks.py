@@ -200,8 +200,8 @@ def _identity_faults(entry: Entry, sight: Sight | None, history: Sequence[Measur
 def _here_before(read: Measurement, sight: Sight | None, history: Sequence[Measurement]) -> list[Measurement]:
     """Return the earlier measurements of this marker at this point: in the same interval, or seen there."""
     seen = sight.measured_as if sight else ()
-    own = [m for m in active_measurements(history) if m.marker_id == read.marker_id]
-    return [m for m in own if _overlap(m, read) or m.id in seen]
+    same_marker = [m for m in active_measurements(history) if m.marker_id == read.marker_id]
+    return [m for m in same_marker if _overlap(m, read) or m.id in seen]
 
 
 def _twin_faults(read: Measurement, earlier: Sequence[Measurement]) -> list[Fault]:

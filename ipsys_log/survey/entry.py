@@ -138,8 +138,8 @@ def _marker(text: str, rig: Rig, faults: list[Fault]) -> int | None:
         faults.append(Fault("marker", message))
         return None
     if not rig.knows(int(text)):
-        known = ", ".join(str(marker.id) for marker in rig.markers)
-        faults.append(Fault("marker", f"marker {text} is not in the rig (it has {known})"))
+        ids = ", ".join(str(marker.id) for marker in rig.markers)
+        faults.append(Fault("marker", f"marker {text} is not in the rig (it has {ids})"))
         return None
     return int(text)
 

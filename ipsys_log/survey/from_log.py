@@ -150,13 +150,13 @@ class FinishedLog:
 
     def _of_others(self) -> list[Message]:
         """Return the measurements that other processes have added since the last look at the log."""
-        known = {(message.payload.id, message.payload.withdraws) for message in self._history}
+        known_ids = {(message.payload.id, message.payload.withdraws) for message in self._history}
         with Session([self.path]) as session:
             messages = session.messages(session.topics(Measurement))
             return [
                 message
                 for message in messages
-                if (message.payload.id, message.payload.withdraws) not in known
+                if (message.payload.id, message.payload.withdraws) not in known_ids
             ]
 
     def _view(self, camera: str, here: Stop) -> View:

@@ -80,7 +80,7 @@ class LiveScene:
             return
         payload, camera = message.payload, message.camera
         with self._lock:
-            # Of a video, only keyframes are shown: they can be decoded without other frames.
+            # In a video, only keyframes are shown: they can be decoded without other frames.
             if isinstance(payload, CompressedImage) or (
                 isinstance(payload, CompressedVideo) and is_keyframe(payload)
             ):

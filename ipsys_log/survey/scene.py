@@ -244,7 +244,7 @@ _MODEL = "poly"
 
 
 def fit_neighbours(seen: Sequence[tuple[Measurement, Sight]], rig: Rig) -> Model | None:
-    """Fit a model to measurements, without those that contradict the rest.
+    """Fit a model to measurements, without the measurements that contradict the rest.
 
     Parameters
     ----------

@@ -108,9 +108,9 @@ def refuse_rows(
         There is at least one such row. The text names each row by its line.
     """
     if faults or doubts:
-        named = "".join(f"\n  line {line}: {text}" for line, text in sorted([*faults, *doubts]))
+        lines = "".join(f"\n  line {line}: {text}" for line, text in sorted([*faults, *doubts]))
         insist = "" if faults else ", or write it as it is with --force"
-        raise IpsysError(f"{path}: nothing was written; correct the sheet{insist}:{named}")
+        raise IpsysError(f"{path}: nothing was written; correct the sheet{insist}:{lines}")
 
 
 def name_columns(text: str, rig: Rig) -> str:
@@ -204,17 +204,17 @@ def _read_lines(path: Path) -> list[str]:
 
 def _check_columns(columns: Sequence[str], rig: Rig, path: Path) -> None:
     distances = [f"d_{point.name}_cm" for point in rig.reference_points]
-    known = [*_PLAIN[:2], *distances, *_PLAIN[2:]]
+    valid = [*_PLAIN[:2], *distances, *_PLAIN[2:]]
     for name in columns:
-        if name not in known:
-            raise IpsysError(f"{path}: line 1: unknown column {name!r}; known are {', '.join(known)}")
+        if name not in valid:
+            raise IpsysError(f"{path}: line 1: unknown column {name!r}; known are {', '.join(valid)}")
         if columns.count(name) > 1:
             raise IpsysError(f"{path}: line 1: two columns have the name {name!r}")
     missing = [name for name in _NEEDED if name not in columns]
     if len(set(distances) & set(columns)) < 2:
         missing += distances[:2]
     if missing:
-        raise IpsysError(f"{path}: line 1: the column {missing[0]} is missing; known are {', '.join(known)}")
+        raise IpsysError(f"{path}: line 1: the column {missing[0]} is missing; known are {', '.join(valid)}")
 
 
 def _row(line: int, cell: dict[str, str], start_ns: int) -> SheetRow:

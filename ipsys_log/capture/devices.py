@@ -162,7 +162,7 @@ def check_devices(cameras: Iterable[RigCamera]) -> None:
 
 
 def check_sources(cameras: Iterable[RigCamera]) -> None:
-    """Check that each camera has a source that can be opened, as far as its text shows.
+    """Check the source of each camera without opening it: its text, its file or its device.
 
     Raises
     ------

@@ -57,7 +57,7 @@ class Stamps:
         """Return the capture time of a packet's frame, in ns of UTC; None if it is not known."""
         time_ns, stamped, self._stamped = read_stamp(packet), self._stamped, packet.has_sidedata("prft")
         if not stamped:
-            # FFmpeg copies the first stamp to the frame before it. There, the stamp is wrong.
+            # FFmpeg copies the first stamp to the frame before it, so the stamp of that frame is wrong.
             time_ns = None
         if self._trusted is None:
             self._judge(time_ns)

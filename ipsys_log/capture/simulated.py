@@ -185,7 +185,7 @@ def _parse_board(camera: RigCamera, text: str) -> Board:
 def show_board(camera: RigCamera, board: str) -> RigCamera:
     """Return a simulated camera with a board in front of it.
 
-    A camera whose source has a board already is returned unchanged, and so is any other camera.
+    A camera that is not simulated, or whose source has a board already, is returned unchanged.
 
     Examples
     --------

@@ -234,7 +234,7 @@ def _stop(device: int) -> None:
     try:
         v4l2.call(device, v4l2.STREAMOFF, v4l2.Int(v4l2.VIDEO_CAPTURE))
     except OSError:
-        return  # a camera that has gone has stopped
+        return  # a disconnected camera has stopped already
 
 
 class _Capture(NamedTuple):

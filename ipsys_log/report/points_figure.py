@@ -69,7 +69,7 @@ def _draw_space(axes: Any, findings: Findings, training_m: Array, test_m: Array)
 
 
 def hull_m(points_m: Array) -> Array | None:
-    """Return the corners (k, 2) of the convex hull of points (n, 2 or 3) on the floor, None if flat."""
+    """Return the corners (k, 2) of the convex hull of points (n, 2 or 3) on the floor, or None."""
     try:
         return points_m[:, :2][ConvexHull(points_m[:, :2]).vertices]
     except (QhullError, ValueError):

@@ -149,7 +149,7 @@ class FinishedLog:
         self._history += added
 
     def _of_others(self) -> list[Message]:
-        """Return the measurements that other processes have added since the last look at the log."""
+        """Return the measurements that other processes have added since the last read of the log."""
         known_ids = {(message.payload.id, message.payload.withdraws) for message in self._history}
         with Session([self.path]) as session:
             messages = session.messages(session.topics(Measurement))

@@ -1,4 +1,4 @@
-"""The thread of one camera: takes what it sends, for as long as it does, and again when it is back."""
+"""The thread of one camera: it reads the frames, and opens the camera again after a disconnection."""
 
 from __future__ import annotations
 
@@ -17,28 +17,28 @@ from ipsys_log.units import NS_PER_S, format_time
 
 __all__ = ["Arrival", "Attendant", "CameraState", "Shared"]
 
-# A camera that opens and then sends nothing is not there.
+# Longest wait for the first frame of a camera.
 _FIRST_FRAME_S = 10.0
-# The simulator draws its frames first, however busy the machine is.
+# The simulator renders its images first, and a busy machine takes long for them.
 _DRAW_S = 120.0
 _RETRY_S, _LONGEST_RETRY_S = 0.5, 8.0
 _TURN_S = 0.1
-# So long a frame without a stamp may wait for the recording to begin: it would get a false time.
+# Longest wait of a frame without a stamp for the start of the recording. A longer wait gives it a wrong time.
 _EARLY_S = 0.01
-# Frames of a video, 20 s or so, among which each camera that is set up well has a keyframe.
+# A well configured camera sends a keyframe within this number of video frames (about 20 s).
 _KEYLESS = 600
-# A camera that loses frames all the time is not named more often.
+# Shortest time between two reports of missed frames of a camera.
 _NAMED_EVERY_NS = NS_PER_S
 
 
 @dataclass(slots=True)
 class CameraState:
-    """What has come of a camera so far.
+    """The counts and the properties of the frames of a camera so far.
 
-    ``dropped`` frames came and never reached the log, ``missed`` ones were lost before they came, as far as
-    the camera's driver counts. ``format`` of its frames is such as jpeg or h264, ``size_px`` their width and
-    height, as soon as one tells, and ``delay_s`` the time from exposure to arrival of the last one, where it
-    has a capture stamp.
+    ``dropped`` frames arrived, but the log does not hold them. ``missed`` frames were lost before they
+    arrived, by the count of the camera's driver. ``format`` is the format of the frames, such as jpeg or
+    h264. ``size_px`` is their width and height, as soon as a frame gives it. ``delay_s`` is the time from
+    exposure to arrival of the last frame, if it has a capture stamp.
     """
 
     frames: int = 0
@@ -53,7 +53,7 @@ class CameraState:
 
 
 class Arrival(NamedTuple):
-    """A message but for its log time, and when it came."""
+    """A message without its log time, and the time of its arrival."""
 
     received_ns: int
     topic: str
@@ -64,8 +64,11 @@ class Arrival(NamedTuple):
 
 @dataclass(frozen=True, slots=True)
 class Shared:
-    """What the threads of all cameras have in common: ``put`` takes an arrival, or says that there is no room
-    for a frame; nothing but the first frames is taken before ``started``, and nothing after ``stopped``."""
+    """The objects that the threads of all cameras share.
+
+    ``put`` takes an arrival; it returns False if there is no room for a frame. Before ``started``, a thread
+    takes only the first frame. After ``stopped``, it takes nothing.
+    """
 
     open_source: Open
     clock: Clock
@@ -77,12 +80,12 @@ class Shared:
 
 
 class Attendant:
-    """Attends to a camera, in a thread of its own.
+    """The reader of one camera, with its thread.
 
     Attributes
     ----------
-    state : what has come so far.
-    fault : what the thread ended with, if it was not the end of the source.
+    state : counts and properties of the frames so far.
+    fault : the error that ended the thread; None if it ended with the source.
     """
 
     def __init__(self, camera: RigCamera, shared: Shared) -> None:
@@ -99,12 +102,12 @@ class Attendant:
         self.thread = threading.Thread(target=self._attend, name=camera.name, daemon=True)
 
     def wait(self) -> None:
-        """Until the first frame has come.
+        """Wait for the first frame.
 
         Raises
         ------
         SourceError
-            Where the camera cannot be opened, or sends nothing.
+            The camera cannot be opened, or sends nothing.
         """
         self._opened.wait()
         simulated = str(self._camera.source).startswith("sim:")
@@ -129,10 +132,10 @@ class Attendant:
                     raise lost
                 retry_s = _RETRY_S if self.state.frames > before else min(2 * retry_s, _LONGEST_RETRY_S)
                 stopped.wait(retry_s)
-        except BaseException as fault:  # whoever opens the cameras, or takes the messages, is to see it
+        except BaseException as fault:  # raised again in the thread that opens or iterates the cameras
             self.fault = fault
             if self._begun.is_set():
-                # The others may go on for hours; where it came from is shown when they have ended.
+                # The other cameras may run for hours. The traceback is shown only after they have ended.
                 text = f"camera {self._camera.name}: the program failed ({fault!r}); nothing more comes of it"
                 self._say("camera_failed", text)
         finally:
@@ -142,7 +145,7 @@ class Attendant:
             self._begun.set()
 
     def _take_all(self) -> SourceError | None:
-        """Frames until the source has ended (None), or the camera has gone."""
+        """Take frames until the source ends (return None) or the camera disconnects (return the error)."""
         shared = self._shared
         try:
             with shared.open_source(self._camera, shared.clock, self._say_setting) as frames:
@@ -187,7 +190,8 @@ class Attendant:
             self._name_caught_up()
         self._name_lost()
         self._begun.set()
-        # What came before the slowest camera would only be late; one without a stamp is not known to be.
+        # A frame with a stamp waits until the slowest camera has started: it is only delayed. A frame
+        # without a stamp must not wait: its arrival is its time.
         while (
             frame.time_ns is not None
             and not self._shared.started.wait(_TURN_S)
@@ -196,10 +200,11 @@ class Attendant:
             pass
 
     def _is_early(self, frame: Frame) -> bool:
-        """Return whether a frame came before the recording began, but for the first; or needs one that did.
+        """Return whether a frame arrived before the recording began, or depends on a frame that did.
 
-        Without a stamp it can only be dated by its arrival, so it must not wait: until then such frames are
-        thrown away. Files and the simulator give stamps, and wait.
+        The caller discards such frames. The first frame is never early. The time of a frame without a stamp
+        is its arrival, so the frame must not wait until the recording begins. Files and the simulator give
+        stamps, and wait.
         """
         if not self._begun.is_set():
             return False
@@ -210,7 +215,7 @@ class Attendant:
         return self._broken
 
     def _count_since_key(self, frame: Frame) -> None:
-        """Say where a video has no keyframes: it cannot be read on from a frame that was skipped."""
+        """Report a video without keyframes: after a dropped frame, decoding cannot start again."""
         self._since_key = 0 if can_begin(frame) else self._since_key + 1
         if self._since_key == _KEYLESS:
             text = (
@@ -220,7 +225,7 @@ class Attendant:
             self._say_once("no_keyframes", text)
 
     def _check_format(self, frame: Frame) -> None:
-        """See that a frame is of the format of those before it: a channel of a log holds only one."""
+        """Check that a frame has the format of the earlier frames: a channel of a log holds one format."""
         before, name = self.state.format, self._camera.name
         if before in (None, frame.format):
             return
@@ -233,7 +238,7 @@ class Attendant:
         raise SourceError(text)
 
     def _note_size(self, frame: Frame) -> None:
-        """Keep the size of the pictures, and say where it changes; of a video only the first is known."""
+        """Store the size of the images, and report a change; of a video, only the first size is read."""
         before = self.state.size_px
         if before is not None and frame.format != "jpeg":
             return
@@ -242,12 +247,12 @@ class Attendant:
             return
         self.state.size_px = size_px
         if before is not None:
-            now, then = (f"{width} x {height} px" for width, height in (size_px, before))
-            text = f"camera {self._camera.name}: its pictures are {now} now, and were {then}; calibrations "
+            new, old = (f"{width} x {height} px" for width, height in (size_px, before))
+            text = f"camera {self._camera.name}: its pictures are {new} now, and were {old}; calibrations "
             self._say("camera_size", f"{text}are for one size: set it back")
 
     def _name_lost(self, now: bool = False) -> None:
-        """Frames that are not in the log, since they were last named."""
+        """Report the frames lost since the last report."""
         state, name = self.state, self._camera.name
         if dropped := state.dropped - self._dropped_before:
             self._dropped_before = state.dropped
@@ -259,7 +264,7 @@ class Attendant:
             self._say("frames_missed", f"{missed} frames of camera {name} were lost before they came")
 
     def _name_late(self, now_ns: int) -> None:
-        """Make an event before the first late frame without a stamp."""
+        """Write an event before the first late frame without a stamp."""
         stall = self._late.take(now_ns)
         if stall is None:
             return
@@ -271,7 +276,7 @@ class Attendant:
         self._say(STAMP_UNRELIABLE, text, stall.start_ns)
 
     def _name_caught_up(self) -> None:
-        """Make an event after the last late frame, with the range of the wrong times."""
+        """Write an event after the last late frame, with the range of the wrong times."""
         start_ns, end_ns = self._late.since_ns, self._late.last_ns
         if start_ns is None or end_ns is None or not self._late.caught_up():
             return
@@ -282,7 +287,7 @@ class Attendant:
         self._say(STAMP_UNRELIABLE, text, start_ns, end_ns)
 
     def _say_setting(self, text: str) -> None:
-        """What a camera refused, once, however often it is opened."""
+        """Report a setting that the camera refused, once, also if the camera is opened several times."""
         self._say_once("camera_setting", text)
 
     def _say_once(self, kind: str, text: str) -> None:
@@ -291,7 +296,7 @@ class Attendant:
             self._say(kind, text)
 
     def _say(self, kind: str, text: str, start_ns: int | None = None, end_ns: int | None = None) -> None:
-        """Make an event of this camera, and print it at once."""
+        """Put an event of this camera into the stream, and show its text at once."""
         now_ns = self._shared.clock.now_ns()
         event = Event(now_ns, kind, text, self._camera.name, None, start_ns, end_ns)
         self._shared.put(Arrival(now_ns, EVENTS_TOPIC, now_ns, event))

@@ -1,4 +1,4 @@
-"""The openers of cameras by the ``source`` in the rig: USB, network, files, simulation."""
+"""The functions that open a camera by its ``source`` in the rig: USB, network, files, simulation."""
 
 from __future__ import annotations
 
@@ -35,12 +35,12 @@ _QUALITY = 92
 
 @contextmanager
 def open_opencv(camera: RigCamera, clock: Clock, say: Say) -> Iterator[Iterator[Frame | None]]:  # noqa: ARG001
-    """The frames of camera ``usb:0``, ``usb:1`` and so on, decoded by OpenCV and encoded once as JPEG.
+    """Open camera ``usb:0``, ``usb:1`` and so on; OpenCV decodes the frames, and they are encoded as JPEG.
 
     Raises
     ------
     SourceError
-        Where there is no such camera; the iterator raises it where the camera has gone.
+        The camera does not exist. The iterator raises it when the camera is disconnected.
     """
     number = (camera.source or "").partition(":")[2]
     if not number.isdecimal():
@@ -60,7 +60,7 @@ def open_opencv(camera: RigCamera, clock: Clock, say: Say) -> Iterator[Iterator[
 
 
 def _set(device: cv2.VideoCapture, camera: RigCamera) -> Given:
-    """Ask for what the rig wants, and read back what is."""
+    """Set a camera to the settings of the rig, and return its actual settings."""
     device.set(cv2.CAP_PROP_FOURCC, cv2.VideoWriter.fourcc(*"MJPG"))
     for key, value in (
         (cv2.CAP_PROP_AUTOFOCUS, camera.focus),
@@ -68,9 +68,9 @@ def _set(device: cv2.VideoCapture, camera: RigCamera) -> Given:
     ):
         if value is not None:
             device.set(key, 0.0)
-    # Drivers take an exposure as a power of two, of s.
+    # The drivers take log2 of the exposure in s.
     exposure = None if camera.exposure_s is None else float(np.log2(camera.exposure_s))
-    asked = {
+    requested = {
         cv2.CAP_PROP_FRAME_WIDTH: camera.width,
         cv2.CAP_PROP_FRAME_HEIGHT: camera.height,
         cv2.CAP_PROP_FPS: camera.rate_hz,
@@ -78,24 +78,24 @@ def _set(device: cv2.VideoCapture, camera: RigCamera) -> Given:
         cv2.CAP_PROP_FOCUS: camera.focus,
         cv2.CAP_PROP_GAIN: camera.gain,
     }
-    taken = {key: value is not None and device.set(key, float(value)) for key, value in asked.items()}
-    has = {key: device.get(key) for key in asked}
+    accepted = {key: value is not None and device.set(key, float(value)) for key, value in requested.items()}
+    actual = {key: device.get(key) for key in requested}
     return Given(
-        int(has[cv2.CAP_PROP_FRAME_WIDTH]),
-        int(has[cv2.CAP_PROP_FRAME_HEIGHT]),
-        has[cv2.CAP_PROP_FPS] or None,
-        2.0 ** has[cv2.CAP_PROP_EXPOSURE] if taken[cv2.CAP_PROP_EXPOSURE] else None,
-        has[cv2.CAP_PROP_FOCUS] if taken[cv2.CAP_PROP_FOCUS] else None,
-        has[cv2.CAP_PROP_GAIN] if taken[cv2.CAP_PROP_GAIN] else None,
+        int(actual[cv2.CAP_PROP_FRAME_WIDTH]),
+        int(actual[cv2.CAP_PROP_FRAME_HEIGHT]),
+        actual[cv2.CAP_PROP_FPS] or None,
+        2.0 ** actual[cv2.CAP_PROP_EXPOSURE] if accepted[cv2.CAP_PROP_EXPOSURE] else None,
+        actual[cv2.CAP_PROP_FOCUS] if accepted[cv2.CAP_PROP_FOCUS] else None,
+        actual[cv2.CAP_PROP_GAIN] if accepted[cv2.CAP_PROP_GAIN] else None,
     )
 
 
 def _frames(device: cv2.VideoCapture, where: str) -> Iterator[Frame | None]:
     while True:
-        came, picture = device.read()
-        if not came:
+        success, image = device.read()
+        if not success:
             raise SourceError(f"{where}: sends no frames; plug it in anew, or into another USB port")
-        data = simplejpeg.encode_jpeg(np.ascontiguousarray(picture), quality=_QUALITY, colorspace="BGR")
+        data = simplejpeg.encode_jpeg(np.ascontiguousarray(image), quality=_QUALITY, colorspace="BGR")
         yield Frame(data, "jpeg", None)
 
 
@@ -103,23 +103,23 @@ _SYSTEM: str = sys.platform
 
 
 def open_usb(camera: RigCamera, clock: Clock, say: Say) -> AbstractContextManager[Iterator[Frame | None]]:
-    """The frames of a camera on USB, as :data:`~ipsys_log.capture.frames.Open` says.
+    """Open a camera on USB; an :data:`~ipsys_log.capture.frames.Open`.
 
-    On Linux they are the camera's own JPEG bytes, with the driver's stamp. On Windows and macOS OpenCV
-    hands over pictures, which are encoded once, without stamps.
+    On Linux, the frames are the camera's own JPEG bytes, with the driver's stamp. On Windows and macOS,
+    OpenCV gives decoded images. They are encoded once, and have no stamps.
 
     Parameters
     ----------
     camera : its ``source`` is ``usb:`` and a device (``usb:/dev/video0``) or its number (``usb:0``).
-    clock : turns the driver's stamps into UTC.
-    say : told what the camera refused.
+    clock : converts the driver's stamps to UTC.
+    say : called with each setting that the camera refused.
 
     Raises
     ------
     SourceError
-        Where there is no such camera, or it is in use, or may not be opened.
+        The camera does not exist, is in use, or access is denied.
     """
-    # By a name, or the type checker would pass over what is not for its own system.
+    # With sys.platform itself, the type checker would skip the code of the other systems.
     if _SYSTEM == "linux":
         from ipsys_log.capture.v4l2_camera import open_v4l2
 
@@ -128,7 +128,7 @@ def open_usb(camera: RigCamera, clock: Clock, say: Say) -> AbstractContextManage
     return open_opencv(camera, clock, say)
 
 
-# By what stands before the first colon of a source.
+# The functions by the text before the first colon of a source.
 OPENERS: dict[str, Open] = {
     "http": open_network,
     "https": open_network,
@@ -143,18 +143,18 @@ OPENERS: dict[str, Open] = {
 
 
 def check_devices(cameras: Iterable[RigCamera]) -> None:
-    """See that no two cameras are one device, by whatever names.
+    """Check that no two cameras are the same device, also under different names of the device.
 
     Raises
     ------
     IpsysError
-        Naming both.
+        Two cameras are the same device. The text names both.
     """
-    known: dict[Path, str] = {}
+    names: dict[Path, str] = {}
     for camera in cameras:
         if camera.source and camera.source.startswith("usb:"):
             device = Path(device_of(camera.source)).resolve()
-            other = known.setdefault(device, camera.name)
+            other = names.setdefault(device, camera.name)
             if other != camera.name:
                 raise IpsysError(
                     f"cameras {other} and {camera.name} are one device, {device}; give each its own"
@@ -162,7 +162,7 @@ def check_devices(cameras: Iterable[RigCamera]) -> None:
 
 
 def check_sources(cameras: Iterable[RigCamera]) -> None:
-    """Check that each camera has a source that can be opened, as far as its text shows.
+    """Check the source of each camera without opening it: its text, its file or its device.
 
     Raises
     ------
@@ -185,7 +185,7 @@ def check_sources(cameras: Iterable[RigCamera]) -> None:
 
 
 def usb_advice(rig: Rig) -> list[str]:
-    """What to change where USB does not carry all the cameras of a rig at once (Linux; elsewhere nothing)."""
+    """Return advice if a USB bus cannot carry all cameras of a rig at once (Linux only; elsewhere empty)."""
     if sys.platform != "linux":
         return []
     from ipsys_log.capture.usb_bus import find_cameras
@@ -194,12 +194,12 @@ def usb_advice(rig: Rig) -> list[str]:
 
 
 def open_source(camera: RigCamera, clock: Clock, say: Say) -> AbstractContextManager[Iterator[Frame | None]]:
-    """Open a camera, whatever it is attached by; an :data:`~ipsys_log.capture.frames.Open` itself.
+    """Open a camera of any kind; an :data:`~ipsys_log.capture.frames.Open`.
 
     Raises
     ------
     IpsysError
-        Where the rig gives no source, or one that nothing here opens.
+        The rig gives no source for the camera, or a source of an unknown kind.
     """
     return _opener(camera)(camera, clock, say)
 
@@ -219,6 +219,6 @@ def _opener(camera: RigCamera) -> Open:
     if opener is None:
         if shown.startswith("/dev/"):
             raise IpsysError(f'camera {camera.name}: source {shown!r}: write it as "usb:{shown}"')
-        known = ", ".join(f"{scheme}:" for scheme in OPENERS)
-        raise IpsysError(f"camera {camera.name}: source {shown!r} is none of {known}")
+        schemes = ", ".join(f"{scheme}:" for scheme in OPENERS)
+        raise IpsysError(f"camera {camera.name}: source {shown!r} is none of {schemes}")
     return opener

@@ -32,12 +32,12 @@ __all__ = [
     "what_fitted",
 ]
 
-# Data lost in a power cut, plus the second that waits to be written and the duration of a sync.
+# A power cut loses the data of this time, of the second that waits to be written, and of a sync.
 SYNC_EVERY_S = 2.0
 # After an interrupt, a hanging disk delays the end by at most this time.
 _LAST_S = 1.0
 
-# Called when the data written before are on the disk, or with the error of the disk.
+# The function is called with None when the earlier data are on the disk, or with the error of the disk.
 Confirm = Callable[[OSError | None], None]
 
 
@@ -49,11 +49,11 @@ class Syncer:
     Parameters
     ----------
     sync : syncs the data written before the call.
-    every_s : time from the end of a sync to the begin of the next.
+    every_s : time from the end of a sync to the start of the next sync.
 
     Attributes
     ----------
-    fault : the error of the first failed sync: data written before it may be lost.
+    fault : the error of the first failed sync; data written before this sync may be lost.
     """
 
     def __init__(self, sync: Callable[[], None], every_s: float = SYNC_EVERY_S) -> None:
@@ -77,7 +77,7 @@ class Syncer:
         self._thread.join(_LAST_S if isinstance(error, KeyboardInterrupt) else None)
 
     def soon(self, confirm: Confirm) -> None:
-        """Sync at once, or after the running sync, and ``confirm`` it from the thread."""
+        """Request a sync, at once or after the running sync; the thread then calls ``confirm``."""
         with self._changed:
             self._asked.append(confirm)
             self._changed.notify()
@@ -86,8 +86,8 @@ class Syncer:
         while True:
             with self._changed:
                 self._changed.wait_for(lambda: self._asked or self._ended, self._every_s)
-                asked, self._asked = self._asked, []
-                if self._ended and not asked:
+                requests, self._asked = self._asked, []
+                if self._ended and not requests:
                     return
             fault: OSError | None = None
             try:
@@ -95,12 +95,13 @@ class Syncer:
             except OSError as error:
                 fault = error
                 self.fault = self.fault or error
-            for confirm in asked:
+            for confirm in requests:
                 confirm(fault)
 
 
-# Set aside on the disk, so that a log can be finished when the disk is full: what waits is written and looked
-# at, and the table of contents, which has some MB after some hours, is written twice. On a small disk half.
+# Disk space reserved to finish a log when the disk is full. The end of a log needs it for the waiting
+# messages, for their results, and for the table of contents, which is written twice. The table has some
+# MB after some hours. On a small disk, half of the free space is reserved.
 _RESERVE_BYTES = 64 << 20
 
 
@@ -112,13 +113,13 @@ def reserved_bytes(free_bytes: int) -> int:
 @contextmanager
 def reserve(path: Path) -> Iterator[Callable[[], None]]:
     """Reserve disk space in an unnamed file; call the yielded function to release it."""
-    with ExitStack() as held:
-        with suppress(OSError):  # a file system that cannot, or a disk that is full already
+    with ExitStack() as resources:
+        with suppress(OSError):  # the file system does not support it, or the disk is full already
             if hasattr(os, "O_TMPFILE"):
                 fd = os.open(path.parent, os.O_TMPFILE | os.O_RDWR)
-                held.callback(os.close, fd)
+                resources.callback(os.close, fd)
                 os.posix_fallocate(fd, 0, reserved_bytes(shutil.disk_usage(path.parent).free))
-        yield held.close
+        yield resources.close
 
 
 def what_fitted(path: Path, error: WriteError) -> str:
@@ -128,12 +129,14 @@ def what_fitted(path: Path, error: WriteError) -> str:
             count, seconds = log.message_count, ((log.end_ns or 0) - (log.start_ns or 0)) / NS_PER_S
     except LogError:
         return str(error)
-    what = "the disk is full" if is_full(error.cause) else disk_fault(error.cause)
-    then = "Free some space, or record to another disk" if is_full(error.cause) else "Record to another disk"
+    cause = "the disk is full" if is_full(error.cause) else disk_fault(error.cause)
+    remedy = (
+        "Free some space, or record to another disk" if is_full(error.cause) else "Record to another disk"
+    )
     size = format_bytes(path.stat().st_size)
     return (
-        f"{path}: {what}; recording has stopped, and the log is complete up to then: "
-        f"{count} messages, {seconds:.1f} s, {size}. {then}"
+        f"{path}: {cause}; recording has stopped, and the log is complete up to then: "
+        f"{count} messages, {seconds:.1f} s, {size}. {remedy}"
     )
 
 
@@ -150,12 +153,13 @@ def disk_fault(fault: OSError) -> str:
     return f"the disk has failed ({fault.strerror})"
 
 
-# Warn of a disk that lasts no longer.
+# The recorder warns if the disk is full before this time.
 SHORT_S = 600.0
-# From this rate on, advise how to make the recording smaller.
+# From this rate on, the recorder gives advice to make the recording smaller.
 _LARGE_BYTES_PER_S = 500e6 / 60
 _USUAL_RATE_HZ = 30.0
-# H.264 of cameras takes some 6 Mbit/s at 1920 x 1080 and 30 frames/s. A first frame tells little of it.
+# H.264 of a camera takes about 6 Mbit/s at 1920 x 1080 and 30 frames/s. The first frame, a keyframe, is
+# much larger than the mean.
 _VIDEO_BYTES_PER_PX = 0.0125
 
 
@@ -165,9 +169,9 @@ class DiskRoom:
 
     Attributes
     ----------
-    folder : of the recording.
+    folder : folder of the recording.
     free_bytes : space for the recording.
-    bytes_per_s : of all cameras; 0 if it is not known.
+    bytes_per_s : data rate of all cameras; 0 if it is not known.
     """
 
     folder: Path
@@ -176,7 +180,7 @@ class DiskRoom:
 
     @property
     def lasts_s(self) -> float | None:
-        """Seconds until the disk is full; None if the rate is not known."""
+        """The time until the disk is full, in s; None if the rate is not known."""
         return self.free_bytes / self.bytes_per_s if self.bytes_per_s > 0 else None
 
     def is_short(self, seconds: float | None = None) -> bool:
@@ -223,7 +227,7 @@ def expected_bytes_per_s(cameras: Iterable[RigCamera], states: Mapping[str, Came
     Parameters
     ----------
     cameras : a camera without a rate is assumed to send 30 frames/s.
-    states : of the cameras, by name, once each has sent a frame.
+    states : states of the cameras by name, after each camera has sent a frame.
 
     Examples
     --------

@@ -15,12 +15,15 @@ __all__ = ["Clock", "Frame", "Given", "Open", "Say", "SourceError", "device_of",
 
 
 class SourceError(IpsysError):
-    """A camera cannot be opened, or has gone; it may come back."""
+    """An error of a camera that cannot be opened, or that is disconnected; the camera may come back."""
 
 
 class Frame(NamedTuple):
-    """A frame as the camera sent it: ``format`` is jpeg, png, h264 or h265; ``time_ns`` is the driver's stamp
-    in UTC, None where there is none; ``missed`` frames before it were lost, as the driver counts."""
+    """A frame as the camera sent it.
+
+    ``format`` is jpeg, png, h264 or h265. ``time_ns`` is the driver's stamp in UTC; None without a stamp.
+    ``missed`` is the number of frames lost directly before this frame, by the count of the driver.
+    """
 
     data: bytes
     format: str
@@ -28,14 +31,14 @@ class Frame(NamedTuple):
     missed: int = 0
 
 
-# More than the difference of two clocks that are read one after the other.
+# Reading two clocks one after the other gives a smaller difference.
 _LEAST_SLEEP_NS = NS_PER_S // 100
 
 
 class Clock:
-    """UTC that never jumps back: the monotonic clock, anchored to UTC once.
+    """A clock of UTC that never jumps back: the monotonic clock plus an offset, which is read once.
 
-    The monotonic clock stops while the machine sleeps; the time of the sleep is added.
+    The monotonic clock stops while the machine sleeps. This clock adds the time of the sleep.
     """
 
     def __init__(self) -> None:
@@ -53,33 +56,34 @@ class Clock:
         return self.of_monotonic_ns(self._read_ns)
 
     def of_monotonic_ns(self, monotonic_ns: int) -> int:
-        """Return a stamp of the monotonic clock, such as V4L2's, in UTC."""
+        """Convert a stamp of the monotonic clock, such as a stamp of V4L2, to UTC."""
         slept_ns = next(slept for since, slept in reversed(self._sleeps_ns) if since <= monotonic_ns)
         return monotonic_ns + self._offset_ns + slept_ns
 
 
 def _asleep_ns() -> int:
-    """Return the time that the machine has slept since its start; 0 if the system does not tell."""
+    """Return the time that the machine has slept since its start; 0 if the system does not give it."""
     if not hasattr(time, "CLOCK_BOOTTIME"):
         return 0
     return time.clock_gettime_ns(time.CLOCK_BOOTTIME) - time.monotonic_ns()
 
 
-# Tells the user what a camera refused, one line at a time.
+# The function shows one line of text to the user.
 Say = Callable[[str], None]
-# Opens a camera as the rig wants it. While nothing comes it yields None, at least twice a second, so that its
-# thread can end. It ends when there will never be more, as of a file; when a camera has gone it raises
-# SourceError.
+# The function opens a camera with the settings of the rig, and returns an iterator of its frames. While no
+# frame arrives, the iterator yields None at least twice a second, so that its thread can end. The iterator
+# ends when no more frames can arrive, for example at the end of a file. When a camera is disconnected, the
+# iterator raises SourceError.
 Open = Callable[[RigCamera, Clock, Say], AbstractContextManager[Iterator[Frame | None]]]
 
 
 def instant_ns(stamp_ns: int, camera: RigCamera) -> int:
-    """The middle of the exposure of a frame's first row, from the driver's stamp.
+    """Return the time of the middle of the exposure of a frame's first row, from the driver's stamp.
 
     Parameters
     ----------
-    stamp_ns : of the frame.
-    camera : ``stamp`` says what it means, the start where it says nothing.
+    stamp_ns : stamp of the frame.
+    camera : its ``stamp`` gives the meaning of the stamp; None means the start of the exposure.
 
     Examples
     --------
@@ -97,12 +101,15 @@ def instant_ns(stamp_ns: int, camera: RigCamera) -> int:
     return stamp_ns + half_ns
 
 
-# By so much may a number differ, relatively: 30000/1001 frames/s are 30.
+# Largest relative difference of two equal settings: 30000/1001 frames/s count as 30.
 _NEAR = 0.01
 
 
 class Given(NamedTuple):
-    """What a camera gives; None where it cannot be set, or of the rate, where it cannot be told."""
+    """The actual settings of a camera.
+
+    None means that the camera does not let us set the value. For the rate, None means that it is not known.
+    """
 
     width: int | None = None
     height: int | None = None
@@ -113,13 +120,13 @@ class Given(NamedTuple):
 
 
 def say_refused(camera: RigCamera, given: Given, say: Say) -> None:
-    """Say, a line for each, what a camera gives other than the rig asks for.
+    """Report each setting of a camera that differs from the rig, in one line per setting.
 
     Parameters
     ----------
-    camera : what is asked for; None stands for whatever the camera likes.
-    given : what it gives.
-    say : told of each difference.
+    camera : the requested settings; None means any value.
+    given : the actual settings.
+    say : called with each difference.
 
     Examples
     --------
@@ -136,17 +143,17 @@ def say_refused(camera: RigCamera, given: Given, say: Say) -> None:
         ("of focus", camera.focus, given.focus),
         ("of gain", camera.gain, given.gain),
     )
-    for unit, asked, has in rows:
-        if asked is None or (has is None and unit == "frames/s"):
+    for unit, requested, actual in rows:
+        if requested is None or (actual is None and unit == "frames/s"):
             continue
-        if has is None:
-            say(f"camera {camera.name}: asked for {asked:g} {unit}, which it does not let us set")
-        elif abs(asked - has) > _NEAR * max(abs(asked), abs(has)):
-            say(f"camera {camera.name}: asked for {asked:g} {unit}, gives {has:g}")
+        if actual is None:
+            say(f"camera {camera.name}: asked for {requested:g} {unit}, which it does not let us set")
+        elif abs(requested - actual) > _NEAR * max(abs(requested), abs(actual)):
+            say(f"camera {camera.name}: asked for {requested:g} {unit}, gives {actual:g}")
 
 
 def device_of(source: str) -> str:
-    """The device that a source names.
+    """Return the path of the device that a source names.
 
     Examples
     --------

@@ -1,7 +1,7 @@
-"""Cameras that send now, as one source of messages.
+"""The live cameras as one source of messages.
 
-Each camera has a thread that puts what comes into one queue and does nothing else. Messages get their log
-time at one place, where they are taken out of it.
+Each camera has a thread that only puts the arriving frames into one queue. A message gets its log time when
+it leaves the queue.
 """
 
 from __future__ import annotations
@@ -21,39 +21,41 @@ from ipsys_log.messages import EVENTS_TOPIC, CompressedImage, CompressedVideo, E
 
 __all__ = ["Attached"]
 
-# What may wait to be written: some seconds of three cameras, and no more of the memory than that.
+# Most bytes of frames that wait to be written: some seconds of three cameras.
 _LIMIT_BYTES = 256 << 20
 _TICK_S = 0.1
 _REMEMBERED = 20_000
-# Longest wait of the user for the disk when a point is saved.
+# Longest time that the user waits for the disk when a point is saved.
 _SAVED_S = 10.0
-# Whoever interrupts does not wait longer for a camera that hangs.
+# After an interrupt, a hanging camera delays the end by at most this time.
 _LAST_S = 1.0
 
 
 class Attached:
-    """Cameras of a rig that send frames now. A context manager; iterate over it once.
+    """The live cameras of a rig. A context manager; iterate over it once.
 
-    Yields messages in the order of their log times, which strictly increase, and None ten times a second
-    while nothing comes. It ends when all cameras have (files do), or after :meth:`stop`.
+    The iteration yields messages in the order of their log times, which strictly increase. While no message
+    arrives, it yields None ten times a second. It ends when all cameras have ended (files end), or after
+    :meth:`stop`.
 
     Parameters
     ----------
-    cameras : each with a source.
-    open_source : opens any of them.
-    clock : the one that all stamps are of.
-    say : is told at once what becomes an event too: settings refused, a camera lost or back, frames dropped.
-    limit_bytes : what may wait in memory; frames beyond that are dropped, counted and named by an event.
+    cameras : cameras, each with a source.
+    open_source : function that opens any of the cameras.
+    clock : clock of all stamps.
+    say : called at once with the text of each event: settings refused, a camera lost or back, frames dropped.
+    limit_bytes : most bytes of frames that wait in memory. Further frames are dropped and counted, and an
+        event reports them.
 
     Attributes
     ----------
-    states : by the name of a camera.
-    received_ns : when the last frames came, by log time.
+    states : states of the cameras, by camera name.
+    received_ns : arrival times of the last frames, by log time.
 
     Raises
     ------
     SourceError
-        On entering, where a camera cannot be opened or sends nothing.
+        On entering: a camera cannot be opened, or sends nothing.
     """
 
     def __init__(
@@ -77,7 +79,9 @@ class Attached:
         self._heartbeat = Heartbeat(clock)
         shared = Shared(open_source, clock, self._put, say, self._started, self._stopped, self._heartbeat)
         self._attendants = [Attendant(camera, shared) for camera in cameras]
-        self.states = {one.name: by.state for one, by in zip(cameras, self._attendants, strict=True)}
+        self.states = {
+            camera.name: attendant.state for camera, attendant in zip(cameras, self._attendants, strict=True)
+        }
 
     def __enter__(self) -> Attached:
         try:
@@ -98,17 +102,22 @@ class Attached:
         self._end(_LAST_S if isinstance(error, KeyboardInterrupt) else None)
 
     def stop(self, why: str | None = None) -> None:
-        """Take no more frames; what has come is still given out. A signal handler may call it: no lock.
+        """Take no more frames; the iteration still yields the waiting messages.
+
+        This method takes no lock, so a signal handler may call it.
 
         Parameters
         ----------
-        why : said to whoever comes too late.
+        why : reason that the error of a later call of :meth:`save` or :meth:`add` names.
         """
         self._why = why or self._why
         self._ending = True
 
     def __iter__(self) -> Generator[Message | None, None, None]:
-        """Requesting the next message acknowledges the previous write; ending the iteration closes this."""
+        """Yield messages; requesting the next message acknowledges the previous write.
+
+        The end of the iteration closes the stream.
+        """
         try:
             while True:
                 if self._ending:
@@ -130,22 +139,24 @@ class Attached:
                 raise attendant.fault
 
     def add(self, topic: str, payload: Any) -> None:
-        """Take something else into the stream, such as an event: it gets its log time as frames do.
+        """Append another message to the stream, such as an event; it gets its log time as a frame does.
 
         Raises
         ------
         SourceError
-            Where the stream has ended: nobody would write it down.
+            The stream has ended, so no thread would write the message.
         """
         self._add(Arrival(self.clock.now_ns(), topic, payload.timestamp, payload))
 
     def save(self, topic: str, payload: Any) -> None:
-        """Take something into the stream, and wait until it is on the disk. Not for the thread that iterates.
+        """Append a message to the stream, and wait until it is on the disk.
+
+        The iterating thread must not call this method.
 
         Raises
         ------
         SourceError
-            Where it is not, and why.
+            The message is not on the disk, or maybe not. The text gives the reason.
         """
         saving = _Saving(Arrival(self.clock.now_ns(), topic, payload.timestamp, payload))
         with self._arrived:
@@ -155,8 +166,8 @@ class Attached:
                 lambda: saving.confirmed or (self._closed and not saving.written), _SAVED_S
             )
             self._saving.remove(saving)
-            waits = _has(self._waiting, saving.arrival)
-            self._waiting = deque(one for one in self._waiting if one is not saving.arrival)
+            is_waiting = _has(self._waiting, saving.arrival)
+            self._waiting = deque(arrival for arrival in self._waiting if arrival is not saving.arrival)
             closed = self._closed
         if saving.fault is not None:
             raise SourceError(
@@ -166,7 +177,7 @@ class Attached:
             return
         if closed and not saving.written:
             raise SourceError(f"not saved: {self._why}")
-        if waits:
+        if is_waiting:
             raise SourceError("not saved: the disk is too slow; try again")
         raise SourceError("maybe not saved: the disk does not answer; look into the log")
 
@@ -179,18 +190,18 @@ class Attached:
             self._arrived.notify_all()
 
     def warn(self, kind: str, text: str) -> None:
-        """An event of no camera, said at once too; only said where the stream has ended."""
+        """Append an event without a camera, and show its text at once; after the end, only show the text."""
         with suppress(SourceError):
             self.add(EVENTS_TOPIC, Event(self.clock.now_ns(), kind, text))
         self.say(text)
 
     def now_ns(self) -> int:
-        """A log time for what is not of a camera: later than all before."""
+        """Return a log time that is later than all earlier log times."""
         self._last_ns = max(self.clock.now_ns(), self._last_ns + 1)
         return self._last_ns
 
     def _put(self, arrival: Arrival) -> bool:
-        """Let something wait; False for a frame that there is no room for."""
+        """Append an arrival to the queue; return False if there is no room for a frame."""
         size = _bytes_of(arrival)
         with self._arrived:
             if size and self._waiting_bytes + size > self._limit_bytes:
@@ -207,7 +218,7 @@ class Attached:
             self._put(arrival)
 
     def _take(self) -> tuple[Arrival | None, bool]:
-        """What has waited longest, and whether there will never be more."""
+        """Take the oldest arrival from the queue; return it, and whether the stream has ended."""
         with self._arrived:
             if not self._waiting and not self._done():
                 self._arrived.wait(_TICK_S)
@@ -244,13 +255,13 @@ class Attached:
         self._stopped.set()
         self._heartbeat.stop()
         for attendant in self._attendants:
-            if attendant.thread.ident is not None:  # an interrupt may come before all threads were started
+            if attendant.thread.ident is not None:  # after an early interrupt, some threads have not started
                 attendant.thread.join(seconds)
 
 
 @dataclass(eq=False, slots=True)
 class _Saving:
-    """The state that a caller of ``save`` waits for: written by the iterating thread, then on the disk."""
+    """The progress of one ``save``: the iterating thread writes the message, then it is on the disk."""
 
     arrival: Arrival
     log_time_ns: int | None = None
@@ -260,10 +271,10 @@ class _Saving:
 
 
 def _bytes_of(arrival: Arrival | None) -> int:
-    """What a frame takes; nothing else counts."""
+    """Return the size of a frame, in bytes; 0 for any other message."""
     frame = None if arrival is None else arrival.payload
     return len(frame.data) if isinstance(frame, (CompressedImage, CompressedVideo)) else 0
 
 
 def _has(arrivals: Iterable[Arrival], arrival: Arrival) -> bool:
-    return any(one is arrival for one in arrivals)
+    return any(other is arrival for other in arrivals)

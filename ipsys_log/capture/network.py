@@ -1,7 +1,7 @@
 """Cameras on the network: RTSP, MJPEG over HTTP, and every address that FFmpeg opens.
 
-Packets are handed on as they came, never decoded: JPEG pictures, or H.264 and H.265 as Annex B with the
-parameter sets before each keyframe, which is what ``foxglove.CompressedVideo`` asks for.
+The packets are never decoded. They are JPEG images, or H.264 and H.265 as Annex B. The parameter sets come
+before each keyframe, as ``foxglove.CompressedVideo`` requires.
 """
 
 from __future__ import annotations
@@ -28,21 +28,21 @@ if TYPE_CHECKING:
 
 __all__ = ["Stamps", "check_address", "open_network", "read_stamp"]
 
-# A frame that is said to be older, or younger, comes from a camera whose clock is not ours.
+# Largest and smallest age of a frame by its stamp. Beyond them, the clock of the camera is not synchronized.
 _OLDEST_NS = NS_PER_S
 _YOUNGEST_NS = -NS_PER_S // 20
 
 
 class Stamps:
-    """Stamps of one stream, as far as they are to be trusted, and what is to be said of that, once.
+    """The stamps of one stream, with a check of the camera's clock; the result is reported once.
 
     Parameters
     ----------
-    name : of the camera.
-    clock : ours.
-    say : told how the frames are stamped.
-    patience : so many frames may come before the first stamp. RTSP's sender ties its stamps to a clock by
-        reports, one every few seconds.
+    name : name of the camera.
+    clock : clock of the recorder.
+    say : called with the kind of stamps that the frames get.
+    patience : most frames that may arrive before the first stamp. An RTSP sender relates its stamps to its
+        clock by reports, and sends one report every few seconds.
     """
 
     def __init__(self, name: str, clock: Clock, say: Say, patience: int = 1) -> None:
@@ -54,10 +54,10 @@ class Stamps:
         self._trusted: bool | None = None
 
     def of(self, packet: Packet[VideoStream]) -> int | None:
-        """When a packet's frame was taken, in ns of UTC; None where that is not known."""
+        """Return the capture time of a packet's frame, in ns of UTC; None if it is not known."""
         time_ns, stamped, self._stamped = read_stamp(packet), self._stamped, packet.has_sidedata("prft")
         if not stamped:
-            # FFmpeg gives the frame before the first that has a stamp that one's.
+            # FFmpeg copies the first stamp to the frame before it, so the stamp of that frame is wrong.
             time_ns = None
         if self._trusted is None:
             self._judge(time_ns)
@@ -84,7 +84,7 @@ class Stamps:
 
 
 def read_stamp(packet: Packet[VideoStream]) -> int | None:
-    """The wall clock of the sender that goes with a packet, in ns since 1970; RTSP's comes by RTCP."""
+    """Return the sender's wall clock for a packet, in ns since 1970; an RTSP sender sends it by RTCP."""
     if not packet.has_sidedata("prft"):
         return None
     # AVProducerReferenceTime: int64 of microseconds, int of flags.
@@ -92,37 +92,38 @@ def read_stamp(packet: Packet[VideoStream]) -> int | None:
     return wall_us * 1000
 
 
-# A stream that is silent for so long has gone.
+# A stream that sends nothing for this time is disconnected.
 _SILENT_S = 5.0
 _TURN_S = 0.4
-# Frames between FFmpeg's thread and ours; what is behind them waits in the socket.
+# Most frames in the queue between FFmpeg's thread and ours; later frames wait in the socket.
 _WAITING = 4
-# RTSP's first report of the camera's clock comes within 5 s or so: at 30 frames/s, in time.
+# Most frames before the first stamp. RTSP's first report of the camera's clock arrives within about 5 s:
+# after 150 frames at 30 frames/s.
 _PATIENCE = 300
 _OPTIONS = {
     "rtsp_flags": "prefer_tcp",
-    # What was read to find out what the stream is would come late, and in one go.
+    # With a buffer, the packets read to detect the type of the stream would arrive late, and all at once.
     "fflags": "nobuffer",
     "analyzeduration": "1000000",
 }
 
-# Frames, what went wrong, or None at the end of the stream.
+# The queue holds frames, then the error, or None at the end of the stream.
 _Queue = Queue[Frame | SourceError | None]
 
 
 @contextmanager
 def open_network(camera: RigCamera, clock: Clock, say: Say) -> Iterator[Iterator[Frame | None]]:
-    """The frames of a stream, as :data:`~ipsys_log.capture.frames.Open` says.
+    """Open a stream; an :data:`~ipsys_log.capture.frames.Open`.
 
-    A read of FFmpeg's cannot be broken off, so a thread of its own reads; on leaving it is left to
-    itself, and ends with what it waits for, after 5 s at the latest. The address is opened there too:
-    a :class:`~ipsys_log.capture.frames.SourceError` comes from the iterator.
+    A read of FFmpeg cannot be interrupted, so a separate thread reads. On leaving, the caller does not
+    wait for this thread. It ends after its current read, within 5 s. The thread opens the address too, so
+    the iterator raises the :class:`~ipsys_log.capture.frames.SourceError`.
 
     Parameters
     ----------
     camera : its ``source`` is the address.
-    clock : to tell by how much the camera's own clock is off.
-    say : told what the stream does not give.
+    clock : clock of the recorder; the camera's own clock is compared with it.
+    say : called with each setting that the stream does not give.
     """
     queue: _Queue = Queue(_WAITING)
     stop = Event()
@@ -164,7 +165,7 @@ def _read(camera: RigCamera, clock: Clock, say: Say, queue: _Queue, stop: Event)
 
 
 def _put(queue: _Queue, item: Frame | SourceError | None, stop: Event) -> bool:
-    """Return whether it was wanted."""
+    """Put an item into the queue; return False if the reader has stopped."""
     while not stop.is_set():
         try:
             queue.put(item, timeout=_TURN_S)
@@ -175,32 +176,32 @@ def _put(queue: _Queue, item: Frame | SourceError | None, stop: Event) -> bool:
 
 
 def _frames(camera: RigCamera, clock: Clock, say: Say) -> Iterator[Frame]:
-    """Frames until the camera has gone, from :func:`_read`'s thread."""
+    """Yield frames until the camera is disconnected; :func:`_read` calls it in its thread."""
     import av
 
-    where = f"camera {camera.name}: {hide_password(camera.source or '')}"
+    label = f"camera {camera.name}: {hide_password(camera.source or '')}"
     try:
-        with _open(camera.source or "", where) as container:
-            stream = find_video(container, where)
+        with _open(camera.source or "", label) as container:
+            stream = find_video(container, label)
             codec = stream.codec_context
             name = name_format(stream)
             if name is None:
-                raise SourceError(f"{where}: is {codec.name} video; set the camera to MJPEG, H.264 or H.265")
+                raise SourceError(f"{label}: is {codec.name} video; set the camera to MJPEG, H.264 or H.265")
             rate_hz = float(stream.average_rate) if stream.average_rate else None
             say_refused(camera, Given(codec.width, codec.height, rate_hz), say)
             stamps = Stamps(camera.name, clock, say, _PATIENCE if container.format.name == "rtsp" else 1)
-            # A stream that stops within a packet has ended.
+            # A stream that stops within a packet has ended. This is no error of the data.
             with suppress(av.error.InvalidDataError):
-                for packet in pass_through(_heard(container.demux(stream), clock, where), stream):
+                for packet in pass_through(_heard(container.demux(stream), clock, label), stream):
                     yield Frame(bytes(packet), name, stamps.of(packet))
-            # A camera that is there does not end: it may come back.
-            raise SourceError(f"{where}: the stream has ended")
+            # The stream of a connected camera does not end. After an error, the camera is opened again.
+            raise SourceError(f"{label}: the stream has ended")
     except av.error.FFmpegError as error:
-        raise SourceError(f"{where}: {_explain(error)}") from error
+        raise SourceError(f"{label}: {_explain(error)}") from error
 
 
 def _heard(packets: Iterable[Packet[VideoStream]], clock: Clock, where: str) -> Iterator[Packet[VideoStream]]:
-    """Packets, until for long only empty ones have come, which is as silent as none."""
+    """Yield packets; raise an error after a long time with only empty packets."""
     heard_ns = clock.now_ns()
     for packet in packets:
         if not packet.size and clock.now_ns() - heard_ns > _SILENT_S * NS_PER_S:
@@ -227,10 +228,10 @@ def _open(address: str, where: str) -> InputContainer:
 
 
 def _explain(error: Exception) -> str:
-    """What an error of FFmpeg's means for the user, and what to do."""
+    """Describe an error of FFmpeg for the user, and the remedy."""
     import av
 
-    known = {
+    explanations = {
         av.error.ConnectionRefusedError: "refuses the connection; is the camera on, and the port right?",
         av.error.HTTPNotFoundError: "the camera has no such path; look it up in the camera's manual",
         av.error.HTTPUnauthorizedError: "asks for a password, or another; put user:password@ before the host",
@@ -240,19 +241,19 @@ def _explain(error: Exception) -> str:
         av.error.TimeoutError: "does not answer; is the camera on, and the network up?",
         av.error.ProtocolNotFoundError: "is of a protocol that FFmpeg does not know; use rtsp:// or http://",
     }
-    for kind, text in known.items():
+    for kind, text in explanations.items():
         if isinstance(error, kind):
             return text
     return f"cannot be read ({getattr(error, 'strerror', None) or error}); try the address in another player"
 
 
 def check_address(camera: RigCamera) -> None:
-    """See that the source of a camera is an address.
+    """Check that the source of a camera is a valid address.
 
     Raises
     ------
     SourceError
-        Where it names no host. A stream that is sent to this machine (``udp://:5000``) needs none.
+        The address names no host. A stream that is sent to this machine (``udp://:5000``) needs no host.
     """
     address = camera.source or ""
     if not address.lower().startswith(("http", "rtsp")):

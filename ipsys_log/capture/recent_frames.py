@@ -1,4 +1,4 @@
-"""Buffer of recent frames: those around a measurement are written to the log, the others discarded."""
+"""Buffer of recent frames: the log gets the frames around a measurement; other frames are discarded."""
 
 from __future__ import annotations
 
@@ -13,26 +13,27 @@ from ipsys_log.units import NS_PER_S
 
 __all__ = ["Recent"]
 
-# Longer than a marker is looked at, and what the stages may be behind.
+# Longer than the stationary interval of a measurement and the delay of the stages.
 _HELD_NS = 5 * NS_PER_S
-# Two seconds of eight cameras at 60/s are less. Beyond that a place gets what is held of its second.
+# Eight cameras at 60 frames/s send less in two seconds. Beyond this limit, a calibration point gets only the
+# frames that the buffer still holds.
 _LIMIT_BYTES = 256 << 20
-# A marker may be exposed so long after the time of its frame (rolling shutter).
+# Longest time from the time of a frame to the exposure of a marker in it (rolling shutter).
 _ROLLING_NS = NS_PER_S // 10
 
 
 class Recent:
-    """The end of a recording that is not written yet. A context manager: on leaving, the rest is.
+    """A buffer of the last messages of a recording. A context manager: on leaving, it writes the rest.
 
-    Everything comes and goes in the order of log times. A frame that is older than some seconds is forgotten,
-    sooner where all that is held would be too much for the memory, and any other message written then. A
-    measurement is written at once, and before it the frames since its marker lay still, as if everything were
-    recorded.
+    Messages enter and leave in the order of log times. A frame is discarded after some seconds, or earlier
+    if the buffer is full. Any other message is written then. A measurement is written at once. Before it,
+    the buffer writes the frames since the start of the marker's stationary interval. Their order is the same
+    as in a full recording.
 
     Parameters
     ----------
-    log : where all of it goes.
-    limit_bytes : what may be held of frames.
+    log : recording that gets the messages.
+    limit_bytes : most bytes of frames in the buffer.
     """
 
     def __init__(self, log: Recording, limit_bytes: int = _LIMIT_BYTES) -> None:
@@ -58,15 +59,15 @@ class Recent:
         return self._log.fault
 
     def put(self, message: Message) -> None:
-        """Take the next message of a recording.
+        """Append the next message of a recording.
 
         Raises
         ------
         WriteError
-            Where the disk is full.
+            The disk is full.
         """
         payload = message.payload
-        # It tells a replay what live results lack; here there are none.
+        # The event tells a replay which frames have no live results. This log holds no live results.
         if isinstance(payload, Event) and payload.kind == FRAME_SKIPPED:
             return
         self._held.append(message)
@@ -76,12 +77,12 @@ class Recent:
         while _is_frame(message) and (
             self._held[0].log_time_ns < message.log_time_ns - _HELD_NS or self._held_bytes > self._limit_bytes
         ):
-            old = self._take()
-            if not _is_frame(old):
-                self._log.put(old)
+            oldest = self._take()
+            if not _is_frame(oldest):
+                self._log.put(oldest)
 
     def flush(self) -> None:
-        """Hand to the disk what is written."""
+        """Flush the written messages to the operating system."""
         self._log.flush()
 
     def sync(self, confirm: Confirm) -> None:
@@ -89,7 +90,7 @@ class Recent:
         self._log.sync(confirm)
 
     def _write(self, since_ns: int | None = None) -> None:
-        """Write all that is held; of the frames those taken since then, None for none."""
+        """Write all messages of the buffer; of the frames, only those since ``since_ns`` (None: no frame)."""
         while self._held:
             message = self._take()
             if not _is_frame(message) or (since_ns is not None and message.publish_time_ns >= since_ns):

@@ -33,7 +33,7 @@ _SQUARE_M, _MARKER_SCALE, _DICTIONARY = 0.03, 0.75, "DICT_4X4_50"
 
 
 class Seat(NamedTuple):
-    """The scene of a simulated camera: a lab, the number of its camera, and a board before it, if any."""
+    """The scene of a simulated camera: a lab, the number of its camera, and an optional board in front."""
 
     lab: LabSettings
     number: int
@@ -41,11 +41,11 @@ class Seat(NamedTuple):
 
 
 class _Stopped(Exception):  # noqa: N818
-    """The pictures are not needed any more."""
+    """A signal to end the rendering: the images are not needed any more."""
 
 
 class _Pictures:
-    """The pictures of a film, rendered by a separate thread in the order of their use."""
+    """The images of a film, rendered by a separate thread in the order of their use."""
 
     def __init__(self, name: str, make_film: Callable[[Check], Film], timing: _Timing, clock: Clock) -> None:
         self._film: Film | None = None
@@ -53,14 +53,14 @@ class _Pictures:
         self._fault: BaseException | None = None
         self._make_film, self._timing, self._clock = make_film, timing, clock
         self._stopped = Event()
-        # No daemon: Python would end such a thread within OpenCV, and that aborts the program.
+        # Not a daemon: Python ends a daemon thread within a call of OpenCV, and the program aborts.
         Thread(target=self._work, name=f"draws {name}", daemon=False).start()
 
     def stop(self) -> None:
         self._stopped.set()
 
     def picture(self, frame: int) -> bytes | None:
-        """Return the picture of a frame; None if it is not rendered yet."""
+        """Return the image of a frame; None if it is not rendered yet."""
         if self._fault is not None:
             raise self._fault
         return None if self._film is None else self._drawn.get(self._film.index_of(frame))
@@ -76,40 +76,40 @@ class _Pictures:
                 took_ns = self._clock.now_ns() - start_ns
         except _Stopped:
             return
-        except BaseException as fault:  # raised again where the frames are taken
+        except BaseException as fault:  # raised again in the thread that takes the frames
             self._fault = fault
 
     def _frame_in(self, later_ns: int) -> int:
-        """Return the number of the first frame that is handed over after some time from now."""
+        """Return the number of the first frame that is delivered later than ``later_ns`` from now."""
         return self._timing.frame_at(self._clock.now_ns() + later_ns) + 1
 
     def _check(self) -> None:
-        # Python waits for this thread when the program ends, also where nobody was left to stop it.
+        # When the program ends, Python waits for this thread, also if no caller has stopped it.
         if self._stopped.is_set() or not main_thread().is_alive():
             raise _Stopped
 
 
 @contextmanager
 def open_simulated(camera: RigCamera, clock: Clock, say: Say) -> Iterator[Iterator[Frame | None]]:
-    """The frames of a simulated camera, as :data:`~ipsys_log.capture.frames.Open` says.
+    """Open a simulated camera; an :data:`~ipsys_log.capture.frames.Open`.
 
-    Most markers of the lab are stationary; the others drive to and fro. Or a board is shown before the
-    camera. Each picture is rendered once, by a separate thread, and shown repeatedly. A frame is skipped if
-    its picture is not rendered yet. The clock alone decides the picture of a frame: all cameras of a lab see
-    the robots at the same places, in all processes.
+    Most markers of the lab are stationary; the others drive to and fro. With a board in the source, the
+    camera sees this board instead. Each image is rendered once, by a separate thread, and shown repeatedly.
+    A frame is skipped if its image is not rendered yet. The clock alone decides the image of a frame: all
+    cameras of a lab see the robots at the same positions, in all processes.
 
     Parameters
     ----------
-    camera : its ``source`` is ``sim:`` and the name of the camera in the lab, and may set what
-        ``ipsys simulate`` can, and a board: ``sim:red?seed=3&markers=5``, ``sim:red?board=6x4``. Size and
-        rate are those of the rig.
-    clock : tells which frame is shown.
-    say : told what the camera shows.
+    camera : its ``source`` is ``sim:`` and the name of the camera in the lab. The source may have a board
+        and the settings of ``ipsys simulate``: ``sim:red?seed=3&markers=5``, ``sim:red?board=6x4``. The
+        rig gives size and rate.
+    clock : decides the image of each frame.
+    say : called with a description of the scene, and with each setting that is refused.
 
     Raises
     ------
     IpsysError
-        Where the lab has no such camera, or no such setting.
+        The lab has no such camera or setting.
     """
     seat = parse_source(camera)
     lab = seat.lab
@@ -131,7 +131,7 @@ def open_simulated(camera: RigCamera, clock: Clock, say: Say) -> Iterator[Iterat
 
 
 def parse_source(camera: RigCamera) -> Seat:
-    """Parse a source: the lab, the camera, and the board before it.
+    """Parse a source; return the lab, the camera, and the board in front of the camera.
 
     Raises
     ------
@@ -145,21 +145,23 @@ def parse_source(camera: RigCamera) -> Seat:
     (3, 960, 'white', 'a chessboard of 6 x 4 inner corners')
     """
     name, _, query = (camera.source or "").partition(":")[2].partition("?")
-    asked = {"width": camera.width, "height": camera.height, "rate_hz": camera.rate_hz}
-    values: dict[str, int | float] = {key: value for key, value in asked.items() if value is not None}
-    known = {f.name: type(f.default) for f in fields(LabSettings) if isinstance(f.default, (int, float))}
+    requested = {"width": camera.width, "height": camera.height, "rate_hz": camera.rate_hz}
+    values: dict[str, int | float] = {key: value for key, value in requested.items() if value is not None}
+    setting_types = {
+        f.name: type(f.default) for f in fields(LabSettings) if isinstance(f.default, (int, float))
+    }
     board = None
     for key, text in parse_qsl(query, keep_blank_values=True):
         if key == "board":
             board = _parse_board(camera, text)
             continue
-        if key not in known:
+        if key not in setting_types:
             raise IpsysError(
                 f"camera {camera.name}: the simulated lab has no setting {key!r}; "
-                f"it has board, {', '.join(known)}"
+                f"it has board, {', '.join(setting_types)}"
             )
         try:
-            values[key] = known[key](text)
+            values[key] = setting_types[key](text)
         except ValueError as error:
             raise IpsysError(f"camera {camera.name}: {key}={text} is no number") from error
     settings = replace(LIVE_SETTINGS, **values)  # type: ignore[arg-type]
@@ -181,7 +183,9 @@ def _parse_board(camera: RigCamera, text: str) -> Board:
 
 
 def show_board(camera: RigCamera, board: str) -> RigCamera:
-    """Return a simulated camera with a board held before it, unless its source names one; others as they are.
+    """Return a simulated camera with a board in front of it.
+
+    A camera that is not simulated, or whose source has a board already, is returned unchanged.
 
     Examples
     --------
@@ -193,8 +197,8 @@ def show_board(camera: RigCamera, board: str) -> RigCamera:
     source = str(camera.source)
     if not source.startswith("sim:") or parse_source(camera).board is not None:
         return camera
-    joint = "&" if "?" in source else "?"
-    return replace(camera, source=f"{source}{joint}{urlencode({'board': board}, safe=':')}")
+    separator = "&" if "?" in source else "?"
+    return replace(camera, source=f"{source}{separator}{urlencode({'board': board}, safe=':')}")
 
 
 def lens_of(camera: RigCamera) -> CameraCalibration:
@@ -210,29 +214,29 @@ def lens_of(camera: RigCamera) -> CameraCalibration:
 
 
 class _Timing(NamedTuple):
-    """Times at which frames are exposed, stamped and delivered."""
+    """The times at which frames are exposed, stamped and delivered."""
 
-    # Times since 1970 are too long for floating point.
+    # A float is not precise enough for times since 1970.
     period_ns: Fraction
     stamp_ns: int
     behind_ns: int
 
     @classmethod
     def of(cls, lab: LabSettings, stamp: str | None) -> _Timing:
-        # A driver stamps the start of the first row's exposure, or the end of the last one's.
+        # A driver stamps the start of the first row's exposure, or the end of the last row's exposure.
         start_s, end_s = exposed(0, lab.height - 1, lab)
         stamp_ns = round({"start": start_s, "end": end_s}.get(stamp or "", 0.0) * NS_PER_S)
         return cls(NS_PER_S / Fraction(lab.rate_hz), stamp_ns, round(end_s * NS_PER_S) + _LATENCY_NS)
 
     def frame_at(self, now_ns: int) -> int:
-        """Return the number of the last frame that has been handed over by a time."""
+        """Return the number of the last frame that is delivered at ``now_ns`` or before."""
         return math.floor((now_ns - self.behind_ns) / self.period_ns)
 
 
 def _play(pictures: _Pictures, timing: _Timing, clock: Clock) -> Iterator[Frame | None]:
     frame = 0
     while True:
-        # A late reader has missed some.
+        # A late reader misses frames.
         frame = max(frame + 1, timing.frame_at(clock.now_ns()))
         time_ns = round(frame * timing.period_ns)
         while (left_s := (time_ns - (clock.now_ns() - timing.behind_ns)) / NS_PER_S) > 0:

@@ -1,8 +1,8 @@
 """Detection of stalls of the recorder, and of the late frames that follow them.
 
-A program that is stopped, swapped out or asleep with its machine reads nothing. Frames wait in buffers
-meanwhile, and arrive in a burst afterwards. Frames with a capture stamp keep their time. The others get the
-time of their arrival, which is wrong until the burst is over.
+A program that is stopped, swapped out or asleep with its machine reads nothing. During this time, frames
+wait in buffers. Afterwards they arrive in a burst. Frames with a capture stamp keep their time. The others
+get the time of their arrival, which is wrong until the end of the burst.
 """
 
 from __future__ import annotations
@@ -17,10 +17,11 @@ from ipsys_log.units import NS_PER_S
 
 __all__ = ["STALL_NS", "Heartbeat", "LateFrames", "Stall"]
 
-# Longer than threads of a busy machine wait. A robot at 1 m/s moves 25 cm in this time.
+# Threads of a busy machine wait for a shorter time. A robot at 1 m/s moves 25 cm in this time.
 STALL_NS = NS_PER_S // 4
 _BEAT_S = 0.05
-# The usual interval of a camera is the median of so many; it is back after so many usual ones in a row.
+# Number of intervals for the median, the usual interval of a camera; number of intervals after a stall whose
+# median must be usual again.
 _USUAL, _AGAIN = 60, 5
 _LIKE_BEFORE = 0.7
 _FASTEST_HZ = 60.0
@@ -38,7 +39,7 @@ class Heartbeat:
 
     Parameters
     ----------
-    clock : continues while the machine sleeps.
+    clock : clock that continues while the machine sleeps.
     """
 
     def __init__(self, clock: Clock) -> None:
@@ -49,7 +50,7 @@ class Heartbeat:
         self._stopped = threading.Event()
 
     def start(self) -> None:
-        """Note the time in a separate thread."""
+        """Start the thread that notes the time."""
         self._stopped.clear()
         threading.Thread(target=self._run, name="heartbeat", daemon=True).start()
 
@@ -58,10 +59,13 @@ class Heartbeat:
         self._stopped.set()
 
     def beat(self, now_ns: int) -> Stall | None:
-        """Note a time, and return the newest stall. The first thread that runs again finds it."""
+        """Note a time, and return the newest stall.
+
+        After a stall, the first thread that runs again detects it.
+        """
         with self._lock:
             if self._last_ns is not None and now_ns - self._last_ns > STALL_NS:
-                self._newest = Stall(self._last_ns + 1, now_ns)  # a frame may have come at the last time
+                self._newest = Stall(self._last_ns + 1, now_ns)  # a frame may have arrived at the last time
             self._last_ns = max(now_ns, self._last_ns or now_ns)
             return self._newest
 
@@ -73,16 +77,16 @@ class Heartbeat:
 class LateFrames:
     """A detector of the late frames after a stall, for one camera without capture stamps.
 
-    Frames are late from a stall on, until they come at the camera's usual rate again.
+    Frames are late from a stall on, until they arrive at the camera's usual rate again.
 
     Parameters
     ----------
-    rate_hz : of the camera, used until its usual rate is known.
+    rate_hz : rate of the camera, used until its usual rate is known.
 
     Attributes
     ----------
-    since_ns : start of the stall that made frames late, None while they are in time.
-    last_ns : arrival of the last frame.
+    since_ns : start of the stall that made frames late; None while frames arrive in time.
+    last_ns : arrival time of the last frame.
     """
 
     def __init__(self, heartbeat: Heartbeat, rate_hz: float | None) -> None:
@@ -114,7 +118,7 @@ class LateFrames:
         return None
 
     def caught_up(self) -> bool:
-        """Return whether all late frames have arrived; then the next ones are in time."""
+        """Return whether all late frames have arrived; then the next frames are in time."""
         usual_ns = median(self._usual_ns) if len(self._usual_ns) >= _AGAIN else self._least_ns
         if (
             self.since_ns is None

@@ -1,4 +1,4 @@
-"""What a person at the cameras wants to know: a look at a frame of each, about once a second."""
+"""The live check of the cameras: it analyses one frame of each camera about once a second."""
 
 from __future__ import annotations
 
@@ -19,17 +19,21 @@ from ipsys_log.stages.detect.search import search
 __all__ = ["Look", "Monitor"]
 
 _EVERY_S = 1.0
-# Mean grey level of a picture in which nothing can be seen, and its spread behind a cap.
+# Mean grey level of a dark image, and standard deviation of the grey levels behind a lens cap.
 _DARK, _FLAT = 20.0, 4.0
-# Of the best sharpness that a camera had: below that something moves, or the exposure is too long.
+# Sharpness relative to the best sharpness of the camera. Below it, there is motion or too long an exposure.
 _BLURRED = 0.4
 _SHRINK = 3
 
 
 @dataclass(frozen=True, slots=True)
 class Look:
-    """One frame of a camera: ids of the rig's markers in it, and of others, mean brightness 0 to 255,
-    sharpness relative to the best so far, and what is wrong with it, in words."""
+    """The result of the check of one frame.
+
+    ``markers`` are the ids of the rig's markers in the image, and ``strange`` the other ids. ``brightness``
+    is the mean grey level, 0 to 255. ``sharpness`` is relative to the best sharpness so far. ``warnings``
+    describe the faults of the image.
+    """
 
     markers: tuple[int, ...]
     strange: tuple[int, ...]
@@ -39,16 +43,18 @@ class Look:
 
 
 class Monitor:
-    """Looks at a frame of each camera now and then, in a thread of its own; of a video at keyframes, which
-    need no others. A context manager.
+    """The live check of all cameras, in a separate thread. A context manager.
+
+    The thread analyses one frame of each camera about once a second. In a video, it analyses only keyframes,
+    which can be decoded without other frames.
 
     Parameters
     ----------
-    rig : which markers there are.
+    rig : rig with the ids of the known markers.
 
     Attributes
     ----------
-    looks : the last one of each camera.
+    looks : the last result of each camera.
     """
 
     def __init__(self, rig: Rig) -> None:
@@ -70,7 +76,7 @@ class Monitor:
         self._thread.join()
 
     def __call__(self, message: Message | None) -> None:
-        """Be shown what is recorded."""
+        """Handle one recorded message."""
         if message is None or not isinstance(message.payload, (CompressedImage, CompressedVideo)):
             return
         if isinstance(message.payload, CompressedImage) or is_keyframe(message.payload):
@@ -86,7 +92,7 @@ class Monitor:
             grey = decode_grey(decode_keyframe(image) if isinstance(image, CompressedVideo) else image)
         except FrameError as error:
             return Look((), (), 0.0, 0.0, (f"a frame cannot be decoded: {error}",))
-        seen = Counter(one.id for one in search(grey, self._rig.dictionary))
+        seen = Counter(sighting.id for sighting in search(grey, self._rig.dictionary))
         counts = {n: count for n, count in seen.items() if self._rig.knows(n)}
         strange = tuple(sorted(set(seen) - set(counts)))
         small = grey[::_SHRINK, ::_SHRINK]
@@ -105,10 +111,12 @@ class Monitor:
 
 
 def _unknown(ids: tuple[int, ...]) -> str:
-    """What to do about markers that are in the picture and not in the rig."""
+    """Return advice about markers that are in the image but not in the rig."""
     names = ", ".join(map(str, ids))
     if len(ids) == 1:
-        which, todo = f"marker {names} is", "to track it"
+        subject, todo = f"marker {names} is", "to track it"
     else:
-        which, todo = f"markers {names} are", "to track them"
-    return f"{which} seen, but not in the rig; {todo} add the line [[markers]] to it, and below id = {ids[0]}"
+        subject, todo = f"markers {names} are", "to track them"
+    return (
+        f"{subject} seen, but not in the rig; {todo} add the line [[markers]] to it, and below id = {ids[0]}"
+    )

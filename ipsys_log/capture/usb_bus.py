@@ -16,15 +16,16 @@ from ipsys_log.messages import Rig, RigCamera
 
 __all__ = ["Attached", "Demand", "Mode", "Plug", "advise", "demands_of", "find_cameras", "list_modes"]
 
-# USB 2 gives at most 80 % of a microframe of 125 us to transfers at fixed times (USB 2.0, 5.6.4): of the 7500
-# bytes that 480 Mbit/s are, 6000.
+# USB 2 gives at most 80 % of a microframe of 125 us to transfers at fixed times (USB 2.0, 5.6.4). At
+# 480 Mbit/s a microframe has 7500 bytes, so these transfers get 6000 bytes.
 _MICROFRAMES_PER_S = 8000
 _CARRIES = 6000
 _USB_2_MBIT_S = 480
-# A packet takes so many bytes more on the wire (USB 2.0, 5.6.3), and holds at most so many of its own.
+# Extra bytes of a packet on the wire (USB 2.0, 5.6.3), and its largest payload in bytes.
 _HEAD = 38
 _PACKET = 1024
-# JPEG of a busy scene at the quality cameras use takes up to 2 bit per pixel; other formats, bytes per pixel.
+# At the usual quality of cameras, JPEG of a scene with many details takes up to 2 bits per pixel.
+# The table gives the bytes per pixel of other formats.
 _JPEG_BYTES_PER_PX = 0.25
 _BYTES_PER_PX = {"YUYV": 2.0, "UYVY": 2.0, "NV12": 1.5, "GREY": 1.0}
 _RATES_HZ = (60, 30, 25, 20, 15, 10, 5)
@@ -41,10 +42,10 @@ _SIZES = (
 
 
 class Demand(NamedTuple):
-    """A camera as it is to run.
+    """The bandwidth demand of a camera.
 
-    ``bus`` is the number of its USB bus; ``hub`` says what it is plugged into; ``most`` is how many bytes it
-    can reserve in each microframe, as its descriptors tell.
+    ``bus`` is the number of its USB bus. ``hub`` describes the hub that it is plugged into. ``most`` is the
+    largest number of bytes that it can reserve in each microframe, from its descriptors.
     """
 
     camera: str
@@ -59,29 +60,29 @@ class Demand(NamedTuple):
 
 
 def demands_of(attached: Sequence[Attached], rig: Rig | None) -> list[Demand]:
-    """What the cameras on USB will ask for: what the rig says or, without one, each its largest JPEG mode.
+    """Return the demands of the cameras on USB: the settings of the rig, or else the largest JPEG modes.
 
     Parameters
     ----------
-    attached : from :func:`~ipsys_log.capture.usb_bus.find_cameras`.
-    rig : only its cameras are to run, where it is given.
+    attached : cameras from :func:`~ipsys_log.capture.usb_bus.find_cameras`.
+    rig : rig of the cameras that run; None if all attached cameras run.
     """
-    wanted: list[tuple[Attached, str, RigCamera | None]]
+    requests: list[tuple[Attached, str, RigCamera | None]]
     if rig is None:
-        wanted = [(camera, camera.device, None) for camera in attached]
+        requests = [(camera, camera.device, None) for camera in attached]
     else:
         by_path = {Path(camera.device).resolve(): camera for camera in attached}
-        named = [camera for camera in rig.cameras if (camera.source or "").startswith("usb:")]
-        paths = ((camera, Path(device_of(camera.source or "")).resolve()) for camera in named)
-        wanted = [(by_path[path], camera.name, camera) for camera, path in paths if path in by_path]
+        usb_cameras = [camera for camera in rig.cameras if (camera.source or "").startswith("usb:")]
+        paths = ((camera, Path(device_of(camera.source or "")).resolve()) for camera in usb_cameras)
+        requests = [(by_path[path], camera.name, camera) for camera, path in paths if path in by_path]
     demands = []
-    for camera, name, asked in wanted:
+    for camera, name, rig_camera in requests:
         modes = [mode for mode in camera.modes if mode.format in ("MJPG", "JPEG")] or camera.modes
         if camera.plug is None or not modes:
             continue
         mode = max(modes, key=lambda mode: (mode.width * mode.height, mode.rate_hz))
-        width, height = (asked.width, asked.height) if asked else (None, None)
-        rate_hz = (asked.rate_hz if asked else None) or mode.rate_hz
+        width, height = (rig_camera.width, rig_camera.height) if rig_camera else (None, None)
+        rate_hz = (rig_camera.rate_hz if rig_camera else None) or mode.rate_hz
         bus, _, speed_mbit_s, hub, most = camera.plug
         size = (width or mode.width, height or mode.height)
         demands.append(Demand(name, bus, speed_mbit_s, hub, mode.format, *size, rate_hz, most))
@@ -89,13 +90,14 @@ def demands_of(attached: Sequence[Attached], rig: Rig | None) -> list[Demand]:
 
 
 def advise(demands: Sequence[Demand]) -> list[str]:
-    """A line for each bus that its cameras may ask too much of: who, where, how much, and what would fit.
+    """Return one line per overloaded bus: its cameras, its hub, the bandwidth, and modes that would fit.
 
-    Many cameras reserve as much as they can, whatever they send; that these may not start is said too.
+    Many cameras reserve as much as they can, at any rate and size. A line also warns that such cameras may
+    not start.
 
     Parameters
     ----------
-    demands : all cameras that are to run at once.
+    demands : demands of all cameras that run at the same time.
 
     Examples
     --------
@@ -114,17 +116,17 @@ def advise(demands: Sequence[Demand]) -> list[str]:
 def _explain(bus: int, shared: Sequence[Demand]) -> str | None:
     *names, last = sorted(demand.camera for demand in shared)
     hubs = ", ".join(sorted({demand.hub for demand in shared}))
-    who = f"cameras {', '.join(names)} and {last} share" if names else f"camera {last} is alone on"
+    subject = f"cameras {', '.join(names)} and {last} share" if names else f"camera {last} is alone on"
     needed, most = (_wire_bytes(shared, each) for each in (_needed, lambda demand: demand.most))
     carries = f"MB/s of its {_CARRIES * _MICROFRAMES_PER_S / 1e6:.0f}"
     if needed > _CARRIES:
         ways = ["plug one into another bus"] if names else []
         ways += _smaller(shared)
-        wanted = f"need {_mb_s(needed)}" if names else f"needs {_mb_s(needed)}"
-        return f"{who} USB bus {bus} ({hubs}) and {wanted} {carries}: {', or '.join(ways)}"
+        demand_text = f"need {_mb_s(needed)}" if names else f"needs {_mb_s(needed)}"
+        return f"{subject} USB bus {bus} ({hubs}) and {demand_text} {carries}: {', or '.join(ways)}"
     if names and most > _CARRIES:
         return (
-            f"{who} USB bus {bus} ({hubs}) and may reserve {_mb_s(most)} {carries}: "
+            f"{subject} USB bus {bus} ({hubs}) and may reserve {_mb_s(most)} {carries}: "
             "if one of them does not start, plug it into another bus"
         )
     return None
@@ -135,7 +137,7 @@ def _mb_s(per_microframe: int) -> str:
 
 
 def _smaller(shared: Sequence[Demand]) -> list[str]:
-    """The highest rate, and the largest size, at which all would fit; and a format that takes less."""
+    """Return the ways to fit all cameras: the highest rate, the largest size, and a smaller format."""
     ways = []
     for rate_hz in _RATES_HZ:
         slower = [demand._replace(rate_hz=min(rate_hz, demand.rate_hz)) for demand in shared]
@@ -159,7 +161,7 @@ def _needed(demand: Demand) -> int:
 
 
 def _wire_bytes(shared: Sequence[Demand], own: Callable[[Demand], int]) -> int:
-    """Bytes of a microframe that cameras take up on the wire, with the packets' heads."""
+    """Return the bytes that cameras take of a microframe on the wire, with the heads of the packets."""
     return sum(own(demand) + _HEAD * math.ceil(own(demand) / _PACKET) for demand in shared)
 
 
@@ -168,7 +170,7 @@ _VIDEO_STREAMING = (14, 2)
 
 
 class Mode(NamedTuple):
-    """What a camera can be set to; ``format`` is the driver's name of it: MJPG, YUYV."""
+    """A mode of a camera; ``format`` is the driver's name of the pixel format, such as MJPG or YUYV."""
 
     format: str
     width: int
@@ -177,8 +179,11 @@ class Mode(NamedTuple):
 
 
 class Plug(NamedTuple):
-    """Where on USB a camera is plugged in: bus, port within it, the hub, and the most bytes it can reserve
-    in a microframe."""
+    """The USB connection of a camera.
+
+    The fields are the bus, the port of the bus, the speed, the hub, and the most bytes that the camera can
+    reserve in a microframe.
+    """
 
     bus: int
     port: str
@@ -188,7 +193,11 @@ class Plug(NamedTuple):
 
 
 class Attached(NamedTuple):
-    """A camera. ``stable`` is its path that stays the same; ``fault`` says why it could not be asked."""
+    """An attached camera.
+
+    ``stable`` is the device path that stays the same. ``fault`` is the reason if the modes
+    cannot be read.
+    """
 
     device: str
     stable: str | None
@@ -199,34 +208,34 @@ class Attached(NamedTuple):
 
 
 def find_cameras(root: Path = Path("/")) -> list[Attached]:
-    """All cameras of this machine.
+    """Find all cameras of this machine.
 
     Parameters
     ----------
-    root : below which ``sys`` and ``dev`` lie.
+    root : folder that contains ``sys`` and ``dev``.
     """
     folder = root / "sys/class/video4linux"
-    found = []
+    cameras = []
     for entry in sorted(folder.iterdir(), key=_number) if folder.is_dir() else ():
         device = root / "dev" / entry.name
         modes: list[Mode] = []
         fault = None
         try:
-            opened = os.open(device, os.O_RDWR | os.O_NONBLOCK)
+            fd = os.open(device, os.O_RDWR | os.O_NONBLOCK)
         except OSError as error:
             fault = error.strerror
         else:
             try:
-                if not v4l2.is_camera(opened):
+                if not v4l2.is_camera(fd):
                     continue
-                modes = list_modes(opened)
+                modes = list_modes(fd)
             except OSError as error:
                 fault = error.strerror
             finally:
-                os.close(opened)
+                os.close(fd)
         name = _read(entry / "name") or entry.name
-        found.append(Attached(str(device), _stable(root, device), name, _plug(entry), tuple(modes), fault))
-    return found
+        cameras.append(Attached(str(device), _stable(root, device), name, _plug(entry), tuple(modes), fault))
+    return cameras
 
 
 def _number(entry: Path) -> int:
@@ -234,7 +243,7 @@ def _number(entry: Path) -> int:
 
 
 def _stable(root: Path, device: Path) -> str | None:
-    """By the camera's serial number or, where two have the same, by the port it is plugged into."""
+    """Return the stable path of a device, by its serial number; by its port if two cameras share a number."""
     for kind in ("by-id", "by-path"):
         folder = root / "dev/v4l" / kind
         for link in sorted(folder.iterdir()) if folder.is_dir() else ():
@@ -261,21 +270,21 @@ def _hub(usb: Path) -> str:
 
 
 def _most(usb: Path) -> int:
-    """Bytes in a microframe of the widest setting for pictures, from the descriptors (USB 2.0, 9.6)."""
+    """Return the most bytes per microframe of a video setting, from the descriptors (USB 2.0, 9.6)."""
     try:
         data = (usb / "descriptors").read_bytes()
     except OSError:
         data = b""
     streaming, most = False, 0
-    at = 0
-    while at + 1 < len(data) and data[at]:
-        length, kind = data[at], data[at + 1]
+    offset = 0
+    while offset + 1 < len(data) and data[offset]:
+        length, kind = data[offset], data[offset + 1]
         if kind == _INTERFACE and length >= 9:
-            streaming = (data[at + 5], data[at + 6]) == _VIDEO_STREAMING
+            streaming = (data[offset + 5], data[offset + 6]) == _VIDEO_STREAMING
         elif kind == _ENDPOINT and length >= 7 and streaming:
-            size = int.from_bytes(data[at + 4 : at + 6], "little")
+            size = int.from_bytes(data[offset + 4 : offset + 6], "little")
             most = max(most, (size & 0x7FF) * ((size >> 11 & 3) + 1))
-        at += length
+        offset += length
     return most or 3 * 1024
 
 
@@ -286,7 +295,7 @@ def _read(path: Path) -> str:
 
 
 def list_modes(device: int) -> list[Mode]:
-    """All that an open device can be set to; of sizes and rates in steps, the least and the greatest."""
+    """List all modes of an open device; if sizes or rates come in steps, the smallest and the largest."""
     return [
         Mode(name, width, height, rate_hz)
         for name in v4l2.list_formats(device)

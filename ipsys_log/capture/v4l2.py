@@ -1,4 +1,4 @@
-"""Video for Linux, version 2: its requests and structures, as ``linux/videodev2.h`` has them for 64 bits.
+"""Requests and structures of Video for Linux, version 2, as in ``linux/videodev2.h`` for 64 bits.
 
 References
 ----------
@@ -19,7 +19,7 @@ VIDEO_CAPTURE = 1
 MMAP = 1
 CAN_CAPTURE, CAN_STREAM, HAS_DEVICE_CAPS = 0x1, 0x0400_0000, 0x8000_0000
 CAN_SET_RATE = 0x1000
-# Of the flags of a buffer: which clock its stamp is of, and of which instant.
+# Flags of a buffer: the clock of its stamp, and the instant of its stamp.
 STAMP_CLOCK, STAMP_MONOTONIC = 0xE000, 0x2000
 STAMP_SOURCE, STAMP_OF_START = 0x7_0000, 0x1_0000
 DISCRETE = 1
@@ -42,7 +42,10 @@ class FormatDescription(ctypes.Structure):
 
 
 class FrameSize(ctypes.Structure):
-    """``sides`` is width and height or, where the type is not discrete, least, most and step of both."""
+    """A frame size.
+
+    For a discrete type, ``sides`` is width and height. Else it is the minimum, maximum and step of both.
+    """
 
     _fields_ = (
         ("index", c_uint32), ("pixel_format", c_uint32), ("type", c_uint32),
@@ -51,7 +54,11 @@ class FrameSize(ctypes.Structure):
 
 
 class FrameInterval(ctypes.Structure):
-    """``times`` is numerator and denominator, in s; where the type is not discrete, of least, most, step."""
+    """A frame interval.
+
+    For a discrete type, ``times`` is the numerator and the denominator of the interval in s. Else it is the
+    same for the minimum, the maximum and the step.
+    """
 
     _fields_ = (
         ("index", c_uint32), ("pixel_format", c_uint32), ("width", c_uint32), ("height", c_uint32),
@@ -60,7 +67,7 @@ class FrameInterval(ctypes.Structure):
 
 
 class Format(ctypes.Structure):
-    # A union with pointers in it: it begins at 8.
+    # The fields after "_" are a union with pointers, which begins at byte 8.
     _fields_ = (
         ("type", c_uint32), ("_", c_uint32), ("width", c_uint32), ("height", c_uint32),
         ("pixelformat", c_uint32), ("field", c_uint32), ("bytesperline", c_uint32),
@@ -97,7 +104,7 @@ class Int(ctypes.Structure):
 
 
 def _request(direction: int, number: int, kind: type[ctypes.Structure]) -> int:
-    """As ``asm-generic/ioctl.h`` makes it: 1 for what is written, 2 for what is read."""
+    """Return the number of a request as in ``asm-generic/ioctl.h``; direction 1 is write, 2 is read."""
     return direction << 30 | ctypes.sizeof(kind) << 16 | ord("V") << 8 | number
 
 
@@ -119,19 +126,19 @@ ENUM_FRAMEINTERVALS = _request(3, 75, FrameInterval)
 
 
 def call(device: int, request: int, struct: Struct) -> Struct:
-    """Put a request to an open device; what it answers stands in ``struct``.
+    """Send a request to an open device; the driver writes its answer into ``struct``.
 
     Raises
     ------
     OSError
-        As the driver says.
+        The driver reports an error.
     """
     ioctl(device, request, struct, True)
     return struct
 
 
 def fourcc(name: str) -> int:
-    """A pixel format's number.
+    """Return the number of a pixel format.
 
     Examples
     --------
@@ -142,30 +149,30 @@ def fourcc(name: str) -> int:
 
 
 def fourcc_name(number: int) -> str:
-    """A pixel format's name."""
+    """Return the name of a pixel format."""
     return number.to_bytes(4, "little").decode("ascii", "replace").strip()
 
 
 def is_camera(device: int) -> bool:
-    """Whether an open device hands over pictures; a camera has devices for other things too."""
+    """Return whether an open device delivers images; a camera also has devices for other purposes."""
     try:
-        known = call(device, QUERYCAP, Capability())
+        capability = call(device, QUERYCAP, Capability())
     except OSError as error:
         if error.errno in (errno.ENOTTY, errno.EINVAL):
             return False
         raise
-    has = known.device_caps if known.capabilities & HAS_DEVICE_CAPS else known.capabilities
-    return bool(has & CAN_CAPTURE and has & CAN_STREAM)
+    flags = capability.device_caps if capability.capabilities & HAS_DEVICE_CAPS else capability.capabilities
+    return bool(flags & CAN_CAPTURE and flags & CAN_STREAM)
 
 
 def list_formats(device: int) -> list[str]:
-    """Names of the pixel formats of an open device."""
+    """List the names of the pixel formats of an open device."""
     kinds = each(device, ENUM_FMT, lambda index: FormatDescription(index=index, type=VIDEO_CAPTURE))
     return [fourcc_name(kind.pixelformat) for kind in kinds]
 
 
 def each(device: int, request: int, at: Callable[[int], Struct]) -> Iterator[Struct]:
-    """What a driver counts up, until it says that there are no more."""
+    """Yield the answers of a driver for the indices 0, 1, 2 and so on, until there are no more."""
     for index in count():
         try:
             yield call(device, request, at(index))

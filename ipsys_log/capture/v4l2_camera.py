@@ -1,4 +1,4 @@
-"""Frames from a camera by Video for Linux, with the driver's stamps: its JPEG bytes, or encoded once."""
+"""Frames of a camera by Video for Linux, with the driver's stamps: its JPEG bytes, or encoded once."""
 
 from __future__ import annotations
 
@@ -23,13 +23,13 @@ __all__ = ["RAW_FORMATS", "Layout", "encode_raw", "open_v4l2"]
 
 Plane = NDArray[np.uint8]
 
-# The driver's names, the one that is taken first in front: of those with colour that of the fewest bytes.
+# The driver's names of raw formats, in order of preference. The colour format with the fewest bytes is first.
 RAW_FORMATS = ("NV12", "YUYV", "UYVY", "GREY")
 _QUALITY = 95
 
 
 class Layout(NamedTuple):
-    """Of a picture in memory: ``stride`` is how many bytes lie between the beginnings of two rows."""
+    """The layout of an image in memory; ``stride`` is the number of bytes from one row to the next."""
 
     format: str
     width: int
@@ -38,13 +38,13 @@ class Layout(NamedTuple):
 
     @property
     def size(self) -> int:
-        """How many bytes a picture takes."""
+        """The size of an image, in bytes."""
         rows = self.height + self.height // 2 if self.format == "NV12" else self.height
         return self.stride * rows
 
 
 def encode_raw(data: bytes, layout: Layout) -> bytes | None:
-    """A picture as JPEG, its levels as the camera gave them; None where data is missing.
+    """Encode an image as JPEG, with the grey levels of the camera; return None if data is missing.
 
     Examples
     --------
@@ -64,7 +64,7 @@ def encode_raw(data: bytes, layout: Layout) -> bytes | None:
 
 
 def _planes(rows: Plane, layout: Layout) -> list[Plane]:
-    """Brightness and, of colour, the two planes of it, which are smaller."""
+    """Return the brightness plane and, for colour formats, the two smaller colour planes."""
     width, height = layout.width, layout.height
     if layout.format == "GREY":
         return [rows[:, :width]]
@@ -77,16 +77,17 @@ def _planes(rows: Plane, layout: Layout) -> list[Plane]:
     return [pairs[:, 0::2], pairs[:, 1::4], pairs[:, 3::4]]
 
 
-# The driver's names of JPEG pictures.
+# The driver's names of JPEG images.
 _JPEG = ("MJPG", "JPEG")
 _BUFFERS = 8
 _TURN_S = 0.4
-# A camera that gives no picture for so long has gone, though it may still hand back empty buffers.
+# A camera that sends no image for this time is disconnected. It may still return empty buffers.
 _SILENT_S = 5.0
-# No camera loses so many frames in a row and is still there.
+# A larger gap of the frame numbers means that the driver counts from the start again. No connected camera
+# loses so many frames in a row.
 _COUNTS_ANEW = 10_000
 
-# Controls, by linux/v4l2-controls.h. What sets itself is turned off before the value is set.
+# Controls, by linux/v4l2-controls.h. An automatic control is turned off before its value is set.
 _EXPOSURE, _AUTO_EXPOSURE, _MANUAL, _SLOWER_IN_THE_DARK = 0x9A0902, 0x9A0901, 1, 0x9A0903
 _FOCUS, _AUTO_FOCUS = 0x9A090A, 0x9A090C
 _GAIN, _AUTO_GAIN = 0x980913, 0x980912
@@ -105,30 +106,30 @@ _FAULTS = {
 
 @contextmanager
 def open_v4l2(camera: RigCamera, clock: Clock, say: Say) -> Iterator[Iterator[Frame | None]]:
-    """The frames of a camera, as :data:`~ipsys_log.capture.frames.Open` says.
+    """Open a camera; an :data:`~ipsys_log.capture.frames.Open`.
 
     Raises
     ------
     SourceError
-        Where it cannot be opened; the iterator raises it where the camera has gone.
+        The camera cannot be opened. The iterator raises it when the camera is disconnected.
     """
     path = device_of(camera.source or "")
-    where = f"camera {camera.name}: {path}"
+    label = f"camera {camera.name}: {path}"
     with ExitStack() as stack:
-        with _faults(where):
+        with _faults(label):
             device = os.open(path, os.O_RDWR | os.O_NONBLOCK)
             stack.callback(os.close, device)
             if not v4l2.is_camera(device):
                 raise OSError(errno.ENOTTY, "")
-            given, layout = _set_up(device, camera, where)
-            say_refused(camera, given, say)
+            actual, layout = _set_up(device, camera, label)
+            say_refused(camera, actual, say)
             if layout is not None:
-                what = f"its {layout.format} pictures are encoded as JPEG once"
-                say(f"camera {camera.name}: gives no MJPG; {what}")
+                note = f"its {layout.format} pictures are encoded as JPEG once"
+                say(f"camera {camera.name}: gives no MJPG; {note}")
             buffers = _map_buffers(device, stack)
             v4l2.call(device, v4l2.STREAMON, v4l2.Int(v4l2.VIDEO_CAPTURE))
             stack.callback(_stop, device)
-        yield _frames(_Capture(camera, where, device, buffers, layout), clock, say)
+        yield _frames(_Capture(camera, label, device, buffers, layout), clock, say)
 
 
 @contextmanager
@@ -136,20 +137,20 @@ def _faults(where: str) -> Iterator[None]:
     try:
         yield
     except OSError as error:
-        said = _FAULTS.get(error.errno or 0, f"cannot be read ({error.strerror}); plug it in anew")
-        raise SourceError(f"{where}: {said}") from error
+        message = _FAULTS.get(error.errno or 0, f"cannot be read ({error.strerror}); plug it in anew")
+        raise SourceError(f"{where}: {message}") from error
 
 
 def _set_up(device: int, camera: RigCamera, where: str) -> tuple[Given, Layout | None]:
-    """Set a camera to what the rig asks for; what it gives then, and how, if not as JPEG."""
+    """Set a camera to the settings of the rig; return its actual settings, and the layout of raw images."""
     offers = v4l2.list_formats(device)
     name = next((name for name in (*_JPEG, *RAW_FORMATS) if name in offers), None)
     if name is None:
         raise SourceError(f"{where}: offers only {', '.join(offers)}; a camera that gives MJPG is needed")
-    wanted = v4l2.Format(type=v4l2.VIDEO_CAPTURE, pixelformat=v4l2.fourcc(name))
-    wanted.width, wanted.height = camera.width or 1920, camera.height or 1080
-    has = v4l2.call(device, v4l2.S_FMT, wanted)
-    if has.pixelformat != v4l2.fourcc(name):
+    requested = v4l2.Format(type=v4l2.VIDEO_CAPTURE, pixelformat=v4l2.fourcc(name))
+    requested.width, requested.height = camera.width or 1920, camera.height or 1080
+    format = v4l2.call(device, v4l2.S_FMT, requested)
+    if format.pixelformat != v4l2.fourcc(name):
         raise SourceError(
             f"{where}: does not give {name} at {camera.width} x {camera.height}; take another size"
         )
@@ -160,22 +161,22 @@ def _set_up(device: int, camera: RigCamera, where: str) -> tuple[Given, Layout |
     exposure = _control(device, _EXPOSURE, exposure)
     for auto, value in ((_AUTO_FOCUS, camera.focus), (_AUTO_GAIN, camera.gain)):
         _control(device, auto, None if value is None else 0)
-    given = Given(
-        has.width,
-        has.height,
+    actual = Given(
+        format.width,
+        format.height,
         _set_rate(device, camera.rate_hz),
         None if exposure is None else exposure / _EXPOSURE_UNITS,
         _control(device, _FOCUS, camera.focus),
         _control(device, _GAIN, camera.gain),
     )
     if name in _JPEG:
-        return given, None
-    least = has.width * (2 if name in ("YUYV", "UYVY") else 1)
-    return given, Layout(name, has.width, has.height, max(has.bytesperline, least))
+        return actual, None
+    least = format.width * (2 if name in ("YUYV", "UYVY") else 1)
+    return actual, Layout(name, format.width, format.height, max(format.bytesperline, least))
 
 
 def _set_rate(device: int, rate_hz: float | None) -> float | None:
-    """Frames per second after they were asked for; None where the driver does not tell."""
+    """Set the frame rate, and return the actual rate in Hz; None if the driver does not give it."""
     try:
         parameters = v4l2.call(device, v4l2.G_PARM, v4l2.StreamParameters(type=v4l2.VIDEO_CAPTURE))
         if rate_hz is not None and parameters.capability & v4l2.CAN_SET_RATE:
@@ -189,13 +190,14 @@ def _set_rate(device: int, rate_hz: float | None) -> float | None:
 
 
 def _control(device: int, control: int, value: float | None) -> float | None:
-    """A control's value after it was asked for; None where the camera has no such control, or none was."""
+    """Set a control, and return its actual value; None if ``value`` is None or the control is missing."""
     if value is None:
         return None
     try:
         v4l2.call(device, v4l2.S_CTRL, v4l2.Control(control, round(value)))
     except OSError as error:
-        # Out of range, read only, or taken care of by the camera: what it is now, is what it gives.
+        # The value is out of range, or the control is read-only or automatic.
+        # The result is its present value.
         if error.errno not in (errno.EINVAL, errno.ERANGE, errno.EACCES, errno.EBUSY, errno.EIO, errno.EPERM):
             raise
     try:
@@ -207,24 +209,24 @@ def _control(device: int, control: int, value: float | None) -> float | None:
 
 
 def _map_buffers(device: int, stack: ExitStack) -> list[mmap.mmap]:
-    """The driver's memory for frames; handed to it, empty."""
+    """Map the driver's frame buffers into memory, and give them to the driver, empty."""
     kind = {"type": v4l2.VIDEO_CAPTURE, "memory": v4l2.MMAP}
     granted = v4l2.call(device, v4l2.REQBUFS, v4l2.RequestBuffers(count=_BUFFERS, **kind))
     buffers = []
     for index in range(granted.count):
-        place = v4l2.call(device, v4l2.QUERYBUF, v4l2.Buffer(index=index, **kind))
+        buffer = v4l2.call(device, v4l2.QUERYBUF, v4l2.Buffer(index=index, **kind))
         buffers.append(
             stack.enter_context(
                 mmap.mmap(
                     device,
-                    place.length,
+                    buffer.length,
                     mmap.MAP_SHARED,
                     mmap.PROT_READ | mmap.PROT_WRITE,
-                    offset=place.offset,
+                    offset=buffer.offset,
                 )
             )
         )
-        v4l2.call(device, v4l2.QBUF, place)
+        v4l2.call(device, v4l2.QBUF, buffer)
     return buffers
 
 
@@ -232,7 +234,7 @@ def _stop(device: int) -> None:
     try:
         v4l2.call(device, v4l2.STREAMOFF, v4l2.Int(v4l2.VIDEO_CAPTURE))
     except OSError:
-        return  # a camera that has gone has stopped
+        return  # a disconnected camera has stopped already
 
 
 class _Capture(NamedTuple):
@@ -244,7 +246,7 @@ class _Capture(NamedTuple):
 
 
 def _frames(capture: _Capture, clock: Clock, say: Say) -> Iterator[Frame | None]:
-    heard_ns, said = clock.now_ns(), False
+    heard_ns, reported = clock.now_ns(), False
     last: int | None = None
     while True:
         with _faults(capture.where):
@@ -253,15 +255,15 @@ def _frames(capture: _Capture, clock: Clock, say: Say) -> Iterator[Frame | None]
             _check_heard(capture, clock.now_ns() - heard_ns)
             yield None
             continue
-        if not said:
-            said = True
+        if not reported:
+            reported = True
             _say_stamps(capture.camera, buffer.flags, say)
         stamped = buffer.flags & v4l2.STAMP_CLOCK == v4l2.STAMP_MONOTONIC
         stamp_ns = buffer.seconds * NS_PER_S + buffer.microseconds * 1000
         data = capture.buffers[buffer.index][: buffer.bytesused]
         with _faults(capture.where):
             v4l2.call(capture.device, v4l2.QBUF, buffer)
-        # The driver hands back a frame it could make nothing of as an empty one.
+        # The driver returns a frame that it cannot decode as an empty buffer.
         if data and capture.layout is not None:
             data = encode_raw(data, capture.layout) or b""
             if not data:
@@ -281,13 +283,13 @@ def _check_heard(capture: _Capture, silent_ns: int) -> None:
 
 
 def _missed(last: int | None, sequence: int) -> int:
-    """Frames between two numbers of 32 bits; none where a driver does not count, or counts anew."""
+    """Return the number of frames between two 32-bit numbers; 0 if a driver does not count, or restarts."""
     between = 0 if last is None else (sequence - last - 1) & 0xFFFF_FFFF
     return between if between < _COUNTS_ANEW else 0
 
 
 def _next_buffer(device: int) -> v4l2.Buffer | None:
-    """The next buffer with a frame; None while none comes."""
+    """Return the next buffer with a frame; None if no frame arrives in time."""
     select.select([device], [], [], _TURN_S)
     try:
         return v4l2.call(device, v4l2.DQBUF, v4l2.Buffer(type=v4l2.VIDEO_CAPTURE, memory=v4l2.MMAP))
@@ -296,13 +298,13 @@ def _next_buffer(device: int) -> v4l2.Buffer | None:
 
 
 def _say_stamps(camera: RigCamera, flags: int, say: Say) -> None:
-    """What the driver's stamps mean, where the rig says something else, or nothing."""
+    """Report the meaning of the driver's stamps if the rig has no meaning, or a different one."""
     head = f"camera {camera.name}: the driver stamps"
     if flags & v4l2.STAMP_CLOCK != v4l2.STAMP_MONOTONIC:
         say(f"{head} by another clock, so frames get the time they arrive at")
         return
-    means = "start" if flags & v4l2.STAMP_SOURCE == v4l2.STAMP_OF_START else "end"
+    meaning = "start" if flags & v4l2.STAMP_SOURCE == v4l2.STAMP_OF_START else "end"
     if camera.stamp is None:
-        say(f'{head} the {means} of a frame; put into the rig: stamp = "{means}"')
-    elif camera.stamp != means:
-        say(f"{head} the {means} of a frame, the rig says: {camera.stamp}")
+        say(f'{head} the {meaning} of a frame; put into the rig: stamp = "{meaning}"')
+    elif camera.stamp != meaning:
+        say(f"{head} the {meaning} of a frame, the rig says: {camera.stamp}")

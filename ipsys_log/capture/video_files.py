@@ -1,4 +1,4 @@
-"""Video files as frames, and as live cameras in real time."""
+"""Readers of video files, as frames and as live cameras in real time."""
 
 from __future__ import annotations
 
@@ -41,7 +41,7 @@ _RATE_HZ = 30
 
 
 class Timed(NamedTuple):
-    """A frame of a video, ``since_ns`` after its start."""
+    """A frame of a video, ``since_ns`` after the start of the video."""
 
     since_ns: int
     data: bytes
@@ -50,20 +50,20 @@ class Timed(NamedTuple):
 
 @contextmanager
 def open_video(path: Path, say: Say) -> Iterator[Iterator[Timed]]:
-    """The frames of a video file, its packets as they are.
+    """Open a video file, and yield its frames; the packets are unchanged.
 
-    No log holds frames that need later ones (B-frames), or other codecs than MJPEG, H.264 and H.265: of
-    such a file the pictures are decoded, and each encoded as JPEG.
+    A log cannot hold frames that need later frames (B-frames), or other codecs than MJPEG, H.264 and H.265.
+    The images of such a file are decoded, and each is encoded as JPEG.
 
     Parameters
     ----------
-    path : of the file.
-    say : told where pictures are encoded anew.
+    path : path of the file.
+    say : called if the images are encoded again.
 
     Raises
     ------
     SourceError
-        Where it cannot be read, or is no video.
+        The file cannot be read, or is no video.
     """
     import av
 
@@ -75,8 +75,8 @@ def open_video(path: Path, say: Say) -> Iterator[Iterator[Timed]]:
         if name and not stream.codec_context.has_b_frames:
             frames = _passed(container, stream, name)
         else:
-            why = "frames that need later ones" if name else f"{stream.codec_context.name} video"
-            say(f"{path}: has {why}, which no log holds; its pictures are encoded anew, as JPEG")
+            reason = "frames that need later ones" if name else f"{stream.codec_context.name} video"
+            say(f"{path}: has {reason}, which no log holds; its pictures are encoded anew, as JPEG")
             frames = _encoded(container, stream)
         yield _guarded(path, frames)
 
@@ -100,7 +100,7 @@ def _passed(container: InputContainer, stream: VideoStream, name: str) -> Iterat
     start: int | None = None
     for index, packet in enumerate(pass_through(container.demux(stream), stream)):
         if packet.pts is None or packet.time_base is None:
-            # Streams without a container have no times, only a rate.
+            # A stream without a container has no times, only a rate.
             yield Timed(round(index * NS_PER_S / (stream.guessed_rate or _RATE_HZ)), bytes(packet), name)
             continue
         start = packet.pts if start is None else start
@@ -110,17 +110,17 @@ def _passed(container: InputContainer, stream: VideoStream, name: str) -> Iterat
 def _encoded(container: InputContainer, stream: VideoStream) -> Iterator[Timed]:
     start: int | None = None
     stream.codec_context.options = {"max_pixels": str(MOST_PIXELS)}
-    for picture in container.decode(stream):
-        if picture.pts is None or picture.time_base is None:
+    for image in container.decode(stream):
+        if image.pts is None or image.time_base is None:
             continue
-        start = picture.pts if start is None else start
-        pixels = np.ascontiguousarray(picture.to_ndarray(format="rgb24"))
+        start = image.pts if start is None else start
+        pixels = np.ascontiguousarray(image.to_ndarray(format="rgb24"))
         data = simplejpeg.encode_jpeg(pixels, quality=_QUALITY, colorsubsampling="422")
-        yield Timed(round((picture.pts - start) * picture.time_base * NS_PER_S), data, "jpeg")
+        yield Timed(round((image.pts - start) * image.time_base * NS_PER_S), data, "jpeg")
 
 
 def frame_payload(time_ns: int, camera: str, data: bytes, format: str) -> CompressedImage | CompressedVideo:
-    """A frame as a log holds it.
+    """Return a frame as the payload of a message of a log.
 
     Examples
     --------
@@ -138,19 +138,19 @@ def read_videos(
     start_ns: int,
     say: Say,
 ) -> Iterator[Message]:
-    """Videos as frames, in log order; all begin at one instant.
+    """Yield the frames of videos as messages, in log order; all videos begin at the same instant.
 
     Parameters
     ----------
-    videos : by camera.
-    rig, lenses : written first, where given; lenses by camera.
-    start_ns : of their first frames.
-    say : told where pictures are encoded anew.
+    videos : video files, by camera.
+    rig, lenses : optional messages before the frames; ``lenses`` are the intrinsics by camera.
+    start_ns : time of the first frames.
+    say : called if the images are encoded again.
 
     Raises
     ------
     SourceError
-        Where a file cannot be read, or is no video.
+        A file cannot be read, or is no video.
     """
     log_ns = start_ns - len(lenses) - 1
     if rig is not None:
@@ -165,7 +165,7 @@ def read_videos(
         ]
         for camera, frame in heapq.merge(*streams, key=lambda item: item[1].since_ns):
             time_ns = start_ns + frame.since_ns
-            # What is of one instant follows by 1 ns.
+            # Frames of the same instant get log times 1 ns apart.
             log_ns = max(time_ns, log_ns + 1)
             payload = frame_payload(time_ns, camera, frame.data, frame.format)
             yield Message(image_topic(camera), log_ns, time_ns, payload, camera)
@@ -176,49 +176,51 @@ _TURN_S = 0.4
 
 @contextmanager
 def open_played(camera: RigCamera, clock: Clock, say: Say) -> Iterator[Iterator[Frame | None]]:
-    """The frames of a file, as :data:`~ipsys_log.capture.frames.Open` says, each at its time since the first.
+    """Open a file as a live camera; an :data:`~ipsys_log.capture.frames.Open`.
+
+    Each frame arrives at its time since the first frame.
 
     Parameters
     ----------
-    camera : its ``source`` is ``file:`` and a video or a log; of a log, the camera of its own name is taken,
-        or the one that is named: ``file:session.mcap?red``.
-    clock : frames are stamped by it, as if they were taken now.
-    say : told where pictures are encoded anew.
+    camera : its ``source`` is ``file:`` and a video or a log. From a log, the camera with the same name is
+        played, or the camera in the source: ``file:session.mcap?red``.
+    clock : gives the stamps, as if the frames were taken now.
+    say : called if the images are encoded again.
 
     Raises
     ------
     SourceError
-        Where the file cannot be read, or a log has no such camera.
+        The file cannot be read, or a log has no such camera.
     """
-    path, wanted = check_played(camera)
+    path, camera_name = check_played(camera)
     if path.suffix != ".mcap":
         with open_video(path, say) as frames:
             yield _play(frames, clock)
         return
     with Session([path]) as session:
-        topic = session.images.get(wanted or camera.name)
+        topic = session.images.get(camera_name or camera.name)
         if topic is None:
-            known = ", ".join(f"{path}?{other}" for other in session.images) or "none"
-            raise SourceError(f"camera {camera.name}: {path}: has no such camera; it has: {known}")
+            names = ", ".join(f"{path}?{other}" for other in session.images) or "none"
+            raise SourceError(f"camera {camera.name}: {path}: has no such camera; it has: {names}")
         yield _play(_recorded(session, topic), clock)
 
 
 def check_played(camera: RigCamera) -> tuple[Path, str]:
-    """The file that a source names, and the camera that it asks for, or nothing.
+    """Check that the file of a source exists; return the file and the camera in it (see :func:`file_of`).
 
     Raises
     ------
     SourceError
-        Where there is no such file.
+        The file does not exist.
     """
-    path, wanted = file_of(camera.source or "")
+    path, camera_name = file_of(camera.source or "")
     if not path.is_file():
         raise SourceError(f"camera {camera.name}: {path}: there is no such file")
-    return path, wanted
+    return path, camera_name
 
 
 def file_of(source: str) -> tuple[Path, str]:
-    """The file in a source, and the camera of it that is asked for, or nothing.
+    """Split a source into its file and the requested camera of this file (an empty string if none).
 
     Examples
     --------
@@ -226,8 +228,8 @@ def file_of(source: str) -> tuple[Path, str]:
     >>> path.name, camera
     ('session.mcap', 'red')
     """
-    name, _, wanted = source.partition(":")[2].partition("?")
-    return Path(name), wanted
+    name, _, camera_name = source.partition(":")[2].partition("?")
+    return Path(name), camera_name
 
 
 def _recorded(session: Session, topic: str) -> Iterator[Timed]:

@@ -1,4 +1,4 @@
-"""Packets of a video as they are in its container, made fit to stand in a log each by itself."""
+"""Packets of a video container, converted so that each packet can be one message of a log."""
 
 from __future__ import annotations
 
@@ -19,26 +19,26 @@ if TYPE_CHECKING:
 
 __all__ = ["can_begin", "find_size", "find_video", "name_format", "pass_through"]
 
-# FFmpeg's name of a codec, and that in the log.
+# FFmpeg's name of a codec, and the name in the log.
 _FORMATS = {"mjpeg": "jpeg", "h264": "h264", "hevc": "h265"}
 # The head of a unit of Annex B: the start code, and the byte that holds its type.
 _UNIT = re.compile(rb"\x00\x00\x01(.)", re.DOTALL)
-# Containers of one picture, as a camera's snapshot address gives it.
+# Containers of a single image, as from the snapshot address of a camera.
 _SINGLE = ("image2", "jpeg_pipe", "png_pipe")
 
 
 def find_video(container: InputContainer, where: str) -> VideoStream:
-    """The video in a container.
+    """Return the video stream of a container.
 
     Parameters
     ----------
-    container : as PyAV opened it.
-    where : what the error begins with.
+    container : container that PyAV opened.
+    where : first words of the error text.
 
     Raises
     ------
     SourceError
-        Where there is none, or only a single picture.
+        The container has no video, or only a single image.
     """
     if not container.streams.video:
         raise SourceError(f"{where}: is not video; give the address of the camera's picture stream")
@@ -49,27 +49,27 @@ def find_video(container: InputContainer, where: str) -> VideoStream:
 
 
 def name_format(stream: VideoStream) -> str | None:
-    """``jpeg``, ``h264`` or ``h265``; None for a codec that no log holds."""
+    """Return the format of a stream: ``jpeg``, ``h264`` or ``h265``; None if a log cannot hold its codec."""
     return _FORMATS.get(stream.codec_context.name)
 
 
 def pass_through(
     packets: Iterable[Packet[VideoStream]], stream: VideoStream
 ) -> Iterator[Packet[VideoStream]]:
-    """Packets of a stream from the first keyframe on; H.264 and H.265 as Annex B.
+    """Yield the packets of a stream from the first keyframe on; H.264 and H.265 as Annex B.
 
-    Each keyframe has the parameter sets before it, so that a reader can begin there.
+    The parameter sets come before each keyframe, so that a reader can begin at any keyframe.
 
     Parameters
     ----------
-    packets : as the container gives them.
-    stream : what they are of.
+    packets : packets from the container.
+    stream : stream of the packets.
     """
     from av.bitstream import BitStreamFilterContext
 
     name = stream.codec_context.name
     if name == "mjpeg":
-        # The last packet of PyAV's is an empty one.
+        # The last packet from PyAV is empty.
         yield from (packet for packet in packets if packet.size)
         return
     packed = (stream.codec_context.extradata or b"")[:1] == b"\x01"  # avcC and hvcC; Annex B begins with 0
@@ -89,9 +89,12 @@ def pass_through(
 
 
 def find_size(frame: Frame) -> tuple[int, int] | None:
-    """Width and height of a frame, in px; None where it does not tell: of a video, a keyframe does."""
+    """Return width and height of a frame, in px; None if the frame does not hold them.
+
+    In a video, only keyframes hold them.
+    """
     if frame.format == "jpeg":
-        with suppress(ValueError, KeyError):  # a damaged frame says nothing
+        with suppress(ValueError, KeyError):  # a damaged frame gives no size
             height, width, *_ = simplejpeg.decode_jpeg_header(frame.data, strict=False)
             return width, height
     return _find_video_size(frame) if frame.format in ("h264", "h265") else None
@@ -111,16 +114,16 @@ def _find_video_size(frame: Frame) -> tuple[int, int] | None:
 
 
 def can_begin(frame: Frame) -> bool:
-    """Whether a frame, as :func:`pass_through` gives it, needs none before it."""
+    """Return whether a frame from :func:`pass_through` can be decoded without earlier frames."""
     return frame.format not in ("h264", "h265") or _has_parameters(frame.data, frame.format == "h265")
 
 
 def _has_parameters(data: bytes | memoryview, wide: bool) -> bool:
-    """Whether a frame in Annex B, of H.265 if ``wide``, has the parameter sets before its picture."""
+    """Return whether a frame in Annex B (H.265 if ``wide``) has the parameter sets before its image."""
     for match in _UNIT.finditer(data):
         kind = match[1][0] >> 1 & 0x3F if wide else match[1][0] & 0x1F
-        if kind == (33 if wide else 7):  # the sequence's parameters
+        if kind == (33 if wide else 7):  # the sequence parameter set
             return True
-        if kind < 32 if wide else kind <= 5:  # a piece of the picture
+        if kind < 32 if wide else kind <= 5:  # a slice of the image
             return False
     return False

@@ -1,4 +1,4 @@
-"""Camera calibrations as the files of OpenCV, ROS and Kalibr: read and written."""
+"""Readers and writers of camera calibration files of OpenCV, ROS and Kalibr."""
 
 from __future__ import annotations
 
@@ -25,7 +25,7 @@ __all__ = [
     "ros_yaml",
 ]
 
-# Names under which programs write the camera matrix, the coefficients and the size.
+# Names that programs use in these files for the camera matrix, the coefficients and the image size.
 _K = ("mtx", "camera_matrix", "K", "cameraMatrix", "Camera_Matrix")
 _D = ("dist", "distortion_coefficients", "D", "distCoeffs", "dist_coeff", "Distortion_Coefficients")
 _WIDTH, _HEIGHT = ("img_width", "image_width", "width"), ("img_height", "image_height", "height")
@@ -40,8 +40,8 @@ _MODEL_OF_COUNT = {4: "kannala_brandt", 5: "plumb_bob", 8: "rational_polynomial"
 def read_opencv_calibration(path: Path, camera: str, time_ns: int = 0) -> CameraCalibration:
     """Read intrinsics from a FileStorage YAML, XML or JSON file, or a ``camera_info`` YAML of ROS.
 
-    The file names the distortion model. If it does not, four coefficients are those of the fisheye (k1..k4),
-    five and eight those of the pinhole.
+    The file names the distortion model. Without a name, four coefficients belong to the fisheye model
+    (k1..k4). Five or eight coefficients belong to the pinhole model.
 
     Raises
     ------
@@ -54,7 +54,7 @@ def read_opencv_calibration(path: Path, camera: str, time_ns: int = 0) -> Camera
         storage = cv2.FileStorage(_as_file_storage(path), cv2.FILE_STORAGE_READ | cv2.FILE_STORAGE_MEMORY)
         k, d = _read_matrix(storage, _K), _read_matrix(storage, _D)
         width, height = _number(storage, _WIDTH), _number(storage, _HEIGHT)
-        named = _text(storage, "distortion_model")
+        model_name = _text(storage, "distortion_model")
     except OSError as error:
         raise IpsysError(f"{path}: cannot be read: {error.strerror}") from error
     except (cv2.error, SystemError, ValueError) as error:
@@ -63,9 +63,11 @@ def read_opencv_calibration(path: Path, camera: str, time_ns: int = 0) -> Camera
         raise IpsysError(f"{path}: lacks the camera matrix, the distortion coefficients or the image size")
     if width < 0 or height < 0:
         raise IpsysError(f"{path}: its image width or height must be 1 to {_WIDEST_PX} pixels")
-    model = _MODEL_OF_NAME.get(named, named) or _MODEL_OF_COUNT.get(d.size, f"with {d.size} coefficients")
+    model = _MODEL_OF_NAME.get(model_name, model_name) or _MODEL_OF_COUNT.get(
+        d.size, f"with {d.size} coefficients"
+    )
     if model == "plumb_bob" and d.size == 4:
-        d = np.append(d, 0.0)  # k3 is often left out
+        d = np.append(d, 0.0)  # many files leave out k3
     lens = CameraCalibration(time_ns, camera, width, height, model, d.reshape(-1), k.reshape(3, 3))
     return check_calibration(lens, str(path))
 
@@ -75,7 +77,7 @@ def _as_file_storage(path: Path) -> str:
     if path.stat().st_size > _LARGEST_FILE:
         raise ValueError("too large")
     text = path.read_text(encoding="utf-8")
-    # OpenCV's reader is recursive for each level, without a limit.
+    # OpenCV's reader makes one recursive call per level, without a limit.
     if sum(map(text.count, "[{<")) > _MOST_BRACKETS or "\0" in text:
         raise ValueError("too many levels")
     is_yaml = path.suffix.lower() in (".yaml", ".yml")
@@ -112,15 +114,15 @@ def _text(storage: cv2.FileStorage, name: str) -> str:
 
 
 def opencv_yaml(lens: CameraCalibration, sigmas: Mapping[str, float], comment: str) -> str:
-    """A FileStorage YAML: matrix, coefficients, image size, and the standard deviations by name.
+    """Return a FileStorage YAML: matrix, coefficients, image size, and the standard deviations by name.
 
     Parameters
     ----------
-    lens : what is written.
-    sigmas : by name of the parameter, fx to the last coefficient.
-    comment : for the first lines.
+    lens : camera intrinsics to write.
+    sigmas : standard deviations by name of the parameter, fx to the last coefficient.
+    comment : text of the first lines.
     """
-    known = [f"   {name}: {value!r}" for name, value in sigmas.items()]
+    deviations = [f"   {name}: {value!r}" for name, value in sigmas.items()]
     lines = [
         "%YAML:1.0",
         "---",
@@ -133,13 +135,13 @@ def opencv_yaml(lens: CameraCalibration, sigmas: Mapping[str, float], comment: s
         *_matrix("distortion_coefficients", lens.D.size, 1, lens.D, tag=True),
         "# One standard deviation of each; 0 was not fitted.",
         "standard_deviations:",
-        *known,
+        *deviations,
     ]
     return "\n".join(lines) + "\n"
 
 
 def ros_yaml(lens: CameraCalibration, sigmas: Mapping[str, float], comment: str) -> str:  # noqa: ARG001
-    """A ``camera_info`` YAML; ROS calls the fisheye ``equidistant``."""
+    """Return a ``camera_info`` YAML; ROS calls the fisheye model ``equidistant``."""
     model = "equidistant" if lens.distortion_model == "kannala_brandt" else lens.distortion_model
     projection = np.column_stack([lens.K, np.zeros(3)])
     lines = [
@@ -157,7 +159,7 @@ def ros_yaml(lens: CameraCalibration, sigmas: Mapping[str, float], comment: str)
 
 
 def kalibr_yaml(lens: CameraCalibration, sigmas: Mapping[str, float], comment: str) -> str:  # noqa: ARG001
-    """A ``camchain`` YAML of one camera; :func:`check_format` says which lenses Kalibr has."""
+    """Return a ``camchain`` YAML of one camera; :func:`check_format` rejects models that Kalibr lacks."""
     fisheye = lens.distortion_model == "kannala_brandt"
     intrinsics = [lens.K[0, 0], lens.K[1, 1], lens.K[0, 2], lens.K[1, 2]]
     lines = [
@@ -174,7 +176,7 @@ def kalibr_yaml(lens: CameraCalibration, sigmas: Mapping[str, float], comment: s
     return "\n".join(lines) + "\n"
 
 
-# By the name a user gives: what writes it, and what is added to the name of the camera.
+# For each format name: the function that writes it, and the suffix after the camera name in the file name.
 FORMATS: dict[str, tuple[Callable[[CameraCalibration, Mapping[str, float], str], str], str]] = {
     "opencv": (opencv_yaml, ""),
     "ros": (ros_yaml, "_ros"),
@@ -183,12 +185,12 @@ FORMATS: dict[str, tuple[Callable[[CameraCalibration, Mapping[str, float], str],
 
 
 def check_format(name: str, lens_name: str) -> None:
-    """See that there is such a format and that it has the kind of lens, ``fisheye``, ``pinhole4`` ...
+    """Check that a format exists and supports the lens model (``fisheye``, ``pinhole4`` ...).
 
     Raises
     ------
     IpsysError
-        Otherwise.
+        The format does not exist, or does not support the lens model.
     """
     if name not in FORMATS:
         raise IpsysError(f"--format {name}: there is no such format; use one of {', '.join(FORMATS)}")
@@ -210,15 +212,15 @@ def _row(values: Iterable[float]) -> str:
 
 
 def read_lens(path: Path, camera: str) -> CameraCalibration:
-    """The lens of a camera from a YAML file of OpenCV or ROS, or from a log (``.mcap``).
+    """Read the intrinsics of a camera from a YAML file of OpenCV or ROS, or from a log (``.mcap``).
 
-    A log has it as the camera's newest calibration; one that holds a single calibration may have it under
-    another name.
+    From a log, the newest calibration of the camera is read. If the log holds the calibration of a single
+    camera, this camera may have another name.
 
     Raises
     ------
     IpsysError
-        Where there is no such file, it cannot be read, or it holds no calibration of this camera.
+        The file does not exist, cannot be read, or holds no calibration of this camera.
     """
     if path.suffix != ".mcap":
         return read_opencv_calibration(path, camera)
@@ -226,7 +228,7 @@ def read_lens(path: Path, camera: str) -> CameraCalibration:
         topics = log.calibrations
         name = next(iter(topics)) if len(topics) == 1 else camera
         if name not in topics:
-            held = ", ".join(topics) or "none"
-            raise IpsysError(f"{path}: holds no calibration of camera {camera}; it has those of: {held}")
+            names = ", ".join(topics) or "none"
+            raise IpsysError(f"{path}: holds no calibration of camera {camera}; it has those of: {names}")
         lens: CameraCalibration = log.payloads([topics[name]])[-1]
     return replace(lens, frame_id=camera)

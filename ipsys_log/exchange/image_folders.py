@@ -1,4 +1,4 @@
-"""Folders of images as messages, with the times from their names or from a table."""
+"""Reader of folders of images as messages, with the times from their names or from a table."""
 
 from __future__ import annotations
 
@@ -26,9 +26,10 @@ __all__ = ["FORMATS", "find_pictures", "find_times", "parse_start", "parse_time"
 
 NAMES = "names"
 _COLUMNS = ("file", "time")
-# A whole number says by its length what it counts: seconds since 1970 have 10 digits until 2286.
+# The number of digits of a time gives its unit: seconds since 1970 have 10 digits until 2286.
+# The values are the factors to ns.
 _DIGITS = {19: 1, 16: 1_000, 13: 1_000_000, 10: NS_PER_S}
-# In the names of files there are no colons.
+# The names of files have no colons, so other separators are valid too.
 _ISO = re.compile(r"(\d{4}-\d\d-\d\d)[T_ ](\d\d)[:.-](\d\d)[:.-](\d\d)([.,]\d{1,9})?(Z|[+-]\d\d:?\d\d)?")
 
 
@@ -63,40 +64,40 @@ def parse_time(text: str) -> int:
 
 
 def find_times(pictures: Mapping[str, list[Path]], times: str) -> dict[Path, int]:
-    """When pictures were taken, in ns since 1970.
+    """Return the capture times of images, in ns since 1970.
 
     Parameters
     ----------
-    pictures : by camera, from :func:`~ipsys_log.exchange.image_folders.find_pictures`.
+    pictures : image files by camera, from :func:`~ipsys_log.exchange.image_folders.find_pictures`.
     times : ``names``, or a CSV file with the columns ``file`` (such as ``red/0001.jpg``) and ``time``.
 
     Raises
     ------
     IpsysError
-        Where a picture has no time, or a time cannot be read, or two of one camera have the same.
+        An image has no time, a time cannot be read, or two images of one camera have the same time.
     """
     if times == NAMES:
-        found = {path: _time(path.stem, str(path)) for paths in pictures.values() for path in paths}
+        times_ns = {path: _time(path.stem, str(path)) for paths in pictures.values() for path in paths}
     else:
-        found = _read_table(Path(times), pictures)
+        times_ns = _read_table(Path(times), pictures)
     for paths in pictures.values():
         seen: dict[int, Path] = {}
         for path in paths:
-            if path not in found:
+            if path not in times_ns:
                 raise IpsysError(f"{times}: has no row for {path.parent.name}/{path.name}; add it")
-            other = seen.setdefault(found[path], path)
+            other = seen.setdefault(times_ns[path], path)
             if other is not path:
                 raise IpsysError(f"{path}: has the time of {other.name}; give each picture its own")
-    return found
+    return times_ns
 
 
 def parse_start(text: str) -> int:
-    """The time that ``--start`` gives.
+    """Parse the time of the option ``--start``.
 
     Raises
     ------
     IpsysError
-        Where it is none.
+        The text is no time.
     """
     return _time(text, "--start")
 
@@ -112,56 +113,58 @@ def _time(text: str, where: str) -> int:
 
 def _read_table(table: Path, pictures: Mapping[str, list[Path]]) -> dict[Path, int]:
     by_name = {f"{path.parent.name}/{path.name}": path for paths in pictures.values() for path in paths}
-    found = {}
+    times_ns = {}
     try:
         with table.open(newline="", encoding="utf-8-sig") as file:
             rows = csv.DictReader(file)
             if not set(_COLUMNS) <= set(rows.fieldnames or ()):
                 raise IpsysError(f"{table}: its first line must name the columns {' and '.join(_COLUMNS)}")
             for row in rows:
-                where = f"{table}: line {rows.line_num}"
+                label = f"{table}: line {rows.line_num}"
                 path = by_name.get(row["file"] or "")
                 if path is None:
-                    raise IpsysError(f"{where}: no picture is called {row['file']!r}; write red/0001.jpg")
-                found[path] = _time(row["time"] or "", where)
+                    raise IpsysError(f"{label}: no picture is called {row['file']!r}; write red/0001.jpg")
+                times_ns[path] = _time(row["time"] or "", label)
     except OSError as error:
         raise IpsysError(f"{table}: cannot be read: {error.strerror}") from error
     except (UnicodeDecodeError, csv.Error) as error:
         raise IpsysError(f"{table}: is not a CSV file: {error}") from error
-    return found
+    return times_ns
 
 
-# By file name; the bytes go into the log as they are.
+# The formats by suffix of the file name. The bytes are written to the log unchanged.
 FORMATS = {".jpg": "jpeg", ".jpeg": "jpeg", ".png": "png", ".webp": "webp"}
 OTHER_FORMATS = (".bmp", ".tif", ".tiff", ".gif", ".heic", ".pgm", ".ppm", ".raw", ".dng")
 
-# Pictures that tell no time start here, so that the same folder gives the same log.
+# Images without times start at this time, so that the same folder gives the same log.
 START_NS = 1_577_836_800 * NS_PER_S  # 2020-01-01
 
 
 def find_pictures(folder: Path) -> dict[str, list[Path]]:
-    """The pictures of a folder with one sub-folder per camera, by camera.
+    """Find the images of a folder with one sub-folder per camera; return them by camera.
 
-    In the order of their names, numbers in them by their value: img2 before img10.
+    The images are in the order of their names. Numbers in the names count by their value: img2 before img10.
 
     Raises
     ------
     IpsysError
-        Where there are none, or a picture is in a format that cannot be read.
+        The folder has no images, or an image has a format that cannot be read.
     """
     if not folder.is_dir():
         raise IpsysError(f"{folder}: there is no such folder")
     pictures = {}
     for sub in sorted(path for path in folder.iterdir() if path.is_dir()):
         files = [path for path in sub.iterdir() if path.is_file() and not path.name.startswith(".")]
-        other = sorted(path for path in files if path.suffix.lower() in OTHER_FORMATS)
-        if other:
-            known = ", ".join(FORMATS)
-            raise IpsysError(f"{other[0]}: only {known} are read; convert the picture, or take it out")
-        found = [path for path in files if path.suffix.lower() in FORMATS]
-        if found:
+        unreadable = sorted(path for path in files if path.suffix.lower() in OTHER_FORMATS)
+        if unreadable:
+            suffixes = ", ".join(FORMATS)
+            raise IpsysError(
+                f"{unreadable[0]}: only {suffixes} are read; convert the picture, or take it out"
+            )
+        images = [path for path in files if path.suffix.lower() in FORMATS]
+        if images:
             name = check_name(sub.name, f"{sub}: rename the folder; camera name")
-            pictures[name] = sorted(found, key=_by_number)
+            pictures[name] = sorted(images, key=_by_number)
     if not pictures:
         raise IpsysError(f"{folder}: has no sub-folders with pictures (.jpg, .png); make one for each camera")
     return pictures
@@ -179,29 +182,31 @@ def read_images(
     rate_hz: float,
     times_ns: Mapping[Path, int] | None = None,
 ) -> Iterator[Message]:
-    """Pictures as frames, in log order; the n-th of all cameras are of one instant, unless times are given.
+    """Yield images as messages of frames, in log order.
+
+    Without times, the n-th images of all cameras have the same time.
 
     Parameters
     ----------
-    pictures : by camera, from :func:`find_pictures`.
-    rig, lenses : written first, where given; lenses by camera.
-    rate_hz : pictures per second.
-    times_ns : when each was taken, from :func:`~ipsys_log.exchange.image_folders.find_times`; then there is
-        no rate.
+    pictures : image files by camera, from :func:`find_pictures`.
+    rig, lenses : optional messages before the frames; ``lenses`` are the intrinsics by camera.
+    rate_hz : images per second.
+    times_ns : capture time of each image, from :func:`~ipsys_log.exchange.image_folders.find_times`. With
+        times, the rate has no effect.
 
     Raises
     ------
     IpsysError
-        Where a lens is of a camera without pictures, or the rate is none.
+        A camera with intrinsics has no images, or the rate is invalid.
     """
     if not 1e-6 <= rate_hz <= 1e6:
         raise IpsysError(f"--rate {rate_hz:g}: give pictures per second, above 0")
     strange = sorted(set(lenses) - set(pictures))
     if strange:
-        known = ", ".join(pictures)
-        raise IpsysError(f"--calibration {strange[0]}: there are no pictures of such a camera (only {known})")
+        names = ", ".join(pictures)
+        raise IpsysError(f"--calibration {strange[0]}: there are no pictures of such a camera (only {names})")
     taken_ns = times_ns if times_ns is not None else _even_times(pictures, rate_hz)
-    # What is written at one instant follows by 1 ns.
+    # Messages of the same instant get log times 1 ns apart.
     log_ns = min(taken_ns.values()) - len(lenses) - 1 if times_ns is not None else START_NS
     if rig is not None:
         yield Message(RIG_TOPIC, log_ns, log_ns, rig)
@@ -216,7 +221,7 @@ def read_images(
 
 
 def _even_times(pictures: Mapping[str, list[Path]], rate_hz: float) -> dict[Path, int]:
-    """One instant takes the time of its number."""
+    """Return times at a constant rate; images with the same number get the same time."""
     return {
         path: START_NS + round((number + 1) * NS_PER_S / rate_hz)
         for paths in pictures.values()

@@ -1,10 +1,10 @@
-"""The measurements that the authors of the paper published, as messages of a log.
+"""Reader of the published measurements of the paper's authors, as messages of a log.
 
-The folder is that of the data alone, or a clone of their repository
+The folder holds the data alone, or a clone of the authors' repository
 (https://github.com/iMSEL-USC/Indoor-Positioning-System-iMSEL).
 
-SciPy's reader trusts the types and flags in a file: wrong ones crash the process.
-Layout: "MAT-File Format", The MathWorks, chapter 1.
+SciPy's reader of MAT files is not used: wrong types or flags in a file crash its process.
+Layout of the files: "MAT-File Format", The MathWorks, chapter 1.
 """
 
 from __future__ import annotations
@@ -43,7 +43,7 @@ __all__ = ["read_imsel", "read_mat"]
 
 _HEAD = 128  # bytes
 _LITTLE_ENDIAN = b"\x00\x01IM"
-_TAG = struct.Struct("<II")  # type, bytes that follow
+_TAG = struct.Struct("<II")  # type, number of the following bytes
 _MATRIX, _COMPRESSED, _FLAGS, _DIMENSIONS, _TEXT = 14, 15, 6, 5, 1
 _NUMBERS = {
     1: "i1", 2: "u1", 3: "<i2", 4: "<u2", 5: "<i4", 6: "<u4", 7: "<f4", 9: "<f8", 12: "<i8", 13: "<u8",
@@ -72,11 +72,11 @@ def read_mat(path: Path) -> dict[str, NDArray[np.float64]]:
 
 
 def _matrices(data: bytes) -> Iterator[bytes]:
-    at = _HEAD
-    while at < len(data):
-        kind, size = _TAG.unpack_from(data, at)
-        body = data[at + _TAG.size : at + _TAG.size + size]
-        at += _TAG.size + size
+    offset = _HEAD
+    while offset < len(data):
+        kind, size = _TAG.unpack_from(data, offset)
+        body = data[offset + _TAG.size : offset + _TAG.size + size]
+        offset += _TAG.size + size
         if len(body) < size:
             raise ValueError("it is cut off")
         if kind == _COMPRESSED:
@@ -104,22 +104,22 @@ def _table(matrix: bytes) -> tuple[str, NDArray[np.float64]]:
 
 
 def _parts(matrix: bytes) -> Iterator[tuple[int, bytes]]:
-    at = 0
-    while at < len(matrix):
-        kind, size = _TAG.unpack_from(matrix, at)
-        start, step = at + _TAG.size, _TAG.size + -(-size // 8) * 8
-        if kind >> 16:  # up to four bytes lie in the tag
-            kind, size, start, step = kind & 0xFFFF, kind >> 16, at + 4, _TAG.size
+    offset = 0
+    while offset < len(matrix):
+        kind, size = _TAG.unpack_from(matrix, offset)
+        start, step = offset + _TAG.size, _TAG.size + -(-size // 8) * 8
+        if kind >> 16:  # the tag itself holds up to four bytes
+            kind, size, start, step = kind & 0xFFFF, kind >> 16, offset + 4, _TAG.size
         if start + size > len(matrix) or (step == _TAG.size and size > 4):
             raise ValueError("a part of a table is cut off")
         yield kind, matrix[start : start + size]
-        at += step
+        offset += step
 
 
 CAMERAS = {"red": "cam_gnt", "white": "cam_wht", "black": "cam_blk_new_2"}
 SUBSETS = (10, 20, 30, 40)
 
-# The places were measured before the paper was submitted; no time was published. Each gets a second.
+# The points were measured before the paper was submitted. No time is published, so each point gets a second.
 START_NS = 1_640_995_200 * NS_PER_S  # 2022-01-01
 
 _RIG = Rig(
@@ -136,8 +136,8 @@ _RIG = Rig(
 def read_imsel(folder: Path) -> Iterator[Message]:
     """Yield the authors' rig, intrinsics, camera points and measured points, in log order.
 
-    Each point is measured for one camera, and gets a separate second. The 40 training points are labelled
-    ``train``, the published subsets ``train_10`` to ``train_40``, the others ``test``.
+    Each point is measured for one camera, and gets a separate second. The 40 training points have the label
+    ``train``, and the published subsets the labels ``train_10`` to ``train_40``. The others have ``test``.
 
     Raises
     ------
@@ -167,12 +167,12 @@ def _training(count: int) -> str:
 def _find(folder: Path, name: str) -> Path:
     if not folder.is_dir():
         raise IpsysError(f"{folder}: there is no such folder; name that of the authors' .mat files")
-    found = sorted(folder.rglob(name), key=lambda path: (len(path.parts), path))
-    if not found:
+    matches = sorted(folder.rglob(name), key=lambda path: (len(path.parts), path))
+    if not matches:
         raise IpsysError(
             f"{folder}: has no {name}; name the folder of the authors' data, or of their repository"
         )
-    return found[0]
+    return matches[0]
 
 
 def _array(mats: dict[str, dict[str, Any]], mat: str, name: str) -> NDArray[np.float64]:
@@ -185,7 +185,7 @@ def _array(mats: dict[str, dict[str, Any]], mat: str, name: str) -> NDArray[np.f
 def _places(
     mats: dict[str, dict[str, Any]], camera: str
 ) -> Iterator[tuple[NDArray[np.float64], NDArray[np.float64], tuple[str, ...]]]:
-    """Camera point, world point (m) and labels of each place: the training pairs, then the others."""
+    """Yield camera point (m), world point (m) and labels of each calibration point; training points first."""
     largest = _training(SUBSETS[-1])
     subsets = {
         f"train_{n}": {tuple(row) for row in _array(mats, _training(n), f"Xc_{camera}").tolist()}

@@ -1,1 +1,1 @@
-"""What people read: tables and figures, in centimetres."""
+"""Reports for people: texts, tables and figures, in centimetres."""

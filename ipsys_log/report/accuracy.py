@@ -1,4 +1,4 @@
-"""How accurate a session is: one summary, as it is read from a log and as JSON."""
+"""The accuracy of a session: the evaluations in a log, and their summary as JSON."""
 
 from __future__ import annotations
 
@@ -28,7 +28,7 @@ __all__ = ["Accuracy", "accuracy_json", "gather_suspects", "read_accuracy"]
 
 @dataclass(frozen=True, slots=True)
 class Accuracy:
-    """One model's evaluation, and its tracks against the truth where there is one."""
+    """The evaluation of one model, and the errors of its tracks if the log has ground truth."""
 
     run: str
     evaluation: Evaluation | None
@@ -39,19 +39,19 @@ class Accuracy:
         return self.evaluation.model if self.evaluation else self.run
 
     def rows(self, cross_validated: bool) -> list[CameraEvaluation]:
-        """The rows by cross-validation, or those of the places held out."""
+        """Return the cross-validated rows, or the rows on held-out points."""
         rows = self.evaluation.cameras if self.evaluation else ()
         return [row for row in rows if (row.scheme == CROSS_VALIDATION) == cross_validated]
 
     def rmse_m(self, row: CameraEvaluation, errors: ErrorStatistics | None) -> float | None:
-        """Return the RMSE of a row in space, or on the floor."""
+        """Return the RMSE of the errors of a row, in space or on the floor."""
         repeats = count_repeats(row, self.evaluation.cameras if self.evaluation else ())
         return None if errors is None or repeats is None else root_mean_square_m(errors, repeats)
 
 
 def read_accuracy(session: Session, outcomes: Sequence[Outcome]) -> list[Accuracy]:
-    """What a replay has found, read from the log that holds it."""
-    found = []
+    """Read the accuracy of each model from the log that a replay has written."""
+    accuracies = []
     for evaluated, fused in _run_pairs(outcomes):
         run = evaluated or fused
         evaluations = session.payloads(session.topics(EVALUATION, run))
@@ -63,14 +63,14 @@ def read_accuracy(session: Session, outcomes: Sequence[Outcome]) -> list[Accurac
                 carried=_told_heights(session, fused),
             )
         if evaluations or tracks is not None:
-            found.append(Accuracy(run, evaluations[-1] if evaluations else None, tracks))
-    return found
+            accuracies.append(Accuracy(run, evaluations[-1] if evaluations else None, tracks))
+    return accuracies
 
 
 def _run_pairs(outcomes: Sequence[Outcome]) -> list[tuple[str, str]]:
-    """For each model the run that evaluates it and the run that has its tracks, "" where there is none.
+    """Return for each model the run of its evaluation and the run of its tracks; "" if there is none.
 
-    They differ in name where a model was evaluated again, as with other folds.
+    The two names differ if a model was evaluated again, for example with other folds.
     """
     pairs: list[tuple[str, str]] = []
     for outcome in outcomes:
@@ -89,11 +89,11 @@ def _told_heights(session: Session, run: str) -> bool:
 
 
 def accuracy_json(accuracies: Sequence[Accuracy]) -> dict[str, Any]:
-    """The summary as plain data, in cm.
+    """Return the summary as plain data, in cm.
 
-    ``models -> cameras -> 3d / 2d`` on places held out, in each of these ``cross_validation`` and
-    ``truth`` where there are such; ``pooled`` has the same over all cameras. ``recommendation`` is there
-    where learning curves are.
+    ``models -> cameras -> 3d / 2d`` are the errors on held-out points. Each camera may also have
+    ``cross_validation`` and ``truth``. ``pooled`` has the same over all cameras. ``recommendation`` exists
+    only with learning curves.
     """
     models = {accuracy.model: _model_json(accuracy) for accuracy in accuracies}
     advice = advise([accuracy.evaluation for accuracy in accuracies if accuracy.evaluation])
@@ -103,35 +103,35 @@ def accuracy_json(accuracies: Sequence[Accuracy]) -> dict[str, Any]:
 def _model_json(accuracy: Accuracy) -> dict[str, Any]:
     cameras: dict[str, Any] = {}
     for row in (*accuracy.rows(False), *accuracy.rows(True)):
-        place = cameras.setdefault(row.camera, {})
+        target = cameras.setdefault(row.camera, {})
         if row.scheme == CROSS_VALIDATION:
-            place = place.setdefault("cross_validation", {})
+            target = target.setdefault("cross_validation", {})
         if row.against != "tape":
-            place = place.setdefault(row.against, {})
-        place.update(_row_json(accuracy, row))
-    found: dict[str, Any] = {"run": accuracy.run}
+            target = target.setdefault(row.against, {})
+        target.update(_row_json(accuracy, row))
+    summary: dict[str, Any] = {"run": accuracy.run}
     if POOLED in cameras:
-        found["pooled"] = cameras.pop(POOLED)
-    found["cameras"] = cameras
+        summary["pooled"] = cameras.pop(POOLED)
+    summary["cameras"] = cameras
     if accuracy.evaluation is not None:
-        found["learning_curve"] = [_learning_json(point) for point in accuracy.evaluation.learning]
-        found["suspects"] = [_suspect_json(suspect) for suspect in accuracy.evaluation.suspects]
+        summary["learning_curve"] = [_learning_json(point) for point in accuracy.evaluation.learning]
+        summary["suspects"] = [_suspect_json(suspect) for suspect in accuracy.evaluation.suspects]
     if accuracy.tracks is not None:
         space, floor = (_statistics(errors, root_mean_square_m(errors)) for errors in accuracy.tracks)
-        found["tracks"] = {"truth": {"3d": space, "2d": floor}}
-    return found
+        summary["tracks"] = {"truth": {"3d": space, "2d": floor}}
+    return summary
 
 
 def _row_json(accuracy: Accuracy, row: CameraEvaluation) -> dict[str, Any]:
-    found: dict[str, Any] = {}
+    summary: dict[str, Any] = {}
     if row.error_3d is not None:
-        found["3d"] = _statistics(row.error_3d, accuracy.rmse_m(row, row.error_3d))
-    found["2d"] = _statistics(row.error_2d, accuracy.rmse_m(row, row.error_2d))
+        summary["3d"] = _statistics(row.error_3d, accuracy.rmse_m(row, row.error_3d))
+    summary["2d"] = _statistics(row.error_2d, accuracy.rmse_m(row, row.error_2d))
     if row.bias_m is not None:
-        found["bias_cm"] = (row.bias_m * CM_PER_M).tolist()
+        summary["bias_cm"] = (row.bias_m * CM_PER_M).tolist()
     if row.within_68 is not None and row.within_95 is not None:
-        found["within"] = {"68": row.within_68, "95": row.within_95}
-    return found
+        summary["within"] = {"68": row.within_68, "95": row.within_95}
+    return summary
 
 
 def _statistics(errors: ErrorStatistics, rmse_m: float | None) -> dict[str, float | int]:
@@ -146,26 +146,26 @@ def _statistics(errors: ErrorStatistics, rmse_m: float | None) -> dict[str, floa
         "mean_low_cm": errors.mean_low_m,
         "mean_high_cm": errors.mean_high_m,
     }
-    found: dict[str, float | int] = {k: v * CM_PER_M for k, v in values.items() if v is not None}
-    return {**found, "n": errors.count}
+    values_cm: dict[str, float | int] = {k: v * CM_PER_M for k, v in values.items() if v is not None}
+    return {**values_cm, "n": errors.count}
 
 
 def _learning_json(point: LearningPoint) -> dict[str, Any]:
-    found: dict[str, Any] = {"camera": point.camera, "pairs": point.pairs, "subsets": point.subsets}
+    summary: dict[str, Any] = {"camera": point.camera, "pairs": point.pairs, "subsets": point.subsets}
     if point.label is not None:
-        found["label"] = point.label
+        summary["label"] = point.label
     for kind, mean_m, std_m in (
         ("3d", point.mean_3d_m, point.std_3d_m),
         ("2d", point.mean_2d_m, point.std_2d_m),
     ):
-        found[kind] = {"mean_cm": mean_m * CM_PER_M}
+        summary[kind] = {"mean_cm": mean_m * CM_PER_M}
         if std_m is not None:
-            found[kind]["std_cm"] = std_m * CM_PER_M
-    return found
+            summary[kind]["std_cm"] = std_m * CM_PER_M
+    return summary
 
 
 def _advice_json(advice: Advice) -> dict[str, Any]:
-    """For each number of places and group of models the one to use, and the lowest, see :mod:`.advice`."""
+    """Return the model to use and the lowest error, by number of points and model group (:mod:`.advice`)."""
     return {
         "subsets": "labelled" if advice.published else "random",
         "errors": "3d" if advice.in_space else "2d",
@@ -187,26 +187,29 @@ def _choice_json(choice: Choice) -> dict[str, Any]:
 
 
 def _suspect_json(suspect: Suspect) -> dict[str, Any]:
-    found: dict[str, Any] = {
+    summary: dict[str, Any] = {
         "measurement": suspect.measurement,
         "cameras": list(suspect.cameras),
         "residual_cm": (suspect.residual_m * CM_PER_M).tolist(),
         "score": suspect.score,
     }
     if suspect.kind is not None:
-        found["kind"] = suspect.kind
+        summary["kind"] = suspect.kind
     if suspect.text is not None:
-        found["text"] = suspect.text
+        summary["text"] = suspect.text
     if suspect.corrected_m is not None:
-        found["corrected_m"] = suspect.corrected_m.tolist()
-    return found
+        summary["corrected_m"] = suspect.corrected_m.tolist()
+    return summary
 
 
 def gather_suspects(accuracies: Sequence[Accuracy]) -> list[tuple[Suspect, list[str]]]:
-    """Each suspect as the last model has it that names it, and all that do; the one off by most first."""
-    found: dict[str, tuple[Suspect, list[str]]] = {}
+    """Return each outlier, from the last model that names it, with the names of all models that do.
+
+    The outlier with the largest residual is first.
+    """
+    by_measurement: dict[str, tuple[Suspect, list[str]]] = {}
     for accuracy in accuracies:
         for suspect in accuracy.evaluation.suspects if accuracy.evaluation else ():
-            models = found.get(suspect.measurement, (suspect, []))[1]
-            found[suspect.measurement] = (suspect, [*models, accuracy.model])
-    return sorted(found.values(), key=lambda pair: -float((pair[0].residual_m ** 2).sum()))
+            models = by_measurement.get(suspect.measurement, (suspect, []))[1]
+            by_measurement[suspect.measurement] = (suspect, [*models, accuracy.model])
+    return sorted(by_measurement.values(), key=lambda pair: -float((pair[0].residual_m ** 2).sum()))

@@ -1,13 +1,17 @@
 """Advice on the number of calibration points and on the model, from learning curves.
 
-The rule: of the models of a group the simplest one whose mean error is within the noise of the lowest
-(the one-standard-error rule of Breiman et al., with a 95 % interval of the difference for the one standard
-error). Simple is what has few free parameters. The mean is that of a learning curve over all cameras: of
-the subsets that somebody labelled, where the log has such, else of random ones. Its noise is what the
-mean would vary by with other places to judge it at (the bootstrap interval of the model's error at the
-places held out, or by cross-validation, in proportion) and, for random subsets, with others of these.
-Two models are judged at the same places, which makes their errors alike: the rule rather takes a
-difference for noise than noise for a difference.
+The rule selects the simplest model of a group whose mean error is within the noise of the lowest mean error.
+It is the one-standard-error rule of Breiman et al., with a 95 % interval of the difference instead of one
+standard error. A simple model has few free parameters.
+
+The mean error is that of a learning curve over all cameras. The curve uses the labelled subsets of the log,
+or random subsets if there are no labels. The noise has two parts. The first part is the variation of the
+mean with other test points. Its estimate is the bootstrap interval of the model's error on held-out points,
+or by cross-validation, scaled in proportion to the mean. The second part exists for random subsets only: the
+variation with other random subsets.
+
+All models have the same test points, so their errors are similar. Therefore the rule tends to take a
+difference for noise. It rarely takes noise for a difference.
 
 References
 ----------
@@ -48,7 +52,7 @@ __all__ = [
 
 
 class CurvePoint(NamedTuple):
-    """A mean error at so many places for each camera; ``std_m`` is its spread over random subsets."""
+    """A mean error with a number of points per camera; ``std_m`` is its spread over random subsets."""
 
     places: int
     mean_m: float
@@ -60,26 +64,27 @@ Curve = list[CurvePoint]
 
 
 def has_published(evaluations: Sequence[Evaluation]) -> bool:
-    """Whether somebody chose subsets of several sizes to fit on, and labelled them."""
+    """Return whether the log has labelled subsets of several sizes for the fit."""
     sizes = {
         (point.camera, point.pairs)
         for evaluation in evaluations
         for point in evaluation.learning
         if point.label is not None
     }
-    return any(len({size for camera, size in sizes if camera == own}) > 1 for own, _ in sizes)
+    return any(len({size for camera, size in sizes if camera == this_camera}) > 1 for this_camera, _ in sizes)
 
 
 def camera_curve(evaluation: Evaluation, camera: str, published: bool, in_space: bool) -> Curve:
-    """The curve of one camera, of the published subsets or of random ones."""
+    """Return the learning curve of one camera, on the published subsets or on random subsets."""
     points = [p for p in evaluation.learning if (p.label is not None) == published and p.camera == camera]
     return _sorted(_point([point], point.pairs, in_space) for point in points)
 
 
 def mean_curve(evaluation: Evaluation, published: bool, in_space: bool) -> Curve:
-    """The mean over the cameras, where all of them have a point.
+    """Return the mean curve over the cameras, at the sizes that all cameras have.
 
-    Published subsets have one label for all cameras, and may differ in size by a place or two.
+    A published subset has one label for all cameras. Its size may differ between cameras by one or two
+    points.
     """
     points = [point for point in evaluation.learning if (point.label is not None) == published]
     groups: dict[str | int, list[LearningPoint]] = {}
@@ -100,19 +105,19 @@ def _sorted(points: Iterable[CurvePoint]) -> Curve:
 def _point(points: Sequence[LearningPoint], places: int, in_space: bool) -> CurvePoint:
     means_m = [point.mean_3d_m if in_space else point.mean_2d_m for point in points]
     stds_m = [point.std_3d_m if in_space else point.std_2d_m for point in points]
-    known = [std_m for std_m in stds_m if std_m is not None]
-    # Cameras see different places: their spreads are independent.
-    std_m = float(np.linalg.norm(known)) / len(points) if len(known) == len(points) else None
+    known_stds_m = [std_m for std_m in stds_m if std_m is not None]
+    # Cameras see different points, so their spreads are independent.
+    std_m = float(np.linalg.norm(known_stds_m)) / len(points) if len(known_stds_m) == len(points) else None
     return CurvePoint(places, float(np.mean(means_m)), std_m, min(point.subsets for point in points))
 
 
-# The simplest first, by free parameters per camera: 6 of a pose, some more of a lens, 30 of a polynomial,
-# as many as places, weights.
+# The simplest model first, by free parameters per camera: 6 for a pose, some more for lens distortion, 30 for
+# a polynomial, one per point for kriging, and the weights of a network.
 _SIMPLE_FIRST = (
     "rigid", "rayplane", "best", "poly", "rigid+poly", "kriging", "rigid+kriging",
     "kriging-regression", "rigid+kriging-regression", "ann", "rigid+ann",
 )  # fmt: skip
-# The paper recommends one of these two, by how many places there are.
+# The paper recommends one of these two, by the number of points.
 _SIMPLE = ("rigid", "poly")
 _OWN = ("rayplane", "best")
 SIMPLE, PAPER, ANY, TOLD = "simple", "paper", "any", "height_known"
@@ -128,7 +133,7 @@ _CONFIDENCE = 1.96
 
 @dataclass(frozen=True, slots=True)
 class Choice:
-    """Of a group of models the one to use, and the one with the lowest mean error."""
+    """The model to use of a group, and the model with the lowest mean error."""
 
     model: str
     mean_m: float
@@ -138,14 +143,15 @@ class Choice:
 
 @dataclass(frozen=True, slots=True)
 class Advice:
-    """What to use with how many places for each camera.
+    """The advice on the model, by the number of points per camera.
 
     Attributes
     ----------
-    published : whether subsets were chosen by somebody, or drawn.
-    in_space : whether errors are those in space, or on the floor: where heights cannot be learned.
-    choices : by number of places and group; the group ``height_known`` only where a model is told heights.
-    sentences : the same in words.
+    published : True for labelled subsets, False for random subsets.
+    in_space : True for errors in space, False for errors on the floor (if heights cannot be learned).
+    choices : choices by number of points and group. The group ``height_known`` exists only if a model gets
+        the heights as input.
+    sentences : the advice as text.
     """
 
     published: bool
@@ -155,10 +161,10 @@ class Advice:
 
     @property
     def groups(self) -> list[str]:
-        """The groups that say something else than those before them."""
+        """The groups whose choices differ from all groups before them."""
         shown: dict[str, list[Choice | None]] = {}
         for group in GROUPS:
-            column = [found.get(group) for found in self.choices.values()]
+            column = [choices.get(group) for choices in self.choices.values()]
             if any(column) and column not in shown.values():
                 shown[group] = column
         return list(shown)
@@ -171,30 +177,30 @@ class _Candidate:
     noise_m: float
 
     def like(self, other: _Candidate) -> bool:
-        """Return whether the difference is within the noise."""
+        """Return whether the difference to another candidate is within the noise."""
         return bool(self.mean_m - other.mean_m <= _CONFIDENCE * np.hypot(self.noise_m, other.noise_m))
 
 
 def told_height(model: str) -> bool:
-    """Whether a model is told the height of a marker, so that its error in space is one on the floor."""
+    """Return whether a model gets the height of a marker as input; then its 3D error is a 2D error."""
     return model in MODELS and reads_height(model)
 
 
 def label(model: str) -> str:
-    """A model's name, with the mark of :data:`TOLD_NOTE` where that holds for it."""
+    """Return the name of a model, with the mark of :data:`TOLD_NOTE` if the model gets heights as input."""
     return f"{model}*" if told_height(model) else model
 
 
 def advise(evaluations: Sequence[Evaluation]) -> Advice | None:
-    """The advice that learning curves give; None where there is none of two numbers of places."""
+    """Return the advice from learning curves; None without curves for at least two numbers of points."""
     published = has_published(evaluations)
     in_space = all(row.error_3d is not None for e in evaluations for row in e.cameras)
     table: dict[int, list[_Candidate]] = {}
     for evaluation in evaluations:
         noise = _relative_noise(evaluation, published, in_space)
         for point in mean_curve(evaluation, published, in_space):
-            found = _Candidate(evaluation.model, point.mean_m, _noise_m(point, noise))
-            table.setdefault(point.places, []).append(found)
+            candidate = _Candidate(evaluation.model, point.mean_m, _noise_m(point, noise))
+            table.setdefault(point.places, []).append(candidate)
     if len(table) < 2:
         return None
     choices = {places: _choices(candidates) for places, candidates in sorted(table.items())}
@@ -202,7 +208,7 @@ def advise(evaluations: Sequence[Evaluation]) -> Advice | None:
 
 
 def _relative_noise(evaluation: Evaluation, published: bool, in_space: bool) -> float:
-    """Standard error of a mean over places, in units of the mean."""
+    """Return the standard error of a mean over points, in units of the mean."""
     scheme = [row for row in evaluation.cameras if (row.scheme == CROSS_VALIDATION) != published]
     rows = [row for row in scheme if row.against == "tape"]
     for row in [row for row in rows if row.camera == POOLED] or rows[:1]:
@@ -228,7 +234,7 @@ def _choices(candidates: Sequence[_Candidate]) -> dict[str, Choice]:
 
 
 def _choose(candidates: Sequence[_Candidate]) -> Choice:
-    # What is the same function, as poly and rigid+poly, differs in the last digits.
+    # Models that are the same function, as poly and rigid+poly, differ in the last digits only.
     lowest = min(candidates, key=lambda candidate: (round(candidate.mean_m, 9), _rank(candidate.model)))
     chosen = min((c for c in candidates if c.like(lowest)), key=lambda c: _rank(c.model))
     return Choice(chosen.model, chosen.mean_m, lowest.model, lowest.mean_m)
@@ -241,18 +247,18 @@ def _rank(model: str) -> int:
 def _sentences(
     choices: Mapping[int, Mapping[str, Choice]], table: Mapping[int, Sequence[_Candidate]]
 ) -> Iterable[str]:
-    """Return advice on the model by the number of points."""
-    if len({candidate.model for found in table.values() for candidate in found}) == 1:
-        means_cm = [found[0].mean_m * CM_PER_M for _, found in sorted(table.items())]
+    """Yield sentences of advice on the model, by the number of points."""
+    if len({candidate.model for row in table.values() for candidate in row}) == 1:
+        means_cm = [row[0].mean_m * CM_PER_M for _, row in sorted(table.items())]
         name = next(iter(table.values()))[0].model
         yield (
             f"The mean error of {name} is {means_cm[0]:.1f} cm with {min(table)} points per camera, "
             f"{means_cm[-1]:.1f} cm with {max(table)}."
         )
         return
-    simple = {c.model for found in table.values() for c in found if c.model in _SIMPLE}
+    simple = {c.model for row in table.values() for c in row if c.model in _SIMPLE}
     group, use = (SIMPLE, "Between rigid and poly, use") if len(simple) > 1 else (ANY, "Use")
-    by_places = {places: found[group].model for places, found in choices.items() if group in found}
+    by_places = {places: row[group].model for places, row in choices.items() if group in row}
     if by_places:
         yield f"{use} {_by_number(by_places)}."
     most = max(choices)
@@ -262,7 +268,7 @@ def _sentences(
 
 
 def _by_number(models: Mapping[int, str]) -> str:
-    """``rigid with up to 20 points per camera, poly from 30 on``."""
+    """Return text such as ``rigid with up to 20 points per camera, poly from 30 on``."""
     parts: list[tuple[str, list[int]]] = []
     for places, model in models.items():
         if parts and parts[-1][0] == model:
@@ -283,10 +289,12 @@ def _span(places: Sequence[int]) -> str:
 def _saving(
     start: str, model: str, usual: Choice, most: int, table: Mapping[int, Sequence[_Candidate]]
 ) -> Iterable[str]:
-    """Return the least number of points with which a model is as good as the usual one with most points."""
+    """Yield a sentence with the fewest points for which a model equals the usual model with most points."""
     if model == usual.model:
         return
-    means_m = {places: c.mean_m for places, found in table.items() for c in found if c.model == model}
+    means_m = {
+        places: c.mean_m for places, candidates in table.items() for c in candidates if c.model == model
+    }
     enough = [places for places, mean_m in sorted(means_m.items()) if mean_m <= usual.mean_m]
     if enough and enough[0] < most:
         usual_cm, least_cm = (f"{mean_m * CM_PER_M:.1f} cm" for mean_m in (usual.mean_m, means_m[most]))

@@ -1,4 +1,4 @@
-"""How the cameras of a log hang and what of the floor they see, and that in words."""
+"""The alignment of the cameras of a log, their coverage of the floor, and notes on both."""
 
 from __future__ import annotations
 
@@ -29,24 +29,28 @@ __all__ = ["AlignedLab", "read_alignment"]
 Lenses = Mapping[str, CameraCalibration]
 
 _LEAST_PLACES = 3
-# A camera whose places say another tilt than the markers do was moved in between.
+# Largest difference of the tilts from the calibration points and from the markers. Beyond it (plus three
+# sigmas), the camera has moved between the two.
 _MOVED_RAD = math.radians(1.0)
-# Markers nearer together than this part of the picture say little of its edges.
+# Markers within a smaller part of the image give little information about its edges.
 _NARROW = 0.5
 
 
 @dataclass(frozen=True, slots=True, eq=False)
 class AlignedLab:
-    """How cameras hang, and what they see.
+    """The alignment of the cameras of a lab, and their coverage.
 
     Attributes
     ----------
-    run : whose camera points these are.
-    alignments : one for each camera, by name.
-    lenses : by camera, where known.
-    hung : the cameras whose places in the world are known; ``coverage`` None where that is not all it takes.
-    overlaps : of neighbours, with a coverage or without one; ``diagonal_m`` what a marker needs.
-    notes : what to know of it.
+    run : run of the camera points.
+    rig : rig in force.
+    alignments : one alignment per camera, sorted by name.
+    lenses : known intrinsics, by camera.
+    hung : cameras with a known pose in the world.
+    coverage : coverage of the floor; None if the cameras or the floor are not known.
+    overlaps : overlaps of neighbouring cameras, also without a coverage.
+    diagonal_m : diagonal of a marker, the overlap that it needs.
+    notes : remarks on the result.
     """
 
     run: str
@@ -61,12 +65,13 @@ class AlignedLab:
 
 
 def read_alignment(session: Session, run: str, rig: Rig, lenses: Lenses) -> AlignedLab:
-    """Gather the markers that lie still in a log, and say how its cameras hang.
+    """Read the stationary markers of a log, and estimate the alignment of its cameras.
 
     Parameters
     ----------
-    run : of the camera points, best those of ``--method pose``.
-    rig, lenses : in force; the lenses by camera.
+    session : open logs.
+    run : run of the camera points; a run of ``--method pose`` is best.
+    rig, lenses : rig and intrinsics in force; ``lenses`` by camera.
     """
     notes: list[str] = []
     measurements, pairs = _measured(session, run, rig, notes)
@@ -76,7 +81,7 @@ def read_alignment(session: Session, run: str, rig: Rig, lenses: Lenses) -> Alig
     alignments = tuple(
         align_camera(camera, find_lying(seen, measurements)) for camera, seen in sorted(frames.items())
     )
-    notes += [note for one in alignments for note in _notes(one, lenses.get(one.camera))]
+    notes += [note for alignment in alignments for note in _notes(alignment, lenses.get(alignment.camera))]
     if any(point.poses == () for seen in frames.values() for frame in seen for point in frame.points):
         notes.append(
             "these camera points are by eq. (3), which overstates a tilt by half: go two thirds of the way, "
@@ -88,7 +93,7 @@ def read_alignment(session: Session, run: str, rig: Rig, lenses: Lenses) -> Alig
     if coverage is not None:
         overlaps = coverage.overlaps
     else:
-        # Without a tape, or without a floor to end at.
+        # There are no tape measurements, or the rig has no floor.
         near = hung if len(hung) > 1 else join_cameras(alignments, lenses)
         overlaps = find_overlaps(near, height_m) if near else ()
     diagonal_m = length_m * math.sqrt(2)
@@ -98,14 +103,15 @@ def read_alignment(session: Session, run: str, rig: Rig, lenses: Lenses) -> Alig
 def _measured(
     session: Session, run: str, rig: Rig, notes: list[str]
 ) -> tuple[list[Measurement], Mapping[str, Sequence[Pair]]]:
-    """What was measured, and what each camera saw of it; else what the newest model was fitted on."""
+    """Return the measurements and their pairs by camera; without measurements, the newest model's pairs."""
     places: list[Measured] = []
     try:
         view = LogView(session, {CAMERA_POINTS: run}, rig)
         places = measured(view)
         pairs = find_pairs(view, places)
     except IpsysError as error:
-        # A slip of the tape must not keep anybody from hanging a camera; heights are by the ruler.
+        # An error of a tape measurement must not block the alignment. It needs only the heights, which are
+        # measured with the ruler.
         notes.append(f"the measured places were left out: {error}")
         return [place.measurement for place in places], {}
     fitted = newest_run(session, MODEL)
@@ -122,8 +128,8 @@ def _notes(alignment: Alignment, lens: CameraCalibration | None) -> Iterator[str
         heights_m.setdefault(lying.marker_id, []).append(above_m)
     for marker_id, all_m in heights_m.items():
         mean_cm = float(np.mean(all_m)) * CM_PER_M
-        where = f"{abs(mean_cm):.0f} cm {'above' if mean_cm > 0 else 'below'} the plane of the others"
-        yield f"{name}: marker {marker_id} lies {where}, and was left out; lay it on the floor"
+        position = f"{abs(mean_cm):.0f} cm {'above' if mean_cm > 0 else 'below'} the plane of the others"
+        yield f"{name}: marker {marker_id} lies {position}, and was left out; lay it on the floor"
     if alignment.uneven_m is not None:
         yield (
             f"{name}: its markers do not lie on one plane (off by {alignment.uneven_m * CM_PER_M:.0f} cm): "
@@ -137,29 +143,31 @@ def _notes(alignment: Alignment, lens: CameraCalibration | None) -> Iterator[str
 
 
 def _part_of_picture(alignment: Alignment, lens: CameraCalibration) -> float:
-    """How much of the picture's width or height markers span, whichever is more."""
+    """Return the part of the image that the markers span: of its width or its height, the larger part."""
     middle, end = lens.K[:2, 2], np.array([lens.width - 1.0, lens.height - 1.0])
     edges = np.array([[0, middle[1]], [end[0], middle[1]], [middle[0], 0], [middle[0], end[1]]])
     (left, right, top, bottom) = undistort(edges, lens)
-    uv = np.array([one.point_m[:2] / one.point_m[2] for one in alignment.lying])
+    uv = np.array([marker.point_m[:2] / marker.point_m[2] for marker in alignment.lying])
     return float(np.nanmax(np.ptp(uv, axis=0) / np.array([right[0] - left[0], bottom[1] - top[1]])))
 
 
 def _hang(
     alignments: Sequence[Alignment], pairs: Mapping[str, Sequence[Pair]], lenses: Lenses, notes: list[str]
 ) -> Iterator[Hung]:
-    """The cameras whose place in the world follows from measured places."""
+    """Yield the cameras with a pose in the world that follows from calibration points."""
     for alignment in alignments:
-        camera, found = alignment.camera, pairs.get(alignment.camera, ())
+        camera, camera_pairs = alignment.camera, pairs.get(alignment.camera, ())
         if camera not in lenses:
             notes.append(f"camera {camera} has no calibration, so what it sees of the floor is not known")
             continue
-        if len(found) < _LEAST_PLACES:
+        if len(camera_pairs) < _LEAST_PLACES:
             if any(pairs.values()):
-                notes.append(f"camera {camera} saw {len(found)} measured places: its coverage needs three")
+                notes.append(
+                    f"camera {camera} saw {len(camera_pairs)} measured places: its coverage needs three"
+                )
             continue
         points_m, world_m = (
-            np.array([getattr(pair, key) for pair in found]) for key in ("camera_m", "world_m")
+            np.array([getattr(pair, key) for pair in camera_pairs]) for key in ("camera_m", "world_m")
         )
         try:
             axes, origin_m = rigid_transform(points_m, world_m)
@@ -178,7 +186,7 @@ def _hang(
 
 
 def _marker(rig: Rig) -> tuple[float, float]:
-    """Side and height of the markers that are hardest to see whole: the largest side, the greatest height."""
+    """Return the largest side and the greatest height of the markers; such markers need the most overlap."""
     markers = [marker.id for marker in rig.markers]
     lengths_m = [rig.length_of(marker) for marker in markers]
     heights_m = [rig.height_of(marker) or 0.0 for marker in markers]

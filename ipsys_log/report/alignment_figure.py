@@ -1,4 +1,4 @@
-"""How the cameras hang as one picture: the floor as they see it, and which way to tilt each one."""
+"""Figure of the alignment: the coverage of the floor, and the direction to tilt each camera."""
 
 from __future__ import annotations
 
@@ -29,19 +29,23 @@ Array = NDArray[np.float64]
 _DPI = 100
 _FLOOR_IN, _PANEL_IN, _GAP_IN = 5.6, 3.4, 0.55
 _ROWS, _ROW_IN = 3, 2.4
-# Seen by one camera, by more, and where a marker is whole in no picture.
+# Colours of the floor where a marker is whole in one image, in several images, and in none.
 _ONE, _MORE, _NONE = "#EAF1F8", "#C3D6E8", "#F2B8A0"
 _LEVEL, _TILTED = "#00734D", "#B3261E"
 _NEAR, _FAR = "#0072B2", "#D55E00"
 
 
 def draw_alignment(lab: AlignedLab, path: Path) -> None:
-    """Draw: on the left the floor map, where it is known; on the right each camera's picture with
-    its markers, by how much Zc there is off the middle one, and an arrow to where it has to look.
+    """Draw the alignment of a lab into a file.
+
+    On the left is the floor map, if the coverage is known. On the right is the image of each camera with its
+    markers. Each marker shows the difference of its Zc from the median. An arrow shows the direction to turn
+    the camera.
 
     Parameters
     ----------
-    path : the picture, of the kind that its suffix says, in place of one that is there already.
+    lab : the alignment to draw.
+    path : path of the figure; an existing file is replaced. The suffix gives the file format.
     """
     floor = lab.coverage is not None
     columns = -(-len(lab.alignments) // _ROWS)
@@ -53,8 +57,8 @@ def draw_alignment(lab: AlignedLab, path: Path) -> None:
         axes = figure.add_axes((0.65 / size[0], 1.0 / size[1], _FLOOR_IN / size[0], _FLOOR_IN / size[1]))
         _draw_floor(axes, lab, lab.coverage)
         handles, labels = axes.get_legend_handles_labels()
-        where = (0.5 / size[0], 0.05 / size[1])
-        figure.legend(handles, labels, loc=where, ncols=3, fontsize=8, frameon=False)
+        location = (0.5 / size[0], 0.05 / size[1])
+        figure.legend(handles, labels, loc=location, ncols=3, fontsize=8, frameon=False)
     for number, alignment in enumerate(lab.alignments):
         column, row = divmod(number, _ROWS)
         x_in, y_in = left_in + column * (_PANEL_IN + _GAP_IN), size[1] - 0.15 - (row + 1) * _ROW_IN
@@ -74,21 +78,21 @@ def _draw_floor(axes: Axes, lab: AlignedLab, coverage: Coverage) -> None:
         coverage.ys_m[0] - half_m, coverage.ys_m[-1] + half_m,
     )  # fmt: skip
     shades = ListedColormap([_NONE, _ONE, _MORE])
-    # A marker that hangs over the edge need not be seen.
+    # A marker that would extend over the edge of the floor does not need to be seen.
     shown = np.ma.masked_where((counts == 0) & ~coverage.fits, np.minimum(counts, 2))
     axes.imshow(shown, cmap=shades, vmin=0, vmax=2, origin="lower", extent=frame, zorder=0.5)
     for colour, text in ((_ONE, "whole in one picture"), (_MORE, "in two or more"), (_NONE, "in none")):
         axes.plot([], [], "s", ms=9, mfc=colour, mec=REST, label=text)
-    styles = camera_styles(one.camera for one in lab.hung)
-    for one in lab.hung:
-        colour, shape = styles[one.camera]
-        # Beyond the floor nothing was looked at: its edge closes the outline.
-        seen = np.pad(coverage.whole[one.camera].astype(float), 1)
+    styles = camera_styles(hung.camera for hung in lab.hung)
+    for hung in lab.hung:
+        colour, shape = styles[hung.camera]
+        # The area outside of the floor has no data, so the edge of the floor closes the outline.
+        seen = np.pad(coverage.whole[hung.camera].astype(float), 1)
         around_m = [
             np.concatenate([[v[0] - half_m], v, [v[-1] + half_m]]) for v in (coverage.xs_m, coverage.ys_m)
         ]
         axes.contour(*around_m, seen, levels=[0.5], colors=[colour], linewidths=1.8, zorder=3)
-        axes.plot(*one.foot_m, shape, color=colour, ms=7, mec="white", zorder=5, label=shorten(one.camera))
+        axes.plot(*hung.foot_m, shape, color=colour, ms=7, mec="white", zorder=5, label=shorten(hung.camera))
     for overlap in coverage.overlaps:
         good, width_cm = overlap.width_m >= coverage.diagonal_m, overlap.width_m * CM_PER_M
         text = f"pictures overlap {width_cm:.0f} cm" if width_cm > 0 else f"gap of {-width_cm:.0f} cm"
@@ -112,7 +116,7 @@ def _draw_picture(axes: Axes, one: Alignment, lenses: Mapping[str, CameraCalibra
         axes.annotate("no calibration", (0.5, 0.5), xycoords="axes fraction", ha="center", color=NOTE)
         return
     axes.set(xlim=(0, lens.width), ylim=(lens.height, 0), aspect="equal")
-    # The optical axis, which is to stand upright on the floor.
+    # The principal point: the optical axis has to be vertical on the floor.
     axes.plot(*lens.K[:2, 2], "+", color=REST, ms=12, zorder=1)
     if one.lying:
         _draw_depths(axes, one, lens)
@@ -133,8 +137,8 @@ def _draw_depths(axes: Axes, one: Alignment, lens: CameraCalibration) -> None:
     off_cm = ((depths_m - np.median(depths_m)) * CM_PER_M).round(1) + 0.0  # no -0.0
     few = len(off_cm) <= 12
     for (x, y), cm, lying in zip(project(points_m, lens), off_cm, one.lying, strict=True):
-        hue = REST if abs(cm) < 0.5 else _FAR if cm > 0 else _NEAR
-        axes.plot(x, y, "o", color=hue, ms=5 if few else min(9, 2 + 0.7 * abs(cm)), alpha=0.9, zorder=2)
+        colour = REST if abs(cm) < 0.5 else _FAR if cm > 0 else _NEAR
+        axes.plot(x, y, "o", color=colour, ms=5 if few else min(9, 2 + 0.7 * abs(cm)), alpha=0.9, zorder=2)
         if few:
             up = y > lens.height / 2
             axes.annotate(
@@ -148,7 +152,7 @@ def _draw_depths(axes: Axes, one: Alignment, lens: CameraCalibration) -> None:
 
 
 def _draw_arrow(axes: Axes, one: Alignment, lens: CameraCalibration) -> None:
-    """To where it has to look; its length says nothing."""
+    """Draw the arrow in the direction to turn the camera; its length has no meaning."""
     assert one.down is not None
     assert one.tilt_rad is not None
     start = lens.K[:2, 2]

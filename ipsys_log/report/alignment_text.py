@@ -1,4 +1,4 @@
-"""What to do about how cameras hang, in words for somebody on a ladder, and in numbers for machines."""
+"""Advice on the alignment of cameras: text for the person who adjusts a camera, and JSON."""
 
 from __future__ import annotations
 
@@ -18,13 +18,13 @@ __all__ = ["advise", "alignment_json", "alignment_table", "coverage_lines"]
 
 _GOOD, _BAD = "green", "red"
 _LEVEL_CM = f"{LEVEL_M * CM_PER_M:g} cm"
-# Nobody turns a camera by less.
+# Smaller turns of a camera are not practical.
 _LEAST_DEG = 0.05
 _MOST_PATCHES = 4
 
 
 def advise(alignment: Alignment) -> str:
-    """What to do with a camera.
+    """Return the advice on one camera, as text.
 
     Examples
     --------
@@ -32,8 +32,10 @@ def advise(alignment: Alignment) -> str:
     'lay four or more markers on the '
     """
     if len(alignment.lying) < 2:
-        count, so = ("three", "one says nothing") if alignment.lying else ("four", "none lies still there")
-        return f"lay {count} or more markers on the floor, out to the edges of its picture: {so}"
+        count, reason = (
+            ("three", "one says nothing") if alignment.lying else ("four", "none lies still there")
+        )
+        return f"lay {count} or more markers on the floor, out to the edges of its picture: {reason}"
     if alignment.axes == 0:
         return "lay its markers further apart, out to the edges of its picture"
     if alignment.axes == 1 and alignment.level is None:
@@ -44,36 +46,36 @@ def advise(alignment: Alignment) -> str:
         return f"nothing: it is level, the spread is under {_LEVEL_CM}"
     turns = _turns(alignment)
     if alignment.left_m is not None and alignment.left_m >= LEVEL_M:
-        what = (
+        text = (
             f"{turns}, but that leaves {alignment.left_m * CM_PER_M:.1f} cm"
             if turns
             else "no tilt mends this"
         )
-        return f"{what}: see that the markers lie flat on the floor, or calibrate its lens again{rest}"
+        return f"{text}: see that the markers lie flat on the floor, or calibrate its lens again{rest}"
     return f"{turns}{rest}"
 
 
 def _turns(alignment: Alignment) -> str:
-    """How to tilt a camera, one way after the other; empty where it is not worth it."""
+    """Return the turns of a camera as text, one direction after the other; empty if both are too small."""
     names = (("right", "left"), ("bottom", "top"))
     parts: list[str] = []
     for turn_rad, (more, less) in zip(alignment.turns_rad, names, strict=True):
         if abs(turn := math.degrees(turn_rad)) >= _LEAST_DEG:
-            whose = "" if parts else " of its picture"
-            parts.append(f"towards the {more if turn_rad > 0 else less}{whose}, by {abs(turn):.1f} degrees")
-    where = _on_floor(alignment)
-    return f"tilt it so that it looks further {' and '.join(parts)}{where}" if parts else ""
+            suffix = "" if parts else " of its picture"
+            parts.append(f"towards the {more if turn_rad > 0 else less}{suffix}, by {abs(turn):.1f} degrees")
+    shift = _on_floor(alignment)
+    return f"tilt it so that it looks further {' and '.join(parts)}{shift}" if parts else ""
 
 
 def _on_floor(alignment: Alignment) -> str:
-    """By how much the middle of the picture moves on the floor, which is easier to see than an angle."""
+    """Return the shift of the principal point on the floor as text; it is easier to see than an angle."""
     if alignment.height_m is None or alignment.tilt_rad is None:
         return ""
     return f" ({alignment.height_m * math.tan(alignment.tilt_rad) * CM_PER_M:.0f} cm on the floor)"
 
 
 def alignment_table(lab: AlignedLab) -> Table:
-    """A row for each camera: green where the spread is under 5 cm, red where it is not."""
+    """Return a table with one row per camera: green if the spread is under 5 cm, else red."""
     table = Table(
         title="How the cameras hang", title_justify="left", title_style="bold", box=None, pad_edge=False
     )
@@ -81,14 +83,18 @@ def alignment_table(lab: AlignedLab) -> Table:
     for name in ("markers", "spread cm", "tilt deg"):
         table.add_column(name, justify="right", no_wrap=True)
     table.add_column("what to do", overflow="fold")
-    for one in lab.alignments:
-        colour = {None: "", True: _GOOD, False: _BAD}[one.level]
-        spread = "-" if one.spread_m is None else f"{one.spread_m * CM_PER_M:.1f}"
-        total = len(one.lying) + len(one.raised)
-        count = f"{len(one.lying)} of {total}" if one.raised else str(total)
-        # Names out of a log are not for rich to read as its markup.
+    for alignment in lab.alignments:
+        colour = {None: "", True: _GOOD, False: _BAD}[alignment.level]
+        spread = "-" if alignment.spread_m is None else f"{alignment.spread_m * CM_PER_M:.1f}"
+        total = len(alignment.lying) + len(alignment.raised)
+        count = f"{len(alignment.lying)} of {total}" if alignment.raised else str(total)
+        # As Text: rich must not read names from a log as its markup.
         table.add_row(
-            Text(one.camera), count, Text(spread, style=colour), _tilt(one), Text(advise(one), style=colour)
+            Text(alignment.camera),
+            count,
+            Text(spread, style=colour),
+            _tilt(alignment),
+            Text(advise(alignment), style=colour),
         )
     return table
 
@@ -101,9 +107,11 @@ def _tilt(one: Alignment) -> str:
 
 
 def coverage_lines(lab: AlignedLab) -> list[tuple[str, bool]]:
-    """What is to be said of the floor and of neighbours, each line with whether it is good."""
+    """Return lines on the floor and on neighbouring cameras; True marks a good result."""
     floor = _floor_lines(lab.coverage) if lab.coverage is not None else []
-    return floor + [_overlap_line(one, lab.diagonal_m, lab.coverage is not None) for one in lab.overlaps]
+    return floor + [
+        _overlap_line(overlap, lab.diagonal_m, lab.coverage is not None) for overlap in lab.overlaps
+    ]
 
 
 def _floor_lines(coverage: Coverage) -> list[tuple[str, bool]]:
@@ -124,45 +132,45 @@ def _patch_line(patches: Sequence[Patch], floor_m2: float, good: str, bad: str) 
     if not patches:
         return good, True
     total_m2 = sum(patch.area_m2 for patch in patches)
-    where = "; ".join(
+    position = "; ".join(
         f"x {p.low_m[0]:.2f} to {p.high_m[0]:.2f}, y {p.low_m[1]:.2f} to {p.high_m[1]:.2f}"
         for p in patches[:_MOST_PATCHES]
     )
     more = f"; {len(patches) - _MOST_PATCHES} more" if len(patches) > _MOST_PATCHES else ""
     area = f"{total_m2:.2f} m² of the floor ({100 * total_m2 / floor_m2:.2g} %)"
-    return (f"{bad} {area}" if " with " in bad else f"{area} are {bad}") + f": {where}{more}", False
+    return (f"{bad} {area}" if " with " in bad else f"{area} are {bad}") + f": {position}{more}", False
 
 
 def _overlap_line(overlap: Overlap, diagonal_m: float, placed: bool) -> tuple[str, bool]:
-    both, (x_m, y_m) = " and ".join(overlap.cameras), overlap.at_m.tolist()
+    names, (x_m, y_m) = " and ".join(overlap.cameras), overlap.at_m.tolist()
     needed = f"a marker needs {diagonal_m * CM_PER_M:.0f} cm, corner to corner"
     width_cm = overlap.width_m * CM_PER_M
     if overlap.width_m >= diagonal_m:
-        return f"{both} overlap by {width_cm:.0f} cm or more: enough, {needed}", True
-    what = (
+        return f"{names} overlap by {width_cm:.0f} cm or more: enough, {needed}", True
+    fault = (
         f"overlap by {width_cm:.0f} cm only" if overlap.width_m > 0 else f"leave a gap of {-width_cm:.0f} cm"
     )
     end = "one that crosses there is whole in neither picture"
-    where = f", at x {x_m:.2f}, y {y_m:.2f}" if placed else ""
-    return f"{both} {what}{where}: {needed}; {end}", False
+    position = f", at x {x_m:.2f}, y {y_m:.2f}" if placed else ""
+    return f"{names} {fault}{position}: {needed}; {end}", False
 
 
 def alignment_json(lab: AlignedLab) -> dict[str, Any]:
-    """All of it for machines; None for what is not known."""
+    """Return the alignment as plain data; None for unknown values."""
     return {
         "run": lab.run,
         "level_below_cm": LEVEL_M * CM_PER_M,
-        "cameras": [_camera_json(one) for one in lab.alignments],
+        "cameras": [_camera_json(alignment) for alignment in lab.alignments],
         "coverage": None if lab.coverage is None else _coverage_json(lab.coverage),
         "marker_diagonal_m": lab.diagonal_m,
         "overlaps": [
             {
-                "cameras": list(one.cameras),
-                "width_m": one.width_m,
-                "at_m": None if lab.coverage is None else one.at_m.tolist(),
-                "enough": one.width_m >= lab.diagonal_m,
+                "cameras": list(overlap.cameras),
+                "width_m": overlap.width_m,
+                "at_m": None if lab.coverage is None else overlap.at_m.tolist(),
+                "enough": overlap.width_m >= lab.diagonal_m,
             }
-            for one in lab.overlaps
+            for overlap in lab.overlaps
         ],
         "notes": list(lab.notes),
     }
@@ -170,7 +178,7 @@ def alignment_json(lab: AlignedLab) -> dict[str, Any]:
 
 def _camera_json(one: Alignment) -> dict[str, Any]:
     right_rad, bottom_rad = one.turns_rad
-    known = one.down is not None
+    is_known = one.down is not None
     return {
         "camera": one.camera,
         "places": len(one.lying),
@@ -181,8 +189,8 @@ def _camera_json(one: Alignment) -> dict[str, Any]:
         "level": one.level,
         "tilt_deg": _scaled(one.tilt_rad, math.degrees(1)),
         "tilt_sigma_deg": _scaled(one.sigma_rad, math.degrees(1)),
-        "look_further_right_deg": math.degrees(right_rad) if known else None,
-        "look_further_down_deg": math.degrees(bottom_rad) if known else None,
+        "look_further_right_deg": math.degrees(right_rad) if is_known else None,
+        "look_further_down_deg": math.degrees(bottom_rad) if is_known else None,
         "known_directions": one.axes,
         "height_m": one.height_m,
         "advice": advise(one),

@@ -21,31 +21,31 @@ from ipsys_log.report.figures import NOTE, REST, shorten, strip
 
 __all__ = ["calibration_figure", "calibration_json", "calibration_lines", "calibration_table"]
 
-# From pale for a small error to dark for a large one, which any colour vision sees.
+# Colours from pale (small error) to dark (large error), readable with any colour vision.
 _COLOURS = ListedColormap(colormaps["magma_r"](np.linspace(0.2, 0.95, 256)))
-# Arrows of a usual error are so long, as a share of the image's width.
+# Length of the arrow of a usual error, as a share of the image's width.
 _ARROW = 0.014
 _FACTORS = (1, 2, 5, 10, 20, 50, 100, 200, 500, 1000)
 _MOST_NAMED = 30
 
 
 def calibration_figure(found: Sequence[Calibrated]) -> Figure:
-    """A row for each camera: the residuals in the image, among themselves, and by picture."""
+    """Return a figure with a row per camera: residuals in the image, as a scatter plot, and by image."""
     figure = Figure(figsize=(13.5, 4.4 * len(found)), layout="constrained")
     rows = figure.subplots(len(found), 3, squeeze=False, width_ratios=(1.5, 1.0, 1.2))
-    for (image, cloud, pictures), one in zip(rows, found, strict=True):
-        _draw_image(image, one)
-        _draw_cloud(cloud, one)
-        _draw_pictures(pictures, one)
+    for (image, cloud, pictures), calibrated in zip(rows, found, strict=True):
+        _draw_image(image, calibrated)
+        _draw_cloud(cloud, calibrated)
+        _draw_pictures(pictures, calibrated)
     return figure
 
 
 def _draw_image(axes: Axes, found: Calibrated) -> None:
-    """Every corner where it was seen, with an arrow to where the lens puts it."""
+    """Draw every detected corner, with an arrow to its projection by the fitted intrinsics."""
     width, height = found.lens.width, found.lens.height
     lengths = np.linalg.norm(found.residuals_px, axis=1)
-    wanted = _ARROW * width / max(float(np.median(lengths)), 1e-9)
-    factor = max((f for f in _FACTORS if f <= wanted), default=1)
+    ideal = _ARROW * width / max(float(np.median(lengths)), 1e-9)
+    factor = max((f for f in _FACTORS if f <= ideal), default=1)
     top = float(np.quantile(lengths, 0.98))
     order = np.argsort(lengths, kind="stable")
     arrows = axes.quiver(
@@ -91,15 +91,15 @@ def _draw_cloud(axes: Axes, found: Calibrated) -> None:
 
 
 def _draw_pictures(axes: Axes, found: Calibrated) -> None:
-    """The RMS of each picture, the greatest on top."""
+    """Draw the RMS of each image, the largest on top."""
     ranked = sorted(found.used, key=lambda used: used[1])[-_MOST_NAMED:]
     positions = np.arange(len(ranked))
     axes.barh(positions, [rms_px for _, rms_px in ranked], color="#56B4E9", height=0.75)
     size = float(np.clip(210 / len(ranked), 7, 9))
     axes.set_yticks(positions, [shorten(name) for name, _ in ranked], fontsize=size)
     axes.set(ylim=(-0.7, len(ranked) - 0.3), xlabel="RMS of a picture in px")
-    which = f", the worst {len(ranked)}" if len(ranked) < len(found.used) else ""
-    axes.set_title(f"{len(found.used)} pictures used of {found.looked}{which}\n", loc="left", fontsize=10)
+    suffix = f", the worst {len(ranked)}" if len(ranked) < len(found.used) else ""
+    axes.set_title(f"{len(found.used)} pictures used of {found.looked}{suffix}\n", loc="left", fontsize=10)
     strip(axes, "x")
 
 
@@ -107,7 +107,7 @@ _SHOWN_DROPPED = 6
 
 
 def calibration_table(found: Calibrated) -> Table:
-    """The parameters of a lens with their standard deviations."""
+    """Return a table of the intrinsics with their standard deviations."""
     title = f"{found.camera}: {found.lens.distortion_model}, {found.lens.width} x {found.lens.height} px"
     table = Table(title=title, title_justify="left", title_style="bold", box=None, pad_edge=False)
     table.add_column("", no_wrap=True)
@@ -146,21 +146,21 @@ def _degrees(angle_rad: float | None) -> str:
 
 
 def _dropped_lines(dropped: tuple[Dropped, ...], what: str) -> list[str]:
-    """Return a line for each reason why pictures were left out, the most frequent first."""
+    """Return one line per reason for leaving out images, the most frequent reason first."""
     counts = Counter(drop.reason for drop in dropped)
     lines = []
     for reason, count in counts.most_common():
         names = [drop.name for drop in dropped if drop.reason == reason]
         shown = ", ".join(names[:3]) + (f" and {count - 3} more" if count > 3 else "")
-        # A reason is told of one picture.
-        why = re.sub("^is ", "are ", reason) if count > 1 else reason
-        lines.append(f"{what}: {shown}: {why}")
+        # The text of a reason is in the singular.
+        text = re.sub("^is ", "are ", reason) if count > 1 else reason
+        lines.append(f"{what}: {shown}: {text}")
     more = len(lines) - _SHOWN_DROPPED
     return lines if more <= 1 else [*lines[:_SHOWN_DROPPED], f"{what}: and so on, {more} more (see --json)"]
 
 
 def calibration_json(found: Calibrated) -> dict[str, Any]:
-    """All of it but the single corners."""
+    """Return the result as plain data, without the single corners."""
     lens, coverage = found.lens, found.coverage
     return {
         "camera": found.camera,

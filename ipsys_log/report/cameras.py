@@ -38,14 +38,14 @@ _MOST_ROBOTS, _MOST_IDS = 10, 8
 
 
 class LiveStatus:
-    """The display on the terminal while cameras send.
+    """The display on the terminal during a recording.
 
     Parameters
     ----------
-    states, monitor : of the cameras.
+    states, monitor : states and live check of the cameras.
     target : the log that is written.
-    now_s : a clock for rates.
-    expected_bytes_per_s : of the log, until it can be measured; None if it does not grow with time.
+    now_s : clock for the rates.
+    expected_bytes_per_s : growth of the log, until it can be measured; None if it does not grow with time.
     """
 
     def __init__(
@@ -64,20 +64,20 @@ class LiveStatus:
         self._tracks: dict[str, Track] = {}
 
     def __call__(self, message: Message | None) -> None:
-        """Be shown a message on its way."""
+        """Handle one recorded message."""
         self._monitor(message)
         if message is not None and isinstance(message.payload, Tracks):
             self._tracks.update({track.robot: track for track in message.payload.tracks})
 
     def show(self) -> Group:
-        """Cameras, robots, the disk, and what is wrong with a camera."""
+        """Return the display: cameras, robots, warnings on cameras, and the disk."""
         now_s = self._now_s()
         for name, state in self._states.items():
             self._rates[name] = self._rate(name, state, now_s)
         parts: list[Table | Text] = [cameras_table(self._states, self._monitor.looks, self._rates)]
         if self._tracks:
             parts.append(robots_table(self._tracks))
-        # Text, for there are brackets in it that rich would take for its own.
+        # As Text: rich would read brackets in a plain string as its markup.
         parts += [Text(line, style="yellow") for line in self._warnings()]
         parts.append(self._disk(now_s - self._begin_s))
         return Group(*parts)
@@ -96,7 +96,7 @@ class LiveStatus:
         return Text(f"{line}: {format_duration(room.lasts_s)}", style="bold red" if room.is_short() else "")
 
     def summary(self) -> list[str]:
-        """What was recorded, when it is over."""
+        """Return the lines that describe a finished recording."""
         took_s = self._now_s() - self._begin_s
         lines = [f"{self._target} written: {took_s:.1f} s, {format_bytes(self._target.stat().st_size)}"]
         for name, state in self._states.items():
@@ -106,9 +106,9 @@ class LiveStatus:
         return lines + self._warnings()
 
     def _rate(self, name: str, state: CameraState, now_s: float) -> tuple[float, float]:
-        then_s, frames, size = self._before.get(name, (self._begin_s, 0, 0))
+        before_s, frames, size = self._before.get(name, (self._begin_s, 0, 0))
         self._before[name] = now_s, state.frames, state.bytes
-        took_s = max(now_s - then_s, 1e-9)
+        took_s = max(now_s - before_s, 1e-9)
         return (state.frames - frames) / took_s, (state.bytes - size) / took_s / 1e6
 
     def _warnings(self) -> list[str]:
@@ -120,15 +120,15 @@ class LiveStatus:
 
 
 def robots_table(tracks: Mapping[str, Track]) -> Table:
-    """Return where the robots are: first those that have a name, and no more than fit into a window."""
+    """Return a table of the robots' positions: named robots first, and only as many as fit into a window."""
     table = Table(box=None, pad_edge=False)
     for heading in ("robot", "x cm", "y cm", "z cm", "heading", "cameras"):
         table.add_column(heading, justify="left" if heading in ("robot", "cameras") else "right")
     order = sorted(tracks.items(), key=lambda item: (item[0] == f"marker_{item[1].id}", item[1].id))
     for name, track in order[:_MOST_ROBOTS]:
         heading = "-" if track.heading_rad is None else f"{degrees(track.heading_rad):.0f} deg"
-        at_cm = (f"{CM_PER_M * value:.1f}" for value in (track.x_m, track.y_m, track.z_m))
-        table.add_row(name, *at_cm, heading, ", ".join(track.cameras))
+        position_cm = (f"{CM_PER_M * value:.1f}" for value in (track.x_m, track.y_m, track.z_m))
+        table.add_row(name, *position_cm, heading, ", ".join(track.cameras))
     if len(order) > _MOST_ROBOTS:
         table.add_row(f"and {len(order) - _MOST_ROBOTS} more")
     return table
@@ -139,11 +139,12 @@ def cameras_table(
     looks: Mapping[str, Look],
     rates: Mapping[str, tuple[float, float]],
 ) -> Table:
-    """A row for each camera, at most 80 columns wide.
+    """Return a table with one row per camera, at most 80 columns wide.
 
     Parameters
     ----------
-    rates : frames and MB per second.
+    states, looks : states and last checks of the cameras, by name.
+    rates : frames and MB per second, by name.
     """
     table = Table(box=None, pad_edge=False)
     for heading in ("camera", "frames", "Hz", "MB/s", "drops", "delay", "light", "sharp", "markers"):
@@ -168,51 +169,51 @@ def cameras_table(
 
 
 def _markers(look: Look) -> Text:
-    """The ids of a picture; those that are not in the rig with a question mark."""
+    """Return the ids of the markers in an image; ids that are not in the rig get a question mark."""
     ids = [Text(str(n)) for n in look.markers] + [Text(f"{n}?", style="yellow") for n in look.strange]
     more = [Text(f"and {len(ids) - _MOST_IDS} more")] if len(ids) > _MOST_IDS else []
     return Text(", ").join([*ids[:_MOST_IDS], *more]) if ids else Text("none")
 
 
 def latency_table(steps: Mapping[str, Percentiles]) -> Group:
-    """Return how long each step took, in ms."""
+    """Return a table of the durations of the steps, in ms."""
     table = Table(box=None, pad_edge=False, title="Milliseconds for each step", title_justify="left")
     table.add_column("step")
     for heading in ("median", "90 %", "99 %", "longest"):
         table.add_column(heading, justify="right")
-    for step, found in steps.items():
-        table.add_row(step, *(f"{1e3 * value:.1f}" for value in asdict(found).values()))
+    for step, percentiles in steps.items():
+        table.add_row(step, *(f"{1e3 * value:.1f}" for value in asdict(percentiles).values()))
     return Group(table, Text("total: from the arrival of a frame to its position"))
 
 
 def comparison_table(found: Sequence[Comparison], sides: tuple[str, str]) -> Table:
-    """A row for each channel; ``sides`` are the headings of the two that are compared."""
+    """Return a table with one row per channel; ``sides`` are the headings of the two compared sides."""
     table = Table(box=None, pad_edge=False)
     for heading in ("channel", *sides, "same", "RMS off", "most off"):
         table.add_column(heading, justify="left" if heading == "channel" else "right")
-    for one in found:
-        style = "" if one.equal else "red"
+    for comparison in found:
+        style = "" if comparison.equal else "red"
         table.add_row(
-            Text(one.topic.removeprefix("/runs/"), style=style),
-            str(one.left),
-            str(one.right),
-            "all" if one.equal else str(one.same),
-            _distance(one.rms, one.unit),
-            _distance(one.greatest, one.unit),
+            Text(comparison.topic.removeprefix("/runs/"), style=style),
+            str(comparison.left),
+            str(comparison.right),
+            "all" if comparison.equal else str(comparison.same),
+            _distance(comparison.rms, comparison.unit),
+            _distance(comparison.greatest, comparison.unit),
         )
     return table
 
 
 def first_difference(found: Sequence[Comparison]) -> str | None:
-    """Return where two sides differ first, in words; None where they do not."""
-    apart = [one for one in found if not one.equal]
-    if not apart:
+    """Return the first difference of two sides as text; None if they are equal."""
+    different = [comparison for comparison in found if not comparison.equal]
+    if not different:
         return None
-    if not any(one.together for one in found if one.left > 1):
+    if not any(comparison.together for comparison in found if comparison.left > 1):
         return (
             "they have no frame in common: no message of one speaks of the same instant as one of the other"
         )
-    first = min(apart, key=lambda one: one.first_ns or 0)
+    first = min(different, key=lambda one: one.first_ns or 0)
     return f"first in {first.topic}: {first.first}"
 
 
@@ -225,5 +226,8 @@ def _distance(value: float | None, unit: str | None) -> str:
 
 
 def comparison_json(found: Sequence[Comparison]) -> dict[str, Any]:
-    """Return whether all is equal, and each channel."""
-    return {"equal": all(one.equal for one in found), "channels": [asdict(one) for one in found]}
+    """Return the comparison as plain data: whether all channels are equal, and each channel."""
+    return {
+        "equal": all(comparison.equal for comparison in found),
+        "channels": [asdict(comparison) for comparison in found],
+    }

@@ -31,7 +31,7 @@ __all__ = [
 
 
 def stops_json(scene: FinishedLog) -> list[dict[str, Any]]:
-    """The places of a log as plain data; ``time_s`` from its start."""
+    """Return the stationary intervals of a log as plain data; ``time_s`` is from the start of the log."""
     active = active_measurements(scene.history())
     return [
         {
@@ -48,7 +48,7 @@ def stops_json(scene: FinishedLog) -> list[dict[str, Any]]:
 
 
 def stops_table(found: list[dict[str, Any]]) -> Table:
-    """The same to be read."""
+    """Return the stationary intervals of :func:`stops_json` as a table."""
     table = Table(
         title="Where markers lie still", title_justify="left", title_style="bold", box=None, pad_edge=False
     )
@@ -66,11 +66,11 @@ def stops_table(found: list[dict[str, Any]]) -> Table:
     return table
 
 
-# A gap is a silence of this many times the usual distance between messages of one camera. Those of several
-# are not evenly spaced: there it is a silence of so long.
+# On a channel of one camera, a gap is this many times longer than the usual interval between messages.
+# Messages of several cameras have no regular interval. On their channels, a gap is longer than this time.
 _GAP_FACTOR = 3
 _MERGED_GAP_S = 0.5
-# What comes frame by frame; nothing else has a rate.
+# Schemas with one message per frame; the other channels have no rate.
 _OF_FRAMES = (
     *("Image", "CompressedImage", "CompressedVideo", "Markers", "ImageAnnotations", "CameraPoints"),
     *("Positions", "Tracks", "FrameTransforms"),
@@ -78,7 +78,7 @@ _OF_FRAMES = (
 
 
 def contents_json(session: Session) -> dict[str, Any]:
-    """The contents of one or several logs as plain data; times in s, sizes in bytes."""
+    """Return the contents of one or several logs as plain data; times in s, sizes in bytes."""
     topics = sorted({topic for reader in session.readers for topic in reader.channels})
     start_ns, end_ns = session.start_ns, session.end_ns
     empty = not any(reader.message_count for reader in session.readers)
@@ -140,10 +140,10 @@ def _channel(session: Session, topic: str) -> dict[str, Any]:
 
 
 def states_json(session: Session) -> list[dict[str, Any]]:
-    """Return the rows of `runs_json`, each with its state and the version of its stage."""
+    """Return the rows of :func:`runs_json`, each with its state and the version of its stage."""
     states = [
-        {"state": one.state, "stage_version": one.stage_version, "out_of_date": one.out_of_date}
-        for one in recorded_stages(session)
+        {"state": stage.state, "stage_version": stage.stage_version, "out_of_date": stage.out_of_date}
+        for stage in recorded_stages(session)
     ]
     return [row | state for row, state in zip(runs_json(session), states, strict=True)]
 
@@ -179,7 +179,7 @@ def _table(title: str, *columns: str, right: tuple[str, ...] = ()) -> Table:
 
 
 def contents_tables(found: dict[str, Any]) -> list[Table]:
-    """The same as tables, in 80 columns where the names are not too long for it."""
+    """Return the contents of :func:`contents_json` as tables, in 80 columns if the names are short enough."""
     files = _table("Files", "path", "size", "messages", "chunks", right=("size", "messages", "chunks"))
     for file in found["files"]:
         files.add_row(file["path"], format_bytes(file["bytes"]), str(file["messages"]), str(file["chunks"]))
@@ -201,7 +201,7 @@ def _cameras_table(found: dict[str, Any]) -> Table:
 
 
 def _channels_table(found: dict[str, Any]) -> Table:
-    """A row for each channel; those of a run below its name, so that they are short."""
+    """Return a table with one row per channel; below the name of a run, its channels have short names."""
     numbers = ("count", "Hz", "gaps (longest)")
     table = _table("Channels", "topic", *numbers, "schema", right=numbers)
     for column in table.columns[:4]:
@@ -226,16 +226,18 @@ def _rate(channel: dict[str, Any]) -> str:
 
 
 def runs_table(runs: list[dict[str, Any]]) -> Table:
-    """Return a table with one row per stage of a run, and its state where that is known."""
+    """Return a table with one row per stage of a run, with its state if the state is known."""
     states = ["state"] if any("state" in run for run in runs) else []
     columns = ("run", "stage", "from", "parameters", "count", "ipsys", *states)
     table = _table("Runs", *columns, right=("count",))
     for run in runs:
-        given = [f"{key}={value}" for key, value in run["parameters"].items()]
-        given += [f"other {name}" for name in run["overrides"]]
+        parameters = [f"{key}={value}" for key, value in run["parameters"].items()]
+        parameters += [f"other {name}" for name in run["overrides"]]
         count = sum(output["messages"] for output in run["outputs"])
         sources = ", ".join(run["input_runs"]) or "-"
         version = run["fingerprint"].get("ipsys_log", "-")
         state = [run["state"]] if states else []
-        table.add_row(run["run"], run["stage"], sources, ", ".join(given) or "-", str(count), version, *state)
+        table.add_row(
+            run["run"], run["stage"], sources, ", ".join(parameters) or "-", str(count), version, *state
+        )
     return table

@@ -1,4 +1,4 @@
-"""Every error of every model and camera, in cm, as points with their mean, and the figures beside."""
+"""Panel of all errors by model and camera, in cm: points with their mean, and the statistics as numbers."""
 
 from __future__ import annotations
 
@@ -21,11 +21,11 @@ from ipsys_log.units import CM_PER_M
 __all__ = ["count_rows", "draw_errors"]
 
 _TRACKS = "tracks"
-# Beyond this ratio of the largest error to the usual one, the small ones need a logarithm to be seen.
+# Above this ratio of the largest error to the median, a logarithmic scale makes the small errors visible.
 _LOG_RATIO = 15.0
 _GAP = 0.7  # between models, in rows
 _MOST_ROW_IN = 0.42
-# Across the figure: where the axes end, how wide they are at least, and where each column ends.
+# Horizontal layout of the figure: right end of the axes, their smallest width, and right end of each column.
 _RIGHT_IN = 11.75
 _LEAST_IN = 1.5
 _COLUMNS_IN = {"mean": 12.25, "std": 12.7, "max": 13.15, "n": 13.6}
@@ -33,7 +33,7 @@ _COLUMNS_IN = {"mean": 12.25, "std": 12.7, "max": 13.15, "n": 13.6}
 
 @dataclass(frozen=True, slots=True, eq=False)
 class _Row:
-    """A line of the picture: ``errors_cm`` (n,), empty where only the statistics are known."""
+    """A row of the panel; ``errors_cm`` (n,) is empty if only the statistics are known."""
 
     model: str
     name: str
@@ -43,7 +43,7 @@ class _Row:
 
 
 def _in_space(accuracies: Sequence[Accuracy]) -> bool:
-    """Whether heights could be learned; else all errors are those on the floor."""
+    """Return whether the errors are in space; they are on the floor if heights cannot be learned."""
     return all(row.error_3d is not None for accuracy in accuracies for row in accuracy.rows(False))
 
 
@@ -53,7 +53,7 @@ def _rows(accuracies: Sequence[Accuracy]) -> list[_Row]:
     for accuracy in accuracies:
         evaluation = accuracy.evaluation
         model = evaluation.model if evaluation else accuracy.run
-        # Two runs of one model are told apart by their names.
+        # A second run of the same model shows the name of the run.
         name = (
             model
             if accuracy.run == model.replace("+", "_").replace("-", "_")
@@ -72,7 +72,7 @@ def _rows(accuracies: Sequence[Accuracy]) -> list[_Row]:
 
 
 def count_rows(accuracies: Sequence[Accuracy]) -> int:
-    """How many lines the panel has, with the spaces between models."""
+    """Return the number of rows of the panel, with the spaces between models."""
     rows = _rows(accuracies)
     return len(rows) + round(_GAP * len({row.model for row in rows}))
 
@@ -84,13 +84,14 @@ def draw_errors(
     left_in: float,
     top_in: float,
 ) -> None:
-    """Draw the panel into the right of a figure.
+    """Draw the panel on the right side of a figure.
 
     Parameters
     ----------
-    accuracies : with at least one error.
+    figure : figure to draw into.
+    accuracies : accuracies with at least one error.
     styles : colour and marker shape by camera.
-    left_in, top_in : where the names and where the axes begin, in inches.
+    left_in, top_in : left end of the names and top of the axes, in inches.
     """
     rows = _rows(accuracies)
     heights = _heights(rows)
@@ -107,8 +108,8 @@ def draw_errors(
     axes.set_yticks(heights, [_name(row) for row in rows], fontsize=size)
     _name_models(axes, rows, heights, size, bar_in)
     _print_figures(axes, rows, heights, size)
-    where = "in space" if _in_space(accuracies) else "on the floor"
-    axes.set_title(f"Errors {where} on held-out places", loc="left", fontsize=10, pad=size + 12)
+    space = "in space" if _in_space(accuracies) else "on the floor"
+    axes.set_title(f"Errors {space} on held-out places", loc="left", fontsize=10, pad=size + 12)
     axes.annotate(
         _note(rows), (0, 0), (0, -38), xycoords="axes fraction", textcoords="offset points", fontsize=8,
         color="#505050", va="top",
@@ -116,7 +117,7 @@ def draw_errors(
 
 
 def _name_widths(rows: Sequence[_Row], size: float) -> tuple[float, float]:
-    """How many inches the longest name of a model and of a row take."""
+    """Return the widths of the longest name of a model and of the longest name of a row, in inches."""
     bold, plain = FontProperties(weight="bold"), FontProperties()
     models = [TextPath((0, 0), row.model, size=size + 1, prop=bold).get_extents().width for row in rows]
     names = [TextPath((0, 0), _name(row), size=size, prop=plain).get_extents().width for row in rows]
@@ -124,7 +125,7 @@ def _name_widths(rows: Sequence[_Row], size: float) -> tuple[float, float]:
 
 
 def _add_axes(figure: Figure, left_in: float, top_in: float, high_in: float) -> Axes:
-    """Axes that end where the figures begin, however long the names before them are."""
+    """Add axes that end at the columns of numbers, for names of any length."""
     width, height = figure.get_size_inches()
     left_in = min(left_in, _RIGHT_IN - _LEAST_IN)
     low_in = height - top_in - high_in
@@ -139,7 +140,7 @@ def _add_axes(figure: Figure, left_in: float, top_in: float, high_in: float) -> 
 
 
 def _beside(axes: Axes) -> Transform:
-    """Across in inches of the figure, along in rows."""
+    """Return a transform with x in inches of the figure and y in rows."""
     figure = axes.get_figure(root=True)
     assert figure is not None
     return blended_transform_factory(figure.dpi_scale_trans, axes.transData)
@@ -183,11 +184,11 @@ def _draw_row(axes: Axes, y: float, row: _Row, colour: str, shape: str, size: fl
 def _name_models(
     axes: Axes, rows: Sequence[_Row], heights: Sequence[float], size: float, bar_in: float
 ) -> None:
-    """The model once beside its rows, with a line along them."""
+    """Write each model once beside its rows, with a line along the rows."""
     beside = _beside(axes)
     for model in dict.fromkeys(row.model for row in rows):
-        here = [y for y, row in zip(heights, rows, strict=True) if row.model == model]
-        ends = [here[0] - 0.4, here[-1] + 0.4]
+        row_heights = [y for y, row in zip(heights, rows, strict=True) if row.model == model]
+        ends = [row_heights[0] - 0.4, row_heights[-1] + 0.4]
         axes.plot([bar_in, bar_in], ends, color="black", lw=1, transform=beside, clip_on=False)
         axes.text(
             bar_in - 0.08, sum(ends) / 2, model, transform=beside, fontsize=size + 1, weight="bold",
@@ -196,7 +197,7 @@ def _name_models(
 
 
 def _bar(row: _Row) -> NDArray[np.float64]:
-    """Mean, and mean plus standard deviation, of a row that has no points of its own."""
+    """Return mean, and mean plus standard deviation, of a row without single points, in cm."""
     mean_m, std_m = row.statistics.mean_m, row.statistics.std_m or 0.0
     return np.array([mean_m, mean_m + std_m]) * CM_PER_M
 
@@ -219,10 +220,10 @@ def _print_figures(axes: Axes, rows: Sequence[_Row], heights: Sequence[float], s
     for title, x in _COLUMNS_IN.items():
         axes.text(x, -0.9, title, transform=beside, fontsize=size, color="#505050", ha="right", va="bottom")
     for y, row in zip(heights, rows, strict=True):
-        found = row.statistics
-        values_m = {"mean": found.mean_m, "std": found.std_m, "max": found.max_m}
+        statistics = row.statistics
+        values_m = {"mean": statistics.mean_m, "std": statistics.std_m, "max": statistics.max_m}
         cells = {name: "-" if m is None else _figure(m * CM_PER_M) for name, m in values_m.items()}
-        for name, text in {**cells, "n": str(found.count)}.items():
+        for name, text in {**cells, "n": str(statistics.count)}.items():
             weight = "bold" if name == "mean" else "normal"
             axes.text(
                 _COLUMNS_IN[name],
@@ -237,5 +238,5 @@ def _print_figures(axes: Axes, rows: Sequence[_Row], heights: Sequence[float], s
 
 
 def _figure(value_cm: float) -> str:
-    """Two digits behind the point, as the paper has them; fewer where the column would burst."""
+    """Format a value with two decimals, as in the paper, or with none if the column is too narrow."""
     return f"{value_cm:.2f}" if value_cm < 100 else f"{value_cm:.0f}"

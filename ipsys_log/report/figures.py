@@ -1,6 +1,6 @@
-"""Figures as bytes, equal for equal figures, and the colours and symbols of figures.
+"""Figures as bytes (equal figures give equal bytes), and the colours and symbols of figures.
 
-The hues are those of Okabe and Ito (2008), without their yellow, which white paper swallows.
+The hues are those of Okabe and Ito (2008). Their yellow is left out: it is hard to see on white paper.
 """
 
 from __future__ import annotations
@@ -38,7 +38,7 @@ __all__ = [
     "svg_uri",
 ]
 
-# A camera that has the name of a colour gets one that is like it and can be seen.
+# A camera with the name of a colour gets a similar colour that is easy to see.
 _NAMED = {"red": "#D55E00", "white": "#8C8C8C", "black": "#000000", "blue": "#0072B2", "green": "#009E73"}
 _COLOURS = ("#0072B2", "#D55E00", "#009E73", "#CC79A7", "#000000", "#E69F00", "#56B4E9", "#8C8C8C")
 _SHAPES = "osD^vP*X"
@@ -53,17 +53,20 @@ _MODELS = {
     "best": ("#000000", "X"),
 }
 
-# What is not the matter of a picture, but belongs to it.
+# Colours for the less important parts of a figure.
 REST = "#B5B5B5"
 GRID = "#E6E6E6"
 NOTE = "#505050"
-# Places that no model was fitted on, beside black ones that it was fitted on.
+# Colour of held-out points; the points of the fit are black.
 TEST = "#D7191C"
 
 
 class ModelStyle(NamedTuple):
-    """A hybrid has the colour of its second model, a dashed ``line`` and hollow, larger marks: where both
-    are the same function, both are seen."""
+    """The style of a model in a figure.
+
+    A hybrid model has the colour of its second model, a dashed ``line`` and larger, hollow marks. So both
+    models stay visible if they are the same function.
+    """
 
     colour: str
     line: str
@@ -71,13 +74,13 @@ class ModelStyle(NamedTuple):
 
 
 def camera_styles(cameras: Iterable[str]) -> dict[str, tuple[str, str]]:
-    """Colour and marker shape for each camera, whatever the order of the names."""
+    """Return colour and marker shape of each camera, independent of the order of the names."""
     colours = assign_colours(cameras, _NAMED, _COLOURS)
     return {camera: (colours[camera], _SHAPES[n % len(_SHAPES)]) for n, camera in enumerate(sorted(colours))}
 
 
 def model_styles(models: Iterable[str]) -> dict[str, ModelStyle]:
-    """Colour, shape and line of each model, the same in every picture and for every choice of models."""
+    """Return colour, shape and line of each model, the same in every figure and for every set of models."""
     styles = {}
     for model in models:
         first, plus, second = model.partition("+")
@@ -88,13 +91,13 @@ def model_styles(models: Iterable[str]) -> dict[str, ModelStyle]:
 
 
 def robot_colour(number: int) -> str:
-    """The colour of the first, second ... robot."""
+    """Return the colour of a robot by its number, from 0."""
     return _ROBOTS[number % len(_ROBOTS)]
 
 
 _DPI = 150
 _LONGEST = 24
-# Without the time of writing.
+# Options that leave out the time of writing.
 _WITHOUT: dict[str, dict[str, object]] = {
     "pdf": {"metadata": {"Creator": None, "Producer": None, "CreationDate": None}},
     "jpg": {},
@@ -104,12 +107,12 @@ _WITHOUT: dict[str, dict[str, object]] = {
 
 
 def png(figure: Figure, dpi: int = _DPI) -> bytes:
-    """A figure as the bytes of a PNG."""
+    """Return a figure as the bytes of a PNG file."""
     return _saved(figure, format="png", dpi=dpi, metadata={"Software": None})
 
 
 def picture(figure: Figure, path: Path, dpi: int = _DPI) -> bytes:
-    """A figure as the bytes of the kind of file that a name ends in, one of ``PICTURES``."""
+    """Return a figure as the bytes of a file; the suffix of ``path`` gives the format, see ``PICTURES``."""
     kind = path.suffix.lower().removeprefix(".")
     if kind == "png":
         return png(figure, dpi)
@@ -122,7 +125,7 @@ def _svg(figure: Figure) -> bytes:
 
 
 def svg_uri(figure: Figure) -> str:
-    """A figure as an address that holds the picture itself."""
+    """Return a figure as a data URI, which holds the figure itself."""
     data = _svg(figure)
     return f"data:image/svg+xml;base64,{base64.b64encode(data).decode()}"
 
@@ -130,35 +133,35 @@ def svg_uri(figure: Figure) -> str:
 def _saved(figure: Figure, **how: object) -> bytes:
     buffer = io.BytesIO()
     with warnings.catch_warnings():
-        # A name in letters that the font lacks is drawn as boxes.
+        # Letters that the font lacks are drawn as boxes, without a warning.
         warnings.filterwarnings("ignore", message="Glyph")
         figure.savefig(buffer, **how)  # type: ignore[arg-type]
     return buffer.getvalue()
 
 
 def shorten(name: str) -> str:
-    """A name out of a log as a picture has room for it, on one line."""
+    """Shorten a name from a log to one line that fits into a figure."""
     plain = plain_text(name)
     return plain if len(plain) <= _LONGEST else f"{plain[: _LONGEST - 1]}…"
 
 
 def strip(axes: Axes, grid: str = "both") -> None:
-    """The look that all pictures of figures share: a light grid behind, no box around."""
+    """Set the common style of plots: a light grid behind the data, and no box."""
     axes.grid(axis=grid, color=GRID, lw=0.7)  # type: ignore[arg-type]
     axes.set_axisbelow(True)
     axes.spines[["top", "right"]].set_visible(False)
 
 
 def scale_logarithmic(axes: Axes, axis: str, low: float, high: float) -> None:
-    """A logarithmic axis whose ticks are round numbers, not powers."""
+    """Make an axis logarithmic, with round numbers as ticks instead of powers of ten."""
     steps = [m * 10.0**e for e in range(-4, 6) for m in (1, 2, 5)]
     axes.set(**{f"{axis}scale": "log", f"{axis}lim": (low, high)})
     set_ticks(axes, axis, [step for step in steps if low <= step <= high])
 
 
 def set_ticks(axes: Axes, axis: str, values: Sequence[float]) -> None:
-    """Ticks at just these values, and their numbers in plain digits."""
-    along = axes.xaxis if axis == "x" else axes.yaxis
-    along.set_major_locator(FixedLocator(values))
-    along.set_minor_locator(NullLocator())
-    along.set_major_formatter(FuncFormatter(lambda value, _: f"{value:g}"))
+    """Set the ticks of an axis to the given values, with labels in plain digits."""
+    target = axes.xaxis if axis == "x" else axes.yaxis
+    target.set_major_locator(FixedLocator(values))
+    target.set_minor_locator(NullLocator())
+    target.set_major_formatter(FuncFormatter(lambda value, _: f"{value:g}"))

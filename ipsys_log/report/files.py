@@ -1,4 +1,4 @@
-"""Output files: written wholly or not at all, never in place of a log; tables in cm."""
+"""Output files: written completely or not at all, and never over a log; tables in cm."""
 
 from __future__ import annotations
 
@@ -25,7 +25,7 @@ __all__ = [
     "write_files",
 ]
 
-# Names of the paper's methods, as its Tables I and II have them.
+# Names of the methods in Tables I and II of the paper.
 _PAPER_NAMES = {
     "rigid": "RT",
     "poly": "PR",
@@ -41,10 +41,10 @@ _FIGURES = {"mean": "mean_m", "min": "min_m", "max": "max_m", "std": "std_m"}
 
 
 def paper_csv(findings: Findings, in_space: bool) -> bytes:
-    """Table I of the paper (errors in space) or Table II (on the floor): a row for each model.
+    """Return Table I of the paper (errors in space) or Table II (errors on the floor), one row per model.
 
-    The columns are those of the paper: the mean of each camera, then their lower bounds, upper bounds and
-    standard deviations, on the places held out, against the tape. What is not known is empty.
+    The columns are those of the paper: the means of the cameras, then their minima, maxima and standard
+    deviations. The errors are on held-out points, against the tape. Unknown values are empty.
     """
     header = ["method", "paper"] + [f"{figure}_cm_{c}" for figure in _FIGURES for c in findings.cameras]
     rows = []
@@ -73,7 +73,7 @@ _STATISTICS = {
 
 
 def cross_validation_csv(findings: Findings) -> bytes:
-    """A row for each model, camera (``all``: together) and what it is compared with."""
+    """Return a table with one row per model, camera (``all``: all together) and reference (tape or truth)."""
     header = ["method", "camera", "against", "places"]
     header += [f"{name}_{space}_cm" for space in ("3d", "2d") for name in (*_STATISTICS, "rmse")]
     header += [f"bias_{axis}_cm" for axis in "xyz"] + ["within_68", "within_95"]
@@ -100,7 +100,7 @@ def _csv(header: Sequence[str], rows: Iterable[Sequence[str]]) -> bytes:
     return text.getvalue().encode()
 
 
-# How the name of a picture may end; it is written as that.
+# Valid suffixes of a figure file; the suffix gives the file format.
 PICTURES = (".png", ".pdf", ".svg", ".jpg", ".jpeg", ".webp")
 
 
@@ -110,7 +110,7 @@ def check_file(path: Path, option: str, logs: Iterable[Path]) -> None:
     Raises
     ------
     IpsysError
-        It cannot be written, or it is one of the logs.
+        The file cannot be written, or it is one of the logs.
     """
     if any(log.exists() and path.exists() and path.samefile(log) for log in logs):
         raise IpsysError(f"{option} {path}: this is the log itself; name another file")
@@ -124,12 +124,12 @@ def check_file(path: Path, option: str, logs: Iterable[Path]) -> None:
 
 
 def check_picture(path: Path, option: str, logs: Iterable[Path]) -> None:
-    """See that a picture can be written, and of what kind, before there is work that would be lost.
+    """Check that a figure can be written and has a valid format, before any work is done.
 
     Raises
     ------
     IpsysError
-        Where it cannot, or where its name does not end in one of ``PICTURES``.
+        The file cannot be written, or its name does not end in one of ``PICTURES``.
     """
     check_file(path, option, logs)
     if path.suffix.lower() not in PICTURES:
@@ -138,17 +138,17 @@ def check_picture(path: Path, option: str, logs: Iterable[Path]) -> None:
 
 
 def check_folder(folder: Path, option: str) -> None:
-    """See that a folder is there, or can be made, and can be written to.
+    """Check that a folder exists or can be created, and can be written to.
 
     Raises
     ------
     IpsysError
-        Where it cannot.
+        The folder cannot be created or written to.
     """
-    there = next(parent for parent in (folder, *folder.absolute().parents) if parent.exists())
-    if not there.is_dir():
-        raise IpsysError(f"{option} {folder}: {there} is a file; name a folder")
-    _check_writable(there, f"{option} {folder}")
+    existing = next(parent for parent in (folder, *folder.absolute().parents) if parent.exists())
+    if not existing.is_dir():
+        raise IpsysError(f"{option} {folder}: {existing} is a file; name a folder")
+    _check_writable(existing, f"{option} {folder}")
 
 
 def _check_writable(folder: Path, where: str) -> None:
@@ -160,7 +160,7 @@ def _check_writable(folder: Path, where: str) -> None:
 
 
 def write_files(folder: Path, files: Mapping[str, bytes]) -> None:
-    """Write files of these names into a folder, all of them or none; made if it is not there."""
+    """Write files into a folder, all of them or none; create the folder if it does not exist."""
     folder.mkdir(parents=True, exist_ok=True)
     partials = {folder / name: folder / f"{name}.{os.getpid()}.partial" for name in files}
     try:
@@ -170,7 +170,7 @@ def write_files(folder: Path, files: Mapping[str, bytes]) -> None:
             with partial.open("wb") as file:
                 file.write(content)
                 file.flush()
-                os.fsync(file.fileno())  # else a power cut may leave an empty file under the new name
+                os.fsync(file.fileno())  # without it, a power cut may leave an empty file with the new name
         for path, partial in partials.items():
             partial.replace(path)
     finally:

@@ -1,4 +1,4 @@
-"""What tables, pictures and the report are made of: evaluations, and the lab that they are of."""
+"""The data of tables, figures and the report: evaluations, and the lab of these evaluations."""
 
 from __future__ import annotations
 
@@ -23,12 +23,13 @@ Array = NDArray[np.float64]
 
 @dataclass(frozen=True, slots=True, eq=False)
 class Missed:
-    """How far one camera's positions at n places are off, in m, as means over repeats.
+    """The position errors of one camera at n calibration points, in m, as means over repeats.
 
     Attributes
     ----------
-    world_m, offsets_m : (n, 3), the places, and predicted minus measured.
-    lengths_m : (n, 2), of the errors in space and on the floor.
+    camera : name of the camera.
+    world_m, offsets_m : (n, 3), the points, and predicted minus measured positions.
+    lengths_m : (n, 2), lengths of the errors in space and on the floor.
     """
 
     camera: str
@@ -39,15 +40,15 @@ class Missed:
 
 @dataclass(frozen=True, slots=True, eq=False)
 class Findings:
-    """Evaluated models.
+    """The evaluated models of a session, and their lab.
 
     Attributes
     ----------
-    rig : the one in force.
-    accuracies : of those models that were evaluated.
-    fitted : by name of the model; one of a log by others may be missing.
-    cameras : in the order of the rig, which is that of the paper's tables.
-    advice : from the learning curves, where there are such.
+    rig : rig in force.
+    accuracies : accuracies of the evaluated models.
+    fitted : fitted models by name; a model of a log by other software may be missing.
+    cameras : cameras in the order of the rig, which is the order of the paper's tables.
+    advice : advice from learning curves; None without learning curves.
     """
 
     rig: Rig | None
@@ -66,28 +67,28 @@ class Findings:
 
     @property
     def in_space(self) -> bool:
-        """Whether errors are judged in space, or on the floor: where heights could not be learned."""
+        """The kind of the errors: True in space, False on the floor (if heights cannot be learned)."""
         return in_space(self.accuracies)
 
     def errors(self, row: CameraEvaluation) -> ErrorStatistics:
-        """The errors of a row that models are judged by."""
+        """Return the errors of a row by which models are compared."""
         return judged(row, self.in_space)
 
     def ranked(self) -> list[Accuracy]:
-        """The lowest mean error first; models that are told the height come last."""
+        """Return the models, the lowest mean error first; models with heights as input come last."""
         return rank(self.accuracies)
 
     def training_m(self) -> dict[str, Array]:
-        """The places that models were fitted on, (n, 3) in m by camera."""
-        found: dict[str, Array] = {}
+        """Return the points that models were fitted on, (n, 3) in m by camera."""
+        points_m: dict[str, Array] = {}
         for model in self.fitted.values():
             for camera in model.cameras:
-                if camera.pairs and camera.camera not in found:
-                    found[camera.camera] = np.array([pair.world_m for pair in camera.pairs])
-        return found
+                if camera.pairs and camera.camera not in points_m:
+                    points_m[camera.camera] = np.array([pair.world_m for pair in camera.pairs])
+        return points_m
 
     def test_m(self) -> dict[str, Array]:
-        """The places that were held out, (n, 3) in m by camera."""
+        """Return the held-out points, (n, 3) in m by camera."""
         rows = [row for accuracy in self.accuracies for row in accuracy.rows(False)]
         return {
             row.camera: np.array([residual.world_m for residual in row.residuals])
@@ -96,7 +97,7 @@ class Findings:
         }
 
     def missed(self, accuracy: Accuracy) -> list[Missed]:
-        """Errors at each place against the tape: by cross-validation, or else where it was held out."""
+        """Return the errors at each point against the tape: cross-validated, or else on held-out points."""
         rows = accuracy.rows(True) or accuracy.rows(False)
         return [_missed(row) for row in rows if row.against == "tape" and row.residuals]
 
@@ -108,30 +109,30 @@ def _missed(row: CameraEvaluation) -> Missed:
         places.setdefault(residual.measurement, []).append(residual.world_m)
         offsets.setdefault(residual.measurement, []).append(residual.predicted_m - residual.world_m)
     lengths = [
-        [np.linalg.norm(found, axis=1).mean(), np.linalg.norm(np.array(found)[:, :2], axis=1).mean()]
-        for found in offsets.values()
+        [np.linalg.norm(vectors_m, axis=1).mean(), np.linalg.norm(np.array(vectors_m)[:, :2], axis=1).mean()]
+        for vectors_m in offsets.values()
     ]
     return Missed(
         row.camera,
-        np.array([found[0] for found in places.values()]),
-        np.array([np.mean(found, axis=0) for found in offsets.values()]),
+        np.array([vectors_m[0] for vectors_m in places.values()]),
+        np.array([np.mean(vectors_m, axis=0) for vectors_m in offsets.values()]),
         np.array(lengths),
     )
 
 
 def in_space(accuracies: Sequence[Accuracy]) -> bool:
-    """Return whether errors are judged in space, or on the floor: where heights could not be learned."""
+    """Return True for errors in space, or False for errors on the floor (if heights cannot be learned)."""
     rows = [row for accuracy in accuracies if accuracy.evaluation for row in accuracy.evaluation.cameras]
     return all(row.error_3d is not None for row in rows)
 
 
 def judged(row: CameraEvaluation, space: bool) -> ErrorStatistics:
-    """Return the errors of a row that models are judged by."""
+    """Return the errors of a row by which models are compared, in space or on the floor."""
     return row.error_3d if space and row.error_3d is not None else row.error_2d
 
 
 def rank(accuracies: Sequence[Accuracy]) -> list[Accuracy]:
-    """Sort models: the lowest mean error first; those that are told the height come last."""
+    """Sort models: the lowest mean error first; models with heights as input come last."""
     space = in_space(accuracies)
 
     def place(accuracy: Accuracy) -> tuple[bool, bool, float]:
@@ -142,20 +143,20 @@ def rank(accuracies: Sequence[Accuracy]) -> list[Accuracy]:
 
 
 def overall(accuracy: Accuracy, cross_validated: bool, against: str = "tape") -> CameraEvaluation | None:
-    """The row over all cameras, which is that of the only one where there is but one."""
+    """Return the row over all cameras; with a single camera, return the row of this camera."""
     rows = [row for row in accuracy.rows(cross_validated) if row.against == against]
     pooled = [row for row in rows if row.camera == POOLED]
     return next(iter(pooled or rows), None)
 
 
 def gather_findings(session: Session, accuracies: Sequence[Accuracy]) -> Findings:
-    """What was evaluated, with the models and the lab."""
+    """Gather the evaluations of a session, with the models and the lab."""
     evaluated = tuple(accuracy for accuracy in accuracies if accuracy.evaluation is not None)
     rig = rig_in_force(session, [accuracy.run for accuracy in evaluated])
     evaluations = [accuracy.evaluation for accuracy in evaluated if accuracy.evaluation]
-    cameras = {row.camera for found in evaluations for row in found.cameras} - {POOLED}
-    named = [camera.name for camera in rig.cameras] if rig else []
-    ordered = [name for name in named if name in cameras]
+    cameras = {row.camera for evaluation in evaluations for row in evaluation.cameras} - {POOLED}
+    rig_cameras = [camera.name for camera in rig.cameras] if rig else []
+    ordered = [name for name in rig_cameras if name in cameras]
     models = {accuracy.model: _model(session, accuracy.run) for accuracy in evaluated}
     return Findings(
         rig,
@@ -167,7 +168,7 @@ def gather_findings(session: Session, accuracies: Sequence[Accuracy]) -> Finding
 
 
 def _model(session: Session, run: str) -> Model | None:
-    """The model that a run evaluated: its own, or that of a run that it read."""
+    """Return the model that a run evaluated: its own model, or the model of one of its input runs."""
     records = [record for record in session.runs() if (record.run, record.stage) == (run, "evaluate")]
     for name in (run, *(source for record in records for source in record.input_runs)):
         if topics := session.topics(MODEL, name):

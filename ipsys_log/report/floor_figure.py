@@ -51,7 +51,7 @@ __all__ = [
 ]
 
 _GRID_M = 0.5
-# Arrows are drawn so much longer that most of them span less than this part of the floor.
+# The factor of the arrows is so large that most arrows are shorter than this part of the floor.
 _ARROW_SHARE = 0.1
 _KEY_SHARE = 0.03
 _FACTORS = (1, 2, 5, 10, 20, 50, 100, 200, 500)
@@ -62,7 +62,10 @@ Lines = Mapping[str, NDArray[np.float64]]
 
 @dataclass(frozen=True, slots=True, eq=False)
 class Scene:
-    """What is drawn of a session; tracks and truth as (n, 2) in m by robot, with NaN where a line breaks."""
+    """The drawn data of a session.
+
+    ``tracks`` and ``truth`` are (n, 2) in m by robot, with NaN at the breaks of a line.
+    """
 
     rig: Rig | None
     places: Sequence[Place]
@@ -72,7 +75,7 @@ class Scene:
     truth: Lines
 
     def rows(self) -> list[CameraEvaluation]:
-        """Residuals to draw as arrows: against the tape, which every lab has."""
+        """Return the rows with residuals to draw as arrows: errors against the tape, which every lab has."""
         rows = self.evaluation.cameras if self.evaluation else ()
         return [
             row for row in rows if row.against == "tape" and row.residuals and row.scheme != CROSS_VALIDATION
@@ -80,7 +83,7 @@ class Scene:
 
 
 def draw_floor(axes: Axes, scene: Scene, styles: Mapping[str, tuple[str, str]]) -> None:
-    """Draw all of a scene.
+    """Draw the floor, tracks, points and errors of a scene.
 
     Parameters
     ----------
@@ -102,8 +105,8 @@ def draw_ground(axes: Axes, rig: Rig | None, around_m: Sequence[NDArray[np.float
 
     Parameters
     ----------
-    rig : for floor and points; without one the picture has room for what is in ``around_m``.
-    around_m : points (2,) or (n, 2) on the floor that are to be seen.
+    rig : rig with the floor and the reference points; None: the map shows the area of ``around_m``.
+    around_m : points (2,) or (n, 2) on the floor that must be visible.
     """
     floor = rig.floor if rig else None
     if floor is not None:
@@ -123,7 +126,7 @@ def draw_ground(axes: Axes, rig: Rig | None, around_m: Sequence[NDArray[np.float
 class Square(NamedTuple):
     """The part of the floor on a map: its centre (2,) and half of its side, in m.
 
-    Square axes of a square part have the same scale both ways.
+    With square axes, a square part has the same scale in both directions.
     """
 
     middle: NDArray[np.float64]
@@ -169,7 +172,7 @@ def _draw_tracks(axes: Axes, scene: Scene) -> None:
         axes.plot(*line.T, "--", color="black", lw=0.8, zorder=2.5, label="_" + name)
     for name, line in scene.tracks.items():
         axes.plot(*line.T, "-", color=colours[name], lw=1.6, zorder=2)
-        # Where a robot only stood, there is no line to see.
+        # The dots show a stationary robot, which has no visible line.
         axes.plot(*line.T, ".", color=colours[name], ms=2.2, zorder=2)
     for name in islice(scene.tracks, _MOST_ROBOTS):
         axes.plot([], [], "-", color=colours[name], lw=1.6, label=name)
@@ -191,7 +194,7 @@ def _draw_places(axes: Axes, scene: Scene) -> None:
 
 
 def _draw_errors(axes: Axes, scene: Scene, styles: Mapping[str, tuple[str, str]]) -> str:
-    """The arrows; returns the title that says what they are."""
+    """Draw the arrows of the errors; return the title that describes them."""
     rows = scene.rows()
     if not rows or scene.evaluation is None:
         return f"The floor, tracks of run {scene.run}" if scene.tracks else "The floor"
@@ -210,7 +213,7 @@ def _draw_errors(axes: Axes, scene: Scene, styles: Mapping[str, tuple[str, str]]
 
 
 def exaggeration(errors_m: Sequence[NDArray[np.float64]], span_m: float) -> int:
-    """Return the scale of errors (n, 2 or 3) on a map: most are visible, none covers much of the floor."""
+    """Return the factor of error arrows (n, 2 or 3) on a map: most are visible, and none is too long."""
     usual_m = float(np.quantile(np.linalg.norm(np.array(errors_m)[:, :2], axis=1), 0.9))
     fitting = [factor for factor in _FACTORS if factor * usual_m <= _ARROW_SHARE * span_m]
     return fitting[-1] if fitting else 1
@@ -224,7 +227,7 @@ def draw_arrows(
     *values: Any,
     **look: Any,
 ) -> Quiver:
-    """Draw errors (n, 2) at places (n, 2), so many times as long; ``values`` (n,) give them a colour each."""
+    """Draw errors (n, 2) at points (n, 2), longer by a factor; optional ``values`` (n,) give the colours."""
     return axes.quiver(
         *start_m.T, *error_m.T, *values, angles="xy", scale_units="xy", scale=1 / factor, width=0.0035,
         headwidth=4, headlength=5, headaxislength=4.5, minlength=0, zorder=4, **look,
@@ -232,7 +235,7 @@ def draw_arrows(
 
 
 def draw_key(axes: Axes, arrows: Quiver, factor: int) -> None:
-    """An arrow at the top right of the axes that says how long 1 cm, or some more, is drawn."""
+    """Draw the key of the arrows at the top right of the axes: the length of 1 cm, or of some cm."""
     span_m = axes.get_xlim()[1] - axes.get_xlim()[0]
     size_cm = next((cm for cm in (1, 2, 5, 10, 20) if factor * cm / CM_PER_M > _KEY_SHARE * span_m), 50)
     length_m = size_cm / CM_PER_M
@@ -243,35 +246,35 @@ def draw_key(axes: Axes, arrows: Quiver, factor: int) -> None:
 
 
 _DPI = 100
-# Of the floor's axes: how far below the top of the picture, and how long a side.
+# The axes of the floor: distance to the top of the figure, and length of a side.
 _TOP_IN = 0.65
 _SIDE_IN = 6.3
-# A line joins two instants of a track only where a robot can have gone from one to the other.
+# A line joins two positions of a track only if a robot can have moved from one to the other.
 _STEP_M = 0.5
 _GAP_NS = 500_000_000
 
 
 def draw_session(session: Session, accuracies: Sequence[Accuracy], path: Path) -> None:
-    """Draw a session into a picture of about 1400 x 800 pixels.
+    """Draw a session into a figure of about 1400 x 800 pixels.
 
-    On the left the floor to scale: measured places, the error of each held-out one as an arrow
-    (exaggerated by the factor that the title states) for the first model, tracks and, where known, the
-    truth. On the right every error of every model and camera, in cm.
+    The left side shows the floor to scale: measured points, tracks and, if known, the ground truth. An arrow
+    shows the error of the first model at each held-out point. The title states the factor of the arrows. The
+    right side shows every error of every model and camera, in cm.
 
     Parameters
     ----------
     session : open logs.
-    accuracies : from :func:`ipsys_log.report.accuracy.read_accuracy`; none leaves out the right side.
-    path : the picture, of the kind that its suffix says, in place of one that is there already.
+    accuracies : from :func:`ipsys_log.report.accuracy.read_accuracy`; empty leaves out the right side.
+    path : path of the figure; an existing file is replaced. The suffix gives the file format.
 
     Raises
     ------
     IpsysError
-        For a session with neither a floor nor places nor tracks.
+        The session has no floor, no measured points and no tracks.
     """
     scene = _gather(session, accuracies)
     rows = count_rows(accuracies)
-    # Rows of text need their height; beyond some 28 of them the picture grows.
+    # Rows of text need some height. With more than about 28 rows, the figure grows.
     figure = Figure(figsize=(14 if rows else 9, max(8.0, 1.6 + 0.23 * rows)), dpi=_DPI)
     width, height = figure.get_size_inches()
     low_in = height - _TOP_IN - _SIDE_IN
@@ -310,10 +313,10 @@ def _gather(session: Session, accuracies: Sequence[Accuracy]) -> Scene:
 
 
 def _lines(session: Session, topics: Sequence[str], rig: Rig | None) -> dict[str, NDArray[np.float64]]:
-    """Ways on the floor by robot, (n, 2) in m, one point an instant, NaN where the line breaks."""
+    """Return the tracks on the floor by robot, (n, 2) in m, one point per instant, NaN at a break."""
     lines = {}
     for marker_id, track in sorted(gather_tracks(session.messages(topics)).items() if topics else ()):
-        # The last of the poses of one instant rests on all cameras.
+        # A track may have several poses with the same time. The last of them uses all cameras.
         times_ns, last = np.unique(track.times_ns[::-1], return_index=True)
         points_m = track.points_m[::-1][last][:, :2]
         broken = (np.linalg.norm(np.diff(points_m, axis=0), axis=1) > _STEP_M) | (np.diff(times_ns) > _GAP_NS)

@@ -1,4 +1,4 @@
-"""A session as one page that needs nothing but itself: no network, no scripts, no fonts, no clock."""
+"""The report of a session as one self-contained HTML page: no network, no scripts, no fonts, no clock."""
 
 from __future__ import annotations
 
@@ -25,7 +25,7 @@ __all__ = ["render_report"]
 
 
 def render_report(session: Session, accuracies: Sequence[Accuracy]) -> str:
-    """The page of a session, always the same for the same log.
+    """Render the page of a session; the same log always gives the same page.
 
     Parameters
     ----------
@@ -35,14 +35,14 @@ def render_report(session: Session, accuracies: Sequence[Accuracy]) -> str:
     Raises
     ------
     IpsysError
-        Where no model was evaluated.
+        The session has no evaluated model.
     """
     findings = gather_findings(session, accuracies)
     if not findings.cameras:
         raise IpsysError(f"{session}: no model was evaluated, for no place is held out; measure some")
     environment = Environment(
         loader=PackageLoader("ipsys_log", "report"),
-        autoescape=True,  # names in a log are anybody's
+        autoescape=True,  # names in a log may hold any text
         finalize=_plain,
         undefined=StrictUndefined,
         trim_blocks=True,
@@ -57,7 +57,7 @@ def render_report(session: Session, accuracies: Sequence[Accuracy]) -> str:
 
 
 def _plain(value: Any) -> Any:
-    """Return what a page shows of a value: text without control characters, HTML of ours as it is."""
+    """Return the displayed form of a value: text without control characters, our own HTML unchanged."""
     if not isinstance(value, str) or hasattr(value, "__html__"):
         return value
     return plain_text(value, keep="\n", longest=len(value))
@@ -77,10 +77,10 @@ def _said(findings: Findings) -> dict[str, Any]:
 
 
 def _measured(session: Session, findings: Findings) -> list[Measured]:
-    """The places that count, with the rig that the evaluation was told to use, or their own."""
+    """Return the valid measured points, with the rig of the evaluation's options, or with the log's rig."""
     runs = [accuracy.run for accuracy in findings.accuracies]
-    told = [record.rig for record in session.runs() if record.run in runs and record.rig is not None]
-    return measured(LogView(session, rig=told[-1] if told else None))
+    rigs = [record.rig for record in session.runs() if record.run in runs and record.rig is not None]
+    return measured(LogView(session, rig=rigs[-1] if rigs else None))
 
 
 def _drawn(findings: Findings) -> dict[str, Any]:
@@ -94,7 +94,7 @@ def _drawn(findings: Findings) -> dict[str, Any]:
 
 
 def _made(session: Session, findings: Findings) -> dict[str, Any]:
-    """Where it all comes from."""
+    """Return the provenance of the page: logs, runs and parameters."""
     runs = _sources(session.runs(), [accuracy.run for accuracy in findings.accuracies])
     newest = next((run for run in reversed(runs) if run.stage == "evaluate"), None)
     return {
@@ -110,19 +110,19 @@ def _made(session: Session, findings: Findings) -> dict[str, Any]:
 
 
 def _span(start: str, end: str) -> str:
-    """Two times, with the day of the second only where it is another."""
+    """Format two times; the second one has a date only if the dates differ."""
     same_day = start[:10] == end[:10]
     return f"{start} to {end[11:] if same_day else end} UTC"
 
 
 def _sources(records: Sequence[Run], names: Sequence[str]) -> list[Run]:
-    """The records of some runs, up to their evaluation, and of all that they were made from."""
-    found: set[str] = set()
+    """Return the records of some runs up to their evaluation, and the records of all their input runs."""
+    collected: set[str] = set()
     waiting = [*names]
     while waiting:
         name = waiting.pop()
-        if name not in found:
-            found.add(name)
+        if name not in collected:
+            collected.add(name)
             waiting += [source for record in records if record.run == name for source in record.input_runs]
     later = ("locate", "fuse")
-    return [record for record in records if record.run in found and record.stage not in later]
+    return [record for record in records if record.run in collected and record.stage not in later]

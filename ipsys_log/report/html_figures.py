@@ -1,4 +1,4 @@
-"""The pictures of a session's page: narrow enough for a telephone, each with what it needs to be read."""
+"""The figures of a session's page: narrow enough for a phone, each with its caption."""
 
 from __future__ import annotations
 
@@ -39,7 +39,7 @@ Picture = dict[str, Any]
 
 def _picture(figure: Figure, caption: str) -> Picture:
     width_in, height_in = figure.get_size_inches()
-    # The size in pixels keeps the place of a picture while the page loads.
+    # The size in pixels reserves the space of a figure while the page loads.
     size = {"width": round(96 * width_in), "height": round(96 * height_in)}
     return {"uri": svg_uri(figure), "caption": caption, **size}
 
@@ -56,7 +56,7 @@ def _spaces(findings: Findings) -> tuple[bool, ...]:
 
 
 def models_pictures(findings: Findings) -> list[Picture]:
-    """Models side by side, in space and on the floor."""
+    """Return figures that compare the models, in space and on the floor."""
     pictures = []
     ranked = findings.ranked()
     for in_space in _spaces(findings):
@@ -74,7 +74,7 @@ def models_pictures(findings: Findings) -> list[Picture]:
 
 
 def residual_pictures(findings: Findings) -> list[Picture]:
-    """Where on the floor the shown models are off, with one scale of floor, arrows and colours."""
+    """Return floor maps of the errors of the shown models, all with the same scales."""
     accuracies = shown_models(findings)
     if not accuracies:
         return []
@@ -97,7 +97,7 @@ def residual_pictures(findings: Findings) -> list[Picture]:
 
 
 def learning_pictures(findings: Findings) -> list[Picture]:
-    """The mean over all cameras on random subsets, in space and on the floor."""
+    """Return the learning curves over all cameras on random subsets, in space and on the floor."""
     text = "Mean error {} over all cameras, fitted on random subsets; bars: one standard deviation"
     return _curves_pictures(
         {text.format(_SPACE[in_space]): mean_curves(findings, in_space) for in_space in _spaces(findings)}
@@ -105,7 +105,10 @@ def learning_pictures(findings: Findings) -> list[Picture]:
 
 
 def published_pictures(findings: Findings) -> list[Picture]:
-    """Each camera on the labelled subsets, where there are such: figures 10 and 11 of the paper."""
+    """Return the learning curves of each camera on the labelled subsets: figures 10 and 11 of the paper.
+
+    The list is empty if the log has no labelled subsets.
+    """
     text = "Mean error {} of camera {} at the held-out places, fitted on the labelled subsets"
     if not has_published(findings.evaluations):
         return []
@@ -119,7 +122,7 @@ def published_pictures(findings: Findings) -> list[Picture]:
 
 
 def _curves_pictures(panels: Mapping[str, Curves]) -> list[Picture]:
-    """A picture for each caption, all with one scale."""
+    """Return one figure per caption, all with the same scale."""
     limits = limits_cm(panels.values())
     return [
         _picture(curves_picture(curves, _WIDTH_IN, limits), caption)
@@ -129,7 +132,7 @@ def _curves_pictures(panels: Mapping[str, Curves]) -> list[Picture]:
 
 
 def coverage_picture(findings: Findings) -> Picture | None:
-    """The floor that lies around no camera's places."""
+    """Return a map of the floor outside of the fitted points of all cameras; None without fitted points."""
     if not findings.training_m():
         return None
     figure, axes = _figure(5.2)

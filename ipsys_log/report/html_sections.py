@@ -34,7 +34,7 @@ _TRUTH = "truth"
 
 
 def format_cm(value_m: float | None, digits: int = 2) -> str:
-    """A length in cm, or a dash where it is not known."""
+    """Format a length in cm, or return a dash if it is not known."""
     return "–" if value_m is None else f"{value_m * CM_PER_M:.{digits}f}"
 
 
@@ -45,13 +45,13 @@ def _interval(errors: ErrorStatistics) -> str:
 
 
 def headline(findings: Findings) -> dict[str, Any]:
-    """The best model, how good it is, and what that rests on."""
+    """Return the best model, its errors, and the data behind this result."""
     ranked = findings.ranked()
     best = ranked[0]
     row = overall(best, True) or overall(best, False)
     assert row is not None  # a model without any row was not evaluated
     errors, truth = findings.errors(row), overall(best, bool(best.rows(True)), _TRUTH)
-    told = [accuracy for accuracy in ranked if told_height(accuracy.model) and accuracy is not best]
+    height_models = [accuracy for accuracy in ranked if told_height(accuracy.model) and accuracy is not best]
     return {
         "model": label(best.model),
         "mean": format_cm(errors.mean_m, 1),
@@ -65,14 +65,16 @@ def headline(findings: Findings) -> dict[str, Any]:
         "floor": format_cm(row.error_2d.mean_m, 1),
         "p95": format_cm(errors.p95_m, 1),
         "truth": format_cm(findings.errors(truth).mean_m, 2) if truth else None,
-        "told": [(label(accuracy.model), _overall_mean(findings, accuracy)) for accuracy in told[:1]],
+        "told": [
+            (label(accuracy.model), _overall_mean(findings, accuracy)) for accuracy in height_models[:1]
+        ],
         "fitted": [(camera, len(points_m)) for camera, points_m in in_order(findings, findings.training_m())],
         "cameras": findings.cameras,
     }
 
 
 def _counts(accuracy: Accuracy) -> list[str]:
-    """How many places errors were judged at."""
+    """Return the numbers of points behind the errors, as texts."""
     schemes = {"by cross-validation": overall(accuracy, True), "held out": overall(accuracy, False)}
     return [f"{row.error_2d.count} {name}" for name, row in schemes.items() if row]
 
@@ -83,13 +85,13 @@ def _overall_mean(findings: Findings, accuracy: Accuracy) -> str:
 
 
 def in_order(findings: Findings, by_camera: Mapping[str, Any]) -> list[tuple[str, Any]]:
-    """By camera, in the order of the rig."""
+    """Return pairs of camera and value, in the order of the rig."""
     rest = sorted(set(by_camera) - {*findings.cameras})
     return [(name, by_camera[name]) for name in (*findings.cameras, *rest) if name in by_camera]
 
 
 def advice_rows(findings: Findings) -> dict[str, Any] | None:
-    """What to use with how many places; the groups that say something, as columns."""
+    """Return the model to use by number of points; columns are the groups with different choices."""
     advice = findings.advice
     if advice is None:
         return None
@@ -98,8 +100,8 @@ def advice_rows(findings: Findings) -> dict[str, Any] | None:
         "in_space": advice.in_space,
         "groups": [GROUPS[group] for group in advice.groups],
         "rows": [
-            (places, [_choice(found.get(group)) for group in advice.groups])
-            for places, found in advice.choices.items()
+            (places, [_choice(choices.get(group)) for group in advice.groups])
+            for places, choices in advice.choices.items()
         ],
         "sentences": advice.sentences,
     }
@@ -118,34 +120,34 @@ def _choice(choice: Choice | None) -> dict[str, str] | None:
 
 
 def model_rows(findings: Findings, camera: str = POOLED) -> list[dict[str, Any]]:
-    """A row for each model and what it is compared with: of one camera, or of all, the best first."""
+    """Return one row per model and reference (tape or truth), for one camera or for all; the best first."""
     against = [a for a in ("tape", _TRUTH) if any(_rows(f, camera, a) for f in findings.accuracies)]
     return [
         {
             "model": label(accuracy.model),
             "against": side,
             "several": len(against) > 1,
-            "held_out": _errors(accuracy, found.get(False)),
-            "crossed": _errors(accuracy, found.get(True)),
+            "held_out": _errors(accuracy, rows.get(False)),
+            "crossed": _errors(accuracy, rows.get(True)),
         }
         for accuracy in findings.ranked()
         for side in against
-        if (found := _rows(accuracy, camera, side))
+        if (rows := _rows(accuracy, camera, side))
     ]
 
 
 def _rows(accuracy: Accuracy, camera: str, against: str) -> dict[bool, CameraEvaluation]:
-    """By whether it is that of cross-validation."""
+    """Return the rows of a model; the key is True for cross-validation, False for held-out points."""
     if camera == POOLED:
-        found = {crossed: overall(accuracy, crossed, against) for crossed in (False, True)}
+        rows = {crossed: overall(accuracy, crossed, against) for crossed in (False, True)}
     else:
-        found = {
+        rows = {
             crossed: next(
                 (r for r in accuracy.rows(crossed) if (r.camera, r.against) == (camera, against)), None
             )
             for crossed in (False, True)
         }
-    return {crossed: row for crossed, row in found.items() if row is not None}
+    return {crossed: row for crossed, row in rows.items() if row is not None}
 
 
 def _errors(accuracy: Accuracy, row: CameraEvaluation | None) -> dict[str, str] | None:
@@ -164,14 +166,14 @@ def _errors(accuracy: Accuracy, row: CameraEvaluation | None) -> dict[str, str] 
     }
 
 
-# Beyond so many standard deviations a share is not the one that was said.
+# A share contradicts the covariance if it differs from the expected share by more standard deviations.
 _SURE = 1.96
-# Points each way that the floor is sampled at.
+# Number of sample points on each side of the floor.
 _GRID = 200
 
 
 def suspects(findings: Findings) -> list[dict[str, Any]]:
-    """Each suspect measurement with the correction that would explain it, the worst first."""
+    """Return each outlier with the correction that would explain it, the worst first."""
     return [
         {
             "name": suspect.measurement,
@@ -192,7 +194,7 @@ def _point(point_m: Iterable[float] | None) -> str:
 
 
 def flat_rows(places: Sequence[Measured]) -> list[dict[str, str]] | None:
-    """Places whose tape circles cross flatly, the worst first; None where none was measured by tape."""
+    """Return points whose tape circles cross at a flat angle, the worst first; None without tape points."""
     if not any(len(place.measurement.distances) > 1 for place in places):
         return None
     return [
@@ -202,7 +204,7 @@ def flat_rows(places: Sequence[Measured]) -> list[dict[str, str]] | None:
 
 
 def coverage(findings: Findings) -> dict[str, Any]:
-    """The volume of the measured places of each camera, and the share of the floor that lies outside all."""
+    """Return the extent of the fitted points of each camera, and the share of the floor outside of all."""
     training = in_order(findings, findings.training_m())
     hulls = [corners_m for _, points_m in training if (corners_m := hull_m(points_m)) is not None]
     rows = []
@@ -229,22 +231,24 @@ def _area_m2(corners_m: NDArray[np.float64]) -> float:
 
 
 def calibration(findings: Findings) -> list[dict[str, Any]]:
-    """Whether errors are as large as the covariance of a position says, for each model that has one."""
+    """Return a row on the consistency of the covariance, for each model with a covariance."""
     rows = []
     for accuracy in findings.ranked():
         schemes = {
             name: overall(accuracy, crossed) for name, crossed in (("crossed", True), ("held_out", False))
         }
-        known = {name: row for name, row in schemes.items() if row is not None and row.within_68 is not None}
-        if known:
+        known_rows = {
+            name: row for name, row in schemes.items() if row is not None and row.within_68 is not None
+        }
+        if known_rows:
             rows.append(
                 {
                     "model": label(accuracy.model),
                     **{
                         name: (_percent(row.within_68), _percent(row.within_95))
-                        for name, row in known.items()
+                        for name, row in known_rows.items()
                     },
-                    "verdict": _verdict(next(iter(known.values()))),
+                    "verdict": _verdict(next(iter(known_rows.values()))),
                 }
             )
     return rows
@@ -256,7 +260,7 @@ def _percent(share: float | None) -> str:
 
 def _verdict(row: CameraEvaluation) -> str:
     def beyond(share: float | None, said: float) -> float:
-        """How many standard deviations of a share of so many places it is above what was said."""
+        """Return the excess of a share over the expected share, in standard deviations of the share."""
         return (
             0.0 if share is None else float((share - said) / np.sqrt(said * (1 - said) / row.error_2d.count))
         )

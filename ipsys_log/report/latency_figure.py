@@ -1,4 +1,4 @@
-"""The latency ledger as a picture: how the steps share the time from a frame to its position."""
+"""Figure of the latency: the time from a frame to its position, and the parts of the steps."""
 
 from __future__ import annotations
 
@@ -17,17 +17,19 @@ __all__ = ["draw_latency"]
 
 _STEPS = ("detected", "located", "fused", "published")
 _NEAR, _FAR = "#0072B2", "#D3D7DB"
-# Beyond this many times the 99th percentile a few late ones would squeeze all the others.
+# The axis ends at this many times the 99th percentile. A few late positions would make it too long.
 _SHOWN = 1.6
 
 
 def draw_latency(times_s: Mapping[str, NDArray[np.float64]], path: Path) -> None:
-    """Draw what share of positions is there within which time, and each step of it, 1200 x 600 if in pixels.
+    """Draw the cumulative distribution of the latency, and the duration of each step.
+
+    A file in pixels has 1200 x 600 pixels.
 
     Parameters
     ----------
-    times_s : of :func:`ipsys_log.analysis.latency.step_times_s`.
-    path : the picture, of the kind that its suffix says.
+    times_s : from :func:`ipsys_log.analysis.latency.step_times_s`.
+    path : path of the figure; the suffix gives the file format.
     """
     figure = Figure(figsize=(12, 6), dpi=100)
     left = figure.add_axes((0.07, 0.11, 0.42, 0.73))
@@ -43,8 +45,8 @@ def _draw_shares(axes: Axes, total_ms: NDArray[np.float64]) -> None:
     share = 100 * np.arange(1, len(total_ms) + 1) / len(total_ms)
     axes.step(total_ms, share, where="post", color="black", label=f"all; longest {total_ms[-1]:.1f} ms")
     median_ms, far_ms = np.percentile(total_ms, [50, 99]).tolist()
-    for name, at_ms, dashes in (("median", median_ms, "--"), ("99 %", far_ms, ":")):
-        axes.axvline(at_ms, color=NOTE, lw=1.2, ls=dashes, label=f"{name} {at_ms:.1f} ms")
+    for name, value_ms, dashes in (("median", median_ms, "--"), ("99 %", far_ms, ":")):
+        axes.axvline(value_ms, color=NOTE, lw=1.2, ls=dashes, label=f"{name} {value_ms:.1f} ms")
     axes.set(xlabel="ms from the arrival of a frame to its position", ylabel="% of positions", ylim=(0, 101))
     axes.set_xlim(0, min(float(total_ms[-1]) * 1.05, _SHOWN * far_ms))
     strip(axes)
@@ -53,13 +55,13 @@ def _draw_shares(axes: Axes, total_ms: NDArray[np.float64]) -> None:
 
 def _draw_steps(axes: Axes, times_s: Mapping[str, NDArray[np.float64]]) -> None:
     rows = np.arange(len(_STEPS))
-    found_ms = np.array([np.percentile(times_s[step], [50, 99]) for step in _STEPS]) * 1e3
-    axes.barh(rows, found_ms[:, 1], color=_FAR, label="99 % of positions")
-    axes.barh(rows, found_ms[:, 0], color=_NEAR, height=0.5, label="median")
-    for row, (median_ms, far_ms) in enumerate(found_ms):
+    steps_ms = np.array([np.percentile(times_s[step], [50, 99]) for step in _STEPS]) * 1e3
+    axes.barh(rows, steps_ms[:, 1], color=_FAR, label="99 % of positions")
+    axes.barh(rows, steps_ms[:, 0], color=_NEAR, height=0.5, label="median")
+    for row, (median_ms, far_ms) in enumerate(steps_ms):
         text = f"{median_ms:.1f}, 99 %: {far_ms:.1f}"
         axes.annotate(text, (far_ms, row), (5, 0), textcoords="offset points", va="center", fontsize=9)
-    axes.set_xlim(0, 1.5 * float(found_ms[:, 1].max()))
+    axes.set_xlim(0, 1.5 * float(steps_ms[:, 1].max()))
     axes.set_yticks(rows, _STEPS)
     axes.invert_yaxis()
     axes.set(xlabel="ms for the step")
@@ -68,5 +70,5 @@ def _draw_steps(axes: Axes, times_s: Mapping[str, NDArray[np.float64]]) -> None:
 
 
 def _key(axes: Axes) -> None:
-    """The legend, above the axes, where it covers nothing."""
+    """Draw the legend above the axes, outside of the data."""
     axes.legend(loc="lower left", bbox_to_anchor=(-0.02, 1.0), ncols=3, fontsize=9, frameon=False)

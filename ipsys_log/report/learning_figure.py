@@ -1,4 +1,4 @@
-"""How many places are enough, as pictures: figures 10 and 11 of the paper, and random subsets."""
+"""Figures of the learning curves: figures 10 and 11 of the paper, and random subsets."""
 
 from __future__ import annotations
 
@@ -36,20 +36,20 @@ __all__ = [
 
 Curves = Mapping[str, Curve]
 
-# Beyond this ratio of the largest mean to the smallest, equal steps hide the small ones.
+# Above this ratio of the largest mean to the smallest, the scale is logarithmic to show small values.
 _LOG_RATIO = 8.0
-# Bars of one number of places stand side by side on the picture, so far apart; the marks stay at the number.
+# Distance of the error bars of several models at one number of points. The marks are not shifted.
 _APART_PT = 0.9
 _SPACE = {True: "Mean error in space in cm", False: "Mean error on the floor in cm"}
 
 
 def camera_curves(findings: Findings, camera: str, in_space: bool) -> Curves:
-    """The curves of one camera on the labelled subsets, by model."""
+    """Return the curves of one camera on the labelled subsets, by model."""
     return _some({e.model: camera_curve(e, camera, True, in_space) for e in findings.evaluations})
 
 
 def mean_curves(findings: Findings, in_space: bool) -> Curves:
-    """The curves over all cameras on random subsets, by model."""
+    """Return the curves over all cameras on random subsets, by model."""
     return _some({e.model: mean_curve(e, False, in_space) for e in findings.evaluations})
 
 
@@ -58,14 +58,14 @@ def _some(curves: Curves) -> Curves:
 
 
 def published_figure(findings: Findings, in_space: bool) -> Figure:
-    """One panel for each camera: figure 10 of the paper in space, figure 11 on the floor."""
+    """Return a figure with one panel per camera: figure 10 of the paper in space, figure 11 on the floor."""
     panels = {f"camera {shorten(name)}": camera_curves(findings, name, in_space) for name in findings.cameras}
     title = f"{_SPACE[in_space]} at the held-out places, fitted on the labelled subsets"
     return _figure(panels, title, _SPACE[in_space])
 
 
 def learning_figure(findings: Findings) -> Figure:
-    """The mean over the cameras on random subsets, in space and on the floor."""
+    """Return a figure of the mean over the cameras on random subsets, in space and on the floor."""
     spaces = {"in space": True, "on the floor": False} if findings.in_space else {"on the floor": False}
     panels = {title: mean_curves(findings, in_space) for title, in_space in spaces.items()}
     title = "Fitted on random subsets, judged at the other places; bars: one standard deviation over subsets"
@@ -91,7 +91,7 @@ def _figure(panels: Mapping[str, Curves], title: str, ylabel: str) -> Figure:
 
 
 def curves_picture(curves: Curves, width_in: float, limits: tuple[float, float]) -> Figure:
-    """One panel with its legend below, for a narrow page."""
+    """Return a figure with one panel and its legend below, for a narrow page."""
     lines = -(-len(curves) // 2)
     figure = Figure(figsize=(width_in, 3.7 + 0.19 * lines), layout="constrained")
     axes, styles = figure.add_subplot(), model_styles(curves)
@@ -103,13 +103,13 @@ def curves_picture(curves: Curves, width_in: float, limits: tuple[float, float])
 
 
 def _note(models: Iterable[str]) -> str:
-    """What stands above the legend."""
+    """Return the title of the legend."""
     order = "in the order of the right ends"
     return f"{order}\n{TOLD_NOTE}" if any(map(told_height, models)) else order
 
 
 def _by_end(panels: Sequence[Curves]) -> list[str]:
-    """Models in the order in which their curves end, from the top."""
+    """Return the models in the order of the right ends of their curves, from the top."""
     ends: dict[str, list[float]] = {}
     for curves in panels:
         for model, curve in curves.items():
@@ -122,7 +122,10 @@ def _handle(model: str, style: ModelStyle) -> Line2D:
 
 
 def limits_cm(panels: Iterable[Curves]) -> tuple[float, float]:
-    """The least and the largest that there is to show, in cm; a bar adds at most as much as the mean."""
+    """Return the smallest mean and the highest end of a bar, in cm.
+
+    The highest end is limited to twice the largest mean.
+    """
     points = [point for curves in panels for curve in curves.values() for point in curve]
     if not points:
         return 1.0, 1.0
@@ -132,7 +135,10 @@ def limits_cm(panels: Iterable[Curves]) -> tuple[float, float]:
 
 
 def _bar(point: CurvePoint) -> tuple[float, float]:
-    """Where the bar of a point begins and ends; below a mean no larger than its spread it says nothing."""
+    """Return the lower and upper end of the bar of a point, in m.
+
+    If the spread is nearly as large as the mean or larger, the lower end is the mean.
+    """
     spread_m = point.std_m or 0.0
     return point.mean_m - spread_m if spread_m < 0.9 * point.mean_m else point.mean_m, point.mean_m + spread_m
 
@@ -144,8 +150,8 @@ def draw_curves(
 
     Parameters
     ----------
-    styles : by model.
-    limits : of all panels that share their scale, from :func:`limits_cm`.
+    styles : styles by model.
+    limits : limits of all panels with the same scale, from :func:`limits_cm`.
     """
     low_cm, high_cm = limits
     for number, (model, curve) in enumerate(curves.items()):

@@ -1,4 +1,4 @@
-"""The tables and figures of the paper, and some more, as files of a folder."""
+"""The tables and figures of the paper, and some more, as files in a folder."""
 
 from __future__ import annotations
 
@@ -51,14 +51,18 @@ __all__ = [
 Array = NDArray[np.float64]
 
 
-# From pale for a small error to dark for a large one, which any colour vision sees.
+# Colours from pale (small error) to dark (large error), readable with any colour vision.
 _COLOURS = ListedColormap(colormaps["magma_r"](np.linspace(0.2, 0.95, 256)))
-# So much wider at most the picture may be than the floor for the sake of an arrow.
+# Largest factor by which the map is wider than the floor, to make room for arrows.
 _WIDER = 1.12
 
 
 class ResidualScale(NamedTuple):
-    """Scales of floor maps: the error in cm that has the last colour, the arrows' factor, the floor shown."""
+    """The scales of floor maps.
+
+    ``most_cm`` is the error in cm of the last colour, ``factor`` the factor of the arrows, and ``square`` the
+    part of the floor.
+    """
 
     most_cm: float
     factor: int
@@ -66,18 +70,21 @@ class ResidualScale(NamedTuple):
 
 
 def shown_models(findings: Findings) -> list[Accuracy]:
-    """``poly``, which everybody knows, and the best of all that need no height; with residuals."""
+    """Return the models whose errors are drawn: ``poly``, a well-known model, and the best model.
+
+    Models without residuals are left out. Models with heights as input come last in the ranking.
+    """
     ranked = [accuracy for accuracy in findings.ranked() if findings.missed(accuracy)]
-    named = [accuracy for accuracy in ranked if accuracy.model == "poly"]
-    return list(dict.fromkeys([*named, *ranked[:1]]))
+    poly = [accuracy for accuracy in ranked if accuracy.model == "poly"]
+    return list(dict.fromkeys([*poly, *ranked[:1]]))
 
 
 def residual_scale(findings: Findings, accuracies: Sequence[Accuracy]) -> ResidualScale:
-    """Return the scale that shows all these models alike: maps side by side are compared by eye."""
+    """Return one scale for the maps of all these models, so that the maps can be compared by eye."""
     missed = [missed for accuracy in accuracies for missed in findings.missed(accuracy)]
-    places_m = np.vstack([each.world_m[:, :2] for each in missed])
-    errors_m = np.vstack([each.offsets_m[:, :2] for each in missed])
-    lengths_cm = np.concatenate([_lengths_cm(findings, each) for each in missed])
+    places_m = np.vstack([camera_errors.world_m[:, :2] for camera_errors in missed])
+    errors_m = np.vstack([camera_errors.offsets_m[:, :2] for camera_errors in missed])
+    lengths_cm = np.concatenate([_lengths_cm(findings, camera_errors) for camera_errors in missed])
     square = square_around(findings.rig, [places_m])
     factor = exaggeration(list(errors_m), 2 * square.half)
     # Make room for the arrows, while the floor stays large.
@@ -87,7 +94,7 @@ def residual_scale(findings: Findings, accuracies: Sequence[Accuracy]) -> Residu
 
 
 def residuals_figure(findings: Findings) -> Figure:
-    """A floor for each model that is shown, with one scale of colours."""
+    """Return a figure with one floor map per shown model, with the same scale of colours."""
     accuracies = shown_models(findings)
     figure = Figure(figsize=(5.6 * len(accuracies) + 0.9, 6.6), layout="constrained")
     scale = residual_scale(findings, accuracies)
@@ -106,16 +113,16 @@ def residuals_figure(findings: Findings) -> Figure:
 
 
 def draw_residuals(axes: Axes, findings: Findings, accuracy: Accuracy, scale: ResidualScale) -> Quiver:
-    """Draw one model's mean error at each place as an arrow on the floor, coloured by its length in space."""
+    """Draw one model's mean error at each point as an arrow on the floor, coloured by its length in space."""
     missed = findings.missed(accuracy)
-    places_m = np.vstack([found.world_m[:, :2] for found in missed])
-    errors_m = np.vstack([found.offsets_m[:, :2] for found in missed])
-    lengths_cm = np.concatenate([_lengths_cm(findings, found) for found in missed])
+    places_m = np.vstack([camera_errors.world_m[:, :2] for camera_errors in missed])
+    errors_m = np.vstack([camera_errors.offsets_m[:, :2] for camera_errors in missed])
+    lengths_cm = np.concatenate([_lengths_cm(findings, camera_errors) for camera_errors in missed])
     draw_ground(axes, findings.rig, [places_m])
     draw_hulls(axes, findings)
     show_square(axes, scale.square)
     factor = scale.factor
-    # The largest last, on top of the others.
+    # The largest errors are drawn last, on top of the others.
     order = np.argsort(lengths_cm, kind="stable")
     places_m, errors_m, lengths_cm = places_m[order], errors_m[order], lengths_cm[order]
     look = {"cmap": _COLOURS, "norm": Normalize(0, scale.most_cm)}
@@ -139,7 +146,7 @@ HELD_OUT = {"marker": "D", "mfc": "white", "mec": NOTE, "ms": 5.5, "mew": 1.2, "
 
 
 def models_figure(findings: Findings) -> Figure:
-    """A row for each model, the best on top: the mean with its interval, in space and on the floor."""
+    """Return a figure with a row per model, the best on top: mean and interval, in space and on the floor."""
     spaces = (True, False) if findings.in_space else (False,)
     ranked = findings.ranked()
     figure = Figure(figsize=(1.8 + 4.2 * len(spaces), 1.7 + _ROW_IN * len(ranked)), layout="constrained")
@@ -159,12 +166,12 @@ def models_figure(findings: Findings) -> Figure:
 
 
 def models_note(accuracies: Sequence[Accuracy]) -> str:
-    """What the mark at the names of some models means; empty where there are none."""
+    """Return the meaning of the mark at the names of some models; empty if no model has it."""
     return TOLD_NOTE if any(told_height(accuracy.model) for accuracy in accuracies) else ""
 
 
 def draw_models(axes: Axes, ranked: Sequence[Accuracy], in_space: bool) -> None:
-    """Draw a row for each model, the first on top; the scale is that of errors in space and on the floor."""
+    """Draw one row per model, the first on top; the scale fits the errors in space and on the floor."""
     styles = model_styles(accuracy.model for accuracy in ranked)
     for y, accuracy in enumerate(ranked):
         crossed = _errors(overall(accuracy, True), in_space)
@@ -195,7 +202,7 @@ def _errors(row: CameraEvaluation | None, in_space: bool) -> ErrorStatistics | N
 
 
 def _ends_cm(errors: ErrorStatistics) -> list[float]:
-    """Of the confidence interval of the mean, or the mean itself."""
+    """Return the ends of the confidence interval of the mean, or the mean itself, in cm."""
     ends_m = (errors.mean_low_m, errors.mean_high_m)
     return [(errors.mean_m if end_m is None else end_m) * CM_PER_M for end_m in ends_m]
 
@@ -212,7 +219,7 @@ def _published(findings: Findings) -> bool:
     return has_published(findings.evaluations)
 
 
-# Each file: when there is something for it, and its bytes.
+# For each file: the condition to write it, and the function that returns its bytes.
 _FILES: dict[str, tuple[Callable[[Findings], bool], Callable[[Findings], bytes]]] = {
     "table_1.csv": (_always, lambda f: paper_csv(f, in_space=True)),
     "table_2.csv": (_always, lambda f: paper_csv(f, in_space=False)),
@@ -230,7 +237,7 @@ _FILES: dict[str, tuple[Callable[[Findings], bool], Callable[[Findings], bytes]]
 
 
 def write_plots(findings: Findings, folder: Path) -> list[str]:
-    """Write what there is to be shown into a folder, all of it or nothing.
+    """Write all tables and figures that have data into a folder: all files, or none.
 
     Returns
     -------
@@ -239,9 +246,9 @@ def write_plots(findings: Findings, folder: Path) -> list[str]:
     Raises
     ------
     IpsysError
-        Where no model was evaluated.
+        No model was evaluated.
     """
-    files = {name: draw(findings) for name, (wanted, draw) in _FILES.items() if wanted(findings)}
+    files = {name: draw(findings) for name, (has_data, draw) in _FILES.items() if has_data(findings)}
     if not files:
         raise IpsysError(
             f"{folder}: nothing to draw: no model was evaluated, for no place is held out; measure some"

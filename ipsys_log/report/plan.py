@@ -1,4 +1,4 @@
-"""What to measure next, planned from a log."""
+"""Plan of the next points to measure, from a log."""
 
 from __future__ import annotations
 
@@ -26,31 +26,33 @@ __all__ = ["PlannedFloor", "fitted_view", "means_cm", "mesh", "plan_floor"]
 Array = NDArray[np.float64]
 Lenses = Mapping[str, CameraCalibration]
 
-# From the middle of a marker to the corners of the white around it, in sides: it has 6 cells or more.
+# Distance from the centre of a marker to the corners of its white margin, in sides of the marker. A marker
+# has 6 cells or more per side.
 _RADIUS = 8 / 6 / np.sqrt(2)
-# Between candidates, and of the floor's cells; twice as much on a floor of 10 m.
+# Step between candidates and size of the floor's cells; on a floor of 10 m, the step is twice as large.
 _STEP_M, _SPAN_M = 0.1, 5.0
 _AROUND_M = 0.5
 _MOST_HEIGHTS = 5
-# Of a tape, and of a camera with too few places to tell: relative, as uncertainty.py has them.
+# Usual standard deviation of a tape in m. Usual noise and fit error of a camera with too few points for an
+# estimate; both are relative, as in uncertainty.py.
 _USUAL_TAPE_M, _USUAL_NOISE, _USUAL_FIT = 0.003, 3e-4, 2.5e-3
 _LITTLE = 0.05
-# As many as the leverage has terms: with fewer it knows no bounds.
+# The leverage has this many terms. With fewer points, it has no upper bound.
 _LEAST_PLACES = 6
 
 
 @dataclass(frozen=True, slots=True, eq=False)
 class PlannedFloor:
-    """A plan and what it is for.
+    """A plan of the next points, with its model, its floor and its inputs.
 
     Attributes
     ----------
-    model, run, rig : that were planned for.
-    plan : over the middles of the floor's cells, (b * a,), row by row.
-    xs_m, ys_m : (a,), (b,), the middles of these cells.
-    height_m : of the marker whose error is predicted.
-    measured_m : (n, 3), the places that the model was fitted on.
-    notes : what to know of it.
+    model, run, rig : model, run and rig of the plan.
+    plan : plan over the centres of the floor's cells, (b * a,), row by row.
+    xs_m, ys_m : (a,), (b,), the centres of these cells.
+    height_m : height of the marker whose error is predicted.
+    measured_m : (n, 3), the points that the model was fitted on.
+    notes : remarks on the plan.
     """
 
     model: str
@@ -64,12 +66,15 @@ class PlannedFloor:
     notes: tuple[str, ...]
 
     def distances_m(self, point_m: Array) -> dict[str, float]:
-        """What the tape will say of a place (3,), about, by reference point."""
+        """Return the approximate tape distances to a point (3,), by reference point."""
         x_m, y_m, _ = point_m.tolist()
         return {p.name: math.hypot(x_m - p.x_m, y_m - p.y_m) for p in self.rig.reference_points}
 
     def side(self, point_m: Array) -> str | None:
-        """Of the line from the first reference point to the second, where the tape needs it."""
+        """Return the side of a point relative to the line from the first to the second reference point.
+
+        Return None if tape measurements need no side.
+        """
         known_m = _references(self.rig)
         if len(known_m) < 2 or not sides_alike(known_m):
             return None
@@ -80,18 +85,20 @@ class PlannedFloor:
 def plan_floor(
     session: Session, run: str, rig: Rig, lenses: Lenses, count: int, heights_m: Sequence[float] = ()
 ) -> PlannedFloor:
-    """Plan the next places to measure for the fitted model of a run.
+    """Plan the next points to measure for the fitted model of a run.
 
     Parameters
     ----------
-    rig, lenses : in force; the lenses by camera.
-    count : how many places.
-    heights_m : at which a marker can be laid; empty for those that were used so far.
+    session : open logs.
+    run : run of the fitted model.
+    rig, lenses : rig and intrinsics in force; ``lenses`` by camera.
+    count : number of points to plan.
+    heights_m : possible heights of a marker; empty for the heights that were used so far.
 
     Raises
     ------
     IpsysError
-        Where no camera sees a marker of such a height anywhere on the floor.
+        No camera sees a marker of these heights anywhere on the floor.
     """
     model: Model = session.payloads(session.topics(MODEL, run))[-1]
     views = [
@@ -100,7 +107,7 @@ def plan_floor(
     if not views:
         raise IpsysError(f"run {run}: its model does not say on which places it was fitted; fit it again")
     measured_m = np.unique(np.vstack([view.fitted_m for view in views]), axis=0)
-    # The height of the robots' markers, where it is known.
+    # The known heights of the robots' markers.
     carried_m = [height for marker in rig.markers if (height := rig.height_of(marker.id)) is not None]
     height_m = round(float(np.median(carried_m or measured_m[:, 2])), 3)
     low_m, high_m = _corners(rig, measured_m)
@@ -120,7 +127,7 @@ def plan_floor(
 
 
 def fitted_view(name: str, camera: CameraModel, lens: CameraCalibration | None) -> View:
-    """What a fitted camera sees; ``name`` is its model's, ``lens`` None where it is not known."""
+    """Return the view of a fitted camera; ``name`` is the name of its model, ``lens`` None if not known."""
     points_m, world_m = (np.array([getattr(p, key) for p in camera.pairs]) for key in ("camera_m", "world_m"))
     arrays = {p.name: p.values.reshape(p.shape) for p in camera.parameters}
     if {"rotation", "origin", "lens"} <= set(arrays):
@@ -138,10 +145,13 @@ def fitted_view(name: str, camera: CameraModel, lens: CameraCalibration | None) 
 
 
 def _used_heights(heights_m: Array) -> list[float]:
-    """To the centimetre; of many, some from the lowest to the highest."""
+    """Return the used heights, rounded to centimetres.
+
+    If there are many, return some of them, from the lowest to the highest.
+    """
     used_m = np.unique(np.round(heights_m, 2))
-    some = np.linspace(0, len(used_m) - 1, min(len(used_m), _MOST_HEIGHTS)).round().astype(int)
-    return [float(height_m) for height_m in used_m[some]]
+    chosen = np.linspace(0, len(used_m) - 1, min(len(used_m), _MOST_HEIGHTS)).round().astype(int)
+    return [float(height_m) for height_m in used_m[chosen]]
 
 
 def _corners(rig: Rig, measured_m: Array) -> tuple[Array, Array]:
@@ -154,20 +164,20 @@ def _corners(rig: Rig, measured_m: Array) -> tuple[Array, Array]:
 def _candidates(
     rig: Rig, low_m: Array, high_m: Array, step_m: float, half_m: float, heights_m: Sequence[float]
 ) -> Array:
-    """Where a marker can be laid, (c, 3): not over the edge of the floor, nor on a reference point."""
+    """Return possible points for a marker, (c, 3): not over the edge of the floor or a reference point."""
     inset_m = _STEP_M * math.ceil(half_m / _STEP_M - 1e-9)
-    # In whole centimetres, as they are printed.
+    # The coordinates are in whole centimetres, as the plan prints them.
     xs_m, ys_m = (
         np.arange(a + inset_m, b - half_m + 1e-9, step_m).round(2) for a, b in zip(low_m, high_m, strict=True)
     )
-    found_m = mesh(xs_m, ys_m, heights_m)
-    apart_m = np.linalg.norm(found_m[:, None, :2] - _references(rig), axis=2)
-    free: Array = found_m[(apart_m > half_m).all(axis=1)]
+    points_m = mesh(xs_m, ys_m, heights_m)
+    apart_m = np.linalg.norm(points_m[:, None, :2] - _references(rig), axis=2)
+    free: Array = points_m[(apart_m > half_m).all(axis=1)]
     return free
 
 
 def mesh(xs_m: Array, ys_m: Array, zs_m: Sequence[float]) -> Array:
-    """All points of a grid, (n, 3), row by row."""
+    """Return all points of a grid, (n, 3), row by row."""
     return np.stack(np.meshgrid(xs_m, ys_m, zs_m), axis=-1).reshape(-1, 3)
 
 
@@ -176,7 +186,10 @@ def _references(rig: Rig) -> Array:
 
 
 def _tape(session: Session, rig: Rig) -> Callable[[Array], Array]:
-    """The variance of x plus that of y at places (n, 3); 0 where nothing is known of the tape's start."""
+    """Return a function for the variance of x plus the variance of y at points (n, 3), by tape.
+
+    Without two reference points, the function returns 0.
+    """
     known_m = _references(rig)
     payloads = session.payloads(session.topics(MEASUREMENTS)) if rig.tape_sigma_m is None else []
     named_m = [d.sigma_m for measurement in payloads for d in measurement.distances if d.sigma_m]
@@ -187,8 +200,8 @@ def _tape(session: Session, rig: Rig) -> Callable[[Array], Array]:
             return np.zeros(len(world_m))
         sigmas_m = np.full(len(known_m), sigma_m)
         floor_m, rows = np.unique(world_m[:, :2], axis=0, return_inverse=True)
-        found_m2 = [np.trace(tape_covariance(point_m, known_m, sigmas_m)) for point_m in floor_m]
-        return np.array(found_m2)[rows.reshape(-1)]
+        variances_m2 = [np.trace(tape_covariance(point_m, known_m, sigmas_m)) for point_m in floor_m]
+        return np.array(variances_m2)[rows.reshape(-1)]
 
     return variances
 
@@ -213,7 +226,7 @@ def _notes(model: Model, rig: Rig, lenses: Lenses, plan: Plan) -> Iterator[str]:
 
 
 def means_cm(*means_m: float) -> list[str]:
-    """Mean errors in cm, with a third digit where two do not tell them apart.
+    """Format mean errors in cm with two decimals; with three if some values look equal otherwise.
 
     Examples
     --------

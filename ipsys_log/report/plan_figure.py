@@ -1,4 +1,4 @@
-"""What to measure next as a picture: the predicted error over the floor, before and after."""
+"""Figure of a measuring plan: the predicted error over the floor, before and after."""
 
 from __future__ import annotations
 
@@ -23,26 +23,29 @@ __all__ = ["draw_plan"]
 
 Array = NDArray[np.float64]
 
-# Pale where the error is small; no hue of a camera, and apart in grey too.
+# Colours from pale (small error) to dark. They differ from the camera colours, and are distinct in grey too.
 _HEAT = LinearSegmentedColormap.from_list("heat", ["#FBFDFF", "#DCE6F2", "#B3CBE3", "#86A9D0", "#5C84B8"])
 _SIDE_IN = 5.35
-# Places nearer together than this share of the floor share a ring.
+# Points that are closer than this share of the floor have a common ring.
 _RING = 0.04
 
 
 def draw_plan(found: PlannedFloor, path: Path) -> None:
-    """Draw the predicted error over the floor, now and with the planned places, 1400 x 700 if in pixels."""
+    """Draw the predicted error over the floor, now and with the planned points.
+
+    A file in pixels has 1400 x 700 pixels.
+    """
     figure = Figure(figsize=(14, 7), dpi=100)
     plan, count = found.plan, len(found.plan.places)
-    then = "With this place" if count == 1 else f"With these {count} places"
-    # Some cells far out must not take all the shades.
+    after_title = "With this place" if count == 1 else f"With these {count} places"
+    # A few cells with large errors must not use most of the colour range.
     top_cm = float(np.nanquantile(plan.before_m, 0.98)) * CM_PER_M
     means = means_cm(plan.places[0].mean_before_m, plan.places[-1].mean_after_m)
-    panels = zip((0.6, 6.9), (plan.before_m, plan.after_m), ("Now", then), means, strict=True)
-    for left_in, error_m, when, mean_cm in panels:
+    panels = zip((0.6, 6.9), (plan.before_m, plan.after_m), ("Now", after_title), means, strict=True)
+    for left_in, error_m, heading, mean_cm in panels:
         axes = figure.add_axes((left_in / 14, 0.93 / 7, _SIDE_IN / 14, _SIDE_IN / 7))
         shades = _draw_floor(axes, found, error_m * CM_PER_M, top_cm)
-        axes.set_title(f"{when}: {mean_cm} cm", loc="left", fontsize=11)
+        axes.set_title(f"{heading}: {mean_cm} cm", loc="left", fontsize=11)
     box = figure.add_axes((12.7 / 14, 0.93 / 7, 0.18 / 14, _SIDE_IN / 7))
     figure.colorbar(shades, cax=box, extend="max", label="predicted error in x and y, in cm")
     title = f"Where to measure next: predicted mean error of the model {found.model} over the floor, "
@@ -66,7 +69,7 @@ def _draw_floor(axes: Axes, found: PlannedFloor, error_cm: Array, top_cm: float)
         axes.plot([], [], "s", ms=9, mfc="white", mec=REST, label="seen by none")
     axes.plot(*found.measured_m[:, :2].T, "o", color=NOTE, ms=3, zorder=3, label="measured")
     axes.plot([], [], "o", ms=9, mfc="white", mec="black", mew=1.2, label="to measure, in this order")
-    # Of a large floor only what the cameras see.
+    # On a large floor, the map shows only the part that the cameras see.
     seen_m = mesh(found.xs_m, found.ys_m, [0.0])[~np.isnan(error_cm), :2]
     shown_m = np.vstack([seen_m - half_m, seen_m + half_m, found.measured_m[:, :2]])
     middle_m, span_m = (shown_m.max(axis=0) + shown_m.min(axis=0)) / 2, float(np.ptp(shown_m, axis=0).max())
@@ -80,7 +83,7 @@ def _draw_floor(axes: Axes, found: PlannedFloor, error_cm: Array, top_cm: float)
 
 
 def _draw_views(axes: Axes, found: PlannedFloor, shape: tuple[int, int], half_m: float) -> None:
-    """The outline of what each camera sees: smoothed, or it would have the steps of the cells."""
+    """Draw the outline of each camera's field of view, smoothed to hide the steps of the cells."""
     around_m = [np.array([m[0] - 2 * half_m, *m, m[-1] + 2 * half_m]) for m in (found.xs_m, found.ys_m)]
     for camera, (colour, _) in camera_styles(found.plan.seen).items():
         seen = gaussian_filter(found.plan.seen[camera].reshape(shape).astype(float), 2.0, mode="nearest")
@@ -89,15 +92,15 @@ def _draw_views(axes: Axes, found: PlannedFloor, shape: tuple[int, int], half_m:
 
 
 def _draw_rings(axes: Axes, found: PlannedFloor, width_m: float) -> None:
-    """The numbers of the planned places, and the names of the reference points away from these."""
+    """Draw the numbers of the planned points, and the names of the reference points beside these numbers."""
     rings: list[tuple[Array, str]] = []
     for number, place in enumerate(found.plan.places, 1):
-        at_m = place.point_m[:2]
-        met = [n for n, (other_m, _) in enumerate(rings) if np.hypot(*(at_m - other_m)) < width_m]
-        if met:
-            rings[met[0]] = (rings[met[0]][0], f"{rings[met[0]][1]},{number}")
+        center_m = place.point_m[:2]
+        near = [n for n, (other_m, _) in enumerate(rings) if np.hypot(*(center_m - other_m)) < width_m]
+        if near:
+            rings[near[0]] = (rings[near[0]][0], f"{rings[near[0]][1]},{number}")
         else:
-            rings.append((at_m, str(number)))
+            rings.append((center_m, str(number)))
     for (x_m, y_m), text in rings:
         axes.plot(x_m, y_m, "o", ms=15, mfc="white", mec="black", mew=1.4, zorder=5)
         size = 9 if len(text) < 3 else 20 / len(text)

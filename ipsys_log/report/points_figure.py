@@ -1,4 +1,4 @@
-"""Where models were fitted and tested: figure 9 of the paper, and the floor that no place vouches for."""
+"""Figures of the training and test points: figure 9 of the paper, and the floor without nearby points."""
 
 from __future__ import annotations
 
@@ -22,7 +22,7 @@ Array = NDArray[np.float64]
 
 
 def places_figure(findings: Findings) -> Figure:
-    """Training places in black and test places in red, in space and from above."""
+    """Return a figure of training points in black and test points in red, in space and from above."""
     figure = Figure(figsize=(11.5, 5.6), layout="constrained")
     training_m, test_m = (
         np.vstack([np.empty((0, 3)), *points_m.values()])
@@ -50,7 +50,7 @@ _LOOKS: tuple[dict[str, Any], ...] = (
 def _draw_space(axes: Any, findings: Findings, training_m: Array, test_m: Array) -> None:
     for points_m, look in zip((training_m, test_m), _LOOKS, strict=True):
         axes.plot(*points_m.T, ls="none", **look)
-        # A line down to the floor says where in the picture's depth a place is.
+        # A vertical line to the floor shows the depth of a point in the 3D view.
         for x, y, z in points_m.tolist():
             axes.plot([x, x], [y, y], [0, z], color=look["color"], lw=0.6, alpha=0.35)
     floor = findings.rig.floor if findings.rig else None
@@ -69,15 +69,15 @@ def _draw_space(axes: Any, findings: Findings, training_m: Array, test_m: Array)
 
 
 def hull_m(points_m: Array) -> Array | None:
-    """Corners (k, 2) of the smallest convex part of the floor with all places (n, 2 or 3) in it."""
+    """Return the corners (k, 2) of the convex hull of points (n, 2 or 3) on the floor, or None."""
     try:
         return points_m[:, :2][ConvexHull(points_m[:, :2]).vertices]
     except (QhullError, ValueError):
-        return None  # fewer than three, or on one line
+        return None  # fewer than three points, or all points on one line
 
 
 def draw_hulls(axes: Axes, findings: Findings, fill: bool = False) -> None:
-    """Outline for each camera the part of the floor that its places lie around."""
+    """Draw the convex hull of the fitted points of each camera on the floor."""
     styles = camera_styles(findings.cameras)
     for camera, points_m in findings.training_m().items():
         corners_m = hull_m(points_m)
@@ -99,7 +99,7 @@ def draw_hulls(axes: Axes, findings: Findings, fill: bool = False) -> None:
 
 
 def draw_coverage(axes: Axes, findings: Findings) -> None:
-    """Hatch the floor that lies around no camera's places."""
+    """Draw the fitted points; hatch the floor outside of the convex hulls of all cameras."""
     training_m = findings.training_m()
     draw_ground(axes, findings.rig, [points_m[:, :2] for points_m in training_m.values()])
     floor = findings.rig.floor if findings.rig else None

@@ -1,4 +1,4 @@
-"""Prints on pages of paper, as a PDF at true size, with cutting marks, captions and a ruler."""
+"""Pages with prints, as a PDF at true size, with cutting marks, captions and a ruler."""
 
 from __future__ import annotations
 
@@ -21,11 +21,12 @@ __all__ = ["PAPERS", "RULER_MM", "Page", "Paper", "Placed", "choose_paper", "dra
 MM_PER_INCH = 25.4
 # Printers leave this much of the paper's edge white.
 _EDGE_MM = 10.0
-# At the bottom: the ruler, and what stands beside it.
+# Height of the foot of a page: the ruler, and the text beside it.
 _FOOT_MM = 15.0
 RULER_MM = 100.0
 _RULER_Y_MM = _EDGE_MM + 5.0
-# Below a marker: an arrow to its front, and three lines of text. Between two prints: the cutting marks.
+# Height of the caption below a marker (an arrow to its front, and three lines of text). Gap between two
+# prints, for the cutting marks. Smallest width of the paper of a marker.
 _CAPTION_MM, _GAP_MM, _NARROWEST_MM = 8.0, 6.0, 34.0
 _MARK_MM, _MARK_PT = 2.0, 0.3
 _GREY = "0.35"
@@ -33,19 +34,19 @@ _GREY = "0.35"
 
 @dataclass(frozen=True, slots=True)
 class Paper:
-    """A sheet of paper, upright: its name, and its size in mm."""
+    """A sheet of paper in portrait orientation: its name, and its size in mm."""
 
     name: str
     width_mm: float
     height_mm: float
 
     def turned(self) -> Paper:
-        """Return the sheet lying on its side."""
+        """Return the sheet in landscape orientation."""
         return Paper(self.name, self.height_mm, self.width_mm)
 
     @property
     def room_mm(self) -> tuple[float, float]:
-        """Width and height that prints can take."""
+        """The width and height that are free for prints."""
         return self.width_mm - 2 * _EDGE_MM, self.height_mm - 2 * _EDGE_MM - _FOOT_MM
 
 
@@ -58,7 +59,7 @@ PAPERS = {
 
 @dataclass(frozen=True, slots=True, eq=False)
 class Placed:
-    """A print on a page, with the top left of its black in mm from the bottom left of the page."""
+    """A print on a page; its position is the top left of its black, in mm from the page's bottom left."""
 
     what: Print
     x_mm: float
@@ -67,14 +68,14 @@ class Placed:
 
 @dataclass(frozen=True, slots=True, eq=False)
 class Page:
-    """A sheet of paper, and what is printed on it."""
+    """A sheet of paper, and the prints on it."""
 
     paper: Paper
     placed: tuple[Placed, ...]
 
 
 def choose_paper(prints: Sequence[Print], name: str | None) -> Paper:
-    """Return the paper of a name; without a name A4, or A3 where a print is too large for A4.
+    """Return the paper with a name; without a name, A4, or A3 if a print is too large for A4.
 
     Raises
     ------
@@ -85,20 +86,21 @@ def choose_paper(prints: Sequence[Print], name: str | None) -> Paper:
         raise IpsysError(f"--page {name}: is none of {', '.join(PAPERS)}")
     papers = [PAPERS["a4"], PAPERS["a3"]] if name is None else [PAPERS[name.lower()]]
     for paper in papers:
-        large = [one for one in prints if _orientation(one, paper) is None]
+        large = [item for item in prints if _orientation(item, paper) is None]
         if not large:
             return paper
     raise IpsysError(_too_large(large[0], papers[-1]))
 
 
 def lay_out(prints: Sequence[Print], paper: Paper) -> list[Page]:
-    """Lay prints onto pages: markers in rows from the top left, each board on a page of its own.
+    """Arrange prints on pages: markers in rows from the top left, each board on a separate page.
 
     Parameters
     ----------
-    prints : each fits onto the paper, as :func:`choose_paper` has seen.
+    prints : prints that fit onto the paper; :func:`choose_paper` checks this.
+    paper : the paper of the pages.
     """
-    markers = [one for one in prints if not one.is_board]
+    markers = [item for item in prints if not item.is_board]
     pages = _rows_of_markers(markers, paper)
     for board in prints:
         if board.is_board:
@@ -109,7 +111,7 @@ def lay_out(prints: Sequence[Print], paper: Paper) -> list[Page]:
 
 
 def draw_pages(pages: Sequence[Page]) -> bytes:
-    """Draw pages as a PDF, the same bytes for the same pages."""
+    """Draw pages as a PDF; equal pages give equal bytes."""
     buffer = io.BytesIO()
     metadata: dict[str, object] = {"Creator": None, "Producer": None, "CreationDate": None}
     with PdfPages(buffer, metadata=metadata) as pdf:
@@ -128,7 +130,7 @@ def draw_pages(pages: Sequence[Page]) -> bytes:
 
 
 def _size_mm(what: Print) -> tuple[float, float]:
-    """Width and height of the paper that a print takes. A board has the edge of the page as margin, too."""
+    """Return width and height of the paper for a print; the edge of the page counts as margin of a board."""
     if what.is_board:
         spare_mm = max(what.margin_mm - _EDGE_MM, 0.0)
         return what.width_mm + 2 * spare_mm, what.height_mm + spare_mm + what.margin_mm
@@ -137,7 +139,7 @@ def _size_mm(what: Print) -> tuple[float, float]:
 
 
 def _orientation(what: Print, paper: Paper) -> Paper | None:
-    """Return the paper, upright or, for a board, turned; None if the print does not fit."""
+    """Return the paper in portrait, or in landscape if a board needs it; None if the print does not fit."""
     width_mm, height_mm = _size_mm(what)
     for turned in (paper, paper.turned()) if what.is_board else (paper,):
         room_mm = turned.room_mm
@@ -161,16 +163,16 @@ def _rows_of_markers(markers: Sequence[Print], paper: Paper) -> list[Page]:
     room_mm = paper.room_mm
     pages: list[list[Placed]] = []
     x_mm = y_mm = row_mm = 0.0
-    for what in markers:
-        width_mm, height_mm = _size_mm(what)
+    for marker in markers:
+        width_mm, height_mm = _size_mm(marker)
         if x_mm + width_mm > room_mm[0] + 1e-6:
             x_mm, y_mm, row_mm = 0.0, y_mm + row_mm + _GAP_MM, 0.0
         if not pages or y_mm + height_mm > room_mm[1] + 1e-6:
             pages.append([])
             x_mm = y_mm = row_mm = 0.0
-        left_mm = _EDGE_MM + x_mm + (width_mm - what.width_mm) / 2
-        top_mm = paper.height_mm - _EDGE_MM - y_mm - what.margin_mm
-        pages[-1].append(Placed(what, left_mm, top_mm))
+        left_mm = _EDGE_MM + x_mm + (width_mm - marker.width_mm) / 2
+        top_mm = paper.height_mm - _EDGE_MM - y_mm - marker.margin_mm
+        pages[-1].append(Placed(marker, left_mm, top_mm))
         x_mm, row_mm = x_mm + width_mm + _GAP_MM, max(row_mm, height_mm)
     return [Page(paper, tuple(placed)) for placed in pages]
 
@@ -184,7 +186,7 @@ def _in_the_middle(board: Print, paper: Paper) -> Placed:
 
 
 def _blank(paper: Paper) -> tuple[Figure, Axes]:
-    """A page whose data coordinates are mm from its bottom left."""
+    """Return an empty page with data coordinates in mm from its bottom left."""
     figure = Figure(figsize=(paper.width_mm / MM_PER_INCH, paper.height_mm / MM_PER_INCH))
     axes = figure.add_axes((0.0, 0.0, 1.0, 1.0))
     axes.set_xlim(0, paper.width_mm)
@@ -206,17 +208,17 @@ def _draw_black(axes: Axes, placed: Placed) -> None:
 
 
 def _draw_marker_text(axes: Axes, placed: Placed) -> None:
-    """Draw an arrow to the front of the marker below the margin, and the caption."""
-    what = placed.what
-    width_mm = _size_mm(what)[0]
-    left_mm = placed.x_mm + what.width_mm / 2 - width_mm / 2 + 1.5
-    bottom_mm = placed.y_mm - what.height_mm - what.margin_mm - _CAPTION_MM + 1.5
+    """Draw the caption below the margin of a marker, with an arrow to the front of the marker."""
+    marker = placed.what
+    width_mm = _size_mm(marker)[0]
+    left_mm = placed.x_mm + marker.width_mm / 2 - width_mm / 2 + 1.5
+    bottom_mm = placed.y_mm - marker.height_mm - marker.margin_mm - _CAPTION_MM + 1.5
     arrow = np.array([[0.9, 0], [0.9, 3], [0, 3], [1.5, 5.5], [3, 3], [2.1, 3], [2.1, 0]])
     axes.add_patch(
         PathPatch(Outline(arrow + np.array([left_mm, bottom_mm]), closed=False), facecolor=_GREY, linewidth=0)
     )
     size_pt = 5.0 if width_mm < 60 else 8.0
-    text = "\n".join(("front: this way up" if width_mm >= 60 else "front", *what.lines))
+    text = "\n".join(("front: this way up" if width_mm >= 60 else "front", *marker.lines))
     _write(axes, left_mm + 4.5, bottom_mm + 2.75, text, size_pt)
 
 
@@ -229,11 +231,11 @@ def _write(axes: Axes, x_mm: float, y_mm: float, text: str, size_pt: float) -> N
 
 
 def _draw_cutting_marks(axes: Axes, placed: Placed) -> None:
-    """A small angle outside of each corner of the paper that belongs to a marker."""
-    what = placed.what
-    width_mm, height_mm = _size_mm(what)
-    left_mm = placed.x_mm + what.width_mm / 2 - width_mm / 2
-    top_mm = placed.y_mm + what.margin_mm
+    """Draw a small angle outside of each corner of the paper of a marker."""
+    marker = placed.what
+    width_mm, height_mm = _size_mm(marker)
+    left_mm = placed.x_mm + marker.width_mm / 2 - width_mm / 2
+    top_mm = placed.y_mm + marker.margin_mm
     for x_mm, right in ((left_mm, -1), (left_mm + width_mm, 1)):
         for y_mm, up in ((top_mm, 1), (top_mm - height_mm, -1)):
             for dx, dy in ((right, 0), (0, up)):
@@ -242,7 +244,7 @@ def _draw_cutting_marks(axes: Axes, placed: Placed) -> None:
 
 
 def _draw_ruler(axes: Axes) -> None:
-    """10 cm with a tick for each mm, at the bottom left."""
+    """Draw a ruler of 10 cm at the bottom left, with a tick for each mm."""
     for number in range(int(RULER_MM) + 1):
         length_mm = 5.0 if number % 10 == 0 else 3.5 if number % 5 == 0 else 2.0
         x_mm = _EDGE_MM + number

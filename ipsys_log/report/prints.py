@@ -19,7 +19,7 @@ __all__ = ["Print", "board_print", "marker_print", "rig_prints"]
 
 Array = NDArray[np.float64]
 
-# White around a chessboard or a ChArUco board, in squares; around a marker, in cells.
+# White margin around a chessboard or a ChArUco board, in squares; white margin around a marker, in cells.
 _BOARD_MARGIN, _MARKER_MARGIN = 0.5, 1.0
 
 
@@ -29,12 +29,12 @@ class Print:
 
     Attributes
     ----------
-    name : for error messages.
+    name : name in error messages.
     polygons : the black parts, each (n, 2): x to the right and y down, from the top left of the black.
-    width_mm, height_mm : of the black.
-    margin_mm : of white around it.
-    lines : of text beside it.
-    is_board : a board has a separate page.
+    width_mm, height_mm : size of the black.
+    margin_mm : white margin around the black.
+    lines : lines of text beside the print.
+    is_board : True for a board, which has a separate page.
     """
 
     name: str
@@ -52,18 +52,19 @@ def marker_print(dictionary: str, marker_id: int, length_m: float, robot: str | 
     side_mm = length_m * MM_PER_M
     cell_mm = side_mm / len(black)
     polygons = tuple(polygon * cell_mm for polygon in cell_outlines(black))
-    who = f"id {marker_id}" if robot is None else f"id {marker_id}, {robot}"
-    lines = (who, f"{dictionary}, {side_mm:g} mm")
+    title = f"id {marker_id}" if robot is None else f"id {marker_id}, {robot}"
+    lines = (title, f"{dictionary}, {side_mm:g} mm")
     return Print(f"marker {marker_id}", polygons, side_mm, side_mm, _MARKER_MARGIN * cell_mm, lines)
 
 
 def rig_prints(rig: Rig, ids: Sequence[int] | None = None, length_m: float | None = None) -> list[Print]:
-    """Return the prints of the markers of a rig, or of those with some ids, each at its own length.
+    """Return the prints of the markers of a rig, or of some ids, each with its own side length.
 
     Parameters
     ----------
-    ids : other ids of the dictionary than the rig lists.
-    length_m : for all of them, instead of the rig's lengths.
+    rig : rig with the dictionary, the markers and their side lengths.
+    ids : ids of the dictionary to print instead of the ids of the rig.
+    length_m : side length of all markers, instead of the lengths of the rig.
     """
     listed = {marker.id: marker for marker in rig.markers}
     prints = []
@@ -77,7 +78,7 @@ def rig_prints(rig: Rig, ids: Sequence[int] | None = None, length_m: float | Non
 def board_print(board: Board, text: str) -> Print:
     """Return the print of a calibration board; ``text`` is its name for ``ipsys calibrate --board``.
 
-    The layout is that of ``ipsys calibrate`` and OpenCV since 4.6.
+    The layout is the same as in ``ipsys calibrate`` and in OpenCV since 4.6.
     """
     square_mm = board.square_m * MM_PER_M
     squares = black_squares(board)
@@ -98,5 +99,5 @@ def board_print(board: Board, text: str) -> Print:
 
 
 def _wrapped(text: str) -> list[str]:
-    """Lines that fit beside the ruler."""
+    """Wrap a text into lines that fit beside the ruler."""
     return textwrap.wrap(text, 54, break_long_words=False, break_on_hyphens=False)

@@ -1,4 +1,4 @@
-"""The result of a repair in words: saved and lost messages."""
+"""The result of a repair as text: saved and lost messages."""
 
 from __future__ import annotations
 
@@ -15,15 +15,15 @@ from ipsys_log.units import NS_PER_S, format_bytes, format_time
 
 __all__ = ["repair_lines"]
 
-# A recorder hands over what it has at least so often.
+# A recorder flushes its messages at least once in this time.
 _FLUSH_NS = NS_PER_S
-# A file that was written so long after its last message was copied since, or recorded by another clock.
+# If a file was written this long after its last message, it was copied later, or recorded by another clock.
 _COPIED_NS = 10 * NS_PER_S
 _MOST_NOTES = 12
 
 
 def repair_lines(report: RepairReport) -> Iterator[str | Table]:
-    """Lines and tables, at most 80 columns wide as long as topics and paths are short."""
+    """Yield lines and tables, at most 80 columns wide if topics and paths are short."""
     kept = f"{report.messages_kept} messages" if report.messages_kept else "no message"
     if report.changed and report.last_kept_ns is not None:
         yield f"{report.path} repaired: {kept}, up to {format_time(report.last_kept_ns)} UTC"
@@ -44,18 +44,18 @@ def repair_lines(report: RepairReport) -> Iterator[str | Table]:
 
 
 def _about_the_loss(report: RepairReport) -> Iterator[str | Table]:
-    """Yield the number of unreadable bytes, and the lost messages as far as they are known."""
+    """Yield the number of unreadable bytes, and the known lost messages."""
     if not (report.bytes_lost or report.gone):
         return
     if report.gone and report.uncounted:
-        named = "these messages are gone, and an unknown number of others:"
+        ending = "these messages are gone, and an unknown number of others:"
     elif report.gone:
-        named = "these messages are gone:"
+        ending = "these messages are gone:"
     elif report.uncounted:
-        named = "the number of messages in them is not known"
+        ending = "the number of messages in them is not known"
     else:
-        named = "no message was in them"
-    yield f"{format_bytes(report.bytes_lost)} cannot be read; {named}"
+        ending = "no message was in them"
+    yield f"{format_bytes(report.bytes_lost)} cannot be read; {ending}"
     if report.gone:
         yield _lost_table(report)
 
@@ -79,7 +79,7 @@ def _about_the_rig(report: RepairReport) -> Iterator[str]:
 
 
 def _about_the_end(report: RepairReport) -> Iterator[str | Table]:
-    """The last message of each recorded channel, and how many may have come after it."""
+    """Yield the last message of each recorded channel, and the largest possible number of lost messages."""
     assert report.last_kept_ns is not None
     late_ns = report.written_ns - report.last_kept_ns
     copied = not -_FLUSH_NS < late_ns < _COPIED_NS
@@ -103,7 +103,7 @@ def _about_the_end(report: RepairReport) -> Iterator[str | Table]:
 
 
 def _gone(times_ns: Sequence[int], end_ns: int | None) -> str:
-    """Return how many messages of a steady channel may have come from its last one to the end."""
+    """Return the possible number of messages of a channel with a constant rate, after its last message."""
     if end_ns is None or len(times_ns) < 2:
         return "not known"
     rate_hz = (len(times_ns) - 1) * NS_PER_S / max(times_ns[-1] - times_ns[0], 1)
@@ -118,5 +118,5 @@ def _table(*headings: str) -> Table:
 
 
 def _clock(time_ns: int) -> str:
-    """The time of day."""
+    """Format the time of day of a timestamp."""
     return format_time(time_ns).partition(" ")[2]

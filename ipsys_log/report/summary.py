@@ -1,4 +1,4 @@
-"""The answer of an evaluation: the model to use, its error, the outliers; and one table of all models."""
+"""The summary of an evaluation: the best model, its error and the outliers; and a table of all models."""
 
 from __future__ import annotations
 
@@ -22,13 +22,13 @@ from ipsys_log.units import CM_PER_M
 
 __all__ = ["answer_json", "answer_text", "models_table"]
 
-# The outliers that the answer explains; the others are named.
+# Number of outliers with an explanation in the answer; the other outliers are only named.
 _EXPLAINED = 3
 _TRUTH = "truth"
 
 
 def answer_text(accuracies: Sequence[Accuracy]) -> Group | None:
-    """Return the answer in sentences; None where nothing was judged."""
+    """Return the answer in sentences; None without an evaluated model."""
     if not accuracies:
         return None
     best = rank(accuracies)[0]
@@ -52,7 +52,9 @@ def _best_lines(accuracies: Sequence[Accuracy], best: Accuracy) -> Iterator[str 
     knows = ", with known marker heights" if told_height(best.model) else ""
     yield Text(f"{'Best model' if several else 'Model'}: {name_cell(best.model)}{knows}", style="bold")
     yield f"Mean position error: {_figures(judged(row, space), best.rmse_m(row, judged(row, space)))}"
-    cameras = {found.camera for found in (best.evaluation.cameras if best.evaluation else ())} - {POOLED}
+    cameras = {camera_row.camera for camera_row in (best.evaluation.cameras if best.evaluation else ())} - {
+        POOLED
+    }
     yield (
         f"({'3D' if space and not told_height(best.model) else '2D'}, {_scheme(row)}: "
         f"{_count(row.error_2d.count, 'point')} of {_count(len(cameras), 'camera')}; a camera's view of a "
@@ -62,11 +64,15 @@ def _best_lines(accuracies: Sequence[Accuracy], best: Accuracy) -> Iterator[str 
     if truth is not None:
         errors = judged(truth, space)
         yield f"Against the ground truth: {_figures(errors, best.rmse_m(truth, errors))}."
-    told = [accuracy for accuracy in rank(accuracies) if told_height(accuracy.model)]
-    if told and told[0] is not best and (there := overall(told[0], True) or overall(told[0], False)):
-        errors = judged(there, space)
-        figures = _figures(errors, told[0].rmse_m(there, errors))
-        yield f"With known marker heights: {told[0].model}, {figures} (2D)."
+    height_models = [accuracy for accuracy in rank(accuracies) if told_height(accuracy.model)]
+    if (
+        height_models
+        and height_models[0] is not best
+        and (told_row := overall(height_models[0], True) or overall(height_models[0], False))
+    ):
+        errors = judged(told_row, space)
+        figures = _figures(errors, height_models[0].rmse_m(told_row, errors))
+        yield f"With known marker heights: {height_models[0].model}, {figures} (2D)."
 
 
 def _scheme(row: CameraEvaluation) -> str:
@@ -78,7 +84,7 @@ def _count(number: int, what: str) -> str:
 
 
 def _figures(errors: ErrorStatistics, rmse_m: float | None) -> str:
-    """Return the figures of errors in words."""
+    """Return the statistics of errors as text."""
     parts = [f"{_cm(errors.mean_m)} cm"]
     if errors.mean_low_m is not None and errors.mean_high_m is not None:
         parts[0] += f" (95 % CI {_cm(errors.mean_low_m)} to {_cm(errors.mean_high_m)})"
@@ -94,7 +100,7 @@ def _cm(value_m: float) -> str:
 
 
 def _outlier_lines(accuracies: Sequence[Accuracy]) -> Iterator[str | Text]:
-    """Yield the outliers, the worst first; the first ones with a possible explanation."""
+    """Yield the outliers, the worst first; the first outliers have a possible explanation."""
     suspects = gather_suspects(accuracies)
     if not suspects:
         searched = "none" if any(map(_screened, accuracies)) else f"not searched: {_needed()}"
@@ -106,8 +112,8 @@ def _outlier_lines(accuracies: Sequence[Accuracy]) -> Iterator[str | Text]:
         name = name_cell(suspect.measurement).plain
         yield Text(wrap_text(f"{name}, {_length(suspect.residual_m)} cm off: {text}.", indent="  "))
     if rest := suspects[_EXPLAINED:]:
-        named = (f"{name_cell(s.measurement).plain} ({_length(s.residual_m)} cm)" for s, _ in rest)
-        yield Text(wrap_text(f"{', '.join(named)}.", indent="  "))
+        texts = (f"{name_cell(s.measurement).plain} ({_length(s.residual_m)} cm)" for s, _ in rest)
+        yield Text(wrap_text(f"{', '.join(texts)}.", indent="  "))
 
 
 def _length(residual_m: Any) -> str:
@@ -115,7 +121,7 @@ def _length(residual_m: Any) -> str:
 
 
 def _screened(accuracy: Accuracy) -> bool:
-    """Return whether a model has judged its points: only some models do, with enough points."""
+    """Return whether a model was used to search for outliers; some models are, if they have enough points."""
     rows = [row for row in accuracy.rows(True) if row.camera != POOLED]
     return accuracy.model in SCREENING and any(row.error_2d.count >= FEWEST_POINTS for row in rows)
 
@@ -125,7 +131,7 @@ def _needed() -> str:
 
 
 def answer_json(accuracies: Sequence[Accuracy]) -> dict[str, Any]:
-    """Return the answer as plain data, in cm; empty where nothing was judged."""
+    """Return the answer as plain data, in cm; empty without an evaluated model."""
     best = rank(accuracies)[0] if accuracies else None
     row = None if best is None else overall(best, True) or overall(best, False)
     if best is None or row is None:
@@ -140,7 +146,10 @@ def answer_json(accuracies: Sequence[Accuracy]) -> dict[str, Any]:
 
 
 def models_table(accuracies: Sequence[Accuracy]) -> Table | None:
-    """Return one row for each model, the best first, or for each camera of the only one; None without any."""
+    """Return a table with one row per model, the best first; None without rows.
+
+    For a single model, it has one row per camera.
+    """
     space = in_space(accuracies)
     lines = [(accuracy, rows) for accuracy in rank(accuracies) for rows in _rows(accuracy, len(accuracies))]
     if not lines:
@@ -164,7 +173,7 @@ def models_table(accuracies: Sequence[Accuracy]) -> Table | None:
 
 
 def _rows(accuracy: Accuracy, models: int) -> list[dict[bool, CameraEvaluation | None]]:
-    """Return the rows against the tape, by whether they are cross-validated: of all cameras, or of each."""
+    """Return rows against the tape, by cross-validation (True or False): over all cameras, or by camera."""
     if models > 1:
         pooled = {crossed: overall(accuracy, crossed) for crossed in (True, False)}
         return [pooled] if any(pooled.values()) else []
@@ -190,7 +199,7 @@ def _held_out(row: CameraEvaluation | None, space: bool) -> str:
 
 
 def _two(value_m: float | None) -> str:
-    """Return a length in cm with two decimals, or none if a column would be too wide."""
+    """Format a length in cm with two decimals, or without decimals if a column would be too wide."""
     if value_m is None:
         return "-"
     value_cm = value_m * CM_PER_M

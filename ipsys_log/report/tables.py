@@ -25,7 +25,7 @@ _WIDTH = 80
 
 
 def plain_table(title: str, names: Iterable[str], figures: Iterable[str] = ()) -> Table:
-    """Return a table without lines: columns of names to the left, columns of figures to the right."""
+    """Return a table without lines: left-aligned columns of names, right-aligned columns of numbers."""
     table = Table(title=title, title_justify="left", title_style="bold", box=None, pad_edge=False)
     table.padding = (0, 1, 0, 0)
     for column in names:
@@ -49,7 +49,7 @@ def wrap_text(text: str, indent: str = "") -> str:
 
 
 def format_interval(errors: ErrorStatistics) -> str:
-    """The 95 % confidence interval of a mean in cm, or a dash."""
+    """Format the 95 % confidence interval of a mean in cm, or return a dash."""
     if errors.mean_low_m is None or errors.mean_high_m is None:
         return "-"
     digits = 2 if errors.mean_high_m * CM_PER_M < 100 else 0
@@ -64,7 +64,7 @@ _ALL = "(all)"
 
 
 def accuracy_tables(accuracies: Sequence[Accuracy]) -> list[Table | Group]:
-    """Return all tables; of many models the cross-validated errors only of all cameras together."""
+    """Return all tables; for several models, the cross-validated errors are those over all cameras."""
     tables: list[Table] = []
     if any(accuracy.rows(False) or accuracy.tracks for accuracy in accuracies):
         tables.append(_held_out_table(accuracies))
@@ -80,7 +80,7 @@ def accuracy_tables(accuracies: Sequence[Accuracy]) -> list[Table | Group]:
     return [*tables]
 
 
-# What a row is of, and its figures: model, camera, what it is compared with, cells.
+# A row of a table: model, camera, reference (tape or truth), and cells with numbers.
 _Line = tuple[str, str, str, list[str]]
 
 
@@ -98,7 +98,7 @@ def _held_out_table(accuracies: Sequence[Accuracy]) -> Table:
 
 
 def _cross_validation_table(accuracies: Sequence[Accuracy]) -> Table:
-    """Return a row for each model, or for each camera of the only one."""
+    """Return a table with one row per model; for a single model, with one row per camera."""
     lines: list[_Line] = []
     for accuracy in accuracies:
         rows = _cross_validated(accuracy, len(accuracies))
@@ -109,7 +109,7 @@ def _cross_validation_table(accuracies: Sequence[Accuracy]) -> Table:
 
 
 def _named(accuracy: Accuracy, rows: Sequence[tuple[str, str, list[str]]]) -> list[_Line]:
-    """Name the model of several rows once; a long name takes several of them."""
+    """Add the model's name to the first of several rows; a long name continues in the next rows."""
     names = _break(label(accuracy.model), len(rows))
     return [(name, *row) for name, row in zip(chain(names, repeat("")), rows, strict=False)]
 
@@ -129,13 +129,15 @@ def _break(name: str, lines: int) -> list[str]:
 
 
 def _filled(title: str, lines: Sequence[_Line], figures: Sequence[str]) -> Table:
-    """Return a table of rows, without the columns that say nothing."""
+    """Return a table of rows, without the columns that hold no information."""
     several = len({against for _, _, against, _ in lines}) > 1
     shown = [True, any(camera != _ALL for _, camera, _, _ in lines), several]
     names = [name for name, show in zip(("model", "camera", "against"), shown, strict=True) if show]
     table = plain_table(title, names, figures)
-    for *of, cells in lines:
-        table.add_row(*(name_cell(str(text)) for text, show in zip(of, shown, strict=True) if show), *cells)
+    for *labels, cells in lines:
+        table.add_row(
+            *(name_cell(str(text)) for text, show in zip(labels, shown, strict=True) if show), *cells
+        )
     return table
 
 
@@ -151,7 +153,7 @@ def _cells(error_3d: ErrorStatistics | None, error_2d: ErrorStatistics, rmse_3d_
 
 
 def _cm(value_m: float | None) -> str:
-    """Three digits behind the point, as the paper has them, and fewer where a column would burst."""
+    """Format a length in cm with three decimals, as in the paper, or without if a column is too narrow."""
     if value_m is None:
         return "-"
     value_cm = value_m * CM_PER_M
@@ -175,7 +177,7 @@ def _crossed_cells(accuracy: Accuracy, row: CameraEvaluation) -> list[str]:
 
 
 def _suspects_table(accuracies: Sequence[Accuracy]) -> Table:
-    """Each suspect once, with the models that say so."""
+    """Return a table of the outliers, each with the models that found it."""
     table = plain_table("Outliers, the worst first: measure these again", ("point",), ("error cm",))
     table.add_column("found by", overflow="fold", max_width=_FOUND_BY_WIDTH)
     table.add_column("what would explain it", overflow="fold")
@@ -189,16 +191,18 @@ def _suspects_table(accuracies: Sequence[Accuracy]) -> Table:
 
 
 def _advice_table(advice: Advice) -> Group:
-    """Return the model to use by the number of points; the title is wider than the table may be."""
+    """Return a table of the model to use by the number of points; its title may be wider than the table."""
     title = Text("Model by the number of points per camera, mean error in cm", style="bold")
     table = plain_table("", (), ("points",))
     for group in advice.groups:
         table.add_column(GROUPS[group], overflow="fold")
-    for places, found in advice.choices.items():
+    for places, choices in advice.choices.items():
         table.add_row(
-            str(places), *(_choice(found[group]) if group in found else "-" for group in advice.groups)
+            str(places), *(_choice(choices[group]) if group in choices else "-" for group in advice.groups)
         )
-    lower = any(one.lowest != one.model for found in advice.choices.values() for one in found.values())
+    lower = any(
+        choice.lowest != choice.model for choices in advice.choices.values() for choice in choices.values()
+    )
     note = "In brackets: the lowest mean error, if a simpler model is as good within the noise."
     return Group(title, table, *([Text(wrap_text(note))] if lower else []))
 

@@ -1,1 +1,1 @@
-"""Calibration points: entry and checks of tape measurements, in logs and while cameras send."""
+"""Calibration points: entry and checks of tape measurements, in finished logs and with live cameras."""

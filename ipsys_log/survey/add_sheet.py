@@ -1,4 +1,4 @@
-"""A sheet of measurements into a finished log: all of its rows, or none."""
+"""Append of a sheet of measurements to a finished log: all rows, or none."""
 
 from __future__ import annotations
 
@@ -21,7 +21,10 @@ __all__ = ["add_sheet", "check_sheet"]
 
 @dataclass(frozen=True, slots=True, eq=False)
 class _Row:
-    """A row of a sheet, the observations of its marker, and the result; ``stop`` says why there are none."""
+    """A row of a sheet, its entry, and the observations of its marker.
+
+    ``stop`` is the reason if the row has no stationary interval in the log, else empty.
+    """
 
     line: int
     entry: Entry
@@ -31,7 +34,7 @@ class _Row:
 
 
 def check_sheet(path: Path, log: Path, request: Request) -> None:
-    """See that a sheet can be read, before the long work on a log begins.
+    """Check that a sheet can be read, before the long processing of a log begins.
 
     Raises
     ------
@@ -50,7 +53,7 @@ def add_sheet(scene: FinishedLog, path: Path, insist: bool = False) -> list[str]
     Parameters
     ----------
     scene : the log.
-    path : of the sheet.
+    path : path of the sheet.
     insist : also write rows that look wrong but may be right.
 
     Returns
@@ -60,36 +63,38 @@ def add_sheet(scene: FinishedLog, path: Path, insist: bool = False) -> list[str]
     Raises
     ------
     IpsysError
-        Rows are bad; the text names each by its line, with the contradiction.
+        Rows are bad; the text names each row by its line, with the contradiction.
     """
     rows = list(_sighted(scene, read_sheet(path, scene.rig, scene.start_ns)))
     model, name = scene.model, THE_MODEL
     checked = _check(scene, rows, model, name)
-    if model is None:  # then the rows can contradict one another
+    if model is None:  # then the rows are compared with each other
         model, name = _fit(scene, rows, checked), OTHER_ROWS
         checked = checked if model is None else _check(scene, rows, model, name)
     faults = [(row.line, row.stop) for row in rows if row.stop]
-    faults += _by_line(rows, [[fault.text for fault in one.faults] for one in checked], scene.rig)
+    faults += _by_line(rows, [[fault.text for fault in result.faults] for result in checked], scene.rig)
     doubts = _by_line(rows, _doubts(rows, checked, scene, model), scene.rig)
     refuse_rows(path, faults, () if insist else doubts)
-    scene.add([one.measurement for one in checked if one.measurement is not None])
-    ids = {row.line: one.id for row, one in zip(rows, checked, strict=True)}
-    imprecise = _by_line(rows, [one.imprecise for one in checked], scene.rig)
+    scene.add([result.measurement for result in checked if result.measurement is not None])
+    ids = {row.line: result.id for row, result in zip(rows, checked, strict=True)}
+    imprecise = _by_line(rows, [result.imprecise for result in checked], scene.rig)
     return [f"line {line}: {ids[line]}: {text}" for line, text in sorted(doubts + imprecise)]
 
 
 def _by_line(rows: Sequence[_Row], texts: Sequence[Sequence[str]], rig: Rig) -> list[tuple[int, str]]:
     """Name the columns of a sheet in remarks on its rows."""
     return [
-        (row.line, name_columns(text, rig)) for row, held in zip(rows, texts, strict=True) for text in held
+        (row.line, name_columns(text, rig))
+        for row, row_texts in zip(rows, texts, strict=True)
+        for text in row_texts
     ]
 
 
 def _sighted(scene: FinishedLog, rows: Sequence[SheetRow]) -> Iterator[_Row]:
-    """Find the stationary interval of each row, and the observations of its marker then."""
-    read = [read_typed(row.typed, scene.rig) for row in rows]
-    stops = find_stops(rows, scene.stops, [entry.marker_id for entry, _ in read])
-    for row, (entry, faults), stop in zip(rows, read, stops, strict=True):
+    """Find the stationary interval of each row, and the observations of its marker in this interval."""
+    parsed = [read_typed(row.typed, scene.rig) for row in rows]
+    stops = find_stops(rows, scene.stops, [entry.marker_id for entry, _ in parsed])
+    for row, (entry, faults), stop in zip(rows, parsed, stops, strict=True):
         sight = None
         if isinstance(stop, int) and entry.marker_id is not None:
             sight = look(scene.views(stop), entry.marker_id)
@@ -97,36 +102,36 @@ def _sighted(scene: FinishedLog, rows: Sequence[SheetRow]) -> Iterator[_Row]:
 
 
 def _check(scene: FinishedLog, rows: Sequence[_Row], model: Model | None, name: str) -> list[Checked]:
-    """Check each row as the page does, after those above it."""
-    history, found = [*scene.history()], []
+    """Check each row as the web page does, after the rows above it."""
+    history, results = [*scene.history()], []
     for row in rows:
-        one = check_entry(row.entry, row.faults, scene.rig, row.sight, history, model, name)
-        history += [] if one.measurement is None else [one.measurement]
-        found.append(one)
-    return found
+        result = check_entry(row.entry, row.faults, scene.rig, row.sight, history, model, name)
+        history += [] if result.measurement is None else [result.measurement]
+        results.append(result)
+    return results
 
 
 def _fit(scene: FinishedLog, rows: Sequence[_Row], checked: Sequence[Checked]) -> Model | None:
-    """Return a model of the rows themselves, without those that contradict it."""
+    """Fit a model to the rows themselves, without the rows that contradict it."""
     seen: list[tuple[Measurement, Sight]] = []
-    for row, one in zip(rows, checked, strict=True):
-        if one.measurement is not None and row.sight is not None:
-            seen.append((one.measurement, row.sight))
+    for row, result in zip(rows, checked, strict=True):
+        if result.measurement is not None and row.sight is not None:
+            seen.append((result.measurement, row.sight))
     return fit_neighbours(seen, scene.rig)
 
 
 def _doubts(
     rows: Sequence[_Row], checked: Sequence[Checked], scene: FinishedLog, model: Model | None
 ) -> list[list[str]]:
-    """Return the contradictions of each row, and another such row that its numbers fit, if there is one."""
-    doubtful = [row for row, one in zip(rows, checked, strict=True) if one.contradictions]
+    """Return the contradictions of each row; a hint names another contradictory row that the numbers fit."""
+    doubtful = [row for row, result in zip(rows, checked, strict=True) if result.contradictions]
     doubts = []
-    for row, one in zip(rows, checked, strict=True):
-        other = next((r for r in doubtful if one.contradictions and _fits(row, r, scene, model)), None)
+    for row, result in zip(rows, checked, strict=True):
+        other = next((r for r in doubtful if result.contradictions and _fits(row, r, scene, model)), None)
         hint = (
             "" if other is None else f"; its numbers fit line {other.line} (marker {other.entry.marker_id})"
         )
-        doubts.append([text + hint for text in one.contradictions])
+        doubts.append([text + hint for text in result.contradictions])
     return doubts
 
 
@@ -135,5 +140,5 @@ def _fits(row: _Row, other: _Row, scene: FinishedLog, model: Model | None) -> bo
     if other is row or other.sight is None:
         return False
     entry = replace(row.entry, marker_id=other.entry.marker_id, id=None)
-    one = check_entry(entry, (), scene.rig, other.sight, (), model)
-    return bool(one.predictions) and one.measurement is not None and not one.contradictions
+    result = check_entry(entry, (), scene.rig, other.sight, (), model)
+    return bool(result.predictions) and result.measurement is not None and not result.contradictions

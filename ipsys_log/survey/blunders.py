@@ -1,4 +1,4 @@
-"""Warnings on a measurement: off the floor, flat tapes, another prediction by the model."""
+"""Warnings on a measurement: a point outside of the floor, a flat crossing angle, a contradicting model."""
 
 from __future__ import annotations
 
@@ -30,24 +30,24 @@ Array = NDArray[np.float64]
 
 # The name of a model from a log, in a warning.
 THE_MODEL = "the model"
-# Without a sigma in the rig, only to tell how well a place is known.
+# Standard deviation of a tape if the rig gives none. It only serves to estimate the precision of a point.
 _USUAL_TAPE_M = 0.003
-# Distances that contradict one another by more than this, or three sigmas, were not read well.
+# A residual of a distance above this value, and above three sigmas, is a reading error.
 _MISFIT_M = 0.01
 _OUTSIDE_M = 0.02
-# A model is not off by more than this, or four sigmas, among the places that it was fitted to; beyond them
-# it may be.
+# Largest error of a model, or four sigmas if they are larger: between the points of its fit, and outside of
+# these points.
 _ASTRAY_M, _ASTRAY_OUTSIDE_M = 0.05, 0.15
 _SIGMAS = 4.0
 
 
 def with_tape(rig: Rig) -> Rig:
-    """The rig with a usual tape if it names none."""
+    """Return the rig; if it gives no standard deviation of the tape, with the usual value."""
     return replace(rig, tape_sigma_m=_USUAL_TAPE_M) if rig.tape_sigma_m is None else rig
 
 
 def _outside_m(point_m: Array, rig: Rig) -> float:
-    """Return how far a point lies outside of the floor, 0 inside."""
+    """Return the distance of a point from the floor area, in m; 0 inside."""
     if rig.floor is None:
         return 0.0
     size_m = np.array([rig.floor.width_m, rig.floor.depth_m])
@@ -65,14 +65,14 @@ def doubt_floor(read: Measurement, fixed: TapePoint, rig: Rig) -> tuple[bool | N
     text = f"{_tapes(read)} put the point {outside_m * CM_PER_M:.0f} cm outside of the floor"
     if read.side is not None and sides_alike(reference_points(read, rig)):
         other = SIDES[1 - SIDES.index(read.side)]
-        there_m = world_point(replace(read, side=other), rig).world_m
-        if _outside_m(there_m, rig) <= _OUTSIDE_M:
+        other_m = world_point(replace(read, side=other), rig).world_m
+        if _outside_m(other_m, rig) <= _OUTSIDE_M:
             text += f"; on the {other} it would lie on it"
     return False, [text]
 
 
 def doubt_tapes(read: Measurement, fixed: TapePoint, rig: Rig) -> list[str]:
-    """Return a warning if distances contradict one another."""
+    """Return a warning if the distances of a measurement contradict one another."""
     sigma_m = with_tape(rig).tape_sigma_m or _USUAL_TAPE_M
     worst = int(np.abs(fixed.residuals_m).argmax())
     off_m = float(abs(fixed.residuals_m[worst]))
@@ -91,7 +91,7 @@ def doubt_crossing(read: Measurement, rig: Rig) -> list[str]:
 
 
 def floor_sigma_m(fixed: TapePoint) -> float | None:
-    """Return how well the tape knows a place in the direction in which it knows it least, in m."""
+    """Return the largest standard deviation of a tape point on the floor plane, in m."""
     if fixed.covariance_m2 is None:
         return None
     return float(np.sqrt(np.linalg.eigvalsh(fixed.covariance_m2[:2, :2])[-1]))
@@ -104,31 +104,31 @@ def doubt_model(
     predictions: Sequence[Prediction],
     model_name: str = THE_MODEL,
 ) -> list[str]:
-    """Return a warning if the model predicts another point, with the mistake that explains it."""
+    """Return a warning if the model predicts another point, with the measuring mistake that explains it."""
     if not predictions:
         return []
-    predicted_m = np.mean([one.world_m for one in predictions], axis=0)
+    predicted_m = np.mean([prediction.world_m for prediction in predictions], axis=0)
     off_m = float(np.linalg.norm(predicted_m - fixed.world_m))
-    known = [one for one in predictions if one.inside is not False]
-    sigma_m = max((one.sigma_m or 0.0 for one in predictions), default=0.0)
+    inside = [prediction for prediction in predictions if prediction.inside is not False]
+    sigma_m = max((prediction.sigma_m or 0.0 for prediction in predictions), default=0.0)
     bound_m = max(
-        _ASTRAY_M if known else _ASTRAY_OUTSIDE_M,
+        _ASTRAY_M if inside else _ASTRAY_OUTSIDE_M,
         _SIGMAS * float(np.hypot(sigma_m, floor_sigma_m(fixed) or 0.0)),
     )
     if off_m <= bound_m:
         return []
     text = f"the point is {off_m * CM_PER_M:.0f} cm away from the prediction of {model_name}"
     for group in possible_slips(read, rig, predicted_m):
-        left = []
+        explanations = []
         for slip in group:
             try:
-                there_m = world_point(slip.corrected, rig).world_m
+                corrected_m = world_point(slip.corrected, rig).world_m
             except IpsysError:
-                continue  # without this slip it would be nowhere
-            left.append((float(np.linalg.norm(there_m - predicted_m)), slip.text))
-        if left and min(left)[0] <= bound_m:
-            why = min(left)[1]
-            return [f"{text}: {why}{'' if why.endswith('fit') else '?'}"]
+                continue  # the corrected distances form no point
+            explanations.append((float(np.linalg.norm(corrected_m - predicted_m)), slip.text))
+        if explanations and min(explanations)[0] <= bound_m:
+            explanation = min(explanations)[1]
+            return [f"{text}: {explanation}{'' if explanation.endswith('fit') else '?'}"]
     return [f"{text}: read {_tapes(read)}, the height and the marker again"]
 
 

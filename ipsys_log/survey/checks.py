@@ -31,18 +31,18 @@ __all__ = ["Checked", "check_entry", "next_id", "withdraw"]
 
 Array = NDArray[np.float64]
 
-_NUMBERED = re.compile(r"p[0-9]{1,18}")  # an id in a log may have thousands of digits
+_NUMBERED = re.compile(r"p[0-9]{1,18}")  # the limit matters: an id in a log may have thousands of digits
 
 
 @dataclass(frozen=True, slots=True, eq=False)
 class Checked:
     """The result of the check of an entry.
 
-    ``faults`` keep it out of the log, ``warnings`` must be confirmed first. Warnings that are ``imprecise``
-    are no mistakes: the point only has a large uncertainty. ``point_m`` (3,) is the world point, ``sigma_m``
-    its largest standard deviation by the tape, ``residuals_m`` those of the distances by reference point, if
-    there are more than two. ``sides_m`` are both possible points (3,) if the side is not given yet.
-    ``measurement`` is None if there are faults.
+    An entry with ``faults`` is not written to the log. The user must confirm ``warnings`` first. Warnings in
+    ``imprecise`` are no mistakes: the point only has a large uncertainty. ``point_m`` (3,) is the world
+    point, and ``sigma_m`` its largest standard deviation by the tape. ``residuals_m`` are the residuals of
+    the distances by reference point, if there are more than two distances. ``sides_m`` are both possible
+    points (3,) if the side is not given yet. ``measurement`` is None if there are faults.
     """
 
     id: str
@@ -76,12 +76,12 @@ def next_id(history: Iterable[Measurement]) -> str:
 
 
 def withdraw(history: Sequence[Measurement], name: str) -> Measurement:
-    """The message that withdraws a measurement; nothing is erased.
+    """Return the message that withdraws a measurement; the log keeps the measurement.
 
     Raises
     ------
     IpsysError
-        Where there is none of that id, or it is withdrawn already.
+        No measurement has this id, or it is withdrawn already.
     """
     for measurement in active_measurements(history):
         if measurement.id == name:
@@ -98,56 +98,57 @@ def check_entry(
     model: Model | None = None,
     model_name: str = THE_MODEL,
 ) -> Checked:
-    """Check whether an entry is plausible, and make its measurement.
+    """Check whether an entry is plausible, and create its measurement.
 
     Parameters
     ----------
-    entry, faults : from :func:`~ipsys_log.survey.entry.read_typed`.
-    rig : the present one.
-    sight : the observations of the marker, None if the marker is not known.
+    entry, faults : results of :func:`~ipsys_log.survey.entry.read_typed`.
+    rig : the present rig.
+    sight : observations of the marker; None if the marker is not known.
     history : measurements and withdrawals so far.
-    model : the present one, to compare with.
-    model_name : its name in a warning.
+    model : the present model, for the comparison; None to skip it.
+    model_name : name of the model in a warning.
     """
     name = entry.id or next_id(history)
-    found = [*faults, *_identity_faults(entry, sight, history)]
+    all_faults = [*faults, *_identity_faults(entry, sight, history)]
     warnings = list(entry.doubts)
     read = _measurement(entry, name, sight)
-    given = {fault.field for fault in found}
-    apart = _apart(read, rig)
-    if apart is not None:
-        # That one of them may be in metres is then why.
-        return Checked(name, (*found, Fault("", "; ".join([apart, *entry.doubts]))))
-    missing = {"side", "height", ""} & given or {f for f in given if f.startswith("d_")}
+    faulty_fields = {fault.field for fault in all_faults}
+    misfit = _apart(read, rig)
+    if misfit is not None:
+        # A distance in metres may be the reason; the doubts say so.
+        return Checked(name, (*all_faults, Fault("", "; ".join([misfit, *entry.doubts]))))
+    missing = {"side", "height", ""} & faulty_fields or {f for f in faulty_fields if f.startswith("d_")}
     if missing == {"side"} and len(entry.distances) >= 2 and entry.height_m is not None:
         sides_m, fault = _both_sides(read, rig)
-        return Checked(name, tuple(found + fault), tuple(warnings), sides_m=sides_m)
+        return Checked(name, tuple(all_faults + fault), tuple(warnings), sides_m=sides_m)
     if missing or len(entry.distances) < 2 or entry.height_m is None:
-        return Checked(name, tuple(found), tuple(warnings))
+        return Checked(name, tuple(all_faults), tuple(warnings))
     try:
-        # A usual tape tells how flatly the circles cross; what is written down has no sigma of its own.
+        # With the usual tape sigma, the covariance shows a flat crossing of the circles. The written
+        # measurement has no sigma of its own.
         fixed = world_point(read, with_tape(rig))
     except IpsysError as error:
-        why = "; ".join([_without_id(error, name), *entry.doubts])
-        return Checked(name, (*found, Fault("", why)))
+        reason = "; ".join([_without_id(error, name), *entry.doubts])
+        return Checked(name, (*all_faults, Fault("", reason)))
     on_floor, remark = doubt_floor(read, fixed, rig)
     flat = doubt_crossing(read, rig)
     warnings += [*remark, *doubt_tapes(read, fixed, rig), *flat]
     earlier = _here_before(read, sight, history)
-    found += _twin_faults(read, earlier)
+    all_faults += _twin_faults(read, earlier)
     warnings += _repeat_warnings(read, fixed, rig, earlier) if read.still else []
     predictions = predict(model, sight.points_m, fixed.world_m) if model and sight else ()
     warnings += doubt_model(read, fixed, rig, predictions, model_name)
     return Checked(
         name,
-        tuple(found),
+        tuple(all_faults),
         tuple(dict.fromkeys(warnings)),
         fixed.world_m,
         floor_sigma_m(fixed),
         _residuals(read, fixed),
         on_floor,
         predictions,
-        measurement=None if found else read,
+        measurement=None if all_faults else read,
         imprecise=tuple(flat),
     )
 
@@ -168,17 +169,17 @@ def _measurement(entry: Entry, name: str, sight: Sight | None) -> Measurement:
 
 
 def _apart(read: Measurement, rig: Rig) -> str | None:
-    """Why two tapes do not meet, named as they were asked for: of side and height nothing need be known."""
+    """Return the reason why two distances do not meet, else None; side and height are not needed."""
     if len(read.distances) != 2:
         return None
     first_m, second_m = reference_points(read, rig)
     base_m = float(np.hypot(*(second_m - first_m)))
-    one, other = read.distances
-    if abs(one.distance_m - other.distance_m) <= base_m <= one.distance_m + other.distance_m:
+    first, second = read.distances
+    if abs(first.distance_m - second.distance_m) <= base_m <= first.distance_m + second.distance_m:
         return None
-    tapes = (f"distance to {d.reference} = {d.distance_m * CM_PER_M:g} cm" for d in (one, other))
+    tapes = (f"distance to {d.reference} = {d.distance_m * CM_PER_M:g} cm" for d in (first, second))
     return (
-        f"no triangle has the sides {one.reference} to {other.reference} = {base_m * CM_PER_M:.1f} cm, "
+        f"no triangle has the sides {first.reference} to {second.reference} = {base_m * CM_PER_M:.1f} cm, "
         f"{' and '.join(tapes)}; read both again"
     )
 
@@ -188,23 +189,23 @@ def _without_id(error: IpsysError, name: str) -> str:
 
 
 def _identity_faults(entry: Entry, sight: Sight | None, history: Sequence[Measurement]) -> list[Fault]:
-    found = []
+    faults = []
     if entry.id is not None and any(entry.id in (m.id, m.withdraws) for m in history):
-        found.append(Fault("id", f"id {entry.id} was used before; leave it out for the next free one"))
+        faults.append(Fault("id", f"id {entry.id} was used before; leave it out for the next free one"))
     if sight is not None and sight.still is None:
-        found.append(Fault("marker", sight.text))
-    return found
+        faults.append(Fault("marker", sight.text))
+    return faults
 
 
 def _here_before(read: Measurement, sight: Sight | None, history: Sequence[Measurement]) -> list[Measurement]:
-    """Return the measurements of this marker here: of one stationary interval, or seen there."""
+    """Return the earlier measurements of this marker at this point: in the same interval, or seen there."""
     seen = sight.measured_as if sight else ()
-    own = [m for m in active_measurements(history) if m.marker_id == read.marker_id]
-    return [m for m in own if _overlap(m, read) or m.id in seen]
+    same_marker = [m for m in active_measurements(history) if m.marker_id == read.marker_id]
+    return [m for m in same_marker if _overlap(m, read) or m.id in seen]
 
 
 def _twin_faults(read: Measurement, earlier: Sequence[Measurement]) -> list[Fault]:
-    """The same place typed twice, to the last digit."""
+    """Return a fault if an earlier measurement has exactly the same numbers."""
     for other in earlier:
         same = (other.side, other.height_m) == (read.side, read.height_m)
         if same and _tapes(other) == _tapes(read):
@@ -222,7 +223,7 @@ def _repeat_warnings(
 
 
 def _apart_from(other: Measurement, fixed: TapePoint, rig: Rig) -> str:
-    """Return the distance to another measurement in words; "" if that one forms no point."""
+    """Return the distance to another measurement as text; "" if the other measurement forms no point."""
     try:
         other_m = world_point(other, rig).world_m
     except IpsysError:
@@ -243,10 +244,10 @@ def _overlap(one: Measurement, other: Measurement) -> bool:
 def _both_sides(read: Measurement, rig: Rig) -> tuple[tuple[tuple[str, Array], ...], list[Fault]]:
     """Return the points on both sides, or the reason why the tape distances do not meet."""
     try:
-        places = tuple((side, world_point(replace(read, side=side), rig).world_m) for side in SIDES)
+        points = tuple((side, world_point(replace(read, side=side), rig).world_m) for side in SIDES)
     except IpsysError as error:
         return (), [Fault("", _without_id(error, read.id))]
-    return places, []
+    return points, []
 
 
 def _residuals(read: Measurement, fixed: TapePoint) -> tuple[tuple[str, float], ...]:

@@ -1,4 +1,4 @@
-"""What was typed, in centimetres as the tape reads, into what it says: field by field."""
+"""Parser of typed measurements: text fields in centimetres become an entry in metres, or faults."""
 
 from __future__ import annotations
 
@@ -18,18 +18,21 @@ __all__ = ["Entry", "Fault", "Typed", "check_references", "needs_side", "read_ty
 
 _NUMBER = re.compile(r"\d+(?:[.,]\d*)?|[.,]\d+")
 _NAME = re.compile(r"[A-Za-z0-9][A-Za-z0-9_.-]*")
-# Without a floor in the rig, no tape is longer and no marker carried higher.
+# Longest distance if the rig has no floor, and largest height of a marker.
 _LONGEST_M = 30.0
 _HIGHEST_M = 5.0
-# So near to a reference point hardly anybody measures; to a hundredth of a millimetre, nobody.
+# A shorter distance may be in metres. With three decimals or more, it is a fault, else only a doubt.
 _NEAR_CM = 10.0
 _METRES = re.compile(r"\d?[.,]\d{3,}")
 _LOWEST_CM = 1.0
 
 
 class Fault(NamedTuple):
-    """What cannot be right: ``field`` is ``marker``, ``side``, ``height``, ``id``, ``split``, the name of a
-    reference point after ``d_``, or empty where it is about all of it."""
+    """An error in an entry.
+
+    ``field`` is ``marker``, ``side``, ``height``, ``id``, ``split``, or ``d_`` and the name of a reference
+    point. It is empty if the fault is in the whole entry.
+    """
 
     field: str
     text: str
@@ -37,7 +40,10 @@ class Fault(NamedTuple):
 
 @dataclass(frozen=True, slots=True)
 class Typed:
-    """One place as it was typed: text, centimetres. ``distances`` by reference point; empty is not given."""
+    """One calibration point as it was typed: texts, in centimetres.
+
+    ``distances`` are by reference point. An empty text means that the value is missing.
+    """
 
     marker: str
     distances: Mapping[str, str]
@@ -49,7 +55,7 @@ class Typed:
 
 @dataclass(frozen=True, slots=True)
 class Entry:
-    """One place as read from tape and ruler, in m. ``id`` is None where the next free one will do."""
+    """One calibration point as read from tape and ruler, in m; ``id`` None means the next free id."""
 
     marker_id: int | None
     distances: tuple[Distance, ...]
@@ -61,31 +67,33 @@ class Entry:
 
 
 def check_references(rig: Rig) -> None:
-    """See that a tape can be laid in this lab.
+    """Check that the rig has enough reference points for tape measurements.
 
     Raises
     ------
     IpsysError
-        Where the rig has fewer than two reference points.
+        The rig has fewer than two reference points.
     """
     count = len(rig.reference_points)
     if count < 2:
-        has = f"only the reference point {rig.reference_points[0].name}" if count else "no reference points"
+        present = (
+            f"only the reference point {rig.reference_points[0].name}" if count else "no reference points"
+        )
         raise IpsysError(
-            f"the rig has {has} to lay the tape from: write two or more as [[reference_points]] into "
+            f"the rig has {present} to lay the tape from: write two or more as [[reference_points]] into "
             "lab.toml and give it with --rig"
         )
 
 
 def needs_side(rig: Rig, names: Iterable[str]) -> bool:
-    """Whether the side must be told where the tape was laid from these reference points."""
-    given = set(names)
-    at_m = [(p.x_m, p.y_m) for p in rig.reference_points if p.name in given]
-    return len(at_m) >= 2 and sides_alike(np.array(at_m))
+    """Return whether distances from these reference points need a side (left or right)."""
+    used = set(names)
+    points_m = [(p.x_m, p.y_m) for p in rig.reference_points if p.name in used]
+    return len(points_m) >= 2 and sides_alike(np.array(points_m))
 
 
 def read_typed(typed: Typed, rig: Rig) -> tuple[Entry, list[Fault]]:
-    """What was typed, and what is wrong or still missing in each field.
+    """Parse typed texts; return the entry, and the faults and missing values of each field.
 
     Examples
     --------
@@ -118,29 +126,29 @@ def read_typed(typed: Typed, rig: Rig) -> tuple[Entry, list[Fault]]:
 
 
 def _line(rig: Rig, distances: tuple[Distance, ...]) -> str:
-    given = {d.reference for d in distances}
-    names = [p.name for p in rig.reference_points if p.name in given]
+    used = {d.reference for d in distances}
+    names = [p.name for p in rig.reference_points if p.name in used]
     return f"{names[0]} to {names[1]}"
 
 
 def _marker(text: str, rig: Rig, faults: list[Fault]) -> int | None:
     text = text.strip()
     if not re.fullmatch(r"\d{1,6}", text):
-        what = f"{text!r} is no marker id; type a whole number" if text else "which marker?"
-        faults.append(Fault("marker", what))
+        message = f"{text!r} is no marker id; type a whole number" if text else "which marker?"
+        faults.append(Fault("marker", message))
         return None
     if not rig.knows(int(text)):
-        known = ", ".join(str(marker.id) for marker in rig.markers)
-        faults.append(Fault("marker", f"marker {text} is not in the rig (it has {known})"))
+        ids = ", ".join(str(marker.id) for marker in rig.markers)
+        faults.append(Fault("marker", f"marker {text} is not in the rig (it has {ids})"))
         return None
     return int(text)
 
 
 def _distances(typed: Typed, rig: Rig, faults: list[Fault], doubts: list[str]) -> Iterator[Distance]:
-    given = {name: text.strip() for name, text in typed.distances.items() if text.strip()}
+    texts = {name: text.strip() for name, text in typed.distances.items() if text.strip()}
     count = len(rig.reference_points)
     for point in rig.reference_points:
-        text = _bare(given.pop(point.name, ""))
+        text = _bare(texts.pop(point.name, ""))
         if text:
             value_cm = _number(text, f"distance to {point.name}", f"d_{point.name}", faults)
             fault = None if value_cm is None else _distance_fault(text, value_cm, point, rig)
@@ -153,31 +161,31 @@ def _distances(typed: Typed, rig: Rig, faults: list[Fault], doubts: list[str]) -
                         f"Then type {_times(value_cm)}"
                     )
                 yield Distance(point.name, value_cm / CM_PER_M)
-        elif count == 2:  # of more, any two will do
+        elif count == 2:  # with more reference points, any two distances are enough
             faults.append(Fault(f"d_{point.name}", f"distance to {point.name}?"))
-    for name in given:
+    for name in texts:
         faults.append(Fault(f"d_{name}", f"{name} is no reference point of the rig"))
     if count > 2 and sum(bool(text.strip()) for text in typed.distances.values()) < 2:
         faults.append(Fault("", "give two distances or more"))
 
 
 def _distance_fault(text: str, value_cm: float, point: ReferencePoint, rig: Rig) -> Fault | None:
-    """Why a number cannot be a distance in cm."""
+    """Return a fault if a number cannot be a distance in cm, else None."""
     longest_cm = _reach_m(rig, point.x_m, point.y_m) * CM_PER_M
     if value_cm == 0:
-        why = "a distance is above 0"
+        reason = "a distance is above 0"
     elif value_cm < _NEAR_CM and _METRES.fullmatch(text):
-        why = f"{text} cm looks like metres; type {_times(value_cm)}"
+        reason = f"{text} cm looks like metres; type {_times(value_cm)}"
     elif value_cm > longest_cm:
         in_mm = f"; in mm? Then type {value_cm / 10:g}" if value_cm / 10 <= longest_cm else ""
-        why = f"{text} cm is further than the floor reaches{in_mm}"
+        reason = f"{text} cm is further than the floor reaches{in_mm}"
     else:
         return None
-    return Fault(f"d_{point.name}", f"distance to {point.name}: {why}")
+    return Fault(f"d_{point.name}", f"distance to {point.name}: {reason}")
 
 
 def _reach_m(rig: Rig, x_m: float, y_m: float) -> float:
-    """From a reference point to the furthest corner of the floor."""
+    """Return the distance from a reference point to the furthest corner of the floor, in m."""
     if rig.floor is None:
         return _LONGEST_M
     corners = [(x, y) for x in (0.0, rig.floor.width_m) for y in (0.0, rig.floor.depth_m)]
@@ -206,7 +214,7 @@ def _height(text: str, faults: list[Fault], doubts: list[str]) -> float | None:
 
 
 def _bare(text: str) -> str:
-    """A number without the unit that it is asked for in."""
+    """Remove the unit cm and spaces from a typed number."""
     return re.sub(r"\s*cm$", "", text.strip(), flags=re.IGNORECASE)
 
 

@@ -1,4 +1,4 @@
-"""Measuring on a finished log: its places one after the other, and measurements appended at their time."""
+"""Measuring in a finished log: the stationary intervals in order, and measurements appended at their time."""
 
 from __future__ import annotations
 
@@ -39,11 +39,11 @@ from ipsys_log.units import NS_PER_S
 
 __all__ = ["FinishedLog", "opened_log", "rigs_of"]
 
-# How far the log time of a frame can lie from the time that its geometry speaks of, and how far before the
-# exposure of a marker that of its frame.
+# Largest difference between the log time of a frame and the time of its results; longest time from the time
+# of a frame to the exposure of a marker in it.
 _LATE_NS = 2 * NS_PER_S
 _ROLLING_NS = NS_PER_S // 10
-# Stretches whose pictures are kept: each is asked for with every key that is typed.
+# Number of stationary intervals whose images are kept. The page requests an image after every typed key.
 _KEPT = 4
 
 
@@ -59,7 +59,8 @@ def opened_log(
     Parameters
     ----------
     path : a finished log.
-    request : its rig and lenses are used instead of the log's.
+    request : its rig and camera intrinsics are used instead of those of the log.
+    progress : called with the progress of the computation.
     say : called with the runs that are out of date.
 
     Raises
@@ -109,7 +110,7 @@ class FinishedLog:
             )
 
     def views(self, stop: int | None) -> list[View]:
-        """What each camera saw in a stretch, and its picture from the middle of it."""
+        """Return the view of each camera in a stationary interval, with the image at its middle."""
         number = stop or 0
         if number not in self._seen:
             while len(self._seen) >= _KEPT:
@@ -121,19 +122,21 @@ class FinishedLog:
         return [message.payload for message in self._history]
 
     def add(self, measurements: Sequence[Measurement]) -> None:
-        """Append measurements at the time of their stretch, withdrawals after what they withdraw.
+        """Append measurements at the end of their stationary intervals.
+
+        A withdrawal comes after its measurement.
 
         Raises
         ------
         LogError
-            Where the log is locked or cannot be written to; or another process measured in it meanwhile: that
-            is then in the history, and the same can be added again.
+            The log is locked or cannot be written to, or another process has added measurements to it. These
+            are then in the history, and the caller can repeat this call.
         """
         with LogWriter.append(self.path) as writer:
             others = self._of_others()
             if others:
                 self._history += others
-                names = ", ".join(one.payload.id for one in others)
+                names = ", ".join(message.payload.id for message in others)
                 raise LogError(
                     f"somebody else measured in this log meanwhile ({names}), so this is not written yet: "
                     "look again, and repeat it"
@@ -145,34 +148,38 @@ class FinishedLog:
         self._history += added
 
     def _of_others(self) -> list[Message]:
-        """What other processes have measured since it was looked last."""
-        known = {(one.payload.id, one.payload.withdraws) for one in self._history}
-        with Session([self.path]) as now:
-            found = now.messages(now.topics(MEASUREMENTS))
-            return [one for one in found if (one.payload.id, one.payload.withdraws) not in known]
+        """Return the measurements that other processes have added since the last read of the log."""
+        known_ids = {(message.payload.id, message.payload.withdraws) for message in self._history}
+        with Session([self.path]) as session:
+            messages = session.messages(session.topics(MEASUREMENTS))
+            return [
+                message
+                for message in messages
+                if (message.payload.id, message.payload.withdraws) not in known_ids
+            ]
 
     def _view(self, camera: str, here: Stop) -> View:
         middle_ns = here.start_ns + (here.end_ns - here.start_ns) // 2
         seen = [m for m in self._within(CAMERA_POINTS, camera, here) if _sees(m, here)]
-        found = self._within(MARKERS, camera, here)
-        marked = min(found, key=lambda m: abs(m.publish_time_ns - middle_ns), default=None)
-        jpeg = self._picture(camera, marked.log_time_ns if marked else middle_ns)
+        marker_messages = self._within(MARKERS, camera, here)
+        nearest = min(marker_messages, key=lambda m: abs(m.publish_time_ns - middle_ns), default=None)
+        jpeg = self._picture(camera, nearest.log_time_ns if nearest else middle_ns)
         return View(
             camera,
-            marked.publish_time_ns if marked else middle_ns,
+            nearest.publish_time_ns if nearest else middle_ns,
             jpeg,
-            marked.payload if marked else None,
+            nearest.payload if nearest else None,
             tuple(message.payload for message in seen),
         )
 
     def _within(self, channel: Channel, camera: str, here: Stop) -> list[Message]:
-        """Messages of a camera that speak of a stretch."""
+        """Return the messages of a camera whose frames lie in a stationary interval."""
         topics = [topic for topic in self._topics[channel] if camera_of_topic(topic) == camera]
-        found = self._session.messages(topics, here.start_ns - _LATE_NS, here.end_ns + _LATE_NS)
-        return [m for m in found if here.start_ns - _ROLLING_NS <= m.publish_time_ns <= here.end_ns]
+        messages = self._session.messages(topics, here.start_ns - _LATE_NS, here.end_ns + _LATE_NS)
+        return [m for m in messages if here.start_ns - _ROLLING_NS <= m.publish_time_ns <= here.end_ns]
 
     def _picture(self, camera: str, log_time_ns: int) -> bytes | None:
-        """The frame of a log time, or the nearest one, as a JPEG."""
+        """Return the frame nearest to a log time, as a JPEG."""
         topic = self._session.images.get(camera)
         if topic is None:
             return None
@@ -194,7 +201,7 @@ class FinishedLog:
 
 
 def rigs_of(session: Session, request: Request) -> list[Rig]:
-    """The rigs of a log, or the one that holds instead; the last one is measured with."""
+    """Return the rigs of a log, or the rig of the request instead; measurements use the last rig."""
     return [request.rig] if request.rig is not None else session.payloads(session.topics(RIG))
 
 
@@ -204,7 +211,10 @@ def _newest(session: Session, channel: Channel) -> list[str]:
 
 
 def _message(measurement: Measurement, earlier: Sequence[Message]) -> Message:
-    """At the end of its stretch; but what is said of an id is said in order."""
+    """Return the message of a measurement, at the end of its stationary interval.
+
+    Messages with the same id keep their order.
+    """
     end_ns = measurement.timestamp if measurement.still is None else measurement.still.end
     names = {measurement.id, measurement.withdraws}
     same = [m.log_time_ns + 1 for m in earlier if {m.payload.id, m.payload.withdraws} & (names - {None})]
@@ -212,17 +222,21 @@ def _message(measurement: Measurement, earlier: Sequence[Message]) -> Message:
 
 
 def _find_stops(sightings: Mapping[tuple[str, int], Sightings], rig: Rig) -> list[Stop]:
-    """Return where the rig's markers lie still, in order of time."""
+    """Return the stationary intervals of the rig's markers, in order of time."""
     stops = []
     for marker_id in sorted({marker_id for _, marker_id in sightings}):
         if rig.knows(marker_id):
-            seen = {camera: found for (camera, one), found in sightings.items() if one == marker_id}
-            stops += [Stop(marker_id, *stretch) for stretch in still_stretches(seen)]
+            seen = {
+                camera: observations
+                for (camera, seen_id), observations in sightings.items()
+                if seen_id == marker_id
+            }
+            stops += [Stop(marker_id, *interval) for interval in still_stretches(seen)]
     return sorted(stops, key=lambda stop: (stop.start_ns, stop.marker_id))
 
 
 def _sees(message: Message, here: Stop) -> bool:
-    """Return whether camera points have the marker of a stretch within it."""
+    """Return whether camera points hold the marker of a stationary interval at a time within it."""
     return any(
         point.id == here.marker_id
         and here.start_ns <= message.publish_time_ns + (point.time_offset_ns or 0) <= here.end_ns

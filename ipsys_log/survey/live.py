@@ -1,4 +1,4 @@
-"""Measuring while cameras send: what they see now, and measurements on their way into the log."""
+"""Measuring with live cameras: their present views, and measurements that go into the running log."""
 
 from __future__ import annotations
 
@@ -36,19 +36,21 @@ _LAST_NS = NS_PER_S
 
 
 class LiveScene:
-    """A recording as a :class:`~ipsys_log.survey.scene.Scene`. Call it with what is recorded and made.
+    """A running recording as a :class:`~ipsys_log.survey.scene.Scene`; call it with every message.
+
+    The messages are the recorded frames and the results of the stages.
 
     Parameters
     ----------
-    rig, model : those that hold; the model may be None.
-    cameras : by name; of one that is lost nothing is seen.
-    add : puts a payload on a topic into the log, through the one place that gives log times; it returns when
-        that is written.
+    rig, model : the present rig and model; the model may be None.
+    cameras : camera states by name; a lost camera has an empty view.
+    add : function that writes a payload with a topic to the log. It goes through the queue that gives log
+        times, and returns after the write.
 
     Raises
     ------
     IpsysError
-        Where the rig has no two reference points to lay a tape from.
+        The rig has fewer than two reference points for a tape.
     """
 
     def __init__(
@@ -64,21 +66,21 @@ class LiveScene:
         self._cameras, self._add = cameras, add
         self._lock = threading.Lock()
         self._images: dict[str, deque[Message]] = {camera: deque(maxlen=60) for camera in cameras}
-        # The last picture with its markers. Frames that were skipped have none.
+        # The last image with its markers. Skipped frames have no markers.
         self._marked: dict[str, tuple[Message, Markers]] = {}
         self._decoded: dict[str, tuple[int, bytes | None]] = {}
         self._points: dict[str, deque[CameraPoints]] = {camera: deque() for camera in cameras}
         self._history: list[Measurement] = []
-        # Where each camera saw the marker of a measurement: id, marker, mean camera point (3,).
+        # For each camera and measurement: the id, the marker, and its mean camera point (3,).
         self._measured: dict[str, list[tuple[str, int, NDArray[np.float64]]]] = {c: [] for c in cameras}
 
     def __call__(self, message: Message | None) -> None:
-        """Be shown a frame, or what a stage made of it."""
+        """Handle one frame, or one result of a stage."""
         if message is None or message.camera not in self._images:
             return
         payload, camera = message.payload, message.camera
         with self._lock:
-            # Of a video keyframes are shown, which need no others.
+            # In a video, only keyframes are shown: they can be decoded without other frames.
             if isinstance(payload, CompressedImage) or (
                 isinstance(payload, CompressedVideo) and is_keyframe(payload)
             ):
@@ -94,7 +96,7 @@ class LiveScene:
                     points.popleft()
 
     def views(self, stop: int | None) -> list[View]:  # noqa: ARG002
-        """The latest picture of every camera whose markers are known, and its last second."""
+        """Return the view of each camera: the latest image with known markers, and the points of a second."""
         with self._lock:
             newest_ns = max((points[-1].timestamp for points in self._points.values() if points), default=0)
             return [self._view(camera, newest_ns - _LAST_NS) for camera in sorted(self._images)]
@@ -103,12 +105,12 @@ class LiveScene:
         return list(self._history)
 
     def add(self, measurements: Sequence[Measurement]) -> None:
-        """Send measurements into the log.
+        """Write measurements to the log.
 
         Raises
         ------
         IpsysError
-            Where the recording has ended, or they could not be written: it says that they are not saved.
+            The recording has ended, or the write failed. The text says that the measurements are not saved.
         """
         for measurement in measurements:
             self._add(MEASUREMENTS_TOPIC, measurement)
@@ -116,7 +118,7 @@ class LiveScene:
             self._remember(measurement)
 
     def _remember(self, measurement: Measurement) -> None:
-        """Note where it was measured, to tell whether the marker has moved since."""
+        """Store the camera points of a measurement, to detect later whether the marker has moved."""
         still = measurement.still
         if still is None or measurement.marker_id is None:
             return
@@ -124,21 +126,23 @@ class LiveScene:
             for camera, seen in self._points.items():
                 points_m = [
                     (point.x_m, point.y_m, point.z_m)
-                    for one in seen
-                    for point in one.points
+                    for camera_points in seen
+                    for point in camera_points.points
                     if point.id == measurement.marker_id
-                    and still.start <= one.timestamp + (point.time_offset_ns or 0) <= still.end
+                    and still.start <= camera_points.timestamp + (point.time_offset_ns or 0) <= still.end
                 ]
                 if points_m:
-                    place = measurement.id, measurement.marker_id, np.mean(points_m, axis=0)
-                    self._measured[camera].append(place)
+                    measured_point = measurement.id, measurement.marker_id, np.mean(points_m, axis=0)
+                    self._measured[camera].append(measured_point)
 
     def _view(self, camera: str, since_ns: int) -> View:
         if camera not in self._marked or not self._cameras[camera].up:
             return View(camera, 0)
         image, markers = self._marked[camera]
-        # That of a camera which hangs, and is not known to be lost yet, is not the last second.
-        points = tuple(one for one in self._points[camera] if one.timestamp >= since_ns)
+        # A camera that hangs, but is not known to be lost, has only older points. They are left out.
+        points = tuple(
+            camera_points for camera_points in self._points[camera] if camera_points.timestamp >= since_ns
+        )
         measured = tuple(self._measured[camera])
         return View(camera, image.publish_time_ns, self._jpeg(camera, image), markers, points, measured)
 

@@ -38,10 +38,11 @@ Array = NDArray[np.float64]
 
 @dataclass(frozen=True, slots=True, eq=False)
 class Prediction:
-    """Where the model of a camera has the marker, ``world_m`` (3,), and ``off_m`` how far from the tape.
+    """The position of a marker by the model of one camera.
 
-    ``sigma_m`` is the model's own in the worst direction, ``inside`` whether the place lies among those
-    that it was fitted to; None where the model does not say.
+    ``world_m`` (3,) is the predicted position, and ``off_m`` its distance from the tape point. ``sigma_m``
+    is the model's largest standard deviation in any direction. ``inside`` tells whether the position lies
+    between the points of the fit. ``sigma_m`` and ``inside`` are None if the model does not give them.
     """
 
     camera: str
@@ -52,35 +53,35 @@ class Prediction:
 
 
 def predict(model: Model, points_m: Mapping[str, Array], world_m: Array) -> tuple[Prediction, ...]:
-    """What the model of each camera that saw the marker says.
+    """Predict the position of a marker, for each camera that saw it.
 
     Parameters
     ----------
-    model : out of a log.
+    model : model from a log.
     points_m : mean camera point (3,) by camera.
-    world_m : (3,), by tape and ruler; models that need the height of the marker get it from here.
+    world_m : position (3,) by tape and ruler; models that need the height of the marker use its height.
     """
     applied = _applied(model)
     heights_m = np.array([world_m[2]])
-    found = []
+    predictions = []
     for camera, point_m in sorted(points_m.items()):
         if camera not in applied:
             continue
-        one, here_m = applied[camera], point_m[None]
-        there_m = one.predict(here_m, heights_m)
-        if not np.isfinite(there_m).all():
+        camera_model, camera_m = applied[camera], point_m[None]
+        predicted_m = camera_model.predict(camera_m, heights_m)
+        if not np.isfinite(predicted_m).all():
             continue
-        covariances_m2 = one.covariances(here_m, heights_m)
+        covariances_m2 = camera_model.covariances(camera_m, heights_m)
         sigma_m = None
         if covariances_m2 is not None:
             sigma_m = float(np.sqrt(np.linalg.eigvalsh(covariances_m2[0])[-1]))
         sigmas_m = np.zeros(1) if covariances_m2 is None else np.sqrt(covariances_m2[:, 2, 2])
-        inside = one.inside(here_m, there_m, sigmas_m)
-        off_m = float(np.linalg.norm(there_m[0] - world_m))
-        found.append(
-            Prediction(camera, there_m[0], off_m, sigma_m, None if inside is None else bool(inside[0]))
+        inside = camera_model.inside(camera_m, predicted_m, sigmas_m)
+        off_m = float(np.linalg.norm(predicted_m[0] - world_m))
+        predictions.append(
+            Prediction(camera, predicted_m[0], off_m, sigma_m, None if inside is None else bool(inside[0]))
         )
-    return tuple(found)
+    return tuple(predictions)
 
 
 @lru_cache(maxsize=2)
@@ -90,12 +91,13 @@ def _applied(model: Model) -> dict[str, AppliedModel]:
 
 @dataclass(frozen=True, slots=True, eq=False)
 class View:
-    """What a camera sees.
+    """The view of one camera.
 
-    ``jpeg`` is the picture taken at ``time_ns``, None where there is none, and ``markers`` those found in
-    it. ``points`` are the camera points of the last second, that picture's last; of a finished log those
-    of the whole stretch in which the marker lies still. ``measured`` are the places measured so far while
-    the camera sent: id, marker and mean camera point (3,); of a finished log none, its stretches tell.
+    ``jpeg`` is the image taken at ``time_ns``; None without an image. ``markers`` are the markers detected in
+    it. ``points`` are the camera points of the last second; those of the image come last. In a finished log,
+    they are the camera points of the whole stationary interval. ``measured`` are the calibration points
+    measured while the camera was live: id, marker and mean camera point (3,). For a finished log, it is
+    empty, because the stationary intervals give the same information.
     """
 
     camera: str
@@ -108,7 +110,7 @@ class View:
 
 @dataclass(frozen=True, slots=True)
 class Stop:
-    """A stretch of a finished log, ends included, in which a marker lies still."""
+    """A stationary interval of a marker in a finished log; both ends belong to it."""
 
     marker_id: int
     start_ns: int
@@ -116,17 +118,17 @@ class Stop:
     cameras: tuple[str, ...]
 
     def covers(self, measurement: Measurement) -> bool:
-        """Whether a measurement is one of this marker in this stretch."""
+        """Return whether a measurement belongs to this marker and this stationary interval."""
         still = measurement.still or Interval(measurement.timestamp, measurement.timestamp)
-        here = still.start <= self.end_ns and still.end >= self.start_ns
-        return measurement.marker_id == self.marker_id and here
+        overlaps = still.start <= self.end_ns and still.end >= self.start_ns
+        return measurement.marker_id == self.marker_id and overlaps
 
 
 class Scene(Protocol):
-    """What measuring is done on.
+    """The source of views for measuring: a finished log or live cameras.
 
-    ``stops`` are the places of a finished log, in order; none while recording. ``model`` is the present
-    one, ``rig`` the one that holds. Whoever asks does so from one thread, which need not be the main one.
+    ``stops`` are the stationary intervals of a finished log, in order; empty during a recording. ``model``
+    and ``rig`` are the present ones. All calls must come from one thread; this can be any thread.
     """
 
     @property
@@ -139,11 +141,11 @@ class Scene(Protocol):
     def stops(self) -> Sequence[Stop]: ...
 
     def views(self, stop: int | None) -> Sequence[View]:
-        """The latest view of every camera, or the views of a stop by its index."""
+        """Return the latest view of every camera, or the views of a stationary interval by its index."""
         ...
 
     def history(self) -> Sequence[Measurement]:
-        """Every measurement and withdrawal so far, in the order they were made."""
+        """Return every measurement and withdrawal so far, in the order of their creation."""
         ...
 
     def add(self, measurements: Sequence[Measurement]) -> None:
@@ -153,11 +155,11 @@ class Scene(Protocol):
 
 @dataclass(frozen=True, slots=True, eq=False)
 class Sight:
-    """What the cameras say of one marker.
+    """The observations of one marker by all cameras.
 
-    ``still`` is the stretch in which it lies still, None where it moves or is not seen; ``points_m`` its
-    mean camera point (3,) by camera then; ``moving`` are the cameras that see it move;
-    ``measured_as`` are the measurements since which every camera sees it where it was.
+    ``still`` is its stationary interval; None if it moves or is not seen. ``points_m`` are its mean camera
+    points (3,) in this interval, by camera. ``moving`` are the cameras that see it move. ``measured_as`` are
+    the measurements of the marker at its present position, by the views of all cameras.
     """
 
     marker_id: int
@@ -168,14 +170,14 @@ class Sight:
 
     @property
     def state(self) -> str:
-        """``still``, ``moving`` or ``unseen``."""
+        """The state: ``still``, ``moving`` or ``unseen``."""
         if self.moving:
             return "moving"
         return "unseen" if self.still is None else "still"
 
     @property
     def text(self) -> str:
-        """The state in words."""
+        """The state as a sentence."""
         name = f"marker {self.marker_id}"
         if self.moving:
             return f"{name} moves, as seen by {', '.join(self.moving)}: wait until it lies still"
@@ -185,7 +187,7 @@ class Sight:
 
 
 def look(views: Sequence[View], marker_id: int) -> Sight:
-    """What the cameras say of a marker: whether it lies still, and where.
+    """Combine the observations of a marker by all cameras; check whether the marker is stationary.
 
     Examples
     --------
@@ -197,17 +199,18 @@ def look(views: Sequence[View], marker_id: int) -> Sight:
     seen: dict[str, tuple[int, int, Array]] = {}
     moving = []
     for view in views:
-        rows = [(p.timestamp, one) for p in view.points for one in p.points if one.id == marker_id]
+        rows = [(p.timestamp, point) for p in view.points for point in p.points if point.id == marker_id]
         if len(rows) < FEWEST_FRAMES:
             continue
-        seen_m = np.array([(one.x_m, one.y_m, one.z_m) for _, one in rows])
+        seen_m = np.array([(point.x_m, point.y_m, point.z_m) for _, point in rows])
         if not lies_still(seen_m):
             moving.append(view.camera)
-        times_ns = [time_ns + (one.time_offset_ns or 0) for time_ns, one in rows]
+        times_ns = [time_ns + (point.time_offset_ns or 0) for time_ns, point in rows]
         seen[view.camera] = min(times_ns), max(times_ns), seen_m.mean(axis=0)
     if moving or not seen:
         return Sight(marker_id, None, {}, tuple(moving))
-    # A camera that sees it no more since before another one did may have seen it elsewhere.
+    # The last view of a camera may end before another camera sees the marker. Then the marker may have been
+    # at another position, so this camera is left out.
     start_ns = end_ns = max(last_ns for _, last_ns, _ in seen.values())
     for first_ns, last_ns, _ in sorted(seen.values(), key=lambda one: one[1], reverse=True):
         if last_ns >= start_ns:
@@ -218,61 +221,70 @@ def look(views: Sequence[View], marker_id: int) -> Sight:
 
 
 def _measured_as(views: Iterable[View], marker_id: int, points_m: Mapping[str, Array]) -> tuple[str, ...]:
-    """The measurements of a marker made where it is now, for all cameras that can tell."""
+    """Return the ids of the measurements of a marker at its present position, by all cameras with data."""
     same: dict[str, bool] = {}
     for view in views:
-        here_m = points_m.get(view.camera)
-        for name, measured_id, there_m in view.measured:
-            if measured_id == marker_id and here_m is not None:
-                same[name] = same.get(name, True) and bool(lies_at(here_m[None], there_m)[0])
+        present_m = points_m.get(view.camera)
+        for name, measured_id, measured_m in view.measured:
+            if measured_id == marker_id and present_m is not None:
+                same[name] = same.get(name, True) and bool(lies_at(present_m[None], measured_m)[0])
     return tuple(name for name, is_same in same.items() if is_same)
 
 
 def visible_markers(views: Iterable[View], rig: Rig) -> list[int]:
-    """The rig's markers that some camera sees, sorted."""
-    found = {point.id for view in views for points in view.points for point in points.points}
-    return sorted(one for one in found if rig.knows(one))
+    """Return the ids of the rig's markers that at least one camera sees, sorted."""
+    ids = {point.id for view in views for points in view.points for point in points.points}
+    return sorted(marker_id for marker_id in ids if rig.knows(marker_id))
 
 
-# Their name in a warning.
+# The name of a model that is fitted to the rows of a sheet, in a warning.
 OTHER_ROWS = "the other rows"
-# Fits in milliseconds, and follows the points closely enough to see an error of some centimetres.
+# The fit takes milliseconds. It follows the points closely enough to show an error of some centimetres.
 _MODEL = "poly"
 
 
 def fit_neighbours(seen: Sequence[tuple[Measurement, Sight]], rig: Rig) -> Model | None:
-    """Fit a model to measurements, without those that contradict the rest.
+    """Fit a model to measurements, without the measurements that contradict the rest.
 
     Parameters
     ----------
     seen : measurements, each with the observations of its marker.
-    rig : of all of them.
+    rig : rig of all measurements.
 
     Returns
     -------
-    None if no camera saw enough of them.
+    The model; None if no camera saw enough calibration points.
     """
     pairs = _pairs(seen, rig)
     if not pairs:
         return None
     places = [Measured(measurement, rig) for measurement, _ in seen]
-    within = {pair.measurement for held in pairs.values() for pair in held}
+    paired_ids = {pair.measurement for camera_pairs in pairs.values() for pair in camera_pairs}
     try:
         suspects = find_suspects(
             leave_one_out(_MODEL, gather_places(pairs)),
-            [place for place in places if place.measurement.id in within],
+            [place for place in places if place.measurement.id in paired_ids],
         )
-        wrong = {suspect.measurement for suspect in suspects}
-        kept = {camera: [p for p in held if p.measurement not in wrong] for camera, held in pairs.items()}
+        suspect_ids = {suspect.measurement for suspect in suspects}
+        kept = {
+            camera: [p for p in camera_pairs if p.measurement not in suspect_ids]
+            for camera, camera_pairs in pairs.items()
+        }
         return fit_model(
-            _MODEL, {camera: held for camera, held in kept.items() if len(held) >= FEWEST_POINTS}, 0
+            _MODEL,
+            {
+                camera: camera_pairs
+                for camera, camera_pairs in kept.items()
+                if len(camera_pairs) >= FEWEST_POINTS
+            },
+            0,
         )
     except FitError:
         return None
 
 
 def _pairs(seen: Sequence[tuple[Measurement, Sight]], rig: Rig) -> dict[str, list[Pair]]:
-    """Pair camera points and world points, by camera; a camera with few of them is left out."""
+    """Pair camera points and world points, by camera; a camera with too few pairs is left out."""
     pairs: dict[str, list[Pair]] = {}
     for measurement, sight in seen:
         try:
@@ -282,4 +294,6 @@ def _pairs(seen: Sequence[tuple[Measurement, Sight]], rig: Rig) -> dict[str, lis
         for camera, point_m in sight.points_m.items():
             row = (measurement.id, sight.marker_id, point_m, fixed.world_m, 1, fixed.covariance_m2)
             pairs.setdefault(camera, []).append(Pair(*row))
-    return {camera: held for camera, held in pairs.items() if len(held) >= FEWEST_POINTS}
+    return {
+        camera: camera_pairs for camera, camera_pairs in pairs.items() if len(camera_pairs) >= FEWEST_POINTS
+    }

@@ -1,4 +1,4 @@
-"""A sheet of tape measurements, CSV, as it is filled in beside the floor: see docs/measuring.md."""
+"""Reader of a CSV sheet of tape measurements, which is filled in during measuring: see docs/measuring.md."""
 
 from __future__ import annotations
 
@@ -24,14 +24,17 @@ _NEEDED = ("marker", "height_cm")
 _LARGEST = 4 << 20
 _MOST_DIGITS = 10
 _NUMBER = re.compile(r"[\d.]+")
-# A time read off a watch need not lie within the stretch to the second.
+# A time read from a watch may be this far outside of the stationary interval.
 _NEAR_NS = 2 * NS_PER_S
 
 
 @dataclass(frozen=True, slots=True)
 class SheetRow:
-    """One place: the line it stands on, what is written there, and what says which stretch it is: ``place``,
-    its number in the log, or ``time_ns``; else it is the next one of its marker."""
+    """One row of a sheet: its line, its texts, and its stationary interval.
+
+    ``place`` is the number of the interval in the log, or ``time_ns`` is a time within it. Without both, it
+    is the next stationary interval of the marker.
+    """
 
     line: int
     typed: Typed
@@ -44,7 +47,8 @@ def read_sheet(path: Path, rig: Rig, start_ns: int) -> list[SheetRow]:
 
     Parameters
     ----------
-    path : of the sheet: UTF-8, cells separated by commas, or by semicolons (then with decimal commas, too).
+    path : path of the sheet: UTF-8, cells separated by commas, or by semicolons. With semicolons, decimal
+        commas are valid too.
     rig : its reference points name the columns ``d_A_cm``, ``d_B_cm`` ...
     start_ns : start of the log; a plain number as ``time`` is in seconds after it.
 
@@ -65,13 +69,13 @@ def read_sheet(path: Path, rig: Rig, start_ns: int) -> list[SheetRow]:
             if not any(cell.strip() for cell in cells):
                 continue
             if len(cells) > len(columns):
-                why = f"{len(cells)} cells, but {len(columns)} columns{_comma_advice(delimiter)}"
-                faults.append((reader.line_num, why))
+                reason = f"{len(cells)} cells, but {len(columns)} columns{_comma_advice(delimiter)}"
+                faults.append((reader.line_num, reason))
                 continue
             cell = dict(zip(columns, (text.strip() for text in cells), strict=False))
             if _NUMBER.fullmatch(cell.get("side", "")):
-                why = f"side {cell['side']!r}: write left or right{_comma_advice(delimiter)}"
-                faults.append((reader.line_num, why))
+                reason = f"side {cell['side']!r}: write left or right{_comma_advice(delimiter)}"
+                faults.append((reader.line_num, reason))
                 continue
             try:
                 rows.append(_row(reader.line_num, cell, start_ns))
@@ -80,8 +84,8 @@ def read_sheet(path: Path, rig: Rig, start_ns: int) -> list[SheetRow]:
     except csv.Error as error:
         raise IpsysError(f"{path}: line {reader.line_num}: {error}") from error
     for row in rows:
-        alone = check_entry(*read_typed(row.typed, rig), rig, None, ())
-        faults += [(row.line, name_columns(fault.text, rig)) for fault in alone.faults]
+        checked = check_entry(*read_typed(row.typed, rig), rig, None, ())
+        faults += [(row.line, name_columns(fault.text, rig)) for fault in checked.faults]
     refuse_rows(path, faults)
     if not rows:
         raise IpsysError(f"{path}: holds no measurements below its header")
@@ -89,24 +93,24 @@ def read_sheet(path: Path, rig: Rig, start_ns: int) -> list[SheetRow]:
 
 
 def _comma_advice(delimiter: str) -> str:
-    """Why a row may have come apart."""
+    """Return a hint that a decimal comma may have split a cell."""
     return "; a decimal comma? Write a point: 212.7" if delimiter == "," else ""
 
 
 def refuse_rows(
     path: Path, faults: Sequence[tuple[int, str]], doubts: Sequence[tuple[int, str]] = ()
 ) -> None:
-    """Name every bad row by its line, and each that looks wrong.
+    """Raise an error if there are bad rows or rows that look wrong.
 
     Raises
     ------
     IpsysError
-        Where there is one.
+        There is at least one such row. The text names each row by its line.
     """
     if faults or doubts:
-        named = "".join(f"\n  line {line}: {text}" for line, text in sorted([*faults, *doubts]))
+        lines = "".join(f"\n  line {line}: {text}" for line, text in sorted([*faults, *doubts]))
         insist = "" if faults else ", or write it as it is with --force"
-        raise IpsysError(f"{path}: nothing was written; correct the sheet{insist}:{named}")
+        raise IpsysError(f"{path}: nothing was written; correct the sheet{insist}:{lines}")
 
 
 def name_columns(text: str, rig: Rig) -> str:
@@ -119,14 +123,14 @@ def name_columns(text: str, rig: Rig) -> str:
     >>> name_columns("the distances to A and B look exchanged", Rig("lab", "", 0.2, reference_points=points))
     'd_A_cm and d_B_cm look exchanged'
     """
-    one = "|".join(re.escape(point.name) for point in rig.reference_points)
-    each = re.compile(rf"\b({one})\b(?=, | and |$)")
+    names_pattern = "|".join(re.escape(point.name) for point in rig.reference_points)
+    name_pattern = re.compile(rf"\b({names_pattern})\b(?=, | and |$)")
     text = re.sub(
-        rf"\bthe distances to ((?:(?:{one}), )*(?:{one}) and (?:{one}))\b",
-        lambda names: each.sub(r"d_\1_cm", names[1]),
+        rf"\bthe distances to ((?:(?:{names_pattern}), )*(?:{names_pattern}) and (?:{names_pattern}))\b",
+        lambda names: name_pattern.sub(r"d_\1_cm", names[1]),
         text,
     )
-    text = re.sub(rf"\b(?:the )?distance to ({one})\b", r"d_\1_cm", text)
+    text = re.sub(rf"\b(?:the )?distance to ({names_pattern})\b", r"d_\1_cm", text)
     text = re.sub(r"\bit lies (left|right) of the line\b", r"side: it lies \1 of the line", text)
     return re.sub(r"\b(?:the )?height(?=:|\?| reads| and)", "height_cm", text)
 
@@ -134,16 +138,16 @@ def name_columns(text: str, rig: Rig) -> str:
 def find_stops(
     rows: Sequence[SheetRow], stops: Sequence[Stop], markers: Sequence[int | None]
 ) -> Iterator[int | str]:
-    """The stretch of each row, as index of ``stops``; or in words why there is none.
+    """Yield the stationary interval of each row, as index of ``stops``, or the reason if there is none.
 
-    A row is told apart by its ``place``, else by its ``time``; else the rows of a marker must be as many as
-    the stretches in which it lies still, and are taken in this order.
+    The ``place`` of a row decides, else its ``time``. Without both, the number of such rows of a marker must
+    equal the number of its stationary intervals. Then the rows are assigned in order.
 
     Parameters
     ----------
-    rows : of the sheet.
-    stops : of the log.
-    markers : of each row, None where it is not known.
+    rows : rows of the sheet.
+    stops : stationary intervals of the log.
+    markers : marker of each row; None if it is not known.
     """
     in_order: dict[int, list[int]] = {}
     for row, marker_id in zip(rows, markers, strict=True):
@@ -200,17 +204,17 @@ def _read_lines(path: Path) -> list[str]:
 
 def _check_columns(columns: Sequence[str], rig: Rig, path: Path) -> None:
     distances = [f"d_{point.name}_cm" for point in rig.reference_points]
-    known = [*_PLAIN[:2], *distances, *_PLAIN[2:]]
+    valid = [*_PLAIN[:2], *distances, *_PLAIN[2:]]
     for name in columns:
-        if name not in known:
-            raise IpsysError(f"{path}: line 1: unknown column {name!r}; known are {', '.join(known)}")
+        if name not in valid:
+            raise IpsysError(f"{path}: line 1: unknown column {name!r}; known are {', '.join(valid)}")
         if columns.count(name) > 1:
             raise IpsysError(f"{path}: line 1: two columns have the name {name!r}")
     missing = [name for name in _NEEDED if name not in columns]
     if len(set(distances) & set(columns)) < 2:
         missing += distances[:2]
     if missing:
-        raise IpsysError(f"{path}: line 1: the column {missing[0]} is missing; known are {', '.join(known)}")
+        raise IpsysError(f"{path}: line 1: the column {missing[0]} is missing; known are {', '.join(valid)}")
 
 
 def _row(line: int, cell: dict[str, str], start_ns: int) -> SheetRow:
@@ -230,7 +234,7 @@ def _row(line: int, cell: dict[str, str], start_ns: int) -> SheetRow:
 
 
 def _time_ns(text: str, start_ns: int) -> int:
-    """Seconds from the start of the log, or a date and time; UTC where it names no zone."""
+    """Parse seconds from the start of the log, or a date and time (UTC if it has no time zone)."""
     try:
         seconds = float(text.replace(",", "."))
         if math.isfinite(seconds) and abs(seconds) < 1e9:

@@ -1,1 +1,1 @@
-"""The measuring page: a small web server for a phone beside the tape."""
+"""The measuring page: a small web server for the phone of the person who measures."""

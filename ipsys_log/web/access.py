@@ -1,4 +1,4 @@
-"""Access control of the page: by the token, an address of this machine, and the origin of the request."""
+"""Access control of the page: by the token, the address of this machine, and the origin of the request."""
 
 from __future__ import annotations
 
@@ -13,7 +13,7 @@ from starlette.types import ASGIApp, Message, Receive, Scope, Send
 
 __all__ = ["HEADER", "Guard"]
 
-# Only a script of the page itself can send this one: a browser asks before it lets another site do so.
+# Only a script of the page can send this header. Before another site sends it, the browser asks this server.
 HEADER = "x-ipsys"
 
 _HEADERS = {
@@ -26,14 +26,15 @@ _HEADERS = {
 
 
 class Guard:
-    """Refuses requests before they reach the app.
+    """A guard that refuses requests before they reach the app.
 
     Parameters
     ----------
-    app : what is guarded.
-    names : host names under which this machine is asked for, besides ``localhost`` and plain addresses. A
-        name of somebody else that was made to lead here (DNS rebinding) is refused.
-    token : that the first address has as ``?token=``, and a cookie from then on; None: none is needed.
+    app : the guarded app.
+    names : host names of this machine, besides ``localhost`` and plain IP addresses. The guard refuses other
+        names that lead to this machine (DNS rebinding).
+    token : token of the first request as ``?token=``, and of the cookie of later requests. None: no token is
+        needed.
     """
 
     def __init__(self, app: ASGIApp, names: frozenset[str], token: str | None) -> None:
@@ -61,8 +62,8 @@ class Guard:
         if not self._is_ours(host):
             return _refuse("this address is not one of this machine")
         if self._token is not None:
-            given = parse_qs(scope["query_string"].decode("latin-1")).get("token", [""])[0]
-            if scope["method"] == "GET" and scope["path"] == "/" and self._fits(given):
+            token = parse_qs(scope["query_string"].decode("latin-1")).get("token", [""])[0]
+            if scope["method"] == "GET" and scope["path"] == "/" and self._fits(token):
                 return self._welcome(scope)
             if not any(map(self._fits, self._cookies(headers, scope))):
                 return _refuse("open the page with the full address that ipsys printed")
@@ -84,7 +85,7 @@ class Guard:
         return hmac.compare_digest(given.encode(), (self._token or "").encode())
 
     def _welcome(self, scope: Scope) -> Response:
-        """Take the token out of the address line, where it would be seen, and leave it as a cookie."""
+        """Move the token from the address line, where other people could read it, to a cookie."""
         response = RedirectResponse("/", 303)
         response.set_cookie(self._name(scope), self._token or "", httponly=True, samesite="strict")
         return response
@@ -103,10 +104,13 @@ class Guard:
 
     @staticmethod
     def _name(scope: Scope) -> str:
-        """Cookies do not tell ports apart: two pages of one machine must not share one."""
+        """Return the name of the cookie, with the port.
+
+        Browsers send a cookie to all ports of a host. Two pages on one machine must not share a cookie.
+        """
         return f"ipsys_{(scope.get('server') or ('', 0))[1]}"
 
 
 def _refuse(text: str) -> Response:
-    """Answer, and close the connection: only a user of the page may keep one open."""
+    """Refuse a request and close the connection: only a user of the page may keep a connection open."""
     return PlainTextResponse(text, 403, headers={"Connection": "close"})

@@ -1,4 +1,4 @@
-"""The measuring page: its requests, one at a time, and their answers."""
+"""The app of the measuring page: it answers the requests, one at a time."""
 
 from __future__ import annotations
 
@@ -27,14 +27,14 @@ __all__ = ["build_app", "checked_json", "history_json", "scene_json", "views_jso
 
 
 def scene_json(scene: Scene) -> dict[str, Any]:
-    """What stays as it is: the lab and the places to go through."""
+    """Return the constant data of the page: the lab, and the stationary intervals of a log."""
     rig = scene.rig
-    at_m = np.array([(p.x_m, p.y_m) for p in rig.reference_points])
+    points_m = np.array([(p.x_m, p.y_m) for p in rig.reference_points])
     return {
         "lab": rig.name,
         "references": [{"name": p.name, "x_m": p.x_m, "y_m": p.y_m} for p in rig.reference_points],
         "floor": None if rig.floor is None else [rig.floor.width_m, rig.floor.depth_m],
-        "one_line": sides_alike(at_m),
+        "one_line": sides_alike(points_m),
         "stops": [
             {"marker": stop.marker_id, "seconds": (stop.end_ns - stop.start_ns) / NS_PER_S}
             for stop in scene.stops
@@ -44,7 +44,7 @@ def scene_json(scene: Scene) -> dict[str, Any]:
 
 
 def history_json(scene: Scene) -> dict[str, Any]:
-    """What was measured so far, the newest first, withdrawn ones too; and which stops that are."""
+    """Return all measurements so far, newest first, also withdrawn ones; and the measured intervals."""
     history = scene.history()
     active = active_measurements(history)
     points = {place.id: place.point_m for place in measured_places(active, scene.rig)[0]}
@@ -72,12 +72,15 @@ def _tapes(measurement: Measurement) -> str:
 
 
 def _measured(stops: Sequence[Stop], active: Sequence[Measurement]) -> list[str | None]:
-    """The measurement of each stop, None where there is none yet."""
+    """Return the id of the measurement of each stationary interval; None if it is not measured yet."""
     return [next((m.id for m in active if stop.covers(m)), None) for stop in stops]
 
 
 def views_json(scene: Scene, views: Sequence[View], marker_id: int | None) -> dict[str, Any]:
-    """What the cameras see now, and what they say of the chosen marker; of the only one if none is chosen."""
+    """Return the present views of the cameras, and the observations of the chosen marker.
+
+    Without a chosen marker, a single visible marker is chosen.
+    """
     visible = visible_markers(views, scene.rig)
     if marker_id is None and len(visible) == 1:
         marker_id = visible[0]
@@ -112,7 +115,7 @@ def _invitation(visible: Sequence[int]) -> str:
 
 
 def checked_json(checked: Checked) -> dict[str, Any]:
-    """What follows from what was typed."""
+    """Return the result of the check of an entry."""
     point = None if checked.point_m is None else checked.point_m.tolist()
     return {
         "id": checked.id,
@@ -123,8 +126,12 @@ def checked_json(checked: Checked) -> dict[str, Any]:
         "residuals": [{"name": name, "cm": off_m * CM_PER_M} for name, off_m in checked.residuals_m],
         "on_floor": checked.on_floor,
         "predictions": [
-            {"camera": one.camera, "point_m": one.world_m.tolist(), "cm": one.off_m * CM_PER_M}
-            for one in checked.predictions
+            {
+                "camera": prediction.camera,
+                "point_m": prediction.world_m.tolist(),
+                "cm": prediction.off_m * CM_PER_M,
+            }
+            for prediction in checked.predictions
         ],
         "sides": [{"side": side, "point_m": place_m.tolist()} for side, place_m in checked.sides_m],
         "ready": checked.measurement is not None,
@@ -138,7 +145,7 @@ _FILES = {
 }
 _LARGEST = 16 << 10
 _MOST_DIGITS = 20
-# Pictures that were named to a page and may still be asked for.
+# Number of images that are kept for later requests, after the page got their addresses.
 _KEPT = 30
 
 
@@ -147,7 +154,7 @@ def build_app(scene: Scene) -> Starlette:
     questions = _Questions(scene)
     return Starlette(
         routes=[
-            *(Route(path, _file(*found)) for path, found in _FILES.items()),
+            *(Route(path, _file(*names)) for path, names in _FILES.items()),
             Route("/picture/{camera}/{time_ns}", questions.picture),
             Route("/api/scene", questions.scene),
             Route("/api/views", questions.views),
@@ -173,7 +180,7 @@ async def _refused(_: Request, error: Exception) -> Response:
 
 
 async def _gone(_: Request, __: Exception) -> Response:
-    return Response(status_code=400)  # the client has gone
+    return Response(status_code=400)  # the client has disconnected
 
 
 async def _failed(_: Request, error: Exception) -> Response:
@@ -182,7 +189,10 @@ async def _failed(_: Request, error: Exception) -> Response:
 
 
 class _Questions:
-    """Asynchronous, but never waiting in between: one question is answered after the other."""
+    """The handlers of the requests.
+
+    They are asynchronous, but wait only for the body of a request. So they answer one request at a time.
+    """
 
     def __init__(self, scene: Scene) -> None:
         self._scene = scene
@@ -203,17 +213,17 @@ class _Questions:
 
     async def picture(self, request: Request) -> Response:
         time_ns = _whole_number(request.path_params["time_ns"])
-        found = None if time_ns is None else self._pictures.get((request.path_params["camera"], time_ns))
-        if found is None:
+        jpeg = None if time_ns is None else self._pictures.get((request.path_params["camera"], time_ns))
+        if jpeg is None:
             return Response(status_code=404)
-        # Its address names one picture for good.
-        return Response(found, media_type="image/jpeg", headers={"Cache-Control": "private, max-age=60"})
+        # The address always means the same image.
+        return Response(jpeg, media_type="image/jpeg", headers={"Cache-Control": "private, max-age=60"})
 
     async def check(self, request: Request) -> Response:
         return JSONResponse(checked_json(self._checked(await _body(request))))
 
     async def measure(self, request: Request) -> Response:
-        """Append the place, if nothing speaks against it but what the user has seen and accepted."""
+        """Append the measurement if it has no faults, and the user has accepted all its warnings."""
         body = await _body(request)
         checked = self._checked(body)
         accepted = body.get("accepted", [])
@@ -262,7 +272,7 @@ async def _body(request: Request) -> dict[str, Any]:
             raise IpsysError("that is more than a place needs")
     try:
         body = json.loads(data)
-        json.dumps(body, ensure_ascii=False).encode()  # half of a surrogate pair cannot be sent
+        json.dumps(body, ensure_ascii=False).encode()  # raises for half of a surrogate pair
     except (ValueError, RecursionError) as error:
         raise IpsysError("this is not JSON") from error
     if not isinstance(body, dict):

@@ -1,10 +1,10 @@
-// What each camera sees: the marker close up, or, after a tap, whole pictures.
+// The view of each camera: the marker close up or, after a tap, the whole image.
 import { element, make } from "./make.js";
 
 let shown = { cameras: [] };
 
-// The tiles stay what they are while pictures come: a tap, or the focus, is on one of them. They are there
-// before the first picture, so that nothing below them moves away under a finger.
+// New images do not replace the tiles, because a tile may have a tap or the focus. The tiles exist before the
+// first image, so that the elements below them do not move while the user taps.
 export async function drawCameras(where, view) {
   const names = view.cameras.map((camera) => camera.name).join(" ");
   if (where.dataset.names !== names) {
@@ -16,11 +16,11 @@ export async function drawCameras(where, view) {
   view.cameras.forEach((camera, n) => fill(where.children[n], camera, view, where.classList.contains("whole")));
 }
 
-// So that a tile changes from one picture to the next without a blank between them.
+// Decode an image before it is shown, so that a tile is not blank between two images.
 async function load(source) {
   const picture = new Image();
   picture.src = source;
-  try { await picture.decode(); } catch { /* its place stays dark */ }
+  try { await picture.decode(); } catch { /* the tile stays dark */ }
 }
 
 function tile(where) {
@@ -39,7 +39,7 @@ function fill(made, camera, view, whole) {
   const [width, height] = camera.size_px ?? [16, 9];
   const close = chosen && !whole;
   svg.setAttribute("class", view.state);
-  // Before one is chosen there is no "it".
+  // Without a chosen marker, the text names the ids.
   const ids = view.marker === null ? camera.markers.map((one) => one.id).filter((id) => view.visible.includes(id)) : [];
   const what = view.marker !== null ? (sees ? "sees it" : "no") : ids.length ? `sees ${ids.join(", ")}` : "sees none";
   svg.setAttribute("aria-label", `Camera ${camera.name} ${view.marker === null ? what : sees ? `sees marker ${view.marker}` : "does not see it"}`);
@@ -56,7 +56,7 @@ function fill(made, camera, view, whole) {
   name.style.borderColor = camera.colour;
 }
 
-// A square about the marker, five times as wide, within the picture as far as it goes.
+// Return the view box of a square around the marker: five times its size, and inside of the image.
 function closeUp(corners, width, height) {
   const xs = corners.map((c) => c[0]), ys = corners.map((c) => c[1]);
   const size = Math.min(5 * Math.max(Math.max(...xs) - Math.min(...xs), Math.max(...ys) - Math.min(...ys), 8), width, height);

@@ -1,4 +1,4 @@
-"""Connections to the page: limited in number and time, so that a recorder keeps its descriptors."""
+"""Connections to the page, limited in number and time, so that a recorder keeps its file descriptors."""
 
 from __future__ import annotations
 
@@ -14,24 +14,24 @@ from uvicorn.server import ServerState
 
 __all__ = ["Connections", "Limits", "derive_limits"]
 
-# Cameras, the log and libraries of a recorder need the other descriptors.
+# The page gets one of this many descriptors. Cameras, the log and libraries of a recorder need the others.
 _SHARE_OF_DESCRIPTORS = 8
 _MIN_TOTAL, _MAX_TOTAL = 12, 64
-# A browser opens up to six.
+# A browser opens up to six connections.
 _MIN_PER_ADDRESS = 8
 _REQUEST_TIMEOUT_S = 20.0
-# A flood of connections leaves the processor to the recorder: 500 are taken in a second.
+# At most 500 connections are accepted per second, so that many of them do not slow down the recorder.
 _PAUSE_S = 0.002
 _RETRY_S = 0.2
 
 
 class Limits(NamedTuple):
-    """Limits of open connections.
+    """The limits of open connections.
 
     Attributes
     ----------
-    total, per_address : open at the same time.
-    request_s : from the opening, or the last answer, to the end of the next answer.
+    total, per_address : most connections that are open at the same time.
+    request_s : longest time from the opening, or the last answer, to the end of the next answer.
     """
 
     total: int
@@ -40,7 +40,7 @@ class Limits(NamedTuple):
 
 
 def derive_limits() -> Limits:
-    """Return the limits that leave most of this process's descriptors to the recorder."""
+    """Return the limits that leave most file descriptors of this process to the recorder."""
     soft, _ = resource.getrlimit(resource.RLIMIT_NOFILE)
     share = _MAX_TOTAL if soft == resource.RLIM_INFINITY else soft // _SHARE_OF_DESCRIPTORS
     total = min(max(share, _MIN_TOTAL), _MAX_TOTAL)
@@ -48,10 +48,10 @@ def derive_limits() -> Limits:
 
 
 class Connections:
-    """Open connections of the page.
+    """The open connections of the page.
 
     The guard closes a connection when it refuses a request. So an open connection with an answer belongs to
-    a user of the page. Only connections without an answer make room for new ones, the oldest first.
+    a user of the page. To make room, only connections without an answer are closed, the oldest first.
     """
 
     def __init__(self, limits: Limits, config: Config, state: ServerState) -> None:
@@ -59,12 +59,12 @@ class Connections:
         self._addresses: dict[_Connection, str] = {}  # the oldest first
 
     async def accept(self, listening: socket.socket) -> None:
-        """Accept connections until this task is cancelled. ``listening`` must not block."""
+        """Accept connections until this task is cancelled; ``listening`` must not block."""
         loop = asyncio.get_running_loop()
         while True:
             try:
                 peer, _ = await loop.sock_accept(listening)
-            except OSError:  # no descriptor is left, or the client has gone already
+            except OSError:  # no file descriptor is free, or the client has disconnected already
                 await asyncio.sleep(_RETRY_S)
                 continue
             try:
@@ -81,28 +81,28 @@ class Connections:
     def add(self, connection: _Connection, address: str) -> None:
         """Add a new connection, and close another one to make room if necessary."""
         self._addresses[connection] = address
-        neighbours = [other for other, its in self._addresses.items() if its == address]
+        neighbours = [other for other, other_address in self._addresses.items() if other_address == address]
         if len(neighbours) > self._limits.per_address:
             self._close_oldest(neighbours)
         elif len(self._addresses) > self._limits.total:
             self._close_oldest(self._addresses)
 
     def remove(self, connection: _Connection) -> None:
-        """Forget a connection that was closed."""
+        """Remove a closed connection from the list."""
         self._addresses.pop(connection, None)
 
     def _connection(self) -> _Connection:
         return _Connection(self, self._limits.request_s, self._config, self._state)
 
     def _close_oldest(self, connections: Iterable[_Connection]) -> None:
-        # The new connection has no answer yet: if all others have one, it is closed itself.
+        # The new connection has no answer yet. If all others have an answer, the new connection is closed.
         oldest = next(connection for connection in connections if not connection.is_answered)
         self.remove(oldest)
         oldest.abort()
 
 
 class _Connection(H11Protocol):
-    """A connection; aborted when an answer takes too long, because of either side."""
+    """A connection; it is aborted if an answer takes too long, because of the server or the client."""
 
     def __init__(self, owner: Connections, request_s: float, config: Config, state: ServerState) -> None:
         super().__init__(config, state, {})

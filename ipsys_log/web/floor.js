@@ -1,9 +1,9 @@
-// The floor from above, x to the right and y away: 100 units to a metre.
+// The floor from above, x to the right and y up; 100 units are one metre.
 import { element } from "./make.js";
 
 const UNITS = 100, PAD = 30;
 
-// lab: references, floor; found: what the check says; done: points measured so far; choose(side).
+// lab: references, floor; found: result of the check; done: points measured so far; choose(side): callback.
 export function drawFloor(svg, lab, found, done, colours, choose) {
   const [width, depth, x0, y0] = extent(lab);
   const at = ([x, y]) => [(x - x0) * UNITS, (depth + y0 - y) * UNITS];
@@ -55,7 +55,7 @@ export function drawFloor(svg, lab, found, done, colours, choose) {
   svg.replaceChildren(...parts);
 }
 
-// Width and depth in m, and the corner: the floor, or what the tapes can reach about the reference points.
+// Return width and depth in m, and the corner: of the floor, or of the area around the reference points.
 function extent(lab) {
   if (lab.floor) return [...lab.floor, 0, 0];
   const reach = 3;

@@ -1,4 +1,4 @@
-// The measuring page. It draws and asks; what is right is decided by the server alone.
+// The measuring page. It shows data and sends requests. Only the server checks the data.
 import { drawCameras } from "./cameras.js";
 import { drawFloor } from "./floor.js";
 import { make } from "./make.js";
@@ -26,12 +26,12 @@ async function ask(path, body) {
   return { ...content, refused: answer.status === 409 };
 }
 
-// What could not be written may be so because somebody else has written: what is known is asked for anew.
+// A write may fail because another program has written to the log. Then the page reads the history again.
 async function write(path, body) {
   try {
     return await ask(path, body);
   } catch (error) {
-    try { ({ history } = await ask("scene")); refresh(); } catch { /* the first error says it */ }
+    try { ({ history } = await ask("scene")); refresh(); } catch { /* only the first error is shown */ }
     throw error;
   }
 }
@@ -48,7 +48,7 @@ const guarded = (work) => async (...given) => {
   try { await work(...given); } catch (error) { tell(error.message, true); }
 };
 
-// --- what is typed ----------------------------------------------------------------------------
+// --- entry ------------------------------------------------------------------------------------
 
 const inputs = () => lab.references.map((r) => $(`d-${r.name}`));
 const side = () => document.querySelector("[name=side]:checked")?.value ?? "";
@@ -71,7 +71,7 @@ function buildFields() {
   offerSides([]);
 }
 
-// Where the reference points are on one line, or only two of them were measured from.
+// Show the choice of the side if the reference points are on one line, or only two distances are given.
 function offerSides(faults) {
   const given = lab.references.map((r) => r.name).filter((name) => $(`d-${name}`).value);
   const [from, to] = given.length > 1 ? given : lab.references.map((r) => r.name);
@@ -85,7 +85,7 @@ function clear() {
   for (const radio of document.querySelectorAll("[name=side]")) radio.checked = false;
 }
 
-// --- the check, at once while typing ----------------------------------------------------------
+// --- check while typing -----------------------------------------------------------------------
 
 function soon() {
   clearTimeout(timer);
@@ -107,7 +107,7 @@ function show(answer) {
   for (const [name, text] of Object.entries(now.distances)) tapes[name] = parseFloat(text.replace(",", ".")) / 100;
   found = { ...answer, tapes };
   offerSides(answer.faults);
-  // What is only missing yet is no fault.
+  // A missing value is no fault.
   const empty = (field) =>
     field === "marker" ? !now.marker : field === "side" ? !now.side
       : field === "height" ? !now.height : field.startsWith("d_") && !now.distances[field.slice(2)];
@@ -126,7 +126,7 @@ function show(answer) {
     ...answer.warnings.map((text) => make("p", { className: "warn" }, upper(text))),
   );
   const save = $("save"), doubtful = answer.warnings.length > 0;
-  // The verdict may be out of sight: the bar says in short what is saved, or what speaks against it.
+  // The verdict may be scrolled out of view. The bar shows a short form: the point to save, or the objections.
   const against = [...rest.map((fault) => fault.text), ...answer.warnings].map(upper);
   $("bar").className = rest.length ? "bad" : doubtful ? "warn" : "";
   $("short").replaceChildren(...against.map((text) => make("span", {}, text)));
@@ -183,7 +183,7 @@ function draw() {
     ? `Floor map: the place is at x ${found.point_m[0].toFixed(2)}, y ${found.point_m[1].toFixed(2)} m` : "Floor map");
 }
 
-// --- what the cameras see ---------------------------------------------------------------------
+// --- views of the cameras ---------------------------------------------------------------------
 
 async function look() {
   const query = new URLSearchParams(stop === null ? { marker: $("marker").value } : { stop, marker: lab.stops[stop].marker });
@@ -206,7 +206,7 @@ function offerMarkers() {
   $("marker").value = chosen;
 }
 
-// --- places -----------------------------------------------------------------------------------
+// --- calibration points -----------------------------------------------------------------------
 
 async function go(to) {
   stop = Math.min(Math.max(to, 0), lab.stops.length - 1);
@@ -276,7 +276,7 @@ const save = guarded(async () => {
   if (stop !== null) await go(nextOpen());
 });
 
-// --- begin ------------------------------------------------------------------------------------
+// --- start ------------------------------------------------------------------------------------
 
 async function watch() {
   try { await look(); } catch (error) { $("sight").textContent = error.message; $("sight").className = "chip"; }

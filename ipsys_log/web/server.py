@@ -1,4 +1,4 @@
-"""The server of the measuring page in a separate thread, and its faults."""
+"""The server of the measuring page in a separate thread, and its unexpected exceptions."""
 
 from __future__ import annotations
 
@@ -28,7 +28,7 @@ __all__ = ["Faults", "Served", "check_free", "qr_code", "serving"]
 
 
 class Faults:
-    """Unexpected exceptions in the server's thread: their number, and the first one's traceback."""
+    """The unexpected exceptions in the server's thread: their number, and the first traceback."""
 
     def __init__(self) -> None:
         self.count = 0
@@ -42,7 +42,7 @@ class Faults:
         self.first = self.first or "".join(traceback.format_exception(error)).rstrip()
 
     def watch_loop(self, loop: asyncio.AbstractEventLoop) -> None:
-        """Count exceptions that nothing else in an event loop handles."""
+        """Count exceptions of an event loop that no other code handles."""
 
         def handle(_: asyncio.AbstractEventLoop, context: dict[str, Any]) -> None:
             self.add(context.get("exception") or RuntimeError(str(context.get("message"))))
@@ -67,7 +67,7 @@ _TURN_S = 0.1
 _BACKLOG = 128
 # A browser also sends cookies of other programs on this machine, up to 4 kB each.
 _MAX_HEADER_BYTES = 64 << 10
-# The screen belongs to a recording: Faults keeps the messages of the server.
+# The server prints nothing, because the recorder uses the terminal. Faults stores the exceptions.
 _SILENT: dict[str, Any] = {
     "version": 1,
     "disable_existing_loggers": False,
@@ -78,7 +78,7 @@ _SILENT: dict[str, Any] = {
 
 @dataclass(frozen=True, slots=True)
 class Served:
-    """A page that is served: its address, with the token where one is needed."""
+    """A running server of the page: its address (with the token if needed), its thread and its exceptions."""
 
     url: str
     thread: Thread
@@ -94,18 +94,19 @@ class Served:
 def serving(
     scene: Scene, host: str | None = None, port: int = 8000, limits: Limits | None = None
 ) -> Iterator[Served]:
-    """Serve the page of a scene until the with-block is left.
+    """Serve the page of a scene until the end of the with-block.
 
     Parameters
     ----------
-    host : the address to listen on; None: only this machine, without a token.
-    port : 0 takes any free port.
-    limits : of connections; None: as many as a recorder can spare.
+    scene : a finished log or live cameras.
+    host : address to listen on. None: the page is only for this machine, and needs no token.
+    port : port to listen on; 0 means any free port.
+    limits : limits of connections. None: the limits of :func:`derive_limits`.
 
     Raises
     ------
     IpsysError
-        The port is taken or not allowed, the host is not of this machine, or the server does not start.
+        The port is in use or not allowed, the host is not this machine, or the server does not start.
     """
     token = None if host is None else secrets.token_urlsafe(12)
     with _listen(host or _LOOPBACK, port) as listening:
@@ -133,7 +134,7 @@ def serving(
 
 
 def _run(server: uvicorn.Server, listening: socket.socket, limits: Limits, faults: Faults) -> None:
-    """Serve until ``server.should_exit``. A fault ends only this thread."""
+    """Serve until ``server.should_exit`` is true; an exception ends only this thread."""
     try:
         asyncio.run(_serve(server, listening, limits, faults))
     except Exception as error:
@@ -155,12 +156,12 @@ async def _serve(server: uvicorn.Server, listening: socket.socket, limits: Limit
 
 
 def check_free(host: str | None, port: int) -> None:
-    """See that a page can be served there.
+    """Check that a page can be served at an address and a port.
 
     Raises
     ------
     IpsysError
-        As :func:`serving`.
+        The errors of :func:`serving`.
     """
     _listen(host or _LOOPBACK, port).close()
 
@@ -194,17 +195,17 @@ def _url(host: str | None, port: int, token: str | None) -> str:
 
 
 def _address() -> str:
-    """The address of this machine in its network: the one that it would send from. Nothing is sent."""
+    """Return the address that this machine sends from in its network; the probe sends no data."""
     with socket.socket(socket.AF_INET, socket.SOCK_DGRAM) as probe:
         try:
-            probe.connect(("192.0.2.1", 9))  # RFC 5737: an address for examples
+            probe.connect(("192.0.2.1", 9))  # RFC 5737: an address reserved for documentation
             return str(probe.getsockname()[0])
         except OSError:
             return socket.gethostname()
 
 
 def qr_code(text: str) -> str:
-    """A QR code in half blocks, to be shown light on dark or dark on light alike."""
+    """Return a QR code as text of half blocks, readable as light on dark and as dark on light."""
     modules = cv2.QRCodeEncoder.create().encode(text) == 0
     if len(modules) % 2:
         modules = cv2.copyMakeBorder(modules.astype("uint8"), 0, 1, 0, 0, cv2.BORDER_CONSTANT, value=0) == 1

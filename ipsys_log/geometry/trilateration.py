@@ -258,8 +258,8 @@ def _least_squares(
     first = np.unique(references_m, axis=0, return_index=True)[1][:_STARTS]
     solutions = []
     for i, j in combinations(first.tolist(), 2):
-        circles = references_m[i], references_m[j], float(distances_m[i]), float(distances_m[j])
-        starts_m = [meeting_point(*circles, start_side) for start_side in SIDES]
+        two_circles = references_m[i], references_m[j], float(distances_m[i]), float(distances_m[j])
+        starts_m = [meeting_point(*two_circles, start_side) for start_side in SIDES]
         solutions += [_descend(start_m, references_m, distances_m, weights) for start_m in starts_m]
     likely = min(cost for cost, _ in solutions) + _ALIKE
     on_side = [

@@ -151,8 +151,8 @@ def lies_still(points_m: Array) -> bool:
     if near.mean() < _SHARE_NEAR:
         return False
     points_m = points_m[near]
-    # The drift is that across the view. The noise of a depth moves a point along its ray, and so also sideways
-    # if the ray is slanted.
+    # The drift is measured across the view. The noise of a depth moves a point along its ray, and so also
+    # sideways if the ray is slanted.
     rays = points_m[:, :2] / points_m[:, 2:]
     half = len(rays) // 2
     drift_m = (rays[-half:].mean(axis=0) - rays[:half].mean(axis=0)) * points_m[:, 2].mean()

@@ -77,7 +77,7 @@ class Alignment:
 
     @property
     def turns_rad(self) -> tuple[float, float]:
-        """Return the rotations that level the camera: to the right of its image, and then to its bottom."""
+        """Return the rotations that level a camera, in rad: to the right of its image, then to its bottom."""
         x, y, z = (0.0, 0.0, 1.0) if self.down is None else self.down.tolist()
         return math.atan2(x, z), math.asin(y)
 
@@ -120,8 +120,8 @@ def align_camera(camera: str, lying: Sequence[Lying]) -> Alignment:
     ----------
     camera : its name.
     lying : markers from :func:`ipsys_log.analysis.stationary.find_lying`, from camera points by
-        ``--method pose``. Camera points by eq. (3) give a tilt that is too large by half: at (u, v), a tilt t
-        increases Zc by a factor of about 1 + t u, and also reduces the marker's perimeter by 1 - t u / 2.
+        ``--method pose``. Camera points by eq. (3) give a tilt that is too large by half. At (u, v), a tilt t
+        increases Zc by a factor of about 1 + t u. It also reduces the marker's perimeter by 1 - t u / 2.
 
     References
     ----------

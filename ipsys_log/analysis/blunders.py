@@ -39,16 +39,16 @@ def possible_slips(measurement: Measurement, rig: Rig, predicted_m: Array) -> li
 
     Parameters
     ----------
-    measurement : measurement of a suspect world point. Without tape distances, the function computes the
-        distances from its world point to the first two reference points.
+    measurement : measurement of an outlier. Without tape distances, the function computes the distances from
+        its world point to the first two reference points.
     rig : the rig that was valid at the measurement.
     predicted_m : (3,), predicted world point from all other measurements.
 
     Returns
     -------
-    Groups of blunders; all blunders of a group are equally simple. The first group contains a wrong side and
-    two exchanged distances; the second group both at once; the third group one wrong distance or height, with
-    the correction that fits the prediction best.
+    Groups of blunders; all blunders of a group are equally simple. The first group contains a wrong side, and
+    two exchanged distances. The second group contains both at once. The third group contains one wrong
+    distance or height, with the correction that fits the prediction best.
 
     Examples
     --------

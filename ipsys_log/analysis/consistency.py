@@ -1,4 +1,4 @@
-"""Usual errors of predictions by place and direction: the unit for the detection of outliers."""
+"""Usual errors of predictions by position and direction: the unit for the detection of outliers."""
 
 from __future__ import annotations
 

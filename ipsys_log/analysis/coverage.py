@@ -27,7 +27,7 @@ _STEP_M, _MOST = 0.01, 800
 _GRAZED = 5.0
 # Margin of the tested area around the foot points of cameras, without a known floor.
 _AROUND_M = 2.0
-# Smaller areas are not reported: the positions of cameras, by tape, are not accurate enough.
+# Smaller areas (less than a hand) are not reported: camera positions by tape are not accurate enough.
 _LEAST_M2 = 0.01
 
 

@@ -1,4 +1,4 @@
-"""Differences between two runs, or between a run and its repetition, message by message."""
+"""Differences between two runs, or between a run and a repetition of its stage, message by message."""
 
 from __future__ import annotations
 

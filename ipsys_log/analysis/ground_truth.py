@@ -56,8 +56,8 @@ def track_errors(
 ) -> tuple[ErrorStatistics, ErrorStatistics] | None:
     """Return the 3D errors and the floor errors of tracks against the ground truth at the same instants.
 
-    Between two instants of the ground truth, up to 0.1 s apart, the true position is interpolated linearly,
-    because a rolling shutter exposes a marker some time after the frame's instant.
+    A rolling shutter exposes a marker some time after the frame's instant. The true position between two
+    instants of the ground truth, up to 0.1 s apart, is therefore interpolated linearly.
 
     Parameters
     ----------

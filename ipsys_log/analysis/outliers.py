@@ -62,8 +62,8 @@ def find_suspects(leave_one_out: LeaveOneOut, places: Sequence[Measured]) -> tup
 
     Parameters
     ----------
-    leave_one_out : function of ids that no fit may use. For each camera and each point that it saw, including
-        those ids, it returns the world point (3,) in m of a model that is fitted without this point.
+    leave_one_out : function of ids that no fit may use. It returns, by camera and by point that the camera
+        saw, the world point (3,) in m of a model without this point. Points with those ids are included.
     places : the valid measurements. Measurements that no camera saw are skipped, and also cameras that saw
         fewer than 15 of them.
 

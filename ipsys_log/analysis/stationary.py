@@ -129,7 +129,7 @@ _DRIFT_M, _DRIFT_OF_ONE_M = 0.002, 0.004
 # A slow motion can look stationary for a shorter time. A shorter interval is valid only if the marker is not
 # visible before and after.
 _SHORTEST_NS = NS_PER_S
-# Least share of sightings near the median: single frames with an occlusion do not end an interval.
+# Least share of sightings near the median: single frames with a passing object do not end an interval.
 _SHARE_NEAR = 0.95
 # One sighting does not show if a marker is stationary.
 FEWEST_FRAMES = 2
@@ -160,7 +160,7 @@ def lies_still(points_m: Array) -> bool:
 
 
 def lies_at(points_m: Array, place_m: Array) -> NDArray[np.bool_]:
-    """Return a mask (n,) of the camera points (n, 3) that are at a place (3,), within their noise."""
+    """Return a mask (n,) of the camera points (n, 3) that are at a position (3,), within their noise."""
     across_m = (points_m[:, :2] / points_m[:, 2:] - place_m[:2] / place_m[2]) * place_m[2]
     along_m = np.abs(points_m[:, 2] - place_m[2])
     near: NDArray[np.bool_] = (np.hypot(across_m[:, 0], across_m[:, 1]) <= _ACROSS_M) & (along_m <= _ALONG_M)
@@ -217,7 +217,7 @@ def _between(sightings: Sightings, start_ns: int, end_ns: int) -> Array:
 
 
 def _joined(sightings: Sightings) -> list[tuple[int, int]]:
-    """Return the stationary intervals of one camera; join consecutive intervals at the same place."""
+    """Return the stationary intervals of one camera; join consecutive intervals at the same position."""
     intervals: list[tuple[int, int]] = []
     for start_ns, end_ns in _camera_stretches(sightings):
         both = (intervals[-1][0], end_ns) if intervals else (start_ns, end_ns)

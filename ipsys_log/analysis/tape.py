@@ -98,22 +98,22 @@ def world_point(measurement: Measurement, rig: Rig) -> TapePoint:
     >>> np.sqrt(found.covariance_m2.diagonal()).round(6).tolist()
     [0.003, 0.004, 0.001]
     """
-    where = f"measurement {measurement.id}"
+    context = f"measurement {measurement.id}"
     entered = measurement.point
     if entered is None:
-        return _solved(measurement, rig, where)
+        return _solved(measurement, rig, context)
     world_m = np.array([entered.x_m, entered.y_m, entered.z_m])
-    _check_point(world_m, where)
-    _check_lengths(measurement, where)
+    _check_point(world_m, context)
+    _check_lengths(measurement, context)
     known = {point.name for point in rig.reference_points}
     if not measurement.distances or any(d.reference not in known for d in measurement.distances):
         return TapePoint(world_m, None, np.zeros(0))
     references_m = reference_points(measurement, rig)
     ranges_m = np.linalg.norm(world_m[:2] - references_m, axis=1)
-    sigmas_m = _tape_sigmas(measurement, rig, where)
+    sigmas_m = _tape_sigmas(measurement, rig, context)
     floor_m2 = None if sigmas_m is None else tape_covariance(world_m[:2], references_m, sigmas_m)
     residuals_m = np.array([d.distance_m for d in measurement.distances]) - ranges_m
-    return TapePoint(world_m, _with_height(floor_m2, measurement, where), residuals_m)
+    return TapePoint(world_m, _with_height(floor_m2, measurement, context), residuals_m)
 
 
 def reference_points(measurement: Measurement, rig: Rig) -> Array:

@@ -74,7 +74,7 @@ def pixel_slopes(uv: Array, lens: CameraCalibration) -> Array:
 def whiten(covariances_px2: Array) -> Array:
     """Return matrices that turn a marker's corners into eight independent numbers of variance 1.
 
-    A pose that is fitted to an image gives corners with a covariance of rank 6: the fit removes the noise in
+    A pose that is fitted to an image gives corners with a covariance of rank 6. The fit removes the noise in
     the other two of their eight directions. These two directions distinguish one pose from another. Their
     weight must therefore not be zero, and not that of a measurement without noise. Before the fit, they had
     the same noise as the others. They get the mean variance of the others.
@@ -124,7 +124,7 @@ def camera_point(corners_uv: Array, length_m: float | Array) -> Array:
     References
     ----------
     Ou et al., Robotica 2023, eq. (3), (4) and (5). In the printed (4) and (5), a factor 1/4 is
-    missing in the middle: Xc0 is the mean of the corners' Xc.
+    missing in the middle of the equation: Xc0 is the mean of the corners' Xc.
 
     Examples
     --------

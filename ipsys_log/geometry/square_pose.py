@@ -55,7 +55,8 @@ def solve_squares(uv: Array, lengths_m: Array) -> tuple[Array, Array]:
     both = np.empty((len(uv), 2, 3, 3))
     both[:, :, :2, :2] = flat[:, None]
     both[..., 2, 2] = (det / per_m2)[:, None]
-    # The third column is the cross product of the first two. Its sign, except for its depth, follows theirs.
+    # The third column is the cross product of the first two. Its x and y have the sign of their depths. Its own
+    # depth is the same for both signs.
     normal = flat[:, ::-1, 0] * depths[:, 1:] - flat[:, ::-1, 1] * depths[:, :1]
     normal[:, 1] *= -1
     for pose, sign in enumerate((1, -1)):
@@ -245,8 +246,8 @@ def _choose(better: NDArray[np.bool_], tried: _Fit, now: _Fit) -> _Fit:
 def _look(seen: _Seen, rotations: Array, centres_m: Array) -> _Fit:
     """Return poses with their whitened residuals (n, 2, 8) and the slopes of the residuals, (n, 2, 8, 6).
 
-    The six parameters are a rotation of the marker about its centre, in rad about the camera's axes, and a
-    translation of its centre, in units of its distance z.
+    The first three parameters are a rotation of the marker about its centre, in rad about the camera's axes.
+    The other three are a translation of its centre, in units of its distance z.
     """
     arms_m = seen.corners_m @ rotations.swapaxes(-1, -2)
     points_m = arms_m + centres_m[..., None, :]

@@ -132,8 +132,8 @@ def multilaterate(
     Raises
     ------
     IpsysError
-        Two circles do not meet; the side is required and missing; all reference points are the same point; or
-        a distance or sigma is not a positive number.
+        Two circles do not meet, or the required side is missing. Or all reference points are the same point,
+        or a distance or sigma is not a positive number.
 
     References
     ----------

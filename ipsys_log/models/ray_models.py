@@ -1,4 +1,4 @@
-"""Models on rays: ``raydepth`` corrects the depth, ``rayplane`` uses the known height of a marker."""
+"""Models on rays: ``RayDepth`` corrects the depth, ``RayPlane`` uses the known height of a marker."""
 
 from __future__ import annotations
 

@@ -57,8 +57,8 @@ class Places:
 def directions(points_m: Array, lens: Array) -> Array:
     """Return directions (u', v', 1) in camera coordinates, (n, 3), from camera points (n, 3).
 
-    The lens correction of u = Xc / Zc, v = Yc / Zc has the first radial and the two tangential terms of
-    Brown and Conrady, ``lens`` = (k1, p1, p2).
+    The lens correction ``lens`` = (k1, p1, p2) of u = Xc / Zc, v = Yc / Zc has the first radial and the two
+    tangential terms of Brown and Conrady.
 
     Examples
     --------

@@ -1,9 +1,10 @@
 """Uncertainty of a position: its covariance, and the volume of the calibration points.
 
-A position's error has two parts. The first part is the noise of the camera point: along the view, it is
-relative to the depth; across the view, it is an error of the direction. The model transforms this noise to
-the world. The second part is the uncertainty of the model. It depends on the number of calibration points and
-on the error of the tape. It is small between the calibration points, and grows towards their edge and beyond.
+A position's error has two parts. The first part is the noise of the camera point. Along the view, this noise
+is proportional to the depth. Across the view, it is an error of the direction. The model transforms this
+noise to the world. The second part is the uncertainty of the model. It depends on the number of calibration
+points and on the error of the tape. It is small between the calibration points, and grows towards their edge
+and outside.
 """
 
 from __future__ import annotations

@@ -22,7 +22,7 @@ class _Kind(NamedTuple):
 
 
 _LENGTHS = (("cm", 0.01), ("mm", 0.001))
-# By the key in the rig file. A value outside the range is in another unit. A row time of 0 is also valid.
+# By the key in the rig file. A value outside the range has another unit. A row time of 0 is also valid.
 _KINDS = {
     "marker_length_m": _Kind("m", 0.002, 2.0, _LENGTHS),
     "length_m": _Kind("m", 0.002, 2.0, _LENGTHS),

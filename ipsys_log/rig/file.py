@@ -218,8 +218,8 @@ def check_rig(rig: Rig, where: str) -> Rig:
     Raises
     ------
     IpsysError
-        Two cameras, markers or reference points have the same name; two reference points have the same
-        position; a name is not valid; a length or sigma is not positive; or a height is impossible.
+        Two cameras, markers or reference points have the same name, or two reference points have the same
+        position. Or a name is not valid, a length or sigma is not positive, or a height is impossible.
     """
     for camera in rig.cameras:
         check_name(camera.name, f"{where}: camera name")

@@ -1,4 +1,4 @@
-"""Simulated calibration points: places of the markers, and readings of tape and ruler."""
+"""Simulated calibration points: poses of the markers, and readings of tape and ruler."""
 
 from __future__ import annotations
 
@@ -32,14 +32,14 @@ Array = NDArray[np.float64]
 
 REFERENCES = (ReferencePoint("A", 1.2192, 2.4384), ReferencePoint("B", 3.6576, 2.4384))
 _DRAWS = 4000
-# Number of candidates of a place. The selected candidate is the one farthest from all earlier places.
+# Number of candidates of a pose. The selected candidate is the one farthest from all earlier poses.
 _CANDIDATES = 4
 _TEST_SHARE = 0.2
 
 
 @dataclass(frozen=True, slots=True)
 class Place:
-    """A marker on the floor, facing up: its centre in world m, its heading in rad."""
+    """The pose of a marker that faces up: its centre in world m, and its heading in rad."""
 
     marker_id: int
     x_m: float
@@ -57,7 +57,7 @@ class Station:
 
 
 def place(where: Place, settings: LabSettings) -> Placed:
-    """Return the print at a place."""
+    """Return the print of a marker at a pose."""
     return Placed(
         where.marker_id,
         settings.marker_length_m,
@@ -111,10 +111,10 @@ def plan_stations(settings: LabSettings, cameras: Sequence[Camera]) -> list[tupl
         for marker_id in range(settings.markers):
             camera = min(cameras, key=lambda one: len(seen[one.name]))
             taken = [station.place for station in stations]
-            position = choose_place(rng, settings, cameras, camera, marker_id, taken, seen[camera.name])
-            stations.append(Station(position, camera.name))
-            for name in seen_whole(position, cameras, settings):
-                seen[name].append(position)
+            pose = choose_place(rng, settings, cameras, camera, marker_id, taken, seen[camera.name])
+            stations.append(Station(pose, camera.name))
+            for name in seen_whole(pose, cameras, settings):
+                seen[name].append(pose)
         sets.append(tuple(stations))
     return sets
 
@@ -134,14 +134,14 @@ def split(sets: Sequence[tuple[Station, ...]], seed: int) -> list[tuple[str, ...
 def measure(
     where: Place, settings: LabSettings, index: int, times_ns: Sequence[int], splits: tuple[str, ...]
 ) -> Measurement:
-    """Simulate the manual measurement of a place: its distances from A and B on the floor, and its height.
+    """Simulate the manual measurement of a marker: distances from A and B on the floor, and its height.
 
     Parameters
     ----------
     where : the ground truth.
     settings : the sigmas of tape and ruler.
     index : number of the measurement; every second measurement contains its stationary interval.
-    times_ns : times of the frames in which the marker is stationary at this place.
+    times_ns : times of the frames in which the marker is stationary at this pose.
     splits : splits of the calibration point, such as train or test.
     """
     rng = stream(settings.seed, Purpose.TAPE, index)
@@ -166,7 +166,7 @@ def measure(
 
 
 def tape_lengths_m(where: Place) -> Array:
-    """Return the true distances of a place from A and B in the plane of the floor, (2,) in m."""
+    """Return the true distances of a marker from A and B in the plane of the floor, (2,) in m."""
     return np.array([np.hypot(where.x_m - p.x_m, where.y_m - p.y_m) for p in REFERENCES])
 
 
@@ -195,7 +195,7 @@ def choose_place(
     before: Sequence[Place],
     suits: Callable[[Place, Camera, LabSettings], bool] = lambda where, camera, settings: True,
 ) -> Place:
-    """Choose a place in a camera's field of view, far from places ``before``, without overlap with ``taken``.
+    """Choose a pose in a camera's field of view, far from poses ``before``, without overlap with ``taken``.
 
     Raises
     ------

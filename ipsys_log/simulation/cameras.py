@@ -66,7 +66,7 @@ def hang_cameras(settings: LabSettings, time_ns: int = 0) -> tuple[Camera, ...]:
 def sees(camera: Camera, points_m: Array) -> NDArray[np.bool_]:
     """Return a mask (n,) of the world points, (n, 3) in m, that are in the image."""
     points_c = transform(camera.camera_from_world, points_m)
-    # Beyond the widest angle, the polynomial of the lens distortion is not valid.
+    # Outside the widest angle, the polynomial of the lens distortion is not valid.
     in_front = np.hypot(points_c[:, 0], points_c[:, 1]) < np.tan(_WIDEST_RAD) * points_c[:, 2]
     px = project(np.where(in_front[:, None], points_c, [0.0, 0.0, 1.0]), camera.lens)
     last = np.array([camera.lens.width - 1, camera.lens.height - 1])

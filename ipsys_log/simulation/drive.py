@@ -48,11 +48,11 @@ class Drive:
     phases_rad: Array
 
     def places_at(self, time_s: float) -> tuple[Place, ...]:
-        """Return the places of all markers at a time after the start; before it, they are stationary."""
+        """Return the poses of all markers at a time after the start; before it, they are stationary."""
         return tuple(self.place_at(marker_id, time_s) for marker_id in self.ahead_s)
 
     def place_at(self, marker_id: int, time_s: float) -> Place:
-        """Return the place of one marker at a time after the start."""
+        """Return the pose of one marker at a time after the start."""
         (x_m, y_m), (dx, dy) = self._follow(self.ahead_s[marker_id], np.array([max(time_s, 0.0)]))
         heading_rad = float(np.arctan2(dy[0], dx[0]))
         return Place(marker_id, float(x_m[0]), float(y_m[0]), self.height_m, heading_rad)
@@ -69,7 +69,7 @@ class Drive:
 
 
 def plan_drive(settings: LabSettings, cameras: Sequence[Camera]) -> Drive:
-    """Place up to ``settings.markers`` markers on the path that never cover one another; return the drive.
+    """Put up to ``settings.markers`` markers, which never cover one another, on the path; return the drive.
 
     Marker 0 starts at a wall.
     """

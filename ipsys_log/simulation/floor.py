@@ -124,7 +124,7 @@ def _noise_at(settings: LabSettings, which: int, x_m: Array, y_m: Array, stretch
 def _noise_tile(seed: int, which: int) -> Plane:
     """Return the tile that :func:`_noise_at` repeats; all cameras of a lab share it."""
     white = stream(seed, Purpose.FLOOR, which).standard_normal((_TILE, _TILE))
-    # The filter is a cyclic convolution, so the tile repeats without a seam.
+    # The filter is a convolution on the torus, so the tile repeats without a seam.
     fy, fx = np.fft.fftfreq(_TILE)[:, None], np.fft.rfftfreq(_TILE)[None, :]
     soft = np.exp(-2 * (np.pi * 1.2) ** 2 * ((fx) ** 2 + (fy) ** 2)) / (1 + 60 * np.hypot(fx, fy))
     tile = np.fft.irfft2(np.fft.rfft2(white) * soft, s=white.shape)

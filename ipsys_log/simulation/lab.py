@@ -55,7 +55,7 @@ _LATENCY_NS = 4_000_000
 class Instant:
     """A time at which all cameras take a frame, with the measurements that follow it.
 
-    ``places`` are the places of the markers at ``time_ns``, the middle of the exposure of the first row.
+    ``places`` are the poses of the markers at ``time_ns``, the middle of the exposure of the first row.
     ``prints`` are the markers for the renderer.
     """
 
@@ -123,7 +123,7 @@ def build_rig(settings: LabSettings) -> Rig:
 def drive_start_ns(settings: LabSettings, cameras: Sequence[Camera]) -> int:
     """Return the start time of the robots.
 
-    The true places at a time are ``drive.places_at`` of the seconds since this start.
+    The true poses at a time are ``drive.places_at`` of the seconds since this start.
 
     Parameters
     ----------
@@ -188,12 +188,12 @@ def _instants(settings: LabSettings, cameras: Sequence[Camera]) -> Iterator[Inst
     splits = split(sets, settings.seed)
     for number, stations in enumerate(sets):
         places = tuple(station.place for station in stations)
-        lying = tuple(place(position, settings) for position in places)
+        lying = tuple(place(pose, settings) for pose in places)
         times_ns = _times(settings, _start_ns(settings, number), settings.frames_per_station)
         first = number * settings.markers
         measured = tuple(
-            measure(position, settings, index, times_ns, splits[index])
-            for index, position in enumerate(places, first)
+            measure(pose, settings, index, times_ns, splits[index])
+            for index, pose in enumerate(places, first)
         )
         for time_ns in times_ns[:-1]:
             yield Instant(time_ns, places, lying)
@@ -225,14 +225,14 @@ def _truth(instant: Instant, rig: Rig, cameras: Sequence[Camera], settings: LabS
         instant.time_ns,
         tuple(
             Track(
-                robot=rig.robot_of(position.marker_id),
-                id=position.marker_id,
-                x_m=position.x_m,
-                y_m=position.y_m,
-                z_m=position.z_m,
-                heading_rad=position.heading_rad,
-                cameras=seen_whole(position, cameras, settings),
+                robot=rig.robot_of(pose.marker_id),
+                id=pose.marker_id,
+                x_m=pose.x_m,
+                y_m=pose.y_m,
+                z_m=pose.z_m,
+                heading_rad=pose.heading_rad,
+                cameras=seen_whole(pose, cameras, settings),
             )
-            for position in instant.places
+            for pose in instant.places
         ),
     )

@@ -56,7 +56,7 @@ LIVE_SETTINGS = LabSettings(
 _RAISED_SHARE, _BOXES_M = 0.35, (0.1, 0.2)
 # Samples per second of the paths of driving markers. Stationary markers do not overlap these samples.
 _CHECKED_HZ = 5
-# The plan uses this image size, so the places do not depend on the size of the images, if they are wide.
+# The plan uses this image size, so the poses do not depend on the size of the images, if they are wide.
 _WIDTH, _HEIGHT = 1920, 1080
 # In an image of this width, markers have at least this width. The detector may miss narrower markers in
 # smaller images.
@@ -67,7 +67,7 @@ _planning = Lock()
 
 @dataclass(frozen=True, slots=True, eq=False)
 class LiveLab:
-    """Places of markers: those with ids from ``settings.markers`` on are stationary, the others drive."""
+    """Poses of markers: those with ids from ``settings.markers`` on are stationary, the others drive."""
 
     settings: LabSettings
     drive: Drive
@@ -79,7 +79,7 @@ def plan_live_lab(settings: LabSettings) -> LiveLab:
 
     Parameters
     ----------
-    settings : settings of the lab. All determine the places, except size, rate and quality of the images.
+    settings : settings of the lab. All determine the poses, except size, rate and quality of the images.
 
     Raises
     ------
@@ -103,7 +103,7 @@ def _plan(settings: LabSettings) -> tuple[Drive, tuple[Place, ...]]:
     cameras = hang_cameras(settings)
     drive = plan_drive(settings, cameras)
     times_s = np.linspace(0, settings.drive_s, round(settings.drive_s * _CHECKED_HZ) + 1).tolist()
-    taken = [position for time_s in times_s for position in drive.places_at(time_s)]
+    taken = [pose for time_s in times_s for pose in drive.places_at(time_s)]
     rng = stream(settings.seed, Purpose.LYING)
     seen: dict[str, list[Place]] = {camera.name: [] for camera in cameras}
     lying: list[Place] = []
@@ -113,19 +113,19 @@ def _plan(settings: LabSettings) -> tuple[Drive, tuple[Place, ...]]:
         _check_left(settings, number)
         level = replace(settings, heights_m=(_next_height_m(lying, seen[camera.name]),))
         others = [*taken, *lying]
-        position = choose_place(rng, level, cameras, camera, number, others, seen[camera.name], _is_wide)
-        lying.append(position)
-        for name in seen_whole(position, cameras, settings):
-            seen[name].append(position)
+        pose = choose_place(rng, level, cameras, camera, number, others, seen[camera.name], _is_wide)
+        lying.append(pose)
+        for name in seen_whole(pose, cameras, settings):
+            seen[name].append(pose)
     return drive, tuple(lying)
 
 
 def _next_height_m(lying: Sequence[Place], seen: Sequence[Place]) -> float:
     """Return the height of the next marker: each camera sees only a small share of raised markers."""
-    raised = sum(position.z_m > 0 for position in seen)
+    raised = sum(pose.z_m > 0 for pose in seen)
     if raised >= _RAISED_SHARE * len(seen):
         return 0.0
-    return _BOXES_M[sum(position.z_m > 0 for position in lying) % len(_BOXES_M)]
+    return _BOXES_M[sum(pose.z_m > 0 for pose in lying) % len(_BOXES_M)]
 
 
 def _is_wide(where: Place, camera: Camera, settings: LabSettings) -> bool:
@@ -154,7 +154,7 @@ def live_rig(settings: LabSettings) -> Rig:
         RigCamera(name, None, None, f"sim:{name}", settings.width, settings.height, settings.rate_hz)
         for name in settings.cameras
     )
-    still = (RigMarker(position.marker_id, height_m=position.z_m) for position in lying)
+    still = (RigMarker(pose.marker_id, height_m=pose.z_m) for pose in lying)
     return replace(rig, cameras=tuple(cameras), markers=(*rig.markers, *still))
 
 
@@ -170,10 +170,10 @@ def tape_sheet(lying: Sequence[Place]) -> str:
     """
     a, b = REFERENCES
     rows = [f"marker,d_{a.name}_cm,d_{b.name}_cm,side,height_cm"]
-    for position in lying:
-        tapes = ",".join(f"{CM_PER_M * length_m:.1f}" for length_m in tape_lengths_m(position).tolist())
-        side = "left" if position.y_m >= a.y_m else "right"
-        rows.append(f"{position.marker_id},{tapes},{side},{CM_PER_M * position.z_m:.1f}")
+    for pose in lying:
+        tapes = ",".join(f"{CM_PER_M * length_m:.1f}" for length_m in tape_lengths_m(pose).tolist())
+        side = "left" if pose.y_m >= a.y_m else "right"
+        rows.append(f"{pose.marker_id},{tapes},{side},{CM_PER_M * pose.z_m:.1f}")
     return "\n".join(rows) + "\n"
 
 
@@ -208,7 +208,7 @@ def lab_film(settings: LabSettings, number: int, check: Check) -> Film:
     count = max(round(settings.drive_s * settings.rate_hz), 1)
     check()
     bare = prepare_view(hang_cameras(settings)[number], settings, check)
-    view = lay_down(bare, [place(where, settings) for where in lab.lying], settings)
+    view = lay_down(bare, [place(pose, settings) for pose in lab.lying], settings)
 
     def draw(index: int) -> bytes:
         return _picture(view, _driving(lab, index), settings, number, index)

@@ -22,7 +22,7 @@ __all__ = ["Print", "encode_jpeg", "expose", "lay_down", "render"]
 
 Plane = NDArray[np.float32]
 Image = NDArray[np.uint8]
-# Objects in a frame.
+# Objects in an image.
 Print = Placed | PlacedBoard | Moving
 
 # Grey levels that a warm lamp subtracts from the blue of the floor and adds to its red.
@@ -38,7 +38,7 @@ def render(
     ----------
     view : view of the camera, from :func:`~ipsys_log.simulation.floor.prepare_view`.
     placed : the markers. If two overlap, the later one is on top. A moving marker is a function of the time
-        in s since the time of the frame, which is the middle of the exposure of its first row.
+        in s since the time of the frame. This is the middle of the exposure of its first row.
     settings : the grey levels, blur, gamma and dictionary of the scene; row time and exposure.
     rng : random generator for the part of the noise field; None for an image without noise.
 

@@ -22,7 +22,7 @@ _CHANGED_SAMPLES = 3
 _AROUND_PX = 192
 _ENTERED = 0.4
 _MARGIN = 0.35
-# Share of a change that each frame adds to the background. A thing that stays becomes background within
+# Share of a change that each frame adds to the background. A stationary object becomes background within
 # about ten frames.
 _LEARN = np.float32(0.15)
 

@@ -47,13 +47,13 @@ _BLURRED = 0.6
 _SEEN = 0.6
 _EXACT_PX = 0.05
 _WRONG_CELLS = 1
-# Signs of glare, a shadow or a cover: a side is displaced by _SIDE_OFF times the edges' spread, or the black
-# beside some edges is lighter than beside the others, by _LIGHTER times the contrast. A few edges may have
-# lighter black, because a neighbouring white cell reaches them if cells are small.
+# Signs of glare, a shadow or a cover. First sign: a side is displaced by _SIDE_OFF times the edges' spread.
+# Second sign: the black beside some edges is lighter than beside the others, by _LIGHTER times the contrast.
+# A few edges may have lighter black, because a neighbouring white cell reaches them if cells are small.
 _SIDE_OFF, _LIGHTER = 0.85, 0.35
 _WIDE_SPREAD_PX, _SIDE_OFF_WIDE = 0.12, 0.6
 _LEAST_SPREAD_PX, _FEW, _SMALL_PX = 0.03, 3, 4.0
-# Another sign: the spread of the edges is larger than _SPREAD_PX. If motion blurs edges, or seems to blur
+# Third sign: the spread of the edges is larger than _SPREAD_PX. If motion blurs edges, or seems to blur
 # them, sides are displaced by shares of the blur's width. The surroundings of an edge then mix with it.
 _SPREAD_PX, _LIGHTER_BLURRED = 0.3, 0.6
 
@@ -82,8 +82,8 @@ def fit_edges(
 
     Returns
     -------
-    For each guess the fit, or None if the image does not show the marker: the fit does not converge, edges
-    are missing, a corner is outside the image, or the cells do not match this id.
+    The fit of each guess, or None if the image does not show the marker. It is None if the fit does not
+    converge, edges are missing, a corner is outside the image, or the cells do not match this id.
     """
     possible = into_poses(guesses).possible() if guesses else np.ones(0, dtype=bool)
     if not possible.all():
@@ -118,7 +118,7 @@ class _Settled(NamedTuple):
     """Fitted poses with their residuals.
 
     ``covariances`` (m, 6, 6) are those of the twists in print coordinates. ``ends`` (m, s, 2) are levels at
-    both ends of the profiles, ``cells_px`` (m,) is the least width of a cell, and ``sides_off_px`` (m,) the
+    both ends of the profiles. ``cells_px`` (m,) is the least width of a cell, and ``sides_off_px`` (m,) the
     largest displacement of a side.
     """
 

@@ -39,7 +39,8 @@ _STAGGER = 3
 # markers are decoded.
 _WHOLE_EVERY = 10
 _MARGIN_PX = 24
-# A fit at rest is as good as a moving fit, with more unknowns, up to this multiple of its spread of edges.
+# A fit at rest is good if its spread of edges is below this multiple of the spread of a moving fit. The moving
+# fit has one more freedom.
 _AS_GOOD = 1.1
 # Two fits of one id are the same marker if they are nearer together.
 _SAME_PX = 8.0
@@ -253,8 +254,8 @@ class Follow:
     ) -> list[Fit]:
         """Return the fits and those of the candidates that are not among them.
 
-        If two poses look alike, the upright pose is selected. The other pose is selected if the spread of
-        its edges is less than ``better`` times that of the upright pose.
+        If two poses look alike, the function selects the upright pose. It selects the other pose if the
+        spread of its edges is less than ``better`` times that of the upright pose.
         """
         new_candidates = [
             candidate for candidate in candidates if not _among(candidate.id, candidate.corners_px, fits)

@@ -31,9 +31,9 @@ _BORDER_PX = 1
 _NEAR = (4, 4)
 _REFINE = (cv2.TERM_CRITERIA_COUNT + cv2.TERM_CRITERIA_EPS, 10, 0.05)
 _MISREAD = 3
-# Leftovers: the least contrast between neighbouring samples, and the size of a square with such contrast;
-# the reach of the paper around a marker, in sides; and the limits above which one search of the whole image
-# is faster than many searches.
+# Search of leftovers: least contrast between neighbouring samples; sampling steps; masks for the contrast and
+# for a square with contrast; reach of the paper around a marker, in sides; margin of an area. The last two
+# are limits: a share of the image, and a number of areas. Above them, one search of the whole image is faster.
 _CONTRAST = 30
 _FINER, _COARSER = 2, 3
 _STEP_PX = _FINER * _SHRINK
@@ -108,7 +108,7 @@ def search_thoroughly(grey: Grey, dictionary: str, region: tuple[slice, slice] =
 def search_leftovers(
     grey: Grey, dictionary: str, samples: Grey, known_px: Sequence[Array]
 ) -> list[Candidate]:
-    """Search thoroughly in areas whose contrast no known marker, (4, 2) in px, explains.
+    """Search thoroughly in areas with contrast that no known marker, (4, 2) in px, explains.
 
     Parameters
     ----------
@@ -190,7 +190,7 @@ def _is_cut(grey: Grey, fine: Grey, left: int, top: int, right: int, bottom: int
 
 
 def _squares(samples: Grey) -> Grey:
-    """Return a mask of the squares whose samples have contrast everywhere."""
+    """Return a mask of the squares with contrast at all samples."""
     contrast = cv2.morphologyEx(samples, cv2.MORPH_GRADIENT, _AROUND)
     high = cv2.threshold(contrast, _CONTRAST, 1, cv2.THRESH_BINARY)[1]
     return np.asarray(cv2.morphologyEx(high, cv2.MORPH_OPEN, _SQUARE), dtype=np.uint8)

@@ -110,7 +110,7 @@ _WEAK, _WEAK_ROUGH = 0.3, 0.25
 _MISSHAPEN, _MISSHAPEN_SURELY, _ODD = 0.02, 0.12, 3.0
 # An edge farther out in its profile is cut off.
 _CENTRAL = 0.6
-# Shorter profiles cannot tell a slope of the light from a step.
+# Shorter profiles cannot distinguish a slope of the light from a step.
 _LONG_PX = 2.5
 
 

@@ -55,8 +55,8 @@ def solve_squares(uv: Array, lengths_m: Array) -> tuple[Array, Array]:
     both = np.empty((len(uv), 2, 3, 3))
     both[:, :, :2, :2] = flat[:, None]
     both[..., 2, 2] = (det / per_m2)[:, None]
-    # The third column is the cross product of the first two. Its x and y have the sign of their depths. Its own
-    # depth is the same for both signs.
+    # The third column is the cross product of the first two. Its x and y have the sign of their depths. Its
+    # own depth is the same for both signs.
     normal = flat[:, ::-1, 0] * depths[:, 1:] - flat[:, ::-1, 1] * depths[:, :1]
     normal[:, 1] *= -1
     for pose, sign in enumerate((1, -1)):

@@ -120,7 +120,7 @@ _RAW_TO_GREY = {
 
 
 class _Memory:
-    """The buffers of a thread for decoding, used again: allocation would take longer than the decoding."""
+    """The reused buffers of a thread for decoding: allocation of new memory takes longer than filling it."""
 
     def __init__(self) -> None:
         self.pixels = np.zeros((0, 0), dtype=np.uint8)

@@ -112,8 +112,8 @@ def cut_rows(
     ----------
     data, layout : the whole JPEG, and its :func:`read_layout`.
     rows : slices from :func:`whole_rows`.
-    memory : buffer for a JPEG, used again for the next JPEG, because allocation of new memory would take
-        longer than the copy. It grows if necessary.
+    memory : buffer for a JPEG, used again for the next JPEG, because allocation of new memory takes longer
+        than filling it. It grows if necessary.
 
     Returns
     -------

@@ -39,8 +39,8 @@ _STAGGER = 3
 # markers are decoded.
 _WHOLE_EVERY = 10
 _MARGIN_PX = 24
-# A fit at rest is good if its spread of edges is below this multiple of the spread of a moving fit. The moving
-# fit has one more freedom.
+# A fit at rest is good if its spread of edges is below this multiple of the spread of a moving fit. The
+# moving fit has one more freedom.
 _AS_GOOD = 1.1
 # Two fits of one id are the same marker if they are nearer together.
 _SAME_PX = 8.0

@@ -33,7 +33,8 @@ _REFINE = (cv2.TERM_CRITERIA_COUNT + cv2.TERM_CRITERIA_EPS, 10, 0.05)
 _MISREAD = 3
 # Search of leftovers: least contrast between neighbouring samples; sampling steps; masks for the contrast and
 # for a square with contrast; reach of the paper around a marker, in sides; margin of an area. The last two
-# are limits: a share of the image, and a number of areas. Above them, one search of the whole image is faster.
+# are limits: a share of the image, and a number of areas. Above them, one search of the whole image is
+# faster.
 _CONTRAST = 30
 _FINER, _COARSER = 2, 3
 _STEP_PX = _FINER * _SHRINK

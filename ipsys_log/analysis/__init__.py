@@ -1,1 +1,1 @@
-"""Analysis of measurements, runs and cameras: arrays and messages in, results out."""
+"""Analysis of measurements, runs and cameras: functions from arrays and messages to results."""

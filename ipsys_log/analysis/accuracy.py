@@ -28,23 +28,23 @@ _RESAMPLES = 2000
 
 
 def error_statistics(errors_m: NDArray[np.float64], independent: bool = True) -> ErrorStatistics:
-    """Mean, bounds, percentiles and standard deviation of distances, and how certain their mean is.
+    """Return mean, bounds, percentiles and standard deviation of distances, and an interval of their mean.
 
     Parameters
     ----------
-    errors_m : (n,) or (repeats, n), n > 0, in m: distances at n places.
-    independent : whether one place says nothing of the next, as the instants of a track do: otherwise there
-        is no interval.
+    errors_m : (n,) or (repeats, n), n > 0, in m: distances at n points.
+    independent : True if the errors of the points are independent. The errors at the instants of a track are
+        not, and then there is no interval.
 
     Returns
     -------
-    ErrorStatistics : of all distances; ``count`` is the number of places. The 95 % confidence interval
-        of the mean is a percentile bootstrap over the places, which are independent as repeats at one
-        place are not; always the same for the same errors.
+    ErrorStatistics : statistics of all distances; ``count`` is the number of points. The 95 % confidence
+        interval of the mean is a percentile bootstrap over the points, because points are independent and
+        repeats at one point are not. Equal errors always give the same interval.
 
     References
     ----------
-    Ou et al., Robotica 2023, Tables I and II; the standard deviation there has n - 1. Efron and
+    Ou et al., Robotica 2023, Tables I and II. The standard deviation there uses n - 1. Efron and
     Tibshirani, An Introduction to the Bootstrap, 1993, ch. 13.
 
     Examples
@@ -80,7 +80,7 @@ def root_mean_square_m(errors: ErrorStatistics, repeats: int = 1) -> float:
 
     Parameters
     ----------
-    errors : of n places.
+    errors : error statistics of n points.
     repeats : number of errors of each point; the standard deviation is that of all of them.
 
     Examples
@@ -97,28 +97,28 @@ Array = NDArray[np.float64]
 
 HELD_OUT = "held_out"
 CROSS_VALIDATION = "cross_validation"
-# The camera of a row that has all of them together.
+# Name of the camera in a row for all cameras together.
 POOLED = ""
-# Shares of a region of the covariance that are looked at.
+# Probabilities of the tested regions of the covariance.
 _REGIONS = (0.68, 0.95)
 
 
 def errors_held_out(
     model: Model, held_out: Mapping[str, Sequence[Pair]], truth: Mapping[str, Array]
 ) -> list[CameraEvaluation]:
-    """Errors of a model on held-out places, against the tape and, where there is one, the truth.
+    """Return the errors of a model at held-out points, against the tape and, if known, the ground truth.
 
     Parameters
     ----------
-    model : fitted.
-    held_out : measured places by camera; those that the model was fitted on after all do not count.
+    model : the fitted model.
+    held_out : calibration points by camera. Points that were used in the fit of the model do not count.
     truth : true world points (3,) in m by id of the measurement; empty outside a simulated lab.
 
     Returns
     -------
-    A row for each camera that has held-out places, and one for all of them where there are several.
+    A row for each camera with held-out points, and a row for all cameras if there are several.
     """
-    found = {}
+    predictions = {}
     for camera in model.cameras:
         used = {pair.measurement: pair.world_m for pair in camera.pairs}
         pairs = [
@@ -129,33 +129,34 @@ def errors_held_out(
         if pairs:
             applied = AppliedModel(model.name, camera)
             points_m, world_m = _arrays(pairs)
-            found[camera.camera] = (pairs, applied.predict(points_m, world_m[:, 2])[None])
-    return _rows(model, found, truth, HELD_OUT)
+            predictions[camera.camera] = (pairs, applied.predict(points_m, world_m[:, 2])[None])
+    return _rows(model, predictions, truth, HELD_OUT)
 
 
 def errors_cross_validated(
     model: Model, pairs: Mapping[str, Sequence[Pair]], truth: Mapping[str, Array], seed: int
 ) -> list[CameraEvaluation]:
-    """Errors by repeated cross-validation over all measured places: the honest figure.
+    """Return cross-validated errors: repeated cross-validation over all calibration points.
 
-    A published split can flatter: which places are held out decides how many of them lie at the edge.
+    The errors of a published split can be too small, because they depend on the number of held-out points at
+    the edge. Cross-validation does not have this bias.
 
     Parameters
     ----------
-    model : its name says what is fitted to each fold, its covariances what the errors are compared with.
-    pairs : all measured places by camera.
+    model : the model. Its name selects the model for each fold. The errors are compared with its covariances.
+    pairs : all calibration points by camera.
     truth : as in :func:`errors_held_out`.
-    seed : of the folds.
+    seed : random seed of the folds.
 
     Raises
     ------
     FitError
-        Where a fold leaves too few places to fit to.
+        Too few calibration points remain for the fit of a fold.
     """
     cameras = gather_places(pairs)
     predicted = cross_validate(model.name, cameras, seed)
-    found = {camera: (list(pairs[camera]), predicted[camera]) for camera in cameras}
-    return _rows(model, found, truth, CROSS_VALIDATION)
+    predictions = {camera: (list(pairs[camera]), predicted[camera]) for camera in cameras}
+    return _rows(model, predictions, truth, CROSS_VALIDATION)
 
 
 def count_repeats(row: CameraEvaluation, rows: Sequence[CameraEvaluation]) -> int | None:
@@ -163,12 +164,12 @@ def count_repeats(row: CameraEvaluation, rows: Sequence[CameraEvaluation]) -> in
 
     Parameters
     ----------
-    row : of an evaluation.
-    rows : all of them; the row over all cameras has no residuals, those of the cameras have.
+    row : row of an evaluation.
+    rows : all rows; the row for all cameras has no residuals, but the rows of single cameras have residuals.
 
     Returns
     -------
-    None if the log does not tell.
+    The number, or None if the log does not contain it.
     """
     if row.scheme != CROSS_VALIDATION:
         return 1
@@ -188,7 +189,7 @@ def _rows(
     truth: Mapping[str, Array],
     scheme: str,
 ) -> list[CameraEvaluation]:
-    """Rows of errors; ``found`` has the pairs of each camera and what was predicted, (repeats, n, 3)."""
+    """Return rows of errors; ``found`` has pairs and predictions (repeats, n, 3) of each camera."""
     fitted = {camera.camera: camera for camera in model.cameras}
     level = level_cameras(model)
     rows: list[CameraEvaluation] = []
@@ -231,7 +232,7 @@ def _row(
     return CameraEvaluation(
         camera,
         against,
-        # Where all places have one height, an error in space would only look like one.
+        # If all calibration points have the same height, the 3D error is not meaningful.
         None if level else error_statistics(np.linalg.norm(offsets_m, axis=2)),  # eq. (26)
         error_statistics(np.linalg.norm(offsets_m[:, :, :2], axis=2)),  # eq. (27)
         residuals,
@@ -245,7 +246,7 @@ def _row(
 def _squares(
     name: str, camera: CameraModel | None, pairs: Sequence[Pair], offsets_m: Array, against: str, level: bool
 ) -> Array | None:
-    """The smallest region of the covariance that holds each error, as a share, (repeats, n)."""
+    """Return the probability of the smallest region of the covariance with each error, (repeats, n)."""
     if camera is None:
         return None
     points_m, world_m = _arrays(pairs)
@@ -255,7 +256,7 @@ def _squares(
     if against == "tape":
         tape = [np.zeros((3, 3)) if p.world_covariance_m2 is None else p.world_covariance_m2 for p in pairs]
         covariances = covariances + np.array(tape)
-    # A height that was given, or is the only one, has no error.
+    # A known height, or the only height of all calibration points, has no error.
     size = 2 if level or reads_height(name) else 3
     inverse = np.linalg.inv(covariances[:, :size, :size])
     squares = np.einsum("rni,nij,rnj->rn", offsets_m[:, :, :size], inverse, offsets_m[:, :, :size])

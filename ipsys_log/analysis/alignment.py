@@ -1,4 +1,4 @@
-"""Camera poses above the floor, from markers that lie on it (sect. 3 of the paper)."""
+"""Camera poses relative to the floor, from markers on the floor (sect. 3 of the paper)."""
 
 from __future__ import annotations
 
@@ -21,32 +21,33 @@ __all__ = ["LEVEL_M", "Alignment", "align_camera", "join_cameras"]
 Array = NDArray[np.float64]
 Mask = NDArray[np.bool_]
 
-# The paper calls a camera parallel to the floor below this spread of Zc.
+# In the paper, a camera is parallel to the floor if the spread of Zc is below this value.
 LEVEL_M = 0.05
-# What a lens leaves of a depth, relative, however many frames there are; and what is flat enough.
+# Relative error of a depth by the lens, for any number of frames; and the flatness of a floor.
 _USUAL_DEPTH, _FLAT_M = 0.002, 0.015
-# A slope that is known no better than this is not known.
+# A slope with a larger sigma is unknown.
 _LOOSE = math.radians(1.0)
 _FAR = 4.0
-# To tell one that lies elsewhere from the rest takes so many; of more triples than these, some.
+# Least number of markers to identify one outside the plane; largest number of triples of markers. If there
+# are more triples, the code draws a random subset.
 _LEAST_TO_NAME, _MOST_TRIPLES = 5, 2000
 _SLENDER, _LEAST_AREA_M2 = 0.05, 1e-4
 
 
 @dataclass(frozen=True, slots=True, eq=False)
 class Alignment:
-    """What markers on the floor say of a camera.
+    """The tilt and height of a camera from markers on the floor.
 
     Attributes
     ----------
-    lying : the markers that it rests on; ``raised`` those that do not lie in the plane of the others,
-        each with how far above it, in m.
-    spread_m : of Zc, greatest minus least, brought down to the floor where a height was measured; None
-        for fewer than two markers. ``left_m`` is what is left of it when the camera has been tilted.
-    down : (3,), the plumb line in the frame of the camera, a unit vector; None where nothing is known.
-    sigma_rad : of the tilt, in the direction that is known worst.
-    axes : in how many directions the tilt is known: 2; 1 along a line of markers only; or 0.
-    uneven_m : by how much markers miss a plane (RMS), where too few are there to say which.
+    lying : the markers of the fit. ``raised`` are markers outside the plane of the others, each with its
+        height above the plane in m.
+    spread_m : spread of Zc, greatest minus least, corrected to the floor with measured heights; None for
+        fewer than two markers. ``left_m`` is the remaining spread after the correction of the tilt.
+    down : (3,), the plumb line in camera coordinates, a unit vector; None if it is unknown.
+    sigma_rad : sigma of the tilt in its least accurate direction.
+    axes : number of directions in which the tilt is known: 2; 1 for markers on a line; or 0.
+    uneven_m : RMS distance of markers from a plane, if there are too few to identify a raised marker.
     """
 
     camera: str
@@ -61,33 +62,38 @@ class Alignment:
 
     @property
     def level(self) -> bool | None:
-        """Whether the spread is below 5 cm; None where markers lie too close together to tell, or on a line
-        across which the floor may fall away."""
+        """Return whether the spread is below 5 cm; None if the markers do not determine it.
+
+        This is the case if they are too close together, or on a line. The slope across the line is unknown.
+        """
         if self.spread_m is None or self.axes == 0 or (self.axes == 1 and self.spread_m < LEVEL_M):
             return None
         return self.spread_m < LEVEL_M
 
     @property
     def tilt_rad(self) -> float | None:
-        """Between the optical axis and the plumb line."""
+        """Return the angle between the optical axis and the plumb line, in rad."""
         return None if self.down is None else math.acos(min(1.0, float(self.down[2])))
 
     @property
     def turns_rad(self) -> tuple[float, float]:
-        """By how much it has to look further to the right of its picture, and then to its bottom."""
+        """Return the rotations that level a camera, in rad: to the right of its image, then to its bottom."""
         x, y, z = (0.0, 0.0, 1.0) if self.down is None else self.down.tolist()
         return math.atan2(x, z), math.asin(y)
 
     @property
     def height_m(self) -> float | None:
-        """Of the camera above the floor."""
+        """Return the height of the camera above the floor, in m."""
         if self.down is None:
             return None
-        return float(np.median([one.point_m @ self.down + one.height_m for one in self.lying]))
+        return float(np.median([marker.point_m @ self.down + marker.height_m for marker in self.lying]))
 
 
 class _Plane(NamedTuple):
-    """Zc = ``start_m`` + ``slopes`` . (Xc, Yc) on the floor; ``sigma`` that of the worst known slope."""
+    """A plane Zc = ``start_m`` + ``slopes`` . (Xc, Yc) on the floor.
+
+    ``axes`` is the number of known slopes, and ``sigma`` the sigma of the least accurate known slope.
+    """
 
     start_m: float
     slopes: Array
@@ -100,22 +106,22 @@ class _Plane(NamedTuple):
         return np.asarray(normal / np.linalg.norm(normal))
 
     def misses_m(self, lying: Sequence[Lying]) -> Array:
-        """How much lower than the floor markers seem to lie, along Zc, (n,)."""
+        """Return the apparent distances of markers below the floor, along Zc, (n,) in m."""
         points_m, depths_m = _on_floor(lying, self.down)
         return np.asarray(depths_m - self.start_m - points_m[:, :2] @ self.slopes)
 
 
 def align_camera(camera: str, lying: Sequence[Lying]) -> Alignment:
-    """The tilt of a camera against the plane of the markers that lie on the floor.
+    """Estimate the tilt of a camera against the plane of the markers on the floor.
 
-    With five markers or more those that lie in another plane, such as on a box, are found and left out.
+    With five or more markers, the function detects and omits markers in another plane, such as on a box.
 
     Parameters
     ----------
     camera : its name.
-    lying : from :func:`ipsys_log.analysis.stationary.find_lying`, from camera points by ``--method pose``.
-        Those by eq. (3) overstate a tilt by half: at (u, v) a tilt t makes Zc greater by a factor of
-        about 1 + t u, and shortens the marker's perimeter by 1 - t u / 2 besides.
+    lying : markers from :func:`ipsys_log.analysis.stationary.find_lying`, from camera points by
+        ``--method pose``. Camera points by eq. (3) give a tilt that is too large by half. At (u, v), a tilt t
+        increases Zc by a factor of about 1 + t u. It also reduces the marker's perimeter by 1 - t u / 2.
 
     References
     ----------
@@ -133,14 +139,14 @@ def align_camera(camera: str, lying: Sequence[Lying]) -> Alignment:
     1.15
     """
     kept = _on_one_plane(lying)
-    used = tuple(one for one, keep in zip(lying, kept, strict=True) if keep)
+    used = tuple(marker for marker, keep in zip(lying, kept, strict=True) if keep)
     if len(used) < 2:
         return Alignment(camera, used)
     plane = _fit_plane(used)
     misses_m = plane.misses_m(used)
     raised = tuple(
-        (one, -float(plane.misses_m([one])[0] * plane.down[2]))
-        for one, keep in zip(lying, kept, strict=True)
+        (marker, -float(plane.misses_m([marker])[0] * plane.down[2]))
+        for marker, keep in zip(lying, kept, strict=True)
         if not keep
     )
     spread_m = float(np.ptp(_on_floor(used, plane.down)[1]))
@@ -156,23 +162,24 @@ def align_camera(camera: str, lying: Sequence[Lying]) -> Alignment:
 
 
 def _on_floor(lying: Sequence[Lying], down: Array) -> tuple[Array, Array]:
-    """Camera points (n, 3), and the depths (n,) of the floor beneath them: what was raised, brought down."""
-    points_m = np.array([one.point_m for one in lying])
-    # Along Zc, at the same (Xc, Yc), the floor is 1 / cos(tilt) as far away as along the plumb line.
-    return points_m, points_m[:, 2] + np.array([one.height_m for one in lying]) / down[2]
+    """Return camera points (n, 3), and depths (n,) of the floor below them, corrected for marker heights."""
+    points_m = np.array([marker.point_m for marker in lying])
+    # Along Zc, at the same (Xc, Yc), the distance to the floor is 1 / cos(tilt) times the distance along the
+    # plumb line.
+    return points_m, points_m[:, 2] + np.array([marker.height_m for marker in lying]) / down[2]
 
 
 def _sigmas(lying: Sequence[Lying], down: Array) -> Array:
-    """Standard deviations (n,) in m of the depth of the floor beneath markers."""
-    noise_m2 = np.array([down @ one.covariance_m2 @ down for one in lying])
-    depths_m = np.array([one.point_m[2] for one in lying])
+    """Return the standard deviations (n,) in m of the depths of the floor below markers."""
+    noise_m2 = np.array([down @ marker.covariance_m2 @ down for marker in lying])
+    depths_m = np.array([marker.point_m[2] for marker in lying])
     return np.asarray(np.sqrt(noise_m2 + (_USUAL_DEPTH * depths_m) ** 2))
 
 
 def _fit_plane(lying: Sequence[Lying]) -> _Plane:
-    """By weighted least squares, in those directions in which markers lie far enough apart."""
+    """Fit a plane by weighted least squares, in directions in which markers are far enough apart."""
     plane = _Plane(0.0, np.zeros(2), 0, math.inf)
-    for _ in range(3):  # heights stand on the floor, which is found here
+    for _ in range(3):  # marker heights are relative to the floor, which is unknown at first
         sigmas_m = _sigmas(lying, plane.down)
         weights = sigmas_m**-2
         points_m, depths_m = _on_floor(lying, plane.down)
@@ -188,7 +195,7 @@ def _fit_plane(lying: Sequence[Lying]) -> _Plane:
 
 
 def _on_one_plane(lying: Sequence[Lying]) -> Mask:
-    """Which markers share the plane that most of them lie in, (n,)."""
+    """Return a mask (n,) of the markers in the plane that contains most of them."""
     count = len(lying)
     if count < _LEAST_TO_NAME:
         return np.ones(count, dtype=np.bool_)
@@ -196,7 +203,7 @@ def _on_one_plane(lying: Sequence[Lying]) -> Mask:
     sigmas_m, (points_m, depths_m) = _sigmas(lying, level), _on_floor(lying, level)
     terms, triples = np.column_stack([points_m[:, :2], np.ones(count)]), _triples(count)
     areas = np.abs(np.linalg.det(terms[triples]))
-    # Three on a line, or nearly so, say nothing of the plane beside it.
+    # Three markers that are nearly on a line do not determine a plane.
     triples = triples[areas > max(_SLENDER * float(areas.max()), _LEAST_AREA_M2)]
     if not len(triples):
         return np.ones(count, dtype=np.bool_)
@@ -205,40 +212,45 @@ def _on_one_plane(lying: Sequence[Lying]) -> Mask:
     quantile = (count + 4) // 2 - 1
     scores = np.partition(off, quantile, axis=1)[:, quantile]
     best, off = float(scores.min()), off[scores.argmin()]
-    # The best of many triples fits the better by chance, the fewer markers there are (Rousseeuw, Leroy 1987).
+    # With few markers, the best of many triples fits too well by chance (Rousseeuw, Leroy 1987).
     limits = np.maximum(_FLAT_M / sigmas_m, _FAR * max(1.0, best * (1 + 5 / (count - 3))))
     kept = np.asarray(off <= limits)
-    if kept.sum() >= 3:  # once more, by all that agree
-        plane = _fit_plane([one for one, keep in zip(lying, kept, strict=True) if keep])
+    if kept.sum() >= 3:  # repeat the fit with all consistent markers
+        plane = _fit_plane([marker for marker, keep in zip(lying, kept, strict=True) if keep])
         kept = np.asarray(np.abs(plane.misses_m(lying)) / sigmas_m <= limits)
     return kept
 
 
 def _triples(count: int) -> NDArray[np.int64]:
-    """Three of so many, (n, 3): all of them, or some."""
+    """Return triples of indices below ``count``, (n, 3): all of them, or a random subset."""
     if math.comb(count, 3) <= _MOST_TRIPLES:
         return np.array([*combinations(range(count), 3)], dtype=np.int64)
     rng = np.random.default_rng(0)
     return np.array([rng.choice(count, 3, replace=False) for _ in range(_MOST_TRIPLES)], dtype=np.int64)
 
 
-# Nearer together than that, places that two cameras see do not tell how these are turned.
+# Least distance between common markers of two cameras, to determine the rotation between the cameras.
 _APART_M = 0.15
-# What two cameras say of the same places differs by less; else these are not the same.
+# Largest difference between the positions of common markers by two cameras. A larger difference shows that
+# the markers are not the same.
 _ALIKE_M = 0.05
 
 
 def join_cameras(alignments: Sequence[Alignment], lenses: Mapping[str, CameraCalibration]) -> list[Hung]:
-    """The cameras that hang together with the first of them by markers that two see at the same time.
+    """Return the cameras that common markers connect to the first camera, in common coordinates.
 
-    The markers on the floor give the height and the plumb line of each camera; two places that both of two
-    cameras see, how the one is turned and shifted against the other.
+    Two cameras must see a common marker at the same time. The markers on the floor give the height and the
+    plumb line of each camera. Two common markers give the rotation and translation between two cameras.
 
     Returns
     -------
-    Places in a frame of which nothing is known but that its z = 0 is the floor; none for fewer than two.
+    Cameras in arbitrary coordinates with the floor at z = 0; an empty list for fewer than two cameras.
     """
-    known = {one.camera: one for one in alignments if one.axes == 2 and one.camera in lenses}
+    known = {
+        alignment.camera: alignment
+        for alignment in alignments
+        if alignment.axes == 2 and alignment.camera in lenses
+    }
     waiting = list(known)
     joined = {waiting.pop(0): np.eye(4)} if waiting else {}
     while pairs := [(new, old, _turn(known[new], known[old])) for new in waiting for old in joined]:
@@ -257,7 +269,10 @@ def join_cameras(alignments: Sequence[Alignment], lenses: Mapping[str, CameraCal
 
 
 def _floor_from_camera(one: Alignment) -> Array:
-    """In a frame of the camera's own: its foot the origin, z up, x as in its picture."""
+    """Return the pose (4, 4) from camera coordinates to the camera's own floor coordinates.
+
+    The floor coordinates have their origin at the foot point of the camera, z up, and x as in its image.
+    """
     assert one.down is not None
     assert one.height_m is not None
     x = np.array([1.0, 0.0, 0.0]) - one.down[0] * one.down
@@ -267,16 +282,16 @@ def _floor_from_camera(one: Alignment) -> Array:
 
 
 def _turn(one: Alignment, other: Alignment) -> Array | None:
-    """From the floor frame of one camera to that of another, (4, 4)."""
+    """Return the pose from the floor coordinates of one camera to those of another, (4, 4), or None."""
     pairs = [(a, b) for a in one.lying for b in other.lying if _same(a, b)]
     if len(pairs) < 2:
         return None
-    here, there = (
+    own_m, other_m = (
         transform(_floor_from_camera(camera), np.array([pair[n].point_m for pair in pairs]))[:, :2]
         for n, camera in enumerate((one, other))
     )
-    # As complex numbers: the best turn is the direction of their product.
-    a, b = (points_m @ np.array([1, 1j]) for points_m in (here, there))
+    # With points as complex numbers, the best rotation is the direction of their product.
+    a, b = (points_m @ np.array([1, 1j]) for points_m in (own_m, other_m))
     product = np.vdot(a - a.mean(), b - b.mean())
     if np.abs(a - a.mean()).max() < _APART_M / 2 or product == 0:
         return None
@@ -289,5 +304,5 @@ def _turn(one: Alignment, other: Alignment) -> Array | None:
 
 
 def _same(one: Lying, other: Lying) -> bool:
-    """Whether two cameras saw one marker at one place."""
+    """Return whether two cameras saw the same marker in overlapping stationary intervals."""
     return one.marker_id == other.marker_id and one.start_ns <= other.end_ns and other.start_ns <= one.end_ns

@@ -1,4 +1,4 @@
-"""The slips that are made with tape, ruler and pencil, and what each would have made of a place."""
+"""Typical blunders with tape, ruler and pencil, and the measurement without each of them."""
 
 from __future__ import annotations
 
@@ -19,15 +19,15 @@ __all__ = ["Slip", "possible_slips"]
 
 Array = NDArray[np.float64]
 
-# A prediction may lie a little below the floor; a marker does not.
+# A lower predicted height is impossible for a marker. Noise can move a prediction slightly below the floor.
 _LOWEST_M = -0.03
-# A correction below this is told to the millimetre.
+# The text of a smaller correction has a resolution of 1 mm.
 _FINE_M = 0.02
 
 
 @dataclass(frozen=True, slots=True)
 class Slip:
-    """What may have gone wrong: ``kind`` as in a Suspect, ``text`` in words, ``corrected`` without it."""
+    """A possible blunder: ``kind`` as in a Suspect, its ``text``, and the ``corrected`` measurement."""
 
     kind: str
     text: str
@@ -35,19 +35,20 @@ class Slip:
 
 
 def possible_slips(measurement: Measurement, rig: Rig, predicted_m: Array) -> list[list[Slip]]:
-    """What may have gone wrong with a measurement, the simplest first.
+    """Return the possible blunders of a measurement, the simplest first.
 
     Parameters
     ----------
-    measurement : whose world point is in doubt. Where it has no tape distances, they are those from
+    measurement : measurement of an outlier. Without tape distances, the function computes the distances from
         its world point to the first two reference points.
-    rig : in force when it was measured.
-    predicted_m : (3,), where it is by all the others.
+    rig : the rig that was valid at the measurement.
+    predicted_m : (3,), predicted world point from all other measurements.
 
     Returns
     -------
-    Groups of slips, those of a group equally simple: a wrong side or two exchanged distances; both; one
-    distance or the height, each such that it fits the prediction best.
+    Groups of blunders; all blunders of a group are equally simple. The first group contains a wrong side, and
+    two exchanged distances. The second group contains both at once. The third group contains one wrong
+    distance or height, with the correction that fits the prediction best.
 
     Examples
     --------
@@ -73,14 +74,14 @@ def possible_slips(measurement: Measurement, rig: Rig, predicted_m: Array) -> li
         for swap in swaps
         for side in _side_slips(swap.corrected, references_m)
     ]
-    # A distance that nobody read comes from the world point.
+    # Without a tape reading, the distance comes from the world point.
     says = "reads" if measurement.distances else "comes to"
     distances = list(_distance_slips(taped, references_m, predicted_m, says))
     return [sides + swaps, both, distances + _height_slips(taped, predicted_m)]
 
 
 def _as_taped(measurement: Measurement, rig: Rig) -> Measurement | None:
-    """The measurement by its distances alone; None where there are none and nowhere to measure from."""
+    """Return the measurement with distances only; None without distances and without reference points."""
     known = {point.name for point in rig.reference_points}
     point = measurement.point
     if point is None:
@@ -112,13 +113,13 @@ def _side_slips(taped: Measurement, references_m: Array) -> Iterator[Slip]:
 def _swaps(taped: Measurement) -> Iterator[Slip]:
     tapes = taped.distances
     for i, j in combinations(range(len(tapes)), 2):
-        one = replace(tapes[i], distance_m=tapes[j].distance_m)
+        own = replace(tapes[i], distance_m=tapes[j].distance_m)
         other = replace(tapes[j], distance_m=tapes[i].distance_m)
         swapped = [*tapes]
-        swapped[i], swapped[j] = one, other
+        swapped[i], swapped[j] = own, other
         text = (
-            f"the distances to {one.reference} and {other.reference} look exchanged: "
-            f"{one.distance_m:.3f} m to {one.reference} and {other.distance_m:.3f} m to {other.reference} fit"
+            f"the distances to {own.reference} and {other.reference} look exchanged: "
+            f"{own.distance_m:.3f} m to {own.reference} and {other.distance_m:.3f} m to {other.reference} fit"
         )
         yield Slip("swapped", text, replace(taped, distances=tuple(swapped)))
 
@@ -139,14 +140,14 @@ def _distance_slips(taped: Measurement, references_m: Array, predicted_m: Array,
 
 
 def _nearest(references_m: Array, distances_m: Array, predicted_m: Array) -> Array:
-    """Of the points at the given distances from the reference points, the one nearest to a prediction."""
+    """Return the point at the given distances from the reference points that is nearest to a prediction."""
     if len(references_m) == 1:
         towards_m = predicted_m - references_m[0]
         point_m: Array = references_m[0] + towards_m * (distances_m[0] / max(np.hypot(*towards_m), 1e-9))
         return point_m
     sides = SIDES if sides_alike(references_m) else (None,)
-    found = [multilaterate(references_m, distances_m, None, side).point_m for side in sides]
-    return min(found, key=lambda point_m: float(np.hypot(*(point_m - predicted_m))))
+    solutions = [multilaterate(references_m, distances_m, None, side).point_m for side in sides]
+    return min(solutions, key=lambda point_m: float(np.hypot(*(point_m - predicted_m))))
 
 
 def _height_slips(measurement: Measurement, predicted_m: Array) -> list[Slip]:
@@ -163,7 +164,10 @@ def _height_slips(measurement: Measurement, predicted_m: Array) -> list[Slip]:
 
 
 def _correction(read_m: float, right_m: float) -> str:
-    """In words; to the centimetre, as cameras know it, but for where the tapes make much of less."""
+    """Return the text of a correction: in cm, the accuracy of cameras; in mm for small corrections.
+
+    A small correction can be important if the tapes amplify it.
+    """
     off_m = right_m - read_m
     digits = 0 if abs(off_m) >= _FINE_M else 1
     change = f"{abs(off_m) * CM_PER_M:.{digits}f} cm {'more' if off_m > 0 else 'less'}"

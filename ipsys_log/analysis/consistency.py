@@ -1,4 +1,4 @@
-"""What error of a prediction is usual, where and in which direction: the unit that suspects are told by."""
+"""Usual errors of predictions by position and direction: the unit for the detection of outliers."""
 
 from __future__ import annotations
 
@@ -12,30 +12,32 @@ __all__ = ["FEWEST_POINTS", "score", "usual_covariances"]
 
 Array = NDArray[np.float64]
 
-# Of fewer places of a camera nobody can say what is usual: with ten terms to fit, each alone bends the model.
+# With fewer calibration points of a camera, the usual error is unknown: the fit has ten terms, so each point
+# alone bends the model.
 FEWEST_POINTS = 15
-# The median of |x| and of the length of (x, y, z), all normal with a sigma of 1.
+# Medians of |x| and of the length of (x, y, z), if x, y and z are normal with a sigma of 1.
 _MEDIAN_1D = float(norm.ppf(0.75))
 _MEDIAN_3D = float(chi.median(3))
-# Cameras look down on the middle of the places that they see, from about here; 1.5 m or 5 m would do nearly
-# as well, since it only turns the axes of the yardstick and stretches the powers below.
+# Assumed height of a camera above the middle of its calibration points. Results for 1.5 m or 5 m are nearly
+# the same, because the height only rotates the axes of the usual errors and scales the powers below.
 _EYE_M = 2.0
 _NEAREST_M = 0.5
-# Depths get worse to the rim of an image as a power of 1 + u^2 + v^2: none, or the first in theory, with a
-# standard deviation of 1; a model that does not bend enough adds to it.
+# Depth errors grow towards the rim of an image by a power of 1 + u^2 + v^2. In theory, the power is 0 or 1;
+# its prior has a standard deviation of 1. A model that does not bend enough increases the power.
 _EXPONENTS = np.arange(0.0, 4.01, 0.25)
 _EXPECTED = 0.5
-# Fifty places tell the power no better than by this: the rim has the benefit of the doubt.
+# Uncertainty of the power from fifty calibration points. The code adds it, in favour of points at the rim.
 _DOUBT = 0.5
 _FREEDOM = 4
-# Across the view an error is smaller than along it, yet not nothing.
+# Least ratio of the error across the view to the error along the view.
 _LEAST_ACROSS = 0.3
-# Nobody measures places better; keeps the yardstick from shrinking to rounding errors.
+# Best accuracy of a manual measurement. It prevents usual errors as small as rounding errors.
 _FINEST_M = 0.001
-# The polynomial has this many terms; a place that determines more than this of its own fit counts as this.
+# Number of terms of the polynomial, and upper limit of the leverage of a calibration point.
 _TERMS = 10
 _MOST_LEVERAGE = 0.9
-# Found by trial: what leave-one-out errors scatter beyond their leverage when few places are left over.
+# An empirical value: with few additional calibration points, leave-one-out errors scatter more than their
+# leverage predicts.
 _FEW = 50.0
 _LEAST_SPREAD_M = 0.02
 
@@ -43,25 +45,25 @@ _LEAST_SPREAD_M = 0.02
 def usual_covariances(
     predicted_m: Array, residuals_m: Array, fitted: NDArray[np.bool_], tape_m2: Array
 ) -> Array:
-    """For each place of a camera the covariance of a usual leave-one-out error, but for a bad tape's.
+    """Return the covariance of a usual leave-one-out error for each calibration point of a camera.
 
-    Depths are known worse than directions, the more so to the rim of an image, so an error along the
-    view is told from one across it; a model knows less at the rim of the places than amid them, by the
-    leverage that second-order terms have there. The rest is one scale for each direction, from medians,
-    so that gross errors do not count.
+    It does not contain the error of a bad tape. Depths are less accurate than directions, in particular at
+    the rim of an image. The covariance therefore distinguishes errors along and across the view. A model is
+    less accurate at the rim of the calibration points, by the leverage of second-order terms. Each direction
+    has one scale, from medians, so gross errors have no effect.
 
     Parameters
     ----------
-    predicted_m : (n, 3), where models fitted without a place see it.
+    predicted_m : (n, 3), predictions for each point by models fitted without this point.
     residuals_m : (n, 3), predicted minus measured.
-    fitted : (n,), whether the other models rest on a place. At least :data:`FEWEST_POINTS` are.
-    tape_m2 : (n, 3, 3), covariances of the measured points, 0 where not known.
+    fitted : (n,), True if the other models use the point. At least :data:`FEWEST_POINTS` points are True.
+    tape_m2 : (n, 3, 3), covariances of the measured points, 0 if unknown.
 
     Returns
     -------
-    (n, 3, 3), in m^2, without ``tape_m2``. With it the median of :func:`score` over the fitted places is
-    1 or, where the tape's error is much of it, a little less; much less for few places, which say little
-    of what is usual.
+    (n, 3, 3), in m^2, without ``tape_m2``. With ``tape_m2``, the median of :func:`score` over the fitted
+    points is 1, or slightly less if the tape's error is large. It is much less for few points, because they
+    do not determine the usual error well.
 
     Examples
     --------
@@ -88,22 +90,22 @@ def usual_covariances(
     shape = (across_m**2)[:, None, None] * np.eye(3) + (along_m**2 - across_m**2)[:, None, None] * outer
     shape *= leverage[:, None, None] ** 2
     few = 1 + _FEW / max(free, 1) ** 2
-    # The scatter holds the error of a usual tape, and keeps it: that of a bad one comes on top.
+    # The scatter contains the error of a usual tape. The error of a bad tape is additional.
     median = float(np.median(score(residuals_m[fitted], shape[fitted] + tape_m2[fitted])))
     covariances: Array = (few * median) ** 2 * shape + _FINEST_M**2 * np.eye(3)
     return covariances
 
 
 def score(residuals_m: Array, covariances_m2: Array) -> Array:
-    """Lengths (n,) of residuals (n, 3) in units of the usual one, given its covariance (n, 3, 3).
+    """Return the lengths (n,) of residuals (n, 3) in units of the usual error with covariance (n, 3, 3).
 
     Examples
     --------
     >>> score(np.array([[0.0, 0.0, 0.0154]]), 0.01**2 * np.eye(3)[None]).round(2).tolist()
     [1.0]
     """
-    weighed = np.linalg.solve(covariances_m2, residuals_m[:, :, None])[:, :, 0]
-    lengths: Array = np.sqrt((residuals_m * weighed).sum(axis=1)) / _MEDIAN_3D
+    weighted = np.linalg.solve(covariances_m2, residuals_m[:, :, None])[:, :, 0]
+    lengths: Array = np.sqrt((residuals_m * weighted).sum(axis=1)) / _MEDIAN_3D
     return lengths
 
 
@@ -112,10 +114,10 @@ def _sigma(errors: Array) -> float:
 
 
 def _exponent(along: Array, slant: Array) -> float:
-    """The power of 1 + u^2 + v^2 by which errors along the view, (n,), grow to the rim.
+    """Return the power of 1 + u^2 + v^2 by which errors along the view, (n,), grow towards the rim.
 
-    The likeliest one, by Student's distribution, in which no gross error has much of a say; few places
-    say little, so it is looked for around what is to be expected.
+    It is the most likely power by Student's distribution, which limits the effect of gross errors. A prior
+    around the expected power stabilizes the result for few calibration points.
     """
     unlikely = []
     for exponent in _EXPONENTS:
@@ -130,15 +132,17 @@ def _exponent(along: Array, slant: Array) -> float:
 
 
 def _growth(predicted_m: Array, fitted: NDArray[np.bool_]) -> tuple[Array, int]:
-    """How much greater the error of a place left out is than that of its camera point, (n,); and how
-    many places are left over when each term has had its own."""
+    """Return the factors (n,) from errors of camera points to errors of held-out points, and the redundancy.
+
+    The redundancy is the number of fitted points minus the number of terms.
+    """
     centred = predicted_m - predicted_m[fitted].mean(axis=0)
     terms = regressors(centred / np.maximum(np.abs(centred[fitted]).max(axis=0), _LEAST_SPREAD_M))
     _, sizes, axes = np.linalg.svd(terms[fitted], full_matrices=False)
     kept = sizes > 1e-6 * sizes[0]
     leverage = ((terms @ axes[kept].T / sizes[kept]) ** 2).sum(axis=1)
-    # Terms that the places do not determine, as where all have one height, are fitted to noise: they
-    # make a model less sure everywhere, and count three times.
+    # Some terms are not determined, for example if all calibration points have the same height. The fit of
+    # such terms depends on noise. They make a model less accurate everywhere, and count three times.
     undetermined = int(_TERMS - kept.sum())
     leverage += undetermined / fitted.sum()
     growth: Array = np.where(
@@ -148,8 +152,8 @@ def _growth(predicted_m: Array, fitted: NDArray[np.bool_]) -> tuple[Array, int]:
 
 
 def _axes_across(views: Array) -> tuple[Array, Array]:
-    """Two unit vectors, each (n, 3), at right angles to each view and to one another."""
-    # No camera looks along the floor to the right.
+    """Return two unit vectors, (n, 3) each, perpendicular to each view and to each other."""
+    # No camera looks to the right, parallel to the floor, so the cross product is never zero.
     first = np.cross(views, [1.0, 0.0, 0.0])
     first /= np.linalg.norm(first, axis=1)[:, None]
     return first, np.cross(views, first)

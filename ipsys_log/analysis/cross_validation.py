@@ -33,23 +33,23 @@ REPEATS = 4
 
 
 def gather_places(pairs: Mapping[str, Sequence[Pair]]) -> dict[str, Places]:
-    """The pairs of each camera as arrays; a camera without any is left out."""
+    """Return the pairs of each camera as arrays; omit cameras without pairs."""
     return {
         camera: Places(
-            np.array([pair.camera_m for pair in found]),
-            np.array([pair.world_m for pair in found]),
-            tuple(pair.measurement for pair in found),
+            np.array([pair.camera_m for pair in own_pairs]),
+            np.array([pair.world_m for pair in own_pairs]),
+            tuple(pair.measurement for pair in own_pairs),
         )
-        for camera, found in sorted(pairs.items())
-        if found
+        for camera, own_pairs in sorted(pairs.items())
+        if own_pairs
     }
 
 
 def deal(cameras: Mapping[str, Places], folds: int, rng: np.random.Generator) -> list[frozenset[str]]:
-    """Names of places dealt at random into folds, so that each camera's share in all of them is alike.
+    """Return random folds of names of calibration points, with equal shares of each camera in all folds.
 
-    A place is in one fold only, whichever cameras saw it: otherwise what is held out from one camera
-    would be known through another.
+    A calibration point is in one fold only, for all cameras. Otherwise, a point that is held out from one
+    camera would be known through another camera.
     """
     dealt: dict[str, int] = {}
     for places in cameras.values():
@@ -63,12 +63,12 @@ def deal(cameras: Mapping[str, Places], folds: int, rng: np.random.Generator) ->
 
 
 def predict_without(name: str, cameras: Mapping[str, Places], left_out: Collection[str]) -> dict[str, Array]:
-    """What a model fitted without some places predicts for all of them, (n, 3) in m by camera.
+    """Fit a model without some calibration points; return its predictions for all, (n, 3) in m by camera.
 
     Raises
     ------
     FitError
-        Where too few places are left.
+        Too few calibration points remain.
     """
     rest = {camera: _without(places, left_out) for camera, places in cameras.items()}
     models = fit_cameras(name, rest)
@@ -85,13 +85,13 @@ def _without(places: Places, left_out: Collection[str]) -> Places:
 
 
 def cross_validate(name: str, cameras: Mapping[str, Places], seed: int) -> dict[str, Array]:
-    """Repeated k-fold cross-validation: for each camera what models that had not seen a place predict.
+    """Predict held-out points by repeated k-fold cross-validation, for each camera.
 
     Parameters
     ----------
-    name : of the table of models.
-    cameras : all measured places.
-    seed : of the folds.
+    name : name in the table of models.
+    cameras : all calibration points.
+    seed : random seed of the folds.
 
     Returns
     -------
@@ -100,41 +100,43 @@ def cross_validate(name: str, cameras: Mapping[str, Places], seed: int) -> dict[
     Raises
     ------
     FitError
-        Where a fold leaves too few places.
+        Too few calibration points remain without a fold.
     """
     rng = np.random.default_rng(seed)
-    found = {camera: np.full((REPEATS, *places.world_m.shape), np.nan) for camera, places in cameras.items()}
+    predictions = {
+        camera: np.full((REPEATS, *places.world_m.shape), np.nan) for camera, places in cameras.items()
+    }
     for repeat in range(REPEATS):
         for fold in deal(cameras, FOLDS, rng):
             predicted = predict_without(name, cameras, fold)
             for camera, places in cameras.items():
                 rows = [row for row, place in enumerate(places.names) if place in fold]
-                found[camera][repeat, rows] = predicted[camera][rows]
-    return found
+                predictions[camera][repeat, rows] = predicted[camera][rows]
+    return predictions
 
 
 def leave_one_out(
     name: str, cameras: Mapping[str, Places]
 ) -> Callable[[frozenset[str]], dict[str, dict[str, Array]]]:
-    """Models fitted without one place after the other.
+    """Return a function that fits models without one calibration point after the other.
 
     Returns
     -------
-    A function that is given the places that no model shall be fitted to (they are predicted as well), and
-    gives for each camera and place the world point (3,) in m of a model fitted without that place. It
-    fits again only cameras on which what is given has a bearing.
+    A function of the calibration points that no fit may use; they are predicted too. For each camera and
+    point, it returns the world point (3,) in m that a model without this point predicts. It repeats the fit
+    only for cameras that depend on the unused points.
     """
     groups = [{camera: cameras[camera] for camera in tied} for tied in tied_cameras(name, cameras)]
     known: dict[tuple[int, frozenset[str]], dict[str, dict[str, Array]]] = {}
 
     def left_out(unused: frozenset[str]) -> dict[str, dict[str, Array]]:
-        found = {}
+        predictions = {}
         for number, group in enumerate(groups):
             key = number, unused & {place for places in group.values() for place in places.names}
             if key not in known:
                 known[key] = _each_left_out(name, group, key[1])
-            found.update(known[key])
-        return found
+            predictions.update(known[key])
+        return predictions
 
     return left_out
 
@@ -142,35 +144,37 @@ def leave_one_out(
 def _each_left_out(
     name: str, cameras: Mapping[str, Places], unused: Collection[str]
 ) -> dict[str, dict[str, Array]]:
-    found: dict[str, dict[str, Array]] = {camera: {} for camera in cameras}
+    predictions: dict[str, dict[str, Array]] = {camera: {} for camera in cameras}
     for place in dict.fromkeys(place for places in cameras.values() for place in places.names):
         predicted = predict_without(name, cameras, {place, *unused})
         for camera, places in cameras.items():
             if place in places.names:
-                found[camera][place] = predicted[camera][places.names.index(place)]
-    return found
+                predictions[camera][place] = predicted[camera][places.names.index(place)]
+    return predictions
 
 
 SUBSETS = 10
 _SIZES = (5, 7, 10, 15, 20, 30, 40, 60, 80, 120, 160, 240)
-# So many places at least are left to see the error at.
+# Least number of held-out points for an error.
 _LEAST_REST = 5
 
 
 def learning_sizes(name: str, cameras: Mapping[str, Places]) -> list[int]:
-    """How many places a curve is drawn at, for the camera that has fewest."""
+    """Return the subset sizes of a learning curve, for the camera with the fewest calibration points."""
     fewest = min(len(places.names) for places in cameras.values())
     return [size for size in _SIZES if min_pairs(name) <= size <= fewest - _LEAST_REST]
 
 
 def learning_curve(name: str, cameras: Mapping[str, Places], seed: int) -> Iterator[list[LearningPoint]]:
-    """For one number of places after the other the errors of models fitted to random subsets, by camera.
+    """Yield the errors of models that are fitted to random subsets, for one subset size after the other.
+
+    Each list contains the errors of all cameras.
 
     Parameters
     ----------
-    name : of the table of models.
-    cameras : all measured places; the errors are those at the places that are not in a subset.
-    seed : of the subsets.
+    name : name in the table of models.
+    cameras : all calibration points; the errors are those at the points that are not in a subset.
+    seed : random seed of the subsets.
     """
     rng = np.random.default_rng(seed)
     names = sorted({name for places in cameras.values() for name in places.names})
@@ -179,20 +183,20 @@ def learning_curve(name: str, cameras: Mapping[str, Places], seed: int) -> Itera
         for _ in range(SUBSETS):
             order = rng.permutation(names).tolist()
             used = {place for places in cameras.values() for place in _first(places, order, size)}
-            for camera, found in _errors(name, cameras, set(names) - used, set(names) - used).items():
-                errors[camera].append(found)
-        yield [_point(camera, size, np.array(found)) for camera, found in errors.items() if found]
+            for camera, means_m in _errors(name, cameras, set(names) - used, set(names) - used).items():
+                errors[camera].append(means_m)
+        yield [_point(camera, size, np.array(rows)) for camera, rows in errors.items() if rows]
 
 
 def _point(camera: str, size: int, errors_m: Array) -> LearningPoint:
-    """The mean and its spread over subsets; ``errors_m`` (subsets, 2) in space and on the floor."""
+    """Return the mean error and its spread over subsets; ``errors_m`` (subsets, 2) is 3D and on the floor."""
     mean_3d, mean_2d = errors_m.mean(axis=0).tolist()
     std_3d, std_2d = errors_m.std(axis=0, ddof=1).tolist() if len(errors_m) > 1 else (None, None)
     return LearningPoint(camera, size, mean_3d, mean_2d, len(errors_m), std_3d_m=std_3d, std_2d_m=std_2d)
 
 
 def labelled_subsets(measurements: Iterable[Measurement]) -> dict[str, set[str]]:
-    """Ids by the labels other than ``train`` and ``test``: subsets that somebody chose to fit on."""
+    """Return ids by labels other than ``train`` and ``test``: manually selected subsets for fits."""
     subsets: dict[str, set[str]] = {}
     for measurement in measurements:
         for label in set(measurement.splits) - {"train", "test"}:
@@ -203,13 +207,13 @@ def labelled_subsets(measurements: Iterable[Measurement]) -> dict[str, set[str]]
 def published_curve(
     name: str, cameras: Mapping[str, Places], subsets: Mapping[str, set[str]], held_out: set[str]
 ) -> list[LearningPoint]:
-    """Errors at held-out places of models fitted to labelled subsets, as in the paper's figures 10, 11."""
+    """Return errors at held-out points of models fitted to labelled subsets (the paper's figures 10, 11)."""
     names = {name for places in cameras.values() for name in places.names}
     points = []
     for label, used in sorted(subsets.items()):
-        for camera, found in _errors(name, cameras, names - used, held_out - used).items():
+        for camera, means_m in _errors(name, cameras, names - used, held_out - used).items():
             count = sum(place in used for place in cameras[camera].names)
-            points.append(LearningPoint(camera, count, *found, subsets=1, label=label))
+            points.append(LearningPoint(camera, count, *means_m, subsets=1, label=label))
     return points
 
 
@@ -221,7 +225,7 @@ def _first(places: Places, order: list[str], size: int) -> list[str]:
 def _errors(
     name: str, cameras: Mapping[str, Places], left_out: set[str], looked_at: set[str]
 ) -> dict[str, tuple[float, float]]:
-    """Mean error in space and on the floor by camera; none where the rest does not determine a model."""
+    """Return the mean 3D error and floor error by camera; none if the other points determine no model."""
     try:
         predicted = predict_without(name, cameras, left_out)
     except FitError:

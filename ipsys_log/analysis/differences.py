@@ -1,4 +1,4 @@
-"""Two runs, or what a run says and what its stage makes of the same input now: message by message."""
+"""Differences between two runs, or between a run and a repetition of its stage, message by message."""
 
 from __future__ import annotations
 
@@ -21,11 +21,12 @@ Array = NDArray[np.float64]
 
 @dataclass(frozen=True, slots=True)
 class Comparison:
-    """Counts of one channel: messages on both sides, those of the same frame, those that are equal byte for
-    byte; and the first difference.
+    """The differences of one channel.
 
-    ``rms`` and ``greatest`` are distances between what both sides have, in ``unit``: of corners in px, of
-    points in m. None where there is nothing to measure.
+    ``left`` and ``right`` are the numbers of messages on both sides. ``together`` is the number of pairs of
+    the same frame, and ``same`` the number of pairs that are equal byte for byte. ``first`` is the first
+    difference. ``rms`` and ``greatest`` are distances between common markers of both sides, in ``unit``:
+    corners in px, points in m. They are None without common markers.
     """
 
     topic: str
@@ -54,11 +55,11 @@ class Extent:
 
 
 def explain_apart(first: Extent, second: Extent) -> str | None:
-    """Return the reason why two sides have nothing in common to compare; None if they have.
+    """Return the reason why two sides have nothing in common; None if they have common data.
 
     Parameters
     ----------
-    first, second : of what moves, frame by frame.
+    first, second : extents of the markers, points, positions or tracks of both sides.
     """
     if not (len(first.times_ns) and len(second.times_ns)):
         side = "second" if len(first.times_ns) else "first"
@@ -74,7 +75,7 @@ def explain_apart(first: Extent, second: Extent) -> str | None:
 
 
 def _explain_times(first: Extent, second: Extent) -> str | None:
-    """Return the reason why two sides have no frame in common; None if they have one."""
+    """Return the reason why two sides have no frame in common; None if they have a common frame."""
     advice = "Compare logs of one recording"
     if first.times_ns[-1] < second.times_ns[0] or second.times_ns[-1] < first.times_ns[0]:
         sides = _range(first), _range(second)
@@ -110,32 +111,35 @@ def _nearest_ns(first: Extent, second: Extent) -> int:
 
 # A message, and the bytes of its payload.
 Stored = tuple[Message, bytes]
-# Log time, publish time, bytes, and what can be measured in them.
+# Log time, publish time, bytes, and coordinates by marker id.
 _Row = tuple[int, int, bytes, dict[int, Array]]
 
 
 def compare_channels(left: Iterable[Stored], right: Iterable[Stored]) -> list[Comparison]:
-    """Compare messages channel by channel; those of one channel and log time by their order.
+    """Compare messages channel by channel; compare those of one channel and log time by their order.
 
     Parameters
     ----------
-    left, right : messages with their bytes, in log order, of the same topics. Neither is held as a whole.
+    left, right : messages with their bytes, in log order, of the same topics. The function does not keep all
+        of them in memory.
     """
     tallies: dict[str, _Tally] = {}
     for ours, theirs in _together(_by_time(left), _by_time(right)):
         for topic in {**ours, **theirs}:
             tally = tallies.setdefault(topic, _Tally())
-            for one, other in zip_longest(ours.get(topic, ()), theirs.get(topic, ())):
-                tally.add(one, other)
+            for our_row, their_row in zip_longest(ours.get(topic, ()), theirs.get(topic, ())):
+                tally.add(our_row, their_row)
     return [tally.found(topic) for topic, tally in sorted(tallies.items())]
 
 
 def _by_time(messages: Iterable[Stored]) -> Iterator[tuple[int, dict[str, list[_Row]]]]:
-    """Messages of one log time, by topic."""
+    """Yield the messages of one log time after the other, by topic."""
     for time_ns, group in groupby(messages, key=lambda stored: stored[0].log_time_ns):
         rows: dict[str, list[_Row]] = defaultdict(list)
-        for one, data in group:
-            rows[one.topic].append((one.log_time_ns, one.publish_time_ns, data, _values(one.payload)))
+        for message, data in group:
+            rows[message.topic].append(
+                (message.log_time_ns, message.publish_time_ns, data, _values(message.payload))
+            )
         yield time_ns, rows
 
 
@@ -145,24 +149,24 @@ _Group = tuple[int, dict[str, list[_Row]]]
 def _together(
     left: Iterator[_Group], right: Iterator[_Group]
 ) -> Iterator[tuple[dict[str, list[_Row]], dict[str, list[_Row]]]]:
-    """Yield the rows of both sides for each log time; an empty dictionary for a side without any."""
-    one, other = next(left, None), next(right, None)
-    while one is not None or other is not None:
-        if other is None or (one is not None and one[0] < other[0]):
-            assert one is not None
-            yield one[1], {}
-            one = next(left, None)
-        elif one is None or other[0] < one[0]:
-            yield {}, other[1]
-            other = next(right, None)
+    """Yield the rows of both sides for each log time; an empty dictionary for a side without rows."""
+    ours, theirs = next(left, None), next(right, None)
+    while ours is not None or theirs is not None:
+        if theirs is None or (ours is not None and ours[0] < theirs[0]):
+            assert ours is not None
+            yield ours[1], {}
+            ours = next(left, None)
+        elif ours is None or theirs[0] < ours[0]:
+            yield {}, theirs[1]
+            theirs = next(right, None)
         else:
-            yield one[1], other[1]
-            one, other = next(left, None), next(right, None)
+            yield ours[1], theirs[1]
+            ours, theirs = next(left, None), next(right, None)
 
 
 @dataclass(slots=True)
 class _Tally:
-    """Counts and differences of one channel so far; in px for markers, in m for all else."""
+    """Counts and differences of one channel so far; in px for markers, in m for all other channels."""
 
     left: int = 0
     right: int = 0
@@ -175,7 +179,7 @@ class _Tally:
     greatest: float = 0.0
 
     def add(self, one: _Row | None, other: _Row | None) -> None:
-        """A message of both sides, or of one."""
+        """Add a message of both sides, or of one side."""
         self.left += one is not None
         self.right += other is not None
         if one is None or other is None or one[:3] != other[:3]:
@@ -218,14 +222,14 @@ def _values(payload: Any) -> dict[int, Array]:
 def _said(left: _Row | None, right: _Row | None) -> str:
     """Describe the difference of two messages."""
     if left is None or right is None:
-        there = left or right
-        assert there is not None
+        row = left or right
+        assert row is not None
         side = "second" if left is None else "first"
-        return f"a message that only the {side} has, at {format_time(there[0])} ({there[0]} ns)"
-    where = f"at {format_time(left[0])} ({left[0]} ns)" if left[0] else "for all times"
+        return f"a message that only the {side} has, at {format_time(row[0])} ({row[0]} ns)"
+    time_text = f"at {format_time(left[0])} ({left[0]} ns)" if left[0] else "for all times"
     if left[1] != right[1]:
-        return f"publish times differ by {right[1] - left[1]} ns, {where}"
+        return f"publish times differ by {right[1] - left[1]} ns, {time_text}"
     ids = sorted(left[3].keys() ^ right[3].keys())
     if ids:
-        return f"marker {ids[0]} is only in one of them, {where}"
-    return f"content differs, {where}"
+        return f"marker {ids[0]} is only in one of them, {time_text}"
+    return f"content differs, {time_text}"

@@ -1,4 +1,4 @@
-"""What a simulated lab knows of where its markers truly were."""
+"""Ground truth of a simulated lab: true positions of markers, and errors against them."""
 
 from __future__ import annotations
 
@@ -15,12 +15,13 @@ from ipsys_log.units import NS_PER_S
 __all__ = ["gather_tracks", "track_errors", "true_points"]
 
 _SAME_HEIGHT_M = 0.005
-# Over 1/30 s a straight line is off by 0.7 mm where a robot at 2 m/s turns by 2.5 rad/s, over 0.1 s by 6 mm.
+# Longest gap for linear interpolation. For a robot with 2 m/s and 2.5 rad/s, its error is 0.7 mm over 1/30 s,
+# and 6 mm over 0.1 s.
 _GAP_NS = NS_PER_S // 10
 
 
 def gather_tracks(messages: Iterable[Message]) -> dict[int, Sightings]:
-    """Positions of tracks by marker, in the order of time and, at one time, of the log."""
+    """Return positions of tracks by marker, in order of time; those of equal time in log order."""
     rows: dict[int, list[tuple[int, float, float, float]]] = {}
     for message in messages:
         if isinstance(message.payload, Tracks):
@@ -39,7 +40,7 @@ def gather_tracks(messages: Iterable[Message]) -> dict[int, Sightings]:
 
 
 def true_points(places: Iterable[Measured], truth: Mapping[int, Sightings]) -> dict[str, NDArray[np.float64]]:
-    """Where each measured marker truly was, (3,) in m by id; only where the truth of that time is known."""
+    """Return the true position of each measured marker, (3,) in m by id, if the ground truth is known."""
     points = {}
     for place in places:
         measurement = place.measurement
@@ -53,30 +54,30 @@ def true_points(places: Iterable[Measured], truth: Mapping[int, Sightings]) -> d
 def track_errors(
     tracks: Mapping[int, Sightings], truth: Mapping[int, Sightings], carried: bool = False
 ) -> tuple[ErrorStatistics, ErrorStatistics] | None:
-    """Errors of tracks against the truth at the same instants, in space and on the floor.
+    """Return the 3D errors and the floor errors of tracks against the ground truth at the same instants.
 
-    Between two instants of the truth, up to 0.1 s apart, it lies on the line from one to the other: a rolling
-    shutter exposes a marker some time after the frame's instant.
+    A rolling shutter exposes a marker some time after the frame's instant. The true position between two
+    instants of the ground truth, up to 0.1 s apart, is therefore interpolated linearly.
 
     Parameters
     ----------
-    carried : only instants at which a marker has the height of its track: for a model that is told at which
-        height the robot carries it, and not when somebody lifts it to measure a place.
+    carried : True to use only instants at which a marker has the height of its track. Models with a known
+        marker height are not valid while a user lifts the marker for a measurement.
 
     Returns
     -------
-    None where no instant of a track has a truth.
+    Both error statistics; None if no instant of a track has a ground truth.
     """
     offsets = []
     for marker_id, track in tracks.items():
         known = truth.get(marker_id)
         if known is None:
             continue
-        # The last of the poses of one instant rests on all cameras. Cameras that expose a marker at
-        # different times have no instant in common: the pose of each counts.
+        # The last pose of an instant uses all cameras. Cameras that expose a marker at different times have
+        # no common instant: the pose of each camera counts.
         times_ns, last = np.unique(track.times_ns[::-1], return_index=True)
-        true_m, told = _between(known, times_ns)
-        offset = (track.points_m[::-1][last] - true_m)[told]
+        true_m, is_known = _between(known, times_ns)
+        offset = (track.points_m[::-1][last] - true_m)[is_known]
         if carried:
             offset = offset[np.abs(offset[:, 2]) < _SAME_HEIGHT_M]
         if len(offset):
@@ -91,15 +92,16 @@ def track_errors(
 
 
 def _between(known: Sightings, times_ns: NDArray[np.int64]) -> tuple[NDArray[np.float64], NDArray[np.bool_]]:
-    """Points (n, 3) at times (n,), and whether they are told: not beyond the ends, nor in a gap.
+    """Return points (n, 3) at times (n,), and a mask of the known points.
 
-    At an instant of its own the truth is as it stands, the first one where it is there twice.
+    Points beyond the ends or in a gap are unknown. At an instant of the ground truth, the result is the exact
+    true point. If this instant occurs twice, the first point counts.
     """
     after = np.searchsorted(known.times_ns, times_ns).clip(max=len(known.times_ns) - 1)
     end_ns = known.times_ns[after]
     before = np.where(end_ns > times_ns, after - 1, after).clip(min=0)
     start_ns = known.times_ns[before]
-    told = (start_ns <= times_ns) & (times_ns <= end_ns) & (end_ns - start_ns <= _GAP_NS)
+    is_known = (start_ns <= times_ns) & (times_ns <= end_ns) & (end_ns - start_ns <= _GAP_NS)
     share = (times_ns - start_ns) / np.maximum(end_ns - start_ns, 1)
     start_m = known.points_m[before]
-    return start_m + share[:, None] * (known.points_m[after] - start_m), told
+    return start_m + share[:, None] * (known.points_m[after] - start_m), is_known

@@ -1,4 +1,4 @@
-"""The latency ledger: when each step of a position was done, by the wall clock."""
+"""Latency ledger: the wall-clock time of each processing step of a position."""
 
 from __future__ import annotations
 
@@ -25,12 +25,12 @@ _STEP_OF = {MARKERS: "detected", POSITIONS: "located", TRACKS: "fused"}
 
 
 class Ledger:
-    """Notes the times of frames on their way. Telemetry: no stage sees it.
+    """A ledger of the times of frames in the processing steps. It is telemetry: no stage reads it.
 
     Parameters
     ----------
     now_ns : the wall clock.
-    received_ns : when frames came, by log time.
+    received_ns : arrival times of frames, by log time.
     """
 
     def __init__(self, now_ns: Callable[[], int], received_ns: Mapping[int, int]) -> None:
@@ -39,7 +39,10 @@ class Ledger:
         self._times_ns: dict[int, dict[tuple[str, str], int]] = {}
 
     def note(self, channel: Channel, run: str, messages: Iterable[Message]) -> Iterator[Message]:
-        """Yield the messages, unchanged. One of this channel is a step done for the frame of its log time."""
+        """Yield the messages unchanged; a message of this channel and run ends a step for its frame.
+
+        The log time of the message identifies the frame.
+        """
         step, payloads = _STEP_OF.get(channel), channel.payloads
         for message in messages:
             if (
@@ -54,7 +57,7 @@ class Ledger:
             yield message
 
     def entry(self, message: Message) -> Message | None:
-        """The times of a position that has just been published; None for any other message."""
+        """Return the times of a position that was just published; None for any other message."""
         times_ns = self._times_ns.get(message.log_time_ns, {})
         received_ns = self._received_ns.get(message.log_time_ns)
         run = run_of_topic(message.topic) or ""
@@ -73,32 +76,34 @@ class Ledger:
 
 
 def recorded_latencies(paths: Sequence[Path]) -> list[Latency]:
-    """The ledger in a log.
+    """Return the latency ledger of a log.
 
     Raises
     ------
     IpsysError
-        Where there is none.
+        The log has no latencies.
     """
     with Session(paths) as session:
-        found: list[Latency] = session.payloads(session.topics(LATENCY))
-        if not found:
+        latencies: list[Latency] = session.payloads(session.topics(LATENCY))
+        if not latencies:
             raise IpsysError(f"{session}: holds no latencies; only 'ipsys live' writes them")
-    return found
+    return latencies
 
 
 def step_times_s(entries: Iterable[Latency]) -> dict[str, NDArray[np.float64]]:
-    """How long each step took, and ``total`` from receiving a frame to publishing, in s.
+    """Return the duration of each step, and ``total`` from the arrival of a frame to publishing, in s.
 
-    ``received`` is from the exposure to the arrival of a frame, what camera and cable take; cameras that give
-    no capture stamps say nothing of it.
+    ``received`` is the time from the exposure to the arrival of a frame: the latency of camera and cable. It
+    is unknown for cameras without capture stamps.
     """
-    times_ns = np.array([[getattr(one, _field(step)) for step in STEPS] for one in entries], dtype=np.int64)
+    times_ns = np.array(
+        [[getattr(entry, _field(step)) for step in STEPS] for entry in entries], dtype=np.int64
+    )
     times_ns = times_ns.reshape(-1, len(STEPS))
     took_s = np.diff(times_ns, axis=1) / NS_PER_S
-    found = {step: took_s[:, n] for n, step in enumerate(STEPS[1:])}
-    found["received"] = found["received"][found["received"] > 0]
-    return {**found, "total": (times_ns[:, -1] - times_ns[:, 1]) / NS_PER_S}
+    durations_s = {step: took_s[:, n] for n, step in enumerate(STEPS[1:])}
+    durations_s["received"] = durations_s["received"][durations_s["received"] > 0]
+    return {**durations_s, "total": (times_ns[:, -1] - times_ns[:, 1]) / NS_PER_S}
 
 
 def _field(step: str) -> str:
@@ -107,7 +112,7 @@ def _field(step: str) -> str:
 
 @dataclass(frozen=True, slots=True)
 class Percentiles:
-    """Of one step, in s."""
+    """The percentiles of the duration of one step, in s."""
 
     median_s: float
     p90_s: float
@@ -116,10 +121,10 @@ class Percentiles:
 
 
 def latency_percentiles(times_s: Mapping[str, NDArray[np.float64]]) -> dict[str, Percentiles]:
-    """Median, 90th and 99th percentile and maximum of each step."""
-    found = {}
+    """Return median, 90th and 99th percentile and maximum of each step."""
+    percentiles = {}
     for step, values in times_s.items():
         if len(values):
             median_s, p90_s, p99_s, max_s = np.percentile(values, [50, 90, 99, 100]).tolist()
-            found[step] = Percentiles(median_s, p90_s, p99_s, max_s)
-    return found
+            percentiles[step] = Percentiles(median_s, p90_s, p99_s, max_s)
+    return percentiles

@@ -1,4 +1,4 @@
-"""Measurements that the others contradict: found one by one, and explained where one slip explains them."""
+"""Detection of outliers among measurements, one by one, and their explanation by a single blunder."""
 
 from __future__ import annotations
 
@@ -19,17 +19,19 @@ __all__ = ["LeaveOneOut", "find_suspects"]
 
 Array = NDArray[np.float64]
 
-# Ids that no fit may use -> camera -> id -> world point (3,) predicted by a model fitted without that place.
+# A function from ids that no fit may use to predictions by camera and id. Each prediction is a world point
+# (3,) of a model that is fitted without this point.
 LeaveOneOut = Callable[[frozenset[str]], Mapping[str, Mapping[str, Array]]]
 
-# In units of the usual error: a place that is further off is a suspect (in simulated labs one of 150 good
-# places is, in 1 to 5 sessions of 100).
+# A calibration point with a larger error, in units of the usual error, is an outlier. In simulated labs, one
+# of 150 good points is an outlier in 1 to 5 of 100 sessions.
 _SUSPECT = 3.7
-# A slip explains it if without it the place is no further off than the first; or than the second share of
-# what it was, and no suspect.
+# A blunder explains an outlier if the error of the corrected point is at most _EXPLAINED. A larger error is
+# also sufficient if it is at most _SHARE_LEFT times the original error and below _SUSPECT.
 _EXPLAINED = 2.5
 _SHARE_LEFT = 0.2
-# So much, and so many times the median, is no error of a camera or a model.
+# An error that is greater than both this length and this multiple of the median is gross: it is no error of a
+# camera or a model.
 _GROSS_M = 0.3
 _GROSS = 3.0
 _MOST_SHARE = 0.2
@@ -38,7 +40,7 @@ _USUAL_TAPE_M = 0.003
 
 @dataclass(frozen=True, slots=True, eq=False)
 class _Finding:
-    """A place in the light of the others: what they predict, and how unusual the error is."""
+    """The prediction for a calibration point from all other points, and the score of its error."""
 
     cameras: tuple[str, ...]
     predicted_m: Array
@@ -51,29 +53,30 @@ _Judge = Callable[[frozenset[str]], dict[str, _Finding]]
 
 
 def find_suspects(leave_one_out: LeaveOneOut, places: Sequence[Measured]) -> tuple[Suspect, ...]:
-    """Measured places that disagree with models fitted without them.
+    """Return the outliers: calibration points that disagree with models that are fitted without them.
 
-    The worst place is taken out and the others are judged afresh, until none stands out: a gross error
-    spoils the fits to its neighbours, hides smaller errors, and makes good places look bad. What was
-    taken out is judged once more by the clean fits, and put back where they agree with it.
+    The function removes the worst point and repeats the test of the other points, until no point is an
+    outlier. The repetition is necessary, because a gross error affects the fits to its neighbours, hides
+    smaller errors, and makes good points look bad. Finally, the function tests the removed points against the
+    fits without outliers, and restores points that agree with them.
 
     Parameters
     ----------
-    leave_one_out : given ids that no fit may use, for each camera and each place that it saw, those
-        ids included, the world point (3,) in m predicted by a model fitted without that place.
-    places : the measurements that count; those that no camera saw are passed over, and so are cameras
-        that saw fewer than 15.
+    leave_one_out : function of ids that no fit may use. It returns, by camera and by point that the camera
+        saw, the world point (3,) in m of a model without this point. Points with those ids are included.
+    places : the valid measurements. Measurements that no camera saw are skipped, and also cameras that saw
+        fewer than 15 of them.
 
     Returns
     -------
-    The suspects, at most a fifth of the places, the one that is off by most first.
+    The outliers, at most a fifth of the points, the outlier with the largest error first.
 
     Raises
     ------
     FitError
-        Where ``leave_one_out`` has too few places to begin with.
+        ``leave_one_out`` has too few points at the start.
     IpsysError
-        Where a place forms no world point.
+        A measurement forms no world point.
 
     Examples
     --------
@@ -100,15 +103,15 @@ def find_suspects(leave_one_out: LeaveOneOut, places: Sequence[Measured]) -> tup
 
 
 def _with_tape(rig: Rig) -> Rig:
-    """The rig with a usual tape if it names none: a flat crossing is to excuse an error all the same."""
+    """Return the rig with a usual tape if it has none: a small crossing angle must still excuse an error."""
     return replace(rig, tape_sigma_m=_USUAL_TAPE_M) if rig.tape_sigma_m is None else rig
 
 
 def _search(judge: _Judge) -> tuple[list[str], dict[str, _Finding]]:
-    """The places that contradict the others, and all places in the light of the others."""
+    """Return the names of the outliers, and the findings of all calibration points."""
     findings = judge(frozenset())
     taken: list[str] = []
-    with suppress(FitError):  # too few places are left to judge the others by
+    with suppress(FitError):  # too few calibration points remain for the test of the others
         while len(taken) < _MOST_SHARE * len(findings) and (worst := _worst(findings, taken)):
             taken.append(worst)
             findings |= judge(frozenset(taken))
@@ -120,10 +123,10 @@ def _search(judge: _Judge) -> tuple[list[str], dict[str, _Finding]]:
 
 
 def _worst(findings: Mapping[str, _Finding], taken: Collection[str]) -> str | None:
-    """The place that stands out most of those that are still in; None where none does.
+    """Return the worst outlier of the remaining points; None if there is no outlier.
 
-    Errors of metres spoil the very yardstick, but by length they stand out all the more: a fit without a
-    place owes nothing to its error, the fits to the others owe a part of it.
+    Errors of metres also affect the usual error, but their length identifies them. The fit without a point is
+    independent of the point's error, while the fits for the other points contain a part of it.
     """
     lengths = {name: float(np.linalg.norm(finding.residual_m)) for name, finding in findings.items()}
     left = [name for name in findings if name not in taken]
@@ -137,7 +140,7 @@ def _worst(findings: Mapping[str, _Finding], taken: Collection[str]) -> str | No
 def _judge(
     predicted: Mapping[str, Mapping[str, Array]], fixed: Mapping[str, TapePoint], taken: Collection[str]
 ) -> dict[str, _Finding]:
-    """Each place that a camera with enough places saw."""
+    """Return the findings of all points that a camera with enough calibration points saw."""
     rows: dict[str, list[tuple[str, Array, Array]]] = {}
     for camera, points in sorted(predicted.items()):
         names = [name for name in fixed if name in points and np.isfinite(points[name]).all()]
@@ -154,8 +157,11 @@ def _judge(
 
 
 def _finding(seen: Sequence[tuple[str, Array, Array]], fixed: TapePoint) -> _Finding:
-    """What the cameras have in common, the tape's error above all, does not average out: neither is the
-    mean of several taken for better than one."""
+    """Return the mean finding of several cameras.
+
+    The mean does not reduce the common errors of the cameras, mainly the error of the tape. The usual error
+    of the mean is therefore that of one camera.
+    """
     cameras, points_m, usual_m2 = zip(*seen, strict=True)
     predicted_m = np.mean(points_m, axis=0)
     usual = np.mean(usual_m2, axis=0)
@@ -186,7 +192,7 @@ def _suspect(place: Measured, finding: _Finding) -> Suspect:
 
 
 def _explain(place: Measured, finding: _Finding) -> tuple[Slip, Array] | None:
-    """The simplest slip without which the error is a usual one, and the world point then."""
+    """Return the simplest blunder whose correction gives a usual error, and the corrected world point."""
     usual = min(max(_EXPLAINED, _SHARE_LEFT * finding.score), _SUSPECT)
     for group in possible_slips(place.measurement, place.rig, finding.predicted_m):
         left = []
@@ -194,7 +200,7 @@ def _explain(place: Measured, finding: _Finding) -> tuple[Slip, Array] | None:
             try:
                 fixed = world_point(slip.corrected, place.rig)
             except IpsysError:
-                continue  # without this slip it would be nowhere
+                continue  # the corrected measurement forms no world point
             left.append((_score(finding.predicted_m, finding.usual_m2, fixed), slip, fixed.world_m))
         if left and (best := min(left, key=lambda row: row[0]))[0] <= usual:
             return best[1:]

@@ -1,4 +1,4 @@
-"""Calibration points: the valid measurements, their world points, and the camera points seen there."""
+"""Calibration points: the valid measurements, their world points, and the camera points of the cameras."""
 
 from __future__ import annotations
 
@@ -28,19 +28,19 @@ __all__ = [
     "still_interval",
 ]
 
-# A marker lies still while it stays within these of where it was when it was measured: above the
-# noise of plain sub-pixel corners (about 1 mm across and 5 mm along the view at 2 m).
+# A marker is stationary if it stays within these distances from its position at the measurement. They are
+# above the noise of plain sub-pixel corners (about 1 mm across and 5 mm along the view at 2 m).
 _STILL_ACROSS_M = 0.01
 _STILL_ALONG_M = 0.04
 _GAP_NS = 2 * NS_PER_S
 _FARTHEST_M = 10_000.0
-# Heights that differ by less are one: what a ruler and uneven boards give.
+# Heights with smaller differences are equal: the accuracy of a ruler and of uneven boards.
 _ONE_HEIGHT_M = 0.005
 
 
 @dataclass(frozen=True, slots=True, eq=False)
 class Sightings:
-    """What one camera saw of one marker: ``times_ns`` (n,) ascending, ``points_m`` (n, 3)."""
+    """Sightings of one marker by one camera: ``times_ns`` (n,), ascending, and ``points_m`` (n, 3)."""
 
     times_ns: NDArray[np.int64]
     points_m: NDArray[np.float64]
@@ -52,7 +52,7 @@ def gather_sightings(messages: Iterable[Message]) -> dict[tuple[str, int], Sight
     Raises
     ------
     IpsysError
-        A point is not a number, or is farther away than any lab is wide.
+        A point is not a number, or its distance is impossible in a lab.
     """
     rows: dict[tuple[str, int], list[tuple[int, float, float, float]]] = {}
     for message in messages:
@@ -76,40 +76,40 @@ def gather_sightings(messages: Iterable[Message]) -> dict[tuple[str, int], Sight
 
 
 def measured_in_order(messages: Iterable[Message], override: Rig | None) -> list[Measured]:
-    """The measurements that have not been withdrawn, each with its rig.
+    """Return the measurements that are not withdrawn, each with its rig.
 
     Parameters
     ----------
-    messages : rigs and measurements, in log order; the first rig holds for what was measured before it.
-    override : a rig that holds for all of them instead.
+    messages : rigs and measurements, in log order. The first rig is also valid for measurements before it.
+    override : a rig that replaces the rigs of all measurements.
 
     Raises
     ------
     IpsysError
-        Where two measurements have one id, one lacks its marker, or there is no rig.
+        Two measurements have the same id, a measurement has no marker, or there is no rig.
     """
     rigs: list[Rig] = [override] if override is not None else []
-    found: list[tuple[Measurement, int]] = []
+    numbered: list[tuple[Measurement, int]] = []
     for message in messages:
         if isinstance(message.payload, Rig) and override is None:
             rigs.append(message.payload)
         elif isinstance(message.payload, Measurement):
-            found.append((message.payload, max(len(rigs) - 1, 0)))
-    active = {measurement.id for measurement in active_measurements(m for m, _ in found)}
-    if found and not rigs:
+            numbered.append((message.payload, max(len(rigs) - 1, 0)))
+    active = {measurement.id for measurement in active_measurements(m for m, _ in numbered)}
+    if numbered and not rigs:
         raise IpsysError("the log has no rig (reference points, markers): give one with --rig lab.toml")
-    # Of an id that was withdrawn and measured again, the last one counts.
-    last = {m.id: Measured(m, rigs[number]) for m, number in found if m.withdraws is None}
+    # If an id was withdrawn and measured again, the last measurement counts.
+    last = {m.id: Measured(m, rigs[number]) for m, number in numbered if m.withdraws is None}
     return [place for name, place in last.items() if name in active]
 
 
 def active_measurements(measurements: Iterable[Measurement]) -> list[Measurement]:
-    """The measurements that have not been withdrawn, in the order they were made.
+    """Return the measurements that are not withdrawn, in their order.
 
     Raises
     ------
     IpsysError
-        Where two measurements have one id, or one lacks its marker.
+        Two measurements have the same id, or a measurement has no marker.
     """
     active: dict[str, Measurement] = {}
     for measurement in measurements:
@@ -125,17 +125,17 @@ def active_measurements(measurements: Iterable[Measurement]) -> list[Measurement
 
 
 def still_interval(sightings: Sightings, time_ns: int) -> tuple[int, int] | None:
-    """The stretch around a time in which a marker does not move.
+    """Return the stationary interval of a marker around a time.
 
     Parameters
     ----------
-    sightings : of one marker by one camera.
-    time_ns : when it was measured.
+    sightings : sightings of one marker by one camera.
+    time_ns : time of the measurement.
 
     Returns
     -------
-    First and last time in ns, both included; None where the camera did not see the marker within
-    two seconds of ``time_ns``.
+    First and last time in ns, both included; None if the camera did not see the marker within two seconds of
+    ``time_ns``.
     """
     if len(sightings.times_ns) == 0:
         return None
@@ -156,23 +156,22 @@ def still_interval(sightings: Sightings, time_ns: int) -> tuple[int, int] | None
 def build_pairs(
     sightings: Mapping[tuple[str, int], Sightings], places: Iterable[Measured]
 ) -> dict[str, list[Pair]]:
-    """For each camera, the measured places that it saw.
+    """Return the calibration points that each camera saw.
 
     Parameters
     ----------
-    sightings : by camera and marker, from :func:`gather_sightings`.
-    places : those that count, from :func:`measured_in_order`.
+    sightings : sightings by camera and marker, from :func:`gather_sightings`.
+    places : the valid measurements, from :func:`measured_in_order`.
 
     Returns
     -------
-    dict from camera to pairs: the mean camera point over the still interval, and the world point with
-    its covariance where that is known.
+    dict from camera to pairs: the mean camera point over the stationary interval, and the world point with
+    its covariance if that is known.
 
     Raises
     ------
     IpsysError
-        For a marker that is not in the rig or never seen, a measurement that gives no point, or a pair that
-        was entered twice.
+        A marker is not in the rig or never visible, a measurement gives no point, or a pair occurs twice.
     """
     cameras = sorted({camera for camera, _ in sightings})
     seen_ids = sorted({marker_id for _, marker_id in sightings})
@@ -180,7 +179,7 @@ def build_pairs(
     for place in places:
         measurement, rig = place.measurement, place.rig
         marker_id = measurement.marker_id
-        assert marker_id is not None  # active_measurements has seen to it
+        assert marker_id is not None  # active_measurements has checked it
         if not rig.knows(marker_id) or marker_id not in seen_ids:
             raise IpsysError(
                 f"measurement {measurement.id} names marker {marker_id}, which "
@@ -189,9 +188,9 @@ def build_pairs(
             )
         fixed = world_point(measurement, rig)
         for camera in cameras:
-            found = _mean_point(sightings.get((camera, marker_id)), measurement)
-            if found is not None:
-                mean_m, frames = found
+            camera_point = _mean_point(sightings.get((camera, marker_id)), measurement)
+            if camera_point is not None:
+                mean_m, frames = camera_point
                 row = (measurement.id, marker_id, mean_m, fixed.world_m, frames, fixed.covariance_m2)
                 pairs[camera].append(Pair(*row))
     for camera, entered in pairs.items():
@@ -200,7 +199,7 @@ def build_pairs(
 
 
 def _check_twins(camera: str, pairs: Iterable[Pair]) -> None:
-    """One pair entered twice counts double, and is known where it is held out."""
+    """Check that no pair occurs twice: it would count double, and a fit would know it when it is held out."""
     seen: dict[bytes, str] = {}
     for pair in pairs:
         twin = seen.setdefault(pair.camera_m.tobytes() + pair.world_m.tobytes(), pair.measurement)
@@ -229,18 +228,18 @@ def _mean_point(
 
 
 def split(measurements: Iterable[Measurement], train: str, seed: int) -> tuple[set[str], set[str]]:
-    """Ids of the measurements to fit on, and of those held out.
+    """Return the ids of the measurements for the fit, and the ids of the held-out measurements.
 
     Parameters
     ----------
-    measurements : those that count.
-    train : the label of the subset to fit on; ``test`` is the label of those held out.
-    seed : where no measurement has a label, a fifth of them is held out at random.
+    measurements : the valid measurements.
+    train : the label of the subset for the fit; ``test`` is the label of held-out measurements.
+    seed : random seed. If no measurement has a label, a random fifth of them is held out.
 
     Raises
     ------
     IpsysError
-        Where measurements are labelled, but none with ``train``.
+        Measurements have labels, but no measurement has the label ``train``.
     """
     measurements = list(measurements)
     labels = sorted({label for m in measurements for label in m.splits} - {"test"})
@@ -259,7 +258,10 @@ def split(measurements: Iterable[Measurement], train: str, seed: int) -> tuple[s
 
 
 def level_cameras(model: Model) -> dict[str, float]:
-    """The cameras whose places all have one height, with that height in m: it cannot be learned there."""
+    """Return the cameras whose calibration points all have one height, with this height in m.
+
+    A fit to such points cannot determine heights.
+    """
     heights = {c.camera: np.array([pair.world_m[2] for pair in c.pairs]) for c in model.cameras}
     return {name: float(h.mean()) for name, h in heights.items() if np.ptp(h) < _ONE_HEIGHT_M}
 
@@ -269,7 +271,7 @@ KINDS = ("training", "test", "measured")
 
 @dataclass(frozen=True, slots=True, eq=False)
 class Place:
-    """``point_m`` (3,) in the world; ``kind`` is ``measured`` where nothing says what it is for."""
+    """A calibration point: ``point_m`` (3,) in the world; ``kind`` is ``measured`` without a label."""
 
     id: str
     point_m: NDArray[np.float64]
@@ -277,15 +279,15 @@ class Place:
 
 
 def measured_places(measurements: Iterable[Measurement], rig: Rig | None) -> tuple[list[Place], list[str]]:
-    """The places that count, and what is wrong with those that cannot be drawn.
+    """Return the valid calibration points, and the faults of those without a position.
 
-    To look at a log must be possible above all when something in it is wrong: what the stages
-    refuse is left out here, and said.
+    A user must be able to view a log with faults. This function therefore skips measurements that the stages
+    refuse, and returns their faults.
 
     Parameters
     ----------
-    measurements : in the order they were made.
-    rig : for the reference points; without one only places with a world point can be drawn.
+    measurements : measurements in their order.
+    rig : rig with the reference points; without a rig, only measurements with a world point have a position.
     """
     try:
         active = active_measurements(measurements)
@@ -297,7 +299,7 @@ def measured_places(measurements: Iterable[Measurement], rig: Rig | None) -> tup
             faults.append(f"measurement {measurement.id} cannot be placed: the log has no rig")
             continue
         try:
-            # The rig is not looked at where the measurement has its point.
+            # The rig is not used if the measurement has a world point.
             point_m = world_point(measurement, rig or Rig("", "", 1.0)).world_m
         except IpsysError as error:
             faults.append(str(error))

@@ -1,8 +1,9 @@
-"""The next calibration points: those that reduce the predicted error over the floor most.
+"""Next calibration points: the points that reduce the predicted error over the floor most.
 
-A model's predicted error falls with the leverage of a position among the fitted places, and a new place
-lowers it all over the view of each camera that sees it, the more the better the tape knows the place.
-Greedy I-optimal design picks, one after the other, the place after which the mean error is least.
+A model's predicted error depends on the leverage of a position relative to the calibration points of the fit.
+A new calibration point reduces the error in the whole field of view of each camera that sees it. The effect
+is larger if the tape measures the point more accurately. Greedy I-optimal design selects, one after the
+other, the point that gives the least mean error.
 """
 
 from __future__ import annotations
@@ -26,25 +27,26 @@ __all__ = ["Plan", "PlannedPlace", "View", "mean_length", "plan_places"]
 Array = NDArray[np.float64]
 Mask = NDArray[np.bool_]
 
-# The corners of a marker of any heading lie on a circle; so many points of it are looked at.
+# Number of tested points of a circle, which contains the corners of a marker of any heading.
 _RIM = 12
-# Where the lens is not known, so far beyond the outermost places (in u and v) a camera sees.
+# Without intrinsics, the field of view extends this far, in u and v, beyond the outermost calibration points.
 _BEYOND = 0.05
-# Directions (u, v) nearer together than this are one.
+# Directions (u, v) nearer together than this are equal.
 _SAME_RAY = 1e-3
+# Tangent of the largest angle of a field of view.
 _GRAZED = 5.0
 
 
 @dataclass(frozen=True, slots=True, eq=False)
 class View:
-    """A fitted camera: what it sees of the world, and how far off its positions are.
+    """A fitted camera: its field of view, and the uncertainty of its positions.
 
     Attributes
     ----------
-    camera_from_world, bend : (4, 4) and (3,), fitted: the pose, and the correction of the lens as
-        :func:`ipsys_log.models.rays.directions` takes it.
-    lens : its calibration, None where it is not known.
-    fitted_m : (n, 3), world points of the places that it was fitted on, as ``uncertainty`` has them.
+    camera_from_world, bend : (4, 4) and (3,), the fitted pose, and the fitted lens correction for
+        :func:`ipsys_log.models.rays.directions`.
+    lens : its calibration, None if it is unknown.
+    fitted_m : (n, 3), world points of the calibration points of the fit, in the order of ``uncertainty``.
     """
 
     camera: str
@@ -56,26 +58,27 @@ class View:
     fitted_m: Array
 
     def points(self, world_m: Array) -> Array:
-        """Camera points (n, 3) of world points (n, 3); NaN where there is none."""
+        """Return camera points (n, 3) of world points (n, 3); NaN if a point has none."""
         inside_m = transform(self.camera_from_world, world_m)
-        # Nothing is seen, and no model holds, where the view is grazed.
+        # At larger angles from the optical axis, no camera sees a point, and no model is valid.
         ahead = np.hypot(inside_m[:, 0], inside_m[:, 1]) < _GRAZED * inside_m[:, 2]
         depths_m = np.where(ahead, inside_m[:, 2], np.nan)[:, None]
-        said = true = inside_m / depths_m
-        for _ in range(5):  # to what the model bends to the true direction
-            said = said + true - directions(said, self.bend)
-        lost = ~(np.abs(directions(said, self.bend) - true).max(axis=1) < _SAME_RAY)
-        return np.where(lost[:, None], np.nan, said * depths_m)
+        measured = exact = inside_m / depths_m
+        for _ in range(5):  # invert the lens correction: its result must be the true direction
+            measured = measured + exact - directions(measured, self.bend)
+        lost = ~(np.abs(directions(measured, self.bend) - exact).max(axis=1) < _SAME_RAY)
+        return np.where(lost[:, None], np.nan, measured * depths_m)
 
     def sees(self, world_m: Array, radius_m: float) -> Mask:
-        """Whether level discs about world points (n, 3) lie in the image whole, (n,).
+        """Return a mask (n,) of the level discs about world points (n, 3) that are completely in the image.
 
-        Without a lens: whether the points lie, in the image, among the fitted places or a little beyond.
+        Without intrinsics: a mask of the points that, in the image, are inside the convex hull of the
+        calibration points of the fit, with a small margin.
         """
         if self.lens is None:
-            fitted, at = (p[:, :2] / p[:, 2:] for p in (self.uncertainty.points_m, self.points(world_m)))
+            fitted, uv = (p[:, :2] / p[:, 2:] for p in (self.uncertainty.points_m, self.points(world_m)))
             edges = ConvexHull(fitted).equations
-            return np.asarray((at @ edges[:, :2].T + edges[:, 2]).max(axis=1) <= _BEYOND, dtype=np.bool_)
+            return np.asarray((uv @ edges[:, :2].T + edges[:, 2]).max(axis=1) <= _BEYOND, dtype=np.bool_)
         angles = np.linspace(0, 2 * np.pi, _RIM, endpoint=False)
         rim_m = radius_m * np.stack([np.cos(angles), np.sin(angles), np.zeros(_RIM)], axis=1)
         whole = in_picture(self.points(world_m), self.lens)
@@ -84,18 +87,22 @@ class View:
         return whole
 
 
-# The variance of x plus that of y, (n,), of places (n, 3) that are measured.
+# A function from measured points (n, 3) to the variance of x plus the variance of y, (n,).
 Tape = Callable[[Array], Array]
 
-# So near to a known place another one may err alike; another that does this share as much is better.
+# Points nearer to a known point may have the same error. A point farther away is better if it has at least
+# this share of the effect.
 _BESIDE_M = 0.2
 _ALMOST = 0.9
 
 
 @dataclass(frozen=True, slots=True, eq=False)
 class PlannedPlace:
-    """A place to measure: ``point_m`` (3,), the ``cameras`` that see it, and the predicted error, its mean
-    over the floor, before and after it is measured: those before it are by then."""
+    """A calibration point to measure: ``point_m`` (3,), and the ``cameras`` that see it.
+
+    ``mean_before_m`` and ``mean_after_m`` are the mean predicted errors over the floor before and after its
+    measurement. All points before it in the plan are already measured then.
+    """
 
     point_m: Array
     cameras: tuple[str, ...]
@@ -105,14 +112,14 @@ class PlannedPlace:
 
 @dataclass(frozen=True, slots=True, eq=False)
 class Plan:
-    """Places to measure, in order, and what they do.
+    """Calibration points to measure, in order, and their effect.
 
     Attributes
     ----------
-    places : the first one does most.
-    before_m, after_m : (n,), predicted error at each point of the floor: the smallest of the cameras that
-        see it; NaN where none does.
-    seen : (n,) by camera.
+    places : the calibration points; the first one has the largest effect.
+    before_m, after_m : (n,), predicted error at each point of the floor: the least error of the cameras that
+        see it; NaN if no camera sees it.
+    seen : (n,) by camera, mask of the points of the floor that the camera sees.
     """
 
     places: tuple[PlannedPlace, ...]
@@ -124,23 +131,23 @@ class Plan:
 def plan_places(
     views: Sequence[View], floor_m: Array, candidates_m: Array, tape_m2: Tape, radius_m: float, count: int
 ) -> Plan:
-    """Choose the places to measure next.
+    """Choose the calibration points to measure next.
 
-    The heights of the candidates take turns, so that none is measured much less than the others.
+    The heights of the candidates alternate, so the numbers of measurements at all heights are similar.
 
     Parameters
     ----------
     views : the fitted cameras.
-    floor_m : (n, 3), points that the error is averaged over, as far as a camera sees them.
-    candidates_m : (c, 3), where a marker could be laid.
-    tape_m2 : how well the tape knows a place.
-    radius_m : of the disc about a marker that a camera must see.
-    count : how many places.
+    floor_m : (n, 3), points of the floor. The mean error is that over the points that a camera sees.
+    candidates_m : (c, 3), possible positions of a marker.
+    tape_m2 : function for the variance of a tape measurement.
+    radius_m : radius of the disc about a marker that a camera must see.
+    count : number of calibration points to choose.
 
     Raises
     ------
     IpsysError
-        Where there are no candidates, or no camera sees a marker at their height or on the floor.
+        There are no candidates, or no camera sees a marker at their height or on the floor.
 
     References
     ----------
@@ -164,7 +171,9 @@ def plan_places(
     if not len(candidates_m):
         raise IpsysError("the floor has no room to lay a marker on; correct width_m and depth_m in lab.toml")
     shares = [_Share(view, floor_m, candidates_m, tape_m2, radius_m) for view in views]
-    on_floor, near = (np.any([getattr(s, what) for s in shares], axis=0) for what in ("on_floor", "near"))
+    on_floor, near = (
+        np.any([getattr(s, attribute) for s in shares], axis=0) for attribute in ("on_floor", "near")
+    )
     seen_m = np.concatenate([floor_m[on_floor, 2], candidates_m[near, 2]])
     for height_m in np.setdiff1d(np.concatenate([floor_m[:, 2], candidates_m[:, 2]]), seen_m):
         raise IpsysError(f"no camera sees a whole marker {height_m:g} m above the floor; give another height")
@@ -189,7 +198,7 @@ def plan_places(
 
 
 class _Share:
-    """What one camera sees of floor and candidates, and its leverage there, kept up as places are added."""
+    """The visible floor points and candidates of one camera, and their leverage after each added point."""
 
     def __init__(self, view: View, floor_m: Array, candidates_m: Array, tape_m2: Tape, radius_m: float):
         self.on_floor, self.near = view.sees(floor_m, radius_m), view.sees(candidates_m, radius_m)
@@ -199,16 +208,16 @@ class _Share:
         self._fit_m2 = fit_m2 / _leverage(self._floor_terms, self._inverse)
         noise_m2, _, self._terms = _parts(view, candidates_m[self.near])
         usual_m2 = np.median(tape_m2(view.fitted_m) + _parts(view, view.fitted_m)[0][:2].sum(axis=0))
-        # A fit takes all places for alike: one that is known better than usual counts as one, not more.
+        # A fit gives all calibration points the same weight: an unusually accurate point counts as one point.
         known_m2 = tape_m2(candidates_m[self.near]) + noise_m2[:2].sum(axis=0)
         self._weights = usual_m2 / np.maximum(known_m2, usual_m2)
 
     def errors(self) -> Array:
-        """Predicted error (r,) at the points of the floor that it sees."""
+        """Return the predicted error (r,) at the visible points of the floor."""
         return mean_length(self._noise_m2 + self._fit_m2 * _leverage(self._floor_terms, self._inverse))
 
     def errors_with_each(self, allowed: Mask) -> Array:
-        """The same, (r, c), were each of the candidates that it sees and that are ``allowed`` measured."""
+        """Return the predicted errors (r, c) after measuring each visible and ``allowed`` candidate."""
         terms, weights = self._terms[allowed[self.near]], self._weights[allowed[self.near]]
         gain = weights / (1 + weights * _leverage(terms, self._inverse))
         lower = (self._floor_terms @ self._inverse @ terms.T) ** 2 * gain
@@ -217,7 +226,7 @@ class _Share:
         return mean_length(noise_m2 + fit_m2 * leverage)
 
     def add(self, candidate: int) -> None:
-        """Count a candidate as measured (Sherman and Morrison's formula)."""
+        """Add a candidate to the measured points (Sherman-Morrison formula)."""
         if self.near[candidate]:
             row = int(self.near[:candidate].sum())
             terms, weight = self._terms[row], self._weights[row]
@@ -226,14 +235,17 @@ class _Share:
 
 
 def _parts(view: View, world_m: Array) -> tuple[Array, Array, Array]:
-    """Variances of x and y and their covariance, (3, n), that no place can lower, and those that rest on the
-    fit; and the terms (n, 6) of the leverage."""
+    """Return the parts of the covariance of x and y, and the terms (n, 6) of the leverage.
+
+    Each part contains the variances of x and y and their covariance, (3, n). The first part is noise, which
+    no calibration point can reduce. The second part is the uncertainty of the fit.
+    """
     if not len(world_m):
         return np.zeros((3, 0)), np.zeros((3, 0)), np.zeros((0, 6))
     points_m, certain = view.points(world_m), replace(view.uncertainty, fit=np.zeros((3, 3)))
     whole_m2, noise_m2 = (
-        one.covariances(view.predict, points_m, world_m[:, 2])[:, [0, 1, 0], [0, 1, 1]].T
-        for one in (view.uncertainty, certain)
+        uncertainty.covariances(view.predict, points_m, world_m[:, 2])[:, [0, 1, 0], [0, 1, 1]].T
+        for uncertainty in (view.uncertainty, certain)
     )
     return noise_m2, whole_m2 - noise_m2, leverage_terms(points_m)
 
@@ -243,10 +255,10 @@ def _leverage(terms: Array, inverse: Array) -> Array:
 
 
 def mean_length(covariance: Array) -> Array:
-    """Mean length of an error in the plane, from (3, ...): the variances of x and y, and their covariance.
+    """Return the mean length of an error in the plane from variances of x and y, and covariance, (3, ...).
 
-    It is sqrt(2 / pi) times a quarter of the perimeter of the ellipse of standard deviations; that by
-    Ramanujan's first formula, 0.5 % short for a needle.
+    It is sqrt(2 / pi) times a quarter of the perimeter of the ellipse of standard deviations. The perimeter
+    follows from Ramanujan's first formula, which is 0.5 % too small for a degenerate ellipse.
 
     Examples
     --------
@@ -260,7 +272,7 @@ def mean_length(covariance: Array) -> Array:
 
 
 def _least(shares: Sequence[_Share], count: int) -> Array:
-    """The smallest error of the cameras at each point of the floor, (n,); NaN where none sees it."""
+    """Return the least error of the cameras at each point of the floor, (n,); NaN if no camera sees it."""
     least_m = np.full(count, np.nan)
     for share in shares:
         least_m[share.on_floor] = np.fmin(least_m[share.on_floor], share.errors())
@@ -268,19 +280,23 @@ def _least(shares: Sequence[_Share], count: int) -> Array:
 
 
 def _means_with_each(shares: Sequence[_Share], now_m: Array, allowed: Mask) -> Array:
-    """The mean error over the floor were each candidate measured, (c,); infinite for those not allowed."""
+    """Return the mean error over the floor after measuring each candidate, (c,); inf if not allowed."""
     least_m = np.repeat(now_m[:, None].astype(np.float32), allowed.sum(), axis=1)
     column = np.cumsum(allowed) - 1
     for share in shares:
-        where = np.ix_(share.on_floor.nonzero()[0], column[share.near & allowed])
-        least_m[where] = np.fmin(least_m[where], share.errors_with_each(allowed))
+        cells = np.ix_(share.on_floor.nonzero()[0], column[share.near & allowed])
+        least_m[cells] = np.fmin(least_m[cells], share.errors_with_each(allowed))
     means_m = np.full(len(allowed), np.inf)
     means_m[allowed] = np.nanmean(least_m, axis=0, dtype=np.float64)
     return means_m
 
 
 def _choose(means_m: Array, now_m: float, apart_m: Array) -> int:
-    """The best candidate; one beside a known place only where it does clearly more than those elsewhere."""
+    """Return the best candidate.
+
+    A candidate near a known calibration point is selected only if its effect is clearly larger than that of
+    all candidates farther away.
+    """
     elsewhere = np.where(apart_m >= _BESIDE_M, means_m, np.inf)
     best, other = int(means_m.argmin()), int(elsewhere.argmin())
     return other if now_m - elsewhere[other] >= _ALMOST * (now_m - means_m[best]) else best

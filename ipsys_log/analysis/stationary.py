@@ -1,4 +1,4 @@
-"""Stationary intervals of markers: over a whole log, and over the last second."""
+"""Stationary intervals of markers: in a whole log, and in the last second."""
 
 from __future__ import annotations
 
@@ -17,25 +17,25 @@ __all__ = ["FEWEST_FRAMES", "Lying", "find_lying", "lies_at", "lies_still", "sti
 
 Array = NDArray[np.float64]
 
-# A marker lies still while it stays this near to where it was: above the noise of plain corners.
+# A marker is stationary if its motion is below these limits, which are above the noise of plain corners.
 _STILL_ACROSS_M, _STILL_ALONG_M, _STILL_ALONG = 0.01, 0.04, 0.02
-# So long a silence may hide that it was carried elsewhere.
+# In a longer gap of the sightings, the marker may have moved.
 _GAP_NS = 2 * NS_PER_S
-# What stays put for less, and was elsewhere just before or after, is only passing.
+# Least duration of a stationary interval directly before or after a motion.
 _LEAST_NS = NS_PER_S // 2
 
 
 @dataclass(frozen=True, slots=True, eq=False)
 class Lying:
-    """A marker that lay still.
+    """A stationary interval of a marker.
 
     Attributes
     ----------
-    point_m : (3,), its centre in the frame of the camera.
-    covariance_m2 : (3, 3), of this point by the noise of the corners; zeros where that is not known.
-    height_m : above the floor, where it was measured; else 0.
-    frames : how many show it there.
-    start_ns, end_ns : of the first and the last of them.
+    point_m : (3,), centre of the marker in camera coordinates.
+    covariance_m2 : (3, 3), covariance of this point from the noise of the corners; zeros if it is unknown.
+    height_m : measured height above the floor; 0 without a measurement.
+    frames : number of frames that show the marker in this interval.
+    start_ns, end_ns : times of the first and of the last of these frames.
     """
 
     marker_id: int
@@ -48,15 +48,15 @@ class Lying:
 
 
 def find_lying(frames: Iterable[CameraPoints], measurements: Sequence[Measurement] = ()) -> list[Lying]:
-    """All places at which markers lay still, by marker and time.
+    """Return all stationary intervals of markers, ordered by marker and time.
 
-    A marker that is carried about and laid down gives a place each time: where it stays within a
-    centimetre for half a second, or where a camera has seen it only there for two seconds around.
+    A marker that is moved several times has several intervals. In an interval, it stays within 1 cm for at
+    least 0.5 s. The duration may be shorter if the camera does not see the marker for 2 s before and after.
 
     Parameters
     ----------
     frames : the camera points of one camera.
-    measurements : those that count; a marker has the height that was measured while it lay there.
+    measurements : the valid measurements; a marker has the height of a measurement in its interval.
 
     Examples
     --------
@@ -68,17 +68,19 @@ def find_lying(frames: Iterable[CameraPoints], measurements: Sequence[Measuremen
     for frame in frames:
         for point in frame.points:
             seen.setdefault(point.id, []).append((frame.timestamp + (point.time_offset_ns or 0), point))
-    found = []
+    intervals = []
     for marker_id in sorted(seen):
         sightings = sorted(seen[marker_id], key=lambda sighting: sighting[0])
         for first, last in _stretches(sightings):
-            here = sightings[first : last + 1]
-            found.append(_lying(here, _height(marker_id, here[0][0], here[-1][0], measurements)))
-    return found
+            interval = sightings[first : last + 1]
+            intervals.append(
+                _lying(interval, _height(marker_id, interval[0][0], interval[-1][0], measurements))
+            )
+    return intervals
 
 
 def _stretches(sightings: Sequence[tuple[int, CameraPoint]]) -> Iterator[tuple[int, int]]:
-    """First and last index of each stretch in which a marker did not move."""
+    """Yield the first and last index of each stationary interval."""
     times_ns = np.array([time_ns for time_ns, _ in sightings], dtype=np.int64)
     points_m = np.array([(p.x_m, p.y_m, p.z_m) for _, p in sightings])
     joined = np.diff(times_ns) <= _GAP_NS
@@ -118,22 +120,23 @@ def _height(marker_id: int, start_ns: int, end_ns: int, measurements: Sequence[M
     return 0.0
 
 
-# Those of a fit (offline/pairs.py), above the noise of plain sub-pixel corners.
+# The limits of calibration pairs (analysis/pairs.py), above the noise of plain sub-pixel corners.
 _ACROSS_M = 0.01
 _ALONG_M = 0.04
-# What creeps past stays within these bounds for a while, but its later half lies beside its earlier one.
-# Halves of few sightings are less well known.
+# A very slow marker stays within these limits for some time, but the means of the earlier and the later half
+# differ. The means of few sightings are less accurate.
 _DRIFT_M, _DRIFT_OF_ONE_M = 0.002, 0.004
-# Slow motion looks still for shorter than this; but not if the marker was not seen before and after.
+# A slow motion can look stationary for a shorter time. A shorter interval is valid only if the marker is not
+# visible before and after.
 _SHORTEST_NS = NS_PER_S
-# A frame in which something passes by does not end a stretch.
+# Least share of sightings near the median: single frames with a passing object do not end an interval.
 _SHARE_NEAR = 0.95
-# Of one sighting nobody can tell.
+# One sighting does not show if a marker is stationary.
 FEWEST_FRAMES = 2
 
 
 def lies_still(points_m: Array) -> bool:
-    """Whether camera points (n, 3) of a marker, in order of time, are all of one place.
+    """Return whether a marker is stationary, from its camera points (n, 3) in order of time.
 
     Examples
     --------
@@ -148,7 +151,8 @@ def lies_still(points_m: Array) -> bool:
     if near.mean() < _SHARE_NEAR:
         return False
     points_m = points_m[near]
-    # Across the view: the noise of a depth moves a point along its ray, sideways too where that is slanted.
+    # The drift is measured across the view. The noise of a depth moves a point along its ray, and so also
+    # sideways if the ray is slanted.
     rays = points_m[:, :2] / points_m[:, 2:]
     half = len(rays) // 2
     drift_m = (rays[-half:].mean(axis=0) - rays[:half].mean(axis=0)) * points_m[:, 2].mean()
@@ -156,7 +160,7 @@ def lies_still(points_m: Array) -> bool:
 
 
 def lies_at(points_m: Array, place_m: Array) -> NDArray[np.bool_]:
-    """Which camera points (n, 3) are, within their noise, at a place (3,)."""
+    """Return a mask (n,) of the camera points (n, 3) that are at a position (3,), within their noise."""
     across_m = (points_m[:, :2] / points_m[:, 2:] - place_m[:2] / place_m[2]) * place_m[2]
     along_m = np.abs(points_m[:, 2] - place_m[2])
     near: NDArray[np.bool_] = (np.hypot(across_m[:, 0], across_m[:, 1]) <= _ACROSS_M) & (along_m <= _ALONG_M)
@@ -164,7 +168,7 @@ def lies_at(points_m: Array, place_m: Array) -> NDArray[np.bool_]:
 
 
 def still_stretches(cameras: Mapping[str, Sightings]) -> list[tuple[int, int, tuple[str, ...]]]:
-    """The stretches in which one marker lies still, from what each camera saw of it, in order of time.
+    """Return the stationary intervals of one marker, from the sightings of all cameras, in order of time.
 
     Parameters
     ----------
@@ -172,12 +176,13 @@ def still_stretches(cameras: Mapping[str, Sightings]) -> list[tuple[int, int, tu
 
     Returns
     -------
-    First and last time in ns, both included, and the cameras that saw it then. Stretches of several
-    cameras that overlap are one: all of it, or what they have in common where one saw it move meanwhile.
+    First and last time in ns, both included, and the cameras that saw the marker in the interval. Overlapping
+    intervals of several cameras become one interval: their union, or their intersection if a camera saw the
+    marker move in the union.
     """
-    found = sorted(stretch for seen in cameras.values() for stretch in _joined(seen))
+    intervals = sorted(stretch for seen in cameras.values() for stretch in _joined(seen))
     joined: list[list[tuple[int, int]]] = []
-    for start_ns, end_ns in found:
+    for start_ns, end_ns in intervals:
         if joined and start_ns <= max(end for _, end in joined[-1]):
             joined[-1].append((start_ns, end_ns))
         else:
@@ -195,7 +200,7 @@ def still_stretches(cameras: Mapping[str, Sightings]) -> list[tuple[int, int, tu
 
 
 def _seen_still(cameras: Mapping[str, Sightings], start_ns: int, end_ns: int) -> tuple[str, ...]:
-    """The cameras that saw it in a stretch; none where one of them saw it move."""
+    """Return the cameras that saw the marker in an interval; none if one of them saw it move."""
     seen = []
     for camera, sightings in sorted(cameras.items()):
         points_m = _between(sightings, start_ns, end_ns)
@@ -212,19 +217,19 @@ def _between(sightings: Sightings, start_ns: int, end_ns: int) -> Array:
 
 
 def _joined(sightings: Sightings) -> list[tuple[int, int]]:
-    """The stretches of one camera; two of one place that follow one another are one."""
-    found: list[tuple[int, int]] = []
+    """Return the stationary intervals of one camera; join consecutive intervals at the same position."""
+    intervals: list[tuple[int, int]] = []
     for start_ns, end_ns in _camera_stretches(sightings):
-        both = (found[-1][0], end_ns) if found else (start_ns, end_ns)
-        if found and start_ns - found[-1][1] <= _GAP_NS and lies_still(_between(sightings, *both)):
-            found[-1] = both
+        both = (intervals[-1][0], end_ns) if intervals else (start_ns, end_ns)
+        if intervals and start_ns - intervals[-1][1] <= _GAP_NS and lies_still(_between(sightings, *both)):
+            intervals[-1] = both
         else:
-            found.append((start_ns, end_ns))
-    return found
+            intervals.append((start_ns, end_ns))
+    return intervals
 
 
 def _camera_stretches(sightings: Sightings) -> Iterator[tuple[int, int]]:
-    """The stretches in which one camera sees a marker lie still."""
+    """Yield the intervals in which one camera sees a marker stationary."""
     times_ns, points_m = sightings.times_ns, sightings.points_m
     ends = np.append(np.flatnonzero(np.diff(times_ns) > _GAP_NS), len(times_ns) - 1) + 1
     rays = (points_m[:, :2] / points_m[:, 2:]).tolist()
@@ -234,10 +239,10 @@ def _camera_stretches(sightings: Sightings) -> Iterator[tuple[int, int]]:
         end = int(ends[np.searchsorted(ends, first, "right")])
         stop = _first_away(rays, depths_m, first, end)
         if stop - first < FEWEST_FRAMES or not lies_still(points_m[first:stop]):
-            # A stretch that is met in its middle is followed back to its beginning.
+            # An interval that is detected in its middle is extended back to its start.
             first += max((stop - first) // 4, 1)
             continue
-        # About its middle: at the beginning the hand may still be at it.
+        # The reference is the middle of the interval, because a hand may still move the marker at the start.
         near = lies_at(points_m[first:end], np.median(points_m[first:stop], axis=0))
         middle = (stop - first) // 2
         begin = first + int(np.flatnonzero(np.append(True, ~near[:middle]))[-1])
@@ -252,7 +257,7 @@ def _camera_stretches(sightings: Sightings) -> Iterator[tuple[int, int]]:
 
 
 def _first_away(rays: Sequence[Sequence[float]], depths_m: Sequence[float], first: int, end: int) -> int:
-    """The first sighting after ``first``, before ``end``, that is not near it; ``end`` where all are."""
+    """Return the first sighting between ``first`` and ``end`` that is not near ``first``, or ``end``."""
     (u, v), depth_m = rays[first], depths_m[first]
     for n in range(first + 1, end):
         across = (rays[n][0] - u) ** 2 + (rays[n][1] - v) ** 2

@@ -1,4 +1,4 @@
-"""Where a measured place is, by tape and ruler, and how well they know it (eq. 25)."""
+"""World points of calibration points by tape and ruler (eq. 25), and their covariances."""
 
 from __future__ import annotations
 
@@ -16,11 +16,11 @@ __all__ = ["FlatPlace", "Measured", "TapePoint", "flat_places", "reference_point
 
 Array = NDArray[np.float64]
 
-# A height without a sigma of its own, where the tape has one.
+# Sigma of a height without its own sigma, if the tape has a sigma.
 _RULER_SIGMA_M = 0.001
-# Nothing is read better by hand; a simulated tape may be perfect, and its weight must stay finite.
+# Least sigma of a manual reading. A simulated tape may have no error, but its weight must be finite.
 _FINEST_M = 0.0001
-# The tape of a place that names none, only to tell how flatly its circles cross.
+# Sigma of the tape of a point without its own, only to determine the crossing angle of its circles.
 _USUAL_TAPE_M = 0.003
 _FLAT_RATIO = 3.0
 _FARTHEST_M = 10_000.0
@@ -28,7 +28,7 @@ _FARTHEST_M = 10_000.0
 
 @dataclass(frozen=True, slots=True)
 class Measured:
-    """A measurement that counts, and the rig in force when it was made."""
+    """A valid measurement, and the rig that was valid at its time."""
 
     measurement: Measurement
     rig: Rig
@@ -36,11 +36,11 @@ class Measured:
 
 @dataclass(frozen=True, slots=True, eq=False)
 class TapePoint:
-    """A measured place: ``world_m`` (3,).
+    """The world point ``world_m`` (3,) of a measurement.
 
-    ``covariance_m2`` (3, 3) follows from the sigmas of tape and ruler, None where no tape sigma is
-    known. ``residuals_m`` (n,) has each tape distance as measured minus as it is from the point; empty
-    for a world point that came without distances to known reference points.
+    ``covariance_m2`` (3, 3) follows from the sigmas of tape and ruler; None if the tape sigma is unknown.
+    ``residuals_m`` (n,) are the measured tape distances minus those from the point. They are empty for a
+    world point without distances to known reference points.
     """
 
     world_m: Array
@@ -50,10 +50,10 @@ class TapePoint:
 
 @dataclass(frozen=True, slots=True)
 class FlatPlace:
-    """A place whose tape circles cross flatly.
+    """A calibration point whose tape circles cross at a small angle.
 
-    ``sigma_m`` is that of the place in the direction in which the tapes know it least, None where the
-    tape's own is not known; ``angle_deg`` the angle at which they cross.
+    ``sigma_m`` is the standard deviation of the point in its least accurate direction; None if the sigma of
+    the tape is unknown. ``angle_deg`` is the crossing angle.
     """
 
     id: str
@@ -62,15 +62,16 @@ class FlatPlace:
 
 
 def world_point(measurement: Measurement, rig: Rig) -> TapePoint:
-    """Return the world point of a measurement, as given or by eq. (25), and its covariance.
+    """Return the world point of a measurement, as entered or by eq. (25), and its covariance.
 
-    The sigma of a distance is its own, else the rig's; that of the height its own, else 1 mm.
+    The sigma of a distance is its own, otherwise that of the rig. The sigma of the height is its own,
+    otherwise 1 mm.
 
     Parameters
     ----------
-    measurement : with a world point, or two or more distances, the height, and the side if the reference
-        points lie on one line.
-    rig : for the reference points and the tape; not used if there is only a world point.
+    measurement : measurement with a world point; or with two or more distances, the height, and the side if
+        the reference points are on one line.
+    rig : rig with the reference points and the tape; not used if there is only a world point.
 
     Returns
     -------
@@ -97,31 +98,31 @@ def world_point(measurement: Measurement, rig: Rig) -> TapePoint:
     >>> np.sqrt(found.covariance_m2.diagonal()).round(6).tolist()
     [0.003, 0.004, 0.001]
     """
-    where = f"measurement {measurement.id}"
-    given = measurement.point
-    if given is None:
-        return _solved(measurement, rig, where)
-    world_m = np.array([given.x_m, given.y_m, given.z_m])
-    _check_point(world_m, where)
-    _check_lengths(measurement, where)
+    context = f"measurement {measurement.id}"
+    entered = measurement.point
+    if entered is None:
+        return _solved(measurement, rig, context)
+    world_m = np.array([entered.x_m, entered.y_m, entered.z_m])
+    _check_point(world_m, context)
+    _check_lengths(measurement, context)
     known = {point.name for point in rig.reference_points}
     if not measurement.distances or any(d.reference not in known for d in measurement.distances):
         return TapePoint(world_m, None, np.zeros(0))
     references_m = reference_points(measurement, rig)
     ranges_m = np.linalg.norm(world_m[:2] - references_m, axis=1)
-    sigmas_m = _tape_sigmas(measurement, rig, where)
+    sigmas_m = _tape_sigmas(measurement, rig, context)
     floor_m2 = None if sigmas_m is None else tape_covariance(world_m[:2], references_m, sigmas_m)
     residuals_m = np.array([d.distance_m for d in measurement.distances]) - ranges_m
-    return TapePoint(world_m, _with_height(floor_m2, measurement, where), residuals_m)
+    return TapePoint(world_m, _with_height(floor_m2, measurement, context), residuals_m)
 
 
 def reference_points(measurement: Measurement, rig: Rig) -> Array:
-    """The reference point of each tape distance, (n, 2) in m.
+    """Return the reference point of each tape distance, (n, 2) in m.
 
     Raises
     ------
     IpsysError
-        Where the rig lacks one.
+        A reference point is not in the rig.
 
     Examples
     --------
@@ -141,11 +142,11 @@ def reference_points(measurement: Measurement, rig: Rig) -> Array:
 
 
 def flat_places(places: Iterable[Measured]) -> list[FlatPlace]:
-    """The places that the tape knows much worse than its own sigma, more than three times; worst first.
+    """Return the points whose standard deviation exceeds three times the sigma of the tape, largest first.
 
-    Circles that cross at a right angle know a place as well as the tape is read; at 27 degrees, or near
-    the line through the reference points, three times worse. What came as a world point alone is not
-    looked at.
+    If the circles cross at a right angle, a point is as accurate as the tape. At 27 degrees, or near the line
+    through the reference points, the standard deviation is three times larger. Measurements with a world
+    point alone are skipped.
 
     Raises
     ------
@@ -162,7 +163,7 @@ def flat_places(places: Iterable[Measured]) -> list[FlatPlace]:
     >>> [(flat.id, round(flat.sigma_m, 4), round(flat.angle_deg, 1)) for flat in flat_places([place])]
     [('a', 0.0108, 22.7)]
     """
-    found = []
+    ranked = []
     for place in places:
         measurement, rig = place.measurement, place.rig
         if len(measurement.distances) < 2:
@@ -176,8 +177,8 @@ def flat_places(places: Iterable[Measured]) -> list[FlatPlace]:
         if ratio > _FLAT_RATIO:
             angle_deg = float(np.degrees(crossing_angle(world_m[:2], references_m)))
             sigma_m = None if known_m is None else float(np.sqrt(spread_m2[-1]))
-            found.append((ratio, FlatPlace(measurement.id, sigma_m, angle_deg)))
-    return [flat for _, flat in sorted(found, key=lambda one: -one[0])]
+            ranked.append((ratio, FlatPlace(measurement.id, sigma_m, angle_deg)))
+    return [place for _, place in sorted(ranked, key=lambda one: -one[0])]
 
 
 def _solved(measurement: Measurement, rig: Rig, where: str) -> TapePoint:
@@ -201,7 +202,7 @@ def _solved(measurement: Measurement, rig: Rig, where: str) -> TapePoint:
 
 
 def _tape_sigmas(measurement: Measurement, rig: Rig, where: str) -> Array | None:
-    """Of each distance, (n,) in m; None where one is not known."""
+    """Return the sigma of each distance, (n,) in m; None if one of them is unknown."""
     named = [rig.tape_sigma_m if d.sigma_m is None else d.sigma_m for d in measurement.distances]
     known = [_check_sigma(sigma_m, where) for sigma_m in named if sigma_m is not None]
     return np.array(known) if len(known) == len(named) else None

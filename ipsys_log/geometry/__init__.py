@@ -1,1 +1,1 @@
-"""Arrays in, arrays out, no state: lenses, markers, trilateration."""
+"""Stateless functions on arrays: lens distortion, markers, poses, trilateration."""

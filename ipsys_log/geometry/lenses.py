@@ -1,4 +1,4 @@
-"""Lens models: pixels to rays and back, and the points where rays meet horizontal planes."""
+"""Lens distortion models: pixels to rays and back, and intersections of rays with horizontal planes."""
 
 from __future__ import annotations
 
@@ -23,24 +23,24 @@ __all__ = [
     "undistort",
 ]
 
-# A ray that rises or falls by less than this per metre meets no floor that a camera sees.
+# A ray that rises or falls by less than this per metre does not meet the floor in the field of view.
 _LEAST_SLOPE = 1e-6
 
 
 def meet_height(
     origin_m: NDArray[np.float64], directions: NDArray[np.float64], heights_m: NDArray[np.float64]
 ) -> NDArray[np.float64]:
-    """The points at given heights on rays from one origin.
+    """Return the points at given heights on rays from one origin.
 
     Parameters
     ----------
     origin_m : (3,), in world m.
     directions : (n, 3), of any length.
-    heights_m : (n,), the z to meet, in m.
+    heights_m : (n,), the z of the points, in m.
 
     Returns
     -------
-    (n, 3): world points in m; NaN where a ray is level or the height lies behind the origin.
+    (n, 3): world points in m; NaN if a ray is level or if its point is behind the origin.
 
     Examples
     --------
@@ -57,19 +57,20 @@ def meet_height(
     return points_m
 
 
-# Foxglove's and ROS's names; the number of coefficients that each takes.
+# Names of Foxglove and ROS, with the number of coefficients of each model.
 DISTORTION_MODELS = {"kannala_brandt": 4, "plumb_bob": 5, "rational_polynomial": 8}
 
-# The inverse of a lens has no closed form: iterate to far below what a log can resolve.
+# The inverse of a lens distortion has no closed form: the iteration continues far below the resolution of a
+# log.
 _CRITERIA = (cv2.TERM_CRITERIA_COUNT + cv2.TERM_CRITERIA_EPS, 100, 1e-12)
 
 _LOST_PX = 0.01
 _LARGEST = 1e9  # px, and a coefficient
 _WIDEST_PX = 65_535
-# Directions (u, v) nearer together than this are one.
+# Directions (u, v) nearer together than this are equal.
 _SAME_RAY = 1e-3
 
-# OpenCV 5 takes the criteria in undistortPoints; 4 has a function of its own for them.
+# OpenCV 5 accepts the criteria in undistortPoints. OpenCV 4 has a separate function with criteria.
 _undistort_pinhole = getattr(cv2, "undistortPointsIter", cv2.undistortPoints)
 
 
@@ -80,7 +81,7 @@ def check_calibration(lens: CameraCalibration, where: str) -> CameraCalibration:
     ------
     IpsysError
         The distortion model is unknown, the number of coefficients is wrong, or a focal length is not
-        positive; the text names ``where``.
+        positive. The text names ``where``.
     """
     wanted = DISTORTION_MODELS.get(lens.distortion_model)
     if wanted is None:
@@ -113,12 +114,12 @@ def _advice(lens: CameraCalibration) -> str:
 
 
 def check_size(lens: CameraCalibration, width: int, height: int, camera: str | None) -> None:
-    """See that a calibration is for the frames of a camera.
+    """Check that a calibration has the size of the frames of a camera.
 
     Raises
     ------
     SizeError
-        Where it is for another size.
+        The calibration is for another size.
     """
     if (lens.width, lens.height) != (width, height):
         raise SizeError(
@@ -129,12 +130,12 @@ def check_size(lens: CameraCalibration, width: int, height: int, camera: str | N
 
 
 def scale_lens(lens: CameraCalibration, width: int, height: int, where: str) -> CameraCalibration:
-    """A calibration for pictures of another size that show the same.
+    """Return the calibration for images of another size with the same field of view.
 
     Raises
     ------
     IpsysError
-        Naming ``where``, for a size of another shape: it shows something else.
+        The new size has another aspect ratio, so its field of view differs. The text names ``where``.
 
     Examples
     --------
@@ -159,13 +160,13 @@ def scale_lens(lens: CameraCalibration, width: int, height: int, where: str) -> 
 
 
 def same_lens(one: CameraCalibration, other: CameraCalibration) -> bool:
-    """Return whether two calibrations map pixels to rays alike; their times and frames may differ."""
+    """Return whether two calibrations map pixels to the same rays; times and frame ids may differ."""
     sizes = [(lens.width, lens.height, lens.distortion_model) for lens in (one, other)]
     return sizes[0] == sizes[1] and np.array_equal(one.K, other.K) and np.array_equal(one.D, other.D)
 
 
 def undistort(points_px: NDArray[np.float64], lens: CameraCalibration) -> NDArray[np.float64]:
-    """Normalized image coordinates (u, v) = (Xc / Zc, Yc / Zc) of pixels.
+    """Return the normalized image coordinates (u, v) = (Xc / Zc, Yc / Zc) of pixels.
 
     Parameters
     ----------
@@ -174,7 +175,7 @@ def undistort(points_px: NDArray[np.float64], lens: CameraCalibration) -> NDArra
 
     Returns
     -------
-    (n, 2), without unit; NaN if no ray of the lens meets the pixel, outside of the calibrated area.
+    (n, 2), without unit; NaN if no ray of the lens meets the pixel, outside the calibrated area.
 
     References
     ----------
@@ -196,7 +197,7 @@ def undistort(points_px: NDArray[np.float64], lens: CameraCalibration) -> NDArra
     else:
         uv = _undistort_pinhole(points, lens.K, lens.D, R=np.eye(3), P=np.eye(3), criteria=_CRITERIA)
     uv = np.asarray(uv, dtype=np.float64).reshape(-1, 2)
-    # OpenCV's iteration may end anywhere: what does not lead back to its pixel is no solution.
+    # OpenCV's iteration may end anywhere: if the result does not project to its pixel, it is no solution.
     again_px = _distort(uv, lens)
     lost = ~(np.abs(again_px - points.reshape(-1, 2)).max(axis=1, initial=0) < _LOST_PX)
     uv[lost] = np.nan
@@ -206,7 +207,8 @@ def undistort(points_px: NDArray[np.float64], lens: CameraCalibration) -> NDArra
 def _distort(points_uv: NDArray[np.float64], lens: CameraCalibration) -> NDArray[np.float64]:
     """Return the pixels (n, 2) of normalized image coordinates (n, 2)."""
     if lens.distortion_model == "kannala_brandt":
-        # The same to the bit as projectPoints, which also computes a Jacobian and takes 30 times as long.
+        # The result is bit-identical to that of projectPoints, which also computes a Jacobian and takes 30
+        # times as long.
         pixels = cv2.fisheye.distortPoints(points_uv.reshape(-1, 1, 2), lens.K, lens.D)
         return np.asarray(pixels, dtype=np.float64).reshape(-1, 2)
     return project(np.column_stack([points_uv, np.ones(len(points_uv))]), lens)
@@ -228,7 +230,7 @@ def project(points_m: NDArray[np.float64], lens: CameraCalibration) -> NDArray[n
     if lens.distortion_model == "kannala_brandt":
         depths = points[:, 2:]
         if not depths.all():
-            # As projectPoints does.
+            # projectPoints also does this.
             depths = np.where(depths == 0.0, 1.0, depths)
         return _distort(points[:, :2] / depths, lens)
     still = np.zeros(3)
@@ -237,11 +239,11 @@ def project(points_m: NDArray[np.float64], lens: CameraCalibration) -> NDArray[n
 
 
 def in_picture(points_m: NDArray[np.float64], lens: CameraCalibration) -> NDArray[np.bool_]:
-    """Return whether points in camera coordinates lie in the image, (n,).
+    """Return a mask (n,) of the points in camera coordinates that are visible in the image.
 
     Parameters
     ----------
-    points_m : (n, 3), in m; where a point is NaN or not in front of the camera, it lies in no picture.
+    points_m : (n, 3), in m. A point that is NaN or not in front of the camera is not visible.
     lens : the camera's calibration.
     """
     inside = np.asarray(np.isfinite(points_m).all(axis=1) & (points_m[:, 2] > 0))
@@ -250,7 +252,7 @@ def in_picture(points_m: NDArray[np.float64], lens: CameraCalibration) -> NDArra
         framed = ((px >= 0) & (px <= [lens.width - 1, lens.height - 1])).all(axis=1)
         inside[inside] = framed
     if inside.any():
-        # What lies outside may be bent back into the frame: it is not there.
+        # The distortion model can map a point outside the field of view into the image: it is not visible.
         again = undistort(px[framed], lens) - points_m[inside, :2] / points_m[inside, 2:]
         inside[inside] = np.abs(again).max(axis=1) < _SAME_RAY
     return inside

@@ -1,4 +1,4 @@
-"""Printed markers: their corners, their black cells, and the outlines of these."""
+"""Printed markers: their corners, their black cells, and the outlines of the cells."""
 
 from __future__ import annotations
 
@@ -33,8 +33,8 @@ class Placed:
     """A printed marker in the world.
 
     ``length_m`` is the side of its black square; a white margin of one cell is printed around it.
-    ``world_from_marker`` is (4, 4), the marker's frame that of
-    :func:`ipsys_log.geometry.markers.marker_corners`: it may lie at any angle.
+    ``world_from_marker`` is (4, 4), with the marker coordinates of
+    :func:`ipsys_log.geometry.markers.marker_corners`. The marker may have any orientation.
     """
 
     id: int
@@ -46,9 +46,9 @@ class Placed:
 class PlacedBoard:
     """A printed calibration board in the world.
 
-    ``cells`` (rows, columns) is True where the print is black, its white margin included, top row first;
-    ``cell_m`` is the side of a cell. ``world_from_marker`` is (4, 4); the board's frame has its origin in
-    the centre of the print, x to the right, y up and z towards the viewer.
+    ``cells`` (rows, columns) is True for black cells, with the white margin, top row first. ``cell_m`` is the
+    side of a cell. ``world_from_marker`` is (4, 4). The board coordinates have their origin in the centre of
+    the print, x to the right, y up and z towards the viewer.
     """
 
     cells: NDArray[np.bool_]
@@ -56,20 +56,20 @@ class PlacedBoard:
     world_from_marker: Array
 
 
-# A print by the time in s since the time of the frame.
+# A function from the time in s since the time of the frame to the marker at that time.
 Moving = Callable[[float], Placed]
 
 
 @cache
 def black_cells(dictionary: str, marker_id: int) -> NDArray[np.bool_]:
-    """Which cells of the print are black, (n + 2, n + 2) with the white margin, top row first."""
+    """Return a mask of the black cells of a print, (n + 2, n + 2) with the white margin, top row first."""
     black: NDArray[np.bool_] = np.pad(~white_cells(dictionary, marker_id), 1)
     black.flags.writeable = False
     return black
 
 
 def printed_cells(placed: Placed | PlacedBoard, dictionary: str) -> tuple[NDArray[np.bool_], float]:
-    """Return which cells of a print are black, (rows, columns), margin included, and cells per m."""
+    """Return a mask of the black cells of a print, (rows, columns) with margin, and the cells per m."""
     if isinstance(placed, PlacedBoard):
         return placed.cells, 1 / placed.cell_m
     cells = black_cells(dictionary, placed.id)
@@ -77,7 +77,7 @@ def printed_cells(placed: Placed | PlacedBoard, dictionary: str) -> tuple[NDArra
 
 
 def print_outline(placed: Placed | PlacedBoard, dictionary: str, per_side: int = 8) -> Array:
-    """Points around the edge of the print, white margin included, (4 per_side, 3) in world m."""
+    """Return points around the edge of a print, white margin included, (4 per_side, 3) in world m."""
     cells, cells_per_m = printed_cells(placed, dictionary)
     corners = marker_corners(1 / cells_per_m) * [cells.shape[1], cells.shape[0], 1]
     step = np.linspace(0, 1, per_side, endpoint=False)[None, :, None]
@@ -86,17 +86,17 @@ def print_outline(placed: Placed | PlacedBoard, dictionary: str, per_side: int =
 
 
 def true_corners(lens: CameraCalibration, camera_from_world: Array, placed: Placed) -> Array:
-    """Pixels of the corners of the black square, in OpenCV's order, as no detector finds them.
+    """Return the exact pixels of the corners of the black square, without noise, in OpenCV's order.
 
     Parameters
     ----------
-    lens : of the camera.
-    camera_from_world : (4, 4), its pose.
+    lens : intrinsics of the camera.
+    camera_from_world : (4, 4), pose of the camera.
     placed : the marker.
 
     Returns
     -------
-    (4, 2), in px, (0, 0) the centre of the first pixel; clockwise from the marker's own top left.
+    (4, 2), in px, clockwise from the marker's own top left; (0, 0) is the centre of the first pixel.
     """
     camera_from_marker = camera_from_world @ placed.world_from_marker
     return project(transform(camera_from_marker, marker_corners(placed.length_m)), lens)
@@ -104,7 +104,8 @@ def true_corners(lens: CameraCalibration, camera_from_world: Array, placed: Plac
 
 Point = tuple[int, int]
 
-# In image coordinates (x right, y down); around a black cell with the black on the right-hand side.
+# Sides of a black cell in image coordinates (x right, y down), in the direction with black on the right:
+# start, end, and offset of the neighbouring cell.
 _SIDES = (
     ((0, 0), (1, 0), (0, -1)),
     ((1, 0), (1, 1), (1, 0)),
@@ -116,8 +117,8 @@ _SIDES = (
 def cell_outlines(black: NDArray[np.bool_]) -> list[NDArray[np.float64]]:
     """Trace the edges between black and white cells into closed polygons.
 
-    Neighbouring black cells share one polygon, so that no renderer leaves a light seam between them. The
-    outlines of holes have the opposite direction, so that the nonzero rule fills exactly the black cells.
+    Neighbouring black cells share one polygon, to avoid light seams between them in a renderer. The outlines
+    of holes have the opposite direction, so the nonzero rule fills exactly the black cells.
 
     Parameters
     ----------
@@ -141,7 +142,7 @@ def cell_outlines(black: NDArray[np.bool_]) -> list[NDArray[np.float64]]:
 
 
 def _directed_edges(black: NDArray[np.bool_]) -> dict[Point, list[Point]]:
-    """The ends of the edges that start at each point."""
+    """Return the ends of the edges that start at each point."""
     padded = np.pad(black, 1)
     ends: dict[Point, list[Point]] = {}
     for row, column in np.argwhere(black).tolist():
@@ -152,7 +153,7 @@ def _directed_edges(black: NDArray[np.bool_]) -> dict[Point, list[Point]]:
 
 
 def _walk(ends: dict[Point, list[Point]], start: Point) -> list[Point]:
-    """Take the edges of one polygon out of ``ends``; the points that it passes."""
+    """Remove the edges of one polygon from ``ends``; return its points in order."""
     points, point = [start], _take(ends, start)
     while point != start:
         points.append(point)
@@ -168,7 +169,7 @@ def _take(ends: dict[Point, list[Point]], point: Point) -> Point:
 
 
 def _corners(points: list[Point]) -> NDArray[np.float64]:
-    """The points at which a polygon turns."""
+    """Return the points at which a polygon turns."""
     outline = np.array(points, dtype=np.float64)
     before, after = outline - np.roll(outline, 1, axis=0), np.roll(outline, -1, axis=0) - outline
     turns = before[:, 0] * after[:, 1] != before[:, 1] * after[:, 0]

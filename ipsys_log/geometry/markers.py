@@ -25,28 +25,28 @@ __all__ = [
 
 Array = NDArray[np.float64]
 
-# About a tenth of a pixel: what the third derivative of a lens adds is below 1e-7 of the slope.
+# About 0.1 px: the error by the third derivative of a lens distortion is below 1e-7 of the slope.
 _STEP = 1e-4
 _STEPS = _STEP * np.array([[1.0, 0.0], [-1.0, 0.0], [0.0, 1.0], [0.0, -1.0]])
-# A covariance of less than full rank has variances of 1e-7 of the largest one, of either sign, in the
-# directions in which it has none: it is stored in single precision.
+# A covariance of lower rank is stored in single precision. In directions without variance, it has values of
+# about 1e-7 of the largest variance, of either sign.
 _NO_VARIANCE = 1e-4
 
 
 def check_covariance(covariance_px2: Array, where: str) -> None:
-    """See that a covariance can be computed with, whatever its rank.
+    """Check that a covariance, of any rank, is usable in computations.
 
     Raises
     ------
     IpsysError
-        Naming ``where``, for a matrix that is no covariance.
+        The matrix is not a covariance. The text names ``where``.
     """
     if not (np.isfinite(covariance_px2).all() and np.trace(covariance_px2) > 0):
         raise IpsysError(f"{where}: covariance_px2 has no variance in it; detect the markers again")
 
 
 def pixel_slopes(uv: Array, lens: CameraCalibration) -> Array:
-    """By how many px a point moves in the raw image as its normalized coordinates change.
+    """Return the derivatives of raw pixels with respect to normalized image coordinates.
 
     Parameters
     ----------
@@ -72,12 +72,12 @@ def pixel_slopes(uv: Array, lens: CameraCalibration) -> Array:
 
 
 def whiten(covariances_px2: Array) -> Array:
-    """What turns a marker's corners into eight numbers of variance 1, independent of each other.
+    """Return matrices that turn a marker's corners into eight independent numbers of variance 1.
 
-    A pose that was fitted to an image gives corners of rank 6: what the noise did in the other two of
-    their eight directions, the fit has taken away. Just these two tell one pose from another, so they must
-    weigh neither nothing, nor as if they had been measured without noise. They had the noise of the others
-    before the fit, and are given the mean variance of those.
+    A pose that is fitted to an image gives corners with a covariance of rank 6. The fit removes the noise in
+    the other two of their eight directions. These two directions distinguish one pose from another. Their
+    weight must therefore not be zero, and not that of a measurement without noise. Before the fit, they had
+    the same noise as the others. They get the mean variance of the others.
 
     Parameters
     ----------
@@ -92,20 +92,20 @@ def whiten(covariances_px2: Array) -> Array:
     >>> np.abs(whiten(np.diag([0.04] * 6 + [0.0, 0.0])[None])).sum(axis=1).round(9).tolist()
     [[5.0, 5.0, 5.0, 5.0, 5.0, 5.0, 5.0, 5.0]]
     """
-    found, axes = np.linalg.eigh(covariances_px2)
-    has = found > _NO_VARIANCE * found[:, -1:]
-    means = (found * has).sum(axis=1) / has.sum(axis=1)
-    filled = np.where(has, found, means[:, None])
+    variances, axes = np.linalg.eigh(covariances_px2)
+    has = variances > _NO_VARIANCE * variances[:, -1:]
+    means = (variances * has).sum(axis=1) / has.sum(axis=1)
+    filled = np.where(has, variances, means[:, None])
     whitening: Array = axes.swapaxes(1, 2) / np.sqrt(filled)[..., None]
     return whitening
 
 
-# Around the marker.
+# Next and previous corner, in the order around the marker.
 _NEXT, _BEFORE = np.array([1, 2, 3, 0]), np.array([3, 0, 1, 2])
 
 
 def camera_point(corners_uv: Array, length_m: float | Array) -> Array:
-    """Centre of a marker, or of several, that lie parallel to the image plane, in the frame of the camera.
+    """Return the centres, in camera coordinates, of markers that are parallel to the image plane.
 
     Parameters
     ----------
@@ -119,12 +119,12 @@ def camera_point(corners_uv: Array, length_m: float | Array) -> Array:
     Raises
     ------
     ValueError
-        Where the four corners of a marker fall together.
+        The four corners of a marker are the same point.
 
     References
     ----------
-    Ou et al., Robotica 2023, eq. (3), (4) and (5). In (4) and (5) as printed a factor 1/4 is
-    missing in the middle: Xc0 is the mean of the corners' Xc.
+    Ou et al., Robotica 2023, eq. (3), (4) and (5). In the printed (4) and (5), a factor 1/4 is
+    missing in the middle of the equation: Xc0 is the mean of the corners' Xc.
 
     Examples
     --------
@@ -144,11 +144,11 @@ def camera_point(corners_uv: Array, length_m: float | Array) -> Array:
 
 
 def camera_point_slopes(corners_uv: Array, length_m: float | Array) -> Array:
-    """By how much :func:`camera_point` moves with the corners.
+    """Return the derivatives of :func:`camera_point` with respect to the corners.
 
     Parameters
     ----------
-    corners_uv : (..., 4, 2), normalized image coordinates; not all four of a marker the same.
+    corners_uv : (..., 4, 2), normalized image coordinates; not all four corners of a marker the same.
     length_m : side of the marker's black square, or one for each (...), in m.
 
     Returns
@@ -156,7 +156,7 @@ def camera_point_slopes(corners_uv: Array, length_m: float | Array) -> Array:
     (..., 4, 3, 2): for each corner rows Xc, Yc, Zc in m, columns u and v.
     """
     sides, lengths = _sides(corners_uv)
-    # A side that has no length has no direction either.
+    # A side without length also has no direction.
     along = sides / np.maximum(lengths, np.finfo(np.float64).tiny)[..., None]
     perimeter = lengths.sum(axis=-1)
     z_m = 4.0 * length_m / perimeter
@@ -169,7 +169,7 @@ def camera_point_slopes(corners_uv: Array, length_m: float | Array) -> Array:
 
 
 def _sides(corners_uv: Array) -> tuple[Array, Array]:
-    """Vectors (..., 4, 2) from each corner to the next, and their lengths (..., 4)."""
+    """Return vectors (..., 4, 2) from each corner to the next, and their lengths (..., 4)."""
     sides = corners_uv.take(_NEXT, axis=-2) - corners_uv
     return sides, np.sqrt((sides * sides).sum(axis=-1))
 
@@ -181,7 +181,7 @@ def _centre(corners_uv: Array) -> Array:
 
 
 def heading(corners_uv: Array) -> Array:
-    """Minus the angle from corner 3 to corner 0 in the plane of the image, (...) in rad in (-pi, pi].
+    """Return the heading: minus the angle from corner 3 to corner 0 in the image, (...) in rad in (-pi, pi].
 
     Parameters
     ----------
@@ -197,9 +197,10 @@ def heading(corners_uv: Array) -> Array:
 
 
 def marker_corners(length_m: float) -> Array:
-    """Corners of a marker in its own frame (x right, y up, z towards the viewer), (4, 3) in m.
+    """Return the corners of a marker in marker coordinates, (4, 3) in m.
 
-    In OpenCV's order: clockwise, as seen from in front, from the top left.
+    In marker coordinates, x is to the right, y up and z towards the viewer. The corners have OpenCV's order:
+    clockwise in the front view, from the top left.
     """
     half = length_m / 2
     return np.array([[-half, half, 0], [half, half, 0], [half, -half, 0], [-half, -half, 0]])
@@ -207,7 +208,7 @@ def marker_corners(length_m: float) -> Array:
 
 @cache
 def white_cells(dictionary: str, marker_id: int) -> NDArray[np.bool_]:
-    """Which cells of a marker's square are white, (n, n), its black border included, the top row first.
+    """Return a mask of the white cells of a marker, (n, n) with its black border, the top row first.
 
     Parameters
     ----------

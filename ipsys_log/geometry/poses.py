@@ -1,4 +1,4 @@
-"""Rigid poses as (4, 4) matrices, named so that chains cancel: ``a_from_b @ b_from_c``."""
+"""Rigid poses as (4, 4) matrices. Their names show valid products: ``a_from_b @ b_from_c`` is a_from_c."""
 
 from __future__ import annotations
 
@@ -12,7 +12,7 @@ Array = NDArray[np.float64]
 
 
 def make_pose(rotation_matrix: Array, origin_m: Array) -> Array:
-    """``a_from_b`` from the axes of b, as columns in a, and the origin of b in a, in m.
+    """Return ``a_from_b`` from the axes of b, as columns in a, and the origin of b in a, in m.
 
     Parameters
     ----------
@@ -30,13 +30,13 @@ def make_pose(rotation_matrix: Array, origin_m: Array) -> Array:
 
 
 def invert_pose(a_from_b: Array) -> Array:
-    """``b_from_a``, (4, 4), by the transpose of the rotation."""
+    """Return ``b_from_a``, (4, 4), by the transpose of the rotation."""
     b_axes = a_from_b[:3, :3].T
     return make_pose(b_axes, -b_axes @ a_from_b[:3, 3])
 
 
 def transform(a_from_b: Array, points_b_m: Array) -> Array:
-    """Points of frame b in frame a, both (n, 3) in m.
+    """Return points given in coordinates b in coordinates a, both (n, 3) in m.
 
     Examples
     --------
@@ -48,20 +48,20 @@ def transform(a_from_b: Array, points_b_m: Array) -> Array:
 
 
 def rotation(vector_rad: Array) -> Array:
-    """Rotation matrix (3, 3) of a rotation vector (3,): axis times angle in rad."""
+    """Return the rotation matrix (3, 3) of a rotation vector (3,), which is axis times angle in rad."""
     return np.asarray(cv2.Rodrigues(np.asarray(vector_rad, dtype=np.float64))[0], dtype=np.float64)
 
 
 def rotation_vector(rotation_matrix: Array) -> Array:
-    """Axis times angle in rad, (3,), of a rotation matrix (3, 3)."""
+    """Return the rotation vector (3,), axis times angle in rad, of a rotation matrix (3, 3)."""
     return np.asarray(cv2.Rodrigues(rotation_matrix)[0], dtype=np.float64).ravel()
 
 
 def lay_flat(x_m: float, y_m: float, z_m: float, heading_rad: float) -> Array:
-    """``world_from_marker`` of a marker that faces up, (4, 4).
+    """Return ``world_from_marker``, (4, 4), of a marker that faces up.
 
-    The heading is the angle, from world x to world y, of the marker's side from corner 3 to corner 0,
-    which is the marker's y axis.
+    The marker's y axis is the side from corner 3 to corner 0. The heading is the angle of this axis, from
+    world x towards world y.
 
     Examples
     --------
@@ -74,15 +74,15 @@ def lay_flat(x_m: float, y_m: float, z_m: float, heading_rad: float) -> Array:
 
 
 def look_down(origin_m: Array, tilt_rad: Array | None = None) -> Array:
-    """``camera_from_world`` of a camera that looks at the floor, (4, 4).
+    """Return ``camera_from_world``, (4, 4), of a camera that looks down at the floor.
 
-    Its x axis is the world's, its y axis minus the world's, so that its image shows the floor as seen
-    from above, with y up.
+    The camera's x axis is the world's x axis, and its y axis is minus the world's y axis. Its image shows the
+    floor from above, with world y up.
 
     Parameters
     ----------
-    origin_m : (3,), where it hangs, in the world.
-    tilt_rad : (3,), rotation vector in the frame of the camera that takes it from the plumb line.
+    origin_m : (3,), camera position in the world.
+    tilt_rad : (3,), rotation vector in camera coordinates that turns the camera away from the plumb line.
     """
     camera_from_plumb = np.eye(3) if tilt_rad is None else rotation(tilt_rad)
     axes = camera_from_plumb @ np.diag([1.0, -1.0, -1.0])

@@ -1,4 +1,4 @@
-"""Both poses of a square marker that explain its four corners."""
+"""Pose estimation of square markers: both poses that explain the four corners."""
 
 from __future__ import annotations
 
@@ -20,9 +20,9 @@ _UNIT = np.eye(2)
 
 
 def solve_squares(uv: Array, lengths_m: Array) -> tuple[Array, Array]:
-    """IPPE's two poses of square markers: by formula, and exact where the corners are.
+    """Return the two poses of square markers by IPPE, a closed formula that is exact for exact corners.
 
-    OpenCV has it as well (``SOLVEPNP_IPPE_SQUARE``), but returns no numbers, or wrong ones, for markers that
+    OpenCV also has this method (``SOLVEPNP_IPPE_SQUARE``). It returns NaN, or wrong numbers, for markers that
     exactly face the camera.
 
     Parameters
@@ -33,7 +33,7 @@ def solve_squares(uv: Array, lengths_m: Array) -> tuple[Array, Array]:
 
     Returns
     -------
-    rotations : (n, 2, 3, 3), the marker's axes in the frame of the camera.
+    rotations : (n, 2, 3, 3), the marker's axes in camera coordinates.
     centres_m : (n, 2, 3).
 
     References
@@ -42,10 +42,10 @@ def solve_squares(uv: Array, lengths_m: Array) -> tuple[Array, Array]:
     """
     slope, centre_uv = _homography(uv, lengths_m)
     camera_from_view = _along_view(centre_uv)
-    # How the image moves with a point about the centre: not at all along the view.
+    # Image motion of a point near the centre. It is zero for a motion along the view direction.
     seen = camera_from_view[:, :2, :2] - centre_uv[:, :, None] * camera_from_view[:, 2:, :2]
     flat = _solve(seen, slope)
-    # Of the upper two rows of a rotation's two columns the larger singular value is 1: that is the scale.
+    # The upper two rows of two columns of a rotation have a largest singular value of 1, which is the scale.
     det = flat[:, 0, 0] * flat[:, 1, 1] - flat[:, 0, 1] * flat[:, 1, 0]
     squares = (flat * flat).sum(axis=(1, 2))
     per_m2 = (squares + np.sqrt(np.maximum(squares * squares - 4 * det * det, 0))) / 2
@@ -55,7 +55,8 @@ def solve_squares(uv: Array, lengths_m: Array) -> tuple[Array, Array]:
     both = np.empty((len(uv), 2, 3, 3))
     both[:, :, :2, :2] = flat[:, None]
     both[..., 2, 2] = (det / per_m2)[:, None]
-    # The first two columns' cross product has, but for its depth, the sign of theirs.
+    # The third column is the cross product of the first two. Its x and y have the sign of their depths. Its
+    # own depth is the same for both signs.
     normal = flat[:, ::-1, 0] * depths[:, 1:] - flat[:, ::-1, 1] * depths[:, :1]
     normal[:, 1] *= -1
     for pose, sign in enumerate((1, -1)):
@@ -66,16 +67,16 @@ def solve_squares(uv: Array, lengths_m: Array) -> tuple[Array, Array]:
 
 
 def _homography(uv: Array, lengths_m: Array) -> tuple[Array, Array]:
-    """At the centres of markers: slopes of (u, v) by the marker's x and y, (n, 2, 2), and (u, v), (n, 2)."""
+    """Return slopes of (u, v) by the marker's x and y, (n, 2, 2), and (u, v), (n, 2), at marker centres."""
     corners_m = _UNIT_CORNERS * lengths_m[:, None, None]
     equations = np.zeros((len(uv), 4, 2, 8))
     equations[:, :, 0, 0:2] = equations[:, :, 1, 3:5] = corners_m
     equations[:, :, 0, 2] = equations[:, :, 1, 5] = 1
     equations[..., 6:] = -uv[..., None] * corners_m[:, :, None]
-    found = _solve(equations.reshape(-1, 8, 8), uv.reshape(-1, 8, 1))[..., 0]
-    affine = found[:, :6].reshape(-1, 2, 3)
+    coefficients = _solve(equations.reshape(-1, 8, 8), uv.reshape(-1, 8, 1))[..., 0]
+    affine = coefficients[:, :6].reshape(-1, 2, 3)
     centre_uv = affine[:, :, 2]
-    return affine[:, :, :2] - centre_uv[:, :, None] * found[:, None, 6:], centre_uv
+    return affine[:, :, :2] - centre_uv[:, :, None] * coefficients[:, None, 6:], centre_uv
 
 
 def _along_view(uv: Array) -> Array:
@@ -93,25 +94,25 @@ def _solve(a: Array, b: Array) -> Array:
     return np.asarray(np.linalg.solve(a, b), dtype=np.float64)
 
 
-# Markers face up and cameras look down, to about this angle: it decides where the corners do not.
+# Markers face up and cameras look down, to about this angle. The tilt selects a pose if the corners do not.
 _TILT_RAD = np.deg2rad(3.0)
-# Two poses that nearly fall together settle slowly, and need not.
+# Two poses that are nearly equal converge slowly. They do not need more iterations.
 _ITERATIONS = 5
-# A fit has settled when a step is expected to lower chi2 by less than this part of it, and this much: to
-# about a hundredth of the corners' noise, and far below it where they are exact.
+# A fit has converged if the expected decrease of chi2 by a step is less than _SETTLED chi2 + _EXACT. This is
+# about 0.01 times the noise of the corners, and far below the noise for exact corners.
 _SETTLED, _EXACT = 1e-3, 1e-6
 _DAMPING = 0.01
 _DIAGONAL = np.eye(6)
-# The least corner of a marker that can be told from a line: the area at it, by the squared perimeter.
+# A marker with a smaller corner is a line: the area at the corner, divided by the squared perimeter.
 _FLAT = 1e-6
 
 
 class SquarePoses(NamedTuple):
-    """Two poses for each of n markers, the likelier one first.
+    """Two poses for each of n markers, the likelier pose first.
 
-    ``rotations`` (n, 2, 3, 3), ``centres_m`` (n, 2, 3): the marker's axes and centre in the frame of the
-    camera. ``chi2`` (n, 2): squared residuals of the eight whitened coordinates, summed. ``covariances_m2``
-    (n, 3, 3): of the first one's centre.
+    ``rotations`` (n, 2, 3, 3) and ``centres_m`` (n, 2, 3) are the marker's axes and centre in camera
+    coordinates. ``chi2`` (n, 2) is the sum of the squared residuals of the eight whitened coordinates.
+    ``covariances_m2`` (n, 3, 3) are those of the centre of the first pose.
     """
 
     rotations: Array
@@ -121,17 +122,17 @@ class SquarePoses(NamedTuple):
 
 
 def fit_squares(uv: Array, whitening: Array, lengths_m: Array) -> SquarePoses:
-    """Poses of square markers from their corners, through a lens that is linear over a pixel.
+    """Estimate both poses of square markers from their corners, with a lens that is linear over a pixel.
 
-    IPPE's two solutions, each refined by Gauss and Newton's method, with Levenberg and Marquardt's damping
-    where a step fails, until the weighted squares of the reprojection error are least. First comes the
-    one with the smaller sum of these squares and of the squared tilt, in units of 3 degrees, between the
-    marker's z axis and the direction against the optical axis.
+    The Gauss-Newton method refines both solutions of IPPE until the weighted squares of the reprojection
+    error are minimal. If a step fails, it uses Levenberg-Marquardt damping. The first pose has the smaller
+    sum of these squares and of the squared tilt, in units of 3 degrees. The tilt is the angle between the
+    marker's z axis and the direction opposite to the optical axis.
 
     Parameters
     ----------
     uv : (n, 4, 2), normalized image coordinates of corners that go around (see :func:`goes_around`).
-    whitening : (n, 8, 8), what turns changes of u0 v0 .. u3 v3 into numbers of variance 1 (see
+    whitening : (n, 8, 8), matrices that turn changes of u0 v0 .. u3 v3 into numbers of variance 1 (see
         :func:`ipsys_log.geometry.markers.whiten`, times the slopes of the lens).
     lengths_m : (n,), sides of the black squares, in m.
 
@@ -153,7 +154,7 @@ def fit_squares(uv: Array, whitening: Array, lengths_m: Array) -> SquarePoses:
     corners_m = marker_corners(1.0) * lengths_m[:, None, None]
     seen = _Seen(uv[:, None], whitening[:, None], corners_m[:, None])
     fit = _refine(seen, *solve_squares(uv, lengths_m))
-    # Twice one plus the cosine: the square of the angle, as long as that is small.
+    # 2 (1 + cosine) is the square of the angle, if the angle is small.
     tilt2_rad2 = 2 * (1 + fit.rotations[..., 2, 2])
     order = np.argsort(fit.chi2 + tilt2_rad2 / _TILT_RAD**2, axis=1, kind="stable")
     row = np.arange(len(uv))
@@ -165,7 +166,7 @@ def fit_squares(uv: Array, whitening: Array, lengths_m: Array) -> SquarePoses:
 
 
 def goes_around(uv: Array) -> bool:
-    """Whether corners, (4, 2), go around a convex figure as those of a marker seen from in front do."""
+    """Return whether corners, (4, 2), go around a convex figure, in the order of a marker in front view."""
     sides = uv[[1, 2, 3, 0]] - uv
     after = sides[[1, 2, 3, 0]]
     turns = sides[:, 0] * after[:, 1] - sides[:, 1] * after[:, 0]
@@ -175,13 +176,13 @@ def goes_around(uv: Array) -> bool:
 def reprojection_px(
     poses: SquarePoses, lengths_m: Array, corners_px: Array, lens: CameraCalibration
 ) -> Array:
-    """Root mean square of the distances between the corners that follow from poses and those seen.
+    """Return the RMS reprojection error: the distances between corners from poses and measured corners.
 
     Parameters
     ----------
-    poses : of n markers.
-    lengths_m : (n,), sides of the black squares.
-    corners_px : (n, 4, 2), as seen in the raw image.
+    poses : poses of n markers.
+    lengths_m : (n,), sides of the black squares, in m.
+    corners_px : (n, 4, 2), measured corners in the raw image.
     lens : the camera's calibration.
 
     Returns
@@ -192,12 +193,12 @@ def reprojection_px(
     points_m = corners_m[:, None] @ poses.rotations.swapaxes(-1, -2) + poses.centres_m[:, :, None]
     again_px = project(points_m.reshape(-1, 3), lens).reshape(-1, 2, 4, 2)
     misses_px2 = ((again_px - corners_px[:, None]) ** 2).sum(axis=-1)
-    found: Array = np.sqrt(misses_px2.mean(axis=-1))
-    return found
+    rms_px: Array = np.sqrt(misses_px2.mean(axis=-1))
+    return rms_px
 
 
 class _Seen(NamedTuple):
-    """What n markers are fitted to, for both poses alike: (n, 1, 4, 2), (n, 1, 8, 8), (n, 1, 4, 3)."""
+    """Inputs of the fit of n markers, the same for both poses: (n, 1, 4, 2), (n, 1, 8, 8), (n, 1, 4, 3)."""
 
     uv: Array
     whitening: Array
@@ -215,7 +216,7 @@ class _Fit(NamedTuple):
 
 
 def _refine(seen: _Seen, rotations: Array, centres_m: Array) -> _Fit:
-    """The poses of least squares, from poses near them."""
+    """Refine approximate poses by least squares."""
     now = _look(seen, rotations, centres_m)
     damping = np.zeros((len(rotations), 2, 1, 1))
     for _ in range(_ITERATIONS):
@@ -243,10 +244,10 @@ def _choose(better: NDArray[np.bool_], tried: _Fit, now: _Fit) -> _Fit:
 
 
 def _look(seen: _Seen, rotations: Array, centres_m: Array) -> _Fit:
-    """Poses with their whitened residuals (n, 2, 8) and the slopes of these, (n, 2, 8, 6).
+    """Return poses with their whitened residuals (n, 2, 8) and the slopes of the residuals, (n, 2, 8, 6).
 
-    The six parameters: a turn of the marker about its centre, in rad about the camera's axes, and a shift of
-    its centre, in parts of its distance z.
+    The first three parameters are a rotation of the marker about its centre, in rad about the camera's axes.
+    The other three are a translation of its centre, in units of its distance z.
     """
     arms_m = seen.corners_m @ rotations.swapaxes(-1, -2)
     points_m = arms_m + centres_m[..., None, :]
@@ -268,7 +269,7 @@ def _look(seen: _Seen, rotations: Array, centres_m: Array) -> _Fit:
 
 
 def _small_turns(vectors_rad: Array) -> Array:
-    """Rotations (..., 3, 3) by vectors (..., 3), to second order: Cayley's, which are rotations exactly."""
+    """Return Cayley's rotations (..., 3, 3) by vectors (..., 3): exact rotations, angles to second order."""
     half = np.zeros((*vectors_rad.shape, 3))
     x, y, z = vectors_rad[..., 0] / 2, vectors_rad[..., 1] / 2, vectors_rad[..., 2] / 2
     half[..., 0, 1], half[..., 0, 2], half[..., 1, 2] = -z, y, -x
@@ -279,6 +280,6 @@ def _small_turns(vectors_rad: Array) -> Array:
 
 
 def _centre_covariances(slopes: Array, z_m: Array) -> Array:
-    """Covariances of centres, (n, 3, 3) in m^2, to first order in the noise of the corners."""
-    of_motions = np.linalg.inv(slopes.swapaxes(1, 2) @ slopes)
-    return np.asarray(of_motions[:, 3:, 3:] * z_m[:, None, None] ** 2, dtype=np.float64)
+    """Return covariances of centres, (n, 3, 3) in m^2, to first order in the noise of the corners."""
+    covariances = np.linalg.inv(slopes.swapaxes(1, 2) @ slopes)
+    return np.asarray(covariances[:, 3:, 3:] * z_m[:, None, None] ** 2, dtype=np.float64)

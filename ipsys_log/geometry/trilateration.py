@@ -28,7 +28,7 @@ SIDES = ("left", "right")
 
 
 def trilaterate(a_m: Array, b_m: Array, d1_m: float, d2_m: float, side: str) -> Array:
-    """The point at distance ``d1_m`` from A and ``d2_m`` from B.
+    """Return the point at distance ``d1_m`` from A and ``d2_m`` from B.
 
     Parameters
     ----------
@@ -44,7 +44,7 @@ def trilaterate(a_m: Array, b_m: Array, d1_m: float, d2_m: float, side: str) -> 
     Raises
     ------
     IpsysError
-        Where A, B and the two distances form no triangle, with the numbers.
+        A, B and the two distances form no triangle. The text contains the numbers.
 
     References
     ----------
@@ -70,11 +70,11 @@ def trilaterate(a_m: Array, b_m: Array, d1_m: float, d2_m: float, side: str) -> 
 
 
 def meeting_point(a_m: Array, b_m: Array, d1_m: float, d2_m: float, side: str) -> Array:
-    """Where two circles meet; where they do not, the point between them on AB or beyond."""
+    """Return the intersection of two circles; without one, the point between them on the line AB."""
     ab = b_m - a_m
     base_m = float(np.hypot(*ab))
     along_m = (d1_m**2 - d2_m**2 + base_m**2) / (2 * base_m)
-    # Rounding can leave a flat triangle with a height just below zero.
+    # By rounding, the squared height of a flat triangle can be slightly below zero.
     across_m = np.sqrt(max(d1_m**2 - along_m**2, 0.0))
     unit = ab / base_m
     normal = np.array([-unit[1], unit[0]])
@@ -82,10 +82,10 @@ def meeting_point(a_m: Array, b_m: Array, d1_m: float, d2_m: float, side: str) -
     return point_m
 
 
-# Reference points nearer to one line than this hardly tell its sides apart.
+# If all reference points are nearer to one line than this, they do not distinguish its sides.
 _BESIDE_LINE_M = 0.05
 _NEAREST_M = 1e-9
-# Two places fit equally well as long as their sums of squares, in sigmas, are no further apart.
+# Two positions fit equally well if their sums of squares, in squared sigmas, differ by less than this.
 _ALIKE = 9.0
 _USUAL_SIGMA_M = 0.003
 _STARTS = 6
@@ -94,11 +94,11 @@ _STEP_M = 1e-10
 
 
 class Trilaterated(NamedTuple):
-    """A place and how well the tape knows it.
+    """A point from tape distances, with its covariance and residuals.
 
-    ``point_m`` (2,); ``covariance_m2`` (2, 2), None without sigmas; ``residuals_m`` (n,), each distance
-    as measured minus as it is from the point, all 0 for two distances; ``reduced_chi2``, about 1 where the
-    distances agree within their sigmas, None for two distances or without sigmas.
+    ``point_m`` is (2,). ``covariance_m2`` is (2, 2), None without sigmas. ``residuals_m`` (n,) are the
+    measured distances minus those from the point, all 0 for two distances. ``reduced_chi2`` is about 1 if the
+    distances agree within their sigmas. It is None for two distances or without sigmas.
     """
 
     point_m: Array
@@ -110,20 +110,20 @@ class Trilaterated(NamedTuple):
 def multilaterate(
     references_m: Array, distances_m: Array, sigmas_m: Array | None = None, side: str | None = None
 ) -> Trilaterated:
-    """The point at given distances from two or more reference points.
+    """Return the point at given distances from two or more reference points.
 
-    Two distances are eq. (25) as it stands; more are weighted least squares of it, each distance with
-    the weight 1 / sigma^2, or all the same. Distances that contradict one another are not refused:
-    their residuals tell.
+    For two distances, the function solves eq. (25) exactly. For more distances, it solves eq. (25) by
+    weighted least squares. Each distance has the weight 1 / sigma^2, or all have the same weight. Distances
+    that contradict one another raise no error, but have large residuals.
 
     Parameters
     ----------
-    references_m : (n, 2), n >= 2, on the floor, in m.
-    distances_m : (n,), from the point to each of them.
+    references_m : (n, 2), n >= 2, reference points on the floor, in m.
+    distances_m : (n,), distances from the point to each reference point, in m.
     sigmas_m : (n,), standard deviations of the distances; without them there is no covariance.
-    side : "left" or "right" of the line from the first reference point to the next one elsewhere. Needed
-        where all of them lie within 5 cm of one line, as two always do; else it decides between places that
-        the distances fit equally well.
+    side : "left" or "right" of the line from the first reference point to the next different one. The side is
+        required if all reference points are within 5 cm of one line; two points always are. Otherwise
+        it selects between positions that fit the distances equally well.
 
     Returns
     -------
@@ -132,8 +132,8 @@ def multilaterate(
     Raises
     ------
     IpsysError
-        Where two circles do not meet, the side is needed and missing, all reference points are one, or
-        a distance or sigma is not a positive number.
+        Two circles do not meet, or the required side is missing. Or all reference points are the same point,
+        or a distance or sigma is not a positive number.
 
     References
     ----------
@@ -168,7 +168,7 @@ def multilaterate(
 
 
 def sides_alike(references_m: Array) -> bool:
-    """Whether reference points, (n, 2) in m, lie so near to one line that the side must be told.
+    """Return whether reference points, (n, 2) in m, are so near to one line that a side is required.
 
     Examples
     --------
@@ -185,8 +185,10 @@ def sides_alike(references_m: Array) -> bool:
 
 
 def side_of(point_m: Array, references_m: Array) -> str:
-    """The side on which a point, (2,), lies of the line from the first of the reference points, (n, 2), to
-    the next one elsewhere; "left" where it lies on it.
+    """Return the side of a point, (2,), relative to a line through reference points, (n, 2).
+
+    The line goes from the first reference point to the next different one. The side of a point on the line is
+    "left".
 
     Examples
     --------
@@ -194,26 +196,28 @@ def side_of(point_m: Array, references_m: Array) -> str:
     'left'
     """
     onward_m = references_m - references_m[0]
-    other = int(np.argmax(np.linalg.norm(onward_m, axis=1) > _NEAREST_M))
-    return "left" if _cross(onward_m[other], point_m - references_m[0]) >= 0 else "right"
+    next_different = int(np.argmax(np.linalg.norm(onward_m, axis=1) > _NEAREST_M))
+    return "left" if _cross(onward_m[next_different], point_m - references_m[0]) >= 0 else "right"
 
 
 def tape_covariance(point_m: Array, references_m: Array, sigmas_m: Array) -> Array:
-    """Covariance of a point from those of its distances, to first order: (J' S^-1 J)^-1, J of eq. (25).
+    """Return the covariance of a point from the standard deviations of its distances, to first order.
 
-    Where the circles cross flatly the point slides along them, and first order knows no bound. Their
-    curvature does: a slide by s changes a distance d by sqrt(d^2 + s^2) - d, and no sigma is greater than
-    the slide that changes the distances by a sigma in all. It is reached below some 3 degrees (2 m, 3 mm).
+    It is (J' S^-1 J)^-1, with J of eq. (25). If the circles cross at a small angle, the point can move along
+    them, and the first order gives no bound. The curvature of the circles gives a bound: a motion by s along
+    a circle changes a distance d by sqrt(d^2 + s^2) - d. No sigma of the point is greater than the motion
+    that changes the distances by one sigma in total. This bound applies below crossing angles of about
+    3 degrees (at 2 m and 3 mm).
 
     Parameters
     ----------
     point_m : (2,), in m.
     references_m : (n, 2), in m.
-    sigmas_m : (n,), standard deviations of the distances.
+    sigmas_m : (n,), standard deviations of the distances, in m.
 
     Returns
     -------
-    (2, 2), in m^2; finite and positive definite wherever the point is.
+    (2, 2), in m^2; finite and positive definite for every point.
 
     Examples
     --------
@@ -223,15 +227,16 @@ def tape_covariance(point_m: Array, references_m: Array, sigmas_m: Array) -> Arr
     """
     ranges_m, units = _directions(point_m, references_m)
     weighted = units / sigmas_m[:, None]
-    known, axes = np.linalg.eigh(weighted.T @ weighted)
+    information, axes = np.linalg.eigh(weighted.T @ weighted)
     curved = np.sqrt(((1 / (sigmas_m * (2 * ranges_m + sigmas_m))) ** 2).sum())
-    covariance: Array = (axes / np.maximum(known, curved)) @ axes.T
+    covariance: Array = (axes / np.maximum(information, curved)) @ axes.T
     return covariance
 
 
 def crossing_angle(point_m: Array, references_m: Array) -> float:
-    """The angle in rad, 0 to pi/2, at which the tapes from reference points, (n, 2) in m with n >= 2, to a
-    point, (2,), cross: the widest of any two of them.
+    """Return the largest crossing angle of two tapes, in rad, 0 to pi/2.
+
+    The tapes go from reference points, (n, 2) in m with n >= 2, to a point, (2,).
 
     Examples
     --------
@@ -241,35 +246,39 @@ def crossing_angle(point_m: Array, references_m: Array) -> float:
     """
     _, units = _directions(point_m, references_m)
     pairs = combinations(units, 2)
-    return max(float(np.arctan2(abs(_cross(one, two)), abs(one @ two))) for one, two in pairs)
+    return max(float(np.arctan2(abs(_cross(unit, other)), abs(unit @ other))) for unit, other in pairs)
 
 
 def _least_squares(
     references_m: Array, distances_m: Array, sigmas_m: Array | None, side: str | None
 ) -> Array:
-    """The best of what is found from where two of the circles meet, on ``side`` if that fits as well."""
+    """Return the best solution from starts at circle intersections, on ``side`` if it fits equally well."""
     weights = 1 / (np.full_like(distances_m, _USUAL_SIGMA_M) if sigmas_m is None else sigmas_m)
-    # Several distances from one reference point begin nowhere else than one of them.
+    # Several distances from one reference point give no additional start.
     first = np.unique(references_m, axis=0, return_index=True)[1][:_STARTS]
-    found = []
+    solutions = []
     for i, j in combinations(first.tolist(), 2):
-        two = references_m[i], references_m[j], float(distances_m[i]), float(distances_m[j])
-        starts_m = [meeting_point(*two, one) for one in SIDES]
-        found += [_descend(start_m, references_m, distances_m, weights) for start_m in starts_m]
-    likely = min(cost for cost, _ in found) + _ALIKE
-    there = [one for one in found if one[0] <= likely and side_of(one[1], references_m) == side]
-    # A place on the line itself may come out on either side of it.
-    return min(there or found, key=lambda one: one[0])[1]
+        two_circles = references_m[i], references_m[j], float(distances_m[i]), float(distances_m[j])
+        starts_m = [meeting_point(*two_circles, start_side) for start_side in SIDES]
+        solutions += [_descend(start_m, references_m, distances_m, weights) for start_m in starts_m]
+    likely = min(cost for cost, _ in solutions) + _ALIKE
+    on_side = [
+        solution
+        for solution in solutions
+        if solution[0] <= likely and side_of(solution[1], references_m) == side
+    ]
+    # The solution for a point on the line may be on either side of the line.
+    return min(on_side or solutions, key=lambda one: one[0])[1]
 
 
 def _descend(point_m: Array, references_m: Array, distances_m: Array, weights: Array) -> tuple[float, Array]:
-    """Damped Newton: the weighted sum of squares at the point it comes to, and the point."""
+    """Minimize by damped Newton's method; return the least weighted sum of squares and its point."""
 
     def misfit(at_m: Array) -> tuple[float, Array, Array]:
         ranges_m, units = _directions(at_m, references_m)
         off = (distances_m - ranges_m) * weights
         outer = units[:, :, None] * units[:, None, :]
-        # Where the circles cross flatly their curvature is what there is to go by.
+        # If the circles cross at a small angle, only their curvature determines the point.
         bend = (off * weights / ranges_m)[:, None, None] * (np.eye(2) - outer)
         hessian = (weights[:, None, None] ** 2 * outer - bend).sum(axis=0)
         return float(off @ off), (off * weights) @ units, hessian
@@ -277,14 +286,14 @@ def _descend(point_m: Array, references_m: Array, distances_m: Array, weights: A
     cost, downhill, hessian = misfit(point_m)
     damping = 1e-6
     for _ in range(_STEPS):
-        # Enough to make it positive definite, whatever the curvature.
+        # This makes the Hessian positive definite for every curvature.
         lift = damping * np.abs(hessian).max() - min(float(np.linalg.eigvalsh(hessian)[0]), 0.0) * 1.1
         step_m = np.linalg.solve(hessian + lift * np.eye(2), downhill)
-        lower, *there = misfit(point_m + step_m)
+        lower, *derivatives = misfit(point_m + step_m)
         if lower > cost:
             damping *= 10
         else:
-            point_m, cost, (downhill, hessian) = point_m + step_m, lower, there
+            point_m, cost, (downhill, hessian) = point_m + step_m, lower, derivatives
             damping = max(damping / 10, 1e-12)
         if np.hypot(*step_m) < _STEP_M:
             break
@@ -292,7 +301,7 @@ def _descend(point_m: Array, references_m: Array, distances_m: Array, weights: A
 
 
 def _directions(point_m: Array, references_m: Array) -> tuple[Array, Array]:
-    """Distances (n,) in m from the references to a point, and unit vectors (n, 2) along them."""
+    """Return distances (n,) in m from the references to a point, and unit vectors (n, 2) along them."""
     offsets_m = point_m - references_m
     ranges_m = np.maximum(np.linalg.norm(offsets_m, axis=1), _NEAREST_M)
     return ranges_m, offsets_m / ranges_m[:, None]

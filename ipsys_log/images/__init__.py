@@ -1,1 +1,1 @@
-"""Images: JPEG and video, decoded within limits."""
+"""Image decoding: JPEG, PNG, raw images and video, with limits on the size."""

@@ -35,7 +35,7 @@ _PNG = b"\x89PNG\r\n\x1a\n"
 def read_picture_size(path: Path) -> tuple[int, int] | None:
     """Return width and height in px from the header of a JPEG or PNG file.
 
-    None for another kind of file, or for an unreadable header.
+    Return None for another kind of file, or for an unreadable header.
     """
     try:
         with path.open("rb") as file:
@@ -49,7 +49,7 @@ def read_picture_size(path: Path) -> tuple[int, int] | None:
         return None
     try:
         height, width, _, _ = simplejpeg.decode_jpeg_header(data, strict=False)
-    except (ValueError, KeyError):  # KeyError: it found no colour space
+    except (ValueError, KeyError):  # KeyError: the header has no known colour space
         return None
     return int(width), int(height)
 
@@ -63,12 +63,12 @@ _JPEG_SCAN = 0xDA
 
 
 def check_encoded(data: bytes) -> None:
-    """Refuse a JPEG or PNG whose header states more pixels than it can have.
+    """Check that the header of a JPEG or PNG does not state too many pixels.
 
     Raises
     ------
     FrameError
-        It claims more than `MOST_PIXELS`, or more than its bytes can code.
+        The header states more than `MOST_PIXELS`, or more than its bytes can encode.
     """
     if data[:2] == b"\xff\xd8":
         width, height = _jpeg_size(data)
@@ -78,12 +78,12 @@ def check_encoded(data: bytes) -> None:
 
 
 def check_size(width: int, height: int, jpeg_bytes: int | None = None) -> None:
-    """Refuse a size in px that is too large, also for the number of bytes of a JPEG.
+    """Check that a size in px is not too large, also for the number of bytes of a JPEG.
 
     Raises
     ------
     FrameError
-        See :func:`check_encoded`.
+        The size is too large, see :func:`check_encoded`.
     """
     if width * height > MOST_PIXELS:
         raise FrameError(f"a picture of {width} x {height} px, more than {MOST_PIXELS} in all")
@@ -93,14 +93,16 @@ def check_size(width: int, height: int, jpeg_bytes: int | None = None) -> None:
 
 def _jpeg_size(data: bytes) -> tuple[int, int]:
     """Return width and height in the first frame header; (0, 0) if there is none before the pixels."""
-    at = 2
-    while at + 9 <= len(data) and data[at] == 0xFF and data[at + 1] != _JPEG_SCAN:
-        if data[at + 1] == 0xFF:  # a fill byte
-            at += 1
+    offset = 2
+    while offset + 9 <= len(data) and data[offset] == 0xFF and data[offset + 1] != _JPEG_SCAN:
+        if data[offset + 1] == 0xFF:  # a fill byte
+            offset += 1
             continue
-        if data[at + 1] in _JPEG_FRAMES:
-            return int.from_bytes(data[at + 7 : at + 9], "big"), int.from_bytes(data[at + 5 : at + 7], "big")
-        at += 2 + int.from_bytes(data[at + 2 : at + 4], "big")
+        if data[offset + 1] in _JPEG_FRAMES:
+            return int.from_bytes(data[offset + 7 : offset + 9], "big"), int.from_bytes(
+                data[offset + 5 : offset + 7], "big"
+            )
+        offset += 2 + int.from_bytes(data[offset + 2 : offset + 4], "big")
     return 0, 0
 
 
@@ -118,7 +120,7 @@ _RAW_TO_GREY = {
 
 
 class _Memory:
-    """What a thread decodes into, again and again: new memory would cost more than to fill it."""
+    """The reused buffers of a thread for decoding: allocation of new memory takes longer than filling it."""
 
     def __init__(self) -> None:
         self.pixels = np.zeros((0, 0), dtype=np.uint8)
@@ -131,22 +133,22 @@ _THREAD = threading.local()
 def decode_rows(
     frame: CompressedImage | RawImage, rows: Sequence[slice] | None = None
 ) -> tuple[Grey, list[slice]]:
-    """Decode the grey picture of a frame, or at least some rows of it.
+    """Decode the grey image of a frame, or at least some rows of it.
 
     Parameters
     ----------
     frame : as recorded.
-    rows : the rows to decode; None for all. With fewer, a JPEG is checked less strictly.
+    rows : the rows to decode; None for all. With fewer rows, the check of a JPEG is less strict.
 
     Returns
     -------
-    The picture (height, width), good until this thread decodes the next one, and the rows of it that were
-    decoded; the others are black.
+    The image (height, width), valid until this thread decodes the next image, and its decoded rows. All other
+    rows are black.
 
     Raises
     ------
     FrameError
-        Where the data is damaged.
+        The data is damaged.
     """
     layout = read_layout(frame.data) if isinstance(frame, CompressedImage) else None
     if layout is None:
@@ -161,23 +163,23 @@ def decode_rows(
         _decode_jpeg(frame.data, grey)
         return grey, [slice(0, layout.height)]
     shown = whole_rows(layout, rows)
-    # What an earlier picture left there, of another camera even, is not to be seen.
+    # The other rows must not show an earlier image, which may be from another camera.
     starts, stops = [part.start for part in shown], [part.stop for part in shown]
     for low, high in zip([0, *stops], [*starts, layout.height], strict=True):
         grey[low:high] = 0
     for piece, part in zip(cut_rows(frame.data, layout, shown, memory.bytes), shown, strict=True):
-        # Without restart markers, what follows the last row that is wanted looks like damage.
+        # Without restart markers, the data after the last requested row looks like damage.
         _decode_jpeg(piece, grey[part], strict=layout.interval > 0)
     return grey, shown
 
 
 def decode_grey(frame: CompressedImage | RawImage) -> Grey:
-    """Decode the grey picture of a frame, (height, width).
+    """Decode the grey image of a frame, (height, width).
 
     Raises
     ------
     FrameError
-        The data are damaged: a JPEG is decoded strictly, and an incomplete picture is refused.
+        The data is damaged. The decoding of a JPEG is strict: an incomplete image is an error.
     """
     if isinstance(frame, RawImage):
         return _raw_grey(frame)
@@ -196,7 +198,7 @@ def decode_grey(frame: CompressedImage | RawImage) -> Grey:
 def _decode_jpeg(
     data: bytes | bytearray | memoryview, pixels: Grey | None = None, strict: bool = True
 ) -> Grey:
-    """Decode a JPEG, into ``pixels`` where they are given."""
+    """Decode a JPEG, into ``pixels`` if it is given."""
     try:
         grey: Grey = simplejpeg.decode_jpeg(data, colorspace="GRAY", buffer=pixels, strict=strict)[..., 0]
     except ValueError as error:
@@ -205,7 +207,7 @@ def _decode_jpeg(
 
 
 def levels_at(grey: Grey, x: NDArray[np.float32], y: NDArray[np.float32]) -> NDArray[np.float64]:
-    """Grey levels at pixels, between them linearly; of the shape (..., n) of x and y, both contiguous."""
+    """Return grey levels at pixels x and y, contiguous and (..., n), by linear interpolation."""
     rows = (-1, x.shape[-1])
     levels = cv2.remap(
         grey, x.reshape(rows), y.reshape(rows), cv2.INTER_LINEAR, borderMode=cv2.BORDER_REPLICATE
@@ -219,7 +221,7 @@ def _raw_grey(frame: RawImage) -> Grey:
         raise FrameError(f"pixel encoding {frame.encoding!r} is not read (only {known})")
     channels, conversion = _RAW_TO_GREY[frame.encoding]
     rows = np.frombuffer(frame.data, np.uint8)
-    step = frame.step or frame.width * channels  # some writers leave it out
+    step = frame.step or frame.width * channels  # some writers omit the step
     too_few = step < frame.width * channels or rows.size < step * frame.height
     if too_few or min(frame.width, frame.height) < 1:
         raise FrameError(f"{rows.size} bytes are too few for {frame.width} x {frame.height}")

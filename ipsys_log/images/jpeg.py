@@ -1,8 +1,8 @@
-"""Only some rows of a JPEG: a baseline JPEG of fewer rows is made from it, whose pixels are the same.
+"""Extraction of rows from a JPEG: a baseline JPEG with fewer rows and the same pixels.
 
-Rows from the top are had by a smaller height in the header. A camera that sends restart markers lets rows
-begin further down as well: between two of them everything is coded anew. Most of a decoder's time goes into
-codes that it has to read one after the other, so rows that are left out are time saved.
+A smaller height in the header gives only the rows from the top. If a camera sends restart markers, rows can
+also begin farther down, because the coding starts again after each restart marker. A decoder spends most of
+its time on codes that it reads one after the other, so omitted rows save time.
 """
 
 from __future__ import annotations
@@ -21,17 +21,21 @@ __all__ = ["Layout", "cut_rows", "read_layout", "whole_rows"]
 _END = b"\xff\xd9"
 _BASELINE = (0xC0, 0xC1)
 _SCAN, _RESTART_INTERVAL, _RESTART = 0xDA, 0xDD, 0xD0
-# Restart markers are numbered 0 to 7, over and over.
+# Restart markers have the cyclic numbers 0 to 7.
 _CYCLE = 8
-# A JPEG of its own costs as much as some rows.
+# A separate JPEG takes as long as this number of rows: nearer rows are decoded together.
 _NEAR_PX = 32
 _AT_ONCE = 65_536
 
 
 class Layout(NamedTuple):
-    """What the header of a baseline JPEG says: its size in px; the height of a row of blocks in px, and how
-    many blocks are in it; where in the file the height is written and the pixels' data begin; and how many
-    blocks lie between two restart markers (0: there are none)."""
+    """The header of a baseline JPEG.
+
+    ``width`` and ``height`` are its size in px. ``block_px`` is the height of a row of blocks in px, and
+    ``blocks`` the number of blocks in a row. ``height_at`` and ``data_at`` are the offsets in the file of the
+    height and of the pixel data. ``interval`` is the number of blocks between two restart markers (0: there
+    are no restart markers).
+    """
 
     width: int
     height: int
@@ -43,25 +47,25 @@ class Layout(NamedTuple):
 
     @property
     def rows_px(self) -> int:
-        """Height of what begins at a restart marker and ends at one, in whole rows."""
+        """Return the least height in px of whole rows that begin and end at a restart marker."""
         return self.block_px * lcm(self.interval, self.blocks) // self.blocks
 
 
 def read_layout(data: bytes) -> Layout | None:
-    """The layout of a whole baseline JPEG in one scan; None for anything else."""
-    # Some cameras fill up with zeros.
+    """Return the layout of a whole baseline JPEG in one scan; None for all other data."""
+    # Some cameras append zeros.
     if data[:2] != b"\xff\xd8" or not (data.endswith(_END) or data.rstrip(b"\0").endswith(_END)):
         return None
-    at, frame, interval = 2, None, 0
-    while at + 4 <= len(data) and data[at] == 0xFF:
-        kind, size = data[at + 1], int.from_bytes(data[at + 2 : at + 4], "big")
+    offset, frame, interval = 2, None, 0
+    while offset + 4 <= len(data) and data[offset] == 0xFF:
+        kind, size = data[offset + 1], int.from_bytes(data[offset + 2 : offset + 4], "big")
         if kind in _BASELINE:
-            frame = at
+            frame = offset
         elif kind == _RESTART_INTERVAL:
-            interval = int.from_bytes(data[at + 4 : at + 6], "big")
+            interval = int.from_bytes(data[offset + 4 : offset + 6], "big")
         elif kind == _SCAN:
-            return None if frame is None else _layout(data, frame, at, size, interval)
-        at += 2 + size
+            return None if frame is None else _layout(data, frame, offset, size, interval)
+        offset += 2 + size
     return None
 
 
@@ -83,9 +87,9 @@ def _layout(data: bytes, frame: int, scan: int, scan_size: int, interval: int) -
 
 
 def whole_rows(layout: Layout, rows: Iterable[slice]) -> list[slice]:
-    """The rows of a JPEG that have to be decoded for some rows of it, each once, from the top.
+    """Return the rows of a JPEG that must be decoded to get ``rows``: each row once, from the top.
 
-    Without restart markers these are all rows from the top.
+    Without restart markers, these are all rows from the top of the image.
     """
     step = layout.rows_px if layout.interval else layout.block_px
     merged: list[slice] = []
@@ -102,23 +106,23 @@ def whole_rows(layout: Layout, rows: Iterable[slice]) -> list[slice]:
 def cut_rows(
     data: bytes, layout: Layout, rows: Sequence[slice], memory: bytearray
 ) -> list[bytearray | memoryview]:
-    """JPEGs of some rows each.
+    """Return one JPEG for each slice of rows.
 
     Parameters
     ----------
-    data, layout : the whole JPEG, and :func:`read_layout` of it.
-    rows : as :func:`whole_rows` has them.
-    memory : where a JPEG may be put, to be used again for the next one: new memory would cost more than to
-        fill it. It grows as needed.
+    data, layout : the whole JPEG, and its :func:`read_layout`.
+    rows : slices from :func:`whole_rows`.
+    memory : buffer for a JPEG, used again for the next JPEG, because allocation of new memory takes longer
+        than filling it. It grows if necessary.
 
     Returns
     -------
-    A JPEG for each; without restart markers, data follows in it that no row needs.
+    A JPEG for each slice. Without restart markers, it ends with data that no row needs.
 
     Raises
     ------
     FrameError
-        Where restart markers are missing or out of order.
+        Restart markers are missing or out of order.
     """
     pieces: list[bytearray | memoryview]
     if layout.interval or not rows:
@@ -133,16 +137,16 @@ def cut_rows(
 
 
 def _find_restarts(codes: NDArray[np.uint8], layout: Layout) -> NDArray[np.intp]:
-    """Where restart markers are: by pieces, which stay in the processor's cache."""
-    found = []
+    """Return the offsets of restart markers; search in pieces that fit into the processor's cache."""
+    offsets = []
     for start in range(layout.data_at, len(codes) - 1, _AT_ONCE):
         ends = np.flatnonzero(codes[start : min(start + _AT_ONCE, len(codes) - 1)] == 0xFF) + start
-        found.append(ends[(codes[ends + 1] & 0xF8) == _RESTART])
-    return np.concatenate(found)
+        offsets.append(ends[(codes[ends + 1] & 0xF8) == _RESTART])
+    return np.concatenate(offsets)
 
 
 def _check_restarts(codes: NDArray[np.uint8], layout: Layout) -> None:
-    """See that all restart markers are there, in their order: rows are found by counting them."""
+    """Check that all restart markers are present and in order, because their count identifies rows."""
     blocks = layout.blocks * -(-layout.height // layout.block_px)
     wanted = _RESTART + np.arange(-(-blocks // layout.interval) - 1) % _CYCLE
     if not np.array_equal(codes, wanted):
@@ -150,7 +154,7 @@ def _check_restarts(codes: NDArray[np.uint8], layout: Layout) -> None:
 
 
 def _between(data: bytes, layout: Layout, rows: Sequence[slice]) -> list[bytearray]:
-    """The header, and the data of some rows, from one restart marker to another."""
+    """Return JPEGs of the header and the data of some rows, from one restart marker to another."""
     if not rows:
         return []
     codes = np.frombuffer(data, dtype=np.uint8)
@@ -166,8 +170,8 @@ def _between(data: bytes, layout: Layout, rows: Sequence[slice]) -> list[bytearr
             end = len(restarts) + 1
         start, stop = starts[begin], starts[end]
         piece = bytearray(data[: layout.data_at]) + data[start:stop]
-        for number, at in enumerate(restarts[begin : end - 1].tolist()):
-            piece[layout.data_at + at - start + 1] = _RESTART + number % _CYCLE
+        for number, offset in enumerate(restarts[begin : end - 1].tolist()):
+            piece[layout.data_at + offset - start + 1] = _RESTART + number % _CYCLE
         piece[-2:] = _END
         pieces.append(piece)
     return pieces

@@ -1,6 +1,6 @@
 """Decoding of video frames, one message after the other, and detection of missing frames.
 
-FFmpeg fills the place of a frame that was lost with the one before it, and says nothing.
+FFmpeg replaces a lost frame by the previous frame, without a warning.
 
 References
 ----------
@@ -24,29 +24,29 @@ if TYPE_CHECKING:
 
 __all__ = ["VIDEO_FORMATS", "FrameNumbers", "Video", "decode_keyframe", "decode_last", "is_keyframe"]
 
-# The head of a unit of Annex B, and as much of it as is read here.
+# The header of a unit of Annex B, with as many bytes of the unit as this module reads.
 _UNIT_WITH_HEAD = re.compile(rb"\x00\x00\x01(.)(?=(.{0,96}))", re.DOTALL)
 _PARAMETERS, _SLICE, _KEY_SLICE = 7, 1, 5
-# Profiles whose parameters say more of colour.
+# Profiles whose parameter sets contain more fields about colour.
 _HIGH = (44, 83, 86, 100, 110, 118, 122, 128, 134, 135, 138, 139, 244)
 
 
 class _Counting(NamedTuple):
-    """How frames are numbered: with ``bits`` bits; ``planes`` says that each colour has slices of its own."""
+    """The numbering of frames: ``bits`` per number; ``planes`` is True if each colour has separate slices."""
 
     bits: int
     planes: bool
 
 
 class FrameNumbers:
-    """Follows the frames of one camera. Call it with the data of each."""
+    """A detector of missing frames of one camera. The caller calls it with the data of each frame."""
 
     def __init__(self) -> None:
         self._counting: _Counting | None = None
         self._last: int | None = None
 
     def __call__(self, data: bytes) -> bool:
-        """Whether one is missing between this frame and the one before; False where that cannot be told."""
+        """Return whether a frame is missing directly before this one; False if that is unknown."""
         for match in _UNIT_WITH_HEAD.finditer(data):
             head = match[1][0]
             if head & 31 == _PARAMETERS:
@@ -56,18 +56,18 @@ class FrameNumbers:
         return False
 
     def _follow(self, head: int, bits: _Bits, counting: _Counting) -> bool:
-        bits.golomb(), bits.golomb(), bits.golomb()  # where it begins, its type, its parameters
+        bits.golomb(), bits.golomb(), bits.golomb()  # first macroblock, slice type, parameter set
         if counting.planes:
             bits.take(2)
         number, last = bits.take(counting.bits), self._last
-        if head >> 5 & 3:  # others need it
+        if head >> 5 & 3:  # a reference frame: other frames need it
             self._last = number
-        # Two fields have one number.
+        # Two fields of a frame have the same number.
         return head & 31 == _SLICE and last is not None and (number - last) % (1 << counting.bits) > 1
 
 
 class _Bits:
-    """The bits of a unit, from its second byte on. Behind its end there are zeros."""
+    """The bits of a unit, from its second byte on. After its end, all bits are zero."""
 
     def __init__(self, data: bytes) -> None:
         plain = data.replace(b"\x00\x00\x03", b"\x00\x00")
@@ -79,7 +79,7 @@ class _Bits:
         return int(self._text[self._at - count : self._at].ljust(count, "0") or "0", 2)
 
     def golomb(self) -> int:
-        """A number of 2 n + 1 bits, of which the first n are zeros (9.1)."""
+        """Read an Exp-Golomb number of 2 n + 1 bits, of which the first n are zeros (9.1)."""
         zeros = 0
         while zeros < 32 and not self.take(1):
             zeros += 1
@@ -87,7 +87,10 @@ class _Bits:
 
 
 def _read_counting(bits: _Bits) -> _Counting | None:
-    """None where numbers may be left out, or a matrix of scales stands before them."""
+    """Read the frame numbering from a sequence parameter set.
+
+    Return None if gaps in the numbers are allowed, or if a scaling matrix precedes the fields of the numbers.
+    """
     profile, planes = bits.take(8), False
     bits.take(16), bits.golomb()
     if profile in _HIGH:
@@ -107,15 +110,16 @@ def _read_counting(bits: _Bits) -> _Counting | None:
     return None if bits.take(1) or number_bits > 16 else _Counting(number_bits, planes)
 
 
-# As the log names them, and FFmpeg.
+# Names of the formats in a log, and in FFmpeg.
 VIDEO_FORMATS = {"h264": "h264", "h265": "hevc"}
-# The head of a unit of Annex B: the start code, and the byte that holds its type.
+# The header of a unit of Annex B: the start code, and the byte that contains its type.
 _UNIT = re.compile(rb"\x00\x00\x01(.)", re.DOTALL)
 
 
 class Video:
-    """Decodes the video of one camera, message by message: each picture needs those before it, up to the
-    last keyframe. What came before that has no effect, damage neither.
+    """A decoder for the video of one camera, message by message.
+
+    Each image needs the frames since the last keyframe. Earlier frames, also damaged ones, have no effect.
 
     Parameters
     ----------
@@ -124,7 +128,7 @@ class Video:
     Raises
     ------
     FrameError
-        For any other format.
+        The format is another one.
     """
 
     def __init__(self, format: str) -> None:
@@ -136,23 +140,23 @@ class Video:
         self._misses = FrameNumbers() if format == "h264" else lambda data: False
 
     def __call__(self, frame: CompressedVideo) -> RawImage | None:
-        """The picture of a message, in grey; None before the first keyframe.
+        """Return the grey image of a message; None before the first keyframe.
 
         Raises
         ------
         FrameError
-            Where the data is damaged, or that of a frame since the last keyframe was, or the picture comes
-            only with later messages.
+            The data of this frame, or of an earlier frame since the last keyframe, is damaged; or the decoder
+            returns the image only after later messages.
         """
-        picture = self._decode(frame)
-        if picture is None:
+        image = self._decode(frame)
+        if image is None:
             return None
-        plane = picture.reformat(format="gray").planes[0]
-        size = picture.width, picture.height
+        plane = image.reformat(format="gray").planes[0]
+        size = image.width, image.height
         return RawImage(frame.timestamp, frame.frame_id, *size, "mono8", plane.line_size, bytes(plane))
 
     def pass_over(self, frame: CompressedVideo) -> None:
-        """Decode a message only for those after it; damage is not named."""
+        """Decode a message only because later messages need it; ignore damage."""
         with suppress(FrameError):
             self._decode(frame)
 
@@ -162,7 +166,7 @@ class Video:
             self._begun = self._keyed = True
             self._fault = None
         elif self._keyed and self._fault is not None:
-            # What a decoder puts into the holes is left over from anywhere: no two runs would agree.
+            # A decoder fills missing areas with arbitrary data: two runs would give different results.
             raise FrameError(f"needs a frame before it that gave no picture ({self._fault})")
         try:
             if missing:
@@ -176,25 +180,25 @@ class Video:
         import av
 
         try:
-            pictures = self._decoder.decode(av.Packet(frame.data))
+            images = self._decoder.decode(av.Packet(frame.data))
         except av.error.FFmpegError as error:
             if not self._begun:
                 return None
             raise FrameError(
                 f"{len(frame.data)} bytes that are no {frame.format} ({error.strerror})"
             ) from error
-        if not pictures and self._decoder.has_b_frames:
+        if not images and self._decoder.has_b_frames:
             raise FrameError("its picture needs a later one; turn off B-frames in the camera")
-        if not pictures and not self._begun:
+        if not images and not self._begun:
             return None
-        if not pictures or pictures[-1].is_corrupt:
+        if not images or images[-1].is_corrupt:
             raise FrameError(f"{len(frame.data)} bytes of {frame.format} that are no whole picture")
         self._begun = True
-        return pictures[-1]
+        return images[-1]
 
 
 def is_keyframe(frame: CompressedVideo) -> bool:
-    """Whether a frame needs none before it.
+    """Return whether a frame needs no earlier frame.
 
     Examples
     --------
@@ -204,37 +208,38 @@ def is_keyframe(frame: CompressedVideo) -> bool:
     wide = frame.format == "h265"
     for match in _UNIT.finditer(frame.data):
         kind = match[1][0] >> 1 & 0x3F if wide else match[1][0] & 0x1F
-        # Pieces of pictures: of H.264 1 to 5, of H.265 0 to 31, 16 to 23 of those that a reader can begin at.
+        # Units with parts of images: types 1 to 5 in H.264, 0 to 31 in H.265. A reader of H.265 can begin at
+        # types 16 to 23.
         if kind < 32 if wide else 1 <= kind <= 5:
             return 16 <= kind <= 23 if wide else kind == 5
     return False
 
 
 def decode_keyframe(frame: CompressedVideo) -> RawImage:
-    """The picture in a keyframe, in grey.
+    """Return the grey image of a keyframe.
 
     Raises
     ------
     FrameError
-        Where it is none, or damaged.
+        The frame is damaged, or it is not a keyframe.
     """
-    picture = Video(frame.format)(frame)
-    if picture is None:
+    image = Video(frame.format)(frame)
+    if image is None:
         raise FrameError(f"{len(frame.data)} bytes of {frame.format} that are no keyframe")
-    return picture
+    return image
 
 
 def decode_last(backwards: Iterable[CompressedVideo]) -> RawImage | None:
-    """The picture in a frame, in grey, whatever that needs; None where there is no keyframe before it.
+    """Return the grey image of a frame with all necessary earlier frames; None without a keyframe before it.
 
     Parameters
     ----------
-    backwards : this frame, the one before it, and so on; taken up to the first keyframe.
+    backwards : this frame, the previous frame, and so on. They are read up to the first keyframe.
 
     Raises
     ------
     FrameError
-        Where it is damaged, or one that it needs.
+        The frame, or a frame that it needs, is damaged.
     """
     needed: list[CompressedVideo] = []
     for frame in backwards:
@@ -253,9 +258,9 @@ def _open(codec: str) -> VideoCodecContext:
 
     decoder = av.VideoCodecContext.create(codec, "r")
     assert isinstance(decoder, av.VideoCodecContext)
-    # A picture for each packet, at once: several threads would hold some back.
+    # The decoder must return an image for each packet immediately. Several threads would delay images.
     decoder.thread_count = 1
     decoder.flags |= av.codec.context.Flags.low_delay
-    # A picture with guessed pieces is none.
+    # An image with guessed areas counts as damaged.
     decoder.options = {"err_detect": "explode", "max_pixels": str(MOST_PIXELS)}
     return decoder

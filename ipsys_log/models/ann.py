@@ -15,7 +15,7 @@ __all__ = ["NeuralNetwork", "network", "spread", "train_networks"]
 
 
 def spread(values: NDArray[np.float64]) -> NDArray[np.float64]:
-    """Standard deviation of each column, (d,) of (n, d); 1 where a column does not vary.
+    """Return the standard deviation of each column, (d,) of (n, d); 1 if a column is constant.
 
     Examples
     --------
@@ -23,7 +23,7 @@ def spread(values: NDArray[np.float64]) -> NDArray[np.float64]:
     [1.0, 1.0]
     """
     deviation = values.std(axis=0)
-    # Rounding leaves a trace of variance in a column of equal numbers.
+    # By rounding, a column of equal numbers can have a tiny variance.
     level = deviation <= 1e-12 * np.abs(values).max(axis=0)
     return np.where(level, 1.0, deviation)
 
@@ -33,31 +33,32 @@ Array = NDArray[np.float64]
 _NEURONS = 3
 _RESTARTS = 16
 _STEPS = 60
-# Of the weights that a network starts with.
+# Standard deviation of the initial weights of a network.
 _FIRST_SIGMA = 0.7
-# How strongly a weight is drawn to zero beside the slopes of the neurons, which bend the function.
+# Regularization of the other weights, relative to that of the slopes of the neurons, which bend the function.
 _OTHERS_PULL = 0.01
-# Steps before the pull is adapted, and its bounds.
+# Number of steps before the regularization is adapted, and its bounds.
 _UNTIL_ADAPTED = 3
 _PULLS = (1e-8, 1e3)
-# Variance, of targets of unit variance: exact targets leave none, and its logarithm is needed.
+# Least variance of the noise, for targets of unit variance. Exact targets have none, but the code needs its
+# logarithm.
 _LEAST_NOISE = 1e-12
 _NOISE_OVER_PLANE = 4.0
 
 
 def network(weights: Array, inputs: Array) -> tuple[Array, Array]:
-    """Outputs of networks with one hidden layer of tanh neurons.
+    """Return the outputs of networks with one hidden layer of tanh neurons.
 
     Parameters
     ----------
-    weights : (b, h (d + 1) + h + 1), of b networks: each neuron's bias and d slopes, then the output's bias
-        and h slopes.
-    inputs : (n, d + 1), the first column ones.
+    weights : (b, h (d + 1) + h + 1), weights of b networks: bias and d slopes of each neuron, then bias and
+        h slopes of the output.
+    inputs : (n, d + 1), the first column is 1.
 
     Returns
     -------
     outputs : (b, n).
-    neurons : (b, h, n), what comes out of the hidden layer.
+    neurons : (b, h, n), outputs of the hidden layer.
     """
     hidden, out = _parts(weights, inputs.shape[1])
     neurons = np.tanh(hidden @ inputs.T)
@@ -70,7 +71,7 @@ def _parts(weights: Array, width: int) -> tuple[Array, Array]:
 
 
 def _slopes(weights: Array, inputs: Array, neurons: Array) -> Array:
-    """Derivatives of the outputs by the weights, (b, weights, n)."""
+    """Return the derivatives of the outputs by the weights, (b, weights, n)."""
     _, out = _parts(weights, inputs.shape[1])
     bent = (1 - neurons**2) * out[:, 1:, None]
     by_hidden = (bent[:, :, None] * inputs.T).reshape(len(weights), -1, len(inputs))
@@ -78,19 +79,19 @@ def _slopes(weights: Array, inputs: Array, neurons: Array) -> Array:
 
 
 def train_networks(inputs: Array, targets: Array, weights: Array) -> tuple[Array, Array]:
-    """Levenberg-Marquardt with a pull towards small weights that the data themselves choose.
+    """Train networks by Levenberg-Marquardt; estimate the regularization of the weights from the data.
 
     Parameters
     ----------
-    inputs : (n, d + 1), the first column ones, the others of unit variance.
+    inputs : (n, d + 1), the first column is 1, the others have unit variance.
     targets : (b, n), of unit variance, one row for each network.
-    weights : (b, w), to start from.
+    weights : (b, w), initial weights.
 
     Returns
     -------
     weights : (b, w).
-    evidence : (b,), logarithm of how likely the targets are, apart from a constant: it counts both misfit
-        and bending against a network, and the one with the greatest is to be taken.
+    evidence : (b,), logarithm of the likelihood of the targets, without a constant. Misfit and bending reduce
+        it. The best network has the greatest evidence.
 
     References
     ----------
@@ -121,13 +122,13 @@ def train_networks(inputs: Array, targets: Array, weights: Array) -> tuple[Array
 
 
 def _most_noise(inputs: Array, targets: Array) -> Array:
-    """Variance (b,) that no noise exceeds: a few times what a plane through the targets leaves.
+    """Return the largest allowed variance (b,) of the noise: a few times that about a plane of the targets.
 
-    Without this bound a few pairs can be explained as noise alone, by a network that is flat.
+    Without this bound, a flat network can explain a few pairs as noise alone.
     """
     residuals = targets.T - inputs @ np.linalg.lstsq(inputs, targets.T, rcond=None)[0]
-    left = (residuals**2).sum(axis=0) / max(len(inputs) - inputs.shape[1], 1)
-    most: Array = np.maximum(_NOISE_OVER_PLANE * left, _LEAST_NOISE)
+    variance = (residuals**2).sum(axis=0) / max(len(inputs) - inputs.shape[1], 1)
+    most: Array = np.maximum(_NOISE_OVER_PLANE * variance, _LEAST_NOISE)
     return most
 
 
@@ -146,7 +147,7 @@ def _diagonal(values: Array) -> Array:
 def _adapted(
     strength: Array, curvature: Array, misfit: Array, weights: Array, pull: Array, most_noise: Array
 ) -> Array:
-    """The pull at which noise and weights are as large as the data make them (MacKay 1992, eq. 2.21)."""
+    """Return the regularization that is consistent with noise and weights (MacKay 1992, eq. 2.21)."""
     determined, noise = _determined(strength, curvature, misfit, pull, most_noise)
     size = weights**2 @ pull / np.maximum(determined, 1e-3)
     adapted: Array = np.clip(noise / np.maximum(size, 1e-300), *_PULLS)
@@ -156,7 +157,10 @@ def _adapted(
 def _determined(
     strength: Array, curvature: Array, misfit: Array, pull: Array, most_noise: Array
 ) -> tuple[Array, Array]:
-    """How many weights the data determine, and the variance (b,) of their noise; ``misfit`` is (b, n)."""
+    """Return the number of weights that the data determine, and the variance of the noise, (b,) each.
+
+    ``misfit`` is (b, n).
+    """
     inverse = np.linalg.inv(curvature + _diagonal(strength[:, None] * pull + 1e-12))
     determined = len(pull) - strength * np.einsum("bii,i->b", inverse, pull)
     count = misfit.shape[1]
@@ -184,13 +188,13 @@ class NeuralNetwork(MultiOutputMixin, RegressorMixin, BaseEstimator):  # type: i
 
     Parameters
     ----------
-    seed : of the weights that the networks start from; of 16 starts the one with the greatest evidence is
-        kept.
+    seed : random seed of the initial weights. The fit keeps the network with the greatest evidence of 16
+        starts.
 
     Attributes
     ----------
-    centre_, scale_ : (d,), of the inputs.
-    target_centre_, target_scale_ : (outputs,)
+    centre_, scale_ : (d,), mean and standard deviation of the inputs.
+    target_centre_, target_scale_ : (outputs,), the same of the targets.
     weights_ : (outputs, 3 (d + 1) + 4), see :func:`network`.
 
     Examples

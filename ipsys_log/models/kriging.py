@@ -1,4 +1,4 @@
-"""Kriging from the frame of a camera to the world (sect. 2.2.4 and 2.2.5 of the paper)."""
+"""Kriging from camera coordinates to world coordinates (sect. 2.2.4 and 2.2.5 of the paper)."""
 
 from __future__ import annotations
 
@@ -21,8 +21,8 @@ __all__ = ["Kriging", "most_likely"]
 Array = NDArray[np.float64]
 
 _EPS = float(np.finfo(np.float64).eps)
-# Logarithms of theta, for inputs of unit variance, and of the noise, relative to the process's variance.
-# Interpolation needs room for short waves; with noise, only long ones are believed.
+# Bounds of the logarithms of theta, for inputs of unit variance, and of the noise, relative to the variance
+# of the process. Interpolation needs a range for short waves. With noise, only long waves are plausible.
 _THETA = {False: (np.log(0.1), np.log(10.0)), True: (np.log(1e-3), 0.0)}
 _NOISE = (np.log(1e-8), np.log(1e2))
 _STARTS_LOG2 = 5
@@ -30,8 +30,11 @@ _REFINED = 2
 
 
 class _Gls(NamedTuple):
-    """Trend by generalised least squares: ``cholesky`` of the correlations, ``trend``, the whitened
-    ``residuals``, and the ``variance`` of the process (eq. 19)."""
+    """A trend by generalised least squares (eq. 19).
+
+    It contains ``cholesky`` of the correlations, ``trend``, the whitened ``residuals``, and the ``variance``
+    of the process.
+    """
 
     cholesky: Array
     trend: Array
@@ -39,26 +42,26 @@ class _Gls(NamedTuple):
     variance: float
 
     def deviance(self) -> float:
-        """-2 log likelihood, apart from a constant, with the variance at its best (DACE)."""
+        """Return -2 log likelihood, without a constant, for the most likely variance (DACE)."""
         log_det = 2 * np.log(np.diagonal(self.cholesky)).sum()
         return float(len(self.cholesky) * np.log(self.variance) + log_det)
 
 
 def _terms(points: Array) -> Array:
-    """The linear trend's regressors (eq. 18)."""
+    """Return the regressors of the linear trend (eq. 18)."""
     return np.hstack([np.ones((len(points), 1)), points])
 
 
 def _squared_gaps(points: Array, isotropic: bool) -> Array:
-    """Squared distances (k, n, n): along each axis, or their sum (k = 1)."""
+    """Return squared distances (k, n, n): along each axis, or their sum (k = 1)."""
     gaps = np.moveaxis((points[:, None] - points[None]) ** 2, -1, 0)
     return np.ascontiguousarray(gaps.sum(axis=0, keepdims=True) if isotropic else gaps)
 
 
 def _correlations(logs: Array, gaps: Array) -> tuple[Array, Array]:
-    """Gaussian correlations (n, n) of eq. (16), without and with the noise on the diagonal (eq. 23).
+    """Return Gaussian correlations (n, n) of eq. (16), without and with noise on the diagonal (eq. 23).
 
-    The trace that is always there keeps close places apart, as in DACE.
+    A tiny constant on the diagonal keeps the matrix regular for nearly equal points, as in DACE.
     """
     smooth = np.exp(-np.tensordot(np.exp(logs[: len(gaps)]), gaps, axes=1))
     noise = float(np.exp(logs[len(gaps)])) if len(logs) > len(gaps) else 0.0
@@ -67,7 +70,8 @@ def _correlations(logs: Array, gaps: Array) -> tuple[Array, Array]:
 
 
 def _gls(correlations: Array, terms: Array, targets: Array) -> _Gls | None:
-    # LAPACK itself: for some dozens of places scipy.linalg's checks would take most of the time.
+    # The code calls LAPACK directly. For a few dozen points, the checks of scipy.linalg would take most of
+    # the time.
     lower, failed = dpotrf(correlations, lower=1)
     if failed:
         return None
@@ -79,7 +83,7 @@ def _gls(correlations: Array, terms: Array, targets: Array) -> _Gls | None:
 
 
 def _deviance(logs: Array, gaps: Array, terms: Array, targets: Array) -> tuple[float, Array]:
-    """Deviance and its gradient by the logarithms of theta and the noise."""
+    """Return the deviance and its gradient by the logarithms of theta and the noise."""
     smooth, noisy = _correlations(logs, gaps)
     fitted = _gls(noisy, terms, targets)
     if fitted is None:
@@ -93,13 +97,13 @@ def _deviance(logs: Array, gaps: Array, terms: Array, targets: Array) -> tuple[f
 
 
 def most_likely(points: Array, targets: Array, noisy: bool) -> Array:
-    """Logarithms of the correlation's parameters that make the targets most likely.
+    """Return the logarithms of the correlation parameters with the maximum likelihood of the targets.
 
     Parameters
     ----------
     points : (n, d), of unit variance.
     targets : (n,), of unit variance.
-    noisy : whether the targets have noise, whose variance is then found as well.
+    noisy : True if the targets have noise. Its variance is then estimated too.
 
     Returns
     -------
@@ -108,8 +112,8 @@ def most_likely(points: Array, targets: Array, noisy: bool) -> Array:
 
     References
     ----------
-    Ou et al., Robotica 2023, below eq. (16) and (24); the concentrated likelihood is that of DACE (Lophaven
-    et al. 2002, eq. 2.23). Theta is isotropic or not as cross-validation on the authors' pairs says.
+    Ou et al., Robotica 2023, below eq. (16) and (24). The concentrated likelihood is that of DACE (Lophaven
+    et al. 2002, eq. 2.23). Cross-validation on the authors' pairs determines if theta is isotropic.
     """
     gaps, terms = _squared_gaps(points, not noisy), _terms(points)
     bounds = [_THETA[noisy]] * len(gaps) + [_NOISE] * noisy
@@ -119,30 +123,30 @@ def most_likely(points: Array, targets: Array, noisy: bool) -> Array:
     for start in starts:
         fitted = _gls(_correlations(start, gaps)[1], terms, targets)
         costs.append(np.inf if fitted is None else fitted.deviance())
-    found = [
+    optima = [
         minimize(_deviance, starts[i], (gaps, terms, targets), jac=True, bounds=bounds, method="L-BFGS-B")
         for i in np.argsort(costs, kind="stable")[:_REFINED]
     ]
-    best: Array = min(found, key=lambda result: float(result.fun)).x
+    best: Array = min(optima, key=lambda result: float(result.fun)).x
     return best
 
 
 class Kriging(MultiOutputMixin, RegressorMixin, BaseEstimator):  # type: ignore[misc]
-    """Kriging with a linear trend and Gaussian correlation, as DACE has it.
+    """Kriging with a linear trend and Gaussian correlation, as in DACE.
 
     Parameters
     ----------
-    noisy : False for interpolation (eq. 15-21), True for regression (eq. 22-24): the noise 10^epsilon of the
-        targets is then found with the rest, by likelihood.
+    noisy : False for interpolation (eq. 15-21), True for regression (eq. 22-24). Regression also estimates
+        the noise 10^epsilon of the targets, by maximum likelihood.
 
     Attributes
     ----------
     points_ : (n, d), the inputs, centred by ``centre_`` (d,) and divided by ``scale_`` (d,).
-    target_centre_, target_scale_ : (outputs,)
+    target_centre_, target_scale_ : (outputs,), mean and standard deviation of the targets.
     logs_ : (outputs, 1) or (outputs, d + 1), see :func:`most_likely`.
-    trend_ : (outputs, d + 1), of eq. (19), for the scaled inputs and outputs.
-    weights_ : (outputs, n), of the correlations in eq. (17) and (23).
-    variance_ : (outputs,), of the process, scaled.
+    trend_ : (outputs, d + 1), coefficients of eq. (19), for the scaled inputs and outputs.
+    weights_ : (outputs, n), weights of the correlations in eq. (17) and (23).
+    variance_ : (outputs,), variance of the process, scaled.
 
     Examples
     --------
@@ -170,7 +174,7 @@ class Kriging(MultiOutputMixin, RegressorMixin, BaseEstimator):  # type: ignore[
 
     def fit(self, X: Any, y: Any) -> Kriging:
         X, y = validate_data(self, X, y, multi_output=True, y_numeric=True, dtype=np.float64)
-        if len(X) < X.shape[1] + 3:  # the trend, and two more: with none over, the variance is zero
+        if len(X) < X.shape[1] + 3:  # the trend, and two more: without additional pairs, the variance is zero
             raise FitError(
                 f"kriging needs at least {X.shape[1] + 3} pairs (samples), found {len(X)} sample"
                 f"{'s' if len(X) > 1 else ''}; measure more places"
@@ -183,24 +187,25 @@ class Kriging(MultiOutputMixin, RegressorMixin, BaseEstimator):  # type: ignore[
         scaled = (targets - self.target_centre_) / self.target_scale_
         self.logs_ = np.array([most_likely(self.points_, column, self.noisy) for column in scaled.T])
         solved = [self._solve(logs, column) for logs, column in zip(self.logs_, scaled.T, strict=True)]
-        self.trend_ = np.array([found.trend for found in solved])
+        self.trend_ = np.array([gls.trend for gls in solved])
         self.weights_ = np.array(
-            [solve_triangular(found.cholesky, found.residuals, lower=True, trans=1) for found in solved]
+            [solve_triangular(gls.cholesky, gls.residuals, lower=True, trans=1) for gls in solved]
         )
-        self.variance_ = np.array([found.variance for found in solved])
+        self.variance_ = np.array([gls.variance for gls in solved])
         return self
 
     def _solve(self, logs: Array, targets: Array) -> _Gls:
         gaps, terms = _squared_gaps(self.points_, not self.noisy), _terms(self.points_)
-        found = _gls(_correlations(logs, gaps)[1], terms, targets)
-        if found is None:
+        gls = _gls(_correlations(logs, gaps)[1], terms, targets)
+        if gls is None:
             raise ArithmeticError("the most likely correlations have no Cholesky factor")  # a bug
-        return found
+        return gls
 
     def predict(self, X: Any, return_std: bool = False) -> Any:
-        """Eq. (17), (23), (n, outputs); with ``return_std`` also the predictor's standard deviations.
+        """Return predictions (n, outputs) of eq. (17), (23); with ``return_std`` also standard deviations.
 
-        Of kriging regression they are those of the function, without the noise of a measurement.
+        For kriging regression, they are the standard deviations of the function, without the noise of a
+        measurement.
         """
         check_is_fitted(self)
         X = validate_data(self, X, dtype=np.float64, reset=False)
@@ -218,16 +223,17 @@ class Kriging(MultiOutputMixin, RegressorMixin, BaseEstimator):  # type: ignore[
         return mean, self._shaped(np.sqrt(np.array(variances)).T * self.target_scale_)
 
     def _near(self, logs: Array, points: Array) -> Array:
-        """Correlations (n, m) of points with those fitted on, eq. (20)."""
+        """Return correlations (n, m) of points with the points of the fit, eq. (20)."""
         theta = np.exp(logs[: points.shape[1]] if self.noisy else logs)
         gaps = (points[:, None] - self.points_[None]) ** 2
         near: Array = np.exp(-(gaps * theta).sum(axis=-1))
         return near
 
     def _variance(self, output: int, terms: Array, near: Array) -> Array:
-        """Eq. (21) for a linear trend: s2 = sigma2 (1 + u' (F' R^-1 F)^-1 u - r' R^-1 r), u = F' R^-1 r - f.
+        """Return the variance of eq. (21) for a linear trend.
 
-        As printed it holds for a constant trend only; this is DACE's (Lophaven et al. 2002, eq. 2.19).
+        s2 = sigma2 (1 + u' (F' R^-1 F)^-1 u - r' R^-1 r), u = F' R^-1 r - f. The printed equation is valid
+        only for a constant trend. This equation is that of DACE (Lophaven et al. 2002, eq. 2.19).
         """
         gaps, fitted = _squared_gaps(self.points_, not self.noisy), _terms(self.points_)
         lower = cholesky(_correlations(self.logs_[output], gaps)[1], lower=True)

@@ -1,4 +1,4 @@
-"""Polynomial regression from the frame of a camera to the world (sect. 2.2.2 of the paper)."""
+"""Polynomial regression from camera coordinates to world coordinates (sect. 2.2.2 of the paper)."""
 
 from __future__ import annotations
 
@@ -16,7 +16,7 @@ Array = NDArray[np.float64]
 
 
 def regressors(points: Array) -> Array:
-    """Constant, linear and second-order terms of each row: ten for three columns.
+    """Return constant, linear and second-order terms of each row: ten terms for three columns.
 
     Parameters
     ----------
@@ -45,7 +45,7 @@ def regressors(points: Array) -> Array:
 
 @cache
 def _factors(columns: int) -> tuple[NDArray[np.intp], NDArray[np.intp]]:
-    """The columns that are multiplied for the second-order terms."""
+    """Return the columns of both factors of the second-order terms."""
     first, second = np.triu_indices(columns)
     return first, second
 
@@ -53,13 +53,13 @@ def _factors(columns: int) -> tuple[NDArray[np.intp], NDArray[np.intp]]:
 class PolynomialRegression(MultiOutputMixin, RegressorMixin, BaseEstimator):  # type: ignore[misc]
     """Ordinary least squares on second-order terms (eq. 13, 14).
 
-    The inputs are centred and scaled first and the problem is solved by singular values, not by the
-    normal equations of eq. (14): the same function, but Zc^2, which hardly varies on a floor, no
-    longer costs digits.
+    The fit centres and scales the inputs, and solves the problem by singular values, not by the normal
+    equations of eq. (14). The fitted function is the same, but the precision is better, because Zc^2 is
+    nearly constant on a floor.
 
     Attributes
     ----------
-    centre_, scale_ : (d,), of the inputs.
+    centre_, scale_ : (d,), mean and largest absolute deviation of the inputs.
     coefficients_ : (terms, outputs), for the centred and scaled inputs.
     """
 

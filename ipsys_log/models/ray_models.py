@@ -1,4 +1,4 @@
-"""Models on rays: ``raydepth`` corrects the depth, ``rayplane`` uses the known height of a marker."""
+"""Models on rays: ``RayDepth`` corrects the depth, ``RayPlane`` uses the known height of a marker."""
 
 from __future__ import annotations
 
@@ -20,14 +20,14 @@ Array = NDArray[np.float64]
 
 
 class RayPlane(RegressorMixin, BaseEstimator):  # type: ignore[misc]
-    """From (n, 4), a camera point and the marker's known height in m, to the world point (n, 3) in m.
+    """A model from camera points and known marker heights, (n, 4) in m, to world points (n, 3) in m.
 
-    Only the direction (Xc / Zc, Yc / Zc) of the camera point counts.
+    It uses only the direction (Xc / Zc, Yc / Zc) of the camera point.
 
     Attributes
     ----------
-    rotation_ : (3, 3), from the frame of the camera to the world.
-    origin_ : (3,), of the camera, in m.
+    rotation_ : (3, 3), from camera coordinates to world coordinates.
+    origin_ : (3,), position of the camera, in m.
     lens_ : (3,), see :func:`ipsys_log.models.rays.directions`.
     """
 
@@ -44,7 +44,7 @@ class RayPlane(RegressorMixin, BaseEstimator):  # type: ignore[misc]
 
     @staticmethod
     def fit_jointly(models: Sequence[RayPlane], cameras: Sequence[Places]) -> list[RayPlane]:
-        """Fit one model for each camera, tied together by the places that several of them saw."""
+        """Fit one model for each camera; points that several cameras measured tie the models together."""
         for model, bearings in zip(models, fit_bearings(cameras), strict=True):
             model.n_features_in_ = 4
             model.rotation_, model.origin_ = bearings.rotation, bearings.origin_m
@@ -60,27 +60,27 @@ class RayPlane(RegressorMixin, BaseEstimator):  # type: ignore[misc]
         return meet_height(self.origin_, rays, X[:, 3])
 
 
-# Standard deviation that the terms of the depth correction have before anything was measured.
+# Prior standard deviation of the terms of the depth correction.
 _TERM_SIGMA = 0.02
-# Relative errors of depth beyond this many usual ones count less and less.
+# Relative depth errors above this multiple of the noise get less weight.
 _ROBUST = 2.0
-# No marker's size says its depth better than this (relative).
+# Least relative noise of a depth from the size of a marker.
 _LEAST_NOISE = 2e-4
 _ROUNDS = 12
 
 
 def depth_terms(points_m: Array) -> tuple[Array, Array]:
-    """What the depth correction is made of, and how uncertain a depth is at each point.
+    """Return the terms of the depth correction, and the relative uncertainty of the depth at each point.
 
     Parameters
     ----------
-    points_m : (n, 3), in the frame of the camera.
+    points_m : (n, 3), in camera coordinates.
 
     Returns
     -------
-    terms : (n, 11): constant, second and third order in u = Xc / Zc, v = Yc / Zc, and (u^2 + v^2)^2.
-    growth : (n,): 1 + u^2 + v^2. A pixel of a wide lens spans so much more towards the edge that the
-        error of a depth grows by it.
+    terms : (n, 11): constant, first, second and third order in u = Xc / Zc, v = Yc / Zc, and (u^2 + v^2)^2.
+    growth : (n,): 1 + u^2 + v^2. A pixel of a wide-angle lens covers more of the scene towards the edge of
+        the image. The error of a depth grows by this factor.
     """
     u, v = points_m[:, 0] / points_m[:, 2], points_m[:, 1] / points_m[:, 2]
     r2 = u * u + v * v
@@ -89,18 +89,18 @@ def depth_terms(points_m: Array) -> tuple[Array, Array]:
 
 
 def fit_depths(points_m: Array, ratios: Array) -> tuple[Array, Array]:
-    """A smooth correction of depths: Bayesian linear regression with a robust loss.
+    """Fit a smooth correction of depths by Bayesian linear regression with a robust loss.
 
     Parameters
     ----------
-    points_m : (n, 3), in the frame of the camera.
+    points_m : (n, 3), in camera coordinates.
     ratios : (n,), true depth over measured depth, minus one.
 
     Returns
     -------
-    coefficients : (11,), of :func:`depth_terms`; all but the constant are drawn towards zero as far as
-        the noise, which is estimated from leave-one-out residuals, makes them uncertain.
-    left_out : (n,), the residual of each ratio where it is left out.
+    coefficients : (11,), coefficients of :func:`depth_terms`. A prior moves all coefficients except the
+        constant towards zero, according to the noise. The noise is estimated from leave-one-out residuals.
+    left_out : (n,), leave-one-out residual of each ratio.
 
     References
     ----------
@@ -123,19 +123,19 @@ def fit_depths(points_m: Array, ratios: Array) -> tuple[Array, Array]:
 
 
 class RayDepth(RegressorMixin, BaseEstimator):  # type: ignore[misc]
-    """From camera points (n, 3) to world points (n, 3), in m.
+    """A model from camera points (n, 3) to world points (n, 3), in m.
 
-    The camera's pose and lens are fitted at the known heights of the measured places; a smooth correction
-    then turns each depth of eq. (3) into the true one. The height that follows from a depth is drawn
-    towards the mean height of the measured places as far as its noise warrants, along the ray; where all
-    places have one height it is that height.
+    The fit estimates the camera's pose and lens correction at the known heights of the calibration points. A
+    smooth correction then turns each depth of eq. (3) into the true depth. The height from a depth is moved
+    along the ray towards the mean height of the calibration points, in proportion to its noise. If all
+    calibration points have the same height, the result is that height.
 
     Attributes
     ----------
     rotation_, origin_, lens_ : see :class:`ipsys_log.models.ray_models.RayPlane`.
     depth_ : (11,), see :func:`fit_depths`.
     heights_ : (3,), mean (m) and variance (m^2) of the measured heights, and the variance (m^2) of a
-        height that follows from a depth, in the middle of the image.
+        height from a depth, at the principal point.
     """
 
     min_pairs: ClassVar[int] = 5
@@ -149,7 +149,7 @@ class RayDepth(RegressorMixin, BaseEstimator):  # type: ignore[misc]
 
     @staticmethod
     def fit_jointly(models: Sequence[RayDepth], cameras: Sequence[Places]) -> list[RayDepth]:
-        """Fit one model for each camera, tied together by the places that several of them saw."""
+        """Fit one model for each camera; points that several cameras measured tie the models together."""
         for model, places, bearings in zip(models, cameras, fit_bearings(cameras), strict=True):
             model._fit_depths(places, bearings)
         return list(models)

@@ -1,7 +1,7 @@
-"""Rays of a camera in the world: its pose and a small correction of its lens, fitted to measured places.
+"""Rays of a camera in the world: its pose and a small lens correction, fitted to calibration points.
 
-A marker's depth from its size (eq. 3) is ten times as uncertain as its direction. Where the height of a
-place is known, its point on the floor rests on the direction alone.
+A marker's depth from its size (eq. 3) is ten times as uncertain as its direction. If the height of a marker
+is known, its position on the floor follows from the direction alone.
 """
 
 from __future__ import annotations
@@ -22,17 +22,19 @@ __all__ = ["Bearings", "Places", "directions", "fit_bearings", "tied"]
 
 Array = NDArray[np.float64]
 
-# An error on the floor beyond this counts less and less: a tape's usual error.
+# Errors on the floor above this get less weight: the usual error of a tape.
 _USUAL_M = 0.005
-# A lens that was calibrated at all needs terms well below 0.05; a weak pull, so that few places suffice.
+# The correction of a calibrated lens has terms well below 0.05. This weak prior towards zero allows fits to
+# few calibration points.
 _LENS_PULL_M = 0.1
-# Share of the tape in the variance of a residual, and of the camera: about the same in the paper's lab.
+# Share of the tape in the variance of a residual. The share of the camera is about the same in the paper's
+# lab.
 _TAPE_SHARE = 0.5
 
 
 @dataclass(frozen=True, slots=True, eq=False)
 class Bearings:
-    """A camera's ``rotation`` (3, 3) and ``origin_m`` (3,) in the world, and its ``lens`` (3,)."""
+    """A camera's ``rotation`` (3, 3) and ``origin_m`` (3,) in the world, and its correction ``lens`` (3,)."""
 
     rotation: Array
     origin_m: Array
@@ -41,8 +43,11 @@ class Bearings:
 
 @dataclass(frozen=True, slots=True, eq=False)
 class Places:
-    """What one camera saw of measured places: ``points_m`` (n, 3) in its frame, ``world_m`` (n, 3), and
-    their ``names``, by which other cameras know them."""
+    """Calibration points that one camera measured.
+
+    ``points_m`` (n, 3) are in camera coordinates, ``world_m`` (n, 3) in world coordinates. ``names`` identify
+    the same points in other cameras.
+    """
 
     points_m: Array
     world_m: Array
@@ -50,10 +55,10 @@ class Places:
 
 
 def directions(points_m: Array, lens: Array) -> Array:
-    """Directions (u', v', 1) in the frame of the camera, (n, 3), from camera points (n, 3).
+    """Return directions (u', v', 1) in camera coordinates, (n, 3), from camera points (n, 3).
 
-    The lens correction of u = Xc / Zc, v = Yc / Zc has the first radial and the two tangential terms of
-    Brown and Conrady, ``lens`` = (k1, p1, p2).
+    The lens correction ``lens`` = (k1, p1, p2) of u = Xc / Zc, v = Yc / Zc has the first radial and the two
+    tangential terms of Brown and Conrady.
 
     Examples
     --------
@@ -66,7 +71,7 @@ def directions(points_m: Array, lens: Array) -> Array:
 
 
 def _lens_terms(u: Array, v: Array) -> Array:
-    """Derivative of (u', v') by (k1, p1, p2), (n, 2, 3)."""
+    """Return the derivative of (u', v') by (k1, p1, p2), (n, 2, 3)."""
     r2 = u * u + v * v
     along_u = np.stack([u * r2, 2 * u * v, r2 + 2 * u * u], axis=1)
     along_v = np.stack([v * r2, r2 + 2 * v * v, 2 * u * v], axis=1)
@@ -74,26 +79,26 @@ def _lens_terms(u: Array, v: Array) -> Array:
 
 
 def fit_bearings(cameras: Sequence[Places]) -> list[Bearings]:
-    """Pose and lens correction of each camera, from measured places of known height.
+    """Estimate pose and lens correction of each camera, from calibration points of known height.
 
-    The errors on the floor are minimised with a soft-L1 loss, from the rigid transformation as a start.
-    Places that several cameras saw tie these together: what differs between cameras cannot be the tape's
-    error, and weighs more than what they have in common.
+    The fit minimises the errors on the floor with a soft-L1 loss and starts from the rigid transformation.
+    Calibration points that several cameras measured tie these cameras together. Differences between the
+    cameras cannot be errors of the tape, so they get more weight than the common part.
 
     Raises
     ------
     FitError
-        For fewer than three places of a camera, or places on a line.
+        A camera has fewer than three calibration points, or they are on a line.
     """
-    found: list[Bearings | None] = [None] * len(cameras)
+    fitted: list[Bearings | None] = [None] * len(cameras)
     for group in tied(cameras):
         for index, bearings in zip(group, _fit_tied([cameras[i] for i in group]), strict=True):
-            found[index] = bearings
-    return [bearings for bearings in found if bearings is not None]
+            fitted[index] = bearings
+    return [bearings for bearings in fitted if bearings is not None]
 
 
 def tied(cameras: Sequence[Places]) -> list[list[int]]:
-    """Cameras by groups that share places, directly or through others."""
+    """Return groups of cameras that share calibration points, directly or through other cameras."""
     groups: list[tuple[list[int], set[str]]] = []
     for index, places in enumerate(cameras):
         names = set(places.names)
@@ -140,17 +145,17 @@ def _fit_tied(cameras: Sequence[Places]) -> list[Bearings]:
 
 
 def _offsets(places: Places, bearings: Bearings) -> Array:
-    """Errors on the floor at the known heights, (n, 2) in m."""
+    """Return errors on the floor at the known heights, (n, 2) in m."""
     rays = directions(places.points_m, bearings.lens) @ bearings.rotation.T
     return (meet_height(bearings.origin_m, rays, places.world_m[:, 2]) - places.world_m)[:, :2]
 
 
 def _slopes(places: Places, bearings: Bearings, turn: Array) -> Array:
-    """Derivative of :func:`_offsets` by rotation vector, origin and lens, (n, 2, 9)."""
+    """Return the derivative of :func:`_offsets` by rotation vector, origin and lens, (n, 2, 9)."""
     points_m = places.points_m
     rays = directions(points_m, bearings.lens) @ bearings.rotation.T
     along = (places.world_m[:, 2] - bearings.origin_m[2]) / rays[:, 2]
-    on_plane = np.zeros((len(rays), 2, 3))  # of the point by the origin
+    on_plane = np.zeros((len(rays), 2, 3))  # derivative of the point by the origin
     on_plane[:, 0, 0] = on_plane[:, 1, 1] = 1.0
     on_plane[:, :, 2] = -rays[:, :2] / rays[:, 2:]
     by_ray = along[:, None, None] * on_plane
@@ -161,14 +166,14 @@ def _slopes(places: Places, bearings: Bearings, turn: Array) -> Array:
 
 
 def _cross(vectors: Array) -> Array:
-    """Matrices (n, 3, 3) of the cross product with each vector (n, 3)."""
+    """Return matrices (n, 3, 3) of the cross product with each vector (n, 3)."""
     x, y, z = vectors.T
     o = np.zeros_like(x)
     return np.stack([o, -z, y, z, o, -x, -y, x, o], axis=1).reshape(-1, 3, 3)
 
 
 def _left_jacobian(turn: Array) -> Array:
-    """How a rotation turns further as its rotation vector (3,) changes (Barfoot 2017, eq. 7.77)."""
+    """Return the left Jacobian of a rotation by its rotation vector (3,) (Barfoot 2017, eq. 7.77)."""
     angle = float(np.linalg.norm(turn))
     if angle < 1e-8:
         return np.eye(3)
@@ -179,10 +184,10 @@ def _left_jacobian(turn: Array) -> Array:
 
 
 def _weights(names: Sequence[str]) -> Array:
-    """What the residuals (n, ...) of places are multiplied by, (n, n), so that they weigh alike.
+    """Return the matrix (n, n) that gives the residuals (n, ...) of calibration points equal variances.
 
-    A place's residuals in k cameras share the tape's error T and have each camera's own, C: their mean
-    has the variance T + C / k, the differences C.
+    The residuals of a calibration point in k cameras share the tape's error T. Each also has the camera's own
+    error C. Their mean has the variance T + C / k, and their differences have the variance C.
     """
     weights = np.eye(len(names))
     for name in {name for name in names if names.count(name) > 1}:

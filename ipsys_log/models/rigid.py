@@ -1,4 +1,4 @@
-"""Rigid transformation from the frame of a camera to the world (sect. 2.2.1 of the paper)."""
+"""Rigid transformation from camera coordinates to world coordinates (sect. 2.2.1 of the paper)."""
 
 from __future__ import annotations
 
@@ -17,7 +17,7 @@ Array = NDArray[np.float64]
 
 
 def rigid_transform(points: Array, targets: Array) -> tuple[Array, Array]:
-    """Rotation and translation that bring ``points`` closest to ``targets``.
+    """Return the rotation and translation that map ``points`` to ``targets`` with least squares.
 
     Parameters
     ----------
@@ -31,12 +31,13 @@ def rigid_transform(points: Array, targets: Array) -> tuple[Array, Array]:
     Raises
     ------
     FitError
-        For fewer than three pairs, or pairs on a line: the rotation about it is not determined.
+        There are fewer than three pairs, or the pairs are on a line: the rotation about the line is not
+        determined.
 
     References
     ----------
-    Ou et al., Robotica 2023, eq. (6) to (12). Eq. (11) can give a reflection when the points lie
-    nearly in a plane; the smallest singular direction is then turned over (Umeyama, PAMI 1991).
+    Ou et al., Robotica 2023, eq. (6) to (12). Eq. (11) can give a reflection if the points are nearly in a
+    plane. The smallest singular direction is then reversed (Umeyama, PAMI 1991).
 
     Examples
     --------
@@ -57,7 +58,7 @@ def rigid_transform(points: Array, targets: Array) -> tuple[Array, Array]:
 
 
 class RigidTransform(RegressorMixin, BaseEstimator):  # type: ignore[misc]
-    """:func:`rigid_transform` as a scikit-learn regressor from (n, 3) to (n, 3), in m.
+    """A scikit-learn regressor from (n, 3) to (n, 3), in m, by :func:`rigid_transform`.
 
     Attributes
     ----------

@@ -1,6 +1,6 @@
-"""The table of models, their parameters as named arrays, and models applied to points.
+"""Table of models, their parameters as named arrays, and models applied to points.
 
-A fitted model travels as named arrays (:func:`parameters`, :func:`restore`), never as a pickle.
+A log stores a fitted model as named arrays (:func:`parameters`, :func:`restore`), not as a pickle.
 """
 
 from __future__ import annotations
@@ -39,8 +39,8 @@ __all__ = [
     "tied_cameras",
 ]
 
-# Those of the paper in the order of its tables: RT, PR, RT+PR, ANN, RT+ANN, KI, RT+KI, KR, RT+KR. A hybrid
-# feeds the first one's output to the second.
+# First the models of the paper in the order of its tables: RT, PR, RT+PR, ANN, RT+ANN, KI, RT+KI, KR, RT+KR.
+# In a hybrid, the output of the first model is the input of the second.
 MODELS: dict[str, Callable[[], Any]] = {
     "rigid": RigidTransform,
     "poly": PolynomialRegression,
@@ -72,12 +72,12 @@ def _after_rigid(name: str, second: Any) -> Pipeline:
 
 
 def create(name: str) -> Any:
-    """An unfitted estimator by its name in :data:`MODELS`.
+    """Return an unfitted estimator by its name in :data:`MODELS`.
 
     Raises
     ------
     IpsysError
-        For a name that is not in the table.
+        The name is not in the table.
     """
     if name not in MODELS:
         raise IpsysError(f"model {name!r} is not known; use one of {', '.join(MODELS)}")
@@ -85,26 +85,26 @@ def create(name: str) -> Any:
 
 
 def min_pairs(name: str) -> int:
-    """How many measured places a model needs at least."""
+    """Return the least number of calibration points that a model needs."""
     return max(int(step.min_pairs) for _, step in _steps(create(name)))
 
 
 @cache
 def reads_height(name: str) -> bool:
-    """Whether a model needs the height at which a marker is carried."""
+    """Return whether a model needs the height of a marker above the floor."""
     return any(getattr(step, "reads_height", False) for _, step in _steps(create(name)))
 
 
 def inputs(name: str, points_m: NDArray[np.float64], heights_m: NDArray[np.float64]) -> NDArray[np.float64]:
-    """What a model predicts from: camera points (n, 3), and heights (n,) where it needs them."""
+    """Return the inputs of a model: camera points (n, 3), and heights (n,) if the model needs them."""
     return np.column_stack([points_m, heights_m]) if reads_height(name) else points_m
 
 
 def predict_array(estimator: Any, points: NDArray[np.float64]) -> NDArray[np.float64]:
-    """``estimator.predict(points)``, for an array (n, d) of numbers that needs no checks.
+    """Return ``estimator.predict(points)`` for an array (n, d) of numbers, without scikit-learn's checks.
 
-    For the few points of a frame scikit-learn's checks take ten times as long as a model. An estimator that
-    has no ``predict_array`` of its own still makes them.
+    For the few points of a frame, these checks take ten times as long as a model. An estimator without its
+    own ``predict_array`` still does the checks.
     """
     for _, step in _steps(estimator):
         points = getattr(step, "predict_array", step.predict)(points)
@@ -112,14 +112,14 @@ def predict_array(estimator: Any, points: NDArray[np.float64]) -> NDArray[np.flo
 
 
 def fit_cameras(name: str, cameras: Mapping[str, Places]) -> dict[str, Any]:
-    """A fitted estimator for each camera, from the places that it saw.
+    """Fit an estimator for each camera to the calibration points that the camera measured.
 
-    Physical models are fitted to all cameras at once: places that two of them saw tie them together.
+    The fit of physical models uses all cameras at once: points that two cameras measured tie them together.
 
     Raises
     ------
     FitError
-        Where the places do not determine a model, naming the camera.
+        The calibration points do not determine a model. The text names the camera.
     """
     models = {camera: create(name) for camera in cameras}
     if (fit_jointly := getattr(MODELS[name], "fit_jointly", None)) is not None:
@@ -133,7 +133,7 @@ def fit_cameras(name: str, cameras: Mapping[str, Places]) -> dict[str, Any]:
 
 
 def tied_cameras(name: str, cameras: Mapping[str, Places]) -> list[list[str]]:
-    """The cameras by groups whose models depend on one another's places."""
+    """Return groups of cameras whose models depend on common calibration points."""
     names = list(cameras)
     if not hasattr(MODELS[name], "fit_jointly"):
         return [[camera] for camera in names]
@@ -141,7 +141,7 @@ def tied_cameras(name: str, cameras: Mapping[str, Places]) -> list[list[str]]:
 
 
 def parameters(estimator: Any) -> dict[str, NDArray[np.float64]]:
-    """The fitted parameters of an estimator, by names such as ``rigid.rotation``.
+    """Return the fitted parameters of an estimator, by names such as ``rigid.rotation``.
 
     Examples
     --------
@@ -160,12 +160,12 @@ def parameters(estimator: Any) -> dict[str, NDArray[np.float64]]:
 
 
 def restore(name: str, arrays: Mapping[str, NDArray[np.float64]]) -> Any:
-    """The estimator called ``name`` with the parameters that :func:`parameters` gave.
+    """Return the estimator ``name`` with parameters from :func:`parameters`.
 
     Raises
     ------
     IpsysError
-        For an unknown model, or one that lacks a parameter.
+        The model is unknown, or a parameter is missing.
     """
     estimator = create(name)
     for prefix, step in _steps(estimator):
@@ -203,11 +203,11 @@ class AppliedModel:
             self._uncertainty = Uncertainty(noise.along, noise.across, noise.growth, noise.fit, fitted_m)
 
     def predict(self, points_m: Array, heights_m: Array) -> Array:
-        """World points (n, 3) from camera points (n, 3) and heights (n,), all in m."""
+        """Return world points (n, 3) from camera points (n, 3) and heights (n,), all in m."""
         return predict_array(self._estimator, inputs(self._name, points_m, heights_m))
 
     def covariances(self, points_m: Array, heights_m: Array) -> Array | None:
-        """Covariances (n, 3, 3) in m^2 of the world points; None where they are not known."""
+        """Return covariances (n, 3, 3) of the world points in m^2; None if they are unknown."""
         if self._uncertainty is not None:
             return self._uncertainty.covariances(self.predict, points_m, heights_m)
         if self._covariance_m2 is not None:
@@ -215,8 +215,9 @@ class AppliedModel:
         return None
 
     def inside(self, points_m: Array, world_m: Array, sigmas_m: Array) -> NDArray[np.bool_] | None:
-        """Whether positions (n, 3) lie in the volume of the measured places, see :class:`Volume`.
+        """Return a mask (n,) of the positions in the volume of the calibration points, see :class:`Volume`.
 
-        None where the model does not say on which places it was fitted.
+        ``points_m`` and ``world_m`` are (n, 3). Return None if the model does not contain the calibration
+        points of its fit.
         """
         return self._volume.contains(points_m, world_m[:, 2], sigmas_m) if self._volume else None

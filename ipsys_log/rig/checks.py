@@ -1,4 +1,4 @@
-"""Values of a rig file that are numbers of the right kind in the wrong unit."""
+"""Checks of a rig file: values in a wrong unit, and marker ids that do not exist."""
 
 from __future__ import annotations
 
@@ -13,7 +13,7 @@ __all__ = ["check_slips", "dictionary_size"]
 
 
 class _Kind(NamedTuple):
-    """Within what a value lies in any lab, in its unit, and the units it is mistaken for, as factors."""
+    """The unit and the plausible range of a value, and the units that users confuse with it, as factors."""
 
     unit: str
     low: float
@@ -22,7 +22,7 @@ class _Kind(NamedTuple):
 
 
 _LENGTHS = (("cm", 0.01), ("mm", 0.001))
-# By the key in the rig file. What is beyond was written in another unit; a row time of 0 is allowed, too.
+# By the key in the rig file. A value outside the range has another unit. A row time of 0 is also valid.
 _KINDS = {
     "marker_length_m": _Kind("m", 0.002, 2.0, _LENGTHS),
     "length_m": _Kind("m", 0.002, 2.0, _LENGTHS),
@@ -37,7 +37,7 @@ _KINDS = {
     "edge_offset_px": _Kind("px", -5.0, 5.0),
 }
 
-# How many markers a dictionary has, where its name does not say it.
+# Number of markers of each dictionary whose name does not contain this number.
 _SIZES = {
     "DICT_ARUCO_ORIGINAL": 1024,
     "DICT_APRILTAG_16h5": 30,
@@ -54,20 +54,22 @@ _SIZES = {
 
 
 def check_slips(rig: Rig, where: str) -> None:
-    """See that no value of a rig file is in another unit than it says, and that its markers exist.
+    """Check that no value of a rig file is in a wrong unit, and that its markers exist.
 
     Raises
     ------
     IpsysError
-        For a value that no lab has, with what was probably meant, and for a marker id that the dictionary
-        does not have.
+        A value is impossible in a lab (the text contains the value in the probable unit), or the dictionary
+        does not contain a marker id.
     """
     for item, key, value in _given(rig):
         kind = _KINDS[key]
         if kind.low <= value <= kind.high:
             continue
         meant = [(unit, value * factor) for unit, factor in kind.others]
-        likely = [f"{it:g} if that is {unit}" for unit, it in meant if kind.low <= it <= kind.high]
+        likely = [
+            f"{number:g} if that is {unit}" for unit, number in meant if kind.low <= number <= kind.high
+        ]
         then = " or ".join(likely) or f"{kind.low:g} to {kind.high:g}"
         raise IpsysError(f"{where}: {item}{key} = {value:g} is too {_far(value, kind)}; write {then}")
     size = dictionary_size(rig.dictionary)
@@ -80,12 +82,12 @@ def check_slips(rig: Rig, where: str) -> None:
 
 
 def _far(value: float, kind: _Kind) -> str:
-    """What is wrong with a value, said of its unit."""
+    """Return the text that a value is too large or too small for its unit."""
     return f"much for {kind.unit}" if value > kind.high else f"little for {kind.unit}"
 
 
 def dictionary_size(dictionary: str) -> int | None:
-    """How many markers a dictionary of OpenCV has; None for an unknown one.
+    """Return the number of markers of an OpenCV dictionary; None for an unknown dictionary.
 
     Examples
     --------
@@ -97,11 +99,14 @@ def dictionary_size(dictionary: str) -> int | None:
 
 
 def _given(rig: Rig) -> Iterator[tuple[str, str, float]]:
-    """What has a kind: of which item of the rig it is, its key, and the value."""
-    items: list[tuple[str, object]] = [("", rig), *((f"marker {one.id}: ", one) for one in rig.markers)]
+    """Yield the values with a plausible range: the item of the rig, the key, and the value."""
+    items: list[tuple[str, object]] = [
+        ("", rig),
+        *((f"marker {marker.id}: ", marker) for marker in rig.markers),
+    ]
     items += [("[floor] ", rig.floor)]
-    items += [(f"reference point {one.name}: ", one) for one in rig.reference_points]
-    items += [(f"camera {one.name}: ", one) for one in rig.cameras]
+    items += [(f"reference point {point.name}: ", point) for point in rig.reference_points]
+    items += [(f"camera {camera.name}: ", camera) for camera in rig.cameras]
     for name, item in items:
         for key in _KINDS:
             value = getattr(item, key, None)

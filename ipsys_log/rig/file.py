@@ -1,4 +1,4 @@
-"""The rig file ``lab.toml``: read, checked, and written as a commented example."""
+"""Rig file ``lab.toml``: its reader, its checks, and its commented example."""
 
 from __future__ import annotations
 
@@ -32,22 +32,23 @@ __all__ = [
 
 Item = TypeVar("Item")
 
-# Markers are carried below the cameras; what is greater was meant in cm.
+# Markers are below the cameras. A greater height is in cm.
 _HIGHEST_M = 5.0
 _FARTHEST = 1e6  # m, px, s or Hz: no number of a lab is larger
-_LARGEST_INT = {"_ns": 2**62}  # by what a name ends with
+_LARGEST_INT = {"_ns": 2**62}  # by the last three characters of a name
 _LARGEST_ID = 2**31 - 1
 _LARGEST_FILE = 1 << 18  # bytes
 _LONGEST_LINE = 120  # characters of a line that an error repeats
 
-# What the time that a driver gives a frame can mean.
+# Meaning of the time that a driver gives to a frame: start or end of the exposure.
 STAMPS = ("start", "end")
 
-# Stands for a password where it may be read by others.
+# Text that replaces a password in public texts.
 HIDDEN = "***"
 # A host with a dot and its port, and then a path or query: no user and password.
 _PORT = r"(?![^/?@:\[]*\.[^/?@:\[]*:[0-9]+(?:/[^@?]*)?(?:\?|$))"
-# Up to the last @: a password may have any sign in it. A lone name may be a token. Or a part of the query.
+# A password ends at the last @, because it may contain any character. A name without a password may be a
+# token. A password may also be a part of the query.
 _PASSWORDS = (
     re.compile(rf"(?<=://){_PORT}(?P<before>[^/?@:\[]*:).*(?=@)"),
     re.compile(r"(?<=://)(?P<before>)[^/?@:\[]+(?=@)"),
@@ -59,12 +60,12 @@ _ITEMS = {"markers": RigMarker, "cameras": RigCamera, "reference_points": Refere
 
 
 def check_name(name: str, what: str) -> str:
-    """Return ``name`` if it can be the name of a camera, run or robot.
+    """Return ``name`` if it is a valid name of a camera, run or robot.
 
     Raises
     ------
     IpsysError
-        Otherwise; such names become parts of topics.
+        The name is not valid. Such names become parts of topics.
     """
     if not _NAME.fullmatch(name):
         raise IpsysError(f"{what} {name!r} must be small letters, digits and _, starting with a letter")
@@ -72,17 +73,17 @@ def check_name(name: str, what: str) -> str:
 
 
 def check_rig_cameras(rig: Rig, cameras: Collection[str], where: str) -> list[str]:
-    """Check that a rig describes the cameras that it is used for.
+    """Check that a rig describes the cameras of a log or of images.
 
     Parameters
     ----------
-    rig : without cameras it fits all.
-    cameras : names in the log or the pictures.
+    rig : the rig; a rig without cameras matches all cameras.
+    cameras : camera names in the log or the images.
     where : the rig file, for the message.
 
     Returns
     -------
-    A remark if some cameras are not described.
+    A remark if the rig does not describe some of the cameras.
 
     Raises
     ------
@@ -103,12 +104,12 @@ def check_rig_cameras(rig: Rig, cameras: Collection[str], where: str) -> list[st
 
 
 def example_toml() -> str:
-    """The commented ``lab.toml`` that ``ipsys init`` writes: the lab of the paper."""
+    """Return the commented ``lab.toml`` that ``ipsys init`` writes: the lab of the paper."""
     return files("ipsys_log.rig").joinpath("lab.toml").read_text(encoding="utf-8")
 
 
 def rig_toml(rig: Rig) -> str:
-    """A rig as the text of a rig file, which :func:`load_rig` reads back.
+    """Return a rig as the text of a rig file, which :func:`load_rig` can read.
 
     Examples
     --------
@@ -132,7 +133,7 @@ def rig_toml(rig: Rig) -> str:
 
 
 def hide_password(address: str) -> str:
-    """An address as it may be shown, and stand in a log.
+    """Return an address without its password, for messages and logs.
 
     Examples
     --------
@@ -147,14 +148,16 @@ def hide_password(address: str) -> str:
 
 
 def hide_passwords(rig: Rig) -> Rig:
-    """A rig without the passwords in its cameras' sources."""
-    cameras = (replace(one, source=one.source and hide_password(one.source)) for one in rig.cameras)
+    """Return a rig without the passwords in its cameras' sources."""
+    cameras = (
+        replace(camera, source=camera.source and hide_password(camera.source)) for camera in rig.cameras
+    )
     return replace(rig, cameras=tuple(cameras))
 
 
 def _toml_rows(item: Any) -> list[str]:
     values = [(f.name, getattr(item, f.name)) for f in fields(item)]
-    # A JSON string is a TOML string; so are numbers.
+    # A JSON string is a TOML string, and a JSON number is a TOML number.
     return [f"{name} = {json.dumps(value)}" for name, value in values if isinstance(value, (str, int, float))]
 
 
@@ -197,11 +200,11 @@ def load_rig(path: Path) -> Rig:
 
 
 def _not_toml(path: Path, error: tomllib.TOMLDecodeError) -> str:
-    """Return the fault of a line, with hints on the most frequent mistakes."""
+    """Return the error text for a line, with hints on the most frequent mistakes."""
     text = f"{path}: is not valid TOML: {error}"
-    found = re.search(r"at line (\d+)", str(error))
+    position = re.search(r"at line (\d+)", str(error))
     lines = path.read_text(encoding="utf-8").split("\n")
-    line = lines[int(found[1]) - 1].strip()[:_LONGEST_LINE] if found else ""
+    line = lines[int(position[1]) - 1].strip()[:_LONGEST_LINE] if position else ""
     if comma := re.search(r"= *(\d+),(\d+)\s*(#.*)?$", line):
         return f"{text}: {line}: a decimal comma? Write {comma[1]}.{comma[2]}"
     if bare := re.search(r"= *([^\s\"'\[{0-9][^#]*?)\s*(#.*)?$", line):
@@ -215,8 +218,8 @@ def check_rig(rig: Rig, where: str) -> Rig:
     Raises
     ------
     IpsysError
-        Two cameras, markers or reference points have the same name, two reference points the same position; a
-        name is bad, a length or sigma is not positive, or a height is impossible.
+        Two cameras, markers or reference points have the same name, or two reference points have the same
+        position. Or a name is not valid, a length or sigma is not positive, or a height is impossible.
     """
     for camera in rig.cameras:
         check_name(camera.name, f"{where}: camera name")
@@ -242,7 +245,7 @@ def check_rig(rig: Rig, where: str) -> Rig:
 
 
 def _check_numbers(item: Any, where: str) -> None:
-    """Refuse numbers that are impossible in a lab, before one of them spoils a computation."""
+    """Check that an item has no impossible numbers, before they cause errors in a computation."""
     for field in fields(item) if item is not None else ():
         value = getattr(item, field.name)
         if isinstance(value, float) and not abs(value) <= _FARTHEST:
@@ -271,7 +274,7 @@ def _check_tape(rig: Rig, where: str) -> None:
                 f"{where}: reference point {point.name!r} has the coordinates {point.x_m} and {point.y_m}; "
                 "give numbers in m"
             )
-    # To the millimetre: nearer together than that two of them are one, written down twice.
+    # Positions are rounded to 1 mm: two nearer points are probably one point that is in the file twice.
     at_m = ((round(point.x_m, 3), round(point.y_m, 3)) for point in rig.reference_points)
     _check_unique(at_m, f"{where}: two reference points are at")
     sigma_m = rig.tape_sigma_m
@@ -282,10 +285,10 @@ def _check_tape(rig: Rig, where: str) -> None:
 def _check_heights(rig: Rig, where: str) -> None:
     heights = {"marker_height_m": rig.marker_height_m}
     heights |= {f"height_m of marker {marker.id}": marker.height_m for marker in rig.markers}
-    for what, height_m in heights.items():
+    for key, height_m in heights.items():
         if height_m is not None and not 0 <= height_m <= _HIGHEST_M:
             raise IpsysError(
-                f"{where}: {what} is {height_m} m; give the height above the floor in m, 0 to {_HIGHEST_M:g}"
+                f"{where}: {key} is {height_m} m; give the height above the floor in m, 0 to {_HIGHEST_M:g}"
                 + (f"; {height_m / 100:g} if that is cm" if 0 < height_m / 100 <= _HIGHEST_M else "")
             )
 
@@ -299,7 +302,7 @@ def _check_unique(names: Iterable[object], what: str) -> None:
 
 
 def _build(item: type[Item], row: Any, where: str) -> Item:
-    """``item`` from a TOML table whose keys are its fields."""
+    """Return an ``item`` from a TOML table whose keys are its fields."""
     if not isinstance(row, Mapping):
         raise IpsysError(f"{where}: must be a table")
     known = {f.name: f for f in fields(item)}  # type: ignore[arg-type]

@@ -1,1 +1,1 @@
-"""A rendered lab with known ground truth: three fisheye cameras above markers on a floor."""
+"""Simulated lab with known ground truth: rendered images of three fisheye cameras above floor markers."""

@@ -1,4 +1,4 @@
-"""A calibration board that is held before a simulated camera, in one pose after the other."""
+"""Calibration board in front of a simulated camera, in one pose after the other."""
 
 from __future__ import annotations
 
@@ -21,9 +21,11 @@ Array = NDArray[np.float64]
 # Positions in the image, as shares of it, from left to right and from top to bottom; each twice.
 _COLUMNS, _ROWS = np.linspace(0.08, 0.92, 5), np.linspace(0.08, 0.92, 3)
 POSES = 2 * len(_COLUMNS) * len(_ROWS)
-# Width of the board, as a share of the image's; tilt of the board against the line of sight, in degrees.
+# Width of the board, as a share of the image width; tilt of the board against the line of sight, and largest
+# roll, in degrees.
 _SHARES, _TILTS_DEG, _ROLL_DEG = (0.28, 0.42), (12.0, 38.0), 25.0
-# White around the squares, in squares. With a whole one the edge of the paper looks like a row of squares.
+# White margin around the squares, in squares. With a margin of 1, the edge of the paper looks like a row of
+# squares.
 _MARGIN = 0.75
 _GOLDEN_RAD = 2.399963
 _TRIES = 60
@@ -63,20 +65,20 @@ def _cells_per_square(board: Board) -> int:
 
 
 def hold_board(board: Board, camera: Camera, settings: LabSettings) -> list[PlacedBoard]:
-    """Return a board in :data:`POSES` poses, which cover the image of a camera and are tilted to all sides.
+    """Return a board in :data:`POSES` poses, which cover the image of a camera, with tilts to all sides.
 
     Parameters
     ----------
-    board : any that :func:`board_cells` draws.
-    camera : whose image holds the whole print in each pose.
+    board : a board that :func:`board_cells` accepts.
+    camera : the camera. Its image contains the whole print in each pose.
     settings : the seed.
     """
     cells, cell_m = board_cells(board)
     rng = stream(settings.seed, Purpose.BOARD, settings.cameras.index(camera.name))
-    places = [(x, y) for _ in range(2) for y in _ROWS for x in _COLUMNS]
+    positions = [(x, y) for _ in range(2) for y in _ROWS for x in _COLUMNS]
     return [
         _hold(cells, cell_m, camera, settings, rng, index, np.array(place))
-        for index, place in enumerate(places)
+        for index, place in enumerate(positions)
     ]
 
 
@@ -89,7 +91,7 @@ def _hold(
     index: int,
     place: Array,
 ) -> PlacedBoard:
-    """Move a tilted board towards the middle of the image until all of it is seen."""
+    """Move a tilted board towards the middle of the image until the image contains the whole board."""
     lens, world_from_camera = camera.lens, invert_pose(camera.camera_from_world)
     width_m = max(cells.shape) * cell_m
     distance_m = width_m * lens.K[0, 0] / (rng.uniform(*_SHARES) * lens.width)

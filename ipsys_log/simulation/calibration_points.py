@@ -1,4 +1,4 @@
-"""Where the markers lie while they are measured, and what tape and ruler say of it."""
+"""Simulated calibration points: poses of the markers, and readings of tape and ruler."""
 
 from __future__ import annotations
 
@@ -32,14 +32,14 @@ Array = NDArray[np.float64]
 
 REFERENCES = (ReferencePoint("A", 1.2192, 2.4384), ReferencePoint("B", 3.6576, 2.4384))
 _DRAWS = 4000
-# A place is the one of so many that lies farthest from the places before it.
+# Number of candidates of a pose. The selected candidate is the one farthest from all earlier poses.
 _CANDIDATES = 4
 _TEST_SHARE = 0.2
 
 
 @dataclass(frozen=True, slots=True)
 class Place:
-    """A marker on the floor, facing up: its centre in world m, its heading in rad."""
+    """The pose of a marker that faces up: its centre in world m, and its heading in rad."""
 
     marker_id: int
     x_m: float
@@ -50,14 +50,14 @@ class Place:
 
 @dataclass(frozen=True, slots=True)
 class Station:
-    """A place to be measured; ``camera`` is the one it was chosen for."""
+    """A calibration point; ``camera`` is the camera for which it is chosen."""
 
     place: Place
     camera: str
 
 
 def place(where: Place, settings: LabSettings) -> Placed:
-    """The print at a place."""
+    """Return the print of a marker at a pose."""
     return Placed(
         where.marker_id,
         settings.marker_length_m,
@@ -66,7 +66,7 @@ def place(where: Place, settings: LabSettings) -> Placed:
 
 
 def seen_whole(where: Place, cameras: Sequence[Camera], settings: LabSettings) -> tuple[str, ...]:
-    """Names of the cameras whose image holds the whole print, white margin included."""
+    """Return the names of the cameras whose image contains the whole print, white margin included."""
     outline_m = print_outline(place(where, settings), settings.dictionary)
     return tuple(camera.name for camera in cameras if sees(camera, outline_m).all())
 
@@ -74,10 +74,10 @@ def seen_whole(where: Place, cameras: Sequence[Camera], settings: LabSettings) -
 def overlap(
     first: Array, second: Array, cameras: Sequence[Camera], settings: LabSettings
 ) -> NDArray[np.bool_]:
-    """Return whether prints at two places, (..., 3) in m, might cover one another in any image: (...).
+    """Return a mask (...) of the pairs of prints, (..., 3) in m, that might overlap in any image.
 
-    The disc around a print throws a shadow on the floor from where a camera hangs; shadows that are
-    apart are apart in its image.
+    The projection of the disc around a print, from the camera onto the floor, is its shadow. If two shadows
+    do not overlap, the prints do not overlap in the image.
     """
     cells = len(black_cells(settings.dictionary, 0))
     radius_m = settings.marker_length_m * cells / (cells - 2) / np.sqrt(2)
@@ -94,7 +94,9 @@ def overlap(
 
 
 def plan_stations(settings: LabSettings, cameras: Sequence[Camera]) -> list[tuple[Station, ...]]:
-    """Sets of places, one of each marker, until every camera sees about ``settings.stations`` places.
+    """Return sets of calibration points, one for each marker, until every camera sees enough of them.
+
+    The required number for each camera is about ``settings.stations``.
 
     Raises
     ------
@@ -109,16 +111,16 @@ def plan_stations(settings: LabSettings, cameras: Sequence[Camera]) -> list[tupl
         for marker_id in range(settings.markers):
             camera = min(cameras, key=lambda one: len(seen[one.name]))
             taken = [station.place for station in stations]
-            where = choose_place(rng, settings, cameras, camera, marker_id, taken, seen[camera.name])
-            stations.append(Station(where, camera.name))
-            for name in seen_whole(where, cameras, settings):
-                seen[name].append(where)
+            pose = choose_place(rng, settings, cameras, camera, marker_id, taken, seen[camera.name])
+            stations.append(Station(pose, camera.name))
+            for name in seen_whole(pose, cameras, settings):
+                seen[name].append(pose)
         sets.append(tuple(stations))
     return sets
 
 
 def split(sets: Sequence[tuple[Station, ...]], seed: int) -> list[tuple[str, ...]]:
-    """The split that each station belongs to, in order: a fifth of each camera's is held out."""
+    """Return the split of each calibration point, in order: a fifth of each camera's points is held out."""
     rng = stream(seed, Purpose.SPLIT)
     cameras = [station.camera for stations in sets for station in stations]
     splits: list[tuple[str, ...]] = [("train",)] * len(cameras)
@@ -132,20 +134,20 @@ def split(sets: Sequence[tuple[Station, ...]], seed: int) -> list[tuple[str, ...
 def measure(
     where: Place, settings: LabSettings, index: int, times_ns: Sequence[int], splits: tuple[str, ...]
 ) -> Measurement:
-    """A place as measured by hand: the distances from A and B in the plane of the floor, the height.
+    """Simulate the manual measurement of a marker: distances from A and B on the floor, and its height.
 
     Parameters
     ----------
-    where : the truth.
+    where : the ground truth.
     settings : the sigmas of tape and ruler.
-    index : number of the measurement; every other one names its still interval.
-    times_ns : instants of the frames in which it lies there.
-    splits : what it is for.
+    index : number of the measurement; every second measurement contains its stationary interval.
+    times_ns : times of the frames in which the marker is stationary at this pose.
+    splits : splits of the calibration point, such as train or test.
     """
     rng = stream(settings.seed, Purpose.TAPE, index)
     distances = _tape(where, settings.tape_sigma_m, rng)
     readout_ns = (settings.height - 1) * settings.row_time_ns
-    # What lies on the floor needs no ruler.
+    # A marker on the floor needs no ruler.
     height_m = where.z_m + (rng.normal(0.0, settings.ruler_sigma_m) if where.z_m else 0.0)
     return Measurement(
         timestamp=times_ns[len(times_ns) // 2],
@@ -164,12 +166,12 @@ def measure(
 
 
 def tape_lengths_m(where: Place) -> Array:
-    """Return the true distances of a place from A and B in the plane of the floor, (2,)."""
+    """Return the true distances of a marker from A and B in the plane of the floor, (2,) in m."""
     return np.array([np.hypot(where.x_m - p.x_m, where.y_m - p.y_m) for p in REFERENCES])
 
 
 def _tape(where: Place, sigma_m: float, rng: np.random.Generator) -> Array:
-    """Draw two distances that form a triangle with AB; invalid readings are repeated."""
+    """Draw two distances that form a triangle with AB; repeat invalid readings."""
     a, b = REFERENCES
     true_m = tape_lengths_m(where)
     base_m = np.hypot(b.x_m - a.x_m, b.y_m - a.y_m)
@@ -193,28 +195,28 @@ def choose_place(
     before: Sequence[Place],
     suits: Callable[[Place, Camera, LabSettings], bool] = lambda where, camera, settings: True,
 ) -> Place:
-    """Choose a place in the view of a camera, far from those ``before``, clear of those that are ``taken``.
+    """Choose a pose in a camera's field of view, far from poses ``before``, without overlap with ``taken``.
 
     Raises
     ------
     IpsysError
-        The view has no room for the marker.
+        The field of view has no room for the marker.
     """
-    found: list[Place] = []
+    candidates: list[Place] = []
     for _ in range(_DRAWS):
         x_m, y_m = rng.uniform(0, FLOOR_M, 2)
         z_m, heading_rad = rng.choice(settings.heights_m), rng.uniform(-np.pi, np.pi)
-        where = Place(marker_id, float(x_m), float(y_m), float(z_m), float(heading_rad))
-        if _fits(where, settings, cameras, camera, taken) and suits(where, camera, settings):
-            found.append(where)
-        if len(found) == _CANDIDATES:
+        candidate = Place(marker_id, float(x_m), float(y_m), float(z_m), float(heading_rad))
+        if _fits(candidate, settings, cameras, camera, taken) and suits(candidate, camera, settings):
+            candidates.append(candidate)
+        if len(candidates) == _CANDIDATES:
             break
-    if not found:
+    if not candidates:
         raise IpsysError(
             f"simulator: no room for marker {marker_id} beside {len(taken)} others in the view of "
             f"{camera.name!r}; set fewer or smaller markers"
         )
-    return max(found, key=lambda where: _distance(where, before))
+    return max(candidates, key=lambda where: _distance(where, before))
 
 
 def _fits(
@@ -229,7 +231,7 @@ def _fits(
 
 
 def _tape_angle_deg(where: Place) -> float:
-    """Angle in 0..90 degrees at which the lines from A and B cross: flat triangles tell little."""
+    """Return the crossing angle of the lines from A and B, 0..90 degrees: flat triangles are inaccurate."""
     to_a, to_b = (np.array([where.x_m - p.x_m, where.y_m - p.y_m]) for p in REFERENCES)
     cross = abs(to_a[0] * to_b[1] - to_a[1] * to_b[0])
     return float(np.degrees(np.arcsin(min(cross / (np.hypot(*to_a) * np.hypot(*to_b)), 1.0))))

@@ -1,4 +1,4 @@
-"""The cameras of the simulated lab: lenses like the paper's, hung so that they cover the floor."""
+"""Cameras of the simulated lab: intrinsics like those of the paper, and poses that cover the floor."""
 
 from __future__ import annotations
 
@@ -18,10 +18,10 @@ __all__ = ["FLOOR_M", "Camera", "hang_cameras", "sees"]
 Array = NDArray[np.float64]
 
 FLOOR_M = 4.88
-# Outermost cameras hang this far from the wall; with three of them, 1.59 m lie between two.
+# Distance of the outermost cameras from the wall. With three cameras, the distance between two is 1.59 m.
 _FROM_WALL_M = 0.85
 _TRIES = 5000
-# Sizes at 1920 px of width; distortion about that of the paper's lenses.
+# Intrinsics for images of 1920 px width. The distortion is about that of the lenses in the paper.
 _FOCAL_PX = (1150.0, 1165.0)
 _OFF_CENTRE_PX = 60.0
 _DISTORTION = np.array([-0.13, 0.01, -0.03, 0.02])
@@ -31,7 +31,7 @@ _WIDEST_RAD = 1.4
 
 @dataclass(frozen=True, slots=True, eq=False)
 class Camera:
-    """A lens in its place: ``camera_from_world`` is (4, 4)."""
+    """A camera with intrinsics ``lens`` and extrinsics ``camera_from_world`` (4, 4)."""
 
     name: str
     lens: CameraCalibration
@@ -39,23 +39,23 @@ class Camera:
 
     @property
     def origin_m(self) -> Array:
-        """Where it hangs in the world, (3,)."""
+        """Return the position of the camera in the world, (3,)."""
         origin: Array = -self.camera_from_world[:3, :3].T @ self.camera_from_world[:3, 3]
         return origin
 
 
 def hang_cameras(settings: LabSettings, time_ns: int = 0) -> tuple[Camera, ...]:
-    """The cameras in a row over the middle of the floor.
+    """Return the cameras in a row above the middle of the floor.
 
     Parameters
     ----------
-    settings : of the lab.
-    time_ns : of the calibrations.
+    settings : settings of the lab.
+    time_ns : time of the calibrations.
 
     Raises
     ------
     IpsysError
-        Where no lens and tilt lets a camera see its part of the floor.
+        A camera cannot see its part of the floor with any intrinsics and tilt.
     """
     count = len(settings.cameras)
     spacing_m = (FLOOR_M - 2 * _FROM_WALL_M) / max(count - 1, 2)
@@ -64,9 +64,9 @@ def hang_cameras(settings: LabSettings, time_ns: int = 0) -> tuple[Camera, ...]:
 
 
 def sees(camera: Camera, points_m: Array) -> NDArray[np.bool_]:
-    """Which points of the world, (n, 3) in m, lie in the image: (n,)."""
+    """Return a mask (n,) of the world points, (n, 3) in m, that are in the image."""
     points_c = transform(camera.camera_from_world, points_m)
-    # Beyond the widest angle the polynomial of the lens means nothing.
+    # Outside the widest angle, the polynomial of the lens distortion is not valid.
     in_front = np.hypot(points_c[:, 0], points_c[:, 1]) < np.tan(_WIDEST_RAD) * points_c[:, 2]
     px = project(np.where(in_front[:, None], points_c, [0.0, 0.0, 1.0]), camera.lens)
     last = np.array([camera.lens.width - 1, camera.lens.height - 1])
@@ -75,7 +75,7 @@ def sees(camera: Camera, points_m: Array) -> NDArray[np.bool_]:
 
 
 def _hang(settings: LabSettings, index: int, y_m: float, spacing_m: float, time_ns: int) -> Camera:
-    """Turn and shift a camera until it sees its part of the floor, as one does on a ladder."""
+    """Draw intrinsics and poses of a camera until it sees its part of the floor."""
     rng = stream(settings.seed, Purpose.CAMERA, index)
     name = settings.cameras[index]
     wanted_m = _part_of_floor(settings, y_m, spacing_m)
@@ -97,15 +97,17 @@ def _hang(settings: LabSettings, index: int, y_m: float, spacing_m: float, time_
 
 
 def _part_of_floor(settings: LabSettings, y_m: float, spacing_m: float) -> Array:
-    """Points that a camera has to see: its strip of the floor, and the overlap above it.
+    """Return the points that a camera must see: its strip of the floor, and the overlap above it.
 
-    Halfway to its neighbour it sees half a marker more, corner to corner, at the greatest height.
+    The overlap is at the greatest height. It reaches half the diagonal of a marker beyond the middle between
+    two cameras.
     """
     across = np.linspace(0, FLOOR_M, 13)
     along = np.clip(y_m + _FROM_WALL_M * np.linspace(-1, 1, 5), 0, FLOOR_M)
     top_m = max(*settings.heights_m, settings.drive_height_m)
     reach_m = spacing_m / 2 + settings.marker_length_m / np.sqrt(2)
-    # A marker at a height near a wall may fall out of the image; the measured places take care.
+    # A raised marker near a wall may be outside the image. The selection of calibration points avoids such
+    # markers.
     across_top = np.linspace(0.15 * FLOOR_M, 0.85 * FLOOR_M, 9)
     along_top = y_m + reach_m * np.linspace(-1, 1, 3)
     low = np.stack(np.meshgrid(across, along, [0.0]), axis=-1).reshape(-1, 3)
@@ -129,7 +131,7 @@ def _draw_lens(rng: np.random.Generator, settings: LabSettings, name: str, time_
 
 
 def _reaches(lens: CameraCalibration) -> bool:
-    """Whether the lens is monotone up to an angle that lies outside of the image."""
+    """Return whether the lens distortion is monotone up to an angle outside the image."""
     theta = np.linspace(0, _WIDEST_RAD, 200)
     powers = theta[:, None] ** np.array([2, 4, 6, 8])
     slope = 1 + powers @ (np.array([3, 5, 7, 9]) * lens.D)

@@ -1,6 +1,6 @@
-"""Robots that drive one behind the other along a smooth closed path over the whole floor.
+"""Convoy of robots that drive along a smooth closed path over the whole floor.
 
-The path does not cross itself, so that a convoy never meets itself however long it drives.
+The path does not cross itself, so the robots of a convoy never meet, for any duration.
 """
 
 from __future__ import annotations
@@ -19,24 +19,26 @@ __all__ = ["Drive", "plan_drive"]
 
 Array = NDArray[np.float64]
 
-# Of the path from the walls: near enough for the edge of the images, and seen whole everywhere.
+# Distance of the path from the walls: the path reaches the edges of the images, and whole markers are visible
+# everywhere.
 _FROM_WALL_M = 0.55
-# A robot gathers speed within about this time.
+# Time constant of the acceleration of a robot.
 _START_S = 0.4
 _TRIES = 200
 _ARMS = 5
 # Mean reach, and the share of a second harmonic that rounds the bends between the arms.
 _MEAN, _ROUND = 0.7, 0.18
-# A robot slows down in bends so as not to turn faster than this.
+# Largest rate of turn. A robot slows down in bends to keep below it.
 _TURN_RAD_S = 2.5
 _CHECKED_HZ = 10
 
 
 @dataclass(frozen=True, slots=True, eq=False)
 class Drive:
-    """A star with five rounded arms, and how far ahead on it each marker starts, in s.
+    """A path in the form of a star with five rounded arms, and the start of each marker on it.
 
-    ``times_s`` (n,) is when a robot passes the angles ``phases_rad`` (n,) of the path.
+    ``ahead_s`` is the time from the start of the path to the start of each marker, in s. ``times_s`` (n,) are
+    the times at which a robot passes the angles ``phases_rad`` (n,) of the path.
     """
 
     height_m: float
@@ -46,17 +48,17 @@ class Drive:
     phases_rad: Array
 
     def places_at(self, time_s: float) -> tuple[Place, ...]:
-        """Where the markers are, a time after the start; before it they stand there."""
+        """Return the poses of all markers at a time after the start; before it, they are stationary."""
         return tuple(self.place_at(marker_id, time_s) for marker_id in self.ahead_s)
 
     def place_at(self, marker_id: int, time_s: float) -> Place:
-        """Where one of them is."""
+        """Return the pose of one marker at a time after the start."""
         (x_m, y_m), (dx, dy) = self._follow(self.ahead_s[marker_id], np.array([max(time_s, 0.0)]))
         heading_rad = float(np.arctan2(dy[0], dx[0]))
         return Place(marker_id, float(x_m[0]), float(y_m[0]), self.height_m, heading_rad)
 
     def track(self, ahead_s: float, times_s: Array) -> Array:
-        """Centres of a marker at times (n,): (n, 3) in m."""
+        """Return the centres of a marker at times (n,): (n, 3) in m."""
         (x_m, y_m), _ = self._follow(ahead_s, times_s)
         return np.stack([x_m, y_m, np.full_like(x_m, self.height_m)], axis=1)
 
@@ -67,7 +69,10 @@ class Drive:
 
 
 def plan_drive(settings: LabSettings, cameras: Sequence[Camera]) -> Drive:
-    """Markers on the path, as many of them as never cover one another; marker 0 starts at a wall."""
+    """Put up to ``settings.markers`` markers, which never cover one another, on the path; return the drive.
+
+    Marker 0 starts at a wall.
+    """
     rng = stream(settings.seed, Purpose.DRIVE)
     mirrored = bool(rng.integers(2))
     empty = Drive(settings.drive_height_m, mirrored, {}, *_timetable(settings.drive_speed_m_s))
@@ -84,7 +89,10 @@ def plan_drive(settings: LabSettings, cameras: Sequence[Camera]) -> Drive:
 
 
 def _timetable(speed_m_s: float) -> tuple[Array, Array]:
-    """When a robot passes which angle of the path, from the wall by the first camera: s and rad."""
+    """Return times in s, and the angles of the path at these times in rad.
+
+    The path starts at the wall at the first camera.
+    """
     phases_rad = -np.pi / 2 + np.linspace(0, 2 * np.pi, 20_001)
     (x_m, y_m), (dx, dy) = _figure(phases_rad, False)
     step_m = np.hypot(np.diff(x_m), np.diff(y_m))
@@ -94,10 +102,10 @@ def _timetable(speed_m_s: float) -> tuple[Array, Array]:
 
 
 def _figure(phase: Array, mirrored: bool) -> tuple[tuple[Array, Array], tuple[Array, Array]]:
-    """Points of the path at angles (n,), in m, and their derivatives by the angle.
+    """Return points of the path at angles (n,), in m, and their derivatives by the angle.
 
-    Between the arms the path comes back to near the middle; the arms end on a square with rounded
-    corners, so that they reach the edges of all images.
+    Between two arms, the path returns to near the middle. The arms end on a square with rounded corners, so
+    they reach the edges of all images.
     """
     side = -1.0 if mirrored else 1.0
     cos, sin = np.cos(phase), np.sin(phase)

@@ -19,10 +19,10 @@ __all__ = ["FIELD_PX", "Check", "View", "lay_floor", "pixel_rays", "prepare_view
 
 Array = NDArray[np.float64]
 Plane = NDArray[np.float32]
-# Called between two steps of long work; its exceptions end the work.
+# A callback between two steps of long work; its exceptions end the work.
 Check = Callable[[], None]
 
-# A step of the work, so that an interrupt need not wait for all of it, and what it needs stays in the caches.
+# Rows in a step of the work. Small steps allow a fast interrupt, and their data stays in the caches.
 _ROWS = 64
 
 _BOARD_M = np.array([1.2192, 2.4384])
@@ -33,11 +33,11 @@ _TILE_M = 2.6
 
 
 def pixel_rays(lens: CameraCalibration, border_px: int, check: Check = lambda: None) -> Array:
-    """Normalized image coordinates of all pixels and of a border around them.
+    """Return the normalized image coordinates of all pixels and of a border around them.
 
     Parameters
     ----------
-    lens, border_px : of the camera; the width of the border.
+    lens, border_px : intrinsics of the camera; width of the border.
     check : called between the steps; its exceptions end the work.
 
     Returns
@@ -55,14 +55,15 @@ def pixel_rays(lens: CameraCalibration, border_px: int, check: Check = lambda: N
 
 
 def lay_floor(settings: LabSettings, camera: Camera, rays: Array, check: Check = lambda: None) -> Plane:
-    """Grey levels of the empty floor, (h, w), for the rays of a camera (h, w, 2).
+    """Return the grey levels of the empty floor, (h, w), for the rays of a camera (h, w, 2).
 
     ``check`` is called between the steps; its exceptions end the work.
     """
     floor = np.empty(rays.shape[:2], dtype=np.float32)
     for first in range(0, len(rays), _ROWS):
         check()
-        # With the rows before and after: the width of a pixel on the floor is a difference between rows.
+        # The rows before and after are necessary: the width of a pixel on the floor is a difference between
+        # rows.
         start = max(first - 1, 0)
         rows = _lay_rows(settings, camera, rays[start : first + _ROWS + 1])
         floor[first : first + _ROWS] = rows[first - start :][:_ROWS]
@@ -75,7 +76,7 @@ def _lay_rows(settings: LabSettings, camera: Camera, rays: Array) -> Plane:
     origin_m = camera.origin_m
     reach = origin_m[2] / np.maximum(-z, 1e-3)
     x_m, y_m = origin_m[0] + x * reach, origin_m[1] + y * reach
-    # Width of a pixel on the floor: what is finer than it is washed out.
+    # Width of a pixel on the floor: finer details have less contrast.
     pixel_m = np.maximum(np.abs(np.gradient(x_m, axis=1)), np.abs(np.gradient(y_m, axis=0)))
     across, along = x_m / _BOARD_M[0], y_m / _BOARD_M[1]
     on_boards = (across >= 0) & (across <= _BOARDS[0]) & (along >= 0) & (along <= _BOARDS[1])
@@ -87,13 +88,13 @@ def _lay_rows(settings: LabSettings, camera: Camera, rays: Array) -> Plane:
 
 
 def _boards(settings: LabSettings, x_m: Array, y_m: Array) -> Array:
-    """Wood with its grain along y; each board has its own shade and its own piece of grain."""
+    """Return grey levels of wood with its grain along y; each board has its own shade and grain."""
     rng = stream(settings.seed, Purpose.FLOOR, 0)
     shades, shifts_m = rng.uniform(-5, 5, _BOARDS), rng.uniform(0, _TILE_M, _BOARDS)
     column = np.clip((x_m / _BOARD_M[0]).astype(int), 0, _BOARDS[0] - 1)
     row = np.clip((y_m / _BOARD_M[1]).astype(int), 0, _BOARDS[1] - 1)
     shift_m = shifts_m[column, row]
-    # A slow sway bends the grain.
+    # A slow oscillation bends the grain.
     bent_m = x_m + 0.012 * np.sin(2.3 * y_m + 5 * shift_m) + shift_m
     grain = _noise_at(settings, 2, bent_m, y_m + shift_m, 18.0)
     fine = _noise_at(settings, 3, 3 * bent_m, y_m - shift_m, 30.0)
@@ -102,7 +103,7 @@ def _boards(settings: LabSettings, x_m: Array, y_m: Array) -> Array:
 
 
 def _seams(across: Array, along: Array, pixel_m: Array) -> Array:
-    """Share of the light that is left in the gaps between boards, (h, w)."""
+    """Return the share of the light that remains in the gaps between boards, (h, w)."""
     to_x_m = np.abs(across - np.round(across)) * _BOARD_M[0]
     to_y_m = np.abs(along - np.round(along)) * _BOARD_M[1]
     width_m = np.maximum(_SEAM_M, pixel_m)
@@ -112,7 +113,7 @@ def _seams(across: Array, along: Array, pixel_m: Array) -> Array:
 
 
 def _noise_at(settings: LabSettings, which: int, x_m: Array, y_m: Array, stretch: float) -> Array:
-    """Smooth noise of unit variance, repeated without a seam, ``stretch`` times as long in y."""
+    """Return smooth noise of unit variance, repeated without a seam, ``stretch`` times as long in y."""
     map_x = (x_m * (_TILE / _TILE_M) % _TILE).astype(np.float32)
     map_y = (y_m * (_TILE / _TILE_M / stretch) % _TILE).astype(np.float32)
     tile = _noise_tile(settings.seed, which)
@@ -123,18 +124,18 @@ def _noise_at(settings: LabSettings, which: int, x_m: Array, y_m: Array, stretch
 def _noise_tile(seed: int, which: int) -> Plane:
     """Return the tile that :func:`_noise_at` repeats; all cameras of a lab share it."""
     white = stream(seed, Purpose.FLOOR, which).standard_normal((_TILE, _TILE))
-    # Longer than wide: filtered by convolution on the torus, so that the tile wraps.
+    # The filter is a convolution on the torus, so the tile repeats without a seam.
     fy, fx = np.fft.fftfreq(_TILE)[:, None], np.fft.rfftfreq(_TILE)[None, :]
     soft = np.exp(-2 * (np.pi * 1.2) ** 2 * ((fx) ** 2 + (fy) ** 2)) / (1 + 60 * np.hypot(fx, fy))
     tile = np.fft.irfft2(np.fft.rfft2(white) * soft, s=white.shape)
     tile = ((tile - tile.mean()) / tile.std()).astype(np.float32)
-    # One wrapped column and row more, or the interpolation would see the edge of the tile.
+    # Additional wrapped columns and rows keep the interpolation away from the edge of the tile.
     wrapped = np.pad(tile, ((0, 2), (0, 2)), mode="wrap")
     wrapped.flags.writeable = False
     return wrapped
 
 
-# By how much the field of noise is larger than a frame.
+# Difference in size between the noise field and an image.
 FIELD_PX = 192
 
 
@@ -142,10 +143,10 @@ FIELD_PX = 192
 class View:
     """The constant data of the frames of a camera.
 
-    ``rays`` (h + 2 border, w + 2 border, 2) are normalized coordinates of pixels, ``floor`` (h, w) is
-    the light from the empty floor behind the optics, ``noise`` a field that is larger than a frame by
-    192 px each way and of which each frame shows another piece. ``bare`` (h, w) is the share of floor in each
-    pixel, where prints lie on it for good.
+    ``rays`` (h + 2 border, w + 2 border, 2) are normalized coordinates of pixels. ``floor`` (h, w) is the
+    light from the empty floor behind the optics. ``noise`` is a noise field that is 192 px larger than an
+    image in both directions; each frame uses another part of it. ``bare`` (h, w) is the share of the floor in
+    each pixel, if stationary prints cover a part of the floor.
     """
 
     camera: Camera
@@ -173,5 +174,5 @@ def prepare_view(camera: Camera, settings: LabSettings, check: Check = lambda: N
 
 
 def to_light(levels: Plane | np.float32, settings: LabSettings) -> Plane:
-    """Light of grey levels, 0 to 255 both."""
+    """Return the light of grey levels, both from 0 to 255."""
     return np.asarray(255.0 * (levels / 255.0) ** settings.gamma, dtype=np.float32)

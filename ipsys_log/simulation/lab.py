@@ -1,4 +1,4 @@
-"""The simulated session: rig, lenses, measured places, driving robots, and the truth of it all."""
+"""Simulated session: rig, camera intrinsics, calibration points, driving robots, and ground truth."""
 
 from __future__ import annotations
 
@@ -43,9 +43,9 @@ from ipsys_log.units import NS_PER_S
 
 __all__ = ["EPOCH_NS", "build_rig", "drive_start_ns", "driving", "simulate"]
 
-# When the simulated clock starts: 2023-11-14 22:13:20 UTC.
+# Start of the simulated clock: 2023-11-14 22:13:20 UTC.
 EPOCH_NS = 1_700_000_000 * NS_PER_S
-# While the markers are carried to their next places, nobody records.
+# Pause of the recording, for the transport of the markers to their next calibration points.
 _PAUSE_NS = 3 * NS_PER_S
 # From the end of the exposure of the last row to the arrival of the frame.
 _LATENCY_NS = 4_000_000
@@ -53,10 +53,10 @@ _LATENCY_NS = 4_000_000
 
 @dataclass(frozen=True, slots=True)
 class Instant:
-    """One moment at which all cameras take a frame; what was measured by then comes after it.
+    """A time at which all cameras take a frame, with the measurements that follow it.
 
-    ``places`` is where the markers are at ``time_ns``, the middle of the exposure of the first row;
-    ``prints`` are they as the cameras see them.
+    ``places`` are the poses of the markers at ``time_ns``, the middle of the exposure of the first row.
+    ``prints`` are the markers for the renderer.
     """
 
     time_ns: int
@@ -69,28 +69,28 @@ def simulate(
     settings: LabSettings,
     progress: Callable[[str, int, int], None] = lambda stage, done, total: None,
 ) -> Iterator[Message]:
-    """A session of the simulated lab, message by message, in log order.
+    """Yield the messages of a session of the simulated lab, in log order.
 
-    Equal settings give equal messages, byte for byte on the same versions of OpenCV and NumPy. No
-    clock is read: the simulated one starts at :data:`EPOCH_NS`.
+    With the same versions of OpenCV and NumPy, equal settings give equal messages, byte for byte. The
+    function reads no clock: the simulated clock starts at :data:`EPOCH_NS`.
 
     Parameters
     ----------
-    settings : of the lab.
-    progress : called with what is done (the ``views`` of the cameras, then ``simulate``: frames), how many of
-        them, and how many there are.
+    settings : settings of the lab.
+    progress : called with the step (``views`` of the cameras, then ``simulate`` for frames), the number of
+        finished items, and the number of all items.
 
     Yields
     ------
     Message
-        The rig; a calibration per camera; then, per instant, the truth, a frame per camera and the
-        measurements that were made. ``publish_time_ns`` is the instant: of a frame, the middle of the
+        The rig; a calibration per camera; then, per instant, the ground truth, a frame per camera and the
+        measurements. ``publish_time_ns`` is the time of the instant. For a frame, it is the middle of the
         exposure of its first row.
 
     Raises
     ------
     IpsysError
-        Where the settings contradict themselves.
+        The settings contradict one another.
 
     Examples
     --------
@@ -106,7 +106,7 @@ def simulate(
 
 
 def build_rig(settings: LabSettings) -> Rig:
-    """The rig of the simulated lab; each marker is on a robot of its own."""
+    """Return the rig of the simulated lab; each marker is on its own robot."""
     return Rig(
         name="simulated_lab",
         dictionary=settings.dictionary,
@@ -121,11 +121,13 @@ def build_rig(settings: LabSettings) -> Rig:
 
 
 def drive_start_ns(settings: LabSettings, cameras: Sequence[Camera]) -> int:
-    """When the robots start: the true places at a time are ``drive.places_at`` of the seconds since then.
+    """Return the start time of the robots.
+
+    The true poses at a time are ``drive.places_at`` of the seconds since this start.
 
     Parameters
     ----------
-    settings : of the lab.
+    settings : settings of the lab.
     cameras : from :func:`~ipsys_log.simulation.cameras.hang_cameras`.
 
     Returns
@@ -169,7 +171,7 @@ def _payloads(
 
 @dataclass(frozen=True, slots=True)
 class _Shutter:
-    """Takes the frames of an instant; which thread takes which makes no difference."""
+    """The renderer of the frames of an instant; the frames do not depend on the threads."""
 
     settings: LabSettings
     instant: Instant
@@ -186,12 +188,12 @@ def _instants(settings: LabSettings, cameras: Sequence[Camera]) -> Iterator[Inst
     splits = split(sets, settings.seed)
     for number, stations in enumerate(sets):
         places = tuple(station.place for station in stations)
-        lying = tuple(place(where, settings) for where in places)
+        lying = tuple(place(pose, settings) for pose in places)
         times_ns = _times(settings, _start_ns(settings, number), settings.frames_per_station)
         first = number * settings.markers
         measured = tuple(
-            measure(where, settings, index, times_ns, splits[index])
-            for index, where in enumerate(places, first)
+            measure(pose, settings, index, times_ns, splits[index])
+            for index, pose in enumerate(places, first)
         )
         for time_ns in times_ns[:-1]:
             yield Instant(time_ns, places, lying)
@@ -204,12 +206,12 @@ def _instants(settings: LabSettings, cameras: Sequence[Camera]) -> Iterator[Inst
 
 
 def driving(drive: Drive, marker_id: int, time_s: float, settings: LabSettings) -> Moving:
-    """A marker on the drive, for the frame of a time after its start."""
+    """Return a moving marker of the drive, for the frame at a time after the start."""
     return lambda since_s: place(drive.place_at(marker_id, time_s + since_s), settings)
 
 
 def _start_ns(settings: LabSettings, number: int) -> int:
-    """When the markers lie at a set of stations for the first time; after the last set the drive starts."""
+    """Return the first time of a set of calibration points; after the last set, the start of the drive."""
     last_ns = _times(settings, 0, settings.frames_per_station)[-1]
     return EPOCH_NS + NS_PER_S + number * (last_ns + _PAUSE_NS)
 
@@ -223,14 +225,14 @@ def _truth(instant: Instant, rig: Rig, cameras: Sequence[Camera], settings: LabS
         instant.time_ns,
         tuple(
             Track(
-                robot=rig.robot_of(where.marker_id),
-                id=where.marker_id,
-                x_m=where.x_m,
-                y_m=where.y_m,
-                z_m=where.z_m,
-                heading_rad=where.heading_rad,
-                cameras=seen_whole(where, cameras, settings),
+                robot=rig.robot_of(pose.marker_id),
+                id=pose.marker_id,
+                x_m=pose.x_m,
+                y_m=pose.y_m,
+                z_m=pose.z_m,
+                heading_rad=pose.heading_rad,
+                cameras=seen_whole(pose, cameras, settings),
             )
-            for where in instant.places
+            for pose in instant.places
         ),
     )

@@ -1,6 +1,6 @@
-"""The simulated lab of live cameras: most markers are stationary, a few drive to and fro.
+"""Simulated lab with live cameras: most markers are stationary, a few drive back and forth.
 
-A stationary marker can be used for alignment and measured at any time.
+Stationary markers can be used for alignment and measured at any time.
 """
 
 from __future__ import annotations
@@ -48,17 +48,18 @@ __all__ = [
     "tape_sheet",
 ]
 
-# A laptop with two cores draws it and tracks in it: three cameras give 2.5 MB a second.
+# A laptop with two cores can draw this lab and track in it. Three cameras send 2.5 MB per second.
 LIVE_SETTINGS = LabSettings(
     width=1280, height=720, rate_hz=10.0, stations=18, drive_s=4.0, noise_sigma=1.0, jpeg_quality=80
 )
-# Most markers lie on the floor, for the alignment of cameras; the others lie on boxes.
+# Most markers are on the floor, for the alignment of cameras; the others are on boxes.
 _RAISED_SHARE, _BOXES_M = 0.35, (0.1, 0.2)
-# Samples per second of the driving markers' paths; stationary markers keep clear of these places.
+# Samples per second of the paths of driving markers. Stationary markers do not overlap these samples.
 _CHECKED_HZ = 5
-# The places do not depend on the size of the frames, as long as these are wide.
+# The plan uses this image size, so the poses do not depend on the size of the images, if they are wide.
 _WIDTH, _HEIGHT = 1920, 1080
-# A marker that is narrower in an image of this width may be missed in a smaller one.
+# In an image of this width, markers have at least this width. The detector may miss narrower markers in
+# smaller images.
 _NARROWEST_PX = 50.0
 
 _planning = Lock()
@@ -66,7 +67,7 @@ _planning = Lock()
 
 @dataclass(frozen=True, slots=True, eq=False)
 class LiveLab:
-    """Places of markers: those with ids from ``settings.markers`` on are stationary, the others drive."""
+    """Poses of markers: those with ids from ``settings.markers`` on are stationary, the others drive."""
 
     settings: LabSettings
     drive: Drive
@@ -78,7 +79,7 @@ def plan_live_lab(settings: LabSettings) -> LiveLab:
 
     Parameters
     ----------
-    settings : all determine the places, except the size, rate and quality of the frames.
+    settings : settings of the lab. All determine the poses, except size, rate and quality of the images.
 
     Raises
     ------
@@ -92,7 +93,7 @@ def plan_live_lab(settings: LabSettings) -> LiveLab:
     ([2, 3, 4], [0, 1])
     """
     shape = replace(settings, width=_WIDTH, height=_HEIGHT, rate_hz=LIVE_SETTINGS.rate_hz)
-    with _planning:  # the cameras of a lab are opened at once, and share one plan
+    with _planning:  # the cameras of a lab open at the same time, and share one plan
         drive, lying = _plan(shape)
     return LiveLab(settings, drive, lying)
 
@@ -102,7 +103,7 @@ def _plan(settings: LabSettings) -> tuple[Drive, tuple[Place, ...]]:
     cameras = hang_cameras(settings)
     drive = plan_drive(settings, cameras)
     times_s = np.linspace(0, settings.drive_s, round(settings.drive_s * _CHECKED_HZ) + 1).tolist()
-    taken = [where for time_s in times_s for where in drive.places_at(time_s)]
+    taken = [pose for time_s in times_s for pose in drive.places_at(time_s)]
     rng = stream(settings.seed, Purpose.LYING)
     seen: dict[str, list[Place]] = {camera.name: [] for camera in cameras}
     lying: list[Place] = []
@@ -112,19 +113,19 @@ def _plan(settings: LabSettings) -> tuple[Drive, tuple[Place, ...]]:
         _check_left(settings, number)
         level = replace(settings, heights_m=(_next_height_m(lying, seen[camera.name]),))
         others = [*taken, *lying]
-        where = choose_place(rng, level, cameras, camera, number, others, seen[camera.name], _is_wide)
-        lying.append(where)
-        for name in seen_whole(where, cameras, settings):
-            seen[name].append(where)
+        pose = choose_place(rng, level, cameras, camera, number, others, seen[camera.name], _is_wide)
+        lying.append(pose)
+        for name in seen_whole(pose, cameras, settings):
+            seen[name].append(pose)
     return drive, tuple(lying)
 
 
 def _next_height_m(lying: Sequence[Place], seen: Sequence[Place]) -> float:
     """Return the height of the next marker: each camera sees only a small share of raised markers."""
-    raised = sum(where.z_m > 0 for where in seen)
+    raised = sum(pose.z_m > 0 for pose in seen)
     if raised >= _RAISED_SHARE * len(seen):
         return 0.0
-    return _BOXES_M[sum(where.z_m > 0 for where in lying) % len(_BOXES_M)]
+    return _BOXES_M[sum(pose.z_m > 0 for pose in lying) % len(_BOXES_M)]
 
 
 def _is_wide(where: Place, camera: Camera, settings: LabSettings) -> bool:
@@ -153,7 +154,7 @@ def live_rig(settings: LabSettings) -> Rig:
         RigCamera(name, None, None, f"sim:{name}", settings.width, settings.height, settings.rate_hz)
         for name in settings.cameras
     )
-    still = (RigMarker(where.marker_id, height_m=where.z_m) for where in lying)
+    still = (RigMarker(pose.marker_id, height_m=pose.z_m) for pose in lying)
     return replace(rig, cameras=tuple(cameras), markers=(*rig.markers, *still))
 
 
@@ -169,23 +170,23 @@ def tape_sheet(lying: Sequence[Place]) -> str:
     """
     a, b = REFERENCES
     rows = [f"marker,d_{a.name}_cm,d_{b.name}_cm,side,height_cm"]
-    for where in lying:
-        tapes = ",".join(f"{CM_PER_M * length_m:.1f}" for length_m in tape_lengths_m(where).tolist())
-        side = "left" if where.y_m >= a.y_m else "right"
-        rows.append(f"{where.marker_id},{tapes},{side},{CM_PER_M * where.z_m:.1f}")
+    for pose in lying:
+        tapes = ",".join(f"{CM_PER_M * length_m:.1f}" for length_m in tape_lengths_m(pose).tolist())
+        side = "left" if pose.y_m >= a.y_m else "right"
+        rows.append(f"{pose.marker_id},{tapes},{side},{CM_PER_M * pose.z_m:.1f}")
     return "\n".join(rows) + "\n"
 
 
-# Duration of each pose of a board.
+# Duration of each pose of a board, in s.
 _HOLD_S = 0.6
 
 
 @dataclass(frozen=True, slots=True, eq=False)
 class Film:
-    """Pictures of a camera, and the picture of each frame.
+    """The images of a camera, and the image index of each frame.
 
-    ``draw`` makes the JPEG picture of an index from 0 to ``count``; ``index_of`` tells the index for the
-    number of a frame since 1970, so that all cameras of a lab agree. It repeats after ``period`` frames.
+    ``draw`` returns the JPEG image of an index from 0 to ``count`` - 1. ``index_of`` returns the index for
+    the number of a frame since 1970, so all cameras of a lab agree. The film repeats after ``period`` frames.
     """
 
     count: int
@@ -199,15 +200,15 @@ def lab_film(settings: LabSettings, number: int, check: Check) -> Film:
 
     Parameters
     ----------
-    settings : of the lab; the robots drive for ``drive_s`` in one direction.
-    number : which of its cameras.
+    settings : settings of the lab; the robots drive for ``drive_s`` in one direction.
+    number : number of the camera in the lab.
     check : called between the steps; its exceptions end the work.
     """
     lab = plan_live_lab(settings)
     count = max(round(settings.drive_s * settings.rate_hz), 1)
     check()
     bare = prepare_view(hang_cameras(settings)[number], settings, check)
-    view = lay_down(bare, [place(where, settings) for where in lab.lying], settings)
+    view = lay_down(bare, [place(pose, settings) for pose in lab.lying], settings)
 
     def draw(index: int) -> bytes:
         return _picture(view, _driving(lab, index), settings, number, index)
@@ -221,21 +222,23 @@ def board_film(settings: LabSettings, number: int, board: Board, check: Check) -
     Parameters
     ----------
     settings, number, check : as for :func:`lab_film`.
-    board : what is held.
+    board : the calibration board.
     """
     camera = hang_cameras(settings)[number]
     poses = hold_board(board, camera, settings)
     view = prepare_view(camera, settings, check)
-    held = max(round(_HOLD_S * settings.rate_hz), 1)
+    frames_per_pose = max(round(_HOLD_S * settings.rate_hz), 1)
 
     def draw(index: int) -> bytes:
         return _picture(view, [poses[index]], settings, number, index)
 
-    return Film(len(poses), len(poses) * held, draw, lambda frame: frame // held % len(poses))
+    return Film(
+        len(poses), len(poses) * frames_per_pose, draw, lambda frame: frame // frames_per_pose % len(poses)
+    )
 
 
 def shown_at(frame: int, count: int) -> int:
-    """Return which of ``count`` pictures a frame shows, by its number: to and fro.
+    """Return the index of the image, of ``count`` images, for a frame number: back and forth.
 
     Examples
     --------
@@ -247,7 +250,7 @@ def shown_at(frame: int, count: int) -> int:
 
 
 def next_missing(film: Film, drawn: Container[int], frame: int) -> int | None:
-    """Return the index of the next picture that is shown from a frame on and not drawn; None if all are.
+    """Return the index of the next image, from a frame on, that is not drawn yet; None if all are drawn.
 
     Examples
     --------

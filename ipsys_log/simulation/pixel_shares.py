@@ -1,16 +1,16 @@
-"""The share of each pixel that a print covers, and its black cells, while it may move.
+"""Shares of each pixel that a stationary or moving print, and its black cells, cover.
 
-A print is piecewise constant. It is drawn on four by four samples per pixel: a sample is sent through
-the exact inverse of the lens onto the plane of the marker and takes the mean over its own footprint
-of the pattern there, so that edges which run along pixel rows stay exact as well. The optics' blur
-acts on the samples, and the sixteen of a pixel are averaged.
+A print is piecewise constant. The module draws it with four by four samples per pixel. The exact inverse of
+the lens distortion projects each sample onto the plane of the marker. The value of a sample is the mean of
+the pattern over the footprint of the sample, so edges along pixel rows are exact too. The blur of the optics
+acts on the samples. A pixel is the mean of its sixteen samples.
 
-A print that moves is drawn so at many instants of the exposure, and each row of pixels takes its own
-mean of them (:mod:`ipsys_log.simulation.pixel_shares`).
+A moving print is drawn like this at many instants of the exposure. Each row of pixels is its own weighted
+mean of these instants (:mod:`ipsys_log.simulation.pixel_shares`).
 
-The time of a frame is the middle of the exposure of its first row, row 0; row r is exposed
-``exposure_s`` long around ``r * row_time_ns`` after it. Between the instants at which a moving print
-is drawn, the picture is taken to change linearly.
+The time of a frame is the middle of the exposure of its first row, row 0. The exposure of row r has the
+length ``exposure_s``, and its middle is ``r * row_time_ns`` later. Between two drawn instants, the image of a
+moving print changes linearly.
 """
 
 from __future__ import annotations
@@ -32,46 +32,48 @@ __all__ = ["Box", "Shares", "exposed", "find_shares", "instants", "row_shares"]
 
 Array = NDArray[np.float64]
 
-# How far a print may move from one instant to the next where there is no motion blur.
+# Largest motion of a print between two instants without motion blur.
 _STEP_PX = 0.125
-# So short that nothing moves.
+# An exposure without motion.
 _SHORTEST_S = 1e-9
 
 
 def exposed(first_row: int, last_row: int, settings: LabSettings) -> tuple[float, float]:
-    """From when to when rows are exposed, in s after the time of the frame."""
+    """Return start and end of the exposure of rows, in s after the time of the frame."""
     row_s, half_s = settings.row_time_ns / NS_PER_S, settings.exposure_s / 2
     return first_row * row_s - half_s, last_row * row_s + half_s
 
 
 def instants(start_s: float, end_s: float, speed_px_s: float, settings: LabSettings) -> Array:
-    """Evenly spaced times (n,) in s from start to end, near enough to draw a motion; one if it is none.
+    """Return evenly spaced times (n,) in s from start to end, with small steps of a motion.
+
+    Without motion, return one time.
 
     Parameters
     ----------
-    start_s, end_s : of the exposure, in s after the time of the frame.
-    speed_px_s : of what moves fastest.
+    start_s, end_s : start and end of the exposure, in s after the time of the frame.
+    speed_px_s : speed of the fastest point.
     settings : the length of an exposure.
     """
-    # Drawing a motion in steps softens only where the blur of it begins and ends. As a share of the
-    # light that grows with the square of the step and falls with the length of the blur.
+    # A motion in steps has errors only at the start and the end of its blur. As a share of the light, they
+    # grow with the square of the step and fall with the length of the blur.
     step_px = _STEP_PX * np.sqrt(1 + speed_px_s * settings.exposure_s)
     steps = int(np.ceil((end_s - start_s) * speed_px_s / step_px))
     return np.linspace(start_s, end_s, steps + 1) if steps else np.array([(start_s + end_s) / 2])
 
 
 def row_shares(times_s: Array, rows: NDArray[np.int_], settings: LabSettings) -> Array:
-    """By which share each instant counts in the mean over the exposure of each row.
+    """Return the weight of each instant in the mean over the exposure of each row.
 
     Parameters
     ----------
     times_s : (n,) from :func:`instants`.
-    rows : (m,), 0 the first of the frame.
+    rows : (m,), row numbers; 0 is the first row of the frame.
     settings : row time and length of an exposure.
 
     Returns
     -------
-    (n, m); the shares of a row that is exposed between the first and the last instant add up to 1.
+    (n, m). The weights of a row add up to 1 if its exposure is between the first and the last instant.
 
     Examples
     --------
@@ -85,7 +87,8 @@ def row_shares(times_s: Array, rows: NDArray[np.int_], settings: LabSettings) ->
     step_s = times_s[1] - times_s[0]
     exposure_s = max(settings.exposure_s, _SHORTEST_S)
     middles_s = rows * (settings.row_time_ns / NS_PER_S) - times_s[:, None]
-    # An instant's weight falls to 0 at its neighbours: the integral of that hat, in steps.
+    # The weight of an instant decreases linearly to 0 at its neighbours: integrate this hat function, in
+    # units of steps.
     start, end = (np.clip((middles_s + side * exposure_s / 2) / step_s, -1, 1) for side in (-1, 1))
     shares: Array = (end - end * np.abs(end) / 2 - start + start * np.abs(start) / 2) * step_s / exposure_s
     return shares
@@ -95,13 +98,13 @@ Plane = NDArray[np.float32]
 Box = tuple[slice, slice]
 
 _SAMPLES = 4
-# Over the time of a frame, a motion between so many instants is as good as straight.
+# With this number of instants in the time of a frame, the motion between two instants is nearly straight.
 _PATH_INSTANTS = 9
 
 
 @dataclass(frozen=True, slots=True, eq=False)
 class Shares:
-    """Of the light in a box of ``View.rays``: ``cover`` from a print, ``dark`` from its black, (h, w)."""
+    """Shares of the light in a box of ``View.rays``: ``cover`` of a print, ``dark`` of its black, (h, w)."""
 
     box: Box
     cover: Plane
@@ -109,7 +112,7 @@ class Shares:
 
 
 def find_shares(view: View, placed: Placed | PlacedBoard | Moving, settings: LabSettings) -> Shares | None:
-    """Of a print; None where it is not in the frame."""
+    """Return the shares of a print; None if the print is not in the image."""
     if isinstance(placed, (Placed, PlacedBoard)):
         return _still(view, placed, settings)
     if not (settings.row_time_ns or settings.exposure_s):
@@ -123,7 +126,7 @@ def _still(view: View, placed: Placed | PlacedBoard, settings: LabSettings) -> S
 
 
 def _moving(view: View, moving: Moving, settings: LabSettings) -> Shares | None:
-    """In each row the mean over the exposure of the row."""
+    """Return the shares of a moving print: in each row, the mean over the exposure of the row."""
     path = _path(view, moving, settings)
     if path is None:
         return None
@@ -145,7 +148,7 @@ def _moving(view: View, moving: Moving, settings: LabSettings) -> Shares | None:
 
 
 def _path(view: View, moving: Moving, settings: LabSettings) -> tuple[Box, float] | None:
-    """Where a moving print is during a frame, and how fast its fastest point is, in px/s."""
+    """Return the box of a moving print during a frame, and the speed of its fastest point in px/s."""
     start_s, end_s = exposed(0, view.camera.lens.height - 1, settings)
     outlines_px = []
     for time_s in np.linspace(start_s, end_s, _PATH_INSTANTS).tolist():
@@ -159,9 +162,9 @@ def _path(view: View, moving: Moving, settings: LabSettings) -> tuple[Box, float
 
 
 def _part(box: Box | None, whole: Box, weights: Array, settings: LabSettings) -> Box | None:
-    """The part of a box in which rows of weight, and what blurs into them, lie; None if there is none.
+    """Return the part of a box with rows of nonzero weight and the rows that blur into them, or None.
 
-    ``weights`` (h,) are of the rows of ``whole``.
+    ``weights`` (h,) are the weights of the rows of ``whole``.
     """
     counted = whole[0].start + np.flatnonzero(weights)
     if box is None or not len(counted) or counted[-1] < box[0].start or counted[0] >= box[0].stop:
@@ -180,19 +183,19 @@ def _box_of(view: View, placed: Placed | PlacedBoard, settings: LabSettings) -> 
 
 
 def _outline_px(view: View, placed: Placed | PlacedBoard, settings: LabSettings) -> Array | None:
-    """Points around a print, (n, 2); None if not all of them lie before the camera."""
+    """Return points around a print, (n, 2) in px; None if some of them are not in front of the camera."""
     outline_m = print_outline(placed, settings.dictionary)
     outline_m = transform(view.camera.camera_from_world, outline_m)
     return None if (outline_m[:, 2] <= 0).any() else project(outline_m, view.camera.lens)
 
 
 def _around_px(settings: LabSettings) -> int:
-    """How far the blur reaches."""
+    """Return the reach of the blur in px."""
     return int(np.ceil(4 * settings.psf_sigma_px)) + 2
 
 
 def _box(view: View, px: Array, settings: LabSettings) -> Box | None:
-    """Rows and columns of ``view.rays`` around points (n, 2), blur included; None outside of the frame."""
+    """Return rows and columns of ``view.rays`` around points (n, 2), with blur; None outside the image."""
     around = _around_px(settings)
     low = np.floor(px.min(axis=0)).astype(int) - around + view.border_px
     high = np.ceil(px.max(axis=0)).astype(int) + around + 1 + view.border_px
@@ -208,11 +211,12 @@ def _box(view: View, px: Array, settings: LabSettings) -> Box | None:
 def _print_shares(
     view: View, placed: Placed | PlacedBoard, box: Box, settings: LabSettings
 ) -> tuple[Plane, Plane]:
-    """Shares of a pixel's light that come from the print, and from its black cells: (h, w) each."""
+    """Return the shares of each pixel's light from the print and from its black cells, (h, w) each."""
     black, cells_per_m = printed_cells(placed, settings.dictionary)
     columns, rows, pixel_cells = _cells_of(view, placed.world_from_marker, box, black.shape, cells_per_m)
     fine = (rows.shape[1] * _SAMPLES, rows.shape[0] * _SAMPLES)
-    # One texel is one sample wide: the ramp between two texels is the mean over a sample's footprint.
+    # The width of a texel is that of a sample: the ramp between two texels is the mean over a sample's
+    # footprint.
     texels = [int(np.clip(round(_SAMPLES / size), 4, 512)) for size in pixel_cells]
     x = cv2.resize(columns * texels[0] - 0.5, fine, interpolation=cv2.INTER_LINEAR).astype(np.float32)
     y = cv2.resize(rows * texels[1] - 0.5, fine, interpolation=cv2.INTER_LINEAR).astype(np.float32)
@@ -230,15 +234,16 @@ def _print_shares(
 def _cells_of(
     view: View, world_from_marker: Array, box: Box, shape: tuple[int, ...], cells_per_m: float
 ) -> tuple[Array, Array, tuple[float, float]]:
-    """Where the pixels of a box lie on a print, in cells from its top left: column and row, (h, w).
+    """Return the positions of the pixels of a box on a print, and the size of a pixel, in cells.
 
-    Also by how many columns and rows a step of one pixel takes one further, at most.
+    The positions are columns and rows from the top left of the print, (h, w) each. The size is the largest
+    step in columns, and in rows, between two neighbouring pixels.
     """
     camera_from_marker = view.camera.camera_from_world @ world_from_marker
     plane = np.linalg.inv(camera_from_marker[:3, [0, 1, 3]])
     uv = view.rays[box]
     x, y, w = (plane[i, 0] * uv[..., 0] + plane[i, 1] * uv[..., 1] + plane[i, 2] for i in range(3))
-    # Rays that pass the plane, and prints seen from behind, show nothing.
+    # Rays that do not meet the plane, and prints with their back to the camera, show nothing.
     seen = w > 1e-6 if camera_from_marker[:3, 2] @ camera_from_marker[:3, 3] < 0 else np.zeros_like(w, bool)
     scale = cells_per_m / np.where(seen, w, 1.0)
     columns = np.where(seen, shape[1] / 2 + x * scale, -1e4)

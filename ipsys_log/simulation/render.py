@@ -1,7 +1,7 @@
-"""Frames of printed markers on a floor, with edges that are exact to a few thousandths of a pixel.
+"""Rendered images of printed markers on a floor, with edges that are exact to a few thousandths of a pixel.
 
-The light from each print (:mod:`ipsys_log.simulation.pixel_shares`) is laid over that of the floor by
-its blurred coverage; gamma, noise and rounding follow.
+The blurred coverage of each print (:mod:`ipsys_log.simulation.pixel_shares`) is the weight of its light
+against the light of the floor. Gamma, noise and rounding follow.
 """
 
 from __future__ import annotations
@@ -22,25 +22,25 @@ __all__ = ["Print", "encode_jpeg", "expose", "lay_down", "render"]
 
 Plane = NDArray[np.float32]
 Image = NDArray[np.uint8]
-# Objects in a frame.
+# Objects in an image.
 Print = Placed | PlacedBoard | Moving
 
-# Grey levels that a warm lamp takes from the blue of the floor and adds to its red.
+# Grey levels that a warm lamp subtracts from the blue of the floor and adds to its red.
 _BLUE, _RED = 9, 6
 
 
 def render(
     view: View, placed: Sequence[Print], settings: LabSettings, rng: np.random.Generator | None
 ) -> Image:
-    """A frame with markers in it.
+    """Render an image with markers.
 
     Parameters
     ----------
-    view : of the camera, from :func:`~ipsys_log.simulation.floor.prepare_view`.
-    placed : the markers; where two overlap, the later one lies on top. One that moves is a function
-        of the time in s since the time of the frame: the middle of the exposure of its first row.
+    view : view of the camera, from :func:`~ipsys_log.simulation.floor.prepare_view`.
+    placed : the markers. If two overlap, the later one is on top. A moving marker is a function of the time
+        in s since the time of the frame. This is the middle of the exposure of its first row.
     settings : the grey levels, blur, gamma and dictionary of the scene; row time and exposure.
-    rng : draws the piece of sensor noise; None for a frame without noise.
+    rng : random generator for the part of the noise field; None for an image without noise.
 
     Returns
     -------
@@ -59,7 +59,7 @@ def render(
 
 
 def expose(view: View, placed: Sequence[Print], settings: LabSettings) -> Plane:
-    """Grey levels of a frame before noise and rounding, (height, width).
+    """Return the grey levels of an image before noise and rounding, (height, width).
 
     Parameters
     ----------
@@ -69,13 +69,13 @@ def expose(view: View, placed: Sequence[Print], settings: LabSettings) -> Plane:
 
 
 def lay_down(view: View, placed: Sequence[Placed], settings: LabSettings) -> View:
-    """Return a view whose floor shows prints that never move, so that no frame has to draw them again."""
+    """Return a view whose floor contains stationary prints, so the renderer does not draw them again."""
     grey, bare = _compose(view, placed, settings)
     return replace(view, floor=to_light(grey, settings), bare=bare)
 
 
 def encode_jpeg(image: Image, settings: LabSettings) -> bytes:
-    """A frame as a camera sends it: JPEG with chroma at half the width (4:2:2)."""
+    """Encode an image as a camera does: JPEG with chroma at half the width (4:2:2)."""
     options = [
         *(cv2.IMWRITE_JPEG_QUALITY, settings.jpeg_quality),
         *(cv2.IMWRITE_JPEG_SAMPLING_FACTOR, cv2.IMWRITE_JPEG_SAMPLING_FACTOR_422),
@@ -84,17 +84,17 @@ def encode_jpeg(image: Image, settings: LabSettings) -> bytes:
 
 
 def _compose(view: View, placed: Sequence[Print], settings: LabSettings) -> tuple[Plane, Plane]:
-    """Grey levels of a frame, and the share of floor in each pixel, both (h, w)."""
+    """Return the grey levels of an image and the share of the floor in each pixel, both (h, w)."""
     grey = _levels(view.floor, settings)
     bare = np.ones_like(grey) if view.bare is None else view.bare.copy()
     white, black = (to_light(np.float32(level), settings) for level in (settings.white, settings.black))
-    for one in placed:
-        shares = find_shares(view, one, settings)
+    for item in placed:
+        shares = find_shares(view, item, settings)
         if shares is None:
             continue
         rows, cols, inner = _inside(view, shares.box)
         cover, dark = shares.cover[inner], shares.dark[inner]
-        # Where two prints meet, the upper one lies on what is there already.
+        # If two prints overlap, the upper print covers the already drawn levels.
         met = (bare[rows, cols] < 1).any()
         below = to_light(grey[rows, cols], settings) if met else view.floor[rows, cols]
         patch = below * (1 - cover) + white * cover - (white - black) * dark
@@ -104,7 +104,7 @@ def _compose(view: View, placed: Sequence[Print], settings: LabSettings) -> tupl
 
 
 def _inside(view: View, box: Box) -> tuple[slice, slice, Box]:
-    """A box without the border: where it lies in the frame, and which part of it is kept."""
+    """Return the rows and columns of a box in the image, and the part of the box inside the image."""
     frame, kept = [], []
     for part, size in zip(box, view.floor.shape, strict=True):
         start, stop = part.start - view.border_px, part.stop - view.border_px

@@ -1,4 +1,4 @@
-"""Settings of the simulated lab, and its random numbers."""
+"""Settings and random numbers of the simulated lab."""
 
 from __future__ import annotations
 
@@ -16,7 +16,7 @@ __all__ = ["LabSettings", "Purpose", "stream"]
 
 
 class Purpose(IntEnum):
-    """What random numbers are drawn for. The numbers are part of what a seed means: only add."""
+    """The purpose of random numbers. A seed depends on these values: never change them, only add new ones."""
 
     CAMERA = 1
     FLOOR = 2
@@ -31,11 +31,11 @@ class Purpose(IntEnum):
 
 
 def stream(seed: int, purpose: Purpose, *which: int) -> np.random.Generator:
-    """The random numbers for a purpose, and for one camera or frame of it."""
+    """Return the random generator for a purpose, and for one camera or frame of it."""
     return np.random.default_rng([seed, int(purpose), *which])
 
 
-# Name of a setting: lowest and highest value that the scene can be drawn with.
+# Lowest and highest valid value of each setting, by its name.
 _RANGES = {
     "seed": (0, 2**63 - 1),
     "width": (160, 7680),
@@ -66,36 +66,39 @@ _RANGES = {
 
 @dataclass(frozen=True, slots=True)
 class LabSettings:
-    """The simulated lab; as it stands, that of the paper (sect. 3) with several markers at once.
+    """The settings of the simulated lab; the defaults are the lab of the paper (sect. 3) with three markers.
 
     Attributes
     ----------
-    seed : everything random follows from it.
-    width, height : of a frame, in px; the focal length scales with the width (1160 px at 1920).
+    seed : seed of all random numbers.
+    width, height : size of an image in px; the focal length scales with the width (1160 px at 1920).
     cameras : names, in the order of the world's y.
-    dictionary, marker_length_m, markers : OpenCV's name; side of the black square; how many at once,
-        with the ids 0, 1, ...
-    stations : about how many measured places each camera sees.
-    frames_per_station : frames of each camera while the markers lie still.
-    heights_m : at which markers are measured.
-    rate_hz : frames per second, of each camera.
-    row_time_ns : between the exposures of two rows (rolling shutter; 31000 is typical); 0 for all at once.
-    exposure_s : of each row, which blurs what moves (1/60 is typical); 0 for no blur. The time of a frame
-        is the middle of the exposure of its first row.
-    drive_s, drive_speed_m_s, drive_height_m : of the robots that drive after the stations.
-    psf_sigma_px : of the Gaussian point-spread of the optics; a pixel then integrates over its area.
-    black, white, floor : grey levels 0..255 as they stand in the frame, whatever the gamma.
-    noise_sigma : of the sensor, in grey levels as they stand in the frame.
-    gamma : a frame holds ``255 * (light / 255) ** (1 / gamma)``; blur acts on the light.
-    jpeg_quality : of the 4:2:2 JPEG frames.
-    mount_height_m, tilt_deg : of the cameras: about how high they hang; range of their tilts.
-    tape_sigma_m, ruler_sigma_m : of a measured distance and of a measured height.
-    tape_angle_deg : no place is measured where the two tapes meet at a flatter angle than this.
+    dictionary, marker_length_m, markers : OpenCV's name; side of the black square; number of simultaneous
+        markers, with the ids 0, 1, ...
+    stations : approximate number of calibration points that each camera sees.
+    frames_per_station : frames of each camera in a stationary interval of the markers.
+    heights_m : heights of measured markers.
+    rate_hz : frames per second of each camera.
+    row_time_ns : time between the exposures of two rows (rolling shutter; 31000 is typical); 0 for a global
+        shutter.
+    exposure_s : exposure time of each row, which blurs moving markers (1/60 is typical); 0 for no blur. The
+        time of a frame is the middle of the exposure of its first row.
+    drive_s, drive_speed_m_s, drive_height_m : duration, speed and marker height of the robots that drive
+        after the measurements.
+    psf_sigma_px : sigma of the Gaussian point-spread function of the optics. A pixel then integrates over its
+        area.
+    black, white, floor : grey levels 0..255 in the image, for every gamma.
+    noise_sigma : sigma of the sensor noise, in grey levels in the image.
+    gamma : an image contains ``255 * (light / 255) ** (1 / gamma)``; blur acts on the light.
+    jpeg_quality : quality of the 4:2:2 JPEG images.
+    mount_height_m, tilt_deg : approximate height of the cameras, and range of their tilts.
+    tape_sigma_m, ruler_sigma_m : sigma of a measured distance, and of a measured height.
+    tape_angle_deg : least angle between the two tapes at a calibration point.
 
     Raises
     ------
     IpsysError
-        For a value that no lab can have.
+        A value is impossible for a lab.
     """
 
     seed: int = 0

@@ -2,7 +2,8 @@
 
 The unknowns are a twist in print coordinates, the edge offset and, with a rolling shutter, the speed along
 the print. The effect of rotation and translation is computed in the plane of the print, without lens
-distortion. The camera at c sees a point x of the plane that moves by d at x + d_xy + (x - c)_xy d_z / c_z.
+distortion. A point x of the plane moves by d. The camera at c then sees the point at
+x + d_xy + (x - c)_xy d_z / c_z.
 """
 
 from __future__ import annotations
@@ -23,7 +24,7 @@ __all__ = ["Fit", "Guess", "into_poses", "known_unknowns", "moves", "outline", "
 Array = NDArray[np.float64]
 
 # Prior weights: squared pixels per squared unit of each unknown: translation and rotation, edge offset,
-# speed. An unobservable tilt, of a marker right below the camera, keeps its value.
+# speed. A marker directly below the camera has an unobservable tilt, which keeps its value.
 _HOLD = np.array([1e-6, 1e-6, 1e-6, 1e-2, 1e-2, 1e-6, 1e-6, 1e-5, 1e-5])
 _HOLD_GIVEN, _HOLD_SPEED = 1e9, 1e-1
 
@@ -33,9 +34,10 @@ _SHARP = np.zeros(2, dtype=bool)
 class Guess(NamedTuple):
     """An approximate marker pose: ``rotation`` (3, 3) and ``centre`` (3,) map marker to camera coordinates.
 
-    Lengths are in sides of its black square, because a picture does not tell the scale. ``motion`` (3,) is
-    its speed along its own x and y, per s, and its rotation about its normal in rad/s; None if not known.
-    ``blurred`` (2,) says whether its motion blurs edges across its x, and across its y.
+    The unit of length is the side of its black square, because an image does not contain the scale.
+    ``motion`` (3,) is its speed along its own x and y, in sides per s, and its rotation about its normal in
+    rad/s. It is None if it is unknown. ``blurred`` (2,) says if its motion blurs edges across its x, and
+    across its y.
     """
 
     id: int
@@ -46,10 +48,10 @@ class Guess(NamedTuple):
 
 
 class Fit(NamedTuple):
-    """A marker's pose, with the covariance (8, 8) of its corners x0 y0 .. x3 y3, the edge offset into the
-    black, the RMS residual of the edges, and their blur.
+    """A marker's pose, its corners, and their covariance (8, 8) in the order x0 y0 .. x3 y3.
 
-    ``uneven`` says that glare, a shadow or a cover may have moved some of the edges.
+    ``edge_offset_px`` is the edge offset into the black, ``spread_px`` the RMS residual of the edges, and
+    ``blur_px`` their blur. ``uneven`` says that glare, a shadow or a cover may have moved some of the edges.
     """
 
     pose: Guess
@@ -63,11 +65,13 @@ class Fit(NamedTuple):
 
 def into_poses(guesses: Sequence[Guess]) -> Poses:
     """Return the poses of guesses as arrays."""
-    return Poses(np.array([one.rotation for one in guesses]), np.array([one.centre for one in guesses]))
+    return Poses(
+        np.array([guess.rotation for guess in guesses]), np.array([guess.centre for guess in guesses])
+    )
 
 
 def solve(rows: Array, weights: Array, off_px: Array, known: Array, hold: Array) -> tuple[Array, Array]:
-    """Return, for m markers, the normal matrices (m, u, u) and the unknowns (m, u) of least squares."""
+    """Return the normal matrices (m, u, u) and the unknowns (m, u) of least squares, for m markers."""
     weighted = rows * weights[:, None]
     normal = weighted @ rows.transpose(0, 2, 1)
     count = known.shape[1]
@@ -88,16 +92,16 @@ def known_unknowns(guesses: Sequence[Guess], edge_offset_px: float | None) -> tu
 
 
 def moves(prints: Prints, camera: Array, slopes: Array, late: Array, unknowns: int) -> Array:
-    """Return the image motion of points on edges along their axis, in px per unit of an unknown.
+    """Return the motion in the image of points on edges along their axis, in px per unit of an unknown.
 
     Parameters
     ----------
-    camera : (m, 3), in print coordinates.
+    camera : (m, 3), camera positions in print coordinates.
     slopes, late : (m, s), as in :class:`~ipsys_log.stages.detect.profiles.Sites`.
 
     Returns
     -------
-    (m, u, s), for 7 unknowns or 9.
+    (m, u, s), for 7 or 9 unknowns u.
     """
     x, y, level = prints.points[..., 0], prints.points[..., 1], prints.level
     aside = (np.where(level, y - camera[:, 1:2], x - camera[:, :1]) / camera[:, 2:]) * slopes
@@ -116,7 +120,12 @@ def moves(prints: Prints, camera: Array, slopes: Array, late: Array, unknowns: i
 
 
 def outline(view: View, poses: Poses) -> tuple[Array, Array, Array]:
-    """Return corners (m, 4, 2) in px, their derivatives by a twist (m, 8, 6), and levels of cells (m, c)."""
+    """Return the corners, their derivatives and the grey levels of the cells of m markers.
+
+    Returns
+    -------
+    Corners (m, 4, 2) in px, their derivatives by a twist (m, 8, 6), and grey levels of cells (m, c).
+    """
     points, count = view.prints.outline, len(poses.centres)
     px = project(poses.into_camera(points).reshape(-1, 3), view.lens).reshape(count, -1, 2)
     per_unit = np.stack([px[:, 4:8] - px[:, :4], px[:, 8:12] - px[:, :4]], axis=3) / view.prints.nudge
@@ -132,6 +141,6 @@ def outline(view: View, poses: Poses) -> tuple[Array, Array, Array]:
 
 
 def whole(corners_px: Array, grey: Grey) -> NDArray[np.bool_]:
-    """Return, (m,), whether all corners (m, 4, 2) of a marker lie in the picture."""
+    """Return a mask (m,) of the markers whose corners (m, 4, 2) are all inside the image."""
     last = np.array([grey.shape[1], grey.shape[0]]) - 0.5
     return np.asarray(((corners_px >= -0.5) & (corners_px <= last)).all(axis=(1, 2)))

@@ -1,4 +1,4 @@
-"""Where a picture has changed since it was last looked at, to know when a search is worth its while."""
+"""Changes between the images of one camera, which decide if a search for new markers is needed."""
 
 from __future__ import annotations
 
@@ -18,16 +18,17 @@ _EVERY_PX = 16
 _HALF_PX = _EVERY_PX // 2
 _CHANGED_LEVELS = 25.0
 _CHANGED_SAMPLES = 3
-# A marker of which only a part has changed is cut off by no less.
+# Margin around changed samples. It also contains the rest of a marker of which only a part has changed.
 _AROUND_PX = 192
 _ENTERED = 0.4
 _MARGIN = 0.35
-# A thing that stays becomes background within some ten frames.
+# Share of a change that each frame adds to the background. A stationary object becomes background within
+# about ten frames.
 _LEARN = np.float32(0.15)
 
 
 class Watch:
-    """Remembers the picture of one camera, a pixel in 16 by 16, but for where markers are known to be."""
+    """The background image of one camera: one pixel of each 16 by 16 block, without the known markers."""
 
     def __init__(self) -> None:
         self._background = np.zeros((0, 0), dtype=np.float32)
@@ -35,18 +36,19 @@ class Watch:
     def changed(
         self, grey: Grey, rows: Sequence[slice], markers_px: Sequence[Array], breadth_px: float
     ) -> tuple[slice, slice] | None:
-        """Rows and columns around what is there and is neither background nor one of the markers.
+        """Return rows and columns around an area that is neither background nor a known marker, or None.
 
         Parameters
         ----------
         grey : (height, width).
-        rows : those that are of this frame.
-        markers_px : corners (4, 2) of the markers that are known.
-        breadth_px : of a marker. Less than four tenths of it at the edge of the picture is none yet.
+        rows : the rows of ``grey`` that belong to this frame.
+        markers_px : corners (4, 2) of the known markers.
+        breadth_px : width of a marker. An area at the border of the image that is narrower than 0.4 times
+            this width does not count as a change yet.
         """
         samples = grey[_HALF_PX::_EVERY_PX, _HALF_PX::_EVERY_PX].astype(np.float32)
         if self._background.shape != samples.shape:
-            # The first picture is background as a whole; rows that it lacks come with a later one.
+            # The whole first image is background. A later image provides its missing rows.
             self._background = np.full_like(samples, np.nan)
             for part in rows:
                 self._background[_samples_in(part)] = samples[_samples_in(part)]
@@ -56,8 +58,8 @@ class Watch:
         self._forget(covered)
         new = np.zeros(samples.shape, dtype=bool)
         for part in rows:
-            here = _samples_in(part)
-            new[here] = self._learn(samples[here], self._background[here])
+            block = _samples_in(part)
+            new[block] = self._learn(samples[block], self._background[block])
         self._forget(covered)
         if np.count_nonzero(new) < _CHANGED_SAMPLES:
             return None
@@ -69,14 +71,14 @@ class Watch:
         return _around(spans[0]), _around(spans[1])
 
     def _learn(self, samples: Samples, background: Samples) -> NDArray[np.bool_]:
-        """Which samples are new; they and what was not known become background."""
-        off = samples - background
-        background += _LEARN * off
+        """Return a mask of the new samples; add them and the unknown samples to the background."""
+        differences = samples - background
+        background += _LEARN * differences
         np.copyto(background, samples, where=np.isnan(background))
-        return np.asarray(np.abs(off) > _CHANGED_LEVELS)
+        return np.asarray(np.abs(differences) > _CHANGED_LEVELS)
 
     def forget(self, markers_px: Sequence[Array]) -> None:
-        """What lies under markers (4, 2) is not known: it is no change when it comes to light."""
+        """Mark the background under markers (4, 2) as unknown: it is no change when it becomes visible."""
         self._forget(_boxes(markers_px))
 
     def _forget(self, boxes: Iterable[tuple[slice, slice]]) -> None:
@@ -89,7 +91,7 @@ def _samples_in(rows: slice) -> slice:
 
 
 def _boxes(markers_px: Sequence[Array]) -> list[tuple[slice, slice]]:
-    """Rows and columns of samples that markers (4, 2) cover, with their margin and what carries them."""
+    """Return rows and columns of samples that markers (4, 2), their margins and their carriers cover."""
     if not markers_px:
         return []
     corners_px = np.array(markers_px)
@@ -100,6 +102,6 @@ def _boxes(markers_px: Sequence[Array]) -> list[tuple[slice, slice]]:
 
 
 def _around(span: NDArray[np.intp]) -> slice:
-    """Pixels with a marker's breadth around samples, as much of them as there is."""
+    """Return the pixels of samples and up to a marker's width around them, from pixel 0 on."""
     first, last = int(span[0]) * _EVERY_PX, int(span[-1] + 1) * _EVERY_PX
     return slice(max(first - _AROUND_PX, 0), last + _AROUND_PX)

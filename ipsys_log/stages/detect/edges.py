@@ -1,12 +1,13 @@
-"""Corners from the edges of a marker: its pose is moved until the print lies on the picture.
+"""Corners from the edges of a marker: least squares of its pose until the print matches the image.
 
-From an approximate pose, points on all edges between black and white of the known print, the inner ones
-too, are sent through the lens into the picture. Across each edge a short profile of grey levels is read, and
-a blurred step is fitted to it: how far it lies beside the middle is how far the edge is off. One small turn
-and shift of the marker explains all of them at once; the next pass starts from there, until nothing moves.
+The fit starts from an approximate pose. It projects points on all edges between black and white of the known
+print, the inner edges too, into the image, with the lens distortion. It reads a short profile of grey levels
+across each edge and fits a blurred step to it. The distance of the step from the middle of the profile is
+the displacement of the edge. One small rotation and translation of the marker explains all displacements at
+once. The next pass starts from the new pose, until the pose converges.
 
-Where a sensor exposes row after row, each point of the print is seen where it was at its own time: the speed
-along the print is one more thing that the edges tell.
+A rolling shutter exposes row after row, so the image shows each point of the print at a different time. The
+edges then also determine the speed along the print.
 """
 
 from __future__ import annotations
@@ -38,22 +39,22 @@ Array = NDArray[np.float64]
 
 _MOVED_FAR_PX = 1.0
 _PASSES = 7
-# The last step of a fit that has settled is shorter.
+# A fit has converged if its last step is shorter.
 _SETTLED_PX = 0.12
 _SHORT_PX = 8.0
-# Edges that rise by less than this share from black to white are blurred by motion.
+# Motion blurs edges that rise by less than this share of the step from black to white.
 _BLURRED = 0.6
 _SEEN = 0.6
 _EXACT_PX = 0.05
 _WRONG_CELLS = 1
-# Signs of glare, a shadow or a cover: a side is displaced by this share of the edges' spread, or the black
-# beside some edges is lighter than beside the others, by that share of the contrast. A few edges
-# may be: a neighbouring white cell reaches as far where cells are small.
+# Signs of glare, a shadow or a cover. First sign: a side is displaced by _SIDE_OFF times the edges' spread.
+# Second sign: the black beside some edges is lighter than beside the others, by _LIGHTER times the contrast.
+# A few edges may have lighter black, because a neighbouring white cell reaches them if cells are small.
 _SIDE_OFF, _LIGHTER = 0.85, 0.35
 _WIDE_SPREAD_PX, _SIDE_OFF_WIDE = 0.12, 0.6
 _LEAST_SPREAD_PX, _FEW, _SMALL_PX = 0.03, 3, 4.0
-# Or the edges are spread by more px. If motion blurs them, or seems to, sides are displaced by shares of the
-# blur's width, and the surroundings of an edge mix with it.
+# Third sign: the spread of the edges is larger than _SPREAD_PX. If motion blurs edges, or seems to blur
+# them, sides are displaced by shares of the blur's width. The surroundings of an edge then mix with it.
 _SPREAD_PX, _LIGHTER_BLURRED = 0.3, 0.6
 
 
@@ -66,29 +67,29 @@ def fit_edges(
     row_time_s: float = 0.0,
     blur_px: float | None = None,
 ) -> list[Fit | None]:
-    """Fit marker poses to a picture.
+    """Fit marker poses to an image.
 
     Parameters
     ----------
     grey : (height, width).
-    guesses : markers and their approximate poses, to some pixels.
+    guesses : markers and their approximate poses, with errors of a few pixels.
     dictionary : OpenCV's name, such as DICT_4X4_100.
-    lens : of the camera.
+    lens : intrinsics of the camera.
     edge_offset_px : offset of edges into the black; None: estimated with each marker.
-    row_time_s : between the exposures of two rows. Poses are valid for the exposure of the row of the marker
-        centre.
-    blur_px : of edges in pictures of this camera; None: estimated from these.
+    row_time_s : time between the exposures of two rows. Poses are valid for the exposure of the row of the
+        marker centre.
+    blur_px : blur of edges in images of this camera; None: estimated from this image.
 
     Returns
     -------
-    For each guess the fit, or None if there is no such marker: the fit does not converge, edges are missing,
-    a corner lies outside of the picture, or the cells do not match this id.
+    The fit of each guess, or None if the image does not show the marker. It is None if the fit does not
+    converge, edges are missing, a corner is outside the image, or the cells do not match this id.
     """
     possible = into_poses(guesses).possible() if guesses else np.ones(0, dtype=bool)
     if not possible.all():
         some = [guess for guess, ok in zip(guesses, possible, strict=True) if ok]
-        found = iter(fit_edges(grey, some, dictionary, lens, edge_offset_px, row_time_s, blur_px))
-        return [next(found) if ok else None for ok in possible]
+        fits = iter(fit_edges(grey, some, dictionary, lens, edge_offset_px, row_time_s, blur_px))
+        return [next(fits) if ok else None for ok in possible]
     if not guesses:
         return []
     view = View(grey, lens, lay_out(dictionary, tuple(guess.id for guess in guesses)), row_time_s, blur_px)
@@ -114,9 +115,12 @@ def fit_edges(
 
 
 class _Settled(NamedTuple):
-    """Fitted poses; ``covariances`` (m, 6, 6) of the twists in print coordinates; ``ends`` (m, s, 2), levels
-    at both ends of the profiles; ``cells_px`` (m,), least width of a cell; ``sides_off_px`` (m,), largest
-    displacement of a side."""
+    """Fitted poses with their residuals.
+
+    ``covariances`` (m, 6, 6) are those of the twists in print coordinates. ``ends`` (m, s, 2) are levels at
+    both ends of the profiles. ``cells_px`` (m,) is the least width of a cell, and ``sides_off_px`` (m,) the
+    largest displacement of a side.
+    """
 
     poses: Poses
     edge_offsets_px: Array
@@ -131,12 +135,12 @@ class _Settled(NamedTuple):
     sides_off_px: Array
 
     def where(self, good: NDArray[np.bool_], other: _Settled) -> _Settled:
-        """Return the good ones of these fits, and others instead of the rest."""
+        """Return these fits where they are good, and the other fits elsewhere."""
         if not good.any():
             return other
         chosen = [
-            np.where(good.reshape(-1, *[1] * (one.ndim - 1)), one, two)
-            for one, two in zip(self[1:], other[1:], strict=True)
+            np.where(good.reshape(-1, *[1] * (own.ndim - 1)), own, others)
+            for own, others in zip(self[1:], other[1:], strict=True)
         ]
         return _Settled(self.poses.where(good, other.poses), *chosen)
 
@@ -144,17 +148,17 @@ class _Settled(NamedTuple):
 def _settle_all(
     view: View, guesses: Sequence[Guess], edge_offset_px: float | None
 ) -> tuple[_Settled, tuple[Array, Array, Array]]:
-    """Fit markers until they converge, again if edges are blurred; return them with their outlines."""
+    """Fit markers until they converge; repeat the fit if edges are blurred; return fits and outlines."""
     settled = _settle(view, guesses, edge_offset_px, np.array([guess.blurred for guess in guesses]))
-    seen = outline(view, settled.poses)
-    more = _blurred(view.prints, settled.heights, seen[2]) & ~settled.blurred
+    outlines = outline(view, settled.poses)
+    more = _blurred(view.prints, settled.heights, outlines[2]) & ~settled.blurred
     if more.any():
         sharp = settled.blurred
         settled = _settle(view, guesses, edge_offset_px, sharp | more)
         if (more.any(axis=1) & settled.good).any():
             settled = _sharpened(view, guesses, edge_offset_px, sharp, settled)
-        seen = outline(view, settled.poses)
-    return settled, seen
+        outlines = outline(view, settled.poses)
+    return settled, outlines
 
 
 def _sharpened(
@@ -164,9 +168,9 @@ def _sharpened(
     blurred: NDArray[np.bool_],
     settled: _Settled,
 ) -> _Settled:
-    """Return the fits; sharp ones if only ``blurred`` axes (m, 2) stay blurred in a fit from their poses.
+    """Return the fits, or sharp fits if only ``blurred`` axes (m, 2) stay blurred in a fit from their poses.
 
-    If a guess is far off, sharp edges seem to be blurred.
+    If a guess has a large error, sharp edges seem to be blurred.
     """
     poses = settled.poses
     nearer = [
@@ -184,7 +188,7 @@ def _settle(
 ) -> _Settled:
     """Move markers until they converge; ``blurred`` (m, 2) marks the axes across which edges are blurred."""
     poses = into_poses(guesses)
-    # Unknown are a twist, the edge offset and, where rows take time, the speed along the print.
+    # The unknowns are a twist, the edge offset and, with a rolling shutter, the speed along the print.
     unknowns = 9 if view.row_time_s else 7
     known, hold = known_unknowns(guesses, edge_offset_px)
     known, hold, motions = known[:, :unknowns], hold[:, :unknowns], known[:, 7:]
@@ -193,31 +197,32 @@ def _settle(
     for _ in range(_PASSES):
         seen = measure(view, poses, motions, wide)
         rows = moves(view.prints, poses.camera(), seen.slopes, seen.late, unknowns)
-        # Edges were looked for where they are at the speed known so far.
+        # The edges were measured at the positions that follow from the speed known so far.
         off_px = seen.off_px
         if view.row_time_s:
             off_px = off_px + (motions[:, None, :2] @ rows[:, 7:])[:, 0]
         weights = seen.certainty / doubt
-        normal, found = solve(rows, weights, off_px, known, hold)
-        left_px = off_px - (found[:, None] @ rows)[:, 0]
-        # Steps are what the twist moves, and what the speed does that was not known before.
-        moved_px = np.abs(seen.off_px - left_px + found[:, 6:7] * view.prints.polarity).max(axis=1)
-        # A step of many pixels was read off another edge.
+        normal, solution = solve(rows, weights, off_px, known, hold)
+        left_px = off_px - (solution[:, None] @ rows)[:, 0]
+        # A step is the motion by the twist plus the motion by the change of the speed.
+        moved_px = np.abs(seen.off_px - left_px + solution[:, 6:7] * view.prints.polarity).max(axis=1)
+        # A step of many pixels comes from another edge.
         short = np.minimum(1.0, _SHORT_PX / np.maximum(moved_px, _SHORT_PX))
-        moved = poses.moved(found[:, :6] * short[:, None])
-        # What is no marker may run away, behind the camera even: it stays, and never settles.
+        moved = poses.moved(solution[:, :6] * short[:, None])
+        # The pose of a false marker can diverge, even to a pose behind the camera. It then keeps its last
+        # possible pose and never converges.
         possible = moved.possible()
         if possible.all():
             poses = moved
         else:
             poses, moved_px = moved.where(possible, poses), np.where(possible, moved_px, np.inf)
         if view.row_time_s:
-            motions = np.concatenate([found[:, 7:], motions[:, 2:]], axis=1)
+            motions = np.concatenate([solution[:, 7:], motions[:, 2:]], axis=1)
         spread_px = np.sqrt((weights * left_px**2).sum(axis=1) / np.maximum(weights.sum(axis=1), 1e-9))
         if (moved_px < _SETTLED_PX).all():
             break
         wide = blurred | (moved_px > _MOVED_FAR_PX)[:, None]
-        # What still lies beside the others, beyond twice their spread, counts for less.
+        # Edges with residuals above twice the spread get less weight.
         doubt = np.maximum(1.0, np.abs(left_px) / (_EXACT_PX + 2 * spread_px)[:, None])
     count = weights.sum(axis=1)
     variances_px2 = spread_px**2 * count / np.maximum(count - unknowns, 1.0)
@@ -227,7 +232,7 @@ def _settle(
     sided = (left_px * view.prints.polarity * (seen.certainty > 0))[:, None] @ view.prints.by_side
     return _Settled(
         poses,
-        found[:, 6],
+        solution[:, 6],
         covariances,
         good,
         seen.heights(view.prints),
@@ -241,20 +246,20 @@ def _settle(
 
 
 def _blurred(prints: Prints, heights: Array, levels: Array) -> NDArray[np.bool_]:
-    """Across which axes edges rise by less than from black cells to white ones, (m, 2)."""
+    """Return the axes (m, 2) across which edges rise by less than the step from black to white cells."""
     bright, dark = _bright_and_dark(prints, levels)
     rises = (heights[:, None] @ prints.by_axis)[:, 0]
     return np.asarray(rises < _BLURRED * (bright - dark)[:, None])
 
 
 def _bright_and_dark(prints: Prints, levels: Array) -> tuple[Array, Array]:
-    """Mean grey levels of the cells that are white, and of those that are black, (m,) each."""
+    """Return the mean grey levels of the white cells and of the black cells, (m,) each."""
     bright, dark = (levels[:, None] @ prints.by_colour)[:, 0].T
     return bright, dark
 
 
 def _same_cells(prints: Prints, levels: Array, colours: tuple[Array, Array]) -> NDArray[np.bool_]:
-    """Return whether cells have the right colours, (m,), from their grey levels (m, c)."""
+    """Return a mask (m,) of the markers whose cells have the right colours, from grey levels (m, c)."""
     bright, dark = colours
     wrong = np.count_nonzero((levels > ((bright + dark) / 2)[:, None]) != prints.white, axis=1)
     return np.asarray((wrong <= _WRONG_CELLS) & (bright - dark > LEAST_CONTRAST))

@@ -1,4 +1,4 @@
-"""Markers of one camera from frame to frame."""
+"""Tracking of the markers of one camera from frame to frame."""
 
 from __future__ import annotations
 
@@ -30,41 +30,42 @@ __all__ = ["Follow"]
 
 Array = NDArray[np.float64]
 
-# The whole picture is searched every so many frames, whatever happens, and more thoroughly, at full size,
-# every so many.
+# Number of frames between two searches of the whole image, and between two thorough searches at full size.
 _SEARCH_EVERY = 20
 _THOROUGH_EVERY = 240
-# Of one camera so many frames later than of the one before.
+# The searches of each camera start this number of frames after those of the previous camera.
 _STAGGER = 3
-# And decoded as a whole every so many; the others only as far as markers are expected.
+# Number of frames between two decodings of the whole image. In other frames only the rows with expected
+# markers are decoded.
 _WHOLE_EVERY = 10
 _MARGIN_PX = 24
-# Times the spread of edges about a fit with one more freedom.
+# A fit at rest is good if its spread of edges is below this multiple of the spread of a moving fit. The
+# moving fit has one more freedom.
 _AS_GOOD = 1.1
-# Of two fits of one id, nearer together than this, one is enough.
+# Two fits of one id are the same marker if they are nearer together.
 _SAME_PX = 8.0
-# Further from where it was expected, a marker is looked at once more, in the whole frame.
+# A marker farther from its expected position is fitted again, in the whole frame.
 _JUMP_PX = 3.0
-# Edges are that near to those of a fit whose pose is the right one of two.
+# Largest spread of edges of a fit that has certainly the correct one of two poses.
 _SURE_PX = 0.08
-# Small markers, found only by a thorough search, look nearly the same in both poses.
+# Small markers, detected only by a thorough search, look nearly the same in both poses.
 _MUCH_BETTER = 0.9
 # In uneven light, a fit with a larger spread of edges may have an error of that size.
 _DISTURBED_PX = 0.5
-# From so many frames with markers it is known how blurred edges are.
+# Number of frames with markers that determine the blur of edges.
 _BLURS = 10
 
 
 class Follow:
-    """Finds the markers of one camera in frame after frame, starting from where it found them before.
+    """A tracker of the markers of one camera, which starts each frame from the poses of earlier frames.
 
     Parameters
     ----------
     dictionary : OpenCV's name, such as DICT_4X4_100.
-    lens : of the camera.
+    lens : intrinsics of the camera.
     edge_offset_px, row_time_s : as for :func:`fit_edges`.
-    number : of the camera in the rig. Cameras search the whole picture in different frames: the thorough
-        searches of all of them at once would take longer than live tracking has.
+    number : number of the camera in the rig. Cameras search the whole image in different frames.
+        Simultaneous thorough searches of all cameras would take too long for live tracking.
     camera : its name, for messages.
     """
 
@@ -92,34 +93,34 @@ class Follow:
 
     @property
     def rejections(self) -> list[Rejection]:
-        """Markers that are seen in the last frame and cannot be measured, sorted by id."""
+        """Return the markers that are visible in the last frame but cannot be measured, sorted by id."""
         fitted = {track[0].pose.id for track in self._tracks}
-        last = {one.id: one for one in self._rejections if one.id not in fitted}
+        last = {rejection.id: rejection for rejection in self._rejections if rejection.id not in fitted}
         return [last[n] for n in sorted(last)]
 
     def __call__(self, frame: CompressedImage | RawImage, time_ns: int) -> tuple[list[Fit], int, int]:
         """Return the markers in a frame, sorted by id, and its width and height; an id can occur twice.
 
-        A frame that raises an error changes nothing for those after it.
+        A frame that raises an error does not affect the frames after it.
 
         Parameters
         ----------
         frame : as recorded.
-        time_ns : when it was taken.
+        time_ns : capture time of the frame.
 
         Raises
         ------
         FrameError
-            Where it cannot be decoded.
+            The frame cannot be decoded.
         SizeError
-            Where it is of another size than the lens.
+            The size of the frame differs from the size in the camera calibration.
         """
         turn = self._frames
         fresh = self._last_ns is None or not 0 < (time_ns - self._last_ns) / NS_PER_S < LONG_S
         due = turn % _SEARCH_EVERY == 0 or fresh
         self._rejections = []
         grey, rows, seen, lost = self._look_again(frame, time_ns, due or turn % _WHOLE_EVERY == 0)
-        # One that cannot be decoded is not looked at: its turn is the next one's.
+        # A frame that cannot be decoded raises an error before this line: the next frame takes its turn.
         self._frames, self._last_ns = turn + 1, time_ns
         fits = list(seen.values())
         self._changed = self._watch.changed(grey, rows, [fit.corners_px for fit in fits], self._breadth_px)
@@ -128,14 +129,14 @@ class Follow:
         if region is not None:
             fits = self._add(grey, fits, search(grey, self._dictionary, region, samples))
         if samples is not None:
-            # Nothing is known yet, and no later frame may show the markers that are missed now.
+            # No marker is known yet, and later frames may not show the markers that are missed now.
             known_px = [fit.corners_px for fit in fits]
             leftovers = search_leftovers(grey, self._dictionary, samples, known_px)
             fits = self._add(grey, fits, leftovers, _MUCH_BETTER)
         if turn % _THOROUGH_EVERY == _SEARCH_EVERY or lost - {fit.pose.id for fit in fits}:
             fits = self._add(grey, fits, search_thoroughly(grey, self._dictionary))
         elif turn % _SEARCH_EVERY == _SEARCH_EVERY // 2 and self._changed and len(fits) == len(seen):
-            # What is new and no marker at first sight may be one in shadow.
+            # A new object without a detected marker may be a marker in shadow.
             fits = self._add(grey, fits, search_thoroughly(grey, self._dictionary, self._changed))
         self._watch.forget([fit.corners_px for fit in fits])
         self._remember(list(seen), fits, time_ns)
@@ -148,8 +149,8 @@ class Follow:
 
         Returns
         -------
-        The picture and its decoded rows, the fits by the number of their track, and the ids of markers that
-        are not at their predicted position; if there are any, the picture is decoded as a whole.
+        The image and its decoded rows, the fits by the number of their track, and the ids of markers that
+        are not at their predicted position. If there are such markers, the whole image is decoded.
         """
         guesses = [predict(track, time_ns) for track in self._tracks]
         outlines_px = self._outlines(guesses)
@@ -158,7 +159,7 @@ class Follow:
         tried = self._with_speed(grey, time_ns, guesses, self._fit(grey, guesses))
         tried = self._partly(grey, [[guess] for guess in guesses], tried, near=True)
         if rows != [slice(0, len(grey))] and _jumped(outlines_px, tried):
-            # Damage in a JPEG moves what comes after it, and is noticed only at its end.
+            # Damage in a JPEG moves the image after it. The decoder notices the damage only at the end.
             grey, rows = decode_rows(frame)
             tried = self._with_speed(grey, time_ns, guesses, self._fit(grey, guesses))
             tried = self._partly(grey, [[guess] for guess in guesses], tried, near=True)
@@ -177,7 +178,7 @@ class Follow:
         unknown = [n for n, guess in enumerate(guesses) if guess.motion is None]
         if not self._row_time_s or not unknown:
             return fits
-        # Shear and tilt look much alike: what can be at rest is taken to be.
+        # Shear and tilt look nearly the same: a marker that can be at rest is assumed to be at rest.
         resting = self._fit_as_guessed(grey, [guesses[n]._replace(motion=np.zeros(3)) for n in unknown])
         for n, still in zip(unknown, resting, strict=True):
             moving = fits[n]
@@ -206,7 +207,7 @@ class Follow:
         fits: Sequence[Fit | None],
         near: bool = False,
     ) -> list[Fit | None]:
-        """Return the fits; those of markers in uneven light are replaced by fits to their visible edges."""
+        """Return the fits; replace those of markers in uneven light by fits to their visible edges."""
         better = list(fits)
         for n, (poses, fit) in enumerate(zip(guesses, fits, strict=True)):
             if fit is not None and not fit.uneven:
@@ -236,49 +237,51 @@ class Follow:
     def _with_speed(
         self, grey: Grey, frame_ns: int, guesses: Sequence[Guess], fits: list[Fit | None]
     ) -> list[Fit | None]:
-        """Return the same fits, with the speeds that follow from them if rows take time."""
+        """Return the fits; with a rolling shutter, repeat those whose track gives a new speed."""
         if not self._row_time_s:
             return fits
-        again = {}
+        predicted = {}
         for n, (guess, fit) in enumerate(zip(guesses, fits, strict=True)):
             if fit is not None:
-                known = predict(extend(self._tracks[n], fit, frame_ns, self._row_time_s), frame_ns)
-                if not same_speed(known.motion, guess.motion):
-                    again[n] = known
-        better = dict(zip(again, self._fit(grey, list(again.values())), strict=True))
+                prediction = predict(extend(self._tracks[n], fit, frame_ns, self._row_time_s), frame_ns)
+                if not same_speed(prediction.motion, guess.motion):
+                    predicted[n] = prediction
+        better = dict(zip(predicted, self._fit(grey, list(predicted.values())), strict=True))
         return [better.get(n) or fit for n, fit in enumerate(fits)]
 
     def _add(
         self, grey: Grey, fits: list[Fit], candidates: Iterable[Candidate], better: float = 1.0
     ) -> list[Fit]:
-        """Return fits, and those of the candidates that are not among them.
+        """Return the fits and those of the candidates that are not among them.
 
-        If two poses look alike, the upright one is selected, unless the spread of the edges about the other
-        is less than ``better`` times its own.
+        If two poses look alike, the function selects the upright pose. It selects the other pose if the
+        spread of its edges is less than ``better`` times that of the upright pose.
         """
-        new = [one for one in candidates if not _among(one.id, one.corners_px, fits)]
-        if not new:
+        new_candidates = [
+            candidate for candidate in candidates if not _among(candidate.id, candidate.corners_px, fits)
+        ]
+        if not new_candidates:
             return fits
-        upright, other = self._guess(new)
-        found = self._fit(grey, upright)
-        # Where a marker lies as robots carry it, there is no need to try the pose that looks like it.
-        unsure = [n for n, fit in enumerate(found) if fit is None or fit.spread_px > _SURE_PX]
+        upright, other = self._guess(new_candidates)
+        new_fits = self._fit(grey, upright)
+        # If the upright pose, usual for markers on robots, has a small spread, the other pose is not tried.
+        unsure = [n for n, fit in enumerate(new_fits) if fit is None or fit.spread_px > _SURE_PX]
         for n, fit in zip(unsure, self._fit(grey, [other[n] for n in unsure]), strict=True):
-            one = found[n]
-            if fit is not None and (one is None or fit.spread_px < better * one.spread_px):
-                found[n] = fit
-        found = self._partly(grey, list(zip(upright, other, strict=True)), found)
+            upright_fit = new_fits[n]
+            if fit is not None and (upright_fit is None or fit.spread_px < better * upright_fit.spread_px):
+                new_fits[n] = fit
+        new_fits = self._partly(grey, list(zip(upright, other, strict=True)), new_fits)
         fits = list(fits)
-        for fit in found:
+        for fit in new_fits:
             if fit is not None and not _among(fit.pose.id, fit.corners_px, fits):
                 fits.append(fit)
         return fits
 
     def _guess(self, candidates: Sequence[Candidate]) -> tuple[list[Guess], list[Guess]]:
-        """Both poses of squares that look alike, first those that face the plane of the image."""
+        """Return both poses that look alike for each square, first the poses that face the image plane."""
         if not candidates:
             return [], []
-        corners_px = np.array([one.corners_px for one in candidates])
+        corners_px = np.array([candidate.corners_px for candidate in candidates])
         uv = undistort(corners_px.reshape(-1, 2), self._lens).reshape(-1, 4, 2)
         usable = [n for n, corners in enumerate(uv) if np.isfinite(corners).all() and goes_around(corners)]
         if not usable:
@@ -295,7 +298,7 @@ class Follow:
         return upright, other
 
     def _outlines(self, guesses: Sequence[Guess]) -> list[Array]:
-        """Corners in px, (4, 2) each; far outside where a guess has gone behind the camera."""
+        """Return the corners in px, (4, 2) each; far outside the image if a guess is behind the camera."""
         if not guesses:
             return []
         points = np.array([marker_corners(1.0) @ guess.rotation.T + guess.centre for guess in guesses])
@@ -306,8 +309,8 @@ class Follow:
         return [*px]
 
     def _remember(self, followed: Sequence[int], fits: Sequence[Fit], frame_ns: int) -> None:
-        """``fits`` are first those of the tracks that were followed, in their order, then new ones."""
-        # A marker that was lost and found again in the same frame is the one of before.
+        """Extend the tracks by ``fits``: first the fits of followed tracks, in their order, then new fits."""
+        # A marker that is lost and detected again in the same frame continues its old track.
         left = {t[0].pose.id: t for n, t in enumerate(self._tracks) if n not in followed}
         before = [self._tracks[n] for n in followed]
         before += [left.pop(fit.pose.id, ()) for fit in fits[len(followed) :]]
@@ -334,7 +337,7 @@ def _jumped(outlines_px: Sequence[Array], fits: Sequence[Fit | None]) -> bool:
 
 
 def _rows(outlines_px: Sequence[Array], changed: tuple[slice, slice] | None) -> list[slice]:
-    """The rows that markers are expected in, with what is needed around them, and those that have changed."""
+    """Return the rows with expected markers, with the necessary margin, and the changed rows."""
     rows = [
         slice(max(int(px[:, 1].min()) - _MARGIN_PX, 0), max(int(px[:, 1].max()) + _MARGIN_PX, 0))
         for px in outlines_px

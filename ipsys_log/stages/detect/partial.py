@@ -1,8 +1,8 @@
 """Fit of a marker that glare, a shadow or a cover hides in part, from three good sides and the cells.
 
 Edges that contradict the others, or do not have the shape of an edge, get no weight. A side that is hidden
-along its whole length looks like a good side at another place. The fit is therefore tried without each of the
-four sides, and the one with the least residuals is selected. The intrinsics are known, so a pose has six
+along its whole length looks like a good side at another position. The fit is therefore tried without each of
+the four sides, and the fit with the least residuals is selected. The intrinsics are known, so a pose has six
 degrees of freedom. The other sides and the edges between cells determine them. The corners beside a hidden
 side follow from the pose, and their covariance from that of the pose.
 """
@@ -44,7 +44,7 @@ __all__ = ["Rejection", "fit_partly", "resembles"]
 Array = NDArray[np.float64]
 Mask = NDArray[np.bool_]
 
-# The sides of a square, and none.
+# The omitted side of each hypothesis: none, or one of the four sides.
 _WITHOUT = (None, 0, 1, 2, 3)
 _FAR_PX, _NEAR_PX, _OF_CELL = 12.0, 3.0, 0.45
 # Passes with far profiles and with near ones, before and after the selection of the better of two poses.
@@ -55,20 +55,21 @@ _SHORT_PX = 8.0
 _CUT, _CUT_PX, _CUT_ROUGH, _CUT_ROUGH_OF_REACH = 4.0, 0.08, 3.0, (0.36, 0.24, 0.15)
 # Edges with larger residuals, in px, cost as much as missing ones.
 _COSTLY_PX = 0.4
-# A side is disturbed as a whole if it is displaced by so many standard deviations, and px.
+# A whole side is disturbed if its displacement exceeds this number of standard deviations and of px.
 _DISTURBED, _DISTURBED_PX = 6.0, 0.06
 _CHEAPER, _ALIKE_POSES = 0.03, 0.06
 # Least share of visible edges of a side, and of all edges together; and their largest cost.
 _SEEN, _SEEN_OF_ALL, _COST = 0.3, 0.4, 0.7
 _MOST_UNCERTAIN_PX = 1.0
-# In cells of fewer px, edges disturb one another.
+# In cells narrower than this, edges disturb one another.
 _LEAST_CELL_PX = 2.2
-# Errors of neighbouring edges are correlated; least squares assumes that they are not.
+# Factor for covariances: errors of neighbouring edges are correlated, but least squares assumes that they
+# are not.
 _ALIKE = 1.7
 
 
 class Rejection(NamedTuple):
-    """A marker that is seen and cannot be measured, and the reason, in words without changing figures."""
+    """A visible marker that cannot be measured, and the reason, in a text without changing numbers."""
 
     id: int
     reason: str
@@ -77,8 +78,8 @@ class Rejection(NamedTuple):
 def resembles(grey: Grey, lens: CameraCalibration, dictionary: str, guesses: Sequence[Guess]) -> bool:
     """Return whether cells look like those of a marker, for any of its possible poses.
 
-    If they do not, and the ordinary fit has failed, there is no such marker: the partial fit takes as long as
-    ten others, and found none in any of 315 rendered frames.
+    If they do not, and the ordinary fit has failed, the marker is absent. The partial fit takes as long as
+    ten ordinary fits. For such markers it succeeds in none of 315 rendered frames.
     """
     guesses = [guess for guess in guesses if into_poses([guess]).possible()[0]]
     if not guesses:
@@ -103,15 +104,15 @@ def fit_partly(
 
     Parameters
     ----------
-    guesses : possible poses, the likelier one first.
+    guesses : possible poses, the likelier pose first.
     grey, dictionary, lens, edge_offset_px, row_time_s, blur_px : as for
         :func:`ipsys_log.stages.detect.edges.fit_edges`.
-    near : whether the guesses are right to a pixel or two.
+    near : True if the guesses have errors of at most one or two pixels.
 
     Returns
     -------
-    The fit; a rejection if cells show this id and the pose cannot be determined; or None if there is no such
-    marker.
+    The fit; a rejection if cells show this id but the pose cannot be determined; or None if the image does
+    not show the marker.
     """
     guesses = [guess for guess in guesses if into_poses([guess]).possible()[0]]
     if not guesses:
@@ -121,7 +122,7 @@ def fit_partly(
 
 
 class _State(NamedTuple):
-    """Hypotheses: poses and motions (m, 3), and the side that each leaves out, (m,), -1 for none."""
+    """Hypotheses: poses, motions (m, 3), and the omitted side of each, (m,), -1 for none."""
 
     poses: Poses
     motions: Array
@@ -135,8 +136,8 @@ class _State(NamedTuple):
 class _Solved(NamedTuple):
     """Least squares of hypotheses: as for :func:`~ipsys_log.stages.detect.adjustment.solve`.
 
-    ``left_px`` (m, s) are the residuals of the edges, ``costs`` (m,) their mean cost, without those of the
-    omitted side.
+    ``left_px`` (m, s) are the residuals of the edges. ``costs`` (m,) are their mean costs, without the edges
+    of the omitted side.
     """
 
     rows: Array
@@ -149,7 +150,7 @@ class _Solved(NamedTuple):
     blur_px: float
 
     def variance_px2(self, n: int) -> float:
-        """Return the variance of the position of an edge about a fit."""
+        """Return the variance of the positions of edges about a fit, in px^2."""
         weights = self.weights[n]
         freedoms = max(float(weights.sum()) - self.rows.shape[1], 1.0)
         return float((weights * self.left_px[n] ** 2).sum() / freedoms)
@@ -187,7 +188,7 @@ class _Trial:
         state = _State(into_poses(guesses), self._known[:, 7:], without)
         for number in range(self._first, _ROUGH + _EXACT):
             state, solved = self._move(state, number)
-        # If poses look alike, the first is the likelier one.
+        # If poses look alike, the first pose is the likelier one.
         costs = solved.costs.reshape(-1, len(_WITHOUT)).min(axis=1)
         best = int(costs.argmin()) if costs.min() < costs[0] - _ALIKE_POSES else 0
         chosen = np.arange(len(_WITHOUT)) + best * len(_WITHOUT)
@@ -248,7 +249,7 @@ class _Trial:
         return exact_steps(view.prints, profiles, reach_px, blur_px), blur_px, _CUT_PX
 
     def judge(self, settled: tuple[_State, _Solved]) -> Fit | Rejection | None:
-        """Return what the best hypothesis is worth."""
+        """Return the fit of the best hypothesis, a rejection, or None if the marker is absent."""
         state, solved = settled
         n = self._choose(state, solved)
         view = View(self._grey, self._lens, lay_out(self._dictionary, (self._id,)), self._row_time_s, None)
@@ -257,8 +258,8 @@ class _Trial:
         if not whole(corners_px, self._grey)[0] or not agreement.likely:
             return None
         if not agreement.clear:
-            what = _hider(levels[0], view.prints)
-            return Rejection(self._id, f"{what} hides too many of its cells")
+            hider = _hider(levels[0], view.prints)
+            return Rejection(self._id, f"{hider} hides too many of its cells")
         cell_px = _width_px(corners_px[0]) / view.prints.cells
         if cell_px < _LEAST_CELL_PX:
             reason = f"its cells are under {_LEAST_CELL_PX} px wide, and some of its edges are disturbed"
@@ -267,8 +268,8 @@ class _Trial:
         seen = [float(weights[side].sum() / side.sum()) for side in self._sides]
         lost = sum(share < _SEEN for share in seen)
         if lost > 1 or weights.sum() < _SEEN_OF_ALL * self._real.sum():
-            where = f"{lost} of its 4 sides" if lost > 1 else "most of its edges"
-            return Rejection(self._id, f"{_hider(levels[0], view.prints)} hides {where}")
+            hidden_part = f"{lost} of its 4 sides" if lost > 1 else "most of its edges"
+            return Rejection(self._id, f"{_hider(levels[0], view.prints)} hides {hidden_part}")
         covariance_px2 = self._covariance(solved, n, slopes[0])
         if solved.costs[n] > _COST or np.diag(covariance_px2).max() > _MOST_UNCERTAIN_PX**2:
             return Rejection(self._id, "its edges are too disturbed to fit a flat square")
@@ -278,7 +279,7 @@ class _Trial:
         return Fit(pose, corners_px[0], covariance_px2, offset_px, spread_px, solved.blur_px, True)
 
     def _choose(self, state: _State, solved: _Solved) -> int:
-        """Return the hypothesis with all sides, or the one without a side that is disturbed as a whole."""
+        """Return the hypothesis with all sides, or the hypothesis without a completely disturbed side."""
         n = 1 + int(solved.costs[1:].argmin())
         if solved.costs[0] > solved.costs[n] + _CHEAPER:
             return n
@@ -297,12 +298,12 @@ class _Trial:
         """Return the covariance (8, 8) of the corners, in px^2."""
         inverse = np.linalg.inv(solved.normal[n])
         rows, weights = solved.rows[n], solved.weights[n]
-        of_unknowns = inverse @ ((rows * weights**2) @ rows.T) @ inverse * solved.variance_px2(n)
-        return np.asarray(_ALIKE * slopes @ of_unknowns[:6, :6] @ slopes.T, dtype=np.float64)
+        unknowns_covariance = inverse @ ((rows * weights**2) @ rows.T) @ inverse * solved.variance_px2(n)
+        return np.asarray(_ALIKE * slopes @ unknowns_covariance[:6, :6] @ slopes.T, dtype=np.float64)
 
 
 def _biweight(shares: Array) -> Array:
-    """Return Tukey's weights of residuals that are scaled to the residual of weight 0."""
+    """Return Tukey's weights of residuals in units of the residual with weight 0."""
     return np.asarray((1.0 - np.minimum(shares * shares, 1.0)) ** 2)
 
 

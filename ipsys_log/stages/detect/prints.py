@@ -14,30 +14,31 @@ __all__ = ["Prints", "lay_out"]
 
 Array = NDArray[np.float64]
 
-# Along the side of a cell, clear of its corners, where edges are rounded by the blur.
+# Positions of points along the side of a cell, away from its corners, because the blur rounds the corners.
 _ALONG_CELL = np.array([0.3, 0.7])
-# In cells, across an edge; and of a side.
+# Reach across an edge, in cells; step of a numerical derivative, in sides of the marker.
 _REACH, _NUDGE = 0.15, 1e-3
 
 
 @dataclass(frozen=True, slots=True, eq=False)
 class Prints:
-    """Markers of side 1 around (0, 0), x to their right and y to their top.
+    """Printed markers of side 1 around (0, 0), with x to their right and y to their top.
 
     Attributes
     ----------
     points : (m, s, 2), points on the edges between black and white of m markers.
-    ends : (m, 2 s + 1, 2), ``reach`` before and behind each of them, across the edge; and the middle.
+    ends : (m, 2 s + 1, 2), the points ``reach`` before and behind each of these points, across the edge; and
+        the middle of the marker.
     level : (m, s), 0.0 if the edge runs along y and so measures x; else 1.0.
     swirl : (m, s), motion of a point across its edge when the marker turns about its centre.
-    polarity : (m, s), 1.0 where white lies towards the greater coordinate, else -1.0; 0.0 for a point that
-        pads the array, because another marker has more.
-    outline : (12 + c, 2), the corners, the same moved by ``nudge`` in x, and in y, and the middles of the
-        cells, black border included.
-    white : (m, c), which cells are white.
+    polarity : (m, s), 1.0 if white is on the side of the greater coordinate, else -1.0; 0.0 for a point that
+        pads the array, because another marker has more points.
+    outline : (12 + c, 2), the corners, the corners moved by ``nudge`` in x, the corners moved by ``nudge`` in
+        y, and the middles of the cells, black border included.
+    white : (m, c), True for white cells.
     by_axis : (m, s, 2), maps values at points to their means over the edges along y, and along x.
-    by_side : (m, s, 4), the same over the top, the right, the bottom and the left side of the square.
-    by_colour : (m, c, 2), maps values at cells to their means over the white ones and the black ones.
+    by_side : (m, s, 4), maps them to means over the top, right, bottom and left side of the square.
+    by_colour : (m, c, 2), maps values at cells to their means over the white cells and the black cells.
     cells : number of cells along a side.
     """
 
@@ -62,7 +63,7 @@ def lay_out(dictionary: str, marker_ids: tuple[int, ...]) -> Prints:
     edges = [_edges(dictionary, marker_id) for marker_id in marker_ids]
     most = max(len(rows) for rows in edges)
     rows = np.stack(
-        [np.vstack([one, np.repeat(one[:1] * [1, 1, 1, 0], most - len(one), 0)]) for one in edges]
+        [np.vstack([row, np.repeat(row[:1] * [1, 1, 1, 0], most - len(row), 0)]) for row in edges]
     )
     white = np.stack([white_cells(dictionary, marker_id) for marker_id in marker_ids])
     cells = white.shape[1]
@@ -107,7 +108,7 @@ def _outline(cells: int) -> Array:
 
 @cache
 def _edges(dictionary: str, marker_id: int) -> Array:
-    """Points on edges: x, y, axis, polarity; (s, 4)."""
+    """Return points on edges as rows of x, y, axis, polarity; (s, 4)."""
     margin = np.pad(white_cells(dictionary, marker_id), 1, constant_values=True)
     cells = len(margin) - 2
     lines = np.arange(cells + 1) / cells - 0.5

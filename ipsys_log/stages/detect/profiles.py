@@ -1,4 +1,4 @@
-"""Profiles of grey levels across the edges of a print, and where in them the edges are."""
+"""Profiles of grey levels across the edges of a print, and positions of the edges in them."""
 
 from __future__ import annotations
 
@@ -30,25 +30,26 @@ __all__ = [
 
 Array = NDArray[np.float64]
 
-# In grey levels: what rises by less is no edge.
+# In grey levels: a smaller rise is no edge.
 LEAST_CONTRAST = 8.0
 
-# Profiles reach this far to each side, and never to the middle of a cell.
+# Reach of near and of far profiles to each side, and their largest reach in cells. Profiles do not reach the
+# middle of a cell.
 _NEAR_PX, _FAR_PX, _OF_CELL = 3.0, 12.0, 0.45
 _TAPS = np.linspace(-1, 1, 7)
-# Of a blurred step: what optics, pixels and JPEG do to an edge.
+# Standard deviation of a blurred step: the usual effect of optics, pixels and JPEG on an edge.
 USUAL_BLUR_PX = 0.8
 BLURS_PX = np.arange(0.5, 2.35, 0.05).round(2)
-# Wider edges than that tell less.
+# Edges wider than this get less weight.
 _SHARP_PX = 4.0
 # Edges of less than this share of the mean contrast are covered, or in glare.
 _WEAK = 0.3
-# In sides of a marker: it would be smaller than a pixel.
+# Largest distance in sides of a marker: a farther marker is smaller than a pixel.
 _HORIZON = 1e4
 
 
 class View(NamedTuple):
-    """A picture, and what markers are looked for in it."""
+    """An image, the intrinsics of its camera, and the prints of the markers to measure in it."""
 
     grey: Grey
     lens: CameraCalibration
@@ -58,33 +59,36 @@ class View(NamedTuple):
 
 
 class Poses(NamedTuple):
-    """Of m markers: (m, 3, 3) and (m, 3)."""
+    """Poses of m markers in camera coordinates: rotations (m, 3, 3) and centres (m, 3)."""
 
     rotations: Array
     centres: Array
 
     def into_camera(self, points: Array) -> Array:
-        """Points of prints, (m, n, 2), in the frame of the camera: (m, n, 3)."""
+        """Return points of prints, (m, n, 2), in camera coordinates, (m, n, 3)."""
         return points @ self.rotations[:, :, :2].transpose(0, 2, 1) + self.centres[:, None]
 
     def camera(self) -> Array:
-        """Return the camera positions in the frames of the prints, (m, 3)."""
+        """Return the camera positions in print coordinates, (m, 3)."""
         return -(self.centres[:, None] @ self.rotations)[:, 0]
 
     def moved(self, twists: Array) -> Poses:
-        """Shifted and turned by (m, 6), in the frames of the prints."""
+        """Return the poses after translations and rotations ``twists`` (m, 6), in print coordinates."""
         shifts = (self.rotations @ twists[:, :3, None])[..., 0]
         turns = np.array([rotation(vector) for vector in twists[:, 3:]])
         return Poses(self.rotations @ turns, self.centres + shifts)
 
     def possible(self) -> NDArray[np.bool_]:
-        """Which of them a camera can see as a whole, (m,): numbers, and further away than they are large."""
+        """Return a mask (m,) of the poses that a camera can completely see.
+
+        Such poses are finite, and the distance of the marker is larger than its side.
+        """
         away = self.centres[:, 2]
         known = np.isfinite(self.rotations.sum(axis=(1, 2)) + self.centres.sum(axis=1))
         return np.asarray(known & (away > 1.0) & (away < _HORIZON))
 
     def where(self, good: NDArray[np.bool_], other: Poses) -> Poses:
-        """These poses where they are good, and others where not."""
+        """Return these poses where they are good, and the other poses elsewhere."""
         return Poses(
             np.where(good[:, None, None], self.rotations, other.rotations),
             np.where(good[:, None], self.centres, other.centres),
@@ -92,11 +96,11 @@ class Poses(NamedTuple):
 
 
 class Sites(NamedTuple):
-    """Positions of edges in a picture: ``middle`` (m, s, 2) in px, and ``across`` (m, s, 2) from there over
-    the edge, ``lengths_px`` (m, s) long.
+    """Positions of edges in an image: ``middle`` (m, s, 2) in px.
 
-    ``slopes`` (m, s) are px per side of the print, and ``late`` (m, s) px per speed along their axis, for
-    rows that are exposed later.
+    ``across`` (m, s, 2) are vectors from there across the edge, ``lengths_px`` (m, s) long. ``slopes`` (m, s)
+    are px per side of the print. ``late`` (m, s) are px per speed along their axis, for rows that are exposed
+    later.
     """
 
     middle: Array
@@ -109,9 +113,9 @@ class Sites(NamedTuple):
 class Seen(NamedTuple):
     """Observed edges of prints, (m, s) each.
 
-    ``off_px`` is their displacement along their axis; ``certainty`` goes from 1.0 to 0.0 for missing edges.
+    ``off_px`` is their displacement along their axis. ``certainty`` is between 1.0 and 0.0 (a missing edge).
     ``slopes`` and ``late`` are as in :class:`Sites`. ``blurs_px`` (m,) is the blur of the edges. ``profiles``
-    (m, s, t) are grey levels across the edges, to ``near_px`` (m,) on each side if they are not wide.
+    (m, s, t) are grey levels across the edges, up to ``near_px`` (m,) on each side if they are not wide.
     """
 
     off_px: Array
@@ -123,7 +127,7 @@ class Seen(NamedTuple):
     near_px: Array
 
     def heights(self, prints: Prints) -> Array:
-        """Return the grey levels by which edges rise within the usual blur, (m, s)."""
+        """Return the rises of edges within the usual blur, (m, s), in grey levels."""
         usual = np.array([_template(reach_px, USUAL_BLUR_PX)[:, :1] for reach_px in self.near_px.tolist()])
         return np.asarray((self.profiles @ usual)[..., 0] * prints.polarity)
 
@@ -160,11 +164,11 @@ def read_profiles(grey: Grey, sites: Sites, reaches_px: Array, taps: Array) -> A
     Parameters
     ----------
     reaches_px : (m, 1) or (m, s), reach of profiles to each side.
-    taps : (t,), in shares of that.
+    taps : (t,), positions in shares of that reach.
     """
-    places = (reaches_px / sites.lengths_px)[..., None] * taps
-    x = (sites.middle[..., :1] + sites.across[..., :1] * places).astype(np.float32)
-    y = (sites.middle[..., 1:] + sites.across[..., 1:] * places).astype(np.float32)
+    positions = (reaches_px / sites.lengths_px)[..., None] * taps
+    x = (sites.middle[..., :1] + sites.across[..., :1] * positions).astype(np.float32)
+    y = (sites.middle[..., 1:] + sites.across[..., 1:] * positions).astype(np.float32)
     return levels_at(grey, x, y)
 
 
@@ -174,7 +178,7 @@ def measure(view: View, poses: Poses, motions: Array, wide: NDArray[np.bool_]) -
     Parameters
     ----------
     motions : (m, 3), as in :class:`~ipsys_log.stages.detect.adjustment.Guess`.
-    wide : (m, 2), whether profiles reach far to both sides, across edges along y and along x.
+    wide : (m, 2), True if profiles reach far to both sides, across edges along y and along x.
     """
     prints = view.prints
     sites = locate(view, poses, motions)
@@ -202,12 +206,14 @@ def measure(view: View, poses: Poses, motions: Array, wide: NDArray[np.bool_]) -
 
 
 def _by_area(prints: Prints, profiles: Array, reaches_px: Array) -> tuple[Array, Array, Array]:
-    """How far edges lie off by the share of white in their profiles, whether they are sharp and far away, or
-    blurred over more than a profile shows.
+    """Return the displacements of edges from the share of white in their profiles.
+
+    The method is valid for sharp edges far from their prediction, and for edges with more blur than a
+    profile shows.
 
     Returns
     -------
-    off_px (m, s), how wide the edges are (m, s), and which are there (m, s).
+    Displacements (m, s) in px, widths of the edges (m, s) in px, and a mask (m, s) of the visible edges.
     """
     real = prints.polarity != 0
     low, high = profiles.min(axis=(1, 2))[:, None], profiles.max(axis=(1, 2))[:, None]
@@ -239,12 +245,12 @@ def _residues(reach_px: float) -> Array:
 
 @cache
 def _template(reach_px: float, blur_px: float) -> Array:
-    """Takes a profile to a blurred step: its height, and height times shift; (taps, 2)."""
+    """Return the matrix (taps, 2) from a profile to the height, and height times shift, of a blurred step."""
     return np.asarray(np.linalg.pinv(_step(reach_px, blur_px))[1:].T.copy(), dtype=np.float64)
 
 
 def _step(reach_px: float, blur_px: float) -> Array:
-    """Foot, height and shift of a blurred step, as profiles: (taps, 3)."""
+    """Return foot, height and shift of a blurred step as profiles, (taps, 3)."""
     x = reach_px * _TAPS / blur_px
     bell = np.exp(-(x**2) / 2) / (np.sqrt(2 * np.pi) * blur_px)
     return np.column_stack([np.ones_like(x), ndtr(x), -bell])

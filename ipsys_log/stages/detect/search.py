@@ -1,8 +1,8 @@
-"""Markers anywhere in a picture: found in a reduced one, read in the full one.
+"""Search for markers in a whole image: detection in a reduced image, identification at full size.
 
-Squares are found by OpenCV's detector at a third of the size, with one threshold window instead of three.
-Cells of a marker that is far or foreshortened are too small to be read there, so whatever is a square but
-not a marker yet is read again at full size.
+OpenCV's detector finds squares at a third of the size, with one threshold window instead of three. There,
+the cells of a far or foreshortened marker are too small for identification. All squares that are not
+identified as markers are therefore read again at full size.
 """
 
 from __future__ import annotations
@@ -23,7 +23,7 @@ __all__ = ["WHOLE", "Candidate", "sample", "search", "search_leftovers", "search
 Array = NDArray[np.float64]
 
 _SHRINK = 3
-# At that scale: of the threshold, wider than the sides of the black border are thick.
+# Window of the threshold at that scale. It is wider than the black border of a marker.
 _WINDOW_PX = 31
 _DARKER = 12
 _ROUNDED = 0.06
@@ -31,8 +31,10 @@ _BORDER_PX = 1
 _NEAR = (4, 4)
 _REFINE = (cv2.TERM_CRITERIA_COUNT + cv2.TERM_CRITERIA_EPS, 10, 0.05)
 _MISREAD = 3
-# Leftovers: the contrast between neighbouring samples, and the square that has it; how far around a marker
-# its paper reaches, in sides; and where one search of the whole picture is faster than many.
+# Search of leftovers: least contrast between neighbouring samples; sampling steps; masks for the contrast and
+# for a square with contrast; reach of the paper around a marker, in sides; margin of an area. The last two
+# are limits: a share of the image, and a number of areas. Above them, one search of the whole image is
+# faster.
 _CONTRAST = 30
 _FINER, _COARSER = 2, 3
 _STEP_PX = _FINER * _SHRINK
@@ -42,20 +44,20 @@ _CLEAR_PX = 24
 _MOST, _MANY = 0.4, 40
 # Share of the contrast: darker samples are the black of a marker.
 _AS_BLACK = 0.1
-# Rows and columns of a whole picture.
+# Rows and columns of a whole image.
 WHOLE = (slice(None), slice(None))
 
 
 class Candidate(NamedTuple):
-    """A marker and about where its corners are, (4, 2) in px."""
+    """A marker and its approximate corners, (4, 2) in px."""
 
     id: int
     corners_px: Array
 
 
 def sample(grey: Grey) -> Grey:
-    """Return the reduced picture: sample k is pixel 3 k + 1."""
-    # Whole pixels, not means: three times as fast, and as good where cells are wider than that.
+    """Return the reduced image: sample k is pixel 3 k + 1."""
+    # Single pixels are three times as fast as means of pixels, and as good if cells are wider than 3 px.
     return np.ascontiguousarray(grey[_SHRINK // 2 :: _SHRINK, _SHRINK // 2 :: _SHRINK])
 
 
@@ -65,14 +67,14 @@ def search(
     region: tuple[slice, slice] = WHOLE,
     samples: Grey | None = None,
 ) -> list[Candidate]:
-    """Find markers in a picture, with approximate corners.
+    """Find markers in an image, with approximate corners.
 
     Parameters
     ----------
     grey : (height, width).
     dictionary : OpenCV's name, such as DICT_4X4_100.
     region : rows and columns to search.
-    samples : of the region, if they are known.
+    samples : reduced image of the region, if it is known.
     """
     part = np.ascontiguousarray(grey[region])
     return _placed(_search(part, sample(part) if samples is None else samples, dictionary), region)
@@ -82,36 +84,36 @@ def _placed(found: list[Candidate], region: tuple[slice, slice]) -> list[Candida
     if region == WHOLE or not found:
         return found
     origin = np.array([region[1].start or 0, region[0].start or 0], dtype=np.float64)
-    return [one._replace(corners_px=one.corners_px + origin) for one in found]
+    return [candidate._replace(corners_px=candidate.corners_px + origin) for candidate in found]
 
 
 def _search(grey: Grey, small: Grey, dictionary: str) -> list[Candidate]:
     if not small.size:
         return []
-    found, ids, rejected = _quick_detector(dictionary).detectMarkers(small)
-    squares = [*found, *rejected]
+    marker_corners, ids, rejected = _quick_detector(dictionary).detectMarkers(small)
+    squares = [*marker_corners, *rejected]
     if not squares:
         return []
     rough = np.concatenate(squares).reshape(-1, 1, 2) * np.float32(_SHRINK) + np.float32(_SHRINK // 2)
     corners_px = cv2.cornerSubPix(grey, rough, _NEAR, (-1, -1), _REFINE).reshape(-1, 4, 2).astype(np.float64)
-    read = len(found)
+    read = len(marker_corners)
     return _candidates(corners_px[:read], ids) + _read(grey, corners_px[read:], dictionary)
 
 
 def search_thoroughly(grey: Grey, dictionary: str, region: tuple[slice, slice] = WHOLE) -> list[Candidate]:
-    """The same by OpenCV's detector with its own settings, at full size: finds markers in shadow too."""
-    found, ids, _ = _full_detector(dictionary).detectMarkers(np.ascontiguousarray(grey[region]))
-    return _placed(_candidates(found, ids), region)
+    """Find markers, also those in shadow, with the default settings of OpenCV's detector, at full size."""
+    marker_corners, ids, _ = _full_detector(dictionary).detectMarkers(np.ascontiguousarray(grey[region]))
+    return _placed(_candidates(marker_corners, ids), region)
 
 
 def search_leftovers(
     grey: Grey, dictionary: str, samples: Grey, known_px: Sequence[Array]
 ) -> list[Candidate]:
-    """Search thoroughly in areas whose contrast no known marker, (4, 2) in px, explains.
+    """Search thoroughly in areas with contrast that no known marker, (4, 2) in px, explains.
 
     Parameters
     ----------
-    samples : of the picture, from :func:`sample`.
+    samples : reduced image, from :func:`sample`.
     """
     candidates = []
     for region in _contrasts(grey, samples, known_px):
@@ -122,10 +124,10 @@ def search_leftovers(
 def _contrasts(grey: Grey, samples: Grey, known_px: Sequence[Array]) -> list[tuple[slice, slice]]:
     """Return rows and columns of areas with the contrast of a marker, without known markers.
 
-    Lines and the edges of large things have contrast too, but not everywhere in a square.
+    Lines and the edges of large objects also have contrast, but not everywhere in a square.
     """
     fine = np.ascontiguousarray(samples[_FINER // 2 :: _FINER, _FINER // 2 :: _FINER])
-    # Cells of a large marker have no contrast in them at the fine scale.
+    # At the fine scale, there is no contrast inside the cells of a large marker.
     coarse = np.ascontiguousarray(fine[_COARSER // 2 :: _COARSER, _COARSER // 2 :: _COARSER])
     if not coarse.size:
         return [WHOLE]
@@ -133,7 +135,7 @@ def _contrasts(grey: Grey, samples: Grey, known_px: Sequence[Array]) -> list[tup
     known = _spans(known_px)
     down, right = wide.shape[0] / full.shape[0], wide.shape[1] / full.shape[1]
     for rows, columns in known:
-        # Coarse samples that lie completely in it.
+        # Only the coarse samples that are completely inside the known marker.
         wide[_inner(rows, down), _inner(columns, right)] = 0
     if cv2.countNonZero(wide):
         widened = cv2.resize(wide, full.shape[::-1], interpolation=cv2.INTER_NEAREST)
@@ -171,9 +173,10 @@ def _inner(span: slice, scale: float) -> slice:
 
 
 def _is_cut(grey: Grey, fine: Grey, left: int, top: int, right: int, bottom: int) -> bool:
-    """Return whether the picture cuts off a marker in a box of samples: its black meets the border.
+    """Return whether the image border cuts off a marker in a box of samples.
 
-    A whole marker has its white margin around it, or at least the floor.
+    The black of such a marker touches the border. A whole marker has its white margin around it, or at least
+    the floor.
     """
     height, width = fine.shape
     rows = slice(top * _STEP_PX, bottom * _STEP_PX)
@@ -188,7 +191,7 @@ def _is_cut(grey: Grey, fine: Grey, left: int, top: int, right: int, bottom: int
 
 
 def _squares(samples: Grey) -> Grey:
-    """Return a mask of the squares whose samples have contrast everywhere."""
+    """Return a mask of the squares with contrast at all samples."""
     contrast = cv2.morphologyEx(samples, cv2.MORPH_GRADIENT, _AROUND)
     high = cv2.threshold(contrast, _CONTRAST, 1, cv2.THRESH_BINARY)[1]
     return np.asarray(cv2.morphologyEx(high, cv2.MORPH_OPEN, _SQUARE), dtype=np.uint8)
@@ -199,7 +202,7 @@ def _widened(first: int, count: int) -> slice:
 
 
 def _candidates(found: Iterable[Any], ids: Any) -> list[Candidate]:
-    # OpenCV 5 gives ids of shape (n,), OpenCV 4 of shape (n, 1), or None.
+    # OpenCV 5 returns ids of shape (n,), OpenCV 4 returns ids of shape (n, 1), or None.
     numbers = [] if ids is None else np.ravel(ids).tolist()
     return [
         Candidate(n, np.asarray(square, dtype=np.float64).reshape(4, 2))
@@ -225,7 +228,7 @@ def _quick_detector(dictionary: str) -> cv2.aruco.ArucoDetector:
 def _full_detector(dictionary: str) -> cv2.aruco.ArucoDetector:
     parameters = cv2.aruco.DetectorParameters()
     parameters.minDistanceToBorder = _BORDER_PX
-    # Bits are read from 8 px a cell instead of 4: finds more small and tilted markers.
+    # Bits are read from 8 px per cell instead of 4: this finds more small and tilted markers.
     parameters.perspectiveRemovePixelPerCell = 8
     return cv2.aruco.ArucoDetector(_known(dictionary), parameters)
 
@@ -234,12 +237,12 @@ def _read(grey: Grey, corners: Array, dictionary: str) -> list[Candidate]:
     """Return the markers among the squares (n, 4, 2), by their cells."""
     if not len(corners):
         return []
-    words, places = _words(dictionary)
-    x, y = (np.ascontiguousarray(corners[..., axis] @ places.T, dtype=np.float32) for axis in (0, 1))
+    words, positions = _words(dictionary)
+    x, y = (np.ascontiguousarray(corners[..., axis] @ positions.T, dtype=np.float32) for axis in (0, 1))
     levels = levels_at(grey, x, y)
     middle = levels.min(axis=1) / 2 + levels.max(axis=1) / 2
     signs = np.where(levels > middle[:, None], np.float32(1), np.float32(-1))
-    # (squares, ids * turns): how many cells differ.
+    # Number of cells that differ, (squares, ids * turns).
     differ = (words.shape[1] - signs @ words.T) / 2
     best = differ.argmin(axis=1)
     candidates = []
@@ -251,18 +254,19 @@ def _read(grey: Grey, corners: Array, dictionary: str) -> list[Candidate]:
 
 @cache
 def _words(dictionary: str) -> tuple[NDArray[np.float32], Array]:
-    """The cells of all markers of a dictionary, and where they are in a square.
+    """Return the cells of all markers of a dictionary, and the positions of the cells in a square.
 
     Returns
     -------
     words : (ids * 4, cells), border included, 1 for white and -1 for black, turned by 0 to 3 quarters.
-    places : (cells, 4), shares of the corners. Between them a square of this size is bent little by
-        perspective and lens.
+    places : (cells, 4), weights of the corners. Perspective and lens distortion bend a square of this size
+        only a little, so linear interpolation between the corners is sufficient.
     """
     images = [white_cells(dictionary, n) for n in range(len(_known(dictionary).bytesList))]
     cells = len(images[0])
-    # With the marker's top left at corner k of a square, the square shows it turned k quarters clockwise.
+    # If the marker's top left is corner k of a square, the square shows the marker turned k quarters
+    # clockwise.
     turned = [np.rot90(image, -turn).ravel() for image in images for turn in range(4)]
     x, y = (axis.ravel() for axis in np.meshgrid(*2 * [(np.arange(cells) + 0.5) / cells]))
-    places = np.stack([(1 - x) * (1 - y), x * (1 - y), x * y, (1 - x) * y], axis=1)
-    return np.where(turned, np.float32(1), np.float32(-1)), places
+    positions = np.stack([(1 - x) * (1 - y), x * (1 - y), x * y, (1 - x) * y], axis=1)
+    return np.where(turned, np.float32(1), np.float32(-1)), positions

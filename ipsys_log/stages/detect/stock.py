@@ -15,12 +15,12 @@ _REFINE = (cv2.TERM_CRITERIA_COUNT + cv2.TERM_CRITERIA_EPS, 40, 0.001)
 
 
 def marker_detector(dictionary: str) -> cv2.aruco.ArucoDetector:
-    """OpenCV's detector for a dictionary such as DICT_4X4_100.
+    """Return OpenCV's detector for a dictionary such as DICT_4X4_100.
 
     Raises
     ------
     IpsysError
-        Where OpenCV has no dictionary of that name.
+        OpenCV has no dictionary of that name.
     """
     index = getattr(cv2.aruco, dictionary, None) if dictionary.startswith("DICT_") else None
     if not isinstance(index, int):
@@ -28,13 +28,13 @@ def marker_detector(dictionary: str) -> cv2.aruco.ArucoDetector:
             f"the rig's marker dictionary {dictionary!r} is none of OpenCV's, such as DICT_4X4_100"
         )
     parameters = cv2.aruco.DetectorParameters()
-    # Bits are read from 8 px a cell instead of 4: finds more small and tilted markers.
+    # Bits are read from 8 px per cell instead of 4: this finds more small and tilted markers.
     parameters.perspectiveRemovePixelPerCell = 8
     return cv2.aruco.ArucoDetector(cv2.aruco.getPredefinedDictionary(index), parameters)
 
 
 def detect_markers(grey: Grey, dictionary: str) -> list[Marker]:
-    """All markers of a dictionary in a picture, sorted by id; an id can occur twice.
+    """Return all markers of a dictionary in an image, sorted by id; an id can occur twice.
 
     Parameters
     ----------
@@ -43,13 +43,13 @@ def detect_markers(grey: Grey, dictionary: str) -> list[Marker]:
 
     Returns
     -------
-    list of :class:`Marker`, corners refined to sub-pixels with a window of 3 (the authors' setting).
+    list of :class:`Marker`, with corners refined to sub-pixels with a window of 3 (the authors' setting).
     """
     corners, ids, _ = marker_detector(dictionary).detectMarkers(grey)
     if ids is None or len(ids) == 0:
         return []
     flat = np.concatenate(corners, axis=1).reshape(-1, 1, 2).astype(np.float32)
     refined = cv2.cornerSubPix(grey, flat, (3, 3), (-1, -1), _REFINE).reshape(-1, 4, 2)
-    # OpenCV 5 gives ids of shape (n,), OpenCV 4 of shape (n, 1).
+    # OpenCV 5 returns ids of shape (n,), OpenCV 4 returns ids of shape (n, 1).
     order = np.argsort(np.ravel(ids), kind="stable")
     return [Marker(int(np.ravel(ids)[i]), np.asarray(refined[i], dtype=np.float64)) for i in order]

@@ -1,8 +1,8 @@
 """Markers in uneven light: edges that glare, a shadow or a cover disturbs, and the colours of cells.
 
-A profile far to both sides shows the approximate position of an edge. A near one shows the exact position.
-Its shape shows whether it is one undisturbed edge: glare that begins there, or saturates the white, gives
-another shape.
+A profile far to both sides shows the approximate position of an edge. A near profile shows the exact
+position. The shape of a near profile shows if the edge is undisturbed. Glare that begins at the edge, or
+saturates the white, causes another shape.
 
 Under glare or half in a shadow, no single threshold separates black from white. Neighbouring cells still
 differ if the print changes its colour between them, and hardly differ if it does not.
@@ -41,7 +41,7 @@ _AGREES, _CLEARLY, _ALIKE = 0.5, 0.1, 0.3
 
 
 class Agreement(NamedTuple):
-    """The share of neighbouring cells that agree with a marker, minus that of those that contradict it.
+    """The share of neighbouring cells that agree with a marker, minus the share of those that contradict it.
 
     ``own`` is the share for the tested marker, ``next`` the greatest for any other or any turned one.
     """
@@ -81,7 +81,7 @@ def compare_pattern(levels: Array, dictionary: str, marker_id: int) -> Agreement
     if contrast < LEAST_CONTRAST:
         return Agreement(0.0, 0.0)
     signs = np.sign(rises) * (np.abs(rises) > _DIFFERENT * contrast)
-    # Equal signs agree, opposite signs contradict; an invisible step counts for neither.
+    # Equal signs agree, opposite signs contradict. An invisible step counts for none of the two.
     agreements = words @ signs + (words == 0) @ np.where(signs == 0, 1.0, -1.0)
     agreements /= len(signs)
     own = float(agreements[4 * marker_id])
@@ -106,11 +106,11 @@ def _steps(dictionary: str) -> Array:
 TAPS = np.linspace(-1, 1, 13)
 # Share of the median height: a lower rise is no edge of the print.
 _WEAK, _WEAK_ROUGH = 0.3, 0.25
-# RMS of a profile about its step, relative to the step height; and to the median of that over all edges.
+# RMS of a profile about its step, relative to the step height, and relative to its median over all edges.
 _MISSHAPEN, _MISSHAPEN_SURELY, _ODD = 0.02, 0.12, 3.0
 # An edge farther out in its profile is cut off.
 _CENTRAL = 0.6
-# Shorter profiles cannot tell a slope of the light from a step.
+# Shorter profiles cannot distinguish a slope of the light from a step.
 _LONG_PX = 2.5
 
 

@@ -35,7 +35,6 @@ from ipsys_log.messages.channels import (
     CALIBRATIONS,
     IMAGES,
     MEASUREMENTS_TOPIC,
-    RECORD,
     Channel,
     channel_of,
 )
@@ -253,7 +252,11 @@ class Session:
         return [run for reader, items in self._items() for run in self._runs_in(reader, items)]
 
     def _runs_in(self, reader: LogReader, items: Items) -> list[Run]:
-        topics = [t for t, stored in reader.channels.items() if self._channel_of(t, stored) is RECORD]
+        topics = [
+            topic
+            for topic, stored in reader.channels.items()
+            if stored.schema is not None and payload_type(stored.schema.name) is Run
+        ]
         found = [message.payload for message in self._decoded(reader, items, topics, None, None)]
         return sorted(found, key=lambda run: run.number)
 

@@ -58,7 +58,7 @@ from ipsys_log.runs.output import opened_target
 from ipsys_log.runs.provenance import Outcome
 from ipsys_log.runs.select import wanted_models
 from ipsys_log.runs.stream import WiredStage, in_threads, run
-from ipsys_log.sinks.sink import Consumer, Consumers
+from ipsys_log.sinks.sink import Consumer, Consumers, Sink
 
 __all__ = ["live", "measure", "record", "replay"]
 
@@ -130,6 +130,7 @@ def record(
     target: Path,
     consumers: Sequence[Consumer] = (),
     overwrite: bool = False,
+    sinks: Sequence[Sink] = (),
 ) -> Mapping[str, int]:
     """Write the messages of cameras to a new log; return the number of messages of each topic.
 
@@ -139,16 +140,16 @@ def record(
     settings : written first: rig and lenses.
     consumers : each is shown everything after it was written, and None where nothing came.
     overwrite : put it in place of a log that is there.
+    sinks : each gets the same in its own thread; a slow one loses messages, images first.
 
     Raises
     ------
     IpsysError
         The log cannot be written; it is complete up to then.
     Exception
-        The error of the first failed consumer, after the recording has ended: it cannot end it.
+        The error of the first failed consumer or sink, after the recording has ended: it cannot end it.
     """
-    show = Consumers(consumers, source.warn)
-    with recording(target, settings, overwrite) as log:
+    with Consumers(consumers, source.warn, sinks) as show, recording(target, settings, overwrite) as log:
         for arrived in written(source, log):
             show(arrived)
     log.check_disk()
@@ -163,6 +164,7 @@ def measure(
     request: Request,
     consumers: Sequence[Consumer],
     overwrite: bool = False,
+    sinks: Sequence[Sink] = (),
 ) -> Mapping[str, int]:
     """Detect markers in the frames of cameras, and write measurements with their frames to a new log.
 
@@ -175,6 +177,7 @@ def measure(
     settings : written first: rig and lenses.
     request : corners.
     consumers : each is shown every frame that the stages have seen, its markers and camera points.
+    sinks : the same, each in its own thread; a slow one loses messages, images first.
 
     Returns
     -------
@@ -188,9 +191,9 @@ def measure(
         What the first of ``consumers`` raised, after the log is complete.
     """
     check_pictures(cameras.states)
-    show = Consumers(consumers, cameras.warn)
     plan = plan_live(cameras.states, settings, request, "camera-frame")
     with (
+        Consumers(consumers, cameras.warn, sinks) as show,
         threadpool_limits(1, user_api="blas"),
         recording(target, settings, overwrite) as log,
         Recent(log) as recent,
@@ -212,6 +215,7 @@ def live(
     until: str = "fuse",
     consumers: Sequence[Consumer] = (),
     overwrite: bool = False,
+    sinks: Sequence[Sink] = (),
 ) -> list[Outcome]:
     """Write the messages of cameras to a new log with the results of the stages: the run of a replay.
 
@@ -225,6 +229,7 @@ def live(
     until : detect, camera-frame or fuse.
     consumers : each is shown every frame that the stages have seen, and what they make of it, after it was
         written.
+    sinks : the same, each in its own thread; a slow one loses messages, images first.
 
     Returns
     -------
@@ -239,8 +244,8 @@ def live(
     """
     plan = plan_live(cameras.states, settings, request, until)
     first = (*settings, *plan.copies(cameras.now_ns))
-    show = Consumers(consumers, cameras.warn)
     with (
+        Consumers(consumers, cameras.warn, sinks) as show,
         threadpool_limits(1, user_api="blas"),
         recording(target, first, overwrite) as log,
         Backlog(cameras, log, cameras.now_ns) as frames,

@@ -5,7 +5,6 @@ from __future__ import annotations
 import shutil
 import subprocess
 import sys
-import time
 from collections.abc import Callable
 from dataclasses import replace
 from io import BytesIO
@@ -30,6 +29,7 @@ from ipsys_log.messages.channels import TRACKS
 from ipsys_log.runs.options import Request
 from ipsys_log.sinks.rerun.live import LiveView, Write
 from ipsys_log.sinks.rerun.recording import write_recording
+from ipsys_log.sinks.sink import LiveQueue
 from ipsys_log.survey.from_log import opened_log
 from ipsys_log.survey.live import LiveScene
 
@@ -176,15 +176,16 @@ def test_a_live_viewer_that_was_too_slow_goes_on_with_a_keyframe(video: Path, tm
     before = [*(once * 6), *once[:5]]
     came = [*before, *once[5:]]
     frames = [replace(one, log_time_ns=n, publish_time_ns=n) for n, one in enumerate(came, 10**18)]
-    view = LiveView(rig, ["red"], None, print, show)
+    waiting = LiveQueue()
+    messages = iter(waiting)
+    shown: list[Message | None] = []
     for frame in frames[: len(before)]:
-        view(frame)
-    with view:
-        until = time.monotonic() + 20
-        while not view._waiting.empty() and time.monotonic() < until:
-            time.sleep(0.05)
-        for frame in frames[len(before) :]:
-            view(frame)
+        waiting.put(frame)
+    shown += iter(messages.__next__, None)
+    for frame in frames[len(before) :]:
+        waiting.put(frame)
+    waiting.close()
+    LiveView(rig, ["red"], None, print, show).consume(iter([*shown, *messages]))
     whole = tmp_path / "whole.rrd"
     merge = [sys.executable, "-m", "rerun", "rrd", "merge", str(tmp_path / "live.rrd"), "-o", str(whole)]
     subprocess.run(merge, check=True, capture_output=True)

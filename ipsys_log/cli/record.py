@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-from contextlib import nullcontext
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, Optional
 
@@ -128,7 +127,6 @@ def live(
     from ipsys_log import pipeline
     from ipsys_log.capture.live_plan import check_start
     from ipsys_log.runs.options import Request
-    from ipsys_log.sinks.sink import Consumer
 
     lab = prepared(rig, camera, calibration)
     check_target(output, force, [*lab.files, (MODEL, model_from)])
@@ -136,15 +134,12 @@ def live(
     request = Request(models=models, model_from=model_from, corners=corners, method=method)
     for line in check_start(lab.rig, lab.names, lab.lenses, request, "fuse"):
         remarks.print(line, style="yellow", markup=False)
-    with (
-        opened(lab, output, seconds) as (cameras, settings, status),
-        _viewed(settings, cameras, request) if view else nullcontext() as viewer,
-    ):
-        consumers: list[Consumer] = [status] if viewer is None else [status, viewer]
-        pipeline.live(cameras, settings, output, request, "fuse", consumers, force)
+    with opened(lab, output, seconds) as (cameras, settings, status):
+        sinks = [_viewer(settings, cameras, request)] if view else []
+        pipeline.live(cameras, settings, output, request, "fuse", [status], force, sinks)
 
 
-def _viewed(settings: list[Message], cameras: Attached, request: Request) -> LiveView:
+def _viewer(settings: list[Message], cameras: Attached, request: Request) -> LiveView:
     from ipsys_log.runs.select import wanted_models
     from ipsys_log.sinks.rerun.live import LiveView
     from ipsys_log.stages.fit import model_run

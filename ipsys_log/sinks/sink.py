@@ -1,29 +1,189 @@
-"""Consumers of recorded messages, such as displays: none of them can end the recording."""
+"""Sinks: consumers of messages. Beside a recording they never block it; offline the log waits for them."""
 
 from __future__ import annotations
 
-from collections.abc import Callable, Sequence
+import threading
+from collections import Counter, deque
+from collections.abc import Callable, Iterator, Sequence
+from dataclasses import replace
+from types import TracebackType
+from typing import Protocol
 
-from ipsys_log.messages import Message
+from ipsys_log.images.video import is_keyframe
+from ipsys_log.messages import CompressedImage, CompressedVideo, Message, RawImage, SkippedVideo
 
-__all__ = ["Consumer", "Consumers"]
+__all__ = ["Consumer", "Consumers", "LiveQueue", "LiveSinks", "Sink", "text_of"]
 
-# Gets messages after they were written, and None if nothing comes.
+# Messages that may wait for a sink. Above the first limit images are dropped, above the second all messages.
+_MOST_WITH_IMAGES, _MOST_WAITING = 100, 200
+_JOIN_TIMEOUT_S = 2.0
+_IMAGES = (CompressedImage, CompressedVideo, RawImage, SkippedVideo)
+
+# Gets messages after they were written, and None if nothing comes. For parts of the recorder itself, which
+# return at once, such as its status; everything else is a sink.
 Consumer = Callable[[Message | None], None]
 
 
+class Sink(Protocol):
+    """A consumer of messages, such as a display or a stream to robots.
+
+    Beside a recording, ``consume`` runs in its own thread, behind a :class:`LiveQueue`: a slow sink loses
+    messages and does not delay the recording. Offline, the player waits for it, and it loses none.
+    """
+
+    name: str
+
+    def consume(self, messages: Iterator[Message | None]) -> None:
+        """Take all messages; None if nothing waits at present, to flush what is held back."""
+
+
+class LiveQueue:
+    """Messages that wait for a sink beside a recording. ``put`` never blocks.
+
+    If the sink is too slow, images are dropped first, of a video all frames up to the next keyframe. Tracks
+    and all other messages are dropped last.
+
+    Attributes
+    ----------
+    dropped : number of dropped messages by the last part of their topic, such as ``image``.
+    """
+
+    def __init__(self) -> None:
+        self.dropped: Counter[str] = Counter()
+        self._waiting: deque[Message] = deque()
+        self._changed = threading.Condition()
+        self._closed = False
+        # Cameras whose video continues with a keyframe only.
+        self._broken: set[str | None] = set()
+
+    def __len__(self) -> int:
+        return len(self._waiting)
+
+    def put(self, message: Message) -> None:
+        """Let a message wait, or drop it."""
+        if isinstance(message.payload, SkippedVideo):
+            message = replace(message, payload=message.payload.frame)
+        with self._changed:
+            if self._closed:
+                return
+            if self._is_dropped(message):
+                self.dropped[message.topic.rpartition("/")[2]] += 1
+                return
+            self._waiting.append(message)
+            self._changed.notify()
+
+    def close(self) -> None:
+        """End the messages: the sink gets those that wait, and no more."""
+        with self._changed:
+            self._closed = True
+            self._changed.notify()
+
+    def __iter__(self) -> Iterator[Message | None]:
+        while True:
+            with self._changed:
+                message = self._waiting.popleft() if self._waiting else None
+                if message is None and self._closed:
+                    return
+            yield message
+            if message is None:
+                with self._changed:
+                    self._changed.wait_for(lambda: self._waiting or self._closed)
+
+    def _is_dropped(self, message: Message) -> bool:
+        is_full = len(self._waiting) >= _MOST_WITH_IMAGES
+        if isinstance(message.payload, CompressedVideo):
+            if is_full:
+                self._broken.add(message.camera)
+            elif is_keyframe(message.payload):
+                self._broken.discard(message.camera)
+            return message.camera in self._broken
+        return len(self._waiting) >= (
+            _MOST_WITH_IMAGES if isinstance(message.payload, _IMAGES) else _MOST_WAITING
+        )
+
+
+class LiveSinks:
+    """Sinks beside a recording, as one consumer. A context manager.
+
+    A sink that raises gets no more messages: an event says so, and the recording goes on.
+
+    Parameters
+    ----------
+    sinks : each gets every message.
+    warn : makes an event of a kind and a text, and prints it; called from any thread.
+    """
+
+    def __init__(self, sinks: Sequence[Sink], warn: Callable[[str, str], None]) -> None:
+        self.queues = {sink.name: LiveQueue() for sink in sinks}
+        self._warn = warn
+        self._fault: Exception | None = None
+        self._threads = [
+            threading.Thread(target=self._run, args=(sink,), name=f"sink {sink.name}", daemon=True)
+            for sink in sinks
+        ]
+
+    def __enter__(self) -> LiveSinks:
+        for thread in self._threads:
+            thread.start()
+        return self
+
+    def __exit__(
+        self, kind: type[BaseException] | None, error: BaseException | None, trace: TracebackType | None
+    ) -> None:
+        for waiting in self.queues.values():
+            waiting.close()
+        for thread in self._threads:
+            thread.join(_JOIN_TIMEOUT_S)  # a window stays open as long as its user wants
+
+    def __call__(self, message: Message | None) -> None:
+        """Hand a message to each sink."""
+        if message is not None:
+            for waiting in self.queues.values():
+                waiting.put(message)
+
+    def check(self) -> None:
+        """Raise the error of the first sink that failed, if one did."""
+        if self._fault is not None:
+            raise self._fault
+
+    def _run(self, sink: Sink) -> None:
+        waiting = self.queues[sink.name]
+        try:
+            sink.consume(iter(waiting))
+        except Exception as fault:  # any error: the frames are more important
+            self._fault = self._fault or fault
+            waiting.close()
+            self._warn("sink_stopped", f"{sink.name} stopped ({text_of(fault)}); the recording goes on")
+
+
 class Consumers:
-    """Pass messages to several consumers. A consumer that raises gets no more messages.
+    """Pass messages to the consumers of a recording, and to its sinks. A context manager.
+
+    A consumer that raises gets no more messages.
 
     Parameters
     ----------
     consumers : each gets every message.
     warn : makes an event of a kind and a text, and prints it.
+    sinks : each gets every message that is not dropped for it, in its own thread.
     """
 
-    def __init__(self, consumers: Sequence[Consumer], warn: Callable[[str, str], None]) -> None:
-        self._consumers, self._warn = list(consumers), warn
+    def __init__(
+        self, consumers: Sequence[Consumer], warn: Callable[[str, str], None], sinks: Sequence[Sink] = ()
+    ) -> None:
+        self._sinks = LiveSinks(sinks, warn)
+        self._consumers: list[Consumer] = [*consumers, self._sinks]
+        self._warn = warn
         self._fault: Exception | None = None
+
+    def __enter__(self) -> Consumers:
+        self._sinks.__enter__()
+        return self
+
+    def __exit__(
+        self, kind: type[BaseException] | None, error: BaseException | None, trace: TracebackType | None
+    ) -> None:
+        self._sinks.__exit__(kind, error, trace)
 
     def __call__(self, message: Message | None) -> None:
         for consumer in tuple(self._consumers):
@@ -32,10 +192,18 @@ class Consumers:
             except Exception as fault:  # any error: the frames are more important
                 self._fault = self._fault or fault
                 self._consumers.remove(consumer)
-                text = " ".join(str(fault).split()) or "no word"
-                self._warn("sink_stopped", f"the display stopped ({text}); the recording goes on")
+                self._warn("sink_stopped", f"the display stopped ({text_of(fault)}); the recording goes on")
 
     def check(self) -> None:
-        """Raise the error of the first consumer that failed, if one did."""
+        """Raise the error of the first consumer or sink that failed, if one did."""
         if self._fault is not None:
             raise self._fault
+        self._sinks.check()
+
+
+def text_of(fault: Exception) -> str:
+    """Return the text of an error on one line; its type if it has no text."""
+    try:
+        return " ".join(str(fault).split()) or type(fault).__name__
+    except Exception:  # an error that cannot say itself
+        return type(fault).__name__

@@ -1,0 +1,190 @@
+"""Sinks: a slow one loses images first, one that raises ends no recording, and offline nothing is lost."""
+
+from __future__ import annotations
+
+import threading
+from collections.abc import Iterator
+from contextlib import contextmanager
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+from ipsys_log import pipeline
+from ipsys_log.capture.devices import OPENERS, open_source
+from ipsys_log.capture.frames import Clock, Frame, Say
+from ipsys_log.capture.multiplexer import Attached
+from ipsys_log.capture.recorder import first_messages
+from ipsys_log.log.dataset import Session
+from ipsys_log.messages import CompressedImage, CompressedVideo, Message, Rig, RigCamera, Tracks
+from ipsys_log.sinks.player import play
+from ipsys_log.sinks.sink import LiveQueue, Sink
+from tests.stages.drawing import jpeg
+
+_LIMIT_S = 120.0
+
+
+class Collected:
+    """A sink, as a newcomer would write it: it keeps the messages. ``fault`` is raised at the n-th one."""
+
+    def __init__(self, name: str = "collected", fault_at: int | None = None) -> None:
+        self.name = name
+        self.messages: list[Message] = []
+        self._fault_at = fault_at
+
+    def consume(self, messages: Iterator[Message | None]) -> None:
+        for message in messages:
+            if message is None:
+                continue
+            self.messages.append(message)
+            if len(self.messages) == self._fault_at:
+                raise ZeroDivisionError("a fault\nin the sink")
+
+
+class Stuck:
+    """A sink that takes one message and no more, until it is released."""
+
+    name = "stuck"
+
+    def __init__(self) -> None:
+        self.released = threading.Event()
+
+    def consume(self, messages: Iterator[Message | None]) -> None:
+        next(messages)
+        assert self.released.wait(_LIMIT_S)
+
+
+def image(number: int) -> Message:
+    return Message("/cameras/red/image", number, number, CompressedImage(number, "red", b"", "jpeg"), "red")
+
+
+def tracks(number: int) -> Message:
+    return Message("/runs/poly/tracks", number, number, Tracks(number, ()))
+
+
+def video(number: int, keyframe: bool) -> Message:
+    data = b"\x00\x00\x01\x65" if keyframe else b"\x00\x00\x01\x41"
+    return Message("/cameras/red/image", number, number, CompressedVideo(number, "red", data, "h264"), "red")
+
+
+def drained(waiting: LiveQueue) -> list[Message]:
+    return list(iter(iter(waiting).__next__, None))
+
+
+def test_slow_sink_loses_images_before_tracks() -> None:
+    waiting = LiveQueue()
+    for number in range(150):
+        waiting.put(image(number))
+        if number < 90:
+            waiting.put(tracks(number))
+    messages = drained(waiting)
+    assert len([m for m in messages if isinstance(m.payload, Tracks)]) == 90
+    images = [m for m in messages if isinstance(m.payload, CompressedImage)]
+    assert waiting.dropped == {"image": 150 - len(images)}
+    assert 0 < len(images) <= 100
+
+
+def test_waiting_messages_are_bounded() -> None:
+    waiting = LiveQueue()
+    for number in range(1000):
+        waiting.put(tracks(number))
+    assert (len(waiting), waiting.dropped["tracks"]) == (200, 800)
+
+
+def test_video_continues_with_a_keyframe() -> None:
+    waiting = LiveQueue()
+    for number in range(110):
+        waiting.put(video(number, keyframe=number % 30 == 0))
+    assert [m.log_time_ns for m in drained(waiting)] == list(range(100))
+    for number in range(110, 130):
+        waiting.put(video(number, keyframe=number % 30 == 0))
+    assert [m.log_time_ns for m in drained(waiting)] == list(range(120, 130))
+
+
+def recorded(target: Path, *sinks: Sink) -> None:
+    """Record 40 frames of each of two cameras, of a source that is a row of the table of openers."""
+    rig = Rig("lab", "DICT_4X4_100", 0.2)
+    cameras = [RigCamera(name, source=f"test:{name}") for name in ("red", "white")]
+    attached = Attached(cameras, open_source, Clock())
+    with attached:
+        pipeline.record(attached, first_messages(rig, {}, attached.now_ns), target, sinks=sinks)
+
+
+@pytest.fixture
+def test_source(monkeypatch: pytest.MonkeyPatch) -> None:
+    """A source for tests, as a newcomer would add it: a function, and a row in the table."""
+    data = jpeg(np.full((120, 160), 200, np.uint8))
+
+    @contextmanager
+    def opened(camera: RigCamera, clock: Clock, say: Say) -> Iterator[Iterator[Frame | None]]:
+        yield (Frame(data, "jpeg", clock.now_ns()) for _ in range(40))
+
+    monkeypatch.setitem(OPENERS, "test", opened)
+
+
+def frames_in(log: Path) -> dict[str, int]:
+    with Session([log]) as session:
+        return {camera: session.count(topic) for camera, topic in session.images.items()}
+
+
+@pytest.mark.usefixtures("test_source")
+def test_source_and_sink_of_one_row_are_recorded(tmp_path: Path) -> None:
+    sink = Collected()
+    recorded(tmp_path / "x.mcap", sink)
+    assert frames_in(tmp_path / "x.mcap") == {"red": 40, "white": 40}
+    assert len([m for m in sink.messages if isinstance(m.payload, CompressedImage)]) == 80
+
+
+@pytest.mark.usefixtures("test_source")
+def test_sink_that_raises_loses_no_frame(tmp_path: Path) -> None:
+    good, bad = Collected("good"), Collected("bad", fault_at=3)
+    with pytest.raises(ZeroDivisionError, match="a fault"):
+        recorded(tmp_path / "x.mcap", bad, good)
+    assert frames_in(tmp_path / "x.mcap") == {"red": 40, "white": 40}
+    assert len(bad.messages) == 3
+    assert len([m for m in good.messages if isinstance(m.payload, CompressedImage)]) == 80
+
+
+@pytest.mark.usefixtures("test_source")
+def test_sink_that_hangs_holds_nothing_up(tmp_path: Path) -> None:
+    stuck = Stuck()
+    try:
+        recorded(tmp_path / "x.mcap", stuck)
+    finally:
+        stuck.released.set()
+    assert frames_in(tmp_path / "x.mcap") == {"red": 40, "white": 40}
+
+
+def test_player_drops_nothing_and_keeps_the_order() -> None:
+    sinks = [Collected("a"), Collected("b")]
+    paced: list[Message] = []
+    messages = [image(number) for number in range(1000)]
+    play(messages, sinks, paced.append)
+    assert sinks[0].messages == sinks[1].messages == paced == messages
+
+
+@pytest.mark.parametrize("count", [1, 2])
+def test_error_of_a_sink_fails_the_player(count: int) -> None:
+    sinks = [Collected("bad", fault_at=3), *(Collected(str(n)) for n in range(1, count))]
+    with pytest.raises(ZeroDivisionError):
+        play((image(number) for number in range(1000)), sinks)
+
+
+def test_sink_that_ends_early_does_not_hang_the_player() -> None:
+    class Brief(Collected):
+        def consume(self, messages: Iterator[Message | None]) -> None:
+            next(messages)
+
+    other = Collected("other")
+    play([image(number) for number in range(1000)], [Brief("brief"), other])
+    assert len(other.messages) == 1000
+
+
+def test_error_in_the_log_ends_the_player() -> None:
+    def broken() -> Iterator[Message]:
+        yield image(0)
+        raise OSError("the disk")
+
+    sinks = [Collected("a"), Collected("b")]
+    with pytest.raises(OSError, match="the disk"):
+        play(broken(), sinks)

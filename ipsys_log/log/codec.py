@@ -25,7 +25,7 @@ from ipsys_log.log.bounds import Items
 from ipsys_log.log.protobuf_fields import fields_of, fill_proto, read_proto
 from ipsys_log.log.ros2 import ROS2_PAYLOADS, read_ros2
 
-__all__ = ["PAYLOADS", "decode", "encode", "payload_type", "schema_data", "schema_name"]
+__all__ = ["PAYLOADS", "decode", "encode", "payload_type", "proto_class", "schema_data", "schema_name"]
 
 # The payloads with separate channels, by the name of their schema.
 PAYLOADS: dict[str, type] = {
@@ -86,7 +86,7 @@ def encode(payload: Any) -> bytes:
     for name in _bytes_fields(kind):
         if len(getattr(payload, name)) >= _LONG:
             return _encode_around(payload, name)
-    proto = _proto_class(schema_name(kind))()
+    proto = proto_class(schema_name(kind))()
     fill_proto(kind, proto, payload)
     return proto.SerializeToString(deterministic=True)
 
@@ -98,9 +98,9 @@ def _encode_around(payload: Any, long: str) -> bytes:
     message contains a field of bytes without change. Protobuf would copy an image three times.
     """
     kind: type = type(payload)
-    proto_class = _proto_class(schema_name(kind))
-    numbers = {field.name: field.number for field in proto_class.DESCRIPTOR.fields}
-    lower, higher = proto_class(), proto_class()
+    message_class = proto_class(schema_name(kind))
+    numbers = {field.name: field.number for field in message_class.DESCRIPTOR.fields}
+    lower, higher = message_class(), message_class()
     for name, fill, _ in fields_of(kind):
         value = getattr(payload, name)
         if name != long and value is not None:
@@ -160,17 +160,17 @@ def decode(
     if payload is None:
         raise LogError(f"its schema {name!r} is none that ipsys reads")
     try:
-        return read_proto(payload, _parse(_proto_class(name), data, encoding, items), items)
+        return read_proto(payload, _parse(proto_class(name), data, encoding, items), items)
     except (DecodeError, json_format.ParseError, ValueError, TypeError, RecursionError) as error:
         raise LogError(f"a message is not a valid {name}: {error}") from error
 
 
-def _parse(proto_class: type[Proto], data: bytes, encoding: str, items: Items) -> Proto:
+def _parse(message_class: type[Proto], data: bytes, encoding: str, items: Items) -> Proto:
     if encoding == "protobuf":
-        return proto_class.FromString(data)
+        return message_class.FromString(data)
     if encoding == "json":
         items.take(sum(map(data.count, (b",", b"{", b"["))))
-        return json_format.ParseDict(_read_json(data), proto_class(), ignore_unknown_fields=True)
+        return json_format.ParseDict(_read_json(data), message_class(), ignore_unknown_fields=True)
     raise LogError(f"messages encoded as {encoding!r} are not read, only protobuf and json")
 
 
@@ -209,7 +209,7 @@ def schema_data(name: str) -> bytes:
             add(dependency)
         file.CopyToProto(descriptors.file.add())
 
-    add(_proto_class(name).DESCRIPTOR.file)
+    add(proto_class(name).DESCRIPTOR.file)
     return descriptors.SerializeToString(deterministic=True)
 
 
@@ -223,7 +223,8 @@ def _pool() -> descriptor_pool.DescriptorPool:
 
 
 @cache
-def _proto_class(name: str) -> type[Proto]:
+def proto_class(name: str) -> type[Proto]:
+    """Return the class of protobuf for a schema."""
     package, _, message = name.rpartition(".")
     if package == "foxglove":
         module = import_module(f"foxglove_schemas_protobuf.{message}_pb2")

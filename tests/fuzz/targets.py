@@ -45,11 +45,17 @@ Target = tuple[st.SearchStrategy[Any], Callable[[Any], None]]
 
 
 def attack(act: Callable[[Any], None], given: Any) -> None:
-    """Run one case within its time."""
-    start_s = time.process_time()
-    with suppress(IpsysError):
-        act(given)
-    assert time.process_time() - start_s < _MOST_CPU_S
+    """Run one case within its processor time, that of this thread alone.
+
+    A case that takes too long is run again: a slow case is slow each time, a busy machine is not.
+    """
+    for _ in range(3):
+        start_s = time.thread_time()
+        with suppress(IpsysError):
+            act(given)
+        if time.thread_time() - start_s < _MOST_CPU_S:
+            return
+    raise AssertionError(f"a case takes more than {_MOST_CPU_S} s")
 
 
 @contextmanager

@@ -57,10 +57,10 @@ def read_all(path: Path) -> None:
 def test_small_file_that_asks_for_much_is_refused_soon(name: str, tmp_path: Path) -> None:
     path = tmp_path / "bomb.mcap"
     path.write_bytes(BOMBS[name]())
-    start_s = time.process_time()
+    start_s = time.thread_time()
     with pytest.raises(LogError) as caught:
         read_all(path)
-    assert time.process_time() - start_s < 2.0
+    assert time.thread_time() - start_s < 2.0
     assert "\n" not in str(caught.value)
     assert str(path) in str(caught.value)
 

@@ -89,7 +89,7 @@ def test_a_log_that_changes_while_it_is_opened_is_opened_again(
             append(log, list(changes.pop()))
         return contents
 
-    monkeypatch.setattr(reader_module, "load_contents", slowly)
+    monkeypatch.setattr(reader_module, "contents_of", slowly)
     with LogReader(log) as reader:
         assert reader.channels["/runs/a"].message_count == 3
 

@@ -1,15 +1,73 @@
 """Indoor positioning with cheap cameras: everything is a channel in a log.
 
-The command is ``ipsys``; the pipeline is in :mod:`ipsys_log.pipeline`.
+``import ipsys_log as ipsys`` gives the Python API below; :mod:`ipsys_log.api` describes it. All other
+modules are private until 1.0. The command is ``ipsys``; the pipeline is in :mod:`ipsys_log.pipeline`.
 """
+
+from typing import TYPE_CHECKING, Any
+
+if TYPE_CHECKING:
+    from ipsys_log.api import (
+        Calibrated,
+        Comparison,
+        Evaluated,
+        Failure,
+        FittedModel,
+        Listing,
+        LiveTracks,
+        Log,
+        Outcome,
+        Replayed,
+        Tracker,
+        calibrate,
+        live,
+        load_model,
+        open,
+        replay,
+        verify,
+    )
+    from ipsys_log.errors import IpsysError
+
+__all__ = [
+    "Calibrated",
+    "Comparison",
+    "Evaluated",
+    "Failure",
+    "FittedModel",
+    "IpsysError",
+    "Listing",
+    "LiveTracks",
+    "Log",
+    "Outcome",
+    "Replayed",
+    "Tracker",
+    "calibrate",
+    "live",
+    "load_model",
+    "open",
+    "replay",
+    "verify",
+]
 
 __version__: str
 
 
-def __getattr__(name: str) -> str:
-    # The command notes signals as early as it can: the import below takes longer than all before it.
+def __getattr__(name: str) -> Any:
+    # Each name is looked up when it is used: the command notes signals before the imports, which take long.
     if name == "__version__":
         from importlib.metadata import version
 
         return version("ipsys_log")
+    if name == "IpsysError":
+        from ipsys_log.errors import IpsysError
+
+        return IpsysError
+    if name in __all__:
+        from ipsys_log import api
+
+        return getattr(api, name)
     raise AttributeError(f"module {__name__!r} has no attribute {name!r}")
+
+
+def __dir__() -> list[str]:
+    return sorted([*__all__, "__version__"])

@@ -112,15 +112,16 @@ def calibrate(
     Writes one file for each camera that saw the board, with the name of the camera. If a camera has no
     result, the files of the others are written, and the exit code is 1. Sharp, different pictures are
     selected automatically; two dozen with the board in all parts of the image are enough."""
+    from ipsys_log import api
     from ipsys_log.calibration.board import parse_board
-    from ipsys_log.calibration.calibrate import Calibrated, calibrate_cameras
+    from ipsys_log.calibration.calibrate import Calibrated
     from ipsys_log.calibration.images import find_sources
     from ipsys_log.calibration.lens_models import find_lens
     from ipsys_log.exchange.calibration_files import check_format
     from ipsys_log.report.files import check_picture
 
-    model = find_lens(lens)
-    wanted = parse_board(board, square, marker_scale, dictionary, inverted)
+    find_lens(lens)
+    parse_board(board, square, marker_scale, dictionary, inverted)
     names = list(dict.fromkeys(formats or ["opencv"]))
     for name in names:
         check_format(name, lens)
@@ -135,7 +136,18 @@ def calibrate(
         targets = _targets([pictures.camera for pictures in found], output, names, force)
         with progress_bar() as progress:
             outcomes: list[Calibrated | Failure] = []
-            for outcome in calibrate_cameras(found, wanted, model, progress, insist=force):
+            for outcome in api.calibrate(
+                *taken,
+                board=board,
+                square_m=square,
+                lens=lens,
+                marker_scale=marker_scale,
+                dictionary=dictionary,
+                inverted=inverted,
+                cameras=camera or (),
+                force=force,
+                progress=progress,
+            ):
                 if isinstance(outcome, Calibrated):
                     _write(outcome, targets[outcome.camera])
                     outcomes.append(outcome)

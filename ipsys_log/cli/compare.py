@@ -34,11 +34,13 @@ def verify(
     """Make every run of a log again from what it read, and compare each channel byte for byte.
 
     Frames that were skipped live are passed over. Exits with code 1 if anything differs."""
+    from ipsys_log import api
     from ipsys_log.report.cameras import comparison_json, comparison_table, first_difference
-    from ipsys_log.runs.verify import verify as verify_runs
 
     with progress_bar() as progress:
-        found = verify_runs(logs, run, progress, lambda text: remarks.print(text, markup=False))
+        found = api.verify(
+            *logs, run=run, progress=progress, say=lambda text: remarks.print(text, markup=False)
+        )
     if as_json:
         print(json.dumps(comparison_json(found), indent=2))  # noqa: T201
     else:

@@ -199,40 +199,12 @@ def load_lab(
     IpsysError
         Where the rig has no such camera, or none with a source.
     """
-    from ipsys_log.capture.simulated import lens_of
-    from ipsys_log.errors import IpsysError
-    from ipsys_log.exchange.calibration_files import read_lens
-    from ipsys_log.rig.file import load_rig
-    from ipsys_log.stages.detect import marker_detector
+    from ipsys_log.exchange.lab_files import load_cameras, load_lenses
 
-    lab = load_rig(rig)
-    marker_detector(lab.dictionary)  # a bad name is said now, not when markers are looked for
-    known = {camera.name: camera for camera in lab.cameras}
-    for name in only:
-        if name not in known:
-            raise IpsysError(
-                f"--camera {name}: {rig} has no such camera (it has {', '.join(known) or 'none'})"
-            )
-    cameras = [one for one in lab.cameras if (one.name in only if only else one.source)]
-    for camera in cameras:
-        if camera.source is None:
-            raise IpsysError(f'{rig}: camera {camera.name} has no source, such as source = "usb:/dev/video0"')
-    if not cameras:
-        raise IpsysError(
-            f'{rig}: no camera has a source; give each one, such as source = "usb:/dev/video0" '
-            "(see 'ipsys cameras')"
-        )
+    lab, cameras = load_cameras(rig, only)
     names = [camera.name for camera in cameras]
     lenses = load_calibrations(calibration, lambda: names)
-    for camera in cameras if with_lenses else ():
-        if camera.name not in lenses and camera.calibration is not None:
-            lenses[camera.name] = read_lens(rig.parent / camera.calibration, camera.name)
-        elif camera.name not in lenses and str(camera.source).startswith("sim:"):
-            lenses[camera.name] = lens_of(camera)
-    strange = sorted(set(lenses) - set(names))
-    if strange:
-        raise IpsysError(f"--calibration {strange[0]}: no such camera is recorded (only {', '.join(names)})")
-    return lab, cameras, lenses
+    return lab, cameras, load_lenses(rig, cameras, lenses, with_lenses)
 
 
 def cameras_of(logs: list[Path]) -> set[str]:

@@ -30,7 +30,6 @@ from ipsys_log.cli.signals import say_kept
 if TYPE_CHECKING:
     from ipsys_log.log.dataset import Session
     from ipsys_log.report.accuracy import Accuracy
-    from ipsys_log.runs.options import Request
     from ipsys_log.runs.provenance import Outcome
 
 __all__ = ["EVALUATE", "MORE", "add_commands", "build_command", "derived", "options_of"]
@@ -193,19 +192,18 @@ def build_command(options: Mapping[str, tuple[Any, Any]], work: Callable[..., No
     return command
 
 
-def _request(logs: list[Path], **given: Any) -> Request:
+def _options(logs: list[Path], **given: Any) -> dict[str, Any]:
+    """Return the options of a command as those of :func:`ipsys_log.api.replay`."""
     from ipsys_log.rig.file import check_name
-    from ipsys_log.runs.options import Request
 
     rig, run = given.pop("rig"), given.pop("run")
-    models = tuple(given.pop("model", None) or ())
-    return Request(
-        models=models,
-        rig=load_matching_rig(rig, lambda: cameras_of(logs)),
-        lenses=load_calibrations(given.pop("calibration", None), lambda: cameras_of(logs)),
-        run=check_name(run, "--run") if run else None,
+    return {
+        "models": given.pop("model", None) or (),
+        "rig": load_matching_rig(rig, lambda: cameras_of(logs)),
+        "calibrations": load_calibrations(given.pop("calibration", None), lambda: cameras_of(logs)),
+        "run": check_name(run, "--run") if run else None,
         **given,
-    )
+    }
 
 
 @contextmanager
@@ -216,13 +214,14 @@ def derived(
 
     A log that is not ``kept`` is not named.
     """
+    from ipsys_log import api
     from ipsys_log.log.dataset import Session
-    from ipsys_log.pipeline import replay
     from ipsys_log.report.accuracy import read_accuracy
 
-    request = _request(logs, **given)
+    options = _options(logs, **given)
     with say_kept(_kept_runs(logs, output)), progress_bar() as progress:
-        outcomes = replay(logs, request, until, output, progress, say)
+        replayed = api.replay(*logs, until=until, output=output, progress=progress, say=say, **options)
+    outcomes = list(replayed.outcomes)
     # A new log is only there if there was something to write.
     written = [output] if output is not None and output.exists() else []
     with Session([*logs, *written]) as session:

@@ -207,6 +207,25 @@ class Session:
         streams = [self._stored(reader, items, topics) for reader, items in self._items()]
         return heapq.merge(*streams, key=lambda row: row[0].log_time_ns)
 
+    def encoded(
+        self, topics: Collection[str], start_ns: int | None = None, end_ns: int | None = None
+    ) -> Iterator[tuple[str, int, int, bytes]]:
+        """Yield topic, log time, publish time and encoded payload of messages in log order.
+
+        Raises
+        ------
+        LogError
+            A channel is not encoded with protobuf.
+        """
+        for reader in self.readers:
+            for topic in topics:
+                if topic in reader.channels and reader.channels[topic].message_encoding != "protobuf":
+                    raise LogError(f"{reader.path}: {topic} is not encoded with protobuf")
+        streams = [self._raw(reader, topics, start_ns, end_ns) for reader in self.readers]
+        raw = streams[0] if len(streams) == 1 else heapq.merge(*streams, key=lambda one: one.log_time_ns)
+        for message in raw:
+            yield message.topic, message.log_time_ns, message.publish_time_ns, message.data
+
     def _stored(
         self, reader: LogReader, items: Items, topics: Collection[str]
     ) -> Iterator[tuple[Message, bytes]]:

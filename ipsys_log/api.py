@@ -1,0 +1,671 @@
+"""The Python API that ``import ipsys_log as ipsys`` gives. All other modules are private until 1.0."""
+
+from __future__ import annotations
+
+import queue
+import threading
+from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
+from dataclasses import dataclass
+from datetime import datetime
+from html import escape
+from os import PathLike
+from pathlib import Path
+from types import TracebackType
+from typing import TYPE_CHECKING, NamedTuple
+
+import numpy as np
+from numpy.typing import ArrayLike, NDArray
+
+from ipsys_log.analysis.differences import Comparison
+from ipsys_log.calibration.calibrate import Calibrated, Failure
+from ipsys_log.errors import IpsysError
+from ipsys_log.log.contents import run_of_topic
+from ipsys_log.log.dataset import Session
+from ipsys_log.messages import (
+    CameraCalibration,
+    ErrorStatistics,
+    Evaluation,
+    Message,
+    Model,
+    Rig,
+    Track,
+    Tracks,
+)
+from ipsys_log.messages.channels import CHANNELS, EVALUATION, Channel
+from ipsys_log.models.table import AppliedModel
+from ipsys_log.runs.options import Progress, Request
+from ipsys_log.runs.provenance import Outcome, newest_run
+from ipsys_log.runs.states import recorded_stages
+
+if TYPE_CHECKING:
+    import pandas as pd
+
+__all__ = [
+    "Calibrated",
+    "Comparison",
+    "Evaluated",
+    "Failure",
+    "FittedModel",
+    "Listing",
+    "LiveTracks",
+    "Log",
+    "Outcome",
+    "Replayed",
+    "Tracker",
+    "calibrate",
+    "live",
+    "load_model",
+    "open",
+    "replay",
+    "verify",
+]
+
+StrPath = str | PathLike[str]
+Time = int | datetime
+Array = NDArray[np.float64]
+
+
+class Listing(tuple[NamedTuple, ...]):
+    """Rows of one kind, such as the runs of a log. It prints as a table, in notebooks too."""
+
+    __slots__ = ()
+
+    def __repr__(self) -> str:
+        if not self:
+            return "(none)"
+        rows = [self[0]._fields, *(tuple(map(_cell, row)) for row in self)]
+        widths = [max(len(row[n]) for row in rows) for n in range(len(rows[0]))]
+        return "\n".join(
+            "  ".join(cell.ljust(width) for cell, width in zip(row, widths, strict=True)).rstrip()
+            for row in rows
+        )
+
+    def _repr_html_(self) -> str:
+        if not self:
+            return "<p>none</p>"
+        head = "".join(f"<th>{escape(name)}</th>" for name in self[0]._fields)
+        body = "".join(f"<tr>{''.join(f'<td>{escape(_cell(v))}</td>' for v in row)}</tr>" for row in self)
+        return f"<table><tr>{head}</tr>{body}</table>"
+
+
+def _cell(value: object) -> str:
+    return "" if value is None else ", ".join(map(str, value)) if isinstance(value, tuple) else str(value)
+
+
+class _CameraRow(NamedTuple):
+    camera: str
+    images: int
+    calibrated: bool
+
+
+class _RunRow(NamedTuple):
+    run: str
+    stage: str
+    state: str
+    inputs: tuple[str, ...]
+
+
+class _ChannelRow(NamedTuple):
+    channel: str
+    run: str | None
+    topic: str
+    messages: int
+
+
+class Log:
+    """One or several logs, read as one: a snapshot of the time when they were opened. A context manager.
+
+    Attributes
+    ----------
+    cameras, runs, channels : what the logs hold, as small tables.
+    """
+
+    def __init__(self, *paths: StrPath) -> None:
+        if not paths:
+            raise IpsysError("name at least one log")
+        self._session = Session([Path(path) for path in paths])
+
+    def __enter__(self) -> Log:
+        return self
+
+    def __exit__(
+        self, kind: type[BaseException] | None, error: BaseException | None, trace: TracebackType | None
+    ) -> None:
+        self.close()
+
+    def close(self) -> None:
+        """Close the files; a second call does nothing."""
+        self._session.__exit__(None, None, None)
+
+    def __repr__(self) -> str:
+        runs = len(self._session.run_names())
+        return f"<Log {self._session}: {len(self._session.images)} cameras, {runs} runs>"
+
+    @property
+    def paths(self) -> tuple[Path, ...]:
+        """The paths of the logs."""
+        return tuple(self._session.paths)
+
+    @property
+    def cameras(self) -> Listing:
+        """The cameras: name, number of images, and whether intrinsics are in the log."""
+        session = self._session
+        names = sorted({*session.images, *session.calibrations})
+        return Listing(
+            _CameraRow(name, session.count(session.images.get(name, "")), name in session.calibrations)
+            for name in names
+        )
+
+    @property
+    def runs(self) -> Listing:
+        """The recorded stages, oldest first: run, stage, state, and the runs that they read."""
+        return Listing(
+            _RunRow(one.run.run, one.run.stage, one.state, one.run.input_runs)
+            for one in recorded_stages(self._session)
+        )
+
+    @property
+    def channels(self) -> Listing:
+        """The channels that have messages: name, run, topic, number of messages."""
+        session = self._session
+        rows = [
+            _ChannelRow(channel.name, run, topic, session.count(topic))
+            for channel in CHANNELS
+            for run in (sorted(session.run_names()) if channel.is_derived else [None])
+            for topic in session.topics(channel, run)
+        ]
+        return Listing(rows)
+
+    def messages(
+        self, channel: str, run: str | None = None, start: Time | None = None, end: Time | None = None
+    ) -> Iterator[Message]:
+        """Yield the decoded messages of a channel in log order.
+
+        Parameters
+        ----------
+        channel : its name, such as ``images``, ``markers`` or ``tracks``.
+        run : the run of a derived channel; None: the newest complete one.
+        start, end : log times, as an integer in ns or a datetime with a time zone; the end is not included.
+
+        Raises
+        ------
+        IpsysError
+            There is no such channel or run.
+        """
+        found = _channel_named(channel)
+        topics = self._session.topics(found, self._run_of(found, run))
+        return self._session.messages(topics, _ns(start), _ns(end))
+
+    def table(
+        self,
+        name: str,
+        run: str | Sequence[str] | None = None,
+        start: Time | None = None,
+        end: Time | None = None,
+    ) -> pd.DataFrame:
+        """Read a channel as a table: one row for each marker, point, position or track.
+
+        Times are of UTC; ``time`` is the instant that a row speaks of. Missing values are NaN or NA.
+
+        Parameters
+        ----------
+        name : ``markers``, ``camera_points``, ``positions``, ``tracks``, ``truth``, ``measurements``,
+            ``events`` or ``latency``.
+        run : the run of a derived channel; None: the newest complete one; several: a column ``run`` names it.
+        start, end : as of :meth:`messages`.
+
+        Raises
+        ------
+        IpsysError
+            There is no such table or run, or pandas is not installed.
+        """
+        from ipsys_log.exchange.data_frames import TABLES, read_table
+
+        if name not in TABLES:
+            raise IpsysError(f"there is no table {name!r}; use one of {', '.join(TABLES)}")
+        channel = _channel_named(name)
+        wanted = [run] if run is None or isinstance(run, str) else list(run)
+        runs = [self._run_of(channel, one) for one in wanted]
+        return read_table(self._session, name, runs, _ns(start), _ns(end))
+
+    def _run_of(self, channel: Channel, run: str | None) -> str | None:
+        if not channel.is_derived:
+            if run is not None:
+                raise IpsysError(f"channel {channel.name} was recorded: it belongs to no run")
+            return None
+        name = run or newest_run(self._session, channel)
+        if name is None or not self._session.topics(channel, name):
+            known = [one for one in sorted(self._session.run_names()) if self._session.topics(channel, one)]
+            which = f"run {run} has no {channel.name}" if run else f"no run has {channel.name}"
+            raise IpsysError(f"{self._session}: {which} (it is in: {', '.join(known) or 'none'})")
+        return name
+
+
+def _channel_named(name: str) -> Channel:
+    found = next((channel for channel in CHANNELS if channel.name == name), None)
+    if found is None:
+        raise IpsysError(f"there is no channel {name!r}; use one of {', '.join(c.name for c in CHANNELS)}")
+    return found
+
+
+def _ns(time: Time | None) -> int | None:
+    if time is None or isinstance(time, int):
+        return time
+    if time.tzinfo is None:
+        raise IpsysError(f"{time}: a time needs a time zone, for example datetime.now(timezone.utc)")
+    whole = int(time.replace(microsecond=0).timestamp())
+    return whole * 1_000_000_000 + time.microsecond * 1_000
+
+
+def open(*paths: StrPath) -> Log:
+    """Open logs, read as one in log order.
+
+    Raises
+    ------
+    IpsysError
+        A file is missing, damaged, or no MCAP log.
+
+    Examples
+    --------
+    >>> with open("sample_logs/small_lab.mcap") as log:  # doctest: +SKIP
+    ...     log.cameras
+    """
+    return Log(*paths)
+
+
+@dataclass(frozen=True, slots=True)
+class Evaluated:
+    """The evaluation of a model: its errors on held-out and cross-validated calibration points."""
+
+    model: str
+    run: str
+    evaluation: Evaluation
+
+    def to_frame(self) -> pd.DataFrame:
+        """Return the errors as a table: a row for each camera ("" for all), scheme and dimension."""
+        import pandas as pd
+
+        rows = [
+            {
+                "camera": one.camera,
+                "scheme": one.scheme or "held_out",
+                "against": one.against,
+                "dimensions": name,
+            }
+            | {key: getattr(errors, key) for key in ErrorStatistics.__slots__}
+            for one in self.evaluation.cameras
+            for name, errors in (("3d", one.error_3d), ("2d", one.error_2d))
+            if errors is not None
+        ]
+        return pd.DataFrame(rows)
+
+
+@dataclass(frozen=True, slots=True)
+class Replayed:
+    """The result of a replay: an outcome for each stage, and by model its evaluation."""
+
+    outcomes: tuple[Outcome, ...]
+    evaluations: Mapping[str, Evaluated]
+
+
+def replay(
+    *paths: StrPath,
+    models: Iterable[str] = (),
+    until: str | None = None,
+    rig: Rig | StrPath | None = None,
+    calibrations: Mapping[str, CameraCalibration] | None = None,
+    model_from: StrPath | None = None,
+    output: StrPath | None = None,
+    run: str | None = None,
+    corners: str | None = None,
+    method: str = "perimeter",
+    train: str = "train",
+    seed: int = 0,
+    as_live: bool = False,
+    skip_ambiguous: bool = False,
+    parameters: Mapping[str, str] | None = None,
+    progress: Progress = lambda stage, done, total: None,
+    say: Callable[[str], None] = lambda text: None,
+) -> Replayed:
+    """Compute what logs lack, and append it to the last one or write it to ``output``.
+
+    Parameters
+    ----------
+    models : names of models, such as ``best``; none: ``poly``, or all of them to evaluate.
+    until : the last stage, such as ``detect`` or ``evaluate``; None: all stages.
+    rig, calibrations : in place of those of the log, as a new run; calibrations by camera.
+    model_from : another log, whose fitted model is applied and copied in.
+    run : name of the new run.
+    corners, method, train, seed, as_live, skip_ambiguous : as the options of ``ipsys replay``.
+    parameters : options of further stages, by name.
+    progress : called with the stage, the messages done and their total.
+    say : called with the runs that are out of date and computed again.
+
+    Raises
+    ------
+    IpsysError
+        The input has a fault that the user must correct.
+    """
+    from ipsys_log import pipeline
+    from ipsys_log.rig.file import load_rig
+
+    request = Request(
+        models=tuple(models),
+        rig=rig if rig is None or isinstance(rig, Rig) else load_rig(Path(rig)),
+        lenses=dict(calibrations or {}),
+        model_from=None if model_from is None else Path(model_from),
+        train=train,
+        seed=seed,
+        run=run,
+        corners=corners,
+        method=method,
+        as_live=as_live,
+        skip_ambiguous=skip_ambiguous,
+        parameters=dict(parameters or {}),
+    )
+    logs = [Path(path) for path in paths]
+    target = None if output is None else Path(output)
+    outcomes = pipeline.replay(logs, request, until, target, progress, say)
+    written = [target] if target is not None and target.exists() else []
+    with Session([*logs, *written]) as session:
+        return Replayed(tuple(outcomes), _evaluations(session, outcomes))
+
+
+def _evaluations(session: Session, outcomes: Sequence[Outcome]) -> dict[str, Evaluated]:
+    runs = dict.fromkeys(outcome.run for outcome in outcomes)
+    found: dict[str, Evaluated] = {}
+    for run in runs:
+        for evaluation in session.payloads(session.topics(EVALUATION, run)):
+            found[evaluation.model] = Evaluated(evaluation.model, run, evaluation)
+    return found
+
+
+def verify(
+    *paths: StrPath,
+    run: str | None = None,
+    progress: Progress = lambda stage, done, total: None,
+    say: Callable[[str], None] = lambda text: None,
+) -> list[Comparison]:
+    """Repeat the runs of logs from their recorded input, and compare each channel byte for byte.
+
+    Returns
+    -------
+    One comparison for each derived channel; its ``equal`` is the result.
+
+    Raises
+    ------
+    IpsysError
+        There is no such run, or nothing of it can be verified.
+    """
+    from ipsys_log.runs.verify import verify as verify_runs
+
+    return verify_runs([Path(path) for path in paths], run, progress, say)
+
+
+class FittedModel:
+    """A fitted model of a log, ready to be applied.
+
+    Attributes
+    ----------
+    name : in the table of models.
+    cameras : names of the cameras that it knows.
+    """
+
+    def __init__(self, model: Model) -> None:
+        self.name = model.name
+        self.cameras = tuple(camera.camera for camera in model.cameras)
+        self._applied = {camera.camera: AppliedModel(model.name, camera) for camera in model.cameras}
+
+    def __repr__(self) -> str:
+        return f"<FittedModel {self.name} of {', '.join(self.cameras)}>"
+
+    def predict(self, camera: str, points_m: ArrayLike, heights_m: ArrayLike = 0.0) -> Array:
+        """Return world points (n, 3) in m.
+
+        Parameters
+        ----------
+        camera : the camera that saw the markers.
+        points_m : camera points (n, 3) in m.
+        heights_m : heights of the markers above the floor (n,) in m; only some models read them.
+
+        Raises
+        ------
+        IpsysError
+            The model does not know the camera, or the points have another shape.
+        """
+        points = np.asarray(points_m, dtype=np.float64)
+        if points.ndim != 2 or points.shape[1] != 3:
+            raise IpsysError(f"points_m has the shape {points.shape}; give camera points (n, 3) in m")
+        if camera not in self._applied:
+            raise IpsysError(
+                f"the model {self.name} has no camera {camera!r} (it has {', '.join(self.cameras)})"
+            )
+        heights = np.broadcast_to(np.asarray(heights_m, dtype=np.float64), (len(points),))
+        return self._applied[camera].predict(points, heights)
+
+
+def load_model(path: StrPath, name: str | None = None) -> FittedModel:
+    """Load the newest fitted model of a log.
+
+    Parameters
+    ----------
+    name : in the table of models, such as ``best``; None: the newest of all.
+
+    Raises
+    ------
+    IpsysError
+        The log has no such model.
+    """
+    from ipsys_log.runs.select import fitted_in
+
+    with Session([Path(path)]) as session:
+        return FittedModel(fitted_in(session, name)[0])
+
+
+def calibrate(
+    *sources: StrPath,
+    board: str,
+    square_m: float = 0.03,
+    lens: str = "fisheye",
+    marker_scale: float = 0.75,
+    dictionary: str = "DICT_4X4_50",
+    inverted: bool = False,
+    cameras: Sequence[str] = (),
+    force: bool = False,
+    progress: Progress = lambda stage, done, total: None,
+) -> Iterator[Calibrated | Failure]:
+    """Calibrate camera intrinsics from images of a chessboard or a ChArUco board.
+
+    Parameters
+    ----------
+    sources : logs, folders, image files or videos.
+    board : inner corners of a chessboard as ``6x4``, or squares of a ChArUco board as ``charuco:4x5``.
+    square_m : side of a square in m.
+    lens : ``fisheye`` or another lens model of ``ipsys calibrate``.
+    cameras : only these cameras of a log; or the name of the one camera of the other sources.
+    force : accept the stated board size, and poor results.
+
+    Yields
+    ------
+    A result for each camera as soon as it is ready; a failure says why a camera has none.
+
+    Raises
+    ------
+    IpsysError
+        A source cannot be read, or an option is not valid.
+    """
+    from ipsys_log.calibration.board import parse_board
+    from ipsys_log.calibration.calibrate import calibrate_cameras
+    from ipsys_log.calibration.images import find_sources
+    from ipsys_log.calibration.lens_models import find_lens
+
+    model = find_lens(lens)
+    wanted = parse_board(board, square_m, marker_scale, dictionary, inverted)
+    images = find_sources([Path(source) for source in sources], list(cameras))
+    return calibrate_cameras(images, wanted, model, progress, insist=force)
+
+
+class LiveTracks(NamedTuple):
+    """The tracks of one instant: the run of the model, the time in ns, and a track for each robot."""
+
+    run: str
+    time_ns: int
+    tracks: tuple[Track, ...]
+
+
+class Tracker:
+    """Live tracking. Iterate over the newest tracks; leaving the block ends the recording whole.
+
+    A context manager, made by :func:`live`.
+
+    Attributes
+    ----------
+    dropped : number of tracks that a slow loop missed.
+    outcomes : one for each stage, after the end.
+    """
+
+    name = "the tracker"
+
+    def __init__(self, track: Callable[[Tracker], list[Outcome]]) -> None:
+        self.dropped = 0
+        self.outcomes: tuple[Outcome, ...] = ()
+        self._stop_cameras: Callable[[], None] | None = None
+        self._newest: queue.SimpleQueue[LiveTracks | None] = queue.SimpleQueue()
+        self._fault: BaseException | None = None
+        self._begun = threading.Event()
+        self._stopped = False
+        self._thread = threading.Thread(target=self._run, args=(track,), name="tracker", daemon=True)
+
+    def __enter__(self) -> Tracker:
+        self._thread.start()
+        self._begun.wait()
+        if self._fault is not None:
+            raise self._fault
+        return self
+
+    def __exit__(
+        self, kind: type[BaseException] | None, error: BaseException | None, trace: TracebackType | None
+    ) -> None:
+        self.stop()
+        self._thread.join()
+        if self._fault is not None and error is None:
+            raise self._fault
+
+    def __iter__(self) -> Iterator[LiveTracks]:
+        while (tracks := self._newest.get()) is not None:
+            while (newer := self._take()) is not None:
+                self.dropped += 1
+                tracks = newer
+            yield tracks
+
+    def stop(self) -> None:
+        """Take no more frames; the iteration ends after the last tracks."""
+        self._stopped = True
+        if self._stop_cameras is not None:
+            self._stop_cameras()
+
+    def begin(self, stop_cameras: Callable[[], None]) -> None:
+        """Note that the cameras send; called by the pipeline."""
+        self._stop_cameras = stop_cameras
+        if self._stopped:
+            stop_cameras()
+        self._begun.set()
+
+    def consume(self, messages: Iterator[Message | None]) -> None:
+        """Take the tracks of the pipeline, as one of its sinks."""
+        for message in messages:
+            if message is not None and isinstance(message.payload, Tracks):
+                run = run_of_topic(message.topic) or ""
+                self._newest.put(LiveTracks(run, message.payload.timestamp, message.payload.tracks))
+
+    def _take(self) -> LiveTracks | None:
+        """Return tracks that wait already, if any. The end stays in the queue."""
+        try:
+            tracks = self._newest.get_nowait()
+        except queue.Empty:
+            return None
+        if tracks is None:
+            self._newest.put(None)
+        return tracks
+
+    def _run(self, track: Callable[[Tracker], list[Outcome]]) -> None:
+        try:
+            self.outcomes = tuple(track(self))
+        except BaseException as fault:
+            self._fault = fault
+        finally:
+            self._newest.put(None)
+            self._begun.set()
+
+
+def live(
+    rig: StrPath,
+    *,
+    record: StrPath,
+    model_from: StrPath,
+    models: Iterable[str] = (),
+    cameras: Sequence[str] = (),
+    calibrations: Mapping[str, CameraCalibration] | None = None,
+    corners: str | None = None,
+    method: str = "perimeter",
+    force: bool = False,
+    say: Callable[[str], None] = lambda text: None,
+) -> Tracker:
+    """Track robots with the cameras of a rig file, and record everything.
+
+    Parameters
+    ----------
+    rig : the rig file, ``lab.toml``.
+    record : the new log.
+    model_from : the log with the fitted models.
+    models : names of models; none: ``poly`` if there is one, else the newest.
+    cameras : only these cameras of the rig.
+    calibrations : in place of the intrinsics that the rig names, by camera.
+    corners, method : as the options of ``ipsys live``.
+    force : replace an existing log.
+    say : called with remarks.
+
+    Returns
+    -------
+    Tracker : enter it to open the cameras.
+
+    Raises
+    ------
+    IpsysError
+        On entering: the rig, a camera, an intrinsic calibration or a model has a fault.
+
+    Examples
+    --------
+    >>> with live("lab.toml", record="mon.mcap", model_from="cal.mcap") as tracker:  # doctest: +SKIP
+    ...     for tracks in tracker:
+    ...         print(tracks.time_ns, tracks.tracks)
+    """
+    request = Request(
+        models=tuple(dict.fromkeys(models)), model_from=Path(model_from), corners=corners, method=method
+    )
+
+    def track(tracker: Tracker) -> list[Outcome]:
+        from ipsys_log import pipeline
+        from ipsys_log.capture.devices import check_devices, check_sources, open_source
+        from ipsys_log.capture.frames import Clock
+        from ipsys_log.capture.live_plan import check_start
+        from ipsys_log.capture.multiplexer import Attached
+        from ipsys_log.capture.recorder import first_messages, fitting_lenses
+        from ipsys_log.exchange.lab_files import load_cameras, load_lenses
+
+        lab, wanted = load_cameras(Path(rig), cameras)
+        lenses = load_lenses(Path(rig), wanted, calibrations or {})
+        check_devices(wanted)
+        check_sources(wanted)
+        names = [camera.name for camera in wanted]
+        for line in check_start(lab, names, lenses, request, "fuse"):
+            say(line)
+        if Path(record).exists() and not force:
+            raise IpsysError(f"{record}: exists already; give another name, or force=True to overwrite it")
+        with Attached(wanted, open_source, Clock(), say) as attached:
+            sizes_px = {name: state.size_px for name, state in attached.states.items()}
+            settings = first_messages(lab, fitting_lenses(lenses, sizes_px, say), attached.now_ns)
+            tracker.begin(attached.stop)
+            return pipeline.live(attached, settings, Path(record), request, overwrite=force, sinks=[tracker])
+
+    return Tracker(track)

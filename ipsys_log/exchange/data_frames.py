@@ -1,0 +1,253 @@
+"""Channels as tables of pandas: one row for each marker, point, position or track."""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Mapping, Sequence
+from typing import TYPE_CHECKING, Any, NamedTuple
+
+import numpy as np
+from numpy.typing import NDArray
+
+from ipsys_log.errors import IpsysError
+from ipsys_log.log.codec import schema_name
+from ipsys_log.log.columns import Column, Columns, read_columns
+from ipsys_log.log.contents import camera_of_topic
+from ipsys_log.log.dataset import Session
+from ipsys_log.messages import CameraPoints, Event, Latency, Markers, Measurement, Message, Positions, Tracks
+from ipsys_log.messages.channels import (
+    CAMERA_POINTS,
+    EVENTS,
+    LATENCY,
+    MARKERS,
+    MEASUREMENTS,
+    POSITIONS,
+    TRACKS,
+    TRUTH,
+    Channel,
+)
+
+if TYPE_CHECKING:
+    import pandas as pd
+
+__all__ = ["TABLES", "read_table"]
+
+# The six different numbers of a covariance of x, y, z by their place in nine, row by row.
+_COVARIANCE = {"xx": 0, "xy": 1, "xz": 2, "yy": 4, "yz": 5, "zz": 8}
+_CORNERS = [f"{axis}{corner}_px" for corner in range(4) for axis in "xy"]
+_BATCH = 1 << 16  # messages that are read at once: more take memory, and are no faster
+
+_POINT = ("id", "x_m", "y_m", "z_m", "heading_rad", "covariance_m2")
+
+
+class _Table(NamedTuple):
+    """A table: its channel, the payload with the items, and the fields of an item in the order of columns."""
+
+    channel: Channel
+    payload: type
+    fields: tuple[str, ...]
+
+
+_ITEMS = {
+    "markers": _Table(MARKERS, Markers, ("id", "corners_px", "time_offset_ns", "edge_offset_px")),
+    "camera_points": _Table(CAMERA_POINTS, CameraPoints, (*_POINT, "time_offset_ns")),
+    "positions": _Table(POSITIONS, Positions, (*_POINT, "inside", "time_offset_ns")),
+    "tracks": _Table(TRACKS, Tracks, ("robot", *_POINT, "cameras", "inside")),
+    "truth": _Table(TRUTH, Tracks, ("robot", *_POINT)),
+}
+TABLES = (*_ITEMS, "measurements", "events", "latency")
+
+
+def read_table(
+    session: Session, name: str, runs: Sequence[str | None], start_ns: int | None, end_ns: int | None
+) -> pd.DataFrame:
+    """Read a channel as a table.
+
+    Parameters
+    ----------
+    name : one of :data:`TABLES`.
+    runs : to read; with several, a column names the run. None for a recorded channel.
+    start_ns, end_ns : log times; the end is not included.
+
+    Raises
+    ------
+    IpsysError
+        pandas is not installed, or there is no such table.
+    """
+    try:
+        import pandas as pd
+    except ModuleNotFoundError:
+        raise IpsysError("tables need pandas: pip install 'ipsys_log[table]'") from None
+    if name not in TABLES:
+        raise IpsysError(f"there is no table {name!r}; use one of {', '.join(TABLES)}")
+    if name in _ITEMS:
+        tables = [_item_table(pd, session, _ITEMS[name], run, start_ns, end_ns) for run in runs]
+    else:
+        channel, row = _ROWS[name]
+        messages = list(session.messages(session.topics(channel), start_ns, end_ns))
+        return _typed(pd, pd.DataFrame([_times(one) | row(one) for one in messages], columns=_COLUMNS[name]))
+    if len(runs) == 1:
+        return tables[0]
+    return pd.concat(
+        [table.assign(run=run) for run, table in zip(runs, tables, strict=True)], ignore_index=True
+    )
+
+
+def _item_table(
+    pd: Any, session: Session, table: _Table, run: str | None, start_ns: int | None, end_ns: int | None
+) -> pd.DataFrame:
+    topics = session.topics(table.channel, run)
+    parts: list[dict[str, Any]] = []
+    times: list[tuple[int, int]] = []
+    cameras: list[str | None] = []
+    encoded: list[bytes] = []
+
+    def flush() -> None:
+        if encoded or not parts:
+            columns = read_columns(schema_name(table.payload), encoded, table.fields)
+            parts.append(_part(columns, np.array(times, np.int64).reshape(-1, 2), cameras, table))
+        times.clear()
+        cameras.clear()
+        encoded.clear()
+
+    has_camera = "{camera}" in table.channel.topic
+    by_topic = {topic: camera_of_topic(topic) for topic in topics}
+    for topic, log_time_ns, publish_time_ns, data in session.encoded(topics, start_ns, end_ns):
+        times.append((publish_time_ns, log_time_ns))
+        if has_camera:
+            cameras.append(by_topic[topic])
+        encoded.append(data)
+        if len(encoded) == _BATCH:
+            flush()
+    flush()
+    joined = {name: np.concatenate([part[name] for part in parts]) for name in parts[0]}
+    return _typed(pd, pd.DataFrame(joined, copy=False))
+
+
+def _part(
+    columns: Columns, times_ns: NDArray[np.int64], cameras: Sequence[str | None], table: _Table
+) -> dict[str, Any]:
+    rows: dict[str, Any] = {
+        "time": times_ns[columns.message, 0],
+        "log_time_ns": times_ns[columns.message, 1],
+    }
+    if "{camera}" in table.channel.topic:
+        rows["camera"] = np.array(cameras, object)[columns.message]
+    for name in table.fields:
+        rows |= _EXPAND.get(name, _number)(name, columns.fields[name])
+    return rows
+
+
+def _number(name: str, column: Column) -> dict[str, Any]:
+    name = "marker_id" if name == "id" else name
+    if column.values.dtype == np.float64:
+        return {name: np.where(column.missing, np.nan, column.values)}
+    return {name: column.values}
+
+
+def _covariance(_: str, column: Column) -> dict[str, Any]:
+    rows = column.values if column.values.shape[1] == 9 else np.zeros((len(column.values), 9))
+    missing = column.missing | (column.values.shape[1] != 9)
+    return {
+        f"cov_{axes}_m2": np.where(missing, np.nan, rows[:, place]) for axes, place in _COVARIANCE.items()
+    }
+
+
+def _corners(_: str, column: Column) -> dict[str, Any]:
+    rows = column.values if column.values.shape[1] == 8 else np.full((len(column.values), 8), np.nan)
+    return {name: rows[:, place] for place, name in enumerate(_CORNERS)}
+
+
+def _optional_flag(name: str, column: Column) -> dict[str, Any]:
+    values = column.values.astype(object)
+    values[~column.missing] = column.values[~column.missing].astype(bool)
+    values[column.missing] = None
+    return {name: values}
+
+
+def _optional_integer(name: str, column: Column) -> dict[str, Any]:
+    values = column.values.astype(object)
+    values[column.missing] = None
+    return {name: values}
+
+
+_EXPAND: dict[str, Callable[[str, Column], dict[str, Any]]] = {
+    "covariance_m2": _covariance,
+    "corners_px": _corners,
+    "inside": _optional_flag,
+    "time_offset_ns": _optional_integer,
+}
+_TIMES = ("time", "still_start", "still_end", "received", "detected", "located", "fused", "published")
+_INTEGERS = ("time_offset_ns",)
+
+
+def _typed(pd: Any, table: pd.DataFrame) -> pd.DataFrame:
+    """Give the columns of a table their types: times are of UTC, missing values NaN or NA."""
+    for name in _TIMES:
+        if name in table:
+            times = pd.to_datetime(table[name], unit="ns", utc=True)
+            table[name] = times.astype("datetime64[ns, UTC]")
+    for name in ("camera", "robot"):
+        if name in table:
+            table[name] = table[name].astype("category")
+    if "inside" in table:
+        table["inside"] = table["inside"].astype("boolean")
+    for name in _INTEGERS:
+        if name in table:
+            table[name] = table[name].astype("Int64")
+    if "marker_id" in table and table["marker_id"].dtype == object:
+        table["marker_id"] = table["marker_id"].astype("Int64")
+    return table
+
+
+def _times(message: Message) -> dict[str, Any]:
+    return {"time": message.publish_time_ns, "log_time_ns": message.log_time_ns}
+
+
+def _measurement(message: Message) -> dict[str, Any]:
+    measurement: Measurement = message.payload
+    point = measurement.point
+    return {
+        "id": measurement.id,
+        "marker_id": measurement.marker_id,
+        "side": measurement.side,
+        "height_m": measurement.height_m,
+        "x_m": None if point is None else point.x_m,
+        "y_m": None if point is None else point.y_m,
+        "z_m": None if point is None else point.z_m,
+        "still_start": None if measurement.still is None else measurement.still.start,
+        "still_end": None if measurement.still is None else measurement.still.end,
+        "distances_m": {one.reference: one.distance_m for one in measurement.distances},
+        "splits": measurement.splits,
+        "withdraws": measurement.withdraws,
+    }
+
+
+def _event(message: Message) -> dict[str, Any]:
+    event: Event = message.payload
+    return {
+        "kind": event.kind,
+        "camera": event.camera,
+        "marker_id": event.marker_id,
+        "text": event.text,
+    }
+
+
+def _latency(message: Message) -> dict[str, Any]:
+    latency: Latency = message.payload
+    names = ("camera", "received", "detected", "located", "fused", "published")
+    return {name: getattr(latency, name) for name in names}
+
+
+_ROWS: Mapping[str, tuple[Channel, Callable[[Message], dict[str, Any]]]] = {
+    "measurements": (MEASUREMENTS, _measurement),
+    "events": (EVENTS, _event),
+    "latency": (LATENCY, _latency),
+}
+_COLUMNS = {
+    "measurements": [
+        *("time", "log_time_ns", "id", "marker_id", "side", "height_m", "x_m", "y_m", "z_m"),
+        *("still_start", "still_end", "distances_m", "splits", "withdraws"),
+    ],
+    "events": ["time", "log_time_ns", "kind", "camera", "marker_id", "text"],
+    "latency": ["time", "log_time_ns", "camera", "received", "detected", "located", "fused", "published"],
+}

@@ -1,0 +1,73 @@
+"""The cameras of a lab: those of the rig file, with their intrinsics."""
+
+from __future__ import annotations
+
+from collections.abc import Collection, Mapping, Sequence
+from pathlib import Path
+
+from ipsys_log.capture.simulated import lens_of
+from ipsys_log.errors import IpsysError
+from ipsys_log.exchange.calibration_files import read_lens
+from ipsys_log.messages import CameraCalibration, Rig, RigCamera
+from ipsys_log.rig.file import load_rig
+from ipsys_log.stages.detect import marker_detector
+
+__all__ = ["load_cameras", "load_lenses"]
+
+
+def load_cameras(path: Path, only: Collection[str] = ()) -> tuple[Rig, list[RigCamera]]:
+    """Return the rig of a file, and its cameras that have a source, or ``only`` some.
+
+    Raises
+    ------
+    IpsysError
+        The rig has no such camera, or no camera with a source.
+    """
+    rig = load_rig(path)
+    marker_detector(rig.dictionary)  # a bad name is an error now, not at the first frame
+    known = {camera.name: camera for camera in rig.cameras}
+    for name in only:
+        if name not in known:
+            raise IpsysError(
+                f"--camera {name}: {path} has no such camera (it has {', '.join(known) or 'none'})"
+            )
+    cameras = [camera for camera in rig.cameras if (camera.name in only if only else camera.source)]
+    for camera in cameras:
+        if camera.source is None:
+            raise IpsysError(
+                f'{path}: camera {camera.name} has no source, such as source = "usb:/dev/video0"'
+            )
+    if not cameras:
+        raise IpsysError(
+            f'{path}: no camera has a source; give each one, such as source = "usb:/dev/video0" '
+            "(see 'ipsys cameras')"
+        )
+    return rig, cameras
+
+
+def load_lenses(
+    path: Path, cameras: Sequence[RigCamera], given: Mapping[str, CameraCalibration], read: bool = True
+) -> dict[str, CameraCalibration]:
+    """Return the intrinsics of cameras: the given ones, else those of the files that the rig names.
+
+    Parameters
+    ----------
+    path : of the rig file; names of files are relative to its folder.
+    read : read the files; without it, only the given intrinsics are returned.
+
+    Raises
+    ------
+    IpsysError
+        A file cannot be read, or intrinsics are given for another camera.
+    """
+    names = [camera.name for camera in cameras]
+    lenses = dict(given)
+    for camera in cameras if read else ():
+        if camera.name not in lenses and camera.calibration is not None:
+            lenses[camera.name] = read_lens(path.parent / camera.calibration, camera.name)
+        elif camera.name not in lenses and str(camera.source).startswith("sim:"):
+            lenses[camera.name] = lens_of(camera)
+    unknown = sorted(set(lenses) - set(names))
+    if unknown:
+        raise IpsysError(f"--calibration {unknown[0]}: no such camera is recorded (only {', '.join(names)})")
+    return lenses

@@ -24,6 +24,7 @@ BENCHMARKS = {
     "live": "recording and tracking of streams on loopback: drops, processor time, latency",
     "log_write": "recording and small messages, beside mcap and foxglove-sdk",
     "log_read": "reading, beside mcap",
+    "table": "a channel as a table, beside decoding its messages",
     "startup": "ipsys --help and ipsys info",
 }
 

@@ -1,0 +1,82 @@
+"""Docstrings and comments are plain English: no sentence begins with a relative clause."""
+
+from __future__ import annotations
+
+import ast
+import io
+import re
+import tokenize
+from collections.abc import Iterator
+from pathlib import Path
+
+import pytest
+
+from tests.conftest import ROOT
+
+# Such a sentence has no subject that a reader meets first; with a question mark it is a question.
+_OPENING = re.compile(r"(?:^|[.;:!?]\s+)(Who|What|Whether|Where|Of|That which)\b(?![^.]*\?)")
+# Phrases of an earlier dialect; docs/glossary.md has the standard terms.
+_PHRASES = (
+    "lies still",
+    "lie still",
+    "lay still",
+    "measured place",
+    "places held out",
+    "how far it is off",
+    "of what cameras send",
+    "was not looked at",
+    "were not looked at",
+    "how a camera hangs",
+)
+_FILES = sorted([*ROOT.glob("ipsys_log/**/*.py"), *ROOT.glob("benchmarks/*.py")])
+
+
+def sentences(source: str) -> Iterator[tuple[int, str]]:
+    """Yield the docstrings and comments of a source, each with its line."""
+    for node in ast.walk(ast.parse(source)):
+        if isinstance(node, ast.Module | ast.ClassDef | ast.FunctionDef | ast.AsyncFunctionDef):
+            text = ast.get_docstring(node)
+            if text:
+                yield getattr(node, "lineno", 1), text
+    lines: list[tuple[int, str]] = []
+    for token in tokenize.generate_tokens(io.StringIO(source).readline):
+        if token.type == tokenize.COMMENT:
+            lines.append((token.start[0], token.string.lstrip("# ")))
+    for number, (line, text) in enumerate(lines):
+        follows = number and lines[number - 1][0] == line - 1
+        if not follows:
+            yield line, text
+
+
+def faults(source: str) -> list[str]:
+    found = []
+    for line, text in sentences(source):
+        plain = re.sub(r"``.*?``|>>> .*", "x", text)
+        for paragraph in re.split(r"\n\s*\n", plain):
+            opening = _OPENING.search(" ".join(paragraph.split()))
+            if opening:
+                found.append(f"line {line}: begins with {opening[1]!r}: {' '.join(paragraph.split())[:70]}")
+        found += [f"line {line}: {phrase!r}" for phrase in _PHRASES if phrase in plain.lower()]
+    return found
+
+
+@pytest.mark.parametrize("path", _FILES, ids=[str(path.relative_to(ROOT)) for path in _FILES])
+def test_docstrings_and_comments_are_plain(path: Path) -> None:
+    assert faults(path.read_text(encoding="utf-8")) == []
+
+
+@pytest.mark.parametrize(
+    "source",
+    [
+        '"""What is recorded."""',
+        "x = 1  # Who asks for more has read it.",
+        'def f():\n    """Return it. Of these, one is right."""',
+        '"""Return where a marker lies still."""',
+    ],
+)
+def test_the_guard_sees_a_fault(source: str) -> None:
+    assert faults(source)
+
+
+def test_questions_and_code_are_no_fault() -> None:
+    assert faults('"""Return x. ``What`` is a name. Is it right? What then?"""') == []

@@ -86,13 +86,15 @@ def test_no_calibration_for_a_camera(ipsys: Ipsys, lab: Path) -> None:
     refused(ipsys, log, "replay", log, "-o", log.with_name("out.mcap"))
 
 
-def test_a_calibration_of_another_size(ipsys: Ipsys, lab: Path) -> None:
+@pytest.mark.parametrize("corners", ["edges", "stock"])
+def test_a_calibration_of_another_size(ipsys: Ipsys, lab: Path, corners: str) -> None:
     def wider(message: Message) -> Message:
         if message.topic == "/cameras/red/calibration":
             return replace(message, payload=replace(message.payload, width=1920, height=1080))
         return message
 
-    line = refused(ipsys, lab, "replay", rewrite(lab, wider), "-o", lab.with_name("out.mcap"))
+    log = rewrite(lab, wider)
+    line = refused(ipsys, log, "replay", log, "--corners", corners)  # and leaves no run behind
     assert "camera red: its frames are 960 x 540 px, its calibration is for 1920 x 1080" in line
 
 

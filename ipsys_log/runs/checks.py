@@ -3,15 +3,18 @@
 from __future__ import annotations
 
 from collections.abc import Collection, Sequence
+from contextlib import suppress
 from dataclasses import replace
 from pathlib import Path
 
 from ipsys_log.analysis.calibration_points import measured, split_ids
 from ipsys_log.analysis.tape import world_point
-from ipsys_log.errors import FitError, IpsysError
-from ipsys_log.geometry.lenses import check_calibration
+from ipsys_log.errors import FitError, FrameError, IpsysError
+from ipsys_log.geometry.lenses import check_calibration, check_size
+from ipsys_log.images.decode import decode_grey
 from ipsys_log.log.contents import camera_of_topic
 from ipsys_log.log.dataset import Session
+from ipsys_log.messages import CompressedImage, RawImage
 from ipsys_log.messages.channels import (
     CAMERA_POINTS,
     EVALUATION,
@@ -57,6 +60,8 @@ def check_inputs(
             _check_lenses(session, request, cameras)
         if request.corners != "stock" or CAMERA_POINTS in written:
             _check_distortion(session, request, cameras)
+        if CAMERA_POINTS in written:
+            _check_sizes(session, request)
         if MODEL in written and request.model_from is None:
             _check_measurements(session, request, models)
         if POSITIONS in written:
@@ -160,6 +165,19 @@ def _check_distortion(session: Session, request: Request, cameras: set[str]) -> 
         first = None if topic is None else next(iter(session.messages([topic])), None)
         if first is not None:
             check_calibration(replace(first.payload, frame_id=name), f"{session}: {topic}")
+
+
+def _check_sizes(session: Session, request: Request) -> None:
+    """Check that calibrations have the size of the images; else detection would be done in vain."""
+    for name, topic in session.images.items():
+        stored = [session.calibrations[name]] if name in session.calibrations else []
+        lens = request.lenses.get(name) or next((m.payload for m in session.messages(stored)), None)
+        first = next(iter(session.messages([topic])), None)
+        if lens is None or first is None or not isinstance(first.payload, (CompressedImage, RawImage)):
+            continue  # a frame of a video has no size by itself
+        with suppress(FrameError):  # a corrupt frame is an event
+            height, width = decode_grey(first.payload).shape
+            check_size(lens, width, height, name)
 
 
 def _check_measurements(session: Session, request: Request, models: Sequence[str]) -> None:

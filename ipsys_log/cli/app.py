@@ -158,7 +158,7 @@ app = typer.Typer(
     help="Indoor positioning with cheap cameras and ArUco markers. Everything is a channel in an MCAP log: "
     "replay it, compare models on it, look at it.",
     epilog="The help of a command ends with examples: ipsys record --help. To try all of it without a "
-    "camera: ipsys init lab.toml --simulated.",
+    "camera: ipsys init lab.toml --simulated. docs/glossary.md explains the terms.",
     no_args_is_help=True,
     add_completion=False,
     pretty_exceptions_enable=False,

@@ -20,7 +20,6 @@ from ipsys_log.cli.options import (
     log_option,
 )
 from ipsys_log.cli.stages import derived
-from ipsys_log.messages.channels import CAMERA_POINTS, MARKERS, RIG
 
 if TYPE_CHECKING:
     from ipsys_log.report.alignment import AlignedLab
@@ -107,6 +106,7 @@ def _prepared_now(
 
 def _align(logs: list[Path], options: dict[str, Any], plot: Path | None, as_json: bool) -> None:
     from ipsys_log.log.dataset import Session
+    from ipsys_log.messages.channels import CAMERA_POINTS, MARKERS, RIG
     from ipsys_log.report.alignment import read_alignment
     from ipsys_log.rig.file import load_rig
     from ipsys_log.runs.provenance import newest_run

@@ -13,7 +13,6 @@ import typer
 from ipsys_log.cli.console import console, remarks
 from ipsys_log.cli.options import AsJson, Calibrations, Logs, RigFile, cameras_of, load_calibrations
 from ipsys_log.cli.stages import derived
-from ipsys_log.messages.channels import RIG
 
 if TYPE_CHECKING:
     from rich.table import Table
@@ -66,6 +65,7 @@ def plan(
 
     A model that the log does not hold yet is fitted first, to the places measured so far.
     """
+    from ipsys_log.messages.channels import RIG
     from ipsys_log.report.files import check_picture
     from ipsys_log.report.plan import plan_floor
     from ipsys_log.rig.file import load_rig
@@ -108,6 +108,7 @@ def _check(logs: list[Path], rig: Rig | None, model: str, places: int, heights_m
     from ipsys_log.analysis.calibration_points import measured
     from ipsys_log.errors import IpsysError
     from ipsys_log.log.dataset import Session
+    from ipsys_log.messages.channels import RIG
     from ipsys_log.runs.select import copied_run
     from ipsys_log.runs.view import LogView
 

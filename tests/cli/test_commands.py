@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import json
 import subprocess
+import sys
 from dataclasses import fields
 from pathlib import Path
 
@@ -145,3 +146,14 @@ def test_runs_say_where_they_come_from(ipsys: Ipsys, lab: Path) -> None:
     assert all(row["hash"] and row["messages"] for row in runs["detect"]["inputs"])
     assert runs["locate"]["input_runs"] == ["edges", "poly"]
     assert {"numpy", "opencv-python-headless", "blas", "python"} <= set(runs["fit"]["fingerprint"])
+
+
+def test_help_imports_no_heavy_library() -> None:
+    """The help and the completion of a shell are there at once."""
+    program = (
+        "import sys, ipsys_log.cli.app; print(sorted({'numpy', 'cv2', 'rerun', 'mcap'} & sys.modules.keys()))"
+    )
+    done = subprocess.run(
+        [sys.executable, "-c", program], cwd=ROOT, capture_output=True, text=True, check=True, timeout=120
+    )
+    assert done.stdout.strip() == "[]"

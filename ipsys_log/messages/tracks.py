@@ -20,7 +20,7 @@ __all__ = [
 
 @dataclass(frozen=True, slots=True, eq=False)
 class Position:
-    """A marker in the world, as one camera has it; ``inside`` the volume of the measured places or not."""
+    """The world position of a marker by one camera; is it ``inside`` the volume of the calibration points?"""
 
     id: int
     x_m: float
@@ -40,7 +40,7 @@ class Positions:
 
 @dataclass(frozen=True, slots=True, eq=False)
 class Track:
-    """A robot in the world, from all the cameras that saw it."""
+    """The world position of a robot from all cameras that saw it."""
 
     robot: str
     id: int

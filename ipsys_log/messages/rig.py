@@ -23,8 +23,8 @@ class RigCamera:
 
     ``row_time_ns`` lies between the exposures of two rows. ``edge_offset_px`` is the distance by which edges
     of black lie too far inside the black. ``source`` is the source of the frames; ``width`` to ``gain`` are
-    the requested camera settings. ``stamp`` is the meaning of the driver's time: ``start`` of the exposure of the
-    first row or ``end`` of the frame. ``latency_ns`` is the delay of the stamp after that instant.
+    the requested camera settings. ``stamp`` is the meaning of the driver's time: ``start`` of the exposure of
+    the first row or ``end`` of the frame. ``latency_ns`` is the delay of the stamp after that instant.
     ``calibration`` names the file of its intrinsics.
     """
 

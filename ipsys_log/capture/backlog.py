@@ -32,7 +32,7 @@ _DECODED = 30
 class Waiting:
     """A queue of frames, with a limit for each camera. For one thread, or under a lock.
 
-    Of JPEG images, the oldest is skipped. Later frames of a video need the earlier ones: the oldest frame is
+    For JPEG images, the oldest is skipped. Later frames of a video need the earlier ones: the oldest frame is
     still decoded, which takes half of the time, and not searched. If this is too slow as well, all frames up
     to the next keyframe are skipped.
     """

@@ -184,7 +184,7 @@ class Session:
         return sum(r.channels[topic].message_count for r in self.readers if topic in r.channels)
 
     def hash(self, topic: str) -> str:
-        """Return the hash of a channel's messages, independent of the file; one hash for each of several files."""
+        """Return the hash of a channel's messages, independent of file names; one hash for each file."""
         parts = [r for r in self.readers if len(_times(r, topic))]
         # The order is that of their times, not that of the command line.
         return "+".join(r.channel_hash(topic) for r in sorted(parts, key=lambda r: int(_times(r, topic)[0])))

@@ -54,7 +54,7 @@ __all__ = [
 
 
 class OtherContentError(Exception):
-    """Error: a run contains a message that its stage does not make from the log."""
+    """The error of a run that contains a message that its stage does not make from the log."""
 
 
 def cut_short(session: Session, target: Path, task: Task, run: str) -> dict[str, int]:

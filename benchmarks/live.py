@@ -2,8 +2,8 @@
 
     python benchmarks/live.py --record-seconds 60 --live-seconds 30
 
-FFmpeg serves JPEGs of the simulated lab, 1920 x 1080 at 30/s and about 300 kB, from loopback as HTTP MJPEG,
-one process for each camera; a remark names a stream that never comes. ``ipsys record`` and ``ipsys live``
+FFmpeg serves JPEGs of the simulated lab, 1920 x 1080 at 30/s and about 300 kB, from loopback as HTTP MJPEG.
+Each camera has one process; a remark names a stream that never comes. ``ipsys record`` and ``ipsys live``
 run as for a user; their processor time is that of the whole process, with its start. Then the number of
 cameras of a recording increases until a camera loses frames; the same cores serve their streams.
 """

@@ -10,7 +10,8 @@ same way; :func:`measure` writes only the measurements with their frames.
 stage           reads               writes            its run is named after
 ==============  ==================  ================  =====================================
 detect          frames              markers           the corner method, ``edges``
-camera-frame    markers, lenses     camera points     the run of its markers
+camera-frame    markers,            camera points     the run of its markers
+                intrinsics
 fit             camera points,      model             the model, ``poly``
                 measurements
 evaluate        the same, model     evaluation        the run of its model

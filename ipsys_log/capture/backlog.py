@@ -81,7 +81,7 @@ class Waiting:
         return [*gone, late]
 
     def _jump(self, camera: str | None) -> list[Message]:
-        """If too many frames wait, go on with the newest or next keyframe; return the skipped frames."""
+        """Skip frames up to the newest or the next keyframe, if too many wait; return them."""
         mine = self._of(camera)
         if len(mine) <= _DECODED:
             return []

@@ -25,8 +25,8 @@ __all__ = ["LivePlan", "check_model", "check_pictures", "check_start", "plan_liv
 class LivePlan(NamedTuple):
     """The plan of a live run.
 
-    It has the completed request, the models of another log with the tasks that copy them in, the runs in the
-    order of their records, and the causal stages.
+    It has the completed request, and the models of another log with the tasks that copy them. It also has the
+    runs in the order of their records, and the causal stages.
     """
 
     request: Request

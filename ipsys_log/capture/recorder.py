@@ -139,7 +139,7 @@ class Recording:
             raise IpsysError(what_failed(self._writer.path, self.fault)) from self.fault
 
     def settle(self) -> bool:
-        """Prevent further writes from all threads; return False if a thread is in the middle of a write."""
+        """Prevent further writes from all threads; return False if a thread is still writing."""
         return self._lock.acquire(timeout=_SETTLE_S) and not self._torn
 
     def _write(self, write: Callable[[], None]) -> None:

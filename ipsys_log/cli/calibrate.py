@@ -132,8 +132,8 @@ def calibrate(
     if lab is not None:
         _targets(lab.names, output, names, force)
     with nullcontext(sources or []) if lab is None else _taken_now(lab, seconds) as taken:
-        pictures_by_camera = find_sources(taken, camera or [])
-        targets = _targets([pictures.camera for pictures in pictures_by_camera], output, names, force)
+        image_sources = find_sources(taken, camera or [])
+        targets = _targets([pictures.camera for pictures in image_sources], output, names, force)
         with progress_bar() as progress:
             outcomes: list[Calibrated | Failure] = []
             for outcome in api.calibrate(

@@ -103,25 +103,25 @@ def _ask_distances(rig: Rig, distances: dict[str, str]) -> dict[str, str]:
 
 def _ask_side(question: str, usual: str) -> str:
     while True:
-        given = answer(question, usual)
-        if given.lower() in _SIDES:
-            return _SIDES[given.lower()]
-        _complain([f"{given!r} is no side; type l or r" if given else "type l or r"])
+        typed = answer(question, usual)
+        if typed.lower() in _SIDES:
+            return _SIDES[typed.lower()]
+        _complain([f"{typed!r} is no side; type l or r" if typed else "type l or r"])
 
 
 def _ask(question: str, field: str, usual: str, read: Read) -> str:
     """Ask until an answer is valid for a field; ask once more if the answer is doubtful."""
     while True:
-        given = answer(question, usual)
-        entry, faults = read(given)
+        typed = answer(question, usual)
+        entry, faults = read(typed)
         wrong = [fault.text for fault in faults if fault.field == field]
         if wrong:
             _complain(wrong)
-        elif entry.doubts and given != usual:
+        elif entry.doubts and typed != usual:
             _complain(entry.doubts, "yellow")
-            usual = given
+            usual = typed
         else:
-            return given
+            return typed
 
 
 def _complain(texts: Sequence[str], style: str = "red") -> None:

@@ -83,16 +83,11 @@ def _check_versions(
 
 def _check_run_name(session: Session, request: Request, until: Stage) -> None:
     """Check that the run name of the user is not that of a run that is out of date."""
-    for recorded in recorded_stages(session) if request.run is not None else ():
-        stage = stage_named(recorded.run.stage)
-        if (
-            recorded.run.run == request.run
-            and recorded.out_of_date
-            and stage
-            and has_given_name(stage, until)
-        ):
+    for entry in recorded_stages(session) if request.run is not None else ():
+        stage = stage_named(entry.run.stage)
+        if entry.run.run == request.run and entry.out_of_date and stage and has_given_name(stage, until):
             raise IpsysError(
-                f"run {request.run} already has the stage {recorded.run.stage}, which is {recorded.state}; "
+                f"run {request.run} already has the stage {entry.run.stage}, which is {entry.state}; "
                 "use another --run name"
             )
 

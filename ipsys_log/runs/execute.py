@@ -66,10 +66,8 @@ def cut_short(session: Session, target: Path, task: Task, run: str) -> dict[str,
     if signed or task.step is None or not session.topics(task.stage.writes[0], run):
         return {}
     topics = [topic for channel in task.stage.writes for topic in session.topics(channel, run)]
-    topics_of_target = {
-        topic for reader in session.readers if reader.path == target for topic in reader.channels
-    }
-    return {topic: session.count(topic) for topic in topics} if topics_of_target.issuperset(topics) else {}
+    available = {topic for reader in session.readers if reader.path == target for topic in reader.channels}
+    return {topic: session.count(topic) for topic in topics} if available.issuperset(topics) else {}
 
 
 def without_held(session: Session, held: Collection[str], made: Iterable[Message]) -> Iterator[Message]:

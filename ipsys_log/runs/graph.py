@@ -1,7 +1,7 @@
 """The graph of stages: one table of their rows, and the plan of each on a log.
 
-Adding a stage takes a file with its row in :mod:`ipsys_log.stages`, a line in :data:`STAGES` and, for a new
-channel, a line in the table of :mod:`ipsys_log.messages.channels`.
+A new stage needs a file with its row in :mod:`ipsys_log.stages`, and a line in :data:`STAGES`. A new channel
+needs a line in the table of :mod:`ipsys_log.messages.channels`.
 """
 
 from __future__ import annotations
@@ -114,7 +114,7 @@ class Task:
     topics : the topics that it reads from the log; ``foreign`` are the topics from another log.
     inputs : by derived channel, the run that it reads.
     parameters : all other settings on which its result depends; ``input_runs`` are the runs of ``foreign``.
-    rig, lenses : set where they replace those of the log.
+    rig, lenses : set if they replace those of the log.
     """
 
     stage: Stage

@@ -44,7 +44,8 @@ def verify(
 
     A model that was copied from another log cannot be repeated, and neither can its evaluation; results made
     with it can. A model cannot be repeated if measurements were added or withdrawn since. Results of another
-    version are not repeated either; a remark says so. Later stages are repeated from the recorded channels.
+    version are not repeated either; a remark reports this. Later stages are repeated from the recorded
+    channels.
 
     Parameters
     ----------

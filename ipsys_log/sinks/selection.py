@@ -50,14 +50,12 @@ def choose_runs(session: Session, names: Sequence[str] = ()) -> Shown:
         No complete run has one of the names.
     """
     records = session.runs()
-    recorded = list(dict.fromkeys(record.run for record in records))
+    known = list(dict.fromkeys(record.run for record in records))
     for name in names:
-        if name not in recorded:
-            raise IpsysError(
-                f"{session}: there is no run {name!r} (there are: {', '.join(recorded) or 'none'})"
-            )
-    located = [run for run in recorded if session.topics(TRACKS, run) or session.topics(POSITIONS, run)]
-    marked = [run for run in recorded if session.topics(MARKERS, run)]
+        if name not in known:
+            raise IpsysError(f"{session}: there is no run {name!r} (there are: {', '.join(known) or 'none'})")
+    located = [run for run in known if session.topics(TRACKS, run) or session.topics(POSITIONS, run)]
+    marked = [run for run in known if session.topics(MARKERS, run)]
     if names:
         sources = _sources(records, names)
         markers = _newest(records, [run for run in marked if run in sources])

@@ -74,12 +74,12 @@ class CameraFrame:
         if frame.markers:
             rig, lens = self._settings(camera)
             seen: list[_Seen] = []
-            for seen_marker in _through_lens(frame.markers, rig, lens):
-                fault = self._fault(seen_marker, camera)
+            for sighting in _through_lens(frame.markers, rig, lens):
+                fault = self._fault(sighting, camera)
                 if fault is None:
-                    seen.append(seen_marker)
+                    seen.append(sighting)
                 else:
-                    yield Event(message.publish_time_ns, *fault, camera, seen_marker.marker.id)
+                    yield Event(message.publish_time_ns, *fault, camera, sighting.marker.id)
             points = self._method.place(seen, lens) if seen else []
         yield CameraPoints(message.publish_time_ns, tuple(points))
 
@@ -121,14 +121,11 @@ def _through_lens(markers: Sequence[Marker], rig: Rig, lens: CameraCalibration) 
 
 
 def _lens_slopes(seen: Sequence[_Seen], lens: CameraCalibration) -> Array:
-    return pixel_slopes(np.concatenate([seen_marker.uv for seen_marker in seen]), lens).reshape(-1, 4, 2, 2)
+    return pixel_slopes(np.concatenate([sighting.uv for sighting in seen]), lens).reshape(-1, 4, 2, 2)
 
 
 def _by_perimeter(seen: Sequence[_Seen], lens: CameraCalibration) -> list[CameraPoint]:
-    uv, lengths_m = (
-        np.stack([seen_marker.uv for seen_marker in seen]),
-        np.array([seen_marker.length_m for seen_marker in seen]),
-    )
+    uv, lengths_m = np.stack([s.uv for s in seen]), np.array([s.length_m for s in seen])
     places = zip(camera_point(uv, lengths_m).tolist(), heading(uv).tolist(), strict=True)
     covariances_m2 = _perimeter_covariances(seen, uv, lengths_m, lens)
     points = []
@@ -142,7 +139,7 @@ def _perimeter_covariances(
     seen: Sequence[_Seen], uv: Array, lengths_m: Array, lens: CameraCalibration
 ) -> dict[int, Array]:
     """Return covariances (3, 3) in m^2, by index, of the points whose corners have a covariance."""
-    covariances = {n: seen_marker.marker.covariance_px2 for n, seen_marker in enumerate(seen)}
+    covariances = {n: sighting.marker.covariance_px2 for n, sighting in enumerate(seen)}
     known = {n: covariance_px2 for n, covariance_px2 in covariances.items() if covariance_px2 is not None}
     if not known:
         return {}
@@ -155,12 +152,10 @@ def _perimeter_covariances(
 
 
 def _by_pose(seen: Sequence[_Seen], lens: CameraCalibration) -> list[CameraPoint]:
-    lengths_m = np.array([seen_marker.length_m for seen_marker in seen])
+    lengths_m = np.array([sighting.length_m for sighting in seen])
     whitening = _whitening(seen, _lens_slopes(seen, lens))
-    squares = fit_squares(np.stack([seen_marker.uv for seen_marker in seen]), whitening, lengths_m)
-    misses_px = reprojection_px(
-        squares, lengths_m, np.stack([seen_marker.marker.corners_px for seen_marker in seen]), lens
-    )
+    squares = fit_squares(np.stack([sighting.uv for sighting in seen]), whitening, lengths_m)
+    misses_px = reprojection_px(squares, lengths_m, np.stack([s.marker.corners_px for s in seen]), lens)
     points = []
     for n, (marker, _, _) in enumerate(seen):
         both = zip(squares.centres_m[n].tolist(), squares.rotations[n], misses_px[n].tolist(), strict=True)
@@ -177,12 +172,8 @@ def _by_pose(seen: Sequence[_Seen], lens: CameraCalibration) -> list[CameraPoint
 
 def _whitening(seen: Sequence[_Seen], lens_slopes: Array) -> Array:
     """Return matrices that turn changes of u0 v0 .. u3 v3 into eight numbers of variance 1, (n, 8, 8)."""
-    covariances_px2 = [seen_marker.marker.covariance_px2 for seen_marker in seen]
-    whitening = whiten(
-        np.stack(
-            [_USUAL_PX2 if covariance_px2 is None else covariance_px2 for covariance_px2 in covariances_px2]
-        )
-    )
+    covariances_px2 = [sighting.marker.covariance_px2 for sighting in seen]
+    whitening = whiten(np.stack([_USUAL_PX2 if c is None else c for c in covariances_px2]))
     by_corner = whitening.reshape(-1, 8, 4, 2).swapaxes(1, 2)
     by_marker: Array = (by_corner @ lens_slopes).swapaxes(1, 2).reshape(-1, 8, 8)
     return by_marker

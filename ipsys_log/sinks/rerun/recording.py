@@ -33,7 +33,8 @@ def viewer_command() -> list[str]:
     """Return the command of the viewer; it shows the recording from its standard input.
 
     The viewer also accepts connections, by default on all interfaces; this command limits it to this machine.
-    It needs a free port, because otherwise an open viewer is used, with any binding.
+    With a fixed port, an open viewer would get the recording, even if it listens on all interfaces. So the
+    command selects a free port.
     """
     return [sys.executable, "-m", "rerun", "--bind", "127.0.0.1", "--port", "auto", "-"]
 

@@ -89,7 +89,7 @@ def _contender(scene: Scene, finder: str, ranges: Sequence[tuple[int, int]]) -> 
 def score(found: Sequence[Found], known: Mapping[tuple[str, int], Truth]) -> dict[str, Any]:
     """Return the errors of corners against ground truth, and the share of whole markers that were detected.
 
-    An id without a marker in ground truth within 10 px is wrong; a second marker of an id is wrong too.
+    An id is wrong if ground truth has no such marker within 10 px, or if it was detected before.
     """
     off_px: list[float] = []
     wrong = seen = 0

@@ -37,7 +37,7 @@ class Contender:
 
 @dataclass(frozen=True, slots=True)
 class Spent:
-    """Wall time and processor time of all threads in s; number of page faults."""
+    """Wall time and processor time of all threads in s; number of minor page faults."""
 
     wall_s: float = 0.0
     cpu_s: float = 0.0

@@ -115,7 +115,7 @@ def _wait_for(port: int, program: subprocess.Popen[bytes], said: Path, end_s: fl
 
 
 def _listened_at(port: int) -> bool:
-    """Return True if a program listens at a port; the test does not disturb it, as it shares the address."""
+    """Return True if a program listens at a port; the test makes no connection."""
     with socket.socket() as probe:
         probe.setsockopt(socket.SOL_SOCKET, socket.SO_REUSEADDR, 1)
         try:

@@ -148,7 +148,7 @@ def record(
     IpsysError
         The log cannot be written; the messages before the error are complete in it.
     Exception
-        The error of the first failed consumer or sink. It is raised after the recording has ended.
+        The error of the first failed consumer or sink. It cannot end the recording, and is raised after it.
     """
     with Consumers(consumers, source.warn, sinks) as show, recording(target, settings, overwrite) as log:
         for arrived in written(source, log):

@@ -184,7 +184,10 @@ class Session:
         return sum(r.channels[topic].message_count for r in self.readers if topic in r.channels)
 
     def hash(self, topic: str) -> str:
-        """Return the hash of a channel's messages, independent of file names; one hash for each file."""
+        """Return the hash of a channel's messages, which does not depend on their file.
+
+        With several logs, it is the hash of each log, joined by "+".
+        """
         parts = [r for r in self.readers if len(_times(r, topic))]
         # The order is that of their times, not that of the command line.
         return "+".join(r.channel_hash(topic) for r in sorted(parts, key=lambda r: int(_times(r, topic)[0])))
@@ -309,7 +312,7 @@ class Session:
                 reader.check_number(sum(counts), kind)
 
     def _check_overlaps(self) -> None:
-        """Refuse logs that record the same camera or the same run at the same time."""
+        """Refuse logs that have the same run, or images of the same camera at the same time."""
         images = set(self.topics(IMAGES))
         first: dict[str, LogReader] = {}
         for reader in self.readers:

@@ -49,7 +49,7 @@ def contents_of(view: View) -> Contents:
         As :func:`~ipsys_log.log.summary.load_contents`.
     """
     known = _known.get()
-    if known is None or view.tail_fd >= 0:  # with a tail in a journal, the file size does not identify it
+    if known is None or view.tail_fd >= 0:  # with a tail in a journal, the file is not the whole log
         return load_contents(view)
     status = os.fstat(view.fd)
     last = known.get((status.st_dev, status.st_ino))

@@ -81,7 +81,10 @@ class Color:
 
 @dataclass(frozen=True, slots=True)
 class PointsAnnotation:
-    """Points of a drawing; ``type`` 2 is a closed line. Pixels count from the first pixel's corner."""
+    """Points of a drawing; ``type`` 2 is a closed line.
+
+    Pixels count from the corner of the first pixel, not its centre.
+    """
 
     timestamp: TimeNs
     type: int

@@ -20,7 +20,10 @@ __all__ = [
 
 @dataclass(frozen=True, slots=True, eq=False)
 class Position:
-    """The world position of a marker by one camera; is it ``inside`` the volume of the calibration points?"""
+    """The world position of a marker by one camera.
+
+    ``inside`` tells whether it lies in the volume of the calibration points; None if this is unknown.
+    """
 
     id: int
     x_m: float

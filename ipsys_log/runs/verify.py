@@ -111,7 +111,7 @@ def _is_of_other_version(one: Recorded, say: Callable[[str], None]) -> bool:
 
 
 def _unrecorded(session: Session, names: Collection[str]) -> list[Comparison]:
-    """Return a comparison for each channel of the runs that is in no record."""
+    """Return a comparison for each channel of the runs that no record names."""
     known = {output.topic for record in session.runs() for output in record.outputs}
     return [
         Comparison(topic, session.count(topic), 0, 0, 0, "no record says how it was made", 0)

@@ -184,7 +184,7 @@ def _vector(rotation: Array) -> Array:
 
 
 class _Method(NamedTuple):
-    """A method for camera points: does it accept four corners, and which points do the markers get?"""
+    """A method for camera points: its check of four corners, and its function for the points of a frame."""
 
     accepts: Callable[[Array], bool]
     place: Callable[[Sequence[_Seen], CameraCalibration], list[CameraPoint]]

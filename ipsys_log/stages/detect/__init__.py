@@ -209,7 +209,7 @@ class Detect:
 
 
 def check_corners(name: str) -> str:
-    """Return the name of a method for corners, if it is one.
+    """Return the name of a corner method, if there is such a method.
 
     Raises
     ------
@@ -254,7 +254,10 @@ def _sift(found: list[Marker], rig: Rig, message: Message) -> tuple[tuple[Marker
 
 
 def _drawing(time_ns: int, markers: tuple[Marker, ...]) -> ImageAnnotations:
-    """Return outlines and ids; pixels count from the first pixel's corner for Foxglove, not its centre."""
+    """Return outlines and ids for viewers.
+
+    Foxglove counts pixels from the first pixel's corner, OpenCV from its centre.
+    """
     shifted = [(marker.id, marker.corners_px + 0.5) for marker in markers]
     return ImageAnnotations(
         points=tuple(

@@ -1,12 +1,12 @@
-"""Run the benchmarks and print what they measure: ratios first.
+"""Run the benchmarks and print their results: ratios first.
 
-    ./scripts/bench                      # all of them, about a quarter of an hour
-    ./scripts/bench detection startup    # some
-    ./scripts/bench --smoke              # on next to nothing: that they run, not what they measure
+    ./scripts/bench                      # all benchmarks, about a quarter of an hour
+    ./scripts/bench detection startup    # some benchmarks
+    ./scripts/bench --smoke              # with very little data: a test that they run, not a measurement
 
-Speed is a ratio within one run: contenders take turns at the same work, each in a process of its own,
-round after round; a row is the median over the rounds, the least and the most. Writes one JSON file,
-ratios first, then figures with a unit, then everything else, by default .cache/bench/results.json.
+Speed is a ratio within one run: contenders take turns at the same work, each in a separate process, round
+after round. A row has the median over the rounds, the minimum and the maximum. The command writes one JSON
+file: ratios first, then numbers with a unit, then all other values; by default .cache/bench/results.json.
 """
 
 from __future__ import annotations

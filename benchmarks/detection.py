@@ -1,12 +1,12 @@
-"""How fast markers are found, from an MCAP log to corners, and how well, in one run.
+"""Speed and accuracy of marker detection, from an MCAP log to corners, in one run.
 
     python benchmarks/detection.py --frames 150
 
-Frames are those of the simulated lab: three cameras of 1920 x 1080, robots that drive. The pipelines
-(benchmarks/pipelines.py says what each does) take turns at the same frames, each in a process of its
-own. With one thread the time is the processor's; with three cameras at once it is the wall's. Corners
-are compared with the simulator's truth: a speed is worth nothing without them. Prints a table, and JSON
-with -o.
+Frames are from the simulated lab: three cameras of 1920 x 1080, and robots that drive. The pipelines (see
+benchmarks/pipelines.py) take turns at the same frames, each in a separate process. With one thread, the
+time is processor time; with three cameras in parallel, it is wall time. Corners are compared with the
+simulator's ground truth, because a speed without accuracy means nothing. The script prints a table, and
+writes JSON with -o.
 """
 
 from __future__ import annotations
@@ -28,12 +28,12 @@ from ipsys_log.simulation.settings import LabSettings
 
 __all__ = ["measure"]
 
-# Frames of each camera that a pipeline looks at before it is the next one's turn; where the cameras go
-# together, the last ones of a turn leave a core idle.
+# Number of frames of each camera that a pipeline processes in one turn. With parallel cameras, a core is
+# idle during the last frames of a turn.
 _INSTANTS, _INSTANTS_TOGETHER = 15, 30
-# Corners that are farther off than this on the mean are those of something else.
+# Corners with a larger mean distance than this belong to another object.
 _SAME_PX = 10.0
-# Of a contender whose heap keeps what it frees.
+# Suffix of a contender whose heap keeps freed memory.
 _KEPT = ", heap kept"
 _SEVERAL = "3 cameras at once"
 _TAGS = "3 AprilTags (36h11)"
@@ -43,7 +43,7 @@ _MARKERS = (3, 1, 8)
 
 @dataclass(frozen=True, slots=True)
 class Scene:
-    """A log to race on; ``together``: all cameras are looked at at once."""
+    """A log for a race; ``together``: all cameras are processed in parallel."""
 
     name: str
     path: Path
@@ -59,7 +59,9 @@ def _titled(markers: int) -> str:
 def _scenes(lab: Mapping[str, Any], report: Report) -> list[Scene]:
     ours = ("plain", "stock", "stateless", "tracking", "decode", "read")
     settings = {markers: LabSettings(**lab, markers=markers) for markers in _MARKERS}
-    scenes = [Scene(_titled(n), drawn(one), one, ours) for n, one in settings.items()]
+    scenes = [
+        Scene(_titled(n), drawn(lab_settings), lab_settings, ours) for n, lab_settings in settings.items()
+    ]
     three = scenes[0] = replace(scenes[0], finders=(*ours, "plain" + _KEPT, "tracking" + _KEPT))
     scenes.append(Scene(_SEVERAL, three.path, three.settings, ("plain3", "ours3"), together=True))
     restarts = with_restarts(three.path)
@@ -85,9 +87,9 @@ def _contender(scene: Scene, finder: str, ranges: Sequence[tuple[int, int]]) -> 
 
 
 def score(found: Sequence[Found], known: Mapping[tuple[str, int], Truth]) -> dict[str, Any]:
-    """How far corners lie from the truth; how many of the markers wholly in the image were found.
+    """Return the errors of corners against ground truth, and the share of whole markers that were detected.
 
-    An id that is not there, or not within 10 px of there, is a wrong one; a second one of an id too.
+    An id is wrong if ground truth has no such marker within 10 px, or if it was detected before.
     """
     off_px: list[float] = []
     wrong = seen = 0
@@ -95,12 +97,12 @@ def score(found: Sequence[Found], known: Mapping[tuple[str, int], Truth]) -> dic
         frame = known[camera, time_ns]
         left = dict(frame.corners_px)
         for marker_id, corners_px in markers:
-            there = left.pop(marker_id, None)
-            if there is None or np.linalg.norm(corners_px - there, axis=1).mean() > _SAME_PX:
+            true_px = left.pop(marker_id, None)
+            if true_px is None or np.linalg.norm(corners_px - true_px, axis=1).mean() > _SAME_PX:
                 wrong += 1
             elif marker_id in frame.whole:
                 seen += 1
-                off_px.extend(np.linalg.norm(corners_px - there, axis=1))
+                off_px.extend(np.linalg.norm(corners_px - true_px, axis=1))
     there_are = sum(len(known[camera, time_ns].whole) for camera, time_ns, _ in found)
     return {
         "rms_px": float(np.sqrt(np.mean(np.square(off_px)))) if off_px else None,

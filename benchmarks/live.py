@@ -1,11 +1,11 @@
-"""Recording and live tracking of real streams: drops, processor time, and from a frame to its position.
+"""Recording and live tracking of real streams: drops, processor time, and latency of positions.
 
     python benchmarks/live.py --record-seconds 60 --live-seconds 30
 
-FFmpeg serves JPEGs of the simulated lab, 1920 x 1080 at 30/s and about 300 kB, from loopback as HTTP MJPEG,
-one process for each camera; a stream that never comes is named. ``ipsys record`` and ``ipsys live`` run as a
-user runs them; their processor time is all that their process takes, its start included. Then more and more
-cameras are recorded at once, until one is short of frames; their streams are served by the same cores.
+FFmpeg serves JPEGs of the simulated lab, 1920 x 1080 at 30/s and about 300 kB, from loopback as HTTP MJPEG.
+Each camera has one process; a remark names a stream that never comes. ``ipsys record`` and ``ipsys live``
+run as for a user; their processor time is that of the whole process, with its start. Then the number of
+cameras of a recording increases until a camera loses frames; the same cores serve their streams.
 """
 
 from __future__ import annotations
@@ -37,14 +37,14 @@ from ipsys_log.simulation.settings import LabSettings
 __all__ = ["measure"]
 
 _RATE_HZ = 30.0
-# A camera that has sent less than this share of its frames is too much.
+# A camera that has sent less than this share of its frames is too slow.
 _SHORT = 0.98
-# Cameras that are recorded at once, more and more.
+# Numbers of cameras that are recorded in parallel, in increasing order.
 _COUNTS = (6, 9, 12, 15, 18, 24)
 
 
 class _FailedError(Exception):
-    """A command of ours that did not end with 0."""
+    """The error of a command of ipsys whose exit code is not 0."""
 
 
 def _run(arguments: Sequence[object]) -> float:
@@ -53,7 +53,7 @@ def _run(arguments: Sequence[object]) -> float:
     Raises
     ------
     _FailedError
-        With its last line, where it did not end with 0.
+        The exit code is not 0; the text is the last line of the command.
     """
     with tempfile.TemporaryFile("w+") as said:
         program = subprocess.Popen(
@@ -71,7 +71,7 @@ def _run(arguments: Sequence[object]) -> float:
 
 @contextmanager
 def _measured(what: str, report: Report) -> Iterator[None]:
-    """Turn a failure into a remark: what was measured so far is still reported."""
+    """Turn a failure into a remark: the report keeps the results so far."""
     try:
         yield
     except _FailedError as error:
@@ -87,8 +87,8 @@ def _say_missing(what: str, served: Served, report: Report) -> None:
 
 
 def _rates(log: Path, cameras: Iterable[str]) -> dict[str, tuple[int, float, int]]:
-    """Return frames, frames per second, and the size of a frame in bytes; zeros for a camera without any."""
-    found = {}
+    """Return frames, frames per second, and the size of a frame in bytes; zeros without frames."""
+    rates = {}
     with Session([log]) as session:
         for name in cameras:
             times, size = [], 0
@@ -97,8 +97,8 @@ def _rates(log: Path, cameras: Iterable[str]) -> dict[str, tuple[int, float, int
                 times.append(message.log_time_ns)
                 size += len(message.payload.data)
             rate_hz = (len(times) - 1) / (times[-1] - times[0]) * 1e9 if len(times) > 1 else 0.0
-            found[name] = len(times), rate_hz, size // max(len(times), 1)
-    return found
+            rates[name] = len(times), rate_hz, size // max(len(times), 1)
+    return rates
 
 
 def _events(log: Path, kind: str) -> int:
@@ -127,22 +127,22 @@ def _record(
 def _many(
     lab: Path, loops: dict[str, Path], folder: Path, options: argparse.Namespace, report: Report
 ) -> None:
-    """Find how many cameras can be recorded at once."""
-    held, log = 0, folder / "many.mcap"
+    """Find the largest number of cameras that can be recorded in parallel."""
+    sustained, log = 0, folder / "many.mcap"
     for count in _COUNTS:
-        what, before = f"{count} cameras", len(report.remarks)
-        with _measured(what, report), serve(lab, loops, count, folder, options.wait_seconds) as served:
-            _say_missing(what, served, report)
+        title, before = f"{count} cameras", len(report.remarks)
+        with _measured(title, report), serve(lab, loops, count, folder, options.wait_seconds) as served:
+            _say_missing(title, served, report)
             cpu_s = _run(["record", "--rig", served.rig, "-o", log, "--seconds", options.many_seconds])
             rates = _rates(log, served.cameras)
             slowest, dropped = min(rate for _, rate, _ in rates.values()), _events(log, "frames_dropped")
             details = {"cpu_s": cpu_s, "slowest_hz": slowest, "drops": dropped, "cameras": len(rates)}
-            report.details[what] = details
+            report.details[title] = details
         log.unlink(missing_ok=True)
         if len(report.remarks) > before or slowest < _SHORT * _RATE_HZ or dropped:
             break
-        held = count
-    report.rows.append(Row("cameras held at once", (held,), "cameras"))
+        sustained = count
+    report.rows.append(Row("cameras held at once", (sustained,), "cameras"))
 
 
 def _live(
@@ -172,7 +172,7 @@ def _live(
 
 
 def measure(options: argparse.Namespace) -> Report:
-    """Record and track from streams on loopback."""
+    """Measure recording and tracking of streams on loopback."""
     report = Report("live")
     if shutil.which("ffmpeg") is None:
         report.remarks.append("no ffmpeg to serve the streams; on Debian: sudo apt-get install ffmpeg")

@@ -1,9 +1,10 @@
-"""How long it takes to append the results of three stages to a log of images.
+"""Time to append the results of three stages to a log of images.
 
     python benchmarks/log_append.py --gb 1
 
 Three appends of 9 channels and 10,000 small messages each. Only the work of the log counts: opening for
-append, writing, closing (journal, truncate, fsync). Prints JSON; fails if the recorded data changed.
+append, writing, closing (journal, truncate, fsync). The script prints JSON; it fails if the recorded data
+changed.
 """
 
 import argparse
@@ -35,7 +36,7 @@ def record(path: Path, gigabytes: float) -> None:
 
 
 def append_stage(path: Path, stage: int) -> float:
-    """Seconds of log work for one stage."""
+    """Return the seconds of log work for one stage."""
     chance = random.Random(stage)
     schema = Schema("ipsys.v1.Markers", "protobuf", bytes(5_000))
     rows = [

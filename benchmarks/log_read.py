@@ -1,12 +1,12 @@
-"""How fast messages are read, headers and payload bytes, against the ``mcap`` package in the same run.
+"""Read speed of messages, headers and payload bytes, against the ``mcap`` package in the same run.
 
     python benchmarks/log_read.py --gb 1
 
-Small messages that lie among images, in logs that ``mcap.Writer`` wrote and in one of our own; then
-everything of our own; then a log of small messages alone. Images are random bytes of 300 kB, as
-incompressible as JPEG. Both readers run in turns, in processes of their own, and must agree; the files
-are in the page cache; the processor's time. A bare ``os.pread`` of the file is what no reader comes below:
-where images are read too, that alone is about a fifth of what ``mcap`` takes.
+The first cases are small messages among images, in logs of ``mcap.Writer`` and in one of ipsys. The next
+cases are all messages of the ipsys log, and a log of small messages alone. Images are random bytes of
+300 kB, as incompressible as JPEG. Both readers run in turns, in separate processes, and must agree. The
+files are in the page cache; the time is processor time. A bare ``os.pread`` of the file is the lower limit
+for every reader: with images, this alone is about a fifth of the time of ``mcap``.
 """
 
 import argparse
@@ -31,7 +31,7 @@ PERIOD_NS = 33_333_333
 
 
 def payloads(gigabytes: float) -> tuple[int, list[bytes]]:
-    """Number of images, and small payloads of about 100 bytes."""
+    """Return the number of images, and small payloads of about 100 bytes."""
     chance = random.Random(1)
     return int(gigabytes * 1e9 / IMAGE_BYTES), [chance.randbytes(90 + k % 20) for k in range(SMALL)]
 
@@ -96,18 +96,18 @@ def ours(path: Path, topics: list[str] | None) -> Turn:
 
 
 def bare(path: Path, _topics: list[str] | None) -> Turn:
-    """The bytes of the file and nothing else."""
+    """Read the bytes of the file and do nothing else."""
 
     def turn(_number: int) -> int:
-        places = range(0, path.stat().st_size, IMAGE_BYTES)
+        offsets = range(0, path.stat().st_size, IMAGE_BYTES)
         with path.open("rb", buffering=0) as file:
-            return sum(len(os.pread(file.fileno(), IMAGE_BYTES, at)) for at in places)
+            return sum(len(os.pread(file.fileno(), IMAGE_BYTES, offset)) for offset in offsets)
 
     return turn
 
 
 def check(name: str, path: Path, topics: list[str] | None) -> int:
-    """The number of messages that both read alike; the file is in the page cache then."""
+    """Return the number of messages that both readers read alike; the file is in the page cache then."""
     with path.open("rb") as file, LogReader(path) as reader:
         theirs = make_reader(file).iter_messages(topics=topics)
         count = 0
@@ -122,7 +122,7 @@ def check(name: str, path: Path, topics: list[str] | None) -> int:
 
 
 def compare(name: str, path: Path, topics: list[str] | None, rounds: int, report: Report) -> None:
-    """One row: the stock reader's time by ours."""
+    """Add one row: the time of the stock reader divided by that of ipsys."""
     messages = check(name, path, topics)
     contenders = [Contender("mcap", stock, (path, topics)), Contender("ours", ours, (path, topics))]
     contenders += [Contender("pread", bare, (path, topics))] if topics is None else []
@@ -131,15 +131,15 @@ def compare(name: str, path: Path, topics: list[str] | None, rounds: int, report
     if "pread" in timings:
         report.rows.append(ratio_row("  mcap / bare os.pread of the file", timings["mcap"], timings["pread"]))
     report.details[name] = {
-        **{f"{one}_cpu_s": timing.cpu_s for one, timing in timings.items()},
-        **{f"{one}_wall_s": timing.wall_s for one, timing in timings.items()},
+        **{f"{contender}_cpu_s": timing.cpu_s for contender, timing in timings.items()},
+        **{f"{contender}_wall_s": timing.wall_s for contender, timing in timings.items()},
         "messages": messages,
         "bytes": timings["ours"].kept[0],
     }
 
 
 def measure(options: argparse.Namespace) -> Report:
-    """Logs of others, our own, and one without images."""
+    """Compare logs of other writers, a log of ipsys, and a log without images."""
     report = Report("log_read")
     gigabytes = 0.01 if options.smoke else options.gb
     messages = 1_000 if options.smoke else 100_000

@@ -1,13 +1,13 @@
-"""What writing a log costs, beside the ``mcap`` package and foxglove-sdk in the same run.
+"""Cost of writing a log, compared with the ``mcap`` package and foxglove-sdk in the same run.
 
     python benchmarks/log_write.py --write-seconds 20
 
 Images: three cameras at 30/s with frames of 300 kB, random bytes as incompressible as JPEG. ``recorder``
-does what a recorder does: payloads encoded, written, flushed every second; its share of a core is the
-processor's time, the kernel's included, by that of the stream. The other writers, ours once more among
-them, are given the same bytes ready encoded; chunks of 4 MiB, uncompressed. Small messages: about 120
-bytes on nine channels, encoded, each writer with its own default chunks and compression (all zstd).
-All by the processor's time.
+works like a recorder: it encodes and writes payloads, and flushes every second. Its share of a core is its
+processor time, with that of the kernel, divided by the duration of the stream. The other writers, and
+ipsys once more, get the same bytes already encoded; chunks of 4 MiB, uncompressed. Small messages: about
+120 bytes on nine channels, encoded; each writer uses its own default chunks and compression (all zstd).
+All times are processor times.
 """
 
 from __future__ import annotations
@@ -38,14 +38,14 @@ CHANNELS = 9
 _DIFFERENT = 30
 _EPOCH_NS = 1_700_000_000_000_000_000
 
-# Takes channel, log time and publish time in ns, and the bytes of a message.
+# Its arguments are channel, log time and publish time in ns, and the bytes of a message.
 Put = Callable[[int, int, int, bytes], None]
 
 
 def _opened(
     kind: str, path: Path, schema: str, topics: list[str], images: bool
 ) -> tuple[Put, Callable[[], Any]]:
-    """A writer on a new file: what puts a message into it, and what finishes it."""
+    """Return the functions of a writer on a new file: one writes a message, one finishes the file."""
     return {"ours": _ours, "mcap": _mcap, "foxglove": _foxglove}[kind](path, schema, topics, images)
 
 
@@ -95,7 +95,7 @@ def _foxglove(path: Path, schema: str, topics: list[str], images: bool) -> tuple
     ]
 
     def put(channel: int, log_ns: int, _publish_ns: int, data: bytes) -> None:
-        logs[channel](data, log_time=log_ns)  # it has no publish time
+        logs[channel](data, log_time=log_ns)  # foxglove-sdk has no publish time
 
     def finish(_kept: Any = context) -> None:  # its channels close with the context
         writer.close()
@@ -109,7 +109,7 @@ def _frames() -> list[CompressedImage]:
 
 
 def _images(folder: Path, kind: str, seconds: int) -> Turn:
-    """Write a stream of so many seconds."""
+    """Return a turn that writes a stream of the given duration."""
     path = folder / f"{kind}.mcap"
     path.unlink(missing_ok=True)
     ready = [encode(frame) for frame in _frames()]
@@ -128,7 +128,7 @@ def _images(folder: Path, kind: str, seconds: int) -> Turn:
 
 
 def _recorder(folder: Path, seconds: int) -> Turn:
-    """The same through encoding, and safe on the disk up to a second ago."""
+    """Return a turn that also encodes, and that syncs to the disk every second."""
     path = folder / "recorder.mcap"
     path.unlink(missing_ok=True)
     frames = _frames()
@@ -156,11 +156,11 @@ def _recorder(folder: Path, seconds: int) -> Turn:
 
 
 def _small(folder: Path, kind: str, messages: int) -> Turn:
-    """Write so many small messages, as nine channels make them that go through a stage."""
+    """Return a turn that writes small messages on nine channels, like the channels of a stage."""
     path = folder / f"{kind}.mcap"
     path.unlink(missing_ok=True)
     chance = random.Random(2)
-    # Half noise, half zeros and names: about as compressible as numbers are.
+    # Half noise, half zeros and names: about as compressible as numbers.
     ready = [chance.randbytes(60) + b"camera" * 10 for _ in range(999)]
     topics = [f"/runs/stock/cameras/c{number}/markers" for number in range(CHANNELS)]
 
@@ -176,7 +176,7 @@ def _small(folder: Path, kind: str, messages: int) -> Turn:
 
 
 def _check(folder: Path, kinds: Sequence[str], messages: int) -> None:
-    """Who writes nothing is fast."""
+    """Check that each writer has written all messages: otherwise its speed means nothing."""
     for kind in kinds:
         with LogReader(folder / f"{kind}.mcap") as log:
             if log.message_count != messages:
@@ -184,7 +184,7 @@ def _check(folder: Path, kinds: Sequence[str], messages: int) -> None:
 
 
 def measure(options: argparse.Namespace) -> Report:
-    """Images, then small messages."""
+    """Measure images, then small messages."""
     report = Report("log_write")
     seconds, messages = (1, 2_000) if options.smoke else (options.write_seconds, options.write_messages)
     kinds = ("ours", "mcap", "foxglove")
@@ -206,8 +206,8 @@ def measure(options: argparse.Namespace) -> Report:
     for kind in kinds:
         rate = tuple(messages / cpu_s for cpu_s in small[kind].cpu_s)
         rows.append(Row(f"small messages, {kind}", rate, "messages/s"))
-    for what, timings in (("images", large), ("small", small)):
-        report.details[what] = {
+    for kind_of_messages, timings in (("images", large), ("small", small)):
+        report.details[kind_of_messages] = {
             kind: {"cpu_s": timing.cpu_s, "wall_s": timing.wall_s, "bytes": timing.kept[0]}
             for kind, timing in timings.items()
         }

@@ -1,4 +1,4 @@
-"""What a benchmark ran on."""
+"""The machine and the software of a benchmark."""
 
 from __future__ import annotations
 
@@ -21,12 +21,12 @@ _PACKAGES = (
     "foxglove-sdk",
     "pupil-apriltags",
 )
-# What can be said from outside about threads and the heap.
+# Environment variables that change threads and the heap.
 _VARIABLES = ("MALLOC_", "GLIBC_TUNABLES", "OMP_", "OPENBLAS_", "OPENCV_", "LD_PRELOAD")
 
 
 def facts() -> dict[str, Any]:
-    """Processor, memory, load, versions, and the commit that was measured."""
+    """Return processor, memory, load, versions, and the measured commit."""
     memory = next((line.split()[1] for line in _lines("/proc/meminfo") if line.startswith("MemTotal")), "0")
     return {
         "when": datetime.datetime.now(datetime.UTC).isoformat(timespec="seconds"),

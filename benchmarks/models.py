@@ -1,9 +1,10 @@
-"""How long the models take, and how good they are, on the authors' 150 measured places.
+"""Time and accuracy of the models on the authors' 150 calibration points.
 
     python benchmarks/models.py                  # the time of each step
-    python benchmarks/models.py --seeds 10       # also: best against poly on that many sets of folds
+    python benchmarks/models.py --seeds 10       # also: best against poly on 10 sets of folds
 
-Needs the public data (docs/data.md). One thread for linear algebra, as in the pipeline. Prints JSON.
+The script needs the public data (docs/data.md). It uses one thread for linear algebra, like the pipeline.
+It prints JSON.
 """
 
 import argparse
@@ -32,7 +33,7 @@ from ipsys_log.runs.view import LogView
 from ipsys_log.stages.evaluate import Study, evaluate_model
 from ipsys_log.stages.fit import fit_model
 
-# Best was chosen with other folds.
+# Best was selected with other folds.
 FIRST_SEED = 1000
 
 
@@ -53,11 +54,11 @@ def timed(work: Callable[[], object]) -> float:
 
 
 def quiet(done: int, total: int) -> None:
-    """Nobody watches."""
+    """Ignore the progress."""
 
 
 def times(pairs: dict[str, list[Pair]], places: list[Measured]) -> dict[str, object]:
-    """Seconds of a fit with its uncertainty, and of everything that is asked of a model."""
+    """Return the seconds of a fit with its uncertainty, and of a full evaluation of each model."""
     measurements = [place.measurement for place in places]
     held_out = {m.id for m in measurements if "test" in m.splits}
     study = Study(places, pairs, held_out, labelled_subsets(measurements), {}, 0)
@@ -82,7 +83,7 @@ def times(pairs: dict[str, list[Pair]], places: list[Measured]) -> dict[str, obj
 
 
 def validated(name: str, cameras: dict, seed: int, axes: int = 3) -> float:  # type: ignore[type-arg]
-    """Mean error in cm over the cameras by repeated cross-validation."""
+    """Return the mean error in cm over the cameras, by repeated cross-validation."""
     predicted = cross_validate(name, cameras, seed)
     return 100 * float(
         np.mean(
@@ -97,11 +98,11 @@ def validated(name: str, cameras: dict, seed: int, axes: int = 3) -> float:  # t
 def accuracy(pairs: dict[str, list[Pair]], seeds: int) -> dict[str, object]:
     cameras = gather_places(pairs)
     numbers = range(FIRST_SEED, FIRST_SEED + seeds)
-    found = {name: [validated(name, cameras, seed) for seed in numbers] for name in ("poly", "best")}
+    errors_cm = {name: [validated(name, cameras, seed) for seed in numbers] for name in ("poly", "best")}
     flat = [validated("rayplane", cameras, seed, axes=2) for seed in numbers]
-    means = {name: float(np.mean(values)) for name, values in found.items()}
+    means = {name: float(np.mean(values)) for name, values in errors_cm.items()}
     return {
-        "cross_validated_3d_cm": found,
+        "cross_validated_3d_cm": errors_cm,
         "best_below_poly_percent": 100 * (1 - means["best"] / means["poly"]),
         "rayplane_2d_cm": flat,
     }

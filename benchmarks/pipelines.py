@@ -1,4 +1,4 @@
-"""Ways from an MCAP log to the corners of the markers in it, each to be run in a process of its own."""
+"""Pipelines from an MCAP log to the corners of its markers; each runs in a separate process."""
 
 from __future__ import annotations
 
@@ -22,31 +22,31 @@ from ipsys_log.stages.detect import Detect
 __all__ = ["FINDERS", "OURS", "Found", "one_by_one", "threaded"]
 
 Corners = NDArray[np.float64]
-# Camera and publish time in ns of a frame, and the corners in px found in it, (4, 2) each, with their ids.
+# Camera and publish time in ns of a frame, and the detected corners in px, (4, 2) each, with their ids.
 Found = tuple[str, int, list[tuple[int, Corners]]]
 Finder = Callable[[Message], list[tuple[int, Corners]]]
 
 OURS = detect.EDGES
 
-# Of glibc's malloc.h.
+# Constants of glibc's malloc.h.
 _TRIM_THRESHOLD, _MMAP_THRESHOLD = -1, -3
 
 _REFINE = (cv2.TERM_CRITERIA_COUNT + cv2.TERM_CRITERIA_EPS, 40, 0.001)
 
 
 def _fed(stage: Callable[[Message], Any], message: Message) -> list[tuple[int, Corners]]:
-    """The corners that a stage makes of a message, none of what it does not read."""
+    """Return the corners that a stage makes from a message; none from a message that it does not read."""
     if not any(isinstance(message.payload, channel.payloads) for channel in detect.STAGE.reads):
         return []
-    found = [payload for payload in stage(message) if isinstance(payload, Markers)]
-    return [(marker.id, marker.corners_px) for markers in found for marker in markers.markers]
+    frames = [payload for payload in stage(message) if isinstance(payload, Markers)]
+    return [(marker.id, marker.corners_px) for markers in frames for marker in markers.markers]
 
 
 def plain(rig: Message, lenses: dict[str, Message]) -> Finder:
-    """What the authors' program does, written with today's OpenCV and nothing else.
+    """Return a finder like the authors' program, written with today's OpenCV and nothing else.
 
-    Colour, then grey, OpenCV's detector with its default parameters, cornerSubPix with a window of 3,
-    fisheye.undistortPoints, and the camera points of eq. (3) to (5).
+    It converts colour to grey. Then it uses OpenCV's detector with its default parameters, cornerSubPix with
+    a window of 3, fisheye.undistortPoints, and the camera points of eq. (3) to (5).
     """
     detector = cv2.aruco.ArucoDetector(_dictionary(rig.payload))
     length_m = rig.payload.marker_length_m
@@ -59,13 +59,13 @@ def plain(rig: Message, lenses: dict[str, Message]) -> Finder:
         if ids is None or len(ids) == 0:
             return []
         lens = lenses[str(message.camera)].payload
-        found = []
+        markers = []
         for marker_id, square in zip(np.ravel(ids), corners, strict=True):
             px = cv2.cornerSubPix(grey, square.reshape(-1, 1, 2), (3, 3), (-1, -1), _REFINE)
             uv = cv2.fisheye.undistortPoints(px.astype(np.float64), lens.K, lens.D)
             _camera_point(np.asarray(uv, np.float64).reshape(-1, 2), length_m)
-            found.append((int(marker_id), px.reshape(4, 2).astype(np.float64)))
-        return found
+            markers.append((int(marker_id), px.reshape(4, 2).astype(np.float64)))
+        return markers
 
     return find
 
@@ -81,7 +81,7 @@ def _dictionary(rig: Rig) -> cv2.aruco.Dictionary:
 
 
 def stateless(rig: Message, lenses: dict[str, Message], corners: str = OURS) -> Finder:
-    """Ours without memory: a new stage for every frame."""
+    """Return the ipsys finder without memory: a new stage for every frame."""
 
     def find(message: Message) -> list[tuple[int, Corners]]:
         stage = Detect(corners)
@@ -93,7 +93,7 @@ def stateless(rig: Message, lenses: dict[str, Message], corners: str = OURS) -> 
 
 
 def tracking(rig: Message, lenses: dict[str, Message]) -> Finder:
-    """Ours as it runs: one stage for each camera, from frame to frame."""
+    """Return the ipsys finder as in a replay: one stage for each camera, tracking from frame to frame."""
     stages = {camera: Detect(OURS) for camera in lenses}
     for camera, stage in stages.items():
         _fed(stage, rig)
@@ -102,12 +102,12 @@ def tracking(rig: Message, lenses: dict[str, Message]) -> Finder:
 
 
 def stock(rig: Message, lenses: dict[str, Message]) -> Finder:
-    """Ours with OpenCV's detector on the full frame."""
+    """Return the ipsys finder with OpenCV's detector on the full frame."""
     return stateless(rig, lenses, detect.STOCK)
 
 
 def decode(_rig: Message, _lenses: dict[str, Message]) -> Finder:
-    """Nothing is looked for: the JPEG becomes a grey picture."""
+    """Return a finder that only decodes the JPEG to a grey image."""
 
     def find(message: Message) -> list[tuple[int, Corners]]:
         simplejpeg.decode_jpeg(message.payload.data, colorspace="GRAY")
@@ -117,15 +117,15 @@ def decode(_rig: Message, _lenses: dict[str, Message]) -> Finder:
 
 
 def read(_rig: Message, _lenses: dict[str, Message]) -> Finder:
-    """The JPEG is read from the log, and not decoded."""
+    """Return a finder that only reads the JPEG from the log, without decoding."""
     return lambda _message: []
 
 
 def apriltags(_rig: Message, _lenses: dict[str, Message]) -> Finder:
-    """The AprilTag library through pupil-apriltags as it comes, on one thread.
+    """Return a finder of the AprilTag library through pupil-apriltags with default settings, on one thread.
 
-    As it comes is quad_decimate 2, quad_sigma 0, refine_edges 1, decode_sharpening 0.25. Its corners run
-    the other way round, from another corner, and count from the edge of the first pixel, not its centre.
+    The defaults are quad_decimate 2, quad_sigma 0, refine_edges 1, decode_sharpening 0.25. Its corners have
+    the opposite order, start at another corner, and count from the edge of the first pixel, not its centre.
     """
     from pupil_apriltags import Detector  # type: ignore[import-untyped]
 
@@ -154,12 +154,12 @@ FINDERS: dict[str, Callable[[Message, dict[str, Message]], Finder]] = {
 def _opened(path: Path) -> tuple[Session, Message, dict[str, Message]]:
     session = Session([path])
     (rig,) = session.messages(session.topics(RIG))
-    lenses = {str(one.camera): one for one in session.messages(session.topics(CALIBRATIONS))}
+    lenses = {str(message.camera): message for message in session.messages(session.topics(CALIBRATIONS))}
     return session, rig, lenses
 
 
 def keep_heap() -> None:
-    """Have glibc keep freed memory for the next frame instead of giving it back and faulting it in anew."""
+    """Let glibc keep freed memory for the next frame, instead of returning it and faulting it in again."""
     mallopt = getattr(ctypes.CDLL(None), "mallopt", None)
     if mallopt is not None:
         mallopt(_TRIM_THRESHOLD, 1 << 28)
@@ -169,7 +169,10 @@ def keep_heap() -> None:
 def one_by_one(
     path: Path, ranges: Sequence[tuple[int, int]], finder: str, threads: int = 1, kept_heap: bool = False
 ) -> Turn:
-    """Frame after frame in one thread of Python; OpenCV may use ``threads``, -1 for its default."""
+    """Return a turn that takes frame after frame in one Python thread; OpenCV may use ``threads``.
+
+    The value -1 means the default of OpenCV.
+    """
     if kept_heap:
         keep_heap()
     cv2.setNumThreads(threads)
@@ -184,8 +187,8 @@ def one_by_one(
 
 
 def threaded(path: Path, ranges: Sequence[tuple[int, int]]) -> Turn:
-    """Ours as :func:`ipsys_log.pipeline.replay` runs it: a thread for each camera."""
-    # Late: the whole package comes with it, and the other contenders start without.
+    """Return the ipsys turn as in :func:`ipsys_log.pipeline.replay`: a thread for each camera."""
+    # Imported late: it imports the whole package, and the other contenders start without the package.
     from ipsys_log.runs.stream import in_threads, run, wire
 
     cv2.setNumThreads(1)

@@ -1,14 +1,14 @@
-"""What the whole chain costs beside detection alone, and how much memory ten minutes of it take.
+"""Cost of the whole chain compared with detection alone, and memory of a replay of ten minutes.
 
     python benchmarks/replay.py --replay-seconds 40
 
-Speed: ``pipeline.replay`` from frames to tracks, its results written to a log, and the same detection in
-the same threads with its results thrown away, in turns over one log of three cameras of 1920 x 1080 at
-30/s; wall time, and the processor's, which other programs do not disturb.
+Speed: ``pipeline.replay`` from frames to tracks writes its results to a log. The same detection in the same
+threads discards its results. Both take turns over one log of three cameras of 1920 x 1080 at 30/s. The times
+are wall time, and processor time, which other programs do not disturb.
 
 Memory: RssAnon of a process that replays ten minutes of three cameras (54,000 frames), read ten times a
-second. The frames of that log are smaller (--memory-size), as only a few of each camera are in memory at
-a time. Both logs are a short drawn one whose last frames are repeated to and fro.
+second. The frames of that log are smaller (--memory-size), because only a few frames of each camera are in
+memory at a time. Both logs are a short simulated log; its last frames repeat forward and backward.
 """
 
 from __future__ import annotations
@@ -102,8 +102,8 @@ def _rss_anon_mb(pid: int) -> float | None:
 
 def _memory(path: Path, frames: int, report: Report) -> None:
     context = multiprocessing.get_context("spawn")
-    line, there = context.Pipe()
-    process = context.Process(target=_replayed, args=(there, path))
+    line, remote = context.Pipe()
+    process = context.Process(target=_replayed, args=(remote, path))
     begin = time.monotonic()
     process.start()
     samples: list[tuple[float, float]] = []
@@ -117,8 +117,8 @@ def _memory(path: Path, frames: int, report: Report) -> None:
     end_s = time.monotonic() - begin
     process.join()
     peaks, growth_mb = _by_stage(samples, stages_s, end_s)
-    what = f"{frames} frames"
-    report.rows.append(Row(f"RssAnon at most, {what}", (max(mb for _, mb in samples),), "MB", ("<=", 500)))
+    amount = f"{frames} frames"
+    report.rows.append(Row(f"RssAnon at most, {amount}", (max(mb for _, mb in samples),), "MB", ("<=", 500)))
     report.rows.append(Row("RssAnon, growth while detecting", (growth_mb,), "MB"))
     report.details["memory"] = {
         "peak_mb_by_stage": peaks,
@@ -132,17 +132,17 @@ def _memory(path: Path, frames: int, report: Report) -> None:
 def _by_stage(
     samples: list[tuple[float, float]], stages_s: list[tuple[str, float]], end_s: float
 ) -> tuple[dict[str, float], float]:
-    """Peaks in MB by stage, and by how much the last quarter of detect lies above its second one."""
+    """Return peaks in MB by stage, and the growth from the second to the last quarter of detect."""
     peaks: dict[str, float] = {}
     growth_mb = 0.0
     start_s = end_s - sum(seconds for _, seconds in stages_s)
     for stage, seconds in stages_s:
-        part = [(at - start_s, mb) for at, mb in samples if start_s <= at < start_s + seconds]
+        part = [(time_s - start_s, mb) for time_s, mb in samples if start_s <= time_s < start_s + seconds]
         if part:
             peaks[stage] = max(mb for _, mb in part)
         if stage == "detect" and len(part) >= 8:
             early, late = (
-                [mb for at, mb in part if low <= at / seconds < high]
+                [mb for time_s, mb in part if low <= time_s / seconds < high]
                 for low, high in ((0.25, 0.5), (0.75, 1.0))
             )
             growth_mb = statistics.median(late) - statistics.median(early)
@@ -151,7 +151,7 @@ def _by_stage(
 
 
 def measure(options: argparse.Namespace) -> Report:
-    """Speed, then memory."""
+    """Measure speed, then memory."""
     report = Report("replay")
     stations: dict[str, Any] = {"stations": 16, "drive_s": 0.5 if options.smoke else 10.0}
     width, height = (int(size) for size in ("640x360" if options.smoke else options.memory_size).split("x"))

@@ -1,4 +1,4 @@
-"""What benchmarks find: a table to read and a file to keep, ratios first."""
+"""Results of benchmarks: a table for the terminal and a file, ratios first."""
 
 from __future__ import annotations
 
@@ -31,9 +31,9 @@ BENCHMARKS = {
 
 @dataclass(slots=True)
 class Report:
-    """What a benchmark found: rows for the table, tables of its own, remarks; ``details`` for the file.
+    """The results of a benchmark: rows for the table, separate tables, remarks; ``details`` for the file.
 
-    One that ``failed`` has not measured all that it should.
+    A benchmark that ``failed`` has not measured all values.
     """
 
     name: str
@@ -83,7 +83,7 @@ def _as_json(reports: list[Report], machine: dict[str, Any], options: argparse.N
 
 
 def run_all(names: list[str], options: argparse.Namespace, output: Path | None) -> None:
-    """Run benchmarks, print what they found, and write it to ``output``."""
+    """Run benchmarks, print their results, and write them to ``output``."""
     os.environ.setdefault("OPENBLAS_NUM_THREADS", "1")
     reports, machine = [], facts()
     if options.smoke:
@@ -107,7 +107,7 @@ def run_all(names: list[str], options: argparse.Namespace, output: Path | None) 
 
 
 def _measure(name: str, options: argparse.Namespace) -> Report:
-    """Run a benchmark; one that gives up is a remark, for the others have figures."""
+    """Run a benchmark; a failure becomes a remark, because the other benchmarks have results."""
     try:
         report: Report = importlib.import_module(name).measure(options)
         return report
@@ -116,7 +116,7 @@ def _measure(name: str, options: argparse.Namespace) -> Report:
 
 
 def parser_of(description: str | None, modules: list[ModuleType]) -> argparse.ArgumentParser:
-    """The options that all benchmarks have, and those of each."""
+    """Return the parser with the options of all benchmarks, and those of each benchmark."""
     parser = argparse.ArgumentParser(
         description=description, formatter_class=argparse.RawDescriptionHelpFormatter
     )
@@ -128,7 +128,7 @@ def parser_of(description: str | None, modules: list[ModuleType]) -> argparse.Ar
 
 
 def command(name: str) -> None:
-    """One benchmark run by itself as a script."""
+    """Run one benchmark as a script."""
     module = importlib.import_module(name)
     parser = parser_of(module.__doc__, [module])
     parser.add_argument("-o", "--output", type=Path, help="JSON file to write")

@@ -1,8 +1,8 @@
-"""Races: contenders in processes of their own take turns at the same work, round after round.
+"""Races: contenders in separate processes take turns at the same work, round after round.
 
-What one machine takes for anything changes with its load, so only ratios within one run are worth
-keeping: A B C A B C, and the ratio of each round. Time is taken in the contender's process, both
-on the wall and of the processor; the latter stands still while other programs have the core.
+The time of any work on one machine changes with its load. So only ratios within one run are useful: A B C
+A B C, and the ratio of each round. The contender's process takes the time, as wall time and as processor
+time; processor time does not count while other programs have the core.
 """
 
 from __future__ import annotations
@@ -20,7 +20,7 @@ from typing import Any
 
 __all__ = ["Contender", "Row", "Timing", "Turn", "race", "ratio_row"]
 
-# The work of one turn, by its number; what it returns is kept from the first round.
+# The work of one turn, by its number; the result of the first round is kept.
 Turn = Callable[[int], Any]
 
 _STOP = -1
@@ -28,7 +28,7 @@ _STOP = -1
 
 @dataclass(frozen=True, slots=True)
 class Contender:
-    """``make(*arguments)`` is called in a new process for every round, untimed."""
+    """A contender of a race; ``make(*arguments)`` is called in a new process for every round, untimed."""
 
     name: str
     make: Callable[..., Turn]
@@ -37,7 +37,7 @@ class Contender:
 
 @dataclass(frozen=True, slots=True)
 class Spent:
-    """Seconds on the wall and of the processor, by all threads; pages that the kernel had to hand out."""
+    """Wall time and processor time of all threads in s; number of minor page faults."""
 
     wall_s: float = 0.0
     cpu_s: float = 0.0
@@ -54,7 +54,7 @@ class Spent:
 
 @dataclass(slots=True)
 class Timing:
-    """What was spent in each round, and what the turns of the first round returned."""
+    """The times of each round, and the results of the turns of the first round."""
 
     wall_s: list[float] = field(default_factory=list)
     cpu_s: list[float] = field(default_factory=list)
@@ -74,7 +74,7 @@ class Timing:
 
 @dataclass(frozen=True, slots=True)
 class Row:
-    """A figure, one value for each round. A ratio has no ``unit``; ``wanted`` is such as (">=", 4.5)."""
+    """A result, one value for each round. A ratio has no ``unit``; ``wanted`` is such as (">=", 4.5)."""
 
     name: str
     values: tuple[float, ...]
@@ -87,7 +87,7 @@ class Row:
 
     @property
     def met(self) -> bool | None:
-        """Whether the median is as wanted; None where nothing was."""
+        """Return whether the median meets the wanted limit; None without a limit."""
         if self.wanted is None:
             return None
         sign, limit = self.wanted
@@ -107,23 +107,23 @@ def ratio_row(
     wanted: tuple[str, float] | None = None,
     wall: bool = False,
 ) -> Row:
-    """How many times as long ``over`` took as ``under``, by the processor's time or on the wall."""
+    """Return the time of ``over`` divided by that of ``under``, as processor time or as wall time."""
     pairs = zip(over.wall_s, under.wall_s, strict=True) if wall else zip(over.cpu_s, under.cpu_s, strict=True)
-    return Row(name, tuple(one / other for one, other in pairs), wanted=wanted)
+    return Row(name, tuple(over_s / under_s for over_s, under_s in pairs), wanted=wanted)
 
 
 def race(contenders: Sequence[Contender], turns: int, rounds: int) -> dict[str, Timing]:
-    """Let every contender have each turn in its turn; all of it ``rounds`` times, in new processes.
+    """Let all contenders take each turn one after the other; repeat this ``rounds`` times in new processes.
 
-    What the heap looks like by then can make a process a quarter slower, so that an old one says nothing
-    of a new one. The allocator is left as it is, unless the environment says otherwise.
+    The state of the heap can make a process a quarter slower, so an old process tells nothing about a new
+    process. The allocator is not changed, unless the environment changes it.
     """
     timings = {contender.name: Timing() for contender in contenders}
-    # What is small would only wait for the threads of BLAS; the processes that start now inherit this.
+    # For small work, threads of BLAS would only wait; the processes that start now inherit this setting.
     os.environ.setdefault("OPENBLAS_NUM_THREADS", "1")
     for number in range(rounds):
         with ExitStack() as stack:
-            lines = {one.name: stack.enter_context(_Started(one)) for one in contenders}
+            lines = {contender.name: stack.enter_context(_Started(contender)) for contender in contenders}
             for timing in timings.values():
                 timing.begin_round()
             for turn in range(turns):
@@ -136,15 +136,15 @@ def race(contenders: Sequence[Contender], turns: int, rounds: int) -> dict[str, 
 
 
 class _Started:
-    """A contender's process, and the line to it. A context manager."""
+    """The process of a contender, and the connection to it. A context manager."""
 
     def __init__(self, contender: Contender) -> None:
         self.name = contender.name
         context = multiprocessing.get_context("spawn")
-        self._line, there = context.Pipe()
-        self._process = context.Process(target=_serve, args=(there, contender), daemon=True)
+        self._line, remote = context.Pipe()
+        self._process = context.Process(target=_serve, args=(remote, contender), daemon=True)
         self._process.start()
-        there.close()
+        remote.close()
         self._hear()
 
     def __enter__(self) -> _Started:

@@ -1,4 +1,4 @@
-"""Rendered logs with known truth, drawn once and kept in ``.cache/bench``."""
+"""Rendered logs with known ground truth, rendered once and kept in ``.cache/bench``."""
 
 from __future__ import annotations
 
@@ -35,14 +35,14 @@ _PAUSE_NS = 1_000_000_000
 
 @dataclass(frozen=True, slots=True, eq=False)
 class Truth:
-    """Corners in px, (4, 2), by the id of a marker in a frame; ``whole`` are wholly in the image."""
+    """Corners in px, (4, 2), by the id of a marker in a frame; ``whole`` markers are wholly in the image."""
 
     corners_px: dict[int, Corners]
     whole: frozenset[int]
 
 
 def drawn(settings: LabSettings) -> Path:
-    """The log of a session of the simulated lab, drawn if it is not there yet."""
+    """Return the log of a session of the simulated lab; render it if it does not exist yet."""
     # Another simulator or another JPEG encoder gives other frames.
     key = hashlib.blake2b(f"{settings} {cv2.__version__}".encode(), digest_size=8)
     for source in sorted(Path(simulation.__file__).parent.glob("*.py")):
@@ -55,10 +55,10 @@ def drawn(settings: LabSettings) -> Path:
 
 
 def with_restarts(path: Path, rows: int = 1) -> Path | None:
-    """The same log, its JPEGs losslessly rewritten with a restart marker every ``rows`` rows of blocks.
+    """Return the same log, its JPEGs losslessly rewritten with a restart marker per ``rows`` rows of blocks.
 
-    None where there is no ``jpegtran`` (Debian: libjpeg-turbo-progs). Another program could only decode
-    and encode again, and the pixels would not be the same.
+    The result is None without ``jpegtran`` (Debian: libjpeg-turbo-progs). Another program could only decode
+    and encode again, and this would change the pixels.
     """
     if shutil.which("jpegtran") is None:
         return None
@@ -80,7 +80,7 @@ def _restarted(path: Path, rows: int) -> Iterator[Message]:
 
 
 def blocks(path: Path, instants: int) -> list[tuple[int, int]]:
-    """Half-open ranges of log time in ns, each of so many frames of every camera."""
+    """Return half-open ranges of log time in ns; each has the same number of frames of every camera."""
     with Session([path]) as session:
         starts = [message.log_time_ns for message in session.messages(session.topics(TRUTH))]
         firsts = starts[::instants]
@@ -88,9 +88,9 @@ def blocks(path: Path, instants: int) -> list[tuple[int, int]]:
 
 
 def truth(path: Path, settings: LabSettings) -> dict[tuple[str, int], Truth]:
-    """What is to be seen in each frame, by camera and publish time in ns."""
+    """Return the ground truth of each frame, by camera and publish time in ns."""
     cameras = hang_cameras(settings)
-    found = {}
+    truths = {}
     with Session([path]) as session:
         for tracks in session.payloads(session.topics(TRUTH)):
             for camera in cameras:
@@ -100,14 +100,14 @@ def truth(path: Path, settings: LabSettings) -> dict[tuple[str, int], Truth]:
                     printed = place(where, settings)
                     px[track.id] = true_corners(camera.lens, camera.camera_from_world, printed)
                 whole = frozenset(track.id for track in tracks.tracks if camera.name in track.cameras)
-                found[camera.name, tracks.timestamp] = Truth(px, whole)
-    return found
+                truths[camera.name, tracks.timestamp] = Truth(px, whole)
+    return truths
 
 
 def lengthened(path: Path, target: Path, frames: int) -> None:
-    """Write a longer log: all of one, then its last frames to and fro with new times, to so many frames.
+    """Write a longer log of ``frames``: a log, then its last frames forward and backward with new times.
 
-    Nothing jumps, as it would if the frames began again from the first.
+    Nothing jumps; a restart from the first frame would make the robots jump.
     """
     write_log(target, _lengthened(path, frames))
 
@@ -134,9 +134,9 @@ def _lengthened(path: Path, frames: int) -> Iterator[Message]:
 
 
 def _continuous(images: list[Message], cameras: int) -> list[list[Message]]:
-    """The frames of each instant after the last pause."""
-    instants = [images[at : at + cameras] for at in range(0, len(images), cameras)]
-    for at in range(len(instants) - 1, 0, -1):
-        if instants[at][0].publish_time_ns - instants[at - 1][0].publish_time_ns > _PAUSE_NS:
-            return instants[at:]
+    """Return the frames of each instant after the last pause."""
+    instants = [images[index : index + cameras] for index in range(0, len(images), cameras)]
+    for index in range(len(instants) - 1, 0, -1):
+        if instants[index][0].publish_time_ns - instants[index - 1][0].publish_time_ns > _PAUSE_NS:
+            return instants[index:]
     return instants

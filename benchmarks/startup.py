@@ -1,9 +1,9 @@
-"""How long a command takes before it does anything.
+"""Time that a command takes before it begins its work.
 
     python benchmarks/startup.py
 
-``ipsys --help``, and ``ipsys info`` on a log of 1 GB, beside an interpreter that does nothing; in turns,
-wall time of the whole process, with the files in the page cache.
+``ipsys --help``, and ``ipsys info`` on a log of 1 GB, compared with an interpreter that does nothing. The
+commands take turns. The time is wall time of the whole process, with the files in the page cache.
 """
 
 from __future__ import annotations
@@ -31,13 +31,13 @@ def _timed(arguments: list[str]) -> float:
 
 
 def _ipsys() -> list[str]:
-    """The command that pip put beside this interpreter."""
+    """Return the command that pip installed beside this interpreter."""
     installed = Path(sys.executable).with_name("ipsys")
     return [str(installed)] if installed.exists() else [sys.executable, "-m", "ipsys_log"]
 
 
 def measure(options: argparse.Namespace) -> Report:
-    """Start each command in its turn."""
+    """Start the commands in turns."""
     report = Report("startup")
     width, height = (640, 360) if options.smoke else (1920, 1080)
     base = drawn(LabSettings(width=width, height=height, stations=0, drive_s=1.0))
@@ -61,7 +61,7 @@ def measure(options: argparse.Namespace) -> Report:
     base_s = times["python -c pass"]
     wanted = {"ipsys --help": 0.3, "ipsys info": 0.6}
     for name in wanted:
-        ratios = tuple(one / other for one, other in zip(times[name], base_s, strict=True))
+        ratios = tuple(time_s / empty_s for time_s, empty_s in zip(times[name], base_s, strict=True))
         report.rows.append(Row(f"{name} / python -c pass", ratios))
     for name, seconds in times.items():
         limit = ("<=", wanted[name]) if name in wanted else None

@@ -1,4 +1,4 @@
-"""Streams of the simulated lab on loopback: one FFmpeg for each camera, and a rig of those that came."""
+"""Streams of the simulated lab on loopback: one FFmpeg for each camera, and a rig of these cameras."""
 
 from __future__ import annotations
 
@@ -26,7 +26,7 @@ _FORMAT = ("-f", "mpjpeg", "-content_type", "multipart/x-mixed-replace;boundary=
 
 @dataclass(slots=True)
 class Served:
-    """Streams that wait for a reader: the rig file of their cameras, and why others never came, by name."""
+    """Streams that wait for a reader: the rig file, the cameras, and by name why others are missing."""
 
     rig: Path
     cameras: list[str] = field(default_factory=list)
@@ -34,7 +34,7 @@ class Served:
 
 
 def loops_of(lab: Path, folder: Path) -> dict[str, Path]:
-    """Write the drive of each camera as a file of JPEGs, to and fro, so that nothing jumps."""
+    """Write the drive of each camera as a file of JPEGs, forward and backward, so that nothing jumps."""
     loops = {}
     with Session([lab]) as session:
         for name, topic in session.images.items():
@@ -46,13 +46,13 @@ def loops_of(lab: Path, folder: Path) -> dict[str, Path]:
 
 @contextmanager
 def serve(lab: Path, loops: Mapping[str, Path], count: int, folder: Path, limit_s: float) -> Iterator[Served]:
-    """Serve so many cameras while the block lasts.
+    """Serve ``count`` cameras while the block lasts.
 
     Parameters
     ----------
-    lab : the log whose rig and lenses they have.
-    loops : a file of JPEGs by camera; more cameras than files share them.
-    limit_s : to wait for all of them; one that does not listen by then is missing.
+    lab : the log with the rig and the intrinsics of the cameras.
+    loops : a file of JPEGs by camera; if there are more cameras than files, cameras share the files.
+    limit_s : time to wait for all streams; a stream that does not listen by then is missing.
     """
     with Session([lab]) as session:
         text = rig_toml(session.payloads(["/rig"])[0]).partition("[[cameras]]")[0]
@@ -80,7 +80,7 @@ def serve(lab: Path, loops: Mapping[str, Path], count: int, folder: Path, limit_
 
 
 def _free_ports(count: int) -> list[int]:
-    """Return ports that nobody uses now, all different."""
+    """Return ports that are not in use now, all different."""
     with ExitStack() as stack:
         probes = [stack.enter_context(socket.socket()) for _ in range(count)]
         for probe in probes:
@@ -100,9 +100,9 @@ def _start(loop: Path, address: str, said: Path, stack: ExitStack) -> subprocess
 
 
 def _wait_for(port: int, program: subprocess.Popen[bytes], said: Path, end_s: float) -> str | None:
-    """Wait until a program listens at a port; why it never did.
+    """Wait until a program listens at a port; return the reason if it never does.
 
-    FFmpeg serves its first reader and no other, so that a connection to see whether it listens would end it.
+    FFmpeg serves only its first reader. So a connection as a test whether it listens would end the stream.
     """
     while not _listened_at(port):
         if program.poll() is not None:
@@ -115,7 +115,7 @@ def _wait_for(port: int, program: subprocess.Popen[bytes], said: Path, end_s: fl
 
 
 def _listened_at(port: int) -> bool:
-    """Return True where somebody listens; nobody else notices, for the address may be shared until then."""
+    """Return True if a program listens at a port; the test makes no connection."""
     with socket.socket() as probe:
         probe.setsockopt(socket.SOL_SOCKET, socket.SO_REUSEADDR, 1)
         try:

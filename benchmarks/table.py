@@ -1,9 +1,9 @@
-"""How fast a channel becomes a table, beside decoding its messages one by one.
+"""Speed of reading a channel as a table, compared with decoding its messages one by one.
 
     python benchmarks/table.py --rows 1000000
 
-Tracks of three robots a message, with covariances, read from a file in the page cache by
-``Log.table("tracks")`` and by a loop over ``Log.messages``; in turns, in processes of their own.
+Each message has the tracks of three robots with covariances. ``Log.table("tracks")`` and a loop over
+``Log.messages`` read a file in the page cache; in turns, in separate processes.
 """
 
 from __future__ import annotations
@@ -31,7 +31,7 @@ _START_NS = 1_700_000_000_000_000_000
 
 
 def tracks(rows: int) -> Iterator[Message]:
-    """Tracks of three robots, with covariances that differ."""
+    """Yield tracks of three robots, with covariances that differ."""
     chance = np.random.default_rng(0)
     yield Message("/rig", _START_NS, _START_NS, Rig("lab", "DICT_4X4_100", 0.2))
     for number in range(rows // _ROBOTS):
@@ -46,7 +46,7 @@ def tracks(rows: int) -> Iterator[Message]:
 
 
 def _import() -> tuple[object, object]:
-    """Import what both need: that takes a second, and is not measured."""
+    """Import the packages that both need: this takes a second, and is not measured."""
     import pandas as pd
 
     return ipsys.open, pd.DataFrame

@@ -1,4 +1,4 @@
-"""The Python API that ``import ipsys_log as ipsys`` gives. All other modules are private until 1.0."""
+"""The Python API of ``import ipsys_log as ipsys``. All other modules are private until 1.0."""
 
 from __future__ import annotations
 
@@ -117,7 +117,7 @@ class Log:
 
     Attributes
     ----------
-    cameras, runs, channels : what the logs hold, as small tables.
+    cameras, runs, channels : the content of the logs, as small tables.
     """
 
     def __init__(self, *paths: StrPath) -> None:
@@ -148,7 +148,7 @@ class Log:
 
     @property
     def cameras(self) -> Listing:
-        """The cameras: name, number of images, and whether intrinsics are in the log."""
+        """The cameras: name, number of images, and whether the log has their intrinsics."""
         session = self._session
         names = sorted({*session.images, *session.calibrations})
         return Listing(
@@ -160,8 +160,8 @@ class Log:
     def runs(self) -> Listing:
         """The recorded stages, oldest first: run, stage, state, and the runs that they read."""
         return Listing(
-            _RunRow(one.run.run, one.run.stage, one.state, one.run.input_runs)
-            for one in recorded_stages(self._session)
+            _RunRow(recorded.run.run, recorded.run.stage, recorded.state, recorded.run.input_runs)
+            for recorded in recorded_stages(self._session)
         )
 
     @property
@@ -192,8 +192,8 @@ class Log:
         IpsysError
             There is no such channel or run.
         """
-        found = _channel_named(channel)
-        topics = self._session.topics(found, self._run_of(found, run))
+        selected = _channel_named(channel)
+        topics = self._session.topics(selected, self._run_of(selected, run))
         return self._session.messages(topics, _ns(start), _ns(end))
 
     def table(
@@ -205,14 +205,14 @@ class Log:
     ) -> pd.DataFrame:
         """Read a channel as a table: one row for each marker, point, position or track.
 
-        Times are of UTC; ``time`` is the instant that a row speaks of. Missing values are NaN or NA.
+        Times are in UTC; ``time`` is the instant of the row. Missing values are NaN or NA.
 
         Parameters
         ----------
         name : ``markers``, ``camera_points``, ``positions``, ``tracks``, ``truth``, ``measurements``,
             ``events`` or ``latency``.
         run : the run of a derived channel; None: the newest complete one; several: a column ``run`` names it.
-        start, end : as of :meth:`messages`.
+        start, end : as for :meth:`messages`.
 
         Raises
         ------
@@ -225,7 +225,7 @@ class Log:
             raise IpsysError(f"there is no table {name!r}; use one of {', '.join(TABLES)}")
         channel = _channel_named(name)
         wanted = [run] if run is None or isinstance(run, str) else list(run)
-        runs = [self._run_of(channel, one) for one in wanted]
+        runs = [self._run_of(channel, name) for name in wanted]
         return read_table(self._session, name, runs, _ns(start), _ns(end))
 
     def _run_of(self, channel: Channel, run: str | None) -> str | None:
@@ -235,17 +235,19 @@ class Log:
             return None
         name = run or newest_run(self._session, channel)
         if name is None or not self._session.topics(channel, name):
-            known = [one for one in sorted(self._session.run_names()) if self._session.topics(channel, one)]
+            known = [
+                name for name in sorted(self._session.run_names()) if self._session.topics(channel, name)
+            ]
             which = f"run {run} has no {channel.name}" if run else f"no run has {channel.name}"
             raise IpsysError(f"{self._session}: {which} (it is in: {', '.join(known) or 'none'})")
         return name
 
 
 def _channel_named(name: str) -> Channel:
-    found = next((channel for channel in CHANNELS if channel.name == name), None)
-    if found is None:
+    channel = next((channel for channel in CHANNELS if channel.name == name), None)
+    if channel is None:
         raise IpsysError(f"there is no channel {name!r}; use one of {', '.join(c.name for c in CHANNELS)}")
-    return found
+    return channel
 
 
 def _ns(time: Time | None) -> int | None:
@@ -287,14 +289,14 @@ class Evaluated:
 
         rows = [
             {
-                "camera": one.camera,
-                "scheme": one.scheme or "held_out",
-                "against": one.against,
+                "camera": errors_of_camera.camera,
+                "scheme": errors_of_camera.scheme or "held_out",
+                "against": errors_of_camera.against,
                 "dimensions": name,
             }
             | {key: getattr(errors, key) for key in ErrorStatistics.__slots__}
-            for one in self.evaluation.cameras
-            for name, errors in (("3d", one.error_3d), ("2d", one.error_2d))
+            for errors_of_camera in self.evaluation.cameras
+            for name, errors in (("3d", errors_of_camera.error_3d), ("2d", errors_of_camera.error_2d))
             if errors is not None
         ]
         return pd.DataFrame(rows)
@@ -327,18 +329,18 @@ def replay(
     progress: Progress = lambda stage, done, total: None,
     say: Callable[[str], None] = lambda text: None,
 ) -> Replayed:
-    """Compute what logs lack, and append it to the last one or write it to ``output``.
+    """Compute the results that logs lack, and append them to the last log or write them to ``output``.
 
     Parameters
     ----------
-    models : names of models, such as ``best``; none: ``poly``, or all of them to evaluate.
+    models : names of models, such as ``best``; none: ``poly``, or all models for an evaluation.
     until : the last stage, such as ``detect`` or ``evaluate``; None: all stages.
-    rig, calibrations : in place of those of the log, as a new run; calibrations by camera.
-    model_from : another log, whose fitted model is applied and copied in.
+    rig, calibrations : they replace those of the log, as a new run; calibrations by camera.
+    model_from : another log; its fitted model is applied and copied into the log.
     run : name of the new run.
     corners, method, train, seed, as_live, skip_ambiguous : as the options of ``ipsys replay``.
     parameters : options of further stages, by name.
-    progress : called with the stage, the messages done and their total.
+    progress : called with the stage, the number of messages done, and the total number of messages.
     say : called with the runs that are out of date and computed again.
 
     Raises
@@ -373,11 +375,11 @@ def replay(
 
 def _evaluations(session: Session, outcomes: Sequence[Outcome]) -> dict[str, Evaluated]:
     runs = dict.fromkeys(outcome.run for outcome in outcomes)
-    found: dict[str, Evaluated] = {}
+    evaluations: dict[str, Evaluated] = {}
     for run in runs:
         for evaluation in session.payloads(session.topics(EVALUATION, run)):
-            found[evaluation.model] = Evaluated(evaluation.model, run, evaluation)
-    return found
+            evaluations[evaluation.model] = Evaluated(evaluation.model, run, evaluation)
+    return evaluations
 
 
 def verify(
@@ -407,8 +409,8 @@ class FittedModel:
 
     Attributes
     ----------
-    name : in the table of models.
-    cameras : names of the cameras that it knows.
+    name : the name in the table of models.
+    cameras : names of the cameras of the model.
     """
 
     def __init__(self, model: Model) -> None:
@@ -449,7 +451,7 @@ def load_model(path: StrPath, name: str | None = None) -> FittedModel:
 
     Parameters
     ----------
-    name : in the table of models, such as ``best``; None: the newest of all.
+    name : the name in the table of models, such as ``best``; None: the newest of all.
 
     Raises
     ------
@@ -482,12 +484,12 @@ def calibrate(
     board : inner corners of a chessboard as ``6x4``, or squares of a ChArUco board as ``charuco:4x5``.
     square_m : side of a square in m.
     lens : ``fisheye`` or another lens model of ``ipsys calibrate``.
-    cameras : only these cameras of a log; or the name of the one camera of the other sources.
+    cameras : only these cameras of a log; or the name of the only camera of the other sources.
     force : accept the stated board size, and poor results.
 
     Yields
     ------
-    A result for each camera as soon as it is ready; a failure says why a camera has none.
+    A result for each camera as soon as it is ready; a failure gives the reason if a camera has no result.
 
     Raises
     ------
@@ -514,7 +516,7 @@ class LiveTracks(NamedTuple):
 
 
 class Tracker:
-    """Live tracking. Iterate over the newest tracks; leaving the block ends the recording whole.
+    """Live tracking. Iterate over the newest tracks; the end of the block completes the recording.
 
     A context manager, made by :func:`live`.
 
@@ -565,7 +567,7 @@ class Tracker:
             self._stop_cameras()
 
     def begin(self, stop_cameras: Callable[[], None]) -> None:
-        """Note that the cameras send; called by the pipeline."""
+        """Note that the cameras send; the pipeline calls this method."""
         self._stop_cameras = stop_cameras
         if self._stopped:
             stop_cameras()
@@ -579,7 +581,7 @@ class Tracker:
                 self._newest.put(LiveTracks(run, message.payload.timestamp, message.payload.tracks))
 
     def _take(self) -> LiveTracks | None:
-        """Return tracks that wait already, if any. The end stays in the queue."""
+        """Return tracks that already wait, if any. The end mark stays in the queue."""
         try:
             tracks = self._newest.get_nowait()
         except queue.Empty:
@@ -620,7 +622,7 @@ def live(
     model_from : the log with the fitted models.
     models : names of models; none: ``poly`` if there is one, else the newest.
     cameras : only these cameras of the rig.
-    calibrations : in place of the intrinsics that the rig names, by camera.
+    calibrations : they replace the intrinsics that the rig names, by camera.
     corners, method : as the options of ``ipsys live``.
     force : replace an existing log.
     say : called with remarks.

@@ -1,16 +1,17 @@
 """The whole system on one page: how a frame becomes a position.
 
-A source is an iterable of messages, a stage a row that says what it reads and has a step from a
-message to payloads, and :func:`run` sends one through the others. :func:`replay` does this for a
-log, stage by stage: what the log does not hold yet, or no longer rightly, is computed and appended.
-:func:`record` writes what cameras send; :func:`live` writes it first, and then sends it through the
-same stages in the same way; :func:`measure` writes only what is measured.
+A source is an iterable of messages. A stage is a row with the channels that it reads and a step from a
+message to payloads. :func:`run` sends a source through stages. :func:`replay` does this for a log, stage
+by stage: missing results and results that are out of date are computed and appended. :func:`record` writes
+the messages of cameras. :func:`live` writes them first, and then sends them through the same stages in the
+same way; :func:`measure` writes only the measurements with their frames.
 
 ==============  ==================  ================  =====================================
 stage           reads               writes            its run is named after
 ==============  ==================  ================  =====================================
 detect          frames              markers           the corner method, ``edges``
-camera-frame    markers, lenses     camera points     the run of its markers
+camera-frame    markers,            camera points     the run of its markers
+                intrinsics
 fit             camera points,      model             the model, ``poly``
                 measurements
 evaluate        the same, model     evaluation        the run of its model
@@ -19,10 +20,10 @@ locate          camera points,      positions         the run of its model
 fuse            positions           tracks, poses     the run of its positions
 ==============  ==================  ================  =====================================
 
-The rig is read by all, by locate only for models that are told the height of a marker.
-:mod:`ipsys_log.runs` says in full what each stage reads (``tasks``) and how its run is found or made
-(``perform``), :mod:`ipsys_log.recording` how frames get from the cameras into the log (``recorder``) and from
-there, as long as the stages keep up, to them (``waiting``).
+All stages read the rig; locate reads it only for models that need the height of a marker.
+:mod:`ipsys_log.runs` has the details: the plan of each stage (``graph``), and the search or creation of its
+run (``execute``). :mod:`ipsys_log.capture` moves frames from the cameras into the log (``recorder``), and
+from the log to the stages, as long as the stages keep up (``backlog``).
 """
 
 from __future__ import annotations
@@ -72,7 +73,7 @@ def replay(
     progress: Progress = lambda stage, done, total: None,
     say: Callable[[str], None] = lambda text: None,
 ) -> list[Outcome]:
-    """Compute what a log lacks, up to a stage, and append it; or write it to a new log.
+    """Compute the results that a log lacks, up to a stage, and append them; or write them to a new log.
 
     Results that are out of date are computed again, as a new run beside the old one.
 
@@ -84,7 +85,7 @@ def replay(
 
     Returns
     -------
-    One outcome for each stage, in order, saying which run holds it and whether it is new.
+    One outcome for each stage, in order, with the run of its result; ``fresh`` if the run is new.
 
     Raises
     ------
@@ -99,7 +100,7 @@ def replay(
     with opened_target(paths, output) as (logs, target), threadpool_limits(1, user_api="blas"):
 
         def do(stage: Stage, inputs: dict[Channel, str], model: str | None = None) -> None:
-            """Run a stage, or find its result; note its run as that of the channels that it writes."""
+            """Run a stage, or find its result; note its run as the run of the channels that it writes."""
             with Session(logs) as session:
                 if MODEL in stage.writes and request.model_from is not None:
                     task: Task | str = copy_model(request, str(model))[0]
@@ -136,18 +137,18 @@ def record(
 
     Parameters
     ----------
-    source : messages, and None where nothing comes.
-    settings : written first: rig and lenses.
-    consumers : each is shown everything after it was written, and None where nothing came.
-    overwrite : put it in place of a log that is there.
-    sinks : each gets the same in its own thread; a slow one loses messages, images first.
+    source : messages, and None if no message came.
+    settings : written first: rig and camera intrinsics.
+    consumers : each gets everything after it was written, and None if no message came.
+    overwrite : replace an existing log.
+    sinks : each gets the same in its own thread; a slow sink loses messages, images first.
 
     Raises
     ------
     IpsysError
-        The log cannot be written; it is complete up to then.
+        The log cannot be written; the messages before the error are complete in it.
     Exception
-        The error of the first failed consumer or sink, after the recording has ended: it cannot end it.
+        The error of the first failed consumer or sink. It cannot end the recording, and is raised after it.
     """
     with Consumers(consumers, source.warn, sinks) as show, recording(target, settings, overwrite) as log:
         for arrived in written(source, log):
@@ -169,26 +170,26 @@ def measure(
     """Detect markers in the frames of cameras, and write measurements with their frames to a new log.
 
     A measurement in the cameras' stream keeps the frames of the second in which its marker was stationary;
-    all others are processed and discarded. Results of the stages are only shown: a replay computes them from
-    the frames.
+    all other frames are processed and discarded. Results of the stages are only shown: a replay computes them
+    from the frames.
 
     Parameters
     ----------
-    settings : written first: rig and lenses.
+    settings : written first: rig and camera intrinsics.
     request : corners.
-    consumers : each is shown every frame that the stages have seen, its markers and camera points.
-    sinks : the same, each in its own thread; a slow one loses messages, images first.
+    consumers : each gets every frame that the stages have processed, its markers and camera points.
+    sinks : the same, each in its own thread; a slow sink loses messages, images first.
 
     Returns
     -------
-    How many messages went to each topic.
+    The number of messages by topic.
 
     Raises
     ------
     IpsysError
-        For cameras that send no pictures but video, or a log that cannot be written; what it holds is kept.
+        A camera sends video instead of single images, or the log cannot be written; its content is kept.
     Exception
-        What the first of ``consumers`` raised, after the log is complete.
+        The first error of ``consumers``, after the log is complete.
     """
     check_pictures(cameras.states)
     plan = plan_live(cameras.states, settings, request, "camera-frame")
@@ -224,23 +225,22 @@ def live(
 
     Parameters
     ----------
-    settings : written first: rig and lenses.
+    settings : written first: rig and camera intrinsics.
     request : corners, method and, for fuse, ``model_from``.
     until : detect, camera-frame or fuse.
-    consumers : each is shown every frame that the stages have seen, and what they make of it, after it was
-        written.
-    sinks : the same, each in its own thread; a slow one loses messages, images first.
+    consumers : each gets every frame that the stages have processed, and their results, after the write.
+    sinks : the same, each in its own thread; a slow sink loses messages, images first.
 
     Returns
     -------
-    One outcome for each stage, as of :func:`replay`.
+    One outcome for each stage, as from :func:`replay`.
 
     Raises
     ------
     IpsysError
-        Where the other log has no such model, or the log cannot be written; what it holds is kept.
+        The other log has no such model, or the log cannot be written; its content is kept.
     Exception
-        What the first of ``consumers`` raised, after the log is complete: it cannot end the recording.
+        The first error of ``consumers``, after the log is complete: it cannot end the recording.
     """
     plan = plan_live(cameras.states, settings, request, until)
     first = (*settings, *plan.copies(cameras.now_ns))
@@ -291,7 +291,7 @@ def _put_through(
         for message in _through(stages, frames, ledger):
             if message is TICK:
                 continue
-            if run_of_topic(message.topic) is not None:  # all else is written already
+            if run_of_topic(message.topic) is not None:  # all other messages are written already
                 log.put(message)
                 entry = ledger.entry(message)
                 if entry is not None:

@@ -1,4 +1,4 @@
-"""Logs whose recorder was killed: made whole again, with the runs that it was writing."""
+"""Repair of logs whose recorder was killed: the recorder's runs are completed."""
 
 from __future__ import annotations
 
@@ -16,19 +16,19 @@ from ipsys_log.stages.detect import CORNERS, skipped_frames
 
 __all__ = ["finish_runs", "unfinished_runs"]
 
-# What a run of camera points is called, and why.
+# The names of the runs of camera points, each with its corner method and its camera-point method.
 _POINTS = [(points_run(corners, method), corners, method) for corners in CORNERS for method in METHODS]
 
 
 def unfinished_runs(session: Session) -> dict[str, str]:
-    """What ``ipsys live`` and ``record --detect`` wrote and could not sign: the run of each such stage."""
+    """Return by stage the unsigned runs that ``ipsys live`` and ``record --detect`` wrote."""
     signed = {(run.run, run.stage) for run in session.runs()}
-    found = _live_runs(session) if session.images else ()
-    return {stage: run for stage, run in found if (run, stage) not in signed}
+    live_runs = _live_runs(session) if session.images else ()
+    return {stage: run for stage, run in live_runs if (run, stage) not in signed}
 
 
 def _live_runs(session: Session) -> Iterator[tuple[str, str]]:
-    """Stages and their runs, as they are called live, as far as the log has them."""
+    """Yield stages and their runs with the names of live processing, if the log has them."""
     for corners in CORNERS:
         if session.topics(MARKERS, corners):
             yield detect.STAGE.name, corners
@@ -43,19 +43,19 @@ def _live_runs(session: Session) -> Iterator[tuple[str, str]]:
 
 
 def finish_runs(path: Path, progress: Progress) -> list[Outcome]:
-    """Bring the runs that a killed recorder left to their end: its last frames are looked at too.
+    """Complete the runs that a killed recorder left; the stages also process its last frames.
 
-    A run is signed only if all that was written of it is what its stages make of the log now, byte for byte.
-    Frames that were skipped for want of time are passed over, as they were live.
+    A run is signed only if all its messages equal the messages that its stages make from the log now, byte
+    for byte. Frames that live processing skipped because it was too slow are skipped again.
 
     Returns
     -------
-    One outcome for each stage; none where there is nothing to finish.
+    One outcome for each stage; none if all runs are finished.
 
     Raises
     ------
     IpsysError
-        Where the log lacks something that the stages need; nothing was changed then.
+        The log lacks an input of the stages; in this case nothing was changed.
     """
     with Session([path]) as session:
         left = unfinished_runs(session)
@@ -66,7 +66,7 @@ def finish_runs(path: Path, progress: Progress) -> list[Outcome]:
 
 
 def _request(session: Session, left: Mapping[str, str]) -> Request:
-    """What was asked for live, by the names of the runs."""
+    """Return the request of the live run, derived from the names of the runs."""
     points = left.get(camera_frame.STAGE.name) or newest_run(session, CAMERA_POINTS)
     live = (left.get(detect.STAGE.name), PERIMETER)
     corners, method = next(((corners, method) for run, corners, method in _POINTS if run == points), live)

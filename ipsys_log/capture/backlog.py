@@ -1,4 +1,4 @@
-"""Recorded frames that wait for the stages, and the frames that are skipped where too many wait."""
+"""The backlog: recorded frames that wait for the stages, and the frames that are skipped."""
 
 from __future__ import annotations
 
@@ -23,36 +23,36 @@ from ipsys_log.messages import (
 
 __all__ = ["TICK", "Backlog", "Waiting"]
 
-# Frames of a camera that may wait to be searched; older ones are skipped.
+# Number of frames of a camera that may wait for the search; older frames are skipped.
 _SEARCHED = 3
-# Frames of a video that may wait at all, most of them only to be decoded; that is a second or two.
+# Number of frames of a video that may wait, most of them only for decoding; this is a second or two.
 _DECODED = 30
 
 
 class Waiting:
-    """Frames in the order they came, at most so many of each camera. For one thread, or under a lock.
+    """A queue of frames, with a limit for each camera. For one thread, or under a lock.
 
-    Of JPEG pictures the oldest is skipped. A frame of a video is needed by those after it: the oldest is
-    still decoded, which takes half of the time, and not searched. Where that is too much as well, all
-    frames up to the next keyframe are skipped.
+    For JPEG images, the oldest is skipped. Later frames of a video need the earlier ones: the oldest frame is
+    still decoded, which takes half of the time, and not searched. If this is too slow as well, all frames up
+    to the next keyframe are skipped.
     """
 
     def __init__(self) -> None:
         self._frames: deque[Message] = deque()
-        # Cameras whose next frames are nothing without one that was skipped.
+        # Cameras whose next frames cannot be decoded, because an earlier frame was skipped.
         self._broken: set[str | None] = set()
 
     def __len__(self) -> int:
         return len(self._frames)
 
     def take(self) -> list[Message]:
-        """All that wait; those of a video that are not to be searched as :class:`SkippedVideo`."""
+        """Return all waiting frames; video frames that are only decoded are :class:`SkippedVideo`."""
         taken = list(self._frames)
         self._frames.clear()
         return taken
 
     def put(self, message: Message) -> list[Message]:
-        """Let a frame wait; returns those that are skipped for it, maybe itself."""
+        """Enqueue a frame; return the frames skipped to make room, possibly the new one."""
         if isinstance(message.payload, CompressedVideo):
             return self._put_video(message)
         self._frames.append(message)
@@ -70,7 +70,7 @@ class Waiting:
         self._frames.append(message)
         gone = self._jump(message.camera)
         mine = self._of(message.camera)
-        searched = [one for one in mine if isinstance(one.payload, CompressedVideo)]
+        searched = [queued for queued in mine if isinstance(queued.payload, CompressedVideo)]
         if len(searched) <= _SEARCHED:
             return gone
         late, following = searched[:2]
@@ -81,23 +81,23 @@ class Waiting:
         return [*gone, late]
 
     def _jump(self, camera: str | None) -> list[Message]:
-        """Where too many wait, go on with the newest keyframe, or with the next one; what is skipped."""
+        """Skip frames up to the newest or the next keyframe, if too many wait; return them."""
         mine = self._of(camera)
         if len(mine) <= _DECODED:
             return []
-        keys = [n for n, one in enumerate(mine) if n and is_keyframe(_frame(one))]
+        keys = [n for n, queued in enumerate(mine) if n and is_keyframe(_frame(queued))]
         gone = mine[: keys[-1]] if keys else mine
         if not keys:
             self._broken.add(camera)
         self._leave_out(gone)
-        return [one for one in gone if isinstance(one.payload, CompressedVideo)]
+        return [skipped for skipped in gone if isinstance(skipped.payload, CompressedVideo)]
 
     def _of(self, camera: str | None) -> list[Message]:
-        return [one for one in self._frames if one.camera == camera]
+        return [queued for queued in self._frames if queued.camera == camera]
 
     def _leave_out(self, gone: list[Message]) -> None:
-        times_ns = {one.log_time_ns for one in gone}
-        self._frames = deque(one for one in self._frames if one.log_time_ns not in times_ns)
+        times_ns = {skipped.log_time_ns for skipped in gone}
+        self._frames = deque(queued for queued in self._frames if queued.log_time_ns not in times_ns)
 
 
 def _frame(message: Message) -> CompressedVideo:
@@ -105,24 +105,24 @@ def _frame(message: Message) -> CompressedVideo:
     return payload.frame if isinstance(payload, SkippedVideo) else payload
 
 
-# Between two messages of a source: nothing more has come so far. It is not in the log.
+# A tick between two messages of a source: no more messages have come so far. It is not in the log.
 TICK = Message("", 0, 0, None)
-# Whoever interrupts does not wait longer for a recorder that hangs.
+# After an interrupt, the backlog waits no longer than this for a recorder that hangs.
 _LAST_S = 1.0
 
 
 class Backlog:
-    """Frames that are in the log and that the stages have not seen. A context manager; iterate once.
+    """The frames that are in the log and that the stages have not seen. A context manager; iterate once.
 
-    A thread of its own writes what a source gives and hands the frames on. Where the stages are slower than
-    the cameras, frames are skipped as :class:`~ipsys_log.capture.backlog.Waiting` does, never the recording
-    of them, and an event names each. After everything that waits comes a :data:`TICK`.
+    A separate thread writes the messages of a source and passes the frames on. If the stages are slower than
+    the cameras, frames are skipped as in :class:`~ipsys_log.capture.backlog.Waiting`. The recording loses no
+    frame, and an event names each skipped frame. After all waiting messages comes a :data:`TICK`.
 
     Parameters
     ----------
-    source : messages, None where nothing comes.
-    log : where all of them go.
-    now_ns : a log time for an event, called by the thread that takes from the source.
+    source : messages, and None if no message came.
+    log : the log for all messages.
+    now_ns : returns a log time for an event; called by the thread that reads the source.
     """
 
     def __init__(self, source: Source, log: Target, now_ns: Callable[[], int]) -> None:
@@ -162,7 +162,7 @@ class Backlog:
             for message in written(self._source, self._log):
                 if message is not None and (message.camera is not None or _is_read(message)):
                     self._hand_on(message)
-        except BaseException as fault:  # raised again where the messages are taken
+        except BaseException as fault:  # raised again in the thread that takes the messages
             self._fault = fault
         finally:
             with self._changed:

@@ -1,4 +1,4 @@
-"""What a live run is made of: the stages, and the runs that a replay would name."""
+"""The plan of a live run: its stages, and its runs with the names of a replay."""
 
 from __future__ import annotations
 
@@ -23,8 +23,11 @@ __all__ = ["LivePlan", "check_model", "check_pictures", "check_start", "plan_liv
 
 
 class LivePlan(NamedTuple):
-    """A live run: the request with all that it leaves open, the models of another log with the tasks that
-    copy them in, the runs in the order of their records, and the causal stages."""
+    """The plan of a live run.
+
+    It has the completed request, and the models of another log with the tasks that copy them. It also has the
+    runs in the order of their records, and the causal stages.
+    """
 
     request: Request
     copied: list[tuple[Task, Model]]
@@ -42,9 +45,9 @@ class LivePlan(NamedTuple):
 
 @dataclass(frozen=True, slots=True, eq=False)
 class _LiveView:
-    """The view of a stage on cameras that send: nothing is recorded yet but the rig and the intrinsics.
+    """The view of a stage on live cameras: only the rig and the intrinsics are recorded so far.
 
-    ``model`` is the one that the stage applies.
+    ``model`` is the model that the stage applies.
     """
 
     cameras: Collection[str]
@@ -58,7 +61,11 @@ class _LiveView:
         return self.inputs.get(channel, "")
 
     def messages(self, *channels: Channel) -> Iterator[Message]:
-        return (one for one in self.settings if channel_of(one.topic, type(one.payload)) in channels)
+        return (
+            message
+            for message in self.settings
+            if channel_of(message.topic, type(message.payload)) in channels
+        )
 
     def payloads(self, channel: Channel) -> list[Any]:
         if channel is MODEL:
@@ -78,13 +85,13 @@ class _LiveView:
 def plan_live(
     cameras: Collection[str], settings: Sequence[Message], request: Request, until: str
 ) -> LivePlan:
-    """Plan a live run as a replay of its log would be.
+    """Plan a live run like a replay of its log.
 
     Raises
     ------
     IpsysError
-        Where the other log has no such model; for a camera without a lens, a model that knows none of the
-        cameras, or one that needs a height that the rig does not say.
+        The other log has no such model; a camera has no intrinsics; the model has none of the cameras, or it
+        needs a height that the rig does not give.
     """
     lenses = {str(message.camera) for message in settings if isinstance(message.payload, CameraCalibration)}
     (rig,) = (message.payload for message in settings if isinstance(message.payload, Rig))
@@ -98,21 +105,21 @@ def plan_live(
 def check_start(
     rig: Rig, cameras: Collection[str], lenses: Collection[str], request: Request, until: str
 ) -> list[str]:
-    """See, before a camera is opened, that a live run can be planned.
+    """Check, before a camera is opened, that a live run can be planned.
 
     Parameters
     ----------
-    cameras, lenses : the names of the cameras, and of those that have a lens.
-    request, until : as of :func:`plan_live`.
+    cameras, lenses : the names of the cameras, and of the cameras with intrinsics.
+    request, until : as for :func:`plan_live`.
 
     Returns
     -------
-    A line for each thing to know.
+    One line for each remark.
 
     Raises
     ------
     IpsysError
-        As :func:`plan_live`.
+        As for :func:`plan_live`.
     """
     models = [model for _, model in _copied(request, until)]
     _check(rig, cameras, lenses, models, until)
@@ -124,12 +131,12 @@ def check_start(
 
 
 def check_model(model: Model, cameras: Collection[str]) -> None:
-    """See that a model is of some of the cameras.
+    """Check that a model has some of the cameras.
 
     Raises
     ------
     IpsysError
-        Otherwise.
+        The model has none of them.
     """
     known = sorted(camera.camera for camera in model.cameras)
     if not set(known) & set(cameras):
@@ -140,7 +147,7 @@ def check_model(model: Model, cameras: Collection[str]) -> None:
 
 
 def _copied(request: Request, until: str) -> list[tuple[Task, Model]]:
-    """The models of another log that are applied, with the tasks that copy them in; none before locate."""
+    """Return the models of another log to apply, with the tasks that copy them in; none before locate."""
     reads_model = any(MODEL in stage.reads for stage in _causal(until))
     return [copy_model(request, name) for name in wanted_models(request)] if reads_model else []
 
@@ -152,7 +159,7 @@ def _causal(until: str) -> list[Stage]:
 def _check(
     rig: Rig, cameras: Collection[str], lenses: Collection[str], models: Sequence[Model], until: str
 ) -> None:
-    """See that the stages will not have to stop later."""
+    """Check that the stages will not have to stop later."""
     missing = sorted(set(cameras) - set(lenses))
     if missing and any(CAMERA_POINTS in stage.writes for stage in _causal(until)):
         name = missing[0]
@@ -171,12 +178,12 @@ def _check(
 
 
 def check_pictures(cameras: Mapping[str, CameraState]) -> None:
-    """See that any frame can be taken out of what cameras send.
+    """Check that each frame of the cameras can be decoded by itself.
 
     Raises
     ------
     IpsysError
-        For a camera that sends video: a frame of it is nothing without those before it.
+        A camera sends video: its frames cannot be decoded without the frames before them.
     """
     for name, state in cameras.items():
         if state.format in ("h264", "h265"):

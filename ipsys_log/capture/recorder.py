@@ -41,7 +41,7 @@ __all__ = [
     "written",
 ]
 
-# Whoever interrupts does not wait longer for a write.
+# After an interrupt, the recorder waits no longer than this for a write.
 _SETTLE_S = 1.0
 
 
@@ -64,7 +64,7 @@ class Source(Protocol):
 class Target(Protocol):
     """Destination of messages, in the order of their log times.
 
-    ``full`` is set when the disk is full, ``fault`` when it failed to keep written messages.
+    ``full`` is set if the disk is full, ``fault`` if it failed to keep written messages.
     """
 
     @property
@@ -81,7 +81,7 @@ class Target(Protocol):
 
 
 class Recording:
-    """A log that several threads write. Made by :func:`recording`.
+    """A log that several threads write; :func:`recording` creates it.
 
     Parameters
     ----------
@@ -89,8 +89,8 @@ class Recording:
 
     Attributes
     ----------
-    counts : messages so far, by topic.
-    full : set when the disk is full; the reserved space is in use then.
+    counts : number of messages so far, by topic.
+    full : set when the disk is full; then the reserved space is in use.
     syncer : syncs the log to the disk.
     """
 
@@ -103,17 +103,17 @@ class Recording:
         self._torn = False
 
     def put(self, message: Message) -> None:
-        """Write a message. No chunk spans more than a second: a recorder that is killed loses no more.
+        """Write a message. A chunk lasts at most a second: a killed recorder loses no more than that.
 
         Raises
         ------
         WriteError
-            Where the disk is full, and what was set aside is used up too.
+            The disk is full, and the reserved space is used up too.
         """
         self._write(lambda: write_message(self._writer, message, self.counts))
 
     def flush(self) -> None:
-        """Hand everything to the disk."""
+        """Pass all messages to the disk."""
         self._write(self._writer.flush)
 
     def sync(self, confirm: Confirm) -> None:
@@ -139,7 +139,7 @@ class Recording:
             raise IpsysError(what_failed(self._writer.path, self.fault)) from self.fault
 
     def settle(self) -> bool:
-        """Write nothing more, whichever thread wants to; False where one is in the midst of it."""
+        """Prevent further writes from all threads; return False if a thread is still writing."""
         return self._lock.acquire(timeout=_SETTLE_S) and not self._torn
 
     def _write(self, write: Callable[[], None]) -> None:
@@ -159,8 +159,8 @@ class Recording:
 def written(source: Source, log: Target) -> Iterator[Message | None]:
     """Yield the messages of a source, each after it was written.
 
-    A measurement is confirmed as soon as it is on the disk. When the disk is full the source is stopped.
-    Other messages than frames are still written, to the reserved space.
+    A measurement is confirmed as soon as it is on the disk. When the disk is full, the source is stopped.
+    Messages other than frames are still written, to the reserved space.
     """
     warned = False
     with closing(iter(source)) as messages:
@@ -204,18 +204,18 @@ def recording(path: Path, settings: Iterable[Message] = (), overwrite: bool = Fa
     """
     created = _create(path, overwrite)
     try:
-        with ExitStack() as held:
-            log = Recording(held.enter_context(created), held.enter_context(reserve(path)))
+        with ExitStack() as resources:
+            log = Recording(resources.enter_context(created), resources.enter_context(reserve(path)))
             try:
                 for message in settings:
                     log.put(message)
                 log.flush()
-                held.enter_context(log.syncer)
+                resources.enter_context(log.syncer)
                 yield log
             except KeyboardInterrupt as error:
                 if log.settle():
                     raise
-                held.pop_all()  # a log that is torn cannot be ended, and what hangs would hang here too
+                resources.pop_all()  # a torn log cannot be ended, and a hanging write would block here
                 text = (
                     f"{path}: interrupted while it was written; see what it holds with: ipsys repair {path}"
                 )
@@ -229,9 +229,9 @@ def _create(path: Path, overwrite: bool) -> LogWriter:
         return LogWriter.create(path)
     old = open_locked(DISK, path, os.O_RDWR)
     try:
-        roll_back(DISK, path, old)  # what was left over of an append is not of the new log
+        roll_back(DISK, path, old)  # an unfinished append to the old log does not belong to the new log
         partial = path.with_name(f"{path.name}.new")
-        partial.unlink(missing_ok=True)  # who made it was killed: the lock is ours
+        partial.unlink(missing_ok=True)  # its writer was killed: this process has the lock
         try:
             writer = LogWriter.create(partial)
             writer.move(path)
@@ -248,12 +248,12 @@ def fitting_lenses(
     sizes_px: Mapping[str, tuple[int, int] | None],
     say: Callable[[str], None],
 ) -> dict[str, CameraCalibration]:
-    """Lenses for the frames that cameras send, scaled where these are of another size, which is said.
+    """Return intrinsics for the frames of cameras, scaled for frames of another size; ``say`` reports this.
 
     Raises
     ------
     IpsysError
-        Where frames have another shape.
+        The frames have another aspect ratio.
     """
     fitting = {}
     for camera, lens in lenses.items():
@@ -267,11 +267,11 @@ def fitting_lenses(
 def first_messages(
     rig: Rig, lenses: Mapping[str, CameraCalibration], now_ns: Callable[[], int]
 ) -> list[Message]:
-    """The first messages of a log: the rig, and the intrinsics by camera."""
+    """Return the first messages of a log: the rig, and the intrinsics by camera."""
     time_ns = now_ns()
-    found = [Message(RIG_TOPIC, time_ns, time_ns, rig)]
+    messages = [Message(RIG_TOPIC, time_ns, time_ns, rig)]
     for camera, lens in sorted(lenses.items()):
         time_ns = now_ns()
         stamped = replace(lens, timestamp=time_ns)
-        found.append(Message(calibration_topic(camera), time_ns, time_ns, stamped, camera))
-    return found
+        messages.append(Message(calibration_topic(camera), time_ns, time_ns, stamped, camera))
+    return messages

@@ -12,7 +12,7 @@ _LONGEST_COMPLAINT = 100_000
 
 
 def main() -> None:
-    """Run the command line; a fault of the input is one line on stderr and exit code 1."""
+    """Run the command line; an error of the input is one line on stderr and exit code 1."""
     from ipsys_log.cli.signals import InterruptError, hold_signals
 
     hold_signals()
@@ -26,14 +26,14 @@ def main() -> None:
     except IpsysError as error:
         sys.exit(_complain(str(error)))
     except BrokenPipeError:
-        sys.stderr.close()  # the reader of a pipe has gone, such as head
+        sys.stderr.close()  # the reader of the pipe, such as head, has ended
         sys.exit(0)
     except OSError as error:
         full = is_full(error)
         if error.filename is None and not full:
             raise
-        what = f"the disk is full; {disk_advice(error)}" if full else error.strerror
-        sys.exit(_complain(f"{error.filename}: {what}" if error.filename else str(what)))
+        cause = f"the disk is full; {disk_advice(error)}" if full else error.strerror
+        sys.exit(_complain(f"{error.filename}: {cause}" if error.filename else str(cause)))
     except InterruptError as interrupt:
         _complain(interrupt.text)
         sys.exit(interrupt.exit_code)
@@ -45,13 +45,13 @@ def _complain(text: str) -> int:
     line = "ipsys: " + plain_text(text, keep="\n", longest=_LONGEST_COMPLAINT)
     if sys.stderr.isatty():  # a file or a pipe gets one line
         width = shutil.get_terminal_size().columns
-        line = "\n".join(_wrapped(one, width) for one in line.splitlines())
+        line = "\n".join(_wrapped(text_line, width) for text_line in line.splitlines())
     print(line, file=sys.stderr)  # noqa: T201
     return 1
 
 
 def _wrapped(line: str, width: int) -> str:
-    """A line broken between words, what follows as far in as it began."""
+    """Return a line that is wrapped between words; further lines have the same indent."""
     indent = line[: len(line) - len(line.lstrip())]
     return textwrap.fill(
         line, width, subsequent_indent=indent, break_long_words=False, break_on_hyphens=False

@@ -1,4 +1,4 @@
-"""How the cameras hang, and what of the floor they see: ``ipsys align``."""
+"""Alignment of the cameras and coverage of the floor: ``ipsys align``."""
 
 from __future__ import annotations
 
@@ -58,12 +58,12 @@ def align(
     output: Output = None,
     as_json: AsJson = False,
 ) -> None:
-    """Say which way to tilt each camera so that it looks straight down, and what of the floor they all see.
+    """Say how to tilt each camera so that it looks straight down, and which floor all cameras see.
 
-    From markers that lie on the floor, four or more in each picture, or one that is laid down at one place
-    after the other. Where places were measured, also the floor that no camera sees, and where neighbours
-    overlap by less than a marker. What it needs and the log does not hold yet is made first. Without a log
-    it looks at what the cameras of the rig send now.
+    The command uses markers that lie on the floor: four or more in each image, or one marker that is laid
+    down at one calibration point after the other. If the log has calibration points, the command also reports
+    the floor that no camera sees, and neighbours that overlap by less than a marker. It computes missing
+    results first. Without a log, it uses the present images of the cameras of the rig.
     """
     from ipsys_log.report.files import check_picture
 
@@ -90,7 +90,7 @@ def align(
 def _prepared_now(
     rig: Path | None, calibration: list[str] | None, corners: str | None, output: Path | None
 ) -> Lab:
-    """The cameras to look at, when everything is said that can be said before they are opened."""
+    """Return the cameras to open, after all checks that are possible before they are opened."""
     from ipsys_log.capture.live_plan import check_start
     from ipsys_log.errors import IpsysError
     from ipsys_log.runs.options import Request
@@ -112,7 +112,7 @@ def _align(logs: list[Path], options: dict[str, Any], plot: Path | None, as_json
     from ipsys_log.runs.provenance import newest_run
     from ipsys_log.sinks.selection import rig_in_force
 
-    given = load_rig(options["rig"]) if options["rig"] else None
+    given_rig = load_rig(options["rig"]) if options["rig"] else None
     lenses = load_calibrations(options["calibration"], lambda: cameras_of(logs))
     with Session(logs) as session:
         bare = not session.images and newest_run(session, MARKERS) is None
@@ -120,9 +120,11 @@ def _align(logs: list[Path], options: dict[str, Any], plot: Path | None, as_json
     with derived(logs, "camera-frame", method=method, run=None, **options) as (session, outcomes, _):
         made = [outcome.run for outcome in outcomes if outcome.stage == "camera-frame"]
         run = made[-1] if made else str(newest_run(session, CAMERA_POINTS))
-        held = {camera: session.payloads([topic])[-1] for camera, topic in session.calibrations.items()}
-        in_force = given or rig_in_force(session, [run]) or session.payloads(session.topics(RIG))[-1]
-        lab = read_alignment(session, run, in_force, {**held, **lenses})
+        recorded_lenses = {
+            camera: session.payloads([topic])[-1] for camera, topic in session.calibrations.items()
+        }
+        in_force = given_rig or rig_in_force(session, [run]) or session.payloads(session.topics(RIG))[-1]
+        lab = read_alignment(session, run, in_force, {**recorded_lenses, **lenses})
     _show(lab, plot, as_json)
 
 

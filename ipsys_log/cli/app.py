@@ -27,7 +27,7 @@ from ipsys_log.cli.signals import interruptible
 
 __all__ = ["EXAMPLES", "PANELS", "arrange"]
 
-# The commands as ``ipsys --help`` lists them.
+# The commands in the order of ``ipsys --help``.
 PANELS: dict[str, tuple[str, ...]] = {
     "The first day, in this order": (
         *("init", "markers", "cameras", "calibrate", "align", "record", "measure", "replay", "live"),
@@ -38,7 +38,7 @@ PANELS: dict[str, tuple[str, ...]] = {
     "Without cameras of your own": ("simulate", "import"),
 }
 
-# Each line is a command and what it is for; at most 76 columns.
+# Each line is a command and its purpose; at most 76 columns.
 EXAMPLES: dict[str, str] = {
     "init": """
 ipsys init lab.toml                      # an example with comments
@@ -136,8 +136,8 @@ def arrange(app: typer.Typer) -> None:
 
 
 def _unwrapped(text: str) -> str:
-    """A help whose paragraphs are one line each: the window breaks them."""
-    return "\n\n".join(" ".join(one.split()) for one in cleandoc(text).split("\n\n"))
+    """Return a help text with one line for each paragraph: the terminal wraps them."""
+    return "\n\n".join(" ".join(paragraph.split()) for paragraph in cleandoc(text).split("\n\n"))
 
 
 def _with_one_reading(command: Callable[..., Any]) -> Callable[..., Any]:

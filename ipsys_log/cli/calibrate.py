@@ -1,4 +1,4 @@
-"""A lens from pictures of a board: ``ipsys calibrate``."""
+"""Calibration of camera intrinsics from images of a board: ``ipsys calibrate``."""
 
 from __future__ import annotations
 
@@ -132,8 +132,8 @@ def calibrate(
     if lab is not None:
         _targets(lab.names, output, names, force)
     with nullcontext(sources or []) if lab is None else _taken_now(lab, seconds) as taken:
-        found = find_sources(taken, camera or [])
-        targets = _targets([pictures.camera for pictures in found], output, names, force)
+        image_sources = find_sources(taken, camera or [])
+        targets = _targets([pictures.camera for pictures in image_sources], output, names, force)
         with progress_bar() as progress:
             outcomes: list[Calibrated | Failure] = []
             for outcome in api.calibrate(
@@ -167,7 +167,7 @@ def _print_outcomes(
     as_json: bool,
     for_rig: bool,
 ) -> None:
-    """Print the results, then a line for each camera without one; exit with 1 if one is missing."""
+    """Print the results, then a line for each camera without a result; exit with 1 if a result is missing."""
     from ipsys_log.calibration.calibrate import Failure
     from ipsys_log.errors import IpsysError
 
@@ -208,7 +208,7 @@ def _prepared_now(rig: Path | None, only: list[str] | None, board: str) -> Lab:
             "send now"
         )
     lab = prepared(rig, only, None, with_lenses=False)
-    return lab._replace(cameras=[show_board(one, board) for one in lab.cameras])
+    return lab._replace(cameras=[show_board(camera, board) for camera in lab.cameras])
 
 
 @contextmanager

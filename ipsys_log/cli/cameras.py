@@ -44,14 +44,14 @@ def cameras(
         raise IpsysError("ipsys cameras: only Linux lists them; elsewhere they are usb:0, usb:1 and so on")
     from ipsys_log.capture.usb_bus import find_cameras
 
-    found = find_cameras()
-    advice = advise(demands_of(found, load_rig(rig) if rig else None))
+    attached = find_cameras()
+    advice = advise(demands_of(attached, load_rig(rig) if rig else None))
     if as_json:
-        print(json.dumps({"cameras": [_plain(camera) for camera in found], "advice": advice}, indent=2))  # noqa: T201
+        print(json.dumps({"cameras": [_plain(camera) for camera in attached], "advice": advice}, indent=2))  # noqa: T201
         return
-    for camera in found:
+    for camera in attached:
         console.print(_describe(camera), markup=False)
-    if not found:
+    if not attached:
         console.print(_NONE, markup=False)
     for line in advice:
         console.print(line, markup=False)

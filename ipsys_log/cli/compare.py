@@ -1,4 +1,4 @@
-"""Is it the same, and how fast was it: ``ipsys verify``, ``ipsys diff``, ``ipsys latency``."""
+"""Comparison of runs and speed of live runs: ``ipsys verify``, ``ipsys diff``, ``ipsys latency``."""
 
 from __future__ import annotations
 
@@ -38,20 +38,20 @@ def verify(
     from ipsys_log.report.cameras import comparison_json, comparison_table, first_difference
 
     with progress_bar() as progress:
-        found = api.verify(
+        comparisons = api.verify(
             *logs, run=run, progress=progress, say=lambda text: remarks.print(text, markup=False)
         )
     if as_json:
-        print(json.dumps(comparison_json(found), indent=2))  # noqa: T201
+        print(json.dumps(comparison_json(comparisons), indent=2))  # noqa: T201
     else:
-        console.print(comparison_table(found, ("log", "again")))
-        difference = first_difference(found)
+        console.print(comparison_table(comparisons, ("log", "again")))
+        difference = first_difference(comparisons)
         console.print(
             "a replay equals the log" if difference is None else difference,
             style="green" if difference is None else "red",
             markup=False,
         )
-    _end(found)
+    _end(comparisons)
 
 
 def diff(
@@ -84,22 +84,24 @@ def diff(
     if second is None and len(names) < 2:
         raise IpsysError("name a second log, or with --run twice two runs of one")
     sides = first, second or first, (names[0], names[-1])
-    found = compare(*sides)
+    comparisons = compare(*sides)
     # If a distance could be measured, they have frames in common.
-    comparable = all(one.equal for one in found) or any(one.rms is not None for one in found)
+    comparable = all(comparison.equal for comparison in comparisons) or any(
+        comparison.rms is not None for comparison in comparisons
+    )
     why = None if comparable else explain_diff(*sides)
     if as_json:
         reason = {} if why is None else {"nothing_in_common": why}
-        print(json.dumps({**comparison_json(found), **reason}, indent=2))  # noqa: T201
+        print(json.dumps({**comparison_json(comparisons), **reason}, indent=2))  # noqa: T201
     else:
-        console.print(comparison_table(found, ("first", "second")))
-        difference = why or first_difference(found)
+        console.print(comparison_table(comparisons, ("first", "second")))
+        difference = why or first_difference(comparisons)
         console.print(
             "no difference" if difference is None else difference,
             style="green" if difference is None else "red",
             markup=False,
         )
-    _end(found)
+    _end(comparisons)
 
 
 def latency(
@@ -127,11 +129,11 @@ def latency(
         draw_latency(times_s, plot)
         remarks.print(f"{plot} drawn", markup=False)
     if as_json:
-        print(json.dumps({step: asdict(found) for step, found in steps.items()}, indent=2))  # noqa: T201
+        print(json.dumps({step: asdict(times) for step, times in steps.items()}, indent=2))  # noqa: T201
     else:
         console.print(latency_table(steps))
 
 
 def _end(found: Sequence[Comparison]) -> None:
-    if not all(one.equal for one in found):
+    if not all(comparison.equal for comparison in found):
         raise typer.Exit(1)

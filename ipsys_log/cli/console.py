@@ -22,10 +22,10 @@ if TYPE_CHECKING:
 
 __all__ = ["console", "print_outcomes", "print_warnings", "progress_bar", "remarks", "say"]
 
-# The stages that go through the frames, one message for each.
+# The stages with one message for each frame.
 _OF_FRAMES = ("detect", "camera-frame", "locate", "fuse", "simulate")
 _DRAW_EVERY_S = 0.1
-# More runs of a stage than this are counted, not listed.
+# A stage with more runs than this gets a count instead of a list.
 _MANY_RUNS = 4
 _LONGEST = 10_000
 
@@ -34,7 +34,7 @@ class SafeConsole(Console):
     """A console that prints text literally: no markup, and no control characters."""
 
     def __init__(self, file: IO[str], *, stderr: bool = False) -> None:
-        # In a window lines break between words; in a file or a pipe they do not break.
+        # On a terminal, lines break between words; in a file or a pipe, they do not break.
         super().__init__(
             stderr=stderr, highlight=False, markup=False, emoji=False, soft_wrap=not file.isatty()
         )
@@ -86,7 +86,7 @@ def print_warnings() -> Iterator[None]:
 
 @contextmanager
 def progress_bar() -> Iterator[Progress]:
-    """A bar for each stage, while it works and only on a terminal."""
+    """Yield the progress function; it shows a bar for each working stage, only on a terminal."""
     from rich.progress import (
         BarColumn,
         MofNCompleteColumn,
@@ -114,7 +114,7 @@ def progress_bar() -> Iterator[Progress]:
             nonlocal drawn_s
             if stage not in bars or done == 0:
                 bars[stage] = bar.add_task(stage, total=total, rate="")
-            # To draw takes longer than to do.
+            # Drawing the bar takes longer than processing a message.
             now_s = monotonic()
             if now_s - drawn_s < _DRAW_EVERY_S and done != total:
                 return
@@ -127,12 +127,12 @@ def progress_bar() -> Iterator[Progress]:
 
 
 def say(text: str) -> None:
-    """Print a remark unchanged, beside the results."""
+    """Print a remark unchanged, separate from the results."""
     remarks.print(text, markup=False)
 
 
 def print_outcomes(outcomes: Sequence[Outcome]) -> None:
-    """Print the stages that were done, found up to date, or left out."""
+    """Print the stages that were computed, were up to date, or were left out."""
     rest = _print_many(outcomes)
     width = max((len(outcome.run) for outcome in rest), default=0)
     for outcome in rest:
@@ -150,4 +150,4 @@ def _print_many(outcomes: Sequence[Outcome]) -> list[Outcome]:
     for stage, fresh in alike:
         if (stage, fresh) in many:
             remarks.print(f"{stage:<13} {alike[stage, fresh]} runs {'made' if fresh else 'up to date'}")
-    return [one for one in outcomes if one.remarks or (one.stage, one.fresh) not in many]
+    return [outcome for outcome in outcomes if outcome.remarks or (outcome.stage, outcome.fresh) not in many]

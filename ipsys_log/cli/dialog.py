@@ -16,7 +16,7 @@ if TYPE_CHECKING:
     from ipsys_log.survey.entry import Entry, Fault, Typed
     from ipsys_log.survey.scene import Scene
 
-    # Of an answer: what it says, and what is wrong.
+    # Reads an answer: returns its content and its faults.
     Read = Callable[[str], tuple[Entry, list[Fault]]]
 
 __all__ = ["HELP", "LetterError", "agreed", "answer", "ask_marker", "ask_numbers", "ask_places"]
@@ -31,52 +31,52 @@ _YES_NO = {"y": True, "yes": True, "n": False, "no": False}
 
 
 class LetterError(Exception):
-    """A letter was typed instead of an answer; or the terminal has gone, which is ``q``."""
+    """A letter typed instead of an answer; it is ``q`` if the terminal was closed."""
 
 
 def answer(question: str, usual: str = "") -> str:
-    """What is typed; what is usual where nothing is.
+    """Return the typed answer, or ``usual`` for an empty answer.
 
     Raises
     ------
     LetterError
-        For a letter that means something at any question.
+        The answer is a letter with a meaning at any question.
     """
     try:
-        given = str(typer.prompt(question, default=usual, show_default=bool(usual))).strip()
+        text = str(typer.prompt(question, default=usual, show_default=bool(usual))).strip()
     except (typer.Abort, EOFError):
         raise LetterError("q") from None
-    if given.lower() in _LETTERS:
-        raise LetterError(given.lower())
-    return given
+    if text.lower() in _LETTERS:
+        raise LetterError(text.lower())
+    return text
 
 
 def agreed(question: str, usual: bool) -> bool:
-    """Ask for yes or no until it is one of them."""
+    """Ask for yes or no until the answer is valid; return whether it is yes."""
     while True:
-        given = answer(f"{question} [{'Y/n' if usual else 'y/N'}]").lower()
-        if not given or given in _YES_NO:
-            return _YES_NO.get(given, usual)
-        _complain([f"{given!r} is neither yes nor no; type y or n"])
+        text = answer(f"{question} [{'Y/n' if usual else 'y/N'}]").lower()
+        if not text or text in _YES_NO:
+            return _YES_NO.get(text, usual)
+        _complain([f"{text!r} is neither yes nor no; type y or n"])
 
 
 def ask_marker(rig: Rig, usual: str) -> str:
-    """Ask for a marker until it is one of the rig."""
+    """Ask for a marker until the answer is a marker of the rig."""
     from ipsys_log.survey.entry import Typed, read_typed
 
     return _ask("marker", "marker", usual, lambda given: read_typed(Typed(given, {}), rig))
 
 
 def ask_numbers(rig: Rig, marker: str, before: Typed | None) -> Typed:
-    """Ask for distances, side and height of a place; Enter keeps what was typed before."""
+    """Ask for distances, side and height of a calibration point; Enter keeps the previous text."""
     from ipsys_log.survey.entry import Typed, needs_side, read_typed
 
     distances = _ask_distances(rig, dict(before.distances) if before else {})
-    given = [name for name, text in distances.items() if text]
+    entered = [name for name, text in distances.items() if text]
     side = ""
-    if needs_side(rig, given):
+    if needs_side(rig, entered):
         usual = before.side if before else ""
-        question = f"from {given[0]} to {given[1]}, it lies left or right?{'' if usual else ' [l/r]'}"
+        question = f"from {entered[0]} to {entered[1]}, it lies left or right?{'' if usual else ' [l/r]'}"
         side = _ask_side(question, usual)
     usual = before.height if before else ""
     height = _ask("height, cm", "height", usual, lambda text: read_typed(Typed("", {}, height=text), rig))
@@ -84,7 +84,7 @@ def ask_numbers(rig: Rig, marker: str, before: Typed | None) -> Typed:
 
 
 def _ask_distances(rig: Rig, distances: dict[str, str]) -> dict[str, str]:
-    """Ask until they can be those of one place, as far as distances alone tell."""
+    """Ask for distances until they are consistent with one calibration point."""
     from ipsys_log.survey.checks import check_entry
     from ipsys_log.survey.entry import Typed, read_typed
 
@@ -103,25 +103,25 @@ def _ask_distances(rig: Rig, distances: dict[str, str]) -> dict[str, str]:
 
 def _ask_side(question: str, usual: str) -> str:
     while True:
-        given = answer(question, usual)
-        if given.lower() in _SIDES:
-            return _SIDES[given.lower()]
-        _complain([f"{given!r} is no side; type l or r" if given else "type l or r"])
+        typed = answer(question, usual)
+        if typed.lower() in _SIDES:
+            return _SIDES[typed.lower()]
+        _complain([f"{typed!r} is no side; type l or r" if typed else "type l or r"])
 
 
 def _ask(question: str, field: str, usual: str, read: Read) -> str:
-    """Ask until an answer can be one of a field; what is doubtful once more."""
+    """Ask until an answer is valid for a field; ask once more if the answer is doubtful."""
     while True:
-        given = answer(question, usual)
-        entry, faults = read(given)
+        typed = answer(question, usual)
+        entry, faults = read(typed)
         wrong = [fault.text for fault in faults if fault.field == field]
         if wrong:
             _complain(wrong)
-        elif entry.doubts and given != usual:
+        elif entry.doubts and typed != usual:
             _complain(entry.doubts, "yellow")
-            usual = given
+            usual = typed
         else:
-            return given
+            return typed
 
 
 def _complain(texts: Sequence[str], style: str = "red") -> None:
@@ -130,12 +130,12 @@ def _complain(texts: Sequence[str], style: str = "red") -> None:
 
 
 def ask_places(scene: Scene) -> None:
-    """Go through the places that are not measured yet; of a recording, through what is there, until ``q``."""
+    """Go through the stationary intervals that are not measured yet; with live cameras, ask until ``q``."""
     from ipsys_log.analysis.pairs import active_measurements
     from ipsys_log.survey.entry import check_references
 
     check_references(scene.rig)
-    with suppress(ImportError):  # arrow keys, where there is one
+    with suppress(ImportError):  # arrow keys, if the system has readline
         import readline  # noqa: F401
     console.print(HELP, style="dim", markup=False)
     active = active_measurements(scene.history())
@@ -147,7 +147,7 @@ def ask_places(scene: Scene) -> None:
         outcome = _ask_place(scene, left[0], saved)
         if outcome == "q":
             return
-        if not isinstance(outcome, str):  # it was undone: back to its place
+        if not isinstance(outcome, str):  # it was undone: ask for its stationary interval again
             left[:0] = [n for n, stop in enumerate(scene.stops) if stop.covers(outcome) and n not in left]
         elif scene.stops:
             del left[0]
@@ -193,7 +193,7 @@ def _measure(scene: Scene, stop: int | None, before: Typed | None, saved: list[s
         doubtful = bool(checked.warnings)
         if not agreed(f"save {checked.id}{' all the same' if doubtful else ''}?", not doubtful):
             return typed
-        # While somebody read the question, the marker lay there, or was taken up.
+        # The marker may have stopped or moved while the user read the question.
         now = _check(scene, stop, typed)
         if now.measurement is None:
             continue
@@ -227,8 +227,8 @@ def _ask_point(scene: Scene, stop: int | None, before: Typed | None) -> Typed:
         usual = before.marker if before else str(visible[0]) if len(visible) == 1 else ""
         marker = ask_marker(scene.rig, usual)
     else:
-        here = scene.stops[stop]
-        marker = str(here.marker_id)
+        interval = scene.stops[stop]
+        marker = str(interval.marker_id)
         console.print(f"Place {stop + 1} of {len(scene.stops)}", style="bold")
     sight = look(scene.views(stop), int(marker))
     console.print(sight.text, style="green" if sight.state == "still" else "yellow", markup=False)
@@ -249,8 +249,10 @@ def _show(checked: Checked) -> None:
         )
     for name, off_m in checked.residuals_m:
         console.print(f"  {name} disagrees by {off_m * CM_PER_M:+.1f} cm", markup=False)
-    for one in checked.predictions:
-        console.print(f"  model of {one.camera}: {one.off_m * CM_PER_M:.1f} cm off", markup=False)
+    for prediction in checked.predictions:
+        console.print(
+            f"  model of {prediction.camera}: {prediction.off_m * CM_PER_M:.1f} cm off", markup=False
+        )
     for text in checked.warnings:
         console.print(text, style="yellow", markup=False)
 

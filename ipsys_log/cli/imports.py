@@ -1,4 +1,4 @@
-"""Data of others into a log: ``ipsys import imsel``, ``ipsys import images`` and ``ipsys import videos``."""
+"""Import of other data into a log: ``ipsys import imsel``, ``images`` and ``videos``."""
 
 from __future__ import annotations
 
@@ -105,7 +105,7 @@ def _refuse_log(path: Path) -> None:
         with path.open("rb") as file:
             is_log = file.read(len(_MCAP_MAGIC)) == _MCAP_MAGIC
     except OSError:
-        return  # a folder, or missing: the importer reports it
+        return  # a folder, or no file: the importer reports it
     if is_log:
         raise IpsysError(
             f"{path}: is a log already and needs no import. See what it holds with: ipsys info {path}; "

@@ -47,11 +47,11 @@ def info(logs: Logs, as_json: AsJson = False) -> None:
     from ipsys_log.report.contents import contents_json, contents_tables
 
     with Session(logs) as session:
-        found = contents_json(session)
+        contents = contents_json(session)
     if as_json:
-        print(json.dumps(found, indent=2))  # noqa: T201
+        print(json.dumps(contents, indent=2))  # noqa: T201
     else:
-        for number, table in enumerate(contents_tables(found)):
+        for number, table in enumerate(contents_tables(contents)):
             if number:
                 console.print()
             console.print(table)
@@ -67,11 +67,11 @@ def runs(logs: Logs, as_json: AsJson = False) -> None:
     from ipsys_log.report.contents import runs_table, states_json
 
     with Session(logs) as session:
-        found = states_json(session)
+        states = states_json(session)
     if as_json:
-        print(json.dumps(found, indent=2))  # noqa: T201
+        print(json.dumps(states, indent=2))  # noqa: T201
     else:
-        console.print(runs_table(found))
+        console.print(runs_table(states))
 
 
 def repair(
@@ -93,17 +93,17 @@ def repair(
     try:
         with Session([log]) as session:
             if not session.run_names():
-                return  # nothing to finish, and no stage to import for it
+                return  # there is no run to complete, so the stages are not imported
         from ipsys_log.restore import finish_runs
 
         with progress_bar() as progress:
             print_outcomes(finish_runs(log, progress))
-    except IpsysError as error:  # the log itself is whole
+    except IpsysError as error:  # the log itself is complete
         remarks.print(f"its runs cannot be finished: {error}", style="yellow", markup=False)
 
 
 def view(logs: Logs, run: Runs = None, save: Save = None) -> None:
-    """Show frames with drawn markers, floor, measured places, positions and tracks over time, in Rerun."""
+    """Show frames with drawn markers, floor, calibration points, positions and tracks over time, in Rerun."""
     from ipsys_log.log.dataset import Session
 
     if save is not None:
@@ -115,10 +115,10 @@ def view(logs: Logs, run: Runs = None, save: Save = None) -> None:
         shown = write_recording(session, run or (), save)
         for line in out_of_date_lines(session, [shown.markers, *shown.runs]):
             say(line)
-    for what, names in (("markers", [shown.markers]), ("positions and tracks", shown.runs)):
+    for kind, names in (("markers", [shown.markers]), ("positions and tracks", shown.runs)):
         named = ", ".join(name for name in names if name)
         if named:
-            remarks.print(f"{what:<21} run {named}")
+            remarks.print(f"{kind:<21} run {named}")
     if save is not None:
         remarks.print(f"{save} written; look at it with: rerun {save}")
 

@@ -1,4 +1,4 @@
-"""Markers and boards on paper: ``ipsys markers``."""
+"""Markers and calibration boards for print: ``ipsys markers``."""
 
 from __future__ import annotations
 
@@ -122,7 +122,7 @@ def _marker_prints(
 
 
 def _lab(rig: Path | None, length: float | None, dictionary: str | None) -> Rig:
-    """Return the rig, or one with only a dictionary and a length."""
+    """Return the rig, or a rig with only a dictionary and a length."""
     from dataclasses import replace
 
     from ipsys_log.errors import IpsysError
@@ -157,7 +157,7 @@ def _parse_ids(text: str, dictionary: str) -> list[int]:
 
     ids: list[int] = []
     for part in text.split(","):
-        first, dash, last = (one.strip() for one in part.partition("-"))
+        first, dash, last = (text.strip() for text in part.partition("-"))
         if not first.isdecimal() or (dash and not last.isdecimal()) or len(part) > 12:
             raise IpsysError(f"--ids {text}: write ids as 1,2,3 or as 0-9")
         ids += range(int(first), min(int(last or first), int(first) + _MOST) + 1)
@@ -175,6 +175,6 @@ def _board(text: str, square: float, marker_scale: float, dictionary: str) -> Pr
 
 
 def _contents(prints: list[Print]) -> str:
-    count = sum(not one.is_board for one in prints)
+    count = sum(not item.is_board for item in prints)
     parts = [f"{count} marker{'' if count == 1 else 's'}"] if count else []
-    return " and ".join([*parts, *(one.name for one in prints if one.is_board)])
+    return " and ".join([*parts, *(item.name for item in prints if item.is_board)])

@@ -1,4 +1,4 @@
-"""Tape measurements into a log: ``ipsys measure``."""
+"""Entry of tape measurements into a log: ``ipsys measure``."""
 
 from __future__ import annotations
 
@@ -61,7 +61,7 @@ Places = Annotated[
     bool, typer.Option("--places", help="Only list where markers lie still, as a sheet numbers them.")
 ]
 
-# That which a replay fits, and how many places it is good with.
+# The model that a replay fits, and the number of calibration points that gives good results.
 _MODEL, _GOOD = "poly", 40
 
 
@@ -88,11 +88,11 @@ def measure(
 ) -> None:
     """Enter tape measurements: on a page for the phone, in the terminal, or from a sheet.
 
-    With --rig lab.toml -o places.mcap it uses the live cameras until Ctrl-C, and writes about a second of
-    frames for each measured point. With a finished LOG it goes through the stationary intervals of the
-    markers, and appends the measurements.
+    With --rig lab.toml -o places.mcap, the command uses the live cameras until Ctrl-C. It writes about a
+    second of frames for each measured point. With a finished LOG, the command goes through the stationary
+    intervals of the markers, and appends the measurements.
 
-    Each entry is checked at once. Undo withdraws a measurement; nothing is erased.
+    The command checks each entry at once. Undo withdraws a measurement and erases nothing.
     """
     ends = csv is not None or places
     allow_interrupt(None if ends else "stopped; every saved point is in the log")
@@ -122,7 +122,7 @@ def measure(
 
 
 def _refuse(where: str, **options: object) -> None:
-    """Options that belong elsewhere."""
+    """Refuse options that belong to another way of measuring."""
     from ipsys_log.errors import IpsysError
 
     for name, value in options.items():
@@ -177,7 +177,7 @@ def _measure_log(
 
 
 def serve_page(scene: Scene, host: str | None, port: int) -> None:
-    """Serve the page until it is interrupted."""
+    """Serve the page until an interrupt."""
     from ipsys_log.cli.measure_live import say_faults
     from ipsys_log.web.server import qr_code, serving
 
@@ -205,7 +205,7 @@ def _show_count(log: Path, added: Sequence[Measurement], as_json: bool) -> None:
 
 
 def _show_next(log: Path, history: Sequence[Measurement]) -> None:
-    """Print the next step for the points that a log has now."""
+    """Print the next step for the number of points that a log has now."""
     from ipsys_log.analysis.pairs import active_measurements
     from ipsys_log.models.table import min_pairs
 
@@ -224,8 +224,8 @@ def _show_next(log: Path, history: Sequence[Measurement]) -> None:
 def _show_places(scene: FinishedLog, as_json: bool) -> None:
     from ipsys_log.report.contents import stops_json, stops_table
 
-    found = stops_json(scene)
+    stops = stops_json(scene)
     if as_json:
-        print(json.dumps(found, indent=2))  # noqa: T201
+        print(json.dumps(stops, indent=2))  # noqa: T201
     else:
-        console.print(stops_table(found))
+        console.print(stops_table(stops))

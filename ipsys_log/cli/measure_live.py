@@ -1,4 +1,4 @@
-"""Measuring with cameras that send now: the page or the terminal beside the pipeline."""
+"""Measurements with live cameras: the page or the terminal beside the pipeline."""
 
 from __future__ import annotations
 
@@ -24,7 +24,7 @@ if TYPE_CHECKING:
 __all__ = ["live_scene", "measure_now", "ready_to_measure", "say_faults", "served"]
 
 _TURN_S = 0.05
-# After that it is known what the cameras see, and what of it lies still.
+# After this time, the markers in the images and their stationary intervals are known.
 _LOOK_S = 1.0
 
 
@@ -68,7 +68,7 @@ def measure_now(
 
 
 def ready_to_measure(lab: Lab, request: Request, model_from: Path | None) -> Model | None:
-    """See that places can be measured with these cameras; the newest model of another log, if it is named."""
+    """Check that these cameras can measure points; return the newest model of the other log, if named."""
     from ipsys_log.capture.live_plan import check_model, check_start
     from ipsys_log.log.dataset import Session
     from ipsys_log.runs.select import fitted_in

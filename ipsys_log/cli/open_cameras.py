@@ -1,4 +1,4 @@
-"""Cameras of a rig that are opened for a command; first everything is said that can be said before."""
+"""Cameras of a rig that a command opens; all possible checks come before the cameras are opened."""
 
 from __future__ import annotations
 
@@ -37,14 +37,14 @@ __all__ = [
 
 # The name of a log that exists only while the command runs.
 SENT_NOW = "what the cameras sent"
-# What a log is that is named by --model-from.
+# The description of the log of --model-from in messages.
 MODEL = "the log with the model"
-# Duration of the frames that are kept of a measured point.
+# Duration of the frames that are kept for a measured point.
 _PLACE_S = 1.5
 
 
 class Lab(NamedTuple):
-    """The cameras to open: the rig, its cameras, their intrinsics by name, and the files of these."""
+    """The cameras to open: the rig, its cameras, their intrinsics by name, and the input files."""
 
     rig: Rig
     cameras: list[RigCamera]
@@ -59,17 +59,17 @@ class Lab(NamedTuple):
 def prepared(
     rig: Path, only: list[str] | None, calibration: list[str] | None, with_lenses: bool = True
 ) -> Lab:
-    """The cameras of a rig file; nothing is opened yet.
+    """Return the cameras of a rig file; no camera is opened yet.
 
     Parameters
     ----------
-    only : the names of some cameras; otherwise all that have a source.
-    with_lenses : read the lenses that the rig names, too; not where they are still to be made.
+    only : the names of some cameras; otherwise all cameras with a source.
+    with_lenses : also read the intrinsics that the rig names; False if they do not exist yet.
 
     Raises
     ------
     IpsysError
-        For what is wrong with the rig, the source of a camera, or the file of a lens.
+        The rig, the source of a camera, or a file of intrinsics has a fault.
     """
     from ipsys_log.capture.devices import check_devices, check_sources, usb_advice
 
@@ -89,13 +89,13 @@ def prepared(
 def _files(rig: Path, cameras: list[RigCamera], calibration: list[str] | None) -> list[tuple[str, Path]]:
     from ipsys_log.capture.video_files import file_of
 
-    found = [("a calibration", Path(one.rpartition("=")[2])) for one in calibration or ()]
-    for one in cameras:
-        if one.calibration is not None:
-            found.append((f"the lens of camera {one.name}", rig.parent / one.calibration))
-        if str(one.source).startswith("file:"):
-            found.append((f"what camera {one.name} plays", file_of(str(one.source))[0]))
-    return found
+    files = [("a calibration", Path(option.rpartition("=")[2])) for option in calibration or ()]
+    for camera in cameras:
+        if camera.calibration is not None:
+            files.append((f"the lens of camera {camera.name}", rig.parent / camera.calibration))
+        if str(camera.source).startswith("file:"):
+            files.append((f"what camera {camera.name} plays", file_of(str(camera.source))[0]))
+    return files
 
 
 def check_target(output: Path, force: bool, files: Iterable[tuple[str, Path]]) -> None:
@@ -108,8 +108,8 @@ def check_target(output: Path, force: bool, files: Iterable[tuple[str, Path]]) -
     Raises
     ------
     IpsysError
-        The log exists, its folder does not exist, or the folder takes no files or none of that name; with
-        ``force``, if another process is writing it.
+        The log exists, its folder does not exist, or the folder accepts no files or no such file name; with
+        ``force``, another process is writing the log.
     """
     from ipsys_log.errors import IpsysError
     from ipsys_log.log.journal import DISK, journal_path
@@ -126,9 +126,9 @@ def check_target(output: Path, force: bool, files: Iterable[tuple[str, Path]]) -
         check_free(output)
         check_locks(output.parent)
     else:
-        for what, path in files:
+        for purpose, path in files:
             if path.exists() and output.samefile(path):
-                raise IpsysError(f"-o {output}: is {what}; give another name")
+                raise IpsysError(f"-o {output}: is {purpose}; give another name")
         if not force:
             raise IpsysError(f"{output}: exists already; give another name, or --force to overwrite it")
         os.close(open_locked(DISK, output, os.O_RDWR))
@@ -147,8 +147,8 @@ def opened(
 
     Parameters
     ----------
-    doing : text for the beginning if this is no recording; then the end has no text on frames.
-    panel : whether the screen is free for a table of the cameras.
+    doing : text for the beginning if the command does not record; then the end has no text on frames.
+    panel : the screen is free for a table of the cameras.
     until_stopped : a signal stops the cameras, and the command ends in order; otherwise it interrupts.
 
     Raises
@@ -171,7 +171,7 @@ def opened(
         lenses = fitting_lenses(lab.lenses, sizes_px, say)
         stack.enter_context(_ended(attached.stop, seconds, until_stopped))
         expected = expected_bytes_per_s(lab.cameras, attached.states)
-        # A log that is no recording grows only with measured points.
+        # A log without a recording grows only with measured points.
         growing = None if doing and seconds is None else expected
         monitor = stack.enter_context(Monitor(lab.rig))
         status = LiveStatus(attached.states, monitor, output, monotonic, growing)
@@ -187,7 +187,7 @@ def opened(
 def _say_room(lab: Lab, attached: Attached, room: DiskRoom, seconds: float | None, doing: str | None) -> None:
     """Print the expected size of the recording and how long the disk lasts, before it begins.
 
-    If frames are taken only for some seconds, nothing is printed, unless the disk is too small for that.
+    If frames are taken only for some seconds, the text is printed only if the disk is too small for them.
     """
     if doing and not (seconds is not None and room.is_short(seconds)):
         if seconds is None:

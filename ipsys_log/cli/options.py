@@ -41,7 +41,7 @@ Logs = Annotated[
 ]
 
 
-# Endings of other input and output files: a log of that name is a mistake.
+# File name extensions of other input and output files: a log with such a name is a mistake.
 _OTHER_FILES = (
     *(".html", ".htm", ".csv", ".json", ".toml", ".yaml", ".yml", ".rrd"),
     *(".png", ".pdf", ".svg", ".jpg", ".jpeg", ".webp"),
@@ -49,7 +49,7 @@ _OTHER_FILES = (
 
 
 def _named_as_log(path: Path | None) -> Path | None:
-    """Return the path of a new log, with the ending of logs.
+    """Return the path of a new log, with the extension of logs.
 
     Raises
     ------
@@ -68,7 +68,7 @@ def _named_as_log(path: Path | None) -> Path | None:
     return named
 
 
-# What every command does with the name of a new log.
+# The options that every command uses for the name of a new log.
 log_option = partial(typer.Option, "--output", "-o", metavar="LOG", callback=_named_as_log)
 NewLog = Annotated[Path, log_option(help="The log to write, a file that ends in .mcap.")]
 RigFile = Annotated[
@@ -135,12 +135,12 @@ AsJson = Annotated[bool, typer.Option("--json", help="Print JSON.")]
 def load_calibrations(
     options: list[str] | None, cameras: Callable[[], Collection[str]]
 ) -> dict[str, CameraCalibration]:
-    """Lenses by camera from ``camera=file``, or from ``other.mcap`` for those of ``cameras``.
+    """Read intrinsics by camera from ``camera=file``, or from ``other.mcap`` for the given ``cameras``.
 
     Raises
     ------
     IpsysError
-        For an option of another form, or a file that holds no calibration.
+        An option has another form, or a file contains no calibration.
     """
     from ipsys_log.errors import IpsysError
     from ipsys_log.exchange.calibration_files import read_lens
@@ -150,24 +150,24 @@ def load_calibrations(
     for option in options or []:
         camera, equals, name = option.partition("=")
         if equals:
-            found = {camera: read_lens(Path(name), camera)}
+            calibrations = {camera: read_lens(Path(name), camera)}
         elif option.endswith(".mcap"):
             with Session([Path(option)]) as log:
-                held = {c: log.payloads([topic])[-1] for c, topic in log.calibrations.items()}
-            found = {c: lens for c, lens in held.items() if c in cameras()}
-            if not found:
+                recorded = {c: log.payloads([topic])[-1] for c, topic in log.calibrations.items()}
+            calibrations = {c: lens for c, lens in recorded.items() if c in cameras()}
+            if not calibrations:
                 raise IpsysError(f"--calibration {option}: holds no calibration of these cameras")
         else:
             raise IpsysError(f"--calibration {option}: write it as camera=file.yaml, or name a log (.mcap)")
-        for name in found:
+        for name in calibrations:
             if name in lenses:
                 raise IpsysError(f"--calibration: two cameras of one name, {name!r}")
-        lenses.update(found)
+        lenses.update(calibrations)
     return lenses
 
 
 def load_matching_rig(path: Path | None, cameras: Callable[[], Collection[str]]) -> Rig | None:
-    """Read a rig for cameras that are given by their pictures; None if no file is named.
+    """Read a rig for cameras that are given by their images; None if no file is named.
 
     A rig that describes only some of the cameras causes a remark.
 
@@ -189,15 +189,15 @@ def load_matching_rig(path: Path | None, cameras: Callable[[], Collection[str]])
 def load_lab(
     rig: Path, calibration: list[str] | None, only: Collection[str], with_lenses: bool = True
 ) -> tuple[Rig, list[RigCamera], dict[str, CameraCalibration]]:
-    """The rig of a file, its cameras that have a source (or ``only`` some), and their lenses.
+    """Return the rig of a file, its cameras that have a source (or ``only`` some), and their intrinsics.
 
-    A lens is what ``calibration`` says, else the file that the rig names, beside the rig file; that only
-    ``with_lenses``.
+    The intrinsics come from ``calibration``, else from the file that the rig names, relative to the folder of
+    the rig file. The files of the rig are read only ``with_lenses``.
 
     Raises
     ------
     IpsysError
-        Where the rig has no such camera, or none with a source.
+        The rig has no such camera, or no camera with a source.
     """
     from ipsys_log.exchange.lab_files import load_cameras, load_lenses
 
@@ -208,7 +208,7 @@ def load_lab(
 
 
 def cameras_of(logs: list[Path]) -> set[str]:
-    """The cameras that logs have frames or anything derived of."""
+    """Return the cameras of which logs have frames or derived channels."""
     from ipsys_log.log.contents import camera_of_topic
     from ipsys_log.log.dataset import Session
 

@@ -1,4 +1,4 @@
-"""Where to measure next: ``ipsys plan``."""
+"""Planning of the next calibration points: ``ipsys plan``."""
 
 from __future__ import annotations
 
@@ -23,7 +23,7 @@ if TYPE_CHECKING:
 __all__ = ["add_commands"]
 
 _MOST_PLACES = 50
-# Without a floor in the rig, no marker is carried higher than this.
+# Without a floor in the rig, this is the largest height of a marker.
 _HIGHEST_M = 5.0
 
 Places = Annotated[int, typer.Option(metavar="N", help="How many places.")]
@@ -72,19 +72,21 @@ def plan(
     from ipsys_log.runs.select import copied_run
     from ipsys_log.sinks.selection import rig_in_force
 
-    given = load_rig(rig) if rig else None
+    given_rig = load_rig(rig) if rig else None
     lenses = load_calibrations(calibration, lambda: cameras_of(logs))
-    _check(logs, given, model, places, height_m or ())
+    _check(logs, given_rig, model, places, height_m or ())
     if plot is not None:
         check_picture(plot, "--plot", logs)
     options: dict[str, Any] = {"train": train, "rig": rig, "calibration": calibration, "run": None}
     with derived(logs, "fit", model=[model], **options) as (session, outcomes, _):
         fitted = [outcome.run for outcome in outcomes if outcome.stage == "fit"]
         run = fitted[-1] if fitted else str(copied_run(session, model))
-        held = {camera: session.payloads([topic])[-1] for camera, topic in session.calibrations.items()}
-        in_force = given or rig_in_force(session, [run]) or session.payloads(session.topics(RIG))[-1]
-        found = plan_floor(session, run, in_force, {**held, **lenses}, places, height_m or ())
-    _show(found, plot, as_json)
+        recorded_lenses = {
+            camera: session.payloads([topic])[-1] for camera, topic in session.calibrations.items()
+        }
+        in_force = given_rig or rig_in_force(session, [run]) or session.payloads(session.topics(RIG))[-1]
+        planned = plan_floor(session, run, in_force, {**recorded_lenses, **lenses}, places, height_m or ())
+    _show(planned, plot, as_json)
 
 
 def _show(found: PlannedFloor, plot: Path | None, as_json: bool) -> None:
@@ -104,7 +106,7 @@ def _show(found: PlannedFloor, plot: Path | None, as_json: bool) -> None:
 
 
 def _check(logs: list[Path], rig: Rig | None, model: str, places: int, heights_m: Sequence[float]) -> None:
-    """See that there is something to plan, before anything is fitted."""
+    """Check that a plan is possible, before a model is fitted."""
     from ipsys_log.analysis.calibration_points import measured
     from ipsys_log.errors import IpsysError
     from ipsys_log.log.dataset import Session
@@ -118,7 +120,11 @@ def _check(logs: list[Path], rig: Rig | None, model: str, places: int, heights_m
         )
     with Session(logs) as session:
         rigs = [rig] if rig is not None else session.payloads(session.topics(RIG))
-        spans_m = [max(one.floor.width_m, one.floor.depth_m) for one in rigs if one.floor is not None]
+        spans_m = [
+            max(checked_rig.floor.width_m, checked_rig.floor.depth_m)
+            for checked_rig in rigs
+            if checked_rig.floor is not None
+        ]
         for height_m in heights_m:
             if not (math.isfinite(height_m) and 0 <= height_m <= max(spans_m, default=_HIGHEST_M)):
                 raise IpsysError(
@@ -135,8 +141,8 @@ def _headline(found: PlannedFloor) -> str:
     from ipsys_log.report.plan import means_cm
 
     before, after = means_cm(found.plan.places[0].mean_before_m, found.plan.places[-1].mean_after_m)
-    these = "this place" if len(found.plan.places) == 1 else f"these {len(found.plan.places)} places"
-    return f"predicted mean error over the floor now {before} cm; with {these} {after} cm"
+    subject = "this place" if len(found.plan.places) == 1 else f"these {len(found.plan.places)} places"
+    return f"predicted mean error over the floor now {before} cm; with {subject} {after} cm"
 
 
 def _table(found: PlannedFloor) -> Table:

@@ -1,4 +1,4 @@
-"""From cameras that send now: ``ipsys record`` and ``ipsys live``."""
+"""Recording and live tracking: ``ipsys record`` and ``ipsys live``."""
 
 from __future__ import annotations
 

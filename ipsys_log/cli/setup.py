@@ -1,4 +1,4 @@
-"""Begin: ``ipsys init`` and ``ipsys simulate``."""
+"""Setup of a lab: ``ipsys init`` and ``ipsys simulate``."""
 
 from __future__ import annotations
 
@@ -15,8 +15,8 @@ from ipsys_log.cli.signals import say_kept
 
 __all__ = ["add_commands"]
 
-# The settings of the simulated lab that have an option: default, help. The defaults are the library's
-# (a test sees to it); it is not imported just to print a help.
+# The settings of the simulated lab that have an option: default, help. The defaults equal those of the
+# library, and a test checks this; importing the library only for a help text is too slow.
 SETTINGS: dict[str, tuple[int | float, str]] = {
     "seed": (0, "The same seed gives the same bytes."),
     "width": (1920, "Width of a frame, in px; the lens scales with it."),
@@ -40,7 +40,7 @@ SETTINGS: dict[str, tuple[int | float, str]] = {
     "tape_sigma_m": (0.003, "How badly the tape is read, in m."),
 }
 
-# At the top of the rig file of the simulated lab.
+# The beginning of the rig file of the simulated lab.
 _SIMULATED = """# The simulated lab, without hardware. docs/first-day.md goes through all commands with it.
 # The robots 0, 1 and 2 drive to and fro at a height of 10 cm. The other markers lie still.
 
@@ -153,7 +153,7 @@ def simulate(output: Path, **settings: Any) -> None:
 
 
 def _simulate_command() -> Callable[..., None]:
-    """:func:`simulate` with an option for each setting."""
+    """Build the command of :func:`simulate` with an option for each setting."""
     keyword = inspect.Parameter.KEYWORD_ONLY
     parameters = [inspect.Parameter("output", keyword, annotation=NewLog)]
     for name, (default, text) in SETTINGS.items():

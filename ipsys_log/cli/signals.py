@@ -56,8 +56,11 @@ class InterruptError(Exception):
 
 @dataclass(slots=True)
 class _State:
-    """The signal that was noted, the text of a normal end (None: an interrupt is a failure), the interrupt
-    that has not arrived yet, and the results that the command has kept so far."""
+    """The state of the signals.
+
+    It has the signal that was noted, the text of a normal end (None: an interrupt is a failure), the
+    interrupt that has not arrived yet, and the results that the command has kept so far.
+    """
 
     noted: int | None = None
     normal_text: str | None = None
@@ -164,7 +167,7 @@ def interruptible(command: Callable[..., Any]) -> Callable[..., Any]:
 
 
 def _note(number: int, _: FrameType | None = None) -> None:
-    if _state.noted is not None:  # the user does not want to wait
+    if _state.noted is not None:  # on a second signal, the user does not want to wait
         signal.signal(number, signal.SIG_DFL)
         signal.raise_signal(number)
     _state.noted = number
@@ -187,7 +190,7 @@ def _interrupt_again(*_: object) -> None:
     error = sys.exception()
     while error is not None:
         if isinstance(error, (Interrupted, GeneratorExit)):
-            return  # it is: some block, or a generator that it has ended, cleans up
+            return  # the interrupt has arrived: a block, or a generator that it has ended, cleans up
         error = error.__context__
     if _state.raised is not None:
         raise Interrupted(_state.raised.exit_code, _state.raised.text)

@@ -1,4 +1,4 @@
-"""The stages and ``ipsys replay``: derive channels from channels, and say how accurate they are."""
+"""The stages and ``ipsys replay``: they derive channels from channels, and report the accuracy."""
 
 from __future__ import annotations
 
@@ -171,12 +171,12 @@ def add_commands(app: typer.Typer) -> None:
 
 
 def options_of(names: Sequence[str]) -> dict[str, tuple[Any, Any]]:
-    """Rows of the table of options."""
+    """Return rows of the table of options."""
     return {name: OPTIONS[name] for name in names}
 
 
 def build_command(options: Mapping[str, tuple[Any, Any]], work: Callable[..., None]) -> Callable[..., None]:
-    """A function with just these options, by name: type with help, and default."""
+    """Return a function that has only these options, by name: type with help, and default."""
 
     def command(**given: Any) -> None:
         work(**given)
@@ -212,7 +212,7 @@ def derived(
 ) -> Iterator[tuple[Session, list[Outcome], list[Accuracy]]]:
     """Run the stages up to ``until``; yield the session with the results, the outcomes, and the accuracy.
 
-    A log that is not ``kept`` is not named.
+    The texts do not name a log that is not ``kept``.
     """
     from ipsys_log import api
     from ipsys_log.log.dataset import Session
@@ -222,7 +222,7 @@ def derived(
     with say_kept(_kept_runs(logs, output)), progress_bar() as progress:
         replayed = api.replay(*logs, until=until, output=output, progress=progress, say=say, **options)
     outcomes = list(replayed.outcomes)
-    # A new log is only there if there was something to write.
+    # A new log exists only if there was something to write.
     written = [output] if output is not None and output.exists() else []
     with Session([*logs, *written]) as session:
         yield session, outcomes, read_accuracy(session, outcomes)
@@ -277,14 +277,14 @@ def _derive(
         _print_json(outcomes, accuracies)
     else:
         _print(accuracies, details)
-    for what in drawn:
-        remarks.print(what)
+    for line in drawn:
+        remarks.print(line)
 
 
 def _draw(
     session: Session, accuracies: Sequence[Accuracy], plot: Path | None, plots: Path | None
 ) -> list[str]:
-    """Draw what was asked for; a line for each that says so."""
+    """Draw the requested figures; return a line for each figure."""
     drawn = []
     if plot is not None:
         from ipsys_log.report.floor_figure import draw_session
@@ -305,12 +305,12 @@ def _print_json(outcomes: Sequence[Outcome], accuracies: Sequence[Accuracy]) -> 
     from ipsys_log.report.summary import answer_json
 
     stages = [{"stage": o.stage, "run": o.run, "new": o.fresh, "messages": o.messages} for o in outcomes]
-    found = {**answer_json(accuracies), **accuracy_json(accuracies), "stages": stages}
-    print(json.dumps(found, indent=2, allow_nan=False))  # noqa: T201
+    results = {**answer_json(accuracies), **accuracy_json(accuracies), "stages": stages}
+    print(json.dumps(results, indent=2, allow_nan=False))  # noqa: T201
 
 
 def _print(accuracies: Sequence[Accuracy], details: bool) -> None:
-    """Print the answer first, then one table, and on request all figures."""
+    """Print the answer first, then one table, and on request all numbers."""
     from ipsys_log.report.summary import answer_text, models_table
     from ipsys_log.report.tables import accuracy_tables
 
@@ -324,7 +324,7 @@ def _print(accuracies: Sequence[Accuracy], details: bool) -> None:
 
 
 def _remark(outcomes: list[Outcome], target: Path | None) -> None:
-    """Print what was done, and the log with the results."""
+    """Print the stages that were done, and the log with the results."""
     print_outcomes(outcomes)
     if target is None:
         return

@@ -1,4 +1,4 @@
-"""Channels as tables of pandas: one row for each marker, point, position or track."""
+"""Channels as pandas tables: one row for each marker, point, position or track."""
 
 from __future__ import annotations
 
@@ -31,10 +31,10 @@ if TYPE_CHECKING:
 
 __all__ = ["TABLES", "read_table"]
 
-# The six different numbers of a covariance of x, y, z by their place in nine, row by row.
+# The six different elements of a 3 x 3 covariance of x, y, z, by their index in row-major order.
 _COVARIANCE = {"xx": 0, "xy": 1, "xz": 2, "yy": 4, "yz": 5, "zz": 8}
 _CORNERS = [f"{axis}{corner}_px" for corner in range(4) for axis in "xy"]
-_BATCH = 1 << 16  # messages that are read at once: more take memory, and are no faster
+_BATCH = 1 << 16  # number of messages that are read at once: a larger batch takes memory, and is no faster
 
 _POINT = ("id", "x_m", "y_m", "z_m", "heading_rad", "covariance_m2")
 
@@ -65,7 +65,7 @@ def read_table(
     Parameters
     ----------
     name : one of :data:`TABLES`.
-    runs : to read; with several, a column names the run. None for a recorded channel.
+    runs : the runs to read; with several runs, a column names the run. None for a recorded channel.
     start_ns, end_ns : log times; the end is not included.
 
     Raises
@@ -84,7 +84,9 @@ def read_table(
     else:
         channel, row = _ROWS[name]
         messages = list(session.messages(session.topics(channel), start_ns, end_ns))
-        return _typed(pd, pd.DataFrame([_times(one) | row(one) for one in messages], columns=_COLUMNS[name]))
+        return _typed(
+            pd, pd.DataFrame([_times(message) | row(message) for message in messages], columns=_COLUMNS[name])
+        )
     if len(runs) == 1:
         return tables[0]
     return pd.concat(
@@ -181,7 +183,7 @@ _INTEGERS = ("time_offset_ns",)
 
 
 def _typed(pd: Any, table: pd.DataFrame) -> pd.DataFrame:
-    """Give the columns of a table their types: times are of UTC, missing values NaN or NA."""
+    """Set the types of the columns of a table: times are in UTC, missing values are NaN or NA."""
     for name in _TIMES:
         if name in table:
             times = pd.to_datetime(table[name], unit="ns", utc=True)
@@ -216,7 +218,7 @@ def _measurement(message: Message) -> dict[str, Any]:
         "z_m": None if point is None else point.z_m,
         "still_start": None if measurement.still is None else measurement.still.start,
         "still_end": None if measurement.still is None else measurement.still.end,
-        "distances_m": {one.reference: one.distance_m for one in measurement.distances},
+        "distances_m": {distance.reference: distance.distance_m for distance in measurement.distances},
         "splits": measurement.splits,
         "withdraws": measurement.withdraws,
     }

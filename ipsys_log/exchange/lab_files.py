@@ -1,4 +1,4 @@
-"""The cameras of a lab: those of the rig file, with their intrinsics."""
+"""The cameras of a lab: the cameras of the rig file, with their intrinsics."""
 
 from __future__ import annotations
 
@@ -16,7 +16,7 @@ __all__ = ["load_cameras", "load_lenses"]
 
 
 def load_cameras(path: Path, only: Collection[str] = ()) -> tuple[Rig, list[RigCamera]]:
-    """Return the rig of a file, and its cameras that have a source, or ``only`` some.
+    """Return the rig of a file, and its cameras that have a source, or only the cameras in ``only``.
 
     Raises
     ------
@@ -24,7 +24,7 @@ def load_cameras(path: Path, only: Collection[str] = ()) -> tuple[Rig, list[RigC
         The rig has no such camera, or no camera with a source.
     """
     rig = load_rig(path)
-    marker_detector(rig.dictionary)  # a bad name is an error now, not at the first frame
+    marker_detector(rig.dictionary)  # a wrong name is an error now, not at the first frame
     known = {camera.name: camera for camera in rig.cameras}
     for name in only:
         if name not in known:
@@ -48,11 +48,11 @@ def load_cameras(path: Path, only: Collection[str] = ()) -> tuple[Rig, list[RigC
 def load_lenses(
     path: Path, cameras: Sequence[RigCamera], given: Mapping[str, CameraCalibration], read: bool = True
 ) -> dict[str, CameraCalibration]:
-    """Return the intrinsics of cameras: the given ones, else those of the files that the rig names.
+    """Return the intrinsics of cameras: the given ones, else those from the files that the rig names.
 
     Parameters
     ----------
-    path : of the rig file; names of files are relative to its folder.
+    path : path of the rig file; names of files are relative to its folder.
     read : read the files; without it, only the given intrinsics are returned.
 
     Raises

@@ -28,12 +28,12 @@ __all__ = ["Column", "Columns", "read_columns"]
 Bytes = NDArray[np.uint8]
 
 _VARINT, _FIXED64, _LENGTH = 0, 1, 2
-_MOST_SHAPES = 64  # in messages of one length; the rest is read one by one
+_MOST_SHAPES = 64  # for messages of one length; the other messages are read one by one
 
 
 @dataclass(frozen=True, slots=True)
 class Column:
-    """The values of a field, (n,), or (n, k) for a list of k numbers; and which are missing, (n,).
+    """The values of a field, (n,), or (n, k) for a list of k numbers; and the mask of missing values, (n,).
 
     Texts are objects, a list of texts is a tuple. A missing number is 0, a missing text "".
     """
@@ -44,7 +44,7 @@ class Column:
 
 @dataclass(frozen=True, slots=True)
 class Columns:
-    """The items of messages: for each the number of its message, (n,) ascending, and its fields."""
+    """The items of messages: the number of the message of each item, (n,) ascending, and its fields."""
 
     message: NDArray[np.int64]
     fields: dict[str, Column]
@@ -97,13 +97,13 @@ class _Kind(NamedTuple):
 @cache
 def _kind_of(schema: str) -> _Kind:
     descriptor: Any = proto_class(schema).DESCRIPTOR
-    (items,) = (one for one in descriptor.fields if _is_list(one) and one.message_type is not None)
+    (items,) = (entry for entry in descriptor.fields if _is_list(entry) and entry.message_type is not None)
     of_item = items.message_type.fields
     return _Kind(items.name, items.number, {f.number: f for f in of_item}, {f.name: f for f in of_item})
 
 
 def _is_list(described: FieldDescriptor) -> bool:
-    # Older versions of protobuf have only the label, newer ones warn of it.
+    # Older versions of protobuf have only the label; newer versions warn of its use.
     repeated = getattr(described, "is_repeated", None)
     return bool(
         getattr(described, "label", 0) == FieldDescriptor.LABEL_REPEATED if repeated is None else repeated
@@ -122,7 +122,7 @@ class _Value(NamedTuple):
 
 @dataclass(slots=True)
 class _Shape:
-    """What messages that look alike have in common: equal bytes, the lengths of their numbers, the values."""
+    """The common part of messages of one shape: equal bytes, the lengths of their numbers, the values."""
 
     items: int = 0
     values: list[_Value] = field(default_factory=list)
@@ -131,11 +131,11 @@ class _Shape:
     first: bytes = b""
 
     def fits(self, data: Bytes) -> NDArray[np.bool_]:
-        """Return which messages look like the first one, (n,)."""
+        """Return a mask of the messages that have the shape of the first one, (n,)."""
         first = np.frombuffer(self.first, np.uint8)
         equal, varints = np.array(self.equal, np.int64), np.array(self.varints, np.int64)
         same = (data[:, equal] == first[equal]).all(axis=1)
-        # The highest bit of a byte says whether the number goes on.
+        # The highest bit of a byte tells whether the number continues.
         lengths = ((data[:, varints] ^ first[varints]) & 0x80 == 0).all(axis=1)
         return np.asarray(same & lengths, dtype=np.bool_)
 
@@ -161,7 +161,7 @@ class _Shape:
 
 
 class _Piece(NamedTuple):
-    """Items of some messages, all at one place in their message; by field the values, None if missing."""
+    """Items at the same index of some messages; by field the values, None if missing."""
 
     numbers: NDArray[np.int64]
     item: int
@@ -169,7 +169,7 @@ class _Piece(NamedTuple):
 
 
 def _shape_of(data: bytes, kind: _Kind, fields: Sequence[str]) -> _Shape | None:
-    """Return the shape of a message; None for one that is not read by shape."""
+    """Return the shape of a message; None for a message that is not read by shape."""
     shape = _Shape(first=data)
     try:
         for number, wire, offset, end in _tokens(data, 0, len(data), shape):
@@ -248,7 +248,7 @@ def _texts(part: Bytes) -> NDArray[np.object_]:
 
 
 def _column(described: FieldDescriptor, parts: list[NDArray[Any]] | None) -> NDArray[Any] | None:
-    """Join the parts of a field: of a list those of all its fields, else the last one."""
+    """Join the parts of a field: for a list the parts of all its fields, else the last part."""
     if parts is None:
         return None
     if not _is_list(described):
@@ -263,7 +263,7 @@ def _column(described: FieldDescriptor, parts: list[NDArray[Any]] | None) -> NDA
 def _one_by_one(
     schema: str, messages: Sequence[bytes], numbers: NDArray[np.int64], kind: _Kind, fields: Sequence[str]
 ) -> list[_Piece]:
-    """Read messages of rare shapes by the library of protobuf."""
+    """Read messages of rare shapes with the library of protobuf."""
     pieces = []
     for number in numbers.tolist():
         try:
@@ -312,7 +312,7 @@ def _joined(pieces: Sequence[_Piece], kind: _Kind, fields: Sequence[str]) -> Col
 
 
 def _filled(described: FieldDescriptor, parts: Sequence[NDArray[Any] | None], sizes: Sequence[int]) -> Column:
-    """Join the parts of a column; a field that is absent and has no presence is 0 or "", not missing."""
+    """Join the parts of a column; an absent field without presence is 0 or "", not missing."""
     is_text = described.type == FieldDescriptor.TYPE_STRING
     is_list = _is_list(described)
     width = max((part.shape[1] for part in parts if part is not None and part.ndim == 2), default=0)
@@ -324,14 +324,14 @@ def _filled(described: FieldDescriptor, parts: Sequence[NDArray[Any] | None], si
     if is_text:
         values[:] = [() if is_list else ""] * len(values)
     missing = np.zeros(sum(sizes), np.bool_)
-    at = 0
+    start = 0
     for part, size in zip(parts, sizes, strict=True):
         if part is None:
-            missing[at : at + size] = is_list or described.has_presence
+            missing[start : start + size] = is_list or described.has_presence
         elif values.ndim == 2:
-            values[at : at + size, : part.shape[1]] = part
-            missing[at : at + size] = part.shape[1] < width
+            values[start : start + size, : part.shape[1]] = part
+            missing[start : start + size] = part.shape[1] < width
         else:
-            values[at : at + size] = part
-        at += size
+            values[start : start + size] = part
+        start += size
     return Column(values, missing)

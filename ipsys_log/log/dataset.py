@@ -1,7 +1,7 @@
 """One or several logs as one stream of decoded messages, from any recorder.
 
-Own logs name their cameras in their topics. In the logs of others, images and calibrations are
-known by their schema, and a camera's name is made from the topic or the frame they share.
+Logs of this program name their cameras in their topics. In logs of other recorders, the schema identifies
+images and calibrations, and the topic or the shared ``frame_id`` gives the name of the camera.
 """
 
 from __future__ import annotations
@@ -43,7 +43,7 @@ __all__ = ["Session", "other_ids", "renamed"]
 
 
 def other_ids(logs: Iterable[Iterable[Measurement]]) -> list[dict[str, str]]:
-    """New ids where an earlier log has the same: for each log, the new one by the old one.
+    """Return new ids for ids that an earlier log has too: for each log, the new id by the old id.
 
     Parameters
     ----------
@@ -55,20 +55,20 @@ def other_ids(logs: Iterable[Iterable[Measurement]]) -> list[dict[str, str]]:
     [{}, {'p001': 'p001_2'}]
     """
     taken: set[str] = set()
-    found = []
+    renamings = []
     for number, measurements in enumerate(logs, 1):
-        here = list(dict.fromkeys(one.id for one in measurements))
+        ids = list(dict.fromkeys(measurement.id for measurement in measurements))
         new: dict[str, str] = {}
-        for name in here:
+        for name in ids:
             if name in taken:
                 new[name] = f"{name}_{number}"
-        taken.update(new.get(name, name) for name in here)
-        found.append(new)
-    return found
+        taken.update(new.get(name, name) for name in ids)
+        renamings.append(new)
+    return renamings
 
 
 def renamed(measurement: Measurement, ids: Mapping[str, str]) -> Measurement:
-    """A measurement, or the end of one, under the new ids of its log."""
+    """Return a measurement, or a withdrawal, with the new ids of its log."""
     withdrawn = measurement.withdraws
     return replace(
         measurement,
@@ -84,11 +84,11 @@ _LATEST_NS = 1 << 63
 class Session:
     """Open logs, read together in log order. A context manager.
 
-    Where measurements of two logs have one id, that of the later log gets another, such as ``p001_2``.
+    If two logs have measurements with the same id, that of the later log gets a new id, such as ``p001_2``.
 
     Parameters
     ----------
-    paths : the logs; where two hold messages of one time, the earlier one's come first.
+    paths : the logs; at equal times, messages of an earlier log come first.
 
     Attributes
     ----------
@@ -154,20 +154,20 @@ class Session:
         return self._channels[key]
 
     def last(self, topics: Collection[str]) -> tuple[int, int]:
-        """Log time and publish time of the last message of some topics; the start where there is none."""
-        found = [(times[-1], r, t) for r in self.readers for t in topics if len(times := _times(r, t))]
-        if not found:
+        """Return log time and publish time of the last message of some topics; the start if there is none."""
+        last_times = [(times[-1], r, t) for r in self.readers for t in topics if len(times := _times(r, t))]
+        if not last_times:
             return self.start_ns, self.start_ns
-        last_ns, reader, topic = max(found, key=lambda item: item[0])
+        last_ns, reader, topic = max(last_times, key=lambda item: item[0])
         *_, message = reader.messages([topic], start_ns=int(last_ns))
         return message.log_time_ns, message.publish_time_ns
 
     def run_names(self) -> set[str]:
-        """Every run that has a channel, complete or not."""
+        """Return the names of all runs that have a channel, complete or not."""
         return {run for reader in self.readers for topic in reader.channels if (run := run_of_topic(topic))}
 
     def unread_images(self) -> list[str]:
-        """Topics that look like images, but are of a schema that is not read here."""
+        """Return the topics that look like images, but have a schema that this version cannot read."""
         schemas = {
             topic: channel.schema.name
             for reader in self.readers
@@ -184,9 +184,12 @@ class Session:
         return sum(r.channels[topic].message_count for r in self.readers if topic in r.channels)
 
     def hash(self, topic: str) -> str:
-        """Hash of a channel's messages, the same in whichever file they lie; one for each of several."""
+        """Return the hash of a channel's messages, which does not depend on their file.
+
+        With several logs, it is the hash of each log, joined by "+".
+        """
         parts = [r for r in self.readers if len(_times(r, topic))]
-        # In the order of their times, not in that of the command line.
+        # The order is that of their times, not that of the command line.
         return "+".join(r.channel_hash(topic) for r in sorted(parts, key=lambda r: int(_times(r, topic)[0])))
 
     def messages(
@@ -235,8 +238,8 @@ class Session:
     def _raw(
         self, reader: LogReader, topics: Collection[str], start_ns: int | None, end_ns: int | None
     ) -> Iterator[RawMessage]:
-        here = [topic for topic in topics if topic in reader.channels]
-        return reader.messages(here, start_ns, end_ns) if here else iter(())
+        present = [topic for topic in topics if topic in reader.channels]
+        return reader.messages(present, start_ns, end_ns) if present else iter(())
 
     def _items(self) -> list[tuple[LogReader, Items]]:
         """Return the logs, each with the limits for one reading."""
@@ -259,7 +262,7 @@ class Session:
         if isinstance(payload, Measurement) and reader in self._ids:
             payload = renamed(payload, self._ids[reader])
         camera = self._camera_of.get(raw.topic) or camera_of_topic(raw.topic)
-        # Who records ROS 2 knows when a message came; when its frame was taken stands within.
+        # The log time of a ROS 2 recorder is the arrival; the message contains the time of its frame.
         taken_ns = payload.timestamp if channel.message_encoding == "cdr" else 0
         return Message(raw.topic, raw.log_time_ns, taken_ns or raw.publish_time_ns, payload, camera)
 
@@ -276,40 +279,40 @@ class Session:
             for topic, stored in reader.channels.items()
             if stored.schema is not None and payload_type(stored.schema.name) is Run
         ]
-        found = [message.payload for message in self._decoded(reader, items, topics, None, None)]
-        return sorted(found, key=lambda run: run.number)
+        runs = [message.payload for message in self._decoded(reader, items, topics, None, None)]
+        return sorted(runs, key=lambda run: run.number)
 
     def _tell_apart(self) -> dict[LogReader, dict[str, str]]:
-        """Return the ids of measurements that an earlier log has too, and their ids here."""
+        """Return the ids of measurements that an earlier log has too, and their new ids."""
         readers = [reader for reader in self.readers if len(_times(reader, MEASUREMENTS_TOPIC))]
         if len(readers) < 2:
             return {}
         readers.sort(key=lambda reader: int(_times(reader, MEASUREMENTS_TOPIC)[0]))
-        found = other_ids(
+        new_ids = other_ids(
             [
-                one.payload
-                for one in self._decoded(
+                message.payload
+                for message in self._decoded(
                     reader, Items(reader.allowance.most_items), [MEASUREMENTS_TOPIC], None, None
                 )
-                if isinstance(one.payload, Measurement)
+                if isinstance(message.payload, Measurement)
             ]
             for reader in readers
         )
-        return dict(zip(readers, found, strict=True))
+        return dict(zip(readers, new_ids, strict=True))
 
     def _check_numbers(self) -> None:
-        """Refuse more runs or measurements than a lab has: each costs a line, or an equation."""
+        """Refuse more runs or measurements than a lab has: each of them costs a line, or an equation."""
         for reader in self.readers:
-            for payload, what in ((Run, "runs"), (Measurement, "measurements")):
+            for payload, kind in ((Run, "runs"), (Measurement, "measurements")):
                 counts = [
                     channel.message_count
                     for channel in reader.channels.values()
                     if channel.schema is not None and payload_type(channel.schema.name) is payload
                 ]
-                reader.check_number(sum(counts), what)
+                reader.check_number(sum(counts), kind)
 
     def _check_overlaps(self) -> None:
-        """Logs that follow one another are one; two that speak at once of one thing are not."""
+        """Refuse logs that have the same run, or images of the same camera at the same time."""
         images = set(self.topics(IMAGES))
         first: dict[str, LogReader] = {}
         for reader in self.readers:
@@ -334,25 +337,27 @@ class Session:
         for payload in channel.payloads:
             topics = [topic for topic in self.topics(channel) if self._has_payload(topic, payload)]
             names = [camera_of_topic(topic) or foreign_camera(topic) for topic in topics]
-            found: dict[str, str] = {}
+            topic_of: dict[str, str] = {}
             for topic, name in zip(topics, names, strict=True):
                 # Topics that differ only in words such as color or mono keep these words.
                 camera = name if names.count(name) == 1 else clean_name(topic)
-                if camera in found:
+                if camera in topic_of:
                     raise LogError(
-                        f"{self}: two cameras of one name, {camera!r}: {found[camera]} and {topic}; "
+                        f"{self}: two cameras of one name, {camera!r}: {topic_of[camera]} and {topic}; "
                         "rename one of the topics"
                     )
-                found[camera] = topic
-            cameras = found | cameras
+                topic_of[camera] = topic
+            cameras = topic_of | cameras
         return cameras
 
     def _has_payload(self, topic: str, payload: type) -> bool:
         stored = (reader.channels[topic] for reader in self.readers if topic in reader.channels)
-        return any(one.schema is not None and payload_type(one.schema.name) is payload for one in stored)
+        return any(
+            channel.schema is not None and payload_type(channel.schema.name) is payload for channel in stored
+        )
 
     def _pair_calibrations(self, found: dict[str, str]) -> dict[str, str]:
-        """Give each calibration the name of its camera: by topic, else by a shared frame."""
+        """Give each calibration the name of its camera: by topic, else by a shared ``frame_id``."""
         paired = {camera: topic for camera, topic in found.items() if camera in self.images}
         rest = {camera: topic for camera, topic in found.items() if camera not in paired}
         waiting = {c: self._frame_id(t) for c, t in self.images.items() if c not in paired} if rest else {}

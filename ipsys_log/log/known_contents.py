@@ -1,4 +1,4 @@
-"""One reading of each log: its table of contents is parsed once, until somebody else changes the file."""
+"""Known contents of logs: a table of contents is parsed once, until another process changes the file."""
 
 from __future__ import annotations
 
@@ -16,7 +16,7 @@ __all__ = ["contents_of", "note_contents", "one_reading"]
 
 
 class _Known(NamedTuple):
-    """A table of contents, and the size in bytes and the time of change in ns that its file had."""
+    """A table of contents, with the size in bytes and the change time in ns of its file."""
 
     size: int
     changed_ns: int
@@ -31,7 +31,7 @@ _known: ContextVar[dict[tuple[int, int], _Known] | None] = ContextVar("known_con
 def one_reading() -> Iterator[None]:
     """Parse the summary of each log once within this block, and again only after a change of its file.
 
-    A change is seen by inode, size and time of change. Before an append it is looked for under the lock.
+    Inode, size and change time show a change. An append checks for a change under the lock.
     """
     token = _known.set(_known.get() or {})
     try:
@@ -49,7 +49,7 @@ def contents_of(view: View) -> Contents:
         As :func:`~ipsys_log.log.summary.load_contents`.
     """
     known = _known.get()
-    if known is None or view.tail_fd >= 0:  # with a tail in a journal, the file is not what it says
+    if known is None or view.tail_fd >= 0:  # with a tail in a journal, the file is not the whole log
         return load_contents(view)
     status = os.fstat(view.fd)
     last = known.get((status.st_dev, status.st_ino))

@@ -1,8 +1,8 @@
-"""What travels through the pipeline: frozen payloads, each a mirror of one schema of the log.
+"""Messages of the pipeline: frozen payloads; each mirrors one schema of the log.
 
-A field here has the name of the field in the schema; :mod:`ipsys_log.log.codec` turns one into the
-other by these names and types. Lengths are metres, angles radians, times nanoseconds since 1970
-(UTC). What is missing is ``None`` or empty, never 0 and never NaN.
+A field has the same name as the field of the schema; :mod:`ipsys_log.log.codec` converts between them by
+these names and types. Lengths are in metres, angles in radians, times in nanoseconds since 1970 (UTC). A
+missing value is ``None`` or empty, never 0 and never NaN.
 """
 
 from ipsys_log.messages.channels import (

@@ -1,4 +1,4 @@
-"""The channels of a log, in one table: their topics, their payloads, and how a reader recognises them."""
+"""The channels of a log, in one table: their topics, their payloads, and their recognition by a reader."""
 
 from __future__ import annotations
 
@@ -53,15 +53,15 @@ __all__ = [
 
 @dataclass(frozen=True, slots=True, kw_only=True, eq=False)
 class Channel:
-    """A channel: what it is, in every log and for every stage. Two channels may have one payload type.
+    """A channel: its identity in every log and for every stage. Two channels may have one payload type.
 
     Attributes
     ----------
     name : unique in the table.
     topic : pattern of its topics, with ``{run}`` and ``{camera}``.
     payloads : types of its messages.
-    by_schema : a topic of another name, outside of all runs, is this channel if it has such a payload. Other
-        programs name their topics as they like.
+    by_schema : a topic outside of all runs with another name is this channel if it has such a payload. Other
+        programs use their own topic names.
     """
 
     name: str
@@ -74,7 +74,7 @@ class Channel:
 
     @property
     def is_derived(self) -> bool:
-        """Whether a stage writes it, in a run."""
+        """Return whether a stage writes the channel, in a run."""
         return self.topic.startswith("/runs/")
 
     def topic_of(self, run: str | None = None, camera: str | None = None) -> str:
@@ -83,7 +83,7 @@ class Channel:
 
 
 RIG = Channel(name="rig", topic="/rig", payloads=(Rig,), by_schema=True)
-# A skipped frame of a video is in no log: the frame itself is, and an event names it.
+# No log contains a skipped frame of a video as such: the log has the frame, and an event names it.
 IMAGES = Channel(
     name="images",
     topic="/cameras/{camera}/image",
@@ -114,7 +114,7 @@ EVALUATION = Channel(name="evaluation", topic="/runs/{run}/evaluation", payloads
 POSITIONS = Channel(name="positions", topic="/runs/{run}/cameras/{camera}/positions", payloads=(Positions,))
 TRACKS = Channel(name="tracks", topic="/runs/{run}/tracks", payloads=(Tracks,))
 POSES = Channel(name="poses", topic="/runs/{run}/poses", payloads=(FrameTransforms,))
-# The one channel that several stages of a run write.
+# The only channel that several stages of a run write.
 RUN_EVENTS = Channel(name="run_events", topic="/runs/{run}/events", payloads=(Event,))
 
 CHANNELS: tuple[Channel, ...] = (
@@ -145,7 +145,7 @@ def calibration_topic(camera: str) -> str:
 def channel_of(topic: str, payload: type | None) -> Channel | None:
     """Return the channel of a topic with messages of a type; None if the table has none.
 
-    The name of the topic decides. Outside of all runs, the payload decides where no name fits.
+    The name of the topic decides. Outside of all runs, the payload decides if no name fits.
 
     Examples
     --------

@@ -8,9 +8,9 @@ from ipsys_log.messages.message import TimeNs
 
 __all__ = ["FRAME_SKIPPED", "STAMP_UNRELIABLE", "Event", "Latency"]
 
-# The kind of an event whose timestamp is the log time of a frame that no stage has seen when it was recorded.
+# The kind of an event whose timestamp is the log time of a frame that live processing skipped.
 FRAME_SKIPPED = "frame_skipped"
-# The kind of an event for late frames of a camera that have their time of arrival.
+# The kind of an event for late frames of a camera; these frames have their time of arrival.
 STAMP_UNRELIABLE = "stamp_unreliable"
 
 
@@ -33,8 +33,10 @@ class Event:
 
 @dataclass(frozen=True, slots=True)
 class Latency:
-    """When the steps from a frame to its positions were done, by the wall clock. Telemetry: no stage reads
-    it."""
+    """The times at which the steps from a frame to its positions were done, by the wall clock.
+
+    This is telemetry: no stage reads it.
+    """
 
     timestamp: TimeNs
     camera: str

@@ -21,7 +21,7 @@ __all__ = [
 
 @dataclass(frozen=True, slots=True, eq=False)
 class CompressedImage:
-    """``foxglove.CompressedImage``: the frame as the camera sent it."""
+    """``foxglove.CompressedImage``: the frame, as the camera sent it."""
 
     timestamp: TimeNs
     frame_id: str
@@ -31,8 +31,10 @@ class CompressedImage:
 
 @dataclass(frozen=True, slots=True, eq=False)
 class CompressedVideo:
-    """``foxglove.CompressedVideo``: one frame of a video, H.264 or H.265 in Annex B; each keyframe has its
-    parameter sets before it, and no frame needs a later one."""
+    """``foxglove.CompressedVideo``: one frame of a video, H.264 or H.265 in Annex B.
+
+    Each keyframe has its parameter sets before it, and no frame needs a later one.
+    """
 
     timestamp: TimeNs
     frame_id: str
@@ -42,15 +44,17 @@ class CompressedVideo:
 
 @dataclass(frozen=True, slots=True, eq=False)
 class SkippedVideo:
-    """A frame of a video that is decoded, since those after it need it, and not searched. It is in no log:
-    there the frame is itself, and an event names it."""
+    """A frame of a video that is decoded because later frames need it, and that is not searched.
+
+    No log contains it: the log has the frame itself, and an event names it.
+    """
 
     frame: CompressedVideo
 
 
 @dataclass(frozen=True, slots=True, eq=False)
 class RawImage:
-    """``foxglove.RawImage``, in the logs of others."""
+    """``foxglove.RawImage``, in logs of other recorders."""
 
     timestamp: TimeNs
     frame_id: str
@@ -77,7 +81,10 @@ class Color:
 
 @dataclass(frozen=True, slots=True)
 class PointsAnnotation:
-    """``type`` 2 is a closed line. Pixels from the corner of the first pixel, not its centre."""
+    """Points of a drawing; ``type`` 2 is a closed line.
+
+    Pixels count from the corner of the first pixel, not its centre.
+    """
 
     timestamp: TimeNs
     type: int

@@ -11,10 +11,13 @@ __all__ = ["CameraPoint", "CameraPoints", "Marker", "MarkerPose", "Markers"]
 
 @dataclass(frozen=True, slots=True, eq=False)
 class Marker:
-    """A marker in a frame: corners in px of the raw image, clockwise from the marker's top left,
-    (0, 0) the centre of the first pixel; ``covariance_px2`` of x0 y0 .. x3 y3, in single precision;
-    exposed ``time_offset_ns`` after the time of the frame; edges of black lie ``edge_offset_px`` too far
-    inside the black."""
+    """A marker in a frame.
+
+    ``corners_px`` are in px of the raw image, clockwise from the marker's top left; (0, 0) is the centre of
+    the first pixel. ``covariance_px2`` is that of x0 y0 .. x3 y3, in single precision. The marker was exposed
+    ``time_offset_ns`` after the time of the frame. Its edges of black lie ``edge_offset_px`` too far inside
+    the black.
+    """
 
     id: int
     corners_px: Corners
@@ -35,8 +38,11 @@ class Markers:
 
 @dataclass(frozen=True, slots=True, eq=False)
 class MarkerPose:
-    """A marker in the frame of the camera: its centre, the rotation vector that takes the marker's axes to
-    the camera's, and by how much (RMS) the corners that follow from it miss those that were seen."""
+    """The pose of a marker in camera coordinates.
+
+    It has the centre, the rotation vector from the marker's axes to the camera's axes, and the reprojection
+    error (RMS) of the corners.
+    """
 
     x_m: float
     y_m: float
@@ -47,8 +53,10 @@ class MarkerPose:
 
 @dataclass(frozen=True, slots=True, eq=False)
 class CameraPoint:
-    """Centre of a marker in the frame of the camera: x right, y down, z forward; ``poses`` are the solutions
-    for a planar square, the one that was taken first, or none for eq. (3)."""
+    """The centre of a marker in camera coordinates: x right, y down, z forward.
+
+    ``poses`` are the solutions for a planar square, the selected one first; empty for eq. (3).
+    """
 
     id: int
     x_m: float

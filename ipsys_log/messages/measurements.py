@@ -31,7 +31,7 @@ class WorldPoint:
 
 @dataclass(frozen=True, slots=True)
 class Measurement:
-    """One place of one marker, measured by hand; or, with ``withdraws``, the end of one."""
+    """A tape measurement of one marker at one calibration point; or, with ``withdraws``, a withdrawal."""
 
     timestamp: TimeNs
     id: str

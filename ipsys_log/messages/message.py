@@ -1,4 +1,4 @@
-"""Message: a payload on a topic, and the types of the fields of payloads."""
+"""Messages: a payload on a topic, and the types of the fields of payloads."""
 
 from __future__ import annotations
 
@@ -23,7 +23,7 @@ Mat88 = Annotated[NDArray[np.float64], (8, 8)]
 class Message:
     """A payload on a topic, with the two times of the log.
 
-    ``camera`` is the camera it belongs to, or None: the rig, a measurement, a track.
+    ``camera`` is the camera of the message; None for a rig, a measurement or a track.
     """
 
     topic: str

@@ -32,7 +32,7 @@ class Parameter:
 
 @dataclass(frozen=True, slots=True, eq=False)
 class Pair:
-    """A measured place: mean camera point of the still marker, and its world point."""
+    """A calibration point: mean camera point of the stationary marker, and its world point."""
 
     measurement: str
     marker_id: int
@@ -44,10 +44,10 @@ class Pair:
 
 @dataclass(frozen=True, slots=True, eq=False)
 class Noise:
-    """What a position's covariance is made of, see :mod:`ipsys_log.models.uncertainty`.
+    """The terms of the covariance of a position, see :mod:`ipsys_log.models.uncertainty`.
 
-    ``along`` is the relative error of a depth, ``across`` that of (u, v), ``growth`` the power by which
-    they grow; ``fit`` the covariance of (u, v, ln Zc) that has the effect of the uncertainty of the fit.
+    ``along`` is the relative error of a depth, ``across`` that of (u, v), ``growth`` the power of their
+    growth. ``fit`` is the covariance of (u, v, ln Zc) that has the same effect as the uncertainty of the fit.
     """
 
     along: float
@@ -74,8 +74,11 @@ class Model:
 
 @dataclass(frozen=True, slots=True)
 class ErrorStatistics:
-    """Of a set of distances; ``std_m`` with count - 1, as in Tables I and II. ``mean_low_m`` and
-    ``mean_high_m`` are the 95 % confidence interval of the mean."""
+    """Statistics of a set of distances.
+
+    ``std_m`` divides by count - 1, as in Tables I and II. ``mean_low_m`` and ``mean_high_m`` are the 95 %
+    confidence interval of the mean.
+    """
 
     count: int
     mean_m: float
@@ -97,11 +100,11 @@ class Residual:
 
 @dataclass(frozen=True, slots=True, eq=False)
 class CameraEvaluation:
-    """Errors of one camera (``""``: of all) against the ``tape`` or, in a simulated lab, the ``truth``.
+    """Errors of a camera (``""``: of all) against the ``tape`` or, in a simulated lab, the ground ``truth``.
 
-    ``scheme`` is ``held_out`` (also where absent) or ``cross_validation``; the latter has a residual
-    for each place and repeat, repeat by repeat. ``within_68`` and ``within_95`` are the shares of them
-    within these regions of their covariance.
+    ``scheme`` is ``held_out`` (also if it is absent) or ``cross_validation``. Cross-validation has a residual
+    for each calibration point and repeat, repeat by repeat. ``within_68`` and ``within_95`` are the shares of
+    the residuals within these regions of their covariance.
     """
 
     camera: str
@@ -117,7 +120,7 @@ class CameraEvaluation:
 
 @dataclass(frozen=True, slots=True)
 class LearningPoint:
-    """Mean errors of models fitted on ``pairs`` places: of the subset called ``label``, or of random ones."""
+    """Mean errors of models fitted on ``pairs`` calibration points: a subset ``label``, or random subsets."""
 
     camera: str
     pairs: int
@@ -131,10 +134,10 @@ class LearningPoint:
 
 @dataclass(frozen=True, slots=True, eq=False)
 class Suspect:
-    """A measurement that disagrees with the model fitted without it, and what would explain it.
+    """A measurement that disagrees with the model fitted without it, and a possible explanation.
 
-    ``residual_m`` is predicted minus measured, the mean over ``cameras``; ``score`` its length in units
-    of the usual one; ``kind`` one of ``side``, ``swapped``, ``distance``, ``height``, or None.
+    ``residual_m`` is predicted minus measured, the mean over ``cameras``. ``score`` is its length in units of
+    the usual length. ``kind`` is one of ``side``, ``swapped``, ``distance``, ``height``, or None.
     """
 
     measurement: str

@@ -19,12 +19,14 @@ class RigMarker:
 
 @dataclass(frozen=True, slots=True)
 class RigCamera:
-    """A camera: ``row_time_ns`` lies between the exposures of two rows, ``edge_offset_px`` is by how much
-    edges of black lie too far inside the black.
+    """A camera of the rig.
 
-    ``source`` says where frames come from, ``width`` to ``gain`` what the camera is asked for. ``stamp`` is
-    what the driver's time means, ``start`` of the exposure of the first row or ``end`` of the frame, and
-    ``latency_ns`` how long after that the stamp is taken. ``calibration`` names the file of its lens."""
+    ``row_time_ns`` lies between the exposures of two rows. ``edge_offset_px`` is the distance by which edges
+    of black lie too far inside the black. ``source`` is the source of the frames; ``width`` to ``gain`` are
+    the requested camera settings. ``stamp`` is the meaning of the driver's time: ``start`` of the exposure of
+    the first row or ``end`` of the frame. ``latency_ns`` is the delay of the stamp after that instant.
+    ``calibration`` names the file of its intrinsics.
+    """
 
     name: str
     row_time_ns: int | None = None
@@ -56,7 +58,7 @@ class Floor:
 
 @dataclass(frozen=True, slots=True)
 class Rig:
-    """The lab, as ``lab.toml`` and the channel ``/rig`` hold it (see :mod:`ipsys_log.rig.file`)."""
+    """The lab, as in ``lab.toml`` and in the channel ``/rig`` (see :mod:`ipsys_log.rig.file`)."""
 
     name: str
     dictionary: str
@@ -69,39 +71,42 @@ class Rig:
     tape_sigma_m: float | None = None
 
     def camera(self, name: str) -> RigCamera:
-        """What is said of a camera."""
+        """Return the entry of a camera; an empty entry for a camera that is not in the rig."""
         return next((camera for camera in self.cameras if camera.name == name), RigCamera(name))
 
     def length_of(self, marker_id: int) -> float:
-        """Side of a marker's black square, in m."""
+        """Return the side of a marker's black square, in m."""
         for marker in self.markers:
             if marker.id == marker_id and marker.length_m is not None:
                 return marker.length_m
         return self.marker_length_m
 
     def height_of(self, marker_id: int) -> float | None:
-        """Height above the floor at which a marker is carried, in m, where it is known."""
+        """Return the height above the floor at which a robot carries a marker, in m; None if unknown."""
         for marker in self.markers:
             if marker.id == marker_id and marker.height_m is not None:
                 return marker.height_m
         return self.marker_height_m
 
     def robot_of(self, marker_id: int) -> str:
-        """Name of the robot that carries a marker."""
+        """Return the name of the robot that carries a marker."""
         for marker in self.markers:
             if marker.id == marker_id and marker.robot is not None:
                 return marker.robot
         return f"marker_{marker_id}"
 
     def knows(self, marker_id: int) -> bool:
-        """Return whether an id is in use here: listed, or nothing is listed."""
+        """Return whether an id is in use: it is listed, or the rig lists no markers."""
         return not self.markers or any(marker.id == marker_id for marker in self.markers)
 
 
 @dataclass(frozen=True, slots=True, eq=False)
 class CameraCalibration:
-    """``foxglove.CameraCalibration``: the lens. ``distortion_model`` is ``kannala_brandt``
-    (OpenCV's fisheye, k1..k4), ``plumb_bob`` (5) or ``rational_polynomial`` (8)."""
+    """``foxglove.CameraCalibration``: the camera intrinsics.
+
+    ``distortion_model`` is ``kannala_brandt`` (OpenCV's fisheye, k1..k4), ``plumb_bob`` (5) or
+    ``rational_polynomial`` (8).
+    """
 
     timestamp: TimeNs
     frame_id: str

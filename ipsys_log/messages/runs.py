@@ -12,7 +12,7 @@ __all__ = ["ChannelRead", "ChannelWritten", "Lens", "Run"]
 
 @dataclass(frozen=True, slots=True, eq=False)
 class Lens:
-    """A calibration in force in a run, without its time."""
+    """The camera intrinsics that a run used, without their time."""
 
     camera: str
     width: int

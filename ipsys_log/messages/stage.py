@@ -1,4 +1,4 @@
-"""The row of a stage: the channels that it reads and writes, and the ways to plan and to carry out a run."""
+"""The row of a stage: the channels that it reads and writes, its plan and its execution."""
 
 from __future__ import annotations
 
@@ -12,26 +12,26 @@ from ipsys_log.messages.rig import Rig
 
 __all__ = ["Plan", "Progress", "Stage", "Step", "View"]
 
-# From a message to payloads; called with the messages in log order.
+# A step turns a message into payloads; it is called with the messages in log order.
 Step = Callable[[Message], Iterable[Any]]
-# Called with the steps done, and the number of all steps.
+# Called with the number of steps done, and the number of all steps.
 Progress = Callable[[int, int], None]
 
 
 class View(Protocol):
-    """What a stage may know of a log: its channels, those of runs from the runs that the stage reads."""
+    """The view of a stage on a log: its channels; derived ones come from the runs that the stage reads."""
 
     @property
     def rig(self) -> Rig | None:
-        """The rig that replaces the one of the log, if any."""
+        """Return the rig that replaces the one of the log, if any."""
 
     @property
     def cameras(self) -> Collection[str]:
-        """The names of the cameras with images."""
+        """Return the names of the cameras with images."""
 
     @property
     def lenses(self) -> Collection[str]:
-        """The names of the cameras with intrinsics, of the log or given in their place."""
+        """Return the names of the cameras with intrinsics, from the log or from the user."""
 
     def run(self, channel: Channel, /) -> str:
         """Return the run that the stage reads of a derived channel; "" if there is none."""
@@ -54,12 +54,12 @@ class View(Protocol):
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class Plan:
-    """What one run of a stage is: everything that makes its result what it is.
+    """The plan of one run of a stage: everything on which its result depends.
 
     Attributes
     ----------
-    run : its name, unless that is taken.
-    parameters : those on which the result depends, as the record of the run holds them.
+    run : its name, if this name is free.
+    parameters : the parameters on which the result depends, as in the record of the run.
     reads : the channels of the row that a run with these parameters reads.
     step : makes the step of a causal stage for a run of a given name; or
     compute : returns the one payload of a stage that needs the whole log.
@@ -76,23 +76,23 @@ class Plan:
 
 @dataclass(frozen=True, slots=True, kw_only=True, eq=False)
 class Stage:
-    """The row of a stage: all that the rest of the program knows about it.
+    """The row of a stage: everything that the rest of the program knows about the stage.
 
     Attributes
     ----------
-    name : as its command and its records have it.
+    name : the name in its command and its records.
     versions : of the stage and of its methods, by name. A version rises by one with each change of the output
         for the same input.
-    reads : channels that its steps get; of recorded channels all, of derived ones those of one run.
-    writes : channels, the first is its purpose. Each has other payload types than the others.
-    plan : plans a run from a log and the options of the user, by name; or returns the name of a run that
-        serves in its place, "" if there is none.
+    reads : channels that its steps get; recorded channels completely, derived channels of one run.
+    writes : channels; the first is its purpose. Each has other payload types than the others.
+    plan : plans a run from a log and the options of the user, by name; or returns the name of an existing run
+        to use instead, "" if there is none.
     rig_part : the part of the rig on which the result depends.
     method : the method or model of a run, from its parameters and its view; "" for a stage without methods.
     causal : it has steps: live tracking can run it.
     per_camera : a step sees the messages of one camera only, so that cameras can be processed in parallel.
-    in_threads : its work is done outside of Python: one thread for each camera pays off.
-    of_model : each model has its own run of it, and so of the stages that read it.
+    in_threads : it works outside of Python: one thread for each camera is faster.
+    of_model : each model has its own run of this stage, and of the stages that read it.
     """
 
     name: str

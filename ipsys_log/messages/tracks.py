@@ -20,7 +20,10 @@ __all__ = [
 
 @dataclass(frozen=True, slots=True, eq=False)
 class Position:
-    """A marker in the world, as one camera has it; ``inside`` the volume of the measured places or not."""
+    """The world position of a marker by one camera.
+
+    ``inside`` tells whether it lies in the volume of the calibration points; None if this is unknown.
+    """
 
     id: int
     x_m: float
@@ -40,7 +43,7 @@ class Positions:
 
 @dataclass(frozen=True, slots=True, eq=False)
 class Track:
-    """A robot in the world, from all the cameras that saw it."""
+    """The world position of a robot from all cameras that saw it."""
 
     robot: str
     id: int

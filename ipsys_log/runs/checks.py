@@ -88,12 +88,12 @@ def _check_versions(
 
 def _check_run_name(session: Session, request: Request, until: Stage) -> None:
     """Check that the run name of the user is not that of a run that is out of date."""
-    for one in recorded_stages(session) if request.run is not None else ():
-        stage = stage_named(one.run.stage)
-        if one.run.run == request.run and one.out_of_date and stage and has_given_name(stage, until):
+    for entry in recorded_stages(session) if request.run is not None else ():
+        stage = stage_named(entry.run.stage)
+        if entry.run.run == request.run and entry.out_of_date and stage and has_given_name(stage, until):
             raise IpsysError(
-                f"run {request.run} already has the stage {one.run.stage}, which is {one.state}; use another "
-                "--run name"
+                f"run {request.run} already has the stage {entry.run.stage}, which is {entry.state}; "
+                "use another --run name"
             )
 
 
@@ -123,7 +123,7 @@ def _check_rigs(session: Session, request: Request) -> None:
 
 
 def _cameras(session: Session, written: Collection[Channel]) -> set[str]:
-    """The cameras whose markers are to be seen through a lens; none where there are only camera points."""
+    """Return the cameras whose markers need camera intrinsics; none if the log has only camera points."""
     if session.images:
         return set(session.images)
     markers = newest_run(session, MARKERS)
@@ -137,13 +137,13 @@ def _cameras(session: Session, written: Collection[Channel]) -> set[str]:
 
 
 def _check_overrides(session: Session, request: Request, cameras: set[str]) -> None:
-    """What cannot take effect is not passed over in silence."""
+    """Raise an error for an override that cannot take effect."""
     known = ", ".join(sorted(cameras)) if cameras else "none whose markers are in the log"
     for name in sorted(set(request.lenses) - cameras):
         raise IpsysError(f"--calibration {name}: the log has no such camera (it has {known})")
     if request.rig is not None and not cameras:
-        held = session.payloads(session.topics(RIG))
-        if any(rig.marker_length_m != request.rig.marker_length_m for rig in held):
+        rigs = session.payloads(session.topics(RIG))
+        if any(rig.marker_length_m != request.rig.marker_length_m for rig in rigs):
             raise IpsysError(
                 "--rig: another marker length cannot take effect, the log has camera points but no markers"
             )
@@ -226,7 +226,7 @@ def _check_model(session: Session, request: Request, models: Sequence[str], came
 
 
 def _check_heights(session: Session, request: Request, models: Sequence[str]) -> None:
-    """A model that reads the height of a marker needs one for each that may be seen."""
+    """Check that the rig has a height for each marker, if a model reads the heights of markers."""
     rigs = [request.rig] if request.rig is not None else session.payloads(session.topics(RIG))
     for name in models:
         for rig in rigs:

@@ -54,48 +54,51 @@ __all__ = [
 
 
 class OtherContentError(Exception):
-    """A run holds something that its stage does not make of the log."""
+    """The error of a run that contains a message that its stage does not make from the log."""
 
 
 def cut_short(session: Session, target: Path, task: Task, run: str) -> dict[str, int]:
-    """What a run in ``target`` holds of a stage that has not signed it: messages by topic, or nothing."""
-    signed = any((one.run, one.stage) == (run, task.stage.name) for one in session.runs())
+    """Return the number of messages by topic that an unsigned stage wrote to a run in ``target``.
+
+    The result is empty if the run has nothing of the stage, or if the stage has its record.
+    """
+    signed = any((record.run, record.stage) == (run, task.stage.name) for record in session.runs())
     if signed or task.step is None or not session.topics(task.stage.writes[0], run):
         return {}
     topics = [topic for channel in task.stage.writes for topic in session.topics(channel, run)]
-    here = {topic for reader in session.readers if reader.path == target for topic in reader.channels}
-    return {topic: session.count(topic) for topic in topics} if here.issuperset(topics) else {}
+    available = {topic for reader in session.readers if reader.path == target for topic in reader.channels}
+    return {topic: session.count(topic) for topic in topics} if available.issuperset(topics) else {}
 
 
 def without_held(session: Session, held: Collection[str], made: Iterable[Message]) -> Iterator[Message]:
-    """What is missing in a run: those of the messages made that are not there, byte for byte.
+    """Yield the messages of ``made`` that are missing in a run; messages are compared byte for byte.
 
     Parameters
     ----------
-    held : the run's topics.
-    made : all that its stage makes, in log order.
+    held : the topics of the run.
+    made : all messages that its stage makes, in log order.
 
     Raises
     ------
     OtherContentError
-        Where the run has something else. Events may be another stage's: these two can share a channel.
+        The run contains another message. Events are exempt: two stages can share a channel of events.
     """
     waiting = session.messages(held)
     following = next(waiting, None)
-    here: list[Message] = []
+    pending: list[Message] = []
     for message in made:
         while following is not None and following.log_time_ns <= message.log_time_ns:
-            here.append(following)
+            pending.append(following)
             following = next(waiting, None)
-        _refuse(one for one in here if one.log_time_ns < message.log_time_ns)
-        here = [one for one in here if one.log_time_ns == message.log_time_ns]
-        same = next((one for one in here if _same(one, message)), None)
+        _refuse(stored for stored in pending if stored.log_time_ns < message.log_time_ns)
+        pending = [stored for stored in pending if stored.log_time_ns == message.log_time_ns]
+        same = next((stored for stored in pending if _same(stored, message)), None)
         if same is None:
             yield message
         else:
-            here.remove(same)
-    _refuse(here)
-    _refuse(one for one in (following, *waiting) if one is not None)
+            pending.remove(same)
+    _refuse(pending)
+    _refuse(stored for stored in (following, *waiting) if stored is not None)
 
 
 def _same(one: Message, other: Message) -> bool:
@@ -106,9 +109,9 @@ def _same(one: Message, other: Message) -> bool:
 
 
 def _refuse(left: Iterable[Message]) -> None:
-    for one in left:
-        if not isinstance(one.payload, Event):
-            raise OtherContentError(f"{one.topic} is another one at {format_time(one.log_time_ns)}")
+    for message in left:
+        if not isinstance(message.payload, Event):
+            raise OtherContentError(f"{message.topic} is another one at {format_time(message.log_time_ns)}")
 
 
 Make = Callable[[Task, Session, str], Iterable[Message]]
@@ -126,23 +129,23 @@ def perform(
     """Find the run that has done ``task``, or ``make`` it and append it to ``target``.
 
     An interrupted run is completed, if its content equals the present result. If the newest run of such a
-    task is out of date, a remark says so before a new run is made.
+    task is out of date, a remark reports this before a new run is made.
     """
     name = request.run if has_given_name(task.stage, until) else None
     record = record_of(session, task)
-    found = find_run(session, record, name)
-    if found is not None:
-        return Outcome(task.stage.name, found, fresh=False)
+    finished_run = find_run(session, record, name)
+    if finished_run is not None:
+        return Outcome(task.stage.name, finished_run, fresh=False)
     _say_renewal(session, task, record, say)
     number = max((run.number for run in session.runs()), default=0) + 1
     record = replace(record, fingerprint=fingerprint(), number=number)
     remarks: tuple[str, ...] = ()
-    given = name or task.run
-    if held := cut_short(session, target, task, given):
+    run_name = name or task.run
+    if counts := cut_short(session, target, task, run_name):
         try:
-            return _append(session, target, task, replace(record, run=given), held, request, make)
+            return _append(session, target, task, replace(record, run=run_name), counts, request, make)
         except OtherContentError as other:
-            remarks = (f"run {given} was cut short, and is left so: {other}",)
+            remarks = (f"run {run_name} was cut short, and is left so: {other}",)
     if name is None:
         name = free_name(session, record, task.run, task.stage.writes)
     else:
@@ -162,14 +165,14 @@ def _say_renewal(session: Session, task: Task, record: Run, say: Callable[[str],
 
     def is_such(one: Recorded) -> bool:
         is_same = (one.run.stage, one.method) == (task.stage.name, method)
-        # A stage without methods differs by its input only: the writer of that has reported the change.
+        # A stage without methods differs by its input only: the stage that wrote it has reported the change.
         return is_same and (bool(method) or one.run.input_runs == record.input_runs)
 
-    such = [one for one in recorded_stages(session) if is_such(one)]
-    if such and such[-1].out_of_date:
+    matches = [recorded for recorded in recorded_stages(session) if is_such(recorded)]
+    if matches and matches[-1].out_of_date:
         frames = sum(session.count(topic) for topic in task.topics if topic in session.images.values())
         much = f" for {frames} frames" if frames else ""
-        say(f"{task.stage.name} is computed again{much}; run {such[-1].run.run} is {such[-1].state}")
+        say(f"{task.stage.name} is computed again{much}; run {matches[-1].run.run} is {matches[-1].state}")
 
 
 def _append(
@@ -181,7 +184,7 @@ def _append(
     request: Request,
     make: Make,
 ) -> Outcome:
-    """Make a run, append what of it is not held, and its record."""
+    """Compute a run; append the messages that the log does not hold yet, and the record of the run."""
     log_time_ns, publish_time_ns = session.last(task.topics)
     remarks = Remarks(task, request.skip_ambiguous)
     made = append_run(
@@ -196,8 +199,10 @@ def _append(
 
 
 class LiveRun(NamedTuple):
-    """A run that a stage writes live, and by derived channel the runs that it reads; ``copied`` is a run that
-    was copied from another log and has its record."""
+    """A run that a stage writes live, and by derived channel the runs that it reads.
+
+    ``copied`` is a run that was copied from another log and has its record.
+    """
 
     stage: Stage
     run: str
@@ -237,7 +242,7 @@ def sign(path: Path, options: Mapping[str, str], runs: Sequence[LiveRun]) -> lis
 
 def signed_copy(task: Task, model: Model, number: int, now_ns: Callable[[], int]) -> list[Message]:
     """Return the messages that copy a model into a new log: the model, and the record of its run."""
-    at = MODEL.topic_of(task.run)
+    topic = MODEL.topic_of(task.run)
     record = Run(
         timestamp=model.timestamp,
         run=task.run,
@@ -246,14 +251,14 @@ def signed_copy(task: Task, model: Model, number: int, now_ns: Callable[[], int]
         fingerprint=fingerprint(),
         input_runs=task.input_runs,
         inputs=task.foreign,
-        outputs=(ChannelWritten(at, 1),),
+        outputs=(ChannelWritten(topic, 1),),
         number=number,
     )
-    return [Message(at, now_ns(), model.timestamp, model), record_message(record, now_ns())]
+    return [Message(topic, now_ns(), model.timestamp, model), record_message(record, now_ns())]
 
 
 def record_of(session: Session, task: Task) -> Run:
-    """The record of a task, but for its name, its time and what it wrote."""
+    """Return the record of a task, without its name, its time and its outputs."""
     lenses = tuple(
         Lens(name, lens.width, lens.height, lens.distortion_model, lens.D, lens.K)
         for name, lens in sorted(task.lenses.items())
@@ -290,7 +295,7 @@ def inputs(session: Session, task: Task, progress: Progress) -> Iterator[Message
         if message.log_time_ns not in skipped:
             yield message
         elif isinstance(message.payload, CompressedVideo):
-            # Those after it need it. What live passed over up to a keyframe, makes no difference.
+            # The next frames need it. Frames that live processing skipped before a keyframe have no effect.
             yield replace(message, payload=SkippedVideo(message.payload))
         progress(task.stage.name, done, total)
 
@@ -306,7 +311,7 @@ def _settings(
 
 
 def carry_out(task: Task, session: Session, name: str, progress: Progress) -> Iterator[Message]:
-    """Yield the messages of a task's run: its causal stage over the log, or one computed from all of it."""
+    """Yield the messages of a task's run: of its causal stage, or one message computed from the whole log."""
     if task.step is None:
         assert task.compute is not None
         payload = task.compute(partial(progress, task.stage.name))
@@ -317,7 +322,7 @@ def carry_out(task: Task, session: Session, name: str, progress: Progress) -> It
     wired = wire(task.stage, name, task.inputs, task.step(name))
     written = {(channel, name) for channel in task.stage.writes}
     is_written: dict[tuple[str, type], bool] = {}
-    # Threads that run Python wait for one another, and a stage takes longer in them than without.
+    # Python threads wait for one another: a stage that runs Python is slower in threads than without.
     for message in run(
         inputs(session, task, progress), [wired], in_threads if task.stage.in_threads else map
     ):

@@ -1,7 +1,7 @@
 """The graph of stages: one table of their rows, and the plan of each on a log.
 
-Adding a stage takes a file with its row in :mod:`ipsys_log.stages`, a line in :data:`STAGES` and, for a new
-channel, a line in the table of :mod:`ipsys_log.messages.channels`.
+A new stage needs a file with its row in :mod:`ipsys_log.stages`, and a line in :data:`STAGES`. A new channel
+needs a line in the table of :mod:`ipsys_log.messages.channels`.
 """
 
 from __future__ import annotations
@@ -38,7 +38,7 @@ __all__ = [
     "writes",
 ]
 
-# In an order in which each stage comes after those that write its channels.
+# Each stage comes after the stages that write its channels.
 STAGES: tuple[Stage, ...] = (
     detect.STAGE,
     camera_frame.STAGE,
@@ -58,8 +58,8 @@ def stage_named(name: str) -> Stage | None:
 def stages_until(name: str | None) -> list[Stage]:
     """Return a stage and all those that it needs, in order; all stages for None.
 
-    With a stage whose result no other one reads, those before it in the table that nobody reads belong to it
-    as well: fuse also evaluates.
+    If no stage reads the result of this stage, the earlier stages of the table without readers are included:
+    fuse also evaluates.
     """
     last = STAGES[-1] if name is None else stage_named(name)
     if last is None:
@@ -74,13 +74,13 @@ def stages_until(name: str | None) -> list[Stage]:
 
 def _with_needed(stage: Stage) -> set[Stage]:
     needed = {stage}
-    for writer in (one for one in STAGES if _own(one) & set(stage.reads)):
+    for writer in (candidate for candidate in STAGES if _own(candidate) & set(stage.reads)):
         needed |= _with_needed(writer)
     return needed
 
 
 def _readers(stage: Stage) -> list[Stage]:
-    return [one for one in STAGES if _own(stage) & set(one.reads)]
+    return [candidate for candidate in STAGES if _own(stage) & set(candidate.reads)]
 
 
 def _own(stage: Stage) -> set[Channel]:
@@ -90,7 +90,7 @@ def _own(stage: Stage) -> set[Channel]:
 
 def is_of_model(stage: Stage) -> bool:
     """Return whether each model has its own run of a stage."""
-    return any(one.of_model for one in _with_needed(stage))
+    return any(needed.of_model for needed in _with_needed(stage))
 
 
 def versioned_names(stage: str, method: str = "") -> list[str]:
@@ -110,11 +110,11 @@ class Task:
 
     Attributes
     ----------
-    run : its name, unless that is taken.
-    topics : that it reads of the log, and ``foreign`` those of another log.
+    run : its name, if this name is free.
+    topics : the topics that it reads from the log; ``foreign`` are the topics from another log.
     inputs : by derived channel, the run that it reads.
-    parameters : what else its result depends on; ``input_runs`` are those of ``foreign``.
-    rig, lenses : set where they replace those of the log.
+    parameters : all other settings on which its result depends; ``input_runs`` are the runs of ``foreign``.
+    rig, lenses : set if they replace those of the log.
     """
 
     stage: Stage
@@ -145,11 +145,11 @@ def plan_stage(
     ----------
     options : of the user, by name, see :meth:`ipsys_log.runs.options.Request.options`.
     inputs : by derived channel, the run to read.
-    rig, lenses : given by the user. They replace those of the log where the stage would notice it.
+    rig, lenses : given by the user. They replace those of the log if they change the input of the stage.
 
     Returns
     -------
-    The task; or the name of a run to use as it is, "" where there is none.
+    The task; or the name of an existing run to use instead, "" if there is none.
     """
     other_lenses = _other_lenses(session, lenses or {}) if CALIBRATIONS in stage.reads else {}
     view = LogView(session, inputs, _other_rig(session, stage, rig), other_lenses)
@@ -174,8 +174,8 @@ def plan_stage(
 
 def _other_rig(session: Session, stage: Stage, rig: Rig | None) -> Rig | None:
     """Return a rig that the user gives if it differs, for a stage, from those of the log."""
-    held = session.payloads(session.topics(RIG)) if rig is not None else []
-    if rig is None or (held and all(stage.rig_part(one) == stage.rig_part(rig) for one in held)):
+    rigs = session.payloads(session.topics(RIG)) if rig is not None else []
+    if rig is None or (rigs and all(stage.rig_part(recorded) == stage.rig_part(rig) for recorded in rigs)):
         return None
     return rig
 
@@ -184,7 +184,9 @@ def _other_lenses(session: Session, given: Mapping[str, CameraCalibration]) -> d
     """Return the given intrinsics that differ from those of the log."""
     lenses = dict(given)
     for camera, topic in session.calibrations.items():
-        if camera in lenses and all(same_lens(held, lenses[camera]) for held in session.payloads([topic])):
+        if camera in lenses and all(
+            same_lens(recorded, lenses[camera]) for recorded in session.payloads([topic])
+        ):
             del lenses[camera]
     return lenses
 

@@ -1,4 +1,4 @@
-"""What the user asks for, beyond what the log itself says."""
+"""The requests of the user, beyond the content of the log."""
 
 from __future__ import annotations
 
@@ -12,32 +12,32 @@ from ipsys_log.stages.detect import check_corners
 
 __all__ = ["Progress", "Request"]
 
-# Called with the stage, the messages done, and all there are, where that is known.
+# Called with the stage, the number of messages done, and the number of all messages, if it is known.
 Progress = Callable[[str, int, int | None], None]
 
 
 @dataclass(frozen=True, slots=True)
 class Request:
-    """What the user asks for.
+    """The requests of the user.
 
     Attributes
     ----------
-    models : names in the table of models; empty: ``poly``, or what ``model_from`` holds; to evaluate,
-        all of them.
-    rig, lenses : used instead of the log's own, as a new run. Lenses by camera.
-    model_from : another log, whose newest fitted model is applied and copied in.
-    train, seed : the subset to fit on, or the seed of the random split where nothing is labelled.
-    run : name for the new run of the last stages, instead of one made from the model.
-    corners : how corners are found: ``edges`` or ``stock``; None: edges, if all cameras have a calibration.
-    method : how camera points are made of markers: ``perimeter`` or ``pose``.
-    as_live : pass over the frames that were skipped when the log was recorded live.
-    skip_ambiguous : go on where a marker id is seen twice in a frame, without that marker.
+    models : names in the table of models; empty: ``poly``, or the model of ``model_from``; for an evaluation,
+        all models.
+    rig, lenses : used instead of those of the log, as a new run. Camera intrinsics by camera.
+    model_from : another log; its newest fitted model is applied and copied into the log.
+    train, seed : the subset to fit on, or the seed of the random split if no measurement has a label.
+    run : name for the new run of the last stages; without it, the name comes from the model.
+    corners : method of corner detection: ``edges`` or ``stock``; None: edges, if all cameras have intrinsics.
+    method : method that computes camera points from markers: ``perimeter`` or ``pose``.
+    as_live : skip the frames that were skipped when the log was recorded live.
+    skip_ambiguous : if a frame shows a marker id twice, continue without that marker.
     parameters : further options of stages, by name.
 
     Raises
     ------
     IpsysError
-        Where there is no such method.
+        There is no such method.
     """
 
     models: tuple[str, ...] = ()

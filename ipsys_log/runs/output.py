@@ -1,4 +1,4 @@
-"""Messages into logs: a whole new one, or a run at the end of one."""
+"""Output of messages to logs: to a new log, or as a run at the end of a log."""
 
 from __future__ import annotations
 
@@ -33,7 +33,7 @@ __all__ = [
 
 
 def write_messages(writer: LogWriter, messages: Iterable[Message]) -> dict[str, int]:
-    """Put messages into an open log; returns how many went to each topic."""
+    """Write messages to an open log; return the number of messages by topic."""
     counts: dict[str, int] = {}
     for message in messages:
         write_message(writer, message, counts)
@@ -41,10 +41,10 @@ def write_messages(writer: LogWriter, messages: Iterable[Message]) -> dict[str, 
 
 
 def write_message(writer: LogWriter, message: Message, counts: dict[str, int]) -> None:
-    """Put a message into an open log, and count it by its topic. No password gets into a log."""
+    """Write a message to an open log, and count it by its topic. Passwords are removed before."""
     payload = hide_passwords(message.payload) if isinstance(message.payload, Rig) else message.payload
     name = schema_name(type(message.payload))
-    # A camera may begin to send something else: of what is known, this refuses another schema.
+    # A camera can begin to send another message type: this check refuses another schema on a known topic.
     if message.topic not in counts or message.camera is not None:
         writer.add_channel(message.topic, Schema(name, "protobuf", schema_data(name)))
     writer.write(message.topic, message.log_time_ns, message.publish_time_ns, encode(payload))
@@ -52,11 +52,11 @@ def write_message(writer: LogWriter, message: Message, counts: dict[str, int]) -
 
 
 def write_log(path: Path, messages: Iterable[Message]) -> dict[str, int]:
-    """Write a new log; after an error nothing of it is left.
+    """Write a new log; after an error, delete it.
 
     Returns
     -------
-    How many messages went to each topic.
+    The number of messages by topic.
     """
     with LogWriter.create(path, atomic=True) as writer:
         return write_messages(writer, messages)
@@ -69,15 +69,15 @@ def append_run(
     messages: Callable[[], Iterable[Message]],
     held: Mapping[str, int],
 ) -> Run:
-    """Append what a stage makes, then its record, in one step: all of it is in the log, or nothing.
+    """Append the messages of a stage and then its record in one step: the log gets all of them, or none.
 
-    ``messages`` is called when the log is locked, so that no two processes do the same work; ``held`` says
-    how many the run has already on each topic.
+    ``messages`` is called when the log is locked, so that no two processes do the same work; ``held`` is the
+    number of messages by topic that the run already has.
 
     Raises
     ------
     LogError
-        Where another process has written to this run meanwhile.
+        Another process has written to this run in the meantime.
     """
     with LogWriter.append(path) as writer:
         with Session([path]) as now:
@@ -91,7 +91,7 @@ def append_run(
 
 
 def append_messages(path: Path, messages: Iterable[Message]) -> None:
-    """Append messages to a log, all of them or none."""
+    """Append messages to a log: all of them or none."""
     with LogWriter.append(path) as writer:
         write_messages(writer, messages)
 
@@ -102,16 +102,16 @@ def record_message(record: Run, log_time_ns: int) -> Message:
 
 @contextmanager
 def opened_target(paths: Sequence[Path], output: Path | None) -> Iterator[tuple[list[Path], Path]]:
-    """The logs to read and the one to append to: the last one given, or a new one.
+    """Yield the logs to read, and the log to append to: the last log of ``paths``, or a new log.
 
-    A new one has its name only when all is done; where nothing was to do, or after an error, there is
-    none.
+    A new log gets its name only when all work is done. If there was no work, or after an error, no new log
+    remains.
     """
     if output is None:
         yield list(paths), paths[-1]
         return
     _check_free(output)
-    # Another process may be making a log of that name: the first to finish gets it.
+    # Another process may write a log of that name at the same time: the first one to finish gets the name.
     partial = output.with_name(f"{output.name}.{secrets.token_hex(4)}.partial")
     with LogWriter.create(partial):
         pass
@@ -127,7 +127,7 @@ def opened_target(paths: Sequence[Path], output: Path | None) -> Iterator[tuple[
 
 
 def _give_name(partial: Path, output: Path) -> None:
-    """Rename without overwriting a file that another process may have created meanwhile."""
+    """Rename a file; do not overwrite a file that another process has created in the meantime."""
     try:
         os.link(partial, output)
     except FileExistsError:

@@ -60,7 +60,7 @@ def _versions() -> tuple[tuple[str, str], ...]:
 
 
 def fingerprint() -> dict[str, str]:
-    """The environment that the digits of a result can depend on: versions and BLAS kernel."""
+    """Return the environment on which the digits of a result can depend: versions and BLAS kernel."""
     kernels = {
         f"{library.get('internal_api')} {library.get('version')} {library.get('architecture', '')}".strip()
         for library in threadpoolctl.threadpool_info()
@@ -70,12 +70,12 @@ def fingerprint() -> dict[str, str]:
 
 
 def read_channels(session: Session, topics: Iterable[str]) -> tuple[ChannelRead, ...]:
-    """An input of a stage, identified by its content (law 4 of the log)."""
+    """Return the input of a stage by topic, identified by its content (law 4 of the log)."""
     return tuple(ChannelRead(topic, session.count(topic), session.hash(topic)) for topic in sorted(topics))
 
 
 def _essence(run: Run) -> bytes:
-    """The identity of a run of a stage: all except names, times and the environment."""
+    """Return the identity of a run of a stage: all fields except names, times and the environment."""
     return encode(replace(run, timestamp=0, run="", fingerprint={}, input_runs=(), outputs=(), number=0))
 
 
@@ -99,10 +99,10 @@ def find_run(session: Session, wanted: Run, name: str | None = None) -> str | No
 
 
 def free_name(session: Session, record: Run, base: str, writes: Sequence[Channel]) -> str:
-    """The name for a new run: ``base``, or ``base_2``, ``base_3`` ... where that is taken.
+    """Return the name for a new run: ``base``, or ``base_2``, ``base_3`` ... if ``base`` is taken.
 
-    A stage joins the run that it reads from, as long as that does not have the stage; any other name
-    must be new, so that a run holds only what belongs together.
+    A stage joins the run that it reads from, if that run does not have the stage yet. Any other name must
+    be new: a run holds only results that belong together.
     """
     taken = session.run_names()
     joins = base in record.input_runs and not _has_stage(session, record.stage, base, writes)
@@ -115,7 +115,7 @@ def free_name(session: Session, record: Run, base: str, writes: Sequence[Channel
 
 
 def _has_stage(session: Session, stage: str, name: str, writes: Sequence[Channel]) -> bool:
-    """By its record, or by a channel that such a stage writes, whoever made it."""
+    """Return whether a run has a stage, by its record or by the first channel that the stage writes."""
     recorded = any((run.run, run.stage) == (name, stage) for run in session.runs())
     return recorded or bool(session.topics(writes[0], name))
 
@@ -126,7 +126,7 @@ def check_run_name(session: Session, stage: str, name: str, writes: Sequence[Cha
     Raises
     ------
     IpsysError
-        Otherwise.
+        The run already has that stage.
     """
     if _has_stage(session, stage, name, writes):
         raise IpsysError(f"run {name} already has the stage {stage} from other input; use another --run name")
@@ -136,7 +136,7 @@ def check_run_name(session: Session, stage: str, name: str, writes: Sequence[Cha
 def newest_run(session: Session, channel: Channel) -> str | None:
     """Return the run whose newest complete stage wrote a channel.
 
-    Imported channels are of no recorded stage: they count with any complete stage of their run.
+    Imported channels belong to no recorded stage: they count with any complete stage of their run.
     """
     recorded = {output.topic for run in session.runs() for output in run.outputs}
     for run in reversed(complete_runs(session)):

@@ -1,4 +1,4 @@
-"""Remarks on a stage, and decisions that a user has to make before it is written."""
+"""Remarks on a stage, and decisions that a user must make before the stage is written."""
 
 from __future__ import annotations
 
@@ -19,18 +19,18 @@ __all__ = ["Remarks"]
 
 
 class Remarks:
-    """Watches the messages that a stage makes on their way into the log."""
+    """Collector of remarks; it sees all messages of a stage on their way into the log."""
 
     def __init__(self, task: Task, skip_ambiguous: bool) -> None:
         self._task = task
         self._skip_ambiguous = skip_ambiguous
-        # Of each kind of event: how many there were, and the first of them.
+        # For each kind of event: the number of events, and the first event.
         self._events: Counter[str] = Counter()
         self._first: dict[str, Message] = {}
         self._unknown: set[str] = set()
         self._frames = self._markers = 0
         self._located: set[str | None] = set()
-        # Eight bytes for each: a long log has millions.
+        # An array takes eight bytes for each offset: a long log has millions of offsets.
         self._offsets_px: dict[str, array[float]] = {}
 
     def watch(self, messages: Iterable[Message]) -> Iterator[Message]:
@@ -92,7 +92,7 @@ class Remarks:
             )
 
     def lines(self) -> tuple[str, ...]:
-        """One line for each thing to know."""
+        """Return one line for each remark."""
         lines = [
             f"{count} x {kind.replace('_', ' ')}, first: {_said(self._first[kind])}"
             for kind, count in sorted(self._events.items())
@@ -106,7 +106,11 @@ class Remarks:
         return (*lines, *self._task.notes)
 
     def _about_offsets(self) -> list[str]:
-        medians = {c: median(found) for c, found in self._offsets_px.items() if len(found) >= MIN_OFFSETS}
+        medians = {
+            c: median(offsets_px)
+            for c, offsets_px in self._offsets_px.items()
+            if len(offsets_px) >= MIN_OFFSETS
+        }
         return [
             f"camera {camera}: edges of black lie {offset_px:.2f} px inside the black (gamma); allowed for"
             for camera, offset_px in sorted(medians.items())

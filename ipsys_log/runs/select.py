@@ -29,7 +29,7 @@ __all__ = [
 ]
 
 
-# Of so many markers the median edge offset is that of the camera; and less than that is none.
+# The median edge offset of a camera needs 10 markers; an offset below 0.05 px counts as zero.
 MIN_OFFSETS, LEAST_OFFSET_PX = 10, 0.05
 
 
@@ -38,8 +38,12 @@ def wanted_models(
 ) -> tuple[str, ...]:
     """Return the names of the models to fit or apply.
 
-    The first that applies: the models of the request; ``poly`` or another one of ``model_from``; the models
-    that were copied into the logs of ``paths``, if these have no measurements to fit to; the ``usual`` ones.
+    The first of these cases applies:
+
+    - the models of the request;
+    - ``poly``, or another model of ``model_from``;
+    - the models that were copied into the logs of ``paths``, if these have no measurements to fit to;
+    - the ``usual`` models.
 
     Raises
     ------
@@ -56,27 +60,27 @@ def wanted_models(
             return ("poly" if "poly" in names else fitted_in(other, None)[0].name,)
     if paths:
         with Session(paths) as session:
-            held = _copied_models(session)
-        if held:
-            return held
+            copied = _copied_models(session)
+        if copied:
+            return copied
     return tuple(usual)
 
 
 def fitted_in(other: Session, name: str | None) -> tuple[Model, str]:
-    """The newest model in another log, of a name where one is given, and its topic.
+    """Return the newest model in another log, of the given name if there is one, and its topic.
 
     Raises
     ------
     IpsysError
-        Where there is none.
+        There is no such model.
     """
     for topic in reversed(_model_topics(other)):
         model: Model = other.payloads([topic])[-1]
         if name in (None, model.name):
             return model, topic
-    what = f"model {name}" if name else "model"
+    wanted = f"model {name}" if name else "model"
     option = f" --model {name}" if name else ""
-    raise IpsysError(f"{other}: has no fitted {what}; fit one there with: ipsys fit {other}{option}")
+    raise IpsysError(f"{other}: has no fitted {wanted}; fit one there with: ipsys fit {other}{option}")
 
 
 def _model_topics(session: Session) -> list[str]:
@@ -93,7 +97,7 @@ def _copied_models(session: Session) -> tuple[str, ...]:
 
 
 def copied_run(session: Session, model: str) -> str | None:
-    """The run of a model that was copied into a log without measurements, the newest one."""
+    """Return the newest run with a model that was copied into a log without measurements."""
     if has_measurements(LogView(session)):
         return None
     for topic in reversed(_model_topics(session)):
@@ -103,24 +107,27 @@ def copied_run(session: Session, model: str) -> str | None:
 
 
 def rig_with_offsets(session: Session) -> Rig:
-    """The newest rig of a log, with the edge offset of each camera that has one and the rig does not say it:
-    the median of those that the newest detection found.
+    """Return the newest rig of a log, with the edge offsets of its cameras.
+
+    If the rig has no edge offset for a camera, the offset is the median over the newest detection.
 
     Raises
     ------
     IpsysError
-        Where the log holds no rig.
+        The log holds no rig.
     """
     rigs: list[Rig] = session.payloads(session.topics(RIG))
     if not rigs:
         raise IpsysError(f"{session}: holds no rig; write an example with 'ipsys init lab.toml'")
     run = newest_run(session, MARKERS)
-    found: dict[str, list[float]] = {}
+    offsets_by_camera: dict[str, list[float]] = {}
     for message in session.messages(session.topics(MARKERS, run) if run else []):
-        offsets = found.setdefault(str(message.camera), [])
+        offsets = offsets_by_camera.setdefault(str(message.camera), [])
         offsets += [m.edge_offset_px for m in message.payload.markers if m.edge_offset_px is not None]
-    cameras = {name: rigs[-1].camera(name) for name in [c.name for c in rigs[-1].cameras] + sorted(found)}
-    for name, offsets in found.items():
+    cameras = {
+        name: rigs[-1].camera(name) for name in [c.name for c in rigs[-1].cameras] + sorted(offsets_by_camera)
+    }
+    for name, offsets in offsets_by_camera.items():
         offset_px = float(np.median(offsets)) if len(offsets) >= MIN_OFFSETS else 0.0
         if abs(offset_px) >= LEAST_OFFSET_PX and cameras[name].edge_offset_px is None:
             cameras[name] = replace(cameras[name], edge_offset_px=round(offset_px, 3))

@@ -1,4 +1,4 @@
-"""The state of recorded runs: whether this software would compute the same from the log."""
+"""The state of recorded runs: would this software compute the same result from the log?"""
 
 from __future__ import annotations
 
@@ -15,13 +15,13 @@ from ipsys_log.runs.provenance import is_complete, recorded_version
 __all__ = ["Recorded", "is_fitted_here", "made_by_newer", "out_of_date_lines", "recorded_stages"]
 
 _CURRENT = "current"
-# A model that was fitted to measurements of the same log has one of these parameters.
+# The record of a model that was fitted to measurements of the same log has one of these parameters.
 _FITTED_HERE = frozenset(("train", "seed"))
 
 
 @dataclass(frozen=True, slots=True)
 class Recorded:
-    """A stage of a run, and its state.
+    """A stage of a run and its state.
 
     Attributes
     ----------
@@ -41,37 +41,39 @@ class Recorded:
 
     @property
     def is_of_other_version(self) -> bool:
-        """Return whether older or newer software made it, with perhaps another result."""
+        """Return whether older or newer software made the stage, perhaps with another result."""
         names = versioned_names(self.run.stage, self.method)
         return any(recorded_version(self.run, name) != VERSIONS.get(name) for name in names)
 
     @property
     def stage_version(self) -> int:
-        """The version of the stage that made it."""
+        """The version of the stage at the time of the run."""
         return recorded_version(self.run, self.run.stage)
 
 
 def recorded_stages(session: Session) -> list[Recorded]:
     """Return every recorded stage with its state, oldest first."""
     stages = [_judge(session, Recorded(run, method_of(session, run))) for run in session.runs()]
-    stale: set[str] = set()  # topics that stages wrote which are out of date
+    stale: set[str] = set()  # topics of the stages that are out of date
     while True:
-        more = {output.topic for one in stages if one.out_of_date for output in one.run.outputs} - stale
+        more = {output.topic for stage in stages if stage.out_of_date for output in stage.run.outputs} - stale
         if not more:
             return stages
         stale |= more
-        stages = [_judge_inputs(one, stale) for one in stages]
+        stages = [_judge_inputs(stage, stale) for stage in stages]
 
 
 def out_of_date_lines(session: Session, names: Iterable[str | None]) -> list[str]:
     """Return a line for each run of these names that is out of date, with its first such stage."""
     lines: dict[str, str] = {}
     wanted = set(names)
-    for one in recorded_stages(session):
-        is_shown = one.run.run in wanted and not writes(one.run, EVALUATION)
-        if is_shown and (one.out_of_date or one.is_newer):
-            advice = "" if one.is_newer else "; ipsys replay makes it again"
-            lines.setdefault(one.run.run, f"run {one.run.run}: {one.run.stage} is {one.state}{advice}")
+    for recorded in recorded_stages(session):
+        is_shown = recorded.run.run in wanted and not writes(recorded.run, EVALUATION)
+        if is_shown and (recorded.out_of_date or recorded.is_newer):
+            advice = "" if recorded.is_newer else "; ipsys replay makes it again"
+            lines.setdefault(
+                recorded.run.run, f"run {recorded.run.run}: {recorded.run.stage} is {recorded.state}{advice}"
+            )
     return list(lines.values())
 
 
@@ -80,8 +82,8 @@ def made_by_newer(session: Session, run: Run) -> str:
     for name in versioned_names(run.stage, method_of(session, run)):
         version = recorded_version(run, name)
         if version > VERSIONS.get(name, 0):
-            here = f"this is {name} {VERSIONS[name]}" if name in VERSIONS else "which is not known here"
-            return f"made by {name} {version}, {here}: update ipsys"
+            present = f"this is {name} {VERSIONS[name]}" if name in VERSIONS else "which is not known here"
+            return f"made by {name} {version}, {present}: update ipsys"
     return ""
 
 
@@ -91,7 +93,7 @@ def is_fitted_here(run: Run) -> bool:
 
 
 def _judge(session: Session, one: Recorded) -> Recorded:
-    """Return a stage with its state, as far as its own record and the log tell it."""
+    """Return a stage with its state, derived from its own record and the log."""
     run = one.run
     if not is_complete(session, run):
         return replace(one, state="unfinished")
@@ -111,7 +113,7 @@ def _judge(session: Session, one: Recorded) -> Recorded:
 
 
 def _judge_inputs(one: Recorded, stale: Collection[str]) -> Recorded:
-    """Return a stage that was current as out of date, if it read a ``stale`` topic."""
+    """Return a stage; mark a current stage as out of date if it read a ``stale`` topic."""
     names = [str(run_of_topic(read.topic)) for read in one.run.inputs if read.topic in stale]
     if one.state != _CURRENT or not names:
         return one

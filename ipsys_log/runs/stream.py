@@ -1,4 +1,4 @@
-"""Messages through stages: one after the other, or with one thread for each camera."""
+"""Streams of messages through stages: in one thread, or with one thread for each camera."""
 
 from __future__ import annotations
 
@@ -33,8 +33,8 @@ class Route(NamedTuple):
 class WiredStage:
     """A causal stage in a stream: the run that it writes, the routes that it reads, and its step.
 
-    A stage that remembers something across cameras is not ``per_camera``: it takes one message after the
-    other, whatever the map.
+    A stage that combines cameras is not ``per_camera``: it processes one message after the other, with any
+    ``map``.
     """
 
     stage: Stage
@@ -48,7 +48,7 @@ class WiredStage:
 
 
 def wire(stage: Stage, run: str, inputs: Mapping[Channel, str], step: Step) -> WiredStage:
-    """Wire a causal stage: it reads the recorded channels of its row, and derived ones of ``inputs``."""
+    """Wire a causal stage: it reads recorded channels of its row, and derived channels of ``inputs``."""
     reads = {
         Route(channel, inputs.get(channel, "") if channel.is_derived else None) for channel in stage.reads
     }
@@ -56,11 +56,11 @@ def wire(stage: Stage, run: str, inputs: Mapping[Channel, str], step: Step) -> W
 
 
 def run(source: Iterable[Message], stages: Sequence[WiredStage], map: Map = map) -> Iterator[Message]:
-    """Send every message of a source through the stages, and yield it and what they make of it.
+    """Send each message of a source through the stages; yield the message and the messages made from it.
 
-    A derived message has the log time of the message that it was made from, and follows it at once; the
-    next stage sees both. Its publish time is its own timestamp. With ``map`` as :func:`in_threads`,
-    cameras use the cores in parallel and the order stays the same.
+    A derived message has the log time of its source message and follows it at once; the next stage sees
+    both. Its publish time is its own timestamp. With ``map`` as :func:`in_threads`, cameras use the cores in
+    parallel and the order stays the same.
     """
     for stage in stages:
         source = _through(stage, source, map)
@@ -80,7 +80,7 @@ def _through(wired: WiredStage, source: Iterable[Message], map: Map) -> Iterator
     for message, payloads in (map if wired.stage.per_camera else builtins.map)(work, source):
         yield message
         for payload in payloads:
-            # Transforms have their times one by one; drawings on an image have that of the image.
+            # Each transform has its own time; drawings on an image have the time of the image.
             stamped = payload.transforms[0] if isinstance(payload, FrameTransforms) else payload
             time_ns = getattr(stamped, "timestamp", message.publish_time_ns)
             topic = wired.topic_of(payload, message.camera)
@@ -88,10 +88,10 @@ def _through(wired: WiredStage, source: Iterable[Message], map: Map) -> Iterator
 
 
 def in_threads(function: Callable[[Message], Any], messages: Iterable[Message]) -> Iterator[Any]:
-    """``map`` with one thread per camera: a camera's messages stay in order, and so do the results.
+    """Apply a function like ``map``, with one thread per camera; keep the order of messages and results.
 
-    A message of no camera (the rig) concerns all of them: it waits for those before it. OpenCV's own
-    threads are turned off meanwhile; one thread per camera uses the cores better.
+    A message of no camera (the rig) concerns all cameras: it waits for the messages before it. OpenCV's own
+    threads are turned off during this time; one thread per camera uses the cores better.
     """
     threads = cv2.getNumThreads()
     cv2.setNumThreads(1)
@@ -108,7 +108,7 @@ def in_threads(function: Callable[[Message], Any], messages: Iterable[Message]) 
             if message.camera not in workers:
                 workers[message.camera] = stack.enter_context(ThreadPoolExecutor(1))
             pending.append(workers[message.camera].submit(function, message))
-            # Enough ahead that no camera waits for another, and no more in memory than that.
+            # This queue is long enough that no camera waits for another, and it limits the memory.
             while len(pending) > 4 * len(workers):
                 yield pending.popleft().result()
         while pending:

@@ -1,4 +1,4 @@
-"""The proof that a log replays: every run made again from what it read, and compared byte for byte."""
+"""Verification that a log replays: every run is repeated from its input and compared byte for byte."""
 
 from __future__ import annotations
 
@@ -42,9 +42,10 @@ def verify(
 ) -> list[Comparison]:
     """Repeat every run from its recorded input, and compare.
 
-    A model that was copied from another log cannot be repeated, nor its evaluation; results made with it can.
-    A model cannot be repeated if measurements were added or withdrawn since. Results of another version are
-    not repeated either, with a remark. Later stages are repeated from the recorded channels.
+    A model that was copied from another log cannot be repeated, and neither can its evaluation; results made
+    with it can. A model cannot be repeated if measurements were added or withdrawn since. Results of another
+    version are not repeated either; a remark reports this. Later stages are repeated from the recorded
+    channels.
 
     Parameters
     ----------
@@ -62,33 +63,34 @@ def verify(
     """
     with Session(paths) as session, threadpool_limits(1, user_api="blas"):
         names = session.run_names() if run is None else session.run_names() & {run}
-        recorded = [one for one in recorded_stages(session) if one.run.run in names]
-        records = [one.run for one in recorded if not _is_of_copied_model(one.run)]
+        recorded = [stage for stage in recorded_stages(session) if stage.run.run in names]
+        records = [stage.run for stage in recorded if not _is_of_copied_model(stage.run)]
         if not records:
             raise IpsysError(
                 f"{session}: has no {'run' if run is None else f'run {run}'} to verify; "
                 "make one with 'ipsys replay', or see 'ipsys runs'"
             )
-        checked = {output.topic for one in records for output in one.outputs}
+        checked = {output.topic for record in records for output in record.outputs}
         repeated = [
-            one.run
-            for one in recorded
-            if one.run in records
-            and not _is_of_other_version(one, say)
-            and _is_up_to_date(session, one.run, checked, say)
+            stage.run
+            for stage in recorded
+            if stage.run in records
+            and not _is_of_other_version(stage, say)
+            and _is_up_to_date(session, stage.run, checked, say)
         ]
         if not repeated:
             raise IpsysError(f"{session}: nothing of its runs can be verified; see 'ipsys runs'")
-        found = []
+        comparisons = []
         for name in sorted(names):
-            stages = [one for one in repeated if one.run == name]
-            topics = {output.topic for one in stages for output in one.outputs}
-            # Stages can share a channel, that of events.
+            stages = [record for record in repeated if record.run == name]
+            topics = {output.topic for record in stages for output in record.outputs}
+            # Several stages can write to the channel of events.
             made = heapq.merge(
-                *(_made_again(session, one, progress) for one in stages), key=lambda row: row[0].log_time_ns
+                *(_made_again(session, record, progress) for record in stages),
+                key=lambda row: row[0].log_time_ns,
             )
-            found += compare_channels(session.stored(sorted(topics)), made)
-        return sorted([*found, *_unrecorded(session, names)], key=lambda one: one.topic)
+            comparisons += compare_channels(session.stored(sorted(topics)), made)
+        return sorted([*comparisons, *_unrecorded(session, names)], key=lambda one: one.topic)
 
 
 def _is_of_copied_model(run: Run) -> bool:
@@ -109,8 +111,8 @@ def _is_of_other_version(one: Recorded, say: Callable[[str], None]) -> bool:
 
 
 def _unrecorded(session: Session, names: Collection[str]) -> list[Comparison]:
-    """Channels of runs that no record says anything of."""
-    known = {output.topic for one in session.runs() for output in one.outputs}
+    """Return a comparison for each channel of the runs that no record names."""
+    known = {output.topic for record in session.runs() for output in record.outputs}
     return [
         Comparison(topic, session.count(topic), 0, 0, 0, "no record says how it was made", 0)
         for topic in sorted({topic for reader in session.readers for topic in reader.channels} - known)
@@ -130,18 +132,20 @@ def diff(left: Path, right: Path, runs: tuple[str | None, str | None]) -> list[C
     IpsysError
         A run does not exist, or the logs have no run in common.
     """
-    with Session([left]) as one, Session([right]) as other:
-        first, second = _compared_runs(one, other, runs)
-        ours, theirs = _derived(one, first, None), _derived(other, second, runs[0])
+    with Session([left]) as left_session, Session([right]) as right_session:
+        first, second = _compared_runs(left_session, right_session, runs)
+        ours, theirs = _derived(left_session, first, None), _derived(right_session, second, runs[0])
         return compare_channels(ours, theirs)
 
 
 def explain_diff(left: Path, right: Path, runs: tuple[str | None, str | None]) -> str | None:
-    """Return the reason why two logs or two runs have nothing in common that can be compared; None where
-    they have something. The parameters are those of `diff`."""
-    with Session([left]) as one, Session([right]) as other:
-        first, second = _compared_runs(one, other, runs)
-        return explain_apart(_extent(one, first), _extent(other, second))
+    """Return the reason why two logs or two runs have nothing in common to compare; None if they have.
+
+    The parameters are those of `diff`.
+    """
+    with Session([left]) as left_session, Session([right]) as right_session:
+        first, second = _compared_runs(left_session, right_session, runs)
+        return explain_apart(_extent(left_session, first), _extent(right_session, second))
 
 
 def _compared_runs(
@@ -174,9 +178,9 @@ def _run_names(session: Session, wanted: str | None) -> set[str]:
 
 
 def _derived(session: Session, runs: set[str], called: str | None) -> Iterator[Stored]:
-    """What runs have written, but for their records; as that of a run ``called`` otherwise.
+    """Yield the messages of runs without their records; rename the run to ``called``, if given.
 
-    Models come first, and without a time: one that was copied in has the time at which it was.
+    Models come first and have time 0: a copied model has the time of its copy.
     """
     topics = {
         topic
@@ -193,22 +197,22 @@ def _derived(session: Session, runs: set[str], called: str | None) -> Iterator[S
 
 
 def _called(message: Message, run: str | None) -> Message:
-    """A message as one of another run, whose name stands in its topic and in the frames of robots."""
+    """Return a message as a message of another run: the run's name is in its topic and in robot frame ids."""
     if run is None:
         return message
     name, payload = run_of_topic(message.topic), message.payload
     if isinstance(payload, FrameTransforms):
         payload = FrameTransforms(
             tuple(
-                replace(one, child_frame_id=one.child_frame_id.replace(f"{name}/", f"{run}/", 1))
-                for one in payload.transforms
+                replace(transform, child_frame_id=transform.child_frame_id.replace(f"{name}/", f"{run}/", 1))
+                for transform in payload.transforms
             )
         )
     return replace(message, topic=message.topic.replace(f"/runs/{name}/", f"/runs/{run}/"), payload=payload)
 
 
 def _is_up_to_date(session: Session, run: Run, checked: Collection[str], say: Callable[[str], None]) -> bool:
-    """Whether a stage can be made again; where what it read is ``checked`` itself, the faults show there."""
+    """Return whether a stage can be repeated; skip inputs that are ``checked`` themselves."""
     for read in run.inputs:
         count = session.count(read.topic)
         if read.topic in checked or (count == read.messages and session.hash(read.topic) == read.hash):
@@ -241,8 +245,8 @@ def _made_again(session: Session, run: Run, progress: Progress) -> Iterator[Stor
 def _lenses(run: Run) -> dict[str, CameraCalibration]:
     """Return the intrinsics that replaced those of the log in a run."""
     return {
-        one.camera: CameraCalibration(
-            0, one.camera, one.width, one.height, one.distortion_model, one.d, one.k
+        lens.camera: CameraCalibration(
+            0, lens.camera, lens.width, lens.height, lens.distortion_model, lens.d, lens.k
         )
-        for one in run.lenses
+        for lens in run.lenses
     }

@@ -1,4 +1,4 @@
-"""The view of a stage on a log: its channels, with what the user gives in place of the log's own."""
+"""The view of a stage on a log: its channels; the settings of the user replace those of the log."""
 
 from __future__ import annotations
 
@@ -21,7 +21,7 @@ class LogView:
     Attributes
     ----------
     inputs : by derived channel, the run that the stage reads.
-    rig, given_lenses : in place of those of the log.
+    rig, given_lenses : they replace the rig and the camera intrinsics of the log.
     """
 
     session: Session
@@ -31,12 +31,12 @@ class LogView:
 
     @property
     def cameras(self) -> set[str]:
-        """The names of the cameras with images."""
+        """Return the names of the cameras with images."""
         return set(self.session.images)
 
     @property
     def lenses(self) -> set[str]:
-        """The names of the cameras with intrinsics, of the log or given in their place."""
+        """Return the names of the cameras with intrinsics, from the log or from the user."""
         return {*self.session.calibrations, *self.given_lenses}
 
     def run(self, channel: Channel) -> str:
@@ -44,12 +44,12 @@ class LogView:
         return self.inputs.get(channel, "")
 
     def topics(self, channel: Channel) -> list[str]:
-        """Return the topics of a channel in the log; those that are replaced are left out."""
+        """Return the topics of a channel in the log, without replaced topics."""
         if channel is RIG:
             return [] if self.rig is not None else self.session.topics(RIG)
         if channel is CALIBRATIONS:
-            held = self.session.calibrations.items()
-            return [topic for camera, topic in held if camera not in self.given_lenses]
+            calibrations = self.session.calibrations.items()
+            return [topic for camera, topic in calibrations if camera not in self.given_lenses]
         if channel is IMAGES:
             return list(self.session.images.values())
         return self.session.topics(channel, self.run(channel) if channel.is_derived else None)

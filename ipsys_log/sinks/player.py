@@ -74,7 +74,7 @@ class _Reader(threading.Thread):
         self.start()
 
     def put(self, message: Message | None) -> None:
-        """Hand over a message, or None at the end; wait for room."""
+        """Hand over a message, or None at the end; block while the queue is full."""
         self._waiting.put(message)
 
     def forget(self) -> None:

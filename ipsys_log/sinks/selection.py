@@ -1,4 +1,4 @@
-"""What of a session is looked at: which runs, which channels, and the rig that holds for them."""
+"""Selection of the content to show: runs, channels, and the rig that these runs used."""
 
 from __future__ import annotations
 
@@ -27,9 +27,9 @@ _FADE_STEPS = 3
 
 @dataclass(frozen=True, slots=True)
 class Shown:
-    """The run with the markers, and those with positions and tracks; then the topics of each kind.
+    """The content to show: the run of the markers, the runs of positions and tracks, and the topics by kind.
 
-    ``cameras`` are those with frames or markers, ``others`` those that have positions only.
+    ``cameras`` are the cameras with frames or markers, ``others`` the cameras with positions only.
     """
 
     markers: str | None
@@ -42,20 +42,20 @@ class Shown:
 
 
 def choose_runs(session: Session, names: Sequence[str] = ()) -> Shown:
-    """What to show: the runs named with the markers they rest on, or the newest ones.
+    """Choose the runs to show: the named runs with the markers that they use, or the newest runs.
 
     Raises
     ------
     IpsysError
-        For a name that no complete run has.
+        No complete run has one of the names.
     """
     records = session.runs()
-    there = list(dict.fromkeys(record.run for record in records))
+    known = list(dict.fromkeys(record.run for record in records))
     for name in names:
-        if name not in there:
-            raise IpsysError(f"{session}: there is no run {name!r} (there are: {', '.join(there) or 'none'})")
-    located = [run for run in there if session.topics(TRACKS, run) or session.topics(POSITIONS, run)]
-    marked = [run for run in there if session.topics(MARKERS, run)]
+        if name not in known:
+            raise IpsysError(f"{session}: there is no run {name!r} (there are: {', '.join(known) or 'none'})")
+    located = [run for run in known if session.topics(TRACKS, run) or session.topics(POSITIONS, run)]
+    marked = [run for run in known if session.topics(MARKERS, run)]
     if names:
         sources = _sources(records, names)
         markers = _newest(records, [run for run in marked if run in sources])
@@ -71,15 +71,15 @@ def _newest(records: Sequence[Run], among: Sequence[str]) -> str | None:
 
 
 def _sources(records: Sequence[Run], names: Sequence[str]) -> set[str]:
-    """Some runs, and all that they were made from."""
-    found: set[str] = set()
+    """Return some runs, and all runs from which they were made."""
+    sources: set[str] = set()
     waiting = list(names)
     while waiting:
         name = waiting.pop()
-        if name not in found:
-            found.add(name)
+        if name not in sources:
+            sources.add(name)
             waiting += [source for record in records if record.run == name for source in record.input_runs]
-    return found
+    return sources
 
 
 def _topics(session: Session, markers: str | None, runs: Sequence[str]) -> Shown:
@@ -105,18 +105,18 @@ def _topics(session: Session, markers: str | None, runs: Sequence[str]) -> Shown
 
 
 def fade_ns(session: Session, topics: Sequence[str], factor: int = 1) -> dict[str, int]:
-    """After which silence a topic's last message says nothing of now, from how often it comes."""
-    found = {}
+    """Return by topic the silence in ns after which its last message is obsolete, from its usual period."""
+    fades_ns = {}
     for topic in topics:
         times = [reader.times(topic) for reader in session.readers if topic in reader.channels]
         steps_ns = np.diff(np.unique(np.concatenate(times)).astype(np.int64))
         usual_ns = int(np.median(steps_ns)) if len(steps_ns) else 0
-        found[topic] = factor * max(NS_PER_S, _FADE_STEPS * usual_ns)
-    return found
+        fades_ns[topic] = factor * max(NS_PER_S, _FADE_STEPS * usual_ns)
+    return fades_ns
 
 
 def rig_in_force(session: Session, runs: Sequence[str]) -> Rig | None:
-    """The rig that the runs to be shown were made with, where it replaced the log's; else the log's last."""
+    """Return the rig that replaced the log's rig in the shown runs; else the last rig of the log."""
     for record in reversed(session.runs()):
         if record.run in runs and record.rig is not None:
             return record.rig

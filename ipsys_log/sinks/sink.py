@@ -1,4 +1,4 @@
-"""Sinks: consumers of messages. Beside a recording they never block it; offline the log waits for them."""
+"""Sinks: consumers of messages. They never block a recording; offline, the log waits for them."""
 
 from __future__ import annotations
 
@@ -14,33 +14,33 @@ from ipsys_log.messages import CompressedImage, CompressedVideo, Message, RawIma
 
 __all__ = ["Consumer", "Consumers", "LiveQueue", "LiveSinks", "Sink", "text_of"]
 
-# Messages that may wait for a sink. Above the first limit images are dropped, above the second all messages.
+# Limits of a sink's queue: above the first limit images are dropped, above the second all messages.
 _MOST_WITH_IMAGES, _MOST_WAITING = 100, 200
 _JOIN_TIMEOUT_S = 2.0
 _IMAGES = (CompressedImage, CompressedVideo, RawImage, SkippedVideo)
 
-# Gets messages after they were written, and None if nothing comes. For parts of the recorder itself, which
-# return at once, such as its status; everything else is a sink.
+# Gets messages after they were written, and None if nothing comes. This type is for parts of the recorder
+# that return at once, such as its status; everything else is a sink.
 Consumer = Callable[[Message | None], None]
 
 
 class Sink(Protocol):
     """A consumer of messages, such as a display or a stream to robots.
 
-    Beside a recording, ``consume`` runs in its own thread, behind a :class:`LiveQueue`: a slow sink loses
+    During a recording, ``consume`` runs in its own thread, behind a :class:`LiveQueue`: a slow sink loses
     messages and does not delay the recording. Offline, the player waits for it, and it loses none.
     """
 
     name: str
 
     def consume(self, messages: Iterator[Message | None]) -> None:
-        """Take all messages; None if nothing waits at present, to flush what is held back."""
+        """Process all messages; None means that no message waits: then flush the buffers."""
 
 
 class LiveQueue:
-    """Messages that wait for a sink beside a recording. ``put`` never blocks.
+    """The queue of messages for a sink during a recording. ``put`` never blocks.
 
-    If the sink is too slow, images are dropped first, of a video all frames up to the next keyframe. Tracks
+    If the sink is too slow, images are dropped first; of a video, all frames up to the next keyframe. Tracks
     and all other messages are dropped last.
 
     Attributes
@@ -60,7 +60,7 @@ class LiveQueue:
         return len(self._waiting)
 
     def put(self, message: Message) -> None:
-        """Let a message wait, or drop it."""
+        """Enqueue a message, or drop it."""
         if isinstance(message.payload, SkippedVideo):
             message = replace(message, payload=message.payload.frame)
         with self._changed:
@@ -73,7 +73,7 @@ class LiveQueue:
             self._changed.notify()
 
     def close(self) -> None:
-        """End the messages: the sink gets those that wait, and no more."""
+        """End the queue: the sink gets the messages that wait, and no more."""
         with self._changed:
             self._closed = True
             self._changed.notify()
@@ -103,9 +103,9 @@ class LiveQueue:
 
 
 class LiveSinks:
-    """Sinks beside a recording, as one consumer. A context manager.
+    """The sinks of a recording, as one consumer. A context manager.
 
-    A sink that raises gets no more messages: an event says so, and the recording goes on.
+    A sink that raises an error gets no more messages: an event reports the error, and the recording goes on.
 
     Parameters
     ----------
@@ -157,9 +157,9 @@ class LiveSinks:
 
 
 class Consumers:
-    """Pass messages to the consumers of a recording, and to its sinks. A context manager.
+    """The consumers of a recording, and its sinks; it passes messages to them. A context manager.
 
-    A consumer that raises gets no more messages.
+    A consumer that raises an error gets no more messages.
 
     Parameters
     ----------
@@ -205,5 +205,5 @@ def text_of(fault: Exception) -> str:
     """Return the text of an error on one line; its type if it has no text."""
     try:
         return " ".join(str(fault).split()) or type(fault).__name__
-    except Exception:  # an error that cannot say itself
+    except Exception:  # an error without a text
         return type(fault).__name__

@@ -1,1 +1,1 @@
-"""Stages of the pipeline: each reads channels and writes channels. They know no files and no clocks."""
+"""Stages of the pipeline: each stage reads and writes channels. A stage uses no files and no clocks."""

@@ -1,4 +1,4 @@
-"""Markers in pixels to points in the frame of the camera: by eq. (3) to (5), or by the pose of the square."""
+"""Conversion of markers in pixels to points in camera coordinates: eq. (3) to (5), or the square's pose."""
 
 from __future__ import annotations
 
@@ -40,17 +40,17 @@ PERIMETER = "perimeter"
 
 Array = NDArray[np.float64]
 
-# Of corners without a covariance: OpenCV's are off by about a quarter of a pixel.
+# For corners without a covariance: OpenCV's corners have an error of about a quarter of a pixel.
 _USUAL_PX2 = 0.25**2 * np.eye(8)
 
 
 class CameraFrame:
-    """The stage *camera-frame*: through the lens of each camera, with the marker's length.
+    """The stage *camera-frame*: it uses the camera intrinsics and the length of the marker.
 
     Parameters
     ----------
     method : ``perimeter``, eq. (3) to (5), exact for a marker that is parallel to the image plane; or
-        ``pose``, exact for a marker that is tilted in any way.
+        ``pose``, exact for a marker with any tilt.
     """
 
     def __init__(self, method: str = PERIMETER) -> None:
@@ -74,12 +74,12 @@ class CameraFrame:
         if frame.markers:
             rig, lens = self._settings(camera)
             seen: list[_Seen] = []
-            for one in _through_lens(frame.markers, rig, lens):
-                fault = self._fault(one, camera)
+            for sighting in _through_lens(frame.markers, rig, lens):
+                fault = self._fault(sighting, camera)
                 if fault is None:
-                    seen.append(one)
+                    seen.append(sighting)
                 else:
-                    yield Event(message.publish_time_ns, *fault, camera, one.marker.id)
+                    yield Event(message.publish_time_ns, *fault, camera, sighting.marker.id)
             points = self._method.place(seen, lens) if seen else []
         yield CameraPoints(message.publish_time_ns, tuple(points))
 
@@ -94,7 +94,7 @@ class CameraFrame:
         return self._rig, self._lenses[camera]
 
     def _fault(self, seen: _Seen, camera: str | None) -> tuple[str, str] | None:
-        """Why a marker has no place, as kind and text of an event."""
+        """Return the reason why a marker gets no camera point, as kind and text of an event."""
         name = f"marker {seen.marker.id}"
         if seen.marker.covariance_px2 is not None:
             check_covariance(seen.marker.covariance_px2, f"{name} of camera {camera}")
@@ -114,18 +114,18 @@ class _Seen(NamedTuple):
 
 
 def _through_lens(markers: Sequence[Marker], rig: Rig, lens: CameraCalibration) -> list[_Seen]:
-    # Once for all: most of a call's time goes into the call itself.
+    # One call for all markers: most of the time of a call does not depend on their number.
     uv = undistort(np.concatenate([marker.corners_px for marker in markers]), lens).reshape(-1, 4, 2)
     lengths_m = [rig.length_of(marker.id) for marker in markers]
-    return [_Seen(*one) for one in zip(markers, uv, lengths_m, strict=True)]
+    return [_Seen(*row) for row in zip(markers, uv, lengths_m, strict=True)]
 
 
 def _lens_slopes(seen: Sequence[_Seen], lens: CameraCalibration) -> Array:
-    return pixel_slopes(np.concatenate([one.uv for one in seen]), lens).reshape(-1, 4, 2, 2)
+    return pixel_slopes(np.concatenate([sighting.uv for sighting in seen]), lens).reshape(-1, 4, 2, 2)
 
 
 def _by_perimeter(seen: Sequence[_Seen], lens: CameraCalibration) -> list[CameraPoint]:
-    uv, lengths_m = np.stack([one.uv for one in seen]), np.array([one.length_m for one in seen])
+    uv, lengths_m = np.stack([s.uv for s in seen]), np.array([s.length_m for s in seen])
     places = zip(camera_point(uv, lengths_m).tolist(), heading(uv).tolist(), strict=True)
     covariances_m2 = _perimeter_covariances(seen, uv, lengths_m, lens)
     points = []
@@ -138,9 +138,9 @@ def _by_perimeter(seen: Sequence[_Seen], lens: CameraCalibration) -> list[Camera
 def _perimeter_covariances(
     seen: Sequence[_Seen], uv: Array, lengths_m: Array, lens: CameraCalibration
 ) -> dict[int, Array]:
-    """Covariances (3, 3) in m^2, by index, of those points whose corners have one."""
-    given = {n: one.marker.covariance_px2 for n, one in enumerate(seen)}
-    known = {n: covariance_px2 for n, covariance_px2 in given.items() if covariance_px2 is not None}
+    """Return covariances (3, 3) in m^2, by index, of the points whose corners have a covariance."""
+    covariances = {n: sighting.marker.covariance_px2 for n, sighting in enumerate(seen)}
+    known = {n: covariance_px2 for n, covariance_px2 in covariances.items() if covariance_px2 is not None}
     if not known:
         return {}
     indices = list(known)
@@ -152,31 +152,31 @@ def _perimeter_covariances(
 
 
 def _by_pose(seen: Sequence[_Seen], lens: CameraCalibration) -> list[CameraPoint]:
-    lengths_m = np.array([one.length_m for one in seen])
+    lengths_m = np.array([sighting.length_m for sighting in seen])
     whitening = _whitening(seen, _lens_slopes(seen, lens))
-    found = fit_squares(np.stack([one.uv for one in seen]), whitening, lengths_m)
-    misses_px = reprojection_px(found, lengths_m, np.stack([one.marker.corners_px for one in seen]), lens)
+    squares = fit_squares(np.stack([sighting.uv for sighting in seen]), whitening, lengths_m)
+    misses_px = reprojection_px(squares, lengths_m, np.stack([s.marker.corners_px for s in seen]), lens)
     points = []
     for n, (marker, _, _) in enumerate(seen):
-        both = zip(found.centres_m[n].tolist(), found.rotations[n], misses_px[n].tolist(), strict=True)
+        both = zip(squares.centres_m[n].tolist(), squares.rotations[n], misses_px[n].tolist(), strict=True)
         poses = tuple(MarkerPose(x, y, z, _vector(turn), miss_px) for (x, y, z), turn, miss_px in both)
-        x_m, y_m, z_m = found.centres_m[n, 0].tolist()
+        x_m, y_m, z_m = squares.centres_m[n, 0].tolist()
         # The side from corner 3 to corner 0 is the marker's y axis.
-        right, down, _ = found.rotations[n, 0, :, 1]
+        right, down, _ = squares.rotations[n, 0, :, 1]
         heading_rad = float(np.arctan2(-down, right))
-        covariance_m2 = None if marker.covariance_px2 is None else found.covariances_m2[n]
+        covariance_m2 = None if marker.covariance_px2 is None else squares.covariances_m2[n]
         offset_ns = marker.time_offset_ns
         points.append(CameraPoint(marker.id, x_m, y_m, z_m, heading_rad, offset_ns, covariance_m2, poses))
     return points
 
 
 def _whitening(seen: Sequence[_Seen], lens_slopes: Array) -> Array:
-    """What turns changes of u0 v0 .. u3 v3 into eight numbers of variance 1, (n, 8, 8)."""
-    given = [one.marker.covariance_px2 for one in seen]
-    whitening = whiten(np.stack([_USUAL_PX2 if one is None else one for one in given]))
+    """Return matrices that turn changes of u0 v0 .. u3 v3 into eight numbers of variance 1, (n, 8, 8)."""
+    covariances_px2 = [sighting.marker.covariance_px2 for sighting in seen]
+    whitening = whiten(np.stack([_USUAL_PX2 if c is None else c for c in covariances_px2]))
     by_corner = whitening.reshape(-1, 8, 4, 2).swapaxes(1, 2)
-    found: Array = (by_corner @ lens_slopes).swapaxes(1, 2).reshape(-1, 8, 8)
-    return found
+    by_marker: Array = (by_corner @ lens_slopes).swapaxes(1, 2).reshape(-1, 8, 8)
+    return by_marker
 
 
 def _vector(rotation: Array) -> Array:
@@ -184,7 +184,7 @@ def _vector(rotation: Array) -> Array:
 
 
 class _Method(NamedTuple):
-    """How markers get their places: whether four corners can have one, and the points of a frame."""
+    """A method for camera points: its check of four corners, and its function for the points of a frame."""
 
     accepts: Callable[[Array], bool]
     place: Callable[[Sequence[_Seen], CameraCalibration], list[CameraPoint]]
@@ -202,7 +202,7 @@ def check_method(name: str) -> str:
     Raises
     ------
     IpsysError
-        Where there is none of that name.
+        There is no method of that name.
     """
     if name not in METHODS:
         raise IpsysError(f"method {name!r} is not known; use one of {', '.join(METHODS)}")
@@ -223,7 +223,7 @@ def _plan(view: View, options: Mapping[str, str]) -> Plan | str:
         return view.newest(CAMERA_POINTS)
     return Plan(
         run=points_run(markers, method),
-        # Logs from before there was a choice have no such parameter.
+        # Logs from before this option do not have the parameter.
         parameters={} if method == PERIMETER else {"method": method},
         reads=(RIG, MARKERS, CALIBRATIONS),
         step=lambda run: CameraFrame(method),

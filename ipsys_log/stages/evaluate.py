@@ -1,4 +1,4 @@
-"""What a lab wants to know of a model: how good it is, from how many places, and which of them are wrong."""
+"""Evaluation of a model: its errors, the effect of the number of points, and suspect measurements."""
 
 from __future__ import annotations
 
@@ -37,22 +37,22 @@ from ipsys_log.models.table import Places, min_pairs
 
 __all__ = ["SCREENING", "STAGE", "Study", "can_evaluate", "evaluate_model"]
 
-# The models that measurements are checked with: of those that fit in milliseconds the ones that follow
-# the places closely enough to see an error of some centimetres.
+# Models that check the measurements. They fit in milliseconds, and they follow the calibration points
+# closely enough to show an error of some centimetres.
 SCREENING = ("poly", "rayplane", "best")
 
 
 @dataclass(frozen=True, slots=True, eq=False)
 class Study:
-    """What there is to evaluate on.
+    """The data for an evaluation.
 
     Attributes
     ----------
     places : the measurements that count.
-    pairs : all of them that were seen, by camera.
-    held_out : ids of those that were held out.
-    subsets : ids by the label of a published subset to be fitted on.
-    truth : true world points (3,) in m by id; empty outside a simulated lab.
+    pairs : pairs of all measurements that a camera saw, by camera.
+    held_out : ids of the held-out measurements.
+    subsets : ids by the label of a published subset for fitting.
+    truth : ground-truth world points (3,) in m by id; empty outside a simulated lab.
     seed : of folds and random subsets; None for a model of another log, which is not fitted again.
     """
 
@@ -67,25 +67,25 @@ class Study:
 def evaluate_model(
     model: Model, study: Study, time_ns: int, notes: list[str], progress: Callable[[int, int], None]
 ) -> Evaluation:
-    """Errors on places held out and by cross-validation, learning curve and suspect measurements.
+    """Compute errors on held-out points and by cross-validation, learning curve and suspect measurements.
 
     Parameters
     ----------
-    model : fitted.
+    model : fitted model.
     time_ns : of the last input.
-    notes : what could not be done is added to it.
-    progress : called with the steps done, and all there are.
+    notes : list of remarks; each impossible step adds a remark.
+    progress : called with the number of steps done, and the number of all steps.
     """
     held_out = {
-        camera: [pair for pair in found if pair.measurement in study.held_out]
-        for camera, found in study.pairs.items()
+        camera: [pair for pair in camera_pairs if pair.measurement in study.held_out]
+        for camera, camera_pairs in study.pairs.items()
     }
     rows = errors_held_out(model, held_out, study.truth)
     learning: list[LearningPoint] = []
     suspects: tuple[Suspect, ...] = ()
     if study.seed is not None:
         fitted = {camera.camera for camera in model.cameras}
-        pairs = {camera: found for camera, found in study.pairs.items() if camera in fitted}
+        pairs = {camera: camera_pairs for camera, camera_pairs in study.pairs.items() if camera in fitted}
         cameras = gather_places(pairs)
         sizes = learning_sizes(model.name, cameras)
         total = 2 + len(sizes)
@@ -106,10 +106,12 @@ def evaluate_model(
 
 
 def _enough(name: str, pairs: Mapping[str, Sequence[Pair]], notes: list[str]) -> bool:
-    """Whether each fold leaves enough places to fit to."""
-    for camera, found in pairs.items():
-        if len(found) - -(-len(found) // FOLDS) < min_pairs(name):
-            notes.append(f"no cross-validation of {name}: camera {camera} has only {len(found)} places")
+    """Return whether each fold leaves enough calibration points for a fit."""
+    for camera, camera_pairs in pairs.items():
+        if len(camera_pairs) - -(-len(camera_pairs) // FOLDS) < min_pairs(name):
+            notes.append(
+                f"no cross-validation of {name}: camera {camera} has only {len(camera_pairs)} places"
+            )
             return False
     return True
 
@@ -117,7 +119,7 @@ def _enough(name: str, pairs: Mapping[str, Sequence[Pair]], notes: list[str]) ->
 def _suspects(name: str, cameras: Mapping[str, Places], places: Sequence[Measured]) -> tuple[Suspect, ...]:
     if name not in SCREENING or any(len(p.names) <= min_pairs(name) + 1 for p in cameras.values()):
         return ()
-    seen = {place for found in cameras.values() for place in found.names}
+    seen = {place for camera_places in cameras.values() for place in camera_places.names}
     try:
         return find_suspects(leave_one_out(name, cameras), [p for p in places if p.measurement.id in seen])
     except FitError:
@@ -133,7 +135,7 @@ def can_evaluate(view: View, options: Mapping[str, str], model: str) -> bool:
 
 
 def _is_fitted_here(view: View, options: Mapping[str, str], model: str) -> bool:
-    """Return whether a model is fitted to points of this log, so that it can be fitted to fewer of them."""
+    """Return whether a model is fitted to points of this log: then it can be fitted to fewer points too."""
     if "model_from" in options:
         return False
     return has_measurements(view) or all(copy.name != model for _, copy in view.copied(MODEL))

@@ -1,4 +1,4 @@
-"""Fit a model to each camera's measured places."""
+"""The stage *fit*: a model for the calibration points of each camera."""
 
 from __future__ import annotations
 
@@ -27,13 +27,13 @@ __all__ = ["STAGE", "fit_model", "model_run"]
 
 Array = NDArray[np.float64]
 
-# No hand-held tape is better than this; it keeps the covariance of a flat data set invertible.
+# No hand-held tape is more accurate; this floor keeps the covariance of a flat data set invertible.
 _FLOOR_SIGMA_M = 0.001
 
-# Nearer together than this two places are one; nearer to a line than this (RMS) they lie on it.
+# Two calibration points closer than this are the same point; points closer to a line (RMS) lie on it.
 _SAME_PLACE_M = 0.01
 _BESIDE_LINE_M = 0.03
-# Groups of places that the uncertainty is found with, by leaving out one after the other.
+# Groups of calibration points; the uncertainty is estimated by leaving out one group after the other.
 _GROUPS = 10
 
 
@@ -47,20 +47,20 @@ def fit_model(
 
     Parameters
     ----------
-    name : of the table of models, such as ``poly``.
-    pairs : measured places by camera; a camera without any is left out.
+    name : in the table of models, such as ``poly``.
+    pairs : calibration points by camera; a camera without points is left out.
     time_ns : of the last input.
-    progress : called with the fits done, and all there are.
+    progress : called with the number of fits done, and the number of all fits.
 
     Returns
     -------
-    Model : with each camera's parameters, pairs, the covariance of its left-out errors, and what the
-        covariance of a position is made of; these two only where there are more pairs than needed.
+    Model : with each camera's parameters, pairs, the covariance of its left-out errors, and the terms of the
+        covariance of a position; the last two only if there are more pairs than the model needs.
 
     Raises
     ------
     FitError
-        Where a camera has fewer pairs than the model needs, or none has any.
+        A camera has fewer pairs than the model needs, or no camera has a pair.
     """
     cameras = gather_places(pairs)
     if not cameras:
@@ -99,7 +99,7 @@ def _check_count(name: str, camera: str, places: Places) -> None:
 
 
 def _check_spread(name: str, camera: str, targets: Array) -> None:
-    """Places that differ by no more than the tape's error say nothing new."""
+    """Check that the points differ by more than the tape's error; otherwise they add no information."""
     different = len(np.unique(np.round(targets / _SAME_PLACE_M), axis=0))
     if different < min_pairs(name):
         raise FitError(
@@ -116,7 +116,10 @@ def _check_spread(name: str, camera: str, targets: Array) -> None:
 def _predict_without_groups(
     name: str, cameras: Mapping[str, Places], progress: Callable[[int, int], None]
 ) -> tuple[list[frozenset[str]], dict[str, Array]] | None:
-    """The groups, and what models without each predict, (g, n, 3) by camera; None for too few places."""
+    """Return the groups, and predictions of models fitted without each group, (g, n, 3) by camera.
+
+    The result is None for too few calibration points.
+    """
     fewest = min(len(places.names) for places in cameras.values())
     if fewest <= min_pairs(name):
         return None
@@ -129,13 +132,13 @@ def _predict_without_groups(
         except FitError:
             return None
         progress(done, len(groups))
-    return groups, {camera: np.array([found[camera] for found in predicted]) for camera in cameras}
+    return groups, {camera: np.array([by_camera[camera] for by_camera in predicted]) for camera in cameras}
 
 
 def _left_out(
     places: Places, groups: Sequence[frozenset[str]], without: Array
 ) -> tuple[Array, NDArray[np.int64]]:
-    """Errors (n, 3) of the models that had not seen a place, and the group (n,) of each."""
+    """Return errors (n, 3) of the models fitted without a point, and the group (n,) of each point."""
     index = np.array([next(g for g, group in enumerate(groups) if name in group) for name in places.names])
     return without[index, np.arange(len(index))] - places.world_m, index
 
@@ -151,10 +154,10 @@ def _noise(
         world_m: Array = estimator.predict(inputs(name, points_m, heights_m))  # type: ignore[attr-defined]
         return world_m
 
-    found: Uncertainty = estimate_uncertainty(
+    uncertainty: Uncertainty = estimate_uncertainty(
         predict, places.points_m, places.world_m, tape_m2, without, groups
     )
-    return Noise(found.along, found.across, found.growth, found.fit)
+    return Noise(uncertainty.along, uncertainty.across, uncertainty.growth, uncertainty.fit)
 
 
 def model_run(model: str) -> str:
@@ -197,10 +200,12 @@ def _plan(view: View, options: Mapping[str, str]) -> Plan | str:
 
 def _unused_points(pairs: Mapping[str, list[Pair]], train: set[str]) -> list[str]:
     """Return remarks on points that no camera saw, and on cameras that saw no point."""
-    seen = {pair.measurement for found in pairs.values() for pair in found}
+    seen = {pair.measurement for camera_pairs in pairs.values() for pair in camera_pairs}
     unseen = sorted(train - seen)
     lines = [
-        f"camera {name} saw no measured place: it has no model" for name, found in pairs.items() if not found
+        f"camera {name} saw no measured place: it has no model"
+        for name, camera_pairs in pairs.items()
+        if not camera_pairs
     ]
     if unseen:
         names = ", ".join(unseen[:5]) + (" ..." if len(unseen) > 5 else "")

@@ -29,17 +29,17 @@ __all__ = ["STAGE", "Fuse", "fuse_positions"]
 
 
 class Fuse:
-    """The stage *fuse*: positions of one instant, weighted by their inverse covariances.
+    """The stage *fuse*: it averages positions of one instant, weighted by their inverse covariances.
 
-    Every message of positions gives a pose of each robot in it, from this camera and from the others
-    that saw the robot within ``window_ns``: at 2 m/s a robot moves 1 cm in 5 ms, so cameras that do
-    not run in step are not averaged. Cameras that do give a pose each, the last of them from all.
+    Every message of positions gives a pose of each robot in it. The pose uses this camera and the other
+    cameras that saw the robot within ``window_ns``. At 2 m/s a robot moves 1 cm in 5 ms, so unsynchronized
+    cameras are not averaged. Synchronized cameras give one pose each; the last pose uses all cameras.
 
-    A pose is valid for the instant at which its marker was exposed: markers of a frame with time offsets
-    (rolling shutter) go out as messages of their own, earlier ones first. Two such cameras see a robot in
-    different rows, up to 30 ms apart; beyond the window they are not averaged either.
+    A pose is valid for the instant at which its marker was exposed. With time offsets (rolling shutter), each
+    marker of a frame gets its own message, earlier ones first. Two such cameras see a robot in different
+    rows, up to 30 ms apart; beyond the window they are not averaged either.
 
-    Late frames, named by an event of their camera, have wrong times: their positions are in no pose.
+    Late frames have wrong times; an event of their camera names them. Their positions are in no pose.
     """
 
     def __init__(self, run: str, window_ns: int = 5_000_000) -> None:
@@ -61,11 +61,13 @@ class Fuse:
             return
         if self._rig is None:
             raise IpsysError("the log has no rig (robots and their markers): give one with --rig lab.toml")
-        at: dict[int, list[Track]] = {}
+        tracks_by_time: dict[int, list[Track]] = {}
         for position in message.payload.positions:
             now_ns = message.publish_time_ns + (position.time_offset_ns or 0)
-            at.setdefault(now_ns, []).append(self._track(position, str(message.camera), now_ns, self._rig))
-        for now_ns, tracks in sorted(at.items()):
+            tracks_by_time.setdefault(now_ns, []).append(
+                self._track(position, str(message.camera), now_ns, self._rig)
+            )
+        for now_ns, tracks in sorted(tracks_by_time.items()):
             yield Tracks(now_ns, tuple(tracks))
             yield FrameTransforms(tuple(_transform(track, self._run, now_ns) for track in tracks))
 
@@ -82,8 +84,8 @@ class Fuse:
         seen = self._latest.setdefault(position.id, {})
         seen[camera] = (now_ns, position)
         together = {
-            name: at
-            for name, (time_ns, at) in sorted(seen.items())
+            name: recent
+            for name, (time_ns, recent) in sorted(seen.items())
             if abs(now_ns - time_ns) <= self._window_ns
         }
         fused = fuse_positions(list(together.values()))
@@ -96,7 +98,7 @@ class Fuse:
             fused.heading_rad,
             fused.covariance_m2,
             tuple(together),
-            _any_inside([at.inside for at in together.values()]),
+            _any_inside([recent.inside for recent in together.values()]),
         )
 
 
@@ -106,7 +108,7 @@ def _any_inside(flags: list[bool | None]) -> bool | None:
 
 
 def fuse_positions(positions: list[Position]) -> Position:
-    """The best single position of one marker at one instant.
+    """Return the best single position of one marker at one instant.
 
     Parameters
     ----------
@@ -114,8 +116,8 @@ def fuse_positions(positions: list[Position]) -> Position:
 
     Returns
     -------
-    Position : weighted by inverse covariances where every position has one, else the plain mean
-        (without a covariance). The heading is the circular mean of those there are.
+    Position : weighted by inverse covariances if every position has a covariance, else the plain mean
+        (without a covariance). The heading is the circular mean of the known headings.
 
     Examples
     --------
@@ -141,17 +143,17 @@ def fuse_positions(positions: list[Position]) -> Position:
 
 
 def _weights(positions: list[Position]) -> NDArray[np.float64] | None:
-    """Inverse covariances (n, 3, 3), where every position has one: a log may hold anything."""
-    found = [p.covariance_m2 for p in positions if p.covariance_m2 is not None]
-    covariances = np.array(found)
-    if len(found) < len(positions) or not np.isfinite(covariances).all():
+    """Return inverse covariances (n, 3, 3); None unless every position has a valid covariance."""
+    present = [p.covariance_m2 for p in positions if p.covariance_m2 is not None]
+    covariances = np.array(present)
+    if len(present) < len(positions) or not np.isfinite(covariances).all():
         return None
     least = np.linalg.eigvalsh(covariances)[:, 0]  # of the lower triangles
     return np.asarray(np.linalg.inv(covariances), dtype=np.float64) if (least > 0).all() else None
 
 
 def _transform(track: Track, run: str, time_ns: int) -> FrameTransform:
-    # A transform cannot leave its rotation out; /runs/<run>/tracks says where the heading is missing.
+    # A transform must have a rotation; /runs/<run>/tracks shows that the heading is missing.
     half_rad = (track.heading_rad or 0.0) / 2
     return FrameTransform(
         time_ns,
@@ -167,7 +169,7 @@ def _plan(view: View, _options: Mapping[str, str]) -> Plan:
     return Plan(
         run=view.run(POSITIONS),
         parameters={},
-        # A log without such events keeps its runs.
+        # A log without such events keeps its existing runs.
         reads=(RIG, POSITIONS, *([EVENTS] if has_late_frames else [])),
         step=Fuse,
     )

@@ -1,4 +1,4 @@
-"""Camera points to world positions, through the model of each camera."""
+"""The stage *locate*: camera points to world positions, with the model of each camera."""
 
 from __future__ import annotations
 
@@ -18,14 +18,14 @@ __all__ = ["STAGE", "Locate"]
 
 Array = NDArray[np.float64]
 
-# Far enough for the digits, near enough for the curvature of a model.
+# This step is long enough for the precision of the numbers, and short enough for a curved model.
 _STEP_M = 0.01
 
 
 class Locate:
-    """The stage *locate*. A camera that the model does not know has no positions.
+    """The stage *locate*. A camera that is not in the model has no positions.
 
-    Models that read the height of a marker have it from the rig.
+    Models that need the height of a marker get it from the rig.
     """
 
     def __init__(self, model: Model) -> None:
@@ -60,17 +60,17 @@ class Locate:
 def _positions(
     applied: AppliedModel, points: tuple[CameraPoint, ...], heights_m: Array
 ) -> tuple[Position, ...]:
-    """Where the markers are; one whose ray does not meet its height is nowhere."""
-    here = np.array([(p.x_m, p.y_m, p.z_m) for p in points])
-    # The marker's direction is carried over by mapping a second point a little along it.
+    """Return the positions of the markers; a marker whose ray does not meet its height has none."""
+    points_m = np.array([(p.x_m, p.y_m, p.z_m) for p in points])
+    # The model maps a second point, a little along the heading: the two points give the world heading.
     angles = np.array([-p.heading_rad if p.heading_rad is not None else 0.0 for p in points])
-    ahead = here + _STEP_M * np.stack([np.cos(angles), np.sin(angles), np.zeros(len(points))], axis=1)
-    both = applied.predict(np.vstack([here, ahead]), np.concatenate([heights_m, heights_m]))
+    ahead = points_m + _STEP_M * np.stack([np.cos(angles), np.sin(angles), np.zeros(len(points))], axis=1)
+    both = applied.predict(np.vstack([points_m, ahead]), np.concatenate([heights_m, heights_m]))
     world, along = both[: len(points)], both[len(points) :] - both[: len(points)]
     headings = np.arctan2(along[:, 1], along[:, 0]).tolist()
-    covariances = applied.covariances(here, heights_m)
+    covariances = applied.covariances(points_m, heights_m)
     sigmas_m = np.zeros(len(points)) if covariances is None else np.sqrt(covariances[:, 2, 2])
-    inside = applied.inside(here, world, sigmas_m)
+    inside = applied.inside(points_m, world, sigmas_m)
     return tuple(
         Position(
             point.id,

@@ -193,8 +193,9 @@ def look(views: Sequence[View], marker_id: int) -> Sight:
     --------
     >>> from ipsys_log.messages import CameraPoint
     >>> seen = tuple(CameraPoints(n, (CameraPoint(7, 0.1, 0.2, 2.0),)) for n in (100, 200, 300))
-    >>> look([View("red", 300, points=seen), View("white", 300)], 7).text
-    'marker 7 lies still, seen by red'
+    >>> sight = look([View("red", 300, points=seen), View("white", 300)], 7)
+    >>> sight.text == "marker 7 lies still, seen by red"
+    True
     """
     seen: dict[str, tuple[int, int, Array]] = {}
     moving = []

@@ -28,7 +28,7 @@ class LiveView:
     ----------
     rig, cameras, run : content of the display; ``run`` is the run of the tracks, None without tracks.
     say : called with the reason if the viewer could not be shown.
-    show : opens the viewer and feeds it; a test gives another one than the real viewer.
+    show : opens the viewer and feeds it; a test replaces the real viewer.
 
     Raises
     ------
@@ -55,11 +55,11 @@ class LiveView:
         """Show the messages until they end."""
         try:
             self._show(lambda write: self._feed(write, messages))
-        except IpsysError as error:  # there is no viewer, which is no fault of the recording
+        except IpsysError as error:  # a missing viewer is not an error of the recording
             self._say(str(error))
 
     def _fades_ns(self) -> dict[str, int]:
-        """By topic, after which time what is not seen any more is gone."""
+        """Return by topic the time in ns after which its last entity is cleared."""
         topics = [image_topic(camera) for camera in self._cameras]
         if self._run is not None:
             topics += [f"/runs/{self._run}/cameras/{camera}/positions" for camera in self._cameras]

@@ -1,4 +1,4 @@
-"""Messages as Rerun entities, one after the other."""
+"""Conversion of messages to Rerun entities, one message after the other."""
 
 from __future__ import annotations
 
@@ -43,12 +43,12 @@ _CODECS = {"h264": rr.VideoCodec.H264, "h265": rr.VideoCodec.H265}
 def rerun_image(
     frame: CompressedImage | CompressedVideo | RawImage,
 ) -> rr.EncodedImage | rr.VideoStream | rr.Image:
-    """A frame for Rerun; JPEG, PNG and video are neither decoded nor copied into another format.
+    """Return a frame for Rerun; JPEG, PNG and video are neither decoded nor converted to another format.
 
     Raises
     ------
     ValueError
-        Where it is no picture that can be drawn, saying why.
+        The frame is no image that can be drawn; the text gives the reason.
     """
     if isinstance(frame, RawImage):
         return _raw_image(frame)
@@ -94,14 +94,14 @@ def tracks_entity(run: str | None) -> Entity:
 
 
 def trail_entity(run: str | None) -> str:
-    """Path of the trails of a run's robots; without a run of the truth."""
+    """Return the path of the trails of a run's robots; without a run, that of the ground truth."""
     return "/".join((*tracks_entity(run), "trails"))
 
 
 class _Look(NamedTuple):
-    """The look of an entity, the publish time from which it holds, and that at which it was drawn last.
+    """The look of an entity, the publish time from which it is valid, and the time of its last drawing.
 
-    Without a key the look is not known: it is drawn again.
+    Without a key the look is unknown: the entity is drawn again.
     """
 
     key: str | None
@@ -111,21 +111,21 @@ class _Look(NamedTuple):
 
 
 _NO_LOOK = _Look(None, 0, 0, is_drawn=False)
-# What may be drawn below an entity that is cleared.
+# Entities that may exist below an entity that is cleared.
 _PARTS = (("ids",), ("heading",), ("markers",), ("markers", "ids"))
 
 
 class RerunSink:
-    """Draw messages, in log order, into a recording.
+    """A sink that draws messages, in log order, into a recording.
 
-    What is no longer seen goes away, ``fade_ns`` of its topic after its last message.
+    An entity that is no longer seen is cleared, ``fade_ns`` of its topic after its last message.
 
     Parameters
     ----------
-    recording : an explicit stream, so that nothing of Rerun's global state is touched.
-    cameras : all there are, so that each has its colour whoever comes first.
-    fade_ns : by topic; without one, the last of a topic stays.
-    runs : those drawn. Where there are several, a robot has a colour and a line of text for each.
+    recording : an explicit stream, so that Rerun's global state is not changed.
+    cameras : all cameras; each camera has its colour independent of the order of the messages.
+    fade_ns : by topic; the last message of a topic without an entry stays.
+    runs : the runs to draw. With several runs, a robot has a colour and a line of text for each run.
     """
 
     def __init__(
@@ -155,14 +155,14 @@ class RerunSink:
         }
 
     def __call__(self, message: Message) -> None:
-        """Draw a message; one of a type that is not drawn is passed over."""
+        """Draw a message; ignore a message of a type that is not drawn."""
         self._fading.advance(message.log_time_ns)
         draw = self._draw.get(type(message.payload))
         if draw is not None:
             draw(message)
 
     def flush(self) -> None:
-        """Draw the waiting rows: many rows of an entity at once take a fraction of the time."""
+        """Draw the waiting rows: drawing many rows of an entity at once is many times faster."""
         for entity in list(self._waiting):
             self._send(entity)
 
@@ -176,13 +176,13 @@ class RerunSink:
         self._log_at(message.publish_time_ns, message.log_time_ns, entity, *what)
 
     def _log_at(self, publish_time_ns: int, log_time_ns: int, entity: Entity, *what: Any) -> None:
-        # The time is set for each entity: a trail belongs to an earlier instant than what is drawn with it.
+        # The time is set for each entity: a trail is older than the other entities of its message.
         for timeline, time_ns in zip(TIMELINES, (publish_time_ns, log_time_ns), strict=True):
             self._recording.set_time(timeline, timestamp=np.datetime64(time_ns, "ns"))
         self._recording.log(list(entity), *what, strict=True)
 
     def _log_moved(self, message: Message, entity: Entity, kind: Kind, moved: Fields, look: Fields) -> None:
-        """Draw the position of an entity, and its appearance only if that is new: that takes most time."""
+        """Draw the position of an entity; draw its look only if it is new: this takes the most time."""
         key, time_ns = str(look), message.publish_time_ns
         before = self._looks.get(entity, _NO_LOOK)
         last_ns, is_late = max(before.last_ns, time_ns), time_ns < before.since_ns
@@ -217,7 +217,7 @@ class RerunSink:
         rr.send_columns(path, timelines, columns, recording=self._recording)
 
     def _clear_now(self, message: Message, entity: Entity) -> None:
-        """Clear what is drawn, unless something later is drawn already."""
+        """Clear an entity, unless a later message has drawn it already."""
         look = self._looks.get(entity, _NO_LOOK)
         if look.is_drawn and message.publish_time_ns >= look.last_ns:
             self._clear(entity, message.publish_time_ns, message.log_time_ns)
@@ -248,7 +248,7 @@ class RerunSink:
         outlines = [np.vstack([m.corners_px, m.corners_px[:1]]) + _CORNER_FROM_CENTRE_PX for m in markers]
         line = {"colors": [MARKER_COLOUR], "radii": [_LINE]}
         self._log_moved(message, entity, rr.LineStrips2D, {"strips": outlines}, line)
-        # A label in the middle would hide the marker; below a point at its lower edge it does not.
+        # A label in the centre would hide the marker; a label below its lower edge does not.
         below = [(outline[:4, 0].mean(), outline[:4, 1].max()) for outline in outlines]
         ids = [str(marker.id) for marker in markers]
         label = {"labels": ids, "colors": [MARKER_COLOUR], "radii": [_DOT], "show_labels": [True]}
@@ -284,17 +284,17 @@ class RerunSink:
     def _draw_robot(self, message: Message, entity: Entity, run: str | None, track: Track) -> None:
         colour = self._robot_colour(run, track.robot)
         label = self._label(run, track.robot)
-        at = [(track.x_m, track.y_m, track.z_m)]
+        positions = [(track.x_m, track.y_m, track.z_m)]
         radius = 0.03 if run is None else 0.05
-        # The truth lies under the track: its name would hide the robot's.
+        # The ground truth lies under the track: its name would hide the robot's name.
         look = {"colors": [colour], "radii": [radius], "labels": [label], "show_labels": [run is not None]}
-        self._log_moved(message, entity, rr.Points3D, {"positions": at}, look)
+        self._log_moved(message, entity, rr.Points3D, {"positions": positions}, look)
         heading = (*entity, "heading")
         if track.heading_rad is None:
             self._clear_now(message, heading)
             return
         ahead = [(_HEADING_M * np.cos(track.heading_rad), _HEADING_M * np.sin(track.heading_rad), 0.0)]
-        arrow = {"origins": at, "vectors": ahead}
+        arrow = {"origins": positions, "vectors": ahead}
         self._log_moved(message, heading, rr.Arrows3D, arrow, {"colors": [colour], "radii": [0.012]})
 
     def _robot_colour(self, run: str | None, robot: str) -> tuple[int, int, int]:
@@ -307,7 +307,7 @@ class RerunSink:
     def _label(self, run: str | None, robot: str) -> str:
         if run is None or len(self._runs) < 2:
             return f"{robot} (truth)" if run is None else robot
-        # Runs put a robot at nearly one place: a line further down for each keeps them apart.
+        # All runs have a robot at nearly the same position: each run's label starts one line lower.
         return "\n" * self._runs.index(run) + f"{robot} ({run})"
 
     def _draw_segment(self, key: tuple[str | None, str], segment: Segment) -> None:

@@ -1,4 +1,4 @@
-"""A recording for Rerun: images with markers, the floor, positions and tracks; and its viewer."""
+"""The Rerun recording of a log: images with markers, floor, positions and tracks; and its viewer."""
 
 from __future__ import annotations
 
@@ -30,21 +30,22 @@ _INSTEAD = "write a recording with 'ipsys view --save session.rrd' and open that
 
 
 def viewer_command() -> list[str]:
-    """The command that shows what comes through its standard input.
+    """Return the command of the viewer; it shows the recording from its standard input.
 
-    The viewer also listens for others to connect, by default on all interfaces; here only this
-    machine can. A port of its own, or a viewer that is open already would be used, however bound.
+    The viewer also accepts connections, by default on all interfaces; this command limits it to this machine.
+    With a fixed port, an open viewer would get the recording, even if it listens on all interfaces. So the
+    command selects a free port.
     """
     return [sys.executable, "-m", "rerun", "--bind", "127.0.0.1", "--port", "auto", "-"]
 
 
 def check_screen(environment: Mapping[str, str]) -> None:
-    """See to it that a window can be opened.
+    """Check that a window can be opened.
 
     Raises
     ------
     IpsysError
-        Where there is no display.
+        There is no display.
     """
     displays = ("DISPLAY", "WAYLAND_DISPLAY", "WAYLAND_SOCKET")
     if sys.platform.startswith("linux") and not any(environment.get(name) for name in displays):
@@ -61,7 +62,7 @@ def show_in_viewer(feed: Callable[[Callable[[bytes], object]], None]) -> None:
     Raises
     ------
     IpsysError
-        Where no window can be opened.
+        No window can be opened.
     """
     check_screen(os.environ)
     environment = {"RUST_LOG": "error", **os.environ}
@@ -76,7 +77,7 @@ def show_in_viewer(feed: Callable[[Callable[[bytes], object]], None]) -> None:
             feed(viewer.stdin.write)
             viewer.stdin.close()
         except BrokenPipeError:
-            # The window was closed before all was read, or never opened: the exit code says which.
+            # The window was closed before the end, or it never opened: the exit code shows the case.
             _abandon(viewer.stdin)
         except BaseException:
             _stop(viewer)
@@ -87,7 +88,7 @@ def show_in_viewer(feed: Callable[[Callable[[bytes], object]], None]) -> None:
 
 
 def _stop(viewer: subprocess.Popen[bytes]) -> None:
-    """End the viewer; what was started is Python, which hands on an interrupt but not a termination."""
+    """End the viewer; its process is Python, which passes on an interrupt but not a termination."""
     if sys.platform == "win32":
         viewer.terminate()
     else:
@@ -95,7 +96,7 @@ def _stop(viewer: subprocess.Popen[bytes]) -> None:
 
 
 def _abandon(pipe: IO[bytes]) -> None:
-    """Close a pipe that nobody reads, with what is left in it."""
+    """Close a pipe without a reader, with the data left in it."""
     try:
         pipe.close()
     except BrokenPipeError:
@@ -109,9 +110,9 @@ def _last_line(complaints: IO[bytes]) -> str:
     return lines[-1] if lines else "it gave no reason"
 
 
-# Frames are kept longer than positions: between two places of a calibration nothing may be recorded.
+# Frames stay longer than positions: between two calibration points the log may have a gap.
 _FRAME_FACTOR = 10
-# Messages between two writes to the viewer: enough to keep it busy, little to hold.
+# Number of messages between two writes to the viewer: enough for its speed, small in memory.
 _BATCH = 64
 
 
@@ -121,17 +122,17 @@ def write_recording(session: Session, runs: Sequence[str] = (), save: Path | Non
     Parameters
     ----------
     session : open logs.
-    runs : names of the runs to show; the newest complete ones where empty.
+    runs : names of the runs to show; if empty, the newest complete runs.
     save : an ``.rrd`` file to write instead of opening a window; it has its name only when complete.
 
     Returns
     -------
-    What is shown.
+    The content that is shown.
 
     Raises
     ------
     IpsysError
-        For logs with nothing to show, an unknown run, or, without ``save``, no screen.
+        The logs have nothing to show, a run is unknown, or, without ``save``, there is no screen.
     """
     shown = choose_runs(session, runs)
     if not (shown.frames or shown.moving or session.count(MEASUREMENTS_TOPIC)):
@@ -143,7 +144,7 @@ def write_recording(session: Session, runs: Sequence[str] = (), save: Path | Non
         show_in_viewer(lambda write: _stream(session, shown, write))
         return shown
     partial = save.with_name(save.name + ".partial")
-    partial.touch()  # what is wrong with the path is said here, not by Rerun
+    partial.touch()  # errors of the path are raised by this call, not by Rerun
     try:
         _save(session, shown, partial)
         partial.replace(save)
@@ -153,7 +154,7 @@ def write_recording(session: Session, runs: Sequence[str] = (), save: Path | Non
 
 
 def _recording(session: Session) -> rr.RecordingStream:
-    """A stream of its own, without the clock and the counter that Rerun adds to each message."""
+    """Return a separate stream, without the clock and the counter that Rerun adds to each message."""
     recording = rr.RecordingStream("ipsys", send_properties=False)
     recording.set_log_time_enabled(False)
     recording.set_log_tick_enabled(False)

@@ -1,6 +1,6 @@
 """The static part of a Rerun recording: floor, calibration points, layout and colours.
 
-The hues are those of Okabe and Ito (2008), lightened where a dark ground asks for it.
+The hues are from Okabe and Ito (2008); some are lighter for a dark background.
 """
 
 from __future__ import annotations
@@ -40,7 +40,7 @@ KIND_COLOURS: dict[str, RGB] = {
     "measured": (130, 130, 130),
 }
 
-# A camera that has the name of a colour gets it, as far as it can be seen.
+# A camera that is named after a colour gets this colour, in a visible shade.
 _NAMED: dict[str, RGB] = {
     "red": (235, 95, 60),
     "white": (240, 240, 240),
@@ -71,9 +71,9 @@ _ROBOTS: tuple[RGB, ...] = (
 def assign_colours(
     cameras: Iterable[str], named: Mapping[str, Colour], rest: Sequence[Colour]
 ) -> dict[str, Colour]:
-    """A colour for each camera, the same ones whatever the order of the names.
+    """Assign a colour to each camera, independent of the order of the names.
 
-    A camera that has the name of a colour in ``named`` gets that one; the others share the ``rest``.
+    A camera that is named after a colour in ``named`` gets this colour; the others share the ``rest``.
     """
     cameras = sorted(set(cameras))
     colours = {camera: named[camera] for camera in cameras if camera in named}
@@ -84,16 +84,16 @@ def assign_colours(
 
 
 def camera_colours(cameras: Iterable[str]) -> dict[str, RGB]:
-    """Colours for cameras on a dark ground."""
+    """Return colours for cameras on a dark background."""
     return assign_colours(cameras, _NAMED, _REST)
 
 
 def robot_colour(number: int) -> RGB:
-    """The colour of the first, second ... robot; the eighth has the first one's again."""
+    """Return the colour of the first, second ... robot; the eighth robot has the colour of the first."""
     return _ROBOTS[number % len(_ROBOTS)]
 
 
-# The first one is what the values speak of, and the one that is shown.
+# The viewer shows the first timeline; the times in the payloads belong to it.
 TIMELINES = ("publish_time", "log_time")
 
 _GRID_M = 0.5
@@ -104,7 +104,7 @@ _LIGHT = (150, 150, 150)
 
 
 def draw_rig(recording: rr.RecordingStream, rig: Rig | None) -> None:
-    """The floor with its grid, the axes and the reference points; nothing that the rig does not have."""
+    """Draw the floor with its grid, the axes and the reference points, as far as the rig has them."""
     recording.log("world", rr.ViewCoordinates.RIGHT_HAND_Z_UP, static=True)
     if rig is None:
         return
@@ -146,14 +146,14 @@ def _draw_floor(recording: rr.RecordingStream, floor: Floor) -> None:
 
 
 def draw_places(recording: rr.RecordingStream, places: Iterable[Place]) -> None:
-    """The measured places, one entity for each kind, with their ids as labels that show on demand."""
+    """Draw the calibration points, one entity for each kind; their ids are labels that show on demand."""
     places = list(places)
     for kind in KINDS:
-        here = [place for place in places if place.kind == kind]
-        if here:
+        places_of_kind = [place for place in places if place.kind == kind]
+        if places_of_kind:
             points = rr.Points3D(
-                [place.point_m for place in here],
-                labels=[place.id for place in here],
+                [place.point_m for place in places_of_kind],
+                labels=[place.id for place in places_of_kind],
                 colors=[KIND_COLOURS[kind]],
                 radii=[0.025],
                 show_labels=False,
@@ -162,11 +162,11 @@ def draw_places(recording: rr.RecordingStream, places: Iterable[Place]) -> None:
 
 
 def layout(cameras: Sequence[str], trails: Sequence[str], rig: Rig | None, events: bool) -> rrb.Blueprint:
-    """Cameras on the left, the floor from above on the right, events below it.
+    """Return the layout: cameras on the left, the floor from above on the right, events below the floor.
 
     Parameters
     ----------
-    cameras : those with frames or markers.
+    cameras : the cameras with frames or markers.
     trails : paths of the entities whose last seconds are shown together.
     """
     right: list[rrb.View | rrb.Container] = [_floor_view(trails, rig)]
@@ -174,7 +174,7 @@ def layout(cameras: Sequence[str], trails: Sequence[str], rig: Rig | None, event
         right.append(rrb.TextLogView(origin="/events", name="Events"))
     floor = rrb.Vertical(*right, row_shares=[5, 1][: len(right)])
     views = [rrb.Spatial2DView(origin=f"/cameras/{camera}", name=camera) for camera in cameras]
-    # Frames are wide: up to three of them are best one above the other, beside a square floor.
+    # Frames are wide: up to three of them fit best in one column, beside a square floor.
     columns = 1 if len(views) <= 3 else 2
     whole = (
         rrb.Horizontal(rrb.Grid(*views, grid_columns=columns), floor, column_shares=[2, 3])
@@ -200,7 +200,7 @@ def _floor_view(trails: Sequence[str], rig: Rig | None) -> rrb.Spatial3DView:
     if rig is not None and rig.floor is not None:
         width_m, depth_m = rig.floor.width_m, rig.floor.depth_m
         middle = (width_m / 2, depth_m / 2, 0.0)
-        # Straight down, upward of the picture along y as on the plan that the tape was read from.
+        # The view is straight down, with y upward in the image, as on the plan of the tape measurements.
         above = (width_m / 2, depth_m / 2, 1.15 * max(width_m, depth_m))
         eye = rrb.EyeControls3D(position=above, look_target=middle, eye_up=(0.0, 1.0, 0.0))
     return rrb.Spatial3DView(

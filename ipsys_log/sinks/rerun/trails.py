@@ -15,19 +15,19 @@ Entity = tuple[str, ...]
 
 
 class Fading:
-    """Remember when things were seen last, and ``clear`` them at the instant they are overdue.
+    """The times of the last sightings of entities; ``clear`` is called when an entity is overdue.
 
-    ``clear`` is called with the entity and that instant, in publish and in log time (ns).
+    The arguments of ``clear`` are the entity and this instant, in publish time and in log time (ns).
     """
 
     def __init__(self, clear: Callable[[Entity, int, int], None]) -> None:
         self._clear = clear
         self._seen: dict[Entity, tuple[int, int]] = {}  # expiry time, in publish and in log time
-        # One entry for each entity, not later than its expiry: it may have been drawn again since.
+        # One entry for each entity, not later than its expiry; the entity may have a newer drawing by then.
         self._checks: list[tuple[int, Entity]] = []
 
     def seen(self, entity: Entity, message: Message, fade_ns: int) -> None:
-        """Note that an entity is drawn; with 0 it stays until it is drawn again."""
+        """Note that an entity is drawn; with 0 it stays until the next drawing."""
         if fade_ns <= 0:
             return
         overdue_ns = message.log_time_ns + fade_ns
@@ -54,7 +54,7 @@ Key = TypeVar("Key", bound=Hashable)
 
 @dataclass(frozen=True, slots=True)
 class Segment:
-    """A way from one pose to the next, in m, and the time of the latter in ns."""
+    """A path from one pose to the next, in m, and the time of the second pose in ns."""
 
     start_m: Point
     end_m: Point
@@ -70,10 +70,10 @@ class _Pose:
 
 
 class Trails(Generic[Key]):
-    """Join the poses of each robot, and hand each way to ``draw``.
+    """The trails of robots: it joins the poses of each robot, and passes each segment to ``draw``.
 
-    Several poses of one instant (one from each camera) count as the last of them, which rests on all
-    cameras; so a pose waits until the next instant. Over a gap there is no line.
+    Several poses of one instant (one from each camera) count as the last of them, which uses all cameras. So
+    a pose waits until the next instant. There is no line over a gap.
     """
 
     def __init__(self, draw: Callable[[Key, Segment], None]) -> None:
@@ -83,7 +83,7 @@ class Trails(Generic[Key]):
         self._gap_ns: dict[Key, int] = {}
 
     def add(self, key: Key, message: Message, point_m: Point, gap_ns: int) -> None:
-        """Take in a pose; ``gap_ns`` is the silence over which nothing is joined."""
+        """Add a pose; poses with more than ``gap_ns`` of silence between them are not joined."""
         pose = _Pose(message.publish_time_ns, message.log_time_ns, point_m)
         waiting = self._waiting.get(key)
         if waiting is not None and pose.publish_time_ns < waiting.publish_time_ns:
@@ -94,7 +94,7 @@ class Trails(Generic[Key]):
         self._waiting[key] = pose
 
     def close(self) -> None:
-        """Draw the last way of each robot."""
+        """Draw the last segment of each robot."""
         for key, pose in self._waiting.items():
             self._finish(key, pose)
         self._waiting.clear()

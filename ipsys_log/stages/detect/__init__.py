@@ -1,4 +1,4 @@
-"""Frames to markers: found, followed, and measured at their edges, or as the paper does it."""
+"""The stage *detect*: frames to markers, tracked and fitted at their edges, or as in the paper."""
 
 from __future__ import annotations
 
@@ -68,14 +68,14 @@ _GREEN = Color(0.1, 0.9, 0.3, 1.0)
 class Detect:
     """The stage *detect*, one for all cameras.
 
-    Yields, for a frame, its :class:`Markers` and their drawing for viewers. For a frame that cannot be
-    decoded, or that suddenly has another size than the calibration, it yields an :class:`Event`. A marker id
-    that is seen twice in a frame, or is not in the rig, is left out and named by an event. An event also
-    names a marker of the rig that is seen and cannot be measured, once for each reason.
+    It yields for a frame its :class:`Markers` and their drawing for viewers. It yields an :class:`Event` for
+    a frame that cannot be decoded, or that suddenly has another size than the calibration. It leaves out a
+    marker id that is seen twice in a frame or is not in the rig; an event names the id. Another event names a
+    marker of the rig that is seen and cannot be measured, once for each reason.
 
     Parameters
     ----------
-    corners : ``edges``, fitted to the edges of the print through the lens, from frame to frame; or
+    corners : ``edges``, fitted to the edges of the print with the lens distortion, tracked over frames; or
         ``stock``, OpenCV's detector on each frame, refined as the authors do.
 
     Raises
@@ -93,14 +93,14 @@ class Detect:
         self._videos: dict[str | None, Video] = {}
         self._said: dict[str | None, set[int | None]] = {}
         self._rejected: set[tuple[str | None, int, str]] = set()
-        # Cameras of which a frame has had the size of the lens.
+        # Cameras with at least one frame of the size of their calibration.
         self._fitted: set[str | None] = set()
 
     def __call__(self, message: Message) -> Iterator[Any]:
         payload = message.payload
         if isinstance(payload, Rig):
             self._rig = payload
-            # Each dictionary is looked up once, here, so that a bad name is said before any frame.
+            # Each dictionary is loaded once at this point: a wrong name is an error before the first frame.
             marker_detector(payload.dictionary)
             self._following.clear()
         elif isinstance(payload, CameraCalibration):
@@ -113,7 +113,7 @@ class Detect:
         elif isinstance(payload, SkippedVideo):
             with suppress(FrameError):
                 self._video(message.camera, payload.frame).pass_over(payload.frame)
-        elif not isinstance(payload, Event):  # events only say which frames a replay as live skips
+        elif not isinstance(payload, Event):  # events only tell which frames a replay ``as_live`` skips
             yield from self._frame(message)
 
     def _frame(self, message: Message) -> Iterator[Any]:
@@ -128,33 +128,33 @@ class Detect:
                     yield from self._before_keyframe(message)
                     return
                 message = replace(message, payload=picture)
-            found, width, height = self._find(message, self._rig)
+            markers_in_frame, width, height = self._find(message, self._rig)
         except FrameError as error:
             text = f"{message.topic}: corrupt frame: {error}"
             yield Event(message.publish_time_ns, "corrupt_frame", text, message.camera)
             return
         except SizeError as error:
-            # A camera that never fits would give nothing at all.
+            # Without this error, a camera whose frames never fit would give no results at all.
             if message.camera not in self._fitted:
                 raise
             text = f"{message.topic}: a frame is left out: {error}"
             yield Event(message.publish_time_ns, "wrong_size", text, message.camera)
             return
         self._fitted.add(message.camera)
-        markers, events = _sift(found, self._rig, message)
+        markers, events = _sift(markers_in_frame, self._rig, message)
         yield from self._unsaid(events)
         yield from self._rejections(message, self._rig)
         yield Markers(message.publish_time_ns, markers, width, height)
         yield _drawing(message.publish_time_ns, markers)
 
     def _video(self, camera: str | None, frame: CompressedVideo) -> Video:
-        """The decoder of a camera, which is given all its frames."""
+        """Return the decoder of a camera; it must get all frames of the camera."""
         if camera not in self._videos:
             self._videos[camera] = Video(frame.format)
         return self._videos[camera]
 
     def _before_keyframe(self, message: Message) -> Iterator[Event]:
-        """Frames before the first keyframe are no pictures, which is said once."""
+        """Yield an event at the first frame before a keyframe: such frames cannot be decoded."""
         said = self._said.setdefault(message.camera, set())
         if None not in said:
             said.add(None)
@@ -162,20 +162,20 @@ class Detect:
             yield Event(message.publish_time_ns, "no_keyframe", text, message.camera)
 
     def _find(self, message: Message, rig: Rig) -> tuple[list[Marker], int, int]:
-        """The markers in a frame, and its width and height."""
+        """Return the markers in a frame, and its width and height."""
         camera = rig.camera(str(message.camera))
         if self._corners == STOCK:
             grey = decode_grey(message.payload)
             height, width = grey.shape
             if message.camera in self._lenses:
                 check_size(self._lenses[message.camera], width, height, message.camera)
-            found = detect_markers(grey, rig.dictionary)
+            markers = detect_markers(grey, rig.dictionary)
         else:
             if message.camera not in self._following:
                 self._following[message.camera] = self._follow(message, rig, camera)
             fits, width, height = self._following[message.camera](message.payload, message.publish_time_ns)
-            found = [_marker(fit) for fit in fits]
-        return [_timed(marker, camera) for marker in found], width, height
+            markers = [_marker(fit) for fit in fits]
+        return [_timed(marker, camera) for marker in markers], width, height
 
     def _follow(self, message: Message, rig: Rig, camera: RigCamera) -> Follow:
         lens = self._lenses.get(message.camera)
@@ -189,7 +189,7 @@ class Detect:
         return Follow(rig.dictionary, lens, camera.edge_offset_px, row_time_s, number, message.camera)
 
     def _unsaid(self, events: list[Event]) -> Iterator[Event]:
-        """A camera names an id that is not in the rig once, and whatever else every time."""
+        """Yield events; an id that is not in the rig is named once per camera, other events every time."""
         for event in events:
             said = self._said.setdefault(event.camera, set())
             if event.kind != "unknown_marker" or event.marker_id not in said:
@@ -209,12 +209,12 @@ class Detect:
 
 
 def check_corners(name: str) -> str:
-    """Return the name of a method for corners, if it is one.
+    """Return the name of a corner method, if there is such a method.
 
     Raises
     ------
     IpsysError
-        Otherwise.
+        There is no such method.
     """
     if name not in CORNERS:
         raise IpsysError(f"--corners {name}: there is no such method; use one of {', '.join(CORNERS)}")
@@ -222,13 +222,13 @@ def check_corners(name: str) -> str:
 
 
 def _marker(fit: Fit) -> Marker:
-    # In single precision, as the log stores it: what comes next is to see the same numbers.
+    # In single precision, as in the log: the next stages must read the same numbers from both.
     covariance_px2 = fit.covariance_px2.astype(np.float32).astype(np.float64)
     return Marker(fit.pose.id, fit.corners_px, covariance_px2, edge_offset_px=fit.edge_offset_px)
 
 
 def _timed(marker: Marker, camera: RigCamera) -> Marker:
-    """With the time from the exposure of the first row to that of the row it lies in (rolling shutter)."""
+    """Return a marker with its time offset: exposure of its row minus that of the first (rolling shutter)."""
     if camera.row_time_ns is None:
         return marker
     row = float(marker.corners_px[:, 1].mean())
@@ -236,7 +236,7 @@ def _timed(marker: Marker, camera: RigCamera) -> Marker:
 
 
 def _sift(found: list[Marker], rig: Rig, message: Message) -> tuple[tuple[Marker, ...], list[Event]]:
-    """Leave out what cannot be told apart or does not belong here, and say so."""
+    """Leave out ambiguous and unknown markers; return the other markers, and an event for each id."""
     counts = Counter(marker.id for marker in found)
     events = []
     for marker_id, count in sorted(counts.items()):
@@ -254,7 +254,10 @@ def _sift(found: list[Marker], rig: Rig, message: Message) -> tuple[tuple[Marker
 
 
 def _drawing(time_ns: int, markers: tuple[Marker, ...]) -> ImageAnnotations:
-    """Outlines and ids; Foxglove counts pixels from the first pixel's corner, OpenCV from its centre."""
+    """Return outlines and ids for viewers.
+
+    Foxglove counts pixels from the first pixel's corner, OpenCV from its centre.
+    """
     shifted = [(marker.id, marker.corners_px + 0.5) for marker in markers]
     return ImageAnnotations(
         points=tuple(
@@ -314,7 +317,7 @@ def _why_stock(camera: str) -> str:
 
 def _rig_part(rig: Rig) -> object:
     shutters = {(camera.name, camera.row_time_ns, camera.edge_offset_px) for camera in rig.cameras}
-    return rig.dictionary, {m.id for m in rig.markers}, {one for one in shutters if any(one[1:])}
+    return rig.dictionary, {m.id for m in rig.markers}, {shutter for shutter in shutters if any(shutter[1:])}
 
 
 STAGE = Stage(

@@ -14,7 +14,7 @@ import numpy as np
 
 from ipsys_log.calibration.board_detection import Grey
 from ipsys_log.errors import FrameError, IpsysError
-from ipsys_log.images.decode import check_encoded, read_picture_size
+from ipsys_log.images.decode import check_encoded, read_image_size
 from ipsys_log.images.video import Video
 from ipsys_log.log.dataset import Session
 from ipsys_log.messages import CompressedImage, CompressedVideo, RawImage
@@ -161,7 +161,7 @@ def _read_files(files: Sequence[Path]) -> Iterator[tuple[str, Grey | None]]:
 
 
 def _read_sizes(files: Sequence[Path]) -> list[tuple[str, tuple[int, int]]]:
-    sizes = [(path.name, read_picture_size(path)) for path in _spread(files)]
+    sizes = [(path.name, read_image_size(path)) for path in _spread(files)]
     return [(name, size) for name, size in sizes if size is not None]
 
 
@@ -240,7 +240,7 @@ def _read_log(path: Path, topic: str, stride: int) -> Iterator[tuple[str, Grey |
                 if wanted:
                     frame = _of_video(video, frame)
                 else:
-                    video.pass_over(frame)
+                    video.skip(frame)
             if wanted:
                 seconds = (message.publish_time_ns - session.start_ns) * 1e-9
                 yield f"at {seconds:.2f} s", None if frame is None else _frame(frame)

@@ -60,7 +60,7 @@ def read_accuracy(session: Session, outcomes: Sequence[Outcome]) -> list[Accurac
             tracks = track_errors(
                 gather_tracks(session.messages(session.topics(TRACKS, fused))),
                 gather_tracks(session.messages([TRUTH_TOPIC])),
-                carried=_told_heights(session, fused),
+                at_track_height=_told_heights(session, fused),
             )
         if evaluations or tracks is not None:
             accuracies.append(Accuracy(run, evaluations[-1] if evaluations else None, tracks))

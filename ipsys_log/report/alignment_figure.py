@@ -118,9 +118,9 @@ def _draw_picture(axes: Axes, one: Alignment, lenses: Mapping[str, CameraCalibra
     axes.set(xlim=(0, lens.width), ylim=(lens.height, 0), aspect="equal")
     # The principal point: the optical axis has to be vertical on the floor.
     axes.plot(*lens.K[:2, 2], "+", color=REST, ms=12, zorder=1)
-    if one.lying:
+    if one.floor_markers:
         _draw_depths(axes, one, lens)
-    for lying, _ in one.raised:
+    for lying, _ in one.raised_markers:
         x, y = project(lying.point_m[None], lens)[0]
         axes.plot(x, y, "x", color=NOTE, ms=6, zorder=3)
         axes.annotate(
@@ -132,11 +132,11 @@ def _draw_picture(axes: Axes, one: Alignment, lenses: Mapping[str, CameraCalibra
 
 
 def _draw_depths(axes: Axes, one: Alignment, lens: CameraCalibration) -> None:
-    points_m = np.array([lying.point_m for lying in one.lying])
-    depths_m = points_m[:, 2] + np.array([lying.height_m for lying in one.lying])
+    points_m = np.array([lying.point_m for lying in one.floor_markers])
+    depths_m = points_m[:, 2] + np.array([lying.height_m for lying in one.floor_markers])
     off_cm = ((depths_m - np.median(depths_m)) * CM_PER_M).round(1) + 0.0  # no -0.0
     few = len(off_cm) <= 12
-    for (x, y), cm, lying in zip(project(points_m, lens), off_cm, one.lying, strict=True):
+    for (x, y), cm, lying in zip(project(points_m, lens), off_cm, one.floor_markers, strict=True):
         colour = REST if abs(cm) < 0.5 else _FAR if cm > 0 else _NEAR
         axes.plot(x, y, "o", color=colour, ms=5 if few else min(9, 2 + 0.7 * abs(cm)), alpha=0.9, zorder=2)
         if few:

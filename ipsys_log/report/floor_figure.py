@@ -18,7 +18,7 @@ from numpy.typing import NDArray
 
 from ipsys_log.analysis.accuracy import CROSS_VALIDATION
 from ipsys_log.analysis.ground_truth import gather_tracks
-from ipsys_log.analysis.pairs import Place, measured_places
+from ipsys_log.analysis.pairs import Place, locate_measurements
 from ipsys_log.errors import IpsysError
 from ipsys_log.log.dataset import Session
 from ipsys_log.messages import (
@@ -296,7 +296,7 @@ def _gather(session: Session, accuracies: Sequence[Accuracy]) -> Scene:
     runs = [accuracy.run for accuracy in (evaluated or accuracies)]
     run = runs[0] if runs else newest_run(session, TRACKS)
     rig = rig_in_force(session, [run] if run else [])
-    places, _ = measured_places(session.payloads(session.topics(MEASUREMENTS)), rig)
+    places, _ = locate_measurements(session.payloads(session.topics(MEASUREMENTS)), rig)
     topics = session.topics(TRACKS, run) if run else []
     truth = [TRUTH_TOPIC] if TRUTH_TOPIC in session.topics(TRUTH) else []
     scene = Scene(

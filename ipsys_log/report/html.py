@@ -9,7 +9,7 @@ from jinja2 import Environment, PackageLoader, StrictUndefined
 
 from ipsys_log.analysis.calibration_points import measured
 from ipsys_log.analysis.cross_validation import FOLDS, REPEATS, SUBSETS
-from ipsys_log.analysis.tape import Measured
+from ipsys_log.analysis.tape import RiggedMeasurement
 from ipsys_log.errors import IpsysError
 from ipsys_log.log.dataset import Session
 from ipsys_log.messages import Run
@@ -76,7 +76,7 @@ def _said(findings: Findings) -> dict[str, Any]:
     }
 
 
-def _measured(session: Session, findings: Findings) -> list[Measured]:
+def _measured(session: Session, findings: Findings) -> list[RiggedMeasurement]:
     """Return the valid measured points, with the rig of the evaluation's options, or with the log's rig."""
     runs = [accuracy.run for accuracy in findings.accuracies]
     rigs = [record.rig for record in session.runs() if record.run in runs and record.rig is not None]

@@ -10,7 +10,7 @@ from matplotlib.path import Path as Outline
 from numpy.typing import NDArray
 
 from ipsys_log.analysis.accuracy import POOLED
-from ipsys_log.analysis.tape import Measured, flat_places
+from ipsys_log.analysis.tape import RiggedMeasurement, find_weak_points
 from ipsys_log.messages import CameraEvaluation, ErrorStatistics
 from ipsys_log.report.accuracy import Accuracy, gather_suspects
 from ipsys_log.report.advice import GROUPS, Choice, label, told_height
@@ -193,13 +193,13 @@ def _point(point_m: Iterable[float] | None) -> str:
     return "" if point_m is None else ", ".join(f"{value:.3f}" for value in point_m)
 
 
-def flat_rows(places: Sequence[Measured]) -> list[dict[str, str]] | None:
+def flat_rows(places: Sequence[RiggedMeasurement]) -> list[dict[str, str]] | None:
     """Return points whose tape circles cross at a flat angle, the worst first; None without tape points."""
     if not any(len(place.measurement.distances) > 1 for place in places):
         return None
     return [
         {"name": flat.id, "angle": f"{flat.angle_deg:.0f}", "sigma": format_cm(flat.sigma_m, 1)}
-        for flat in flat_places(places)
+        for flat in find_weak_points(places)
     ]
 
 

@@ -15,7 +15,7 @@ from ipsys_log.analysis.differences import (
     Extent,
     Stored,
     compare_channels,
-    explain_apart,
+    explain_no_overlap,
     marker_ids,
 )
 from ipsys_log.errors import IpsysError
@@ -141,7 +141,7 @@ def explain_diff(left: Path, right: Path, runs: tuple[str | None, str | None]) -
     they have something. The parameters are those of `diff`."""
     with Session([left]) as one, Session([right]) as other:
         first, second = _compared_runs(one, other, runs)
-        return explain_apart(_extent(one, first), _extent(other, second))
+        return explain_no_overlap(_extent(one, first), _extent(other, second))
 
 
 def _compared_runs(

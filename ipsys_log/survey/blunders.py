@@ -8,10 +8,16 @@ from dataclasses import replace
 import numpy as np
 from numpy.typing import NDArray
 
-from ipsys_log.analysis.blunders import possible_slips
-from ipsys_log.analysis.tape import Measured, TapePoint, flat_places, reference_points, world_point
+from ipsys_log.analysis.blunders import possible_blunders
+from ipsys_log.analysis.tape import (
+    RiggedMeasurement,
+    TapePoint,
+    find_weak_points,
+    reference_points,
+    world_point,
+)
 from ipsys_log.errors import IpsysError
-from ipsys_log.geometry.trilateration import SIDES, sides_alike
+from ipsys_log.geometry.trilateration import SIDES, are_collinear
 from ipsys_log.messages import Measurement, Rig
 from ipsys_log.survey.scene import Prediction
 from ipsys_log.units import CM_PER_M
@@ -63,7 +69,7 @@ def doubt_floor(read: Measurement, fixed: TapePoint, rig: Rig) -> tuple[bool | N
     if outside_m <= _OUTSIDE_M:
         return True, []
     text = f"{_tapes(read)} put the point {outside_m * CM_PER_M:.0f} cm outside of the floor"
-    if read.side is not None and sides_alike(reference_points(read, rig)):
+    if read.side is not None and are_collinear(reference_points(read, rig)):
         other = SIDES[1 - SIDES.index(read.side)]
         other_m = world_point(replace(read, side=other), rig).world_m
         if _outside_m(other_m, rig) <= _OUTSIDE_M:
@@ -86,7 +92,7 @@ def doubt_crossing(read: Measurement, rig: Rig) -> list[str]:
     return [
         f"{_tapes(read)}: the tapes cross at {flat.angle_deg:.0f} degrees only, so that the point is known "
         f"to {(flat.sigma_m or 0.0) * CM_PER_M:.1f} cm; another place, or a third reference point, is better"
-        for flat in flat_places([Measured(read, with_tape(rig))])
+        for flat in find_weak_points([RiggedMeasurement(read, with_tape(rig))])
     ]
 
 
@@ -118,7 +124,7 @@ def doubt_model(
     if off_m <= bound_m:
         return []
     text = f"the point is {off_m * CM_PER_M:.0f} cm away from the prediction of {model_name}"
-    for group in possible_slips(read, rig, predicted_m):
+    for group in possible_blunders(read, rig, predicted_m):
         explanations = []
         for slip in group:
             try:

@@ -10,7 +10,7 @@ from typing import NamedTuple
 import numpy as np
 
 from ipsys_log.errors import IpsysError
-from ipsys_log.geometry.trilateration import SIDES, sides_alike
+from ipsys_log.geometry.trilateration import SIDES, are_collinear
 from ipsys_log.messages import Distance, ReferencePoint, Rig
 from ipsys_log.units import CM_PER_M
 
@@ -89,7 +89,7 @@ def needs_side(rig: Rig, names: Iterable[str]) -> bool:
     """Return whether distances from these reference points need a side (left or right)."""
     used = set(names)
     points_m = [(p.x_m, p.y_m) for p in rig.reference_points if p.name in used]
-    return len(points_m) >= 2 and sides_alike(np.array(points_m))
+    return len(points_m) >= 2 and are_collinear(np.array(points_m))
 
 
 def read_typed(typed: Typed, rig: Rig) -> tuple[Entry, list[Fault]]:

@@ -11,7 +11,7 @@ import cv2
 import numpy as np
 
 from ipsys_log.analysis.pairs import Sightings, gather_sightings
-from ipsys_log.analysis.stationary import still_stretches
+from ipsys_log.analysis.stationary import stationary_intervals
 from ipsys_log.errors import FrameError, IpsysError, LogError
 from ipsys_log.images.video import decode_last
 from ipsys_log.log.contents import camera_of_topic
@@ -231,7 +231,7 @@ def _find_stops(sightings: Mapping[tuple[str, int], Sightings], rig: Rig) -> lis
                 for (camera, seen_id), observations in sightings.items()
                 if seen_id == marker_id
             }
-            stops += [Stop(marker_id, *interval) for interval in still_stretches(seen)]
+            stops += [Stop(marker_id, *interval) for interval in stationary_intervals(seen)]
     return sorted(stops, key=lambda stop: (stop.start_ns, stop.marker_id))
 
 

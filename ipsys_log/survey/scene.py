@@ -11,10 +11,10 @@ import numpy as np
 from numpy.typing import NDArray
 
 from ipsys_log.analysis.consistency import FEWEST_POINTS
-from ipsys_log.analysis.cross_validation import gather_places, leave_one_out
-from ipsys_log.analysis.outliers import find_suspects
-from ipsys_log.analysis.stationary import FEWEST_FRAMES, lies_at, lies_still
-from ipsys_log.analysis.tape import Measured, world_point
+from ipsys_log.analysis.cross_validation import gather_points, leave_one_out
+from ipsys_log.analysis.outliers import find_outliers
+from ipsys_log.analysis.stationary import FEWEST_FRAMES, is_near, is_stationary
+from ipsys_log.analysis.tape import RiggedMeasurement, world_point
 from ipsys_log.errors import FitError, IpsysError
 from ipsys_log.messages import CameraPoints, Interval, Markers, Measurement, Model, Pair, Rig
 from ipsys_log.models.table import AppliedModel
@@ -203,7 +203,7 @@ def look(views: Sequence[View], marker_id: int) -> Sight:
         if len(rows) < FEWEST_FRAMES:
             continue
         seen_m = np.array([(point.x_m, point.y_m, point.z_m) for _, point in rows])
-        if not lies_still(seen_m):
+        if not is_stationary(seen_m):
             moving.append(view.camera)
         times_ns = [time_ns + (point.time_offset_ns or 0) for time_ns, point in rows]
         seen[view.camera] = min(times_ns), max(times_ns), seen_m.mean(axis=0)
@@ -227,7 +227,7 @@ def _measured_as(views: Iterable[View], marker_id: int, points_m: Mapping[str, A
         present_m = points_m.get(view.camera)
         for name, measured_id, measured_m in view.measured:
             if measured_id == marker_id and present_m is not None:
-                same[name] = same.get(name, True) and bool(lies_at(present_m[None], measured_m)[0])
+                same[name] = same.get(name, True) and bool(is_near(present_m[None], measured_m)[0])
     return tuple(name for name, is_same in same.items() if is_same)
 
 
@@ -258,11 +258,11 @@ def fit_neighbours(seen: Sequence[tuple[Measurement, Sight]], rig: Rig) -> Model
     pairs = _pairs(seen, rig)
     if not pairs:
         return None
-    places = [Measured(measurement, rig) for measurement, _ in seen]
+    places = [RiggedMeasurement(measurement, rig) for measurement, _ in seen]
     paired_ids = {pair.measurement for camera_pairs in pairs.values() for pair in camera_pairs}
     try:
-        suspects = find_suspects(
-            leave_one_out(_MODEL, gather_places(pairs)),
+        suspects = find_outliers(
+            leave_one_out(_MODEL, gather_points(pairs)),
             [place for place in places if place.measurement.id in paired_ids],
         )
         suspect_ids = {suspect.measurement for suspect in suspects}

@@ -13,9 +13,9 @@ from starlette.requests import ClientDisconnect, Request
 from starlette.responses import JSONResponse, Response
 from starlette.routing import Route
 
-from ipsys_log.analysis.pairs import active_measurements, measured_places
+from ipsys_log.analysis.pairs import active_measurements, locate_measurements
 from ipsys_log.errors import IpsysError
-from ipsys_log.geometry.trilateration import sides_alike
+from ipsys_log.geometry.trilateration import are_collinear
 from ipsys_log.messages import Measurement
 from ipsys_log.report.figures import camera_styles
 from ipsys_log.survey.checks import Checked, check_entry, next_id, withdraw
@@ -34,7 +34,7 @@ def scene_json(scene: Scene) -> dict[str, Any]:
         "lab": rig.name,
         "references": [{"name": p.name, "x_m": p.x_m, "y_m": p.y_m} for p in rig.reference_points],
         "floor": None if rig.floor is None else [rig.floor.width_m, rig.floor.depth_m],
-        "one_line": sides_alike(points_m),
+        "one_line": are_collinear(points_m),
         "stops": [
             {"marker": stop.marker_id, "seconds": (stop.end_ns - stop.start_ns) / NS_PER_S}
             for stop in scene.stops
@@ -47,7 +47,7 @@ def history_json(scene: Scene) -> dict[str, Any]:
     """Return all measurements so far, newest first, also withdrawn ones; and the measured intervals."""
     history = scene.history()
     active = active_measurements(history)
-    points = {place.id: place.point_m for place in measured_places(active, scene.rig)[0]}
+    points = {place.id: place.point_m for place in locate_measurements(active, scene.rig)[0]}
     rows = [
         {
             "id": measurement.id,

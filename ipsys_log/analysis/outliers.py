@@ -89,9 +89,9 @@ def find_outliers(leave_one_out: LeaveOneOut, places: Sequence[RiggedMeasurement
     ...     tape = Distance("A", np.hypot(x - 1, y + 1)), Distance("B", np.hypot(x - 3, y + 1))
     ...     side = "right" if n == 12 else "left"
     ...     read = Measurement(0, f"m{n}", distances=tape, side=side, height_m=0.0)
-    ...     places.append(Measured(read, rig))
-    >>> (suspect,) = find_outliers(lambda unused: {"red": seen}, places)
-    >>> suspect.measurement, suspect.kind, suspect.text, suspect.corrected_m.round(3).tolist()
+    ...     places.append(RiggedMeasurement(read, rig))
+    >>> (outlier,) = find_outliers(lambda unused: {"red": seen}, places)
+    >>> outlier.measurement, outlier.kind, outlier.text, outlier.corrected_m.round(3).tolist()
     ('m12', 'side', 'it lies left of the line from A to B, not right', [1.0, 3.0, 0.0])
     """
     places = [replace(place, rig=_with_tape(place.rig)) for place in places]

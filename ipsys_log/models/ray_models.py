@@ -47,10 +47,10 @@ class RayPlane(RegressorMixin, BaseEstimator):  # type: ignore[misc]
     @staticmethod
     def fit_jointly(models: Sequence[RayPlane], cameras: Sequence[CalibrationPoints]) -> list[RayPlane]:
         """Fit one model for each camera; points that several cameras measured tie the models together."""
-        for model, bearings in zip(models, fit_rays(cameras), strict=True):
+        for model, camera_rays in zip(models, fit_rays(cameras), strict=True):
             model.n_features_in_ = 4
-            model.rotation_, model.origin_ = bearings.rotation, bearings.origin_m
-            model.lens_ = bearings.lens
+            model.rotation_, model.origin_ = camera_rays.rotation, camera_rays.origin_m
+            model.lens_ = camera_rays.lens
         return list(models)
 
     def predict(self, X: Any) -> Array:
@@ -152,18 +152,22 @@ class RayDepth(RegressorMixin, BaseEstimator):  # type: ignore[misc]
     @staticmethod
     def fit_jointly(models: Sequence[RayDepth], cameras: Sequence[CalibrationPoints]) -> list[RayDepth]:
         """Fit one model for each camera; points that several cameras measured tie the models together."""
-        for model, places, bearings in zip(models, cameras, fit_rays(cameras), strict=True):
-            model._fit_depths(places, bearings)
+        for model, places, camera_rays in zip(models, cameras, fit_rays(cameras), strict=True):
+            model._fit_depths(places, camera_rays)
         return list(models)
 
-    def _fit_depths(self, places: CalibrationPoints, bearings: CameraRays) -> None:
+    def _fit_depths(self, places: CalibrationPoints, camera_rays: CameraRays) -> None:
         self.n_features_in_ = 3
-        self.rotation_, self.origin_, self.lens_ = bearings.rotation, bearings.origin_m, bearings.lens
+        self.rotation_, self.origin_, self.lens_ = (
+            camera_rays.rotation,
+            camera_rays.origin_m,
+            camera_rays.lens,
+        )
         points_m, world_m = places.points_m, places.world_m
-        depths_m = (world_m - bearings.origin_m) @ bearings.rotation[:, 2]
+        depths_m = (world_m - camera_rays.origin_m) @ camera_rays.rotation[:, 2]
         self.depth_, left_out = fit_depths(points_m, depths_m / points_m[:, 2] - 1)
         _, growth = depth_terms(points_m)
-        falls = (directions(points_m, bearings.lens) @ bearings.rotation.T)[:, 2]
+        falls = (directions(points_m, camera_rays.lens) @ camera_rays.rotation.T)[:, 2]
         noise_m2 = np.mean((left_out * points_m[:, 2] * falls / growth) ** 2) + _LEAST_NOISE**2
         self.heights_ = np.array([world_m[:, 2].mean(), world_m[:, 2].var(), noise_m2])
 

@@ -137,7 +137,7 @@ def drive_start_ns(settings: LabSettings, cameras: Sequence[Camera]) -> int:
     Examples
     --------
     >>> lab = LabSettings(stations=0, drive_s=2.0, markers=1)
-    >>> cameras = hang_cameras(lab)
+    >>> cameras = mount_cameras(lab)
     >>> (drive_start_ns(lab, cameras) - EPOCH_NS) / NS_PER_S
     1.0
     """

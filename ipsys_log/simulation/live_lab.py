@@ -163,7 +163,7 @@ def tape_sheet(stationary: Sequence[MarkerPose]) -> str:
 
     Examples
     --------
-    >>> print(tape_sheet([Place(3, 1.2192, 3.4384, 0.1, 0.0)]))
+    >>> print(tape_sheet([MarkerPose(3, 1.2192, 3.4384, 0.1, 0.0)]))
     marker,d_A_cm,d_B_cm,side,height_cm
     3,100.0,263.5,left,10.0
     <BLANKLINE>

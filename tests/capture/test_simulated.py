@@ -11,9 +11,9 @@ import numpy as np
 import pytest
 
 from ipsys_log.calibration.board import parse_board
-from ipsys_log.calibration.calibrate import Calibrated, calibrate_cameras
+from ipsys_log.calibration.calibrate import CalibrationResult, calibrate_cameras
 from ipsys_log.calibration.images import find_sources
-from ipsys_log.calibration.lens_models import find_lens
+from ipsys_log.calibration.lens_models import find_lens_model
 from ipsys_log.capture.frames import Clock, Frame
 from ipsys_log.capture.simulated import open_simulated, parse_source
 from ipsys_log.errors import IpsysError
@@ -148,8 +148,10 @@ def test_board_before_a_camera_gives_its_lens(text: str, tmp_path: Path) -> None
     for index in range(film.count):
         (folder / f"{index:03}.jpg").write_bytes(film.draw(index))
     board = parse_board(text, 0.03, 0.75, "DICT_4X4_50", False)
-    (result,) = calibrate_cameras(find_sources([folder], []), board, find_lens("fisheye"), lambda *_: None)
-    assert isinstance(result, Calibrated), result
+    (result,) = calibrate_cameras(
+        find_sources([folder], []), board, find_lens_model("fisheye"), lambda *_: None
+    )
+    assert isinstance(result, CalibrationResult), result
     true = mount_cameras(seat.lab)[seat.number].lens
     assert result.rms_px < 0.1
     assert math.isclose(result.lens.K[0, 0], true.K[0, 0], rel_tol=0.005)

@@ -66,10 +66,10 @@ def align(
     overlap by less than a marker. What it needs and the log does not hold yet is made first. Without a log
     it looks at what the cameras of the rig send now.
     """
-    from ipsys_log.report.files import check_picture
+    from ipsys_log.report.files import check_figure_file
 
     if plot is not None:
-        check_picture(plot, "--plot", logs or [])
+        check_figure_file(plot, "--plot", logs or [])
     if logs:
         options: dict[str, Any] = {
             "rig": rig,

@@ -117,7 +117,7 @@ def calibrate(
     from ipsys_log.calibration.images import find_sources
     from ipsys_log.calibration.lens_models import find_lens_model
     from ipsys_log.exchange.calibration_files import check_format
-    from ipsys_log.report.files import check_picture
+    from ipsys_log.report.files import check_figure_file
 
     model = find_lens_model(lens)
     wanted = parse_board(board, square, marker_scale, dictionary, inverted)
@@ -125,7 +125,7 @@ def calibrate(
     for name in names:
         check_format(name, lens)
     if plot is not None:
-        check_picture(plot, "--plot", sources or [])
+        check_figure_file(plot, "--plot", sources or [])
         _check_free(plot, force)
     lab = None if sources else _prepared_now(rig, camera, board)
     if lab is not None:
@@ -260,10 +260,10 @@ def _write(one: CalibrationResult, paths: dict[str, Path]) -> None:
 
 def _draw(lenses: list[CalibrationResult], plot: Path) -> None:
     from ipsys_log.report.calibration import calibration_figure
-    from ipsys_log.report.figures import picture
+    from ipsys_log.report.figures import figure_bytes
     from ipsys_log.report.files import write_files
 
-    write_files(plot.parent, {plot.name: picture(calibration_figure(lenses), plot, 110)})
+    write_files(plot.parent, {plot.name: figure_bytes(calibration_figure(lenses), plot, 110)})
 
 
 def _show(one: CalibrationResult, files: list[Path], for_rig: bool) -> None:

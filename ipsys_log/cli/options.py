@@ -143,14 +143,14 @@ def load_calibrations(
         For an option of another form, or a file that holds no calibration.
     """
     from ipsys_log.errors import IpsysError
-    from ipsys_log.exchange.calibration_files import read_lens
+    from ipsys_log.exchange.calibration_files import read_intrinsics
     from ipsys_log.log.dataset import Session
 
     lenses: dict[str, CameraCalibration] = {}
     for option in options or []:
         camera, equals, name = option.partition("=")
         if equals:
-            found = {camera: read_lens(Path(name), camera)}
+            found = {camera: read_intrinsics(Path(name), camera)}
         elif option.endswith(".mcap"):
             with Session([Path(option)]) as log:
                 held = {c: log.payloads([topic])[-1] for c, topic in log.calibrations.items()}
@@ -201,7 +201,7 @@ def load_lab(
     """
     from ipsys_log.capture.simulated import lens_of
     from ipsys_log.errors import IpsysError
-    from ipsys_log.exchange.calibration_files import read_lens
+    from ipsys_log.exchange.calibration_files import read_intrinsics
     from ipsys_log.rig.file import load_rig
     from ipsys_log.stages.detect import marker_detector
 
@@ -226,7 +226,7 @@ def load_lab(
     lenses = load_calibrations(calibration, lambda: names)
     for camera in cameras if with_lenses else ():
         if camera.name not in lenses and camera.calibration is not None:
-            lenses[camera.name] = read_lens(rig.parent / camera.calibration, camera.name)
+            lenses[camera.name] = read_intrinsics(rig.parent / camera.calibration, camera.name)
         elif camera.name not in lenses and str(camera.source).startswith("sim:"):
             lenses[camera.name] = lens_of(camera)
     strange = sorted(set(lenses) - set(names))

@@ -182,8 +182,10 @@ def _camera_json(one: Alignment) -> dict[str, Any]:
     return {
         "camera": one.camera,
         "places": len(one.floor_markers),
-        "markers": sorted({lying.marker_id for lying in one.floor_markers}),
-        "raised": [{"marker": lying.marker_id, "above_cm": m * CM_PER_M} for lying, m in one.raised_markers],
+        "markers": sorted({marker.marker_id for marker in one.floor_markers}),
+        "raised": [
+            {"marker": marker.marker_id, "above_cm": m * CM_PER_M} for marker, m in one.raised_markers
+        ],
         "spread_cm": _scaled(one.spread_m, CM_PER_M),
         "spread_after_cm": _scaled(one.remaining_m, CM_PER_M),
         "level": one.level,

@@ -17,7 +17,7 @@ from rich.table import Table
 
 from ipsys_log.calibration.calibrate import CalibrationResult
 from ipsys_log.calibration.image_selection import ExcludedSighting
-from ipsys_log.report.figures import NOTE, REST, shorten, strip
+from ipsys_log.report.figures import NOTE, REST, shorten, style_axes
 
 __all__ = ["calibration_figure", "calibration_json", "calibration_lines", "calibration_table"]
 
@@ -87,7 +87,7 @@ def _draw_cloud(axes: Axes, found: CalibrationResult) -> None:
     outside = int((~inside).sum())
     title = f"RMS {found.rms_px:.3f} px (circle), median {found.median_px:.3f}"
     axes.set_title(title + (f"\n{outside} farther out" if outside else "\n"), loc="left", fontsize=10)
-    strip(axes)
+    style_axes(axes)
 
 
 def _draw_pictures(axes: Axes, found: CalibrationResult) -> None:
@@ -102,7 +102,7 @@ def _draw_pictures(axes: Axes, found: CalibrationResult) -> None:
     axes.set_title(
         f"{len(found.used)} pictures used of {found.examined_count}{suffix}\n", loc="left", fontsize=10
     )
-    strip(axes, "x")
+    style_axes(axes, "x")
 
 
 _SHOWN_DROPPED = 6

@@ -21,7 +21,7 @@ from ipsys_log.models.table import AppliedModel
 from ipsys_log.models.uncertainty import Uncertainty
 from ipsys_log.units import CM_PER_M
 
-__all__ = ["PlannedFloor", "fitted_view", "means_cm", "mesh", "plan_floor"]
+__all__ = ["PlannedFloor", "means_cm", "mesh", "plan_floor", "view_of_model"]
 
 Array = NDArray[np.float64]
 Lenses = Mapping[str, CameraCalibration]
@@ -102,7 +102,9 @@ def plan_floor(
     """
     model: Model = session.payloads(session.topics(MODEL, run))[-1]
     views = [
-        fitted_view(model.name, camera, lenses.get(camera.camera)) for camera in model.cameras if camera.pairs
+        view_of_model(model.name, camera, lenses.get(camera.camera))
+        for camera in model.cameras
+        if camera.pairs
     ]
     if not views:
         raise IpsysError(f"run {run}: its model does not say on which places it was fitted; fit it again")
@@ -126,7 +128,7 @@ def plan_floor(
     return PlannedFloor(model.name, run, rig, plan, xs_m, ys_m, height_m, measured_m, notes)
 
 
-def fitted_view(name: str, camera: CameraModel, lens: CameraCalibration | None) -> FittedCamera:
+def view_of_model(name: str, camera: CameraModel, lens: CameraCalibration | None) -> FittedCamera:
     """Return the view of a fitted camera; ``name`` is the name of its model, ``lens`` None if not known."""
     points_m, world_m = (np.array([getattr(p, key) for p in camera.pairs]) for key in ("camera_m", "world_m"))
     arrays = {p.name: p.values.reshape(p.shape) for p in camera.parameters}

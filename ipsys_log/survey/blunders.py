@@ -23,19 +23,19 @@ from ipsys_log.survey.scene import Prediction
 from ipsys_log.units import CM_PER_M
 
 __all__ = [
-    "THE_MODEL",
-    "doubt_crossing",
-    "doubt_floor",
-    "doubt_model",
-    "doubt_tapes",
+    "MODEL_NAME",
     "floor_sigma_m",
+    "warn_crossing",
+    "warn_floor",
+    "warn_model",
+    "warn_tapes",
     "with_tape",
 ]
 
 Array = NDArray[np.float64]
 
 # The name of a model from a log, in a warning.
-THE_MODEL = "the model"
+MODEL_NAME = "the model"
 # Standard deviation of a tape if the rig gives none. It only serves to estimate the precision of a point.
 _USUAL_TAPE_M = 0.003
 # A residual of a distance above this value, and above three sigmas, is a reading error.
@@ -61,7 +61,7 @@ def _outside_m(point_m: Array, rig: Rig) -> float:
     return float(np.hypot(*beyond_m))
 
 
-def doubt_floor(read: Measurement, fixed: TapePoint, rig: Rig) -> tuple[bool | None, list[str]]:
+def warn_floor(read: Measurement, fixed: TapePoint, rig: Rig) -> tuple[bool | None, list[str]]:
     """Return whether a point lies on the floor (None without a floor in the rig), and a warning."""
     if rig.floor is None:
         return None, []
@@ -77,7 +77,7 @@ def doubt_floor(read: Measurement, fixed: TapePoint, rig: Rig) -> tuple[bool | N
     return False, [text]
 
 
-def doubt_tapes(read: Measurement, fixed: TapePoint, rig: Rig) -> list[str]:
+def warn_tapes(read: Measurement, fixed: TapePoint, rig: Rig) -> list[str]:
     """Return a warning if the distances of a measurement contradict one another."""
     sigma_m = with_tape(rig).tape_sigma_m or _USUAL_TAPE_M
     worst = int(np.abs(fixed.residuals_m).argmax())
@@ -87,7 +87,7 @@ def doubt_tapes(read: Measurement, fixed: TapePoint, rig: Rig) -> list[str]:
     return []
 
 
-def doubt_crossing(read: Measurement, rig: Rig) -> list[str]:
+def warn_crossing(read: Measurement, rig: Rig) -> list[str]:
     """Return a warning if the tapes cross at an angle that is too flat."""
     return [
         f"{_tapes(read)}: the tapes cross at {flat.angle_deg:.0f} degrees only, so that the point is known "
@@ -103,12 +103,12 @@ def floor_sigma_m(fixed: TapePoint) -> float | None:
     return float(np.sqrt(np.linalg.eigvalsh(fixed.covariance_m2[:2, :2])[-1]))
 
 
-def doubt_model(
+def warn_model(
     read: Measurement,
     fixed: TapePoint,
     rig: Rig,
     predictions: Sequence[Prediction],
-    model_name: str = THE_MODEL,
+    model_name: str = MODEL_NAME,
 ) -> list[str]:
     """Return a warning if the model predicts another point, with the measuring mistake that explains it."""
     if not predictions:

@@ -22,13 +22,13 @@ from ipsys_log.stages.fit import fit_model
 
 __all__ = [
     "OTHER_ROWS",
+    "CameraView",
+    "MarkerObservations",
+    "MeasuringScene",
     "Prediction",
-    "Scene",
-    "Sight",
-    "Stop",
-    "View",
+    "StationaryInterval",
     "fit_neighbours",
-    "look",
+    "observe_marker",
     "predict",
     "visible_markers",
 ]
@@ -90,7 +90,7 @@ def _applied(model: Model) -> dict[str, AppliedModel]:
 
 
 @dataclass(frozen=True, slots=True, eq=False)
-class View:
+class CameraView:
     """The view of one camera.
 
     ``jpeg`` is the image taken at ``time_ns``; None without an image. ``markers`` are the markers detected in
@@ -109,7 +109,7 @@ class View:
 
 
 @dataclass(frozen=True, slots=True)
-class Stop:
+class StationaryInterval:
     """A stationary interval of a marker in a finished log; both ends belong to it."""
 
     marker_id: int
@@ -124,7 +124,7 @@ class Stop:
         return measurement.marker_id == self.marker_id and overlaps
 
 
-class Scene(Protocol):
+class MeasuringScene(Protocol):
     """The source of views for measuring: a finished log or live cameras.
 
     ``stops`` are the stationary intervals of a finished log, in order; empty during a recording. ``model``
@@ -138,9 +138,9 @@ class Scene(Protocol):
     def model(self) -> Model | None: ...
 
     @property
-    def stops(self) -> Sequence[Stop]: ...
+    def stops(self) -> Sequence[StationaryInterval]: ...
 
-    def views(self, stop: int | None) -> Sequence[View]:
+    def views(self, stop: int | None) -> Sequence[CameraView]:
         """Return the latest view of every camera, or the views of a stationary interval by its index."""
         ...
 
@@ -154,7 +154,7 @@ class Scene(Protocol):
 
 
 @dataclass(frozen=True, slots=True, eq=False)
-class Sight:
+class MarkerObservations:
     """The observations of one marker by all cameras.
 
     ``still`` is its stationary interval; None if it moves or is not seen. ``points_m`` are its mean camera
@@ -186,14 +186,14 @@ class Sight:
         return f"{name} lies still, seen by {', '.join(self.points_m)}"
 
 
-def look(views: Sequence[View], marker_id: int) -> Sight:
+def observe_marker(views: Sequence[CameraView], marker_id: int) -> MarkerObservations:
     """Combine the observations of a marker by all cameras; check whether the marker is stationary.
 
     Examples
     --------
     >>> from ipsys_log.messages import CameraPoint
     >>> seen = tuple(CameraPoints(n, (CameraPoint(7, 0.1, 0.2, 2.0),)) for n in (100, 200, 300))
-    >>> look([View("red", 300, points=seen), View("white", 300)], 7).text
+    >>> observe_marker([CameraView("red", 300, points=seen), CameraView("white", 300)], 7).text
     'marker 7 lies still, seen by red'
     """
     seen: dict[str, tuple[int, int, Array]] = {}
@@ -208,7 +208,7 @@ def look(views: Sequence[View], marker_id: int) -> Sight:
         times_ns = [time_ns + (point.time_offset_ns or 0) for time_ns, point in rows]
         seen[view.camera] = min(times_ns), max(times_ns), seen_m.mean(axis=0)
     if moving or not seen:
-        return Sight(marker_id, None, {}, tuple(moving))
+        return MarkerObservations(marker_id, None, {}, tuple(moving))
     # The last view of a camera may end before another camera sees the marker. Then the marker may have been
     # at another position, so this camera is left out.
     start_ns = end_ns = max(last_ns for _, last_ns, _ in seen.values())
@@ -217,10 +217,12 @@ def look(views: Sequence[View], marker_id: int) -> Sight:
             start_ns = min(start_ns, first_ns)
     points_m = {camera: mean_m for camera, (_, last_ns, mean_m) in seen.items() if last_ns >= start_ns}
     measured_as = _measured_as(views, marker_id, points_m)
-    return Sight(marker_id, Interval(start_ns, end_ns), points_m, measured_as=measured_as)
+    return MarkerObservations(marker_id, Interval(start_ns, end_ns), points_m, measured_as=measured_as)
 
 
-def _measured_as(views: Iterable[View], marker_id: int, points_m: Mapping[str, Array]) -> tuple[str, ...]:
+def _measured_as(
+    views: Iterable[CameraView], marker_id: int, points_m: Mapping[str, Array]
+) -> tuple[str, ...]:
     """Return the ids of the measurements of a marker at its present position, by all cameras with data."""
     same: dict[str, bool] = {}
     for view in views:
@@ -231,7 +233,7 @@ def _measured_as(views: Iterable[View], marker_id: int, points_m: Mapping[str, A
     return tuple(name for name, is_same in same.items() if is_same)
 
 
-def visible_markers(views: Iterable[View], rig: Rig) -> list[int]:
+def visible_markers(views: Iterable[CameraView], rig: Rig) -> list[int]:
     """Return the ids of the rig's markers that at least one camera sees, sorted."""
     ids = {point.id for view in views for points in view.points for point in points.points}
     return sorted(marker_id for marker_id in ids if rig.knows(marker_id))
@@ -243,7 +245,7 @@ OTHER_ROWS = "the other rows"
 _MODEL = "poly"
 
 
-def fit_neighbours(seen: Sequence[tuple[Measurement, Sight]], rig: Rig) -> Model | None:
+def fit_neighbours(seen: Sequence[tuple[Measurement, MarkerObservations]], rig: Rig) -> Model | None:
     """Fit a model to measurements, without the measurements that contradict the rest.
 
     Parameters
@@ -283,7 +285,7 @@ def fit_neighbours(seen: Sequence[tuple[Measurement, Sight]], rig: Rig) -> Model
         return None
 
 
-def _pairs(seen: Sequence[tuple[Measurement, Sight]], rig: Rig) -> dict[str, list[Pair]]:
+def _pairs(seen: Sequence[tuple[Measurement, MarkerObservations]], rig: Rig) -> dict[str, list[Pair]]:
     """Pair camera points and world points, by camera; a camera with too few pairs is left out."""
     pairs: dict[str, list[Pair]] = {}
     for measurement, sight in seen:

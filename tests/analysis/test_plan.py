@@ -18,7 +18,7 @@ from ipsys_log.geometry.trilateration import tape_covariance
 from ipsys_log.messages import CameraCalibration, Pair
 from ipsys_log.models.table import CalibrationPoints, fit_cameras, inputs
 from ipsys_log.models.uncertainty import Uncertainty
-from ipsys_log.report.plan import fitted_view
+from ipsys_log.report.plan import view_of_model
 from ipsys_log.stages.fit import fit_model
 
 Array = NDArray[np.float64]
@@ -157,7 +157,7 @@ def lab(seed: int, count: int = 12) -> tuple[list[Camera], dict[str, list[Pair]]
 
 def views_of(cameras: list[Camera], pairs: dict[str, list[Pair]], model: str = "best") -> list[FittedCamera]:
     fitted = {row.camera: row for row in fit_model(model, pairs, 0).cameras}
-    return [fitted_view(model, fitted[camera.name], camera.lens) for camera in cameras]
+    return [view_of_model(model, fitted[camera.name], camera.lens) for camera in cameras]
 
 
 def true_mean_error_m(cameras: list[Camera], pairs: dict[str, list[Pair]], model: str = "best") -> float:

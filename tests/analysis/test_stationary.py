@@ -8,7 +8,7 @@ import pytest
 from ipsys_log.analysis.pairs import Sightings
 from ipsys_log.analysis.stationary import is_stationary, stationary_intervals
 from ipsys_log.messages import CameraPoint, CameraPoints
-from ipsys_log.survey.scene import View, look
+from ipsys_log.survey.scene import CameraView, observe_marker
 from ipsys_log.units import NS_PER_S
 from tests import labs
 
@@ -75,18 +75,18 @@ def test_a_depth_that_jitters_at_the_edge_of_the_picture_is_no_motion() -> None:
 
 
 def test_the_last_second_of_a_recording() -> None:
-    def view(path: Array, camera: str = "red", first: int = 0) -> View:
+    def view(path: Array, camera: str = "red", first: int = 0) -> CameraView:
         rows = [CameraPoints(n, (CameraPoint(3, *point),)) for n, point in enumerate(path.tolist(), first)]
-        return View(camera, len(rows), points=tuple(rows))
+        return CameraView(camera, len(rows), points=tuple(rows))
 
     still, moves = laid((1, 0, 0)), laid((1, 0.05, 0))
-    assert look([view(still)], 3).state == "still"
-    assert look([view(still), view(moves, "white")], 3).moving == ("white",)
-    assert look([view(still)], 4).state == "unseen"
+    assert observe_marker([view(still)], 3).state == "still"
+    assert observe_marker([view(still), view(moves, "white")], 3).moving == ("white",)
+    assert observe_marker([view(still)], 4).state == "unseen"
     # A single sighting says nothing.
-    assert look([view(still[:1])], 3).state == "unseen"
+    assert observe_marker([view(still[:1])], 3).state == "unseen"
     # What another camera saw before it came into view here may have been another place.
-    later = look([view(still, "white", 10), view(still[:10])], 3)
+    later = observe_marker([view(still, "white", 10), view(still[:10])], 3)
     assert later.still is not None
     assert (later.still.start, list(later.points_m)) == (10, ["white"])
-    assert list(look([view(still, "white", 9), view(still[:10])], 3).points_m) == ["white", "red"]
+    assert list(observe_marker([view(still, "white", 9), view(still[:10])], 3).points_m) == ["white", "red"]

@@ -21,8 +21,8 @@ from threadpoolctl import threadpool_limits
 
 from ipsys_log.analysis.accuracy import error_statistics
 from ipsys_log.analysis.calibration_points import measured
-from ipsys_log.analysis.cross_validation import cross_validate, gather_places, labelled_subsets
-from ipsys_log.analysis.pairs import Measured, build_pairs, gather_sightings
+from ipsys_log.analysis.cross_validation import cross_validate, gather_points, labelled_subsets
+from ipsys_log.analysis.pairs import RiggedMeasurement, build_pairs, gather_sightings
 from ipsys_log.exchange.imsel import read_imsel
 from ipsys_log.log.dataset import Session
 from ipsys_log.messages import Pair
@@ -37,7 +37,7 @@ from ipsys_log.stages.fit import fit_model
 FIRST_SEED = 1000
 
 
-def read(folder: Path) -> tuple[dict[str, list[Pair]], list[Measured]]:
+def read(folder: Path) -> tuple[dict[str, list[Pair]], list[RiggedMeasurement]]:
     with tempfile.TemporaryDirectory() as work:
         log = Path(work) / "imsel.mcap"
         write_log(log, read_imsel(folder))
@@ -57,7 +57,7 @@ def quiet(done: int, total: int) -> None:
     """Ignore the progress."""
 
 
-def times(pairs: dict[str, list[Pair]], places: list[Measured]) -> dict[str, object]:
+def times(pairs: dict[str, list[Pair]], places: list[RiggedMeasurement]) -> dict[str, object]:
     """Return the seconds of a fit with its uncertainty, and of a full evaluation of each model."""
     measurements = [place.measurement for place in places]
     held_out = {m.id for m in measurements if "test" in m.splits}
@@ -68,7 +68,7 @@ def times(pairs: dict[str, list[Pair]], places: list[Measured]) -> dict[str, obj
         fits[name] = timed(lambda name=name: fit_model(name, pairs, 0))  # type: ignore[misc]
         studies[name] = timed(lambda model=model: evaluate_model(model, study, 0, [], quiet))  # type: ignore[misc]
         print(f"{name:<26} fit {fits[name]:6.2f} s, study {studies[name]:6.2f} s", file=sys.stderr)
-    cameras = gather_places(pairs)
+    cameras = gather_points(pairs)
     both = {
         name: timed(lambda name=name: validated(name, cameras, 0))  # type: ignore[misc]
         for name in ("poly", "rayplane")
@@ -96,7 +96,7 @@ def validated(name: str, cameras: dict, seed: int, axes: int = 3) -> float:  # t
 
 
 def accuracy(pairs: dict[str, list[Pair]], seeds: int) -> dict[str, object]:
-    cameras = gather_places(pairs)
+    cameras = gather_points(pairs)
     numbers = range(FIRST_SEED, FIRST_SEED + seeds)
     errors_cm = {name: [validated(name, cameras, seed) for seed in numbers] for name in ("poly", "best")}
     flat = [validated("rayplane", cameras, seed, axes=2) for seed in numbers]

@@ -14,13 +14,13 @@ import numpy as np
 from numpy.typing import NDArray
 
 from ipsys_log import simulation
-from ipsys_log.geometry.marker_cells import true_corners
+from ipsys_log.geometry.marker_cells import project_corners
 from ipsys_log.log.dataset import Session
 from ipsys_log.messages import CompressedImage, Message
 from ipsys_log.messages.channels import TRUTH
 from ipsys_log.runs.output import write_log
-from ipsys_log.simulation.calibration_points import Place, place
-from ipsys_log.simulation.cameras import hang_cameras
+from ipsys_log.simulation.calibration_points import MarkerPose, place_marker
+from ipsys_log.simulation.cameras import mount_cameras
 from ipsys_log.simulation.lab import simulate
 from ipsys_log.simulation.settings import LabSettings
 
@@ -89,16 +89,16 @@ def blocks(path: Path, instants: int) -> list[tuple[int, int]]:
 
 def truth(path: Path, settings: LabSettings) -> dict[tuple[str, int], Truth]:
     """Return the ground truth of each frame, by camera and publish time in ns."""
-    cameras = hang_cameras(settings)
+    cameras = mount_cameras(settings)
     truths = {}
     with Session([path]) as session:
         for tracks in session.payloads(session.topics(TRUTH)):
             for camera in cameras:
                 px = {}
                 for track in tracks.tracks:
-                    where = Place(track.id, track.x_m, track.y_m, track.z_m, track.heading_rad)
-                    printed = place(where, settings)
-                    px[track.id] = true_corners(camera.lens, camera.camera_from_world, printed)
+                    where = MarkerPose(track.id, track.x_m, track.y_m, track.z_m, track.heading_rad)
+                    printed = place_marker(where, settings)
+                    px[track.id] = project_corners(camera.lens, camera.camera_from_world, printed)
                 whole = frozenset(track.id for track in tracks.tracks if camera.name in track.cameras)
                 truths[camera.name, tracks.timestamp] = Truth(px, whole)
     return truths

@@ -8,16 +8,16 @@ from typing import TYPE_CHECKING, Any
 
 if TYPE_CHECKING:
     from ipsys_log.api import (
-        Calibrated,
+        CalibrationResult,
         Comparison,
-        Evaluated,
         Failure,
         FittedModel,
         Listing,
         LiveTracks,
         Log,
+        ModelEvaluation,
         Outcome,
-        Replayed,
+        ReplayResult,
         Tracker,
         calibrate,
         live,
@@ -29,17 +29,17 @@ if TYPE_CHECKING:
     from ipsys_log.errors import IpsysError
 
 __all__ = [
-    "Calibrated",
+    "CalibrationResult",
     "Comparison",
-    "Evaluated",
     "Failure",
     "FittedModel",
     "IpsysError",
     "Listing",
     "LiveTracks",
     "Log",
+    "ModelEvaluation",
     "Outcome",
-    "Replayed",
+    "ReplayResult",
     "Tracker",
     "calibrate",
     "live",

@@ -17,7 +17,7 @@ import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
 from ipsys_log.analysis.differences import Comparison
-from ipsys_log.calibration.calibrate import Calibrated, Failure
+from ipsys_log.calibration.calibrate import CalibrationResult, Failure
 from ipsys_log.errors import IpsysError
 from ipsys_log.log.contents import run_of_topic
 from ipsys_log.log.dataset import Session
@@ -41,16 +41,16 @@ if TYPE_CHECKING:
     import pandas as pd
 
 __all__ = [
-    "Calibrated",
+    "CalibrationResult",
     "Comparison",
-    "Evaluated",
     "Failure",
     "FittedModel",
     "Listing",
     "LiveTracks",
     "Log",
+    "ModelEvaluation",
     "Outcome",
-    "Replayed",
+    "ReplayResult",
     "Tracker",
     "calibrate",
     "live",
@@ -276,7 +276,7 @@ def open(*paths: StrPath) -> Log:
 
 
 @dataclass(frozen=True, slots=True)
-class Evaluated:
+class ModelEvaluation:
     """The evaluation of a model: its errors on held-out and cross-validated calibration points."""
 
     model: str
@@ -303,11 +303,11 @@ class Evaluated:
 
 
 @dataclass(frozen=True, slots=True)
-class Replayed:
+class ReplayResult:
     """The result of a replay: an outcome for each stage, and by model its evaluation."""
 
     outcomes: tuple[Outcome, ...]
-    evaluations: Mapping[str, Evaluated]
+    evaluations: Mapping[str, ModelEvaluation]
 
 
 def replay(
@@ -328,7 +328,7 @@ def replay(
     parameters: Mapping[str, str] | None = None,
     progress: Progress = lambda stage, done, total: None,
     say: Callable[[str], None] = lambda text: None,
-) -> Replayed:
+) -> ReplayResult:
     """Compute the results that logs lack, and append them to the last log or write them to ``output``.
 
     Parameters
@@ -370,15 +370,15 @@ def replay(
     outcomes = pipeline.replay(logs, request, until, target, progress, say)
     written = [target] if target is not None and target.exists() else []
     with Session([*logs, *written]) as session:
-        return Replayed(tuple(outcomes), _evaluations(session, outcomes))
+        return ReplayResult(tuple(outcomes), _evaluations(session, outcomes))
 
 
-def _evaluations(session: Session, outcomes: Sequence[Outcome]) -> dict[str, Evaluated]:
+def _evaluations(session: Session, outcomes: Sequence[Outcome]) -> dict[str, ModelEvaluation]:
     runs = dict.fromkeys(outcome.run for outcome in outcomes)
-    evaluations: dict[str, Evaluated] = {}
+    evaluations: dict[str, ModelEvaluation] = {}
     for run in runs:
         for evaluation in session.payloads(session.topics(EVALUATION, run)):
-            evaluations[evaluation.model] = Evaluated(evaluation.model, run, evaluation)
+            evaluations[evaluation.model] = ModelEvaluation(evaluation.model, run, evaluation)
     return evaluations
 
 
@@ -475,7 +475,7 @@ def calibrate(
     cameras: Sequence[str] = (),
     force: bool = False,
     progress: Progress = lambda stage, done, total: None,
-) -> Iterator[Calibrated | Failure]:
+) -> Iterator[CalibrationResult | Failure]:
     """Calibrate camera intrinsics from images of a chessboard or a ChArUco board.
 
     Parameters
@@ -499,12 +499,12 @@ def calibrate(
     from ipsys_log.calibration.board import parse_board
     from ipsys_log.calibration.calibrate import calibrate_cameras
     from ipsys_log.calibration.images import find_sources
-    from ipsys_log.calibration.lens_models import find_lens
+    from ipsys_log.calibration.lens_models import find_lens_model
 
-    model = find_lens(lens)
+    model = find_lens_model(lens)
     wanted = parse_board(board, square_m, marker_scale, dictionary, inverted)
     images = find_sources([Path(source) for source in sources], list(cameras))
-    return calibrate_cameras(images, wanted, model, progress, insist=force)
+    return calibrate_cameras(images, wanted, model, progress, force=force)
 
 
 class LiveTracks(NamedTuple):

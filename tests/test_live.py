@@ -46,10 +46,10 @@ from ipsys_log.runs.verify import diff, verify
 from ipsys_log.runs.view import LogView
 from ipsys_log.sinks.sink import Consumer
 from ipsys_log.stages.detect import Detect
-from ipsys_log.survey.checks import check_entry, withdraw
-from ipsys_log.survey.entry import Typed, read_typed
+from ipsys_log.survey.checks import check_entry, withdrawal_of
+from ipsys_log.survey.entry import TypedEntry, parse_entry
 from ipsys_log.survey.live import LiveScene
-from ipsys_log.survey.scene import look
+from ipsys_log.survey.scene import observe_marker
 from tests.conftest import Ipsys
 from tests.playing import SteppedClock, cameras, playing
 
@@ -228,7 +228,7 @@ def test_a_place_measured_since_is_said_and_no_difference(
     with Session([log]) as session:
         last = session.payloads(["/measurements"])[-1]
         time_ns = session.end_ns + 1
-    append_messages(log, [Message("/measurements", time_ns, time_ns, withdraw([last], last.id))])
+    append_messages(log, [Message("/measurements", time_ns, time_ns, withdrawal_of([last], last.id))])
     done = ipsys("verify", log)
     assert done.code == 0, done.out
     assert "its fit is not verified: ipsys replay makes it again" in done.err
@@ -575,16 +575,16 @@ def test_a_place_is_measured_while_it_is_recorded_and_a_model_is_fitted_to_it(
         def measure(message: Message | None) -> None:
             scene(message)
             for marker_id, one in wanted.items():
-                sight = look(scene.views(None), marker_id)
+                sight = observe_marker(scene.views(None), marker_id)
                 if marker_id in saved or sight.state != "still" or len(sight.points_m) == 0:
                     continue
-                typed = Typed(
+                typed = TypedEntry(
                     marker=str(marker_id),
                     distances={d.reference: f"{100 * d.distance_m:.2f}" for d in one.distances},
                     side=one.side or "",
                     height=f"{100 * (one.height_m or 0):.2f}",
                 )
-                entry, wrong = read_typed(typed, rig)
+                entry, wrong = parse_entry(typed, rig)
                 checked = check_entry(entry, wrong, rig, sight, scene.history(), model)
                 assert checked.measurement is not None, checked.faults
                 scene.add([checked.measurement])

@@ -29,20 +29,20 @@ from ipsys_log.log.dataset import Session
 from ipsys_log.messages import MEASUREMENTS_TOPIC, Measurement, Pair
 from ipsys_log.messages.channels import MEASUREMENTS, MODEL
 from ipsys_log.runs.options import Request
-from ipsys_log.survey.checks import check_entry, withdraw
-from ipsys_log.survey.entry import Typed, read_typed
-from ipsys_log.survey.from_log import opened_log
-from ipsys_log.survey.scene import look
+from ipsys_log.survey.checks import check_entry, withdrawal_of
+from ipsys_log.survey.entry import TypedEntry, parse_entry
+from ipsys_log.survey.from_log import open_finished_log
+from ipsys_log.survey.scene import observe_marker
 from tests.conftest import Ipsys, Unmeasured, data_section
 from tests.test_bad_input import refused, rewrite
 
 
-def as_typed(measurement: Measurement) -> Typed:
+def as_typed(measurement: Measurement) -> TypedEntry:
     """A measurement as somebody would type it, to a tenth of a millimetre."""
     distances = {d.reference: f"{100 * d.distance_m:.2f}" for d in measurement.distances}
     height = f"{100 * (measurement.height_m or 0):.2f}"
     split = " ".join(measurement.splits)
-    return Typed(str(measurement.marker_id), distances, measurement.side or "", height, split)
+    return TypedEntry(str(measurement.marker_id), distances, measurement.side or "", height, split)
 
 
 def sheet(path: Path, tape: Iterable[Measurement], **columns: list[str]) -> Path:
@@ -128,20 +128,20 @@ def fitted_ids(log: Path, run: str) -> set[str]:
 
 def test_one_place_its_undo_and_what_a_fit_makes_of_both(ipsys: Ipsys, unmeasured: Unmeasured) -> None:
     log, tape = unmeasured
-    with opened_log(log, Request()) as scene:
+    with open_finished_log(log, Request()) as scene:
         for one in tape[8:20]:
             (stop,) = (n for n, stop in enumerate(scene.stops) if stop.covers(one))
             typed = as_typed(one)
-            sight = look(scene.views(stop), int(typed.marker))
+            sight = observe_marker(scene.views(stop), int(typed.marker))
             history = scene.history()
-            checked = check_entry(*read_typed(typed, scene.rig), scene.rig, sight, history, scene.model)
+            checked = check_entry(*parse_entry(typed, scene.rig), scene.rig, sight, history, scene.model)
             assert checked.measurement is not None, checked.faults
             scene.add([checked.measurement])
         assert ipsys("replay", log, "--model", "rigid").code == 0
         gone = min(fitted_ids(log, "rigid"))
-        scene.add([withdraw(scene.history(), gone)])
+        scene.add([withdrawal_of(scene.history(), gone)])
         with pytest.raises(IpsysError, match=f"no measurement {gone} to withdraw"):
-            withdraw(scene.history(), gone)
+            withdrawal_of(scene.history(), gone)
     assert ipsys("replay", log, "--model", "rigid").code == 0
     assert fitted_ids(log, "rigid") - fitted_ids(log, "rigid_2") == {gone}
     rows = foreign_read(log)
@@ -161,7 +161,7 @@ def test_rows_of_a_marker_in_order_and_by_place(ipsys: Ipsys, unmeasured: Unmeas
     assert f"places in it: {len(mine)}; {needed}" in done.err
     assert f"then: ipsys replay {log}" in done.err
     other = [one for one in tape if one.marker_id == 4][:2]
-    with opened_log(log, Request()) as scene:
+    with open_finished_log(log, Request()) as scene:
         numbers = [str(next(n for n, s in enumerate(scene.stops, 1) if s.covers(one))) for one in other]
     assert ipsys("measure", log, "--csv", sheet(tmp_path / "b.csv", other, place=numbers)).code == 0
     with Session([log]) as session:
@@ -247,7 +247,7 @@ def test_a_log_that_is_locked_gone_or_not_to_be_written(ipsys: Ipsys, unmeasured
 
 def test_two_people_at_one_log(unmeasured: Unmeasured) -> None:
     log, tape = unmeasured
-    with opened_log(log, Request()) as one, opened_log(log, Request()) as other:
+    with open_finished_log(log, Request()) as one, open_finished_log(log, Request()) as other:
         one.add([Measurement(tape[0].timestamp, "p001", marker_id=0)])
         with pytest.raises(LogError, match="somebody else measured in this log meanwhile"):
             other.add([Measurement(tape[0].timestamp, "p001", marker_id=0)])
@@ -255,8 +255,8 @@ def test_two_people_at_one_log(unmeasured: Unmeasured) -> None:
         assert [m.id for m in other.history()] == ["p001"]
         other.add([Measurement(tape[0].timestamp, "p002", marker_id=0)])
         with pytest.raises(LogError, match=r"meanwhile \(p002\), so this is not written yet"):
-            one.add([withdraw(one.history(), "p001")])
-        one.add([withdraw(one.history(), "p001")])
+            one.add([withdrawal_of(one.history(), "p001")])
+        one.add([withdrawal_of(one.history(), "p001")])
         with pytest.raises(LogError, match="p001_withdrawn"):
             other.add([Measurement(tape[0].timestamp, "p003", marker_id=0)])
         assert [m.id for m in active_measurements(other.history())] == ["p002"]
@@ -299,7 +299,7 @@ def test_the_terminal_asks_checks_and_undoes(
     ipsys: Ipsys, unmeasured: Unmeasured, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     log, tape = unmeasured
-    with opened_log(log, Request()) as scene:
+    with open_finished_log(log, Request()) as scene:
         first = as_typed(next(one for one in tape if scene.stops[0].covers(one)))
     a, b = first.distances.values()
     answers = [a, "1.234", b, first.side[0], first.height, "", "u", "q"]
@@ -320,7 +320,7 @@ def test_a_bad_answer_in_the_terminal_costs_that_answer_only(
     unmeasured: Unmeasured, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
 ) -> None:
     log, tape = unmeasured
-    with opened_log(log, Request()) as scene:
+    with open_finished_log(log, Request()) as scene:
         first = as_typed(next(one for one in tape if scene.stops[0].covers(one)))
         a, b = first.distances.values()
         script = [
@@ -365,7 +365,7 @@ def test_in_the_terminal_somebody_else_may_measure_meanwhile(
     unmeasured: Unmeasured, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
 ) -> None:
     log, tape = unmeasured
-    with opened_log(log, Request()) as scene, opened_log(log, Request()) as other:
+    with open_finished_log(log, Request()) as scene, open_finished_log(log, Request()) as other:
         first = as_typed(next(one for one in tape if scene.stops[0].covers(one)))
         a, b = first.distances.values()
         answers = iter([a, b, first.side[0], first.height, "y", "y", "q"])

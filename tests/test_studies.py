@@ -133,7 +133,7 @@ def test_a_position_outside_the_measured_volume_says_so(tmp_path: Path) -> None:
 
 def test_a_model_out_of_a_log_predicts_what_it_predicted(ipsys: Ipsys, tmp_path: Path) -> None:
     """To 1e-9 m, for every model in the table, by way of the numbers in the log."""
-    from ipsys_log.models.table import MODELS, AppliedModel, Places, fit_cameras, inputs
+    from ipsys_log.models.table import MODELS, AppliedModel, CalibrationPoints, fit_cameras, inputs
 
     log = made(tmp_path / "lab.mcap", labels=lambda n: ("train",))
     options = [option for name in MODELS for option in ("--model", name)]
@@ -149,7 +149,7 @@ def test_a_model_out_of_a_log_predicts_what_it_predicted(ipsys: Ipsys, tmp_path:
         (camera,) = model.cameras
         points = np.array([pair.camera_m for pair in camera.pairs])
         world = np.array([pair.world_m for pair in camera.pairs])
-        places = Places(points, world, tuple(pair.measurement for pair in camera.pairs))
+        places = CalibrationPoints(points, world, tuple(pair.measurement for pair in camera.pairs))
         fresh = fit_cameras(model.name, {"red": places})["red"]
         np.testing.assert_allclose(
             AppliedModel(model.name, camera).predict(points, world[:, 2]),

@@ -30,7 +30,7 @@ from ipsys_log.runs.options import Request
 from ipsys_log.sinks.rerun.live import LiveView, Write
 from ipsys_log.sinks.rerun.recording import write_recording
 from ipsys_log.sinks.sink import LiveQueue
-from ipsys_log.survey.from_log import opened_log
+from ipsys_log.survey.from_log import open_finished_log
 from ipsys_log.survey.live import LiveScene
 
 Grey = NDArray[np.uint8]
@@ -90,7 +90,7 @@ def test_positions_are_those_of_the_pictures(video: Path, lab: Path) -> None:
 
 def test_while_measuring_on_a_finished_log_each_place_is_shown_as_it_was(video: Path) -> None:
     """Most of these frames are no keyframes."""
-    with opened_log(video, Request()) as scene:
+    with open_finished_log(video, Request()) as scene:
         pictures = {camera: decoded(video, camera) for camera in ("black", "red", "white")}
         found = found_markers(video)
         shown = 0

@@ -8,7 +8,7 @@ import numpy as np
 from numpy.typing import NDArray
 from scipy.stats import chi2
 
-from ipsys_log.analysis.cross_validation import cross_validate, gather_places
+from ipsys_log.analysis.cross_validation import cross_validate, gather_points
 from ipsys_log.analysis.pairs import level_cameras
 from ipsys_log.messages import CameraEvaluation, CameraModel, ErrorStatistics, Model, Pair, Residual
 from ipsys_log.models.table import AppliedModel, reads_height
@@ -19,8 +19,8 @@ __all__ = [
     "POOLED",
     "count_repeats",
     "error_statistics",
-    "errors_cross_validated",
-    "errors_held_out",
+    "evaluate_cross_validated",
+    "evaluate_held_out",
     "root_mean_square_m",
 ]
 
@@ -103,8 +103,8 @@ POOLED = ""
 _REGIONS = (0.68, 0.95)
 
 
-def errors_held_out(
-    model: Model, held_out: Mapping[str, Sequence[Pair]], truth: Mapping[str, Array]
+def evaluate_held_out(
+    model: Model, held_out: Mapping[str, Sequence[Pair]], ground_truth: Mapping[str, Array]
 ) -> list[CameraEvaluation]:
     """Return the errors of a model at held-out points, against the tape and, if known, the ground truth.
 
@@ -112,7 +112,7 @@ def errors_held_out(
     ----------
     model : the fitted model.
     held_out : calibration points by camera. Points that were used in the fit of the model do not count.
-    truth : true world points (3,) in m by id of the measurement; empty outside a simulated lab.
+    ground_truth : true world points (3,) in m by id of the measurement; empty outside a simulated lab.
 
     Returns
     -------
@@ -130,11 +130,11 @@ def errors_held_out(
             applied = AppliedModel(model.name, camera)
             points_m, world_m = _arrays(pairs)
             predictions[camera.camera] = (pairs, applied.predict(points_m, world_m[:, 2])[None])
-    return _rows(model, predictions, truth, HELD_OUT)
+    return _rows(model, predictions, ground_truth, HELD_OUT)
 
 
-def errors_cross_validated(
-    model: Model, pairs: Mapping[str, Sequence[Pair]], truth: Mapping[str, Array], seed: int
+def evaluate_cross_validated(
+    model: Model, pairs: Mapping[str, Sequence[Pair]], ground_truth: Mapping[str, Array], seed: int
 ) -> list[CameraEvaluation]:
     """Return cross-validated errors: repeated cross-validation over all calibration points.
 
@@ -145,7 +145,7 @@ def errors_cross_validated(
     ----------
     model : the model. Its name selects the model for each fold. The errors are compared with its covariances.
     pairs : all calibration points by camera.
-    truth : as in :func:`errors_held_out`.
+    ground_truth : as in :func:`evaluate_held_out`.
     seed : random seed of the folds.
 
     Raises
@@ -153,10 +153,10 @@ def errors_cross_validated(
     FitError
         Too few calibration points remain for the fit of a fold.
     """
-    cameras = gather_places(pairs)
+    cameras = gather_points(pairs)
     predicted = cross_validate(model.name, cameras, seed)
     predictions = {camera: (list(pairs[camera]), predicted[camera]) for camera in cameras}
-    return _rows(model, predictions, truth, CROSS_VALIDATION)
+    return _rows(model, predictions, ground_truth, CROSS_VALIDATION)
 
 
 def count_repeats(row: CameraEvaluation, rows: Sequence[CameraEvaluation]) -> int | None:
@@ -186,7 +186,7 @@ def _arrays(pairs: Sequence[Pair]) -> tuple[Array, Array]:
 def _rows(
     model: Model,
     found: Mapping[str, tuple[list[Pair], Array]],
-    truth: Mapping[str, Array],
+    ground_truth: Mapping[str, Array],
     scheme: str,
 ) -> list[CameraEvaluation]:
     """Return rows of errors; ``found`` has pairs and predictions (repeats, n, 3) of each camera."""
@@ -196,7 +196,7 @@ def _rows(
     for against in ("tape", "truth"):
         compared: list[tuple[Array, Array | None]] = []
         for camera, (pairs, predicted_m) in found.items():
-            known = {p.measurement: p.world_m for p in pairs} if against == "tape" else truth
+            known = {p.measurement: p.world_m for p in pairs} if against == "tape" else ground_truth
             keep = [n for n, pair in enumerate(pairs) if pair.measurement in known]
             if not keep:
                 continue

@@ -11,8 +11,8 @@ from typing import NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 
-from ipsys_log.analysis.coverage import Hung
-from ipsys_log.analysis.stationary import Lying
+from ipsys_log.analysis.coverage import MountedCamera
+from ipsys_log.analysis.stationary import StationaryMarker
 from ipsys_log.geometry.poses import invert_pose, make_pose, transform
 from ipsys_log.messages import CameraCalibration
 
@@ -40,10 +40,10 @@ class Alignment:
 
     Attributes
     ----------
-    lying : the markers of the fit. ``raised`` are markers outside the plane of the others, each with its
-        height above the plane in m.
+    floor_markers : the markers of the fit. ``raised_markers`` are markers outside the plane of the others,
+        each with its height above the plane in m.
     spread_m : spread of Zc, greatest minus least, corrected to the floor with measured heights; None for
-        fewer than two markers. ``left_m`` is the remaining spread after the correction of the tilt.
+        fewer than two markers. ``remaining_m`` is the remaining spread after the correction of the tilt.
     down : (3,), the plumb line in camera coordinates, a unit vector; None if it is unknown.
     sigma_rad : sigma of the tilt in its least accurate direction.
     axes : number of directions in which the tilt is known: 2; 1 for markers on a line; or 0.
@@ -51,10 +51,10 @@ class Alignment:
     """
 
     camera: str
-    lying: tuple[Lying, ...]
-    raised: tuple[tuple[Lying, float], ...] = ()
+    floor_markers: tuple[StationaryMarker, ...]
+    raised_markers: tuple[tuple[StationaryMarker, float], ...] = ()
     spread_m: float | None = None
-    left_m: float | None = None
+    remaining_m: float | None = None
     down: Array | None = None
     sigma_rad: float | None = None
     axes: int = 0
@@ -86,7 +86,9 @@ class Alignment:
         """Return the height of the camera above the floor, in m."""
         if self.down is None:
             return None
-        return float(np.median([marker.point_m @ self.down + marker.height_m for marker in self.lying]))
+        return float(
+            np.median([marker.point_m @ self.down + marker.height_m for marker in self.floor_markers])
+        )
 
 
 class _Plane(NamedTuple):
@@ -105,13 +107,13 @@ class _Plane(NamedTuple):
         normal = np.array([*-self.slopes, 1.0])
         return np.asarray(normal / np.linalg.norm(normal))
 
-    def misses_m(self, lying: Sequence[Lying]) -> Array:
+    def misses_m(self, markers: Sequence[StationaryMarker]) -> Array:
         """Return the apparent distances of markers below the floor, along Zc, (n,) in m."""
-        points_m, depths_m = _on_floor(lying, self.down)
+        points_m, depths_m = _on_floor(markers, self.down)
         return np.asarray(depths_m - self.start_m - points_m[:, :2] @ self.slopes)
 
 
-def align_camera(camera: str, lying: Sequence[Lying]) -> Alignment:
+def align_camera(camera: str, markers: Sequence[StationaryMarker]) -> Alignment:
     """Estimate the tilt of a camera against the plane of the markers on the floor.
 
     With five or more markers, the function detects and omits markers in another plane, such as on a box.
@@ -119,7 +121,7 @@ def align_camera(camera: str, lying: Sequence[Lying]) -> Alignment:
     Parameters
     ----------
     camera : its name.
-    lying : markers from :func:`ipsys_log.analysis.stationary.find_lying`, from camera points by
+    markers : markers from :func:`ipsys_log.analysis.stationary.find_stationary`, from camera points by
         ``--method pose``. Camera points by eq. (3) give a tilt that is too large by half. At (u, v), a tilt t
         increases Zc by a factor of about 1 + t u. It also reduces the marker's perimeter by 1 - t u / 2.
 
@@ -131,22 +133,22 @@ def align_camera(camera: str, lying: Sequence[Lying]) -> Alignment:
     --------
     >>> corners = [(-1.0, -0.5), (1.0, -0.5), (1.0, 0.5), (-1.0, 0.5)]
     >>> points = [np.array([x, y, 2.0 - 0.02 * x]) for x, y in corners]
-    >>> lying = [Lying(n, point, np.zeros((3, 3))) for n, point in enumerate(points)]
-    >>> found = align_camera("red", lying)
+    >>> markers = [StationaryMarker(n, point, np.zeros((3, 3))) for n, point in enumerate(points)]
+    >>> found = align_camera("red", markers)
     >>> round(found.spread_m, 3), round(math.degrees(found.tilt_rad), 2)
     (0.04, 1.15)
     >>> round(math.degrees(found.turns_rad[0]), 2)  # to the right, where markers are nearer
     1.15
     """
-    kept = _on_one_plane(lying)
-    used = tuple(marker for marker, keep in zip(lying, kept, strict=True) if keep)
+    kept = _on_one_plane(markers)
+    used = tuple(marker for marker, keep in zip(markers, kept, strict=True) if keep)
     if len(used) < 2:
         return Alignment(camera, used)
     plane = _fit_plane(used)
     misses_m = plane.misses_m(used)
     raised = tuple(
         (marker, -float(plane.misses_m([marker])[0] * plane.down[2]))
-        for marker, keep in zip(lying, kept, strict=True)
+        for marker, keep in zip(markers, kept, strict=True)
         if not keep
     )
     spread_m = float(np.ptp(_on_floor(used, plane.down)[1]))
@@ -161,28 +163,28 @@ def align_camera(camera: str, lying: Sequence[Lying]) -> Alignment:
     return Alignment(camera, used, raised, spread_m, left_m, plane.down, sigma_rad, plane.axes, uneven_m)
 
 
-def _on_floor(lying: Sequence[Lying], down: Array) -> tuple[Array, Array]:
+def _on_floor(markers: Sequence[StationaryMarker], down: Array) -> tuple[Array, Array]:
     """Return camera points (n, 3), and depths (n,) of the floor below them, corrected for marker heights."""
-    points_m = np.array([marker.point_m for marker in lying])
+    points_m = np.array([marker.point_m for marker in markers])
     # Along Zc, at the same (Xc, Yc), the distance to the floor is 1 / cos(tilt) times the distance along the
     # plumb line.
-    return points_m, points_m[:, 2] + np.array([marker.height_m for marker in lying]) / down[2]
+    return points_m, points_m[:, 2] + np.array([marker.height_m for marker in markers]) / down[2]
 
 
-def _sigmas(lying: Sequence[Lying], down: Array) -> Array:
+def _sigmas(markers: Sequence[StationaryMarker], down: Array) -> Array:
     """Return the standard deviations (n,) in m of the depths of the floor below markers."""
-    noise_m2 = np.array([down @ marker.covariance_m2 @ down for marker in lying])
-    depths_m = np.array([marker.point_m[2] for marker in lying])
+    noise_m2 = np.array([down @ marker.covariance_m2 @ down for marker in markers])
+    depths_m = np.array([marker.point_m[2] for marker in markers])
     return np.asarray(np.sqrt(noise_m2 + (_USUAL_DEPTH * depths_m) ** 2))
 
 
-def _fit_plane(lying: Sequence[Lying]) -> _Plane:
+def _fit_plane(markers: Sequence[StationaryMarker]) -> _Plane:
     """Fit a plane by weighted least squares, in directions in which markers are far enough apart."""
     plane = _Plane(0.0, np.zeros(2), 0, math.inf)
     for _ in range(3):  # marker heights are relative to the floor, which is unknown at first
-        sigmas_m = _sigmas(lying, plane.down)
+        sigmas_m = _sigmas(markers, plane.down)
         weights = sigmas_m**-2
-        points_m, depths_m = _on_floor(lying, plane.down)
+        points_m, depths_m = _on_floor(markers, plane.down)
         middle_m, depth_m = (np.average(v, axis=0, weights=weights) for v in (points_m[:, :2], depths_m))
         across_m = points_m[:, :2] - middle_m
         spreads, directions = np.linalg.eigh((weights * across_m.T) @ across_m)
@@ -194,13 +196,13 @@ def _fit_plane(lying: Sequence[Lying]) -> _Plane:
     return plane
 
 
-def _on_one_plane(lying: Sequence[Lying]) -> Mask:
+def _on_one_plane(markers: Sequence[StationaryMarker]) -> Mask:
     """Return a mask (n,) of the markers in the plane that contains most of them."""
-    count = len(lying)
+    count = len(markers)
     if count < _LEAST_TO_NAME:
         return np.ones(count, dtype=np.bool_)
     level = np.array([0.0, 0.0, 1.0])
-    sigmas_m, (points_m, depths_m) = _sigmas(lying, level), _on_floor(lying, level)
+    sigmas_m, (points_m, depths_m) = _sigmas(markers, level), _on_floor(markers, level)
     terms, triples = np.column_stack([points_m[:, :2], np.ones(count)]), _triples(count)
     areas = np.abs(np.linalg.det(terms[triples]))
     # Three markers that are nearly on a line do not determine a plane.
@@ -216,8 +218,8 @@ def _on_one_plane(lying: Sequence[Lying]) -> Mask:
     limits = np.maximum(_FLAT_M / sigmas_m, _FAR * max(1.0, best * (1 + 5 / (count - 3))))
     kept = np.asarray(off <= limits)
     if kept.sum() >= 3:  # repeat the fit with all consistent markers
-        plane = _fit_plane([marker for marker, keep in zip(lying, kept, strict=True) if keep])
-        kept = np.asarray(np.abs(plane.misses_m(lying)) / sigmas_m <= limits)
+        plane = _fit_plane([marker for marker, keep in zip(markers, kept, strict=True) if keep])
+        kept = np.asarray(np.abs(plane.misses_m(markers)) / sigmas_m <= limits)
     return kept
 
 
@@ -236,7 +238,9 @@ _APART_M = 0.15
 _ALIKE_M = 0.05
 
 
-def join_cameras(alignments: Sequence[Alignment], lenses: Mapping[str, CameraCalibration]) -> list[Hung]:
+def join_cameras(
+    alignments: Sequence[Alignment], lenses: Mapping[str, CameraCalibration]
+) -> list[MountedCamera]:
     """Return the cameras that common markers connect to the first camera, in common coordinates.
 
     Two cameras must see a common marker at the same time. The markers on the floor give the height and the
@@ -262,7 +266,7 @@ def join_cameras(alignments: Sequence[Alignment], lenses: Mapping[str, CameraCal
     if len(joined) < 2:
         return []
     return [
-        Hung(name, lenses[name], invert_pose(joined[name] @ _floor_from_camera(known[name])))
+        MountedCamera(name, lenses[name], invert_pose(joined[name] @ _floor_from_camera(known[name])))
         for name in known
         if name in joined
     ]
@@ -283,7 +287,7 @@ def _floor_from_camera(one: Alignment) -> Array:
 
 def _turn(one: Alignment, other: Alignment) -> Array | None:
     """Return the pose from the floor coordinates of one camera to those of another, (4, 4), or None."""
-    pairs = [(a, b) for a in one.lying for b in other.lying if _same(a, b)]
+    pairs = [(a, b) for a in one.floor_markers for b in other.floor_markers if _same(a, b)]
     if len(pairs) < 2:
         return None
     own_m, other_m = (
@@ -303,6 +307,6 @@ def _turn(one: Alignment, other: Alignment) -> Array | None:
     return make_pose(rotation, np.array([shift.real, shift.imag, 0.0]))
 
 
-def _same(one: Lying, other: Lying) -> bool:
+def _same(one: StationaryMarker, other: StationaryMarker) -> bool:
     """Return whether two cameras saw the same marker in overlapping stationary intervals."""
     return one.marker_id == other.marker_id and one.start_ns <= other.end_ns and other.start_ns <= one.end_ns

@@ -11,11 +11,11 @@ from numpy.typing import NDArray
 
 from ipsys_log.analysis.tape import reference_points
 from ipsys_log.errors import IpsysError
-from ipsys_log.geometry.trilateration import SIDES, multilaterate, side_of, sides_alike
+from ipsys_log.geometry.trilateration import SIDES, are_collinear, multilaterate, side_of
 from ipsys_log.messages import Distance, Measurement, Rig, WorldPoint
 from ipsys_log.units import CM_PER_M
 
-__all__ = ["Slip", "possible_slips"]
+__all__ = ["Blunder", "possible_blunders"]
 
 Array = NDArray[np.float64]
 
@@ -26,7 +26,7 @@ _FINE_M = 0.02
 
 
 @dataclass(frozen=True, slots=True)
-class Slip:
+class Blunder:
     """A possible blunder: ``kind`` as in a Suspect, its ``text``, and the ``corrected`` measurement."""
 
     kind: str
@@ -34,7 +34,7 @@ class Slip:
     corrected: Measurement
 
 
-def possible_slips(measurement: Measurement, rig: Rig, predicted_m: Array) -> list[list[Slip]]:
+def possible_blunders(measurement: Measurement, rig: Rig, predicted_m: Array) -> list[list[Blunder]]:
     """Return the possible blunders of a measurement, the simplest first.
 
     Parameters
@@ -57,27 +57,27 @@ def possible_slips(measurement: Measurement, rig: Rig, predicted_m: Array) -> li
     >>> rig = Rig("lab", "DICT_4X4_100", 0.2, reference_points=points)
     >>> tape = (Distance("A", 1.600), Distance("B", 1.414))
     >>> read = Measurement(0, "a", distances=tape, side="left", height_m=0.0)
-    >>> slips = possible_slips(read, rig, np.array([1.0, 1.0, 0.0]))
-    >>> [[slip.kind for slip in group] for group in slips]
+    >>> blunders = possible_blunders(read, rig, np.array([1.0, 1.0, 0.0]))
+    >>> [[blunder.kind for blunder in group] for group in blunders]
     [['side', 'swapped'], ['swapped'], ['distance', 'distance', 'height']]
-    >>> slips[2][0].text
+    >>> blunders[2][0].text
     'the distance to A reads 1.600 m; 1.41 m, 19 cm less, would fit'
     """
     taped = _as_taped(measurement, rig)
     if taped is None:
-        return [_height_slips(measurement, predicted_m)]
+        return [_height_blunders(measurement, predicted_m)]
     references_m = reference_points(taped, rig)
-    sides = list(_side_slips(taped, references_m))
+    sides = list(_side_blunders(taped, references_m))
     swaps = list(_swaps(taped))
     both = [
         replace(side, kind=swap.kind, text=f"{swap.text}, and {side.text}")
         for swap in swaps
-        for side in _side_slips(swap.corrected, references_m)
+        for side in _side_blunders(swap.corrected, references_m)
     ]
     # Without a tape reading, the distance comes from the world point.
     says = "reads" if measurement.distances else "comes to"
-    distances = list(_distance_slips(taped, references_m, predicted_m, says))
-    return [sides + swaps, both, distances + _height_slips(taped, predicted_m)]
+    distances = list(_distance_blunders(taped, references_m, predicted_m, says))
+    return [sides + swaps, both, distances + _height_blunders(taped, predicted_m)]
 
 
 def _as_taped(measurement: Measurement, rig: Rig) -> Measurement | None:
@@ -101,16 +101,16 @@ def _as_taped(measurement: Measurement, rig: Rig) -> Measurement | None:
     return replace(taped, point=None, side=side, height_m=height_m)
 
 
-def _side_slips(taped: Measurement, references_m: Array) -> Iterator[Slip]:
-    if taped.side in SIDES and sides_alike(references_m):
+def _side_blunders(taped: Measurement, references_m: Array) -> Iterator[Blunder]:
+    if taped.side in SIDES and are_collinear(references_m):
         other = "right" if taped.side == "left" else "left"
         first = taped.distances[0].reference
         second = next(tape.reference for tape in taped.distances if tape.reference != first)
         text = f"it lies {other} of the line from {first} to {second}, not {taped.side}"
-        yield Slip("side", text, replace(taped, side=other))
+        yield Blunder("side", text, replace(taped, side=other))
 
 
-def _swaps(taped: Measurement) -> Iterator[Slip]:
+def _swaps(taped: Measurement) -> Iterator[Blunder]:
     tapes = taped.distances
     for i, j in combinations(range(len(tapes)), 2):
         own = replace(tapes[i], distance_m=tapes[j].distance_m)
@@ -121,10 +121,12 @@ def _swaps(taped: Measurement) -> Iterator[Slip]:
             f"the distances to {own.reference} and {other.reference} look exchanged: "
             f"{own.distance_m:.3f} m to {own.reference} and {other.distance_m:.3f} m to {other.reference} fit"
         )
-        yield Slip("swapped", text, replace(taped, distances=tuple(swapped)))
+        yield Blunder("swapped", text, replace(taped, distances=tuple(swapped)))
 
 
-def _distance_slips(taped: Measurement, references_m: Array, predicted_m: Array, says: str) -> Iterator[Slip]:
+def _distance_blunders(
+    taped: Measurement, references_m: Array, predicted_m: Array, says: str
+) -> Iterator[Blunder]:
     for wrong, tape in enumerate(taped.distances):
         rest = [n for n in range(len(references_m)) if n != wrong]
         rest_m = np.array([taped.distances[n].distance_m for n in rest])
@@ -136,7 +138,7 @@ def _distance_slips(taped: Measurement, references_m: Array, predicted_m: Array,
         text = f"the distance to {tape.reference} {says} {_correction(tape.distance_m, right_m)}"
         tapes = [*taped.distances]
         tapes[wrong] = replace(tape, distance_m=right_m)
-        yield Slip("distance", text, replace(taped, distances=tuple(tapes)))
+        yield Blunder("distance", text, replace(taped, distances=tuple(tapes)))
 
 
 def _nearest(references_m: Array, distances_m: Array, predicted_m: Array) -> Array:
@@ -145,12 +147,12 @@ def _nearest(references_m: Array, distances_m: Array, predicted_m: Array) -> Arr
         towards_m = predicted_m - references_m[0]
         point_m: Array = references_m[0] + towards_m * (distances_m[0] / max(np.hypot(*towards_m), 1e-9))
         return point_m
-    sides = SIDES if sides_alike(references_m) else (None,)
+    sides = SIDES if are_collinear(references_m) else (None,)
     solutions = [multilaterate(references_m, distances_m, None, side).point_m for side in sides]
     return min(solutions, key=lambda point_m: float(np.hypot(*(point_m - predicted_m))))
 
 
-def _height_slips(measurement: Measurement, predicted_m: Array) -> list[Slip]:
+def _height_blunders(measurement: Measurement, predicted_m: Array) -> list[Blunder]:
     height_m, right_m = measurement.height_m, float(predicted_m[2])
     point = measurement.point
     if point is None:
@@ -160,7 +162,7 @@ def _height_slips(measurement: Measurement, predicted_m: Array) -> list[Slip]:
         corrected = replace(measurement, point=WorldPoint(point.x_m, point.y_m, right_m))
     if height_m is None or right_m < _LOWEST_M:
         return []
-    return [Slip("height", f"the height reads {_correction(height_m, right_m)}", corrected)]
+    return [Blunder("height", f"the height reads {_correction(height_m, right_m)}", corrected)]
 
 
 def _correction(read_m: float, right_m: float) -> str:

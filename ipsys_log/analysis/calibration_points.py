@@ -4,7 +4,13 @@ from __future__ import annotations
 
 from collections.abc import Iterable, Mapping
 
-from ipsys_log.analysis.pairs import Measured, build_pairs, gather_sightings, measured_in_order, split
+from ipsys_log.analysis.pairs import (
+    RiggedMeasurement,
+    build_pairs,
+    gather_sightings,
+    split,
+    valid_measurements,
+)
 from ipsys_log.messages import Measurement, Pair
 from ipsys_log.messages.channels import CAMERA_POINTS, MEASUREMENTS, RIG
 from ipsys_log.messages.stage import View
@@ -19,12 +25,12 @@ __all__ = [
 ]
 
 
-def measured(view: View) -> list[Measured]:
+def measured(view: View) -> list[RiggedMeasurement]:
     """Return the valid measurements, each with the rig in force when it was measured, or with the view's."""
-    return measured_in_order(view.messages(RIG, MEASUREMENTS), view.rig)
+    return valid_measurements(view.messages(RIG, MEASUREMENTS), view.rig)
 
 
-def find_pairs(view: View, points: list[Measured]) -> dict[str, list[Pair]]:
+def find_pairs(view: View, points: list[RiggedMeasurement]) -> dict[str, list[Pair]]:
     """Return the observations of the calibration points by camera."""
     return build_pairs(gather_sightings(view.messages(CAMERA_POINTS)), points)
 

@@ -12,11 +12,11 @@ import numpy as np
 from numpy.typing import NDArray
 from scipy.ndimage import distance_transform_edt, find_objects, label
 
-from ipsys_log.geometry.lenses import in_picture
+from ipsys_log.geometry.lenses import in_image
 from ipsys_log.geometry.poses import invert_pose, transform
 from ipsys_log.messages import CameraCalibration, Floor
 
-__all__ = ["Coverage", "Hung", "Overlap", "Patch", "cover_floor", "find_overlaps"]
+__all__ = ["Coverage", "MountedCamera", "Overlap", "Patch", "cover_floor", "find_overlaps"]
 
 Array = NDArray[np.float64]
 Mask = NDArray[np.bool_]
@@ -32,7 +32,7 @@ _LEAST_M2 = 0.01
 
 
 @dataclass(frozen=True, slots=True, eq=False)
-class Hung:
+class MountedCamera:
     """A camera with intrinsics ``lens`` and extrinsics ``camera_from_world`` (4, 4)."""
 
     camera: str
@@ -76,7 +76,7 @@ class Coverage:
     whole : by camera, (b, a): True if the image contains the whole marker, for any heading.
     fits : (b, a), True if the whole marker is on the floor.
     unseen : parts of the floor itself that no image contains, the largest first.
-    broken : parts of ``fits`` where no image contains the whole marker, the largest first.
+    gaps : parts of ``fits`` where no image contains the whole marker, the largest first.
     overlaps : overlaps of neighbouring cameras.
     """
 
@@ -88,11 +88,13 @@ class Coverage:
     whole: Mapping[str, Mask]
     fits: Mask
     unseen: tuple[Patch, ...]
-    broken: tuple[Patch, ...]
+    gaps: tuple[Patch, ...]
     overlaps: tuple[Overlap, ...]
 
 
-def cover_floor(floor: Floor, cameras: Sequence[Hung], marker_length_m: float, height_m: float) -> Coverage:
+def cover_floor(
+    floor: Floor, cameras: Sequence[MountedCamera], marker_length_m: float, height_m: float
+) -> Coverage:
     """Compute the coverage of the floor at points about every centimetre.
 
     Parameters
@@ -125,7 +127,7 @@ def cover_floor(floor: Floor, cameras: Sequence[Hung], marker_length_m: float, h
     )  # fmt: skip
 
 
-def find_overlaps(cameras: Sequence[Hung], height_m: float) -> tuple[Overlap, ...]:
+def find_overlaps(cameras: Sequence[MountedCamera], height_m: float) -> tuple[Overlap, ...]:
     """Return the overlaps of neighbouring cameras on an unlimited floor.
 
     Parameters
@@ -150,12 +152,12 @@ def _middles(size_m: float, step_m: float, rim: int) -> Array:
     return np.asarray(step_m * (np.arange(-rim, round(size_m / step_m) + rim) + 0.5), dtype=np.float64)
 
 
-def _seen(camera: Hung, xs_m: Array, ys_m: Array, height_m: float) -> Mask:
+def _seen(camera: MountedCamera, xs_m: Array, ys_m: Array, height_m: float) -> Mask:
     """Return a mask (b, a) of the points of a grid at a height that are in the image."""
     points_m = np.stack(np.meshgrid(xs_m, ys_m, [height_m]), axis=-1).reshape(-1, 3)
     inside_m = transform(camera.camera_from_world, points_m)
     ahead = np.hypot(inside_m[:, 0], inside_m[:, 1]) < _GRAZED * inside_m[:, 2]
-    ahead[ahead] = in_picture(inside_m[ahead], camera.lens)
+    ahead[ahead] = in_image(inside_m[ahead], camera.lens)
     return np.asarray(ahead.reshape(len(ys_m), len(xs_m)))
 
 
@@ -197,7 +199,7 @@ class _Grid(NamedTuple):
         return np.asarray(inside & mask[np.where(inside, rows, 0), np.where(inside, columns, 0)])
 
 
-def _overlaps(grid: _Grid, seen: Mapping[str, Mask], cameras: Sequence[Hung]) -> Iterator[Overlap]:
+def _overlaps(grid: _Grid, seen: Mapping[str, Mask], cameras: Sequence[MountedCamera]) -> Iterator[Overlap]:
     feet_m = {camera.camera: camera.foot_m for camera in cameras}
     for first, second in combinations(feet_m, 2):
         middle_m = (feet_m[first] + feet_m[second]) / 2

@@ -9,19 +9,26 @@ from numpy.typing import NDArray
 
 from ipsys_log.errors import FitError
 from ipsys_log.messages import LearningPoint, Measurement, Pair
-from ipsys_log.models.table import Places, fit_cameras, inputs, min_pairs, predict_array, tied_cameras
+from ipsys_log.models.table import (
+    CalibrationPoints,
+    fit_cameras,
+    group_dependent_cameras,
+    inputs,
+    min_pairs,
+    predict_array,
+)
 
 __all__ = [
     "FOLDS",
     "REPEATS",
     "SUBSETS",
     "cross_validate",
-    "deal",
-    "gather_places",
+    "gather_points",
     "labelled_subsets",
     "learning_curve",
     "learning_sizes",
     "leave_one_out",
+    "make_folds",
     "predict_without",
     "published_curve",
 ]
@@ -32,10 +39,10 @@ FOLDS = 5
 REPEATS = 4
 
 
-def gather_places(pairs: Mapping[str, Sequence[Pair]]) -> dict[str, Places]:
+def gather_points(pairs: Mapping[str, Sequence[Pair]]) -> dict[str, CalibrationPoints]:
     """Return the pairs of each camera as arrays; omit cameras without pairs."""
     return {
-        camera: Places(
+        camera: CalibrationPoints(
             np.array([pair.camera_m for pair in own_pairs]),
             np.array([pair.world_m for pair in own_pairs]),
             tuple(pair.measurement for pair in own_pairs),
@@ -45,7 +52,9 @@ def gather_places(pairs: Mapping[str, Sequence[Pair]]) -> dict[str, Places]:
     }
 
 
-def deal(cameras: Mapping[str, Places], folds: int, rng: np.random.Generator) -> list[frozenset[str]]:
+def make_folds(
+    cameras: Mapping[str, CalibrationPoints], folds: int, rng: np.random.Generator
+) -> list[frozenset[str]]:
     """Return random folds of names of calibration points, with equal shares of each camera in all folds.
 
     A calibration point is in one fold only, for all cameras. Otherwise, a point that is held out from one
@@ -62,7 +71,9 @@ def deal(cameras: Mapping[str, Places], folds: int, rng: np.random.Generator) ->
     return [frozenset(name for name, fold in dealt.items() if fold == f) for f in range(folds)]
 
 
-def predict_without(name: str, cameras: Mapping[str, Places], left_out: Collection[str]) -> dict[str, Array]:
+def predict_without(
+    name: str, cameras: Mapping[str, CalibrationPoints], left_out: Collection[str]
+) -> dict[str, Array]:
     """Fit a model without some calibration points; return its predictions for all, (n, 3) in m by camera.
 
     Raises
@@ -78,13 +89,13 @@ def predict_without(name: str, cameras: Mapping[str, Places], left_out: Collecti
     }
 
 
-def _without(places: Places, left_out: Collection[str]) -> Places:
+def _without(places: CalibrationPoints, left_out: Collection[str]) -> CalibrationPoints:
     keep = np.array([name not in left_out for name in places.names], dtype=bool)
     names = tuple(name for name in places.names if name not in left_out)
-    return Places(places.points_m[keep], places.world_m[keep], names)
+    return CalibrationPoints(places.points_m[keep], places.world_m[keep], names)
 
 
-def cross_validate(name: str, cameras: Mapping[str, Places], seed: int) -> dict[str, Array]:
+def cross_validate(name: str, cameras: Mapping[str, CalibrationPoints], seed: int) -> dict[str, Array]:
     """Predict held-out points by repeated k-fold cross-validation, for each camera.
 
     Parameters
@@ -107,7 +118,7 @@ def cross_validate(name: str, cameras: Mapping[str, Places], seed: int) -> dict[
         camera: np.full((REPEATS, *places.world_m.shape), np.nan) for camera, places in cameras.items()
     }
     for repeat in range(REPEATS):
-        for fold in deal(cameras, FOLDS, rng):
+        for fold in make_folds(cameras, FOLDS, rng):
             predicted = predict_without(name, cameras, fold)
             for camera, places in cameras.items():
                 rows = [row for row, place in enumerate(places.names) if place in fold]
@@ -116,7 +127,7 @@ def cross_validate(name: str, cameras: Mapping[str, Places], seed: int) -> dict[
 
 
 def leave_one_out(
-    name: str, cameras: Mapping[str, Places]
+    name: str, cameras: Mapping[str, CalibrationPoints]
 ) -> Callable[[frozenset[str]], dict[str, dict[str, Array]]]:
     """Return a function that fits models without one calibration point after the other.
 
@@ -126,7 +137,7 @@ def leave_one_out(
     point, it returns the world point (3,) in m that a model without this point predicts. It repeats the fit
     only for cameras that depend on the unused points.
     """
-    groups = [{camera: cameras[camera] for camera in tied} for tied in tied_cameras(name, cameras)]
+    groups = [{camera: cameras[camera] for camera in tied} for tied in group_dependent_cameras(name, cameras)]
     known: dict[tuple[int, frozenset[str]], dict[str, dict[str, Array]]] = {}
 
     def left_out(unused: frozenset[str]) -> dict[str, dict[str, Array]]:
@@ -142,7 +153,7 @@ def leave_one_out(
 
 
 def _each_left_out(
-    name: str, cameras: Mapping[str, Places], unused: Collection[str]
+    name: str, cameras: Mapping[str, CalibrationPoints], unused: Collection[str]
 ) -> dict[str, dict[str, Array]]:
     predictions: dict[str, dict[str, Array]] = {camera: {} for camera in cameras}
     for place in dict.fromkeys(place for places in cameras.values() for place in places.names):
@@ -159,13 +170,15 @@ _SIZES = (5, 7, 10, 15, 20, 30, 40, 60, 80, 120, 160, 240)
 _LEAST_REST = 5
 
 
-def learning_sizes(name: str, cameras: Mapping[str, Places]) -> list[int]:
+def learning_sizes(name: str, cameras: Mapping[str, CalibrationPoints]) -> list[int]:
     """Return the subset sizes of a learning curve, for the camera with the fewest calibration points."""
     fewest = min(len(places.names) for places in cameras.values())
     return [size for size in _SIZES if min_pairs(name) <= size <= fewest - _LEAST_REST]
 
 
-def learning_curve(name: str, cameras: Mapping[str, Places], seed: int) -> Iterator[list[LearningPoint]]:
+def learning_curve(
+    name: str, cameras: Mapping[str, CalibrationPoints], seed: int
+) -> Iterator[list[LearningPoint]]:
     """Yield the errors of models that are fitted to random subsets, for one subset size after the other.
 
     Each list contains the errors of all cameras.
@@ -205,7 +218,7 @@ def labelled_subsets(measurements: Iterable[Measurement]) -> dict[str, set[str]]
 
 
 def published_curve(
-    name: str, cameras: Mapping[str, Places], subsets: Mapping[str, set[str]], held_out: set[str]
+    name: str, cameras: Mapping[str, CalibrationPoints], subsets: Mapping[str, set[str]], held_out: set[str]
 ) -> list[LearningPoint]:
     """Return errors at held-out points of models fitted to labelled subsets (the paper's figures 10, 11)."""
     names = {name for places in cameras.values() for name in places.names}
@@ -217,13 +230,13 @@ def published_curve(
     return points
 
 
-def _first(places: Places, order: list[str], size: int) -> list[str]:
+def _first(places: CalibrationPoints, order: list[str], size: int) -> list[str]:
     own = set(places.names)
     return [place for place in order if place in own][:size]
 
 
 def _errors(
-    name: str, cameras: Mapping[str, Places], left_out: set[str], looked_at: set[str]
+    name: str, cameras: Mapping[str, CalibrationPoints], left_out: set[str], looked_at: set[str]
 ) -> dict[str, tuple[float, float]]:
     """Return the mean 3D error and floor error by camera; none if the other points determine no model."""
     try:

@@ -14,7 +14,7 @@ from numpy.typing import NDArray
 from ipsys_log.messages import CameraPoints, Markers, Message, Positions, Tracks
 from ipsys_log.units import NS_PER_S, format_time
 
-__all__ = ["Comparison", "Extent", "Stored", "compare_channels", "explain_apart", "marker_ids"]
+__all__ = ["Comparison", "Extent", "Stored", "compare_channels", "explain_no_overlap", "marker_ids"]
 
 Array = NDArray[np.float64]
 
@@ -54,7 +54,7 @@ class Extent:
     ids: frozenset[int]
 
 
-def explain_apart(first: Extent, second: Extent) -> str | None:
+def explain_no_overlap(first: Extent, second: Extent) -> str | None:
     """Return the reason why two sides have nothing in common; None if they have common data.
 
     Parameters
@@ -184,7 +184,7 @@ class _Tally:
         self.right += other is not None
         if one is None or other is None or one[:3] != other[:3]:
             if self.first_ns is None:
-                self.first = _said(one, other)
+                self.first = _describe(one, other)
                 self.first_ns = min(row[0] for row in (one, other) if row is not None)
         else:
             self.same += 1
@@ -219,7 +219,7 @@ def _values(payload: Any) -> dict[int, Array]:
     return {p.id: np.array([[p.x_m, p.y_m, p.z_m]]) for p in points}
 
 
-def _said(left: _Row | None, right: _Row | None) -> str:
+def _describe(left: _Row | None, right: _Row | None) -> str:
     """Describe the difference of two messages."""
     if left is None or right is None:
         row = left or right

@@ -8,7 +8,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from ipsys_log.analysis.accuracy import error_statistics
-from ipsys_log.analysis.pairs import Measured, Sightings, still_interval
+from ipsys_log.analysis.pairs import RiggedMeasurement, Sightings, still_interval
 from ipsys_log.messages import ErrorStatistics, Message, Tracks
 from ipsys_log.units import NS_PER_S
 
@@ -39,12 +39,14 @@ def gather_tracks(messages: Iterable[Message]) -> dict[int, Sightings]:
     }
 
 
-def true_points(places: Iterable[Measured], truth: Mapping[int, Sightings]) -> dict[str, NDArray[np.float64]]:
+def true_points(
+    places: Iterable[RiggedMeasurement], ground_truth: Mapping[int, Sightings]
+) -> dict[str, NDArray[np.float64]]:
     """Return the true position of each measured marker, (3,) in m by id, if the ground truth is known."""
     points = {}
     for place in places:
         measurement = place.measurement
-        known = truth.get(measurement.marker_id if measurement.marker_id is not None else -1)
+        known = ground_truth.get(measurement.marker_id if measurement.marker_id is not None else -1)
         if known is not None and (interval := still_interval(known, measurement.timestamp)) is not None:
             within = (known.times_ns >= interval[0]) & (known.times_ns <= interval[1])
             points[measurement.id] = known.points_m[within].mean(axis=0)
@@ -52,7 +54,7 @@ def true_points(places: Iterable[Measured], truth: Mapping[int, Sightings]) -> d
 
 
 def track_errors(
-    tracks: Mapping[int, Sightings], truth: Mapping[int, Sightings], carried: bool = False
+    tracks: Mapping[int, Sightings], ground_truth: Mapping[int, Sightings], at_track_height: bool = False
 ) -> tuple[ErrorStatistics, ErrorStatistics] | None:
     """Return the 3D errors and the floor errors of tracks against the ground truth at the same instants.
 
@@ -61,8 +63,8 @@ def track_errors(
 
     Parameters
     ----------
-    carried : True to use only instants at which a marker has the height of its track. Models with a known
-        marker height are not valid while a user lifts the marker for a measurement.
+    at_track_height : True to use only instants at which a marker has the height of its track. Models
+        with a known marker height are not valid while a user lifts the marker for a measurement.
 
     Returns
     -------
@@ -70,7 +72,7 @@ def track_errors(
     """
     offsets = []
     for marker_id, track in tracks.items():
-        known = truth.get(marker_id)
+        known = ground_truth.get(marker_id)
         if known is None:
             continue
         # The last pose of an instant uses all cameras. Cameras that expose a marker at different times have
@@ -78,7 +80,7 @@ def track_errors(
         times_ns, last = np.unique(track.times_ns[::-1], return_index=True)
         true_m, is_known = _between(known, times_ns)
         offset = (track.points_m[::-1][last] - true_m)[is_known]
-        if carried:
+        if at_track_height:
             offset = offset[np.abs(offset[:, 2]) < _SAME_HEIGHT_M]
         if len(offset):
             offsets.append(offset)

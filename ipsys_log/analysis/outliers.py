@@ -9,13 +9,13 @@ from dataclasses import dataclass, replace
 import numpy as np
 from numpy.typing import NDArray
 
-from ipsys_log.analysis.blunders import Slip, possible_slips
+from ipsys_log.analysis.blunders import Blunder, possible_blunders
 from ipsys_log.analysis.consistency import FEWEST_POINTS, score, usual_covariances
-from ipsys_log.analysis.tape import Measured, TapePoint, world_point
+from ipsys_log.analysis.tape import RiggedMeasurement, TapePoint, world_point
 from ipsys_log.errors import FitError, IpsysError
 from ipsys_log.messages import Rig, Suspect
 
-__all__ = ["LeaveOneOut", "find_suspects"]
+__all__ = ["LeaveOneOut", "find_outliers"]
 
 Array = NDArray[np.float64]
 
@@ -52,7 +52,7 @@ class _Finding:
 _Judge = Callable[[frozenset[str]], dict[str, _Finding]]
 
 
-def find_suspects(leave_one_out: LeaveOneOut, places: Sequence[Measured]) -> tuple[Suspect, ...]:
+def find_outliers(leave_one_out: LeaveOneOut, places: Sequence[RiggedMeasurement]) -> tuple[Suspect, ...]:
     """Return the outliers: calibration points that disagree with models that are fitted without them.
 
     The function removes the worst point and repeats the test of the other points, until no point is an
@@ -89,17 +89,17 @@ def find_suspects(leave_one_out: LeaveOneOut, places: Sequence[Measured]) -> tup
     ...     tape = Distance("A", np.hypot(x - 1, y + 1)), Distance("B", np.hypot(x - 3, y + 1))
     ...     side = "right" if n == 12 else "left"
     ...     read = Measurement(0, f"m{n}", distances=tape, side=side, height_m=0.0)
-    ...     places.append(Measured(read, rig))
-    >>> (suspect,) = find_suspects(lambda unused: {"red": seen}, places)
-    >>> suspect.measurement, suspect.kind, suspect.text, suspect.corrected_m.round(3).tolist()
+    ...     places.append(RiggedMeasurement(read, rig))
+    >>> (outlier,) = find_outliers(lambda unused: {"red": seen}, places)
+    >>> outlier.measurement, outlier.kind, outlier.text, outlier.corrected_m.round(3).tolist()
     ('m12', 'side', 'it lies left of the line from A to B, not right', [1.0, 3.0, 0.0])
     """
     places = [replace(place, rig=_with_tape(place.rig)) for place in places]
     fixed = {place.measurement.id: world_point(place.measurement, place.rig) for place in places}
     taken, findings = _search(lambda names: _judge(leave_one_out(names), fixed, names))
     by_id = {place.measurement.id: place for place in places}
-    suspects = [_suspect(by_id[name], findings[name]) for name in taken]
-    return tuple(sorted(suspects, key=lambda suspect: -float(np.linalg.norm(suspect.residual_m))))
+    outliers = [_suspect(by_id[name], findings[name]) for name in taken]
+    return tuple(sorted(outliers, key=lambda suspect: -float(np.linalg.norm(suspect.residual_m))))
 
 
 def _with_tape(rig: Rig) -> Rig:
@@ -178,30 +178,30 @@ def _tape_m2(fixed: TapePoint) -> Array:
     return np.zeros((3, 3)) if fixed.covariance_m2 is None else fixed.covariance_m2
 
 
-def _suspect(place: Measured, finding: _Finding) -> Suspect:
-    slip, corrected_m = _explain(place, finding) or (None, None)
+def _suspect(place: RiggedMeasurement, finding: _Finding) -> Suspect:
+    blunder, corrected_m = _explain(place, finding) or (None, None)
     return Suspect(
         measurement=place.measurement.id,
         cameras=finding.cameras,
         residual_m=finding.residual_m,
         score=finding.score,
-        kind=slip.kind if slip else None,
-        text=slip.text if slip else None,
+        kind=blunder.kind if blunder else None,
+        text=blunder.text if blunder else None,
         corrected_m=corrected_m,
     )
 
 
-def _explain(place: Measured, finding: _Finding) -> tuple[Slip, Array] | None:
+def _explain(place: RiggedMeasurement, finding: _Finding) -> tuple[Blunder, Array] | None:
     """Return the simplest blunder whose correction gives a usual error, and the corrected world point."""
     usual = min(max(_EXPLAINED, _SHARE_LEFT * finding.score), _SUSPECT)
-    for group in possible_slips(place.measurement, place.rig, finding.predicted_m):
+    for group in possible_blunders(place.measurement, place.rig, finding.predicted_m):
         left = []
-        for slip in group:
+        for blunder in group:
             try:
-                fixed = world_point(slip.corrected, place.rig)
+                fixed = world_point(blunder.corrected, place.rig)
             except IpsysError:
                 continue  # the corrected measurement forms no world point
-            left.append((_score(finding.predicted_m, finding.usual_m2, fixed), slip, fixed.world_m))
+            left.append((_score(finding.predicted_m, finding.usual_m2, fixed), blunder, fixed.world_m))
         if left and (best := min(left, key=lambda row: row[0]))[0] <= usual:
             return best[1:]
     return None

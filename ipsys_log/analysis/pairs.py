@@ -8,24 +8,24 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import NDArray
 
-from ipsys_log.analysis.tape import Measured, world_point
+from ipsys_log.analysis.tape import RiggedMeasurement, world_point
 from ipsys_log.errors import IpsysError
 from ipsys_log.messages import CameraPoints, Measurement, Message, Model, Pair, Rig
 from ipsys_log.units import NS_PER_S
 
 __all__ = [
     "KINDS",
-    "Measured",
     "Place",
+    "RiggedMeasurement",
     "Sightings",
     "active_measurements",
     "build_pairs",
     "gather_sightings",
     "level_cameras",
-    "measured_in_order",
-    "measured_places",
+    "locate_measurements",
     "split",
     "still_interval",
+    "valid_measurements",
 ]
 
 # A marker is stationary if it stays within these distances from its position at the measurement. They are
@@ -75,7 +75,7 @@ def gather_sightings(messages: Iterable[Message]) -> dict[tuple[str, int], Sight
     return sightings
 
 
-def measured_in_order(messages: Iterable[Message], override: Rig | None) -> list[Measured]:
+def valid_measurements(messages: Iterable[Message], override: Rig | None) -> list[RiggedMeasurement]:
     """Return the measurements that are not withdrawn, each with its rig.
 
     Parameters
@@ -99,7 +99,7 @@ def measured_in_order(messages: Iterable[Message], override: Rig | None) -> list
     if numbered and not rigs:
         raise IpsysError("the log has no rig (reference points, markers): give one with --rig lab.toml")
     # If an id was withdrawn and measured again, the last measurement counts.
-    last = {m.id: Measured(m, rigs[number]) for m, number in numbered if m.withdraws is None}
+    last = {m.id: RiggedMeasurement(m, rigs[number]) for m, number in numbered if m.withdraws is None}
     return [place for name, place in last.items() if name in active]
 
 
@@ -154,14 +154,14 @@ def still_interval(sightings: Sightings, time_ns: int) -> tuple[int, int] | None
 
 
 def build_pairs(
-    sightings: Mapping[tuple[str, int], Sightings], places: Iterable[Measured]
+    sightings: Mapping[tuple[str, int], Sightings], places: Iterable[RiggedMeasurement]
 ) -> dict[str, list[Pair]]:
     """Return the calibration points that each camera saw.
 
     Parameters
     ----------
     sightings : sightings by camera and marker, from :func:`gather_sightings`.
-    places : the valid measurements, from :func:`measured_in_order`.
+    places : the valid measurements, from :func:`valid_measurements`.
 
     Returns
     -------
@@ -194,11 +194,11 @@ def build_pairs(
                 row = (measurement.id, marker_id, mean_m, fixed.world_m, frames, fixed.covariance_m2)
                 pairs[camera].append(Pair(*row))
     for camera, entered in pairs.items():
-        _check_twins(camera, entered)
+        _check_duplicates(camera, entered)
     return pairs
 
 
-def _check_twins(camera: str, pairs: Iterable[Pair]) -> None:
+def _check_duplicates(camera: str, pairs: Iterable[Pair]) -> None:
     """Check that no pair occurs twice: it would count double, and a fit would know it when it is held out."""
     seen: dict[bytes, str] = {}
     for pair in pairs:
@@ -278,7 +278,9 @@ class Place:
     kind: str
 
 
-def measured_places(measurements: Iterable[Measurement], rig: Rig | None) -> tuple[list[Place], list[str]]:
+def locate_measurements(
+    measurements: Iterable[Measurement], rig: Rig | None
+) -> tuple[list[Place], list[str]]:
     """Return the valid calibration points, and the faults of those without a position.
 
     A user must be able to view a log with faults. This function therefore skips measurements that the stages

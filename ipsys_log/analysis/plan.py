@@ -16,13 +16,13 @@ from numpy.typing import NDArray
 from scipy.spatial import ConvexHull, cKDTree
 
 from ipsys_log.errors import IpsysError
-from ipsys_log.geometry.lenses import in_picture
+from ipsys_log.geometry.lenses import in_image
 from ipsys_log.geometry.poses import transform
 from ipsys_log.messages import CameraCalibration
 from ipsys_log.models.rays import directions
 from ipsys_log.models.uncertainty import Predict, Uncertainty, leverage_terms
 
-__all__ = ["Plan", "PlannedPlace", "View", "mean_length", "plan_places"]
+__all__ = ["FittedCamera", "Plan", "PlannedPlace", "mean_length", "plan_points"]
 
 Array = NDArray[np.float64]
 Mask = NDArray[np.bool_]
@@ -38,7 +38,7 @@ _GRAZED = 5.0
 
 
 @dataclass(frozen=True, slots=True, eq=False)
-class View:
+class FittedCamera:
     """A fitted camera: its field of view, and the uncertainty of its positions.
 
     Attributes
@@ -81,9 +81,9 @@ class View:
             return np.asarray((uv @ edges[:, :2].T + edges[:, 2]).max(axis=1) <= _BEYOND, dtype=np.bool_)
         angles = np.linspace(0, 2 * np.pi, _RIM, endpoint=False)
         rim_m = radius_m * np.stack([np.cos(angles), np.sin(angles), np.zeros(_RIM)], axis=1)
-        whole = in_picture(self.points(world_m), self.lens)
+        whole = in_image(self.points(world_m), self.lens)
         rims_m = (world_m[whole, None] + rim_m).reshape(-1, 3)
-        whole[whole] = in_picture(self.points(rims_m), self.lens).reshape(-1, _RIM).all(axis=1)
+        whole[whole] = in_image(self.points(rims_m), self.lens).reshape(-1, _RIM).all(axis=1)
         return whole
 
 
@@ -128,8 +128,13 @@ class Plan:
     seen: dict[str, Mask]
 
 
-def plan_places(
-    views: Sequence[View], floor_m: Array, candidates_m: Array, tape_m2: Tape, radius_m: float, count: int
+def plan_points(
+    views: Sequence[FittedCamera],
+    floor_m: Array,
+    candidates_m: Array,
+    tape_m2: Tape,
+    radius_m: float,
+    count: int,
 ) -> Plan:
     """Choose the calibration points to measure next.
 
@@ -163,8 +168,8 @@ def plan_places(
     >>> unsure = Uncertainty(3e-4, 1e-4, 1.0, 1e-5 * np.eye(3), transform(pose, fitted_m))
     >>> def predict(points_m, heights_m):
     ...     return transform(invert_pose(pose), points_m)
-    >>> view = View("over", pose, np.zeros(3), None, predict, unsure, fitted_m)
-    >>> plan = plan_places([view], floor_m, floor_m, lambda at_m: np.full(len(at_m), 1e-5), 0.1, 1)
+    >>> view = FittedCamera("over", pose, np.zeros(3), None, predict, unsure, fitted_m)
+    >>> plan = plan_points([view], floor_m, floor_m, lambda at_m: np.full(len(at_m), 1e-5), 0.1, 1)
     >>> plan.places[0].point_m.tolist()
     [1.0, 0.0, 0.0]
     """
@@ -200,7 +205,9 @@ def plan_places(
 class _Share:
     """The visible floor points and candidates of one camera, and their leverage after each added point."""
 
-    def __init__(self, view: View, floor_m: Array, candidates_m: Array, tape_m2: Tape, radius_m: float):
+    def __init__(
+        self, view: FittedCamera, floor_m: Array, candidates_m: Array, tape_m2: Tape, radius_m: float
+    ):
         self.on_floor, self.near = view.sees(floor_m, radius_m), view.sees(candidates_m, radius_m)
         fitted = leverage_terms(view.uncertainty.points_m)
         self._inverse = np.asarray(np.linalg.inv(fitted.T @ fitted + 1e-9 * np.eye(6)), dtype=np.float64)
@@ -234,7 +241,7 @@ class _Share:
             self._inverse -= np.outer(step, step) * (weight / (1 + weight * (terms @ step)))
 
 
-def _parts(view: View, world_m: Array) -> tuple[Array, Array, Array]:
+def _parts(view: FittedCamera, world_m: Array) -> tuple[Array, Array, Array]:
     """Return the parts of the covariance of x and y, and the terms (n, 6) of the leverage.
 
     Each part contains the variances of x and y and their covariance, (3, n). The first part is noise, which

@@ -13,7 +13,14 @@ from ipsys_log.analysis.pairs import Sightings
 from ipsys_log.messages import CameraPoint, CameraPoints, Measurement
 from ipsys_log.units import NS_PER_S
 
-__all__ = ["FEWEST_FRAMES", "Lying", "find_lying", "lies_at", "lies_still", "still_stretches"]
+__all__ = [
+    "FEWEST_FRAMES",
+    "StationaryMarker",
+    "find_stationary",
+    "is_near",
+    "is_stationary",
+    "stationary_intervals",
+]
 
 Array = NDArray[np.float64]
 
@@ -26,7 +33,7 @@ _LEAST_NS = NS_PER_S // 2
 
 
 @dataclass(frozen=True, slots=True, eq=False)
-class Lying:
+class StationaryMarker:
     """A stationary interval of a marker.
 
     Attributes
@@ -47,7 +54,9 @@ class Lying:
     end_ns: int = 0
 
 
-def find_lying(frames: Iterable[CameraPoints], measurements: Sequence[Measurement] = ()) -> list[Lying]:
+def find_stationary(
+    frames: Iterable[CameraPoints], measurements: Sequence[Measurement] = ()
+) -> list[StationaryMarker]:
     """Return all stationary intervals of markers, ordered by marker and time.
 
     A marker that is moved several times has several intervals. In an interval, it stays within 1 cm for at
@@ -61,7 +70,7 @@ def find_lying(frames: Iterable[CameraPoints], measurements: Sequence[Measuremen
     Examples
     --------
     >>> frames = [CameraPoints(n * 10**8, (CameraPoint(4, 0.1, 0.2, 2.0),)) for n in range(20)]
-    >>> [(one.marker_id, one.frames) for one in find_lying(frames)]
+    >>> [(one.marker_id, one.frames) for one in find_stationary(frames)]
     [(4, 20)]
     """
     seen: dict[int, list[tuple[int, CameraPoint]]] = {}
@@ -100,13 +109,13 @@ def _together(one_m: Array, other_m: Array) -> bool:
     return bool(np.hypot(x_m, y_m) <= _STILL_ACROSS_M and z_m <= max(_STILL_ALONG_M, _STILL_ALONG * one_m[2]))
 
 
-def _lying(sightings: Sequence[tuple[int, CameraPoint]], height_m: float) -> Lying:
+def _lying(sightings: Sequence[tuple[int, CameraPoint]], height_m: float) -> StationaryMarker:
     points = [point for _, point in sightings]
     known_m2 = [point.covariance_m2 for point in points if point.covariance_m2 is not None]
     covariance_m2 = np.mean(known_m2, axis=0) / len(points) if known_m2 else np.zeros((3, 3))
     point_m = np.median([(p.x_m, p.y_m, p.z_m) for p in points], axis=0)
     times_ns = sightings[0][0], sightings[-1][0]
-    return Lying(points[0].id, point_m, covariance_m2, height_m, len(points), *times_ns)
+    return StationaryMarker(points[0].id, point_m, covariance_m2, height_m, len(points), *times_ns)
 
 
 def _height(marker_id: int, start_ns: int, end_ns: int, measurements: Sequence[Measurement]) -> float:
@@ -135,19 +144,19 @@ _SHARE_NEAR = 0.95
 FEWEST_FRAMES = 2
 
 
-def lies_still(points_m: Array) -> bool:
+def is_stationary(points_m: Array) -> bool:
     """Return whether a marker is stationary, from its camera points (n, 3) in order of time.
 
     Examples
     --------
-    >>> lies_still(np.array([[0.1, 0.2, 2.0], [0.101, 0.2, 2.01], [0.1, 0.2, 2.0]]))
+    >>> is_stationary(np.array([[0.1, 0.2, 2.0], [0.101, 0.2, 2.01], [0.1, 0.2, 2.0]]))
     True
-    >>> lies_still(np.array([[0.1, 0.2, 2.0], [0.106, 0.2, 2.0]]))
+    >>> is_stationary(np.array([[0.1, 0.2, 2.0], [0.106, 0.2, 2.0]]))
     False
     """
     if len(points_m) < FEWEST_FRAMES:
         return False
-    near = lies_at(points_m, np.median(points_m, axis=0))
+    near = is_near(points_m, np.median(points_m, axis=0))
     if near.mean() < _SHARE_NEAR:
         return False
     points_m = points_m[near]
@@ -159,7 +168,7 @@ def lies_still(points_m: Array) -> bool:
     return float(np.hypot(*drift_m)) <= _DRIFT_M + _DRIFT_OF_ONE_M / math.sqrt(len(rays))
 
 
-def lies_at(points_m: Array, place_m: Array) -> NDArray[np.bool_]:
+def is_near(points_m: Array, place_m: Array) -> NDArray[np.bool_]:
     """Return a mask (n,) of the camera points (n, 3) that are at a position (3,), within their noise."""
     across_m = (points_m[:, :2] / points_m[:, 2:] - place_m[:2] / place_m[2]) * place_m[2]
     along_m = np.abs(points_m[:, 2] - place_m[2])
@@ -167,7 +176,7 @@ def lies_at(points_m: Array, place_m: Array) -> NDArray[np.bool_]:
     return near
 
 
-def still_stretches(cameras: Mapping[str, Sightings]) -> list[tuple[int, int, tuple[str, ...]]]:
+def stationary_intervals(cameras: Mapping[str, Sightings]) -> list[tuple[int, int, tuple[str, ...]]]:
     """Return the stationary intervals of one marker, from the sightings of all cameras, in order of time.
 
     Parameters
@@ -180,7 +189,7 @@ def still_stretches(cameras: Mapping[str, Sightings]) -> list[tuple[int, int, tu
     intervals of several cameras become one interval: their union, or their intersection if a camera saw the
     marker move in the union.
     """
-    intervals = sorted(stretch for seen in cameras.values() for stretch in _joined(seen))
+    intervals = sorted(interval for seen in cameras.values() for interval in _joined(seen))
     joined: list[list[tuple[int, int]]] = []
     for start_ns, end_ns in intervals:
         if joined and start_ns <= max(end for _, end in joined[-1]):
@@ -205,7 +214,7 @@ def _seen_still(cameras: Mapping[str, Sightings], start_ns: int, end_ns: int) ->
     for camera, sightings in sorted(cameras.items()):
         points_m = _between(sightings, start_ns, end_ns)
         if len(points_m) >= FEWEST_FRAMES:
-            if not lies_still(points_m):
+            if not is_stationary(points_m):
                 return ()
             seen.append(camera)
     return tuple(seen)
@@ -221,7 +230,7 @@ def _joined(sightings: Sightings) -> list[tuple[int, int]]:
     intervals: list[tuple[int, int]] = []
     for start_ns, end_ns in _camera_stretches(sightings):
         both = (intervals[-1][0], end_ns) if intervals else (start_ns, end_ns)
-        if intervals and start_ns - intervals[-1][1] <= _GAP_NS and lies_still(_between(sightings, *both)):
+        if intervals and start_ns - intervals[-1][1] <= _GAP_NS and is_stationary(_between(sightings, *both)):
             intervals[-1] = both
         else:
             intervals.append((start_ns, end_ns))
@@ -238,16 +247,16 @@ def _camera_stretches(sightings: Sightings) -> Iterator[tuple[int, int]]:
     while first < len(times_ns):
         end = int(ends[np.searchsorted(ends, first, "right")])
         stop = _first_away(rays, depths_m, first, end)
-        if stop - first < FEWEST_FRAMES or not lies_still(points_m[first:stop]):
+        if stop - first < FEWEST_FRAMES or not is_stationary(points_m[first:stop]):
             # An interval that is detected in its middle is extended back to its start.
             first += max((stop - first) // 4, 1)
             continue
         # The reference is the middle of the interval, because a hand may still move the marker at the start.
-        near = lies_at(points_m[first:end], np.median(points_m[first:stop], axis=0))
+        near = is_near(points_m[first:end], np.median(points_m[first:stop], axis=0))
         middle = (stop - first) // 2
         begin = first + int(np.flatnonzero(np.append(True, ~near[:middle]))[-1])
         done = first + middle + int(np.flatnonzero(np.append(~near[middle:], True))[0])
-        if not lies_still(points_m[begin:done]):
+        if not is_stationary(points_m[begin:done]):
             begin, done = first, stop
         start_ns, end_ns = int(times_ns[begin]), int(times_ns[done - 1])
         alone = done == end and (begin == 0 or begin in ends)

@@ -12,7 +12,14 @@ from ipsys_log.errors import IpsysError
 from ipsys_log.geometry.trilateration import crossing_angle, multilaterate, tape_covariance
 from ipsys_log.messages import Measurement, Rig
 
-__all__ = ["FlatPlace", "Measured", "TapePoint", "flat_places", "reference_points", "world_point"]
+__all__ = [
+    "RiggedMeasurement",
+    "TapePoint",
+    "WeakPoint",
+    "find_weak_points",
+    "reference_points",
+    "world_point",
+]
 
 Array = NDArray[np.float64]
 
@@ -27,7 +34,7 @@ _FARTHEST_M = 10_000.0
 
 
 @dataclass(frozen=True, slots=True)
-class Measured:
+class RiggedMeasurement:
     """A valid measurement, and the rig that was valid at its time."""
 
     measurement: Measurement
@@ -49,7 +56,7 @@ class TapePoint:
 
 
 @dataclass(frozen=True, slots=True)
-class FlatPlace:
+class WeakPoint:
     """A calibration point whose tape circles cross at a small angle.
 
     ``sigma_m`` is the standard deviation of the point in its least accurate direction; None if the sigma of
@@ -141,7 +148,7 @@ def reference_points(measurement: Measurement, rig: Rig) -> Array:
     return np.array([known[distance.reference] for distance in measurement.distances]).reshape(-1, 2)
 
 
-def flat_places(places: Iterable[Measured]) -> list[FlatPlace]:
+def find_weak_points(places: Iterable[RiggedMeasurement]) -> list[WeakPoint]:
     """Return the points whose standard deviation exceeds three times the sigma of the tape, largest first.
 
     If the circles cross at a right angle, a point is as accurate as the tape. At 27 degrees, or near the line
@@ -159,8 +166,8 @@ def flat_places(places: Iterable[Measured]) -> list[FlatPlace]:
     >>> points = (ReferencePoint("A", 0.0, 0.0), ReferencePoint("B", 2.0, 0.0))
     >>> rig = Rig("lab", "DICT_4X4_100", 0.2, reference_points=points, tape_sigma_m=0.003)
     >>> tape = (Distance("A", 1.02), Distance("B", 1.02))
-    >>> place = Measured(Measurement(0, "a", distances=tape, side="left", height_m=0.0), rig)
-    >>> [(flat.id, round(flat.sigma_m, 4), round(flat.angle_deg, 1)) for flat in flat_places([place])]
+    >>> place = RiggedMeasurement(Measurement(0, "a", distances=tape, side="left", height_m=0.0), rig)
+    >>> [(flat.id, round(flat.sigma_m, 4), round(flat.angle_deg, 1)) for flat in find_weak_points([place])]
     [('a', 0.0108, 22.7)]
     """
     ranked = []
@@ -177,7 +184,7 @@ def flat_places(places: Iterable[Measured]) -> list[FlatPlace]:
         if ratio > _FLAT_RATIO:
             angle_deg = float(np.degrees(crossing_angle(world_m[:2], references_m)))
             sigma_m = None if known_m is None else float(np.sqrt(spread_m2[-1]))
-            ranked.append((ratio, FlatPlace(measurement.id, sigma_m, angle_deg)))
+            ranked.append((ratio, WeakPoint(measurement.id, sigma_m, angle_deg)))
     return [place for _, place in sorted(ranked, key=lambda one: -one[0])]
 
 

@@ -53,14 +53,14 @@ class Board:
         difference = 0 if self.marker_scale is None else 1
         return self.columns - difference, self.rows - difference
 
-    def places(self, ids: NDArray[np.intp]) -> NDArray[np.float64]:
+    def grid_positions(self, ids: NDArray[np.intp]) -> NDArray[np.float64]:
         """Return the column and the row of each corner, (n, 2)."""
         return np.column_stack([ids % self.grid[0], ids // self.grid[0]]).astype(np.float64)
 
     def points_m(self, ids: NDArray[np.intp]) -> NDArray[np.float64]:
         """Return the corners on the board, (n, 3) in m: x along rows, y down columns, 0 at the center."""
         center = (np.array(self.grid) - 1) / 2
-        return np.column_stack([(self.places(ids) - center) * self.square_m, np.zeros(len(ids))])
+        return np.column_stack([(self.grid_positions(ids) - center) * self.square_m, np.zeros(len(ids))])
 
 
 def parse_board(text: str, square_m: float, marker_scale: float, dictionary: str, inverted: bool) -> Board:

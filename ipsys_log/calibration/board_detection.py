@@ -19,7 +19,7 @@ from numpy.typing import NDArray
 from ipsys_log.calibration.board import Board
 from ipsys_log.calibration.chessboard import find_chessboard
 
-__all__ = ["LEAST_CORNERS", "Grey", "Sighting", "View", "find_board", "refine_corners", "view_board"]
+__all__ = ["LEAST_CORNERS", "BoardSighting", "Grey", "View", "find_board", "refine_corners", "view_board"]
 
 Array = NDArray[np.float64]
 Grey = NDArray[np.uint8]
@@ -60,7 +60,7 @@ def refine_corners(
     positions = pixels.copy()
     for _ in range(_ROUNDS):
         arms = _arms(columns, ids, positions)
-        positions = _crossed(grey, arms, positions, blur_px, clear)
+        positions = _intersect_edges(grey, arms, positions, blur_px, clear)
     return positions
 
 
@@ -89,7 +89,7 @@ def _arms(columns: int, ids: NDArray[np.intp], pixels: Array) -> Array:
     return np.where(np.isnan(arms), opposite, arms)
 
 
-def _crossed(grey: Grey, arms: Array, pixels: Array, blur_px: float, clear: float) -> Array:
+def _intersect_edges(grey: Grey, arms: Array, pixels: Array, blur_px: float, clear: float) -> Array:
     """Return the intersections of the edges along ``arms``, (n, 2)."""
     lengths = np.linalg.norm(arms, axis=3)
     spacing = np.nanmin(lengths, axis=(1, 2), initial=np.inf)
@@ -170,7 +170,7 @@ _FARTHEST = 3.0
 
 
 @dataclass(frozen=True, slots=True, eq=False)
-class Sighting:
+class BoardSighting:
     """A detection of the board in the image ``name``.
 
     ``ids`` (n,) and ``pixels`` (n, 2) are the detected corners. ``blur_px`` is the width of the edges (a
@@ -187,11 +187,11 @@ class Sighting:
 class View(NamedTuple):
     """A sighting, or None; for a chessboard also columns and rows of the largest grid of inner corners."""
 
-    sighting: Sighting | None
+    sighting: BoardSighting | None
     grid: tuple[int, int] | None = None
 
 
-def find_board(name: str, grey: Grey, board: Board, thorough: bool) -> Sighting | None:
+def find_board(name: str, grey: Grey, board: Board, thorough: bool) -> BoardSighting | None:
     """Detect the board in an image; see `view_board`."""
     return view_board(name, grey, board, thorough).sighting
 
@@ -223,14 +223,14 @@ def view_board(name: str, grey: Grey, board: Board, thorough: bool) -> View:
     return View(_sighting(name, grey, board, ids, view.corners.reshape(-1, 2)), view.size)
 
 
-def _sighting(name: str, grey: Grey, board: Board, ids: NDArray[np.intp], pixels: Array) -> Sighting:
-    places = board.places(ids)
+def _sighting(name: str, grey: Grey, board: Board, ids: NDArray[np.intp], pixels: Array) -> BoardSighting:
+    places = board.grid_positions(ids)
     if len(ids) < LEAST_CORNERS or min(len(set(column)) for column in places.T.tolist()) < 2:
-        return Sighting(name, ids, pixels, 0.0, np.tile(pixels.mean(axis=0), (4, 1)))
+        return BoardSighting(name, ids, pixels, 0.0, np.tile(pixels.mean(axis=0), (4, 1)))
     blur_px = _edge_width_px(grey, board, ids, pixels)
     clear = _CLEAR if board.marker_scale is None else _CLEAR_MARKERS * (1 - board.marker_scale)
     pixels = refine_corners(grey, board.grid[0], ids, pixels, blur_px, clear)
-    return Sighting(name, ids, pixels, blur_px, _outline(board, ids, pixels))
+    return BoardSighting(name, ids, pixels, blur_px, _outline(board, ids, pixels))
 
 
 def _charuco(grey: Grey, board: Board) -> tuple[NDArray[np.intp], Array] | None:
@@ -260,10 +260,10 @@ def _outline(board: Board, ids: NDArray[np.intp], pixels: Array) -> Array:
     by_id = dict(zip(ids.tolist(), pixels, strict=True))
     if all(end in by_id for end in ends.tolist()):
         return np.array([by_id[end] for end in ends.tolist()])
-    places, center = board.places(ids), pixels.mean(axis=0)
+    places, center = board.grid_positions(ids), pixels.mean(axis=0)
     homography, _ = cv2.findHomography(places, pixels)
     projected = (
-        np.column_stack([board.places(ends), np.ones(4)])
+        np.column_stack([board.grid_positions(ends), np.ones(4)])
         @ (np.eye(3) if homography is None else homography).T
     )
     # The homography is not valid beyond the horizon, so the distance is limited.

@@ -8,13 +8,13 @@ from dataclasses import dataclass
 from typing import NamedTuple
 
 from ipsys_log.calibration.board import Board
-from ipsys_log.calibration.board_detection import Grey, Sighting, View, view_board
-from ipsys_log.calibration.board_size import check_charuco_size, check_chessboard_size, hint
+from ipsys_log.calibration.board_detection import BoardSighting, Grey, View, view_board
+from ipsys_log.calibration.board_size import check_charuco_size, check_chessboard_size, describe_other_board
 from ipsys_log.calibration.chessboard import fits_in
-from ipsys_log.calibration.image_selection import Dropped
+from ipsys_log.calibration.image_selection import ExcludedSighting
 from ipsys_log.errors import IpsysError
 
-__all__ = ["Looked", "NotSeenError", "Size", "check_sizes", "look"]
+__all__ = ["NotSeenError", "SearchResult", "Size", "check_sizes", "search_images"]
 
 # Up to this number of images, the search is thorough. More images come from a video, which has enough images.
 _THOROUGH = 100
@@ -34,17 +34,17 @@ Size = tuple[int, int]
 
 
 @dataclass(frozen=True, slots=True, eq=False)
-class Looked:
+class SearchResult:
     """All images of a camera: number, size, sightings, unreadable images, and images without the board."""
 
     count: int
     size_px: tuple[int, int]
-    sightings: tuple[Sighting, ...]
-    unreadable: tuple[Dropped, ...]
-    unseen: tuple[Dropped, ...] = ()
+    sightings: tuple[BoardSighting, ...]
+    unreadable: tuple[ExcludedSighting, ...]
+    unseen: tuple[ExcludedSighting, ...] = ()
 
 
-class _Seen(NamedTuple):
+class ImageView(NamedTuple):
     """One readable image: its name, its size in px, and the view of the board."""
 
     name: str
@@ -52,26 +52,26 @@ class _Seen(NamedTuple):
     view: View
 
 
-def look(
-    pictures: Iterable[tuple[str, Grey | None]],
+def search_images(
+    images: Iterable[tuple[str, Grey | None]],
     board: Board,
     total: int,
-    where: str,
+    source: str,
     progress: Callable[[int], None] = lambda done: None,
     trying: Callable[[int, int], None] = lambda done, total: None,
-    insist: bool = False,
-) -> Looked:
+    force: bool = False,
+) -> SearchResult:
     """Detect the board in all images.
 
     Parameters
     ----------
-    pictures : names and grey images, None for an unreadable image.
+    images : names and grey images, None for an unreadable image.
     board : the board to search for.
     total : approximate number of images; 0 if it is not known.
-    where : source of the images, for messages.
+    source : source of the images, for messages.
     progress : called with the number of searched images.
     trying : called with the number of other boards tried, and their total, if no image shows the board.
-    insist : accept the size of the board, even if the images contradict it.
+    force : accept the size of the board, even if the images contradict it.
 
     Raises
     ------
@@ -82,36 +82,38 @@ def look(
         No image shows the board; the text says which board the images show.
     """
     count = 0
-    views: list[_Seen] = []
-    unreadable: list[Dropped] = []
+    views: list[ImageView] = []
+    unreadable: list[ExcludedSighting] = []
     without, shown = _Sample(_HINTED, total), _Sample(_CHECKED, total)
-    for name, grey in pictures:
+    for name, grey in images:
         count += 1
         if grey is None:
-            unreadable.append(Dropped(name, "cannot be read"))
+            unreadable.append(ExcludedSighting(name, "cannot be read"))
             continue
         view = view_board(name, grey, board, thorough=0 < total <= _THOROUGH)
-        views.append(_Seen(name, (grey.shape[1], grey.shape[0]), view))
+        views.append(ImageView(name, (grey.shape[1], grey.shape[0]), view))
         (without if view.sighting is None else shown).add(grey)
         progress(count)
     if not views:
-        raise IpsysError(f"{where}: none of {count} pictures can be read")
-    usual_size = check_sizes([(viewed.name, viewed.size) for viewed in views], where)
+        raise IpsysError(f"{source}: none of {count} pictures can be read")
+    usual_size = check_sizes([(viewed.name, viewed.size) for viewed in views], source)
     if all(viewed.view.sighting is None for viewed in views):
-        hint_text = hint(without.pictures, board, trying, [viewed.view.grid for viewed in views])
-        raise NotSeenError(f"{where}: {board} is not seen in any of {count} pictures{hint_text}")
-    if not insist and board.marker_scale is None:
-        check_chessboard_size([viewed.view.grid for viewed in views], board, where)
-    elif not insist:
-        check_charuco_size(shown.pictures, board, where)
+        hint_text = describe_other_board(
+            without.images, board, trying, [viewed.view.grid for viewed in views]
+        )
+        raise NotSeenError(f"{source}: {board} is not seen in any of {count} pictures{hint_text}")
+    if not force and board.marker_scale is None:
+        check_chessboard_size([viewed.view.grid for viewed in views], board, source)
+    elif not force:
+        check_charuco_size(shown.images, board, source)
     ordinary = [viewed for viewed in views if viewed.size == usual_size]
     sightings = [viewed.view.sighting for viewed in ordinary if viewed.view.sighting is not None]
     unseen = [
-        Dropped(viewed.name, _reason(viewed.view, board))
+        ExcludedSighting(viewed.name, _reason(viewed.view, board))
         for viewed in ordinary
         if viewed.view.sighting is None
     ]
-    return Looked(
+    return SearchResult(
         count, usual_size, tuple(sightings), (*unreadable, *_strange(views, usual_size)), tuple(unseen)
     )
 
@@ -125,13 +127,13 @@ def _reason(view: View, board: Board) -> str:
     return f"a grid of {columns} x {rows} corners is seen instead"
 
 
-def check_sizes(sizes: Sequence[tuple[str, Size]], where: str) -> Size:
+def check_sizes(sizes: Sequence[tuple[str, Size]], source: str) -> Size:
     """Return the size in px that most images have.
 
     Parameters
     ----------
     sizes : name and size of each image, at least one.
-    where : source of the images, for messages.
+    source : source of the images, for messages.
 
     Raises
     ------
@@ -149,15 +151,17 @@ def check_sizes(sizes: Sequence[tuple[str, Size]], where: str) -> Size:
         )
     kinds += [f"{len(counts) - len(kinds)} more"] * (len(counts) > len(kinds))
     raise IpsysError(
-        f"{where}: pictures have {len(counts)} sizes: {'; '.join(kinds)}. "
+        f"{source}: pictures have {len(counts)} sizes: {'; '.join(kinds)}. "
         "A calibration needs one size: put the pictures of each size into a separate folder"
     )
 
 
-def _strange(views: Sequence[_Seen], usual: Size) -> list[Dropped]:
+def _strange(views: Sequence[ImageView], usual: Size) -> list[ExcludedSighting]:
     reason = "is {} x {} px, most are {} x {}"
     return [
-        Dropped(viewed.name, reason.format(*viewed.size, *usual)) for viewed in views if viewed.size != usual
+        ExcludedSighting(viewed.name, reason.format(*viewed.size, *usual))
+        for viewed in views
+        if viewed.size != usual
     ]
 
 
@@ -165,13 +169,13 @@ class _Sample:
     """A small sample of images, spread over all images."""
 
     def __init__(self, wanted: int, total: int) -> None:
-        self.pictures: list[Grey] = []
+        self.images: list[Grey] = []
         self._stride, self._wanted, self._count = max(1, -(-total // (2 * wanted))), wanted, 0
 
     def add(self, grey: Grey) -> None:
         if self._count % self._stride == 0:
-            self.pictures.append(grey)
-            if len(self.pictures) > 2 * self._wanted:
-                del self.pictures[::2]
+            self.images.append(grey)
+            if len(self.images) > 2 * self._wanted:
+                del self.images[::2]
                 self._stride *= 2
         self._count += 1

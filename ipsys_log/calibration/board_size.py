@@ -17,7 +17,13 @@ from ipsys_log.calibration.board_detection import Grey, find_board
 from ipsys_log.calibration.chessboard import find_largest_grid, fits_in
 from ipsys_log.errors import IpsysError
 
-__all__ = ["CharucoSize", "check_charuco_size", "check_chessboard_size", "estimate_charuco_size", "hint"]
+__all__ = [
+    "CharucoSize",
+    "check_charuco_size",
+    "check_chessboard_size",
+    "describe_other_board",
+    "estimate_charuco_size",
+]
 
 Array = NDArray[np.float64]
 # Squares in a row of the tried boards, and the largest number of rows.
@@ -33,10 +39,10 @@ class CharucoSize(NamedTuple):
 
     columns: int
     rows: int
-    pictures: int
+    image_count: int
 
 
-def estimate_charuco_size(pictures: Sequence[Grey], dictionary: str) -> CharucoSize | None:
+def estimate_charuco_size(images: Sequence[Grey], dictionary: str) -> CharucoSize | None:
     """Return the size of the board that explains most markers; None if there is none.
 
     With the right number of columns, the markers of an image lie in a plane, each at the position of its id.
@@ -44,13 +50,13 @@ def estimate_charuco_size(pictures: Sequence[Grey], dictionary: str) -> CharucoS
 
     Parameters
     ----------
-    pictures : grey images, not inverted.
+    images : grey images, not inverted.
     dictionary : name of the marker dictionary in OpenCV.
     """
     number = getattr(cv2.aruco, dictionary)
     detector = cv2.aruco.ArucoDetector(cv2.aruco.getPredefinedDictionary(number))
     rows_by_columns: dict[int, list[int]] = {}
-    for grey in pictures:
+    for grey in images:
         corners, ids, _ = detector.detectMarkers(grey)
         if ids is None or len(ids) < _LEAST_MARKERS:
             continue
@@ -73,26 +79,26 @@ def _size_of(ids: NDArray[np.intp], centres: Array) -> tuple[int, int] | None:
     for columns in _COLUMNS:
         # OpenCV before 4.6 printed boards with an even number of rows with a white square at the top left.
         for first in (1, 0):
-            places = _marker_places(columns, first)
-            known = ids < len(places)
-            if known.sum() <= most or len({int(y) for y in places[ids[known]][:, 1]}) < 2:
+            positions = _marker_positions(columns, first)
+            known = ids < len(positions)
+            if known.sum() <= most or len({int(y) for y in positions[ids[known]][:, 1]}) < 2:
                 continue
-            near = _at_place(places[ids[known]], centres[known])
+            near = _share_at_positions(positions[ids[known]], centres[known])
             if near.sum() > most:
                 most = float(near.sum())
-                best = columns, int(places[ids[known]][near, 1].max()) + 1
+                best = columns, int(positions[ids[known]][near, 1].max()) + 1
     return best
 
 
-def _at_place(places: Array, centres: Array) -> NDArray[np.bool_]:
+def _share_at_positions(positions: Array, centres: Array) -> NDArray[np.bool_]:
     """Return a mask of the markers at their positions in a plane, (n,); all False if there is no plane."""
-    result: Any = cv2.findHomography(centres, places, cv2.RANSAC, _NEAR)
+    result: Any = cv2.findHomography(centres, positions, cv2.RANSAC, _NEAR)
     homography, near = result
-    return np.zeros(len(places), np.bool_) if homography is None else np.ravel(near).astype(np.bool_)
+    return np.zeros(len(positions), np.bool_) if homography is None else np.ravel(near).astype(np.bool_)
 
 
 @cache
-def _marker_places(columns: int, first: int) -> Array:
+def _marker_positions(columns: int, first: int) -> Array:
     """Return column and row of the square of each id, (n, 2); ``first`` is the first column with a marker."""
     return np.array(
         [(x, y) for y in range(_MOST_ROWS) for x in range(columns) if (x + y) % 2 == first], dtype=np.float64
@@ -114,8 +120,8 @@ _CONTRADICTED = 0.5
 _FORCE = "if the size is right, give --force"
 
 
-def hint(
-    pictures: Sequence[Grey],
+def describe_other_board(
+    images: Sequence[Grey],
     board: Board,
     trying: Callable[[int, int], None],
     sizes: Sequence[Size | None] = (),
@@ -124,16 +130,16 @@ def hint(
 
     Parameters
     ----------
-    pictures : the images to examine.
+    images : the images to examine.
     board : the board that no image shows.
     trying : called with the number of other kinds of board tried so far, and their total: the search is slow.
     sizes : size of the largest chessboard in each image, if it is known.
     """
     if any(size is not None for size in sizes) and (answer := _name_size(sizes, board, board)):
         return answer
-    if board.marker_scale is not None and (mirrored := _mirrored(pictures, board)):
+    if board.marker_scale is not None and (mirrored := _mirrored(images, board)):
         return mirrored
-    searches = list(_searches(pictures, board))
+    searches = list(_searches(images, board))
     for number, search in enumerate(searches):
         trying(number, len(searches))
         if answer := search():
@@ -146,14 +152,14 @@ def hint(
     return "; give columns x rows of its squares, and the --dictionary that its markers are of"
 
 
-def check_chessboard_size(sizes: Sequence[Size | None], board: Board, where: str) -> None:
+def check_chessboard_size(sizes: Sequence[Size | None], board: Board, source: str) -> None:
     """Check that most images do not show a larger chessboard than the given board.
 
     Parameters
     ----------
     sizes : size of the largest grid in each image.
     board : a chessboard.
-    where : source of the images, for messages.
+    source : source of the images, for messages.
 
     Raises
     ------
@@ -168,12 +174,12 @@ def check_chessboard_size(sizes: Sequence[Size | None], board: Board, where: str
     larger_board = _sized(board, larger)
     shown = sum(_same(size, larger) for size in sizes)
     raise IpsysError(
-        f"{where}: {board} is a part of {larger_board}, which {shown} of {total} pictures of a board show: "
+        f"{source}: {board} is a part of {larger_board}, which {shown} of {total} pictures of a board show: "
         f"give --board {larger_board.columns}x{larger_board.rows}; {_FORCE}"
     )
 
 
-def check_charuco_size(pictures: Sequence[Grey], board: Board, where: str) -> None:
+def check_charuco_size(images: Sequence[Grey], board: Board, source: str) -> None:
     """Check that the markers have the positions of a ChArUco board of the given size.
 
     Raises
@@ -181,44 +187,44 @@ def check_charuco_size(pictures: Sequence[Grey], board: Board, where: str) -> No
     IpsysError
         The markers have other positions; the text names the board size that fits the markers.
     """
-    size = estimate_charuco_size([_as_printed(grey, board) for grey in pictures], board.dictionary)
-    if size is None or size.pictures <= _CONTRADICTED * len(pictures):
+    size = estimate_charuco_size([_as_printed(grey, board) for grey in images], board.dictionary)
+    if size is None or size.image_count <= _CONTRADICTED * len(images):
         return
     if size.columns == board.columns and size.rows <= board.rows:
         return
     rows = max(size.rows, board.rows) if size.columns == board.columns else size.rows
     raise IpsysError(
-        f"{where}: {size.pictures} of {len(pictures)} tried pictures have the markers of "
+        f"{source}: {size.image_count} of {len(images)} tried pictures have the markers of "
         f"{replace(board, columns=size.columns, rows=rows)} or more, not of {board.columns} x {board.rows}: "
         f"give --board charuco:{size.columns}x{rows}; {_FORCE}"
     )
 
 
-def _mirrored(pictures: Sequence[Grey], board: Board) -> str:
-    mirrored = [np.ascontiguousarray(grey[:, ::-1]) for grey in pictures]
+def _mirrored(images: Sequence[Grey], board: Board) -> str:
+    mirrored = [np.ascontiguousarray(grey[:, ::-1]) for grey in images]
     seen = sum(find_board("", grey, board, thorough=False) is not None for grey in mirrored)
     if not seen:
         return ""
     return (
-        f"; but it is seen mirrored in {seen} of {len(pictures)} tried: webcam programs may mirror pictures; "
+        f"; but it is seen mirrored in {seen} of {len(images)} tried: webcam programs may mirror pictures; "
         "turn that off, and take the pictures again"
     )
 
 
-def _searches(pictures: Sequence[Grey], board: Board) -> Iterator[Callable[[], str]]:
+def _searches(images: Sequence[Grey], board: Board) -> Iterator[Callable[[], str]]:
     """Yield the searches for other boards, the likely boards first."""
     inverted = replace(board, inverted=not board.inverted)
-    chessboards = [partial(_other_chessboard, pictures, kind, board) for kind in (board, inverted)]
+    chessboards = [partial(_other_chessboard, images, kind, board) for kind in (board, inverted)]
     markers = [
-        partial(_other_charuco, pictures, replace(kind, dictionary=name), board)
+        partial(_other_charuco, images, replace(kind, dictionary=name), board)
         for name in dict.fromkeys((board.dictionary, *_DICTIONARIES))
         for kind in (board, inverted)
     ]
     yield from [*chessboards, *markers] if board.marker_scale is None else [*markers, *chessboards]
 
 
-def _other_chessboard(pictures: Sequence[Grey], kind: Board, board: Board) -> str:
-    return _name_size([find_largest_grid(_as_printed(grey, kind)) for grey in pictures], kind, board)
+def _other_chessboard(images: Sequence[Grey], kind: Board, board: Board) -> str:
+    return _name_size([find_largest_grid(_as_printed(grey, kind)) for grey in images], kind, board)
 
 
 def _name_size(sizes: Sequence[Size | None], kind: Board, board: Board) -> str:
@@ -235,8 +241,8 @@ def _name_size(sizes: Sequence[Size | None], kind: Board, board: Board) -> str:
     return f"; but {seen_board} is seen in {seen_count} of {len(sizes)} tried: give {option}{turn}"
 
 
-def _other_charuco(pictures: Sequence[Grey], kind: Board, board: Board) -> str:
-    size = estimate_charuco_size([_as_printed(grey, kind) for grey in pictures], kind.dictionary)
+def _other_charuco(images: Sequence[Grey], kind: Board, board: Board) -> str:
+    size = estimate_charuco_size([_as_printed(grey, kind) for grey in images], kind.dictionary)
     if size is None:
         return ""
     scale = board.marker_scale if board.marker_scale is not None else 0.75
@@ -248,7 +254,7 @@ def _other_charuco(pictures: Sequence[Grey], kind: Board, board: Board) -> str:
     if not options:
         return ""
     options_text = " and ".join(options)
-    return f"; but {seen_board} is seen in {size.pictures} of {len(pictures)} tried: give {options_text}"
+    return f"; but {seen_board} is seen in {size.image_count} of {len(images)} tried: give {options_text}"
 
 
 def _largest_board(sizes: Sequence[Size | None]) -> Size | None:

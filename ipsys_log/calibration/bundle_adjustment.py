@@ -38,37 +38,37 @@ class Corners:
     """All corners of all images.
 
     ``board_m`` (n, 3) has the positions on the board, ``pixels`` (n, 2) the positions in the image.
-    ``picture`` (n,) has the number of the image, in ascending order. Each number from 0 to ``pictures`` - 1
-    occurs at least once.
+    ``image_numbers`` (n,) has the number of the image, in ascending order. Each number from 0 to
+    ``image_count`` - 1 occurs at least once.
     """
 
     board_m: Array
     pixels: Array
-    picture: NDArray[np.intp]
-    pictures: int
+    image_numbers: NDArray[np.intp]
+    image_count: int
 
     @property
     def starts(self) -> NDArray[np.intp]:
         """The index of the first corner of each image."""
-        return np.searchsorted(self.picture, np.arange(self.pictures))
+        return np.searchsorted(self.image_numbers, np.arange(self.image_count))
 
     def sums(self, values: Array) -> Array:
-        """Return the sums of ``values`` over the corners of each image, (pictures, ...)."""
+        """Return the sums of ``values`` over the corners of each image, (image_count, ...)."""
         return np.asarray(np.add.reduceat(values, self.starts, axis=0))
 
-    def keep(self, kept: NDArray[np.bool_]) -> tuple[Corners, NDArray[np.intp]]:
-        """Return the corners of the mask ``kept`` (n,), and the numbers of images that still have corners."""
-        remaining, numbers = np.unique(self.picture[kept], return_inverse=True)
-        return Corners(self.board_m[kept], self.pixels[kept], numbers, len(remaining)), remaining
+    def select(self, mask: NDArray[np.bool_]) -> tuple[Corners, NDArray[np.intp]]:
+        """Return the corners of the mask ``mask`` (n,), and the numbers of images that still have corners."""
+        remaining, numbers = np.unique(self.image_numbers[mask], return_inverse=True)
+        return Corners(self.board_m[mask], self.pixels[mask], numbers, len(remaining)), remaining
 
 
 @dataclass(frozen=True, slots=True, eq=False)
 class Fit:
     """The intrinsics (p,), and each board pose in camera coordinates: (f, 3, 3) and (f, 3) in m."""
 
-    lens: Array
+    intrinsics: Array
     rotations: Array
-    places_m: Array
+    positions_m: Array
     cost: float = np.inf
 
 
@@ -92,31 +92,31 @@ class Normal:
 
 def camera_points(fit: Fit, corners: Corners) -> Array:
     """Return the corners in camera coordinates, (n, 3) in m."""
-    rotated = np.einsum("nij,nj->ni", fit.rotations[corners.picture], corners.board_m)
-    return np.asarray(rotated + fit.places_m[corners.picture])
+    rotated = np.einsum("nij,nj->ni", fit.rotations[corners.image_numbers], corners.board_m)
+    return np.asarray(rotated + fit.positions_m[corners.image_numbers])
 
 
 def residuals(model: LensModel, fit: Fit, corners: Corners) -> Array:
     """Return the reprojection residuals of the corners, (n, 2) in px."""
-    return project_points(model, fit.lens, camera_points(fit, corners)) - corners.pixels
+    return project_points(model, fit.intrinsics, camera_points(fit, corners)) - corners.pixels
 
 
-def _weights(missed_px: Array, scale_px: float | None) -> tuple[Array, float]:
+def _weights(residuals_px: Array, scale_px: float | None) -> tuple[Array, float]:
     """Return the weights of the corners and the cost, by Cauchy's loss, or by squares without a scale."""
-    squares = (missed_px**2).sum(axis=1)
+    squares = (residuals_px**2).sum(axis=1)
     if scale_px is None:
         return np.ones(len(squares)), float(squares.sum())
     ratio = squares / scale_px**2
     return 1 / (1 + ratio), float(scale_px**2 * np.log1p(ratio).sum())
 
 
-def corner_weights(missed_px: Array, scale_px: float | None) -> Array:
+def corner_weights(residuals_px: Array, scale_px: float | None) -> Array:
     """Return the weight of each corner, (n,): 1, or less for an outlier."""
-    return _weights(missed_px, scale_px)[0]
+    return _weights(residuals_px, scale_px)[0]
 
 
 def _cost(model: LensModel, fit: Fit, corners: Corners, scale_px: float | None) -> float:
-    return _weights(residuals(model, fit, corners), scale_px)[1] + float(model.pull @ fit.lens**2)
+    return _weights(residuals(model, fit, corners), scale_px)[1] + float(model.pull @ fit.intrinsics**2)
 
 
 def normal_equations(
@@ -124,9 +124,9 @@ def normal_equations(
 ) -> Normal:
     """Return the normal equations of a step; ``basis`` (p, q) has the free directions of the intrinsics."""
     points_m = camera_points(fit, corners)
-    pixels, by_point, by_lens = project_with_slopes(model, fit.lens, points_m)
-    missed_px = pixels - corners.pixels
-    x, y, z = (points_m - fit.places_m[corners.picture]).T
+    pixels, by_point, by_lens = project_with_slopes(model, fit.intrinsics, points_m)
+    residuals_px = pixels - corners.pixels
+    x, y, z = (points_m - fit.positions_m[corners.image_numbers]).T
     # Columns: the intrinsics (q), rotation and translation of the board (6), and the residual.
     count = basis.shape[1]
     rows = np.empty((len(points_m), 2, count + 7))
@@ -138,8 +138,8 @@ def normal_equations(
     rows[..., count + 1] = by_x * z - by_z * x
     rows[..., count + 2] = by_y * x - by_x * y
     rows[..., count + 3 : count + 6] = by_point
-    rows[..., count + 6] = missed_px
-    rows *= np.sqrt(_weights(missed_px, scale_px)[0])[:, None, None]
+    rows[..., count + 6] = residuals_px
+    rows *= np.sqrt(_weights(residuals_px, scale_px)[0])[:, None, None]
     squares = np.stack([_squares(part) for part in np.split(rows, corners.starts[1:])])
     lens, pose = slice(count), slice(count, count + 6)
     return Normal(
@@ -149,7 +149,7 @@ def normal_equations(
         squares[:, pose, -1],
         squares[:, pose, lens],
         (basis.T * model.pull) @ basis,
-        basis.T @ (model.pull * fit.lens),
+        basis.T @ (model.pull * fit.intrinsics),
     )
 
 
@@ -186,9 +186,9 @@ def _diagonals(matrices: Array) -> Array:
     return np.asarray(matrices * np.eye(matrices.shape[-1]))
 
 
-def _moved(fit: Fit, lens_step: Array, pose_steps: Array) -> Fit:
+def _apply_step(fit: Fit, lens_step: Array, pose_steps: Array) -> Fit:
     turns = Rotation.from_rotvec(pose_steps[:, :3]).as_matrix()
-    return Fit(fit.lens + lens_step, turns @ fit.rotations, fit.places_m + pose_steps[:, 3:])
+    return Fit(fit.intrinsics + lens_step, turns @ fit.rotations, fit.positions_m + pose_steps[:, 3:])
 
 
 def adjust(
@@ -219,7 +219,7 @@ def adjust(
         normal = normal_equations(model, fit, corners, basis, scale_px)
         cost_before = fit.cost
         while damping < _MOST_DAMPING:
-            trial = _tried(model, fit, corners, basis, normal, damping, scale_px)
+            trial = _try_step(model, fit, corners, basis, normal, damping, scale_px)
             if trial is not None and trial.cost <= cost_before:
                 fit, damping = trial, max(damping / 10, 1e-12)
                 break
@@ -229,7 +229,7 @@ def adjust(
     return fit
 
 
-def _tried(
+def _try_step(
     model: LensModel,
     fit: Fit,
     corners: Corners,
@@ -243,8 +243,8 @@ def _tried(
         lens_step, pose_steps = _solve(normal, damping)
     except np.linalg.LinAlgError:
         return None
-    trial = _moved(fit, basis @ lens_step, pose_steps)
-    if not (np.isfinite(trial.lens).all() and (trial.lens[:2] > 0).all()):
+    trial = _apply_step(fit, basis @ lens_step, pose_steps)
+    if not (np.isfinite(trial.intrinsics).all() and (trial.intrinsics[:2] > 0).all()):
         return None
     with np.errstate(over="ignore", invalid="ignore"):
         cost = _cost(model, trial, corners, scale_px)

@@ -209,7 +209,7 @@ class ChessboardView(NamedTuple):
 class _Try(NamedTuple):
     """One call of OpenCV's detector; with CALIB_CB_LARGER in ``flags``, a larger grid is accepted."""
 
-    whole_picture: bool
+    whole_image: bool
     size: Size
     flags: int = 0
 
@@ -232,14 +232,14 @@ def find_chessboard(grey: Grey, size: Size, thorough: bool) -> ChessboardView:
     small = cv2.resize(grey, None, fx=0.5, fy=0.5, interpolation=cv2.INTER_AREA) if large else grey
     largest: Size | None = None
     for attempt in _tries(size, large, thorough):
-        picture = grey if attempt.whole_picture or not large else np.asarray(small, dtype=np.uint8)
-        grid = _grid(picture, attempt)
+        image = grey if attempt.whole_image or not large else np.asarray(small, dtype=np.uint8)
+        grid = _grid(image, attempt)
         if grid is None:
             continue
         columns_rows = (grid.shape[1], grid.shape[0])
         if fits_in(size, columns_rows):
-            corners = crop_grid(picture, grid, size)
-            return ChessboardView(corners if picture is grey else 2 * corners + 0.5, columns_rows)
+            corners = crop_grid(image, grid, size)
+            return ChessboardView(corners if image is grey else 2 * corners + 0.5, columns_rows)
         largest = _larger(largest, columns_rows)
         if not fits_in(columns_rows, size):
             break  # a board of another size
@@ -275,10 +275,10 @@ def _tries(size: Size, large: bool, thorough: bool) -> list[_Try]:
     return tries
 
 
-def _grid(picture: Grey, attempt: _Try) -> Array | None:
+def _grid(image: Grey, attempt: _Try) -> Array | None:
     """Return the real corners from one call of the detector, (rows, columns, 2), or None."""
-    is_detected, corners, cells = cv2.findChessboardCornersSBWithMeta(picture, attempt.size, attempt.flags)
+    is_detected, corners, cells = cv2.findChessboardCornersSBWithMeta(image, attempt.size, attempt.flags)
     if not is_detected:
         return None
     rows, columns = cells.shape if attempt.flags & cv2.CALIB_CB_LARGER else attempt.size[::-1]
-    return complete_grid(picture, np.asarray(corners, dtype=np.float64).reshape(rows, columns, 2))
+    return complete_grid(image, np.asarray(corners, dtype=np.float64).reshape(rows, columns, 2))

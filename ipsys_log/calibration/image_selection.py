@@ -10,18 +10,18 @@ import numpy as np
 from numpy.typing import NDArray
 
 from ipsys_log.calibration.board import Board
-from ipsys_log.calibration.board_detection import LEAST_CORNERS, Sighting
+from ipsys_log.calibration.board_detection import LEAST_CORNERS, BoardSighting
 
 __all__ = [
-    "MOST_PICTURES",
+    "MAX_IMAGES",
     "NEAR",
-    "Chosen",
     "Coverage",
-    "Dropped",
-    "advice",
-    "choose",
+    "ExcludedSighting",
+    "Selection",
+    "advise",
     "group_outlines",
     "measure_coverage",
+    "select_images",
 ]
 
 Array = NDArray[np.float64]
@@ -42,15 +42,15 @@ class Coverage:
     """The coverage of the image and of the board poses by all used corners.
 
     ``share`` is the share of the image (in 8 x 6 cells) with corners, ``empty_sides`` are the sides of the
-    image without corners. ``tilted`` counts the boards with a tilt of 25 degrees or more, ``places`` the
-    board positions that differ by 3 % of the image. ``widest_rad`` is the greatest angle of a corner from
-    the optical axis, or None.
+    image without corners. ``tilted`` counts the boards with a tilt of 25 degrees or more,
+    ``position_count`` the board positions that differ by 3 % of the image. ``widest_rad`` is the greatest
+    angle of a corner from the optical axis, or None.
     """
 
     share: float
     empty_sides: tuple[str, ...]
     tilted: int
-    places: int
+    position_count: int
     widest_rad: float | None = None
 
 
@@ -109,7 +109,7 @@ def group_outlines(outlines: Array, near_px: float) -> NDArray[np.intp]:
     return np.array(groups)
 
 
-def advice(coverage: Coverage) -> list[str]:
+def advise(coverage: Coverage) -> list[str]:
     """Return advice on additional images; an empty list if the images are good."""
     lines = []
     if coverage.empty_sides:
@@ -118,9 +118,9 @@ def advice(coverage: Coverage) -> list[str]:
         lines.append(f"no board near the {sides} of the image: hold it there too")
     elif coverage.share < _ENOUGH_SHARE:
         lines.append(f"the board covered {coverage.share:.0%} of the image: move it all over the view")
-    if coverage.places < _ENOUGH_PLACES:
-        places = "place that differs" if coverage.places == 1 else "places that differ"
-        lines.append(f"the board was held at {coverage.places} {places}: move it more")
+    if coverage.position_count < _ENOUGH_PLACES:
+        places = "place that differs" if coverage.position_count == 1 else "places that differ"
+        lines.append(f"the board was held at {coverage.position_count} {places}: move it more")
     if coverage.tilted < _ENOUGH_TILTED:
         lines.append(
             f"tilted by 25 degrees or more in {coverage.tilted} pictures: tilt the board to all sides, "
@@ -129,7 +129,7 @@ def advice(coverage: Coverage) -> list[str]:
     return lines
 
 
-MOST_PICTURES = 50
+MAX_IMAGES = 50
 # Edges are blurred if they are wider than edges in sharp images by this factor, and wider than this limit.
 _BLURRED = 2.2
 _BLURRED_PX = 1.8
@@ -137,22 +137,22 @@ _BLURRED_PX = 1.8
 _SAME = 0.0005
 
 
-class Dropped(NamedTuple):
+class ExcludedSighting(NamedTuple):
     """An image that is not used, and the reason."""
 
     name: str
     reason: str
 
 
-class Chosen(NamedTuple):
+class Selection(NamedTuple):
     """The images for the fit, the bad images, and good images that give no new information."""
 
-    used: list[Sighting]
-    bad: list[Dropped]
-    spare: list[Dropped]
+    used: list[BoardSighting]
+    bad: list[ExcludedSighting]
+    spare: list[ExcludedSighting]
 
 
-def choose(sightings: Sequence[Sighting], board: Board, size_px: tuple[int, int]) -> Chosen:
+def select_images(sightings: Sequence[BoardSighting], board: Board, size_px: tuple[int, int]) -> Selection:
     """Choose images for the calibration from all images that show the board.
 
     If there are more images than necessary, the next image is the image whose board is farthest from all
@@ -171,35 +171,40 @@ def choose(sightings: Sequence[Sighting], board: Board, size_px: tuple[int, int]
         if reason is None:
             good.append(sighting)
         else:
-            bad.append(Dropped(sighting.name, reason))
+            bad.append(ExcludedSighting(sighting.name, reason))
     if not good:
-        return Chosen([], bad, [])
+        return Selection([], bad, [])
     order, spare = _spread(good, usual_px, _SAME * float(np.hypot(*size_px)))
-    return Chosen([good[n] for n in sorted(order)], bad, spare)
+    return Selection([good[n] for n in sorted(order)], bad, spare)
 
 
-def _usual_blur_px(sightings: Sequence[Sighting]) -> float:
+def _usual_blur_px(sightings: Sequence[BoardSighting]) -> float:
     widths = [s.blur_px for s in sightings if s.blur_px > 0]
     return float(np.quantile(widths, 0.25)) if widths else 0.0
 
 
-def _fault(sighting: Sighting, board: Board, usual_px: float) -> str | None:
+def _fault(sighting: BoardSighting, board: Board, usual_px: float) -> str | None:
     count = len(sighting.ids)
-    if count < LEAST_CORNERS or min(len(set(line)) for line in board.places(sighting.ids).T.tolist()) < 2:
+    if (
+        count < LEAST_CORNERS
+        or min(len(set(line)) for line in board.grid_positions(sighting.ids).T.tolist()) < 2
+    ):
         return f"only {count} corners are seen" if count < LEAST_CORNERS else "its corners lie on one line"
     if usual_px and sighting.blur_px > max(_BLURRED * usual_px, _BLURRED_PX):
         return f"blurred: edges are {sighting.blur_px:.1f} px wide, in the sharp pictures {usual_px:.1f}"
     return None
 
 
-def _spread(good: Sequence[Sighting], usual_px: float, same_px: float) -> tuple[list[int], list[Dropped]]:
+def _spread(
+    good: Sequence[BoardSighting], usual_px: float, same_px: float
+) -> tuple[list[int], list[ExcludedSighting]]:
     """Return the numbers of the images to use, and the other images with the names of similar images."""
     outlines = np.stack([s.outline for s in good])
     sharp = np.array([min(1.0, usual_px / s.blur_px) if s.blur_px > 0 else 1.0 for s in good])
     order = [int(np.argmax(sharp * [len(s.ids) for s in good]))]
     nearest = np.full(len(good), order[0])
     distances = _distances_px(outlines, outlines[order[0]])
-    while len(order) < min(len(good), MOST_PICTURES):
+    while len(order) < min(len(good), MAX_IMAGES):
         farthest = int(np.argmax(distances * sharp))
         if distances[farthest] <= same_px:
             break
@@ -209,7 +214,7 @@ def _spread(good: Sequence[Sighting], usual_px: float, same_px: float) -> tuple[
         distances = np.minimum(distances, new_distances)
     used = set(order)
     spare = [
-        Dropped(s.name, f"shows the board nearly as {good[nearest[n]].name} does")
+        ExcludedSighting(s.name, f"shows the board nearly as {good[nearest[n]].name} does")
         for n, s in enumerate(good)
         if n not in used
     ]

@@ -14,18 +14,18 @@ import numpy as np
 
 from ipsys_log.calibration.board_detection import Grey
 from ipsys_log.errors import FrameError, IpsysError
-from ipsys_log.images.decode import check_encoded, read_picture_size
+from ipsys_log.images.decode import check_encoded, read_image_size
 from ipsys_log.images.video import Video
 from ipsys_log.log.dataset import Session
 from ipsys_log.messages import CompressedImage, CompressedVideo, RawImage
 from ipsys_log.rig.file import check_name
 
-__all__ = ["MOST_LOOKED_AT", "Pictures", "find_sources"]
+__all__ = ["MAX_EXAMINED_IMAGES", "ImageSource", "find_sources"]
 
 # Largest number of images to examine in a long recording, evenly spread.
-MOST_LOOKED_AT = 400
+MAX_EXAMINED_IMAGES = 400
 
-_PICTURES = (".jpg", ".jpeg", ".png", ".webp", ".bmp", ".tif", ".tiff", ".pgm", ".ppm")
+_IMAGE_SUFFIXES = (".jpg", ".jpeg", ".png", ".webp", ".bmp", ".tif", ".tiff", ".pgm", ".ppm")
 _VIDEOS = (".mp4", ".avi", ".mov", ".mkv", ".m4v", ".webm", ".mpg", ".mpeg", ".mjpeg", ".mjpg")
 _GREY_OF_RAW = {
     "mono8": (1, None), "8UC1": (1, None),
@@ -38,12 +38,12 @@ def _no_sizes() -> list[tuple[str, tuple[int, int]]]:
     return []
 
 
-class Pictures(NamedTuple):
+class ImageSource(NamedTuple):
     """The images of one camera.
 
     Attributes
     ----------
-    camera, where : name of the camera, and the source of the images.
+    camera, source : name of the camera, and the source of the images.
     total : approximate number of images; 0 if it is not known.
     read : returns each image with its name; None for an unreadable image.
     sizes : returns names and sizes in px, if they are known before decoding.
@@ -51,19 +51,19 @@ class Pictures(NamedTuple):
     """
 
     camera: str
-    where: str
+    source: str
     total: int
     read: Callable[[], Iterator[tuple[str, Grey | None]]]
     sizes: Callable[[], list[tuple[str, tuple[int, int]]]] = _no_sizes
     requested: bool = True
 
     @property
-    def looked_at(self) -> int:
+    def examined_count(self) -> int:
         """The number of images to read; 0 if it is not known."""
         return -(-self.total // _stride(self.total))
 
 
-def find_sources(paths: Sequence[Path], cameras: Sequence[str]) -> list[Pictures]:
+def find_sources(paths: Sequence[Path], cameras: Sequence[str]) -> list[ImageSource]:
     """Return the images in logs (``.mcap``), folders, image files and videos, by camera.
 
     Parameters
@@ -76,10 +76,10 @@ def find_sources(paths: Sequence[Path], cameras: Sequence[str]) -> list[Pictures
     IpsysError
         A source cannot be read, a requested camera has no images, or a camera has no valid name.
     """
-    sources = [pictures for path in paths for pictures in _sources_of(path, cameras)]
-    by_camera: dict[str, list[Pictures]] = {}
-    for pictures in sources:
-        by_camera.setdefault(pictures.camera, []).append(pictures)
+    sources = [images for path in paths for images in _sources_of(path, cameras)]
+    by_camera: dict[str, list[ImageSource]] = {}
+    for images in sources:
+        by_camera.setdefault(images.camera, []).append(images)
     missing = [camera for camera in cameras if camera not in by_camera]
     if missing:
         known = ", ".join(by_camera)
@@ -88,12 +88,12 @@ def find_sources(paths: Sequence[Path], cameras: Sequence[str]) -> list[Pictures
     return [_joined(camera, parts) for camera, parts in wanted.items()]
 
 
-def _joined(camera: str, parts: list[Pictures]) -> Pictures:
+def _joined(camera: str, parts: list[ImageSource]) -> ImageSource:
     if len(parts) == 1:
         return parts[0]
-    source = f"{parts[0].where} and {len(parts) - 1} more"
+    source = f"{parts[0].source} and {len(parts) - 1} more"
     total = sum(part.total for part in parts)
-    return Pictures(
+    return ImageSource(
         camera,
         source,
         total,
@@ -103,21 +103,20 @@ def _joined(camera: str, parts: list[Pictures]) -> Pictures:
     )
 
 
-def _sources_of(path: Path, cameras: Sequence[str]) -> list[Pictures]:
+def _sources_of(path: Path, cameras: Sequence[str]) -> list[ImageSource]:
     if path.is_dir():
         return _folder(path, cameras)
     if not path.is_file():
         raise IpsysError(f"{path}: there is no such log, folder, picture or video")
     if path.suffix.lower() == ".mcap":
         return _log(path, requested=bool(cameras))
-    if path.suffix.lower() in _PICTURES:
+    if path.suffix.lower() in _IMAGE_SUFFIXES:
         name = _camera_name(path.absolute().parent.name, path, cameras)
         return [_of_files(name, path, [path])]
     if path.suffix.lower() in _VIDEOS:
         return [_video(path, cameras)]
-    raise IpsysError(
-        f"{path}: is neither a log (.mcap), a picture ({_PICTURES[0]} ...) nor a video ({_VIDEOS[0]} ...)"
-    )
+    image, video = _IMAGE_SUFFIXES[0], _VIDEOS[0]
+    raise IpsysError(f"{path}: is neither a log (.mcap), a picture ({image} ...) nor a video ({video} ...)")
 
 
 def _camera_name(text: str, path: Path, cameras: Sequence[str]) -> str:
@@ -129,7 +128,7 @@ def _camera_name(text: str, path: Path, cameras: Sequence[str]) -> str:
     return name if name[:1].isalpha() else f"camera_{name}".rstrip("_")
 
 
-def _folder(folder: Path, cameras: Sequence[str]) -> list[Pictures]:
+def _folder(folder: Path, cameras: Sequence[str]) -> list[ImageSource]:
     """Return the images in a folder as one camera, or without images, each sub-folder as one camera."""
     folder_files = _files(folder)
     if folder_files:
@@ -137,16 +136,18 @@ def _folder(folder: Path, cameras: Sequence[str]) -> list[Pictures]:
         return [_of_files(name, folder, folder_files)]
     subs = {sub: files for sub in sorted(folder.iterdir()) if sub.is_dir() and (files := _files(sub))}
     if not subs:
-        raise IpsysError(f"{folder}: has no pictures ({', '.join(_PICTURES[:3])} ...)")
+        raise IpsysError(f"{folder}: has no pictures ({', '.join(_IMAGE_SUFFIXES[:3])} ...)")
     return [_of_files(_camera_name(sub.name, sub, []), sub, files) for sub, files in subs.items()]
 
 
-def _of_files(camera: str, where: Path, files: list[Path]) -> Pictures:
-    return Pictures(camera, str(where), len(files), partial(_read_files, files), partial(_read_sizes, files))
+def _of_files(camera: str, source: Path, files: list[Path]) -> ImageSource:
+    return ImageSource(
+        camera, str(source), len(files), partial(_read_files, files), partial(_read_sizes, files)
+    )
 
 
 def _files(folder: Path) -> list[Path]:
-    files = [path for path in folder.iterdir() if path.is_file() and path.suffix.lower() in _PICTURES]
+    files = [path for path in folder.iterdir() if path.is_file() and path.suffix.lower() in _IMAGE_SUFFIXES]
     return sorted((path for path in files if not path.name.startswith(".")), key=_by_number)
 
 
@@ -161,7 +162,7 @@ def _read_files(files: Sequence[Path]) -> Iterator[tuple[str, Grey | None]]:
 
 
 def _read_sizes(files: Sequence[Path]) -> list[tuple[str, tuple[int, int]]]:
-    sizes = [(path.name, read_picture_size(path)) for path in _spread(files)]
+    sizes = [(path.name, read_image_size(path)) for path in _spread(files)]
     return [(name, size) for name, size in sizes if size is not None]
 
 
@@ -170,7 +171,7 @@ def _spread(files: Sequence[Path]) -> Sequence[Path]:
 
 
 def _stride(total: int) -> int:
-    return max(1, -(-total // MOST_LOOKED_AT))
+    return max(1, -(-total // MAX_EXAMINED_IMAGES))
 
 
 def _decode(data: bytes) -> Grey | None:
@@ -184,14 +185,14 @@ def _decode(data: bytes) -> Grey | None:
     return None if grey is None else np.asarray(grey, dtype=np.uint8)
 
 
-def _video(path: Path, cameras: Sequence[str]) -> Pictures:
+def _video(path: Path, cameras: Sequence[str]) -> ImageSource:
     video = cv2.VideoCapture(str(path))
     total, opened = int(video.get(cv2.CAP_PROP_FRAME_COUNT)), video.isOpened()
     video.release()
     if not opened:
         raise IpsysError(f"{path}: is no video that can be read; convert it to H.264 in an .mp4")
     name = _camera_name(path.stem, path, cameras)
-    return Pictures(name, str(path), max(total, 0), partial(_read_video, path, _stride(total)))
+    return ImageSource(name, str(path), max(total, 0), partial(_read_video, path, _stride(total)))
 
 
 def _read_video(path: Path, stride: int) -> Iterator[tuple[str, Grey | None]]:
@@ -215,14 +216,14 @@ def _grey(frame: Grey) -> Grey:
     return np.asarray(cv2.cvtColor(frame, cv2.COLOR_BGR2GRAY), dtype=np.uint8)
 
 
-def _log(path: Path, requested: bool) -> list[Pictures]:
+def _log(path: Path, requested: bool) -> list[ImageSource]:
     with Session([path]) as session:
         topics = dict(session.images)
         counts = {camera: session.count(topic) for camera, topic in topics.items()}
         if not session.images:
             raise IpsysError(f"{path}: has no frames of any camera")
     return [
-        Pictures(
+        ImageSource(
             c, f"{path}: camera {c}", counts[c], partial(_read_log, path, t, _stride(counts[c])),
             requested=requested,
         )
@@ -240,7 +241,7 @@ def _read_log(path: Path, topic: str, stride: int) -> Iterator[tuple[str, Grey |
                 if wanted:
                     frame = _of_video(video, frame)
                 else:
-                    video.pass_over(frame)
+                    video.skip(frame)
             if wanted:
                 seconds = (message.publish_time_ns - session.start_ns) * 1e-9
                 yield f"at {seconds:.2f} s", None if frame is None else _frame(frame)

@@ -13,7 +13,7 @@ from numpy.typing import NDArray
 
 from ipsys_log.errors import IpsysError
 
-__all__ = ["LENSES", "LensModel", "find_lens", "project_points", "project_with_slopes"]
+__all__ = ["LENS_MODELS", "LensModel", "find_lens_model", "project_points", "project_with_slopes"]
 
 Array = NDArray[np.float64]
 
@@ -27,16 +27,16 @@ _PULL_PX = 0.1
 class LensModel(NamedTuple):
     """A lens model: its name in the log, its coefficient names, and the number of fitted coefficients.
 
-    The other coefficients stay 0. ``bend`` returns the image of points at a focal length of 1,
-    ``bend_with_slopes`` also its derivatives. ``usual`` is the usual size of coefficients that images may not
-    determine separately: a common factor of numerator and denominator has no effect.
+    The other coefficients stay 0. ``distort`` returns the image of points at a focal length of 1,
+    ``distort_with_slopes`` also its derivatives. ``usual`` is the usual size of coefficients that
+    images may not determine separately: a common factor of numerator and denominator has no effect.
     """
 
     distortion_model: str
     coefficients: tuple[str, ...]
     fitted: int
-    bend: Callable[[Array, Array], Array]
-    bend_with_slopes: Callable[[Array, Array], tuple[Array, Array, Array]]
+    distort: Callable[[Array, Array], Array]
+    distort_with_slopes: Callable[[Array, Array], tuple[Array, Array, Array]]
     usual: float = np.inf
 
     @property
@@ -63,7 +63,7 @@ def project_points(model: LensModel, parameters: Array, points_m: Array) -> Arra
     parameters : (p,), in the order of ``model.names``.
     points_m : (n, 3), in camera coordinates; for a fisheye also beside and behind the camera.
     """
-    return np.asarray(model.bend(points_m, parameters[4:]) * parameters[:2] + parameters[2:4])
+    return np.asarray(model.distort(points_m, parameters[4:]) * parameters[:2] + parameters[2:4])
 
 
 def project_with_slopes(model: LensModel, parameters: Array, points_m: Array) -> tuple[Array, Array, Array]:
@@ -77,13 +77,13 @@ def project_with_slopes(model: LensModel, parameters: Array, points_m: Array) ->
     -------
     Pixels (n, 2), their derivatives by the point (n, 2, 3), in px/m, and by the parameters (n, 2, p).
     """
-    bent, by_point, by_coefficients = model.bend_with_slopes(points_m, parameters[4:])
+    distorted, by_point, by_coefficients = model.distort_with_slopes(points_m, parameters[4:])
     focal_px = parameters[:2]
     by_parameters = np.zeros((len(points_m), 2, parameters.size))
-    by_parameters[:, 0, 0], by_parameters[:, 1, 1] = bent.T
+    by_parameters[:, 0, 0], by_parameters[:, 1, 1] = distorted.T
     by_parameters[:, 0, 2] = by_parameters[:, 1, 3] = 1.0
     by_parameters[:, :, 4:] = by_coefficients * focal_px[:, None]
-    return bent * focal_px + parameters[2:4], by_point * focal_px[:, None], by_parameters
+    return distorted * focal_px + parameters[2:4], by_point * focal_px[:, None], by_parameters
 
 
 def _fisheye_angle(points_m: Array) -> tuple[Array, Array, Array, Array]:
@@ -95,23 +95,23 @@ def _fisheye_angle(points_m: Array) -> tuple[Array, Array, Array, Array]:
     return square, r, theta, theta * theta
 
 
-def _bend_fisheye(points_m: Array, k: Array) -> Array:
+def _distort_fisheye(points_m: Array, k: Array) -> Array:
     """Apply the model of Kannala and Brandt (PAMI 2006) in OpenCV's form: it distorts the angle to the axis.
 
     The angle is atan2(r, z), so that it may exceed 90 degrees.
     """
     _, r, theta, t2 = _fisheye_angle(points_m)
-    bent = theta * (1 + t2 * (k[0] + t2 * (k[1] + t2 * (k[2] + t2 * k[3]))))
-    return np.asarray(points_m[:, :2] * (bent / r)[:, None])
+    distorted = theta * (1 + t2 * (k[0] + t2 * (k[1] + t2 * (k[2] + t2 * k[3]))))
+    return np.asarray(points_m[:, :2] * (distorted / r)[:, None])
 
 
-def _bend_fisheye_with_slopes(points_m: Array, k: Array) -> tuple[Array, Array, Array]:
-    """Return the result of ``_bend_fisheye``, and its derivatives by the point and by the coefficients."""
+def _distort_fisheye_with_slopes(points_m: Array, k: Array) -> tuple[Array, Array, Array]:
+    """Return the result of ``_distort_fisheye``, and its derivatives by the point and by the coefficients."""
     square, r, theta, t2 = _fisheye_angle(points_m)
-    bent = theta * (1 + t2 * (k[0] + t2 * (k[1] + t2 * (k[2] + t2 * k[3]))))
+    distorted = theta * (1 + t2 * (k[0] + t2 * (k[1] + t2 * (k[2] + t2 * k[3]))))
     slope = 1 + t2 * (3 * k[0] + t2 * (5 * k[1] + t2 * (7 * k[2] + t2 * 9 * k[3])))
-    scale = bent / r
-    # d scale / d (x, y, z), of bent(theta(r, z)) / r(x, y).
+    scale = distorted / r
+    # d scale / d (x, y, z), of distorted(theta(r, z)) / r(x, y).
     x, y, z = points_m.T
     along_r = (slope * z / square - scale) / r**2
     by_scale = np.stack([along_r * x, along_r * y, -slope / square], axis=1)
@@ -138,20 +138,20 @@ def _eight(k: Array) -> list[float]:
     return [*k.tolist(), *[0.0] * (8 - k.size)]
 
 
-def _bend_pinhole(points_m: Array, k: Array) -> Array:
+def _distort_pinhole(points_m: Array, k: Array) -> Array:
     """Apply Brown's radial and tangential terms in OpenCV's form: k1 k2 p1 p2 k3, and a divisor k4 k5 k6."""
     (a, b), _ = _planar(points_m)
     k1, k2, p1, p2, k3, k4, k5, k6 = _eight(k)
     r2 = a * a + b * b
     radial = (1 + r2 * (k1 + r2 * (k2 + r2 * k3))) / (1 + r2 * (k4 + r2 * (k5 + r2 * k6)))
-    bent = np.empty((len(points_m), 2))
-    bent[:, 0] = a * radial + 2 * p1 * a * b + p2 * (r2 + 2 * a * a)
-    bent[:, 1] = b * radial + p1 * (r2 + 2 * b * b) + 2 * p2 * a * b
-    return bent
+    distorted = np.empty((len(points_m), 2))
+    distorted[:, 0] = a * radial + 2 * p1 * a * b + p2 * (r2 + 2 * a * a)
+    distorted[:, 1] = b * radial + p1 * (r2 + 2 * b * b) + 2 * p2 * a * b
+    return distorted
 
 
-def _bend_pinhole_with_slopes(points_m: Array, k: Array) -> tuple[Array, Array, Array]:
-    """Return the result of ``_bend_pinhole``, and its derivatives by the point and by the coefficients."""
+def _distort_pinhole_with_slopes(points_m: Array, k: Array) -> tuple[Array, Array, Array]:
+    """Return the result of ``_distort_pinhole``, and its derivatives by the point and by the coefficients."""
     (a, b), depth_m = _planar(points_m)
     k1, k2, p1, p2, k3, k4, k5, k6 = _eight(k)
     r2, two_ab = a * a + b * b, 2 * a * b
@@ -160,9 +160,9 @@ def _bend_pinhole_with_slopes(points_m: Array, k: Array) -> tuple[Array, Array, 
     climb = k1 + r2 * (2 * k2 + r2 * 3 * k3) - radial * (k4 + r2 * (2 * k5 + r2 * 3 * k6))
     slope = 2 * climb / bottom
     of_p1, of_p2 = r2 + 2 * b * b, r2 + 2 * a * a
-    bent = np.empty((len(points_m), 2))
-    bent[:, 0] = a * radial + p1 * two_ab + p2 * of_p2
-    bent[:, 1] = b * radial + p1 * of_p1 + p2 * two_ab
+    distorted = np.empty((len(points_m), 2))
+    distorted[:, 0] = a * radial + p1 * two_ab + p2 * of_p2
+    distorted[:, 1] = b * radial + p1 * of_p1 + p2 * two_ab
     by_point = np.empty((len(points_m), 2, 3))
     by_point[:, 0, 0] = a * a * slope + radial + 2 * p1 * b + 6 * p2 * a
     by_point[:, 1, 1] = b * b * slope + radial + 6 * p1 * b + 2 * p2 * a
@@ -178,15 +178,15 @@ def _bend_pinhole_with_slopes(points_m: Array, k: Array) -> tuple[Array, Array, 
             by_k[:, axis, above], by_k[:, axis, below] = rise, -rise * radial
     by_k[:, 0, 2], by_k[:, 0, 3] = two_ab, of_p2
     by_k[:, 1, 2], by_k[:, 1, 3] = of_p1, two_ab
-    return bent, by_point, by_k[:, :, : k.size]
+    return distorted, by_point, by_k[:, :, : k.size]
 
 
-_FISHEYE = (_bend_fisheye, _bend_fisheye_with_slopes)
-_PINHOLE = (_bend_pinhole, _bend_pinhole_with_slopes)
+_FISHEYE = (_distort_fisheye, _distort_fisheye_with_slopes)
+_PINHOLE = (_distort_pinhole, _distort_pinhole_with_slopes)
 _FIVE = ("k1", "k2", "p1", "p2", "k3")
 
 # The lens models by their name in the option --lens.
-LENSES = {
+LENS_MODELS = {
     "fisheye": LensModel("kannala_brandt", ("k1", "k2", "k3", "k4"), 4, *_FISHEYE),
     "pinhole": LensModel("plumb_bob", _FIVE, 5, *_PINHOLE),
     "pinhole4": LensModel("plumb_bob", _FIVE, 4, *_PINHOLE),
@@ -194,7 +194,7 @@ LENSES = {
 }
 
 
-def find_lens(name: str) -> LensModel:
+def find_lens_model(name: str) -> LensModel:
     """Return the lens model with a name.
 
     Raises
@@ -202,6 +202,6 @@ def find_lens(name: str) -> LensModel:
     IpsysError
         There is no lens model with this name.
     """
-    if name not in LENSES:
-        raise IpsysError(f"--lens {name}: there is no such lens; use one of {', '.join(LENSES)}")
-    return LENSES[name]
+    if name not in LENS_MODELS:
+        raise IpsysError(f"--lens {name}: there is no such lens; use one of {', '.join(LENS_MODELS)}")
+    return LENS_MODELS[name]

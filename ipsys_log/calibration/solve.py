@@ -15,18 +15,18 @@ from numpy.typing import NDArray
 
 from ipsys_log.calibration.bundle_adjustment import Corners, Fit, adjust, residuals
 from ipsys_log.calibration.lens_models import LensModel
-from ipsys_log.calibration.uncertainty import alike, lens_covariance
+from ipsys_log.calibration.uncertainty import group_similar_images, lens_covariance
 
 __all__ = [
-    "Left",
-    "Solved",
-    "doubt_from_px",
+    "ExcludedImage",
+    "SolveResult",
+    "determines_focal_length",
     "find_start",
     "fitted_basis",
+    "loss_scale_px",
     "pose_from_rays",
     "rms_px",
     "solve",
-    "tells_focal_length",
 ]
 
 Array = NDArray[np.float64]
@@ -60,15 +60,15 @@ def find_start(model: LensModel, corners: Corners, size_px: tuple[int, int]) -> 
     """
     longer = max(size_px)
     shares = _FOCAL_SHARES[model.distortion_model]
-    posed = [_posed(model, corners, size_px, share * longer) for share in shares]
+    posed = [_estimate_poses(model, corners, size_px, share * longer) for share in shares]
     # A fit of the poses and the focal length is enough to sort out bad start values.
-    fits = [_freed(model, fit, corners, _FIRST) for fit in posed]
+    fits = [_fit_stages(model, fit, corners, _FIRST) for fit in posed]
     best = _best(model, fits, corners)
-    if shares[0] / _FLED <= best.lens[0] / longer <= shares[-1] * _FLED:
+    if shares[0] / _FLED <= best.intrinsics[0] / longer <= shares[-1] * _FLED:
         return best
     # Boards with little tilt look almost the same at a far shorter focal length with even less tilt. Without
     # distortion coefficients the wrong fit may have the lower cost, so the second try fits them first.
-    fits = [_bent(model, fit, corners) for fit in posed]
+    fits = [_fit_distortion(model, fit, corners) for fit in posed]
     return min(best, _best(model, fits, corners), key=lambda fit: fit.cost)
 
 
@@ -77,27 +77,30 @@ def _best(model: LensModel, tried: list[Fit], corners: Corners) -> Fit:
     promising: list[Fit] = []
     for fit in sorted(tried, key=lambda fit: fit.cost):
         is_similar = any(
-            _near(fit.cost, other.cost) and _near(fit.lens[0], other.lens[0]) for other in promising
+            _near(fit.cost, other.cost) and _near(fit.intrinsics[0], other.intrinsics[0])
+            for other in promising
         )
         promising += [] if is_similar or len(promising) == _KEPT else [fit]
-    return min((_freed(model, fit, corners, _THEN) for fit in promising), key=lambda fit: fit.cost)
+    return min((_fit_stages(model, fit, corners, _THEN) for fit in promising), key=lambda fit: fit.cost)
 
 
 def _near(one: float, other: float) -> bool:
     return abs(one - other) <= _ALIKE * abs(other)
 
 
-def _posed(model: LensModel, corners: Corners, size_px: tuple[int, int], focal_px: float) -> Fit:
+def _estimate_poses(model: LensModel, corners: Corners, size_px: tuple[int, int], focal_px: float) -> Fit:
     """Return a fit with the given focal length, and with the poses that follow from it."""
     lens = np.zeros(len(model.names))
     lens[:4] = focal_px, focal_px, (size_px[0] - 1) / 2, (size_px[1] - 1) / 2
     rays = _rays(model, lens, corners.pixels)
-    bounds = [*corners.starts, len(corners.picture)]
+    bounds = [*corners.starts, len(corners.image_numbers)]
     poses = [pose_from_rays(corners.board_m[a:b], rays[a:b]) for a, b in pairwise(bounds)]
     return Fit(lens, np.stack([r for r, _ in poses]), np.stack([t for _, t in poses]))
 
 
-def _freed(model: LensModel, fit: Fit, corners: Corners, plan: tuple[tuple[int | None, int], ...]) -> Fit:
+def _fit_stages(
+    model: LensModel, fit: Fit, corners: Corners, plan: tuple[tuple[int | None, int], ...]
+) -> Fit:
     """Fit in stages with more and more free intrinsics; ``plan`` has their number and the number of steps."""
     basis = fitted_basis(model, square=True)
     for unknowns, steps in plan:
@@ -105,11 +108,11 @@ def _freed(model: LensModel, fit: Fit, corners: Corners, plan: tuple[tuple[int |
     return fit
 
 
-def _bent(model: LensModel, fit: Fit, corners: Corners) -> Fit:
+def _fit_distortion(model: LensModel, fit: Fit, corners: Corners) -> Fit:
     """Fit all parameters except the focal length."""
     basis = fitted_basis(model, square=True)
     return adjust(
-        model, _freed(model, fit, corners, _FIRST[:1]), corners, basis[:, 1:], _SCALE_PX, _HELD_STEPS
+        model, _fit_stages(model, fit, corners, _FIRST[:1]), corners, basis[:, 1:], _SCALE_PX, _HELD_STEPS
     )
 
 
@@ -171,8 +174,8 @@ _MEDIAN = float(np.sqrt(2 * np.log(2)))
 # Errors of a corner with half the weight, and of an outlier corner, in standard deviations. RMS of an image
 # that is left out, as a multiple of the usual RMS.
 _DOUBTED = 5.0
-_FAR_CORNER = 12.0
-_FAR_PICTURE = 3.5
+_OUTLIER_CORNER = 12.0
+_OUTLIER_IMAGE = 3.5
 _LEAST_CORNERS = 6
 _MOST_ROUNDS = 8
 # A smaller error is never an outlier: pixels are not more accurate.
@@ -185,20 +188,21 @@ _OTHER_FOCALS, _WORSE, _OTHER_STEPS = (0.7, 1.3), 3.0, 40
 
 
 @dataclass(frozen=True, slots=True, eq=False)
-class Left:
+class ExcludedImage:
     """An image that the fit left out: its number, and the reason."""
 
-    picture: int
+    number: int
     reason: str
 
 
 @dataclass(frozen=True, slots=True, eq=False)
-class Solved:
+class SolveResult:
     """The result of a calibration.
 
     ``covariance`` (p, p) is the covariance of the intrinsics. ``corners`` are the corners of the fit,
-    ``pictures`` the numbers of their images, ``residuals_px`` (n, 2) their residuals in px. ``left`` lists
-    the images that were left out, ``far_corners`` counts the single corners left out of other images.
+    ``image_numbers`` the numbers of their images, ``residuals_px`` (n, 2) their residuals in px. ``excluded``
+    lists the images that were left out, ``outlier_corners`` counts the single corners left out of other
+    images.
     ``groups`` is the number of groups of images that differ. ``square`` says that fx and fy are one number.
     """
 
@@ -206,15 +210,17 @@ class Solved:
     fit: Fit
     covariance: Array
     corners: Corners
-    pictures: NDArray[np.intp]
+    image_numbers: NDArray[np.intp]
     residuals_px: Array
-    left: tuple[Left, ...]
-    far_corners: int
+    excluded: tuple[ExcludedImage, ...]
+    outlier_corners: int
     groups: int
     square: bool
 
 
-def solve(model: LensModel, corners: Corners, size_px: tuple[int, int], start: Fit | None = None) -> Solved:
+def solve(
+    model: LensModel, corners: Corners, size_px: tuple[int, int], start: Fit | None = None
+) -> SolveResult:
     """Estimate the intrinsics from corners of a board in several images.
 
     Parameters
@@ -232,10 +238,11 @@ def solve(model: LensModel, corners: Corners, size_px: tuple[int, int], start: F
         purged = _purge(model, start, corners, square=False)
         fit, covariance, groups, square = _finish(model, purged, size_px)
     used_corners = purged.corners
-    far = int(np.isin(corners.picture, purged.pictures).sum()) - len(used_corners.picture)
+    far = int(np.isin(corners.image_numbers, purged.image_numbers).sum()) - len(used_corners.image_numbers)
     residuals_px = residuals(model, fit, used_corners)
-    return Solved(
-        model, fit, covariance, used_corners, purged.pictures, residuals_px, purged.left, far, groups, square
+    return SolveResult(
+        model, fit, covariance, used_corners, purged.image_numbers, residuals_px, purged.excluded, far,
+        groups, square,
     )  # fmt: skip
 
 
@@ -244,43 +251,43 @@ class _Purged(NamedTuple):
 
     fit: Fit
     corners: Corners
-    pictures: NDArray[np.intp]
-    left: tuple[Left, ...]
+    image_numbers: NDArray[np.intp]
+    excluded: tuple[ExcludedImage, ...]
 
 
 def _purge(model: LensModel, fit: Fit, corners: Corners, square: bool) -> _Purged:
     """Fit, leave out outliers, and fit again, until there are no outliers."""
-    basis, pictures, left_out = fitted_basis(model, square), np.arange(corners.pictures), []
+    basis, numbers, all_excluded = fitted_basis(model, square), np.arange(corners.image_count), []
     for _ in range(_MOST_ROUNDS):
-        fit = adjust(model, fit, corners, basis, doubt_from_px(model, fit, corners))
-        keep_mask, excluded = _belonging(corners, residuals(model, fit, corners))
-        if keep_mask.all() or len(pictures) - len(excluded) < 3:
+        fit = adjust(model, fit, corners, basis, loss_scale_px(model, fit, corners))
+        keep_mask, excluded = _split_outliers(corners, residuals(model, fit, corners))
+        if keep_mask.all() or len(numbers) - len(excluded) < 3:
             break
-        left_out += [Left(int(pictures[g.picture]), g.reason) for g in excluded]
-        corners, remaining = corners.keep(keep_mask)
-        pictures = pictures[remaining]
-        fit = Fit(fit.lens, fit.rotations[remaining], fit.places_m[remaining])
-    return _Purged(fit, corners, pictures, tuple(left_out))
+        all_excluded += [ExcludedImage(int(numbers[one.number]), one.reason) for one in excluded]
+        corners, remaining = corners.select(keep_mask)
+        numbers = numbers[remaining]
+        fit = Fit(fit.intrinsics, fit.rotations[remaining], fit.positions_m[remaining])
+    return _Purged(fit, corners, numbers, tuple(all_excluded))
 
 
 def _finish(model: LensModel, purged: _Purged, size_px: tuple[int, int]) -> tuple[Fit, Array, int, bool]:
     """Return the last fit, its covariance (p, p), the number of groups, and whether fx = fy was assumed."""
     start, corners = purged.fit, purged.corners
-    groups = alike(model, start, corners, size_px)
+    groups = group_similar_images(model, start, corners, size_px)
     results = []
     for square in (False, True):
         basis = fitted_basis(model, square)
-        fit = adjust(model, start, corners, basis, doubt_from_px(model, start, corners))
-        covariance = lens_covariance(model, fit, corners, basis, doubt_from_px(model, fit, corners), groups)
+        fit = adjust(model, start, corners, basis, loss_scale_px(model, start, corners))
+        covariance = lens_covariance(model, fit, corners, basis, loss_scale_px(model, fit, corners), groups)
         results.append((fit, basis @ covariance @ basis.T, int(groups.max()) + 1, square))
     free, covariance = results[0][:2]
-    ratio = np.array([1.0, -1.0]) / free.lens[:2]
+    ratio = np.array([1.0, -1.0]) / free.intrinsics[:2]
     sigma = float(np.sqrt(ratio @ covariance[:2, :2] @ ratio))
-    off = abs(float(np.log(free.lens[0] / free.lens[1])))
+    off = abs(float(np.log(free.intrinsics[0] / free.intrinsics[1])))
     return results[0] if off > max(_SURE * sigma, min(_SQUARE, _QUITE_SURE * sigma)) else results[1]
 
 
-def tells_focal_length(solved: Solved) -> bool:
+def determines_focal_length(solved: SolveResult) -> bool:
     """Return whether a focal length that differs by 30 % fits worse, with all other parameters free.
 
     If the images hardly determine the focal length, the cost is not a parabola, and the standard deviation is
@@ -289,11 +296,11 @@ def tells_focal_length(solved: Solved) -> bool:
     model, fit, corners = solved.model, solved.fit, solved.corners
     # All free directions except the focal length.
     rest = fitted_basis(model, square=True)[:, 1:]
-    scale_px = doubt_from_px(model, fit, corners)
+    scale_px = loss_scale_px(model, fit, corners)
     most = fit.cost + (_WORSE * _spread(solved.residuals_px)) ** 2
     for factor in _OTHER_FOCALS:
-        lens, nearer = fit.lens * ([factor] * 2 + [1.0] * (len(fit.lens) - 2)), [1.0, 1.0, factor]
-        other = Fit(lens, fit.rotations, fit.places_m * nearer)
+        lens, nearer = fit.intrinsics * ([factor] * 2 + [1.0] * (len(fit.intrinsics) - 2)), [1.0, 1.0, factor]
+        other = Fit(lens, fit.rotations, fit.positions_m * nearer)
         for basis in (rest[:, :0], rest):
             other = adjust(model, other, corners, basis, scale_px, _OTHER_STEPS)
         if other.cost < most:
@@ -301,37 +308,37 @@ def tells_focal_length(solved: Solved) -> bool:
     return True
 
 
-def doubt_from_px(model: LensModel, fit: Fit, corners: Corners) -> float:
+def loss_scale_px(model: LensModel, fit: Fit, corners: Corners) -> float:
     """Return the error in px from which a corner has at most half the weight."""
     return max(_DOUBTED * _spread(residuals(model, fit, corners)), _NEAR_PX)
 
 
-def rms_px(solved: Solved) -> float:
+def rms_px(solved: SolveResult) -> float:
     """Return the RMS reprojection error in px."""
     return float(np.sqrt((solved.residuals_px**2).sum(axis=1).mean()))
 
 
-def _spread(missed_px: Array) -> float:
+def _spread(residuals_px: Array) -> float:
     """Return the standard deviation of one coordinate; a few outliers have no effect."""
-    return float(np.median(np.linalg.norm(missed_px, axis=1))) / _MEDIAN
+    return float(np.median(np.linalg.norm(residuals_px, axis=1))) / _MEDIAN
 
 
-def _belonging(corners: Corners, missed_px: Array) -> tuple[NDArray[np.bool_], list[Left]]:
+def _split_outliers(corners: Corners, residuals_px: Array) -> tuple[NDArray[np.bool_], list[ExcludedImage]]:
     """Return a mask of the corners of the fit, (n,), and the images that are left out."""
-    distances = np.linalg.norm(missed_px, axis=1)
-    near = distances <= max(_FAR_CORNER * _spread(missed_px), _NEAR_PX)
+    distances = np.linalg.norm(residuals_px, axis=1)
+    near = distances <= max(_OUTLIER_CORNER * _spread(residuals_px), _NEAR_PX)
     counts = corners.sums(np.ones_like(distances))
     remaining = corners.sums(near.astype(float))
     # An image may also have large errors as a whole, without its single outlier corners.
     rest_px = np.sqrt(corners.sums(distances**2 * near) / np.maximum(remaining, 1))
     usual_px = float(np.median(rest_px))
     scattered = remaining < np.maximum(_LEAST_CORNERS, counts / 2)
-    off = rest_px > max(_FAR_PICTURE * usual_px, _NEAR_PX)
+    off = rest_px > max(_OUTLIER_IMAGE * usual_px, _NEAR_PX)
     excluded = []
     for n in np.flatnonzero(scattered | off):
         if scattered[n]:
             reason = f"corners far off: {counts[n] - remaining[n]:.0f} of {counts[n]:.0f}"
         else:
             reason = f"does not fit: its corners are {rest_px[n]:.2f} px off, usually {usual_px:.2f}"
-        excluded.append(Left(int(n), reason))
-    return near & ~(scattered | off)[corners.picture], excluded
+        excluded.append(ExcludedImage(int(n), reason))
+    return near & ~(scattered | off)[corners.image_numbers], excluded

@@ -22,8 +22,8 @@ from ipsys_log.calibration.bundle_adjustment import (
     reduce_to_lens,
     residuals,
 )
-from ipsys_log.calibration.lens_models import LENSES, LensModel
-from ipsys_log.calibration.solve import doubt_from_px, fitted_basis, rms_px, solve
+from ipsys_log.calibration.lens_models import LENS_MODELS, LensModel
+from ipsys_log.calibration.solve import fitted_basis, loss_scale_px, rms_px, solve
 
 __all__ = [
     "MOST_RMS_PX",
@@ -37,7 +37,7 @@ __all__ = [
 Array = NDArray[np.float64]
 Group = NDArray[np.bool_]
 
-_LEAST_PICTURES = 4
+_MIN_IMAGES = 4
 _DIRECTIONS, _ROUNDS, _STEPS, _POSE_STEPS = 3, 8, 8, 4
 # Least relative excess of the squared errors with one set of intrinsics for two cameras. Images of
 # one camera reach 0.37 (fisheye_chessboard), and fewer images per parameter reach more.
@@ -75,12 +75,12 @@ def find_two_cameras(
     corners : corners of all images.
     names : names of the images, (f,).
     """
-    if corners.pictures < 2 * _LEAST_PICTURES:
+    if corners.image_count < 2 * _MIN_IMAGES:
         return None
     basis = fitted_basis(model, square=False)
-    scale_px = doubt_from_px(model, start, corners)
+    scale_px = loss_scale_px(model, start, corners)
     fit = adjust(model, start, corners, basis, scale_px)
-    scale_px = doubt_from_px(model, fit, corners)
+    scale_px = loss_scale_px(model, fit, corners)
     by_name = list(_name_groups(names))
     seeds = [*by_name, *_opposite_pulls(model, fit, corners, basis, scale_px)]
     splits = [_refine(model, fit, corners, basis, scale_px, seed) for seed in seeds]
@@ -92,8 +92,8 @@ def find_two_cameras(
     with_one = _errors(model, fit, corners, scale_px)
     gain = float(with_one.sum() / best.errors.sum()) - 1
     agreement = max((max(np.mean(best.second == g), np.mean(best.second != g)) for g in by_name), default=0.0)
-    needed = _GAIN + _GAIN_PER_PARAMETER * basis.shape[1] / corners.pictures
-    counts = corners.sums(np.ones(len(corners.picture)))
+    needed = _GAIN + _GAIN_PER_PARAMETER * basis.shape[1] / corners.image_count
+    counts = corners.sums(np.ones(len(corners.image_numbers)))
     first_px, second_px = (_rms_px(best.errors[g], counts[g]) for g in (~best.second, best.second))
     if gain < (_NAMED_GAIN if agreement >= _AGREE else needed):
         return None
@@ -112,7 +112,7 @@ def _name_groups(names: Sequence[str]) -> Iterator[Group]:
     different = np.unique(kinds)
     for kind in different[: len(different) - 1 if len(different) == 2 else _DIRECTIONS]:
         group = kinds == kind
-        if min(group.sum(), (~group).sum()) >= _LEAST_PICTURES:
+        if min(group.sum(), (~group).sum()) >= _MIN_IMAGES:
             yield group
 
 
@@ -134,7 +134,7 @@ def _refine(
     """Return the converged groups, or None if a group has too few images."""
     fits = [fit, fit]
     for _ in range(_ROUNDS):
-        if min(second.sum(), (~second).sum()) < _LEAST_PICTURES:
+        if min(second.sum(), (~second).sum()) < _MIN_IMAGES:
             return None
         groups = (~second, second)
         fits = [
@@ -152,14 +152,19 @@ def _fit_group(
     model: LensModel, fit: Fit, corners: Corners, basis: Array, scale_px: float, group: Group
 ) -> Fit:
     """Return the intrinsics of a group of images, and the poses of all images with these intrinsics."""
-    part, _ = corners.keep(group[corners.picture])
+    part, _ = corners.select(group[corners.image_numbers])
     group_fit = adjust(
-        model, Fit(fit.lens, fit.rotations[group], fit.places_m[group]), part, basis, scale_px, _STEPS
+        model,
+        Fit(fit.intrinsics, fit.rotations[group], fit.positions_m[group]),
+        part,
+        basis,
+        scale_px,
+        _STEPS,
     )
-    rotations, places_m = fit.rotations.copy(), fit.places_m.copy()
-    rotations[group], places_m[group] = group_fit.rotations, group_fit.places_m
+    rotations, places_m = fit.rotations.copy(), fit.positions_m.copy()
+    rotations[group], places_m[group] = group_fit.rotations, group_fit.positions_m
     return adjust(
-        model, Fit(group_fit.lens, rotations, places_m), corners, basis[:, :0], scale_px, _POSE_STEPS
+        model, Fit(group_fit.intrinsics, rotations, places_m), corners, basis[:, :0], scale_px, _POSE_STEPS
     )
 
 
@@ -187,7 +192,7 @@ def find_better_model(
 ) -> BetterModel | None:
     """Return the model with the least error for the same corners, if it is far less than ``left_px``."""
     candidates = []
-    for name, other in LENSES.items():
+    for name, other in LENS_MODELS.items():
         if other == model:
             continue
         try:
@@ -195,7 +200,7 @@ def find_better_model(
         except np.linalg.LinAlgError:
             continue
         # A model that leaves out most images does not describe them.
-        if 2 * len(solved.pictures) >= corners.pictures:
+        if 2 * len(solved.image_numbers) >= corners.image_count:
             candidates.append(BetterModel(name, rms_px(solved)))
     least_px = min((candidate.rms_px for candidate in candidates), default=np.inf)
     if least_px >= _BETTER * left_px:

@@ -24,7 +24,7 @@ from ipsys_log.calibration.bundle_adjustment import (
 from ipsys_log.calibration.image_selection import NEAR, group_outlines
 from ipsys_log.calibration.lens_models import LensModel, project_points
 
-__all__ = ["alike", "lens_covariance", "model_change"]
+__all__ = ["group_similar_images", "lens_covariance", "model_change"]
 
 Array = NDArray[np.float64]
 
@@ -61,8 +61,8 @@ def model_change(
     James and Stein, Estimation with quadratic loss, 1961: the shrinkage 1 - c / chi^2.
     """
     lens_count = basis.shape[1]
-    bent = model.bend(camera_points(fit, corners), fit.lens[4:])
-    terms = _terms(model, bent)
+    distorted = model.distort(camera_points(fit, corners), fit.intrinsics[4:])
+    terms = _terms(model, distorted)
     richer, richer_fit, richer_basis = _enrich(model, fit, basis, terms)
     normal = normal_equations(richer, richer_fit, corners, richer_basis, scale_px)
     matrices, gradients = reduce_to_lens(normal)
@@ -80,14 +80,14 @@ def model_change(
     return np.asarray(-np.sqrt(share) * following @ size)
 
 
-def _terms(model: LensModel, bent: Array) -> _Terms:
-    a, b = bent.T
+def _terms(model: LensModel, distorted: Array) -> _Terms:
+    a, b = distorted.T
     square = a * a + b * b
     widest = float(square.max())
     zero, power = np.zeros_like(a), _NEXT_POWER[model.distortion_model] // 2
     if model.fitted < len(model.coefficients):
         power -= 1
-    radial = bent * ((square / widest) ** power)[:, None]
+    radial = distorted * ((square / widest) ** power)[:, None]
     prism = [np.stack([square, zero], axis=1), np.stack([zero, square], axis=1)]
     decentering = [
         np.stack([2 * a * b, square + 2 * b * b], axis=1),
@@ -102,16 +102,16 @@ def _enrich(model: LensModel, fit: Fit, basis: Array, terms: _Terms) -> tuple[Le
     """Return the richer model at the fitted corners, the same fit in it, and the basis with the terms."""
     count = len(terms.usual)
 
-    def bend(points_m: Array, k: Array) -> tuple[Array, Array, Array]:
-        bent, by_point, by_coefficients = model.bend_with_slopes(points_m, k[:-count])
-        return bent, by_point, np.concatenate([by_coefficients, terms.displacements], axis=2)
+    def distort(points_m: Array, k: Array) -> tuple[Array, Array, Array]:
+        distorted, by_point, by_coefficients = model.distort_with_slopes(points_m, k[:-count])
+        return distorted, by_point, np.concatenate([by_coefficients, terms.displacements], axis=2)
 
     names = tuple(f"e{n}" for n in range(count))
-    richer = model._replace(coefficients=(*model.coefficients, *names), bend_with_slopes=bend)
+    richer = model._replace(coefficients=(*model.coefficients, *names), distort_with_slopes=distort)
     wider = np.zeros((len(basis) + count, basis.shape[1] + count))
     wider[: len(basis), : basis.shape[1]] = basis
     wider[len(basis) :, basis.shape[1] :] = np.eye(count)
-    return richer, Fit(np.append(fit.lens, np.zeros(count)), fit.rotations, fit.places_m), wider
+    return richer, Fit(np.append(fit.intrinsics, np.zeros(count)), fit.rotations, fit.positions_m), wider
 
 
 # Near boards form one group. The limit of the distance is halved up to so many times, until there are enough
@@ -122,15 +122,17 @@ _ENOUGH_GROUPS = 15
 _EQUAL_GROUPS = 8
 
 
-def alike(model: LensModel, fit: Fit, corners: Corners, size_px: tuple[int, int]) -> NDArray[np.intp]:
+def group_similar_images(
+    model: LensModel, fit: Fit, corners: Corners, size_px: tuple[int, int]
+) -> NDArray[np.intp]:
     """Return the group of each image, (f,): a group shows the board in nearly the same pose.
 
     Successive frames of a video have the same errors, so they give no new information.
     """
     low, high = corners.board_m.min(axis=0), corners.board_m.max(axis=0)
     outline_m = np.array([[x, y, 0.0] for x in (low[0], high[0]) for y in (low[1], high[1])])
-    seen_m = np.einsum("fij,kj->fki", fit.rotations, outline_m) + fit.places_m[:, None]
-    outlines = project_points(model, fit.lens, seen_m.reshape(-1, 3)).reshape(-1, 4, 2)
+    seen_m = np.einsum("fij,kj->fki", fit.rotations, outline_m) + fit.positions_m[:, None]
+    outlines = project_points(model, fit.intrinsics, seen_m.reshape(-1, 3)).reshape(-1, 4, 2)
     near_px = NEAR * float(np.hypot(*size_px))
     for _ in range(_HALVINGS):
         groups = group_outlines(outlines, near_px)
@@ -192,6 +194,6 @@ def _variance_px2(
     model: LensModel, fit: Fit, corners: Corners, scale_px: float | None, unknowns: int
 ) -> float:
     """Return the variance of a corner coordinate in px^2, for independent corners."""
-    missed_px = residuals(model, fit, corners)
-    squares = float(corner_weights(missed_px, scale_px) @ (missed_px**2).sum(axis=1))
-    return squares / max(missed_px.size - 6 * corners.pictures - unknowns, 1)
+    residuals_px = residuals(model, fit, corners)
+    squares = float(corner_weights(residuals_px, scale_px) @ (residuals_px**2).sum(axis=1))
+    return squares / max(residuals_px.size - 6 * corners.image_count - unknowns, 1)

@@ -13,7 +13,7 @@ from typing import Protocol
 
 from ipsys_log.capture.disk import Confirm, Syncer, disk_fault, reserve, what_failed, what_fitted
 from ipsys_log.errors import IpsysError, LogError, WriteError, is_full
-from ipsys_log.geometry.lenses import scale_lens
+from ipsys_log.geometry.lenses import scale_intrinsics
 from ipsys_log.log.journal import DISK, roll_back
 from ipsys_log.log.lock import open_locked
 from ipsys_log.log.writer import LogWriter
@@ -258,7 +258,7 @@ def fitting_lenses(
     fitting = {}
     for camera, lens in lenses.items():
         width, height = sizes_px.get(camera) or (lens.width, lens.height)
-        fitting[camera] = scale_lens(lens, width, height, f"camera {camera}")
+        fitting[camera] = scale_intrinsics(lens, width, height, f"camera {camera}")
         if width != lens.width:
             say(f"camera {camera}: its calibration is scaled from {lens.width} to {width} px of width")
     return fitting

@@ -17,10 +17,10 @@ from ipsys_log.capture.frames import Clock, Frame, Given, Say, say_refused
 from ipsys_log.errors import IpsysError
 from ipsys_log.messages import CameraCalibration, RigCamera
 from ipsys_log.simulation.board import board_cells
-from ipsys_log.simulation.cameras import hang_cameras
+from ipsys_log.simulation.cameras import mount_cameras
 from ipsys_log.simulation.floor import Check
 from ipsys_log.simulation.live_lab import LIVE_SETTINGS, Film, board_film, lab_film, next_missing
-from ipsys_log.simulation.pixel_shares import exposed
+from ipsys_log.simulation.pixel_shares import exposure_interval
 from ipsys_log.simulation.settings import LabSettings
 from ipsys_log.units import NS_PER_S
 
@@ -210,7 +210,7 @@ def lens_of(camera: RigCamera) -> CameraCalibration:
         The simulated lab has no such camera.
     """
     lab, number, _ = parse_source(camera)
-    return replace(hang_cameras(lab)[number].lens, frame_id=camera.name)
+    return replace(mount_cameras(lab)[number].lens, frame_id=camera.name)
 
 
 class _Timing(NamedTuple):
@@ -224,7 +224,7 @@ class _Timing(NamedTuple):
     @classmethod
     def of(cls, lab: LabSettings, stamp: str | None) -> _Timing:
         # A driver stamps the start of the first row's exposure, or the end of the last row's exposure.
-        start_s, end_s = exposed(0, lab.height - 1, lab)
+        start_s, end_s = exposure_interval(0, lab.height - 1, lab)
         stamp_ns = round({"start": start_s, "end": end_s}.get(stamp or "", 0.0) * NS_PER_S)
         return cls(NS_PER_S / Fraction(lab.rate_hz), stamp_ns, round(end_s * NS_PER_S) + _LATENCY_NS)
 

@@ -15,7 +15,7 @@ import simplejpeg
 
 from ipsys_log.capture.frames import Clock, Frame, Say, SourceError
 from ipsys_log.capture.video_packets import find_video, name_format, pass_through
-from ipsys_log.images.decode import MOST_PIXELS
+from ipsys_log.images.decode import MAX_PIXELS
 from ipsys_log.log.dataset import Session
 from ipsys_log.messages import (
     RIG_TOPIC,
@@ -109,7 +109,7 @@ def _passed(container: InputContainer, stream: VideoStream, name: str) -> Iterat
 
 def _encoded(container: InputContainer, stream: VideoStream) -> Iterator[Timed]:
     start: int | None = None
-    stream.codec_context.options = {"max_pixels": str(MOST_PIXELS)}
+    stream.codec_context.options = {"max_pixels": str(MAX_PIXELS)}
     for image in container.decode(stream):
         if image.pts is None or image.time_base is None:
             continue

@@ -10,7 +10,7 @@ from typing import TYPE_CHECKING
 import simplejpeg
 
 from ipsys_log.capture.frames import Frame, SourceError
-from ipsys_log.images.decode import MOST_PIXELS
+from ipsys_log.images.decode import MAX_PIXELS
 
 if TYPE_CHECKING:
     from av.container import InputContainer
@@ -107,7 +107,7 @@ def _find_video_size(frame: Frame) -> tuple[int, int] | None:
     decoder = av.VideoCodecContext.create(codec, "r")
     assert isinstance(decoder, av.VideoCodecContext)
     decoder.thread_count = 1
-    decoder.options = {"max_pixels": str(MOST_PIXELS)}
+    decoder.options = {"max_pixels": str(MAX_PIXELS)}
     with suppress(av.error.FFmpegError):
         decoder.decode(av.Packet(frame.data))
     return (decoder.width, decoder.height) if decoder.width else None

@@ -65,10 +65,10 @@ def align(
     the floor that no camera sees, and neighbours that overlap by less than a marker. It computes missing
     results first. Without a log, it uses the present images of the cameras of the rig.
     """
-    from ipsys_log.report.files import check_picture
+    from ipsys_log.report.files import check_figure_file
 
     if plot is not None:
-        check_picture(plot, "--plot", logs or [])
+        check_figure_file(plot, "--plot", logs or [])
     if logs:
         options: dict[str, Any] = {
             "rig": rig,

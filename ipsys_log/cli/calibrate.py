@@ -16,7 +16,7 @@ from ipsys_log.cli.options import AsJson
 from ipsys_log.cli.signals import note_kept, say_kept
 
 if TYPE_CHECKING:
-    from ipsys_log.calibration.calibrate import Calibrated, Failure
+    from ipsys_log.calibration.calibrate import CalibrationResult, Failure
 
 __all__ = ["add_commands"]
 
@@ -114,19 +114,19 @@ def calibrate(
     selected automatically; two dozen with the board in all parts of the image are enough."""
     from ipsys_log import api
     from ipsys_log.calibration.board import parse_board
-    from ipsys_log.calibration.calibrate import Calibrated
+    from ipsys_log.calibration.calibrate import CalibrationResult
     from ipsys_log.calibration.images import find_sources
-    from ipsys_log.calibration.lens_models import find_lens
+    from ipsys_log.calibration.lens_models import find_lens_model
     from ipsys_log.exchange.calibration_files import check_format
-    from ipsys_log.report.files import check_picture
+    from ipsys_log.report.files import check_figure_file
 
-    find_lens(lens)
+    find_lens_model(lens)
     parse_board(board, square, marker_scale, dictionary, inverted)
     names = list(dict.fromkeys(formats or ["opencv"]))
     for name in names:
         check_format(name, lens)
     if plot is not None:
-        check_picture(plot, "--plot", sources or [])
+        check_figure_file(plot, "--plot", sources or [])
         _check_free(plot, force)
     lab = None if sources else _prepared_now(rig, camera, board)
     if lab is not None:
@@ -135,7 +135,7 @@ def calibrate(
         image_sources = find_sources(taken, camera or [])
         targets = _targets([pictures.camera for pictures in image_sources], output, names, force)
         with progress_bar() as progress:
-            outcomes: list[Calibrated | Failure] = []
+            outcomes: list[CalibrationResult | Failure] = []
             for outcome in api.calibrate(
                 *taken,
                 board=board,
@@ -148,20 +148,20 @@ def calibrate(
                 force=force,
                 progress=progress,
             ):
-                if isinstance(outcome, Calibrated):
+                if isinstance(outcome, CalibrationResult):
                     _write(outcome, targets[outcome.camera])
                     outcomes.append(outcome)
                 else:  # a temporary log is deleted before the user reads the reason
                     reason = outcome.reason.replace(str(taken[0]), SENT_NOW) if lab else outcome.reason
                     outcomes.append(outcome._replace(reason=reason))
-    lenses = [outcome for outcome in outcomes if isinstance(outcome, Calibrated)]
+    lenses = [outcome for outcome in outcomes if isinstance(outcome, CalibrationResult)]
     if plot is not None and lenses:
         _draw(lenses, plot)
     _print_outcomes(outcomes, targets, plot, as_json, for_rig="opencv" in names)
 
 
 def _print_outcomes(
-    outcomes: list[Calibrated | Failure],
+    outcomes: list[CalibrationResult | Failure],
     targets: dict[str, dict[str, Path]],
     plot: Path | None,
     as_json: bool,
@@ -188,7 +188,7 @@ def _print_outcomes(
         raise typer.Exit(1)
 
 
-def _json(outcome: Calibrated | Failure, targets: dict[str, dict[str, Path]]) -> dict[str, Any]:
+def _json(outcome: CalibrationResult | Failure, targets: dict[str, dict[str, Path]]) -> dict[str, Any]:
     from ipsys_log.calibration.calibrate import Failure
     from ipsys_log.report.calibration import calibration_json
 
@@ -254,7 +254,7 @@ def _check_free(path: Path, force: bool) -> None:
         raise IpsysError(f"{path}: exists already; choose another --output, or give --force to write over it")
 
 
-def _write(one: Calibrated, paths: dict[str, Path]) -> None:
+def _write(one: CalibrationResult, paths: dict[str, Path]) -> None:
     """Write the files of a camera, one for each format."""
     from ipsys_log.exchange.calibration_files import FORMATS
     from ipsys_log.report.files import write_files
@@ -270,15 +270,15 @@ def _write(one: Calibrated, paths: dict[str, Path]) -> None:
         note_kept(", ".join(str(path) for path in contents if path.parent == folder))
 
 
-def _draw(lenses: list[Calibrated], plot: Path) -> None:
+def _draw(lenses: list[CalibrationResult], plot: Path) -> None:
     from ipsys_log.report.calibration import calibration_figure
-    from ipsys_log.report.figures import picture
+    from ipsys_log.report.figures import figure_bytes
     from ipsys_log.report.files import write_files
 
-    write_files(plot.parent, {plot.name: picture(calibration_figure(lenses), plot, 110)})
+    write_files(plot.parent, {plot.name: figure_bytes(calibration_figure(lenses), plot, 110)})
 
 
-def _show(one: Calibrated, files: list[Path], for_rig: bool) -> None:
+def _show(one: CalibrationResult, files: list[Path], for_rig: bool) -> None:
     from ipsys_log.report.calibration import calibration_lines, calibration_table
 
     console.print(calibration_table(one))

@@ -117,10 +117,10 @@ def latency(
 
     from ipsys_log.analysis.latency import latency_percentiles, recorded_latencies, step_times_s
     from ipsys_log.report.cameras import latency_table
-    from ipsys_log.report.files import check_picture
+    from ipsys_log.report.files import check_figure_file
 
     if plot is not None:
-        check_picture(plot, "--plot", logs)
+        check_figure_file(plot, "--plot", logs)
     times_s = step_times_s(recorded_latencies(logs))
     steps = latency_percentiles(times_s)
     if plot is not None:

@@ -12,9 +12,9 @@ from ipsys_log.cli.console import console
 
 if TYPE_CHECKING:
     from ipsys_log.messages import Measurement, Rig
-    from ipsys_log.survey.checks import Checked
-    from ipsys_log.survey.entry import Entry, Fault, Typed
-    from ipsys_log.survey.scene import Scene
+    from ipsys_log.survey.checks import EntryCheck
+    from ipsys_log.survey.entry import Entry, Fault, TypedEntry
+    from ipsys_log.survey.scene import MeasuringScene
 
     # Reads an answer: returns its content and its faults.
     Read = Callable[[str], tuple[Entry, list[Fault]]]
@@ -62,14 +62,14 @@ def agreed(question: str, usual: bool) -> bool:
 
 def ask_marker(rig: Rig, usual: str) -> str:
     """Ask for a marker until the answer is a marker of the rig."""
-    from ipsys_log.survey.entry import Typed, read_typed
+    from ipsys_log.survey.entry import TypedEntry, parse_entry
 
-    return _ask("marker", "marker", usual, lambda given: read_typed(Typed(given, {}), rig))
+    return _ask("marker", "marker", usual, lambda given: parse_entry(TypedEntry(given, {}), rig))
 
 
-def ask_numbers(rig: Rig, marker: str, before: Typed | None) -> Typed:
+def ask_numbers(rig: Rig, marker: str, before: TypedEntry | None) -> TypedEntry:
     """Ask for distances, side and height of a calibration point; Enter keeps the previous text."""
-    from ipsys_log.survey.entry import Typed, needs_side, read_typed
+    from ipsys_log.survey.entry import TypedEntry, needs_side, parse_entry
 
     distances = _ask_distances(rig, dict(before.distances) if before else {})
     entered = [name for name, text in distances.items() if text]
@@ -79,22 +79,24 @@ def ask_numbers(rig: Rig, marker: str, before: Typed | None) -> Typed:
         question = f"from {entered[0]} to {entered[1]}, it lies left or right?{'' if usual else ' [l/r]'}"
         side = _ask_side(question, usual)
     usual = before.height if before else ""
-    height = _ask("height, cm", "height", usual, lambda text: read_typed(Typed("", {}, height=text), rig))
-    return Typed(marker, distances, side, height)
+    height = _ask(
+        "height, cm", "height", usual, lambda text: parse_entry(TypedEntry("", {}, height=text), rig)
+    )
+    return TypedEntry(marker, distances, side, height)
 
 
 def _ask_distances(rig: Rig, distances: dict[str, str]) -> dict[str, str]:
     """Ask for distances until they are consistent with one calibration point."""
     from ipsys_log.survey.checks import check_entry
-    from ipsys_log.survey.entry import Typed, read_typed
+    from ipsys_log.survey.entry import TypedEntry, parse_entry
 
     def of(name: str) -> Read:
-        return lambda given: read_typed(Typed("", {name: given}), rig)
+        return lambda given: parse_entry(TypedEntry("", {name: given}), rig)
 
     while True:
         for name in (point.name for point in rig.reference_points):
             distances[name] = _ask(f"distance to {name}, cm", f"d_{name}", distances.get(name, ""), of(name))
-        together = check_entry(*read_typed(Typed("", distances), rig), rig, None, ())
+        together = check_entry(*parse_entry(TypedEntry("", distances), rig), rig, None, ())
         faults = [fault.text for fault in together.faults if not fault.field]
         if not faults:
             return distances
@@ -129,7 +131,7 @@ def _complain(texts: Sequence[str], style: str = "red") -> None:
         console.print(text, style=style, markup=False)
 
 
-def ask_places(scene: Scene) -> None:
+def ask_places(scene: MeasuringScene) -> None:
     """Go through the stationary intervals that are not measured yet; with live cameras, ask until ``q``."""
     from ipsys_log.analysis.pairs import active_measurements
     from ipsys_log.survey.entry import check_references
@@ -154,12 +156,12 @@ def ask_places(scene: Scene) -> None:
     console.print("no more places in this log")
 
 
-def _ask_place(scene: Scene, stop: int | None, saved: list[str]) -> str | Measurement:
+def _ask_place(scene: MeasuringScene, stop: int | None, saved: list[str]) -> str | Measurement:
     """Ask until a point is measured or skipped; return ``s``, ``q`` to end, or the undone measurement.
 
     ``saved`` has the ids that this session has measured, the newest last.
     """
-    typed: Typed | None = None
+    typed: TypedEntry | None = None
     while True:
         try:
             typed = _measure(scene, stop, typed, saved)
@@ -177,7 +179,9 @@ def _ask_place(scene: Scene, stop: int | None, saved: list[str]) -> str | Measur
                     return undone
 
 
-def _measure(scene: Scene, stop: int | None, before: Typed | None, saved: list[str]) -> Typed | None:
+def _measure(
+    scene: MeasuringScene, stop: int | None, before: TypedEntry | None, saved: list[str]
+) -> TypedEntry | None:
     """Ask for one point and append it; return the typed texts if the point must be asked for again."""
     from ipsys_log.errors import IpsysError
 
@@ -207,18 +211,18 @@ def _measure(scene: Scene, stop: int | None, before: Typed | None, saved: list[s
         return None
 
 
-def _check(scene: Scene, stop: int | None, typed: Typed) -> Checked:
+def _check(scene: MeasuringScene, stop: int | None, typed: TypedEntry) -> EntryCheck:
     from ipsys_log.survey.checks import check_entry
-    from ipsys_log.survey.entry import read_typed
-    from ipsys_log.survey.scene import look
+    from ipsys_log.survey.entry import parse_entry
+    from ipsys_log.survey.scene import observe_marker
 
-    entry, faults = read_typed(typed, scene.rig)
-    sight = None if entry.marker_id is None else look(scene.views(stop), entry.marker_id)
+    entry, faults = parse_entry(typed, scene.rig)
+    sight = None if entry.marker_id is None else observe_marker(scene.views(stop), entry.marker_id)
     return check_entry(entry, faults, scene.rig, sight, scene.history(), scene.model)
 
 
-def _ask_point(scene: Scene, stop: int | None, before: Typed | None) -> Typed:
-    from ipsys_log.survey.scene import look, visible_markers
+def _ask_point(scene: MeasuringScene, stop: int | None, before: TypedEntry | None) -> TypedEntry:
+    from ipsys_log.survey.scene import observe_marker, visible_markers
 
     console.print()
     if stop is None:
@@ -230,12 +234,12 @@ def _ask_point(scene: Scene, stop: int | None, before: Typed | None) -> Typed:
         interval = scene.stops[stop]
         marker = str(interval.marker_id)
         console.print(f"Place {stop + 1} of {len(scene.stops)}", style="bold")
-    sight = look(scene.views(stop), int(marker))
+    sight = observe_marker(scene.views(stop), int(marker))
     console.print(sight.text, style="green" if sight.state == "still" else "yellow", markup=False)
     return ask_numbers(scene.rig, marker, before)
 
 
-def _show(checked: Checked) -> None:
+def _show(checked: EntryCheck) -> None:
     from ipsys_log.units import CM_PER_M
 
     for fault in checked.faults:
@@ -257,14 +261,14 @@ def _show(checked: Checked) -> None:
         console.print(text, style="yellow", markup=False)
 
 
-def _undo(scene: Scene, saved: list[str]) -> Measurement | None:
+def _undo(scene: MeasuringScene, saved: list[str]) -> Measurement | None:
     """Withdraw the last valid measurement, and return it; None if none is withdrawn.
 
     A measurement of an earlier session is withdrawn only if the user agrees.
     """
     from ipsys_log.analysis.pairs import active_measurements
     from ipsys_log.errors import IpsysError
-    from ipsys_log.survey.checks import withdraw
+    from ipsys_log.survey.checks import withdrawal_of
 
     active = {measurement.id: measurement for measurement in active_measurements(scene.history())}
     if not active:
@@ -276,7 +280,7 @@ def _undo(scene: Scene, saved: list[str]) -> Measurement | None:
         console.print("nothing is withdrawn", style="yellow")
         return None
     try:
-        scene.add([withdraw(scene.history(), last.id)])
+        scene.add([withdrawal_of(scene.history(), last.id)])
     except IpsysError as error:
         console.print(str(error), style="red", markup=False)
         return None

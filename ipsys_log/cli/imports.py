@@ -55,11 +55,11 @@ def images(
 ) -> None:
     """A folder of pictures, one sub-folder per camera; without --times the n-th of each belong together."""
     from ipsys_log.cli.options import load_calibrations, load_matching_rig
-    from ipsys_log.exchange.image_folders import find_pictures, find_times, read_images
+    from ipsys_log.exchange.image_folders import find_images, find_times, read_images
     from ipsys_log.runs.output import write_log
 
     _refuse_log(folder)
-    pictures = find_pictures(folder)
+    pictures = find_images(folder)
     lenses = load_calibrations(calibration, lambda: pictures)
     taken_ns = find_times(pictures, times) if times else None
     lab = load_matching_rig(rig, lambda: pictures)

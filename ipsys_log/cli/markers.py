@@ -127,7 +127,7 @@ def _lab(rig: Path | None, length: float | None, dictionary: str | None) -> Rig:
 
     from ipsys_log.errors import IpsysError
     from ipsys_log.messages import Rig
-    from ipsys_log.rig.checks import check_slips
+    from ipsys_log.rig.checks import check_units
     from ipsys_log.rig.file import check_rig, load_rig
     from ipsys_log.stages.detect import marker_detector
 
@@ -140,7 +140,7 @@ def _lab(rig: Path | None, length: float | None, dictionary: str | None) -> Rig:
     marker_detector(lab.dictionary)
     if length is not None:
         lab = replace(lab, marker_length_m=length)
-        check_slips(check_rig(lab, "--length"), "--length")
+        check_units(check_rig(lab, "--length"), "--length")
     return lab
 
 

@@ -30,7 +30,7 @@ from ipsys_log.cli.signals import allow_interrupt, runs_until_stopped, stop_on_s
 if TYPE_CHECKING:
     from ipsys_log.messages import Measurement
     from ipsys_log.survey.from_log import FinishedLog
-    from ipsys_log.survey.scene import Scene
+    from ipsys_log.survey.scene import MeasuringScene
 
 __all__ = ["add_commands", "serve_page"]
 
@@ -145,7 +145,7 @@ def _measure_log(
 ) -> None:
     from ipsys_log.runs.options import Request
     from ipsys_log.survey.add_sheet import add_sheet, check_sheet
-    from ipsys_log.survey.from_log import opened_log
+    from ipsys_log.survey.from_log import open_finished_log
 
     lenses = load_calibrations(calibration, lambda: cameras_of([log]))
     lab = load_matching_rig(rig, lambda: cameras_of([log]))
@@ -154,7 +154,7 @@ def _measure_log(
         check_sheet(csv, log, request)
     with ExitStack() as stack:
         with progress_bar() as progress:
-            scene = stack.enter_context(opened_log(log, request, progress, say))
+            scene = stack.enter_context(open_finished_log(log, request, progress, say))
         if places:
             _show_places(scene, as_json)
             return
@@ -176,14 +176,14 @@ def _measure_log(
         )
 
 
-def serve_page(scene: Scene, host: str | None, port: int) -> None:
+def serve_page(scene: MeasuringScene, host: str | None, port: int) -> None:
     """Serve the page until an interrupt."""
     from ipsys_log.cli.measure_live import say_faults
-    from ipsys_log.web.server import qr_code, serving
+    from ipsys_log.web.server import qr_code, serve
 
     signals: list[None] = []  # a list: an Event takes a lock that the interrupted thread may hold
     stop_on_signal(lambda: signals.append(None))
-    with serving(scene, host, port) as page:
+    with serve(scene, host, port) as page:
         if host is not None:
             console.print(qr_code(page.url), style="#ffffff on #000000", markup=False)
         console.print(f"open {page.url}", markup=False)
@@ -222,10 +222,10 @@ def _show_next(log: Path, history: Sequence[Measurement]) -> None:
 
 
 def _show_places(scene: FinishedLog, as_json: bool) -> None:
-    from ipsys_log.report.contents import stops_json, stops_table
+    from ipsys_log.report.contents import intervals_json, intervals_table
 
-    stops = stops_json(scene)
+    stops = intervals_json(scene)
     if as_json:
         print(json.dumps(stops, indent=2))  # noqa: T201
     else:
-        console.print(stops_table(stops))
+        console.print(intervals_table(stops))

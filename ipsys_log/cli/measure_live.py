@@ -19,9 +19,9 @@ if TYPE_CHECKING:
     from ipsys_log.messages import Measurement, Message, Model
     from ipsys_log.runs.options import Request
     from ipsys_log.survey.live import LiveScene
-    from ipsys_log.web.server import Served
+    from ipsys_log.web.server import PageServer
 
-__all__ = ["live_scene", "measure_now", "ready_to_measure", "say_faults", "served"]
+__all__ = ["live_scene", "measure_now", "ready_to_measure", "say_faults", "serve_live_page"]
 
 _TURN_S = 0.05
 # After this time, the markers in the images and their stationary intervals are known.
@@ -50,9 +50,9 @@ def measure_now(
     check_target(output, force, read)
     model = ready_to_measure(lab, request, model_from)
     if not terminal:
-        from ipsys_log.web.server import check_free
+        from ipsys_log.web.server import check_port_free
 
-        check_free(host, port)
+        check_port_free(host, port)
     ends = "q" if terminal else "Ctrl-C"
     doing = f"measuring into {output}; {ends} ends it"
     with opened(lab, output, None, doing, not terminal) as (cameras, settings, status):
@@ -62,7 +62,7 @@ def measure_now(
         if terminal:
             _ask_beside(work, scene, cameras)
         else:
-            with served(scene, host, port):
+            with serve_live_page(scene, host, port):
                 work()
     return scene.history()
 
@@ -92,11 +92,11 @@ def live_scene(settings: list[Message], cameras: Attached, model: Model | None) 
 
 
 @contextmanager
-def served(scene: LiveScene, host: str | None, port: int) -> Iterator[None]:
+def serve_live_page(scene: LiveScene, host: str | None, port: int) -> Iterator[None]:
     """Serve the measuring page until the block ends."""
-    from ipsys_log.web.server import qr_code, serving
+    from ipsys_log.web.server import qr_code, serve
 
-    with serving(scene, host, port) as page:
+    with serve(scene, host, port) as page:
         if host is not None:
             console.print(qr_code(page.url), style="#ffffff on #000000", markup=False)
         remarks.print(f"measure at {page.url}", markup=False)
@@ -106,13 +106,13 @@ def served(scene: LiveScene, host: str | None, port: int) -> Iterator[None]:
             say_faults(page)
 
 
-def say_faults(page: Served) -> None:
+def say_faults(page: PageServer) -> None:
     """Print the faults of the page's server at the end, when the screen is free for a traceback."""
-    if page.faults.count:
+    if page.exceptions.count:
         remarks.print(
-            f"faults of ipsys in the measuring page: {page.faults.count}; the first one:", style="red"
+            f"faults of ipsys in the measuring page: {page.exceptions.count}; the first one:", style="red"
         )
-        remarks.print(page.faults.first, markup=False, highlight=False)
+        remarks.print(page.exceptions.first, markup=False, highlight=False)
 
 
 def _ask_beside(work: Callable[[], Any], scene: LiveScene, cameras: Attached) -> None:

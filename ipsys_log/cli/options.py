@@ -143,14 +143,14 @@ def load_calibrations(
         An option has another form, or a file contains no calibration.
     """
     from ipsys_log.errors import IpsysError
-    from ipsys_log.exchange.calibration_files import read_lens
+    from ipsys_log.exchange.calibration_files import read_intrinsics
     from ipsys_log.log.dataset import Session
 
     lenses: dict[str, CameraCalibration] = {}
     for option in options or []:
         camera, equals, name = option.partition("=")
         if equals:
-            calibrations = {camera: read_lens(Path(name), camera)}
+            calibrations = {camera: read_intrinsics(Path(name), camera)}
         elif option.endswith(".mcap"):
             with Session([Path(option)]) as log:
                 recorded = {c: log.payloads([topic])[-1] for c, topic in log.calibrations.items()}

@@ -66,7 +66,7 @@ def plan(
     A model that the log does not hold yet is fitted first, to the places measured so far.
     """
     from ipsys_log.messages.channels import RIG
-    from ipsys_log.report.files import check_picture
+    from ipsys_log.report.files import check_figure_file
     from ipsys_log.report.plan import plan_floor
     from ipsys_log.rig.file import load_rig
     from ipsys_log.runs.select import copied_run
@@ -76,7 +76,7 @@ def plan(
     lenses = load_calibrations(calibration, lambda: cameras_of(logs))
     _check(logs, given_rig, model, places, height_m or ())
     if plot is not None:
-        check_picture(plot, "--plot", logs)
+        check_figure_file(plot, "--plot", logs)
     options: dict[str, Any] = {"train": train, "rig": rig, "calibration": calibration, "run": None}
     with derived(logs, "fit", model=[model], **options) as (session, outcomes, _):
         fitted = [outcome.run for outcome in outcomes if outcome.stage == "fit"]

@@ -66,7 +66,7 @@ def record(
     allow_interrupt(_NOT_BEGUN)
     from ipsys_log import pipeline
     from ipsys_log.capture.live_plan import check_start
-    from ipsys_log.cli.measure_live import live_scene, ready_to_measure, served
+    from ipsys_log.cli.measure_live import live_scene, ready_to_measure, serve_live_page
     from ipsys_log.errors import IpsysError
     from ipsys_log.runs.options import Request
 
@@ -77,10 +77,10 @@ def record(
     check_target(output, force, read)
     request = Request(corners=corners)
     if measure:
-        from ipsys_log.web.server import check_free
+        from ipsys_log.web.server import check_port_free
 
         model = ready_to_measure(lab, request, model_from)
-        check_free(host, port)
+        check_port_free(host, port)
     elif detect:
         check_start(lab.rig, lab.names, lab.lenses, request, "detect")
     with opened(lab, output, seconds) as (cameras, settings, status):
@@ -91,7 +91,7 @@ def record(
             remarks.print(text, style="yellow", markup=False)
         if measure:
             scene = live_scene(settings, cameras, model)
-            with served(scene, host, port):
+            with serve_live_page(scene, host, port):
                 pipeline.live(cameras, settings, output, request, "camera-frame", [status, scene], force)
         elif detect:
             pipeline.live(cameras, settings, output, request, "detect", [status], force)

@@ -92,7 +92,7 @@ def _init_simulated(path: Path) -> None:
     from ipsys_log.simulation.live_lab import LIVE_SETTINGS, live_rig, plan_live_lab, tape_sheet
 
     tape = path.with_name(f"{path.stem}_tape.csv")
-    lying = plan_live_lab(LIVE_SETTINGS).lying
+    lying = plan_live_lab(LIVE_SETTINGS).stationary
     _write_new({path: _SIMULATED + rig_toml(live_rig(LIVE_SETTINGS)), tape: tape_sheet(lying)})
     console.print(f"{path} written: the simulated lab, with three cameras", markup=False)
     console.print(

@@ -265,10 +265,10 @@ def _derive(
     details: bool = False,
     **given: Any,
 ) -> None:
-    from ipsys_log.report.files import check_folder, check_picture
+    from ipsys_log.report.files import check_figure_file, check_folder
 
     if plot is not None:
-        check_picture(plot, "--plot", logs)
+        check_figure_file(plot, "--plot", logs)
     if plots is not None:
         check_folder(plots, "--plots")
     with derived(logs, until, **given) as (session, outcomes, accuracies):

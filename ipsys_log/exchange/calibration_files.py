@@ -20,7 +20,7 @@ __all__ = [
     "check_format",
     "kalibr_yaml",
     "opencv_yaml",
-    "read_lens",
+    "read_intrinsics",
     "read_opencv_calibration",
     "ros_yaml",
 ]
@@ -184,7 +184,7 @@ FORMATS: dict[str, tuple[Callable[[CameraCalibration, Mapping[str, float], str],
 }
 
 
-def check_format(name: str, lens_name: str) -> None:
+def check_format(name: str, lens_model: str) -> None:
     """Check that a format exists and supports the lens model (``fisheye``, ``pinhole4`` ...).
 
     Raises
@@ -194,9 +194,9 @@ def check_format(name: str, lens_name: str) -> None:
     """
     if name not in FORMATS:
         raise IpsysError(f"--format {name}: there is no such format; use one of {', '.join(FORMATS)}")
-    if name == "kalibr" and lens_name not in ("fisheye", "pinhole4"):
+    if name == "kalibr" and lens_model not in ("fisheye", "pinhole4"):
         raise IpsysError(
-            f"--format kalibr: Kalibr has four coefficients, --lens {lens_name} has more; "
+            f"--format kalibr: Kalibr has four coefficients, --lens {lens_model} has more; "
             "use --lens fisheye or --lens pinhole4"
         )
 
@@ -211,7 +211,7 @@ def _row(values: Iterable[float]) -> str:
     return f"[{', '.join(repr(float(value)) for value in values)}]"
 
 
-def read_lens(path: Path, camera: str) -> CameraCalibration:
+def read_intrinsics(path: Path, camera: str) -> CameraCalibration:
     """Read the intrinsics of a camera from a YAML file of OpenCV or ROS, or from a log (``.mcap``).
 
     From a log, the newest calibration of the camera is read. If the log holds the calibration of a single

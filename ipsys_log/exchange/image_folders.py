@@ -22,7 +22,7 @@ from ipsys_log.messages import (
 from ipsys_log.rig.file import check_name
 from ipsys_log.units import NS_PER_S
 
-__all__ = ["FORMATS", "find_pictures", "find_times", "parse_start", "parse_time", "read_images"]
+__all__ = ["FORMATS", "find_images", "find_times", "parse_start", "parse_time", "read_images"]
 
 NAMES = "names"
 _COLUMNS = ("file", "time")
@@ -63,12 +63,12 @@ def parse_time(text: str) -> int:
     return int(number * _DIGITS[whole_digits])
 
 
-def find_times(pictures: Mapping[str, list[Path]], times: str) -> dict[Path, int]:
+def find_times(images: Mapping[str, list[Path]], times: str) -> dict[Path, int]:
     """Return the capture times of images, in ns since 1970.
 
     Parameters
     ----------
-    pictures : image files by camera, from :func:`~ipsys_log.exchange.image_folders.find_pictures`.
+    images : image files by camera, from :func:`~ipsys_log.exchange.image_folders.find_images`.
     times : ``names``, or a CSV file with the columns ``file`` (such as ``red/0001.jpg``) and ``time``.
 
     Raises
@@ -77,10 +77,10 @@ def find_times(pictures: Mapping[str, list[Path]], times: str) -> dict[Path, int
         An image has no time, a time cannot be read, or two images of one camera have the same time.
     """
     if times == NAMES:
-        times_ns = {path: _time(path.stem, str(path)) for paths in pictures.values() for path in paths}
+        times_ns = {path: _time(path.stem, str(path)) for paths in images.values() for path in paths}
     else:
-        times_ns = _read_table(Path(times), pictures)
-    for paths in pictures.values():
+        times_ns = _read_table(Path(times), images)
+    for paths in images.values():
         seen: dict[int, Path] = {}
         for path in paths:
             if path not in times_ns:
@@ -111,8 +111,8 @@ def _time(text: str, where: str) -> int:
         ) from error
 
 
-def _read_table(table: Path, pictures: Mapping[str, list[Path]]) -> dict[Path, int]:
-    by_name = {f"{path.parent.name}/{path.name}": path for paths in pictures.values() for path in paths}
+def _read_table(table: Path, images: Mapping[str, list[Path]]) -> dict[Path, int]:
+    by_name = {f"{path.parent.name}/{path.name}": path for paths in images.values() for path in paths}
     times_ns = {}
     try:
         with table.open(newline="", encoding="utf-8-sig") as file:
@@ -140,7 +140,7 @@ OTHER_FORMATS = (".bmp", ".tif", ".tiff", ".gif", ".heic", ".pgm", ".ppm", ".raw
 START_NS = 1_577_836_800 * NS_PER_S  # 2020-01-01
 
 
-def find_pictures(folder: Path) -> dict[str, list[Path]]:
+def find_images(folder: Path) -> dict[str, list[Path]]:
     """Find the images of a folder with one sub-folder per camera; return them by camera.
 
     The images are in the order of their names. Numbers in the names count by their value: img2 before img10.
@@ -176,7 +176,7 @@ def _by_number(path: Path) -> list[tuple[int, str]]:
 
 
 def read_images(
-    pictures: Mapping[str, list[Path]],
+    images: Mapping[str, list[Path]],
     rig: Rig | None,
     lenses: Mapping[str, CameraCalibration],
     rate_hz: float,
@@ -188,7 +188,7 @@ def read_images(
 
     Parameters
     ----------
-    pictures : image files by camera, from :func:`find_pictures`.
+    images : image files by camera, from :func:`find_images`.
     rig, lenses : optional messages before the frames; ``lenses`` are the intrinsics by camera.
     rate_hz : images per second.
     times_ns : capture time of each image, from :func:`~ipsys_log.exchange.image_folders.find_times`. With
@@ -201,11 +201,11 @@ def read_images(
     """
     if not 1e-6 <= rate_hz <= 1e6:
         raise IpsysError(f"--rate {rate_hz:g}: give pictures per second, above 0")
-    strange = sorted(set(lenses) - set(pictures))
+    strange = sorted(set(lenses) - set(images))
     if strange:
-        names = ", ".join(pictures)
+        names = ", ".join(images)
         raise IpsysError(f"--calibration {strange[0]}: there are no pictures of such a camera (only {names})")
-    taken_ns = times_ns if times_ns is not None else _even_times(pictures, rate_hz)
+    taken_ns = times_ns if times_ns is not None else _even_times(images, rate_hz)
     # Messages of the same instant get log times 1 ns apart.
     log_ns = min(taken_ns.values()) - len(lenses) - 1 if times_ns is not None else START_NS
     if rig is not None:
@@ -213,17 +213,17 @@ def read_images(
     for camera, lens in sorted(lenses.items()):
         log_ns += 1
         yield Message(calibration_topic(camera), log_ns, log_ns, lens, camera)
-    shots = [(taken_ns[path], camera, path) for camera, paths in pictures.items() for path in paths]
+    shots = [(taken_ns[path], camera, path) for camera, paths in images.items() for path in paths]
     for time_ns, camera, path in sorted(shots, key=lambda shot: shot[0]):
         log_ns = max(time_ns, log_ns + 1)
         image = CompressedImage(time_ns, camera, path.read_bytes(), FORMATS[path.suffix.lower()])
         yield Message(image_topic(camera), log_ns, time_ns, image, camera)
 
 
-def _even_times(pictures: Mapping[str, list[Path]], rate_hz: float) -> dict[Path, int]:
+def _even_times(images: Mapping[str, list[Path]], rate_hz: float) -> dict[Path, int]:
     """Return times at a constant rate; images with the same number get the same time."""
     return {
         path: START_NS + round((number + 1) * NS_PER_S / rate_hz)
-        for paths in pictures.values()
+        for paths in images.values()
         for number, path in enumerate(paths)
     }

@@ -7,7 +7,7 @@ from pathlib import Path
 
 from ipsys_log.capture.simulated import lens_of
 from ipsys_log.errors import IpsysError
-from ipsys_log.exchange.calibration_files import read_lens
+from ipsys_log.exchange.calibration_files import read_intrinsics
 from ipsys_log.messages import CameraCalibration, Rig, RigCamera
 from ipsys_log.rig.file import load_rig
 from ipsys_log.stages.detect import marker_detector
@@ -64,7 +64,7 @@ def load_lenses(
     lenses = dict(given)
     for camera in cameras if read else ():
         if camera.name not in lenses and camera.calibration is not None:
-            lenses[camera.name] = read_lens(path.parent / camera.calibration, camera.name)
+            lenses[camera.name] = read_intrinsics(path.parent / camera.calibration, camera.name)
         elif camera.name not in lenses and str(camera.source).startswith("sim:"):
             lenses[camera.name] = lens_of(camera)
     unknown = sorted(set(lenses) - set(names))

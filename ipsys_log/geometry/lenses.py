@@ -15,11 +15,11 @@ __all__ = [
     "DISTORTION_MODELS",
     "check_calibration",
     "check_size",
-    "in_picture",
-    "meet_height",
+    "in_image",
+    "intersect_height",
     "project",
-    "same_lens",
-    "scale_lens",
+    "same_intrinsics",
+    "scale_intrinsics",
     "undistort",
 ]
 
@@ -27,7 +27,7 @@ __all__ = [
 _LEAST_SLOPE = 1e-6
 
 
-def meet_height(
+def intersect_height(
     origin_m: NDArray[np.float64], directions: NDArray[np.float64], heights_m: NDArray[np.float64]
 ) -> NDArray[np.float64]:
     """Return the points at given heights on rays from one origin.
@@ -45,7 +45,7 @@ def meet_height(
     Examples
     --------
     >>> down = np.array([[0.0, 0.0, -1.0], [1.0, 0.0, -1.0], [0.0, 0.0, 1.0]])
-    >>> meet_height(np.array([0.0, 0.0, 2.0]), down, np.array([0.0, 0.5, 0.0])).tolist()
+    >>> intersect_height(np.array([0.0, 0.0, 2.0]), down, np.array([0.0, 0.5, 0.0])).tolist()
     [[0.0, 0.0, 0.0], [1.5, 0.0, 0.5], [nan, nan, nan]]
     """
     falls = directions[:, 2]
@@ -129,7 +129,7 @@ def check_size(lens: CameraCalibration, width: int, height: int, camera: str | N
         )
 
 
-def scale_lens(lens: CameraCalibration, width: int, height: int, where: str) -> CameraCalibration:
+def scale_intrinsics(lens: CameraCalibration, width: int, height: int, where: str) -> CameraCalibration:
     """Return the calibration for images of another size with the same field of view.
 
     Raises
@@ -141,7 +141,7 @@ def scale_lens(lens: CameraCalibration, width: int, height: int, where: str) -> 
     --------
     >>> K = np.array([[1150.0, 0, 959.5], [0, 1150, 539.5], [0, 0, 1]])
     >>> lens = CameraCalibration(0, "red", 1920, 1080, "kannala_brandt", np.zeros(4), K)
-    >>> scale_lens(lens, 960, 540, "camera red").K.tolist()
+    >>> scale_intrinsics(lens, 960, 540, "camera red").K.tolist()
     [[575.0, 0.0, 479.5], [0.0, 575.0, 269.5], [0.0, 0.0, 1.0]]
     """
     if (lens.width, lens.height) == (width, height):
@@ -159,7 +159,7 @@ def scale_lens(lens: CameraCalibration, width: int, height: int, where: str) -> 
     return replace(lens, width=width, height=height, K=matrix, P=P)
 
 
-def same_lens(one: CameraCalibration, other: CameraCalibration) -> bool:
+def same_intrinsics(one: CameraCalibration, other: CameraCalibration) -> bool:
     """Return whether two calibrations map pixels to the same rays; times and frame ids may differ."""
     sizes = [(lens.width, lens.height, lens.distortion_model) for lens in (one, other)]
     return sizes[0] == sizes[1] and np.array_equal(one.K, other.K) and np.array_equal(one.D, other.D)
@@ -238,7 +238,7 @@ def project(points_m: NDArray[np.float64], lens: CameraCalibration) -> NDArray[n
     return np.asarray(pixels, dtype=np.float64).reshape(-1, 2)
 
 
-def in_picture(points_m: NDArray[np.float64], lens: CameraCalibration) -> NDArray[np.bool_]:
+def in_image(points_m: NDArray[np.float64], lens: CameraCalibration) -> NDArray[np.bool_]:
     """Return a mask (n,) of the points in camera coordinates that are visible in the image.
 
     Parameters

@@ -15,21 +15,21 @@ from ipsys_log.geometry.poses import transform
 from ipsys_log.messages import CameraCalibration
 
 __all__ = [
-    "Moving",
-    "Placed",
+    "MovingMarker",
     "PlacedBoard",
+    "PlacedMarker",
     "black_cells",
     "cell_outlines",
     "print_outline",
     "printed_cells",
-    "true_corners",
+    "project_corners",
 ]
 
 Array = NDArray[np.float64]
 
 
 @dataclass(frozen=True, slots=True, eq=False)
-class Placed:
+class PlacedMarker:
     """A printed marker in the world.
 
     ``length_m`` is the side of its black square; a white margin of one cell is printed around it.
@@ -57,7 +57,7 @@ class PlacedBoard:
 
 
 # A function from the time in s since the time of the frame to the marker at that time.
-Moving = Callable[[float], Placed]
+MovingMarker = Callable[[float], PlacedMarker]
 
 
 @cache
@@ -68,7 +68,7 @@ def black_cells(dictionary: str, marker_id: int) -> NDArray[np.bool_]:
     return black
 
 
-def printed_cells(placed: Placed | PlacedBoard, dictionary: str) -> tuple[NDArray[np.bool_], float]:
+def printed_cells(placed: PlacedMarker | PlacedBoard, dictionary: str) -> tuple[NDArray[np.bool_], float]:
     """Return a mask of the black cells of a print, (rows, columns) with margin, and the cells per m."""
     if isinstance(placed, PlacedBoard):
         return placed.cells, 1 / placed.cell_m
@@ -76,7 +76,7 @@ def printed_cells(placed: Placed | PlacedBoard, dictionary: str) -> tuple[NDArra
     return cells, (len(cells) - 2) / placed.length_m
 
 
-def print_outline(placed: Placed | PlacedBoard, dictionary: str, per_side: int = 8) -> Array:
+def print_outline(placed: PlacedMarker | PlacedBoard, dictionary: str, per_side: int = 8) -> Array:
     """Return points around the edge of a print, white margin included, (4 per_side, 3) in world m."""
     cells, cells_per_m = printed_cells(placed, dictionary)
     corners = marker_corners(1 / cells_per_m) * [cells.shape[1], cells.shape[0], 1]
@@ -85,7 +85,7 @@ def print_outline(placed: Placed | PlacedBoard, dictionary: str, per_side: int =
     return transform(placed.world_from_marker, sides.reshape(-1, 3))
 
 
-def true_corners(lens: CameraCalibration, camera_from_world: Array, placed: Placed) -> Array:
+def project_corners(lens: CameraCalibration, camera_from_world: Array, placed: PlacedMarker) -> Array:
     """Return the exact pixels of the corners of the black square, without noise, in OpenCV's order.
 
     Parameters

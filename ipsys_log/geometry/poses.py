@@ -6,7 +6,15 @@ import cv2
 import numpy as np
 from numpy.typing import NDArray
 
-__all__ = ["invert_pose", "lay_flat", "look_down", "make_pose", "rotation", "rotation_vector", "transform"]
+__all__ = [
+    "invert_pose",
+    "look_down",
+    "make_pose",
+    "pose_facing_up",
+    "rotation",
+    "rotation_vector",
+    "transform",
+]
 
 Array = NDArray[np.float64]
 
@@ -57,7 +65,7 @@ def rotation_vector(rotation_matrix: Array) -> Array:
     return np.asarray(cv2.Rodrigues(rotation_matrix)[0], dtype=np.float64).ravel()
 
 
-def lay_flat(x_m: float, y_m: float, z_m: float, heading_rad: float) -> Array:
+def pose_facing_up(x_m: float, y_m: float, z_m: float, heading_rad: float) -> Array:
     """Return ``world_from_marker``, (4, 4), of a marker that faces up.
 
     The marker's y axis is the side from corner 3 to corner 0. The heading is the angle of this axis, from
@@ -65,7 +73,7 @@ def lay_flat(x_m: float, y_m: float, z_m: float, heading_rad: float) -> Array:
 
     Examples
     --------
-    >>> world_from_marker = lay_flat(1.0, 2.0, 0.1, np.pi / 2)
+    >>> world_from_marker = pose_facing_up(1.0, 2.0, 0.1, np.pi / 2)
     >>> transform(world_from_marker, np.array([[0.1, 0.0, 0.0]])).round(9).tolist()
     [[1.1, 2.0, 0.1]]
     """

@@ -11,7 +11,7 @@ from ipsys_log.geometry.lenses import project
 from ipsys_log.geometry.markers import marker_corners
 from ipsys_log.messages import CameraCalibration
 
-__all__ = ["SquarePoses", "fit_squares", "goes_around", "reprojection_px", "solve_squares"]
+__all__ = ["SquarePoses", "fit_squares", "is_convex", "reprojection_px", "solve_squares"]
 
 Array = NDArray[np.float64]
 
@@ -28,7 +28,7 @@ def solve_squares(uv: Array, lengths_m: Array) -> tuple[Array, Array]:
     Parameters
     ----------
     uv : (n, 4, 2), normalized image coordinates of corners that go around (see
-        :func:`ipsys_log.geometry.square_pose.goes_around`).
+        :func:`ipsys_log.geometry.square_pose.is_convex`).
     lengths_m : (n,), sides of the black squares, in m.
 
     Returns
@@ -131,7 +131,7 @@ def fit_squares(uv: Array, whitening: Array, lengths_m: Array) -> SquarePoses:
 
     Parameters
     ----------
-    uv : (n, 4, 2), normalized image coordinates of corners that go around (see :func:`goes_around`).
+    uv : (n, 4, 2), normalized image coordinates of corners that go around (see :func:`is_convex`).
     whitening : (n, 8, 8), matrices that turn changes of u0 v0 .. u3 v3 into numbers of variance 1 (see
         :func:`ipsys_log.geometry.markers.whiten`, times the slopes of the lens).
     lengths_m : (n,), sides of the black squares, in m.
@@ -165,7 +165,7 @@ def fit_squares(uv: Array, whitening: Array, lengths_m: Array) -> SquarePoses:
     return SquarePoses(rotations, centres_m, chi2, covariances_m2)
 
 
-def goes_around(uv: Array) -> bool:
+def is_convex(uv: Array) -> bool:
     """Return whether corners, (4, 2), go around a convex figure, in the order of a marker in front view."""
     sides = uv[[1, 2, 3, 0]] - uv
     after = sides[[1, 2, 3, 0]]

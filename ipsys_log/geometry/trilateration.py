@@ -12,12 +12,12 @@ from ipsys_log.errors import IpsysError
 
 __all__ = [
     "SIDES",
-    "Trilaterated",
+    "TapePosition",
+    "are_collinear",
     "crossing_angle",
-    "meeting_point",
+    "intersect_circles",
     "multilaterate",
     "side_of",
-    "sides_alike",
     "tape_covariance",
     "trilaterate",
 ]
@@ -66,10 +66,10 @@ def trilaterate(a_m: Array, b_m: Array, d1_m: float, d2_m: float, side: str) -> 
             f"no triangle has the sides AB = {base_m:.4f} m, d1 = {d1_m:.4f} m and d2 = {d2_m:.4f} m; "
             "measure d1 and d2 again"
         )
-    return meeting_point(a_m, b_m, d1_m, d2_m, side)
+    return intersect_circles(a_m, b_m, d1_m, d2_m, side)
 
 
-def meeting_point(a_m: Array, b_m: Array, d1_m: float, d2_m: float, side: str) -> Array:
+def intersect_circles(a_m: Array, b_m: Array, d1_m: float, d2_m: float, side: str) -> Array:
     """Return the intersection of two circles; without one, the point between them on the line AB."""
     ab = b_m - a_m
     base_m = float(np.hypot(*ab))
@@ -93,7 +93,7 @@ _STEPS = 50
 _STEP_M = 1e-10
 
 
-class Trilaterated(NamedTuple):
+class TapePosition(NamedTuple):
     """A point from tape distances, with its covariance and residuals.
 
     ``point_m`` is (2,). ``covariance_m2`` is (2, 2), None without sigmas. ``residuals_m`` (n,) are the
@@ -109,7 +109,7 @@ class Trilaterated(NamedTuple):
 
 def multilaterate(
     references_m: Array, distances_m: Array, sigmas_m: Array | None = None, side: str | None = None
-) -> Trilaterated:
+) -> TapePosition:
     """Return the point at given distances from two or more reference points.
 
     For two distances, the function solves eq. (25) exactly. For more distances, it solves eq. (25) by
@@ -127,7 +127,7 @@ def multilaterate(
 
     Returns
     -------
-    Trilaterated : point, covariance (see :func:`tape_covariance`), residuals, reduced chi-square.
+    TapePosition : point, covariance (see :func:`tape_covariance`), residuals, reduced chi-square.
 
     Raises
     ------
@@ -149,7 +149,7 @@ def multilaterate(
     _check_numbers(references_m, distances_m, sigmas_m)
     if side is not None and side not in SIDES:
         raise IpsysError(f"side {side!r} of AB is neither 'left' nor 'right'")
-    if sides_alike(references_m) and side is None:
+    if are_collinear(references_m) and side is None:
         raise IpsysError(
             f"the {len(references_m)} reference points lie on one line and the distances fit on both "
             "sides of it; say whether the place is 'left' or 'right' of it"
@@ -161,20 +161,20 @@ def multilaterate(
         point_m = _least_squares(references_m, distances_m, sigmas_m, side)
         residuals_m = distances_m - np.linalg.norm(point_m - references_m, axis=1)
     if sigmas_m is None:
-        return Trilaterated(point_m, None, residuals_m, None)
+        return TapePosition(point_m, None, residuals_m, None)
     free = len(references_m) - 2
     chi2 = float(((residuals_m / sigmas_m) ** 2).sum()) / free if free else None
-    return Trilaterated(point_m, tape_covariance(point_m, references_m, sigmas_m), residuals_m, chi2)
+    return TapePosition(point_m, tape_covariance(point_m, references_m, sigmas_m), residuals_m, chi2)
 
 
-def sides_alike(references_m: Array) -> bool:
+def are_collinear(references_m: Array) -> bool:
     """Return whether reference points, (n, 2) in m, are so near to one line that a side is required.
 
     Examples
     --------
-    >>> sides_alike(np.array([[0.0, 0.0], [2.0, 0.0]]))
+    >>> are_collinear(np.array([[0.0, 0.0], [2.0, 0.0]]))
     True
-    >>> sides_alike(np.array([[0.0, 0.0], [2.0, 0.0], [0.0, 2.0]]))
+    >>> are_collinear(np.array([[0.0, 0.0], [2.0, 0.0], [0.0, 2.0]]))
     False
     """
     if len(references_m) == 2:
@@ -259,7 +259,7 @@ def _least_squares(
     solutions = []
     for i, j in combinations(first.tolist(), 2):
         two_circles = references_m[i], references_m[j], float(distances_m[i]), float(distances_m[j])
-        starts_m = [meeting_point(*two_circles, start_side) for start_side in SIDES]
+        starts_m = [intersect_circles(*two_circles, start_side) for start_side in SIDES]
         solutions += [_descend(start_m, references_m, distances_m, weights) for start_m in starts_m]
     likely = min(cost for cost, _ in solutions) + _ALIKE
     on_side = [

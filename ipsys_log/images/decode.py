@@ -17,14 +17,14 @@ from ipsys_log.images.jpeg import cut_rows, read_layout, whole_rows
 from ipsys_log.messages import CompressedImage, RawImage
 
 __all__ = [
-    "MOST_PIXELS",
+    "MAX_PIXELS",
     "Grey",
     "check_encoded",
-    "check_size",
+    "check_pixel_count",
     "decode_grey",
     "decode_rows",
     "levels_at",
-    "read_picture_size",
+    "read_image_size",
 ]
 
 # An embedded thumbnail may come before the size of a JPEG.
@@ -32,7 +32,7 @@ _FIRST_BYTES = 1 << 18
 _PNG = b"\x89PNG\r\n\x1a\n"
 
 
-def read_picture_size(path: Path) -> tuple[int, int] | None:
+def read_image_size(path: Path) -> tuple[int, int] | None:
     """Return width and height in px from the header of a JPEG or PNG file.
 
     Return None for another kind of file, or for an unreadable header.
@@ -54,7 +54,7 @@ def read_picture_size(path: Path) -> tuple[int, int] | None:
     return int(width), int(height)
 
 
-MOST_PIXELS = 1 << 27  # 134 million
+MAX_PIXELS = 1 << 27  # 134 million
 # A JPEG has at least one bit for each block of 8 x 8 px.
 _JPEG_PIXELS_PER_BYTE = 512
 # SOF0 to SOF15, except the tables and the extension between them.
@@ -68,16 +68,16 @@ def check_encoded(data: bytes) -> None:
     Raises
     ------
     FrameError
-        The header states more than `MOST_PIXELS`, or more than its bytes can encode.
+        The header states more than ``MAX_PIXELS``, or more than its bytes can encode.
     """
     if data[:2] == b"\xff\xd8":
         width, height = _jpeg_size(data)
-        check_size(width, height, len(data))
+        check_pixel_count(width, height, len(data))
     elif data[:8] == _PNG and len(data) >= 24:
-        check_size(int.from_bytes(data[16:20], "big"), int.from_bytes(data[20:24], "big"))
+        check_pixel_count(int.from_bytes(data[16:20], "big"), int.from_bytes(data[20:24], "big"))
 
 
-def check_size(width: int, height: int, jpeg_bytes: int | None = None) -> None:
+def check_pixel_count(width: int, height: int, jpeg_bytes: int | None = None) -> None:
     """Check that a size in px is not too large, also for the number of bytes of a JPEG.
 
     Raises
@@ -85,8 +85,8 @@ def check_size(width: int, height: int, jpeg_bytes: int | None = None) -> None:
     FrameError
         The size is too large, see :func:`check_encoded`.
     """
-    if width * height > MOST_PIXELS:
-        raise FrameError(f"a picture of {width} x {height} px, more than {MOST_PIXELS} in all")
+    if width * height > MAX_PIXELS:
+        raise FrameError(f"a picture of {width} x {height} px, more than {MAX_PIXELS} in all")
     if jpeg_bytes is not None and width * height > _JPEG_PIXELS_PER_BYTE * jpeg_bytes:
         raise FrameError(f"{jpeg_bytes} bytes are too few for a JPEG of {width} x {height} px")
 
@@ -154,7 +154,7 @@ def decode_rows(
     if layout is None:
         grey = decode_grey(frame)
         return grey, [slice(0, len(grey))]
-    check_size(layout.width, layout.height, len(frame.data))
+    check_pixel_count(layout.width, layout.height, len(frame.data))
     memory: _Memory = _THREAD.__dict__.setdefault("memory", _Memory())
     if memory.pixels.shape != (layout.height, layout.width):
         memory.pixels = np.zeros((layout.height, layout.width), dtype=np.uint8)

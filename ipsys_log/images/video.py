@@ -15,14 +15,14 @@ from contextlib import suppress
 from typing import TYPE_CHECKING, NamedTuple
 
 from ipsys_log.errors import FrameError
-from ipsys_log.images.decode import MOST_PIXELS
+from ipsys_log.images.decode import MAX_PIXELS
 from ipsys_log.messages import CompressedVideo, RawImage
 
 if TYPE_CHECKING:
     from av.video.codeccontext import VideoCodecContext
     from av.video.frame import VideoFrame
 
-__all__ = ["VIDEO_FORMATS", "FrameNumbers", "Video", "decode_keyframe", "decode_last", "is_keyframe"]
+__all__ = ["VIDEO_FORMATS", "FrameGapDetector", "Video", "decode_keyframe", "decode_last", "is_keyframe"]
 
 # The header of a unit of Annex B, with as many bytes of the unit as this module reads.
 _UNIT_WITH_HEAD = re.compile(rb"\x00\x00\x01(.)(?=(.{0,96}))", re.DOTALL)
@@ -38,7 +38,7 @@ class _Counting(NamedTuple):
     planes: bool
 
 
-class FrameNumbers:
+class FrameGapDetector:
     """A detector of missing frames of one camera. The caller calls it with the data of each frame."""
 
     def __init__(self) -> None:
@@ -137,7 +137,7 @@ class Video:
         self._decoder = _open(VIDEO_FORMATS[format])
         self._begun = self._keyed = False
         self._fault: str | None = None
-        self._misses = FrameNumbers() if format == "h264" else lambda data: False
+        self._misses = FrameGapDetector() if format == "h264" else lambda data: False
 
     def __call__(self, frame: CompressedVideo) -> RawImage | None:
         """Return the grey image of a message; None before the first keyframe.
@@ -155,7 +155,7 @@ class Video:
         size = image.width, image.height
         return RawImage(frame.timestamp, frame.frame_id, *size, "mono8", plane.line_size, bytes(plane))
 
-    def pass_over(self, frame: CompressedVideo) -> None:
+    def skip(self, frame: CompressedVideo) -> None:
         """Decode a message only because later messages need it; ignore damage."""
         with suppress(FrameError):
             self._decode(frame)
@@ -249,7 +249,7 @@ def decode_last(backwards: Iterable[CompressedVideo]) -> RawImage | None:
     last, *before = needed
     video = Video(last.format)
     for frame in reversed(before):
-        video.pass_over(frame)
+        video.skip(frame)
     return video(last)
 
 
@@ -262,5 +262,5 @@ def _open(codec: str) -> VideoCodecContext:
     decoder.thread_count = 1
     decoder.flags |= av.codec.context.Flags.low_delay
     # An image with guessed areas counts as damaged.
-    decoder.options = {"err_detect": "explode", "max_pixels": str(MOST_PIXELS)}
+    decoder.options = {"err_detect": "explode", "max_pixels": str(MAX_PIXELS)}
     return decoder

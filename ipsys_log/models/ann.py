@@ -11,15 +11,15 @@ from sklearn.utils.validation import check_is_fitted, validate_data
 
 from ipsys_log.errors import FitError
 
-__all__ = ["NeuralNetwork", "network", "spread", "train_networks"]
+__all__ = ["NeuralNetwork", "column_sigmas", "evaluate_networks", "train_networks"]
 
 
-def spread(values: NDArray[np.float64]) -> NDArray[np.float64]:
+def column_sigmas(values: NDArray[np.float64]) -> NDArray[np.float64]:
     """Return the standard deviation of each column, (d,) of (n, d); 1 if a column is constant.
 
     Examples
     --------
-    >>> spread(np.array([[0.0, 5.0], [2.0, 5.0]])).tolist()
+    >>> column_sigmas(np.array([[0.0, 5.0], [2.0, 5.0]])).tolist()
     [1.0, 1.0]
     """
     deviation = values.std(axis=0)
@@ -46,7 +46,7 @@ _LEAST_NOISE = 1e-12
 _NOISE_OVER_PLANE = 4.0
 
 
-def network(weights: Array, inputs: Array) -> tuple[Array, Array]:
+def evaluate_networks(weights: Array, inputs: Array) -> tuple[Array, Array]:
     """Return the outputs of networks with one hidden layer of tanh neurons.
 
     Parameters
@@ -100,7 +100,7 @@ def train_networks(inputs: Array, targets: Array, weights: Array) -> tuple[Array
     most_noise = _most_noise(inputs, targets)
     pull = _relative_pulls(inputs.shape[1], weights.shape[1])
     strength, damping = np.full(len(weights), 1e-3), np.full(len(weights), 1e-2)
-    outputs, neurons = network(weights, inputs)
+    outputs, neurons = evaluate_networks(weights, inputs)
     for step in range(_STEPS):
         slopes = _slopes(weights, inputs, neurons)
         curvature = slopes @ slopes.transpose(0, 2, 1)
@@ -111,7 +111,7 @@ def train_networks(inputs: Array, targets: Array, weights: Array) -> tuple[Array
         gradient = np.einsum("bwn,bn->bw", slopes, misfit) + strength[:, None] * pull * weights
         damped = curvature + _diagonal(strength[:, None] * pull + damping[:, None])
         tried = weights - np.linalg.solve(damped, gradient[:, :, None])[:, :, 0]
-        tried_outputs, tried_neurons = network(tried, inputs)
+        tried_outputs, tried_neurons = evaluate_networks(tried, inputs)
         tried_cost = ((tried_outputs - targets) ** 2).sum(axis=1) + strength * (tried**2 @ pull)
         better = tried_cost < cost
         weights = np.where(better[:, None], tried, weights)
@@ -171,7 +171,7 @@ def _determined(
 def _evidence(
     weights: Array, inputs: Array, targets: Array, strength: Array, pull: Array, most_noise: Array
 ) -> Array:
-    outputs, neurons = network(weights, inputs)
+    outputs, neurons = evaluate_networks(weights, inputs)
     slopes, misfit = _slopes(weights, inputs, neurons), outputs - targets
     curvature = slopes @ slopes.transpose(0, 2, 1)
     _, noise = _determined(strength, curvature, misfit, pull, most_noise)
@@ -195,7 +195,7 @@ class NeuralNetwork(MultiOutputMixin, RegressorMixin, BaseEstimator):  # type: i
     ----------
     centre_, scale_ : (d,), mean and standard deviation of the inputs.
     target_centre_, target_scale_ : (outputs,), the same of the targets.
-    weights_ : (outputs, 3 (d + 1) + 4), see :func:`network`.
+    weights_ : (outputs, 3 (d + 1) + 4), see :func:`evaluate_networks`.
 
     Examples
     --------
@@ -220,8 +220,8 @@ class NeuralNetwork(MultiOutputMixin, RegressorMixin, BaseEstimator):  # type: i
             )
         targets = y.reshape(len(y), -1)
         self._single = y.ndim == 1
-        self.centre_, self.scale_ = X.mean(axis=0), spread(X)
-        self.target_centre_, self.target_scale_ = targets.mean(axis=0), spread(targets)
+        self.centre_, self.scale_ = X.mean(axis=0), column_sigmas(X)
+        self.target_centre_, self.target_scale_ = targets.mean(axis=0), column_sigmas(targets)
         scaled = ((targets - self.target_centre_) / self.target_scale_).T
         inputs = self._inputs(X)
         width = _NEURONS * inputs.shape[1] + _NEURONS + 1
@@ -236,7 +236,7 @@ class NeuralNetwork(MultiOutputMixin, RegressorMixin, BaseEstimator):  # type: i
     def predict(self, X: Any) -> Array:
         check_is_fitted(self)
         X = validate_data(self, X, dtype=np.float64, reset=False)
-        scaled, _ = network(self.weights_, self._inputs(X))
+        scaled, _ = evaluate_networks(self.weights_, self._inputs(X))
         values: Array = scaled.T * self.target_scale_ + self.target_centre_
         return values[:, 0] if getattr(self, "_single", False) else values
 

@@ -14,9 +14,9 @@ from sklearn.base import BaseEstimator, MultiOutputMixin, RegressorMixin
 from sklearn.utils.validation import check_is_fitted, validate_data
 
 from ipsys_log.errors import FitError
-from ipsys_log.models.ann import spread
+from ipsys_log.models.ann import column_sigmas
 
-__all__ = ["Kriging", "most_likely"]
+__all__ = ["Kriging", "fit_correlations"]
 
 Array = NDArray[np.float64]
 
@@ -96,7 +96,7 @@ def _deviance(logs: Array, gaps: Array, terms: Array, targets: Array) -> tuple[f
     return fitted.deviance(), np.append(by_theta, by_noise)
 
 
-def most_likely(points: Array, targets: Array, noisy: bool) -> Array:
+def fit_correlations(points: Array, targets: Array, noisy: bool) -> Array:
     """Return the logarithms of the correlation parameters with the maximum likelihood of the targets.
 
     Parameters
@@ -143,7 +143,7 @@ class Kriging(MultiOutputMixin, RegressorMixin, BaseEstimator):  # type: ignore[
     ----------
     points_ : (n, d), the inputs, centred by ``centre_`` (d,) and divided by ``scale_`` (d,).
     target_centre_, target_scale_ : (outputs,), mean and standard deviation of the targets.
-    logs_ : (outputs, 1) or (outputs, d + 1), see :func:`most_likely`.
+    logs_ : (outputs, 1) or (outputs, d + 1), see :func:`fit_correlations`.
     trend_ : (outputs, d + 1), coefficients of eq. (19), for the scaled inputs and outputs.
     weights_ : (outputs, n), weights of the correlations in eq. (17) and (23).
     variance_ : (outputs,), variance of the process, scaled.
@@ -181,11 +181,11 @@ class Kriging(MultiOutputMixin, RegressorMixin, BaseEstimator):  # type: ignore[
             )
         targets = y.reshape(len(y), -1)
         self._single = y.ndim == 1
-        self.centre_, self.scale_ = X.mean(axis=0), spread(X)
-        self.target_centre_, self.target_scale_ = targets.mean(axis=0), spread(targets)
+        self.centre_, self.scale_ = X.mean(axis=0), column_sigmas(X)
+        self.target_centre_, self.target_scale_ = targets.mean(axis=0), column_sigmas(targets)
         self.points_ = (X - self.centre_) / self.scale_
         scaled = (targets - self.target_centre_) / self.target_scale_
-        self.logs_ = np.array([most_likely(self.points_, column, self.noisy) for column in scaled.T])
+        self.logs_ = np.array([fit_correlations(self.points_, column, self.noisy) for column in scaled.T])
         solved = [self._solve(logs, column) for logs, column in zip(self.logs_, scaled.T, strict=True)]
         self.trend_ = np.array([gls.trend for gls in solved])
         self.weights_ = np.array(

@@ -11,8 +11,8 @@ from sklearn.base import BaseEstimator, RegressorMixin
 from sklearn.utils.validation import check_is_fitted, validate_data
 
 from ipsys_log.errors import FitError
-from ipsys_log.geometry.lenses import meet_height
-from ipsys_log.models.rays import Bearings, Places, directions, fit_bearings
+from ipsys_log.geometry.lenses import intersect_height
+from ipsys_log.models.rays import CalibrationPoints, CameraRays, directions, fit_rays
 
 __all__ = ["RayDepth", "RayPlane", "fit_depths"]
 
@@ -39,16 +39,18 @@ class RayPlane(RegressorMixin, BaseEstimator):  # type: ignore[misc]
         X, y = validate_data(self, X, y, multi_output=True, dtype=np.float64)
         if X.shape[1] != 4 or y.shape != (len(X), 3):
             raise FitError(f"rayplane maps (n, 4) to (n, 3), found {X.shape} and {y.shape}")
-        places = Places(X[:, :3], np.column_stack([y[:, :2], X[:, 3]]), tuple(map(str, range(len(X)))))
+        places = CalibrationPoints(
+            X[:, :3], np.column_stack([y[:, :2], X[:, 3]]), tuple(map(str, range(len(X))))
+        )
         return self.fit_jointly([self], [places])[0]
 
     @staticmethod
-    def fit_jointly(models: Sequence[RayPlane], cameras: Sequence[Places]) -> list[RayPlane]:
+    def fit_jointly(models: Sequence[RayPlane], cameras: Sequence[CalibrationPoints]) -> list[RayPlane]:
         """Fit one model for each camera; points that several cameras measured tie the models together."""
-        for model, bearings in zip(models, fit_bearings(cameras), strict=True):
+        for model, camera_rays in zip(models, fit_rays(cameras), strict=True):
             model.n_features_in_ = 4
-            model.rotation_, model.origin_ = bearings.rotation, bearings.origin_m
-            model.lens_ = bearings.lens
+            model.rotation_, model.origin_ = camera_rays.rotation, camera_rays.origin_m
+            model.lens_ = camera_rays.lens
         return list(models)
 
     def predict(self, X: Any) -> Array:
@@ -57,7 +59,7 @@ class RayPlane(RegressorMixin, BaseEstimator):  # type: ignore[misc]
 
     def predict_array(self, X: Array) -> Array:
         rays = directions(X[:, :3], self.lens_) @ self.rotation_.T
-        return meet_height(self.origin_, rays, X[:, 3])
+        return intersect_height(self.origin_, rays, X[:, 3])
 
 
 # Prior standard deviation of the terms of the depth correction.
@@ -145,23 +147,27 @@ class RayDepth(RegressorMixin, BaseEstimator):  # type: ignore[misc]
         X, y = validate_data(self, X, y, multi_output=True, dtype=np.float64)
         if X.shape[1] != 3 or y.shape != X.shape:
             raise FitError(f"best maps (n, 3) to (n, 3), found {X.shape} and {y.shape}")
-        return self.fit_jointly([self], [Places(X, y, tuple(map(str, range(len(X)))))])[0]
+        return self.fit_jointly([self], [CalibrationPoints(X, y, tuple(map(str, range(len(X)))))])[0]
 
     @staticmethod
-    def fit_jointly(models: Sequence[RayDepth], cameras: Sequence[Places]) -> list[RayDepth]:
+    def fit_jointly(models: Sequence[RayDepth], cameras: Sequence[CalibrationPoints]) -> list[RayDepth]:
         """Fit one model for each camera; points that several cameras measured tie the models together."""
-        for model, places, bearings in zip(models, cameras, fit_bearings(cameras), strict=True):
-            model._fit_depths(places, bearings)
+        for model, places, camera_rays in zip(models, cameras, fit_rays(cameras), strict=True):
+            model._fit_depths(places, camera_rays)
         return list(models)
 
-    def _fit_depths(self, places: Places, bearings: Bearings) -> None:
+    def _fit_depths(self, places: CalibrationPoints, camera_rays: CameraRays) -> None:
         self.n_features_in_ = 3
-        self.rotation_, self.origin_, self.lens_ = bearings.rotation, bearings.origin_m, bearings.lens
+        self.rotation_, self.origin_, self.lens_ = (
+            camera_rays.rotation,
+            camera_rays.origin_m,
+            camera_rays.lens,
+        )
         points_m, world_m = places.points_m, places.world_m
-        depths_m = (world_m - bearings.origin_m) @ bearings.rotation[:, 2]
+        depths_m = (world_m - camera_rays.origin_m) @ camera_rays.rotation[:, 2]
         self.depth_, left_out = fit_depths(points_m, depths_m / points_m[:, 2] - 1)
         _, growth = depth_terms(points_m)
-        falls = (directions(points_m, bearings.lens) @ bearings.rotation.T)[:, 2]
+        falls = (directions(points_m, camera_rays.lens) @ camera_rays.rotation.T)[:, 2]
         noise_m2 = np.mean((left_out * points_m[:, 2] * falls / growth) ** 2) + _LEAST_NOISE**2
         self.heights_ = np.array([world_m[:, 2].mean(), world_m[:, 2].var(), noise_m2])
 
@@ -175,4 +181,4 @@ class RayDepth(RegressorMixin, BaseEstimator):  # type: ignore[misc]
         heights_m = self.origin_[2] + X[:, 2] * (1 + terms @ self.depth_) * rays[:, 2]
         mean_m, spread_m2, noise_m2 = self.heights_
         trust = spread_m2 / (spread_m2 + noise_m2 * growth**2)
-        return meet_height(self.origin_, rays, mean_m + trust * (heights_m - mean_m))
+        return intersect_height(self.origin_, rays, mean_m + trust * (heights_m - mean_m))

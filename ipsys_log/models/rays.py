@@ -15,10 +15,10 @@ from scipy.optimize import least_squares
 from scipy.spatial.transform import Rotation
 
 from ipsys_log.errors import FitError
-from ipsys_log.geometry.lenses import meet_height
+from ipsys_log.geometry.lenses import intersect_height
 from ipsys_log.models.rigid import rigid_transform
 
-__all__ = ["Bearings", "Places", "directions", "fit_bearings", "tied"]
+__all__ = ["CalibrationPoints", "CameraRays", "directions", "fit_rays", "group_cameras"]
 
 Array = NDArray[np.float64]
 
@@ -33,7 +33,7 @@ _TAPE_SHARE = 0.5
 
 
 @dataclass(frozen=True, slots=True, eq=False)
-class Bearings:
+class CameraRays:
     """A camera's ``rotation`` (3, 3) and ``origin_m`` (3,) in the world, and its correction ``lens`` (3,)."""
 
     rotation: Array
@@ -42,7 +42,7 @@ class Bearings:
 
 
 @dataclass(frozen=True, slots=True, eq=False)
-class Places:
+class CalibrationPoints:
     """Calibration points that one camera measured.
 
     ``points_m`` (n, 3) are in camera coordinates, ``world_m`` (n, 3) in world coordinates. ``names`` identify
@@ -78,7 +78,7 @@ def _lens_terms(u: Array, v: Array) -> Array:
     return np.stack([along_u, along_v], axis=1)
 
 
-def fit_bearings(cameras: Sequence[Places]) -> list[Bearings]:
+def fit_rays(cameras: Sequence[CalibrationPoints]) -> list[CameraRays]:
     """Estimate pose and lens correction of each camera, from calibration points of known height.
 
     The fit minimises the errors on the floor with a soft-L1 loss and starts from the rigid transformation.
@@ -90,14 +90,14 @@ def fit_bearings(cameras: Sequence[Places]) -> list[Bearings]:
     FitError
         A camera has fewer than three calibration points, or they are on a line.
     """
-    fitted: list[Bearings | None] = [None] * len(cameras)
-    for group in tied(cameras):
-        for index, bearings in zip(group, _fit_tied([cameras[i] for i in group]), strict=True):
-            fitted[index] = bearings
-    return [bearings for bearings in fitted if bearings is not None]
+    fitted: list[CameraRays | None] = [None] * len(cameras)
+    for group in group_cameras(cameras):
+        for index, camera_rays in zip(group, _fit_group([cameras[i] for i in group]), strict=True):
+            fitted[index] = camera_rays
+    return [camera_rays for camera_rays in fitted if camera_rays is not None]
 
 
-def tied(cameras: Sequence[Places]) -> list[list[int]]:
+def group_cameras(cameras: Sequence[CalibrationPoints]) -> list[list[int]]:
     """Return groups of cameras that share calibration points, directly or through other cameras."""
     groups: list[tuple[list[int], set[str]]] = []
     for index, places in enumerate(cameras):
@@ -109,27 +109,27 @@ def tied(cameras: Sequence[Places]) -> list[list[int]]:
     return [indices for indices, _ in groups]
 
 
-def _fit_tied(cameras: Sequence[Places]) -> list[Bearings]:
+def _fit_group(cameras: Sequence[CalibrationPoints]) -> list[CameraRays]:
     starts = [rigid_transform(places.points_m, places.world_m) for places in cameras]
     weights = _weights([name for places in cameras for name in places.names])
     first = np.concatenate([np.concatenate([np.zeros(3), t, np.zeros(3)]) for _, t in starts])
     ends = np.cumsum([0, *(len(places.names) for places in cameras)])
 
-    def bearings(values: Array) -> list[Bearings]:
+    def camera_rays(values: Array) -> list[CameraRays]:
         return [
-            Bearings(Rotation.from_rotvec(v[:3]).as_matrix() @ start, v[3:6], v[6:])
+            CameraRays(Rotation.from_rotvec(v[:3]).as_matrix() @ start, v[3:6], v[6:])
             for v, (start, _) in zip(values.reshape(-1, 9), starts, strict=True)
         ]
 
     def residuals(values: Array) -> Array:
-        offsets = [_offsets(p, b) for p, b in zip(cameras, bearings(values), strict=True)]
+        offsets = [_offsets(p, b) for p, b in zip(cameras, camera_rays(values), strict=True)]
         pulls = values.reshape(-1, 9)[:, 6:] * _LENS_PULL_M
         return np.concatenate([(weights @ np.vstack(offsets)).reshape(-1), pulls.reshape(-1)])
 
     def jacobian(values: Array) -> Array:
         rows = np.zeros((ends[-1], 2, len(values)))
         pulls = np.zeros((3 * len(cameras), len(values)))
-        for n, (places, b) in enumerate(zip(cameras, bearings(values), strict=True)):
+        for n, (places, b) in enumerate(zip(cameras, camera_rays(values), strict=True)):
             rows[ends[n] : ends[n + 1], :, 9 * n : 9 * n + 9] = _slopes(places, b, values[9 * n : 9 * n + 3])
             pulls[3 * n : 3 * n + 3, 9 * n + 6 : 9 * n + 9] = _LENS_PULL_M * np.eye(3)
         return np.vstack([np.tensordot(weights, rows, axes=1).reshape(-1, len(values)), pulls])
@@ -141,27 +141,27 @@ def _fit_tied(cameras: Sequence[Places]) -> list[Bearings]:
         raise FitError(
             "the rays of the camera do not fit the measured places; check the heights of the places"
         )
-    return bearings(solved.x)
+    return camera_rays(solved.x)
 
 
-def _offsets(places: Places, bearings: Bearings) -> Array:
+def _offsets(places: CalibrationPoints, camera_rays: CameraRays) -> Array:
     """Return errors on the floor at the known heights, (n, 2) in m."""
-    rays = directions(places.points_m, bearings.lens) @ bearings.rotation.T
-    return (meet_height(bearings.origin_m, rays, places.world_m[:, 2]) - places.world_m)[:, :2]
+    rays = directions(places.points_m, camera_rays.lens) @ camera_rays.rotation.T
+    return (intersect_height(camera_rays.origin_m, rays, places.world_m[:, 2]) - places.world_m)[:, :2]
 
 
-def _slopes(places: Places, bearings: Bearings, turn: Array) -> Array:
+def _slopes(places: CalibrationPoints, camera_rays: CameraRays, turn: Array) -> Array:
     """Return the derivative of :func:`_offsets` by rotation vector, origin and lens, (n, 2, 9)."""
     points_m = places.points_m
-    rays = directions(points_m, bearings.lens) @ bearings.rotation.T
-    along = (places.world_m[:, 2] - bearings.origin_m[2]) / rays[:, 2]
+    rays = directions(points_m, camera_rays.lens) @ camera_rays.rotation.T
+    along = (places.world_m[:, 2] - camera_rays.origin_m[2]) / rays[:, 2]
     on_plane = np.zeros((len(rays), 2, 3))  # derivative of the point by the origin
     on_plane[:, 0, 0] = on_plane[:, 1, 1] = 1.0
     on_plane[:, :, 2] = -rays[:, :2] / rays[:, 2:]
     by_ray = along[:, None, None] * on_plane
     by_turn = -by_ray @ _cross(rays) @ _left_jacobian(turn)
     u, v = points_m[:, 0] / points_m[:, 2], points_m[:, 1] / points_m[:, 2]
-    by_lens = by_ray @ bearings.rotation[:, :2] @ _lens_terms(u, v)
+    by_lens = by_ray @ camera_rays.rotation[:, :2] @ _lens_terms(u, v)
     return np.concatenate([by_turn, on_plane, by_lens], axis=2)
 
 

@@ -19,7 +19,7 @@ from ipsys_log.models.ann import NeuralNetwork
 from ipsys_log.models.kriging import Kriging
 from ipsys_log.models.poly import PolynomialRegression
 from ipsys_log.models.ray_models import RayDepth, RayPlane
-from ipsys_log.models.rays import Places, tied
+from ipsys_log.models.rays import CalibrationPoints, group_cameras
 from ipsys_log.models.rigid import RigidTransform
 from ipsys_log.models.uncertainty import Uncertainty, Volume
 
@@ -27,16 +27,16 @@ __all__ = [
     "MODELS",
     "MODEL_VERSIONS",
     "AppliedModel",
-    "Places",
+    "CalibrationPoints",
     "create",
     "fit_cameras",
+    "group_dependent_cameras",
     "inputs",
     "min_pairs",
     "parameters",
     "predict_array",
     "reads_height",
     "restore",
-    "tied_cameras",
 ]
 
 # First the models of the paper in the order of its tables: RT, PR, RT+PR, ANN, RT+ANN, KI, RT+KI, KR, RT+KR.
@@ -111,7 +111,7 @@ def predict_array(estimator: Any, points: NDArray[np.float64]) -> NDArray[np.flo
     return points
 
 
-def fit_cameras(name: str, cameras: Mapping[str, Places]) -> dict[str, Any]:
+def fit_cameras(name: str, cameras: Mapping[str, CalibrationPoints]) -> dict[str, Any]:
     """Fit an estimator for each camera to the calibration points that the camera measured.
 
     The fit of physical models uses all cameras at once: points that two cameras measured tie them together.
@@ -132,12 +132,12 @@ def fit_cameras(name: str, cameras: Mapping[str, Places]) -> dict[str, Any]:
     return models
 
 
-def tied_cameras(name: str, cameras: Mapping[str, Places]) -> list[list[str]]:
+def group_dependent_cameras(name: str, cameras: Mapping[str, CalibrationPoints]) -> list[list[str]]:
     """Return groups of cameras whose models depend on common calibration points."""
     names = list(cameras)
     if not hasattr(MODELS[name], "fit_jointly"):
         return [[camera] for camera in names]
-    return [[names[i] for i in group] for group in tied(list(cameras.values()))]
+    return [[names[i] for i in group] for group in group_cameras(list(cameras.values()))]
 
 
 def parameters(estimator: Any) -> dict[str, NDArray[np.float64]]:

@@ -23,7 +23,7 @@ from ipsys_log.report.advice import Advice, Choice, advise
 from ipsys_log.runs.provenance import Outcome
 from ipsys_log.units import CM_PER_M
 
-__all__ = ["Accuracy", "accuracy_json", "gather_suspects", "read_accuracy"]
+__all__ = ["Accuracy", "accuracy_json", "gather_outliers", "read_accuracy"]
 
 
 @dataclass(frozen=True, slots=True)
@@ -60,7 +60,7 @@ def read_accuracy(session: Session, outcomes: Sequence[Outcome]) -> list[Accurac
             tracks = track_errors(
                 gather_tracks(session.messages(session.topics(TRACKS, fused))),
                 gather_tracks(session.messages([TRUTH_TOPIC])),
-                carried=_told_heights(session, fused),
+                at_track_height=_uses_heights(session, fused),
             )
         if evaluations or tracks is not None:
             accuracies.append(Accuracy(run, evaluations[-1] if evaluations else None, tracks))
@@ -83,7 +83,7 @@ def _run_pairs(outcomes: Sequence[Outcome]) -> list[tuple[str, str]]:
     return pairs
 
 
-def _told_heights(session: Session, run: str) -> bool:
+def _uses_heights(session: Session, run: str) -> bool:
     models = session.payloads(session.topics(MODEL, run))
     return bool(models) and models[-1].name in MODELS and reads_height(models[-1].name)
 
@@ -202,7 +202,7 @@ def _suspect_json(suspect: Suspect) -> dict[str, Any]:
     return summary
 
 
-def gather_suspects(accuracies: Sequence[Accuracy]) -> list[tuple[Suspect, list[str]]]:
+def gather_outliers(accuracies: Sequence[Accuracy]) -> list[tuple[Suspect, list[str]]]:
     """Return each outlier, from the last model that names it, with the names of all models that do.
 
     The outlier with the largest residual is first.

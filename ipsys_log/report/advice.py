@@ -32,12 +32,12 @@ from ipsys_log.models.table import MODELS, reads_height
 from ipsys_log.units import CM_PER_M
 
 __all__ = [
-    "ANY",
+    "ALL_MODELS",
     "GROUPS",
+    "HEIGHT_KNOWN",
+    "HEIGHT_NOTE",
     "PAPER",
     "SIMPLE",
-    "TOLD",
-    "TOLD_NOTE",
     "Advice",
     "Choice",
     "Curve",
@@ -47,7 +47,7 @@ __all__ = [
     "has_published",
     "label",
     "mean_curve",
-    "told_height",
+    "uses_height",
 ]
 
 
@@ -120,14 +120,14 @@ _SIMPLE_FIRST = (
 # The paper recommends one of these two, by the number of points.
 _SIMPLE = ("rigid", "poly")
 _OWN = ("rayplane", "best")
-SIMPLE, PAPER, ANY, TOLD = "simple", "paper", "any", "height_known"
+SIMPLE, PAPER, ALL_MODELS, HEIGHT_KNOWN = "simple", "paper", "any", "height_known"
 GROUPS = {
     SIMPLE: "rigid or poly",
     PAPER: "the paper's methods",
-    ANY: "all methods",
-    TOLD: "all, heights known",
+    ALL_MODELS: "all methods",
+    HEIGHT_KNOWN: "all, heights known",
 }
-TOLD_NOTE = "* is told the height of each marker"
+HEIGHT_NOTE = "* is told the height of each marker"
 _CONFIDENCE = 1.96
 
 
@@ -181,14 +181,14 @@ class _Candidate:
         return bool(self.mean_m - other.mean_m <= _CONFIDENCE * np.hypot(self.noise_m, other.noise_m))
 
 
-def told_height(model: str) -> bool:
+def uses_height(model: str) -> bool:
     """Return whether a model gets the height of a marker as input; then its 3D error is a 2D error."""
     return model in MODELS and reads_height(model)
 
 
 def label(model: str) -> str:
-    """Return the name of a model, with the mark of :data:`TOLD_NOTE` if the model gets heights as input."""
-    return f"{model}*" if told_height(model) else model
+    """Return the name of a model, with the mark of :data:`HEIGHT_NOTE` if the model gets heights as input."""
+    return f"{model}*" if uses_height(model) else model
 
 
 def advise(evaluations: Sequence[Evaluation]) -> Advice | None:
@@ -227,8 +227,8 @@ def _choices(candidates: Sequence[_Candidate]) -> dict[str, Choice]:
     groups = {
         SIMPLE: [c for c in candidates if c.model in _SIMPLE],
         PAPER: [c for c in candidates if c.model not in _OWN],
-        ANY: [c for c in candidates if not told_height(c.model)],
-        TOLD: candidates if any(told_height(c.model) for c in candidates) else [],
+        ALL_MODELS: [c for c in candidates if not uses_height(c.model)],
+        HEIGHT_KNOWN: candidates if any(uses_height(c.model) for c in candidates) else [],
     }
     return {group: _choose(members) for group, members in groups.items() if members}
 
@@ -257,12 +257,15 @@ def _sentences(
         )
         return
     simple = {c.model for row in table.values() for c in row if c.model in _SIMPLE}
-    group, use = (SIMPLE, "Between rigid and poly, use") if len(simple) > 1 else (ANY, "Use")
+    group, use = (SIMPLE, "Between rigid and poly, use") if len(simple) > 1 else (ALL_MODELS, "Use")
     by_places = {places: row[group].model for places, row in choices.items() if group in row}
     if by_places:
         yield f"{use} {_by_number(by_places)}."
     most = max(choices)
-    for other, start in ((ANY, "The"), (TOLD, "Where the heights of the markers are known, the")):
+    for other, start in (
+        (ALL_MODELS, "The"),
+        (HEIGHT_KNOWN, "Where the heights of the markers are known, the"),
+    ):
         if SIMPLE in choices[most] and other in choices[most]:
             yield from _saving(start, choices[most][other].model, choices[most][SIMPLE], most, table)
 

@@ -10,9 +10,9 @@ import numpy as np
 
 from ipsys_log.analysis.alignment import Alignment, align_camera, join_cameras
 from ipsys_log.analysis.calibration_points import find_pairs, measured
-from ipsys_log.analysis.coverage import Coverage, Hung, Overlap, cover_floor, find_overlaps
-from ipsys_log.analysis.pairs import Measured
-from ipsys_log.analysis.stationary import find_lying
+from ipsys_log.analysis.coverage import Coverage, MountedCamera, Overlap, cover_floor, find_overlaps
+from ipsys_log.analysis.pairs import RiggedMeasurement
+from ipsys_log.analysis.stationary import find_stationary
 from ipsys_log.errors import IpsysError
 from ipsys_log.geometry.lenses import undistort
 from ipsys_log.geometry.poses import invert_pose, make_pose
@@ -46,7 +46,7 @@ class AlignedLab:
     rig : rig in force.
     alignments : one alignment per camera, sorted by name.
     lenses : known intrinsics, by camera.
-    hung : cameras with a known pose in the world.
+    mounted_cameras : cameras with a known pose in the world.
     coverage : coverage of the floor; None if the cameras or the floor are not known.
     overlaps : overlaps of neighbouring cameras, also without a coverage.
     diagonal_m : diagonal of a marker, the overlap that it needs.
@@ -57,7 +57,7 @@ class AlignedLab:
     rig: Rig
     alignments: tuple[Alignment, ...]
     lenses: Lenses
-    hung: tuple[Hung, ...]
+    mounted_cameras: tuple[MountedCamera, ...]
     coverage: Coverage | None
     overlaps: tuple[Overlap, ...]
     diagonal_m: float
@@ -79,7 +79,7 @@ def read_alignment(session: Session, run: str, rig: Rig, lenses: Lenses) -> Alig
     for message in session.messages(session.topics(CAMERA_POINTS, run)):
         frames.setdefault(str(message.camera), []).append(message.payload)
     alignments = tuple(
-        align_camera(camera, find_lying(seen, measurements)) for camera, seen in sorted(frames.items())
+        align_camera(camera, find_stationary(seen, measurements)) for camera, seen in sorted(frames.items())
     )
     notes += [note for alignment in alignments for note in _notes(alignment, lenses.get(alignment.camera))]
     if any(point.poses == () for seen in frames.values() for frame in seen for point in frame.points):
@@ -87,24 +87,24 @@ def read_alignment(session: Session, run: str, rig: Rig, lenses: Lenses) -> Alig
             "these camera points are by eq. (3), which overstates a tilt by half: go two thirds of the way, "
             "or begin with frames"
         )
-    hung = tuple(_hang(alignments, pairs, lenses, notes))
+    mounted = tuple(_mount(alignments, pairs, lenses, notes))
     length_m, height_m = _marker(rig)
-    coverage = _cover(rig, hung, length_m, height_m, notes)
+    coverage = _cover(rig, mounted, length_m, height_m, notes)
     if coverage is not None:
         overlaps = coverage.overlaps
     else:
         # There are no tape measurements, or the rig has no floor.
-        near = hung if len(hung) > 1 else join_cameras(alignments, lenses)
+        near = mounted if len(mounted) > 1 else join_cameras(alignments, lenses)
         overlaps = find_overlaps(near, height_m) if near else ()
     diagonal_m = length_m * math.sqrt(2)
-    return AlignedLab(run, rig, alignments, lenses, hung, coverage, overlaps, diagonal_m, tuple(notes))
+    return AlignedLab(run, rig, alignments, lenses, mounted, coverage, overlaps, diagonal_m, tuple(notes))
 
 
 def _measured(
     session: Session, run: str, rig: Rig, notes: list[str]
 ) -> tuple[list[Measurement], Mapping[str, Sequence[Pair]]]:
     """Return the measurements and their pairs by camera; without measurements, the newest model's pairs."""
-    places: list[Measured] = []
+    places: list[RiggedMeasurement] = []
     try:
         view = LogView(session, {CAMERA_POINTS: run}, rig)
         places = measured(view)
@@ -124,8 +124,8 @@ def _measured(
 def _notes(alignment: Alignment, lens: CameraCalibration | None) -> Iterator[str]:
     name = f"camera {alignment.camera}"
     heights_m: dict[int, list[float]] = {}
-    for lying, above_m in alignment.raised:
-        heights_m.setdefault(lying.marker_id, []).append(above_m)
+    for marker, above_m in alignment.raised_markers:
+        heights_m.setdefault(marker.marker_id, []).append(above_m)
     for marker_id, all_m in heights_m.items():
         mean_cm = float(np.mean(all_m)) * CM_PER_M
         position = f"{abs(mean_cm):.0f} cm {'above' if mean_cm > 0 else 'below'} the plane of the others"
@@ -147,13 +147,13 @@ def _part_of_picture(alignment: Alignment, lens: CameraCalibration) -> float:
     middle, end = lens.K[:2, 2], np.array([lens.width - 1.0, lens.height - 1.0])
     edges = np.array([[0, middle[1]], [end[0], middle[1]], [middle[0], 0], [middle[0], end[1]]])
     (left, right, top, bottom) = undistort(edges, lens)
-    uv = np.array([marker.point_m[:2] / marker.point_m[2] for marker in alignment.lying])
+    uv = np.array([marker.point_m[:2] / marker.point_m[2] for marker in alignment.floor_markers])
     return float(np.nanmax(np.ptp(uv, axis=0) / np.array([right[0] - left[0], bottom[1] - top[1]])))
 
 
-def _hang(
+def _mount(
     alignments: Sequence[Alignment], pairs: Mapping[str, Sequence[Pair]], lenses: Lenses, notes: list[str]
-) -> Iterator[Hung]:
+) -> Iterator[MountedCamera]:
     """Yield the cameras with a pose in the world that follows from calibration points."""
     for alignment in alignments:
         camera, camera_pairs = alignment.camera, pairs.get(alignment.camera, ())
@@ -182,7 +182,7 @@ def _hang(
                 f"camera {camera} hangs otherwise than when its places were measured: what it sees of the "
                 "floor is as it was then"
             )
-        yield Hung(camera, lenses[camera], invert_pose(make_pose(axes, origin_m)))
+        yield MountedCamera(camera, lenses[camera], invert_pose(make_pose(axes, origin_m)))
 
 
 def _marker(rig: Rig) -> tuple[float, float]:
@@ -194,9 +194,9 @@ def _marker(rig: Rig) -> tuple[float, float]:
 
 
 def _cover(
-    rig: Rig, hung: Sequence[Hung], length_m: float, height_m: float, notes: list[str]
+    rig: Rig, mounted: Sequence[MountedCamera], length_m: float, height_m: float, notes: list[str]
 ) -> Coverage | None:
-    if not hung:
+    if not mounted:
         notes.append(
             "what is seen of the whole floor needs at least three measured places in the view of each "
             "camera, not on a line: measure some (ipsys measure), and align that log (ipsys align LOG)"
@@ -208,4 +208,4 @@ def _cover(
             "with --rig"
         )
         return None
-    return cover_floor(rig.floor, hung, length_m, height_m)
+    return cover_floor(rig.floor, mounted, length_m, height_m)

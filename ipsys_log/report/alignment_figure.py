@@ -17,7 +17,7 @@ from ipsys_log.analysis.coverage import Coverage
 from ipsys_log.geometry.lenses import project
 from ipsys_log.messages import CameraCalibration
 from ipsys_log.report.alignment import AlignedLab
-from ipsys_log.report.figures import NOTE, REST, camera_styles, picture, shorten
+from ipsys_log.report.figures import NOTE, REST, camera_styles, figure_bytes, shorten
 from ipsys_log.report.files import write_files
 from ipsys_log.report.floor_figure import draw_ground
 from ipsys_log.units import CM_PER_M
@@ -65,7 +65,7 @@ def draw_alignment(lab: AlignedLab, path: Path) -> None:
         height_in = _PANEL_IN * 9 / 16
         box = (x_in / size[0], y_in / size[1], _PANEL_IN / size[0], height_in / size[1])
         _draw_picture(figure.add_axes(box), alignment, lab.lenses)
-    write_files(path.parent, {path.name: picture(figure, path, _DPI)})
+    write_files(path.parent, {path.name: figure_bytes(figure, path, _DPI)})
 
 
 def _draw_floor(axes: Axes, lab: AlignedLab, coverage: Coverage) -> None:
@@ -83,8 +83,8 @@ def _draw_floor(axes: Axes, lab: AlignedLab, coverage: Coverage) -> None:
     axes.imshow(shown, cmap=shades, vmin=0, vmax=2, origin="lower", extent=frame, zorder=0.5)
     for colour, text in ((_ONE, "whole in one picture"), (_MORE, "in two or more"), (_NONE, "in none")):
         axes.plot([], [], "s", ms=9, mfc=colour, mec=REST, label=text)
-    styles = camera_styles(hung.camera for hung in lab.hung)
-    for hung in lab.hung:
+    styles = camera_styles(hung.camera for hung in lab.mounted_cameras)
+    for hung in lab.mounted_cameras:
         colour, shape = styles[hung.camera]
         # The area outside of the floor has no data, so the edge of the floor closes the outline.
         seen = np.pad(coverage.whole[hung.camera].astype(float), 1)
@@ -118,13 +118,13 @@ def _draw_picture(axes: Axes, one: Alignment, lenses: Mapping[str, CameraCalibra
     axes.set(xlim=(0, lens.width), ylim=(lens.height, 0), aspect="equal")
     # The principal point: the optical axis has to be vertical on the floor.
     axes.plot(*lens.K[:2, 2], "+", color=REST, ms=12, zorder=1)
-    if one.lying:
+    if one.floor_markers:
         _draw_depths(axes, one, lens)
-    for lying, _ in one.raised:
-        x, y = project(lying.point_m[None], lens)[0]
+    for marker, _ in one.raised_markers:
+        x, y = project(marker.point_m[None], lens)[0]
         axes.plot(x, y, "x", color=NOTE, ms=6, zorder=3)
         axes.annotate(
-            f"{lying.marker_id} left out", (x, y), (7, 0), textcoords="offset points", va="center",
+            f"{marker.marker_id} left out", (x, y), (7, 0), textcoords="offset points", va="center",
             fontsize=8, color=NOTE,
         )  # fmt: skip
     if one.level is False and one.down is not None:
@@ -132,17 +132,17 @@ def _draw_picture(axes: Axes, one: Alignment, lenses: Mapping[str, CameraCalibra
 
 
 def _draw_depths(axes: Axes, one: Alignment, lens: CameraCalibration) -> None:
-    points_m = np.array([lying.point_m for lying in one.lying])
-    depths_m = points_m[:, 2] + np.array([lying.height_m for lying in one.lying])
+    points_m = np.array([marker.point_m for marker in one.floor_markers])
+    depths_m = points_m[:, 2] + np.array([marker.height_m for marker in one.floor_markers])
     off_cm = ((depths_m - np.median(depths_m)) * CM_PER_M).round(1) + 0.0  # no -0.0
     few = len(off_cm) <= 12
-    for (x, y), cm, lying in zip(project(points_m, lens), off_cm, one.lying, strict=True):
+    for (x, y), cm, marker in zip(project(points_m, lens), off_cm, one.floor_markers, strict=True):
         colour = REST if abs(cm) < 0.5 else _FAR if cm > 0 else _NEAR
         axes.plot(x, y, "o", color=colour, ms=5 if few else min(9, 2 + 0.7 * abs(cm)), alpha=0.9, zorder=2)
         if few:
             up = y > lens.height / 2
             axes.annotate(
-                f"{lying.marker_id}: {cm:+.1f}", (x, y), (0, 6 if up else -6), textcoords="offset points",
+                f"{marker.marker_id}: {cm:+.1f}", (x, y), (0, 6 if up else -6), textcoords="offset points",
                 ha="center", va="bottom" if up else "top", fontsize=8, color=NOTE, annotation_clip=False,
             )  # fmt: skip
     axes.annotate(

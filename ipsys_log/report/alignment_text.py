@@ -31,9 +31,9 @@ def advise(alignment: Alignment) -> str:
     >>> advise(Alignment("red", ()))[:32]
     'lay four or more markers on the '
     """
-    if len(alignment.lying) < 2:
+    if len(alignment.floor_markers) < 2:
         count, reason = (
-            ("three", "one says nothing") if alignment.lying else ("four", "none lies still there")
+            ("three", "one says nothing") if alignment.floor_markers else ("four", "none lies still there")
         )
         return f"lay {count} or more markers on the floor, out to the edges of its picture: {reason}"
     if alignment.axes == 0:
@@ -45,9 +45,9 @@ def advise(alignment: Alignment) -> str:
     if alignment.level:
         return f"nothing: it is level, the spread is under {_LEVEL_CM}"
     turns = _turns(alignment)
-    if alignment.left_m is not None and alignment.left_m >= LEVEL_M:
+    if alignment.remaining_m is not None and alignment.remaining_m >= LEVEL_M:
         text = (
-            f"{turns}, but that leaves {alignment.left_m * CM_PER_M:.1f} cm"
+            f"{turns}, but that leaves {alignment.remaining_m * CM_PER_M:.1f} cm"
             if turns
             else "no tilt mends this"
         )
@@ -86,8 +86,8 @@ def alignment_table(lab: AlignedLab) -> Table:
     for alignment in lab.alignments:
         colour = {None: "", True: _GOOD, False: _BAD}[alignment.level]
         spread = "-" if alignment.spread_m is None else f"{alignment.spread_m * CM_PER_M:.1f}"
-        total = len(alignment.lying) + len(alignment.raised)
-        count = f"{len(alignment.lying)} of {total}" if alignment.raised else str(total)
+        total = len(alignment.floor_markers) + len(alignment.raised_markers)
+        count = f"{len(alignment.floor_markers)} of {total}" if alignment.raised_markers else str(total)
         # As Text: rich must not read names from a log as its markup.
         table.add_row(
             Text(alignment.camera),
@@ -122,7 +122,7 @@ def _floor_lines(coverage: Coverage) -> list[tuple[str, bool]]:
     return [
         _patch_line(coverage.unseen, floor_m2, "every part of the floor is in a picture", "in no picture"),
         _patch_line(
-            coverage.broken, floor_m2, f"{size} is whole in a picture wherever it lies",
+            coverage.gaps, floor_m2, f"{size} is whole in a picture wherever it lies",
             f"{size} is whole in no picture with its middle on",
         ),
     ]  # fmt: skip
@@ -181,11 +181,13 @@ def _camera_json(one: Alignment) -> dict[str, Any]:
     is_known = one.down is not None
     return {
         "camera": one.camera,
-        "places": len(one.lying),
-        "markers": sorted({lying.marker_id for lying in one.lying}),
-        "raised": [{"marker": lying.marker_id, "above_cm": m * CM_PER_M} for lying, m in one.raised],
+        "places": len(one.floor_markers),
+        "markers": sorted({marker.marker_id for marker in one.floor_markers}),
+        "raised": [
+            {"marker": marker.marker_id, "above_cm": m * CM_PER_M} for marker, m in one.raised_markers
+        ],
         "spread_cm": _scaled(one.spread_m, CM_PER_M),
-        "spread_after_cm": _scaled(one.left_m, CM_PER_M),
+        "spread_after_cm": _scaled(one.remaining_m, CM_PER_M),
         "level": one.level,
         "tilt_deg": _scaled(one.tilt_rad, math.degrees(1)),
         "tilt_sigma_deg": _scaled(one.sigma_rad, math.degrees(1)),
@@ -205,7 +207,7 @@ def _coverage_json(coverage: Coverage) -> dict[str, Any]:
     return {
         "marker_height_m": coverage.height_m,
         "unseen": [_patch_json(patch) for patch in coverage.unseen],
-        "whole_in_no_picture": [_patch_json(patch) for patch in coverage.broken],
+        "whole_in_no_picture": [_patch_json(patch) for patch in coverage.gaps],
     }
 
 

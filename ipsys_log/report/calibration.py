@@ -15,9 +15,9 @@ from matplotlib.colors import ListedColormap
 from matplotlib.figure import Figure
 from rich.table import Table
 
-from ipsys_log.calibration.calibrate import Calibrated
-from ipsys_log.calibration.image_selection import Dropped
-from ipsys_log.report.figures import NOTE, REST, shorten, strip
+from ipsys_log.calibration.calibrate import CalibrationResult
+from ipsys_log.calibration.image_selection import ExcludedSighting
+from ipsys_log.report.figures import NOTE, REST, shorten, style_axes
 
 __all__ = ["calibration_figure", "calibration_json", "calibration_lines", "calibration_table"]
 
@@ -29,7 +29,7 @@ _FACTORS = (1, 2, 5, 10, 20, 50, 100, 200, 500, 1000)
 _MOST_NAMED = 30
 
 
-def calibration_figure(found: Sequence[Calibrated]) -> Figure:
+def calibration_figure(found: Sequence[CalibrationResult]) -> Figure:
     """Return a figure with a row per camera: residuals in the image, as a scatter plot, and by image."""
     figure = Figure(figsize=(13.5, 4.4 * len(found)), layout="constrained")
     rows = figure.subplots(len(found), 3, squeeze=False, width_ratios=(1.5, 1.0, 1.2))
@@ -40,7 +40,7 @@ def calibration_figure(found: Sequence[Calibrated]) -> Figure:
     return figure
 
 
-def _draw_image(axes: Axes, found: Calibrated) -> None:
+def _draw_image(axes: Axes, found: CalibrationResult) -> None:
     """Draw every detected corner, with an arrow to its projection by the fitted intrinsics."""
     width, height = found.lens.width, found.lens.height
     lengths = np.linalg.norm(found.residuals_px, axis=1)
@@ -68,7 +68,7 @@ def _draw_image(axes: Axes, found: Calibrated) -> None:
     axes.figure.colorbar(arrows, ax=axes, shrink=0.8, pad=0.02, extend="max", label="error in px")
 
 
-def _draw_cloud(axes: Axes, found: Calibrated) -> None:
+def _draw_cloud(axes: Axes, found: CalibrationResult) -> None:
     lengths = np.linalg.norm(found.residuals_px, axis=1)
     reach = 1.15 * max(float(np.quantile(lengths, 0.99)), 2 * found.rms_px)
     inside = lengths <= reach
@@ -87,10 +87,10 @@ def _draw_cloud(axes: Axes, found: Calibrated) -> None:
     outside = int((~inside).sum())
     title = f"RMS {found.rms_px:.3f} px (circle), median {found.median_px:.3f}"
     axes.set_title(title + (f"\n{outside} farther out" if outside else "\n"), loc="left", fontsize=10)
-    strip(axes)
+    style_axes(axes)
 
 
-def _draw_pictures(axes: Axes, found: Calibrated) -> None:
+def _draw_pictures(axes: Axes, found: CalibrationResult) -> None:
     """Draw the RMS of each image, the largest on top."""
     ranked = sorted(found.used, key=lambda used: used[1])[-_MOST_NAMED:]
     positions = np.arange(len(ranked))
@@ -99,14 +99,16 @@ def _draw_pictures(axes: Axes, found: Calibrated) -> None:
     axes.set_yticks(positions, [shorten(name) for name, _ in ranked], fontsize=size)
     axes.set(ylim=(-0.7, len(ranked) - 0.3), xlabel="RMS of a picture in px")
     suffix = f", the worst {len(ranked)}" if len(ranked) < len(found.used) else ""
-    axes.set_title(f"{len(found.used)} pictures used of {found.looked}{suffix}\n", loc="left", fontsize=10)
-    strip(axes, "x")
+    axes.set_title(
+        f"{len(found.used)} pictures used of {found.examined_count}{suffix}\n", loc="left", fontsize=10
+    )
+    style_axes(axes, "x")
 
 
 _SHOWN_DROPPED = 6
 
 
-def calibration_table(found: Calibrated) -> Table:
+def calibration_table(found: CalibrationResult) -> Table:
     """Return a table of the intrinsics with their standard deviations."""
     title = f"{found.camera}: {found.lens.distortion_model}, {found.lens.width} x {found.lens.height} px"
     table = Table(title=title, title_justify="left", title_style="bold", box=None, pad_edge=False)
@@ -124,20 +126,21 @@ def calibration_table(found: Calibrated) -> Table:
     return table
 
 
-def calibration_lines(found: Calibrated) -> list[str]:
+def calibration_lines(found: CalibrationResult) -> list[str]:
     """Return lines on the quality of the result, and on the data that were left out."""
     coverage, counts = found.coverage, [f"{len(found.used)} used"]
     counts += [f"{len(found.dropped)} bad"] if found.dropped else []
     counts += [f"{len(found.spare)} not needed"] if found.spare else []
     lines = [
         f"error: RMS {found.rms_px:.3f} px, median {found.median_px:.3f} px over {len(found.pixels)} corners",
-        f"pictures: {found.looked} looked at, board seen in {found.seen}, {', '.join(counts)}",
+        f"pictures: {found.examined_count} looked at, board seen in {found.seen}, {', '.join(counts)}",
         f"coverage: {coverage.share:.0%} of the image, to {_degrees(coverage.widest_rad)} from the axis",
-        f"          {coverage.places} places of the board, {coverage.tilted} tilted by 25 degrees or more",
+        f"          {coverage.position_count} places of the board, "
+        f"{coverage.tilted} tilted by 25 degrees or more",
     ]
-    if found.far_corners:
-        corners = "corner" if found.far_corners == 1 else "corners"
-        lines.append(f"left out: {found.far_corners} single {corners}, far off")
+    if found.outlier_corners:
+        corners = "corner" if found.outlier_corners == 1 else "corners"
+        lines.append(f"left out: {found.outlier_corners} single {corners}, far off")
     return lines + _dropped_lines(found.dropped, "left out") + _dropped_lines(found.unseen, "not seen")
 
 
@@ -145,7 +148,7 @@ def _degrees(angle_rad: float | None) -> str:
     return "?" if angle_rad is None else f"{math.degrees(angle_rad):.0f} degrees"
 
 
-def _dropped_lines(dropped: tuple[Dropped, ...], what: str) -> list[str]:
+def _dropped_lines(dropped: tuple[ExcludedSighting, ...], what: str) -> list[str]:
     """Return one line per reason for leaving out images, the most frequent reason first."""
     counts = Counter(drop.reason for drop in dropped)
     lines = []
@@ -159,7 +162,7 @@ def _dropped_lines(dropped: tuple[Dropped, ...], what: str) -> list[str]:
     return lines if more <= 1 else [*lines[:_SHOWN_DROPPED], f"{what}: and so on, {more} more (see --json)"]
 
 
-def calibration_json(found: Calibrated) -> dict[str, Any]:
+def calibration_json(found: CalibrationResult) -> dict[str, Any]:
     """Return the result as plain data, without the single corners."""
     lens, coverage = found.lens, found.coverage
     return {
@@ -173,9 +176,9 @@ def calibration_json(found: Calibrated) -> dict[str, Any]:
         "rms_px": found.rms_px,
         "median_px": found.median_px,
         "corners": len(found.pixels),
-        "far_corners": found.far_corners,
+        "far_corners": found.outlier_corners,
         "pictures": {
-            "looked_at": found.looked,
+            "looked_at": found.examined_count,
             "seen": found.seen,
             "used": [{"name": name, "rms_px": rms_px} for name, rms_px in found.used],
             "dropped": [drop._asdict() for drop in found.dropped],
@@ -185,7 +188,7 @@ def calibration_json(found: Calibrated) -> dict[str, Any]:
         "coverage": {
             "share": coverage.share,
             "empty_sides": list(coverage.empty_sides),
-            "places": coverage.places,
+            "places": coverage.position_count,
             "tilted": coverage.tilted,
             "widest_rad": coverage.widest_rad,
         },

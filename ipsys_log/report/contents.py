@@ -22,15 +22,15 @@ from ipsys_log.units import NS_PER_S, format_bytes, format_time
 __all__ = [
     "contents_json",
     "contents_tables",
+    "intervals_json",
+    "intervals_table",
     "runs_json",
     "runs_table",
     "states_json",
-    "stops_json",
-    "stops_table",
 ]
 
 
-def stops_json(scene: FinishedLog) -> list[dict[str, Any]]:
+def intervals_json(scene: FinishedLog) -> list[dict[str, Any]]:
     """Return the stationary intervals of a log as plain data; ``time_s`` is from the start of the log."""
     active = active_measurements(scene.history())
     return [
@@ -47,8 +47,8 @@ def stops_json(scene: FinishedLog) -> list[dict[str, Any]]:
     ]
 
 
-def stops_table(found: list[dict[str, Any]]) -> Table:
-    """Return the stationary intervals of :func:`stops_json` as a table."""
+def intervals_table(found: list[dict[str, Any]]) -> Table:
+    """Return the stationary intervals of :func:`intervals_json` as a table."""
     table = Table(
         title="Where markers lie still", title_justify="left", title_style="bold", box=None, pad_edge=False
     )

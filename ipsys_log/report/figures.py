@@ -27,15 +27,15 @@ __all__ = [
     "TEST",
     "ModelStyle",
     "camera_styles",
+    "figure_bytes",
     "model_styles",
-    "picture",
     "png",
     "robot_colour",
     "scale_logarithmic",
     "set_ticks",
     "shorten",
-    "strip",
-    "svg_uri",
+    "style_axes",
+    "svg_data_uri",
 ]
 
 # A camera with the name of a colour gets a similar colour that is easy to see.
@@ -111,7 +111,7 @@ def png(figure: Figure, dpi: int = _DPI) -> bytes:
     return _saved(figure, format="png", dpi=dpi, metadata={"Software": None})
 
 
-def picture(figure: Figure, path: Path, dpi: int = _DPI) -> bytes:
+def figure_bytes(figure: Figure, path: Path, dpi: int = _DPI) -> bytes:
     """Return a figure as the bytes of a file; the suffix of ``path`` gives the format, see ``PICTURES``."""
     kind = path.suffix.lower().removeprefix(".")
     if kind == "png":
@@ -124,7 +124,7 @@ def _svg(figure: Figure) -> bytes:
         return _saved(figure, format="svg", metadata={"Date": None, "Creator": None})
 
 
-def svg_uri(figure: Figure) -> str:
+def svg_data_uri(figure: Figure) -> str:
     """Return a figure as a data URI, which holds the figure itself."""
     data = _svg(figure)
     return f"data:image/svg+xml;base64,{base64.b64encode(data).decode()}"
@@ -145,7 +145,7 @@ def shorten(name: str) -> str:
     return plain if len(plain) <= _LONGEST else f"{plain[: _LONGEST - 1]}…"
 
 
-def strip(axes: Axes, grid: str = "both") -> None:
+def style_axes(axes: Axes, grid: str = "both") -> None:
     """Set the common style of plots: a light grid behind the data, and no box."""
     axes.grid(axis=grid, color=GRID, lw=0.7)  # type: ignore[arg-type]
     axes.set_axisbelow(True)

@@ -16,10 +16,10 @@ from ipsys_log.report.findings import Findings
 from ipsys_log.units import CM_PER_M
 
 __all__ = [
-    "PICTURES",
+    "FIGURE_SUFFIXES",
+    "check_figure_file",
     "check_file",
     "check_folder",
-    "check_picture",
     "cross_validation_csv",
     "paper_csv",
     "write_files",
@@ -101,7 +101,7 @@ def _csv(header: Sequence[str], rows: Iterable[Sequence[str]]) -> bytes:
 
 
 # Valid suffixes of a figure file; the suffix gives the file format.
-PICTURES = (".png", ".pdf", ".svg", ".jpg", ".jpeg", ".webp")
+FIGURE_SUFFIXES = (".png", ".pdf", ".svg", ".jpg", ".jpeg", ".webp")
 
 
 def check_file(path: Path, option: str, logs: Iterable[Path]) -> None:
@@ -123,17 +123,17 @@ def check_file(path: Path, option: str, logs: Iterable[Path]) -> None:
     _check_writable(path.parent, f"{option} {path}")
 
 
-def check_picture(path: Path, option: str, logs: Iterable[Path]) -> None:
+def check_figure_file(path: Path, option: str, logs: Iterable[Path]) -> None:
     """Check that a figure can be written and has a valid format, before any work is done.
 
     Raises
     ------
     IpsysError
-        The file cannot be written, or its name does not end in one of ``PICTURES``.
+        The file cannot be written, or its name does not end in one of ``FIGURE_SUFFIXES``.
     """
     check_file(path, option, logs)
-    if path.suffix.lower() not in PICTURES:
-        ends = f"{', '.join(PICTURES[:-1])} or {PICTURES[-1]}"
+    if path.suffix.lower() not in FIGURE_SUFFIXES:
+        ends = f"{', '.join(FIGURE_SUFFIXES[:-1])} or {FIGURE_SUFFIXES[-1]}"
         raise IpsysError(f"{option} {path}: is no kind of picture; let its name end in {ends}")
 
 

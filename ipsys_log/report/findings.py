@@ -13,16 +13,16 @@ from ipsys_log.log.dataset import Session
 from ipsys_log.messages import CameraEvaluation, ErrorStatistics, Evaluation, Model, Rig
 from ipsys_log.messages.channels import MODEL
 from ipsys_log.report.accuracy import Accuracy
-from ipsys_log.report.advice import Advice, advise, told_height
+from ipsys_log.report.advice import Advice, advise, uses_height
 from ipsys_log.sinks.selection import rig_in_force
 
-__all__ = ["Findings", "Missed", "gather_findings", "in_space", "judged", "overall", "rank"]
+__all__ = ["Findings", "PointErrors", "gather_findings", "in_space", "overall_row", "rank", "ranking_errors"]
 
 Array = NDArray[np.float64]
 
 
 @dataclass(frozen=True, slots=True, eq=False)
-class Missed:
+class PointErrors:
     """The position errors of one camera at n calibration points, in m, as means over repeats.
 
     Attributes
@@ -72,7 +72,7 @@ class Findings:
 
     def errors(self, row: CameraEvaluation) -> ErrorStatistics:
         """Return the errors of a row by which models are compared."""
-        return judged(row, self.in_space)
+        return ranking_errors(row, self.in_space)
 
     def ranked(self) -> list[Accuracy]:
         """Return the models, the lowest mean error first; models with heights as input come last."""
@@ -96,13 +96,13 @@ class Findings:
             if row.against == "tape" and row.residuals
         }
 
-    def missed(self, accuracy: Accuracy) -> list[Missed]:
+    def point_errors(self, accuracy: Accuracy) -> list[PointErrors]:
         """Return the errors at each point against the tape: cross-validated, or else on held-out points."""
         rows = accuracy.rows(True) or accuracy.rows(False)
-        return [_missed(row) for row in rows if row.against == "tape" and row.residuals]
+        return [_point_errors(row) for row in rows if row.against == "tape" and row.residuals]
 
 
-def _missed(row: CameraEvaluation) -> Missed:
+def _point_errors(row: CameraEvaluation) -> PointErrors:
     places: dict[str, list[Array]] = {}
     offsets: dict[str, list[Array]] = {}
     for residual in row.residuals:
@@ -112,7 +112,7 @@ def _missed(row: CameraEvaluation) -> Missed:
         [np.linalg.norm(vectors_m, axis=1).mean(), np.linalg.norm(np.array(vectors_m)[:, :2], axis=1).mean()]
         for vectors_m in offsets.values()
     ]
-    return Missed(
+    return PointErrors(
         row.camera,
         np.array([vectors_m[0] for vectors_m in places.values()]),
         np.array([np.mean(vectors_m, axis=0) for vectors_m in offsets.values()]),
@@ -126,7 +126,7 @@ def in_space(accuracies: Sequence[Accuracy]) -> bool:
     return all(row.error_3d is not None for row in rows)
 
 
-def judged(row: CameraEvaluation, space: bool) -> ErrorStatistics:
+def ranking_errors(row: CameraEvaluation, space: bool) -> ErrorStatistics:
     """Return the errors of a row by which models are compared, in space or on the floor."""
     return row.error_3d if space and row.error_3d is not None else row.error_2d
 
@@ -136,13 +136,13 @@ def rank(accuracies: Sequence[Accuracy]) -> list[Accuracy]:
     space = in_space(accuracies)
 
     def place(accuracy: Accuracy) -> tuple[bool, bool, float]:
-        row = overall(accuracy, True) or overall(accuracy, False)
-        return row is None, told_height(accuracy.model), judged(row, space).mean_m if row else np.inf
+        row = overall_row(accuracy, True) or overall_row(accuracy, False)
+        return row is None, uses_height(accuracy.model), ranking_errors(row, space).mean_m if row else np.inf
 
     return sorted(accuracies, key=place)
 
 
-def overall(accuracy: Accuracy, cross_validated: bool, against: str = "tape") -> CameraEvaluation | None:
+def overall_row(accuracy: Accuracy, cross_validated: bool, against: str = "tape") -> CameraEvaluation | None:
     """Return the row over all cameras; with a single camera, return the row of this camera."""
     rows = [row for row in accuracy.rows(cross_validated) if row.against == against]
     pooled = [row for row in rows if row.camera == POOLED]

@@ -18,7 +18,7 @@ from numpy.typing import NDArray
 
 from ipsys_log.analysis.accuracy import CROSS_VALIDATION
 from ipsys_log.analysis.ground_truth import gather_tracks
-from ipsys_log.analysis.pairs import Place, measured_places
+from ipsys_log.analysis.pairs import Place, locate_measurements
 from ipsys_log.errors import IpsysError
 from ipsys_log.log.dataset import Session
 from ipsys_log.messages import (
@@ -31,21 +31,21 @@ from ipsys_log.messages import (
 from ipsys_log.messages.channels import MEASUREMENTS, TRACKS, TRUTH
 from ipsys_log.report.accuracy import Accuracy
 from ipsys_log.report.errors_figure import count_rows, draw_errors
-from ipsys_log.report.figures import GRID, REST, camera_styles, picture, robot_colour, shorten
+from ipsys_log.report.figures import GRID, REST, camera_styles, figure_bytes, robot_colour, shorten
 from ipsys_log.report.files import write_files
 from ipsys_log.runs.provenance import newest_run
 from ipsys_log.sinks.selection import rig_in_force
 from ipsys_log.units import CM_PER_M
 
 __all__ = [
-    "Scene",
+    "FloorData",
     "Square",
+    "arrow_factor",
     "draw_arrows",
     "draw_floor",
     "draw_ground",
     "draw_key",
     "draw_session",
-    "exaggeration",
     "show_square",
     "square_around",
 ]
@@ -61,7 +61,7 @@ Lines = Mapping[str, NDArray[np.float64]]
 
 
 @dataclass(frozen=True, slots=True, eq=False)
-class Scene:
+class FloorData:
     """The drawn data of a session.
 
     ``tracks`` and ``truth`` are (n, 2) in m by robot, with NaN at the breaks of a line.
@@ -82,7 +82,7 @@ class Scene:
         ]
 
 
-def draw_floor(axes: Axes, scene: Scene, styles: Mapping[str, tuple[str, str]]) -> None:
+def draw_floor(axes: Axes, scene: FloorData, styles: Mapping[str, tuple[str, str]]) -> None:
     """Draw the floor, tracks, points and errors of a scene.
 
     Parameters
@@ -165,7 +165,7 @@ def _steps(half_m: float) -> MultipleLocator:
     return MultipleLocator(step_m)
 
 
-def _draw_tracks(axes: Axes, scene: Scene) -> None:
+def _draw_tracks(axes: Axes, scene: FloorData) -> None:
     names = sorted({*scene.tracks, *scene.truth})
     colours = {name: robot_colour(number) for number, name in enumerate(names)}
     for name, line in scene.truth.items():
@@ -182,7 +182,7 @@ def _draw_tracks(axes: Axes, scene: Scene) -> None:
         axes.plot([], [], "--", color="black", lw=0.8, label="truth")
 
 
-def _draw_places(axes: Axes, scene: Scene) -> None:
+def _draw_places(axes: Axes, scene: FloorData) -> None:
     tested = {residual.measurement for row in scene.rows() for residual in row.residuals}
     rest = [place for place in scene.places if place.id not in tested]
     for kind, colour in (("training", REST), ("measured", REST), ("test", "#6A6A6A")):
@@ -193,14 +193,14 @@ def _draw_places(axes: Axes, scene: Scene) -> None:
             axes.plot(*points_m.T, "o", color=colour, mfc=fill, ms=3.5, zorder=3, label=name)
 
 
-def _draw_errors(axes: Axes, scene: Scene, styles: Mapping[str, tuple[str, str]]) -> str:
+def _draw_errors(axes: Axes, scene: FloorData, styles: Mapping[str, tuple[str, str]]) -> str:
     """Draw the arrows of the errors; return the title that describes them."""
     rows = scene.rows()
     if not rows or scene.evaluation is None:
         return f"The floor, tracks of run {scene.run}" if scene.tracks else "The floor"
     residuals = [residual for row in rows for residual in row.residuals]
     span_m = axes.get_xlim()[1] - axes.get_xlim()[0]
-    factor = exaggeration([r.predicted_m - r.world_m for r in residuals], span_m)
+    factor = arrow_factor([r.predicted_m - r.world_m for r in residuals], span_m)
     for row in rows:
         colour, shape = styles[row.camera]
         start_m = np.array([residual.world_m[:2] for residual in row.residuals])
@@ -212,7 +212,7 @@ def _draw_errors(axes: Axes, scene: Scene, styles: Mapping[str, tuple[str, str]]
     return f"Errors of {scene.evaluation.model} on held-out places{times}"
 
 
-def exaggeration(errors_m: Sequence[NDArray[np.float64]], span_m: float) -> int:
+def arrow_factor(errors_m: Sequence[NDArray[np.float64]], span_m: float) -> int:
     """Return the factor of error arrows (n, 2 or 3) on a map: most are visible, and none is too long."""
     usual_m = float(np.quantile(np.linalg.norm(np.array(errors_m)[:, :2], axis=1), 0.9))
     fitting = [factor for factor in _FACTORS if factor * usual_m <= _ARROW_SHARE * span_m]
@@ -288,18 +288,18 @@ def draw_session(session: Session, accuracies: Sequence[Accuracy], path: Path) -
     )  # fmt: skip
     if rows:
         draw_errors(figure, accuracies, styles, left_in=7.3, top_in=_TOP_IN)
-    write_files(path.parent, {path.name: picture(figure, path, _DPI)})
+    write_files(path.parent, {path.name: figure_bytes(figure, path, _DPI)})
 
 
-def _gather(session: Session, accuracies: Sequence[Accuracy]) -> Scene:
+def _gather(session: Session, accuracies: Sequence[Accuracy]) -> FloorData:
     evaluated = [accuracy for accuracy in accuracies if accuracy.evaluation is not None]
     runs = [accuracy.run for accuracy in (evaluated or accuracies)]
     run = runs[0] if runs else newest_run(session, TRACKS)
     rig = rig_in_force(session, [run] if run else [])
-    places, _ = measured_places(session.payloads(session.topics(MEASUREMENTS)), rig)
+    places, _ = locate_measurements(session.payloads(session.topics(MEASUREMENTS)), rig)
     topics = session.topics(TRACKS, run) if run else []
     truth = [TRUTH_TOPIC] if TRUTH_TOPIC in session.topics(TRUTH) else []
-    scene = Scene(
+    scene = FloorData(
         rig,
         places,
         run,

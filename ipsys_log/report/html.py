@@ -9,14 +9,14 @@ from jinja2 import Environment, PackageLoader, StrictUndefined
 
 from ipsys_log.analysis.calibration_points import measured
 from ipsys_log.analysis.cross_validation import FOLDS, REPEATS, SUBSETS
-from ipsys_log.analysis.tape import Measured
+from ipsys_log.analysis.tape import RiggedMeasurement
 from ipsys_log.errors import IpsysError
 from ipsys_log.log.dataset import Session
 from ipsys_log.messages import Run
 from ipsys_log.plain_text import plain_text
 from ipsys_log.report import html_figures, html_sections
 from ipsys_log.report.accuracy import Accuracy
-from ipsys_log.report.advice import TOLD_NOTE, told_height
+from ipsys_log.report.advice import HEIGHT_NOTE, uses_height
 from ipsys_log.report.findings import Findings, gather_findings
 from ipsys_log.runs.view import LogView
 from ipsys_log.units import format_time
@@ -49,10 +49,10 @@ def render_report(session: Session, accuracies: Sequence[Accuracy]) -> str:
         lstrip_blocks=True,
     )
     return environment.get_template("session.html").render(
-        **_said(findings),
+        **_text_values(findings),
         flat=html_sections.flat_rows(_measured(session, findings)),
-        **_drawn(findings),
-        **_made(session, findings),
+        **_figure_values(findings),
+        **_provenance(session, findings),
     )
 
 
@@ -63,27 +63,27 @@ def _plain(value: Any) -> Any:
     return plain_text(value, keep="\n", longest=len(value))
 
 
-def _said(findings: Findings) -> dict[str, Any]:
+def _text_values(findings: Findings) -> dict[str, Any]:
     return {
         "head": html_sections.headline(findings),
         "advice": html_sections.advice_rows(findings),
         "models": html_sections.model_rows(findings),
         "by_camera": [(camera, html_sections.model_rows(findings, camera)) for camera in findings.cameras],
-        "told_note": TOLD_NOTE if any(map(told_height, findings.models)) else "",
+        "told_note": HEIGHT_NOTE if any(map(uses_height, findings.models)) else "",
         "suspects": html_sections.suspects(findings),
         "coverage": html_sections.coverage(findings),
         "calibration": html_sections.calibration(findings),
     }
 
 
-def _measured(session: Session, findings: Findings) -> list[Measured]:
+def _measured(session: Session, findings: Findings) -> list[RiggedMeasurement]:
     """Return the valid measured points, with the rig of the evaluation's options, or with the log's rig."""
     runs = [accuracy.run for accuracy in findings.accuracies]
     rigs = [record.rig for record in session.runs() if record.run in runs and record.rig is not None]
     return measured(LogView(session, rig=rigs[-1] if rigs else None))
 
 
-def _drawn(findings: Findings) -> dict[str, Any]:
+def _figure_values(findings: Findings) -> dict[str, Any]:
     return {
         "models_pictures": html_figures.models_pictures(findings),
         "residual_pictures": html_figures.residual_pictures(findings),
@@ -93,7 +93,7 @@ def _drawn(findings: Findings) -> dict[str, Any]:
     }
 
 
-def _made(session: Session, findings: Findings) -> dict[str, Any]:
+def _provenance(session: Session, findings: Findings) -> dict[str, Any]:
     """Return the provenance of the page: logs, runs and parameters."""
     runs = _sources(session.runs(), [accuracy.run for accuracy in findings.accuracies])
     newest = next((run for run in reversed(runs) if run.stage == "evaluate"), None)

@@ -10,7 +10,7 @@ from matplotlib.figure import Figure
 from matplotlib.lines import Line2D
 
 from ipsys_log.report.advice import has_published, label
-from ipsys_log.report.figures import svg_uri
+from ipsys_log.report.figures import svg_data_uri
 from ipsys_log.report.findings import Findings
 from ipsys_log.report.learning_figure import Curves, camera_curves, curves_picture, limits_cm, mean_curves
 from ipsys_log.report.paper_figures import (
@@ -41,7 +41,7 @@ def _picture(figure: Figure, caption: str) -> Picture:
     width_in, height_in = figure.get_size_inches()
     # The size in pixels reserves the space of a figure while the page loads.
     size = {"width": round(96 * width_in), "height": round(96 * height_in)}
-    return {"uri": svg_uri(figure), "caption": caption, **size}
+    return {"uri": svg_data_uri(figure), "caption": caption, **size}
 
 
 def _figure(height_in: float) -> tuple[Figure, Axes]:

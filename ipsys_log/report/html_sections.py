@@ -10,11 +10,11 @@ from matplotlib.path import Path as Outline
 from numpy.typing import NDArray
 
 from ipsys_log.analysis.accuracy import POOLED
-from ipsys_log.analysis.tape import Measured, flat_places
+from ipsys_log.analysis.tape import RiggedMeasurement, find_weak_points
 from ipsys_log.messages import CameraEvaluation, ErrorStatistics
-from ipsys_log.report.accuracy import Accuracy, gather_suspects
-from ipsys_log.report.advice import GROUPS, Choice, label, told_height
-from ipsys_log.report.findings import Findings, overall
+from ipsys_log.report.accuracy import Accuracy, gather_outliers
+from ipsys_log.report.advice import GROUPS, Choice, label, uses_height
+from ipsys_log.report.findings import Findings, overall_row
 from ipsys_log.report.points_figure import hull_m
 from ipsys_log.units import CM_PER_M
 
@@ -48,10 +48,10 @@ def headline(findings: Findings) -> dict[str, Any]:
     """Return the best model, its errors, and the data behind this result."""
     ranked = findings.ranked()
     best = ranked[0]
-    row = overall(best, True) or overall(best, False)
+    row = overall_row(best, True) or overall_row(best, False)
     assert row is not None  # a model without any row was not evaluated
-    errors, truth = findings.errors(row), overall(best, bool(best.rows(True)), _TRUTH)
-    height_models = [accuracy for accuracy in ranked if told_height(accuracy.model) and accuracy is not best]
+    errors, truth = findings.errors(row), overall_row(best, bool(best.rows(True)), _TRUTH)
+    height_models = [accuracy for accuracy in ranked if uses_height(accuracy.model) and accuracy is not best]
     return {
         "model": label(best.model),
         "mean": format_cm(errors.mean_m, 1),
@@ -75,12 +75,12 @@ def headline(findings: Findings) -> dict[str, Any]:
 
 def _counts(accuracy: Accuracy) -> list[str]:
     """Return the numbers of points behind the errors, as texts."""
-    schemes = {"by cross-validation": overall(accuracy, True), "held out": overall(accuracy, False)}
+    schemes = {"by cross-validation": overall_row(accuracy, True), "held out": overall_row(accuracy, False)}
     return [f"{row.error_2d.count} {name}" for name, row in schemes.items() if row]
 
 
 def _overall_mean(findings: Findings, accuracy: Accuracy) -> str:
-    row = overall(accuracy, True) or overall(accuracy, False)
+    row = overall_row(accuracy, True) or overall_row(accuracy, False)
     return format_cm(findings.errors(row).mean_m if row else None, 1)
 
 
@@ -139,7 +139,7 @@ def model_rows(findings: Findings, camera: str = POOLED) -> list[dict[str, Any]]
 def _rows(accuracy: Accuracy, camera: str, against: str) -> dict[bool, CameraEvaluation]:
     """Return the rows of a model; the key is True for cross-validation, False for held-out points."""
     if camera == POOLED:
-        rows = {crossed: overall(accuracy, crossed, against) for crossed in (False, True)}
+        rows = {crossed: overall_row(accuracy, crossed, against) for crossed in (False, True)}
     else:
         rows = {
             crossed: next(
@@ -185,7 +185,7 @@ def suspects(findings: Findings) -> list[dict[str, Any]]:
             "corrected": _point(suspect.corrected_m),
             "models": ", ".join(models),
         }
-        for suspect, models in gather_suspects(findings.accuracies)
+        for suspect, models in gather_outliers(findings.accuracies)
     ]
 
 
@@ -193,13 +193,13 @@ def _point(point_m: Iterable[float] | None) -> str:
     return "" if point_m is None else ", ".join(f"{value:.3f}" for value in point_m)
 
 
-def flat_rows(places: Sequence[Measured]) -> list[dict[str, str]] | None:
+def flat_rows(places: Sequence[RiggedMeasurement]) -> list[dict[str, str]] | None:
     """Return points whose tape circles cross at a flat angle, the worst first; None without tape points."""
     if not any(len(place.measurement.distances) > 1 for place in places):
         return None
     return [
         {"name": flat.id, "angle": f"{flat.angle_deg:.0f}", "sigma": format_cm(flat.sigma_m, 1)}
-        for flat in flat_places(places)
+        for flat in find_weak_points(places)
     ]
 
 
@@ -235,7 +235,7 @@ def calibration(findings: Findings) -> list[dict[str, Any]]:
     rows = []
     for accuracy in findings.ranked():
         schemes = {
-            name: overall(accuracy, crossed) for name, crossed in (("crossed", True), ("held_out", False))
+            name: overall_row(accuracy, crossed) for name, crossed in (("crossed", True), ("held_out", False))
         }
         known_rows = {
             name: row for name, row in schemes.items() if row is not None and row.within_68 is not None

@@ -10,7 +10,7 @@ from matplotlib.axes import Axes
 from matplotlib.figure import Figure
 from numpy.typing import NDArray
 
-from ipsys_log.report.figures import NOTE, picture, strip
+from ipsys_log.report.figures import NOTE, figure_bytes, style_axes
 from ipsys_log.report.files import write_files
 
 __all__ = ["draw_latency"]
@@ -38,7 +38,7 @@ def draw_latency(times_s: Mapping[str, NDArray[np.float64]], path: Path) -> None
     _draw_shares(left, total_ms)
     _draw_steps(right, times_s)
     figure.text(0.07, 0.94, f"Latency of {len(total_ms)} positions", fontsize=12)
-    write_files(path.parent, {path.name: picture(figure, path, 100)})
+    write_files(path.parent, {path.name: figure_bytes(figure, path, 100)})
 
 
 def _draw_shares(axes: Axes, total_ms: NDArray[np.float64]) -> None:
@@ -49,7 +49,7 @@ def _draw_shares(axes: Axes, total_ms: NDArray[np.float64]) -> None:
         axes.axvline(value_ms, color=NOTE, lw=1.2, ls=dashes, label=f"{name} {value_ms:.1f} ms")
     axes.set(xlabel="ms from the arrival of a frame to its position", ylabel="% of positions", ylim=(0, 101))
     axes.set_xlim(0, min(float(total_ms[-1]) * 1.05, _SHOWN * far_ms))
-    strip(axes)
+    style_axes(axes)
     _key(axes)
 
 
@@ -65,7 +65,7 @@ def _draw_steps(axes: Axes, times_s: Mapping[str, NDArray[np.float64]]) -> None:
     axes.set_yticks(rows, _STEPS)
     axes.invert_yaxis()
     axes.set(xlabel="ms for the step")
-    strip(axes, "x")
+    style_axes(axes, "x")
     _key(axes)
 
 

@@ -10,7 +10,15 @@ from matplotlib.figure import Figure
 from matplotlib.lines import Line2D
 from matplotlib.transforms import ScaledTranslation
 
-from ipsys_log.report.advice import TOLD_NOTE, Curve, CurvePoint, camera_curve, label, mean_curve, told_height
+from ipsys_log.report.advice import (
+    HEIGHT_NOTE,
+    Curve,
+    CurvePoint,
+    camera_curve,
+    label,
+    mean_curve,
+    uses_height,
+)
 from ipsys_log.report.figures import (
     NOTE,
     ModelStyle,
@@ -18,7 +26,7 @@ from ipsys_log.report.figures import (
     scale_logarithmic,
     set_ticks,
     shorten,
-    strip,
+    style_axes,
 )
 from ipsys_log.report.findings import Findings
 from ipsys_log.units import CM_PER_M
@@ -105,7 +113,7 @@ def curves_picture(curves: Curves, width_in: float, limits: tuple[float, float])
 def _note(models: Iterable[str]) -> str:
     """Return the title of the legend."""
     order = "in the order of the right ends"
-    return f"{order}\n{TOLD_NOTE}" if any(map(told_height, models)) else order
+    return f"{order}\n{HEIGHT_NOTE}" if any(map(uses_height, models)) else order
 
 
 def _by_end(panels: Sequence[Curves]) -> list[str]:
@@ -166,7 +174,7 @@ def draw_curves(
         axes.set_ylim(0, high_cm * 1.08)
     axes.set_xlabel("places for each camera")
     axes.tick_params(labelsize=9)
-    strip(axes)
+    style_axes(axes)
     if not curves:
         axes.text(0.5, 0.5, "none", transform=axes.transAxes, ha="center", color=NOTE)
 

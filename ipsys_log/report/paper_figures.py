@@ -18,16 +18,16 @@ from numpy.typing import NDArray
 from ipsys_log.errors import IpsysError
 from ipsys_log.messages import CameraEvaluation, ErrorStatistics
 from ipsys_log.report.accuracy import Accuracy
-from ipsys_log.report.advice import TOLD_NOTE, has_published, label, told_height
-from ipsys_log.report.figures import NOTE, model_styles, png, scale_logarithmic, strip
+from ipsys_log.report.advice import HEIGHT_NOTE, has_published, label, uses_height
+from ipsys_log.report.figures import NOTE, model_styles, png, scale_logarithmic, style_axes
 from ipsys_log.report.files import cross_validation_csv, paper_csv, write_files
-from ipsys_log.report.findings import Findings, Missed, overall
+from ipsys_log.report.findings import Findings, PointErrors, overall_row
 from ipsys_log.report.floor_figure import (
     Square,
+    arrow_factor,
     draw_arrows,
     draw_ground,
     draw_key,
-    exaggeration,
     show_square,
     square_around,
 )
@@ -74,19 +74,19 @@ def shown_models(findings: Findings) -> list[Accuracy]:
 
     Models without residuals are left out. Models with heights as input come last in the ranking.
     """
-    ranked = [accuracy for accuracy in findings.ranked() if findings.missed(accuracy)]
+    ranked = [accuracy for accuracy in findings.ranked() if findings.point_errors(accuracy)]
     poly = [accuracy for accuracy in ranked if accuracy.model == "poly"]
     return list(dict.fromkeys([*poly, *ranked[:1]]))
 
 
 def residual_scale(findings: Findings, accuracies: Sequence[Accuracy]) -> ResidualScale:
     """Return one scale for the maps of all these models, so that the maps can be compared by eye."""
-    missed = [missed for accuracy in accuracies for missed in findings.missed(accuracy)]
+    missed = [missed for accuracy in accuracies for missed in findings.point_errors(accuracy)]
     places_m = np.vstack([camera_errors.world_m[:, :2] for camera_errors in missed])
     errors_m = np.vstack([camera_errors.offsets_m[:, :2] for camera_errors in missed])
     lengths_cm = np.concatenate([_lengths_cm(findings, camera_errors) for camera_errors in missed])
     square = square_around(findings.rig, [places_m])
-    factor = exaggeration(list(errors_m), 2 * square.half)
+    factor = arrow_factor(list(errors_m), 2 * square.half)
     # Make room for the arrows, while the floor stays large.
     reach_m = 1.01 * np.abs(places_m + factor * errors_m - square.middle).max()
     half_m = float(np.clip(reach_m, square.half, _WIDER * square.half))
@@ -114,7 +114,7 @@ def residuals_figure(findings: Findings) -> Figure:
 
 def draw_residuals(axes: Axes, findings: Findings, accuracy: Accuracy, scale: ResidualScale) -> Quiver:
     """Draw one model's mean error at each point as an arrow on the floor, coloured by its length in space."""
-    missed = findings.missed(accuracy)
+    missed = findings.point_errors(accuracy)
     places_m = np.vstack([camera_errors.world_m[:, :2] for camera_errors in missed])
     errors_m = np.vstack([camera_errors.offsets_m[:, :2] for camera_errors in missed])
     lengths_cm = np.concatenate([_lengths_cm(findings, camera_errors) for camera_errors in missed])
@@ -136,7 +136,7 @@ def draw_residuals(axes: Axes, findings: Findings, accuracy: Accuracy, scale: Re
     return arrows
 
 
-def _lengths_cm(findings: Findings, missed: Missed) -> Array:
+def _lengths_cm(findings: Findings, missed: PointErrors) -> Array:
     return missed.lengths_m[:, 0 if findings.in_space else 1] * CM_PER_M
 
 
@@ -167,22 +167,22 @@ def models_figure(findings: Findings) -> Figure:
 
 def models_note(accuracies: Sequence[Accuracy]) -> str:
     """Return the meaning of the mark at the names of some models; empty if no model has it."""
-    return TOLD_NOTE if any(told_height(accuracy.model) for accuracy in accuracies) else ""
+    return HEIGHT_NOTE if any(uses_height(accuracy.model) for accuracy in accuracies) else ""
 
 
 def draw_models(axes: Axes, ranked: Sequence[Accuracy], in_space: bool) -> None:
     """Draw one row per model, the first on top; the scale fits the errors in space and on the floor."""
     styles = model_styles(accuracy.model for accuracy in ranked)
     for y, accuracy in enumerate(ranked):
-        crossed = _errors(overall(accuracy, True), in_space)
-        held_out = _errors(overall(accuracy, False), in_space)
+        crossed = _errors(overall_row(accuracy, True), in_space)
+        held_out = _errors(overall_row(accuracy, False), in_space)
         if crossed is not None:
             colour = styles[accuracy.model].colour
             axes.plot(_ends_cm(crossed), [y, y], color=colour, lw=2.4, solid_capstyle="butt", zorder=3)
             axes.plot(crossed.mean_m * CM_PER_M, y, "o", color=colour, ms=6.5, zorder=3.5)
         if held_out is not None:
             axes.plot(held_out.mean_m * CM_PER_M, y, zorder=4, **HELD_OUT)  # type: ignore[arg-type]
-    rows = [overall(accuracy, scheme) for accuracy in ranked for scheme in (True, False)]
+    rows = [overall_row(accuracy, scheme) for accuracy in ranked for scheme in (True, False)]
     shown = [errors for row in rows if row for errors in (row.error_3d, row.error_2d) if errors]
     ends_cm = [end for errors in shown for end in _ends_cm(errors)]
     if ends_cm and max(ends_cm) > _LOG_RATIO * min(ends_cm):
@@ -193,7 +193,7 @@ def draw_models(axes: Axes, ranked: Sequence[Accuracy], in_space: bool) -> None:
     axes.set_ylim(len(ranked) - 0.4, -0.6)
     axes.set_xlabel("mean error in cm")
     axes.tick_params(axis="y", length=0)
-    strip(axes, "x")
+    style_axes(axes, "x")
     axes.spines["left"].set_visible(False)
 
 
@@ -207,32 +207,32 @@ def _ends_cm(errors: ErrorStatistics) -> list[float]:
     return [(errors.mean_m if end_m is None else end_m) * CM_PER_M for end_m in ends_m]
 
 
-def _always(findings: Findings) -> bool:
+def _has_models(findings: Findings) -> bool:
     return bool(findings.accuracies)
 
 
-def _crossed(findings: Findings) -> bool:
+def _has_cross_validation(findings: Findings) -> bool:
     return any(accuracy.rows(True) for accuracy in findings.accuracies)
 
 
-def _published(findings: Findings) -> bool:
+def _has_published(findings: Findings) -> bool:
     return has_published(findings.evaluations)
 
 
 # For each file: the condition to write it, and the function that returns its bytes.
 _FILES: dict[str, tuple[Callable[[Findings], bool], Callable[[Findings], bytes]]] = {
-    "table_1.csv": (_always, lambda f: paper_csv(f, in_space=True)),
-    "table_2.csv": (_always, lambda f: paper_csv(f, in_space=False)),
-    "cross_validation.csv": (_crossed, cross_validation_csv),
+    "table_1.csv": (_has_models, lambda f: paper_csv(f, in_space=True)),
+    "table_2.csv": (_has_models, lambda f: paper_csv(f, in_space=False)),
+    "cross_validation.csv": (_has_cross_validation, cross_validation_csv),
     "figure_9.png": (lambda f: bool(f.training_m() or f.test_m()), lambda f: png(places_figure(f))),
     "figure_10.png": (
-        lambda f: _published(f) and f.in_space,
+        lambda f: _has_published(f) and f.in_space,
         lambda f: png(published_figure(f, in_space=True)),
     ),
-    "figure_11.png": (_published, lambda f: png(published_figure(f, in_space=False))),
+    "figure_11.png": (_has_published, lambda f: png(published_figure(f, in_space=False))),
     "learning_curve.png": (lambda f: bool(mean_curves(f, False)), lambda f: png(learning_figure(f))),
     "errors_floor.png": (lambda f: bool(shown_models(f)), lambda f: png(residuals_figure(f))),
-    "models.png": (_always, lambda f: png(models_figure(f))),
+    "models.png": (_has_models, lambda f: png(models_figure(f))),
 }
 
 

@@ -9,10 +9,10 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import NDArray
 
-from ipsys_log.analysis.plan import Plan, View, plan_places
+from ipsys_log.analysis.plan import FittedCamera, Plan, plan_points
 from ipsys_log.errors import IpsysError
 from ipsys_log.geometry.poses import invert_pose, make_pose
-from ipsys_log.geometry.trilateration import sides_alike, tape_covariance
+from ipsys_log.geometry.trilateration import are_collinear, tape_covariance
 from ipsys_log.log.dataset import Session
 from ipsys_log.messages import CameraCalibration, CameraModel, Model, Rig
 from ipsys_log.messages.channels import MEASUREMENTS, MODEL
@@ -21,7 +21,7 @@ from ipsys_log.models.table import AppliedModel
 from ipsys_log.models.uncertainty import Uncertainty
 from ipsys_log.units import CM_PER_M
 
-__all__ = ["PlannedFloor", "fitted_view", "means_cm", "mesh", "plan_floor"]
+__all__ = ["PlannedFloor", "means_cm", "mesh", "plan_floor", "view_of_model"]
 
 Array = NDArray[np.float64]
 Lenses = Mapping[str, CameraCalibration]
@@ -76,7 +76,7 @@ class PlannedFloor:
         Return None if tape measurements need no side.
         """
         known_m = _references(self.rig)
-        if len(known_m) < 2 or not sides_alike(known_m):
+        if len(known_m) < 2 or not are_collinear(known_m):
             return None
         (x, y), (along, across) = known_m[1] - known_m[0], point_m[:2] - known_m[0]
         return "left" if x * across >= y * along else "right"
@@ -102,7 +102,9 @@ def plan_floor(
     """
     model: Model = session.payloads(session.topics(MODEL, run))[-1]
     views = [
-        fitted_view(model.name, camera, lenses.get(camera.camera)) for camera in model.cameras if camera.pairs
+        view_of_model(model.name, camera, lenses.get(camera.camera))
+        for camera in model.cameras
+        if camera.pairs
     ]
     if not views:
         raise IpsysError(f"run {run}: its model does not say on which places it was fitted; fit it again")
@@ -114,7 +116,7 @@ def plan_floor(
     step_m = _STEP_M * max(1, round(float((high_m - low_m).max()) / _SPAN_M))
     xs_m, ys_m = (np.arange(a + step_m / 2, b, step_m) for a, b in zip(low_m, high_m, strict=True))
     side_m = max((rig.length_of(marker.id) for marker in rig.markers), default=rig.marker_length_m)
-    plan = plan_places(
+    plan = plan_points(
         views,
         mesh(xs_m, ys_m, [height_m]),
         _candidates(rig, low_m, high_m, step_m, side_m / 2, heights_m or _used_heights(measured_m[:, 2])),
@@ -126,7 +128,7 @@ def plan_floor(
     return PlannedFloor(model.name, run, rig, plan, xs_m, ys_m, height_m, measured_m, notes)
 
 
-def fitted_view(name: str, camera: CameraModel, lens: CameraCalibration | None) -> View:
+def view_of_model(name: str, camera: CameraModel, lens: CameraCalibration | None) -> FittedCamera:
     """Return the view of a fitted camera; ``name`` is the name of its model, ``lens`` None if not known."""
     points_m, world_m = (np.array([getattr(p, key) for p in camera.pairs]) for key in ("camera_m", "world_m"))
     arrays = {p.name: p.values.reshape(p.shape) for p in camera.parameters}
@@ -141,7 +143,9 @@ def fitted_view(name: str, camera: CameraModel, lens: CameraCalibration | None) 
     else:
         uncertainty = Uncertainty(noise.along, noise.across, noise.growth, noise.fit, points_m)
     pose = invert_pose(make_pose(rotation, origin_m))
-    return View(camera.camera, pose, bend, lens, AppliedModel(name, camera).predict, uncertainty, world_m)
+    return FittedCamera(
+        camera.camera, pose, bend, lens, AppliedModel(name, camera).predict, uncertainty, world_m
+    )
 
 
 def _used_heights(heights_m: Array) -> list[float]:

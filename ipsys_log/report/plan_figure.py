@@ -14,7 +14,7 @@ from matplotlib.ticker import MaxNLocator
 from numpy.typing import NDArray
 from scipy.ndimage import gaussian_filter
 
-from ipsys_log.report.figures import NOTE, REST, camera_styles, picture
+from ipsys_log.report.figures import NOTE, REST, camera_styles, figure_bytes
 from ipsys_log.report.files import write_files
 from ipsys_log.report.plan import PlannedFloor, means_cm, mesh
 from ipsys_log.units import CM_PER_M
@@ -53,7 +53,7 @@ def draw_plan(found: PlannedFloor, path: Path) -> None:
     figure.text(0.6 / 14, 6.7 / 7, title, fontsize=12)
     handles, labels = axes.get_legend_handles_labels()
     figure.legend(handles, labels, loc=(0.035, 0.01), ncols=8, fontsize=9, frameon=False)
-    write_files(path.parent, {path.name: picture(figure, path, 100)})
+    write_files(path.parent, {path.name: figure_bytes(figure, path, 100)})
 
 
 def _draw_floor(axes: Axes, found: PlannedFloor, error_cm: Array, top_cm: float) -> AxesImage:

@@ -40,12 +40,12 @@ class Paper:
     width_mm: float
     height_mm: float
 
-    def turned(self) -> Paper:
+    def landscape(self) -> Paper:
         """Return the sheet in landscape orientation."""
         return Paper(self.name, self.height_mm, self.width_mm)
 
     @property
-    def room_mm(self) -> tuple[float, float]:
+    def free_mm(self) -> tuple[float, float]:
         """The width and height that are free for prints."""
         return self.width_mm - 2 * _EDGE_MM, self.height_mm - 2 * _EDGE_MM - _FOOT_MM
 
@@ -61,7 +61,7 @@ PAPERS = {
 class Placed:
     """A print on a page; its position is the top left of its black, in mm from the page's bottom left."""
 
-    what: Print
+    item: Print
     x_mm: float
     y_mm: float
 
@@ -104,9 +104,9 @@ def lay_out(prints: Sequence[Print], paper: Paper) -> list[Page]:
     pages = _rows_of_markers(markers, paper)
     for board in prints:
         if board.is_board:
-            turned = _orientation(board, paper)
-            assert turned is not None
-            pages.append(Page(turned, (_in_the_middle(board, turned),)))
+            oriented = _orientation(board, paper)
+            assert oriented is not None
+            pages.append(Page(oriented, (_in_the_middle(board, oriented),)))
     return pages
 
 
@@ -120,8 +120,8 @@ def draw_pages(pages: Sequence[Page]) -> bytes:
             _draw_ruler(axes)
             for placed in page.placed:
                 _draw_black(axes, placed)
-                if placed.what.is_board:
-                    _draw_board_text(axes, placed.what)
+                if placed.item.is_board:
+                    _draw_board_text(axes, placed.item)
                 else:
                     _draw_marker_text(axes, placed)
                     _draw_cutting_marks(axes, placed)
@@ -129,45 +129,45 @@ def draw_pages(pages: Sequence[Page]) -> bytes:
     return buffer.getvalue()
 
 
-def _size_mm(what: Print) -> tuple[float, float]:
+def _size_mm(item: Print) -> tuple[float, float]:
     """Return width and height of the paper for a print; the edge of the page counts as margin of a board."""
-    if what.is_board:
-        spare_mm = max(what.margin_mm - _EDGE_MM, 0.0)
-        return what.width_mm + 2 * spare_mm, what.height_mm + spare_mm + what.margin_mm
-    width_mm = what.width_mm + 2 * what.margin_mm
-    return max(width_mm, _NARROWEST_MM), what.height_mm + 2 * what.margin_mm + _CAPTION_MM
+    if item.is_board:
+        spare_mm = max(item.margin_mm - _EDGE_MM, 0.0)
+        return item.width_mm + 2 * spare_mm, item.height_mm + spare_mm + item.margin_mm
+    width_mm = item.width_mm + 2 * item.margin_mm
+    return max(width_mm, _NARROWEST_MM), item.height_mm + 2 * item.margin_mm + _CAPTION_MM
 
 
-def _orientation(what: Print, paper: Paper) -> Paper | None:
+def _orientation(item: Print, paper: Paper) -> Paper | None:
     """Return the paper in portrait, or in landscape if a board needs it; None if the print does not fit."""
-    width_mm, height_mm = _size_mm(what)
-    for turned in (paper, paper.turned()) if what.is_board else (paper,):
-        room_mm = turned.room_mm
-        if width_mm <= room_mm[0] + 1e-6 and height_mm <= room_mm[1] + 1e-6:
-            return turned
+    width_mm, height_mm = _size_mm(item)
+    for oriented in (paper, paper.landscape()) if item.is_board else (paper,):
+        free_mm = oriented.free_mm
+        if width_mm <= free_mm[0] + 1e-6 and height_mm <= free_mm[1] + 1e-6:
+            return oriented
     return None
 
 
-def _too_large(what: Print, paper: Paper) -> str:
-    width_mm, height_mm = _size_mm(what)
+def _too_large(item: Print, paper: Paper) -> str:
+    width_mm, height_mm = _size_mm(item)
     size = f"{width_mm:.0f} x {height_mm:.0f} mm"
-    text = f"{what.name} takes {size} with its white margin, too much for {paper.name}"
-    if what.is_board:
+    text = f"{item.name} takes {size} with its white margin, too much for {paper.name}"
+    if item.is_board:
         return f"{text}; make its squares smaller, with --square, or use larger paper"
-    largest_mm = np.floor(paper.room_mm[0] / (1 + 2 * what.margin_mm / what.width_mm))
+    largest_mm = np.floor(paper.free_mm[0] / (1 + 2 * item.margin_mm / item.width_mm))
     text += f", which holds markers of up to {largest_mm:.0f} mm: --length {largest_mm / 1000:g}"
     return text if paper is PAPERS["a3"] else f"{text}; or use larger paper: --page a3"
 
 
 def _rows_of_markers(markers: Sequence[Print], paper: Paper) -> list[Page]:
-    room_mm = paper.room_mm
+    free_mm = paper.free_mm
     pages: list[list[Placed]] = []
     x_mm = y_mm = row_mm = 0.0
     for marker in markers:
         width_mm, height_mm = _size_mm(marker)
-        if x_mm + width_mm > room_mm[0] + 1e-6:
+        if x_mm + width_mm > free_mm[0] + 1e-6:
             x_mm, y_mm, row_mm = 0.0, y_mm + row_mm + _GAP_MM, 0.0
-        if not pages or y_mm + height_mm > room_mm[1] + 1e-6:
+        if not pages or y_mm + height_mm > free_mm[1] + 1e-6:
             pages.append([])
             x_mm = y_mm = row_mm = 0.0
         left_mm = _EDGE_MM + x_mm + (width_mm - marker.width_mm) / 2
@@ -197,7 +197,7 @@ def _blank(paper: Paper) -> tuple[Figure, Axes]:
 
 def _draw_black(axes: Axes, placed: Placed) -> None:
     """Draw all black parts as one path, so that no part is drawn twice."""
-    loops = [np.vstack([polygon, polygon[:1]]) for polygon in placed.what.polygons]
+    loops = [np.vstack([polygon, polygon[:1]]) for polygon in placed.item.polygons]
     codes = [
         code
         for loop in loops
@@ -209,7 +209,7 @@ def _draw_black(axes: Axes, placed: Placed) -> None:
 
 def _draw_marker_text(axes: Axes, placed: Placed) -> None:
     """Draw the caption below the margin of a marker, with an arrow to the front of the marker."""
-    marker = placed.what
+    marker = placed.item
     width_mm = _size_mm(marker)[0]
     left_mm = placed.x_mm + marker.width_mm / 2 - width_mm / 2 + 1.5
     bottom_mm = placed.y_mm - marker.height_mm - marker.margin_mm - _CAPTION_MM + 1.5
@@ -232,7 +232,7 @@ def _write(axes: Axes, x_mm: float, y_mm: float, text: str, size_pt: float) -> N
 
 def _draw_cutting_marks(axes: Axes, placed: Placed) -> None:
     """Draw a small angle outside of each corner of the paper of a marker."""
-    marker = placed.what
+    marker = placed.item
     width_mm, height_mm = _size_mm(marker)
     left_mm = placed.x_mm + marker.width_mm / 2 - width_mm / 2
     top_mm = placed.y_mm + marker.margin_mm

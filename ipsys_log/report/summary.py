@@ -13,9 +13,9 @@ from rich.text import Text
 from ipsys_log.analysis.accuracy import CROSS_VALIDATION, POOLED, root_mean_square_m
 from ipsys_log.analysis.consistency import FEWEST_POINTS
 from ipsys_log.messages import CameraEvaluation, ErrorStatistics
-from ipsys_log.report.accuracy import Accuracy, gather_suspects
-from ipsys_log.report.advice import TOLD_NOTE, advise, label, told_height
-from ipsys_log.report.findings import in_space, judged, overall, rank
+from ipsys_log.report.accuracy import Accuracy, gather_outliers
+from ipsys_log.report.advice import HEIGHT_NOTE, advise, label, uses_height
+from ipsys_log.report.findings import in_space, overall_row, rank, ranking_errors
 from ipsys_log.report.tables import format_interval, name_cell, plain_table, wrap_text
 from ipsys_log.stages.evaluate import SCREENING
 from ipsys_log.units import CM_PER_M
@@ -44,33 +44,34 @@ def answer_text(accuracies: Sequence[Accuracy]) -> Group | None:
 
 
 def _best_lines(accuracies: Sequence[Accuracy], best: Accuracy) -> Iterator[str | Text]:
-    row = overall(best, True) or overall(best, False)
+    row = overall_row(best, True) or overall_row(best, False)
     if row is None:
         return
     space = in_space(accuracies)
     several = len(accuracies) > 1
-    knows = ", with known marker heights" if told_height(best.model) else ""
+    knows = ", with known marker heights" if uses_height(best.model) else ""
     yield Text(f"{'Best model' if several else 'Model'}: {name_cell(best.model)}{knows}", style="bold")
-    yield f"Mean position error: {_figures(judged(row, space), best.rmse_m(row, judged(row, space)))}"
+    errors = ranking_errors(row, space)
+    yield f"Mean position error: {_figures(errors, best.rmse_m(row, errors))}"
     cameras = {camera_row.camera for camera_row in (best.evaluation.cameras if best.evaluation else ())} - {
         POOLED
     }
     yield (
-        f"({'3D' if space and not told_height(best.model) else '2D'}, {_scheme(row)}: "
+        f"({'3D' if space and not uses_height(best.model) else '2D'}, {_scheme(row)}: "
         f"{_count(row.error_2d.count, 'point')} of {_count(len(cameras), 'camera')}; a camera's view of a "
         "point counts as one)."
     )
-    truth = overall(best, row.scheme == CROSS_VALIDATION, _TRUTH)
+    truth = overall_row(best, row.scheme == CROSS_VALIDATION, _TRUTH)
     if truth is not None:
-        errors = judged(truth, space)
+        errors = ranking_errors(truth, space)
         yield f"Against the ground truth: {_figures(errors, best.rmse_m(truth, errors))}."
-    height_models = [accuracy for accuracy in rank(accuracies) if told_height(accuracy.model)]
+    height_models = [accuracy for accuracy in rank(accuracies) if uses_height(accuracy.model)]
     if (
         height_models
         and height_models[0] is not best
-        and (told_row := overall(height_models[0], True) or overall(height_models[0], False))
+        and (told_row := overall_row(height_models[0], True) or overall_row(height_models[0], False))
     ):
-        errors = judged(told_row, space)
+        errors = ranking_errors(told_row, space)
         figures = _figures(errors, height_models[0].rmse_m(told_row, errors))
         yield f"With known marker heights: {height_models[0].model}, {figures} (2D)."
 
@@ -101,7 +102,7 @@ def _cm(value_m: float) -> str:
 
 def _outlier_lines(accuracies: Sequence[Accuracy]) -> Iterator[str | Text]:
     """Yield the outliers, the worst first; the first outliers have a possible explanation."""
-    suspects = gather_suspects(accuracies)
+    suspects = gather_outliers(accuracies)
     if not suspects:
         searched = "none" if any(map(_screened, accuracies)) else f"not searched: {_needed()}"
         yield f"Outliers: {searched}."
@@ -133,15 +134,15 @@ def _needed() -> str:
 def answer_json(accuracies: Sequence[Accuracy]) -> dict[str, Any]:
     """Return the answer as plain data, in cm; empty without an evaluated model."""
     best = rank(accuracies)[0] if accuracies else None
-    row = None if best is None else overall(best, True) or overall(best, False)
+    row = None if best is None else overall_row(best, True) or overall_row(best, False)
     if best is None or row is None:
         return {}
-    errors = judged(row, in_space(accuracies))
+    errors = ranking_errors(row, in_space(accuracies))
     rmse_m = best.rmse_m(row, errors)
     figures = {"mean_cm": errors.mean_m * CM_PER_M} | (
         {} if rmse_m is None else {"rmse_cm": rmse_m * CM_PER_M}
     )
-    names = [suspect.measurement for suspect, _ in gather_suspects(accuracies)]
+    names = [suspect.measurement for suspect, _ in gather_outliers(accuracies)]
     return {"answer": {"model": best.model, "scheme": row.scheme, **figures, "outliers": names}}
 
 
@@ -167,15 +168,15 @@ def models_table(accuracies: Sequence[Accuracy]) -> Table | None:
         cells = _cells(accuracy, row, space)
         cells += [_held_out(rows[False], space)] if held_out else []
         table.add_row(name_cell((row.camera or "(all)") if by_camera else label(accuracy.model)), *cells)
-    if not by_camera and any(told_height(accuracy.model) for accuracy, _ in lines):
-        table.caption, table.caption_justify, table.caption_style = Text(TOLD_NOTE), "left", ""
+    if not by_camera and any(uses_height(accuracy.model) for accuracy, _ in lines):
+        table.caption, table.caption_justify, table.caption_style = Text(HEIGHT_NOTE), "left", ""
     return table
 
 
 def _rows(accuracy: Accuracy, models: int) -> list[dict[bool, CameraEvaluation | None]]:
     """Return rows against the tape, by cross-validation (True or False): over all cameras, or by camera."""
     if models > 1:
-        pooled = {crossed: overall(accuracy, crossed) for crossed in (True, False)}
+        pooled = {crossed: overall_row(accuracy, crossed) for crossed in (True, False)}
         return [pooled] if any(pooled.values()) else []
     by_camera: dict[str, dict[bool, CameraEvaluation | None]] = {}
     for crossed in (True, False):
@@ -186,7 +187,7 @@ def _rows(accuracy: Accuracy, models: int) -> list[dict[bool, CameraEvaluation |
 
 
 def _cells(accuracy: Accuracy, row: CameraEvaluation, space: bool) -> list[str]:
-    errors = judged(row, space)
+    errors = ranking_errors(row, space)
     cells = [_two(errors.mean_m), format_interval(errors), _two(accuracy.rmse_m(row, errors))]
     cells.append(_two(errors.p95_m))
     if space:
@@ -195,7 +196,7 @@ def _cells(accuracy: Accuracy, row: CameraEvaluation, space: bool) -> list[str]:
 
 
 def _held_out(row: CameraEvaluation | None, space: bool) -> str:
-    return "-" if row is None else _two(judged(row, space).mean_m)
+    return "-" if row is None else _two(ranking_errors(row, space).mean_m)
 
 
 def _two(value_m: float | None) -> str:

@@ -15,8 +15,8 @@ from rich.text import Text
 from ipsys_log.analysis.accuracy import POOLED, root_mean_square_m
 from ipsys_log.messages import CameraEvaluation, ErrorStatistics
 from ipsys_log.plain_text import plain_text
-from ipsys_log.report.accuracy import Accuracy, gather_suspects
-from ipsys_log.report.advice import GROUPS, TOLD_NOTE, Advice, Choice, advise, label, told_height
+from ipsys_log.report.accuracy import Accuracy, gather_outliers
+from ipsys_log.report.advice import GROUPS, HEIGHT_NOTE, Advice, Choice, advise, label, uses_height
 from ipsys_log.units import CM_PER_M
 
 __all__ = ["accuracy_tables", "format_interval", "name_cell", "plain_table", "wrap_text"]
@@ -70,8 +70,8 @@ def accuracy_tables(accuracies: Sequence[Accuracy]) -> list[Table | Group]:
         tables.append(_held_out_table(accuracies))
     if any(accuracy.rows(True) for accuracy in accuracies):
         tables.append(_cross_validation_table(accuracies))
-    if tables and any(told_height(accuracy.model) for accuracy in accuracies):
-        caption = Text(wrap_text(TOLD_NOTE))
+    if tables and any(uses_height(accuracy.model) for accuracy in accuracies):
+        caption = Text(wrap_text(HEIGHT_NOTE))
         tables[-1].caption, tables[-1].caption_justify, tables[-1].caption_style = caption, "left", ""
     if any(accuracy.evaluation and accuracy.evaluation.suspects for accuracy in accuracies):
         tables.append(_suspects_table(accuracies))
@@ -181,7 +181,7 @@ def _suspects_table(accuracies: Sequence[Accuracy]) -> Table:
     table = plain_table("Outliers, the worst first: measure these again", ("point",), ("error cm",))
     table.add_column("found by", overflow="fold", max_width=_FOUND_BY_WIDTH)
     table.add_column("what would explain it", overflow="fold")
-    for suspect, models in gather_suspects(accuracies):
+    for suspect, models in gather_outliers(accuracies):
         length_cm = float(np.linalg.norm(suspect.residual_m)) * CM_PER_M
         found_by, text = ", ".join(models), suspect.text or "nothing simple"
         table.add_row(

@@ -9,7 +9,7 @@ from typing import NamedTuple
 from ipsys_log.errors import IpsysError
 from ipsys_log.messages import Rig
 
-__all__ = ["check_slips", "dictionary_size"]
+__all__ = ["check_units", "dictionary_size"]
 
 
 class _Kind(NamedTuple):
@@ -53,7 +53,7 @@ _SIZES = {
 }
 
 
-def check_slips(rig: Rig, where: str) -> None:
+def check_units(rig: Rig, where: str) -> None:
     """Check that no value of a rig file is in a wrong unit, and that its markers exist.
 
     Raises

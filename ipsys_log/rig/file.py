@@ -15,7 +15,7 @@ from typing import Any, TypeVar
 
 from ipsys_log.errors import IpsysError
 from ipsys_log.messages import Floor, ReferencePoint, Rig, RigCamera, RigMarker
-from ipsys_log.rig.checks import check_slips
+from ipsys_log.rig.checks import check_units
 
 __all__ = [
     "HIDDEN",
@@ -195,7 +195,7 @@ def load_rig(path: Path) -> Rig:
     if "floor" in table:
         table["floor"] = _build(Floor, table["floor"], f"{path}: [floor]")
     rig = check_rig(_build(Rig, table, str(path)), str(path))
-    check_slips(rig, str(path))
+    check_units(rig, str(path))
     return rig
 
 

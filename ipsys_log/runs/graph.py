@@ -10,7 +10,7 @@ from collections.abc import Callable, Mapping
 from dataclasses import dataclass, field
 from typing import Any
 
-from ipsys_log.geometry.lenses import same_lens
+from ipsys_log.geometry.lenses import same_intrinsics
 from ipsys_log.log.contents import camera_of_topic, run_of_topic
 from ipsys_log.log.dataset import Session
 from ipsys_log.messages import CameraCalibration, ChannelRead, Model, Rig, Run
@@ -185,7 +185,7 @@ def _other_lenses(session: Session, given: Mapping[str, CameraCalibration]) -> d
     lenses = dict(given)
     for camera, topic in session.calibrations.items():
         if camera in lenses and all(
-            same_lens(recorded, lenses[camera]) for recorded in session.payloads([topic])
+            same_intrinsics(recorded, lenses[camera]) for recorded in session.payloads([topic])
         ):
             del lenses[camera]
     return lenses

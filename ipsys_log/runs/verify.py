@@ -15,7 +15,7 @@ from ipsys_log.analysis.differences import (
     Extent,
     Stored,
     compare_channels,
-    explain_apart,
+    explain_no_overlap,
     marker_ids,
 )
 from ipsys_log.errors import IpsysError
@@ -145,7 +145,7 @@ def explain_diff(left: Path, right: Path, runs: tuple[str | None, str | None]) -
     """
     with Session([left]) as left_session, Session([right]) as right_session:
         first, second = _compared_runs(left_session, right_session, runs)
-        return explain_apart(_extent(left_session, first), _extent(right_session, second))
+        return explain_no_overlap(_extent(left_session, first), _extent(right_session, second))
 
 
 def _compared_runs(

@@ -12,9 +12,9 @@ from ipsys_log.geometry.marker_cells import PlacedBoard, print_outline
 from ipsys_log.geometry.markers import white_cells
 from ipsys_log.geometry.poses import invert_pose, make_pose, rotation
 from ipsys_log.simulation.cameras import Camera, sees
-from ipsys_log.simulation.settings import LabSettings, Purpose, stream
+from ipsys_log.simulation.settings import LabSettings, Purpose, random_stream
 
-__all__ = ["POSES", "board_cells", "hold_board"]
+__all__ = ["POSES", "board_cells", "board_poses"]
 
 Array = NDArray[np.float64]
 
@@ -64,7 +64,7 @@ def _cells_per_square(board: Board) -> int:
     return per_square
 
 
-def hold_board(board: Board, camera: Camera, settings: LabSettings) -> list[PlacedBoard]:
+def board_poses(board: Board, camera: Camera, settings: LabSettings) -> list[PlacedBoard]:
     """Return a board in :data:`POSES` poses, which cover the image of a camera, with tilts to all sides.
 
     Parameters
@@ -74,7 +74,7 @@ def hold_board(board: Board, camera: Camera, settings: LabSettings) -> list[Plac
     settings : the seed.
     """
     cells, cell_m = board_cells(board)
-    rng = stream(settings.seed, Purpose.BOARD, settings.cameras.index(camera.name))
+    rng = random_stream(settings.seed, Purpose.BOARD, settings.cameras.index(camera.name))
     positions = [(x, y) for _ in range(2) for y in _ROWS for x in _COLUMNS]
     return [
         _hold(cells, cell_m, camera, settings, rng, index, np.array(place))

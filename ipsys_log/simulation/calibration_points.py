@@ -9,21 +9,21 @@ import numpy as np
 from numpy.typing import NDArray
 
 from ipsys_log.errors import IpsysError
-from ipsys_log.geometry.marker_cells import Placed, black_cells, print_outline
-from ipsys_log.geometry.poses import lay_flat
+from ipsys_log.geometry.marker_cells import PlacedMarker, black_cells, print_outline
+from ipsys_log.geometry.poses import pose_facing_up
 from ipsys_log.messages import Distance, Interval, Measurement, ReferencePoint
 from ipsys_log.simulation.cameras import FLOOR_M, Camera, sees
-from ipsys_log.simulation.settings import LabSettings, Purpose, stream
+from ipsys_log.simulation.settings import LabSettings, Purpose, random_stream
 
 __all__ = [
     "REFERENCES",
-    "Place",
+    "MarkerPose",
+    "cameras_seeing",
     "choose_place",
     "measure",
     "overlap",
-    "place",
-    "plan_stations",
-    "seen_whole",
+    "place_marker",
+    "plan_points",
     "split",
     "tape_lengths_m",
 ]
@@ -38,7 +38,7 @@ _TEST_SHARE = 0.2
 
 
 @dataclass(frozen=True, slots=True)
-class Place:
+class MarkerPose:
     """The pose of a marker that faces up: its centre in world m, and its heading in rad."""
 
     marker_id: int
@@ -49,25 +49,25 @@ class Place:
 
 
 @dataclass(frozen=True, slots=True)
-class Station:
+class SimulatedPoint:
     """A calibration point; ``camera`` is the camera for which it is chosen."""
 
-    place: Place
+    pose: MarkerPose
     camera: str
 
 
-def place(where: Place, settings: LabSettings) -> Placed:
+def place_marker(where: MarkerPose, settings: LabSettings) -> PlacedMarker:
     """Return the print of a marker at a pose."""
-    return Placed(
+    return PlacedMarker(
         where.marker_id,
         settings.marker_length_m,
-        lay_flat(where.x_m, where.y_m, where.z_m, where.heading_rad),
+        pose_facing_up(where.x_m, where.y_m, where.z_m, where.heading_rad),
     )
 
 
-def seen_whole(where: Place, cameras: Sequence[Camera], settings: LabSettings) -> tuple[str, ...]:
+def cameras_seeing(where: MarkerPose, cameras: Sequence[Camera], settings: LabSettings) -> tuple[str, ...]:
     """Return the names of the cameras whose image contains the whole print, white margin included."""
-    outline_m = print_outline(place(where, settings), settings.dictionary)
+    outline_m = print_outline(place_marker(where, settings), settings.dictionary)
     return tuple(camera.name for camera in cameras if sees(camera, outline_m).all())
 
 
@@ -93,36 +93,36 @@ def overlap(
     return met
 
 
-def plan_stations(settings: LabSettings, cameras: Sequence[Camera]) -> list[tuple[Station, ...]]:
+def plan_points(settings: LabSettings, cameras: Sequence[Camera]) -> list[tuple[SimulatedPoint, ...]]:
     """Return sets of calibration points, one for each marker, until every camera sees enough of them.
 
-    The required number for each camera is about ``settings.stations``.
+    The required number for each camera is about ``settings.points``.
 
     Raises
     ------
     IpsysError
         The floor has no room for another marker.
     """
-    rng = stream(settings.seed, Purpose.PLACES)
-    seen: dict[str, list[Place]] = {camera.name: [] for camera in cameras}
-    sets: list[tuple[Station, ...]] = []
+    rng = random_stream(settings.seed, Purpose.PLACES)
+    seen: dict[str, list[MarkerPose]] = {camera.name: [] for camera in cameras}
+    sets: list[tuple[SimulatedPoint, ...]] = []
     while min(map(len, seen.values())) < settings.stations:
-        stations: list[Station] = []
+        points: list[SimulatedPoint] = []
         for marker_id in range(settings.markers):
             camera = min(cameras, key=lambda one: len(seen[one.name]))
-            taken = [station.place for station in stations]
+            taken = [point.pose for point in points]
             pose = choose_place(rng, settings, cameras, camera, marker_id, taken, seen[camera.name])
-            stations.append(Station(pose, camera.name))
-            for name in seen_whole(pose, cameras, settings):
+            points.append(SimulatedPoint(pose, camera.name))
+            for name in cameras_seeing(pose, cameras, settings):
                 seen[name].append(pose)
-        sets.append(tuple(stations))
+        sets.append(tuple(points))
     return sets
 
 
-def split(sets: Sequence[tuple[Station, ...]], seed: int) -> list[tuple[str, ...]]:
+def split(sets: Sequence[tuple[SimulatedPoint, ...]], seed: int) -> list[tuple[str, ...]]:
     """Return the split of each calibration point, in order: a fifth of each camera's points is held out."""
-    rng = stream(seed, Purpose.SPLIT)
-    cameras = [station.camera for stations in sets for station in stations]
+    rng = random_stream(seed, Purpose.SPLIT)
+    cameras = [point.camera for points in sets for point in points]
     splits: list[tuple[str, ...]] = [("train",)] * len(cameras)
     for camera in dict.fromkeys(cameras):
         own = [index for index, name in enumerate(cameras) if name == camera]
@@ -132,7 +132,7 @@ def split(sets: Sequence[tuple[Station, ...]], seed: int) -> list[tuple[str, ...
 
 
 def measure(
-    where: Place, settings: LabSettings, index: int, times_ns: Sequence[int], splits: tuple[str, ...]
+    where: MarkerPose, settings: LabSettings, index: int, times_ns: Sequence[int], splits: tuple[str, ...]
 ) -> Measurement:
     """Simulate the manual measurement of a marker: distances from A and B on the floor, and its height.
 
@@ -144,7 +144,7 @@ def measure(
     times_ns : times of the frames in which the marker is stationary at this pose.
     splits : splits of the calibration point, such as train or test.
     """
-    rng = stream(settings.seed, Purpose.TAPE, index)
+    rng = random_stream(settings.seed, Purpose.TAPE, index)
     distances = _tape(where, settings.tape_sigma_m, rng)
     readout_ns = (settings.height - 1) * settings.row_time_ns
     # A marker on the floor needs no ruler.
@@ -165,12 +165,12 @@ def measure(
     )
 
 
-def tape_lengths_m(where: Place) -> Array:
+def tape_lengths_m(where: MarkerPose) -> Array:
     """Return the true distances of a marker from A and B in the plane of the floor, (2,) in m."""
     return np.array([np.hypot(where.x_m - p.x_m, where.y_m - p.y_m) for p in REFERENCES])
 
 
-def _tape(where: Place, sigma_m: float, rng: np.random.Generator) -> Array:
+def _tape(where: MarkerPose, sigma_m: float, rng: np.random.Generator) -> Array:
     """Draw two distances that form a triangle with AB; repeat invalid readings."""
     a, b = REFERENCES
     true_m = tape_lengths_m(where)
@@ -191,10 +191,10 @@ def choose_place(
     cameras: Sequence[Camera],
     camera: Camera,
     marker_id: int,
-    taken: Sequence[Place],
-    before: Sequence[Place],
-    suits: Callable[[Place, Camera, LabSettings], bool] = lambda where, camera, settings: True,
-) -> Place:
+    taken: Sequence[MarkerPose],
+    before: Sequence[MarkerPose],
+    suits: Callable[[MarkerPose, Camera, LabSettings], bool] = lambda where, camera, settings: True,
+) -> MarkerPose:
     """Choose a pose in a camera's field of view, far from poses ``before``, without overlap with ``taken``.
 
     Raises
@@ -202,11 +202,11 @@ def choose_place(
     IpsysError
         The field of view has no room for the marker.
     """
-    candidates: list[Place] = []
+    candidates: list[MarkerPose] = []
     for _ in range(_DRAWS):
         x_m, y_m = rng.uniform(0, FLOOR_M, 2)
         z_m, heading_rad = rng.choice(settings.heights_m), rng.uniform(-np.pi, np.pi)
-        candidate = Place(marker_id, float(x_m), float(y_m), float(z_m), float(heading_rad))
+        candidate = MarkerPose(marker_id, float(x_m), float(y_m), float(z_m), float(heading_rad))
         if _fits(candidate, settings, cameras, camera, taken) and suits(candidate, camera, settings):
             candidates.append(candidate)
         if len(candidates) == _CANDIDATES:
@@ -220,26 +220,30 @@ def choose_place(
 
 
 def _fits(
-    where: Place, settings: LabSettings, cameras: Sequence[Camera], camera: Camera, taken: Sequence[Place]
+    where: MarkerPose,
+    settings: LabSettings,
+    cameras: Sequence[Camera],
+    camera: Camera,
+    taken: Sequence[MarkerPose],
 ) -> bool:
     if not sees(camera, _centre(where)[None])[0] or _tape_angle_deg(where) < settings.tape_angle_deg:
         return False
-    if camera.name not in seen_whole(where, (camera,), settings):
+    if camera.name not in cameras_seeing(where, (camera,), settings):
         return False
     others = np.array([_centre(other) for other in taken]).reshape(-1, 3)
     return not overlap(_centre(where), others, cameras, settings).any()
 
 
-def _tape_angle_deg(where: Place) -> float:
+def _tape_angle_deg(where: MarkerPose) -> float:
     """Return the crossing angle of the lines from A and B, 0..90 degrees: flat triangles are inaccurate."""
     to_a, to_b = (np.array([where.x_m - p.x_m, where.y_m - p.y_m]) for p in REFERENCES)
     cross = abs(to_a[0] * to_b[1] - to_a[1] * to_b[0])
     return float(np.degrees(np.arcsin(min(cross / (np.hypot(*to_a) * np.hypot(*to_b)), 1.0))))
 
 
-def _centre(where: Place) -> Array:
+def _centre(where: MarkerPose) -> Array:
     return np.array([where.x_m, where.y_m, where.z_m])
 
 
-def _distance(where: Place, before: Sequence[Place]) -> float:
+def _distance(where: MarkerPose, before: Sequence[MarkerPose]) -> float:
     return min((np.hypot(where.x_m - p.x_m, where.y_m - p.y_m) for p in before), default=np.inf)

@@ -11,9 +11,9 @@ from ipsys_log.errors import IpsysError
 from ipsys_log.geometry.lenses import project
 from ipsys_log.geometry.poses import look_down, transform
 from ipsys_log.messages import CameraCalibration
-from ipsys_log.simulation.settings import LabSettings, Purpose, stream
+from ipsys_log.simulation.settings import LabSettings, Purpose, random_stream
 
-__all__ = ["FLOOR_M", "Camera", "hang_cameras", "sees"]
+__all__ = ["FLOOR_M", "Camera", "mount_cameras", "sees"]
 
 Array = NDArray[np.float64]
 
@@ -44,7 +44,7 @@ class Camera:
         return origin
 
 
-def hang_cameras(settings: LabSettings, time_ns: int = 0) -> tuple[Camera, ...]:
+def mount_cameras(settings: LabSettings, time_ns: int = 0) -> tuple[Camera, ...]:
     """Return the cameras in a row above the middle of the floor.
 
     Parameters
@@ -60,7 +60,7 @@ def hang_cameras(settings: LabSettings, time_ns: int = 0) -> tuple[Camera, ...]:
     count = len(settings.cameras)
     spacing_m = (FLOOR_M - 2 * _FROM_WALL_M) / max(count - 1, 2)
     ys_m = FLOOR_M / 2 + spacing_m * (np.arange(count) - (count - 1) / 2)
-    return tuple(_hang(settings, index, float(y_m), spacing_m, time_ns) for index, y_m in enumerate(ys_m))
+    return tuple(_mount(settings, index, float(y_m), spacing_m, time_ns) for index, y_m in enumerate(ys_m))
 
 
 def sees(camera: Camera, points_m: Array) -> NDArray[np.bool_]:
@@ -74,9 +74,9 @@ def sees(camera: Camera, points_m: Array) -> NDArray[np.bool_]:
     return inside
 
 
-def _hang(settings: LabSettings, index: int, y_m: float, spacing_m: float, time_ns: int) -> Camera:
+def _mount(settings: LabSettings, index: int, y_m: float, spacing_m: float, time_ns: int) -> Camera:
     """Draw intrinsics and poses of a camera until it sees its part of the floor."""
-    rng = stream(settings.seed, Purpose.CAMERA, index)
+    rng = random_stream(settings.seed, Purpose.CAMERA, index)
     name = settings.cameras[index]
     wanted_m = _part_of_floor(settings, y_m, spacing_m)
     for _ in range(_TRIES):

@@ -11,9 +11,9 @@ from dataclasses import dataclass, replace
 import numpy as np
 from numpy.typing import NDArray
 
-from ipsys_log.simulation.calibration_points import Place, overlap
+from ipsys_log.simulation.calibration_points import MarkerPose, overlap
 from ipsys_log.simulation.cameras import FLOOR_M, Camera
-from ipsys_log.simulation.settings import LabSettings, Purpose, stream
+from ipsys_log.simulation.settings import LabSettings, Purpose, random_stream
 
 __all__ = ["Drive", "plan_drive"]
 
@@ -47,15 +47,15 @@ class Drive:
     times_s: Array
     phases_rad: Array
 
-    def places_at(self, time_s: float) -> tuple[Place, ...]:
+    def poses_at(self, time_s: float) -> tuple[MarkerPose, ...]:
         """Return the poses of all markers at a time after the start; before it, they are stationary."""
-        return tuple(self.place_at(marker_id, time_s) for marker_id in self.ahead_s)
+        return tuple(self.pose_at(marker_id, time_s) for marker_id in self.ahead_s)
 
-    def place_at(self, marker_id: int, time_s: float) -> Place:
+    def pose_at(self, marker_id: int, time_s: float) -> MarkerPose:
         """Return the pose of one marker at a time after the start."""
         (x_m, y_m), (dx, dy) = self._follow(self.ahead_s[marker_id], np.array([max(time_s, 0.0)]))
         heading_rad = float(np.arctan2(dy[0], dx[0]))
-        return Place(marker_id, float(x_m[0]), float(y_m[0]), self.height_m, heading_rad)
+        return MarkerPose(marker_id, float(x_m[0]), float(y_m[0]), self.height_m, heading_rad)
 
     def track(self, ahead_s: float, times_s: Array) -> Array:
         """Return the centres of a marker at times (n,): (n, 3) in m."""
@@ -73,7 +73,7 @@ def plan_drive(settings: LabSettings, cameras: Sequence[Camera]) -> Drive:
 
     Marker 0 starts at a wall.
     """
-    rng = stream(settings.seed, Purpose.DRIVE)
+    rng = random_stream(settings.seed, Purpose.DRIVE)
     mirrored = bool(rng.integers(2))
     empty = Drive(settings.drive_height_m, mirrored, {}, *_timetable(settings.drive_speed_m_s))
     times_s = np.arange(0, settings.drive_s + 1 / _CHECKED_HZ, 1 / _CHECKED_HZ)

@@ -13,7 +13,7 @@ from numpy.typing import NDArray
 from ipsys_log.geometry.lenses import undistort
 from ipsys_log.messages import CameraCalibration
 from ipsys_log.simulation.cameras import Camera
-from ipsys_log.simulation.settings import LabSettings, Purpose, stream
+from ipsys_log.simulation.settings import LabSettings, Purpose, random_stream
 
 __all__ = ["FIELD_PX", "Check", "View", "lay_floor", "pixel_rays", "prepare_view", "to_light"]
 
@@ -89,7 +89,7 @@ def _lay_rows(settings: LabSettings, camera: Camera, rays: Array) -> Plane:
 
 def _boards(settings: LabSettings, x_m: Array, y_m: Array) -> Array:
     """Return grey levels of wood with its grain along y; each board has its own shade and grain."""
-    rng = stream(settings.seed, Purpose.FLOOR, 0)
+    rng = random_stream(settings.seed, Purpose.FLOOR, 0)
     shades, shifts_m = rng.uniform(-5, 5, _BOARDS), rng.uniform(0, _TILE_M, _BOARDS)
     column = np.clip((x_m / _BOARD_M[0]).astype(int), 0, _BOARDS[0] - 1)
     row = np.clip((y_m / _BOARD_M[1]).astype(int), 0, _BOARDS[1] - 1)
@@ -123,7 +123,7 @@ def _noise_at(settings: LabSettings, which: int, x_m: Array, y_m: Array, stretch
 @lru_cache(maxsize=4)
 def _noise_tile(seed: int, which: int) -> Plane:
     """Return the tile that :func:`_noise_at` repeats; all cameras of a lab share it."""
-    white = stream(seed, Purpose.FLOOR, which).standard_normal((_TILE, _TILE))
+    white = random_stream(seed, Purpose.FLOOR, which).standard_normal((_TILE, _TILE))
     # The filter is a convolution on the torus, so the tile repeats without a seam.
     fy, fx = np.fft.fftfreq(_TILE)[:, None], np.fft.rfftfreq(_TILE)[None, :]
     soft = np.exp(-2 * (np.pi * 1.2) ** 2 * ((fx) ** 2 + (fy) ** 2)) / (1 + 60 * np.hypot(fx, fy))
@@ -167,7 +167,7 @@ def prepare_view(camera: Camera, settings: LabSettings, check: Check = lambda: N
         behind = cv2.GaussianBlur(behind, (0, 0), settings.psf_sigma_px).astype(np.float32)
     inner = slice(border_px, -border_px)
     index = settings.cameras.index(camera.name) if camera.name in settings.cameras else len(settings.cameras)
-    rng = stream(settings.seed, Purpose.NOISE_FIELD, index)
+    rng = random_stream(settings.seed, Purpose.NOISE_FIELD, index)
     size = (camera.lens.height + FIELD_PX, camera.lens.width + FIELD_PX)
     noise = rng.standard_normal(size, dtype=np.float32) * np.float32(settings.noise_sigma)
     return View(camera, border_px, rays, np.ascontiguousarray(behind[inner, inner]), noise)

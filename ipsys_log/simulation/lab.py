@@ -7,7 +7,7 @@ from concurrent.futures import ThreadPoolExecutor
 from dataclasses import dataclass
 from typing import Any
 
-from ipsys_log.geometry.marker_cells import Moving, Placed
+from ipsys_log.geometry.marker_cells import MovingMarker, PlacedMarker
 from ipsys_log.messages import (
     MEASUREMENTS_TOPIC,
     RIG_TOPIC,
@@ -26,22 +26,22 @@ from ipsys_log.messages import (
 )
 from ipsys_log.simulation.calibration_points import (
     REFERENCES,
-    Place,
+    MarkerPose,
+    cameras_seeing,
     measure,
-    place,
-    plan_stations,
-    seen_whole,
+    place_marker,
+    plan_points,
     split,
 )
-from ipsys_log.simulation.cameras import FLOOR_M, Camera, hang_cameras
+from ipsys_log.simulation.cameras import FLOOR_M, Camera, mount_cameras
 from ipsys_log.simulation.drive import Drive, plan_drive
 from ipsys_log.simulation.floor import View, prepare_view
-from ipsys_log.simulation.pixel_shares import exposed
+from ipsys_log.simulation.pixel_shares import exposure_interval
 from ipsys_log.simulation.render import encode_jpeg, render
-from ipsys_log.simulation.settings import LabSettings, Purpose, stream
+from ipsys_log.simulation.settings import LabSettings, Purpose, random_stream
 from ipsys_log.units import NS_PER_S
 
-__all__ = ["EPOCH_NS", "build_rig", "drive_start_ns", "driving", "simulate"]
+__all__ = ["EPOCH_NS", "build_rig", "drive_start_ns", "moving_marker", "simulate"]
 
 # Start of the simulated clock: 2023-11-14 22:13:20 UTC.
 EPOCH_NS = 1_700_000_000 * NS_PER_S
@@ -60,8 +60,8 @@ class Instant:
     """
 
     time_ns: int
-    places: tuple[Place, ...]
-    prints: tuple[Placed | Moving, ...]
+    places: tuple[MarkerPose, ...]
+    prints: tuple[PlacedMarker | MovingMarker, ...]
     measured: tuple[Measurement, ...] = ()
 
 
@@ -99,7 +99,7 @@ def simulate(
     ['/rig', '/cameras/red/calibration', '/truth/tracks', '/cameras/red/image']
     """
     log_time_ns = EPOCH_NS
-    latency_ns = _LATENCY_NS + round(exposed(0, settings.height - 1, settings)[1] * NS_PER_S)
+    latency_ns = _LATENCY_NS + round(exposure_interval(0, settings.height - 1, settings)[1] * NS_PER_S)
     for topic, payload, publish_time_ns, camera in _payloads(settings, progress):
         log_time_ns = max(publish_time_ns + latency_ns, log_time_ns + 1)
         yield Message(topic, log_time_ns, publish_time_ns, payload, camera)
@@ -128,7 +128,7 @@ def drive_start_ns(settings: LabSettings, cameras: Sequence[Camera]) -> int:
     Parameters
     ----------
     settings : settings of the lab.
-    cameras : from :func:`~ipsys_log.simulation.cameras.hang_cameras`.
+    cameras : from :func:`~ipsys_log.simulation.cameras.mount_cameras`.
 
     Returns
     -------
@@ -137,18 +137,18 @@ def drive_start_ns(settings: LabSettings, cameras: Sequence[Camera]) -> int:
     Examples
     --------
     >>> lab = LabSettings(stations=0, drive_s=2.0, markers=1)
-    >>> cameras = hang_cameras(lab)
+    >>> cameras = mount_cameras(lab)
     >>> (drive_start_ns(lab, cameras) - EPOCH_NS) / NS_PER_S
     1.0
     """
-    return _start_ns(settings, len(plan_stations(settings, cameras)))
+    return _start_ns(settings, len(plan_points(settings, cameras)))
 
 
 def _payloads(
     settings: LabSettings, progress: Callable[[str, int, int], None]
 ) -> Iterator[tuple[str, Any, int, str | None]]:
     rig = build_rig(settings)
-    cameras = hang_cameras(settings, EPOCH_NS)
+    cameras = mount_cameras(settings, EPOCH_NS)
     yield RIG_TOPIC, rig, EPOCH_NS, None
     for camera in cameras:
         yield calibration_topic(camera.name), camera.lens, EPOCH_NS, camera.name
@@ -178,17 +178,17 @@ class _Shutter:
     index: int
 
     def __call__(self, number: int, view: View) -> CompressedImage:
-        rng = stream(self.settings.seed, Purpose.FRAME, number, self.index)
+        rng = random_stream(self.settings.seed, Purpose.FRAME, number, self.index)
         data = encode_jpeg(render(view, self.instant.prints, self.settings, rng), self.settings)
         return CompressedImage(self.instant.time_ns, view.camera.name, data, "jpeg")
 
 
 def _instants(settings: LabSettings, cameras: Sequence[Camera]) -> Iterator[Instant]:
-    sets = plan_stations(settings, cameras)
+    sets = plan_points(settings, cameras)
     splits = split(sets, settings.seed)
-    for number, stations in enumerate(sets):
-        places = tuple(station.place for station in stations)
-        lying = tuple(place(pose, settings) for pose in places)
+    for number, points in enumerate(sets):
+        places = tuple(point.pose for point in points)
+        lying = tuple(place_marker(pose, settings) for pose in places)
         times_ns = _times(settings, _start_ns(settings, number), settings.frames_per_station)
         first = number * settings.markers
         measured = tuple(
@@ -201,13 +201,13 @@ def _instants(settings: LabSettings, cameras: Sequence[Camera]) -> Iterator[Inst
     drive, start_ns = plan_drive(settings, cameras), _start_ns(settings, len(sets))
     for time_ns in _times(settings, start_ns, round(settings.drive_s * settings.rate_hz)):
         time_s = (time_ns - start_ns) / NS_PER_S
-        prints = tuple(driving(drive, marker_id, time_s, settings) for marker_id in drive.ahead_s)
-        yield Instant(time_ns, drive.places_at(time_s), prints)
+        prints = tuple(moving_marker(drive, marker_id, time_s, settings) for marker_id in drive.ahead_s)
+        yield Instant(time_ns, drive.poses_at(time_s), prints)
 
 
-def driving(drive: Drive, marker_id: int, time_s: float, settings: LabSettings) -> Moving:
+def moving_marker(drive: Drive, marker_id: int, time_s: float, settings: LabSettings) -> MovingMarker:
     """Return a moving marker of the drive, for the frame at a time after the start."""
-    return lambda since_s: place(drive.place_at(marker_id, time_s + since_s), settings)
+    return lambda since_s: place_marker(drive.pose_at(marker_id, time_s + since_s), settings)
 
 
 def _start_ns(settings: LabSettings, number: int) -> int:
@@ -231,7 +231,7 @@ def _truth(instant: Instant, rig: Rig, cameras: Sequence[Camera], settings: LabS
                 y_m=pose.y_m,
                 z_m=pose.z_m,
                 heading_rad=pose.heading_rad,
-                cameras=seen_whole(pose, cameras, settings),
+                cameras=cameras_seeing(pose, cameras, settings),
             )
             for pose in instant.places
         ),

@@ -15,24 +15,24 @@ import numpy as np
 
 from ipsys_log.calibration.board import Board
 from ipsys_log.errors import IpsysError
-from ipsys_log.geometry.marker_cells import true_corners
+from ipsys_log.geometry.marker_cells import project_corners
 from ipsys_log.messages import Rig, RigCamera, RigMarker
 from ipsys_log.rig.checks import dictionary_size
-from ipsys_log.simulation.board import hold_board
+from ipsys_log.simulation.board import board_poses
 from ipsys_log.simulation.calibration_points import (
     REFERENCES,
-    Place,
+    MarkerPose,
+    cameras_seeing,
     choose_place,
-    place,
-    seen_whole,
+    place_marker,
     tape_lengths_m,
 )
-from ipsys_log.simulation.cameras import Camera, hang_cameras
+from ipsys_log.simulation.cameras import Camera, mount_cameras
 from ipsys_log.simulation.drive import Drive, plan_drive
 from ipsys_log.simulation.floor import Check, View, prepare_view
-from ipsys_log.simulation.lab import build_rig, driving
-from ipsys_log.simulation.render import Print, encode_jpeg, lay_down, render
-from ipsys_log.simulation.settings import LabSettings, Purpose, stream
+from ipsys_log.simulation.lab import build_rig, moving_marker
+from ipsys_log.simulation.render import Print, add_static_prints, encode_jpeg, render
+from ipsys_log.simulation.settings import LabSettings, Purpose, random_stream
 from ipsys_log.units import CM_PER_M
 
 __all__ = [
@@ -40,11 +40,11 @@ __all__ = [
     "Film",
     "LiveLab",
     "board_film",
+    "image_index",
     "lab_film",
     "live_rig",
     "next_missing",
     "plan_live_lab",
-    "shown_at",
     "tape_sheet",
 ]
 
@@ -71,7 +71,7 @@ class LiveLab:
 
     settings: LabSettings
     drive: Drive
-    lying: tuple[Place, ...]
+    stationary: tuple[MarkerPose, ...]
 
 
 def plan_live_lab(settings: LabSettings) -> LiveLab:
@@ -89,48 +89,48 @@ def plan_live_lab(settings: LabSettings) -> LiveLab:
     Examples
     --------
     >>> lab = plan_live_lab(LabSettings(stations=4, markers=2, drive_s=2.0))
-    >>> [place.marker_id for place in lab.lying][:3], sorted(lab.drive.ahead_s)
+    >>> [place.marker_id for place in lab.stationary][:3], sorted(lab.drive.ahead_s)
     ([2, 3, 4], [0, 1])
     """
     shape = replace(settings, width=_WIDTH, height=_HEIGHT, rate_hz=LIVE_SETTINGS.rate_hz)
     with _planning:  # the cameras of a lab open at the same time, and share one plan
-        drive, lying = _plan(shape)
-    return LiveLab(settings, drive, lying)
+        drive, stationary = _plan(shape)
+    return LiveLab(settings, drive, stationary)
 
 
 @lru_cache(maxsize=4)
-def _plan(settings: LabSettings) -> tuple[Drive, tuple[Place, ...]]:
-    cameras = hang_cameras(settings)
+def _plan(settings: LabSettings) -> tuple[Drive, tuple[MarkerPose, ...]]:
+    cameras = mount_cameras(settings)
     drive = plan_drive(settings, cameras)
     times_s = np.linspace(0, settings.drive_s, round(settings.drive_s * _CHECKED_HZ) + 1).tolist()
-    taken = [pose for time_s in times_s for pose in drive.places_at(time_s)]
-    rng = stream(settings.seed, Purpose.LYING)
-    seen: dict[str, list[Place]] = {camera.name: [] for camera in cameras}
-    lying: list[Place] = []
+    taken = [pose for time_s in times_s for pose in drive.poses_at(time_s)]
+    rng = random_stream(settings.seed, Purpose.LYING)
+    seen: dict[str, list[MarkerPose]] = {camera.name: [] for camera in cameras}
+    stationary: list[MarkerPose] = []
     while min(map(len, seen.values())) < settings.stations:
         camera = min(cameras, key=lambda one: len(seen[one.name]))
-        number = settings.markers + len(lying)
+        number = settings.markers + len(stationary)
         _check_left(settings, number)
-        level = replace(settings, heights_m=(_next_height_m(lying, seen[camera.name]),))
-        others = [*taken, *lying]
+        level = replace(settings, heights_m=(_next_height_m(stationary, seen[camera.name]),))
+        others = [*taken, *stationary]
         pose = choose_place(rng, level, cameras, camera, number, others, seen[camera.name], _is_wide)
-        lying.append(pose)
-        for name in seen_whole(pose, cameras, settings):
+        stationary.append(pose)
+        for name in cameras_seeing(pose, cameras, settings):
             seen[name].append(pose)
-    return drive, tuple(lying)
+    return drive, tuple(stationary)
 
 
-def _next_height_m(lying: Sequence[Place], seen: Sequence[Place]) -> float:
+def _next_height_m(stationary: Sequence[MarkerPose], seen: Sequence[MarkerPose]) -> float:
     """Return the height of the next marker: each camera sees only a small share of raised markers."""
     raised = sum(pose.z_m > 0 for pose in seen)
     if raised >= _RAISED_SHARE * len(seen):
         return 0.0
-    return _BOXES_M[sum(pose.z_m > 0 for pose in lying) % len(_BOXES_M)]
+    return _BOXES_M[sum(pose.z_m > 0 for pose in stationary) % len(_BOXES_M)]
 
 
-def _is_wide(where: Place, camera: Camera, settings: LabSettings) -> bool:
+def _is_wide(where: MarkerPose, camera: Camera, settings: LabSettings) -> bool:
     """Return whether a marker is wide enough in the image of a camera with a slanted view."""
-    corners_px = true_corners(camera.lens, camera.camera_from_world, place(where, settings))
+    corners_px = project_corners(camera.lens, camera.camera_from_world, place_marker(where, settings))
     area_px = cv2.contourArea(corners_px.astype(np.float32))
     longest_px = np.linalg.norm(np.roll(corners_px, -1, axis=0) - corners_px, axis=1).max()
     return bool(area_px / longest_px >= _NARROWEST_PX)
@@ -149,28 +149,28 @@ def _check_left(settings: LabSettings, number: int) -> None:
 def live_rig(settings: LabSettings) -> Rig:
     """Return the rig of the live lab: each camera with its source, each marker with its height."""
     rig = build_rig(settings)
-    lying = plan_live_lab(settings).lying
+    stationary = plan_live_lab(settings).stationary
     cameras = (
         RigCamera(name, None, None, f"sim:{name}", settings.width, settings.height, settings.rate_hz)
         for name in settings.cameras
     )
-    still = (RigMarker(pose.marker_id, height_m=pose.z_m) for pose in lying)
+    still = (RigMarker(pose.marker_id, height_m=pose.z_m) for pose in stationary)
     return replace(rig, cameras=tuple(cameras), markers=(*rig.markers, *still))
 
 
-def tape_sheet(lying: Sequence[Place]) -> str:
+def tape_sheet(stationary: Sequence[MarkerPose]) -> str:
     """Return the tape and ruler readings of stationary markers, as a sheet for ``ipsys measure --csv``.
 
     Examples
     --------
-    >>> print(tape_sheet([Place(3, 1.2192, 3.4384, 0.1, 0.0)]))
+    >>> print(tape_sheet([MarkerPose(3, 1.2192, 3.4384, 0.1, 0.0)]))
     marker,d_A_cm,d_B_cm,side,height_cm
     3,100.0,263.5,left,10.0
     <BLANKLINE>
     """
     a, b = REFERENCES
     rows = [f"marker,d_{a.name}_cm,d_{b.name}_cm,side,height_cm"]
-    for pose in lying:
+    for pose in stationary:
         tapes = ",".join(f"{CM_PER_M * length_m:.1f}" for length_m in tape_lengths_m(pose).tolist())
         side = "left" if pose.y_m >= a.y_m else "right"
         rows.append(f"{pose.marker_id},{tapes},{side},{CM_PER_M * pose.z_m:.1f}")
@@ -207,13 +207,13 @@ def lab_film(settings: LabSettings, number: int, check: Check) -> Film:
     lab = plan_live_lab(settings)
     count = max(round(settings.drive_s * settings.rate_hz), 1)
     check()
-    bare = prepare_view(hang_cameras(settings)[number], settings, check)
-    view = lay_down(bare, [place(pose, settings) for pose in lab.lying], settings)
+    bare = prepare_view(mount_cameras(settings)[number], settings, check)
+    view = add_static_prints(bare, [place_marker(pose, settings) for pose in lab.stationary], settings)
 
     def draw(index: int) -> bytes:
-        return _picture(view, _driving(lab, index), settings, number, index)
+        return _picture(view, _moving_marker(lab, index), settings, number, index)
 
-    return Film(count, max(2 * count - 2, 1), draw, lambda frame: shown_at(frame, count))
+    return Film(count, max(2 * count - 2, 1), draw, lambda frame: image_index(frame, count))
 
 
 def board_film(settings: LabSettings, number: int, board: Board, check: Check) -> Film:
@@ -224,8 +224,8 @@ def board_film(settings: LabSettings, number: int, board: Board, check: Check) -
     settings, number, check : as for :func:`lab_film`.
     board : the calibration board.
     """
-    camera = hang_cameras(settings)[number]
-    poses = hold_board(board, camera, settings)
+    camera = mount_cameras(settings)[number]
+    poses = board_poses(board, camera, settings)
     view = prepare_view(camera, settings, check)
     frames_per_pose = max(round(_HOLD_S * settings.rate_hz), 1)
 
@@ -237,12 +237,12 @@ def board_film(settings: LabSettings, number: int, board: Board, check: Check) -
     )
 
 
-def shown_at(frame: int, count: int) -> int:
+def image_index(frame: int, count: int) -> int:
     """Return the index of the image, of ``count`` images, for a frame number: back and forth.
 
     Examples
     --------
-    >>> [shown_at(frame, 4) for frame in range(8)]
+    >>> [image_index(frame, 4) for frame in range(8)]
     [0, 1, 2, 3, 2, 1, 0, 1]
     """
     turn = frame % max(2 * count - 2, 1)
@@ -254,7 +254,7 @@ def next_missing(film: Film, drawn: Container[int], frame: int) -> int | None:
 
     Examples
     --------
-    >>> film = Film(4, 6, lambda index: b"", lambda frame: shown_at(frame, 4))
+    >>> film = Film(4, 6, lambda index: b"", lambda frame: image_index(frame, 4))
     >>> next_missing(film, {2, 3}, 2), next_missing(film, {0, 1, 2, 3}, 2)
     (1, None)
     """
@@ -262,11 +262,11 @@ def next_missing(film: Film, drawn: Container[int], frame: int) -> int | None:
     return next((index for index in indices if index not in drawn), None)
 
 
-def _driving(lab: LiveLab, index: int) -> list[Print]:
+def _moving_marker(lab: LiveLab, index: int) -> list[Print]:
     time_s = index / lab.settings.rate_hz
-    return [driving(lab.drive, marker_id, time_s, lab.settings) for marker_id in lab.drive.ahead_s]
+    return [moving_marker(lab.drive, marker_id, time_s, lab.settings) for marker_id in lab.drive.ahead_s]
 
 
 def _picture(view: View, prints: list[Print], settings: LabSettings, number: int, index: int) -> bytes:
-    rng = stream(settings.seed, Purpose.FRAME, number, index)
+    rng = random_stream(settings.seed, Purpose.FRAME, number, index)
     return encode_jpeg(render(view, prints, settings, rng), settings)

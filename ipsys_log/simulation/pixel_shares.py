@@ -22,13 +22,19 @@ import numpy as np
 from numpy.typing import NDArray
 
 from ipsys_log.geometry.lenses import project
-from ipsys_log.geometry.marker_cells import Moving, Placed, PlacedBoard, print_outline, printed_cells
+from ipsys_log.geometry.marker_cells import (
+    MovingMarker,
+    PlacedBoard,
+    PlacedMarker,
+    print_outline,
+    printed_cells,
+)
 from ipsys_log.geometry.poses import transform
 from ipsys_log.simulation.floor import View
 from ipsys_log.simulation.settings import LabSettings
 from ipsys_log.units import NS_PER_S
 
-__all__ = ["Box", "Shares", "exposed", "find_shares", "instants", "row_shares"]
+__all__ = ["Box", "Shares", "exposure_interval", "find_shares", "row_shares", "sample_times"]
 
 Array = NDArray[np.float64]
 
@@ -38,13 +44,13 @@ _STEP_PX = 0.125
 _SHORTEST_S = 1e-9
 
 
-def exposed(first_row: int, last_row: int, settings: LabSettings) -> tuple[float, float]:
+def exposure_interval(first_row: int, last_row: int, settings: LabSettings) -> tuple[float, float]:
     """Return start and end of the exposure of rows, in s after the time of the frame."""
     row_s, half_s = settings.row_time_ns / NS_PER_S, settings.exposure_s / 2
     return first_row * row_s - half_s, last_row * row_s + half_s
 
 
-def instants(start_s: float, end_s: float, speed_px_s: float, settings: LabSettings) -> Array:
+def sample_times(start_s: float, end_s: float, speed_px_s: float, settings: LabSettings) -> Array:
     """Return evenly spaced times (n,) in s from start to end, with small steps of a motion.
 
     Without motion, return one time.
@@ -67,7 +73,7 @@ def row_shares(times_s: Array, rows: NDArray[np.int_], settings: LabSettings) ->
 
     Parameters
     ----------
-    times_s : (n,) from :func:`instants`.
+    times_s : (n,) from :func:`sample_times`.
     rows : (m,), row numbers; 0 is the first row of the frame.
     settings : row time and length of an exposure.
 
@@ -111,21 +117,23 @@ class Shares:
     dark: Plane
 
 
-def find_shares(view: View, placed: Placed | PlacedBoard | Moving, settings: LabSettings) -> Shares | None:
+def find_shares(
+    view: View, placed: PlacedMarker | PlacedBoard | MovingMarker, settings: LabSettings
+) -> Shares | None:
     """Return the shares of a print; None if the print is not in the image."""
-    if isinstance(placed, (Placed, PlacedBoard)):
+    if isinstance(placed, (PlacedMarker, PlacedBoard)):
         return _still(view, placed, settings)
     if not (settings.row_time_ns or settings.exposure_s):
         return _still(view, placed(0.0), settings)
     return _moving(view, placed, settings)
 
 
-def _still(view: View, placed: Placed | PlacedBoard, settings: LabSettings) -> Shares | None:
+def _still(view: View, placed: PlacedMarker | PlacedBoard, settings: LabSettings) -> Shares | None:
     box = _box_of(view, placed, settings)
     return None if box is None else Shares(box, *_print_shares(view, placed, box, settings))
 
 
-def _moving(view: View, moving: Moving, settings: LabSettings) -> Shares | None:
+def _moving(view: View, moving: MovingMarker, settings: LabSettings) -> Shares | None:
     """Return the shares of a moving print: in each row, the mean over the exposure of the row."""
     path = _path(view, moving, settings)
     if path is None:
@@ -133,7 +141,7 @@ def _moving(view: View, moving: Moving, settings: LabSettings) -> Shares | None:
     whole, speed_px_s = path
     rows = np.arange(whole[0].start, whole[0].stop) - view.border_px
     seen = np.clip(rows[[0, -1]], 0, view.camera.lens.height - 1).tolist()
-    times_s = instants(*exposed(seen[0], seen[1], settings), speed_px_s, settings)
+    times_s = sample_times(*exposure_interval(seen[0], seen[1], settings), speed_px_s, settings)
     cover, dark = np.zeros((2, len(rows), whole[1].stop - whole[1].start), dtype=np.float32)
     for time_s, weights in zip(times_s.tolist(), row_shares(times_s, rows, settings), strict=True):
         placed = moving(time_s)
@@ -147,9 +155,9 @@ def _moving(view: View, moving: Moving, settings: LabSettings) -> Shares | None:
     return Shares(whole, cover, dark)
 
 
-def _path(view: View, moving: Moving, settings: LabSettings) -> tuple[Box, float] | None:
+def _path(view: View, moving: MovingMarker, settings: LabSettings) -> tuple[Box, float] | None:
     """Return the box of a moving print during a frame, and the speed of its fastest point in px/s."""
-    start_s, end_s = exposed(0, view.camera.lens.height - 1, settings)
+    start_s, end_s = exposure_interval(0, view.camera.lens.height - 1, settings)
     outlines_px = []
     for time_s in np.linspace(start_s, end_s, _PATH_INSTANTS).tolist():
         outline_px = _outline_px(view, moving(time_s), settings)
@@ -177,12 +185,12 @@ def _part(box: Box | None, whole: Box, weights: Array, settings: LabSettings) ->
     )
 
 
-def _box_of(view: View, placed: Placed | PlacedBoard, settings: LabSettings) -> Box | None:
+def _box_of(view: View, placed: PlacedMarker | PlacedBoard, settings: LabSettings) -> Box | None:
     outline_px = _outline_px(view, placed, settings)
     return None if outline_px is None else _box(view, outline_px, settings)
 
 
-def _outline_px(view: View, placed: Placed | PlacedBoard, settings: LabSettings) -> Array | None:
+def _outline_px(view: View, placed: PlacedMarker | PlacedBoard, settings: LabSettings) -> Array | None:
     """Return points around a print, (n, 2) in px; None if some of them are not in front of the camera."""
     outline_m = print_outline(placed, settings.dictionary)
     outline_m = transform(view.camera.camera_from_world, outline_m)
@@ -209,7 +217,7 @@ def _box(view: View, px: Array, settings: LabSettings) -> Box | None:
 
 
 def _print_shares(
-    view: View, placed: Placed | PlacedBoard, box: Box, settings: LabSettings
+    view: View, placed: PlacedMarker | PlacedBoard, box: Box, settings: LabSettings
 ) -> tuple[Plane, Plane]:
     """Return the shares of each pixel's light from the print and from its black cells, (h, w) each."""
     black, cells_per_m = printed_cells(placed, settings.dictionary)

@@ -13,17 +13,17 @@ import cv2
 import numpy as np
 from numpy.typing import NDArray
 
-from ipsys_log.geometry.marker_cells import Moving, Placed, PlacedBoard
+from ipsys_log.geometry.marker_cells import MovingMarker, PlacedBoard, PlacedMarker
 from ipsys_log.simulation.floor import FIELD_PX, View, to_light
 from ipsys_log.simulation.pixel_shares import Box, find_shares
 from ipsys_log.simulation.settings import LabSettings
 
-__all__ = ["Print", "encode_jpeg", "expose", "lay_down", "render"]
+__all__ = ["Print", "add_static_prints", "encode_jpeg", "expose", "render"]
 
 Plane = NDArray[np.float32]
 Image = NDArray[np.uint8]
 # Objects in an image.
-Print = Placed | PlacedBoard | Moving
+Print = PlacedMarker | PlacedBoard | MovingMarker
 
 # Grey levels that a warm lamp subtracts from the blue of the floor and adds to its red.
 _BLUE, _RED = 9, 6
@@ -68,7 +68,7 @@ def expose(view: View, placed: Sequence[Print], settings: LabSettings) -> Plane:
     return _compose(view, placed, settings)[0]
 
 
-def lay_down(view: View, placed: Sequence[Placed], settings: LabSettings) -> View:
+def add_static_prints(view: View, placed: Sequence[PlacedMarker], settings: LabSettings) -> View:
     """Return a view whose floor contains stationary prints, so the renderer does not draw them again."""
     grey, bare = _compose(view, placed, settings)
     return replace(view, floor=to_light(grey, settings), bare=bare)

@@ -12,7 +12,7 @@ import numpy as np
 from ipsys_log.errors import IpsysError
 from ipsys_log.rig.file import check_name
 
-__all__ = ["LabSettings", "Purpose", "stream"]
+__all__ = ["LabSettings", "Purpose", "random_stream"]
 
 
 class Purpose(IntEnum):
@@ -30,7 +30,7 @@ class Purpose(IntEnum):
     LYING = 10
 
 
-def stream(seed: int, purpose: Purpose, *which: int) -> np.random.Generator:
+def random_stream(seed: int, purpose: Purpose, *which: int) -> np.random.Generator:
     """Return the random generator for a purpose, and for one camera or frame of it."""
     return np.random.default_rng([seed, int(purpose), *which])
 

@@ -19,7 +19,7 @@ from ipsys_log.geometry.markers import (
     pixel_slopes,
     whiten,
 )
-from ipsys_log.geometry.square_pose import fit_squares, goes_around, reprojection_px
+from ipsys_log.geometry.square_pose import fit_squares, is_convex, reprojection_px
 from ipsys_log.messages import (
     CameraCalibration,
     CameraPoint,
@@ -192,7 +192,7 @@ class _Method(NamedTuple):
 
 METHODS = {
     PERIMETER: _Method(lambda uv: bool((uv != uv[0]).any()), _by_perimeter),
-    "pose": _Method(goes_around, _by_pose),
+    "pose": _Method(is_convex, _by_pose),
 }
 
 

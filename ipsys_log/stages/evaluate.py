@@ -8,7 +8,7 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import NDArray
 
-from ipsys_log.analysis.accuracy import errors_cross_validated, errors_held_out
+from ipsys_log.analysis.accuracy import evaluate_cross_validated, evaluate_held_out
 from ipsys_log.analysis.calibration_points import (
     find_pairs,
     has_measurements,
@@ -19,7 +19,7 @@ from ipsys_log.analysis.calibration_points import (
 from ipsys_log.analysis.cross_validation import (
     FOLDS,
     REPEATS,
-    gather_places,
+    gather_points,
     labelled_subsets,
     learning_curve,
     learning_sizes,
@@ -27,13 +27,13 @@ from ipsys_log.analysis.cross_validation import (
     published_curve,
 )
 from ipsys_log.analysis.ground_truth import gather_tracks, true_points
-from ipsys_log.analysis.outliers import find_suspects
-from ipsys_log.analysis.pairs import Measured
+from ipsys_log.analysis.outliers import find_outliers
+from ipsys_log.analysis.pairs import RiggedMeasurement
 from ipsys_log.errors import FitError
 from ipsys_log.messages import Evaluation, LearningPoint, Model, Pair, Suspect
 from ipsys_log.messages.channels import CAMERA_POINTS, EVALUATION, MEASUREMENTS, MODEL, RIG, TRUTH
 from ipsys_log.messages.stage import Plan, Progress, Stage, View
-from ipsys_log.models.table import Places, min_pairs
+from ipsys_log.models.table import CalibrationPoints, min_pairs
 
 __all__ = ["SCREENING", "STAGE", "Study", "can_evaluate", "evaluate_model"]
 
@@ -56,7 +56,7 @@ class Study:
     seed : of folds and random subsets; None for a model of another log, which is not fitted again.
     """
 
-    places: Sequence[Measured]
+    places: Sequence[RiggedMeasurement]
     pairs: Mapping[str, Sequence[Pair]]
     held_out: set[str]
     subsets: Mapping[str, set[str]]
@@ -80,19 +80,19 @@ def evaluate_model(
         camera: [pair for pair in camera_pairs if pair.measurement in study.held_out]
         for camera, camera_pairs in study.pairs.items()
     }
-    rows = errors_held_out(model, held_out, study.truth)
+    rows = evaluate_held_out(model, held_out, study.truth)
     learning: list[LearningPoint] = []
     suspects: tuple[Suspect, ...] = ()
     if study.seed is not None:
         fitted = {camera.camera for camera in model.cameras}
         pairs = {camera: camera_pairs for camera, camera_pairs in study.pairs.items() if camera in fitted}
-        cameras = gather_places(pairs)
+        cameras = gather_points(pairs)
         sizes = learning_sizes(model.name, cameras)
         total = 2 + len(sizes)
         progress(0, total)
         if _enough(model.name, pairs, notes):
             try:
-                rows += errors_cross_validated(model, pairs, study.truth, study.seed)
+                rows += evaluate_cross_validated(model, pairs, study.truth, study.seed)
             except FitError as error:
                 notes.append(f"no cross-validation: {error}")
         progress(1, total)
@@ -116,12 +116,14 @@ def _enough(name: str, pairs: Mapping[str, Sequence[Pair]], notes: list[str]) ->
     return True
 
 
-def _suspects(name: str, cameras: Mapping[str, Places], places: Sequence[Measured]) -> tuple[Suspect, ...]:
+def _suspects(
+    name: str, cameras: Mapping[str, CalibrationPoints], places: Sequence[RiggedMeasurement]
+) -> tuple[Suspect, ...]:
     if name not in SCREENING or any(len(p.names) <= min_pairs(name) + 1 for p in cameras.values()):
         return ()
     seen = {place for camera_places in cameras.values() for place in camera_places.names}
     try:
-        return find_suspects(leave_one_out(name, cameras), [p for p in places if p.measurement.id in seen])
+        return find_outliers(leave_one_out(name, cameras), [p for p in places if p.measurement.id in seen])
     except FitError:
         return ()
 

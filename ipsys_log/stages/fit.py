@@ -14,13 +14,20 @@ from ipsys_log.analysis.calibration_points import (
     split_ids,
     split_parameters,
 )
-from ipsys_log.analysis.cross_validation import deal, gather_places, predict_without
+from ipsys_log.analysis.cross_validation import gather_points, make_folds, predict_without
 from ipsys_log.analysis.pairs import level_cameras
 from ipsys_log.errors import FitError
 from ipsys_log.messages import CameraModel, Model, Noise, Pair, Parameter
 from ipsys_log.messages.channels import CAMERA_POINTS, MEASUREMENTS, MODEL, RIG
 from ipsys_log.messages.stage import Plan, Progress, Stage, View
-from ipsys_log.models.table import MODEL_VERSIONS, Places, fit_cameras, inputs, min_pairs, parameters
+from ipsys_log.models.table import (
+    MODEL_VERSIONS,
+    CalibrationPoints,
+    fit_cameras,
+    inputs,
+    min_pairs,
+    parameters,
+)
 from ipsys_log.models.uncertainty import Uncertainty, estimate_uncertainty
 
 __all__ = ["STAGE", "fit_model", "model_run"]
@@ -62,7 +69,7 @@ def fit_model(
     FitError
         A camera has fewer pairs than the model needs, or no camera has a pair.
     """
-    cameras = gather_places(pairs)
+    cameras = gather_points(pairs)
     if not cameras:
         raise FitError(
             "no camera saw any of the measured places to fit on; measure places in the cameras' view"
@@ -88,7 +95,7 @@ def fit_model(
     return Model(time_ns, name, tuple(fitted))
 
 
-def _check_count(name: str, camera: str, places: Places) -> None:
+def _check_count(name: str, camera: str, places: CalibrationPoints) -> None:
     needed = min_pairs(name)
     if len(places.names) < needed:
         other = "" if name == "rigid" else ", or use --model rigid, which needs 3"
@@ -114,7 +121,7 @@ def _check_spread(name: str, camera: str, targets: Array) -> None:
 
 
 def _predict_without_groups(
-    name: str, cameras: Mapping[str, Places], progress: Callable[[int, int], None]
+    name: str, cameras: Mapping[str, CalibrationPoints], progress: Callable[[int, int], None]
 ) -> tuple[list[frozenset[str]], dict[str, Array]] | None:
     """Return the groups, and predictions of models fitted without each group, (g, n, 3) by camera.
 
@@ -124,7 +131,7 @@ def _predict_without_groups(
     if fewest <= min_pairs(name):
         return None
     most = max(len(places.names) for places in cameras.values())
-    groups = deal(cameras, min(most, _GROUPS), np.random.default_rng(0))
+    groups = make_folds(cameras, min(most, _GROUPS), np.random.default_rng(0))
     predicted = []
     for done, group in enumerate(groups, 1):
         try:
@@ -136,7 +143,7 @@ def _predict_without_groups(
 
 
 def _left_out(
-    places: Places, groups: Sequence[frozenset[str]], without: Array
+    places: CalibrationPoints, groups: Sequence[frozenset[str]], without: Array
 ) -> tuple[Array, NDArray[np.int64]]:
     """Return errors (n, 3) of the models fitted without a point, and the group (n,) of each point."""
     index = np.array([next(g for g, group in enumerate(groups) if name in group) for name in places.names])
@@ -148,7 +155,12 @@ def _tape(pair: Pair) -> Array:
 
 
 def _noise(
-    name: str, estimator: object, places: Places, tape_m2: Array, without: Array, groups: NDArray[np.int64]
+    name: str,
+    estimator: object,
+    places: CalibrationPoints,
+    tape_m2: Array,
+    without: Array,
+    groups: NDArray[np.int64],
 ) -> Noise | None:
     def predict(points_m: Array, heights_m: Array) -> Array:
         world_m: Array = estimator.predict(inputs(name, points_m, heights_m))  # type: ignore[attr-defined]

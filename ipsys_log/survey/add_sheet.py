@@ -9,12 +9,12 @@ from pathlib import Path
 from ipsys_log.log.dataset import Session
 from ipsys_log.messages import Measurement, Model, Rig
 from ipsys_log.runs.options import Request
-from ipsys_log.survey.blunders import THE_MODEL
-from ipsys_log.survey.checks import Checked, check_entry
-from ipsys_log.survey.entry import Entry, Fault, read_typed
+from ipsys_log.survey.blunders import MODEL_NAME
+from ipsys_log.survey.checks import EntryCheck, check_entry
+from ipsys_log.survey.entry import Entry, Fault, parse_entry
 from ipsys_log.survey.from_log import FinishedLog, rigs_of
-from ipsys_log.survey.scene import OTHER_ROWS, Sight, fit_neighbours, look
-from ipsys_log.survey.sheet import SheetRow, find_stops, name_columns, read_sheet, refuse_rows
+from ipsys_log.survey.scene import OTHER_ROWS, MarkerObservations, fit_neighbours, observe_marker
+from ipsys_log.survey.sheet import SheetRow, assign_intervals, name_columns, raise_for_rows, read_sheet
 
 __all__ = ["add_sheet", "check_sheet"]
 
@@ -30,7 +30,7 @@ class _Row:
     entry: Entry
     faults: Sequence[Fault]
     stop: str
-    sight: Sight | None
+    sight: MarkerObservations | None
 
 
 def check_sheet(path: Path, log: Path, request: Request) -> None:
@@ -47,14 +47,14 @@ def check_sheet(path: Path, log: Path, request: Request) -> None:
             read_sheet(path, rigs[-1], session.start_ns)
 
 
-def add_sheet(scene: FinishedLog, path: Path, insist: bool = False) -> list[str]:
+def add_sheet(scene: FinishedLog, path: Path, force: bool = False) -> list[str]:
     """Append the measurements of a sheet: all of them, or none.
 
     Parameters
     ----------
     scene : the log.
     path : path of the sheet.
-    insist : also write rows that look wrong but may be right.
+    force : also write rows that look wrong but may be right.
 
     Returns
     -------
@@ -66,15 +66,15 @@ def add_sheet(scene: FinishedLog, path: Path, insist: bool = False) -> list[str]
         Rows are bad; the text names each row by its line, with the contradiction.
     """
     rows = list(_sighted(scene, read_sheet(path, scene.rig, scene.start_ns)))
-    model, name = scene.model, THE_MODEL
+    model, name = scene.model, MODEL_NAME
     checked = _check(scene, rows, model, name)
     if model is None:  # then the rows are compared with each other
         model, name = _fit(scene, rows, checked), OTHER_ROWS
         checked = checked if model is None else _check(scene, rows, model, name)
     faults = [(row.line, row.stop) for row in rows if row.stop]
     faults += _by_line(rows, [[fault.text for fault in result.faults] for result in checked], scene.rig)
-    doubts = _by_line(rows, _doubts(rows, checked, scene, model), scene.rig)
-    refuse_rows(path, faults, () if insist else doubts)
+    doubts = _by_line(rows, _contradictions(rows, checked, scene, model), scene.rig)
+    raise_for_rows(path, faults, () if force else doubts)
     scene.add([result.measurement for result in checked if result.measurement is not None])
     ids = {row.line: result.id for row, result in zip(rows, checked, strict=True)}
     imprecise = _by_line(rows, [result.imprecise for result in checked], scene.rig)
@@ -92,16 +92,16 @@ def _by_line(rows: Sequence[_Row], texts: Sequence[Sequence[str]], rig: Rig) -> 
 
 def _sighted(scene: FinishedLog, rows: Sequence[SheetRow]) -> Iterator[_Row]:
     """Find the stationary interval of each row, and the observations of its marker in this interval."""
-    parsed = [read_typed(row.typed, scene.rig) for row in rows]
-    stops = find_stops(rows, scene.stops, [entry.marker_id for entry, _ in parsed])
+    parsed = [parse_entry(row.typed, scene.rig) for row in rows]
+    stops = assign_intervals(rows, scene.stops, [entry.marker_id for entry, _ in parsed])
     for row, (entry, faults), stop in zip(rows, parsed, stops, strict=True):
         sight = None
         if isinstance(stop, int) and entry.marker_id is not None:
-            sight = look(scene.views(stop), entry.marker_id)
+            sight = observe_marker(scene.views(stop), entry.marker_id)
         yield _Row(row.line, entry, faults, stop if isinstance(stop, str) else "", sight)
 
 
-def _check(scene: FinishedLog, rows: Sequence[_Row], model: Model | None, name: str) -> list[Checked]:
+def _check(scene: FinishedLog, rows: Sequence[_Row], model: Model | None, name: str) -> list[EntryCheck]:
     """Check each row as the web page does, after the rows above it."""
     history, results = [*scene.history()], []
     for row in rows:
@@ -111,17 +111,17 @@ def _check(scene: FinishedLog, rows: Sequence[_Row], model: Model | None, name: 
     return results
 
 
-def _fit(scene: FinishedLog, rows: Sequence[_Row], checked: Sequence[Checked]) -> Model | None:
+def _fit(scene: FinishedLog, rows: Sequence[_Row], checked: Sequence[EntryCheck]) -> Model | None:
     """Fit a model to the rows themselves, without the rows that contradict it."""
-    seen: list[tuple[Measurement, Sight]] = []
+    seen: list[tuple[Measurement, MarkerObservations]] = []
     for row, result in zip(rows, checked, strict=True):
         if result.measurement is not None and row.sight is not None:
             seen.append((result.measurement, row.sight))
     return fit_neighbours(seen, scene.rig)
 
 
-def _doubts(
-    rows: Sequence[_Row], checked: Sequence[Checked], scene: FinishedLog, model: Model | None
+def _contradictions(
+    rows: Sequence[_Row], checked: Sequence[EntryCheck], scene: FinishedLog, model: Model | None
 ) -> list[list[str]]:
     """Return the contradictions of each row; a hint names another contradictory row that the numbers fit."""
     doubtful = [row for row, result in zip(rows, checked, strict=True) if result.contradictions]

@@ -8,28 +8,34 @@ from dataclasses import replace
 import numpy as np
 from numpy.typing import NDArray
 
-from ipsys_log.analysis.blunders import possible_slips
-from ipsys_log.analysis.tape import Measured, TapePoint, flat_places, reference_points, world_point
+from ipsys_log.analysis.blunders import possible_blunders
+from ipsys_log.analysis.tape import (
+    RiggedMeasurement,
+    TapePoint,
+    find_weak_points,
+    reference_points,
+    world_point,
+)
 from ipsys_log.errors import IpsysError
-from ipsys_log.geometry.trilateration import SIDES, sides_alike
+from ipsys_log.geometry.trilateration import SIDES, are_collinear
 from ipsys_log.messages import Measurement, Rig
 from ipsys_log.survey.scene import Prediction
 from ipsys_log.units import CM_PER_M
 
 __all__ = [
-    "THE_MODEL",
-    "doubt_crossing",
-    "doubt_floor",
-    "doubt_model",
-    "doubt_tapes",
+    "MODEL_NAME",
     "floor_sigma_m",
+    "warn_crossing",
+    "warn_floor",
+    "warn_model",
+    "warn_tapes",
     "with_tape",
 ]
 
 Array = NDArray[np.float64]
 
 # The name of a model from a log, in a warning.
-THE_MODEL = "the model"
+MODEL_NAME = "the model"
 # Standard deviation of a tape if the rig gives none. It only serves to estimate the precision of a point.
 _USUAL_TAPE_M = 0.003
 # A residual of a distance above this value, and above three sigmas, is a reading error.
@@ -55,7 +61,7 @@ def _outside_m(point_m: Array, rig: Rig) -> float:
     return float(np.hypot(*beyond_m))
 
 
-def doubt_floor(read: Measurement, fixed: TapePoint, rig: Rig) -> tuple[bool | None, list[str]]:
+def warn_floor(read: Measurement, fixed: TapePoint, rig: Rig) -> tuple[bool | None, list[str]]:
     """Return whether a point lies on the floor (None without a floor in the rig), and a warning."""
     if rig.floor is None:
         return None, []
@@ -63,7 +69,7 @@ def doubt_floor(read: Measurement, fixed: TapePoint, rig: Rig) -> tuple[bool | N
     if outside_m <= _OUTSIDE_M:
         return True, []
     text = f"{_tapes(read)} put the point {outside_m * CM_PER_M:.0f} cm outside of the floor"
-    if read.side is not None and sides_alike(reference_points(read, rig)):
+    if read.side is not None and are_collinear(reference_points(read, rig)):
         other = SIDES[1 - SIDES.index(read.side)]
         other_m = world_point(replace(read, side=other), rig).world_m
         if _outside_m(other_m, rig) <= _OUTSIDE_M:
@@ -71,7 +77,7 @@ def doubt_floor(read: Measurement, fixed: TapePoint, rig: Rig) -> tuple[bool | N
     return False, [text]
 
 
-def doubt_tapes(read: Measurement, fixed: TapePoint, rig: Rig) -> list[str]:
+def warn_tapes(read: Measurement, fixed: TapePoint, rig: Rig) -> list[str]:
     """Return a warning if the distances of a measurement contradict one another."""
     sigma_m = with_tape(rig).tape_sigma_m or _USUAL_TAPE_M
     worst = int(np.abs(fixed.residuals_m).argmax())
@@ -81,12 +87,12 @@ def doubt_tapes(read: Measurement, fixed: TapePoint, rig: Rig) -> list[str]:
     return []
 
 
-def doubt_crossing(read: Measurement, rig: Rig) -> list[str]:
+def warn_crossing(read: Measurement, rig: Rig) -> list[str]:
     """Return a warning if the tapes cross at an angle that is too flat."""
     return [
         f"{_tapes(read)}: the tapes cross at {flat.angle_deg:.0f} degrees only, so that the point is known "
         f"to {(flat.sigma_m or 0.0) * CM_PER_M:.1f} cm; another place, or a third reference point, is better"
-        for flat in flat_places([Measured(read, with_tape(rig))])
+        for flat in find_weak_points([RiggedMeasurement(read, with_tape(rig))])
     ]
 
 
@@ -97,12 +103,12 @@ def floor_sigma_m(fixed: TapePoint) -> float | None:
     return float(np.sqrt(np.linalg.eigvalsh(fixed.covariance_m2[:2, :2])[-1]))
 
 
-def doubt_model(
+def warn_model(
     read: Measurement,
     fixed: TapePoint,
     rig: Rig,
     predictions: Sequence[Prediction],
-    model_name: str = THE_MODEL,
+    model_name: str = MODEL_NAME,
 ) -> list[str]:
     """Return a warning if the model predicts another point, with the measuring mistake that explains it."""
     if not predictions:
@@ -118,7 +124,7 @@ def doubt_model(
     if off_m <= bound_m:
         return []
     text = f"the point is {off_m * CM_PER_M:.0f} cm away from the prediction of {model_name}"
-    for group in possible_slips(read, rig, predicted_m):
+    for group in possible_blunders(read, rig, predicted_m):
         explanations = []
         for slip in group:
             try:

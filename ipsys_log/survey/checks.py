@@ -15,19 +15,19 @@ from ipsys_log.errors import IpsysError
 from ipsys_log.geometry.trilateration import SIDES
 from ipsys_log.messages import Measurement, Model, Rig
 from ipsys_log.survey.blunders import (
-    THE_MODEL,
-    doubt_crossing,
-    doubt_floor,
-    doubt_model,
-    doubt_tapes,
+    MODEL_NAME,
     floor_sigma_m,
+    warn_crossing,
+    warn_floor,
+    warn_model,
+    warn_tapes,
     with_tape,
 )
 from ipsys_log.survey.entry import Entry, Fault
-from ipsys_log.survey.scene import Prediction, Sight, predict
+from ipsys_log.survey.scene import MarkerObservations, Prediction, predict
 from ipsys_log.units import CM_PER_M
 
-__all__ = ["Checked", "check_entry", "next_id", "withdraw"]
+__all__ = ["EntryCheck", "check_entry", "next_id", "withdrawal_of"]
 
 Array = NDArray[np.float64]
 
@@ -35,7 +35,7 @@ _NUMBERED = re.compile(r"p[0-9]{1,18}")  # the limit matters: an id in a log may
 
 
 @dataclass(frozen=True, slots=True, eq=False)
-class Checked:
+class EntryCheck:
     """The result of the check of an entry.
 
     An entry with ``faults`` is not written to the log. The user must confirm ``warnings`` first. Warnings in
@@ -75,7 +75,7 @@ def next_id(history: Iterable[Measurement]) -> str:
     return f"p{max(numbers, default=0) + 1:03d}"
 
 
-def withdraw(history: Sequence[Measurement], name: str) -> Measurement:
+def withdrawal_of(history: Sequence[Measurement], name: str) -> Measurement:
     """Return the message that withdraws a measurement; the log keeps the measurement.
 
     Raises
@@ -93,16 +93,16 @@ def check_entry(
     entry: Entry,
     faults: Sequence[Fault],
     rig: Rig,
-    sight: Sight | None,
+    sight: MarkerObservations | None,
     history: Sequence[Measurement],
     model: Model | None = None,
-    model_name: str = THE_MODEL,
-) -> Checked:
+    model_name: str = MODEL_NAME,
+) -> EntryCheck:
     """Check whether an entry is plausible, and create its measurement.
 
     Parameters
     ----------
-    entry, faults : results of :func:`~ipsys_log.survey.entry.read_typed`.
+    entry, faults : results of :func:`~ipsys_log.survey.entry.parse_entry`.
     rig : the present rig.
     sight : observations of the marker; None if the marker is not known.
     history : measurements and withdrawals so far.
@@ -117,29 +117,29 @@ def check_entry(
     misfit = _apart(read, rig)
     if misfit is not None:
         # A distance in metres may be the reason; the doubts say so.
-        return Checked(name, (*all_faults, Fault("", "; ".join([misfit, *entry.doubts]))))
+        return EntryCheck(name, (*all_faults, Fault("", "; ".join([misfit, *entry.doubts]))))
     missing = {"side", "height", ""} & faulty_fields or {f for f in faulty_fields if f.startswith("d_")}
     if missing == {"side"} and len(entry.distances) >= 2 and entry.height_m is not None:
         sides_m, fault = _both_sides(read, rig)
-        return Checked(name, tuple(all_faults + fault), tuple(warnings), sides_m=sides_m)
+        return EntryCheck(name, tuple(all_faults + fault), tuple(warnings), sides_m=sides_m)
     if missing or len(entry.distances) < 2 or entry.height_m is None:
-        return Checked(name, tuple(all_faults), tuple(warnings))
+        return EntryCheck(name, tuple(all_faults), tuple(warnings))
     try:
         # With the usual tape sigma, the covariance shows a flat crossing of the circles. The written
         # measurement has no sigma of its own.
         fixed = world_point(read, with_tape(rig))
     except IpsysError as error:
         reason = "; ".join([_without_id(error, name), *entry.doubts])
-        return Checked(name, (*all_faults, Fault("", reason)))
-    on_floor, remark = doubt_floor(read, fixed, rig)
-    flat = doubt_crossing(read, rig)
-    warnings += [*remark, *doubt_tapes(read, fixed, rig), *flat]
+        return EntryCheck(name, (*all_faults, Fault("", reason)))
+    on_floor, remark = warn_floor(read, fixed, rig)
+    flat = warn_crossing(read, rig)
+    warnings += [*remark, *warn_tapes(read, fixed, rig), *flat]
     earlier = _here_before(read, sight, history)
     all_faults += _twin_faults(read, earlier)
     warnings += _repeat_warnings(read, fixed, rig, earlier) if read.still else []
     predictions = predict(model, sight.points_m, fixed.world_m) if model and sight else ()
-    warnings += doubt_model(read, fixed, rig, predictions, model_name)
-    return Checked(
+    warnings += warn_model(read, fixed, rig, predictions, model_name)
+    return EntryCheck(
         name,
         tuple(all_faults),
         tuple(dict.fromkeys(warnings)),
@@ -153,7 +153,7 @@ def check_entry(
     )
 
 
-def _measurement(entry: Entry, name: str, sight: Sight | None) -> Measurement:
+def _measurement(entry: Entry, name: str, sight: MarkerObservations | None) -> Measurement:
     still = sight.still if sight else None
     time_ns = 0 if still is None else still.start + (still.end - still.start) // 2
     return Measurement(
@@ -188,7 +188,9 @@ def _without_id(error: IpsysError, name: str) -> str:
     return str(error).removeprefix(f"measurement {name}").removeprefix(": ").strip()
 
 
-def _identity_faults(entry: Entry, sight: Sight | None, history: Sequence[Measurement]) -> list[Fault]:
+def _identity_faults(
+    entry: Entry, sight: MarkerObservations | None, history: Sequence[Measurement]
+) -> list[Fault]:
     faults = []
     if entry.id is not None and any(entry.id in (m.id, m.withdraws) for m in history):
         faults.append(Fault("id", f"id {entry.id} was used before; leave it out for the next free one"))
@@ -197,7 +199,9 @@ def _identity_faults(entry: Entry, sight: Sight | None, history: Sequence[Measur
     return faults
 
 
-def _here_before(read: Measurement, sight: Sight | None, history: Sequence[Measurement]) -> list[Measurement]:
+def _here_before(
+    read: Measurement, sight: MarkerObservations | None, history: Sequence[Measurement]
+) -> list[Measurement]:
     """Return the earlier measurements of this marker at this point: in the same interval, or seen there."""
     seen = sight.measured_as if sight else ()
     same_marker = [m for m in active_measurements(history) if m.marker_id == read.marker_id]

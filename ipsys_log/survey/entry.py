@@ -10,11 +10,11 @@ from typing import NamedTuple
 import numpy as np
 
 from ipsys_log.errors import IpsysError
-from ipsys_log.geometry.trilateration import SIDES, sides_alike
+from ipsys_log.geometry.trilateration import SIDES, are_collinear
 from ipsys_log.messages import Distance, ReferencePoint, Rig
 from ipsys_log.units import CM_PER_M
 
-__all__ = ["Entry", "Fault", "Typed", "check_references", "needs_side", "read_typed"]
+__all__ = ["Entry", "Fault", "TypedEntry", "check_references", "needs_side", "parse_entry"]
 
 _NUMBER = re.compile(r"\d+(?:[.,]\d*)?|[.,]\d+")
 _NAME = re.compile(r"[A-Za-z0-9][A-Za-z0-9_.-]*")
@@ -39,7 +39,7 @@ class Fault(NamedTuple):
 
 
 @dataclass(frozen=True, slots=True)
-class Typed:
+class TypedEntry:
     """One calibration point as it was typed: texts, in centimetres.
 
     ``distances`` are by reference point. An empty text means that the value is missing.
@@ -89,10 +89,10 @@ def needs_side(rig: Rig, names: Iterable[str]) -> bool:
     """Return whether distances from these reference points need a side (left or right)."""
     used = set(names)
     points_m = [(p.x_m, p.y_m) for p in rig.reference_points if p.name in used]
-    return len(points_m) >= 2 and sides_alike(np.array(points_m))
+    return len(points_m) >= 2 and are_collinear(np.array(points_m))
 
 
-def read_typed(typed: Typed, rig: Rig) -> tuple[Entry, list[Fault]]:
+def parse_entry(typed: TypedEntry, rig: Rig) -> tuple[Entry, list[Fault]]:
     """Parse typed texts; return the entry, and the faults and missing values of each field.
 
     Examples
@@ -100,7 +100,7 @@ def read_typed(typed: Typed, rig: Rig) -> tuple[Entry, list[Fault]]:
     >>> from ipsys_log.messages import ReferencePoint
     >>> points = (ReferencePoint("A", 0.0, 0.0), ReferencePoint("B", 2.0, 0.0))
     >>> rig = Rig("lab", "DICT_4X4_100", 0.2, reference_points=points)
-    >>> entry, faults = read_typed(Typed("3", {"A": "150,5", "B": "1.234"}, "left", "10"), rig)
+    >>> entry, faults = parse_entry(TypedEntry("3", {"A": "150,5", "B": "1.234"}, "left", "10"), rig)
     >>> entry.distances[0].distance_m, entry.height_m
     (1.505, 0.1)
     >>> faults[0].text
@@ -144,7 +144,7 @@ def _marker(text: str, rig: Rig, faults: list[Fault]) -> int | None:
     return int(text)
 
 
-def _distances(typed: Typed, rig: Rig, faults: list[Fault], doubts: list[str]) -> Iterator[Distance]:
+def _distances(typed: TypedEntry, rig: Rig, faults: list[Fault], doubts: list[str]) -> Iterator[Distance]:
     texts = {name: text.strip() for name, text in typed.distances.items() if text.strip()}
     count = len(rig.reference_points)
     for point in rig.reference_points:
@@ -222,8 +222,8 @@ def _times(value_cm: float) -> str:
     return f"{value_cm * CM_PER_M:g}"
 
 
-def _number(text: str, what: str, name: str, faults: list[Fault]) -> float | None:
+def _number(text: str, item_name: str, name: str, faults: list[Fault]) -> float | None:
     if not _NUMBER.fullmatch(text):
-        faults.append(Fault(name, f"{what}: {text!r} is no number; type centimetres, such as 123.4"))
+        faults.append(Fault(name, f"{item_name}: {text!r} is no number; type centimetres, such as 123.4"))
         return None
     return float(text.replace(",", "."))

@@ -11,7 +11,7 @@ import cv2
 import numpy as np
 
 from ipsys_log.analysis.pairs import Sightings, gather_sightings
-from ipsys_log.analysis.stationary import still_stretches
+from ipsys_log.analysis.stationary import stationary_intervals
 from ipsys_log.errors import FrameError, IpsysError, LogError
 from ipsys_log.images.video import decode_last
 from ipsys_log.log.contents import camera_of_topic
@@ -34,10 +34,10 @@ from ipsys_log.runs.provenance import newest_run
 from ipsys_log.runs.states import out_of_date_lines
 from ipsys_log.stages.detect import decode_grey
 from ipsys_log.survey.entry import check_references
-from ipsys_log.survey.scene import Stop, View
+from ipsys_log.survey.scene import CameraView, StationaryInterval
 from ipsys_log.units import NS_PER_S
 
-__all__ = ["FinishedLog", "opened_log", "rigs_of"]
+__all__ = ["FinishedLog", "open_finished_log", "rigs_of"]
 
 # Largest difference between the log time of a frame and the time of its results; longest time from the time
 # of a frame to the exposure of a marker in it.
@@ -48,7 +48,7 @@ _KEPT = 4
 
 
 @contextmanager
-def opened_log(
+def open_finished_log(
     path: Path,
     request: Request,
     progress: Progress = lambda stage, done, total: None,
@@ -87,7 +87,7 @@ def opened_log(
 
 
 class FinishedLog:
-    """A finished log as a :class:`~ipsys_log.survey.scene.Scene`."""
+    """A finished log as a :class:`~ipsys_log.survey.scene.MeasuringScene`."""
 
     def __init__(self, path: Path, session: Session, rig: Rig) -> None:
         self.path, self.rig = path, rig
@@ -98,18 +98,18 @@ class FinishedLog:
         }
         cameras = {str(camera_of_topic(topic)) for topic in self._topics[CAMERA_POINTS]}
         self._cameras = sorted({*session.images, *cameras})
-        self._seen: dict[int, list[View]] = {}
+        self._seen: dict[int, list[CameraView]] = {}
         models = session.payloads(_newest(session, MODEL))
         self.model: Model | None = models[-1] if models else None
         self._history = list(session.messages(session.topics(MEASUREMENTS)))
-        self.stops = _find_stops(gather_sightings(session.messages(self._topics[CAMERA_POINTS])), rig)
+        self.stops = _find_intervals(gather_sightings(session.messages(self._topics[CAMERA_POINTS])), rig)
         if not self.stops:
             raise IpsysError(
                 f"{path}: no marker of the rig lies still in it for two frames or longer: there is nothing "
                 "to measure; lay markers down while recording"
             )
 
-    def views(self, stop: int | None) -> list[View]:
+    def views(self, stop: int | None) -> list[CameraView]:
         """Return the view of each camera in a stationary interval, with the image at its middle."""
         number = stop or 0
         if number not in self._seen:
@@ -158,13 +158,13 @@ class FinishedLog:
                 if (message.payload.id, message.payload.withdraws) not in known_ids
             ]
 
-    def _view(self, camera: str, here: Stop) -> View:
-        middle_ns = here.start_ns + (here.end_ns - here.start_ns) // 2
-        seen = [m for m in self._within(CAMERA_POINTS, camera, here) if _sees(m, here)]
-        marker_messages = self._within(MARKERS, camera, here)
+    def _view(self, camera: str, interval: StationaryInterval) -> CameraView:
+        middle_ns = interval.start_ns + (interval.end_ns - interval.start_ns) // 2
+        seen = [m for m in self._within(CAMERA_POINTS, camera, interval) if _sees(m, interval)]
+        marker_messages = self._within(MARKERS, camera, interval)
         nearest = min(marker_messages, key=lambda m: abs(m.publish_time_ns - middle_ns), default=None)
         jpeg = self._picture(camera, nearest.log_time_ns if nearest else middle_ns)
-        return View(
+        return CameraView(
             camera,
             nearest.publish_time_ns if nearest else middle_ns,
             jpeg,
@@ -172,11 +172,13 @@ class FinishedLog:
             tuple(message.payload for message in seen),
         )
 
-    def _within(self, channel: Channel, camera: str, here: Stop) -> list[Message]:
+    def _within(self, channel: Channel, camera: str, interval: StationaryInterval) -> list[Message]:
         """Return the messages of a camera whose frames lie in a stationary interval."""
         topics = [topic for topic in self._topics[channel] if camera_of_topic(topic) == camera]
-        messages = self._session.messages(topics, here.start_ns - _LATE_NS, here.end_ns + _LATE_NS)
-        return [m for m in messages if here.start_ns - _ROLLING_NS <= m.publish_time_ns <= here.end_ns]
+        messages = self._session.messages(topics, interval.start_ns - _LATE_NS, interval.end_ns + _LATE_NS)
+        return [
+            m for m in messages if interval.start_ns - _ROLLING_NS <= m.publish_time_ns <= interval.end_ns
+        ]
 
     def _picture(self, camera: str, log_time_ns: int) -> bytes | None:
         """Return the frame nearest to a log time, as a JPEG."""
@@ -221,7 +223,7 @@ def _message(measurement: Measurement, earlier: Sequence[Message]) -> Message:
     return Message(MEASUREMENTS_TOPIC, max([end_ns, *same]), measurement.timestamp, measurement)
 
 
-def _find_stops(sightings: Mapping[tuple[str, int], Sightings], rig: Rig) -> list[Stop]:
+def _find_intervals(sightings: Mapping[tuple[str, int], Sightings], rig: Rig) -> list[StationaryInterval]:
     """Return the stationary intervals of the rig's markers, in order of time."""
     stops = []
     for marker_id in sorted({marker_id for _, marker_id in sightings}):
@@ -231,14 +233,14 @@ def _find_stops(sightings: Mapping[tuple[str, int], Sightings], rig: Rig) -> lis
                 for (camera, seen_id), observations in sightings.items()
                 if seen_id == marker_id
             }
-            stops += [Stop(marker_id, *interval) for interval in still_stretches(seen)]
+            stops += [StationaryInterval(marker_id, *interval) for interval in stationary_intervals(seen)]
     return sorted(stops, key=lambda stop: (stop.start_ns, stop.marker_id))
 
 
-def _sees(message: Message, here: Stop) -> bool:
+def _sees(message: Message, interval: StationaryInterval) -> bool:
     """Return whether camera points hold the marker of a stationary interval at a time within it."""
     return any(
-        point.id == here.marker_id
-        and here.start_ns <= message.publish_time_ns + (point.time_offset_ns or 0) <= here.end_ns
+        point.id == interval.marker_id
+        and interval.start_ns <= message.publish_time_ns + (point.time_offset_ns or 0) <= interval.end_ns
         for point in message.payload.points
     )

@@ -27,7 +27,7 @@ from ipsys_log.messages import (
 )
 from ipsys_log.stages.detect import decode_grey
 from ipsys_log.survey.entry import check_references
-from ipsys_log.survey.scene import Stop, View
+from ipsys_log.survey.scene import CameraView, StationaryInterval
 from ipsys_log.units import NS_PER_S
 
 __all__ = ["LiveScene"]
@@ -36,7 +36,7 @@ _LAST_NS = NS_PER_S
 
 
 class LiveScene:
-    """A running recording as a :class:`~ipsys_log.survey.scene.Scene`; call it with every message.
+    """A running recording as a :class:`~ipsys_log.survey.scene.MeasuringScene`; call it with every message.
 
     The messages are the recorded frames and the results of the stages.
 
@@ -62,7 +62,7 @@ class LiveScene:
     ) -> None:
         check_references(rig)
         self.rig, self.model = rig, model
-        self.stops: Sequence[Stop] = ()
+        self.stops: Sequence[StationaryInterval] = ()
         self._cameras, self._add = cameras, add
         self._lock = threading.Lock()
         self._images: dict[str, deque[Message]] = {camera: deque(maxlen=60) for camera in cameras}
@@ -95,7 +95,7 @@ class LiveScene:
                 while points[0].timestamp < payload.timestamp - _LAST_NS:
                     points.popleft()
 
-    def views(self, stop: int | None) -> list[View]:  # noqa: ARG002
+    def views(self, stop: int | None) -> list[CameraView]:  # noqa: ARG002
         """Return the view of each camera: the latest image with known markers, and the points of a second."""
         with self._lock:
             newest_ns = max((points[-1].timestamp for points in self._points.values() if points), default=0)
@@ -135,16 +135,16 @@ class LiveScene:
                     measured_point = measurement.id, measurement.marker_id, np.mean(points_m, axis=0)
                     self._measured[camera].append(measured_point)
 
-    def _view(self, camera: str, since_ns: int) -> View:
+    def _view(self, camera: str, since_ns: int) -> CameraView:
         if camera not in self._marked or not self._cameras[camera].up:
-            return View(camera, 0)
+            return CameraView(camera, 0)
         image, markers = self._marked[camera]
         # A camera that hangs, but is not known to be lost, has only older points. They are left out.
         points = tuple(
             camera_points for camera_points in self._points[camera] if camera_points.timestamp >= since_ns
         )
         measured = tuple(self._measured[camera])
-        return View(camera, image.publish_time_ns, self._jpeg(camera, image), markers, points, measured)
+        return CameraView(camera, image.publish_time_ns, self._jpeg(camera, image), markers, points, measured)
 
     def _jpeg(self, camera: str, image: Message) -> bytes | None:
         if isinstance(image.payload, CompressedImage):

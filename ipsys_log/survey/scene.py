@@ -11,10 +11,10 @@ import numpy as np
 from numpy.typing import NDArray
 
 from ipsys_log.analysis.consistency import FEWEST_POINTS
-from ipsys_log.analysis.cross_validation import gather_places, leave_one_out
-from ipsys_log.analysis.outliers import find_suspects
-from ipsys_log.analysis.stationary import FEWEST_FRAMES, lies_at, lies_still
-from ipsys_log.analysis.tape import Measured, world_point
+from ipsys_log.analysis.cross_validation import gather_points, leave_one_out
+from ipsys_log.analysis.outliers import find_outliers
+from ipsys_log.analysis.stationary import FEWEST_FRAMES, is_near, is_stationary
+from ipsys_log.analysis.tape import RiggedMeasurement, world_point
 from ipsys_log.errors import FitError, IpsysError
 from ipsys_log.messages import CameraPoints, Interval, Markers, Measurement, Model, Pair, Rig
 from ipsys_log.models.table import AppliedModel
@@ -22,13 +22,13 @@ from ipsys_log.stages.fit import fit_model
 
 __all__ = [
     "OTHER_ROWS",
+    "CameraView",
+    "MarkerObservations",
+    "MeasuringScene",
     "Prediction",
-    "Scene",
-    "Sight",
-    "Stop",
-    "View",
+    "StationaryInterval",
     "fit_neighbours",
-    "look",
+    "observe_marker",
     "predict",
     "visible_markers",
 ]
@@ -90,7 +90,7 @@ def _applied(model: Model) -> dict[str, AppliedModel]:
 
 
 @dataclass(frozen=True, slots=True, eq=False)
-class View:
+class CameraView:
     """The view of one camera.
 
     ``jpeg`` is the image taken at ``time_ns``; None without an image. ``markers`` are the markers detected in
@@ -109,7 +109,7 @@ class View:
 
 
 @dataclass(frozen=True, slots=True)
-class Stop:
+class StationaryInterval:
     """A stationary interval of a marker in a finished log; both ends belong to it."""
 
     marker_id: int
@@ -124,7 +124,7 @@ class Stop:
         return measurement.marker_id == self.marker_id and overlaps
 
 
-class Scene(Protocol):
+class MeasuringScene(Protocol):
     """The source of views for measuring: a finished log or live cameras.
 
     ``stops`` are the stationary intervals of a finished log, in order; empty during a recording. ``model``
@@ -138,9 +138,9 @@ class Scene(Protocol):
     def model(self) -> Model | None: ...
 
     @property
-    def stops(self) -> Sequence[Stop]: ...
+    def stops(self) -> Sequence[StationaryInterval]: ...
 
-    def views(self, stop: int | None) -> Sequence[View]:
+    def views(self, stop: int | None) -> Sequence[CameraView]:
         """Return the latest view of every camera, or the views of a stationary interval by its index."""
         ...
 
@@ -154,7 +154,7 @@ class Scene(Protocol):
 
 
 @dataclass(frozen=True, slots=True, eq=False)
-class Sight:
+class MarkerObservations:
     """The observations of one marker by all cameras.
 
     ``still`` is its stationary interval; None if it moves or is not seen. ``points_m`` are its mean camera
@@ -186,14 +186,14 @@ class Sight:
         return f"{name} lies still, seen by {', '.join(self.points_m)}"
 
 
-def look(views: Sequence[View], marker_id: int) -> Sight:
+def observe_marker(views: Sequence[CameraView], marker_id: int) -> MarkerObservations:
     """Combine the observations of a marker by all cameras; check whether the marker is stationary.
 
     Examples
     --------
     >>> from ipsys_log.messages import CameraPoint
     >>> seen = tuple(CameraPoints(n, (CameraPoint(7, 0.1, 0.2, 2.0),)) for n in (100, 200, 300))
-    >>> sight = look([View("red", 300, points=seen), View("white", 300)], 7)
+    >>> sight = observe_marker([CameraView("red", 300, points=seen), CameraView("white", 300)], 7)
     >>> sight.text == "marker 7 lies still, seen by red"
     True
     """
@@ -204,12 +204,12 @@ def look(views: Sequence[View], marker_id: int) -> Sight:
         if len(rows) < FEWEST_FRAMES:
             continue
         seen_m = np.array([(point.x_m, point.y_m, point.z_m) for _, point in rows])
-        if not lies_still(seen_m):
+        if not is_stationary(seen_m):
             moving.append(view.camera)
         times_ns = [time_ns + (point.time_offset_ns or 0) for time_ns, point in rows]
         seen[view.camera] = min(times_ns), max(times_ns), seen_m.mean(axis=0)
     if moving or not seen:
-        return Sight(marker_id, None, {}, tuple(moving))
+        return MarkerObservations(marker_id, None, {}, tuple(moving))
     # The last view of a camera may end before another camera sees the marker. Then the marker may have been
     # at another position, so this camera is left out.
     start_ns = end_ns = max(last_ns for _, last_ns, _ in seen.values())
@@ -218,21 +218,23 @@ def look(views: Sequence[View], marker_id: int) -> Sight:
             start_ns = min(start_ns, first_ns)
     points_m = {camera: mean_m for camera, (_, last_ns, mean_m) in seen.items() if last_ns >= start_ns}
     measured_as = _measured_as(views, marker_id, points_m)
-    return Sight(marker_id, Interval(start_ns, end_ns), points_m, measured_as=measured_as)
+    return MarkerObservations(marker_id, Interval(start_ns, end_ns), points_m, measured_as=measured_as)
 
 
-def _measured_as(views: Iterable[View], marker_id: int, points_m: Mapping[str, Array]) -> tuple[str, ...]:
+def _measured_as(
+    views: Iterable[CameraView], marker_id: int, points_m: Mapping[str, Array]
+) -> tuple[str, ...]:
     """Return the ids of the measurements of a marker at its present position, by all cameras with data."""
     same: dict[str, bool] = {}
     for view in views:
         present_m = points_m.get(view.camera)
         for name, measured_id, measured_m in view.measured:
             if measured_id == marker_id and present_m is not None:
-                same[name] = same.get(name, True) and bool(lies_at(present_m[None], measured_m)[0])
+                same[name] = same.get(name, True) and bool(is_near(present_m[None], measured_m)[0])
     return tuple(name for name, is_same in same.items() if is_same)
 
 
-def visible_markers(views: Iterable[View], rig: Rig) -> list[int]:
+def visible_markers(views: Iterable[CameraView], rig: Rig) -> list[int]:
     """Return the ids of the rig's markers that at least one camera sees, sorted."""
     ids = {point.id for view in views for points in view.points for point in points.points}
     return sorted(marker_id for marker_id in ids if rig.knows(marker_id))
@@ -244,7 +246,7 @@ OTHER_ROWS = "the other rows"
 _MODEL = "poly"
 
 
-def fit_neighbours(seen: Sequence[tuple[Measurement, Sight]], rig: Rig) -> Model | None:
+def fit_neighbours(seen: Sequence[tuple[Measurement, MarkerObservations]], rig: Rig) -> Model | None:
     """Fit a model to measurements, without the measurements that contradict the rest.
 
     Parameters
@@ -259,11 +261,11 @@ def fit_neighbours(seen: Sequence[tuple[Measurement, Sight]], rig: Rig) -> Model
     pairs = _pairs(seen, rig)
     if not pairs:
         return None
-    places = [Measured(measurement, rig) for measurement, _ in seen]
+    places = [RiggedMeasurement(measurement, rig) for measurement, _ in seen]
     paired_ids = {pair.measurement for camera_pairs in pairs.values() for pair in camera_pairs}
     try:
-        suspects = find_suspects(
-            leave_one_out(_MODEL, gather_places(pairs)),
+        suspects = find_outliers(
+            leave_one_out(_MODEL, gather_points(pairs)),
             [place for place in places if place.measurement.id in paired_ids],
         )
         suspect_ids = {suspect.measurement for suspect in suspects}
@@ -284,7 +286,7 @@ def fit_neighbours(seen: Sequence[tuple[Measurement, Sight]], rig: Rig) -> Model
         return None
 
 
-def _pairs(seen: Sequence[tuple[Measurement, Sight]], rig: Rig) -> dict[str, list[Pair]]:
+def _pairs(seen: Sequence[tuple[Measurement, MarkerObservations]], rig: Rig) -> dict[str, list[Pair]]:
     """Pair camera points and world points, by camera; a camera with too few pairs is left out."""
     pairs: dict[str, list[Pair]] = {}
     for measurement, sight in seen:

@@ -13,11 +13,11 @@ from pathlib import Path
 from ipsys_log.errors import IpsysError
 from ipsys_log.messages import Rig
 from ipsys_log.survey.checks import check_entry
-from ipsys_log.survey.entry import Typed, read_typed
-from ipsys_log.survey.scene import Stop
+from ipsys_log.survey.entry import TypedEntry, parse_entry
+from ipsys_log.survey.scene import StationaryInterval
 from ipsys_log.units import NS_PER_S
 
-__all__ = ["SheetRow", "find_stops", "name_columns", "read_sheet", "refuse_rows"]
+__all__ = ["SheetRow", "assign_intervals", "name_columns", "raise_for_rows", "read_sheet"]
 
 _PLAIN = ("id", "marker", "side", "height_cm", "place", "time", "split", "note")
 _NEEDED = ("marker", "height_cm")
@@ -37,7 +37,7 @@ class SheetRow:
     """
 
     line: int
-    typed: Typed
+    typed: TypedEntry
     place: int | None = None
     time_ns: int | None = None
 
@@ -84,9 +84,9 @@ def read_sheet(path: Path, rig: Rig, start_ns: int) -> list[SheetRow]:
     except csv.Error as error:
         raise IpsysError(f"{path}: line {reader.line_num}: {error}") from error
     for row in rows:
-        checked = check_entry(*read_typed(row.typed, rig), rig, None, ())
+        checked = check_entry(*parse_entry(row.typed, rig), rig, None, ())
         faults += [(row.line, name_columns(fault.text, rig)) for fault in checked.faults]
-    refuse_rows(path, faults)
+    raise_for_rows(path, faults)
     if not rows:
         raise IpsysError(f"{path}: holds no measurements below its header")
     return rows
@@ -97,7 +97,7 @@ def _comma_advice(delimiter: str) -> str:
     return "; a decimal comma? Write a point: 212.7" if delimiter == "," else ""
 
 
-def refuse_rows(
+def raise_for_rows(
     path: Path, faults: Sequence[tuple[int, str]], doubts: Sequence[tuple[int, str]] = ()
 ) -> None:
     """Raise an error if there are bad rows or rows that look wrong.
@@ -109,8 +109,8 @@ def refuse_rows(
     """
     if faults or doubts:
         lines = "".join(f"\n  line {line}: {text}" for line, text in sorted([*faults, *doubts]))
-        insist = "" if faults else ", or write it as it is with --force"
-        raise IpsysError(f"{path}: nothing was written; correct the sheet{insist}:{lines}")
+        force_advice = "" if faults else ", or write it as it is with --force"
+        raise IpsysError(f"{path}: nothing was written; correct the sheet{force_advice}:{lines}")
 
 
 def name_columns(text: str, rig: Rig) -> str:
@@ -135,8 +135,8 @@ def name_columns(text: str, rig: Rig) -> str:
     return re.sub(r"\b(?:the )?height(?=:|\?| reads| and)", "height_cm", text)
 
 
-def find_stops(
-    rows: Sequence[SheetRow], stops: Sequence[Stop], markers: Sequence[int | None]
+def assign_intervals(
+    rows: Sequence[SheetRow], stops: Sequence[StationaryInterval], markers: Sequence[int | None]
 ) -> Iterator[int | str]:
     """Yield the stationary interval of each row, as index of ``stops``, or the reason if there is none.
 
@@ -174,14 +174,14 @@ def find_stops(
             yield own[in_order[marker_id].index(row.line)]
 
 
-def _numbered(place: int, marker_id: int, stops: Sequence[Stop]) -> int | str:
+def _numbered(place: int, marker_id: int, stops: Sequence[StationaryInterval]) -> int | str:
     if not 1 <= place <= len(stops):
         return f"place {place} is none of 1 to {len(stops)}"
     other = stops[place - 1].marker_id
     return place - 1 if other == marker_id else f"place {place} is one of marker {other}, not {marker_id}"
 
 
-def _timed(time_ns: int, marker_id: int, stops: Sequence[Stop]) -> int | str:
+def _timed(time_ns: int, marker_id: int, stops: Sequence[StationaryInterval]) -> int | str:
     def away_ns(number: int) -> int:
         return max(stops[number].start_ns - time_ns, time_ns - stops[number].end_ns, 0)
 
@@ -219,7 +219,7 @@ def _check_columns(columns: Sequence[str], rig: Rig, path: Path) -> None:
 
 def _row(line: int, cell: dict[str, str], start_ns: int) -> SheetRow:
     distances = {n[2:-3]: text for n, text in cell.items() if n.startswith("d_") and n.endswith("_cm")}
-    typed = Typed(
+    typed = TypedEntry(
         cell.get("marker", ""),
         distances,
         cell.get("side", ""),

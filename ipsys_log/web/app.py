@@ -13,20 +13,26 @@ from starlette.requests import ClientDisconnect, Request
 from starlette.responses import JSONResponse, Response
 from starlette.routing import Route
 
-from ipsys_log.analysis.pairs import active_measurements, measured_places
+from ipsys_log.analysis.pairs import active_measurements, locate_measurements
 from ipsys_log.errors import IpsysError
-from ipsys_log.geometry.trilateration import sides_alike
+from ipsys_log.geometry.trilateration import are_collinear
 from ipsys_log.messages import Measurement
 from ipsys_log.report.figures import camera_styles
-from ipsys_log.survey.checks import Checked, check_entry, next_id, withdraw
-from ipsys_log.survey.entry import Typed, read_typed
-from ipsys_log.survey.scene import Scene, Stop, View, look, visible_markers
+from ipsys_log.survey.checks import EntryCheck, check_entry, next_id, withdrawal_of
+from ipsys_log.survey.entry import TypedEntry, parse_entry
+from ipsys_log.survey.scene import (
+    CameraView,
+    MeasuringScene,
+    StationaryInterval,
+    observe_marker,
+    visible_markers,
+)
 from ipsys_log.units import CM_PER_M, NS_PER_S
 
 __all__ = ["build_app", "checked_json", "history_json", "scene_json", "views_json"]
 
 
-def scene_json(scene: Scene) -> dict[str, Any]:
+def scene_json(scene: MeasuringScene) -> dict[str, Any]:
     """Return the constant data of the page: the lab, and the stationary intervals of a log."""
     rig = scene.rig
     points_m = np.array([(p.x_m, p.y_m) for p in rig.reference_points])
@@ -34,7 +40,7 @@ def scene_json(scene: Scene) -> dict[str, Any]:
         "lab": rig.name,
         "references": [{"name": p.name, "x_m": p.x_m, "y_m": p.y_m} for p in rig.reference_points],
         "floor": None if rig.floor is None else [rig.floor.width_m, rig.floor.depth_m],
-        "one_line": sides_alike(points_m),
+        "one_line": are_collinear(points_m),
         "stops": [
             {"marker": stop.marker_id, "seconds": (stop.end_ns - stop.start_ns) / NS_PER_S}
             for stop in scene.stops
@@ -43,11 +49,11 @@ def scene_json(scene: Scene) -> dict[str, Any]:
     }
 
 
-def history_json(scene: Scene) -> dict[str, Any]:
+def history_json(scene: MeasuringScene) -> dict[str, Any]:
     """Return all measurements so far, newest first, also withdrawn ones; and the measured intervals."""
     history = scene.history()
     active = active_measurements(history)
-    points = {place.id: place.point_m for place in measured_places(active, scene.rig)[0]}
+    points = {place.id: place.point_m for place in locate_measurements(active, scene.rig)[0]}
     rows = [
         {
             "id": measurement.id,
@@ -71,12 +77,12 @@ def _tapes(measurement: Measurement) -> str:
     return ", ".join([*tapes, *side, *height])
 
 
-def _measured(stops: Sequence[Stop], active: Sequence[Measurement]) -> list[str | None]:
+def _measured(stops: Sequence[StationaryInterval], active: Sequence[Measurement]) -> list[str | None]:
     """Return the id of the measurement of each stationary interval; None if it is not measured yet."""
     return [next((m.id for m in active if stop.covers(m)), None) for stop in stops]
 
 
-def views_json(scene: Scene, views: Sequence[View], marker_id: int | None) -> dict[str, Any]:
+def views_json(scene: MeasuringScene, views: Sequence[CameraView], marker_id: int | None) -> dict[str, Any]:
     """Return the present views of the cameras, and the observations of the chosen marker.
 
     Without a chosen marker, a single visible marker is chosen.
@@ -84,7 +90,7 @@ def views_json(scene: Scene, views: Sequence[View], marker_id: int | None) -> di
     visible = visible_markers(views, scene.rig)
     if marker_id is None and len(visible) == 1:
         marker_id = visible[0]
-    sight = None if marker_id is None else look(views, marker_id)
+    sight = None if marker_id is None else observe_marker(views, marker_id)
     colours = camera_styles(view.camera for view in views)
     return {
         "marker": marker_id,
@@ -114,7 +120,7 @@ def _invitation(visible: Sequence[int]) -> str:
     return f"choose the marker: {', '.join(map(str, visible))} are seen"
 
 
-def checked_json(checked: Checked) -> dict[str, Any]:
+def checked_json(checked: EntryCheck) -> dict[str, Any]:
     """Return the result of the check of an entry."""
     point = None if checked.point_m is None else checked.point_m.tolist()
     return {
@@ -149,7 +155,7 @@ _MOST_DIGITS = 20
 _KEPT = 30
 
 
-def build_app(scene: Scene) -> Starlette:
+def build_app(scene: MeasuringScene) -> Starlette:
     """Return the page of a scene, without a guard; its requests are under ``/api``."""
     questions = _Questions(scene)
     return Starlette(
@@ -162,7 +168,11 @@ def build_app(scene: Scene) -> Starlette:
             Route("/api/measure", questions.measure, methods=["POST"]),
             Route("/api/undo", questions.undo, methods=["POST"]),
         ],
-        exception_handlers={IpsysError: _refused, ClientDisconnect: _gone, Exception: _failed},
+        exception_handlers={
+            IpsysError: _handle_refusal,
+            ClientDisconnect: _handle_disconnect,
+            Exception: _handle_failure,
+        },
     )
 
 
@@ -175,15 +185,15 @@ def _file(name: str, kind: str) -> Any:
     return answer
 
 
-async def _refused(_: Request, error: Exception) -> Response:
+async def _handle_refusal(_: Request, error: Exception) -> Response:
     return JSONResponse({"error": str(error)}, 400)
 
 
-async def _gone(_: Request, __: Exception) -> Response:
+async def _handle_disconnect(_: Request, __: Exception) -> Response:
     return Response(status_code=400)  # the client has disconnected
 
 
-async def _failed(_: Request, error: Exception) -> Response:
+async def _handle_failure(_: Request, error: Exception) -> Response:
     text = f"a fault of ipsys: {type(error).__name__}: {error}; the terminal shows more when the command ends"
     return JSONResponse({"error": text}, 500)
 
@@ -194,7 +204,7 @@ class _Questions:
     They are asynchronous, but wait only for the body of a request. So they answer one request at a time.
     """
 
-    def __init__(self, scene: Scene) -> None:
+    def __init__(self, scene: MeasuringScene) -> None:
         self._scene = scene
         self._pictures: dict[tuple[str, int], bytes] = {}
 
@@ -234,20 +244,20 @@ class _Questions:
 
     async def undo(self, request: Request) -> Response:
         name = str((await _body(request)).get("id", ""))
-        self._scene.add([withdraw(self._scene.history(), name)])
+        self._scene.add([withdrawal_of(self._scene.history(), name)])
         return JSONResponse({"withdrawn": name, "history": history_json(self._scene)})
 
-    def _checked(self, body: Mapping[str, Any]) -> Checked:
+    def _checked(self, body: Mapping[str, Any]) -> EntryCheck:
         scene, distances = self._scene, body.get("distances", {})
         if not isinstance(distances, dict):
             raise IpsysError("distances must be an object, by reference point")
         texts = {name: str(body.get(name, "")) for name in ("marker", "side", "height", "split")}
-        typed = Typed(distances={str(k): str(v) for k, v in distances.items()}, **texts)
-        entry, faults = read_typed(typed, scene.rig)
+        typed = TypedEntry(distances={str(k): str(v) for k, v in distances.items()}, **texts)
+        entry, faults = parse_entry(typed, scene.rig)
         stop = self._stop(body.get("stop"))
         sight = None
         if entry.marker_id is not None:
-            sight = look(scene.views(stop), entry.marker_id)
+            sight = observe_marker(scene.views(stop), entry.marker_id)
         return check_entry(entry, faults, scene.rig, sight, scene.history(), scene.model)
 
     def _stop(self, given: Any) -> int | None:

@@ -19,15 +19,15 @@ import uvicorn
 from starlette.types import ASGIApp, Receive, Scope, Send
 
 from ipsys_log.errors import IpsysError
-from ipsys_log.survey.scene import Scene
+from ipsys_log.survey.scene import MeasuringScene
 from ipsys_log.web.access import Guard
 from ipsys_log.web.app import build_app
 from ipsys_log.web.connections import Connections, Limits, derive_limits
 
-__all__ = ["Faults", "Served", "check_free", "qr_code", "serving"]
+__all__ = ["PageServer", "ServerExceptions", "check_port_free", "qr_code", "serve"]
 
 
-class Faults:
+class ServerExceptions:
     """The unexpected exceptions in the server's thread: their number, and the first traceback."""
 
     def __init__(self) -> None:
@@ -67,7 +67,7 @@ _TURN_S = 0.1
 _BACKLOG = 128
 # A browser also sends cookies of other programs on this machine, up to 4 kB each.
 _MAX_HEADER_BYTES = 64 << 10
-# The server prints nothing, because the recorder uses the terminal. Faults stores the exceptions.
+# The server prints nothing, because the recorder uses the terminal. ServerExceptions stores the exceptions.
 _SILENT: dict[str, Any] = {
     "version": 1,
     "disable_existing_loggers": False,
@@ -77,12 +77,12 @@ _SILENT: dict[str, Any] = {
 
 
 @dataclass(frozen=True, slots=True)
-class Served:
+class PageServer:
     """A running server of the page: its address (with the token if needed), its thread and its exceptions."""
 
     url: str
     thread: Thread
-    faults: Faults
+    exceptions: ServerExceptions
 
     def wait(self, stopped: Callable[[], bool]) -> None:
         """Wait until the server ends, or until `stopped` is true."""
@@ -91,9 +91,9 @@ class Served:
 
 
 @contextmanager
-def serving(
-    scene: Scene, host: str | None = None, port: int = 8000, limits: Limits | None = None
-) -> Iterator[Served]:
+def serve(
+    scene: MeasuringScene, host: str | None = None, port: int = 8000, limits: Limits | None = None
+) -> Iterator[PageServer]:
     """Serve the page of a scene until the end of the with-block.
 
     Parameters
@@ -112,36 +112,40 @@ def serving(
     with _listen(host or _LOOPBACK, port) as listening:
         names = {socket.gethostname().lower(), f"{socket.gethostname().lower()}.local"}
         names |= {host.lower()} if host else set()
-        faults = Faults()
+        exceptions = ServerExceptions()
         config = uvicorn.Config(
-            faults.watch_app(Guard(build_app(scene), frozenset(names), token)),
+            exceptions.watch_app(Guard(build_app(scene), frozenset(names), token)),
             log_config=_SILENT, access_log=False, lifespan="off", ws="none", http="h11", loop="asyncio",
             server_header=False, timeout_graceful_shutdown=1, h11_max_incomplete_event_size=_MAX_HEADER_BYTES,
         )  # fmt: skip
         server = uvicorn.Server(config)
-        run = (server, listening, limits or derive_limits(), faults)
+        run = (server, listening, limits or derive_limits(), exceptions)
         thread = Thread(target=_run, args=run, name="page", daemon=True)
         thread.start()
         while thread.is_alive() and not server.started:
             thread.join(_STEP_S)
         if not server.started:
-            raise IpsysError(f"the page cannot be served: {faults.first.splitlines()[-1]}")
+            raise IpsysError(f"the page cannot be served: {exceptions.first.splitlines()[-1]}")
         try:
-            yield Served(_url(host, listening.getsockname()[1], token), thread, faults)
+            yield PageServer(_url(host, listening.getsockname()[1], token), thread, exceptions)
         finally:
             server.should_exit = True
             thread.join()
 
 
-def _run(server: uvicorn.Server, listening: socket.socket, limits: Limits, faults: Faults) -> None:
+def _run(
+    server: uvicorn.Server, listening: socket.socket, limits: Limits, exceptions: ServerExceptions
+) -> None:
     """Serve until ``server.should_exit`` is true; an exception ends only this thread."""
     try:
-        asyncio.run(_serve(server, listening, limits, faults))
+        asyncio.run(_serve(server, listening, limits, exceptions))
     except Exception as error:
-        faults.add(error)
+        exceptions.add(error)
 
 
-async def _serve(server: uvicorn.Server, listening: socket.socket, limits: Limits, faults: Faults) -> None:
+async def _serve(
+    server: uvicorn.Server, listening: socket.socket, limits: Limits, faults: ServerExceptions
+) -> None:
     faults.watch_loop(asyncio.get_running_loop())
     listening.setblocking(False)
     server.config.load()
@@ -155,13 +159,13 @@ async def _serve(server: uvicorn.Server, listening: socket.socket, limits: Limit
             connections.abort()
 
 
-def check_free(host: str | None, port: int) -> None:
+def check_port_free(host: str | None, port: int) -> None:
     """Check that a page can be served at an address and a port.
 
     Raises
     ------
     IpsysError
-        The errors of :func:`serving`.
+        The errors of :func:`serve`.
     """
     _listen(host or _LOOPBACK, port).close()
 

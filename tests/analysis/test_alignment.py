@@ -10,9 +10,9 @@ import pytest
 from numpy.typing import NDArray
 
 from ipsys_log.analysis.alignment import LEVEL_M, Alignment, align_camera
-from ipsys_log.analysis.stationary import Lying, find_lying
+from ipsys_log.analysis.stationary import StationaryMarker, find_stationary
 from ipsys_log.geometry.markers import camera_point, marker_corners
-from ipsys_log.geometry.poses import lay_flat, look_down, rotation, transform
+from ipsys_log.geometry.poses import look_down, pose_facing_up, rotation, transform
 from ipsys_log.messages import CameraPoint, CameraPoints, Interval, Measurement
 from ipsys_log.report.alignment_text import advise
 from ipsys_log.units import NS_PER_S
@@ -33,7 +33,7 @@ def hang(tilt_deg: float, towards_deg: float) -> Array:
 
 def lay(
     camera_from_world: Array, noise_m: float = 0.0, heights_m: Sequence[float] = (), seed: int = 0
-) -> list[Lying]:
+) -> list[StationaryMarker]:
     """Markers at :data:`PLACES_M` as the camera has them; what they stand on is known to nobody."""
     rng = np.random.default_rng(seed)
     heights = np.zeros(len(PLACES_M))
@@ -41,7 +41,7 @@ def lay(
     points_m = transform(camera_from_world, np.column_stack([PLACES_M, heights]))
     # Most of the noise of a camera point is along the view.
     points_m *= 1 + noise_m / points_m[:, 2:] * rng.normal(size=(len(points_m), 1))
-    return [Lying(n, point_m, np.zeros((3, 3))) for n, point_m in enumerate(points_m)]
+    return [StationaryMarker(n, point_m, np.zeros((3, 3))) for n, point_m in enumerate(points_m)]
 
 
 def degrees(angle_rad: float | None) -> float:
@@ -60,8 +60,8 @@ def test_a_known_tilt_comes_back_and_the_advice_mends_it(tilt_deg: float, toward
     assert math.degrees(math.acos(min(1.0, float(found.down @ -camera[:3, 2])))) < 0.2
     assert degrees(found.sigma_rad) < 0.2
     assert found.spread_m is not None
-    assert found.left_m is not None
-    assert found.left_m < 0.02
+    assert found.remaining_m is not None
+    assert found.remaining_m < 0.02
     if tilt_deg == 0:
         assert found.level
         assert advise(found).startswith("nothing: it is level, the spread is under 5 cm")
@@ -90,16 +90,18 @@ def test_the_words(axis: tuple[float, float], says: str) -> None:
     points_m = transform(look_down(ORIGIN_M), np.column_stack([PLACES_M, np.zeros(len(PLACES_M))]))
     # The axes of the camera are turned: what it sees turns the other way.
     found = align_camera(
-        "red", [Lying(n, p, np.zeros((3, 3))) for n, p in enumerate(points_m @ camera_turned)]
+        "red", [StationaryMarker(n, p, np.zeros((3, 3))) for n, p in enumerate(points_m @ camera_turned)]
     )
     assert advise(found) == f"tilt it so that it looks further {says}"
 
 
-def by_eq_3(camera_from_world: Array) -> list[Lying]:
+def by_eq_3(camera_from_world: Array) -> list[StationaryMarker]:
     lying = []
     for n, (x_m, y_m) in enumerate(PLACES_M):
-        corners_m = transform(camera_from_world @ lay_flat(x_m, y_m, 0.0, 0.3 * n), marker_corners(0.2))
-        lying.append(Lying(n, camera_point(corners_m[:, :2] / corners_m[:, 2:], 0.2), np.zeros((3, 3))))
+        corners_m = transform(camera_from_world @ pose_facing_up(x_m, y_m, 0.0, 0.3 * n), marker_corners(0.2))
+        lying.append(
+            StationaryMarker(n, camera_point(corners_m[:, :2] / corners_m[:, 2:], 0.2), np.zeros((3, 3)))
+        )
     return lying
 
 
@@ -115,17 +117,17 @@ def test_a_marker_on_a_box_is_named_and_left_out() -> None:
     for raised in range(5):
         heights_m = [0.05 if n == raised else 0.0 for n in range(6)]
         found = align_camera("red", lay(hang(2.0, 30), 0.002, heights_m))
-        ((lying, above_m),) = found.raised
+        ((lying, above_m),) = found.raised_markers
         assert lying.marker_id == raised
         assert above_m == pytest.approx(0.05, abs=0.01)
         assert degrees(found.tilt_rad) == pytest.approx(2.0, abs=0.2)
     flat = align_camera("red", lay(hang(2.0, 30), 0.002))
-    assert flat.raised == ()
+    assert flat.raised_markers == ()
 
 
 def test_of_four_markers_nobody_can_tell_which_is_on_a_box() -> None:
     found = align_camera("red", lay(hang(0.0, 0), 0.001, [0.08])[:4])
-    assert found.raised == ()
+    assert found.raised_markers == ()
     assert found.uneven_m == pytest.approx(0.04, abs=0.005)
     assert align_camera("red", lay(hang(3.0, 0), 0.001)[:4]).uneven_m is None
 
@@ -134,14 +136,14 @@ def test_a_height_that_was_measured_is_brought_down() -> None:
     camera = hang(4.0, 130)
     lying = lay(camera, 0.0, [0.2, 0.0, 0.1, 0.15])
     known = [
-        Lying(one.marker_id, one.point_m, one.covariance_m2, height_m)
+        StationaryMarker(one.marker_id, one.point_m, one.covariance_m2, height_m)
         for one, height_m in zip(lying, [0.2, 0.0, 0.1, 0.15, 0.0, 0.0], strict=True)
     ]
     found = align_camera("red", known)
     assert degrees(found.tilt_rad) == pytest.approx(4.0, abs=1e-3)
-    assert found.left_m == pytest.approx(0.0, abs=1e-4)
+    assert found.remaining_m == pytest.approx(0.0, abs=1e-4)
     assert found.height_m == pytest.approx(2.1)
-    assert found.raised == ()
+    assert found.raised_markers == ()
 
 
 def test_one_and_two_markers_and_markers_on_a_line() -> None:
@@ -163,11 +165,13 @@ def test_one_and_two_markers_and_markers_on_a_line() -> None:
     assert advise(across).startswith("lay one aside of the line of its markers")
     assert two.level is False
     line = [
-        Lying(n, lying[0].point_m + n * (lying[1].point_m - lying[0].point_m) / 5, np.zeros((3, 3)))
+        StationaryMarker(
+            n, lying[0].point_m + n * (lying[1].point_m - lying[0].point_m) / 5, np.zeros((3, 3))
+        )
         for n in range(6)
     ]
     assert align_camera("red", line).axes == 1
-    near = [lying[0], Lying(1, lying[0].point_m + np.array([0.05, 0, 0]), np.zeros((3, 3)))]
+    near = [lying[0], StationaryMarker(1, lying[0].point_m + np.array([0.05, 0, 0]), np.zeros((3, 3)))]
     assert align_camera("red", near).axes == 0
     assert align_camera("red", near).level is None  # not green, whatever the spread
     assert "further apart" in advise(align_camera("red", near))
@@ -177,7 +181,7 @@ def test_what_a_tilt_does_not_mend_is_said() -> None:
     """A lens that was calibrated badly bends the floor."""
     lying = lay(hang(0.0, 0))
     bowl = [
-        Lying(
+        StationaryMarker(
             one.marker_id,
             one.point_m * (1 + 0.05 * float(one.point_m[0] ** 2 + one.point_m[1] ** 2) / 4),
             one.covariance_m2,
@@ -200,7 +204,9 @@ def test_the_uncertainty_is_that_of_the_scatter() -> None:
     off_rad = np.sqrt(np.mean(np.square(misses), axis=0)).max()
     assert 0.8 < np.degrees(off_rad) / np.sqrt(np.mean(np.square(sigmas_deg))) < 1.2
     # More of what scatters so is not named as lying elsewhere than chance has it.
-    named = [len(align_camera("red", lay(hang(3.0, 20), 0.01, seed=seed)).raised) for seed in range(200)]
+    named = [
+        len(align_camera("red", lay(hang(3.0, 20), 0.01, seed=seed)).raised_markers) for seed in range(200)
+    ]
     assert np.mean(np.array(named) > 0) < 0.1
 
 
@@ -220,7 +226,7 @@ def carried(places_m: Sequence[Array]) -> Iterator[CameraPoints]:
 def test_one_marker_at_one_place_after_the_other() -> None:
     camera = hang(4.0, 200)
     places_m = [one.point_m for one in lay(camera)]
-    lying = find_lying(carried(places_m))
+    lying = find_stationary(carried(places_m))
     assert len(lying) == len(places_m)
     assert np.abs(np.array([one.point_m for one in lying]) - places_m).max() < 1e-9
     assert {one.marker_id for one in lying} == {7}
@@ -230,10 +236,10 @@ def test_one_marker_at_one_place_after_the_other() -> None:
 def test_a_frame_for_each_place_is_enough_where_there_is_time_between() -> None:
     places_m = [one.point_m for one in lay(hang(4.0, 200))]
     frames = [CameraPoints(n * 3 * NS_PER_S, (CameraPoint(7, *p.tolist()),)) for n, p in enumerate(places_m)]
-    assert len(find_lying(frames)) == len(places_m)
+    assert len(find_stationary(frames)) == len(places_m)
     # A robot that drives by lies nowhere.
     passing = [CameraPoints(n * NS_PER_S // 10, (CameraPoint(7, 0.1 * n, 0.0, 2.0),)) for n in range(20)]
-    assert find_lying(passing) == []
+    assert find_stationary(passing) == []
 
 
 def test_a_measured_height_belongs_to_its_time() -> None:
@@ -241,4 +247,4 @@ def test_a_measured_height_belongs_to_its_time() -> None:
     still = Interval(3 * NS_PER_S, 3 * NS_PER_S)
     other = Measurement(0, "b", marker_id=8, height_m=0.4, still=still)
     measured = Measurement(3 * NS_PER_S, "a", marker_id=7, height_m=0.15, still=still)
-    assert [one.height_m for one in find_lying(frames, [other, measured])] == [0.0, 0.15, 0.0]
+    assert [one.height_m for one in find_stationary(frames, [other, measured])] == [0.0, 0.15, 0.0]

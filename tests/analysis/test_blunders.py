@@ -9,7 +9,7 @@ import pytest
 from hypothesis import assume, given
 from hypothesis import strategies as st
 
-from ipsys_log.analysis.blunders import Slip, possible_slips
+from ipsys_log.analysis.blunders import Blunder, possible_blunders
 from ipsys_log.analysis.tape import world_point
 from ipsys_log.messages import Distance, Measurement, ReferencePoint, Rig, WorldPoint
 
@@ -21,8 +21,8 @@ PLACE = Measurement(
 TRUE = world_point(PLACE, RIG).world_m
 
 
-def slips(measurement: Measurement, *, rig: Rig = RIG, predicted: object = TRUE) -> list[Slip]:
-    return [slip for group in possible_slips(measurement, rig, np.array(predicted)) for slip in group]
+def slips(measurement: Measurement, *, rig: Rig = RIG, predicted: object = TRUE) -> list[Blunder]:
+    return [slip for group in possible_blunders(measurement, rig, np.array(predicted)) for slip in group]
 
 
 def misread(index: int, distance_m: float) -> Measurement:
@@ -71,7 +71,7 @@ def test_a_corrected_distance_comes_as_near_as_the_other_one_allows(
 
 
 def test_the_order_is_from_simple_to_less_so() -> None:
-    groups = [[slip.kind for slip in group] for group in possible_slips(PLACE, RIG, TRUE)]
+    groups = [[slip.kind for slip in group] for group in possible_blunders(PLACE, RIG, TRUE)]
     assert groups == [["side", "swapped"], ["swapped"], ["distance", "distance", "height"]]
 
 

@@ -6,11 +6,11 @@ import numpy as np
 import pytest
 from numpy.typing import NDArray
 
-from ipsys_log.analysis.coverage import Hung, cover_floor
+from ipsys_log.analysis.coverage import MountedCamera, cover_floor
 from ipsys_log.geometry.markers import marker_corners
-from ipsys_log.geometry.poses import lay_flat, look_down, transform
+from ipsys_log.geometry.poses import look_down, pose_facing_up, transform
 from ipsys_log.messages import CameraCalibration, Floor
-from ipsys_log.simulation.cameras import Camera, hang_cameras, sees
+from ipsys_log.simulation.cameras import Camera, mount_cameras, sees
 from ipsys_log.simulation.settings import LabSettings
 
 Array = NDArray[np.float64]
@@ -18,11 +18,11 @@ Array = NDArray[np.float64]
 FLOOR = Floor(2.0, 3.0)
 
 
-def pinhole(camera: str, x_m: float, y_m: float, height_m: float = 2.0) -> Hung:
+def pinhole(camera: str, x_m: float, y_m: float, height_m: float = 2.0) -> MountedCamera:
     """Sees 2.4 m x 1.6 m of the floor from 2 m above it."""
     K = np.array([[1000.0, 0, 600], [0, 1000, 400], [0, 0, 1]])
     lens = CameraCalibration(0, camera, 1201, 801, "plumb_bob", np.zeros(5), K)
-    return Hung(camera, lens, look_down(np.array([x_m, y_m, height_m])))
+    return MountedCamera(camera, lens, look_down(np.array([x_m, y_m, height_m])))
 
 
 @pytest.mark.parametrize(("apart_m", "width_m"), [(1.1, 0.5), (1.4, 0.2), (1.7, -0.1)])
@@ -37,7 +37,7 @@ def test_two_cameras_that_look_straight_down(apart_m: float, width_m: float) -> 
     assert found.diagonal_m == pytest.approx(diagonal_m)
     # A strip in the middle; and at both ends of the floor where its last bit is not seen.
     strip_m = max(0.0, diagonal_m - width_m)
-    middle = [patch for patch in found.broken if abs((patch.low_m + patch.high_m)[1] / 2 - 1.5) < 0.1]
+    middle = [patch for patch in found.gaps if abs((patch.low_m + patch.high_m)[1] / 2 - 1.5) < 0.1]
     assert [patch.area_m2 for patch in middle] == (
         [pytest.approx(1.8 * strip_m, rel=0.12)] if strip_m else []
     )
@@ -62,7 +62,7 @@ def whole(camera: Camera, places_m: Array, length_m: float) -> NDArray[np.bool_]
     """Whether all corners of a marker are in the picture at each of many headings, corner by corner."""
     found = np.ones(len(places_m), dtype=bool)
     for heading_rad in np.linspace(0, np.pi / 2, 16, endpoint=False):
-        corners_m = transform(lay_flat(0, 0, 0, float(heading_rad)), marker_corners(length_m))
+        corners_m = transform(pose_facing_up(0, 0, 0, float(heading_rad)), marker_corners(length_m))
         for corner_m in corners_m:
             found &= sees(camera, places_m + corner_m)
     return found
@@ -70,8 +70,8 @@ def whole(camera: Camera, places_m: Array, length_m: float) -> NDArray[np.bool_]
 
 def test_a_fisheye_that_is_tilted_against_every_corner_of_a_marker() -> None:
     lab = LabSettings(cameras=("red",), tilt_deg=(4.0, 6.0), mount_height_m=2.4)
-    (camera,) = hang_cameras(lab)
-    hung = Hung("red", camera.lens, camera.camera_from_world)
+    (camera,) = mount_cameras(lab)
+    hung = MountedCamera("red", camera.lens, camera.camera_from_world)
     found = cover_floor(Floor(4.88, 4.88), [hung], 0.2, 0.1)
     mask = found.whole["red"]
     step = 5

@@ -8,8 +8,8 @@ import numpy as np
 from numpy.typing import NDArray
 
 from ipsys_log.analysis.alignment import align_camera, join_cameras
-from ipsys_log.analysis.coverage import Hung
-from ipsys_log.analysis.stationary import Lying
+from ipsys_log.analysis.coverage import MountedCamera
+from ipsys_log.analysis.stationary import StationaryMarker
 from ipsys_log.geometry.poses import invert_pose, look_down, make_pose, rotation, transform
 from ipsys_log.messages import CameraCalibration
 
@@ -28,13 +28,13 @@ FLOOR_M = {
 }
 
 
-def lying(camera: str, pose: Array) -> list[Lying]:
+def lying(camera: str, pose: Array) -> list[StationaryMarker]:
     places_m = np.array([(*xy, 0.0) for xy in FLOOR_M[camera]])
     ids = [0, 1, 2, 3] if camera == "red" else [2, 3, 4, 5]
-    return [Lying(n, p, NONE) for n, p in zip(ids, transform(pose, places_m), strict=True)]
+    return [StationaryMarker(n, p, NONE) for n, p in zip(ids, transform(pose, places_m), strict=True)]
 
 
-def joined(red: list[Lying], white: list[Lying]) -> list[Hung]:
+def joined(red: list[StationaryMarker], white: list[StationaryMarker]) -> list[MountedCamera]:
     alignments = [align_camera("red", red), align_camera("white", white)]
     return join_cameras(alignments, {"red": LENS, "white": LENS})
 

@@ -10,9 +10,9 @@ import numpy as np
 import pytest
 from numpy.typing import NDArray
 
-from ipsys_log.analysis.outliers import LeaveOneOut, find_suspects
-from ipsys_log.analysis.pairs import build_pairs, gather_sightings, measured_in_order
-from ipsys_log.analysis.tape import Measured, world_point
+from ipsys_log.analysis.outliers import LeaveOneOut, find_outliers
+from ipsys_log.analysis.pairs import build_pairs, gather_sightings, valid_measurements
+from ipsys_log.analysis.tape import RiggedMeasurement, world_point
 from ipsys_log.errors import FitError, IpsysError
 from ipsys_log.exchange.imsel import read_imsel
 from ipsys_log.messages import Distance, Measurement, ReferencePoint, Rig, Suspect, WorldPoint
@@ -30,7 +30,7 @@ TILES_M = 4.88
 class Session:
     """Measured places, where they truly are, and what each camera saw of them."""
 
-    places: list[Measured]
+    places: list[RiggedMeasurement]
     truth: Mapping[str, Array]
     points: Mapping[str, Mapping[str, Array]]
 
@@ -81,7 +81,7 @@ def simulated(seed: int, count: int = 50, shared: bool = False, rig: Rig = RIG) 
         height_m = point[2] + rng.normal(0, 0.001) * (point[2] > 0)
         side = "left" if y >= A.y_m else "right"
         tape = tuple(read_tape(point, rng, 0.003, rig))
-        places.append(Measured(Measurement(0, name, None, 0, tape, side, float(height_m)), rig))
+        places.append(RiggedMeasurement(Measurement(0, name, None, 0, tape, side, float(height_m)), rig))
     return Session(places, truth, points)
 
 
@@ -113,7 +113,7 @@ def without_each(session: Session, model: str = "poly") -> LeaveOneOut:
 
 
 def suspects_of(session: Session, model: str = "poly") -> tuple[Suspect, ...]:
-    return find_suspects(without_each(session, model), session.places)
+    return find_outliers(without_each(session, model), session.places)
 
 
 def other_side(one: Measurement) -> Measurement:
@@ -335,7 +335,7 @@ def test_a_prediction_that_is_no_point_is_passed_over() -> None:
             points[sorted(set(points) - set(planted))[0]] = np.full(3, np.nan)
         return found
 
-    assert [suspect.measurement for suspect in find_suspects(broken, session.places)] == list(planted)
+    assert [suspect.measurement for suspect in find_outliers(broken, session.places)] == list(planted)
 
 
 def test_few_fits_are_asked_for() -> None:
@@ -347,7 +347,7 @@ def test_few_fits_are_asked_for() -> None:
             calls.append(unused)
             return fits(unused)
 
-        find_suspects(counted, session.places)
+        find_outliers(counted, session.places)
         assert calls[0] == frozenset()
         return len(calls)
 
@@ -358,8 +358,8 @@ def test_few_fits_are_asked_for() -> None:
 def test_cameras_with_too_few_places_are_not_judged() -> None:
     session, _ = plant(simulated(12, count=14), ["side"], 12)
     assert suspects_of(session) == ()
-    assert find_suspects(lambda unused: {}, session.places) == ()
-    assert find_suspects(lambda unused: {"red": {}}, []) == ()
+    assert find_outliers(lambda unused: {}, session.places) == ()
+    assert find_outliers(lambda unused: {"red": {}}, []) == ()
 
 
 def test_the_search_ends_where_too_few_places_are_left_to_fit_to() -> None:
@@ -371,14 +371,14 @@ def test_the_search_ends_where_too_few_places_are_left_to_fit_to() -> None:
             raise FitError("too few places")
         return fits(unused)
 
-    (suspect,) = find_suspects(tired, session.places)
+    (suspect,) = find_outliers(tired, session.places)
     assert suspect.measurement in planted
 
     def never(unused: frozenset[str]) -> Mapping[str, Mapping[str, Array]]:
         raise FitError("too few places")
 
     with pytest.raises(FitError, match="too few"):
-        find_suspects(never, session.places)
+        find_outliers(never, session.places)
 
 
 def test_at_most_a_fifth_of_the_places_is_suspected() -> None:
@@ -405,7 +405,7 @@ def test_a_good_place_is_put_back_when_the_clean_fits_agree_with_it(lasting: boo
             found["red"][name] = found["red"][name] + np.array([0.5, 0, 0])
         return found
 
-    assert find_suspects(fooled, session.places) == ()
+    assert find_outliers(fooled, session.places) == ()
     # With it back in, the others are judged once more.
     assert calls == [frozenset(), frozenset({name}), frozenset()]
 
@@ -417,7 +417,7 @@ def test_the_pair_of_the_authors_that_contradicts_its_neighbours_comes_first(
     if not (data / "imsel").is_dir():
         pytest.skip(f"no authors' data in {data / 'imsel'}")
     log = list(read_imsel(data / "imsel"))
-    places = [p for p in measured_in_order(log, None) if set(labels) & set(p.measurement.splits)]
+    places = [p for p in valid_measurements(log, None) if set(labels) & set(p.measurement.splits)]
     pairs = build_pairs(gather_sightings(log), places)
     assert [len(found) for found in pairs.values()] == [40 if labels == ("train",) else 50] * 3
     points = {camera: {pair.measurement: pair.camera_m for pair in found} for camera, found in pairs.items()}

@@ -8,13 +8,13 @@ import numpy as np
 import pytest
 
 from ipsys_log.analysis.pairs import (
-    Measured,
+    RiggedMeasurement,
     active_measurements,
     build_pairs,
     gather_sightings,
-    measured_in_order,
     split,
     still_interval,
+    valid_measurements,
 )
 from ipsys_log.errors import IpsysError
 from ipsys_log.messages import (
@@ -85,7 +85,7 @@ def test_a_sighting_is_of_the_time_at_which_the_marker_was_exposed() -> None:
 def test_a_still_interval_holds_for_what_was_exposed_in_it() -> None:
     sightings = gather_sightings(late((0, 30 * MS, 0.1), (1, 30 * MS, 0.2), (2, 30 * MS, 0.3)))
     given = Measurement(0, "a", marker_id=0, still=Interval(S, 2 * S), point=WorldPoint(1, 2, 3))
-    (pair,) = build_pairs(sightings, [Measured(given, RIG)])["red"]
+    (pair,) = build_pairs(sightings, [RiggedMeasurement(given, RIG)])["red"]
     assert (pair.frames, pair.camera_m[0]) == (1, 0.2)
 
 
@@ -103,7 +103,7 @@ def test_a_long_silence_ends_the_stretch() -> None:
 def test_a_pair_is_the_mean_over_the_still_interval() -> None:
     rows = still(0, 2, 0.5)
     given = Measurement(0, "a", marker_id=0, still=Interval(int(0.5 * S), S), point=WorldPoint(1, 2, 3))
-    pair = build_pairs(gather_sightings(seen(*rows)), [Measured(given, RIG)])["red"][0]
+    pair = build_pairs(gather_sightings(seen(*rows)), [RiggedMeasurement(given, RIG)])["red"][0]
     inside = [x for t, x, _ in rows if 0.5 <= t <= 1.0]
     assert pair.frames == len(inside) == 6
     assert pair.camera_m[0] == pytest.approx(np.mean(inside))
@@ -116,20 +116,20 @@ def test_a_pair_knows_how_well_its_place_is_known() -> None:
     taped = Measurement(
         0, "a", marker_id=0, distances=corner, side="left", height_m=0.1, height_sigma_m=0.002
     )
-    pair = build_pairs(sightings, [Measured(taped, RIG)])["red"][0]
+    pair = build_pairs(sightings, [RiggedMeasurement(taped, RIG)])["red"][0]
     np.testing.assert_allclose(pair.world_m, [0, 2, 0.1], atol=1e-9)
     assert pair.world_covariance_m2 is not None
     # A at a right angle to the floor's edge knows y; B, at 45 degrees, adds x.
     sigmas_m = np.sqrt(pair.world_covariance_m2.diagonal())
     np.testing.assert_allclose(sigmas_m, [0.003 * 3**0.5, 0.003, 0.002], rtol=1e-9)
     given_point = Measurement(0, "b", marker_id=0, point=WorldPoint(1, 2, 0))
-    assert build_pairs(sightings, [Measured(given_point, RIG)])["red"][0].world_covariance_m2 is None
+    assert build_pairs(sightings, [RiggedMeasurement(given_point, RIG)])["red"][0].world_covariance_m2 is None
 
 
 def test_a_camera_that_did_not_see_a_place_has_no_pair_of_it() -> None:
     messages = seen(*still(0, 1, 0.5)) + seen(*still(50, 51, 0.5), camera="black")
     measured = Measurement(S // 2, "a", marker_id=0, point=WorldPoint(1, 2, 0))
-    pairs = build_pairs(gather_sightings(messages), [Measured(measured, RIG)])
+    pairs = build_pairs(gather_sightings(messages), [RiggedMeasurement(measured, RIG)])
     assert len(pairs["red"]) == 1
     assert pairs["black"] == []
 
@@ -175,7 +175,7 @@ def test_a_withdrawn_measurement_does_not_count() -> None:
 )
 def test_measurements_that_say_too_little(measurement: Measurement, said: str) -> None:
     with pytest.raises(IpsysError, match=said):
-        build_pairs(gather_sightings(seen(*still(0, 1, 0.5))), [Measured(measurement, RIG)])
+        build_pairs(gather_sightings(seen(*still(0, 1, 0.5))), [RiggedMeasurement(measurement, RIG)])
 
 
 def test_a_split_at_random_is_a_fifth_and_the_same_for_a_seed() -> None:
@@ -192,11 +192,11 @@ def test_the_rig_of_its_time_holds_for_a_measurement() -> None:
     moved = replace(RIG, reference_points=(ReferencePoint("A", 0.0, 0.0), ReferencePoint("B", 3.0, 0.0)))
     one, two = (Measurement(0, name, marker_id=0, point=WorldPoint(0, 0, 0)) for name in "ab")
     log = [Message("t", n, n, payload) for n, payload in enumerate((one, RIG, two, moved))]
-    found = measured_in_order(log, None)
+    found = valid_measurements(log, None)
     assert [(place.measurement.id, place.rig) for place in found] == [("a", RIG), ("b", RIG)]
-    assert [place.rig for place in measured_in_order(log, moved)] == [moved, moved]
+    assert [place.rig for place in valid_measurements(log, moved)] == [moved, moved]
     later = [*log, Message("t", 9, 9, Measurement(0, "c", marker_id=0))]
-    assert measured_in_order(later, None)[-1].rig == moved
+    assert valid_measurements(later, None)[-1].rig == moved
 
 
 def test_places_that_are_held_out_are_never_fitted_on() -> None:
@@ -212,4 +212,4 @@ def test_places_that_are_held_out_are_never_fitted_on() -> None:
 def test_a_world_point_that_is_no_point(value: float) -> None:
     measurement = Measurement(0, "a", marker_id=0, point=WorldPoint(1.0, 2.0, value))
     with pytest.raises(IpsysError, match="measurement a: its world point"):
-        build_pairs(gather_sightings(seen(*still(0, 1, 0.5))), [Measured(measurement, RIG)])
+        build_pairs(gather_sightings(seen(*still(0, 1, 0.5))), [RiggedMeasurement(measurement, RIG)])

@@ -10,15 +10,15 @@ import pytest
 from numpy.typing import NDArray
 from scipy.special import ellipe
 
-from ipsys_log.analysis.plan import Plan, View, mean_length, plan_places
+from ipsys_log.analysis.plan import FittedCamera, Plan, mean_length, plan_points
 from ipsys_log.errors import IpsysError
 from ipsys_log.geometry.lenses import undistort
-from ipsys_log.geometry.poses import invert_pose, lay_flat, look_down, transform
+from ipsys_log.geometry.poses import invert_pose, look_down, pose_facing_up, transform
 from ipsys_log.geometry.trilateration import tape_covariance
 from ipsys_log.messages import CameraCalibration, Pair
-from ipsys_log.models.table import Places, fit_cameras, inputs
+from ipsys_log.models.table import CalibrationPoints, fit_cameras, inputs
 from ipsys_log.models.uncertainty import Uncertainty
-from ipsys_log.report.plan import fitted_view
+from ipsys_log.report.plan import view_of_model
 from ipsys_log.stages.fit import fit_model
 
 Array = NDArray[np.float64]
@@ -71,7 +71,7 @@ class Camera:
         inside = np.ones(len(world_m), dtype=bool)
         for heading in np.linspace(0, np.pi / 2, 7):
             for corner in SIDE_M / 2 * np.array([[-1, 1, 0], [1, 1, 0], [1, -1, 0], [-1, -1, 0]]):
-                at_m = transform(lay_flat(0.0, 0.0, 0.0, heading), corner[None]) + world_m
+                at_m = transform(pose_facing_up(0.0, 0.0, 0.0, heading), corner[None]) + world_m
                 px = self.pixels(at_m)
                 inside &= (px >= 0).all(axis=1) & (px[:, 0] <= 1919) & (px[:, 1] <= 1079)
         return inside
@@ -126,9 +126,9 @@ def measure(
     return pairs
 
 
-def places(pairs: list[Pair]) -> Places:
+def places(pairs: list[Pair]) -> CalibrationPoints:
     points_m, world_m = (np.array([getattr(pair, key) for pair in pairs]) for key in ("camera_m", "world_m"))
-    return Places(points_m, world_m, tuple(pair.measurement for pair in pairs))
+    return CalibrationPoints(points_m, world_m, tuple(pair.measurement for pair in pairs))
 
 
 def draw(cameras: list[Camera], count: int, rng: np.random.Generator) -> Array:
@@ -155,9 +155,9 @@ def lab(seed: int, count: int = 12) -> tuple[list[Camera], dict[str, list[Pair]]
             return cameras, pairs, rng
 
 
-def views_of(cameras: list[Camera], pairs: dict[str, list[Pair]], model: str = "best") -> list[View]:
+def views_of(cameras: list[Camera], pairs: dict[str, list[Pair]], model: str = "best") -> list[FittedCamera]:
     fitted = {row.camera: row for row in fit_model(model, pairs, 0).cameras}
-    return [fitted_view(model, fitted[camera.name], camera.lens) for camera in cameras]
+    return [view_of_model(model, fitted[camera.name], camera.lens) for camera in cameras]
 
 
 def true_mean_error_m(cameras: list[Camera], pairs: dict[str, list[Pair]], model: str = "best") -> float:
@@ -175,8 +175,8 @@ def true_mean_error_m(cameras: list[Camera], pairs: dict[str, list[Pair]], model
     return float(np.nanmean(np.where(np.isnan(first_m), second_m, first_m)))
 
 
-def planned(views: list[View], count: int = 6) -> Plan:
-    return plan_places(views, grid(0.2, (0.1,)), grid(0.2, HEIGHTS_M), tape_m2, RADIUS_M, count)
+def planned(views: list[FittedCamera], count: int = 6) -> Plan:
+    return plan_points(views, grid(0.2, (0.1,)), grid(0.2, HEIGHTS_M), tape_m2, RADIUS_M, count)
 
 
 @pytest.mark.parametrize(
@@ -206,7 +206,7 @@ def test_planned_places_are_worth_more_than_random_ones(seeds: range) -> None:
     assert (planned_m < without_m).mean() > 0.8
 
 
-def from_scratch(views: list[View], floor_m: Array, points_m: Array) -> Array:
+def from_scratch(views: list[FittedCamera], floor_m: Array, points_m: Array) -> Array:
     """The error over the floor with further places, from the normal equations of all of them."""
     least_m = np.full(len(floor_m), np.inf)
     for view in views:
@@ -231,7 +231,7 @@ def from_scratch(views: list[View], floor_m: Array, points_m: Array) -> Array:
     return np.where(np.isinf(least_m), np.nan, least_m)
 
 
-def covariances_m2(uncertainty: Uncertainty, view: View, world_m: Array) -> Array:
+def covariances_m2(uncertainty: Uncertainty, view: FittedCamera, world_m: Array) -> Array:
     return uncertainty.covariances(view.predict, view.points(world_m), world_m[:, 2])[:, :2, :2]
 
 
@@ -262,7 +262,7 @@ def test_the_first_place_is_the_best_of_all() -> None:
     cameras, pairs, _ = lab(5)
     views, floor_m = views_of(cameras, pairs), grid(0.4, (0.1,))
     candidates_m = grid(0.4, (0.1,))
-    plan = plan_places(views, floor_m, candidates_m, tape_m2, RADIUS_M, 1)
+    plan = plan_points(views, floor_m, candidates_m, tape_m2, RADIUS_M, 1)
     seen = np.any([view.sees(candidates_m, RADIUS_M) for view in views], axis=0)
     means_m = [np.nanmean(from_scratch(views, floor_m, point_m[None])) for point_m in candidates_m[seen]]
     assert plan.places[0].mean_after_m == pytest.approx(min(means_m), rel=1e-5)
@@ -342,7 +342,7 @@ def test_a_camera_without_a_lens_sees_what_lies_among_its_places() -> None:
     assert not view.sees(middle_m[None] + [4.0, 0, 0], RADIUS_M).any()
 
 
-def level_view(fitted_m: Array) -> View:
+def level_view(fitted_m: Array) -> FittedCamera:
     """A perfect camera 2 m above the middle of the world."""
     pose = look_down(np.array([0.0, 0.0, 2.0]))
 
@@ -351,7 +351,7 @@ def level_view(fitted_m: Array) -> View:
 
     uncertainty = Uncertainty(3e-4, 1e-4, 1.0, 1e-5 * np.eye(3), transform(pose, fitted_m))
     calibration = lens("over", "kannala_brandt", 600, FISHEYE)
-    return View("over", pose, np.zeros(3), calibration, predict, uncertainty, fitted_m)
+    return FittedCamera("over", pose, np.zeros(3), calibration, predict, uncertainty, fitted_m)
 
 
 def test_where_the_tapes_cross_flatly_nothing_is_planned() -> None:
@@ -370,13 +370,13 @@ def test_where_the_tapes_cross_flatly_nothing_is_planned() -> None:
         return np.array([np.trace(tape_covariance(p[:2], references_m, sigmas_m)) for p in world_m])
 
     def after_m(candidate_m: Array) -> float:
-        none = plan_places([view], floor_m, candidate_m[None], lambda w: np.zeros(len(w)), RADIUS_M, 1)
+        none = plan_points([view], floor_m, candidate_m[None], lambda w: np.zeros(len(w)), RADIUS_M, 1)
         return none.places[0].mean_after_m
 
     # By what they say of the camera they are worth the same.
     assert after_m(flat_m) == pytest.approx(after_m(flat_m * mirror), rel=1e-9)
     for order in ([flat_m, flat_m * mirror], [flat_m * mirror, flat_m]):
-        plan = plan_places([view], floor_m, np.array(order), variances, RADIUS_M, 1)
+        plan = plan_points([view], floor_m, np.array(order), variances, RADIUS_M, 1)
         assert plan.places[0].point_m.tolist() == (flat_m * mirror).tolist()
 
 
@@ -390,7 +390,7 @@ def test_a_place_beside_a_known_one_has_to_do_clearly_more() -> None:
 
     def first(*candidates_m: tuple[float, float]) -> tuple[list[float], float]:
         world_m = np.column_stack([np.array(candidates_m), np.zeros(len(candidates_m))])
-        plan = plan_places([view], floor_m, world_m, lambda w: np.full(len(w), 2e-5), RADIUS_M, 1)
+        plan = plan_points([view], floor_m, world_m, lambda w: np.full(len(w), 2e-5), RADIUS_M, 1)
         place = plan.places[0]
         return place.point_m[:2].tolist(), place.mean_before_m - place.mean_after_m
 
@@ -405,4 +405,4 @@ def test_a_height_that_no_camera_sees_is_said() -> None:
     cameras, pairs, _ = lab(2)
     views = views_of(cameras, pairs)
     with pytest.raises(IpsysError, match=r"no camera sees a whole marker 2\.5 m above the floor"):
-        plan_places(views, grid(0.4, (0.1,)), grid(0.4, (0.1, 2.5)), tape_m2, RADIUS_M, 1)
+        plan_points(views, grid(0.4, (0.1,)), grid(0.4, (0.1, 2.5)), tape_m2, RADIUS_M, 1)

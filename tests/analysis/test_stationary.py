@@ -6,9 +6,9 @@ import numpy as np
 import pytest
 
 from ipsys_log.analysis.pairs import Sightings
-from ipsys_log.analysis.stationary import lies_still, still_stretches
+from ipsys_log.analysis.stationary import is_stationary, stationary_intervals
 from ipsys_log.messages import CameraPoint, CameraPoints
-from ipsys_log.survey.scene import View, look
+from ipsys_log.survey.scene import CameraView, observe_marker
 from ipsys_log.units import NS_PER_S
 from tests import labs
 
@@ -34,19 +34,19 @@ def laid(*parts: tuple[float, float, float]) -> Array:
 
 
 def test_two_places_with_a_walk_between_them() -> None:
-    found = still_stretches({"red": seen(laid((5, 0, 0), (2, 0.4, 0.1), (4, 0, 0)))})
+    found = stationary_intervals({"red": seen(laid((5, 0, 0), (2, 0.4, 0.1), (4, 0, 0)))})
     assert [(round(a / NS_PER_S, 0), round(b / NS_PER_S, 0)) for a, b, _ in found] == [(0, 5), (7, 11)]
 
 
 @pytest.mark.parametrize("speed_m_s", [0.01, 0.03, 0.1, 0.5])
 def test_what_moves_however_slowly_does_not_lie_still(speed_m_s: float) -> None:
-    assert still_stretches({"red": seen(laid((6, speed_m_s, speed_m_s / 3)))}) == []
+    assert stationary_intervals({"red": seen(laid((6, speed_m_s, speed_m_s / 3)))}) == []
 
 
 def test_what_several_cameras_see_is_one_place() -> None:
     path = laid((6, 0, 0), (1, 0.5, 0))
     cameras = {"red": seen(path), "white": seen(path[40:], 40 / RATE_HZ), "black": seen(path[:1])}
-    (found,) = still_stretches(cameras)
+    (found,) = stationary_intervals(cameras)
     assert found[2] == ("red", "white")
     assert found[0] == 0
     assert found[1] == pytest.approx(6 * NS_PER_S, abs=0.1 * NS_PER_S)
@@ -59,34 +59,34 @@ def test_a_hand_in_front_of_it_for_a_second_does_not_part_a_place_but_three_do()
         joined = Sightings(
             np.concatenate([first.times_ns, last.times_ns]), np.concatenate([first.points_m, last.points_m])
         )
-        assert len(still_stretches({"red": joined})) == count
+        assert len(stationary_intervals({"red": joined})) == count
 
 
 def test_a_frame_in_which_it_jumps_does_not_part_a_place() -> None:
     path = laid((8, 0, 0))
     path[100] += [0.05, 0, 0]
-    (found,) = still_stretches({"red": seen(path)})
+    (found,) = stationary_intervals({"red": seen(path)})
     assert found[:2] == (0, int(seen(path).times_ns[-1]))
 
 
 def test_a_depth_that_jitters_at_the_edge_of_the_picture_is_no_motion() -> None:
     ray = np.array([-0.95, 0.55, 1.0])
-    assert lies_still(ray * np.array([[1.92], [1.921], [1.913]]))
+    assert is_stationary(ray * np.array([[1.92], [1.921], [1.913]]))
 
 
 def test_the_last_second_of_a_recording() -> None:
-    def view(path: Array, camera: str = "red", first: int = 0) -> View:
+    def view(path: Array, camera: str = "red", first: int = 0) -> CameraView:
         rows = [CameraPoints(n, (CameraPoint(3, *point),)) for n, point in enumerate(path.tolist(), first)]
-        return View(camera, len(rows), points=tuple(rows))
+        return CameraView(camera, len(rows), points=tuple(rows))
 
     still, moves = laid((1, 0, 0)), laid((1, 0.05, 0))
-    assert look([view(still)], 3).state == "still"
-    assert look([view(still), view(moves, "white")], 3).moving == ("white",)
-    assert look([view(still)], 4).state == "unseen"
+    assert observe_marker([view(still)], 3).state == "still"
+    assert observe_marker([view(still), view(moves, "white")], 3).moving == ("white",)
+    assert observe_marker([view(still)], 4).state == "unseen"
     # A single sighting says nothing.
-    assert look([view(still[:1])], 3).state == "unseen"
+    assert observe_marker([view(still[:1])], 3).state == "unseen"
     # What another camera saw before it came into view here may have been another place.
-    later = look([view(still, "white", 10), view(still[:10])], 3)
+    later = observe_marker([view(still, "white", 10), view(still[:10])], 3)
     assert later.still is not None
     assert (later.still.start, list(later.points_m)) == (10, ["white"])
-    assert list(look([view(still, "white", 9), view(still[:10])], 3).points_m) == ["white", "red"]
+    assert list(observe_marker([view(still, "white", 9), view(still[:10])], 3).points_m) == ["white", "red"]

@@ -9,7 +9,7 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
-from ipsys_log.analysis.tape import Measured, flat_places, reference_points, world_point
+from ipsys_log.analysis.tape import RiggedMeasurement, find_weak_points, reference_points, world_point
 from ipsys_log.errors import IpsysError
 from ipsys_log.geometry.trilateration import trilaterate
 from ipsys_log.messages import Distance, Measurement, ReferencePoint, Rig, WorldPoint
@@ -153,9 +153,10 @@ def test_the_reference_points_of_the_distances_in_their_order() -> None:
 def test_places_where_the_tapes_cross_flatly_are_listed_the_worst_first() -> None:
     here = {"good": (2.4, 3.6), "flat": (2.4, 2.65), "beyond": (4.6, 2.6), "flatter": (2.4, 2.5)}
     places = [
-        Measured(replace(measurement("A", "B", x=x, y=y), id=name), RIG) for name, (x, y) in here.items()
+        RiggedMeasurement(replace(measurement("A", "B", x=x, y=y), id=name), RIG)
+        for name, (x, y) in here.items()
     ]
-    found = flat_places(places)
+    found = find_weak_points(places)
     assert [flat.id for flat in found] == ["flatter", "beyond", "flat"]
     for flat in found:
         x, y = here[flat.id]
@@ -169,9 +170,11 @@ def test_places_where_the_tapes_cross_flatly_are_listed_the_worst_first() -> Non
 
 
 def test_without_a_sigma_the_angle_still_tells() -> None:
-    flat = Measured(measurement("A", "B", x=2.4, y=2.5), UNKNOWN)
-    found = flat_places([flat])
+    flat = RiggedMeasurement(measurement("A", "B", x=2.4, y=2.5), UNKNOWN)
+    found = find_weak_points([flat])
     assert [(one.id, one.sigma_m) for one in found] == [("a", None)]
     # A third tape from elsewhere knows it.
-    assert flat_places([Measured(measurement("A", "B", "C", x=2.4, y=2.5), RIG)]) == []
-    assert flat_places([Measured(Measurement(0, "b", point=WorldPoint(2.4, 2.5, 0)), RIG)]) == []
+    assert find_weak_points([RiggedMeasurement(measurement("A", "B", "C", x=2.4, y=2.5), RIG)]) == []
+    assert (
+        find_weak_points([RiggedMeasurement(Measurement(0, "b", point=WorldPoint(2.4, 2.5, 0)), RIG)]) == []
+    )

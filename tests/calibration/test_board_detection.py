@@ -12,9 +12,9 @@ from numpy.typing import NDArray
 from scipy.ndimage import gaussian_filter
 
 from ipsys_log.calibration.board import Board, parse_board
-from ipsys_log.calibration.board_detection import Sighting, find_board
-from ipsys_log.calibration.board_search import look
-from ipsys_log.calibration.image_selection import MOST_PICTURES, choose
+from ipsys_log.calibration.board_detection import BoardSighting, find_board
+from ipsys_log.calibration.board_search import search_images
+from ipsys_log.calibration.image_selection import MAX_IMAGES, select_images
 from ipsys_log.errors import IpsysError
 from tests.calibration.boards_seen import Array, chessboard_pattern, pixels_of, random_pose, render
 
@@ -142,31 +142,31 @@ def test_mirrored_pictures_are_said_to_be() -> None:
     pictures = [np.ascontiguousarray(drawn(CHARUCO, seed, 0.7)[0][:, ::-1]) for seed in range(2)]
     said = "it is seen mirrored in 2 of 2 tried"
     with pytest.raises(IpsysError, match=said):
-        look([("a", pictures[0]), ("b", pictures[1])], CHARUCO, 2, "red")
+        search_images([("a", pictures[0]), ("b", pictures[1])], CHARUCO, 2, "red")
 
 
 def test_pictures_of_the_same_name_of_which_one_has_another_size() -> None:
     """Two folders of one camera may have pictures of one name."""
     grey = drawn(CHARUCO, 0, 0.7)[0]
     small = np.ascontiguousarray(grey[100:, 100:])
-    looked = look([("a", grey), ("a", small), ("a", grey), ("a", grey)], CHARUCO, 4, "red")
+    looked = search_images([("a", grey), ("a", small), ("a", grey), ("a", grey)], CHARUCO, 4, "red")
     assert len(looked.sightings) == 3
     assert looked.unreadable == (("a", "is 540 x 380 px, most are 640 x 480"),)
 
 
-def sighting(name: str, x: float, y: float, blur_px: float = 0.8, count: int = 24) -> Sighting:
+def sighting(name: str, x: float, y: float, blur_px: float = 0.8, count: int = 24) -> BoardSighting:
     """A board of 100 x 60 px with its upper left corner at x, y."""
     ids = np.arange(count)
-    pixels = CHESSBOARD.places(ids) * 20 + (x, y)
+    pixels = CHESSBOARD.grid_positions(ids) * 20 + (x, y)
     outline = np.array([[0.0, 0], [100, 0], [100, 60], [0, 60]]) + np.array([x, y])
-    return Sighting(name, ids, pixels, blur_px, outline)
+    return BoardSighting(name, ids, pixels, blur_px, outline)
 
 
 def test_blurred_pictures_and_those_with_few_corners_are_dropped_with_the_reason() -> None:
     seen = [sighting(str(n), 30 * n, 10) for n in range(10)]
     seen += [sighting("shaken", 100, 200, blur_px=3.5), sighting("half", 200, 200, count=4)]
     seen += [sighting("row", 300, 200, count=6)]
-    chosen = choose(seen, CHESSBOARD, (640, 480))
+    chosen = select_images(seen, CHESSBOARD, (640, 480))
     assert len(chosen.used) == 10
     reasons = dict(chosen.bad)
     assert reasons["shaken"] == "blurred: edges are 3.5 px wide, in the sharp pictures 0.8"
@@ -178,8 +178,8 @@ def test_of_hundreds_of_frames_some_dozens_that_differ_are_chosen() -> None:
     """A board that lies still for most of a video, and then goes all over the image."""
     still = [sighting(f"still {n}", 300, 200) for n in range(200)]
     moving = [sighting(f"{x} {y}", x, y) for x in range(0, 540, 20) for y in range(0, 420, 20)]
-    chosen = choose([*still, *moving], CHESSBOARD, (640, 480))
-    assert len(chosen.used) == MOST_PICTURES
+    chosen = select_images([*still, *moving], CHESSBOARD, (640, 480))
+    assert len(chosen.used) == MAX_IMAGES
     assert sum(s.name.startswith("still") for s in chosen.used) <= 1
     corners = np.concatenate([s.pixels for s in chosen.used])
     assert corners.min(axis=0).tolist() == [0, 0]
@@ -189,7 +189,7 @@ def test_of_hundreds_of_frames_some_dozens_that_differ_are_chosen() -> None:
 
 def test_of_two_that_show_the_same_the_sharp_one_is_chosen() -> None:
     seen = [sighting(f"{x}", x, 10, blur_px=0.8 + (x % 2)) for x in range(400)]
-    chosen = choose(seen, CHESSBOARD, (640, 480))
+    chosen = select_images(seen, CHESSBOARD, (640, 480))
     assert np.mean([s.blur_px < 1 for s in chosen.used]) > 0.9
 
 
@@ -211,7 +211,7 @@ def test_a_chessboard_that_was_taken_for_a_charuco_board_is_named_while_others_a
     pictures = [(f"{seed}", drawn(CHESSBOARD, seed, 1.0)[0]) for seed in range(3)]
     tried: list[tuple[int, int]] = []
     with pytest.raises(IpsysError, match="but a chessboard of 6 x 4 inner corners is seen in 3 of 3 tried"):
-        look(
+        search_images(
             pictures,
             Board(7, 5, 0.03, 0.75),
             3,

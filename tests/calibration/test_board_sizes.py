@@ -9,10 +9,10 @@ import pytest
 from numpy.typing import NDArray
 
 from ipsys_log.calibration.board import Board, parse_board
-from ipsys_log.calibration.board_search import Looked, look
+from ipsys_log.calibration.board_search import SearchResult, search_images
 from ipsys_log.calibration.calibrate import calibrate
 from ipsys_log.calibration.chessboard import complete_grid, find_chessboard
-from ipsys_log.calibration.lens_models import LENSES
+from ipsys_log.calibration.lens_models import LENS_MODELS
 from ipsys_log.errors import IpsysError
 from tests.calibration.boards_seen import chessboard_pattern, photograph, striped_pattern
 from tests.calibration.test_board_detection import charuco_pattern
@@ -44,10 +44,10 @@ def charuco(columns: int, rows: int) -> list[Grey]:
     return photograph(charuco_pattern(board), half_m, LENS, SIZE_PX, 4, 5, (0.33, 0.42))
 
 
-def seen(pictures: list[Grey], board: str, insist: bool = False) -> Looked:
+def seen(pictures: list[Grey], board: str, insist: bool = False) -> SearchResult:
     named = [(f"{n}.png", picture) for n, picture in enumerate(pictures)]
     wanted = parse_board(board, SQUARE_M, 0.75, "DICT_4X4_50", False)
-    return look(named, wanted, len(pictures), "red", insist=insist)
+    return search_images(named, wanted, len(pictures), "red", force=insist)
 
 
 # Margin, width and phase of the stripes in squares: dark beside the paper above, or on both sides; or so that
@@ -66,10 +66,10 @@ def test_board_over_stripes_right_size_gives_the_lens(stripes: tuple[float, floa
     """The edge of the paper before a dark stripe looks like one more row of corners."""
     looked = seen(striped(*stripes), "8x6")
     assert len(looked.sightings) >= 6
-    result = calibrate("red", looked, Board(8, 6, SQUARE_M), LENSES["pinhole4"])
+    result = calibrate("red", looked, Board(8, 6, SQUARE_M), LENS_MODELS["pinhole4"])
     assert result.values[0] == pytest.approx(LENS[0], rel=0.005)
     assert result.rms_px < 0.1
-    assert result.far_corners < 0.02 * len(result.pixels)
+    assert result.outlier_corners < 0.02 * len(result.pixels)
 
 
 @pytest.mark.parametrize("stripes", STRIPES[:2])

@@ -7,10 +7,10 @@ import pytest
 from scipy.spatial.transform import Rotation
 
 from ipsys_log.calibration.board import Board
-from ipsys_log.calibration.board_detection import Sighting
-from ipsys_log.calibration.board_search import Looked
-from ipsys_log.calibration.calibrate import Calibrated, calibrate
-from ipsys_log.calibration.lens_models import LENSES
+from ipsys_log.calibration.board_detection import BoardSighting
+from ipsys_log.calibration.board_search import SearchResult
+from ipsys_log.calibration.calibrate import CalibrationResult, calibrate
+from ipsys_log.calibration.lens_models import LENS_MODELS
 from ipsys_log.errors import IpsysError
 from tests.calibration.boards_seen import SIZE_PX, TRUTH, grid_m, pixels_of, seen
 
@@ -24,15 +24,15 @@ def sightings(
     blur_px: float = 0.8,
     seed: int = 0,
     name: str = "pinhole",
-) -> Looked:
+) -> SearchResult:
     """Boards at these places, each tilted to another side."""
     rng, found = np.random.default_rng(seed), []
     for n, place_m in enumerate(places_m):
         turn = Rotation.from_rotvec([tilt_rad * np.cos(n * 2.4), tilt_rad * np.sin(n * 2.4), 0]).as_matrix()
         pixels = pixels_of(name, TRUTH[name], grid_m() @ turn.T + place_m)
         pixels += rng.normal(0, noise_px, pixels.shape)
-        found.append(Sighting(f"{n}.png", np.arange(24), pixels, blur_px, pixels[[0, 5, 23, 18]]))
-    return Looked(len(found), SIZE_PX, tuple(found), ())
+        found.append(BoardSighting(f"{n}.png", np.arange(24), pixels, blur_px, pixels[[0, 5, 23, 18]]))
+    return SearchResult(len(found), SIZE_PX, tuple(found), ())
 
 
 def everywhere(
@@ -47,8 +47,8 @@ def everywhere(
     ]
 
 
-def calibrated(looked: Looked) -> Calibrated:
-    return calibrate("red", looked, BOARD, LENSES["pinhole"])
+def calibrated(looked: SearchResult) -> CalibrationResult:
+    return calibrate("red", looked, BOARD, LENS_MODELS["pinhole"])
 
 
 def test_of_good_pictures_nothing_is_asked() -> None:
@@ -79,7 +79,7 @@ def test_boards_along_the_image_tell_no_focal_length_near_and_far(name: str) -> 
     """Else it runs away to a hundredth of itself, with a standard deviation that says otherwise."""
     looked = sightings(everywhere(), 0.0, name=name)
     with pytest.raises(IpsysError, match="tilt it to all sides"):
-        calibrate("red", looked, BOARD, LENSES[name])
+        calibrate("red", looked, BOARD, LENS_MODELS[name])
 
 
 def test_boards_that_were_hardly_tilted_tell_it_as_well_as_they_can() -> None:
@@ -99,20 +99,22 @@ def test_corners_that_are_far_off_are_said_to_be() -> None:
     assert any("px: check that the board is flat" in note for note in calibrated(looked).notes)
 
 
-def through_fisheye() -> Looked:
+def through_fisheye() -> SearchResult:
     """Boards all over the picture of a fisheye, to 85 degrees from its axis."""
     corners = seen("fisheye", np.random.default_rng(1)).pixels.reshape(-1, 24, 2)
-    views = [Sighting(f"{n}.png", np.arange(24), p, 0.8, p[[0, 5, 23, 18]]) for n, p in enumerate(corners)]
-    return Looked(len(views), SIZE_PX, tuple(views), ())
+    views = [
+        BoardSighting(f"{n}.png", np.arange(24), p, 0.8, p[[0, 5, 23, 18]]) for n, p in enumerate(corners)
+    ]
+    return SearchResult(len(views), SIZE_PX, tuple(views), ())
 
 
 def test_pinhole_on_a_fisheye_is_refused() -> None:
     with pytest.raises(IpsysError, match=r"error is .*--lens fisheye leaves 0\.1\d px: use it; or give"):
-        calibrate("red", through_fisheye(), BOARD, LENSES["pinhole4"])
+        calibrate("red", through_fisheye(), BOARD, LENS_MODELS["pinhole4"])
 
 
 def test_pinhole_on_a_fisheye_insisted_on_is_noted() -> None:
-    result = calibrate("red", through_fisheye(), BOARD, LENSES["pinhole4"], insist=True)
+    result = calibrate("red", through_fisheye(), BOARD, LENS_MODELS["pinhole4"], force=True)
     assert result.rms_px > 2
     assert "written only for --force: the RMS reprojection error is" in result.notes[0]
 

@@ -7,7 +7,12 @@ import numpy as np
 import pytest
 from numpy.typing import NDArray
 
-from ipsys_log.calibration.lens_models import LENSES, find_lens, project_points, project_with_slopes
+from ipsys_log.calibration.lens_models import (
+    LENS_MODELS,
+    find_lens_model,
+    project_points,
+    project_with_slopes,
+)
 from ipsys_log.errors import IpsysError
 from tests.calibration.boards_seen import TRUTH, pixels_of
 
@@ -19,28 +24,28 @@ def points(seed: int = 0) -> NDArray[np.float64]:
     return np.column_stack([rng.uniform(-0.6, 0.6, (50, 2)), rng.uniform(0.6, 2.0, 50)])
 
 
-@pytest.mark.parametrize("name", list(LENSES))
+@pytest.mark.parametrize("name", list(LENS_MODELS))
 def test_pixels_are_those_of_opencv(name: str) -> None:
     lens = np.array(TRUTH[name])
     k = np.array([[lens[0], 0, lens[2]], [0, lens[1], lens[3]], [0, 0, 1]])
     project = cv2.fisheye.projectPoints if name == "fisheye" else cv2.projectPoints
     expected, _ = project(points().reshape(-1, 1, 3), STILL, STILL, k, lens[4:])
-    pixels = project_points(LENSES[name], lens, points())
+    pixels = project_points(LENS_MODELS[name], lens, points())
     np.testing.assert_allclose(pixels, np.reshape(expected, (-1, 2)), atol=1e-9)
 
 
 def test_a_fisheye_sees_what_is_beside_and_behind_it() -> None:
     beyond = points() * (1.0, 1.0, -0.3)
-    pixels = project_points(LENSES["fisheye"], np.array(TRUTH["fisheye"]), beyond)
+    pixels = project_points(LENS_MODELS["fisheye"], np.array(TRUTH["fisheye"]), beyond)
     np.testing.assert_allclose(pixels, pixels_of("fisheye", TRUTH["fisheye"], beyond), atol=1e-9)
     # Farther from the middle than anything before the camera.
     middle = TRUTH["fisheye"][2:4]
     assert np.linalg.norm(pixels - middle, axis=1).min() > 185 * np.pi / 2 * 0.9
 
 
-@pytest.mark.parametrize("name", list(LENSES))
+@pytest.mark.parametrize("name", list(LENS_MODELS))
 def test_derivatives(name: str) -> None:
-    model, lens, here = LENSES[name], np.array(TRUTH[name]), points(1)
+    model, lens, here = LENS_MODELS[name], np.array(TRUTH[name]), points(1)
     if name == "fisheye":
         here[:10, 2] *= -1
     _, by_point, by_lens = project_with_slopes(model, lens, here)
@@ -55,7 +60,7 @@ def test_derivatives(name: str) -> None:
 
 def test_the_axis_itself_is_the_middle() -> None:
     pixels, by_point, _ = project_with_slopes(
-        LENSES["fisheye"], np.array(TRUTH["fisheye"]), np.array([[0.0, 0.0, 2.0]])
+        LENS_MODELS["fisheye"], np.array(TRUTH["fisheye"]), np.array([[0.0, 0.0, 2.0]])
     )
     np.testing.assert_allclose(pixels[0], TRUTH["fisheye"][2:4])
     np.testing.assert_allclose(by_point[0, :, :2], np.eye(2) * 185.0 / 2.0, atol=1e-6)
@@ -63,4 +68,4 @@ def test_the_axis_itself_is_the_middle() -> None:
 
 def test_a_lens_that_there_is_not() -> None:
     with pytest.raises(IpsysError, match="use one of fisheye, pinhole"):
-        find_lens("omni")
+        find_lens_model("omni")

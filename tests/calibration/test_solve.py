@@ -10,8 +10,8 @@ import pytest
 from numpy.typing import NDArray
 
 from ipsys_log.calibration.bundle_adjustment import Corners
-from ipsys_log.calibration.lens_models import LENSES
-from ipsys_log.calibration.solve import Solved, find_start, pose_from_rays, solve
+from ipsys_log.calibration.lens_models import LENS_MODELS
+from ipsys_log.calibration.solve import SolveResult, find_start, pose_from_rays, solve
 from tests.calibration.boards_seen import SIZE_PX, TRUTH, grid_m, random_pose, seen
 
 
@@ -19,10 +19,12 @@ def squared_errors(name: str, seeds: range, shared_px: float = 0.0) -> NDArray[n
     """Squared errors in units of the variance that is said, (seeds, parameters)."""
     rows = []
     for seed in seeds:
-        found = solve(LENSES[name], seen(name, np.random.default_rng(seed), shared_px=shared_px), SIZE_PX)
+        found = solve(
+            LENS_MODELS[name], seen(name, np.random.default_rng(seed), shared_px=shared_px), SIZE_PX
+        )
         variance = np.diag(found.covariance)
         fitted = variance > 0
-        rows.append((found.fit.lens - TRUTH[name])[fitted] ** 2 / variance[fitted])
+        rows.append((found.fit.intrinsics - TRUTH[name])[fitted] ** 2 / variance[fitted])
     return np.array(rows)
 
 
@@ -46,15 +48,15 @@ def test_more_noise_is_more_uncertainty() -> None:
     sigmas = []
     for noise_px in (0.05, 0.5):
         corners = seen("pinhole", np.random.default_rng(0), noise_px=noise_px)
-        sigmas.append(np.sqrt(np.diag(solve(LENSES["pinhole"], corners, SIZE_PX).covariance)))
+        sigmas.append(np.sqrt(np.diag(solve(LENS_MODELS["pinhole"], corners, SIZE_PX).covariance)))
     np.testing.assert_allclose(sigmas[1] / sigmas[0], 10, rtol=0.5)
 
 
 def test_opencv_finds_the_same_pinhole() -> None:
     """On the same corners, to a part of the standard deviation: only doubted corners weigh differently."""
     corners = seen("pinhole", np.random.default_rng(3))
-    found = solve(LENSES["pinhole"], corners, SIZE_PX)
-    bounds = [*corners.starts, len(corners.picture)]
+    found = solve(LENS_MODELS["pinhole"], corners, SIZE_PX)
+    bounds = [*corners.starts, len(corners.image_numbers)]
     boards = [corners.board_m[a:b].astype(np.float32) for a, b in pairwise(bounds)]
     pixels = [corners.pixels[a:b].astype(np.float32) for a, b in pairwise(bounds)]
     start = np.array([[500.0, 0, 320], [0, 500, 240], [0, 0, 1]])
@@ -62,23 +64,23 @@ def test_opencv_finds_the_same_pinhole() -> None:
     _, k, d, _, _ = cv2.calibrateCamera(boards, pixels, SIZE_PX, start, np.zeros(5), flags=flags)
     theirs = np.concatenate([[k[0, 0], k[1, 1], k[0, 2], k[1, 2]], np.ravel(d)[:5]])
     assert found.square
-    assert (np.abs(found.fit.lens - theirs) < 0.35 * np.sqrt(np.diag(found.covariance))).all()
+    assert (np.abs(found.fit.intrinsics - theirs) < 0.35 * np.sqrt(np.diag(found.covariance))).all()
 
 
 def test_pixels_that_are_not_square() -> None:
     stretched = (600.0, 642.0, *TRUTH["pinhole"][2:])
     corners = seen("pinhole", np.random.default_rng(0), lens=stretched)
-    found = solve(LENSES["pinhole"], corners, SIZE_PX)
+    found = solve(LENS_MODELS["pinhole"], corners, SIZE_PX)
     assert not found.square
     sigmas = np.sqrt(np.diag(found.covariance))
-    assert (np.abs(found.fit.lens - stretched) < 4 * sigmas).all()
+    assert (np.abs(found.fit.intrinsics - stretched) < 4 * sigmas).all()
 
 
 def test_pixels_that_are_hardly_not_square() -> None:
     """By half a per cent, in pictures that are good enough to tell."""
     stretched = (600.0, 603.0, *TRUTH["pinhole"][2:])
     corners = seen("pinhole", np.random.default_rng(0), noise_px=0.03, lens=stretched)
-    found = solve(LENSES["pinhole"], corners, SIZE_PX)
+    found = solve(LENS_MODELS["pinhole"], corners, SIZE_PX)
     assert not found.square
     assert np.sqrt((found.residuals_px**2).sum(axis=1).mean()) < 0.05
 
@@ -87,10 +89,10 @@ def test_what_does_not_belong_is_told_by_pixels_that_are_not_square() -> None:
     """Taken for square, all pictures are off, so that one more is not noticed."""
     stretched = (600.0, 618.0, *TRUTH["pinhole"][2:])
     corners = seen("pinhole", np.random.default_rng(0), lens=stretched)
-    corners.pixels[corners.picture == 12] += np.random.default_rng(9).normal(0, 0.6, (24, 2))
-    found = solve(LENSES["pinhole"], corners, SIZE_PX)
-    assert [left.picture for left in found.left] == [12]
-    assert (np.abs(found.fit.lens - stretched) < 4 * np.sqrt(np.diag(found.covariance))).all()
+    corners.pixels[corners.image_numbers == 12] += np.random.default_rng(9).normal(0, 0.6, (24, 2))
+    found = solve(LENS_MODELS["pinhole"], corners, SIZE_PX)
+    assert [left.number for left in found.excluded] == [12]
+    assert (np.abs(found.fit.intrinsics - stretched) < 4 * np.sqrt(np.diag(found.covariance))).all()
 
 
 def spoiled(corners: Corners) -> Corners:
@@ -98,30 +100,30 @@ def spoiled(corners: Corners) -> Corners:
     rng = np.random.default_rng(9)
     pixels = corners.pixels.copy()
     pixels[rng.choice(200, 10, replace=False)] += rng.uniform(5, 20, (10, 2))
-    pixels[corners.picture == 12] += rng.normal(0, 2.0, (24, 2))
-    return Corners(corners.board_m, pixels, corners.picture, corners.pictures)
+    pixels[corners.image_numbers == 12] += rng.normal(0, 2.0, (24, 2))
+    return Corners(corners.board_m, pixels, corners.image_numbers, corners.image_count)
 
 
 @pytest.mark.parametrize("name", ["fisheye", "pinhole"])
 def test_what_does_not_belong_is_left_out_and_said(name: str) -> None:
-    found = solve(LENSES[name], spoiled(seen(name, np.random.default_rng(5))), SIZE_PX)
-    assert [left.picture for left in found.left] == [12]
-    assert "does not fit" in found.left[0].reason or "far off" in found.left[0].reason
-    assert found.far_corners == 10
+    found = solve(LENS_MODELS[name], spoiled(seen(name, np.random.default_rng(5))), SIZE_PX)
+    assert [left.number for left in found.excluded] == [12]
+    assert "does not fit" in found.excluded[0].reason or "far off" in found.excluded[0].reason
+    assert found.outlier_corners == 10
     assert within(found, name)
 
 
-def within(found: Solved, name: str) -> bool:
+def within(found: SolveResult, name: str) -> bool:
     sigmas = np.sqrt(np.diag(found.covariance))
-    return bool((np.abs(found.fit.lens - TRUTH[name]) <= 4 * sigmas).all())
+    return bool((np.abs(found.fit.intrinsics - TRUTH[name]) <= 4 * sigmas).all())
 
 
 @pytest.mark.parametrize("focal_px", [90.0, 185.0, 400.0])
 def test_a_fisheye_of_any_focal_length_is_found_without_being_told(focal_px: float) -> None:
     lens = (focal_px, focal_px, *TRUTH["fisheye"][2:])
     corners = seen("fisheye", np.random.default_rng(1), pictures=15, lens=lens)
-    start = find_start(LENSES["fisheye"], corners, SIZE_PX)
-    np.testing.assert_allclose(start.lens[:4], lens[:4], rtol=0.02)
+    start = find_start(LENS_MODELS["fisheye"], corners, SIZE_PX)
+    np.testing.assert_allclose(start.intrinsics[:4], lens[:4], rtol=0.02)
 
 
 def test_a_pose_follows_from_rays_beyond_90_degrees() -> None:

@@ -7,11 +7,11 @@ import pytest
 from numpy.typing import NDArray
 
 from ipsys_log.calibration.board import Board
-from ipsys_log.calibration.board_detection import Sighting
-from ipsys_log.calibration.board_search import Looked
+from ipsys_log.calibration.board_detection import BoardSighting
+from ipsys_log.calibration.board_search import SearchResult
 from ipsys_log.calibration.bundle_adjustment import Corners
-from ipsys_log.calibration.calibrate import Calibrated, calibrate
-from ipsys_log.calibration.lens_models import LENSES
+from ipsys_log.calibration.calibrate import CalibrationResult, calibrate
+from ipsys_log.calibration.lens_models import LENS_MODELS
 from ipsys_log.calibration.solve import find_start
 from ipsys_log.calibration.two_cameras import TwoCameras, find_two_cameras
 from ipsys_log.errors import IpsysError
@@ -25,8 +25,8 @@ def both(first: Corners, second: Corners) -> Corners:
     return Corners(
         np.concatenate([first.board_m, second.board_m]),
         np.concatenate([first.pixels, second.pixels]),
-        np.concatenate([first.picture, second.picture + first.pictures]),
-        first.pictures + second.pictures,
+        np.concatenate([first.image_numbers, second.image_numbers + first.image_count]),
+        first.image_count + second.image_count,
     )
 
 
@@ -37,8 +37,8 @@ def mixed(seed: int, shared_px: float = 0.0, pictures: int = 12) -> Corners:
 
 
 def split(name: str, corners: Corners, names: list[str] | None = None) -> TwoCameras | None:
-    model = LENSES[name]
-    names = names or [f"{n}.png" for n in range(corners.pictures)]
+    model = LENS_MODELS[name]
+    names = names or [f"{n}.png" for n in range(corners.image_count)]
     return find_two_cameras(model, find_start(model, corners, SIZE_PX), corners, names)
 
 
@@ -79,13 +79,13 @@ def test_names_help_where_cameras_are_alike() -> None:
     assert agreement(result.second, np.arange(24) >= 12) >= 0.9
 
 
-def calibrated(corners: Corners, insist: bool = False) -> Calibrated:
+def calibrated(corners: Corners, insist: bool = False) -> CalibrationResult:
     sightings = tuple(
-        Sighting(f"{'ab'[n >= 12]}{n}.png", np.arange(24), pixels, 0.8, pixels[[0, 5, 23, 18]])
+        BoardSighting(f"{'ab'[n >= 12]}{n}.png", np.arange(24), pixels, 0.8, pixels[[0, 5, 23, 18]])
         for n, pixels in enumerate(corners.pixels.reshape(-1, 24, 2))
     )
-    looked = Looked(corners.pictures, SIZE_PX, sightings, ())
-    return calibrate("red", looked, Board(6, 4, 0.03), LENSES["pinhole"], insist)
+    looked = SearchResult(corners.image_count, SIZE_PX, sightings, ())
+    return calibrate("red", looked, Board(6, 4, 0.03), LENS_MODELS["pinhole"], insist)
 
 
 def test_two_cameras_are_refused_with_their_pictures() -> None:

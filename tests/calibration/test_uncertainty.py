@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 from numpy.typing import NDArray
 
-from ipsys_log.calibration.lens_models import LENSES
+from ipsys_log.calibration.lens_models import LENS_MODELS
 from ipsys_log.calibration.solve import solve
 from tests.calibration.boards_seen import SIZE_PX, TRUTH, seen
 
@@ -21,8 +21,8 @@ def squared_errors(
     rows = []
     for seed in seeds:
         corners = seen(true, np.random.default_rng(seed), pictures, lens=lens)
-        solved = solve(LENSES[fitted], corners, SIZE_PX)
-        errors = solved.fit.lens - np.pad(lens or TRUTH[true], (0, 99))[: len(solved.fit.lens)]
+        solved = solve(LENS_MODELS[fitted], corners, SIZE_PX)
+        errors = solved.fit.intrinsics - np.pad(lens or TRUTH[true], (0, 99))[: len(solved.fit.intrinsics)]
         rows.append((errors**2 / np.diag(solved.covariance).clip(1e-12))[[0, 2, 3]])
     return np.array(rows)
 

@@ -42,10 +42,10 @@ from ipsys_log.messages.channels import CAMERA_POINTS, MEASUREMENTS, MODEL
 from ipsys_log.runs.options import Request
 from ipsys_log.runs.output import write_log
 from ipsys_log.runs.view import LogView
-from ipsys_log.survey.checks import check_entry, withdraw
-from ipsys_log.survey.entry import read_typed
+from ipsys_log.survey.checks import check_entry, withdrawal_of
+from ipsys_log.survey.entry import parse_entry
 from ipsys_log.survey.live import LiveScene
-from ipsys_log.survey.scene import look
+from ipsys_log.survey.scene import observe_marker
 from ipsys_log.units import NS_PER_S
 from tests import labs
 from tests.capture.test_recorder import Noted
@@ -173,13 +173,13 @@ def test_of_a_camera_that_hangs_or_is_lost_nothing_is_seen() -> None:
 
     show("white", 0, 10)
     show("red", 0, 15)
-    sight = look(scene.views(None), 0)
+    sight = observe_marker(scene.views(None), 0)
     assert sorted(sight.points_m) == ["red", "white"]
     assert sight.still == Interval(NS_PER_S // 10 * 4, NS_PER_S // 10 * 14)
     show("red", 15, 40)  # white is quiet, and not known to be lost
-    assert list(look(scene.views(None), 0).points_m) == ["red"]
+    assert list(observe_marker(scene.views(None), 0).points_m) == ["red"]
     states["red"].up = False
-    assert look(scene.views(None), 0).state == "unseen"
+    assert observe_marker(scene.views(None), 0).state == "unseen"
 
 
 # --- with cameras that send the rendered lab --------------------------------------------------------
@@ -241,19 +241,19 @@ class Hand:
             return
         views = self.scene.views(None)
         for marker_id in {point.id for view in views for row in view.points for point in row.points}:
-            one, sight = self.tape.get((marker_id, message.payload.data)), look(views, marker_id)
+            one, sight = self.tape.get((marker_id, message.payload.data)), observe_marker(views, marker_id)
             if one is None or one.id in self._done or sight.still is None:
                 continue
             if sight.still.end - sight.still.start < 0.6 * NS_PER_S:
                 continue
-            entry, faults = read_typed(as_typed(replace(one, marker_id=marker_id)), self.scene.rig)
+            entry, faults = parse_entry(as_typed(replace(one, marker_id=marker_id)), self.scene.rig)
             history = self.scene.history()
             checked = check_entry(replace(entry, id=one.id), faults, self.scene.rig, sight, history)
             assert checked.measurement is not None, checked.faults
             self.scene.add([checked.measurement])
             self._done.add(one.id)
             if len(self._done) == 3:
-                self.scene.add([withdraw(self.scene.history(), one.id)])
+                self.scene.add([withdrawal_of(self.scene.history(), one.id)])
 
 
 def pairs(log: Path) -> dict[tuple[str, str], Pair]:

@@ -11,19 +11,19 @@ import numpy as np
 import pytest
 
 from ipsys_log.calibration.board import parse_board
-from ipsys_log.calibration.calibrate import Calibrated, calibrate_cameras
+from ipsys_log.calibration.calibrate import CalibrationResult, calibrate_cameras
 from ipsys_log.calibration.images import find_sources
-from ipsys_log.calibration.lens_models import find_lens
+from ipsys_log.calibration.lens_models import find_lens_model
 from ipsys_log.capture.frames import Clock, Frame
 from ipsys_log.capture.simulated import open_simulated, parse_source
 from ipsys_log.errors import IpsysError
-from ipsys_log.geometry.marker_cells import true_corners
+from ipsys_log.geometry.marker_cells import project_corners
 from ipsys_log.messages import CompressedImage, RigCamera
 from ipsys_log.simulation.board import POSES
-from ipsys_log.simulation.calibration_points import place
-from ipsys_log.simulation.cameras import hang_cameras
+from ipsys_log.simulation.calibration_points import place_marker
+from ipsys_log.simulation.cameras import mount_cameras
 from ipsys_log.simulation.floor import prepare_view
-from ipsys_log.simulation.live_lab import board_film, lab_film, plan_live_lab, shown_at
+from ipsys_log.simulation.live_lab import board_film, image_index, lab_film, plan_live_lab
 from ipsys_log.stages.detect import decode_grey, detect_markers
 from ipsys_log.units import NS_PER_S
 
@@ -58,15 +58,15 @@ def test_frames_show_each_marker_where_it_is() -> None:
     # Where the markers are, from the plan of the lab and the model of the camera.
     seat = parse_source(camera)
     lab = plan_live_lab(seat.lab)
-    view = hang_cameras(seat.lab)[seat.number]
-    lying = {where.marker_id: where for where in lab.lying}
+    view = mount_cameras(seat.lab)[seat.number]
+    lying = {where.marker_id: where for where in lab.stationary}
     seen = set()
     for time_ns, (_, frame) in list(zip(times_ns, came, strict=True))[::3]:
-        since_s = shown_at(round(time_ns * 20 / NS_PER_S), 20) / 20
+        since_s = image_index(round(time_ns * 20 / NS_PER_S), 20) / 20
         grey = decode_grey(CompressedImage(time_ns, "red", frame.data, frame.format))
         for marker in detect_markers(grey, seat.lab.dictionary):
-            where = lying.get(marker.id) or lab.drive.place_at(marker.id, since_s)
-            true_px = true_corners(view.lens, view.camera_from_world, place(where, seat.lab))
+            where = lying.get(marker.id) or lab.drive.pose_at(marker.id, since_s)
+            true_px = project_corners(view.lens, view.camera_from_world, place_marker(where, seat.lab))
             assert np.abs(marker.corners_px - true_px).mean() < 1.0
             seen.add(marker.id)
     assert len(seen & set(lying)) >= 6
@@ -108,10 +108,10 @@ def test_live_lab_gives_each_camera_enough_markers_to_work_with() -> None:
     """Enough to fit the model that is usual, most of them on the floor, and never one over another."""
     seat = parse_source(RigCamera("red", source="sim:red"))
     lab = plan_live_lab(seat.lab)
-    cameras = hang_cameras(seat.lab)
+    cameras = mount_cameras(seat.lab)
     for number, camera in enumerate(cameras):
         film = lab_film(seat.lab, number, lambda: None)
-        lying = {where.marker_id: where for where in lab.lying}
+        lying = {where.marker_id: where for where in lab.stationary}
         seen: set[int] = set()
         for index in (0, film.count // 2, film.count - 1):
             grey = decode_grey(CompressedImage(0, camera.name, film.draw(index), "jpeg"))
@@ -127,7 +127,9 @@ def test_live_lab_gives_each_camera_enough_markers_to_work_with() -> None:
 
 def test_places_do_not_depend_on_the_size_of_frames() -> None:
     plans = [
-        plan_live_lab(parse_source(RigCamera("red", source="sim:red", width=width, height=height)).lab).lying
+        plan_live_lab(
+            parse_source(RigCamera("red", source="sim:red", width=width, height=height)).lab
+        ).stationary
         for width, height in ((1920, 1080), (640, 360), (640, 480))
     ]
     assert plans[0] == plans[1] == plans[2]
@@ -146,9 +148,11 @@ def test_board_before_a_camera_gives_its_lens(text: str, tmp_path: Path) -> None
     for index in range(film.count):
         (folder / f"{index:03}.jpg").write_bytes(film.draw(index))
     board = parse_board(text, 0.03, 0.75, "DICT_4X4_50", False)
-    (result,) = calibrate_cameras(find_sources([folder], []), board, find_lens("fisheye"), lambda *_: None)
-    assert isinstance(result, Calibrated), result
-    true = hang_cameras(seat.lab)[seat.number].lens
+    (result,) = calibrate_cameras(
+        find_sources([folder], []), board, find_lens_model("fisheye"), lambda *_: None
+    )
+    assert isinstance(result, CalibrationResult), result
+    true = mount_cameras(seat.lab)[seat.number].lens
     assert result.rms_px < 0.1
     assert math.isclose(result.lens.K[0, 0], true.K[0, 0], rel_tol=0.005)
     assert np.abs(result.lens.K[:2, 2] - true.K[:2, 2]).max() < 1.0
@@ -181,4 +185,4 @@ def test_preparing_a_view_ends_between_two_steps() -> None:
 
     seat = parse_source(RigCamera("red", source="sim:red", width=320, height=180))
     with pytest.raises(InterruptedError):
-        prepare_view(hang_cameras(seat.lab)[0], seat.lab, check)
+        prepare_view(mount_cameras(seat.lab)[0], seat.lab, check)

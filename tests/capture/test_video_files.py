@@ -12,7 +12,7 @@ import simplejpeg
 from ipsys_log.capture.devices import open_source
 from ipsys_log.capture.frames import Clock, Frame, SourceError
 from ipsys_log.errors import IpsysError
-from ipsys_log.exchange.image_folders import find_pictures, find_times, parse_time, read_images
+from ipsys_log.exchange.image_folders import find_images, find_times, parse_time, read_images
 from ipsys_log.log.dataset import Session
 from ipsys_log.messages import CompressedImage, CompressedVideo, RigCamera
 from ipsys_log.units import NS_PER_S
@@ -89,7 +89,7 @@ def folder(tmp_path: Path, names: list[str]) -> dict[str, list[Path]]:
         path = tmp_path / "pictures" / name
         path.parent.mkdir(parents=True, exist_ok=True)
         path.write_bytes(name.encode())
-    return find_pictures(tmp_path / "pictures")
+    return find_images(tmp_path / "pictures")
 
 
 def test_times_are_in_the_names(tmp_path: Path) -> None:

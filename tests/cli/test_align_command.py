@@ -14,8 +14,8 @@ import numpy as np
 import pytest
 from numpy.typing import NDArray
 
-from ipsys_log.geometry.marker_cells import Placed
-from ipsys_log.geometry.poses import lay_flat, look_down
+from ipsys_log.geometry.marker_cells import PlacedMarker
+from ipsys_log.geometry.poses import look_down, pose_facing_up
 from ipsys_log.log.dataset import Session
 from ipsys_log.messages import (
     RIG_TOPIC,
@@ -29,7 +29,7 @@ from ipsys_log.messages import (
     image_topic,
 )
 from ipsys_log.runs.output import write_log
-from ipsys_log.simulation.cameras import Camera, hang_cameras
+from ipsys_log.simulation.cameras import Camera, mount_cameras
 from ipsys_log.simulation.floor import prepare_view
 from ipsys_log.simulation.lab import EPOCH_NS
 from ipsys_log.simulation.render import encode_jpeg, render
@@ -48,7 +48,7 @@ RIG = Rig("lab", LAB.dictionary, LAB.marker_length_m, floor=Floor(4.88, 4.88))
 def hung(tilts: Mapping[str, tuple[float, float]]) -> dict[str, Camera]:
     """Cameras above the floor, each with its tilt and where in its picture the axis of this tilt points."""
     cameras = {}
-    for camera in hang_cameras(LAB):
+    for camera in mount_cameras(LAB):
         if camera.name in tilts:
             tilt, towards = np.radians(tilts[camera.name])
             turned = look_down(camera.origin_m, tilt * np.array([np.cos(towards), np.sin(towards), 0.0]))
@@ -75,7 +75,7 @@ def film(
         for n, (name, camera) in enumerate(cameras.items(), 100):
             x_m, y_m, _ = camera.origin_m
             prints = [
-                Placed(i, 0.2, lay_flat(x_m + x, y_m + y, (raised_m or {}).get(i, 0.0), 0.4 * i))
+                PlacedMarker(i, 0.2, pose_facing_up(x_m + x, y_m + y, (raised_m or {}).get(i, 0.0), 0.4 * i))
                 for i, (x, y) in enumerate(places_m)
             ]
             frame = render(prepare_view(camera, LAB), prints, LAB, np.random.default_rng(n))
@@ -133,7 +133,7 @@ def test_a_session_with_measured_places(ipsys: Ipsys, lab: Path, monkeypatch: py
     section = data_section(lab)
     found = aligned(ipsys, lab)
     settings = LabSettings(width=960, height=540, markers=8, stations=26, drive_s=1.0)
-    for camera in hang_cameras(settings):
+    for camera in mount_cameras(settings):
         row = found["cameras"][camera.name]
         assert row["tilt_deg"] == pytest.approx(true_tilt(camera), abs=0.2)
         assert row["height_m"] == pytest.approx(camera.origin_m[2], abs=0.01)

@@ -369,7 +369,7 @@ def test_a_recorded_video_gives_the_lens_of_its_pictures(
     # What is lost between the two is rounding of grey levels.
     assert np.abs(np.subtract(*lenses)).max() < 0.05
     # Of a long one not each is looked at; those that are need the others.
-    monkeypatch.setattr("ipsys_log.calibration.images.MOST_LOOKED_AT", 4)
+    monkeypatch.setattr("ipsys_log.calibration.images.MAX_EXAMINED_IMAGES", 4)
     (some,) = find_sources([log], [])
     looked_at = [grey for _, grey in some.read()]
     assert len(looked_at) == 4

@@ -27,8 +27,8 @@ from ipsys_log.messages import (
 from ipsys_log.messages.channels import TRACKS
 from ipsys_log.rig.file import load_rig
 from ipsys_log.runs.output import write_log
-from ipsys_log.simulation.cameras import hang_cameras
-from ipsys_log.simulation.live_lab import LIVE_SETTINGS, lab_film, plan_live_lab, shown_at
+from ipsys_log.simulation.cameras import mount_cameras
+from ipsys_log.simulation.live_lab import LIVE_SETTINGS, image_index, lab_film, plan_live_lab
 from ipsys_log.units import NS_PER_S
 from tests.conftest import Ipsys
 from tests.test_measure_now import Lab, measuring
@@ -41,14 +41,14 @@ def errors_m(log: Path, run: str = "poly") -> np.ndarray:
     """How far the tracks of a log are from where the simulated robots and markers truly are, (n,)."""
     lab = plan_live_lab(LIVE_SETTINGS)
     count = round(LIVE_SETTINGS.drive_s * LIVE_SETTINGS.rate_hz)
-    lying = {where.marker_id: where for where in lab.lying}
+    lying = {where.marker_id: where for where in lab.stationary}
     offsets = []
     with Session([log]) as session:
         for tracks in session.payloads(session.topics(TRACKS, run)):
             frame = round(tracks.timestamp * LIVE_SETTINGS.rate_hz / 1e9)
-            time_s = shown_at(frame, count) / LIVE_SETTINGS.rate_hz
+            time_s = image_index(frame, count) / LIVE_SETTINGS.rate_hz
             for track in tracks.tracks:
-                true = lying.get(track.id) or lab.drive.place_at(track.id, time_s)
+                true = lying.get(track.id) or lab.drive.pose_at(track.id, time_s)
                 offsets.append((track.x_m - true.x_m, track.y_m - true.y_m, track.z_m - true.z_m))
     return np.asarray(np.linalg.norm(np.array(offsets).reshape(-1, 3), axis=1))
 
@@ -76,7 +76,7 @@ def test_simulated_lab_gives_its_rig_and_its_tape(
     assert done.code == 0, done.err
     rig = load_rig(tmp_path / "lab.toml")
     assert [camera.source for camera in rig.cameras] == ["sim:red", "sim:white", "sim:black"]
-    lying = {where.marker_id: where for where in plan_live_lab(LIVE_SETTINGS).lying}
+    lying = {where.marker_id: where for where in plan_live_lab(LIVE_SETTINGS).stationary}
     rows = sheet_rows(tmp_path / "lab_tape.csv")
     assert sorted(row.marker_id or 0 for row in rows) == sorted(lying)
     known = {point.name: point for point in rig.reference_points}
@@ -120,7 +120,7 @@ def seen_by_all(rig: Rig) -> Iterator[Message]:
     start_ns = 1_700_000_000 * NS_PER_S
     films = [lab_film(LIVE_SETTINGS, number, lambda: None) for number in range(3)]
     yield Message(RIG_TOPIC, start_ns - step_ns, start_ns - step_ns, rig)
-    for number, camera in enumerate(hang_cameras(LIVE_SETTINGS)):
+    for number, camera in enumerate(mount_cameras(LIVE_SETTINGS)):
         time_ns = start_ns - step_ns + 1 + number
         yield Message(calibration_topic(camera.name), time_ns, time_ns, camera.lens, camera.name)
     for frame in range(5):
@@ -164,7 +164,7 @@ def test_every_command_of_the_first_day_works_without_hardware(day: Day) -> None
     day("init", "lab.toml", "--simulated")
     day("markers", "--rig", "lab.toml")
     day("cameras", "--rig", "lab.toml")
-    cameras = {camera.name: camera for camera in hang_cameras(LIVE_SETTINGS)}
+    cameras = {camera.name: camera for camera in mount_cameras(LIVE_SETTINGS)}
 
     board = ("--board", "6x4", "--camera", "red", "--seconds", 20)
     (found,) = json.loads(day("calibrate", "--rig", "lab.toml", *board, "--json"))

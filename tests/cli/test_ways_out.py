@@ -17,7 +17,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from ipsys_log.analysis.differences import Extent, explain_apart
+from ipsys_log.analysis.differences import Extent, explain_no_overlap
 from ipsys_log.cli.signals import Interrupted, note_kept, say_kept
 from ipsys_log.log.dataset import Session
 from ipsys_log.messages import CameraCalibration, CameraPoints, Markers, Message, Positions
@@ -212,9 +212,9 @@ def test_diff_of_runs_without_frames_says_which_side(ipsys: Ipsys, detected: Pat
 def test_extents_that_meet_are_not_explained() -> None:
     times_ns = np.array([1, 5, 9])
     one = Extent(frozenset({"red"}), times_ns, frozenset({1, 2}))
-    assert explain_apart(one, replace(one, ids=frozenset({2, 3}))) is None
-    assert explain_apart(*[replace(one, times_ns=times_ns[:0])] * 2) is None
-    apart = explain_apart(one, replace(one, times_ns=np.array([7])))
+    assert explain_no_overlap(one, replace(one, ids=frozenset({2, 3}))) is None
+    assert explain_no_overlap(*[replace(one, times_ns=times_ns[:0])] * 2) is None
+    apart = explain_no_overlap(one, replace(one, times_ns=np.array([7])))
     assert apart is not None
     assert "differ by 0.000000 s" in apart
 

@@ -17,7 +17,7 @@ from ipsys_log.exchange.calibration_files import (
     read_opencv_calibration,
     ros_yaml,
 )
-from ipsys_log.geometry.lenses import same_lens
+from ipsys_log.geometry.lenses import same_intrinsics
 from ipsys_log.messages import CameraCalibration
 
 COEFFICIENTS = {
@@ -39,7 +39,7 @@ def test_what_is_written_is_read_to_the_last_digit(
 ) -> None:
     path = tmp_path / "red.yaml"
     path.write_text(write(lens(model), {"fx": 1.5, "k1": 0.0}, "two\nlines"))
-    assert same_lens(read_opencv_calibration(path, "red"), lens(model))
+    assert same_intrinsics(read_opencv_calibration(path, "red"), lens(model))
 
 
 def test_opencv_says_how_well_each_parameter_is_known() -> None:

@@ -7,7 +7,7 @@ from pathlib import Path
 import pytest
 
 from ipsys_log.errors import IpsysError
-from ipsys_log.exchange.image_folders import find_pictures, read_images
+from ipsys_log.exchange.image_folders import find_images, read_images
 from ipsys_log.messages import CompressedImage
 
 
@@ -21,7 +21,7 @@ def folder(tmp_path: Path, *names: str) -> Path:
 
 def test_numbers_in_names_count_by_their_value(tmp_path: Path) -> None:
     names = [f"red/img{n}.jpg" for n in (1, 2, 10, 11)] + [f"white/frame_{n:03}.PNG" for n in range(4)]
-    messages = list(read_images(find_pictures(folder(tmp_path, *names)), None, {}, 2.0))
+    messages = list(read_images(find_images(folder(tmp_path, *names)), None, {}, 2.0))
     assert all(isinstance(message.payload, CompressedImage) for message in messages)
     order = [message.payload.data.decode() for message in messages if message.camera == "red"]
     assert order == names[:4]
@@ -42,10 +42,10 @@ def test_numbers_in_names_count_by_their_value(tmp_path: Path) -> None:
 )
 def test_pictures_that_would_be_left_out_are_named(tmp_path: Path, names: list[str], said: str) -> None:
     with pytest.raises(IpsysError, match=said):
-        find_pictures(folder(tmp_path, *names))
+        find_images(folder(tmp_path, *names))
 
 
 @pytest.mark.parametrize("rate", [0.0, -1.0, float("nan"), float("inf")])
 def test_a_rate_that_is_none(tmp_path: Path, rate: float) -> None:
     with pytest.raises(IpsysError, match="pictures per second"):
-        list(read_images(find_pictures(folder(tmp_path, "red/a.jpg")), None, {}, rate))
+        list(read_images(find_images(folder(tmp_path, "red/a.jpg")), None, {}, rate))

@@ -9,7 +9,7 @@ from hypothesis import strategies as st
 from scipy.optimize import brentq
 
 from ipsys_log.errors import IpsysError
-from ipsys_log.geometry.lenses import check_calibration, project, same_lens, undistort
+from ipsys_log.geometry.lenses import check_calibration, project, same_intrinsics, undistort
 from ipsys_log.messages import CameraCalibration
 
 FISHEYE = (-0.1305, 0.0119, -0.0310, 0.0168)
@@ -81,5 +81,5 @@ def test_a_lens_that_cannot_be_computed_with(model: str, d: tuple[float, ...], s
 
 
 def test_same_lens_looks_at_what_bends_the_rays() -> None:
-    assert same_lens(lens("kannala_brandt", FISHEYE), lens("kannala_brandt", FISHEYE))
-    assert not same_lens(lens("kannala_brandt", FISHEYE), lens("kannala_brandt", (0.0, *FISHEYE[1:])))
+    assert same_intrinsics(lens("kannala_brandt", FISHEYE), lens("kannala_brandt", FISHEYE))
+    assert not same_intrinsics(lens("kannala_brandt", FISHEYE), lens("kannala_brandt", (0.0, *FISHEYE[1:])))

@@ -13,9 +13,9 @@ from scipy.optimize import least_squares
 
 from ipsys_log.errors import IpsysError
 from ipsys_log.geometry.trilateration import (
+    are_collinear,
     crossing_angle,
     multilaterate,
-    sides_alike,
     tape_covariance,
     trilaterate,
 )
@@ -57,7 +57,7 @@ def test_exact_distances_from_three_points_or_more_need_no_side(numbers: list[tu
     point, references = np.array(numbers[0]), np.array(numbers[1:])
     triangles = [triangle_area(*corners) for corners in combinations(references, 3)]
     assume(max(triangles) > 0.5)  # some three of them are well off one line
-    assume(not sides_alike(references) and ranges(point, references).min() > 0)
+    assume(not are_collinear(references) and ranges(point, references).min() > 0)
     found = multilaterate(references, ranges(point, references))
     np.testing.assert_allclose(found.point_m, point, atol=1e-6)
     np.testing.assert_allclose(found.residuals_m, 0, atol=1e-7)
@@ -128,7 +128,7 @@ def test_three_reference_points_on_one_line_need_the_side(side: str) -> None:
     left = np.array([0.5, 2.0])  # of the line from the first to the last
     right = left[::-1]
     distances = ranges(left, references) + np.array([0.001, -0.001, 0.001])
-    assert sides_alike(references)
+    assert are_collinear(references)
     with pytest.raises(IpsysError, match=r"3 reference points lie on one line.*'left' or 'right'"):
         multilaterate(references, distances)
     found = multilaterate(references, distances, side=side)
@@ -254,8 +254,8 @@ def test_no_place_has_a_covariance_without_bound(numbers: tuple[float, ...], sig
 
 
 def test_sides_are_alike_where_three_points_lie_nearly_on_a_line() -> None:
-    assert sides_alike(np.array([[0.0, 0.0], [2.0, 0.0], [4.0, 0.06]]))
-    assert not sides_alike(np.array([[0.0, 0.0], [2.0, 0.3], [4.0, 0.0]]))
+    assert are_collinear(np.array([[0.0, 0.0], [2.0, 0.0], [4.0, 0.06]]))
+    assert not are_collinear(np.array([[0.0, 0.0], [2.0, 0.3], [4.0, 0.0]]))
 
 
 @pytest.mark.parametrize(

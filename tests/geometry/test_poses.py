@@ -2,7 +2,7 @@ import numpy as np
 import pytest
 
 from ipsys_log.geometry.markers import heading, marker_corners
-from ipsys_log.geometry.poses import invert_pose, lay_flat, look_down, make_pose, rotation, transform
+from ipsys_log.geometry.poses import invert_pose, look_down, make_pose, pose_facing_up, rotation, transform
 
 
 def test_a_pose_and_its_inverse_cancel() -> None:
@@ -24,6 +24,6 @@ def test_a_camera_that_looks_down_sees_the_floor_as_from_above() -> None:
 
 @pytest.mark.parametrize("angle_rad", [-3.0, -1.0, 0.0, 0.5, 2.5])
 def test_the_heading_in_the_image_is_the_heading_in_the_world(angle_rad: float) -> None:
-    camera_from_marker = look_down(np.array([2.0, 2.0, 2.1])) @ lay_flat(2.3, 1.8, 0.1, angle_rad)
+    camera_from_marker = look_down(np.array([2.0, 2.0, 2.1])) @ pose_facing_up(2.3, 1.8, 0.1, angle_rad)
     corners_m = transform(camera_from_marker, marker_corners(0.2))
     assert heading(corners_m[:, :2] / corners_m[:, 2:]) == pytest.approx(angle_rad)

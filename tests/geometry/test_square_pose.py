@@ -13,7 +13,7 @@ from ipsys_log.geometry.markers import camera_point, marker_corners, pixel_slope
 from ipsys_log.geometry.square_pose import (
     SquarePoses,
     fit_squares,
-    goes_around,
+    is_convex,
     reprojection_px,
     solve_squares,
 )
@@ -222,8 +222,8 @@ def test_what_a_tilt_of_5_degrees_costs(
 
 def test_corners_that_go_around() -> None:
     square = np.array([[0.0, 0.0], [0.1, 0.0], [0.1, 0.1], [0.0, 0.1]])
-    assert goes_around(square)
-    assert not goes_around(square[::-1])  # from behind
-    assert not goes_around(square[[0, 2, 1, 3]])  # crossed
-    assert not goes_around(np.zeros((4, 2)))
-    assert not goes_around(np.array([[0.0, 0.0], [0.1, 0.0], [0.2, 0.0], [0.3, 0.0]]))
+    assert is_convex(square)
+    assert not is_convex(square[::-1])  # from behind
+    assert not is_convex(square[[0, 2, 1, 3]])  # crossed
+    assert not is_convex(np.zeros((4, 2)))
+    assert not is_convex(np.array([[0.0, 0.0], [0.1, 0.0], [0.2, 0.0], [0.3, 0.0]]))

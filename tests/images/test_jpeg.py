@@ -17,7 +17,7 @@ from ipsys_log.errors import FrameError, SizeError
 from ipsys_log.images.decode import decode_grey, decode_rows
 from ipsys_log.images.jpeg import cut_rows, read_layout, whole_rows
 from ipsys_log.messages import CompressedImage
-from ipsys_log.stages.detect.follow import Follow
+from ipsys_log.stages.detect.follow import MarkerTracker
 from tests.stages.drawing import VGA, Array, Look, Picture, at_px, corners_px, draw, jpeg
 
 SAMPLINGS = {
@@ -136,7 +136,7 @@ class Filmed:
 
         FrameError, SizeError: it is known to be damaged.
         """
-        follow = Follow("DICT_4X4_100", VGA, None, 0.0)
+        follow = MarkerTracker("DICT_4X4_100", VGA, None, 0.0)
         for n in range(frames):
             follow(CompressedImage(0, "red", self.data, "jpeg"), n * 33_000_000)
         fits, _, _ = follow(CompressedImage(0, "red", damaged, "jpeg"), frames * 33_000_000)

@@ -14,7 +14,7 @@ from sklearn.pipeline import Pipeline
 from sklearn.utils.estimator_checks import check_estimator
 
 from ipsys_log.errors import FitError
-from ipsys_log.models.ann import NeuralNetwork, _slopes, network
+from ipsys_log.models.ann import NeuralNetwork, _slopes, evaluate_networks
 from ipsys_log.models.rigid import RigidTransform
 from ipsys_log.models.table import create
 from tests.models.test_rays import authors_pairs, error_cm
@@ -26,7 +26,7 @@ def test_three_tanh_neurons_and_a_linear_output() -> None:
     weights, x = rng.normal(size=16), rng.normal(size=(5, 3))
     neurons = [np.tanh(weights[4 * k] + x @ weights[4 * k + 1 : 4 * k + 4]) for k in range(3)]
     expected = weights[12] + sum(w * n for w, n in zip(weights[13:], neurons, strict=True))
-    found, _ = network(weights[None], np.column_stack([np.ones(5), x]))
+    found, _ = evaluate_networks(weights[None], np.column_stack([np.ones(5), x]))
     np.testing.assert_allclose(found[0], expected, atol=1e-12)
 
 
@@ -35,10 +35,10 @@ def test_its_slopes_are_those_of_finite_differences() -> None:
     weights, inputs = rng.normal(size=16), np.column_stack([np.ones(6), rng.normal(size=(6, 3))])
 
     def outputs(flat: np.ndarray) -> np.ndarray:
-        return np.asarray(network(flat[None], inputs)[0][0])
+        return np.asarray(evaluate_networks(flat[None], inputs)[0][0])
 
     numeric = approx_fprime(weights, outputs, 1e-7)
-    found = _slopes(weights[None], inputs, network(weights[None], inputs)[1])
+    found = _slopes(weights[None], inputs, evaluate_networks(weights[None], inputs)[1])
     np.testing.assert_allclose(found[0].T, numeric, atol=1e-5)
 
 

@@ -11,7 +11,7 @@ from sklearn.exceptions import SkipTestWarning
 from sklearn.utils.estimator_checks import check_estimator
 
 from ipsys_log.errors import FitError
-from ipsys_log.models.kriging import Kriging, _correlations, _gls, _squared_gaps, most_likely
+from ipsys_log.models.kriging import Kriging, _correlations, _gls, _squared_gaps, fit_correlations
 from ipsys_log.models.table import create, parameters, restore
 from tests import labs
 from tests.models.test_rays import authors_pairs, error_cm
@@ -85,7 +85,7 @@ def test_no_other_parameters_are_more_likely() -> None:
         sigma2 = (z - f @ alpha) @ inverse @ (z - f @ alpha) / len(z)
         return float(multivariate_normal.logpdf(z, f @ alpha, sigma2 * full))
 
-    best = most_likely(points, z, noisy=True)
+    best = fit_correlations(points, z, noisy=True)
     rng = np.random.default_rng(0)
     low, high = np.log([1e-3, 1e-3, 1e-3, 1e-8]), np.log([1.0, 1.0, 1.0, 1e2])
     others = [*(best + rng.normal(0, 0.1, 4) for _ in range(40)), *rng.uniform(low, high, (200, 4))]

@@ -11,7 +11,7 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 from sklearn.model_selection import KFold
 
-from ipsys_log.models.table import Places, create, fit_cameras, inputs, tied_cameras
+from ipsys_log.models.table import CalibrationPoints, create, fit_cameras, group_dependent_cameras, inputs
 from tests import labs
 
 
@@ -80,7 +80,7 @@ def test_places_that_two_cameras_saw_tie_them_together() -> None:
             own, _ = labs.measure(seen[name], rng, 0.01)
             points = camera.see(np.vstack([seen[name], shared]), rng)
             names = [f"{name}{n}" for n in range(15)] + [f"both{n}" for n in range(len(shared))]
-            cameras[name] = Places(points, np.vstack([own, common]), tuple(names))
+            cameras[name] = CalibrationPoints(points, np.vstack([own, common]), tuple(names))
         overlap = np.column_stack([rng.uniform(0.3, 4.5, 200), rng.uniform(1.2, 1.7, 200), np.full(200, 0.1)])
         both = [camera.see(overlap, rng) for camera in (left, right)]
         tied = fit_cameras("rayplane", cameras)
@@ -95,12 +95,15 @@ def test_places_that_two_cameras_saw_tie_them_together() -> None:
 
 
 def test_cameras_are_tied_through_others_too() -> None:
-    def seen(*names: str) -> Places:
-        return Places(np.zeros((len(names), 3)), np.zeros((len(names), 3)), names)
+    def seen(*names: str) -> CalibrationPoints:
+        return CalibrationPoints(np.zeros((len(names), 3)), np.zeros((len(names), 3)), names)
 
     cameras = {"a": seen("1", "2"), "b": seen("7", "8"), "c": seen("3"), "d": seen("2", "3")}
-    assert sorted(sorted(group) for group in tied_cameras("best", cameras)) == [["a", "c", "d"], ["b"]]
-    assert tied_cameras("poly", cameras) == [["a"], ["b"], ["c"], ["d"]]
+    assert sorted(sorted(group) for group in group_dependent_cameras("best", cameras)) == [
+        ["a", "c", "d"],
+        ["b"],
+    ]
+    assert group_dependent_cameras("poly", cameras) == [["a"], ["b"], ["c"], ["d"]]
 
 
 def test_a_ray_that_does_not_meet_the_height_gives_no_place() -> None:

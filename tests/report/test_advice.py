@@ -10,7 +10,7 @@ import pytest
 
 from ipsys_log.exchange.imsel import read_imsel
 from ipsys_log.messages import CameraEvaluation, ErrorStatistics, Evaluation, LearningPoint
-from ipsys_log.report.advice import ANY, PAPER, SIMPLE, TOLD, advise
+from ipsys_log.report.advice import ALL_MODELS, HEIGHT_KNOWN, PAPER, SIMPLE, advise
 from ipsys_log.report.findings import Findings
 from ipsys_log.runs.output import write_log
 from tests.report.conftest import find
@@ -122,7 +122,7 @@ def test_a_model_that_is_told_heights_is_not_compared_with_those_that_are_not() 
     )  # fmt: skip
     assert advice is not None
     assert {group: choice.model for group, choice in advice.choices[10].items()} == {
-        SIMPLE: "rigid", PAPER: "rigid", ANY: "best", TOLD: "rayplane",
+        SIMPLE: "rigid", PAPER: "rigid", ALL_MODELS: "best", HEIGHT_KNOWN: "rayplane",
     }  # fmt: skip
 
 

@@ -35,7 +35,7 @@ from ipsys_log.messages import (
 from ipsys_log.report.accuracy import Accuracy
 from ipsys_log.report.errors_figure import count_rows, draw_errors
 from ipsys_log.report.figures import camera_styles
-from ipsys_log.report.floor_figure import Scene, draw_floor, draw_session
+from ipsys_log.report.floor_figure import FloorData, draw_floor, draw_session
 from ipsys_log.runs.output import write_log
 
 RIG = Rig(
@@ -160,7 +160,7 @@ def test_no_text_covers_another_or_leaves_the_picture(
 def test_arrows_are_exaggerated_by_the_factor_that_is_stated(scale_m: float, factor: int | None) -> None:
     found = evaluation("poly", ("red",), scale_m=scale_m)
     axes: Axes = Figure().add_subplot()
-    draw_floor(axes, Scene(RIG, [], "poly", found, {}, {}), camera_styles(["red"]))
+    draw_floor(axes, FloorData(RIG, [], "poly", found, {}, {}), camera_styles(["red"]))
     title = axes.get_title(loc="left")
     assert title == "Errors of poly on held-out places" + (
         f", drawn {factor} times as long" if factor else ""

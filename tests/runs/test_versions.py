@@ -211,11 +211,11 @@ def test_versions_of_packages_make_nothing_out_of_date(
 def test_measurement_since_makes_the_model_out_of_date(ipsys: Ipsys, log: Path, tmp_path: Path) -> None:
     from ipsys_log.messages import Message
     from ipsys_log.runs.output import append_messages
-    from ipsys_log.survey.checks import withdraw
+    from ipsys_log.survey.checks import withdrawal_of
 
     with Session([log]) as session:
         last, time_ns = session.payloads(["/measurements"])[-1], session.end_ns + 1
-    append_messages(log, [Message("/measurements", time_ns, time_ns, withdraw([last], last.id))])
+    append_messages(log, [Message("/measurements", time_ns, time_ns, withdrawal_of([last], last.id))])
     rows = states(ipsys, log)
     assert rows["edges", "camera-frame"]["state"] == "current"
     assert rows["poly", "fit"]["state"] == "out of date: measurements changed"

@@ -9,13 +9,13 @@ import numpy as np
 import pytest
 
 from ipsys_log.errors import IpsysError
-from ipsys_log.geometry.marker_cells import Placed, true_corners
+from ipsys_log.geometry.marker_cells import PlacedMarker, project_corners
 from ipsys_log.geometry.trilateration import trilaterate
 from ipsys_log.log.codec import encode
 from ipsys_log.messages import CameraCalibration, CompressedImage, Measurement, Message, Rig, Tracks
 from ipsys_log.rig.file import check_rig
-from ipsys_log.simulation.calibration_points import Place, measure, plan_stations, seen_whole, split
-from ipsys_log.simulation.cameras import FLOOR_M, hang_cameras, sees
+from ipsys_log.simulation.calibration_points import MarkerPose, cameras_seeing, measure, plan_points, split
+from ipsys_log.simulation.cameras import FLOOR_M, mount_cameras, sees
 from ipsys_log.simulation.drive import plan_drive
 from ipsys_log.simulation.lab import simulate
 from ipsys_log.simulation.settings import LabSettings
@@ -80,7 +80,7 @@ def test_all_cameras_take_their_frames_at_the_same_instants(session: list[Messag
 def test_markers_are_seen_in_the_images_where_the_truth_says(session: list[Message]) -> None:
     """At a third of the size the stock detector misses some far ones; what it finds must be true."""
     detector = cv2.aruco.ArucoDetector(cv2.aruco.getPredefinedDictionary(cv2.aruco.DICT_4X4_100))
-    cameras = {camera.name: camera for camera in hang_cameras(SMALL)}
+    cameras = {camera.name: camera for camera in mount_cameras(SMALL)}
     truth: Tracks | None = None
     found, whole = 0, 0
     for m in session:
@@ -101,7 +101,7 @@ def test_markers_are_seen_in_the_images_where_the_truth_says(session: list[Messa
             pose = np.eye(4)
             pose[:2, 0], pose[:2, 1], pose[:3, 3] = right, up, [t.x_m, t.y_m, t.z_m]
             camera = cameras[m.camera]
-            wanted = true_corners(camera.lens, camera.camera_from_world, Placed(t.id, 0.2, pose))
+            wanted = project_corners(camera.lens, camera.camera_from_world, PlacedMarker(t.id, 0.2, pose))
             assert np.abs(np.reshape(px, (4, 2)) - wanted).max() < 2.0
             found += m.camera in t.cameras
     assert found >= 0.8 * whole
@@ -137,7 +137,7 @@ def test_a_measurement_lies_in_its_still_interval_and_names_a_place(session: lis
 
 def test_tape_and_ruler_err_by_their_sigmas() -> None:
     settings = LabSettings(tape_sigma_m=0.004, ruler_sigma_m=0.002)
-    where = Place(0, 1.0, 4.0, 0.1, 0.0)
+    where = MarkerPose(0, 1.0, 4.0, 0.1, 0.0)
     truth = [np.hypot(1.0 - 1.2192, 4.0 - 2.4384), np.hypot(1.0 - 3.6576, 4.0 - 2.4384)]
     taken = [measure(where, settings, n, [0, 1, 2], ("train",)) for n in range(1500)]
     off = np.array([[d.distance_m for d in m.distances] for m in taken]) - truth
@@ -152,14 +152,14 @@ def test_tape_and_ruler_err_by_their_sigmas() -> None:
 
 def test_each_camera_gets_its_places_and_a_fifth_of_them_is_held_out() -> None:
     settings = LabSettings()
-    cameras = hang_cameras(settings)
-    sets = plan_stations(settings, cameras)
+    cameras = mount_cameras(settings)
+    sets = plan_points(settings, cameras)
     splits = iter(split(sets, settings.seed))
     seen: Counter[tuple[str, str]] = Counter()
     for stations in sets:
         for station in stations:
             label = next(splits)[0]
-            for camera in seen_whole(station.place, cameras, settings):
+            for camera in cameras_seeing(station.pose, cameras, settings):
                 seen[camera, label] += 1
     for camera in settings.cameras:
         train, test = seen[camera, "train"], seen[camera, "test"]
@@ -172,20 +172,20 @@ def test_each_camera_gets_its_places_and_a_fifth_of_them_is_held_out() -> None:
 def test_every_spot_of_the_floor_is_seen(seed: int) -> None:
     x, y = np.meshgrid(np.linspace(0, FLOOR_M, 60), np.linspace(0, FLOOR_M, 60))
     spots = np.column_stack([x.ravel(), y.ravel(), np.zeros(x.size)])
-    seen = [sees(camera, spots) for camera in hang_cameras(LabSettings(seed=seed))]
+    seen = [sees(camera, spots) for camera in mount_cameras(LabSettings(seed=seed))]
     assert np.any(seen, axis=0).all()
 
 
 @pytest.mark.parametrize("markers", [1, 3, 8])
 def test_robots_stay_in_view_and_within_their_speed(markers: int) -> None:
     settings = LabSettings(markers=markers, drive_s=35.0)
-    cameras = hang_cameras(settings)
+    cameras = mount_cameras(settings)
     drive = plan_drive(settings, cameras)
     for time_s in np.arange(0, 35, 0.5).tolist():
-        now, soon = drive.places_at(time_s), drive.places_at(time_s + 1e-3)
+        now, soon = drive.poses_at(time_s), drive.poses_at(time_s + 1e-3)
         assert len(now) == markers
         for before, after in zip(now, soon, strict=True):
-            assert seen_whole(before, cameras, settings)
+            assert cameras_seeing(before, cameras, settings)
             dx, dy = after.x_m - before.x_m, after.y_m - before.y_m
             assert np.hypot(dx, dy) <= 0.501e-3
             if time_s:
@@ -218,10 +218,10 @@ def test_impossible_settings_are_refused_in_one_line(change: dict[str, object], 
 
 def test_a_lab_that_cannot_be_built_says_why() -> None:
     with pytest.raises(IpsysError, match="'red' cannot see its part of the floor"):
-        hang_cameras(LabSettings(mount_height_m=1.5))
+        mount_cameras(LabSettings(mount_height_m=1.5))
     crowded = LabSettings(markers=60, marker_length_m=0.5)
     with pytest.raises(IpsysError, match="no room for marker"):
-        plan_stations(crowded, hang_cameras(LabSettings()))
+        plan_points(crowded, mount_cameras(LabSettings()))
 
 
 @pytest.mark.slow

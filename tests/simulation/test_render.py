@@ -8,9 +8,9 @@ import pytest
 from numpy.typing import NDArray
 from scipy.ndimage import gaussian_filter
 
-from ipsys_log.geometry.marker_cells import Placed, true_corners
-from ipsys_log.geometry.poses import lay_flat, make_pose, rotation
-from ipsys_log.simulation.cameras import Camera, hang_cameras
+from ipsys_log.geometry.marker_cells import PlacedMarker, project_corners
+from ipsys_log.geometry.poses import make_pose, pose_facing_up, rotation
+from ipsys_log.simulation.cameras import Camera, mount_cameras
 from ipsys_log.simulation.floor import View, prepare_view
 from ipsys_log.simulation.render import encode_jpeg, expose, render
 from ipsys_log.simulation.settings import LabSettings
@@ -22,11 +22,11 @@ SETTINGS = LabSettings()
 
 @pytest.fixture(scope="module")
 def views() -> list[View]:
-    return [prepare_view(camera, SETTINGS) for camera in hang_cameras(SETTINGS)]
+    return [prepare_view(camera, SETTINGS) for camera in mount_cameras(SETTINGS)]
 
 
-def lay(marker_id: int, x_m: float, y_m: float, z_m: float, heading_rad: float) -> Placed:
-    return Placed(marker_id, LENGTH_M, lay_flat(x_m, y_m, z_m, heading_rad))
+def lay(marker_id: int, x_m: float, y_m: float, z_m: float, heading_rad: float) -> PlacedMarker:
+    return PlacedMarker(marker_id, LENGTH_M, pose_facing_up(x_m, y_m, z_m, heading_rad))
 
 
 def world_points(x_m: float, y_m: float, z_m: float, heading_rad: float, local: Array) -> Array:
@@ -56,12 +56,12 @@ def test_true_corners_agree_with_the_formulas(views: list[View]) -> None:
     for view in views:
         for _ in range(10):
             x, y, z, turn = rng.uniform([0, 0, 0, -3], [4.8, 4.8, 0.2, 3])
-            found = true_corners(view.camera.lens, view.camera.camera_from_world, lay(0, x, y, z, turn))
+            found = project_corners(view.camera.lens, view.camera.camera_from_world, lay(0, x, y, z, turn))
             wanted = to_pixels(view.camera, world_points(x, y, z, turn, CORNERS))
             np.testing.assert_allclose(found, wanted, atol=1e-8)
 
 
-def edge_errors(view: View, placed: Placed, settings: LabSettings) -> Array:
+def edge_errors(view: View, placed: PlacedMarker, settings: LabSettings) -> Array:
     """By how many px the drawn sides of the black square lie off, pixel row by pixel row.
 
     The light along a line across an edge, added up, tells where the edge is, whatever the blur.
@@ -107,8 +107,10 @@ def test_edges_lie_where_they_should_to_a_hundredth_of_a_pixel(views: list[View]
 
 
 def test_edges_of_a_tilted_marker_are_as_exact(views: list[View]) -> None:
-    tilted = lay_flat(3.0, 2.6, 0.1, 0.7) @ make_pose(rotation(np.array([0.12, -0.05, 0.0])), np.zeros(3))
-    errors = edge_errors(views[1], Placed(5, LENGTH_M, tilted), SETTINGS)
+    tilted = pose_facing_up(3.0, 2.6, 0.1, 0.7) @ make_pose(
+        rotation(np.array([0.12, -0.05, 0.0])), np.zeros(3)
+    )
+    errors = edge_errors(views[1], PlacedMarker(5, LENGTH_M, tilted), SETTINGS)
     assert np.abs(errors).max() < 0.01
 
 
@@ -116,7 +118,7 @@ def test_a_frame_equals_one_drawn_by_brute_force(views: list[View]) -> None:
     """Twelve by twelve hard samples per pixel through an inverse of the lens found by bisection."""
     view, samples = views[1], 12
     where = (3.1, 2.9, 0.15, 0.6)
-    corners = true_corners(view.camera.lens, view.camera.camera_from_world, lay(7, *where))
+    corners = project_corners(view.camera.lens, view.camera.camera_from_world, lay(7, *where))
     low = corners.min(axis=0).astype(int) - 2
     size = np.ptp(corners, axis=0).astype(int) + 5
     steps = (np.arange(samples) + 0.5) / samples - 0.5
@@ -171,7 +173,7 @@ def test_gamma_keeps_black_and_white_and_thins_black(views: list[View]) -> None:
     view = prepare_view(views[1].camera, settings)
     placed = lay(3, 2.6, 2.3, 0.0, 0.2)
     image = expose(view, [placed], settings)
-    corners = true_corners(view.camera.lens, view.camera.camera_from_world, placed)
+    corners = project_corners(view.camera.lens, view.camera.camera_from_world, placed)
     outer = image[int(corners[:, 1].min()) : int(corners[:, 1].max())]
     assert outer.min() == pytest.approx(35, abs=0.05)
     assert image.max() == pytest.approx(205, abs=0.05)
@@ -201,7 +203,7 @@ def test_the_stock_detector_finds_every_marker_near_its_truth(views: list[View])
         for found, marker_id in zip(corners, np.ravel(ids).tolist(), strict=True):
             start = np.ascontiguousarray(found, np.float32).reshape(-1, 1, 2)
             fine = cv2.cornerSubPix(image, start, (3, 3), (-1, -1), (3, 40, 0.001)).reshape(4, 2)
-            truth = true_corners(view.camera.lens, view.camera.camera_from_world, placed[int(marker_id)])
+            truth = project_corners(view.camera.lens, view.camera.camera_from_world, placed[int(marker_id)])
             errors.append(fine - truth)
     assert np.sqrt(np.mean(np.sum(np.square(errors), axis=-1))) < 0.35
 
@@ -218,9 +220,11 @@ def test_a_marker_at_the_edge_of_the_image_is_cut_off_and_nothing_else(views: li
 
 
 def test_a_marker_is_not_seen_from_behind(views: list[View]) -> None:
-    turned = lay_flat(2.44, 2.44, 0.1, 0.0) @ make_pose(rotation(np.array([np.pi, 0.0, 0.0])), np.zeros(3))
+    turned = pose_facing_up(2.44, 2.44, 0.1, 0.0) @ make_pose(
+        rotation(np.array([np.pi, 0.0, 0.0])), np.zeros(3)
+    )
     bare = expose(views[1], [], SETTINGS)
-    assert (expose(views[1], [Placed(1, LENGTH_M, turned)], SETTINGS) == bare).all()
+    assert (expose(views[1], [PlacedMarker(1, LENGTH_M, turned)], SETTINGS) == bare).all()
 
 
 def test_noise_has_the_stated_sigma_and_is_new_in_each_frame(views: list[View]) -> None:

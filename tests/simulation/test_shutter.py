@@ -8,11 +8,11 @@ import pytest
 from numpy.typing import NDArray
 from scipy.ndimage import uniform_filter1d
 
-from ipsys_log.geometry.marker_cells import Moving, Placed, true_corners
-from ipsys_log.geometry.poses import lay_flat, look_down
+from ipsys_log.geometry.marker_cells import MovingMarker, PlacedMarker, project_corners
+from ipsys_log.geometry.poses import look_down, pose_facing_up
 from ipsys_log.messages import CameraCalibration, CompressedImage, Message, Rig, Tracks
-from ipsys_log.simulation.calibration_points import place
-from ipsys_log.simulation.cameras import Camera, hang_cameras
+from ipsys_log.simulation.calibration_points import place_marker
+from ipsys_log.simulation.cameras import Camera, mount_cameras
 from ipsys_log.simulation.drive import Drive, plan_drive
 from ipsys_log.simulation.floor import prepare_view
 from ipsys_log.simulation.lab import EPOCH_NS, drive_start_ns, simulate
@@ -48,19 +48,19 @@ def camera() -> Camera:
 MIDDLE, CORNER, BELOW = (2.580, 2.393), (2.806, 2.189), (2.582, 2.095)
 
 
-def drive_past(where_m: tuple[float, float], towards_rad: float, turn_rad_s: float) -> Moving:
+def drive_past(where_m: tuple[float, float], towards_rad: float, turn_rad_s: float) -> MovingMarker:
     """A marker that is at a place while row 120 is exposed."""
     velocity = SPEED_M_S * np.array([np.cos(towards_rad), np.sin(towards_rad)])
 
-    def moving(time_s: float) -> Placed:
+    def moving(time_s: float) -> PlacedMarker:
         since_s = time_s - 120 * ROW_NS * 1e-9
         x_m, y_m = where_m + velocity * since_s
-        return Placed(3, 0.1, lay_flat(float(x_m), float(y_m), 0.1, 0.4 + turn_rad_s * since_s))
+        return PlacedMarker(3, 0.1, pose_facing_up(float(x_m), float(y_m), 0.1, 0.4 + turn_rad_s * since_s))
 
     return moving
 
 
-def by_brute_force(camera: Camera, moving: Moving, settings: LabSettings) -> Array:
+def by_brute_force(camera: Camera, moving: MovingMarker, settings: LabSettings) -> Array:
     """Each row: the mean, in light, of the frozen frames at all times within its exposure."""
     frozen = replace(settings, row_time_ns=0, exposure_s=0.0)
     view = prepare_view(camera, frozen)
@@ -149,7 +149,7 @@ def session() -> list[Message]:
 
 
 def drive_of(settings: LabSettings) -> tuple[Drive, int, dict[str, Camera]]:
-    cameras = hang_cameras(settings, EPOCH_NS)
+    cameras = mount_cameras(settings, EPOCH_NS)
     named = {camera.name: camera for camera in cameras}
     return plan_drive(settings, cameras), drive_start_ns(settings, cameras), named
 
@@ -161,7 +161,7 @@ def test_the_truth_is_that_of_the_time_of_the_frame(session: list[Message]) -> N
     assert len(driving) == 20
     assert driving[0].timestamp == start_ns
     for tracks in driving:
-        places = drive.places_at((tracks.timestamp - start_ns) / 1e9)
+        places = drive.poses_at((tracks.timestamp - start_ns) / 1e9)
         assert [(t.id, t.x_m, t.y_m, t.heading_rad) for t in tracks.tracks] == [
             (p.marker_id, p.x_m, p.y_m, p.heading_rad) for p in places
         ]
@@ -169,8 +169,8 @@ def test_the_truth_is_that_of_the_time_of_the_frame(session: list[Message]) -> N
 
 def test_before_their_start_the_robots_stand() -> None:
     drive = drive_of(LAB)[0]
-    assert drive.places_at(-1.0) == drive.places_at(0.0)
-    assert drive.places_at(1e-2) != drive.places_at(0.0)
+    assert drive.poses_at(-1.0) == drive.poses_at(0.0)
+    assert drive.poses_at(1e-2) != drive.poses_at(0.0)
 
 
 def test_corners_in_a_session_lie_where_the_marker_was_while_their_row_was_exposed(
@@ -191,8 +191,8 @@ def test_corners_in_a_session_lie_where_the_marker_was_while_their_row_was_expos
             for number, px in enumerate(fine):
                 for name, row in (("own row", float(px[1])), ("frame", 0.0)):
                     time_s = (m.publish_time_ns - start_ns + row * LAB.row_time_ns) / 1e9
-                    placed = place(drive.places_at(time_s)[int(marker_id)], LAB)
-                    truth = true_corners(camera.lens, camera.camera_from_world, placed)[number]
+                    placed = place_marker(drive.poses_at(time_s)[int(marker_id)], LAB)
+                    truth = project_corners(camera.lens, camera.camera_from_world, placed)[number]
                     off_px[name].append(px - truth)
     assert len(off_px["frame"]) > 200
     rms = {name: float(np.sqrt(np.mean(np.sum(np.square(off), axis=-1)))) for name, off in off_px.items()}

@@ -5,7 +5,7 @@ from __future__ import annotations
 import numpy as np
 import pytest
 
-from ipsys_log.stages.detect.changes import Watch
+from ipsys_log.stages.detect.changes import ChangeDetector
 from tests.stages.drawing import Array, Picture
 
 WIDTH, HEIGHT, BREADTH_PX = 640, 480, 80.0
@@ -33,11 +33,11 @@ def put(picture: Picture, corners_px: Array, level: int = THING) -> Picture:
 
 
 @pytest.fixture
-def watch() -> Watch:
+def watch() -> ChangeDetector:
     """One that knows the empty floor."""
-    watch = Watch()
+    watch = ChangeDetector()
     for _ in range(3):
-        assert watch.changed(floor(), ALL, [], BREADTH_PX) is None
+        assert watch.find_change(floor(), ALL, [], BREADTH_PX) is None
     return watch
 
 
@@ -52,41 +52,41 @@ def covers(region: tuple[slice, slice] | None, corners_px: Array) -> bool:
 
 
 @pytest.mark.parametrize("place", [(320, 240), (41, 41), (599, 41), (41, 439), (599, 439), (333, 222)])
-def test_a_new_thing_is_noticed_where_it_is(watch: Watch, place: tuple[float, float]) -> None:
+def test_a_new_thing_is_noticed_where_it_is(watch: ChangeDetector, place: tuple[float, float]) -> None:
     there = square(*place)
-    assert covers(watch.changed(put(floor(), there), ALL, [], BREADTH_PX), there)
+    assert covers(watch.find_change(put(floor(), there), ALL, [], BREADTH_PX), there)
 
 
-def test_what_is_known_to_be_a_marker_is_no_news(watch: Watch) -> None:
+def test_what_is_known_to_be_a_marker_is_no_news(watch: ChangeDetector) -> None:
     there = square(300, 200)
-    assert watch.changed(put(floor(), there), ALL, [there], BREADTH_PX) is None
+    assert watch.find_change(put(floor(), there), ALL, [there], BREADTH_PX) is None
 
 
 @pytest.mark.parametrize("step_px", [3, 20, 70])
 def test_floor_that_a_marker_uncovers_is_no_alarm(step_px: int) -> None:
     """A marker drives across a floor that was never seen without it."""
-    watch = Watch()
+    watch = ChangeDetector()
     for n in range(8):
         there = square(100 + step_px * n, 200)
-        assert watch.changed(put(floor(), there), ALL, [there], BREADTH_PX) is None
+        assert watch.find_change(put(floor(), there), ALL, [there], BREADTH_PX) is None
 
 
 def test_floor_under_a_marker_that_is_taken_away_is_no_alarm() -> None:
-    watch, there = Watch(), square(300, 200)
+    watch, there = ChangeDetector(), square(300, 200)
     for _ in range(5):
-        assert watch.changed(put(floor(), there), ALL, [there], BREADTH_PX) is None
-    assert watch.changed(floor(), ALL, [], BREADTH_PX) is None
+        assert watch.find_change(put(floor(), there), ALL, [there], BREADTH_PX) is None
+    assert watch.find_change(floor(), ALL, [], BREADTH_PX) is None
 
 
-def test_another_marker_beside_a_known_one_is_noticed(watch: Watch) -> None:
+def test_another_marker_beside_a_known_one_is_noticed(watch: ChangeDetector) -> None:
     known, other = square(200, 200), square(420, 240)
-    watch.changed(put(floor(), known), ALL, [known], BREADTH_PX)
+    watch.find_change(put(floor(), known), ALL, [known], BREADTH_PX)
     picture = put(put(floor(), known), other)
-    assert covers(watch.changed(picture, ALL, [known], BREADTH_PX), other)
+    assert covers(watch.find_change(picture, ALL, [known], BREADTH_PX), other)
 
 
 @pytest.mark.parametrize("side", ["left", "right", "top", "bottom"])
-def test_at_the_edge_a_thing_counts_when_half_of_it_is_in(watch: Watch, side: str) -> None:
+def test_at_the_edge_a_thing_counts_when_half_of_it_is_in(watch: ChangeDetector, side: str) -> None:
     """Less cannot be a marker yet, and would be searched for in vain in every frame."""
     little, enough = (
         square(
@@ -99,40 +99,42 @@ def test_at_the_edge_a_thing_counts_when_half_of_it_is_in(watch: Watch, side: st
         )
         for seen_px in (20, 56)
     )
-    assert watch.changed(put(floor(), little), ALL, [], BREADTH_PX) is None
-    assert covers(watch.changed(put(floor(), enough), ALL, [], BREADTH_PX), enough)
+    assert watch.find_change(put(floor(), little), ALL, [], BREADTH_PX) is None
+    assert covers(watch.find_change(put(floor(), enough), ALL, [], BREADTH_PX), enough)
 
 
-def test_what_stays_becomes_background(watch: Watch) -> None:
+def test_what_stays_becomes_background(watch: ChangeDetector) -> None:
     """A chair is searched for markers some frames long, not for ever."""
     picture = put(floor(), square(320, 240, 160))
-    alarms = [watch.changed(picture, ALL, [], BREADTH_PX) is not None for _ in range(30)]
+    alarms = [watch.find_change(picture, ALL, [], BREADTH_PX) is not None for _ in range(30)]
     assert alarms[0]
     assert not any(alarms[15:])
 
 
-def test_slow_changes_of_light_are_no_alarm(watch: Watch) -> None:
+def test_slow_changes_of_light_are_no_alarm(watch: ChangeDetector) -> None:
     for level in np.linspace(0, 60, 60).astype(int).tolist():
-        assert watch.changed(floor() - np.uint8(level), ALL, [], BREADTH_PX) is None
+        assert watch.find_change(floor() - np.uint8(level), ALL, [], BREADTH_PX) is None
 
 
-def test_rows_that_were_not_decoded_say_nothing(watch: Watch) -> None:
+def test_rows_that_were_not_decoded_say_nothing(watch: ChangeDetector) -> None:
     """They still hold what an older frame left there."""
     there = square(320, 100)
     picture = put(floor(), there)
-    assert watch.changed(picture, [slice(200, HEIGHT)], [], BREADTH_PX) is None
-    assert watch.changed(picture, [], [], BREADTH_PX) is None
-    assert covers(watch.changed(picture, [slice(0, 40), slice(56, 160)], [], BREADTH_PX), there)
+    assert watch.find_change(picture, [slice(200, HEIGHT)], [], BREADTH_PX) is None
+    assert watch.find_change(picture, [], [], BREADTH_PX) is None
+    assert covers(watch.find_change(picture, [slice(0, 40), slice(56, 160)], [], BREADTH_PX), there)
 
 
 @pytest.mark.parametrize("size", [(240, 320), (8, 8), (1, 1), (9, 3000)])
-def test_frames_of_another_size_begin_anew(watch: Watch, size: tuple[int, int]) -> None:
+def test_frames_of_another_size_begin_anew(watch: ChangeDetector, size: tuple[int, int]) -> None:
     for _ in range(2):
         other = np.full(size, 20, np.uint8)
-        assert watch.changed(other, [slice(0, size[0])], [square(5, 5)], BREADTH_PX) is None
+        assert watch.find_change(other, [slice(0, size[0])], [square(5, 5)], BREADTH_PX) is None
 
 
-def test_markers_outside_of_the_picture_are_no_trouble(watch: Watch) -> None:
+def test_markers_outside_of_the_picture_are_no_trouble(watch: ChangeDetector) -> None:
     for place in ((-500, -500), (5000, 100), (320, -60), (-39, 479)):
-        assert watch.changed(floor(), ALL, [square(*place)], BREADTH_PX) is None
-    assert watch.changed(put(floor(), square(320, 240)), ALL, [square(-500, -500)], BREADTH_PX) is not None
+        assert watch.find_change(floor(), ALL, [square(*place)], BREADTH_PX) is None
+    assert (
+        watch.find_change(put(floor(), square(320, 240)), ALL, [square(-500, -500)], BREADTH_PX) is not None
+    )

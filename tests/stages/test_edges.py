@@ -11,17 +11,17 @@ from typing import Any
 import numpy as np
 import pytest
 
-from ipsys_log.geometry.marker_cells import true_corners
+from ipsys_log.geometry.marker_cells import project_corners
 from ipsys_log.messages import CameraCalibration, CompressedImage, Marker, RigCamera, Tracks
-from ipsys_log.simulation.calibration_points import Place, place, seen_whole
-from ipsys_log.simulation.cameras import Camera, hang_cameras
+from ipsys_log.simulation.calibration_points import MarkerPose, cameras_seeing, place_marker
+from ipsys_log.simulation.cameras import Camera, mount_cameras
 from ipsys_log.simulation.drive import plan_drive
 from ipsys_log.simulation.floor import View, prepare_view
 from ipsys_log.simulation.lab import EPOCH_NS, drive_start_ns, simulate
 from ipsys_log.simulation.render import encode_jpeg, render
 from ipsys_log.simulation.settings import LabSettings
 from ipsys_log.stages.detect.edges import Guess, fit_edges
-from ipsys_log.stages.detect.follow import Follow
+from ipsys_log.stages.detect.follow import MarkerTracker
 from ipsys_log.units import NS_PER_S
 from tests.stages.drawing import (
     FISHEYE,
@@ -47,7 +47,7 @@ from tests.stages.drawing import (
 )
 
 LAB = LabSettings(stations=0)
-CAMERAS = dict(zip(LAB.cameras, hang_cameras(LAB), strict=True))
+CAMERAS = dict(zip(LAB.cameras, mount_cameras(LAB), strict=True))
 
 
 # --- the simulator's frames ---------------------------------------------------------------------
@@ -65,12 +65,12 @@ def filmed(settings: LabSettings, camera: str, starts_s: Sequence[float], frames
     for start_s in starts_s:
         seen, truths, wholes = [], [], []
         for time_s in start_s + np.arange(frames) / 30:
-            places = drive.places_at(time_s)
-            prints = [place(one, settings) for one in places]
+            places = drive.poses_at(time_s)
+            prints = [place_marker(one, settings) for one in places]
             data = encode_jpeg(render(view(camera, settings.gamma), prints, settings, rng), settings)
             seen.append((EPOCH_NS + round(time_s * NS_PER_S), data))
-            truths.append({p.id: true_corners(where.lens, where.camera_from_world, p) for p in prints})
-            wholes.append([one.marker_id for one in places if seen_whole(one, [where], settings)])
+            truths.append({p.id: project_corners(where.lens, where.camera_from_world, p) for p in prints})
+            wholes.append([one.marker_id for one in places if cameras_seeing(one, [where], settings)])
         for markers, truth_px, whole in zip(follow(where.lens, seen), truths, wholes, strict=True):
             score.add(markers, truth_px, whole)
     return score
@@ -117,10 +117,10 @@ ROLLING = LabSettings(
 @pytest.mark.slow
 def test_markers_behind_a_rolling_shutter_are_where_they_were_then() -> None:
     """Robots at 2 m/s, 1/60 s of motion blur; from the third sighting on speed is known as well."""
-    cameras = hang_cameras(ROLLING)
+    cameras = mount_cameras(ROLLING)
     drive, start_ns = plan_drive(ROLLING, cameras), drive_start_ns(ROLLING, cameras)
     row_s = ROLLING.row_time_ns / NS_PER_S
-    following = {c.name: Follow(ROLLING.dictionary, c.lens, None, row_s) for c in cameras}
+    following = {c.name: MarkerTracker(ROLLING.dictionary, c.lens, None, row_s) for c in cameras}
     times_seen: Counter[tuple[str, int]] = Counter()
     whole: dict[int, tuple[str, ...]] = {}
     to_find: list[bool] = []
@@ -141,7 +141,7 @@ def test_markers_behind_a_rolling_shutter_are_where_they_were_then() -> None:
                 fit = seen[marker_id]
                 late_s = float(fit.corners_px[:, 1].mean()) * row_s
                 time_s = (message.publish_time_ns - start_ns) / NS_PER_S + late_s
-                truth_m = centre_m(camera, drive.place_at(marker_id, time_s))
+                truth_m = centre_m(camera, drive.pose_at(marker_id, time_s))
                 offs_m.append(fit.pose.centre * ROLLING.marker_length_m - truth_m)
     rms_m = float(np.sqrt(np.mean(np.sum(np.square(offs_m), axis=1))))
     assert len(offs_m) > 50
@@ -149,7 +149,7 @@ def test_markers_behind_a_rolling_shutter_are_where_they_were_then() -> None:
     assert rms_m <= 0.0015
 
 
-def centre_m(camera: Camera, where: Place) -> Array:
+def centre_m(camera: Camera, where: MarkerPose) -> Array:
     return (camera.camera_from_world @ [where.x_m, where.y_m, where.z_m, 1.0])[:3]
 
 

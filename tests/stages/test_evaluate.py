@@ -9,20 +9,20 @@ import numpy as np
 import pytest
 from scipy.stats import chi2
 
-from ipsys_log.analysis.accuracy import POOLED, error_statistics, errors_cross_validated, errors_held_out
+from ipsys_log.analysis.accuracy import POOLED, error_statistics, evaluate_cross_validated, evaluate_held_out
 from ipsys_log.analysis.cross_validation import (
-    deal,
-    gather_places,
+    gather_points,
     labelled_subsets,
     learning_curve,
     leave_one_out,
+    make_folds,
     predict_without,
     published_curve,
 )
 from ipsys_log.analysis.ground_truth import gather_tracks, track_errors
 from ipsys_log.errors import FitError
 from ipsys_log.messages import Message, Pair, Track, Tracks
-from ipsys_log.models.table import AppliedModel, Places, min_pairs
+from ipsys_log.models.table import AppliedModel, CalibrationPoints, min_pairs
 from ipsys_log.stages.fit import fit_model
 from tests import labs
 
@@ -76,7 +76,7 @@ def test_repeats_at_one_place_do_not_make_the_mean_more_certain() -> None:
 
 def test_errors_in_space_and_on_the_floor() -> None:
     model = fit_model("rigid", {"red": pairs(np.zeros(3))}, 0)
-    (row,) = errors_held_out(model, {"red": pairs(np.array([0.03, 0.04, 0.12]))}, {})
+    (row,) = evaluate_held_out(model, {"red": pairs(np.array([0.03, 0.04, 0.12]))}, {})
     assert (row.against, row.scheme) == ("tape", "held_out")
     assert row.error_3d is not None
     assert row.error_3d.mean_m == pytest.approx(0.13)
@@ -88,7 +88,7 @@ def test_errors_in_space_and_on_the_floor() -> None:
 def test_the_truth_is_compared_where_it_is_known() -> None:
     model = fit_model("rigid", {"red": pairs(np.zeros(3))}, 0)
     truth = {"m0": POINTS[0], "m5": POINTS[5] + [0, 0, 0.01]}
-    rows = {row.against: row for row in errors_held_out(model, {"red": pairs(np.ones(3))}, truth)}
+    rows = {row.against: row for row in evaluate_held_out(model, {"red": pairs(np.ones(3))}, truth)}
     assert rows["truth"].error_3d is not None
     assert rows["truth"].error_3d.count == 2
     assert rows["truth"].error_3d.max_m == pytest.approx(0.01)
@@ -98,17 +98,17 @@ def test_the_truth_is_compared_where_it_is_known() -> None:
 def test_all_cameras_together_are_one_row_more() -> None:
     model = fit_model("rigid", {"red": pairs(np.zeros(3)), "white": pairs(np.zeros(3))}, 0)
     held_out = {"red": pairs(np.array([0.01, 0, 0])), "white": pairs(np.array([0.03, 0, 0]))[:7]}
-    rows = {row.camera: row for row in errors_held_out(model, held_out, {})}
+    rows = {row.camera: row for row in evaluate_held_out(model, held_out, {})}
     assert set(rows) == {"red", "white", POOLED}
     assert rows[POOLED].error_2d.mean_m == pytest.approx((14 * 0.01 + 7 * 0.03) / 21)
-    only = errors_held_out(model, {"white": pairs(np.ones(3))}, {})
+    only = evaluate_held_out(model, {"white": pairs(np.ones(3))}, {})
     assert [row.camera for row in only] == ["white"]
 
 
 def test_places_that_the_model_was_fitted_on_are_not_held_out() -> None:
     """As where a model is applied to the very log that it was made from."""
     model = fit_model("rigid", {"red": pairs(np.zeros(3))}, 0)
-    assert errors_held_out(model, {"red": pairs(np.zeros(3))}, {}) == []
+    assert evaluate_held_out(model, {"red": pairs(np.zeros(3))}, {}) == []
 
 
 def test_where_all_places_have_one_height_there_is_no_error_in_space() -> None:
@@ -117,14 +117,14 @@ def test_where_all_places_have_one_height_there_is_no_error_in_space() -> None:
     tape, covariances = labs.measure(world, rng)
     tape[:, 2] = 0.1
     model = fit_model("poly", {"red": labs.pairs(labs.camera(rng).see(world, rng), tape, covariances)}, 0)
-    rows = errors_cross_validated(model, {"red": list(model.cameras[0].pairs)}, {}, 0)
+    rows = evaluate_cross_validated(model, {"red": list(model.cameras[0].pairs)}, {}, 0)
     assert [(row.error_3d, row.error_2d.count) for row in rows] == [(None, 20)]
 
 
 def test_cross_validation_is_that_of_a_loop_written_out() -> None:
     found, _, _ = lab(0, 23)
     model = fit_model("poly", {"red": found}, 0)
-    (row,) = errors_cross_validated(model, {"red": found}, {}, seed=7)
+    (row,) = evaluate_cross_validated(model, {"red": found}, {}, seed=7)
     by_place: dict[str, list[float]] = {}
     for residual in row.residuals:
         error = float(np.linalg.norm(residual.predicted_m - residual.world_m))
@@ -136,19 +136,19 @@ def test_cross_validation_is_that_of_a_loop_written_out() -> None:
     inside = np.linalg.norm(applied.predict(points, world[:, 2]) - world, axis=1)
     assert row.error_3d is not None
     assert row.error_3d.mean_m > 1.3 * inside.mean()
-    again = errors_cross_validated(model, {"red": found}, {}, seed=8)
+    again = evaluate_cross_validated(model, {"red": found}, {}, seed=8)
     assert again[0].error_3d != row.error_3d
 
 
 def test_a_place_seen_by_two_cameras_is_held_out_from_both() -> None:
-    def seen(*names: str) -> Places:
-        return Places(np.zeros((len(names), 3)), np.zeros((len(names), 3)), names)
+    def seen(*names: str) -> CalibrationPoints:
+        return CalibrationPoints(np.zeros((len(names), 3)), np.zeros((len(names), 3)), names)
 
     cameras = {
         "red": seen(*(f"r{n}" for n in range(20)), *(f"b{n}" for n in range(5))),
         "white": seen(*(f"w{n}" for n in range(15)), *(f"b{n}" for n in range(5))),
     }
-    folds = deal(cameras, 5, np.random.default_rng(0))
+    folds = make_folds(cameras, 5, np.random.default_rng(0))
     assert sorted(name for fold in folds for name in fold) == sorted(
         {name for places in cameras.values() for name in places.names}
     )
@@ -159,7 +159,7 @@ def test_a_place_seen_by_two_cameras_is_held_out_from_both() -> None:
 
 def test_leave_one_out_is_a_fit_without_the_place() -> None:
     found, _, _ = lab(1, 16)
-    cameras = gather_places({"red": found})
+    cameras = gather_points({"red": found})
     left_out = leave_one_out("poly", cameras)(frozenset({"m03"}))["red"]
     rest = {"red": [p for p in found if p.measurement not in ("m03", "m05")]}
     applied = AppliedModel("poly", fit_model("poly", rest, 0).cameras[0])
@@ -171,7 +171,7 @@ def test_leave_one_out_is_a_fit_without_the_place() -> None:
 
 def test_more_places_make_a_better_model_and_the_curve_says_so() -> None:
     found, _, _ = lab(2, 60)
-    curve = [p for points in learning_curve("poly", gather_places({"red": found}), 0) for p in points]
+    curve = [p for points in learning_curve("poly", gather_points({"red": found}), 0) for p in points]
     assert [p.pairs for p in curve] == [10, 15, 20, 30, 40]
     assert curve[0].mean_3d_m > 3 * curve[-1].mean_3d_m
     assert all(p.std_3d_m is not None and p.subsets == 10 for p in curve)
@@ -179,7 +179,7 @@ def test_more_places_make_a_better_model_and_the_curve_says_so() -> None:
 
 def test_published_subsets_are_fitted_and_looked_at_where_the_paper_does() -> None:
     found, _, _ = lab(3, 30)
-    cameras = gather_places({"red": found})
+    cameras = gather_points({"red": found})
     names = [p.measurement for p in found]
     (point,) = published_curve("poly", cameras, {"train_12": set(names[:12])}, set(names[20:]))
     assert (point.pairs, point.label) == (12, "train_12")
@@ -253,7 +253,7 @@ def test_away_from_the_measured_places_a_position_is_less_certain() -> None:
 def test_places_of_a_fold_too_few_to_fit_are_an_error() -> None:
     found, _, _ = lab(7, min_pairs("poly") + 1)
     with pytest.raises(FitError):
-        predict_without("rigid", gather_places({"red": found}), {p.measurement for p in found[2:]})
+        predict_without("rigid", gather_points({"red": found}), {p.measurement for p in found[2:]})
 
 
 def tracked(time_ns: int, x_m: float) -> Message:

@@ -9,17 +9,17 @@ import cv2
 import numpy as np
 import pytest
 
-from ipsys_log.geometry.marker_cells import true_corners
+from ipsys_log.geometry.marker_cells import project_corners
 from ipsys_log.messages import CompressedImage, Event, Marker
-from ipsys_log.simulation.calibration_points import place
-from ipsys_log.simulation.cameras import hang_cameras
+from ipsys_log.simulation.calibration_points import place_marker
+from ipsys_log.simulation.cameras import mount_cameras
 from ipsys_log.simulation.drive import plan_drive
 from ipsys_log.simulation.floor import prepare_view
 from ipsys_log.simulation.render import encode_jpeg, render
 from ipsys_log.simulation.settings import LabSettings
 from ipsys_log.stages.detect import Detect, decode_grey, detect_markers
 from ipsys_log.stages.detect.adjustment import Fit, Guess
-from ipsys_log.stages.detect.partial import fit_partly
+from ipsys_log.stages.detect.partial import fit_visible_edges
 from ipsys_log.stages.detect.uneven_light import compare_pattern
 from tests.stages.drawing import (
     FISHEYE,
@@ -109,11 +109,11 @@ def test_covariance_with_three_sides_holds_the_errors() -> None:
 def test_simulated_marker_with_glare_on_a_side_is_exact() -> None:
     """Glare is added to the picture, as light that saturates: another way than the drawing's."""
     settings = LabSettings(stations=0, markers=3, width=960, height=540)
-    camera = hang_cameras(settings)[0]
+    camera = mount_cameras(settings)[0]
     drive = plan_drive(settings, [camera])
-    places = [place(one, settings) for one in drive.places_at(1.0)]
+    places = [place_marker(one, settings) for one in drive.poses_at(1.0)]
     picture = render(prepare_view(camera, settings), places, settings, np.random.default_rng(0))
-    truth_px = {p.id: true_corners(camera.lens, camera.camera_from_world, p) for p in places}
+    truth_px = {p.id: project_corners(camera.lens, camera.camera_from_world, p) for p in places}
     shown = {n: px for n, px in truth_px.items() if ((px > 20) & (px < [940, 520])).all()}
     assert shown
     levels = picture.astype(np.float64)
@@ -178,11 +178,11 @@ def test_partial_fit_is_never_that_of_another_marker() -> None:
     glare, _ = streak(300.0, 0.05)(VGA, one, np.random.default_rng(3))
     grey = draw(VGA, [one], Look(glare=glare))
     centre = one.centre_m / SIDE_M
-    fits = [fit_partly(grey, [Guess(n, one.axes, centre)], DICTIONARY, VGA) for n in range(5, 100, 3)]
+    fits = [fit_visible_edges(grey, [Guess(n, one.axes, centre)], DICTIONARY, VGA) for n in range(5, 100, 3)]
     assert [isinstance(fit, Fit) for fit in fits] == [True] + [False] * (len(fits) - 1)
     noise = np.random.default_rng(0).integers(0, 255, grey.shape).astype(np.uint8)
     for empty in (np.full_like(grey, 150), noise):
-        assert fit_partly(empty, [Guess(5, one.axes, centre)], DICTIONARY, VGA) is None
+        assert fit_visible_edges(empty, [Guess(5, one.axes, centre)], DICTIONARY, VGA) is None
 
 
 def test_side_in_glare_makes_its_corners_uncertain() -> None:
@@ -191,7 +191,7 @@ def test_side_in_glare_makes_its_corners_uncertain() -> None:
     top = corners_px(VGA, one)[:2].mean(axis=0)
     y, _ = np.mgrid[: VGA.height, : VGA.width]
     grey = draw(VGA, [one], Look(glare=400 * np.exp(-((y - top[1]) ** 2) / (2 * 4.0**2))))
-    fit = fit_partly(grey, [Guess(5, one.axes, one.centre_m / SIDE_M)], DICTIONARY, VGA)
+    fit = fit_visible_edges(grey, [Guess(5, one.axes, one.centre_m / SIDE_M)], DICTIONARY, VGA)
     assert isinstance(fit, Fit)
     sigmas_px = np.sqrt(np.diag(fit.covariance_px2)).reshape(4, 2)[:, 1]
     assert sigmas_px[:2].min() > 1.15 * sigmas_px[2:].max()
@@ -204,7 +204,7 @@ def test_partial_fit_settles_from_some_pixels_aside(where: str) -> None:
     glare, _ = spots(300.0, 0.08, where)(VGA, one, np.random.default_rng(1))
     grey = draw(VGA, [one], Look(glare=glare))
     aside = np.array([2.0, -2.0, 0.0]) * one.centre_m[2] / SIDE_M / VGA.K[0, 0]
-    fit = fit_partly(grey, [Guess(5, one.axes, one.centre_m / SIDE_M + aside)], DICTIONARY, VGA)
+    fit = fit_visible_edges(grey, [Guess(5, one.axes, one.centre_m / SIDE_M + aside)], DICTIONARY, VGA)
     assert isinstance(fit, Fit)
     assert np.hypot(*(fit.corners_px - corners_px(VGA, one)).T).max() < 0.15
 

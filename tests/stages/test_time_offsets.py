@@ -37,7 +37,7 @@ from ipsys_log.pipeline import replay
 from ipsys_log.runs.options import Request
 from ipsys_log.runs.output import write_log
 from ipsys_log.runs.stream import run, wire
-from ipsys_log.simulation.cameras import hang_cameras
+from ipsys_log.simulation.cameras import mount_cameras
 from ipsys_log.simulation.lab import drive_start_ns, simulate
 from ipsys_log.simulation.settings import LabSettings
 from ipsys_log.stages import fuse, locate
@@ -139,7 +139,7 @@ def rolling(tmp_path_factory: pytest.TempPathFactory) -> Path:
 def drive_error_m(log: Path, rig: Rig | None) -> float:
     """Mean error of the tracks on the drive, of a model that reads no depths."""
     fused = replay([log], Request(models=("rayplane",), rig=rig))[-1]
-    start_ns = drive_start_ns(ROLLING, hang_cameras(ROLLING))
+    start_ns = drive_start_ns(ROLLING, mount_cameras(ROLLING))
     with Session([log]) as session:
         made = list(session.messages(session.topics(TRACKS, fused.run)))
         tracks = gather_tracks(m for m in made if m.publish_time_ns >= start_ns)

@@ -14,9 +14,9 @@ from hypothesis import strategies as st
 from ipsys_log.errors import IpsysError
 from ipsys_log.messages import Interval, Measurement, Model, ReferencePoint, Rig
 from ipsys_log.stages.fit import fit_model
-from ipsys_log.survey.checks import Checked, check_entry, next_id, withdraw
-from ipsys_log.survey.entry import Typed, read_typed
-from ipsys_log.survey.scene import Sight
+from ipsys_log.survey.checks import EntryCheck, check_entry, next_id, withdrawal_of
+from ipsys_log.survey.entry import TypedEntry, parse_entry
+from ipsys_log.survey.scene import MarkerObservations
 from tests import labs
 
 Array = labs.Array
@@ -30,25 +30,25 @@ PLACES = st.tuples(st.floats(0.1, 4.7), st.floats(0.1, 4.7), st.floats(0.0, 0.3)
 )
 
 
-def tape(world_m: Sequence[float], rig: Rig = RIG, **changed: Any) -> Typed:
+def tape(world_m: Sequence[float], rig: Rig = RIG, **changed: Any) -> TypedEntry:
     """A place as somebody reads it who reads well: to the millimetre."""
     distances = {
         p.name: f"{100 * np.hypot(world_m[0] - p.x_m, world_m[1] - p.y_m):.1f}" for p in rig.reference_points
     }
     side = "" if len(distances) > 2 else "left" if world_m[1] > labs.A[1] else "right"
-    return replace(Typed("0", distances, side, f"{100 * world_m[2]:.1f}"), **changed)
+    return replace(TypedEntry("0", distances, side, f"{100 * world_m[2]:.1f}"), **changed)
 
 
 def check(
-    typed: Typed,
+    typed: TypedEntry,
     rig: Rig = RIG,
     history: Sequence[Measurement] = (),
     model: Model | None = None,
     seen: Mapping[str, Array] | None = None,
-) -> Checked:
+) -> EntryCheck:
     points_m = {"red": np.array([0.0, 0.0, 2.0])} if seen is None else seen
-    sight = Sight(0, STILL if points_m else None, points_m)
-    return check_entry(*read_typed(typed, rig), rig, sight, history, model)
+    sight = MarkerObservations(0, STILL if points_m else None, points_m)
+    return check_entry(*parse_entry(typed, rig), rig, sight, history, model)
 
 
 @given(PLACES)
@@ -78,15 +78,15 @@ def test_three_distances_need_no_side_and_check_one_another(world_m: tuple[float
 
 
 def test_two_tapes_that_cannot_meet() -> None:
-    checked = check(Typed("0", {"A": "40", "B": "50"}, "left", "0"))
+    checked = check(TypedEntry("0", {"A": "40", "B": "50"}, "left", "0"))
     assert checked.measurement is None
     said = "no triangle has the sides A to B = 243.8 cm, distance to A = 40 cm and distance to B = 50 cm"
     assert checked.faults[0].text == f"{said}; read both again"
     # The side is not what is wrong: said before it is asked for.
-    unsided = check(Typed("0", {"A": "40", "B": "50"}, "", "0"))
+    unsided = check(TypedEntry("0", {"A": "40", "B": "50"}, "", "0"))
     assert any("no triangle" in fault.text for fault in unsided.faults)
     # Nor is the height.
-    alone = check(Typed("0", {"A": "40", "B": "50"}))
+    alone = check(TypedEntry("0", {"A": "40", "B": "50"}))
     assert any("no triangle" in fault.text for fault in alone.faults)
 
 
@@ -116,8 +116,8 @@ def test_a_marker_that_no_camera_sees_or_that_moves() -> None:
     assert unseen.measurement is None
     assert unseen.faults[0].text.startswith("no camera sees marker 0")
     assert unseen.point_m is not None
-    moving = Sight(0, None, {}, ("red",))
-    checked = check_entry(*read_typed(tape((1.0, 4.0, 0.0)), RIG), RIG, moving, [])
+    moving = MarkerObservations(0, None, {}, ("red",))
+    checked = check_entry(*parse_entry(tape((1.0, 4.0, 0.0)), RIG), RIG, moving, [])
     assert checked.faults[0].text == "marker 0 moves, as seen by red: wait until it lies still"
 
 
@@ -125,12 +125,12 @@ def test_ids_count_up_and_undo_withdraws() -> None:
     first = check(tape((1.0, 4.0, 0.0))).measurement
     assert first is not None
     assert first.id == "p001"
-    gone = withdraw([first], "p001")
+    gone = withdrawal_of([first], "p001")
     assert (gone.withdraws, gone.timestamp) == ("p001", first.timestamp)
     assert next_id([first, gone]) == "p002"
     for history in ([first, gone], []):
         with pytest.raises(IpsysError, match="no measurement p001 to withdraw"):
-            withdraw(history, "p001")
+            withdrawal_of(history, "p001")
     assert check(tape((1.0, 4.0, 0.0), id="p001"), history=[first, gone]).faults[0].field == "id"
 
 
@@ -142,7 +142,7 @@ def test_the_same_place_once_more() -> None:
     other = check(tape((1.0, 4.01, 0.0)), history=[first])
     assert len(other.warnings) == 1
     assert other.warnings[0].startswith("marker 0 is measured here already, as p001")
-    assert check(tape((1.0, 4.0, 0.0)), history=[first, withdraw([first], "p001")]).warnings == ()
+    assert check(tape((1.0, 4.0, 0.0)), history=[first, withdrawal_of([first], "p001")]).warnings == ()
 
 
 @pytest.fixture(scope="module")

@@ -8,19 +8,21 @@ import pytest
 
 from ipsys_log.errors import IpsysError
 from ipsys_log.messages import ReferencePoint
-from ipsys_log.survey.entry import Typed, check_references, read_typed
+from ipsys_log.survey.entry import TypedEntry, check_references, parse_entry
 from tests import labs
 
 THREE = replace(labs.RIG, reference_points=(*labs.RIG.reference_points, ReferencePoint("C", 2.4, 0.1)))
-GOOD = Typed("0", {"A": "170.0", "B": "190.0"}, "left", "10")
+GOOD = TypedEntry("0", {"A": "170.0", "B": "190.0"}, "left", "10")
 
 
-def faults(typed: Typed) -> dict[str, str]:
-    return {fault.field: fault.text for fault in read_typed(typed, labs.RIG)[1]}
+def faults(typed: TypedEntry) -> dict[str, str]:
+    return {fault.field: fault.text for fault in parse_entry(typed, labs.RIG)[1]}
 
 
 def test_centimetres_become_metres_with_point_or_comma() -> None:
-    entry, wrong = read_typed(replace(GOOD, distances={"A": " 170.5", "B": "190,25cm"}, height="0"), labs.RIG)
+    entry, wrong = parse_entry(
+        replace(GOOD, distances={"A": " 170.5", "B": "190,25cm"}, height="0"), labs.RIG
+    )
     assert wrong == []
     assert [(d.reference, d.distance_m) for d in entry.distances] == [("A", 1.705), ("B", 1.9025)]
     assert (entry.marker_id, entry.side, entry.height_m) == (0, "left", 0.0)
@@ -44,7 +46,7 @@ def test_centimetres_become_metres_with_point_or_comma() -> None:
 def test_a_distance_that_cannot_be_in_centimetres(text: str, said: str | None) -> None:
     typed = replace(GOOD, distances={"A": text, "B": "190.0"})
     if said is None:
-        entry, wrong = read_typed(typed, labs.RIG)
+        entry, wrong = parse_entry(typed, labs.RIG)
         assert wrong == []
         assert "in metres? Then type 190" in entry.doubts[0]
     else:
@@ -53,10 +55,10 @@ def test_a_distance_that_cannot_be_in_centimetres(text: str, said: str | None) -
 
 @pytest.mark.parametrize("text", ["0,1", "0.5", "0.9 cm"])
 def test_a_height_that_may_be_in_metres_is_asked_for(text: str) -> None:
-    entry, wrong = read_typed(replace(GOOD, height=text), labs.RIG)
+    entry, wrong = parse_entry(replace(GOOD, height=text), labs.RIG)
     assert wrong == []
     assert "in metres? Then type" in entry.doubts[0]
-    assert read_typed(replace(GOOD, height="1"), labs.RIG)[0].doubts == ()
+    assert parse_entry(replace(GOOD, height="1"), labs.RIG)[0].doubts == ()
 
 
 @pytest.mark.parametrize(
@@ -68,7 +70,7 @@ def test_a_height_that_cannot_be_in_centimetres(text: str, said: str) -> None:
 
 
 def test_what_is_missing_is_named() -> None:
-    assert set(faults(Typed("", {}))) == {"marker", "d_A", "d_B", "height"}
+    assert set(faults(TypedEntry("", {}))) == {"marker", "d_A", "d_B", "height"}
     assert set(faults(replace(GOOD, side=""))) == {"side"}
     assert "from A to B" in faults(replace(GOOD, side=""))["side"]
 
@@ -78,11 +80,11 @@ def test_a_marker_that_the_rig_does_not_know() -> None:
 
 
 def test_of_three_reference_points_any_two_and_no_side_unless_they_lie_on_a_line() -> None:
-    assert read_typed(replace(GOOD, distances={"A": "170", "B": "190", "C": "300"}, side=""), THREE)[1] == []
+    assert parse_entry(replace(GOOD, distances={"A": "170", "B": "190", "C": "300"}, side=""), THREE)[1] == []
     two = replace(GOOD, distances={"A": "170", "B": "", "C": "300"}, side="")
-    assert [fault.field for fault in read_typed(two, THREE)[1]] == ["side"]
+    assert [fault.field for fault in parse_entry(two, THREE)[1]] == ["side"]
     one = replace(GOOD, distances={"A": "170", "B": "", "C": ""})
-    assert "two distances or more" in read_typed(one, THREE)[1][0].text
+    assert "two distances or more" in parse_entry(one, THREE)[1][0].text
 
 
 @pytest.mark.parametrize(

@@ -6,15 +6,15 @@ import numpy as np
 
 from ipsys_log.capture.camera_thread import CameraState
 from ipsys_log.messages import CameraPoint, CameraPoints, CompressedImage, Markers, Message
-from ipsys_log.survey.checks import Checked, check_entry, withdraw
-from ipsys_log.survey.entry import Typed, read_typed
+from ipsys_log.survey.checks import EntryCheck, check_entry, withdrawal_of
+from ipsys_log.survey.entry import TypedEntry, parse_entry
 from ipsys_log.survey.live import LiveScene
-from ipsys_log.survey.scene import look
+from ipsys_log.survey.scene import observe_marker
 from ipsys_log.units import NS_PER_S
 from tests import labs
 
-PLACE = Typed("0", {"A": "170", "B": "190"}, "left", "10")
-BETTER = Typed("0", {"A": "171", "B": "190"}, "left", "10")
+PLACE = TypedEntry("0", {"A": "170", "B": "190"}, "left", "10")
+BETTER = TypedEntry("0", {"A": "171", "B": "190"}, "left", "10")
 
 
 class Lab:
@@ -34,12 +34,12 @@ class Lab:
             for payload in (image, Markers(taken_ns, (), 960, 540), points):
                 self.scene(Message("", taken_ns, taken_ns, payload, "red"))
 
-    def check(self, typed: Typed) -> Checked:
+    def check(self, typed: TypedEntry) -> EntryCheck:
         scene = self.scene
-        sight = look(scene.views(None), 0)
-        return check_entry(*read_typed(typed, scene.rig), scene.rig, sight, scene.history())
+        sight = observe_marker(scene.views(None), 0)
+        return check_entry(*parse_entry(typed, scene.rig), scene.rig, sight, scene.history())
 
-    def save(self, typed: Typed) -> None:
+    def save(self, typed: TypedEntry) -> None:
         checked = self.check(typed)
         assert checked.measurement is not None
         self.scene.add([checked.measurement])
@@ -56,10 +56,10 @@ def test_a_marker_that_has_not_moved_since_it_was_measured() -> None:
     assert "marker 0 is measured here already, as p001" in text
     lab.save(BETTER)
     lab.show(2, 0.1)
-    (text,) = lab.check(Typed("0", {"A": "172", "B": "190"}, "left", "10")).warnings
+    (text,) = lab.check(TypedEntry("0", {"A": "172", "B": "190"}, "left", "10")).warnings
     assert "as p001 (2.0 cm away), p002 (1.0 cm away)" in text
     for name in ("p001", "p002"):
-        lab.scene.add([withdraw(lab.scene.history(), name)])
+        lab.scene.add([withdrawal_of(lab.scene.history(), name)])
     assert lab.check(BETTER).warnings == ()
 
 

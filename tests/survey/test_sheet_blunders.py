@@ -16,8 +16,8 @@ from ipsys_log.log.dataset import Session
 from ipsys_log.messages import Measurement, Rig
 from ipsys_log.messages.channels import MEASUREMENTS
 from ipsys_log.runs.options import Request
-from ipsys_log.survey.entry import Typed
-from ipsys_log.survey.from_log import opened_log
+from ipsys_log.survey.entry import TypedEntry
+from ipsys_log.survey.from_log import open_finished_log
 from ipsys_log.survey.sheet import name_columns
 from tests import labs
 from tests.conftest import Ipsys, Unmeasured
@@ -117,7 +117,7 @@ def test_sheet_with_two_rows_swapped_names_both_rows(
     if model:
         assert ipsys("fit", lab).code == 0
         assert ipsys("fit", log, "--model-from", lab).code == 0
-    with opened_log(log, Request()) as scene:
+    with open_finished_log(log, Request()) as scene:
         stops = scene.stops
     seen = [one for one in tape if lies_far_from_b(one) and any(stop.covers(one) for stop in stops)]
     first, second = 3, 17
@@ -146,7 +146,7 @@ def test_sheet_with_two_rows_swapped_names_both_rows(
         ),
     ],
 )
-def test_doubt_about_a_row_names_its_column(typed: Typed, rig: Rig, column: str) -> None:
+def test_doubt_about_a_row_names_its_column(typed: TypedEntry, rig: Rig, column: str) -> None:
     (text,) = check(typed, rig).warnings
     assert column in name_columns(text, rig)
 

@@ -14,7 +14,7 @@ import numpy as np
 import pytest
 
 from ipsys_log.errors import IpsysError
-from ipsys_log.web.server import qr_code, serving
+from ipsys_log.web.server import qr_code, serve
 from tests.web.test_measuring_page import Recording
 
 PLACE = {"marker": "0", "distances": {"A": "170", "B": "190"}, "side": "left", "height": "10"}
@@ -47,13 +47,13 @@ def scene() -> Recording:
 
 @pytest.fixture
 def here(scene: Recording) -> Iterator[Caller]:
-    with serving(scene, port=0) as page:
+    with serve(scene, port=0) as page:
         yield Caller(page.url)
 
 
 @pytest.fixture
 def shared(scene: Recording) -> Iterator[Caller]:
-    with serving(scene, "127.0.0.1", 0) as page:
+    with serve(scene, "127.0.0.1", 0) as page:
         yield Caller(page.url)
 
 
@@ -187,12 +187,12 @@ def test_a_warning_has_to_be_seen_before_it_is_passed_over(here: Caller, scene: 
 def test_a_port_that_is_in_use_and_a_host_that_is_not_ours(here: Caller, scene: Recording) -> None:
     with (
         pytest.raises(IpsysError, match=f"--port {here.parts.port}: is in use"),
-        serving(scene, port=here.parts.port or 0),
+        serve(scene, port=here.parts.port or 0),
     ):
         pass
     with (
         pytest.raises(IpsysError, match=r"no address of this machine|cannot be listened on"),
-        serving(scene, "192.0.2.7", 0),
+        serve(scene, "192.0.2.7", 0),
     ):
         pass
 

@@ -23,9 +23,9 @@ import uvicorn
 from ipsys_log.cli.measure_live import say_faults
 from ipsys_log.errors import IpsysError
 from ipsys_log.log.dataset import Session
-from ipsys_log.survey.scene import View
+from ipsys_log.survey.scene import CameraView
 from ipsys_log.web.connections import Limits, derive_limits
-from ipsys_log.web.server import Faults, Served, serving
+from ipsys_log.web.server import PageServer, ServerExceptions, serve
 from tests.test_measure_now import Lab, still_lab
 from tests.web.test_access import Caller
 from tests.web.test_measuring_page import Recording
@@ -104,8 +104,8 @@ def test_recorder_survives_idle_connections(still_lab: Lab, tmp_path: Path) -> N
 
 
 @contextmanager
-def page_with(limits: Limits, scene: Recording | None = None) -> Iterator[tuple[Caller, Served]]:
-    with serving(scene or Recording(), "127.0.0.1", 0, limits) as page:
+def page_with(limits: Limits, scene: Recording | None = None) -> Iterator[tuple[Caller, PageServer]]:
+    with serve(scene or Recording(), "127.0.0.1", 0, limits) as page:
         yield Caller(page.url), page
 
 
@@ -142,7 +142,7 @@ def test_idle_connections_leave_room_for_a_phone() -> None:
             for _ in range(5):
                 assert caller.ask("GET", "/api/scene", Cookie=cookie)[0] == 200
             wait_until(lambda: sum(map(is_open, held)) <= 6)
-        assert page.faults.count == 0
+        assert page.exceptions.count == 0
 
 
 def test_phone_keeps_its_connection_beside_new_ones() -> None:
@@ -179,7 +179,7 @@ def test_slow_requests_are_closed() -> None:
             for connection, start in zip(slow, SLOW_REQUESTS, strict=True):
                 connection.sendall(start.replace(b"COOKIE", cookie))
             assert all(map(is_closed_by_page, slow))
-        assert page.faults.count == 0
+        assert page.exceptions.count == 0
 
 
 def answers(caller: Caller) -> bool:
@@ -191,7 +191,7 @@ def answers(caller: Caller) -> bool:
 
 def test_answers_that_are_not_read_make_room_in_time() -> None:
     scene = Recording()
-    scene.views = lambda stop: [View("red", 1, bytes(8 << 20))]  # type: ignore[method-assign]
+    scene.views = lambda stop: [CameraView("red", 1, bytes(8 << 20))]  # type: ignore[method-assign]
     with page_with(Limits(total=6, per_address=4, request_s=0.5), scene) as (caller, page):
         cookie = sign_in(caller)
         assert caller.ask("GET", "/api/views", Cookie=cookie)[0] == 200
@@ -201,7 +201,7 @@ def test_answers_that_are_not_read_make_room_in_time() -> None:
                 connection.sendall(request)
                 assert connection.recv(1)
             wait_until(lambda: answers(caller))
-        assert page.faults.count == 0
+        assert page.exceptions.count == 0
 
 
 def test_noise_on_the_port_stays_off_the_screen(capfd: pytest.CaptureFixture[str]) -> None:
@@ -211,32 +211,32 @@ def test_noise_on_the_port_stays_off_the_screen(capfd: pytest.CaptureFixture[str
                 noisy.sendall(noise)
                 assert is_closed_by_page(noisy)
         assert sign_in(caller)
-        assert page.faults.count == 0
+        assert page.exceptions.count == 0
     assert capfd.readouterr() == ("", "")
 
 
 def test_fault_of_the_page_is_kept_for_the_end(capfd: pytest.CaptureFixture[str]) -> None:
     scene = Recording()
 
-    def fail(stop: int | None) -> list[View]:
+    def fail(stop: int | None) -> list[CameraView]:
         raise ZeroDivisionError("a bug")
 
     scene.views = fail  # type: ignore[method-assign]
-    with serving(scene, port=0) as page:
+    with serve(scene, port=0) as page:
         caller = Caller(page.url)
         for _ in range(2):
             status, text, _ = caller.ask("GET", "/api/views")
             assert status == 500
             assert "ZeroDivisionError: a bug" in json.loads(text)["error"]
         assert caller.ask("GET", "/")[0] == 200
-        assert page.faults.count == 2
-        assert page.faults.first.startswith("Traceback")
+        assert page.exceptions.count == 2
+        assert page.exceptions.first.startswith("Traceback")
     assert capfd.readouterr() == ("", "")
 
 
 def test_faults_are_printed_when_the_command_ends(capsys: pytest.CaptureFixture[str]) -> None:
-    faults = Faults()
-    page = Served("http://127.0.0.1/", threading.Thread(), faults)
+    faults = ServerExceptions()
+    page = PageServer("http://127.0.0.1/", threading.Thread(), faults)
     say_faults(page)
     assert capsys.readouterr() == ("", "")
     for text in ("[first]", "second"):
@@ -258,12 +258,12 @@ def test_end_of_the_server_leaves_the_block_going(
         return self.should_exit
 
     monkeypatch.setattr(uvicorn.Server, "on_tick", tick)
-    with serving(Recording(), port=0) as page:
+    with serve(Recording(), port=0) as page:
         is_broken.set()
         page.thread.join(PATIENCE_S)
         assert not page.thread.is_alive()
-        assert page.faults.count == 1
-        assert page.faults.first.endswith("ZeroDivisionError: a bug")
+        assert page.exceptions.count == 1
+        assert page.exceptions.first.endswith("ZeroDivisionError: a bug")
     assert capfd.readouterr() == ("", "")
 
 
@@ -274,7 +274,7 @@ def test_server_that_does_not_start_is_refused(monkeypatch: pytest.MonkeyPatch) 
     monkeypatch.setattr(uvicorn.Server, "startup", start)
     with (
         pytest.raises(IpsysError, match=r"the page cannot be served: OSError: .* Too many open files"),
-        serving(Recording(), port=0),
+        serve(Recording(), port=0),
     ):
         pass
 

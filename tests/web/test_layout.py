@@ -11,8 +11,8 @@ from contextlib import contextmanager
 import pytest
 
 from ipsys_log.runs.options import Request
-from ipsys_log.survey.from_log import opened_log
-from ipsys_log.web.server import serving
+from ipsys_log.survey.from_log import open_finished_log
+from ipsys_log.web.server import serve
 from tests.conftest import Unmeasured
 from tests.web.contrast import low_contrasts
 from tests.web.phone import Phone, phone
@@ -67,7 +67,7 @@ def test_every_state_of_the_page_fits_the_screen(
     browser: Phone, unmeasured: Unmeasured, size: tuple[int, int]
 ) -> None:
     log, tape = unmeasured
-    with opened_log(log, Request()) as scene, serving(scene, port=0) as page:
+    with open_finished_log(log, Request()) as scene, serve(scene, port=0) as page:
         a, b, side, height = texts_at(scene, tape, 0)
         browser.open(page.url, size)
         says(browser, "#sight", "lies still")
@@ -109,7 +109,7 @@ def test_every_state_of_the_page_fits_the_screen(
 
 
 def test_desktop_shows_cameras_and_entry_side_by_side(browser: Phone) -> None:
-    with serving(Recording(), port=0) as page:
+    with serve(Recording(), port=0) as page:
         browser.open(page.url, DESKTOP)
         says(browser, "#sight", "lies still")
         seen, entry = browser.run(
@@ -144,7 +144,7 @@ def other_program() -> Iterator[str]:
 
 
 def test_cookie_of_another_program_locks_no_phone_out(browser: Phone) -> None:
-    with other_program() as other, serving(Recording(), "127.0.0.1", 0) as page:
+    with other_program() as other, serve(Recording(), "127.0.0.1", 0) as page:
         browser.open(other)
         browser.open(page.url)
         assert browser.run("location.pathname + location.search") == "/"

@@ -25,9 +25,9 @@ from ipsys_log.messages import (
 )
 from ipsys_log.messages.channels import MEASUREMENTS
 from ipsys_log.runs.options import Request
-from ipsys_log.survey.from_log import FinishedLog, opened_log
-from ipsys_log.survey.scene import Stop, View
-from ipsys_log.web.server import serving
+from ipsys_log.survey.from_log import FinishedLog, open_finished_log
+from ipsys_log.survey.scene import CameraView, StationaryInterval
+from ipsys_log.web.server import serve
 from tests import labs
 from tests.conftest import Ipsys, Unmeasured
 from tests.test_measure import as_typed, foreign_read
@@ -68,7 +68,7 @@ def texts_at(scene: FinishedLog, tape: Sequence[Measurement], number: int) -> tu
 
 def test_a_place_is_typed_checked_saved_and_withdrawn(hand: Phone, unmeasured: Unmeasured) -> None:
     log, tape = unmeasured
-    with opened_log(log, Request()) as scene, serving(scene, port=0) as page:
+    with open_finished_log(log, Request()) as scene, serve(scene, port=0) as page:
         a, b, side, height = texts_at(scene, tape, 0)
         hand.open(page.url)
         says(hand, "#sight", "lies still, seen by")
@@ -111,7 +111,7 @@ def test_the_side_is_chosen_on_the_map_and_a_slip_is_seen_by_the_model(
     log, tape = unmeasured
     assert ipsys("fit", lab, "--model", "rigid").code == 0
     assert ipsys("fit", log, "--model-from", lab, "--model", "rigid").code == 0
-    with opened_log(log, Request()) as scene, serving(scene, port=0) as page:
+    with open_finished_log(log, Request()) as scene, serve(scene, port=0) as page:
         assert scene.model is not None
         a, b, side, height = texts_at(scene, tape, 0)
         hand.open(page.url)
@@ -132,7 +132,7 @@ def test_the_side_is_chosen_on_the_map_and_a_slip_is_seen_by_the_model(
 
 def test_what_goes_wrong_in_the_log_is_said_on_the_page(hand: Phone, unmeasured: Unmeasured) -> None:
     log, tape = unmeasured
-    with opened_log(log, Request()) as scene, serving(scene, port=0) as page:
+    with open_finished_log(log, Request()) as scene, serve(scene, port=0) as page:
         a, b, side, height = texts_at(scene, tape, 0)
         hand.open(page.url)
         says(hand, "#sight", "lies still")
@@ -153,9 +153,9 @@ def test_what_goes_wrong_in_the_log_is_said_on_the_page(hand: Phone, unmeasured:
 def test_somebody_else_measures_in_the_same_log(hand: Phone, unmeasured: Unmeasured) -> None:
     log, tape = unmeasured
     with (
-        opened_log(log, Request()) as scene,
-        serving(scene, port=0) as page,
-        opened_log(log, Request()) as other,
+        open_finished_log(log, Request()) as scene,
+        serve(scene, port=0) as page,
+        open_finished_log(log, Request()) as other,
     ):
         texts = texts_at(scene, tape, 0)
         hand.open(page.url)
@@ -186,19 +186,19 @@ class Recording:
 
     rig: Rig = labs.RIG
     model: Model | None = None
-    stops: Sequence[Stop] = ()
+    stops: Sequence[StationaryInterval] = ()
 
     def __init__(self) -> None:
         self.speed_m, self.done = 0.0, list[Measurement]()
         self.seen = True
 
-    def views(self, stop: int | None) -> list[View]:
+    def views(self, stop: int | None) -> list[CameraView]:
         assert stop is None
         if not self.seen:
-            return [View("red", 10**9)]
+            return [CameraView("red", 10**9)]
         path = [CameraPoint(0, n * self.speed_m, 0.1, 2.0) for n in range(9)]
         rows = tuple(CameraPoints(10**9 + n, (point,)) for n, point in enumerate(path))
-        return [View("red", rows[-1].timestamp, points=rows)]
+        return [CameraView("red", rows[-1].timestamp, points=rows)]
 
     def history(self) -> list[Measurement]:
         return self.done
@@ -210,7 +210,7 @@ class Recording:
 def test_while_recording_the_marker_has_to_lie_still(hand: Phone) -> None:
     scene = Recording()
     scene.speed_m = 0.02
-    with serving(scene, port=0) as page:
+    with serve(scene, port=0) as page:
         hand.open(page.url)
         says(hand, "#sight", "Marker 0 moves, as seen by red")
         fill(hand, "170", "190", "left", "10")
@@ -237,7 +237,7 @@ SEEN = """(e => {{ const b = e.getBoundingClientRect();
 
 def test_what_is_saved_stands_above_the_button_that_saves_it(hand: Phone) -> None:
     scene = Recording()
-    with serving(scene, port=0) as page:
+    with serve(scene, port=0) as page:
         hand.open(page.url)
         says(hand, "#sight", "Marker 0 lies still")
         hand.type("#d-A", "152 cm")
@@ -274,9 +274,12 @@ def test_before_a_marker_is_chosen_each_camera_says_which_it_sees(hand: Phone) -
     points = tuple(
         CameraPoints(n, (CameraPoint(0, 0.1, 0.1, 2.0), CameraPoint(3, 0.5, 0.1, 2.0))) for n in range(9)
     )
-    views = [View("red", 1, None, found, points), View("white", 1, None, Markers(1, (), 960, 540))]
+    views = [
+        CameraView("red", 1, None, found, points),
+        CameraView("white", 1, None, Markers(1, (), 960, 540)),
+    ]
     scene.views = lambda stop: views  # type: ignore[method-assign]
-    with serving(scene, port=0) as page:
+    with serve(scene, port=0) as page:
         hand.open(page.url)
         says(hand, "#sight", "Choose the marker: 0, 3 are seen")
         says(hand, "#cameras button:nth-child(1) span", "sees 0, 3")
@@ -290,7 +293,7 @@ def test_of_three_reference_points_two_need_the_side_and_three_check_one_another
     scene = Recording()
     third = ReferencePoint("C", 2.4, 0.3)
     scene.rig = replace(labs.RIG, reference_points=(*labs.RIG.reference_points, third))
-    with serving(scene, port=0) as page:
+    with serve(scene, port=0) as page:
         hand.open(page.url)
         says(hand, "#sight", "Marker 0 lies still, seen by red")
         assert hand.run("document.querySelector('#sides').hidden")
@@ -308,7 +311,7 @@ def test_of_three_reference_points_two_need_the_side_and_three_check_one_another
 
 def test_place_after_place_in_through_the_token(hand: Phone, unmeasured: Unmeasured) -> None:
     log, tape = unmeasured
-    with opened_log(log, Request()) as scene, serving(scene, "127.0.0.1", 0) as page:
+    with open_finished_log(log, Request()) as scene, serve(scene, "127.0.0.1", 0) as page:
         hand.open(page.url)
         # The token is out of sight as soon as it was used.
         assert hand.run("location.pathname + location.search") == "/"

@@ -14,7 +14,7 @@ from typing import IO
 
 import rerun as rr
 
-from ipsys_log.analysis.pairs import measured_places
+from ipsys_log.analysis.pairs import locate_measurements
 from ipsys_log.errors import IpsysError
 from ipsys_log.log.dataset import Session
 from ipsys_log.messages import MEASUREMENTS_TOPIC, TRUTH_TOPIC, Message
@@ -187,7 +187,7 @@ def _draw(session: Session, shown: Shown, recording: rr.RecordingStream, sent: C
     """Draw a whole session; ``sent`` is called repeatedly, and at the end."""
     rig = rig_in_force(session, [run for run in (shown.markers, *shown.runs) if run])
     measurements = session.payloads(session.topics(MEASUREMENTS))
-    places, faults = measured_places(measurements, rig)
+    places, faults = locate_measurements(measurements, rig)
     trails = [trail_entity(run) for run in (*shown.runs, *([None] if TRUTH_TOPIC in shown.moving else []))]
     recording.send_blueprint(layout(shown.cameras, trails, rig, events=bool(shown.events or faults)))
     draw_rig(recording, rig)

@@ -11,7 +11,7 @@ from typing import Any
 import numpy as np
 
 from ipsys_log.errors import FrameError, IpsysError, SizeError
-from ipsys_log.geometry.lenses import check_calibration, check_size, same_lens
+from ipsys_log.geometry.lenses import check_calibration, check_size, same_intrinsics
 from ipsys_log.images.decode import decode_grey
 from ipsys_log.images.video import Video
 from ipsys_log.messages import (
@@ -42,7 +42,7 @@ from ipsys_log.messages.channels import (
 )
 from ipsys_log.messages.stage import Plan, Stage, View
 from ipsys_log.stages.detect.edges import Fit
-from ipsys_log.stages.detect.follow import Follow
+from ipsys_log.stages.detect.follow import MarkerTracker
 from ipsys_log.stages.detect.stock import detect_markers, marker_detector
 from ipsys_log.units import NS_PER_S
 
@@ -89,7 +89,7 @@ class Detect:
         self._corners = check_corners(corners)
         self._rig: Rig | None = None
         self._lenses: dict[str | None, CameraCalibration] = {}
-        self._following: dict[str | None, Follow] = {}
+        self._following: dict[str | None, MarkerTracker] = {}
         self._videos: dict[str | None, Video] = {}
         self._said: dict[str | None, set[int | None]] = {}
         self._rejected: set[tuple[str | None, int, str]] = set()
@@ -107,12 +107,12 @@ class Detect:
             lens = check_calibration(payload, f"calibration of {message.camera}")
             known = self._lenses.get(message.camera)
             self._lenses[message.camera] = lens
-            if known is None or not same_lens(known, lens):
+            if known is None or not same_intrinsics(known, lens):
                 self._following.pop(message.camera, None)
                 self._fitted.discard(message.camera)
         elif isinstance(payload, SkippedVideo):
             with suppress(FrameError):
-                self._video(message.camera, payload.frame).pass_over(payload.frame)
+                self._video(message.camera, payload.frame).skip(payload.frame)
         elif not isinstance(payload, Event):  # events only tell which frames a replay ``as_live`` skips
             yield from self._frame(message)
 
@@ -177,7 +177,7 @@ class Detect:
             markers = [_marker(fit) for fit in fits]
         return [_timed(marker, camera) for marker in markers], width, height
 
-    def _follow(self, message: Message, rig: Rig, camera: RigCamera) -> Follow:
+    def _follow(self, message: Message, rig: Rig, camera: RigCamera) -> MarkerTracker:
         lens = self._lenses.get(message.camera)
         if lens is None:
             raise IpsysError(
@@ -186,7 +186,7 @@ class Detect:
             )
         row_time_s = (camera.row_time_ns or 0) / NS_PER_S
         number = rig.cameras.index(camera) if camera in rig.cameras else 0
-        return Follow(rig.dictionary, lens, camera.edge_offset_px, row_time_s, number, message.camera)
+        return MarkerTracker(rig.dictionary, lens, camera.edge_offset_px, row_time_s, number, message.camera)
 
     def _unsaid(self, events: list[Event]) -> Iterator[Event]:
         """Yield events; an id that is not in the rig is named once per camera, other events every time."""

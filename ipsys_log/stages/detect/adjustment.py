@@ -19,7 +19,7 @@ from ipsys_log.images.decode import Grey, levels_at
 from ipsys_log.stages.detect.prints import Prints
 from ipsys_log.stages.detect.profiles import Poses, View
 
-__all__ = ["Fit", "Guess", "into_poses", "known_unknowns", "moves", "outline", "solve", "whole"]
+__all__ = ["Fit", "Guess", "edge_derivatives", "inside_image", "outline", "poses_of", "prior", "solve"]
 
 Array = NDArray[np.float64]
 
@@ -50,20 +50,20 @@ class Guess(NamedTuple):
 class Fit(NamedTuple):
     """A marker's pose, its corners, and their covariance (8, 8) in the order x0 y0 .. x3 y3.
 
-    ``edge_offset_px`` is the edge offset into the black, ``spread_px`` the RMS residual of the edges, and
-    ``blur_px`` their blur. ``uneven`` says that glare, a shadow or a cover may have moved some of the edges.
+    ``edge_offset_px`` is the edge offset into the black, ``rms_px`` the RMS residual of the edges, and
+    ``blur_px`` their blur. ``disturbed`` says that glare, a shadow or a cover may have moved some edges.
     """
 
     pose: Guess
     corners_px: Array
     covariance_px2: Array
     edge_offset_px: float
-    spread_px: float
+    rms_px: float
     blur_px: float
-    uneven: bool = False
+    disturbed: bool = False
 
 
-def into_poses(guesses: Sequence[Guess]) -> Poses:
+def poses_of(guesses: Sequence[Guess]) -> Poses:
     """Return the poses of guesses as arrays."""
     return Poses(
         np.array([guess.rotation for guess in guesses]), np.array([guess.centre for guess in guesses])
@@ -80,7 +80,7 @@ def solve(rows: Array, weights: Array, off_px: Array, known: Array, hold: Array)
     return normal, np.asarray(np.linalg.solve(normal, right)[..., 0], dtype=np.float64)
 
 
-def known_unknowns(guesses: Sequence[Guess], edge_offset_px: float | None) -> tuple[Array, Array]:
+def prior(guesses: Sequence[Guess], edge_offset_px: float | None) -> tuple[Array, Array]:
     """Return the prior of the unknowns and the rotation, (m, 10), and its weights, (m, 9)."""
     known, hold = np.zeros((len(guesses), 10)), np.tile(_HOLD, (len(guesses), 1))
     if edge_offset_px is not None:
@@ -91,19 +91,19 @@ def known_unknowns(guesses: Sequence[Guess], edge_offset_px: float | None) -> tu
     return known, hold
 
 
-def moves(prints: Prints, camera: Array, slopes: Array, late: Array, unknowns: int) -> Array:
+def edge_derivatives(prints: Prints, camera: Array, slopes: Array, late: Array, unknowns: int) -> Array:
     """Return the motion in the image of points on edges along their axis, in px per unit of an unknown.
 
     Parameters
     ----------
     camera : (m, 3), camera positions in print coordinates.
-    slopes, late : (m, s), as in :class:`~ipsys_log.stages.detect.profiles.Sites`.
+    slopes, late : (m, s), as in :class:`~ipsys_log.stages.detect.profiles.EdgePositions`.
 
     Returns
     -------
     (m, u, s), for 7 or 9 unknowns u.
     """
-    x, y, level = prints.points[..., 0], prints.points[..., 1], prints.level
+    x, y, level = prints.points[..., 0], prints.points[..., 1], prints.along_x
     aside = (np.where(level, y - camera[:, 1:2], x - camera[:, :1]) / camera[:, 2:]) * slopes
     rows = np.empty((len(level), unknowns, level.shape[1]))
     np.multiply(slopes, level, out=rows[:, 1])
@@ -111,7 +111,7 @@ def moves(prints: Prints, camera: Array, slopes: Array, late: Array, unknowns: i
     rows[:, 2] = aside
     np.multiply(aside, y, out=rows[:, 3])
     np.multiply(aside, -x, out=rows[:, 4])
-    np.multiply(slopes, prints.swirl, out=rows[:, 5])
+    np.multiply(slopes, prints.rotation_derivative, out=rows[:, 5])
     np.negative(prints.polarity, out=rows[:, 6])
     if unknowns > 7:
         np.multiply(late, level, out=rows[:, 8])
@@ -130,7 +130,7 @@ def outline(view: View, poses: Poses) -> tuple[Array, Array, Array]:
     px = project(poses.into_camera(points).reshape(-1, 3), view.lens).reshape(count, -1, 2)
     per_unit = np.stack([px[:, 4:8] - px[:, :4], px[:, 8:12] - px[:, :4]], axis=3) / view.prints.nudge
     x, y = points[:4].T
-    camera = poses.camera()
+    camera = poses.camera_positions()
     aside = (points[:4] - camera[:, None, :2]) / camera[:, None, 2:]
     inplane = np.zeros((count, 4, 2, 6))
     inplane[:, :, 0, 0] = inplane[:, :, 1, 1] = 1.0
@@ -140,7 +140,7 @@ def outline(view: View, poses: Poses) -> tuple[Array, Array, Array]:
     return px[:, :4], (per_unit @ inplane).reshape(count, 8, 6), levels
 
 
-def whole(corners_px: Array, grey: Grey) -> NDArray[np.bool_]:
+def inside_image(corners_px: Array, grey: Grey) -> NDArray[np.bool_]:
     """Return a mask (m,) of the markers whose corners (m, 4, 2) are all inside the image."""
     last = np.array([grey.shape[1], grey.shape[0]]) - 0.5
     return np.asarray(((corners_px >= -0.5) & (corners_px <= last)).all(axis=(1, 2)))

@@ -9,7 +9,7 @@ from numpy.typing import NDArray
 
 from ipsys_log.images.decode import Grey
 
-__all__ = ["Watch"]
+__all__ = ["ChangeDetector"]
 
 Array = NDArray[np.float64]
 Samples = NDArray[np.float32]
@@ -27,13 +27,13 @@ _MARGIN = 0.35
 _LEARN = np.float32(0.15)
 
 
-class Watch:
+class ChangeDetector:
     """The background image of one camera: one pixel of each 16 by 16 block, without the known markers."""
 
     def __init__(self) -> None:
         self._background = np.zeros((0, 0), dtype=np.float32)
 
-    def changed(
+    def find_change(
         self, grey: Grey, rows: Sequence[slice], markers_px: Sequence[Array], breadth_px: float
     ) -> tuple[slice, slice] | None:
         """Return rows and columns around an area that is neither background nor a known marker, or None.

@@ -23,14 +23,14 @@ from ipsys_log.messages import CameraCalibration
 from ipsys_log.stages.detect.adjustment import (
     Fit,
     Guess,
-    into_poses,
-    known_unknowns,
-    moves,
+    edge_derivatives,
+    inside_image,
     outline,
+    poses_of,
+    prior,
     solve,
-    whole,
 )
-from ipsys_log.stages.detect.prints import Prints, lay_out
+from ipsys_log.stages.detect.prints import Prints, build_prints
 from ipsys_log.stages.detect.profiles import LEAST_CONTRAST, Poses, View, measure
 
 __all__ = ["Fit", "Guess", "fit_edges"]
@@ -85,17 +85,19 @@ def fit_edges(
     The fit of each guess, or None if the image does not show the marker. It is None if the fit does not
     converge, edges are missing, a corner is outside the image, or the cells do not match this id.
     """
-    possible = into_poses(guesses).possible() if guesses else np.ones(0, dtype=bool)
+    possible = poses_of(guesses).is_visible() if guesses else np.ones(0, dtype=bool)
     if not possible.all():
         some = [guess for guess, ok in zip(guesses, possible, strict=True) if ok]
         fits = iter(fit_edges(grey, some, dictionary, lens, edge_offset_px, row_time_s, blur_px))
         return [next(fits) if ok else None for ok in possible]
     if not guesses:
         return []
-    view = View(grey, lens, lay_out(dictionary, tuple(guess.id for guess in guesses)), row_time_s, blur_px)
+    view = View(
+        grey, lens, build_prints(dictionary, tuple(guess.id for guess in guesses)), row_time_s, blur_px
+    )
     settled, (corners_px, slopes, levels) = _settle_all(view, guesses, edge_offset_px)
     colours = _bright_and_dark(view.prints, levels)
-    good = settled.good & whole(corners_px, grey) & _same_cells(view.prints, levels, colours)
+    good = settled.good & inside_image(corners_px, grey) & _same_cells(view.prints, levels, colours)
     uneven = _uneven(view.prints, settled, colours)
     covariances_px2 = slopes @ settled.covariances @ slopes.transpose(0, 2, 1)
     return [
@@ -142,7 +144,7 @@ class _Settled(NamedTuple):
             np.where(good.reshape(-1, *[1] * (own.ndim - 1)), own, others)
             for own, others in zip(self[1:], other[1:], strict=True)
         ]
-        return _Settled(self.poses.where(good, other.poses), *chosen)
+        return _Settled(self.poses.select(good, other.poses), *chosen)
 
 
 def _settle_all(
@@ -187,16 +189,16 @@ def _settle(
     view: View, guesses: Sequence[Guess], edge_offset_px: float | None, blurred: NDArray[np.bool_]
 ) -> _Settled:
     """Move markers until they converge; ``blurred`` (m, 2) marks the axes across which edges are blurred."""
-    poses = into_poses(guesses)
+    poses = poses_of(guesses)
     # The unknowns are a twist, the edge offset and, with a rolling shutter, the speed along the print.
     unknowns = 9 if view.row_time_s else 7
-    known, hold = known_unknowns(guesses, edge_offset_px)
+    known, hold = prior(guesses, edge_offset_px)
     known, hold, motions = known[:, :unknowns], hold[:, :unknowns], known[:, 7:]
     wide = blurred
     doubt: Array | float = 1.0
     for _ in range(_PASSES):
         seen = measure(view, poses, motions, wide)
-        rows = moves(view.prints, poses.camera(), seen.slopes, seen.late, unknowns)
+        rows = edge_derivatives(view.prints, poses.camera_positions(), seen.slopes, seen.late, unknowns)
         # The edges were measured at the positions that follow from the speed known so far.
         off_px = seen.off_px
         if view.row_time_s:
@@ -208,14 +210,14 @@ def _settle(
         moved_px = np.abs(seen.off_px - left_px + solution[:, 6:7] * view.prints.polarity).max(axis=1)
         # A step of many pixels comes from another edge.
         short = np.minimum(1.0, _SHORT_PX / np.maximum(moved_px, _SHORT_PX))
-        moved = poses.moved(solution[:, :6] * short[:, None])
+        moved = poses.move(solution[:, :6] * short[:, None])
         # The pose of a false marker can diverge, even to a pose behind the camera. It then keeps its last
         # possible pose and never converges.
-        possible = moved.possible()
+        possible = moved.is_visible()
         if possible.all():
             poses = moved
         else:
-            poses, moved_px = moved.where(possible, poses), np.where(possible, moved_px, np.inf)
+            poses, moved_px = moved.select(possible, poses), np.where(possible, moved_px, np.inf)
         if view.row_time_s:
             motions = np.concatenate([solution[:, 7:], motions[:, 2:]], axis=1)
         spread_px = np.sqrt((weights * left_px**2).sum(axis=1) / np.maximum(weights.sum(axis=1), 1e-9))

@@ -9,24 +9,24 @@ from numpy.typing import NDArray
 
 from ipsys_log.geometry.lenses import check_size, project, undistort
 from ipsys_log.geometry.markers import marker_corners
-from ipsys_log.geometry.square_pose import goes_around, solve_squares
+from ipsys_log.geometry.square_pose import is_convex, solve_squares
 from ipsys_log.images.decode import Grey, decode_rows
 from ipsys_log.messages import CameraCalibration, CompressedImage, RawImage
-from ipsys_log.stages.detect.changes import Watch
+from ipsys_log.stages.detect.changes import ChangeDetector
 from ipsys_log.stages.detect.edges import Fit, Guess, fit_edges
 from ipsys_log.stages.detect.motion import LONG_S, Track, extend, predict, same_speed
-from ipsys_log.stages.detect.partial import Rejection, fit_partly, resembles
+from ipsys_log.stages.detect.partial import Rejection, fit_visible_edges, resembles
 from ipsys_log.stages.detect.search import (
     WHOLE,
     Candidate,
     sample,
     search,
-    search_leftovers,
     search_thoroughly,
+    search_unexplained_areas,
 )
 from ipsys_log.units import NS_PER_S
 
-__all__ = ["Follow"]
+__all__ = ["MarkerTracker"]
 
 Array = NDArray[np.float64]
 
@@ -56,7 +56,7 @@ _DISTURBED_PX = 0.5
 _BLURS = 10
 
 
-class Follow:
+class MarkerTracker:
     """A tracker of the markers of one camera, which starts each frame from the poses of earlier frames.
 
     Parameters
@@ -82,7 +82,7 @@ class Follow:
         self._lens, self._camera = lens, camera
         self._edge_offset_px = edge_offset_px
         self._row_time_s = row_time_s
-        self._watch = Watch()
+        self._watch = ChangeDetector()
         self._changed: tuple[slice, slice] | None = None
         self._breadth_px = 0.0
         self._frames = -_STAGGER * number
@@ -123,7 +123,9 @@ class Follow:
         # A frame that cannot be decoded raises an error before this line: the next frame takes its turn.
         self._frames, self._last_ns = turn + 1, time_ns
         fits = list(seen.values())
-        self._changed = self._watch.changed(grey, rows, [fit.corners_px for fit in fits], self._breadth_px)
+        self._changed = self._watch.find_change(
+            grey, rows, [fit.corners_px for fit in fits], self._breadth_px
+        )
         region = WHOLE if lost or due else self._changed
         samples = sample(grey) if fresh else None
         if region is not None:
@@ -131,7 +133,7 @@ class Follow:
         if samples is not None:
             # No marker is known yet, and later frames may not show the markers that are missed now.
             known_px = [fit.corners_px for fit in fits]
-            leftovers = search_leftovers(grey, self._dictionary, samples, known_px)
+            leftovers = search_unexplained_areas(grey, self._dictionary, samples, known_px)
             fits = self._add(grey, fits, leftovers, _MUCH_BETTER)
         if turn % _THOROUGH_EVERY == _SEARCH_EVERY or lost - {fit.pose.id for fit in fits}:
             fits = self._add(grey, fits, search_thoroughly(grey, self._dictionary))
@@ -157,12 +159,12 @@ class Follow:
         grey, rows = decode_rows(frame, None if whole else _rows(outlines_px, self._changed))
         check_size(self._lens, grey.shape[1], grey.shape[0], self._camera)
         tried = self._with_speed(grey, time_ns, guesses, self._fit(grey, guesses))
-        tried = self._partly(grey, [[guess] for guess in guesses], tried, near=True)
+        tried = self._fit_disturbed(grey, [[guess] for guess in guesses], tried, near=True)
         if rows != [slice(0, len(grey))] and _jumped(outlines_px, tried):
             # Damage in a JPEG moves the image after it. The decoder notices the damage only at the end.
             grey, rows = decode_rows(frame)
             tried = self._with_speed(grey, time_ns, guesses, self._fit(grey, guesses))
-            tried = self._partly(grey, [[guess] for guess in guesses], tried, near=True)
+            tried = self._fit_disturbed(grey, [[guess] for guess in guesses], tried, near=True)
         seen = {n: fit for n, fit in enumerate(tried) if fit is not None}
         lost = {
             guess.id
@@ -182,7 +184,7 @@ class Follow:
         resting = self._fit_as_guessed(grey, [guesses[n]._replace(motion=np.zeros(3)) for n in unknown])
         for n, still in zip(unknown, resting, strict=True):
             moving = fits[n]
-            if still is not None and (moving is None or still.spread_px < _AS_GOOD * moving.spread_px):
+            if still is not None and (moving is None or still.rms_px < _AS_GOOD * moving.rms_px):
                 fits[n] = still
         return fits
 
@@ -200,7 +202,7 @@ class Follow:
     def _known_blur_px(self) -> float | None:
         return float(np.mean(self._blurs_px).round(2)) if len(self._blurs_px) == _BLURS else None
 
-    def _partly(
+    def _fit_disturbed(
         self,
         grey: Grey,
         guesses: Sequence[Sequence[Guess]],
@@ -210,13 +212,13 @@ class Follow:
         """Return the fits; replace those of markers in uneven light by fits to their visible edges."""
         better = list(fits)
         for n, (poses, fit) in enumerate(zip(guesses, fits, strict=True)):
-            if fit is not None and not fit.uneven:
+            if fit is not None and not fit.disturbed:
                 continue
             if not all(_inside(outline_px, grey) for outline_px in self._outlines(poses)):
                 continue
             if fit is None and not resembles(grey, self._lens, self._dictionary, poses):
                 continue
-            part = fit_partly(
+            part = fit_visible_edges(
                 grey,
                 poses,
                 self._dictionary,
@@ -228,7 +230,7 @@ class Follow:
             )
             if isinstance(part, Fit):
                 better[n] = part
-            elif fit is not None and (fit.spread_px > _DISTURBED_PX or fit.pose.blurred.any()):
+            elif fit is not None and (fit.rms_px > _DISTURBED_PX or fit.pose.blurred.any()):
                 better[n] = None
             if isinstance(part, Rejection) and better[n] is None:
                 self._rejections.append(part)
@@ -265,12 +267,12 @@ class Follow:
         upright, other = self._guess(new_candidates)
         new_fits = self._fit(grey, upright)
         # If the upright pose, usual for markers on robots, has a small spread, the other pose is not tried.
-        unsure = [n for n, fit in enumerate(new_fits) if fit is None or fit.spread_px > _SURE_PX]
+        unsure = [n for n, fit in enumerate(new_fits) if fit is None or fit.rms_px > _SURE_PX]
         for n, fit in zip(unsure, self._fit(grey, [other[n] for n in unsure]), strict=True):
             upright_fit = new_fits[n]
-            if fit is not None and (upright_fit is None or fit.spread_px < better * upright_fit.spread_px):
+            if fit is not None and (upright_fit is None or fit.rms_px < better * upright_fit.rms_px):
                 new_fits[n] = fit
-        new_fits = self._partly(grey, list(zip(upright, other, strict=True)), new_fits)
+        new_fits = self._fit_disturbed(grey, list(zip(upright, other, strict=True)), new_fits)
         fits = list(fits)
         for fit in new_fits:
             if fit is not None and not _among(fit.pose.id, fit.corners_px, fits):
@@ -283,7 +285,7 @@ class Follow:
             return [], []
         corners_px = np.array([candidate.corners_px for candidate in candidates])
         uv = undistort(corners_px.reshape(-1, 2), self._lens).reshape(-1, 4, 2)
-        usable = [n for n, corners in enumerate(uv) if np.isfinite(corners).all() and goes_around(corners)]
+        usable = [n for n, corners in enumerate(uv) if np.isfinite(corners).all() and is_convex(corners)]
         if not usable:
             return [], []
         rotations, centres = solve_squares(uv[usable], np.ones(len(usable)))

@@ -25,7 +25,7 @@ _REMEMBERED = 3
 _SAME_SPEED = 0.1
 
 
-class Sighting(NamedTuple):
+class MarkerSighting(NamedTuple):
     """A marker pose at the exposure of its row, ``late_ns`` after the first row of its frame."""
 
     time_ns: int
@@ -34,7 +34,7 @@ class Sighting(NamedTuple):
 
 
 # The newest sighting first.
-Track = tuple[Sighting, ...]
+Track = tuple[MarkerSighting, ...]
 
 
 def extend(track: Track, fit: Fit, frame_ns: int, row_time_s: float) -> Track:
@@ -46,7 +46,7 @@ def extend(track: Track, fit: Fit, frame_ns: int, row_time_s: float) -> Track:
     row_time_s : time between the exposures of two rows.
     """
     late_ns = round(float(fit.corners_px[:, 1].mean()) * row_time_s * NS_PER_S)
-    now = Sighting(frame_ns + late_ns, late_ns, fit.pose)
+    now = MarkerSighting(frame_ns + late_ns, late_ns, fit.pose)
     # Without an increase of time there is no speed.
     ordered = not track or track[0].time_ns < now.time_ns
     return (now, *track[: _REMEMBERED - 1]) if ordered else (now,)

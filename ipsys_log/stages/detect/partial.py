@@ -20,15 +20,15 @@ from ipsys_log.messages import CameraCalibration
 from ipsys_log.stages.detect.adjustment import (
     Fit,
     Guess,
-    into_poses,
-    known_unknowns,
-    moves,
+    edge_derivatives,
+    inside_image,
     outline,
+    poses_of,
+    prior,
     solve,
-    whole,
 )
-from ipsys_log.stages.detect.prints import Prints, lay_out
-from ipsys_log.stages.detect.profiles import Poses, Sites, View, locate, read_profiles
+from ipsys_log.stages.detect.prints import Prints, build_prints
+from ipsys_log.stages.detect.profiles import EdgePositions, Poses, View, locate, read_profiles
 from ipsys_log.stages.detect.uneven_light import (
     TAPS,
     Steps,
@@ -39,7 +39,7 @@ from ipsys_log.stages.detect.uneven_light import (
     usual_blur,
 )
 
-__all__ = ["Rejection", "fit_partly", "resembles"]
+__all__ = ["Rejection", "fit_visible_edges", "resembles"]
 
 Array = NDArray[np.float64]
 Mask = NDArray[np.bool_]
@@ -81,16 +81,16 @@ def resembles(grey: Grey, lens: CameraCalibration, dictionary: str, guesses: Seq
     If they do not, and the ordinary fit has failed, the marker is absent. The partial fit takes as long as
     ten ordinary fits. For such markers it succeeds in none of 315 rendered frames.
     """
-    guesses = [guess for guess in guesses if into_poses([guess]).possible()[0]]
+    guesses = [guess for guess in guesses if poses_of([guess]).is_visible()[0]]
     if not guesses:
         return False
     marker_id = guesses[0].id
-    view = View(grey, lens, lay_out(dictionary, (marker_id,) * len(guesses)), 0.0, None)
-    *_, levels = outline(view, into_poses(guesses))
+    view = View(grey, lens, build_prints(dictionary, (marker_id,) * len(guesses)), 0.0, None)
+    *_, levels = outline(view, poses_of(guesses))
     return any(compare_pattern(row, dictionary, marker_id).possible for row in levels)
 
 
-def fit_partly(
+def fit_visible_edges(
     grey: Grey,
     guesses: Sequence[Guess],
     dictionary: str,
@@ -114,10 +114,10 @@ def fit_partly(
     The fit; a rejection if cells show this id but the pose cannot be determined; or None if the image does
     not show the marker.
     """
-    guesses = [guess for guess in guesses if into_poses([guess]).possible()[0]]
+    guesses = [guess for guess in guesses if poses_of([guess]).is_visible()[0]]
     if not guesses:
         return None
-    trial = _Trial(grey, lens, dictionary, guesses, edge_offset_px, row_time_s, blur_px, near)
+    trial = _PartialFit(grey, lens, dictionary, guesses, edge_offset_px, row_time_s, blur_px, near)
     return trial.judge(trial.settle())
 
 
@@ -156,7 +156,7 @@ class _Solved(NamedTuple):
         return float((weights * self.left_px[n] ** 2).sum() / freedoms)
 
 
-class _Trial:
+class _PartialFit:
     """Fits of one marker with several poses, and with and without each of its sides."""
 
     def __init__(
@@ -176,16 +176,16 @@ class _Trial:
         self._unknowns = 9 if row_time_s else 7
         self._edge_offset_px = edge_offset_px
         self._first = _ROUGH - 1 if near else 0
-        prints = lay_out(dictionary, (self._id,))
+        prints = build_prints(dictionary, (self._id,))
         self._sides = (prints.by_side[0] > 0).T
         self._real = prints.polarity[0] != 0
 
     def settle(self) -> tuple[_State, _Solved]:
         """Return the five hypotheses of the better pose, and the residuals of each."""
         guesses = [guess for guess in self._guesses for _ in _WITHOUT]
-        self._known, self._hold = known_unknowns(guesses, self._edge_offset_px)
+        self._known, self._hold = prior(guesses, self._edge_offset_px)
         without = np.array([-1 if side is None else side for _ in self._guesses for side in _WITHOUT])
-        state = _State(into_poses(guesses), self._known[:, 7:], without)
+        state = _State(poses_of(guesses), self._known[:, 7:], without)
         for number in range(self._first, _ROUGH + _EXACT):
             state, solved = self._move(state, number)
         # If poses look alike, the first pose is the likelier one.
@@ -202,12 +202,18 @@ class _Trial:
         """Return hypotheses after one pass of least squares, and the residuals before it."""
         count = len(state.without)
         view = View(
-            self._grey, self._lens, lay_out(self._dictionary, (self._id,) * count), self._row_time_s, None
+            self._grey,
+            self._lens,
+            build_prints(self._dictionary, (self._id,) * count),
+            self._row_time_s,
+            None,
         )
         sites = locate(view, state.poses, state.motions)
         steps, blur_px, least_px = self._steps(view, sites, number)
         used = np.where(state.without[:, None] >= 0, ~self._sides[state.without], True)
-        rows = moves(view.prints, state.poses.camera(), sites.slopes, sites.late, self._unknowns)
+        rows = edge_derivatives(
+            view.prints, state.poses.camera_positions(), sites.slopes, sites.late, self._unknowns
+        )
         off_px = steps.off_px
         if self._row_time_s:
             off_px = off_px + (state.motions[:, None, :2] @ rows[:, 7:])[:, 0]
@@ -225,15 +231,15 @@ class _Trial:
         costs = (cost * counted).sum(axis=1) / counted.sum(axis=1)
         shift_px = np.abs((unknowns[:, None, :6] @ rows[:, :6])[:, 0]).max(axis=1)
         short = np.minimum(1.0, _SHORT_PX / np.maximum(shift_px, _SHORT_PX))
-        moved = state.poses.moved(unknowns[:, :6] * short[:, None])
-        poses = moved.where(moved.possible(), state.poses)
+        moved = state.poses.move(unknowns[:, :6] * short[:, None])
+        poses = moved.select(moved.is_visible(), state.poses)
         motions = state.motions
         if self._row_time_s:
             motions = np.concatenate([unknowns[:, 7:], motions[:, 2:]], axis=1)
         solved = _Solved(rows, normal, unknowns, weights, left_px, steps.clear, costs, blur_px)
         return _State(poses, motions, state.without), solved
 
-    def _steps(self, view: View, sites: Sites, number: int) -> tuple[Steps, float, float]:
+    def _steps(self, view: View, sites: EdgePositions, number: int) -> tuple[Steps, float, float]:
         """Return the steps at edges, their blur, and the least residual from which weights may be 0."""
         farthest_px = _FAR_PX if number < _ROUGH else _NEAR_PX
         cell_px = float(np.quantile(sites.slopes[0], 0.2)) / view.prints.cells
@@ -252,10 +258,12 @@ class _Trial:
         """Return the fit of the best hypothesis, a rejection, or None if the marker is absent."""
         state, solved = settled
         n = self._choose(state, solved)
-        view = View(self._grey, self._lens, lay_out(self._dictionary, (self._id,)), self._row_time_s, None)
+        view = View(
+            self._grey, self._lens, build_prints(self._dictionary, (self._id,)), self._row_time_s, None
+        )
         corners_px, slopes, levels = outline(view, state.only(np.array([n])).poses)
         agreement = compare_pattern(levels[0], self._dictionary, self._id)
-        if not whole(corners_px, self._grey)[0] or not agreement.likely:
+        if not inside_image(corners_px, self._grey)[0] or not agreement.likely:
             return None
         if not agreement.clear:
             hider = _hider(levels[0], view.prints)
@@ -287,7 +295,7 @@ class _Trial:
         if np.count_nonzero(side) < 2:
             return 0
         off_px = solved.left_px[n][side]
-        polarity = lay_out(self._dictionary, (self._id,)).polarity[0][side]
+        polarity = build_prints(self._dictionary, (self._id,)).polarity[0][side]
         row = (solved.rows[n][:, side] * polarity).mean(axis=1)
         mean_px = float((off_px * polarity).mean())
         variance = 1 / len(off_px) + float(row @ np.linalg.solve(solved.normal[n], row))

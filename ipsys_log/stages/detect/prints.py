@@ -10,7 +10,7 @@ from numpy.typing import NDArray
 
 from ipsys_log.geometry.markers import marker_corners, white_cells
 
-__all__ = ["Prints", "lay_out"]
+__all__ = ["Prints", "build_prints"]
 
 Array = NDArray[np.float64]
 
@@ -29,8 +29,8 @@ class Prints:
     points : (m, s, 2), points on the edges between black and white of m markers.
     ends : (m, 2 s + 1, 2), the points ``reach`` before and behind each of these points, across the edge; and
         the middle of the marker.
-    level : (m, s), 0.0 if the edge runs along y and so measures x; else 1.0.
-    swirl : (m, s), motion of a point across its edge when the marker turns about its centre.
+    along_x : (m, s), 0.0 if the edge runs along y and so measures x; else 1.0.
+    rotation_derivative : (m, s), motion of a point across its edge when the marker turns about its centre.
     polarity : (m, s), 1.0 if white is on the side of the greater coordinate, else -1.0; 0.0 for a point that
         pads the array, because another marker has more points.
     outline : (12 + c, 2), the corners, the corners moved by ``nudge`` in x, the corners moved by ``nudge`` in
@@ -44,8 +44,8 @@ class Prints:
 
     points: Array
     ends: Array
-    level: Array
-    swirl: Array
+    along_x: Array
+    rotation_derivative: Array
     polarity: Array
     outline: Array
     white: NDArray[np.bool_]
@@ -58,7 +58,7 @@ class Prints:
 
 
 @lru_cache(maxsize=1024)
-def lay_out(dictionary: str, marker_ids: tuple[int, ...]) -> Prints:
+def build_prints(dictionary: str, marker_ids: tuple[int, ...]) -> Prints:
     """Return the prints of markers; ``dictionary`` is OpenCV's name, such as DICT_4X4_100."""
     edges = [_edges(dictionary, marker_id) for marker_id in marker_ids]
     most = max(len(rows) for rows in edges)

@@ -19,9 +19,9 @@ __all__ = [
     "BLURS_PX",
     "LEAST_CONTRAST",
     "USUAL_BLUR_PX",
+    "EdgeMeasurements",
+    "EdgePositions",
     "Poses",
-    "Seen",
-    "Sites",
     "View",
     "locate",
     "measure",
@@ -68,17 +68,17 @@ class Poses(NamedTuple):
         """Return points of prints, (m, n, 2), in camera coordinates, (m, n, 3)."""
         return points @ self.rotations[:, :, :2].transpose(0, 2, 1) + self.centres[:, None]
 
-    def camera(self) -> Array:
+    def camera_positions(self) -> Array:
         """Return the camera positions in print coordinates, (m, 3)."""
         return -(self.centres[:, None] @ self.rotations)[:, 0]
 
-    def moved(self, twists: Array) -> Poses:
+    def move(self, twists: Array) -> Poses:
         """Return the poses after translations and rotations ``twists`` (m, 6), in print coordinates."""
         shifts = (self.rotations @ twists[:, :3, None])[..., 0]
         turns = np.array([rotation(vector) for vector in twists[:, 3:]])
         return Poses(self.rotations @ turns, self.centres + shifts)
 
-    def possible(self) -> NDArray[np.bool_]:
+    def is_visible(self) -> NDArray[np.bool_]:
         """Return a mask (m,) of the poses that a camera can completely see.
 
         Such poses are finite, and the distance of the marker is larger than its side.
@@ -87,7 +87,7 @@ class Poses(NamedTuple):
         known = np.isfinite(self.rotations.sum(axis=(1, 2)) + self.centres.sum(axis=1))
         return np.asarray(known & (away > 1.0) & (away < _HORIZON))
 
-    def where(self, good: NDArray[np.bool_], other: Poses) -> Poses:
+    def select(self, good: NDArray[np.bool_], other: Poses) -> Poses:
         """Return these poses where they are good, and the other poses elsewhere."""
         return Poses(
             np.where(good[:, None, None], self.rotations, other.rotations),
@@ -95,7 +95,7 @@ class Poses(NamedTuple):
         )
 
 
-class Sites(NamedTuple):
+class EdgePositions(NamedTuple):
     """Positions of edges in an image: ``middle`` (m, s, 2) in px.
 
     ``across`` (m, s, 2) are vectors from there across the edge, ``lengths_px`` (m, s) long. ``slopes`` (m, s)
@@ -110,12 +110,13 @@ class Sites(NamedTuple):
     late: Array
 
 
-class Seen(NamedTuple):
+class EdgeMeasurements(NamedTuple):
     """Observed edges of prints, (m, s) each.
 
     ``off_px`` is their displacement along their axis. ``certainty`` is between 1.0 and 0.0 (a missing edge).
-    ``slopes`` and ``late`` are as in :class:`Sites`. ``blurs_px`` (m,) is the blur of the edges. ``profiles``
-    (m, s, t) are grey levels across the edges, up to ``near_px`` (m,) on each side if they are not wide.
+    ``slopes`` and ``late`` are as in :class:`EdgePositions`. ``blurs_px`` (m,) is the blur of the edges.
+    ``profiles`` (m, s, t) are grey levels across the edges, up to ``near_px`` (m,) on each side if they are
+    not wide.
     """
 
     off_px: Array
@@ -136,7 +137,7 @@ class Seen(NamedTuple):
         return self.profiles[..., :: len(_TAPS) - 1]
 
 
-def locate(view: View, poses: Poses, motions: Array) -> Sites:
+def locate(view: View, poses: Poses, motions: Array) -> EdgePositions:
     """Return the predicted positions of edges.
 
     Parameters
@@ -153,12 +154,15 @@ def locate(view: View, poses: Poses, motions: Array) -> Sites:
     late = np.zeros_like(slopes)
     if view.row_time_s:
         late = slopes * (middle[..., 1] - points_px[:, -1:, 1]) * view.row_time_s
-        speed = np.where(prints.level, motions[:, 1:2], motions[:, :1]) + prints.swirl * motions[:, 2:]
+        speed = (
+            np.where(prints.along_x, motions[:, 1:2], motions[:, :1])
+            + prints.rotation_derivative * motions[:, 2:]
+        )
         middle = middle + (late * speed / lengths_px)[..., None] * across
-    return Sites(middle, across, lengths_px, slopes, late)
+    return EdgePositions(middle, across, lengths_px, slopes, late)
 
 
-def read_profiles(grey: Grey, sites: Sites, reaches_px: Array, taps: Array) -> Array:
+def read_profiles(grey: Grey, sites: EdgePositions, reaches_px: Array, taps: Array) -> Array:
     """Return grey levels across edges, (m, s, t).
 
     Parameters
@@ -172,7 +176,7 @@ def read_profiles(grey: Grey, sites: Sites, reaches_px: Array, taps: Array) -> A
     return levels_at(grey, x, y)
 
 
-def measure(view: View, poses: Poses, motions: Array, wide: NDArray[np.bool_]) -> Seen:
+def measure(view: View, poses: Poses, motions: Array, wide: NDArray[np.bool_]) -> EdgeMeasurements:
     """Measure profiles across the edges, near their predicted positions.
 
     Parameters
@@ -187,7 +191,7 @@ def measure(view: View, poses: Poses, motions: Array, wide: NDArray[np.bool_]) -
     reaches_px = near_px[:, None]
     widened = bool(wide.any())
     if widened:
-        wide_edges = np.where(prints.level, wide[:, 1:], wide[:, :1])
+        wide_edges = np.where(prints.along_x, wide[:, 1:], wide[:, :1])
         reaches_px = np.where(wide_edges, farthest_px[:, None], reaches_px)
     profiles = read_profiles(view.grey, sites, reaches_px, _TAPS)
     blurs_px = _blurs(view, profiles, near_px, widened)
@@ -202,7 +206,7 @@ def measure(view: View, poses: Poses, motions: Array, wide: NDArray[np.bool_]) -
         off_px = np.where(wide_edges, by_area, off_px)
         certainty = np.where(wide_edges, shown * np.minimum(1.0, _SHARP_PX / width_px) ** 2, certainty)
     off_px = np.minimum(np.maximum(off_px, -reaches_px), reaches_px)
-    return Seen(off_px, certainty, sites.slopes, sites.late, blurs_px, profiles, near_px)
+    return EdgeMeasurements(off_px, certainty, sites.slopes, sites.late, blurs_px, profiles, near_px)
 
 
 def _by_area(prints: Prints, profiles: Array, reaches_px: Array) -> tuple[Array, Array, Array]:
@@ -221,7 +225,7 @@ def _by_area(prints: Prints, profiles: Array, reaches_px: Array) -> tuple[Array,
     white = (profiles.mean(axis=2) - low) / contrast
     rise = (profiles @ _TAPS) / (_TAPS @ _TAPS) / reaches_px * prints.polarity
     rises = rise[:, None] @ prints.by_axis
-    width_px = contrast / np.maximum(np.where(prints.level, rises[..., 1], rises[..., 0]), 1e-3)
+    width_px = contrast / np.maximum(np.where(prints.along_x, rises[..., 1], rises[..., 0]), 1e-3)
     width_px = np.maximum(width_px, 2 * reaches_px)
     return (0.5 - white) * width_px * prints.polarity, width_px, real & (rise > 0)
 

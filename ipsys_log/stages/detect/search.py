@@ -18,7 +18,7 @@ from numpy.typing import NDArray
 from ipsys_log.geometry.markers import white_cells
 from ipsys_log.images.decode import Grey, levels_at
 
-__all__ = ["WHOLE", "Candidate", "sample", "search", "search_leftovers", "search_thoroughly"]
+__all__ = ["WHOLE", "Candidate", "sample", "search", "search_thoroughly", "search_unexplained_areas"]
 
 Array = NDArray[np.float64]
 
@@ -106,7 +106,7 @@ def search_thoroughly(grey: Grey, dictionary: str, region: tuple[slice, slice] =
     return _placed(_candidates(marker_corners, ids), region)
 
 
-def search_leftovers(
+def search_unexplained_areas(
     grey: Grey, dictionary: str, samples: Grey, known_px: Sequence[Array]
 ) -> list[Candidate]:
     """Search thoroughly in areas with contrast that no known marker, (4, 2) in px, explains.

@@ -20,9 +20,9 @@ fuse            positions           tracks, poses     the run of its positions
 ==============  ==================  ================  =====================================
 
 The rig is read by all, by locate only for models that are told the height of a marker.
-:mod:`ipsys_log.runs` says in full what each stage reads (``tasks``) and how its run is found or made
-(``perform``), :mod:`ipsys_log.recording` how frames get from the cameras into the log (``recorder``) and from
-there, as long as the stages keep up, to them (``waiting``).
+:mod:`ipsys_log.runs` says in full what each stage reads (``graph``) and how its run is found or made
+(``execute``), :mod:`ipsys_log.capture` how frames get from the cameras into the log (``recorder``) and from
+there, as long as the stages keep up, to them (``backlog``).
 """
 
 from __future__ import annotations
@@ -38,10 +38,10 @@ from threadpoolctl import threadpool_limits
 from ipsys_log.analysis.latency import Ledger
 from ipsys_log.capture.backlog import TICK, Backlog
 from ipsys_log.capture.frames import SourceError
-from ipsys_log.capture.live_plan import check_pictures, plan_live
-from ipsys_log.capture.multiplexer import Attached
-from ipsys_log.capture.recent_frames import Recent
-from ipsys_log.capture.recorder import Recording, Source, recording, written
+from ipsys_log.capture.live_plan import check_independent_frames, plan_live
+from ipsys_log.capture.multiplexer import LiveCameras
+from ipsys_log.capture.recent_frames import RecentFrames
+from ipsys_log.capture.recorder import Recording, Source, open_recording, write_each
 from ipsys_log.errors import IpsysError, LogError
 from ipsys_log.log.contents import run_of_topic
 from ipsys_log.log.dataset import Session
@@ -149,8 +149,11 @@ def record(
     Exception
         The error of the first failed consumer or sink, after the recording has ended: it cannot end it.
     """
-    with Consumers(consumers, source.warn, sinks) as show, recording(target, settings, overwrite) as log:
-        for arrived in written(source, log):
+    with (
+        Consumers(consumers, source.add_event, sinks) as show,
+        open_recording(target, settings, overwrite) as log,
+    ):
+        for arrived in write_each(source, log):
             show(arrived)
     log.check_disk()
     show.check()
@@ -158,7 +161,7 @@ def record(
 
 
 def measure(
-    cameras: Attached,
+    cameras: LiveCameras,
     settings: Sequence[Message],
     target: Path,
     request: Request,
@@ -190,13 +193,13 @@ def measure(
     Exception
         What the first of ``consumers`` raised, after the log is complete.
     """
-    check_pictures(cameras.states)
+    check_independent_frames(cameras.states)
     plan = plan_live(cameras.states, settings, request, "camera-frame")
     with (
-        Consumers(consumers, cameras.warn, sinks) as show,
+        Consumers(consumers, cameras.add_event, sinks) as show,
         threadpool_limits(1, user_api="blas"),
-        recording(target, settings, overwrite) as log,
-        Recent(log) as recent,
+        open_recording(target, settings, overwrite) as log,
+        RecentFrames(log) as recent,
         Backlog(cameras, recent, cameras.now_ns) as frames,
     ):
         for message in _through(plan.stages, chain(settings, frames)):
@@ -208,7 +211,7 @@ def measure(
 
 
 def live(
-    cameras: Attached,
+    cameras: LiveCameras,
     settings: Sequence[Message],
     target: Path,
     request: Request,
@@ -245,15 +248,15 @@ def live(
     plan = plan_live(cameras.states, settings, request, until)
     first = (*settings, *plan.copies(cameras.now_ns))
     with (
-        Consumers(consumers, cameras.warn, sinks) as show,
+        Consumers(consumers, cameras.add_event, sinks) as show,
         threadpool_limits(1, user_api="blas"),
-        recording(target, first, overwrite) as log,
+        open_recording(target, first, overwrite) as log,
         Backlog(cameras, log, cameras.now_ns) as frames,
     ):
         ledger = Ledger(cameras.clock.now_ns, cameras.received_ns)
         fault = _put_through(chain(settings, frames), plan.stages, ledger, log, show)
         if fault is not None:
-            cameras.warn("stages_stopped", f"{fault}; frames are recorded all the same")
+            cameras.add_event("stages_stopped", f"{fault}; frames are recorded all the same")
             for message in frames:
                 if message is not TICK:
                     show(message)

@@ -19,7 +19,7 @@ from ipsys_log.runs.select import wanted_models
 from ipsys_log.runs.stream import WiredStage, wire
 from ipsys_log.stages.detect import usual_corners
 
-__all__ = ["LivePlan", "check_model", "check_pictures", "check_start", "plan_live"]
+__all__ = ["LivePlan", "check_independent_frames", "check_model", "check_start", "plan_live"]
 
 
 class LivePlan(NamedTuple):
@@ -170,7 +170,7 @@ def _check(
             )
 
 
-def check_pictures(cameras: Mapping[str, CameraState]) -> None:
+def check_independent_frames(cameras: Mapping[str, CameraState]) -> None:
     """See that any frame can be taken out of what cameras send.
 
     Raises

@@ -15,7 +15,7 @@ from ipsys_log.cli.open_cameras import MODEL, Lab, check_target, opened, prepare
 from ipsys_log.cli.signals import allow_interrupt, suppress_interrupt
 
 if TYPE_CHECKING:
-    from ipsys_log.capture.multiplexer import Attached
+    from ipsys_log.capture.multiplexer import LiveCameras
     from ipsys_log.messages import Measurement, Message, Model
     from ipsys_log.runs.options import Request
     from ipsys_log.survey.live import LiveScene
@@ -84,7 +84,7 @@ def ready_to_measure(lab: Lab, request: Request, model_from: Path | None) -> Mod
     return model
 
 
-def live_scene(settings: list[Message], cameras: Attached, model: Model | None) -> LiveScene:
+def live_scene(settings: list[Message], cameras: LiveCameras, model: Model | None) -> LiveScene:
     """Make the scene of the live cameras, for measuring."""
     from ipsys_log.survey.live import LiveScene
 
@@ -115,7 +115,7 @@ def say_faults(page: PageServer) -> None:
         remarks.print(page.exceptions.first, markup=False, highlight=False)
 
 
-def _ask_beside(work: Callable[[], Any], scene: LiveScene, cameras: Attached) -> None:
+def _ask_beside(work: Callable[[], Any], scene: LiveScene, cameras: LiveCameras) -> None:
     """Ask in the terminal while the work runs in a thread, and stop the cameras after that."""
     from ipsys_log.cli.dialog import ask_places
 

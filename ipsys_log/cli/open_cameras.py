@@ -20,7 +20,7 @@ from ipsys_log.units import format_bytes
 
 if TYPE_CHECKING:
     from ipsys_log.capture.disk import DiskRoom
-    from ipsys_log.capture.multiplexer import Attached
+    from ipsys_log.capture.multiplexer import LiveCameras
     from ipsys_log.messages import CameraCalibration, Message, Rig, RigCamera
     from ipsys_log.report.cameras import LiveStatus
 
@@ -87,14 +87,14 @@ def prepared(
 
 
 def _files(rig: Path, cameras: list[RigCamera], calibration: list[str] | None) -> list[tuple[str, Path]]:
-    from ipsys_log.capture.video_files import file_of
+    from ipsys_log.capture.video_files import split_source
 
     found = [("a calibration", Path(one.rpartition("=")[2])) for one in calibration or ()]
     for one in cameras:
         if one.calibration is not None:
             found.append((f"the lens of camera {one.name}", rig.parent / one.calibration))
         if str(one.source).startswith("file:"):
-            found.append((f"what camera {one.name} plays", file_of(str(one.source))[0]))
+            found.append((f"what camera {one.name} plays", split_source(str(one.source))[0]))
     return found
 
 
@@ -142,7 +142,7 @@ def opened(
     doing: str | None = None,
     panel: bool = True,
     until_stopped: bool = True,
-) -> Iterator[tuple[Attached, list[Message], LiveStatus]]:
+) -> Iterator[tuple[LiveCameras, list[Message], LiveStatus]]:
     """Open the cameras; yield them, the first messages of the log, and the status on the screen.
 
     Parameters
@@ -159,21 +159,21 @@ def opened(
     from ipsys_log.capture.devices import open_source
     from ipsys_log.capture.disk import expected_bytes_per_s, free_room
     from ipsys_log.capture.frames import Clock
-    from ipsys_log.capture.multiplexer import Attached
+    from ipsys_log.capture.live_check import CameraMonitor
+    from ipsys_log.capture.multiplexer import LiveCameras
     from ipsys_log.capture.recorder import first_messages, fitting_lenses
-    from ipsys_log.capture.status import Monitor
     from ipsys_log.report.cameras import LiveStatus
 
     with ExitStack() as stack:
         with remarks.status("opening " + ", ".join(lab.names)):
-            attached = stack.enter_context(Attached(lab.cameras, open_source, Clock(), say))
+            attached = stack.enter_context(LiveCameras(lab.cameras, open_source, Clock(), say))
         sizes_px = {name: state.size_px for name, state in attached.states.items()}
         lenses = fitting_lenses(lab.lenses, sizes_px, say)
         stack.enter_context(_ended(attached.stop, seconds, until_stopped))
         expected = expected_bytes_per_s(lab.cameras, attached.states)
         # A log that is no recording grows only with measured points.
         growing = None if doing and seconds is None else expected
-        monitor = stack.enter_context(Monitor(lab.rig))
+        monitor = stack.enter_context(CameraMonitor(lab.rig))
         status = LiveStatus(attached.states, monitor, output, monotonic, growing)
         _say_room(lab, attached, free_room(output, expected), seconds, doing)
         say(doing or f"recording into {output}; Ctrl-C ends it")
@@ -184,7 +184,9 @@ def opened(
         console.print(line, markup=False)
 
 
-def _say_room(lab: Lab, attached: Attached, room: DiskRoom, seconds: float | None, doing: str | None) -> None:
+def _say_room(
+    lab: Lab, attached: LiveCameras, room: DiskRoom, seconds: float | None, doing: str | None
+) -> None:
     """Print the expected size of the recording and how long the disk lasts, before it begins.
 
     If frames are taken only for some seconds, nothing is printed, unless the disk is too small for that.

@@ -199,7 +199,7 @@ def load_lab(
     IpsysError
         Where the rig has no such camera, or none with a source.
     """
-    from ipsys_log.capture.simulated import lens_of
+    from ipsys_log.capture.simulated import intrinsics_of
     from ipsys_log.errors import IpsysError
     from ipsys_log.exchange.calibration_files import read_intrinsics
     from ipsys_log.rig.file import load_rig
@@ -228,7 +228,7 @@ def load_lab(
         if camera.name not in lenses and camera.calibration is not None:
             lenses[camera.name] = read_intrinsics(rig.parent / camera.calibration, camera.name)
         elif camera.name not in lenses and str(camera.source).startswith("sim:"):
-            lenses[camera.name] = lens_of(camera)
+            lenses[camera.name] = intrinsics_of(camera)
     strange = sorted(set(lenses) - set(names))
     if strange:
         raise IpsysError(f"--calibration {strange[0]}: no such camera is recorded (only {', '.join(names)})")

@@ -24,7 +24,7 @@ from ipsys_log.cli.options import (
 from ipsys_log.cli.signals import allow_interrupt, runs_until_stopped
 
 if TYPE_CHECKING:
-    from ipsys_log.capture.multiplexer import Attached
+    from ipsys_log.capture.multiplexer import LiveCameras
     from ipsys_log.messages import Message
     from ipsys_log.runs.options import Request
     from ipsys_log.sinks.rerun.live import LiveView
@@ -139,7 +139,7 @@ def live(
         pipeline.live(cameras, settings, output, request, "fuse", [status], force, sinks)
 
 
-def _viewer(settings: list[Message], cameras: Attached, request: Request) -> LiveView:
+def _viewer(settings: list[Message], cameras: LiveCameras, request: Request) -> LiveView:
     from ipsys_log.runs.select import wanted_models
     from ipsys_log.sinks.rerun.live import LiveView
     from ipsys_log.stages.fit import model_run

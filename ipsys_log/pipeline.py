@@ -51,10 +51,10 @@ from ipsys_log.messages.channels import EVALUATION, MODEL, RUN_EVENTS, Channel
 from ipsys_log.messages.stage import Stage
 from ipsys_log.models.table import MODELS
 from ipsys_log.runs.checks import check_inputs
-from ipsys_log.runs.execute import carry_out, perform, sign
+from ipsys_log.runs.execute import compute_messages, run_stage, sign
 from ipsys_log.runs.graph import Task, copy_model, is_of_model, plan_stage, stages_until
 from ipsys_log.runs.options import Progress, Request
-from ipsys_log.runs.output import opened_target
+from ipsys_log.runs.output import open_target
 from ipsys_log.runs.provenance import Outcome
 from ipsys_log.runs.select import wanted_models
 from ipsys_log.runs.stream import WiredStage, in_threads, run
@@ -96,7 +96,7 @@ def replay(
     check_inputs(paths, request, models, stages)
     outcomes: list[Outcome] = []
     # The matrices are small: threads of BLAS would only wait for one another.
-    with opened_target(paths, output) as (logs, target), threadpool_limits(1, user_api="blas"):
+    with open_target(paths, output) as (logs, target), threadpool_limits(1, user_api="blas"):
 
         def do(stage: Stage, inputs: dict[Channel, str], model: str | None = None) -> None:
             """Run a stage, or find its result; note its run as that of the channels that it writes."""
@@ -107,8 +107,8 @@ def replay(
                     options = request.options(model)
                     task = plan_stage(stage, session, options, inputs, request.rig, request.lenses)
                 if isinstance(task, Task):
-                    make = partial(carry_out, progress=progress)
-                    outcomes.append(perform(session, target, task, request, stages[-1], make, say))
+                    make = partial(compute_messages, progress=progress)
+                    outcomes.append(run_stage(session, target, task, request, stages[-1], make, say))
                     task = outcomes[-1].run
             inputs.update({channel: task for channel in stage.writes if channel is not RUN_EVENTS})
 

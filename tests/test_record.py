@@ -206,7 +206,7 @@ def stop(attached):
 @runs_until_stopped
 def record():
     with LiveCameras([RigCamera("red", source="a:1")], opened, Clock()) as attached:
-        with open_cameras._ended(lambda: stop(attached), None):
+        with open_cameras._stop_after(lambda: stop(attached), None):
             pipeline.record(attached, [], Path(sys.argv[1]))
 
 Disk.pwrite = hanging
@@ -255,7 +255,7 @@ from ipsys_log.capture.multiplexer import LiveCameras
 from ipsys_log.capture.frames import Clock
 
 attached = LiveCameras([], None, Clock())
-with open_cameras._ended(attached.stop, None):
+with open_cameras._stop_after(attached.stop, None):
     handler = signal.getsignal(signal.SIGINT)
     signal.signal(signal.SIGALRM, lambda *_: handler(signal.SIGINT, None))
     signal.setitimer(signal.ITIMER_REAL, 0.002, 0.002)

@@ -129,13 +129,13 @@ class ActualSettings(NamedTuple):
     gain: float | None = None
 
 
-def report_refused_settings(camera: RigCamera, given: ActualSettings, say: Say) -> None:
+def report_refused_settings(camera: RigCamera, settings: ActualSettings, say: Say) -> None:
     """Report each setting of a camera that differs from the rig, in one line per setting.
 
     Parameters
     ----------
     camera : the requested settings; None means any value.
-    given : the actual settings.
+    settings : the actual settings.
     say : called with each difference.
 
     Examples
@@ -143,15 +143,15 @@ def report_refused_settings(camera: RigCamera, given: ActualSettings, say: Say) 
     >>> report_refused_settings(RigCamera("red", rate_hz=60.0), ActualSettings(1920, 1080, 30.0), print)
     camera red: asked for 60 frames/s, gives 30
     """
-    size = (camera.width or given.width, camera.height or given.height)
-    if given.width and given.height and size != (given.width, given.height):
+    size = (camera.width or settings.width, camera.height or settings.height)
+    if settings.width and settings.height and size != (settings.width, settings.height):
         text = " x ".join(str(side) for side in size)
-        say(f"camera {camera.name}: asked for {text} px, gives {given.width} x {given.height}")
+        say(f"camera {camera.name}: asked for {text} px, gives {settings.width} x {settings.height}")
     rows = (
-        ("frames/s", camera.rate_hz, given.rate_hz),
-        ("s of exposure", camera.exposure_s, given.exposure_s),
-        ("of focus", camera.focus, given.focus),
-        ("of gain", camera.gain, given.gain),
+        ("frames/s", camera.rate_hz, settings.rate_hz),
+        ("s of exposure", camera.exposure_s, settings.exposure_s),
+        ("of focus", camera.focus, settings.focus),
+        ("of gain", camera.gain, settings.gain),
     )
     for unit, requested, actual in rows:
         if requested is None or (actual is None and unit == "frames/s"):

@@ -12,7 +12,7 @@ from ipsys_log.messages import CameraCalibration, Message, Model, Rig
 from ipsys_log.messages.channels import CAMERA_POINTS, MODEL, RUN_EVENTS, Channel, channel_of
 from ipsys_log.messages.stage import Plan, Stage
 from ipsys_log.models.table import reads_height
-from ipsys_log.runs.execute import LiveRun, signed_copy
+from ipsys_log.runs.execute import LiveRun, copy_messages
 from ipsys_log.runs.graph import Task, copy_model, is_of_model, stages_until
 from ipsys_log.runs.options import Request
 from ipsys_log.runs.select import wanted_models
@@ -36,7 +36,7 @@ class LivePlan(NamedTuple):
         return [
             message
             for number, (task, model) in enumerate(self.copied, 1)
-            for message in signed_copy(task, model, number, now_ns)
+            for message in copy_messages(task, model, number, now_ns)
         ]
 
 

@@ -11,7 +11,7 @@ from time import sleep
 from typing import TYPE_CHECKING, Any
 
 from ipsys_log.cli.console import console, remarks
-from ipsys_log.cli.open_cameras import MODEL, Lab, check_target, opened, prepared
+from ipsys_log.cli.open_cameras import MODEL, Lab, check_target, open_cameras, prepare_lab
 from ipsys_log.cli.signals import allow_interrupt, suppress_interrupt
 
 if TYPE_CHECKING:
@@ -45,7 +45,7 @@ def measure_now(
     from ipsys_log.runs.options import Request
     from ipsys_log.sinks.sink import Consumer
 
-    lab, request = prepared(rig, camera, calibration), Request(corners=corners)
+    lab, request = prepare_lab(rig, camera, calibration), Request(corners=corners)
     read = lab.files if model_from is None else [*lab.files, (MODEL, model_from)]
     check_target(output, force, read)
     model = ready_to_measure(lab, request, model_from)
@@ -55,7 +55,7 @@ def measure_now(
         check_port_free(host, port)
     ends = "q" if terminal else "Ctrl-C"
     doing = f"measuring into {output}; {ends} ends it"
-    with opened(lab, output, None, doing, not terminal) as (cameras, settings, status):
+    with open_cameras(lab, output, None, doing, not terminal) as (cameras, settings, status):
         scene = live_scene(settings, cameras, model)
         consumers: list[Consumer] = [status, scene]
         work = partial(pipeline.measure, cameras, settings, output, request, consumers, force)

@@ -29,9 +29,9 @@ __all__ = [
     "SENT_NOW",
     "Lab",
     "check_target",
-    "opened",
-    "prepared",
-    "recorded_now",
+    "open_cameras",
+    "prepare_lab",
+    "record_now",
 ]
 
 
@@ -56,7 +56,7 @@ class Lab(NamedTuple):
         return [camera.name for camera in self.cameras]
 
 
-def prepared(
+def prepare_lab(
     rig: Path, only: list[str] | None, calibration: list[str] | None, with_lenses: bool = True
 ) -> Lab:
     """The cameras of a rig file; nothing is opened yet.
@@ -135,7 +135,7 @@ def check_target(output: Path, force: bool, files: Iterable[tuple[str, Path]]) -
 
 
 @contextmanager
-def opened(
+def open_cameras(
     lab: Lab,
     output: Path,
     seconds: float | None,
@@ -169,7 +169,7 @@ def opened(
             attached = stack.enter_context(LiveCameras(lab.cameras, open_source, Clock(), say))
         sizes_px = {name: state.size_px for name, state in attached.states.items()}
         lenses = fitting_lenses(lab.lenses, sizes_px, say)
-        stack.enter_context(_ended(attached.stop, seconds, until_stopped))
+        stack.enter_context(_stop_after(attached.stop, seconds, until_stopped))
         expected = expected_bytes_per_s(lab.cameras, attached.states)
         # A log that is no recording grows only with measured points.
         growing = None if doing and seconds is None else expected
@@ -203,7 +203,7 @@ def _say_room(
 
 
 @contextmanager
-def _ended(stop: Callable[[], None], seconds: float | None, on_signal: bool = True) -> Iterator[None]:
+def _stop_after(stop: Callable[[], None], seconds: float | None, on_signal: bool = True) -> Iterator[None]:
     """Stop in order after some time, or on the first signal: messages that arrived before are written."""
     if on_signal:
         stop_on_signal(stop)
@@ -225,7 +225,7 @@ def _on_screen(status: LiveStatus) -> AbstractContextManager[object]:
 
 
 @contextmanager
-def recorded_now(lab: Lab, seconds: float, keep: Path | None = None) -> Iterator[Path]:
+def record_now(lab: Lab, seconds: float, keep: Path | None = None) -> Iterator[Path]:
     """Record the cameras for some seconds; without ``keep`` the log is deleted after the block.
 
     Raises
@@ -240,7 +240,7 @@ def recorded_now(lab: Lab, seconds: float, keep: Path | None = None) -> Iterator
         log = keep or Path(folder) / "now.mcap"
         doing = None if keep else f"looking for {seconds:g} s"
         try:
-            with opened(lab, log, seconds, doing, until_stopped=False) as (cameras, settings, status):
+            with open_cameras(lab, log, seconds, doing, until_stopped=False) as (cameras, settings, status):
                 pipeline.record(cameras, settings, log, [status])
         except Interrupted as interrupt:
             kept = (

@@ -41,15 +41,15 @@ from ipsys_log.units import format_time
 __all__ = [
     "LiveRun",
     "OtherContentError",
-    "carry_out",
-    "cut_short",
+    "compute_messages",
+    "copy_messages",
+    "find_unfinished",
     "has_given_name",
     "inputs",
-    "perform",
+    "missing_messages",
     "record_of",
+    "run_stage",
     "sign",
-    "signed_copy",
-    "without_held",
 ]
 
 
@@ -57,7 +57,7 @@ class OtherContentError(Exception):
     """A run holds something that its stage does not make of the log."""
 
 
-def cut_short(session: Session, target: Path, task: Task, run: str) -> dict[str, int]:
+def find_unfinished(session: Session, target: Path, task: Task, run: str) -> dict[str, int]:
     """What a run in ``target`` holds of a stage that has not signed it: messages by topic, or nothing."""
     signed = any((one.run, one.stage) == (run, task.stage.name) for one in session.runs())
     if signed or task.step is None or not session.topics(task.stage.writes[0], run):
@@ -67,7 +67,7 @@ def cut_short(session: Session, target: Path, task: Task, run: str) -> dict[str,
     return {topic: session.count(topic) for topic in topics} if here.issuperset(topics) else {}
 
 
-def without_held(session: Session, held: Collection[str], made: Iterable[Message]) -> Iterator[Message]:
+def missing_messages(session: Session, held: Collection[str], made: Iterable[Message]) -> Iterator[Message]:
     """What is missing in a run: those of the messages made that are not there, byte for byte.
 
     Parameters
@@ -114,7 +114,7 @@ def _refuse(left: Iterable[Message]) -> None:
 Make = Callable[[Task, Session, str], Iterable[Message]]
 
 
-def perform(
+def run_stage(
     session: Session,
     target: Path,
     task: Task,
@@ -138,7 +138,7 @@ def perform(
     record = replace(record, fingerprint=fingerprint(), number=number)
     remarks: tuple[str, ...] = ()
     given = name or task.run
-    if held := cut_short(session, target, task, given):
+    if held := find_unfinished(session, target, task, given):
         try:
             return _append(session, target, task, replace(record, run=given), held, request, make)
         except OtherContentError as other:
@@ -188,7 +188,7 @@ def _append(
         target,
         replace(record, timestamp=publish_time_ns),
         log_time_ns,
-        lambda: without_held(session, held, remarks.watch(make(task, session, record.run))),
+        lambda: missing_messages(session, held, remarks.watch(make(task, session, record.run))),
         held,
     )
     count = sum(output.messages for output in made.outputs)
@@ -235,7 +235,7 @@ def sign(path: Path, options: Mapping[str, str], runs: Sequence[LiveRun]) -> lis
     return outcomes
 
 
-def signed_copy(task: Task, model: Model, number: int, now_ns: Callable[[], int]) -> list[Message]:
+def copy_messages(task: Task, model: Model, number: int, now_ns: Callable[[], int]) -> list[Message]:
     """Return the messages that copy a model into a new log: the model, and the record of its run."""
     at = MODEL.topic_of(task.run)
     record = Run(
@@ -305,7 +305,7 @@ def _settings(
         yield Message(calibration_topic(camera), start_ns, start_ns, lens, camera)
 
 
-def carry_out(task: Task, session: Session, name: str, progress: Progress) -> Iterator[Message]:
+def compute_messages(task: Task, session: Session, name: str, progress: Progress) -> Iterator[Message]:
     """Yield the messages of a task's run: its causal stage over the log, or one computed from all of it."""
     if task.step is None:
         assert task.compute is not None

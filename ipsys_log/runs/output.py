@@ -24,7 +24,7 @@ from ipsys_log.rig.file import hide_passwords
 __all__ = [
     "append_messages",
     "append_run",
-    "opened_target",
+    "open_target",
     "record_message",
     "write_log",
     "write_message",
@@ -101,7 +101,7 @@ def record_message(record: Run, log_time_ns: int) -> Message:
 
 
 @contextmanager
-def opened_target(paths: Sequence[Path], output: Path | None) -> Iterator[tuple[list[Path], Path]]:
+def open_target(paths: Sequence[Path], output: Path | None) -> Iterator[tuple[list[Path], Path]]:
     """The logs to read and the one to append to: the last one given, or a new one.
 
     A new one has its name only when all is done; where nothing was to do, or after an error, there is

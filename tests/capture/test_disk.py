@@ -15,7 +15,7 @@ import pytest
 from ipsys_log.capture.camera_thread import CameraState
 from ipsys_log.capture.disk import DiskRoom, expected_bytes_per_s, free_room
 from ipsys_log.capture.live_check import CameraMonitor
-from ipsys_log.cli.open_cameras import opened, prepared
+from ipsys_log.cli.open_cameras import open_cameras, prepare_lab
 from ipsys_log.log.dataset import Session
 from ipsys_log.messages import Rig, RigCamera
 from ipsys_log.report.cameras import LiveStatus
@@ -45,7 +45,7 @@ def status_line(status: LiveStatus) -> tuple[str, str]:
 @contextmanager
 def opening(rig: Path, log: Path, seconds: float | None, doing: str | None = None) -> Iterator[LiveStatus]:
     """The cameras opened as a command opens them; nothing is written."""
-    with opened(prepared(rig, None, None), log, seconds, doing) as (cameras, _, status):
+    with open_cameras(prepare_lab(rig, None, None), log, seconds, doing) as (cameras, _, status):
         yield status
         cameras.stop()
         log.touch()

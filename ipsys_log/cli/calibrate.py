@@ -234,9 +234,9 @@ def _targets(cameras: list[str], output: Path, formats: list[str], force: bool) 
 
 def _check_free(path: Path, force: bool) -> None:
     from ipsys_log.errors import IpsysError
-    from ipsys_log.log.lock import dangling
+    from ipsys_log.log.lock import describe_broken_link
 
-    if (text := dangling(path)) is not None:
+    if (text := describe_broken_link(path)) is not None:
         raise IpsysError(text)
     if path.exists() and not force:
         raise IpsysError(f"{path}: exists already; choose another --output, or give --force to write over it")

@@ -19,14 +19,14 @@ import numpy as np
 from numpy.typing import NDArray
 
 from ipsys_log.errors import LogError
-from ipsys_log.log.bounds import BoundError, Items
+from ipsys_log.log.bounds import BoundError, PartCounter
 from ipsys_log.log.codec import decode, payload_type
 from ipsys_log.log.contents import (
     RawMessage,
     StoredChannel,
     camera_of_topic,
     clean_name,
-    foreign_camera,
+    parse_foreign_camera,
     run_of_topic,
 )
 from ipsys_log.log.reader import LogReader
@@ -39,10 +39,10 @@ from ipsys_log.messages.channels import (
     channel_of,
 )
 
-__all__ = ["Session", "other_ids", "renamed"]
+__all__ = ["Session", "find_new_ids", "rename_ids"]
 
 
-def other_ids(logs: Iterable[Iterable[Measurement]]) -> list[dict[str, str]]:
+def find_new_ids(logs: Iterable[Iterable[Measurement]]) -> list[dict[str, str]]:
     """New ids where an earlier log has the same: for each log, the new one by the old one.
 
     Parameters
@@ -51,7 +51,7 @@ def other_ids(logs: Iterable[Iterable[Measurement]]) -> list[dict[str, str]]:
 
     Examples
     --------
-    >>> other_ids([[Measurement(0, "p001")], [Measurement(9, "p001"), Measurement(9, "p002")]])
+    >>> find_new_ids([[Measurement(0, "p001")], [Measurement(9, "p001"), Measurement(9, "p002")]])
     [{}, {'p001': 'p001_2'}]
     """
     taken: set[str] = set()
@@ -67,7 +67,7 @@ def other_ids(logs: Iterable[Iterable[Measurement]]) -> list[dict[str, str]]:
     return found
 
 
-def renamed(measurement: Measurement, ids: Mapping[str, str]) -> Measurement:
+def rename_ids(measurement: Measurement, ids: Mapping[str, str]) -> Measurement:
     """A measurement, or the end of one, under the new ids of its log."""
     withdrawn = measurement.withdraws
     return replace(
@@ -109,7 +109,7 @@ class Session:
                 topic: name for topics in (self.images, self.calibrations) for name, topic in topics.items()
             }
             self._ids: dict[LogReader, dict[str, str]] = {}
-            self._ids = self._tell_apart()
+            self._ids = self._find_new_ids()
         except BaseException:
             self._stack.close()
             raise
@@ -208,7 +208,7 @@ class Session:
         return heapq.merge(*streams, key=lambda row: row[0].log_time_ns)
 
     def _stored(
-        self, reader: LogReader, items: Items, topics: Collection[str]
+        self, reader: LogReader, items: PartCounter, topics: Collection[str]
     ) -> Iterator[tuple[Message, bytes]]:
         for raw in self._raw(reader, topics, None, None):
             yield self._message(reader, raw, items), bytes(raw.data)
@@ -219,14 +219,14 @@ class Session:
         here = [topic for topic in topics if topic in reader.channels]
         return reader.messages(here, start_ns, end_ns) if here else iter(())
 
-    def _items(self) -> list[tuple[LogReader, Items]]:
+    def _items(self) -> list[tuple[LogReader, PartCounter]]:
         """Return the logs, each with the limits for one reading."""
-        return [(reader, Items(reader.allowance.most_items)) for reader in self.readers]
+        return [(reader, PartCounter(reader.read_limits.max_items)) for reader in self.readers]
 
     def _decoded(
         self,
         reader: LogReader,
-        items: Items,
+        items: PartCounter,
         topics: Collection[str],
         start_ns: int | None,
         end_ns: int | None,
@@ -234,11 +234,11 @@ class Session:
         for raw in self._raw(reader, topics, start_ns, end_ns):
             yield self._message(reader, raw, items)
 
-    def _message(self, reader: LogReader, raw: RawMessage, items: Items) -> Message:
+    def _message(self, reader: LogReader, raw: RawMessage, items: PartCounter) -> Message:
         channel = reader.channels[raw.topic]
         payload = _payload(reader, raw, items)
         if isinstance(payload, Measurement) and reader in self._ids:
-            payload = renamed(payload, self._ids[reader])
+            payload = rename_ids(payload, self._ids[reader])
         camera = self._camera_of.get(raw.topic) or camera_of_topic(raw.topic)
         # Who records ROS 2 knows when a message came; when its frame was taken stands within.
         taken_ns = payload.timestamp if channel.message_encoding == "cdr" else 0
@@ -251,7 +251,7 @@ class Session:
         """Return the records of the stages, oldest first: in the order of the given logs, then by number."""
         return [run for reader, items in self._items() for run in self._runs_in(reader, items)]
 
-    def _runs_in(self, reader: LogReader, items: Items) -> list[Run]:
+    def _runs_in(self, reader: LogReader, items: PartCounter) -> list[Run]:
         topics = [
             topic
             for topic, stored in reader.channels.items()
@@ -260,17 +260,17 @@ class Session:
         found = [message.payload for message in self._decoded(reader, items, topics, None, None)]
         return sorted(found, key=lambda run: run.number)
 
-    def _tell_apart(self) -> dict[LogReader, dict[str, str]]:
+    def _find_new_ids(self) -> dict[LogReader, dict[str, str]]:
         """Return the ids of measurements that an earlier log has too, and their ids here."""
         readers = [reader for reader in self.readers if len(_times(reader, MEASUREMENTS_TOPIC))]
         if len(readers) < 2:
             return {}
         readers.sort(key=lambda reader: int(_times(reader, MEASUREMENTS_TOPIC)[0]))
-        found = other_ids(
+        found = find_new_ids(
             [
                 one.payload
                 for one in self._decoded(
-                    reader, Items(reader.allowance.most_items), [MEASUREMENTS_TOPIC], None, None
+                    reader, PartCounter(reader.read_limits.max_items), [MEASUREMENTS_TOPIC], None, None
                 )
                 if isinstance(one.payload, Measurement)
             ]
@@ -314,7 +314,7 @@ class Session:
         cameras: dict[str, str] = {}
         for payload in channel.payloads:
             topics = [topic for topic in self.topics(channel) if self._has_payload(topic, payload)]
-            names = [camera_of_topic(topic) or foreign_camera(topic) for topic in topics]
+            names = [camera_of_topic(topic) or parse_foreign_camera(topic) for topic in topics]
             found: dict[str, str] = {}
             for topic, name in zip(topics, names, strict=True):
                 # Topics that differ only in words such as color or mono keep these words.
@@ -348,12 +348,12 @@ class Session:
             if topic in reader.channels:
                 raw = next(reader.messages([topic]), None)
                 if raw is not None:
-                    items = Items(reader.allowance.most_items)
+                    items = PartCounter(reader.read_limits.max_items)
                     return str(_payload(reader, raw, items).frame_id)
         return ""
 
 
-def _payload(reader: LogReader, raw: RawMessage, items: Items) -> Any:
+def _payload(reader: LogReader, raw: RawMessage, items: PartCounter) -> Any:
     """Decode a message; its error names the log, the topic and the time."""
     where = f"{reader.path}: {raw.topic} at {raw.log_time_ns} ns"
     if max(raw.log_time_ns, raw.publish_time_ns) >= _LATEST_NS:
@@ -366,14 +366,14 @@ def _payload(reader: LogReader, raw: RawMessage, items: Items) -> Any:
         raise LogError(f"{where}: {error}") from error
 
 
-def _decode(reader: LogReader, channel: StoredChannel, data: bytes, items: Items) -> Any:
+def _decode(reader: LogReader, channel: StoredChannel, data: bytes, items: PartCounter) -> Any:
     schema = channel.schema
     if schema is None:
         return decode("", data, channel.message_encoding)
     image = payload_type(schema.name) in IMAGES.payloads
     if image:
         items.take(_ITEMS_OF_IMAGE)
-    elif len(data) > reader.allowance.most_structured:
+    elif len(data) > reader.read_limits.max_structured:
         raise BoundError(f"a message of {len(data)} bytes is refused: only images may be so large")
     definition = schema.data if schema.encoding == "ros2msg" else b""
     return decode(schema.name, data, channel.message_encoding, definition, items)

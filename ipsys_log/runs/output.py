@@ -15,7 +15,7 @@ from ipsys_log.log.codec import encode, schema_data, schema_name
 from ipsys_log.log.contents import Schema
 from ipsys_log.log.dataset import Session
 from ipsys_log.log.journal import DISK, journal_path
-from ipsys_log.log.lock import dangling
+from ipsys_log.log.lock import describe_broken_link
 from ipsys_log.log.reader import LogReader
 from ipsys_log.log.writer import LogWriter
 from ipsys_log.messages import ChannelWritten, Message, Rig, Run
@@ -141,7 +141,7 @@ def _give_name(partial: Path, output: Path) -> None:
 
 
 def _check_free(output: Path) -> None:
-    if (text := dangling(output)) is not None:
+    if (text := describe_broken_link(output)) is not None:
         raise IpsysError(text)
     if output.exists():
         raise IpsysError(

@@ -651,7 +651,7 @@ def live(
         from ipsys_log.capture.devices import check_devices, check_sources, open_source
         from ipsys_log.capture.frames import Clock
         from ipsys_log.capture.live_plan import check_start
-        from ipsys_log.capture.multiplexer import Attached
+        from ipsys_log.capture.multiplexer import LiveCameras
         from ipsys_log.capture.recorder import first_messages, fitting_lenses
         from ipsys_log.exchange.lab_files import load_cameras, load_lenses
 
@@ -664,7 +664,7 @@ def live(
             say(line)
         if Path(record).exists() and not force:
             raise IpsysError(f"{record}: exists already; give another name, or force=True to overwrite it")
-        with Attached(wanted, open_source, Clock(), say) as attached:
+        with LiveCameras(wanted, open_source, Clock(), say) as attached:
             sizes_px = {name: state.size_px for name, state in attached.states.items()}
             settings = first_messages(lab, fitting_lenses(lenses, sizes_px, say), attached.now_ns)
             tracker.begin(attached.stop)

@@ -39,10 +39,10 @@ from threadpoolctl import threadpool_limits
 from ipsys_log.analysis.latency import Ledger
 from ipsys_log.capture.backlog import TICK, Backlog
 from ipsys_log.capture.frames import SourceError
-from ipsys_log.capture.live_plan import check_pictures, plan_live
-from ipsys_log.capture.multiplexer import Attached
-from ipsys_log.capture.recent_frames import Recent
-from ipsys_log.capture.recorder import Recording, Source, recording, written
+from ipsys_log.capture.live_plan import check_independent_frames, plan_live
+from ipsys_log.capture.multiplexer import LiveCameras
+from ipsys_log.capture.recent_frames import RecentFrames
+from ipsys_log.capture.recorder import Recording, Source, open_recording, write_each
 from ipsys_log.errors import IpsysError, LogError
 from ipsys_log.log.contents import run_of_topic
 from ipsys_log.log.dataset import Session
@@ -52,10 +52,10 @@ from ipsys_log.messages.channels import EVALUATION, MODEL, RUN_EVENTS, Channel
 from ipsys_log.messages.stage import Stage
 from ipsys_log.models.table import MODELS
 from ipsys_log.runs.checks import check_inputs
-from ipsys_log.runs.execute import carry_out, perform, sign
+from ipsys_log.runs.execute import compute_messages, run_stage, sign
 from ipsys_log.runs.graph import Task, copy_model, is_of_model, plan_stage, stages_until
 from ipsys_log.runs.options import Progress, Request
-from ipsys_log.runs.output import opened_target
+from ipsys_log.runs.output import open_target
 from ipsys_log.runs.provenance import Outcome
 from ipsys_log.runs.select import wanted_models
 from ipsys_log.runs.stream import WiredStage, in_threads, run
@@ -97,7 +97,7 @@ def replay(
     check_inputs(paths, request, models, stages)
     outcomes: list[Outcome] = []
     # The matrices are small: threads of BLAS would only wait for one another.
-    with opened_target(paths, output) as (logs, target), threadpool_limits(1, user_api="blas"):
+    with open_target(paths, output) as (logs, target), threadpool_limits(1, user_api="blas"):
 
         def do(stage: Stage, inputs: dict[Channel, str], model: str | None = None) -> None:
             """Run a stage, or find its result; note its run as the run of the channels that it writes."""
@@ -108,8 +108,8 @@ def replay(
                     options = request.options(model)
                     task = plan_stage(stage, session, options, inputs, request.rig, request.lenses)
                 if isinstance(task, Task):
-                    make = partial(carry_out, progress=progress)
-                    outcomes.append(perform(session, target, task, request, stages[-1], make, say))
+                    make = partial(compute_messages, progress=progress)
+                    outcomes.append(run_stage(session, target, task, request, stages[-1], make, say))
                     task = outcomes[-1].run
             inputs.update({channel: task for channel in stage.writes if channel is not RUN_EVENTS})
 
@@ -150,8 +150,11 @@ def record(
     Exception
         The error of the first failed consumer or sink. It cannot end the recording, and is raised after it.
     """
-    with Consumers(consumers, source.warn, sinks) as show, recording(target, settings, overwrite) as log:
-        for arrived in written(source, log):
+    with (
+        Consumers(consumers, source.add_event, sinks) as show,
+        open_recording(target, settings, overwrite) as log,
+    ):
+        for arrived in write_each(source, log):
             show(arrived)
     log.check_disk()
     show.check()
@@ -159,7 +162,7 @@ def record(
 
 
 def measure(
-    cameras: Attached,
+    cameras: LiveCameras,
     settings: Sequence[Message],
     target: Path,
     request: Request,
@@ -191,13 +194,13 @@ def measure(
     Exception
         The first error of ``consumers``, after the log is complete.
     """
-    check_pictures(cameras.states)
+    check_independent_frames(cameras.states)
     plan = plan_live(cameras.states, settings, request, "camera-frame")
     with (
-        Consumers(consumers, cameras.warn, sinks) as show,
+        Consumers(consumers, cameras.add_event, sinks) as show,
         threadpool_limits(1, user_api="blas"),
-        recording(target, settings, overwrite) as log,
-        Recent(log) as recent,
+        open_recording(target, settings, overwrite) as log,
+        RecentFrames(log) as recent,
         Backlog(cameras, recent, cameras.now_ns) as frames,
     ):
         for message in _through(plan.stages, chain(settings, frames)):
@@ -209,7 +212,7 @@ def measure(
 
 
 def live(
-    cameras: Attached,
+    cameras: LiveCameras,
     settings: Sequence[Message],
     target: Path,
     request: Request,
@@ -245,15 +248,15 @@ def live(
     plan = plan_live(cameras.states, settings, request, until)
     first = (*settings, *plan.copies(cameras.now_ns))
     with (
-        Consumers(consumers, cameras.warn, sinks) as show,
+        Consumers(consumers, cameras.add_event, sinks) as show,
         threadpool_limits(1, user_api="blas"),
-        recording(target, first, overwrite) as log,
+        open_recording(target, first, overwrite) as log,
         Backlog(cameras, log, cameras.now_ns) as frames,
     ):
         ledger = Ledger(cameras.clock.now_ns, cameras.received_ns)
         fault = _put_through(chain(settings, frames), plan.stages, ledger, log, show)
         if fault is not None:
-            cameras.warn("stages_stopped", f"{fault}; frames are recorded all the same")
+            cameras.add_event("stages_stopped", f"{fault}; frames are recorded all the same")
             for message in frames:
                 if message is not TICK:
                     show(message)

@@ -12,7 +12,7 @@ NS_PER_S = 1_000_000_000
 
 
 def format_time(time_ns: int) -> str:
-    """A time since 1970 as UTC to the millisecond.
+    """Return a time since 1970 as UTC to the millisecond.
 
     Examples
     --------
@@ -25,7 +25,7 @@ def format_time(time_ns: int) -> str:
 
 
 def format_bytes(count: int) -> str:
-    """A size in powers of ten.
+    """Return a size in powers of ten.
 
     Examples
     --------

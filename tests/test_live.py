@@ -19,7 +19,7 @@ from ipsys_log.analysis.calibration_points import find_pairs
 from ipsys_log.analysis.calibration_points import measured as measured_places
 from ipsys_log.analysis.differences import Comparison
 from ipsys_log.capture.frames import Clock
-from ipsys_log.capture.multiplexer import Attached
+from ipsys_log.capture.multiplexer import LiveCameras
 from ipsys_log.capture.recorder import first_messages
 from ipsys_log.errors import IpsysError
 from ipsys_log.log.dataset import Session
@@ -76,11 +76,11 @@ def lenses(lab: Path) -> dict[str, CameraCalibration]:
         return {name: session.payloads([topic])[0] for name, topic in session.calibrations.items()}
 
 
-def attached_to(lab: Path, rate_hz: float) -> tuple[Attached, list[Message]]:
+def attached_to(lab: Path, rate_hz: float) -> tuple[LiveCameras, list[Message]]:
     frames = sent(lab)
     with Session([lab]) as session:
         (rig,) = session.payloads(["/rig"])
-    attached = Attached(cameras(*frames), playing(frames, rate_hz), Clock())
+    attached = LiveCameras(cameras(*frames), playing(frames, rate_hz), Clock())
     return attached, first_messages(rig, lenses(lab), attached.now_ns)
 
 
@@ -102,7 +102,7 @@ def recorded(lab_log: Path, calibration: Path, tmp_path_factory: pytest.TempPath
     clock = SteppedClock(list(frames), RATE_HZ)
     with Session([lab_log]) as session:
         (rig,) = session.payloads(["/rig"])
-    attached = Attached(cameras(*frames), playing(frames, inf, before=clock.before), clock)
+    attached = LiveCameras(cameras(*frames), playing(frames, inf, before=clock.before), clock)
     settings = first_messages(rig, lenses(lab_log), attached.now_ns)
     with attached:
         pipeline.live(attached, settings, target, Request(model_from=calibration), consumers=[clock.watch])
@@ -380,7 +380,7 @@ def stalled(lab_log: Path, calibration: Path, tmp_path_factory: pytest.TempPathF
 
     with Session([lab_log]) as session:
         (rig,) = session.payloads(["/rig"])
-    attached = Attached(cameras(*frames), playing(frames, RATE_HZ, False, stand_still), clock)
+    attached = LiveCameras(cameras(*frames), playing(frames, RATE_HZ, False, stand_still), clock)
     settings = first_messages(rig, lenses(lab_log), attached.now_ns)
     with attached:
         pipeline.live(attached, settings, target, Request(model_from=calibration))
@@ -567,7 +567,7 @@ def test_a_place_is_measured_while_it_is_recorded_and_a_model_is_fitted_to_it(
     wanted = {m.marker_id: m for m in measured[: len(ids)] if m.marker_id is not None}
     target = tmp_path / "measured.mcap"
     frames = {name: found[:2] * 10 for name, found in sent(lab_log).items()}
-    attached = Attached(cameras(*frames), playing(frames, 10.0), Clock())
+    attached = LiveCameras(cameras(*frames), playing(frames, 10.0), Clock())
     saved: set[int] = set()
     with attached:
         scene = LiveScene(rig, model, attached.states, attached.save)

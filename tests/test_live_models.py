@@ -8,7 +8,7 @@ from pathlib import Path
 import pytest
 
 from ipsys_log import pipeline
-from ipsys_log.capture.multiplexer import Attached
+from ipsys_log.capture.multiplexer import LiveCameras
 from ipsys_log.capture.recorder import first_messages
 from ipsys_log.log.dataset import Session
 from ipsys_log.messages import Latency
@@ -38,7 +38,7 @@ def recorded(lab_log: Path, fitted: Path, tmp_path_factory: pytest.TempPathFacto
     clock = SteppedClock(list(frames), RATE_HZ)
     with Session([lab_log]) as session:
         (rig,) = session.payloads(["/rig"])
-    attached = Attached(cameras(*frames), playing(frames, inf, before=clock.before), clock)
+    attached = LiveCameras(cameras(*frames), playing(frames, inf, before=clock.before), clock)
     settings = first_messages(rig, lenses(lab_log), attached.now_ns)
     request = Request(models=MODELS, model_from=fitted)
     with attached:

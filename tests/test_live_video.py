@@ -13,7 +13,7 @@ import pytest
 
 from ipsys_log import pipeline
 from ipsys_log.capture.frames import Clock
-from ipsys_log.capture.multiplexer import Attached
+from ipsys_log.capture.multiplexer import LiveCameras
 from ipsys_log.capture.network import open_network
 from ipsys_log.capture.recorder import first_messages
 from ipsys_log.images.video import Video, is_keyframe
@@ -45,7 +45,7 @@ def streamed(lab: Path, folder: Path, *options: str) -> Iterator[str]:
 
 def go_live(lab: Path, address: str, target: Path) -> None:
     """For some seconds, up to the markers."""
-    attached = Attached([RigCamera("red", source=address)], open_network, Clock())
+    attached = LiveCameras([RigCamera("red", source=address)], open_network, Clock())
     with Session([lab]) as session:
         (rig,) = session.payloads(["/rig"])
         lens = session.payloads([session.calibrations["red"]])[0]

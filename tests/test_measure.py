@@ -130,7 +130,7 @@ def test_one_place_its_undo_and_what_a_fit_makes_of_both(ipsys: Ipsys, unmeasure
     log, tape = unmeasured
     with open_finished_log(log, Request()) as scene:
         for one in tape[8:20]:
-            (stop,) = (n for n, stop in enumerate(scene.stops) if stop.covers(one))
+            (stop,) = (n for n, stop in enumerate(scene.intervals) if stop.covers(one))
             typed = as_typed(one)
             sight = observe_marker(scene.views(stop), int(typed.marker))
             history = scene.history()
@@ -162,7 +162,7 @@ def test_rows_of_a_marker_in_order_and_by_place(ipsys: Ipsys, unmeasured: Unmeas
     assert f"then: ipsys replay {log}" in done.err
     other = [one for one in tape if one.marker_id == 4][:2]
     with open_finished_log(log, Request()) as scene:
-        numbers = [str(next(n for n, s in enumerate(scene.stops, 1) if s.covers(one))) for one in other]
+        numbers = [str(next(n for n, s in enumerate(scene.intervals, 1) if s.covers(one))) for one in other]
     assert ipsys("measure", log, "--csv", sheet(tmp_path / "b.csv", other, place=numbers)).code == 0
     with Session([log]) as session:
         found = session.payloads([MEASUREMENTS_TOPIC])
@@ -300,7 +300,7 @@ def test_the_terminal_asks_checks_and_undoes(
 ) -> None:
     log, tape = unmeasured
     with open_finished_log(log, Request()) as scene:
-        first = as_typed(next(one for one in tape if scene.stops[0].covers(one)))
+        first = as_typed(next(one for one in tape if scene.intervals[0].covers(one)))
     a, b = first.distances.values()
     answers = [a, "1.234", b, first.side[0], first.height, "", "u", "q"]
     monkeypatch.setattr("sys.stdin", io.StringIO("\n".join(answers) + "\n"))
@@ -321,7 +321,7 @@ def test_a_bad_answer_in_the_terminal_costs_that_answer_only(
 ) -> None:
     log, tape = unmeasured
     with open_finished_log(log, Request()) as scene:
-        first = as_typed(next(one for one in tape if scene.stops[0].covers(one)))
+        first = as_typed(next(one for one in tape if scene.intervals[0].covers(one)))
         a, b = first.distances.values()
         script = [
             ("distance to A", "hallo"), ("distance to A", f"{a} cm"),
@@ -366,7 +366,7 @@ def test_in_the_terminal_somebody_else_may_measure_meanwhile(
 ) -> None:
     log, tape = unmeasured
     with open_finished_log(log, Request()) as scene, open_finished_log(log, Request()) as other:
-        first = as_typed(next(one for one in tape if scene.stops[0].covers(one)))
+        first = as_typed(next(one for one in tape if scene.intervals[0].covers(one)))
         a, b = first.distances.values()
         answers = iter([a, b, first.side[0], first.height, "y", "y", "q"])
 

@@ -176,7 +176,7 @@ from ipsys_log.cli.signals import InterruptError, interruptible, runs_until_stop
 from ipsys_log.errors import IpsysError
 from ipsys_log.log.journal import Disk
 from ipsys_log.messages import RigCamera
-from ipsys_log.capture.multiplexer import Attached
+from ipsys_log.capture.multiplexer import LiveCameras
 from ipsys_log.capture.frames import Clock, Frame
 
 what, pwrite = sys.argv[2], Disk.pwrite
@@ -205,8 +205,8 @@ def stop(attached):
 @interruptible
 @runs_until_stopped
 def record():
-    with Attached([RigCamera("red", source="a:1")], opened, Clock()) as attached:
-        with open_cameras._ended(lambda: stop(attached), None):
+    with LiveCameras([RigCamera("red", source="a:1")], opened, Clock()) as attached:
+        with open_cameras._stop_after(lambda: stop(attached), None):
             pipeline.record(attached, [], Path(sys.argv[1]))
 
 Disk.pwrite = hanging
@@ -251,11 +251,11 @@ def test_a_second_interrupt_ends_what_hangs_and_the_log_is_kept(
 ENDING = """
 import signal, time
 from ipsys_log.cli import open_cameras
-from ipsys_log.capture.multiplexer import Attached
+from ipsys_log.capture.multiplexer import LiveCameras
 from ipsys_log.capture.frames import Clock
 
-attached = Attached([], None, Clock())
-with open_cameras._ended(attached.stop, None):
+attached = LiveCameras([], None, Clock())
+with open_cameras._stop_after(attached.stop, None):
     handler = signal.getsignal(signal.SIGINT)
     signal.signal(signal.SIGALRM, lambda *_: handler(signal.SIGINT, None))
     signal.setitimer(signal.ITIMER_REAL, 0.002, 0.002)

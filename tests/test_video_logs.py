@@ -19,9 +19,9 @@ from numpy.typing import NDArray
 from rerun.chunk import RrdReader
 
 from ipsys_log import pipeline
-from ipsys_log.capture import status
+from ipsys_log.capture import live_check
 from ipsys_log.capture.camera_thread import CameraState
-from ipsys_log.capture.status import Monitor
+from ipsys_log.capture.live_check import CameraMonitor
 from ipsys_log.images.video import is_keyframe
 from ipsys_log.log.dataset import Session
 from ipsys_log.messages import CompressedVideo, Markers, Message
@@ -94,7 +94,7 @@ def test_while_measuring_on_a_finished_log_each_place_is_shown_as_it_was(video: 
         pictures = {camera: decoded(video, camera) for camera in ("black", "red", "white")}
         found = found_markers(video)
         shown = 0
-        for stop in range(0, len(scene.stops), 3):
+        for stop in range(0, len(scene.intervals), 3):
             for view in scene.views(stop):
                 if view.markers is not None:
                     assert_shows(view.jpeg, pictures[view.camera][view.time_ns])
@@ -126,19 +126,19 @@ def test_while_recording_the_last_keyframe_is_shown_with_its_own_markers(video: 
 def test_the_monitor_looks_at_keyframes(video: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     pipeline.replay([video], Request(), "detect")
     found = found_markers(video)
-    monkeypatch.setattr(status, "_EVERY_S", 3600.0)
+    monkeypatch.setattr(live_check, "_EVERY_S", 3600.0)
     with Session([video]) as session:
         (rig,) = session.payloads(["/rig"])
         frames = list(session.messages([session.images["red"]]))
     pictures = decoded(video, "red")
-    with Monitor(rig) as looking:
+    with CameraMonitor(rig) as looking:
         keys: list[Message] = []
         for frame in frames:
             looking(frame)
             keys += [frame] if is_keyframe(frame.payload) else []
             ((camera, newest),) = looking._newest.items()
             assert (camera, newest) == ("red", keys[-1].payload)
-        look = looking._look("red", keys[-1].payload)
+        look = looking._check("red", keys[-1].payload)
     assert set(look.markers) >= set(found["red", keys[-1].publish_time_ns]) != set()
     assert look.brightness == pytest.approx(pictures[keys[-1].publish_time_ns].mean(), abs=3)
     assert look.warnings == ()

@@ -8,7 +8,7 @@ from collections.abc import Callable, Iterator
 from dataclasses import replace
 from types import TracebackType
 
-from ipsys_log.capture.recorder import Source, Target, written
+from ipsys_log.capture.recorder import Source, Target, write_each
 from ipsys_log.images.video import is_keyframe
 from ipsys_log.messages import (
     EVENTS_TOPIC,
@@ -159,7 +159,7 @@ class Backlog:
 
     def _record(self) -> None:
         try:
-            for message in written(self._source, self._log):
+            for message in write_each(self._source, self._log):
                 if message is not None and (message.camera is not None or _is_read(message)):
                     self._hand_on(message)
         except BaseException as fault:  # raised again in the thread that takes the messages

@@ -7,15 +7,15 @@ from collections.abc import Callable
 from dataclasses import dataclass
 from typing import Any, NamedTuple
 
-from ipsys_log.capture.frames import Clock, Frame, Open, Say, SourceError, instant_ns
-from ipsys_log.capture.stalls import Heartbeat, LateFrames
+from ipsys_log.capture.frames import Clock, Frame, Open, Say, SourceError, mid_exposure_ns
+from ipsys_log.capture.stalls import Heartbeat, LateFrameDetector
 from ipsys_log.capture.video_files import frame_payload
-from ipsys_log.capture.video_packets import can_begin, find_size
+from ipsys_log.capture.video_packets import find_size, is_decodable_start
 from ipsys_log.messages import EVENTS_TOPIC, STAMP_UNRELIABLE, Event, RigCamera, image_topic
 from ipsys_log.rig.file import hide_password
 from ipsys_log.units import NS_PER_S, format_time
 
-__all__ = ["Arrival", "Attendant", "CameraState", "Shared"]
+__all__ = ["Arrival", "CameraReader", "CameraState", "ReaderContext"]
 
 # Longest wait for the first frame of a camera.
 _FIRST_FRAME_S = 10.0
@@ -26,7 +26,7 @@ _TURN_S = 0.1
 # Longest wait of a frame without a stamp for the start of the recording. A longer wait gives it a wrong time.
 _EARLY_S = 0.01
 # A well configured camera sends a keyframe within this number of video frames (about 20 s).
-_KEYLESS = 600
+MAX_FRAMES_WITHOUT_KEYFRAME = 600
 # Shortest time between two reports of missed frames of a camera.
 _NAMED_EVERY_NS = NS_PER_S
 
@@ -63,7 +63,7 @@ class Arrival(NamedTuple):
 
 
 @dataclass(frozen=True, slots=True)
-class Shared:
+class ReaderContext:
     """The objects that the threads of all cameras share.
 
     ``put`` takes an arrival; it returns False if there is no room for a frame. Before ``started``, a thread
@@ -79,7 +79,7 @@ class Shared:
     heartbeat: Heartbeat
 
 
-class Attendant:
+class CameraReader:
     """The reader of one camera, with its thread.
 
     Attributes
@@ -88,20 +88,20 @@ class Attendant:
     fault : the error that ended the thread; None if it ended with the source.
     """
 
-    def __init__(self, camera: RigCamera, shared: Shared) -> None:
+    def __init__(self, camera: RigCamera, shared: ReaderContext) -> None:
         self.state = CameraState()
         self.fault: BaseException | None = None
         self._camera, self._shared = camera, shared
-        self._opened, self._begun = threading.Event(), threading.Event()
+        self._is_open, self._has_first_frame = threading.Event(), threading.Event()
         self._lost_ns: int | None = None
         self._dropped_before = self._missed_before = self._missed_named_ns = 0
         self._said: set[str] = set()
         self._broken = False
         self._since_key = 0
-        self._late = LateFrames(shared.heartbeat, camera.rate_hz)
+        self._late = LateFrameDetector(shared.heartbeat, camera.rate_hz)
         self.thread = threading.Thread(target=self._attend, name=camera.name, daemon=True)
 
-    def wait(self) -> None:
+    def wait_for_first_frame(self) -> None:
         """Wait for the first frame.
 
         Raises
@@ -109,9 +109,9 @@ class Attendant:
         SourceError
             The camera cannot be opened, or sends nothing.
         """
-        self._opened.wait()
+        self._is_open.wait()
         simulated = str(self._camera.source).startswith("sim:")
-        begun = self._begun.wait(_DRAW_S if simulated else _FIRST_FRAME_S)
+        begun = self._has_first_frame.wait(_DRAW_S if simulated else _FIRST_FRAME_S)
         if self.fault is not None:
             raise self.fault
         if not begun:
@@ -128,28 +128,28 @@ class Attendant:
                 lost = self._take_all()
                 if lost is None:
                     break
-                if not self._begun.is_set():
+                if not self._has_first_frame.is_set():
                     raise lost
                 retry_s = _RETRY_S if self.state.frames > before else min(2 * retry_s, _LONGEST_RETRY_S)
                 stopped.wait(retry_s)
         except BaseException as fault:  # raised again in the thread that opens or iterates the cameras
             self.fault = fault
-            if self._begun.is_set():
+            if self._has_first_frame.is_set():
                 # The other cameras may run for hours. The traceback is shown only after they have ended.
                 text = f"camera {self._camera.name}: the program failed ({fault!r}); nothing more comes of it"
                 self._say("camera_failed", text)
         finally:
-            self._name_lost(now=True)
+            self._report_lost(now=True)
             self.state.up, self.state.finished = False, True
-            self._opened.set()
-            self._begun.set()
+            self._is_open.set()
+            self._has_first_frame.set()
 
     def _take_all(self) -> SourceError | None:
         """Take frames until the source ends (return None) or the camera disconnects (return the error)."""
         shared = self._shared
         try:
             with shared.open_source(self._camera, shared.clock, self._say_setting) as frames:
-                self._opened.set()
+                self._is_open.set()
                 for frame in frames:
                     if shared.stopped.is_set():
                         break
@@ -175,9 +175,9 @@ class Attendant:
         self._note_size(frame)
         time_ns = now_ns
         if frame.time_ns is None:
-            self._name_late(now_ns)
+            self._report_late(now_ns)
         else:
-            time_ns = instant_ns(frame.time_ns, camera)
+            time_ns = mid_exposure_ns(frame.time_ns, camera)
             state.delay_s = (now_ns - time_ns) / NS_PER_S
         state.missed += frame.missed
         payload = frame_payload(time_ns, camera.name, frame.data, frame.format)
@@ -187,9 +187,9 @@ class Attendant:
         state.frames += 1
         state.bytes += len(frame.data)
         if frame.time_ns is None and self._late.since_ns is not None:
-            self._name_caught_up()
-        self._name_lost()
-        self._begun.set()
+            self._report_caught_up()
+        self._report_lost()
+        self._has_first_frame.set()
         # A frame with a stamp waits until the slowest camera has started: it is only delayed. A frame
         # without a stamp must not wait: its arrival is its time.
         while (
@@ -206,21 +206,22 @@ class Attendant:
         is its arrival, so the frame must not wait until the recording begins. Files and the simulator give
         stamps, and wait.
         """
-        if not self._begun.is_set():
+        if not self._has_first_frame.is_set():
             return False
         if frame.time_ns is None and not self._shared.started.wait(_EARLY_S):
             self._broken = True
             return True
-        self._broken = self._broken and 0 < self._since_key < _KEYLESS
+        self._broken = self._broken and 0 < self._since_key < MAX_FRAMES_WITHOUT_KEYFRAME
         return self._broken
 
     def _count_since_key(self, frame: Frame) -> None:
         """Report a video without keyframes: after a dropped frame, decoding cannot start again."""
-        self._since_key = 0 if can_begin(frame) else self._since_key + 1
-        if self._since_key == _KEYLESS:
+        self._since_key = 0 if is_decodable_start(frame) else self._since_key + 1
+        if self._since_key == MAX_FRAMES_WITHOUT_KEYFRAME:
             text = (
-                f"camera {self._camera.name}: no keyframe in {_KEYLESS} frames; after one that is skipped "
-                "or damaged nothing can be looked at; set its keyframe interval (GOP) to a second or two"
+                f"camera {self._camera.name}: no keyframe in {MAX_FRAMES_WITHOUT_KEYFRAME} frames; "
+                "after one that is skipped or damaged nothing can be looked at; "
+                "set its keyframe interval (GOP) to a second or two"
             )
             self._say_once("no_keyframes", text)
 
@@ -251,7 +252,7 @@ class Attendant:
             text = f"camera {self._camera.name}: its pictures are {new} now, and were {old}; calibrations "
             self._say("camera_size", f"{text}are for one size: set it back")
 
-    def _name_lost(self, now: bool = False) -> None:
+    def _report_lost(self, now: bool = False) -> None:
         """Report the frames lost since the last report."""
         state, name = self.state, self._camera.name
         if dropped := state.dropped - self._dropped_before:
@@ -263,7 +264,7 @@ class Attendant:
             self._missed_before, self._missed_named_ns = state.missed, time_ns
             self._say("frames_missed", f"{missed} frames of camera {name} were lost before they came")
 
-    def _name_late(self, now_ns: int) -> None:
+    def _report_late(self, now_ns: int) -> None:
         """Write an event before the first late frame without a stamp."""
         stall = self._late.take(now_ns)
         if stall is None:
@@ -275,10 +276,10 @@ class Attendant:
         )
         self._say(STAMP_UNRELIABLE, text, stall.start_ns)
 
-    def _name_caught_up(self) -> None:
+    def _report_caught_up(self) -> None:
         """Write an event after the last late frame, with the range of the wrong times."""
         start_ns, end_ns = self._late.since_ns, self._late.last_ns
-        if start_ns is None or end_ns is None or not self._late.caught_up():
+        if start_ns is None or end_ns is None or not self._late.has_caught_up():
             return
         text = (
             f"camera {self._camera.name}: its frames are in time again; those from {format_time(start_ns)} "

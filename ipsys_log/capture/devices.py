@@ -11,11 +11,20 @@ import cv2
 import numpy as np
 import simplejpeg
 
-from ipsys_log.capture.frames import Clock, Frame, Given, Open, Say, SourceError, device_of, say_refused
+from ipsys_log.capture.frames import (
+    ActualSettings,
+    Clock,
+    Frame,
+    Open,
+    Say,
+    SourceError,
+    device_path,
+    report_refused_settings,
+)
 from ipsys_log.capture.network import check_address, open_network
 from ipsys_log.capture.simulated import open_simulated, parse_source
-from ipsys_log.capture.usb_bus import advise, demands_of
-from ipsys_log.capture.video_files import check_played, open_played
+from ipsys_log.capture.usb_bus import advise, list_demands
+from ipsys_log.capture.video_files import check_playback_source, open_playback
 from ipsys_log.errors import IpsysError
 from ipsys_log.messages import Rig, RigCamera
 from ipsys_log.rig.file import HIDDEN, hide_password
@@ -49,7 +58,7 @@ def open_opencv(camera: RigCamera, clock: Clock, say: Say) -> Iterator[Iterator[
     try:
         if not device.isOpened():
             raise SourceError(f"camera {camera.name}: there is no camera {number}, or another program has it")
-        say_refused(camera, _set(device, camera), say)
+        report_refused_settings(camera, _set(device, camera), say)
         say(
             f"camera {camera.name}: this system hands over decoded pictures; they are encoded as JPEG again, "
             "and get their time of arrival"
@@ -59,7 +68,7 @@ def open_opencv(camera: RigCamera, clock: Clock, say: Say) -> Iterator[Iterator[
         device.release()
 
 
-def _set(device: cv2.VideoCapture, camera: RigCamera) -> Given:
+def _set(device: cv2.VideoCapture, camera: RigCamera) -> ActualSettings:
     """Set a camera to the settings of the rig, and return its actual settings."""
     device.set(cv2.CAP_PROP_FOURCC, cv2.VideoWriter.fourcc(*"MJPG"))
     for key, value in (
@@ -80,7 +89,7 @@ def _set(device: cv2.VideoCapture, camera: RigCamera) -> Given:
     }
     accepted = {key: value is not None and device.set(key, float(value)) for key, value in requested.items()}
     actual = {key: device.get(key) for key in requested}
-    return Given(
+    return ActualSettings(
         int(actual[cv2.CAP_PROP_FRAME_WIDTH]),
         int(actual[cv2.CAP_PROP_FRAME_HEIGHT]),
         actual[cv2.CAP_PROP_FPS] or None,
@@ -90,11 +99,11 @@ def _set(device: cv2.VideoCapture, camera: RigCamera) -> Given:
     )
 
 
-def _frames(device: cv2.VideoCapture, where: str) -> Iterator[Frame | None]:
+def _frames(device: cv2.VideoCapture, label: str) -> Iterator[Frame | None]:
     while True:
         success, image = device.read()
         if not success:
-            raise SourceError(f"{where}: sends no frames; plug it in anew, or into another USB port")
+            raise SourceError(f"{label}: sends no frames; plug it in anew, or into another USB port")
         data = simplejpeg.encode_jpeg(np.ascontiguousarray(image), quality=_QUALITY, colorspace="BGR")
         yield Frame(data, "jpeg", None)
 
@@ -138,7 +147,7 @@ OPENERS: dict[str, Open] = {
     "udp": open_network,
     "usb": open_usb,
     "sim": open_simulated,
-    "file": open_played,
+    "file": open_playback,
 }
 
 
@@ -153,7 +162,7 @@ def check_devices(cameras: Iterable[RigCamera]) -> None:
     names: dict[Path, str] = {}
     for camera in cameras:
         if camera.source and camera.source.startswith("usb:"):
-            device = Path(device_of(camera.source)).resolve()
+            device = Path(device_path(camera.source)).resolve()
             other = names.setdefault(device, camera.name)
             if other != camera.name:
                 raise IpsysError(
@@ -175,11 +184,11 @@ def check_sources(cameras: Iterable[RigCamera]) -> None:
             check_address(camera)
         elif _opener(camera) is open_simulated:
             parse_source(camera)
-        elif _opener(camera) is open_played:
-            check_played(camera)
-        elif sys.platform == "linux" and not Path(device_of(source)).exists():
+        elif _opener(camera) is open_playback:
+            check_playback_source(camera)
+        elif sys.platform == "linux" and not Path(device_path(source)).exists():
             raise IpsysError(
-                f"camera {camera.name}: there is no device {device_of(source)!r}; 'ipsys cameras' "
+                f"camera {camera.name}: there is no device {device_path(source)!r}; 'ipsys cameras' "
                 "lists what is attached"
             )
 
@@ -190,7 +199,7 @@ def usb_advice(rig: Rig) -> list[str]:
         return []
     from ipsys_log.capture.usb_bus import find_cameras
 
-    return advise(demands_of(find_cameras(), rig))
+    return advise(list_demands(find_cameras(), rig))
 
 
 def open_source(camera: RigCamera, clock: Clock, say: Say) -> AbstractContextManager[Iterator[Frame | None]]:

@@ -18,18 +18,18 @@ from ipsys_log.messages import RigCamera
 from ipsys_log.units import NS_PER_S, format_bytes, format_duration
 
 __all__ = [
-    "SHORT_S",
+    "LOW_DISK_WARNING_S",
     "SYNC_EVERY_S",
     "Confirm",
     "DiskRoom",
     "Syncer",
-    "disk_fault",
+    "describe_disk_failure",
+    "describe_disk_fault",
+    "describe_disk_full",
     "expected_bytes_per_s",
     "free_room",
     "reserve",
     "reserved_bytes",
-    "what_failed",
-    "what_fitted",
 ]
 
 # A power cut loses the data of this time, of the second that waits to be written, and of a sync.
@@ -122,14 +122,14 @@ def reserve(path: Path) -> Iterator[Callable[[], None]]:
         yield resources.close
 
 
-def what_fitted(path: Path, error: WriteError) -> str:
+def describe_disk_full(path: Path, error: WriteError) -> str:
     """Describe a log that ended because the disk was full or failed."""
     try:
         with LogReader(path) as log:
             count, seconds = log.message_count, ((log.end_ns or 0) - (log.start_ns or 0)) / NS_PER_S
     except LogError:
         return str(error)
-    cause = "the disk is full" if is_full(error.cause) else disk_fault(error.cause)
+    cause = "the disk is full" if is_full(error.cause) else describe_disk_fault(error.cause)
     remedy = (
         "Free some space, or record to another disk" if is_full(error.cause) else "Record to another disk"
     )
@@ -140,21 +140,21 @@ def what_fitted(path: Path, error: WriteError) -> str:
     )
 
 
-def what_failed(path: Path, fault: OSError) -> str:
+def describe_disk_failure(path: Path, fault: OSError) -> str:
     """Describe what to do with a log that may be incomplete on a failed disk."""
     return (
-        f"{path}: {disk_fault(fault)} during the recording; messages may be lost. To check the log: "
+        f"{path}: {describe_disk_fault(fault)} during the recording; messages may be lost. To check the log: "
         f"ipsys repair {path}. Record to another disk"
     )
 
 
-def disk_fault(fault: OSError) -> str:
+def describe_disk_fault(fault: OSError) -> str:
     """Describe a fault of the disk."""
     return f"the disk has failed ({fault.strerror})"
 
 
 # The recorder warns if the disk is full before this time.
-SHORT_S = 600.0
+LOW_DISK_WARNING_S = 600.0
 # From this rate on, the recorder gives advice to make the recording smaller.
 _LARGE_BYTES_PER_S = 500e6 / 60
 _USUAL_RATE_HZ = 30.0
@@ -179,13 +179,15 @@ class DiskRoom:
     bytes_per_s: float
 
     @property
-    def lasts_s(self) -> float | None:
+    def remaining_s(self) -> float | None:
         """The time until the disk is full, in s; None if the rate is not known."""
         return self.free_bytes / self.bytes_per_s if self.bytes_per_s > 0 else None
 
     def is_short(self, seconds: float | None = None) -> bool:
         """Return whether the disk is full before ``seconds``, or before 10 minutes if no end is set."""
-        return self.lasts_s is not None and self.lasts_s < (SHORT_S if seconds is None else seconds)
+        return self.remaining_s is not None and self.remaining_s < (
+            LOW_DISK_WARNING_S if seconds is None else seconds
+        )
 
     def describe(self, seconds: float | None = None) -> str:
         """Describe the size of the recording, and how long the disk lasts.
@@ -205,7 +207,7 @@ class DiskRoom:
             size = f"{format_bytes(round(60 * self.bytes_per_s))} a minute"
         else:
             size = f"{format_bytes(round(seconds * self.bytes_per_s))} in {format_duration(seconds)}"
-        lasts = format_duration(self.lasts_s or 0.0)
+        lasts = format_duration(self.remaining_s or 0.0)
         ends = f"full after {lasts}" if self.is_short(seconds) else f"enough for {lasts}"
         return f"about {size}; {format_bytes(self.free_bytes)} free in {self.folder}: {ends}"
 

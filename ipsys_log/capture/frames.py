@@ -11,7 +11,17 @@ from ipsys_log.errors import IpsysError
 from ipsys_log.messages import RigCamera
 from ipsys_log.units import NS_PER_S
 
-__all__ = ["Clock", "Frame", "Given", "Open", "Say", "SourceError", "device_of", "instant_ns", "say_refused"]
+__all__ = [
+    "ActualSettings",
+    "Clock",
+    "Frame",
+    "Open",
+    "Say",
+    "SourceError",
+    "device_path",
+    "mid_exposure_ns",
+    "report_refused_settings",
+]
 
 
 class SourceError(IpsysError):
@@ -53,9 +63,9 @@ class Clock:
         if slept_ns - self._sleeps_ns[-1][1] > _LEAST_SLEEP_NS:
             self._sleeps_ns.append((read_ns + 1, slept_ns))
         self._read_ns = time.monotonic_ns()
-        return self.of_monotonic_ns(self._read_ns)
+        return self.to_utc_ns(self._read_ns)
 
-    def of_monotonic_ns(self, monotonic_ns: int) -> int:
+    def to_utc_ns(self, monotonic_ns: int) -> int:
         """Convert a stamp of the monotonic clock, such as a stamp of V4L2, to UTC."""
         slept_ns = next(slept for since, slept in reversed(self._sleeps_ns) if since <= monotonic_ns)
         return monotonic_ns + self._offset_ns + slept_ns
@@ -77,7 +87,7 @@ Say = Callable[[str], None]
 Open = Callable[[RigCamera, Clock, Say], AbstractContextManager[Iterator[Frame | None]]]
 
 
-def instant_ns(stamp_ns: int, camera: RigCamera) -> int:
+def mid_exposure_ns(stamp_ns: int, camera: RigCamera) -> int:
     """Return the time of the middle of the exposure of a frame's first row, from the driver's stamp.
 
     Parameters
@@ -88,9 +98,9 @@ def instant_ns(stamp_ns: int, camera: RigCamera) -> int:
     Examples
     --------
     >>> camera = RigCamera("red", height=1080, row_time_ns=30_000, exposure_s=0.01, stamp="end")
-    >>> instant_ns(100_000_000, camera)
+    >>> mid_exposure_ns(100_000_000, camera)
     62630000
-    >>> instant_ns(100_000_000, RigCamera("red", exposure_s=0.01, latency_ns=1_000_000))
+    >>> mid_exposure_ns(100_000_000, RigCamera("red", exposure_s=0.01, latency_ns=1_000_000))
     104000000
     """
     half_ns = round((camera.exposure_s or 0.0) * NS_PER_S / 2)
@@ -105,7 +115,7 @@ def instant_ns(stamp_ns: int, camera: RigCamera) -> int:
 _NEAR = 0.01
 
 
-class Given(NamedTuple):
+class ActualSettings(NamedTuple):
     """The actual settings of a camera.
 
     None means that the camera does not let us set the value. For the rate, None means that it is not known.
@@ -119,29 +129,29 @@ class Given(NamedTuple):
     gain: float | None = None
 
 
-def say_refused(camera: RigCamera, given: Given, say: Say) -> None:
+def report_refused_settings(camera: RigCamera, settings: ActualSettings, say: Say) -> None:
     """Report each setting of a camera that differs from the rig, in one line per setting.
 
     Parameters
     ----------
     camera : the requested settings; None means any value.
-    given : the actual settings.
+    settings : the actual settings.
     say : called with each difference.
 
     Examples
     --------
-    >>> say_refused(RigCamera("red", rate_hz=60.0), Given(1920, 1080, 30.0), print)
+    >>> report_refused_settings(RigCamera("red", rate_hz=60.0), ActualSettings(1920, 1080, 30.0), print)
     camera red: asked for 60 frames/s, gives 30
     """
-    size = (camera.width or given.width, camera.height or given.height)
-    if given.width and given.height and size != (given.width, given.height):
+    size = (camera.width or settings.width, camera.height or settings.height)
+    if settings.width and settings.height and size != (settings.width, settings.height):
         text = " x ".join(str(side) for side in size)
-        say(f"camera {camera.name}: asked for {text} px, gives {given.width} x {given.height}")
+        say(f"camera {camera.name}: asked for {text} px, gives {settings.width} x {settings.height}")
     rows = (
-        ("frames/s", camera.rate_hz, given.rate_hz),
-        ("s of exposure", camera.exposure_s, given.exposure_s),
-        ("of focus", camera.focus, given.focus),
-        ("of gain", camera.gain, given.gain),
+        ("frames/s", camera.rate_hz, settings.rate_hz),
+        ("s of exposure", camera.exposure_s, settings.exposure_s),
+        ("of focus", camera.focus, settings.focus),
+        ("of gain", camera.gain, settings.gain),
     )
     for unit, requested, actual in rows:
         if requested is None or (actual is None and unit == "frames/s"):
@@ -152,12 +162,12 @@ def say_refused(camera: RigCamera, given: Given, say: Say) -> None:
             say(f"camera {camera.name}: asked for {requested:g} {unit}, gives {actual:g}")
 
 
-def device_of(source: str) -> str:
+def device_path(source: str) -> str:
     """Return the path of the device that a source names.
 
     Examples
     --------
-    >>> device_of("usb:2"), device_of("usb:/dev/v4l/by-id/red-camera")
+    >>> device_path("usb:2"), device_path("usb:/dev/v4l/by-id/red-camera")
     ('/dev/video2', '/dev/v4l/by-id/red-camera')
     """
     name = source.partition(":")[2]

@@ -12,14 +12,14 @@ from ipsys_log.messages import CameraCalibration, Message, Model, Rig
 from ipsys_log.messages.channels import CAMERA_POINTS, MODEL, RUN_EVENTS, Channel, channel_of
 from ipsys_log.messages.stage import Plan, Stage
 from ipsys_log.models.table import reads_height
-from ipsys_log.runs.execute import LiveRun, signed_copy
+from ipsys_log.runs.execute import LiveRun, copy_messages
 from ipsys_log.runs.graph import Task, copy_model, is_of_model, stages_until
 from ipsys_log.runs.options import Request
 from ipsys_log.runs.select import wanted_models
 from ipsys_log.runs.stream import WiredStage, wire
 from ipsys_log.stages.detect import usual_corners
 
-__all__ = ["LivePlan", "check_model", "check_pictures", "check_start", "plan_live"]
+__all__ = ["LivePlan", "check_independent_frames", "check_model", "check_start", "plan_live"]
 
 
 class LivePlan(NamedTuple):
@@ -39,7 +39,7 @@ class LivePlan(NamedTuple):
         return [
             message
             for number, (task, model) in enumerate(self.copied, 1)
-            for message in signed_copy(task, model, number, now_ns)
+            for message in copy_messages(task, model, number, now_ns)
         ]
 
 
@@ -177,7 +177,7 @@ def _check(
             )
 
 
-def check_pictures(cameras: Mapping[str, CameraState]) -> None:
+def check_independent_frames(cameras: Mapping[str, CameraState]) -> None:
     """Check that each frame of the cameras can be decoded by itself.
 
     Raises

@@ -14,12 +14,12 @@ from dataclasses import dataclass
 from types import TracebackType
 from typing import Any
 
-from ipsys_log.capture.camera_thread import Arrival, Attendant, Shared
+from ipsys_log.capture.camera_thread import Arrival, CameraReader, ReaderContext
 from ipsys_log.capture.frames import Clock, Open, Say, SourceError
 from ipsys_log.capture.stalls import Heartbeat
 from ipsys_log.messages import EVENTS_TOPIC, CompressedImage, CompressedVideo, Event, Message, RigCamera
 
-__all__ = ["Attached"]
+__all__ = ["LiveCameras"]
 
 # Most bytes of frames that wait to be written: some seconds of three cameras.
 _LIMIT_BYTES = 256 << 20
@@ -31,7 +31,7 @@ _SAVED_S = 10.0
 _LAST_S = 1.0
 
 
-class Attached:
+class LiveCameras:
     """The live cameras of a rig. A context manager; iterate over it once.
 
     The iteration yields messages in the order of their log times, which strictly increase. While no message
@@ -74,22 +74,24 @@ class Attached:
         self._arrived = threading.Condition()
         self._saving: list[_Saving] = []
         self._closed = self._ending = False
-        self._why = "the recording has ended; measure in its log with: ipsys measure LOG"
+        self._reason = "the recording has ended; measure in its log with: ipsys measure LOG"
         self._started, self._stopped = threading.Event(), threading.Event()
         self._heartbeat = Heartbeat(clock)
-        shared = Shared(open_source, clock, self._put, say, self._started, self._stopped, self._heartbeat)
-        self._attendants = [Attendant(camera, shared) for camera in cameras]
+        shared = ReaderContext(
+            open_source, clock, self._put, say, self._started, self._stopped, self._heartbeat
+        )
+        self._readers = [CameraReader(camera, shared) for camera in cameras]
         self.states = {
-            camera.name: attendant.state for camera, attendant in zip(cameras, self._attendants, strict=True)
+            camera.name: reader.state for camera, reader in zip(cameras, self._readers, strict=True)
         }
 
-    def __enter__(self) -> Attached:
+    def __enter__(self) -> LiveCameras:
         try:
             self._heartbeat.start()
-            for attendant in self._attendants:
-                attendant.thread.start()
-            for attendant in self._attendants:
-                attendant.wait()
+            for reader in self._readers:
+                reader.thread.start()
+            for reader in self._readers:
+                reader.wait_for_first_frame()
         except BaseException:
             self._end()
             raise
@@ -101,16 +103,16 @@ class Attached:
     ) -> None:
         self._end(_LAST_S if isinstance(error, KeyboardInterrupt) else None)
 
-    def stop(self, why: str | None = None) -> None:
+    def stop(self, reason: str | None = None) -> None:
         """Take no more frames; the iteration still yields the waiting messages.
 
         This method takes no lock, so a signal handler may call it.
 
         Parameters
         ----------
-        why : reason that the error of a later call of :meth:`save` or :meth:`add` names.
+        reason : reason that the error of a later call of :meth:`save` or :meth:`add` names.
         """
-        self._why = why or self._why
+        self._reason = reason or self._reason
         self._ending = True
 
     def __iter__(self) -> Generator[Message | None, None, None]:
@@ -134,9 +136,9 @@ class Attached:
             with self._arrived:
                 self._closed = True
                 self._arrived.notify_all()
-        for attendant in self._attendants:
-            if attendant.fault is not None:
-                raise attendant.fault
+        for reader in self._readers:
+            if reader.fault is not None:
+                raise reader.fault
 
     def add(self, topic: str, payload: Any) -> None:
         """Append another message to the stream, such as an event; it gets its log time as a frame does.
@@ -176,7 +178,7 @@ class Attached:
         if saving.confirmed:
             return
         if closed and not saving.written:
-            raise SourceError(f"not saved: {self._why}")
+            raise SourceError(f"not saved: {self._reason}")
         if is_waiting:
             raise SourceError("not saved: the disk is too slow; try again")
         raise SourceError("maybe not saved: the disk does not answer; look into the log")
@@ -189,7 +191,7 @@ class Attached:
                     saving.confirmed, saving.fault = True, fault
             self._arrived.notify_all()
 
-    def warn(self, kind: str, text: str) -> None:
+    def add_event(self, kind: str, text: str) -> None:
         """Append an event without a camera, and show its text at once; after the end, only show the text."""
         with suppress(SourceError):
             self.add(EVENTS_TOPIC, Event(self.clock.now_ns(), kind, text))
@@ -214,17 +216,17 @@ class Attached:
     def _add(self, arrival: Arrival) -> None:
         with self._arrived:
             if self._closed:
-                raise SourceError(f"not saved: {self._why}")
+                raise SourceError(f"not saved: {self._reason}")
             self._put(arrival)
 
     def _take(self) -> tuple[Arrival | None, bool]:
         """Take the oldest arrival from the queue; return it, and whether the stream has ended."""
         with self._arrived:
-            if not self._waiting and not self._done():
+            if not self._waiting and not self._all_finished():
                 self._arrived.wait(_TICK_S)
             arrival = self._waiting.popleft() if self._waiting else None
             self._waiting_bytes -= _bytes_of(arrival)
-            self._closed = self._closed or (arrival is None and self._done())
+            self._closed = self._closed or (arrival is None and self._all_finished())
             return arrival, self._closed
 
     def _note_written(self, arrival: Arrival) -> None:
@@ -248,15 +250,15 @@ class Attached:
         _, topic, publish_time_ns, payload, camera = arrival
         return Message(topic, log_time_ns, publish_time_ns, payload, camera)
 
-    def _done(self) -> bool:
+    def _all_finished(self) -> bool:
         return all(state.finished for state in self.states.values())
 
     def _end(self, seconds: float | None = None) -> None:
         self._stopped.set()
         self._heartbeat.stop()
-        for attendant in self._attendants:
-            if attendant.thread.ident is not None:  # after an early interrupt, some threads have not started
-                attendant.thread.join(seconds)
+        for reader in self._readers:
+            if reader.thread.ident is not None:  # after an early interrupt, some threads have not started
+                reader.thread.join(seconds)
 
 
 @dataclass(eq=False, slots=True)

@@ -15,7 +15,7 @@ from threading import Event, Thread
 from typing import TYPE_CHECKING
 from urllib.parse import urlsplit
 
-from ipsys_log.capture.frames import Clock, Frame, Given, Say, SourceError, say_refused
+from ipsys_log.capture.frames import ActualSettings, Clock, Frame, Say, SourceError, report_refused_settings
 from ipsys_log.capture.video_packets import find_video, name_format, pass_through
 from ipsys_log.messages import RigCamera
 from ipsys_log.rig.file import hide_password
@@ -188,7 +188,7 @@ def _frames(camera: RigCamera, clock: Clock, say: Say) -> Iterator[Frame]:
             if name is None:
                 raise SourceError(f"{label}: is {codec.name} video; set the camera to MJPEG, H.264 or H.265")
             rate_hz = float(stream.average_rate) if stream.average_rate else None
-            say_refused(camera, Given(codec.width, codec.height, rate_hz), say)
+            report_refused_settings(camera, ActualSettings(codec.width, codec.height, rate_hz), say)
             stamps = Stamps(camera.name, clock, say, _PATIENCE if container.format.name == "rtsp" else 1)
             # A stream that stops within a packet has ended. This is no error of the data.
             with suppress(av.error.InvalidDataError):
@@ -200,18 +200,18 @@ def _frames(camera: RigCamera, clock: Clock, say: Say) -> Iterator[Frame]:
         raise SourceError(f"{label}: {_explain(error)}") from error
 
 
-def _heard(packets: Iterable[Packet[VideoStream]], clock: Clock, where: str) -> Iterator[Packet[VideoStream]]:
+def _heard(packets: Iterable[Packet[VideoStream]], clock: Clock, label: str) -> Iterator[Packet[VideoStream]]:
     """Yield packets; raise an error after a long time with only empty packets."""
     heard_ns = clock.now_ns()
     for packet in packets:
         if not packet.size and clock.now_ns() - heard_ns > _SILENT_S * NS_PER_S:
-            raise SourceError(f"{where}: sends only empty frames; start the camera anew")
+            raise SourceError(f"{label}: sends only empty frames; start the camera anew")
         yield packet
         if packet.size:
             heard_ns = clock.now_ns()
 
 
-def _open(address: str, where: str) -> InputContainer:
+def _open(address: str, label: str) -> InputContainer:
     import av
 
     host = urlsplit(address).hostname
@@ -219,9 +219,9 @@ def _open(address: str, where: str) -> InputContainer:
         socket.getaddrinfo(host, None)
     except socket.gaierror as error:
         if error.errno == socket.EAI_NONAME:
-            raise SourceError(f"{where}: there is no host {host!r}; check the address") from error
+            raise SourceError(f"{label}: there is no host {host!r}; check the address") from error
         raise SourceError(
-            f"{where}: the name {host!r} cannot be looked up ({error.strerror}); check the network, "
+            f"{label}: the name {host!r} cannot be looked up ({error.strerror}); check the network, "
             "or write the address as a number"
         ) from error
     return av.open(address, options=dict(_OPTIONS), timeout=_SILENT_S)

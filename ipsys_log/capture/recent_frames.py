@@ -11,10 +11,10 @@ from ipsys_log.errors import WriteError
 from ipsys_log.messages import FRAME_SKIPPED, CompressedImage, Event, Measurement, Message
 from ipsys_log.units import NS_PER_S
 
-__all__ = ["Recent"]
+__all__ = ["RecentFrames"]
 
 # Longer than the stationary interval of a measurement and the delay of the stages.
-_HELD_NS = 5 * NS_PER_S
+BUFFER_NS = 5 * NS_PER_S
 # Eight cameras at 60 frames/s send less in two seconds. Beyond this limit, a calibration point gets only the
 # frames that the buffer still holds.
 _LIMIT_BYTES = 256 << 20
@@ -22,7 +22,7 @@ _LIMIT_BYTES = 256 << 20
 _ROLLING_NS = NS_PER_S // 10
 
 
-class Recent:
+class RecentFrames:
     """A buffer of the last messages of a recording. A context manager: on leaving, it writes the rest.
 
     Messages enter and leave in the order of log times. A frame is discarded after some seconds, or earlier
@@ -38,10 +38,10 @@ class Recent:
 
     def __init__(self, log: Recording, limit_bytes: int = _LIMIT_BYTES) -> None:
         self._log = log
-        self._limit_bytes, self._held_bytes = limit_bytes, 0
-        self._held: deque[Message] = deque()
+        self._limit_bytes, self._buffer_bytes = limit_bytes, 0
+        self._buffer: deque[Message] = deque()
 
-    def __enter__(self) -> Recent:
+    def __enter__(self) -> RecentFrames:
         return self
 
     def __exit__(
@@ -70,12 +70,13 @@ class Recent:
         # The event tells a replay which frames have no live results. This log holds no live results.
         if isinstance(payload, Event) and payload.kind == FRAME_SKIPPED:
             return
-        self._held.append(message)
-        self._held_bytes += _bytes_of(message)
+        self._buffer.append(message)
+        self._buffer_bytes += _bytes_of(message)
         if isinstance(payload, Measurement):
             self._write(None if payload.still is None else payload.still.start - _ROLLING_NS)
         while _is_frame(message) and (
-            self._held[0].log_time_ns < message.log_time_ns - _HELD_NS or self._held_bytes > self._limit_bytes
+            self._buffer[0].log_time_ns < message.log_time_ns - BUFFER_NS
+            or self._buffer_bytes > self._limit_bytes
         ):
             oldest = self._take()
             if not _is_frame(oldest):
@@ -91,14 +92,14 @@ class Recent:
 
     def _write(self, since_ns: int | None = None) -> None:
         """Write all messages of the buffer; of the frames, only those since ``since_ns`` (None: no frame)."""
-        while self._held:
+        while self._buffer:
             message = self._take()
             if not _is_frame(message) or (since_ns is not None and message.publish_time_ns >= since_ns):
                 self._log.put(message)
 
     def _take(self) -> Message:
-        message = self._held.popleft()
-        self._held_bytes -= _bytes_of(message)
+        message = self._buffer.popleft()
+        self._buffer_bytes -= _bytes_of(message)
         return message
 
 

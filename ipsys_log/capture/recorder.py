@@ -11,7 +11,14 @@ from functools import partial
 from pathlib import Path
 from typing import Protocol
 
-from ipsys_log.capture.disk import Confirm, Syncer, disk_fault, reserve, what_failed, what_fitted
+from ipsys_log.capture.disk import (
+    Confirm,
+    Syncer,
+    describe_disk_failure,
+    describe_disk_fault,
+    describe_disk_full,
+    reserve,
+)
 from ipsys_log.errors import IpsysError, LogError, WriteError, is_full
 from ipsys_log.geometry.lenses import scale_intrinsics
 from ipsys_log.log.journal import DISK, roll_back
@@ -37,8 +44,8 @@ __all__ = [
     "Target",
     "first_messages",
     "fitting_lenses",
-    "recording",
-    "written",
+    "open_recording",
+    "write_each",
 ]
 
 # After an interrupt, the recorder waits no longer than this for a write.
@@ -49,16 +56,16 @@ class Source(Protocol):
     """Messages, and None if nothing comes; after ``stop`` only those that arrived before.
 
     ``confirm`` is called from any thread when a measurement is on the disk, or with the error of the disk;
-    ``warn`` makes an event, and prints it.
+    ``add_event`` makes an event, and prints it.
     """
 
     def __iter__(self) -> Generator[Message | None, None, None]: ...
 
-    def stop(self, why: str | None = None) -> None: ...
+    def stop(self, reason: str | None = None) -> None: ...
 
     def confirm(self, message: Message, fault: OSError | None) -> None: ...
 
-    def warn(self, kind: str, text: str) -> None: ...
+    def add_event(self, kind: str, text: str) -> None: ...
 
 
 class Target(Protocol):
@@ -81,7 +88,7 @@ class Target(Protocol):
 
 
 class Recording:
-    """A log that several threads write; :func:`recording` creates it.
+    """A log that several threads write; :func:`open_recording` creates it.
 
     Parameters
     ----------
@@ -134,9 +141,9 @@ class Recording:
             The disk was full or failed; the text describes the log.
         """
         if self.full is not None:
-            raise IpsysError(what_fitted(self._writer.path, self.full)) from self.full
+            raise IpsysError(describe_disk_full(self._writer.path, self.full)) from self.full
         if self.fault is not None:
-            raise IpsysError(what_failed(self._writer.path, self.fault)) from self.fault
+            raise IpsysError(describe_disk_failure(self._writer.path, self.fault)) from self.fault
 
     def settle(self) -> bool:
         """Prevent further writes from all threads; return False if a thread is still writing."""
@@ -156,7 +163,7 @@ class Recording:
             self._torn = False
 
 
-def written(source: Source, log: Target) -> Iterator[Message | None]:
+def write_each(source: Source, log: Target) -> Iterator[Message | None]:
     """Yield the messages of a source, each after it was written.
 
     A measurement is confirmed as soon as it is on the disk. When the disk is full, the source is stopped.
@@ -167,7 +174,9 @@ def written(source: Source, log: Target) -> Iterator[Message | None]:
         for message in messages:
             if log.fault is not None and not warned:
                 warned = True
-                source.warn("disk_fault", f"{disk_fault(log.fault)}; what was written just now may be lost")
+                source.add_event(
+                    "disk_fault", f"{describe_disk_fault(log.fault)}; what was written just now may be lost"
+                )
             if message is None:
                 log.flush()
             elif log.full is None or not isinstance(message.payload, (CompressedImage, CompressedVideo)):
@@ -181,11 +190,15 @@ def written(source: Source, log: Target) -> Iterator[Message | None]:
                 continue
             yield message
             if log.full is not None:
-                source.stop("the disk is full" if is_full(log.full.cause) else disk_fault(log.full.cause))
+                source.stop(
+                    "the disk is full" if is_full(log.full.cause) else describe_disk_fault(log.full.cause)
+                )
 
 
 @contextmanager
-def recording(path: Path, settings: Iterable[Message] = (), overwrite: bool = False) -> Iterator[Recording]:
+def open_recording(
+    path: Path, settings: Iterable[Message] = (), overwrite: bool = False
+) -> Iterator[Recording]:
     """Write a new log that keeps its messages even if an exception ends the block.
 
     Parameters
@@ -221,7 +234,7 @@ def recording(path: Path, settings: Iterable[Message] = (), overwrite: bool = Fa
                 )
                 raise IpsysError(text) from error
     except WriteError as error:
-        raise IpsysError(what_fitted(path, error)) from error
+        raise IpsysError(describe_disk_full(path, error)) from error
 
 
 def _create(path: Path, overwrite: bool) -> LogWriter:

@@ -13,7 +13,7 @@ from typing import NamedTuple
 from urllib.parse import parse_qsl, urlencode
 
 from ipsys_log.calibration.board import Board, parse_board
-from ipsys_log.capture.frames import Clock, Frame, Given, Say, say_refused
+from ipsys_log.capture.frames import ActualSettings, Clock, Frame, Say, report_refused_settings
 from ipsys_log.errors import IpsysError
 from ipsys_log.messages import CameraCalibration, RigCamera
 from ipsys_log.simulation.board import board_cells
@@ -24,7 +24,7 @@ from ipsys_log.simulation.pixel_shares import exposure_interval
 from ipsys_log.simulation.settings import LabSettings
 from ipsys_log.units import NS_PER_S
 
-__all__ = ["Seat", "lens_of", "open_simulated", "parse_source", "show_board"]
+__all__ = ["SimulatedCamera", "intrinsics_of", "open_simulated", "parse_source", "show_board"]
 
 _TURN_S = 0.4
 _LATENCY_NS = 4_000_000
@@ -32,7 +32,7 @@ _LATENCY_NS = 4_000_000
 _SQUARE_M, _MARKER_SCALE, _DICTIONARY = 0.03, 0.75, "DICT_4X4_50"
 
 
-class Seat(NamedTuple):
+class SimulatedCamera(NamedTuple):
     """The scene of a simulated camera: a lab, the number of its camera, and an optional board in front."""
 
     lab: LabSettings
@@ -44,7 +44,7 @@ class _Stopped(Exception):  # noqa: N818
     """A signal to end the rendering: the images are not needed any more."""
 
 
-class _Pictures:
+class _Images:
     """The images of a film, rendered by a separate thread in the order of their use."""
 
     def __init__(self, name: str, make_film: Callable[[Check], Film], timing: _Timing, clock: Clock) -> None:
@@ -59,7 +59,7 @@ class _Pictures:
     def stop(self) -> None:
         self._stopped.set()
 
-    def picture(self, frame: int) -> bytes | None:
+    def image(self, frame: int) -> bytes | None:
         """Return the image of a frame; None if it is not rendered yet."""
         if self._fault is not None:
             raise self._fault
@@ -111,26 +111,26 @@ def open_simulated(camera: RigCamera, clock: Clock, say: Say) -> Iterator[Iterat
     IpsysError
         The lab has no such camera or setting.
     """
-    seat = parse_source(camera)
-    lab = seat.lab
-    say_refused(camera, Given(lab.width, lab.height, lab.rate_hz), say)
-    shown = "the simulated lab" if seat.board is None else f"{seat.board} in the simulated lab"
+    simulated = parse_source(camera)
+    lab = simulated.lab
+    report_refused_settings(camera, ActualSettings(lab.width, lab.height, lab.rate_hz), say)
+    shown = "the simulated lab" if simulated.board is None else f"{simulated.board} in the simulated lab"
     say(f"camera {camera.name}: shows {shown}, {lab.width} x {lab.height} px, {lab.rate_hz:g} frames/s")
     timing = _Timing.of(lab, camera.stamp)
 
     def make_film(check: Check) -> Film:
-        if seat.board is None:
-            return lab_film(lab, seat.number, check)
-        return board_film(lab, seat.number, seat.board, check)
+        if simulated.board is None:
+            return lab_film(lab, simulated.number, check)
+        return board_film(lab, simulated.number, simulated.board, check)
 
-    pictures = _Pictures(camera.name, make_film, timing, clock)
+    images = _Images(camera.name, make_film, timing, clock)
     try:
-        yield _play(pictures, timing, clock)
+        yield _play(images, timing, clock)
     finally:
-        pictures.stop()
+        images.stop()
 
 
-def parse_source(camera: RigCamera) -> Seat:
+def parse_source(camera: RigCamera) -> SimulatedCamera:
     """Parse a source; return the lab, the camera, and the board in front of the camera.
 
     Raises
@@ -170,7 +170,7 @@ def parse_source(camera: RigCamera) -> Seat:
         raise IpsysError(
             f"camera {camera.name}: the simulated lab has no camera {name!r}; write one of {names}"
         )
-    return Seat(settings, settings.cameras.index(name), board)
+    return SimulatedCamera(settings, settings.cameras.index(name), board)
 
 
 def _parse_board(camera: RigCamera, text: str) -> Board:
@@ -201,7 +201,7 @@ def show_board(camera: RigCamera, board: str) -> RigCamera:
     return replace(camera, source=f"{source}{separator}{urlencode({'board': board}, safe=':')}")
 
 
-def lens_of(camera: RigCamera) -> CameraCalibration:
+def intrinsics_of(camera: RigCamera) -> CameraCalibration:
     """Return the intrinsics of a simulated camera.
 
     Raises
@@ -233,7 +233,7 @@ class _Timing(NamedTuple):
         return math.floor((now_ns - self.behind_ns) / self.period_ns)
 
 
-def _play(pictures: _Pictures, timing: _Timing, clock: Clock) -> Iterator[Frame | None]:
+def _play(images: _Images, timing: _Timing, clock: Clock) -> Iterator[Frame | None]:
     frame = 0
     while True:
         # A late reader misses frames.
@@ -243,5 +243,5 @@ def _play(pictures: _Pictures, timing: _Timing, clock: Clock) -> Iterator[Frame 
             time.sleep(min(left_s, _TURN_S))
             if left_s > _TURN_S:
                 yield None
-        data = pictures.picture(frame)
+        data = images.image(frame)
         yield None if data is None else Frame(data, "jpeg", time_ns + timing.stamp_ns)

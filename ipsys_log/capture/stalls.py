@@ -15,7 +15,7 @@ from typing import NamedTuple
 from ipsys_log.capture.frames import Clock
 from ipsys_log.units import NS_PER_S
 
-__all__ = ["STALL_NS", "Heartbeat", "LateFrames", "Stall"]
+__all__ = ["STALL_NS", "Heartbeat", "LateFrameDetector", "Stall"]
 
 # Threads of a busy machine wait for a shorter time. A robot at 1 m/s moves 25 cm in this time.
 STALL_NS = NS_PER_S // 4
@@ -74,7 +74,7 @@ class Heartbeat:
             self.beat(self._clock.now_ns())
 
 
-class LateFrames:
+class LateFrameDetector:
     """A detector of the late frames after a stall, for one camera without capture stamps.
 
     Frames are late from a stall on, until they arrive at the camera's usual rate again.
@@ -117,7 +117,7 @@ class LateFrames:
             self._usual_ns.append(now_ns - before_ns)
         return None
 
-    def caught_up(self) -> bool:
+    def has_caught_up(self) -> bool:
         """Return whether all late frames have arrived; then the next frames are in time."""
         usual_ns = median(self._usual_ns) if len(self._usual_ns) >= _AGAIN else self._least_ns
         if (

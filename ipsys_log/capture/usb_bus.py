@@ -11,10 +11,19 @@ from pathlib import Path
 from typing import NamedTuple
 
 from ipsys_log.capture import v4l2
-from ipsys_log.capture.frames import device_of
+from ipsys_log.capture.frames import device_path
 from ipsys_log.messages import Rig, RigCamera
 
-__all__ = ["Attached", "Demand", "Mode", "Plug", "advise", "demands_of", "find_cameras", "list_modes"]
+__all__ = [
+    "BandwidthDemand",
+    "Mode",
+    "UsbCamera",
+    "UsbConnection",
+    "advise",
+    "find_cameras",
+    "list_demands",
+    "list_modes",
+]
 
 # USB 2 gives at most 80 % of a microframe of 125 us to transfers at fixed times (USB 2.0, 5.6.4). At
 # 480 Mbit/s a microframe has 7500 bytes, so these transfers get 6000 bytes.
@@ -41,7 +50,7 @@ _SIZES = (
 )
 
 
-class Demand(NamedTuple):
+class BandwidthDemand(NamedTuple):
     """The bandwidth demand of a camera.
 
     ``bus`` is the number of its USB bus. ``hub`` describes the hub that it is plugged into. ``most`` is the
@@ -59,7 +68,7 @@ class Demand(NamedTuple):
     most: int = 3 * _PACKET
 
 
-def demands_of(attached: Sequence[Attached], rig: Rig | None) -> list[Demand]:
+def list_demands(attached: Sequence[UsbCamera], rig: Rig | None) -> list[BandwidthDemand]:
     """Return the demands of the cameras on USB: the settings of the rig, or else the largest JPEG modes.
 
     Parameters
@@ -67,13 +76,13 @@ def demands_of(attached: Sequence[Attached], rig: Rig | None) -> list[Demand]:
     attached : cameras from :func:`~ipsys_log.capture.usb_bus.find_cameras`.
     rig : rig of the cameras that run; None if all attached cameras run.
     """
-    requests: list[tuple[Attached, str, RigCamera | None]]
+    requests: list[tuple[UsbCamera, str, RigCamera | None]]
     if rig is None:
         requests = [(camera, camera.device, None) for camera in attached]
     else:
         by_path = {Path(camera.device).resolve(): camera for camera in attached}
         usb_cameras = [camera for camera in rig.cameras if (camera.source or "").startswith("usb:")]
-        paths = ((camera, Path(device_of(camera.source or "")).resolve()) for camera in usb_cameras)
+        paths = ((camera, Path(device_path(camera.source or "")).resolve()) for camera in usb_cameras)
         requests = [(by_path[path], camera.name, camera) for camera, path in paths if path in by_path]
     demands = []
     for camera, name, rig_camera in requests:
@@ -85,11 +94,11 @@ def demands_of(attached: Sequence[Attached], rig: Rig | None) -> list[Demand]:
         rate_hz = (rig_camera.rate_hz if rig_camera else None) or mode.rate_hz
         bus, _, speed_mbit_s, hub, most = camera.plug
         size = (width or mode.width, height or mode.height)
-        demands.append(Demand(name, bus, speed_mbit_s, hub, mode.format, *size, rate_hz, most))
+        demands.append(BandwidthDemand(name, bus, speed_mbit_s, hub, mode.format, *size, rate_hz, most))
     return demands
 
 
-def advise(demands: Sequence[Demand]) -> list[str]:
+def advise(demands: Sequence[BandwidthDemand]) -> list[str]:
     """Return one line per overloaded bus: its cameras, its hub, the bandwidth, and modes that would fit.
 
     Many cameras reserve as much as they can, at any rate and size. A line also warns that such cameras may
@@ -101,7 +110,7 @@ def advise(demands: Sequence[Demand]) -> list[str]:
 
     Examples
     --------
-    >>> three = [Demand(name, 1, 480, "a hub", "MJPG", 1920, 1080, 30.0) for name in ("a", "b", "c")]
+    >>> three = [BandwidthDemand(name, 1, 480, "a hub", "MJPG", 1920, 1080, 30.0) for name in ("a", "b", "c")]
     >>> print(advise(three)[0])
     cameras a, b and c share USB bus 1 (a hub) and need 48.5 MB/s of its 48: plug one into another bus, or ask for 25 frames/s of each, or for 1600 x 1200 px
     """  # noqa: E501
@@ -113,7 +122,7 @@ def advise(demands: Sequence[Demand]) -> list[str]:
     return [line for line in lines if line]
 
 
-def _explain(bus: int, shared: Sequence[Demand]) -> str | None:
+def _explain(bus: int, shared: Sequence[BandwidthDemand]) -> str | None:
     *names, last = sorted(demand.camera for demand in shared)
     hubs = ", ".join(sorted({demand.hub for demand in shared}))
     subject = f"cameras {', '.join(names)} and {last} share" if names else f"camera {last} is alone on"
@@ -136,7 +145,7 @@ def _mb_s(per_microframe: int) -> str:
     return f"{per_microframe * _MICROFRAMES_PER_S / 1e6:.1f}"
 
 
-def _smaller(shared: Sequence[Demand]) -> list[str]:
+def _smaller(shared: Sequence[BandwidthDemand]) -> list[str]:
     """Return the ways to fit all cameras: the highest rate, the largest size, and a smaller format."""
     ways = []
     for rate_hz in _RATES_HZ:
@@ -155,12 +164,12 @@ def _smaller(shared: Sequence[Demand]) -> list[str]:
     return ways
 
 
-def _needed(demand: Demand) -> int:
+def _needed(demand: BandwidthDemand) -> int:
     per_px = _BYTES_PER_PX.get(demand.format, _JPEG_BYTES_PER_PX)
     return math.ceil(demand.width * demand.height * demand.rate_hz * per_px / _MICROFRAMES_PER_S)
 
 
-def _wire_bytes(shared: Sequence[Demand], own: Callable[[Demand], int]) -> int:
+def _wire_bytes(shared: Sequence[BandwidthDemand], own: Callable[[BandwidthDemand], int]) -> int:
     """Return the bytes that cameras take of a microframe on the wire, with the heads of the packets."""
     return sum(own(demand) + _HEAD * math.ceil(own(demand) / _PACKET) for demand in shared)
 
@@ -178,7 +187,7 @@ class Mode(NamedTuple):
     rate_hz: float
 
 
-class Plug(NamedTuple):
+class UsbConnection(NamedTuple):
     """The USB connection of a camera.
 
     The fields are the bus, the port of the bus, the speed, the hub, and the most bytes that the camera can
@@ -192,7 +201,7 @@ class Plug(NamedTuple):
     most: int
 
 
-class Attached(NamedTuple):
+class UsbCamera(NamedTuple):
     """An attached camera.
 
     ``stable`` is the device path that stays the same. ``fault`` is the reason if the modes
@@ -202,12 +211,12 @@ class Attached(NamedTuple):
     device: str
     stable: str | None
     name: str
-    plug: Plug | None
+    plug: UsbConnection | None
     modes: tuple[Mode, ...]
     fault: str | None = None
 
 
-def find_cameras(root: Path = Path("/")) -> list[Attached]:
+def find_cameras(root: Path = Path("/")) -> list[UsbCamera]:
     """Find all cameras of this machine.
 
     Parameters
@@ -234,7 +243,7 @@ def find_cameras(root: Path = Path("/")) -> list[Attached]:
             finally:
                 os.close(fd)
         name = _read(entry / "name") or entry.name
-        cameras.append(Attached(str(device), _stable(root, device), name, _plug(entry), tuple(modes), fault))
+        cameras.append(UsbCamera(str(device), _stable(root, device), name, _plug(entry), tuple(modes), fault))
     return cameras
 
 
@@ -252,12 +261,12 @@ def _stable(root: Path, device: Path) -> str | None:
     return None
 
 
-def _plug(entry: Path) -> Plug | None:
+def _plug(entry: Path) -> UsbConnection | None:
     usb = next((part for part in entry.resolve().parents if (part / "busnum").is_file()), None)
     if usb is None:
         return None
     port = _read(usb / "devpath")
-    return Plug(int(_read(usb / "busnum")), port, float(_read(usb / "speed")), _hub(usb), _most(usb))
+    return UsbConnection(int(_read(usb / "busnum")), port, float(_read(usb / "speed")), _hub(usb), _most(usb))
 
 
 def _hub(usb: Path) -> str:
@@ -308,7 +317,7 @@ def _sizes(device: int, pixels: int) -> Iterator[tuple[int, int]]:
     def at(index: int) -> v4l2.FrameSize:
         return v4l2.FrameSize(index=index, pixel_format=pixels)
 
-    for size in v4l2.each(device, v4l2.ENUM_FRAMESIZES, at):
+    for size in v4l2.enumerate_items(device, v4l2.ENUM_FRAMESIZES, at):
         sides = size.sides
         if size.type == v4l2.DISCRETE:
             yield sides[0], sides[1]
@@ -321,7 +330,7 @@ def _rates_hz(device: int, pixels: int, width: int, height: int) -> Iterator[flo
     def at(index: int) -> v4l2.FrameInterval:
         return v4l2.FrameInterval(index=index, pixel_format=pixels, width=width, height=height)
 
-    for interval in v4l2.each(device, v4l2.ENUM_FRAMEINTERVALS, at):
+    for interval in v4l2.enumerate_items(device, v4l2.ENUM_FRAMEINTERVALS, at):
         times = interval.times
         yield times[1] / times[0]
         if interval.type != v4l2.DISCRETE:

@@ -125,7 +125,7 @@ ENUM_FRAMESIZES = _request(3, 74, FrameSize)
 ENUM_FRAMEINTERVALS = _request(3, 75, FrameInterval)
 
 
-def call(device: int, request: int, struct: Struct) -> Struct:
+def send_request(device: int, request: int, struct: Struct) -> Struct:
     """Send a request to an open device; the driver writes its answer into ``struct``.
 
     Raises
@@ -156,7 +156,7 @@ def fourcc_name(number: int) -> str:
 def is_camera(device: int) -> bool:
     """Return whether an open device delivers images; a camera also has devices for other purposes."""
     try:
-        capability = call(device, QUERYCAP, Capability())
+        capability = send_request(device, QUERYCAP, Capability())
     except OSError as error:
         if error.errno in (errno.ENOTTY, errno.EINVAL):
             return False
@@ -167,15 +167,17 @@ def is_camera(device: int) -> bool:
 
 def list_formats(device: int) -> list[str]:
     """List the names of the pixel formats of an open device."""
-    kinds = each(device, ENUM_FMT, lambda index: FormatDescription(index=index, type=VIDEO_CAPTURE))
+    kinds = enumerate_items(
+        device, ENUM_FMT, lambda index: FormatDescription(index=index, type=VIDEO_CAPTURE)
+    )
     return [fourcc_name(kind.pixelformat) for kind in kinds]
 
 
-def each(device: int, request: int, at: Callable[[int], Struct]) -> Iterator[Struct]:
+def enumerate_items(device: int, request: int, make_query: Callable[[int], Struct]) -> Iterator[Struct]:
     """Yield the answers of a driver for the indices 0, 1, 2 and so on, until there are no more."""
     for index in count():
         try:
-            yield call(device, request, at(index))
+            yield send_request(device, request, make_query(index))
         except OSError as error:
             if error.errno in (errno.EINVAL, errno.ENOTTY):
                 return

@@ -15,7 +15,15 @@ import simplejpeg
 from numpy.typing import NDArray
 
 from ipsys_log.capture import v4l2
-from ipsys_log.capture.frames import Clock, Frame, Given, Say, SourceError, device_of, say_refused
+from ipsys_log.capture.frames import (
+    ActualSettings,
+    Clock,
+    Frame,
+    Say,
+    SourceError,
+    device_path,
+    report_refused_settings,
+)
 from ipsys_log.messages import RigCamera
 from ipsys_log.units import NS_PER_S
 
@@ -113,7 +121,7 @@ def open_v4l2(camera: RigCamera, clock: Clock, say: Say) -> Iterator[Iterator[Fr
     SourceError
         The camera cannot be opened. The iterator raises it when the camera is disconnected.
     """
-    path = device_of(camera.source or "")
+    path = device_path(camera.source or "")
     label = f"camera {camera.name}: {path}"
     with ExitStack() as stack:
         with _faults(label):
@@ -122,37 +130,37 @@ def open_v4l2(camera: RigCamera, clock: Clock, say: Say) -> Iterator[Iterator[Fr
             if not v4l2.is_camera(device):
                 raise OSError(errno.ENOTTY, "")
             actual, layout = _set_up(device, camera, label)
-            say_refused(camera, actual, say)
+            report_refused_settings(camera, actual, say)
             if layout is not None:
                 note = f"its {layout.format} pictures are encoded as JPEG once"
                 say(f"camera {camera.name}: gives no MJPG; {note}")
             buffers = _map_buffers(device, stack)
-            v4l2.call(device, v4l2.STREAMON, v4l2.Int(v4l2.VIDEO_CAPTURE))
+            v4l2.send_request(device, v4l2.STREAMON, v4l2.Int(v4l2.VIDEO_CAPTURE))
             stack.callback(_stop, device)
         yield _frames(_Capture(camera, label, device, buffers, layout), clock, say)
 
 
 @contextmanager
-def _faults(where: str) -> Iterator[None]:
+def _faults(label: str) -> Iterator[None]:
     try:
         yield
     except OSError as error:
         message = _FAULTS.get(error.errno or 0, f"cannot be read ({error.strerror}); plug it in anew")
-        raise SourceError(f"{where}: {message}") from error
+        raise SourceError(f"{label}: {message}") from error
 
 
-def _set_up(device: int, camera: RigCamera, where: str) -> tuple[Given, Layout | None]:
+def _set_up(device: int, camera: RigCamera, label: str) -> tuple[ActualSettings, Layout | None]:
     """Set a camera to the settings of the rig; return its actual settings, and the layout of raw images."""
     offers = v4l2.list_formats(device)
     name = next((name for name in (*_JPEG, *RAW_FORMATS) if name in offers), None)
     if name is None:
-        raise SourceError(f"{where}: offers only {', '.join(offers)}; a camera that gives MJPG is needed")
+        raise SourceError(f"{label}: offers only {', '.join(offers)}; a camera that gives MJPG is needed")
     requested = v4l2.Format(type=v4l2.VIDEO_CAPTURE, pixelformat=v4l2.fourcc(name))
     requested.width, requested.height = camera.width or 1920, camera.height or 1080
-    format = v4l2.call(device, v4l2.S_FMT, requested)
+    format = v4l2.send_request(device, v4l2.S_FMT, requested)
     if format.pixelformat != v4l2.fourcc(name):
         raise SourceError(
-            f"{where}: does not give {name} at {camera.width} x {camera.height}; take another size"
+            f"{label}: does not give {name} at {camera.width} x {camera.height}; take another size"
         )
     if camera.exposure_s is not None:
         _control(device, _SLOWER_IN_THE_DARK, 0)
@@ -161,7 +169,7 @@ def _set_up(device: int, camera: RigCamera, where: str) -> tuple[Given, Layout |
     exposure = _control(device, _EXPOSURE, exposure)
     for auto, value in ((_AUTO_FOCUS, camera.focus), (_AUTO_GAIN, camera.gain)):
         _control(device, auto, None if value is None else 0)
-    actual = Given(
+    actual = ActualSettings(
         format.width,
         format.height,
         _set_rate(device, camera.rate_hz),
@@ -178,10 +186,10 @@ def _set_up(device: int, camera: RigCamera, where: str) -> tuple[Given, Layout |
 def _set_rate(device: int, rate_hz: float | None) -> float | None:
     """Set the frame rate, and return the actual rate in Hz; None if the driver does not give it."""
     try:
-        parameters = v4l2.call(device, v4l2.G_PARM, v4l2.StreamParameters(type=v4l2.VIDEO_CAPTURE))
+        parameters = v4l2.send_request(device, v4l2.G_PARM, v4l2.StreamParameters(type=v4l2.VIDEO_CAPTURE))
         if rate_hz is not None and parameters.capability & v4l2.CAN_SET_RATE:
             parameters.numerator, parameters.denominator = 1000, round(1000 * rate_hz)
-            v4l2.call(device, v4l2.S_PARM, parameters)
+            v4l2.send_request(device, v4l2.S_PARM, parameters)
     except OSError as error:
         if error.errno not in (errno.EINVAL, errno.ENOTTY):
             raise
@@ -194,14 +202,14 @@ def _control(device: int, control: int, value: float | None) -> float | None:
     if value is None:
         return None
     try:
-        v4l2.call(device, v4l2.S_CTRL, v4l2.Control(control, round(value)))
+        v4l2.send_request(device, v4l2.S_CTRL, v4l2.Control(control, round(value)))
     except OSError as error:
         # The value is out of range, or the control is read-only or automatic.
         # The result is its present value.
         if error.errno not in (errno.EINVAL, errno.ERANGE, errno.EACCES, errno.EBUSY, errno.EIO, errno.EPERM):
             raise
     try:
-        return float(v4l2.call(device, v4l2.G_CTRL, v4l2.Control(control)).value)
+        return float(v4l2.send_request(device, v4l2.G_CTRL, v4l2.Control(control)).value)
     except OSError as error:
         if error.errno not in (errno.EINVAL, errno.EACCES, errno.EIO):
             raise
@@ -211,10 +219,10 @@ def _control(device: int, control: int, value: float | None) -> float | None:
 def _map_buffers(device: int, stack: ExitStack) -> list[mmap.mmap]:
     """Map the driver's frame buffers into memory, and give them to the driver, empty."""
     kind = {"type": v4l2.VIDEO_CAPTURE, "memory": v4l2.MMAP}
-    granted = v4l2.call(device, v4l2.REQBUFS, v4l2.RequestBuffers(count=_BUFFERS, **kind))
+    granted = v4l2.send_request(device, v4l2.REQBUFS, v4l2.RequestBuffers(count=_BUFFERS, **kind))
     buffers = []
     for index in range(granted.count):
-        buffer = v4l2.call(device, v4l2.QUERYBUF, v4l2.Buffer(index=index, **kind))
+        buffer = v4l2.send_request(device, v4l2.QUERYBUF, v4l2.Buffer(index=index, **kind))
         buffers.append(
             stack.enter_context(
                 mmap.mmap(
@@ -226,20 +234,20 @@ def _map_buffers(device: int, stack: ExitStack) -> list[mmap.mmap]:
                 )
             )
         )
-        v4l2.call(device, v4l2.QBUF, buffer)
+        v4l2.send_request(device, v4l2.QBUF, buffer)
     return buffers
 
 
 def _stop(device: int) -> None:
     try:
-        v4l2.call(device, v4l2.STREAMOFF, v4l2.Int(v4l2.VIDEO_CAPTURE))
+        v4l2.send_request(device, v4l2.STREAMOFF, v4l2.Int(v4l2.VIDEO_CAPTURE))
     except OSError:
         return  # a disconnected camera has stopped already
 
 
 class _Capture(NamedTuple):
     camera: RigCamera
-    where: str
+    label: str
     device: int
     buffers: list[mmap.mmap]
     layout: Layout | None
@@ -249,7 +257,7 @@ def _frames(capture: _Capture, clock: Clock, say: Say) -> Iterator[Frame | None]
     heard_ns, reported = clock.now_ns(), False
     last: int | None = None
     while True:
-        with _faults(capture.where):
+        with _faults(capture.label):
             buffer = _next_buffer(capture.device)
         if buffer is None:
             _check_heard(capture, clock.now_ns() - heard_ns)
@@ -261,8 +269,8 @@ def _frames(capture: _Capture, clock: Clock, say: Say) -> Iterator[Frame | None]
         stamped = buffer.flags & v4l2.STAMP_CLOCK == v4l2.STAMP_MONOTONIC
         stamp_ns = buffer.seconds * NS_PER_S + buffer.microseconds * 1000
         data = capture.buffers[buffer.index][: buffer.bytesused]
-        with _faults(capture.where):
-            v4l2.call(capture.device, v4l2.QBUF, buffer)
+        with _faults(capture.label):
+            v4l2.send_request(capture.device, v4l2.QBUF, buffer)
         # The driver returns a frame that it cannot decode as an empty buffer.
         if data and capture.layout is not None:
             data = encode_raw(data, capture.layout) or b""
@@ -273,13 +281,13 @@ def _frames(capture: _Capture, clock: Clock, say: Say) -> Iterator[Frame | None]
             yield None
         else:
             missed, last = _missed(last, buffer.sequence), buffer.sequence
-            yield Frame(data, "jpeg", clock.of_monotonic_ns(stamp_ns) if stamped else None, missed)
+            yield Frame(data, "jpeg", clock.to_utc_ns(stamp_ns) if stamped else None, missed)
             heard_ns = clock.now_ns()
 
 
 def _check_heard(capture: _Capture, silent_ns: int) -> None:
     if silent_ns > _SILENT_S * NS_PER_S:
-        raise SourceError(f"{capture.where}: sends no frames; plug it in anew, or into another USB port")
+        raise SourceError(f"{capture.label}: sends no frames; plug it in anew, or into another USB port")
 
 
 def _missed(last: int | None, sequence: int) -> int:
@@ -292,7 +300,7 @@ def _next_buffer(device: int) -> v4l2.Buffer | None:
     """Return the next buffer with a frame; None if no frame arrives in time."""
     select.select([device], [], [], _TURN_S)
     try:
-        return v4l2.call(device, v4l2.DQBUF, v4l2.Buffer(type=v4l2.VIDEO_CAPTURE, memory=v4l2.MMAP))
+        return v4l2.send_request(device, v4l2.DQBUF, v4l2.Buffer(type=v4l2.VIDEO_CAPTURE, memory=v4l2.MMAP))
     except BlockingIOError:
         return None
 

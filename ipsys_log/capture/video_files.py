@@ -34,13 +34,21 @@ if TYPE_CHECKING:
     from av.container import InputContainer
     from av.video.stream import VideoStream
 
-__all__ = ["Timed", "check_played", "file_of", "frame_payload", "open_played", "open_video", "read_videos"]
+__all__ = [
+    "TimedFrame",
+    "check_playback_source",
+    "frame_payload",
+    "open_playback",
+    "open_video",
+    "read_videos",
+    "split_source",
+]
 
 _QUALITY = 95
 _RATE_HZ = 30
 
 
-class Timed(NamedTuple):
+class TimedFrame(NamedTuple):
     """A frame of a video, ``since_ns`` after the start of the video."""
 
     since_ns: int
@@ -49,7 +57,7 @@ class Timed(NamedTuple):
 
 
 @contextmanager
-def open_video(path: Path, say: Say) -> Iterator[Iterator[Timed]]:
+def open_video(path: Path, say: Say) -> Iterator[Iterator[TimedFrame]]:
     """Open a video file, and yield its frames; the packets are unchanged.
 
     A log cannot hold frames that need later frames (B-frames), or other codecs than MJPEG, H.264 and H.265.
@@ -81,7 +89,7 @@ def open_video(path: Path, say: Say) -> Iterator[Iterator[Timed]]:
         yield _guarded(path, frames)
 
 
-def _guarded(path: Path, frames: Iterator[Timed]) -> Iterator[Timed]:
+def _guarded(path: Path, frames: Iterator[TimedFrame]) -> Iterator[TimedFrame]:
     with _faults(path):
         yield from frames
 
@@ -96,18 +104,18 @@ def _faults(path: Path) -> Iterator[None]:
         raise SourceError(f"{path}: cannot be read as a video: {error.strerror}") from error
 
 
-def _passed(container: InputContainer, stream: VideoStream, name: str) -> Iterator[Timed]:
+def _passed(container: InputContainer, stream: VideoStream, name: str) -> Iterator[TimedFrame]:
     start: int | None = None
     for index, packet in enumerate(pass_through(container.demux(stream), stream)):
         if packet.pts is None or packet.time_base is None:
             # A stream without a container has no times, only a rate.
-            yield Timed(round(index * NS_PER_S / (stream.guessed_rate or _RATE_HZ)), bytes(packet), name)
+            yield TimedFrame(round(index * NS_PER_S / (stream.guessed_rate or _RATE_HZ)), bytes(packet), name)
             continue
         start = packet.pts if start is None else start
-        yield Timed(round((packet.pts - start) * packet.time_base * NS_PER_S), bytes(packet), name)
+        yield TimedFrame(round((packet.pts - start) * packet.time_base * NS_PER_S), bytes(packet), name)
 
 
-def _encoded(container: InputContainer, stream: VideoStream) -> Iterator[Timed]:
+def _encoded(container: InputContainer, stream: VideoStream) -> Iterator[TimedFrame]:
     start: int | None = None
     stream.codec_context.options = {"max_pixels": str(MAX_PIXELS)}
     for image in container.decode(stream):
@@ -116,7 +124,7 @@ def _encoded(container: InputContainer, stream: VideoStream) -> Iterator[Timed]:
         start = image.pts if start is None else start
         pixels = np.ascontiguousarray(image.to_ndarray(format="rgb24"))
         data = simplejpeg.encode_jpeg(pixels, quality=_QUALITY, colorsubsampling="422")
-        yield Timed(round((image.pts - start) * image.time_base * NS_PER_S), data, "jpeg")
+        yield TimedFrame(round((image.pts - start) * image.time_base * NS_PER_S), data, "jpeg")
 
 
 def frame_payload(time_ns: int, camera: str, data: bytes, format: str) -> CompressedImage | CompressedVideo:
@@ -175,7 +183,7 @@ _TURN_S = 0.4
 
 
 @contextmanager
-def open_played(camera: RigCamera, clock: Clock, say: Say) -> Iterator[Iterator[Frame | None]]:
+def open_playback(camera: RigCamera, clock: Clock, say: Say) -> Iterator[Iterator[Frame | None]]:
     """Open a file as a live camera; an :data:`~ipsys_log.capture.frames.Open`.
 
     Each frame arrives at its time since the first frame.
@@ -192,7 +200,7 @@ def open_played(camera: RigCamera, clock: Clock, say: Say) -> Iterator[Iterator[
     SourceError
         The file cannot be read, or a log has no such camera.
     """
-    path, camera_name = check_played(camera)
+    path, camera_name = check_playback_source(camera)
     if path.suffix != ".mcap":
         with open_video(path, say) as frames:
             yield _play(frames, clock)
@@ -205,26 +213,26 @@ def open_played(camera: RigCamera, clock: Clock, say: Say) -> Iterator[Iterator[
         yield _play(_recorded(session, topic), clock)
 
 
-def check_played(camera: RigCamera) -> tuple[Path, str]:
-    """Check that the file of a source exists; return the file and the camera in it (see :func:`file_of`).
+def check_playback_source(camera: RigCamera) -> tuple[Path, str]:
+    """Check that the file of a source exists; return both (see :func:`split_source`).
 
     Raises
     ------
     SourceError
         The file does not exist.
     """
-    path, camera_name = file_of(camera.source or "")
+    path, camera_name = split_source(camera.source or "")
     if not path.is_file():
         raise SourceError(f"camera {camera.name}: {path}: there is no such file")
     return path, camera_name
 
 
-def file_of(source: str) -> tuple[Path, str]:
+def split_source(source: str) -> tuple[Path, str]:
     """Split a source into its file and the requested camera of this file (an empty string if none).
 
     Examples
     --------
-    >>> path, camera = file_of("file:session.mcap?red")
+    >>> path, camera = split_source("file:session.mcap?red")
     >>> path.name, camera
     ('session.mcap', 'red')
     """
@@ -232,17 +240,17 @@ def file_of(source: str) -> tuple[Path, str]:
     return Path(name), camera_name
 
 
-def _recorded(session: Session, topic: str) -> Iterator[Timed]:
+def _recorded(session: Session, topic: str) -> Iterator[TimedFrame]:
     start_ns: int | None = None
     for message in session.messages([topic]):
         if not isinstance(message.payload, (CompressedImage, CompressedVideo)):
             raise SourceError(f"{session}: {topic}: its pictures are not compressed; only such are played")
         start_ns = message.publish_time_ns if start_ns is None else start_ns
         since_ns = message.publish_time_ns - start_ns
-        yield Timed(since_ns, message.payload.data, message.payload.format)
+        yield TimedFrame(since_ns, message.payload.data, message.payload.format)
 
 
-def _play(frames: Iterator[Timed], clock: Clock) -> Iterator[Frame | None]:
+def _play(frames: Iterator[TimedFrame], clock: Clock) -> Iterator[Frame | None]:
     start_ns = clock.now_ns()
     for since_ns, data, format in frames:
         while (left_s := (start_ns + since_ns - clock.now_ns()) / NS_PER_S) > 0:

@@ -17,7 +17,7 @@ if TYPE_CHECKING:
     from av.packet import Packet
     from av.video.stream import VideoStream
 
-__all__ = ["can_begin", "find_size", "find_video", "name_format", "pass_through"]
+__all__ = ["find_size", "find_video", "is_decodable_start", "name_format", "pass_through"]
 
 # FFmpeg's name of a codec, and the name in the log.
 _FORMATS = {"mjpeg": "jpeg", "h264": "h264", "hevc": "h265"}
@@ -27,13 +27,13 @@ _UNIT = re.compile(rb"\x00\x00\x01(.)", re.DOTALL)
 _SINGLE = ("image2", "jpeg_pipe", "png_pipe")
 
 
-def find_video(container: InputContainer, where: str) -> VideoStream:
+def find_video(container: InputContainer, label: str) -> VideoStream:
     """Return the video stream of a container.
 
     Parameters
     ----------
     container : container that PyAV opened.
-    where : first words of the error text.
+    label : first words of the error text.
 
     Raises
     ------
@@ -41,10 +41,10 @@ def find_video(container: InputContainer, where: str) -> VideoStream:
         The container has no video, or only a single image.
     """
     if not container.streams.video:
-        raise SourceError(f"{where}: is not video; give the address of the camera's picture stream")
+        raise SourceError(f"{label}: is not video; give the address of the camera's picture stream")
     stream = container.streams.video[0]
     if container.format.name in _SINGLE:
-        raise SourceError(f"{where}: is a single picture; give the address of the camera's stream")
+        raise SourceError(f"{label}: is a single picture; give the address of the camera's stream")
     return stream
 
 
@@ -113,17 +113,17 @@ def _find_video_size(frame: Frame) -> tuple[int, int] | None:
     return (decoder.width, decoder.height) if decoder.width else None
 
 
-def can_begin(frame: Frame) -> bool:
+def is_decodable_start(frame: Frame) -> bool:
     """Return whether a frame from :func:`pass_through` can be decoded without earlier frames."""
     return frame.format not in ("h264", "h265") or _has_parameters(frame.data, frame.format == "h265")
 
 
-def _has_parameters(data: bytes | memoryview, wide: bool) -> bool:
-    """Return whether a frame in Annex B (H.265 if ``wide``) has the parameter sets before its image."""
+def _has_parameters(data: bytes | memoryview, is_h265: bool) -> bool:
+    """Return whether a frame in Annex B (H.265 if ``is_h265``) has the parameter sets before its image."""
     for match in _UNIT.finditer(data):
-        kind = match[1][0] >> 1 & 0x3F if wide else match[1][0] & 0x1F
-        if kind == (33 if wide else 7):  # the sequence parameter set
+        kind = match[1][0] >> 1 & 0x3F if is_h265 else match[1][0] & 0x1F
+        if kind == (33 if is_h265 else 7):  # the sequence parameter set
             return True
-        if kind < 32 if wide else kind <= 5:  # a slice of the image
+        if kind < 32 if is_h265 else kind <= 5:  # a slice of the image
             return False
     return False

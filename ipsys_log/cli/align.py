@@ -9,7 +9,7 @@ from typing import TYPE_CHECKING, Annotated, Any, Optional
 import typer
 
 from ipsys_log.cli.console import console, remarks
-from ipsys_log.cli.open_cameras import Lab, check_target, prepared, recorded_now
+from ipsys_log.cli.open_cameras import Lab, check_target, prepare_lab, record_now
 from ipsys_log.cli.options import (
     AsJson,
     Calibrations,
@@ -19,7 +19,7 @@ from ipsys_log.cli.options import (
     load_calibrations,
     log_option,
 )
-from ipsys_log.cli.stages import derived
+from ipsys_log.cli.stages import derive
 
 if TYPE_CHECKING:
     from ipsys_log.report.alignment import AlignedLab
@@ -78,8 +78,8 @@ def align(
         }
         _align(logs, options, plot, as_json)
         return
-    lab = _prepared_now(rig, calibration, corners, output)
-    with recorded_now(lab, seconds, output) as log:
+    lab = _prepare_now(rig, calibration, corners, output)
+    with record_now(lab, seconds, output) as log:
         kept = output is not None
         options = {"rig": None, "calibration": None, "corners": corners, "kept": kept}
         _align([log], options, plot, as_json)
@@ -87,7 +87,7 @@ def align(
         remarks.print("nothing is kept; -o name.mcap keeps the frames and what was found", markup=False)
 
 
-def _prepared_now(
+def _prepare_now(
     rig: Path | None, calibration: list[str] | None, corners: str | None, output: Path | None
 ) -> Lab:
     """Return the cameras to open, after all checks that are possible before they are opened."""
@@ -97,7 +97,7 @@ def _prepared_now(
 
     if rig is None:
         raise IpsysError("name a log, or give --rig lab.toml to take what its cameras send now")
-    lab = prepared(rig, None, calibration)
+    lab = prepare_lab(rig, None, calibration)
     check_start(lab.rig, lab.names, lab.lenses, Request(corners=corners), "camera-frame")
     if output is not None:
         check_target(output, False, lab.files)
@@ -117,7 +117,7 @@ def _align(logs: list[Path], options: dict[str, Any], plot: Path | None, as_json
     with Session(logs) as session:
         bare = not session.images and newest_run(session, MARKERS) is None
     method = "perimeter" if bare else "pose"
-    with derived(logs, "camera-frame", method=method, run=None, **options) as (session, outcomes, _):
+    with derive(logs, "camera-frame", method=method, run=None, **options) as (session, outcomes, _):
         made = [outcome.run for outcome in outcomes if outcome.stage == "camera-frame"]
         run = made[-1] if made else str(newest_run(session, CAMERA_POINTS))
         recorded_lenses = {

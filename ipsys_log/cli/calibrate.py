@@ -11,7 +11,7 @@ from typing import TYPE_CHECKING, Annotated, Any, Optional
 import typer
 
 from ipsys_log.cli.console import console, progress_bar, remarks, say
-from ipsys_log.cli.open_cameras import SENT_NOW, Lab, prepared, recorded_now
+from ipsys_log.cli.open_cameras import SENT_NOW, Lab, prepare_lab, record_now
 from ipsys_log.cli.options import AsJson
 from ipsys_log.cli.signals import note_kept, say_kept
 
@@ -128,10 +128,10 @@ def calibrate(
     if plot is not None:
         check_figure_file(plot, "--plot", sources or [])
         _check_free(plot, force)
-    lab = None if sources else _prepared_now(rig, camera, board)
+    lab = None if sources else _prepare_now(rig, camera, board)
     if lab is not None:
         _targets(lab.names, output, names, force)
-    with nullcontext(sources or []) if lab is None else _taken_now(lab, seconds) as taken:
+    with nullcontext(sources or []) if lab is None else _record_now(lab, seconds) as taken:
         image_sources = find_sources(taken, camera or [])
         targets = _targets([pictures.camera for pictures in image_sources], output, names, force)
         with progress_bar() as progress:
@@ -197,7 +197,7 @@ def _json(outcome: CalibrationResult | Failure, targets: dict[str, dict[str, Pat
     return {**calibration_json(outcome), "files": [str(path) for path in targets[outcome.camera].values()]}
 
 
-def _prepared_now(rig: Path | None, only: list[str] | None, board: str) -> Lab:
+def _prepare_now(rig: Path | None, only: list[str] | None, board: str) -> Lab:
     """Return the cameras to calibrate; simulated ones show the calibration board."""
     from ipsys_log.capture.simulated import show_board
     from ipsys_log.errors import IpsysError
@@ -207,17 +207,17 @@ def _prepared_now(rig: Path | None, only: list[str] | None, board: str) -> Lab:
             "name pictures, a video or a log of a board, or give --rig lab.toml to take what its cameras "
             "send now"
         )
-    lab = prepared(rig, only, None, with_lenses=False)
+    lab = prepare_lab(rig, only, None, with_lenses=False)
     return lab._replace(cameras=[show_board(camera, board) for camera in lab.cameras])
 
 
 @contextmanager
-def _taken_now(lab: Lab, seconds: float) -> Iterator[list[Path]]:
+def _record_now(lab: Lab, seconds: float) -> Iterator[list[Path]]:
     say(
         "move the board through all of each picture, tilted this way and that, and hold it still; "
         "the frames are not kept"
     )
-    with recorded_now(lab, seconds) as log:
+    with record_now(lab, seconds) as log:
         yield [log]
 
 
@@ -246,9 +246,9 @@ def _targets(cameras: list[str], output: Path, formats: list[str], force: bool) 
 
 def _check_free(path: Path, force: bool) -> None:
     from ipsys_log.errors import IpsysError
-    from ipsys_log.log.lock import dangling
+    from ipsys_log.log.lock import describe_broken_link
 
-    if (text := dangling(path)) is not None:
+    if (text := describe_broken_link(path)) is not None:
         raise IpsysError(text)
     if path.exists() and not force:
         raise IpsysError(f"{path}: exists already; choose another --output, or give --force to write over it")

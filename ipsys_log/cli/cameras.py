@@ -13,7 +13,7 @@ from ipsys_log.cli.console import console
 from ipsys_log.cli.options import AsJson
 
 if TYPE_CHECKING:
-    from ipsys_log.capture.usb_bus import Attached
+    from ipsys_log.capture.usb_bus import UsbCamera
 
 __all__ = ["add_commands"]
 
@@ -36,7 +36,7 @@ def cameras(
     """List the cameras attached by USB: device, modes, bus and hub; and whether USB carries them all at once.
 
     Without a rig that is reckoned with each at its largest mode. Cameras on the network are not listed."""
-    from ipsys_log.capture.usb_bus import advise, demands_of
+    from ipsys_log.capture.usb_bus import advise, list_demands
     from ipsys_log.errors import IpsysError
     from ipsys_log.rig.file import load_rig
 
@@ -45,7 +45,7 @@ def cameras(
     from ipsys_log.capture.usb_bus import find_cameras
 
     attached = find_cameras()
-    advice = advise(demands_of(attached, load_rig(rig) if rig else None))
+    advice = advise(list_demands(attached, load_rig(rig) if rig else None))
     if as_json:
         print(json.dumps({"cameras": [_plain(camera) for camera in attached], "advice": advice}, indent=2))  # noqa: T201
         return
@@ -57,12 +57,12 @@ def cameras(
         console.print(line, markup=False)
 
 
-def _plain(camera: Attached) -> dict[str, Any]:
+def _plain(camera: UsbCamera) -> dict[str, Any]:
     plug = camera.plug._asdict() if camera.plug else None
     return camera._asdict() | {"plug": plug, "modes": [mode._asdict() for mode in camera.modes]}
 
 
-def _describe(camera: Attached) -> str:
+def _describe(camera: UsbCamera) -> str:
     lines = [f'{camera.name}: source = "usb:{camera.stable or camera.device}"']
     if camera.stable:
         lines.append(f"  {camera.device}")

@@ -142,21 +142,25 @@ def ask_places(scene: MeasuringScene) -> None:
     console.print(HELP, style="dim", markup=False)
     active = active_measurements(scene.history())
     saved: list[str] = []
-    left: list[int | None] = [n for n, stop in enumerate(scene.stops) if not any(map(stop.covers, active))]
-    if not scene.stops:
+    left: list[int | None] = [
+        n for n, interval in enumerate(scene.intervals) if not any(map(interval.covers, active))
+    ]
+    if not scene.intervals:
         left = [None]
     while left:
         outcome = _ask_place(scene, left[0], saved)
         if outcome == "q":
             return
         if not isinstance(outcome, str):  # it was undone: ask for its stationary interval again
-            left[:0] = [n for n, stop in enumerate(scene.stops) if stop.covers(outcome) and n not in left]
-        elif scene.stops:
+            left[:0] = [
+                n for n, interval in enumerate(scene.intervals) if interval.covers(outcome) and n not in left
+            ]
+        elif scene.intervals:
             del left[0]
     console.print("no more places in this log")
 
 
-def _ask_place(scene: MeasuringScene, stop: int | None, saved: list[str]) -> str | Measurement:
+def _ask_place(scene: MeasuringScene, interval: int | None, saved: list[str]) -> str | Measurement:
     """Ask until a point is measured or skipped; return ``s``, ``q`` to end, or the undone measurement.
 
     ``saved`` has the ids that this session has measured, the newest last.
@@ -164,7 +168,7 @@ def _ask_place(scene: MeasuringScene, stop: int | None, saved: list[str]) -> str
     typed: TypedEntry | None = None
     while True:
         try:
-            typed = _measure(scene, stop, typed, saved)
+            typed = _measure(scene, interval, typed, saved)
             if typed is None:
                 return "s"
         except LetterError as left:
@@ -180,16 +184,16 @@ def _ask_place(scene: MeasuringScene, stop: int | None, saved: list[str]) -> str
 
 
 def _measure(
-    scene: MeasuringScene, stop: int | None, before: TypedEntry | None, saved: list[str]
+    scene: MeasuringScene, interval: int | None, before: TypedEntry | None, saved: list[str]
 ) -> TypedEntry | None:
     """Ask for one point and append it; return the typed texts if the point must be asked for again."""
     from ipsys_log.errors import IpsysError
 
-    typed = _ask_point(scene, stop, before)
+    typed = _ask_point(scene, interval, before)
     while True:
-        checked = _check(scene, stop, typed)
+        checked = _check(scene, interval, typed)
         _show(checked)
-        if checked.faults and stop is None and {fault.field for fault in checked.faults} == {"marker"}:
+        if checked.faults and interval is None and {fault.field for fault in checked.faults} == {"marker"}:
             answer("Enter looks again")
             continue
         if checked.measurement is None:
@@ -198,7 +202,7 @@ def _measure(
         if not agreed(f"save {checked.id}{' all the same' if doubtful else ''}?", not doubtful):
             return typed
         # The marker may have stopped or moved while the user read the question.
-        now = _check(scene, stop, typed)
+        now = _check(scene, interval, typed)
         if now.measurement is None:
             continue
         try:
@@ -211,31 +215,33 @@ def _measure(
         return None
 
 
-def _check(scene: MeasuringScene, stop: int | None, typed: TypedEntry) -> EntryCheck:
+def _check(scene: MeasuringScene, interval: int | None, typed: TypedEntry) -> EntryCheck:
     from ipsys_log.survey.checks import check_entry
     from ipsys_log.survey.entry import parse_entry
     from ipsys_log.survey.scene import observe_marker
 
     entry, faults = parse_entry(typed, scene.rig)
-    sight = None if entry.marker_id is None else observe_marker(scene.views(stop), entry.marker_id)
-    return check_entry(entry, faults, scene.rig, sight, scene.history(), scene.model)
+    observations = None if entry.marker_id is None else observe_marker(scene.views(interval), entry.marker_id)
+    return check_entry(entry, faults, scene.rig, observations, scene.history(), scene.model)
 
 
-def _ask_point(scene: MeasuringScene, stop: int | None, before: TypedEntry | None) -> TypedEntry:
+def _ask_point(scene: MeasuringScene, interval: int | None, before: TypedEntry | None) -> TypedEntry:
     from ipsys_log.survey.scene import observe_marker, visible_markers
 
     console.print()
-    if stop is None:
+    if interval is None:
         visible = visible_markers(scene.views(None), scene.rig)
         console.print(f"markers seen: {', '.join(map(str, visible)) or 'none'}", markup=False)
         usual = before.marker if before else str(visible[0]) if len(visible) == 1 else ""
         marker = ask_marker(scene.rig, usual)
     else:
-        interval = scene.stops[stop]
-        marker = str(interval.marker_id)
-        console.print(f"Place {stop + 1} of {len(scene.stops)}", style="bold")
-    sight = observe_marker(scene.views(stop), int(marker))
-    console.print(sight.text, style="green" if sight.state == "still" else "yellow", markup=False)
+        stationary = scene.intervals[interval]
+        marker = str(stationary.marker_id)
+        console.print(f"Place {interval + 1} of {len(scene.intervals)}", style="bold")
+    observations = observe_marker(scene.views(interval), int(marker))
+    console.print(
+        observations.text, style="green" if observations.state == "still" else "yellow", markup=False
+    )
     return ask_numbers(scene.rig, marker, before)
 
 

@@ -27,7 +27,7 @@ def imsel(
     folder: Annotated[Path, typer.Argument(help="The authors' data, or a clone of their repository.")],
     output: NewLog,
 ) -> None:
-    """The measurements behind the paper (Ou et al., Robotica 2023): .mat files and camera YAMLs."""
+    """Import the measurements behind the paper (Ou et al., Robotica 2023): .mat files and camera YAMLs."""
     _refuse_log(folder)
     from ipsys_log.exchange.imsel import read_imsel
     from ipsys_log.runs.output import write_log
@@ -53,7 +53,7 @@ def images(
         ),
     ] = None,
 ) -> None:
-    """A folder of pictures, one sub-folder per camera; without --times the n-th of each belong together."""
+    """Import a folder of images, one sub-folder per camera; without --times the n-th of each belong together."""
     from ipsys_log.cli.options import load_calibrations, load_matching_rig
     from ipsys_log.exchange.image_folders import find_images, find_times, read_images
     from ipsys_log.runs.output import write_log

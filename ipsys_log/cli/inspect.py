@@ -10,7 +10,7 @@ import typer
 
 from ipsys_log.cli.console import console, print_outcomes, progress_bar, remarks, say
 from ipsys_log.cli.options import AsJson, Logs
-from ipsys_log.cli.stages import EVALUATE, MORE, build_command, derived, options_of
+from ipsys_log.cli.stages import EVALUATE, MORE, build_command, derive, options_of
 
 __all__ = ["add_commands"]
 
@@ -139,6 +139,6 @@ def _report(logs: list[Path], output: Path | None, html: Path | None, **given: A
 
     target = html or (output or logs[-1]).with_suffix(".html")
     check_file(target, "--html", [*logs, *([output] if output else [])])
-    with derived(logs, "evaluate", output, **given) as (session, _, accuracies):
+    with derive(logs, "evaluate", output, **given) as (session, _, accuracies):
         write_files(target.parent, {target.name: render_report(session, accuracies).encode()})
     console.print(f"{target} written: open it in a browser", markup=False)

@@ -11,11 +11,11 @@ from time import sleep
 from typing import TYPE_CHECKING, Any
 
 from ipsys_log.cli.console import console, remarks
-from ipsys_log.cli.open_cameras import MODEL, Lab, check_target, opened, prepared
+from ipsys_log.cli.open_cameras import MODEL, Lab, check_target, open_cameras, prepare_lab
 from ipsys_log.cli.signals import allow_interrupt, suppress_interrupt
 
 if TYPE_CHECKING:
-    from ipsys_log.capture.multiplexer import Attached
+    from ipsys_log.capture.multiplexer import LiveCameras
     from ipsys_log.messages import Measurement, Message, Model
     from ipsys_log.runs.options import Request
     from ipsys_log.survey.live import LiveScene
@@ -45,7 +45,7 @@ def measure_now(
     from ipsys_log.runs.options import Request
     from ipsys_log.sinks.sink import Consumer
 
-    lab, request = prepared(rig, camera, calibration), Request(corners=corners)
+    lab, request = prepare_lab(rig, camera, calibration), Request(corners=corners)
     read = lab.files if model_from is None else [*lab.files, (MODEL, model_from)]
     check_target(output, force, read)
     model = ready_to_measure(lab, request, model_from)
@@ -55,7 +55,7 @@ def measure_now(
         check_port_free(host, port)
     ends = "q" if terminal else "Ctrl-C"
     doing = f"measuring into {output}; {ends} ends it"
-    with opened(lab, output, None, doing, not terminal) as (cameras, settings, status):
+    with open_cameras(lab, output, None, doing, not terminal) as (cameras, settings, status):
         scene = live_scene(settings, cameras, model)
         consumers: list[Consumer] = [status, scene]
         work = partial(pipeline.measure, cameras, settings, output, request, consumers, force)
@@ -84,7 +84,7 @@ def ready_to_measure(lab: Lab, request: Request, model_from: Path | None) -> Mod
     return model
 
 
-def live_scene(settings: list[Message], cameras: Attached, model: Model | None) -> LiveScene:
+def live_scene(settings: list[Message], cameras: LiveCameras, model: Model | None) -> LiveScene:
     """Make the scene of the live cameras, for measuring."""
     from ipsys_log.survey.live import LiveScene
 
@@ -115,7 +115,7 @@ def say_faults(page: PageServer) -> None:
         remarks.print(page.exceptions.first, markup=False, highlight=False)
 
 
-def _ask_beside(work: Callable[[], Any], scene: LiveScene, cameras: Attached) -> None:
+def _ask_beside(work: Callable[[], Any], scene: LiveScene, cameras: LiveCameras) -> None:
     """Ask in the terminal while the work runs in a thread, and stop the cameras after that."""
     from ipsys_log.cli.dialog import ask_places
 

@@ -20,7 +20,7 @@ from ipsys_log.units import format_bytes
 
 if TYPE_CHECKING:
     from ipsys_log.capture.disk import DiskRoom
-    from ipsys_log.capture.multiplexer import Attached
+    from ipsys_log.capture.multiplexer import LiveCameras
     from ipsys_log.messages import CameraCalibration, Message, Rig, RigCamera
     from ipsys_log.report.cameras import LiveStatus
 
@@ -29,9 +29,9 @@ __all__ = [
     "SENT_NOW",
     "Lab",
     "check_target",
-    "opened",
-    "prepared",
-    "recorded_now",
+    "open_cameras",
+    "prepare_lab",
+    "record_now",
 ]
 
 
@@ -56,7 +56,7 @@ class Lab(NamedTuple):
         return [camera.name for camera in self.cameras]
 
 
-def prepared(
+def prepare_lab(
     rig: Path, only: list[str] | None, calibration: list[str] | None, with_lenses: bool = True
 ) -> Lab:
     """Return the cameras of a rig file; no camera is opened yet.
@@ -87,14 +87,14 @@ def prepared(
 
 
 def _files(rig: Path, cameras: list[RigCamera], calibration: list[str] | None) -> list[tuple[str, Path]]:
-    from ipsys_log.capture.video_files import file_of
+    from ipsys_log.capture.video_files import split_source
 
     files = [("a calibration", Path(option.rpartition("=")[2])) for option in calibration or ()]
     for camera in cameras:
         if camera.calibration is not None:
             files.append((f"the lens of camera {camera.name}", rig.parent / camera.calibration))
         if str(camera.source).startswith("file:"):
-            files.append((f"what camera {camera.name} plays", file_of(str(camera.source))[0]))
+            files.append((f"what camera {camera.name} plays", split_source(str(camera.source))[0]))
     return files
 
 
@@ -135,14 +135,14 @@ def check_target(output: Path, force: bool, files: Iterable[tuple[str, Path]]) -
 
 
 @contextmanager
-def opened(
+def open_cameras(
     lab: Lab,
     output: Path,
     seconds: float | None,
     doing: str | None = None,
     panel: bool = True,
     until_stopped: bool = True,
-) -> Iterator[tuple[Attached, list[Message], LiveStatus]]:
+) -> Iterator[tuple[LiveCameras, list[Message], LiveStatus]]:
     """Open the cameras; yield them, the first messages of the log, and the status on the screen.
 
     Parameters
@@ -159,21 +159,21 @@ def opened(
     from ipsys_log.capture.devices import open_source
     from ipsys_log.capture.disk import expected_bytes_per_s, free_room
     from ipsys_log.capture.frames import Clock
-    from ipsys_log.capture.multiplexer import Attached
+    from ipsys_log.capture.live_check import CameraMonitor
+    from ipsys_log.capture.multiplexer import LiveCameras
     from ipsys_log.capture.recorder import first_messages, fitting_lenses
-    from ipsys_log.capture.status import Monitor
     from ipsys_log.report.cameras import LiveStatus
 
     with ExitStack() as stack:
         with remarks.status("opening " + ", ".join(lab.names)):
-            attached = stack.enter_context(Attached(lab.cameras, open_source, Clock(), say))
+            attached = stack.enter_context(LiveCameras(lab.cameras, open_source, Clock(), say))
         sizes_px = {name: state.size_px for name, state in attached.states.items()}
         lenses = fitting_lenses(lab.lenses, sizes_px, say)
-        stack.enter_context(_ended(attached.stop, seconds, until_stopped))
+        stack.enter_context(_stop_after(attached.stop, seconds, until_stopped))
         expected = expected_bytes_per_s(lab.cameras, attached.states)
         # A log without a recording grows only with measured points.
         growing = None if doing and seconds is None else expected
-        monitor = stack.enter_context(Monitor(lab.rig))
+        monitor = stack.enter_context(CameraMonitor(lab.rig))
         status = LiveStatus(attached.states, monitor, output, monotonic, growing)
         _say_room(lab, attached, free_room(output, expected), seconds, doing)
         say(doing or f"recording into {output}; Ctrl-C ends it")
@@ -184,7 +184,9 @@ def opened(
         console.print(line, markup=False)
 
 
-def _say_room(lab: Lab, attached: Attached, room: DiskRoom, seconds: float | None, doing: str | None) -> None:
+def _say_room(
+    lab: Lab, attached: LiveCameras, room: DiskRoom, seconds: float | None, doing: str | None
+) -> None:
     """Print the expected size of the recording and how long the disk lasts, before it begins.
 
     If frames are taken only for some seconds, the text is printed only if the disk is too small for them.
@@ -201,7 +203,7 @@ def _say_room(lab: Lab, attached: Attached, room: DiskRoom, seconds: float | Non
 
 
 @contextmanager
-def _ended(stop: Callable[[], None], seconds: float | None, on_signal: bool = True) -> Iterator[None]:
+def _stop_after(stop: Callable[[], None], seconds: float | None, on_signal: bool = True) -> Iterator[None]:
     """Stop in order after some time, or on the first signal: messages that arrived before are written."""
     if on_signal:
         stop_on_signal(stop)
@@ -223,7 +225,7 @@ def _on_screen(status: LiveStatus) -> AbstractContextManager[object]:
 
 
 @contextmanager
-def recorded_now(lab: Lab, seconds: float, keep: Path | None = None) -> Iterator[Path]:
+def record_now(lab: Lab, seconds: float, keep: Path | None = None) -> Iterator[Path]:
     """Record the cameras for some seconds; without ``keep`` the log is deleted after the block.
 
     Raises
@@ -238,7 +240,7 @@ def recorded_now(lab: Lab, seconds: float, keep: Path | None = None) -> Iterator
         log = keep or Path(folder) / "now.mcap"
         doing = None if keep else f"looking for {seconds:g} s"
         try:
-            with opened(lab, log, seconds, doing, until_stopped=False) as (cameras, settings, status):
+            with open_cameras(lab, log, seconds, doing, until_stopped=False) as (cameras, settings, status):
                 pipeline.record(cameras, settings, log, [status])
         except Interrupted as interrupt:
             kept = (

@@ -12,7 +12,7 @@ import typer
 
 from ipsys_log.cli.console import console, remarks
 from ipsys_log.cli.options import AsJson, Calibrations, Logs, RigFile, cameras_of, load_calibrations
-from ipsys_log.cli.stages import derived
+from ipsys_log.cli.stages import derive
 
 if TYPE_CHECKING:
     from rich.table import Table
@@ -78,7 +78,7 @@ def plan(
     if plot is not None:
         check_figure_file(plot, "--plot", logs)
     options: dict[str, Any] = {"train": train, "rig": rig, "calibration": calibration, "run": None}
-    with derived(logs, "fit", model=[model], **options) as (session, outcomes, _):
+    with derive(logs, "fit", model=[model], **options) as (session, outcomes, _):
         fitted = [outcome.run for outcome in outcomes if outcome.stage == "fit"]
         run = fitted[-1] if fitted else str(copied_run(session, model))
         recorded_lenses = {

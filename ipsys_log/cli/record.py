@@ -8,7 +8,7 @@ from typing import TYPE_CHECKING, Annotated, Optional
 import typer
 
 from ipsys_log.cli.console import remarks, say
-from ipsys_log.cli.open_cameras import MODEL, check_target, opened, prepared
+from ipsys_log.cli.open_cameras import MODEL, check_target, open_cameras, prepare_lab
 from ipsys_log.cli.options import (
     Calibrations,
     Corners,
@@ -24,7 +24,7 @@ from ipsys_log.cli.options import (
 from ipsys_log.cli.signals import allow_interrupt, runs_until_stopped
 
 if TYPE_CHECKING:
-    from ipsys_log.capture.multiplexer import Attached
+    from ipsys_log.capture.multiplexer import LiveCameras
     from ipsys_log.messages import Message
     from ipsys_log.runs.options import Request
     from ipsys_log.sinks.rerun.live import LiveView
@@ -72,7 +72,7 @@ def record(
 
     if model_from is not None and not measure:
         raise IpsysError(f"--model-from {model_from}: has no effect without --measure; to track: ipsys live")
-    lab = prepared(rig, camera, calibration)
+    lab = prepare_lab(rig, camera, calibration)
     read = lab.files if model_from is None else [*lab.files, (MODEL, model_from)]
     check_target(output, force, read)
     request = Request(corners=corners)
@@ -83,7 +83,7 @@ def record(
         check_port_free(host, port)
     elif detect:
         check_start(lab.rig, lab.names, lab.lenses, request, "detect")
-    with opened(lab, output, seconds) as (cameras, settings, status):
+    with open_cameras(lab, output, seconds) as (cameras, settings, status):
         for name in sorted(set(lab.names) - set(lab.lenses)):
             text = (
                 f'camera {name} has no lens; a replay needs one: calibration = "{name}.yaml" in the rig file'
@@ -128,18 +128,18 @@ def live(
     from ipsys_log.capture.live_plan import check_start
     from ipsys_log.runs.options import Request
 
-    lab = prepared(rig, camera, calibration)
+    lab = prepare_lab(rig, camera, calibration)
     check_target(output, force, [*lab.files, (MODEL, model_from)])
     models = tuple(dict.fromkeys(model or ()))
     request = Request(models=models, model_from=model_from, corners=corners, method=method)
     for line in check_start(lab.rig, lab.names, lab.lenses, request, "fuse"):
         remarks.print(line, style="yellow", markup=False)
-    with opened(lab, output, seconds) as (cameras, settings, status):
+    with open_cameras(lab, output, seconds) as (cameras, settings, status):
         sinks = [_viewer(settings, cameras, request)] if view else []
         pipeline.live(cameras, settings, output, request, "fuse", [status], force, sinks)
 
 
-def _viewer(settings: list[Message], cameras: Attached, request: Request) -> LiveView:
+def _viewer(settings: list[Message], cameras: LiveCameras, request: Request) -> LiveView:
     from ipsys_log.runs.select import wanted_models
     from ipsys_log.sinks.rerun.live import LiveView
     from ipsys_log.stages.fit import model_run

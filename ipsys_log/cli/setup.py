@@ -110,7 +110,7 @@ def _write_new(texts: dict[Path, str]) -> None:
         A file exists.
     """
     from ipsys_log.errors import IpsysError
-    from ipsys_log.log.lock import dangling
+    from ipsys_log.log.lock import describe_broken_link
 
     made: list[Path] = []
     try:
@@ -123,7 +123,7 @@ def _write_new(texts: dict[Path, str]) -> None:
             path.unlink()
         if isinstance(error, FileExistsError):
             taken = Path(error.filename)
-            text = dangling(taken) or f"{taken}: exists already; edit it, or give another name"
+            text = describe_broken_link(taken) or f"{taken}: exists already; edit it, or give another name"
             raise IpsysError(text) from error
         raise
 

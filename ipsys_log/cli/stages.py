@@ -32,7 +32,7 @@ if TYPE_CHECKING:
     from ipsys_log.report.accuracy import Accuracy
     from ipsys_log.runs.provenance import Outcome
 
-__all__ = ["EVALUATE", "MORE", "add_commands", "build_command", "derived", "options_of"]
+__all__ = ["EVALUATE", "MORE", "add_commands", "build_command", "derive", "options_of"]
 
 _Path = Optional[Path]  # noqa: UP045
 
@@ -207,7 +207,7 @@ def _options(logs: list[Path], **given: Any) -> dict[str, Any]:
 
 
 @contextmanager
-def derived(
+def derive(
     logs: list[Path], until: str, output: Path | None = None, kept: bool = True, **given: Any
 ) -> Iterator[tuple[Session, list[Outcome], list[Accuracy]]]:
     """Run the stages up to ``until``; yield the session with the results, the outcomes, and the accuracy.
@@ -271,7 +271,7 @@ def _derive(
         check_figure_file(plot, "--plot", logs)
     if plots is not None:
         check_folder(plots, "--plots")
-    with derived(logs, until, **given) as (session, outcomes, accuracies):
+    with derive(logs, until, **given) as (session, outcomes, accuracies):
         drawn = _draw(session, accuracies, plot, plots)
     if as_json:
         _print_json(outcomes, accuracies)

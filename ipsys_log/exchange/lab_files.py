@@ -5,7 +5,7 @@ from __future__ import annotations
 from collections.abc import Collection, Mapping, Sequence
 from pathlib import Path
 
-from ipsys_log.capture.simulated import lens_of
+from ipsys_log.capture.simulated import intrinsics_of
 from ipsys_log.errors import IpsysError
 from ipsys_log.exchange.calibration_files import read_intrinsics
 from ipsys_log.messages import CameraCalibration, Rig, RigCamera
@@ -66,7 +66,7 @@ def load_lenses(
         if camera.name not in lenses and camera.calibration is not None:
             lenses[camera.name] = read_intrinsics(path.parent / camera.calibration, camera.name)
         elif camera.name not in lenses and str(camera.source).startswith("sim:"):
-            lenses[camera.name] = lens_of(camera)
+            lenses[camera.name] = intrinsics_of(camera)
     unknown = sorted(set(lenses) - set(names))
     if unknown:
         raise IpsysError(f"--calibration {unknown[0]}: no such camera is recorded (only {', '.join(names)})")

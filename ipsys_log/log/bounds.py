@@ -14,9 +14,9 @@ __all__ = [
     "LARGEST_CHUNK",
     "LARGEST_DEFINITION",
     "LARGEST_MESSAGE",
-    "Allowance",
     "BoundError",
-    "Items",
+    "PartCounter",
+    "ReadLimits",
     "chunk_excess",
 ]
 
@@ -58,7 +58,7 @@ def chunk_excess(packed: int, unpacked: int) -> str:
 
 
 @dataclass(slots=True)
-class Allowance:
+class ReadLimits:
     """The limits of the work for a file of `size` bytes. Each chunk counts once, even if it is read again."""
 
     size: int
@@ -68,27 +68,27 @@ class Allowance:
     _total_records: int = 0
 
     @property
-    def most_unpacked(self) -> int:
+    def max_unpacked(self) -> int:
         """The limit for all compressed chunks together, in bytes after decompression."""
         return _UNPACKED + _HIGHEST_RATIO * max(0, self.size - _MIB)
 
     @property
-    def most_records(self) -> int:
+    def max_records(self) -> int:
         """The limit for the number of records in chunks without a message index."""
         return _RECORDS + self.size // _BYTES_PER_RECORD
 
     @property
-    def most_channels(self) -> int:
+    def max_channels(self) -> int:
         """The limit for the number of channels; also for the number of schemas, and of runs."""
         return _CHANNELS + self.size // _BYTES_PER_CHANNEL
 
     @property
-    def most_payload(self) -> int:
+    def max_payload(self) -> int:
         """The limit for one message in a compressed chunk, in bytes."""
         return _ANY_RATIO + 4 * self.size
 
     @property
-    def most_structured(self) -> int:
+    def max_structured(self) -> int:
         """The limit for one message that is not an image, in bytes.
 
         The parts of such a message take many times its size in memory.
@@ -96,7 +96,7 @@ class Allowance:
         return 2 * _MIB + self.size
 
     @property
-    def most_items(self) -> int:
+    def max_items(self) -> int:
         """The limit for the message parts in one read of the log, such as the markers of a frame."""
         return _ITEMS + self.size // _BYTES_PER_ITEM
 
@@ -107,13 +107,13 @@ class Allowance:
         """
         self._total_unpacked += size - self._unpacked.get(offset, 0)
         self._unpacked[offset] = size
-        if self._total_unpacked <= self.most_unpacked:
+        if self._total_unpacked <= self.max_unpacked:
             return ""
-        return f"its chunks hold more than {format_bytes(self.most_unpacked)}"
+        return f"its chunks hold more than {format_bytes(self.max_unpacked)}"
 
     def records_left(self, offset: int) -> int:
         """Return the number of records that the chunk at `offset` may hold."""
-        return self.most_records - self._total_records + self._records.get(offset, 0)
+        return self.max_records - self._total_records + self._records.get(offset, 0)
 
     def count_records(self, offset: int, number: int) -> None:
         """Count the records of the chunk at `offset`."""
@@ -122,7 +122,7 @@ class Allowance:
 
 
 @dataclass(slots=True)
-class Items:
+class PartCounter:
     """A counter of the message parts that are still allowed, such as the markers of a frame."""
 
     left: int

@@ -8,7 +8,7 @@ from dataclasses import dataclass, field
 from pathlib import Path
 
 from ipsys_log.errors import LogError
-from ipsys_log.log.bounds import Allowance, BoundError
+from ipsys_log.log.bounds import BoundError, ReadLimits
 
 __all__ = ["View", "open_for_reading"]
 
@@ -33,10 +33,10 @@ class View:
     tail_base: int = 0
     bytes_read: int = 0
     patches: Sequence[tuple[int, bytes]] = ()
-    allowance: Allowance = field(init=False)
+    read_limits: ReadLimits = field(init=False)
 
     def __post_init__(self) -> None:
-        self.allowance = Allowance(self.size)
+        self.read_limits = ReadLimits(self.size)
 
     def read(self, offset: int, length: int) -> bytes:
         """Read exactly `length` bytes at `offset`; check the length against the file before allocation."""
@@ -73,21 +73,21 @@ class View:
             parts.append(self._pread(self.tail_fd, tail_position, length - head))
         return parts[0] if len(parts) == 1 else b"".join(parts)
 
-    def fault(self, offset: int, what: str) -> LogError:
+    def fault(self, offset: int, reason: str) -> LogError:
         """Return the error for damage at `offset`."""
-        return LogError(f"{self.path} is damaged at byte {offset}: {what}. Run: ipsys repair {self.path}")
+        return LogError(f"{self.path} is damaged at byte {offset}: {reason}. Run: ipsys repair {self.path}")
 
-    def refusal(self, what: str) -> BoundError:
+    def refusal(self, reason: str) -> BoundError:
         """Return the error for a log that exceeds the limits. Such a log may be undamaged."""
         return BoundError(
-            f"{self.path} is refused: {what}. If it is a true recording, unpack it first: "
+            f"{self.path} is refused: {reason}. If it is a true recording, unpack it first: "
             f"mcap decompress {self.path} -o unpacked.mcap"
         )
 
-    def check_number(self, number: int, what: str) -> None:
+    def check_number(self, number: int, item_name: str) -> None:
         """Refuse a log with more channels, runs or similar items than its file size allows."""
-        if number > self.allowance.most_channels:
-            raise self.refusal(f"it has {number} {what}, more than {self.allowance.most_channels}")
+        if number > self.read_limits.max_channels:
+            raise self.refusal(f"it has {number} {item_name}, more than {self.read_limits.max_channels}")
 
     def close(self) -> None:
         for fd in (self.fd, self.tail_fd):

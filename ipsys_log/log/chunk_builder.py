@@ -150,14 +150,14 @@ class ChunkBuilder:
         self._record[self._end : end] = indexes
         return self._record[:end]
 
-    def _indexes(self, at: int) -> tuple[bytes, dict[int, int]]:
-        """Return the MessageIndex records for offset `at`, and the offset of each record by channel id."""
+    def _indexes(self, offset: int) -> tuple[bytes, dict[int, int]]:
+        """Return the MessageIndex records for `offset`, and the offset of each record by channel id."""
         parts: list[bytes] = []
         offsets: dict[int, int] = {}
         for channel, entries in self._entries.items():
             rows = entries.tobytes()  # little-endian machines only, like the rest of this package
             parts += (INDEX_HEAD.pack(Opcode.MESSAGE_INDEX, 6 + len(rows), channel, len(rows)), rows)
-            offsets[channel], at = at, at + INDEX_HEAD.size + len(rows)
+            offsets[channel], offset = offset, offset + INDEX_HEAD.size + len(rows)
         return b"".join(parts), offsets
 
     def _make_room(self, end: int) -> None:

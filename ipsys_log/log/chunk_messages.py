@@ -11,7 +11,14 @@ from mcap.opcode import Opcode
 from numpy.typing import NDArray
 
 from ipsys_log.log.byte_source import View
-from ipsys_log.log.chunks import EqualBlocks, RawBlocks, check_compression, find_blocks, look_inside, unpack
+from ipsys_log.log.chunks import (
+    EqualBlocks,
+    RawBlocks,
+    check_compression,
+    find_blocks,
+    parse_chunk_contents,
+    unpack,
+)
 from ipsys_log.log.contents import RawMessage
 from ipsys_log.log.order import Cursor
 from ipsys_log.log.records import (
@@ -26,15 +33,15 @@ from ipsys_log.log.records import (
 
 __all__ = [
     "ALWAYS",
-    "Blocks",
     "Entries",
+    "RangeCache",
     "Rows",
     "Run",
-    "as_rows",
     "chunk_entries",
     "open_chunk",
-    "open_loose",
+    "open_unchunked",
     "runs",
+    "to_rows",
     "wanted_rows",
 ]
 
@@ -48,7 +55,7 @@ Entries = Mapping[int, Rows]  # by channel id
 Run = tuple[int, int]  # start and end of a byte range
 
 
-def as_rows(entries: Mapping[int, list[tuple[int, int]]]) -> Entries:
+def to_rows(entries: Mapping[int, list[tuple[int, int]]]) -> Entries:
     return {channel: np.array(rows, np.uint64).reshape(-1, 2) for channel, rows in entries.items()}
 
 
@@ -62,7 +69,7 @@ def chunk_entries(
     if not chunk.index_offsets or not chunk.index_length:
         if chunk.offset not in searched:
             data = unpack(view, chunk.offset, parse_chunk_head(view, chunk.offset)[1])
-            searched[chunk.offset] = as_rows(look_inside(view, chunk.offset, data).entries)
+            searched[chunk.offset] = to_rows(parse_chunk_contents(view, chunk.offset, data).entries)
         return searched[chunk.offset]
     start = chunk.offset + chunk.length
     data = view.read(start, chunk.index_length)
@@ -122,28 +129,28 @@ _new = tuple.__new__  # RawMessage(...) calls a Python function and takes twice 
 
 
 @dataclass(slots=True)
-class Blocks:
+class RangeCache:
     """A cache of the byte ranges read last. Its memory is bounded, even if many chunks overlap in time."""
 
     capacity: int = _CACHE_BYTES
     searched: dict[int, Entries] = field(default_factory=dict)  # rows of chunks without message indexes
-    _held: "OrderedDict[tuple[int, int, int], bytes]" = field(default_factory=OrderedDict)
+    _cache: "OrderedDict[tuple[int, int, int], bytes]" = field(default_factory=OrderedDict)
     _size: int = 0
 
-    def fetch(self, place: int, read: Callable[[int, int], bytes], low: int, high: int) -> bytes:
-        """Return bytes `low` to `high` of the chunk at `place`; call `read` if they are not in the cache."""
+    def fetch(self, chunk_offset: int, read: Callable[[int, int], bytes], low: int, high: int) -> bytes:
+        """Return bytes `low` to `high` of the chunk at `chunk_offset`; `read` reads missing bytes."""
         if low == high:
             return b""
-        key = (place, low, high)
-        data = self._held.get(key)
+        key = (chunk_offset, low, high)
+        data = self._cache.get(key)
         if data is not None:
-            self._held.move_to_end(key)
+            self._cache.move_to_end(key)
             return data
         data = read(low, high)
-        self._held[key] = data
+        self._cache[key] = data
         self._size += len(data)
-        while self._size > self.capacity and len(self._held) > 1:
-            self._size -= len(self._held.popitem(last=False)[1])
+        while self._size > self.capacity and len(self._cache) > 1:
+            self._size -= len(self._cache.popitem(last=False)[1])
         return data
 
 
@@ -156,7 +163,7 @@ class _Messages:
 
     view: View
     topics: Mapping[int, str]
-    place: int  # the chunk's offset, 0 for messages in no chunk
+    chunk_offset: int  # the chunk's offset, 0 for messages in no chunk
     times: list[int]
     offsets: list[int]
     runs: list[Run]
@@ -164,12 +171,12 @@ class _Messages:
     read: Callable[[int, int], bytes]
     spare: int  # bytes: limit for the remaining messages together; if they have more, messages overlap
 
-    def between(self, first: int, stop: int) -> Iterator[RawMessage]:
+    def read_rows(self, first: int, stop: int) -> Iterator[RawMessage]:
         """Yield the messages of rows `first` to `stop`; each record must agree with the index."""
         # Reading small messages spends its time here. So most of them need no call of a Python function.
         unpack, topic_of = MESSAGE.unpack_from, self.topics.get
         data, low, size, fetched = b"", 0, 0, None
-        largest = self.view.allowance.most_payload
+        largest = self.view.read_limits.max_payload
         rows = slice(first, stop)
         for indexed_time, offset, run in zip(
             self.times[rows], self.offsets[rows], self.runs[rows], strict=True
@@ -185,7 +192,7 @@ class _Messages:
                 opcode, length, channel, _, time, published = unpack(head)
             topic = topic_of(channel)
             if time != indexed_time or opcode != _OPCODE or length < _SHORTEST or topic is None:
-                fault_offset = self.place or offset
+                fault_offset = self.chunk_offset or offset
                 raise self.view.fault(fault_offset, "a message index points to no message of its time")
             if largest < length < self.spare:
                 raise self.view.refusal(f"one of its messages has {length} bytes, more than {largest}")
@@ -196,7 +203,7 @@ class _Messages:
                 payload = self.read(offset + MESSAGE_HEAD_SIZE, offset + HEAD_SIZE + length)
             self.spare -= length
             if self.spare < 0:
-                raise self.view.fault(self.place, "its message indexes name bytes more than once")
+                raise self.view.fault(self.chunk_offset, "its message indexes name bytes more than once")
             yield _new(RawMessage, (topic, time, published, payload))
 
 
@@ -234,13 +241,13 @@ class _Records:
 
 
 def open_chunk(
-    view: View, blocks: Blocks, chunk: ChunkRef, topics: Mapping[int, str], span: tuple[int, int]
+    view: View, cache: RangeCache, chunk: ChunkRef, topics: Mapping[int, str], span: tuple[int, int]
 ) -> Cursor:
     """Return a cursor over the messages of the channels in `topics` with start <= log time <= end."""
     offset, name, size = chunk.offset, chunk.compression, chunk.uncompressed_size
     packed = chunk.compressed_size
     check_compression(view, name)
-    entries = chunk_entries(view, chunk, blocks.searched)
+    entries = chunk_entries(view, chunk, cache.searched)
     rows = wanted_rows(entries, topics, span)
     records = _Records(view, chunk)
     if name and packed > _SMALL and packed > len(rows) * _SPARSE:
@@ -248,14 +255,19 @@ def open_chunk(
     if name and records.raw is None:
         ranges, fetch = [(0, size)] * len(rows), records.unpacked
     else:
-        ranges, fetch = runs(entries, rows, size), partial(blocks.fetch, offset, records.read)
+        ranges, fetch = runs(entries, rows, size), partial(cache.fetch, offset, records.read)
     times, offsets = rows.T.tolist()
     messages = _Messages(view, topics, offset, times, offsets, ranges, fetch, records.read, size)
-    return Cursor(offset, times, offsets, messages.between)
+    return Cursor(offset, times, offsets, messages.read_rows)
 
 
-def open_loose(
-    view: View, blocks: Blocks, entries: Entries, topics: Mapping[int, str], span: tuple[int, int], end: int
+def open_unchunked(
+    view: View,
+    cache: RangeCache,
+    entries: Entries,
+    topics: Mapping[int, str],
+    span: tuple[int, int],
+    end: int,
 ) -> Cursor:
     """Return a cursor over messages that lie in no chunk; `end` is the end offset of the data section."""
 
@@ -263,7 +275,7 @@ def open_loose(
         return view.read(low, high - low)
 
     rows = wanted_rows(entries, topics, span)
-    ranges, fetch = runs(entries, rows, end), partial(blocks.fetch, 0, read)
+    ranges, fetch = runs(entries, rows, end), partial(cache.fetch, 0, read)
     times, offsets = rows.T.tolist()
     messages = _Messages(view, topics, 0, times, offsets, ranges, fetch, read, end)
-    return Cursor(None, times, offsets, messages.between)
+    return Cursor(None, times, offsets, messages.read_rows)

@@ -22,14 +22,14 @@ from ipsys_log.log.byte_source import View
 from ipsys_log.log.records import HEADER, MESSAGE, ChunkHead, RecordAt, parse
 
 __all__ = [
+    "ChunkContents",
     "EqualBlocks",
-    "Inside",
     "RawBlocks",
     "check_compression",
     "check_definition",
     "find_blocks",
     "inner_records",
-    "look_inside",
+    "parse_chunk_contents",
     "unpack",
 ]
 
@@ -220,9 +220,9 @@ def _decompress(view: View, offset: int, head: ChunkHead, data: bytes, excess: s
     # than the limit.
     proof = min(size, LARGEST_CHUNK + 1) if excess and frame_size == -1 else 0
     unpacked_size = sum(map(len, _pieces(head.compression, data, proof)))
-    allowance_excess = view.allowance.unpack(offset, unpacked_size if excess else size)
-    if allowance_excess or (excess and unpacked_size == proof):
-        raise view.refusal(excess or allowance_excess)
+    limit_excess = view.read_limits.unpack(offset, unpacked_size if excess else size)
+    if limit_excess or (excess and unpacked_size == proof):
+        raise view.refusal(excess or limit_excess)
     if excess:
         raise ValueError(f"it claims {size} bytes and holds {unpacked_size}")
     if head.compression == "zstd":
@@ -266,48 +266,50 @@ def inner_records(view: View, offset: int, data: bytes) -> Iterator[RecordAt]:
 
 
 @dataclass(slots=True)
-class Inside:
+class ChunkContents:
     """The definitions and message entries of a chunk, or of a data section without chunks."""
 
     schemas: dict[int, mcap.Schema] = field(default_factory=dict)
     channels: dict[int, mcap.Channel] = field(default_factory=dict)
     entries: dict[int, list[tuple[int, int]]] = field(default_factory=dict)
 
-    def add(self, view: View, at: RecordAt, where: int, body: bytes) -> None:
+    def add(self, view: View, record: RecordAt, offset: int, body: bytes) -> None:
         """Add one record of type Schema, Channel or Message; ignore other types."""
-        if at.opcode == Opcode.MESSAGE:
+        if record.opcode == Opcode.MESSAGE:
             if len(body) < MESSAGE.size - HEADER.size:
-                raise view.fault(where, "a Message record is too short")
+                raise view.fault(offset, "a Message record is too short")
             channel, time = int.from_bytes(body[:2], "little"), int.from_bytes(body[6:14], "little")
-            self.entries.setdefault(channel, []).append((time, at.offset))
-        elif at.opcode == Opcode.SCHEMA and int.from_bytes(body[:2], "little") not in self.schemas:
-            schema = parse(mcap.Schema.read, view, RecordAt(at.opcode, where, at.length), body)
+            self.entries.setdefault(channel, []).append((time, record.offset))
+        elif record.opcode == Opcode.SCHEMA and int.from_bytes(body[:2], "little") not in self.schemas:
+            schema = parse(mcap.Schema.read, view, RecordAt(record.opcode, offset, record.length), body)
             self.schemas[schema.id] = schema
             view.check_number(len(self.schemas), "schemas")
-        elif at.opcode == Opcode.CHANNEL and int.from_bytes(body[:2], "little") not in self.channels:
-            channel_ = parse(mcap.Channel.read, view, RecordAt(at.opcode, where, at.length), body)
+        elif record.opcode == Opcode.CHANNEL and int.from_bytes(body[:2], "little") not in self.channels:
+            channel_ = parse(mcap.Channel.read, view, RecordAt(record.opcode, offset, record.length), body)
             self.channels[channel_.id] = channel_
             view.check_number(len(self.channels), "channels")
 
 
-def check_definition(view: View, at: RecordAt) -> None:
+def check_definition(view: View, record: RecordAt) -> None:
     """Refuse a record that is too large to be read as a whole."""
-    if at.length > LARGEST_DEFINITION:
-        raise view.refusal(f"one of its definitions has {at.length} bytes, more than {LARGEST_DEFINITION}")
+    if record.length > LARGEST_DEFINITION:
+        raise view.refusal(
+            f"one of its definitions has {record.length} bytes, more than {LARGEST_DEFINITION}"
+        )
 
 
-def look_inside(view: View, offset: int, data: bytes) -> Inside:
+def parse_chunk_contents(view: View, offset: int, data: bytes) -> ChunkContents:
     """Return the definitions and message entries of the decompressed chunk `data` at `offset`."""
-    inside, number = Inside(), 0
-    left = view.allowance.records_left(offset)
+    inside, number = ChunkContents(), 0
+    left = view.read_limits.records_left(offset)
     for number, record in enumerate(inner_records(view, offset, data), 1):
         if number > left:
-            raise view.refusal(f"its chunks hold more than {view.allowance.most_records} records")
+            raise view.refusal(f"its chunks hold more than {view.read_limits.max_records} records")
         if record.opcode in _DEFINITIONS:
             check_definition(view, record)
         head = MESSAGE.size if record.opcode == Opcode.MESSAGE else record.length
         inside.add(
             view, record, offset, data[record.offset + HEADER.size : record.offset + min(head, record.length)]
         )
-    view.allowance.count_records(offset, number)
+    view.read_limits.count_records(offset, number)
     return inside

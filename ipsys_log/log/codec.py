@@ -21,7 +21,7 @@ from google.protobuf.timestamp_pb2 import Timestamp
 
 from ipsys_log import messages
 from ipsys_log.errors import LogError
-from ipsys_log.log.bounds import Items
+from ipsys_log.log.bounds import PartCounter
 from ipsys_log.log.protobuf_fields import fields_of, fill_proto, read_proto
 from ipsys_log.log.ros2 import ROS2_PAYLOADS, read_ros2
 
@@ -132,7 +132,11 @@ def _bytes_fields(kind: type) -> tuple[str, ...]:
 
 
 def decode(
-    name: str, data: bytes, encoding: str = "protobuf", definition: bytes = b"", items: Items | None = None
+    name: str,
+    data: bytes,
+    encoding: str = "protobuf",
+    definition: bytes = b"",
+    items: PartCounter | None = None,
 ) -> Any:
     """Decode the payload in ``data``, a message of the schema ``name``.
 
@@ -151,7 +155,7 @@ def decode(
     LogError
         The schema or encoding is not known here, or the bytes are not a valid message of the schema.
     """
-    items = items or Items(_ITEMS_OF_ONE)
+    items = items or PartCounter(_ITEMS_OF_ONE)
     if name in ROS2_PAYLOADS:
         if encoding != "cdr":
             raise LogError(f"messages of ROS 2 encoded as {encoding!r} are not read, only cdr")
@@ -165,7 +169,7 @@ def decode(
         raise LogError(f"a message is not a valid {name}: {error}") from error
 
 
-def _parse(message_class: type[Proto], data: bytes, encoding: str, items: Items) -> Proto:
+def _parse(message_class: type[Proto], data: bytes, encoding: str, items: PartCounter) -> Proto:
     if encoding == "protobuf":
         return message_class.FromString(data)
     if encoding == "json":

@@ -18,11 +18,11 @@ __all__ = [
     "RawMessage",
     "Schema",
     "StoredChannel",
-    "by_topic",
     "camera_of_topic",
     "clean_name",
-    "foreign_camera",
     "free_id",
+    "group_by_topic",
+    "parse_foreign_camera",
     "run_of_topic",
 ]
 
@@ -47,7 +47,7 @@ def run_of_topic(topic: str) -> str | None:
     return match["run"] if match else None
 
 
-def foreign_camera(topic: str) -> str:
+def parse_foreign_camera(topic: str) -> str:
     """Return the camera in a topic of another program, such as ``/robot/front/image_raw/compressed``."""
     parts = topic.strip("/").split("/")
     while len(parts) > 1 and _GENERIC.fullmatch(clean_name(parts[-1])):
@@ -113,7 +113,7 @@ _LARGEST_ID = 0xFFFF
 class Contents:
     """Schemas and channels by id, chunks, and the counts that go into the Statistics record.
 
-    `loose` holds the messages that lie in no chunk: per channel id (log time in ns, file offset).
+    `unchunked` holds the messages that lie in no chunk: per channel id (log time in ns, file offset).
     `data_end` is the offset of the end of the data, `data_crc` the CRC of the data (0: not computed). The
     DataEnd record lies at `data_end`, unless an append was interrupted (`cut_short`).
     """
@@ -128,14 +128,14 @@ class Contents:
     metadata_count: int = 0
     start_ns: int | None = None
     end_ns: int | None = None
-    loose: dict[int, list[tuple[int, int]]] = field(default_factory=dict)
+    unchunked: dict[int, list[tuple[int, int]]] = field(default_factory=dict)
     data_end: int = 0
     data_crc: int = 0
     cut_short: bool = False
 
     def copy(self) -> Contents:
         """Return a copy that does not change when these contents grow."""
-        fields = ("schemas", "channels", "chunks", "attachments", "metadata", "counts", "loose")
+        fields = ("schemas", "channels", "chunks", "attachments", "metadata", "counts", "unchunked")
         return replace(self, **{name: copy(getattr(self, name)) for name in fields})
 
     def count(self, channel_id: int, messages: int) -> None:
@@ -156,7 +156,7 @@ def free_id(known: Mapping[int, object]) -> int | None:
     return next((key for key in range(1, _LARGEST_ID + 1) if key not in known), None)
 
 
-def by_topic(contents: Contents) -> tuple[Mapping[str, StoredChannel], Mapping[str, str]]:
+def group_by_topic(contents: Contents) -> tuple[Mapping[str, StoredChannel], Mapping[str, str]]:
     """Return the channels by topic, and by topic the differences between channels of one topic, if any."""
     channels: dict[str, StoredChannel] = {}
     conflicts: dict[str, str] = {}

@@ -19,14 +19,14 @@ import numpy as np
 from numpy.typing import NDArray
 
 from ipsys_log.errors import LogError
-from ipsys_log.log.bounds import BoundError, Items
+from ipsys_log.log.bounds import BoundError, PartCounter
 from ipsys_log.log.codec import decode, payload_type
 from ipsys_log.log.contents import (
     RawMessage,
     StoredChannel,
     camera_of_topic,
     clean_name,
-    foreign_camera,
+    parse_foreign_camera,
     run_of_topic,
 )
 from ipsys_log.log.reader import LogReader
@@ -39,10 +39,10 @@ from ipsys_log.messages.channels import (
     channel_of,
 )
 
-__all__ = ["Session", "other_ids", "renamed"]
+__all__ = ["Session", "find_new_ids", "rename_ids"]
 
 
-def other_ids(logs: Iterable[Iterable[Measurement]]) -> list[dict[str, str]]:
+def find_new_ids(logs: Iterable[Iterable[Measurement]]) -> list[dict[str, str]]:
     """Return new ids for ids that an earlier log has too: for each log, the new id by the old id.
 
     Parameters
@@ -51,7 +51,7 @@ def other_ids(logs: Iterable[Iterable[Measurement]]) -> list[dict[str, str]]:
 
     Examples
     --------
-    >>> other_ids([[Measurement(0, "p001")], [Measurement(9, "p001"), Measurement(9, "p002")]])
+    >>> find_new_ids([[Measurement(0, "p001")], [Measurement(9, "p001"), Measurement(9, "p002")]])
     [{}, {'p001': 'p001_2'}]
     """
     taken: set[str] = set()
@@ -67,7 +67,7 @@ def other_ids(logs: Iterable[Iterable[Measurement]]) -> list[dict[str, str]]:
     return renamings
 
 
-def renamed(measurement: Measurement, ids: Mapping[str, str]) -> Measurement:
+def rename_ids(measurement: Measurement, ids: Mapping[str, str]) -> Measurement:
     """Return a measurement, or a withdrawal, with the new ids of its log."""
     withdrawn = measurement.withdraws
     return replace(
@@ -109,7 +109,7 @@ class Session:
                 topic: name for topics in (self.images, self.calibrations) for name, topic in topics.items()
             }
             self._ids: dict[LogReader, dict[str, str]] = {}
-            self._ids = self._tell_apart()
+            self._ids = self._find_new_ids()
         except BaseException:
             self._stack.close()
             raise
@@ -230,7 +230,7 @@ class Session:
             yield message.topic, message.log_time_ns, message.publish_time_ns, message.data
 
     def _stored(
-        self, reader: LogReader, items: Items, topics: Collection[str]
+        self, reader: LogReader, items: PartCounter, topics: Collection[str]
     ) -> Iterator[tuple[Message, bytes]]:
         for raw in self._raw(reader, topics, None, None):
             yield self._message(reader, raw, items), bytes(raw.data)
@@ -241,14 +241,14 @@ class Session:
         present = [topic for topic in topics if topic in reader.channels]
         return reader.messages(present, start_ns, end_ns) if present else iter(())
 
-    def _items(self) -> list[tuple[LogReader, Items]]:
+    def _items(self) -> list[tuple[LogReader, PartCounter]]:
         """Return the logs, each with the limits for one reading."""
-        return [(reader, Items(reader.allowance.most_items)) for reader in self.readers]
+        return [(reader, PartCounter(reader.read_limits.max_items)) for reader in self.readers]
 
     def _decoded(
         self,
         reader: LogReader,
-        items: Items,
+        items: PartCounter,
         topics: Collection[str],
         start_ns: int | None,
         end_ns: int | None,
@@ -256,11 +256,11 @@ class Session:
         for raw in self._raw(reader, topics, start_ns, end_ns):
             yield self._message(reader, raw, items)
 
-    def _message(self, reader: LogReader, raw: RawMessage, items: Items) -> Message:
+    def _message(self, reader: LogReader, raw: RawMessage, items: PartCounter) -> Message:
         channel = reader.channels[raw.topic]
         payload = _payload(reader, raw, items)
         if isinstance(payload, Measurement) and reader in self._ids:
-            payload = renamed(payload, self._ids[reader])
+            payload = rename_ids(payload, self._ids[reader])
         camera = self._camera_of.get(raw.topic) or camera_of_topic(raw.topic)
         # The log time of a ROS 2 recorder is the arrival; the message contains the time of its frame.
         taken_ns = payload.timestamp if channel.message_encoding == "cdr" else 0
@@ -273,7 +273,7 @@ class Session:
         """Return the records of the stages, oldest first: in the order of the given logs, then by number."""
         return [run for reader, items in self._items() for run in self._runs_in(reader, items)]
 
-    def _runs_in(self, reader: LogReader, items: Items) -> list[Run]:
+    def _runs_in(self, reader: LogReader, items: PartCounter) -> list[Run]:
         topics = [
             topic
             for topic, stored in reader.channels.items()
@@ -282,17 +282,17 @@ class Session:
         runs = [message.payload for message in self._decoded(reader, items, topics, None, None)]
         return sorted(runs, key=lambda run: run.number)
 
-    def _tell_apart(self) -> dict[LogReader, dict[str, str]]:
+    def _find_new_ids(self) -> dict[LogReader, dict[str, str]]:
         """Return the ids of measurements that an earlier log has too, and their new ids."""
         readers = [reader for reader in self.readers if len(_times(reader, MEASUREMENTS_TOPIC))]
         if len(readers) < 2:
             return {}
         readers.sort(key=lambda reader: int(_times(reader, MEASUREMENTS_TOPIC)[0]))
-        new_ids = other_ids(
+        new_ids = find_new_ids(
             [
                 message.payload
                 for message in self._decoded(
-                    reader, Items(reader.allowance.most_items), [MEASUREMENTS_TOPIC], None, None
+                    reader, PartCounter(reader.read_limits.max_items), [MEASUREMENTS_TOPIC], None, None
                 )
                 if isinstance(message.payload, Measurement)
             ]
@@ -336,7 +336,7 @@ class Session:
         cameras: dict[str, str] = {}
         for payload in channel.payloads:
             topics = [topic for topic in self.topics(channel) if self._has_payload(topic, payload)]
-            names = [camera_of_topic(topic) or foreign_camera(topic) for topic in topics]
+            names = [camera_of_topic(topic) or parse_foreign_camera(topic) for topic in topics]
             topic_of: dict[str, str] = {}
             for topic, name in zip(topics, names, strict=True):
                 # Topics that differ only in words such as color or mono keep these words.
@@ -372,12 +372,12 @@ class Session:
             if topic in reader.channels:
                 raw = next(reader.messages([topic]), None)
                 if raw is not None:
-                    items = Items(reader.allowance.most_items)
+                    items = PartCounter(reader.read_limits.max_items)
                     return str(_payload(reader, raw, items).frame_id)
         return ""
 
 
-def _payload(reader: LogReader, raw: RawMessage, items: Items) -> Any:
+def _payload(reader: LogReader, raw: RawMessage, items: PartCounter) -> Any:
     """Decode a message; its error names the log, the topic and the time."""
     where = f"{reader.path}: {raw.topic} at {raw.log_time_ns} ns"
     if max(raw.log_time_ns, raw.publish_time_ns) >= _LATEST_NS:
@@ -390,14 +390,14 @@ def _payload(reader: LogReader, raw: RawMessage, items: Items) -> Any:
         raise LogError(f"{where}: {error}") from error
 
 
-def _decode(reader: LogReader, channel: StoredChannel, data: bytes, items: Items) -> Any:
+def _decode(reader: LogReader, channel: StoredChannel, data: bytes, items: PartCounter) -> Any:
     schema = channel.schema
     if schema is None:
         return decode("", data, channel.message_encoding)
     image = payload_type(schema.name) in IMAGES.payloads
     if image:
         items.take(_ITEMS_OF_IMAGE)
-    elif len(data) > reader.allowance.most_structured:
+    elif len(data) > reader.read_limits.max_structured:
         raise BoundError(f"a message of {len(data)} bytes is refused: only images may be so large")
     definition = schema.data if schema.encoding == "ros2msg" else b""
     return decode(schema.name, data, channel.message_encoding, definition, items)

@@ -14,7 +14,7 @@ from functools import cache
 
 from mcap import records as mcap
 
-from ipsys_log.log.records import as_bytes
+from ipsys_log.log.records import to_bytes
 
 __all__ = [
     "METADATA_NAME",
@@ -126,7 +126,7 @@ def metadata_of_hashes(hashes: dict[str, ChannelHash], offset: int) -> bytes:
     for topic, state in hashes.items():
         if state.valid and state.count:
             values[_PREFIX + topic] = f"{state.count} {state.last_ns} {state.digest.hex()}"
-    return as_bytes(mcap.Metadata(METADATA_NAME, values)) if len(values) > 1 else b""
+    return to_bytes(mcap.Metadata(METADATA_NAME, values)) if len(values) > 1 else b""
 
 
 def hashes_from_metadata(record: mcap.Metadata, offset: int) -> dict[str, ChannelHash]:

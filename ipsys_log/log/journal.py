@@ -2,7 +2,7 @@
 
 Two copies protect the old log during the replacement:
 
-- A *standing* tail: a copy of the old summary after the new end of the file. Other programs read a log from
+- A *temporary* tail: a copy of the old summary after the new end of the file. Other programs read a log from
   its end, without the journal. They find the old log by this copy until the file is truncated to its new
   size.
 - The journal ``<path>.journal``: the old tail. The old log is valid while the journal is whole and the file
@@ -161,14 +161,14 @@ def read_journal(fd: int, journal_fd: int) -> Journal | None:
         and os.fstat(journal_fd).st_size == body + _CRC.size
         and os.pread(journal_fd, _CRC.size, body) == _CRC.pack(_crc(journal_fd, 0, body) or 0)
         and _crc(fd, tail_offset - bytes_before, bytes_before) == before_crc
-        and not _went_on(fd, (old_size, *sizes))
+        and not _is_continued(fd, (old_size, *sizes))
     )
     # The file gets its new size last, after all other data are on the disk.
     complete = not earlier and os.fstat(fd).st_size == sizes[0]
     return Journal(old_size, tail_offset, head.size) if whole and not complete else None
 
 
-def _went_on(fd: int, sizes: tuple[int, ...]) -> bool:
+def _is_continued(fd: int, sizes: tuple[int, ...]) -> bool:
     """Return whether the file is a finished log of another size.
 
     Such a log was repaired and extended under another name.
@@ -204,14 +204,14 @@ def replace_tail(
     fd: int,
     offset: int,
     pieces: Sequence[bytes],
-    standing: Callable[[int], bytes] = lambda at: b"\0",
+    make_temporary_tail: Callable[[int], bytes] = lambda at: b"\0",
 ) -> None:
     """Replace all bytes from `offset` on by `pieces`, crash-safe. The caller holds the exclusive lock.
 
     Parameters
     ----------
-    standing : returns a copy of the old tail for an offset after the old and the new end. Other programs
-        need this copy to find the old log during the replacement.
+    make_temporary_tail : returns a copy of the old tail for an offset after the old and the new end.
+        Other programs need this copy to find the old log during the replacement.
 
     Raises
     ------
@@ -220,9 +220,9 @@ def replace_tail(
     """
     new_size = offset + sum(map(len, pieces))
     beyond = max(os.fstat(fd).st_size, new_size)
-    standing_tail = standing(beyond)
-    _write_journal(storage, path, fd, offset, (new_size, beyond + len(standing_tail)))
-    write_all(storage, fd, standing_tail, beyond)
+    temporary_tail = make_temporary_tail(beyond)
+    _write_journal(storage, path, fd, offset, (new_size, beyond + len(temporary_tail)))
+    write_all(storage, fd, temporary_tail, beyond)
     storage.fsync(fd)
     for piece in pieces:
         write_all(storage, fd, piece, offset)
@@ -260,7 +260,7 @@ def roll_back(storage: Storage, path: Path, fd: int) -> bool:
     try:
         journal = read_journal(fd, journal_fd)
         if journal is not None:
-            _put_back(storage, fd, journal_fd, journal)
+            _restore(storage, fd, journal_fd, journal)
     finally:
         os.close(journal_fd)
     storage.fsync(fd)
@@ -268,8 +268,8 @@ def roll_back(storage: Storage, path: Path, fd: int) -> bool:
     return journal is not None
 
 
-def _put_back(storage: Storage, fd: int, journal_fd: int, journal: Journal) -> None:
-    """Write the old tail while the standing tail still follows it. Truncate the file after that."""
+def _restore(storage: Storage, fd: int, journal_fd: int, journal: Journal) -> None:
+    """Write the old tail while the temporary tail still follows it. Truncate the file after that."""
     offset = journal.tail_offset
     for data in _blocks(journal_fd, journal.tail_base, journal.old_size - offset):
         write_all(storage, fd, data, offset)

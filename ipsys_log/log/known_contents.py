@@ -72,5 +72,5 @@ def _note(status: os.stat_result, contents: Contents) -> None:
         return
     key = status.st_dev, status.st_ino
     known.pop(key, None)
-    if not contents.loose and not contents.cut_short:
+    if not contents.unchunked and not contents.cut_short:
         known[key] = _Known(status.st_size, status.st_mtime_ns, contents.copy())

@@ -10,7 +10,7 @@ from ipsys_log.errors import LogError
 from ipsys_log.log.byte_source import open_for_reading
 from ipsys_log.log.journal import Storage, journal_path
 
-__all__ = ["check_free", "check_locks", "dangling", "is_being_written", "open_locked"]
+__all__ = ["check_free", "check_locks", "describe_broken_link", "is_being_written", "open_locked"]
 
 
 def open_locked(storage: Storage, path: Path, flags: int) -> int:
@@ -103,10 +103,12 @@ def check_free(path: Path) -> None:
 
 
 def _why_taken(path: Path) -> str:
-    return dangling(path) or f"{path} exists already and is never overwritten: choose another name"
+    return (
+        describe_broken_link(path) or f"{path} exists already and is never overwritten: choose another name"
+    )
 
 
-def dangling(path: Path) -> str | None:
+def describe_broken_link(path: Path) -> str | None:
     """Return an error text for a path that is a broken link; None for any other path.
 
     Such a path does not exist, but no file can be created there.

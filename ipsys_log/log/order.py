@@ -9,31 +9,31 @@ from typing import NamedTuple
 
 from ipsys_log.log.contents import RawMessage
 
-__all__ = ["Cursor", "Pending", "in_log_order"]
+__all__ = ["Cursor", "PendingChunk", "in_log_order"]
 
 _NEVER = 1 << 64  # ns, later than any log time
 
 
 @dataclass(slots=True)
 class Cursor:
-    """The wanted messages of one chunk, in log order; `between` yields the messages of a range of rows.
+    """The wanted messages of one chunk, in log order; `read_rows` yields the messages of a range of rows.
 
-    `place` is the offset of the chunk. It is None for messages outside of chunks: then the offsets of the
-    messages define their order.
+    `chunk_offset` is the offset of the chunk. It is None for messages outside of chunks: then the
+    offsets of the messages define their order.
     """
 
-    place: int | None
+    chunk_offset: int | None
     times: list[int]
     offsets: list[int]
-    between: Callable[[int, int], Iterator[RawMessage]]
+    read_rows: Callable[[int, int], Iterator[RawMessage]]
 
     def key(self, row: int) -> tuple[int, int, int]:
         """Return the sort key of message `row` for log order."""
         offset = self.offsets[row]
-        return self.times[row], offset if self.place is None else self.place, offset
+        return self.times[row], offset if self.chunk_offset is None else self.chunk_offset, offset
 
 
-class Pending(NamedTuple):
+class PendingChunk(NamedTuple):
     """A chunk that is opened only when its start time is reached, so that a log is never loaded whole."""
 
     start_ns: int
@@ -41,15 +41,17 @@ class Pending(NamedTuple):
     open: Callable[[], Cursor]
 
 
-def in_log_order(pending: Sequence[Pending], fault: Callable[[int], Exception]) -> Iterator[RawMessage]:
+def in_log_order(pending: Sequence[PendingChunk], fault: Callable[[int], Exception]) -> Iterator[RawMessage]:
     """Merge chunks, which may overlap in time, into one stream.
 
     `fault` returns the error for a chunk, given by its offset, with a message before the start of the chunk.
     """
-    return chain.from_iterable(_turns(pending, fault))
+    return chain.from_iterable(_split_by_chunk(pending, fault))
 
 
-def _turns(pending: Sequence[Pending], fault: Callable[[int], Exception]) -> Iterator[Iterator[RawMessage]]:
+def _split_by_chunk(
+    pending: Sequence[PendingChunk], fault: Callable[[int], Exception]
+) -> Iterator[Iterator[RawMessage]]:
     """Yield the stream in parts; a new part begins if the next message comes from another chunk."""
     waiting = sorted(pending, key=lambda chunk: (chunk.start_ns, chunk.offset))
     heap: list[tuple[tuple[int, int, int], int, Cursor]] = []
@@ -71,7 +73,7 @@ def _turns(pending: Sequence[Pending], fault: Callable[[int], Exception]) -> Ite
         if opened < len(waiting) and waiting[opened].start_ns < until_ns:
             until_ns = waiting[opened].start_ns
         stop = bisect_left(cursor.times, until_ns, row + 1)
-        yield cursor.between(row, stop)
+        yield cursor.read_rows(row, stop)
         last_ns = cursor.times[stop - 1]
         if stop < len(cursor.times):
             heapq.heappush(heap, (cursor.key(stop), stop, cursor))

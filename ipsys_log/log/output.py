@@ -13,7 +13,7 @@ from ipsys_log.errors import LogError, WriteError, disk_advice
 from ipsys_log.log.hashing import Buffer, extend
 from ipsys_log.log.journal import Storage, replace_tail, roll_back, write_all
 
-__all__ = ["Growing", "Output", "Pending", "cannot_write"]
+__all__ = ["NewFile", "Output", "PendingAppend", "cannot_write"]
 
 _logger = logging.getLogger(__name__)
 
@@ -37,7 +37,7 @@ class Output(Protocol):
 
 
 @dataclass(slots=True)
-class Growing:
+class NewFile:
     """A new file. Each piece of data goes to the operating system at once.
 
     With a `target`, the complete file is renamed to `target`, and an abandoned file is removed.
@@ -96,7 +96,7 @@ class Growing:
 
 
 @dataclass(slots=True)
-class Pending:
+class PendingAppend:
     """An append. The file does not change before `finish`."""
 
     storage: Storage
@@ -106,7 +106,7 @@ class Pending:
     start: int
     offset: int
     crc: int | None
-    standing: Callable[[int], bytes]
+    make_temporary_tail: Callable[[int], bytes]
     _pieces: list[bytes] = field(default_factory=list)
 
     def emit(self, data: Buffer, crc: int | None = None) -> None:
@@ -119,7 +119,7 @@ class Pending:
             return
         try:
             pieces = (*self._pieces, tail)
-            replace_tail(self.storage, self.path, self.fd, self.start, pieces, self.standing)
+            replace_tail(self.storage, self.path, self.fd, self.start, pieces, self.make_temporary_tail)
         except OSError as error:
             self._settle(error, tail)
         except BaseException:  # an interrupt: keep the old log, or the new log if it is complete
@@ -165,7 +165,7 @@ def _extend(so_far: int, data: Buffer, crc: int | None) -> int:
     return zlib.crc32(data, so_far) if crc is None else extend(so_far, data, crc)
 
 
-def cannot_write(path: Path, error: OSError, then: str) -> WriteError:
-    """Return the error for a failed write; `then` describes the consequence."""
-    text = f"{path} cannot be written ({error.strerror or os.strerror(error.errno or 0)}): {then}"
+def cannot_write(path: Path, error: OSError, consequence: str) -> WriteError:
+    """Return the error for a failed write; `consequence` describes the consequence."""
+    text = f"{path} cannot be written ({error.strerror or os.strerror(error.errno or 0)}): {consequence}"
     return WriteError(text, error)

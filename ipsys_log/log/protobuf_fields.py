@@ -11,7 +11,7 @@ from typing import Annotated, Any, Union, get_args, get_origin, get_type_hints
 
 import numpy as np
 
-from ipsys_log.log.bounds import Items
+from ipsys_log.log.bounds import PartCounter
 
 __all__ = ["NS", "fields_of", "fill_proto", "read_proto"]
 
@@ -19,7 +19,7 @@ NS = 1_000_000_000
 _LATEST_NS = 1 << 63
 
 Fill = Callable[[Any, Any], None]
-Read = Callable[[Any, Items], Any]
+Read = Callable[[Any, PartCounter], Any]
 
 
 def fill_proto(payload_type: type, proto: Any, payload: Any) -> None:
@@ -30,7 +30,7 @@ def fill_proto(payload_type: type, proto: Any, payload: Any) -> None:
             fill(proto, value)
 
 
-def read_proto(payload_type: type, proto: Any, items: Items) -> Any:
+def read_proto(payload_type: type, proto: Any, items: PartCounter) -> Any:
     """Decode the payload in a protobuf message; its parts are counted in `items`."""
     return payload_type(*(read(proto, items) for _, _, read in fields_of(payload_type)))
 
@@ -61,7 +61,7 @@ def _converters(name: str, hint: Any) -> tuple[Fill, Read]:
 
 
 def _map(name: str) -> tuple[Fill, Read]:
-    def read(proto: Any, items: Items) -> dict[Any, Any]:
+    def read(proto: Any, items: PartCounter) -> dict[Any, Any]:
         pairs = getattr(proto, name)
         items.take(len(pairs))
         return dict(sorted(pairs.items()))
@@ -87,7 +87,7 @@ def _array(name: str, shape: tuple[int, ...]) -> tuple[Fill, Read]:
     def fill(proto: Any, value: Any) -> None:
         getattr(proto, name).extend(np.asarray(value, dtype=np.float64).reshape(-1).tolist())
 
-    def read(proto: Any, _: Items) -> Any:
+    def read(proto: Any, _: PartCounter) -> Any:
         # A list of numbers is faster to read than the protobuf container.
         array = np.array(getattr(proto, name)[:], dtype=np.float64)
         if size is not None and array.size != size:
@@ -105,7 +105,7 @@ def _time(name: str) -> tuple[Fill, Read]:
         stamp.seconds, stamp.nanos = divmod(value, NS)
         stamp.SetInParent()
 
-    def read(proto: Any, _: Items) -> int:
+    def read(proto: Any, _: PartCounter) -> int:
         stamp = getattr(proto, name)
         time_ns = int(stamp.seconds * NS + stamp.nanos)
         if not -_LATEST_NS <= time_ns < _LATEST_NS:
@@ -116,7 +116,7 @@ def _time(name: str) -> tuple[Fill, Read]:
 
 
 def _repeated(name: str, item: Any) -> tuple[Fill, Read]:
-    def numbers(proto: Any, items: Items) -> tuple[Any, ...]:
+    def numbers(proto: Any, items: PartCounter) -> tuple[Any, ...]:
         values = getattr(proto, name)
         items.take(len(values))
         return tuple(values)
@@ -129,7 +129,7 @@ def _repeated(name: str, item: Any) -> tuple[Fill, Read]:
         for element in value:
             fill_proto(nested, getattr(proto, name).add(), element)
 
-    def read(proto: Any, items: Items) -> tuple[Any, ...]:
+    def read(proto: Any, items: PartCounter) -> tuple[Any, ...]:
         values = getattr(proto, name)
         items.take(len(values))
         return tuple(read_proto(nested, element, items) for element in values)

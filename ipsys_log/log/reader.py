@@ -14,15 +14,22 @@ from mcap import records as mcap
 from numpy.typing import NDArray
 
 from ipsys_log.errors import LogError
-from ipsys_log.log.bounds import Allowance
+from ipsys_log.log.bounds import ReadLimits
 from ipsys_log.log.byte_source import View, open_for_reading
-from ipsys_log.log.chunk_messages import ALWAYS, Blocks, as_rows, chunk_entries, open_chunk, open_loose
-from ipsys_log.log.contents import Contents, RawMessage, by_topic
+from ipsys_log.log.chunk_messages import (
+    ALWAYS,
+    RangeCache,
+    chunk_entries,
+    open_chunk,
+    open_unchunked,
+    to_rows,
+)
+from ipsys_log.log.contents import Contents, RawMessage, group_by_topic
 from ipsys_log.log.hashing import METADATA_NAME, ChannelHash, hashes_from_metadata
 from ipsys_log.log.journal import attach_journal
 from ipsys_log.log.known_contents import contents_of
 from ipsys_log.log.lock import is_being_written
-from ipsys_log.log.order import Pending, in_log_order
+from ipsys_log.log.order import PendingChunk, in_log_order
 from ipsys_log.log.records import HEADER, parse, walk
 from ipsys_log.log.summary import NoFooterError
 
@@ -85,9 +92,9 @@ class LogReader:
     def __init__(self, path: str | os.PathLike[str]) -> None:
         self.path = Path(path)
         self._view, self._contents = _open(self.path)
-        self._blocks = Blocks()
+        self._cache = RangeCache()
         self._stored: dict[str, ChannelHash] | None = None
-        self.channels, self.conflicts = by_topic(self._contents)
+        self.channels, self.conflicts = group_by_topic(self._contents)
         self.start_ns, self.end_ns = self._contents.start_ns, self._contents.end_ns
         self.message_count = sum(self._contents.counts.values())
         self.chunk_count = len(self._contents.chunks)
@@ -110,13 +117,13 @@ class LogReader:
         return self._view.bytes_read
 
     @property
-    def allowance(self) -> Allowance:
+    def read_limits(self) -> ReadLimits:
         """The limits of the work to read the log."""
-        return self._view.allowance
+        return self._view.read_limits
 
-    def check_number(self, number: int, what: str) -> None:
+    def check_number(self, number: int, item_name: str) -> None:
         """Refuse a log with more runs or measurements than its file size allows."""
-        self._view.check_number(number, what)
+        self._view.check_number(number, item_name)
 
     @property
     def data_end(self) -> int:
@@ -147,8 +154,8 @@ class LogReader:
         wanted = self._topics_by_id(topics)
         span = (max(0, start_ns or 0), ALWAYS[1] if end_ns is None else end_ns - 1)
         pending = [
-            Pending(
-                chunk.start_ns, chunk.offset, partial(open_chunk, view, self._blocks, chunk, wanted, span)
+            PendingChunk(
+                chunk.start_ns, chunk.offset, partial(open_chunk, view, self._cache, chunk, wanted, span)
             )
             for chunk in contents.chunks
             if chunk.start_ns <= span[1]
@@ -157,19 +164,19 @@ class LogReader:
         ]
         if span[1] < span[0] or not wanted:
             return iter(())
-        if contents.loose:
-            entries = as_rows(contents.loose)
-            loose = partial(open_loose, view, self._blocks, entries, wanted, span, contents.data_end)
-            pending.append(Pending(0, 0, loose))
+        if contents.unchunked:
+            entries = to_rows(contents.unchunked)
+            unchunked = partial(open_unchunked, view, self._cache, entries, wanted, span, contents.data_end)
+            pending.append(PendingChunk(0, 0, unchunked))
         return in_log_order(pending, lambda at: view.fault(at, "a message is older than its chunk says"))
 
     def times(self, topic: str) -> NDArray[np.int64]:
         """Return the log times of a topic in ns, sorted, shape (N,); read from the indexes alone."""
         wanted = set(self._topics_by_id([topic]))
-        parts = [rows for key, rows in as_rows(self._contents.loose).items() if key in wanted]
+        parts = [rows for key, rows in to_rows(self._contents.unchunked).items() if key in wanted]
         for chunk in self._contents.chunks:
             if not chunk.index_offsets or not wanted.isdisjoint(chunk.index_offsets):
-                entries = chunk_entries(self._view, chunk, self._blocks.searched, wanted)
+                entries = chunk_entries(self._view, chunk, self._cache.searched, wanted)
                 parts += [rows for key, rows in entries.items() if key in wanted]
         times = np.concatenate([rows[:, 0] for rows in parts]) if parts else np.empty(0, np.uint64)
         return np.sort(times).astype(np.int64)
@@ -232,7 +239,7 @@ def _open(path: Path) -> tuple[View, Contents]:
         except BaseException:
             view.close()
             raise
-        if fault is None and (has_journal or _stood_still(view, status_before)):
+        if fault is None and (has_journal or _is_unchanged(view, status_before)):
             if (has_journal or contents.cut_short) and not is_being_written(path):
                 _logger.warning(
                     "%s: an append to it was interrupted; ipsys reads the old log. Repair it with: "
@@ -240,7 +247,7 @@ def _open(path: Path) -> tuple[View, Contents]:
                     path, path,
                 )  # fmt: skip
             return view, contents
-        has_changed = not has_journal and not _stood_still(view, status_before)
+        has_changed = not has_journal and not _is_unchanged(view, status_before)
         view.close()
         if fault is not None and not has_changed:
             break
@@ -250,7 +257,7 @@ def _open(path: Path) -> tuple[View, Contents]:
     raise fault
 
 
-def _stood_still(view: View, before: os.stat_result) -> bool:
+def _is_unchanged(view: View, before: os.stat_result) -> bool:
     now = os.fstat(view.fd)
     probe = View(view.path, os.dup(view.fd), now.st_size, now.st_size)
     try:

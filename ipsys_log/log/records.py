@@ -29,13 +29,13 @@ __all__ = [
     "ChunkHead",
     "ChunkRef",
     "RecordAt",
-    "as_bytes",
     "chunk_head",
-    "exact",
     "parse",
     "parse_chunk_head",
     "parse_chunk_index",
+    "parse_exact",
     "parse_message_index",
+    "to_bytes",
     "walk",
 ]
 
@@ -109,7 +109,7 @@ class ChunkHead(NamedTuple):
     data_size: int
 
 
-def as_bytes(*records: mcap.McapRecord) -> bytes:
+def to_bytes(*records: mcap.McapRecord) -> bytes:
     """Return the records as the bytes of a file."""
     builder = RecordBuilder()  # type: ignore[no-untyped-call, unused-ignore]
     for record in records:
@@ -118,12 +118,14 @@ def as_bytes(*records: mcap.McapRecord) -> bytes:
     return data
 
 
-def parse(read: Callable[[ReadDataStream], R], view: View, at: RecordAt, body: bytes) -> R:
+def parse(read: Callable[[ReadDataStream], R], view: View, record: RecordAt, body: bytes) -> R:
     """Parse one record with a `read` of ``mcap``; wrong lengths in the record cannot reach beyond `body`."""
     try:
         return read(ReadDataStream(BytesIO(body)))
     except (McapError, struct.error, UnicodeDecodeError, OverflowError, MemoryError, ValueError) as error:
-        raise view.fault(at.offset, f"the {_name(at.opcode)} record is not valid ({error!r})") from None
+        raise view.fault(
+            record.offset, f"the {_name(record.opcode)} record is not valid ({error!r})"
+        ) from None
 
 
 _READERS: dict[int, Callable[[ReadDataStream], mcap.McapRecord]] = {
@@ -139,20 +141,22 @@ _READERS: dict[int, Callable[[ReadDataStream], mcap.McapRecord]] = {
 }
 
 
-def exact(view: View, at: RecordAt, data: bytes) -> mcap.McapRecord:
+def parse_exact(view: View, record_at: RecordAt, data: bytes) -> mcap.McapRecord:
     """Parse the record `data`, of any type without messages; its lengths must be right.
 
     Bytes after the known fields are ignored: later versions of the format may add fields.
     """
-    if at.opcode not in _READERS:
-        raise view.fault(at.offset, f"a record of {_name(at.opcode)} has no place there")
-    record = parse(_READERS[at.opcode], view, at, data[HEADER.size :])
-    if not data.startswith(as_bytes(record)[HEADER.size :], HEADER.size):
-        raise view.fault(at.offset, f"the {_name(at.opcode)} record claims lengths that it does not have")
+    if record_at.opcode not in _READERS:
+        raise view.fault(record_at.offset, f"a record of {_name(record_at.opcode)} has no place there")
+    record = parse(_READERS[record_at.opcode], view, record_at, data[HEADER.size :])
+    if not data.startswith(to_bytes(record)[HEADER.size :], HEADER.size):
+        raise view.fault(
+            record_at.offset, f"the {_name(record_at.opcode)} record claims lengths that it does not have"
+        )
     return record
 
 
-def parse_chunk_index(view: View, at: RecordAt, body: bytes) -> ChunkRef:
+def parse_chunk_index(view: View, record: RecordAt, body: bytes) -> ChunkRef:
     """Parse a ChunkIndex record, much faster than field by field; each chunk has such a record."""
     try:
         start, end, offset, length, map_length = _CHUNK_INDEX.unpack_from(body)
@@ -162,7 +166,7 @@ def parse_chunk_index(view: View, at: RecordAt, body: bytes) -> ChunkRef:
         name = _short_name(body[rest + 12 : rest + 12 + name_length])
         compressed, uncompressed = struct.unpack_from("<QQ", body, rest + 12 + name_length)
     except (struct.error, ValueError) as error:
-        raise view.fault(at.offset, f"the ChunkIndex record is not valid ({error})") from None
+        raise view.fault(record.offset, f"the ChunkIndex record is not valid ({error})") from None
     return ChunkRef(offset, length, start, end, name, compressed, uncompressed, index_length, offsets)
 
 
@@ -195,7 +199,7 @@ def chunk_head(start_ns: int, end_ns: int, size: int, crc: int, compression: str
     return HEADER.pack(Opcode.CHUNK, len(fields) + data_size) + fields
 
 
-def parse_message_index(view: View, data: bytes, position: int, channel_id: int, at: int) -> bytes:
+def parse_message_index(view: View, data: bytes, position: int, channel_id: int, offset: int) -> bytes:
     """Return the entries of the record at `position` in `data`; each has the layout of `ENTRY`."""
     if 0 <= position <= len(data) - INDEX_HEAD.size:
         opcode, length, channel, size = INDEX_HEAD.unpack_from(data, position)
@@ -203,7 +207,7 @@ def parse_message_index(view: View, data: bytes, position: int, channel_id: int,
         fits = end <= len(data) and size + 6 <= length and size % 16 == 0
         if fits and opcode == Opcode.MESSAGE_INDEX and channel == channel_id:
             return data[end - size : end]
-    raise view.fault(at, f"there is no MessageIndex record of channel {channel_id} where one must be")
+    raise view.fault(offset, f"there is no MessageIndex record of channel {channel_id} where one must be")
 
 
 def walk(view: View, start: int, end: int) -> Iterator[RecordAt]:

@@ -32,7 +32,7 @@ from ipsys_log.log.damage.survey import HEADER_RECORD, survey
 from ipsys_log.log.hashing import METADATA_NAME, combine, metadata_of_hashes
 from ipsys_log.log.journal import DISK, Storage, replace_tail, roll_back
 from ipsys_log.log.lock import open_locked
-from ipsys_log.log.records import MAGIC, MESSAGE, as_bytes, walk
+from ipsys_log.log.records import MAGIC, MESSAGE, to_bytes, walk
 from ipsys_log.log.summary import Summary, read_summary, tail_bytes
 
 __all__ = ["RepairReport", "repair"]
@@ -45,10 +45,10 @@ _IN_MEMORY = 16 << 20  # bytes of saved messages in memory; more go to an unname
 class RepairReport:
     """The result of a repair.
 
-    ``lost`` has the log times in ns of lost messages by topic, ``gone`` the number of lost messages by topic.
+    ``lost`` has the log times in ns of lost messages by topic, ``lost_counts`` their number by topic.
     A number may be known without the times. ``uncounted`` says that an unknown number of other messages may
     be lost. ``unchecked`` counts messages that were saved from damaged chunks without a CRC to confirm them.
-    ``bytes_lost`` counts bytes of the data section that cannot be read. ``kept_in`` is the file with all
+    ``bytes_lost`` counts bytes of the data section that cannot be read. ``damaged_file`` is the file with all
     bytes that were taken out of the log. ``cut_off`` says that the log had no end. Then the messages in the
     memory of its writer at the last write (``written_ns``) are lost and unknown.
     """
@@ -62,16 +62,16 @@ class RepairReport:
     notes: tuple[str, ...] = ()
     cut_off: bool = False
     written_ns: int = 0
-    gone: Mapping[str, int] = field(default_factory=dict)
+    lost_counts: Mapping[str, int] = field(default_factory=dict)
     uncounted: bool = False
     unchecked: int = 0
-    kept_in: Path | None = None
+    damaged_file: Path | None = None
 
 
 def repair(path: str | os.PathLike[str], *, storage: Storage = DISK) -> RepairReport:
     """Repair a log in place: keep all whole records, and report the lost messages.
 
-    An interrupted append is rolled back. A whole log is not changed. Damaged stretches become records that
+    An interrupted append is rolled back. A whole log is not changed. Damaged ranges become records that
     every reader skips. Their definitions and message indexes are written there again if they are known. The
     readable messages of a damaged chunk are saved in a new chunk. All bytes that are overwritten or cut off
     are kept in ``<path>.damaged`` (``.damaged_2`` if an earlier repair left such a file).
@@ -98,11 +98,11 @@ def repair(path: str | os.PathLike[str], *, storage: Storage = DISK) -> RepairRe
         _check_not_empty(view)
         known = _summary(view)
         with tempfile.SpooledTemporaryFile(_IN_MEMORY, dir=str(target.parent)) as spool:
-            saved = Salvage(spool)
-            findings = survey(view, known, saved)
-            if findings.loose.entries and not findings.crc_is_right and not findings.damaged:
+            salvage = Salvage(spool)
+            findings = survey(view, known, salvage)
+            if findings.unchunked.entries and not findings.crc_is_right and not findings.damaged:
                 findings = survey(
-                    view, known, saved, doubtful=True
+                    view, known, salvage, doubtful=True
                 )  # there is damage that the survey does not see
             if findings.end < len(MAGIC):
                 start = view.read(0, min(len(MAGIC), view.size))
@@ -119,9 +119,9 @@ def repair(path: str | os.PathLike[str], *, storage: Storage = DISK) -> RepairRe
                     total,
                     findings.contents.end_ns,
                     notes=tuple(notes),
-                    kept_in=resumed,
+                    damaged_file=resumed,
                 )
-            report = _rebuild(storage, view, findings, saved, known)
+            report = _rebuild(storage, view, findings, salvage, known)
         report_notes = report.notes or (f"found: {difference}",)
         return replace(report, notes=(*notes, *report_notes), written_ns=status.st_mtime_ns)
     except OSError as error:
@@ -155,40 +155,40 @@ class _Plan(NamedTuple):
 
 
 def _rebuild(
-    storage: Storage, view: View, found: Survey, saved: Salvage, known: Summary | None
+    storage: Storage, view: View, findings: Survey, salvage: Salvage, known: Summary | None
 ) -> RepairReport:
     with tempfile.TemporaryFile(dir=view.path.parent) as tail:
-        plan = _plan(view, found, saved, tail)
-        _check(view, found, plan)
-        new_size = found.end + plan.tail_size
-        own_end = _own_end(view, found)
-        change = Change(plan.patches, found.end, new_size, plan.tail_crc, own_end, view.size)
-        kept_in = _commit(storage, view, change, plan)
-    return _report(view, found, saved, known, kept_in, own_end)
+        plan = _plan(view, findings, salvage, tail)
+        _check(view, findings, plan)
+        new_size = findings.end + plan.tail_size
+        own_end = _own_end(view, findings)
+        change = Change(plan.patches, findings.end, new_size, plan.tail_crc, own_end, view.size)
+        damaged_file = _commit(storage, view, change, plan)
+    return _report(view, findings, salvage, known, damaged_file, own_end)
 
 
-def _plan(view: View, found: Survey, saved: Salvage, tail: IO[bytes]) -> _Plan:
+def _plan(view: View, findings: Survey, salvage: Salvage, tail: IO[bytes]) -> _Plan:
     """Plan the new log; the file is not changed yet."""
-    contents, start = found.contents, found.end
-    patches = _patches(found)
-    end = _End(tail, start, _crc_with(view, patches, start, found.crc))
+    contents, start = findings.contents, findings.end
+    patches = _patches(findings)
+    end = _End(tail, start, _crc_with(view, patches, start, findings.crc))
     if start == len(MAGIC):
         end.emit(HEADER_RECORD)
-    if found.unindexed is not None:
-        data, offsets = index_records(found.unindexed.entries, end.offset)
+    if findings.unindexed is not None:
+        data, offsets = index_records(findings.unindexed.entries, end.offset)
         contents.chunks[-1] = contents.chunks[-1]._replace(index_length=len(data), index_offsets=offsets)
         end.emit(data)
-    _emit_saved(end, found, saved)
-    _emit_homeless(end, view, found)
-    found.definitions.complete()
-    contents.schemas, contents.channels = found.definitions.schemas, found.definitions.channels
-    hashes = b"" if contents.loose else metadata_of_hashes(found.hashes, end.offset)
+    _emit_saved(end, findings, salvage)
+    _emit_displaced(end, view, findings)
+    findings.definitions.complete()
+    contents.schemas, contents.channels = findings.definitions.schemas, findings.definitions.channels
+    hashes = b"" if contents.unchunked else metadata_of_hashes(findings.hashes, end.offset)
     if hashes:
         contents.metadata.append(mcap.MetadataIndex(end.offset, len(hashes), METADATA_NAME))
         contents.metadata_count += 1
         end.emit(hashes)
     contents.data_end, contents.data_crc = end.offset, end.data_crc
-    end.emit(tail_bytes(contents, index_chunks=not contents.loose))
+    end.emit(tail_bytes(contents, index_chunks=not contents.unchunked))
     tail.flush()
     return _Plan(patches, tail, end.offset - start, end.crc, sum(contents.counts.values()))
 
@@ -208,46 +208,46 @@ class _End:
         self.crc, self.data_crc = zlib.crc32(data, self.crc), zlib.crc32(data, self.data_crc)
 
 
-def _emit_saved(end: _End, found: Survey, saved: Salvage) -> None:
+def _emit_saved(end: _End, findings: Survey, salvage: Salvage) -> None:
     """Write the saved messages after the definitions of their channels."""
-    saved.finish()
-    for record in found.definitions.missing(set(saved.counts), saved.inside):
-        end.emit(as_bytes(record))
-    contents, base = found.contents, end.offset
-    saved.spool.seek(0)
-    while block := saved.spool.read(_BLOCK):
+    salvage.finish()
+    for record in findings.definitions.missing(set(salvage.counts), salvage.inside):
+        end.emit(to_bytes(record))
+    contents, base = findings.contents, end.offset
+    salvage.spool.seek(0)
+    while block := salvage.spool.read(_BLOCK):
         end.emit(block)
-    for ref in saved.chunks:
+    for ref in salvage.chunks:
         offsets = {channel: offset + base for channel, offset in ref.index_offsets.items()}
         contents.chunks.append(ref._replace(offset=ref.offset + base, index_offsets=offsets))
         contents.cover(ref.start_ns, ref.end_ns)
-    for channel, number in saved.counts.items():
+    for channel, number in salvage.counts.items():
         contents.count(channel, number)
 
 
-def _emit_homeless(end: _End, view: View, found: Survey) -> None:
+def _emit_displaced(end: _End, view: View, findings: Survey) -> None:
     """Write messages outside of chunks that cannot stay in place, after the definitions of their channels."""
-    contents = found.contents
-    heads = [MESSAGE.unpack(view.read(record_at.offset, MESSAGE.size)) for record_at in found.homeless]
-    for record in found.definitions.missing({head[2] for head in heads}, found.definitions.known):
-        end.emit(as_bytes(record))
-    for record_at, (_, _, channel, _, time_ns, _) in zip(found.homeless, heads, strict=True):
-        contents.loose.setdefault(channel, []).append((time_ns, end.offset))
+    contents = findings.contents
+    heads = [MESSAGE.unpack(view.read(record_at.offset, MESSAGE.size)) for record_at in findings.displaced]
+    for record in findings.definitions.missing({head[2] for head in heads}, findings.definitions.known):
+        end.emit(to_bytes(record))
+    for record_at, (_, _, channel, _, time_ns, _) in zip(findings.displaced, heads, strict=True):
+        contents.unchunked.setdefault(channel, []).append((time_ns, end.offset))
         contents.count(channel, 1)
         contents.cover(time_ns, time_ns)
         end.emit(view.read(record_at.offset, record_at.length))
 
 
-def _patches(found: Survey) -> list[Patch]:
-    chunks = found.contents.chunks
-    for stretch in found.damaged:
-        if stretch.chunk is not None:
-            data, offsets = stretch.indexes()
-            chunks[stretch.chunk] = chunks[stretch.chunk]._replace(
+def _patches(findings: Survey) -> list[Patch]:
+    chunks = findings.contents.chunks
+    for damaged_range in findings.damaged:
+        if damaged_range.chunk is not None:
+            data, offsets = damaged_range.indexes()
+            chunks[damaged_range.chunk] = chunks[damaged_range.chunk]._replace(
                 index_length=len(data), index_offsets=offsets
             )
-    patches = [(stretch.offset, stretch.content()) for stretch in found.damaged]
-    return sorted([*patches, *found.wrong_heads])
+    patches = [(damaged_range.offset, damaged_range.content()) for damaged_range in findings.damaged]
+    return sorted([*patches, *findings.wrong_heads])
 
 
 def _crc_with(view: View, patches: Sequence[Patch], end: int, crc: int) -> int:
@@ -258,7 +258,7 @@ def _crc_with(view: View, patches: Sequence[Patch], end: int, crc: int) -> int:
     return crc
 
 
-def _check(view: View, found: Survey, plan: _Plan) -> None:
+def _check(view: View, findings: Survey, plan: _Plan) -> None:
     """Check the new log before it is written: by its indexes, record by record, and by its statistics.
 
     Raises
@@ -266,21 +266,21 @@ def _check(view: View, found: Survey, plan: _Plan) -> None:
     LogError
         The numbers of messages do not agree.
     """
-    size = found.end + plan.tail_size
-    new = View(view.path, view.fd, size, found.end, plan.tail.fileno(), 0, patches=plan.patches)
+    size = findings.end + plan.tail_size
+    new = View(view.path, view.fd, size, findings.end, plan.tail.fileno(), 0, patches=plan.patches)
     new_findings = survey(new, _summary(new))
     streamed = sum(new_findings.contents.counts.values())
     difference = disagreement(new, new_findings)
     if not difference and not plan.messages == streamed == count_by_indexes(new):
         difference = f"{plan.messages} messages were saved, {streamed} would be read"
     if difference:
-        faults = "; ".join(found.faults[:3])
+        faults = "; ".join(findings.faults[:3])
         raise LogError(
             f"{view.path} cannot be repaired ({difference}) and was not changed. Keep a copy. Found: {faults}"
         )
 
 
-class _Blocks(Sequence[bytes]):
+class _FileBlocks(Sequence[bytes]):
     """A file as blocks of bytes, read when they are needed."""
 
     def __init__(self, fd: int, size: int) -> None:
@@ -307,7 +307,7 @@ def _commit(storage: Storage, view: View, change: Change, plan: _Plan) -> Path |
     check_room(path, change)
     has_old_bytes = keep_old_bytes(storage, view, change, os.fstat(fd).st_mtime_ns)
     try:
-        replace_tail(storage, path, fd, change.start, _Blocks(plan.tail.fileno(), plan.tail_size))
+        replace_tail(storage, path, fd, change.start, _FileBlocks(plan.tail.fileno(), plan.tail_size))
     except BaseException:  # a disk error, or an interrupt
         with suppress(OSError):  # after a failure the next writer rolls back
             roll_back(storage, path, fd)
@@ -316,52 +316,57 @@ def _commit(storage: Storage, view: View, change: Change, plan: _Plan) -> Path |
     return overwrite(storage, path, fd, change.patches) if has_old_bytes else None
 
 
-def _own_end(view: View, found: Survey) -> int:
+def _own_end(view: View, findings: Survey) -> int:
     """Return the end of a finished log; later bytes are not a part of the log."""
-    if found.finished:
+    if findings.finished:
         with suppress(LogError):
-            for record_at in walk(view, found.end, view.size):
+            for record_at in walk(view, findings.end, view.size):
                 if record_at.opcode == Opcode.FOOTER:
                     return min(record_at.offset + record_at.length + len(MAGIC), view.size)
     return view.size
 
 
 def _report(
-    view: View, found: Survey, saved: Salvage, known: Summary | None, kept_in: Path | None, own_end: int
+    view: View,
+    findings: Survey,
+    salvage: Salvage,
+    known: Summary | None,
+    damaged_file: Path | None,
+    own_end: int,
 ) -> RepairReport:
-    contents = found.contents
-    notes = [f"found: {fault}" for fault in found.faults]
-    if found.finished and not found.crc_is_right and not found.damaged:
+    contents = findings.contents
+    notes = [f"found: {fault}" for fault in findings.faults]
+    if findings.finished and not findings.crc_is_right and not findings.damaged:
         notes.append("found: the CRC of the data section is wrong; the damaged part is not known")
     if own_end < view.size:
         notes.append(f"{view.size - own_end} bytes after its end, perhaps another log, were cut off")
-    lost_counts, counted = _gone(found, known)
+    lost_counts, counted = _count_lost(findings, known)
     # Without a CRC and a summary, a removal of whole records cannot be detected.
-    is_unsure = found.finished and not (found.has_crc and found.crc_is_right)
+    is_unsure = findings.finished and not (findings.has_crc and findings.crc_is_right)
     return RepairReport(
         view.path,
         True,
-        found.lost.bytes - sum(record_at.length for record_at in found.homeless) + view.size - own_end,
+        findings.lost.bytes - sum(record_at.length for record_at in findings.displaced) + view.size - own_end,
         sum(contents.counts.values()),
         contents.end_ns,
-        found.lost.times_ns,
+        findings.lost.times_ns,
         tuple(notes),
-        cut_off=not found.finished and known is None,
-        gone=lost_counts,
-        uncounted=not counted and (found.lost.uncounted > 0 or is_unsure),
-        unchecked=saved.unchecked,
-        kept_in=kept_in,
+        cut_off=not findings.finished and known is None,
+        lost_counts=lost_counts,
+        uncounted=not counted and (findings.lost.uncounted > 0 or is_unsure),
+        unchecked=salvage.unchecked,
+        damaged_file=damaged_file,
     )
 
 
-def _gone(found: Survey, known: Summary | None) -> tuple[dict[str, int], bool]:
+def _count_lost(findings: Survey, known: Summary | None) -> tuple[dict[str, int], bool]:
     """Return the number of lost messages by topic, and whether the summary confirms these numbers."""
-    lost_counts = {topic: len(times_ns) for topic, times_ns in found.lost.times_ns.items()}
+    lost_counts = {topic: len(times_ns) for topic, times_ns in findings.lost.times_ns.items()}
     if known is None or not known.checked or known.statistics is None:
         return lost_counts, False
     for channel, number in known.statistics.channel_message_counts.items():
         record = known.contents.channels.get(channel)
-        missing = number - found.contents.counts.get(channel, 0)
+        missing = number - findings.contents.counts.get(channel, 0)
         if missing > 0:
             topic = record.topic if record else f"channel {channel}"
             lost_counts[topic] = max(lost_counts.get(topic, 0), missing)

@@ -13,7 +13,7 @@ from mcap.records import Schema
 from mcap_ros2.decoder import DecoderFactory
 
 from ipsys_log.errors import LogError
-from ipsys_log.log.bounds import Items
+from ipsys_log.log.bounds import PartCounter
 from ipsys_log.messages import CameraCalibration, CompressedImage, RawImage
 from ipsys_log.units import NS_PER_S
 
@@ -43,7 +43,7 @@ _BYTES_PER_NUMBER = 8
 _MODELS = {"equidistant": "kannala_brandt", "fisheye": "kannala_brandt"}
 
 
-def read_ros2(name: str, data: bytes, definition: bytes, items: Items | None = None) -> Any:
+def read_ros2(name: str, data: bytes, definition: bytes, items: PartCounter | None = None) -> Any:
     """Decode the payload in a message of ROS 2.
 
     Parameters
@@ -117,41 +117,41 @@ def _time_ns(stamp: Any) -> int:
     return int(stamp.sec) * NS_PER_S + int(stamp.nanosec)
 
 
-def _read_compressed(found: Any, time_ns: int) -> CompressedImage:
+def _read_compressed(message: Any, time_ns: int) -> CompressedImage:
     # ROS also writes "bgr8; jpeg compressed bgr8" as format. The first bytes show the real format.
     heads = {b"\xff\xd8": "jpeg", b"\x89P": "png"}
-    kind = heads.get(bytes(found.data[:2]), found.format)
-    return CompressedImage(time_ns, found.header.frame_id, bytes(found.data), kind)
+    kind = heads.get(bytes(message.data[:2]), message.format)
+    return CompressedImage(time_ns, message.header.frame_id, bytes(message.data), kind)
 
 
-def _read_raw(found: Any, time_ns: int) -> RawImage:
+def _read_raw(message: Any, time_ns: int) -> RawImage:
     return RawImage(
         time_ns,
-        found.header.frame_id,
-        found.width,
-        found.height,
-        found.encoding,
-        found.step,
-        bytes(found.data),
+        message.header.frame_id,
+        message.width,
+        message.height,
+        message.encoding,
+        message.step,
+        bytes(message.data),
     )
 
 
-def _read_lens(found: Any, time_ns: int) -> CameraCalibration:
+def _read_intrinsics(message: Any, time_ns: int) -> CameraCalibration:
     return CameraCalibration(
         time_ns,
-        found.header.frame_id,
-        found.width,
-        found.height,
-        _MODELS.get(found.distortion_model, found.distortion_model),
-        np.array(found.d, dtype=np.float64),
-        np.array(found.k, dtype=np.float64).reshape(3, 3),
-        np.array(found.r, dtype=np.float64).reshape(3, 3),
-        np.array(found.p, dtype=np.float64).reshape(3, 4),
+        message.header.frame_id,
+        message.width,
+        message.height,
+        _MODELS.get(message.distortion_model, message.distortion_model),
+        np.array(message.d, dtype=np.float64),
+        np.array(message.k, dtype=np.float64).reshape(3, 3),
+        np.array(message.r, dtype=np.float64).reshape(3, 3),
+        np.array(message.p, dtype=np.float64).reshape(3, 4),
     )
 
 
 _READ: dict[str, Callable[[Any, int], Any]] = {
-    "sensor_msgs/msg/CameraInfo": _read_lens,
+    "sensor_msgs/msg/CameraInfo": _read_intrinsics,
     "sensor_msgs/msg/CompressedImage": _read_compressed,
     "sensor_msgs/msg/Image": _read_raw,
 }

@@ -11,39 +11,39 @@ from mcap.opcode import Opcode
 from ipsys_log.errors import LogError
 from ipsys_log.log.byte_source import View
 from ipsys_log.log.contents import Contents
-from ipsys_log.log.records import DATA_END, FOOTER, HEADER, MAGIC, as_bytes, parse, parse_chunk_index, walk
+from ipsys_log.log.records import DATA_END, FOOTER, HEADER, MAGIC, parse, parse_chunk_index, to_bytes, walk
 from ipsys_log.log.scan import scan
 
 __all__ = [
-    "STANDING",
+    "TEMPORARY_TAIL_MARK",
     "NoFooterError",
     "Summary",
     "load_contents",
     "read_summary",
-    "standing_bytes",
-    "standing_data_end",
     "tail_bytes",
+    "temporary_tail_bytes",
+    "temporary_tail_data_end",
 ]
 
-# The record before a standing tail: a private type, with the offset of the end of the old data.
-STANDING = struct.Struct("<BQ8sQ")
-_STANDING_TYPE, _STANDING_NAME = 0x80 | Opcode.DATA_END, b"standing"
+# The record before a temporary tail: a private type, with the offset of the end of the old data.
+TEMPORARY_TAIL_MARK = struct.Struct("<BQ8sQ")
+_MARK_TYPE, _MARK_NAME = 0x80 | Opcode.DATA_END, b"standing"
 
 
-def standing_bytes(contents: Contents, offset: int) -> bytes:
+def temporary_tail_bytes(contents: Contents, offset: int) -> bytes:
     """Return the temporary tail of a log at `offset`, for the time while new data are written before it."""
-    length = STANDING.size - HEADER.size
-    mark = STANDING.pack(_STANDING_TYPE, length, _STANDING_NAME, contents.data_end)
+    length = TEMPORARY_TAIL_MARK.size - HEADER.size
+    mark = TEMPORARY_TAIL_MARK.pack(_MARK_TYPE, length, _MARK_NAME, contents.data_end)
     return mark + tail_bytes(contents, offset + len(mark))
 
 
-def standing_data_end(view: View, at: int) -> int | None:
-    """Return the end of the data if the DataEnd record at `at` belongs to a temporary tail, else None."""
-    if at < len(MAGIC) + STANDING.size:
+def temporary_tail_data_end(view: View, offset: int) -> int | None:
+    """Return the end of the data if the DataEnd record at `offset` belongs to a temporary tail, else None."""
+    if offset < len(MAGIC) + TEMPORARY_TAIL_MARK.size:
         return None
-    mark = STANDING.unpack(view.read(at - STANDING.size, STANDING.size))
-    expected = (_STANDING_TYPE, STANDING.size - HEADER.size, _STANDING_NAME)
-    return mark[3] if mark[:3] == expected and len(MAGIC) <= mark[3] < at else None
+    mark = TEMPORARY_TAIL_MARK.unpack(view.read(offset - TEMPORARY_TAIL_MARK.size, TEMPORARY_TAIL_MARK.size))
+    expected = (_MARK_TYPE, TEMPORARY_TAIL_MARK.size - HEADER.size, _MARK_NAME)
+    return mark[3] if mark[:3] == expected and len(MAGIC) <= mark[3] < offset else None
 
 
 def tail_bytes(contents: Contents, offset: int | None = None, *, index_chunks: bool = True) -> bytes:
@@ -55,9 +55,9 @@ def tail_bytes(contents: Contents, offset: int | None = None, *, index_chunks: b
     start = (contents.data_end if offset is None else offset) + DATA_END.size
     summary, offsets = b"", b""
     for opcode, records in _groups(contents):
-        group = as_bytes(*records)
+        group = to_bytes(*records)
         if group and (index_chunks or opcode != Opcode.CHUNK_INDEX):
-            offsets += as_bytes(mcap.SummaryOffset(opcode, start + len(summary), len(group)))
+            offsets += to_bytes(mcap.SummaryOffset(opcode, start + len(summary), len(group)))
             summary += group
     footer = FOOTER.pack(Opcode.FOOTER, 20, start, start + len(summary), 0)[:-4]
     crc = zlib.crc32(summary + offsets + footer)
@@ -136,14 +136,14 @@ def load_contents(view: View) -> Contents:
     opcode, length, crc = DATA_END.unpack(view.read(data_end, DATA_END.size)) if data_end >= 8 else (0, 0, 0)
     if (opcode, length) != (Opcode.DATA_END, 4):
         raise view.fault(max(data_end, 0), "there is no DataEnd record before the summary")
-    standing = standing_data_end(view, data_end)
-    if standing is not None:
-        data_end = standing
+    old_data_end = temporary_tail_data_end(view, data_end)
+    if old_data_end is not None:
+        data_end = old_data_end
     if contents is None or not complete or not _gaps_hold_no_messages(view, contents, data_end):
         contents = scan(view, data_end)
     view.check_number(len(contents.channels), "channels")
     view.check_number(len(contents.schemas), "schemas")
-    contents.data_end, contents.data_crc, contents.cut_short = data_end, crc, standing is not None
+    contents.data_end, contents.data_crc, contents.cut_short = data_end, crc, old_data_end is not None
     return contents
 
 

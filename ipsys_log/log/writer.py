@@ -28,10 +28,10 @@ from ipsys_log.log.hashing import METADATA_NAME, ChannelHash, metadata_of_hashes
 from ipsys_log.log.journal import DISK, Storage, roll_back
 from ipsys_log.log.known_contents import contents_of, note_contents
 from ipsys_log.log.lock import check_free, open_locked
-from ipsys_log.log.output import Growing, Output, Pending, cannot_write
+from ipsys_log.log.output import NewFile, Output, PendingAppend, cannot_write
 from ipsys_log.log.reader import stored_hashes
-from ipsys_log.log.records import HEADER, MAGIC, MESSAGE, as_bytes
-from ipsys_log.log.summary import standing_bytes, tail_bytes
+from ipsys_log.log.records import HEADER, MAGIC, MESSAGE, to_bytes
+from ipsys_log.log.summary import tail_bytes, temporary_tail_bytes
 
 __all__ = ["LogWriter"]
 
@@ -96,12 +96,12 @@ class LogWriter:
         check_free(target)
         file = target.with_name(target.name + ".partial") if atomic else target
         fd = open_locked(storage, file, os.O_RDWR | os.O_CREAT | (0 if atomic else os.O_EXCL))
-        output = Growing(storage, file, fd, target if atomic else None)
+        output = NewFile(storage, file, fd, target if atomic else None)
         try:
             if atomic:
                 storage.truncate(fd, 0)  # an earlier writer of this file was killed: remove its data
             storage.fsync_directory(file.parent)
-            output.emit(MAGIC + as_bytes(mcap.Header("", LIBRARY)))
+            output.emit(MAGIC + to_bytes(mcap.Header("", LIBRARY)))
         except BaseException as error:
             with suppress(OSError):  # the file has no messages
                 storage.unlink(file)
@@ -136,8 +136,10 @@ class LogWriter:
             storage.close(fd)
             raise
         crc = contents.data_crc or None
-        standing = partial(standing_bytes, contents.copy())
-        output = Pending(storage, target, fd, size, contents.data_end, contents.data_end, crc, standing)
+        make_temporary_tail = partial(temporary_tail_bytes, contents.copy())
+        output = PendingAppend(
+            storage, target, fd, size, contents.data_end, contents.data_end, crc, make_temporary_tail
+        )
         writer = cls(target, output, contents, SMALL_APPENDED)
         writer._stored = stored
         return writer
@@ -148,7 +150,7 @@ class LogWriter:
     def __exit__(
         self, kind: type[BaseException] | None, error: BaseException | None, trace: TracebackType | None
     ) -> None:
-        if kind is None or self._keeps_what_it_has():
+        if kind is None or self._finishes_on_error():
             self.close()
         else:
             self.abandon()
@@ -156,7 +158,7 @@ class LogWriter:
     def move(self, path: Path) -> None:
         """Rename a new log, and replace an existing file in one step; later writes go to the new name."""
         output = self._output
-        if not isinstance(output, Growing):
+        if not isinstance(output, NewFile):
             raise ValueError(f"{self.path}: an append stays where it is")
         output.storage.rename(self.path, path)
         self.path = output.path = path
@@ -195,7 +197,7 @@ class LogWriter:
                 dict(metadata or {}),
                 schema_id,
             )
-            self._output.emit(as_bytes(channel))
+            self._output.emit(to_bytes(channel))
             self._contents.channels[channel.id] = channel
         image = schema is not None and schema.name in IMAGE_SCHEMAS
         self._channels[topic] = (channel.id, self._images if image else self._small)
@@ -226,8 +228,8 @@ class LogWriter:
         crc = zlib.crc32(data)
         state.add_row(log_time_ns, publish_time_ns, len(data), crc)
         sequence = state.count & 0xFFFFFFFF
-        if self._contents.loose:
-            self._write_loose(channel, sequence, log_time_ns, publish_time_ns, data)
+        if self._contents.unchunked:
+            self._write_unchunked(channel, sequence, log_time_ns, publish_time_ns, data)
         else:
             builder.add(channel, sequence, log_time_ns, publish_time_ns, data, crc)
 
@@ -239,7 +241,7 @@ class LogWriter:
 
     def sync(self) -> None:
         """Wait until the written data of a new log are on the disk; any thread may call this."""
-        if isinstance(self._output, Growing):
+        if isinstance(self._output, NewFile):
             self._output.sync()
 
     def close(self) -> None:
@@ -274,8 +276,8 @@ class LogWriter:
         output.finish(tail_bytes(contents))
         note_contents(output.fd, contents)
 
-    def _keeps_what_it_has(self) -> bool:
-        return isinstance(self._output, Growing) and self._output.target is None
+    def _finishes_on_error(self) -> bool:
+        return isinstance(self._output, NewFile) and self._output.target is None
 
     def _check_open(self) -> None:
         if not self._open:
@@ -297,7 +299,7 @@ class LogWriter:
                 return key
         key = self._free_id(self._contents.schemas)
         record = mcap.Schema(key, schema.data, schema.encoding, schema.name)
-        self._output.emit(as_bytes(record))
+        self._output.emit(to_bytes(record))
         self._contents.schemas[key] = record
         return key
 
@@ -325,7 +327,9 @@ class LogWriter:
             self._contents.count(channel, number)
         builder.clear()
 
-    def _write_loose(self, channel: int, sequence: int, log_ns: int, publish_ns: int, data: bytes) -> None:
+    def _write_unchunked(
+        self, channel: int, sequence: int, log_ns: int, publish_ns: int, data: bytes
+    ) -> None:
         # The old messages lie in no chunk. Chunk indexes only for new messages would hide the old messages.
         length = MESSAGE.size - HEADER.size + len(data)
         head = MESSAGE.pack(Opcode.MESSAGE, length, channel, sequence, log_ns, publish_ns)

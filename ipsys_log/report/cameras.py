@@ -17,7 +17,7 @@ from ipsys_log.analysis.differences import Comparison
 from ipsys_log.analysis.latency import Percentiles
 from ipsys_log.capture.camera_thread import CameraState
 from ipsys_log.capture.disk import DiskRoom
-from ipsys_log.capture.status import Look, Monitor
+from ipsys_log.capture.live_check import CameraMonitor, FrameCheck
 from ipsys_log.messages import Message, Track, Tracks
 from ipsys_log.units import CM_PER_M, format_bytes, format_duration
 
@@ -51,7 +51,7 @@ class LiveStatus:
     def __init__(
         self,
         states: Mapping[str, CameraState],
-        monitor: Monitor,
+        monitor: CameraMonitor,
         target: Path,
         now_s: Callable[[], float],
         expected_bytes_per_s: float | None = None,
@@ -74,7 +74,7 @@ class LiveStatus:
         now_s = self._now_s()
         for name, state in self._states.items():
             self._rates[name] = self._rate(name, state, now_s)
-        parts: list[Table | Text] = [cameras_table(self._states, self._monitor.looks, self._rates)]
+        parts: list[Table | Text] = [cameras_table(self._states, self._monitor.checks, self._rates)]
         if self._tracks:
             parts.append(robots_table(self._tracks))
         # As Text: rich would read brackets in a plain string as its markup.
@@ -91,9 +91,11 @@ class LiveStatus:
         if self._expected_bytes_per_s is None:
             return Text(line)
         room = DiskRoom(folder, free, size / took_s if took_s >= _SETTLED_S else self._expected_bytes_per_s)
-        if room.lasts_s is None:
+        if room.remaining_s is None:
             return Text(line)
-        return Text(f"{line}: {format_duration(room.lasts_s)}", style="bold red" if room.is_short() else "")
+        return Text(
+            f"{line}: {format_duration(room.remaining_s)}", style="bold red" if room.is_short() else ""
+        )
 
     def summary(self) -> list[str]:
         """Return the lines that describe a finished recording."""
@@ -114,8 +116,8 @@ class LiveStatus:
     def _warnings(self) -> list[str]:
         return [
             f"camera {name}: {text}"
-            for name, look in sorted(self._monitor.looks.items())
-            for text in look.warnings
+            for name, check in sorted(self._monitor.checks.items())
+            for text in check.warnings
         ]
 
 
@@ -136,21 +138,21 @@ def robots_table(tracks: Mapping[str, Track]) -> Table:
 
 def cameras_table(
     states: Mapping[str, CameraState],
-    looks: Mapping[str, Look],
+    checks: Mapping[str, FrameCheck],
     rates: Mapping[str, tuple[float, float]],
 ) -> Table:
     """Return a table with one row per camera, at most 80 columns wide.
 
     Parameters
     ----------
-    states, looks : states and last checks of the cameras, by name.
+    states, checks : states and last checks of the cameras, by name.
     rates : frames and MB per second, by name.
     """
     table = Table(box=None, pad_edge=False)
     for heading in ("camera", "frames", "Hz", "MB/s", "drops", "delay", "light", "sharp", "markers"):
         table.add_column(heading, justify="left" if heading in ("camera", "markers") else "right")
     for name, state in states.items():
-        look = looks.get(name)
+        check = checks.get(name)
         rate_hz, mb_s = rates.get(name, (0.0, 0.0))
         delay = "-" if state.delay_s is None else f"{1e3 * state.delay_s:.0f} ms"
         drops = state.dropped + state.missed
@@ -161,16 +163,18 @@ def cameras_table(
             f"{mb_s:.1f}",
             Text(str(drops), style="red" if drops else ""),
             delay,
-            f"{look.brightness:.0f}" if look else "-",
-            f"{100 * look.sharpness:.0f} %" if look else "-",
-            _markers(look) if look else "-",
+            f"{check.brightness:.0f}" if check else "-",
+            f"{100 * check.sharpness:.0f} %" if check else "-",
+            _markers(check) if check else "-",
         )
     return table
 
 
-def _markers(look: Look) -> Text:
+def _markers(check: FrameCheck) -> Text:
     """Return the ids of the markers in an image; ids that are not in the rig get a question mark."""
-    ids = [Text(str(n)) for n in look.markers] + [Text(f"{n}?", style="yellow") for n in look.strange]
+    ids = [Text(str(n)) for n in check.markers] + [
+        Text(f"{n}?", style="yellow") for n in check.unknown_markers
+    ]
     more = [Text(f"and {len(ids) - _MOST_IDS} more")] if len(ids) > _MOST_IDS else []
     return Text(", ").join([*ids[:_MOST_IDS], *more]) if ids else Text("none")
 

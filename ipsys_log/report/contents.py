@@ -43,7 +43,7 @@ def intervals_json(scene: FinishedLog) -> list[dict[str, Any]]:
             "cameras": list(stop.cameras),
             "measured": [m.id for m in active if stop.covers(m)],
         }
-        for number, stop in enumerate(scene.stops, 1)
+        for number, stop in enumerate(scene.intervals, 1)
     ]
 
 

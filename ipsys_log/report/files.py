@@ -10,7 +10,7 @@ from collections.abc import Iterable, Mapping, Sequence
 from pathlib import Path
 
 from ipsys_log.errors import IpsysError
-from ipsys_log.log.lock import dangling
+from ipsys_log.log.lock import describe_broken_link
 from ipsys_log.messages import CameraEvaluation, ErrorStatistics
 from ipsys_log.report.findings import Findings
 from ipsys_log.units import CM_PER_M
@@ -114,7 +114,7 @@ def check_file(path: Path, option: str, logs: Iterable[Path]) -> None:
     """
     if any(log.exists() and path.exists() and path.samefile(log) for log in logs):
         raise IpsysError(f"{option} {path}: this is the log itself; name another file")
-    if (text := dangling(path)) is not None:
+    if (text := describe_broken_link(path)) is not None:
         raise IpsysError(f"{option} {text}")
     if path.is_dir():
         raise IpsysError(f"{option} {path}: is a folder; name a file in it")

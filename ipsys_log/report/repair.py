@@ -32,8 +32,8 @@ def repair_lines(report: RepairReport) -> Iterator[str | Table]:
     yield from _about_the_loss(report)
     if report.unchecked:
         yield f"{report.unchecked} of them were saved from damaged chunks: no CRC confirms them"
-    if report.kept_in is not None:
-        yield f"all bytes that were taken out are kept in {report.kept_in}"
+    if report.damaged_file is not None:
+        yield f"all bytes that were taken out are kept in {report.damaged_file}"
     yield from report.notes[:_MOST_NOTES]
     if len(report.notes) > _MOST_NOTES:
         yield f"and {len(report.notes) - _MOST_NOTES} more places"
@@ -45,24 +45,24 @@ def repair_lines(report: RepairReport) -> Iterator[str | Table]:
 
 def _about_the_loss(report: RepairReport) -> Iterator[str | Table]:
     """Yield the number of unreadable bytes, and the known lost messages."""
-    if not (report.bytes_lost or report.gone):
+    if not (report.bytes_lost or report.lost_counts):
         return
-    if report.gone and report.uncounted:
+    if report.lost_counts and report.uncounted:
         ending = "these messages are gone, and an unknown number of others:"
-    elif report.gone:
+    elif report.lost_counts:
         ending = "these messages are gone:"
     elif report.uncounted:
         ending = "the number of messages in them is not known"
     else:
         ending = "no message was in them"
     yield f"{format_bytes(report.bytes_lost)} cannot be read; {ending}"
-    if report.gone:
+    if report.lost_counts:
         yield _lost_table(report)
 
 
 def _lost_table(report: RepairReport) -> Table:
     table = _table("channel", "gone", "from", "to (UTC)")
-    for topic, number in sorted(report.gone.items()):
+    for topic, number in sorted(report.lost_counts.items()):
         times_ns = report.lost.get(topic, ())
         span = (_clock(min(times_ns)), _clock(max(times_ns))) if len(times_ns) == number else ("", "")
         table.add_row(topic, str(number), *span)

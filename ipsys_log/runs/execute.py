@@ -41,15 +41,15 @@ from ipsys_log.units import format_time
 __all__ = [
     "LiveRun",
     "OtherContentError",
-    "carry_out",
-    "cut_short",
+    "compute_messages",
+    "copy_messages",
+    "find_unfinished",
     "has_given_name",
     "inputs",
-    "perform",
+    "missing_messages",
     "record_of",
+    "run_stage",
     "sign",
-    "signed_copy",
-    "without_held",
 ]
 
 
@@ -57,7 +57,7 @@ class OtherContentError(Exception):
     """The error of a run that contains a message that its stage does not make from the log."""
 
 
-def cut_short(session: Session, target: Path, task: Task, run: str) -> dict[str, int]:
+def find_unfinished(session: Session, target: Path, task: Task, run: str) -> dict[str, int]:
     """Return the number of messages by topic that an unsigned stage wrote to a run in ``target``.
 
     The result is empty if the run has nothing of the stage, or if the stage has its record.
@@ -70,7 +70,7 @@ def cut_short(session: Session, target: Path, task: Task, run: str) -> dict[str,
     return {topic: session.count(topic) for topic in topics} if available.issuperset(topics) else {}
 
 
-def without_held(session: Session, held: Collection[str], made: Iterable[Message]) -> Iterator[Message]:
+def missing_messages(session: Session, held: Collection[str], made: Iterable[Message]) -> Iterator[Message]:
     """Yield the messages of ``made`` that are missing in a run; messages are compared byte for byte.
 
     Parameters
@@ -117,7 +117,7 @@ def _refuse(left: Iterable[Message]) -> None:
 Make = Callable[[Task, Session, str], Iterable[Message]]
 
 
-def perform(
+def run_stage(
     session: Session,
     target: Path,
     task: Task,
@@ -141,7 +141,7 @@ def perform(
     record = replace(record, fingerprint=fingerprint(), number=number)
     remarks: tuple[str, ...] = ()
     run_name = name or task.run
-    if counts := cut_short(session, target, task, run_name):
+    if counts := find_unfinished(session, target, task, run_name):
         try:
             return _append(session, target, task, replace(record, run=run_name), counts, request, make)
         except OtherContentError as other:
@@ -191,7 +191,7 @@ def _append(
         target,
         replace(record, timestamp=publish_time_ns),
         log_time_ns,
-        lambda: without_held(session, held, remarks.watch(make(task, session, record.run))),
+        lambda: missing_messages(session, held, remarks.watch(make(task, session, record.run))),
         held,
     )
     count = sum(output.messages for output in made.outputs)
@@ -240,7 +240,7 @@ def sign(path: Path, options: Mapping[str, str], runs: Sequence[LiveRun]) -> lis
     return outcomes
 
 
-def signed_copy(task: Task, model: Model, number: int, now_ns: Callable[[], int]) -> list[Message]:
+def copy_messages(task: Task, model: Model, number: int, now_ns: Callable[[], int]) -> list[Message]:
     """Return the messages that copy a model into a new log: the model, and the record of its run."""
     topic = MODEL.topic_of(task.run)
     record = Run(
@@ -310,7 +310,7 @@ def _settings(
         yield Message(calibration_topic(camera), start_ns, start_ns, lens, camera)
 
 
-def carry_out(task: Task, session: Session, name: str, progress: Progress) -> Iterator[Message]:
+def compute_messages(task: Task, session: Session, name: str, progress: Progress) -> Iterator[Message]:
     """Yield the messages of a task's run: of its causal stage, or one message computed from the whole log."""
     if task.step is None:
         assert task.compute is not None

@@ -15,7 +15,7 @@ from ipsys_log.log.codec import encode, schema_data, schema_name
 from ipsys_log.log.contents import Schema
 from ipsys_log.log.dataset import Session
 from ipsys_log.log.journal import DISK, journal_path
-from ipsys_log.log.lock import dangling
+from ipsys_log.log.lock import describe_broken_link
 from ipsys_log.log.reader import LogReader
 from ipsys_log.log.writer import LogWriter
 from ipsys_log.messages import ChannelWritten, Message, Rig, Run
@@ -24,7 +24,7 @@ from ipsys_log.rig.file import hide_passwords
 __all__ = [
     "append_messages",
     "append_run",
-    "opened_target",
+    "open_target",
     "record_message",
     "write_log",
     "write_message",
@@ -101,7 +101,7 @@ def record_message(record: Run, log_time_ns: int) -> Message:
 
 
 @contextmanager
-def opened_target(paths: Sequence[Path], output: Path | None) -> Iterator[tuple[list[Path], Path]]:
+def open_target(paths: Sequence[Path], output: Path | None) -> Iterator[tuple[list[Path], Path]]:
     """Yield the logs to read, and the log to append to: the last log of ``paths``, or a new log.
 
     A new log gets its name only when all work is done. If there was no work, or after an error, no new log
@@ -141,7 +141,7 @@ def _give_name(partial: Path, output: Path) -> None:
 
 
 def _check_free(output: Path) -> None:
-    if (text := dangling(output)) is not None:
+    if (text := describe_broken_link(output)) is not None:
         raise IpsysError(text)
     if output.exists():
         raise IpsysError(

@@ -74,7 +74,7 @@ def read_channels(session: Session, topics: Iterable[str]) -> tuple[ChannelRead,
     return tuple(ChannelRead(topic, session.count(topic), session.hash(topic)) for topic in sorted(topics))
 
 
-def _essence(run: Run) -> bytes:
+def _identity(run: Run) -> bytes:
     """Return the identity of a run of a stage: all fields except names, times and the environment."""
     return encode(replace(run, timestamp=0, run="", fingerprint={}, input_runs=(), outputs=(), number=0))
 
@@ -91,9 +91,9 @@ def is_complete(session: Session, run: Run) -> bool:
 
 def find_run(session: Session, wanted: Run, name: str | None = None) -> str | None:
     """Return the name of the newest complete run with the inputs and parameters of ``wanted``, if any."""
-    essence = _essence(wanted)
+    essence = _identity(wanted)
     for run in reversed(complete_runs(session)):
-        if run.stage == wanted.stage and name in (None, run.run) and _essence(run) == essence:
+        if run.stage == wanted.stage and name in (None, run.run) and _identity(run) == essence:
             return run.run
     return None
 

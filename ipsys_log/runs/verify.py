@@ -25,7 +25,7 @@ from ipsys_log.log.dataset import Session
 from ipsys_log.log.known_contents import one_reading
 from ipsys_log.messages import CameraCalibration, FrameTransforms, Message, Run
 from ipsys_log.messages.channels import CAMERA_POINTS, EVALUATION, MARKERS, MODEL, POSITIONS, TRACKS
-from ipsys_log.runs.execute import carry_out
+from ipsys_log.runs.execute import compute_messages
 from ipsys_log.runs.graph import Task, input_runs, plan_stage, stage_named, writes
 from ipsys_log.runs.options import Progress
 from ipsys_log.runs.states import Recorded, is_fitted_here, recorded_stages
@@ -238,7 +238,7 @@ def _made_again(session: Session, run: Run, progress: Progress) -> Iterator[Stor
     stage = stage_named(run.stage)
     task = plan_stage(stage, session, run.parameters, input_runs(run), run.rig, _lenses(run)) if stage else ""
     if isinstance(task, Task):
-        for message in carry_out(task, session, run.run, progress):
+        for message in compute_messages(task, session, run.run, progress):
             yield message, encode(message.payload)
 
 

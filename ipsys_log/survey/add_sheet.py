@@ -23,14 +23,14 @@ __all__ = ["add_sheet", "check_sheet"]
 class _Row:
     """A row of a sheet, its entry, and the observations of its marker.
 
-    ``stop`` is the reason if the row has no stationary interval in the log, else empty.
+    ``fault`` is the reason if the row has no stationary interval in the log, else empty.
     """
 
     line: int
     entry: Entry
     faults: Sequence[Fault]
-    stop: str
-    sight: MarkerObservations | None
+    fault: str
+    observations: MarkerObservations | None
 
 
 def check_sheet(path: Path, log: Path, request: Request) -> None:
@@ -71,7 +71,7 @@ def add_sheet(scene: FinishedLog, path: Path, force: bool = False) -> list[str]:
     if model is None:  # then the rows are compared with each other
         model, name = _fit(scene, rows, checked), OTHER_ROWS
         checked = checked if model is None else _check(scene, rows, model, name)
-    faults = [(row.line, row.stop) for row in rows if row.stop]
+    faults = [(row.line, row.fault) for row in rows if row.fault]
     faults += _by_line(rows, [[fault.text for fault in result.faults] for result in checked], scene.rig)
     doubts = _by_line(rows, _contradictions(rows, checked, scene, model), scene.rig)
     raise_for_rows(path, faults, () if force else doubts)
@@ -93,19 +93,19 @@ def _by_line(rows: Sequence[_Row], texts: Sequence[Sequence[str]], rig: Rig) -> 
 def _sighted(scene: FinishedLog, rows: Sequence[SheetRow]) -> Iterator[_Row]:
     """Find the stationary interval of each row, and the observations of its marker in this interval."""
     parsed = [parse_entry(row.typed, scene.rig) for row in rows]
-    stops = assign_intervals(rows, scene.stops, [entry.marker_id for entry, _ in parsed])
-    for row, (entry, faults), stop in zip(rows, parsed, stops, strict=True):
-        sight = None
-        if isinstance(stop, int) and entry.marker_id is not None:
-            sight = observe_marker(scene.views(stop), entry.marker_id)
-        yield _Row(row.line, entry, faults, stop if isinstance(stop, str) else "", sight)
+    intervals = assign_intervals(rows, scene.intervals, [entry.marker_id for entry, _ in parsed])
+    for row, (entry, faults), interval in zip(rows, parsed, intervals, strict=True):
+        observations = None
+        if isinstance(interval, int) and entry.marker_id is not None:
+            observations = observe_marker(scene.views(interval), entry.marker_id)
+        yield _Row(row.line, entry, faults, interval if isinstance(interval, str) else "", observations)
 
 
 def _check(scene: FinishedLog, rows: Sequence[_Row], model: Model | None, name: str) -> list[EntryCheck]:
     """Check each row as the web page does, after the rows above it."""
     history, results = [*scene.history()], []
     for row in rows:
-        result = check_entry(row.entry, row.faults, scene.rig, row.sight, history, model, name)
+        result = check_entry(row.entry, row.faults, scene.rig, row.observations, history, model, name)
         history += [] if result.measurement is None else [result.measurement]
         results.append(result)
     return results
@@ -115,8 +115,8 @@ def _fit(scene: FinishedLog, rows: Sequence[_Row], checked: Sequence[EntryCheck]
     """Fit a model to the rows themselves, without the rows that contradict it."""
     seen: list[tuple[Measurement, MarkerObservations]] = []
     for row, result in zip(rows, checked, strict=True):
-        if result.measurement is not None and row.sight is not None:
-            seen.append((result.measurement, row.sight))
+        if result.measurement is not None and row.observations is not None:
+            seen.append((result.measurement, row.observations))
     return fit_neighbours(seen, scene.rig)
 
 
@@ -137,8 +137,8 @@ def _contradictions(
 
 def _fits(row: _Row, other: _Row, scene: FinishedLog, model: Model | None) -> bool:
     """Return True if the numbers of a row fit the observations of another row."""
-    if other is row or other.sight is None:
+    if other is row or other.observations is None:
         return False
     entry = replace(row.entry, marker_id=other.entry.marker_id, id=None)
-    result = check_entry(entry, (), scene.rig, other.sight, (), model)
+    result = check_entry(entry, (), scene.rig, other.observations, (), model)
     return bool(result.predictions) and result.measurement is not None and not result.contradictions

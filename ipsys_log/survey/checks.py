@@ -93,7 +93,7 @@ def check_entry(
     entry: Entry,
     faults: Sequence[Fault],
     rig: Rig,
-    sight: MarkerObservations | None,
+    observations: MarkerObservations | None,
     history: Sequence[Measurement],
     model: Model | None = None,
     model_name: str = MODEL_NAME,
@@ -104,15 +104,15 @@ def check_entry(
     ----------
     entry, faults : results of :func:`~ipsys_log.survey.entry.parse_entry`.
     rig : the present rig.
-    sight : observations of the marker; None if the marker is not known.
+    observations : observations of the marker; None if the marker is not known.
     history : measurements and withdrawals so far.
     model : the present model, for the comparison; None to skip it.
     model_name : name of the model in a warning.
     """
     name = entry.id or next_id(history)
-    all_faults = [*faults, *_identity_faults(entry, sight, history)]
+    all_faults = [*faults, *_identity_faults(entry, observations, history)]
     warnings = list(entry.doubts)
-    read = _measurement(entry, name, sight)
+    read = _measurement(entry, name, observations)
     faulty_fields = {fault.field for fault in all_faults}
     misfit = _apart(read, rig)
     if misfit is not None:
@@ -134,10 +134,10 @@ def check_entry(
     on_floor, remark = warn_floor(read, fixed, rig)
     flat = warn_crossing(read, rig)
     warnings += [*remark, *warn_tapes(read, fixed, rig), *flat]
-    earlier = _here_before(read, sight, history)
+    earlier = _here_before(read, observations, history)
     all_faults += _twin_faults(read, earlier)
     warnings += _repeat_warnings(read, fixed, rig, earlier) if read.still else []
-    predictions = predict(model, sight.points_m, fixed.world_m) if model and sight else ()
+    predictions = predict(model, observations.points_m, fixed.world_m) if model and observations else ()
     warnings += warn_model(read, fixed, rig, predictions, model_name)
     return EntryCheck(
         name,
@@ -153,8 +153,8 @@ def check_entry(
     )
 
 
-def _measurement(entry: Entry, name: str, sight: MarkerObservations | None) -> Measurement:
-    still = sight.still if sight else None
+def _measurement(entry: Entry, name: str, observations: MarkerObservations | None) -> Measurement:
+    still = observations.still if observations else None
     time_ns = 0 if still is None else still.start + (still.end - still.start) // 2
     return Measurement(
         time_ns,
@@ -189,21 +189,21 @@ def _without_id(error: IpsysError, name: str) -> str:
 
 
 def _identity_faults(
-    entry: Entry, sight: MarkerObservations | None, history: Sequence[Measurement]
+    entry: Entry, observations: MarkerObservations | None, history: Sequence[Measurement]
 ) -> list[Fault]:
     faults = []
     if entry.id is not None and any(entry.id in (m.id, m.withdraws) for m in history):
         faults.append(Fault("id", f"id {entry.id} was used before; leave it out for the next free one"))
-    if sight is not None and sight.still is None:
-        faults.append(Fault("marker", sight.text))
+    if observations is not None and observations.still is None:
+        faults.append(Fault("marker", observations.text))
     return faults
 
 
 def _here_before(
-    read: Measurement, sight: MarkerObservations | None, history: Sequence[Measurement]
+    read: Measurement, observations: MarkerObservations | None, history: Sequence[Measurement]
 ) -> list[Measurement]:
     """Return the earlier measurements of this marker at this point: in the same interval, or seen there."""
-    seen = sight.measured_as if sight else ()
+    seen = observations.measured_as if observations else ()
     same_marker = [m for m in active_measurements(history) if m.marker_id == read.marker_id]
     return [m for m in same_marker if _overlap(m, read) or m.id in seen]
 

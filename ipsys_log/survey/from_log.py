@@ -102,20 +102,20 @@ class FinishedLog:
         models = session.payloads(_newest(session, MODEL))
         self.model: Model | None = models[-1] if models else None
         self._history = list(session.messages(session.topics(MEASUREMENTS)))
-        self.stops = _find_intervals(gather_sightings(session.messages(self._topics[CAMERA_POINTS])), rig)
-        if not self.stops:
+        self.intervals = _find_intervals(gather_sightings(session.messages(self._topics[CAMERA_POINTS])), rig)
+        if not self.intervals:
             raise IpsysError(
                 f"{path}: no marker of the rig lies still in it for two frames or longer: there is nothing "
                 "to measure; lay markers down while recording"
             )
 
-    def views(self, stop: int | None) -> list[CameraView]:
+    def views(self, interval: int | None) -> list[CameraView]:
         """Return the view of each camera in a stationary interval, with the image at its middle."""
-        number = stop or 0
+        number = interval or 0
         if number not in self._seen:
             while len(self._seen) >= _KEPT:
                 del self._seen[next(iter(self._seen))]
-            self._seen[number] = [self._view(camera, self.stops[number]) for camera in self._cameras]
+            self._seen[number] = [self._view(camera, self.intervals[number]) for camera in self._cameras]
         return self._seen[number]
 
     def history(self) -> list[Measurement]:
@@ -225,7 +225,7 @@ def _message(measurement: Measurement, earlier: Sequence[Message]) -> Message:
 
 def _find_intervals(sightings: Mapping[tuple[str, int], Sightings], rig: Rig) -> list[StationaryInterval]:
     """Return the stationary intervals of the rig's markers, in order of time."""
-    stops = []
+    intervals = []
     for marker_id in sorted({marker_id for _, marker_id in sightings}):
         if rig.knows(marker_id):
             seen = {
@@ -233,8 +233,8 @@ def _find_intervals(sightings: Mapping[tuple[str, int], Sightings], rig: Rig) ->
                 for (camera, seen_id), observations in sightings.items()
                 if seen_id == marker_id
             }
-            stops += [StationaryInterval(marker_id, *interval) for interval in stationary_intervals(seen)]
-    return sorted(stops, key=lambda stop: (stop.start_ns, stop.marker_id))
+            intervals += [StationaryInterval(marker_id, *interval) for interval in stationary_intervals(seen)]
+    return sorted(intervals, key=lambda stop: (stop.start_ns, stop.marker_id))
 
 
 def _sees(message: Message, interval: StationaryInterval) -> bool:

@@ -62,7 +62,7 @@ class LiveScene:
     ) -> None:
         check_references(rig)
         self.rig, self.model = rig, model
-        self.stops: Sequence[StationaryInterval] = ()
+        self.intervals: Sequence[StationaryInterval] = ()
         self._cameras, self._add = cameras, add
         self._lock = threading.Lock()
         self._images: dict[str, deque[Message]] = {camera: deque(maxlen=60) for camera in cameras}
@@ -95,7 +95,7 @@ class LiveScene:
                 while points[0].timestamp < payload.timestamp - _LAST_NS:
                     points.popleft()
 
-    def views(self, stop: int | None) -> list[CameraView]:  # noqa: ARG002
+    def views(self, interval: int | None) -> list[CameraView]:  # noqa: ARG002
         """Return the view of each camera: the latest image with known markers, and the points of a second."""
         with self._lock:
             newest_ns = max((points[-1].timestamp for points in self._points.values() if points), default=0)

@@ -127,8 +127,8 @@ class StationaryInterval:
 class MeasuringScene(Protocol):
     """The source of views for measuring: a finished log or live cameras.
 
-    ``stops`` are the stationary intervals of a finished log, in order; empty during a recording. ``model``
-    and ``rig`` are the present ones. All calls must come from one thread; this can be any thread.
+    ``intervals`` are the stationary intervals of a finished log, in order; empty during a recording.
+    ``model`` and ``rig`` are the present ones. All calls must come from one thread; this can be any thread.
     """
 
     @property
@@ -138,9 +138,9 @@ class MeasuringScene(Protocol):
     def model(self) -> Model | None: ...
 
     @property
-    def stops(self) -> Sequence[StationaryInterval]: ...
+    def intervals(self) -> Sequence[StationaryInterval]: ...
 
-    def views(self, stop: int | None) -> Sequence[CameraView]:
+    def views(self, interval: int | None) -> Sequence[CameraView]:
         """Return the latest view of every camera, or the views of a stationary interval by its index."""
         ...
 
@@ -289,13 +289,13 @@ def fit_neighbours(seen: Sequence[tuple[Measurement, MarkerObservations]], rig: 
 def _pairs(seen: Sequence[tuple[Measurement, MarkerObservations]], rig: Rig) -> dict[str, list[Pair]]:
     """Pair camera points and world points, by camera; a camera with too few pairs is left out."""
     pairs: dict[str, list[Pair]] = {}
-    for measurement, sight in seen:
+    for measurement, observations in seen:
         try:
             fixed = world_point(measurement, rig)
         except IpsysError:
             continue
-        for camera, point_m in sight.points_m.items():
-            row = (measurement.id, sight.marker_id, point_m, fixed.world_m, 1, fixed.covariance_m2)
+        for camera, point_m in observations.points_m.items():
+            row = (measurement.id, observations.marker_id, point_m, fixed.world_m, 1, fixed.covariance_m2)
             pairs.setdefault(camera, []).append(Pair(*row))
     return {
         camera: camera_pairs for camera, camera_pairs in pairs.items() if len(camera_pairs) >= FEWEST_POINTS

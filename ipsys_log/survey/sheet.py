@@ -136,9 +136,9 @@ def name_columns(text: str, rig: Rig) -> str:
 
 
 def assign_intervals(
-    rows: Sequence[SheetRow], stops: Sequence[StationaryInterval], markers: Sequence[int | None]
+    rows: Sequence[SheetRow], intervals: Sequence[StationaryInterval], markers: Sequence[int | None]
 ) -> Iterator[int | str]:
-    """Yield the stationary interval of each row, as index of ``stops``, or the reason if there is none.
+    """Yield the stationary interval of each row, as index of ``intervals``, or the reason if there is none.
 
     The ``place`` of a row decides, else its ``time``. Without both, the number of such rows of a marker must
     equal the number of its stationary intervals. Then the rows are assigned in order.
@@ -146,7 +146,7 @@ def assign_intervals(
     Parameters
     ----------
     rows : rows of the sheet.
-    stops : stationary intervals of the log.
+    intervals : stationary intervals of the log.
     markers : marker of each row; None if it is not known.
     """
     in_order: dict[int, list[int]] = {}
@@ -157,14 +157,14 @@ def assign_intervals(
         if marker_id is None:
             yield ""
             continue
-        own = [n for n, stop in enumerate(stops) if stop.marker_id == marker_id]
+        own = [n for n, interval in enumerate(intervals) if interval.marker_id == marker_id]
         if not own:
-            seen = ", ".join(map(str, sorted({stop.marker_id for stop in stops}))) or "none"
+            seen = ", ".join(map(str, sorted({interval.marker_id for interval in intervals}))) or "none"
             yield f"marker {marker_id} lies still before no camera (those that do: {seen})"
         elif row.place is not None:
-            yield _numbered(row.place, marker_id, stops)
+            yield _numbered(row.place, marker_id, intervals)
         elif row.time_ns is not None:
-            yield _timed(row.time_ns, marker_id, stops)
+            yield _timed(row.time_ns, marker_id, intervals)
         elif len(own) != len(in_order[marker_id]):
             yield (
                 f"marker {marker_id} lies still {len(own)} times, but {len(in_order[marker_id])} rows name "
@@ -174,18 +174,18 @@ def assign_intervals(
             yield own[in_order[marker_id].index(row.line)]
 
 
-def _numbered(place: int, marker_id: int, stops: Sequence[StationaryInterval]) -> int | str:
-    if not 1 <= place <= len(stops):
-        return f"place {place} is none of 1 to {len(stops)}"
-    other = stops[place - 1].marker_id
+def _numbered(place: int, marker_id: int, intervals: Sequence[StationaryInterval]) -> int | str:
+    if not 1 <= place <= len(intervals):
+        return f"place {place} is none of 1 to {len(intervals)}"
+    other = intervals[place - 1].marker_id
     return place - 1 if other == marker_id else f"place {place} is one of marker {other}, not {marker_id}"
 
 
-def _timed(time_ns: int, marker_id: int, stops: Sequence[StationaryInterval]) -> int | str:
+def _timed(time_ns: int, marker_id: int, intervals: Sequence[StationaryInterval]) -> int | str:
     def away_ns(number: int) -> int:
-        return max(stops[number].start_ns - time_ns, time_ns - stops[number].end_ns, 0)
+        return max(intervals[number].start_ns - time_ns, time_ns - intervals[number].end_ns, 0)
 
-    nearest = min((n for n, stop in enumerate(stops) if stop.marker_id == marker_id), key=away_ns)
+    nearest = min((n for n, interval in enumerate(intervals) if interval.marker_id == marker_id), key=away_ns)
     if away_ns(nearest) > _NEAR_NS:
         return f"marker {marker_id} does not lie still then; nearest is place {nearest + 1}"
     return nearest

@@ -42,8 +42,8 @@ def scene_json(scene: MeasuringScene) -> dict[str, Any]:
         "floor": None if rig.floor is None else [rig.floor.width_m, rig.floor.depth_m],
         "one_line": are_collinear(points_m),
         "stops": [
-            {"marker": stop.marker_id, "seconds": (stop.end_ns - stop.start_ns) / NS_PER_S}
-            for stop in scene.stops
+            {"marker": interval.marker_id, "seconds": (interval.end_ns - interval.start_ns) / NS_PER_S}
+            for interval in scene.intervals
         ],
         "model": None if scene.model is None else scene.model.name,
     }
@@ -67,7 +67,7 @@ def history_json(scene: MeasuringScene) -> dict[str, Any]:
         for measurement in reversed(history)
         if measurement.withdraws is None
     ]
-    return {"next": next_id(history), "places": rows, "measured": _measured(scene.stops, active)}
+    return {"next": next_id(history), "places": rows, "measured": _measured(scene.intervals, active)}
 
 
 def _tapes(measurement: Measurement) -> str:
@@ -77,9 +77,9 @@ def _tapes(measurement: Measurement) -> str:
     return ", ".join([*tapes, *side, *height])
 
 
-def _measured(stops: Sequence[StationaryInterval], active: Sequence[Measurement]) -> list[str | None]:
+def _measured(intervals: Sequence[StationaryInterval], active: Sequence[Measurement]) -> list[str | None]:
     """Return the id of the measurement of each stationary interval; None if it is not measured yet."""
-    return [next((m.id for m in active if stop.covers(m)), None) for stop in stops]
+    return [next((m.id for m in active if interval.covers(m)), None) for interval in intervals]
 
 
 def views_json(scene: MeasuringScene, views: Sequence[CameraView], marker_id: int | None) -> dict[str, Any]:
@@ -90,18 +90,19 @@ def views_json(scene: MeasuringScene, views: Sequence[CameraView], marker_id: in
     visible = visible_markers(views, scene.rig)
     if marker_id is None and len(visible) == 1:
         marker_id = visible[0]
-    sight = None if marker_id is None else observe_marker(views, marker_id)
+    observations = None if marker_id is None else observe_marker(views, marker_id)
     colours = camera_styles(view.camera for view in views)
     return {
         "marker": marker_id,
         "visible": visible,
-        "state": sight.state if sight else "choose" if visible else "unseen",
-        "text": _invitation(visible) if sight is None else sight.text,
+        "state": observations.state if observations else "choose" if visible else "unseen",
+        "text": _invitation(visible) if observations is None else observations.text,
         "cameras": [
             {
                 "name": view.camera,
                 "colour": colours[view.camera][0],
-                "sees": sight is not None and view.camera in (*sight.points_m, *sight.moving),
+                "sees": observations is not None
+                and view.camera in (*observations.points_m, *observations.moving),
                 "picture": None if view.jpeg is None else f"picture/{view.camera}/{view.time_ns}",
                 "size_px": None if view.markers is None else [view.markers.width, view.markers.height],
                 "markers": [
@@ -254,17 +255,17 @@ class _Questions:
         texts = {name: str(body.get(name, "")) for name in ("marker", "side", "height", "split")}
         typed = TypedEntry(distances={str(k): str(v) for k, v in distances.items()}, **texts)
         entry, faults = parse_entry(typed, scene.rig)
-        stop = self._stop(body.get("stop"))
-        sight = None
+        interval = self._stop(body.get("stop"))
+        observations = None
         if entry.marker_id is not None:
-            sight = observe_marker(scene.views(stop), entry.marker_id)
-        return check_entry(entry, faults, scene.rig, sight, scene.history(), scene.model)
+            observations = observe_marker(scene.views(interval), entry.marker_id)
+        return check_entry(entry, faults, scene.rig, observations, scene.history(), scene.model)
 
     def _stop(self, given: Any) -> int | None:
-        if not self._scene.stops:
+        if not self._scene.intervals:
             return None
         number = _whole_number(str(given))
-        if number is None or number >= len(self._scene.stops):
+        if number is None or number >= len(self._scene.intervals):
             raise IpsysError(f"there is no place {str(given)[:_MOST_DIGITS]} in this log")
         return number
 

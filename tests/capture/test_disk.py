@@ -14,8 +14,8 @@ import pytest
 
 from ipsys_log.capture.camera_thread import CameraState
 from ipsys_log.capture.disk import DiskRoom, expected_bytes_per_s, free_room
-from ipsys_log.capture.status import Monitor
-from ipsys_log.cli.open_cameras import opened, prepared
+from ipsys_log.capture.live_check import CameraMonitor
+from ipsys_log.cli.open_cameras import open_cameras, prepare_lab
 from ipsys_log.log.dataset import Session
 from ipsys_log.messages import Rig, RigCamera
 from ipsys_log.report.cameras import LiveStatus
@@ -45,7 +45,7 @@ def status_line(status: LiveStatus) -> tuple[str, str]:
 @contextmanager
 def opening(rig: Path, log: Path, seconds: float | None, doing: str | None = None) -> Iterator[LiveStatus]:
     """The cameras opened as a command opens them; nothing is written."""
-    with opened(prepared(rig, None, None), log, seconds, doing) as (cameras, _, status):
+    with open_cameras(prepare_lab(rig, None, None), log, seconds, doing) as (cameras, _, status):
         yield status
         cameras.stop()
         log.touch()
@@ -109,7 +109,7 @@ def test_line_on_the_screen_is_corrected_by_what_came(
     log.write_bytes(bytes(20_000_000))
     monkeypatch.setattr(shutil, "disk_usage", lambda _: Usage(10**12, 0, 6_000_000_000))
     now_s = [0.0]
-    with Monitor(RIG) as monitor:
+    with CameraMonitor(RIG) as monitor:
         status = LiveStatus({}, monitor, log, lambda: now_s[0], 10e6)
         now_s[0] = 1.0
         assert status_line(status) == ("1 s, 20.0 MB; 6.0 GB left on the disk: 10 minutes", "")
@@ -150,4 +150,4 @@ def test_advice_only_where_a_recording_is_large_or_the_disk_small(tmp_path: Path
 def test_room_leaves_out_what_is_set_aside(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr(shutil, "disk_usage", lambda _: Usage(10**12, 0, 10**9))
     assert free_room(tmp_path / "a.mcap", 1.0).free_bytes == 10**9 - (64 << 20)
-    assert free_room(tmp_path / "a.mcap", 0.0).lasts_s is None
+    assert free_room(tmp_path / "a.mcap", 0.0).remaining_s is None

@@ -16,7 +16,7 @@ import simplejpeg
 
 from ipsys_log.capture import multiplexer as attached_module
 from ipsys_log.capture.frames import Clock, Frame, Open, Say, SourceError
-from ipsys_log.capture.multiplexer import Attached
+from ipsys_log.capture.multiplexer import LiveCameras
 from ipsys_log.messages import STAMP_UNRELIABLE, CompressedImage, Event, Message, RigCamera
 from tests.playing import cameras, playing
 
@@ -25,7 +25,7 @@ LIMIT_S = 240.0
 FRAMES = {name: [f"{name} {n}".encode() for n in range(20)] for name in ("red", "white", "black")}
 
 
-def messages(attached: Attached) -> list[Message]:
+def messages(attached: LiveCameras) -> list[Message]:
     with attached:
         return [message for message in attached if message is not None]
 
@@ -50,7 +50,7 @@ def data_of(found: list[Message], camera: str) -> list[bytes]:
 
 def test_every_frame_comes_as_it_was_and_log_times_increase() -> None:
     begun_ns = time.monotonic_ns()
-    found = messages(Attached(cameras(*FRAMES), playing(FRAMES, 200.0), Clock()))
+    found = messages(LiveCameras(cameras(*FRAMES), playing(FRAMES, 200.0), Clock()))
     most_ns = time.monotonic_ns() - begun_ns + 1_000_000
     assert {name: data_of(found, name) for name in FRAMES} == FRAMES
     assert all(one.log_time_ns < other.log_time_ns for one, other in pairwise(found))
@@ -59,7 +59,7 @@ def test_every_frame_comes_as_it_was_and_log_times_increase() -> None:
 
 def test_log_times_are_utc() -> None:
     before_ns = time.time_ns()
-    (first, *_) = messages(Attached(cameras("red"), playing(FRAMES, 1000.0), Clock()))
+    (first, *_) = messages(LiveCameras(cameras("red"), playing(FRAMES, 1000.0), Clock()))
     assert before_ns - 50_000_000 < first.log_time_ns < time.time_ns() + 50_000_000
 
 
@@ -73,7 +73,7 @@ def test_a_camera_without_stamps_has_the_time_of_arrival() -> None:
             assert attached._started.wait(LIMIT_S)
         sent_ns.append(clock.now_ns())
 
-    attached = Attached(cameras("red"), playing(FRAMES, 200.0, False, before), clock)
+    attached = LiveCameras(cameras("red"), playing(FRAMES, 200.0, False, before), clock)
     with attached:
         wait_until(lambda: attached.states["red"].frames == 20)
         taken_ns = clock.now_ns()
@@ -94,7 +94,7 @@ def test_frames_that_were_lost_before_they_came_are_counted_and_named() -> None:
         yield iter([Frame(b"x", "jpeg", clock.now_ns(), missed) for missed in (0, 0, 2, 0, 3, 1, 0)])
 
     said: list[str] = []
-    attached = Attached(cameras("red"), opened, Clock(), said.append)
+    attached = LiveCameras(cameras("red"), opened, Clock(), said.append)
     found = messages(attached)
     assert (attached.states["red"].missed, attached.states["red"].dropped) == (6, 0)
     assert len(data_of(found, "red")) == 7
@@ -112,7 +112,7 @@ def test_a_camera_that_cannot_be_opened_ends_it_at_once() -> None:
         yield iter([Frame(b"a", "jpeg", clock.now_ns())])
 
     with pytest.raises(SourceError, match="no /dev/video7"):
-        messages(Attached(cameras("red", "white"), opened, Clock()))
+        messages(LiveCameras(cameras("red", "white"), opened, Clock()))
     assert not [thread for thread in threading.enumerate() if thread.name in ("red", "white")]
 
 
@@ -125,7 +125,7 @@ def test_a_camera_that_sends_nothing_is_named_without_its_password(monkeypatch: 
 
     camera = RigCamera("red", source="rtsp://admin:secret@10.0.0.7/live")
     with pytest.raises(SourceError, match=r"admin:\*+@10\.0\.0\.7/live sends no frames") as raised:
-        messages(Attached([camera], silent, Clock()))
+        messages(LiveCameras([camera], silent, Clock()))
     assert "secret" not in str(raised.value)
 
 
@@ -153,7 +153,7 @@ def test_a_camera_that_vanishes_is_tried_again_while_the_others_go_on() -> None:
                 raise SourceError("camera red: there is no /dev/video0")
         yield sent()
 
-    found = messages(Attached(cameras("red", "white"), opened, Clock()))
+    found = messages(LiveCameras(cameras("red", "white"), opened, Clock()))
     said = [event for event in events(found) if event.camera == "red"]
     # It was open when it went the first time, and not when the second try failed.
     assert [event.kind for event in said] == ["camera_lost", "camera_back"]
@@ -184,7 +184,7 @@ def test_a_camera_that_returns_with_another_codec_is_not_recorded(monkeypatch: p
     jpeg, video = Frame(b"a", "jpeg", None), Frame(b"b", "h264", None)
     said: list[str] = []
     opened = changing([jpeg], [video], [video], [jpeg, video], [jpeg])
-    found = messages(Attached(cameras("red"), opened, Clock(), said.append))
+    found = messages(LiveCameras(cameras("red"), opened, Clock(), said.append))
     assert [m.payload.data for m in found if m.camera] == [b"a"] * 3
     kinds = [event.kind for event in events(found)]
     assert kinds == ["camera_lost", "camera_lost", "camera_back", "camera_lost", "camera_back"]
@@ -199,7 +199,7 @@ def test_pictures_of_another_size_are_said_once_for_each_change() -> None:
         for shape in ((48, 64), (24, 32))
     )
     damaged = Frame(b"no picture", "jpeg", None)
-    attached = Attached(
+    attached = LiveCameras(
         cameras("red"), changing([large, large, small, damaged, small, large, large]), Clock()
     )
     found = messages(attached)
@@ -218,7 +218,7 @@ def test_what_the_disk_cannot_take_is_dropped_by_name_and_memory_stays_bounded()
             many_sent.set()
             some_written.wait(LIMIT_S)
 
-    attached = Attached(cameras("red"), playing(frames, 500.0, before=before), Clock(), limit_bytes=10_000)
+    attached = LiveCameras(cameras("red"), playing(frames, 500.0, before=before), Clock(), limit_bytes=10_000)
     found: list[Message] = []
     with attached:
         for message in attached:
@@ -242,12 +242,12 @@ def test_log_times_increase_when_the_clock_stands_still() -> None:
         def now_ns(self) -> int:
             return 1_000
 
-    found = messages(Attached(cameras(*FRAMES), playing(FRAMES, 500.0), Standing()))
+    found = messages(LiveCameras(cameras(*FRAMES), playing(FRAMES, 500.0), Standing()))
     assert all(one.log_time_ns < other.log_time_ns for one, other in pairwise(found))
 
 
 def test_nothing_is_taken_when_nobody_would_write_it() -> None:
-    attached = Attached(cameras("red"), playing(FRAMES, 500.0), Clock())
+    attached = LiveCameras(cameras("red"), playing(FRAMES, 500.0), Clock())
     with attached:
         attached.add("/note", Event(5, "note", "written"))
         found = [message for message in attached if message is not None]
@@ -257,7 +257,7 @@ def test_nothing_is_taken_when_nobody_would_write_it() -> None:
 
 
 def test_what_is_saved_is_written_by_then() -> None:
-    attached = Attached(cameras("red"), playing({"red": [b"a"] * 100}, 100.0), Clock())
+    attached = LiveCameras(cameras("red"), playing({"red": [b"a"] * 100}, 100.0), Clock())
     asked: list[str] = []
     with attached, ThreadPoolExecutor(1) as page:
         saved = page.submit(lambda: attached.save("/note", Event(5, "note", "kept")))
@@ -278,7 +278,7 @@ def test_what_is_saved_is_written_by_then() -> None:
 
 
 def test_what_is_not_written_is_not_saved_and_it_is_said_why() -> None:
-    attached = Attached(cameras("red"), playing({"red": [b"a"] * 300}, 100.0), Clock())
+    attached = LiveCameras(cameras("red"), playing({"red": [b"a"] * 300}, 100.0), Clock())
     with attached, ThreadPoolExecutor(1) as page:
         messages = iter(attached)
         next(messages)
@@ -295,7 +295,7 @@ def test_what_is_not_written_is_not_saved_and_it_is_said_why() -> None:
 
 def test_what_waits_too_long_to_be_saved_is_not_written_later(monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr(attached_module, "_SAVED_S", 0.1)
-    attached = Attached(cameras("red"), playing(FRAMES, 500.0), Clock())
+    attached = LiveCameras(cameras("red"), playing(FRAMES, 500.0), Clock())
     with attached:
         with pytest.raises(SourceError, match="not saved: the disk is too slow"):
             attached.save("/note", Event(5, "note", "late"))
@@ -304,7 +304,7 @@ def test_what_waits_too_long_to_be_saved_is_not_written_later(monkeypatch: pytes
 
 def test_what_was_dropped_at_the_end_is_named_too() -> None:
     frames = {"red": [bytes(1000)] * 40}
-    attached = Attached(cameras("red"), playing(frames, 500.0), Clock(), limit_bytes=10_000)
+    attached = LiveCameras(cameras("red"), playing(frames, 500.0), Clock(), limit_bytes=10_000)
     with attached:
         wait_until(lambda: attached.states["red"].dropped > 0)
         attached.stop()
@@ -329,7 +329,7 @@ def test_early_frames_do_not_pile_up_while_another_camera_opens() -> None:
         yield sent()
 
     waiting: list[int] = []
-    attached = Attached(cameras("early", "late"), opened, Clock())
+    attached = LiveCameras(cameras("early", "late"), opened, Clock())
     with attached:
         assert waiting == [1]
         assert len([message for message in attached if message is not None]) == 10
@@ -358,7 +358,7 @@ def test_frames_without_stamps_do_not_wait_for_another_camera_to_get_a_false_tim
 
         yield early() if camera.name == "early" else late()
 
-    attached = Attached(cameras("early", "late"), opened, Clock())
+    attached = LiveCameras(cameras("early", "late"), opened, Clock())
     with attached:
         found = [message for message in attached if message is not None and message.camera == "early"]
     numbers = [int(message.payload.data[-3:]) for message in found]
@@ -370,10 +370,10 @@ def test_frames_without_stamps_do_not_wait_for_another_camera_to_get_a_false_tim
 
 
 def test_a_video_without_keyframes_is_said_once_and_kept(monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr("ipsys_log.capture.camera_thread._KEYLESS", 10)
+    monkeypatch.setattr("ipsys_log.capture.camera_thread.MAX_FRAMES_WITHOUT_KEYFRAME", 10)
     key, other = (Frame(data, "h264", 1) for data in (b"\0\0\1\x67\0\0\1\x65", b"\0\0\1\x41"))
     for frames, count in (([key, *[other] * 9] * 3, 0), ([key, *[other] * 10, key, *[other] * 15], 1)):
-        found = messages(Attached(cameras("red"), changing(frames), Clock()))
+        found = messages(LiveCameras(cameras("red"), changing(frames), Clock()))
         assert [event.kind for event in events(found)] == ["no_keyframes"] * count
         assert sum(message.camera is not None for message in found) == len(frames)
 
@@ -387,7 +387,9 @@ def test_what_came_before_a_fault_is_given_out() -> None:
 
     found: list[Message] = []
     said: list[str] = []
-    attached = Attached(cameras("red", "white"), playing(FRAMES, 200.0, before=broken), Clock(), said.append)
+    attached = LiveCameras(
+        cameras("red", "white"), playing(FRAMES, 200.0, before=broken), Clock(), said.append
+    )
     with attached:
         time.sleep(0.3)
         with pytest.raises(ZeroDivisionError):
@@ -408,7 +410,7 @@ def test_stopping_gives_out_what_has_come() -> None:
         if number == 10:
             stopped.wait(LIMIT_S)
 
-    attached = Attached(cameras("red"), playing(FRAMES, 100.0, before=before), Clock())
+    attached = LiveCameras(cameras("red"), playing(FRAMES, 100.0, before=before), Clock())
     found = []
     with attached:
         for message in attached:
@@ -425,11 +427,11 @@ def test_a_bug_in_a_source_keeps_its_traceback() -> None:
             raise ZeroDivisionError("a bug")
 
     with pytest.raises(ZeroDivisionError, match="a bug"):
-        messages(Attached(cameras("red"), playing(FRAMES, 100.0, before=broken), Clock()))
+        messages(LiveCameras(cameras("red"), playing(FRAMES, 100.0, before=broken), Clock()))
 
 
 def test_a_silent_camera_is_no_reason_to_be_silent() -> None:
     """So that a recorder can look at its clock, and at signals."""
-    attached = Attached(cameras("red"), playing({"red": [b"a", b"b"]}, 2.0), Clock())
+    attached = LiveCameras(cameras("red"), playing({"red": [b"a", b"b"]}, 2.0), Clock())
     with attached:
         assert list(attached).count(None) >= 3

@@ -15,9 +15,9 @@ from ipsys_log import pipeline
 from ipsys_log.analysis.calibration_points import find_pairs
 from ipsys_log.analysis.calibration_points import measured as measured_places
 from ipsys_log.capture.camera_thread import CameraState
-from ipsys_log.capture.live_plan import check_pictures
-from ipsys_log.capture.multiplexer import Attached
-from ipsys_log.capture.recent_frames import Recent
+from ipsys_log.capture.live_plan import check_independent_frames
+from ipsys_log.capture.multiplexer import LiveCameras
+from ipsys_log.capture.recent_frames import RecentFrames
 from ipsys_log.capture.recorder import first_messages
 from ipsys_log.errors import IpsysError
 from ipsys_log.log.dataset import Session
@@ -87,7 +87,7 @@ def taken_s(log: Noted) -> list[float]:
 
 
 def test_frames_since_a_marker_lay_still_come_with_its_measurement_and_no_others(log: Noted) -> None:
-    with Recent(log) as recent:
+    with RecentFrames(log) as recent:
         for message in frames(0, 60):
             recent.put(message)
         recent.put(measured("p001", 58.6, 59.7, 59.99))
@@ -99,7 +99,7 @@ def test_frames_since_a_marker_lay_still_come_with_its_measurement_and_no_others
 
 
 def test_two_markers_of_one_second_share_its_frames(log: Noted) -> None:
-    with Recent(log) as recent:
+    with RecentFrames(log) as recent:
         for message in frames(0, 10):
             recent.put(message)
         recent.put(measured("p001", 8.6, 9.6, 9.99))
@@ -114,7 +114,7 @@ def test_everything_but_frames_is_written_and_all_of_it_in_order(log: Noted) -> 
         *frames(0, 20), event("camera_lost", 2.05), event("camera_back", 17.05), event("camera_lost", 19.99),
         event(FRAME_SKIPPED, 17.06), measured("p001", 17.0, 17.9, 18.06),
     ]  # fmt: skip
-    with Recent(log) as recent:
+    with RecentFrames(log) as recent:
         for message in sorted(stream, key=lambda one: one.log_time_ns):
             recent.put(message)
         assert [m.payload.kind for m in log.noted if isinstance(m.payload, Event)] == [
@@ -126,7 +126,7 @@ def test_everything_but_frames_is_written_and_all_of_it_in_order(log: Noted) -> 
 
 
 def test_a_withdrawal_brings_no_frames(log: Noted) -> None:
-    with Recent(log) as recent:
+    with RecentFrames(log) as recent:
         for message in frames(0, 10):
             recent.put(message)
         gone = Measurement(0, "p001_withdrawn", withdraws="p001")
@@ -135,18 +135,18 @@ def test_a_withdrawal_brings_no_frames(log: Noted) -> None:
 
 
 def test_hours_of_frames_are_not_kept_in_memory(log: Noted) -> None:
-    with Recent(log) as recent:
+    with RecentFrames(log) as recent:
         for message in frames(0, 3600):
             recent.put(message)
-            assert len(recent._held) <= 52
+            assert len(recent._buffer) <= 52
 
 
 def test_of_large_frames_fewer_are_kept_and_events_all_the_same(log: Noted) -> None:
-    with Recent(log, limit_bytes=10_000) as recent:
+    with RecentFrames(log, limit_bytes=10_000) as recent:
         recent.put(event("camera_lost", 0.001))
         for message in frames(0, 20):
             recent.put(replace(message, payload=replace(message.payload, data=bytes(1000))))
-            held = [one for one in recent._held if isinstance(one.payload, CompressedImage)]
+            held = [one for one in recent._buffer if isinstance(one.payload, CompressedImage)]
             assert len(held) <= 10
         recent.put(measured("p001", 18.6, 19.7, 19.99))
     # The last ten, of the fifteen of its second.
@@ -156,7 +156,7 @@ def test_of_large_frames_fewer_are_kept_and_events_all_the_same(log: Noted) -> N
 
 def test_of_a_video_no_seconds_can_be_kept() -> None:
     with pytest.raises(IpsysError, match="camera white sends h264, of which no single seconds can be kept"):
-        check_pictures({"red": CameraState(format="jpeg"), "white": CameraState(format="h264")})
+        check_independent_frames({"red": CameraState(format="jpeg"), "white": CameraState(format="h264")})
 
 
 def test_of_a_camera_that_hangs_or_is_lost_nothing_is_seen() -> None:
@@ -216,7 +216,7 @@ def tape_of(lab_log: Path) -> tuple[Rig, dict[tuple[int, bytes], Measurement]]:
         return rig, found
 
 
-class Noting(Attached):
+class Noting(LiveCameras):
     """Cameras; notes all that they send."""
 
     sent: list[Message]

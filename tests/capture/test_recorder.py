@@ -12,7 +12,7 @@ from pathlib import Path
 import pytest
 
 from ipsys_log.capture.backlog import TICK, Backlog
-from ipsys_log.capture.recorder import Recording, recording, written
+from ipsys_log.capture.recorder import Recording, open_recording, write_each
 from ipsys_log.errors import IpsysError, LogError
 from ipsys_log.log.dataset import Session
 from ipsys_log.log.journal import Disk
@@ -66,13 +66,13 @@ class Sent:
     def __iter__(self) -> Generator[Message | None, None, None]:
         return self._messages
 
-    def stop(self, why: str | None = None) -> None:
-        self.whys.append(why)
+    def stop(self, reason: str | None = None) -> None:
+        self.whys.append(reason)
 
     def confirm(self, message: Message, fault: OSError | None) -> None:
         self.confirmed.append((message, fault))
 
-    def warn(self, kind: str, text: str) -> None:
+    def add_event(self, kind: str, text: str) -> None:
         self.warned.append((kind, text))
 
 
@@ -124,7 +124,7 @@ def test_settings_are_in_the_file_before_the_first_frame(tmp_path: Path) -> None
     path, killed = tmp_path / "a.mcap", tmp_path / "killed.mcap"
     rig = Rig("lab", "DICT_4X4_100", 0.2)
     settings = [Message(RIG_TOPIC, 1, 1, rig), Message("/runs/poly/model", 2, 2, Model(2, "poly", ()))]
-    with recording(path, settings) as log:
+    with open_recording(path, settings) as log:
         killed.write_bytes(path.read_bytes())
         log.put(frame(0))
     repair(killed)
@@ -159,7 +159,7 @@ def test_on_a_full_disk_what_waits_is_written_but_for_frames_and_nothing_more_is
     sent = Sent(source())
     with LogWriter.create(path, storage=disk) as writer:
         log, sizes = Recording(writer, disk.freed.set), [0]
-        for message in written(sent, log):
+        for message in write_each(sent, log):
             if message is not None and isinstance(message.payload, Measurement):
                 sizes.append(path.stat().st_size)
     with Session([path]) as session:
@@ -171,12 +171,12 @@ def test_on_a_full_disk_what_waits_is_written_but_for_frames_and_nothing_more_is
 
 def test_a_log_that_is_being_written_is_not_overwritten(tmp_path: Path) -> None:
     path = tmp_path / "a.mcap"
-    with recording(path) as first:
+    with open_recording(path) as first:
         first.put(frame(0))
-        with pytest.raises(LogError), recording(path, overwrite=True):
+        with pytest.raises(LogError), open_recording(path, overwrite=True):
             pass
         first.put(frame(1))
-    with recording(path, overwrite=True) as second:
+    with open_recording(path, overwrite=True) as second:
         second.put(frame(2))
     assert second.counts == {image_topic("red"): 1}
 
@@ -185,7 +185,7 @@ def test_the_old_log_is_there_until_the_new_one_stands(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     path = tmp_path / "a.mcap"
-    with recording(path) as first:
+    with open_recording(path) as first:
         first.put(frame(0))
     old = path.read_bytes()
 
@@ -194,14 +194,14 @@ def test_the_old_log_is_there_until_the_new_one_stands(
 
     with monkeypatch.context() as patch:
         patch.setattr(LogWriter, "move", broken)
-        with pytest.raises(IpsysError, match="Operation not permitted"), recording(path, overwrite=True):
+        with pytest.raises(IpsysError, match="Operation not permitted"), open_recording(path, overwrite=True):
             pass
     assert (path.read_bytes(), list(tmp_path.iterdir())) == (old, [path])
     (tmp_path / "a.mcap.new").write_bytes(b"left by one that was killed")
-    with recording(path, overwrite=True) as second:
+    with open_recording(path, overwrite=True) as second:
         second.put(frame(1))
         # Nobody else makes a log there meanwhile, nor is there an instant without one.
-        with pytest.raises(LogError, match="another process"), recording(path, overwrite=True):
+        with pytest.raises(LogError, match="another process"), open_recording(path, overwrite=True):
             pass
     with Session([path]) as session:
         assert [one.timestamp for one in session.payloads([image_topic("red")])] == [1]
@@ -211,7 +211,7 @@ def test_the_old_log_is_there_until_the_new_one_stands(
 @pytest.mark.parametrize("whole", [True, False])
 def test_a_journal_that_was_left_over_does_not_outlive_its_log(tmp_path: Path, whole: bool) -> None:
     path, journal = tmp_path / "a.mcap", tmp_path / "a.mcap.journal"
-    with recording(path) as first:
+    with open_recording(path) as first:
         first.put(frame(0))
     if whole:
         writer = LogWriter.append(path, storage=Killed())
@@ -222,7 +222,7 @@ def test_a_journal_that_was_left_over_does_not_outlive_its_log(tmp_path: Path, w
         assert journal.stat().st_size > 100
     else:
         journal.write_bytes(b"torn")
-    with recording(path, overwrite=True) as second:
+    with open_recording(path, overwrite=True) as second:
         second.put(frame(1))
     with Session([path]) as session:
         assert [one.timestamp for one in session.payloads([image_topic("red")])] == [1]

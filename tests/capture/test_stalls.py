@@ -11,8 +11,8 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from ipsys_log.capture.frames import Clock, Frame, Say
-from ipsys_log.capture.multiplexer import Attached
-from ipsys_log.capture.stalls import STALL_NS, Heartbeat, LateFrames
+from ipsys_log.capture.multiplexer import LiveCameras
+from ipsys_log.capture.stalls import STALL_NS, Heartbeat, LateFrameDetector
 from ipsys_log.messages import STAMP_UNRELIABLE, CompressedImage, Event, Message, RigCamera
 from ipsys_log.units import NS_PER_S
 
@@ -44,7 +44,7 @@ def recorded(
         yield sent()
 
     camera = RigCamera("red", source="test:red", rate_hz=rate_hz)
-    with Attached([camera], opened, clock) as attached:
+    with LiveCameras([camera], opened, clock) as attached:
         return [message for message in attached if message is not None]
 
 
@@ -112,7 +112,7 @@ def test_every_late_frame_is_named(
     """A buffer keeps the first frames of the stall, and gives them out as fast as they are read."""
     period_ns = round(NS_PER_S / rate_hz)
     heartbeat = Heartbeat(Clock())
-    late = LateFrames(heartbeat, None)
+    late = LateFrameDetector(heartbeat, None)
     captured = [NS_PER_S + n * period_ns for n in range(int(stall_s * rate_hz) + 90)]
     stops_ns = captured[30] + 1
     goes_on_ns = stops_ns + round(stall_s * NS_PER_S)
@@ -129,7 +129,7 @@ def test_every_late_frame_is_named(
         late.take(now_ns)
         is_late = now_ns - taken_ns > 1.5 * period_ns + STALL_NS
         assert late.since_ns is not None or not is_late, "a late frame passes for one in time"
-        late.caught_up()
+        late.has_caught_up()
     assert late.since_ns is None
 
 
@@ -142,5 +142,5 @@ def test_sleep_of_the_machine_is_in_the_clock(monkeypatch: pytest.MonkeyPatch) -
     after_ns = clock.now_ns()
     assert 300 * NS_PER_S <= after_ns - before_ns < 310 * NS_PER_S
     # A driver's stamps from before the sleep, and from after it.
-    assert before_ns - 10 * NS_PER_S < clock.of_monotonic_ns(stamp_ns) <= before_ns
-    assert after_ns <= clock.of_monotonic_ns(time.monotonic_ns()) < after_ns + 10 * NS_PER_S
+    assert before_ns - 10 * NS_PER_S < clock.to_utc_ns(stamp_ns) <= before_ns
+    assert after_ns <= clock.to_utc_ns(time.monotonic_ns()) < after_ns + 10 * NS_PER_S

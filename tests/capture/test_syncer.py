@@ -13,8 +13,8 @@ import pytest
 
 from ipsys_log.capture.disk import SYNC_EVERY_S, Syncer
 from ipsys_log.capture.frames import Clock, SourceError
-from ipsys_log.capture.multiplexer import Attached
-from ipsys_log.capture.recorder import Recording, recording, written
+from ipsys_log.capture.multiplexer import LiveCameras
+from ipsys_log.capture.recorder import Recording, open_recording, write_each
 from ipsys_log.errors import IpsysError
 from ipsys_log.log.dataset import Session
 from ipsys_log.log.journal import DISK, Storage
@@ -73,7 +73,7 @@ def test_slow_sync_holds_up_no_frame_and_no_order(tmp_path: Path) -> None:
     with on(disk, path) as writer:
         log = Recording(writer, lambda: None)
         with log.syncer:
-            for _ in written(sent, log):
+            for _ in write_each(sent, log):
                 pass
     assert [(message.payload.id, fault) for message, fault in sent.confirmed] == [("p0", None)]
     with Session([path]) as session:
@@ -91,20 +91,20 @@ def test_recording_is_synced_without_being_asked() -> None:
 
 def test_recording_syncs_while_it_is_open(tmp_path: Path) -> None:
     synced = threading.Event()
-    with recording(tmp_path / "a.mcap") as log:
+    with open_recording(tmp_path / "a.mcap") as log:
         log.sync(lambda fault: synced.set() if fault is None else None)
         assert synced.wait(LIMIT_S)
 
 
 def test_point_is_saved_when_it_is_on_the_disk(tmp_path: Path) -> None:
     disk = Slow()
-    attached = Attached(cameras("red"), playing({"red": [b"a"] * 2000}, 100.0), Clock())
+    attached = LiveCameras(cameras("red"), playing({"red": [b"a"] * 2000}, 100.0), Clock())
     with on(disk, tmp_path / "a.mcap") as writer, ThreadPoolExecutor(1) as page:
         log = Recording(writer, lambda: None)
         with attached, log.syncer:
             saved = page.submit(attached.save, MEASUREMENTS_TOPIC, Measurement(5, "p001"))
             after = 0
-            for message in written(attached, log):
+            for message in write_each(attached, log):
                 after += disk.syncing.is_set() and message is not None
                 if after == 10:
                     assert not saved.done(), "written, but not on the disk"
@@ -115,13 +115,13 @@ def test_point_is_saved_when_it_is_on_the_disk(tmp_path: Path) -> None:
 
 
 def test_point_that_comes_last_is_confirmed_at_the_end(tmp_path: Path) -> None:
-    attached = Attached(cameras("red"), playing({"red": [b"a"] * 2000}, 100.0), Clock())
+    attached = LiveCameras(cameras("red"), playing({"red": [b"a"] * 2000}, 100.0), Clock())
     disk = Slow()
     with on(disk, tmp_path / "a.mcap") as writer, ThreadPoolExecutor(1) as page:
         log = Recording(writer, lambda: None)
         with attached, log.syncer:
             saved = page.submit(attached.save, MEASUREMENTS_TOPIC, Measurement(5, "p001"))
-            for message in written(attached, log):
+            for message in write_each(attached, log):
                 if message is not None and message.topic == MEASUREMENTS_TOPIC:
                     attached.stop()
             assert not saved.done()
@@ -148,7 +148,7 @@ def test_fault_of_a_sync_is_said_once_and_at_the_end(tmp_path: Path) -> None:
     with on(disk, path) as writer:
         log = Recording(writer, lambda: None)
         with log.syncer:
-            for _ in written(sent, log):
+            for _ in write_each(sent, log):
                 pass
         disk.error = None
     assert [kind for kind, _ in sent.warned] == ["disk_fault"]
@@ -161,13 +161,13 @@ def test_fault_of_a_sync_is_said_once_and_at_the_end(tmp_path: Path) -> None:
 
 def test_point_on_a_failing_disk_is_not_called_saved(tmp_path: Path) -> None:
     disk = Slow(errno.EIO)
-    attached = Attached(cameras("red"), playing({"red": [b"a"] * 2000}, 100.0), Clock())
+    attached = LiveCameras(cameras("red"), playing({"red": [b"a"] * 2000}, 100.0), Clock())
     with on(disk, tmp_path / "a.mcap") as writer, ThreadPoolExecutor(1) as page:
         log = Recording(writer, lambda: None)
         with attached, log.syncer:
             saved = page.submit(attached.save, MEASUREMENTS_TOPIC, Measurement(5, "p001"))
             saved.add_done_callback(lambda _: attached.stop())
-            for _ in written(attached, log):
+            for _ in write_each(attached, log):
                 pass
         disk.error = None
         with pytest.raises(SourceError, match=r"maybe not saved: the disk has failed \(Input/output error\)"):

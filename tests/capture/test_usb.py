@@ -58,7 +58,7 @@ def test_frames_are_the_cameras_bytes_with_the_drivers_stamps(driver: Driver) ->
     with open_usb(ask(driver, width=1920, height=1080, rate_hz=30.0), clock, said.append) as frames:
         came = list(islice((frame for frame in frames if frame), 20))
     del driver.stamps_ns[3]
-    expected = [clock.of_monotonic_ns(stamp // 1000 * 1000) for stamp in driver.stamps_ns]
+    expected = [clock.to_utc_ns(stamp // 1000 * 1000) for stamp in driver.stamps_ns]
     assert [frame[:3] for frame in came] == [
         (data, "jpeg", time) for data, time in zip(pictures, expected, strict=True)
     ]

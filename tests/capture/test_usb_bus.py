@@ -12,7 +12,7 @@ from typing import Any
 import pytest
 
 from ipsys_log.capture import usb_bus, v4l2
-from ipsys_log.capture.usb_bus import Demand, Mode, Plug, advise, demands_of, find_cameras
+from ipsys_log.capture.usb_bus import BandwidthDemand, Mode, UsbConnection, advise, find_cameras, list_demands
 from ipsys_log.messages import Rig, RigCamera
 from tests.capture.camera_driver import Driver
 from tests.conftest import Ipsys
@@ -90,8 +90,8 @@ def test_cameras_are_found_where_they_hang(tmp_path: Path, plug_in: Callable[[in
     first, second = find_cameras(tmp_path)
     assert (first.device, first.name) == (str(tmp_path / "dev/video2"), "Lab Camera 2")
     assert first.stable == str(tmp_path / "dev/v4l/by-id/usb-Acme_2-video-index0")
-    assert first.plug == Plug(1, "4", 480.0, "the machine's own, controller 0000:00:14.0", 3060)
-    assert second.plug == Plug(1, "2.3", 480.0, "Acme USB2.0 Hub at port 2", 3060)
+    assert first.plug == UsbConnection(1, "4", 480.0, "the machine's own, controller 0000:00:14.0", 3060)
+    assert second.plug == UsbConnection(1, "2.3", 480.0, "Acme USB2.0 Hub at port 2", 3060)
     assert first.modes == (
         Mode("YUYV", 640, 480, 30),
         Mode("MJPG", 1920, 1080, 30),
@@ -115,7 +115,7 @@ def test_what_the_rig_asks_for_is_reckoned(tmp_path: Path, plug_in: Callable[[in
     for number in (0, 1, 2):
         plug_in(number, f"2.{number + 1}")
     found = find_cameras(tmp_path)
-    assert [(d.camera, d.width, d.rate_hz) for d in demands_of(found, None)] == [
+    assert [(d.camera, d.width, d.rate_hz) for d in list_demands(found, None)] == [
         (str(tmp_path / f"dev/video{n}"), 1920, 30.0) for n in (0, 1, 2)
     ]
     rig = Rig(
@@ -126,13 +126,13 @@ def test_what_the_rig_asks_for_is_reckoned(tmp_path: Path, plug_in: Callable[[in
             RigCamera("black", source="rtsp://10.0.0.7/live"),
         ),
     )  # fmt: skip
-    red, white = demands_of(found, rig)
-    assert red == Demand("red", 1, 480.0, "Acme USB2.0 Hub at port 2", "MJPG", 640, 480, 15.0, 3060)
+    red, white = list_demands(found, rig)
+    assert red == BandwidthDemand("red", 1, 480.0, "Acme USB2.0 Hub at port 2", "MJPG", 640, 480, 15.0, 3060)
     assert white[4:8] == ("MJPG", 1920, 1080, 30.0)
 
 
-def cameras(count: int, **other: Any) -> list[Demand]:
-    demand = Demand("red", 1, 480.0, "Acme Hub at port 2", "MJPG", 1920, 1080, 30.0, 1024)
+def cameras(count: int, **other: Any) -> list[BandwidthDemand]:
+    demand = BandwidthDemand("red", 1, 480.0, "Acme Hub at port 2", "MJPG", 1920, 1080, 30.0, 1024)
     names = ("red", "white", "black", "blue")
     return [demand._replace(camera=name, **other) for name in names[:count]]
 

@@ -14,7 +14,7 @@ from mcap.opcode import Opcode
 
 from ipsys_log.log.codec import encode, schema_data, schema_name
 from ipsys_log.log.contents import Contents
-from ipsys_log.log.records import ENTRY, HEADER, INDEX_HEAD, MAGIC, MESSAGE, ChunkRef, as_bytes, chunk_head
+from ipsys_log.log.records import ENTRY, HEADER, INDEX_HEAD, MAGIC, MESSAGE, ChunkRef, chunk_head, to_bytes
 from ipsys_log.log.summary import tail_bytes
 from ipsys_log.messages import (
     CameraCalibration,
@@ -60,7 +60,7 @@ class Attack:
     """A log being put together, as well or as badly made as an attack needs it."""
 
     contents: Contents = field(default_factory=Contents)
-    data: bytearray = field(default_factory=lambda: bytearray(MAGIC + as_bytes(mcap.Header("", ""))))
+    data: bytearray = field(default_factory=lambda: bytearray(MAGIC + to_bytes(mcap.Header("", ""))))
 
     def channel(
         self, payload: type | str, topic: str, encoding: str = "protobuf", definition: bytes = b""
@@ -75,7 +75,7 @@ class Attack:
             id=number, message_encoding=encoding, metadata={}, schema_id=number, topic=topic
         )
         self.contents.schemas[number], self.contents.channels[number] = schema, record
-        self.data += as_bytes(schema, record)
+        self.data += to_bytes(schema, record)
         return number
 
     def chunk(
@@ -189,8 +189,8 @@ def many_robots(number: int) -> bytes:
 
 def lost_channels(number: int) -> bytes:
     """Messages in no chunk, each of a channel of its own that is not defined."""
-    messages = (as_bytes(mcap.Message(n + 1, n, b"", n, n)) for n in range(number))
-    return MAGIC + as_bytes(mcap.Header("", "")) + b"".join(messages)
+    messages = (to_bytes(mcap.Message(n + 1, n, b"", n, n)) for n in range(number))
+    return MAGIC + to_bytes(mcap.Header("", "")) + b"".join(messages)
 
 
 def with_rig(measurements: list[bytes]) -> bytes:
@@ -241,7 +241,7 @@ def many_channels(number: int, chunked: bool) -> bytes:
             mcap.Channel(id=n, topic=f"{n}", message_encoding="", metadata={}, schema_id=0)
             for n in range(1, number + 1)
         )
-        attack.chunk(b"".join(as_bytes(record) for record in records), count=0)
+        attack.chunk(b"".join(to_bytes(record) for record in records), count=0)
         return attack.finish(False)
     for n in range(1, number + 1):
         attack.contents.channels[n] = mcap.Channel(
@@ -275,7 +275,7 @@ def many_chunks(number: int) -> bytes:
 
 def large_definition(size: int, name: str = "ipsys.v1.Event") -> bytes:
     attack = Attack()
-    records = as_bytes(
+    records = to_bytes(
         mcap.Schema(data=bytes(size), encoding="protobuf", id=1, name=name),
         mcap.Channel(id=1, topic="/events", message_encoding="protobuf", metadata={}, schema_id=1),
     )
@@ -320,7 +320,7 @@ def real_chunk_heads(number: int) -> bytes:
 
 def metadata(number: int) -> bytes:
     attack = Attack()
-    record = as_bytes(mcap.Metadata(name="ipsys", metadata={}))
+    record = to_bytes(mcap.Metadata(name="ipsys", metadata={}))
     attack.data += record * number
     return attack.finish(False)
 

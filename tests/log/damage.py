@@ -29,7 +29,7 @@ from mcap.writer import CompressionType, IndexType, Writer
 from ipsys_log.errors import LogError
 from ipsys_log.log.journal import DISK, Storage
 from ipsys_log.log.reader import LogReader
-from ipsys_log.log.records import MAGIC, as_bytes
+from ipsys_log.log.records import MAGIC, to_bytes
 from ipsys_log.log.repair import RepairReport, repair
 from ipsys_log.log.writer import LogWriter
 from tests.log.conftest import IMAGE, POINT, Row, as_row, linear_rows, stock_rows, write_rows
@@ -210,23 +210,23 @@ def repeated_log(chance: random.Random) -> bytes:
     """A log with the definitions in every chunk; half of the time without its last records."""
     schema = mcap.Schema(1, b"{}", "jsonschema", "Thing")
     channels = [mcap.Channel(key, topic, "json", {}, 1) for key, topic in ((1, "/a"), (7, "/b"))]
-    out = MAGIC + as_bytes(mcap.Header("", "other"))
+    out = MAGIC + to_bytes(mcap.Header("", "other"))
     for number in range(8):
         now = 1_700_000_000_000_000_000 + number * 10**9
         records = [schema, *channels]
         entries: dict[int, list[tuple[int, int]]] = {1: [], 7: []}
-        data = as_bytes(*records)
+        data = to_bytes(*records)
         for k in range(12):
             key = chance.choice((1, 7))
             entries[key].append((now + k, len(data)))
-            data += as_bytes(mcap.Message(key, now + k, chance.randbytes(60), now, k))
+            data += to_bytes(mcap.Message(key, now + k, chance.randbytes(60), now, k))
         packed = zstandard.ZstdCompressor().compress(data)
-        out += as_bytes(mcap.Chunk("zstd", packed, now + 11, now, zlib.crc32(data), len(data)))
+        out += to_bytes(mcap.Chunk("zstd", packed, now + 11, now, zlib.crc32(data), len(data)))
         for key, rows in entries.items():
             if rows:
-                out += as_bytes(mcap.MessageIndex(key, rows))
+                out += to_bytes(mcap.MessageIndex(key, rows))
     if chance.random() < 0.5:
-        out += as_bytes(mcap.DataEnd(0), mcap.Footer(0, 0, 0)) + MAGIC
+        out += to_bytes(mcap.DataEnd(0), mcap.Footer(0, 0, 0)) + MAGIC
     return out
 
 
@@ -390,8 +390,8 @@ def _check_restored(path: Path, damaged: bytes, out: Outcome) -> None:
     """What was taken out, put back where it was, makes the damaged log again, byte for byte."""
     assert out.report is not None
     data = bytearray(path.read_bytes())
-    if out.report.kept_in is not None:
-        with out.report.kept_in.open("rb") as file:
+    if out.report.damaged_file is not None:
+        with out.report.damaged_file.open("rb") as file:
             attachments = sorted(
                 (int(a.name.split()[1]), a.data) for a in make_reader(file).iter_attachments()
             )

@@ -8,7 +8,7 @@ import zstandard
 from mcap import records as mcap
 
 from ipsys_log.log.contents import Contents
-from ipsys_log.log.records import MAGIC, ChunkRef, as_bytes
+from ipsys_log.log.records import MAGIC, ChunkRef, to_bytes
 from tests.log.test_bad_input import build, fault_of, read_everything
 
 NO_MESSAGE = "points to no message of its time"
@@ -44,8 +44,8 @@ def test_one_message(
     data = zstandard.ZstdCompressor().compress(records) if compression else records
     chunk = mcap.Chunk(compression, data, 7, 7, 0, len(records))
     index = mcap.MessageIndex(1, [(7, offset)])
-    start = len(MAGIC) + len(as_bytes(mcap.Header("", "")))
-    end = start + len(as_bytes(chunk))
+    start = len(MAGIC) + len(to_bytes(mcap.Header("", "")))
+    end = start + len(to_bytes(chunk))
     contents = Contents(channels={1: mcap.Channel(1, "/a", "", {}, 0)}, counts={1: 1})
     contents.chunks.append(
         ChunkRef(
@@ -56,7 +56,7 @@ def test_one_message(
             compression,
             len(data),
             len(records) + more,
-            len(as_bytes(index)),
+            len(to_bytes(index)),
             {1: end},
         )
     )

@@ -22,7 +22,7 @@ from ipsys_log.log.contents import Contents, Schema
 from ipsys_log.log.journal import DISK, Storage, journal_path
 from ipsys_log.log.lock import check_locks
 from ipsys_log.log.reader import LogReader
-from ipsys_log.log.records import MAGIC, ChunkRef, as_bytes
+from ipsys_log.log.records import MAGIC, ChunkRef, to_bytes
 from ipsys_log.log.repair import repair
 from ipsys_log.log.summary import tail_bytes
 from ipsys_log.log.writer import LogWriter
@@ -181,7 +181,7 @@ def test_a_changed_summary(log: Path) -> None:
 
 def build(path: Path, contents: Contents, *records: mcap.McapRecord) -> Path:
     """A log of these records with a summary by `contents`."""
-    data = MAGIC + as_bytes(mcap.Header("", "")) + b"".join(as_bytes(record) for record in records)
+    data = MAGIC + to_bytes(mcap.Header("", "")) + b"".join(to_bytes(record) for record in records)
     contents.data_end = len(data)
     path.write_bytes(data + tail_bytes(contents))
     return path
@@ -193,9 +193,9 @@ def test_a_bomb_is_not_unpacked(with_size: bool, tmp_path: Path) -> None:
     bomb = zstandard.ZstdCompressor(write_content_size=with_size).compress(bytes(300 << 20))
     size = 1000 if with_size else 1 << 42
     chunk = mcap.Chunk("zstd", bomb, 1, 1, 0, size)
-    start = len(MAGIC) + len(as_bytes(mcap.Header("", "")))
+    start = len(MAGIC) + len(to_bytes(mcap.Header("", "")))
     contents = Contents(channels={1: mcap.Channel(1, "/a", "", {}, 0)}, counts={1: 1})
-    contents.chunks.append(ChunkRef(start, len(as_bytes(chunk)), 1, 1, "zstd", len(bomb), size, 0, {}))
+    contents.chunks.append(ChunkRef(start, len(to_bytes(chunk)), 1, 1, "zstd", len(bomb), size, 0, {}))
     path = build(tmp_path / "bomb.mcap", contents, chunk)
     tracemalloc.start()
     try:
@@ -208,7 +208,7 @@ def test_a_bomb_is_not_unpacked(with_size: bool, tmp_path: Path) -> None:
 def test_messages_between_chunks_are_found(log: Path, rows: list[Row]) -> None:
     with LogReader(log) as reader:
         contents, end = reader._contents, reader.data_end
-    loose = as_bytes(mcap.Message(1, 5, b"loose", 6, 0))
+    loose = to_bytes(mcap.Message(1, 5, b"loose", 6, 0))
     contents.count(1, 1)
     contents.cover(5, 5)
     data = log.read_bytes()[:end] + loose

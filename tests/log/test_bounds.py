@@ -15,7 +15,7 @@ from hypothesis import given
 from hypothesis import strategies as st
 
 from ipsys_log.errors import IpsysError, LogError
-from ipsys_log.log.bounds import LARGEST_CHUNK, LARGEST_MESSAGE, Allowance, BoundError, chunk_excess
+from ipsys_log.log.bounds import LARGEST_CHUNK, LARGEST_MESSAGE, BoundError, ReadLimits, chunk_excess
 from ipsys_log.log.codec import encode, schema_data
 from ipsys_log.log.contents import Schema
 from ipsys_log.log.dataset import Session
@@ -131,16 +131,16 @@ def test_commands_on_a_small_file_stay_within_bounds(
 def test_true_recordings_stay_far_below_every_bound(path: Path) -> None:
     with Session([path]) as session:
         [reader] = session.readers
-        allowed, contents = reader.allowance, reader._contents
+        allowed, contents = reader.read_limits, reader._contents
         packed = [chunk for chunk in contents.chunks if chunk.compression]
         items = sum(
             16 + sum(len(value) for value in vars_of(message.payload) if isinstance(value, tuple))
             for message in session.messages(reader.channels)
         )
-    assert sum(chunk.uncompressed_size for chunk in packed) < 0.1 * allowed.most_unpacked
-    assert reader.message_count < 0.25 * allowed.most_records
-    assert len(reader.channels) < 0.1 * allowed.most_channels
-    assert items < 0.5 * allowed.most_items
+    assert sum(chunk.uncompressed_size for chunk in packed) < 0.1 * allowed.max_unpacked
+    assert reader.message_count < 0.25 * allowed.max_records
+    assert len(reader.channels) < 0.1 * allowed.max_channels
+    assert items < 0.5 * allowed.max_items
 
 
 def vars_of(payload: object) -> list[object]:
@@ -155,13 +155,13 @@ def test_chunk_is_refused_above_its_size_or_ratio_alone(packed: int, unpacked: i
 
 
 def test_work_on_one_chunk_counts_once() -> None:
-    allowance = Allowance(1000)
+    allowance = ReadLimits(1000)
     for _ in range(100):
         assert allowance.unpack(8, 16 * MIB) == ""
         allowance.count_records(8, 10_000)
     assert allowance.unpack(9, 113 * MIB)
-    assert allowance.records_left(8) == allowance.most_records
-    assert allowance.records_left(9) == allowance.most_records - 10_000
+    assert allowance.records_left(8) == allowance.max_records
+    assert allowance.records_left(9) == allowance.max_records - 10_000
 
 
 def black_frames(path: Path, compression: str, with_size: bool, claim: int = 0) -> Path:

@@ -12,7 +12,7 @@ from mcap.writer import CompressionType, IndexType, Writer
 from ipsys_log.errors import LogError
 from ipsys_log.log.contents import Contents, Schema
 from ipsys_log.log.reader import LogReader
-from ipsys_log.log.records import MAGIC, as_bytes
+from ipsys_log.log.records import MAGIC, to_bytes
 from ipsys_log.log.repair import repair
 from ipsys_log.log.summary import tail_bytes
 from ipsys_log.log.writer import LogWriter
@@ -136,7 +136,7 @@ def test_ids_with_gaps(tmp_path: Path) -> None:
     for key in (7, 65535):
         contents.channels[key] = mcap.Channel(key, f"/{key}", "json", {}, 65535)
     records = [*contents.schemas.values(), *contents.channels.values()]
-    data = MAGIC + as_bytes(mcap.Header("", ""), *records)
+    data = MAGIC + to_bytes(mcap.Header("", ""), *records)
     contents.data_end = len(data)
     path = tmp_path / "gaps.mcap"
     path.write_bytes(data + tail_bytes(contents))

@@ -7,7 +7,7 @@ from hypothesis import given
 from hypothesis import strategies as st
 
 from ipsys_log.log.contents import RawMessage
-from ipsys_log.log.order import Cursor, Pending, in_log_order
+from ipsys_log.log.order import Cursor, PendingChunk, in_log_order
 
 Chunk = tuple[int, list[int]]  # how long before its first message it says to start, and log times
 CHUNKS = st.lists(st.tuples(st.integers(0, 3), st.lists(st.integers(3, 30), max_size=8)), max_size=8)
@@ -20,7 +20,7 @@ class Opened:
         self.places: list[int] = []
         self.pending = [self._pending(100 * n, *chunk) for n, chunk in enumerate(chunks, 1)]
 
-    def _pending(self, place: int, early_ns: int, times: list[int]) -> Pending:
+    def _pending(self, place: int, early_ns: int, times: list[int]) -> PendingChunk:
         rows = sorted((time, offset) for offset, time in enumerate(times))
 
         def between(first: int, stop: int) -> Iterator[RawMessage]:
@@ -30,7 +30,7 @@ class Opened:
             self.places.append(place)
             return Cursor(place, [time for time, _ in rows], [offset for _, offset in rows], between)
 
-        return Pending(min(times, default=5) - early_ns, place, open_)
+        return PendingChunk(min(times, default=5) - early_ns, place, open_)
 
 
 def fault(place: int) -> Exception:

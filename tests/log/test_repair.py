@@ -16,7 +16,7 @@ from mcap.writer import CompressionType, Writer
 
 from ipsys_log.errors import LogError
 from ipsys_log.log.reader import LogReader
-from ipsys_log.log.records import MAGIC, as_bytes
+from ipsys_log.log.records import MAGIC, to_bytes
 from ipsys_log.log.repair import repair
 from tests.log.conftest import IMAGE, POINT, Row, as_row, create, linear_rows, stock_rows
 from tests.log.crash import Recorder, crashes
@@ -74,7 +74,7 @@ def test_repair_zeroed_index_body_is_written_again(tmp_path: Path) -> None:
     path.write_bytes(data)
     report = repair(path)
     assert agree(path) == sorted(rows)
-    assert (report.gone, report.uncounted) == ({}, False)
+    assert (report.lost_counts, report.uncounted) == ({}, False)
 
 
 @pytest.mark.parametrize("finished", [True, False])
@@ -169,7 +169,7 @@ def test_repair_cut_chunk_keeps_what_streams_out(compression: CompressionType, t
     assert (report.messages_kept, report.unchecked) == (expected, expected)
     assert report.uncounted
     assert report.bytes_lost > 0
-    assert restored(path, report.kept_in, cut) == data[:cut]
+    assert restored(path, report.damaged_file, cut) == data[:cut]
 
 
 @pytest.mark.parametrize("compression", CompressionType)
@@ -186,30 +186,30 @@ def test_repair_hole_in_chunk_keeps_its_beginning(compression: CompressionType, 
     got = agree(path)
     assert got == rows[: len(got)]
     assert len(got) > 1000
-    assert report.gone == {"/a": len(rows) - len(got)}
+    assert report.lost_counts == {"/a": len(rows) - len(got)}
     assert list(report.lost["/a"]) == [row[1] for row in rows[len(got) :]]
     assert (report.uncounted, report.unchecked) == (False, len(got))
-    assert restored(path, report.kept_in, len(data)) == data
+    assert restored(path, report.damaged_file, len(data)) == data
 
 
 def log_with_loose_messages(path: Path) -> list[Row]:
     """Chunks, each with its message indexes, and messages between them; no summary."""
-    rows, data = [], as_bytes(mcap.Header("", "other"), mcap.Channel(1, "/a", "json", {}, 0))
-    data = MAGIC + data + as_bytes(mcap.Channel(2, "/b", "json", {}, 0))
+    rows, data = [], to_bytes(mcap.Header("", "other"), mcap.Channel(1, "/a", "json", {}, 0))
+    data = MAGIC + data + to_bytes(mcap.Channel(2, "/b", "json", {}, 0))
     for number in range(6):
         now = START_NS + number * 10**9
         entries: dict[int, list[tuple[int, int]]] = {1: [], 2: []}
         inside = b""
         for k in range(10):
             entries[1 + k % 2].append((now + k, len(inside)))
-            inside += as_bytes(mcap.Message(1 + k % 2, now + k, b"inside" * 9, now, k))
-        data += as_bytes(mcap.Chunk("", inside, now + 9, now, zlib.crc32(inside), len(inside)))
-        data += as_bytes(*(mcap.MessageIndex(channel, found) for channel, found in entries.items()))
+            inside += to_bytes(mcap.Message(1 + k % 2, now + k, b"inside" * 9, now, k))
+        data += to_bytes(mcap.Chunk("", inside, now + 9, now, zlib.crc32(inside), len(inside)))
+        data += to_bytes(*(mcap.MessageIndex(channel, found) for channel, found in entries.items()))
         for k in range(10, 16):
-            data += as_bytes(mcap.Message(1 + k % 2, now + k, b"beside" * 9, now, k))
+            data += to_bytes(mcap.Message(1 + k % 2, now + k, b"beside" * 9, now, k))
         texts = [b"inside"] * 10 + [b"beside"] * 6
         rows += [(("/a", "/b")[k % 2], now + k, now, text * 9) for k, text in enumerate(texts)]
-    path.write_bytes(data + as_bytes(mcap.DataEnd(0), mcap.Footer(0, 0, 0)) + MAGIC)
+    path.write_bytes(data + to_bytes(mcap.DataEnd(0), mcap.Footer(0, 0, 0)) + MAGIC)
     return rows
 
 
@@ -247,7 +247,7 @@ def test_repair_wrong_crc_takes_no_message(tmp_path: Path) -> None:
     path.write_bytes(data)
     report = repair(path)
     assert agree(path) == []
-    assert report.gone == {"/a": len(rows)}
+    assert report.lost_counts == {"/a": len(rows)}
     assert "an unknown one of its messages" in str(report.notes)
 
 
@@ -270,7 +270,7 @@ def test_repair_twice_keeps_the_bytes_of_both(tmp_path: Path) -> None:
         start, end = record_at(data, Opcode.CHUNK, number)
         data[(start + end) // 2] ^= 0xFF
         path.write_bytes(data)
-        damaged.append((bytes(data), repair(path).kept_in))
+        damaged.append((bytes(data), repair(path).damaged_file))
     assert [kept.name for _, kept in damaged if kept] == ["a.mcap.damaged", "a.mcap.damaged_2"]
     assert restored(path, damaged[1][1], len(damaged[1][0])) == damaged[1][0]
 
@@ -316,7 +316,7 @@ def test_repair_cut_at_every_point_is_old_or_new(tmp_path: Path) -> None:
     path.write_bytes(old)
     storage = Recorder()
     storage.know(path)
-    kept = repair(path, storage=storage).kept_in
+    kept = repair(path, storage=storage).damaged_file
     assert kept is not None
     new, kept_bytes = path.read_bytes(), restored(path, kept, len(old))
     assert kept_bytes == old
@@ -344,7 +344,7 @@ def test_repair_record_types_that_stray_are_passed_over(tmp_path: Path) -> None:
     path = create(tmp_path / "a.mcap", rows)
     data = path.read_bytes()
     at = record_at(data, Opcode.CHUNK)[0]
-    stray = as_bytes(
+    stray = to_bytes(
         mcap.Channel(1, "/other", "protobuf", {}, 1),
         mcap.MessageIndex(0, []),
         mcap.Message(77, 5, b"x", 5, 0),
@@ -362,7 +362,7 @@ def test_repair_small_bomb_takes_little_memory(tmp_path: Path) -> None:
     data = path.read_bytes()
     end = record_at(data, Opcode.DATA_END)[0]
     bomb = zstandard.ZstdCompressor().compress(bytes(1 << 30))
-    chunk = as_bytes(mcap.Chunk("zstd", bomb, 1, 1, 0, 1 << 30))
+    chunk = to_bytes(mcap.Chunk("zstd", bomb, 1, 1, 0, 1 << 30))
     path.write_bytes(data[:end] + chunk[:-20])
     tracemalloc.start()
     try:

@@ -13,7 +13,7 @@ import pytest
 from ipsys_log import pipeline
 from ipsys_log.capture.devices import OPENERS, open_source
 from ipsys_log.capture.frames import Clock, Frame, Say
-from ipsys_log.capture.multiplexer import Attached
+from ipsys_log.capture.multiplexer import LiveCameras
 from ipsys_log.capture.recorder import first_messages
 from ipsys_log.log.dataset import Session
 from ipsys_log.messages import CompressedImage, CompressedVideo, Message, Rig, RigCamera, Tracks
@@ -105,7 +105,7 @@ def recorded(target: Path, *sinks: Sink) -> None:
     """Record 40 frames of each of two cameras, of a source that is a row of the table of openers."""
     rig = Rig("lab", "DICT_4X4_100", 0.2)
     cameras = [RigCamera(name, source=f"test:{name}") for name in ("red", "white")]
-    attached = Attached(cameras, open_source, Clock())
+    attached = LiveCameras(cameras, open_source, Clock())
     with attached:
         pipeline.record(attached, first_messages(rig, {}, attached.now_ns), target, sinks=sinks)
 

@@ -118,7 +118,7 @@ def test_sheet_with_two_rows_swapped_names_both_rows(
         assert ipsys("fit", lab).code == 0
         assert ipsys("fit", log, "--model-from", lab).code == 0
     with open_finished_log(log, Request()) as scene:
-        stops = scene.stops
+        stops = scene.intervals
     seen = [one for one in tape if lies_far_from_b(one) and any(stop.covers(one) for stop in stops)]
     first, second = 3, 17
     wrong = swap_rows(seen, first, second)

@@ -191,7 +191,7 @@ def answers(caller: Caller) -> bool:
 
 def test_answers_that_are_not_read_make_room_in_time() -> None:
     scene = Recording()
-    scene.views = lambda stop: [CameraView("red", 1, bytes(8 << 20))]  # type: ignore[method-assign]
+    scene.views = lambda interval: [CameraView("red", 1, bytes(8 << 20))]  # type: ignore[method-assign]
     with page_with(Limits(total=6, per_address=4, request_s=0.5), scene) as (caller, page):
         cookie = sign_in(caller)
         assert caller.ask("GET", "/api/views", Cookie=cookie)[0] == 200
@@ -218,7 +218,7 @@ def test_noise_on_the_port_stays_off_the_screen(capfd: pytest.CaptureFixture[str
 def test_fault_of_the_page_is_kept_for_the_end(capfd: pytest.CaptureFixture[str]) -> None:
     scene = Recording()
 
-    def fail(stop: int | None) -> list[CameraView]:
+    def fail(interval: int | None) -> list[CameraView]:
         raise ZeroDivisionError("a bug")
 
     scene.views = fail  # type: ignore[method-assign]

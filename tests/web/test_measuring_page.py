@@ -62,7 +62,7 @@ def says(hand: Phone, selector: str, text: str) -> None:
 
 
 def texts_at(scene: FinishedLog, tape: Sequence[Measurement], number: int) -> tuple[str, str, str, str]:
-    (typed,) = [as_typed(one) for one in tape if scene.stops[number].covers(one)]
+    (typed,) = [as_typed(one) for one in tape if scene.intervals[number].covers(one)]
     return typed.distances["A"], typed.distances["B"], typed.side, typed.height
 
 
@@ -186,14 +186,14 @@ class Recording:
 
     rig: Rig = labs.RIG
     model: Model | None = None
-    stops: Sequence[StationaryInterval] = ()
+    intervals: Sequence[StationaryInterval] = ()
 
     def __init__(self) -> None:
         self.speed_m, self.done = 0.0, list[Measurement]()
         self.seen = True
 
-    def views(self, stop: int | None) -> list[CameraView]:
-        assert stop is None
+    def views(self, interval: int | None) -> list[CameraView]:
+        assert interval is None
         if not self.seen:
             return [CameraView("red", 10**9)]
         path = [CameraPoint(0, n * self.speed_m, 0.1, 2.0) for n in range(9)]
@@ -278,7 +278,7 @@ def test_before_a_marker_is_chosen_each_camera_says_which_it_sees(hand: Phone) -
         CameraView("red", 1, None, found, points),
         CameraView("white", 1, None, Markers(1, (), 960, 540)),
     ]
-    scene.views = lambda stop: views  # type: ignore[method-assign]
+    scene.views = lambda interval: views  # type: ignore[method-assign]
     with serve(scene, port=0) as page:
         hand.open(page.url)
         says(hand, "#sight", "Choose the marker: 0, 3 are seen")
@@ -321,12 +321,12 @@ def test_place_after_place_in_through_the_token(hand: Phone, unmeasured: Unmeasu
             fill(hand, *texts_at(scene, tape, number))
             save(hand, f"p00{number + 1}")
             says(hand, "#places", f"p00{number + 1}")
-        stops = scene.stops[:5]
+        intervals = scene.intervals[:5]
     with Session([log]) as session:
         saved = session.payloads(session.topics(MEASUREMENTS))
-    for stop, one in zip(stops, sorted(saved, key=lambda m: str(m.id)), strict=True):
-        (meant,) = [m for m in tape if stop.covers(m)]
-        assert stop.covers(one)
+    for interval, one in zip(intervals, sorted(saved, key=lambda m: str(m.id)), strict=True):
+        (meant,) = [m for m in tape if interval.covers(m)]
+        assert interval.covers(one)
         assert one.side == meant.side
         read_m = [d.distance_m for d in one.distances]
         assert read_m == pytest.approx([d.distance_m for d in meant.distances], abs=0.0001)

@@ -11,16 +11,16 @@ from mcap.opcode import Opcode
 
 from ipsys_log.errors import LogError
 from ipsys_log.log.byte_source import View
-from ipsys_log.log.chunks import Inside
+from ipsys_log.log.chunks import ChunkContents
 from ipsys_log.log.contents import Contents
-from ipsys_log.log.damage.regions import Stretch
-from ipsys_log.log.records import MESSAGE, RecordAt, as_bytes, exact, walk
+from ipsys_log.log.damage.regions import DamagedRange
+from ipsys_log.log.records import MESSAGE, RecordAt, parse_exact, to_bytes, walk
 from ipsys_log.log.summary import Summary
 
 __all__ = ["Definitions", "placeholder"]
 
 _MOST_MISREAD = 100
-_MOST_ROOMS = 50  # stretches that are tried
+_MOST_FREE_RANGES = 50  # ranges that are tried
 _LARGEST = 1 << 28  # bytes: limit of the memory for one definition
 
 
@@ -34,15 +34,15 @@ class Definitions:
     """The definitions up to the current offset, by id.
 
     `known` holds definitions of the summary or of damaged chunks; they replace missing definitions of the
-    data section. If the CRC of the summary is right, a record that contradicts it is damaged. `rooms` are
-    the damaged stretches so far: lost definitions are written there.
+    data section. If the CRC of the summary is right, a record that contradicts it is damaged.
+    `free_ranges` are the damaged ranges so far: lost definitions are written there.
     """
 
     summary: Summary | None
-    rooms: list[Stretch]
+    free_ranges: list[DamagedRange]
     schemas: dict[int, mcap.Schema] = field(default_factory=dict)
     channels: dict[int, mcap.Channel] = field(default_factory=dict)
-    known: Inside = field(default_factory=Inside)
+    known: ChunkContents = field(default_factory=ChunkContents)
     _schema_at: dict[int, int] = field(default_factory=dict)  # offset of the definition of each schema
     _sure: Contents | None = None
     _checked: set[tuple[bool, int]] = field(default_factory=set)  # schemas and channels with a right CRC
@@ -57,12 +57,12 @@ class Definitions:
     def __post_init__(self) -> None:
         if self.summary is not None:
             contents, statistics, checked = self.summary
-            self.known = Inside(dict(contents.schemas), dict(contents.channels))
+            self.known = ChunkContents(dict(contents.schemas), dict(contents.channels))
             counts = (len(contents.schemas), len(contents.channels))
             if checked and statistics and counts == (statistics.schema_count, statistics.channel_count):
                 self._sure = contents
 
-    def take(self, view: View, at: RecordAt, *, doubtful: bool = False) -> None:
+    def add_record(self, view: View, record_at: RecordAt, *, doubtful: bool = False) -> None:
         """Add a Schema or Channel record outside of chunks; `doubtful` says that damage is near.
 
         Raises
@@ -70,15 +70,15 @@ class Definitions:
         LogError
             The record cannot be parsed, or contradicts the summary or an earlier record.
         """
-        if at.length > _LARGEST:
-            raise view.fault(at.offset, f"a definition claims {at.length} bytes")
-        record = exact(view, at, view.read(at.offset, at.length))
+        if record_at.length > _LARGEST:
+            raise view.fault(record_at.offset, f"a definition claims {record_at.length} bytes")
+        record = parse_exact(view, record_at, view.read(record_at.offset, record_at.length))
         if isinstance(record, mcap.Schema):
             if record.id == 0 or self._contradicts(record):
-                raise view.fault(at.offset, f"the definition of schema {record.id} is damaged")
+                raise view.fault(record_at.offset, f"the definition of schema {record.id} is damaged")
             self.schemas[record.id] = record
-            self._schema_at.setdefault(record.id, at.offset)
-            self._places[True, record.id] = at
+            self._schema_at.setdefault(record.id, record_at.offset)
+            self._places[True, record.id] = record_at
             self._note_doubt((True, record.id), doubtful=doubtful)
             return
         assert isinstance(record, mcap.Channel)
@@ -86,12 +86,12 @@ class Definitions:
         if self._contradicts(channel):
             if len(self._misread) < _MOST_MISREAD:
                 self._misread.append(channel)
-            raise view.fault(at.offset, f"the definition of channel {channel.id} is damaged")
+            raise view.fault(record_at.offset, f"the definition of channel {channel.id} is damaged")
         if not self._has_schema(channel):
-            raise view.fault(at.offset, f"channel {channel.id} has a schema that is not in the log")
+            raise view.fault(record_at.offset, f"channel {channel.id} has a schema that is not in the log")
         if channel.id not in self.channels:
-            self._unused[channel.id] = at
-            self._places[False, channel.id] = at
+            self._unused[channel.id] = record_at
+            self._places[False, channel.id] = record_at
         self._note_doubt((False, channel.id), doubtful=doubtful)
         self.channels[channel.id] = channel
 
@@ -105,7 +105,7 @@ class Definitions:
         self,
         view: View,
         offset: int,
-        inside: Inside,
+        inside: ChunkContents,
         *,
         checked: bool,
         doubtful: bool = False,
@@ -134,7 +134,7 @@ class Definitions:
         for channel_id in inside.entries:
             self._unused.pop(channel_id, None)
         for channel_id in inside.entries.keys() - inside.channels.keys():
-            self.need(view, offset, channel_id)
+            self.ensure_channel(view, offset, channel_id)
         if checked:
             self._confirm(records)
         for key, schema in inside.schemas.items():
@@ -142,13 +142,13 @@ class Definitions:
             self._schema_at.setdefault(key, offset)
         self.channels |= {key: value for key, value in inside.channels.items() if key not in self.channels}
 
-    def need(self, view: View, offset: int, channel_id: int) -> None:
+    def ensure_channel(self, view: View, offset: int, channel_id: int) -> None:
         """Ensure that the channel of a message at `offset` is defined, if necessary by a placeholder.
 
         Raises
         ------
         LogError
-            No stretch before `offset` has room for the definition.
+            No range before `offset` has room for the definition.
         BoundError
             The log has more channels than its file size allows.
         """
@@ -157,7 +157,7 @@ class Definitions:
             return
         known = self.known.channels.get(channel_id) or self._by_one_bit(view, offset, channel_id)
         channel = known or placeholder(channel_id)
-        if not self._put_back(channel):
+        if not self._restore(channel):
             self._lost.add(channel_id)
             view.check_number(len(self.channels) + len(self._lost), "channels")
             raise view.fault(offset, f"a message is of channel {channel_id}, whose definition is lost")
@@ -168,7 +168,7 @@ class Definitions:
         channel = self.channels.get(channel_id) or self.known.channels.get(channel_id)
         return channel.topic if channel else f"channel {channel_id}"
 
-    def missing(self, channel_ids: set[int], defined: Inside) -> Iterator[mcap.McapRecord]:
+    def missing(self, channel_ids: set[int], defined: ChunkContents) -> Iterator[mcap.McapRecord]:
         """Yield the records that must come before messages of these channels; `defined` may have them."""
         schemas, channels = defined.schemas | self.known.schemas, defined.channels | self.known.channels
         for channel_id in sorted(channel_ids - self.channels.keys()):
@@ -203,9 +203,9 @@ class Definitions:
         del mine[key[1]]
         record_at = self._places.pop(key, None)
         if record_at is not None:
-            self.rooms.append(Stretch(record_at.offset, record_at.length))
+            self.free_ranges.append(DamagedRange(record_at.offset, record_at.length))
 
-    def is_stranger(self, offset: int, inside: Inside) -> bool:
+    def is_foreign(self, offset: int, inside: ChunkContents) -> bool:
         """Return whether a chunk with a right CRC defines an id of this log differently."""
         if offset in self._strange:
             return True
@@ -251,33 +251,33 @@ class Definitions:
             return True
         known = self.known.schemas.get(key)
         schema = known or _empty_schema(key)
-        room = self._room_for(as_bytes(schema), 0)
-        if room is None:  # both are restored later, in a stretch with room for both
+        room = self._room_for(to_bytes(schema), 0)
+        if room is None:  # both are restored later, in a range with room for both
             self.known.channels.setdefault(channel.id, channel if known else replace(channel, schema_id=0))
             return False
         self.schemas[key] = schema
         self._schema_at[key] = room.offset
         return True
 
-    def _put_back(self, channel: mcap.Channel) -> bool:
-        """Write a channel into a damaged stretch: after its schema, or together with it."""
-        key, data = channel.schema_id, as_bytes(channel)
+    def _restore(self, channel: mcap.Channel) -> bool:
+        """Write a channel into a damaged range: after its schema, or together with it."""
+        key, data = channel.schema_id, to_bytes(channel)
         if key == 0:
             return self._room_for(data, 0) is not None
         if key in self.schemas and self._room_for(data, self._schema_at.get(key, 0)) is not None:
             return True
         schema = self.schemas.get(key) or self.known.schemas.get(key) or _empty_schema(key)
-        room = self._room_for(as_bytes(schema) + data, 0)
+        room = self._room_for(to_bytes(schema) + data, 0)
         if room is not None:
             self.schemas[key] = schema
             self._schema_at[key] = min(room.offset, self._schema_at.get(key, room.offset))
         return room is not None
 
-    def _room_for(self, data: bytes, start: int) -> Stretch | None:
-        """Put records into the first stretch from `start` on that has room for them."""
-        while self._full < len(self.rooms) - 1 and self.rooms[self._full].is_full:
+    def _room_for(self, data: bytes, start: int) -> DamagedRange | None:
+        """Put records into the first range from `start` on that has room for them."""
+        while self._full < len(self.free_ranges) - 1 and self.free_ranges[self._full].is_full:
             self._full += 1
-        rooms = islice(self.rooms, self._full, self._full + _MOST_ROOMS)
+        rooms = islice(self.free_ranges, self._full, self._full + _MOST_FREE_RANGES)
         return next((room for room in rooms if room.offset >= start and room.define(data)), None)
 
     def _by_one_bit(self, view: View, offset: int, channel_id: int) -> mcap.Channel | None:
@@ -286,13 +286,13 @@ class Definitions:
         If this channel has messages after the message at `offset`, the id in that message is wrong.
         """
         records = [record for record in self._misread if (record.id ^ channel_id).bit_count() == 1]
-        if not self.rooms:  # its record looks whole, but its channel has no messages
+        if not self.free_ranges:  # its record looks whole, but its channel has no messages
             near = [key for key in self._unused if (key ^ channel_id).bit_count() == 1]
             unused = [key for key in near if not _has_message(view, offset, key)]
             records = [self.channels[key] for key in unused]
             if len(records) == 1:
                 record_at = self._unused.pop(unused[0])
-                self.rooms.append(Stretch(record_at.offset, record_at.length))
+                self.free_ranges.append(DamagedRange(record_at.offset, record_at.length))
                 del self.channels[unused[0]]
         return replace(records[0], id=channel_id) if len(records) == 1 else None
 

@@ -5,23 +5,32 @@ from dataclasses import dataclass, field, replace
 from mcap.opcode import Opcode
 
 from ipsys_log.log.byte_source import View
-from ipsys_log.log.chunks import Inside
+from ipsys_log.log.chunks import ChunkContents
 from ipsys_log.log.contents import Contents
 from ipsys_log.log.damage.definitions import Definitions
-from ipsys_log.log.damage.regions import Stretch
+from ipsys_log.log.damage.regions import DamagedRange
 from ipsys_log.log.damage.resync import Resync
 from ipsys_log.log.damage.salvage import Rows, Salvage, Saved
 from ipsys_log.log.hashing import ChannelHash
 from ipsys_log.log.records import HEADER, RecordAt
 
-__all__ = ["COUNTED", "LOOSE", "Indexed", "Lost", "Survey", "add_damage", "close_indexes", "pass_over"]
+__all__ = [
+    "COUNTED",
+    "UNCHUNKED",
+    "IndexGroup",
+    "Lost",
+    "Survey",
+    "add_damage",
+    "close_indexes",
+    "skip_damage",
+]
 
 
 @dataclass(slots=True)
 class Lost:
     """The lost messages: their log times in ns, by topic.
 
-    `uncounted` is the number of stretches with an unknown number of messages, `bytes` the number of
+    `uncounted` is the number of ranges with an unknown number of messages, `bytes` the number of
     unreadable bytes.
     """
 
@@ -29,17 +38,17 @@ class Lost:
     uncounted: int = 0
     bytes: int = 0
 
-    def note(self, topic: str, time_ns: int) -> None:
+    def add(self, topic: str, time_ns: int) -> None:
         self.times_ns.setdefault(topic, []).append(time_ns)
 
 
 @dataclass(slots=True)
-class Indexed:
-    """The message indexes after a chunk (`inside`), or after a damaged stretch that may have been a chunk."""
+class IndexGroup:
+    """The message indexes after a chunk (`inside`), or after a damaged range that may have been a chunk."""
 
     start: int
-    inside: Inside | None = None
-    stretch: Stretch | None = None
+    inside: ChunkContents | None = None
+    damaged_range: DamagedRange | None = None
     rows: dict[int, list[tuple[int, int]]] = field(default_factory=dict)
     offsets: dict[int, int] = field(default_factory=dict)
     sound: bool = True
@@ -51,28 +60,28 @@ class Indexed:
 
 @dataclass(slots=True)
 class Survey:
-    """The whole records up to `end`, except the stretches in `damaged`.
+    """The whole records up to `end`, except the ranges in `damaged`.
 
     `cut` is the unreadable end of a log without DataEnd; `finished` says that DataEnd lies at `end`.
-    `saved` collects the readable messages of damaged chunks. `faults` lists the faults in words.
+    `salvage` collects the readable messages of damaged chunks. `faults` lists the faults in words.
     `unindexed` holds the entries of the last chunk if its message indexes are missing or cut off.
     """
 
     view: View
     resync: Resync
     definitions: Definitions
-    saved: Salvage | None = None
+    salvage: Salvage | None = None
     contents: Contents = field(default_factory=Contents)
-    loose: Inside = field(default_factory=Inside)
+    unchunked: ChunkContents = field(default_factory=ChunkContents)
     counts: dict[int, dict[int, int]] = field(default_factory=dict)
     hashes: dict[str, ChannelHash] = field(default_factory=dict)
-    damaged: list[Stretch] = field(default_factory=list)
-    homeless: list[RecordAt] = field(default_factory=list)  # messages that cannot stay at their offset
+    damaged: list[DamagedRange] = field(default_factory=list)
+    displaced: list[RecordAt] = field(default_factory=list)  # messages that cannot stay at their offset
     wrong_heads: list[tuple[int, bytes]] = field(default_factory=list)  # offset, right time range
-    cut: Stretch | None = None
+    cut: DamagedRange | None = None
     lost: Lost = field(default_factory=Lost)
     faults: list[str] = field(default_factory=list)
-    unindexed: Inside | None = None
+    unindexed: ChunkContents | None = None
     end: int = 0
     crc: int = 0
     crc_is_right: bool = True
@@ -82,74 +91,79 @@ class Survey:
     wrong_length: int = -1  # a record with an impossible length
     has_crcs: bool = False  # a chunk so far has a CRC
     doubtful_to: int = 0  # offset: before it, unconfirmed lengths are checked closely
-    indexed: Indexed | None = None
+    indexed: IndexGroup | None = None
 
 
-LOOSE = frozenset((Opcode.SCHEMA, Opcode.CHANNEL, Opcode.MESSAGE, Opcode.ATTACHMENT, Opcode.METADATA))
+UNCHUNKED = frozenset((Opcode.SCHEMA, Opcode.CHANNEL, Opcode.MESSAGE, Opcode.ATTACHMENT, Opcode.METADATA))
 # If such a record is damaged, the number of lost messages is known: zero or one.
-COUNTED = LOOSE | {Opcode.MESSAGE_INDEX, Opcode.DATA_END}
+COUNTED = UNCHUNKED | {Opcode.MESSAGE_INDEX, Opcode.DATA_END}
 _DOUBTFUL = 4096  # bytes
 
 
-def pass_over(found: Survey, position: int, at: RecordAt | None, reason: str) -> int:
+def skip_damage(findings: Survey, position: int, record: RecordAt | None, reason: str) -> int:
     """Find the next record after damage at `position`; return its offset."""
-    claimed = at.offset + at.length if at is not None and found.wrong_length != position else 0
-    indexed = found.indexed
+    claimed = record.offset + record.length if record is not None and findings.wrong_length != position else 0
+    indexed = findings.indexed
     # A gap that is too small for a separate record becomes a part of the damage before it.
     behind_indexes = indexed is not None and indexed.inside is not None and position > indexed.start
-    joins = behind_indexes or bool(found.damaged and found.damaged[-1].end == position)
-    follower = found.resync.find(position, claimed, gap=1 if joins else HEADER.size)
+    joins = behind_indexes or bool(findings.damaged and findings.damaged[-1].end == position)
+    follower = findings.resync.find(position, claimed, gap=1 if joins else HEADER.size)
     is_small = follower is not None and follower < position + HEADER.size
     if indexed is not None and indexed.inside is not None:
-        is_apart = indexed.is_complete or found.resync.is_chunk_head(position)
+        is_apart = indexed.is_complete or findings.resync.is_chunk_head(position)
         if is_apart and not is_small:
-            close_indexes(found, position)
+            close_indexes(findings, position)
         else:
-            found.faults.append(reason)
+            findings.faults.append(reason)
             indexed.sound = False
-            found.end = found.view.size if follower is None else follower
-            return found.end
+            findings.end = findings.view.size if follower is None else follower
+            return findings.end
     elif indexed is not None:
-        close_indexes(found, position)
+        close_indexes(findings, position)
     if follower is None:
-        return _end_at_damage(found, position, reason)
-    if at is None or at.opcode not in COUNTED or follower != claimed:
-        found.indexed = Indexed(follower)
-    return add_damage(found, Stretch(position, follower - position), reason)
+        return _end_at_damage(findings, position, reason)
+    if record is None or record.opcode not in COUNTED or follower != claimed:
+        findings.indexed = IndexGroup(follower)
+    return add_damage(findings, DamagedRange(position, follower - position), reason)
 
 
-def add_damage(found: Survey, stretch: Stretch, reason: str) -> int:
-    """Note a damaged stretch; return its end."""
-    found.faults.append(reason)
-    found.lost.bytes += stretch.length
-    if found.indexed is not None:
-        found.indexed.stretch = replace(stretch)
-    last = found.damaged[-1] if found.damaged else None
-    if last is not None and last.end == stretch.offset:  # join both, so that definitions have more room
-        last.length += stretch.length
+def add_damage(findings: Survey, damaged_range: DamagedRange, reason: str) -> int:
+    """Note a damaged range; return its end."""
+    findings.faults.append(reason)
+    findings.lost.bytes += damaged_range.length
+    if findings.indexed is not None:
+        findings.indexed.damaged_range = replace(damaged_range)
+    last = findings.damaged[-1] if findings.damaged else None
+    if last is not None and last.end == damaged_range.offset:  # join both, so that definitions have more room
+        last.length += damaged_range.length
     else:
-        found.damaged.append(stretch)
-    found.end = stretch.end
-    found.doubtful_to = max(found.doubtful_to, stretch.end + _DOUBTFUL)
-    return stretch.end
+        findings.damaged.append(damaged_range)
+    findings.end = damaged_range.end
+    findings.doubtful_to = max(findings.doubtful_to, damaged_range.end + _DOUBTFUL)
+    return damaged_range.end
 
 
-def _end_at_damage(found: Survey, position: int, reason: str) -> int:
+def _end_at_damage(findings: Survey, position: int, reason: str) -> int:
     """End the survey at damage without later records, perhaps in an unfinished chunk."""
-    found.faults.append(reason)
-    found.end = position
-    found.cut = Stretch(position, found.view.size - position)
-    found.lost.bytes += found.cut.length
-    _save(found, found.cut, {})
-    return found.view.size
+    findings.faults.append(reason)
+    findings.end = position
+    findings.cut = DamagedRange(position, findings.view.size - position)
+    findings.lost.bytes += findings.cut.length
+    _save(findings, findings.cut, {})
+    return findings.view.size
 
 
-def _save(found: Survey, stretch: Stretch, rows: Rows) -> None:
+def _save(findings: Survey, damaged_range: DamagedRange, rows: Rows) -> None:
     """Save the readable messages of a damaged chunk, and note the others as lost."""
     saved = Saved()
-    if found.saved is not None and found.resync.chunked is not False:
-        saved = found.saved.save(
-            found.view, stretch, rows, found.definitions, found.hashes, in_order=stretch is found.cut
+    if findings.salvage is not None and findings.resync.chunked is not False:
+        saved = findings.salvage.save(
+            findings.view,
+            damaged_range,
+            rows,
+            findings.definitions,
+            findings.hashes,
+            in_order=damaged_range is findings.cut,
         )
     lost_messages = [
         (channel, time_ns)
@@ -158,37 +172,39 @@ def _save(found: Survey, stretch: Stretch, rows: Rows) -> None:
         if (channel, offset) not in saved.messages
     ]
     for channel, time_ns in lost_messages if rows else saved.torn:
-        found.lost.note(found.definitions.topic(channel), time_ns)
+        findings.lost.add(findings.definitions.topic(channel), time_ns)
     if saved.note:
-        found.faults.append(saved.note)
-    found.lost.uncounted += not (rows or saved.counted)
-    found.lost.bytes -= int(saved.share * stretch.length)
+        findings.faults.append(saved.note)
+    findings.lost.uncounted += not (rows or saved.counted)
+    findings.lost.bytes -= int(saved.share * damaged_range.length)
 
 
-def close_indexes(found: Survey, stop: int) -> None:
-    """Check the message indexes of a chunk, or of a damaged stretch, after all of them are read."""
-    indexed, found.indexed = found.indexed, None
+def close_indexes(findings: Survey, stop: int) -> None:
+    """Check the message indexes of a chunk, or of a damaged range, after all of them are read."""
+    indexed, findings.indexed = findings.indexed, None
     assert indexed is not None
-    if indexed.stretch is not None:
-        _save(found, indexed.stretch, indexed.rows)
+    if indexed.damaged_range is not None:
+        _save(findings, indexed.damaged_range, indexed.rows)
     elif indexed.inside is not None:
-        _close_chunk(found, indexed, indexed.inside, stop)
+        _close_chunk(findings, indexed, indexed.inside, stop)
 
 
-def _close_chunk(found: Survey, indexed: Indexed, inside: Inside, stop: int) -> None:
-    chunk = found.contents.chunks[-1]
+def _close_chunk(findings: Survey, indexed: IndexGroup, inside: ChunkContents, stop: int) -> None:
+    chunk = findings.contents.chunks[-1]
     if indexed.is_complete:
-        found.contents.chunks[-1] = chunk._replace(
+        findings.contents.chunks[-1] = chunk._replace(
             index_length=stop - indexed.start, index_offsets=indexed.offsets
         )
         return
-    if stop == found.view.size:  # the log has no end: the repair writes it with these indexes
-        found.end = indexed.start
-        found.cut = Stretch(found.end, stop - found.end)
-        found.unindexed = inside
+    if stop == findings.view.size:  # the log has no end: the repair writes it with these indexes
+        findings.end = indexed.start
+        findings.cut = DamagedRange(findings.end, stop - findings.end)
+        findings.unindexed = inside
     elif stop > indexed.start:
-        number = len(found.contents.chunks) - 1
-        stretch = Stretch(indexed.start, stop - indexed.start, chunk=number, entries=inside.entries)
-        found.damaged.append(stretch)
+        number = len(findings.contents.chunks) - 1
+        damaged_range = DamagedRange(
+            indexed.start, stop - indexed.start, chunk=number, entries=inside.entries
+        )
+        findings.damaged.append(damaged_range)
         if indexed.sound:
-            found.faults.append("the message indexes of a chunk are not complete")
+            findings.faults.append("the message indexes of a chunk are not complete")

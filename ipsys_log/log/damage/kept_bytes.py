@@ -27,7 +27,7 @@ from ipsys_log.log.byte_source import View, open_for_reading
 from ipsys_log.log.contents import Contents
 from ipsys_log.log.damage.resync import crc_of
 from ipsys_log.log.journal import Storage, write_all
-from ipsys_log.log.records import HEADER, MAGIC, as_bytes, parse, walk
+from ipsys_log.log.records import HEADER, MAGIC, parse, to_bytes, walk
 from ipsys_log.log.summary import read_summary, tail_bytes
 from ipsys_log.units import format_bytes
 
@@ -182,7 +182,7 @@ def _write(storage: Storage, fd: int, view: View, change: Change, time_ns: int) 
         write_all(storage, fd, data, offset)
         crc, offset = zlib.crc32(data, crc), offset + len(data)
 
-    emit(MAGIC + as_bytes(mcap.Header("", "ipsys 1")))
+    emit(MAGIC + to_bytes(mcap.Header("", "ipsys 1")))
     for start, end in change.old_pieces:
         name, begin = f"bytes {start} to {end}", offset
         for data in _attachment(view, name, start, end, time_ns):
@@ -193,7 +193,7 @@ def _write(storage: Storage, fd: int, view: View, change: Change, time_ns: int) 
     contents.attachment_count = len(contents.attachments)
     values = {"start": str(change.start), "new_size": str(change.new_size), "crc": str(change.crc)}
     values |= {f"bytes {patch_offset}": new.hex() for patch_offset, new in change.patches}
-    metadata = as_bytes(mcap.Metadata(_METADATA_NAME, values))
+    metadata = to_bytes(mcap.Metadata(_METADATA_NAME, values))
     contents.metadata.append(mcap.MetadataIndex(offset, len(metadata), _METADATA_NAME))
     contents.metadata_count = 1
     emit(metadata)

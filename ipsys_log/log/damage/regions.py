@@ -1,4 +1,4 @@
-"""Damaged stretches of a data section, and the records that replace them in a repair."""
+"""Damaged ranges of a data section, and the records that replace them in a repair."""
 
 from collections.abc import Mapping
 from dataclasses import dataclass, field
@@ -7,16 +7,16 @@ from mcap import records as mcap
 from mcap.opcode import Opcode
 
 from ipsys_log.log.damage.resync import PRIVATE
-from ipsys_log.log.records import HEADER, MAGIC, as_bytes
+from ipsys_log.log.records import HEADER, MAGIC, to_bytes
 
-__all__ = ["Stretch", "index_records"]
+__all__ = ["DamagedRange", "index_records"]
 
 _SHORTEST_DEFINITION = 23  # bytes: a schema without name and encoding
 _FILLER = Opcode.CHUNK | PRIVATE
 
 
 @dataclass(slots=True)
-class Stretch:
+class DamagedRange:
     """A byte range from `offset` on that does not consist of whole records.
 
     A repair replaces it by `head` (the beginning of a file), the message indexes of the chunk before it
@@ -45,7 +45,7 @@ class Stretch:
 
     @property
     def is_full(self) -> bool:
-        """Return whether the stretch has no room for the shortest definition."""
+        """Return whether the range has no room for the shortest definition."""
         return self.length - self._taken < _SHORTEST_DEFINITION
 
     def define(self, definitions: bytes) -> bool:
@@ -59,7 +59,7 @@ class Stretch:
         return True
 
     def content(self) -> bytes:
-        """Return the new bytes at `offset`: all of the stretch, or its beginning."""
+        """Return the new bytes at `offset`: all of the range, or its beginning."""
         data = b"".join((self.head, self.indexes()[0], *self.definitions))
         rest = self.length - len(data)
         if 0 < rest < HEADER.size:  # too small for a separate record
@@ -81,6 +81,6 @@ def index_records(entries: Mapping[int, list[tuple[int, int]]], offset: int) -> 
     pieces: list[bytes] = []
     offsets: dict[int, int] = {}
     for channel, rows in entries.items():
-        pieces.append(as_bytes(mcap.MessageIndex(channel, rows)))
+        pieces.append(to_bytes(mcap.MessageIndex(channel, rows)))
         offsets[channel], offset = offset, offset + len(pieces[-1])
     return b"".join(pieces), offsets

@@ -13,7 +13,7 @@ from mcap.opcode import Opcode
 
 from ipsys_log.errors import LogError
 from ipsys_log.log.byte_source import View
-from ipsys_log.log.chunks import look_inside, unpack
+from ipsys_log.log.chunks import parse_chunk_contents, unpack
 from ipsys_log.log.records import (
     DATA_END,
     FOOTER,
@@ -22,9 +22,9 @@ from ipsys_log.log.records import (
     MAGIC,
     MESSAGE,
     RecordAt,
-    as_bytes,
-    exact,
     parse_chunk_head,
+    parse_exact,
+    to_bytes,
     walk,
 )
 
@@ -36,10 +36,10 @@ _OVERLAP = 64
 _LONGEST_HEAD = 1 << 16
 _NAME, _SIZE = struct.Struct("<I"), struct.Struct("<Q")
 _LONGEST_CHAIN = 256  # records
-_ENOUGH = 3  # messages and channels in a row, even if they do not belong together
+_LEAST_MESSAGES = 3  # messages and channels in a row, even if they do not belong together
 _RECENT = 8  # messages: damage may have changed the time of one of them
 _DAY_NS = 86_400 * 1_000_000_000
-_IN_VAIN = 64 << 20  # bytes: limit of the search without result in a small log
+_FRUITLESS_SEARCH_BYTES = 64 << 20  # bytes: limit of the search without result in a small log
 _STEP = 4096  # bytes: the cost of a check of a small record
 _CHUNK = rb"\x06.{36}(?:\x00{4}|\x04\x00{3}zstd|\x03\x00{3}lz4)"
 _CHUNK_HEAD = re.compile(_CHUNK, re.DOTALL)
@@ -82,7 +82,7 @@ class Resync:
     budget: int = field(init=False)
 
     def __post_init__(self) -> None:
-        self.budget = _IN_VAIN + 4 * self.view.size
+        self.budget = _FRUITLESS_SEARCH_BYTES + 4 * self.view.size
 
     def find(self, damaged: int, claimed: int = 0, gap: int = HEADER.size) -> int | None:
         """Return the offset of the next whole record after the damaged record, None if there is none.
@@ -92,7 +92,7 @@ class Resync:
         """
         if self.chunked is None and not self.times_ns:
             self.chunked = self._has_chunks(damaged)
-        if damaged < claimed and self.leads_on(claimed):
+        if damaged < claimed and self.starts_records(claimed):
             # Its length may be right, but a stray copy of a head may also claim the bytes after it.
             pattern = _CHUNK_HEAD if self.is_chunk_head(damaged) else _CANDIDATE
             inner = self._find(pattern, damaged + gap, claimed, into_damage=False)
@@ -160,11 +160,11 @@ class Resync:
                 offset = base + match.start()
                 if match.start() >= _BLOCK or offset >= end:
                     break
-                if self.leads_on(offset, into_damage=into_damage):
+                if self.starts_records(offset, into_damage=into_damage):
                     return offset
         return None
 
-    def leads_on(self, offset: int, *, into_damage: bool = True) -> bool:
+    def starts_records(self, offset: int, *, into_damage: bool = True) -> bool:
         """Return whether a record of the data section begins at `offset`, judged by it and the next records.
 
         With `into_damage`, records may count as whole although damage follows them.
@@ -192,7 +192,7 @@ class Resync:
             return into_damage and last in _DEFINITIONS
         return last > 0
 
-    def _judge(self, at: RecordAt, times_ns: list[int], defined: set[int]) -> bool | None:
+    def _judge(self, record: RecordAt, times_ns: list[int], defined: set[int]) -> bool | None:
         """Return whether a record proves that it and earlier records are whole.
 
         None means that the next record decides.
@@ -203,31 +203,31 @@ class Resync:
             The record is damaged.
         """
         view = self.view
-        if at.opcode == Opcode.CHUNK:
-            return self.chunked is not False and self._is_whole_chunk(at)
-        if at.opcode == Opcode.MESSAGE:
-            return self._judge_message(at, times_ns, defined)
-        if at.opcode in _DEFINITIONS:
-            check_exact(view, at, HEADER.size - 1)
-            if at.opcode == Opcode.CHANNEL:
-                defined.add(int.from_bytes(view.read(at.offset + HEADER.size, 2), "little"))
-            return True if at.opcode == Opcode.METADATA else None
-        if at.opcode == Opcode.ATTACHMENT:
-            stored, crc = attachment_crc(view, at)
+        if record.opcode == Opcode.CHUNK:
+            return self.chunked is not False and self._is_whole_chunk(record)
+        if record.opcode == Opcode.MESSAGE:
+            return self._judge_message(record, times_ns, defined)
+        if record.opcode in _DEFINITIONS:
+            check_exact(view, record, HEADER.size - 1)
+            if record.opcode == Opcode.CHANNEL:
+                defined.add(int.from_bytes(view.read(record.offset + HEADER.size, 2), "little"))
+            return True if record.opcode == Opcode.METADATA else None
+        if record.opcode == Opcode.ATTACHMENT:
+            stored, crc = attachment_crc(view, record)
             return (stored == crc) if stored else None
-        if at.opcode == Opcode.DATA_END:
-            return at.length == DATA_END.size
-        may_index = at.opcode == Opcode.MESSAGE_INDEX and self.chunked is not False
-        return None if at.opcode >= PRIVATE or (may_index and is_index(view, at)) else False
+        if record.opcode == Opcode.DATA_END:
+            return record.length == DATA_END.size
+        may_index = record.opcode == Opcode.MESSAGE_INDEX and self.chunked is not False
+        return None if record.opcode >= PRIVATE or (may_index and is_index(view, record)) else False
 
-    def _judge_message(self, at: RecordAt, times_ns: list[int], defined: set[int]) -> bool | None:
-        if self.chunked or at.length < MESSAGE.size:
+    def _judge_message(self, record: RecordAt, times_ns: list[int], defined: set[int]) -> bool | None:
+        if self.chunked or record.length < MESSAGE.size:
             return False
-        _, _, channel, _, time_ns, _ = MESSAGE.unpack(self.view.read(at.offset, MESSAGE.size))
+        _, _, channel, _, time_ns, _ = MESSAGE.unpack(self.view.read(record.offset, MESSAGE.size))
         times_ns.append(time_ns)
         near = self._is_near(time_ns) or (not self.times_ns and len(times_ns) > 1)
         fits = channel in defined or (near and channel in self.channels)
-        return True if fits or len(times_ns) + len(defined) >= _ENOUGH else None
+        return True if fits or len(times_ns) + len(defined) >= _LEAST_MESSAGES else None
 
     def fits(self, channel: int, time_ns: int) -> bool:
         """Return whether a message has a defined channel, or about the time of the last messages."""
@@ -256,37 +256,39 @@ class Resync:
         is_defined = channel in self.channels or next_channel in self.channels
         return is_head and is_defined and abs(next_ns - time_ns) < _DAY_NS
 
-    def holds_chunk(self, at: RecordAt) -> bool:
+    def holds_chunk(self, record: RecordAt) -> bool:
         """Return whether a whole chunk begins within a record."""
-        return self._find(_CHUNK_HEAD, at.offset + HEADER.size, at.offset + at.length) is not None
+        return self._find(_CHUNK_HEAD, record.offset + HEADER.size, record.offset + record.length) is not None
 
-    def _is_whole_chunk(self, at: RecordAt) -> bool:
+    def _is_whole_chunk(self, record: RecordAt) -> bool:
         view = self.view
-        self.budget -= at.length
+        self.budget -= record.length
         if self.budget < 0:
-            raise view.fault(at.offset, "too many of its bytes look like chunks and are none")
-        look_inside(view, at.offset, unpack(view, at.offset, parse_chunk_head(view, at.offset)[1]))
-        self.budget += at.length
+            raise view.fault(record.offset, "too many of its bytes look like chunks and are none")
+        parse_chunk_contents(
+            view, record.offset, unpack(view, record.offset, parse_chunk_head(view, record.offset)[1])
+        )
+        self.budget += record.length
         return True
 
 
-def is_index(view: View, at: RecordAt) -> bool:
+def is_index(view: View, record: RecordAt) -> bool:
     """Return whether a MessageIndex record has the length that its entries need."""
-    if at.length < INDEX_HEAD.size:
+    if record.length < INDEX_HEAD.size:
         return False
-    _, length, _, size = INDEX_HEAD.unpack(view.read(at.offset, INDEX_HEAD.size))
+    _, length, _, size = INDEX_HEAD.unpack(view.read(record.offset, INDEX_HEAD.size))
     return bool(length == size + 6 and size % 16 == 0)
 
 
-def check_exact(view: View, at: RecordAt, padding: int | None = None) -> None:
+def check_exact(view: View, record: RecordAt, padding: int | None = None) -> None:
     """Refuse a Schema, Channel or Metadata record with wrong lengths, or with more than `padding` zeros."""
-    data = view.read(at.offset, at.length)
-    rest = data[len(as_bytes(exact(view, at, data))) :]
+    data = view.read(record.offset, record.length)
+    rest = data[len(to_bytes(parse_exact(view, record, data))) :]
     if padding is not None and (len(rest) > padding or any(rest)):
-        raise view.fault(at.offset, "a record holds more than its fields")
+        raise view.fault(record.offset, "a record holds more than its fields")
 
 
-def attachment_crc(view: View, at: RecordAt) -> tuple[int, int]:
+def attachment_crc(view: View, record: RecordAt) -> tuple[int, int]:
     """Return the stated CRC of an attachment (0: none), and its computed CRC.
 
     Raises
@@ -294,17 +296,19 @@ def attachment_crc(view: View, at: RecordAt) -> tuple[int, int]:
     LogError
         The record has wrong lengths.
     """
-    head = view.read(at.offset, min(at.length, _LONGEST_HEAD))
+    head = view.read(record.offset, min(record.length, _LONGEST_HEAD))
     try:
         (name,) = _NAME.unpack_from(head, HEADER.size + 16)
         (media_type,) = _NAME.unpack_from(head, HEADER.size + 20 + name)
         (size,) = _SIZE.unpack_from(head, HEADER.size + 24 + name + media_type)
     except struct.error:
-        raise view.fault(at.offset, "the Attachment record is not valid") from None
-    if at.length < HEADER.size + 36 + name + media_type + size:
-        raise view.fault(at.offset, "the Attachment record claims lengths that it does not have")
-    stored = int.from_bytes(view.read(at.offset + at.length - 4, 4), "little") if at.length > 13 else 0
-    return stored, crc_of(view, at.length - HEADER.size - 4, at.offset + HEADER.size) if stored else 0
+        raise view.fault(record.offset, "the Attachment record is not valid") from None
+    if record.length < HEADER.size + 36 + name + media_type + size:
+        raise view.fault(record.offset, "the Attachment record claims lengths that it does not have")
+    stored = (
+        int.from_bytes(view.read(record.offset + record.length - 4, 4), "little") if record.length > 13 else 0
+    )
+    return stored, crc_of(view, record.length - HEADER.size - 4, record.offset + HEADER.size) if stored else 0
 
 
 def crc_of(view: View, length: int, start: int = 0, crc: int = 0) -> int:

@@ -13,9 +13,9 @@ from mcap.opcode import Opcode
 from ipsys_log.errors import LogError
 from ipsys_log.log.byte_source import View
 from ipsys_log.log.chunk_builder import IMAGES, ChunkBuilder
-from ipsys_log.log.chunks import Inside, look_inside, unpack
+from ipsys_log.log.chunks import ChunkContents, parse_chunk_contents, unpack
 from ipsys_log.log.damage.definitions import Definitions, placeholder
-from ipsys_log.log.damage.regions import Stretch
+from ipsys_log.log.damage.regions import DamagedRange
 from ipsys_log.log.damage.resync import PRIVATE
 from ipsys_log.log.hashing import ChannelHash
 from ipsys_log.log.records import HEADER, MESSAGE, ChunkRef, RecordAt, parse_chunk_head
@@ -63,10 +63,10 @@ class _Records(NamedTuple):
 
 
 class Saved(NamedTuple):
-    """The messages saved from one stretch: the channel id and the offset in the chunk of each message.
+    """The messages saved from one range: the channel id and the offset in the chunk of each message.
 
-    `torn` has the channel id and log time of an incomplete message. `counted` says that the stretch has no
-    other messages. `share` is the saved fraction of the stretch.
+    `torn` has the channel id and log time of an incomplete message. `counted` says that the range has no
+    other messages. `share` is the saved fraction of the range.
     """
 
     messages: frozenset[tuple[int, int]] = frozenset()
@@ -87,7 +87,7 @@ class Salvage:
     spool: IO[bytes]
     chunks: list[ChunkRef] = field(default_factory=list)
     counts: dict[int, int] = field(default_factory=dict)
-    inside: Inside = field(default_factory=Inside)
+    inside: ChunkContents = field(default_factory=ChunkContents)
     unchecked: int = 0
     size: int = 0
     _builder: ChunkBuilder = field(default_factory=lambda: ChunkBuilder(IMAGES, compress=False))
@@ -95,14 +95,14 @@ class Salvage:
     def save(
         self,
         view: View,
-        stretch: Stretch,
+        damaged_range: DamagedRange,
         rows: Rows,
         definitions: Definitions,
         hashes: dict[str, ChannelHash],
         *,
         in_order: bool,
     ) -> Saved:
-        """Save the plausible messages of the chunk that begins with `stretch`, if there is a chunk.
+        """Save the plausible messages of the chunk that begins with `damaged_range`, if there is a chunk.
 
         A chunk that is cut off ends with its last whole message. A sector that never reached the disk reads
         as zeros: all data from this sector on are rejected. If a record is not plausible, its whole sector
@@ -116,13 +116,13 @@ class Salvage:
         in_order
             The saved messages keep their position, after all others.
         """
-        records = _records_of(view, stretch)
+        records = _records_of(view, damaged_range)
         if records is None:
             return Saved()
         channels = definitions.channels | definitions.known.channels
-        messages, inside, torn, complete = _believable(view, records, rows, channels)
-        if records.checked and definitions.is_stranger(stretch.offset, inside):
-            return Saved(note=f"the chunk at byte {stretch.offset} belongs to another log")
+        messages, inside, torn, complete = _plausible_records(view, records, rows, channels)
+        if records.checked and definitions.is_foreign(damaged_range.offset, inside):
+            return Saved(note=f"the chunk at byte {damaged_range.offset} belongs to another log")
         for key, value in inside.schemas.items():
             self.inside.schemas.setdefault(key, value)
             definitions.known.schemas.setdefault(key, value)
@@ -134,10 +134,12 @@ class Salvage:
             self._add(records.data, channel_id, start, stop, topics, hashes, in_order=in_order)
         if not records.checked:
             self.unchecked += len(messages)
-        note = _note(stretch, records, len(messages), complete=complete)
+        note = _note(damaged_range, records, len(messages), complete=complete)
         saved = frozenset((channel_id, start) for channel_id, start, _ in messages)
         size = sum(stop - start for _, start, stop in messages)
-        part = size / max(records.size, size, 1) if records.compressed else min(1.0, size / stretch.length)
+        part = (
+            size / max(records.size, size, 1) if records.compressed else min(1.0, size / damaged_range.length)
+        )
         return Saved(saved, torn, complete or bool(rows), note, 1.0 if complete else part)
 
     def finish(self) -> None:
@@ -177,8 +179,8 @@ class Salvage:
         state.valid &= in_order
 
 
-def _note(stretch: Stretch, records: _Records, count: int, *, complete: bool) -> str:
-    chunk_text = f"the chunk at byte {stretch.offset} ({records.span})"
+def _note(damaged_range: DamagedRange, records: _Records, count: int, *, complete: bool) -> str:
+    chunk_text = f"the chunk at byte {damaged_range.offset} ({records.span})"
     if records.checked:
         return (
             f"all {count} messages of {chunk_text} were copied: its CRC is right, but it cannot stay in place"
@@ -191,9 +193,9 @@ def _note(stretch: Stretch, records: _Records, count: int, *, complete: bool) ->
     return f"{chunk_text}: an unknown one of its messages is damaged, so that none was saved"
 
 
-def _records_of(view: View, stretch: Stretch) -> _Records | None:
+def _records_of(view: View, damaged_range: DamagedRange) -> _Records | None:
     """Decode a chunk as far as possible; return None if there is no chunk."""
-    head = view.read(stretch.offset, min(_HEAD.size + 4 + _SIZE.size, stretch.length))
+    head = view.read(damaged_range.offset, min(_HEAD.size + 4 + _SIZE.size, damaged_range.length))
     if len(head) < _HEAD.size + _SIZE.size:
         return None
     opcode, length, start_ns, end_ns, size, crc, name_length = _HEAD.unpack_from(head)
@@ -203,18 +205,18 @@ def _records_of(view: View, stretch: Stretch) -> _Records | None:
     if len(head) < _HEAD.size + name_length + _SIZE.size:
         return None
     (packed,) = _SIZE.unpack_from(head, _HEAD.size + name_length)
-    data_offset = stretch.offset + _HEAD.size + name_length + _SIZE.size
-    if length + HEADER.size != data_offset - stretch.offset + packed:
+    data_offset = damaged_range.offset + _HEAD.size + name_length + _SIZE.size
+    if length + HEADER.size != data_offset - damaged_range.offset + packed:
         return None
     span = f"{format_time(start_ns)} to {format_time(end_ns)} UTC"
-    if data_offset + packed <= stretch.end:
+    if data_offset + packed <= damaged_range.end:
         try:
-            data: Buffer = unpack(view, stretch.offset, parse_chunk_head(view, stretch.offset)[1])
+            data: Buffer = unpack(view, damaged_range.offset, parse_chunk_head(view, damaged_range.offset)[1])
         except LogError:
             pass
         else:
             return _Records(data, crc != 0, False, False, bool(name), data_offset, size, span)
-    readable = up_to_first_hole(view, data_offset, min(packed, stretch.end - data_offset))
+    readable = up_to_first_hole(view, data_offset, min(packed, damaged_range.end - data_offset))
     data, ends_early = _decode(view, name, data_offset, readable)
     ends_early |= readable < packed
     is_right = zlib.crc32(data) == crc
@@ -272,32 +274,34 @@ def up_to_first_hole(view: View, offset: int, length: int) -> int:
     return length
 
 
-class _Found(NamedTuple):
+class _PlausibleRecords(NamedTuple):
     """The plausible messages (channel id, start, stop) and definitions, and an incomplete message."""
 
     messages: list[tuple[int, int, int]]
-    inside: Inside
+    inside: ChunkContents
     torn: tuple[tuple[int, int], ...] = ()
     is_all: bool = False
 
 
-def _believable(view: View, records: _Records, rows: Rows, channels: Mapping[int, object]) -> _Found:
+def _plausible_records(
+    view: View, records: _Records, rows: Rows, channels: Mapping[int, object]
+) -> _PlausibleRecords:
     data = records.data
     named = {(channel, time_ns, offset) for channel, entries in rows.items() for time_ns, offset in entries}
-    inside, starts = Inside(), list[RecordAt]()
-    position, makes_sense = 0, True
-    while makes_sense and position + HEADER.size <= len(data):
+    inside, starts = ChunkContents(), list[RecordAt]()
+    position, is_plausible = 0, True
+    while is_plausible and position + HEADER.size <= len(data):
         record_at = RecordAt(*_head(data, position))
-        makes_sense = _makes_sense(view, data, record_at, inside)
-        if makes_sense and record_at.opcode == Opcode.MESSAGE and position + MESSAGE.size <= len(data):
+        is_plausible = _is_plausible(view, data, record_at, inside)
+        if is_plausible and record_at.opcode == Opcode.MESSAGE and position + MESSAGE.size <= len(data):
             _, _, channel, _, time_ns, _ = MESSAGE.unpack_from(data, position)
-            makes_sense = channel in channels or channel in inside.channels or records.checked
-            makes_sense &= channel not in rows or (channel, time_ns, position) in named
-        if not makes_sense or position + record_at.length > len(data):
+            is_plausible = channel in channels or channel in inside.channels or records.checked
+            is_plausible &= channel not in rows or (channel, time_ns, position) in named
+        if not is_plausible or position + record_at.length > len(data):
             break
         starts.append(record_at)
         position += record_at.length
-    return _up_to(records, inside, starts, position, makes_sense=makes_sense)
+    return _up_to(records, inside, starts, position, is_plausible=is_plausible)
 
 
 def _head(data: Buffer, position: int) -> tuple[int, int, int]:
@@ -305,15 +309,17 @@ def _head(data: Buffer, position: int) -> tuple[int, int, int]:
     return opcode, position, HEADER.size + length
 
 
-def _makes_sense(view: View, data: Buffer, at: RecordAt, inside: Inside) -> bool:
+def _is_plausible(view: View, data: Buffer, record: RecordAt, inside: ChunkContents) -> bool:
     """Return whether the record may lie in a chunk; add its definitions to `inside`."""
-    if at.opcode == Opcode.MESSAGE:
-        return MESSAGE.size <= at.length <= _MOST
-    if at.opcode not in (Opcode.SCHEMA, Opcode.CHANNEL):
-        return at.opcode >= PRIVATE
-    if at.offset + at.length <= len(data):
+    if record.opcode == Opcode.MESSAGE:
+        return MESSAGE.size <= record.length <= _MOST
+    if record.opcode not in (Opcode.SCHEMA, Opcode.CHANNEL):
+        return record.opcode >= PRIVATE
+    if record.offset + record.length <= len(data):
         try:
-            record_inside = look_inside(view, 0, bytes(data[at.offset : at.offset + at.length]))
+            record_inside = parse_chunk_contents(
+                view, 0, bytes(data[record.offset : record.offset + record.length])
+            )
         except LogError:
             return False
         inside.schemas |= record_inside.schemas
@@ -322,12 +328,12 @@ def _makes_sense(view: View, data: Buffer, at: RecordAt, inside: Inside) -> bool
 
 
 def _up_to(
-    records: _Records, inside: Inside, starts: list[RecordAt], position: int, *, makes_sense: bool
-) -> _Found:
+    records: _Records, inside: ChunkContents, starts: list[RecordAt], position: int, *, is_plausible: bool
+) -> _PlausibleRecords:
     """Select the plausible records; `position` is their end."""
     data = records.data
     whole = position == len(data)
-    if not makes_sense or (not whole and not records.ends_early):
+    if not is_plausible or (not whole and not records.ends_early):
         sound = records.spoiled(position)
     else:
         sound = len(data) if records.ends_early or not records.is_wrong else 0
@@ -345,4 +351,4 @@ def _up_to(
         _, _, channel, _, time_ns, _ = MESSAGE.unpack_from(data, position)
         torn = ((channel, time_ns),)
     is_all = whole and sound == len(data) and not records.ends_early
-    return _Found(messages, inside if sound else Inside(), torn, is_all)
+    return _PlausibleRecords(messages, inside if sound else ChunkContents(), torn, is_all)

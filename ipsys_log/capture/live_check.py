@@ -16,7 +16,7 @@ from ipsys_log.messages import CompressedImage, CompressedVideo, Message, Rig
 from ipsys_log.stages.detect import decode_grey
 from ipsys_log.stages.detect.search import search
 
-__all__ = ["Look", "Monitor"]
+__all__ = ["CameraMonitor", "FrameCheck"]
 
 _EVERY_S = 1.0
 # Mean grey level of a dark image, and standard deviation of the grey levels behind a lens cap.
@@ -27,22 +27,22 @@ _SHRINK = 3
 
 
 @dataclass(frozen=True, slots=True)
-class Look:
+class FrameCheck:
     """The result of the check of one frame.
 
-    ``markers`` are the ids of the rig's markers in the image, and ``strange`` the other ids. ``brightness``
-    is the mean grey level, 0 to 255. ``sharpness`` is relative to the best sharpness so far. ``warnings``
-    describe the faults of the image.
+    ``markers`` are the ids of the rig's markers in the image, and ``unknown_markers`` the other ids.
+    ``brightness`` is the mean grey level, 0 to 255. ``sharpness`` is relative to the best sharpness so far.
+    ``warnings`` describe the faults of the image.
     """
 
     markers: tuple[int, ...]
-    strange: tuple[int, ...]
+    unknown_markers: tuple[int, ...]
     brightness: float
     sharpness: float
     warnings: tuple[str, ...]
 
 
-class Monitor:
+class CameraMonitor:
     """The live check of all cameras, in a separate thread. A context manager.
 
     The thread analyses one frame of each camera about once a second. In a video, it analyses only keyframes,
@@ -54,18 +54,18 @@ class Monitor:
 
     Attributes
     ----------
-    looks : the last result of each camera.
+    checks : the last result of each camera.
     """
 
     def __init__(self, rig: Rig) -> None:
-        self.looks: dict[str, Look] = {}
+        self.checks: dict[str, FrameCheck] = {}
         self._rig = rig
         self._newest: dict[str, CompressedImage | CompressedVideo] = {}
         self._best: dict[str, float] = {}
         self._ended = threading.Event()
         self._thread = threading.Thread(target=self._watch, name="monitor", daemon=True)
 
-    def __enter__(self) -> Monitor:
+    def __enter__(self) -> CameraMonitor:
         self._thread.start()
         return self
 
@@ -85,16 +85,16 @@ class Monitor:
     def _watch(self) -> None:
         while not self._ended.wait(_EVERY_S):
             for camera, image in list(self._newest.items()):
-                self.looks[camera] = self._look(camera, image)
+                self.checks[camera] = self._check(camera, image)
 
-    def _look(self, camera: str, image: CompressedImage | CompressedVideo) -> Look:
+    def _check(self, camera: str, image: CompressedImage | CompressedVideo) -> FrameCheck:
         try:
             grey = decode_grey(decode_keyframe(image) if isinstance(image, CompressedVideo) else image)
         except FrameError as error:
-            return Look((), (), 0.0, 0.0, (f"a frame cannot be decoded: {error}",))
+            return FrameCheck((), (), 0.0, 0.0, (f"a frame cannot be decoded: {error}",))
         seen = Counter(sighting.id for sighting in search(grey, self._rig.dictionary))
         counts = {n: count for n, count in seen.items() if self._rig.knows(n)}
-        strange = tuple(sorted(set(seen) - set(counts)))
+        unknown = tuple(sorted(set(seen) - set(counts)))
         small = grey[::_SHRINK, ::_SHRINK]
         brightness, spread = float(small.mean()), float(small.std())
         fine = float(cv2.Laplacian(np.ascontiguousarray(small), cv2.CV_32F).std()) / max(spread, 1.0)
@@ -105,9 +105,9 @@ class Monitor:
             warnings.append("the picture is dark or empty: is the lens covered?")
         elif sharpness < _BLURRED:
             warnings.append("blurred: give it more light, or a fixed exposure_s in lab.toml")
-        if strange:
-            warnings.append(_unknown(strange))
-        return Look(tuple(sorted(counts)), strange, brightness, sharpness, tuple(warnings))
+        if unknown:
+            warnings.append(_unknown(unknown))
+        return FrameCheck(tuple(sorted(counts)), unknown, brightness, sharpness, tuple(warnings))
 
 
 def _unknown(ids: tuple[int, ...]) -> str:

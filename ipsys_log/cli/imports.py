@@ -53,7 +53,7 @@ def images(
         ),
     ] = None,
 ) -> None:
-    """Import a folder of images, one sub-folder per camera; without --times the n-th of each belong together."""
+    """Import a folder of images, one sub-folder per camera; without --times the n-th ones belong together."""
     from ipsys_log.cli.options import load_calibrations, load_matching_rig
     from ipsys_log.exchange.image_folders import find_images, find_times, read_images
     from ipsys_log.runs.output import write_log

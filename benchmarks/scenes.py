@@ -19,7 +19,7 @@ from ipsys_log.log.dataset import Session
 from ipsys_log.messages import CompressedImage, Message
 from ipsys_log.messages.channels import TRUTH
 from ipsys_log.runs.output import write_log
-from ipsys_log.simulation.calibration_points import MarkerPose, place_marker
+from ipsys_log.simulation.calibration_points import SimulatedPose, place_marker
 from ipsys_log.simulation.cameras import mount_cameras
 from ipsys_log.simulation.lab import simulate
 from ipsys_log.simulation.settings import LabSettings
@@ -96,7 +96,7 @@ def truth(path: Path, settings: LabSettings) -> dict[tuple[str, int], Truth]:
             for camera in cameras:
                 px = {}
                 for track in tracks.tracks:
-                    where = MarkerPose(track.id, track.x_m, track.y_m, track.z_m, track.heading_rad)
+                    where = SimulatedPose(track.id, track.x_m, track.y_m, track.z_m, track.heading_rad)
                     printed = place_marker(where, settings)
                     px[track.id] = project_corners(camera.lens, camera.camera_from_world, printed)
                 whole = frozenset(track.id for track in tracks.tracks if camera.name in track.cameras)

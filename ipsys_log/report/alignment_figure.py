@@ -83,16 +83,18 @@ def _draw_floor(axes: Axes, lab: AlignedLab, coverage: Coverage) -> None:
     axes.imshow(shown, cmap=shades, vmin=0, vmax=2, origin="lower", extent=frame, zorder=0.5)
     for colour, text in ((_ONE, "whole in one picture"), (_MORE, "in two or more"), (_NONE, "in none")):
         axes.plot([], [], "s", ms=9, mfc=colour, mec=REST, label=text)
-    styles = camera_styles(hung.camera for hung in lab.mounted_cameras)
-    for hung in lab.mounted_cameras:
-        colour, shape = styles[hung.camera]
+    styles = camera_styles(mounted.camera for mounted in lab.mounted_cameras)
+    for mounted in lab.mounted_cameras:
+        colour, shape = styles[mounted.camera]
         # The area outside of the floor has no data, so the edge of the floor closes the outline.
-        seen = np.pad(coverage.whole[hung.camera].astype(float), 1)
+        seen = np.pad(coverage.whole[mounted.camera].astype(float), 1)
         around_m = [
             np.concatenate([[v[0] - half_m], v, [v[-1] + half_m]]) for v in (coverage.xs_m, coverage.ys_m)
         ]
         axes.contour(*around_m, seen, levels=[0.5], colors=[colour], linewidths=1.8, zorder=3)
-        axes.plot(*hung.foot_m, shape, color=colour, ms=7, mec="white", zorder=5, label=shorten(hung.camera))
+        axes.plot(
+            *mounted.foot_m, shape, color=colour, ms=7, mec="white", zorder=5, label=shorten(mounted.camera)
+        )
     for overlap in coverage.overlaps:
         good, width_cm = overlap.width_m >= coverage.diagonal_m, overlap.width_m * CM_PER_M
         text = f"pictures overlap {width_cm:.0f} cm" if width_cm > 0 else f"gap of {-width_cm:.0f} cm"

@@ -17,7 +17,7 @@ from ipsys_log.simulation.settings import LabSettings, Purpose, random_stream
 
 __all__ = [
     "REFERENCES",
-    "MarkerPose",
+    "SimulatedPose",
     "cameras_seeing",
     "choose_place",
     "measure",
@@ -38,7 +38,7 @@ _TEST_SHARE = 0.2
 
 
 @dataclass(frozen=True, slots=True)
-class MarkerPose:
+class SimulatedPose:
     """The pose of a marker that faces up: its centre in world m, and its heading in rad."""
 
     marker_id: int
@@ -52,11 +52,11 @@ class MarkerPose:
 class SimulatedPoint:
     """A calibration point; ``camera`` is the camera for which it is chosen."""
 
-    pose: MarkerPose
+    pose: SimulatedPose
     camera: str
 
 
-def place_marker(where: MarkerPose, settings: LabSettings) -> PlacedMarker:
+def place_marker(where: SimulatedPose, settings: LabSettings) -> PlacedMarker:
     """Return the print of a marker at a pose."""
     return PlacedMarker(
         where.marker_id,
@@ -65,7 +65,7 @@ def place_marker(where: MarkerPose, settings: LabSettings) -> PlacedMarker:
     )
 
 
-def cameras_seeing(where: MarkerPose, cameras: Sequence[Camera], settings: LabSettings) -> tuple[str, ...]:
+def cameras_seeing(where: SimulatedPose, cameras: Sequence[Camera], settings: LabSettings) -> tuple[str, ...]:
     """Return the names of the cameras whose image contains the whole print, white margin included."""
     outline_m = print_outline(place_marker(where, settings), settings.dictionary)
     return tuple(camera.name for camera in cameras if sees(camera, outline_m).all())
@@ -104,7 +104,7 @@ def plan_points(settings: LabSettings, cameras: Sequence[Camera]) -> list[tuple[
         The floor has no room for another marker.
     """
     rng = random_stream(settings.seed, Purpose.PLACES)
-    seen: dict[str, list[MarkerPose]] = {camera.name: [] for camera in cameras}
+    seen: dict[str, list[SimulatedPose]] = {camera.name: [] for camera in cameras}
     sets: list[tuple[SimulatedPoint, ...]] = []
     while min(map(len, seen.values())) < settings.stations:
         points: list[SimulatedPoint] = []
@@ -132,7 +132,7 @@ def split(sets: Sequence[tuple[SimulatedPoint, ...]], seed: int) -> list[tuple[s
 
 
 def measure(
-    where: MarkerPose, settings: LabSettings, index: int, times_ns: Sequence[int], splits: tuple[str, ...]
+    where: SimulatedPose, settings: LabSettings, index: int, times_ns: Sequence[int], splits: tuple[str, ...]
 ) -> Measurement:
     """Simulate the manual measurement of a marker: distances from A and B on the floor, and its height.
 
@@ -165,12 +165,12 @@ def measure(
     )
 
 
-def tape_lengths_m(where: MarkerPose) -> Array:
+def tape_lengths_m(where: SimulatedPose) -> Array:
     """Return the true distances of a marker from A and B in the plane of the floor, (2,) in m."""
     return np.array([np.hypot(where.x_m - p.x_m, where.y_m - p.y_m) for p in REFERENCES])
 
 
-def _tape(where: MarkerPose, sigma_m: float, rng: np.random.Generator) -> Array:
+def _tape(where: SimulatedPose, sigma_m: float, rng: np.random.Generator) -> Array:
     """Draw two distances that form a triangle with AB; repeat invalid readings."""
     a, b = REFERENCES
     true_m = tape_lengths_m(where)
@@ -191,10 +191,10 @@ def choose_place(
     cameras: Sequence[Camera],
     camera: Camera,
     marker_id: int,
-    taken: Sequence[MarkerPose],
-    before: Sequence[MarkerPose],
-    suits: Callable[[MarkerPose, Camera, LabSettings], bool] = lambda where, camera, settings: True,
-) -> MarkerPose:
+    taken: Sequence[SimulatedPose],
+    before: Sequence[SimulatedPose],
+    suits: Callable[[SimulatedPose, Camera, LabSettings], bool] = lambda where, camera, settings: True,
+) -> SimulatedPose:
     """Choose a pose in a camera's field of view, far from poses ``before``, without overlap with ``taken``.
 
     Raises
@@ -202,11 +202,11 @@ def choose_place(
     IpsysError
         The field of view has no room for the marker.
     """
-    candidates: list[MarkerPose] = []
+    candidates: list[SimulatedPose] = []
     for _ in range(_DRAWS):
         x_m, y_m = rng.uniform(0, FLOOR_M, 2)
         z_m, heading_rad = rng.choice(settings.heights_m), rng.uniform(-np.pi, np.pi)
-        candidate = MarkerPose(marker_id, float(x_m), float(y_m), float(z_m), float(heading_rad))
+        candidate = SimulatedPose(marker_id, float(x_m), float(y_m), float(z_m), float(heading_rad))
         if _fits(candidate, settings, cameras, camera, taken) and suits(candidate, camera, settings):
             candidates.append(candidate)
         if len(candidates) == _CANDIDATES:
@@ -220,11 +220,11 @@ def choose_place(
 
 
 def _fits(
-    where: MarkerPose,
+    where: SimulatedPose,
     settings: LabSettings,
     cameras: Sequence[Camera],
     camera: Camera,
-    taken: Sequence[MarkerPose],
+    taken: Sequence[SimulatedPose],
 ) -> bool:
     if not sees(camera, _centre(where)[None])[0] or _tape_angle_deg(where) < settings.tape_angle_deg:
         return False
@@ -234,16 +234,16 @@ def _fits(
     return not overlap(_centre(where), others, cameras, settings).any()
 
 
-def _tape_angle_deg(where: MarkerPose) -> float:
+def _tape_angle_deg(where: SimulatedPose) -> float:
     """Return the crossing angle of the lines from A and B, 0..90 degrees: flat triangles are inaccurate."""
     to_a, to_b = (np.array([where.x_m - p.x_m, where.y_m - p.y_m]) for p in REFERENCES)
     cross = abs(to_a[0] * to_b[1] - to_a[1] * to_b[0])
     return float(np.degrees(np.arcsin(min(cross / (np.hypot(*to_a) * np.hypot(*to_b)), 1.0))))
 
 
-def _centre(where: MarkerPose) -> Array:
+def _centre(where: SimulatedPose) -> Array:
     return np.array([where.x_m, where.y_m, where.z_m])
 
 
-def _distance(where: MarkerPose, before: Sequence[MarkerPose]) -> float:
+def _distance(where: SimulatedPose, before: Sequence[SimulatedPose]) -> float:
     return min((np.hypot(where.x_m - p.x_m, where.y_m - p.y_m) for p in before), default=np.inf)

@@ -11,7 +11,7 @@ from dataclasses import dataclass, replace
 import numpy as np
 from numpy.typing import NDArray
 
-from ipsys_log.simulation.calibration_points import MarkerPose, overlap
+from ipsys_log.simulation.calibration_points import SimulatedPose, overlap
 from ipsys_log.simulation.cameras import FLOOR_M, Camera
 from ipsys_log.simulation.settings import LabSettings, Purpose, random_stream
 
@@ -47,15 +47,15 @@ class Drive:
     times_s: Array
     phases_rad: Array
 
-    def poses_at(self, time_s: float) -> tuple[MarkerPose, ...]:
+    def poses_at(self, time_s: float) -> tuple[SimulatedPose, ...]:
         """Return the poses of all markers at a time after the start; before it, they are stationary."""
         return tuple(self.pose_at(marker_id, time_s) for marker_id in self.ahead_s)
 
-    def pose_at(self, marker_id: int, time_s: float) -> MarkerPose:
+    def pose_at(self, marker_id: int, time_s: float) -> SimulatedPose:
         """Return the pose of one marker at a time after the start."""
         (x_m, y_m), (dx, dy) = self._follow(self.ahead_s[marker_id], np.array([max(time_s, 0.0)]))
         heading_rad = float(np.arctan2(dy[0], dx[0]))
-        return MarkerPose(marker_id, float(x_m[0]), float(y_m[0]), self.height_m, heading_rad)
+        return SimulatedPose(marker_id, float(x_m[0]), float(y_m[0]), self.height_m, heading_rad)
 
     def track(self, ahead_s: float, times_s: Array) -> Array:
         """Return the centres of a marker at times (n,): (n, 3) in m."""

@@ -26,7 +26,7 @@ from ipsys_log.messages import (
 )
 from ipsys_log.simulation.calibration_points import (
     REFERENCES,
-    MarkerPose,
+    SimulatedPose,
     cameras_seeing,
     measure,
     place_marker,
@@ -60,7 +60,7 @@ class Instant:
     """
 
     time_ns: int
-    places: tuple[MarkerPose, ...]
+    places: tuple[SimulatedPose, ...]
     prints: tuple[PlacedMarker | MovingMarker, ...]
     measured: tuple[Measurement, ...] = ()
 

@@ -21,7 +21,7 @@ from ipsys_log.rig.checks import dictionary_size
 from ipsys_log.simulation.board import board_poses
 from ipsys_log.simulation.calibration_points import (
     REFERENCES,
-    MarkerPose,
+    SimulatedPose,
     cameras_seeing,
     choose_place,
     place_marker,
@@ -71,7 +71,7 @@ class LiveLab:
 
     settings: LabSettings
     drive: Drive
-    stationary: tuple[MarkerPose, ...]
+    stationary: tuple[SimulatedPose, ...]
 
 
 def plan_live_lab(settings: LabSettings) -> LiveLab:
@@ -99,14 +99,14 @@ def plan_live_lab(settings: LabSettings) -> LiveLab:
 
 
 @lru_cache(maxsize=4)
-def _plan(settings: LabSettings) -> tuple[Drive, tuple[MarkerPose, ...]]:
+def _plan(settings: LabSettings) -> tuple[Drive, tuple[SimulatedPose, ...]]:
     cameras = mount_cameras(settings)
     drive = plan_drive(settings, cameras)
     times_s = np.linspace(0, settings.drive_s, round(settings.drive_s * _CHECKED_HZ) + 1).tolist()
     taken = [pose for time_s in times_s for pose in drive.poses_at(time_s)]
     rng = random_stream(settings.seed, Purpose.LYING)
-    seen: dict[str, list[MarkerPose]] = {camera.name: [] for camera in cameras}
-    stationary: list[MarkerPose] = []
+    seen: dict[str, list[SimulatedPose]] = {camera.name: [] for camera in cameras}
+    stationary: list[SimulatedPose] = []
     while min(map(len, seen.values())) < settings.stations:
         camera = min(cameras, key=lambda one: len(seen[one.name]))
         number = settings.markers + len(stationary)
@@ -120,7 +120,7 @@ def _plan(settings: LabSettings) -> tuple[Drive, tuple[MarkerPose, ...]]:
     return drive, tuple(stationary)
 
 
-def _next_height_m(stationary: Sequence[MarkerPose], seen: Sequence[MarkerPose]) -> float:
+def _next_height_m(stationary: Sequence[SimulatedPose], seen: Sequence[SimulatedPose]) -> float:
     """Return the height of the next marker: each camera sees only a small share of raised markers."""
     raised = sum(pose.z_m > 0 for pose in seen)
     if raised >= _RAISED_SHARE * len(seen):
@@ -128,7 +128,7 @@ def _next_height_m(stationary: Sequence[MarkerPose], seen: Sequence[MarkerPose])
     return _BOXES_M[sum(pose.z_m > 0 for pose in stationary) % len(_BOXES_M)]
 
 
-def _is_wide(where: MarkerPose, camera: Camera, settings: LabSettings) -> bool:
+def _is_wide(where: SimulatedPose, camera: Camera, settings: LabSettings) -> bool:
     """Return whether a marker is wide enough in the image of a camera with a slanted view."""
     corners_px = project_corners(camera.lens, camera.camera_from_world, place_marker(where, settings))
     area_px = cv2.contourArea(corners_px.astype(np.float32))
@@ -158,12 +158,12 @@ def live_rig(settings: LabSettings) -> Rig:
     return replace(rig, cameras=tuple(cameras), markers=(*rig.markers, *still))
 
 
-def tape_sheet(stationary: Sequence[MarkerPose]) -> str:
+def tape_sheet(stationary: Sequence[SimulatedPose]) -> str:
     """Return the tape and ruler readings of stationary markers, as a sheet for ``ipsys measure --csv``.
 
     Examples
     --------
-    >>> print(tape_sheet([MarkerPose(3, 1.2192, 3.4384, 0.1, 0.0)]))
+    >>> print(tape_sheet([SimulatedPose(3, 1.2192, 3.4384, 0.1, 0.0)]))
     marker,d_A_cm,d_B_cm,side,height_cm
     3,100.0,263.5,left,10.0
     <BLANKLINE>

@@ -14,7 +14,7 @@ from ipsys_log.geometry.trilateration import trilaterate
 from ipsys_log.log.codec import encode
 from ipsys_log.messages import CameraCalibration, CompressedImage, Measurement, Message, Rig, Tracks
 from ipsys_log.rig.file import check_rig
-from ipsys_log.simulation.calibration_points import MarkerPose, cameras_seeing, measure, plan_points, split
+from ipsys_log.simulation.calibration_points import SimulatedPose, cameras_seeing, measure, plan_points, split
 from ipsys_log.simulation.cameras import FLOOR_M, mount_cameras, sees
 from ipsys_log.simulation.drive import plan_drive
 from ipsys_log.simulation.lab import simulate
@@ -137,7 +137,7 @@ def test_a_measurement_lies_in_its_still_interval_and_names_a_place(session: lis
 
 def test_tape_and_ruler_err_by_their_sigmas() -> None:
     settings = LabSettings(tape_sigma_m=0.004, ruler_sigma_m=0.002)
-    where = MarkerPose(0, 1.0, 4.0, 0.1, 0.0)
+    where = SimulatedPose(0, 1.0, 4.0, 0.1, 0.0)
     truth = [np.hypot(1.0 - 1.2192, 4.0 - 2.4384), np.hypot(1.0 - 3.6576, 4.0 - 2.4384)]
     taken = [measure(where, settings, n, [0, 1, 2], ("train",)) for n in range(1500)]
     off = np.array([[d.distance_m for d in m.distances] for m in taken]) - truth

@@ -13,7 +13,7 @@ import pytest
 
 from ipsys_log.geometry.marker_cells import project_corners
 from ipsys_log.messages import CameraCalibration, CompressedImage, Marker, RigCamera, Tracks
-from ipsys_log.simulation.calibration_points import MarkerPose, cameras_seeing, place_marker
+from ipsys_log.simulation.calibration_points import SimulatedPose, cameras_seeing, place_marker
 from ipsys_log.simulation.cameras import Camera, mount_cameras
 from ipsys_log.simulation.drive import plan_drive
 from ipsys_log.simulation.floor import View, prepare_view
@@ -149,7 +149,7 @@ def test_markers_behind_a_rolling_shutter_are_where_they_were_then() -> None:
     assert rms_m <= 0.0015
 
 
-def centre_m(camera: Camera, where: MarkerPose) -> Array:
+def centre_m(camera: Camera, where: SimulatedPose) -> Array:
     return (camera.camera_from_world @ [where.x_m, where.y_m, where.z_m, 1.0])[:3]
 
 

@@ -285,7 +285,7 @@ class ModelEvaluation:
 
     def to_frame(self) -> pd.DataFrame:
         """Return the errors as a table: a row for each camera ("" for all), scheme and dimension."""
-        import pandas as pd
+        from ipsys_log.exchange.data_frames import import_pandas
 
         rows = [
             {
@@ -299,7 +299,8 @@ class ModelEvaluation:
             for name, errors in (("3d", errors_of_camera.error_3d), ("2d", errors_of_camera.error_2d))
             if errors is not None
         ]
-        return pd.DataFrame(rows)
+        table: pd.DataFrame = import_pandas().DataFrame(rows)
+        return table
 
 
 @dataclass(frozen=True, slots=True)

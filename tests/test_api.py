@@ -251,3 +251,12 @@ def test_live_says_what_is_wrong_on_entering(tmp_path: Path, replayed: Path) -> 
     ):
         pass
     assert not (tmp_path / "x.mcap").exists()
+
+
+def test_tables_without_pandas_are_one_line(replayed: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    result = ipsys.replay(replayed, models=["poly"])
+    monkeypatch.setitem(sys.modules, "pandas", None)
+    with ipsys.open(replayed) as log, pytest.raises(IpsysError, match="need pandas"):
+        log.table("tracks")
+    with pytest.raises(IpsysError, match="need pandas"):
+        result.evaluations["poly"].to_frame()

@@ -29,7 +29,7 @@ from ipsys_log.messages.channels import (
 if TYPE_CHECKING:
     import pandas as pd
 
-__all__ = ["TABLES", "read_table"]
+__all__ = ["TABLES", "import_pandas", "read_table"]
 
 # The six different elements of a 3 x 3 covariance of x, y, z, by their index in row-major order.
 _COVARIANCE = {"xx": 0, "xy": 1, "xz": 2, "yy": 4, "yz": 5, "zz": 8}
@@ -57,6 +57,21 @@ _ITEMS = {
 TABLES = (*_ITEMS, "measurements", "events", "latency")
 
 
+def import_pandas() -> Any:
+    """Return the module pandas.
+
+    Raises
+    ------
+    IpsysError
+        It is not installed.
+    """
+    try:
+        import pandas as pd
+    except ModuleNotFoundError:
+        raise IpsysError("tables need pandas: pip install 'ipsys_log[table]'") from None
+    return pd
+
+
 def read_table(
     session: Session, name: str, runs: Sequence[str | None], start_ns: int | None, end_ns: int | None
 ) -> pd.DataFrame:
@@ -73,25 +88,25 @@ def read_table(
     IpsysError
         pandas is not installed, or there is no such table.
     """
-    try:
-        import pandas as pd
-    except ModuleNotFoundError:
-        raise IpsysError("tables need pandas: pip install 'ipsys_log[table]'") from None
+    pandas = import_pandas()
     if name not in TABLES:
         raise IpsysError(f"there is no table {name!r}; use one of {', '.join(TABLES)}")
     if name in _ITEMS:
-        tables = [_item_table(pd, session, _ITEMS[name], run, start_ns, end_ns) for run in runs]
+        tables = [_item_table(pandas, session, _ITEMS[name], run, start_ns, end_ns) for run in runs]
     else:
         channel, row = _ROWS[name]
         messages = list(session.messages(session.topics(channel), start_ns, end_ns))
         return _typed(
-            pd, pd.DataFrame([_times(message) | row(message) for message in messages], columns=_COLUMNS[name])
+            pandas,
+            pandas.DataFrame(
+                [_times(message) | row(message) for message in messages], columns=_COLUMNS[name]
+            ),
         )
     if len(runs) == 1:
         return tables[0]
-    return pd.concat(
-        [table.assign(run=run) for run, table in zip(runs, tables, strict=True)], ignore_index=True
-    )
+    named = [table.assign(run=run) for run, table in zip(runs, tables, strict=True)]
+    joined: pd.DataFrame = pandas.concat(named, ignore_index=True)
+    return joined
 
 
 def _item_table(

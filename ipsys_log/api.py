@@ -64,6 +64,9 @@ StrPath = str | PathLike[str]
 Time = int | datetime
 Array = NDArray[np.float64]
 
+# Tracks that wait for the loop of a user; a loop that pauses for long costs no memory.
+_MOST_WAITING = 100
+
 
 class Listing(tuple[NamedTuple, ...]):
     """Rows of one kind, such as the runs of a log. It prints as a table, in notebooks too."""
@@ -580,6 +583,8 @@ class Tracker:
             if message is not None and isinstance(message.payload, Tracks):
                 run = run_of_topic(message.topic) or ""
                 self._newest.put(LiveTracks(run, message.payload.timestamp, message.payload.tracks))
+                if self._newest.qsize() > _MOST_WAITING and self._take() is not None:
+                    self.dropped += 1
 
     def _take(self) -> LiveTracks | None:
         """Return tracks that already wait, if any. The end mark stays in the queue."""

@@ -19,7 +19,7 @@ import ipsys_log as ipsys
 from ipsys_log import IpsysError
 from ipsys_log.exchange.data_frames import TABLES
 from ipsys_log.log.dataset import Session
-from ipsys_log.messages import Position, Positions, RigCamera, Track, Tracks
+from ipsys_log.messages import Message, Position, Positions, RigCamera, Track, Tracks
 from ipsys_log.messages.channels import CAMERA_POINTS, MARKERS, POSITIONS, TRACKS, Channel
 from ipsys_log.rig.file import rig_toml
 from tests.conftest import ROOT
@@ -40,6 +40,23 @@ def test_every_public_name_is_there() -> None:
         assert getattr(ipsys, name) is not None
     with pytest.raises(AttributeError):
         ipsys.nothing  # noqa: B018
+
+
+def test_package_has_the_names_of_the_api() -> None:
+    from ipsys_log import api
+
+    assert set(ipsys.__all__) == {*api.__all__, "IpsysError"}
+
+
+def test_tracker_keeps_few_tracks_of_a_loop_that_pauses() -> None:
+    from ipsys_log.api import Tracker
+
+    tracker = Tracker(lambda _: [])
+    tracks = [Message("/runs/poly/tracks", n, n, Tracks(n, ())) for n in range(1000)]
+    tracker.consume(iter(tracks))
+    assert tracker.dropped == 900
+    assert next(iter(tracker)).time_ns == 999
+    assert tracker.dropped == 999
 
 
 def test_import_is_light() -> None:
@@ -115,7 +132,7 @@ def test_table_equals_the_decoded_messages(replayed: Path, name: str, channel: C
 
 
 def test_missing_values_are_nan_or_na(tmp_path: Path) -> None:
-    from ipsys_log.messages import Message, Rig
+    from ipsys_log.messages import Rig
     from ipsys_log.runs.output import write_log
 
     path = tmp_path / "x.mcap"

@@ -33,7 +33,8 @@ def one_reading() -> Iterator[None]:
 
     Inode, size and change time show a change. An append checks for a change under the lock.
     """
-    token = _known.set(_known.get() or {})
+    outer = _known.get()
+    token = _known.set({} if outer is None else outer)
     try:
         yield
     finally:

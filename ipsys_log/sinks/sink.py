@@ -12,7 +12,7 @@ from typing import Protocol
 from ipsys_log.images.video import is_keyframe
 from ipsys_log.messages import CompressedImage, CompressedVideo, Message, RawImage, SkippedVideo
 
-__all__ = ["Consumer", "Consumers", "LiveQueue", "LiveSinks", "Sink", "text_of"]
+__all__ = ["Consumer", "Consumers", "LiveQueue", "LiveSinks", "Sink"]
 
 # Limits of a sink's queue: above the first limit images are dropped, above the second all messages.
 _MOST_WITH_IMAGES, _MOST_WAITING = 100, 200
@@ -153,7 +153,7 @@ class LiveSinks:
         except Exception as fault:  # any error: the frames are more important
             self._fault = self._fault or fault
             waiting.close()
-            self._warn("sink_stopped", f"{sink.name} stopped ({text_of(fault)}); the recording goes on")
+            self._warn("sink_stopped", f"{sink.name} stopped ({_text_of(fault)}); the recording goes on")
 
 
 class Consumers:
@@ -192,7 +192,7 @@ class Consumers:
             except Exception as fault:  # any error: the frames are more important
                 self._fault = self._fault or fault
                 self._consumers.remove(consumer)
-                self._warn("sink_stopped", f"the display stopped ({text_of(fault)}); the recording goes on")
+                self._warn("sink_stopped", f"the display stopped ({_text_of(fault)}); the recording goes on")
 
     def check(self) -> None:
         """Raise the error of the first consumer or sink that failed, if one did."""
@@ -201,7 +201,7 @@ class Consumers:
         self._sinks.check()
 
 
-def text_of(fault: Exception) -> str:
+def _text_of(fault: Exception) -> str:
     """Return the text of an error on one line; its type if it has no text."""
     try:
         return " ".join(str(fault).split()) or type(fault).__name__

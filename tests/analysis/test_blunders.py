@@ -1,4 +1,4 @@
-"""What each slip would have made of a place, in words and as a measurement without it."""
+"""The effect of each blunder on a calibration point, in words and as a measurement without it."""
 
 from __future__ import annotations
 

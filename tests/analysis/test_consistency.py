@@ -1,4 +1,4 @@
-"""What is usual: errors drawn from a known law, and the law found again."""
+"""Estimates of the usual errors: errors drawn from a known law, and the law found again."""
 
 from __future__ import annotations
 

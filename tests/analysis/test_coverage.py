@@ -1,4 +1,4 @@
-"""What of the floor cameras see, against a camera that is a closed form and against every corner."""
+"""The floor that cameras see, against a camera that is a closed form and against every corner."""
 
 from __future__ import annotations
 
@@ -59,7 +59,7 @@ def test_only_neighbours_overlap() -> None:
 
 
 def whole(camera: Camera, places_m: Array, length_m: float) -> NDArray[np.bool_]:
-    """Whether all corners of a marker are in the picture at each of many headings, corner by corner."""
+    """Return whether all corners of a marker are in the image at each of many headings."""
     found = np.ones(len(places_m), dtype=bool)
     for heading_rad in np.linspace(0, np.pi / 2, 16, endpoint=False):
         corners_m = transform(pose_facing_up(0, 0, 0, float(heading_rad)), marker_corners(length_m))

@@ -1,4 +1,4 @@
-"""Which places count, where they are, and what a camera saw of them."""
+"""The valid calibration points, their positions, and their observations by a camera."""
 
 from __future__ import annotations
 

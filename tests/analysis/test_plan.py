@@ -67,7 +67,7 @@ class Camera:
         return np.column_stack([uv * depths_m[:, None], depths_m])
 
     def shows(self, world_m: Array) -> NDArray[np.bool_]:
-        """Whether markers at places (n, 3) are in the frame with all corners, whatever their heading."""
+        """Return whether markers at points (n, 3) are in the image with all corners, for each heading."""
         inside = np.ones(len(world_m), dtype=bool)
         for heading in np.linspace(0, np.pi / 2, 7):
             for corner in SIDE_M / 2 * np.array([[-1, 1, 0], [1, 1, 0], [1, -1, 0], [-1, -1, 0]]):

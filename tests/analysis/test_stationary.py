@@ -1,4 +1,4 @@
-"""Where a marker lies still, and where it only creeps."""
+"""Intervals in which a marker is stationary, and in which it creeps."""
 
 from __future__ import annotations
 

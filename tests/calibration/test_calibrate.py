@@ -1,4 +1,4 @@
-"""What is said of a calibration that is not as good as it could be."""
+"""The advice on a calibration that could be better."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""How large a recording gets, and how long the disk lasts: said before it begins, and while it goes on."""
+"""The size of a recording, and how long the disk lasts: printed before it begins, and while it goes on."""
 
 from __future__ import annotations
 

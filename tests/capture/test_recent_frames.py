@@ -1,4 +1,4 @@
-"""Of what cameras send, only what is measured goes into the log: about a second of frames for each place."""
+"""Only measured frames of the cameras go into the log: about a second of frames for each place."""
 
 from __future__ import annotations
 

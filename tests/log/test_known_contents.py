@@ -112,3 +112,12 @@ def test_outside_of_a_command_every_opening_reads(log: Path, parses: Parses) -> 
         with LogReader(log):
             pass
     assert parses.count == 2
+
+
+def test_inner_block_shares_what_it_reads(log: Path, parses: Parses) -> None:
+    with one_reading():
+        with one_reading(), LogReader(log):
+            pass
+        with LogReader(log):
+            pass
+    assert parses.count == 1

@@ -111,7 +111,7 @@ def recorded(target: Path, *sinks: Sink) -> None:
 
 
 @pytest.fixture
-def test_source(monkeypatch: pytest.MonkeyPatch) -> None:
+def source_of_one_row(monkeypatch: pytest.MonkeyPatch) -> None:
     """A source for tests, as a newcomer would add it: a function, and a row in the table."""
     data = jpeg(np.full((120, 160), 200, np.uint8))
 
@@ -127,7 +127,7 @@ def frames_in(log: Path) -> dict[str, int]:
         return {camera: session.count(topic) for camera, topic in session.images.items()}
 
 
-@pytest.mark.usefixtures("test_source")
+@pytest.mark.usefixtures("source_of_one_row")
 def test_source_and_sink_of_one_row_are_recorded(tmp_path: Path) -> None:
     sink = Collected()
     recorded(tmp_path / "x.mcap", sink)
@@ -135,7 +135,7 @@ def test_source_and_sink_of_one_row_are_recorded(tmp_path: Path) -> None:
     assert len([m for m in sink.messages if isinstance(m.payload, CompressedImage)]) == 80
 
 
-@pytest.mark.usefixtures("test_source")
+@pytest.mark.usefixtures("source_of_one_row")
 def test_sink_that_raises_loses_no_frame(tmp_path: Path) -> None:
     good, bad = Collected("good"), Collected("bad", fault_at=3)
     with pytest.raises(ZeroDivisionError, match="a fault"):
@@ -145,7 +145,7 @@ def test_sink_that_raises_loses_no_frame(tmp_path: Path) -> None:
     assert len([m for m in good.messages if isinstance(m.payload, CompressedImage)]) == 80
 
 
-@pytest.mark.usefixtures("test_source")
+@pytest.mark.usefixtures("source_of_one_row")
 def test_sink_that_hangs_holds_nothing_up(tmp_path: Path) -> None:
     stuck = Stuck()
     try:

@@ -277,3 +277,16 @@ def test_tables_without_pandas_are_one_line(replayed: Path, monkeypatch: pytest.
         log.table("tracks")
     with pytest.raises(IpsysError, match="need pandas"):
         result.evaluations["poly"].to_frame()
+
+
+def test_table_of_an_impossible_time_is_one_line(tmp_path: Path) -> None:
+    from ipsys_log.log.codec import encode, schema_data
+    from ipsys_log.log.contents import Schema
+    from ipsys_log.log.writer import LogWriter
+
+    path, name = tmp_path / "x.mcap", "ipsys.v1.Tracks"
+    with LogWriter.create(path) as writer:
+        writer.add_channel("/runs/poly/tracks", Schema(name, "protobuf", schema_data(name)))
+        writer.write("/runs/poly/tracks", 2**63 + 1, 5, encode(Tracks(5, ())))
+    with ipsys.open(path) as log, pytest.raises(IpsysError, match="later than the year 2262"):
+        log.table("tracks", run="poly")

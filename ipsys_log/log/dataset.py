@@ -227,6 +227,11 @@ class Session:
         streams = [self._raw(reader, topics, start_ns, end_ns) for reader in self.readers]
         raw = streams[0] if len(streams) == 1 else heapq.merge(*streams, key=lambda one: one.log_time_ns)
         for message in raw:
+            if max(message.log_time_ns, message.publish_time_ns) >= _LATEST_NS:
+                where = f"{self}: {message.topic} at {message.log_time_ns} ns"
+                raise LogError(
+                    f"{where}: its time is later than the year 2262; the clock of its recorder was wrong"
+                )
             yield message.topic, message.log_time_ns, message.publish_time_ns, message.data
 
     def _stored(

@@ -1,4 +1,4 @@
-"""What the tests share: the real data, and the command line run in this process."""
+"""Parts that the tests share: the real data, and the command line in this process."""
 
 from __future__ import annotations
 
@@ -144,7 +144,7 @@ def lab(lab_log: Path, tmp_path: Path) -> Path:
 
 
 def data_section(path: Path) -> bytes:
-    """What lies before the DataEnd record: what must never be rewritten."""
+    """Return the bytes before the DataEnd record. They must never be rewritten."""
     whole = path.read_bytes()
     summary_start = int.from_bytes(whole[-28:-20], "little")
     return whole[: summary_start - 13]

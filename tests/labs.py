@@ -95,7 +95,7 @@ def places(
 
 
 def tape_covariances(world_m: Array, sigma_m: float = 0.003, ruler_m: float = 0.001) -> Array:
-    """Of the world point (n, 3, 3), to first order in the errors of d1, d2 and the height."""
+    """Return the covariances of the world points (n, 3, 3), to first order in the errors of the tape."""
     covariances = np.zeros((len(world_m), 3, 3))
     for n, point in enumerate(world_m):
         units = np.array([(point[:2] - end) / np.linalg.norm(point[:2] - end) for end in (A, B)])

@@ -82,7 +82,7 @@ def foreign_read(path: Path) -> list[Row]:
 
 
 def pairs_of(log: Path) -> dict[tuple[str, int, tuple[float, ...]], Pair]:
-    """What each camera saw of each place, by camera, marker and camera point in nm."""
+    """Return what each camera saw at each place, by camera, marker and camera point in nm."""
     with Session([log]) as session:
         model = session.payloads(session.topics(MODEL, "poly"))[-1]
     return {

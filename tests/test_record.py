@@ -372,7 +372,7 @@ def test_recorder_that_stood_still_names_its_late_frames(
 
 
 def late_by_s(images: list[CompressedImage], jpegs: list[bytes]) -> list[float]:
-    """How much later than the first one each picture came than it was sent, at 30/s; none lost."""
+    """Return the delay of each picture relative to the first, at 30/s. No picture is lost."""
     first = jpegs.index(images[0].data)
     assert [image.data for image in images] == [jpegs[(first + n) % 30] for n in range(len(images))]
     return [(image.timestamp - images[0].timestamp) / 1e9 - n / 30 for n, image in enumerate(images)]

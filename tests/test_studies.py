@@ -1,4 +1,4 @@
-"""What a lab asks of a log: models beside one another, wrong places, and what cannot be answered."""
+"""Questions of a lab to a log: comparison of models, wrong places, and questions without an answer."""
 
 from __future__ import annotations
 

@@ -33,7 +33,7 @@ FISHEYE = np.array([-0.13, 0.01, -0.03, 0.02])
 
 @dataclass(frozen=True)
 class Camera:
-    """Where it hangs, how its lens is, and what its calibration says of the lens."""
+    """The place of a camera, its lens, and the calibration of the lens."""
 
     name: str
     camera_from_world: Array

@@ -128,7 +128,7 @@ def test_a_large_picture_is_searched_at_half_its_size_and_refined_at_its_own() -
 
 
 def test_a_board_as_opencv_printed_it_before_4_6() -> None:
-    """Of an even number of rows, it begins with a white square."""
+    """With an even number of rows, the board begins with a white square."""
     picture, truth = drawn(CHARUCO, 2, 0.7, legacy=True)
     assert (picture != drawn(CHARUCO, 2, 0.7)[0]).mean() > 0.1
     sighting = find_board("a", picture, CHARUCO, thorough=False)

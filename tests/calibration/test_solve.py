@@ -30,7 +30,7 @@ def squared_errors(name: str, seeds: range, shared_px: float = 0.0) -> NDArray[n
 
 @pytest.mark.parametrize("name", list(TRUTH))
 def test_a_known_lens_is_found_within_what_is_said(name: str) -> None:
-    """Of 8 seeds and some 8 correlated parameters, the mean of the squares is 1 to a factor of two."""
+    """With 8 seeds and about 8 correlated parameters, the mean of the squares is 1 to a factor of two."""
     errors = squared_errors(name, range(8))
     assert 0.5 < errors.mean() < 2.0, errors.mean(axis=0)
     assert (errors < 4).mean() > 0.85

@@ -52,7 +52,7 @@ def opening(rig: Path, log: Path, seconds: float | None, doing: str | None = Non
 
 
 def first_bytes(lab: Path) -> int:
-    """Of the first frames of both cameras together."""
+    """Return the size of the first frames of both cameras together."""
     with Session([lab]) as session:
         return sum(len(session.payloads([session.images[name]])[0].data) for name in ("red", "white"))
 

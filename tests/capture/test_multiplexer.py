@@ -64,7 +64,7 @@ def test_log_times_are_utc() -> None:
 
 
 def test_a_camera_without_stamps_has_the_time_of_arrival() -> None:
-    """That at which its thread had the frame, however long it waited then; and no delay is claimed."""
+    """The time is when the thread had the frame, even if the frame waited. No delay is claimed."""
     sent_ns: list[int] = []
     clock = Clock()
 

@@ -204,7 +204,7 @@ def stretched(lab_log: Path, count: int) -> dict[str, list[bytes]]:
 
 
 def tape_of(lab_log: Path) -> tuple[Rig, dict[tuple[int, bytes], Measurement]]:
-    """What the tape says of a marker, by what a camera sent while it lay there."""
+    """Return the tape measurement of a marker for the frames that a camera sent there."""
     with Session([lab_log]) as session:
         (rig,) = session.payloads(["/rig"])
         found = {}
@@ -257,7 +257,7 @@ class Hand:
 
 
 def pairs(log: Path) -> dict[tuple[str, str], Pair]:
-    """What each camera saw of each place."""
+    """Return what each camera saw at each place."""
     with Session([log]) as session:
         view = LogView(session, {CAMERA_POINTS: "edges"})
         found = find_pairs(view, measured_places(view))

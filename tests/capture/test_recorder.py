@@ -56,7 +56,7 @@ def log(tmp_path: Path) -> Iterator[Noted]:
 
 
 class Sent:
-    """What cameras send, from a generator; notes why they were stopped."""
+    """Frames of cameras from a generator. The class notes why it was stopped."""
 
     def __init__(self, messages: Generator[Message | None, None, None]) -> None:
         self._messages, self.whys = messages, list[str | None]()

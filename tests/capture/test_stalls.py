@@ -31,7 +31,7 @@ class Scripted(Clock):
 def recorded(
     arrivals_ns: Sequence[int], stamped: bool = False, rate_hz: float | None = None
 ) -> list[Message]:
-    """What is recorded of a camera whose frames arrive at these times of the clock."""
+    """Record a camera whose frames arrive at these times of the clock."""
     clock = Scripted()
 
     @contextmanager

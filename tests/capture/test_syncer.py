@@ -1,4 +1,4 @@
-"""What is recorded gets onto the disk every few seconds, and nothing waits for that but a measured point."""
+"""Recorded data reaches the disk every few seconds. Only a measured point waits for that."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""Which cameras are attached and where, from a made-up sysfs; and what their bus carries."""
+"""The attached cameras and the load of their USB bus, read from a simulated sysfs."""
 
 from __future__ import annotations
 

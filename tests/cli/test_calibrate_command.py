@@ -312,7 +312,7 @@ def test_sources_that_are_none(ipsys: Ipsys, red: Path, tmp_path: Path) -> None:
 def test_photographs_through_a_lens_of_more_than_180_degrees(
     ipsys: Ipsys, data: Path, tmp_path: Path
 ) -> None:
-    """Where ``cv2.fisheye.calibrate`` throws; no focal length is told."""
+    """``cv2.fisheye.calibrate`` raises an error here. No focal length is given."""
     folder = data / "fisheye_chessboard"
     done = ipsys("calibrate", folder, "--board", "6x4", "-o", tmp_path, "--json")
     assert done.code == 0, done.err

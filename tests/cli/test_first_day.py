@@ -1,4 +1,4 @@
-"""What somebody meets on the first day: slips that are said at once, names, pictures, and a help to go by."""
+"""The first day of a user: mistakes are reported at once, and names, pictures and help are clear."""
 
 from __future__ import annotations
 
@@ -262,7 +262,7 @@ def test_a_picture_is_what_its_name_says(ipsys: Ipsys, lab: Path) -> None:
 def test_info_keeps_each_channel_on_a_line_and_has_no_rates_of_events(
     ipsys: Ipsys, tmp_path: Path, lab: Path, fitted: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    """Of a log with three runs, in a window of 80 columns."""
+    """The log has three runs. The window has 80 columns."""
     monkeypatch.setenv("COLUMNS", "80")
     monkeypatch.chdir(tmp_path)
     for model in ("poly", "rigid"):

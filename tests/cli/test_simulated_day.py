@@ -38,7 +38,7 @@ PATIENCE_S = 900
 
 
 def errors_m(log: Path, run: str = "poly") -> np.ndarray:
-    """How far the tracks of a log are from where the simulated robots and markers truly are, (n,)."""
+    """Return the distances between the tracks of a log and the true simulated positions, (n,), in m."""
     lab = plan_live_lab(LIVE_SETTINGS)
     count = round(LIVE_SETTINGS.drive_s * LIVE_SETTINGS.rate_hz)
     lying = {where.marker_id: where for where in lab.stationary}

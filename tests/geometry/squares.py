@@ -36,7 +36,7 @@ def turned(heading_rad: float, tilt_deg: float = 0.0, about_rad: float = 0.0) ->
 
 
 def corners_px(lens: CameraCalibration, axes: Array, centre_m: Array, length_m: float = LENGTH_M) -> Array:
-    """What a perfect camera would see, (4, 2)."""
+    """Return the corners that a perfect camera sees, (4, 2), in pixels."""
     half = length_m / 2
     square = np.array([[[-half, half, 0]], [[half, half, 0]], [[half, -half, 0]], [[-half, -half, 0]]])
     vector, shift = cv2.Rodrigues(axes)[0], np.asarray(centre_m, dtype=np.float64)

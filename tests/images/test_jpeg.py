@@ -193,7 +193,7 @@ def damage(interval: int, rounds: int, frames: int) -> None:
 @pytest.mark.parametrize("interval", [0, 40], ids=["plain", "restarts"])
 @pytest.mark.parametrize("rounds", [6, pytest.param(250, marks=pytest.mark.slow)])
 def test_damage_gives_no_wrong_marker(interval: int, rounds: int) -> None:
-    """What the user may get of a damaged frame: an error, no marker, or the right one."""
+    """Check that a damaged frame gives an error, no marker, or the right marker."""
     damage(interval, rounds, 0)
 
 
@@ -212,7 +212,7 @@ def test_a_wrong_bit_above_a_marker_does_not_move_it() -> None:
 
 
 def restarts_of(data: bytes) -> list[int]:
-    """Where restart markers stand."""
+    """Return the offsets of the restart markers."""
     layout = read_layout(data)
     assert layout is not None
     return [
@@ -246,7 +246,7 @@ def test_an_interval_too_many_does_not_shift_the_picture() -> None:
 )
 @pytest.mark.parametrize("size", [(512, 256), (1024, 64)])
 def test_any_bit_of_the_header_may_be_wrong(size: tuple[int, int], interval: int) -> None:
-    """Of a log that nobody vouches for: a FrameError or a picture, nothing else."""
+    """An untrusted log gives a FrameError or a picture, and nothing else."""
     data = packed(colourful(*size, 0), "4:2:0", interval)
     layout = read_layout(data)
     assert layout is not None

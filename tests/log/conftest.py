@@ -46,7 +46,7 @@ def as_row(message: RawMessage) -> Row:
 
 
 def stock_rows(path: Path) -> list[Row]:
-    """What the stock seeking reader makes of the log, chunk CRCs checked."""
+    """Read the log with the seeking reader of the mcap library, which checks chunk CRCs."""
     with path.open("rb") as file:
         return [
             (channel.topic, message.log_time, message.publish_time, message.data)
@@ -55,7 +55,7 @@ def stock_rows(path: Path) -> list[Row]:
 
 
 def linear_rows(path: Path) -> list[Row]:
-    """What the stock linear reader makes of it, the CRC of the data section checked as well."""
+    """Read the log with the linear reader, which also checks the CRC of the data section."""
     topics: dict[int, str] = {}
     rows: list[Row] = []
     with path.open("rb") as file:

@@ -1,6 +1,6 @@
 """A model of a disk that loses power: operations are recorded, then replayed cut at every point.
 
-What was written and not synced may be lost, in any subset; of the last of them only some sectors may
+Any subset of the writes that were not synced may be lost, and only some sectors of the last of them may
 have arrived. A new directory entry, a rename or an unlink may be lost until the directory is synced.
 A truncation counts as a write of the file's metadata: it may be lost too, in order with later writes
 of the same file or not.

@@ -116,7 +116,7 @@ def _records(data: bytes, opcode: int) -> Iterator[mcap.McapRecord]:
 
 
 def _repeats(rest: bytes) -> bool:
-    """Whether a summary defines channels, counts messages, and has a CRC."""
+    """Return if a summary defines channels, counts messages, and has a CRC."""
     opcodes, position = set(), 0
     while position + 9 <= len(rest) - 8:
         opcode, length = struct.unpack_from("<BQ", rest, position)
@@ -293,7 +293,7 @@ def damage(sample: Sample, chance: random.Random, times: int, other: bytes) -> D
 
 @dataclass
 class Outcome:
-    """What a repair made of one damaged log; `complaints` is empty if all is as it must be."""
+    """The result of one repair. `complaints` is empty if the result is correct."""
 
     complaints: list[str] = field(default_factory=list)
     refused: str = ""
@@ -378,7 +378,7 @@ def _check_topics(sample: Sample, damaged: Damaged, got: Counter[Row], out: Outc
 
 
 def non_seeking_rows(path: Path) -> list[Row]:
-    """What the stock reader makes of a stream that cannot seek: it wants definitions before messages."""
+    """Read a stream that cannot seek. The reader needs definitions before messages."""
     from mcap.reader import NonSeekingReader
 
     with path.open("rb") as file:
@@ -387,7 +387,7 @@ def non_seeking_rows(path: Path) -> list[Row]:
 
 
 def _check_restored(path: Path, damaged: bytes, out: Outcome) -> None:
-    """What was taken out, put back where it was, makes the damaged log again, byte for byte."""
+    """Check that the removed bytes, put back, give the damaged log byte for byte."""
     assert out.report is not None
     data = bytearray(path.read_bytes())
     if out.report.damaged_file is not None:

@@ -39,7 +39,7 @@ def read_everything(path: Path) -> None:
 
 
 def fault_of(act: Callable[[Path], object], path: Path) -> str:
-    """What `act` says is wrong, "" if nothing; any other exception than LogError is a failure."""
+    """Return the error that `act` reports, "" if none. Only LogError is allowed."""
     try:
         act(path)
     except LogError as error:

@@ -94,7 +94,7 @@ def run(*arguments: object) -> Cost:
 
 @pytest.fixture(scope="module")
 def plain(tmp_path_factory: pytest.TempPathFactory) -> dict[str, Cost]:
-    """What each command costs on a log of one image: the start of Python, and imports."""
+    """Return the cost of each command on a log of one image: the start of Python, and imports."""
     folder = tmp_path_factory.mktemp("plain")
     path = folder / "a.mcap"
     path.write_bytes(BOMBS["JPEG of 65500 x 65500"]())

@@ -52,7 +52,7 @@ def rows_of(count: int) -> list[Row]:
 
 
 def record_at(data: bytes | bytearray, opcode: int, number: int = 0) -> tuple[int, int]:
-    """Where a record of the data section begins and ends."""
+    """Return the first and last offset of a record of the data section."""
     position = 8
     while position < len(data):
         kind, length = struct.unpack_from("<BQ", data, position)

@@ -1,4 +1,4 @@
-"""What we write is read the same by us and by three other readers."""
+"""Our reader and three other readers read our logs with the same result."""
 
 import subprocess
 import sys

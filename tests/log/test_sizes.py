@@ -75,7 +75,7 @@ def check(path: Path, rows: list[Row]) -> None:
 
 @given(st.lists(st.integers(0, 5 * 10**9), max_size=20))
 def test_no_chunk_spans_a_second(times: list[int]) -> None:
-    """Whether time goes forward or back: a reader then opens few chunks at once."""
+    """This holds for times in any order, so that a reader opens few chunks at once."""
     with tempfile.TemporaryDirectory() as folder:
         path = create(Path(folder) / "log.mcap", [("/points", time, time, b"point") for time in times])
         with LogReader(path) as reader:

@@ -37,7 +37,7 @@ def paper(data: Path, tmp_path_factory: pytest.TempPathFactory) -> Findings:
 
 
 def only(findings: Findings, *models: str) -> Findings:
-    """What was found of some of the models."""
+    """Return the findings for some of the models."""
     return with_accuracies(findings, [a for a in findings.accuracies if a.model in models])
 
 

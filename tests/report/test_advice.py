@@ -1,4 +1,4 @@
-"""How many places and which model: what is recommended, and why."""
+"""The advice on the number of places and on the model, with its reasons."""
 
 from __future__ import annotations
 

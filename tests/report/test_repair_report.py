@@ -1,4 +1,4 @@
-"""What is said of a log that was repaired, as it stands on a terminal."""
+"""The terminal report of a repaired log."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""What is printed after an evaluation fits a terminal, and obeys nobody but us."""
+"""The tables of an evaluation fit a terminal, and control characters from a log have no effect."""
 
 from __future__ import annotations
 

@@ -58,7 +58,7 @@ _LOG = ".mcap"
 
 @dataclass(slots=True)
 class Outcome:
-    """What a case came to with one commit: exit codes, the hash of each file, and how long it took."""
+    """The result of a case with one commit: exit codes, the hash of each file, and the duration."""
 
     folder: Path
     codes: list[int]

@@ -1,4 +1,4 @@
-"""What is shown while it happens: read back by Rerun itself, without a screen."""
+"""Rerun reads back the live recording itself, without a screen."""
 
 from __future__ import annotations
 

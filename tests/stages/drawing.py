@@ -66,7 +66,7 @@ class Print(NamedTuple):
 
 @dataclass(frozen=True)
 class Look:
-    """What a scene looks like; ``floor`` and ``shade`` (a share of the light) are one number or (h, w)."""
+    """The appearance of a scene. ``floor`` and ``shade`` (a share of the light) are one number or (h, w)."""
 
     black: float = 35.0
     white: float = 205.0
@@ -82,7 +82,7 @@ class Look:
 
 
 def corners_px(lens: CameraCalibration, one: Print, sides: float = 1.0) -> Array:
-    """What a perfect camera would see of the corners of the black square, or of a larger one: (4, 2)."""
+    """Return the corners of the black square, or of a larger square, in a perfect camera: (4, 2)."""
     half = sides * one.length_m / 2
     square = np.array([[-half, half, 0], [half, half, 0], [half, -half, 0], [-half, -half, 0]])
     return _project(lens, square @ one.axes.T + one.centre_m)
@@ -207,7 +207,7 @@ def frame(data: bytes | RawImage, time_ns: int, camera: str = "red") -> Message:
 
 
 class Score:
-    """How far found corners lie off the true ones, and what was missed or is not there."""
+    """The errors of found corners, the missed markers and the false markers."""
 
     def __init__(self) -> None:
         self.offs_px: list[Array] = []
@@ -233,7 +233,7 @@ class Score:
 
     @property
     def rms_px(self) -> float:
-        """Of the distances in the plane of the image."""
+        """Return the RMS of the distances in the image plane."""
         return float(np.sqrt(np.mean(np.sum(np.square(self.offs_px), axis=2))))
 
     @property
@@ -343,7 +343,7 @@ def _lights(one: Print, look: Look) -> NDArray[np.float32]:
 def _on_print(
     lens: CameraCalibration, one: Print, low: NDArray[np.int_], high: NDArray[np.int_], cells: int
 ) -> tuple[Array, Array]:
-    """Where the middles of pixels lie on a print, column and row in cells: (h, w) each."""
+    """Return the positions of the centres of pixels on a print, column and row in cells: (h, w) each."""
     x, y = np.meshgrid(np.arange(low[0], high[0]), np.arange(low[1], high[1]))
     rays = _rays(lens, np.stack([x, y], axis=-1).reshape(-1, 2).astype(np.float64))
     rays = np.column_stack([rays, np.ones(len(rays))])
@@ -374,7 +374,7 @@ def _project(lens: CameraCalibration, points_m: Array) -> Array:
 
 
 def _black(dictionary: str, marker_id: int) -> NDArray[np.bool_]:
-    """Which cells of the square are black, its border included, the top row first."""
+    """Return the black cells of the square, its border included, the top row first."""
     known = cv2.aruco.getPredefinedDictionary(getattr(cv2.aruco, dictionary))
     cells = known.markerSize + 2
     black: NDArray[np.bool_] = np.asarray(cv2.aruco.generateImageMarker(known, marker_id, cells)) == 0

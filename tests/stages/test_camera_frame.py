@@ -39,7 +39,7 @@ SIGMA_PX = 0.03
 def points(
     method: str, *markers: Marker, lens: CameraCalibration = FISHEYE, rig: Rig = RIG
 ) -> tuple[tuple[CameraPoint, ...], list[Event]]:
-    """What one frame with these markers gives."""
+    """Return the camera points of one frame with these markers."""
     stage = CameraFrame(method)
     for payload, camera in ((rig, None), (lens, "red")):
         assert list(stage(Message("t", 0, 0, payload, camera))) == []

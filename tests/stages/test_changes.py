@@ -1,4 +1,4 @@
-"""What makes a search worth its while, and what does not."""
+"""The changes in the image that start a search, and those that do not."""
 
 from __future__ import annotations
 
@@ -42,7 +42,7 @@ def watch() -> ChangeDetector:
 
 
 def covers(region: tuple[slice, slice] | None, corners_px: Array) -> bool:
-    """Whether a region holds all of a marker, in pixels."""
+    """Return True if a region contains the whole marker, in pixels."""
     if region is None:
         return False
     low = np.array([region[1].start, region[0].start])

@@ -284,7 +284,7 @@ def test_a_marker_in_shadow_on_a_bright_floor_is_found_within_a_second() -> None
 
 
 def test_glare_on_a_marker_gives_no_wrong_one() -> None:
-    """Where it is too strong the marker is not found; never is it somewhere else."""
+    """If the glare is too strong, the marker is not found. It is never found in another place."""
     y, x = np.mgrid[: VGA.height, : VGA.width]
     one = at_px(VGA, 5, (330, 240), 2.0, length_m=0.4)
     for strength in (60, 120, 250):

@@ -235,7 +235,7 @@ def test_covariances_hold_the_truth_as_often_as_they_say(name: str, along: float
 
 
 def test_the_covariance_of_a_model_that_misfits_knows_most_of_it() -> None:
-    """What rigid leaves of the lens is no noise: it is the same everywhere near by, and has no Gaussian."""
+    """The lens error that rigid leaves is no noise: it is equal at near positions and not Gaussian."""
     within_68, within_95 = regions("rigid", 0.0004, range(40))
     assert 0.55 <= within_68 <= 0.76
     assert 0.80 <= within_95 <= 0.98

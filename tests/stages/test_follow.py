@@ -71,7 +71,7 @@ def started(lens: CameraCalibration = VGA) -> Detect:
 
 
 def feed(detect: Detect, messages: Iterable[Message]) -> list[list[Any]]:
-    """What a stage answers, without the drawing for viewers, to each frame."""
+    """Return the messages of a stage for each frame, without the drawing for viewers."""
     kinds = (Markers, Event)
     return [[one for one in detect(message) if isinstance(one, kinds)] for message in messages]
 
@@ -87,7 +87,7 @@ def film(pictures: Iterable[Picture], camera: str = "red", *options: int) -> lis
 
 
 def ids(answers: Iterable[list[Any]]) -> list[list[int]]:
-    """Of the markers in each frame."""
+    """Return the ids of the markers in each frame."""
     return [[m.id for one in made if isinstance(one, Markers) for m in one.markers] for made in answers]
 
 
@@ -97,7 +97,7 @@ def markers(made: list[Any]) -> tuple[Marker, ...]:
 
 
 def off_px(made: list[Any], one: Print, lens: CameraCalibration = VGA) -> float:
-    """How far the farthest corner of a marker lies off."""
+    """Return the largest corner error of a marker."""
     (marker,) = (marker for marker in markers(made) if marker.id == one.id)
     return float(np.hypot(*(marker.corners_px - corners_px(lens, one)).T).max())
 
@@ -308,7 +308,7 @@ def test_a_marker_that_is_not_in_the_rig_is_named_once() -> None:
     ids=["equal", "backwards", "mixed", "nanoseconds", "months later"],
 )
 def test_odd_time_stamps_lose_no_marker(times_ns: list[int], row_time_ns: int | None) -> None:
-    """Where a marker is looked for follows from the time; it may lie still none the less."""
+    """The search region depends on the time, and a marker may lie still."""
     detect = Detect("edges")
     for message in (rig(RigCamera("red", row_time_ns=row_time_ns)), calibrated(VGA)):
         list(detect(message))

@@ -97,7 +97,7 @@ def test_edges_in_uneven_light_are_exact_at_full_size(name: str) -> None:
 
 @pytest.mark.slow
 def test_covariance_with_three_sides_holds_the_errors() -> None:
-    """Of the errors of each coordinate 68 %, give or take 5 points, lie within their sigma."""
+    """In each coordinate, 68 % of the errors, give or take 5 points, lie within their sigma."""
     errors = [e for name in LIGHTS if "along" in name for e in scored_at_full_size(name)[2]]
     assert np.mean(np.abs(errors) <= 1) == pytest.approx(0.68, abs=0.05)
     assert np.mean(np.abs(errors) <= 2) >= 0.9

@@ -1,4 +1,4 @@
-"""What is typed: units mixed up, fields left out, numbers that are none."""
+"""Typed entries: mixed units, missing fields, and text that is not a number."""
 
 from __future__ import annotations
 

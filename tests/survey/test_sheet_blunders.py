@@ -76,7 +76,7 @@ def test_sheet_row_with_swapped_distances_is_refused(ipsys: Ipsys, with_model: U
 
 
 def mirrored_m(one: Measurement) -> float:
-    """How far apart two points lie whose distances to A and B are exchanged, in closed form."""
+    """Return the distance between two points with exchanged distances to A and B, in closed form."""
     a_m, b_m = (distance.distance_m for distance in one.distances)
     return float(abs(a_m**2 - b_m**2) / np.hypot(*(labs.B - labs.A)))
 

@@ -1,4 +1,4 @@
-"""Who gets in: the token, the address, the page itself, and nobody else."""
+"""Access to the page needs the token and the address. All other requests are refused."""
 
 from __future__ import annotations
 

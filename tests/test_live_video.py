@@ -99,17 +99,13 @@ def test_a_slow_machine_skips_frames_of_a_video_and_a_replay_gives_the_same(
         skipped = {e.timestamp for e in events if e.kind == FRAME_SKIPPED}
         frames = list(session.messages([session.images["red"]]))
         found = list(session.messages(["/runs/edges/cameras/red/markers"]))
-        # A frame that the network damaged has an event in place of markers.
-        events_of_run = list(session.messages(session.topics(RUN_EVENTS, "edges")))
-    damaged = {
-        one.log_time_ns for one in events_of_run if one.payload.kind in ("corrupt_frame", "no_keyframe")
-    }
-    assert len(damaged) < 5
+        events_of_run = session.payloads(session.topics(RUN_EVENTS, "edges"))
+    assert [event.text for event in events_of_run if event.kind in ("corrupt_frame", "no_keyframe")] == []
     assert len(frames) > 60
     assert is_keyframe(frames[0].payload)
     assert len(skipped) > 30
     seen = {one.log_time_ns for one in found}
-    assert seen | damaged == {one.log_time_ns for one in frames} - skipped
+    assert seen == {one.log_time_ns for one in frames} - skipped
     # To the end: it does not fall behind.
     assert len(seen & {one.log_time_ns for one in frames[-25:]}) > 0
     assert all(one.equal and one.left for one in verify([target], None, lambda *_: None))
@@ -117,5 +113,5 @@ def test_a_slow_machine_skips_frames_of_a_video_and_a_replay_gives_the_same(
     pipeline.replay([target], Request(), "detect")
     with Session([target]) as session:
         every = list(session.messages(["/runs/edges_2/cameras/red/markers"]))
-    assert {one.log_time_ns for one in every} >= {one.log_time_ns for one in frames} - damaged
+    assert {one.log_time_ns for one in every} == {one.log_time_ns for one in frames}
     assert any(one.payload.markers for one in every)

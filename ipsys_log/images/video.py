@@ -163,6 +163,9 @@ class Video:
     def _decode(self, frame: CompressedVideo) -> VideoFrame | None:
         missing = self._misses(frame.data)
         if is_keyframe(frame):
+            # After skipped frames, a keyframe of H.265 may repeat the picture order count of the last frame;
+            # FFmpeg takes it for damage.
+            self._decoder.flush_buffers()
             self._begun = self._keyed = True
             self._fault = None
         elif self._keyed and self._fault is not None:

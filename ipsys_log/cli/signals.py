@@ -18,7 +18,9 @@ from collections.abc import Callable, Iterator, Sequence
 from contextlib import contextmanager
 from dataclasses import dataclass, field
 from types import FrameType
-from typing import Any, NoReturn
+from typing import Any
+
+from ipsys_log.interrupts import defer
 
 __all__ = [
     "InterruptError",
@@ -173,7 +175,9 @@ def _note(number: int, _: FrameType | None = None) -> None:
     _state.noted = number
 
 
-def _interrupt(number: int, _: FrameType | None = None) -> NoReturn:
+def _interrupt(number: int, _: FrameType | None = None) -> None:
+    if defer(number):
+        return
     _state.noted, text = None, _state.normal_text
     _state.normal_text = None
     if text is not None:

@@ -6,11 +6,12 @@ import os
 import secrets
 from collections import Counter
 from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
-from contextlib import contextmanager, suppress
+from contextlib import ExitStack, contextmanager, suppress
 from dataclasses import replace
 from pathlib import Path
 
 from ipsys_log.errors import IpsysError, LogError
+from ipsys_log.interrupts import undivided
 from ipsys_log.log.codec import encode, schema_data, schema_name
 from ipsys_log.log.contents import Schema
 from ipsys_log.log.dataset import Session
@@ -58,7 +59,9 @@ def write_log(path: Path, messages: Iterable[Message]) -> dict[str, int]:
     -------
     The number of messages by topic.
     """
-    with LogWriter.create(path, atomic=True) as writer:
+    with ExitStack() as stack:
+        with undivided():
+            writer = stack.enter_context(LogWriter.create(path, atomic=True))
         return write_messages(writer, messages)
 
 
@@ -113,17 +116,16 @@ def open_target(paths: Sequence[Path], output: Path | None) -> Iterator[tuple[li
     _check_free(output)
     # Another process may write a log of that name at the same time: the first one to finish gets the name.
     partial = output.with_name(f"{output.name}.{secrets.token_hex(4)}.partial")
-    with LogWriter.create(partial):
-        pass
-    try:
+    with ExitStack() as stack:
+        with undivided():
+            LogWriter.create(partial).close()
+            for path in (partial, journal_path(partial)):
+                stack.callback(path.unlink, missing_ok=True)
         yield [*paths, partial], partial
         with LogReader(partial) as log:
             anything = log.message_count > 0
         if anything:
             _give_name(partial, output)
-    finally:
-        partial.unlink(missing_ok=True)
-        journal_path(partial).unlink(missing_ok=True)
 
 
 def _give_name(partial: Path, output: Path) -> None:

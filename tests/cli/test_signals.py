@@ -102,6 +102,35 @@ def test_interrupt_swallowed_by_a_library_comes_again() -> None:
     assert caught.value.exit_code == 128 + signal.SIGTERM
 
 
+@pytest.mark.parametrize(
+    "command",
+    [
+        ("simulate", "--width", 320, "--height", 180, "-o", "new.mcap"),
+        ("replay", SAMPLE, "-o", "new.mcap"),
+        ("view", SAMPLE, "--save", "new.rrd"),
+    ],
+    ids=lambda command: command[0],
+)
+def test_interrupt_right_after_the_creation_of_a_file_leaves_no_file(
+    command: tuple[object, ...], ipsys: Ipsys, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    open_file = os.open
+    interrupted: list[str | Path] = []
+
+    def open_and_interrupt(path: str | Path, *arguments: int, **options: int) -> int:
+        number = open_file(path, *arguments, **options)
+        if str(path).endswith(".partial") and not interrupted:
+            interrupted.append(path)
+            signal.raise_signal(signal.SIGINT)
+        return number
+
+    monkeypatch.chdir(tmp_path)
+    monkeypatch.setattr(os, "open", open_and_interrupt)
+    assert ipsys(*command).code == 130
+    assert len(interrupted) == 1
+    assert list(tmp_path.iterdir()) == []
+
+
 @pytest.mark.usefixtures("handlers")
 def test_interrupt_does_not_interrupt_what_cleans_up() -> None:
     cleaned: list[bool] = []

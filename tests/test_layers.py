@@ -11,7 +11,8 @@ import pytest
 PACKAGE = Path(__file__).resolve().parent.parent / "ipsys_log"
 
 LAYERS = (
-    ("errors",), ("units", "plain_text"), ("messages",), ("geometry", "rig"), ("images",), ("models", "log"),
+    ("errors",), ("units", "plain_text", "extras"), ("messages",), ("geometry", "rig"), ("images",),
+    ("models", "log"),
     ("calibration",), ("analysis",), ("stages",), ("runs",), ("simulation",), ("capture",),
     ("exchange", "sinks"), ("pipeline",), ("restore",), ("survey",), ("api",), ("report",),
     ("web",), ("cli",),

@@ -21,10 +21,16 @@ def normalize(distribution: str) -> str:
 
 
 def declared() -> set[str]:
-    """The distributions that pyproject.toml depends on, those of its extras for users too."""
+    """The distributions that pyproject.toml depends on, those of its extras for users too.
+
+    The extra ``all`` names other extras of the package itself.
+    """
     project = tomllib.loads((ROOT / "pyproject.toml").read_text())["project"]
     extras = [
-        text for name, rows in project["optional-dependencies"].items() if name != "dev" for text in rows
+        text
+        for name, rows in project["optional-dependencies"].items()
+        if name not in ("all", "dev")
+        for text in rows
     ]
     names = (re.match(r"[A-Za-z0-9._-]+", text) for text in [*project["dependencies"], *extras])
     return {normalize(name[0]) for name in names if name}

@@ -11,7 +11,7 @@ import pytest
 PACKAGE = Path(__file__).resolve().parent.parent / "ipsys_log"
 
 LAYERS = (
-    ("errors", "interrupts"), ("units", "plain_text"), ("messages",), ("geometry", "rig"), ("images",),
+    ("errors", "interrupts"), ("units", "plain_text", "extras"), ("messages",), ("geometry", "rig"), ("images",),
     ("models", "log"), ("calibration",), ("analysis",), ("stages",), ("runs",), ("simulation",), ("capture",),
     ("exchange", "sinks"), ("pipeline",), ("restore",), ("survey",), ("api",), ("report",),
     ("web",), ("cli",),

@@ -104,8 +104,10 @@ def repair(
 
 def view(logs: Logs, run: Runs = None, save: Save = None) -> None:
     """Show frames with drawn markers, floor, calibration points, positions and tracks over time, in Rerun."""
+    from ipsys_log.extras import check_installed
     from ipsys_log.log.dataset import Session
 
+    check_installed("view needs", "rerun")
     if save is not None:
         _check_save(save, logs)
     from ipsys_log.runs.states import out_of_date_lines
@@ -134,7 +136,10 @@ def _check_save(save: Path, logs: list[Path]) -> None:
 
 
 def _report(logs: list[Path], output: Path | None, html: Path | None, **given: Any) -> None:
+    from ipsys_log.extras import check_installed
     from ipsys_log.report.files import check_file, write_files
+
+    check_installed("report needs", "matplotlib", "jinja2")
     from ipsys_log.report.html import render_report
 
     target = html or (output or logs[-1]).with_suffix(".html")

@@ -82,7 +82,10 @@ def markers(
     Each marker has its white margin, cutting marks, its id and an arrow to its front: the direction of its
     heading. Print at 100 % ("actual size"), and measure the ruler: it is 10 cm long."""
     from ipsys_log.errors import IpsysError
+    from ipsys_log.extras import check_installed
     from ipsys_log.report.files import check_file, write_files
+
+    check_installed("markers needs", "matplotlib")
     from ipsys_log.report.print_pages import choose_paper, draw_pages, lay_out
 
     if output.suffix.lower() != ".pdf":

@@ -97,9 +97,12 @@ def measure(
     ends = csv is not None or places
     allow_interrupt(None if ends else "stopped; every saved point is in the log")
     from ipsys_log.errors import IpsysError
+    from ipsys_log.extras import check_installed
 
     if sum((terminal, csv is not None, places)) > 1:
         raise IpsysError("--terminal, --csv and --places exclude one another; give one of them")
+    if not (terminal or ends):
+        check_installed("the measuring page needs", "starlette", "uvicorn")
     if log is not None:
         _refuse(
             "cameras; leave out LOG, or this",

@@ -90,9 +90,9 @@ def plan(
 
 
 def _show(found: PlannedFloor, plot: Path | None, as_json: bool) -> None:
-    from ipsys_log.report.plan_figure import draw_plan
-
     if plot is not None:
+        from ipsys_log.report.plan_figure import draw_plan
+
         draw_plan(found, plot)
     if as_json:
         print(json.dumps(_plan_json(found), indent=2, allow_nan=False))  # noqa: T201

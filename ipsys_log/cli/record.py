@@ -68,10 +68,13 @@ def record(
     from ipsys_log.capture.live_plan import check_start
     from ipsys_log.cli.measure_live import live_scene, ready_to_measure, serve_live_page
     from ipsys_log.errors import IpsysError
+    from ipsys_log.extras import check_installed
     from ipsys_log.runs.options import Request
 
     if model_from is not None and not measure:
         raise IpsysError(f"--model-from {model_from}: has no effect without --measure; to track: ipsys live")
+    if measure:
+        check_installed("--measure needs", "starlette", "uvicorn")
     lab = prepare_lab(rig, camera, calibration)
     read = lab.files if model_from is None else [*lab.files, (MODEL, model_from)]
     check_target(output, force, read)
@@ -126,8 +129,11 @@ def live(
     allow_interrupt(_NOT_BEGUN)
     from ipsys_log import pipeline
     from ipsys_log.capture.live_plan import check_start
+    from ipsys_log.extras import check_installed
     from ipsys_log.runs.options import Request
 
+    if view:
+        check_installed("--view needs", "rerun")
     lab = prepare_lab(rig, camera, calibration)
     check_target(output, force, [*lab.files, (MODEL, model_from)])
     models = tuple(dict.fromkeys(model or ()))

@@ -265,11 +265,13 @@ def _derive(
     details: bool = False,
     **given: Any,
 ) -> None:
+    from ipsys_log.extras import check_installed
     from ipsys_log.report.files import check_figure_file, check_folder
 
     if plot is not None:
         check_figure_file(plot, "--plot", logs)
     if plots is not None:
+        check_installed("--plots needs", "matplotlib")
         check_folder(plots, "--plots")
     with derive(logs, until, **given) as (session, outcomes, accuracies):
         drawn = _draw(session, accuracies, plot, plots)

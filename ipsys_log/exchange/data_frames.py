@@ -9,6 +9,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from ipsys_log.errors import IpsysError
+from ipsys_log.extras import check_installed
 from ipsys_log.log.codec import schema_name
 from ipsys_log.log.columns import Column, Columns, read_columns
 from ipsys_log.log.contents import camera_of_topic
@@ -65,10 +66,9 @@ def import_pandas() -> Any:
     IpsysError
         It is not installed.
     """
-    try:
-        import pandas as pd
-    except ModuleNotFoundError:
-        raise IpsysError("tables need pandas: pip install 'ipsys_log[table]'") from None
+    check_installed("tables need", "pandas")
+    import pandas as pd
+
     return pd
 
 

@@ -17,9 +17,10 @@ from ipsys_log.analysis.coverage import Coverage
 from ipsys_log.geometry.lenses import project
 from ipsys_log.messages import CameraCalibration
 from ipsys_log.report.alignment import AlignedLab
-from ipsys_log.report.figures import NOTE, REST, camera_styles, figure_bytes, shorten
+from ipsys_log.report.figures import figure_bytes
 from ipsys_log.report.files import write_files
 from ipsys_log.report.floor_figure import draw_ground
+from ipsys_log.report.styles import NOTE, REST, camera_styles, shorten
 from ipsys_log.units import CM_PER_M
 
 __all__ = ["draw_alignment"]

@@ -1,102 +1,23 @@
-"""Figures as bytes (equal figures give equal bytes), and the colours and symbols of figures.
-
-The hues are those of Okabe and Ito (2008). Their yellow is left out: it is hard to see on white paper.
-"""
+"""Figures as bytes (equal figures give equal bytes), and the common style of their axes."""
 
 from __future__ import annotations
 
 import base64
 import io
 import warnings
-from collections.abc import Iterable, Sequence
+from collections.abc import Sequence
 from pathlib import Path
-from typing import Any, NamedTuple
 
 import matplotlib
 from matplotlib.axes import Axes
 from matplotlib.figure import Figure
 from matplotlib.ticker import FixedLocator, FuncFormatter, NullLocator
 
-from ipsys_log.plain_text import plain_text
-from ipsys_log.sinks.rerun.scene import assign_colours
+from ipsys_log.report.styles import GRID
 
-__all__ = [
-    "GRID",
-    "NOTE",
-    "REST",
-    "TEST",
-    "ModelStyle",
-    "camera_styles",
-    "figure_bytes",
-    "model_styles",
-    "png",
-    "robot_colour",
-    "scale_logarithmic",
-    "set_ticks",
-    "shorten",
-    "style_axes",
-    "svg_data_uri",
-]
-
-# A camera with the name of a colour gets a similar colour that is easy to see.
-_NAMED = {"red": "#D55E00", "white": "#8C8C8C", "black": "#000000", "blue": "#0072B2", "green": "#009E73"}
-_COLOURS = ("#0072B2", "#D55E00", "#009E73", "#CC79A7", "#000000", "#E69F00", "#56B4E9", "#8C8C8C")
-_SHAPES = "osD^vP*X"
-_ROBOTS = ("#56B4E9", "#E69F00", "#CC79A7", "#009E73", "#0072B2", "#9467BD")
-_MODELS = {
-    "rigid": ("#0072B2", "o"),
-    "poly": ("#D55E00", "s"),
-    "ann": ("#CC79A7", "D"),
-    "kriging": ("#009E73", "^"),
-    "kriging-regression": ("#56B4E9", "v"),
-    "rayplane": ("#E69F00", "P"),
-    "best": ("#000000", "X"),
-}
-
-# Colours for the less important parts of a figure.
-REST = "#B5B5B5"
-GRID = "#E6E6E6"
-NOTE = "#505050"
-# Colour of held-out points; the points of the fit are black.
-TEST = "#D7191C"
-
-
-class ModelStyle(NamedTuple):
-    """The style of a model in a figure.
-
-    A hybrid model has the colour of its second model, a dashed ``line`` and larger, hollow marks. So both
-    models stay visible if they are the same function.
-    """
-
-    colour: str
-    line: str
-    marker: dict[str, Any]
-
-
-def camera_styles(cameras: Iterable[str]) -> dict[str, tuple[str, str]]:
-    """Return colour and marker shape of each camera, independent of the order of the names."""
-    colours = assign_colours(cameras, _NAMED, _COLOURS)
-    return {camera: (colours[camera], _SHAPES[n % len(_SHAPES)]) for n, camera in enumerate(sorted(colours))}
-
-
-def model_styles(models: Iterable[str]) -> dict[str, ModelStyle]:
-    """Return colour, shape and line of each model, the same in every figure and for every set of models."""
-    styles = {}
-    for model in models:
-        first, plus, second = model.partition("+")
-        colour, shape = _MODELS.get(second or first, (_COLOURS[-1], "h"))
-        marker = {"marker": shape, "ms": 8.5 if plus else 5.5, "mfc": "none" if plus else colour, "mew": 1.2}
-        styles[model] = ModelStyle(colour, "--" if plus else "-", marker)
-    return styles
-
-
-def robot_colour(number: int) -> str:
-    """Return the colour of a robot by its number, from 0."""
-    return _ROBOTS[number % len(_ROBOTS)]
-
+__all__ = ["figure_bytes", "png", "scale_logarithmic", "set_ticks", "style_axes", "svg_data_uri"]
 
 _DPI = 150
-_LONGEST = 24
 # Options that leave out the time of writing.
 _WITHOUT: dict[str, dict[str, object]] = {
     "pdf": {"metadata": {"Creator": None, "Producer": None, "CreationDate": None}},
@@ -137,12 +58,6 @@ def _saved(figure: Figure, **how: object) -> bytes:
         warnings.filterwarnings("ignore", message="Glyph")
         figure.savefig(buffer, **how)  # type: ignore[arg-type]
     return buffer.getvalue()
-
-
-def shorten(name: str) -> str:
-    """Shorten a name from a log to one line that fits into a figure."""
-    plain = plain_text(name)
-    return plain if len(plain) <= _LONGEST else f"{plain[: _LONGEST - 1]}…"
 
 
 def style_axes(axes: Axes, grid: str = "both") -> None:

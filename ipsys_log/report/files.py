@@ -10,6 +10,7 @@ from collections.abc import Iterable, Mapping, Sequence
 from pathlib import Path
 
 from ipsys_log.errors import IpsysError
+from ipsys_log.extras import check_installed
 from ipsys_log.log.lock import describe_broken_link
 from ipsys_log.messages import CameraEvaluation, ErrorStatistics
 from ipsys_log.report.findings import Findings
@@ -129,8 +130,10 @@ def check_figure_file(path: Path, option: str, logs: Iterable[Path]) -> None:
     Raises
     ------
     IpsysError
-        The file cannot be written, or its name does not end in one of ``FIGURE_SUFFIXES``.
+        Matplotlib is not installed, the file cannot be written, or its name does not end in one of
+        ``FIGURE_SUFFIXES``.
     """
+    check_installed(f"{option} needs", "matplotlib")
     check_file(path, option, logs)
     if path.suffix.lower() not in FIGURE_SUFFIXES:
         ends = f"{', '.join(FIGURE_SUFFIXES[:-1])} or {FIGURE_SUFFIXES[-1]}"

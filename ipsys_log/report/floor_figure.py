@@ -31,8 +31,9 @@ from ipsys_log.messages import (
 from ipsys_log.messages.channels import MEASUREMENTS, TRACKS, TRUTH
 from ipsys_log.report.accuracy import Accuracy
 from ipsys_log.report.errors_figure import count_rows, draw_errors
-from ipsys_log.report.figures import GRID, REST, camera_styles, figure_bytes, robot_colour, shorten
+from ipsys_log.report.figures import figure_bytes
 from ipsys_log.report.files import write_files
+from ipsys_log.report.styles import GRID, REST, camera_styles, robot_colour, shorten
 from ipsys_log.runs.provenance import newest_run
 from ipsys_log.sinks.selection import rig_in_force
 from ipsys_log.units import CM_PER_M

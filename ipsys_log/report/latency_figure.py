@@ -10,8 +10,9 @@ from matplotlib.axes import Axes
 from matplotlib.figure import Figure
 from numpy.typing import NDArray
 
-from ipsys_log.report.figures import NOTE, figure_bytes, style_axes
+from ipsys_log.report.figures import figure_bytes, style_axes
 from ipsys_log.report.files import write_files
+from ipsys_log.report.styles import NOTE
 
 __all__ = ["draw_latency"]
 

@@ -19,16 +19,9 @@ from ipsys_log.report.advice import (
     mean_curve,
     uses_height,
 )
-from ipsys_log.report.figures import (
-    NOTE,
-    ModelStyle,
-    model_styles,
-    scale_logarithmic,
-    set_ticks,
-    shorten,
-    style_axes,
-)
+from ipsys_log.report.figures import scale_logarithmic, set_ticks, style_axes
 from ipsys_log.report.findings import Findings
+from ipsys_log.report.styles import NOTE, ModelStyle, model_styles, shorten
 from ipsys_log.units import CM_PER_M
 
 __all__ = [

@@ -19,7 +19,7 @@ from ipsys_log.errors import IpsysError
 from ipsys_log.messages import CameraEvaluation, ErrorStatistics
 from ipsys_log.report.accuracy import Accuracy
 from ipsys_log.report.advice import HEIGHT_NOTE, has_published, label, uses_height
-from ipsys_log.report.figures import NOTE, model_styles, png, scale_logarithmic, style_axes
+from ipsys_log.report.figures import png, scale_logarithmic, style_axes
 from ipsys_log.report.files import cross_validation_csv, paper_csv, write_files
 from ipsys_log.report.findings import Findings, PointErrors, overall_row
 from ipsys_log.report.floor_figure import (
@@ -33,6 +33,7 @@ from ipsys_log.report.floor_figure import (
 )
 from ipsys_log.report.learning_figure import learning_figure, mean_curves, published_figure
 from ipsys_log.report.points_figure import draw_hulls, places_figure
+from ipsys_log.report.styles import NOTE, model_styles
 from ipsys_log.units import CM_PER_M
 
 __all__ = [

@@ -14,9 +14,10 @@ from matplotlib.ticker import MaxNLocator
 from numpy.typing import NDArray
 from scipy.ndimage import gaussian_filter
 
-from ipsys_log.report.figures import NOTE, REST, camera_styles, figure_bytes
+from ipsys_log.report.figures import figure_bytes
 from ipsys_log.report.files import write_files
 from ipsys_log.report.plan import PlannedFloor, means_cm, mesh
+from ipsys_log.report.styles import NOTE, REST, camera_styles
 from ipsys_log.units import CM_PER_M
 
 __all__ = ["draw_plan"]

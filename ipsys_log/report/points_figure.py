@@ -12,9 +12,9 @@ from matplotlib.ticker import MaxNLocator
 from numpy.typing import NDArray
 from scipy.spatial import ConvexHull, QhullError
 
-from ipsys_log.report.figures import NOTE, TEST, camera_styles, shorten
 from ipsys_log.report.findings import Findings
 from ipsys_log.report.floor_figure import draw_ground
+from ipsys_log.report.styles import NOTE, TEST, camera_styles, shorten
 
 __all__ = ["draw_coverage", "draw_hulls", "hull_m", "places_figure"]
 

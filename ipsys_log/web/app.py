@@ -17,7 +17,7 @@ from ipsys_log.analysis.pairs import active_measurements, locate_measurements
 from ipsys_log.errors import IpsysError
 from ipsys_log.geometry.trilateration import are_collinear
 from ipsys_log.messages import Measurement
-from ipsys_log.report.figures import camera_styles
+from ipsys_log.report.styles import camera_styles
 from ipsys_log.survey.checks import EntryCheck, check_entry, next_id, withdrawal_of
 from ipsys_log.survey.entry import TypedEntry, parse_entry
 from ipsys_log.survey.scene import (

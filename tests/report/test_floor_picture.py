@@ -34,8 +34,8 @@ from ipsys_log.messages import (
 )
 from ipsys_log.report.accuracy import Accuracy
 from ipsys_log.report.errors_figure import count_rows, draw_errors
-from ipsys_log.report.figures import camera_styles
 from ipsys_log.report.floor_figure import FloorData, draw_floor, draw_session
+from ipsys_log.report.styles import camera_styles
 from ipsys_log.runs.output import write_log
 
 RIG = Rig(

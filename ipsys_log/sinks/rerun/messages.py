@@ -22,7 +22,8 @@ from ipsys_log.messages import (
     Track,
     Tracks,
 )
-from ipsys_log.sinks.rerun.scene import MARKER_COLOUR, TIMELINES, TRUTH_COLOUR, camera_colours, robot_colour
+from ipsys_log.sinks.colours import MARKER_COLOUR, TRUTH_COLOUR, camera_colours, robot_colour
+from ipsys_log.sinks.rerun.scene import TIMELINES
 from ipsys_log.sinks.rerun.trails import Fading, Segment, Trails
 
 __all__ = ["RerunSink", "rerun_image", "trail_entity"]

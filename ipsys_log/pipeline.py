@@ -216,7 +216,7 @@ def live(
     settings: Sequence[Message],
     target: Path,
     request: Request,
-    until: str = "fuse",
+    until: str | None = None,
     consumers: Sequence[Consumer] = (),
     overwrite: bool = False,
     sinks: Sequence[Sink] = (),
@@ -229,8 +229,8 @@ def live(
     Parameters
     ----------
     settings : written first: rig and camera intrinsics.
-    request : corners, method and, for fuse, ``model_from``.
-    until : detect, camera-frame or fuse.
+    request : corners, method and, for stages that read a model, ``model_from``.
+    until : the last stage, such as detect or camera-frame; None: all causal stages.
     consumers : each gets every frame that the stages have processed, and their results, after the write.
     sinks : the same, each in its own thread; a slow sink loses messages, images first.
 

@@ -666,7 +666,7 @@ def live(
         check_devices(wanted)
         check_sources(wanted)
         names = [camera.name for camera in wanted]
-        for line in check_start(lab, names, lenses, request, "fuse"):
+        for line in check_start(lab, names, lenses, request, None):
             say(line)
         if Path(record).exists() and not force:
             raise IpsysError(f"{record}: exists already; give another name, or force=True to overwrite it")

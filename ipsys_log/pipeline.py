@@ -30,7 +30,6 @@ from __future__ import annotations
 
 from collections.abc import Callable, Iterable, Mapping, Sequence
 from dataclasses import replace
-from functools import partial
 from itertools import chain
 from pathlib import Path
 
@@ -51,7 +50,7 @@ from ipsys_log.messages import Message
 from ipsys_log.messages.channels import EVALUATION, MODEL, RUN_EVENTS, Channel
 from ipsys_log.messages.stage import Stage
 from ipsys_log.models.table import MODELS
-from ipsys_log.runs.checks import check_inputs
+from ipsys_log.runs.checks import check_fits, check_inputs
 from ipsys_log.runs.execute import compute_messages, run_stage, sign
 from ipsys_log.runs.graph import Task, copy_model, is_of_model, plan_stage, stages_until
 from ipsys_log.runs.options import Progress, Request
@@ -96,6 +95,15 @@ def replay(
     models = wanted_models(request, paths, tuple(MODELS) if EVALUATION in stages[-1].writes else ("poly",))
     check_inputs(paths, request, models, stages)
     outcomes: list[Outcome] = []
+    unchecked = list(models) if len(models) > 1 else []
+
+    def make(task: Task, session: Session, name: str) -> Iterable[Message]:
+        """Compute a run. Of several models, check that all can be fitted, before the first one is."""
+        if MODEL in task.stage.writes and task.foreign == () and unchecked:
+            check_fits(session, request, task.inputs, unchecked)
+            unchecked.clear()
+        return compute_messages(task, session, name, progress)
+
     # The matrices are small: threads of BLAS would only wait for one another.
     with open_target(paths, output) as (logs, target), threadpool_limits(1, user_api="blas"):
 
@@ -108,7 +116,6 @@ def replay(
                     options = request.options(model)
                     task = plan_stage(stage, session, options, inputs, request.rig, request.lenses)
                 if isinstance(task, Task):
-                    make = partial(compute_messages, progress=progress)
                     outcomes.append(run_stage(session, target, task, request, stages[-1], make, say))
                     task = outcomes[-1].run
             inputs.update({channel: task for channel in stage.writes if channel is not RUN_EVENTS})
@@ -216,7 +223,7 @@ def live(
     settings: Sequence[Message],
     target: Path,
     request: Request,
-    until: str = "fuse",
+    until: str | None = None,
     consumers: Sequence[Consumer] = (),
     overwrite: bool = False,
     sinks: Sequence[Sink] = (),
@@ -229,8 +236,8 @@ def live(
     Parameters
     ----------
     settings : written first: rig and camera intrinsics.
-    request : corners, method and, for fuse, ``model_from``.
-    until : detect, camera-frame or fuse.
+    request : corners, method and, for stages that read a model, ``model_from``.
+    until : the last stage, such as detect or camera-frame; None: all causal stages.
     consumers : each gets every frame that the stages have processed, and their results, after the write.
     sinks : the same, each in its own thread; a slow sink loses messages, images first.
 

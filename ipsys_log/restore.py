@@ -6,11 +6,12 @@ from collections.abc import Iterator, Mapping
 from pathlib import Path
 
 from ipsys_log.log.dataset import Session
-from ipsys_log.messages.channels import CAMERA_POINTS, EVENTS, MARKERS, MODEL, POSITIONS, TRACKS
+from ipsys_log.messages.channels import CAMERA_POINTS, EVENTS, MARKERS, MODEL
+from ipsys_log.messages.stage import Stage
 from ipsys_log.pipeline import replay
+from ipsys_log.runs.graph import is_of_model, stages_until, writer_of
 from ipsys_log.runs.options import Progress, Request
 from ipsys_log.runs.provenance import Outcome, newest_run
-from ipsys_log.stages import camera_frame, detect, fuse, locate
 from ipsys_log.stages.camera_frame import METHODS, PERIMETER, points_run
 from ipsys_log.stages.detect import CORNERS, skipped_frames
 
@@ -20,26 +21,21 @@ __all__ = ["finish_runs", "unfinished_runs"]
 _POINTS = [(points_run(corners, method), corners, method) for corners in CORNERS for method in METHODS]
 
 
-def unfinished_runs(session: Session) -> dict[str, str]:
+def unfinished_runs(session: Session) -> dict[Stage, str]:
     """Return by stage the unsigned runs that ``ipsys live`` and ``record --detect`` wrote."""
     signed = {(run.run, run.stage) for run in session.runs()}
     live_runs = _live_runs(session) if session.images else ()
-    return {stage: run for stage, run in live_runs if (run, stage) not in signed}
+    return {stage: run for stage, run in live_runs if (run, stage.name) not in signed}
 
 
-def _live_runs(session: Session) -> Iterator[tuple[str, str]]:
+def _live_runs(session: Session) -> Iterator[tuple[Stage, str]]:
     """Yield stages and their runs with the names of live processing, if the log has them."""
-    for corners in CORNERS:
-        if session.topics(MARKERS, corners):
-            yield detect.STAGE.name, corners
-    for points, _, _ in _POINTS:
-        if session.topics(CAMERA_POINTS, points):
-            yield camera_frame.STAGE.name, points
-    for run in sorted(session.run_names()):
-        if session.topics(MODEL, run) and session.topics(POSITIONS, run):
-            yield locate.STAGE.name, run
-            if session.topics(TRACKS, run):
-                yield fuse.STAGE.name, run
+    of_points = {name for name, _, _ in _POINTS}
+    of_model = {run for run in session.run_names() if session.topics(MODEL, run)}
+    for stage in stages_until(None):
+        for run in sorted(of_model if is_of_model(stage) else of_points) if stage.causal else ():
+            if session.topics(stage.writes[0], run):
+                yield stage, run
 
 
 def finish_runs(path: Path, progress: Progress) -> list[Outcome]:
@@ -62,15 +58,15 @@ def finish_runs(path: Path, progress: Progress) -> list[Outcome]:
         if not left:
             return []
         request = _request(session, left)
-    return replay([path], request, list(left)[-1], progress=progress)
+    return replay([path], request, list(left)[-1].name, progress=progress)
 
 
-def _request(session: Session, left: Mapping[str, str]) -> Request:
+def _request(session: Session, left: Mapping[Stage, str]) -> Request:
     """Return the request of the live run, derived from the names of the runs."""
-    points = left.get(camera_frame.STAGE.name) or newest_run(session, CAMERA_POINTS)
-    live = (left.get(detect.STAGE.name), PERIMETER)
+    points = left.get(writer_of(CAMERA_POINTS)) or newest_run(session, CAMERA_POINTS)
+    live = (left.get(writer_of(MARKERS)), PERIMETER)
     corners, method = next(((corners, method) for run, corners, method in _POINTS if run == points), live)
-    run = left.get(locate.STAGE.name) or left.get(fuse.STAGE.name)
+    run = next((run for stage, run in left.items() if is_of_model(stage)), None)
     models = session.payloads(session.topics(MODEL, run)) if run else []
     return Request(
         models=tuple(model.name for model in models[-1:]),

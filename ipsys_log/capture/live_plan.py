@@ -83,7 +83,7 @@ class _LiveView:
 
 
 def plan_live(
-    cameras: Collection[str], settings: Sequence[Message], request: Request, until: str
+    cameras: Collection[str], settings: Sequence[Message], request: Request, until: str | None
 ) -> LivePlan:
     """Plan a live run like a replay of its log.
 
@@ -103,7 +103,7 @@ def plan_live(
 
 
 def check_start(
-    rig: Rig, cameras: Collection[str], lenses: Collection[str], request: Request, until: str
+    rig: Rig, cameras: Collection[str], lenses: Collection[str], request: Request, until: str | None
 ) -> list[str]:
     """Check, before a camera is opened, that a live run can be planned.
 
@@ -146,18 +146,18 @@ def check_model(model: Model, cameras: Collection[str]) -> None:
         )
 
 
-def _copied(request: Request, until: str) -> list[tuple[Task, Model]]:
+def _copied(request: Request, until: str | None) -> list[tuple[Task, Model]]:
     """Return the models of another log to apply, with the tasks that copy them in; none before locate."""
     reads_model = any(MODEL in stage.reads for stage in _causal(until))
     return [copy_model(request, name) for name in wanted_models(request)] if reads_model else []
 
 
-def _causal(until: str) -> list[Stage]:
+def _causal(until: str | None) -> list[Stage]:
     return [stage for stage in stages_until(until) if stage.causal]
 
 
 def _check(
-    rig: Rig, cameras: Collection[str], lenses: Collection[str], models: Sequence[Model], until: str
+    rig: Rig, cameras: Collection[str], lenses: Collection[str], models: Sequence[Model], until: str | None
 ) -> None:
     """Check that the stages will not have to stop later."""
     missing = sorted(set(cameras) - set(lenses))
@@ -199,7 +199,7 @@ def _wire(
     lenses: Collection[str],
     request: Request,
     copied: Sequence[tuple[Task, Model]],
-    until: str,
+    until: str | None,
 ) -> tuple[list[LiveRun], list[WiredStage]]:
     """Return the runs of a live recording, and its stages, each wired to the runs that it reads."""
     runs: list[LiveRun] = []

@@ -109,6 +109,7 @@ def _align(logs: list[Path], options: dict[str, Any], plot: Path | None, as_json
     from ipsys_log.messages.channels import CAMERA_POINTS, MARKERS, RIG
     from ipsys_log.report.alignment import read_alignment
     from ipsys_log.rig.file import load_rig
+    from ipsys_log.runs.graph import writes
     from ipsys_log.runs.provenance import newest_run
     from ipsys_log.sinks.selection import rig_in_force
 
@@ -118,7 +119,7 @@ def _align(logs: list[Path], options: dict[str, Any], plot: Path | None, as_json
         bare = not session.images and newest_run(session, MARKERS) is None
     method = "perimeter" if bare else "pose"
     with derive(logs, "camera-frame", method=method, run=None, **options) as (session, outcomes, _):
-        made = [outcome.run for outcome in outcomes if outcome.stage == "camera-frame"]
+        made = [outcome.run for outcome in outcomes if writes(outcome, CAMERA_POINTS)]
         run = made[-1] if made else str(newest_run(session, CAMERA_POINTS))
         recorded_lenses = {
             camera: session.payloads([topic])[-1] for camera, topic in session.calibrations.items()

@@ -24,19 +24,30 @@ from ipsys_log.cli import (
     stages,
 )
 from ipsys_log.cli.signals import interruptible
+from ipsys_log.stages import ENTRIES
 
 __all__ = ["EXAMPLES", "PANELS", "arrange"]
 
-# The commands in the order of ``ipsys --help``.
-PANELS: dict[str, tuple[str, ...]] = {
+_STAGES = "The stages of replay, one by one"
+# The commands in the order of ``ipsys --help``. A stage without a panel comes into that of the stages.
+_PLACED: dict[str, tuple[str, ...]] = {
     "The first day, in this order": (
         *("init", "markers", "cameras", "calibrate", "align", "record", "measure", "replay", "live"),
     ),
     "How good it is, and where to measure next": ("evaluate", "plan", "report"),
     "Look into a log": ("info", "runs", "view", "verify", "diff", "latency", "repair"),
-    "The stages of replay, one by one": ("detect", "camera-frame", "fit", "locate", "fuse"),
+    _STAGES: (),
     "Without cameras of your own": ("simulate", "import"),
 }
+
+
+def all_panels() -> dict[str, tuple[str, ...]]:
+    """Return the panels with the commands of all stages."""
+    placed = {name for names in _PLACED.values() for name in names}
+    return {**_PLACED, _STAGES: tuple(entry.name for entry in ENTRIES if entry.name not in placed)}
+
+
+PANELS = all_panels()
 
 # Each line is a command and its purpose; at most 76 columns.
 EXAMPLES: dict[str, str] = {
@@ -120,8 +131,9 @@ ipsys simulate -o lab.mcap --stations 25 --frames-per-station 2 --drive-s 4
 
 def arrange(app: typer.Typer) -> None:
     """Put the commands into their panels, in this order, and the examples below their help."""
-    order = [name for names in PANELS.values() for name in names]
-    panel_of = {name: panel for panel, names in PANELS.items() for name in names}
+    panels = all_panels()
+    order = [name for names in panels.values() for name in names]
+    panel_of = {name: panel for panel, names in panels.items() for name in names}
     for command in app.registered_commands:
         assert command.callback is not None
         command.name = command.name or command.callback.__name__

@@ -5,7 +5,7 @@ from __future__ import annotations
 import logging
 import sys
 from collections import Counter
-from collections.abc import Iterable, Iterator, Sequence
+from collections.abc import Callable, Iterable, Iterator, Sequence
 from contextlib import contextmanager
 from time import monotonic
 from typing import IO, TYPE_CHECKING, Any
@@ -22,8 +22,6 @@ if TYPE_CHECKING:
 
 __all__ = ["console", "print_outcomes", "print_warnings", "progress_bar", "remarks", "say"]
 
-# The stages with one message for each frame.
-_OF_FRAMES = ("detect", "camera-frame", "locate", "fuse", "simulate")
 _DRAW_EVERY_S = 0.1
 # A stage with more runs than this gets a count instead of a list.
 _MANY_RUNS = 4
@@ -84,9 +82,19 @@ def print_warnings() -> Iterator[None]:
         logger.propagate = propagate
 
 
+def _is_causal(name: str) -> bool:
+    from ipsys_log.runs.graph import stage_named
+
+    stage = stage_named(name)
+    return stage is not None and stage.causal
+
+
 @contextmanager
-def progress_bar() -> Iterator[Progress]:
-    """Yield the progress function; it shows a bar for each working stage, only on a terminal."""
+def progress_bar(counts_frames: Callable[[str], bool] = _is_causal) -> Iterator[Progress]:
+    """Yield the progress function; it shows a bar for each working stage, only on a terminal.
+
+    ``counts_frames`` tells, by name, whether the messages of a stage are those of frames.
+    """
     from rich.progress import (
         BarColumn,
         MofNCompleteColumn,
@@ -120,7 +128,7 @@ def progress_bar() -> Iterator[Progress]:
                 return
             drawn_s = now_s
             speed = bar.tasks[bars[stage]].speed
-            rate = f"{speed:,.0f} frames/s" if speed and stage in _OF_FRAMES else ""
+            rate = f"{speed:,.0f} frames/s" if speed and counts_frames(stage) else ""
             bar.update(bars[stage], completed=done, rate=rate)
 
         yield show

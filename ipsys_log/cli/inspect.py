@@ -10,7 +10,7 @@ import typer
 
 from ipsys_log.cli.console import console, print_outcomes, progress_bar, remarks, say
 from ipsys_log.cli.options import AsJson, Logs
-from ipsys_log.cli.stages import EVALUATE, MORE, build_command, derive, options_of
+from ipsys_log.cli.stages import MORE, build_command, derive, options_until
 
 __all__ = ["add_commands"]
 
@@ -37,8 +37,9 @@ def add_commands(app: typer.Typer) -> None:
     app.command()(runs)
     app.command()(repair)
     app.command()(view)
-    names = [name for name in EVALUATE if name not in ("as_json", "plots")]
-    app.command("report", help=_HELP)(build_command({**options_of(names), "html": _HTML}, _report))
+    options = options_until("evaluate")
+    del options["as_json"]
+    app.command("report", help=_HELP)(build_command({**options, "html": _HTML}, _report))
 
 
 def info(logs: Logs, as_json: AsJson = False) -> None:

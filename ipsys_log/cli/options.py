@@ -5,11 +5,12 @@ from __future__ import annotations
 from collections.abc import Callable, Collection
 from functools import partial
 from pathlib import Path
-from typing import TYPE_CHECKING, Annotated, Optional
+from typing import TYPE_CHECKING, Annotated, Any, Optional
 
 import typer
 
 from ipsys_log.cli.console import remarks
+from ipsys_log.stages import CORNERS, METHOD, Parameter
 
 if TYPE_CHECKING:
     from ipsys_log.messages import CameraCalibration, Rig, RigCamera
@@ -28,12 +29,31 @@ __all__ = [
     "Port",
     "RigFile",
     "RigNow",
+    "annotate",
+    "build_option",
     "cameras_of",
     "load_calibrations",
     "load_lab",
     "load_matching_rig",
     "log_option",
 ]
+
+
+def build_option(parameter: Parameter) -> Any:
+    """Return the option of a parameter of a stage."""
+    return typer.Option(
+        f"--{parameter.name.replace('_', '-')}",
+        metavar=parameter.metavar,
+        min=parameter.least,
+        help=parameter.help,
+    )
+
+
+def annotate(parameter: Parameter) -> Any:
+    """Return the annotation of a parameter of a stage: its type with its option."""
+    kind = parameter.kind
+    return Annotated[kind, build_option(parameter)]
+
 
 Logs = Annotated[
     list[Path],
@@ -84,24 +104,8 @@ Calibrations = Annotated[
         "that holds it. Repeat it for each camera; without CAMERA= a log gives those of all.",
     ),
 ]
-Corners = Annotated[
-    Optional[str],  # noqa: UP045
-    typer.Option(
-        "--corners",
-        metavar="NAME",
-        help="Find corners by the edges of the print (edges; the default if all cameras have a calibration), "
-        "or as the paper does (stock).",
-    ),
-]
-Method = Annotated[
-    str,
-    typer.Option(
-        "--method",
-        metavar="NAME",
-        help="How markers are placed: by their perimeter (eq. 3 to 5 of the paper; for level ones), or by "
-        "their pose (tilted ones too).",
-    ),
-]
+Corners = Annotated[Optional[str], build_option(CORNERS)]  # noqa: UP045
+Method = Annotated[str, build_option(METHOD)]
 Only = Annotated[
     Optional[list[str]],  # noqa: UP045
     typer.Option("--camera", metavar="NAME", help="Only this camera of the rig; repeat it for several."),

@@ -65,10 +65,11 @@ def plan(
 
     A model that the log does not hold yet is fitted first, to the places measured so far.
     """
-    from ipsys_log.messages.channels import RIG
+    from ipsys_log.messages.channels import MODEL, RIG
     from ipsys_log.report.files import check_figure_file
     from ipsys_log.report.plan import plan_floor
     from ipsys_log.rig.file import load_rig
+    from ipsys_log.runs.graph import writes
     from ipsys_log.runs.select import copied_run
     from ipsys_log.sinks.selection import rig_in_force
 
@@ -79,7 +80,7 @@ def plan(
         check_figure_file(plot, "--plot", logs)
     options: dict[str, Any] = {"train": train, "rig": rig, "calibration": calibration, "run": None}
     with derive(logs, "fit", model=[model], **options) as (session, outcomes, _):
-        fitted = [outcome.run for outcome in outcomes if outcome.stage == "fit"]
+        fitted = [outcome.run for outcome in outcomes if writes(outcome, MODEL)]
         run = fitted[-1] if fitted else str(copied_run(session, model))
         recorded_lenses = {
             camera: session.payloads([topic])[-1] for camera, topic in session.calibrations.items()

@@ -138,11 +138,11 @@ def live(
     check_target(output, force, [*lab.files, (MODEL, model_from)])
     models = tuple(dict.fromkeys(model or ()))
     request = Request(models=models, model_from=model_from, corners=corners, method=method)
-    for line in check_start(lab.rig, lab.names, lab.lenses, request, "fuse"):
+    for line in check_start(lab.rig, lab.names, lab.lenses, request, None):
         remarks.print(line, style="yellow", markup=False)
     with open_cameras(lab, output, seconds) as (cameras, settings, status):
         sinks = [_viewer(settings, cameras, request)] if view else []
-        pipeline.live(cameras, settings, output, request, "fuse", [status], force, sinks)
+        pipeline.live(cameras, settings, output, request, None, [status], force, sinks)
 
 
 def _viewer(settings: list[Message], cameras: LiveCameras, request: Request) -> LiveView:

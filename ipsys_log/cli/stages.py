@@ -6,6 +6,7 @@ import inspect
 import json
 from collections.abc import Callable, Iterator, Mapping, Sequence
 from contextlib import contextmanager
+from dataclasses import fields
 from functools import partial
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, Any, Optional
@@ -16,61 +17,31 @@ from ipsys_log.cli.console import console, print_outcomes, progress_bar, remarks
 from ipsys_log.cli.options import (
     AsJson,
     Calibrations,
-    Corners,
     Logs,
-    Method,
     RigFile,
+    annotate,
     cameras_of,
     load_calibrations,
     load_matching_rig,
     log_option,
 )
 from ipsys_log.cli.signals import say_kept
+from ipsys_log.stages import ENTRIES, parameters_until
 
 if TYPE_CHECKING:
     from ipsys_log.log.dataset import Session
     from ipsys_log.report.accuracy import Accuracy
     from ipsys_log.runs.provenance import Outcome
 
-__all__ = ["EVALUATE", "MORE", "add_commands", "build_command", "derive", "options_of"]
+__all__ = ["MORE", "add_commands", "build_command", "derive", "options_until"]
 
 _Path = Optional[Path]  # noqa: UP045
 
-_MODEL_HELP = (
-    "rigid, poly, ann, kriging, kriging-regression, rigid+ and the name of one of these, rayplane, best; "
-    "repeat it for several."
-)
-# Every option of these commands: its type with its help, and its default.
-OPTIONS: dict[str, tuple[Any, Any]] = {
+# The options of every stage, and of the printed results: type with help, and default.
+_SHARED: dict[str, tuple[Any, Any]] = {
     "logs": (Logs, inspect.Parameter.empty),
-    "model": (
-        Annotated[
-            Optional[list[str]],  # noqa: UP045
-            typer.Option("--model", metavar="NAME", help=_MODEL_HELP),
-        ],
-        None,
-    ),
-    "model_from": (
-        Annotated[
-            _Path,
-            typer.Option("--model-from", metavar="LOG", help="Apply the model of another log; copy it in."),
-        ],
-        None,
-    ),
-    "train": (
-        Annotated[str, typer.Option(metavar="LABEL", help="Fit on the measurements with this label.")],
-        "train",
-    ),
-    "seed": (
-        Annotated[
-            int, typer.Option(min=0, metavar="N", help="The seed of random splits, folds and subsets.")
-        ],
-        0,
-    ),
     "rig": (RigFile, None),
     "calibration": (Calibrations, None),
-    "corners": (Corners, None),
-    "method": (Method, "perimeter"),
     "run": (
         Annotated[
             Optional[str],  # noqa: UP045
@@ -84,22 +55,9 @@ OPTIONS: dict[str, tuple[Any, Any]] = {
         Annotated[_Path, log_option(help="Write the results to a new log instead.")],
         None,
     ),
-    "as_live": (
-        Annotated[
-            bool,
-            typer.Option(
-                "--as-live", help="Pass over the frames that were skipped when the log was recorded."
-            ),
-        ],
-        False,
-    ),
-    "skip_ambiguous": (
-        Annotated[
-            bool,
-            typer.Option("--skip-ambiguous", help="Leave out a marker in frames that show its id twice."),
-        ],
-        False,
-    ),
+    "as_json": (AsJson, False),
+}
+_PRINTS: dict[str, tuple[Any, Any]] = {
     "plot": (
         Annotated[
             _Path,
@@ -121,58 +79,38 @@ OPTIONS: dict[str, tuple[Any, Any]] = {
         Annotated[_Path, typer.Option(metavar="DIR", help="Write the paper's tables and figures, and more.")],
         None,
     ),
-    "as_json": (AsJson, False),
 }
-_FRAMES = (
-    "logs",
-    "rig",
-    "calibration",
-    "corners",
-    "method",
-    "run",
-    "output",
-    "as_live",
-    "skip_ambiguous",
-    "as_json",
+# The order of options in the help. Parameters that are not in it come after these.
+_ORDER = (
+    *("logs", "model", "model_from", "train", "seed", "rig", "calibration", "corners", "method"),
+    *("run", "output", "as_live", "skip_ambiguous"),
 )
-_DETECT = tuple(name for name in _FRAMES if name != "method")
-_MODELS = tuple(name for name in OPTIONS if name not in ("plot", "plots", "details"))
-EVALUATE = (*_MODELS, "plots")
 
 MORE = "\n\nWhat it needs and the log does not hold yet is made first."
-_COMMANDS: dict[str, tuple[str, tuple[str, ...], str]] = {
-    "replay": (
-        "fuse",
-        tuple(OPTIONS),
-        "Run whatever a log lacks, from detect to fuse, append it, and print how accurate it is.",
-    ),
-    "detect": ("detect", _DETECT, "Find the markers in the frames."),
-    "camera-frame": (
-        "camera-frame",
-        _FRAMES,
-        f"Put the markers into the frame of their camera.{MORE}",
-    ),
-    "fit": ("fit", _MODELS, f"Fit models to the measured places (poly, unless you say which).{MORE}"),
-    "evaluate": (
-        "evaluate",
-        (*EVALUATE, "details"),
-        "Say how far models are off, how many places are enough, and which look wrongly measured.\n\n"
-        "For all models, unless you say which; on places held out, and by cross-validation, which takes each "
-        f"part of the places in turn.{MORE}",
-    ),
-    "locate": ("locate", _MODELS, f"Apply a model: world positions for each camera.{MORE}"),
-    "fuse": ("fuse", _MODELS, f"One pose per robot from all cameras that see it.{MORE}"),
-}
 
 
 def add_commands(app: typer.Typer) -> None:
-    for name, (until, options, text) in _COMMANDS.items():
-        app.command(name, help=text)(build_command(options_of(options), partial(_derive, until)))
+    """Add a command for each stage of the table, and the command of all stages."""
+    everything = options_until(None)
+    as_json = everything.pop("as_json")
+    app.command(
+        "replay",
+        help="Run whatever a log lacks, from detect to fuse, append it, and print how accurate it is.",
+    )(build_command({**everything, **_PRINTS, "as_json": as_json}, partial(_derive, None)))
+    for number, entry in enumerate(ENTRIES):
+        options = {**options_until(entry.name), **{name: _PRINTS[name] for name in entry.prints}}
+        text = entry.help + MORE * (number > 0)
+        app.command(entry.name, help=text)(build_command(options, partial(_derive, entry.name)))
 
 
-def options_of(names: Sequence[str]) -> dict[str, tuple[Any, Any]]:
-    """Return rows of the table of options."""
-    return {name: OPTIONS[name] for name in names}
+def options_until(name: str | None) -> dict[str, tuple[Any, Any]]:
+    """Return the options of a stage's command, with the parameters of all stages up to it; None: of all."""
+    options = dict(_SHARED)
+    as_json = options.pop("as_json")
+    for parameter in parameters_until(name):
+        options[parameter.name] = annotate(parameter), parameter.default
+    ordered = {name: options[name] for name in _ORDER if name in options}
+    return {**ordered, **options, "as_json": as_json}
 
 
 def build_command(options: Mapping[str, tuple[Any, Any]], work: Callable[..., None]) -> Callable[..., None]:
@@ -195,20 +133,25 @@ def build_command(options: Mapping[str, tuple[Any, Any]], work: Callable[..., No
 def _options(logs: list[Path], **given: Any) -> dict[str, Any]:
     """Return the options of a command as those of :func:`ipsys_log.api.replay`."""
     from ipsys_log.rig.file import check_name
+    from ipsys_log.runs.options import Request
 
     rig, run = given.pop("rig"), given.pop("run")
+    # Parameters that every request has; those of an added stage arrive by name.
+    known = {field.name for field in fields(Request)}
+    further = {name: given.pop(name) for name in [*given] if name not in {*known, "model"}}
     return {
         "models": given.pop("model", None) or (),
         "rig": load_matching_rig(rig, lambda: cameras_of(logs)),
         "calibrations": load_calibrations(given.pop("calibration", None), lambda: cameras_of(logs)),
         "run": check_name(run, "--run") if run else None,
+        "parameters": {name: str(value) for name, value in further.items() if value not in (None, False)},
         **given,
     }
 
 
 @contextmanager
 def derive(
-    logs: list[Path], until: str, output: Path | None = None, kept: bool = True, **given: Any
+    logs: list[Path], until: str | None, output: Path | None = None, kept: bool = True, **given: Any
 ) -> Iterator[tuple[Session, list[Outcome], list[Accuracy]]]:
     """Run the stages up to ``until``; yield the session with the results, the outcomes, and the accuracy.
 
@@ -257,7 +200,7 @@ def _kept_runs(logs: list[Path], output: Path | None) -> Callable[[Sequence[str]
 
 
 def _derive(
-    until: str,
+    until: str | None,
     logs: list[Path],
     as_json: bool,
     plot: Path | None = None,

@@ -20,6 +20,7 @@ from ipsys_log.messages import (
 from ipsys_log.messages.channels import EVALUATION, MODEL, TRACKS
 from ipsys_log.models.table import MODELS, reads_height
 from ipsys_log.report.advice import Advice, Choice, advise
+from ipsys_log.runs.graph import writes
 from ipsys_log.runs.provenance import Outcome
 from ipsys_log.units import CM_PER_M
 
@@ -74,11 +75,11 @@ def _run_pairs(outcomes: Sequence[Outcome]) -> list[tuple[str, str]]:
     """
     pairs: list[tuple[str, str]] = []
     for outcome in outcomes:
-        if outcome.stage == "evaluate":
+        if writes(outcome, EVALUATION):
             pairs.append((outcome.run, ""))
-        elif outcome.stage == "fuse" and pairs and not pairs[-1][1]:
+        elif writes(outcome, TRACKS) and pairs and not pairs[-1][1]:
             pairs[-1] = (pairs[-1][0], outcome.run)
-        elif outcome.stage == "fuse":
+        elif writes(outcome, TRACKS):
             pairs.append(("", outcome.run))
     return pairs
 

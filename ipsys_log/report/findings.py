@@ -11,9 +11,10 @@ from numpy.typing import NDArray
 from ipsys_log.analysis.accuracy import POOLED
 from ipsys_log.log.dataset import Session
 from ipsys_log.messages import CameraEvaluation, ErrorStatistics, Evaluation, Model, Rig
-from ipsys_log.messages.channels import MODEL
+from ipsys_log.messages.channels import EVALUATION, MODEL
 from ipsys_log.report.accuracy import Accuracy
 from ipsys_log.report.advice import Advice, advise, uses_height
+from ipsys_log.runs.graph import writes
 from ipsys_log.sinks.selection import rig_in_force
 
 __all__ = ["Findings", "PointErrors", "gather_findings", "in_space", "overall_row", "rank", "ranking_errors"]
@@ -169,7 +170,7 @@ def gather_findings(session: Session, accuracies: Sequence[Accuracy]) -> Finding
 
 def _model(session: Session, run: str) -> Model | None:
     """Return the model that a run evaluated: its own model, or the model of one of its input runs."""
-    records = [record for record in session.runs() if (record.run, record.stage) == (run, "evaluate")]
+    records = [record for record in session.runs() if record.run == run and writes(record, EVALUATION)]
     for name in (run, *(source for record in records for source in record.input_runs)):
         if topics := session.topics(MODEL, name):
             model: Model = session.payloads(topics)[-1]

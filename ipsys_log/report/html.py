@@ -13,11 +13,13 @@ from ipsys_log.analysis.tape import RiggedMeasurement
 from ipsys_log.errors import IpsysError
 from ipsys_log.log.dataset import Session
 from ipsys_log.messages import Run
+from ipsys_log.messages.channels import EVALUATION
 from ipsys_log.plain_text import plain_text
 from ipsys_log.report import html_figures, html_sections
 from ipsys_log.report.accuracy import Accuracy
 from ipsys_log.report.advice import HEIGHT_NOTE, uses_height
 from ipsys_log.report.findings import Findings, gather_findings
+from ipsys_log.runs.graph import stages_until, writer_of, writes
 from ipsys_log.runs.view import LogView
 from ipsys_log.units import format_time
 
@@ -96,7 +98,7 @@ def _figure_values(findings: Findings) -> dict[str, Any]:
 def _provenance(session: Session, findings: Findings) -> dict[str, Any]:
     """Return the provenance of the page: logs, runs and parameters."""
     runs = _sources(session.runs(), [accuracy.run for accuracy in findings.accuracies])
-    newest = next((run for run in reversed(runs) if run.stage == "evaluate"), None)
+    newest = next((run for run in reversed(runs) if writes(run, EVALUATION)), None)
     return {
         "logs": [path.name for path in session.paths],
         "lab": findings.rig.name if findings.rig else "",
@@ -124,5 +126,6 @@ def _sources(records: Sequence[Run], names: Sequence[str]) -> list[Run]:
         if name not in collected:
             collected.add(name)
             waiting += [source for record in records if record.run == name for source in record.input_runs]
-    later = ("locate", "fuse")
+    earlier = stages_until(writer_of(EVALUATION).name)
+    later = {stage.name for stage in stages_until(None) if stage not in earlier}
     return [record for record in records if record.run in collected and record.stage not in later]

@@ -2,19 +2,24 @@
 
 from __future__ import annotations
 
-from collections.abc import Collection, Sequence
+from collections.abc import Collection, Mapping, Sequence
 from contextlib import suppress
 from dataclasses import replace
+from itertools import islice
 from pathlib import Path
 
-from ipsys_log.analysis.calibration_points import measured, split_ids
-from ipsys_log.analysis.tape import world_point
+import numpy as np
+from numpy.typing import NDArray
+
+from ipsys_log.analysis.calibration_points import find_pairs, measured, split_ids
+from ipsys_log.analysis.tape import RiggedMeasurement, world_point
 from ipsys_log.errors import FitError, FrameError, IpsysError
 from ipsys_log.geometry.lenses import check_calibration, check_size
 from ipsys_log.images.decode import decode_grey
+from ipsys_log.images.video import Video
 from ipsys_log.log.contents import camera_of_topic
 from ipsys_log.log.dataset import Session
-from ipsys_log.messages import CompressedImage, RawImage
+from ipsys_log.messages import CompressedVideo
 from ipsys_log.messages.channels import (
     CAMERA_POINTS,
     EVALUATION,
@@ -22,22 +27,27 @@ from ipsys_log.messages.channels import (
     MODEL,
     POSITIONS,
     RIG,
+    RUN_EVENTS,
     Channel,
 )
 from ipsys_log.messages.stage import Stage
-from ipsys_log.models.table import min_pairs, reads_height
+from ipsys_log.models.table import AppliedModel, min_pairs, reads_height
 from ipsys_log.rig.file import check_rig
-from ipsys_log.runs.execute import has_given_name
-from ipsys_log.runs.graph import method_of, stage_named
+from ipsys_log.runs.execute import has_given_name, record_of
+from ipsys_log.runs.graph import Task, copy_model, is_of_model, method_of, plan_stage, stage_named
 from ipsys_log.runs.options import Request
-from ipsys_log.runs.provenance import newest_run
+from ipsys_log.runs.provenance import check_run_name, find_run, newest_run
 from ipsys_log.runs.select import copied_run, fitted_in
 from ipsys_log.runs.states import made_by_newer, recorded_stages
 from ipsys_log.runs.view import LogView
 from ipsys_log.stages.detect import usual_corners
 from ipsys_log.stages.evaluate import can_evaluate
+from ipsys_log.stages.fit import BESIDE_LINE_M, check_different, check_pairs
 
-__all__ = ["check_inputs"]
+__all__ = ["check_fits", "check_inputs"]
+
+# The size of a camera's images is that of the first image that can be decoded, among so many.
+_TRIED_FRAMES = 100
 
 
 def check_inputs(
@@ -66,12 +76,15 @@ def check_inputs(
             _check_measurements(session, request, models)
         if POSITIONS in written:
             _check_heights(session, request, models)
-        if POSITIONS in written and request.model_from is not None:
-            _check_model(session, request, models, cameras)
+        if MODEL in written and request.model_from is not None:
+            _check_models(session, request, models, written, cameras)
+        if EVALUATION in written and request.model_from is not None:
+            _check_evaluated(session, request, models)
         if EVALUATION in stages[-1].writes:
             _check_evaluation(session, request, models)
         _check_versions(session, request, models, stages)
         _check_run_name(session, request, stages[-1])
+        _check_new_stages(session, request, models, stages)
 
 
 def _check_versions(
@@ -95,6 +108,42 @@ def _check_run_name(session: Session, request: Request, until: Stage) -> None:
                 f"run {request.run} already has the stage {entry.run.stage}, which is {entry.state}; "
                 "use another --run name"
             )
+
+
+def _check_new_stages(
+    session: Session, request: Request, models: Sequence[str], stages: Sequence[Stage]
+) -> None:
+    """Check that the run name of the user is free for each stage that this command computes."""
+    inputs: dict[Channel, str] = {}
+    new: set[Channel] = set()
+    # A run name belongs to one model.
+    for stage in sorted(stages, key=is_of_model) if request.run is not None else ():
+        name = request.run if has_given_name(stage, stages[-1]) else None
+        if not new.intersection(stage.reads):
+            run = _current_run(session, request, models[0], stage, inputs, name)
+            if run is not None:
+                inputs.update({channel: run for channel in stage.writes if channel is not RUN_EVENTS})
+                continue
+        new |= {channel for channel in stage.writes if channel is not RUN_EVENTS}
+        if any((record.run, record.stage) == (name, stage.name) for record in session.runs()):
+            check_run_name(session, stage.name, str(name), stage.writes)
+
+
+def _current_run(
+    session: Session,
+    request: Request,
+    model: str,
+    stage: Stage,
+    inputs: Mapping[Channel, str],
+    name: str | None,
+) -> str | None:
+    """Return the run of a stage if it is current, "" if the stage is left out; None if there is none."""
+    if MODEL in stage.writes and request.model_from is not None:
+        task: Task | str = copy_model(request, model)[0]
+    else:
+        options = request.options(model if is_of_model(stage) else None)
+        task = plan_stage(stage, session, options, inputs, request.rig, request.lenses)
+    return task if isinstance(task, str) else find_run(session, record_of(session, task), name)
 
 
 def _check_request(paths: Sequence[Path], request: Request, models: Sequence[str]) -> None:
@@ -162,9 +211,8 @@ def _check_distortion(session: Session, request: Request, cameras: set[str]) -> 
     """Check that the calibrations in a log are valid, unless others are given."""
     for name in sorted(cameras - set(request.lenses)):
         topic = session.calibrations.get(name)
-        first = None if topic is None else next(iter(session.messages([topic])), None)
-        if first is not None:
-            check_calibration(replace(first.payload, frame_id=name), f"{session}: {topic}")
+        for lens in session.payloads([topic] if topic else []):
+            check_calibration(replace(lens, frame_id=name), f"{session}: {topic}")
 
 
 def _check_sizes(session: Session, request: Request) -> None:
@@ -172,12 +220,24 @@ def _check_sizes(session: Session, request: Request) -> None:
     for name, topic in session.images.items():
         stored = [session.calibrations[name]] if name in session.calibrations else []
         lens = request.lenses.get(name) or next((m.payload for m in session.messages(stored)), None)
-        first = next(iter(session.messages([topic])), None)
-        if lens is None or first is None or not isinstance(first.payload, (CompressedImage, RawImage)):
-            continue  # a frame of a video has no size by itself
+        size_px = None if lens is None else _first_size_px(session, topic)
+        if lens is not None and size_px is not None:
+            check_size(lens, *size_px, name)
+
+
+def _first_size_px(session: Session, topic: str) -> tuple[int, int] | None:
+    """Return width and height of the first frame that can be decoded; None if the first frames cannot be."""
+    video: Video | None = None
+    for message in islice(session.messages([topic]), _TRIED_FRAMES):
+        frame = message.payload
         with suppress(FrameError):  # a corrupt frame is an event
-            height, width = decode_grey(first.payload).shape
-            check_size(lens, width, height, name)
+            if isinstance(frame, CompressedVideo):
+                video = video or Video(frame.format)
+                frame = video(frame)
+            if frame is not None:
+                height, width = decode_grey(frame).shape
+                return width, height
+    return None
 
 
 def _check_measurements(session: Session, request: Request, models: Sequence[str]) -> None:
@@ -191,15 +251,8 @@ def _check_measurements(session: Session, request: Request, models: Sequence[str
             "calibration.mcap"
         )
     train, _ = split_ids([place.measurement for place in places], request.options())
-    for place in places:
-        world_point(place.measurement, place.rig)
-        marker_id = place.measurement.marker_id
-        if marker_id is not None and not place.rig.knows(marker_id):
-            known = ", ".join(str(marker.id) for marker in place.rig.markers)
-            raise IpsysError(
-                f"measurement {place.measurement.id} names marker {marker_id}, which is not in the rig "
-                f"(it has {known}); correct lab.toml and give it with --rig"
-            )
+    world_m = _check_places(places)
+    train_m = np.array([world_m[name] for name in sorted(train)]).reshape(-1, 3)
     for model in models:
         if len(train) < min_pairs(model):
             raise FitError(
@@ -207,9 +260,68 @@ def _check_measurements(session: Session, request: Request, models: Sequence[str
                 f"found {len(train)} in all; measure more"
                 + ("" if model == "rigid" else ", or use --model rigid")
             )
+        check_different(model, str(session), train_m)
+    _check_line(session, train_m)
 
 
-def _check_model(session: Session, request: Request, models: Sequence[str], cameras: set[str]) -> None:
+def _check_places(places: Sequence[RiggedMeasurement]) -> dict[str, NDArray[np.float64]]:
+    """Return the world points (3,) in m of valid measurements, by id."""
+    world_m = {}
+    for place in places:
+        world_m[place.measurement.id] = world_point(place.measurement, place.rig).world_m
+        marker_id = place.measurement.marker_id
+        if marker_id is not None and not place.rig.knows(marker_id):
+            known = ", ".join(str(marker.id) for marker in place.rig.markers)
+            raise IpsysError(
+                f"measurement {place.measurement.id} names marker {marker_id}, which is not in the rig "
+                f"(it has {known}); correct lab.toml and give it with --rig"
+            )
+    return world_m
+
+
+def _check_line(session: Session, train_m: NDArray[np.float64]) -> None:
+    """Check that not all points lie on a line: then those that one camera sees do so, too."""
+    offsets_m = train_m - train_m.mean(axis=0)
+    along = np.linalg.svd(offsets_m, full_matrices=False)[2][0]
+    beside_m = np.linalg.norm(offsets_m - np.outer(offsets_m @ along, along), axis=1)
+    if beside_m.max() < BESIDE_LINE_M:
+        raise FitError(
+            f"{session}: the {len(train_m)} measured places lie on one line; measure some beside it"
+        )
+
+
+def check_fits(
+    session: Session, request: Request, inputs: Mapping[Channel, str], models: Sequence[str]
+) -> None:
+    """Check that models can be fitted to the camera points of a run, before the first model is fitted.
+
+    Raises
+    ------
+    IpsysError
+        A camera sees too few calibration points for a model, or a measured marker was never seen.
+    """
+    view = LogView(session, inputs, request.rig)
+    points = measured(view)
+    train, _ = split_ids([point.measurement for point in points], request.options())
+    pairs = {
+        camera: [pair for pair in seen if pair.measurement in train]
+        for camera, seen in find_pairs(view, points).items()
+    }
+    for model in models:
+        check_pairs(model, pairs)
+
+
+def _check_evaluated(session: Session, request: Request, models: Sequence[str]) -> None:
+    """Check the measurements on which a model of another log is evaluated."""
+    view = LogView(session, rig=request.rig)
+    if any(can_evaluate(view, request.options(), model) for model in models):
+        _check_places(measured(view))
+
+
+def _check_models(
+    session: Session, request: Request, models: Sequence[str], written: Collection[Channel], cameras: set[str]
+) -> None:
+    """Check that the other log has the models, and that they can be applied if a stage applies them."""
     assert request.model_from is not None
     if not cameras:
         run = newest_run(session, CAMERA_POINTS)
@@ -217,8 +329,10 @@ def _check_model(session: Session, request: Request, models: Sequence[str], came
     with Session([request.model_from]) as other:
         for name in models:
             model, _ = fitted_in(other, name)
+            for camera in model.cameras if {EVALUATION, POSITIONS} & {*written} else ():
+                AppliedModel(model.name, camera)
             fitted = {camera.camera for camera in model.cameras}
-            if not fitted & cameras:
+            if POSITIONS in written and not fitted & cameras:
                 raise IpsysError(
                     f"--model-from {request.model_from}: its model is of the cameras "
                     f"{', '.join(sorted(fitted))}, the log has {', '.join(sorted(cameras))}"

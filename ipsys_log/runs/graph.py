@@ -1,6 +1,6 @@
 """The graph of stages: one table of their rows, and the plan of each on a log.
 
-A new stage needs a file with its row in :mod:`ipsys_log.stages`, and a line in :data:`STAGES`. A new channel
+A new stage needs a file with its row and an entry in the table of :mod:`ipsys_log.stages`. A new channel
 needs a line in the table of :mod:`ipsys_log.messages.channels`.
 """
 
@@ -8,6 +8,7 @@ from __future__ import annotations
 
 from collections.abc import Callable, Mapping
 from dataclasses import dataclass, field
+from importlib import import_module
 from typing import Any
 
 from ipsys_log.geometry.lenses import same_intrinsics
@@ -17,10 +18,10 @@ from ipsys_log.messages import CameraCalibration, ChannelRead, Model, Rig, Run
 from ipsys_log.messages.channels import CALIBRATIONS, MODEL, RIG, RUN_EVENTS, Channel
 from ipsys_log.messages.stage import Plan, Progress, Stage, Step
 from ipsys_log.runs.options import Request
-from ipsys_log.runs.provenance import read_channels
+from ipsys_log.runs.provenance import Outcome, read_channels
 from ipsys_log.runs.select import fitted_in
 from ipsys_log.runs.view import LogView
-from ipsys_log.stages import camera_frame, detect, evaluate, fit, fuse, locate
+from ipsys_log.stages import ENTRIES, fit
 
 __all__ = [
     "STAGES",
@@ -35,18 +36,11 @@ __all__ = [
     "stages_until",
     "version_parameters",
     "versioned_names",
+    "writer_of",
     "writes",
 ]
 
-# Each stage comes after the stages that write its channels.
-STAGES: tuple[Stage, ...] = (
-    detect.STAGE,
-    camera_frame.STAGE,
-    fit.STAGE,
-    evaluate.STAGE,
-    locate.STAGE,
-    fuse.STAGE,
-)
+STAGES: tuple[Stage, ...] = tuple(import_module(entry.module).STAGE for entry in ENTRIES)
 VERSIONS: dict[str, int] = {name: number for stage in STAGES for name, number in stage.versions.items()}
 
 
@@ -203,9 +197,8 @@ def copy_model(request: Request, name: str) -> tuple[Task, Model]:
     with Session([request.model_from]) as other:
         model, topic = fitted_in(other, name)
         foreign = read_channels(other, [topic])
-    (writer,) = (stage for stage in STAGES if stage.writes[0] is MODEL)
     task = Task(
-        stage=writer,
+        stage=writer_of(MODEL),
         run=fit.model_run(name),
         compute=lambda progress: model,
         parameters={"model": name},
@@ -233,7 +226,12 @@ def method_of(session: Session, run: Run) -> str:
     return stage.method(run.parameters, LogView(session, input_runs(run))) if stage else ""
 
 
-def writes(run: Run, channel: Channel) -> bool:
-    """Return whether the stage of a record writes a channel."""
+def writes(run: Run | Outcome, channel: Channel) -> bool:
+    """Return whether the stage of a record, or of an outcome, writes a channel."""
     stage = stage_named(run.stage)
     return stage is not None and channel in stage.writes
+
+
+def writer_of(channel: Channel) -> Stage:
+    """Return the stage that writes a derived channel."""
+    return next(stage for stage in STAGES if channel in _own(stage))

@@ -30,7 +30,7 @@ from ipsys_log.models.table import (
 )
 from ipsys_log.models.uncertainty import Uncertainty, estimate_uncertainty
 
-__all__ = ["STAGE", "fit_model", "model_run"]
+__all__ = ["BESIDE_LINE_M", "STAGE", "check_different", "check_pairs", "fit_model", "model_run"]
 
 Array = NDArray[np.float64]
 
@@ -39,7 +39,7 @@ _FLOOR_SIGMA_M = 0.001
 
 # Two calibration points closer than this are the same point; points closer to a line (RMS) lie on it.
 _SAME_PLACE_M = 0.01
-_BESIDE_LINE_M = 0.03
+BESIDE_LINE_M = 0.03
 # Groups of calibration points; the uncertainty is estimated by leaving out one group after the other.
 _GROUPS = 10
 
@@ -69,14 +69,7 @@ def fit_model(
     FitError
         A camera has fewer pairs than the model needs, or no camera has a pair.
     """
-    cameras = gather_points(pairs)
-    if not cameras:
-        raise FitError(
-            "no camera saw any of the measured places to fit on; measure places in the cameras' view"
-        )
-    for camera, places in cameras.items():
-        _check_count(name, camera, places)
-        _check_spread(name, camera, places.world_m)
+    cameras = check_pairs(name, pairs)
     models = fit_cameras(name, cameras)
     without = _predict_without_groups(name, cameras, progress)
     fitted = []
@@ -95,6 +88,25 @@ def fit_model(
     return Model(time_ns, name, tuple(fitted))
 
 
+def check_pairs(name: str, pairs: Mapping[str, Sequence[Pair]]) -> dict[str, CalibrationPoints]:
+    """Return the calibration points by camera, if they are enough for a model.
+
+    Raises
+    ------
+    FitError
+        No camera has a pair, or a camera has too few, or its points are too near to one another or to a line.
+    """
+    cameras = gather_points(pairs)
+    if not cameras:
+        raise FitError(
+            "no camera saw any of the measured places to fit on; measure places in the cameras' view"
+        )
+    for camera, places in cameras.items():
+        _check_count(name, camera, places)
+        _check_spread(name, camera, places.world_m)
+    return cameras
+
+
 def _check_count(name: str, camera: str, places: CalibrationPoints) -> None:
     needed = min_pairs(name)
     if len(places.names) < needed:
@@ -107,16 +119,27 @@ def _check_count(name: str, camera: str, places: CalibrationPoints) -> None:
 
 def _check_spread(name: str, camera: str, targets: Array) -> None:
     """Check that the points differ by more than the tape's error; otherwise they add no information."""
+    check_different(name, f"camera {camera}", targets)
+    beside_m = np.linalg.svd(targets - targets.mean(axis=0), compute_uv=False)[1] / np.sqrt(len(targets))
+    if beside_m < BESIDE_LINE_M:
+        raise FitError(
+            f"camera {camera}: the {len(targets)} measured places lie on one line; measure some beside it"
+        )
+
+
+def check_different(name: str, where: str, targets: Array) -> None:
+    """Check that enough calibration points, (n, 3) in m, are different ones.
+
+    Raises
+    ------
+    FitError
+        The model needs more of them. The text names ``where``.
+    """
     different = len(np.unique(np.round(targets / _SAME_PLACE_M), axis=0))
     if different < min_pairs(name):
         raise FitError(
-            f"camera {camera}: {name} needs at least {min_pairs(name)} different places, found {different} "
+            f"{where}: {name} needs at least {min_pairs(name)} different places, found {different} "
             f"in {len(targets)} measurements; measure elsewhere too"
-        )
-    beside_m = np.linalg.svd(targets - targets.mean(axis=0), compute_uv=False)[1] / np.sqrt(len(targets))
-    if beside_m < _BESIDE_LINE_M:
-        raise FitError(
-            f"camera {camera}: the {len(targets)} measured places lie on one line; measure some beside it"
         )
 
 

@@ -1,18 +1,29 @@
-"""A stage for tests, as a newcomer would add it: one file, one row, and one channel."""
+"""A stage for tests, as a newcomer would add it: one file, one entry, and one channel.
+
+Run as a program, it is ``ipsys`` with this stage: ``python -m tests.runs.smoothing smooth LOG``.
+"""
 
 from __future__ import annotations
 
+import sys
 from collections.abc import Iterator, Mapping
 from dataclasses import replace
 from typing import Any
 
-from ipsys_log.messages import Message, Tracks
+from ipsys_log import stages
+from ipsys_log.messages import Message, Tracks, channels
 from ipsys_log.messages.channels import TRACKS, Channel
 from ipsys_log.messages.stage import Plan, Stage, View
+from ipsys_log.stages import Entry, Parameter
 
-__all__ = ["SMOOTHED_TRACKS", "STAGE"]
+__all__ = ["ENTRY", "SMOOTHED_TRACKS", "STAGE"]
 
 SMOOTHED_TRACKS = Channel(name="smoothed_tracks", topic="/runs/{run}/smoothed_tracks", payloads=(Tracks,))
+ENTRY = Entry(
+    name="smooth",
+    help="Smooth the tracks.",
+    parameters=(Parameter(name="weight", help="The weight of the newest pose.", metavar="W"),),
+)
 
 
 class Smooth:
@@ -51,3 +62,17 @@ STAGE = Stage(
     rig_part=lambda rig: None,
     per_camera=False,
 )
+
+
+def _add_stage() -> None:
+    """Add the stage to the tables of the program before it reads them, as its file would."""
+    sys.modules[ENTRY.module] = sys.modules[__name__]
+    stages.ENTRIES = (*stages.ENTRIES, ENTRY)
+    channels.CHANNELS = (*channels.CHANNELS, SMOOTHED_TRACKS)
+
+
+if __name__ == "__main__":
+    _add_stage()
+    from ipsys_log.cli import main
+
+    main()

@@ -4,6 +4,8 @@ from __future__ import annotations
 
 import json
 import shutil
+import subprocess
+import sys
 from pathlib import Path
 
 import pytest
@@ -16,7 +18,8 @@ from ipsys_log.runs import graph
 from ipsys_log.runs.graph import STAGES, stages_until
 from ipsys_log.runs.options import Request
 from ipsys_log.runs.verify import verify
-from tests.conftest import Ipsys, data_section
+from ipsys_log.stages import ENTRIES
+from tests.conftest import ROOT, Ipsys, data_section
 from tests.runs import smoothing
 from tests.runs.smoothing import SMOOTHED_TRACKS
 
@@ -121,3 +124,38 @@ def test_row_of_an_added_stage_does_not_change_the_others(
     with Session([log]) as ours, Session([plain]) as theirs:
         topics = ["/runs/poly/tracks", "/runs/poly/poses", "/runs/edges/cameras/red/markers"]
         assert [ours.hash(topic) for topic in topics] == [theirs.hash(topic) for topic in topics]
+
+
+def ipsys_with_smoothing(*arguments: object) -> str:
+    """Run ``ipsys`` with the stage smooth in its table; return its output."""
+    command = [sys.executable, "-m", "tests.runs.smoothing", *map(str, arguments)]
+    done = subprocess.run(command, cwd=ROOT, capture_output=True, text=True, check=True, timeout=300)
+    return done.stdout
+
+
+def test_rows_have_the_names_of_their_entries() -> None:
+    assert [stage.name for stage in STAGES] == [entry.name for entry in ENTRIES]
+
+
+def test_added_stage_is_a_command_in_the_help() -> None:
+    *_, stage_panel, _ = ipsys_with_smoothing("--help").split("\n╭─ ")
+    assert stage_panel.startswith("The stages of replay, one by one")
+    assert "Smooth the tracks." in stage_panel.splitlines()[-2]
+    text = ipsys_with_smoothing("smooth", "--help")
+    assert all(option in text for option in ("--weight", "--model", "--method", "--corners", "--json"))
+
+
+def test_command_of_an_added_stage_gets_its_parameters(log: Path) -> None:
+    results = [
+        json.loads(ipsys_with_smoothing("smooth", log, "--json", *options))["stages"]
+        for options in ((), ("--weight", "0.25"), ("--weight", "0.25"))
+    ]
+    assert [stages[-1]["stage"] for stages in results] == ["smooth"] * 3
+    assert [(stages[-1]["run"], stages[-1]["new"]) for stages in results] == [
+        ("poly", True), ("poly_2", True), ("poly_2", False)
+    ]  # fmt: skip
+
+
+def test_replay_command_runs_an_added_stage(log: Path) -> None:
+    stages = json.loads(ipsys_with_smoothing("replay", log, "--json"))["stages"]
+    assert [stage["stage"] for stage in stages] == [*(stage.name for stage in STAGES), "smooth"]

@@ -182,7 +182,7 @@ def test_two_markers_of_one_id_in_a_frame(ipsys: Ipsys, lab: Path) -> None:
 @pytest.mark.parametrize(
     ("model", "places", "needed"), [("poly", 9, 10), ("rigid+poly", 9, 10), ("rigid", 2, 3)]
 )
-def test_fewer_places_than_a_model_needs(
+def test_too_few_points_for_a_model_are_refused(
     ipsys: Ipsys, data: Path, tmp_path: Path, model: str, places: int, needed: int
 ) -> None:
     imsel = tmp_path / "imsel.mcap"

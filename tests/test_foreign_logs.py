@@ -206,7 +206,7 @@ def test_json_is_read_too(ipsys: Ipsys, tmp_path: Path, rig: Path) -> None:
         ("protobuf", b"\xff\xff", "not a valid foxglove.CompressedImage"),
     ],
 )
-def test_what_cannot_be_decoded_is_named(
+def test_undecodable_frames_are_reported(
     ipsys: Ipsys, tmp_path: Path, rig: Path, encoding: str, data: bytes, said: str
 ) -> None:
     log = write_raw(tmp_path / "odd.mcap", encoding, "", data)

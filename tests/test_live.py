@@ -219,7 +219,7 @@ def test_one_run_under_two_names_is_the_same(
     assert "name a second log" in ipsys("diff", log).err
 
 
-def test_a_place_measured_since_is_said_and_no_difference(
+def test_point_measured_later_is_reported_and_no_difference(
     ipsys: Ipsys, lab_log: Path, tmp_path: Path
 ) -> None:
     log = tmp_path / "lab.mcap"
@@ -276,7 +276,7 @@ def test_robots_that_were_renamed_are_verified_with_their_own_rig(
     assert any(one.topic == "/runs/poly_2/tracks" for one in again(other))
 
 
-def test_cameras_without_a_lens_are_said_before_anything_is_recorded(
+def test_cameras_without_intrinsics_are_reported_first(
     lab_log: Path, calibration: Path, tmp_path: Path
 ) -> None:
     attached, settings = attached_to(lab_log, 60.0)
@@ -286,7 +286,7 @@ def test_cameras_without_a_lens_are_said_before_anything_is_recorded(
     assert not (tmp_path / "x.mcap").exists()
 
 
-def test_a_stage_that_stops_does_not_stop_the_recording(
+def test_failed_stage_does_not_stop_the_recording(
     lab_log: Path, calibration: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     def broken(self: Detect, message: Message) -> Any:
@@ -555,7 +555,7 @@ def test_the_latency_ledger_as_table_and_picture(ipsys: Ipsys, recorded: Path, t
         ]
 
 
-def test_a_place_is_measured_while_it_is_recorded_and_a_model_is_fitted_to_it(
+def test_point_measured_during_a_recording_is_used_by_fit(
     lab_log: Path, calibration: Path, tmp_path: Path
 ) -> None:
     """The distances are those that were measured in the lab; nothing of it but frames is in the recording."""

@@ -92,7 +92,7 @@ def pairs_of(log: Path) -> dict[tuple[str, int, tuple[float, ...]], Pair]:
     }
 
 
-def test_every_place_of_a_session_is_found_and_paired_as_if_measured_while_recording(
+def test_points_measured_later_give_the_pairs_of_a_live_session(
     ipsys: Ipsys, unmeasured: Unmeasured, lab: Path, tmp_path: Path
 ) -> None:
     assert ipsys("replay", lab).code == 0
@@ -126,7 +126,7 @@ def fitted_ids(log: Path, run: str) -> set[str]:
     return {pair.measurement for camera in model.cameras for pair in camera.pairs}
 
 
-def test_one_place_its_undo_and_what_a_fit_makes_of_both(ipsys: Ipsys, unmeasured: Unmeasured) -> None:
+def test_fit_uses_a_measured_point_and_ignores_a_withdrawn_one(ipsys: Ipsys, unmeasured: Unmeasured) -> None:
     log, tape = unmeasured
     with open_finished_log(log, Request()) as scene:
         for one in tape[8:20]:
@@ -150,7 +150,9 @@ def test_one_place_its_undo_and_what_a_fit_makes_of_both(ipsys: Ipsys, unmeasure
     assert at[f"{gone}_withdrawn"] > at["p003"]
 
 
-def test_rows_of_a_marker_in_order_and_by_place(ipsys: Ipsys, unmeasured: Unmeasured, tmp_path: Path) -> None:
+def test_sheet_rows_match_intervals_by_order_or_by_number(
+    ipsys: Ipsys, unmeasured: Unmeasured, tmp_path: Path
+) -> None:
     log, tape = unmeasured
     mine = [one for one in tape if one.marker_id == 3]
     done = ipsys("measure", log, "--csv", sheet(tmp_path / "a.csv", mine))
@@ -223,7 +225,7 @@ def test_a_bad_sheet_changes_nothing_and_names_its_rows(
         assert sum(part in line for line in lines) == 1
 
 
-def test_one_bad_row_keeps_the_good_ones_out(ipsys: Ipsys, unmeasured: Unmeasured) -> None:
+def test_one_bad_row_keeps_all_rows_out_of_the_log(ipsys: Ipsys, unmeasured: Unmeasured) -> None:
     log, tape = unmeasured
     path = sheet(log.with_name("sheet.csv"), tape, time=times(tape, log))
     lines = path.read_text().splitlines()
@@ -263,9 +265,7 @@ def test_two_people_at_one_log(unmeasured: Unmeasured) -> None:
     assert [row.id for row in foreign_read(log)] == ["p001", "p002", "p001_withdrawn"]
 
 
-def test_a_sheet_that_is_not_there_or_has_a_bad_header_is_told_before_markers_are_looked_for(
-    ipsys: Ipsys, lab: Path
-) -> None:
+def test_missing_or_bad_sheet_is_reported_before_detection(ipsys: Ipsys, lab: Path) -> None:
     line = refused(ipsys, lab, "measure", lab, "--csv", lab.with_name("none.csv"))
     assert "none.csv: cannot be read: No such file or directory" in line
     path = lab.with_name("sheet.csv")
@@ -281,7 +281,7 @@ def test_a_rig_without_reference_points(ipsys: Ipsys, unmeasured: Unmeasured) ->
     assert "[[reference_points]]" in line
 
 
-def test_a_log_in_which_nothing_lies_still(ipsys: Ipsys, lab: Path) -> None:
+def test_log_without_stationary_intervals_is_refused(ipsys: Ipsys, lab: Path) -> None:
     with Session([lab]) as session:
         start_ns = session.start_ns
     log = rewrite(lab, lambda m: m if m.log_time_ns <= start_ns + 1_050_000_000 else None)
@@ -361,7 +361,7 @@ def test_a_bad_answer_in_the_terminal_costs_that_answer_only(
     assert as_typed(saved).distances == first.distances
 
 
-def test_in_the_terminal_somebody_else_may_measure_meanwhile(
+def test_terminal_entry_allows_a_second_process_to_measure(
     unmeasured: Unmeasured, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
 ) -> None:
     log, tape = unmeasured
@@ -403,4 +403,4 @@ def test_a_port_in_use(ipsys: Ipsys, unmeasured: Unmeasured) -> None:
     with socket.create_server(("127.0.0.1", 0)) as taken:
         port = taken.getsockname()[1]
         line = refused(ipsys, unmeasured.log, "measure", unmeasured.log, "--port", port)
-    assert f"--port {port}: is in use by another program; give another one" in line
+    assert f"--port {port}: is in use by another program; give another port" in line

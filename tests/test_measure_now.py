@@ -140,7 +140,7 @@ def counted(log: Path) -> dict[str, int]:
 
 
 @pytest.mark.parametrize("number", [signal.SIGINT, signal.SIGTERM])
-def test_places_are_measured_on_the_page_until_it_is_told_to_end(
+def test_page_measures_points_until_it_is_stopped(
     number: int, ipsys: Ipsys, still_lab: Lab, tmp_path: Path
 ) -> None:
     log = tmp_path / "places.mcap"
@@ -164,7 +164,7 @@ def test_places_are_measured_on_the_page_until_it_is_told_to_end(
     assert all(f"p00{n}" in listed.out for n in (1, 3, 4, 5, 6))
 
 
-def test_what_was_measured_survives_a_kill(ipsys: Ipsys, still_lab: Lab, tmp_path: Path) -> None:
+def test_measured_points_survive_a_kill(ipsys: Ipsys, still_lab: Lab, tmp_path: Path) -> None:
     log = tmp_path / "places.mcap"
     with measuring(still_lab, log) as (program, page):
         page.measure(still_lab.tape[0])
@@ -183,7 +183,7 @@ def test_what_was_measured_survives_a_kill(ipsys: Ipsys, still_lab: Lab, tmp_pat
             assert len(inside) > 5
 
 
-def test_a_kill_before_the_first_place_leaves_rig_and_lenses(
+def test_kill_before_the_first_point_leaves_rig_and_intrinsics(
     ipsys: Ipsys, still_lab: Lab, tmp_path: Path
 ) -> None:
     log = tmp_path / "places.mcap"
@@ -223,7 +223,7 @@ def test_a_log_that_is_there_is_kept_unless_it_is_forced(
         (["measure", "--rig", "RIG", "-o", "a.mcap"], "has no lens"),
     ],
 )
-def test_what_does_not_go_together(
+def test_incompatible_options_are_refused(
     ipsys: Ipsys, still_lab: Lab, tmp_path: Path, monkeypatch: pytest.MonkeyPatch, given: list[str], said: str
 ) -> None:
     monkeypatch.chdir(tmp_path)
@@ -263,7 +263,7 @@ def typed(command: list[str], answers: list[tuple[str, str]]) -> tuple[int, str]
 
 
 @pytest.mark.parametrize("end", ["q\n", "\x03", "SIGTERM"])
-def test_places_are_measured_in_the_terminal(end: str, still_lab: Lab, tmp_path: Path) -> None:
+def test_points_are_measured_in_the_terminal(end: str, still_lab: Lab, tmp_path: Path) -> None:
     log, one = tmp_path / "places.mcap", still_lab.tape[0]
     a, b = (f"{100 * d.distance_m:.2f}" for d in one.distances)
     command = ["measure", "--terminal", "--rig", str(still_lab.rig), "-o", str(log)]

@@ -309,7 +309,7 @@ def test_new_measurements_make_the_model_out_of_date(ipsys: Ipsys, lab: Path) ->
     assert used[0] - used[1] == {withdrawn.id}
 
 
-def test_places_of_two_logs_are_two_though_each_log_begins_at_p001(tmp_path: Path) -> None:
+def test_equal_point_names_of_two_logs_stay_different_points(tmp_path: Path) -> None:
     def log(name: str, *places: Measurement) -> Path:
         path = tmp_path / name
         write_log(path, (Message("/measurements", one.timestamp, one.timestamp, one) for one in places))

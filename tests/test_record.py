@@ -152,7 +152,7 @@ def test_a_password_in_the_rig_of_a_run_is_not_recorded(ipsys: Ipsys, lab: Path,
 
 
 @pytest.mark.parametrize("number", [signal.SIGINT, signal.SIGTERM])
-def test_it_ends_cleanly_when_it_is_told_to(
+def test_simulation_ends_cleanly_on_request(
     number: int, pictures: tuple[Path, list[bytes]], tmp_path: Path
 ) -> None:
     log = tmp_path / "a.mcap"
@@ -267,7 +267,7 @@ with open_cameras._stop_after(attached.stop, None):
 """
 
 
-def test_who_interrupts_does_not_wait_for_a_lab_to_be_drawn(tmp_path: Path) -> None:
+def test_interrupt_does_not_wait_for_the_rendering(tmp_path: Path) -> None:
     rig = tmp_path / "lab.toml"
     rig.write_text(
         'name = "lab"\ndictionary = "DICT_4X4_100"\nmarker_length_m = 0.2\n'
@@ -390,7 +390,7 @@ def test_a_full_disk_ends_it_with_a_complete_log(
     assert all(len(jpegs) > 5 for jpegs in found.values())
 
 
-def test_what_is_there_is_never_overwritten_unless_it_is_said(
+def test_existing_file_is_overwritten_only_with_the_option(
     ipsys: Ipsys, pictures: tuple[Path, list[bytes]], tmp_path: Path
 ) -> None:
     log = tmp_path / "a.mcap"
@@ -460,7 +460,7 @@ def test_a_calibration_of_another_shape_is_refused_and_of_another_size_is_scaled
     assert (held.width, held.height, held.K[0, 0], held.K[0, 2]) == (320, 240, 150.0, 159.5)
 
 
-def test_what_is_read_is_not_overwritten(ipsys: Ipsys, lab_log: Path, tmp_path: Path) -> None:
+def test_input_is_not_overwritten(ipsys: Ipsys, lab_log: Path, tmp_path: Path) -> None:
     played, rig, lens = tmp_path / "red.mcap", tmp_path / "lab.toml", tmp_path / "lens.mcap"
     for path in (played, lens):
         path.write_bytes(lab_log.read_bytes())

@@ -145,7 +145,7 @@ def test_a_live_run_that_is_killed_is_brought_to_its_end(
 
 
 @pytest.mark.parametrize("share", [0.3, 0.6, 0.95])
-def test_frames_that_nobody_had_looked_at_are_looked_at(
+def test_skipped_frames_are_processed_by_a_replay(
     recorded: Path,  # noqa: F811
     tmp_path: Path,
     share: float,

@@ -53,7 +53,7 @@ def test_one_pair_entered_twice(ipsys: Ipsys, tmp_path: Path) -> None:
     assert "m03 and m07 are one and the same pair" in said
 
 
-def test_places_on_a_line_too_few_and_none_at_all(ipsys: Ipsys, tmp_path: Path) -> None:
+def test_collinear_too_few_or_missing_points_are_refused(ipsys: Ipsys, tmp_path: Path) -> None:
     def on_a_line(points: np.ndarray, tape: np.ndarray) -> None:
         tape[:, 1] = 0.5 * tape[:, 0]
         tape[:, 2] = 0.0
@@ -78,7 +78,7 @@ def test_nan_in_an_import_is_refused_and_nothing_is_written(ipsys: Ipsys, data: 
     assert not (tmp_path / "x.mcap").exists()
 
 
-def test_where_all_heights_are_equal_the_floor_is_what_can_be_learned(ipsys: Ipsys, tmp_path: Path) -> None:
+def test_equal_heights_give_a_2d_model(ipsys: Ipsys, tmp_path: Path) -> None:
     log = made(tmp_path / "flat.mcap", heights=(0.1,))
     done = ipsys("evaluate", log, "--model", "poly", "--model", "best", "--json")
     assert "camera red: all measured places are 0.100 m high, so heights cannot be learned" in done.err
@@ -92,7 +92,7 @@ def test_where_all_heights_are_equal_the_floor_is_what_can_be_learned(ipsys: Ips
             assert payload.positions[0].z_m == pytest.approx(0.1, abs=1e-6)
 
 
-def test_a_model_that_is_told_the_height_needs_it_in_the_rig(ipsys: Ipsys, tmp_path: Path) -> None:
+def test_model_with_known_heights_needs_them_in_the_rig(ipsys: Ipsys, tmp_path: Path) -> None:
     log = made(tmp_path / "lab.mcap")
     said = refused(ipsys, log, "replay", "--model", "rayplane")
     assert "marker 0 is carried" in said
@@ -168,7 +168,7 @@ def test_a_wrong_side_is_found_named_and_put_right(ipsys: Ipsys, tmp_path: Path)
     assert (first["measurement"], first["kind"]) == ("m13", "side")
 
 
-def test_the_authors_wrong_place_comes_first(ipsys: Ipsys, data: Path, tmp_path: Path) -> None:
+def test_wrong_point_of_the_authors_ranks_first(ipsys: Ipsys, data: Path, tmp_path: Path) -> None:
     """Training pair 11 of the white camera contradicts its neighbours by 8 to 14 cm."""
     log = tmp_path / "imsel.mcap"
     ipsys("import", "imsel", data / "imsel", "-o", log)

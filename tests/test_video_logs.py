@@ -88,7 +88,7 @@ def test_positions_are_those_of_the_pictures(video: Path, lab: Path) -> None:
     assert np.median(np.hypot(*off_m.T)) < 0.002
 
 
-def test_while_measuring_on_a_finished_log_each_place_is_shown_as_it_was(video: Path) -> None:
+def test_page_shows_the_frames_of_each_stationary_interval(video: Path) -> None:
     """Most of these frames are no keyframes."""
     with open_finished_log(video, Request()) as scene:
         pictures = {camera: decoded(video, camera) for camera in ("black", "red", "white")}
@@ -103,7 +103,7 @@ def test_while_measuring_on_a_finished_log_each_place_is_shown_as_it_was(video: 
         assert shown > 20
 
 
-def test_while_recording_the_last_keyframe_is_shown_with_its_own_markers(video: Path) -> None:
+def test_live_page_shows_the_last_keyframe_with_its_markers(video: Path) -> None:
     pipeline.replay([video], Request(), "detect")
     with Session([video]) as session:
         (rig,) = session.payloads(["/rig"])

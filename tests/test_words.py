@@ -28,7 +28,9 @@ _PHRASES = (
     "were not looked at",
     "how a camera hangs",
 )
-_FILES = sorted([*ROOT.glob("ipsys_log/**/*.py"), *ROOT.glob("benchmarks/*.py")])
+_FILES = sorted(
+    path for folder in ("ipsys_log", "benchmarks", "tests") for path in ROOT.glob(f"{folder}/**/*.py")
+)
 
 
 def sentences(source: str) -> Iterator[tuple[int, str]]:

@@ -63,7 +63,7 @@ def _draw_image(axes: Axes, found: CalibrationResult) -> None:
         ylabel="y in px",
     )
     title = f"{shorten(found.camera)}: {found.coverage.share:.0%} of the image covered\n"
-    axes.set_title(f"{title}arrows drawn {factor} times as long, + the middle", loc="left", fontsize=10)
+    axes.set_title(f"{title}arrows {factor} times true length, + principal point", loc="left", fontsize=10)
     assert axes.figure is not None
     axes.figure.colorbar(arrows, ax=axes, shrink=0.8, pad=0.02, extend="max", label="error in px")
 
@@ -86,7 +86,7 @@ def _draw_cloud(axes: Axes, found: CalibrationResult) -> None:
     )
     outside = int((~inside).sum())
     title = f"RMS {found.rms_px:.3f} px (circle), median {found.median_px:.3f}"
-    axes.set_title(title + (f"\n{outside} farther out" if outside else "\n"), loc="left", fontsize=10)
+    axes.set_title(title + (f"\n{outside} outside this plot" if outside else "\n"), loc="left", fontsize=10)
     style_axes(axes)
 
 
@@ -97,10 +97,10 @@ def _draw_pictures(axes: Axes, found: CalibrationResult) -> None:
     axes.barh(positions, [rms_px for _, rms_px in ranked], color="#56B4E9", height=0.75)
     size = float(np.clip(210 / len(ranked), 7, 9))
     axes.set_yticks(positions, [shorten(name) for name, _ in ranked], fontsize=size)
-    axes.set(ylim=(-0.7, len(ranked) - 0.3), xlabel="RMS of a picture in px")
+    axes.set(ylim=(-0.7, len(ranked) - 0.3), xlabel="RMS of an image in px")
     suffix = f", the worst {len(ranked)}" if len(ranked) < len(found.used) else ""
     axes.set_title(
-        f"{len(found.used)} pictures used of {found.examined_count}{suffix}\n", loc="left", fontsize=10
+        f"{len(found.used)} of {found.examined_count} images used{suffix}\n", loc="left", fontsize=10
     )
     style_axes(axes, "x")
 
@@ -120,7 +120,7 @@ def calibration_table(found: CalibrationResult) -> Table:
         digits = 2 if n < 4 else 5
         note = "" if n >= 4 else "px"
         if n == 1 and found.square:
-            note = "px, taken as fx: pixels are square"
+            note = "px, equal to fx: square pixels"
         spread = f"{sigma:.{digits}f}" if sigma > 0 else "not fitted"
         table.add_row(name, f"{value:.{digits}f}", spread, note)
     return table
@@ -132,16 +132,17 @@ def calibration_lines(found: CalibrationResult) -> list[str]:
     counts += [f"{len(found.dropped)} bad"] if found.dropped else []
     counts += [f"{len(found.spare)} not needed"] if found.spare else []
     lines = [
-        f"error: RMS {found.rms_px:.3f} px, median {found.median_px:.3f} px over {len(found.pixels)} corners",
-        f"pictures: {found.examined_count} looked at, board seen in {found.seen}, {', '.join(counts)}",
-        f"coverage: {coverage.share:.0%} of the image, to {_degrees(coverage.widest_rad)} from the axis",
-        f"          {coverage.position_count} places of the board, "
+        f"reprojection error: RMS {found.rms_px:.3f} px, median {found.median_px:.3f} px, "
+        f"{len(found.pixels)} corners",
+        f"images: {found.examined_count} searched, board found in {found.seen}, {', '.join(counts)}",
+        f"coverage: {coverage.share:.0%} of the image, up to {_degrees(coverage.widest_rad)} from the axis",
+        f"          {coverage.position_count} board positions, "
         f"{coverage.tilted} tilted by 25 degrees or more",
     ]
     if found.outlier_corners:
         corners = "corner" if found.outlier_corners == 1 else "corners"
-        lines.append(f"left out: {found.outlier_corners} single {corners}, far off")
-    return lines + _dropped_lines(found.dropped, "left out") + _dropped_lines(found.unseen, "not seen")
+        lines.append(f"excluded: {found.outlier_corners} single {corners} with a large error")
+    return lines + _dropped_lines(found.dropped, "excluded") + _dropped_lines(found.unseen, "board not found")
 
 
 def _degrees(angle_rad: float | None) -> str:
@@ -159,7 +160,7 @@ def _dropped_lines(dropped: tuple[ExcludedSighting, ...], what: str) -> list[str
         text = re.sub("^is ", "are ", reason) if count > 1 else reason
         lines.append(f"{what}: {shown}: {text}")
     more = len(lines) - _SHOWN_DROPPED
-    return lines if more <= 1 else [*lines[:_SHOWN_DROPPED], f"{what}: and so on, {more} more (see --json)"]
+    return lines if more <= 1 else [*lines[:_SHOWN_DROPPED], f"{what}: {more} more reasons (see --json)"]
 
 
 def calibration_json(found: CalibrationResult) -> dict[str, Any]:

@@ -51,7 +51,7 @@ def degrees(angle_rad: float | None) -> float:
 
 @pytest.mark.parametrize("tilt_deg", [0.0, 2.0, 5.0])
 @pytest.mark.parametrize("towards_deg", [0, 45, 100, 200, 290])
-def test_a_known_tilt_comes_back_and_the_advice_mends_it(tilt_deg: float, towards_deg: float) -> None:
+def test_known_tilt_is_estimated_and_the_advice_corrects_it(tilt_deg: float, towards_deg: float) -> None:
     camera = hang(tilt_deg, towards_deg)
     found = align_camera("red", lay(camera, 0.003))
     assert degrees(found.tilt_rad) == pytest.approx(tilt_deg, abs=0.2)
@@ -64,7 +64,7 @@ def test_a_known_tilt_comes_back_and_the_advice_mends_it(tilt_deg: float, toward
     assert found.remaining_m < 0.02
     if tilt_deg == 0:
         assert found.level
-        assert advise(found).startswith("nothing: it is level, the spread is under 5 cm")
+        assert advise(found).startswith("nothing: the camera is level, its spread is under 5 cm")
         return
     assert found.level == (found.spread_m < LEVEL_M)
     if tilt_deg == 5:
@@ -79,20 +79,20 @@ def test_a_known_tilt_comes_back_and_the_advice_mends_it(tilt_deg: float, toward
     ("axis", "says"),
     [
         # Turned about the axis to the right of the picture, a camera looks further to its top.
-        ((1, 0), "towards the bottom of its picture, by 3.0 degrees (11 cm on the floor)"),
-        ((-1, 0), "towards the top of its picture, by 3.0 degrees (11 cm on the floor)"),
-        ((0, 1), "towards the left of its picture, by 3.0 degrees (11 cm on the floor)"),
-        ((0, -1), "towards the right of its picture, by 3.0 degrees (11 cm on the floor)"),
+        ((1, 0), "3.0 degrees towards the bottom of its image (11 cm on the floor)"),
+        ((-1, 0), "3.0 degrees towards the top of its image (11 cm on the floor)"),
+        ((0, 1), "3.0 degrees towards the left of its image (11 cm on the floor)"),
+        ((0, -1), "3.0 degrees towards the right of its image (11 cm on the floor)"),
     ],
 )
-def test_the_words(axis: tuple[float, float], says: str) -> None:
+def test_advice_names_the_direction_of_the_turn(axis: tuple[float, float], says: str) -> None:
     camera_turned = rotation(np.radians(3.0) * np.array([*axis, 0.0]))
     points_m = transform(look_down(ORIGIN_M), np.column_stack([PLACES_M, np.zeros(len(PLACES_M))]))
     # The axes of the camera are turned: what it sees turns the other way.
     found = align_camera(
         "red", [StationaryMarker(n, p, np.zeros((3, 3))) for n, p in enumerate(points_m @ camera_turned)]
     )
-    assert advise(found) == f"tilt it so that it looks further {says}"
+    assert advise(found) == f"turn the camera {says}"
 
 
 def by_eq_3(camera_from_world: Array) -> list[StationaryMarker]:
@@ -125,7 +125,7 @@ def test_a_marker_on_a_box_is_named_and_left_out() -> None:
     assert flat.raised_markers == ()
 
 
-def test_of_four_markers_nobody_can_tell_which_is_on_a_box() -> None:
+def test_raised_marker_of_four_cannot_be_identified() -> None:
     found = align_camera("red", lay(hang(0.0, 0), 0.001, [0.08])[:4])
     assert found.raised_markers == ()
     assert found.uneven_m == pytest.approx(0.04, abs=0.005)
@@ -149,10 +149,10 @@ def test_a_height_that_was_measured_is_brought_down() -> None:
 def test_one_and_two_markers_and_markers_on_a_line() -> None:
     camera = hang(5.0, 90)  # to the left or right of the picture
     lying = lay(camera)
-    assert "none lies still" in advise(align_camera("red", []))
+    assert "none is stationary" in advise(align_camera("red", []))
     one = align_camera("red", lying[:1])
     assert (one.spread_m, one.level, one.tilt_rad) == (None, None, None)
-    assert "lay three or more markers" in advise(one)
+    assert "put three or more markers" in advise(one)
     two = align_camera("red", lying[:2])
     assert two.axes == 1
     assert degrees(two.tilt_rad) == pytest.approx(5.0, abs=0.1)
@@ -162,7 +162,7 @@ def test_one_and_two_markers_and_markers_on_a_line() -> None:
     assert across.spread_m is not None
     assert across.spread_m < LEVEL_M
     assert across.level is None  # not green: it hangs askew by 5 degrees
-    assert advise(across).startswith("lay one aside of the line of its markers")
+    assert advise(across).startswith("put a marker beside the line of its markers")
     assert two.level is False
     line = [
         StationaryMarker(
@@ -177,7 +177,7 @@ def test_one_and_two_markers_and_markers_on_a_line() -> None:
     assert "further apart" in advise(align_camera("red", near))
 
 
-def test_what_a_tilt_does_not_mend_is_said() -> None:
+def test_spread_without_a_tilt_is_reported() -> None:
     """A lens that was calibrated badly bends the floor."""
     lying = lay(hang(0.0, 0))
     bowl = [
@@ -190,7 +190,7 @@ def test_what_a_tilt_does_not_mend_is_said() -> None:
     ]
     found = align_camera("red", bowl)
     assert found.level is False
-    assert "calibrate its lens again" in advise(found)
+    assert "repeat the intrinsic calibration" in advise(found)
 
 
 def test_the_uncertainty_is_that_of_the_scatter() -> None:
@@ -223,7 +223,7 @@ def carried(places_m: Sequence[Array]) -> Iterator[CameraPoints]:
             time_ns += NS_PER_S // 30
 
 
-def test_one_marker_at_one_place_after_the_other() -> None:
+def test_one_marker_can_visit_the_points_in_turn() -> None:
     camera = hang(4.0, 200)
     places_m = [one.point_m for one in lay(camera)]
     lying = find_stationary(carried(places_m))
@@ -233,7 +233,7 @@ def test_one_marker_at_one_place_after_the_other() -> None:
     assert degrees(align_camera("red", lying).tilt_rad) == pytest.approx(4.0, abs=0.01)
 
 
-def test_a_frame_for_each_place_is_enough_where_there_is_time_between() -> None:
+def test_one_frame_per_point_is_enough_with_pauses() -> None:
     places_m = [one.point_m for one in lay(hang(4.0, 200))]
     frames = [CameraPoints(n * 3 * NS_PER_S, (CameraPoint(7, *p.tolist()),)) for n, p in enumerate(places_m)]
     assert len(find_stationary(frames)) == len(places_m)

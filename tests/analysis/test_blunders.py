@@ -50,7 +50,7 @@ def misread(index: int, distance_m: float) -> Measurement:
         ),
     ],
 )
-def test_a_slip_taken_back_gives_the_true_place_and_says_how(wrong: Measurement, text: str) -> None:
+def test_corrected_gross_error_gives_the_true_point(wrong: Measurement, text: str) -> None:
     (slip,) = [one for one in slips(wrong) if one.text == text]
     np.testing.assert_allclose(world_point(slip.corrected, RIG).world_m, TRUE, atol=1e-9)
 
@@ -87,7 +87,7 @@ def test_three_distances_tell_the_side_themselves() -> None:
     np.testing.assert_allclose(world_point(by_c.corrected, RIG).world_m, TRUE, atol=1e-9)
 
 
-def test_one_reference_point_measured_twice_names_the_line_all_the_same() -> None:
+def test_repeated_reference_point_still_names_the_line() -> None:
     twice = replace(PLACE, distances=(Distance("A", 1.5), Distance("A", 1.5), Distance("B", 1.0)))
     sides = [slip.text for slip in slips(twice) if slip.kind == "side"]
     assert sides == ["it lies right of the line from A to B, not left"]
@@ -122,6 +122,6 @@ def test_a_point_with_distances_from_one_reference_point_only() -> None:
     assert any(slip.text.startswith("the distance to B") for slip in slips(odd))
 
 
-def test_no_marker_lies_below_the_floor() -> None:
+def test_marker_below_the_floor_is_refused() -> None:
     assert [slip for slip in slips(PLACE, predicted=[*TRUE[:2], -0.1]) if slip.kind == "height"] == []
     assert [slip for slip in slips(PLACE, predicted=[*TRUE[:2], -0.01]) if slip.kind == "height"] != []

@@ -79,7 +79,7 @@ def test_gross_errors_do_not_move_the_yardstick() -> None:
     assert score(spoilt, usual(places, spoilt))[:6].min() > 5
 
 
-def test_a_place_at_the_rim_is_allowed_more_as_leverage_has_it() -> None:
+def test_threshold_grows_with_leverage_at_the_rim() -> None:
     """Monte Carlo: leave-one-out errors of the polynomial itself, on points with equal noise."""
     rng = np.random.default_rng(4)
     places = floor(rng, 30)
@@ -97,7 +97,7 @@ def test_a_place_at_the_rim_is_allowed_more_as_leverage_has_it() -> None:
     assert allowed.max() > 2 * allowed.min()
 
 
-def test_few_places_make_the_yardstick_longer() -> None:
+def test_few_points_increase_the_threshold() -> None:
     rng = np.random.default_rng(5)
     sizes = []
     for count in (15, 20, 50, 200):
@@ -120,7 +120,7 @@ def test_the_error_of_a_bad_tape_comes_on_top() -> None:
     assert 0.7 < np.median(score(off, known + tape_m2)) <= 1.01
 
 
-def test_places_left_out_are_judged_by_the_others() -> None:
+def test_excluded_points_are_judged_by_the_others() -> None:
     rng = np.random.default_rng(7)
     places = floor(rng, 50)
     off = rng.normal(0, 0.01, places.shape)

@@ -25,7 +25,7 @@ TRUTH = gather_tracks([tracked(0, 0.0), tracked(30, 0.06), tracked(60, 0.06), tr
 @pytest.mark.parametrize(
     ("time_ms", "x_m"), [(0, 0.0), (10, 0.02), (30, 0.06), (29.999999, 0.059999998), (45, 0.06), (161, 1.0)]
 )
-def test_between_its_instants_the_truth_lies_on_a_line(time_ms: float, x_m: float) -> None:
+def test_ground_truth_is_interpolated_linearly(time_ms: float, x_m: float) -> None:
     found = track_errors(gather_tracks([tracked(time_ms, x_m + 0.25)]), TRUTH)
     assert found is not None
     assert found[0].mean_m == pytest.approx(0.25, abs=1e-12)
@@ -36,7 +36,7 @@ def test_beyond_its_ends_and_in_its_gaps_there_is_no_truth(time_ms: float) -> No
     assert track_errors(gather_tracks([tracked(time_ms, 0.0)]), TRUTH) is None
 
 
-def test_one_instant_of_truth_says_nothing_of_the_next_nanosecond() -> None:
+def test_single_ground_truth_pose_is_not_extrapolated() -> None:
     truth = gather_tracks([tracked(0, 0.0)])
     assert track_errors(gather_tracks([tracked(1e-6, 0.0)]), truth) is None
     assert track_errors(gather_tracks([tracked(0, 0.0)]), truth) is not None
@@ -50,7 +50,7 @@ def test_poses_of_different_instants_count_one_by_one() -> None:
     assert found[0].max_m == pytest.approx(0.01)
 
 
-def test_at_its_own_instants_the_truth_is_taken_as_it_stands() -> None:
+def test_ground_truth_is_exact_at_its_own_times() -> None:
     rng = np.random.default_rng(0)
     times_ns = START_NS + np.sort(rng.choice(10_000 * MS, 300, replace=False))
     known = Sightings(times_ns[[0, *range(300)]], rng.normal(size=(301, 3)))

@@ -185,7 +185,7 @@ def check_named(suspect: Suspect, slip: str, truth: Array) -> None:
 
 @pytest.mark.parametrize("slip", SLIPS)
 @pytest.mark.parametrize("seed", [1, 2])
-def test_a_slip_alone_is_found_and_named(slip: str, seed: int) -> None:
+def test_single_gross_error_is_found_and_named(slip: str, seed: int) -> None:
     session, planted = plant(simulated(seed), [slip], seed)
     ((name, _),) = planted.items()
     (suspect,) = suspects_of(session)
@@ -199,7 +199,7 @@ def test_a_slip_alone_is_found_and_named(slip: str, seed: int) -> None:
 
 @pytest.mark.parametrize("seed", range(10, 15))
 @pytest.mark.parametrize("shared", [False, True])
-def test_three_slips_at_once_do_not_hide_one_another(seed: int, shared: bool) -> None:
+def test_three_gross_errors_do_not_hide_each_other(seed: int, shared: bool) -> None:
     slips = ["side", "swapped", ["A long", "A short", "B long", "B short"][seed % 4]]
     session, planted = plant(simulated(seed, shared=shared), slips, seed)
     found = suspects_of(session)
@@ -210,12 +210,12 @@ def test_three_slips_at_once_do_not_hide_one_another(seed: int, shared: bool) ->
     assert off_m == sorted(off_m, reverse=True)
 
 
-def test_nine_slips_at_once_in_a_session_of_thirty_places_a_camera() -> None:
+def test_nine_gross_errors_in_thirty_points_per_camera() -> None:
     session, planted = plant(simulated(3, count=30), ["side", "swapped", "A long"] * 3, 3)
     assert {suspect.measurement for suspect in suspects_of(session)} == set(planted)
 
 
-def test_ten_centimetres_are_said_to_be_ten() -> None:
+def test_error_of_ten_centimetres_is_reported_as_ten() -> None:
     session, planted = plant(simulated(4), ["B long"], 4)
     (name,) = planted
     read_m = session.measurement(name).distances[1].distance_m
@@ -275,7 +275,7 @@ def test_a_third_reference_point() -> None:
     assert "distances to A and B look exchanged" in str(by_id[two].text)
 
 
-def test_a_place_that_came_as_a_point_only() -> None:
+def test_point_without_distances_is_screened() -> None:
     session = simulated(7)
     name = next(n for n, point in session.truth.items() if point[1] > A.y_m + 0.5)
     x, y, z = session.truth[name].tolist()
@@ -288,7 +288,7 @@ def test_a_place_that_came_as_a_point_only() -> None:
     np.testing.assert_allclose(suspect.corrected_m, [x, y, z], atol=1e-9)
 
 
-def test_what_no_single_slip_explains_has_no_kind() -> None:
+def test_unexplained_outlier_has_no_kind() -> None:
     session = simulated(8)
     name = next(n for n, point in session.truth.items() if abs(point[1] - A.y_m) > 0.5)
     x, y, z = session.truth[name].tolist()
@@ -355,14 +355,14 @@ def test_few_fits_are_asked_for() -> None:
     assert asked(plant(simulated(11), ["side", "swapped", "A long"], 11)[0]) <= 5
 
 
-def test_cameras_with_too_few_places_are_not_judged() -> None:
+def test_cameras_with_too_few_points_are_not_screened() -> None:
     session, _ = plant(simulated(12, count=14), ["side"], 12)
     assert suspects_of(session) == ()
     assert find_outliers(lambda unused: {}, session.places) == ()
     assert find_outliers(lambda unused: {"red": {}}, []) == ()
 
 
-def test_the_search_ends_where_too_few_places_are_left_to_fit_to() -> None:
+def test_outlier_search_ends_with_too_few_points() -> None:
     session, planted = plant(simulated(13), ["side", "swapped"], 13)
     fits = without_each(session)
 
@@ -381,7 +381,7 @@ def test_the_search_ends_where_too_few_places_are_left_to_fit_to() -> None:
         find_outliers(never, session.places)
 
 
-def test_at_most_a_fifth_of_the_places_is_suspected() -> None:
+def test_at_most_a_fifth_of_the_points_are_outliers() -> None:
     session = simulated(14, count=20)
     session, planted = plant(session, ["side"] * 25, 14)
     assert len(planted) == 25
@@ -390,7 +390,7 @@ def test_at_most_a_fifth_of_the_places_is_suspected() -> None:
 
 
 @pytest.mark.parametrize("lasting", [True, False])
-def test_a_good_place_is_put_back_when_the_clean_fits_agree_with_it(lasting: bool) -> None:
+def test_good_point_is_restored_if_clean_fits_agree(lasting: bool) -> None:
     session = simulated(15)
     name = sorted(session.points["red"])[0]
     fits = without_each(session)

@@ -110,7 +110,7 @@ def test_a_pair_is_the_mean_over_the_still_interval() -> None:
     np.testing.assert_array_equal(pair.world_m, [1, 2, 3])
 
 
-def test_a_pair_knows_how_well_its_place_is_known() -> None:
+def test_pair_contains_the_covariance_of_its_point() -> None:
     sightings = gather_sightings(seen(*still(0, 1, 0.5)))
     corner = (Distance("A", 2.0, 0.003), Distance("B", 2.0 * 2**0.5, 0.003))
     taped = Measurement(
@@ -126,7 +126,7 @@ def test_a_pair_knows_how_well_its_place_is_known() -> None:
     assert build_pairs(sightings, [RiggedMeasurement(given_point, RIG)])["red"][0].world_covariance_m2 is None
 
 
-def test_a_camera_that_did_not_see_a_place_has_no_pair_of_it() -> None:
+def test_camera_has_no_pair_for_an_unseen_point() -> None:
     messages = seen(*still(0, 1, 0.5)) + seen(*still(50, 51, 0.5), camera="black")
     measured = Measurement(S // 2, "a", marker_id=0, point=WorldPoint(1, 2, 0))
     pairs = build_pairs(gather_sightings(messages), [RiggedMeasurement(measured, RIG)])
@@ -199,7 +199,7 @@ def test_the_rig_of_its_time_holds_for_a_measurement() -> None:
     assert valid_measurements(later, None)[-1].rig == moved
 
 
-def test_places_that_are_held_out_are_never_fitted_on() -> None:
+def test_held_out_points_are_never_used_by_fit() -> None:
     both = [Measurement(0, "a", splits=("train", "test")), Measurement(0, "b", splits=("test",))]
     assert split(both, "train", 0) == ({"a"}, {"b"})
     with pytest.raises(IpsysError, match="held out"):

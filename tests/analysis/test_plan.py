@@ -182,7 +182,7 @@ def planned(views: list[FittedCamera], count: int = 6) -> Plan:
 @pytest.mark.parametrize(
     "seeds", [range(8), pytest.param(range(8, 48), marks=pytest.mark.slow)], ids=["8", "40"]
 )
-def test_planned_places_are_worth_more_than_random_ones(seeds: range) -> None:
+def test_planned_points_reduce_the_error_more_than_random_ones(seeds: range) -> None:
     errors = []
     for seed in seeds:
         cameras, pairs, rng = lab(seed)
@@ -241,7 +241,7 @@ def second_order(points_m: Array) -> Array:
 
 
 @pytest.mark.parametrize("model", ["best", "rayplane", "rigid"])
-def test_the_predicted_error_falls_and_is_that_of_all_places_at_once(model: str) -> None:
+def test_predicted_error_falls_and_equals_the_joint_solution(model: str) -> None:
     cameras, pairs, _ = lab(3)
     views, floor_m = views_of(cameras, pairs, model), grid(0.2, (0.1,))
     plan = planned(views)
@@ -258,7 +258,7 @@ def test_the_predicted_error_falls_and_is_that_of_all_places_at_once(model: str)
     assert [p.point_m.tolist() for p in planned(views, 3).places] == points_m[:3].tolist()
 
 
-def test_the_first_place_is_the_best_of_all() -> None:
+def test_first_planned_point_is_the_best_candidate() -> None:
     cameras, pairs, _ = lab(5)
     views, floor_m = views_of(cameras, pairs), grid(0.4, (0.1,))
     candidates_m = grid(0.4, (0.1,))
@@ -310,7 +310,7 @@ def test_all_of_a_planned_marker_is_in_the_frame_of_its_cameras(model: str) -> N
             assert seen.sum() > 0.85 * shown.sum()
 
 
-def test_what_a_lens_bends_back_into_its_frame_is_not_seen() -> None:
+def test_points_folded_back_by_the_lens_are_not_visible() -> None:
     """The polynomial of a fisheye lens turns round far out: points there fall into the frame once more."""
     cameras, pairs, _ = lab(0)
     view = views_of(cameras, pairs)[0]
@@ -332,7 +332,7 @@ def test_what_a_lens_bends_back_into_its_frame_is_not_seen() -> None:
     assert not replace(view, lens=steep).sees(far_m, RADIUS_M).any()
 
 
-def test_a_camera_without_a_lens_sees_what_lies_among_its_places() -> None:
+def test_camera_without_intrinsics_sees_the_area_of_its_points() -> None:
     cameras, pairs, _ = lab(1)
     view = replace(views_of(cameras, pairs)[0], lens=None)
     assert view.sees(view.fitted_m, RADIUS_M).all()
@@ -354,7 +354,7 @@ def level_view(fitted_m: Array) -> FittedCamera:
     return FittedCamera("over", pose, np.zeros(3), calibration, predict, uncertainty, fitted_m)
 
 
-def test_where_the_tapes_cross_flatly_nothing_is_planned() -> None:
+def test_no_point_is_planned_at_flat_tape_crossings() -> None:
     half_m = np.array([(1.0, 0.5, 0), (-1.0, 0.4, 0), (0.2, 0.7, 0), (0.5, 0.2, 0), (-0.4, 0.3, 0)])
     mirror = np.array([1, -1, 1])
     view = level_view(np.vstack([half_m, half_m * mirror]))
@@ -380,7 +380,7 @@ def test_where_the_tapes_cross_flatly_nothing_is_planned() -> None:
         assert plan.places[0].point_m.tolist() == (flat_m * mirror).tolist()
 
 
-def test_a_place_beside_a_known_one_has_to_do_clearly_more() -> None:
+def test_point_beside_a_known_one_needs_a_clear_gain() -> None:
     half_m = np.array([(1.0, 0.5, 0), (-1.0, 0.4, 0), (0.2, 0.7, 0), (0.5, 0.2, 0), (-0.4, 0.3, 0)])
     fitted_m = np.vstack([half_m, half_m * [1, -1, 1], [[1.3, 0.8, 0], [1.24, -0.76, 0]]])
     view = level_view(fitted_m)
@@ -401,7 +401,7 @@ def test_a_place_beside_a_known_one_has_to_do_clearly_more() -> None:
     assert first(beside, worse)[0] == list(beside)
 
 
-def test_a_height_that_no_camera_sees_is_said() -> None:
+def test_height_outside_all_views_is_reported() -> None:
     cameras, pairs, _ = lab(2)
     views = views_of(cameras, pairs)
     with pytest.raises(IpsysError, match=r"no camera sees a whole marker 2\.5 m above the floor"):

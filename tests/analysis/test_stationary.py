@@ -33,17 +33,17 @@ def laid(*parts: tuple[float, float, float]) -> Array:
     return path_m
 
 
-def test_two_places_with_a_walk_between_them() -> None:
+def test_moved_marker_has_two_intervals() -> None:
     found = stationary_intervals({"red": seen(laid((5, 0, 0), (2, 0.4, 0.1), (4, 0, 0)))})
     assert [(round(a / NS_PER_S, 0), round(b / NS_PER_S, 0)) for a, b, _ in found] == [(0, 5), (7, 11)]
 
 
 @pytest.mark.parametrize("speed_m_s", [0.01, 0.03, 0.1, 0.5])
-def test_what_moves_however_slowly_does_not_lie_still(speed_m_s: float) -> None:
+def test_slow_marker_is_not_stationary(speed_m_s: float) -> None:
     assert stationary_intervals({"red": seen(laid((6, speed_m_s, speed_m_s / 3)))}) == []
 
 
-def test_what_several_cameras_see_is_one_place() -> None:
+def test_views_of_several_cameras_are_one_interval() -> None:
     path = laid((6, 0, 0), (1, 0.5, 0))
     cameras = {"red": seen(path), "white": seen(path[40:], 40 / RATE_HZ), "black": seen(path[:1])}
     (found,) = stationary_intervals(cameras)
@@ -52,7 +52,7 @@ def test_what_several_cameras_see_is_one_place() -> None:
     assert found[1] == pytest.approx(6 * NS_PER_S, abs=0.1 * NS_PER_S)
 
 
-def test_a_hand_in_front_of_it_for_a_second_does_not_part_a_place_but_three_do() -> None:
+def test_only_a_long_occlusion_splits_an_interval() -> None:
     path = laid((3, 0, 0))
     for gap_s, count in ((1.0, 1), (3.0, 2)):
         first, last = seen(path), seen(path, 3 + gap_s)
@@ -62,7 +62,7 @@ def test_a_hand_in_front_of_it_for_a_second_does_not_part_a_place_but_three_do()
         assert len(stationary_intervals({"red": joined})) == count
 
 
-def test_a_frame_in_which_it_jumps_does_not_part_a_place() -> None:
+def test_single_jump_does_not_split_an_interval() -> None:
     path = laid((8, 0, 0))
     path[100] += [0.05, 0, 0]
     (found,) = stationary_intervals({"red": seen(path)})

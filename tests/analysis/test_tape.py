@@ -139,7 +139,7 @@ def test_a_perfect_tape_is_still_a_tape() -> None:
         ({"point": WorldPoint(1.0, float("inf"), 0.0)}, "measurement a: its world point"),
     ],
 )
-def test_what_forms_no_point_is_refused_by_name(change: dict[str, object], said: str) -> None:
+def test_impossible_point_is_refused_by_name(change: dict[str, object], said: str) -> None:
     with pytest.raises(IpsysError, match=said):
         world_point(replace(measurement("A", "B"), **change), RIG)  # type: ignore[arg-type]
 
@@ -150,7 +150,7 @@ def test_the_reference_points_of_the_distances_in_their_order() -> None:
     assert reference_points(Measurement(0, "a"), RIG).shape == (0, 2)
 
 
-def test_places_where_the_tapes_cross_flatly_are_listed_the_worst_first() -> None:
+def test_flat_tape_crossings_are_listed_worst_first() -> None:
     here = {"good": (2.4, 3.6), "flat": (2.4, 2.65), "beyond": (4.6, 2.6), "flatter": (2.4, 2.5)}
     places = [
         RiggedMeasurement(replace(measurement("A", "B", x=x, y=y), id=name), RIG)
@@ -169,7 +169,7 @@ def test_places_where_the_tapes_cross_flatly_are_listed_the_worst_first() -> Non
     assert found[0].sigma_m > 3 * 0.003
 
 
-def test_without_a_sigma_the_angle_still_tells() -> None:
+def test_crossing_angle_counts_without_a_sigma() -> None:
     flat = RiggedMeasurement(measurement("A", "B", x=2.4, y=2.5), UNKNOWN)
     found = find_weak_points([flat])
     assert [(one.id, one.sigma_m) for one in found] == [("a", None)]

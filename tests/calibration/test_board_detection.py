@@ -137,7 +137,7 @@ def test_a_board_as_opencv_printed_it_before_4_6() -> None:
     assert np.abs(sighting.pixels - truth[sighting.ids]).max() < 0.15
 
 
-def test_mirrored_pictures_are_said_to_be() -> None:
+def test_mirrored_images_are_reported() -> None:
     """Markers are not found in a mirror. A chessboard is, and looks as it always does."""
     pictures = [np.ascontiguousarray(drawn(CHARUCO, seed, 0.7)[0][:, ::-1]) for seed in range(2)]
     said = "it is seen mirrored in 2 of 2 tried"
@@ -174,7 +174,7 @@ def test_blurred_pictures_and_those_with_few_corners_are_dropped_with_the_reason
     assert reasons["row"] == "its corners lie on one line"
 
 
-def test_of_hundreds_of_frames_some_dozens_that_differ_are_chosen() -> None:
+def test_selection_takes_some_different_frames_of_many() -> None:
     """A board that lies still for most of a video, and then goes all over the image."""
     still = [sighting(f"still {n}", 300, 200) for n in range(200)]
     moving = [sighting(f"{x} {y}", x, y) for x in range(0, 540, 20) for y in range(0, 420, 20)]
@@ -187,7 +187,7 @@ def test_of_hundreds_of_frames_some_dozens_that_differ_are_chosen() -> None:
     assert "nearly as" in chosen.spare[0].reason
 
 
-def test_of_two_that_show_the_same_the_sharp_one_is_chosen() -> None:
+def test_selection_takes_the_sharper_of_two_equal_views() -> None:
     seen = [sighting(f"{x}", x, 10, blur_px=0.8 + (x % 2)) for x in range(400)]
     chosen = select_images(seen, CHESSBOARD, (640, 480))
     assert np.mean([s.blur_px < 1 for s in chosen.used]) > 0.9

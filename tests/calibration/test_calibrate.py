@@ -51,7 +51,7 @@ def calibrated(looked: SearchResult) -> CalibrationResult:
     return calibrate("red", looked, BOARD, LENS_MODELS["pinhole"])
 
 
-def test_of_good_pictures_nothing_is_asked() -> None:
+def test_good_images_give_no_advice() -> None:
     found = calibrated(sightings(everywhere(), 0.5))
     assert found.notes == ()
     assert found.rms_px == pytest.approx(0.1 * np.sqrt(2), rel=0.15)
@@ -94,7 +94,7 @@ def test_pictures_that_are_all_soft() -> None:
     assert any("edges are 3.0 px wide in all pictures" in note for note in notes)
 
 
-def test_corners_that_are_far_off_are_said_to_be() -> None:
+def test_corners_with_large_errors_are_reported() -> None:
     looked = sightings(everywhere(), 0.5, noise_px=1.0)
     assert any("px: check that the board is flat" in note for note in calibrated(looked).notes)
 

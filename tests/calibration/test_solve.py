@@ -29,7 +29,7 @@ def squared_errors(name: str, seeds: range, shared_px: float = 0.0) -> NDArray[n
 
 
 @pytest.mark.parametrize("name", list(TRUTH))
-def test_a_known_lens_is_found_within_what_is_said(name: str) -> None:
+def test_known_intrinsics_are_recovered_within_their_sigma(name: str) -> None:
     """With 8 seeds and about 8 correlated parameters, the mean of the squares is 1 to a factor of two."""
     errors = squared_errors(name, range(8))
     assert 0.5 < errors.mean() < 2.0, errors.mean(axis=0)
@@ -38,7 +38,7 @@ def test_a_known_lens_is_found_within_what_is_said(name: str) -> None:
 
 
 @pytest.mark.parametrize("name", ["fisheye", "pinhole"])
-def test_errors_that_a_picture_shares_are_in_what_is_said(name: str) -> None:
+def test_sigma_includes_errors_shared_by_an_image(name: str) -> None:
     """Taken for independent, the residuals would make these squares 2 on average."""
     errors = squared_errors(name, range(8), shared_px=0.15)
     assert 0.4 < errors.mean() < 1.6, errors.mean(axis=0)
@@ -85,7 +85,7 @@ def test_pixels_that_are_hardly_not_square() -> None:
     assert np.sqrt((found.residuals_px**2).sum(axis=1).mean()) < 0.05
 
 
-def test_what_does_not_belong_is_told_by_pixels_that_are_not_square() -> None:
+def test_foreign_image_is_found_with_non_square_pixels() -> None:
     """Taken for square, all pictures are off, so that one more is not noticed."""
     stretched = (600.0, 618.0, *TRUTH["pinhole"][2:])
     corners = seen("pinhole", np.random.default_rng(0), lens=stretched)
@@ -105,7 +105,7 @@ def spoiled(corners: Corners) -> Corners:
 
 
 @pytest.mark.parametrize("name", ["fisheye", "pinhole"])
-def test_what_does_not_belong_is_left_out_and_said(name: str) -> None:
+def test_foreign_images_are_excluded_and_reported(name: str) -> None:
     found = solve(LENS_MODELS[name], spoiled(seen(name, np.random.default_rng(5))), SIZE_PX)
     assert [left.number for left in found.excluded] == [12]
     assert "does not fit" in found.excluded[0].reason or "far off" in found.excluded[0].reason

@@ -38,14 +38,14 @@ def test_the_oldest_frames_of_a_video_are_only_decoded() -> None:
     ]  # fmt: skip
 
 
-def test_what_lies_before_a_keyframe_that_is_searched_is_not_even_decoded() -> None:
+def test_frames_before_a_searched_keyframe_are_not_decoded() -> None:
     waiting = Waiting()
     skipped = [late for n in range(10) for late in waiting.put(video(n, n in (0, 7)))]
     assert numbers(waiting.take()) == [7, 8, 9]
     assert numbers(skipped) == list(range(7))
 
 
-def test_where_no_keyframe_comes_for_long_all_is_skipped_until_one_does() -> None:
+def test_frames_are_skipped_until_a_late_keyframe() -> None:
     waiting = Waiting()
     skipped = []
     for n in range(1000):

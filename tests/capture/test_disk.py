@@ -58,7 +58,7 @@ def first_bytes(lab: Path) -> int:
 
 
 @pytest.mark.parametrize("command", [("record",), ("record", "--detect")])
-def test_room_is_said_before_the_recording_begins(
+def test_free_disk_time_is_printed_before_the_recording(
     ipsys: Ipsys, lab: Path, tmp_path: Path, command: tuple[str, ...]
 ) -> None:
     rig = rig_that_plays(lab, "rate_hz = 5\n")
@@ -70,7 +70,7 @@ def test_room_is_said_before_the_recording_begins(
     assert math.isclose(float(said[1]) * 1e6, 2 * 5 * first_bytes(lab), abs_tol=0.06e6)
 
 
-def test_measuring_says_what_a_place_takes(
+def test_measure_prints_the_size_of_one_point(
     capsys: pytest.CaptureFixture[str], lab: Path, tmp_path: Path
 ) -> None:
     """No rate: what is not measured is not kept."""
@@ -112,12 +112,12 @@ def test_line_on_the_screen_is_corrected_by_what_came(
     with CameraMonitor(RIG) as monitor:
         status = LiveStatus({}, monitor, log, lambda: now_s[0], 10e6)
         now_s[0] = 1.0
-        assert status_line(status) == ("1 s, 20.0 MB; 6.0 GB left on the disk: 10 minutes", "")
+        assert status_line(status) == ("1 s, 20.0 MB; 6.0 GB left on the disk, enough for 10 minutes", "")
         now_s[0] = 10.0
-        assert status_line(status) == ("10 s, 20.0 MB; 6.0 GB left on the disk: 50 minutes", "")
+        assert status_line(status) == ("10 s, 20.0 MB; 6.0 GB left on the disk, enough for 50 minutes", "")
         monkeypatch.setattr(shutil, "disk_usage", lambda _: Usage(10**12, 0, 600_000_000))
         line, style = status_line(status)
-        assert line.endswith("600.0 MB left on the disk: 5 minutes")
+        assert line.endswith("600.0 MB left on the disk, enough for 5 minutes")
         assert "red" in style
 
 

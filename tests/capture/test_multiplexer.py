@@ -193,7 +193,7 @@ def test_a_camera_that_returns_with_another_codec_is_not_recorded(monkeypatch: p
     assert said[1].endswith("set it back to jpeg, or begin a new recording; trying again")
 
 
-def test_pictures_of_another_size_are_said_once_for_each_change() -> None:
+def test_frame_size_change_is_reported_once() -> None:
     large, small = (
         Frame(simplejpeg.encode_jpeg(np.zeros((*shape, 3), np.uint8)), "jpeg", None)
         for shape in ((48, 64), (24, 32))
@@ -209,7 +209,7 @@ def test_pictures_of_another_size_are_said_once_for_each_change() -> None:
     assert len(data_of(found, "red")) == 7
 
 
-def test_what_the_disk_cannot_take_is_dropped_by_name_and_memory_stays_bounded() -> None:
+def test_slow_disk_drops_named_frames_and_bounds_memory() -> None:
     frames = {"red": [bytes([n]) * 1000 for n in range(40)]}
     many_sent, some_written = threading.Event(), threading.Event()
 
@@ -246,7 +246,7 @@ def test_log_times_increase_when_the_clock_stands_still() -> None:
     assert all(one.log_time_ns < other.log_time_ns for one, other in pairwise(found))
 
 
-def test_nothing_is_taken_when_nobody_would_write_it() -> None:
+def test_no_frame_is_accepted_without_a_writer() -> None:
     attached = LiveCameras(cameras("red"), playing(FRAMES, 500.0), Clock())
     with attached:
         attached.add("/note", Event(5, "note", "written"))
@@ -256,7 +256,7 @@ def test_nothing_is_taken_when_nobody_would_write_it() -> None:
     assert [message.payload.text for message in found if message.topic == "/note"] == ["written"]
 
 
-def test_what_is_saved_is_written_by_then() -> None:
+def test_saved_point_is_on_the_disk() -> None:
     attached = LiveCameras(cameras("red"), playing({"red": [b"a"] * 100}, 100.0), Clock())
     asked: list[str] = []
     with attached, ThreadPoolExecutor(1) as page:
@@ -277,7 +277,7 @@ def test_what_is_saved_is_written_by_then() -> None:
         assert asked
 
 
-def test_what_is_not_written_is_not_saved_and_it_is_said_why() -> None:
+def test_failed_write_is_not_saved_and_gives_the_reason() -> None:
     attached = LiveCameras(cameras("red"), playing({"red": [b"a"] * 300}, 100.0), Clock())
     with attached, ThreadPoolExecutor(1) as page:
         messages = iter(attached)
@@ -293,7 +293,7 @@ def test_what_is_not_written_is_not_saved_and_it_is_said_why() -> None:
             attached.save("/note", Event(6, "note", "late"))
 
 
-def test_what_waits_too_long_to_be_saved_is_not_written_later(monkeypatch: pytest.MonkeyPatch) -> None:
+def test_timed_out_save_is_not_written_later(monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr(attached_module, "_SAVED_S", 0.1)
     attached = LiveCameras(cameras("red"), playing(FRAMES, 500.0), Clock())
     with attached:
@@ -302,7 +302,7 @@ def test_what_waits_too_long_to_be_saved_is_not_written_later(monkeypatch: pytes
         assert not [one for one in attached if one is not None and one.topic == "/note"]
 
 
-def test_what_was_dropped_at_the_end_is_named_too() -> None:
+def test_frames_dropped_at_the_end_are_reported() -> None:
     frames = {"red": [bytes(1000)] * 40}
     attached = LiveCameras(cameras("red"), playing(frames, 500.0), Clock(), limit_bytes=10_000)
     with attached:
@@ -369,7 +369,7 @@ def test_frames_without_stamps_do_not_wait_for_another_camera_to_get_a_false_tim
         assert asked_ns[n] <= message.publish_time_ns <= asked_ns[n + 1]
 
 
-def test_a_video_without_keyframes_is_said_once_and_kept(monkeypatch: pytest.MonkeyPatch) -> None:
+def test_video_without_keyframes_is_reported_once_and_kept(monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr("ipsys_log.capture.camera_thread.MAX_FRAMES_WITHOUT_KEYFRAME", 10)
     key, other = (Frame(data, "h264", 1) for data in (b"\0\0\1\x67\0\0\1\x65", b"\0\0\1\x41"))
     for frames, count in (([key, *[other] * 9] * 3, 0), ([key, *[other] * 10, key, *[other] * 15], 1)):
@@ -378,7 +378,7 @@ def test_a_video_without_keyframes_is_said_once_and_kept(monkeypatch: pytest.Mon
         assert sum(message.camera is not None for message in found) == len(frames)
 
 
-def test_what_came_before_a_fault_is_given_out() -> None:
+def test_frames_before_an_error_are_delivered() -> None:
     def broken(camera: str, number: int) -> None:
         if camera == "red" and number == 5:
             raise ZeroDivisionError("a bug")
@@ -403,7 +403,7 @@ def test_what_came_before_a_fault_is_given_out() -> None:
     assert number < len(found) - 5
 
 
-def test_stopping_gives_out_what_has_come() -> None:
+def test_stop_delivers_received_frames() -> None:
     stopped = threading.Event()
 
     def before(_: str, number: int) -> None:

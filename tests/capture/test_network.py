@@ -153,14 +153,14 @@ def web(tmp_path: Path) -> Iterator[str]:
         ("/old.avi", "is mpeg4 video; set the camera to MJPEG, H.264 or H.265"),
     ],
 )
-def test_what_is_no_stream_is_named(web: str, path: str, said: str) -> None:
+def test_invalid_stream_is_reported(web: str, path: str, said: str) -> None:
     with pytest.raises(SourceError, match=re.escape(said)) as error:
         take(web + path, 1)
     assert f"camera red: {web}{path}: " in str(error.value)
     assert "\n" not in str(error.value)
 
 
-def test_nobody_listens() -> None:
+def test_missing_server_is_reported() -> None:
     address = f"127.0.0.1:{free_port()}/live"
     with pytest.raises(SourceError, match=f"admin:[*]+@{address}: refuses the connection") as error:
         take(f"http://admin:secret@{address}", 1)

@@ -141,7 +141,7 @@ def test_hours_of_frames_are_not_kept_in_memory(log: Noted) -> None:
             assert len(recent._buffer) <= 52
 
 
-def test_of_large_frames_fewer_are_kept_and_events_all_the_same(log: Noted) -> None:
+def test_fewer_large_frames_are_kept_but_all_events(log: Noted) -> None:
     with RecentFrames(log, limit_bytes=10_000) as recent:
         recent.put(event("camera_lost", 0.001))
         for message in frames(0, 20):
@@ -154,12 +154,12 @@ def test_of_large_frames_fewer_are_kept_and_events_all_the_same(log: Noted) -> N
     assert [m.payload.kind for m in log.noted if isinstance(m.payload, Event)] == ["camera_lost"]
 
 
-def test_of_a_video_no_seconds_can_be_kept() -> None:
+def test_recent_frames_of_a_video_cannot_be_kept() -> None:
     with pytest.raises(IpsysError, match="camera white sends h264, of which no single seconds can be kept"):
         check_independent_frames({"red": CameraState(format="jpeg"), "white": CameraState(format="h264")})
 
 
-def test_of_a_camera_that_hangs_or_is_lost_nothing_is_seen() -> None:
+def test_hanging_or_lost_camera_sees_no_marker() -> None:
     states = {"red": CameraState(up=True), "white": CameraState(up=True)}
     scene = LiveScene(labs.RIG, None, states, lambda topic, payload: None)
 
@@ -269,9 +269,7 @@ def pairs(log: Path) -> dict[tuple[str, str], Pair]:
     return seen
 
 
-def test_the_places_are_those_of_a_whole_recording_from_a_few_frames(
-    ipsys: Ipsys, lab_log: Path, tmp_path: Path
-) -> None:
+def test_few_frames_give_the_points_of_a_full_recording(ipsys: Ipsys, lab_log: Path, tmp_path: Path) -> None:
     places, whole = tmp_path / "places.mcap", tmp_path / "whole.mcap"
     sent = stretched(lab_log, 18)
     rig, tape = tape_of(lab_log)

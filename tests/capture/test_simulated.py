@@ -96,7 +96,7 @@ def test_a_stamp_is_of_the_instant_that_the_rig_says() -> None:
     assert (frames["end"].time_ns or 0) % step_ns == 10_000_000 + 539 * 50_000
 
 
-def test_it_can_be_left_while_it_draws() -> None:
+def test_simulated_camera_can_be_closed_while_it_draws() -> None:
     start = time.monotonic()
     camera = RigCamera("red", source="sim:red", width=1920, height=1080)
     with open_simulated(camera, Clock(), lambda _: None) as frames:
@@ -125,7 +125,7 @@ def test_live_lab_gives_each_camera_enough_markers_to_work_with() -> None:
         assert len({where.z_m for where in found}) == 3
 
 
-def test_places_do_not_depend_on_the_size_of_frames() -> None:
+def test_stations_do_not_depend_on_the_frame_size() -> None:
     plans = [
         plan_live_lab(
             parse_source(RigCamera("red", source="sim:red", width=width, height=height)).lab

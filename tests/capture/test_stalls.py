@@ -57,7 +57,7 @@ def paced(start_ns: int, count: int, period_ns: int = 33 * MS) -> list[int]:
     return [start_ns + n * period_ns for n in range(count)]
 
 
-def test_late_frames_lie_between_two_events() -> None:
+def test_late_frames_are_between_two_events() -> None:
     before = paced(NS_PER_S, 30)
     stopped_ns, goes_on_ns = before[-1] + 1, before[-1] + 2 * NS_PER_S
     burst = paced(goes_on_ns, 20, 2 * MS)
@@ -85,7 +85,7 @@ def test_steady_camera_has_no_event() -> None:
     assert not late_events(recorded(paced(NS_PER_S, 200)))
 
 
-def test_recorder_that_stops_twice_says_the_whole_range() -> None:
+def test_two_stalls_report_the_whole_range() -> None:
     before = paced(NS_PER_S, 30)
     first = paced(before[-1] + NS_PER_S, 10, MS)
     second = paced(first[-1] + NS_PER_S, 10, MS)

@@ -129,7 +129,7 @@ def test_point_that_comes_last_is_confirmed_at_the_end(tmp_path: Path) -> None:
         saved.result(LIMIT_S)
 
 
-def test_fault_of_a_sync_is_said_once_and_at_the_end(tmp_path: Path) -> None:
+def test_sync_error_is_reported_once_and_at_the_end(tmp_path: Path) -> None:
     disk, path = Slow(errno.EIO), tmp_path / "a.mcap"
 
     def source() -> Generator[Message | None, None, None]:

@@ -86,9 +86,7 @@ def test_frames_that_the_driver_lost_are_told(
         assert tuple(frame.missed for frame in islice((one for one in frames if one), 4)) == missed
 
 
-def test_while_nothing_comes_it_says_so_and_at_last_gives_up(
-    driver: Driver, monkeypatch: pytest.MonkeyPatch
-) -> None:
+def test_silent_stream_is_reported_and_then_closed(driver: Driver, monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr(v4l2_camera, "_SILENT_S", 1.0)
     with open_usb(ask(driver), Clock(), lambda _: None) as frames:
         assert [next(frames), next(frames)] == [None, None]
@@ -118,7 +116,7 @@ def test_a_camera_through_opencv_that_is_pulled_out_may_come_back() -> None:
         next(frames)
 
 
-def test_what_the_camera_refuses_is_said(driver: Driver) -> None:
+def test_settings_that_a_camera_refuses_are_reported(driver: Driver) -> None:
     said: list[str] = []
     asked = ask(
         driver, width=1900, height=1000, rate_hz=60.0, exposure_s=1.0, focus=12.0, gain=50.0, stamp="end"
@@ -136,7 +134,7 @@ def test_what_the_camera_refuses_is_said(driver: Driver) -> None:
     assert driver.controls[0x9A0901][2] == 1  # the exposure is by hand
 
 
-def test_what_it_takes_is_not_said(driver: Driver) -> None:
+def test_accepted_settings_give_no_message(driver: Driver) -> None:
     said: list[str] = []
     driver.flags = v4l2.STAMP_MONOTONIC
     driver.frames.append(b"x")
@@ -225,7 +223,7 @@ def test_pictures_of_a_camera_without_jpeg_are_encoded_once(driver: Driver, name
 @pytest.mark.parametrize(
     ("source", "said"), [("usb:/nowhere/video9", "no such device"), ("usb:/dev/null", "is no camera")]
 )
-def test_what_is_no_camera(source: str, said: str) -> None:
+def test_device_that_is_no_camera_is_refused(source: str, said: str) -> None:
     """With the real kernel."""
     with (
         pytest.raises(SourceError, match=said),

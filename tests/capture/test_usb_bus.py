@@ -111,7 +111,7 @@ def test_a_camera_that_may_not_be_opened_is_listed(
     assert camera.modes == ()
 
 
-def test_what_the_rig_asks_for_is_reckoned(tmp_path: Path, plug_in: Callable[[int, str], None]) -> None:
+def test_bus_load_uses_the_settings_of_the_rig(tmp_path: Path, plug_in: Callable[[int, str], None]) -> None:
     for number in (0, 1, 2):
         plug_in(number, f"2.{number + 1}")
     found = find_cameras(tmp_path)
@@ -137,7 +137,7 @@ def cameras(count: int, **other: Any) -> list[BandwidthDemand]:
     return [demand._replace(camera=name, **other) for name in names[:count]]
 
 
-def test_what_fits_a_bus_is_left_alone() -> None:
+def test_cameras_that_fit_a_bus_get_no_advice() -> None:
     """By USB 2.0, 5.6.4, 80 % of 480 Mbit/s: 48 MB/s. Two of 1920 x 1080 x 30 x 0.25 B are 31 MB/s."""
     assert advise(cameras(2)) == []
     assert advise(cameras(3, rate_hz=25.0)) == []
@@ -147,7 +147,7 @@ def test_what_fits_a_bus_is_left_alone() -> None:
     assert advise(cameras(4, speed_mbit_s=5000.0)) == []
 
 
-def test_what_does_not_fit_a_bus_is_explained() -> None:
+def test_overloaded_bus_is_explained() -> None:
     (line,) = advise([*cameras(4), *cameras(1, bus=2)])
     assert line == (
         "cameras black, blue, red and white share USB bus 1 (Acme Hub at port 2) and need "
@@ -159,7 +159,7 @@ def test_what_does_not_fit_a_bus_is_explained() -> None:
     assert advise(cameras(4, rate_hz=25.0)) != []
 
 
-def test_one_camera_can_be_too_much() -> None:
+def test_single_camera_can_overload_a_bus() -> None:
     (line,) = advise(cameras(1, format="YUYV"))
     assert line == (
         "camera red is alone on USB bus 1 (Acme Hub at port 2) and needs 129.3 MB/s of its 48: "

@@ -56,7 +56,7 @@ def test_videos_go_into_a_log_as_they_are(tmp_path: Path, ipsys: Ipsys) -> None:
         (("-c:v", "mpeg4", "-q:v", "1"), "has mpeg4 video"),
     ],
 )
-def test_what_no_log_holds_is_encoded_anew(
+def test_formats_that_no_log_stores_are_encoded_again(
     tmp_path: Path, ipsys: Ipsys, options: tuple[str, ...], said: str
 ) -> None:
     pictures = make_jpegs(tmp_path, 8)
@@ -72,7 +72,7 @@ def test_what_no_log_holds_is_encoded_anew(
         assert np.abs(grey.astype(float) - true).mean() < 8
 
 
-def test_what_is_no_video_leaves_no_log(tmp_path: Path, ipsys: Ipsys) -> None:
+def test_invalid_video_leaves_no_log(tmp_path: Path, ipsys: Ipsys) -> None:
     (tmp_path / "text.mp4").write_text("no video" * 100)
     for name in ("text.mp4", "none.mp4"):
         done = ipsys("import", "videos", f"red={tmp_path / name}", "-o", tmp_path / "log.mcap")
@@ -136,7 +136,7 @@ def test_a_table_that_does_not_fit_is_named(tmp_path: Path, text: str, said: str
 @pytest.mark.parametrize(
     "text", ["", "12", "17000000000", "nan", "inf", "-1700000000", "2023-13-14T22:13:20"]
 )
-def test_what_is_no_time(text: str) -> None:
+def test_invalid_times_are_refused(text: str) -> None:
     with pytest.raises(ValueError):  # noqa: PT011
         parse_time(text)
 

@@ -121,14 +121,16 @@ def test_a_marker_on_a_box_is_named(ipsys: Ipsys, tmp_path: Path) -> None:
     assert [row["marker"] for row in white["raised"]] == [3]
     assert white["raised"][0]["above_cm"] == pytest.approx(6.0, abs=1.0)
     assert white["tilt_deg"] == pytest.approx(1.0, abs=0.2)
-    assert any("marker 3 lies 6 cm above the plane" in note for note in found["notes"])
+    assert any("marker 3 is 6 cm above the plane" in note for note in found["notes"])
 
 
 def true_tilt(camera: Camera) -> float:
     return math.degrees(math.acos(-camera.camera_from_world[2, 2]))
 
 
-def test_a_session_with_measured_places(ipsys: Ipsys, lab: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+def test_align_reads_a_session_with_calibration_points(
+    ipsys: Ipsys, lab: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
     """At all heights, by tape, then a drive: what was measured tells how high a marker was."""
     section = data_section(lab)
     found = aligned(ipsys, lab)
@@ -149,7 +151,7 @@ def test_a_session_with_measured_places(ipsys: Ipsys, lab: Path, monkeypatch: py
     done = ipsys("align", lab, "--plot", drawn)
     assert done.code == 0, done.err
     assert max(map(len, done.out.splitlines())) <= 80, done.out
-    assert "every part of the floor is in a picture" in done.out
+    assert "every part of the floor is in an image" in done.out
     assert "black and white overlap by" in done.out
     picture = cv2.imread(str(drawn))
     assert picture is not None
@@ -187,7 +189,7 @@ def test_overlaps_need_no_tape(ipsys: Ipsys, lab: Path) -> None:
     assert len(found["overlaps"]) == 2
 
 
-def test_a_slip_of_the_tape_does_not_keep_a_camera_askew(ipsys: Ipsys, lab: Path) -> None:
+def test_gross_tape_error_does_not_change_the_alignment(ipsys: Ipsys, lab: Path) -> None:
     def too_short(message: Message) -> Message:
         if isinstance(message.payload, Measurement) and message.payload.id == "s000":
             distances = (Distance("A", 0.4), Distance("B", 0.5))
@@ -196,23 +198,21 @@ def test_a_slip_of_the_tape_does_not_keep_a_camera_askew(ipsys: Ipsys, lab: Path
 
     found = aligned(ipsys, changed(lab, too_short))
     assert found["coverage"] is None
-    assert "the measured places were left out: measurement s000" in " ".join(found["notes"])
+    assert "the calibration points were not used: measurement s000" in " ".join(found["notes"])
     assert len(found["cameras"]) == 3
 
 
-def test_a_camera_that_was_moved_after_its_places_were_measured(
-    ipsys: Ipsys, lab: Path, tmp_path: Path
-) -> None:
+def test_camera_moved_after_the_measurement_gives_a_note(ipsys: Ipsys, lab: Path, tmp_path: Path) -> None:
     tilted = hung({"white": (4.0, 270.0)})
     assert ipsys("fit", lab, "--model", "poly").code == 0
     log = film(tmp_path / "moved.mcap", tilted)
     assert ipsys("fit", log, "--model", "poly", "--model-from", lab).code == 0
     found = aligned(ipsys, log)
-    assert "camera white hangs otherwise than when its places" in " ".join(found["notes"])
+    assert "camera white has moved since its calibration points" in " ".join(found["notes"])
     assert found["coverage"] is not None
 
 
-def test_too_few_markers_are_said(ipsys: Ipsys, tmp_path: Path) -> None:
+def test_too_few_markers_are_reported(ipsys: Ipsys, tmp_path: Path) -> None:
     cameras = hung({"red": (3.0, 0.0)})
     done = ipsys("align", film(tmp_path / "a.mcap", cameras, places_m=()))
     assert (done.code, done.out) == (1, "")
@@ -220,13 +220,13 @@ def test_too_few_markers_are_said(ipsys: Ipsys, tmp_path: Path) -> None:
     one = aligned(ipsys, film(tmp_path / "a.mcap", cameras, places_m=PLACES_M[:1]))
     red = one["cameras"]["red"]
     assert (red["spread_cm"], red["tilt_deg"], red["level"]) == (None, None, None)
-    assert "one says nothing" in red["advice"]
-    assert any("at least three measured places" in note for note in one["notes"])
+    assert "one is not enough" in red["advice"]
+    assert any("at least three calibration points" in note for note in one["notes"])
     near = aligned(ipsys, film(tmp_path / "a.mcap", hung({"red": (0.0, 0.0)}), ((0, 0), (0.5, 0), (0, 0.4))))
     assert any("span only" in note for note in near["notes"])
 
 
-def test_what_a_log_lacks(ipsys: Ipsys, lab: Path, tmp_path: Path) -> None:
+def test_missing_data_of_a_log_give_notes(ipsys: Ipsys, lab: Path, tmp_path: Path) -> None:
     cameras = hung({"red": (3.0, 0.0)})
     done = ipsys("align", film(tmp_path / "a.mcap", cameras, rig=None))
     assert (done.code, done.out) == (1, "")
@@ -244,7 +244,7 @@ def test_what_a_log_lacks(ipsys: Ipsys, lab: Path, tmp_path: Path) -> None:
 
     found = aligned(ipsys, changed(lab, no_floor))
     assert found["coverage"] is None
-    assert any("coverage needs the floor: write [floor]" in note for note in found["notes"])
+    assert any("coverage needs the size of the floor: write [floor]" in note for note in found["notes"])
 
 
 def test_camera_points_without_markers_are_by_eq_3(ipsys: Ipsys, data: Path, tmp_path: Path) -> None:

@@ -118,7 +118,7 @@ def test_all_of_it_as_json_and_in_all_formats(ipsys: Ipsys, red: Path, tmp_path:
         assert lens.K[0, 0] == found["parameters"]["fx"]
 
 
-def test_nothing_is_written_over_without_being_told(ipsys: Ipsys, red: Path, tmp_path: Path) -> None:
+def test_existing_files_are_overwritten_only_on_request(ipsys: Ipsys, red: Path, tmp_path: Path) -> None:
     file = tmp_path / "mine.yaml"
     file.write_text("precious")
     line = refused(ipsys, tmp_path, red, "--board", "6x4", "-o", file)
@@ -189,7 +189,7 @@ def test_a_video(ipsys: Ipsys, rendered: Path, tmp_path: Path) -> None:
         ("charuco:6x4", "but a chessboard of 6 x 4 inner corners is seen in 3 of 3 tried: give --board 6x4"),
     ],
 )
-def test_another_board_than_said(ipsys: Ipsys, red: Path, tmp_path: Path, board: str, said: str) -> None:
+def test_wrong_board_size_is_reported(ipsys: Ipsys, red: Path, tmp_path: Path, board: str, said: str) -> None:
     for path in list(red.iterdir())[3:]:
         path.unlink()
     assert said in refused(ipsys, tmp_path, red, "--board", board, "-o", tmp_path)
@@ -269,7 +269,7 @@ def test_pictures_without_the_board_are_named(ipsys: Ipsys, red: Path, tmp_path:
     cv2.imwrite(str(red / "98.png"), np.full(SIZE_PX[::-1], 90, np.uint8))
     done = calibrate(ipsys, red, "--board", "6x4", "-o", tmp_path)
     assert done.code == 0, done.err
-    assert "not seen: 98.png: the board is not seen" in done.out
+    assert "board not found: 98.png: the board is not seen" in done.out
 
 
 def test_better_model_is_named(ipsys: Ipsys, red: Path, tmp_path: Path) -> None:

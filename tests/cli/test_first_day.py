@@ -75,7 +75,7 @@ COMMANDS = {
 
 @pytest.mark.parametrize("command", COMMANDS)
 @pytest.mark.parametrize("fault", FAULTS)
-def test_a_bad_source_or_lens_is_said_before_any_camera_is_opened(
+def test_bad_source_or_intrinsics_are_reported_before_cameras_open(
     ipsys: Ipsys, tmp_path: Path, monkeypatch: pytest.MonkeyPatch, fitted: Path, command: str, fault: str
 ) -> None:
     cameras, said = FAULTS[fault]
@@ -102,7 +102,7 @@ def test_a_bad_source_or_lens_is_said_before_any_camera_is_opened(
         (("record", "-o", "a.mcap", "--detect", "--corners", "best"), "best"),
         (("record", "-o", "a.mcap", "--model-from", "old.mcap"), "has no effect without --measure"),
         (("record", "-o", "a.mcap", "--measure", "--model-from", "none.mcap"), "none.mcap"),
-        (("record", "-o", "a.mcap", "--measure", "--host", "192.0.2.1"), "--host 192.0.2.1: cannot be"),
+        (("record", "-o", "a.mcap", "--measure", "--host", "192.0.2.1"), "cannot listen on this address"),
         (("live", "-o", "a.mcap", "--model-from", "none.mcap"), "none.mcap"),
         (("live", "-o", "a.mcap", "--model-from", "FITTED", "--model", "best"), "has no fitted model best"),
         (("live", "-o", "old.mcap", "--model-from", "FITTED"), "old.mcap: exists already"),
@@ -111,10 +111,10 @@ def test_a_bad_source_or_lens_is_said_before_any_camera_is_opened(
         (("align", "--corners", "best"), "best"),
         (("calibrate", "--board", "6x4", "-o", "old.yaml"), "old.yaml: exists already"),
         (("calibrate", "--board", "6x4", "-o", "/proc"), "cannot write into /proc"),
-        (("calibrate", "--board", "6x4", "--plot", "a.doc"), "let its name end in .png"),
+        (("calibrate", "--board", "6x4", "--plot", "a.doc"), "use a name that ends in .png"),
     ],
 )
-def test_what_cannot_be_done_is_said_before_any_camera_is_opened(
+def test_impossible_request_is_reported_before_cameras_open(
     ipsys: Ipsys, tmp_path: Path, monkeypatch: pytest.MonkeyPatch, fitted: Path,
     arguments: tuple[str, ...], said: str,
 ) -> None:  # fmt: skip
@@ -172,7 +172,7 @@ def test_a_lens_comes_out_of_a_log(ipsys: Ipsys, tmp_path: Path, lab: Path) -> N
     assert "holds no calibration of camera green; it has those of: black, red, white" in done.err
 
 
-def test_a_name_without_an_ending_gets_it_and_that_is_said(
+def test_file_name_gets_a_missing_suffix_and_a_message(
     ipsys: Ipsys, tmp_path: Path, lab: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     monkeypatch.chdir(tmp_path)
@@ -199,9 +199,7 @@ def test_aligning_now_says_what_is_kept(ipsys: Ipsys, tmp_path: Path, lab: Path)
         assert {run.stage for run in session.runs()} == {"detect", "camera-frame"}
 
 
-def test_what_is_wrong_with_frames_just_taken_names_no_file_that_is_gone(
-    ipsys: Ipsys, tmp_path: Path, lab: Path
-) -> None:
+def test_error_in_live_frames_names_no_deleted_file(ipsys: Ipsys, tmp_path: Path, lab: Path) -> None:
     rig = write_rig(tmp_path, played(lab))
     done = ipsys("calibrate", "--rig", rig, "--board", "6x4", "--seconds", "1")
     assert done.code == 1
@@ -243,7 +241,7 @@ def test_a_picture_of_no_kind_is_refused_before_any_work(
     for name in ("floor.doc", "floor"):
         done = ipsys(*arguments, lab, "--plot", lab.parent / name)
         assert done.code == 1
-        assert "is no kind of picture; let its name end in .png, .pdf, .svg" in done.err
+        assert "is not a figure file; use a name that ends in .png, .pdf, .svg" in done.err
     assert lab.read_bytes() == before
     assert not (lab.parent / "floor").exists()
 

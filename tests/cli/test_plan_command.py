@@ -167,7 +167,7 @@ def test_the_picture(ipsys: Ipsys, fitted: Path) -> None:
     assert sorted(path.name for path in fitted.parent.iterdir()) == ["paper.mcap", "plan.png"]
 
 
-def test_the_authors_ten_places_want_more_where_there_are_none(ipsys: Ipsys, authors: Path) -> None:
+def test_plan_for_ten_paper_points_fills_the_gaps(ipsys: Ipsys, authors: Path) -> None:
     found = planned(ipsys, authors, "--train", "train_10", "--places", 6)
     with Session([authors]) as session:
         measurements = session.payloads(session.topics(MEASUREMENTS))
@@ -196,14 +196,14 @@ def test_the_authors_ten_places_want_more_where_there_are_none(ipsys: Ipsys, aut
     assert full["mean_after_cm"] > 0.95 * full["mean_before_cm"]
 
 
-def test_a_log_without_measured_places_says_what_to_do_first(ipsys: Ipsys, paper: Path) -> None:
+def test_plan_without_calibration_points_names_the_first_step(ipsys: Ipsys, paper: Path) -> None:
     log = rewrite(paper, drop_measured)
     line = refused(ipsys, log)
     assert "no place is measured yet" in line
     assert "measure about 10 places, spread over the view of each camera out to its edges" in line
 
 
-def test_what_cannot_be_planned_is_refused(ipsys: Ipsys, paper: Path) -> None:
+def test_impossible_plan_is_refused(ipsys: Ipsys, paper: Path) -> None:
     assert "does not exist" in refused(ipsys, paper, paper.with_name("none.mcap"))
     for count in (0, -1, 51):
         assert f"--places {count}: plan 1 to 50 places at a time" in refused(ipsys, paper, "--places", count)
@@ -218,7 +218,7 @@ def test_what_cannot_be_planned_is_refused(ipsys: Ipsys, paper: Path) -> None:
     assert "no camera sees a whole marker 3.5 m above the floor" in refused(ipsys, paper, "--height-m", "3.5")
 
 
-def test_too_few_places_are_said(ipsys: Ipsys, paper: Path) -> None:
+def test_too_few_points_are_reported(ipsys: Ipsys, paper: Path) -> None:
     def few(message: Message) -> Message | None:
         payload = message.payload
         return None if isinstance(payload, Measurement) and payload.id > "s003" else message
@@ -226,7 +226,7 @@ def test_too_few_places_are_said(ipsys: Ipsys, paper: Path) -> None:
     assert "best needs at least 5 measured places" in refused(ipsys, rewrite(paper, few))
 
 
-def test_what_the_log_lacks_is_noted(ipsys: Ipsys, authors: Path) -> None:
+def test_missing_data_of_the_log_give_notes(ipsys: Ipsys, authors: Path) -> None:
     """No lenses, no floor, no reference points, and a camera that no place was measured for."""
 
     def bare(message: Message) -> Message | None:
@@ -243,13 +243,13 @@ def test_what_the_log_lacks_is_noted(ipsys: Ipsys, authors: Path) -> None:
     assert {camera for place in found["places"] for camera in place["cameras"]} <= {"red", "white"}
     assert all(place["distances_m"] == {} and place["side"] is None for place in found["places"])
     notes = " ".join(found["notes"])
-    assert "camera black has no model: first measure about 10 places in its view" in notes
-    assert "camera red has no lens" in notes
+    assert "camera black has no model: first measure about 10 points in its field of view" in notes
+    assert "camera red has no intrinsics" in notes
     assert "the rig has no floor" in notes
-    assert "no two reference points" in notes
+    assert "fewer than two reference points" in notes
 
 
-def test_with_three_reference_points_no_side_is_told(ipsys: Ipsys, fitted: Path) -> None:
+def test_plan_with_three_reference_points_gives_no_side(ipsys: Ipsys, fitted: Path) -> None:
     rig = fitted.with_name("lab.toml")
     ipsys("init", rig, "--from", fitted)
     rig.write_text(rig.read_text() + '\n[[reference_points]]\nname = "corner"\nx_m = 0.0\ny_m = 0.0\n')
@@ -262,7 +262,7 @@ def test_with_three_reference_points_no_side_is_told(ipsys: Ipsys, fitted: Path)
     assert "corner" in done.out
 
 
-def test_no_marker_is_laid_on_a_reference_point(ipsys: Ipsys, fitted: Path) -> None:
+def test_planned_markers_do_not_cover_a_reference_point(ipsys: Ipsys, fitted: Path) -> None:
     rig = fitted.with_name("lab.toml")
     ipsys("init", rig, "--from", fitted)
     (best,) = planned(ipsys, fitted, "--rig", rig, "--places", 1)["places"]

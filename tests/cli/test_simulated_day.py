@@ -203,7 +203,7 @@ def test_every_command_of_the_first_day_works_without_hardware(day: Day) -> None
 
 
 @pytest.mark.slow
-def test_places_of_the_simulated_lab_are_measured_on_the_page(tmp_path: Path, ipsys: Ipsys) -> None:
+def test_points_of_the_simulated_lab_are_measured_on_the_page(tmp_path: Path, ipsys: Ipsys) -> None:
     """With cameras, as by phone: nobody has to hurry, for nothing is carried away."""
     assert ipsys("init", tmp_path / "lab.toml", "--simulated").code == 0
     rows = sheet_rows(tmp_path / "lab_tape.csv")

@@ -34,7 +34,7 @@ def lens(model: str) -> CameraCalibration:
 
 @pytest.mark.parametrize("model", list(COEFFICIENTS))
 @pytest.mark.parametrize("write", [opencv_yaml, ros_yaml])
-def test_what_is_written_is_read_to_the_last_digit(
+def test_written_calibration_reads_back_exactly(
     tmp_path: Path, model: str, write: Callable[..., str]
 ) -> None:
     path = tmp_path / "red.yaml"

@@ -89,7 +89,7 @@ def test_contradicting_distances_are_weighed_as_scipy_does(seed: int, count: int
     np.testing.assert_allclose(found.covariance_m2, np.linalg.inv(slope.T @ slope), rtol=1e-4, atol=1e-12)
 
 
-def test_the_side_decides_where_two_places_fit_as_well() -> None:
+def test_side_selects_one_of_two_equal_solutions() -> None:
     """A third reference point 10 cm off the line through the others hardly tells its sides apart."""
     references = np.array([[0.0, 0.0], [4.0, 0.0], [2.0, 0.1]])
     point = np.array([2.1, 0.6])
@@ -103,7 +103,7 @@ def test_the_side_decides_where_two_places_fit_as_well() -> None:
     np.testing.assert_allclose(multilaterate(references, distances, side="right").point_m, point, atol=1e-6)
 
 
-def test_a_gross_contradiction_is_told_not_refused() -> None:
+def test_gross_contradiction_is_reported_and_not_refused() -> None:
     references, point = np.array([A, B, C]), np.array([2.0, 3.5])
     distances = ranges(point, references) + np.array([0.1, 0, 0])
     found = multilaterate(references, distances, np.full(3, 0.003))
@@ -168,7 +168,7 @@ def test_the_side_is_not_asked_where_the_distances_tell() -> None:
 
 
 @pytest.mark.parametrize("angle_deg", [5.0, 20.0, 45.0, 90.0, 135.0])
-def test_two_tapes_know_a_place_by_their_angle(angle_deg: float) -> None:
+def test_covariance_of_two_tapes_depends_on_their_angle(angle_deg: float) -> None:
     angle, sigma = np.radians(angle_deg), 0.003
     # From the point, the references lie 2 m and 3 m away, this angle apart.
     references = -np.array([[2.0, 0.0], [3 * np.cos(angle), 3 * np.sin(angle)]])
@@ -191,7 +191,7 @@ def test_the_crossing_angle_by_the_law_of_cosines(numbers: tuple[float, ...]) ->
     assert np.cos(crossing_angle(point, np.array([a, b]))) == pytest.approx(cosine, abs=1e-9)
 
 
-def test_of_three_tapes_the_widest_crossing_counts() -> None:
+def test_best_crossing_angle_of_three_tapes_counts() -> None:
     middle = (A + B) / 2 + [0, 0.05]
     assert crossing_angle(middle, np.array([A, B])) < np.radians(6)
     assert crossing_angle(middle, np.array([A, B, middle + np.array([0, 1.0])])) > np.radians(87)
@@ -243,7 +243,7 @@ def test_on_the_line_the_covariance_is_finite_and_about_what_samples_scatter(alo
 
 
 @given(st.tuples(*[coordinates] * 6), st.floats(1e-4, 0.05))
-def test_no_place_has_a_covariance_without_bound(numbers: tuple[float, ...], sigma: float) -> None:
+def test_point_covariance_is_bounded(numbers: tuple[float, ...], sigma: float) -> None:
     a, b, point = np.array(numbers).reshape(3, 2)
     covariance = tape_covariance(point, np.array([a, b]), np.full(2, sigma))
     assert np.isfinite(covariance).all()
@@ -253,7 +253,7 @@ def test_no_place_has_a_covariance_without_bound(numbers: tuple[float, ...], sig
     assert large <= 2 * sigma * (longest + sigma) + sigma**2 / 2
 
 
-def test_sides_are_alike_where_three_points_lie_nearly_on_a_line() -> None:
+def test_both_sides_fit_nearly_collinear_reference_points() -> None:
     assert are_collinear(np.array([[0.0, 0.0], [2.0, 0.0], [4.0, 0.06]]))
     assert not are_collinear(np.array([[0.0, 0.0], [2.0, 0.3], [4.0, 0.0]]))
 
@@ -276,7 +276,7 @@ def test_sides_are_alike_where_three_points_lie_nearly_on_a_line() -> None:
         ([A, B], [1.7, 1.9], [0.003, np.nan], "left", "sigmas"),
     ],
 )
-def test_what_cannot_form_a_point_is_refused(
+def test_distances_without_a_solution_are_refused(
     references: list[Array], distances: list[float], sigmas: list[float] | None, side: str | None, said: str
 ) -> None:
     with pytest.raises(IpsysError, match=said):

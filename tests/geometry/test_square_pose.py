@@ -182,7 +182,7 @@ def test_both_solutions_are_there() -> None:
     ("length_m", "sigma_px", "most"),
     [(0.2, 0.03, 0.0), (0.2, 0.25, 0.006), (0.1, 0.03, 0.002), (0.1, 0.25, 0.01)],
 )
-def test_how_often_the_other_solution_is_taken(length_m: float, sigma_px: float, most: float) -> None:
+def test_rate_of_wrong_pose_choices_is_bounded(length_m: float, sigma_px: float, most: float) -> None:
     """Neither the corners nor the tilt alone choose as well; docs/method.md has the figures."""
     rng = np.random.default_rng(7)
     axes, _, seen_px = random_poses(2000, rng, FISHEYE, length_m)
@@ -206,7 +206,7 @@ def test_corners_outweigh_the_tilt_where_they_are_sure() -> None:
 @pytest.mark.parametrize(
     ("place_m", "least_m", "most_m"), [(CENTRE, 0.002, 0.006), (MIDWAY, 0.05, 0.08), (EDGE, 0.12, 0.25)]
 )
-def test_what_a_tilt_of_5_degrees_costs(
+def test_error_of_a_5_degree_tilt_is_bounded(
     place_m: tuple[float, float, float], least_m: float, most_m: float
 ) -> None:
     """Eq. (3) takes the foreshortened marker for a farther one; docs/method.md has the figures."""

@@ -262,14 +262,14 @@ def test_any_bit_of_the_header_may_be_wrong(size: tuple[int, int], interval: int
 
 @given(data=st.binary(max_size=80))
 @ENOUGH
-def test_what_only_begins_like_a_jpeg_is_damaged(data: bytes) -> None:
+def test_jpeg_header_without_an_image_is_damaged(data: bytes) -> None:
     for whole in (data, b"\xff\xd8" + data, b"\xff\xd8\xff\xc0" + data + b"\xff\xd9"):
         with pytest.raises(FrameError):
             decode_rows(CompressedImage(0, "red", whole, "jpeg"), [slice(0, 9)])
 
 
 @pytest.mark.parametrize("interval", [0, 40], ids=["plain", "restarts"])
-def test_nothing_of_an_earlier_picture_shows(interval: int) -> None:
+def test_undecoded_rows_do_not_show_an_earlier_image(interval: int) -> None:
     """All cameras of a thread are decoded into the same memory: what is not decoded is black."""
     first, second = (packed(colourful(320, 480, n), "4:2:0", interval) for n in (1, 2))
     decode_rows(CompressedImage(0, "red", first, "jpeg"))

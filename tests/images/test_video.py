@@ -96,7 +96,7 @@ def test_markers_are_found_from_the_first_keyframe_on(pictures: Path) -> None:
         assert np.abs(marker.corners_px[0] - [39.5 + 4 * frame.timestamp, 59.5]).max() < 0.7
 
 
-def test_what_is_no_video_is_a_corrupt_frame(pictures: Path) -> None:
+def test_invalid_video_data_is_a_corrupt_frame(pictures: Path) -> None:
     video = frames(encode(pictures, "video.mp4", *CODECS["h264"]), "h264")
     broken = CompressedVideo(3, "red", b"\x00\x00\x00\x01\x65nothing of the kind", "h264")
     found = run(Detect("stock"), [*video[:3], broken, *video[5:]])
@@ -114,7 +114,7 @@ def test_a_picture_that_needs_a_later_one_is_named(pictures: Path) -> None:
 
 
 @pytest.mark.parametrize("name", CODECS)
-def test_what_lies_before_a_keyframe_has_no_effect_even_on_a_damaged_one(pictures: Path, name: str) -> None:
+def test_frames_before_a_keyframe_do_not_change_its_image(pictures: Path, name: str) -> None:
     """A live run that fell behind goes on with a keyframe; its replay has decoded all before that."""
     video = frames(encode(pictures, "video.mp4", *CODECS[name]), name)
     assert [n for n, frame in enumerate(video) if is_keyframe(frame)] == [0, 5, 10]

@@ -108,7 +108,7 @@ def test_reading_command_names_repair_for_an_append_cut_short(ipsys: Ipsys, path
     assert not said[-1]
 
 
-def test_repair_mends_an_append_cut_short(ipsys: Ipsys, path: Path) -> None:
+def test_repair_rolls_back_an_interrupted_append(ipsys: Ipsys, path: Path) -> None:
     old = path.read_bytes()
     for cut in killed_at_each_operation(path, NEW):
         assert ipsys("repair", path).code == 0

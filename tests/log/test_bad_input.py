@@ -306,7 +306,7 @@ def test_a_damaged_chunk_in_the_middle_costs_only_itself(log: Path) -> None:
     assert not repair(log).changed
 
 
-def test_what_lay_in_a_damaged_chunk_is_named_exactly(tmp_path: Path) -> None:
+def test_messages_lost_in_a_damaged_chunk_are_named_exactly(tmp_path: Path) -> None:
     """By the message indexes behind it, which are whole."""
     rows = [(f"/image/{k % 3}", k * 10**8, k, bytes([k]) * 3000) for k in range(60)]
     rows += [("/points", k * 10**8 + 1, k, bytes([k]) * 40) for k in range(60)]

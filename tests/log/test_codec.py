@@ -91,7 +91,7 @@ def same(one: Any, other: Any) -> bool:
 
 
 @given(payloads)
-def test_what_is_read_is_what_was_written(payload: Any) -> None:
+def test_reader_returns_the_written_messages(payload: Any) -> None:
     name = next(key for key, kind in PAYLOADS.items() if kind is type(payload))
     data = encode(payload)
     back = decode(name, data)

@@ -173,7 +173,7 @@ def test_larger_recording(tmp_path: Path) -> None:
     check_recording(tmp_path / "crashed", rows, operations, tries=10)
 
 
-def test_what_was_made_of_a_frame_is_never_there_without_it(tmp_path: Path) -> None:
+def test_results_of_a_frame_are_never_stored_without_the_frame(tmp_path: Path) -> None:
     """Whenever a recorder is killed: what it has handed to the system is there, and nothing else."""
     rows: list[Row] = [("/points", 0, 0, b"a note before the first frame")]
     for k in range(6, 60):
@@ -207,7 +207,7 @@ def test_an_atomic_log_is_there_whole_or_not_at_all(tmp_path: Path) -> None:
     assert content == whole
 
 
-def test_what_a_killed_recorder_flushed_is_there(tmp_path: Path) -> None:
+def test_flushed_messages_of_a_killed_recorder_are_kept(tmp_path: Path) -> None:
     path = tmp_path / "recording.mcap"
     writer = LogWriter.create(path)
     writer.add_channel("/points", POINT)

@@ -163,7 +163,7 @@ def test_channels_of_one_topic_that_differ(tmp_path: Path) -> None:
             reader.messages()
 
 
-def test_images_in_a_compressed_log_are_read_in_place(tmp_path: Path) -> None:
+def test_images_in_a_compressed_log_are_read_directly(tmp_path: Path) -> None:
     """Raw blocks of zstd and lz4 frames; messages that span blocks; compressible ones in between."""
     chance = random.Random(1)
     for compression in (CompressionType.ZSTD, CompressionType.LZ4):

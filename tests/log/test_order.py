@@ -47,7 +47,7 @@ def test_by_time_then_chunk_then_offset(chunks: list[Chunk]) -> None:
 
 
 @given(CHUNKS)
-def test_no_chunk_is_opened_before_its_time(chunks: list[Chunk]) -> None:
+def test_chunks_are_opened_as_late_as_possible(chunks: list[Chunk]) -> None:
     opened = Opened(chunks)
     last_ns = 0
     for message in in_log_order(opened.pending, fault):

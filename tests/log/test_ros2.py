@@ -108,7 +108,7 @@ def test_a_bag_is_detected_in_place(bag: Path, tmp_path: Path, ipsys: Ipsys) -> 
     }
 
 
-def test_what_is_no_message_is_named(bag: Path) -> None:
+def test_invalid_messages_are_reported(bag: Path) -> None:
     with bag.open("rb") as file:
         schema, _, message = next(iter(make_reader(file).iter_messages("/red/camera_info")))
     assert schema is not None

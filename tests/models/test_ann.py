@@ -42,7 +42,7 @@ def test_its_slopes_are_those_of_finite_differences() -> None:
     np.testing.assert_allclose(found[0].T, numeric, atol=1e-5)
 
 
-def test_it_learns_what_another_network_of_its_kind_says() -> None:
+def test_network_learns_the_output_of_another_network() -> None:
     rng = np.random.default_rng(2)
     x, elsewhere = rng.normal(size=(200, 3)), rng.normal(size=(200, 3))
     teacher = MLPRegressor(
@@ -84,7 +84,7 @@ def test_a_seed_gives_the_same_network_and_another_another() -> None:
     assert not np.array_equal(one, other)
 
 
-def test_it_keeps_scikit_learns_contract() -> None:
+def test_estimator_passes_scikit_learn_checks() -> None:
     with warnings.catch_warnings():
         warnings.simplefilter("ignore", SkipTestWarning)
         check_estimator(NeuralNetwork())

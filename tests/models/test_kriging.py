@@ -52,7 +52,7 @@ def test_mean_and_variance_are_those_of_the_textbook(noisy: bool) -> None:
     np.testing.assert_allclose(std, np.sqrt(variance) * model.target_scale_, rtol=1e-3, atol=1e-6)
 
 
-def test_interpolation_goes_through_its_places_and_is_uncertain_away_from_them() -> None:
+def test_interpolation_is_exact_at_points_and_uncertain_elsewhere() -> None:
     x, y = wavy(1)
     model = Kriging().fit(x, y)
     found, std = model.predict(x, return_std=True)
@@ -70,7 +70,7 @@ def test_regression_finds_the_noise() -> None:
     assert np.abs(model.predict(x) - y).std() > 0.1
 
 
-def test_no_other_parameters_are_more_likely() -> None:
+def test_fitted_parameters_maximise_the_likelihood() -> None:
     from scipy.stats import multivariate_normal
 
     x, y = wavy(3, count=40, noise=0.1)
@@ -92,7 +92,7 @@ def test_no_other_parameters_are_more_likely() -> None:
     assert log_likelihood(best) >= max(log_likelihood(np.clip(o, low, high)) for o in others) - 1e-6
 
 
-def test_two_measurements_of_one_place_do_not_break_it() -> None:
+def test_duplicate_points_do_not_break_the_fit() -> None:
     x, y = wavy(4)
     x[5] = x[6]
     found = Kriging().fit(x, y).predict(x)
@@ -105,7 +105,7 @@ _TOO_FEW = {"check_regressor_multioutput": "has fewer rows than a linear trend o
 
 
 @pytest.mark.parametrize("noisy", [False, True])
-def test_it_keeps_scikit_learns_contract(noisy: bool) -> None:
+def test_estimator_passes_scikit_learn_checks(noisy: bool) -> None:
     with warnings.catch_warnings():
         warnings.simplefilter("ignore", SkipTestWarning)
         check_estimator(Kriging(noisy), expected_failed_checks=_TOO_FEW)

@@ -41,7 +41,7 @@ def test_rigid_is_what_scipy_finds(seed: int, noise_m: float) -> None:
     np.testing.assert_allclose(translation, world.mean(axis=0) - oracle.apply(points.mean(axis=0)), atol=1e-5)
 
 
-def test_a_flat_set_of_places_gives_a_rotation_and_not_a_reflection() -> None:
+def test_coplanar_points_give_a_rotation_not_a_reflection() -> None:
     points, _ = places(0)
     points[:, 2] = 2.0  # all at one height
     turn = Rotation.from_euler("xyz", (3.1, 0.02, 0.03))
@@ -126,7 +126,7 @@ def test_unknown_models_and_parameters_are_named() -> None:
 
 
 @pytest.mark.parametrize("name", ["rigid", "poly", "rigid+poly", "rayplane", "best"])
-def test_without_checks_a_model_says_the_same_to_the_last_bit(name: str) -> None:
+def test_prediction_without_input_checks_is_bit_identical(name: str) -> None:
     points, world = places(0)
     heights = np.full(len(points), 0.1)
     model = create(name).fit(inputs(name, points, heights), np.column_stack([world[:, :2], heights]))

@@ -48,7 +48,7 @@ def evaluation(
     return Evaluation(0, model, rows, points)
 
 
-def test_the_paper_s_data_ask_for_rigid_with_10_places_and_poly_from_30(paper: Findings) -> None:
+def test_paper_data_recommend_rigid_with_10_points_poly_from_30(paper: Findings) -> None:
     """Sect. 4.1: the rigid transformation exceeds the polynomial with 10 places, and falls behind later."""
     advice = paper.advice
     assert advice is not None
@@ -71,14 +71,12 @@ def test_the_paper_s_data_on_random_subsets_say_the_same(paper: Findings) -> Non
 
 
 @pytest.mark.slow
-def test_our_models_save_places_on_the_paper_s_data(data: Path, tmp_path: Path) -> None:
+def test_own_models_need_fewer_points_on_the_paper_data(data: Path, tmp_path: Path) -> None:
     write_log(tmp_path / "imsel.mcap", read_imsel(data / "imsel"))
     advice = find(tmp_path / "imsel.mcap", ("rigid", "poly", "rayplane", "best")).advice
     assert advice is not None
-    assert advice.sentences[1].startswith("The model best with 10 points is as good as poly with 40")
-    assert advice.sentences[2].startswith(
-        "Where the heights of the markers are known, the model rayplane with 10 points"
-    )
+    assert advice.sentences[1].startswith("Model best with 10 points is as good as poly with 40")
+    assert advice.sentences[2].startswith("With known marker heights, model rayplane with 10 points")
 
 
 def test_the_simplest_model_within_the_noise_is_used() -> None:
@@ -115,7 +113,7 @@ def test_labelled_subsets_come_before_random_ones_where_they_have_sizes() -> Non
     assert list(one.choices) == [5, 10]
 
 
-def test_a_model_that_is_told_heights_is_not_compared_with_those_that_are_not() -> None:
+def test_models_with_known_heights_are_compared_separately() -> None:
     advice = advise(
         [evaluation("rigid", {10: 3.0, 20: 3.0}), evaluation("best", {10: 2.0, 20: 2.0}),
          evaluation("rayplane", {10: 1.0, 20: 1.0})]
@@ -148,7 +146,7 @@ def test_a_level_lab_is_judged_on_the_floor() -> None:
     assert advice.choices[10][SIMPLE].mean_m == pytest.approx(0.015)
 
 
-def test_a_number_of_places_that_a_camera_lacks_says_nothing_of_all_cameras() -> None:
+def test_mean_curve_needs_the_number_of_points_from_all_cameras() -> None:
     found = evaluation("rigid", {10: 3.0, 20: 3.0, 30: 3.0})
     other = tuple(replace(p, camera="white") for p in found.learning if p.pairs < 30)
     advice = advise([replace(found, learning=(*found.learning, *other))])
@@ -156,13 +154,13 @@ def test_a_number_of_places_that_a_camera_lacks_says_nothing_of_all_cameras() ->
     assert list(advice.choices) == [10, 20]
 
 
-def test_without_a_learning_curve_nothing_is_advised() -> None:
+def test_missing_learning_curve_gives_no_advice() -> None:
     assert advise([]) is None
     assert advise([evaluation("rigid", {10: 3.0})]) is None
     assert advise([replace(evaluation("rigid", {10: 3.0}), learning=())]) is None
 
 
-def test_one_model_alone_is_said_with_what_more_places_bring() -> None:
+def test_single_model_advice_gives_the_gain_of_more_points() -> None:
     advice = advise([evaluation("best", {10: 3.0, 40: 1.5})])
     assert advice is not None
     assert advice.sentences == (

@@ -110,14 +110,14 @@ def test_picture_is_drawn_whatever_there_is(
     assert {path.name for path in tmp_path.iterdir()} == {"lab.mcap", "lab.png"}
 
 
-def test_picture_without_a_rig_shows_places_and_tracks(tmp_path: Path) -> None:
+def test_figure_without_a_rig_shows_points_and_tracks(tmp_path: Path) -> None:
     write_log(tmp_path / "lab.mcap", messages(None, True, False))
     with Session([tmp_path / "lab.mcap"]) as session:
         draw_session(session, [], tmp_path / "lab.png")
     assert (tmp_path / "lab.png").stat().st_size > 1000
 
 
-def test_nothing_to_draw_is_said(tmp_path: Path) -> None:
+def test_log_without_data_to_draw_is_refused(tmp_path: Path) -> None:
     write_log(tmp_path / "lab.mcap", [Message("/rig", T0, T0, replace(RIG, floor=None))])
     with Session([tmp_path / "lab.mcap"]) as session, pytest.raises(IpsysError, match="nothing to draw"):
         draw_session(session, [], tmp_path / "lab.png")
@@ -162,8 +162,8 @@ def test_arrows_are_exaggerated_by_the_factor_that_is_stated(scale_m: float, fac
     axes: Axes = Figure().add_subplot()
     draw_floor(axes, FloorData(RIG, [], "poly", found, {}, {}), camera_styles(["red"]))
     title = axes.get_title(loc="left")
-    assert title == "Errors of poly on held-out places" + (
-        f", drawn {factor} times as long" if factor else ""
+    assert title == "Errors of poly at held-out points" + (
+        f", arrows {factor} times true length" if factor else ""
     )
     (arrows,) = [artist for artist in axes.collections if hasattr(artist, "scale")]
     assert arrows.scale == pytest.approx(1 / (factor or 1))

@@ -87,10 +87,10 @@ def test_the_page_in_a_browser(page: str, width: int, tmp_path: Path) -> None:
         assert natural_height > 50
         assert 0.8 * min(width, 450) < shown <= width
     for words in (
-        "Positions are off by", "What to use", "Models", "Where on the floor", "How many places are enough",
-        "Suspect measurements", "Where the tape knows little", "Where not to trust it",
-        "Does it know how wrong it is?", "How it was made", "seed=0", "would fit on the other side",
-        "1.000, 2.000, 0.100 m", "rigid+kriging-regression", "Camera white",
+        "Mean position error", "Recommended model", "Models", "Error map", "Number of calibration points",
+        "Outliers", "Uncertain tape measurements", "Extrapolation",
+        "Consistency of the covariance", "Runs and versions", "seed=0", "would fit on the other side",
+        "100.0, 200.0, 10.0", "rigid+kriging-regression", "Camera white",
     ):  # fmt: skip
         assert words in seen.text, words
 
@@ -165,7 +165,7 @@ def test_a_level_lab_with_one_camera_has_a_page(tmp_path: Path) -> None:
     outcomes = replay([log], Request(models=("rigid",)), "evaluate")
     with Session([log]) as session:
         page = render_report(session, read_accuracy(session, outcomes))
-    assert "cm on the floor, with model rigid" in page
+    assert "cm (2D, model rigid)" in page
     assert "None" not in re.sub(r"data:[^\"]+", "", page)
     assert "nan" not in re.sub(r"data:[^\"]+", "", page)
 
@@ -179,7 +179,7 @@ def test_a_model_of_another_log_has_a_page(ipsys: Ipsys, tmp_path: Path) -> None
     assert done.code == 0, done.err
     page = (tmp_path / "new.html").read_text()
     assert "held out" in page
-    assert "How many places are enough" not in page
+    assert "Number of calibration points" not in page
 
 
 TABLES = """[...document.querySelectorAll("table")].map(table => {

@@ -88,7 +88,7 @@ def test_the_same_log_gives_the_same_bytes(paper: Findings, tmp_path: Path) -> N
         assert (tmp_path / "a" / name).read_bytes() == (tmp_path / "b" / name).read_bytes()
 
 
-def test_only_what_there_is_is_drawn(tmp_path: Path) -> None:
+def test_only_available_data_are_drawn(tmp_path: Path) -> None:
     """Without labelled subsets there are no figures 10 and 11; a level lab has no errors in space."""
     log = tmp_path / "level.mcap"
     write_log(log, lab_messages(heights=(0.1,)))
@@ -181,7 +181,7 @@ def test_a_folder_in_the_way_leaves_the_other_files_as_they_were(ipsys: Ipsys, t
     assert [path.name for path in plots.iterdir()] == ["models.png"]
 
 
-def test_nothing_to_evaluate_says_so_and_writes_nothing(ipsys: Ipsys, tmp_path: Path) -> None:
+def test_log_without_points_is_refused_and_no_file_is_written(ipsys: Ipsys, tmp_path: Path) -> None:
     log = tmp_path / "few.mcap"
     write_log(log, lab_messages(count=4))
     for command in (("evaluate", log, "--plots", tmp_path / "plots"), ("report", log)):
@@ -205,7 +205,7 @@ def test_evaluate_writes_them(ipsys: Ipsys, tmp_path: Path) -> None:
     assert f"{tmp_path / 'plots'} has table_1.csv" in done.err
 
 
-def test_learning_marks_stand_at_their_numbers_of_places(paper: Findings) -> None:
+def test_learning_curve_marks_are_at_their_number_of_points(paper: Findings) -> None:
     findings = with_accuracies(paper, many_models(paper.accuracies))
     for figure in (learning_figure(findings), published_figure(findings, True)):
         for axes in figure.axes:

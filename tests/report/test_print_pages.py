@@ -187,7 +187,10 @@ def test_outlines_enclose_the_black_cells(rows: list[list[bool]]) -> None:
         (("--ids", "1;2", "--length", "0.1"), "write ids as 1,2,3 or as 0-9"),
         (("--ids", "100", "--length", "0.1"), "DICT_4X4_100 has the ids 0 to 99"),
         (("--ids", "1", "--length", "0.1", "--dictionary", "DICT_9X9"), "is none of OpenCV's"),
-        (("--ids", "1", "--length", "0.1", "--page", "a5"), "--page a5: is none of a4, letter, a3"),
+        (
+            ("--ids", "1", "--length", "0.1", "--page", "a5"),
+            "--page a5: is not known; give one of a4, letter, a3",
+        ),
         (("--board", "20x10"), "make its squares smaller, with --square"),
         (("--board", "6"), "write the inner corners of a chessboard as 6x4"),
         (("--ids", "1", "--length", "0.1", "-o", "m.png"), "only PDF keeps the true size"),

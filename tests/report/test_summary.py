@@ -113,7 +113,7 @@ def test_answer_names_model_error_and_outliers_first(paper: Findings) -> None:
     assert f"RMSE {found['rmse_cm']:.1f} cm" in rest[0]
     text = "\n".join(rest)
     outliers, errors = text.index("Outliers: measure 5 points again"), text.index("Errors in cm")
-    assert outliers < text.index("white_11, 8.0 cm off: 2: it lies right") < errors
+    assert outliers < text.index("white_11, error 8.0 cm: 2: it lies right") < errors
     assert outliers < text.index("m5 (6.0 cm)") < text.index("Between rigid and poly, use rigid") < errors
     assert "\x1b" not in text
     assert NAMES[0] in text
@@ -143,7 +143,7 @@ def test_answer_of_all_models_fits_a_window(paper: Findings, truth: bool, factor
     assert ("Against the ground truth: " in text) == truth
 
 
-def test_one_model_is_answered_by_camera(paper: Findings) -> None:
+def test_single_model_has_one_row_per_camera(paper: Findings) -> None:
     lines = printed(only(paper, "poly").accuracies).splitlines()
     assert lines[0] == "Model: poly"
     assert {line.split()[0] for line in lines[-4:]} == {"red", "white", "black", "(all)"}
@@ -154,11 +154,12 @@ def test_outliers_that_were_not_searched_are_not_none(paper: Findings) -> None:
     assert "Outliers: none." in searched
     unsearched = " ".join(printed(only(paper, "rigid").accuracies).split())
     assert (
-        "Outliers: not searched: that needs 15 points of a camera, and one of the models poly" in unsearched
+        "Outliers: not searched. The search needs 15 points of a camera, and one of the models poly"
+        in unsearched
     )
 
 
-def test_nothing_judged_is_answered_with_nothing() -> None:
+def test_no_evaluation_gives_an_empty_answer() -> None:
     assert answer_text([]) is None
     assert models_table([]) is None
     assert answer_json([]) == {}

@@ -29,7 +29,7 @@ RIG = Rig(
 )
 
 
-def test_what_is_written_reads_back(tmp_path: Path) -> None:
+def test_written_rig_reads_back(tmp_path: Path) -> None:
     path = tmp_path / "lab.toml"
     bare = replace(RIG, markers=(), cameras=(), reference_points=(), floor=None)
     for rig in (RIG, replace(bare, marker_height_m=None, tape_sigma_m=None)):
@@ -125,9 +125,7 @@ def test_a_rig_that_cannot_be_right_is_refused(change: dict[str, object], said: 
         ({"cameras": (RigCamera("red", row_time_ns=31),)}, "too little for ns; write 31000 if that is us"),
     ],
 )
-def test_what_was_meant_in_another_unit_is_refused_in_a_rig_file(
-    tmp_path: Path, change: dict[str, object], said: str
-) -> None:
+def test_rig_file_with_a_wrong_unit_is_refused(tmp_path: Path, change: dict[str, object], said: str) -> None:
     path = tmp_path / "lab.toml"
     path.write_text(rig_toml(replace(RIG, **change)))  # type: ignore[arg-type]
     with pytest.raises(IpsysError, match=f"lab.toml: .*{said}"):

@@ -70,7 +70,7 @@ def test_stage_writes_a_payload_type_to_one_channel() -> None:
         ("/rig", None, None),
     ],
 )
-def test_channel_is_told_by_topic_and_payload(
+def test_channel_is_identified_by_topic_and_payload(
     topic: str, payload: type | None, channel: channels.Channel | None
 ) -> None:
     assert channel_of(topic, payload) is channel

@@ -132,7 +132,7 @@ def test_a_run_holds_only_what_belongs_together(ipsys: Ipsys, paper: Path, tmp_p
     assert {again[stage] for stage in ("fit", "evaluate", "locate", "fuse")} == {("poly_3", True)}
 
 
-def test_topics_without_a_record_are_nobodys_and_are_left_alone(ipsys: Ipsys, paper: Path) -> None:
+def test_topics_without_a_record_are_ignored(ipsys: Ipsys, paper: Path) -> None:
     ipsys("replay", paper)
     log = without(paper, lambda m: isinstance(m.payload, Run) and m.payload.stage in ("fit", "locate"))
     with Session([log]) as session:
@@ -164,7 +164,7 @@ def test_a_named_run_takes_the_shared_detection(ipsys: Ipsys, lab: Path) -> None
     assert lab.read_bytes() == before
 
 
-def test_one_name_for_several_models_is_refused_before_anything_is_made(ipsys: Ipsys, paper: Path) -> None:
+def test_one_run_name_for_several_models_is_refused_first(ipsys: Ipsys, paper: Path) -> None:
     before = paper.read_bytes()
     done = ipsys("evaluate", paper, "--run", "x")
     assert done.code == 1
@@ -172,9 +172,7 @@ def test_one_name_for_several_models_is_refused_before_anything_is_made(ipsys: I
     assert paper.read_bytes() == before
 
 
-def test_a_seed_changes_the_folds_and_nothing_else_where_places_are_labelled(
-    ipsys: Ipsys, paper: Path
-) -> None:
+def test_seed_changes_only_the_folds_of_labelled_points(ipsys: Ipsys, paper: Path) -> None:
     ipsys("replay", paper)
     made = runs_of(ipsys, "replay", paper, "--seed", 5)
     assert {stage for stage, (_, new) in made.items() if new} == {"evaluate"}
@@ -232,7 +230,7 @@ def test_a_camera_that_the_model_does_not_know_is_named(ipsys: Ipsys, paper: Pat
     assert "camera red has no model" in done.err
 
 
-def test_a_model_knows_the_places_it_was_made_of(ipsys: Ipsys, paper: Path, tmp_path: Path) -> None:
+def test_model_contains_its_calibration_points(ipsys: Ipsys, paper: Path, tmp_path: Path) -> None:
     plain = change(paper, lambda p: replace(p, splits=()) if hasattr(p, "splits") else p)
     fitted = tmp_path / "fitted.mcap"
     assert ipsys("fit", plain, "-o", fitted).code == 0
@@ -309,7 +307,7 @@ def test_a_model_and_its_evaluation_speak_of_the_last_input(ipsys: Ipsys, lab: P
     assert model.payload.timestamp == model.publish_time_ns
 
 
-def test_places_measured_for_nothing_are_named(ipsys: Ipsys, paper: Path) -> None:
+def test_points_that_no_camera_saw_are_named(ipsys: Ipsys, paper: Path) -> None:
     def late(payload: Any) -> Any:
         if getattr(payload, "id", "") == "s003":
             return replace(payload, still=None, timestamp=payload.timestamp + 10**15)
@@ -342,9 +340,7 @@ def test_a_log_knows_the_model_that_was_copied_into_it(ipsys: Ipsys, paper: Path
     assert "no measurements" in ipsys("replay", drive, "--model", "rigid").err
 
 
-def test_the_rig_of_a_log_can_be_taken_out_mended_and_given_back(
-    ipsys: Ipsys, paper: Path, tmp_path: Path
-) -> None:
+def test_rig_of_a_log_can_be_exported_edited_and_used(ipsys: Ipsys, paper: Path, tmp_path: Path) -> None:
     path = tmp_path / "mended.toml"
     ipsys("replay", paper)
     assert ipsys("init", path, "--from", paper).code == 0

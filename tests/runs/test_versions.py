@@ -96,7 +96,7 @@ def test_changed_stage_is_done_again_beside_the_old_run(
 
 
 @pytest.mark.parametrize("changed", ["camera-frame", "perimeter", "fit", "evaluate", "locate", "fuse"])
-def test_after_a_replay_all_that_it_used_is_current(
+def test_replay_leaves_its_runs_current(
     changed: str, ipsys: Ipsys, log: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     monkeypatch.setitem(VERSIONS, changed, 2)
@@ -239,7 +239,7 @@ def test_run_without_its_inputs_is_not_repeatable_and_later_stages_go_on(
     assert "/runs/poly/tracks" in ipsys("verify", log, "--json").out
 
 
-def test_unfinished_run_is_said_to_be(ipsys: Ipsys, log: Path, tmp_path: Path) -> None:
+def test_unfinished_run_has_the_state_unfinished(ipsys: Ipsys, log: Path, tmp_path: Path) -> None:
     short = tmp_path / "short.mcap"
     with Session([log]) as session, LogWriter.create(short) as writer:
         from ipsys_log.runs.output import write_message

@@ -112,7 +112,7 @@ def rotated(heading_rad: float) -> tuple[list[float], list[float]]:
     return [c, s], [s, -c]
 
 
-def test_a_measurement_lies_in_its_still_interval_and_names_a_place(session: list[Message]) -> None:
+def test_measurement_is_within_its_stationary_interval(session: list[Message]) -> None:
     truth = {
         (m.payload.timestamp, t.id): t
         for m in session
@@ -150,7 +150,7 @@ def test_tape_and_ruler_err_by_their_sigmas() -> None:
     assert taken[0].height_sigma_m == 0.002
 
 
-def test_each_camera_gets_its_places_and_a_fifth_of_them_is_held_out() -> None:
+def test_each_camera_gets_its_points_and_a_fifth_are_held_out() -> None:
     settings = LabSettings()
     cameras = mount_cameras(settings)
     sets = plan_points(settings, cameras)

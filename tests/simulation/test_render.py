@@ -93,7 +93,7 @@ def edge_errors(view: View, placed: PlacedMarker, settings: LabSettings) -> Arra
 
 
 @pytest.mark.parametrize("turn_rad", [0.0, np.pi / 2, 0.3, 2.0])
-def test_edges_lie_where_they_should_to_a_hundredth_of_a_pixel(views: list[View], turn_rad: float) -> None:
+def test_rendered_edges_are_exact_to_0_01_px(views: list[View], turn_rad: float) -> None:
     rng = np.random.default_rng(int(turn_rad * 10))
     for view in views:
         y_m = view.camera.origin_m[1]
@@ -181,7 +181,7 @@ def test_gamma_keeps_black_and_white_and_thins_black(views: list[View]) -> None:
     assert -0.5 < edge_errors(view, placed, settings).mean() < -0.1
 
 
-def test_without_blur_pixels_are_black_white_or_mixed_at_edges(views: list[View]) -> None:
+def test_unblurred_pixels_are_black_white_or_mixed_at_edges(views: list[View]) -> None:
     settings = replace(SETTINGS, psf_sigma_px=0.0)
     view = prepare_view(views[1].camera, settings)
     image = expose(view, [lay(3, 2.6, 2.3, 0.0, 0.0)], settings)

@@ -125,7 +125,7 @@ def test_a_marker_that_stands_is_drawn_as_ever(camera: Camera, shutter: str) -> 
         np.testing.assert_array_equal(expose(view, [one], SHUTTERS[shutter]), before)
 
 
-def test_without_row_time_and_exposure_a_marker_is_seen_at_the_time_of_the_frame(camera: Camera) -> None:
+def test_global_shutter_shows_a_marker_at_the_frame_time(camera: Camera) -> None:
     moving = drive_past(MIDDLE, 0.3, 1.0)
     view = prepare_view(camera, STILL)
     np.testing.assert_array_equal(expose(view, [moving], STILL), expose(view, [moving(0.0)], STILL))
@@ -167,13 +167,13 @@ def test_the_truth_is_that_of_the_time_of_the_frame(session: list[Message]) -> N
         ]
 
 
-def test_before_their_start_the_robots_stand() -> None:
+def test_robots_are_stationary_before_their_start() -> None:
     drive = drive_of(LAB)[0]
     assert drive.poses_at(-1.0) == drive.poses_at(0.0)
     assert drive.poses_at(1e-2) != drive.poses_at(0.0)
 
 
-def test_corners_in_a_session_lie_where_the_marker_was_while_their_row_was_exposed(
+def test_corners_follow_the_exposure_time_of_their_row(
     session: list[Message],
 ) -> None:
     drive, start_ns, cameras = drive_of(LAB)

@@ -161,7 +161,7 @@ def test_corners_lie_half_a_pixel_from_opencvs(saved: Path) -> None:
     assert TIMES_NS[3] in {row[0] for row in cleared}
 
 
-def test_each_robot_is_where_the_log_has_it(saved: Path) -> None:
+def test_robots_have_the_positions_of_the_log(saved: Path) -> None:
     for robot, axis, start in (("robot_0", 0, 1.0), ("robot_1", 1, 0.0)):
         drawn = rows(saved, f"/world/runs/poly/robots/{robot}", "Points3D:positions")
         assert {row[0] for row in drawn} == set(TIMES_NS if robot == "robot_0" else TIMES_NS[:10])
@@ -281,7 +281,7 @@ def test_robot_without_heading_loses_its_arrow(tmp_path: Path) -> None:
     assert None not in looks_at(saved, arrow, "Arrows3D", "vectors", "colors").values()
 
 
-def test_what_is_no_longer_seen_goes_away(saved: Path) -> None:
+def test_unseen_objects_disappear_from_the_view(saved: Path) -> None:
     for entity in ("runs/poly/robots/robot_1", "runs/poly/robots/robot_0", "runs/poly/positions/red"):
         cleared = rows(saved, f"/world/{entity}", "Clear:is_recursive")
         # A second after the last of the first ten, and not at the end of the log.
@@ -298,7 +298,7 @@ def test_trail_has_a_way_for_each_step_and_none_over_the_silence(saved: Path) ->
     assert robot_0[0][1][1][0] == pytest.approx(1.1)
 
 
-def test_place_that_forms_no_triangle_is_left_out_and_said(saved: Path) -> None:
+def test_point_without_a_triangle_is_excluded_and_reported(saved: Path) -> None:
     chunks = RrdReader(saved).stream().to_chunks()
     batches = [c.to_record_batch() for c in chunks if c.entity_path == "/events/measurements"]
     ((text,),) = [row for batch in batches for row in batch.column("TextLog:text").to_pylist()]

@@ -37,7 +37,7 @@ def test_only_this_machine_can_connect() -> None:
 
 
 @pytest.mark.skipif(not sys.platform.startswith("linux"), reason="elsewhere there is always a screen")
-def test_without_a_screen_the_way_out_is_named() -> None:
+def test_missing_screen_error_names_an_alternative() -> None:
     with pytest.raises(IpsysError, match="--save"):
         check_screen({"HOME": "/"})
     check_screen({"WAYLAND_DISPLAY": "wayland-0"})

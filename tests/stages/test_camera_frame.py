@@ -123,7 +123,7 @@ def test_the_covariance_is_that_of_the_scatter(method: str, place_m: tuple[float
 
 
 @pytest.mark.parametrize("method", METHODS)
-def test_without_a_covariance_there_is_none(method: str) -> None:
+def test_missing_input_covariance_gives_no_covariance(method: str) -> None:
     found, _ = points(method, marker(3), marker(5, CENTRE, covariance_px2=SIGMA_PX**2 * np.eye(8)))
     assert [point.covariance_m2 is None for point in found] == [True, False]
 

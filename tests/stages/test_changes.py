@@ -57,7 +57,7 @@ def test_a_new_thing_is_noticed_where_it_is(watch: ChangeDetector, place: tuple[
     assert covers(watch.find_change(put(floor(), there), ALL, [], BREADTH_PX), there)
 
 
-def test_what_is_known_to_be_a_marker_is_no_news(watch: ChangeDetector) -> None:
+def test_known_markers_start_no_search(watch: ChangeDetector) -> None:
     there = square(300, 200)
     assert watch.find_change(put(floor(), there), ALL, [there], BREADTH_PX) is None
 
@@ -86,7 +86,7 @@ def test_another_marker_beside_a_known_one_is_noticed(watch: ChangeDetector) -> 
 
 
 @pytest.mark.parametrize("side", ["left", "right", "top", "bottom"])
-def test_at_the_edge_a_thing_counts_when_half_of_it_is_in(watch: ChangeDetector, side: str) -> None:
+def test_object_at_the_edge_counts_if_half_of_it_is_visible(watch: ChangeDetector, side: str) -> None:
     """Less cannot be a marker yet, and would be searched for in vain in every frame."""
     little, enough = (
         square(
@@ -103,7 +103,7 @@ def test_at_the_edge_a_thing_counts_when_half_of_it_is_in(watch: ChangeDetector,
     assert covers(watch.find_change(put(floor(), enough), ALL, [], BREADTH_PX), enough)
 
 
-def test_what_stays_becomes_background(watch: ChangeDetector) -> None:
+def test_unchanged_object_becomes_background(watch: ChangeDetector) -> None:
     """A chair is searched for markers some frames long, not for ever."""
     picture = put(floor(), square(320, 240, 160))
     alarms = [watch.find_change(picture, ALL, [], BREADTH_PX) is not None for _ in range(30)]

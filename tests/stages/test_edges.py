@@ -376,7 +376,7 @@ def test_a_fit_finds_back(shift_px: tuple[float, float]) -> None:
     np.testing.assert_allclose(fit.pose.centre * one.length_m, one.centre_m, atol=0.004)
 
 
-def test_what_is_not_that_marker_is_not_fitted() -> None:
+def test_other_markers_are_not_fitted() -> None:
     grey, one = still()
     empty = np.full_like(grey, 150)
     noise = np.random.default_rng(0).integers(0, 255, grey.shape).astype(np.uint8)
@@ -422,6 +422,6 @@ def test_a_tilted_marker_follows_its_tilt(tilt_deg: float) -> None:
     assert np.degrees(angle_rad) < 1.5
 
 
-def test_a_tilted_marker_is_found_as_it_lies() -> None:
+def test_tilted_marker_is_fitted_with_its_tilt() -> None:
     score = strew(FISHEYE, Look(), 3, 6, first=100, tilt_deg=50.0)
     assert score.max_px < 0.5, score

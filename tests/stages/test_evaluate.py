@@ -65,7 +65,7 @@ def test_the_interval_of_the_mean_holds_it_as_often_as_it_says() -> None:
     assert 0.90 <= held / 300 <= 0.98
 
 
-def test_repeats_at_one_place_do_not_make_the_mean_more_certain() -> None:
+def test_repeats_at_one_point_do_not_narrow_the_interval() -> None:
     errors = np.random.default_rng(1).gamma(2.0, 0.005, 30)
     once, four_times = error_statistics(errors), error_statistics(np.tile(errors, (4, 1)))
     assert four_times.count == 30
@@ -105,13 +105,13 @@ def test_all_cameras_together_are_one_row_more() -> None:
     assert [row.camera for row in only] == ["white"]
 
 
-def test_places_that_the_model_was_fitted_on_are_not_held_out() -> None:
+def test_points_of_the_fit_are_not_held_out() -> None:
     """As where a model is applied to the very log that it was made from."""
     model = fit_model("rigid", {"red": pairs(np.zeros(3))}, 0)
     assert evaluate_held_out(model, {"red": pairs(np.zeros(3))}, {}) == []
 
 
-def test_where_all_places_have_one_height_there_is_no_error_in_space() -> None:
+def test_points_at_one_height_have_no_3d_error() -> None:
     rng = np.random.default_rng(0)
     world = labs.places(rng, 20, heights=(0.1,))
     tape, covariances = labs.measure(world, rng)
@@ -140,7 +140,7 @@ def test_cross_validation_is_that_of_a_loop_written_out() -> None:
     assert again[0].error_3d != row.error_3d
 
 
-def test_a_place_seen_by_two_cameras_is_held_out_from_both() -> None:
+def test_point_of_two_cameras_is_held_out_from_both() -> None:
     def seen(*names: str) -> CalibrationPoints:
         return CalibrationPoints(np.zeros((len(names), 3)), np.zeros((len(names), 3)), names)
 
@@ -157,7 +157,7 @@ def test_a_place_seen_by_two_cameras_is_held_out_from_both() -> None:
         assert max(sizes) - min(sizes) <= 1
 
 
-def test_leave_one_out_is_a_fit_without_the_place() -> None:
+def test_leave_one_out_equals_a_fit_without_the_point() -> None:
     found, _, _ = lab(1, 16)
     cameras = gather_points({"red": found})
     left_out = leave_one_out("poly", cameras)(frozenset({"m03"}))["red"]
@@ -169,7 +169,7 @@ def test_leave_one_out_is_a_fit_without_the_place() -> None:
     assert set(left_out) == {p.measurement for p in found}
 
 
-def test_more_places_make_a_better_model_and_the_curve_says_so() -> None:
+def test_learning_curve_falls_with_more_points() -> None:
     found, _, _ = lab(2, 60)
     curve = [p for points in learning_curve("poly", gather_points({"red": found}), 0) for p in points]
     assert [p.pairs for p in curve] == [10, 15, 20, 30, 40]
@@ -241,7 +241,7 @@ def test_the_covariance_of_a_model_that_misfits_knows_most_of_it() -> None:
     assert 0.80 <= within_95 <= 0.98
 
 
-def test_away_from_the_measured_places_a_position_is_less_certain() -> None:
+def test_uncertainty_grows_away_from_the_calibration_points() -> None:
     found, _, _ = lab(5)
     inner = [p for p in found if 1.0 < p.world_m[0] < 3.8]
     applied = AppliedModel("poly", fit_model("poly", {"red": inner}, 0).cameras[0])
@@ -250,7 +250,7 @@ def test_away_from_the_measured_places_a_position_is_less_certain() -> None:
     assert sizes[1] > 9 * sizes[0]
 
 
-def test_places_of_a_fold_too_few_to_fit_are_an_error() -> None:
+def test_fold_with_too_few_points_is_an_error() -> None:
     found, _, _ = lab(7, min_pairs("poly") + 1)
     with pytest.raises(FitError):
         predict_without("rigid", gather_points({"red": found}), {p.measurement for p in found[2:]})

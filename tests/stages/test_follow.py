@@ -176,7 +176,7 @@ DAMAGES: dict[str, Callable[[bytes], bytes]] = {
 
 @pytest.mark.parametrize("at", [1, 4, 5])
 @pytest.mark.parametrize("damage", DAMAGES)
-def test_a_corrupt_frame_is_said_and_does_no_harm(damage: str, at: int) -> None:
+def test_corrupt_frame_is_reported_and_changes_nothing_else(damage: str, at: int) -> None:
     frames = film([with_marker()] * 8)
     bad = frame(DAMAGES[damage](frames[at].payload.data), frames[at].publish_time_ns)
     answers = feed(started(), [*frames[:at], bad, *frames[at + 1 :]])

@@ -99,7 +99,7 @@ def test_headings_are_averaged_around_the_circle() -> None:
     assert abs(fused.heading_rad or 0.0) == pytest.approx(np.pi)
 
 
-def test_only_what_was_seen_at_one_instant_is_fused() -> None:
+def test_only_positions_of_one_instant_are_fused() -> None:
     fuse = Fuse("poly", window_ns=5)
     list(fuse(RIG))
 

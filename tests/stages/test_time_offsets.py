@@ -86,7 +86,7 @@ def test_a_pose_goes_out_with_its_own_instant() -> None:
     ]
 
 
-def test_without_offsets_nothing_is_other_than_before_there_were_any() -> None:
+def test_zero_time_offsets_do_not_change_the_result() -> None:
     made = fused(frame(100, "red", None, None))
     tracks = tuple(Track(f"marker_{n}", n, 0.0, 0.0, 0.0, cameras=("red",)) for n in range(2))
     still = Quaternion(0.0, 0.0, 0.0, 1.0)

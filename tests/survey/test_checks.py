@@ -52,7 +52,7 @@ def check(
 
 
 @given(PLACES)
-def test_the_place_is_where_it_was_measured(world_m: tuple[float, float, float]) -> None:
+def test_checked_point_equals_the_measured_point(world_m: tuple[float, float, float]) -> None:
     checked = check(tape(world_m))
     assert checked.faults == ()
     assert checked.point_m is not None
@@ -90,7 +90,7 @@ def test_two_tapes_that_cannot_meet() -> None:
     assert any("no triangle" in fault.text for fault in alone.faults)
 
 
-def test_both_places_while_the_side_is_missing() -> None:
+def test_missing_side_gives_both_points() -> None:
     checked = check(tape((1.0, 4.0, 0.0), side=""))
     assert checked.measurement is None
     places = dict(checked.sides_m)
@@ -98,7 +98,7 @@ def test_both_places_while_the_side_is_missing() -> None:
     assert places["right"] == pytest.approx([1.0, 2 * labs.A[1] - 4.0, 0.0], abs=0.002)
 
 
-def test_a_place_that_is_not_on_the_floor_and_the_side_on_which_it_would_be() -> None:
+def test_point_outside_the_floor_names_the_side_inside() -> None:
     narrow = replace(RIG, floor=replace(labs.RIG.floor, depth_m=3.0))  # type: ignore[type-var]
     checked = check(tape((1.0, 1.0, 0.0), side="left"), narrow)
     assert checked.on_floor is False
@@ -134,7 +134,7 @@ def test_ids_count_up_and_undo_withdraws() -> None:
     assert check(tape((1.0, 4.0, 0.0), id="p001"), history=[first, gone]).faults[0].field == "id"
 
 
-def test_the_same_place_once_more() -> None:
+def test_repeated_point_gives_a_warning() -> None:
     first = check(tape((1.0, 4.0, 0.0))).measurement
     assert first is not None
     again = check(tape((1.0, 4.0, 0.0)), history=[first])
@@ -166,7 +166,7 @@ def known() -> tuple[labs.Camera, Model]:
         ({"height": "65"}, "the height reads 0.650 m"),
     ],
 )
-def test_the_model_finds_the_slip(
+def test_model_finds_the_gross_error(
     known: tuple[labs.Camera, Model], changed: dict[str, str], said: str | None
 ) -> None:
     camera, model = known

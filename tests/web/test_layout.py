@@ -84,7 +84,7 @@ def test_every_state_of_the_page_fits_the_screen(
         browser.type("#d-B", b)
         browser.tap(f"#sides label:nth-of-type({1 if side == 'left' else 2})")
         browser.type("#height", "0.1")
-        says(browser, "#save", "all the same")
+        says(browser, "#save", "despite the warning")
         check_screen(browser)
         browser.run("document.querySelector('#height').value = ''")
         browser.type("#height", height)

@@ -1,4 +1,4 @@
-"""Turn a camera exactly as the text of an advice says."""
+"""Turn a camera exactly by the text of an advice."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""Measuring on a finished log: what goes in comes out as a model, and what is withdrawn does not count."""
+"""Measuring on a finished log: measurements reach the model, and withdrawn ones do not count."""
 
 from __future__ import annotations
 
@@ -38,7 +38,7 @@ from tests.test_bad_input import refused, rewrite
 
 
 def as_typed(measurement: Measurement) -> TypedEntry:
-    """A measurement as somebody would type it, to a tenth of a millimetre."""
+    """Return a measurement as typed text, to a tenth of a millimetre."""
     distances = {d.reference: f"{100 * d.distance_m:.2f}" for d in measurement.distances}
     height = f"{100 * (measurement.height_m or 0):.2f}"
     split = " ".join(measurement.splits)
@@ -46,7 +46,7 @@ def as_typed(measurement: Measurement) -> TypedEntry:
 
 
 def sheet(path: Path, tape: Iterable[Measurement], **columns: list[str]) -> Path:
-    """A sheet of these measurements."""
+    """Write a sheet of these measurements."""
     rows = [",".join(["marker", "d_A_cm", "d_B_cm", "side", "height_cm", "split", *columns])]
     for n, one in enumerate(map(as_typed, tape)):
         cells = [one.marker, one.distances["A"], one.distances["B"], one.side, one.height, one.split]
@@ -67,7 +67,7 @@ class Row(NamedTuple):
 
 
 def foreign_read(path: Path) -> list[Row]:
-    """The measurements as the ``mcap`` package and protobuf read them, by the schema in the log alone."""
+    """Return the measurements as read by the ``mcap`` package and protobuf, with the schema in the log."""
     rows = []
     with path.open("rb") as file:
         for schema, _, message in make_reader(file).iter_messages(topics=[MEASUREMENTS_TOPIC]):
@@ -82,7 +82,7 @@ def foreign_read(path: Path) -> list[Row]:
 
 
 def pairs_of(log: Path) -> dict[tuple[str, int, tuple[float, ...]], Pair]:
-    """Return what each camera saw at each place, by camera, marker and camera point in nm."""
+    """Return the observations of each camera at each point, by camera, marker and camera point in nm."""
     with Session([log]) as session:
         model = session.payloads(session.topics(MODEL, "poly"))[-1]
     return {
@@ -96,14 +96,14 @@ def test_points_measured_later_give_the_pairs_of_a_live_session(
     ipsys: Ipsys, unmeasured: Unmeasured, lab: Path, tmp_path: Path
 ) -> None:
     assert ipsys("replay", lab).code == 0
-    # What lay outside of the pictures, or was seen in one of them only, is not known to have lain still.
+    # Markers outside the images, or in only one image, are not known to be stationary.
     theirs = {key: pair for key, pair in pairs_of(lab).items() if pair.frames > 1}
     seen = {pair.measurement for pair in theirs.values()}
     log, tape = unmeasured
     tape = [one for one in tape if one.id in seen]
     before = data_section(log)
     path = sheet(tmp_path / "a.csv", tape, time=times(tape, log))
-    # One place is so near to B that its distance may be in metres; nothing else is doubted.
+    # One point is so near to B that its distance may be in metres; no other is doubtful.
     (doubt,) = refused(ipsys, log, "measure", log, "--csv", path).splitlines()[1:]
     assert "d_B_cm: 8.15 cm is very near to B: in metres? Then type 815" in doubt
     done = ipsys("measure", log, "--csv", path, "--force")
@@ -116,7 +116,7 @@ def test_points_measured_later_give_the_pairs_of_a_live_session(
     assert theirs.keys() <= mine.keys()
     assert len(theirs) > 40
     for key, pair in theirs.items():
-        # Typed to a tenth of a millimetre, of which flat circles make up to four times as much.
+        # Values are to a tenth of a millimetre; flat circles amplify this up to four times.
         assert np.allclose(mine[key].world_m, pair.world_m, atol=0.0003), key
 
 
@@ -253,7 +253,7 @@ def test_two_people_at_one_log(unmeasured: Unmeasured) -> None:
         one.add([Measurement(tape[0].timestamp, "p001", marker_id=0)])
         with pytest.raises(LogError, match="somebody else measured in this log meanwhile"):
             other.add([Measurement(tape[0].timestamp, "p001", marker_id=0)])
-        # What the first one did is known now: the other goes on after it, and they take turns.
+        # The second process now sees the first one's entry: it continues after it, and they alternate.
         assert [m.id for m in other.history()] == ["p001"]
         other.add([Measurement(tape[0].timestamp, "p002", marker_id=0)])
         with pytest.raises(LogError, match=r"meanwhile \(p002\), so this is not written yet"):
@@ -311,7 +311,7 @@ def test_the_terminal_asks_checks_and_undoes(
     assert "p001 is withdrawn" in done.out
     assert "1 place measured" in done.out
     assert [row.withdraws for row in foreign_read(log)] == ["", "p001"]
-    # Undone while place 2 was asked for, and back at place 1.
+    # withdrawn at the question for point 2, and back at point 1
     places = re.findall(r"Place (\d+) of", done.out)
     assert places == ["1", "2", "1"]
 
@@ -325,9 +325,9 @@ def test_a_bad_answer_in_the_terminal_costs_that_answer_only(
         a, b = first.distances.values()
         script = [
             ("distance to A", "hallo"), ("distance to A", f"{a} cm"),
-            ("distance to B", "1.234"), ("distance to B", "3"),  # metres, perhaps: asked once more
+            ("distance to B", "1.234"), ("distance to B", "3"),  # possibly metres: asked again
             ("distance to B", ""),
-            ("distance to A", ""), ("distance to B", b),  # no triangle: what was good is kept by Enter
+            ("distance to A", ""), ("distance to B", b),  # no triangle: Enter keeps the good values
             ("left or right", "up"), ("left or right", {"left": "links", "right": "Rechts"}[first.side]),
             ("height", "0,15"), ("height", "x"), ("height", first.height),
             ("save p001", "perhaps"), ("save p001", "n"),

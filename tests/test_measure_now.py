@@ -1,4 +1,4 @@
-"""``ipsys measure`` with cameras: what is left of a session, however it ends."""
+"""``ipsys measure`` with cameras: the remaining data of a session, for every end."""
 
 from __future__ import annotations
 
@@ -34,7 +34,7 @@ HEAD = ("measure", "--port", "0", "--rig")
 
 
 class Lab(NamedTuple):
-    """A rig whose cameras send a minute of one station, and what the tape says there."""
+    """Return a rig whose cameras send a minute of one station, and its tape measurement."""
 
     rig: Path
     lenses: Path
@@ -74,7 +74,7 @@ def still_lab(lab_log: Path, tmp_path_factory: pytest.TempPathFactory) -> Lab:
 
 
 class Page:
-    """The page's questions, without a browser."""
+    """The requests of the page, without a browser."""
 
     def __init__(self, url: str) -> None:
         self._url = url
@@ -90,7 +90,7 @@ class Page:
         return found
 
     def measure(self, one: Measurement) -> dict[str, Any]:
-        """Save a place as soon as its marker has lain still, whatever is doubtful."""
+        """Save a point as soon as its marker is stationary, in spite of warnings."""
         body: dict[str, Any] = {
             "marker": str(one.marker_id),
             "distances": {d.reference: f"{100 * d.distance_m:.2f}" for d in one.distances},
@@ -109,7 +109,7 @@ class Page:
 
 @contextmanager
 def measuring(lab: Lab, log: Path) -> Iterator[tuple[subprocess.Popen[str], Page]]:
-    """The command with its page, once the cameras have been looked through for a second."""
+    """Run the command with its page; the cameras were checked for a second."""
     command = [*HEAD, lab.rig, "--calibration", lab.lenses, "-o", log]
     with subprocess.Popen(
         [sys.executable, "-m", "ipsys_log", *map(str, command)],
@@ -150,7 +150,7 @@ def test_page_measures_points_until_it_is_stopped(
             page.measure(one)
         measured_s = time.monotonic() - begun_s
         assert page.ask("undo", {"id": "p002"})["withdrawn"] == "p002"
-        time.sleep(3)  # of which nothing is kept
+        time.sleep(3)  # without kept data
         program.send_signal(number)
         out, err = program.communicate(timeout=PATIENCE_S)
     assert program.returncode == 0, err
@@ -158,7 +158,7 @@ def test_page_measures_points_until_it_is_stopped(
     assert f"6 places measured into {log}, 1 withdrawn" in out
     assert [row.withdraws for row in foreign_read(log)] == [""] * 6 + ["p002"]
     for name, count in counted(log).items():
-        # One second before the first place, and until the last one.
+        # from one second before the first point, and until the last one
         assert 7 < count < RATE_HZ * (measured_s + 2), name
     listed = ipsys("measure", log, "--places")
     assert all(f"p00{n}" in listed.out for n in (1, 3, 4, 5, 6))
@@ -235,7 +235,7 @@ def test_incompatible_options_are_refused(
 
 
 def typed(command: list[str], answers: list[tuple[str, str]]) -> tuple[int, str]:
-    """Run a command in a terminal, and answer what it asks; its exit code and all that was to be read."""
+    """Run a command in a terminal, and answer its questions; return exit code and output."""
     child, terminal = pty.fork()
     if child == 0:
         os.execv(sys.executable, [sys.executable, "-m", "ipsys_log", *command])
@@ -248,7 +248,7 @@ def typed(command: list[str], answers: list[tuple[str, str]]) -> tuple[int, str]
             raise AssertionError(f"nothing more after {told}")
         try:
             data = os.read(terminal, 1 << 16)
-        except OSError:  # it has ended
+        except OSError:  # the command has ended
             break
         told += data.decode(errors="replace")
         if left and left[0][0] in told[seen:]:
@@ -292,5 +292,5 @@ def test_the_faults_of_a_sheet_stand_on_lines_of_their_own_in_a_window(unmeasure
         line.split(": ")[0] for line in lines if line.startswith(("  line 2: no", "  line 3: marker 99"))
     ]
     assert starts == ["  line 2", "  line 3"]
-    # A fault that is longer than the window goes on below itself.
+    # A message that is longer than the window continues below it.
     assert any("d_B_cm" in line and line.startswith("  ") for line in lines)

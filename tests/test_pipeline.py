@@ -1,4 +1,4 @@
-"""Replay: what is missing or out of date is computed and appended, and nothing else."""
+"""Replay: missing and outdated results are computed and appended, and no others."""
 
 from __future__ import annotations
 
@@ -57,7 +57,7 @@ def stages_of(ipsys: Ipsys, *arguments: object) -> dict[str, tuple[str, bool]]:
 
 
 def write_rig(path: Path, lab: Path, length_m: float) -> Path:
-    """The lab's rig as a file, with another marker length."""
+    """Write the lab's rig as a file, with another marker length."""
     with Session([lab]) as session:
         held = session.payloads(["/rig"])[0]
     robots = "".join(f'[[markers]]\nid = {m.id}\nrobot = "{m.robot}"\n' for m in held.markers)
@@ -104,7 +104,7 @@ def test_threads_change_the_speed_and_not_the_order() -> None:
 
     def slow(message: Message) -> Iterator[Any]:
         time.sleep(uneven.random() * 0.003)
-        # A camera's messages come to its stage one after the other, in order.
+        # The stage gets a camera's messages in order.
         assert last.get(message.camera, -1) < message.log_time_ns
         last[message.camera] = message.log_time_ns
         yield Markers(message.publish_time_ns, (), 1, 1)
@@ -189,7 +189,7 @@ def test_replay_in_place_and_into_a_new_log_give_the_same_messages(
         assert [(m.topic, m.log_time_ns, encode(m.payload)) for m in one.messages(topics)] == [
             (m.topic, m.log_time_ns, encode(m.payload)) for m in other.messages(topics)
         ]
-    # Read together, the two logs are one that lacks nothing.
+    # Together, the two logs are one complete log.
     lab.write_bytes(before)
     assert all(not new for _, new in stages_of(ipsys, "replay", lab, beside).values())
 
@@ -198,7 +198,7 @@ def test_a_mistyped_marker_length_is_put_right_as_a_new_run(ipsys: Ipsys, lab: P
     ipsys("replay", lab)
     rig = write_rig(tmp_path / "lab.toml", lab, 0.18)
     stages = stages_of(ipsys, "replay", lab, "--rig", rig)
-    # The length bears on the camera points, not on the corners.
+    # The length changes the camera points, not the corners.
     assert stages["detect"] == ("edges", False)
     assert stages["camera-frame"] == ("edges_2", True)
     assert stages["fit"] == ("poly_2", True)
@@ -208,7 +208,7 @@ def test_a_mistyped_marker_length_is_put_right_as_a_new_run(ipsys: Ipsys, lab: P
             for run in ("edges", "edges_2")
         )
     np.testing.assert_allclose(np.array(new) / np.array(old), 0.9, rtol=1e-12)
-    # Both stand side by side, and each is found again.
+    # Both runs exist, and each is found again.
     assert all(not new for _, new in stages_of(ipsys, "replay", lab).values())
     assert all(not new for _, new in stages_of(ipsys, "replay", lab, "--rig", rig).values())
 
@@ -233,7 +233,7 @@ def test_a_lens_calibrated_later_is_a_new_run(ipsys: Ipsys, lab: Path, tmp_path:
         storage.write("image_height", lens.height)
         storage.release()
         stages = stages_of(ipsys, "replay", lab, "--calibration", f"red={path}")
-        # Edges are fitted through the lens.
+        # Edge fits need intrinsics.
         assert (stages["detect"][1], stages["camera-frame"][1]) == (fresh, fresh)
     runs = json.loads(ipsys("runs", lab, "--json").out)
     assert [run["overrides"] for run in runs if run["run"] == "edges_2"] == [["lens red"]] * 2
@@ -262,7 +262,7 @@ def test_a_model_of_another_log_is_applied_and_copied_in(ipsys: Ipsys, lab: Path
         kept = ["/rig", *session.images.values(), *session.calibrations.values()]
         write_log(drive, session.messages(kept))
         original = session.payloads(session.topics(MODEL, "poly"))[0]
-    done = ipsys("replay", drive)  # it has no measurements of its own
+    done = ipsys("replay", drive)  # the log has no own measurements
     assert done.code == 1
     assert f"enter some with 'ipsys measure {drive}', or apply a model of another log" in done.err
     stages = stages_of(ipsys, "replay", drive, "--model-from", lab)

@@ -1,4 +1,4 @@
-"""Questions of a lab to a log: comparison of models, wrong places, and questions without an answer."""
+"""Studies on a log: comparison of models, wrong points, and impossible questions."""
 
 from __future__ import annotations
 
@@ -20,7 +20,7 @@ from tests.conftest import Ipsys
 
 
 def made(path: Path, seed: int = 0, count: int = 40, spoil: object = None, **options: object) -> Path:
-    """A log of one camera's places, with what ``spoil`` does to camera points and world points."""
+    """Write a log of one camera's points, after ``spoil`` has changed camera points and world points."""
     rng = np.random.default_rng(seed)
     world = labs.places(rng, count, heights=options.pop("heights", labs.HEIGHTS))  # type: ignore[arg-type]
     points = labs.camera(rng).see(world, rng)
@@ -34,7 +34,7 @@ def made(path: Path, seed: int = 0, count: int = 40, spoil: object = None, **opt
 
 
 def refused(ipsys: Ipsys, log: Path, *arguments: object) -> str:
-    """The one line that a command says; the log is as it was."""
+    """Return the one line of a command; the log is unchanged."""
     before = log.read_bytes()
     done = ipsys(*arguments[:1], log, *arguments[1:])
     assert done.code == 1
@@ -97,7 +97,7 @@ def test_model_with_known_heights_needs_them_in_the_rig(ipsys: Ipsys, tmp_path: 
     said = refused(ipsys, log, "replay", "--model", "rayplane")
     assert "marker 0 is carried" in said
     assert "marker_height_m" in said
-    # The measured places have their heights: there is nothing to be told.
+    # The points have their own heights, so the option changes nothing.
     assert ipsys("evaluate", log, "--model", "rayplane").code == 0
     rig = tmp_path / "lab.toml"
     rig.write_text(rig_toml(replace(labs.RIG, markers=(RigMarker(0, robot="ada", height_m=0.12),))))
@@ -126,13 +126,13 @@ def test_a_position_outside_the_measured_volume_says_so(tmp_path: Path) -> None:
         return flag
 
     assert inside(2.4, 0.9, 0.1) is True
-    assert inside(2.4, 0.9, 0.5) is False  # above all that was measured
+    assert inside(2.4, 0.9, 0.5) is False  # above all measured points
     assert inside(2.4, -0.5, 0.1) is False
     assert inside(5.2, 0.9, 0.1) is False
 
 
 def test_a_model_out_of_a_log_predicts_what_it_predicted(ipsys: Ipsys, tmp_path: Path) -> None:
-    """To 1e-9 m, for every model in the table, by way of the numbers in the log."""
+    """The tolerance is 1e-9 m, for every model in the table, by the numbers in the log."""
     from ipsys_log.models.table import MODELS, AppliedModel, CalibrationPoints, fit_cameras, inputs
 
     log = made(tmp_path / "lab.mcap", labels=lambda n: ("train",))

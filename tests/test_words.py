@@ -13,7 +13,7 @@ import pytest
 
 from tests.conftest import ROOT
 
-# Such a sentence has no subject that a reader meets first; with a question mark it is a question.
+# Such a sentence starts without a subject; with a question mark, it is a question.
 _OPENING = re.compile(r"(?:^|[.;:!?]\s+)(Who|What|Whether|Where|Of|That which)\b(?![^.]*\?)")
 # Phrases of an earlier dialect; docs/glossary.md has the standard terms.
 _PHRASES = (

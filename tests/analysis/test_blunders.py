@@ -1,4 +1,4 @@
-"""The effect of each blunder on a calibration point, in words and as a measurement without it."""
+"""The effect of each gross error on a calibration point, as text and as a corrected measurement."""
 
 from __future__ import annotations
 
@@ -91,7 +91,7 @@ def test_repeated_reference_point_still_names_the_line() -> None:
     twice = replace(PLACE, distances=(Distance("A", 1.5), Distance("A", 1.5), Distance("B", 1.0)))
     sides = [slip.text for slip in slips(twice) if slip.kind == "side"]
     assert sides == ["it lies right of the line from A to B, not left"]
-    # Without the distance to B there is no telling where.
+    # Without the distance to B, the side is unknown.
     assert "the distance to B" not in " ".join(slip.text for slip in slips(twice) if slip.kind == "distance")
 
 

@@ -1,4 +1,4 @@
-"""Tracks against the truth, at its instants and between them."""
+"""Errors of tracks against the ground truth, at its times and between them."""
 
 from __future__ import annotations
 
@@ -10,7 +10,7 @@ from ipsys_log.analysis.pairs import Sightings
 from ipsys_log.messages import Message, Track, Tracks
 
 MS = 1_000_000
-# Nanoseconds since 1970 do not fit into a double.
+# A double cannot hold nanoseconds since 1970 exactly.
 START_NS = 1_700_000_000_000_000_001
 
 
@@ -43,7 +43,7 @@ def test_single_ground_truth_pose_is_not_extrapolated() -> None:
 
 
 def test_poses_of_different_instants_count_one_by_one() -> None:
-    # Two cameras that expose a marker 4 ms apart: the second pose rests on both, the first one does not.
+    # Two cameras expose a marker 4 ms apart: the second pose uses both, the first pose one.
     found = track_errors(gather_tracks([tracked(10, 0.02), tracked(14, 0.028), tracked(14, 0.038)]), TRUTH)
     assert found is not None
     assert found[0].count == 2
@@ -58,7 +58,7 @@ def test_ground_truth_is_exact_at_its_own_times() -> None:
     track = Sightings(times_ns[there], rng.normal(size=(200, 3)))
     found = track_errors({0: track}, {0: known})
     assert found is not None
-    # The first of two at one instant, as since the beginning.
+    # The first of two poses at one time counts.
     rows_m = track.points_m - known.points_m[np.where(there == 0, 0, there + 1)]
     errors_m = np.linalg.norm(rows_m, axis=1)
     assert (found[0].count, found[0].mean_m) == (200, errors_m.mean())

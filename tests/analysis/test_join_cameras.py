@@ -1,4 +1,4 @@
-"""Cameras joined without a tape, against where they hang."""
+"""Cameras joined without a tape, compared with their true poses."""
 
 from __future__ import annotations
 
@@ -17,7 +17,7 @@ Array = NDArray[np.float64]
 
 NONE = np.zeros((3, 3))
 LENS = CameraCalibration(0, "any", 1201, 801, "plumb_bob", np.zeros(5), np.diag([1000.0, 1000, 1]))
-# Tilted, at two heights, and the second one turned about the plumb line besides.
+# The cameras are tilted, at two heights, and the second is also turned about the plumb line.
 RED = look_down(np.array([0.0, 0.0, 2.0]), np.array([0.03, -0.02, 0.0]))
 WHITE = make_pose(rotation(np.array([0.0, 0.0, 2.5])), np.zeros(3)) @ look_down(
     np.array([0.3, 1.4, 2.3]), np.array([-0.01, 0.04, 0.0])

@@ -1,4 +1,4 @@
-"""Slips planted in simulated sessions are found and named, good ones left alone; the authors' data."""
+"""Gross errors in simulated sessions are found and named, and good points are kept; the authors' data."""
 
 from __future__ import annotations
 
@@ -28,7 +28,7 @@ TILES_M = 4.88
 
 @dataclass(frozen=True)
 class Session:
-    """Measured places, where they truly are, and what each camera saw of them."""
+    """Calibration points, their true positions, and the camera points of each camera."""
 
     places: list[RiggedMeasurement]
     truth: Mapping[str, Array]
@@ -47,7 +47,7 @@ class Session:
 
 
 def read_tape(point: Array, rng: np.random.Generator, sigma_m: float, rig: Rig = RIG) -> list[Distance]:
-    """Distances with the tape's noise, read again where they close no triangle."""
+    """Return distances with the noise of the tape, drawn again if they form no triangle."""
     while True:
         found = [
             Distance(p.name, float(np.hypot(*(point[:2] - [p.x_m, p.y_m])) + rng.normal(0, sigma_m)))
@@ -59,9 +59,11 @@ def read_tape(point: Array, rng: np.random.Generator, sigma_m: float, rig: Rig =
 
 
 def simulated(seed: int, count: int = 50, shared: bool = False, rig: Rig = RIG) -> Session:
-    """Three cameras 2.1 m above a floor, about ``count`` places each: noise of 1 cm along the view and
-    2.5 mm across it, growing to the rim; tape 3 mm, ruler 1 mm. ``shared`` places count for each camera
-    that sees them."""
+    """Return a session of three cameras 2.1 m above a floor, each with about ``count`` points.
+
+    The noise is 1 cm along the view and 2.5 mm across it, and grows to the rim. The tape has 3 mm, the
+    ruler 1 mm. ``shared`` points count for each camera that sees them.
+    """
     rng = np.random.default_rng(seed)
     points: dict[str, dict[str, Array]] = {camera: {} for camera in CAMERAS}
     truth: dict[str, Array] = {}
@@ -86,7 +88,7 @@ def simulated(seed: int, count: int = 50, shared: bool = False, rig: Rig = RIG) 
 
 
 def see(eye: Array, point: Array, rng: np.random.Generator) -> Array:
-    """The camera point of a camera that looks straight down."""
+    """Return the camera point of a camera that looks straight down."""
     seen = (point - eye) * [1, -1, -1]
     view = seen / np.linalg.norm(seen)
     across = rng.normal(0, 0.0025, 3)
@@ -96,7 +98,7 @@ def see(eye: Array, point: Array, rng: np.random.Generator) -> Array:
 
 
 def without_each(session: Session, model: str = "poly") -> LeaveOneOut:
-    """Leave-one-out as it is defined: fit on the rest, again and again."""
+    """Return leave-one-out residuals by their definition: one fit without each point."""
     worlds = {p.measurement.id: world_point(p.measurement, p.rig).world_m for p in session.places}
 
     def predict(unused: frozenset[str]) -> dict[str, dict[str, Array]]:
@@ -155,7 +157,7 @@ SLIPS: dict[str, tuple[Callable[[Measurement], Measurement], str, str]] = {
 
 
 def plant(session: Session, slips: list[str], seed: int) -> tuple[Session, dict[str, str]]:
-    """Slips that move their place by 10 cm at least, as any of a distance does; which place has which."""
+    """Return gross errors that move their point by at least 10 cm, and the point of each error."""
     rng = np.random.default_rng(seed)
     planted: dict[str, str] = {}
     for slip in slips:
@@ -192,7 +194,7 @@ def test_single_gross_error_is_found_and_named(slip: str, seed: int) -> None:
     assert suspect.measurement == name
     assert suspect.cameras == tuple(camera for camera in sorted(CAMERAS) if name in session.points[camera])
     check_named(suspect, slip, session.truth[name])
-    # Predicted minus measured: where it truly is, seen from where it was put.
+    # The residual is predicted minus measured: true position minus wrong position.
     measured = world_point(session.measurement(name), RIG).world_m
     assert np.linalg.norm(measured + suspect.residual_m - session.truth[name]) < 0.06
 
@@ -314,7 +316,7 @@ def test_a_flat_crossing_excuses_an_error_with_a_usual_tape_where_none_is_named(
     point = np.array([2.4384, A.y_m + 0.10, 0.0])
     seen = see(np.array([2.44, CAMERAS["white"], 2.1]), point, np.random.default_rng(1))
     points = dict(session.points) | {"white": dict(session.points["white"]) | {name: seen}}
-    # Seven centimetres across the line, which is seven millimetres on each tape.
+    # Seven centimetres across the line are seven millimetres on each tape.
     ranges = np.hypot(1.2192, 0.17)
     flat = (Distance("A", float(ranges)), Distance("B", float(ranges)))
     there = replace(session.measurement(name), distances=flat, side="left", height_m=0.0)
@@ -401,12 +403,12 @@ def test_good_point_is_restored_if_clean_fits_agree(lasting: bool) -> None:
         if len(calls) == 3 and not lasting:
             raise FitError("too few places")
         found = {camera: dict(points) for camera, points in fits(unused).items()}
-        if len(calls) == 1:  # as if the error of another place had spoilt the fit to this one
+        if len(calls) == 1:  # as if the error of another point had disturbed this fit
             found["red"][name] = found["red"][name] + np.array([0.5, 0, 0])
         return found
 
     assert find_outliers(fooled, session.places) == ()
-    # With it back in, the others are judged once more.
+    # With this point restored, the others are tested again.
     assert calls == [frozenset(), frozenset({name}), frozenset()]
 
 

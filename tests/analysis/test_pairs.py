@@ -41,7 +41,7 @@ RIG = Rig(
 
 
 def seen(*rows: tuple[float, float, float], camera: str = "red", marker: int = 0) -> list[Message]:
-    """Messages of (time in s, x, z)."""
+    """Return messages of (time in s, x, z)."""
     return [
         Message(
             "t", int(t * S), int(t * S), CameraPoints(int(t * S), (CameraPoint(marker, x, 0.0, z),)), camera
@@ -67,7 +67,7 @@ def test_the_still_stretch_around_a_time() -> None:
 
 
 def late(*rows: tuple[int, int | None, float]) -> list[Message]:
-    """Messages of (time of the frame in s, time offset in ns, x)."""
+    """Return messages of (frame time in s, time offset in ns, x)."""
     return [
         Message(
             "t", t * S, t * S, CameraPoints(t * S, (CameraPoint(0, x, 0.0, 2.0, None, offset_ns),)), "red"
@@ -119,7 +119,7 @@ def test_pair_contains_the_covariance_of_its_point() -> None:
     pair = build_pairs(sightings, [RiggedMeasurement(taped, RIG)])["red"][0]
     np.testing.assert_allclose(pair.world_m, [0, 2, 0.1], atol=1e-9)
     assert pair.world_covariance_m2 is not None
-    # A at a right angle to the floor's edge knows y; B, at 45 degrees, adds x.
+    # The tape from A gives y; the tape from B, at 45 degrees, adds x.
     sigmas_m = np.sqrt(pair.world_covariance_m2.diagonal())
     np.testing.assert_allclose(sigmas_m, [0.003 * 3**0.5, 0.003, 0.002], rtol=1e-9)
     given_point = Measurement(0, "b", marker_id=0, point=WorldPoint(1, 2, 0))
@@ -137,7 +137,7 @@ def test_camera_has_no_pair_for_an_unseen_point() -> None:
 def test_a_withdrawn_measurement_does_not_count() -> None:
     one, two = (Measurement(0, name, marker_id=0, point=WorldPoint(0, 0, 0)) for name in "ab")
     assert active_measurements([one, two, Measurement(1, "c", withdraws="a")]) == [two]
-    # It may be measured again under its old name.
+    # The point may be measured again with its old name.
     assert active_measurements([one, Measurement(1, "c", withdraws="a"), one]) == [one]
     with pytest.raises(IpsysError, match="two measurements have the id 'a'"):
         active_measurements([one, one])

@@ -1,4 +1,4 @@
-"""Intervals in which a marker is stationary, and in which it creeps."""
+"""Intervals of a stationary marker and of a slowly moving marker."""
 
 from __future__ import annotations
 
@@ -18,7 +18,7 @@ RATE_HZ = 30
 
 
 def seen(path_m: Array, start_s: float = 0.0, across_m: float = 0.0008, along: float = 0.002) -> Sightings:
-    """A path (n, 3) as a camera sees it at 30/s, with the noise of plain corners."""
+    """Return a path (n, 3) of camera points at 30 Hz, with the noise of plain corners."""
     rng = np.random.default_rng(4)
     noisy = path_m * (1 + rng.normal(0, along, (len(path_m), 1)))
     noisy[:, :2] += rng.normal(0, across_m, (len(path_m), 2))
@@ -27,7 +27,7 @@ def seen(path_m: Array, start_s: float = 0.0, across_m: float = 0.0008, along: f
 
 
 def laid(*parts: tuple[float, float, float]) -> Array:
-    """Seconds, and speed in m/s along x and y, one part after the other."""
+    """Return a path of parts: seconds, and speed in m/s along x and y."""
     steps = [np.tile([vx / RATE_HZ, vy / RATE_HZ, 0.0], (round(s * RATE_HZ), 1)) for s, vx, vy in parts]
     path_m: Array = np.array([-1.2, 0.6, 2.0]) + np.cumsum(np.concatenate(steps), axis=0)
     return path_m
@@ -83,9 +83,9 @@ def test_the_last_second_of_a_recording() -> None:
     assert observe_marker([view(still)], 3).state == "still"
     assert observe_marker([view(still), view(moves, "white")], 3).moving == ("white",)
     assert observe_marker([view(still)], 4).state == "unseen"
-    # A single sighting says nothing.
+    # A single observation gives no interval.
     assert observe_marker([view(still[:1])], 3).state == "unseen"
-    # What another camera saw before it came into view here may have been another place.
+    # An earlier observation of another camera may be of another point.
     later = observe_marker([view(still, "white", 10), view(still[:10])], 3)
     assert later.still is not None
     assert (later.still.start, list(later.points_m)) == (10, ["white"])

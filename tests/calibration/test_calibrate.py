@@ -25,7 +25,7 @@ def sightings(
     seed: int = 0,
     name: str = "pinhole",
 ) -> SearchResult:
-    """Boards at these places, each tilted to another side."""
+    """Return boards at these points, each with another tilt."""
     rng, found = np.random.default_rng(seed), []
     for n, place_m in enumerate(places_m):
         turn = Rotation.from_rotvec([tilt_rad * np.cos(n * 2.4), tilt_rad * np.sin(n * 2.4), 0]).as_matrix()
@@ -38,7 +38,7 @@ def sightings(
 def everywhere(
     x: tuple[float, float] = (-0.13, 0.13), y: tuple[float, float] = (-0.1, 0.1)
 ) -> list[tuple[float, float, float]]:
-    """Twenty places all over the image, near and far."""
+    """Return twenty board poses all over the image, near and far."""
     return [
         (float(a), float(b), z)
         for n, a in enumerate(np.linspace(*x, 5))
@@ -76,14 +76,14 @@ def test_a_board_that_was_never_tilted_tells_no_focal_length() -> None:
 
 @pytest.mark.parametrize("name", ["fisheye", "pinhole", "pinhole4"])
 def test_boards_along_the_image_tell_no_focal_length_near_and_far(name: str) -> None:
-    """Else it runs away to a hundredth of itself, with a standard deviation that says otherwise."""
+    """Otherwise the focal length falls to a hundredth, with a wrong standard deviation."""
     looked = sightings(everywhere(), 0.0, name=name)
     with pytest.raises(IpsysError, match="tilt it to all sides"):
         calibrate("red", looked, BOARD, LENS_MODELS[name])
 
 
 def test_boards_that_were_hardly_tilted_tell_it_as_well_as_they_can() -> None:
-    """While lines may not bend yet, a far shorter focal length fits better."""
+    """A much shorter focal length fits better as long as the distortion is fixed at zero."""
     for seed in range(2):
         found = calibrated(sightings(everywhere(), 0.12, noise_px=0.05, seed=seed))
         assert abs(found.values[0] - 600) < min(4 * found.sigmas[0], 60)
@@ -100,7 +100,7 @@ def test_corners_with_large_errors_are_reported() -> None:
 
 
 def through_fisheye() -> SearchResult:
-    """Boards all over the picture of a fisheye, to 85 degrees from its axis."""
+    """Return boards all over the image of a fisheye, up to 85 degrees from its axis."""
     corners = seen("fisheye", np.random.default_rng(1)).pixels.reshape(-1, 24, 2)
     views = [
         BoardSighting(f"{n}.png", np.arange(24), p, 0.8, p[[0, 5, 23, 18]]) for n, p in enumerate(corners)

@@ -1,4 +1,4 @@
-"""Projections against OpenCV's, the formulas written out, and their derivatives by differences."""
+"""Projections compared with OpenCV and with the written formulas, and derivatives with differences."""
 
 from __future__ import annotations
 
@@ -38,7 +38,7 @@ def test_a_fisheye_sees_what_is_beside_and_behind_it() -> None:
     beyond = points() * (1.0, 1.0, -0.3)
     pixels = project_points(LENS_MODELS["fisheye"], np.array(TRUTH["fisheye"]), beyond)
     np.testing.assert_allclose(pixels, pixels_of("fisheye", TRUTH["fisheye"], beyond), atol=1e-9)
-    # Farther from the middle than anything before the camera.
+    # Farther from the principal point than any point in front of the camera.
     middle = TRUTH["fisheye"][2:4]
     assert np.linalg.norm(pixels - middle, axis=1).min() > 185 * np.pi / 2 * 0.9
 

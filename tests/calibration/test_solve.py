@@ -1,4 +1,4 @@
-"""Known lenses found again from corners with noise, and how far off they are against what is said."""
+"""Known intrinsics estimated from noisy corners, and their errors compared with the standard deviations."""
 
 from __future__ import annotations
 
@@ -16,7 +16,7 @@ from tests.calibration.boards_seen import SIZE_PX, TRUTH, grid_m, random_pose, s
 
 
 def squared_errors(name: str, seeds: range, shared_px: float = 0.0) -> NDArray[np.float64]:
-    """Squared errors in units of the variance that is said, (seeds, parameters)."""
+    """Return squared errors in units of the estimated variance, (seeds, parameters)."""
     rows = []
     for seed in seeds:
         found = solve(
@@ -30,7 +30,7 @@ def squared_errors(name: str, seeds: range, shared_px: float = 0.0) -> NDArray[n
 
 @pytest.mark.parametrize("name", list(TRUTH))
 def test_known_intrinsics_are_recovered_within_their_sigma(name: str) -> None:
-    """With 8 seeds and about 8 correlated parameters, the mean of the squares is 1 to a factor of two."""
+    """With 8 seeds and about 8 correlated parameters, the mean square is 1 within a factor of two."""
     errors = squared_errors(name, range(8))
     assert 0.5 < errors.mean() < 2.0, errors.mean(axis=0)
     assert (errors < 4).mean() > 0.85
@@ -39,7 +39,7 @@ def test_known_intrinsics_are_recovered_within_their_sigma(name: str) -> None:
 
 @pytest.mark.parametrize("name", ["fisheye", "pinhole"])
 def test_sigma_includes_errors_shared_by_an_image(name: str) -> None:
-    """Taken for independent, the residuals would make these squares 2 on average."""
+    """With residuals taken as independent, these squares would be 2 on average."""
     errors = squared_errors(name, range(8), shared_px=0.15)
     assert 0.4 < errors.mean() < 1.6, errors.mean(axis=0)
 
@@ -53,7 +53,10 @@ def test_more_noise_is_more_uncertainty() -> None:
 
 
 def test_opencv_finds_the_same_pinhole() -> None:
-    """On the same corners, to a part of the standard deviation: only doubted corners weigh differently."""
+    """On the same corners, the results agree within a part of the sigma.
+
+    Only doubtful corners have other weights.
+    """
     corners = seen("pinhole", np.random.default_rng(3))
     found = solve(LENS_MODELS["pinhole"], corners, SIZE_PX)
     bounds = [*corners.starts, len(corners.image_numbers)]
@@ -77,7 +80,7 @@ def test_pixels_that_are_not_square() -> None:
 
 
 def test_pixels_that_are_hardly_not_square() -> None:
-    """By half a per cent, in pictures that are good enough to tell."""
+    """The pixels differ from squares by half a per cent, in images that are good enough to show it."""
     stretched = (600.0, 603.0, *TRUTH["pinhole"][2:])
     corners = seen("pinhole", np.random.default_rng(0), noise_px=0.03, lens=stretched)
     found = solve(LENS_MODELS["pinhole"], corners, SIZE_PX)
@@ -86,7 +89,7 @@ def test_pixels_that_are_hardly_not_square() -> None:
 
 
 def test_foreign_image_is_found_with_non_square_pixels() -> None:
-    """Taken for square, all pictures are off, so that one more is not noticed."""
+    """With pixels assumed square, all images have errors, so one more is not noticed."""
     stretched = (600.0, 618.0, *TRUTH["pinhole"][2:])
     corners = seen("pinhole", np.random.default_rng(0), lens=stretched)
     corners.pixels[corners.image_numbers == 12] += np.random.default_rng(9).normal(0, 0.6, (24, 2))
@@ -96,7 +99,7 @@ def test_foreign_image_is_found_with_non_square_pixels() -> None:
 
 
 def spoiled(corners: Corners) -> Corners:
-    """Ten corners 5 to 20 px off, and one picture in which a print was another one."""
+    """Ten corners have errors of 5 to 20 px, and one image shows another print."""
     rng = np.random.default_rng(9)
     pixels = corners.pixels.copy()
     pixels[rng.choice(200, 10, replace=False)] += rng.uniform(5, 20, (10, 2))

@@ -20,7 +20,7 @@ from gi.repository import GLib, Gst, GstRtsp, GstRtspServer  # noqa: E402
 
 
 def guard(server: GstRtspServer.RTSPServer, method: str) -> GstRtspServer.RTSPPermissions:
-    """Let only the user admin in."""
+    """Allow only the user admin."""
     token, auth = GstRtspServer.RTSPToken.new(), GstRtspServer.RTSPAuth.new()
     token.set_string("media.factory.role", "admin")
     if method == "basic":

@@ -1,4 +1,4 @@
-"""Frames that wait for the stages: never many, and each that is searched has all that it needs before it."""
+"""Frames that wait for the stages: their number is bounded, and each searched frame can be decoded."""
 
 from __future__ import annotations
 
@@ -57,7 +57,7 @@ def test_frames_are_skipped_until_a_late_keyframe() -> None:
     assert searched(waiting.take()) == [1000]
 
 
-# The frames of two cameras, whether each is a keyframe, and where the stages take what waits.
+# A case is the frames of two cameras, their keyframes, and the times at which the stages take frames.
 steps = st.lists(st.tuples(st.sampled_from("ab"), st.booleans(), st.integers(0, 40)), max_size=200)
 
 

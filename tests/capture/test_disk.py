@@ -1,4 +1,4 @@
-"""The size of a recording, and how long the disk lasts: printed before it begins, and while it goes on."""
+"""The size of a recording and the duration of the disk space, before and during a recording."""
 
 from __future__ import annotations
 
@@ -37,14 +37,14 @@ def rig_that_plays(lab: Path, more: str = "") -> Path:
 
 
 def status_line(status: LiveStatus) -> tuple[str, str]:
-    """The last line that is shown while recording, and its style."""
+    """Return the last line of the display during a recording, and its style."""
     text = status.show().renderables[-1]
     return str(text), str(text.style)  # type: ignore[union-attr]
 
 
 @contextmanager
 def opening(rig: Path, log: Path, seconds: float | None, doing: str | None = None) -> Iterator[LiveStatus]:
-    """The cameras opened as a command opens them; nothing is written."""
+    """Open the cameras as a command does; write nothing."""
     with open_cameras(prepare_lab(rig, None, None), log, seconds, doing) as (cameras, _, status):
         yield status
         cameras.stop()
@@ -73,7 +73,7 @@ def test_free_disk_time_is_printed_before_the_recording(
 def test_measure_prints_the_size_of_one_point(
     capsys: pytest.CaptureFixture[str], lab: Path, tmp_path: Path
 ) -> None:
-    """No rate: what is not measured is not kept."""
+    """There is no rate, because only measured frames are kept."""
     with opening(rig_that_plays(lab), tmp_path / "a.mcap", None, "measuring") as status:
         line, _ = status_line(status)
     assert line.endswith("left on the disk")
@@ -85,7 +85,7 @@ def test_measure_prints_the_size_of_one_point(
 def test_small_disk_is_warned_of_before_the_start(
     capsys: pytest.CaptureFixture[str], lab: Path, tmp_path: Path
 ) -> None:
-    """On a disk of its own: 20 MB, of which half is set aside for the end of the log."""
+    """Use a separate disk of 20 MB; half of it is reserved for the end of the log."""
     rig = rig_that_plays(lab, "rate_hz = 30\n")
     with small_disk(tmp_path / "disk", 20) as disk:
         with opening(rig, disk / "a.mcap", None):
@@ -94,7 +94,7 @@ def test_small_disk_is_warned_of_before_the_start(
         assert "to make it smaller: a lower rate_hz in lab.toml (15 halves it)" in said
         with opening(rig, disk / "b.mcap", 1.0):
             assert re.search(r"MB in 1 s; .*: enough for 2 s", capsys.readouterr().err)
-        # Cameras that are only looked at: nothing is said, but where even that does not fit.
+        # Cameras are only shown, so a message appears only if even that does not fit.
         with opening(rig, disk / "c.mcap", 1.0, "looking for 1 s"):
             assert "free in" not in capsys.readouterr().err
         with opening(rig, disk / "d.mcap", 60.0, "looking for 60 s"):
@@ -104,7 +104,7 @@ def test_small_disk_is_warned_of_before_the_start(
 def test_line_on_the_screen_is_corrected_by_what_came(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    """Expected were 10 MB/s; measured are 2 MB/s: the same disk lasts five times as long."""
+    """The estimate is 10 MB/s and the measured rate 2 MB/s: the disk lasts five times as long."""
     log = tmp_path / "a.mcap"
     log.write_bytes(bytes(20_000_000))
     monkeypatch.setattr(shutil, "disk_usage", lambda _: Usage(10**12, 0, 6_000_000_000))
@@ -126,7 +126,7 @@ def test_expected_rate_is_that_of_the_rig_and_the_first_frames() -> None:
     states = {
         "red": CameraState(frames=2, bytes=200_000, format="jpeg", size_px=(1280, 720)),
         "white": CameraState(frames=1, bytes=50_000, format="jpeg", size_px=(640, 480)),
-        # A first frame of a video is a keyframe, which says little.
+        # The first frame of a video is a keyframe, so its size gives no rate.
         "gate": CameraState(frames=1, bytes=400_000, format="h264", size_px=(1920, 1080)),
     }
     video = expected_bytes_per_s(cameras[2:], states)

@@ -1,4 +1,4 @@
-"""Cameras that send now: the order of their messages, what is lost, and what is said of it."""
+"""Live cameras: the order of their messages, lost frames, and events."""
 
 from __future__ import annotations
 
@@ -20,7 +20,7 @@ from ipsys_log.capture.multiplexer import LiveCameras
 from ipsys_log.messages import STAMP_UNRELIABLE, CompressedImage, Event, Message, RigCamera
 from tests.playing import cameras, playing
 
-# Nothing takes so long, however busy the machine is.
+# A limit far above any duration on a busy machine.
 LIMIT_S = 240.0
 FRAMES = {name: [f"{name} {n}".encode() for n in range(20)] for name in ("red", "white", "black")}
 
@@ -31,7 +31,7 @@ def messages(attached: LiveCameras) -> list[Message]:
 
 
 def events(found: list[Message]) -> list[Event]:
-    """Return the events but for those of a busy machine, on which this program stands still at times."""
+    """Return the events, without those of a busy machine that pauses this program."""
     payloads = [message.payload for message in found if isinstance(message.payload, Event)]
     return [event for event in payloads if event.kind != STAMP_UNRELIABLE]
 
@@ -64,12 +64,12 @@ def test_log_times_are_utc() -> None:
 
 
 def test_a_camera_without_stamps_has_the_time_of_arrival() -> None:
-    """The time is when the thread had the frame, even if the frame waited. No delay is claimed."""
+    """The time is the arrival in the thread, even if the frame waited. There is no delay to report."""
     sent_ns: list[int] = []
     clock = Clock()
 
     def before(_: str, number: int) -> None:
-        if number == 1:  # until then frames without stamps are thrown away
+        if number == 1:  # before this, frames without stamps are discarded
             assert attached._started.wait(LIMIT_S)
         sent_ns.append(clock.now_ns())
 
@@ -98,7 +98,7 @@ def test_frames_that_were_lost_before_they_came_are_counted_and_named() -> None:
     found = messages(attached)
     assert (attached.states["red"].missed, attached.states["red"].dropped) == (6, 0)
     assert len(data_of(found, "red")) == 7
-    # The first at once, those within a second of it together.
+    # The first event comes at once, later ones within a second come together.
     assert [(event.kind, event.camera) for event in events(found)] == [("frames_missed", "red")] * 2
     assert [event.text for event in events(found)] == said
     assert said == [f"{n} frames of camera red were lost before they came" for n in (2, 4)]
@@ -121,7 +121,7 @@ def test_a_camera_that_sends_nothing_is_named_without_its_password(monkeypatch: 
 
     @contextmanager
     def silent(camera: RigCamera, clock: Clock, say: Say) -> Iterator[Iterator[Frame | None]]:
-        yield iter(partial(time.sleep, 0.05), "the end")  # None, and None again
+        yield iter(partial(time.sleep, 0.05), "the end")  # None twice
 
     camera = RigCamera("red", source="rtsp://admin:secret@10.0.0.7/live")
     with pytest.raises(SourceError, match=r"admin:\*+@10\.0\.0\.7/live sends no frames") as raised:
@@ -155,7 +155,7 @@ def test_a_camera_that_vanishes_is_tried_again_while_the_others_go_on() -> None:
 
     found = messages(LiveCameras(cameras("red", "white"), opened, Clock()))
     said = [event for event in events(found) if event.camera == "red"]
-    # It was open when it went the first time, and not when the second try failed.
+    # The camera was open at the first loss, and closed when the second attempt failed.
     assert [event.kind for event in said] == ["camera_lost", "camera_back"]
     assert "has gone; trying again" in said[0].text
     assert len(data_of(found, "red")) == 10
@@ -164,7 +164,7 @@ def test_a_camera_that_vanishes_is_tried_again_while_the_others_go_on() -> None:
 
 
 def changing(*visits: list[Frame]) -> Open:
-    """A camera that sends some frames at each visit, and is gone then; after the last it ends."""
+    """A camera that sends some frames per connection and is then lost; after the last it ends."""
     left = list(visits)
 
     @contextmanager
@@ -233,7 +233,7 @@ def test_slow_disk_drops_named_frames_and_bounds_memory() -> None:
     (event,) = events(found)
     assert (event.kind, event.camera) == ("frames_dropped", "red")
     assert event.text == f"{dropped} frames of camera red dropped: the disk is too slow"
-    # In order, and without what is missing.
+    # In order, without the missing frames.
     assert kept == [data for data in frames["red"] if data in kept]
 
 
@@ -286,7 +286,7 @@ def test_failed_write_is_not_saved_and_gives_the_reason() -> None:
         for message in messages:
             if message is not None and message.topic == "/note":
                 attached.stop("the disk is full")
-                messages.close()  # it could not be written
+                messages.close()  # writing failed
         with pytest.raises(SourceError, match="not saved: the disk is full"):
             saved.result(LIMIT_S)
         with pytest.raises(SourceError, match="not saved: the disk is full"):
@@ -337,7 +337,7 @@ def test_early_frames_do_not_pile_up_while_another_camera_opens() -> None:
 
 @pytest.mark.parametrize("format", ["jpeg", "h264"])
 def test_frames_without_stamps_do_not_wait_for_another_camera_to_get_a_false_time(format: str) -> None:
-    """A stream that cannot be stopped: what is not taken waits in the socket, and comes late."""
+    """A stream cannot pause: unread data wait in the socket and arrive late."""
     picture, key = b"\0\0\1\x41", b"\0\0\1\x67\0\0\1\x65"
     taken_15, asked_ns = threading.Event(), list[int]()
 
@@ -362,9 +362,9 @@ def test_frames_without_stamps_do_not_wait_for_another_camera_to_get_a_false_tim
     with attached:
         found = [message for message in attached if message is not None and message.camera == "early"]
     numbers = [int(message.payload.data[-3:]) for message in found]
-    # Those that came before the other camera are thrown away; a video goes on where it can be read.
+    # Frames before the other camera's start are discarded; a video continues at a keyframe.
     assert numbers == [0, *range(20 if format == "h264" else 15, 40)]
-    # Each has the time at which it came: before the next one was asked for.
+    # Each frame has its arrival time, before the request for the next one.
     for message, n in zip(found, numbers, strict=True):
         assert asked_ns[n] <= message.publish_time_ns <= asked_ns[n + 1]
 
@@ -396,7 +396,7 @@ def test_frames_before_an_error_are_delivered() -> None:
             found.extend(message for message in attached if message is not None)
     assert len(data_of(found, "red")) == 5
     assert len(data_of(found, "white")) == 20
-    # Not only in the end: the other camera might go on for hours.
+    # The event does not wait for the end: the other camera might continue for hours.
     ((number, event),) = [(n, m.payload) for n, m in enumerate(found) if isinstance(m.payload, Event)]
     assert (event.kind, event.camera, event.text) == ("camera_failed", "red", said[0])
     assert "camera red: the program failed (ZeroDivisionError('a bug'))" in event.text
@@ -431,7 +431,7 @@ def test_a_bug_in_a_source_keeps_its_traceback() -> None:
 
 
 def test_a_silent_camera_is_no_reason_to_be_silent() -> None:
-    """So that a recorder can look at its clock, and at signals."""
+    """The iterator returns regularly, so a recorder can check its clock and signals."""
     attached = LiveCameras(cameras("red"), playing({"red": [b"a", b"b"]}, 2.0), Clock())
     with attached:
         assert list(attached).count(None) >= 3

@@ -1,4 +1,4 @@
-"""Frames in the log before anything else, and what waits for the stages."""
+"""Frames are logged before their results, and waiting frames are bounded."""
 
 from __future__ import annotations
 
@@ -38,7 +38,7 @@ def frame(number: int, camera: str = "red") -> Message:
 
 
 class Noted(Recording):
-    """Notes what is put into it."""
+    """A sink that notes its messages."""
 
     def __init__(self, writer: LogWriter) -> None:
         super().__init__(writer, lambda: None)
@@ -56,7 +56,7 @@ def log(tmp_path: Path) -> Iterator[Noted]:
 
 
 class Sent:
-    """Frames of cameras from a generator. The class notes why it was stopped."""
+    """Frames of cameras from a generator. The class notes the reason of its end."""
 
     def __init__(self, messages: Generator[Message | None, None, None]) -> None:
         self._messages, self.whys = messages, list[str | None]()
@@ -120,7 +120,7 @@ def test_a_fault_of_the_recorder_is_raised_where_frames_are_taken(log: Noted) ->
 
 
 def test_settings_are_in_the_file_before_the_first_frame(tmp_path: Path) -> None:
-    """As a recorder leaves them that is killed at once: rig, lens and the model of a live run."""
+    """The messages of a recorder that is killed at once: rig, intrinsics and the model of a live run."""
     path, killed = tmp_path / "a.mcap", tmp_path / "killed.mcap"
     rig = Rig("lab", "DICT_4X4_100", 0.2)
     settings = [Message(RIG_TOPIC, 1, 1, rig), Message("/runs/poly/model", 2, 2, Model(2, "poly", ()))]
@@ -134,7 +134,7 @@ def test_settings_are_in_the_file_before_the_first_frame(tmp_path: Path) -> None
 
 
 class FullDisk(Disk):
-    """Takes 100 kB, and more when something is freed."""
+    """A disk with room for 100 kB, and for more when space is freed."""
 
     freed = threading.Event()
 
@@ -200,7 +200,7 @@ def test_the_old_log_is_there_until_the_new_one_stands(
     (tmp_path / "a.mcap.new").write_bytes(b"left by one that was killed")
     with open_recording(path, overwrite=True) as second:
         second.put(frame(1))
-        # Nobody else makes a log there meanwhile, nor is there an instant without one.
+        # No other process creates a log there, and the log exists at every instant.
         with pytest.raises(LogError, match="another process"), open_recording(path, overwrite=True):
             pass
     with Session([path]) as session:
@@ -230,7 +230,7 @@ def test_a_journal_that_was_left_over_does_not_outlive_its_log(tmp_path: Path, w
 
 
 class Killed(Disk):
-    """Is killed when a journal stands."""
+    """A process that is killed while a journal exists."""
 
     def truncate(self, fd: int, size: int) -> None:  # noqa: ARG002
         raise KeyboardInterrupt

@@ -36,7 +36,7 @@ def ask(driver: Driver, **asked: float | str | None) -> RigCamera:
 
 
 def test_requests_are_those_of_the_kernel() -> None:
-    """As a C program prints them that includes linux/videodev2.h, on 64 bits."""
+    """The numbers are the output of a C program with linux/videodev2.h on 64 bits."""
     numbers = {
         "QUERYCAP": 0x80685600, "ENUM_FMT": 0xC0405602, "S_FMT": 0xC0D05605, "REQBUFS": 0xC0145608,
         "QUERYBUF": 0xC0585609, "QBUF": 0xC058560F, "DQBUF": 0xC0585611, "STREAMON": 0x40045612,
@@ -50,7 +50,7 @@ def test_requests_are_those_of_the_kernel() -> None:
 
 
 def test_frames_are_the_cameras_bytes_with_the_drivers_stamps(driver: Driver) -> None:
-    # More than there are buffers, so that each is handed back; an empty frame is none.
+    # There are more frames than buffers, so each buffer is returned; an empty frame is dropped.
     pictures = [bytes([n]) * (1000 + n) for n in range(20)]
     driver.frames.extend([*pictures[:3], b"", *pictures[3:]])
     clock = Clock()
@@ -62,7 +62,9 @@ def test_frames_are_the_cameras_bytes_with_the_drivers_stamps(driver: Driver) ->
     assert [frame[:3] for frame in came] == [
         (data, "jpeg", time) for data, time in zip(pictures, expected, strict=True)
     ]
-    assert [n for n, frame in enumerate(came) if frame.missed] == [3]  # that with the empty one before it
+    assert [n for n, frame in enumerate(came) if frame.missed] == [
+        3
+    ]  # the one with the empty frame before it
     assert not driver.streaming
     assert said == ['camera red: the driver stamps the start of a frame; put into the rig: stamp = "start"']
 
@@ -73,8 +75,8 @@ def test_frames_are_the_cameras_bytes_with_the_drivers_stamps(driver: Driver) ->
         ((0, 1, 2, 3), (0, 0, 0, 0)),
         ((7, 8, 11, 12), (0, 0, 2, 0)),
         ((2**32 - 2, 2**32 - 1, 1, 2), (0, 0, 1, 0)),
-        ((0, 0, 0, 0), (0, 0, 0, 0)),  # it does not count
-        ((500, 501, 0, 1), (0, 0, 0, 0)),  # it counts anew
+        ((0, 0, 0, 0), (0, 0, 0, 0)),  # without a sequence number
+        ((500, 501, 0, 1), (0, 0, 0, 0)),  # the count restarts
     ],
 )
 def test_frames_that_the_driver_lost_are_told(
@@ -131,7 +133,7 @@ def test_settings_that_a_camera_refuses_are_reported(driver: Driver) -> None:
         "camera red: asked for 12 of focus, which it does not let us set",
         "camera red: the driver stamps the start of a frame, the rig says: end",
     ]
-    assert driver.controls[0x9A0901][2] == 1  # the exposure is by hand
+    assert driver.controls[0x9A0901][2] == 1  # manual exposure
 
 
 def test_accepted_settings_give_no_message(driver: Driver) -> None:
@@ -184,7 +186,7 @@ def test_a_camera_of_no_known_format(driver: Driver) -> None:
 
 
 def raw(name: str, picture: NDArray[np.uint8], stride: int) -> bytes:
-    """A picture as FFmpeg's own converter lays it out, its rows padded."""
+    """Return an image in the layout of FFmpeg's converter, with padded rows."""
     frame = av.VideoFrame.from_ndarray(picture, format="bgr24")
     kind = {"YUYV": "yuyv422", "UYVY": "uyvy422", "NV12": "nv12", "GREY": "gray"}[name]
     planes = frame.reformat(format=kind, dst_color_range="JPEG").planes
@@ -224,7 +226,7 @@ def test_pictures_of_a_camera_without_jpeg_are_encoded_once(driver: Driver, name
     ("source", "said"), [("usb:/nowhere/video9", "no such device"), ("usb:/dev/null", "is no camera")]
 )
 def test_device_that_is_no_camera_is_refused(source: str, said: str) -> None:
-    """With the real kernel."""
+    """Test with the real kernel."""
     with (
         pytest.raises(SourceError, match=said),
         open_usb(RigCamera("red", source=source), Clock(), lambda _: None),

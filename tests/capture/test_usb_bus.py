@@ -30,7 +30,7 @@ def endpoint(size: int, more: int = 0) -> bytes:
     return struct.pack("<BBBBHB", 7, 5, 0x81, 5, size | more << 11, 1)
 
 
-# The control interface has an endpoint of its own, which sends no pictures.
+# The control interface has an endpoint that sends no images.
 DESCRIPTORS = (
     bytes([18, 1, *[0] * 16])
     + interface(0, 0, 1) + endpoint(1024, 2)
@@ -68,7 +68,7 @@ def plug_in(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Callable[[int, s
 
 
 def answer(device: int, request: int, about: object, change: bool) -> int:
-    """Each device is a camera of the same modes."""
+    """Return devices that are cameras with the same modes."""
     path = Path(f"/proc/self/fd/{device}").resolve()
     if path.name == "video9":
         raise OSError(25, "Inappropriate ioctl for device")
@@ -85,7 +85,7 @@ def write(folder: Path, values: dict[str, str]) -> None:
 
 
 def test_cameras_are_found_where_they_hang(tmp_path: Path, plug_in: Callable[[int, str], None]) -> None:
-    for number, port in ((10, "2.3"), (2, "4"), (9, "5")):  # 9 is a device that takes no pictures
+    for number, port in ((10, "2.3"), (2, "4"), (9, "5")):  # 9 is a device without images
         plug_in(number, port)
     first, second = find_cameras(tmp_path)
     assert (first.device, first.name) == (str(tmp_path / "dev/video2"), "Lab Camera 2")
@@ -138,11 +138,14 @@ def cameras(count: int, **other: Any) -> list[BandwidthDemand]:
 
 
 def test_cameras_that_fit_a_bus_get_no_advice() -> None:
-    """By USB 2.0, 5.6.4, 80 % of 480 Mbit/s: 48 MB/s. Two of 1920 x 1080 x 30 x 0.25 B are 31 MB/s."""
+    """USB 2.0, section 5.6.4, allows 80 % of 480 Mbit/s: 48 MB/s.
+
+    Two of 1920 x 1080 x 30 x 0.25 B are 31 MB/s.
+    """
     assert advise(cameras(2)) == []
     assert advise(cameras(3, rate_hz=25.0)) == []
     assert advise(cameras(3, width=1280, height=720)) == []
-    # On buses of their own, or on USB 3, four fit.
+    # Four cameras fit on separate buses, or on USB 3.
     assert advise([demand._replace(bus=n) for n, demand in enumerate(cameras(4))]) == []
     assert advise(cameras(4, speed_mbit_s=5000.0)) == []
 
@@ -153,7 +156,7 @@ def test_overloaded_bus_is_explained() -> None:
         "cameras black, blue, red and white share USB bus 1 (Acme Hub at port 2) and need "
         "64.6 MB/s of its 48: plug one into another bus, or ask for 20 frames/s of each, or for 1280 x 960 px"
     )
-    # What it advises fits.
+    # The advised settings fit.
     assert advise(cameras(4, rate_hz=20.0)) == []
     assert advise(cameras(4, width=1280, height=960)) == []
     assert advise(cameras(4, rate_hz=25.0)) != []

@@ -1,4 +1,4 @@
-"""Videos and pictures with times, as frames of a log and as live cameras."""
+"""Videos and images with times, as frames of a log and as live cameras."""
 
 from __future__ import annotations
 
@@ -146,7 +146,7 @@ def test_a_time_with_a_zone() -> None:
 
 
 def play(source: str, name: str = "red") -> list[tuple[int, Frame]]:
-    """Frames and by how much they came after their stamp."""
+    """Return the frames and their delay after their stamps."""
     clock = Clock()
     with open_source(RigCamera(name, source=source), clock, lambda _: None) as frames:
         return [(clock.now_ns() - (frame.time_ns or 0), frame) for frame in frames if frame is not None]

@@ -1,4 +1,4 @@
-"""``ipsys align`` as a user meets it: rendered frames of cameras that hang askew."""
+"""``ipsys align`` on rendered frames of tilted cameras."""
 
 from __future__ import annotations
 
@@ -46,7 +46,7 @@ RIG = Rig("lab", LAB.dictionary, LAB.marker_length_m, floor=Floor(4.88, 4.88))
 
 
 def hung(tilts: Mapping[str, tuple[float, float]]) -> dict[str, Camera]:
-    """Cameras above the floor, each with its tilt and where in its picture the axis of this tilt points."""
+    """Return cameras above the floor, each with its tilt and the direction of the tilt axis in its image."""
     cameras = {}
     for camera in mount_cameras(LAB):
         if camera.name in tilts:
@@ -64,7 +64,7 @@ def film(
     rig: Rig | None = RIG,
     lenses: bool = True,
 ) -> Path:
-    """A log with one frame of each camera, markers on the floor beneath it."""
+    """Write a log with one frame of each camera, and markers on the floor below it."""
 
     def messages() -> Iterator[Message]:
         if rig is not None:
@@ -131,7 +131,7 @@ def true_tilt(camera: Camera) -> float:
 def test_align_reads_a_session_with_calibration_points(
     ipsys: Ipsys, lab: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    """At all heights, by tape, then a drive: what was measured tells how high a marker was."""
+    """The log has points at all heights, and then a drive: the measurements give the heights."""
     section = data_section(lab)
     found = aligned(ipsys, lab)
     settings = LabSettings(width=960, height=540, markers=8, stations=26, drive_s=1.0)
@@ -142,7 +142,7 @@ def test_align_reads_a_session_with_calibration_points(
         assert row["places"] >= 20
     overlaps = {tuple(row["cameras"]): row for row in found["overlaps"]}
     assert set(overlaps) == {("black", "white"), ("red", "white")}
-    # The simulated lab hangs its cameras so that a marker fits.
+    # In the simulated lab, a marker fits into the overlap of its cameras.
     assert all(row["enough"] for row in overlaps.values())
     assert found["coverage"]["unseen"] == []
     assert data_section(lab).startswith(section)
@@ -155,7 +155,7 @@ def test_align_reads_a_session_with_calibration_points(
     assert "black and white overlap by" in done.out
     picture = cv2.imread(str(drawn))
     assert picture is not None
-    # The blue of what two cameras see, on the map.
+    # the blue of the overlap of two cameras on the map
     assert (np.abs(picture.astype(int) - [232, 214, 195]).max(axis=2) < 3).mean() > 0.02
 
 
@@ -173,7 +173,7 @@ def changed(log: Path, change: Callable[[Message], Message | None]) -> Path:
 
 
 def test_overlaps_need_no_tape(ipsys: Ipsys, lab: Path) -> None:
-    """By the plumb lines and markers that two cameras see: about what the tape says."""
+    """The plumb lines and common markers of two cameras give nearly the result of the tape."""
     by_tape = {tuple(row["cameras"]): row["width_m"] for row in aligned(ipsys, lab)["overlaps"]}
 
     def heights_only(message: Message) -> Message:

@@ -33,7 +33,7 @@ OPENED = "shows the simulated lab"
 
 @pytest.fixture(scope="module")
 def fitted(lab_log: Path, tmp_path_factory: pytest.TempPathFactory) -> Path:
-    """A log with a model of the cameras red, white and black."""
+    """Return a log with a model of the cameras red, white and black."""
     path = tmp_path_factory.mktemp("fitted") / "calibration.mcap"
     replay([lab_log], Request(), output=path)
     return path
@@ -46,13 +46,13 @@ def write_rig(folder: Path, cameras: str) -> Path:
 
 
 def played(lab: Path, camera: str = "red", more: str = "") -> str:
-    """A camera that plays a recorded one, and has its lens from the same log."""
+    """Return a rig camera that plays a recorded one, with intrinsics from the same log."""
     return (
         f'[[cameras]]\nname = "{camera}"\nsource = "file:{lab}?{camera}"\ncalibration = "{lab.name}"\n{more}'
     )
 
 
-# Beside the camera that would tell that it was opened.
+# Use this camera beside another one that reports if it is opened.
 FAULTS = {
     "source": ('[[cameras]]\nname = "white"\nsource = "carrier_pigeon:7"\n', "is none of http:"),
     "simulated camera": ('[[cameras]]\nname = "white"\nsource = "sim:blue"\n', "has no camera 'blue'"),
@@ -152,7 +152,7 @@ def test_a_model_of_other_cameras_is_refused_before_any_is_opened(
 
 
 def test_a_lens_comes_out_of_a_log(ipsys: Ipsys, tmp_path: Path, lab: Path) -> None:
-    """By its camera; of a log with a single one, whatever that is called."""
+    """Select by camera name; a log with a single camera needs no name."""
     rig = write_rig(tmp_path, played(lab))
     one = ("record", "--rig", rig, "--seconds", "0.5", "-o")
     assert ipsys(*one, tmp_path / "red.mcap").code == 0
@@ -260,7 +260,7 @@ def test_a_picture_is_what_its_name_says(ipsys: Ipsys, lab: Path) -> None:
 def test_info_keeps_each_channel_on_a_line_and_has_no_rates_of_events(
     ipsys: Ipsys, tmp_path: Path, lab: Path, fitted: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    """The log has three runs. The window has 80 columns."""
+    """The log has three runs, and the window has 80 columns."""
     monkeypatch.setenv("COLUMNS", "80")
     monkeypatch.chdir(tmp_path)
     for model in ("poly", "rigid"):
@@ -277,7 +277,7 @@ def test_info_keeps_each_channel_on_a_line_and_has_no_rates_of_events(
     found = json.loads(ipsys("info", lab.name, "--json").out)
     rates = {topic: row["rate_hz"] for topic, row in found["channels"].items()}
     assert rates["/cameras/red/image"] == pytest.approx(5.0)
-    # Of three cameras, each with two frames at a place: 5 steps in 0.22 s.
+    # Three cameras with two frames at each point: 5 steps in 0.22 s.
     assert rates["/runs/poly/tracks"] == pytest.approx(22.5)
     for topic in ("/measurements", "/rig", "/cameras/red/calibration", "/runs/poly/record"):
         assert rates[topic] is None

@@ -1,4 +1,4 @@
-"""``ipsys plan`` as a user meets it."""
+"""``ipsys plan`` on the command line."""
 
 from __future__ import annotations
 
@@ -26,13 +26,13 @@ PAPER = ROOT / "sample_logs" / "paper_lab.mcap"
 
 @pytest.fixture
 def paper(tmp_path: Path) -> Path:
-    """The paper's layout without frames."""
+    """Write the paper's layout without frames."""
     return Path(shutil.copy(PAPER, tmp_path / "paper.mcap"))
 
 
 @pytest.fixture(scope="module")
 def fitted_log(tmp_path_factory: pytest.TempPathFactory) -> Path:
-    """The paper's layout with the model that a plan is made for, to be copied before it is changed."""
+    """Write the paper's layout with a fitted model for a plan; tests copy it before a change."""
     path = Path(shutil.copy(PAPER, tmp_path_factory.mktemp("fitted") / "paper.mcap"))
     replay([path], Request(models=("best",)), until="fit")
     return path
@@ -40,7 +40,7 @@ def fitted_log(tmp_path_factory: pytest.TempPathFactory) -> Path:
 
 @pytest.fixture
 def fitted(fitted_log: Path, tmp_path: Path) -> Path:
-    """A copy of it."""
+    """Copy the log with the model."""
     return Path(shutil.copy(fitted_log, tmp_path / "paper.mcap"))
 
 
@@ -77,7 +77,7 @@ def planned(ipsys: Ipsys, *arguments: object) -> dict[str, Any]:
 
 
 def refused(ipsys: Ipsys, log: Path, *arguments: object) -> str:
-    """The one line of a plan that cannot be made, after looking that nothing was written."""
+    """Return the one line of an impossible plan, and check that no file was written."""
     before = {path.name: path.read_bytes() for path in log.parent.iterdir()}
     done = ipsys("plan", log, *arguments)
     assert (done.code, done.out) == (1, "")
@@ -100,7 +100,7 @@ def test_the_plan_is_a_table_and_a_headline(
     assert [row.split()[0] for row in rows] == ["1", "2", "3", "4", "5"]
     assert lines[-1].startswith("predicted mean error over the floor now 0.")
     assert "with these 5 places 0." in lines[-1]
-    # The model that was lacking was fitted and appended; what was recorded is as it was.
+    # The missing model was fitted and appended; the recorded data are unchanged.
     assert "fit           run best  1 message\n" in done.err
     assert data_section(paper).startswith(section)
     with Session([paper]) as session:
@@ -138,7 +138,7 @@ def test_heights_and_models_as_asked_for(ipsys: Ipsys, fitted: Path) -> None:
     found = planned(ipsys, fitted, "--height-m", "0.12", "--places", 2)
     assert {place["height_m"] for place in found["places"]} == {0.12}
     found = planned(ipsys, fitted, "--height-m", "0.12", "--height-m", "0", "--places", 2)
-    # Most places were measured nearer to 12 cm: the floor itself has its turn.
+    # Most points were measured at about 12 cm, so the floor itself is next.
     assert {place["height_m"] for place in found["places"]} == {0.0}
     for model in ("poly", "rigid+poly", "rayplane"):
         rig = fitted.with_name("lab.toml")
@@ -149,7 +149,7 @@ def test_heights_and_models_as_asked_for(ipsys: Ipsys, fitted: Path) -> None:
             ipsys, fitted, "--model", model, *(["--rig", rig] if rig.exists() else []), "--places", 1
         )
         assert found["model"] == model
-        # The error is that of the markers as robots carry them, where the rig knows it.
+        # The error is that of markers at the height on the robots, if the rig has this height.
         assert found["marker_height_m"] == pytest.approx(0.2 if model == "rayplane" else 0.1, abs=0.02)
 
 
@@ -161,7 +161,7 @@ def test_the_picture(ipsys: Ipsys, fitted: Path) -> None:
     assert picture is not None
     assert picture.shape == (700, 1400, 3)
     left, right = picture[90:590, 75:580].astype(int), picture[90:590, 705:1210].astype(int)
-    # The same floor twice, with other errors on it.
+    # The figure shows the same floor twice, with other errors.
     same = (left == right).all(axis=2).mean()
     assert 0.1 < same < 0.99
     assert sorted(path.name for path in fitted.parent.iterdir()) == ["paper.mcap", "plan.png"]
@@ -183,7 +183,7 @@ def test_plan_for_ten_paper_points_fills_the_gaps(ipsys: Ipsys, authors: Path) -
     )
     assert nearest_m(planned_m).mean() > 1.3 * nearest_m(floor_m).mean()
     assert nearest_m(planned_m).min() > 0.25
-    # The wide gap right of the middle, where black has no place, is the first.
+    # The wide gap right of the centre, without points of black, is first.
     first = planned_m[0]
     assert 3.0 < first[0] < 4.8
     assert 2.5 < first[1] < 3.7
@@ -191,7 +191,7 @@ def test_plan_for_ten_paper_points_fills_the_gaps(ipsys: Ipsys, authors: Path) -
     sides = [place["side"] for place in found["places"]]
     assert sides == ["left" if y_m > 2.4384 else "right" for _, y_m in planned_m]
     assert set(sides) == {"left", "right"}
-    # With all 40 places of each camera there is little left to gain.
+    # With all 40 points per camera, little improvement is left.
     full = planned(ipsys, authors, "--places", 6)
     assert full["mean_after_cm"] > 0.95 * full["mean_before_cm"]
 
@@ -214,7 +214,7 @@ def test_impossible_plan_is_refused(ipsys: Ipsys, paper: Path) -> None:
     assert "this is the log itself" in refused(ipsys, paper, "--plot", paper)
     assert "there is no folder" in refused(ipsys, paper, "--plot", paper.parent / "nowhere" / "plan.png")
     assert ipsys("fit", paper, "--model", "best").code == 0
-    # Above the cameras, though not above all that the floor allows.
+    # The height is above the cameras, but not above the limit for the floor.
     assert "no camera sees a whole marker 3.5 m above the floor" in refused(ipsys, paper, "--height-m", "3.5")
 
 
@@ -227,7 +227,7 @@ def test_too_few_points_are_reported(ipsys: Ipsys, paper: Path) -> None:
 
 
 def test_missing_data_of_the_log_give_notes(ipsys: Ipsys, authors: Path) -> None:
-    """No lenses, no floor, no reference points, and a camera that no place was measured for."""
+    """The log has no intrinsics, no floor, no reference points, and a camera without points."""
 
     def bare(message: Message) -> Message | None:
         payload = message.payload

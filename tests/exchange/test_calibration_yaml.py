@@ -1,4 +1,4 @@
-"""Calibrations written, and read again by others."""
+"""Written calibrations that other software reads."""
 
 from __future__ import annotations
 

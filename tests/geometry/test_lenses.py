@@ -1,4 +1,4 @@
-"""Lenses against the formulas of their models, written out here."""
+"""Lenses compared with the formulas of their models, written out here."""
 
 from __future__ import annotations
 
@@ -24,7 +24,7 @@ def lens(model: str, d: tuple[float, ...]) -> CameraCalibration:
 
 
 def kannala_brandt(point: tuple[float, float, float]) -> tuple[float, float]:
-    """Eq. of the fisheye model as in OpenCV's documentation, by hand."""
+    """Project with the fisheye formula of OpenCV's documentation."""
     x, y, z = point
     r = np.hypot(x, y) / z
     theta = np.arctan(r)

@@ -1,4 +1,4 @@
-"""Eq. (25) against points whose distances were measured here."""
+"""Eq. (25) compared with points at known distances."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""Payloads survive the log bit for bit, and the schemas are those of the package."""
+"""Payloads keep every bit in the log, and the schemas are those of the package."""
 
 from __future__ import annotations
 
@@ -151,7 +151,7 @@ def test_bytes_that_are_no_such_message(data: bytes) -> None:
 
 
 def test_every_payload_mirrors_its_schema() -> None:
-    """A field that the schema lacks would be lost; the codec finds it only when it is used."""
+    """A field without a schema entry would be lost; the codec finds it only on use."""
     for name, payload in PAYLOADS.items():
         pool = descriptor_pool.DescriptorPool()
         for file in descriptor_pb2.FileDescriptorSet.FromString(schema_data(name)).file:

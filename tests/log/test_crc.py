@@ -1,4 +1,4 @@
-"""A CRC put together from those of the parts is that of the whole."""
+"""A CRC combined from the parts equals that of the whole."""
 
 import zlib
 from random import Random
@@ -24,7 +24,7 @@ def test_any_length(crc: int, zeros: int, rest: bytes) -> None:
 
 @given(CRCS, CRCS, CRCS, st.integers(0, 1 << 60), st.integers(0, 1 << 60))
 def test_texts_longer_than_memory(first: int, second: int, third: int, one: int, other: int) -> None:
-    """Whichever two of three are put together first."""
+    """The order of combination does not matter."""
     from_left = combine(combine(first, second, one), third, other)
     assert from_left == combine(first, combine(second, third, other), one + other)
 

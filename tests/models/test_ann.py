@@ -1,4 +1,4 @@
-"""Small networks: their slopes, what they can learn, and the paper's figures."""
+"""Small networks: their gradients, their learning, and the paper's figures."""
 
 from __future__ import annotations
 
@@ -21,7 +21,7 @@ from tests.models.test_rays import authors_pairs, error_cm
 
 
 def test_three_tanh_neurons_and_a_linear_output() -> None:
-    """Fig. 4 of the paper, written out."""
+    """Compute the network of fig. 4 of the paper, written out."""
     rng = np.random.default_rng(0)
     weights, x = rng.normal(size=16), rng.normal(size=(5, 3))
     neurons = [np.tanh(weights[4 * k] + x @ weights[4 * k + 1 : 4 * k + 4]) for k in range(3)]
@@ -54,7 +54,7 @@ def test_network_learns_the_output_of_another_network() -> None:
 
 
 def test_noise_alone_is_not_learned() -> None:
-    """The pull that the data choose: without it 16 weights make much of 40 numbers."""
+    """The data select the weight decay: without it, 16 weights overfit 40 numbers."""
     rng = np.random.default_rng(3)
     x, noise = rng.normal(size=(40, 3)), rng.normal(size=40)
     assert NeuralNetwork().fit(x, noise).predict(x).std() < 0.2 * noise.std()
@@ -62,7 +62,7 @@ def test_noise_alone_is_not_learned() -> None:
 
 @pytest.mark.parametrize("count", [5, 6, 8, 10])
 def test_a_few_pairs_are_not_taken_for_noise(count: int) -> None:
-    """A network that says nothing explains them too, if the noise may be as large as the floor."""
+    """A constant network also explains the data if the noise may be as large as the floor."""
     for seed in range(10):
         rng = np.random.default_rng(seed)
         x = rng.uniform((-2.3, -1.0, 1.9), (2.3, 1.0, 2.2), (count, 3))
@@ -92,7 +92,7 @@ def test_estimator_passes_scikit_learn_checks() -> None:
 
 @pytest.mark.parametrize(("hybrid", "limit_cm"), [(False, 1.782), (True, 1.670)])
 def test_the_papers_figures(data: Path, hybrid: bool, limit_cm: float) -> None:
-    """Table I: means of ANN and RT+ANN over the three cameras, whatever the seed."""
+    """Compare the means of ANN and RT+ANN over the three cameras with Table I, for any seed."""
     means = []
     for seed in range(5):
         network_of_seed = NeuralNetwork(seed)

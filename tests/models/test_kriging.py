@@ -1,4 +1,4 @@
-"""Kriging against formulas written out, and against the paper's figures."""
+"""Kriging compared with written formulas and with the paper's figures."""
 
 from __future__ import annotations
 
@@ -25,7 +25,7 @@ def wavy(seed: int, count: int = 30, noise: float = 0.0) -> tuple[np.ndarray, np
 
 @pytest.mark.parametrize("noisy", [False, True])
 def test_mean_and_variance_are_those_of_the_textbook(noisy: bool) -> None:
-    """Universal kriging by its normal equations, with the parameters that were found."""
+    """Compute universal kriging by its normal equations, with the fitted parameters."""
     x, y = wavy(0, noise=0.1 if noisy else 0.0)
     model = Kriging(noisy).fit(x, y)
     points = (x - model.centre_) / model.scale_
@@ -100,7 +100,7 @@ def test_duplicate_points_do_not_break_the_fit() -> None:
     assert np.isfinite(Kriging(noisy=True).fit(x, y).predict(x)).all()
 
 
-# It fits 11 rows of 10 columns: the linear trend leaves nothing that a variance could be learned from.
+# It fits 11 rows of 10 columns: the linear trend leaves no data for a variance.
 _TOO_FEW = {"check_regressor_multioutput": "has fewer rows than a linear trend of its columns needs"}
 
 
@@ -139,7 +139,7 @@ def test_the_variance_comes_back_out_of_a_log_too() -> None:
         np.testing.assert_allclose(one, other, atol=1e-9)
 
 
-# Tables I: means of KI and RT+KI in cm for the red, white and black camera.
+# Table I: means of KI and RT+KI in cm for the red, white and black camera.
 INTERPOLATED = {"kriging": (1.306, 2.297, 2.898), "rigid+kriging": (1.312, 2.294, 2.804)}
 REGRESSED = {"kriging-regression": 2.048, "rigid+kriging-regression": 2.033}
 

@@ -59,13 +59,13 @@ def test_one_wrong_point_has_little_effect_on_the_others(name: str) -> None:
         for w in (world, wrong)
     )
     assert np.linalg.norm(right - moved, axis=1).max() < 0.01
-    # Least squares spreads the error over the floor.
+    # Least squares distributes the error over the floor.
     poly = [create("poly").fit(points, w).predict(points) for w in (world, wrong)]
     assert np.linalg.norm(poly[0] - poly[1], axis=1).max() > 0.05
 
 
 def test_shared_points_connect_two_cameras() -> None:
-    """In the overlap both cameras then say nearly the same, although the tape errs."""
+    """In the overlap, both cameras give nearly the same position, in spite of tape errors."""
     apart: list[float] = []
     together: list[float] = []
     for seed in range(20):
@@ -154,7 +154,7 @@ def authors_pairs(data: Path) -> dict[str, tuple[np.ndarray, ...]]:
 
 
 def cross_validated_cm(name: str, data: Path, seed: int, axes: int) -> float:
-    """Mean error over the cameras in 4 x 5-fold cross-validation by scikit-learn's own folds."""
+    """Return the mean error over the cameras in 4 x 5-fold cross-validation by scikit-learn's folds."""
     means = []
     for points, world, test_points, test_world in authors_pairs(data).values():
         x = inputs(name, np.vstack([points, test_points]), np.concatenate([world, test_world])[:, 2])
@@ -169,7 +169,7 @@ def cross_validated_cm(name: str, data: Path, seed: int, axes: int) -> float:
 
 
 def test_known_height_error_on_the_authors_points(data: Path) -> None:
-    """The paper's best method is off by 1.14 cm on its test places, 1.75 cm in cross-validation."""
+    """The paper's best method has 1.14 cm on its test points, and 1.75 cm in cross-validation."""
     errors = []
     for points, world, test_points, test_world in authors_pairs(data).values():
         model = create("rayplane").fit(inputs("rayplane", points, world[:, 2]), world)
@@ -181,7 +181,7 @@ def test_known_height_error_on_the_authors_points(data: Path) -> None:
 
 @pytest.mark.slow
 def test_best_is_better_than_poly_on_folds_that_it_was_not_chosen_on(data: Path) -> None:
-    """Chosen with other folds; ten seeds, each with four times five folds over all places of a camera."""
+    """The model was chosen with other folds; the test has ten seeds, each with four times five folds."""
     seeds = range(700, 710)
     poly, best = (np.mean([cross_validated_cm(name, data, s, 3) for s in seeds]) for name in ("poly", "best"))
     assert best <= 0.82 * poly

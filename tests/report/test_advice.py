@@ -1,4 +1,4 @@
-"""The advice on the number of places and on the model, with its reasons."""
+"""The advice on the number of points and on the model, with its reasons."""
 
 from __future__ import annotations
 
@@ -15,7 +15,7 @@ from ipsys_log.report.findings import Findings
 from ipsys_log.runs.output import write_log
 from tests.report.conftest import find
 
-# The 95 % interval of the mean is this share of it, each way.
+# half of the 95 % interval of the mean, as a share of the mean
 WIDE, NARROW = 0.3, 0.01
 
 
@@ -32,7 +32,7 @@ def evaluation(
     labelled: bool = False,
     level: bool = False,
 ) -> Evaluation:
-    """An evaluation with these mean errors in space by number of places; on the floor they are half."""
+    """Return an evaluation with these 3D mean errors by number of points; the 2D errors are half."""
     last_m = means_cm[max(means_cm)] / 100
     space = None if level else errors(last_m, share)
     rows = tuple(
@@ -49,7 +49,7 @@ def evaluation(
 
 
 def test_paper_data_recommend_rigid_with_10_points_poly_from_30(paper: Findings) -> None:
-    """Sect. 4.1: the rigid transformation exceeds the polynomial with 10 places, and falls behind later."""
+    """Sect. 4.1: the rigid transformation is better than the polynomial with 10 points, and worse later."""
     advice = paper.advice
     assert advice is not None
     assert advice.published
@@ -106,7 +106,7 @@ def test_labelled_subsets_come_before_random_ones_where_they_have_sizes() -> Non
     assert both is not None
     assert both.published
     assert list(both.choices) == [10, 20]
-    # One label is no curve.
+    # One label gives no curve.
     one = advise([replace(drawn, learning=(*drawn.learning, labelled.learning[0]))])
     assert one is not None
     assert not one.published
@@ -135,7 +135,7 @@ def test_the_paper_s_other_methods_are_no_reason_to_use_neither_rigid_nor_poly()
     assert advice.sentences[0] == (
         "Between rigid and poly, use rigid with up to 10 points per camera, poly from 20 on."
     )
-    # Nothing is there that is not of the paper: a column of all would say the same again.
+    # All methods are the paper's: a column for all would repeat the same.
     assert advice.groups == [SIMPLE, PAPER]
 
 

@@ -1,4 +1,4 @@
-"""The picture of a session: complete, legible, of the right size, whatever there is to draw."""
+"""The figure of a session: complete, legible, of the right size, for all data."""
 
 from __future__ import annotations
 
@@ -134,7 +134,7 @@ def test_no_text_covers_another_or_leaves_the_picture(
     figure = Figure(figsize=(14, max(8.0, 1.6 + 0.23 * count_rows(accuracies))), dpi=100)
     draw_errors(figure, accuracies, camera_styles(cameras), left_in=7.3, top_in=0.65)
     width, height = figure.get_size_inches() * figure.dpi
-    figure.savefig(io.BytesIO(), format="png")  # ticks have their texts only when drawn
+    figure.savefig(io.BytesIO(), format="png")  # ticks get their texts during the drawing
     (axes,) = figure.axes
     ticks = [
         tick

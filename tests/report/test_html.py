@@ -1,4 +1,4 @@
-"""``ipsys report``: one page that needs no network, obeys nobody's names, and can be read on a telephone."""
+"""``ipsys report``: one page without a network, safe with any name, and readable on a phone."""
 
 from __future__ import annotations
 
@@ -27,7 +27,7 @@ EVIL = "<script>window.ran=true</script><img src='http://evil.example/x.png'>"
 
 
 def hostile(messages: list[Message]) -> list[Message]:
-    """The same session with names that would run, load or break something."""
+    """Return the same session with names that contain HTML and scripts."""
 
     def spoiled(message: Message) -> Message:
         payload = message.payload
@@ -48,7 +48,7 @@ def hostile_log(tmp_path_factory: pytest.TempPathFactory) -> Path:
 
 
 def with_suspect(accuracies: list[Accuracy]) -> list[Accuracy]:
-    """The last model suspects a measurement, and says how to mend it."""
+    """Give the last model an outlier with a correction."""
     *rest, last = accuracies
     assert last.evaluation is not None
     suspect = Suspect(
@@ -60,7 +60,7 @@ def with_suspect(accuracies: list[Accuracy]) -> list[Accuracy]:
 
 @pytest.fixture(scope="module")
 def page(hostile_log: Path) -> str:
-    """A page with everything that a page can have: all models, suspects, flat tape, hostile names."""
+    """Return a page with all parts: all models, outliers, uncertain tape, hostile names."""
     outcomes = replay([hostile_log], Request(models=("poly",)), "evaluate")
     with Session([hostile_log]) as session:
         return render_report(session, with_suspect(many_models(read_accuracy(session, outcomes))))
@@ -171,7 +171,7 @@ def test_a_level_lab_with_one_camera_has_a_page(tmp_path: Path) -> None:
 
 
 def test_a_model_of_another_log_has_a_page(ipsys: Ipsys, tmp_path: Path) -> None:
-    """It is not fitted again here: there is no cross-validation and no learning curve."""
+    """The model is not fitted again: there is no cross-validation and no learning curve."""
     for name in ("old", "new"):
         write_log(tmp_path / f"{name}.mcap", lab_messages(count=30 if name == "old" else 20))
     assert ipsys("fit", tmp_path / "old.mcap", "--model", "poly").code == 0
@@ -202,7 +202,7 @@ def test_page_fits_screens_and_follows_the_colour_scheme(page: str, tmp_path: Pa
             tables = browser.run(TABLES)
             assert len(tables) >= 6
             for hidden_px, scrolled_px, name_px, is_of_models in tables:
-                # What does not fit is scrolled to, and the name of the row stays.
+                # Wide parts scroll, and the name of the row stays visible.
                 assert scrolled_px >= hidden_px - 1
                 assert name_px < 1
                 assert hidden_px < 1 or size[0] < 1280 or not is_of_models

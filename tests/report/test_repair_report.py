@@ -45,7 +45,7 @@ def lines(path: Path) -> list[str]:
 
 
 def killed(path: Path, tmp_path: Path, written_ns: int) -> Path:
-    """Cut off in the middle of its last frames, and last written at a given time."""
+    """Return a log that is cut in its last frames, with a given time of the last write."""
     with LogReader(path) as log:
         last = max(c.end for c in log._contents.chunks if not c.compression)
     cut = tmp_path / "cut.mcap"
@@ -64,7 +64,7 @@ def test_report_counts_kept_and_lost_messages_of_a_killed_recorder(
         counts = [log.channels[f"/cameras/{name}/image"].message_count for name in ("red", "white")]
     assert 90 < sum(counts) < 100
     assert said[0].startswith(f"cut.mcap repaired: {sum(counts) + 1} messages, up to 2017-07-14 02:40:02.")
-    # At 20/s, from the last one kept to a second after the last write.
+    # The rate is 20 Hz, from the last kept frame to one second after the last write.
     for name, count in zip(("red", "white"), counts, strict=True):
         last_ns = (count - 1) * FRAME_NS
         gone = -(-(3_700_000_000 - last_ns) // FRAME_NS)

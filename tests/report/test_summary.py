@@ -1,4 +1,4 @@
-"""The answer of an evaluation comes first, fits a terminal, and has the figures of the JSON."""
+"""The summary of an evaluation comes first, fits a terminal, and has the figures of the JSON."""
 
 from __future__ import annotations
 
@@ -32,7 +32,7 @@ NAMES = ("[bold]x[/nothing]", "a\x1b[31mb", "white_11", "m4", "m5")
 
 
 def printed(accuracies: Sequence[Accuracy], width: int = 80) -> str:
-    """The answer and its table, as on a terminal, which does not wrap for us."""
+    """Return the summary and its table, as on a terminal that does not wrap."""
     file = io.StringIO()
     console = Console(file=file, width=width, highlight=False, soft_wrap=True)
     for part in (answer_text(accuracies), models_table(accuracies)):
@@ -42,7 +42,7 @@ def printed(accuracies: Sequence[Accuracy], width: int = 80) -> str:
 
 
 def with_suspects(accuracy: Accuracy, count: int) -> Accuracy:
-    """The same with made-up outliers, the first one the worst."""
+    """Return the accuracy with invented outliers, the worst first."""
     assert accuracy.evaluation is not None
     suspects = tuple(
         Suspect(name, ("red",), np.array([0.1 - 0.01 * n, 0.0, 0.0]), 9.0, "side", f"{n}: it lies right")
@@ -52,7 +52,7 @@ def with_suspects(accuracy: Accuracy, count: int) -> Accuracy:
 
 
 def errors_of(rows: Sequence[CameraEvaluation], row: CameraEvaluation, axes: int) -> np.ndarray:
-    """The lengths of the residuals that a row rests on."""
+    """Return the lengths of the residuals behind a row."""
     own = [one for one in rows if (one.scheme, one.against) == (row.scheme, row.against)]
     found = [r for one in own if row.camera in (POOLED, one.camera) for r in one.residuals]
     return np.array([np.linalg.norm((r.predicted_m - r.world_m)[:axes]) for r in found])

@@ -1,4 +1,4 @@
-"""A stage for tests, as a newcomer would add it: one file, one row, and one channel."""
+"""A stage for tests, in the form of a new stage: one file, one row, and one channel."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""The graph of stages: a stage is one row, a channel is told from another one of the same payload type."""
+"""The graph of stages: a stage is one row, and channels with the same payload type are distinct."""
 
 from __future__ import annotations
 
@@ -23,7 +23,7 @@ from tests.runs.smoothing import SMOOTHED_TRACKS
 
 @pytest.fixture
 def with_smoothing(monkeypatch: pytest.MonkeyPatch) -> None:
-    """The stage smooth in the graph: one row more, and one channel."""
+    """Add the stage smooth to the graph: one more row and channel."""
     monkeypatch.setattr(channels, "CHANNELS", (*CHANNELS, SMOOTHED_TRACKS))
     monkeypatch.setattr(graph, "STAGES", (*STAGES, smoothing.STAGE))
     monkeypatch.setitem(graph.VERSIONS, "smooth", 1)
@@ -80,7 +80,7 @@ def test_stages_until_are_those_that_are_needed() -> None:
     assert names("detect") == ["detect"]
     assert names("locate") == ["detect", "camera-frame", "fit", "locate"]
     assert names("evaluate") == ["detect", "camera-frame", "fit", "evaluate"]
-    # fuse is a result that no other stage reads; so is evaluate, which comes before it.
+    # No other stage reads the results of fuse and of evaluate, which comes before it.
     assert names("fuse") == names(None) == [stage.name for stage in STAGES]
 
 

@@ -1,4 +1,4 @@
-"""Runs: a name for what belongs together, found again only where it is whole."""
+"""Runs: names of stage results, reused only if they are complete."""
 
 from __future__ import annotations
 
@@ -33,7 +33,7 @@ PAPER = ROOT / "sample_logs" / "paper_lab.mcap"
 
 @pytest.fixture
 def paper(tmp_path: Path) -> Path:
-    """The paper's layout without frames: its markers are in run ``edges``."""
+    """Write the paper's layout without frames: its markers are in run ``edges``."""
     return Path(shutil.copy(PAPER, tmp_path / "paper.mcap"))
 
 
@@ -61,7 +61,7 @@ def change(log: Path, edit: Callable[[Any], Any]) -> Path:
 
 
 def robots(folder: Path, log: Path, prefix: str) -> Path:
-    """A rig file that differs from the log's in the names of the robots only."""
+    """Write a rig file that differs from the log's only in the names of the robots."""
     with Session([log]) as session:
         rig = session.payloads(session.topics(RIG))[0]
     text = f'name = "a"\ndictionary = "{rig.dictionary}"\nmarker_length_m = {rig.marker_length_m}\n'
@@ -84,7 +84,7 @@ def test_models_that_were_copied_in_are_used_without_measurements(
     assert first["fuse"] == ("rigid", True)
     found = runs_of(ipsys, "replay", bare)
     assert {found[stage] for stage in ("locate", "fuse")} == {("rigid", False)}
-    # One that was entered and withdrawn is none.
+    # A withdrawn measurement is none.
     with Session([paper]) as session, Session([bare]) as other:
         entered: Measurement = session.payloads(["/measurements"])[0]
         time_ns = other.end_ns + 1
@@ -104,7 +104,7 @@ def test_newest_run_is_found_again(ipsys: Ipsys, paper: Path) -> None:
 
 
 def test_run_of_last_log_is_newest_whatever_its_number(ipsys: Ipsys, paper: Path, tmp_path: Path) -> None:
-    """Two results of one recording: the one in the log that is given last counts."""
+    """With two results of one recording, that of the last log counts."""
     low, high = tmp_path / "low.mcap", tmp_path / "high.mcap"
     ipsys("camera-frame", paper)
     assert runs_of(ipsys, "replay", paper, "-o", low, "--run", "low")["fuse"] == ("low", True)
@@ -116,10 +116,10 @@ def test_run_of_last_log_is_newest_whatever_its_number(ipsys: Ipsys, paper: Path
 def test_a_run_holds_only_what_belongs_together(ipsys: Ipsys, paper: Path, tmp_path: Path) -> None:
     ipsys("replay", paper)
     renamed = runs_of(ipsys, "replay", paper, "--rig", robots(tmp_path, paper, "ada"))
-    # Other robots bear on fuse alone, which gets a run of its own ...
+    # Other robots change only fuse, which gets a new run ...
     assert renamed["locate"] == ("poly", False)
     assert renamed["fuse"] == ("poly_2", True)
-    # ... that a new model does not join.
+    # ... without the results of a new model.
     fewer = runs_of(ipsys, "replay", paper, "--model", "rigid", "--rig", robots(tmp_path, paper, "ada"))
     assert {fewer[stage] for stage in ("fit", "evaluate", "locate", "fuse")} == {("rigid", True)}
     with Session([paper]) as session:
@@ -157,7 +157,7 @@ def test_a_named_run_takes_the_shared_detection(ipsys: Ipsys, lab: Path) -> None
     ipsys("detect", lab)
     made = runs_of(ipsys, "camera-frame", lab, "--run", "again")
     assert made == {"detect": ("edges", False), "camera-frame": ("again", True)}
-    # Whoever asks next gets the first one that is right, and nothing is made again.
+    # The next request gets the first correct run, and computes nothing again.
     ipsys("replay", lab)
     before = lab.read_bytes()
     assert "nothing to do" in ipsys("replay", lab).err
@@ -177,10 +177,10 @@ def test_seed_changes_only_the_folds_of_labelled_points(ipsys: Ipsys, paper: Pat
     made = runs_of(ipsys, "replay", paper, "--seed", 5)
     assert {stage for stage, (_, new) in made.items() if new} == {"evaluate"}
     assert all(not new for _, new in runs_of(ipsys, "replay", paper, "--seed", 5).values())
-    # What is shown is the new evaluation, once, with the tracks that are still right.
+    # The output has the new evaluation, once, with the tracks that are still correct.
     done = ipsys("replay", paper, "--seed", 5, "--details")
     assert done.out.count("(tracks)") == 1
-    # One row in the summary, and one in each table of the details.
+    # The summary has one row, and so has each table of the details.
     assert sum(line.split()[:1] == ["red"] for line in done.out.splitlines()) == 1 + 4
 
 
@@ -239,7 +239,7 @@ def test_model_contains_its_calibration_points(ipsys: Ipsys, paper: Path, tmp_pa
     counts = {c: e["3d"]["n"] for c, e in json.loads(done.out)["models"]["poly"]["cameras"].items()}
     with Session([plain]) as session:
         total = len(session.payloads(["/measurements"]))
-    # A fifth was held out when the model was fitted; only these count.
+    # A fifth of the points was held out by fit; only these count.
     assert sum(counts.values()) < 0.5 * total
 
 
@@ -282,7 +282,7 @@ def test_a_rig_recorded_later_does_not_change_what_was_measured_before(ipsys: Ip
 
 def test_a_marker_beyond_the_lens_is_left_out_and_named(ipsys: Ipsys, paper: Path) -> None:
     def bent(payload: Any) -> Any:
-        # A model that folds back: far from the centre no ray belongs to a pixel.
+        # The lens model folds back: far from the centre, a pixel has no ray.
         if isinstance(payload, CameraCalibration) and payload.frame_id == "red":
             return replace(payload, D=np.array([-0.45, 0.0, 0.0, 0.0]))
         return payload
@@ -331,7 +331,7 @@ def test_a_log_knows_the_model_that_was_copied_into_it(ipsys: Ipsys, paper: Path
     ipsys("replay", paper, "--model", "poly")
     ipsys("replay", paper, "--model", "rigid")
     drive = without(paper, lambda m: m.topic.startswith(("/runs/poly", "/runs/rigid", "/measurements")))
-    # Of several models the usual one is meant, not the last one made.
+    # Among several models, the default one is selected, not the newest.
     assert runs_of(ipsys, "replay", drive, "--model-from", paper)["fit"] == ("poly", True)
     paper.unlink()
     before = drive.read_bytes()
@@ -361,7 +361,7 @@ def test_the_rig_taken_out_says_what_a_camera_does_to_edges(ipsys: Ipsys, tmp_pa
     assert ipsys("init", path, "--from", lab).code == 0
     offsets_px = [camera.edge_offset_px for camera in load_rig(path).cameras]
     assert offsets_px == pytest.approx([0.42] * 3, abs=0.1)
-    # With it, every marker has the same.
+    # With the option, every marker has the same length.
     assert ipsys("detect", lab, "--rig", path).code == 0
     with Session([lab]) as session:
         (topic,) = session.topics(MARKERS, "edges_2")[:1]

@@ -1,4 +1,4 @@
-"""Versions of stages: what older software made is told from what this one makes, and made again beside it."""
+"""Versions of stages: results of older software are recognised, and computed again beside them."""
 
 from __future__ import annotations
 
@@ -105,7 +105,7 @@ def test_replay_leaves_its_runs_current(
     rows = states(ipsys, log)
     assert {rows[run, stage]["state"] for stage, (run, _) in used.items()} == {"current"}
     assert not any(new for _, new in made(ipsys, log).values())
-    # What was made again is what had been said to be out of date, and nothing else.
+    # Exactly the results that were out of date are computed again.
     assert {stage for (_, stage), row in before.items() if row["out_of_date"]} == {
         stage for stage, (_, new) in used.items() if new
     }

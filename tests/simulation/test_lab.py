@@ -1,4 +1,4 @@
-"""The simulated session as its readers get it."""
+"""The contents of the simulated session."""
 
 import hashlib
 from collections import Counter
@@ -78,7 +78,10 @@ def test_all_cameras_take_their_frames_at_the_same_instants(session: list[Messag
 
 
 def test_markers_are_seen_in_the_images_where_the_truth_says(session: list[Message]) -> None:
-    """At a third of the size the stock detector misses some far ones; what it finds must be true."""
+    """At a third of the size, the stock detector misses some distant markers.
+
+    The detected ones must be correct.
+    """
     detector = cv2.aruco.ArucoDetector(cv2.aruco.getPredefinedDictionary(cv2.aruco.DICT_4X4_100))
     cameras = {camera.name: camera for camera in mount_cameras(SMALL)}
     truth: Tracks | None = None

@@ -1,4 +1,4 @@
-"""Rerun reads back the live recording itself, without a screen."""
+"""Rerun reads the live recording, without a screen."""
 
 from __future__ import annotations
 
@@ -37,7 +37,7 @@ def test_frames_and_robots_arrive_in_rerun(lab: Path, tmp_path: Path) -> None:
     messages, session = replayed(lab)
     (rig,) = session.payloads(["/rig"])
     LiveView(rig, session.images, "poly", print, show).consume(iter([*messages, None]))
-    # What a viewer reads from a pipe has a table of contents after every piece; a file has one.
+    # The pipe to a viewer has a table of contents after every part; a file has one.
     whole = tmp_path / "whole.rrd"
     command = [sys.executable, "-m", "rerun", "rrd", "merge", str(path), "-o", str(whole)]
     subprocess.run(command, check=True, capture_output=True)

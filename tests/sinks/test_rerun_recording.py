@@ -1,4 +1,4 @@
-"""A session saved for Rerun and read back with Rerun's own reader."""
+"""A session saved for Rerun, and read with Rerun's own reader."""
 
 from __future__ import annotations
 
@@ -40,7 +40,7 @@ from ipsys_log.sinks.rerun.recording import write_recording
 
 START_NS = 1_700_000_000_000_000_001
 STEP_NS = 100_000_000
-# Ten instants, silence, five more.
+# ten times, a pause, five more times
 TIMES_NS = [START_NS + STEP_NS * n for n in (*range(10), *range(200, 205))]
 DELAY_NS = 7_000_000
 CAMERAS = ("red", "white")
@@ -83,7 +83,7 @@ def session_messages() -> Iterator[Message]:
             positions = Positions(time_ns, (Position(0, 1 + 0.1 * n, 2.0, 0.1),))
             yield Message(f"/runs/poly/cameras/{camera}/positions", log_ns, time_ns, positions, camera)
             robots = (Track("robot_0", 0, 1 + 0.1 * n, 2.0, 0.1, 0.5), Track("robot_1", 1, 3.0, 0.1 * n, 0.1))
-            # The second robot goes away during the silence, and one camera sees the first only.
+            # The second robot disappears during the pause, and one camera sees only the first robot.
             seen = robots[: 2 if n < 10 and camera == "white" else 1]
             yield Message("/runs/poly/tracks", log_ns, time_ns, Tracks(time_ns, seen))
         yield Message("/truth/tracks", log_ns, time_ns, Tracks(time_ns, robots))
@@ -110,7 +110,7 @@ def saved(log: Path) -> Path:
 
 
 def rows(path: Path, entity: str, column: str) -> list[tuple[int, int, Any]]:
-    """Publish time, log time and value of a component, in the order of time and writing."""
+    """Return publish time, log time and value of a component, in the order of time and writing."""
     found: list[tuple[int, int, Any]] = []
     for chunk in RrdReader(path).stream().to_chunks():
         batch = chunk.to_record_batch()
@@ -138,7 +138,7 @@ def test_recording_is_sound_and_has_what_the_log_has(saved: Path) -> None:
     expected |= {"/world/floor", "/world/floor/grid", "/world/reference_points", "/events/recorded"}
     expected |= {f"/world/{name}" for name in ("places/training", "places/test", "truth/robots/robot_1")}
     assert expected <= entities
-    # Nothing of the clock of the machine that drew it.
+    # Nothing depends on the clock of the drawing machine.
     assert {name for chunk in chunks for name in chunk.timeline_names} == {"publish_time", "log_time"}
     assert len(RrdReader(saved).blueprints()) >= 1
 
@@ -170,7 +170,7 @@ def test_robots_have_the_positions_of_the_log(saved: Path) -> None:
 
 
 def looks_at(path: Path, entity: str, kind: str, moved: str, look: str) -> dict[int, Any]:
-    """The look in force wherever something is drawn, by publish time: None if a viewer has none."""
+    """Return the visible style at each publish time; None if a viewer has none."""
     drawn = [(time_ns, 2, None) for time_ns, _, _ in rows(path, entity, f"{kind}:{moved}")]
     given = [(time_ns, 1, value) for time_ns, _, value in rows(path, entity, f"{kind}:{look}")]
     parents = ["/".join(entity.split("/")[:depth]) for depth in range(2, entity.count("/") + 2)]
@@ -219,7 +219,7 @@ def drawn_by(path: Path, messages: Iterable[Message], fade_ns: Mapping[str, int]
 
 
 def test_look_of_late_message_holds_for_it_alone(tmp_path: Path) -> None:
-    """Positions of another marker come later than they were taken: each keeps its own label."""
+    """Positions of another marker arrive after their exposure: each keeps its own label."""
     taken = [(10, 0), (5, 1), (12, 0), (7, 1), (13, 0), (14, 0)]
     messages = [
         Message(
@@ -284,7 +284,7 @@ def test_robot_without_heading_loses_its_arrow(tmp_path: Path) -> None:
 def test_unseen_objects_disappear_from_the_view(saved: Path) -> None:
     for entity in ("runs/poly/robots/robot_1", "runs/poly/robots/robot_0", "runs/poly/positions/red"):
         cleared = rows(saved, f"/world/{entity}", "Clear:is_recursive")
-        # A second after the last of the first ten, and not at the end of the log.
+        # one second after the last of the first ten times, not at the end of the log
         assert [row[:2] for row in cleared if row[0] > TIMES_NS[9]] == [
             (TIMES_NS[9] + 10**9, TIMES_NS[9] + DELAY_NS + 10**9)
         ]

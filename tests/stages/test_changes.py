@@ -19,13 +19,13 @@ def floor() -> Picture:
 
 
 def square(x: float, y: float, size: float = BREADTH_PX) -> Array:
-    """Corners of a marker whose middle is at (x, y)."""
+    """Return the corners of a marker with its centre at (x, y)."""
     half = size / 2
     return np.array([[x - half, y - half], [x + half, y - half], [x + half, y + half], [x - half, y + half]])
 
 
 def put(picture: Picture, corners_px: Array, level: int = THING) -> Picture:
-    """With a thing where a marker is."""
+    """Return an image with an object at the position of a marker."""
     (left, top), (right, bottom) = corners_px.min(axis=0).astype(int), corners_px.max(axis=0).astype(int)
     with_it = picture.copy()
     with_it[max(top, 0) : max(bottom, 0), max(left, 0) : max(right, 0)] = level
@@ -34,7 +34,7 @@ def put(picture: Picture, corners_px: Array, level: int = THING) -> Picture:
 
 @pytest.fixture
 def watch() -> ChangeDetector:
-    """One that knows the empty floor."""
+    """Return a detector of changes that knows the empty floor."""
     watch = ChangeDetector()
     for _ in range(3):
         assert watch.find_change(floor(), ALL, [], BREADTH_PX) is None
@@ -64,7 +64,7 @@ def test_known_markers_start_no_search(watch: ChangeDetector) -> None:
 
 @pytest.mark.parametrize("step_px", [3, 20, 70])
 def test_floor_that_a_marker_uncovers_is_no_alarm(step_px: int) -> None:
-    """A marker drives across a floor that was never seen without it."""
+    """A marker moves across a floor that was never seen without it."""
     watch = ChangeDetector()
     for n in range(8):
         there = square(100 + step_px * n, 200)
@@ -87,7 +87,7 @@ def test_another_marker_beside_a_known_one_is_noticed(watch: ChangeDetector) -> 
 
 @pytest.mark.parametrize("side", ["left", "right", "top", "bottom"])
 def test_object_at_the_edge_counts_if_half_of_it_is_visible(watch: ChangeDetector, side: str) -> None:
-    """Less cannot be a marker yet, and would be searched for in vain in every frame."""
+    """A smaller part cannot be a marker yet, and a search in every frame would be useless."""
     little, enough = (
         square(
             *{
@@ -104,7 +104,7 @@ def test_object_at_the_edge_counts_if_half_of_it_is_visible(watch: ChangeDetecto
 
 
 def test_unchanged_object_becomes_background(watch: ChangeDetector) -> None:
-    """A chair is searched for markers some frames long, not for ever."""
+    """A chair is searched for some frames only."""
     picture = put(floor(), square(320, 240, 160))
     alarms = [watch.find_change(picture, ALL, [], BREADTH_PX) is not None for _ in range(30)]
     assert alarms[0]
@@ -117,7 +117,7 @@ def test_slow_changes_of_light_are_no_alarm(watch: ChangeDetector) -> None:
 
 
 def test_rows_that_were_not_decoded_say_nothing(watch: ChangeDetector) -> None:
-    """They still hold what an older frame left there."""
+    """They still contain an older frame."""
     there = square(320, 100)
     picture = put(floor(), there)
     assert watch.find_change(picture, [slice(200, HEIGHT)], [], BREADTH_PX) is None

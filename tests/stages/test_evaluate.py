@@ -1,4 +1,4 @@
-"""Errors by eq. (26) and (27) on places held out and by cross-validation; learning curves; covariances."""
+"""Errors by eq. (26) and (27) at held-out points and by cross-validation; learning curves; covariances."""
 
 from __future__ import annotations
 
@@ -34,7 +34,7 @@ def pairs(offset: np.ndarray) -> list[Pair]:
 
 
 def lab(seed: int, count: int = 40, **noise: float) -> tuple[list[Pair], np.ndarray, np.ndarray]:
-    """Measured pairs of one camera; camera points and world points of a drive in the same view."""
+    """Return pairs of one camera, and camera points and world points of a drive in the same view."""
     rng = np.random.default_rng(seed)
     camera, world = labs.camera(rng, **noise), labs.places(rng, count)
     tape, covariances = labs.measure(world, rng)
@@ -106,7 +106,7 @@ def test_all_cameras_together_are_one_row_more() -> None:
 
 
 def test_points_of_the_fit_are_not_held_out() -> None:
-    """As where a model is applied to the very log that it was made from."""
+    """A model may be applied to the log of its own calibration points."""
     model = fit_model("rigid", {"red": pairs(np.zeros(3))}, 0)
     assert evaluate_held_out(model, {"red": pairs(np.zeros(3))}, {}) == []
 
@@ -130,7 +130,7 @@ def test_cross_validation_is_that_of_a_loop_written_out() -> None:
         error = float(np.linalg.norm(residual.predicted_m - residual.world_m))
         by_place.setdefault(residual.measurement, []).append(error)
     assert {len(errors) for errors in by_place.values()} == {4}
-    # No place is predicted by a model that has seen it: it never comes near its own residual of the fit.
+    # No model predicts a point of its own fit: the error never approaches the residual of the fit.
     applied = AppliedModel("poly", model.cameras[0])
     points, world = (np.array([getattr(p, f) for p in found]) for f in ("camera_m", "world_m"))
     inside = np.linalg.norm(applied.predict(points, world[:, 2]) - world, axis=1)
@@ -196,14 +196,14 @@ def test_the_covariance_is_of_errors_that_the_fit_has_not_seen() -> None:
     ]
     covariance = fit_model("poly", {"red": noisy}, 0).cameras[0].covariance_m2
     assert covariance is not None
-    # With 14 pairs for 10 parameters the fit looks good and is not.
+    # With 14 pairs for 10 parameters, the residuals are small but the errors are not.
     assert np.sqrt(np.trace(covariance) / 3) > 0.015
     few = fit_model("poly", {"red": noisy[:10]}, 0).cameras[0]
     assert (few.covariance_m2, few.noise) == (None, None)
 
 
 def regions(name: str, along: float, seeds: Sequence[int]) -> tuple[float, float]:
-    """Shares of the true places of drives within the 68 % and 95 % regions of their positions."""
+    """Return the shares of true positions within the 68 % and 95 % regions of their positions."""
     size = 2 if name == "rayplane" else 3
     within: list[Mapping[float, float]] = []
     for seed in seeds:
@@ -228,14 +228,14 @@ def regions(name: str, along: float, seeds: Sequence[int]) -> tuple[float, float
     ],
 )  # fmt: skip
 def test_covariances_hold_the_truth_as_often_as_they_say(name: str, along: float) -> None:
-    """One session's tape errors are common to all its positions: only many sessions can tell."""
+    """All positions of a session share its tape errors, so the test needs many sessions."""
     within_68, within_95 = regions(name, along, range(40))
     assert 0.60 <= within_68 <= 0.76
     assert 0.90 <= within_95 <= 0.98
 
 
 def test_the_covariance_of_a_model_that_misfits_knows_most_of_it() -> None:
-    """The lens error that rigid leaves is no noise: it is equal at near positions and not Gaussian."""
+    """The remaining lens error of rigid is no noise: it is equal at near positions and not Gaussian."""
     within_68, within_95 = regions("rigid", 0.0004, range(40))
     assert 0.55 <= within_68 <= 0.76
     assert 0.80 <= within_95 <= 0.98

@@ -1,4 +1,4 @@
-"""One place, checked: where it is, and whether it can be."""
+"""The check of one point: its position, and its faults."""
 
 from __future__ import annotations
 
@@ -24,14 +24,14 @@ Array = labs.Array
 RIG = replace(labs.RIG, tape_sigma_m=0.003)
 THREE = replace(RIG, reference_points=(*RIG.reference_points, ReferencePoint("C", 2.0, 0.3)))
 STILL = Interval(1_000, 2_000)
-# On the floor, where the tapes cross at 15 degrees or more.
+# points on the floor, at tape crossings of 15 degrees or more
 PLACES = st.tuples(st.floats(0.1, 4.7), st.floats(0.1, 4.7), st.floats(0.0, 0.3)).filter(
     lambda p: abs(p[1] - labs.A[1]) > 0.5
 )
 
 
 def tape(world_m: Sequence[float], rig: Rig = RIG, **changed: Any) -> TypedEntry:
-    """A place as somebody reads it who reads well: to the millimetre."""
+    """Return a point with correct readings, to the millimetre."""
     distances = {
         p.name: f"{100 * np.hypot(world_m[0] - p.x_m, world_m[1] - p.y_m):.1f}" for p in rig.reference_points
     }
@@ -57,7 +57,7 @@ def test_checked_point_equals_the_measured_point(world_m: tuple[float, float, fl
     assert checked.faults == ()
     assert checked.point_m is not None
     assert checked.sigma_m is not None
-    # Read to half a millimetre; flat circles make more of it, and say so.
+    # Readings are to half a millimetre; flat circles amplify this, and report it.
     assert np.linalg.norm(checked.point_m - world_m) < 0.002 + 0.6 * checked.sigma_m
     assert checked.on_floor is True
     assert checked.measurement is not None
@@ -82,10 +82,10 @@ def test_two_tapes_that_cannot_meet() -> None:
     assert checked.measurement is None
     said = "no triangle has the sides A to B = 243.8 cm, distance to A = 40 cm and distance to B = 50 cm"
     assert checked.faults[0].text == f"{said}; read both again"
-    # The side is not what is wrong: said before it is asked for.
+    # The fault is not the side, so it is reported before the question for the side.
     unsided = check(TypedEntry("0", {"A": "40", "B": "50"}, "", "0"))
     assert any("no triangle" in fault.text for fault in unsided.faults)
-    # Nor is the height.
+    # The height is not needed either.
     alone = check(TypedEntry("0", {"A": "40", "B": "50"}))
     assert any("no triangle" in fault.text for fault in alone.faults)
 

@@ -32,7 +32,7 @@ def test_centimetres_become_metres_with_point_or_comma() -> None:
     ("text", "said"),
     [
         ("1.234", "looks like metres; type 123.4"),
-        ("1,9", None),  # a short distance, or metres to the decimetre: asked for, not refused
+        ("1,9", None),  # a short distance, or metres to the decimetre: the page asks, and does not refuse
         ("1700", "in mm? Then type 170"),
         ("99999", "further than the floor reaches"),
         ("0", "above 0"),

@@ -21,7 +21,7 @@ PLACE = {"marker": "0", "distances": {"A": "170", "B": "190"}, "side": "left", "
 
 
 class Caller:
-    """Plain HTTP, with whatever headers."""
+    """A plain HTTP client with any headers."""
 
     def __init__(self, url: str) -> None:
         self.parts = urlsplit(url)

@@ -1,4 +1,4 @@
-"""The measuring page on a phone: taps and keys in, measurements in the log out."""
+"""The measuring page on a phone: taps and keys as input, measurements in the log as output."""
 
 from __future__ import annotations
 
@@ -50,7 +50,7 @@ def fill(hand: Phone, a: str, b: str, side: str, height: str) -> None:
 
 
 def save(hand: Phone, name: str) -> None:
-    """When it can be saved: only then is the button one."""
+    """Save a point as soon as the button is enabled."""
     hand.wait("document.querySelector('#verdict[aria-busy=false]')")
     hand.wait("document.querySelector('#save:enabled')")
     says(hand, "#save", f"Save {name}")
@@ -99,7 +99,7 @@ def test_point_is_typed_checked_saved_and_withdrawn(hand: Phone, unmeasured: Unm
         assert hand.run("document.querySelectorAll('#places .gone').length") == 1
         hand.tap("#before")
         says(hand, "#stop", "not measured")
-        # What fills a phone is not wider than it, and nothing went wrong unseen.
+        # The page is not wider than the phone, and the browser reports no error.
         assert hand.run("document.documentElement.scrollWidth") == 390
         assert hand.console == []
         assert hand.run(f"{FETCHED}.every(name => name.startsWith(location.origin))")
@@ -141,7 +141,7 @@ def test_log_errors_are_shown_on_the_page(hand: Phone, unmeasured: Unmeasured) -
             fcntl.flock(other, fcntl.LOCK_EX)
             save(hand, "p001")
             says(hand, "#notice", "another process is writing it")
-        # What was typed is still there, and goes in when the log is free.
+        # The typed values are still there, and are saved when the log is free.
         assert hand.run("document.querySelector('#d-A').value") == a
         save(hand, "p001")
         says(hand, "#notice", "p001 is in the log")
@@ -166,7 +166,7 @@ def test_second_process_measures_in_the_same_log(hand: Phone, unmeasured: Unmeas
         says(hand, "#notice", "somebody else measured in this log meanwhile (p001)")
         says(hand, "#places", "p001")
         assert hand.run("document.querySelector('#d-A').value") == texts[0]
-        # Without a word more: what was typed is checked anew, beside what the other one did.
+        # Without further action, the typed values are checked again, with the other process's entry.
         save(hand, "p002")
         says(hand, "#notice", "p002 is in the log")
         other_id = "p003"
@@ -182,7 +182,7 @@ def test_second_process_measures_in_the_same_log(hand: Phone, unmeasured: Unmeas
 
 
 class Recording:
-    """A lab while it is recorded: one camera, markers that somebody moves by hand."""
+    """A lab during a recording: one camera, and markers that are moved by hand."""
 
     rig: Rig = labs.RIG
     model: Model | None = None
@@ -228,7 +228,7 @@ def test_moving_marker_cannot_be_saved_during_a_recording(hand: Phone) -> None:
     assert (saved.marker_id, saved.side, saved.still.end - saved.still.start) == (0, "left", 8)
 
 
-# Of an element: whether a finger would hit it where it is now, without scrolling.
+# Return whether a tap would hit an element at its present position, without scrolling.
 SEEN = """(e => {{ const b = e.getBoundingClientRect();
   const within = b.top >= 0 && b.bottom <= innerHeight;
   return within && e.contains(document.elementFromPoint(b.x + b.width / 2, b.y + b.height / 2));
@@ -242,7 +242,7 @@ def test_save_button_shows_the_point_to_save(hand: Phone) -> None:
         says(hand, "#sight", "Marker 0 lies still")
         hand.type("#d-A", "152 cm")
         hand.type("#d-B", "40")
-        # Of side and height nothing need be known.
+        # The side and the height are not needed.
         says(hand, "#verdict", "No triangle has the sides")
         hand.run("document.querySelector('#d-B').value = ''")
         hand.type("#d-B", "190")
@@ -313,7 +313,7 @@ def test_points_are_measured_in_turn_with_a_token(hand: Phone, unmeasured: Unmea
     log, tape = unmeasured
     with open_finished_log(log, Request()) as scene, serve(scene, "127.0.0.1", 0) as page:
         hand.open(page.url)
-        # The token is out of sight as soon as it was used.
+        # The token disappears from the address after its use.
         assert hand.run("location.pathname + location.search") == "/"
         for number in range(5):
             says(hand, "#stop", f"interval {number + 1} of")

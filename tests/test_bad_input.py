@@ -285,7 +285,7 @@ def test_a_corrupt_jpeg_in_the_middle(ipsys: Ipsys, lab: Path, damage: str) -> N
     assert [(event.kind, event.camera) for event in events] == [("corrupt_frame", "white")]
 
 
-def test_names_and_options_that_cannot_be(ipsys: Ipsys, lab: Path, tmp_path: Path) -> None:
+def test_impossible_names_and_options_are_refused(ipsys: Ipsys, lab: Path, tmp_path: Path) -> None:
     assert "model 'spline' is not known; use one of" in refused(
         ipsys, lab, "replay", lab, "--model", "spline"
     )
@@ -360,7 +360,7 @@ def test_the_real_command_too(tmp_path: Path) -> None:
     assert done.stderr.count("\n") == 1
 
 
-def test_a_frame_is_never_taken_for_a_picture_that_it_is_not() -> None:
+def test_frame_is_never_decoded_to_a_wrong_image() -> None:
     from ipsys_log.stages.detect import decode_grey
 
     with pytest.raises(ValueError, match="no picture"):

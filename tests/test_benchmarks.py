@@ -25,7 +25,7 @@ BENCHMARKS = Path(__file__).resolve().parent.parent / "benchmarks"
         pytest.param([], marks=pytest.mark.slow),
     ],
 )
-def test_smoke(arguments: list[str], tmp_path: Path) -> None:
+def test_benchmark_smoke_run_writes_its_ratios(arguments: list[str], tmp_path: Path) -> None:
     output = tmp_path / "results.json"
     command = [sys.executable, "bench.py", "--smoke", "-o", str(output), *arguments]
     done = subprocess.run(command, cwd=BENCHMARKS, capture_output=True, text=True, check=False)

@@ -141,7 +141,7 @@ def test_a_second_detect_finds_the_first(ipsys: Ipsys, tmp_path: Path, rig: Path
     assert log.read_bytes() == before
 
 
-def test_edges_that_were_asked_for_need_a_lens(ipsys: Ipsys, tmp_path: Path, rig: Path) -> None:
+def test_edges_option_needs_intrinsics(ipsys: Ipsys, tmp_path: Path, rig: Path) -> None:
     log = tmp_path / "foreign.mcap"
     write(log, [("/cam", 1, jpeg(1, "cam", 1))], CompressionType.ZSTD)
     before = log.read_bytes()

@@ -159,7 +159,7 @@ def test_lens_file_of_many_levels_is_one_line(tmp_path: Path, name: str, text: s
 
 
 @pytest.mark.parametrize("change", ["nan", "huge", "zero focal length", "size", "no size"])
-def test_lens_of_a_log_that_cannot_be_is_refused(change: str) -> None:
+def test_impossible_calibration_of_a_log_is_refused(change: str) -> None:
     K, D = np.array([[500.0, 0, 480], [0, 500, 270], [0, 0, 1]]), np.zeros(4)
     K[0, 2] = {"nan": np.nan, "huge": 1e308}.get(change, 480.0)
     K[0, 0] = 0.0 if change == "zero focal length" else 500.0

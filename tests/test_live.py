@@ -188,15 +188,13 @@ def _corner(payload: Markers) -> Markers | None:
     return replace(payload, markers=(replace(first, corners_px=first.corners_px + 1e-9), *rest))
 
 
-def test_a_marker_that_was_tampered_with_shows_where_it_is_and_in_all_that_was_made_of_it(
-    recorded: Path, tmp_path: Path
-) -> None:
+def test_changed_marker_is_found_in_all_later_results(recorded: Path, tmp_path: Path) -> None:
     log = tampered(recorded, tmp_path / "tampered.mcap", Markers, _corner)
     apart = {one.topic.rpartition("/")[2]: one.left - one.same for one in again(log) if not one.equal}
     assert apart["markers"] == apart["camera_points"] == 1
 
 
-def test_bytes_that_no_field_speaks_of_are_found(recorded: Path, tmp_path: Path) -> None:
+def test_unknown_bytes_are_found(recorded: Path, tmp_path: Path) -> None:
     log = tmp_path / "more.mcap"
     with LogReader(recorded) as reader, LogWriter.create(log) as writer:
         for topic, channel in reader.channels.items():
@@ -246,9 +244,7 @@ def test_a_result_that_is_gone_is_found(recorded: Path, tmp_path: Path) -> None:
     assert set(apart.values()) == {"no record says how it was made"}
 
 
-def test_models_and_their_evaluation_are_made_again_too(
-    lab_log: Path, calibration: Path, tmp_path: Path
-) -> None:
+def test_models_and_evaluations_are_computed_again(lab_log: Path, calibration: Path, tmp_path: Path) -> None:
     def apart(log: Path) -> dict[str, bool]:
         return {one.topic: one.equal for one in verify([lab_log, log], None, lambda stage, done, total: None)}
 
@@ -520,7 +516,7 @@ def test_a_recording_without_stages_is_detected_later_all_the_same(
         assert all(run.stage == "detect" for run in one.runs())
 
 
-def test_a_model_that_is_not_there(ipsys: Ipsys, lab: Path, tmp_path: Path) -> None:
+def test_missing_model_is_refused(ipsys: Ipsys, lab: Path, tmp_path: Path) -> None:
     attached, settings = attached_to(lab, 60.0)
     with attached, pytest.raises(Exception, match="has no fitted model"):
         pipeline.live(attached, settings, tmp_path / "x.mcap", Request(model_from=lab))

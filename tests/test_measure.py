@@ -236,7 +236,7 @@ def test_one_bad_row_keeps_all_rows_out_of_the_log(ipsys: Ipsys, unmeasured: Unm
     assert rows[0].startswith("  line 8: left or right of the line")
 
 
-def test_a_log_that_is_locked_gone_or_not_to_be_written(ipsys: Ipsys, unmeasured: Unmeasured) -> None:
+def test_locked_missing_or_read_only_log_is_refused(ipsys: Ipsys, unmeasured: Unmeasured) -> None:
     log = unmeasured.log
     with log.open("r+b") as other:
         fcntl.flock(other, fcntl.LOCK_EX)
@@ -247,7 +247,7 @@ def test_a_log_that_is_locked_gone_or_not_to_be_written(ipsys: Ipsys, unmeasured
         assert "cannot be opened for writing" in refused(ipsys, log, "measure", log)
 
 
-def test_two_people_at_one_log(unmeasured: Unmeasured) -> None:
+def test_two_processes_measure_in_one_log(unmeasured: Unmeasured) -> None:
     log, tape = unmeasured
     with open_finished_log(log, Request()) as one, open_finished_log(log, Request()) as other:
         one.add([Measurement(tape[0].timestamp, "p001", marker_id=0)])
@@ -290,7 +290,7 @@ def test_log_without_stationary_intervals_is_refused(ipsys: Ipsys, lab: Path) ->
     assert "no marker of the rig lies still in it" in done.err
 
 
-def test_options_that_exclude_one_another(ipsys: Ipsys, unmeasured: Unmeasured) -> None:
+def test_exclusive_options_are_refused(ipsys: Ipsys, unmeasured: Unmeasured) -> None:
     log = unmeasured.log
     assert "exclude one another" in refused(ipsys, log, "measure", log, "--terminal", "--places")
 
@@ -316,7 +316,7 @@ def test_the_terminal_asks_checks_and_undoes(
     assert places == ["1", "2", "1"]
 
 
-def test_a_bad_answer_in_the_terminal_costs_that_answer_only(
+def test_bad_answer_in_the_terminal_is_asked_again(
     unmeasured: Unmeasured, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
 ) -> None:
     log, tape = unmeasured

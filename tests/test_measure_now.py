@@ -196,9 +196,7 @@ def test_kill_before_the_first_point_leaves_rig_and_intrinsics(
         assert len(session.calibrations) == 3
 
 
-def test_a_log_that_is_there_is_kept_unless_it_is_forced(
-    ipsys: Ipsys, still_lab: Lab, tmp_path: Path
-) -> None:
+def test_existing_log_is_kept_without_force(ipsys: Ipsys, still_lab: Lab, tmp_path: Path) -> None:
     log = tmp_path / "places.mcap"
     log.write_bytes(b"years of data")
     done = ipsys(*HEAD, still_lab.rig, "--calibration", still_lab.lenses, "-o", log)
@@ -281,7 +279,7 @@ def test_points_are_measured_in_the_terminal(end: str, still_lab: Lab, tmp_path:
     assert all(5 < count < 40 for count in counted(log).values())
 
 
-def test_the_faults_of_a_sheet_stand_on_lines_of_their_own_in_a_window(unmeasured: Unmeasured) -> None:
+def test_sheet_faults_are_on_separate_lines(unmeasured: Unmeasured) -> None:
     sheet = unmeasured.log.with_name("sheet.csv")
     sheet.write_text("marker,d_A_cm,d_B_cm,side,height_cm\n0,100,40,left,0\n99,170,190,left,0\n")
     code, told = typed(["measure", str(unmeasured.log), "--csv", str(sheet)], [])

@@ -74,7 +74,7 @@ def frames(count: int) -> Iterator[Message]:
         )
 
 
-def test_run_puts_what_a_stage_makes_behind_what_it_was_made_of() -> None:
+def test_run_yields_results_after_their_inputs() -> None:
     def seen(message: Message) -> Iterator[Any]:
         yield Markers(message.publish_time_ns, (), 1, 1)
 
@@ -137,7 +137,7 @@ def test_a_replay_gives_the_same_bytes_every_time(lab_log: Path, tmp_path: Path)
     assert len(set(written)) == 1
 
 
-def test_a_thread_that_fails_is_heard_and_the_rest_is_left() -> None:
+def test_failed_thread_raises_and_stops_the_others() -> None:
     def failing(message: Message) -> Iterator[Any]:
         if message.log_time_ns == 20:
             raise ValueError("a bug")
@@ -149,7 +149,7 @@ def test_a_thread_that_fails_is_heard_and_the_rest_is_left() -> None:
     assert cv2.getNumThreads() == threads
 
 
-def test_everything_is_made_once(ipsys: Ipsys, lab: Path) -> None:
+def test_each_result_is_computed_once(ipsys: Ipsys, lab: Path) -> None:
     recorded = data_section(lab)
     first = stages_of(ipsys, "replay", lab, "--model", "poly")
     assert first == {
@@ -194,7 +194,7 @@ def test_replay_in_place_and_into_a_new_log_give_the_same_messages(
     assert all(not new for _, new in stages_of(ipsys, "replay", lab, beside).values())
 
 
-def test_a_mistyped_marker_length_is_put_right_as_a_new_run(ipsys: Ipsys, lab: Path, tmp_path: Path) -> None:
+def test_corrected_marker_length_makes_a_new_run(ipsys: Ipsys, lab: Path, tmp_path: Path) -> None:
     ipsys("replay", lab)
     rig = write_rig(tmp_path / "lab.toml", lab, 0.18)
     stages = stages_of(ipsys, "replay", lab, "--rig", rig)
@@ -213,7 +213,7 @@ def test_a_mistyped_marker_length_is_put_right_as_a_new_run(ipsys: Ipsys, lab: P
     assert all(not new for _, new in stages_of(ipsys, "replay", lab, "--rig", rig).values())
 
 
-def test_a_rig_that_says_the_same_changes_nothing(ipsys: Ipsys, lab: Path, tmp_path: Path) -> None:
+def test_equal_rig_changes_nothing(ipsys: Ipsys, lab: Path, tmp_path: Path) -> None:
     ipsys("replay", lab)
     rig = write_rig(tmp_path / "lab.toml", lab, 0.20)
     assert load_rig(rig).name == "simulated"
@@ -239,7 +239,7 @@ def test_a_lens_calibrated_later_is_a_new_run(ipsys: Ipsys, lab: Path, tmp_path:
     assert [run["overrides"] for run in runs if run["run"] == "edges_2"] == [["lens red"]] * 2
 
 
-def test_stock_corners_know_no_lens(ipsys: Ipsys, lab: Path, tmp_path: Path) -> None:
+def test_stock_corners_do_not_depend_on_the_lens(ipsys: Ipsys, lab: Path, tmp_path: Path) -> None:
     ipsys("replay", lab, "--corners", "stock")
     with Session([lab]) as session:
         lens = session.payloads(["/cameras/red/calibration"])[0]

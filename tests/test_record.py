@@ -220,9 +220,7 @@ except InterruptError as interrupt:
 
 
 @pytest.mark.parametrize(("what", "code"), [("camera", 130), ("disk", 1)])
-def test_a_second_interrupt_ends_what_hangs_and_the_log_is_kept(
-    what: str, code: int, ipsys: Ipsys, tmp_path: Path
-) -> None:
+def test_second_interrupt_ends_a_hanging_command(what: str, code: int, ipsys: Ipsys, tmp_path: Path) -> None:
     log = tmp_path / "a.mcap"
     with subprocess.Popen(
         [sys.executable, "-c", HANGING, str(log), what],

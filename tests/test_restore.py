@@ -99,7 +99,7 @@ def topics_of(log: Path) -> set[str]:
 LIVE = [("detect", "edges"), ("camera-frame", "edges"), ("locate", "poly"), ("fuse", "poly")]
 
 
-def test_a_live_run_that_is_killed_is_brought_to_its_end(
+def test_killed_live_run_is_completed_by_repair(
     ipsys: Ipsys,
     rig: Path,
     calibration: Path,  # noqa: F811
@@ -180,7 +180,7 @@ def _chunks(log: Path) -> Iterator[ChunkRef]:
         yield from reader._contents.chunks
 
 
-def test_a_run_that_is_not_what_its_stage_makes_is_left_as_it_is(
+def test_run_with_other_content_is_left_unchanged(
     recorded: Path,  # noqa: F811
     ipsys: Ipsys,
     tmp_path: Path,

@@ -132,7 +132,7 @@ def test_raised_marker_of_four_cannot_be_identified() -> None:
     assert align_camera("red", lay(hang(3.0, 0), 0.001)[:4]).uneven_m is None
 
 
-def test_a_height_that_was_measured_is_brought_down() -> None:
+def test_measured_height_is_subtracted() -> None:
     camera = hang(4.0, 130)
     lying = lay(camera, 0.0, [0.2, 0.0, 0.1, 0.15])
     known = [

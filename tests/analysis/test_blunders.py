@@ -56,9 +56,7 @@ def test_corrected_gross_error_gives_the_true_point(wrong: Measurement, text: st
 
 
 @given(st.floats(-3, 5), st.floats(-4, 4), st.floats(-0.4, 0.4), st.sampled_from([0, 1]))
-def test_a_corrected_distance_comes_as_near_as_the_other_one_allows(
-    x: float, y: float, off_m: float, which: int
-) -> None:
+def test_corrected_distance_is_the_best_possible_one(x: float, y: float, off_m: float, which: int) -> None:
     assume(abs(y) > 0.3)
     predicted = np.array([x, y, 0.1])
     distances = [Distance(p.name, float(np.hypot(x - p.x_m, y - p.y_m))) for p in POINTS[:2]]
@@ -70,12 +68,12 @@ def test_a_corrected_distance_comes_as_near_as_the_other_one_allows(
     assert found.corrected.distances[1 - which] == distances[1 - which]
 
 
-def test_the_order_is_from_simple_to_less_so() -> None:
+def test_models_are_ordered_by_complexity() -> None:
     groups = [[slip.kind for slip in group] for group in possible_blunders(PLACE, RIG, TRUE)]
     assert groups == [["side", "swapped"], ["swapped"], ["distance", "distance", "height"]]
 
 
-def test_three_distances_tell_the_side_themselves() -> None:
+def test_three_distances_determine_the_side() -> None:
     ranges = [Distance(p.name, float(np.hypot(*(TRUE[:2] - [p.x_m, p.y_m])))) for p in POINTS]
     wrong = replace(PLACE, distances=(ranges[0], ranges[1], replace(ranges[2], distance_m=2.3)), side=None)
     found = slips(wrong)

@@ -109,7 +109,7 @@ def test_few_points_increase_the_threshold() -> None:
     assert sizes[-1] > 0.95
 
 
-def test_the_error_of_a_bad_tape_comes_on_top() -> None:
+def test_tape_error_adds_to_the_error() -> None:
     rng = np.random.default_rng(6)
     places = floor(rng, 200)
     off = rng.normal(0, 0.01, places.shape)

@@ -32,7 +32,7 @@ def test_ground_truth_is_interpolated_linearly(time_ms: float, x_m: float) -> No
 
 
 @pytest.mark.parametrize("time_ms", [-1e-6, 60 + 1e-6, 100, 161 + 1e-6])
-def test_beyond_its_ends_and_in_its_gaps_there_is_no_truth(time_ms: float) -> None:
+def test_ground_truth_has_no_values_outside_its_times(time_ms: float) -> None:
     assert track_errors(gather_tracks([tracked(time_ms, 0.0)]), TRUTH) is None
 
 

@@ -39,14 +39,14 @@ def joined(red: list[StationaryMarker], white: list[StationaryMarker]) -> list[M
     return join_cameras(alignments, {"red": LENS, "white": LENS})
 
 
-def test_two_markers_that_both_see_are_enough() -> None:
+def test_two_common_markers_join_two_cameras() -> None:
     red, white = joined(lying("red", RED), lying("white", WHITE))
     found = red.camera_from_world @ invert_pose(white.camera_from_world)
     assert np.abs(found - RED @ invert_pose(WHITE)).max() < 1e-6
     assert np.abs(invert_pose(red.camera_from_world)[2] - invert_pose(RED)[2]).max() < 1e-6
 
 
-def test_markers_that_are_not_the_same_join_nothing() -> None:
+def test_different_markers_do_not_join_cameras() -> None:
     red, white = lying("red", RED), lying("white", WHITE)
     assert joined(red, white[1:]) == []
     later = [replace(one, start_ns=10, end_ns=20) for one in white]

@@ -327,7 +327,7 @@ def test_a_flat_crossing_excuses_an_error_with_a_usual_tape_where_none_is_named(
     assert suspect.measurement == name
 
 
-def test_a_prediction_that_is_no_point_is_passed_over() -> None:
+def test_invalid_prediction_is_skipped() -> None:
     session, planted = plant(simulated(17), ["side"], 17)
     fits = without_each(session)
 
@@ -340,7 +340,7 @@ def test_a_prediction_that_is_no_point_is_passed_over() -> None:
     assert [suspect.measurement for suspect in find_outliers(broken, session.places)] == list(planted)
 
 
-def test_few_fits_are_asked_for() -> None:
+def test_number_of_fits_is_small() -> None:
     def asked(session: Session) -> int:
         fits = without_each(session)
         calls = []
@@ -413,9 +413,7 @@ def test_good_point_is_restored_if_clean_fits_agree(lasting: bool) -> None:
 
 
 @pytest.mark.parametrize("labels", [("train",), ("train", "test")])
-def test_the_pair_of_the_authors_that_contradicts_its_neighbours_comes_first(
-    data: Path, labels: tuple[str, ...]
-) -> None:
+def test_contradicting_pair_of_the_authors_ranks_first(data: Path, labels: tuple[str, ...]) -> None:
     if not (data / "imsel").is_dir():
         pytest.skip(f"no authors' data in {data / 'imsel'}")
     log = list(read_imsel(data / "imsel"))

@@ -54,7 +54,7 @@ def still(start: float, end: float, x: float, z: float = 2.0) -> list[tuple[floa
     return [(t, x + 0.001 * (-1) ** n, z) for n, t in enumerate(np.arange(start, end, 0.1))]
 
 
-def test_the_still_stretch_around_a_time() -> None:
+def test_stationary_interval_around_a_time_is_found() -> None:
     moving = [(t, 0.1 * t, 2.0) for t in np.arange(5, 10, 0.1)]
     rows = [*still(0, 5, 0.5), *moving, *still(10, 15, 1.0)]
     sightings = gather_sightings(seen(*rows))["red", 0]
@@ -89,12 +89,12 @@ def test_a_still_interval_holds_for_what_was_exposed_in_it() -> None:
     assert (pair.frames, pair.camera_m[0]) == (1, 0.2)
 
 
-def test_lifting_a_marker_ends_the_stretch() -> None:
+def test_lifted_marker_ends_a_stationary_interval() -> None:
     sightings = gather_sightings(seen(*still(0, 2, 0.5), *still(2, 4, 0.5, z=1.95)))["red", 0]
     assert still_interval(sightings, S) == pytest.approx((0, 1.9 * S))
 
 
-def test_a_long_silence_ends_the_stretch() -> None:
+def test_long_gap_ends_a_stationary_interval() -> None:
     sightings = gather_sightings(seen(*still(0, 1, 0.5), *still(10, 11, 0.5)))["red", 0]
     assert still_interval(sightings, int(0.5 * S)) == pytest.approx((0, 0.9 * S))
     assert still_interval(sightings, 5 * S) is None
@@ -173,7 +173,7 @@ def test_a_withdrawn_measurement_does_not_count() -> None:
         ),
     ],
 )
-def test_measurements_that_say_too_little(measurement: Measurement, said: str) -> None:
+def test_incomplete_measurements_are_refused(measurement: Measurement, said: str) -> None:
     with pytest.raises(IpsysError, match=said):
         build_pairs(gather_sightings(seen(*still(0, 1, 0.5))), [RiggedMeasurement(measurement, RIG)])
 
@@ -188,7 +188,7 @@ def test_a_split_at_random_is_a_fifth_and_the_same_for_a_seed() -> None:
     assert split(measurements, "train", seed=4) != (train, held_out)
 
 
-def test_the_rig_of_its_time_holds_for_a_measurement() -> None:
+def test_measurement_uses_the_rig_of_its_time() -> None:
     moved = replace(RIG, reference_points=(ReferencePoint("A", 0.0, 0.0), ReferencePoint("B", 3.0, 0.0)))
     one, two = (Measurement(0, name, marker_id=0, point=WorldPoint(0, 0, 0)) for name in "ab")
     log = [Message("t", n, n, payload) for n, payload in enumerate((one, RIG, two, moved))]
@@ -209,7 +209,7 @@ def test_held_out_points_are_never_used_by_fit() -> None:
 
 
 @pytest.mark.parametrize("value", [float("nan"), float("inf")])
-def test_a_world_point_that_is_no_point(value: float) -> None:
+def test_invalid_world_point_is_refused(value: float) -> None:
     measurement = Measurement(0, "a", marker_id=0, point=WorldPoint(1.0, 2.0, value))
     with pytest.raises(IpsysError, match="measurement a: its world point"):
         build_pairs(gather_sightings(seen(*still(0, 1, 0.5))), [RiggedMeasurement(measurement, RIG)])

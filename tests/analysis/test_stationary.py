@@ -69,7 +69,7 @@ def test_single_jump_does_not_split_an_interval() -> None:
     assert found[:2] == (0, int(seen(path).times_ns[-1]))
 
 
-def test_a_depth_that_jitters_at_the_edge_of_the_picture_is_no_motion() -> None:
+def test_depth_noise_at_the_image_edge_is_no_motion() -> None:
     ray = np.array([-0.95, 0.55, 1.0])
     assert is_stationary(ray * np.array([[1.92], [1.921], [1.913]]))
 

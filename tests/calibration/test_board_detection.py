@@ -145,7 +145,7 @@ def test_mirrored_images_are_reported() -> None:
         search_images([("a", pictures[0]), ("b", pictures[1])], CHARUCO, 2, "red")
 
 
-def test_pictures_of_the_same_name_of_which_one_has_another_size() -> None:
+def test_equal_image_names_may_have_different_sizes() -> None:
     """Two folders of one camera may have images of the same name."""
     grey = drawn(CHARUCO, 0, 0.7)[0]
     small = np.ascontiguousarray(grey[100:, 100:])
@@ -202,7 +202,7 @@ def test_selection_takes_the_sharper_of_two_equal_views() -> None:
         ("charuco:50x50", "has 50 markers, the board 1250"),
     ],
 )
-def test_boards_that_cannot_be(text: str, said: str) -> None:
+def test_impossible_boards_are_refused(text: str, said: str) -> None:
     with pytest.raises(IpsysError, match=said):
         parse_board(text, 0.03, 0.75, "DICT_4X4_50", False)
 

@@ -131,7 +131,7 @@ def test_pictures_without_the_board_are_named_with_what_they_show() -> None:
     )
 
 
-def test_pictures_of_nothing_say_what_to_look_after() -> None:
+def test_images_without_the_board_name_the_next_step() -> None:
     with pytest.raises(IpsysError, match="one less than the squares in each direction"):
         seen([np.full((120, 160), 90, np.uint8)] * 3, "8x6")
 

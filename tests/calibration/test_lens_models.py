@@ -58,7 +58,7 @@ def test_derivatives(name: str) -> None:
         np.testing.assert_allclose(by_lens[:, :, n], (ahead - behind) / (2 * step), rtol=1e-5, atol=1e-4)
 
 
-def test_the_axis_itself_is_the_middle() -> None:
+def test_optical_axis_projects_to_the_principal_point() -> None:
     pixels, by_point, _ = project_with_slopes(
         LENS_MODELS["fisheye"], np.array(TRUTH["fisheye"]), np.array([[0.0, 0.0, 2.0]])
     )
@@ -66,6 +66,6 @@ def test_the_axis_itself_is_the_middle() -> None:
     np.testing.assert_allclose(by_point[0, :, :2], np.eye(2) * 185.0 / 2.0, atol=1e-6)
 
 
-def test_a_lens_that_there_is_not() -> None:
+def test_missing_calibration_is_refused() -> None:
     with pytest.raises(IpsysError, match="use one of fisheye, pinhole"):
         find_lens_model("omni")

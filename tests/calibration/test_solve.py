@@ -79,7 +79,7 @@ def test_pixels_that_are_not_square() -> None:
     assert (np.abs(found.fit.intrinsics - stretched) < 4 * sigmas).all()
 
 
-def test_pixels_that_are_hardly_not_square() -> None:
+def test_almost_square_pixels_are_recognised() -> None:
     """The pixels differ from squares by half a per cent, in images that are good enough to show it."""
     stretched = (600.0, 603.0, *TRUTH["pinhole"][2:])
     corners = seen("pinhole", np.random.default_rng(0), noise_px=0.03, lens=stretched)

@@ -69,7 +69,7 @@ def test_names_of_two_kinds_do_not_split_one_camera() -> None:
     assert split("pinhole", corners, [f"{'near' if n < 9 else 'far'}_{n}.jpg" for n in range(20)]) is None
 
 
-def test_names_help_where_cameras_are_alike() -> None:
+def test_names_separate_similar_cameras() -> None:
     rng = np.random.default_rng(2)
     like = (615.0, 615.0, 350.0, 222.0, -0.23, 0.06, 0.001, -0.001, 0.02)
     corners = both(seen("pinhole", rng, 12), seen("pinhole", rng, 12, lens=like))

@@ -62,9 +62,7 @@ steps = st.lists(st.tuples(st.sampled_from("ab"), st.booleans(), st.integers(0, 
 
 
 @given(steps, st.integers(1, 40))
-def test_whatever_comes_each_frame_is_searched_or_named_and_can_be_decoded(
-    came: list[tuple[str, bool, int]], every: int
-) -> None:
+def test_each_frame_is_searched_or_reported_as_skipped(came: list[tuple[str, bool, int]], every: int) -> None:
     waiting = Waiting()
     taken: list[Message] = []
     skipped: list[Message] = []

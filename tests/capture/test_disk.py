@@ -101,9 +101,7 @@ def test_small_disk_is_warned_of_before_the_start(
             assert "full after 2 s" in capsys.readouterr().err
 
 
-def test_line_on_the_screen_is_corrected_by_what_came(
-    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
-) -> None:
+def test_displayed_disk_time_uses_the_measured_rate(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     """The estimate is 10 MB/s and the measured rate 2 MB/s: the disk lasts five times as long."""
     log = tmp_path / "a.mcap"
     log.write_bytes(bytes(20_000_000))

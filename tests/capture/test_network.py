@@ -194,7 +194,7 @@ def test_a_stream_that_falls_silent_is_left_at_once(tmp_path: Path) -> None:
         assert time.monotonic() - start < 2.5
 
 
-def test_a_stream_of_empty_parts_has_gone(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+def test_stream_of_empty_parts_is_lost(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr("ipsys_log.capture.network._SILENT_S", 1.0)
     pictures = make_jpegs(tmp_path, 3)
     left = threading.Event()

@@ -86,7 +86,7 @@ def taken_s(log: Noted) -> list[float]:
     return [m.publish_time_ns / NS_PER_S for m in log.noted if isinstance(m.payload, CompressedImage)]
 
 
-def test_frames_since_a_marker_lay_still_come_with_its_measurement_and_no_others(log: Noted) -> None:
+def test_measurement_stores_only_frames_of_its_interval(log: Noted) -> None:
     with RecentFrames(log) as recent:
         for message in frames(0, 60):
             recent.put(message)

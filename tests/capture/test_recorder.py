@@ -110,7 +110,7 @@ def test_the_oldest_frames_are_skipped_and_named_by_their_log_times(log: Noted) 
     assert len([m for m in log.noted if isinstance(m.payload, CompressedImage)]) == 12
 
 
-def test_a_fault_of_the_recorder_is_raised_where_frames_are_taken(log: Noted) -> None:
+def test_recorder_error_is_raised_to_the_consumer(log: Noted) -> None:
     def source() -> Generator[Message | None, None, None]:
         yield frame(0)
         raise ZeroDivisionError("a bug")
@@ -144,7 +144,7 @@ class FullDisk(Disk):
         return Disk.pwrite(self, fd, data, offset)
 
 
-def test_on_a_full_disk_what_waits_is_written_but_for_frames_and_nothing_more_is_taken(
+def test_full_disk_drops_frames_and_writes_other_messages(
     tmp_path: Path,
 ) -> None:
     disk, path = FullDisk(), tmp_path / "a.mcap"
@@ -181,7 +181,7 @@ def test_a_log_that_is_being_written_is_not_overwritten(tmp_path: Path) -> None:
     assert second.counts == {image_topic("red"): 1}
 
 
-def test_the_old_log_is_there_until_the_new_one_stands(
+def test_old_log_exists_until_the_new_one_is_complete(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     path = tmp_path / "a.mcap"
@@ -209,7 +209,7 @@ def test_the_old_log_is_there_until_the_new_one_stands(
 
 
 @pytest.mark.parametrize("whole", [True, False])
-def test_a_journal_that_was_left_over_does_not_outlive_its_log(tmp_path: Path, whole: bool) -> None:
+def test_old_journal_is_removed_with_its_log(tmp_path: Path, whole: bool) -> None:
     path, journal = tmp_path / "a.mcap", tmp_path / "a.mcap.journal"
     with open_recording(path) as first:
         first.put(frame(0))

@@ -97,7 +97,7 @@ def test_silent_stream_is_reported_and_then_closed(driver: Driver, monkeypatch: 
 
 
 @pytest.mark.parametrize(("mode", "bad"), [("MJPG", b""), ("YUYV", b""), ("YUYV", b"half a picture")])
-def test_a_camera_that_hands_over_nothing_of_use_has_gone(
+def test_camera_without_valid_data_is_lost(
     driver: Driver, monkeypatch: pytest.MonkeyPatch, mode: str, bad: bytes
 ) -> None:
     monkeypatch.setattr(v4l2_camera, "_SILENT_S", 0.2)
@@ -150,7 +150,7 @@ def test_accepted_settings_give_no_message(driver: Driver) -> None:
     assert driver.controls[0x980913][2] == 10
 
 
-def test_a_stamp_of_another_clock_is_none(driver: Driver) -> None:
+def test_stamp_of_another_clock_is_ignored(driver: Driver) -> None:
     said: list[str] = []
     driver.flags = 0
     driver.frames.append(b"x")

@@ -84,7 +84,7 @@ def write(folder: Path, values: dict[str, str]) -> None:
         (folder / name).write_text(value + "\n")
 
 
-def test_cameras_are_found_where_they_hang(tmp_path: Path, plug_in: Callable[[int, str], None]) -> None:
+def test_camera_poses_are_recovered(tmp_path: Path, plug_in: Callable[[int, str], None]) -> None:
     for number, port in ((10, "2.3"), (2, "4"), (9, "5")):  # 9 is a device without images
         plug_in(number, port)
     first, second = find_cameras(tmp_path)
@@ -175,7 +175,7 @@ def test_cameras_that_reserve_all_they_can_may_not_start() -> None:
     assert "may reserve 51.0 MB/s of its 48: if one of them does not start" in line
 
 
-def test_the_command(
+def test_cameras_command_lists_the_bus_load(
     tmp_path: Path, plug_in: Callable[[int, str], None], ipsys: Ipsys, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     monkeypatch.setattr(usb_bus, "find_cameras", lambda: find_cameras(tmp_path))

@@ -30,7 +30,7 @@ def images(log: Path, camera: str) -> list[CompressedImage | CompressedVideo]:
     return [message.payload for message in messages]
 
 
-def test_videos_go_into_a_log_as_they_are(tmp_path: Path, ipsys: Ipsys) -> None:
+def test_videos_are_logged_unchanged(tmp_path: Path, ipsys: Ipsys) -> None:
     pictures = make_jpegs(tmp_path, 20)
     red = encode(tmp_path, "red.avi", "-c:v", "copy")
     white = encode(tmp_path, "white.mp4", *X264, rate=25)

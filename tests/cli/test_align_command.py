@@ -94,7 +94,7 @@ def aligned(ipsys: Ipsys, *arguments: object) -> dict[str, Any]:
     return {**found, "cameras": {row["camera"]: row for row in found["cameras"]}}
 
 
-def test_a_tilt_comes_back_and_who_does_as_told_gets_green(ipsys: Ipsys, tmp_path: Path) -> None:
+def test_following_the_advice_makes_a_camera_level(ipsys: Ipsys, tmp_path: Path) -> None:
     cameras = hung(TILTS)
     before = aligned(ipsys, film(tmp_path / "before.mcap", cameras))["cameras"]
     for name, (tilt_deg, _) in TILTS.items():

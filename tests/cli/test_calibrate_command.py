@@ -294,7 +294,7 @@ def test_four_pictures_are_used_if_insisted_on(ipsys: Ipsys, red: Path, tmp_path
     assert "written only for --force: only 4 of 4 pictures can be used" in done.err
 
 
-def test_sources_that_are_none(ipsys: Ipsys, red: Path, tmp_path: Path) -> None:
+def test_invalid_sources_are_refused(ipsys: Ipsys, red: Path, tmp_path: Path) -> None:
     board = ("--board", "6x4", "-o", tmp_path)
     assert "there is no such" in refused(ipsys, tmp_path, tmp_path / "nowhere", *board)
     (tmp_path / "empty").mkdir()

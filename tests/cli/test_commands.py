@@ -135,7 +135,7 @@ def test_evaluate_fits_80_columns(ipsys: Ipsys, lab: Path, monkeypatch: pytest.M
 CAMERAS = ("red", "white", "black")
 
 
-def test_runs_say_where_they_come_from(ipsys: Ipsys, lab: Path) -> None:
+def test_runs_list_their_inputs(ipsys: Ipsys, lab: Path) -> None:
     ipsys("replay", lab)
     runs = {run["stage"]: run for run in json.loads(ipsys("runs", lab, "--json").out)}
     assert runs["detect"]["parameters"] == {"corners": "edges"}

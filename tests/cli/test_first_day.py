@@ -131,7 +131,7 @@ def test_impossible_request_is_reported_before_cameras_open(
     assert (tmp_path / "old.mcap").read_bytes() == b"years of work"
 
 
-def test_a_picture_that_is_higher_than_wide_is_asked_about(ipsys: Ipsys, tmp_path: Path) -> None:
+def test_portrait_image_gives_a_remark(ipsys: Ipsys, tmp_path: Path) -> None:
     for width, height, said in ((180, 320, True), (320, 180, False)):
         size = f"width = {width}\nheight = {height}"
         rig = write_rig(tmp_path, f'[[cameras]]\nname = "red"\nsource = "http://127.0.0.1:9/"\n{size}')
@@ -151,7 +151,7 @@ def test_a_model_of_other_cameras_is_refused_before_any_is_opened(
         assert OPENED not in done.err
 
 
-def test_a_lens_comes_out_of_a_log(ipsys: Ipsys, tmp_path: Path, lab: Path) -> None:
+def test_calibration_is_read_from_a_log(ipsys: Ipsys, tmp_path: Path, lab: Path) -> None:
     """Select by camera name; a log with a single camera needs no name."""
     rig = write_rig(tmp_path, played(lab))
     one = ("record", "--rig", rig, "--seconds", "0.5", "-o")
@@ -185,7 +185,7 @@ def test_file_name_gets_a_missing_suffix_and_a_message(
     assert not (tmp_path / "monday").exists()
 
 
-def test_aligning_now_says_what_is_kept(ipsys: Ipsys, tmp_path: Path, lab: Path) -> None:
+def test_live_align_names_the_kept_log(ipsys: Ipsys, tmp_path: Path, lab: Path) -> None:
     rig = write_rig(tmp_path, played(lab))
     done = ipsys("align", "--rig", rig, "--seconds", "1")
     assert done.code == 0, done.err
@@ -234,7 +234,7 @@ def test_a_camera_without_a_lens_is_recorded_and_named(ipsys: Ipsys, tmp_path: P
 @pytest.mark.parametrize(
     "arguments", [("replay",), ("plan",), ("align",), ("latency",), ("calibrate", "--board", "6x4")]
 )
-def test_a_picture_of_no_kind_is_refused_before_any_work(
+def test_figure_without_a_valid_suffix_is_refused_first(
     ipsys: Ipsys, lab: Path, arguments: tuple[str, ...]
 ) -> None:
     before = lab.read_bytes()

@@ -128,5 +128,5 @@ def test_plain_text_keeps_letters_and_escapes_controls(text: str) -> None:
         assert plain == text
 
 
-def test_plain_text_cuts_what_is_endless() -> None:
+def test_plain_text_cuts_long_texts() -> None:
     assert len(plain_text("a" * 10_000_000)) < 3_000

@@ -134,7 +134,7 @@ def test_the_plan_as_json(ipsys: Ipsys, fitted: Path) -> None:
     assert any("little" in note for note in found["notes"])
 
 
-def test_heights_and_models_as_asked_for(ipsys: Ipsys, fitted: Path) -> None:
+def test_plan_uses_the_given_heights_and_model(ipsys: Ipsys, fitted: Path) -> None:
     found = planned(ipsys, fitted, "--height-m", "0.12", "--places", 2)
     assert {place["height_m"] for place in found["places"]} == {0.12}
     found = planned(ipsys, fitted, "--height-m", "0.12", "--height-m", "0", "--places", 2)
@@ -153,7 +153,7 @@ def test_heights_and_models_as_asked_for(ipsys: Ipsys, fitted: Path) -> None:
         assert found["marker_height_m"] == pytest.approx(0.2 if model == "rayplane" else 0.1, abs=0.02)
 
 
-def test_the_picture(ipsys: Ipsys, fitted: Path) -> None:
+def test_figure_of_the_plan_is_drawn(ipsys: Ipsys, fitted: Path) -> None:
     drawn = fitted.with_name("plan.png")
     done = ipsys("plan", fitted, "--plot", drawn, "--places", 7)
     assert done.code == 0, done.err

@@ -103,7 +103,7 @@ def test_interrupt_swallowed_by_a_library_comes_again() -> None:
 
 
 @pytest.mark.usefixtures("handlers")
-def test_interrupt_does_not_interrupt_what_cleans_up() -> None:
+def test_interrupt_does_not_stop_the_cleanup() -> None:
     cleaned: list[bool] = []
 
     @interruptible

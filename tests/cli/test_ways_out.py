@@ -188,7 +188,7 @@ def detected(tmp_path: Path) -> Path:
         (shifted(0), other_ids, "no marker id in common: the first has 0, 1, 2"),
     ],
 )
-def test_diff_of_nothing_in_common_says_why(
+def test_diff_without_common_frames_gives_the_reason(
     ipsys: Ipsys,
     detected: Path,
     first: Callable[[Message], Message | None],
@@ -209,7 +209,7 @@ def test_diff_of_runs_without_frames_says_which_side(ipsys: Ipsys, detected: Pat
     assert "the second has no markers, points, positions or tracks" in " ".join(done.out.split())
 
 
-def test_extents_that_meet_are_not_explained() -> None:
+def test_adjacent_extents_give_no_explanation() -> None:
     times_ns = np.array([1, 5, 9])
     one = Extent(frozenset({"red"}), times_ns, frozenset({1, 2}))
     assert explain_no_overlap(one, replace(one, ids=frozenset({2, 3}))) is None
@@ -296,7 +296,7 @@ def test_kept_results_of_one_command_are_not_of_the_next(ipsys: Ipsys, tmp_path:
         raise Interrupted(130, "")
 
 
-def test_simulate_tells_how_far_it_is() -> None:
+def test_simulate_shows_its_progress() -> None:
     told: list[tuple[str, int, int]] = []
     lab = LabSettings(width=320, height=180, stations=2, frames_per_station=2, drive_s=0.1, markers=2)
     messages = list(simulate(lab, lambda *step: told.append(step)))

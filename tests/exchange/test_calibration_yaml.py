@@ -64,6 +64,6 @@ def test_kalibr(model: str, name: str) -> None:
     ("name", "kind", "said"),
     [("kalibr", "pinhole", "four coefficients"), ("matlab", "fisheye", "use one of opencv, ros, kalibr")],
 )
-def test_formats_that_cannot_be(name: str, kind: str, said: str) -> None:
+def test_impossible_formats_are_refused(name: str, kind: str, said: str) -> None:
     with pytest.raises(IpsysError, match=said):
         check_format(name, kind)

@@ -46,6 +46,6 @@ def test_pictures_that_would_be_left_out_are_named(tmp_path: Path, names: list[s
 
 
 @pytest.mark.parametrize("rate", [0.0, -1.0, float("nan"), float("inf")])
-def test_a_rate_that_is_none(tmp_path: Path, rate: float) -> None:
+def test_invalid_rate_is_refused(tmp_path: Path, rate: float) -> None:
     with pytest.raises(IpsysError, match="pictures per second"):
         list(read_images(find_images(folder(tmp_path, "red/a.jpg")), None, {}, rate))

@@ -58,7 +58,7 @@ def test_the_slopes_are_those_of_the_camera_point(
 
 
 @given(st.integers(0, 1000), st.integers(1, 9))
-def test_markers_together_are_where_they_are_one_by_one_to_the_last_bit(seed: int, count: int) -> None:
+def test_joint_and_single_fits_are_bit_identical(seed: int, count: int) -> None:
     rng = np.random.default_rng(seed)
     uv = rng.normal(0, 0.5, (count, 1, 2)) + rng.normal(0, 0.05, (count, 4, 2))
     lengths_m = rng.uniform(0.05, 0.3, count)

@@ -158,7 +158,7 @@ def test_many_readings_are_as_good_as_their_mean() -> None:
     np.testing.assert_allclose(found.covariance_m2, alone / 200, rtol=0.02)
 
 
-def test_the_side_is_not_asked_where_the_distances_tell() -> None:
+def test_side_is_not_asked_if_the_distances_determine_it() -> None:
     references = np.array([A, B, C])
     point = np.array([2.0, 3.5])
     for side in ("left", "right", None):
@@ -226,7 +226,7 @@ def test_the_covariance_is_that_of_drawn_distances(
 
 
 @pytest.mark.parametrize("along", [-0.3, 0.4, 1.0, 1.5])
-def test_on_the_line_the_covariance_is_finite_and_about_what_samples_scatter(along: float) -> None:
+def test_covariance_on_the_line_is_finite_and_matches_samples(along: float) -> None:
     rng = np.random.default_rng(7)
     known, sigmas = np.array([A, B]), np.full(2, 0.003)
     point = A + along * (B - A)

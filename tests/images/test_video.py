@@ -152,7 +152,7 @@ FULL = ("-profile:v", "high444", "-pix_fmt", "yuv444p", "-crf", "0")
 
 
 @pytest.mark.parametrize("options", [BASELINE, HIGH, FULL, H265])
-def test_a_frame_that_is_lost_is_not_guessed(pictures: Path, options: tuple[str, ...]) -> None:
+def test_lost_frame_is_not_replaced(pictures: Path, options: tuple[str, ...]) -> None:
     """Over UDP, some packets are lost; FFmpeg would show the previous image."""
     name = "h265" if "libx265" in options else "h264"
     for number in range(12, 60):  # more than the range of frame numbers, 16 at least

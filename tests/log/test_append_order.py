@@ -147,7 +147,7 @@ def error_of_append(path: Path, storage: Failing) -> str:
 
 @pytest.mark.parametrize("for_good", [True, False])
 @pytest.mark.parametrize("error", [errno.EIO, errno.ENOSPC])
-def test_words_after_a_failed_append_are_true(
+def test_message_after_a_failed_append_is_correct(
     tmp_path: Path, error: int, for_good: bool, caplog: pytest.LogCaptureFixture
 ) -> None:
     whole = create(tmp_path / "whole.mcap", OLD).read_bytes()

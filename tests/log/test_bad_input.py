@@ -142,7 +142,7 @@ def test_a_journal_without_its_log(tmp_path: Path) -> None:
         LogWriter.create(path)
 
 
-def test_a_journal_of_another_file_is_not_believed(log: Path, tmp_path: Path, rows: list[Row]) -> None:
+def test_journal_of_another_file_is_not_used(log: Path, tmp_path: Path, rows: list[Row]) -> None:
     other = create(tmp_path / "other.mcap", rows[::2])
     before = log.read_bytes()
     for content in (b"", b"junk", bytes(5000), other.read_bytes()):
@@ -153,7 +153,7 @@ def test_a_journal_of_another_file_is_not_believed(log: Path, tmp_path: Path, ro
         assert not journal_path(log).exists()
 
 
-def test_a_whole_journal_of_another_file_is_not_believed(log: Path, tmp_path: Path, rows: list[Row]) -> None:
+def test_complete_journal_of_another_file_is_not_used(log: Path, tmp_path: Path, rows: list[Row]) -> None:
     storage = Recorder()
     other = create(tmp_path / "other.mcap", rows[::2])
     storage.know(other)
@@ -231,7 +231,7 @@ def test_an_index_that_points_to_another_message(log: Path) -> None:
     assert fault_of(read_everything, log) == ""
 
 
-def test_a_hash_that_was_copied_with_its_record_is_not_believed(tmp_path: Path) -> None:
+def test_copied_hash_is_not_trusted(tmp_path: Path) -> None:
     path = tmp_path / "copy.mcap"
     with path.open("wb") as file:
         writer = Writer(file)
@@ -277,7 +277,7 @@ def test_any_byte_changed_and_repaired(log: Path) -> None:
 
 
 @pytest.mark.parametrize("claim", [1 << 31, 1 << 40, (1 << 64) - 1])
-def test_lengths_are_not_believed(log: Path, claim: int) -> None:
+def test_claimed_lengths_are_checked(log: Path, claim: int) -> None:
     whole = log.read_bytes()
     chunk = whole.index(b"\x06", 40)
     tracemalloc.start()
@@ -292,7 +292,7 @@ def test_lengths_are_not_believed(log: Path, claim: int) -> None:
         tracemalloc.stop()
 
 
-def test_a_damaged_chunk_in_the_middle_costs_only_itself(log: Path) -> None:
+def test_damaged_chunk_loses_only_itself(log: Path) -> None:
     with LogReader(log) as reader:
         total, chunks = reader.message_count, reader.chunk_count
     data = bytearray(log.read_bytes())
@@ -418,7 +418,7 @@ def test_a_chunk_index_with_wrong_times_is_repaired(tmp_path: Path) -> None:
     assert not repair(path).changed
 
 
-def test_a_second_log_behind_the_first_is_kept_beside_it(tmp_path: Path) -> None:
+def test_appended_second_log_is_kept_in_a_separate_file(tmp_path: Path) -> None:
     """The file is from ``cat a.mcap b.mcap``: the second part is foreign, and is kept."""
     one = create(tmp_path / "a.mcap", [("/a", n, n, bytes(50)) for n in range(30)]).read_bytes()
     other = create(tmp_path / "b.mcap", [("/b", n, n, bytes(50)) for n in range(20)]).read_bytes()

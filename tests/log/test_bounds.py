@@ -245,5 +245,5 @@ def test_message_larger_than_a_chunk_is_refused_when_written(tmp_path: Path) -> 
     assert LARGEST_MESSAGE < LARGEST_CHUNK
 
 
-def test_refusals_are_faults_of_the_input() -> None:
+def test_refusals_are_input_errors() -> None:
     assert issubclass(BoundError, IpsysError)

@@ -100,7 +100,7 @@ def test_reader_returns_the_written_messages(payload: Any) -> None:
 
 
 @given(payloads)
-def test_anybody_can_read_it_with_the_schema_in_the_log(payload: Any) -> None:
+def test_log_is_readable_with_its_own_schemas(payload: Any) -> None:
     name = next(key for key, kind in PAYLOADS.items() if kind is type(payload))
     pool = descriptor_pool.DescriptorPool()
     for file in descriptor_pb2.FileDescriptorSet.FromString(schema_data(name)).file:

@@ -24,7 +24,7 @@ ROWS = st.lists(
 
 @settings(max_examples=150)
 @given(st.lists(ROWS, min_size=1, max_size=4), st.integers(0, 10**10), st.integers(0, 10**11))
-def test_sessions(sessions: list[list[Row]], start: int, length: int) -> None:
+def test_appended_sessions_equal_one_log(sessions: list[list[Row]], start: int, length: int) -> None:
     with tempfile.TemporaryDirectory() as folder:
         path = create(Path(folder) / "log.mcap", sessions[0])
         for rows in sessions[1:]:

@@ -226,7 +226,7 @@ def test_repair_damaged_index_costs_no_loose_message(at: int, number: int, tmp_p
     assert agree(path) == sorted(rows)
 
 
-def test_repair_says_that_it_does_not_know_what_was_taken_out(tmp_path: Path) -> None:
+def test_repair_reports_an_unknown_content_of_removed_bytes(tmp_path: Path) -> None:
     """A chunk and its indexes are missing: the summary has moved, and no CRC matches."""
     path = create(tmp_path / "log.mcap", rows_of(60))
     data = path.read_bytes()

@@ -149,7 +149,7 @@ def test_kill_a_recorder(tmp_path: Path) -> None:
     assert kept > 0
 
 
-def test_a_journal_that_the_log_has_outlived_is_not_rolled_back(tmp_path: Path) -> None:
+def test_outdated_journal_is_not_rolled_back(tmp_path: Path) -> None:
     """A crash, then a repair and an append under another name, then the old name again."""
     path, moved = tmp_path / "a.mcap", tmp_path / "b.mcap"
     create(path, [("/a", n, n, b"old") for n in range(30)])
@@ -184,7 +184,7 @@ def _crash_after_truncate(path: Path, whole: bytes) -> None:
         os.close(fd)
 
 
-def test_a_log_is_one_by_whichever_link_it_is_opened(tmp_path: Path) -> None:
+def test_log_is_the_same_through_every_link(tmp_path: Path) -> None:
     path, link = tmp_path / "a.mcap", tmp_path / "link.mcap"
     create(path, [("/a", n, n, b"old") for n in range(30)])
     whole = path.read_bytes()

@@ -30,7 +30,7 @@ def test_three_tanh_neurons_and_a_linear_output() -> None:
     np.testing.assert_allclose(found[0], expected, atol=1e-12)
 
 
-def test_its_slopes_are_those_of_finite_differences() -> None:
+def test_gradients_equal_finite_differences() -> None:
     rng = np.random.default_rng(1)
     weights, inputs = rng.normal(size=16), np.column_stack([np.ones(6), rng.normal(size=(6, 3))])
 
@@ -61,7 +61,7 @@ def test_noise_alone_is_not_learned() -> None:
 
 
 @pytest.mark.parametrize("count", [5, 6, 8, 10])
-def test_a_few_pairs_are_not_taken_for_noise(count: int) -> None:
+def test_few_pairs_give_no_noise_estimate(count: int) -> None:
     """A constant network also explains the data if the noise may be as large as the floor."""
     for seed in range(10):
         rng = np.random.default_rng(seed)

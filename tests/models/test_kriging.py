@@ -111,7 +111,7 @@ def test_estimator_passes_scikit_learn_checks(noisy: bool) -> None:
         check_estimator(Kriging(noisy), expected_failed_checks=_TOO_FEW)
 
 
-def test_pairs_that_leave_nothing_beside_the_trend_are_refused() -> None:
+def test_too_few_pairs_for_a_trend_are_refused() -> None:
     x, y = wavy(5, count=6)
     Kriging().fit(x, y)
     with pytest.raises(FitError, match=r"kriging needs at least 6 pairs .*, found 5 samples; measure more"):

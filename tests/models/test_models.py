@@ -112,7 +112,7 @@ def test_rigid_then_poly_is_poly() -> None:
     np.testing.assert_allclose(both, create("poly").fit(points, world).predict(points), atol=1e-9)
 
 
-def test_poly_keeps_scikit_learns_contract() -> None:
+def test_poly_passes_scikit_learn_checks() -> None:
     with warnings.catch_warnings():
         warnings.simplefilter("ignore", SkipTestWarning)
         check_estimator(PolynomialRegression())

@@ -125,7 +125,7 @@ def test_equal_point_heights_give_that_height_to_all_positions() -> None:
     assert error_cm(found, world, 2) < 0.1
 
 
-def test_noisy_heights_are_drawn_to_those_measured_no_more_than_their_noise_warrants() -> None:
+def test_height_correction_is_limited_by_the_noise() -> None:
     rng = np.random.default_rng(2)
     world = labs.places(rng, 200)
     for along, most in ((0.0005, 0.01), (0.02, 0.4)):

@@ -60,7 +60,7 @@ def test_paper_data_recommend_rigid_with_10_points_poly_from_30(paper: Findings)
     assert "poly from" in advice.sentences[0]
 
 
-def test_the_paper_s_data_on_random_subsets_say_the_same(paper: Findings) -> None:
+def test_random_subsets_of_the_paper_data_agree(paper: Findings) -> None:
     found = paper.evaluations
     drawn = [replace(e, learning=tuple(p for p in e.learning if p.label is None)) for e in found]
     advice = advise(drawn)
@@ -124,7 +124,7 @@ def test_models_with_known_heights_are_compared_separately() -> None:
     }  # fmt: skip
 
 
-def test_the_paper_s_other_methods_are_no_reason_to_use_neither_rigid_nor_poly() -> None:
+def test_other_paper_methods_are_not_better_than_rigid_or_poly() -> None:
     advice = advise(
         [evaluation("rigid", {10: 3.0, 20: 3.0}), evaluation("poly", {10: 8.0, 20: 2.4}),
          evaluation("kriging", {10: 2.0, 20: 2.0})]
@@ -139,7 +139,7 @@ def test_the_paper_s_other_methods_are_no_reason_to_use_neither_rigid_nor_poly()
     assert advice.groups == [SIMPLE, PAPER]
 
 
-def test_a_level_lab_is_judged_on_the_floor() -> None:
+def test_points_at_one_height_are_evaluated_in_2d() -> None:
     advice = advise([evaluation("rigid", {10: 3.0, 20: 3.0}, level=True)])
     assert advice is not None
     assert not advice.in_space

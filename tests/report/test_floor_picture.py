@@ -95,7 +95,7 @@ def messages(rig: Rig | None, moving: bool, truth: bool) -> list[Message]:
 
 @pytest.mark.parametrize("models", [(), MODELS[:1], MODELS[:2], MODELS])
 @pytest.mark.parametrize(("moving", "truth"), [(False, False), (True, False), (True, True)])
-def test_picture_is_drawn_whatever_there_is(
+def test_figure_is_drawn_for_all_kinds_of_data(
     models: tuple[str, ...], moving: bool, truth: bool, tmp_path: Path
 ) -> None:
     write_log(tmp_path / "lab.mcap", messages(RIG, moving, truth))

@@ -95,7 +95,7 @@ def test_the_page_in_a_browser(page: str, width: int, tmp_path: Path) -> None:
         assert words in seen.text, words
 
 
-def test_the_browser_would_see_what_a_page_must_not_do(tmp_path: Path) -> None:
+def test_browser_check_finds_forbidden_actions(tmp_path: Path) -> None:
     bad = visit(
         '<body><script>window.ran = true; console.error("boo")</script><img src="http://evil.example/x.png">'
         '<div style="width:700px">wide</div></body>',
@@ -159,7 +159,7 @@ def test_a_page_that_cannot_be_written_is_refused_beforehand(ipsys: Ipsys, tmp_p
     assert {path.name for path in tmp_path.iterdir()} == {"lab.mcap", "link.html"}
 
 
-def test_a_level_lab_with_one_camera_has_a_page(tmp_path: Path) -> None:
+def test_one_camera_and_one_height_give_a_report(tmp_path: Path) -> None:
     log = tmp_path / "level.mcap"
     write_log(log, lab_messages(heights=(0.1,), cameras=1))
     outcomes = replay([log], Request(models=("rigid",)), "evaluate")

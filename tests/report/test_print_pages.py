@@ -51,7 +51,7 @@ def sides_mm(corners_mm: NDArray[np.float64]) -> NDArray[np.float64]:
 @pytest.mark.parametrize(
     ("page", "size_mm"), [("a4", (210, 297)), ("letter", (215.9, 279.4)), ("a3", (297, 420))]
 )
-def test_markers_of_a_rig_have_their_sizes(
+def test_rig_markers_are_printed_at_their_size(
     ipsys: Ipsys, tmp_path: Path, page: str, size_mm: tuple[float, float]
 ) -> None:
     rig = tmp_path / "lab.toml"

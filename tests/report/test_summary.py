@@ -149,7 +149,7 @@ def test_single_model_has_one_row_per_camera(paper: Findings) -> None:
     assert {line.split()[0] for line in lines[-4:]} == {"red", "white", "black", "(all)"}
 
 
-def test_outliers_that_were_not_searched_are_not_none(paper: Findings) -> None:
+def test_missing_outlier_search_is_not_reported_as_none(paper: Findings) -> None:
     searched = printed([with_suspects(a, 0) for a in only(paper, "poly").accuracies])
     assert "Outliers: none." in searched
     unsearched = " ".join(printed(only(paper, "rigid").accuracies).split())

@@ -96,7 +96,7 @@ def test_the_commented_examples_of_init_hold_when_the_comments_go(tmp_path: Path
         ({"marker_length_m": 0.0}, "0.0 m is not a length"),
     ],
 )
-def test_a_rig_that_cannot_be_right_is_refused(change: dict[str, object], said: str) -> None:
+def test_impossible_rig_is_refused(change: dict[str, object], said: str) -> None:
     assert check_rig(RIG, "lab.toml") is RIG
     with pytest.raises(IpsysError, match=f"^lab.toml: .*{said}"):
         check_rig(replace(RIG, **change), "lab.toml")  # type: ignore[arg-type]
@@ -185,6 +185,6 @@ def test_the_floor_itself_is_a_height() -> None:
         ("usb:/dev/video0", "usb:/dev/video0"),
     ],
 )  # fmt: skip
-def test_a_password_is_hidden_and_nothing_else_is(address: str, shown: str) -> None:
+def test_only_the_password_is_hidden(address: str, shown: str) -> None:
     assert hide_password(address) == shown
     assert hide_password(shown) == shown

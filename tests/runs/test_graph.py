@@ -76,7 +76,7 @@ def test_channel_is_identified_by_topic_and_payload(
     assert channel_of(topic, payload) is channel
 
 
-def test_stages_until_are_those_that_are_needed() -> None:
+def test_stages_until_gives_the_needed_stages() -> None:
     assert names("detect") == ["detect"]
     assert names("locate") == ["detect", "camera-frame", "fit", "locate"]
     assert names("evaluate") == ["detect", "camera-frame", "fit", "evaluate"]

@@ -113,7 +113,7 @@ def test_run_of_last_log_is_newest_whatever_its_number(ipsys: Ipsys, paper: Path
     assert runs_of(ipsys, "replay", paper, high, low)["fuse"] == ("low", False)
 
 
-def test_a_run_holds_only_what_belongs_together(ipsys: Ipsys, paper: Path, tmp_path: Path) -> None:
+def test_run_contains_only_consistent_results(ipsys: Ipsys, paper: Path, tmp_path: Path) -> None:
     ipsys("replay", paper)
     renamed = runs_of(ipsys, "replay", paper, "--rig", robots(tmp_path, paper, "ada"))
     # Other robots change only fuse, which gets a new run ...
@@ -184,9 +184,7 @@ def test_seed_changes_only_the_folds_of_labelled_points(ipsys: Ipsys, paper: Pat
     assert sum(line.split()[:1] == ["red"] for line in done.out.splitlines()) == 1 + 4
 
 
-def test_a_model_is_known_by_what_it_is_and_not_by_its_file(
-    ipsys: Ipsys, paper: Path, tmp_path: Path
-) -> None:
+def test_model_is_identified_by_content_not_by_file(ipsys: Ipsys, paper: Path, tmp_path: Path) -> None:
     ipsys("replay", paper)
     copy = Path(shutil.copy(paper, tmp_path / "copy.mcap"))
     drive = without(paper, lambda m: m.topic.startswith("/runs/poly") or m.topic == "/measurements")
@@ -353,7 +351,7 @@ def test_rig_of_a_log_can_be_exported_edited_and_used(ipsys: Ipsys, paper: Path,
     assert lengths == [0.19]
 
 
-def test_the_rig_taken_out_says_what_a_camera_does_to_edges(ipsys: Ipsys, tmp_path: Path) -> None:
+def test_exported_rig_has_the_edge_offset(ipsys: Ipsys, tmp_path: Path) -> None:
     lab, path = tmp_path / "lab.mcap", tmp_path / "lab.toml"
     size = ("--width", 960, "--height", 540, "--stations", 9, "--drive-s", 0.5)
     assert ipsys("simulate", "-o", lab, *size, "--gamma", 2.2, "--markers", 6).code == 0

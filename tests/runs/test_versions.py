@@ -201,7 +201,7 @@ def test_verify_names_what_another_version_made_and_verifies_the_rest(
     assert "nothing of its runs can be verified" in done.err
 
 
-def test_versions_of_packages_make_nothing_out_of_date(
+def test_package_versions_do_not_outdate_runs(
     ipsys: Ipsys, log: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     monkeypatch.setattr(provenance, "_versions", lambda: (("ipsys_log", "99.0"), ("numpy", "99.0")))

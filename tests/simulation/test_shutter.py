@@ -117,7 +117,7 @@ def test_the_marker_below_the_frame_comes_in_while_it_is_taken(camera: Camera) -
 
 
 @pytest.mark.parametrize("shutter", SHUTTERS)
-def test_a_marker_that_stands_is_drawn_as_ever(camera: Camera, shutter: str) -> None:
+def test_stationary_marker_is_drawn_without_motion_blur(camera: Camera, shutter: str) -> None:
     placed = drive_past(MIDDLE, 0.0, 0.0)(0.0)
     before = expose(prepare_view(camera, STILL), [placed], STILL)
     view = prepare_view(camera, SHUTTERS[shutter])
@@ -154,7 +154,7 @@ def drive_of(settings: LabSettings) -> tuple[Drive, int, dict[str, Camera]]:
     return plan_drive(settings, cameras), drive_start_ns(settings, cameras), named
 
 
-def test_the_truth_is_that_of_the_time_of_the_frame(session: list[Message]) -> None:
+def test_ground_truth_has_the_time_of_the_frame(session: list[Message]) -> None:
     drive, start_ns, _ = drive_of(LAB)
     truth = [m.payload for m in session if isinstance(m.payload, Tracks)]
     driving = [tracks for tracks in truth if tracks.timestamp >= start_ns]
@@ -201,7 +201,7 @@ def test_corners_follow_the_exposure_time_of_their_row(
     assert rms["frame"] > 2
 
 
-def test_the_rig_says_the_row_time_and_nothing_where_there_is_none() -> None:
+def test_rig_has_the_row_time_or_no_entry() -> None:
     for settings, row_time_ns in ((LAB, 3 * ROW_NS), (replace(LAB, row_time_ns=0), None)):
         rig = next(simulate(settings)).payload
         assert isinstance(rig, Rig)

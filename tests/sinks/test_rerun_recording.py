@@ -291,7 +291,7 @@ def test_unseen_objects_disappear_from_the_view(saved: Path) -> None:
     assert rows(saved, "/cameras/red/image", "Clear:is_recursive")[0][0] == TIMES_NS[9] + 10**10
 
 
-def test_trail_has_a_way_for_each_step_and_none_over_the_silence(saved: Path) -> None:
+def test_trail_has_a_line_per_step_and_none_over_a_gap(saved: Path) -> None:
     drawn = rows(saved, "/world/runs/poly/trails", "LineStrips3D:strips")
     robot_0 = [(time_ns, strips[0]) for time_ns, _, strips in drawn if strips[0][0][1] == 2.0]
     assert [time_ns for time_ns, _ in robot_0] == TIMES_NS[1:10] + TIMES_NS[11:]
@@ -332,7 +332,7 @@ def test_log_with_nothing_to_show_is_refused(tmp_path: Path) -> None:
         write_recording(session, save=tmp_path / "out.rrd")
 
 
-def test_runs_named_bring_the_markers_they_rest_on(log: Path, tmp_path: Path) -> None:
+def test_named_runs_include_their_input_markers(log: Path, tmp_path: Path) -> None:
     with Session([log]) as session:
         shown = write_recording(session, ["stock"], tmp_path / "out.rrd")
         assert (shown.markers, shown.runs) == ("stock", ())

@@ -167,7 +167,7 @@ def test_corners_of_no_square_are_an_event(method: str) -> None:
 
 
 @pytest.mark.parametrize("method", METHODS)
-def test_a_covariance_that_is_none_is_named(method: str) -> None:
+def test_invalid_corner_covariance_is_reported(method: str) -> None:
     with pytest.raises(IpsysError, match="marker 3 of camera red: covariance_px2"):
         points(method, marker(3, covariance_px2=np.full((8, 8), np.nan)))
 

@@ -52,7 +52,7 @@ def covers(region: tuple[slice, slice] | None, corners_px: Array) -> bool:
 
 
 @pytest.mark.parametrize("place", [(320, 240), (41, 41), (599, 41), (41, 439), (599, 439), (333, 222)])
-def test_a_new_thing_is_noticed_where_it_is(watch: ChangeDetector, place: tuple[float, float]) -> None:
+def test_new_object_is_detected_at_its_position(watch: ChangeDetector, place: tuple[float, float]) -> None:
     there = square(*place)
     assert covers(watch.find_change(put(floor(), there), ALL, [], BREADTH_PX), there)
 
@@ -116,7 +116,7 @@ def test_slow_changes_of_light_are_no_alarm(watch: ChangeDetector) -> None:
         assert watch.find_change(floor() - np.uint8(level), ALL, [], BREADTH_PX) is None
 
 
-def test_rows_that_were_not_decoded_say_nothing(watch: ChangeDetector) -> None:
+def test_undecoded_rows_start_no_search(watch: ChangeDetector) -> None:
     """They still contain an older frame."""
     there = square(320, 100)
     picture = put(floor(), there)
@@ -132,7 +132,7 @@ def test_frames_of_another_size_begin_anew(watch: ChangeDetector, size: tuple[in
         assert watch.find_change(other, [slice(0, size[0])], [square(5, 5)], BREADTH_PX) is None
 
 
-def test_markers_outside_of_the_picture_are_no_trouble(watch: ChangeDetector) -> None:
+def test_markers_outside_the_image_are_ignored(watch: ChangeDetector) -> None:
     for place in ((-500, -500), (5000, 100), (320, -60), (-39, 479)):
         assert watch.find_change(floor(), ALL, [square(*place)], BREADTH_PX) is None
     assert (

@@ -115,7 +115,7 @@ ROLLING = LabSettings(
 
 
 @pytest.mark.slow
-def test_markers_behind_a_rolling_shutter_are_where_they_were_then() -> None:
+def test_rolling_shutter_markers_are_at_their_exposure_position() -> None:
     """Robots have 2 m/s and 1/60 s of motion blur; the speed is known from the third sighting."""
     cameras = mount_cameras(ROLLING)
     drive, start_ns = plan_drive(ROLLING, cameras), drive_start_ns(ROLLING, cameras)
@@ -307,12 +307,12 @@ def test_glare_on_a_marker_gives_no_wrong_one() -> None:
         pytest.param(Look(black=60, white=110, floor=90), 30, marks=pytest.mark.slow),
     ],
 )
-def test_corners_are_as_uncertain_as_they_say(look: Look, frames: int) -> None:
+def test_corner_covariance_is_consistent(look: Look, frames: int) -> None:
     score = strew(FISHEYE, look, frames, 6)
     assert 0.7 < np.mean(score.normalized) < 1.9, score
 
 
-def test_corners_that_are_blurred_are_as_uncertain_as_they_say() -> None:
+def test_covariance_of_blurred_corners_is_consistent() -> None:
     assert np.mean(strew(FISHEYE, Look(psf_px=1.6), 1, 5).normalized) < 3
 
 
@@ -368,7 +368,7 @@ def guess(one: Print, shift_px: tuple[float, float] = (0.0, 0.0), marker_id: int
 
 
 @pytest.mark.parametrize("shift_px", [(0.0, 0.0), (4.0, -3.0), (-5.0, 0.0), (3.0, 5.0)])
-def test_a_fit_finds_back(shift_px: tuple[float, float]) -> None:
+def test_fit_recovers_the_parameters(shift_px: tuple[float, float]) -> None:
     grey, one = still()
     (fit,) = fit_edges(grey, [guess(one, shift_px)], "DICT_4X4_100", VGA)
     assert fit is not None

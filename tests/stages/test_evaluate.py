@@ -54,7 +54,7 @@ def test_statistics_are_those_of_the_standard_library() -> None:
     assert (single.std_m, single.mean_low_m) == (None, None)
 
 
-def test_the_interval_of_the_mean_holds_it_as_often_as_it_says() -> None:
+def test_confidence_interval_contains_the_mean_at_its_rate() -> None:
     rng = np.random.default_rng(0)
     held = 0
     for _ in range(300):
@@ -177,7 +177,7 @@ def test_learning_curve_falls_with_more_points() -> None:
     assert all(p.std_3d_m is not None and p.subsets == 10 for p in curve)
 
 
-def test_published_subsets_are_fitted_and_looked_at_where_the_paper_does() -> None:
+def test_published_subsets_are_evaluated_as_in_the_paper() -> None:
     found, _, _ = lab(3, 30)
     cameras = gather_points({"red": found})
     names = [p.measurement for p in found]
@@ -189,7 +189,7 @@ def test_published_subsets_are_fitted_and_looked_at_where_the_paper_does() -> No
     assert labelled_subsets([]) == {}
 
 
-def test_the_covariance_is_of_errors_that_the_fit_has_not_seen() -> None:
+def test_covariance_is_for_held_out_errors() -> None:
     rng = np.random.default_rng(1)
     noisy = [
         Pair(p.measurement, 0, p.camera_m, p.world_m + rng.normal(0, 0.01, 3), 1) for p in pairs(np.zeros(3))
@@ -227,14 +227,14 @@ def regions(name: str, along: float, seeds: Sequence[int]) -> tuple[float, float
         pytest.param("best", 0.003, marks=pytest.mark.slow),
     ],
 )  # fmt: skip
-def test_covariances_hold_the_truth_as_often_as_they_say(name: str, along: float) -> None:
+def test_covariance_regions_contain_the_truth_at_their_rate(name: str, along: float) -> None:
     """All positions of a session share its tape errors, so the test needs many sessions."""
     within_68, within_95 = regions(name, along, range(40))
     assert 0.60 <= within_68 <= 0.76
     assert 0.90 <= within_95 <= 0.98
 
 
-def test_the_covariance_of_a_model_that_misfits_knows_most_of_it() -> None:
+def test_covariance_includes_most_of_a_model_misfit() -> None:
     """The remaining lens error of rigid is no noise: it is equal at near positions and not Gaussian."""
     within_68, within_95 = regions("rigid", 0.0004, range(40))
     assert 0.55 <= within_68 <= 0.76

@@ -143,7 +143,7 @@ def test_the_same_frames_give_the_same_markers(options: tuple[int, ...]) -> None
     assert same(feed(detect, mixed)[::2], alone)
 
 
-def test_a_calibration_that_says_the_same_changes_nothing() -> None:
+def test_equal_calibration_changes_nothing() -> None:
     """Recorders repeat the calibration regularly."""
     frames, detect = film(driven()), started()
     answers = []
@@ -412,7 +412,7 @@ def test_kinds_of_frames_may_take_turns() -> None:
     assert bytes(first.data) == before
 
 
-def test_a_corrupt_first_frame_costs_nothing_but_itself() -> None:
+def test_corrupt_first_frame_loses_only_itself() -> None:
     frames = film([with_marker()] * 4)
     broken = replace(frames[0], payload=replace(frames[0].payload, data=b"\xff\xd8 no picture"))
     answers = feed(started(), [broken, *frames[1:]])

@@ -103,7 +103,7 @@ def cameras_of(made: Iterable[Message]) -> list[tuple[str, ...]]:
     return [m.payload.tracks[0].cameras for m in made if isinstance(m.payload, Tracks)]
 
 
-def test_cameras_are_averaged_by_when_they_exposed_the_marker() -> None:
+def test_cameras_are_averaged_by_exposure_time() -> None:
     # The frames have one time, but the marker is in rows 20 ms apart.
     apart = fused(frame(0, "red", 25 * MS), frame(0, "white", 5 * MS))
     assert cameras_of(apart) == [("red",), ("white",)]
@@ -149,7 +149,7 @@ def drive_error_m(log: Path, rig: Rig | None) -> float:
     return found[0].mean_m
 
 
-def test_a_rig_that_says_the_row_time_puts_a_driving_robot_where_it_is(rolling: Path) -> None:
+def test_row_time_of_the_rig_corrects_a_moving_robot(rolling: Path) -> None:
     with Session([rolling]) as session:
         (rig,) = session.payloads([RIG_TOPIC])
     said_m = drive_error_m(rolling, None)

@@ -63,7 +63,7 @@ def test_a_marker_that_has_not_moved_since_it_was_measured() -> None:
     assert lab.check(BETTER).warnings == ()
 
 
-def test_a_marker_that_was_moved_on_by_a_little() -> None:
+def test_slightly_moved_marker_is_a_new_point() -> None:
     lab = Lab()
     lab.show(2, 0.1)
     lab.save(PLACE)

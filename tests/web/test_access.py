@@ -112,7 +112,7 @@ def test_cookies_of_other_programs_do_not_block_access(shared: Caller) -> None:
         assert shared.ask("GET", "/api/scene", Cookie=header)[0] == 403, header
 
 
-def test_a_name_that_leads_here_from_elsewhere_is_refused(here: Caller, shared: Caller) -> None:
+def test_foreign_host_name_is_refused(here: Caller, shared: Caller) -> None:
     for caller in (here, shared):
         path = f"/?token={caller.token}"
         for host in (
@@ -173,7 +173,7 @@ def test_request_beyond_all_bounds_gets_no_server_error(
     assert "Traceback" not in capfd.readouterr().err
 
 
-def test_a_warning_has_to_be_seen_before_it_is_passed_over(here: Caller, scene: Recording) -> None:
+def test_unseen_warning_blocks_saving(here: Caller, scene: Recording) -> None:
     flat = {**PLACE, "distances": {"A": "330", "B": "87"}}
     status, text, _ = here.ask("POST", "/api/measure", flat, X_Ipsys="1")
     assert status == 409, text

@@ -189,7 +189,7 @@ def answers(caller: Caller) -> bool:
         return False
 
 
-def test_answers_that_are_not_read_make_room_in_time() -> None:
+def test_unread_answers_are_closed_in_time() -> None:
     scene = Recording()
     scene.views = lambda interval: [CameraView("red", 1, bytes(8 << 20))]  # type: ignore[method-assign]
     with page_with(Limits(total=6, per_address=4, request_s=0.5), scene) as (caller, page):
@@ -247,7 +247,7 @@ def test_faults_are_printed_when_the_command_ends(capsys: pytest.CaptureFixture[
     assert said.rstrip().endswith("ZeroDivisionError: [first]")
 
 
-def test_end_of_the_server_leaves_the_block_going(
+def test_end_of_the_server_does_not_end_the_block(
     monkeypatch: pytest.MonkeyPatch, capfd: pytest.CaptureFixture[str]
 ) -> None:
     is_broken = threading.Event()

@@ -143,7 +143,7 @@ def other_program() -> Iterator[str]:
         server.shutdown()
 
 
-def test_cookie_of_another_program_locks_no_phone_out(browser: Phone) -> None:
+def test_cookie_of_another_program_does_not_block_a_phone(browser: Phone) -> None:
     with other_program() as other, serve(Recording(), "127.0.0.1", 0) as page:
         browser.open(other)
         browser.open(page.url)

@@ -39,7 +39,7 @@ HEIGHTS = (0.0, 0.05, 0.1, 0.15, 0.2)
 class Camera:
     """A camera at ``origin_m`` that looks down, with small errors of intrinsics and depths.
 
-    ``along`` and ``across`` are the noise of a depth (relative) and of (u, v), in the middle of the image.
+    ``along`` and ``across`` are the noise of a depth (relative) and of (u, v), at the principal point.
     """
 
     origin_m: Array
@@ -126,11 +126,10 @@ def session(
     distances: bool = False,
     labels: Callable[[int], tuple[str, ...]] = lambda n: (),
 ) -> Iterator[Message]:
-    """Write a log of calibration points at one point per second, with the camera points of each camera (NaN.
+    """Write a log of calibration points at one point per second.
 
-    Not seen). With ``distances``, a point has tape distances to A and B, otherwise a world point.
-
-    With ``distances`` a place is measured by the tape to A and B, else its world point is given.
+    The log has the camera points of each camera (NaN if not seen). With ``distances``, a point has tape
+    distances to A and B, otherwise a world point.
     """
     start_ns = 1_700_000_000 * NS_PER_S
     yield Message(RIG_TOPIC, start_ns, start_ns, rig)

@@ -31,8 +31,6 @@ def playing(
     """An opener of cameras that send their frames once, in real time; ``before`` is called before each frame.
 
     All cameras send the frames of one number at one time.
-
-    Frames of one number are sent at one time by all cameras, as of one world.
     """
     starts_s: dict[str, float] = {}
 
@@ -58,11 +56,7 @@ class SteppedClock(Clock):
     """A clock that advances with the frames: a busy machine skips no frame, and stamps are exact.
 
     Give ``before`` to `playing`, with an infinite rate, and ``watch`` to the observer of the frames. Frame
-    n is sent after all cameras' frames n - 1 were observed; the time is then n / ``rate_hz`` after the
-    start.
-
-    Give ``before`` to `playing`, with an infinite rate, and ``watch`` to what looks at the frames. Frame n is
-    sent when all cameras' frames n - 1 were looked at; the time is then n / ``rate_hz`` after the start.
+    n is sent after all frames n - 1 were observed. The time is then n / ``rate_hz`` after the start.
     """
 
     def __init__(self, names: Sequence[str], rate_hz: float) -> None:

@@ -128,8 +128,8 @@ def _floor_lines(coverage: Coverage) -> list[tuple[str, bool]]:
     return [
         _patch_line(coverage.unseen, floor_m2, "every part of the floor is in an image", "in no image"),
         _patch_line(
-            coverage.gaps, floor_m2, f"the whole of {size} is in an image at every position",
-            f"the whole of {size} is in no image with its centre on",
+            coverage.gaps, floor_m2, f"an image shows all of {size} at every position",
+            f"no image shows all of {size} with its centre on",
         ),
     ]  # fmt: skip
 
@@ -156,7 +156,7 @@ def _overlap_line(overlap: Overlap, diagonal_m: float, placed: bool) -> tuple[st
     fault = (
         f"overlap by only {width_cm:.0f} cm" if overlap.width_m > 0 else f"leave a gap of {-width_cm:.0f} cm"
     )
-    end = "the whole of a marker between the two images is in neither of them"
+    end = "neither image shows all of a marker between them"
     position = f", at x {x_m:.2f}, y {y_m:.2f}" if placed else ""
     return f"{names} {fault}{position}: {needed}; {end}", False
 

@@ -35,7 +35,7 @@ def test_two_cameras_that_look_straight_down(apart_m: float, width_m: float) -> 
     assert overlap.at_m[1] == pytest.approx(1.5, abs=0.02)
     diagonal_m = 0.2 * np.sqrt(2)
     assert found.diagonal_m == pytest.approx(diagonal_m)
-    # A strip at the centre is not visible, nor are both ends of the floor.
+    # A strip at the centre and both ends of the floor are not visible.
     strip_m = max(0.0, diagonal_m - width_m)
     middle = [patch for patch in found.gaps if abs((patch.low_m + patch.high_m)[1] / 2 - 1.5) < 0.1]
     assert [patch.area_m2 for patch in middle] == (

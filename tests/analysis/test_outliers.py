@@ -61,7 +61,7 @@ def read_tape(point: Array, rng: np.random.Generator, sigma_m: float, rig: Rig =
 def simulated(seed: int, count: int = 50, shared: bool = False, rig: Rig = RIG) -> Session:
     """Return a session of three cameras 2.1 m above a floor, each with about ``count`` points.
 
-    The noise is 1 cm along the view and 2.5 mm across it, and grows to the rim. The tape has 3 mm, the
+    The noise is 1 cm along the view and 2.5 mm across it, and grows to the rim. The tape has 3 mm sigma, the
     ruler 1 mm. ``shared`` points count for each camera that sees them.
     """
     rng = np.random.default_rng(seed)

@@ -164,8 +164,6 @@ def striped_pattern(
 
     The stripes have the grey levels of the squares, are ``stripe`` squares wide, and are shifted by
     ``phase``.
-
-    The stripes are as dark and light as the squares, ``stripe`` squares wide and shifted by ``phase``.
     """
     board = chessboard_pattern(columns, rows, square_m)
 

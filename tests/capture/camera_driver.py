@@ -1,7 +1,7 @@
-"""A driver for Video for Linux without a camera.
+"""A driver for Video for Linux without a camera. It replaces the kernel.
 
-It stands where the kernel does: it takes the requests of ``ioctl`` on an open file and answers as the
-kernel's documentation has it. The file is a real one, so that its buffers are mapped as those of a device.
+It answers the requests of ``ioctl`` on an open file according to the documentation of the kernel. The file
+is real, so that its buffers are mapped like those of a device.
 """
 
 from __future__ import annotations

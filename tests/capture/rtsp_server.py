@@ -1,10 +1,10 @@
-"""An RTSP server: a program for Debian's own Python, with GStreamer's library that cameras use too.
+"""An RTSP server for Debian's own Python, with the library of GStreamer.
 
     /usr/bin/python3 rtsp_server.py VIDEO PAYLOADER PROTOCOL AUTHENTICATION
 
-VIDEO is a file of MP4's kind, sent once to each client, PAYLOADER what makes packets of its frames. PROTOCOL
-is ``tcp`` or ``udp``, AUTHENTICATION ``none``, ``basic`` or ``digest`` (admin, hush).
-It prints the port it listens at.
+VIDEO is an MP4 file, sent once to each client. PAYLOADER is the element that makes packets of its frames.
+PROTOCOL is ``tcp`` or ``udp``. AUTHENTICATION is ``none``, ``basic`` or ``digest`` (admin, hush). The server
+prints its port.
 """
 
 from __future__ import annotations

@@ -82,10 +82,10 @@ def _await_listening(port: int) -> None:
 
 @contextmanager
 def serve_rtsp(video: Path, clock_shift_s: float = 0.0) -> Iterator[str]:
-    """The address of a video as an RTSP stream; the server's clock may be off.
+    """Return the address of a video as an RTSP stream; the clock of the server may have an error.
 
-    FFmpeg makes the packets and the reports of the clock (RTP and RTCP); they go to the client within its
-    TCP connection, as RFC 2326 (10.12) has it.
+    FFmpeg makes the packets and the clock reports (RTP and RTCP). The server sends them in the TCP
+    connection of the client, as in RFC 2326 (10.12).
     """
     with _bound() as rtp, _bound() as rtcp:
         sdp = video.with_suffix(".sdp")

@@ -1,4 +1,4 @@
-"""The size of a recording and the duration of the disk space, before and during a recording."""
+"""The size of a recording, and the time until the disk is full, before and during a recording."""
 
 from __future__ import annotations
 
@@ -94,7 +94,7 @@ def test_small_disk_is_warned_of_before_the_start(
         assert "to make it smaller: a lower rate_hz in lab.toml (15 halves it)" in said
         with opening(rig, disk / "b.mcap", 1.0):
             assert re.search(r"MB in 1 s; .*: enough for 2 s", capsys.readouterr().err)
-        # Cameras are only shown, so a message appears only if even that does not fit.
+        # The cameras are only previewed: a message appears only if the disk is too small even for that.
         with opening(rig, disk / "c.mcap", 1.0, "looking for 1 s"):
             assert "free in" not in capsys.readouterr().err
         with opening(rig, disk / "d.mcap", 60.0, "looking for 60 s"):

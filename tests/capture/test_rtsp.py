@@ -1,4 +1,4 @@
-"""Cameras by RTSP from GStreamer's server, which is independent software as in real cameras."""
+"""Cameras by RTSP from the server of GStreamer, as independent software."""
 
 from __future__ import annotations
 

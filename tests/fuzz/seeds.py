@@ -96,7 +96,10 @@ def payloads() -> tuple[tuple[str, object], ...]:
 
 @cache
 def logs() -> tuple[bytes, ...]:
-    """Return logs with and without checksums, indexes and compression; without, damage has more effect."""
+    """Return logs with and without checksums, indexes and compression.
+
+    Damage has more effect without these.
+    """
     with TemporaryDirectory() as folder:
         path = Path(folder) / "a.mcap"
         with LogWriter.create(path) as log:

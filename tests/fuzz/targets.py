@@ -1,6 +1,6 @@
 """The readers of untrusted data. For damaged input, they may only raise an `IpsysError`.
 
-Nothing is written where input is refused, and no input takes more than a few seconds of the processor.
+If a reader refuses its input, it writes nothing. No input takes more than a few seconds of the processor.
 """
 
 from __future__ import annotations

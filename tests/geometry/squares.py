@@ -50,8 +50,6 @@ def random_poses(
     """Return markers all over the image, with tilts of 0 to 5 degrees and a camera tilt of 0.5 to 2 degrees.
 
     The result has axes (n, 3, 3), centres (n, 3) in m and corners (n, 4, 2) in px.
-
-    Axes (n, 3, 3), centres (n, 3) in m, corners (n, 4, 2) in px.
     """
     found: list[tuple[Array, Array, Array]] = []
     while len(found) < count:

@@ -132,11 +132,9 @@ class Filmed:
         self.truth_px = corners_px(VGA, self.marker)
 
     def after(self, damaged: bytes, frames: int) -> Array | None:
-        """Return the corners in a damaged frame after other frames.
+        """Return the corners in a damaged frame after other frames. None means a lost marker.
 
-        None means a lost marker, and FrameError or SizeError detected damage.
-
-        FrameError, SizeError: it is known to be damaged.
+        FrameError and SizeError mean detected damage.
         """
         follow = MarkerTracker("DICT_4X4_100", VGA, None, 0.0)
         for n in range(frames):

@@ -59,7 +59,7 @@ QUICK = cast(Storage, NoSync())
 class Sample:
     """A log, and for each message the record that contains it and the definitions of its channel.
 
-    `checked` says that each message is covered by the CRC of its chunk.
+    If `checked` is true, the CRC of its chunk covers each message.
     """
 
     name: str

@@ -213,7 +213,7 @@ def test_indexed_log_with_a_refused_chunk_still_shows_its_contents(tmp_path: Pat
 
 
 def test_densest_log_that_we_write_is_read_and_whole(tmp_path: Path) -> None:
-    """The log has minutes of empty frames, and zero parameters of a model."""
+    """The log has minutes of empty frames, and parameters of one model that are all zeros."""
     path = tmp_path / "dense.mcap"
     nothing = encode(Markers(0, (), 960, 540))
     with LogWriter.create(path) as log:

@@ -1,4 +1,4 @@
-"""Natural damage: what is undamaged survives, three readers agree, and a second repair changes nothing.
+"""Natural damage: all undamaged messages survive, three readers agree, and a second repair changes nothing.
 
 ``IPSYS_DAMAGE_CASES=20000 IPSYS_DAMAGE_SEED=3`` make the slow test longer, and other; `tests.log.damage` is
 the same as a script.

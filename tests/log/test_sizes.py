@@ -62,7 +62,7 @@ def test_foreign_logs(rows: list[Row], compression: CompressionType, chunk_size:
 
 
 def check(path: Path, rows: list[Row]) -> None:
-    """Read all topics, and each topic alone: other messages are between its own then."""
+    """Read all topics, and each topic alone, with messages of other topics between its own."""
     with LogReader(path) as reader:
         got = [as_row(message) for message in reader.messages()]
         assert sorted(got) == sorted(rows)

@@ -66,7 +66,7 @@ def find(path: Path, models: Sequence[str]) -> Findings:
 
 
 def many_models(accuracies: Sequence[Accuracy]) -> list[Accuracy]:
-    """Return the largest number of evaluations, made from a few with new names and scaled errors."""
+    """Return as many evaluations as possible, derived from a few: new names, scaled errors."""
     known = {accuracy.model: accuracy for accuracy in accuracies}
     found = []
     for number, model in enumerate(ALL_MODELS):

@@ -103,7 +103,7 @@ def test_only_available_data_are_drawn(tmp_path: Path) -> None:
 
 def texts_of(figure: Figure) -> dict[Text, tuple[float, float, float, float]]:
     """Return each visible text and its box in the figure."""
-    png(figure, 100)  # ticks have their texts only when drawn
+    png(figure, 100)  # the ticks get their texts during the drawing
     hidden = _hidden_ticks(figure)
     boxes = {}
     for text in figure.findobj(Text):

@@ -29,8 +29,6 @@ class AllowList:
     """Allowed differences by case and place: a topic, a JSON path, a file name, or ``order`` and others.
 
     Both are shell patterns: ``*`` stands for any text, ``?`` for any character.
-
-    Both are patterns as of a shell: ``*`` stands for any text, ``?`` for any character.
     """
 
     path: Path | None = None
@@ -43,9 +41,9 @@ class AllowList:
         Raises
         ------
         AllowListError
-            For a line without a reason.
+            A line has no reason.
         OSError
-            Where the file cannot be read.
+            The file cannot be read.
         """
         allowed = cls(path)
         for number, text in enumerate(path.read_text(encoding="utf-8").splitlines(), start=1):

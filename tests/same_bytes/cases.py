@@ -1,7 +1,7 @@
 """The table of cases: typed commands and their input files.
 
-A case runs in a folder of its own with copies of its inputs. All files in the folder are compared afterwards,
-and so is what each command with ``--json`` prints.
+A case runs in a separate folder with copies of its inputs. Afterwards, all files in the folder and the
+output of each command with ``--json`` are compared.
 """
 
 from __future__ import annotations

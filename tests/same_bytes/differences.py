@@ -89,7 +89,7 @@ def read_log(path: Path) -> Log:
     Raises
     ------
     McapError
-        For a file that is no complete log.
+        The file is no complete log.
     """
     schemas: dict[int, Schema] = {}
     channels: dict[int, Channel] = {}
@@ -114,8 +114,8 @@ def compare_logs(old: Path, new: Path, messages_only: bool = False) -> list[Diff
 
     Parameters
     ----------
-    messages_only : compare the messages of each topic in the order of their log times, not how the file holds
-        them: where several threads write, neither the order between topics nor the chunks are determined.
+    messages_only : compare the messages of each topic in the order of their log times, not in file order:
+        with several writing threads, the order between topics and the chunks are random.
     """
     if old.read_bytes() == new.read_bytes():
         return []
@@ -151,7 +151,7 @@ def _compare_topic(
     old_schema: Definition | None,
     new_schema: Definition | None,
 ) -> tuple[Entry, Difference]:
-    """Return the first message of a topic that differs, and what differs."""
+    """Return the first different message of a topic, and the difference."""
     if not old or not new:
         side, entries = ("new", new) if new else ("old", old)
         text = f"only in the {side} log, {_count(len(entries))}; first at {entries[0].log_time_ns}"

@@ -1,7 +1,7 @@
 """Run the cases with the code of one commit: ``python -P driver.py PLAN``, with PYTHONPATH at its work tree.
 
-This program imports nothing of the project. It only uses what does not change in a rebuild: ``python -m
-ipsys_log`` with the names of commands and options. Each command runs in a process that is forked from this
+This program imports nothing of the project. It uses only stable names: ``python -m ipsys_log``
+with commands and options. Each command runs in a process that is forked from this
 one. There the libraries are imported already, and the project is not.
 """
 

@@ -68,9 +68,9 @@ class Inputs:
         Raises
         ------
         MissingInputError
-            For what is not at hand.
+            An input is missing.
         UnmadeInputError
-            For what the old commit fails to make.
+            The old commit cannot make an input.
         """
         for name in names:
             if not (self.folder / name).exists():

@@ -8,8 +8,9 @@ Each commit gets a temporary git work tree and a process that runs the same comm
 virtual environment. The tool compares the files that the commands write, their --json output and their exit
 codes. It does not compare texts on the screen.
 
-Logs must be equal byte for byte. Recordings have several writing threads: of them the messages of each topic
-must be equal, in the order of their log times. New keys in JSON are no difference; the report lists them.
+Logs must be equal byte for byte. Recordings have several writing threads, so only the messages of each
+topic must be equal, in the order of their log times. New keys in JSON are no difference; the report lists
+them.
 
 A line of the allow file is CASE PLACE REASON. CASE and PLACE are patterns of a shell (* is any text). PLACE
 is a topic, a path in JSON such as stages.3.run, the name of another file, exit-code, or for a whole log:
@@ -222,7 +223,7 @@ def _details(result: CaseResult) -> Iterator[str]:
 
 
 def _first_of_each_file(differences: Sequence[Difference]) -> list[Difference]:
-    """Order the differences.
+    """Return the differences in order: the first of each file, then the second of each.
 
     The first of each file, then the second of each, so that no file hides the others.
     """

@@ -65,8 +65,6 @@ def edge_errors(view: View, placed: PlacedMarker, settings: LabSettings) -> Arra
     """Return the errors in px of the drawn sides of the black square, by pixel row.
 
     The sum of the light along a line across an edge gives the position of the edge, for any blur.
-
-    The light along a line across an edge, added up, tells where the edge is, whatever the blur.
     """
     image = expose(view, [placed], settings).astype(np.float64)
     camera_from_marker = view.camera.camera_from_world @ placed.world_from_marker

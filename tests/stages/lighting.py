@@ -38,7 +38,7 @@ def lit_frame(
     length_m: float = 0.2,
     count: int = 5,
 ) -> tuple[bytes, dict[int, Array]]:
-    """Return a JPEG of markers at random places in a light, and their corners in px by id."""
+    """Return a JPEG of markers at random positions with a given lighting, and their corners in px by id."""
     rng, look = np.random.default_rng(seed), Look(seed=seed)
     prints = strewn(lens, count, rng, look, length_m=length_m)
     glare, shade = np.zeros((lens.height, lens.width)), np.ones((lens.height, lens.width))
@@ -80,7 +80,7 @@ def spots(level: float, breadth: float, where: str) -> Light:
 
 
 def streak(level: float, breadth: float, outside: float = 0.0) -> Light:
-    """Return glare along a whole side, as of a tube lamp, or beside the side by a share of it."""
+    """Return glare along a whole side, as of a tube lamp, or at a given distance from the side."""
 
     def light(lens: CameraCalibration, one: Print, rng: np.random.Generator) -> tuple[Array, float]:
         k = int(rng.integers(4))
@@ -132,7 +132,7 @@ def _side_px(lens: CameraCalibration, one: Print) -> float:
 
 @dataclass(frozen=True)
 class Scene:
-    """A light, and the allowed corner error in it in px (RMS)."""
+    """A lighting, and its allowed corner error in px (RMS)."""
 
     light: Light
     rms_px: float = 0.1

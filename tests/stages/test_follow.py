@@ -163,7 +163,7 @@ def test_markers_are_followed_as_well_as_they_are_found() -> None:
         assert off_px(alone, one) < 0.12
 
 
-# --- what cannot be decoded ---------------------------------------------------------------------
+# --- undecodable frames -------------------------------------------------------------------------
 
 
 DAMAGES: dict[str, Callable[[bytes], bytes]] = {
@@ -192,7 +192,7 @@ def markers_or_event(made: list[Any]) -> bool:
     return isinstance(made[0], Markers) and off_px(made, lying(5, 330, 240)) < 0.1
 
 
-# --- what comes and goes ------------------------------------------------------------------------
+# --- new and lost markers -----------------------------------------------------------------------
 
 
 @pytest.mark.parametrize("options", [(), RESTARTS], ids=["plain", "restarts"])

@@ -126,7 +126,7 @@ def test_only_markers_that_are_not_in_the_rig(ipsys: Ipsys, lab: Path) -> None:
     assert "[[markers]]" in line
 
 
-def test_some_markers_that_are_not_in_the_rig_are_left_out_and_named(ipsys: Ipsys, lab: Path) -> None:
+def test_unknown_markers_are_excluded_and_named(ipsys: Ipsys, lab: Path) -> None:
     def smaller_rig(message: Message) -> Message:
         if isinstance(message.payload, Rig):
             kept = tuple(marker for marker in message.payload.markers if marker.id != 5)

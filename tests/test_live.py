@@ -259,7 +259,7 @@ def test_models_and_evaluations_are_computed_again(lab_log: Path, calibration: P
     assert [topic for topic, equal in found.items() if not equal] == ["/runs/poly/evaluation"]
 
 
-def test_robots_that_were_renamed_are_verified_with_their_own_rig(
+def test_renamed_robots_are_verified_with_their_rig(
     recorded: Path, calibration: Path, tmp_path: Path
 ) -> None:
     other = tmp_path / "renamed.mcap"
@@ -452,7 +452,7 @@ def overloaded(lab_log: Path, calibration: Path, tmp_path: Path, monkeypatch: py
     return target
 
 
-def test_a_slow_machine_skips_frames_after_recording_them_and_says_which(
+def test_slow_machine_records_and_names_skipped_frames(
     overloaded: Path, lab_log: Path, calibration: Path
 ) -> None:
     with Session([overloaded]) as session, Session([lab_log]) as sent:
@@ -498,9 +498,7 @@ def _copied(log: Path) -> Iterator[Message]:
         yield from session.messages({t for reader in session.readers for t in reader.channels})
 
 
-def test_a_recording_without_stages_is_detected_later_all_the_same(
-    lab_log: Path, recorded: Path, tmp_path: Path
-) -> None:
+def test_recording_without_stages_is_detected_later(lab_log: Path, recorded: Path, tmp_path: Path) -> None:
     target = tmp_path / "plain.mcap"
     attached, settings = attached_to(lab_log, 60.0)
     with attached:

@@ -83,7 +83,7 @@ def slow_decoding(patch: pytest.MonkeyPatch) -> None:
 @pytest.mark.parametrize(
     ("codec", "machine"), [(H264, slow_search), (H265, slow_search), (H264, slow_decoding)]
 )
-def test_a_slow_machine_skips_frames_of_a_video_and_a_replay_gives_the_same(
+def test_skipped_video_frames_are_equal_in_a_replay(
     codec: tuple[str, ...],
     machine: Callable[[pytest.MonkeyPatch], None],
     lab_log: Path,

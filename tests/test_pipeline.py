@@ -116,7 +116,7 @@ def test_threads_change_the_speed_and_not_the_order() -> None:
     assert threaded == plain
 
 
-def test_a_stage_across_cameras_takes_one_message_after_the_other() -> None:
+def test_stage_across_cameras_gets_messages_in_order() -> None:
     order: list[int] = []
 
     def across(message: Message) -> Iterator[Any]:
@@ -176,9 +176,7 @@ def test_a_second_model_shares_the_detection(ipsys: Ipsys, lab: Path) -> None:
     assert stages["fuse"] == ("rigid_poly", True)
 
 
-def test_replay_in_place_and_into_a_new_log_give_the_same_messages(
-    ipsys: Ipsys, lab: Path, tmp_path: Path
-) -> None:
+def test_replay_in_place_equals_replay_into_a_new_log(ipsys: Ipsys, lab: Path, tmp_path: Path) -> None:
     beside, before = tmp_path / "derived.mcap", lab.read_bytes()
     assert ipsys("replay", lab, "-o", beside).code == 0
     assert lab.read_bytes() == before

@@ -108,7 +108,7 @@ def test_frames_are_recorded_as_they_came_for_so_many_seconds(
     }
 
 
-def test_a_password_is_neither_shown_nor_recorded_and_asked_for_when_it_is_missing(
+def test_password_is_asked_for_and_never_shown_or_recorded(
     ipsys: Ipsys, pictures: tuple[Path, list[bytes]], tmp_path: Path
 ) -> None:
     log = tmp_path / "a.mcap"
@@ -433,7 +433,7 @@ def test_a_rig_that_cannot_be_recorded(ipsys: Ipsys, tmp_path: Path, cameras: st
     assert not (tmp_path / "a.mcap").exists()
 
 
-def test_a_calibration_of_another_shape_is_refused_and_of_another_size_is_scaled(
+def test_calibration_is_scaled_to_another_size_of_the_same_shape(
     ipsys: Ipsys, pictures: tuple[Path, list[bytes]], tmp_path: Path
 ) -> None:
     def lens(width: int, height: int) -> Path:

@@ -93,7 +93,7 @@ def test_repeated_reference_point_still_names_the_line() -> None:
     assert "the distance to B" not in " ".join(slip.text for slip in slips(twice) if slip.kind == "distance")
 
 
-def test_a_world_point_alone_is_measured_from_the_first_two_reference_points() -> None:
+def test_world_point_uses_the_first_two_reference_points() -> None:
     x, y, z = TRUE.tolist()
     given_point = Measurement(0, "a", marker_id=0, point=WorldPoint(x, -y, z))
     found = slips(given_point)

@@ -68,7 +68,7 @@ def whole(camera: Camera, places_m: Array, length_m: float) -> NDArray[np.bool_]
     return found
 
 
-def test_a_fisheye_that_is_tilted_against_every_corner_of_a_marker() -> None:
+def test_tilted_fisheye_coverage_equals_a_corner_test() -> None:
     lab = LabSettings(cameras=("red",), tilt_deg=(4.0, 6.0), mount_height_m=2.4)
     (camera,) = mount_cameras(lab)
     hung = MountedCamera("red", camera.lens, camera.camera_from_world)

@@ -299,7 +299,7 @@ def test_unexplained_outlier_has_no_kind() -> None:
     assert (suspect.measurement, suspect.kind, suspect.text, suspect.corrected_m) == (name, None, None, None)
 
 
-def test_a_flat_crossing_excuses_an_error() -> None:
+def test_flat_crossing_explains_an_error() -> None:
     session, planted = plant(simulated(9), ["A long"], 9)
     (name,) = planted
     careless = replace(
@@ -310,7 +310,7 @@ def test_a_flat_crossing_excuses_an_error() -> None:
     assert suspects_of(session.replaced(careless)) == ()
 
 
-def test_a_flat_crossing_excuses_an_error_with_a_usual_tape_where_none_is_named() -> None:
+def test_flat_crossing_with_a_usual_tape_explains_an_error() -> None:
     session = simulated(16, rig=replace(RIG, tape_sigma_m=None))
     name = next(n for n in session.points["white"])
     point = np.array([2.4384, A.y_m + 0.10, 0.0])

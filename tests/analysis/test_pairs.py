@@ -76,7 +76,7 @@ def late(*rows: tuple[int, int | None, float]) -> list[Message]:
     ]
 
 
-def test_a_sighting_is_of_the_time_at_which_the_marker_was_exposed() -> None:
+def test_sighting_has_the_exposure_time_of_the_marker() -> None:
     sightings = gather_sightings(late((0, 30 * MS, 0.1), (1, None, 0.3), (1, -10 * MS, 0.2)))["red", 0]
     assert sightings.times_ns.tolist() == [0.03 * S, 0.99 * S, S]
     assert sightings.points_m[:, 0].tolist() == [0.1, 0.2, 0.3]

@@ -61,7 +61,7 @@ def test_three_distances_need_no_side_and_check_one_another() -> None:
     assert np.abs(residuals_m).max() > 0.01
 
 
-def test_the_covariance_follows_from_the_sigmas_nearest_to_the_reading() -> None:
+def test_covariance_uses_the_sigmas_of_the_measurement_first() -> None:
     named = world_point(measurement("A", "B", sigma_m=0.006), RIG).covariance_m2
     from_rig = world_point(measurement("A", "B"), RIG).covariance_m2
     assert named is not None
@@ -97,7 +97,7 @@ def test_the_covariance_is_that_of_tapes_read_again_and_again() -> None:
     np.testing.assert_allclose(root @ sample @ root.T, np.eye(3), atol=0.12)
 
 
-def test_a_given_point_has_a_covariance_where_it_came_with_distances() -> None:
+def test_world_point_with_distances_has_a_covariance() -> None:
     given_point = WorldPoint(2.0, 3.5, 0.1)
     alone = world_point(Measurement(0, "a", point=given_point), RIG)
     assert alone.world_m.tolist() == [2.0, 3.5, 0.1]

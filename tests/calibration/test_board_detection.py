@@ -118,7 +118,7 @@ def test_an_inverted_board() -> None:
     assert len(sighting.ids) == 12
 
 
-def test_a_large_picture_is_searched_at_half_its_size_and_refined_at_its_own() -> None:
+def test_large_image_is_searched_at_half_size() -> None:
     picture, truth = drawn(CHESSBOARD, 1, 0.7)
     large = np.asarray(cv2.resize(picture, None, fx=3, fy=3, interpolation=cv2.INTER_CUBIC), dtype=np.uint8)
     sighting = find_board("a", large, CHESSBOARD, thorough=False)
@@ -162,7 +162,7 @@ def sighting(name: str, x: float, y: float, blur_px: float = 0.8, count: int = 2
     return BoardSighting(name, ids, pixels, blur_px, outline)
 
 
-def test_blurred_pictures_and_those_with_few_corners_are_dropped_with_the_reason() -> None:
+def test_blurred_images_and_few_corners_are_dropped_with_a_reason() -> None:
     seen = [sighting(str(n), 30 * n, 10) for n in range(10)]
     seen += [sighting("shaken", 100, 200, blur_px=3.5), sighting("half", 200, 200, count=4)]
     seen += [sighting("row", 300, 200, count=6)]
@@ -207,7 +207,7 @@ def test_impossible_boards_are_refused(text: str, said: str) -> None:
         parse_board(text, 0.03, 0.75, "DICT_4X4_50", False)
 
 
-def test_a_chessboard_that_was_taken_for_a_charuco_board_is_named_while_others_are_tried() -> None:
+def test_chessboard_instead_of_charuco_is_reported() -> None:
     pictures = [(f"{seed}", drawn(CHESSBOARD, seed, 1.0)[0]) for seed in range(3)]
     tried: list[tuple[int, int]] = []
     with pytest.raises(IpsysError, match="but a chessboard of 6 x 4 inner corners is seen in 3 of 3 tried"):

@@ -122,7 +122,7 @@ def test_charuco_of_right_size_is_accepted() -> None:
     assert len(seen(charuco(5, 7), "charuco:5x7").sightings) == 4
 
 
-def test_pictures_without_the_board_are_named_with_what_they_show() -> None:
+def test_images_without_the_board_are_named_with_a_reason() -> None:
     pictures = [*plain(8, 6), np.full((400, 640), 90, np.uint8), plain(6, 5)[0]]
     looked = seen(pictures, "8x6")
     assert looked.unseen == (

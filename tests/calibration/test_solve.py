@@ -122,7 +122,7 @@ def within(found: SolveResult, name: str) -> bool:
 
 
 @pytest.mark.parametrize("focal_px", [90.0, 185.0, 400.0])
-def test_a_fisheye_of_any_focal_length_is_found_without_being_told(focal_px: float) -> None:
+def test_fisheye_needs_no_initial_focal_length(focal_px: float) -> None:
     lens = (focal_px, focal_px, *TRUTH["fisheye"][2:])
     corners = seen("fisheye", np.random.default_rng(1), pictures=15, lens=lens)
     start = find_start(LENS_MODELS["fisheye"], corners, SIZE_PX)

@@ -132,7 +132,7 @@ def test_expected_rate_is_that_of_the_rig_and_the_first_frames() -> None:
     assert expected_bytes_per_s(cameras, states) == 15 * 100_000 + 30 * 50_000 + video
 
 
-def test_advice_only_where_a_recording_is_large_or_the_disk_small(tmp_path: Path) -> None:
+def test_advice_needs_a_large_recording_or_a_small_disk(tmp_path: Path) -> None:
     cameras = [RigCamera("red", rate_hz=30.0)]
     jpeg, video = (CameraState(1, 1, format=name) for name in ("jpeg", "h264"))
     assert DiskRoom(tmp_path, 10**12, 1e6).advise(cameras, {"red": jpeg}) is None

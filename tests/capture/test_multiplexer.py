@@ -88,7 +88,7 @@ def test_a_camera_without_stamps_has_the_time_of_arrival() -> None:
     assert attached.states["red"].delay_s is None
 
 
-def test_frames_that_were_lost_before_they_came_are_counted_and_named() -> None:
+def test_frames_lost_before_arrival_are_counted_and_named() -> None:
     @contextmanager
     def opened(camera: RigCamera, clock: Clock, say: Say) -> Iterator[Iterator[Frame | None]]:
         yield iter([Frame(b"x", "jpeg", clock.now_ns(), missed) for missed in (0, 0, 2, 0, 3, 1, 0)])
@@ -116,7 +116,7 @@ def test_a_camera_that_cannot_be_opened_ends_it_at_once() -> None:
     assert not [thread for thread in threading.enumerate() if thread.name in ("red", "white")]
 
 
-def test_a_camera_that_sends_nothing_is_named_without_its_password(monkeypatch: pytest.MonkeyPatch) -> None:
+def test_silent_camera_is_named_without_its_password(monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr("ipsys_log.capture.camera_thread._FIRST_FRAME_S", 0.2)
 
     @contextmanager
@@ -129,7 +129,7 @@ def test_a_camera_that_sends_nothing_is_named_without_its_password(monkeypatch: 
     assert "secret" not in str(raised.value)
 
 
-def test_a_camera_that_vanishes_is_tried_again_while_the_others_go_on() -> None:
+def test_lost_camera_is_retried_while_others_continue() -> None:
     tries: list[float] = []
     gone: list[float] = []
 
@@ -179,7 +179,7 @@ def changing(*visits: list[Frame]) -> Open:
     return opened
 
 
-def test_a_camera_that_returns_with_another_codec_is_not_recorded(monkeypatch: pytest.MonkeyPatch) -> None:
+def test_camera_with_a_changed_codec_is_not_recorded(monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr("ipsys_log.capture.camera_thread._RETRY_S", 0.02)
     jpeg, video = Frame(b"a", "jpeg", None), Frame(b"b", "h264", None)
     said: list[str] = []

@@ -60,7 +60,7 @@ def units(data: bytes, name: str) -> list[int]:
     ("name", "options", "container"),
     [("h264", X264, "mpegts"), ("h264", X264, "flv"), ("h265", X265, "mpegts")],
 )
-def test_video_comes_as_annex_b_that_can_be_read_from_each_keyframe(
+def test_video_is_annex_b_and_readable_from_each_keyframe(
     tmp_path: Path, name: str, options: tuple[str, ...], container: str
 ) -> None:
     make_jpegs(tmp_path, 50)

@@ -80,7 +80,7 @@ def backlog(source: Generator[Message | None, None, None], log: Recording) -> Ba
     return Backlog(Sent(source), log, lambda: 10_000)
 
 
-def test_a_frame_is_in_the_log_before_a_stage_sees_it_and_a_tick_follows(log: Noted) -> None:
+def test_frame_is_logged_before_its_processing(log: Noted) -> None:
     def source() -> Generator[Message | None, None, None]:
         for number in range(3):
             time.sleep(0.05)
@@ -95,7 +95,7 @@ def test_a_frame_is_in_the_log_before_a_stage_sees_it_and_a_tick_follows(log: No
     assert [message is TICK for message in seen] == [False, True] * 3
 
 
-def test_the_oldest_frames_are_skipped_and_named_by_their_log_times(log: Noted) -> None:
+def test_oldest_frames_are_skipped_with_an_event(log: Noted) -> None:
     def source() -> Generator[Message | None, None, None]:
         yield from (frame(number) for number in range(10))
         yield from (frame(number, "white") for number in range(10, 12))

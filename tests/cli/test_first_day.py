@@ -75,7 +75,7 @@ COMMANDS = {
 
 @pytest.mark.parametrize("command", COMMANDS)
 @pytest.mark.parametrize("fault", FAULTS)
-def test_bad_source_or_intrinsics_are_reported_before_cameras_open(
+def test_bad_source_or_calibration_is_reported_first(
     ipsys: Ipsys, tmp_path: Path, monkeypatch: pytest.MonkeyPatch, fitted: Path, command: str, fault: str
 ) -> None:
     cameras, said = FAULTS[fault]
@@ -139,7 +139,7 @@ def test_portrait_image_gives_a_remark(ipsys: Ipsys, tmp_path: Path) -> None:
         assert ("camera red: 180 x 320 px is upright: are width and height exchanged?" in done.err) == said
 
 
-def test_a_model_of_other_cameras_is_refused_before_any_is_opened(
+def test_model_of_other_cameras_is_refused_before_cameras_open(
     ipsys: Ipsys, tmp_path: Path, fitted: Path
 ) -> None:
     rig = write_rig(tmp_path, SIMULATED.replace('"red"', '"blue"'))
@@ -207,9 +207,7 @@ def test_error_in_live_frames_names_no_deleted_file(ipsys: Ipsys, tmp_path: Path
     assert "now.mcap" not in done.err
 
 
-def test_a_marker_that_is_not_in_the_rig_is_shown_with_what_to_do(
-    ipsys: Ipsys, tmp_path: Path, lab: Path
-) -> None:
+def test_unknown_marker_is_shown_with_the_next_step(ipsys: Ipsys, tmp_path: Path, lab: Path) -> None:
     with Session([lab]) as session:
         (rig,) = session.payloads(["/rig"])
     known = sorted(marker.id for marker in rig.markers)[1:]
@@ -257,7 +255,7 @@ def test_a_picture_is_what_its_name_says(ipsys: Ipsys, lab: Path) -> None:
         assert drawn[0].read_bytes() == drawn[1].read_bytes()
 
 
-def test_info_keeps_each_channel_on_a_line_and_has_no_rates_of_events(
+def test_info_has_one_line_per_channel_and_no_event_rates(
     ipsys: Ipsys, tmp_path: Path, lab: Path, fitted: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     """The log has three runs, and the window has 80 columns."""

@@ -31,7 +31,7 @@ def test_a_parallel_marker_is_found_exactly(
 
 
 @given(places, st.floats(-3.1, 3.1))
-def test_heading_is_minus_the_angle_of_the_side_from_corner_3_to_0(
+def test_heading_is_minus_the_angle_from_corner_3_to_0(
     centre: tuple[float, float, float], angle_rad: float
 ) -> None:
     # At angle 0, the side points up in the image, along minus y: its angle is -90 degrees.

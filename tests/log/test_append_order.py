@@ -72,7 +72,7 @@ def test_foxglove_reader_opens_a_log_whatever_append_is_cut(
     assert set(complete) == {len(OLD), len(OLD) + len(NEW)}
 
 
-def test_log_cut_short_is_read_appended_and_repaired_without_journal(path: Path) -> None:
+def test_truncated_log_is_usable_without_its_journal(path: Path) -> None:
     """The journal is on the machine that crashed."""
     seen = set()
     for _ in killed_at_each_operation(path, NEW):
@@ -176,7 +176,7 @@ def test_message_after_a_failed_append_is_correct(
     assert said == {"as it was", "in the log", ""} | ({"not put back"} if for_good else set())
 
 
-def test_journal_of_the_first_format_still_brings_the_old_log_back(path: Path) -> None:
+def test_journal_of_the_first_format_rolls_back(path: Path) -> None:
     """Earlier versions truncated the file before they wrote."""
     old = path.read_bytes()
     storage = Recorder()

@@ -205,7 +205,7 @@ def test_repair_takes_a_false_claim_for_damage(with_size: bool, tmp_path: Path) 
         assert [len(one.data) for one in reader.messages()] == [len(good) - 31] * 2
 
 
-def test_indexed_log_with_a_refused_chunk_still_shows_its_contents(tmp_path: Path) -> None:
+def test_log_with_a_refused_chunk_still_shows_its_contents(tmp_path: Path) -> None:
     path = black_frames(tmp_path / "black.mcap", "zstd", True)
     with LogReader(path) as reader:
         assert reader.message_count == 1

@@ -52,7 +52,7 @@ def test_mean_and_variance_are_those_of_the_textbook(noisy: bool) -> None:
     np.testing.assert_allclose(std, np.sqrt(variance) * model.target_scale_, rtol=1e-3, atol=1e-6)
 
 
-def test_interpolation_is_exact_at_points_and_uncertain_elsewhere() -> None:
+def test_interpolation_is_exact_only_at_its_points() -> None:
     x, y = wavy(1)
     model = Kriging().fit(x, y)
     found, std = model.predict(x, return_std=True)

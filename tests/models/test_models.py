@@ -67,7 +67,7 @@ def test_poly_is_least_squares_on_second_order_terms(seed: int) -> None:
     np.testing.assert_allclose(found, oracle.predict(elsewhere), atol=1e-7)
 
 
-def test_poly_keeps_its_digits_where_the_normal_equations_lose_them() -> None:
+def test_poly_is_more_exact_than_normal_equations() -> None:
     """The points are far from the origin and flat: centimetres, and heights that hardly vary."""
     rng = np.random.default_rng(0)
     points = rng.uniform((-200, -100, 2000), (200, 100, 2000.5), (40, 3))

@@ -180,7 +180,7 @@ def test_known_height_error_on_the_authors_points(data: Path) -> None:
 
 
 @pytest.mark.slow
-def test_best_is_better_than_poly_on_folds_that_it_was_not_chosen_on(data: Path) -> None:
+def test_best_is_better_than_poly_on_other_folds(data: Path) -> None:
     """The model was chosen with other folds; the test has ten seeds, each with four times five folds."""
     seeds = range(700, 710)
     poly, best = (np.mean([cross_validated_cm(name, data, s, 3) for s in seeds]) for name in ("poly", "best"))

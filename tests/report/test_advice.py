@@ -99,7 +99,7 @@ def test_the_spread_over_random_subsets_is_noise_too() -> None:
     assert advice.choices[20][SIMPLE].model == "rigid"
 
 
-def test_labelled_subsets_come_before_random_ones_where_they_have_sizes() -> None:
+def test_labelled_subsets_of_several_sizes_have_priority() -> None:
     labelled = evaluation("rigid", {10: 1.0, 20: 1.0}, labelled=True)
     drawn = evaluation("rigid", {5: 2.0, 10: 2.0})
     both = advise([replace(drawn, learning=(*drawn.learning, *labelled.learning))])

@@ -119,7 +119,7 @@ def test_the_figures_are_those_of_the_evaluation(page: str, hostile_log: Path) -
     assert f"{pooled.error_3d.p95_m * 100:.2f}</td>" in page
 
 
-def test_report_is_the_same_each_time_and_leaves_the_log_as_it_is(ipsys: Ipsys, tmp_path: Path) -> None:
+def test_report_is_repeatable_and_leaves_the_log_unchanged(ipsys: Ipsys, tmp_path: Path) -> None:
     log = tmp_path / "lab.mcap"
     write_log(log, lab_messages())
     done = ipsys("report", log, "--model", "poly")

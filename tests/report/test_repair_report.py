@@ -54,7 +54,7 @@ def killed(path: Path, tmp_path: Path, written_ns: int) -> Path:
     return cut
 
 
-def test_report_counts_kept_and_lost_messages_of_a_killed_recorder(
+def test_report_counts_the_messages_of_a_killed_recorder(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     monkeypatch.chdir(tmp_path)

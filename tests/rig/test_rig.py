@@ -50,7 +50,7 @@ def test_heights_and_sigma_read_back_to_the_last_digit(
     assert load_rig(path) == rig
 
 
-def test_the_commented_examples_of_init_hold_when_the_comments_go(tmp_path: Path) -> None:
+def test_commented_examples_of_init_are_valid(tmp_path: Path) -> None:
     path = tmp_path / "lab.toml"
     path.write_text(example_toml())
     plain = load_rig(path)

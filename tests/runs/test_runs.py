@@ -74,9 +74,7 @@ def robots(folder: Path, log: Path, prefix: str) -> Path:
     return path
 
 
-def test_models_that_were_copied_in_are_used_without_measurements(
-    ipsys: Ipsys, paper: Path, tmp_path: Path
-) -> None:
+def test_copied_models_are_used_without_measurements(ipsys: Ipsys, paper: Path, tmp_path: Path) -> None:
     calibration = tmp_path / "calibration.mcap"
     bare = without(paper, lambda message: isinstance(message.payload, Measurement))
     ipsys("replay", paper, "--model", "rigid", "-o", calibration)
@@ -262,7 +260,7 @@ def test_the_rig_of_a_log_is_checked_too(ipsys: Ipsys, paper: Path) -> None:
     assert "/rig: 0.0 m is not a length" in done.err
 
 
-def test_a_rig_recorded_later_does_not_change_what_was_measured_before(ipsys: Ipsys, paper: Path) -> None:
+def test_later_rig_does_not_change_earlier_measurements(ipsys: Ipsys, paper: Path) -> None:
     ipsys("replay", paper)
     with Session([paper]) as session:
         rig, end_ns = session.payloads(["/rig"])[0], session.end_ns

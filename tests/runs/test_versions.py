@@ -184,7 +184,7 @@ def test_run_of_newer_software_is_never_replaced(
     assert states(ipsys, log)["edges_2", "detect"]["out_of_date"] is False
 
 
-def test_verify_names_what_another_version_made_and_verifies_the_rest(
+def test_verify_names_results_of_other_versions(
     ipsys: Ipsys, log: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     monkeypatch.setitem(VERSIONS, "detect", 2)
@@ -225,9 +225,7 @@ def test_measurement_since_makes_the_model_out_of_date(ipsys: Ipsys, log: Path, 
     assert "fit is computed again; run poly is out of date: measurements changed" in ipsys("replay", log).err
 
 
-def test_run_without_its_inputs_is_not_repeatable_and_later_stages_go_on(
-    ipsys: Ipsys, tmp_path: Path
-) -> None:
+def test_run_without_its_inputs_is_not_repeatable(ipsys: Ipsys, tmp_path: Path) -> None:
     log = Path(shutil.copy(ROOT / "sample_logs" / "paper_lab.mcap", tmp_path / "paper.mcap"))
     first = states(ipsys, log)
     assert first

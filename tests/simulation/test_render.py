@@ -208,7 +208,7 @@ def test_the_stock_detector_finds_every_marker_near_its_truth(views: list[View])
     assert np.sqrt(np.mean(np.sum(np.square(errors), axis=-1))) < 0.35
 
 
-def test_a_marker_at_the_edge_of_the_image_is_cut_off_and_nothing_else(views: list[View]) -> None:
+def test_marker_at_the_image_edge_is_cut_off(views: list[View]) -> None:
     view = views[1]
     bare = expose(view, [], SETTINGS)
     cut = expose(view, [lay(1, 2.44, view.camera.origin_m[1] + 1.0, 0.0, 0.4)], SETTINGS)

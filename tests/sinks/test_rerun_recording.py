@@ -187,7 +187,7 @@ def looks_at(path: Path, entity: str, kind: str, moved: str, look: str) -> dict[
     return found
 
 
-def test_everything_drawn_has_its_look_again_after_it_went_away(saved: Path) -> None:
+def test_drawn_objects_keep_their_style_after_they_disappear(saved: Path) -> None:
     robot = "/world/runs/poly/robots/robot_0"
     labels = looks_at(saved, robot, "Points3D", "positions", "labels")
     assert labels == {time_ns: ["robot_0"] for time_ns in TIMES_NS}
@@ -252,7 +252,7 @@ def test_late_message_clears_nothing_that_was_drawn_after_it(tmp_path: Path) -> 
     assert [row[0] - START_NS for row in rows(saved, entity, "Clear:is_recursive")] == [15]
 
 
-def test_markers_have_their_look_again_after_their_image_went_away(tmp_path: Path) -> None:
+def test_markers_keep_their_style_after_their_image_disappears(tmp_path: Path) -> None:
     def frame(time_ns: int) -> Message:
         return Message(
             "/cameras/red/image", time_ns, time_ns, CompressedImage(time_ns, "red", jpeg(1), "jpeg"), "red"

@@ -265,7 +265,7 @@ def test_random_poses_out_to_the_edge_of_the_image(gamma: float, rms_px: float, 
     check(strew(FISHEYE, Look(gamma=gamma), 60, 8), rms_px, 0.5, found)
 
 
-def test_a_marker_in_shadow_on_a_bright_floor_is_found_within_a_second() -> None:
+def test_marker_in_shadow_is_found_within_a_second() -> None:
     """The paper is darker than the floor, so that only the thorough search finds the marker."""
     look = Look(black=20, white=80, floor=150)
     one = at_px(VGA, 5, (330, 240), 2.0, length_m=0.4)

@@ -79,7 +79,7 @@ def test_request_without_the_token_is_refused(shared: Caller, path: str) -> None
     assert shared.ask("GET", f"{path}?token={wrong}")[0] == 403
 
 
-def test_the_token_becomes_a_cookie_that_scripts_and_other_sites_do_not_get(shared: Caller) -> None:
+def test_token_becomes_a_protected_cookie(shared: Caller) -> None:
     status, _, headers = shared.ask("GET", f"/?token={shared.token}")
     assert (status, headers["location"]) == (303, "/")
     cookie = headers["set-cookie"].lower()

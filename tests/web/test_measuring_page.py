@@ -105,7 +105,7 @@ def test_point_is_typed_checked_saved_and_withdrawn(hand: Phone, unmeasured: Unm
         assert hand.run(f"{FETCHED}.every(name => name.startsWith(location.origin))")
 
 
-def test_side_is_chosen_on_the_map_and_the_model_finds_a_wrong_one(
+def test_side_is_chosen_on_the_map_and_checked_by_the_model(
     hand: Phone, ipsys: Ipsys, unmeasured: Unmeasured, lab: Path
 ) -> None:
     log, tape = unmeasured

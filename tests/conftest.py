@@ -1,4 +1,4 @@
-"""Parts that the tests share: the real data, and the command line in this process."""
+"""Shared fixtures: the real data, and the command line in this process."""
 
 from __future__ import annotations
 
@@ -16,7 +16,7 @@ from typing import NamedTuple
 import pytest
 from hypothesis import HealthCheck, settings
 
-# As the pipeline does, and before numpy is there: small matrices, and one process for each core.
+# As in the pipeline, and before the import of numpy: small matrices, and one process per core.
 os.environ.setdefault("OPENBLAS_NUM_THREADS", "1")
 
 from ipsys_log.capture.video_files import open_video
@@ -32,16 +32,16 @@ from ipsys_log.simulation.settings import LabSettings
 from tests.capture.streams import encode
 
 ROOT = Path(__file__).resolve().parent.parent
-# The command line installs handlers for these; a test gives them back.
+# The command line installs handlers for these signals; a test restores them.
 SIGNALS = (signal.SIGINT, signal.SIGTERM, signal.SIGHUP)
-# A runner in the background may ignore some; a program under test inherits that.
+# A background runner may ignore some signals; a program under test inherits that.
 for number in SIGNALS:
     if signal.getsignal(number) is signal.SIG_IGN:
         signal.signal(number, signal.SIG_DFL)
-# Examples take as long as the machine lets them: speed is measured in benchmarks/, never in a test.
+# Examples have no time limit: benchmarks/ measures the speed, not the tests.
 settings.register_profile("any_machine", deadline=None, suppress_health_check=[HealthCheck.too_slow])
 settings.load_profile("any_machine")
-# A program for Debian's own Python.
+# a program for Debian's own Python
 collect_ignore = ["capture/rtsp_server.py"]
 
 
@@ -56,7 +56,7 @@ Ipsys = Callable[..., Done]
 
 @contextmanager
 def small_disk(at: Path, megabytes: int) -> Iterator[Path]:
-    """A disk of its own that is soon full; skips where nobody may mount one."""
+    """Mount a small separate disk; skip the test if mounting is not allowed."""
     at.mkdir()
     mount = ["mount", "-t", "tmpfs", "-o", f"size={megabytes}m", "none", str(at)]
     if subprocess.run(mount, capture_output=True, check=False).returncode != 0:
@@ -69,7 +69,7 @@ def small_disk(at: Path, megabytes: int) -> Iterator[Path]:
 
 @pytest.fixture(scope="session")
 def data() -> Path:
-    """The public data sets; docs/data.md says where they come from."""
+    """Return the public data sets; docs/data.md names their sources."""
     folder = Path(os.environ.get("IPSYS_DATA", ROOT / "../shared/data")).resolve()
     if not folder.is_dir():
         pytest.skip(f"no real data in {folder}: set IPSYS_DATA (docs/data.md says where to get them)")
@@ -78,7 +78,7 @@ def data() -> Path:
 
 @pytest.fixture
 def ipsys(monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]) -> Ipsys:
-    """Run a command as a user does; exit code, stdout and stderr."""
+    """Run a command as a user does; return exit code, stdout and stderr."""
 
     def run(*arguments: object) -> Done:
         monkeypatch.setattr(sys, "argv", ["ipsys", *map(str, arguments)])
@@ -99,7 +99,7 @@ def ipsys(monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]) -
 
 @pytest.fixture(scope="session")
 def lab_log(tmp_path_factory: pytest.TempPathFactory) -> Path:
-    """A small simulated session, to be copied before it is changed."""
+    """Return a small simulated session; tests copy it before a change."""
     path = tmp_path_factory.mktemp("lab") / "lab.mcap"
     settings = LabSettings(
         width=960, height=540, markers=8, stations=26, frames_per_station=2, rate_hz=5.0, drive_s=1.0
@@ -110,8 +110,10 @@ def lab_log(tmp_path_factory: pytest.TempPathFactory) -> Path:
 
 @pytest.fixture(scope="session")
 def video_log(lab_log: Path, tmp_path_factory: pytest.TempPathFactory) -> Path:
-    """The small simulated session with its frames as H.264, a keyframe every ten; to be copied before it is
-    changed."""
+    """Return the small simulated session as H.264, with a keyframe every ten frames.
+
+    Tests copy it before a change.
+    """
     folder = tmp_path_factory.mktemp("video")
     with Session([lab_log]) as session:
         write_log(folder / "lab.mcap", _with_video(session, folder))
@@ -139,19 +141,19 @@ def _as_video(session: Session, topic: str, folder: Path) -> list[bytes]:
 
 @pytest.fixture
 def lab(lab_log: Path, tmp_path: Path) -> Path:
-    """A copy of the small simulated session."""
+    """Copy the small simulated session."""
     return Path(shutil.copy(lab_log, tmp_path / "lab.mcap"))
 
 
 def data_section(path: Path) -> bytes:
-    """Return the bytes before the DataEnd record. They must never be rewritten."""
+    """Return the bytes before the DataEnd record, which no command may rewrite."""
     whole = path.read_bytes()
     summary_start = int.from_bytes(whole[-28:-20], "little")
     return whole[: summary_start - 13]
 
 
 class Unmeasured(NamedTuple):
-    """A session whose markers were detected, but nobody has measured; and what the tape would say."""
+    """A detected session without measurements, and the tape measurements for it."""
 
     log: Path
     tape: list[Measurement]
@@ -159,7 +161,7 @@ class Unmeasured(NamedTuple):
 
 @pytest.fixture(scope="session")
 def unmeasured_log(lab_log: Path, tmp_path_factory: pytest.TempPathFactory) -> Unmeasured:
-    """The small simulated session without its measurements, to be copied before it is changed."""
+    """Return the small simulated session without its measurements; tests copy it before a change."""
     path = tmp_path_factory.mktemp("unmeasured") / "lab.mcap"
     with Session([lab_log]) as session:
         tape = session.payloads(session.topics(MEASUREMENTS))
@@ -172,5 +174,5 @@ def unmeasured_log(lab_log: Path, tmp_path_factory: pytest.TempPathFactory) -> U
 
 @pytest.fixture
 def unmeasured(unmeasured_log: Unmeasured, tmp_path: Path) -> Unmeasured:
-    """A copy of the session that nobody has measured."""
+    """Copy the session without measurements."""
     return unmeasured_log._replace(log=Path(shutil.copy(unmeasured_log.log, tmp_path / "unmeasured.mcap")))

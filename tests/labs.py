@@ -1,4 +1,4 @@
-"""Made-up labs with known truth, from geometry alone: what cameras see of places, what a tape says."""
+"""Simulated labs with known ground truth, by geometry alone: camera points and tape distances."""
 
 from __future__ import annotations
 
@@ -37,9 +37,9 @@ HEIGHTS = (0.0, 0.05, 0.1, 0.15, 0.2)
 
 @dataclass(frozen=True)
 class Camera:
-    """Hangs at ``origin_m``, about downwards; its lens is off a little, its depths are off smoothly.
+    """A camera at ``origin_m`` that looks down, with small errors of intrinsics and depths.
 
-    ``along`` and ``across`` are the noise of a depth (relative) and of (u, v), in the middle of the image.
+    ``along`` and ``across`` are the noise of a depth (relative) and of (u, v), at the principal point.
     """
 
     origin_m: Array
@@ -49,11 +49,11 @@ class Camera:
     across: float = 0.0001
 
     def see(self, world_m: Array, rng: np.random.Generator) -> Array:
-        """Camera points (n, 3) of world points (n, 3), with noise."""
+        """Return camera points (n, 3) of world points (n, 3), with noise."""
         inside = (world_m - self.origin_m) @ self.rotation
         u, v = inside[:, 0] / inside[:, 2], inside[:, 1] / inside[:, 2]
         growth = 1 + u * u + v * v
-        for _ in range(20):  # the lens maps what is seen to what is there: solve for what is seen
+        for _ in range(20):  # the lens model maps distorted to true points: solve for the distorted point
             shift = self._shift(u, v)
             u, v = inside[:, 0] / inside[:, 2] - shift[0], inside[:, 1] / inside[:, 2] - shift[1]
         u = u + rng.normal(0, self.across, len(u)) * growth
@@ -74,7 +74,7 @@ class Camera:
 def camera(
     rng: np.random.Generator, y_m: float = 0.9, along: float = 0.0004, across: float = 0.0001
 ) -> Camera:
-    """One of the cameras above the paper's floor, tilted a little at random."""
+    """Return one of the cameras above the paper's floor, with a small random tilt."""
     turn = (np.pi + rng.normal(0, 0.02), rng.normal(0, 0.02), rng.normal(0, 0.05))
     return Camera(
         np.array([2.4, y_m, 2.1]), Rotation.from_euler("xyz", turn).as_matrix(), along=along, across=across
@@ -84,7 +84,7 @@ def camera(
 def places(
     rng: np.random.Generator, count: int, y_m: float = 0.9, heights: tuple[float, ...] = HEIGHTS
 ) -> Array:
-    """World points (n, 3) in a camera's view, where the two tapes cross at more than 15 degrees."""
+    """Return world points (n, 3) in a camera's view, at tape crossings above 15 degrees."""
     found: list[Array] = []
     while len(found) < count:
         point = np.array([rng.uniform(0.1, 4.7), rng.uniform(y_m - 0.8, y_m + 0.8), rng.choice(heights)])
@@ -106,7 +106,7 @@ def tape_covariances(world_m: Array, sigma_m: float = 0.003, ruler_m: float = 0.
 
 
 def measure(world_m: Array, rng: np.random.Generator, sigma_m: float = 0.003) -> tuple[Array, Array]:
-    """World points as measured, (n, 3), and their covariances (n, 3, 3)."""
+    """Return measured world points, (n, 3), and their covariances (n, 3, 3)."""
     covariances = tape_covariances(world_m, sigma_m)
     roots = np.linalg.cholesky(covariances)
     return world_m + np.einsum("nij,nj->ni", roots, rng.normal(size=world_m.shape)), covariances
@@ -126,9 +126,10 @@ def session(
     distances: bool = False,
     labels: Callable[[int], tuple[str, ...]] = lambda n: (),
 ) -> Iterator[Message]:
-    """A log of measured places: what each camera saw of them (NaN: not seen), one place a second.
+    """Write a log of calibration points at one point per second.
 
-    With ``distances`` a place is measured by the tape to A and B, else its world point is given.
+    The log has the camera points of each camera (NaN if not seen). With ``distances``, a point has tape
+    distances to A and B, otherwise a world point.
     """
     start_ns = 1_700_000_000 * NS_PER_S
     yield Message(RIG_TOPIC, start_ns, start_ns, rig)

@@ -1,4 +1,4 @@
-"""Cameras made of frames that are at hand: the thinnest stand-in for hardware, at the very edge."""
+"""Simulated cameras that play available frames in place of hardware."""
 
 from __future__ import annotations
 
@@ -28,9 +28,9 @@ def playing(
     stamped: bool = True,
     before: Callable[[str, int], None] = lambda camera, number: None,
 ) -> Open:
-    """Opens cameras that send their frames once, in real time; ``before`` is called before each frame.
+    """An opener of cameras that send their frames once, in real time; ``before`` is called before each frame.
 
-    Frames of one number are sent at one time by all cameras, as of one world.
+    All cameras send the frames of one number at one time.
     """
     starts_s: dict[str, float] = {}
 
@@ -53,10 +53,10 @@ def playing(
 
 
 class SteppedClock(Clock):
-    """A clock that frames move on, not real time: a busy machine skips none, and stamps are exact.
+    """A clock that advances with the frames: a busy machine skips no frame, and stamps are exact.
 
-    Give ``before`` to `playing`, with an infinite rate, and ``watch`` to what looks at the frames. Frame n is
-    sent when all cameras' frames n - 1 were looked at; the time is then n / ``rate_hz`` after the start.
+    Give ``before`` to `playing`, with an infinite rate, and ``watch`` to the observer of the frames. Frame
+    n is sent after all frames n - 1 were observed. The time is then n / ``rate_hz`` after the start.
     """
 
     def __init__(self, names: Sequence[str], rate_hz: float) -> None:
@@ -72,7 +72,7 @@ class SteppedClock(Clock):
             return self._now_ns
 
     def before(self, _: str, number: int) -> None:
-        """Wait until frame ``number`` may be sent, and move on to its time."""
+        """Wait until frame ``number`` may be sent, and advance the clock to its time."""
         with self._changed:
             looked_at = self._changed.wait_for(
                 lambda: all(self._seen[name] >= number for name in self._names), _LIMIT_S
@@ -81,7 +81,7 @@ class SteppedClock(Clock):
             self._now_ns = max(self._now_ns, self._start_ns + number * self._step_ns)
 
     def watch(self, message: Message | None) -> None:
-        """Note that a frame was looked at."""
+        """Note that a frame was observed."""
         if message is not None and isinstance(message.payload, CompressedImage):
             with self._changed:
                 self._seen[str(message.camera)] += 1

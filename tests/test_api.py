@@ -1,4 +1,4 @@
-"""The Python API: what a program sees of logs, and tables that equal the decoded messages."""
+"""The Python API: the log contents for programs, and tables that equal the decoded messages."""
 
 from __future__ import annotations
 

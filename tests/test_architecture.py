@@ -20,4 +20,4 @@ def test_drawing_with_one_more_import_differs() -> None:
     more = [("messages", {"cli"}), *modules]
     drawn = _SCRIPT["draw"](_LAYERS, more)
     assert drawn != _SCRIPT["draw"](_LAYERS, modules)
-    assert drawn.count("#c62828") == 1  # an import that goes up is red
+    assert drawn.count("#c62828") == 1  # an upward import is red

@@ -1,4 +1,4 @@
-"""Bad input: one line that says what, where and what to do; exit code 1; nothing half-written."""
+"""Bad input: one line with fault, position and next step; exit code 1; no partial file."""
 
 from __future__ import annotations
 
@@ -22,7 +22,7 @@ from tests.conftest import Ipsys
 
 
 def rewrite(lab: Path, change: Callable[[Message], Message | None], extra: tuple[Message, ...] = ()) -> Path:
-    """The lab with each message changed, or left out where ``change`` gives None."""
+    """Write the lab with each message changed, or removed if ``change`` returns None."""
     path = lab.with_name("changed.mcap")
 
     def messages() -> Iterator[Message]:
@@ -37,8 +37,10 @@ def rewrite(lab: Path, change: Callable[[Message], Message | None], extra: tuple
 
 
 def refused(ipsys: Ipsys, log: Path, *arguments: object) -> str:
-    """Run a command that must fail; its one line, or one more for each bad row of a sheet, after looking that
-    nothing was written."""
+    """Run a failing command; return its one line, or one line per bad row of a sheet.
+
+    Check that no file was written.
+    """
     before = {path: path.read_bytes() for path in log.parent.iterdir() if path.is_file()}
     done = ipsys(*arguments)
     assert done.code == 1
@@ -94,7 +96,7 @@ def test_a_calibration_of_another_size(ipsys: Ipsys, lab: Path, corners: str) ->
         return message
 
     log = rewrite(lab, wider)
-    line = refused(ipsys, log, "replay", log, "--corners", corners)  # and leaves no run behind
+    line = refused(ipsys, log, "replay", log, "--corners", corners)  # and adds no run
     assert "camera red: its frames are 960 x 540 px, its calibration is for 1920 x 1080" in line
 
 
@@ -124,7 +126,7 @@ def test_only_markers_that_are_not_in_the_rig(ipsys: Ipsys, lab: Path) -> None:
     assert "[[markers]]" in line
 
 
-def test_some_markers_that_are_not_in_the_rig_are_left_out_and_named(ipsys: Ipsys, lab: Path) -> None:
+def test_unknown_markers_are_excluded_and_named(ipsys: Ipsys, lab: Path) -> None:
     def smaller_rig(message: Message) -> Message:
         if isinstance(message.payload, Rig):
             kept = tuple(marker for marker in message.payload.markers if marker.id != 5)
@@ -139,13 +141,13 @@ def test_some_markers_that_are_not_in_the_rig_are_left_out_and_named(ipsys: Ipsy
         seen = {m.id for p in session.payloads(session.topics(MARKERS, "edges")) for m in p.markers}
         events = session.payloads(session.topics(RUN_EVENTS, "edges"))
     assert seen == {0, 1, 2, 3, 4, 6, 7}
-    # Once for each camera, not for each frame.
+    # once for each camera, not for each frame
     assert sorted(str(event.camera) for event in events) == ["black", "red", "white"]
     assert {event.marker_id for event in events} == {5}
 
 
 def doubled(lab: Path, number: int = 3) -> tuple[Path, int]:
-    """The lab with two more copies of one marker in one frame of the red camera."""
+    """Write the lab with two more copies of one marker in one frame of the red camera."""
     times: list[int] = []
 
     def change(message: Message) -> Message:
@@ -158,7 +160,7 @@ def doubled(lab: Path, number: int = 3) -> tuple[Path, int]:
         assert picture is not None
         dictionary = cv2.aruco.getPredefinedDictionary(cv2.aruco.DICT_4X4_100)
         picture[200:340, 310:650] = 180
-        for x in (400, 490):  # in the middle, where the lens bends no line
+        for x in (400, 490):  # at the image centre, without distortion of lines
             marker = cv2.aruco.generateImageMarker(dictionary, 4, 42)
             picture[240:300, x : x + 60] = 255
             picture[249:291, x + 9 : x + 51] = marker[..., None]
@@ -182,7 +184,7 @@ def test_two_markers_of_one_id_in_a_frame(ipsys: Ipsys, lab: Path) -> None:
 @pytest.mark.parametrize(
     ("model", "places", "needed"), [("poly", 9, 10), ("rigid+poly", 9, 10), ("rigid", 2, 3)]
 )
-def test_fewer_places_than_a_model_needs(
+def test_too_few_points_for_a_model_are_refused(
     ipsys: Ipsys, data: Path, tmp_path: Path, model: str, places: int, needed: int
 ) -> None:
     imsel = tmp_path / "imsel.mcap"
@@ -264,7 +266,7 @@ def test_a_corrupt_jpeg_in_the_middle(ipsys: Ipsys, lab: Path, damage: str) -> N
         if message.topic != "/cameras/white/image":
             return message
         times.append(message.log_time_ns)
-        # One of the frames that are decoded as a whole; of others only the rows with markers are.
+        # This is one of the completely decoded frames; others are decoded only in the rows with markers.
         if len(times) != 11:
             return message
         return replace(message, payload=replace(message.payload, data=hurt(message.payload.data)))
@@ -283,7 +285,7 @@ def test_a_corrupt_jpeg_in_the_middle(ipsys: Ipsys, lab: Path, damage: str) -> N
     assert [(event.kind, event.camera) for event in events] == [("corrupt_frame", "white")]
 
 
-def test_names_and_options_that_cannot_be(ipsys: Ipsys, lab: Path, tmp_path: Path) -> None:
+def test_impossible_names_and_options_are_refused(ipsys: Ipsys, lab: Path, tmp_path: Path) -> None:
     assert "model 'spline' is not known; use one of" in refused(
         ipsys, lab, "replay", lab, "--model", "spline"
     )
@@ -358,7 +360,7 @@ def test_the_real_command_too(tmp_path: Path) -> None:
     assert done.stderr.count("\n") == 1
 
 
-def test_a_frame_is_never_taken_for_a_picture_that_it_is_not() -> None:
+def test_frame_is_never_decoded_to_a_wrong_image() -> None:
     from ipsys_log.stages.detect import decode_grey
 
     with pytest.raises(ValueError, match="no picture"):

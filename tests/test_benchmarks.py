@@ -1,4 +1,4 @@
-"""The benchmarks run, on next to nothing, and leave a file with the ratios first."""
+"""The benchmarks run with minimal input, and write a file with the ratios first."""
 
 from __future__ import annotations
 
@@ -25,7 +25,7 @@ BENCHMARKS = Path(__file__).resolve().parent.parent / "benchmarks"
         pytest.param([], marks=pytest.mark.slow),
     ],
 )
-def test_smoke(arguments: list[str], tmp_path: Path) -> None:
+def test_benchmark_smoke_run_writes_its_ratios(arguments: list[str], tmp_path: Path) -> None:
     output = tmp_path / "results.json"
     command = [sys.executable, "bench.py", "--smoke", "-o", str(output), *arguments]
     done = subprocess.run(command, cwd=BENCHMARKS, capture_output=True, text=True, check=False)
@@ -34,7 +34,7 @@ def test_smoke(arguments: list[str], tmp_path: Path) -> None:
     results = json.loads(output.read_text(encoding="utf-8"))
     assert next(iter(results)) == "ratios"
     for benchmark, rows in results["ratios"].items():
-        assert rows or benchmark == "live"  # which has figures only
+        assert rows or benchmark == "live"  # a file with figures only
         assert all(0 < row["min"] <= row["median"] <= row["max"] for row in rows.values()), benchmark
     pipelines = results["details"]["detection"]["3 markers"]
     assert pipelines["plain"]["markers"] > 0
@@ -48,7 +48,7 @@ def test_corners_are_scored_against_the_truth(monkeypatch: pytest.MonkeyPatch) -
     square = np.array([[0.0, 0], [50, 0], [50, 50], [0, 50]])
     there = {marker_id: square + 100 * marker_id for marker_id in range(4)}
     known = {("red", 7): scenes.Truth(there, frozenset([0, 1, 2]))}
-    # 0 is 5 px off, 1 is missed, 2 is somewhere else, 3 counts for nothing, 9 is not there.
+    # 0 has an error of 5 px, 1 is missed, 2 is at a wrong position, 3 is ignored, 9 does not exist.
     found = [("red", 7, [(0, square + np.array([3, 4])), (2, square), (3, square + 300), (9, square)])]
     assert detection.score(found, known) == {
         "rms_px": 5.0,
@@ -59,7 +59,7 @@ def test_corners_are_scored_against_the_truth(monkeypatch: pytest.MonkeyPatch) -
     }
 
 
-# In place of ffmpeg: of the cameras' streams one is late and one never comes.
+# In place of ffmpeg: one camera stream is late and one never comes.
 _LATE = """#!/bin/sh
 case "$*" in
 */white) echo "no camera here" >&2; exit 3 ;;
@@ -70,7 +70,7 @@ exec {ffmpeg} "$@"
 
 
 def put_in_path(program: str, folder: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    """Let a script stand for ffmpeg."""
+    """Replace ffmpeg by a script."""
     script = folder / "ffmpeg"
     script.write_text(program)
     script.chmod(0o755)
@@ -91,7 +91,7 @@ def test_live_reports_what_it_measured_without_a_stream(
     assert "live: record: white never came: ffmpeg ended with 3: no camera here" in done.stdout, done.stderr
     assert "Traceback" not in done.stderr
     results = json.loads(output.read_text(encoding="utf-8"))
-    # The late one is measured, as the others are.
+    # The late stream is measured like the others.
     assert set(results["details"]["live"]["record"]["cameras"]) == {"red", "black"}
     assert all(frames > 30 for frames, _, _ in results["details"]["live"]["record"]["cameras"].values())
     assert results["figures"]["live"]["live, 2 cameras: of one core"]["median"] > 0
@@ -104,7 +104,7 @@ def streams(monkeypatch: pytest.MonkeyPatch) -> Any:
     return importlib.import_module("stream_server")
 
 
-# Listens as ffmpeg does, after a while; of the camera black never, of white it ends at once.
+# A script that listens like ffmpeg after a while; the stream black never comes, white ends at once.
 _LISTENER = """#!{python}
 import socket, sys, time
 from urllib.parse import urlsplit

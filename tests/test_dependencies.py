@@ -16,12 +16,12 @@ ROOT = Path(__file__).resolve().parent.parent
 
 
 def normalize(distribution: str) -> str:
-    """The name of a distribution as indexes compare it (PEP 503)."""
+    """Return the normalised name of a distribution (PEP 503)."""
     return re.sub(r"[-_.]+", "-", distribution).lower()
 
 
 def declared() -> set[str]:
-    """The distributions that pyproject.toml depends on, those of its extras for users too.
+    """Return the dependencies of pyproject.toml, with those of its extras for users.
 
     The extra ``all`` names other extras of the package itself.
     """
@@ -37,7 +37,7 @@ def declared() -> set[str]:
 
 
 def imported_modules(source: str) -> Iterator[str]:
-    """Top-level modules that a source imports, also by ``import_module`` with a name that begins plainly."""
+    """Return the imported top-level modules of a source, also of ``import_module`` with a plain start."""
     for node in ast.walk(ast.parse(source)):
         if isinstance(node, ast.Import):
             yield from (alias.name.split(".")[0] for alias in node.names)
@@ -50,7 +50,7 @@ def imported_modules(source: str) -> Iterator[str]:
 
 
 def imported_distributions() -> dict[str, set[str]]:
-    """The distributions that may provide each third-party module of the package."""
+    """Return the possible distributions of each third-party module of the package."""
     providers = packages_distributions()
     own = {*sys.stdlib_module_names, "ipsys_log"}
     sources = [path.read_text(encoding="utf-8") for path in (ROOT / "ipsys_log").rglob("*.py")]

@@ -1,4 +1,4 @@
-"""Logs that others wrote: images and calibrations under any names, known by their schemas."""
+"""Logs of other software: images and calibrations with any names, identified by their schemas."""
 
 from __future__ import annotations
 
@@ -45,7 +45,7 @@ def jpeg(marker_id: int, frame_id: str, time_ns: int) -> Any:
 
 def raw(marker_id: int, frame_id: str, time_ns: int) -> Any:
     colour = cv2.cvtColor(picture(marker_id), cv2.COLOR_GRAY2RGB)
-    padded = np.zeros((360, 2048), np.uint8)  # rows may be longer than what is in them
+    padded = np.zeros((360, 2048), np.uint8)  # rows may be longer than their contents
     padded[:, : 640 * 3] = colour.reshape(360, -1)
     image = RawImage(width=640, height=360, encoding="rgb8", step=2048, data=padded.tobytes())
     return stamped(image, frame_id, time_ns)
@@ -65,7 +65,7 @@ def lens(frame_id: str, time_ns: int) -> Any:
 
 
 def write(path: Path, messages: Iterable[tuple[str, int, Any]], compression: CompressionType) -> None:
-    """A log as the stock writer makes it: everything interleaved, one schema per message type."""
+    """Write a log with the stock writer: everything interleaved, one schema per message type."""
     with path.open("wb") as file:
         writer = Writer(file, compression=compression)
         writer.start()
@@ -113,12 +113,12 @@ def test_detect_and_camera_frame(
             "left_cam": "/Left-Cam/image_raw/compressed",
             "robot_front": "/robot/front",
         }
-        # By topic for the one, by the frame that they share for the other.
+        # one by its topic, the other by the common frame
         assert session.calibrations == {"left_cam": "/Left-Cam/camera_info", "robot_front": "/front_info"}
         for camera, marker_id in (("left_cam", 3), ("robot_front", 4)):
             seen = session.payloads([f"/runs/edges/cameras/{camera}/markers"])
             assert [[m.id for m in frame.markers] for frame in seen] == [[marker_id]] * 5
-            # The first frames came before their lens did: the first one known holds for them.
+            # The first frames precede their calibration: the first known calibration is valid for them.
             points = session.payloads([f"/runs/edges/cameras/{camera}/camera_points"])
             assert len(points) == 5
             assert points[0].points[0].z_m == pytest.approx(0.2 * 500 / 100, rel=0.02)
@@ -134,14 +134,14 @@ def test_a_second_detect_finds_the_first(ipsys: Ipsys, tmp_path: Path, rig: Path
     write(log, [("/cam", t, jpeg(1, "cam", t)) for t in (1, 2, 3)], CompressionType.ZSTD)
     done = ipsys("detect", log, "--rig", rig)
     assert done.code == 0
-    # Edges are fitted through the lens: without one corners are OpenCV's, and that is said.
+    # Edge fits need intrinsics: without them, corners are OpenCV's, and a message says so.
     assert "camera cam has no calibration: corners are found as with --corners stock" in done.err
     before = log.read_bytes()
     assert "up to date" in ipsys("detect", log, "--rig", rig).err
     assert log.read_bytes() == before
 
 
-def test_edges_that_were_asked_for_need_a_lens(ipsys: Ipsys, tmp_path: Path, rig: Path) -> None:
+def test_edges_option_needs_intrinsics(ipsys: Ipsys, tmp_path: Path, rig: Path) -> None:
     log = tmp_path / "foreign.mcap"
     write(log, [("/cam", 1, jpeg(1, "cam", 1))], CompressionType.ZSTD)
     before = log.read_bytes()
@@ -206,7 +206,7 @@ def test_json_is_read_too(ipsys: Ipsys, tmp_path: Path, rig: Path) -> None:
         ("protobuf", b"\xff\xff", "not a valid foxglove.CompressedImage"),
     ],
 )
-def test_what_cannot_be_decoded_is_named(
+def test_undecodable_frames_are_reported(
     ipsys: Ipsys, tmp_path: Path, rig: Path, encoding: str, data: bytes, said: str
 ) -> None:
     log = write_raw(tmp_path / "odd.mcap", encoding, "", data)

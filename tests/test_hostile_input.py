@@ -1,4 +1,4 @@
-"""Input that asks for too much, or says what cannot be: one line, never a traceback, and little memory."""
+"""Input with excessive or impossible values: one line, never a traceback, and little memory."""
 
 from __future__ import annotations
 
@@ -143,7 +143,7 @@ def test_lens_file_with_a_wrong_matrix_is_one_line(tmp_path: Path, rows: str) ->
     ],
 )
 def test_lens_file_of_many_levels_is_one_line(tmp_path: Path, name: str, text: str) -> None:
-    """In a process of its own: OpenCV's reader would end the process."""
+    """Run in a separate process: OpenCV's reader would end the process."""
     path = tmp_path / name
     path.write_text(text, errors="surrogateescape")
     code = (
@@ -159,7 +159,7 @@ def test_lens_file_of_many_levels_is_one_line(tmp_path: Path, name: str, text: s
 
 
 @pytest.mark.parametrize("change", ["nan", "huge", "zero focal length", "size", "no size"])
-def test_lens_of_a_log_that_cannot_be_is_refused(change: str) -> None:
+def test_impossible_calibration_of_a_log_is_refused(change: str) -> None:
     K, D = np.array([[500.0, 0, 480], [0, 500, 270], [0, 0, 1]]), np.zeros(4)
     K[0, 2] = {"nan": np.nan, "huge": 1e308}.get(change, 480.0)
     K[0, 0] = 0.0 if change == "zero focal length" else 500.0
@@ -225,7 +225,7 @@ def test_png_that_claims_gigabytes_takes_no_memory() -> None:
 @pytest.mark.parametrize("size", [(8, 8), (3000, 4000), (1, 1), (16, 4000)])
 @pytest.mark.parametrize("options", [[], [cv2.IMWRITE_JPEG_PROGRESSIVE, 1], [cv2.IMWRITE_JPEG_OPTIMIZE, 1]])
 def test_jpeg_of_one_colour_is_read(size: tuple[int, int], options: list[int]) -> None:
-    """The smallest that an encoder makes of so many pixels."""
+    """Return the smallest encoded image of a given size."""
     for picture in (np.zeros(size, np.uint8), np.zeros((*size, 3), np.uint8)):
         data = cv2.imencode(".jpg", picture, [cv2.IMWRITE_JPEG_QUALITY, 1, *options])[1].tobytes()
         check_encoded(data)

@@ -20,7 +20,7 @@ LAYER = {name: level for level, names in enumerate(LAYERS) for name in names}
 
 
 def imports(source: str) -> Iterator[str]:
-    """Dotted names within the package that a source imports."""
+    """Return the dotted names within the package that a source imports."""
     for node in ast.walk(ast.parse(source)):
         names = []
         if isinstance(node, ast.ImportFrom) and node.module and node.level == 0:
@@ -31,7 +31,7 @@ def imports(source: str) -> Iterator[str]:
 
 
 def fault(module: str, imported: str) -> str | None:
-    """Explain why ``module`` must not import ``imported``; both dotted, without the package."""
+    """Return the reason why ``module`` must not import ``imported``; both dotted, without the package."""
     importer, target = module.split("."), imported.split(".")
     if target[0] not in LAYER:
         return None  # a name of the package itself
@@ -81,7 +81,7 @@ CLOCKS = {"time", "time_ns", "monotonic", "monotonic_ns", "perf_counter", "perf_
 
 
 def clocks(source: str) -> set[str]:
-    """Calls in a source that read a clock: ``time.time()``, ``datetime.now()`` and the like."""
+    """Return calls in a source that read a clock: ``time.time()``, ``datetime.now()`` and others."""
     called = (node.func for node in ast.walk(ast.parse(source)) if isinstance(node, ast.Call))
     return {
         f"{call.value.id}.{call.attr}"
@@ -92,7 +92,7 @@ def clocks(source: str) -> set[str]:
 
 
 def test_nothing_but_a_source_reads_a_clock() -> None:
-    """Law 2: a stage that read a clock would not replay. Sources have one, all the same one."""
+    """A stage that reads a clock could not be replayed. Sources share one clock."""
     reading = {name for name, path in modules() if clocks(path.read_text())}
     assert reading == {"capture.frames"}
 

@@ -1,4 +1,4 @@
-"""Live equals replay: what the stages made while frames came is what they make of the log, byte for byte."""
+"""Live equals replay: the live results equal those from the log, byte for byte."""
 
 from __future__ import annotations
 
@@ -53,7 +53,7 @@ from ipsys_log.survey.scene import observe_marker
 from tests.conftest import Ipsys
 from tests.playing import SteppedClock, cameras, playing
 
-# Slow enough for a machine that does other things too.
+# slow enough for a busy machine
 RATE_HZ = 6.0
 
 
@@ -66,7 +66,7 @@ def calibration(lab_log: Path, tmp_path_factory: pytest.TempPathFactory) -> Path
 
 
 def sent(lab: Path) -> dict[str, list[bytes]]:
-    """The frames of a log, by camera."""
+    """Return the frames of a log by camera."""
     with Session([lab]) as session:
         return {name: [p.data for p in session.payloads([t])] for name, t in session.images.items()}
 
@@ -97,7 +97,7 @@ def again(log: Path, run: str | None = None) -> list[Comparison]:
 
 @pytest.fixture(scope="session")
 def recorded(lab_log: Path, calibration: Path, tmp_path_factory: pytest.TempPathFactory) -> Path:
-    """Recorded by a machine that is fast enough: no frame is skipped."""
+    """Record on a fast machine: no frame is skipped."""
     target, frames = tmp_path_factory.mktemp("live") / "live.mcap", sent(lab_log)
     clock = SteppedClock(list(frames), RATE_HZ)
     with Session([lab_log]) as session:
@@ -146,7 +146,7 @@ def test_a_position_has_the_times_of_its_steps(recorded: Path) -> None:
 
 
 def tampered(log: Path, target: Path, kind: type, change: Callable[[Any], Any]) -> Path:
-    """A copy of a log in which the first message that a change applies to is changed."""
+    """Copy a log, and change the first message to which a change applies."""
     done = False
 
     def messages() -> Iterator[Message]:
@@ -188,21 +188,19 @@ def _corner(payload: Markers) -> Markers | None:
     return replace(payload, markers=(replace(first, corners_px=first.corners_px + 1e-9), *rest))
 
 
-def test_a_marker_that_was_tampered_with_shows_where_it_is_and_in_all_that_was_made_of_it(
-    recorded: Path, tmp_path: Path
-) -> None:
+def test_changed_marker_is_found_in_all_later_results(recorded: Path, tmp_path: Path) -> None:
     log = tampered(recorded, tmp_path / "tampered.mcap", Markers, _corner)
     apart = {one.topic.rpartition("/")[2]: one.left - one.same for one in again(log) if not one.equal}
     assert apart["markers"] == apart["camera_points"] == 1
 
 
-def test_bytes_that_no_field_speaks_of_are_found(recorded: Path, tmp_path: Path) -> None:
+def test_unknown_bytes_are_found(recorded: Path, tmp_path: Path) -> None:
     log = tmp_path / "more.mcap"
     with LogReader(recorded) as reader, LogWriter.create(log) as writer:
         for topic, channel in reader.channels.items():
             writer.add_channel(topic, channel.schema, channel.message_encoding)
         for n, one in enumerate(reader.messages()):
-            # A field of number 999 is read over.
+            # A field with number 999 is ignored.
             more = b"\xb8\x3e\x01" if one.topic == "/runs/poly/poses" and n > 50 else b""
             writer.write(one.topic, one.log_time_ns, one.publish_time_ns, bytes(one.data) + more)
     assert {one.topic for one in again(log) if not one.equal} == {"/runs/poly/poses"}
@@ -219,7 +217,7 @@ def test_one_run_under_two_names_is_the_same(
     assert "name a second log" in ipsys("diff", log).err
 
 
-def test_a_place_measured_since_is_said_and_no_difference(
+def test_point_measured_later_is_reported_and_no_difference(
     ipsys: Ipsys, lab_log: Path, tmp_path: Path
 ) -> None:
     log = tmp_path / "lab.mcap"
@@ -246,9 +244,7 @@ def test_a_result_that_is_gone_is_found(recorded: Path, tmp_path: Path) -> None:
     assert set(apart.values()) == {"no record says how it was made"}
 
 
-def test_models_and_their_evaluation_are_made_again_too(
-    lab_log: Path, calibration: Path, tmp_path: Path
-) -> None:
+def test_models_and_evaluations_are_computed_again(lab_log: Path, calibration: Path, tmp_path: Path) -> None:
     def apart(log: Path) -> dict[str, bool]:
         return {one.topic: one.equal for one in verify([lab_log, log], None, lambda stage, done, total: None)}
 
@@ -263,7 +259,7 @@ def test_models_and_their_evaluation_are_made_again_too(
     assert [topic for topic, equal in found.items() if not equal] == ["/runs/poly/evaluation"]
 
 
-def test_robots_that_were_renamed_are_verified_with_their_own_rig(
+def test_renamed_robots_are_verified_with_their_rig(
     recorded: Path, calibration: Path, tmp_path: Path
 ) -> None:
     other = tmp_path / "renamed.mcap"
@@ -276,7 +272,7 @@ def test_robots_that_were_renamed_are_verified_with_their_own_rig(
     assert any(one.topic == "/runs/poly_2/tracks" for one in again(other))
 
 
-def test_cameras_without_a_lens_are_said_before_anything_is_recorded(
+def test_cameras_without_intrinsics_are_reported_first(
     lab_log: Path, calibration: Path, tmp_path: Path
 ) -> None:
     attached, settings = attached_to(lab_log, 60.0)
@@ -286,7 +282,7 @@ def test_cameras_without_a_lens_are_said_before_anything_is_recorded(
     assert not (tmp_path / "x.mcap").exists()
 
 
-def test_a_stage_that_stops_does_not_stop_the_recording(
+def test_failed_stage_does_not_stop_the_recording(
     lab_log: Path, calibration: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     def broken(self: Detect, message: Message) -> Any:
@@ -307,7 +303,7 @@ def test_a_stage_that_stops_does_not_stop_the_recording(
 
 
 class Failing:
-    """A consumer that fails at its n-th message, and is shown none after that."""
+    """A consumer that fails at its n-th message, and gets no more messages."""
 
     def __init__(self, number: int) -> None:
         self.left = number
@@ -360,7 +356,7 @@ def test_frame_that_was_exchanged_is_found(recorded: Path, tmp_path: Path) -> No
 
 
 class Jumping(Clock):
-    """A clock that goes ahead at once, as that of a recorder that stood still meanwhile."""
+    """A clock that jumps, as of a recorder that was suspended."""
 
     ahead_ns = 0
 
@@ -370,7 +366,7 @@ class Jumping(Clock):
 
 @pytest.fixture(scope="session")
 def stalled(lab_log: Path, calibration: Path, tmp_path_factory: pytest.TempPathFactory) -> Path:
-    """Recorded from cameras without stamps by a program that stood still for 2 s after their tenth frame."""
+    """Record cameras without stamps, with a program that pauses for 2 s after their tenth frame."""
     target, clock = tmp_path_factory.mktemp("stalled") / "live.mcap", Jumping()
     frames = {name: [*found[:10], *found[9:0:-1], *found[:10]] for name, found in sent(lab_log).items()}
 
@@ -398,7 +394,7 @@ def test_live_with_late_frames_equals_replay(stalled: Path, calibration: Path) -
 
 
 def late_ranges(events: list[Event]) -> dict[str, list[tuple[float, float]]]:
-    """By camera from when to when frames came late: as its events say, two for each time."""
+    """Return the times of late frames by camera, from the two events of each stall."""
     ranges: dict[str, list[tuple[float, float]]] = {}
     for camera in {str(event.camera) for event in events}:
         mine = [event for event in events if event.camera == camera]
@@ -429,7 +425,7 @@ def test_late_frames_are_named_and_in_no_track(stalled: Path) -> None:
 
 
 def test_runs_of_logs_without_late_frames_read_no_events(overloaded: Path) -> None:
-    """They are the same runs as before there was such an event."""
+    """The runs are the same as without such an event."""
     with Session([overloaded]) as session:
         assert session.count("/events") > 0
         read = {read.topic for run in session.runs() for read in run.inputs if run.stage == "fuse"}
@@ -448,7 +444,7 @@ def slow(step: Callable[..., Any]) -> Callable[..., Any]:
 
 @pytest.fixture
 def overloaded(lab_log: Path, calibration: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Path:
-    """Recorded by a machine that is too slow for its cameras."""
+    """Record on a machine that is too slow for its cameras."""
     target = tmp_path / "overloaded.mcap"
     with monkeypatch.context() as patch:
         patch.setattr(Detect, "__call__", slow(Detect.__call__))
@@ -456,7 +452,7 @@ def overloaded(lab_log: Path, calibration: Path, tmp_path: Path, monkeypatch: py
     return target
 
 
-def test_a_slow_machine_skips_frames_after_recording_them_and_says_which(
+def test_slow_machine_records_and_names_skipped_frames(
     overloaded: Path, lab_log: Path, calibration: Path
 ) -> None:
     with Session([overloaded]) as session, Session([lab_log]) as sent:
@@ -473,7 +469,7 @@ def test_a_slow_machine_skips_frames_after_recording_them_and_says_which(
     assert len(skipped) > 5
     assert markers == frames - skipped
     assert all(one.equal for one in again(overloaded))
-    # As it was, or all of it: the user says which.
+    # Replay as live, or all frames: the user chooses.
     request = Request(model_from=calibration, as_live=True)
     assert not any(one.fresh for one in pipeline.replay([overloaded], request))
     assert all(
@@ -502,9 +498,7 @@ def _copied(log: Path) -> Iterator[Message]:
         yield from session.messages({t for reader in session.readers for t in reader.channels})
 
 
-def test_a_recording_without_stages_is_detected_later_all_the_same(
-    lab_log: Path, recorded: Path, tmp_path: Path
-) -> None:
+def test_recording_without_stages_is_detected_later(lab_log: Path, recorded: Path, tmp_path: Path) -> None:
     target = tmp_path / "plain.mcap"
     attached, settings = attached_to(lab_log, 60.0)
     with attached:
@@ -520,7 +514,7 @@ def test_a_recording_without_stages_is_detected_later_all_the_same(
         assert all(run.stage == "detect" for run in one.runs())
 
 
-def test_a_model_that_is_not_there(ipsys: Ipsys, lab: Path, tmp_path: Path) -> None:
+def test_missing_model_is_refused(ipsys: Ipsys, lab: Path, tmp_path: Path) -> None:
     attached, settings = attached_to(lab, 60.0)
     with attached, pytest.raises(Exception, match="has no fitted model"):
         pipeline.live(attached, settings, tmp_path / "x.mcap", Request(model_from=lab))
@@ -555,10 +549,10 @@ def test_the_latency_ledger_as_table_and_picture(ipsys: Ipsys, recorded: Path, t
         ]
 
 
-def test_a_place_is_measured_while_it_is_recorded_and_a_model_is_fitted_to_it(
+def test_point_measured_during_a_recording_is_used_by_fit(
     lab_log: Path, calibration: Path, tmp_path: Path
 ) -> None:
-    """The distances are those that were measured in the lab; nothing of it but frames is in the recording."""
+    """The distances are those of the lab; the recording has only frames."""
     with Session([lab_log]) as session:
         measured: list[Measurement] = session.payloads(["/measurements"])
         (model,) = Session([calibration]).payloads(["/runs/poly/model"])

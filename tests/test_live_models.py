@@ -1,4 +1,4 @@
-"""Several models live: each has its own chain of stages, equal to a replay with that model alone."""
+"""Several live models: each has its own chain of stages, equal to a replay with that model alone."""
 
 from __future__ import annotations
 
@@ -25,7 +25,7 @@ MODELS = ("poly", "rigid")
 
 @pytest.fixture(scope="module")
 def fitted(lab_log: Path, tmp_path_factory: pytest.TempPathFactory) -> Path:
-    """A log with both models."""
+    """Return a log with both models."""
     path = tmp_path_factory.mktemp("models") / "calibration.mcap"
     pipeline.replay([lab_log], Request(models=MODELS), output=path)
     return path
@@ -33,7 +33,7 @@ def fitted(lab_log: Path, tmp_path_factory: pytest.TempPathFactory) -> Path:
 
 @pytest.fixture(scope="module")
 def recorded(lab_log: Path, fitted: Path, tmp_path_factory: pytest.TempPathFactory) -> Path:
-    """A live recording with both models; no frame is skipped."""
+    """Return a live recording with both models and no skipped frame."""
     target, frames = tmp_path_factory.mktemp("models") / "live.mcap", sent(lab_log)
     clock = SteppedClock(list(frames), RATE_HZ)
     with Session([lab_log]) as session:
@@ -68,7 +68,7 @@ def test_two_models_live_equal_two_replays(recorded: Path, fitted: Path, tmp_pat
 
 
 def derived(session: Session) -> list[str]:
-    """The derived topics of a log, without models: one that is copied has the time of the copy."""
+    """Return the derived topics of a log, without models: a copied model has the time of the copy."""
     channels = {topic for reader in session.readers for topic in reader.channels}
     return sorted(t for t in channels if t.startswith("/runs/") and not t.endswith(("/record", "/model")))
 

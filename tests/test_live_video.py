@@ -1,4 +1,4 @@
-"""Video that is more than the machine can do: frames are skipped, and live equals replay all the same."""
+"""Video above the machine's capacity: frames are skipped, and live still equals replay."""
 
 from __future__ import annotations
 
@@ -32,7 +32,7 @@ SECONDS = 3.5
 
 @contextmanager
 def streamed(lab: Path, folder: Path, *options: str) -> Iterator[str]:
-    """The address at which FFmpeg sends the red camera's pictures as video, 30 a second."""
+    """Return the address of FFmpeg's video stream of the red camera at 30 Hz."""
     with Session([lab]) as session:
         for number, frame in enumerate(session.payloads([session.images["red"]])):
             (folder / f"{number:03}.jpg").write_bytes(frame.data)
@@ -44,7 +44,7 @@ def streamed(lab: Path, folder: Path, *options: str) -> Iterator[str]:
 
 
 def go_live(lab: Path, address: str, target: Path) -> None:
-    """For some seconds, up to the markers."""
+    """Record some seconds, up to the markers."""
     attached = LiveCameras([RigCamera("red", source=address)], open_network, Clock())
     with Session([lab]) as session:
         (rig,) = session.payloads(["/rig"])
@@ -58,7 +58,7 @@ def go_live(lab: Path, address: str, target: Path) -> None:
 
 
 def slow_search(patch: pytest.MonkeyPatch) -> None:
-    """A machine that decodes in time, and does not search in time."""
+    """A machine that decodes in time, but does not search in time."""
     step: Callable[..., Any] = Detect.__call__
 
     def slower(self: Detect, message: Message) -> Any:
@@ -70,7 +70,7 @@ def slow_search(patch: pytest.MonkeyPatch) -> None:
 
 
 def slow_decoding(patch: pytest.MonkeyPatch) -> None:
-    """A machine that does not even decode in time."""
+    """A machine that does not decode in time."""
     step = Video._next
 
     def slower(self: Video, frame: CompressedVideo) -> Any:
@@ -83,7 +83,7 @@ def slow_decoding(patch: pytest.MonkeyPatch) -> None:
 @pytest.mark.parametrize(
     ("codec", "machine"), [(H264, slow_search), (H265, slow_search), (H264, slow_decoding)]
 )
-def test_a_slow_machine_skips_frames_of_a_video_and_a_replay_gives_the_same(
+def test_skipped_video_frames_are_equal_in_a_replay(
     codec: tuple[str, ...],
     machine: Callable[[pytest.MonkeyPatch], None],
     lab_log: Path,
@@ -106,7 +106,7 @@ def test_a_slow_machine_skips_frames_of_a_video_and_a_replay_gives_the_same(
     assert len(skipped) > 30
     seen = {one.log_time_ns for one in found}
     assert seen == {one.log_time_ns for one in frames} - skipped
-    # To the end: it does not fall behind.
+    # The results continue to the end.
     assert len(seen & {one.log_time_ns for one in frames[-25:]}) > 0
     assert all(one.equal and one.left for one in verify([target], None, lambda *_: None))
     assert not any(one.fresh for one in pipeline.replay([target], Request(as_live=True), "detect"))

@@ -1,4 +1,4 @@
-"""Measuring on a finished log: what goes in comes out as a model, and what is withdrawn does not count."""
+"""Measuring on a finished log: measurements reach the model, and withdrawn ones do not count."""
 
 from __future__ import annotations
 
@@ -38,7 +38,7 @@ from tests.test_bad_input import refused, rewrite
 
 
 def as_typed(measurement: Measurement) -> TypedEntry:
-    """A measurement as somebody would type it, to a tenth of a millimetre."""
+    """Return a measurement as typed text, to a tenth of a millimetre."""
     distances = {d.reference: f"{100 * d.distance_m:.2f}" for d in measurement.distances}
     height = f"{100 * (measurement.height_m or 0):.2f}"
     split = " ".join(measurement.splits)
@@ -46,7 +46,7 @@ def as_typed(measurement: Measurement) -> TypedEntry:
 
 
 def sheet(path: Path, tape: Iterable[Measurement], **columns: list[str]) -> Path:
-    """A sheet of these measurements."""
+    """Write a sheet of these measurements."""
     rows = [",".join(["marker", "d_A_cm", "d_B_cm", "side", "height_cm", "split", *columns])]
     for n, one in enumerate(map(as_typed, tape)):
         cells = [one.marker, one.distances["A"], one.distances["B"], one.side, one.height, one.split]
@@ -67,7 +67,7 @@ class Row(NamedTuple):
 
 
 def foreign_read(path: Path) -> list[Row]:
-    """The measurements as the ``mcap`` package and protobuf read them, by the schema in the log alone."""
+    """Return the measurements as read by the ``mcap`` package and protobuf, with the schema in the log."""
     rows = []
     with path.open("rb") as file:
         for schema, _, message in make_reader(file).iter_messages(topics=[MEASUREMENTS_TOPIC]):
@@ -82,7 +82,7 @@ def foreign_read(path: Path) -> list[Row]:
 
 
 def pairs_of(log: Path) -> dict[tuple[str, int, tuple[float, ...]], Pair]:
-    """Return what each camera saw at each place, by camera, marker and camera point in nm."""
+    """Return the observations of each camera at each point, by camera, marker and camera point in nm."""
     with Session([log]) as session:
         model = session.payloads(session.topics(MODEL, "poly"))[-1]
     return {
@@ -92,18 +92,18 @@ def pairs_of(log: Path) -> dict[tuple[str, int, tuple[float, ...]], Pair]:
     }
 
 
-def test_every_place_of_a_session_is_found_and_paired_as_if_measured_while_recording(
+def test_points_measured_later_give_the_pairs_of_a_live_session(
     ipsys: Ipsys, unmeasured: Unmeasured, lab: Path, tmp_path: Path
 ) -> None:
     assert ipsys("replay", lab).code == 0
-    # What lay outside of the pictures, or was seen in one of them only, is not known to have lain still.
+    # Markers outside the images, or in only one image, are not known to be stationary.
     theirs = {key: pair for key, pair in pairs_of(lab).items() if pair.frames > 1}
     seen = {pair.measurement for pair in theirs.values()}
     log, tape = unmeasured
     tape = [one for one in tape if one.id in seen]
     before = data_section(log)
     path = sheet(tmp_path / "a.csv", tape, time=times(tape, log))
-    # One place is so near to B that its distance may be in metres; nothing else is doubted.
+    # One point is so near to B that its distance may be in metres; no other is doubtful.
     (doubt,) = refused(ipsys, log, "measure", log, "--csv", path).splitlines()[1:]
     assert "d_B_cm: 8.15 cm is very near to B: in metres? Then type 815" in doubt
     done = ipsys("measure", log, "--csv", path, "--force")
@@ -116,7 +116,7 @@ def test_every_place_of_a_session_is_found_and_paired_as_if_measured_while_recor
     assert theirs.keys() <= mine.keys()
     assert len(theirs) > 40
     for key, pair in theirs.items():
-        # Typed to a tenth of a millimetre, of which flat circles make up to four times as much.
+        # Values are to a tenth of a millimetre; flat circles amplify this up to four times.
         assert np.allclose(mine[key].world_m, pair.world_m, atol=0.0003), key
 
 
@@ -126,7 +126,7 @@ def fitted_ids(log: Path, run: str) -> set[str]:
     return {pair.measurement for camera in model.cameras for pair in camera.pairs}
 
 
-def test_one_place_its_undo_and_what_a_fit_makes_of_both(ipsys: Ipsys, unmeasured: Unmeasured) -> None:
+def test_fit_uses_a_measured_point_and_ignores_a_withdrawn_one(ipsys: Ipsys, unmeasured: Unmeasured) -> None:
     log, tape = unmeasured
     with open_finished_log(log, Request()) as scene:
         for one in tape[8:20]:
@@ -150,7 +150,9 @@ def test_one_place_its_undo_and_what_a_fit_makes_of_both(ipsys: Ipsys, unmeasure
     assert at[f"{gone}_withdrawn"] > at["p003"]
 
 
-def test_rows_of_a_marker_in_order_and_by_place(ipsys: Ipsys, unmeasured: Unmeasured, tmp_path: Path) -> None:
+def test_sheet_rows_match_intervals_by_order_or_by_number(
+    ipsys: Ipsys, unmeasured: Unmeasured, tmp_path: Path
+) -> None:
     log, tape = unmeasured
     mine = [one for one in tape if one.marker_id == 3]
     done = ipsys("measure", log, "--csv", sheet(tmp_path / "a.csv", mine))
@@ -223,7 +225,7 @@ def test_a_bad_sheet_changes_nothing_and_names_its_rows(
         assert sum(part in line for line in lines) == 1
 
 
-def test_one_bad_row_keeps_the_good_ones_out(ipsys: Ipsys, unmeasured: Unmeasured) -> None:
+def test_one_bad_row_keeps_all_rows_out_of_the_log(ipsys: Ipsys, unmeasured: Unmeasured) -> None:
     log, tape = unmeasured
     path = sheet(log.with_name("sheet.csv"), tape, time=times(tape, log))
     lines = path.read_text().splitlines()
@@ -234,7 +236,7 @@ def test_one_bad_row_keeps_the_good_ones_out(ipsys: Ipsys, unmeasured: Unmeasure
     assert rows[0].startswith("  line 8: left or right of the line")
 
 
-def test_a_log_that_is_locked_gone_or_not_to_be_written(ipsys: Ipsys, unmeasured: Unmeasured) -> None:
+def test_locked_missing_or_read_only_log_is_refused(ipsys: Ipsys, unmeasured: Unmeasured) -> None:
     log = unmeasured.log
     with log.open("r+b") as other:
         fcntl.flock(other, fcntl.LOCK_EX)
@@ -245,13 +247,13 @@ def test_a_log_that_is_locked_gone_or_not_to_be_written(ipsys: Ipsys, unmeasured
         assert "cannot be opened for writing" in refused(ipsys, log, "measure", log)
 
 
-def test_two_people_at_one_log(unmeasured: Unmeasured) -> None:
+def test_two_processes_measure_in_one_log(unmeasured: Unmeasured) -> None:
     log, tape = unmeasured
     with open_finished_log(log, Request()) as one, open_finished_log(log, Request()) as other:
         one.add([Measurement(tape[0].timestamp, "p001", marker_id=0)])
         with pytest.raises(LogError, match="somebody else measured in this log meanwhile"):
             other.add([Measurement(tape[0].timestamp, "p001", marker_id=0)])
-        # What the first one did is known now: the other goes on after it, and they take turns.
+        # The second process now sees the first one's entry: it continues after it, and they alternate.
         assert [m.id for m in other.history()] == ["p001"]
         other.add([Measurement(tape[0].timestamp, "p002", marker_id=0)])
         with pytest.raises(LogError, match=r"meanwhile \(p002\), so this is not written yet"):
@@ -263,9 +265,7 @@ def test_two_people_at_one_log(unmeasured: Unmeasured) -> None:
     assert [row.id for row in foreign_read(log)] == ["p001", "p002", "p001_withdrawn"]
 
 
-def test_a_sheet_that_is_not_there_or_has_a_bad_header_is_told_before_markers_are_looked_for(
-    ipsys: Ipsys, lab: Path
-) -> None:
+def test_missing_or_bad_sheet_is_reported_before_detection(ipsys: Ipsys, lab: Path) -> None:
     line = refused(ipsys, lab, "measure", lab, "--csv", lab.with_name("none.csv"))
     assert "none.csv: cannot be read: No such file or directory" in line
     path = lab.with_name("sheet.csv")
@@ -281,7 +281,7 @@ def test_a_rig_without_reference_points(ipsys: Ipsys, unmeasured: Unmeasured) ->
     assert "[[reference_points]]" in line
 
 
-def test_a_log_in_which_nothing_lies_still(ipsys: Ipsys, lab: Path) -> None:
+def test_log_without_stationary_intervals_is_refused(ipsys: Ipsys, lab: Path) -> None:
     with Session([lab]) as session:
         start_ns = session.start_ns
     log = rewrite(lab, lambda m: m if m.log_time_ns <= start_ns + 1_050_000_000 else None)
@@ -290,7 +290,7 @@ def test_a_log_in_which_nothing_lies_still(ipsys: Ipsys, lab: Path) -> None:
     assert "no marker of the rig lies still in it" in done.err
 
 
-def test_options_that_exclude_one_another(ipsys: Ipsys, unmeasured: Unmeasured) -> None:
+def test_exclusive_options_are_refused(ipsys: Ipsys, unmeasured: Unmeasured) -> None:
     log = unmeasured.log
     assert "exclude one another" in refused(ipsys, log, "measure", log, "--terminal", "--places")
 
@@ -311,12 +311,12 @@ def test_the_terminal_asks_checks_and_undoes(
     assert "p001 is withdrawn" in done.out
     assert "1 place measured" in done.out
     assert [row.withdraws for row in foreign_read(log)] == ["", "p001"]
-    # Undone while place 2 was asked for, and back at place 1.
+    # withdrawn at the question for point 2, and back at point 1
     places = re.findall(r"Place (\d+) of", done.out)
     assert places == ["1", "2", "1"]
 
 
-def test_a_bad_answer_in_the_terminal_costs_that_answer_only(
+def test_bad_answer_in_the_terminal_is_asked_again(
     unmeasured: Unmeasured, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
 ) -> None:
     log, tape = unmeasured
@@ -325,9 +325,9 @@ def test_a_bad_answer_in_the_terminal_costs_that_answer_only(
         a, b = first.distances.values()
         script = [
             ("distance to A", "hallo"), ("distance to A", f"{a} cm"),
-            ("distance to B", "1.234"), ("distance to B", "3"),  # metres, perhaps: asked once more
+            ("distance to B", "1.234"), ("distance to B", "3"),  # possibly metres: asked again
             ("distance to B", ""),
-            ("distance to A", ""), ("distance to B", b),  # no triangle: what was good is kept by Enter
+            ("distance to A", ""), ("distance to B", b),  # no triangle: Enter keeps the good values
             ("left or right", "up"), ("left or right", {"left": "links", "right": "Rechts"}[first.side]),
             ("height", "0,15"), ("height", "x"), ("height", first.height),
             ("save p001", "perhaps"), ("save p001", "n"),
@@ -361,7 +361,7 @@ def test_a_bad_answer_in_the_terminal_costs_that_answer_only(
     assert as_typed(saved).distances == first.distances
 
 
-def test_in_the_terminal_somebody_else_may_measure_meanwhile(
+def test_terminal_entry_allows_a_second_process_to_measure(
     unmeasured: Unmeasured, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
 ) -> None:
     log, tape = unmeasured
@@ -403,4 +403,4 @@ def test_a_port_in_use(ipsys: Ipsys, unmeasured: Unmeasured) -> None:
     with socket.create_server(("127.0.0.1", 0)) as taken:
         port = taken.getsockname()[1]
         line = refused(ipsys, unmeasured.log, "measure", unmeasured.log, "--port", port)
-    assert f"--port {port}: is in use by another program; give another one" in line
+    assert f"--port {port}: is in use by another program; give another port" in line

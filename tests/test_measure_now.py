@@ -1,4 +1,4 @@
-"""``ipsys measure`` with cameras: what is left of a session, however it ends."""
+"""``ipsys measure`` with cameras: the remaining data of a session, for every end."""
 
 from __future__ import annotations
 
@@ -34,7 +34,7 @@ HEAD = ("measure", "--port", "0", "--rig")
 
 
 class Lab(NamedTuple):
-    """A rig whose cameras send a minute of one station, and what the tape says there."""
+    """Return a rig whose cameras send a minute of one station, and its tape measurement."""
 
     rig: Path
     lenses: Path
@@ -74,7 +74,7 @@ def still_lab(lab_log: Path, tmp_path_factory: pytest.TempPathFactory) -> Lab:
 
 
 class Page:
-    """The page's questions, without a browser."""
+    """The requests of the page, without a browser."""
 
     def __init__(self, url: str) -> None:
         self._url = url
@@ -90,7 +90,7 @@ class Page:
         return found
 
     def measure(self, one: Measurement) -> dict[str, Any]:
-        """Save a place as soon as its marker has lain still, whatever is doubtful."""
+        """Save a point as soon as its marker is stationary, in spite of warnings."""
         body: dict[str, Any] = {
             "marker": str(one.marker_id),
             "distances": {d.reference: f"{100 * d.distance_m:.2f}" for d in one.distances},
@@ -109,7 +109,7 @@ class Page:
 
 @contextmanager
 def measuring(lab: Lab, log: Path) -> Iterator[tuple[subprocess.Popen[str], Page]]:
-    """The command with its page, once the cameras have been looked through for a second."""
+    """Run the command with its page; the cameras were checked for a second."""
     command = [*HEAD, lab.rig, "--calibration", lab.lenses, "-o", log]
     with subprocess.Popen(
         [sys.executable, "-m", "ipsys_log", *map(str, command)],
@@ -140,7 +140,7 @@ def counted(log: Path) -> dict[str, int]:
 
 
 @pytest.mark.parametrize("number", [signal.SIGINT, signal.SIGTERM])
-def test_places_are_measured_on_the_page_until_it_is_told_to_end(
+def test_page_measures_points_until_it_is_stopped(
     number: int, ipsys: Ipsys, still_lab: Lab, tmp_path: Path
 ) -> None:
     log = tmp_path / "places.mcap"
@@ -150,7 +150,7 @@ def test_places_are_measured_on_the_page_until_it_is_told_to_end(
             page.measure(one)
         measured_s = time.monotonic() - begun_s
         assert page.ask("undo", {"id": "p002"})["withdrawn"] == "p002"
-        time.sleep(3)  # of which nothing is kept
+        time.sleep(3)  # without kept data
         program.send_signal(number)
         out, err = program.communicate(timeout=PATIENCE_S)
     assert program.returncode == 0, err
@@ -158,13 +158,13 @@ def test_places_are_measured_on_the_page_until_it_is_told_to_end(
     assert f"6 places measured into {log}, 1 withdrawn" in out
     assert [row.withdraws for row in foreign_read(log)] == [""] * 6 + ["p002"]
     for name, count in counted(log).items():
-        # One second before the first place, and until the last one.
+        # from one second before the first point, and until the last one
         assert 7 < count < RATE_HZ * (measured_s + 2), name
     listed = ipsys("measure", log, "--places")
     assert all(f"p00{n}" in listed.out for n in (1, 3, 4, 5, 6))
 
 
-def test_what_was_measured_survives_a_kill(ipsys: Ipsys, still_lab: Lab, tmp_path: Path) -> None:
+def test_measured_points_survive_a_kill(ipsys: Ipsys, still_lab: Lab, tmp_path: Path) -> None:
     log = tmp_path / "places.mcap"
     with measuring(still_lab, log) as (program, page):
         page.measure(still_lab.tape[0])
@@ -183,7 +183,7 @@ def test_what_was_measured_survives_a_kill(ipsys: Ipsys, still_lab: Lab, tmp_pat
             assert len(inside) > 5
 
 
-def test_a_kill_before_the_first_place_leaves_rig_and_lenses(
+def test_kill_before_the_first_point_leaves_rig_and_intrinsics(
     ipsys: Ipsys, still_lab: Lab, tmp_path: Path
 ) -> None:
     log = tmp_path / "places.mcap"
@@ -196,9 +196,7 @@ def test_a_kill_before_the_first_place_leaves_rig_and_lenses(
         assert len(session.calibrations) == 3
 
 
-def test_a_log_that_is_there_is_kept_unless_it_is_forced(
-    ipsys: Ipsys, still_lab: Lab, tmp_path: Path
-) -> None:
+def test_existing_log_is_kept_without_force(ipsys: Ipsys, still_lab: Lab, tmp_path: Path) -> None:
     log = tmp_path / "places.mcap"
     log.write_bytes(b"years of data")
     done = ipsys(*HEAD, still_lab.rig, "--calibration", still_lab.lenses, "-o", log)
@@ -223,7 +221,7 @@ def test_a_log_that_is_there_is_kept_unless_it_is_forced(
         (["measure", "--rig", "RIG", "-o", "a.mcap"], "has no lens"),
     ],
 )
-def test_what_does_not_go_together(
+def test_incompatible_options_are_refused(
     ipsys: Ipsys, still_lab: Lab, tmp_path: Path, monkeypatch: pytest.MonkeyPatch, given: list[str], said: str
 ) -> None:
     monkeypatch.chdir(tmp_path)
@@ -235,7 +233,7 @@ def test_what_does_not_go_together(
 
 
 def typed(command: list[str], answers: list[tuple[str, str]]) -> tuple[int, str]:
-    """Run a command in a terminal, and answer what it asks; its exit code and all that was to be read."""
+    """Run a command in a terminal, and answer its questions; return exit code and output."""
     child, terminal = pty.fork()
     if child == 0:
         os.execv(sys.executable, [sys.executable, "-m", "ipsys_log", *command])
@@ -248,7 +246,7 @@ def typed(command: list[str], answers: list[tuple[str, str]]) -> tuple[int, str]
             raise AssertionError(f"nothing more after {told}")
         try:
             data = os.read(terminal, 1 << 16)
-        except OSError:  # it has ended
+        except OSError:  # the command has ended
             break
         told += data.decode(errors="replace")
         if left and left[0][0] in told[seen:]:
@@ -263,7 +261,7 @@ def typed(command: list[str], answers: list[tuple[str, str]]) -> tuple[int, str]
 
 
 @pytest.mark.parametrize("end", ["q\n", "\x03", "SIGTERM"])
-def test_places_are_measured_in_the_terminal(end: str, still_lab: Lab, tmp_path: Path) -> None:
+def test_points_are_measured_in_the_terminal(end: str, still_lab: Lab, tmp_path: Path) -> None:
     log, one = tmp_path / "places.mcap", still_lab.tape[0]
     a, b = (f"{100 * d.distance_m:.2f}" for d in one.distances)
     command = ["measure", "--terminal", "--rig", str(still_lab.rig), "-o", str(log)]
@@ -281,7 +279,7 @@ def test_places_are_measured_in_the_terminal(end: str, still_lab: Lab, tmp_path:
     assert all(5 < count < 40 for count in counted(log).values())
 
 
-def test_the_faults_of_a_sheet_stand_on_lines_of_their_own_in_a_window(unmeasured: Unmeasured) -> None:
+def test_sheet_faults_are_on_separate_lines(unmeasured: Unmeasured) -> None:
     sheet = unmeasured.log.with_name("sheet.csv")
     sheet.write_text("marker,d_A_cm,d_B_cm,side,height_cm\n0,100,40,left,0\n99,170,190,left,0\n")
     code, told = typed(["measure", str(unmeasured.log), "--csv", str(sheet)], [])
@@ -292,5 +290,5 @@ def test_the_faults_of_a_sheet_stand_on_lines_of_their_own_in_a_window(unmeasure
         line.split(": ")[0] for line in lines if line.startswith(("  line 2: no", "  line 3: marker 99"))
     ]
     assert starts == ["  line 2", "  line 3"]
-    # A fault that is longer than the window goes on below itself.
+    # A message that is longer than the window continues below it.
     assert any("d_B_cm" in line and line.startswith("  ") for line in lines)

@@ -1,4 +1,4 @@
-"""The paper's own figures, from the authors' own data."""
+"""The paper's figures, from the authors' data."""
 
 from __future__ import annotations
 
@@ -37,7 +37,7 @@ def test_tables_i_and_ii_to_every_printed_digit(ipsys: Ipsys, data: Path, tmp_pa
 
 @pytest.mark.slow
 def test_all_models_are_studied_by_one_command(ipsys: Ipsys, data: Path, tmp_path: Path) -> None:
-    """The tables, the figures and the page; Tables I and II as the paper has their rows."""
+    """Return the tables, the figures and the page; Tables I and II have the paper's rows."""
     log, folder = tmp_path / "imsel.mcap", tmp_path / "figures"
     ipsys("import", "imsel", data / "imsel", "-o", log)
     done = ipsys("evaluate", log, "--plots", folder, "--json")
@@ -80,7 +80,7 @@ def test_the_published_training_subsets(ipsys: Ipsys, data: Path, tmp_path: Path
     ipsys("import", "imsel", data / "imsel", "-o", log)
     done = ipsys("evaluate", log, "--model", "rigid", "--train", f"train_{subset}", "--json")
     mean_cm = json.loads(done.out)["models"]["rigid"]["cameras"]["red"]["3d"]["mean_cm"]
-    # Figure 10 has no numbers; the rigid transformation stays below 5 cm there for every subset.
+    # Figure 10 has no numbers; the rigid transformation is below 5 cm there for every subset.
     assert 0 < mean_cm < 5
     runs = json.loads(ipsys("runs", log, "--json").out)
     assert runs[1]["parameters"]["train"] == f"train_{subset}"
@@ -101,5 +101,5 @@ def test_the_marker_in_the_36_photographs(ipsys: Ipsys, data: Path, tmp_path: Pa
         seen = session.payloads(session.topics(MARKERS, "stock"))
     assert len(seen) == 36
     assert {marker.id for frame in seen for marker in frame.markers} == {0}
-    # OpenCV's default settings find it in 31.
+    # OpenCV's default settings find the marker in 31 frames.
     assert sum(len(frame.markers) for frame in seen) >= 32

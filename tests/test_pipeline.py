@@ -1,4 +1,4 @@
-"""Replay: what is missing or out of date is computed and appended, and nothing else."""
+"""Replay: missing and outdated results are computed and appended, and no others."""
 
 from __future__ import annotations
 
@@ -57,7 +57,7 @@ def stages_of(ipsys: Ipsys, *arguments: object) -> dict[str, tuple[str, bool]]:
 
 
 def write_rig(path: Path, lab: Path, length_m: float) -> Path:
-    """The lab's rig as a file, with another marker length."""
+    """Write the lab's rig as a file, with another marker length."""
     with Session([lab]) as session:
         held = session.payloads(["/rig"])[0]
     robots = "".join(f'[[markers]]\nid = {m.id}\nrobot = "{m.robot}"\n' for m in held.markers)
@@ -74,7 +74,7 @@ def frames(count: int) -> Iterator[Message]:
         )
 
 
-def test_run_puts_what_a_stage_makes_behind_what_it_was_made_of() -> None:
+def test_run_yields_results_after_their_inputs() -> None:
     def seen(message: Message) -> Iterator[Any]:
         yield Markers(message.publish_time_ns, (), 1, 1)
 
@@ -104,7 +104,7 @@ def test_threads_change_the_speed_and_not_the_order() -> None:
 
     def slow(message: Message) -> Iterator[Any]:
         time.sleep(uneven.random() * 0.003)
-        # A camera's messages come to its stage one after the other, in order.
+        # The stage gets a camera's messages in order.
         assert last.get(message.camera, -1) < message.log_time_ns
         last[message.camera] = message.log_time_ns
         yield Markers(message.publish_time_ns, (), 1, 1)
@@ -116,7 +116,7 @@ def test_threads_change_the_speed_and_not_the_order() -> None:
     assert threaded == plain
 
 
-def test_a_stage_across_cameras_takes_one_message_after_the_other() -> None:
+def test_stage_across_cameras_gets_messages_in_order() -> None:
     order: list[int] = []
 
     def across(message: Message) -> Iterator[Any]:
@@ -137,7 +137,7 @@ def test_a_replay_gives_the_same_bytes_every_time(lab_log: Path, tmp_path: Path)
     assert len(set(written)) == 1
 
 
-def test_a_thread_that_fails_is_heard_and_the_rest_is_left() -> None:
+def test_failed_thread_raises_and_stops_the_others() -> None:
     def failing(message: Message) -> Iterator[Any]:
         if message.log_time_ns == 20:
             raise ValueError("a bug")
@@ -149,7 +149,7 @@ def test_a_thread_that_fails_is_heard_and_the_rest_is_left() -> None:
     assert cv2.getNumThreads() == threads
 
 
-def test_everything_is_made_once(ipsys: Ipsys, lab: Path) -> None:
+def test_each_result_is_computed_once(ipsys: Ipsys, lab: Path) -> None:
     recorded = data_section(lab)
     first = stages_of(ipsys, "replay", lab, "--model", "poly")
     assert first == {
@@ -176,9 +176,7 @@ def test_a_second_model_shares_the_detection(ipsys: Ipsys, lab: Path) -> None:
     assert stages["fuse"] == ("rigid_poly", True)
 
 
-def test_replay_in_place_and_into_a_new_log_give_the_same_messages(
-    ipsys: Ipsys, lab: Path, tmp_path: Path
-) -> None:
+def test_replay_in_place_equals_replay_into_a_new_log(ipsys: Ipsys, lab: Path, tmp_path: Path) -> None:
     beside, before = tmp_path / "derived.mcap", lab.read_bytes()
     assert ipsys("replay", lab, "-o", beside).code == 0
     assert lab.read_bytes() == before
@@ -189,16 +187,16 @@ def test_replay_in_place_and_into_a_new_log_give_the_same_messages(
         assert [(m.topic, m.log_time_ns, encode(m.payload)) for m in one.messages(topics)] == [
             (m.topic, m.log_time_ns, encode(m.payload)) for m in other.messages(topics)
         ]
-    # Read together, the two logs are one that lacks nothing.
+    # Together, the two logs are one complete log.
     lab.write_bytes(before)
     assert all(not new for _, new in stages_of(ipsys, "replay", lab, beside).values())
 
 
-def test_a_mistyped_marker_length_is_put_right_as_a_new_run(ipsys: Ipsys, lab: Path, tmp_path: Path) -> None:
+def test_corrected_marker_length_makes_a_new_run(ipsys: Ipsys, lab: Path, tmp_path: Path) -> None:
     ipsys("replay", lab)
     rig = write_rig(tmp_path / "lab.toml", lab, 0.18)
     stages = stages_of(ipsys, "replay", lab, "--rig", rig)
-    # The length bears on the camera points, not on the corners.
+    # The length changes the camera points, not the corners.
     assert stages["detect"] == ("edges", False)
     assert stages["camera-frame"] == ("edges_2", True)
     assert stages["fit"] == ("poly_2", True)
@@ -208,12 +206,12 @@ def test_a_mistyped_marker_length_is_put_right_as_a_new_run(ipsys: Ipsys, lab: P
             for run in ("edges", "edges_2")
         )
     np.testing.assert_allclose(np.array(new) / np.array(old), 0.9, rtol=1e-12)
-    # Both stand side by side, and each is found again.
+    # Both runs exist, and each is found again.
     assert all(not new for _, new in stages_of(ipsys, "replay", lab).values())
     assert all(not new for _, new in stages_of(ipsys, "replay", lab, "--rig", rig).values())
 
 
-def test_a_rig_that_says_the_same_changes_nothing(ipsys: Ipsys, lab: Path, tmp_path: Path) -> None:
+def test_equal_rig_changes_nothing(ipsys: Ipsys, lab: Path, tmp_path: Path) -> None:
     ipsys("replay", lab)
     rig = write_rig(tmp_path / "lab.toml", lab, 0.20)
     assert load_rig(rig).name == "simulated"
@@ -233,13 +231,13 @@ def test_a_lens_calibrated_later_is_a_new_run(ipsys: Ipsys, lab: Path, tmp_path:
         storage.write("image_height", lens.height)
         storage.release()
         stages = stages_of(ipsys, "replay", lab, "--calibration", f"red={path}")
-        # Edges are fitted through the lens.
+        # Edge fits need intrinsics.
         assert (stages["detect"][1], stages["camera-frame"][1]) == (fresh, fresh)
     runs = json.loads(ipsys("runs", lab, "--json").out)
     assert [run["overrides"] for run in runs if run["run"] == "edges_2"] == [["lens red"]] * 2
 
 
-def test_stock_corners_know_no_lens(ipsys: Ipsys, lab: Path, tmp_path: Path) -> None:
+def test_stock_corners_do_not_depend_on_the_lens(ipsys: Ipsys, lab: Path, tmp_path: Path) -> None:
     ipsys("replay", lab, "--corners", "stock")
     with Session([lab]) as session:
         lens = session.payloads(["/cameras/red/calibration"])[0]
@@ -262,7 +260,7 @@ def test_a_model_of_another_log_is_applied_and_copied_in(ipsys: Ipsys, lab: Path
         kept = ["/rig", *session.images.values(), *session.calibrations.values()]
         write_log(drive, session.messages(kept))
         original = session.payloads(session.topics(MODEL, "poly"))[0]
-    done = ipsys("replay", drive)  # it has no measurements of its own
+    done = ipsys("replay", drive)  # the log has no own measurements
     assert done.code == 1
     assert f"enter some with 'ipsys measure {drive}', or apply a model of another log" in done.err
     stages = stages_of(ipsys, "replay", drive, "--model-from", lab)
@@ -309,7 +307,7 @@ def test_new_measurements_make_the_model_out_of_date(ipsys: Ipsys, lab: Path) ->
     assert used[0] - used[1] == {withdrawn.id}
 
 
-def test_places_of_two_logs_are_two_though_each_log_begins_at_p001(tmp_path: Path) -> None:
+def test_equal_point_names_of_two_logs_stay_different_points(tmp_path: Path) -> None:
     def log(name: str, *places: Measurement) -> Path:
         path = tmp_path / name
         write_log(path, (Message("/measurements", one.timestamp, one.timestamp, one) for one in places))

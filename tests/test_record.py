@@ -1,4 +1,4 @@
-"""``ipsys record`` on real streams: what is in the log, and what is left when it ends, however it ends."""
+"""``ipsys record`` on real streams: the log contents, and the remaining data after any end."""
 
 from __future__ import annotations
 
@@ -24,13 +24,13 @@ from tests.capture.streams import encode, free_port, make_jpegs, serve
 from tests.conftest import Ipsys, small_disk
 
 NAMES = ("red", "white", "black")
-# Nothing takes so long, however busy the machine is.
+# a limit far above any duration on a busy machine
 LIMIT_S = 240
 
 
 @pytest.fixture(scope="module")
 def pictures(tmp_path_factory: pytest.TempPathFactory) -> tuple[Path, list[bytes]]:
-    """A second of pictures, as a stream of JPEGs."""
+    """Return a second of images as a stream of JPEGs."""
     folder = tmp_path_factory.mktemp("pictures")
     jpegs = make_jpegs(folder, 30)
     return encode(folder, "loop.mjpeg", "-c", "copy", "-f", "mjpeg"), jpegs
@@ -38,7 +38,7 @@ def pictures(tmp_path_factory: pytest.TempPathFactory) -> tuple[Path, list[bytes
 
 @contextmanager
 def streams(video: Path, folder: Path, more: str = "") -> Iterator[Path]:
-    """A rig of three cameras that are served now."""
+    """Return a rig of three served cameras."""
     rig = folder / "lab.toml"
     lines = ['name = "lab"', 'dictionary = "DICT_4X4_100"', "marker_length_m = 0.2"]
     with ExitStack() as stack:
@@ -108,7 +108,7 @@ def test_frames_are_recorded_as_they_came_for_so_many_seconds(
     }
 
 
-def test_a_password_is_neither_shown_nor_recorded_and_asked_for_when_it_is_missing(
+def test_password_is_asked_for_and_never_shown_or_recorded(
     ipsys: Ipsys, pictures: tuple[Path, list[bytes]], tmp_path: Path
 ) -> None:
     log = tmp_path / "a.mcap"
@@ -139,7 +139,7 @@ def test_a_password_in_the_rig_of_a_run_is_not_recorded(ipsys: Ipsys, lab: Path,
     assert ipsys("init", rig, "--from", lab).code == 0
     text = rig.read_text().replace("marker_length_m = 0.2", "marker_length_m = 0.21")
     rig.write_text(text + '[[cameras]]\nname = "blue"\nsource = "rtsp://admin:hush-hush@10.0.0.7/live"\n')
-    # The second time there is nothing to do.
+    # The second run computes nothing.
     for fresh in (True, False):
         before = lab.read_bytes()
         done = ipsys("camera-frame", lab, "--rig", rig)
@@ -152,7 +152,7 @@ def test_a_password_in_the_rig_of_a_run_is_not_recorded(ipsys: Ipsys, lab: Path,
 
 
 @pytest.mark.parametrize("number", [signal.SIGINT, signal.SIGTERM])
-def test_it_ends_cleanly_when_it_is_told_to(
+def test_simulation_ends_cleanly_on_request(
     number: int, pictures: tuple[Path, list[bytes]], tmp_path: Path
 ) -> None:
     log = tmp_path / "a.mcap"
@@ -220,9 +220,7 @@ except InterruptError as interrupt:
 
 
 @pytest.mark.parametrize(("what", "code"), [("camera", 130), ("disk", 1)])
-def test_a_second_interrupt_ends_what_hangs_and_the_log_is_kept(
-    what: str, code: int, ipsys: Ipsys, tmp_path: Path
-) -> None:
+def test_second_interrupt_ends_a_hanging_command(what: str, code: int, ipsys: Ipsys, tmp_path: Path) -> None:
     log = tmp_path / "a.mcap"
     with subprocess.Popen(
         [sys.executable, "-c", HANGING, str(log), what],
@@ -267,7 +265,7 @@ with open_cameras._stop_after(attached.stop, None):
 """
 
 
-def test_who_interrupts_does_not_wait_for_a_lab_to_be_drawn(tmp_path: Path) -> None:
+def test_interrupt_does_not_wait_for_the_rendering(tmp_path: Path) -> None:
     rig = tmp_path / "lab.toml"
     rig.write_text(
         'name = "lab"\ndictionary = "DICT_4X4_100"\nmarker_length_m = 0.2\n'
@@ -284,7 +282,7 @@ def test_who_interrupts_does_not_wait_for_a_lab_to_be_drawn(tmp_path: Path) -> N
         program.kill()
     assert (program.returncode, "Traceback" in err) == (0, False), err
     assert "stopped before the first frame was recorded; no log was written" in err
-    # Only to prepare the view takes the processor longer.
+    # The preparation of the view alone takes longer.
     assert resource.getrusage(resource.RUSAGE_CHILDREN).ru_utime - before_s < 8
     assert not (tmp_path / "a.mcap").exists()
 
@@ -311,7 +309,7 @@ def test_a_recorder_that_is_killed_loses_its_last_second_at_most(
     with Session([log]) as session:
         ends_ns = [session.last([topic])[0] for topic in session.images.values()]
     assert len(ends_ns) == 3
-    assert min(ends_ns) > killed_ns - 1_300_000_000  # a second, and what it took to kill it
+    assert min(ends_ns) > killed_ns - 1_300_000_000  # one second, and the time to kill it
 
 
 def test_recorder_killed_at_once_keeps_rig_and_lenses(ipsys: Ipsys, tmp_path: Path) -> None:
@@ -324,7 +322,7 @@ def test_recorder_killed_at_once_keeps_rig_and_lenses(ipsys: Ipsys, tmp_path: Pa
         f'[[cameras]]\nname = "red"\nsource = "file:{played}"\ncalibration = "red.yaml"\n'
     )
     program = started("record", "--rig", rig, "-o", log)
-    wait_for(log, 8_000_000)  # the first chunk of frames is whole: it spans a second at most
+    wait_for(log, 8_000_000)  # the first chunk of frames is complete: it spans a second at most
     program.kill()
     program.communicate(timeout=LIMIT_S)
     assert ipsys("repair", log).code == 0
@@ -339,7 +337,7 @@ def test_recorder_killed_at_once_keeps_rig_and_lenses(ipsys: Ipsys, tmp_path: Pa
 def test_recorder_that_stood_still_names_its_late_frames(
     pictures: tuple[Path, list[bytes]], tmp_path: Path
 ) -> None:
-    """Each picture says by its place in the loop when it was sent."""
+    """The position of each image in the loop gives its sending time."""
     log, (video, jpegs) = tmp_path / "a.mcap", pictures
     with streams(video, tmp_path) as rig:
         program = started("record", "--rig", rig, "-o", log)
@@ -390,7 +388,7 @@ def test_a_full_disk_ends_it_with_a_complete_log(
     assert all(len(jpegs) > 5 for jpegs in found.values())
 
 
-def test_what_is_there_is_never_overwritten_unless_it_is_said(
+def test_existing_file_is_overwritten_only_with_the_option(
     ipsys: Ipsys, pictures: tuple[Path, list[bytes]], tmp_path: Path
 ) -> None:
     log = tmp_path / "a.mcap"
@@ -435,7 +433,7 @@ def test_a_rig_that_cannot_be_recorded(ipsys: Ipsys, tmp_path: Path, cameras: st
     assert not (tmp_path / "a.mcap").exists()
 
 
-def test_a_calibration_of_another_shape_is_refused_and_of_another_size_is_scaled(
+def test_calibration_is_scaled_to_another_size_of_the_same_shape(
     ipsys: Ipsys, pictures: tuple[Path, list[bytes]], tmp_path: Path
 ) -> None:
     def lens(width: int, height: int) -> Path:
@@ -460,7 +458,7 @@ def test_a_calibration_of_another_shape_is_refused_and_of_another_size_is_scaled
     assert (held.width, held.height, held.K[0, 0], held.K[0, 2]) == (320, 240, 150.0, 159.5)
 
 
-def test_what_is_read_is_not_overwritten(ipsys: Ipsys, lab_log: Path, tmp_path: Path) -> None:
+def test_input_is_not_overwritten(ipsys: Ipsys, lab_log: Path, tmp_path: Path) -> None:
     played, rig, lens = tmp_path / "red.mcap", tmp_path / "lab.toml", tmp_path / "lens.mcap"
     for path in (played, lens):
         path.write_bytes(lab_log.read_bytes())
@@ -478,7 +476,7 @@ def test_what_is_read_is_not_overwritten(ipsys: Ipsys, lab_log: Path, tmp_path: 
     assert f"-o {lab_log}: is the log with the model" in done.err
     assert f"-o {lab_log}: is the log with the model" in ipsys("live", *model, lab_log).err
     assert {path: path.read_bytes() for path in files} == files
-    # Before a camera is opened.
+    # before a camera is opened
     for count in (243, 249, 300):
         done = ipsys("record", *once, tmp_path / ("x" * count))
         assert done.code == 1

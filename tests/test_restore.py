@@ -1,4 +1,4 @@
-"""A recorder that was killed, or whose disk was full: what is brought back, and what its runs are."""
+"""A killed recorder, or a full disk: the restored data and its runs."""
 
 from __future__ import annotations
 
@@ -29,7 +29,7 @@ from ipsys_log.stages.detect import Detect
 from tests.conftest import Ipsys, small_disk
 from tests.test_live import calibration, go_live, recorded, slow  # noqa: F401
 
-# Nothing takes so long, however busy the machine is.
+# a limit far above any duration on a busy machine
 LIMIT_S = 240
 
 RIG = """name = "lab"
@@ -38,13 +38,13 @@ marker_length_m = 0.2
 """
 
 
-# Robots that drive, in frames so large that each second fills a chunk.
+# Moving robots, in frames so large that each second fills a chunk.
 SCENE = "stations=0&noise_sigma=2&jpeg_quality=90"
 
 
 @pytest.fixture
 def rig(tmp_path: Path) -> Path:
-    """Two cameras of the simulated lab; so many frames that there is always one that waits."""
+    """Return two cameras of the simulated lab with so many frames that one always waits."""
     path = tmp_path / "lab.toml"
     cameras = (
         f'[[cameras]]\nname = "{name}"\nsource = "sim:{name}?{SCENE}"\nwidth = 480\nheight = 270\n'
@@ -57,7 +57,7 @@ def rig(tmp_path: Path) -> Path:
 
 @contextmanager
 def going_live(rig: Path, model: Path, log: Path, seconds: float) -> Iterator[subprocess.Popen[str]]:
-    """``ipsys live``, once it has recorded for so long."""
+    """Return ``ipsys live`` after it has recorded for a given time."""
     command = ["live", "--rig", rig, "--model-from", model, "-o", log]
     program = subprocess.Popen(
         [sys.executable, "-m", "ipsys_log", *map(str, command)],
@@ -99,7 +99,7 @@ def topics_of(log: Path) -> set[str]:
 LIVE = [("detect", "edges"), ("camera-frame", "edges"), ("locate", "poly"), ("fuse", "poly")]
 
 
-def test_a_live_run_that_is_killed_is_brought_to_its_end(
+def test_killed_live_run_is_completed_by_repair(
     ipsys: Ipsys,
     rig: Path,
     calibration: Path,  # noqa: F811
@@ -135,7 +135,7 @@ def test_a_live_run_that_is_killed_is_brought_to_its_end(
             assert looked_at + skipped(session, camera) == session.count(topic) > 50
             assert looked_at > 20
     assert ipsys("verify", log).out.endswith("a replay equals the log\n")
-    # On a busy machine frames are skipped; a replay of all would be another run.
+    # A busy machine skips frames; a replay of all frames would be another run.
     done = ipsys("replay", log, "--as-live")
     assert done.code == 0, done.err
     assert "nothing to do: all of it is up to date" in done.err
@@ -145,12 +145,12 @@ def test_a_live_run_that_is_killed_is_brought_to_its_end(
 
 
 @pytest.mark.parametrize("share", [0.3, 0.6, 0.95])
-def test_frames_that_nobody_had_looked_at_are_looked_at(
+def test_skipped_frames_are_processed_by_a_replay(
     recorded: Path,  # noqa: F811
     tmp_path: Path,
     share: float,
 ) -> None:
-    """Killed between two writes: frames are there, and nothing that was made of the last of them."""
+    """The kill is between two writes: frames are there, but no results of the last frames."""
     images = [chunk for chunk in _chunks(recorded) if not chunk.compression]
     last = images[int(share * len(images))]
     cut = tmp_path / "cut.mcap"
@@ -180,12 +180,12 @@ def _chunks(log: Path) -> Iterator[ChunkRef]:
         yield from reader._contents.chunks
 
 
-def test_a_run_that_is_not_what_its_stage_makes_is_left_as_it_is(
+def test_run_with_other_content_is_left_unchanged(
     recorded: Path,  # noqa: F811
     ipsys: Ipsys,
     tmp_path: Path,
 ) -> None:
-    """Nothing is signed that is not so."""
+    """No record is written for a wrong run."""
     log = tmp_path / "other.mcap"
     with Session([recorded]) as session, LogWriter.create(log) as writer:
         counts: dict[str, int] = {}
@@ -206,7 +206,7 @@ def _stage(message: Message) -> str | None:
 
 
 def _moved(message: Message, end_ns: int) -> Message:
-    """A robot, in the second half, by a hair."""
+    """Move a robot slightly in the second half."""
     if (
         not isinstance(message.payload, Tracks)
         or message.log_time_ns < end_ns - 1e9
@@ -229,7 +229,7 @@ def test_frames_that_were_skipped_stay_skipped(
     with monkeypatch.context() as patch:
         patch.setattr(Detect, "__call__", slow(Detect.__call__))
         go_live(lab_log, calibration, whole, 15.0)
-    # Frames are written right before what was made of those before them: between the two it is killed.
+    # Frames are written just before the results of earlier frames: the kill is between the two.
     chunks = sorted(_chunks(whole), key=lambda chunk: chunk.offset)
     *_, before_end, _signed = (chunk.offset for chunk in chunks if chunk.compression)
     cut.write_bytes(whole.read_bytes()[:before_end])

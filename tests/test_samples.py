@@ -1,4 +1,4 @@
-"""The logs that ship with the project, and those of earlier releases."""
+"""The sample logs of the project, and those of earlier releases."""
 
 from __future__ import annotations
 
@@ -24,7 +24,7 @@ def test_a_sample_log_gives_centimetres(ipsys: Ipsys, tmp_path: Path, name: str)
     model = json.loads(ipsys("replay", log, "--model", "poly", "--json").out)["models"]["poly"]
     assert set(model["cameras"]) == {"red", "white", "black"}
     for errors in model["cameras"].values():
-        # The tape is off by 3 mm a distance; the truth is not.
+        # The tape has a standard deviation of 3 mm; the ground truth is exact.
         assert errors["truth"]["3d"]["mean_cm"] < 1.0
         assert errors["3d"]["mean_cm"] < 1.5
     assert model["tracks"]["truth"]["3d"]["mean_cm"] < 0.6
@@ -46,7 +46,7 @@ def test_a_log_of_an_earlier_release(ipsys: Ipsys, tmp_path: Path, path: Path) -
         assert all(isinstance(encode(message.payload), bytes) for message in messages)
         assert {run.run for run in session.runs()} == {"edges", "poly", "rigid", "best"}
         before = session.payloads(session.topics(POSITIONS, "poly"))
-    # What it holds is still right, and computing it again gives the same to a tenth of a micrometre.
+    # The stored results are correct, and a new computation agrees to a tenth of a micrometre.
     assert "nothing to do" in ipsys("replay", log).err
     again = tmp_path / "again.mcap"
     assert ipsys("replay", log, "--run", "again", "-o", again).code == 0

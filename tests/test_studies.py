@@ -1,4 +1,4 @@
-"""Questions of a lab to a log: comparison of models, wrong places, and questions without an answer."""
+"""Studies on a log: comparison of models, wrong points, and impossible questions."""
 
 from __future__ import annotations
 
@@ -20,7 +20,7 @@ from tests.conftest import Ipsys
 
 
 def made(path: Path, seed: int = 0, count: int = 40, spoil: object = None, **options: object) -> Path:
-    """A log of one camera's places, with what ``spoil`` does to camera points and world points."""
+    """Write a log of one camera's points, after ``spoil`` has changed camera points and world points."""
     rng = np.random.default_rng(seed)
     world = labs.places(rng, count, heights=options.pop("heights", labs.HEIGHTS))  # type: ignore[arg-type]
     points = labs.camera(rng).see(world, rng)
@@ -34,7 +34,7 @@ def made(path: Path, seed: int = 0, count: int = 40, spoil: object = None, **opt
 
 
 def refused(ipsys: Ipsys, log: Path, *arguments: object) -> str:
-    """The one line that a command says; the log is as it was."""
+    """Return the one line of a command; the log is unchanged."""
     before = log.read_bytes()
     done = ipsys(*arguments[:1], log, *arguments[1:])
     assert done.code == 1
@@ -53,7 +53,7 @@ def test_one_pair_entered_twice(ipsys: Ipsys, tmp_path: Path) -> None:
     assert "m03 and m07 are one and the same pair" in said
 
 
-def test_places_on_a_line_too_few_and_none_at_all(ipsys: Ipsys, tmp_path: Path) -> None:
+def test_collinear_too_few_or_missing_points_are_refused(ipsys: Ipsys, tmp_path: Path) -> None:
     def on_a_line(points: np.ndarray, tape: np.ndarray) -> None:
         tape[:, 1] = 0.5 * tape[:, 0]
         tape[:, 2] = 0.0
@@ -78,7 +78,7 @@ def test_nan_in_an_import_is_refused_and_nothing_is_written(ipsys: Ipsys, data: 
     assert not (tmp_path / "x.mcap").exists()
 
 
-def test_where_all_heights_are_equal_the_floor_is_what_can_be_learned(ipsys: Ipsys, tmp_path: Path) -> None:
+def test_equal_heights_give_a_2d_model(ipsys: Ipsys, tmp_path: Path) -> None:
     log = made(tmp_path / "flat.mcap", heights=(0.1,))
     done = ipsys("evaluate", log, "--model", "poly", "--model", "best", "--json")
     assert "camera red: all measured places are 0.100 m high, so heights cannot be learned" in done.err
@@ -92,12 +92,12 @@ def test_where_all_heights_are_equal_the_floor_is_what_can_be_learned(ipsys: Ips
             assert payload.positions[0].z_m == pytest.approx(0.1, abs=1e-6)
 
 
-def test_a_model_that_is_told_the_height_needs_it_in_the_rig(ipsys: Ipsys, tmp_path: Path) -> None:
+def test_model_with_known_heights_needs_them_in_the_rig(ipsys: Ipsys, tmp_path: Path) -> None:
     log = made(tmp_path / "lab.mcap")
     said = refused(ipsys, log, "replay", "--model", "rayplane")
     assert "marker 0 is carried" in said
     assert "marker_height_m" in said
-    # The measured places have their heights: there is nothing to be told.
+    # The points have their own heights, so the option changes nothing.
     assert ipsys("evaluate", log, "--model", "rayplane").code == 0
     rig = tmp_path / "lab.toml"
     rig.write_text(rig_toml(replace(labs.RIG, markers=(RigMarker(0, robot="ada", height_m=0.12),))))
@@ -126,13 +126,13 @@ def test_a_position_outside_the_measured_volume_says_so(tmp_path: Path) -> None:
         return flag
 
     assert inside(2.4, 0.9, 0.1) is True
-    assert inside(2.4, 0.9, 0.5) is False  # above all that was measured
+    assert inside(2.4, 0.9, 0.5) is False  # above all measured points
     assert inside(2.4, -0.5, 0.1) is False
     assert inside(5.2, 0.9, 0.1) is False
 
 
 def test_a_model_out_of_a_log_predicts_what_it_predicted(ipsys: Ipsys, tmp_path: Path) -> None:
-    """To 1e-9 m, for every model in the table, by way of the numbers in the log."""
+    """The tolerance is 1e-9 m, for every model in the table, by the numbers in the log."""
     from ipsys_log.models.table import MODELS, AppliedModel, CalibrationPoints, fit_cameras, inputs
 
     log = made(tmp_path / "lab.mcap", labels=lambda n: ("train",))
@@ -168,7 +168,7 @@ def test_a_wrong_side_is_found_named_and_put_right(ipsys: Ipsys, tmp_path: Path)
     assert (first["measurement"], first["kind"]) == ("m13", "side")
 
 
-def test_the_authors_wrong_place_comes_first(ipsys: Ipsys, data: Path, tmp_path: Path) -> None:
+def test_wrong_point_of_the_authors_ranks_first(ipsys: Ipsys, data: Path, tmp_path: Path) -> None:
     """Training pair 11 of the white camera contradicts its neighbours by 8 to 14 cm."""
     log = tmp_path / "imsel.mcap"
     ipsys("import", "imsel", data / "imsel", "-o", log)

@@ -1,4 +1,4 @@
-"""The tutorial notebook runs from its first cell to its last."""
+"""The tutorial notebook runs completely."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""Logs whose frames are H.264: shown, measured and looked at as those of JPEG pictures are."""
+"""Logs with H.264 frames: viewed, measured and processed like JPEG logs."""
 
 from __future__ import annotations
 
@@ -38,12 +38,12 @@ Grey = NDArray[np.uint8]
 
 @pytest.fixture
 def video(video_log: Path, tmp_path: Path) -> Path:
-    """A copy of the log."""
+    """Copy the log."""
     return Path(shutil.copy(video_log, tmp_path / "video.mcap"))
 
 
 def decoded(log: Path, camera: str) -> dict[int, Grey]:
-    """The pictures of a camera by their time: all packets through FFmpeg, in one go."""
+    """Return the images of a camera by time: all packets through FFmpeg at once."""
     with Session([log]) as session:
         frames = list(session.messages([session.images[camera]]))
     whole = BytesIO(b"".join(one.payload.data for one in frames))
@@ -88,7 +88,7 @@ def test_positions_are_those_of_the_pictures(video: Path, lab: Path) -> None:
     assert np.median(np.hypot(*off_m.T)) < 0.002
 
 
-def test_while_measuring_on_a_finished_log_each_place_is_shown_as_it_was(video: Path) -> None:
+def test_page_shows_the_frames_of_each_stationary_interval(video: Path) -> None:
     """Most of these frames are no keyframes."""
     with open_finished_log(video, Request()) as scene:
         pictures = {camera: decoded(video, camera) for camera in ("black", "red", "white")}
@@ -103,7 +103,7 @@ def test_while_measuring_on_a_finished_log_each_place_is_shown_as_it_was(video: 
         assert shown > 20
 
 
-def test_while_recording_the_last_keyframe_is_shown_with_its_own_markers(video: Path) -> None:
+def test_live_page_shows_the_last_keyframe_with_its_markers(video: Path) -> None:
     pipeline.replay([video], Request(), "detect")
     with Session([video]) as session:
         (rig,) = session.payloads(["/rig"])
@@ -145,7 +145,7 @@ def test_the_monitor_looks_at_keyframes(video: Path, monkeypatch: pytest.MonkeyP
 
 
 def samples(path: Path) -> list[bytes]:
-    """The frames of the red camera in a recording of Rerun's, in their order."""
+    """Return the frames of the red camera in a recording of Rerun, in order."""
     found: list[tuple[int, Any]] = []
     for chunk in RrdReader(path).stream().to_chunks():
         batch = chunk.to_record_batch()
@@ -172,7 +172,7 @@ def test_a_live_viewer_that_was_too_slow_goes_on_with_a_keyframe(video: Path, tm
     with Session([video]) as session:
         (rig,) = session.payloads(["/rig"])
         once = list(session.messages([session.images["red"]]))
-    # Some of it waits for nobody; then it goes on between two keyframes.
+    # A part is requested without waiting; then the request continues between two keyframes.
     before = [*(once * 6), *once[:5]]
     came = [*before, *once[5:]]
     frames = [replace(one, log_time_ns=n, publish_time_ns=n) for n, one in enumerate(came, 10**18)]

@@ -13,7 +13,7 @@ import pytest
 
 from tests.conftest import ROOT
 
-# Such a sentence has no subject that a reader meets first; with a question mark it is a question.
+# Such a sentence starts without a subject; with a question mark, it is a question.
 _OPENING = re.compile(r"(?:^|[.;:!?]\s+)(Who|What|Whether|Where|Of|That which)\b(?![^.]*\?)")
 # Phrases of an earlier dialect; docs/glossary.md has the standard terms.
 _PHRASES = (
@@ -28,7 +28,9 @@ _PHRASES = (
     "were not looked at",
     "how a camera hangs",
 )
-_FILES = sorted([*ROOT.glob("ipsys_log/**/*.py"), *ROOT.glob("benchmarks/*.py")])
+_FILES = sorted(
+    path for folder in ("ipsys_log", "benchmarks", "tests") for path in ROOT.glob(f"{folder}/**/*.py")
+)
 
 
 def sentences(source: str) -> Iterator[tuple[int, str]]:
@@ -80,3 +82,67 @@ def test_the_guard_sees_a_fault(source: str) -> None:
 
 def test_questions_and_code_are_no_fault() -> None:
     assert faults('"""Return x. ``What`` is a name. Is it right? What then?"""') == []
+
+
+_PAGES = sorted(path for suffix in ("html", "js") for path in ROOT.glob(f"ipsys_log/**/*.{suffix}"))
+# Phrases of earlier pages. An id or a CSS class may still have them.
+_PAGE_PHRASES = (
+    *_PHRASES,
+    "off by",
+    "by how much",
+    "has to lie",
+    "it says",
+    "knows little",
+    "the place",
+    "places",
+    "somebody",
+)
+
+
+def page_texts(source: str, suffix: str) -> list[str]:
+    """Return the visible texts of a page: text and labels of HTML, or literals with a space of a script."""
+    if suffix == ".js":
+        code = re.sub(r"^\s*//.*$", "", source, flags=re.MULTILINE)
+        literals = re.findall(r'"((?:[^"\\\n]|\\.)*)"|`((?:[^`\\]|\\.)*)`', code)
+        return [text for pair in literals for text in pair if " " in text.strip()]
+    plain = re.sub(r"\{%.*?%\}|\{#.*?#\}|<style>.*?</style>", "", source, flags=re.DOTALL)
+    plain = re.sub(r"\{\{.*?\}\}", "x", plain, flags=re.DOTALL)
+    labels = re.findall(r'(?:aria-label|alt|title|placeholder)="([^"]*)"', plain)
+    inline = re.sub(r"</?(?:b|i|em|code|span)\b[^>]*>", "", plain)
+    return [text for text in (*re.split(r"<[^>]*>", inline), *labels) if text.strip()]
+
+
+def page_faults(source: str, suffix: str) -> list[str]:
+    """Return the visible texts with a fault."""
+    texts = [" ".join(text.split()) for text in page_texts(source, suffix)]
+    return [
+        text
+        for text in texts
+        if _OPENING.search(text) or any(phrase in text.lower() for phrase in _PAGE_PHRASES)
+    ]
+
+
+@pytest.mark.parametrize("path", _PAGES, ids=[str(path.relative_to(ROOT)) for path in _PAGES])
+def test_pages_are_plain(path: Path) -> None:
+    assert page_faults(path.read_text(encoding="utf-8"), path.suffix) == []
+
+
+@pytest.mark.parametrize(
+    ("source", "suffix"),
+    [
+        ("<h2>Where not to trust it</h2>", ".html"),
+        ("<h1>Positions are off by {{ head.mean }} cm</h1>", ".html"),
+        ('<nav aria-label="Places in the log"></nav>', ".html"),
+        ('save.textContent = "Wait: the marker has to lie still";', ".js"),
+    ],
+)
+def test_page_guard_finds_a_fault(source: str, suffix: str) -> None:
+    assert page_faults(source, suffix)
+
+
+def test_page_guard_finds_texts_of_every_page() -> None:
+    assert len(_PAGES) >= 8
+    found = {path.name: page_texts(path.read_text(encoding="utf-8"), path.suffix) for path in _PAGES}
+    assert "Measured so far" in found["measure.html"]
+    assert "Nothing yet." in found["measure.js"]
+    assert "Error map" in found["session.html"]

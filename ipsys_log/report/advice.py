@@ -125,9 +125,9 @@ GROUPS = {
     SIMPLE: "rigid or poly",
     PAPER: "the paper's methods",
     ALL_MODELS: "all methods",
-    HEIGHT_KNOWN: "all, heights known",
+    HEIGHT_KNOWN: "all, known heights",
 }
-HEIGHT_NOTE = "* is told the height of each marker"
+HEIGHT_NOTE = "* gets the marker height as input"
 _CONFIDENCE = 1.96
 
 
@@ -263,8 +263,8 @@ def _sentences(
         yield f"{use} {_by_number(by_places)}."
     most = max(choices)
     for other, start in (
-        (ALL_MODELS, "The"),
-        (HEIGHT_KNOWN, "Where the heights of the markers are known, the"),
+        (ALL_MODELS, "Model"),
+        (HEIGHT_KNOWN, "With known marker heights, model"),
     ):
         if SIMPLE in choices[most] and other in choices[most]:
             yield from _saving(start, choices[most][other].model, choices[most][SIMPLE], most, table)
@@ -301,8 +301,8 @@ def _saving(
     enough = [places for places, mean_m in sorted(means_m.items()) if mean_m <= usual.mean_m]
     if enough and enough[0] < most:
         usual_cm, least_cm = (f"{mean_m * CM_PER_M:.1f} cm" for mean_m in (usual.mean_m, means_m[most]))
-        more = "" if usual_cm == least_cm else f"; with {most} its error is {least_cm}"
+        more = "" if usual_cm == least_cm else f"; with {most} points, its error is {least_cm}"
         yield (
-            f"{start} model {model} with {enough[0]} points is as good as {usual.model} with {most} "
+            f"{start} {model} with {enough[0]} points is as good as {usual.model} with {most} points "
             f"({usual_cm}){more}."
         )

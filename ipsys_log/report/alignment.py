@@ -84,8 +84,8 @@ def read_alignment(session: Session, run: str, rig: Rig, lenses: Lenses) -> Alig
     notes += [note for alignment in alignments for note in _notes(alignment, lenses.get(alignment.camera))]
     if any(point.poses == () for seen in frames.values() for frame in seen for point in frame.points):
         notes.append(
-            "these camera points are by eq. (3), which overstates a tilt by half: go two thirds of the way, "
-            "or begin with frames"
+            "these camera points are from eq. (3), which overestimates a tilt by half: turn the cameras by "
+            "two thirds of the angle, or use a log with frames"
         )
     mounted = tuple(_mount(alignments, pairs, lenses, notes))
     length_m, height_m = _marker(rig)
@@ -112,7 +112,7 @@ def _measured(
     except IpsysError as error:
         # An error of a tape measurement must not block the alignment. It needs only the heights, which are
         # measured with the ruler.
-        notes.append(f"the measured places were left out: {error}")
+        notes.append(f"the calibration points were not used: {error}")
         return [place.measurement for place in places], {}
     fitted = newest_run(session, MODEL)
     if not places and fitted is not None:
@@ -128,17 +128,19 @@ def _notes(alignment: Alignment, lens: CameraCalibration | None) -> Iterator[str
         heights_m.setdefault(marker.marker_id, []).append(above_m)
     for marker_id, all_m in heights_m.items():
         mean_cm = float(np.mean(all_m)) * CM_PER_M
-        position = f"{abs(mean_cm):.0f} cm {'above' if mean_cm > 0 else 'below'} the plane of the others"
-        yield f"{name}: marker {marker_id} lies {position}, and was left out; lay it on the floor"
+        position = (
+            f"{abs(mean_cm):.0f} cm {'above' if mean_cm > 0 else 'below'} the plane of the other markers"
+        )
+        yield f"{name}: marker {marker_id} is {position} and was not used; put it on the floor"
     if alignment.uneven_m is not None:
         yield (
-            f"{name}: its markers do not lie on one plane (off by {alignment.uneven_m * CM_PER_M:.0f} cm): "
-            "one of them may lie on something; with five or more it can be told which"
+            f"{name}: its markers are not on one plane (error {alignment.uneven_m * CM_PER_M:.0f} cm): "
+            "one of them may be above the floor; use five or more markers to find it"
         )
     if alignment.level and lens is not None and (part := _part_of_picture(alignment, lens)) < _NARROW:
         yield (
-            f"{name}: its markers span only {part:.0%} of the picture; lay them out to its edges, or the "
-            "spread looks smaller than it is"
+            f"{name}: its markers span only {part:.0%} of the image; put markers near the "
+            "image edges, or the spread is underestimated"
         )
 
 
@@ -158,12 +160,12 @@ def _mount(
     for alignment in alignments:
         camera, camera_pairs = alignment.camera, pairs.get(alignment.camera, ())
         if camera not in lenses:
-            notes.append(f"camera {camera} has no calibration, so what it sees of the floor is not known")
+            notes.append(f"camera {camera} has no calibration, so its coverage is not known")
             continue
         if len(camera_pairs) < _LEAST_PLACES:
             if any(pairs.values()):
                 notes.append(
-                    f"camera {camera} saw {len(camera_pairs)} measured places: its coverage needs three"
+                    f"camera {camera} saw {len(camera_pairs)} calibration points: its coverage needs three"
                 )
             continue
         points_m, world_m = (
@@ -179,8 +181,8 @@ def _mount(
             alignment.sigma_rad or 0.0
         ):
             notes.append(
-                f"camera {camera} hangs otherwise than when its places were measured: what it sees of the "
-                "floor is as it was then"
+                f"camera {camera} has moved since its calibration points were measured: "
+                "its coverage is for the old pose"
             )
         yield MountedCamera(camera, lenses[camera], invert_pose(make_pose(axes, origin_m)))
 
@@ -198,14 +200,14 @@ def _cover(
 ) -> Coverage | None:
     if not mounted:
         notes.append(
-            "what is seen of the whole floor needs at least three measured places in the view of each "
-            "camera, not on a line: measure some (ipsys measure), and align that log (ipsys align LOG)"
+            "the coverage of the floor needs at least three calibration points in the view of each camera, "
+            "not on a line: measure some (ipsys measure), and align that log (ipsys align LOG)"
         )
         return None
     if rig.floor is None:
         notes.append(
-            "coverage needs the floor: write [floor] with width_m and depth_m into lab.toml, and give it "
-            "with --rig"
+            "the coverage needs the size of the floor: write [floor] with width_m and "
+            "depth_m into lab.toml, and give it with --rig"
         )
         return None
     return cover_floor(rig.floor, mounted, length_m, height_m)

@@ -82,7 +82,7 @@ def _draw_floor(axes: Axes, lab: AlignedLab, coverage: Coverage) -> None:
     # A marker that would extend over the edge of the floor does not need to be seen.
     shown = np.ma.masked_where((counts == 0) & ~coverage.fits, np.minimum(counts, 2))
     axes.imshow(shown, cmap=shades, vmin=0, vmax=2, origin="lower", extent=frame, zorder=0.5)
-    for colour, text in ((_ONE, "whole in one picture"), (_MORE, "in two or more"), (_NONE, "in none")):
+    for colour, text in ((_ONE, "whole in one image"), (_MORE, "in two or more"), (_NONE, "in none")):
         axes.plot([], [], "s", ms=9, mfc=colour, mec=REST, label=text)
     styles = camera_styles(mounted.camera for mounted in lab.mounted_cameras)
     for mounted in lab.mounted_cameras:
@@ -98,19 +98,19 @@ def _draw_floor(axes: Axes, lab: AlignedLab, coverage: Coverage) -> None:
         )
     for overlap in coverage.overlaps:
         good, width_cm = overlap.width_m >= coverage.diagonal_m, overlap.width_m * CM_PER_M
-        text = f"pictures overlap {width_cm:.0f} cm" if width_cm > 0 else f"gap of {-width_cm:.0f} cm"
+        text = f"overlap {width_cm:.0f} cm" if width_cm > 0 else f"gap of {-width_cm:.0f} cm"
         axes.annotate(
             text, overlap.at_m.tolist(), ha="center", va="center",
             fontsize=8, color=_LEVEL if good else _TILTED, weight="bold", zorder=6,
             bbox={"boxstyle": "round,pad=0.2", "fc": "white", "ec": "none", "alpha": 0.85},
         )  # fmt: skip
     height = f", {coverage.height_m * CM_PER_M:.0f} cm above the floor" if coverage.height_m else ""
-    axes.set_title(f"Where a marker is whole in a picture, by its middle{height}", loc="left", fontsize=10)
+    axes.set_title(f"Images with a whole marker, by the marker's centre{height}", loc="left", fontsize=10)
 
 
 def _draw_picture(axes: Axes, one: Alignment, lenses: Mapping[str, CameraCalibration]) -> None:
     colour = {None: "black", True: _LEVEL, False: _TILTED}[one.level]
-    state = {None: "tilt not known", True: "level", False: "to be tilted"}[one.level]
+    state = {None: "tilt not known", True: "level", False: "not level"}[one.level]
     spread = "" if one.spread_m is None else f", spread {one.spread_m * CM_PER_M:.1f} cm"
     axes.set_title(f"{shorten(one.camera)}: {state}{spread}", loc="left", fontsize=10, color=colour)
     axes.set(xticks=[], yticks=[])
@@ -127,7 +127,7 @@ def _draw_picture(axes: Axes, one: Alignment, lenses: Mapping[str, CameraCalibra
         x, y = project(marker.point_m[None], lens)[0]
         axes.plot(x, y, "x", color=NOTE, ms=6, zorder=3)
         axes.annotate(
-            f"{marker.marker_id} left out", (x, y), (7, 0), textcoords="offset points", va="center",
+            f"{marker.marker_id} not used", (x, y), (7, 0), textcoords="offset points", va="center",
             fontsize=8, color=NOTE,
         )  # fmt: skip
     if one.level is False and one.down is not None:
@@ -149,7 +149,7 @@ def _draw_depths(axes: Axes, one: Alignment, lens: CameraCalibration) -> None:
                 ha="center", va="bottom" if up else "top", fontsize=8, color=NOTE, annotation_clip=False,
             )  # fmt: skip
     axes.annotate(
-        "Zc in cm off the middle one: orange farther, blue nearer", (0, -0.02), xycoords="axes fraction",
+        "Zc minus its median in cm: orange farther, blue nearer", (0, -0.02), xycoords="axes fraction",
         va="top", fontsize=7, color=NOTE,
     )  # fmt: skip
 

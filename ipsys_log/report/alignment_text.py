@@ -29,29 +29,35 @@ def advise(alignment: Alignment) -> str:
     Examples
     --------
     >>> advise(Alignment("red", ()))[:32]
-    'lay four or more markers on the '
+    'put four or more markers on the '
     """
     if len(alignment.floor_markers) < 2:
         count, reason = (
-            ("three", "one says nothing") if alignment.floor_markers else ("four", "none lies still there")
+            ("three", "one is not enough")
+            if alignment.floor_markers
+            else ("four", "none is stationary there")
         )
-        return f"lay {count} or more markers on the floor, out to the edges of its picture: {reason}"
+        return f"put {count} or more markers on the floor, up to the edges of its image: {reason}"
     if alignment.axes == 0:
-        return "lay its markers further apart, out to the edges of its picture"
+        return "put its markers further apart, up to the edges of its image"
     if alignment.axes == 1 and alignment.level is None:
-        return f"lay one aside of the line of its markers: along it the spread is under {_LEVEL_CM}"
-    aside = "; its tilt is known along the line of its markers only: lay one aside of it"
+        return (
+            f"put a marker beside the line of its markers: along this line, the spread is under {_LEVEL_CM}"
+        )
+    aside = "; the tilt is known only along the line of its markers: put a marker beside the line"
     rest = aside if alignment.axes == 1 else ""
     if alignment.level:
-        return f"nothing: it is level, the spread is under {_LEVEL_CM}"
+        return f"nothing: the camera is level, its spread is under {_LEVEL_CM}"
     turns = _turns(alignment)
     if alignment.remaining_m is not None and alignment.remaining_m >= LEVEL_M:
         text = (
-            f"{turns}, but that leaves {alignment.remaining_m * CM_PER_M:.1f} cm"
+            f"{turns}, but a spread of {alignment.remaining_m * CM_PER_M:.1f} cm remains"
             if turns
-            else "no tilt mends this"
+            else "no turn of the camera corrects the spread"
         )
-        return f"{text}: see that the markers lie flat on the floor, or calibrate its lens again{rest}"
+        return (
+            f"{text}: check that the markers are flat on the floor, or repeat the intrinsic calibration{rest}"
+        )
     return f"{turns}{rest}"
 
 
@@ -61,10 +67,10 @@ def _turns(alignment: Alignment) -> str:
     parts: list[str] = []
     for turn_rad, (more, less) in zip(alignment.turns_rad, names, strict=True):
         if abs(turn := math.degrees(turn_rad)) >= _LEAST_DEG:
-            suffix = "" if parts else " of its picture"
-            parts.append(f"towards the {more if turn_rad > 0 else less}{suffix}, by {abs(turn):.1f} degrees")
+            suffix = "" if parts else " of its image"
+            parts.append(f"{abs(turn):.1f} degrees towards the {more if turn_rad > 0 else less}{suffix}")
     shift = _on_floor(alignment)
-    return f"tilt it so that it looks further {' and '.join(parts)}{shift}" if parts else ""
+    return f"turn the camera {' and '.join(parts)}{shift}" if parts else ""
 
 
 def _on_floor(alignment: Alignment) -> str:
@@ -77,7 +83,7 @@ def _on_floor(alignment: Alignment) -> str:
 def alignment_table(lab: AlignedLab) -> Table:
     """Return a table with one row per camera: green if the spread is under 5 cm, else red."""
     table = Table(
-        title="How the cameras hang", title_justify="left", title_style="bold", box=None, pad_edge=False
+        title="Alignment of the cameras", title_justify="left", title_style="bold", box=None, pad_edge=False
     )
     table.add_column("camera", overflow="fold")
     for name in ("markers", "spread cm", "tilt deg"):
@@ -120,10 +126,10 @@ def _floor_lines(coverage: Coverage) -> list[tuple[str, bool]]:
     if coverage.height_m:
         size += f", {coverage.height_m * CM_PER_M:.0f} cm above the floor,"
     return [
-        _patch_line(coverage.unseen, floor_m2, "every part of the floor is in a picture", "in no picture"),
+        _patch_line(coverage.unseen, floor_m2, "every part of the floor is in an image", "in no image"),
         _patch_line(
-            coverage.gaps, floor_m2, f"{size} is whole in a picture wherever it lies",
-            f"{size} is whole in no picture with its middle on",
+            coverage.gaps, floor_m2, f"an image shows all of {size} at every position",
+            f"no image shows all of {size} with its centre on",
         ),
     ]  # fmt: skip
 
@@ -143,14 +149,14 @@ def _patch_line(patches: Sequence[Patch], floor_m2: float, good: str, bad: str) 
 
 def _overlap_line(overlap: Overlap, diagonal_m: float, placed: bool) -> tuple[str, bool]:
     names, (x_m, y_m) = " and ".join(overlap.cameras), overlap.at_m.tolist()
-    needed = f"a marker needs {diagonal_m * CM_PER_M:.0f} cm, corner to corner"
+    needed = f"a marker needs {diagonal_m * CM_PER_M:.0f} cm, its diagonal"
     width_cm = overlap.width_m * CM_PER_M
     if overlap.width_m >= diagonal_m:
-        return f"{names} overlap by {width_cm:.0f} cm or more: enough, {needed}", True
+        return f"{names} overlap by {width_cm:.0f} cm or more. This is enough: {needed}", True
     fault = (
-        f"overlap by {width_cm:.0f} cm only" if overlap.width_m > 0 else f"leave a gap of {-width_cm:.0f} cm"
+        f"overlap by only {width_cm:.0f} cm" if overlap.width_m > 0 else f"leave a gap of {-width_cm:.0f} cm"
     )
-    end = "one that crosses there is whole in neither picture"
+    end = "neither image shows all of a marker between them"
     position = f", at x {x_m:.2f}, y {y_m:.2f}" if placed else ""
     return f"{names} {fault}{position}: {needed}; {end}", False
 

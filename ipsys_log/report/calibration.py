@@ -29,7 +29,7 @@ def calibration_table(found: CalibrationResult) -> Table:
         digits = 2 if n < 4 else 5
         note = "" if n >= 4 else "px"
         if n == 1 and found.square:
-            note = "px, taken as fx: pixels are square"
+            note = "px, equal to fx: square pixels"
         spread = f"{sigma:.{digits}f}" if sigma > 0 else "not fitted"
         table.add_row(name, f"{value:.{digits}f}", spread, note)
     return table
@@ -41,16 +41,17 @@ def calibration_lines(found: CalibrationResult) -> list[str]:
     counts += [f"{len(found.dropped)} bad"] if found.dropped else []
     counts += [f"{len(found.spare)} not needed"] if found.spare else []
     lines = [
-        f"error: RMS {found.rms_px:.3f} px, median {found.median_px:.3f} px over {len(found.pixels)} corners",
-        f"pictures: {found.examined_count} looked at, board seen in {found.seen}, {', '.join(counts)}",
-        f"coverage: {coverage.share:.0%} of the image, to {_degrees(coverage.widest_rad)} from the axis",
-        f"          {coverage.position_count} places of the board, "
+        f"reprojection error: RMS {found.rms_px:.3f} px, median {found.median_px:.3f} px, "
+        f"{len(found.pixels)} corners",
+        f"images: {found.examined_count} searched, board found in {found.seen}, {', '.join(counts)}",
+        f"coverage: {coverage.share:.0%} of the image, up to {_degrees(coverage.widest_rad)} from the axis",
+        f"          {coverage.position_count} board positions, "
         f"{coverage.tilted} tilted by 25 degrees or more",
     ]
     if found.outlier_corners:
         corners = "corner" if found.outlier_corners == 1 else "corners"
-        lines.append(f"left out: {found.outlier_corners} single {corners}, far off")
-    return lines + _dropped_lines(found.dropped, "left out") + _dropped_lines(found.unseen, "not seen")
+        lines.append(f"excluded: {found.outlier_corners} single {corners} with a large error")
+    return lines + _dropped_lines(found.dropped, "excluded") + _dropped_lines(found.unseen, "board not found")
 
 
 def _degrees(angle_rad: float | None) -> str:
@@ -68,7 +69,7 @@ def _dropped_lines(dropped: tuple[ExcludedSighting, ...], what: str) -> list[str
         text = re.sub("^is ", "are ", reason) if count > 1 else reason
         lines.append(f"{what}: {shown}: {text}")
     more = len(lines) - _SHOWN_DROPPED
-    return lines if more <= 1 else [*lines[:_SHOWN_DROPPED], f"{what}: and so on, {more} more (see --json)"]
+    return lines if more <= 1 else [*lines[:_SHOWN_DROPPED], f"{what}: {more} more reasons (see --json)"]
 
 
 def calibration_json(found: CalibrationResult) -> dict[str, Any]:

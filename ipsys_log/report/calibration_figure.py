@@ -58,7 +58,7 @@ def _draw_image(axes: Axes, found: CalibrationResult) -> None:
         ylabel="y in px",
     )
     title = f"{shorten(found.camera)}: {found.coverage.share:.0%} of the image covered\n"
-    axes.set_title(f"{title}arrows drawn {factor} times as long, + the middle", loc="left", fontsize=10)
+    axes.set_title(f"{title}arrows {factor} times true length, + principal point", loc="left", fontsize=10)
     assert axes.figure is not None
     axes.figure.colorbar(arrows, ax=axes, shrink=0.8, pad=0.02, extend="max", label="error in px")
 
@@ -81,7 +81,7 @@ def _draw_cloud(axes: Axes, found: CalibrationResult) -> None:
     )
     outside = int((~inside).sum())
     title = f"RMS {found.rms_px:.3f} px (circle), median {found.median_px:.3f}"
-    axes.set_title(title + (f"\n{outside} farther out" if outside else "\n"), loc="left", fontsize=10)
+    axes.set_title(title + (f"\n{outside} outside this plot" if outside else "\n"), loc="left", fontsize=10)
     style_axes(axes)
 
 
@@ -92,9 +92,9 @@ def _draw_pictures(axes: Axes, found: CalibrationResult) -> None:
     axes.barh(positions, [rms_px for _, rms_px in ranked], color="#56B4E9", height=0.75)
     size = float(np.clip(210 / len(ranked), 7, 9))
     axes.set_yticks(positions, [shorten(name) for name, _ in ranked], fontsize=size)
-    axes.set(ylim=(-0.7, len(ranked) - 0.3), xlabel="RMS of a picture in px")
+    axes.set(ylim=(-0.7, len(ranked) - 0.3), xlabel="RMS of an image in px")
     suffix = f", the worst {len(ranked)}" if len(ranked) < len(found.used) else ""
     axes.set_title(
-        f"{len(found.used)} pictures used of {found.examined_count}{suffix}\n", loc="left", fontsize=10
+        f"{len(found.used)} of {found.examined_count} images used{suffix}\n", loc="left", fontsize=10
     )
     style_axes(axes, "x")

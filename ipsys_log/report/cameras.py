@@ -94,7 +94,8 @@ class LiveStatus:
         if room.remaining_s is None:
             return Text(line)
         return Text(
-            f"{line}: {format_duration(room.remaining_s)}", style="bold red" if room.is_short() else ""
+            f"{line}, enough for {format_duration(room.remaining_s)}",
+            style="bold red" if room.is_short() else "",
         )
 
     def summary(self) -> list[str]:
@@ -103,7 +104,7 @@ class LiveStatus:
         lines = [f"{self._target} written: {took_s:.1f} s, {format_bytes(self._target.stat().st_size)}"]
         for name, state in self._states.items():
             dropped = f", {state.dropped} dropped: the disk is too slow" if state.dropped else ""
-            missed = f", {state.missed} lost before they came" if state.missed else ""
+            missed = f", {state.missed} lost before arrival" if state.missed else ""
             lines.append(f"camera {name}: {state.frames} frames{dropped}{missed}")
         return lines + self._warnings()
 
@@ -181,7 +182,7 @@ def _markers(check: FrameCheck) -> Text:
 
 def latency_table(steps: Mapping[str, Percentiles]) -> Group:
     """Return a table of the durations of the steps, in ms."""
-    table = Table(box=None, pad_edge=False, title="Milliseconds for each step", title_justify="left")
+    table = Table(box=None, pad_edge=False, title="Duration of each step in ms", title_justify="left")
     table.add_column("step")
     for heading in ("median", "90 %", "99 %", "longest"):
         table.add_column(heading, justify="right")
@@ -193,7 +194,7 @@ def latency_table(steps: Mapping[str, Percentiles]) -> Group:
 def comparison_table(found: Sequence[Comparison], sides: tuple[str, str]) -> Table:
     """Return a table with one row per channel; ``sides`` are the headings of the two compared sides."""
     table = Table(box=None, pad_edge=False)
-    for heading in ("channel", *sides, "same", "RMS off", "most off"):
+    for heading in ("channel", *sides, "same", "RMS diff", "max diff"):
         table.add_column(heading, justify="left" if heading == "channel" else "right")
     for comparison in found:
         style = "" if comparison.equal else "red"
@@ -214,11 +215,9 @@ def first_difference(found: Sequence[Comparison]) -> str | None:
     if not different:
         return None
     if not any(comparison.together for comparison in found if comparison.left > 1):
-        return (
-            "they have no frame in common: no message of one speaks of the same instant as one of the other"
-        )
+        return "the two sides have no frame in common: no two messages have the same time"
     first = min(different, key=lambda one: one.first_ns or 0)
-    return f"first in {first.topic}: {first.first}"
+    return f"first difference in {first.topic}: {first.first}"
 
 
 def _distance(value: float | None, unit: str | None) -> str:

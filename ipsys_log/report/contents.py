@@ -50,7 +50,7 @@ def intervals_json(scene: FinishedLog) -> list[dict[str, Any]]:
 def intervals_table(found: list[dict[str, Any]]) -> Table:
     """Return the stationary intervals of :func:`intervals_json` as a table."""
     table = Table(
-        title="Where markers lie still", title_justify="left", title_style="bold", box=None, pad_edge=False
+        title="Stationary intervals", title_justify="left", title_style="bold", box=None, pad_edge=False
     )
     for name in ("place", "marker", "time s"):
         table.add_column(name, justify="right", no_wrap=True)

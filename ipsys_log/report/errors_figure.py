@@ -108,8 +108,8 @@ def draw_errors(
     axes.set_yticks(heights, [_name(row) for row in rows], fontsize=size)
     _name_models(axes, rows, heights, size, bar_in)
     _print_figures(axes, rows, heights, size)
-    space = "in space" if _in_space(accuracies) else "on the floor"
-    axes.set_title(f"Errors {space} on held-out places", loc="left", fontsize=10, pad=size + 12)
+    kind = "3D" if _in_space(accuracies) else "2D"
+    axes.set_title(f"{kind} errors at held-out points", loc="left", fontsize=10, pad=size + 12)
     axes.annotate(
         _note(rows), (0, 0), (0, -38), xycoords="axes fraction", textcoords="offset points", fontsize=8,
         color="#505050", va="top",
@@ -147,9 +147,9 @@ def _beside(axes: Axes) -> Transform:
 
 
 def _note(rows: Sequence[_Row]) -> str:
-    note = "each place a point, | the mean"
+    note = "mark: one point, |: mean"
     if any(row.against == "truth" and len(row.errors_cm) for row in rows):
-        note += "; hollow: against the truth"
+        note += "; hollow: against ground truth"
     if any(row.name == _TRACKS for row in rows):
         note += "\ntracks: mean and standard deviation"
     return note

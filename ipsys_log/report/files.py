@@ -137,7 +137,7 @@ def check_figure_file(path: Path, option: str, logs: Iterable[Path]) -> None:
     check_file(path, option, logs)
     if path.suffix.lower() not in FIGURE_SUFFIXES:
         ends = f"{', '.join(FIGURE_SUFFIXES[:-1])} or {FIGURE_SUFFIXES[-1]}"
-        raise IpsysError(f"{option} {path}: is no kind of picture; let its name end in {ends}")
+        raise IpsysError(f"{option} {path}: is not a figure file; use a name that ends in {ends}")
 
 
 def check_folder(folder: Path, option: str) -> None:

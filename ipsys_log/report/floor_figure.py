@@ -180,7 +180,7 @@ def _draw_tracks(axes: Axes, scene: FloorData) -> None:
     if len(scene.tracks) > _MOST_ROBOTS:
         axes.plot([], [], "-", color=REST, label=f"{len(scene.tracks) - _MOST_ROBOTS} more robots")
     if scene.truth:
-        axes.plot([], [], "--", color="black", lw=0.8, label="truth")
+        axes.plot([], [], "--", color="black", lw=0.8, label="ground truth")
 
 
 def _draw_places(axes: Axes, scene: FloorData) -> None:
@@ -189,7 +189,7 @@ def _draw_places(axes: Axes, scene: FloorData) -> None:
     for kind, colour in (("training", REST), ("measured", REST), ("test", "#6A6A6A")):
         points_m = np.array([place.point_m[:2] for place in rest if place.kind == kind])
         if len(points_m):
-            name = "held out, not seen" if kind == "test" and scene.evaluation else f"{kind} place"
+            name = "held out, not detected" if kind == "test" and scene.evaluation else f"{kind} point"
             fill = "none" if kind == "test" else colour
             axes.plot(*points_m.T, "o", color=colour, mfc=fill, ms=3.5, zorder=3, label=name)
 
@@ -198,7 +198,7 @@ def _draw_errors(axes: Axes, scene: FloorData, styles: Mapping[str, tuple[str, s
     """Draw the arrows of the errors; return the title that describes them."""
     rows = scene.rows()
     if not rows or scene.evaluation is None:
-        return f"The floor, tracks of run {scene.run}" if scene.tracks else "The floor"
+        return f"Floor and tracks of run {scene.run}" if scene.tracks else "Floor"
     residuals = [residual for row in rows for residual in row.residuals]
     span_m = axes.get_xlim()[1] - axes.get_xlim()[0]
     factor = arrow_factor([r.predicted_m - r.world_m for r in residuals], span_m)
@@ -209,8 +209,8 @@ def _draw_errors(axes: Axes, scene: FloorData, styles: Mapping[str, tuple[str, s
         axes.plot(*start_m.T, shape, color=colour, ms=4.5, zorder=4, label=f"held out, {row.camera}")
         arrows = draw_arrows(axes, start_m, error_m, factor, color=colour)
     draw_key(axes, arrows, factor)
-    times = f", drawn {factor} times as long" if factor > 1 else ""
-    return f"Errors of {scene.evaluation.model} on held-out places{times}"
+    times = f", arrows {factor} times true length" if factor > 1 else ""
+    return f"Errors of {scene.evaluation.model} at held-out points{times}"
 
 
 def arrow_factor(errors_m: Sequence[NDArray[np.float64]], span_m: float) -> int:
@@ -309,7 +309,7 @@ def _gather(session: Session, accuracies: Sequence[Accuracy]) -> FloorData:
         _lines(session, truth, rig),
     )
     if not (places or scene.tracks or scene.truth or (rig and rig.floor)):
-        raise IpsysError(f"{session}: nothing to draw: no floor, measured places or tracks")
+        raise IpsysError(f"{session}: nothing to draw: there is no floor, calibration point or track")
     return scene
 
 

@@ -41,7 +41,10 @@ def render_report(session: Session, accuracies: Sequence[Accuracy]) -> str:
     """
     findings = gather_findings(session, accuracies)
     if not findings.cameras:
-        raise IpsysError(f"{session}: no model was evaluated, for no place is held out; measure some")
+        raise IpsysError(
+            f"{session}: no model was evaluated, because no calibration point is held "
+            "out; measure more points"
+        )
     environment = Environment(
         loader=PackageLoader("ipsys_log", "report"),
         autoescape=True,  # names in a log may hold any text

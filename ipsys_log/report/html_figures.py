@@ -32,7 +32,7 @@ __all__ = [
 ]
 
 _WIDTH_IN = 4.7
-_SPACE = {True: "in space", False: "on the floor"}
+_SPACE = {True: "3D", False: "2D"}
 
 Picture = dict[str, Any]
 
@@ -64,11 +64,11 @@ def models_pictures(findings: Findings) -> list[Picture]:
         draw_models(axes, ranked, in_space)
         handles = [Line2D([], [], color="black", marker="o", ms=5, lw=2), Line2D([], [], **HELD_OUT)]  # type: ignore[arg-type]
         figure.legend(
-            handles, ["cross-validation, 95 % interval", "held-out places"],
+            handles, ["cross-validation, 95 % interval", "held-out points"],
             loc="outside lower center", ncols=2, frameon=False, fontsize=8,
         )  # fmt: skip
         note = models_note(ranked)
-        caption = f"Mean error {_SPACE[in_space]} of each model" + (f" ({note})" if note else "")
+        caption = f"Mean {_SPACE[in_space]} error of each model" + (f" ({note})" if note else "")
         pictures.append(_picture(figure, caption))
     return pictures
 
@@ -86,11 +86,12 @@ def residual_pictures(findings: Findings) -> list[Picture]:
         bar = figure.colorbar(
             arrows, ax=axes, location="bottom", shrink=0.75, pad=0.02, extend="max", aspect=30
         )
-        bar.set_label(f"error {_SPACE[findings.in_space]} in cm", fontsize=9)
+        bar.set_label(f"{_SPACE[findings.in_space]} error in cm", fontsize=9)
         bar.ax.tick_params(labelsize=8)
         caption = (
-            f"Errors of {label(accuracy.model)}: an arrow goes from the measured place to the position, seen "
-            "from above and drawn longer than it is; dashed, the floor that a camera's places lie around"
+            f"Errors of {label(accuracy.model)}, seen from above. An arrow points from "
+            "the calibration point to "
+            "the estimated position; arrows are enlarged. Dashed: area of the calibration points of a camera"
         )
         pictures.append(_picture(figure, caption))
     return pictures
@@ -98,7 +99,7 @@ def residual_pictures(findings: Findings) -> list[Picture]:
 
 def learning_pictures(findings: Findings) -> list[Picture]:
     """Return the learning curves over all cameras on random subsets, in space and on the floor."""
-    text = "Mean error {} over all cameras, fitted on random subsets; bars: one standard deviation"
+    text = "Mean {} error over all cameras, fitted on random subsets. Bars: one standard deviation"
     return _curves_pictures(
         {text.format(_SPACE[in_space]): mean_curves(findings, in_space) for in_space in _spaces(findings)}
     )
@@ -109,7 +110,7 @@ def published_pictures(findings: Findings) -> list[Picture]:
 
     The list is empty if the log has no labelled subsets.
     """
-    text = "Mean error {} of camera {} at the held-out places, fitted on the labelled subsets"
+    text = "Mean {} error of camera {} at the held-out points, fitted on the labelled subsets"
     if not has_published(findings.evaluations):
         return []
     return _curves_pictures(
@@ -137,4 +138,6 @@ def coverage_picture(findings: Findings) -> Picture | None:
         return None
     figure, axes = _figure(5.2)
     draw_coverage(axes, findings)
-    return _picture(figure, "Places that the models were fitted on; hatched, the floor around which none lie")
+    return _picture(
+        figure, "Calibration points of the models. Hatched: floor outside the area of these points"
+    )

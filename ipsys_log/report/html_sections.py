@@ -75,7 +75,7 @@ def headline(findings: Findings) -> dict[str, Any]:
 
 def _counts(accuracy: Accuracy) -> list[str]:
     """Return the numbers of points behind the errors, as texts."""
-    schemes = {"by cross-validation": overall_row(accuracy, True), "held out": overall_row(accuracy, False)}
+    schemes = {"cross-validated": overall_row(accuracy, True), "held out": overall_row(accuracy, False)}
     return [f"{row.error_2d.count} {name}" for name, row in schemes.items() if row]
 
 
@@ -190,7 +190,7 @@ def suspects(findings: Findings) -> list[dict[str, Any]]:
 
 
 def _point(point_m: Iterable[float] | None) -> str:
-    return "" if point_m is None else ", ".join(f"{value:.3f}" for value in point_m)
+    return "" if point_m is None else ", ".join(f"{value * CM_PER_M:.1f}" for value in point_m)
 
 
 def flat_rows(places: Sequence[RiggedMeasurement]) -> list[dict[str, str]] | None:
@@ -267,7 +267,7 @@ def _verdict(row: CameraEvaluation) -> str:
 
     most, nearly_all = beyond(row.within_68, 0.68), beyond(row.within_95, 0.95)
     if most < -_SURE:
-        return "errors are larger than it says"
+        return "overconfident: errors are larger than expected"
     if nearly_all < -_SURE:
-        return "more large errors than it says"
-    return "errors are smaller than it says" if most > _SURE else "errors are as it says"
+        return "overconfident: more large errors than expected"
+    return "underconfident: errors are smaller than expected" if most > _SURE else "consistent"

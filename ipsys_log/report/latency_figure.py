@@ -44,11 +44,17 @@ def draw_latency(times_s: Mapping[str, NDArray[np.float64]], path: Path) -> None
 
 def _draw_shares(axes: Axes, total_ms: NDArray[np.float64]) -> None:
     share = 100 * np.arange(1, len(total_ms) + 1) / len(total_ms)
-    axes.step(total_ms, share, where="post", color="black", label=f"all; longest {total_ms[-1]:.1f} ms")
+    axes.step(
+        total_ms, share, where="post", color="black", label=f"all positions; longest {total_ms[-1]:.1f} ms"
+    )
     median_ms, far_ms = np.percentile(total_ms, [50, 99]).tolist()
     for name, value_ms, dashes in (("median", median_ms, "--"), ("99 %", far_ms, ":")):
         axes.axvline(value_ms, color=NOTE, lw=1.2, ls=dashes, label=f"{name} {value_ms:.1f} ms")
-    axes.set(xlabel="ms from the arrival of a frame to its position", ylabel="% of positions", ylim=(0, 101))
+    axes.set(
+        xlabel="latency in ms, from the arrival of a frame to its position",
+        ylabel="positions in %",
+        ylim=(0, 101),
+    )
     axes.set_xlim(0, min(float(total_ms[-1]) * 1.05, _SHOWN * far_ms))
     style_axes(axes)
     _key(axes)
@@ -65,7 +71,7 @@ def _draw_steps(axes: Axes, times_s: Mapping[str, NDArray[np.float64]]) -> None:
     axes.set_xlim(0, 1.5 * float(steps_ms[:, 1].max()))
     axes.set_yticks(rows, _STEPS)
     axes.invert_yaxis()
-    axes.set(xlabel="ms for the step")
+    axes.set(xlabel="duration of the step in ms")
     style_axes(axes, "x")
     _key(axes)
 

@@ -41,7 +41,7 @@ Curves = Mapping[str, Curve]
 _LOG_RATIO = 8.0
 # Distance of the error bars of several models at one number of points. The marks are not shifted.
 _APART_PT = 0.9
-_SPACE = {True: "Mean error in space in cm", False: "Mean error on the floor in cm"}
+_SPACE = {True: "Mean 3D error in cm", False: "Mean 2D error in cm"}
 
 
 def camera_curves(findings: Findings, camera: str, in_space: bool) -> Curves:
@@ -61,15 +61,17 @@ def _some(curves: Curves) -> Curves:
 def published_figure(findings: Findings, in_space: bool) -> Figure:
     """Return a figure with one panel per camera: figure 10 of the paper in space, figure 11 on the floor."""
     panels = {f"camera {shorten(name)}": camera_curves(findings, name, in_space) for name in findings.cameras}
-    title = f"{_SPACE[in_space]} at the held-out places, fitted on the labelled subsets"
+    title = f"{_SPACE[in_space]} at the held-out points, fitted on the labelled subsets"
     return _figure(panels, title, _SPACE[in_space])
 
 
 def learning_figure(findings: Findings) -> Figure:
     """Return a figure of the mean over the cameras on random subsets, in space and on the floor."""
-    spaces = {"in space": True, "on the floor": False} if findings.in_space else {"on the floor": False}
+    spaces = {"3D": True, "2D": False} if findings.in_space else {"2D": False}
     panels = {title: mean_curves(findings, in_space) for title, in_space in spaces.items()}
-    title = "Fitted on random subsets, judged at the other places; bars: one standard deviation over subsets"
+    title = (
+        "Fitted on random subsets, evaluated at the other points; bars: one standard deviation over subsets"
+    )
     return _figure(panels, title, "Mean error over all cameras in cm")
 
 
@@ -105,7 +107,7 @@ def curves_picture(curves: Curves, width_in: float, limits: tuple[float, float])
 
 def _note(models: Iterable[str]) -> str:
     """Return the title of the legend."""
-    order = "in the order of the right ends"
+    order = "sorted by the right ends"
     return f"{order}\n{HEIGHT_NOTE}" if any(map(uses_height, models)) else order
 
 
@@ -165,11 +167,11 @@ def draw_curves(
         scale_logarithmic(axes, "y", low_cm / 1.35, high_cm * 1.2)
     else:
         axes.set_ylim(0, high_cm * 1.08)
-    axes.set_xlabel("places for each camera")
+    axes.set_xlabel("points per camera")
     axes.tick_params(labelsize=9)
     style_axes(axes)
     if not curves:
-        axes.text(0.5, 0.5, "none", transform=axes.transAxes, ha="center", color=NOTE)
+        axes.text(0.5, 0.5, "no data", transform=axes.transAxes, ha="center", color=NOTE)
 
 
 def _draw_curve(axes: Axes, curve: Curve, style: ModelStyle, shift_pt: float) -> None:

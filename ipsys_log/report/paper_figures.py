@@ -103,12 +103,12 @@ def residuals_figure(findings: Findings) -> Figure:
     for axes, accuracy in zip(panels, accuracies, strict=True):
         arrows = draw_residuals(axes, findings, accuracy, scale)
     bar = figure.colorbar(arrows, ax=list(panels), shrink=0.8, pad=0.02, extend="max")
-    bar.set_label(f"error {'in space' if findings.in_space else 'on the floor'} in cm")
+    bar.set_label(f"{'3D' if findings.in_space else '2D'} error in cm")
     handles, labels = panels[0].get_legend_handles_labels()
     if handles:
         figure.legend(
             handles, labels, loc="outside lower center", ncols=3 * len(panels), frameon=False, fontsize=9,
-            title="the floor that a camera's places lie around", title_fontsize=9,
+            title="area of the calibration points", title_fontsize=9,
         )  # fmt: skip
     return figure
 
@@ -131,9 +131,9 @@ def draw_residuals(axes: Axes, findings: Findings, accuracy: Accuracy, scale: Re
     x_m, y_m = places_m.T
     axes.scatter(x_m, y_m, c=lengths_cm, s=14, zorder=3.5, lw=0, **look)  # type: ignore[arg-type]
     draw_key(axes, arrows, factor)
-    scheme = "by cross-validation" if accuracy.rows(True) else "on held-out places"
-    times = f"drawn {factor} times as long" if factor > 1 else ""
-    axes.set_title(f"{label(accuracy.model)}: errors {scheme}\n{times}", loc="left", fontsize=10)
+    scheme = "cross-validated errors" if accuracy.rows(True) else "errors at held-out points"
+    times = f"arrows {factor} times true length" if factor > 1 else ""
+    axes.set_title(f"{label(accuracy.model)}: {scheme}\n{times}", loc="left", fontsize=10)
     return arrows
 
 
@@ -154,11 +154,11 @@ def models_figure(findings: Findings) -> Figure:
     panels = figure.subplots(1, len(spaces), sharex=True, sharey=True, squeeze=False)[0]
     for axes, in_space in zip(panels, spaces, strict=True):
         draw_models(axes, ranked, in_space)
-        axes.set_title("in space" if in_space else "on the floor", fontsize=10, loc="left")
+        axes.set_title("3D" if in_space else "2D (on the floor)", fontsize=10, loc="left")
     dot = Line2D([], [], color="black", marker="o", ms=6, lw=2)
     held_out = Line2D([], [], **HELD_OUT)  # type: ignore[arg-type]
     figure.legend(
-        [dot, held_out], ["by cross-validation, with the 95 % interval", "on held-out places"],
+        [dot, held_out], ["cross-validation, with the 95 % interval", "held-out points"],
         loc="outside lower center", ncols=2, frameon=False, fontsize=9,
     )  # fmt: skip
     if note := models_note(ranked):
@@ -252,7 +252,8 @@ def write_plots(findings: Findings, folder: Path) -> list[str]:
     files = {name: draw(findings) for name, (has_data, draw) in _FILES.items() if has_data(findings)}
     if not files:
         raise IpsysError(
-            f"{folder}: nothing to draw: no model was evaluated, for no place is held out; measure some"
+            f"{folder}: nothing to draw: no model was evaluated, because no calibration point is held out; "
+            "measure more points"
         )
     write_files(folder, files)
     return list(files)

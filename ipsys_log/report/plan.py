@@ -107,7 +107,7 @@ def plan_floor(
         if camera.pairs
     ]
     if not views:
-        raise IpsysError(f"run {run}: its model does not say on which places it was fitted; fit it again")
+        raise IpsysError(f"run {run}: its model does not contain its calibration points; fit it again")
     measured_m = np.unique(np.vstack([view.fitted_m for view in views]), axis=0)
     # The known heights of the robots' markers.
     carried_m = [height for marker in rig.markers if (height := rig.height_of(marker.id)) is not None]
@@ -213,20 +213,31 @@ def _tape(session: Session, rig: Rig) -> Callable[[Array], Array]:
 def _notes(model: Model, rig: Rig, lenses: Lenses, plan: Plan) -> Iterator[str]:
     fitted = {camera.camera for camera in model.cameras if camera.pairs}
     for camera in sorted({camera.name for camera in rig.cameras} - fitted):
-        yield f"camera {camera} has no model: first measure about 10 places in its view, out to its edges"
+        yield (
+            f"camera {camera} has no model: first measure about 10 points in its field "
+            "of view, up to its edges"
+        )
     for row in model.cameras:
         if 0 < len(row.pairs) < _LEAST_PLACES:
-            yield f"camera {row.camera} has fewer than {_LEAST_PLACES} places: its error now is only guessed"
+            yield (
+                f"camera {row.camera} has fewer than {_LEAST_PLACES} points: its "
+                "present error is only a rough estimate"
+            )
         if row.camera in fitted and row.camera not in lenses:
-            yield f"camera {row.camera} has no lens in the log: taken to see what lies among its places"
+            yield (
+                f"camera {row.camera} has no intrinsics in the log: its field of view "
+                "is taken as the area of its points"
+            )
         if row.camera in fitted and row.noise is None:
-            yield f"camera {row.camera} has too few places to know its noise: what is usual was taken"
+            yield (
+                f"camera {row.camera} has too few points for an estimate of its noise: usual noise is assumed"
+            )
     if rig.floor is None:
-        yield "the rig has no floor: planned on half a metre around the measured places"
+        yield "the rig has no floor: the plan covers the measured points and 50 cm around them"
     if len(rig.reference_points) < 2:
-        yield "the rig has no two reference points: how well the tape knows a place was left out"
+        yield "the rig has fewer than two reference points: the plan ignores tape errors"
     if plan.places[-1].mean_after_m > (1 - _LITTLE) * plan.places[0].mean_before_m:
-        yield "these places change little: most of the predicted error is noise of the cameras, not the fit's"
+        yield "these points change little: most of the predicted error is camera noise, not fit error"
 
 
 def means_cm(*means_m: float) -> list[str]:

@@ -38,7 +38,7 @@ def draw_plan(found: PlannedFloor, path: Path) -> None:
     """
     figure = Figure(figsize=(14, 7), dpi=100)
     plan, count = found.plan, len(found.plan.places)
-    after_title = "With this place" if count == 1 else f"With these {count} places"
+    after_title = "With this point" if count == 1 else f"With these {count} points"
     # A few cells with large errors must not use most of the colour range.
     top_cm = float(np.nanquantile(plan.before_m, 0.98)) * CM_PER_M
     means = means_cm(plan.places[0].mean_before_m, plan.places[-1].mean_after_m)
@@ -48,9 +48,9 @@ def draw_plan(found: PlannedFloor, path: Path) -> None:
         shades = _draw_floor(axes, found, error_m * CM_PER_M, top_cm)
         axes.set_title(f"{heading}: {mean_cm} cm", loc="left", fontsize=11)
     box = figure.add_axes((12.7 / 14, 0.93 / 7, 0.18 / 14, _SIDE_IN / 7))
-    figure.colorbar(shades, cax=box, extend="max", label="predicted error in x and y, in cm")
-    title = f"Where to measure next: predicted mean error of the model {found.model} over the floor, "
-    title += f"markers {found.height_m * CM_PER_M:.0f} cm above it"
+    figure.colorbar(shades, cax=box, extend="max", label="predicted 2D error in cm")
+    title = f"Points to measure next: predicted mean error of model {found.model} over the floor, "
+    title += f"for markers {found.height_m * CM_PER_M:.0f} cm above it"
     figure.text(0.6 / 14, 6.7 / 7, title, fontsize=12)
     handles, labels = axes.get_legend_handles_labels()
     figure.legend(handles, labels, loc=(0.035, 0.01), ncols=8, fontsize=9, frameon=False)
@@ -67,7 +67,7 @@ def _draw_floor(axes: Axes, found: PlannedFloor, error_cm: Array, top_cm: float)
     axes.add_patch(Rectangle((left, low), right - left, high - low, fill=False, ec="black", lw=1.2, zorder=2))
     _draw_views(axes, found, shape, half_m)
     if np.isnan(error_cm).any():
-        axes.plot([], [], "s", ms=9, mfc="white", mec=REST, label="seen by none")
+        axes.plot([], [], "s", ms=9, mfc="white", mec=REST, label="seen by no camera")
     axes.plot(*found.measured_m[:, :2].T, "o", color=NOTE, ms=3, zorder=3, label="measured")
     axes.plot([], [], "o", ms=9, mfc="white", mec="black", mew=1.2, label="to measure, in this order")
     # On a large floor, the map shows only the part that the cameras see.

@@ -34,7 +34,7 @@ def places_figure(findings: Findings) -> Figure:
     draw_ground(above, findings.rig, [points_m[:, :2] for points_m in (training_m, test_m) if len(points_m)])
     for points_m, look in zip((training_m, test_m), _LOOKS, strict=True):
         above.plot(*points_m[:, :2].T, ls="none", **look)
-    above.set_title("from above", fontsize=10, loc="left")
+    above.set_title("top view", fontsize=10, loc="left")
     handles, labels = above.get_legend_handles_labels()
     counted = [f"{len(training_m)} {labels[0]}", f"{len(test_m)} {labels[1]}"]
     figure.legend(handles, counted, loc="outside lower center", ncols=2, frameon=False)
@@ -42,7 +42,12 @@ def places_figure(findings: Findings) -> Figure:
 
 
 _LOOKS: tuple[dict[str, Any], ...] = (
-    {"marker": "o", "color": "black", "ms": 4.5, "label": "training pairs (a place as one camera sees it)"},
+    {
+        "marker": "o",
+        "color": "black",
+        "ms": 4.5,
+        "label": "training pairs (a calibration point in one camera)",
+    },
     {"marker": "^", "color": TEST, "ms": 6, "label": "test pairs"},
 )
 
@@ -65,7 +70,7 @@ def _draw_space(axes: Any, findings: Findings, training_m: Array, test_m: Array)
     axes.zaxis.labelpad = 8
     axes.set_box_aspect((1, 1, 0.5), zoom=1.08)
     axes.view_init(elev=26, azim=-60)
-    axes.set_title("in space", fontsize=10, loc="left")
+    axes.set_title("3D view", fontsize=10, loc="left")
 
 
 def hull_m(points_m: Array) -> Array | None:

@@ -83,7 +83,7 @@ def choose_paper(prints: Sequence[Print], name: str | None) -> Paper:
         The name is not known, or a print is too large; the text gives the largest size.
     """
     if name is not None and name.lower() not in PAPERS:
-        raise IpsysError(f"--page {name}: is none of {', '.join(PAPERS)}")
+        raise IpsysError(f"--page {name}: is not known; give one of {', '.join(PAPERS)}")
     papers = [PAPERS["a4"], PAPERS["a3"]] if name is None else [PAPERS[name.lower()]]
     for paper in papers:
         large = [item for item in prints if _orientation(item, paper) is None]
@@ -151,7 +151,7 @@ def _orientation(item: Print, paper: Paper) -> Paper | None:
 def _too_large(item: Print, paper: Paper) -> str:
     width_mm, height_mm = _size_mm(item)
     size = f"{width_mm:.0f} x {height_mm:.0f} mm"
-    text = f"{item.name} takes {size} with its white margin, too much for {paper.name}"
+    text = f"{item.name} needs {size} with its white margin, too much for {paper.name}"
     if item.is_board:
         return f"{text}; make its squares smaller, with --square, or use larger paper"
     largest_mm = np.floor(paper.free_mm[0] / (1 + 2 * item.margin_mm / item.width_mm))
@@ -259,5 +259,5 @@ def _draw_ruler(axes: Axes) -> None:
             axes.text(x_mm, _RULER_Y_MM - 0.8, str(number // 10), fontsize=6, ha="center", va="top")
     ends_mm = [_EDGE_MM, _EDGE_MM + RULER_MM]
     axes.plot(ends_mm, [_RULER_Y_MM] * 2, color="black", linewidth=0.35, solid_capstyle="butt")
-    text = "Print at 100 % (actual size). Measure this: it has to be 10 cm long."
+    text = "Print at 100 % (actual size). Check the scale: it must be 10 cm long."
     _write(axes, _EDGE_MM, _EDGE_MM + 0.4, text, 6.0)

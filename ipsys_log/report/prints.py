@@ -93,7 +93,7 @@ def board_print(board: Board, text: str) -> Print:
         gap_mm = (square_mm - cell_mm * len(black)) / 2
         corner_mm = np.array([marker.column, marker.row]) * square_mm + gap_mm
         polygons += [polygon * cell_mm + corner_mm for polygon in cell_outlines(black)]
-    lines = (*_wrapped(f"{board}; a square has {square_mm:g} mm"), *_wrapped(f"ipsys calibrate {options}"))
+    lines = (*_wrapped(f"{board}; square side {square_mm:g} mm"), *_wrapped(f"ipsys calibrate {options}"))
     size = (columns * square_mm, rows * square_mm)
     return Print(f"the board {text}", tuple(polygons), *size, _BOARD_MARGIN * square_mm, lines, True)
 

@@ -28,15 +28,15 @@ def repair_lines(report: RepairReport) -> Iterator[str | Table]:
     if report.changed and report.last_kept_ns is not None:
         yield f"{report.path} repaired: {kept}, up to {format_time(report.last_kept_ns)} UTC"
     else:
-        yield f"{report.path} {'repaired' if report.changed else 'is whole, nothing changed'}: {kept}"
+        yield f"{report.path} {'repaired' if report.changed else 'is undamaged and unchanged'}: {kept}"
     yield from _about_the_loss(report)
     if report.unchecked:
-        yield f"{report.unchecked} of them were saved from damaged chunks: no CRC confirms them"
+        yield f"{report.unchecked} of them are from damaged chunks: no CRC confirms them"
     if report.damaged_file is not None:
-        yield f"all bytes that were taken out are kept in {report.damaged_file}"
+        yield f"the removed bytes are in {report.damaged_file}"
     yield from report.notes[:_MOST_NOTES]
     if len(report.notes) > _MOST_NOTES:
-        yield f"and {len(report.notes) - _MOST_NOTES} more places"
+        yield f"and {len(report.notes) - _MOST_NOTES} more notes"
     if report.changed and report.messages_kept:
         yield from _about_the_rig(report)
     if report.cut_off and report.messages_kept:
@@ -48,20 +48,20 @@ def _about_the_loss(report: RepairReport) -> Iterator[str | Table]:
     if not (report.bytes_lost or report.lost_counts):
         return
     if report.lost_counts and report.uncounted:
-        ending = "these messages are gone, and an unknown number of others:"
+        ending = "these messages are lost, and an unknown number of others:"
     elif report.lost_counts:
-        ending = "these messages are gone:"
+        ending = "these messages are lost:"
     elif report.uncounted:
-        ending = "the number of messages in them is not known"
+        ending = "the number of messages in these bytes is not known"
     else:
-        ending = "no message was in them"
+        ending = "these bytes contained no message"
     yield f"{format_bytes(report.bytes_lost)} cannot be read; {ending}"
     if report.lost_counts:
         yield _lost_table(report)
 
 
 def _lost_table(report: RepairReport) -> Table:
-    table = _table("channel", "gone", "from", "to (UTC)")
+    table = _table("channel", "lost", "from", "to (UTC)")
     for topic, number in sorted(report.lost_counts.items()):
         times_ns = report.lost.get(topic, ())
         span = (_clock(min(times_ns)), _clock(max(times_ns))) if len(times_ns) == number else ("", "")
@@ -75,7 +75,7 @@ def _about_the_rig(report: RepairReport) -> Iterator[str]:
         images = any(schema is not None and schema.name in IMAGE_SCHEMAS for schema in schemas)
         rig = log.channels.get("/rig")
     if images and not (rig and rig.message_count):
-        yield "it has frames but no rig: give one to each command, as --rig lab.toml"
+        yield "the log has frames but no rig: give one to each command (--rig lab.toml)"
 
 
 def _about_the_end(report: RepairReport) -> Iterator[str | Table]:
@@ -84,7 +84,7 @@ def _about_the_end(report: RepairReport) -> Iterator[str | Table]:
     late_ns = report.written_ns - report.last_kept_ns
     copied = not -_FLUSH_NS < late_ns < _COPIED_NS
     end_ns = None if copied else report.written_ns + _FLUSH_NS
-    table = _table("channel", "messages", "last (UTC)", "gone, at most")
+    table = _table("channel", "messages", "last (UTC)", "lost, at most")
     with LogReader(report.path) as log:
         for topic, channel in sorted(log.channels.items()):
             if run_of_topic(topic) is None and channel.message_count:
@@ -94,11 +94,11 @@ def _about_the_end(report: RepairReport) -> Iterator[str | Table]:
                 table.add_row(topic, str(len(times_ns)), _clock(times_ns[-1]), gone)
     yield table
     if copied:
-        yield "Its end is gone. When it ended is not known: the file was copied since."
+        yield "The end of the log is lost. Its time is unknown: the file was copied later."
     else:
         yield (
-            f"The file was last written at {_clock(report.written_ns)} UTC. What came after that is gone:\n"
-            "at most about a second, as a recorder writes at least once a second."
+            f"The file was last written at {_clock(report.written_ns)} UTC. Later messages are lost:\n"
+            "at most those of one second, as a recorder writes at least once per second."
         )
 
 

@@ -58,8 +58,8 @@ def _best_lines(accuracies: Sequence[Accuracy], best: Accuracy) -> Iterator[str 
     }
     yield (
         f"({'3D' if space and not uses_height(best.model) else '2D'}, {_scheme(row)}: "
-        f"{_count(row.error_2d.count, 'point')} of {_count(len(cameras), 'camera')}; a camera's view of a "
-        "point counts as one)."
+        f"{_count(row.error_2d.count, 'point')} of {_count(len(cameras), 'camera')}; each pair of "
+        "a camera and a point counts as one)."
     )
     truth = overall_row(best, row.scheme == CROSS_VALIDATION, _TRUTH)
     if truth is not None:
@@ -104,14 +104,14 @@ def _outlier_lines(accuracies: Sequence[Accuracy]) -> Iterator[str | Text]:
     """Yield the outliers, the worst first; the first outliers have a possible explanation."""
     suspects = gather_outliers(accuracies)
     if not suspects:
-        searched = "none" if any(map(_screened, accuracies)) else f"not searched: {_needed()}"
+        searched = "none" if any(map(_screened, accuracies)) else f"not searched. {_needed()}"
         yield f"Outliers: {searched}."
         return
     yield f"Outliers: measure {_count(len(suspects), 'point')} again, the worst first:"
     for suspect, _ in suspects[:_EXPLAINED]:
         text = suspect.text or "no simple mistake explains it"
         name = name_cell(suspect.measurement).plain
-        yield Text(wrap_text(f"{name}, {_length(suspect.residual_m)} cm off: {text}.", indent="  "))
+        yield Text(wrap_text(f"{name}, error {_length(suspect.residual_m)} cm: {text}.", indent="  "))
     if rest := suspects[_EXPLAINED:]:
         texts = (f"{name_cell(s.measurement).plain} ({_length(s.residual_m)} cm)" for s, _ in rest)
         yield Text(wrap_text(f"{', '.join(texts)}.", indent="  "))
@@ -128,7 +128,9 @@ def _screened(accuracy: Accuracy) -> bool:
 
 
 def _needed() -> str:
-    return f"that needs {FEWEST_POINTS} points of a camera, and one of the models {', '.join(SCREENING)}"
+    return (
+        f"The search needs {FEWEST_POINTS} points of a camera, and one of the models {', '.join(SCREENING)}"
+    )
 
 
 def answer_json(accuracies: Sequence[Accuracy]) -> dict[str, Any]:

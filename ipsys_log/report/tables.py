@@ -180,10 +180,10 @@ def _suspects_table(accuracies: Sequence[Accuracy]) -> Table:
     """Return a table of the outliers, each with the models that found it."""
     table = plain_table("Outliers, the worst first: measure these again", ("point",), ("error cm",))
     table.add_column("found by", overflow="fold", max_width=_FOUND_BY_WIDTH)
-    table.add_column("what would explain it", overflow="fold")
+    table.add_column("possible cause", overflow="fold")
     for suspect, models in gather_outliers(accuracies):
         length_cm = float(np.linalg.norm(suspect.residual_m)) * CM_PER_M
-        found_by, text = ", ".join(models), suspect.text or "nothing simple"
+        found_by, text = ", ".join(models), suspect.text or "none found"
         table.add_row(
             name_cell(suspect.measurement), f"{length_cm:.1f}", name_cell(found_by), name_cell(text)
         )
@@ -203,7 +203,7 @@ def _advice_table(advice: Advice) -> Group:
     lower = any(
         choice.lowest != choice.model for choices in advice.choices.values() for choice in choices.values()
     )
-    note = "In brackets: the lowest mean error, if a simpler model is as good within the noise."
+    note = "In brackets: the model with the lowest mean error, if a simpler model is within its noise."
     return Group(title, table, *([Text(wrap_text(note))] if lower else []))
 
 

@@ -60,7 +60,7 @@ class Guard:
         headers = Headers(scope=scope)
         host = headers.get("host", "")
         if not self._is_ours(host):
-            return _refuse("this address is not one of this machine")
+            return _refuse("this is not an address of this machine")
         if self._token is not None:
             token = parse_qs(scope["query_string"].decode("latin-1")).get("token", [""])[0]
             if scope["method"] == "GET" and scope["path"] == "/" and self._fits(token):
@@ -70,7 +70,7 @@ class Guard:
         if scope["method"] not in ("GET", "HEAD"):
             origin = headers.get("origin")
             if headers.get(HEADER) != "1" or (origin is not None and origin != f"http://{host}"):
-                return _refuse("only the page itself may write")
+                return _refuse("only the measuring page may write")
         return None
 
     def _is_ours(self, host: str) -> bool:

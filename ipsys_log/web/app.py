@@ -71,9 +71,9 @@ def history_json(scene: MeasuringScene) -> dict[str, Any]:
 
 
 def _tapes(measurement: Measurement) -> str:
-    tapes = [f"{tape.reference} {tape.distance_m * CM_PER_M:.1f}" for tape in measurement.distances]
+    tapes = [f"{tape.reference} {tape.distance_m * CM_PER_M:.1f} cm" for tape in measurement.distances]
     side = [measurement.side] if measurement.side else []
-    height = [f"{measurement.height_m * CM_PER_M:.1f} high"] if measurement.height_m is not None else []
+    height = [f"height {measurement.height_m * CM_PER_M:.1f} cm"] if measurement.height_m is not None else []
     return ", ".join([*tapes, *side, *height])
 
 
@@ -117,8 +117,8 @@ def views_json(scene: MeasuringScene, views: Sequence[CameraView], marker_id: in
 
 def _invitation(visible: Sequence[int]) -> str:
     if not visible:
-        return "no camera sees a marker: lay one down, face up"
-    return f"choose the marker: {', '.join(map(str, visible))} are seen"
+        return "no camera sees a marker: put one on the floor, face up"
+    return f"choose the marker: {', '.join(map(str, visible))} are visible"
 
 
 def checked_json(checked: EntryCheck) -> dict[str, Any]:
@@ -195,7 +195,10 @@ async def _handle_disconnect(_: Request, __: Exception) -> Response:
 
 
 async def _handle_failure(_: Request, error: Exception) -> Response:
-    text = f"a fault of ipsys: {type(error).__name__}: {error}; the terminal shows more when the command ends"
+    text = (
+        f"internal error of ipsys: {type(error).__name__}: {error}; the terminal shows "
+        "it when the command ends"
+    )
     return JSONResponse({"error": text}, 500)
 
 
@@ -266,7 +269,7 @@ class _Questions:
             return None
         number = _whole_number(str(given))
         if number is None or number >= len(self._scene.intervals):
-            raise IpsysError(f"there is no place {str(given)[:_MOST_DIGITS]} in this log")
+            raise IpsysError(f"there is no stationary interval {str(given)[:_MOST_DIGITS]} in this log")
         return number
 
 
@@ -280,12 +283,12 @@ async def _body(request: Request) -> dict[str, Any]:
     async for part in request.stream():
         data += part
         if len(data) > _LARGEST:
-            raise IpsysError("that is more than a place needs")
+            raise IpsysError("the request is too large")
     try:
         body = json.loads(data)
         json.dumps(body, ensure_ascii=False).encode()  # raises for half of a surrogate pair
     except (ValueError, RecursionError) as error:
-        raise IpsysError("this is not JSON") from error
+        raise IpsysError("the request is not JSON") from error
     if not isinstance(body, dict):
-        raise IpsysError("this is not a JSON object")
+        raise IpsysError("the request is not a JSON object")
     return body

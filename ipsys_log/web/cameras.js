@@ -24,7 +24,7 @@ async function load(source) {
 }
 
 function tile(where) {
-  const made = make("button", { type: "button", title: "Close up, or the whole picture" }, element("svg", { role: "img" }), make("span"));
+  const made = make("button", { type: "button", title: "Switch between close-up and whole image" }, element("svg", { role: "img" }), make("span"));
   made.addEventListener("click", () => {
     where.classList.toggle("whole");
     drawCameras(where, shown);
@@ -41,8 +41,8 @@ function fill(made, camera, view, whole) {
   svg.setAttribute("class", view.state);
   // Without a chosen marker, the text names the ids.
   const ids = view.marker === null ? camera.markers.map((one) => one.id).filter((id) => view.visible.includes(id)) : [];
-  const what = view.marker !== null ? (sees ? "sees it" : "no") : ids.length ? `sees ${ids.join(", ")}` : "sees none";
-  svg.setAttribute("aria-label", `Camera ${camera.name} ${view.marker === null ? what : sees ? `sees marker ${view.marker}` : "does not see it"}`);
+  const what = view.marker !== null ? (sees ? "sees it" : "not visible") : ids.length ? `sees ${ids.join(", ")}` : "no marker";
+  svg.setAttribute("aria-label", `Camera ${camera.name} ${view.marker === null ? what : sees ? `sees marker ${view.marker}` : `does not see marker ${view.marker}`}`);
   svg.setAttribute("viewBox", close ? closeUp(chosen.corners_px, width, height) : `0 0 ${width} ${height}`);
   svg.setAttribute("preserveAspectRatio", close ? "xMidYMid slice" : "xMidYMid meet");
   svg.style.aspectRatio = whole ? `${width} / ${height}` : "1";

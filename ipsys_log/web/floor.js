@@ -35,7 +35,7 @@ export function drawFloor(svg, lab, found, done, colours, choose) {
     parts.push(element("text", { x: x - 8, y: y - 16 }, reference.name));
   });
   for (const { side, point_m } of found.sides ?? []) {
-    const dot = circle(point_m, 16, "maybe", { role: "button", tabindex: 0, "aria-label": `The place lies ${side}` });
+    const dot = circle(point_m, 16, "maybe", { role: "button", tabindex: 0, "aria-label": `The point is on the ${side}` });
     dot.addEventListener("click", () => choose(side));
     dot.addEventListener("keydown", (event) => event.key === "Enter" && choose(side));
     const [x, y] = at(point_m);

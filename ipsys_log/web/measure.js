@@ -18,7 +18,7 @@ async function ask(path, body) {
   try {
     answer = await fetch(`api/${path}`, options);
   } catch {
-    throw new Error("The computer does not answer: is ipsys still running, are you in its network?");
+    throw new Error("The computer does not answer. Is ipsys still running? Is this device in its network?");
   }
   const kind = answer.headers.get("content-type") ?? "";
   const content = kind.includes("json") ? await answer.json() : { error: await answer.text() };
@@ -132,9 +132,9 @@ function show(answer) {
   $("short").replaceChildren(...against.map((text) => make("span", {}, text)));
   if (!against.length && answer.ready && answer.point_m) $("short").textContent = short(answer);
   save.disabled = !answer.ready;
-  save.textContent = answer.ready ? `Save ${answer.id}${doubtful ? " all the same" : ""}`
-    : wrong.length && wrong.every((fault) => fault.field === "marker") && !missing.length ? "Wait: the marker has to lie still"
-    : wrong.length && any ? "Not yet: see above" : missing.length && any ? `Still missing: ${missing.join(", ")}` : "Save";
+  save.textContent = answer.ready ? `Save ${answer.id}${doubtful ? " despite the warning" : ""}`
+    : wrong.length && wrong.every((fault) => fault.field === "marker") && !missing.length ? "Wait: the marker must not move"
+    : wrong.length && any ? "Correct the errors above" : missing.length && any ? `Still missing: ${missing.join(", ")}` : "Save";
   draw();
 }
 
@@ -142,20 +142,20 @@ const upper = (text) => text.charAt(0).toUpperCase() + text.slice(1);
 
 function short({ point_m: [x, y, z], sigma_cm }) {
   const known = sigma_cm === null ? "" : ` ± ${cm(sigma_cm)} cm`;
-  return `x ${x.toFixed(3)}, y ${y.toFixed(3)} m${known}, ${cm(z * 100)} cm high`;
+  return `x ${cm(x * 100)}, y ${cm(y * 100)} cm${known}, height ${cm(z * 100)} cm`;
 }
 
 function verdict(answer) {
   if (!answer.point_m) return [];
   const [x, y, z] = answer.point_m;
   const known = answer.sigma_cm === null ? "" : ` ± ${cm(answer.sigma_cm)} cm`;
-  const where = answer.on_floor === null ? "" : answer.on_floor ? ", within the floor's edges" : ", outside of the floor";
+  const where = answer.on_floor === null ? "" : answer.on_floor ? ", inside the floor" : ", outside the floor";
   const parts = [make("p", { className: answer.on_floor === false ? "warn" : "point" },
-    make("b", {}, `x ${x.toFixed(3)}, y ${y.toFixed(3)} m`), `${known}, ${cm(z * 100)} cm high${where}`)];
+    make("b", {}, `x ${cm(x * 100)}, y ${cm(y * 100)} cm`), `${known}, height ${cm(z * 100)} cm${where}`)];
   if (answer.residuals.length)
-    parts.push(table("The distances disagree by", answer.residuals.map((r) => [r.name, `${cm(r.cm)} cm`])));
+    parts.push(table("Residuals of the distances", answer.residuals.map((r) => [r.name, `${cm(r.cm)} cm`])));
   if (answer.predictions.length)
-    parts.push(table("Off the present model", answer.predictions.map((p) => [p.camera, `${cm(p.cm)} cm`, p.camera])));
+    parts.push(table("Difference from the present model", answer.predictions.map((p) => [p.camera, `${cm(p.cm)} cm`, p.camera])));
   return parts;
 }
 
@@ -180,7 +180,7 @@ function draw() {
     soon();
   });
   $("floor").setAttribute("aria-label", found.point_m
-    ? `Floor map: the place is at x ${found.point_m[0].toFixed(2)}, y ${found.point_m[1].toFixed(2)} m` : "Floor map");
+    ? `Floor map: the point is at x ${cm(found.point_m[0] * 100)}, y ${cm(found.point_m[1] * 100)} cm` : "Floor map");
 }
 
 // --- views of the cameras ---------------------------------------------------------------------
@@ -201,7 +201,7 @@ async function look() {
 function offerMarkers() {
   const chosen = $("marker").value, ids = [...new Set([...view.visible.map(String), ...(chosen ? [chosen] : [])])];
   if ([...$("marker").options].slice(1).map((o) => o.value).join() === ids.join()) return;
-  const any = make("option", { value: "" }, view.visible.length === 1 ? `${view.visible[0]}, the only one seen` : "choose");
+  const any = make("option", { value: "" }, view.visible.length === 1 ? `${view.visible[0]}, the only visible marker` : "choose");
   $("marker").replaceChildren(any, ...ids.map((id) => make("option", { value: id }, id)));
   $("marker").value = chosen;
 }
@@ -219,12 +219,12 @@ async function go(to) {
 function showStop() {
   const { marker: id, seconds } = lab.stops[stop], as = history.measured[stop];
   const open = history.measured.filter((one) => one === null).length;
-  const state = as === null ? `still for ${seconds.toFixed(1)} s, not measured` : `measured as ${as}`;
-  $("stop").replaceChildren(`Marker ${id}, place ${stop + 1} of ${lab.stops.length}`, make("small", {}, state));
+  const state = as === null ? `stationary ${seconds.toFixed(1)} s, not measured` : `measured as ${as}`;
+  $("stop").replaceChildren(`Marker ${id}, interval ${stop + 1} of ${lab.stops.length}`, make("small", {}, state));
   $("before").disabled = stop === 0;
   $("after").disabled = stop === lab.stops.length - 1;
   $("open").disabled = open === 0;
-  $("open").textContent = open ? `Next one not measured (${open} left)` : "All are measured";
+  $("open").textContent = open ? `Next unmeasured (${open} left)` : "All are measured";
 }
 
 function nextOpen() {
@@ -235,14 +235,14 @@ function nextOpen() {
 
 function list() {
   const rows = history.places.map((place) => {
-    const where = place.point_m ? `at ${place.point_m.slice(0, 2).map((v) => v.toFixed(2)).join(", ")} m` : place.counts ? "" : "withdrawn";
+    const where = place.point_m ? `at x ${cm(place.point_m[0] * 100)}, y ${cm(place.point_m[1] * 100)} cm` : place.counts ? "" : "withdrawn";
     const text = make("div", {}, make("b", {}, place.id), make("span", {}, ` marker ${place.marker}`), " ", make("em", {}, where), make("small", {}, place.tapes));
     if (!place.counts) return make("li", { className: "gone" }, text);
     const undo = make("button", { type: "button" }, "Undo");
     undo.setAttribute("aria-label", `Undo ${place.id}`);
     undo.addEventListener("click", guarded(async () => {
       history = (await write("undo", { id: place.id })).history;
-      tell(`${place.id} is withdrawn; it stays in the log, but does not count`);
+      tell(`${place.id} is withdrawn. It stays in the log, but no stage uses it.`);
       refresh();
     }));
     return make("li", {}, text, undo);

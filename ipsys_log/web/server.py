@@ -175,15 +175,19 @@ def _listen(host: str, port: int) -> socket.socket:
         family, *_, address = socket.getaddrinfo(host, port, type=socket.SOCK_STREAM)[0]
         return socket.create_server(address[:2], family=family, backlog=_BACKLOG)
     except socket.gaierror as error:
-        raise IpsysError(f"--host {host}: is no address of this machine; 0.0.0.0 is all of them") from error
+        raise IpsysError(
+            f"--host {host}: is not an address of this machine; use 0.0.0.0 for all its addresses"
+        ) from error
     except OverflowError as error:
-        raise IpsysError(f"--port {port}: give one of 1024 to 65535") from error
+        raise IpsysError(f"--port {port}: is not a port; give one from 1024 to 65535") from error
     except OSError as error:
         if error.errno == errno.EADDRINUSE:
-            raise IpsysError(f"--port {port}: is in use by another program; give another one") from error
+            raise IpsysError(f"--port {port}: is in use by another program; give another port") from error
         if error.errno == errno.EACCES:
-            raise IpsysError(f"--port {port}: is not allowed; give one of 1024 to 65535") from error
-        raise IpsysError(f"--host {host}: cannot be listened on: {error.strerror}") from error
+            raise IpsysError(f"--port {port}: is not allowed; give one from 1024 to 65535") from error
+        raise IpsysError(
+            f"--host {host}: the server cannot listen on this address: {error.strerror}"
+        ) from error
 
 
 def _url(host: str | None, port: int, token: str | None) -> str:

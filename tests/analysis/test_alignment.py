@@ -1,4 +1,4 @@
-"""The tilt of a camera from markers on the floor, against tilts that were put in."""
+"""The estimated tilt of a camera, compared with known tilts."""
 
 from __future__ import annotations
 
@@ -21,12 +21,12 @@ from tests.ladder import follow
 Array = NDArray[np.float64]
 
 ORIGIN_M = np.array([2.4, 1.0, 2.1])
-# Under the camera, out to the edges of its picture.
+# Points under the camera, up to the edges of its image.
 PLACES_M = np.array([(0.6, 0.3), (4.2, 0.3), (4.2, 1.7), (0.6, 1.7), (2.0, 1.1), (3.1, 0.6)])
 
 
 def hang(tilt_deg: float, towards_deg: float) -> Array:
-    """``camera_from_world`` of a camera turned about an axis of its own picture."""
+    """Return ``camera_from_world`` of a camera turned about an axis of its own image."""
     towards = math.radians(towards_deg)
     return look_down(ORIGIN_M, math.radians(tilt_deg) * np.array([math.cos(towards), math.sin(towards), 0.0]))
 
@@ -34,7 +34,7 @@ def hang(tilt_deg: float, towards_deg: float) -> Array:
 def lay(
     camera_from_world: Array, noise_m: float = 0.0, heights_m: Sequence[float] = (), seed: int = 0
 ) -> list[StationaryMarker]:
-    """Markers at :data:`PLACES_M` as the camera has them; what they stand on is known to nobody."""
+    """Return stationary markers at :data:`PLACES_M`. The supports under the markers are unknown."""
     rng = np.random.default_rng(seed)
     heights = np.zeros(len(PLACES_M))
     heights[: len(heights_m)] = heights_m
@@ -51,12 +51,12 @@ def degrees(angle_rad: float | None) -> float:
 
 @pytest.mark.parametrize("tilt_deg", [0.0, 2.0, 5.0])
 @pytest.mark.parametrize("towards_deg", [0, 45, 100, 200, 290])
-def test_a_known_tilt_comes_back_and_the_advice_mends_it(tilt_deg: float, towards_deg: float) -> None:
+def test_known_tilt_is_estimated_and_the_advice_corrects_it(tilt_deg: float, towards_deg: float) -> None:
     camera = hang(tilt_deg, towards_deg)
     found = align_camera("red", lay(camera, 0.003))
     assert degrees(found.tilt_rad) == pytest.approx(tilt_deg, abs=0.2)
     assert found.down is not None
-    # The plumb line itself, not only how far it is off.
+    # Compare the direction of the plumb line, not only its angle.
     assert math.degrees(math.acos(min(1.0, float(found.down @ -camera[:3, 2])))) < 0.2
     assert degrees(found.sigma_rad) < 0.2
     assert found.spread_m is not None
@@ -64,7 +64,7 @@ def test_a_known_tilt_comes_back_and_the_advice_mends_it(tilt_deg: float, toward
     assert found.remaining_m < 0.02
     if tilt_deg == 0:
         assert found.level
-        assert advise(found).startswith("nothing: it is level, the spread is under 5 cm")
+        assert advise(found).startswith("nothing: the camera is level, its spread is under 5 cm")
         return
     assert found.level == (found.spread_m < LEVEL_M)
     if tilt_deg == 5:
@@ -78,21 +78,21 @@ def test_a_known_tilt_comes_back_and_the_advice_mends_it(tilt_deg: float, toward
 @pytest.mark.parametrize(
     ("axis", "says"),
     [
-        # Turned about the axis to the right of the picture, a camera looks further to its top.
-        ((1, 0), "towards the bottom of its picture, by 3.0 degrees (11 cm on the floor)"),
-        ((-1, 0), "towards the top of its picture, by 3.0 degrees (11 cm on the floor)"),
-        ((0, 1), "towards the left of its picture, by 3.0 degrees (11 cm on the floor)"),
-        ((0, -1), "towards the right of its picture, by 3.0 degrees (11 cm on the floor)"),
+        # A rotation about the axis to the right of the image turns the view towards the top.
+        ((1, 0), "3.0 degrees towards the bottom of its image (11 cm on the floor)"),
+        ((-1, 0), "3.0 degrees towards the top of its image (11 cm on the floor)"),
+        ((0, 1), "3.0 degrees towards the left of its image (11 cm on the floor)"),
+        ((0, -1), "3.0 degrees towards the right of its image (11 cm on the floor)"),
     ],
 )
-def test_the_words(axis: tuple[float, float], says: str) -> None:
+def test_advice_names_the_direction_of_the_turn(axis: tuple[float, float], says: str) -> None:
     camera_turned = rotation(np.radians(3.0) * np.array([*axis, 0.0]))
     points_m = transform(look_down(ORIGIN_M), np.column_stack([PLACES_M, np.zeros(len(PLACES_M))]))
-    # The axes of the camera are turned: what it sees turns the other way.
+    # The camera axes are turned, so the points turn the other way.
     found = align_camera(
         "red", [StationaryMarker(n, p, np.zeros((3, 3))) for n, p in enumerate(points_m @ camera_turned)]
     )
-    assert advise(found) == f"tilt it so that it looks further {says}"
+    assert advise(found) == f"turn the camera {says}"
 
 
 def by_eq_3(camera_from_world: Array) -> list[StationaryMarker]:
@@ -107,7 +107,7 @@ def by_eq_3(camera_from_world: Array) -> list[StationaryMarker]:
 
 @pytest.mark.parametrize("towards_deg", [0, 70])
 def test_eq_3_overstates_a_tilt_by_half(towards_deg: float) -> None:
-    """Why camera points by the pose of the marker are used."""
+    """Test the reason to use camera points of the marker pose."""
     camera = hang(1.0, towards_deg)
     assert degrees(align_camera("red", by_eq_3(camera)).tilt_rad) == pytest.approx(1.5, abs=0.05)
     assert degrees(align_camera("red", lay(camera)).tilt_rad) == pytest.approx(1.0, abs=1e-6)
@@ -125,14 +125,14 @@ def test_a_marker_on_a_box_is_named_and_left_out() -> None:
     assert flat.raised_markers == ()
 
 
-def test_of_four_markers_nobody_can_tell_which_is_on_a_box() -> None:
+def test_raised_marker_of_four_cannot_be_identified() -> None:
     found = align_camera("red", lay(hang(0.0, 0), 0.001, [0.08])[:4])
     assert found.raised_markers == ()
     assert found.uneven_m == pytest.approx(0.04, abs=0.005)
     assert align_camera("red", lay(hang(3.0, 0), 0.001)[:4]).uneven_m is None
 
 
-def test_a_height_that_was_measured_is_brought_down() -> None:
+def test_measured_height_is_subtracted() -> None:
     camera = hang(4.0, 130)
     lying = lay(camera, 0.0, [0.2, 0.0, 0.1, 0.15])
     known = [
@@ -147,22 +147,22 @@ def test_a_height_that_was_measured_is_brought_down() -> None:
 
 
 def test_one_and_two_markers_and_markers_on_a_line() -> None:
-    camera = hang(5.0, 90)  # to the left or right of the picture
+    camera = hang(5.0, 90)  # turned to the left or right of the image
     lying = lay(camera)
-    assert "none lies still" in advise(align_camera("red", []))
+    assert "none is stationary" in advise(align_camera("red", []))
     one = align_camera("red", lying[:1])
     assert (one.spread_m, one.level, one.tilt_rad) == (None, None, None)
-    assert "lay three or more markers" in advise(one)
+    assert "put three or more markers" in advise(one)
     two = align_camera("red", lying[:2])
     assert two.axes == 1
     assert degrees(two.tilt_rad) == pytest.approx(5.0, abs=0.1)
-    assert "along the line of its markers only" in advise(two)
+    assert "only along the line of its markers" in advise(two)
     across = align_camera("red", lying[1:3])
-    assert degrees(across.tilt_rad) < 0.5  # across it they know nothing
+    assert degrees(across.tilt_rad) < 0.5  # the markers give no information across the line
     assert across.spread_m is not None
     assert across.spread_m < LEVEL_M
-    assert across.level is None  # not green: it hangs askew by 5 degrees
-    assert advise(across).startswith("lay one aside of the line of its markers")
+    assert across.level is None  # not green: the camera is tilted by 5 degrees
+    assert advise(across).startswith("put a marker beside the line of its markers")
     assert two.level is False
     line = [
         StationaryMarker(
@@ -177,8 +177,8 @@ def test_one_and_two_markers_and_markers_on_a_line() -> None:
     assert "further apart" in advise(align_camera("red", near))
 
 
-def test_what_a_tilt_does_not_mend_is_said() -> None:
-    """A lens that was calibrated badly bends the floor."""
+def test_spread_without_a_tilt_is_reported() -> None:
+    """Bad intrinsics make the floor look curved."""
     lying = lay(hang(0.0, 0))
     bowl = [
         StationaryMarker(
@@ -190,7 +190,7 @@ def test_what_a_tilt_does_not_mend_is_said() -> None:
     ]
     found = align_camera("red", bowl)
     assert found.level is False
-    assert "calibrate its lens again" in advise(found)
+    assert "repeat the intrinsic calibration" in advise(found)
 
 
 def test_the_uncertainty_is_that_of_the_scatter() -> None:
@@ -200,10 +200,10 @@ def test_the_uncertainty_is_that_of_the_scatter() -> None:
         assert found.down is not None
         misses.append(found.down + hang(3.0, 20)[:3, 2])
         sigmas_deg.append(degrees(found.sigma_rad))
-    # In the direction that is known worst, variance for variance.
+    # Compare the variances in the direction with the largest uncertainty.
     off_rad = np.sqrt(np.mean(np.square(misses), axis=0)).max()
     assert 0.8 < np.degrees(off_rad) / np.sqrt(np.mean(np.square(sigmas_deg))) < 1.2
-    # More of what scatters so is not named as lying elsewhere than chance has it.
+    # The rate of false outliers is not above chance.
     named = [
         len(align_camera("red", lay(hang(3.0, 20), 0.01, seed=seed)).raised_markers) for seed in range(200)
     ]
@@ -211,7 +211,7 @@ def test_the_uncertainty_is_that_of_the_scatter() -> None:
 
 
 def carried(places_m: Sequence[Array]) -> Iterator[CameraPoints]:
-    """A marker that lies a second at each place, and is lifted and carried to the next one in between."""
+    """Return frames of a marker that stays one second at each point and is then carried to the next."""
     time_ns = 0
     for here_m, next_m in zip(places_m, [*places_m[1:], None], strict=True):
         for _ in range(30):
@@ -223,7 +223,7 @@ def carried(places_m: Sequence[Array]) -> Iterator[CameraPoints]:
             time_ns += NS_PER_S // 30
 
 
-def test_one_marker_at_one_place_after_the_other() -> None:
+def test_one_marker_can_visit_the_points_in_turn() -> None:
     camera = hang(4.0, 200)
     places_m = [one.point_m for one in lay(camera)]
     lying = find_stationary(carried(places_m))
@@ -233,11 +233,11 @@ def test_one_marker_at_one_place_after_the_other() -> None:
     assert degrees(align_camera("red", lying).tilt_rad) == pytest.approx(4.0, abs=0.01)
 
 
-def test_a_frame_for_each_place_is_enough_where_there_is_time_between() -> None:
+def test_one_frame_per_point_is_enough_with_pauses() -> None:
     places_m = [one.point_m for one in lay(hang(4.0, 200))]
     frames = [CameraPoints(n * 3 * NS_PER_S, (CameraPoint(7, *p.tolist()),)) for n, p in enumerate(places_m)]
     assert len(find_stationary(frames)) == len(places_m)
-    # A robot that drives by lies nowhere.
+    # A moving robot has no stationary interval.
     passing = [CameraPoints(n * NS_PER_S // 10, (CameraPoint(7, 0.1 * n, 0.0, 2.0),)) for n in range(20)]
     assert find_stationary(passing) == []
 

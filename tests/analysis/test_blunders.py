@@ -1,4 +1,4 @@
-"""The effect of each blunder on a calibration point, in words and as a measurement without it."""
+"""The effect of each gross error on a calibration point, as text and as a corrected measurement."""
 
 from __future__ import annotations
 
@@ -50,15 +50,13 @@ def misread(index: int, distance_m: float) -> Measurement:
         ),
     ],
 )
-def test_a_slip_taken_back_gives_the_true_place_and_says_how(wrong: Measurement, text: str) -> None:
+def test_corrected_gross_error_gives_the_true_point(wrong: Measurement, text: str) -> None:
     (slip,) = [one for one in slips(wrong) if one.text == text]
     np.testing.assert_allclose(world_point(slip.corrected, RIG).world_m, TRUE, atol=1e-9)
 
 
 @given(st.floats(-3, 5), st.floats(-4, 4), st.floats(-0.4, 0.4), st.sampled_from([0, 1]))
-def test_a_corrected_distance_comes_as_near_as_the_other_one_allows(
-    x: float, y: float, off_m: float, which: int
-) -> None:
+def test_corrected_distance_is_the_best_possible_one(x: float, y: float, off_m: float, which: int) -> None:
     assume(abs(y) > 0.3)
     predicted = np.array([x, y, 0.1])
     distances = [Distance(p.name, float(np.hypot(x - p.x_m, y - p.y_m))) for p in POINTS[:2]]
@@ -70,12 +68,12 @@ def test_a_corrected_distance_comes_as_near_as_the_other_one_allows(
     assert found.corrected.distances[1 - which] == distances[1 - which]
 
 
-def test_the_order_is_from_simple_to_less_so() -> None:
+def test_models_are_ordered_by_complexity() -> None:
     groups = [[slip.kind for slip in group] for group in possible_blunders(PLACE, RIG, TRUE)]
     assert groups == [["side", "swapped"], ["swapped"], ["distance", "distance", "height"]]
 
 
-def test_three_distances_tell_the_side_themselves() -> None:
+def test_three_distances_determine_the_side() -> None:
     ranges = [Distance(p.name, float(np.hypot(*(TRUE[:2] - [p.x_m, p.y_m])))) for p in POINTS]
     wrong = replace(PLACE, distances=(ranges[0], ranges[1], replace(ranges[2], distance_m=2.3)), side=None)
     found = slips(wrong)
@@ -87,15 +85,15 @@ def test_three_distances_tell_the_side_themselves() -> None:
     np.testing.assert_allclose(world_point(by_c.corrected, RIG).world_m, TRUE, atol=1e-9)
 
 
-def test_one_reference_point_measured_twice_names_the_line_all_the_same() -> None:
+def test_repeated_reference_point_still_names_the_line() -> None:
     twice = replace(PLACE, distances=(Distance("A", 1.5), Distance("A", 1.5), Distance("B", 1.0)))
     sides = [slip.text for slip in slips(twice) if slip.kind == "side"]
     assert sides == ["it lies right of the line from A to B, not left"]
-    # Without the distance to B there is no telling where.
+    # Without the distance to B, the side is unknown.
     assert "the distance to B" not in " ".join(slip.text for slip in slips(twice) if slip.kind == "distance")
 
 
-def test_a_world_point_alone_is_measured_from_the_first_two_reference_points() -> None:
+def test_world_point_uses_the_first_two_reference_points() -> None:
     x, y, z = TRUE.tolist()
     given_point = Measurement(0, "a", marker_id=0, point=WorldPoint(x, -y, z))
     found = slips(given_point)
@@ -122,6 +120,6 @@ def test_a_point_with_distances_from_one_reference_point_only() -> None:
     assert any(slip.text.startswith("the distance to B") for slip in slips(odd))
 
 
-def test_no_marker_lies_below_the_floor() -> None:
+def test_marker_below_the_floor_is_refused() -> None:
     assert [slip for slip in slips(PLACE, predicted=[*TRUE[:2], -0.1]) if slip.kind == "height"] == []
     assert [slip for slip in slips(PLACE, predicted=[*TRUE[:2], -0.01]) if slip.kind == "height"] != []

@@ -1,4 +1,4 @@
-"""Estimates of the usual errors: errors drawn from a known law, and the law found again."""
+"""Estimates of the usual errors, from errors with a known distribution."""
 
 from __future__ import annotations
 
@@ -20,7 +20,7 @@ def floor(rng: np.random.Generator, count: int) -> Array:
 
 
 def errors(rng: np.random.Generator, places: Array, along: float, across: float, power: float = 0.0) -> Array:
-    """Along the view from EYE and across it, the former growing to the rim."""
+    """Return errors along and across the view from EYE; those along the view grow towards the rim."""
     views = places - EYE
     slant = (views**2).sum(axis=1) / views[:, 2] ** 2
     views /= np.linalg.norm(views, axis=1)[:, None]
@@ -64,7 +64,7 @@ def test_errors_along_the_view_are_told_from_errors_across_it(power: float) -> N
     along = np.sqrt(np.einsum("ni,nij,nj->n", views, found, views))
     across = np.sqrt((np.trace(found, axis1=1, axis2=2) - along**2) / 2)
     assert 1.3 < np.median((along / across)[slant < 1.1]) < 3.0
-    # The rim has the benefit of half a power.
+    # The test is less strict at the rim, by half a power.
     assert np.polyfit(np.log(slant), np.log(along), 1)[0] == pytest.approx(power + 0.5, abs=0.3)
 
 
@@ -79,8 +79,8 @@ def test_gross_errors_do_not_move_the_yardstick() -> None:
     assert score(spoilt, usual(places, spoilt))[:6].min() > 5
 
 
-def test_a_place_at_the_rim_is_allowed_more_as_leverage_has_it() -> None:
-    """Monte Carlo: leave-one-out errors of the polynomial itself, on points with equal noise."""
+def test_threshold_grows_with_leverage_at_the_rim() -> None:
+    """Return leave-one-out errors of the polynomial itself, on points with equal noise (Monte Carlo)."""
     rng = np.random.default_rng(4)
     places = floor(rng, 30)
     squares = np.zeros(30)
@@ -97,7 +97,7 @@ def test_a_place_at_the_rim_is_allowed_more_as_leverage_has_it() -> None:
     assert allowed.max() > 2 * allowed.min()
 
 
-def test_few_places_make_the_yardstick_longer() -> None:
+def test_few_points_increase_the_threshold() -> None:
     rng = np.random.default_rng(5)
     sizes = []
     for count in (15, 20, 50, 200):
@@ -109,18 +109,18 @@ def test_few_places_make_the_yardstick_longer() -> None:
     assert sizes[-1] > 0.95
 
 
-def test_the_error_of_a_bad_tape_comes_on_top() -> None:
+def test_tape_error_adds_to_the_error() -> None:
     rng = np.random.default_rng(6)
     places = floor(rng, 200)
     off = rng.normal(0, 0.01, places.shape)
     tape_m2 = 0.008**2 * np.eye(3)
     known = usual(places, off, tape=0.008)
     assert np.trace(known.mean(axis=0)) < np.trace(usual(places, off).mean(axis=0))
-    # On the safe side: with the tape's part the usual error is rather too long than too short.
+    # The usual error is rather overestimated than underestimated with the tape's part.
     assert 0.7 < np.median(score(off, known + tape_m2)) <= 1.01
 
 
-def test_places_left_out_are_judged_by_the_others() -> None:
+def test_excluded_points_are_judged_by_the_others() -> None:
     rng = np.random.default_rng(7)
     places = floor(rng, 50)
     off = rng.normal(0, 0.01, places.shape)

@@ -1,4 +1,4 @@
-"""The floor that cameras see, against a camera that is a closed form and against every corner."""
+"""The coverage of the floor, compared with a closed form and with every marker corner."""
 
 from __future__ import annotations
 
@@ -19,7 +19,7 @@ FLOOR = Floor(2.0, 3.0)
 
 
 def pinhole(camera: str, x_m: float, y_m: float, height_m: float = 2.0) -> MountedCamera:
-    """Sees 2.4 m x 1.6 m of the floor from 2 m above it."""
+    """Return a camera that sees 2.4 m x 1.6 m of the floor from a height of 2 m."""
     K = np.array([[1000.0, 0, 600], [0, 1000, 400], [0, 0, 1]])
     lens = CameraCalibration(0, camera, 1201, 801, "plumb_bob", np.zeros(5), K)
     return MountedCamera(camera, lens, look_down(np.array([x_m, y_m, height_m])))
@@ -35,7 +35,7 @@ def test_two_cameras_that_look_straight_down(apart_m: float, width_m: float) -> 
     assert overlap.at_m[1] == pytest.approx(1.5, abs=0.02)
     diagonal_m = 0.2 * np.sqrt(2)
     assert found.diagonal_m == pytest.approx(diagonal_m)
-    # A strip in the middle; and at both ends of the floor where its last bit is not seen.
+    # A strip at the centre and both ends of the floor are not visible.
     strip_m = max(0.0, diagonal_m - width_m)
     middle = [patch for patch in found.gaps if abs((patch.low_m + patch.high_m)[1] / 2 - 1.5) < 0.1]
     assert [patch.area_m2 for patch in middle] == (
@@ -68,7 +68,7 @@ def whole(camera: Camera, places_m: Array, length_m: float) -> NDArray[np.bool_]
     return found
 
 
-def test_a_fisheye_that_is_tilted_against_every_corner_of_a_marker() -> None:
+def test_tilted_fisheye_coverage_equals_a_corner_test() -> None:
     lab = LabSettings(cameras=("red",), tilt_deg=(4.0, 6.0), mount_height_m=2.4)
     (camera,) = mount_cameras(lab)
     hung = MountedCamera("red", camera.lens, camera.camera_from_world)
@@ -78,7 +78,7 @@ def test_a_fisheye_that_is_tilted_against_every_corner_of_a_marker() -> None:
     xs_m, ys_m = np.meshgrid(found.xs_m[::step], found.ys_m[::step])
     places_m = np.column_stack([xs_m.ravel(), ys_m.ravel(), np.full(xs_m.size, 0.1)])
     sampled = mask[::step, ::step].ravel()
-    # A marker that is larger or smaller by 2 cm bounds what the grid may say.
+    # Markers that are 2 cm larger or smaller bound the result of the grid.
     surely, maybe = whole(camera, places_m, 0.22), whole(camera, places_m, 0.18)
     assert 0.1 < surely.mean() < maybe.mean() < 0.9
     assert sampled[surely].all()

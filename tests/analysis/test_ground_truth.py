@@ -1,4 +1,4 @@
-"""Tracks against the truth, at its instants and between them."""
+"""Errors of tracks against the ground truth, at its times and between them."""
 
 from __future__ import annotations
 
@@ -10,7 +10,7 @@ from ipsys_log.analysis.pairs import Sightings
 from ipsys_log.messages import Message, Track, Tracks
 
 MS = 1_000_000
-# Nanoseconds since 1970 do not fit into a double.
+# A double cannot hold nanoseconds since 1970 exactly.
 START_NS = 1_700_000_000_000_000_001
 
 
@@ -25,32 +25,32 @@ TRUTH = gather_tracks([tracked(0, 0.0), tracked(30, 0.06), tracked(60, 0.06), tr
 @pytest.mark.parametrize(
     ("time_ms", "x_m"), [(0, 0.0), (10, 0.02), (30, 0.06), (29.999999, 0.059999998), (45, 0.06), (161, 1.0)]
 )
-def test_between_its_instants_the_truth_lies_on_a_line(time_ms: float, x_m: float) -> None:
+def test_ground_truth_is_interpolated_linearly(time_ms: float, x_m: float) -> None:
     found = track_errors(gather_tracks([tracked(time_ms, x_m + 0.25)]), TRUTH)
     assert found is not None
     assert found[0].mean_m == pytest.approx(0.25, abs=1e-12)
 
 
 @pytest.mark.parametrize("time_ms", [-1e-6, 60 + 1e-6, 100, 161 + 1e-6])
-def test_beyond_its_ends_and_in_its_gaps_there_is_no_truth(time_ms: float) -> None:
+def test_ground_truth_has_no_values_outside_its_times(time_ms: float) -> None:
     assert track_errors(gather_tracks([tracked(time_ms, 0.0)]), TRUTH) is None
 
 
-def test_one_instant_of_truth_says_nothing_of_the_next_nanosecond() -> None:
+def test_single_ground_truth_pose_is_not_extrapolated() -> None:
     truth = gather_tracks([tracked(0, 0.0)])
     assert track_errors(gather_tracks([tracked(1e-6, 0.0)]), truth) is None
     assert track_errors(gather_tracks([tracked(0, 0.0)]), truth) is not None
 
 
 def test_poses_of_different_instants_count_one_by_one() -> None:
-    # Two cameras that expose a marker 4 ms apart: the second pose rests on both, the first one does not.
+    # Two cameras expose a marker 4 ms apart: the second pose uses both, the first pose one.
     found = track_errors(gather_tracks([tracked(10, 0.02), tracked(14, 0.028), tracked(14, 0.038)]), TRUTH)
     assert found is not None
     assert found[0].count == 2
     assert found[0].max_m == pytest.approx(0.01)
 
 
-def test_at_its_own_instants_the_truth_is_taken_as_it_stands() -> None:
+def test_ground_truth_is_exact_at_its_own_times() -> None:
     rng = np.random.default_rng(0)
     times_ns = START_NS + np.sort(rng.choice(10_000 * MS, 300, replace=False))
     known = Sightings(times_ns[[0, *range(300)]], rng.normal(size=(301, 3)))
@@ -58,7 +58,7 @@ def test_at_its_own_instants_the_truth_is_taken_as_it_stands() -> None:
     track = Sightings(times_ns[there], rng.normal(size=(200, 3)))
     found = track_errors({0: track}, {0: known})
     assert found is not None
-    # The first of two at one instant, as since the beginning.
+    # The first of two poses at one time counts.
     rows_m = track.points_m - known.points_m[np.where(there == 0, 0, there + 1)]
     errors_m = np.linalg.norm(rows_m, axis=1)
     assert (found[0].count, found[0].mean_m) == (200, errors_m.mean())

@@ -1,4 +1,4 @@
-"""Cameras joined without a tape, against where they hang."""
+"""Cameras joined without a tape, compared with their true poses."""
 
 from __future__ import annotations
 
@@ -17,7 +17,7 @@ Array = NDArray[np.float64]
 
 NONE = np.zeros((3, 3))
 LENS = CameraCalibration(0, "any", 1201, 801, "plumb_bob", np.zeros(5), np.diag([1000.0, 1000, 1]))
-# Tilted, at two heights, and the second one turned about the plumb line besides.
+# The cameras are tilted, at two heights, and the second is also turned about the plumb line.
 RED = look_down(np.array([0.0, 0.0, 2.0]), np.array([0.03, -0.02, 0.0]))
 WHITE = make_pose(rotation(np.array([0.0, 0.0, 2.5])), np.zeros(3)) @ look_down(
     np.array([0.3, 1.4, 2.3]), np.array([-0.01, 0.04, 0.0])
@@ -39,14 +39,14 @@ def joined(red: list[StationaryMarker], white: list[StationaryMarker]) -> list[M
     return join_cameras(alignments, {"red": LENS, "white": LENS})
 
 
-def test_two_markers_that_both_see_are_enough() -> None:
+def test_two_common_markers_join_two_cameras() -> None:
     red, white = joined(lying("red", RED), lying("white", WHITE))
     found = red.camera_from_world @ invert_pose(white.camera_from_world)
     assert np.abs(found - RED @ invert_pose(WHITE)).max() < 1e-6
     assert np.abs(invert_pose(red.camera_from_world)[2] - invert_pose(RED)[2]).max() < 1e-6
 
 
-def test_markers_that_are_not_the_same_join_nothing() -> None:
+def test_different_markers_do_not_join_cameras() -> None:
     red, white = lying("red", RED), lying("white", WHITE)
     assert joined(red, white[1:]) == []
     later = [replace(one, start_ns=10, end_ns=20) for one in white]

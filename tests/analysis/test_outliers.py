@@ -1,4 +1,4 @@
-"""Slips planted in simulated sessions are found and named, good ones left alone; the authors' data."""
+"""Gross errors in simulated sessions are found and named, and good points are kept; the authors' data."""
 
 from __future__ import annotations
 
@@ -28,7 +28,7 @@ TILES_M = 4.88
 
 @dataclass(frozen=True)
 class Session:
-    """Measured places, where they truly are, and what each camera saw of them."""
+    """Calibration points, their true positions, and the camera points of each camera."""
 
     places: list[RiggedMeasurement]
     truth: Mapping[str, Array]
@@ -47,7 +47,7 @@ class Session:
 
 
 def read_tape(point: Array, rng: np.random.Generator, sigma_m: float, rig: Rig = RIG) -> list[Distance]:
-    """Distances with the tape's noise, read again where they close no triangle."""
+    """Return distances with the noise of the tape, drawn again if they form no triangle."""
     while True:
         found = [
             Distance(p.name, float(np.hypot(*(point[:2] - [p.x_m, p.y_m])) + rng.normal(0, sigma_m)))
@@ -59,9 +59,11 @@ def read_tape(point: Array, rng: np.random.Generator, sigma_m: float, rig: Rig =
 
 
 def simulated(seed: int, count: int = 50, shared: bool = False, rig: Rig = RIG) -> Session:
-    """Three cameras 2.1 m above a floor, about ``count`` places each: noise of 1 cm along the view and
-    2.5 mm across it, growing to the rim; tape 3 mm, ruler 1 mm. ``shared`` places count for each camera
-    that sees them."""
+    """Return a session of three cameras 2.1 m above a floor, each with about ``count`` points.
+
+    The noise is 1 cm along the view and 2.5 mm across it, and grows to the rim. The tape has 3 mm sigma, the
+    ruler 1 mm. ``shared`` points count for each camera that sees them.
+    """
     rng = np.random.default_rng(seed)
     points: dict[str, dict[str, Array]] = {camera: {} for camera in CAMERAS}
     truth: dict[str, Array] = {}
@@ -86,7 +88,7 @@ def simulated(seed: int, count: int = 50, shared: bool = False, rig: Rig = RIG) 
 
 
 def see(eye: Array, point: Array, rng: np.random.Generator) -> Array:
-    """The camera point of a camera that looks straight down."""
+    """Return the camera point of a camera that looks straight down."""
     seen = (point - eye) * [1, -1, -1]
     view = seen / np.linalg.norm(seen)
     across = rng.normal(0, 0.0025, 3)
@@ -96,7 +98,7 @@ def see(eye: Array, point: Array, rng: np.random.Generator) -> Array:
 
 
 def without_each(session: Session, model: str = "poly") -> LeaveOneOut:
-    """Leave-one-out as it is defined: fit on the rest, again and again."""
+    """Return leave-one-out residuals by their definition: one fit without each point."""
     worlds = {p.measurement.id: world_point(p.measurement, p.rig).world_m for p in session.places}
 
     def predict(unused: frozenset[str]) -> dict[str, dict[str, Array]]:
@@ -155,7 +157,7 @@ SLIPS: dict[str, tuple[Callable[[Measurement], Measurement], str, str]] = {
 
 
 def plant(session: Session, slips: list[str], seed: int) -> tuple[Session, dict[str, str]]:
-    """Slips that move their place by 10 cm at least, as any of a distance does; which place has which."""
+    """Return gross errors that move their point by at least 10 cm, and the point of each error."""
     rng = np.random.default_rng(seed)
     planted: dict[str, str] = {}
     for slip in slips:
@@ -185,21 +187,21 @@ def check_named(suspect: Suspect, slip: str, truth: Array) -> None:
 
 @pytest.mark.parametrize("slip", SLIPS)
 @pytest.mark.parametrize("seed", [1, 2])
-def test_a_slip_alone_is_found_and_named(slip: str, seed: int) -> None:
+def test_single_gross_error_is_found_and_named(slip: str, seed: int) -> None:
     session, planted = plant(simulated(seed), [slip], seed)
     ((name, _),) = planted.items()
     (suspect,) = suspects_of(session)
     assert suspect.measurement == name
     assert suspect.cameras == tuple(camera for camera in sorted(CAMERAS) if name in session.points[camera])
     check_named(suspect, slip, session.truth[name])
-    # Predicted minus measured: where it truly is, seen from where it was put.
+    # The residual is predicted minus measured: true position minus wrong position.
     measured = world_point(session.measurement(name), RIG).world_m
     assert np.linalg.norm(measured + suspect.residual_m - session.truth[name]) < 0.06
 
 
 @pytest.mark.parametrize("seed", range(10, 15))
 @pytest.mark.parametrize("shared", [False, True])
-def test_three_slips_at_once_do_not_hide_one_another(seed: int, shared: bool) -> None:
+def test_three_gross_errors_do_not_hide_each_other(seed: int, shared: bool) -> None:
     slips = ["side", "swapped", ["A long", "A short", "B long", "B short"][seed % 4]]
     session, planted = plant(simulated(seed, shared=shared), slips, seed)
     found = suspects_of(session)
@@ -210,12 +212,12 @@ def test_three_slips_at_once_do_not_hide_one_another(seed: int, shared: bool) ->
     assert off_m == sorted(off_m, reverse=True)
 
 
-def test_nine_slips_at_once_in_a_session_of_thirty_places_a_camera() -> None:
+def test_nine_gross_errors_in_thirty_points_per_camera() -> None:
     session, planted = plant(simulated(3, count=30), ["side", "swapped", "A long"] * 3, 3)
     assert {suspect.measurement for suspect in suspects_of(session)} == set(planted)
 
 
-def test_ten_centimetres_are_said_to_be_ten() -> None:
+def test_error_of_ten_centimetres_is_reported_as_ten() -> None:
     session, planted = plant(simulated(4), ["B long"], 4)
     (name,) = planted
     read_m = session.measurement(name).distances[1].distance_m
@@ -275,7 +277,7 @@ def test_a_third_reference_point() -> None:
     assert "distances to A and B look exchanged" in str(by_id[two].text)
 
 
-def test_a_place_that_came_as_a_point_only() -> None:
+def test_point_without_distances_is_screened() -> None:
     session = simulated(7)
     name = next(n for n, point in session.truth.items() if point[1] > A.y_m + 0.5)
     x, y, z = session.truth[name].tolist()
@@ -288,7 +290,7 @@ def test_a_place_that_came_as_a_point_only() -> None:
     np.testing.assert_allclose(suspect.corrected_m, [x, y, z], atol=1e-9)
 
 
-def test_what_no_single_slip_explains_has_no_kind() -> None:
+def test_unexplained_outlier_has_no_kind() -> None:
     session = simulated(8)
     name = next(n for n, point in session.truth.items() if abs(point[1] - A.y_m) > 0.5)
     x, y, z = session.truth[name].tolist()
@@ -297,7 +299,7 @@ def test_what_no_single_slip_explains_has_no_kind() -> None:
     assert (suspect.measurement, suspect.kind, suspect.text, suspect.corrected_m) == (name, None, None, None)
 
 
-def test_a_flat_crossing_excuses_an_error() -> None:
+def test_flat_crossing_explains_an_error() -> None:
     session, planted = plant(simulated(9), ["A long"], 9)
     (name,) = planted
     careless = replace(
@@ -308,13 +310,13 @@ def test_a_flat_crossing_excuses_an_error() -> None:
     assert suspects_of(session.replaced(careless)) == ()
 
 
-def test_a_flat_crossing_excuses_an_error_with_a_usual_tape_where_none_is_named() -> None:
+def test_flat_crossing_with_a_usual_tape_explains_an_error() -> None:
     session = simulated(16, rig=replace(RIG, tape_sigma_m=None))
     name = next(n for n in session.points["white"])
     point = np.array([2.4384, A.y_m + 0.10, 0.0])
     seen = see(np.array([2.44, CAMERAS["white"], 2.1]), point, np.random.default_rng(1))
     points = dict(session.points) | {"white": dict(session.points["white"]) | {name: seen}}
-    # Seven centimetres across the line, which is seven millimetres on each tape.
+    # Seven centimetres across the line are seven millimetres on each tape.
     ranges = np.hypot(1.2192, 0.17)
     flat = (Distance("A", float(ranges)), Distance("B", float(ranges)))
     there = replace(session.measurement(name), distances=flat, side="left", height_m=0.0)
@@ -325,7 +327,7 @@ def test_a_flat_crossing_excuses_an_error_with_a_usual_tape_where_none_is_named(
     assert suspect.measurement == name
 
 
-def test_a_prediction_that_is_no_point_is_passed_over() -> None:
+def test_invalid_prediction_is_skipped() -> None:
     session, planted = plant(simulated(17), ["side"], 17)
     fits = without_each(session)
 
@@ -338,7 +340,7 @@ def test_a_prediction_that_is_no_point_is_passed_over() -> None:
     assert [suspect.measurement for suspect in find_outliers(broken, session.places)] == list(planted)
 
 
-def test_few_fits_are_asked_for() -> None:
+def test_number_of_fits_is_small() -> None:
     def asked(session: Session) -> int:
         fits = without_each(session)
         calls = []
@@ -355,14 +357,14 @@ def test_few_fits_are_asked_for() -> None:
     assert asked(plant(simulated(11), ["side", "swapped", "A long"], 11)[0]) <= 5
 
 
-def test_cameras_with_too_few_places_are_not_judged() -> None:
+def test_cameras_with_too_few_points_are_not_screened() -> None:
     session, _ = plant(simulated(12, count=14), ["side"], 12)
     assert suspects_of(session) == ()
     assert find_outliers(lambda unused: {}, session.places) == ()
     assert find_outliers(lambda unused: {"red": {}}, []) == ()
 
 
-def test_the_search_ends_where_too_few_places_are_left_to_fit_to() -> None:
+def test_outlier_search_ends_with_too_few_points() -> None:
     session, planted = plant(simulated(13), ["side", "swapped"], 13)
     fits = without_each(session)
 
@@ -381,7 +383,7 @@ def test_the_search_ends_where_too_few_places_are_left_to_fit_to() -> None:
         find_outliers(never, session.places)
 
 
-def test_at_most_a_fifth_of_the_places_is_suspected() -> None:
+def test_at_most_a_fifth_of_the_points_are_outliers() -> None:
     session = simulated(14, count=20)
     session, planted = plant(session, ["side"] * 25, 14)
     assert len(planted) == 25
@@ -390,7 +392,7 @@ def test_at_most_a_fifth_of_the_places_is_suspected() -> None:
 
 
 @pytest.mark.parametrize("lasting", [True, False])
-def test_a_good_place_is_put_back_when_the_clean_fits_agree_with_it(lasting: bool) -> None:
+def test_good_point_is_restored_if_clean_fits_agree(lasting: bool) -> None:
     session = simulated(15)
     name = sorted(session.points["red"])[0]
     fits = without_each(session)
@@ -401,19 +403,17 @@ def test_a_good_place_is_put_back_when_the_clean_fits_agree_with_it(lasting: boo
         if len(calls) == 3 and not lasting:
             raise FitError("too few places")
         found = {camera: dict(points) for camera, points in fits(unused).items()}
-        if len(calls) == 1:  # as if the error of another place had spoilt the fit to this one
+        if len(calls) == 1:  # as if the error of another point had disturbed this fit
             found["red"][name] = found["red"][name] + np.array([0.5, 0, 0])
         return found
 
     assert find_outliers(fooled, session.places) == ()
-    # With it back in, the others are judged once more.
+    # With this point restored, the others are tested again.
     assert calls == [frozenset(), frozenset({name}), frozenset()]
 
 
 @pytest.mark.parametrize("labels", [("train",), ("train", "test")])
-def test_the_pair_of_the_authors_that_contradicts_its_neighbours_comes_first(
-    data: Path, labels: tuple[str, ...]
-) -> None:
+def test_contradicting_pair_of_the_authors_ranks_first(data: Path, labels: tuple[str, ...]) -> None:
     if not (data / "imsel").is_dir():
         pytest.skip(f"no authors' data in {data / 'imsel'}")
     log = list(read_imsel(data / "imsel"))

@@ -41,7 +41,7 @@ RIG = Rig(
 
 
 def seen(*rows: tuple[float, float, float], camera: str = "red", marker: int = 0) -> list[Message]:
-    """Messages of (time in s, x, z)."""
+    """Return messages of (time in s, x, z)."""
     return [
         Message(
             "t", int(t * S), int(t * S), CameraPoints(int(t * S), (CameraPoint(marker, x, 0.0, z),)), camera
@@ -54,7 +54,7 @@ def still(start: float, end: float, x: float, z: float = 2.0) -> list[tuple[floa
     return [(t, x + 0.001 * (-1) ** n, z) for n, t in enumerate(np.arange(start, end, 0.1))]
 
 
-def test_the_still_stretch_around_a_time() -> None:
+def test_stationary_interval_around_a_time_is_found() -> None:
     moving = [(t, 0.1 * t, 2.0) for t in np.arange(5, 10, 0.1)]
     rows = [*still(0, 5, 0.5), *moving, *still(10, 15, 1.0)]
     sightings = gather_sightings(seen(*rows))["red", 0]
@@ -67,7 +67,7 @@ def test_the_still_stretch_around_a_time() -> None:
 
 
 def late(*rows: tuple[int, int | None, float]) -> list[Message]:
-    """Messages of (time of the frame in s, time offset in ns, x)."""
+    """Return messages of (frame time in s, time offset in ns, x)."""
     return [
         Message(
             "t", t * S, t * S, CameraPoints(t * S, (CameraPoint(0, x, 0.0, 2.0, None, offset_ns),)), "red"
@@ -76,7 +76,7 @@ def late(*rows: tuple[int, int | None, float]) -> list[Message]:
     ]
 
 
-def test_a_sighting_is_of_the_time_at_which_the_marker_was_exposed() -> None:
+def test_sighting_has_the_exposure_time_of_the_marker() -> None:
     sightings = gather_sightings(late((0, 30 * MS, 0.1), (1, None, 0.3), (1, -10 * MS, 0.2)))["red", 0]
     assert sightings.times_ns.tolist() == [0.03 * S, 0.99 * S, S]
     assert sightings.points_m[:, 0].tolist() == [0.1, 0.2, 0.3]
@@ -89,12 +89,12 @@ def test_a_still_interval_holds_for_what_was_exposed_in_it() -> None:
     assert (pair.frames, pair.camera_m[0]) == (1, 0.2)
 
 
-def test_lifting_a_marker_ends_the_stretch() -> None:
+def test_lifted_marker_ends_a_stationary_interval() -> None:
     sightings = gather_sightings(seen(*still(0, 2, 0.5), *still(2, 4, 0.5, z=1.95)))["red", 0]
     assert still_interval(sightings, S) == pytest.approx((0, 1.9 * S))
 
 
-def test_a_long_silence_ends_the_stretch() -> None:
+def test_long_gap_ends_a_stationary_interval() -> None:
     sightings = gather_sightings(seen(*still(0, 1, 0.5), *still(10, 11, 0.5)))["red", 0]
     assert still_interval(sightings, int(0.5 * S)) == pytest.approx((0, 0.9 * S))
     assert still_interval(sightings, 5 * S) is None
@@ -110,7 +110,7 @@ def test_a_pair_is_the_mean_over_the_still_interval() -> None:
     np.testing.assert_array_equal(pair.world_m, [1, 2, 3])
 
 
-def test_a_pair_knows_how_well_its_place_is_known() -> None:
+def test_pair_contains_the_covariance_of_its_point() -> None:
     sightings = gather_sightings(seen(*still(0, 1, 0.5)))
     corner = (Distance("A", 2.0, 0.003), Distance("B", 2.0 * 2**0.5, 0.003))
     taped = Measurement(
@@ -119,14 +119,14 @@ def test_a_pair_knows_how_well_its_place_is_known() -> None:
     pair = build_pairs(sightings, [RiggedMeasurement(taped, RIG)])["red"][0]
     np.testing.assert_allclose(pair.world_m, [0, 2, 0.1], atol=1e-9)
     assert pair.world_covariance_m2 is not None
-    # A at a right angle to the floor's edge knows y; B, at 45 degrees, adds x.
+    # The tape from A gives y; the tape from B, at 45 degrees, adds x.
     sigmas_m = np.sqrt(pair.world_covariance_m2.diagonal())
     np.testing.assert_allclose(sigmas_m, [0.003 * 3**0.5, 0.003, 0.002], rtol=1e-9)
     given_point = Measurement(0, "b", marker_id=0, point=WorldPoint(1, 2, 0))
     assert build_pairs(sightings, [RiggedMeasurement(given_point, RIG)])["red"][0].world_covariance_m2 is None
 
 
-def test_a_camera_that_did_not_see_a_place_has_no_pair_of_it() -> None:
+def test_camera_has_no_pair_for_an_unseen_point() -> None:
     messages = seen(*still(0, 1, 0.5)) + seen(*still(50, 51, 0.5), camera="black")
     measured = Measurement(S // 2, "a", marker_id=0, point=WorldPoint(1, 2, 0))
     pairs = build_pairs(gather_sightings(messages), [RiggedMeasurement(measured, RIG)])
@@ -137,7 +137,7 @@ def test_a_camera_that_did_not_see_a_place_has_no_pair_of_it() -> None:
 def test_a_withdrawn_measurement_does_not_count() -> None:
     one, two = (Measurement(0, name, marker_id=0, point=WorldPoint(0, 0, 0)) for name in "ab")
     assert active_measurements([one, two, Measurement(1, "c", withdraws="a")]) == [two]
-    # It may be measured again under its old name.
+    # The point may be measured again with its old name.
     assert active_measurements([one, Measurement(1, "c", withdraws="a"), one]) == [one]
     with pytest.raises(IpsysError, match="two measurements have the id 'a'"):
         active_measurements([one, one])
@@ -173,7 +173,7 @@ def test_a_withdrawn_measurement_does_not_count() -> None:
         ),
     ],
 )
-def test_measurements_that_say_too_little(measurement: Measurement, said: str) -> None:
+def test_incomplete_measurements_are_refused(measurement: Measurement, said: str) -> None:
     with pytest.raises(IpsysError, match=said):
         build_pairs(gather_sightings(seen(*still(0, 1, 0.5))), [RiggedMeasurement(measurement, RIG)])
 
@@ -188,7 +188,7 @@ def test_a_split_at_random_is_a_fifth_and_the_same_for_a_seed() -> None:
     assert split(measurements, "train", seed=4) != (train, held_out)
 
 
-def test_the_rig_of_its_time_holds_for_a_measurement() -> None:
+def test_measurement_uses_the_rig_of_its_time() -> None:
     moved = replace(RIG, reference_points=(ReferencePoint("A", 0.0, 0.0), ReferencePoint("B", 3.0, 0.0)))
     one, two = (Measurement(0, name, marker_id=0, point=WorldPoint(0, 0, 0)) for name in "ab")
     log = [Message("t", n, n, payload) for n, payload in enumerate((one, RIG, two, moved))]
@@ -199,7 +199,7 @@ def test_the_rig_of_its_time_holds_for_a_measurement() -> None:
     assert valid_measurements(later, None)[-1].rig == moved
 
 
-def test_places_that_are_held_out_are_never_fitted_on() -> None:
+def test_held_out_points_are_never_used_by_fit() -> None:
     both = [Measurement(0, "a", splits=("train", "test")), Measurement(0, "b", splits=("test",))]
     assert split(both, "train", 0) == ({"a"}, {"b"})
     with pytest.raises(IpsysError, match="held out"):
@@ -209,7 +209,7 @@ def test_places_that_are_held_out_are_never_fitted_on() -> None:
 
 
 @pytest.mark.parametrize("value", [float("nan"), float("inf")])
-def test_a_world_point_that_is_no_point(value: float) -> None:
+def test_invalid_world_point_is_refused(value: float) -> None:
     measurement = Measurement(0, "a", marker_id=0, point=WorldPoint(1.0, 2.0, value))
     with pytest.raises(IpsysError, match="measurement a: its world point"):
         build_pairs(gather_sightings(seen(*still(0, 1, 0.5))), [RiggedMeasurement(measurement, RIG)])

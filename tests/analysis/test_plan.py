@@ -1,4 +1,4 @@
-"""The plan of places to measure against labs of known truth, and against the same figures by other roads."""
+"""The plan of points to measure, compared with ground truth and with other computations."""
 
 from __future__ import annotations
 
@@ -33,7 +33,7 @@ FISHEYE = np.array([-0.13, 0.01, -0.03, 0.02])
 
 @dataclass(frozen=True)
 class Camera:
-    """The place of a camera, its lens, and the calibration of the lens."""
+    """The pose, the lens and the calibration of a camera."""
 
     name: str
     camera_from_world: Array
@@ -42,7 +42,7 @@ class Camera:
     depth: Array
 
     def pixels(self, world_m: Array) -> Array:
-        """By OpenCV, not by the code under test; NaN beyond 75 degrees."""
+        """Project with OpenCV instead of the code under test; return NaN beyond 75 degrees."""
         points_m = transform(self.camera_from_world, world_m)
         turn, shift_m = np.zeros(3), np.zeros(3)
         if self.true.distortion_model == "kannala_brandt":
@@ -53,7 +53,7 @@ class Camera:
         return np.where(inside[:, None], px.reshape(-1, 2), np.nan)
 
     def see(self, world_m: Array, rng: np.random.Generator | None) -> Array:
-        """Camera points (n, 3): directions by the calibration, depths off smoothly; noise with ``rng``."""
+        """Return camera points (n, 3) with smooth depth errors, and with noise if ``rng`` is given."""
         uv = undistort(self.pixels(world_m), self.lens)
         u, v = uv.T
         wide = 1 + u * u + v * v
@@ -103,7 +103,7 @@ def tape_m2(world_m: Array) -> Array:
 
 
 def by_tape(world_m: Array, rng: np.random.Generator) -> tuple[Array, Array]:
-    """World points as measured, and their covariances."""
+    """Return measured world points and their covariances."""
     covariances = np.zeros((len(world_m), 3, 3))
     covariances[:, 2, 2] = 0.001**2
     for covariance, point_m in zip(covariances, world_m, strict=True):
@@ -132,7 +132,7 @@ def places(pairs: list[Pair]) -> CalibrationPoints:
 
 
 def draw(cameras: list[Camera], count: int, rng: np.random.Generator) -> Array:
-    """Places at random that a camera shows and whose tapes cross at 15 degrees or more."""
+    """Return random points in a camera's view at tape crossings of 15 degrees or more."""
     found: list[Array] = []
     while len(found) < count:
         point_m = np.array(
@@ -146,7 +146,7 @@ def draw(cameras: list[Camera], count: int, rng: np.random.Generator) -> Array:
 
 
 def lab(seed: int, count: int = 12) -> tuple[list[Camera], dict[str, list[Pair]], np.random.Generator]:
-    """Two cameras side by side, and so many places at random; each camera sees at least seven."""
+    """Return two cameras side by side and random points; each camera sees at least seven."""
     rng = np.random.default_rng(seed)
     cameras = [hang(rng, "west", 1.6), hang(rng, "east", 3.3)]
     while True:
@@ -161,7 +161,7 @@ def views_of(cameras: list[Camera], pairs: dict[str, list[Pair]], model: str = "
 
 
 def true_mean_error_m(cameras: list[Camera], pairs: dict[str, list[Pair]], model: str = "best") -> float:
-    """Over the floor, of the camera that is nearer, without the noise of a single frame."""
+    """Return the error over the floor of the nearer camera, without the noise of a single frame."""
     estimators = fit_cameras(model, {name: places(found) for name, found in pairs.items()})
     floor_m = grid(0.2, (0.1,))
     errors_m = np.full((len(cameras), len(floor_m)), np.nan)
@@ -182,7 +182,7 @@ def planned(views: list[FittedCamera], count: int = 6) -> Plan:
 @pytest.mark.parametrize(
     "seeds", [range(8), pytest.param(range(8, 48), marks=pytest.mark.slow)], ids=["8", "40"]
 )
-def test_planned_places_are_worth_more_than_random_ones(seeds: range) -> None:
+def test_planned_points_reduce_the_error_more_than_random_ones(seeds: range) -> None:
     errors = []
     for seed in seeds:
         cameras, pairs, rng = lab(seed)
@@ -192,14 +192,15 @@ def test_planned_places_are_worth_more_than_random_ones(seeds: range) -> None:
             ("planned", [points_m] * 3),
             ("random", [draw(cameras, 6, rng) for _ in range(3)]),
         ):
-            # By another tape each time: what is compared is where, not the luck of a reading.
+            # The tape noise differs each time, so the test compares the points and not single readings.
             more = [measure(cameras, world_m, rng, label) for world_m in chosen]
             both = [{name: pairs[name] + found[name] for name in pairs} for found in more]
             row.append(float(np.mean([true_mean_error_m(cameras, found) for found in both])))
         errors.append(row)
     without_m, planned_m, random_m = np.array(errors).T
     gain_m = random_m - planned_m
-    # Over 90 seeds: 0.62 cm with 12 places, 0.45 with 6 more at random, 0.34 with 6 planned ones.
+    # Means of 90 seeds: 0.62 cm with 12 points, 0.45 cm with 6 random points more, 0.34 cm with 6 planned
+    # points more.
     assert planned_m.mean() < 0.85 * random_m.mean()
     assert planned_m.mean() < 0.7 * without_m.mean()
     assert gain_m.mean() > 3 * gain_m.std(ddof=1) / np.sqrt(len(gain_m))
@@ -207,7 +208,7 @@ def test_planned_places_are_worth_more_than_random_ones(seeds: range) -> None:
 
 
 def from_scratch(views: list[FittedCamera], floor_m: Array, points_m: Array) -> Array:
-    """The error over the floor with further places, from the normal equations of all of them."""
+    """Return the error over the floor with more points, from the normal equations of all points."""
     least_m = np.full(len(floor_m), np.inf)
     for view in views:
         bare = replace(view.uncertainty, fit=np.zeros((3, 3)))
@@ -241,7 +242,7 @@ def second_order(points_m: Array) -> Array:
 
 
 @pytest.mark.parametrize("model", ["best", "rayplane", "rigid"])
-def test_the_predicted_error_falls_and_is_that_of_all_places_at_once(model: str) -> None:
+def test_predicted_error_falls_and_equals_the_joint_solution(model: str) -> None:
     cameras, pairs, _ = lab(3)
     views, floor_m = views_of(cameras, pairs, model), grid(0.2, (0.1,))
     plan = planned(views)
@@ -254,11 +255,11 @@ def test_the_predicted_error_falls_and_is_that_of_all_places_at_once(model: str)
     assert afters[-1] == np.nanmean(plan.after_m)
     assert befores[1:] == afters[:-1]
     assert all(after < before for before, after in zip(befores, afters, strict=True))
-    # A shorter plan is the beginning of a longer one.
+    # A shorter plan equals the start of a longer plan.
     assert [p.point_m.tolist() for p in planned(views, 3).places] == points_m[:3].tolist()
 
 
-def test_the_first_place_is_the_best_of_all() -> None:
+def test_first_planned_point_is_the_best_candidate() -> None:
     cameras, pairs, _ = lab(5)
     views, floor_m = views_of(cameras, pairs), grid(0.4, (0.1,))
     candidates_m = grid(0.4, (0.1,))
@@ -306,12 +307,12 @@ def test_all_of_a_planned_marker_is_in_the_frame_of_its_cameras(model: str) -> N
             assert camera.shows(chosen_m).all()
             seen, shown = view.sees(floor_m, RADIUS_M), camera.shows(floor_m)
             assert shown[seen].all()
-            # The white around a marker has to be in the frame too; not much more.
+            # The white margin of a marker must be in the image too.
             assert seen.sum() > 0.85 * shown.sum()
 
 
-def test_what_a_lens_bends_back_into_its_frame_is_not_seen() -> None:
-    """The polynomial of a fisheye lens turns round far out: points there fall into the frame once more."""
+def test_points_folded_back_by_the_lens_are_not_visible() -> None:
+    """The polynomial of a fisheye lens folds back at large angles, so points there project into the image."""
     cameras, pairs, _ = lab(0)
     view = views_of(cameras, pairs)[0]
     around = np.linspace(0, 2 * np.pi, 60)
@@ -332,7 +333,7 @@ def test_what_a_lens_bends_back_into_its_frame_is_not_seen() -> None:
     assert not replace(view, lens=steep).sees(far_m, RADIUS_M).any()
 
 
-def test_a_camera_without_a_lens_sees_what_lies_among_its_places() -> None:
+def test_camera_without_intrinsics_sees_the_area_of_its_points() -> None:
     cameras, pairs, _ = lab(1)
     view = replace(views_of(cameras, pairs)[0], lens=None)
     assert view.sees(view.fitted_m, RADIUS_M).all()
@@ -343,7 +344,7 @@ def test_a_camera_without_a_lens_sees_what_lies_among_its_places() -> None:
 
 
 def level_view(fitted_m: Array) -> FittedCamera:
-    """A perfect camera 2 m above the middle of the world."""
+    """Return a perfect camera 2 m above the origin of the world."""
     pose = look_down(np.array([0.0, 0.0, 2.0]))
 
     def predict(points_m: Array, heights_m: Array) -> Array:
@@ -354,14 +355,14 @@ def level_view(fitted_m: Array) -> FittedCamera:
     return FittedCamera("over", pose, np.zeros(3), calibration, predict, uncertainty, fitted_m)
 
 
-def test_where_the_tapes_cross_flatly_nothing_is_planned() -> None:
+def test_no_point_is_planned_at_flat_tape_crossings() -> None:
     half_m = np.array([(1.0, 0.5, 0), (-1.0, 0.4, 0), (0.2, 0.7, 0), (0.5, 0.2, 0), (-0.4, 0.3, 0)])
     mirror = np.array([1, -1, 1])
     view = level_view(np.vstack([half_m, half_m * mirror]))
     floor_m = np.stack(
         np.meshgrid(np.linspace(-1.5, 1.5, 16), np.linspace(-1, 1, 11), [0.0]), axis=-1
     ).reshape(-1, 3)
-    # Beyond B, and just beside the line AB; its mirror image lies well beside it.
+    # The point is beyond B and just beside the line AB; its mirror image is farther from the line.
     flat_m = np.array([1.3, 0.82, 0.0])
     references_m = np.array([[-1.0, 0.8], [0.2, 0.8]])
 
@@ -373,14 +374,14 @@ def test_where_the_tapes_cross_flatly_nothing_is_planned() -> None:
         none = plan_points([view], floor_m, candidate_m[None], lambda w: np.zeros(len(w)), RADIUS_M, 1)
         return none.places[0].mean_after_m
 
-    # By what they say of the camera they are worth the same.
+    # Both points have the same value for the camera.
     assert after_m(flat_m) == pytest.approx(after_m(flat_m * mirror), rel=1e-9)
     for order in ([flat_m, flat_m * mirror], [flat_m * mirror, flat_m]):
         plan = plan_points([view], floor_m, np.array(order), variances, RADIUS_M, 1)
         assert plan.places[0].point_m.tolist() == (flat_m * mirror).tolist()
 
 
-def test_a_place_beside_a_known_one_has_to_do_clearly_more() -> None:
+def test_point_beside_a_known_one_needs_a_clear_gain() -> None:
     half_m = np.array([(1.0, 0.5, 0), (-1.0, 0.4, 0), (0.2, 0.7, 0), (0.5, 0.2, 0), (-0.4, 0.3, 0)])
     fitted_m = np.vstack([half_m, half_m * [1, -1, 1], [[1.3, 0.8, 0], [1.24, -0.76, 0]]])
     view = level_view(fitted_m)
@@ -401,7 +402,7 @@ def test_a_place_beside_a_known_one_has_to_do_clearly_more() -> None:
     assert first(beside, worse)[0] == list(beside)
 
 
-def test_a_height_that_no_camera_sees_is_said() -> None:
+def test_height_outside_all_views_is_reported() -> None:
     cameras, pairs, _ = lab(2)
     views = views_of(cameras, pairs)
     with pytest.raises(IpsysError, match=r"no camera sees a whole marker 2\.5 m above the floor"):

@@ -1,4 +1,4 @@
-"""World points from tape and ruler, and how well they are known."""
+"""World points from tape and ruler, and their covariance."""
 
 from __future__ import annotations
 
@@ -24,7 +24,7 @@ UNKNOWN = replace(RIG, tape_sigma_m=None)
 
 
 def tape(*names: str, x: float = 2.0, y: float = 3.5, sigma_m: float | None = None) -> tuple[Distance, ...]:
-    """Distances from (x, y)."""
+    """Return the distances from (x, y)."""
     known = {point.name: point for point in POINTS}
     return tuple(
         Distance(name, float(np.hypot(x - known[name].x_m, y - known[name].y_m)), sigma_m) for name in names
@@ -44,7 +44,7 @@ def test_two_distances_give_the_digits_of_eq_25(x: float, y: float) -> None:
     d1, d2 = (distance.distance_m for distance in place.distances)
     try:
         expected = trilaterate(a, b, d1, d2, "left")
-    except IpsysError:  # beyond A or B and so near to the line that rounding opens the triangle
+    except IpsysError:  # beyond A or B, and so near the line that rounding opens the triangle
         return
     found = world_point(place, RIG)
     assert found.world_m.tolist() == [*expected.tolist(), 0.1]
@@ -61,14 +61,14 @@ def test_three_distances_need_no_side_and_check_one_another() -> None:
     assert np.abs(residuals_m).max() > 0.01
 
 
-def test_the_covariance_follows_from_the_sigmas_nearest_to_the_reading() -> None:
+def test_covariance_uses_the_sigmas_of_the_measurement_first() -> None:
     named = world_point(measurement("A", "B", sigma_m=0.006), RIG).covariance_m2
     from_rig = world_point(measurement("A", "B"), RIG).covariance_m2
     assert named is not None
     assert from_rig is not None
     np.testing.assert_allclose(named[:2, :2], 4 * from_rig[:2, :2], rtol=1e-12)
     assert world_point(measurement("A", "B"), UNKNOWN).covariance_m2 is None
-    # One of two without a sigma: no sigma is made up for it.
+    # One of two distances has no sigma: no sigma is invented.
     half = (*tape("A", sigma_m=0.003), *tape("B"))
     assert world_point(replace(measurement("A", "B"), distances=half), UNKNOWN).covariance_m2 is None
 
@@ -97,7 +97,7 @@ def test_the_covariance_is_that_of_tapes_read_again_and_again() -> None:
     np.testing.assert_allclose(root @ sample @ root.T, np.eye(3), atol=0.12)
 
 
-def test_a_given_point_has_a_covariance_where_it_came_with_distances() -> None:
+def test_world_point_with_distances_has_a_covariance() -> None:
     given_point = WorldPoint(2.0, 3.5, 0.1)
     alone = world_point(Measurement(0, "a", point=given_point), RIG)
     assert alone.world_m.tolist() == [2.0, 3.5, 0.1]
@@ -110,7 +110,7 @@ def test_a_given_point_has_a_covariance_where_it_came_with_distances() -> None:
     assert wanted is not None
     np.testing.assert_allclose(both.covariance_m2, wanted, rtol=1e-9)
     np.testing.assert_allclose(both.residuals_m, 0, atol=1e-12)
-    # It is a point whatever the rig knows.
+    # The measurement is a world point, so it does not depend on the rig.
     nowhere = world_point(replace(solved, point=given_point), replace(RIG, reference_points=()))
     assert nowhere.covariance_m2 is None
     assert nowhere.world_m.tolist() == [2.0, 3.5, 0.1]
@@ -139,7 +139,7 @@ def test_a_perfect_tape_is_still_a_tape() -> None:
         ({"point": WorldPoint(1.0, float("inf"), 0.0)}, "measurement a: its world point"),
     ],
 )
-def test_what_forms_no_point_is_refused_by_name(change: dict[str, object], said: str) -> None:
+def test_impossible_point_is_refused_by_name(change: dict[str, object], said: str) -> None:
     with pytest.raises(IpsysError, match=said):
         world_point(replace(measurement("A", "B"), **change), RIG)  # type: ignore[arg-type]
 
@@ -150,7 +150,7 @@ def test_the_reference_points_of_the_distances_in_their_order() -> None:
     assert reference_points(Measurement(0, "a"), RIG).shape == (0, 2)
 
 
-def test_places_where_the_tapes_cross_flatly_are_listed_the_worst_first() -> None:
+def test_flat_tape_crossings_are_listed_worst_first() -> None:
     here = {"good": (2.4, 3.6), "flat": (2.4, 2.65), "beyond": (4.6, 2.6), "flatter": (2.4, 2.5)}
     places = [
         RiggedMeasurement(replace(measurement("A", "B", x=x, y=y), id=name), RIG)
@@ -163,17 +163,17 @@ def test_places_where_the_tapes_cross_flatly_are_listed_the_worst_first() -> Non
         to_a, to_b = (np.arctan2(y - point.y_m, x - point.x_m) for point in POINTS[:2])
         angle = abs(np.sin(to_b - to_a))
         assert np.sin(np.radians(flat.angle_deg)) == pytest.approx(angle)
-        # Closed form: the worst direction of two equal tapes at an angle.
+        # The closed form gives the worst direction of two equal tapes at an angle.
         assert flat.sigma_m == pytest.approx(0.003 / np.sqrt(1 - np.sqrt(1 - angle**2)))
     assert found[0].sigma_m is not None
     assert found[0].sigma_m > 3 * 0.003
 
 
-def test_without_a_sigma_the_angle_still_tells() -> None:
+def test_crossing_angle_counts_without_a_sigma() -> None:
     flat = RiggedMeasurement(measurement("A", "B", x=2.4, y=2.5), UNKNOWN)
     found = find_weak_points([flat])
     assert [(one.id, one.sigma_m) for one in found] == [("a", None)]
-    # A third tape from elsewhere knows it.
+    # A third tape from another direction determines the point.
     assert find_weak_points([RiggedMeasurement(measurement("A", "B", "C", x=2.4, y=2.5), RIG)]) == []
     assert (
         find_weak_points([RiggedMeasurement(Measurement(0, "b", point=WorldPoint(2.4, 2.5, 0)), RIG)]) == []

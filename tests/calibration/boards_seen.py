@@ -1,4 +1,4 @@
-"""Boards as cameras see them, by formulas of their own: corners with noise, and rendered pictures."""
+"""Calibration boards in images, by independent formulas: noisy corners and rendered images."""
 
 from __future__ import annotations
 
@@ -15,7 +15,7 @@ from ipsys_log.calibration.bundle_adjustment import Corners
 
 Array = NDArray[np.float64]
 
-# fx, fy, cx, cy and the coefficients; a fisheye of 190 degrees, and pinholes, of 640 x 480 px.
+# Parameters are fx, fy, cx, cy and the coefficients: a fisheye of 190 degrees, and pinholes, at 640 x 480 px.
 SIZE_PX = (640, 480)
 TRUTH = {
     "fisheye": (185.0, 185.0, 322.0, 236.0, -0.02, 0.01, -0.004, 0.0005),
@@ -26,7 +26,7 @@ TRUTH = {
 
 
 def pixels_of(name: str, lens: tuple[float, ...], points_m: Array) -> Array:
-    """The formulas of OpenCV's documentation, point by point."""
+    """Project points with the formulas of OpenCV's documentation."""
     pixels = []
     fx, fy, cx, cy, *k = lens
     for x, y, z in points_m:
@@ -45,7 +45,7 @@ def pixels_of(name: str, lens: tuple[float, ...], points_m: Array) -> Array:
 
 
 def grid_m(columns: int = 6, rows: int = 4, square_m: float = 0.03) -> Array:
-    """Corners of a board around its middle, row by row."""
+    """Return the corners of a board around its centre, row by row."""
     return np.array(
         [((i - (columns - 1) / 2) * square_m, (j - (rows - 1) / 2) * square_m, 0.0)
          for j in range(rows) for i in range(columns)]
@@ -53,12 +53,12 @@ def grid_m(columns: int = 6, rows: int = 4, square_m: float = 0.03) -> Array:
 
 
 def random_pose(rng: np.random.Generator, name: str) -> tuple[Array, Array]:
-    """Rotation and place of a board that faces the camera, tilted by some 25 degrees."""
+    """Return the pose of a board that faces the camera, tilted by about 25 degrees."""
     tilt = Rotation.from_rotvec(np.append(rng.normal(0, 0.33, 2), rng.uniform(-0.5, 0.5)))
     if name != "fisheye":
         z = rng.uniform(0.17, 0.6)
         return tilt.as_matrix(), np.array([rng.uniform(-0.45, 0.45) * z, rng.uniform(-0.35, 0.35) * z, z])
-    # In any direction up to 85 degrees from the axis, and turned towards the camera.
+    # The board is in any direction up to 85 degrees from the axis, and turned towards the camera.
     polar, azimuth = rng.uniform(0, np.radians(85)), rng.uniform(-np.pi, np.pi)
     aim = Rotation.from_rotvec([0, 0, azimuth]) * Rotation.from_rotvec([0, polar, 0])
     return (aim * tilt).as_matrix(), aim.apply([0, 0, rng.uniform(0.1, 0.3)])
@@ -72,8 +72,10 @@ def seen(
     shared_px: float = 0.0,
     lens: tuple[float, ...] | None = None,
 ) -> Corners:
-    """Corners of a board in pictures all over the image, with noise of each corner, and errors that the
-    corners of a picture share: a smooth warp, as of a board that is not flat."""
+    """Return board corners in images all over the field of view. Each corner has noise.
+
+    The corners of an image also share an error: a smooth warp, as of a curved board.
+    """
     truth, board_m = lens or TRUTH[name], grid_m()
     places = board_m[:, :2] / board_m[:, :2].max()
     warp = np.column_stack([places[:, 0] ** 2, places[:, 1] ** 2, places[:, 0] * places[:, 1]])
@@ -90,7 +92,7 @@ def seen(
 
 
 def fisheye_rays(lens: tuple[float, ...], pixels: Array) -> Array:
-    """Unit rays of pixels, by a table of the formula read backwards."""
+    """Return unit rays of pixels, from a table of the inverted formula."""
     fx, fy, cx, cy, *k = lens
     theta = np.linspace(0, 1.9, 4000)
     bent = theta * (1 + sum(c * theta ** (2 * n) for n, c in enumerate(k, 1)))
@@ -110,11 +112,11 @@ def render(
     rng: np.random.Generator,
     times: int = 3,
 ) -> NDArray[np.uint8]:
-    """A picture of a plane: the mean of ``times`` x ``times`` rays in each pixel, and noise."""
+    """Render a plane: the mean of ``times`` x ``times`` rays in each pixel, and noise."""
     width, height = size_px
     middles = np.stack(np.meshgrid(np.arange(width), np.arange(height)), axis=-1).reshape(-1, 2)
     levels = _met(rays, turn, place_m, pattern, middles.astype(float)).reshape(height, width)
-    # Only at an edge between what is light and dark it matters where in a pixel a ray goes.
+    # The position of a ray within a pixel matters only at an edge.
     edge = maximum_filter(levels, 3) != minimum_filter(levels, 3)
     y, x = np.nonzero(edge)
     offsets = (np.arange(times) + 0.5) / times - 0.5
@@ -132,8 +134,8 @@ def _met(
     pattern: Callable[[Array], Array],
     pixels: Array,
 ) -> Array:
-    """The grey level that the ray of each pixel (n, 2) meets."""
-    directions = rays(pixels) @ turn  # in the axes of the board
+    """Return the grey level at the ray of each pixel (n, 2)."""
+    directions = rays(pixels) @ turn  # in board coordinates
     origin = -place_m @ turn
     depth = -origin[2] / directions[:, 2]
     met = depth > 0
@@ -143,7 +145,7 @@ def _met(
 
 
 def chessboard_pattern(columns: int, rows: int, square_m: float) -> Callable[[Array], Array]:
-    """Grey levels of places on a chessboard of so many inner corners, with a white margin."""
+    """Return grey levels at points of a chessboard with given inner corners and a white margin."""
 
     def levels(places_m: Array) -> Array:
         squares = places_m / square_m + np.array([columns + 1, rows + 1]) / 2
@@ -158,9 +160,10 @@ def chessboard_pattern(columns: int, rows: int, square_m: float) -> Callable[[Ar
 def striped_pattern(
     columns: int, rows: int, square_m: float, margin: float, stripe: float = 1.0, phase: float = 0.0
 ) -> Callable[[Array], Array]:
-    """Grey levels of a chessboard on paper with a margin in squares, over stripes along its rows.
+    """Return grey levels of a chessboard on paper over stripes along its rows. The margin is in squares.
 
-    The stripes are as dark and light as the squares, ``stripe`` squares wide and shifted by ``phase``.
+    The stripes have the grey levels of the squares, are ``stripe`` squares wide, and are shifted by
+    ``phase``.
     """
     board = chessboard_pattern(columns, rows, square_m)
 
@@ -174,7 +177,7 @@ def striped_pattern(
 
 
 def pinhole_rays(lens: tuple[float, ...], pixels: Array) -> Array:
-    """Unit rays of pixels through a pinhole, by OpenCV."""
+    """Return unit rays of pixels of a pinhole camera, by OpenCV."""
     fx, fy, cx, cy, *k = lens
     matrix = np.array([[fx, 0, cx], [0, fy, cy], [0, 0, 1.0]])
     planar = cv2.undistortPoints(pixels.reshape(-1, 1, 2), matrix, np.array(k)).reshape(-1, 2)
@@ -191,7 +194,7 @@ def photograph(
     seed: int,
     z_m: tuple[float, float],
 ) -> list[NDArray[np.uint8]]:
-    """Pictures of a plane that is seen to ``half_m`` from its middle, at distances between ``z_m``."""
+    """Render images of a plane up to ``half_m`` from its centre, at distances between ``z_m``."""
     rng = np.random.default_rng(seed)
     pictures: list[NDArray[np.uint8]] = []
     ends = np.array([[x, y, 0.0] for x in (-half_m[0], half_m[0]) for y in (-half_m[1], half_m[1])])

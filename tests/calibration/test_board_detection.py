@@ -1,4 +1,4 @@
-"""Corners and sharpness in rendered pictures, where the truth is known; and which pictures are chosen."""
+"""Corners and sharpness in rendered images with ground truth, and the selection of images."""
 
 from __future__ import annotations
 
@@ -29,7 +29,7 @@ def straight_rays(pixels: Array) -> Array:
 
 
 def charuco_pattern(board: Board, legacy: bool = False) -> Callable[[Array], Array]:
-    """Grey levels of places on a ChArUco board, as OpenCV prints it, or did before 4.6."""
+    """Return grey levels at points of a ChArUco board, in the layout of OpenCV 4.6 or the older one."""
     dictionary = cv2.aruco.getPredefinedDictionary(getattr(cv2.aruco, board.dictionary))
     printed = cv2.aruco.CharucoBoard((board.columns, board.rows), 1.0, board.marker_scale or 0, dictionary)
     printed.setLegacyPattern(legacy)
@@ -48,7 +48,7 @@ def charuco_pattern(board: Board, legacy: bool = False) -> Callable[[Array], Arr
 
 @cache
 def scene(board: Board, seed: int, z_m: float, legacy: bool) -> tuple[NDArray[np.uint8], Array]:
-    """A sharp picture of a board, and its true corners."""
+    """Return a sharp image of a board, and its true corners."""
     rng = np.random.default_rng(seed)
     turn, place_m = random_pose(rng, "pinhole")
     place_m = np.array([0.1 * place_m[0], 0.1 * place_m[1], z_m])
@@ -64,7 +64,7 @@ def scene(board: Board, seed: int, z_m: float, legacy: bool) -> tuple[NDArray[np
 def drawn(
     board: Board, seed: int, blur_px: float, gamma: float = 1.0, z_m: float = 0.42, legacy: bool = False
 ) -> tuple[NDArray[np.uint8], Array]:
-    """A picture of a board as a camera takes it, and its true corners."""
+    """Return an image of a board as a camera takes it, and its true corners."""
     picture, truth = scene(board, seed, z_m, legacy)
     light = gaussian_filter(picture.astype(float), blur_px)
     return np.round(255 * (light / 255) ** (1 / gamma)).astype(np.uint8), truth
@@ -73,13 +73,13 @@ def drawn(
 @pytest.mark.parametrize("board", [CHESSBOARD, CHARUCO], ids=["chessboard", "charuco"])
 @pytest.mark.parametrize("gamma", [1.0, 2.2])
 def test_corners_are_where_they_are(board: Board, gamma: float) -> None:
-    """Squares of 26 px; OpenCV's own corners are off by 0.07 to 0.08 px here."""
+    """The squares are 26 px wide; OpenCV's own corners have an error of 0.07 to 0.08 px here."""
     errors = []
     for seed in range(3):
         picture, truth = drawn(board, seed, blur_px=0.7, gamma=gamma, z_m=0.7)
         sighting = find_board("a", picture, board, thorough=True)
         assert sighting is not None
-        # A chessboard of even and even corners looks the same upside down.
+        # A chessboard with even numbers of corners looks the same upside down.
         turned = [truth[sighting.ids], truth[::-1][sighting.ids]]
         distances = [np.linalg.norm(sighting.pixels - corners, axis=1) for corners in turned]
         errors.append(min(distances, key=lambda each: float(np.median(each))))
@@ -95,7 +95,7 @@ def test_the_blur_of_a_picture_is_measured(board: Board) -> None:
         sighting = find_board("a", drawn(board, 1, blur_px)[0], board, thorough=True)
         assert sighting is not None
         widths.append(sighting.blur_px)
-    # The pixel itself is 0.29 px wide.
+    # The width of the pixel itself is 0.29 px (standard deviation).
     assert widths[0] == pytest.approx(np.hypot(0.7, 0.29), abs=0.2)
     assert widths[1] == pytest.approx(np.hypot(1.5, 0.29), abs=0.4)
 
@@ -118,7 +118,7 @@ def test_an_inverted_board() -> None:
     assert len(sighting.ids) == 12
 
 
-def test_a_large_picture_is_searched_at_half_its_size_and_refined_at_its_own() -> None:
+def test_large_image_is_searched_at_half_size() -> None:
     picture, truth = drawn(CHESSBOARD, 1, 0.7)
     large = np.asarray(cv2.resize(picture, None, fx=3, fy=3, interpolation=cv2.INTER_CUBIC), dtype=np.uint8)
     sighting = find_board("a", large, CHESSBOARD, thorough=False)
@@ -137,16 +137,16 @@ def test_a_board_as_opencv_printed_it_before_4_6() -> None:
     assert np.abs(sighting.pixels - truth[sighting.ids]).max() < 0.15
 
 
-def test_mirrored_pictures_are_said_to_be() -> None:
-    """Markers are not found in a mirror. A chessboard is, and looks as it always does."""
+def test_mirrored_images_are_reported() -> None:
+    """Markers are not found in a mirrored image. A chessboard is found, because it looks the same."""
     pictures = [np.ascontiguousarray(drawn(CHARUCO, seed, 0.7)[0][:, ::-1]) for seed in range(2)]
     said = "it is seen mirrored in 2 of 2 tried"
     with pytest.raises(IpsysError, match=said):
         search_images([("a", pictures[0]), ("b", pictures[1])], CHARUCO, 2, "red")
 
 
-def test_pictures_of_the_same_name_of_which_one_has_another_size() -> None:
-    """Two folders of one camera may have pictures of one name."""
+def test_equal_image_names_may_have_different_sizes() -> None:
+    """Two folders of one camera may have images of the same name."""
     grey = drawn(CHARUCO, 0, 0.7)[0]
     small = np.ascontiguousarray(grey[100:, 100:])
     looked = search_images([("a", grey), ("a", small), ("a", grey), ("a", grey)], CHARUCO, 4, "red")
@@ -155,14 +155,14 @@ def test_pictures_of_the_same_name_of_which_one_has_another_size() -> None:
 
 
 def sighting(name: str, x: float, y: float, blur_px: float = 0.8, count: int = 24) -> BoardSighting:
-    """A board of 100 x 60 px with its upper left corner at x, y."""
+    """Return a board of 100 x 60 px with its upper left corner at x, y."""
     ids = np.arange(count)
     pixels = CHESSBOARD.grid_positions(ids) * 20 + (x, y)
     outline = np.array([[0.0, 0], [100, 0], [100, 60], [0, 60]]) + np.array([x, y])
     return BoardSighting(name, ids, pixels, blur_px, outline)
 
 
-def test_blurred_pictures_and_those_with_few_corners_are_dropped_with_the_reason() -> None:
+def test_blurred_images_and_few_corners_are_dropped_with_a_reason() -> None:
     seen = [sighting(str(n), 30 * n, 10) for n in range(10)]
     seen += [sighting("shaken", 100, 200, blur_px=3.5), sighting("half", 200, 200, count=4)]
     seen += [sighting("row", 300, 200, count=6)]
@@ -174,8 +174,8 @@ def test_blurred_pictures_and_those_with_few_corners_are_dropped_with_the_reason
     assert reasons["row"] == "its corners lie on one line"
 
 
-def test_of_hundreds_of_frames_some_dozens_that_differ_are_chosen() -> None:
-    """A board that lies still for most of a video, and then goes all over the image."""
+def test_selection_takes_some_different_frames_of_many() -> None:
+    """The board is stationary for most of a video, and then moves all over the image."""
     still = [sighting(f"still {n}", 300, 200) for n in range(200)]
     moving = [sighting(f"{x} {y}", x, y) for x in range(0, 540, 20) for y in range(0, 420, 20)]
     chosen = select_images([*still, *moving], CHESSBOARD, (640, 480))
@@ -187,7 +187,7 @@ def test_of_hundreds_of_frames_some_dozens_that_differ_are_chosen() -> None:
     assert "nearly as" in chosen.spare[0].reason
 
 
-def test_of_two_that_show_the_same_the_sharp_one_is_chosen() -> None:
+def test_selection_takes_the_sharper_of_two_equal_views() -> None:
     seen = [sighting(f"{x}", x, 10, blur_px=0.8 + (x % 2)) for x in range(400)]
     chosen = select_images(seen, CHESSBOARD, (640, 480))
     assert np.mean([s.blur_px < 1 for s in chosen.used]) > 0.9
@@ -202,12 +202,12 @@ def test_of_two_that_show_the_same_the_sharp_one_is_chosen() -> None:
         ("charuco:50x50", "has 50 markers, the board 1250"),
     ],
 )
-def test_boards_that_cannot_be(text: str, said: str) -> None:
+def test_impossible_boards_are_refused(text: str, said: str) -> None:
     with pytest.raises(IpsysError, match=said):
         parse_board(text, 0.03, 0.75, "DICT_4X4_50", False)
 
 
-def test_a_chessboard_that_was_taken_for_a_charuco_board_is_named_while_others_are_tried() -> None:
+def test_chessboard_instead_of_charuco_is_reported() -> None:
     pictures = [(f"{seed}", drawn(CHESSBOARD, seed, 1.0)[0]) for seed in range(3)]
     tried: list[tuple[int, int]] = []
     with pytest.raises(IpsysError, match="but a chessboard of 6 x 4 inner corners is seen in 3 of 3 tried"):

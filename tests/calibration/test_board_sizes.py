@@ -1,4 +1,4 @@
-"""The size of a board: what a user says holds, unless most pictures show another one; then it is named."""
+"""The size of a board: the user's size counts, unless most images show another size."""
 
 from __future__ import annotations
 
@@ -25,7 +25,7 @@ Grey = NDArray[np.uint8]
 
 @cache
 def striped(margin: float, stripe: float, phase: float, count: int = 7) -> list[Grey]:
-    """Pictures of a board of 8 x 6 inner corners on paper with a narrow margin, over stripes."""
+    """Return images of a board of 8 x 6 inner corners on paper with a narrow margin, over stripes."""
     half_m = ((4.5 + margin) * SQUARE_M, (3.5 + margin) * SQUARE_M)
     pattern = striped_pattern(8, 6, SQUARE_M, margin, stripe, phase)
     return photograph(pattern, half_m, LENS, SIZE_PX, count, 3, (0.33, 0.7))
@@ -50,8 +50,8 @@ def seen(pictures: list[Grey], board: str, insist: bool = False) -> SearchResult
     return search_images(named, wanted, len(pictures), "red", force=insist)
 
 
-# Margin, width and phase of the stripes in squares: dark beside the paper above, or on both sides; or so that
-# stripes nearly go on as the squares do.
+# Margin, width and phase of the stripes are in squares. The stripe beside the paper is dark above, or on both
+# sides, or the stripes almost continue the squares.
 STRIPES = [
     (0.2, 1.0, -1.2),
     *(
@@ -63,7 +63,7 @@ STRIPES = [
 
 @pytest.mark.parametrize("stripes", STRIPES)
 def test_board_over_stripes_right_size_gives_the_lens(stripes: tuple[float, float, float]) -> None:
-    """The edge of the paper before a dark stripe looks like one more row of corners."""
+    """The edge of the paper before a dark stripe looks like another row of corners."""
     looked = seen(striped(*stripes), "8x6")
     assert len(looked.sightings) >= 6
     result = calibrate("red", looked, Board(8, 6, SQUARE_M), LENS_MODELS["pinhole4"])
@@ -105,7 +105,7 @@ def test_chessboard_turned_by_a_quarter_is_accepted(stated: str) -> None:
 
 
 def test_part_of_a_board_insisted_on_is_used() -> None:
-    """All its corners are real ones, so that any part of them tells the lens."""
+    """All detected corners are real, so any part of them gives the intrinsics."""
     looked = seen(plain(8, 6), "5x6", insist=True)
     assert len(looked.sightings) == 4
     assert {len(sighting.ids) for sighting in looked.sightings} == {30}
@@ -113,7 +113,7 @@ def test_part_of_a_board_insisted_on_is_used() -> None:
 
 @pytest.mark.parametrize("stated", ["7x5", "5x6", "4x7", "6x7"])
 def test_charuco_of_other_size_is_named(stated: str) -> None:
-    """7x5 has as many markers; its rows are longer."""
+    """A 7x5 board has the same number of markers, but longer rows."""
     with pytest.raises(IpsysError, match=r"--board charuco:5x7"):
         seen(charuco(5, 7), f"charuco:{stated}")
 
@@ -122,7 +122,7 @@ def test_charuco_of_right_size_is_accepted() -> None:
     assert len(seen(charuco(5, 7), "charuco:5x7").sightings) == 4
 
 
-def test_pictures_without_the_board_are_named_with_what_they_show() -> None:
+def test_images_without_the_board_are_named_with_a_reason() -> None:
     pictures = [*plain(8, 6), np.full((400, 640), 90, np.uint8), plain(6, 5)[0]]
     looked = seen(pictures, "8x6")
     assert looked.unseen == (
@@ -131,7 +131,7 @@ def test_pictures_without_the_board_are_named_with_what_they_show() -> None:
     )
 
 
-def test_pictures_of_nothing_say_what_to_look_after() -> None:
+def test_images_without_the_board_name_the_next_step() -> None:
     with pytest.raises(IpsysError, match="one less than the squares in each direction"):
         seen([np.full((120, 160), 90, np.uint8)] * 3, "8x6")
 
@@ -149,7 +149,7 @@ def test_grid_with_missing_rows_is_completed() -> None:
 
 
 def test_grid_with_rows_beside_the_board_is_trimmed() -> None:
-    """Rows of places where no corners are: beyond the outer squares."""
+    """Return rows of points without corners, beyond the outer squares."""
     picture = plain(8, 6)[0]
     corners = find_chessboard(picture, (8, 6), thorough=True).corners
     assert corners is not None

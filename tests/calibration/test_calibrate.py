@@ -25,7 +25,7 @@ def sightings(
     seed: int = 0,
     name: str = "pinhole",
 ) -> SearchResult:
-    """Boards at these places, each tilted to another side."""
+    """Return boards at these points, each with another tilt."""
     rng, found = np.random.default_rng(seed), []
     for n, place_m in enumerate(places_m):
         turn = Rotation.from_rotvec([tilt_rad * np.cos(n * 2.4), tilt_rad * np.sin(n * 2.4), 0]).as_matrix()
@@ -38,7 +38,7 @@ def sightings(
 def everywhere(
     x: tuple[float, float] = (-0.13, 0.13), y: tuple[float, float] = (-0.1, 0.1)
 ) -> list[tuple[float, float, float]]:
-    """Twenty places all over the image, near and far."""
+    """Return twenty board poses all over the image, near and far."""
     return [
         (float(a), float(b), z)
         for n, a in enumerate(np.linspace(*x, 5))
@@ -51,14 +51,14 @@ def calibrated(looked: SearchResult) -> CalibrationResult:
     return calibrate("red", looked, BOARD, LENS_MODELS["pinhole"])
 
 
-def test_of_good_pictures_nothing_is_asked() -> None:
+def test_good_images_give_no_advice() -> None:
     found = calibrated(sightings(everywhere(), 0.5))
     assert found.notes == ()
     assert found.rms_px == pytest.approx(0.1 * np.sqrt(2), rel=0.15)
     assert found.median_px == pytest.approx(0.1 * np.sqrt(2 * np.log(2)), rel=0.15)
 
 
-def test_a_side_without_a_board_is_named() -> None:
+def test_image_side_without_a_board_is_named() -> None:
     found = calibrated(sightings(everywhere(x=(-0.03, 0.13)), 0.5))
     assert "no board near the left edge of the image: hold it there too" in found.notes
     assert found.coverage.empty_sides == ("left",)
@@ -69,38 +69,38 @@ def test_a_board_that_was_hardly_tilted() -> None:
     assert any("tilted by 25 degrees or more in 0 pictures" in note for note in notes)
 
 
-def test_a_board_that_was_never_tilted_tells_no_focal_length() -> None:
+def test_untilted_board_gives_no_focal_length() -> None:
     with pytest.raises(IpsysError, match="tilt it to all sides"):
         calibrated(sightings([(x, 0.0, 0.5) for x in np.linspace(-0.03, 0.03, 10)], 0.0, noise_px=0.3))
 
 
 @pytest.mark.parametrize("name", ["fisheye", "pinhole", "pinhole4"])
-def test_boards_along_the_image_tell_no_focal_length_near_and_far(name: str) -> None:
-    """Else it runs away to a hundredth of itself, with a standard deviation that says otherwise."""
+def test_parallel_boards_give_no_focal_length_at_any_distance(name: str) -> None:
+    """Otherwise the focal length falls to a hundredth, with a wrong standard deviation."""
     looked = sightings(everywhere(), 0.0, name=name)
     with pytest.raises(IpsysError, match="tilt it to all sides"):
         calibrate("red", looked, BOARD, LENS_MODELS[name])
 
 
-def test_boards_that_were_hardly_tilted_tell_it_as_well_as_they_can() -> None:
-    """While lines may not bend yet, a far shorter focal length fits better."""
+def test_slightly_tilted_boards_give_a_large_sigma() -> None:
+    """A much shorter focal length fits better as long as the distortion is fixed at zero."""
     for seed in range(2):
         found = calibrated(sightings(everywhere(), 0.12, noise_px=0.05, seed=seed))
         assert abs(found.values[0] - 600) < min(4 * found.sigmas[0], 60)
 
 
-def test_pictures_that_are_all_soft() -> None:
+def test_images_that_are_all_blurred_are_reported() -> None:
     notes = calibrated(sightings(everywhere(), 0.5, blur_px=3.0)).notes
     assert any("edges are 3.0 px wide in all pictures" in note for note in notes)
 
 
-def test_corners_that_are_far_off_are_said_to_be() -> None:
+def test_corners_with_large_errors_are_reported() -> None:
     looked = sightings(everywhere(), 0.5, noise_px=1.0)
     assert any("px: check that the board is flat" in note for note in calibrated(looked).notes)
 
 
 def through_fisheye() -> SearchResult:
-    """Boards all over the picture of a fisheye, to 85 degrees from its axis."""
+    """Return boards all over the image of a fisheye, up to 85 degrees from its axis."""
     corners = seen("fisheye", np.random.default_rng(1)).pixels.reshape(-1, 24, 2)
     views = [
         BoardSighting(f"{n}.png", np.arange(24), p, 0.8, p[[0, 5, 23, 18]]) for n, p in enumerate(corners)
@@ -119,7 +119,7 @@ def test_pinhole_on_a_fisheye_insisted_on_is_noted() -> None:
     assert "written only for --force: the RMS reprojection error is" in result.notes[0]
 
 
-def test_too_few_say_what_to_add() -> None:
+def test_too_few_images_name_the_missing_poses() -> None:
     looked = sightings([(-0.05, 0.0, 0.4), (0.05, 0.03, 0.4), (0.0, -0.03, 0.4)], 0.4)
     with pytest.raises(IpsysError, match=r"only 3 of 3 pictures can be used.*no board near the left, right"):
         calibrated(looked)

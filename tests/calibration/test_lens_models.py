@@ -1,4 +1,4 @@
-"""Projections against OpenCV's, the formulas written out, and their derivatives by differences."""
+"""Projections compared with OpenCV and with the written formulas, and derivatives with differences."""
 
 from __future__ import annotations
 
@@ -38,7 +38,7 @@ def test_a_fisheye_sees_what_is_beside_and_behind_it() -> None:
     beyond = points() * (1.0, 1.0, -0.3)
     pixels = project_points(LENS_MODELS["fisheye"], np.array(TRUTH["fisheye"]), beyond)
     np.testing.assert_allclose(pixels, pixels_of("fisheye", TRUTH["fisheye"], beyond), atol=1e-9)
-    # Farther from the middle than anything before the camera.
+    # Farther from the principal point than any point in front of the camera.
     middle = TRUTH["fisheye"][2:4]
     assert np.linalg.norm(pixels - middle, axis=1).min() > 185 * np.pi / 2 * 0.9
 
@@ -58,7 +58,7 @@ def test_derivatives(name: str) -> None:
         np.testing.assert_allclose(by_lens[:, :, n], (ahead - behind) / (2 * step), rtol=1e-5, atol=1e-4)
 
 
-def test_the_axis_itself_is_the_middle() -> None:
+def test_optical_axis_projects_to_the_principal_point() -> None:
     pixels, by_point, _ = project_with_slopes(
         LENS_MODELS["fisheye"], np.array(TRUTH["fisheye"]), np.array([[0.0, 0.0, 2.0]])
     )
@@ -66,6 +66,6 @@ def test_the_axis_itself_is_the_middle() -> None:
     np.testing.assert_allclose(by_point[0, :, :2], np.eye(2) * 185.0 / 2.0, atol=1e-6)
 
 
-def test_a_lens_that_there_is_not() -> None:
+def test_missing_calibration_is_refused() -> None:
     with pytest.raises(IpsysError, match="use one of fisheye, pinhole"):
         find_lens_model("omni")

@@ -1,4 +1,4 @@
-"""Known lenses found again from corners with noise, and how far off they are against what is said."""
+"""Known intrinsics estimated from noisy corners, and their errors compared with the standard deviations."""
 
 from __future__ import annotations
 
@@ -16,7 +16,7 @@ from tests.calibration.boards_seen import SIZE_PX, TRUTH, grid_m, random_pose, s
 
 
 def squared_errors(name: str, seeds: range, shared_px: float = 0.0) -> NDArray[np.float64]:
-    """Squared errors in units of the variance that is said, (seeds, parameters)."""
+    """Return squared errors in units of the estimated variance, (seeds, parameters)."""
     rows = []
     for seed in seeds:
         found = solve(
@@ -29,8 +29,8 @@ def squared_errors(name: str, seeds: range, shared_px: float = 0.0) -> NDArray[n
 
 
 @pytest.mark.parametrize("name", list(TRUTH))
-def test_a_known_lens_is_found_within_what_is_said(name: str) -> None:
-    """With 8 seeds and about 8 correlated parameters, the mean of the squares is 1 to a factor of two."""
+def test_known_intrinsics_are_recovered_within_their_sigma(name: str) -> None:
+    """With 8 seeds and about 8 correlated parameters, the mean square is 1 within a factor of two."""
     errors = squared_errors(name, range(8))
     assert 0.5 < errors.mean() < 2.0, errors.mean(axis=0)
     assert (errors < 4).mean() > 0.85
@@ -38,8 +38,8 @@ def test_a_known_lens_is_found_within_what_is_said(name: str) -> None:
 
 
 @pytest.mark.parametrize("name", ["fisheye", "pinhole"])
-def test_errors_that_a_picture_shares_are_in_what_is_said(name: str) -> None:
-    """Taken for independent, the residuals would make these squares 2 on average."""
+def test_sigma_includes_errors_shared_by_an_image(name: str) -> None:
+    """With residuals taken as independent, these squares would be 2 on average."""
     errors = squared_errors(name, range(8), shared_px=0.15)
     assert 0.4 < errors.mean() < 1.6, errors.mean(axis=0)
 
@@ -53,7 +53,10 @@ def test_more_noise_is_more_uncertainty() -> None:
 
 
 def test_opencv_finds_the_same_pinhole() -> None:
-    """On the same corners, to a part of the standard deviation: only doubted corners weigh differently."""
+    """On the same corners, the results agree within a part of the sigma.
+
+    Only doubtful corners have other weights.
+    """
     corners = seen("pinhole", np.random.default_rng(3))
     found = solve(LENS_MODELS["pinhole"], corners, SIZE_PX)
     bounds = [*corners.starts, len(corners.image_numbers)]
@@ -76,8 +79,8 @@ def test_pixels_that_are_not_square() -> None:
     assert (np.abs(found.fit.intrinsics - stretched) < 4 * sigmas).all()
 
 
-def test_pixels_that_are_hardly_not_square() -> None:
-    """By half a per cent, in pictures that are good enough to tell."""
+def test_almost_square_pixels_are_recognised() -> None:
+    """The pixels differ from squares by half a per cent, in images that are good enough to show it."""
     stretched = (600.0, 603.0, *TRUTH["pinhole"][2:])
     corners = seen("pinhole", np.random.default_rng(0), noise_px=0.03, lens=stretched)
     found = solve(LENS_MODELS["pinhole"], corners, SIZE_PX)
@@ -85,8 +88,8 @@ def test_pixels_that_are_hardly_not_square() -> None:
     assert np.sqrt((found.residuals_px**2).sum(axis=1).mean()) < 0.05
 
 
-def test_what_does_not_belong_is_told_by_pixels_that_are_not_square() -> None:
-    """Taken for square, all pictures are off, so that one more is not noticed."""
+def test_foreign_image_is_found_with_non_square_pixels() -> None:
+    """With pixels assumed square, all images have errors, so one more is not noticed."""
     stretched = (600.0, 618.0, *TRUTH["pinhole"][2:])
     corners = seen("pinhole", np.random.default_rng(0), lens=stretched)
     corners.pixels[corners.image_numbers == 12] += np.random.default_rng(9).normal(0, 0.6, (24, 2))
@@ -96,7 +99,7 @@ def test_what_does_not_belong_is_told_by_pixels_that_are_not_square() -> None:
 
 
 def spoiled(corners: Corners) -> Corners:
-    """Ten corners 5 to 20 px off, and one picture in which a print was another one."""
+    """Ten corners have errors of 5 to 20 px, and one image shows another print."""
     rng = np.random.default_rng(9)
     pixels = corners.pixels.copy()
     pixels[rng.choice(200, 10, replace=False)] += rng.uniform(5, 20, (10, 2))
@@ -105,7 +108,7 @@ def spoiled(corners: Corners) -> Corners:
 
 
 @pytest.mark.parametrize("name", ["fisheye", "pinhole"])
-def test_what_does_not_belong_is_left_out_and_said(name: str) -> None:
+def test_foreign_images_are_excluded_and_reported(name: str) -> None:
     found = solve(LENS_MODELS[name], spoiled(seen(name, np.random.default_rng(5))), SIZE_PX)
     assert [left.number for left in found.excluded] == [12]
     assert "does not fit" in found.excluded[0].reason or "far off" in found.excluded[0].reason
@@ -119,7 +122,7 @@ def within(found: SolveResult, name: str) -> bool:
 
 
 @pytest.mark.parametrize("focal_px", [90.0, 185.0, 400.0])
-def test_a_fisheye_of_any_focal_length_is_found_without_being_told(focal_px: float) -> None:
+def test_fisheye_needs_no_initial_focal_length(focal_px: float) -> None:
     lens = (focal_px, focal_px, *TRUTH["fisheye"][2:])
     corners = seen("fisheye", np.random.default_rng(1), pictures=15, lens=lens)
     start = find_start(LENS_MODELS["fisheye"], corners, SIZE_PX)

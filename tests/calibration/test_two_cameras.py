@@ -1,4 +1,4 @@
-"""Pictures of two cameras in one folder are told apart; those of one camera are not."""
+"""Images of two cameras in one folder are separated; those of one camera are not."""
 
 from __future__ import annotations
 
@@ -17,7 +17,7 @@ from ipsys_log.calibration.two_cameras import TwoCameras, find_two_cameras
 from ipsys_log.errors import IpsysError
 from tests.calibration.boards_seen import SIZE_PX, TRUTH, seen
 
-# Cameras of the same type differ by less, those with another lens by more.
+# Cameras of the same type differ less, those with another lens more.
 OTHER = (650.0, 650.0, 310.0, 250.0, -0.25, 0.08, 0.001, -0.001, 0.02)
 
 
@@ -58,7 +58,7 @@ def agreement(groups: NDArray[np.bool_], truth: NDArray[np.bool_]) -> float:
 @pytest.mark.parametrize("name", list(TRUTH))
 @pytest.mark.parametrize("shared_px", [0.0, 0.15])
 def test_pictures_of_one_camera_are_not_split(name: str, shared_px: float) -> None:
-    """Also where the corners of a picture share errors, as on a board that is bent."""
+    """The corners of an image share errors, as on a curved board."""
     for seed, pictures in ((0, 8), (1, 16), (2, 24)):
         corners = seen(name, np.random.default_rng(seed), pictures, shared_px=shared_px)
         assert split(name, corners) is None
@@ -69,7 +69,7 @@ def test_names_of_two_kinds_do_not_split_one_camera() -> None:
     assert split("pinhole", corners, [f"{'near' if n < 9 else 'far'}_{n}.jpg" for n in range(20)]) is None
 
 
-def test_names_help_where_cameras_are_alike() -> None:
+def test_names_separate_similar_cameras() -> None:
     rng = np.random.default_rng(2)
     like = (615.0, 615.0, 350.0, 222.0, -0.23, 0.06, 0.001, -0.001, 0.02)
     corners = both(seen("pinhole", rng, 12), seen("pinhole", rng, 12, lens=like))

@@ -1,4 +1,4 @@
-"""Uncertainties of few pictures, and of lenses that are not of the model fitted, against the truth."""
+"""Uncertainties with few images, and of lenses outside the fitted model, compared with the ground truth."""
 
 from __future__ import annotations
 
@@ -10,14 +10,14 @@ from ipsys_log.calibration.lens_models import LENS_MODELS
 from ipsys_log.calibration.solve import solve
 from tests.calibration.boards_seen import SIZE_PX, TRUTH, seen
 
-# A lens whose elements are off its axis, which the fisheye model has no terms for.
+# A lens with decentred elements: the fisheye model has no terms for it.
 DECENTERED = (600.0, 600.0, 330.0, 230.0, -0.25, 0.1, 0.004, -0.006, -0.02)
 
 
 def squared_errors(
     true: str, fitted: str, pictures: int, seeds: range, lens: tuple[float, ...] | None = None
 ) -> NDArray[np.float64]:
-    """Squared errors of focal length and principal point in units of the variance, (seeds, 3)."""
+    """Return squared errors of focal length and principal point in units of the variance, (seeds, 3)."""
     rows = []
     for seed in seeds:
         corners = seen(true, np.random.default_rng(seed), pictures, lens=lens)
@@ -29,7 +29,7 @@ def squared_errors(
 
 @pytest.mark.parametrize("name", ["fisheye", pytest.param("pinhole", marks=pytest.mark.slow), "pinhole8"])
 def test_few_pictures_errors_are_as_stated(name: str) -> None:
-    """Seven pictures may agree by chance; a jackknife of seven takes that for certainty, up to 6 sigma."""
+    """Seven images may agree by chance; the error of a jackknife of seven is then up to 6 sigma."""
     errors = squared_errors(name, name, 7, range(100, 130))
     assert 0.2 < errors.mean() < 1.3, errors.mean(axis=0)
     assert (errors < 4).mean() >= 0.93
@@ -38,13 +38,13 @@ def test_few_pictures_errors_are_as_stated(name: str) -> None:
 
 @pytest.mark.parametrize("pictures", [pytest.param(7, marks=pytest.mark.slow), 20])
 def test_lens_of_other_kind_errors_are_as_stated(pictures: int) -> None:
-    """With the jackknife alone, the mean is 3 to 4 for 20 pictures."""
+    """With the jackknife only, the mean is 3 to 4 for 20 images."""
     errors = squared_errors("pinhole", "fisheye", pictures, range(100, 120), DECENTERED)
     assert 0.3 < errors.mean() < 2.0, errors.mean(axis=0)
     assert (errors < 4).mean() >= 0.9
 
 
 def test_lens_of_the_right_kind_is_stated_no_worse() -> None:
-    """Twenty pictures: what a richer model shows is noise, and hardly counts."""
+    """With twenty images, the effect of a richer model is noise and has little weight."""
     errors = squared_errors("fisheye", "fisheye", 20, range(100, 120))
     assert errors.mean() > 0.5

@@ -1,7 +1,7 @@
-"""A driver for Video for Linux that needs no camera.
+"""A driver for Video for Linux without a camera. It replaces the kernel.
 
-It stands where the kernel does: it takes the requests of ``ioctl`` on an open file and answers as the
-kernel's documentation has it. The file is a real one, so that its buffers are mapped as those of a device.
+It answers the requests of ``ioctl`` on an open file according to the documentation of the kernel. The file
+is real, so that its buffers are mapped like those of a device.
 """
 
 from __future__ import annotations
@@ -23,7 +23,7 @@ LENGTH = 64 * PAGE
 
 @dataclass
 class Driver:
-    """A camera of some modes; ``frames`` are what it takes next, an OSError is its end."""
+    """A camera with some modes; ``frames`` are its next frames, and an OSError ends it."""
 
     path: Path
     frames: deque[bytes | OSError] = field(default_factory=deque)
@@ -33,7 +33,7 @@ class Driver:
             "MJPG": [(1920, 1080, [30, 15]), (1280, 720, [60, 30])],
         }
     )
-    # Lowest, highest and present value.
+    # minimum, maximum and present value
     controls: dict[int, list[int]] = field(
         default_factory=lambda: {0x9A0902: [1, 5000, 250], 0x9A0901: [0, 3, 3], 0x980913: [0, 100, 50]}
     )
@@ -44,7 +44,7 @@ class Driver:
     rate: tuple[int, int] = (1, 30)
     stride: int = 0
     queued: deque[int] = field(default_factory=deque)
-    # Numbers of the frames to come, where the driver loses some or begins elsewhere.
+    # Sequence numbers of the next frames, for lost frames or another start.
     numbers: Iterator[int] = field(default_factory=count)
     streaming: bool = False
 
@@ -82,7 +82,7 @@ class Driver:
         about.type, about.times[0], about.times[1] = v4l2.DISCRETE, 1, _at(rates, about.index)
 
     def set_size(self, about: v4l2.Format) -> None:
-        """The nearest there is, as the documentation wants."""
+        """Return the nearest mode, as the documentation requires."""
         sizes = [(w, h) for w, h, _ in self.modes[v4l2.fourcc_name(about.pixelformat)]]
         self.size = min(sizes, key=lambda size: abs(size[0] - about.width) + abs(size[1] - about.height))
         about.width, about.height = self.size

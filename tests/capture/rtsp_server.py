@@ -1,10 +1,10 @@
-"""An RTSP server: a program for Debian's own Python, with GStreamer's library that cameras use too.
+"""An RTSP server for Debian's own Python, with the library of GStreamer.
 
     /usr/bin/python3 rtsp_server.py VIDEO PAYLOADER PROTOCOL AUTHENTICATION
 
-VIDEO is a file of MP4's kind, sent once to each client, PAYLOADER what makes packets of its frames. PROTOCOL
-is ``tcp`` or ``udp``, AUTHENTICATION ``none``, ``basic`` or ``digest`` (admin, hush).
-It prints the port it listens at.
+VIDEO is an MP4 file, sent once to each client. PAYLOADER is the element that makes packets of its frames.
+PROTOCOL is ``tcp`` or ``udp``. AUTHENTICATION is ``none``, ``basic`` or ``digest`` (admin, hush). The server
+prints its port.
 """
 
 from __future__ import annotations
@@ -20,7 +20,7 @@ from gi.repository import GLib, Gst, GstRtsp, GstRtspServer  # noqa: E402
 
 
 def guard(server: GstRtspServer.RTSPServer, method: str) -> GstRtspServer.RTSPPermissions:
-    """Let only the user admin in."""
+    """Allow only the user admin."""
     token, auth = GstRtspServer.RTSPToken.new(), GstRtspServer.RTSPAuth.new()
     token.set_string("media.factory.role", "admin")
     if method == "basic":

@@ -1,4 +1,4 @@
-"""Real streams on loopback: FFmpeg serves them, and an RTSP server hands on what FFmpeg sends as RTP."""
+"""Real streams on loopback: FFmpeg serves them, and an RTSP server forwards FFmpeg's RTP packets."""
 
 from __future__ import annotations
 
@@ -22,7 +22,7 @@ __all__ = ["encode", "ffmpeg", "free_port", "make_jpegs", "serve", "serve_rtsp"]
 
 
 def ffmpeg() -> str:
-    """The program; the test is skipped where it is not installed."""
+    """Return the path of a program; skip the test if it is not installed."""
     found = shutil.which("ffmpeg")
     if found is None:
         pytest.skip("no ffmpeg; on Debian: sudo apt-get install ffmpeg")
@@ -36,7 +36,7 @@ def free_port(kind: socket.SocketKind = socket.SOCK_STREAM) -> int:
 
 
 def make_jpegs(folder: Path, count: int, width: int = 320, height: int = 240) -> list[bytes]:
-    """Pictures that differ, as ``000.jpg`` and so on."""
+    """Write different images as ``000.jpg`` and so on."""
     rng = np.random.default_rng(7)
     rows, columns = np.indices((height, width))
     pictures = []
@@ -49,7 +49,7 @@ def make_jpegs(folder: Path, count: int, width: int = 320, height: int = 240) ->
 
 
 def encode(folder: Path, name: str, *options: str, rate: int = 30) -> Path:
-    """A video of the folder's pictures."""
+    """Encode the images of a folder as a video."""
     path = folder / name
     inputs = ["-framerate", str(rate), "-i", str(folder / "%03d.jpg")]
     subprocess.run([ffmpeg(), "-v", "error", "-y", *inputs, *options, str(path)], check=True)
@@ -58,7 +58,7 @@ def encode(folder: Path, name: str, *options: str, rate: int = 30) -> Path:
 
 @contextmanager
 def serve(*options: str, port: int) -> Iterator[subprocess.Popen[bytes]]:
-    """FFmpeg, which listens at a port of loopback for one client."""
+    """Run FFmpeg, listening on a loopback port for one client."""
     program = subprocess.Popen([ffmpeg(), "-v", "quiet", "-nostdin", *options], stderr=subprocess.DEVNULL)
     try:
         _await_listening(port)
@@ -69,12 +69,12 @@ def serve(*options: str, port: int) -> Iterator[subprocess.Popen[bytes]]:
 
 
 def _await_listening(port: int) -> None:
-    """Without connecting: FFmpeg takes the first client, and only that."""
+    """Check the port without a connection, because FFmpeg accepts only one client."""
     local = f"0100007F:{port:04X}"
     until = time.monotonic() + 240
     while time.monotonic() < until:
         rows = [line.split() for line in Path("/proc/net/tcp").read_text().splitlines()[1:]]
-        if any(row[1] == local and row[3] == "0A" for row in rows):  # 0A: it listens
+        if any(row[1] == local and row[3] == "0A" for row in rows):  # 0A means that it listens
             return
         time.sleep(0.02)
     raise TimeoutError(f"nothing listens at port {port}")
@@ -82,10 +82,10 @@ def _await_listening(port: int) -> None:
 
 @contextmanager
 def serve_rtsp(video: Path, clock_shift_s: float = 0.0) -> Iterator[str]:
-    """The address of a video as an RTSP stream; the server's clock may be off.
+    """Return the address of a video as an RTSP stream; the clock of the server may have an error.
 
-    FFmpeg makes the packets and the reports of the clock (RTP and RTCP); they go to the client within its
-    TCP connection, as RFC 2326 (10.12) has it.
+    FFmpeg makes the packets and the clock reports (RTP and RTCP). The server sends them in the TCP
+    connection of the client, as in RFC 2326 (10.12).
     """
     with _bound() as rtp, _bound() as rtcp:
         sdp = video.with_suffix(".sdp")
@@ -132,7 +132,7 @@ class _RtspClient(socketserver.StreamRequestHandler):
     def handle(self) -> None:
         lock = threading.Lock()
         while request := self.rfile.readline():
-            if request[:1] == b"$":  # the client's own reports
+            if request[:1] == b"$":  # reports of the client
                 continue
             lines = iter(lambda: self.rfile.readline().strip(), b"")
             fields = dict(line.decode().split(": ", 1) for line in lines if b": " in line)
@@ -165,7 +165,7 @@ class _RtspClient(socketserver.StreamRequestHandler):
                 return
 
     def _shifted(self, report: bytes) -> bytes:
-        """A sender's report (RFC 3550, 6.4.1) with its clock put forward: 64 bits of 2**-32 s, at 8."""
+        """Return a sender's report (RFC 3550, 6.4.1) with its clock advanced: 64 bits of 2**-32 s, at 8."""
         if len(report) < 16 or report[1] != 200:
             return report
         (ntp,) = struct.unpack_from(">Q", report, 8)

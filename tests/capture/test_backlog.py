@@ -1,4 +1,4 @@
-"""Frames that wait for the stages: never many, and each that is searched has all that it needs before it."""
+"""Frames that wait for the stages: their number is bounded, and each searched frame can be decoded."""
 
 from __future__ import annotations
 
@@ -38,14 +38,14 @@ def test_the_oldest_frames_of_a_video_are_only_decoded() -> None:
     ]  # fmt: skip
 
 
-def test_what_lies_before_a_keyframe_that_is_searched_is_not_even_decoded() -> None:
+def test_frames_before_a_searched_keyframe_are_not_decoded() -> None:
     waiting = Waiting()
     skipped = [late for n in range(10) for late in waiting.put(video(n, n in (0, 7)))]
     assert numbers(waiting.take()) == [7, 8, 9]
     assert numbers(skipped) == list(range(7))
 
 
-def test_where_no_keyframe_comes_for_long_all_is_skipped_until_one_does() -> None:
+def test_frames_are_skipped_until_a_late_keyframe() -> None:
     waiting = Waiting()
     skipped = []
     for n in range(1000):
@@ -57,14 +57,12 @@ def test_where_no_keyframe_comes_for_long_all_is_skipped_until_one_does() -> Non
     assert searched(waiting.take()) == [1000]
 
 
-# The frames of two cameras, whether each is a keyframe, and where the stages take what waits.
+# A case is the frames of two cameras, their keyframes, and the times at which the stages take frames.
 steps = st.lists(st.tuples(st.sampled_from("ab"), st.booleans(), st.integers(0, 40)), max_size=200)
 
 
 @given(steps, st.integers(1, 40))
-def test_whatever_comes_each_frame_is_searched_or_named_and_can_be_decoded(
-    came: list[tuple[str, bool, int]], every: int
-) -> None:
+def test_each_frame_is_searched_or_reported_as_skipped(came: list[tuple[str, bool, int]], every: int) -> None:
     waiting = Waiting()
     taken: list[Message] = []
     skipped: list[Message] = []

@@ -1,4 +1,4 @@
-"""The size of a recording, and how long the disk lasts: printed before it begins, and while it goes on."""
+"""The size of a recording, and the time until the disk is full, before and during a recording."""
 
 from __future__ import annotations
 
@@ -37,14 +37,14 @@ def rig_that_plays(lab: Path, more: str = "") -> Path:
 
 
 def status_line(status: LiveStatus) -> tuple[str, str]:
-    """The last line that is shown while recording, and its style."""
+    """Return the last line of the display during a recording, and its style."""
     text = status.show().renderables[-1]
     return str(text), str(text.style)  # type: ignore[union-attr]
 
 
 @contextmanager
 def opening(rig: Path, log: Path, seconds: float | None, doing: str | None = None) -> Iterator[LiveStatus]:
-    """The cameras opened as a command opens them; nothing is written."""
+    """Open the cameras as a command does; write nothing."""
     with open_cameras(prepare_lab(rig, None, None), log, seconds, doing) as (cameras, _, status):
         yield status
         cameras.stop()
@@ -58,7 +58,7 @@ def first_bytes(lab: Path) -> int:
 
 
 @pytest.mark.parametrize("command", [("record",), ("record", "--detect")])
-def test_room_is_said_before_the_recording_begins(
+def test_free_disk_time_is_printed_before_the_recording(
     ipsys: Ipsys, lab: Path, tmp_path: Path, command: tuple[str, ...]
 ) -> None:
     rig = rig_that_plays(lab, "rate_hz = 5\n")
@@ -70,10 +70,10 @@ def test_room_is_said_before_the_recording_begins(
     assert math.isclose(float(said[1]) * 1e6, 2 * 5 * first_bytes(lab), abs_tol=0.06e6)
 
 
-def test_measuring_says_what_a_place_takes(
+def test_measure_prints_the_size_of_one_point(
     capsys: pytest.CaptureFixture[str], lab: Path, tmp_path: Path
 ) -> None:
-    """No rate: what is not measured is not kept."""
+    """There is no rate, because only measured frames are kept."""
     with opening(rig_that_plays(lab), tmp_path / "a.mcap", None, "measuring") as status:
         line, _ = status_line(status)
     assert line.endswith("left on the disk")
@@ -85,7 +85,7 @@ def test_measuring_says_what_a_place_takes(
 def test_small_disk_is_warned_of_before_the_start(
     capsys: pytest.CaptureFixture[str], lab: Path, tmp_path: Path
 ) -> None:
-    """On a disk of its own: 20 MB, of which half is set aside for the end of the log."""
+    """Use a separate disk of 20 MB; half of it is reserved for the end of the log."""
     rig = rig_that_plays(lab, "rate_hz = 30\n")
     with small_disk(tmp_path / "disk", 20) as disk:
         with opening(rig, disk / "a.mcap", None):
@@ -94,17 +94,15 @@ def test_small_disk_is_warned_of_before_the_start(
         assert "to make it smaller: a lower rate_hz in lab.toml (15 halves it)" in said
         with opening(rig, disk / "b.mcap", 1.0):
             assert re.search(r"MB in 1 s; .*: enough for 2 s", capsys.readouterr().err)
-        # Cameras that are only looked at: nothing is said, but where even that does not fit.
+        # The cameras are only previewed: a message appears only if the disk is too small even for that.
         with opening(rig, disk / "c.mcap", 1.0, "looking for 1 s"):
             assert "free in" not in capsys.readouterr().err
         with opening(rig, disk / "d.mcap", 60.0, "looking for 60 s"):
             assert "full after 2 s" in capsys.readouterr().err
 
 
-def test_line_on_the_screen_is_corrected_by_what_came(
-    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
-) -> None:
-    """Expected were 10 MB/s; measured are 2 MB/s: the same disk lasts five times as long."""
+def test_displayed_disk_time_uses_the_measured_rate(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    """The estimate is 10 MB/s and the measured rate 2 MB/s: the disk lasts five times as long."""
     log = tmp_path / "a.mcap"
     log.write_bytes(bytes(20_000_000))
     monkeypatch.setattr(shutil, "disk_usage", lambda _: Usage(10**12, 0, 6_000_000_000))
@@ -112,12 +110,12 @@ def test_line_on_the_screen_is_corrected_by_what_came(
     with CameraMonitor(RIG) as monitor:
         status = LiveStatus({}, monitor, log, lambda: now_s[0], 10e6)
         now_s[0] = 1.0
-        assert status_line(status) == ("1 s, 20.0 MB; 6.0 GB left on the disk: 10 minutes", "")
+        assert status_line(status) == ("1 s, 20.0 MB; 6.0 GB left on the disk, enough for 10 minutes", "")
         now_s[0] = 10.0
-        assert status_line(status) == ("10 s, 20.0 MB; 6.0 GB left on the disk: 50 minutes", "")
+        assert status_line(status) == ("10 s, 20.0 MB; 6.0 GB left on the disk, enough for 50 minutes", "")
         monkeypatch.setattr(shutil, "disk_usage", lambda _: Usage(10**12, 0, 600_000_000))
         line, style = status_line(status)
-        assert line.endswith("600.0 MB left on the disk: 5 minutes")
+        assert line.endswith("600.0 MB left on the disk, enough for 5 minutes")
         assert "red" in style
 
 
@@ -126,7 +124,7 @@ def test_expected_rate_is_that_of_the_rig_and_the_first_frames() -> None:
     states = {
         "red": CameraState(frames=2, bytes=200_000, format="jpeg", size_px=(1280, 720)),
         "white": CameraState(frames=1, bytes=50_000, format="jpeg", size_px=(640, 480)),
-        # A first frame of a video is a keyframe, which says little.
+        # The first frame of a video is a keyframe, so its size gives no rate.
         "gate": CameraState(frames=1, bytes=400_000, format="h264", size_px=(1920, 1080)),
     }
     video = expected_bytes_per_s(cameras[2:], states)
@@ -134,7 +132,7 @@ def test_expected_rate_is_that_of_the_rig_and_the_first_frames() -> None:
     assert expected_bytes_per_s(cameras, states) == 15 * 100_000 + 30 * 50_000 + video
 
 
-def test_advice_only_where_a_recording_is_large_or_the_disk_small(tmp_path: Path) -> None:
+def test_advice_needs_a_large_recording_or_a_small_disk(tmp_path: Path) -> None:
     cameras = [RigCamera("red", rate_hz=30.0)]
     jpeg, video = (CameraState(1, 1, format=name) for name in ("jpeg", "h264"))
     assert DiskRoom(tmp_path, 10**12, 1e6).advise(cameras, {"red": jpeg}) is None

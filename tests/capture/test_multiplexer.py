@@ -1,4 +1,4 @@
-"""Cameras that send now: the order of their messages, what is lost, and what is said of it."""
+"""Live cameras: the order of their messages, lost frames, and events."""
 
 from __future__ import annotations
 
@@ -20,7 +20,7 @@ from ipsys_log.capture.multiplexer import LiveCameras
 from ipsys_log.messages import STAMP_UNRELIABLE, CompressedImage, Event, Message, RigCamera
 from tests.playing import cameras, playing
 
-# Nothing takes so long, however busy the machine is.
+# A limit far above any duration on a busy machine.
 LIMIT_S = 240.0
 FRAMES = {name: [f"{name} {n}".encode() for n in range(20)] for name in ("red", "white", "black")}
 
@@ -31,7 +31,7 @@ def messages(attached: LiveCameras) -> list[Message]:
 
 
 def events(found: list[Message]) -> list[Event]:
-    """Return the events but for those of a busy machine, on which this program stands still at times."""
+    """Return the events, without those of a busy machine that pauses this program."""
     payloads = [message.payload for message in found if isinstance(message.payload, Event)]
     return [event for event in payloads if event.kind != STAMP_UNRELIABLE]
 
@@ -64,12 +64,12 @@ def test_log_times_are_utc() -> None:
 
 
 def test_a_camera_without_stamps_has_the_time_of_arrival() -> None:
-    """The time is when the thread had the frame, even if the frame waited. No delay is claimed."""
+    """The time is the arrival in the thread, even if the frame waited. There is no delay to report."""
     sent_ns: list[int] = []
     clock = Clock()
 
     def before(_: str, number: int) -> None:
-        if number == 1:  # until then frames without stamps are thrown away
+        if number == 1:  # before this, frames without stamps are discarded
             assert attached._started.wait(LIMIT_S)
         sent_ns.append(clock.now_ns())
 
@@ -88,7 +88,7 @@ def test_a_camera_without_stamps_has_the_time_of_arrival() -> None:
     assert attached.states["red"].delay_s is None
 
 
-def test_frames_that_were_lost_before_they_came_are_counted_and_named() -> None:
+def test_frames_lost_before_arrival_are_counted_and_named() -> None:
     @contextmanager
     def opened(camera: RigCamera, clock: Clock, say: Say) -> Iterator[Iterator[Frame | None]]:
         yield iter([Frame(b"x", "jpeg", clock.now_ns(), missed) for missed in (0, 0, 2, 0, 3, 1, 0)])
@@ -98,7 +98,7 @@ def test_frames_that_were_lost_before_they_came_are_counted_and_named() -> None:
     found = messages(attached)
     assert (attached.states["red"].missed, attached.states["red"].dropped) == (6, 0)
     assert len(data_of(found, "red")) == 7
-    # The first at once, those within a second of it together.
+    # The first event comes at once, later ones within a second come together.
     assert [(event.kind, event.camera) for event in events(found)] == [("frames_missed", "red")] * 2
     assert [event.text for event in events(found)] == said
     assert said == [f"{n} frames of camera red were lost before they came" for n in (2, 4)]
@@ -116,12 +116,12 @@ def test_a_camera_that_cannot_be_opened_ends_it_at_once() -> None:
     assert not [thread for thread in threading.enumerate() if thread.name in ("red", "white")]
 
 
-def test_a_camera_that_sends_nothing_is_named_without_its_password(monkeypatch: pytest.MonkeyPatch) -> None:
+def test_silent_camera_is_named_without_its_password(monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr("ipsys_log.capture.camera_thread._FIRST_FRAME_S", 0.2)
 
     @contextmanager
     def silent(camera: RigCamera, clock: Clock, say: Say) -> Iterator[Iterator[Frame | None]]:
-        yield iter(partial(time.sleep, 0.05), "the end")  # None, and None again
+        yield iter(partial(time.sleep, 0.05), "the end")  # None twice
 
     camera = RigCamera("red", source="rtsp://admin:secret@10.0.0.7/live")
     with pytest.raises(SourceError, match=r"admin:\*+@10\.0\.0\.7/live sends no frames") as raised:
@@ -129,7 +129,7 @@ def test_a_camera_that_sends_nothing_is_named_without_its_password(monkeypatch: 
     assert "secret" not in str(raised.value)
 
 
-def test_a_camera_that_vanishes_is_tried_again_while_the_others_go_on() -> None:
+def test_lost_camera_is_retried_while_others_continue() -> None:
     tries: list[float] = []
     gone: list[float] = []
 
@@ -155,7 +155,7 @@ def test_a_camera_that_vanishes_is_tried_again_while_the_others_go_on() -> None:
 
     found = messages(LiveCameras(cameras("red", "white"), opened, Clock()))
     said = [event for event in events(found) if event.camera == "red"]
-    # It was open when it went the first time, and not when the second try failed.
+    # The camera was open at the first loss, and closed when the second attempt failed.
     assert [event.kind for event in said] == ["camera_lost", "camera_back"]
     assert "has gone; trying again" in said[0].text
     assert len(data_of(found, "red")) == 10
@@ -164,7 +164,7 @@ def test_a_camera_that_vanishes_is_tried_again_while_the_others_go_on() -> None:
 
 
 def changing(*visits: list[Frame]) -> Open:
-    """A camera that sends some frames at each visit, and is gone then; after the last it ends."""
+    """A camera that sends some frames per connection and is then lost; after the last it ends."""
     left = list(visits)
 
     @contextmanager
@@ -179,7 +179,7 @@ def changing(*visits: list[Frame]) -> Open:
     return opened
 
 
-def test_a_camera_that_returns_with_another_codec_is_not_recorded(monkeypatch: pytest.MonkeyPatch) -> None:
+def test_camera_with_a_changed_codec_is_not_recorded(monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr("ipsys_log.capture.camera_thread._RETRY_S", 0.02)
     jpeg, video = Frame(b"a", "jpeg", None), Frame(b"b", "h264", None)
     said: list[str] = []
@@ -193,7 +193,7 @@ def test_a_camera_that_returns_with_another_codec_is_not_recorded(monkeypatch: p
     assert said[1].endswith("set it back to jpeg, or begin a new recording; trying again")
 
 
-def test_pictures_of_another_size_are_said_once_for_each_change() -> None:
+def test_frame_size_change_is_reported_once() -> None:
     large, small = (
         Frame(simplejpeg.encode_jpeg(np.zeros((*shape, 3), np.uint8)), "jpeg", None)
         for shape in ((48, 64), (24, 32))
@@ -209,7 +209,7 @@ def test_pictures_of_another_size_are_said_once_for_each_change() -> None:
     assert len(data_of(found, "red")) == 7
 
 
-def test_what_the_disk_cannot_take_is_dropped_by_name_and_memory_stays_bounded() -> None:
+def test_slow_disk_drops_named_frames_and_bounds_memory() -> None:
     frames = {"red": [bytes([n]) * 1000 for n in range(40)]}
     many_sent, some_written = threading.Event(), threading.Event()
 
@@ -233,7 +233,7 @@ def test_what_the_disk_cannot_take_is_dropped_by_name_and_memory_stays_bounded()
     (event,) = events(found)
     assert (event.kind, event.camera) == ("frames_dropped", "red")
     assert event.text == f"{dropped} frames of camera red dropped: the disk is too slow"
-    # In order, and without what is missing.
+    # In order, without the missing frames.
     assert kept == [data for data in frames["red"] if data in kept]
 
 
@@ -246,7 +246,7 @@ def test_log_times_increase_when_the_clock_stands_still() -> None:
     assert all(one.log_time_ns < other.log_time_ns for one, other in pairwise(found))
 
 
-def test_nothing_is_taken_when_nobody_would_write_it() -> None:
+def test_no_frame_is_accepted_without_a_writer() -> None:
     attached = LiveCameras(cameras("red"), playing(FRAMES, 500.0), Clock())
     with attached:
         attached.add("/note", Event(5, "note", "written"))
@@ -256,7 +256,7 @@ def test_nothing_is_taken_when_nobody_would_write_it() -> None:
     assert [message.payload.text for message in found if message.topic == "/note"] == ["written"]
 
 
-def test_what_is_saved_is_written_by_then() -> None:
+def test_saved_point_is_on_the_disk() -> None:
     attached = LiveCameras(cameras("red"), playing({"red": [b"a"] * 100}, 100.0), Clock())
     asked: list[str] = []
     with attached, ThreadPoolExecutor(1) as page:
@@ -277,7 +277,7 @@ def test_what_is_saved_is_written_by_then() -> None:
         assert asked
 
 
-def test_what_is_not_written_is_not_saved_and_it_is_said_why() -> None:
+def test_failed_write_is_not_saved_and_gives_the_reason() -> None:
     attached = LiveCameras(cameras("red"), playing({"red": [b"a"] * 300}, 100.0), Clock())
     with attached, ThreadPoolExecutor(1) as page:
         messages = iter(attached)
@@ -286,14 +286,14 @@ def test_what_is_not_written_is_not_saved_and_it_is_said_why() -> None:
         for message in messages:
             if message is not None and message.topic == "/note":
                 attached.stop("the disk is full")
-                messages.close()  # it could not be written
+                messages.close()  # writing failed
         with pytest.raises(SourceError, match="not saved: the disk is full"):
             saved.result(LIMIT_S)
         with pytest.raises(SourceError, match="not saved: the disk is full"):
             attached.save("/note", Event(6, "note", "late"))
 
 
-def test_what_waits_too_long_to_be_saved_is_not_written_later(monkeypatch: pytest.MonkeyPatch) -> None:
+def test_timed_out_save_is_not_written_later(monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr(attached_module, "_SAVED_S", 0.1)
     attached = LiveCameras(cameras("red"), playing(FRAMES, 500.0), Clock())
     with attached:
@@ -302,7 +302,7 @@ def test_what_waits_too_long_to_be_saved_is_not_written_later(monkeypatch: pytes
         assert not [one for one in attached if one is not None and one.topic == "/note"]
 
 
-def test_what_was_dropped_at_the_end_is_named_too() -> None:
+def test_frames_dropped_at_the_end_are_reported() -> None:
     frames = {"red": [bytes(1000)] * 40}
     attached = LiveCameras(cameras("red"), playing(frames, 500.0), Clock(), limit_bytes=10_000)
     with attached:
@@ -336,8 +336,8 @@ def test_early_frames_do_not_pile_up_while_another_camera_opens() -> None:
 
 
 @pytest.mark.parametrize("format", ["jpeg", "h264"])
-def test_frames_without_stamps_do_not_wait_for_another_camera_to_get_a_false_time(format: str) -> None:
-    """A stream that cannot be stopped: what is not taken waits in the socket, and comes late."""
+def test_frames_without_stamps_get_times_without_waiting(format: str) -> None:
+    """A stream cannot pause: unread data wait in the socket and arrive late."""
     picture, key = b"\0\0\1\x41", b"\0\0\1\x67\0\0\1\x65"
     taken_15, asked_ns = threading.Event(), list[int]()
 
@@ -362,14 +362,14 @@ def test_frames_without_stamps_do_not_wait_for_another_camera_to_get_a_false_tim
     with attached:
         found = [message for message in attached if message is not None and message.camera == "early"]
     numbers = [int(message.payload.data[-3:]) for message in found]
-    # Those that came before the other camera are thrown away; a video goes on where it can be read.
+    # Frames before the other camera's start are discarded; a video continues at a keyframe.
     assert numbers == [0, *range(20 if format == "h264" else 15, 40)]
-    # Each has the time at which it came: before the next one was asked for.
+    # Each frame has its arrival time, before the request for the next one.
     for message, n in zip(found, numbers, strict=True):
         assert asked_ns[n] <= message.publish_time_ns <= asked_ns[n + 1]
 
 
-def test_a_video_without_keyframes_is_said_once_and_kept(monkeypatch: pytest.MonkeyPatch) -> None:
+def test_video_without_keyframes_is_reported_once_and_kept(monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr("ipsys_log.capture.camera_thread.MAX_FRAMES_WITHOUT_KEYFRAME", 10)
     key, other = (Frame(data, "h264", 1) for data in (b"\0\0\1\x67\0\0\1\x65", b"\0\0\1\x41"))
     for frames, count in (([key, *[other] * 9] * 3, 0), ([key, *[other] * 10, key, *[other] * 15], 1)):
@@ -378,7 +378,7 @@ def test_a_video_without_keyframes_is_said_once_and_kept(monkeypatch: pytest.Mon
         assert sum(message.camera is not None for message in found) == len(frames)
 
 
-def test_what_came_before_a_fault_is_given_out() -> None:
+def test_frames_before_an_error_are_delivered() -> None:
     def broken(camera: str, number: int) -> None:
         if camera == "red" and number == 5:
             raise ZeroDivisionError("a bug")
@@ -396,14 +396,14 @@ def test_what_came_before_a_fault_is_given_out() -> None:
             found.extend(message for message in attached if message is not None)
     assert len(data_of(found, "red")) == 5
     assert len(data_of(found, "white")) == 20
-    # Not only in the end: the other camera might go on for hours.
+    # The event does not wait for the end: the other camera might continue for hours.
     ((number, event),) = [(n, m.payload) for n, m in enumerate(found) if isinstance(m.payload, Event)]
     assert (event.kind, event.camera, event.text) == ("camera_failed", "red", said[0])
     assert "camera red: the program failed (ZeroDivisionError('a bug'))" in event.text
     assert number < len(found) - 5
 
 
-def test_stopping_gives_out_what_has_come() -> None:
+def test_stop_delivers_received_frames() -> None:
     stopped = threading.Event()
 
     def before(_: str, number: int) -> None:
@@ -430,8 +430,8 @@ def test_a_bug_in_a_source_keeps_its_traceback() -> None:
         messages(LiveCameras(cameras("red"), playing(FRAMES, 100.0, before=broken), Clock()))
 
 
-def test_a_silent_camera_is_no_reason_to_be_silent() -> None:
-    """So that a recorder can look at its clock, and at signals."""
+def test_silent_camera_does_not_stop_the_others() -> None:
+    """The iterator returns regularly, so a recorder can check its clock and signals."""
     attached = LiveCameras(cameras("red"), playing({"red": [b"a", b"b"]}, 2.0), Clock())
     with attached:
         assert list(attached).count(None) >= 3

@@ -28,7 +28,7 @@ X265 = ("-c:v", "libx265", "-preset", "ultrafast", "-x265-params", "keyint=10:bf
 
 
 def take(source: str, count: int, said: list[str] | None = None) -> list[Frame]:
-    """The first frames of a stream."""
+    """Return the first frames of a stream."""
     said = [] if said is None else said
     with open_network(RigCamera("red", source=source), Clock(), said.append) as frames:
         return list(islice((frame for frame in frames if frame is not None), count))
@@ -43,24 +43,24 @@ def test_mjpeg_comes_byte_for_byte(tmp_path: Path) -> None:
     with serve(*loop, "-c", "copy", *MJPEG, address, port=port):
         frames = take(address, 60, said)
     assert {(frame.format, frame.time_ns) for frame in frames} == {("jpeg", None)}
-    # What FFmpeg read to see what the stream is may be missing; after that, none is.
+    # The frames that FFmpeg reads to probe the stream may be missing; after that, none are.
     first = pictures.index(frames[0].data)
     assert [frame.data for frame in frames] == [pictures[(first + n) % 25] for n in range(60)]
     assert said == ["camera red: sends no capture stamps; its frames get their time of arrival"]
 
 
 def units(data: bytes, name: str) -> list[int]:
-    """Types of the units in Annex B: H.264's 7 and 8, H.265's 32 to 34 are parameter sets."""
+    """Return the types of the units in Annex B: H.264's 7 and 8, H.265's 32 to 34 are parameter sets."""
     heads = [data[match.end()] for match in re.finditer(b"\x00\x00\x01", data)]
     return [head & 31 if name == "h264" else head >> 1 & 63 for head in heads]
 
 
-# FFmpeg 5 writes no H.265 into FLV; MP4's form of it is in the tests of files.
+# FFmpeg 5 writes no H.265 into FLV; the tests of files cover the form of MP4.
 @pytest.mark.parametrize(
     ("name", "options", "container"),
     [("h264", X264, "mpegts"), ("h264", X264, "flv"), ("h265", X265, "mpegts")],
 )
-def test_video_comes_as_annex_b_that_can_be_read_from_each_keyframe(
+def test_video_is_annex_b_and_readable_from_each_keyframe(
     tmp_path: Path, name: str, options: tuple[str, ...], container: str
 ) -> None:
     make_jpegs(tmp_path, 50)
@@ -75,7 +75,7 @@ def test_video_comes_as_annex_b_that_can_be_read_from_each_keyframe(
     if name == "h265":
         keys = [n for n, frame in enumerate(frames) if {32, 33, 34} <= set(units(frame.data, name))]
     assert keys == list(range(0, 45, 10))
-    # Once each, not once more by us where the stream has them.
+    # Each parameter set appears once: ours are not added if the stream has them.
     sets = (7, 8) if name == "h264" else (32, 33, 34)
     assert all(units(frames[n].data, name).count(kind) == 1 for n in keys for kind in sets)
     for first in (0, 20):
@@ -98,13 +98,13 @@ def test_rtsp_stamps_are_the_cameras(tmp_path: Path) -> None:
         frames = take(address, 60, said)
         end_ns = time.time_ns()
     assert {frame.format for frame in frames} == {"h264"}
-    # RTSP has the parameter sets in its description; here they stand before each keyframe.
+    # RTSP sends the parameter sets in its description; here they precede each keyframe.
     keys = [n for n, frame in enumerate(frames) if 5 in units(frame.data, "h264")]
     assert keys == list(range(0, 60, 10))
     assert all({7, 8} <= set(units(frames[n].data, "h264")) for n in keys)
     stamps = [frame.time_ns for frame in frames if frame.time_ns is not None]
     assert len(stamps) > 30
-    # In the present, and a frame apart.
+    # Times are near the present, and one frame apart.
     assert start_ns - NS_PER_S // 2 < stamps[0] < stamps[-1] < end_ns
     steps = [after - before for before, after in pairwise(stamps)]
     assert all(abs(step - NS_PER_S / 30) < 2e6 for step in steps)
@@ -127,7 +127,7 @@ def test_stamps_of_a_clock_that_is_off_are_not_used(tmp_path: Path, shift_s: flo
 
 @pytest.fixture
 def web(tmp_path: Path) -> Iterator[str]:
-    """A web server that is no camera: a page, a picture, a sound, and nothing else."""
+    """A web server without a camera: a page, an image, a sound, and an empty answer."""
 
     class Quiet(http.server.SimpleHTTPRequestHandler):
         def log_message(self, *args: object) -> None:
@@ -153,14 +153,14 @@ def web(tmp_path: Path) -> Iterator[str]:
         ("/old.avi", "is mpeg4 video; set the camera to MJPEG, H.264 or H.265"),
     ],
 )
-def test_what_is_no_stream_is_named(web: str, path: str, said: str) -> None:
+def test_invalid_stream_is_reported(web: str, path: str, said: str) -> None:
     with pytest.raises(SourceError, match=re.escape(said)) as error:
         take(web + path, 1)
     assert f"camera red: {web}{path}: " in str(error.value)
     assert "\n" not in str(error.value)
 
 
-def test_nobody_listens() -> None:
+def test_missing_server_is_reported() -> None:
     address = f"127.0.0.1:{free_port()}/live"
     with pytest.raises(SourceError, match=f"admin:[*]+@{address}: refuses the connection") as error:
         take(f"http://admin:secret@{address}", 1)
@@ -189,12 +189,12 @@ def test_a_stream_that_falls_silent_is_left_at_once(tmp_path: Path) -> None:
     with serve(*still, "-c", "copy", *MJPEG, address, port=port):
         start = time.monotonic()
         with open_network(RigCamera("red", source=address), Clock(), lambda _: None) as frames:
-            # It says twice a second that nothing came.
+            # The source reports twice per second that no frame arrived.
             assert [next(frames) for _ in range(3)].count(None) >= 2
         assert time.monotonic() - start < 2.5
 
 
-def test_a_stream_of_empty_parts_has_gone(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+def test_stream_of_empty_parts_is_lost(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr("ipsys_log.capture.network._SILENT_S", 1.0)
     pictures = make_jpegs(tmp_path, 3)
     left = threading.Event()
@@ -225,7 +225,7 @@ def test_a_stream_of_empty_parts_has_gone(tmp_path: Path, monkeypatch: pytest.Mo
         ):
             assert sum(frame is not None for frame in frames) > 5
         assert time.monotonic() - start_s < 6
-        # The connection is given up too.
+        # The connection is closed too.
         assert left.wait(2)
         server.shutdown()
 

@@ -1,4 +1,4 @@
-"""Only measured frames of the cameras go into the log: about a second of frames for each place."""
+"""Only frames of measured points go into the log: about one second per point."""
 
 from __future__ import annotations
 
@@ -64,7 +64,7 @@ def log(tmp_path: Path) -> Iterator[Noted]:
 
 
 def frames(start_s: float, end_s: float, camera: str = "red") -> Iterator[Message]:
-    """Frames at 10/s, each in the log 40 ms after it was taken."""
+    """Return frames at 10 Hz, each in the log 40 ms after its exposure."""
     for n in range(round(start_s * 10), round(end_s * 10)):
         taken_ns = n * NS_PER_S // 10
         image = CompressedImage(taken_ns, camera, b"%d" % n, "jpeg")
@@ -86,14 +86,14 @@ def taken_s(log: Noted) -> list[float]:
     return [m.publish_time_ns / NS_PER_S for m in log.noted if isinstance(m.payload, CompressedImage)]
 
 
-def test_frames_since_a_marker_lay_still_come_with_its_measurement_and_no_others(log: Noted) -> None:
+def test_measurement_stores_only_frames_of_its_interval(log: Noted) -> None:
     with RecentFrames(log) as recent:
         for message in frames(0, 60):
             recent.put(message)
         recent.put(measured("p001", 58.6, 59.7, 59.99))
         for message in frames(60, 120):
             recent.put(message)
-    # A marker low in the picture is exposed up to a tenth of a second after the time of its frame.
+    # A marker low in the image is exposed up to a tenth of a second after the frame time.
     assert taken_s(log) == pytest.approx(np.arange(58.5, 59.95, 0.1))
     assert isinstance(log.noted[-1].payload, Measurement)
 
@@ -141,7 +141,7 @@ def test_hours_of_frames_are_not_kept_in_memory(log: Noted) -> None:
             assert len(recent._buffer) <= 52
 
 
-def test_of_large_frames_fewer_are_kept_and_events_all_the_same(log: Noted) -> None:
+def test_fewer_large_frames_are_kept_but_all_events(log: Noted) -> None:
     with RecentFrames(log, limit_bytes=10_000) as recent:
         recent.put(event("camera_lost", 0.001))
         for message in frames(0, 20):
@@ -149,17 +149,17 @@ def test_of_large_frames_fewer_are_kept_and_events_all_the_same(log: Noted) -> N
             held = [one for one in recent._buffer if isinstance(one.payload, CompressedImage)]
             assert len(held) <= 10
         recent.put(measured("p001", 18.6, 19.7, 19.99))
-    # The last ten, of the fifteen of its second.
+    # the last ten of the fifteen frames of its second
     assert taken_s(log) == pytest.approx(np.arange(19.0, 19.95, 0.1))
     assert [m.payload.kind for m in log.noted if isinstance(m.payload, Event)] == ["camera_lost"]
 
 
-def test_of_a_video_no_seconds_can_be_kept() -> None:
+def test_recent_frames_of_a_video_cannot_be_kept() -> None:
     with pytest.raises(IpsysError, match="camera white sends h264, of which no single seconds can be kept"):
         check_independent_frames({"red": CameraState(format="jpeg"), "white": CameraState(format="h264")})
 
 
-def test_of_a_camera_that_hangs_or_is_lost_nothing_is_seen() -> None:
+def test_hanging_or_lost_camera_sees_no_marker() -> None:
     states = {"red": CameraState(up=True), "white": CameraState(up=True)}
     scene = LiveScene(labs.RIG, None, states, lambda topic, payload: None)
 
@@ -176,7 +176,7 @@ def test_of_a_camera_that_hangs_or_is_lost_nothing_is_seen() -> None:
     sight = observe_marker(scene.views(None), 0)
     assert sorted(sight.points_m) == ["red", "white"]
     assert sight.still == Interval(NS_PER_S // 10 * 4, NS_PER_S // 10 * 14)
-    show("red", 15, 40)  # white is quiet, and not known to be lost
+    show("red", 15, 40)  # white sends nothing, but is not known to be lost
     assert list(observe_marker(scene.views(None), 0).points_m) == ["red"]
     states["red"].up = False
     assert observe_marker(scene.views(None), 0).state == "unseen"
@@ -186,7 +186,7 @@ def test_of_a_camera_that_hangs_or_is_lost_nothing_is_seen() -> None:
 
 
 def stretched(lab_log: Path, count: int) -> dict[str, list[bytes]]:
-    """The frames of each station so often after one another, by camera; then those of the drive."""
+    """Return the frames of each station, repeated, by camera; then those of the drive."""
     with Session([lab_log]) as session:
         found = {}
         for name, topic in session.images.items():
@@ -217,7 +217,7 @@ def tape_of(lab_log: Path) -> tuple[Rig, dict[tuple[int, bytes], Measurement]]:
 
 
 class Noting(LiveCameras):
-    """Cameras; notes all that they send."""
+    """Cameras that note all sent frames."""
 
     sent: list[Message]
 
@@ -229,7 +229,7 @@ class Noting(LiveCameras):
 
 
 class Hand:
-    """Measures every marker once it has lain still for most of a second, and withdraws the third place."""
+    """An operator who measures every stationary marker, and withdraws the third point."""
 
     def __init__(self, scene: LiveScene, tape: dict[tuple[int, bytes], Measurement]) -> None:
         self.scene, self.tape = scene, tape
@@ -257,7 +257,7 @@ class Hand:
 
 
 def pairs(log: Path) -> dict[tuple[str, str], Pair]:
-    """Return what each camera saw at each place."""
+    """Return the observations of each camera at each point."""
     with Session([log]) as session:
         view = LogView(session, {CAMERA_POINTS: "edges"})
         found = find_pairs(view, measured_places(view))
@@ -269,9 +269,7 @@ def pairs(log: Path) -> dict[tuple[str, str], Pair]:
     return seen
 
 
-def test_the_places_are_those_of_a_whole_recording_from_a_few_frames(
-    ipsys: Ipsys, lab_log: Path, tmp_path: Path
-) -> None:
+def test_few_frames_give_the_points_of_a_full_recording(ipsys: Ipsys, lab_log: Path, tmp_path: Path) -> None:
     places, whole = tmp_path / "places.mcap", tmp_path / "whole.mcap"
     sent = stretched(lab_log, 18)
     rig, tape = tape_of(lab_log)
@@ -301,16 +299,16 @@ def test_the_places_are_those_of_a_whole_recording_from_a_few_frames(
     assert len(set(times_ns)) == len(times_ns)
     stations = (len(sent["red"]) - 5) // 18
     for name, count in kept.items():
-        assert stations * 6 <= count <= stations * 14, name  # of 18, and none of the drive
+        assert stations * 6 <= count <= stations * 14, name  # of 18, without the drive
 
-    # Beside it, everything that was sent, as a recorder would have written it.
+    # Beside it is a log of all sent frames, as a recorder writes it.
     write_log(whole, [*settings, *attached.sent])
     for log in (places, whole):
         done = ipsys("replay", log, "--model", "rigid")
         assert done.code == 0, done.err
     mine, theirs = pairs(places), pairs(whole)
     assert {name for _, name in mine} == names
-    # At the edge of a picture it is chance whether a marker is found; then it is followed.
+    # At the image edge, the detection of a marker depends on chance; later it is tracked.
     sure = {key for key in mine.keys() & theirs.keys() if min(mine[key].frames, theirs[key].frames) > 3}
     assert len(sure) > 0.9 * len(mine.keys() | theirs.keys())
     for key in sure:

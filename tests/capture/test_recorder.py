@@ -1,4 +1,4 @@
-"""Frames in the log before anything else, and what waits for the stages."""
+"""Frames are logged before their results, and waiting frames are bounded."""
 
 from __future__ import annotations
 
@@ -38,7 +38,7 @@ def frame(number: int, camera: str = "red") -> Message:
 
 
 class Noted(Recording):
-    """Notes what is put into it."""
+    """A sink that notes its messages."""
 
     def __init__(self, writer: LogWriter) -> None:
         super().__init__(writer, lambda: None)
@@ -56,7 +56,7 @@ def log(tmp_path: Path) -> Iterator[Noted]:
 
 
 class Sent:
-    """Frames of cameras from a generator. The class notes why it was stopped."""
+    """Frames of cameras from a generator. The class notes the reason of its end."""
 
     def __init__(self, messages: Generator[Message | None, None, None]) -> None:
         self._messages, self.whys = messages, list[str | None]()
@@ -80,7 +80,7 @@ def backlog(source: Generator[Message | None, None, None], log: Recording) -> Ba
     return Backlog(Sent(source), log, lambda: 10_000)
 
 
-def test_a_frame_is_in_the_log_before_a_stage_sees_it_and_a_tick_follows(log: Noted) -> None:
+def test_frame_is_logged_before_its_processing(log: Noted) -> None:
     def source() -> Generator[Message | None, None, None]:
         for number in range(3):
             time.sleep(0.05)
@@ -95,7 +95,7 @@ def test_a_frame_is_in_the_log_before_a_stage_sees_it_and_a_tick_follows(log: No
     assert [message is TICK for message in seen] == [False, True] * 3
 
 
-def test_the_oldest_frames_are_skipped_and_named_by_their_log_times(log: Noted) -> None:
+def test_oldest_frames_are_skipped_with_an_event(log: Noted) -> None:
     def source() -> Generator[Message | None, None, None]:
         yield from (frame(number) for number in range(10))
         yield from (frame(number, "white") for number in range(10, 12))
@@ -110,7 +110,7 @@ def test_the_oldest_frames_are_skipped_and_named_by_their_log_times(log: Noted) 
     assert len([m for m in log.noted if isinstance(m.payload, CompressedImage)]) == 12
 
 
-def test_a_fault_of_the_recorder_is_raised_where_frames_are_taken(log: Noted) -> None:
+def test_recorder_error_is_raised_to_the_consumer(log: Noted) -> None:
     def source() -> Generator[Message | None, None, None]:
         yield frame(0)
         raise ZeroDivisionError("a bug")
@@ -120,7 +120,7 @@ def test_a_fault_of_the_recorder_is_raised_where_frames_are_taken(log: Noted) ->
 
 
 def test_settings_are_in_the_file_before_the_first_frame(tmp_path: Path) -> None:
-    """As a recorder leaves them that is killed at once: rig, lens and the model of a live run."""
+    """The messages of a recorder that is killed at once: rig, intrinsics and the model of a live run."""
     path, killed = tmp_path / "a.mcap", tmp_path / "killed.mcap"
     rig = Rig("lab", "DICT_4X4_100", 0.2)
     settings = [Message(RIG_TOPIC, 1, 1, rig), Message("/runs/poly/model", 2, 2, Model(2, "poly", ()))]
@@ -134,7 +134,7 @@ def test_settings_are_in_the_file_before_the_first_frame(tmp_path: Path) -> None
 
 
 class FullDisk(Disk):
-    """Takes 100 kB, and more when something is freed."""
+    """A disk with room for 100 kB, and for more when space is freed."""
 
     freed = threading.Event()
 
@@ -144,7 +144,7 @@ class FullDisk(Disk):
         return Disk.pwrite(self, fd, data, offset)
 
 
-def test_on_a_full_disk_what_waits_is_written_but_for_frames_and_nothing_more_is_taken(
+def test_full_disk_drops_frames_and_writes_other_messages(
     tmp_path: Path,
 ) -> None:
     disk, path = FullDisk(), tmp_path / "a.mcap"
@@ -181,7 +181,7 @@ def test_a_log_that_is_being_written_is_not_overwritten(tmp_path: Path) -> None:
     assert second.counts == {image_topic("red"): 1}
 
 
-def test_the_old_log_is_there_until_the_new_one_stands(
+def test_old_log_exists_until_the_new_one_is_complete(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     path = tmp_path / "a.mcap"
@@ -200,7 +200,7 @@ def test_the_old_log_is_there_until_the_new_one_stands(
     (tmp_path / "a.mcap.new").write_bytes(b"left by one that was killed")
     with open_recording(path, overwrite=True) as second:
         second.put(frame(1))
-        # Nobody else makes a log there meanwhile, nor is there an instant without one.
+        # No other process creates a log there, and the log exists at every instant.
         with pytest.raises(LogError, match="another process"), open_recording(path, overwrite=True):
             pass
     with Session([path]) as session:
@@ -209,7 +209,7 @@ def test_the_old_log_is_there_until_the_new_one_stands(
 
 
 @pytest.mark.parametrize("whole", [True, False])
-def test_a_journal_that_was_left_over_does_not_outlive_its_log(tmp_path: Path, whole: bool) -> None:
+def test_old_journal_is_removed_with_its_log(tmp_path: Path, whole: bool) -> None:
     path, journal = tmp_path / "a.mcap", tmp_path / "a.mcap.journal"
     with open_recording(path) as first:
         first.put(frame(0))
@@ -230,7 +230,7 @@ def test_a_journal_that_was_left_over_does_not_outlive_its_log(tmp_path: Path, w
 
 
 class Killed(Disk):
-    """Is killed when a journal stands."""
+    """A process that is killed while a journal exists."""
 
     def truncate(self, fd: int, size: int) -> None:  # noqa: ARG002
         raise KeyboardInterrupt

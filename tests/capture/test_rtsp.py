@@ -1,4 +1,4 @@
-"""Cameras by RTSP, as GStreamer's server sends them: written by others, as cameras' own servers are."""
+"""Cameras by RTSP from the server of GStreamer, as independent software."""
 
 from __future__ import annotations
 
@@ -21,7 +21,7 @@ from ipsys_log.units import NS_PER_S
 from tests.capture.streams import encode, make_jpegs
 
 SERVER = Path(__file__).with_name("rtsp_server.py")
-# The bindings of GStreamer are of the system's Python, not of ours.
+# The bindings of GStreamer belong to the system's Python, not to ours.
 PYTHON = "/usr/bin/python3"
 FINDS = "import gi; gi.require_version('Gst', '1.0'); gi.require_version('GstRtspServer', '1.0')"
 HAS_SERVER = sys.platform == "linux" and not subprocess.run([PYTHON, "-c", FINDS], check=False).returncode
@@ -44,7 +44,7 @@ PAYLOADERS = {
 
 @pytest.fixture(scope="module")
 def videos(tmp_path_factory: pytest.TempPathFactory) -> dict[str, Path]:
-    """Five seconds of each kind; no two pictures are the same."""
+    """Return five seconds of each kind; no two images are the same."""
     folder = tmp_path_factory.mktemp("rtsp")
     make_jpegs(folder, 150)
     return {name: encode(folder, f"{name}.mov", *options) for name, options in CODECS.items()}
@@ -94,7 +94,7 @@ def test_every_frame_comes_with_the_cameras_stamp(videos: dict[str, Path], name:
     stamps = [frame.time_ns for frame in frames if frame.time_ns is not None]
     assert len(stamps) > 5
     assert start_ns < stamps[0] < stamps[-1] <= end_ns
-    # A frame apart; a report of a busy server shifts all that follow by some ms.
+    # Frames are one period apart; a report of a busy server shifts all later ones by some ms.
     steps = np.array([after - before for before, after in pairwise(stamps)]) - NS_PER_S / 30
     assert np.median(np.abs(steps)) < 1e5
     assert np.abs(steps).max() < 25e6

@@ -28,7 +28,7 @@ from ipsys_log.stages.detect import decode_grey, detect_markers
 from ipsys_log.units import NS_PER_S
 
 SMALL = {"width": 960, "height": 540, "rate_hz": 20.0}
-# In one direction; shown to and fro, the pictures come again after 38 frames.
+# The images are in one direction; shown back and forth, they repeat after 38 frames.
 BRIEF, TURN = "drive_s=1&stations=6", 38
 
 
@@ -55,7 +55,7 @@ def test_frames_show_each_marker_where_it_is() -> None:
     steps_ns = np.array([after - before for before, after in pairwise(times_ns)])
     assert (steps_ns > 0).all()
     assert (steps_ns % (NS_PER_S // 20) == 0).all()
-    # Where the markers are, from the plan of the lab and the model of the camera.
+    # The expected markers follow from the plan of the lab and the model of the camera.
     seat = parse_source(camera)
     lab = plan_live_lab(seat.lab)
     view = mount_cameras(seat.lab)[seat.number]
@@ -74,10 +74,10 @@ def test_frames_show_each_marker_where_it_is() -> None:
 
 
 def test_all_cameras_agree_on_the_time() -> None:
-    """The same camera, opened twice by clocks of their own: each instant shows the same."""
+    """The same camera, opened twice with separate clocks, shows the same image at each time."""
     first = {frame.time_ns: frame.data for frame in take(f"red?{BRIEF}", 45, Clock())}
     second = {frame.time_ns: frame.data for frame in take(f"red?{BRIEF}", 45, Clock())}
-    # Two rounds of the loop apart, the frames are the same bytes.
+    # Two loops apart, the frames are the same bytes.
     turn_ns = TURN * NS_PER_S // 20
     by_turn = {(time_ns or 0) % turn_ns: data for time_ns, data in first.items()}
     shared = [(by_turn[t], data) for time, data in second.items() if (t := (time or 0) % turn_ns) in by_turn]
@@ -96,7 +96,7 @@ def test_a_stamp_is_of_the_instant_that_the_rig_says() -> None:
     assert (frames["end"].time_ns or 0) % step_ns == 10_000_000 + 539 * 50_000
 
 
-def test_it_can_be_left_while_it_draws() -> None:
+def test_simulated_camera_can_be_closed_while_it_draws() -> None:
     start = time.monotonic()
     camera = RigCamera("red", source="sim:red", width=1920, height=1080)
     with open_simulated(camera, Clock(), lambda _: None) as frames:
@@ -105,7 +105,7 @@ def test_it_can_be_left_while_it_draws() -> None:
 
 
 def test_live_lab_gives_each_camera_enough_markers_to_work_with() -> None:
-    """Enough to fit the model that is usual, most of them on the floor, and never one over another."""
+    """The points are enough for the default model, most on the floor, and none covers another."""
     seat = parse_source(RigCamera("red", source="sim:red"))
     lab = plan_live_lab(seat.lab)
     cameras = mount_cameras(seat.lab)
@@ -116,7 +116,7 @@ def test_live_lab_gives_each_camera_enough_markers_to_work_with() -> None:
         for index in (0, film.count // 2, film.count - 1):
             grey = decode_grey(CompressedImage(0, camera.name, film.draw(index), "jpeg"))
             ids = {marker.id for marker in detect_markers(grey, seat.lab.dictionary)}
-            # None is ever covered by one that drives by.
+            # No marker is ever covered by a moving one.
             assert not seen or seen & set(lying) == ids & set(lying)
             seen |= ids
         found = [lying[number] for number in seen & set(lying)]
@@ -125,7 +125,7 @@ def test_live_lab_gives_each_camera_enough_markers_to_work_with() -> None:
         assert len({where.z_m for where in found}) == 3
 
 
-def test_places_do_not_depend_on_the_size_of_frames() -> None:
+def test_stations_do_not_depend_on_the_frame_size() -> None:
     plans = [
         plan_live_lab(
             parse_source(RigCamera("red", source="sim:red", width=width, height=height)).lab
@@ -137,7 +137,7 @@ def test_places_do_not_depend_on_the_size_of_frames() -> None:
 
 @pytest.mark.parametrize("text", ["6x4", "charuco:4x5"])
 def test_board_before_a_camera_gives_its_lens(text: str, tmp_path: Path) -> None:
-    """By the command's own way from pictures to a lens; the focal length is known from the simulator."""
+    """The images give the intrinsics as with the command; the simulator knows the focal length."""
     source = RigCamera("white", source=f"sim:white?board={text}", width=640, height=360)
     seat = parse_source(source)
     assert seat.board is not None
@@ -175,7 +175,7 @@ def test_a_lab_that_cannot_be(source: str, said: str) -> None:
 
 
 def test_preparing_a_view_ends_between_two_steps() -> None:
-    """An interrupt waits for one step of the work, not for all of it."""
+    """An interrupt waits for one step of the work only."""
     calls: list[None] = []
 
     def check() -> None:

@@ -1,4 +1,4 @@
-"""A recorder that stood still says which frames have wrong times."""
+"""A suspended recorder reports the frames with wrong times."""
 
 from __future__ import annotations
 
@@ -20,7 +20,7 @@ MS = 1_000_000
 
 
 class Scripted(Clock):
-    """A clock that shows what it is set to."""
+    """A clock with a settable time."""
 
     shown_ns = NS_PER_S
 
@@ -57,7 +57,7 @@ def paced(start_ns: int, count: int, period_ns: int = 33 * MS) -> list[int]:
     return [start_ns + n * period_ns for n in range(count)]
 
 
-def test_late_frames_lie_between_two_events() -> None:
+def test_late_frames_are_between_two_events() -> None:
     before = paced(NS_PER_S, 30)
     stopped_ns, goes_on_ns = before[-1] + 1, before[-1] + 2 * NS_PER_S
     burst = paced(goes_on_ns, 20, 2 * MS)
@@ -85,7 +85,7 @@ def test_steady_camera_has_no_event() -> None:
     assert not late_events(recorded(paced(NS_PER_S, 200)))
 
 
-def test_recorder_that_stops_twice_says_the_whole_range() -> None:
+def test_two_stalls_report_the_whole_range() -> None:
     before = paced(NS_PER_S, 30)
     first = paced(before[-1] + NS_PER_S, 10, MS)
     second = paced(first[-1] + NS_PER_S, 10, MS)
@@ -109,7 +109,7 @@ def test_frames_late_at_the_end_have_an_open_range() -> None:
 def test_every_late_frame_is_named(
     rate_hz: float, stall_s: float, buffered: int, read_s: float, jitter: list[float]
 ) -> None:
-    """A buffer keeps the first frames of the stall, and gives them out as fast as they are read."""
+    """A buffer keeps the first frames of the stall, and delivers them at reading speed."""
     period_ns = round(NS_PER_S / rate_hz)
     heartbeat = Heartbeat(Clock())
     late = LateFrameDetector(heartbeat, None)
@@ -141,6 +141,6 @@ def test_sleep_of_the_machine_is_in_the_clock(monkeypatch: pytest.MonkeyPatch) -
     slept_ns = 300 * NS_PER_S
     after_ns = clock.now_ns()
     assert 300 * NS_PER_S <= after_ns - before_ns < 310 * NS_PER_S
-    # A driver's stamps from before the sleep, and from after it.
+    # A driver's stamps are from before and after the suspension.
     assert before_ns - 10 * NS_PER_S < clock.to_utc_ns(stamp_ns) <= before_ns
     assert after_ns <= clock.to_utc_ns(time.monotonic_ns()) < after_ns + 10 * NS_PER_S

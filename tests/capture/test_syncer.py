@@ -27,7 +27,7 @@ LIMIT_S = 240.0
 
 
 class Slow:
-    """A disk on which a sync takes until it is let through, and then fails if there is an error."""
+    """A disk whose sync blocks until it is released, and fails if an error is set."""
 
     def __init__(self, error: int | None = None) -> None:
         self.syncing, self.let_through = threading.Event(), threading.Event()
@@ -62,7 +62,7 @@ def test_slow_sync_holds_up_no_frame_and_no_order(tmp_path: Path) -> None:
         assert disk.syncing.wait(LIMIT_S)
         for number in range(1, 301):
             yield frame(number)
-        yield None  # nothing comes: all is flushed
+        yield None  # no message comes: all data are flushed
         size = path.stat().st_size
         yield frame(301)
         assert size > 300 * 60, "frames wait for the disk"
@@ -129,7 +129,7 @@ def test_point_that_comes_last_is_confirmed_at_the_end(tmp_path: Path) -> None:
         saved.result(LIMIT_S)
 
 
-def test_fault_of_a_sync_is_said_once_and_at_the_end(tmp_path: Path) -> None:
+def test_sync_error_is_reported_once_and_at_the_end(tmp_path: Path) -> None:
     disk, path = Slow(errno.EIO), tmp_path / "a.mcap"
 
     def source() -> Generator[Message | None, None, None]:

@@ -36,7 +36,7 @@ def ask(driver: Driver, **asked: float | str | None) -> RigCamera:
 
 
 def test_requests_are_those_of_the_kernel() -> None:
-    """As a C program prints them that includes linux/videodev2.h, on 64 bits."""
+    """The numbers are the output of a C program with linux/videodev2.h on 64 bits."""
     numbers = {
         "QUERYCAP": 0x80685600, "ENUM_FMT": 0xC0405602, "S_FMT": 0xC0D05605, "REQBUFS": 0xC0145608,
         "QUERYBUF": 0xC0585609, "QBUF": 0xC058560F, "DQBUF": 0xC0585611, "STREAMON": 0x40045612,
@@ -50,7 +50,7 @@ def test_requests_are_those_of_the_kernel() -> None:
 
 
 def test_frames_are_the_cameras_bytes_with_the_drivers_stamps(driver: Driver) -> None:
-    # More than there are buffers, so that each is handed back; an empty frame is none.
+    # There are more frames than buffers, so each buffer is returned; an empty frame is dropped.
     pictures = [bytes([n]) * (1000 + n) for n in range(20)]
     driver.frames.extend([*pictures[:3], b"", *pictures[3:]])
     clock = Clock()
@@ -62,7 +62,9 @@ def test_frames_are_the_cameras_bytes_with_the_drivers_stamps(driver: Driver) ->
     assert [frame[:3] for frame in came] == [
         (data, "jpeg", time) for data, time in zip(pictures, expected, strict=True)
     ]
-    assert [n for n, frame in enumerate(came) if frame.missed] == [3]  # that with the empty one before it
+    assert [n for n, frame in enumerate(came) if frame.missed] == [
+        3
+    ]  # the one with the empty frame before it
     assert not driver.streaming
     assert said == ['camera red: the driver stamps the start of a frame; put into the rig: stamp = "start"']
 
@@ -73,8 +75,8 @@ def test_frames_are_the_cameras_bytes_with_the_drivers_stamps(driver: Driver) ->
         ((0, 1, 2, 3), (0, 0, 0, 0)),
         ((7, 8, 11, 12), (0, 0, 2, 0)),
         ((2**32 - 2, 2**32 - 1, 1, 2), (0, 0, 1, 0)),
-        ((0, 0, 0, 0), (0, 0, 0, 0)),  # it does not count
-        ((500, 501, 0, 1), (0, 0, 0, 0)),  # it counts anew
+        ((0, 0, 0, 0), (0, 0, 0, 0)),  # without a sequence number
+        ((500, 501, 0, 1), (0, 0, 0, 0)),  # the count restarts
     ],
 )
 def test_frames_that_the_driver_lost_are_told(
@@ -86,9 +88,7 @@ def test_frames_that_the_driver_lost_are_told(
         assert tuple(frame.missed for frame in islice((one for one in frames if one), 4)) == missed
 
 
-def test_while_nothing_comes_it_says_so_and_at_last_gives_up(
-    driver: Driver, monkeypatch: pytest.MonkeyPatch
-) -> None:
+def test_silent_stream_is_reported_and_then_closed(driver: Driver, monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr(v4l2_camera, "_SILENT_S", 1.0)
     with open_usb(ask(driver), Clock(), lambda _: None) as frames:
         assert [next(frames), next(frames)] == [None, None]
@@ -97,7 +97,7 @@ def test_while_nothing_comes_it_says_so_and_at_last_gives_up(
 
 
 @pytest.mark.parametrize(("mode", "bad"), [("MJPG", b""), ("YUYV", b""), ("YUYV", b"half a picture")])
-def test_a_camera_that_hands_over_nothing_of_use_has_gone(
+def test_camera_without_valid_data_is_lost(
     driver: Driver, monkeypatch: pytest.MonkeyPatch, mode: str, bad: bytes
 ) -> None:
     monkeypatch.setattr(v4l2_camera, "_SILENT_S", 0.2)
@@ -112,13 +112,13 @@ def test_a_camera_that_hands_over_nothing_of_use_has_gone(
     assert time.monotonic() - start_s < 2
 
 
-def test_a_camera_through_opencv_that_is_pulled_out_may_come_back() -> None:
+def test_opencv_camera_can_be_unplugged_and_return() -> None:
     frames = devices._frames(cv2.VideoCapture(), "camera red: usb:0")
     with pytest.raises(SourceError, match="camera red: usb:0: sends no frames"):
         next(frames)
 
 
-def test_what_the_camera_refuses_is_said(driver: Driver) -> None:
+def test_settings_that_a_camera_refuses_are_reported(driver: Driver) -> None:
     said: list[str] = []
     asked = ask(
         driver, width=1900, height=1000, rate_hz=60.0, exposure_s=1.0, focus=12.0, gain=50.0, stamp="end"
@@ -133,10 +133,10 @@ def test_what_the_camera_refuses_is_said(driver: Driver) -> None:
         "camera red: asked for 12 of focus, which it does not let us set",
         "camera red: the driver stamps the start of a frame, the rig says: end",
     ]
-    assert driver.controls[0x9A0901][2] == 1  # the exposure is by hand
+    assert driver.controls[0x9A0901][2] == 1  # manual exposure
 
 
-def test_what_it_takes_is_not_said(driver: Driver) -> None:
+def test_accepted_settings_give_no_message(driver: Driver) -> None:
     said: list[str] = []
     driver.flags = v4l2.STAMP_MONOTONIC
     driver.frames.append(b"x")
@@ -150,7 +150,7 @@ def test_what_it_takes_is_not_said(driver: Driver) -> None:
     assert driver.controls[0x980913][2] == 10
 
 
-def test_a_stamp_of_another_clock_is_none(driver: Driver) -> None:
+def test_stamp_of_another_clock_is_ignored(driver: Driver) -> None:
     said: list[str] = []
     driver.flags = 0
     driver.frames.append(b"x")
@@ -186,7 +186,7 @@ def test_a_camera_of_no_known_format(driver: Driver) -> None:
 
 
 def raw(name: str, picture: NDArray[np.uint8], stride: int) -> bytes:
-    """A picture as FFmpeg's own converter lays it out, its rows padded."""
+    """Return an image in the layout of FFmpeg's converter, with padded rows."""
     frame = av.VideoFrame.from_ndarray(picture, format="bgr24")
     kind = {"YUYV": "yuyv422", "UYVY": "uyvy422", "NV12": "nv12", "GREY": "gray"}[name]
     planes = frame.reformat(format=kind, dst_color_range="JPEG").planes
@@ -225,8 +225,8 @@ def test_pictures_of_a_camera_without_jpeg_are_encoded_once(driver: Driver, name
 @pytest.mark.parametrize(
     ("source", "said"), [("usb:/nowhere/video9", "no such device"), ("usb:/dev/null", "is no camera")]
 )
-def test_what_is_no_camera(source: str, said: str) -> None:
-    """With the real kernel."""
+def test_device_that_is_no_camera_is_refused(source: str, said: str) -> None:
+    """Test with the real kernel."""
     with (
         pytest.raises(SourceError, match=said),
         open_usb(RigCamera("red", source=source), Clock(), lambda _: None),

@@ -30,7 +30,7 @@ def endpoint(size: int, more: int = 0) -> bytes:
     return struct.pack("<BBBBHB", 7, 5, 0x81, 5, size | more << 11, 1)
 
 
-# The control interface has an endpoint of its own, which sends no pictures.
+# The control interface has an endpoint that sends no images.
 DESCRIPTORS = (
     bytes([18, 1, *[0] * 16])
     + interface(0, 0, 1) + endpoint(1024, 2)
@@ -68,7 +68,7 @@ def plug_in(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Callable[[int, s
 
 
 def answer(device: int, request: int, about: object, change: bool) -> int:
-    """Each device is a camera of the same modes."""
+    """Return devices that are cameras with the same modes."""
     path = Path(f"/proc/self/fd/{device}").resolve()
     if path.name == "video9":
         raise OSError(25, "Inappropriate ioctl for device")
@@ -84,8 +84,8 @@ def write(folder: Path, values: dict[str, str]) -> None:
         (folder / name).write_text(value + "\n")
 
 
-def test_cameras_are_found_where_they_hang(tmp_path: Path, plug_in: Callable[[int, str], None]) -> None:
-    for number, port in ((10, "2.3"), (2, "4"), (9, "5")):  # 9 is a device that takes no pictures
+def test_camera_poses_are_recovered(tmp_path: Path, plug_in: Callable[[int, str], None]) -> None:
+    for number, port in ((10, "2.3"), (2, "4"), (9, "5")):  # 9 is a device without images
         plug_in(number, port)
     first, second = find_cameras(tmp_path)
     assert (first.device, first.name) == (str(tmp_path / "dev/video2"), "Lab Camera 2")
@@ -111,7 +111,7 @@ def test_a_camera_that_may_not_be_opened_is_listed(
     assert camera.modes == ()
 
 
-def test_what_the_rig_asks_for_is_reckoned(tmp_path: Path, plug_in: Callable[[int, str], None]) -> None:
+def test_bus_load_uses_the_settings_of_the_rig(tmp_path: Path, plug_in: Callable[[int, str], None]) -> None:
     for number in (0, 1, 2):
         plug_in(number, f"2.{number + 1}")
     found = find_cameras(tmp_path)
@@ -137,29 +137,32 @@ def cameras(count: int, **other: Any) -> list[BandwidthDemand]:
     return [demand._replace(camera=name, **other) for name in names[:count]]
 
 
-def test_what_fits_a_bus_is_left_alone() -> None:
-    """By USB 2.0, 5.6.4, 80 % of 480 Mbit/s: 48 MB/s. Two of 1920 x 1080 x 30 x 0.25 B are 31 MB/s."""
+def test_cameras_that_fit_a_bus_get_no_advice() -> None:
+    """USB 2.0, section 5.6.4, allows 80 % of 480 Mbit/s: 48 MB/s.
+
+    Two of 1920 x 1080 x 30 x 0.25 B are 31 MB/s.
+    """
     assert advise(cameras(2)) == []
     assert advise(cameras(3, rate_hz=25.0)) == []
     assert advise(cameras(3, width=1280, height=720)) == []
-    # On buses of their own, or on USB 3, four fit.
+    # Four cameras fit on separate buses, or on USB 3.
     assert advise([demand._replace(bus=n) for n, demand in enumerate(cameras(4))]) == []
     assert advise(cameras(4, speed_mbit_s=5000.0)) == []
 
 
-def test_what_does_not_fit_a_bus_is_explained() -> None:
+def test_overloaded_bus_is_explained() -> None:
     (line,) = advise([*cameras(4), *cameras(1, bus=2)])
     assert line == (
         "cameras black, blue, red and white share USB bus 1 (Acme Hub at port 2) and need "
         "64.6 MB/s of its 48: plug one into another bus, or ask for 20 frames/s of each, or for 1280 x 960 px"
     )
-    # What it advises fits.
+    # The advised settings fit.
     assert advise(cameras(4, rate_hz=20.0)) == []
     assert advise(cameras(4, width=1280, height=960)) == []
     assert advise(cameras(4, rate_hz=25.0)) != []
 
 
-def test_one_camera_can_be_too_much() -> None:
+def test_single_camera_can_overload_a_bus() -> None:
     (line,) = advise(cameras(1, format="YUYV"))
     assert line == (
         "camera red is alone on USB bus 1 (Acme Hub at port 2) and needs 129.3 MB/s of its 48: "
@@ -172,7 +175,7 @@ def test_cameras_that_reserve_all_they_can_may_not_start() -> None:
     assert "may reserve 51.0 MB/s of its 48: if one of them does not start" in line
 
 
-def test_the_command(
+def test_cameras_command_lists_the_bus_load(
     tmp_path: Path, plug_in: Callable[[int, str], None], ipsys: Ipsys, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     monkeypatch.setattr(usb_bus, "find_cameras", lambda: find_cameras(tmp_path))

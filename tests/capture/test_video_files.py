@@ -1,4 +1,4 @@
-"""Videos and pictures with times, as frames of a log and as live cameras."""
+"""Videos and images with times, as frames of a log and as live cameras."""
 
 from __future__ import annotations
 
@@ -30,7 +30,7 @@ def images(log: Path, camera: str) -> list[CompressedImage | CompressedVideo]:
     return [message.payload for message in messages]
 
 
-def test_videos_go_into_a_log_as_they_are(tmp_path: Path, ipsys: Ipsys) -> None:
+def test_videos_are_logged_unchanged(tmp_path: Path, ipsys: Ipsys) -> None:
     pictures = make_jpegs(tmp_path, 20)
     red = encode(tmp_path, "red.avi", "-c:v", "copy")
     white = encode(tmp_path, "white.mp4", *X264, rate=25)
@@ -56,7 +56,7 @@ def test_videos_go_into_a_log_as_they_are(tmp_path: Path, ipsys: Ipsys) -> None:
         (("-c:v", "mpeg4", "-q:v", "1"), "has mpeg4 video"),
     ],
 )
-def test_what_no_log_holds_is_encoded_anew(
+def test_formats_that_no_log_stores_are_encoded_again(
     tmp_path: Path, ipsys: Ipsys, options: tuple[str, ...], said: str
 ) -> None:
     pictures = make_jpegs(tmp_path, 8)
@@ -72,7 +72,7 @@ def test_what_no_log_holds_is_encoded_anew(
         assert np.abs(grey.astype(float) - true).mean() < 8
 
 
-def test_what_is_no_video_leaves_no_log(tmp_path: Path, ipsys: Ipsys) -> None:
+def test_invalid_video_leaves_no_log(tmp_path: Path, ipsys: Ipsys) -> None:
     (tmp_path / "text.mp4").write_text("no video" * 100)
     for name in ("text.mp4", "none.mp4"):
         done = ipsys("import", "videos", f"red={tmp_path / name}", "-o", tmp_path / "log.mcap")
@@ -136,7 +136,7 @@ def test_a_table_that_does_not_fit_is_named(tmp_path: Path, text: str, said: str
 @pytest.mark.parametrize(
     "text", ["", "12", "17000000000", "nan", "inf", "-1700000000", "2023-13-14T22:13:20"]
 )
-def test_what_is_no_time(text: str) -> None:
+def test_invalid_times_are_refused(text: str) -> None:
     with pytest.raises(ValueError):  # noqa: PT011
         parse_time(text)
 
@@ -146,7 +146,7 @@ def test_a_time_with_a_zone() -> None:
 
 
 def play(source: str, name: str = "red") -> list[tuple[int, Frame]]:
-    """Frames and by how much they came after their stamp."""
+    """Return the frames and their delay after their stamps."""
     clock = Clock()
     with open_source(RigCamera(name, source=source), clock, lambda _: None) as frames:
         return [(clock.now_ns() - (frame.time_ns or 0), frame) for frame in frames if frame is not None]

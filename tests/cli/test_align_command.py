@@ -1,4 +1,4 @@
-"""``ipsys align`` as a user meets it: rendered frames of cameras that hang askew."""
+"""``ipsys align`` on rendered frames of tilted cameras."""
 
 from __future__ import annotations
 
@@ -46,7 +46,7 @@ RIG = Rig("lab", LAB.dictionary, LAB.marker_length_m, floor=Floor(4.88, 4.88))
 
 
 def hung(tilts: Mapping[str, tuple[float, float]]) -> dict[str, Camera]:
-    """Cameras above the floor, each with its tilt and where in its picture the axis of this tilt points."""
+    """Return cameras above the floor, each with its tilt and the direction of the tilt axis in its image."""
     cameras = {}
     for camera in mount_cameras(LAB):
         if camera.name in tilts:
@@ -64,7 +64,7 @@ def film(
     rig: Rig | None = RIG,
     lenses: bool = True,
 ) -> Path:
-    """A log with one frame of each camera, markers on the floor beneath it."""
+    """Write a log with one frame of each camera, and markers on the floor below it."""
 
     def messages() -> Iterator[Message]:
         if rig is not None:
@@ -94,7 +94,7 @@ def aligned(ipsys: Ipsys, *arguments: object) -> dict[str, Any]:
     return {**found, "cameras": {row["camera"]: row for row in found["cameras"]}}
 
 
-def test_a_tilt_comes_back_and_who_does_as_told_gets_green(ipsys: Ipsys, tmp_path: Path) -> None:
+def test_following_the_advice_makes_a_camera_level(ipsys: Ipsys, tmp_path: Path) -> None:
     cameras = hung(TILTS)
     before = aligned(ipsys, film(tmp_path / "before.mcap", cameras))["cameras"]
     for name, (tilt_deg, _) in TILTS.items():
@@ -121,15 +121,17 @@ def test_a_marker_on_a_box_is_named(ipsys: Ipsys, tmp_path: Path) -> None:
     assert [row["marker"] for row in white["raised"]] == [3]
     assert white["raised"][0]["above_cm"] == pytest.approx(6.0, abs=1.0)
     assert white["tilt_deg"] == pytest.approx(1.0, abs=0.2)
-    assert any("marker 3 lies 6 cm above the plane" in note for note in found["notes"])
+    assert any("marker 3 is 6 cm above the plane" in note for note in found["notes"])
 
 
 def true_tilt(camera: Camera) -> float:
     return math.degrees(math.acos(-camera.camera_from_world[2, 2]))
 
 
-def test_a_session_with_measured_places(ipsys: Ipsys, lab: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    """At all heights, by tape, then a drive: what was measured tells how high a marker was."""
+def test_align_reads_a_session_with_calibration_points(
+    ipsys: Ipsys, lab: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """The log has points at all heights, and then a drive: the measurements give the heights."""
     section = data_section(lab)
     found = aligned(ipsys, lab)
     settings = LabSettings(width=960, height=540, markers=8, stations=26, drive_s=1.0)
@@ -140,7 +142,7 @@ def test_a_session_with_measured_places(ipsys: Ipsys, lab: Path, monkeypatch: py
         assert row["places"] >= 20
     overlaps = {tuple(row["cameras"]): row for row in found["overlaps"]}
     assert set(overlaps) == {("black", "white"), ("red", "white")}
-    # The simulated lab hangs its cameras so that a marker fits.
+    # In the simulated lab, a marker fits into the overlap of its cameras.
     assert all(row["enough"] for row in overlaps.values())
     assert found["coverage"]["unseen"] == []
     assert data_section(lab).startswith(section)
@@ -149,11 +151,11 @@ def test_a_session_with_measured_places(ipsys: Ipsys, lab: Path, monkeypatch: py
     done = ipsys("align", lab, "--plot", drawn)
     assert done.code == 0, done.err
     assert max(map(len, done.out.splitlines())) <= 80, done.out
-    assert "every part of the floor is in a picture" in done.out
+    assert "every part of the floor is in an image" in done.out
     assert "black and white overlap by" in done.out
     picture = cv2.imread(str(drawn))
     assert picture is not None
-    # The blue of what two cameras see, on the map.
+    # the blue of the overlap of two cameras on the map
     assert (np.abs(picture.astype(int) - [232, 214, 195]).max(axis=2) < 3).mean() > 0.02
 
 
@@ -171,7 +173,7 @@ def changed(log: Path, change: Callable[[Message], Message | None]) -> Path:
 
 
 def test_overlaps_need_no_tape(ipsys: Ipsys, lab: Path) -> None:
-    """By the plumb lines and markers that two cameras see: about what the tape says."""
+    """The plumb lines and common markers of two cameras give nearly the result of the tape."""
     by_tape = {tuple(row["cameras"]): row["width_m"] for row in aligned(ipsys, lab)["overlaps"]}
 
     def heights_only(message: Message) -> Message:
@@ -187,7 +189,7 @@ def test_overlaps_need_no_tape(ipsys: Ipsys, lab: Path) -> None:
     assert len(found["overlaps"]) == 2
 
 
-def test_a_slip_of_the_tape_does_not_keep_a_camera_askew(ipsys: Ipsys, lab: Path) -> None:
+def test_gross_tape_error_does_not_change_the_alignment(ipsys: Ipsys, lab: Path) -> None:
     def too_short(message: Message) -> Message:
         if isinstance(message.payload, Measurement) and message.payload.id == "s000":
             distances = (Distance("A", 0.4), Distance("B", 0.5))
@@ -196,23 +198,21 @@ def test_a_slip_of_the_tape_does_not_keep_a_camera_askew(ipsys: Ipsys, lab: Path
 
     found = aligned(ipsys, changed(lab, too_short))
     assert found["coverage"] is None
-    assert "the measured places were left out: measurement s000" in " ".join(found["notes"])
+    assert "the calibration points were not used: measurement s000" in " ".join(found["notes"])
     assert len(found["cameras"]) == 3
 
 
-def test_a_camera_that_was_moved_after_its_places_were_measured(
-    ipsys: Ipsys, lab: Path, tmp_path: Path
-) -> None:
+def test_camera_moved_after_the_measurement_gives_a_note(ipsys: Ipsys, lab: Path, tmp_path: Path) -> None:
     tilted = hung({"white": (4.0, 270.0)})
     assert ipsys("fit", lab, "--model", "poly").code == 0
     log = film(tmp_path / "moved.mcap", tilted)
     assert ipsys("fit", log, "--model", "poly", "--model-from", lab).code == 0
     found = aligned(ipsys, log)
-    assert "camera white hangs otherwise than when its places" in " ".join(found["notes"])
+    assert "camera white has moved since its calibration points" in " ".join(found["notes"])
     assert found["coverage"] is not None
 
 
-def test_too_few_markers_are_said(ipsys: Ipsys, tmp_path: Path) -> None:
+def test_too_few_markers_are_reported(ipsys: Ipsys, tmp_path: Path) -> None:
     cameras = hung({"red": (3.0, 0.0)})
     done = ipsys("align", film(tmp_path / "a.mcap", cameras, places_m=()))
     assert (done.code, done.out) == (1, "")
@@ -220,13 +220,13 @@ def test_too_few_markers_are_said(ipsys: Ipsys, tmp_path: Path) -> None:
     one = aligned(ipsys, film(tmp_path / "a.mcap", cameras, places_m=PLACES_M[:1]))
     red = one["cameras"]["red"]
     assert (red["spread_cm"], red["tilt_deg"], red["level"]) == (None, None, None)
-    assert "one says nothing" in red["advice"]
-    assert any("at least three measured places" in note for note in one["notes"])
+    assert "one is not enough" in red["advice"]
+    assert any("at least three calibration points" in note for note in one["notes"])
     near = aligned(ipsys, film(tmp_path / "a.mcap", hung({"red": (0.0, 0.0)}), ((0, 0), (0.5, 0), (0, 0.4))))
     assert any("span only" in note for note in near["notes"])
 
 
-def test_what_a_log_lacks(ipsys: Ipsys, lab: Path, tmp_path: Path) -> None:
+def test_missing_data_of_a_log_give_notes(ipsys: Ipsys, lab: Path, tmp_path: Path) -> None:
     cameras = hung({"red": (3.0, 0.0)})
     done = ipsys("align", film(tmp_path / "a.mcap", cameras, rig=None))
     assert (done.code, done.out) == (1, "")
@@ -244,7 +244,7 @@ def test_what_a_log_lacks(ipsys: Ipsys, lab: Path, tmp_path: Path) -> None:
 
     found = aligned(ipsys, changed(lab, no_floor))
     assert found["coverage"] is None
-    assert any("coverage needs the floor: write [floor]" in note for note in found["notes"])
+    assert any("coverage needs the size of the floor: write [floor]" in note for note in found["notes"])
 
 
 def test_camera_points_without_markers_are_by_eq_3(ipsys: Ipsys, data: Path, tmp_path: Path) -> None:

@@ -1,4 +1,4 @@
-"""``ipsys calibrate`` as a user meets it: on rendered pictures of a known lens, and on real ones."""
+"""``ipsys calibrate`` on rendered images of a known lens, and on real images."""
 
 from __future__ import annotations
 
@@ -37,7 +37,7 @@ COLUMNS, ROWS, SQUARE_M = 6, 4, 0.03
 
 @pytest.fixture(scope="session")
 def rendered(tmp_path_factory: pytest.TempPathFactory) -> Path:
-    """A folder ``red`` of twelve pictures of a chessboard through a fisheye."""
+    """Return a folder ``red`` of twelve images of a chessboard through a fisheye."""
     folder = tmp_path_factory.mktemp("pictures") / "red"
     folder.mkdir()
     rng = np.random.default_rng(4)
@@ -58,7 +58,7 @@ def rendered(tmp_path_factory: pytest.TempPathFactory) -> Path:
 
 @pytest.fixture
 def red(rendered: Path, tmp_path: Path) -> Path:
-    """A copy of the pictures."""
+    """Copy the images."""
     return Path(shutil.copytree(rendered, tmp_path / "red"))
 
 
@@ -67,7 +67,7 @@ def calibrate(ipsys: Ipsys, *arguments: object) -> Done:
 
 
 def refused(ipsys: Ipsys, folder: Path, *arguments: object) -> str:
-    """The one line of a command that must fail, after looking that nothing was written."""
+    """Return the one line of a failing command, and check that no file was written."""
     before = sorted(folder.rglob("*"))
     done = calibrate(ipsys, *arguments)
     assert done.code == 1
@@ -90,10 +90,10 @@ def test_a_folder_of_pictures(ipsys: Ipsys, red: Path, monkeypatch: pytest.Monke
     found = [lens.K[0, 0], lens.K[1, 1], lens.K[0, 2], lens.K[1, 2], *lens.D]
     assert (np.abs(np.subtract(found, LENS)) < 4 * np.array(sigmas)).all()
     assert sigmas[0] < 1.0
-    # Over distances in the plane of the image.
+    # The tolerance is over distances in the image plane.
     assert float(re.findall(r"RMS (\S+) px", done.out)[0]) < 0.1
     assert max(len(line.rstrip()) for line in done.out.splitlines()) <= 80
-    # The line for the rig is TOML, and names the file.
+    # The printed line for the rig is TOML, and names the file.
     line = next(line for line in done.out.splitlines() if line.startswith("calibration ="))
     assert tomllib.loads(line) == {"calibration": "red.yaml"}
     picture = cv2.imread(str(red.parent / "red.png"))
@@ -118,7 +118,7 @@ def test_all_of_it_as_json_and_in_all_formats(ipsys: Ipsys, red: Path, tmp_path:
         assert lens.K[0, 0] == found["parameters"]["fx"]
 
 
-def test_nothing_is_written_over_without_being_told(ipsys: Ipsys, red: Path, tmp_path: Path) -> None:
+def test_existing_files_are_overwritten_only_on_request(ipsys: Ipsys, red: Path, tmp_path: Path) -> None:
     file = tmp_path / "mine.yaml"
     file.write_text("precious")
     line = refused(ipsys, tmp_path, red, "--board", "6x4", "-o", file)
@@ -131,7 +131,7 @@ def test_nothing_is_written_over_without_being_told(ipsys: Ipsys, red: Path, tmp
 
 @pytest.fixture
 def log(rendered: Path, tmp_path: Path) -> Path:
-    """A log in which the camera red sees the board and the camera white sees a wall."""
+    """Write a log in which the red camera sees the board and the white camera sees a wall."""
     wall = cv2.imencode(".png", np.full((120, 160), 90, np.uint8))[1].tobytes()
 
     def messages() -> Iterator[Message]:
@@ -152,7 +152,7 @@ def test_a_log_gives_a_file_for_each_camera_that_saw_the_board(ipsys: Ipsys, log
     assert (log.parent / "red.yaml").is_file()
     assert not (log.parent / "white.yaml").exists()
     assert "camera white: a chessboard of 6 x 4 inner corners is not seen in any of 12" in done.err
-    # And the file is what every other command takes.
+    # All other commands accept the file.
     assert "no such camera" not in ipsys("detect", log, "--calibration", f"red={log.parent}/red.yaml").err
 
 
@@ -189,7 +189,7 @@ def test_a_video(ipsys: Ipsys, rendered: Path, tmp_path: Path) -> None:
         ("charuco:6x4", "but a chessboard of 6 x 4 inner corners is seen in 3 of 3 tried: give --board 6x4"),
     ],
 )
-def test_another_board_than_said(ipsys: Ipsys, red: Path, tmp_path: Path, board: str, said: str) -> None:
+def test_wrong_board_size_is_reported(ipsys: Ipsys, red: Path, tmp_path: Path, board: str, said: str) -> None:
     for path in list(red.iterdir())[3:]:
         path.unlink()
     assert said in refused(ipsys, tmp_path, red, "--board", board, "-o", tmp_path)
@@ -206,7 +206,7 @@ def test_too_few_pictures(ipsys: Ipsys, red: Path, tmp_path: Path) -> None:
 def test_pictures_of_two_sizes_are_refused_before_looking(
     ipsys: Ipsys, red: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    """No board is looked for, which takes long: the headers of the files say the size."""
+    """No slow board search runs: the headers of the files give the size."""
     for n in range(9):
         cv2.imwrite(str(red / f"99{n}.png"), np.zeros((480, 640), np.uint8))
     monkeypatch.setattr("ipsys_log.calibration.board_search.view_board", None)
@@ -235,7 +235,7 @@ def test_a_picture_that_cannot_be_read_is_left_out_and_named(ipsys: Ipsys, red: 
 
 
 def test_bad_camera_does_not_cost_the_others(ipsys: Ipsys, red: Path, tmp_path: Path) -> None:
-    """Three good folders and one whose pictures are blurred."""
+    """Return three good folders, and one with blurred images."""
     for name in ("blue", "green", "white"):
         shutil.copytree(red, tmp_path / "all" / name)
     for path in (tmp_path / "all" / "green").iterdir():
@@ -269,7 +269,7 @@ def test_pictures_without_the_board_are_named(ipsys: Ipsys, red: Path, tmp_path:
     cv2.imwrite(str(red / "98.png"), np.full(SIZE_PX[::-1], 90, np.uint8))
     done = calibrate(ipsys, red, "--board", "6x4", "-o", tmp_path)
     assert done.code == 0, done.err
-    assert "not seen: 98.png: the board is not seen" in done.out
+    assert "board not found: 98.png: the board is not seen" in done.out
 
 
 def test_better_model_is_named(ipsys: Ipsys, red: Path, tmp_path: Path) -> None:
@@ -294,7 +294,7 @@ def test_four_pictures_are_used_if_insisted_on(ipsys: Ipsys, red: Path, tmp_path
     assert "written only for --force: only 4 of 4 pictures can be used" in done.err
 
 
-def test_sources_that_are_none(ipsys: Ipsys, red: Path, tmp_path: Path) -> None:
+def test_invalid_sources_are_refused(ipsys: Ipsys, red: Path, tmp_path: Path) -> None:
     board = ("--board", "6x4", "-o", tmp_path)
     assert "there is no such" in refused(ipsys, tmp_path, tmp_path / "nowhere", *board)
     (tmp_path / "empty").mkdir()
@@ -328,7 +328,7 @@ def test_photographs_through_a_lens_of_more_than_180_degrees(
                pytest.param(3, marks=pytest.mark.slow)],
 )  # fmt: skip
 def test_videos_of_a_charuco_board(ipsys: Ipsys, data: Path, tmp_path: Path, camera: int) -> None:
-    """Focal lengths within 2 % of the reference, and no farther than three of their standard deviations."""
+    """Focal lengths are within 2 % of the reference, and within three of their standard deviations."""
     folder = data / "charuco_videos"
     reference = (folder / "camera_array.toml").read_text().split(f"[cameras.{camera}]")[1]
     matrix = json.loads(re.findall(r"matrix = (\[\[.*?\]\])", reference)[0])
@@ -348,7 +348,7 @@ def test_videos_of_a_charuco_board(ipsys: Ipsys, data: Path, tmp_path: Path, cam
 def test_a_recorded_video_gives_the_lens_of_its_pictures(
     ipsys: Ipsys, red: Path, tmp_path: Path, codec: tuple[str, ...], monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    """The pictures are those that FFmpeg decodes; the log holds the packets, most of them no keyframes."""
+    """FFmpeg decodes the images; the log holds the packets, most of them no keyframes."""
     video, log, pictures = tmp_path / "red.mp4", tmp_path / "lab.mcap", tmp_path / "decoded"
     pictures.mkdir()
     make = [ffmpeg(), "-v", "error", "-framerate", "5", "-i", str(red / "%d.png"), *codec, "-crf", "12"]
@@ -366,9 +366,9 @@ def test_a_recorded_video_gives_the_lens_of_its_pictures(
         assert one["pictures"]["seen"] == 12
         lens = read_opencv_calibration(tmp_path / "x.yaml", "red")
         lenses.append(lens.K)
-    # What is lost between the two is rounding of grey levels.
+    # The only loss between the two is the rounding of grey levels.
     assert np.abs(np.subtract(*lenses)).max() < 0.05
-    # Of a long one not each is looked at; those that are need the others.
+    # Only some frames of a long video are searched; decoding those needs the other frames.
     monkeypatch.setattr("ipsys_log.calibration.images.MAX_EXAMINED_IMAGES", 4)
     (some,) = find_sources([log], [])
     looked_at = [grey for _, grey in some.read()]

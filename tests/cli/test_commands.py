@@ -1,4 +1,4 @@
-"""The commands as a user meets them."""
+"""The commands on the command line."""
 
 from __future__ import annotations
 
@@ -44,7 +44,7 @@ def test_init_writes_a_rig_that_can_be_read(ipsys: Ipsys, tmp_path: Path) -> Non
     path = tmp_path / "lab.toml"
     assert ipsys("init", path).code == 0
     rig = check_rig(load_rig(path), "lab.toml")
-    # The lab of the paper (sect. 3).
+    # the lab of the paper (sect. 3)
     assert [(p.x_m, p.y_m) for p in rig.reference_points] == [(1.2192, 2.4384), (3.6576, 2.4384)]
     assert [camera.name for camera in rig.cameras] == ["red", "white", "black"]
     text = path.read_text()
@@ -88,7 +88,7 @@ def test_info_says_what_is_in_a_log(ipsys: Ipsys, lab: Path) -> None:
     images = found["channels"]["/cameras/red/image"]
     assert images["schema"] == "foxglove.CompressedImage"
     assert images["rate_hz"] == pytest.approx(5.0)
-    # The markers are moved between the places: so many silences.
+    # The markers are moved between the points, so the log has as many gaps.
     assert images["gaps"] > 5
     assert images["longest_gap_s"] == pytest.approx(3.0, abs=0.5)
     assert [run["stage"] for run in found["runs"]] == [
@@ -116,7 +116,7 @@ def test_info_fits_80_columns(ipsys: Ipsys, lab: Path, monkeypatch: pytest.Monke
 
 
 def test_evaluate_fits_80_columns(ipsys: Ipsys, lab: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    """In the terminal itself, with what a simulated lab has besides: the truth."""
+    """Print the ground truth of a simulated lab in the terminal too."""
     monkeypatch.setenv("COLUMNS", "80")
     models = ("--model", "rigid", "--model", "poly", "--model", "rigid+poly")
     done = ipsys("evaluate", lab, *models, "--details")
@@ -135,7 +135,7 @@ def test_evaluate_fits_80_columns(ipsys: Ipsys, lab: Path, monkeypatch: pytest.M
 CAMERAS = ("red", "white", "black")
 
 
-def test_runs_say_where_they_come_from(ipsys: Ipsys, lab: Path) -> None:
+def test_runs_list_their_inputs(ipsys: Ipsys, lab: Path) -> None:
     ipsys("replay", lab)
     runs = {run["stage"]: run for run in json.loads(ipsys("runs", lab, "--json").out)}
     assert runs["detect"]["parameters"] == {"corners": "edges"}
@@ -149,7 +149,7 @@ def test_runs_say_where_they_come_from(ipsys: Ipsys, lab: Path) -> None:
 
 
 def test_help_imports_no_heavy_library() -> None:
-    """The help and the completion of a shell are there at once."""
+    """The help and the shell completion appear at once."""
     program = (
         "import sys, ipsys_log.cli.app; print(sorted({'numpy', 'cv2', 'rerun', 'mcap'} & sys.modules.keys()))"
     )

@@ -33,7 +33,7 @@ OPENED = "shows the simulated lab"
 
 @pytest.fixture(scope="module")
 def fitted(lab_log: Path, tmp_path_factory: pytest.TempPathFactory) -> Path:
-    """A log with a model of the cameras red, white and black."""
+    """Return a log with a model of the cameras red, white and black."""
     path = tmp_path_factory.mktemp("fitted") / "calibration.mcap"
     replay([lab_log], Request(), output=path)
     return path
@@ -46,13 +46,13 @@ def write_rig(folder: Path, cameras: str) -> Path:
 
 
 def played(lab: Path, camera: str = "red", more: str = "") -> str:
-    """A camera that plays a recorded one, and has its lens from the same log."""
+    """Return a rig camera that plays a recorded one, with intrinsics from the same log."""
     return (
         f'[[cameras]]\nname = "{camera}"\nsource = "file:{lab}?{camera}"\ncalibration = "{lab.name}"\n{more}'
     )
 
 
-# Beside the camera that would tell that it was opened.
+# Use this camera beside another one that reports if it is opened.
 FAULTS = {
     "source": ('[[cameras]]\nname = "white"\nsource = "carrier_pigeon:7"\n', "is none of http:"),
     "simulated camera": ('[[cameras]]\nname = "white"\nsource = "sim:blue"\n', "has no camera 'blue'"),
@@ -75,7 +75,7 @@ COMMANDS = {
 
 @pytest.mark.parametrize("command", COMMANDS)
 @pytest.mark.parametrize("fault", FAULTS)
-def test_a_bad_source_or_lens_is_said_before_any_camera_is_opened(
+def test_bad_source_or_calibration_is_reported_first(
     ipsys: Ipsys, tmp_path: Path, monkeypatch: pytest.MonkeyPatch, fitted: Path, command: str, fault: str
 ) -> None:
     cameras, said = FAULTS[fault]
@@ -102,7 +102,7 @@ def test_a_bad_source_or_lens_is_said_before_any_camera_is_opened(
         (("record", "-o", "a.mcap", "--detect", "--corners", "best"), "best"),
         (("record", "-o", "a.mcap", "--model-from", "old.mcap"), "has no effect without --measure"),
         (("record", "-o", "a.mcap", "--measure", "--model-from", "none.mcap"), "none.mcap"),
-        (("record", "-o", "a.mcap", "--measure", "--host", "192.0.2.1"), "--host 192.0.2.1: cannot be"),
+        (("record", "-o", "a.mcap", "--measure", "--host", "192.0.2.1"), "cannot listen on this address"),
         (("live", "-o", "a.mcap", "--model-from", "none.mcap"), "none.mcap"),
         (("live", "-o", "a.mcap", "--model-from", "FITTED", "--model", "best"), "has no fitted model best"),
         (("live", "-o", "old.mcap", "--model-from", "FITTED"), "old.mcap: exists already"),
@@ -111,10 +111,10 @@ def test_a_bad_source_or_lens_is_said_before_any_camera_is_opened(
         (("align", "--corners", "best"), "best"),
         (("calibrate", "--board", "6x4", "-o", "old.yaml"), "old.yaml: exists already"),
         (("calibrate", "--board", "6x4", "-o", "/proc"), "cannot write into /proc"),
-        (("calibrate", "--board", "6x4", "--plot", "a.doc"), "let its name end in .png"),
+        (("calibrate", "--board", "6x4", "--plot", "a.doc"), "use a name that ends in .png"),
     ],
 )
-def test_what_cannot_be_done_is_said_before_any_camera_is_opened(
+def test_impossible_request_is_reported_before_cameras_open(
     ipsys: Ipsys, tmp_path: Path, monkeypatch: pytest.MonkeyPatch, fitted: Path,
     arguments: tuple[str, ...], said: str,
 ) -> None:  # fmt: skip
@@ -131,7 +131,7 @@ def test_what_cannot_be_done_is_said_before_any_camera_is_opened(
     assert (tmp_path / "old.mcap").read_bytes() == b"years of work"
 
 
-def test_a_picture_that_is_higher_than_wide_is_asked_about(ipsys: Ipsys, tmp_path: Path) -> None:
+def test_portrait_image_gives_a_remark(ipsys: Ipsys, tmp_path: Path) -> None:
     for width, height, said in ((180, 320, True), (320, 180, False)):
         size = f"width = {width}\nheight = {height}"
         rig = write_rig(tmp_path, f'[[cameras]]\nname = "red"\nsource = "http://127.0.0.1:9/"\n{size}')
@@ -139,7 +139,7 @@ def test_a_picture_that_is_higher_than_wide_is_asked_about(ipsys: Ipsys, tmp_pat
         assert ("camera red: 180 x 320 px is upright: are width and height exchanged?" in done.err) == said
 
 
-def test_a_model_of_other_cameras_is_refused_before_any_is_opened(
+def test_model_of_other_cameras_is_refused_before_cameras_open(
     ipsys: Ipsys, tmp_path: Path, fitted: Path
 ) -> None:
     rig = write_rig(tmp_path, SIMULATED.replace('"red"', '"blue"'))
@@ -151,8 +151,8 @@ def test_a_model_of_other_cameras_is_refused_before_any_is_opened(
         assert OPENED not in done.err
 
 
-def test_a_lens_comes_out_of_a_log(ipsys: Ipsys, tmp_path: Path, lab: Path) -> None:
-    """By its camera; of a log with a single one, whatever that is called."""
+def test_calibration_is_read_from_a_log(ipsys: Ipsys, tmp_path: Path, lab: Path) -> None:
+    """Select by camera name; a log with a single camera needs no name."""
     rig = write_rig(tmp_path, played(lab))
     one = ("record", "--rig", rig, "--seconds", "0.5", "-o")
     assert ipsys(*one, tmp_path / "red.mcap").code == 0
@@ -172,7 +172,7 @@ def test_a_lens_comes_out_of_a_log(ipsys: Ipsys, tmp_path: Path, lab: Path) -> N
     assert "holds no calibration of camera green; it has those of: black, red, white" in done.err
 
 
-def test_a_name_without_an_ending_gets_it_and_that_is_said(
+def test_file_name_gets_a_missing_suffix_and_a_message(
     ipsys: Ipsys, tmp_path: Path, lab: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     monkeypatch.chdir(tmp_path)
@@ -185,7 +185,7 @@ def test_a_name_without_an_ending_gets_it_and_that_is_said(
     assert not (tmp_path / "monday").exists()
 
 
-def test_aligning_now_says_what_is_kept(ipsys: Ipsys, tmp_path: Path, lab: Path) -> None:
+def test_live_align_names_the_kept_log(ipsys: Ipsys, tmp_path: Path, lab: Path) -> None:
     rig = write_rig(tmp_path, played(lab))
     done = ipsys("align", "--rig", rig, "--seconds", "1")
     assert done.code == 0, done.err
@@ -199,9 +199,7 @@ def test_aligning_now_says_what_is_kept(ipsys: Ipsys, tmp_path: Path, lab: Path)
         assert {run.stage for run in session.runs()} == {"detect", "camera-frame"}
 
 
-def test_what_is_wrong_with_frames_just_taken_names_no_file_that_is_gone(
-    ipsys: Ipsys, tmp_path: Path, lab: Path
-) -> None:
+def test_error_in_live_frames_names_no_deleted_file(ipsys: Ipsys, tmp_path: Path, lab: Path) -> None:
     rig = write_rig(tmp_path, played(lab))
     done = ipsys("calibrate", "--rig", rig, "--board", "6x4", "--seconds", "1")
     assert done.code == 1
@@ -209,9 +207,7 @@ def test_what_is_wrong_with_frames_just_taken_names_no_file_that_is_gone(
     assert "now.mcap" not in done.err
 
 
-def test_a_marker_that_is_not_in_the_rig_is_shown_with_what_to_do(
-    ipsys: Ipsys, tmp_path: Path, lab: Path
-) -> None:
+def test_unknown_marker_is_shown_with_the_next_step(ipsys: Ipsys, tmp_path: Path, lab: Path) -> None:
     with Session([lab]) as session:
         (rig,) = session.payloads(["/rig"])
     known = sorted(marker.id for marker in rig.markers)[1:]
@@ -236,14 +232,14 @@ def test_a_camera_without_a_lens_is_recorded_and_named(ipsys: Ipsys, tmp_path: P
 @pytest.mark.parametrize(
     "arguments", [("replay",), ("plan",), ("align",), ("latency",), ("calibrate", "--board", "6x4")]
 )
-def test_a_picture_of_no_kind_is_refused_before_any_work(
+def test_figure_without_a_valid_suffix_is_refused_first(
     ipsys: Ipsys, lab: Path, arguments: tuple[str, ...]
 ) -> None:
     before = lab.read_bytes()
     for name in ("floor.doc", "floor"):
         done = ipsys(*arguments, lab, "--plot", lab.parent / name)
         assert done.code == 1
-        assert "is no kind of picture; let its name end in .png, .pdf, .svg" in done.err
+        assert "is not a figure file; use a name that ends in .png, .pdf, .svg" in done.err
     assert lab.read_bytes() == before
     assert not (lab.parent / "floor").exists()
 
@@ -259,10 +255,10 @@ def test_a_picture_is_what_its_name_says(ipsys: Ipsys, lab: Path) -> None:
         assert drawn[0].read_bytes() == drawn[1].read_bytes()
 
 
-def test_info_keeps_each_channel_on_a_line_and_has_no_rates_of_events(
+def test_info_has_one_line_per_channel_and_no_event_rates(
     ipsys: Ipsys, tmp_path: Path, lab: Path, fitted: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    """The log has three runs. The window has 80 columns."""
+    """The log has three runs, and the window has 80 columns."""
     monkeypatch.setenv("COLUMNS", "80")
     monkeypatch.chdir(tmp_path)
     for model in ("poly", "rigid"):
@@ -279,7 +275,7 @@ def test_info_keeps_each_channel_on_a_line_and_has_no_rates_of_events(
     found = json.loads(ipsys("info", lab.name, "--json").out)
     rates = {topic: row["rate_hz"] for topic, row in found["channels"].items()}
     assert rates["/cameras/red/image"] == pytest.approx(5.0)
-    # Of three cameras, each with two frames at a place: 5 steps in 0.22 s.
+    # Three cameras with two frames at each point: 5 steps in 0.22 s.
     assert rates["/runs/poly/tracks"] == pytest.approx(22.5)
     for topic in ("/measurements", "/rig", "/cameras/red/calibration", "/runs/poly/record"):
         assert rates[topic] is None

@@ -1,4 +1,4 @@
-"""Names in a log are of others: a terminal, a table or a page obeys nothing that stands in them."""
+"""Names in a log are untrusted: terminals, tables and pages do not obey their contents."""
 
 from __future__ import annotations
 
@@ -28,7 +28,7 @@ SHOWN = "\\x1b[31m\\x9b2J\\x07\\u202ered[/bold]:smile:"
 
 @pytest.fixture
 def hostile(tmp_path: Path) -> Path:
-    """A log whose file, topics, schema and run have names with escape sequences."""
+    """Write a log whose file, topics, schema and run have names with escape sequences."""
     path = tmp_path / f"{ESCAPE.replace('/', '')}.mcap"
     with LogWriter.create(path) as log:
         topic = f"/runs/{ESCAPE}/record"
@@ -61,7 +61,7 @@ def test_info_with_hostile_names_shows_them_as_they_are(ipsys: Ipsys, hostile: P
 
 
 def test_a_terminal_gets_no_escape_out_of_a_log(hostile: Path) -> None:
-    """Rich colours on a terminal; the only sequences there are its own."""
+    """Rich uses colours on a terminal; no other escape sequences are printed."""
     ours, theirs = pty.openpty()
     environment = os.environ | {"TERM": "xterm-256color", "COLUMNS": "200", "PYTHONPATH": str(ROOT)}
     command = [sys.executable, "-m", "ipsys_log", "runs", str(hostile)]
@@ -71,7 +71,7 @@ def test_a_terminal_gets_no_escape_out_of_a_log(hostile: Path) -> None:
     try:
         while part := os.read(ours, 1 << 16):
             shown += part
-    except OSError:  # all is read
+    except OSError:  # all messages are read
         pass
     os.close(ours)
     text = shown.decode()
@@ -121,12 +121,12 @@ def test_a_report_of_hostile_names_is_written(ipsys: Ipsys, lab: Path, tmp_path:
 @given(st.text(max_size=40))
 def test_plain_text_keeps_letters_and_escapes_controls(text: str) -> None:
     plain = plain_text(text)
-    plain.encode()  # no lone surrogate
+    plain.encode()  # without a lone surrogate
     assert unsafe(plain) == set()
     assert plain_text(plain) == plain
     if text.isprintable():
         assert plain == text
 
 
-def test_plain_text_cuts_what_is_endless() -> None:
+def test_plain_text_cuts_long_texts() -> None:
     assert len(plain_text("a" * 10_000_000)) < 3_000

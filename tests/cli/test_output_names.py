@@ -1,4 +1,4 @@
-"""Names that -o refuses, before any work is done and any camera is opened."""
+"""Names that -o refuses before any work is done and before any camera is opened."""
 
 from __future__ import annotations
 

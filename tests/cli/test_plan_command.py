@@ -1,4 +1,4 @@
-"""``ipsys plan`` as a user meets it."""
+"""``ipsys plan`` on the command line."""
 
 from __future__ import annotations
 
@@ -26,13 +26,13 @@ PAPER = ROOT / "sample_logs" / "paper_lab.mcap"
 
 @pytest.fixture
 def paper(tmp_path: Path) -> Path:
-    """The paper's layout without frames."""
+    """Write the paper's layout without frames."""
     return Path(shutil.copy(PAPER, tmp_path / "paper.mcap"))
 
 
 @pytest.fixture(scope="module")
 def fitted_log(tmp_path_factory: pytest.TempPathFactory) -> Path:
-    """The paper's layout with the model that a plan is made for, to be copied before it is changed."""
+    """Write the paper's layout with a fitted model for a plan; tests copy it before a change."""
     path = Path(shutil.copy(PAPER, tmp_path_factory.mktemp("fitted") / "paper.mcap"))
     replay([path], Request(models=("best",)), until="fit")
     return path
@@ -40,7 +40,7 @@ def fitted_log(tmp_path_factory: pytest.TempPathFactory) -> Path:
 
 @pytest.fixture
 def fitted(fitted_log: Path, tmp_path: Path) -> Path:
-    """A copy of it."""
+    """Copy the log with the model."""
     return Path(shutil.copy(fitted_log, tmp_path / "paper.mcap"))
 
 
@@ -77,7 +77,7 @@ def planned(ipsys: Ipsys, *arguments: object) -> dict[str, Any]:
 
 
 def refused(ipsys: Ipsys, log: Path, *arguments: object) -> str:
-    """The one line of a plan that cannot be made, after looking that nothing was written."""
+    """Return the one line of an impossible plan, and check that no file was written."""
     before = {path.name: path.read_bytes() for path in log.parent.iterdir()}
     done = ipsys("plan", log, *arguments)
     assert (done.code, done.out) == (1, "")
@@ -100,7 +100,7 @@ def test_the_plan_is_a_table_and_a_headline(
     assert [row.split()[0] for row in rows] == ["1", "2", "3", "4", "5"]
     assert lines[-1].startswith("predicted mean error over the floor now 0.")
     assert "with these 5 places 0." in lines[-1]
-    # The model that was lacking was fitted and appended; what was recorded is as it was.
+    # The missing model was fitted and appended; the recorded data are unchanged.
     assert "fit           run best  1 message\n" in done.err
     assert data_section(paper).startswith(section)
     with Session([paper]) as session:
@@ -134,11 +134,11 @@ def test_the_plan_as_json(ipsys: Ipsys, fitted: Path) -> None:
     assert any("little" in note for note in found["notes"])
 
 
-def test_heights_and_models_as_asked_for(ipsys: Ipsys, fitted: Path) -> None:
+def test_plan_uses_the_given_heights_and_model(ipsys: Ipsys, fitted: Path) -> None:
     found = planned(ipsys, fitted, "--height-m", "0.12", "--places", 2)
     assert {place["height_m"] for place in found["places"]} == {0.12}
     found = planned(ipsys, fitted, "--height-m", "0.12", "--height-m", "0", "--places", 2)
-    # Most places were measured nearer to 12 cm: the floor itself has its turn.
+    # Most points were measured at about 12 cm, so the floor itself is next.
     assert {place["height_m"] for place in found["places"]} == {0.0}
     for model in ("poly", "rigid+poly", "rayplane"):
         rig = fitted.with_name("lab.toml")
@@ -149,11 +149,11 @@ def test_heights_and_models_as_asked_for(ipsys: Ipsys, fitted: Path) -> None:
             ipsys, fitted, "--model", model, *(["--rig", rig] if rig.exists() else []), "--places", 1
         )
         assert found["model"] == model
-        # The error is that of the markers as robots carry them, where the rig knows it.
+        # The error is that of markers at the height on the robots, if the rig has this height.
         assert found["marker_height_m"] == pytest.approx(0.2 if model == "rayplane" else 0.1, abs=0.02)
 
 
-def test_the_picture(ipsys: Ipsys, fitted: Path) -> None:
+def test_figure_of_the_plan_is_drawn(ipsys: Ipsys, fitted: Path) -> None:
     drawn = fitted.with_name("plan.png")
     done = ipsys("plan", fitted, "--plot", drawn, "--places", 7)
     assert done.code == 0, done.err
@@ -161,13 +161,13 @@ def test_the_picture(ipsys: Ipsys, fitted: Path) -> None:
     assert picture is not None
     assert picture.shape == (700, 1400, 3)
     left, right = picture[90:590, 75:580].astype(int), picture[90:590, 705:1210].astype(int)
-    # The same floor twice, with other errors on it.
+    # The figure shows the same floor twice, with other errors.
     same = (left == right).all(axis=2).mean()
     assert 0.1 < same < 0.99
     assert sorted(path.name for path in fitted.parent.iterdir()) == ["paper.mcap", "plan.png"]
 
 
-def test_the_authors_ten_places_want_more_where_there_are_none(ipsys: Ipsys, authors: Path) -> None:
+def test_plan_for_ten_paper_points_fills_the_gaps(ipsys: Ipsys, authors: Path) -> None:
     found = planned(ipsys, authors, "--train", "train_10", "--places", 6)
     with Session([authors]) as session:
         measurements = session.payloads(session.topics(MEASUREMENTS))
@@ -183,7 +183,7 @@ def test_the_authors_ten_places_want_more_where_there_are_none(ipsys: Ipsys, aut
     )
     assert nearest_m(planned_m).mean() > 1.3 * nearest_m(floor_m).mean()
     assert nearest_m(planned_m).min() > 0.25
-    # The wide gap right of the middle, where black has no place, is the first.
+    # The wide gap right of the centre, without points of black, is first.
     first = planned_m[0]
     assert 3.0 < first[0] < 4.8
     assert 2.5 < first[1] < 3.7
@@ -191,19 +191,19 @@ def test_the_authors_ten_places_want_more_where_there_are_none(ipsys: Ipsys, aut
     sides = [place["side"] for place in found["places"]]
     assert sides == ["left" if y_m > 2.4384 else "right" for _, y_m in planned_m]
     assert set(sides) == {"left", "right"}
-    # With all 40 places of each camera there is little left to gain.
+    # With all 40 points per camera, little improvement is left.
     full = planned(ipsys, authors, "--places", 6)
     assert full["mean_after_cm"] > 0.95 * full["mean_before_cm"]
 
 
-def test_a_log_without_measured_places_says_what_to_do_first(ipsys: Ipsys, paper: Path) -> None:
+def test_plan_without_calibration_points_names_the_first_step(ipsys: Ipsys, paper: Path) -> None:
     log = rewrite(paper, drop_measured)
     line = refused(ipsys, log)
     assert "no place is measured yet" in line
     assert "measure about 10 places, spread over the view of each camera out to its edges" in line
 
 
-def test_what_cannot_be_planned_is_refused(ipsys: Ipsys, paper: Path) -> None:
+def test_impossible_plan_is_refused(ipsys: Ipsys, paper: Path) -> None:
     assert "does not exist" in refused(ipsys, paper, paper.with_name("none.mcap"))
     for count in (0, -1, 51):
         assert f"--places {count}: plan 1 to 50 places at a time" in refused(ipsys, paper, "--places", count)
@@ -214,11 +214,11 @@ def test_what_cannot_be_planned_is_refused(ipsys: Ipsys, paper: Path) -> None:
     assert "this is the log itself" in refused(ipsys, paper, "--plot", paper)
     assert "there is no folder" in refused(ipsys, paper, "--plot", paper.parent / "nowhere" / "plan.png")
     assert ipsys("fit", paper, "--model", "best").code == 0
-    # Above the cameras, though not above all that the floor allows.
+    # The height is above the cameras, but not above the limit for the floor.
     assert "no camera sees a whole marker 3.5 m above the floor" in refused(ipsys, paper, "--height-m", "3.5")
 
 
-def test_too_few_places_are_said(ipsys: Ipsys, paper: Path) -> None:
+def test_too_few_points_are_reported(ipsys: Ipsys, paper: Path) -> None:
     def few(message: Message) -> Message | None:
         payload = message.payload
         return None if isinstance(payload, Measurement) and payload.id > "s003" else message
@@ -226,8 +226,8 @@ def test_too_few_places_are_said(ipsys: Ipsys, paper: Path) -> None:
     assert "best needs at least 5 measured places" in refused(ipsys, rewrite(paper, few))
 
 
-def test_what_the_log_lacks_is_noted(ipsys: Ipsys, authors: Path) -> None:
-    """No lenses, no floor, no reference points, and a camera that no place was measured for."""
+def test_missing_data_of_the_log_give_notes(ipsys: Ipsys, authors: Path) -> None:
+    """The log has no intrinsics, no floor, no reference points, and a camera without points."""
 
     def bare(message: Message) -> Message | None:
         payload = message.payload
@@ -243,13 +243,13 @@ def test_what_the_log_lacks_is_noted(ipsys: Ipsys, authors: Path) -> None:
     assert {camera for place in found["places"] for camera in place["cameras"]} <= {"red", "white"}
     assert all(place["distances_m"] == {} and place["side"] is None for place in found["places"])
     notes = " ".join(found["notes"])
-    assert "camera black has no model: first measure about 10 places in its view" in notes
-    assert "camera red has no lens" in notes
+    assert "camera black has no model: first measure about 10 points in its field of view" in notes
+    assert "camera red has no intrinsics" in notes
     assert "the rig has no floor" in notes
-    assert "no two reference points" in notes
+    assert "fewer than two reference points" in notes
 
 
-def test_with_three_reference_points_no_side_is_told(ipsys: Ipsys, fitted: Path) -> None:
+def test_plan_with_three_reference_points_gives_no_side(ipsys: Ipsys, fitted: Path) -> None:
     rig = fitted.with_name("lab.toml")
     ipsys("init", rig, "--from", fitted)
     rig.write_text(rig.read_text() + '\n[[reference_points]]\nname = "corner"\nx_m = 0.0\ny_m = 0.0\n')
@@ -262,7 +262,7 @@ def test_with_three_reference_points_no_side_is_told(ipsys: Ipsys, fitted: Path)
     assert "corner" in done.out
 
 
-def test_no_marker_is_laid_on_a_reference_point(ipsys: Ipsys, fitted: Path) -> None:
+def test_planned_markers_do_not_cover_a_reference_point(ipsys: Ipsys, fitted: Path) -> None:
     rig = fitted.with_name("lab.toml")
     ipsys("init", rig, "--from", fitted)
     (best,) = planned(ipsys, fitted, "--rig", rig, "--places", 1)["places"]

@@ -1,4 +1,4 @@
-"""Signals at any moment of a command: exit codes, files that are left, and signals that stay ignored."""
+"""Signals at any time of a command: exit codes, remaining files, and signals that stay ignored."""
 
 from __future__ import annotations
 
@@ -22,7 +22,7 @@ from tests.test_record import wait_for
 SAMPLE = ROOT / "sample_logs" / "small_lab.mcap"
 LIMIT_S = 240
 
-# Runs the command line, and sends a signal to itself at the n-th file or module that the command opens.
+# A program that runs the command line, and sends a signal to itself at the n-th opened file or module.
 AT_EVENT = """
 import os, sys
 from ipsys_log.cli import main, signals
@@ -78,7 +78,7 @@ def sample_rig(folder: Path) -> Path:
 
 @pytest.fixture
 def handlers() -> Iterator[None]:
-    """Give back the handlers of signals that a test installs."""
+    """Restore the signal handlers after a test."""
     before = {number: signal.getsignal(number) for number in SIGNALS}
     yield
     for number, handler in before.items():
@@ -87,7 +87,7 @@ def handlers() -> Iterator[None]:
 
 @pytest.mark.usefixtures("handlers")
 def test_interrupt_swallowed_by_a_library_comes_again() -> None:
-    """As while NumPy loads its random numbers: there an exception is lost."""
+    """The signal comes while NumPy loads its random numbers: an exception there is lost."""
 
     @interruptible
     def command() -> None:
@@ -132,7 +132,7 @@ def test_interrupt_right_after_the_creation_of_a_file_leaves_no_file(
 
 
 @pytest.mark.usefixtures("handlers")
-def test_interrupt_does_not_interrupt_what_cleans_up() -> None:
+def test_interrupt_does_not_stop_the_cleanup() -> None:
     cleaned: list[bool] = []
 
     @interruptible
@@ -171,7 +171,7 @@ def test_record_stopped_anywhere_exits_with_0(parts: list[float], tmp_path: Path
         code, err = end(max(int(part * events), 1), number, "record", "--rig", rig, "-o", log)
         assert (code, "Traceback" in err) == (0, False), (part, err)
         if log.exists():
-            LogReader(log).close()  # a whole log
+            LogReader(log).close()  # a complete log
 
 
 @pytest.mark.slow
@@ -191,7 +191,7 @@ def test_measure_stopped_anywhere_exits_with_0(
 
 
 def start(*command: object, shell: str = "") -> subprocess.Popen[str]:
-    """Start a command from a shell that first runs some words of its own."""
+    """Start a command from a shell that first runs other shell commands."""
     program = [sys.executable, "-m", "ipsys_log", *map(str, command)]
     return subprocess.Popen(
         ["/bin/sh", "-c", f'{shell} exec "$@"', "sh", *program],

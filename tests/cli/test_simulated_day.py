@@ -1,4 +1,4 @@
-"""A first day without hardware: every command on the simulated lab, against what is true there."""
+"""All commands on the simulated lab, compared with its ground truth."""
 
 from __future__ import annotations
 
@@ -33,7 +33,7 @@ from ipsys_log.units import NS_PER_S
 from tests.conftest import Ipsys
 from tests.test_measure_now import Lab, measuring
 
-# A limit for one command on a busy machine; a quiet one takes seconds.
+# a limit for one command on a busy machine; a free machine needs seconds
 PATIENCE_S = 900
 
 
@@ -88,7 +88,7 @@ def test_simulated_lab_gives_its_rig_and_its_tape(
             assert abs(np.hypot(where.x_m - a.x_m, where.y_m - a.y_m) - tape.distance_m) < 0.001
     before = (tmp_path / "lab_tape.csv").read_bytes()
     assert "lab.toml: exists already" in ipsys("init", "--simulated").err
-    # Both files, or none.
+    # Both files are there, or none.
     (tmp_path / "lab.toml").unlink()
     done = ipsys("init", "lab.toml", "--simulated")
     assert (done.code, (tmp_path / "lab.toml").exists()) == (1, False)
@@ -100,7 +100,7 @@ def test_simulated_lab_gives_its_rig_and_its_tape(
 def test_simulated_lab_is_measured_and_fitted(
     ipsys: Ipsys, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    """The thin way through the day, without its real time: the sheet fits the frames, to the centimetre."""
+    """A short simulated day, without its real time: the sheet fits the frames to the centimetre."""
     monkeypatch.chdir(tmp_path)
     assert ipsys("init", "--simulated").code == 0
     write_log(tmp_path / "day.mcap", seen_by_all(load_rig(tmp_path / "lab.toml")))
@@ -115,7 +115,7 @@ def test_simulated_lab_is_measured_and_fitted(
 
 
 def seen_by_all(rig: Rig) -> Iterator[Message]:
-    """Frames as all three cameras show them in half a second."""
+    """Return the frames of all three cameras in half a second."""
     step_ns = round(NS_PER_S / LIVE_SETTINGS.rate_hz)
     start_ns = 1_700_000_000 * NS_PER_S
     films = [lab_film(LIVE_SETTINGS, number, lambda: None) for number in range(3)]
@@ -133,7 +133,7 @@ def seen_by_all(rig: Rig) -> Iterator[Message]:
 
 
 class Day:
-    """Runs commands as programs, in a folder, and remembers which."""
+    """A runner of commands as programs in a folder, with a list of them."""
 
     def __init__(self, folder: Path) -> None:
         self.folder = folder
@@ -198,13 +198,13 @@ def test_every_command_of_the_first_day_works_without_hardware(day: Day) -> None
     for stage in ("detect", "camera-frame", "fit", "locate", "fuse"):
         day(stage, "session.mcap")
     day("simulate", "-o", "s.mcap", "--width", 320, "--height", 180, "--stations", 1, "--drive-s", 0.2)
-    day.commands.add("import")  # needs data of others
+    day.commands.add("import")  # needs public data
     assert day.commands == {name for names in PANELS.values() for name in names}
 
 
 @pytest.mark.slow
-def test_places_of_the_simulated_lab_are_measured_on_the_page(tmp_path: Path, ipsys: Ipsys) -> None:
-    """With cameras, as by phone: nobody has to hurry, for nothing is carried away."""
+def test_points_of_the_simulated_lab_are_measured_on_the_page(tmp_path: Path, ipsys: Ipsys) -> None:
+    """Measure with live cameras as on a phone; the markers stay, so no step is urgent."""
     assert ipsys("init", tmp_path / "lab.toml", "--simulated").code == 0
     rows = sheet_rows(tmp_path / "lab_tape.csv")
     assert (

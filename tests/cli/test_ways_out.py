@@ -1,4 +1,4 @@
-"""Commands that are used in a wrong way, or interrupted, name the way out and what was kept."""
+"""Wrong or interrupted commands name the next step and the kept data."""
 
 from __future__ import annotations
 
@@ -41,7 +41,7 @@ def test_view_saved_under_another_ending_is_refused(ipsys: Ipsys, lab: Path) -> 
 
 @pytest.mark.parametrize("command", [("images",), ("imsel",), ("videos",)])
 def test_import_of_a_log_names_what_to_run(ipsys: Ipsys, lab: Path, command: tuple[str]) -> None:
-    # A log by its bytes, whatever it is called.
+    # a log by its bytes, with any file name
     log = Path(shutil.copy(lab, lab.with_name("recorded.bin")))
     source = f"red={log}" if command == ("videos",) else log
     line = refused(ipsys, lab, "import", *command, source, "-o", lab.with_name("new.mcap"))
@@ -50,7 +50,7 @@ def test_import_of_a_log_names_what_to_run(ipsys: Ipsys, lab: Path, command: tup
 
 
 def with_lens(lab: Path, model: str) -> Path:
-    """A log in which the lens of the red camera has another distortion model."""
+    """Return a log with another distortion model of the red camera."""
 
     def change(message: Message) -> Message:
         if isinstance(message.payload, CameraCalibration) and message.camera == "red":
@@ -68,7 +68,7 @@ def test_unknown_distortion_model_names_the_way_out(ipsys: Ipsys, lab: Path, com
     assert "kannala_brandt, plumb_bob, rational_polynomial" in line
     assert "ipsys calibrate" in line
     assert "--calibration red=red.yaml" in line
-    # The way out is one.
+    # The proposed command works.
     assert ipsys("detect", log, "--calibration", f"red={lens_file(lab)}").code == 0
 
 
@@ -93,7 +93,7 @@ def test_unknown_distortion_model_of_a_file_names_the_way_out(ipsys: Ipsys, lab:
 
 
 def rig_file(lab: Path, *cameras: str) -> Path:
-    """The rig of a log, with these cameras."""
+    """Return the rig of a log, with these cameras."""
     path = lab.with_name("lab.toml")
     path.unlink(missing_ok=True)
     text = ['name = "lab"', 'dictionary = "DICT_4X4_100"', "marker_length_m = 0.2"]
@@ -167,7 +167,7 @@ def other_ids(message: Message) -> Message:
 
 @pytest.fixture
 def detected(tmp_path: Path) -> Path:
-    """The markers of the sample log."""
+    """Return the markers of the sample log."""
     return Path(shutil.copy(PAPER_LAB, tmp_path / "lab.mcap"))
 
 
@@ -188,7 +188,7 @@ def detected(tmp_path: Path) -> Path:
         (shifted(0), other_ids, "no marker id in common: the first has 0, 1, 2"),
     ],
 )
-def test_diff_of_nothing_in_common_says_why(
+def test_diff_without_common_frames_gives_the_reason(
     ipsys: Ipsys,
     detected: Path,
     first: Callable[[Message], Message | None],
@@ -209,7 +209,7 @@ def test_diff_of_runs_without_frames_says_which_side(ipsys: Ipsys, detected: Pat
     assert "the second has no markers, points, positions or tracks" in " ".join(done.out.split())
 
 
-def test_extents_that_meet_are_not_explained() -> None:
+def test_adjacent_extents_give_no_explanation() -> None:
     times_ns = np.array([1, 5, 9])
     one = Extent(frozenset({"red"}), times_ns, frozenset({1, 2}))
     assert explain_no_overlap(one, replace(one, ids=frozenset({2, 3}))) is None
@@ -220,7 +220,7 @@ def test_extents_that_meet_are_not_explained() -> None:
 
 
 def interrupted_when(command: list[object], ready: Callable[[], bool]) -> tuple[int, str]:
-    """Run a command on a terminal, and interrupt it once it is so far; its exit code and last words."""
+    """Run a command on a terminal, and interrupt it at a given output; return exit code and last lines."""
     main, side = pty.openpty()
     program = subprocess.Popen(
         [sys.executable, "-m", "ipsys_log", *map(str, command)],
@@ -296,7 +296,7 @@ def test_kept_results_of_one_command_are_not_of_the_next(ipsys: Ipsys, tmp_path:
         raise Interrupted(130, "")
 
 
-def test_simulate_tells_how_far_it_is() -> None:
+def test_simulate_shows_its_progress() -> None:
     told: list[tuple[str, int, int]] = []
     lab = LabSettings(width=320, height=180, stations=2, frames_per_station=2, drive_s=0.1, markers=2)
     messages = list(simulate(lab, lambda *step: told.append(step)))

@@ -1,4 +1,4 @@
-"""Calibrations written, and read again by others."""
+"""Written calibrations that other software reads."""
 
 from __future__ import annotations
 
@@ -34,7 +34,7 @@ def lens(model: str) -> CameraCalibration:
 
 @pytest.mark.parametrize("model", list(COEFFICIENTS))
 @pytest.mark.parametrize("write", [opencv_yaml, ros_yaml])
-def test_what_is_written_is_read_to_the_last_digit(
+def test_written_calibration_reads_back_exactly(
     tmp_path: Path, model: str, write: Callable[..., str]
 ) -> None:
     path = tmp_path / "red.yaml"
@@ -64,6 +64,6 @@ def test_kalibr(model: str, name: str) -> None:
     ("name", "kind", "said"),
     [("kalibr", "pinhole", "four coefficients"), ("matlab", "fisheye", "use one of opencv, ros, kalibr")],
 )
-def test_formats_that_cannot_be(name: str, kind: str, said: str) -> None:
+def test_impossible_formats_are_refused(name: str, kind: str, said: str) -> None:
     with pytest.raises(IpsysError, match=said):
         check_format(name, kind)

@@ -1,4 +1,4 @@
-"""Folders of pictures."""
+"""Import of image folders."""
 
 from __future__ import annotations
 
@@ -25,7 +25,7 @@ def test_numbers_in_names_count_by_their_value(tmp_path: Path) -> None:
     assert all(isinstance(message.payload, CompressedImage) for message in messages)
     order = [message.payload.data.decode() for message in messages if message.camera == "red"]
     assert order == names[:4]
-    # The n-th of each camera are of one instant, and no two messages have one log time.
+    # The n-th images of the cameras have one time, and no two messages have the same log time.
     instants = [message.publish_time_ns for message in messages]
     assert instants[::2] == instants[1::2]
     assert len({message.log_time_ns for message in messages}) == len(messages)
@@ -46,6 +46,6 @@ def test_pictures_that_would_be_left_out_are_named(tmp_path: Path, names: list[s
 
 
 @pytest.mark.parametrize("rate", [0.0, -1.0, float("nan"), float("inf")])
-def test_a_rate_that_is_none(tmp_path: Path, rate: float) -> None:
+def test_invalid_rate_is_refused(tmp_path: Path, rate: float) -> None:
     with pytest.raises(IpsysError, match="pictures per second"):
         list(read_images(find_images(folder(tmp_path, "red/a.jpg")), None, {}, rate))

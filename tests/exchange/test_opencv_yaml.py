@@ -1,4 +1,4 @@
-"""Calibrations in the files that people have."""
+"""Calibration files of other software."""
 
 from __future__ import annotations
 

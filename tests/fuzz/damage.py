@@ -1,4 +1,4 @@
-"""Damage to bytes and texts, as Hypothesis draws and shrinks it."""
+"""Random damage to bytes and texts, drawn and shrunk by Hypothesis."""
 
 from __future__ import annotations
 
@@ -8,7 +8,7 @@ from hypothesis import strategies as st
 
 __all__ = ["damaged"]
 
-# Numbers and signs at which readers stumble.
+# Numbers and signs that often cause faults in readers.
 _NUMBERS = (0, 1, 0x7F, 0x80, 0xFF, 0x7FFF, 0xFFFF, 1 << 31, 1 << 32, 1 << 62, 1 << 63, (1 << 64) - 1)
 _TEXTS = (
     b"nan", b"inf", b"-1", b"1e308", b"1e999", b"9" * 5000, b"\x1b[31m", b"\xff\xfe", b"\0", b"\n",
@@ -28,7 +28,7 @@ _EDIT = st.one_of(
 
 
 def damaged(wholes: Sequence[bytes]) -> st.SearchStrategy[bytes]:
-    """One of some whole inputs after up to six edits; some are left whole, some are noise."""
+    """Return one of some valid inputs after up to six edits; some stay valid, some are noise."""
     edited = st.builds(_apply, st.sampled_from(list(wholes)), st.lists(_EDIT, max_size=6))
     return st.one_of(edited, edited, edited, edited, st.binary(max_size=200))
 

@@ -1,4 +1,4 @@
-"""Small whole inputs that the fuzz job damages, made anew in each run."""
+"""Small valid inputs for the fuzz job, created anew in each run."""
 
 from __future__ import annotations
 
@@ -61,7 +61,7 @@ _CORNERS = np.array([[1.0, 2.0], [9.0, 2.0], [9.0, 9.0], [1.0, 9.0]])
 
 @cache
 def pictures() -> tuple[bytes, ...]:
-    """JPEGs of several kinds, with restart markers too, and a PNG."""
+    """Return JPEGs of several kinds, also with restart markers, and a PNG."""
     pixels = np.random.default_rng(1).integers(0, 255, (48, 64, 3), np.uint8)
     kinds: list[tuple[str, list[int]]] = [
         (".jpg", []),
@@ -74,7 +74,7 @@ def pictures() -> tuple[bytes, ...]:
 
 @cache
 def payloads() -> tuple[tuple[str, object], ...]:
-    """One payload for each topic of a small log."""
+    """Return one payload for each topic of a small log."""
     camera, run = "/cameras/red", "/runs/edges/cameras/red"
     return (
         ("/rig", RIG),
@@ -96,7 +96,10 @@ def payloads() -> tuple[tuple[str, object], ...]:
 
 @cache
 def logs() -> tuple[bytes, ...]:
-    """Logs with and without checksums, indexes and compression: without, damage reaches further in."""
+    """Return logs with and without checksums, indexes and compression.
+
+    Damage has more effect without these.
+    """
     with TemporaryDirectory() as folder:
         path = Path(folder) / "a.mcap"
         with LogWriter.create(path) as log:
@@ -121,7 +124,7 @@ def _bare(compression: str, summary: bool) -> bytes:
 
 
 def _foreign() -> bytes:
-    """JSON of Foxglove and CDR of ROS 2."""
+    """Return JSON of Foxglove and CDR of ROS 2."""
     attack = Attack()
     lens = b'{"timestamp":{"sec":1,"nsec":2},"frame_id":"red","width":64,"height":48,"K":[1,2,3]}'
     attack.channel("foxglove.CameraCalibration", "/red/info", "json")
@@ -147,7 +150,7 @@ def rig_files() -> tuple[bytes, ...]:
 
 @cache
 def lens_files() -> tuple[tuple[str, bytes], ...]:
-    """Lens files by the ending of their name."""
+    """Return calibration files by suffix."""
     sigmas = {"fx": 0.1}
     texts = [(".yaml", make(_LENS, sigmas, "made by hand")) for make in (opencv_yaml, ros_yaml, kalibr_yaml)]
     storage = cv2.FileStorage(".json", cv2.FILE_STORAGE_WRITE | cv2.FILE_STORAGE_MEMORY)
@@ -166,7 +169,7 @@ def sheets() -> tuple[bytes, ...]:
 
 @cache
 def mat() -> tuple[bytes, ...]:
-    """MATLAB files as the authors of the paper publish theirs, and packed."""
+    """Return MATLAB files in the format of the paper's authors, packed and unpacked."""
     tables = {f"X{kind}_red": np.arange(12.0).reshape(4, 3) for kind in "cw"}
     with TemporaryDirectory() as folder:
         path = Path(folder) / "a.mat"

@@ -1,6 +1,6 @@
-"""The readers of outside data. Each gets damaged input; all may end with an `IpsysError`, none otherwise.
+"""The readers of untrusted data. For damaged input, they may only raise an `IpsysError`.
 
-Nothing is written where input is refused, and no input takes more than a few seconds of the processor.
+If a reader refuses its input, it writes nothing. No input takes more than a few seconds of the processor.
 """
 
 from __future__ import annotations
@@ -60,7 +60,7 @@ def attack(act: Callable[[Any], None], given: Any) -> None:
 
 @contextmanager
 def file(data: bytes, name: str) -> Iterator[Path]:
-    """The data as a file; where it is refused, it and its folder are as they were."""
+    """Write the data to a file; if a reader refuses it, the file and its folder stay unchanged."""
     with TemporaryDirectory(prefix="fuzz") as folder:
         path = Path(folder) / name
         path.write_bytes(data)
@@ -87,7 +87,7 @@ def append_log(data: bytes) -> None:
         with LogWriter.append(path) as log:
             log.add_channel("/fuzz", None)
             log.write("/fuzz", 5, 5, b"payload")
-        with suppress(IpsysError), LogReader(path) as reader:  # what was damaged before still is
+        with suppress(IpsysError), LogReader(path) as reader:  # the earlier damage is still there
             assert [message.data for message in reader.messages(["/fuzz"])][-1:] == [b"payload"]
 
 
@@ -150,7 +150,7 @@ def ask_page(given: tuple[str, str, bytes]) -> None:
 
 
 async def _ask(method: str, path: str, body: bytes) -> int:
-    """The status of an answer, straight from the page without a socket."""
+    """Return the status of an answer, directly from the page without a socket."""
     statuses: list[int] = []
     plain, _, query = path.partition("?")
     scope = {

@@ -1,4 +1,4 @@
-"""The fuzz job in short: a few cases for each reader of outside data; ``scripts/fuzz`` runs many."""
+"""A short fuzz job: a few cases for each reader of untrusted data; ``scripts/fuzz`` runs many."""
 
 from __future__ import annotations
 

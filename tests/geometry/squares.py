@@ -1,4 +1,4 @@
-"""Made-up markers under known lenses: their corners by OpenCV's projection, their turns by SciPy's."""
+"""Synthetic markers with known lenses: corners by OpenCV's projection, rotations by SciPy."""
 
 from __future__ import annotations
 
@@ -22,21 +22,21 @@ LENSES = {
 }
 FISHEYE = LENSES["kannala_brandt"]
 LENGTH_M = 0.2
-# Where 2.1 m below the camera: its middle, half-way out, and the side of its image.
+# Points 2.1 m below the camera: at the image centre, half-way out, and at the image edge.
 CENTRE, MIDWAY, EDGE = (0.02, -0.03, 2.1), (1.0, 0.5, 2.1), (2.4, 0.1, 2.1)
 
 
 def turned(heading_rad: float, tilt_deg: float = 0.0, about_rad: float = 0.0) -> Array:
-    """Axes of a marker that faces the camera, then tilted about a line in the plane of the image."""
+    """Return the axes of a marker that faces the camera, tilted about a line in the image plane."""
     along = np.array([np.cos(about_rad), np.sin(about_rad), 0.0])
     tilt = Rotation.from_rotvec(np.deg2rad(tilt_deg) * along)
-    # Its y axis points to the heading, which is minus the angle in the image.
+    # The y axis has the direction of the heading, which is minus the angle in the image.
     facing = Rotation.from_euler("z", np.pi / 2 - heading_rad) * Rotation.from_euler("x", np.pi)
     return np.asarray((tilt * facing).as_matrix())
 
 
 def corners_px(lens: CameraCalibration, axes: Array, centre_m: Array, length_m: float = LENGTH_M) -> Array:
-    """Return the corners that a perfect camera sees, (4, 2), in pixels."""
+    """Return the corners (4, 2) in a perfect camera, in pixels."""
     half = length_m / 2
     square = np.array([[[-half, half, 0]], [[half, half, 0]], [[half, -half, 0]], [[-half, -half, 0]]])
     vector, shift = cv2.Rodrigues(axes)[0], np.asarray(centre_m, dtype=np.float64)
@@ -47,13 +47,13 @@ def corners_px(lens: CameraCalibration, axes: Array, centre_m: Array, length_m: 
 def random_poses(
     count: int, rng: np.random.Generator, lens: CameraCalibration, length_m: float = LENGTH_M
 ) -> tuple[Array, Array, Array]:
-    """Markers all over the image, tilted by 0 to 5 degrees under a camera tilted by 0.5 to 2.
+    """Return markers all over the image, with tilts of 0 to 5 degrees and a camera tilt of 0.5 to 2 degrees.
 
-    Axes (n, 3, 3), centres (n, 3) in m, corners (n, 4, 2) in px.
+    The result has axes (n, 3, 3), centres (n, 3) in m and corners (n, 4, 2) in px.
     """
     found: list[tuple[Array, Array, Array]] = []
     while len(found) < count:
-        # The lenses with coefficients for pixels end before the image does.
+        # The lenses with pixel coefficients end inside the image.
         reach = (2.6, 1.3) if lens is FISHEYE else (1.3, 0.7)
         centre_m = np.array([*rng.uniform(-1, 1, 2) * reach, rng.uniform(1.9, 2.1)])
         marker = turned(rng.uniform(-3, 3), rng.uniform(0, 5), rng.uniform(0, 2 * np.pi))

@@ -1,4 +1,4 @@
-"""The noise of corners against derivatives by hand and against samples of it."""
+"""The propagated corner noise, compared with manual derivatives and with samples."""
 
 from __future__ import annotations
 
@@ -36,10 +36,10 @@ def test_whitened_noise_is_white() -> None:
 
 
 def test_directions_without_noise_weigh_as_much_as_the_others() -> None:
-    """A fitted pose leaves corners of rank 6, stored in single precision."""
+    """A fitted pose gives corner covariances of rank 6, stored in single precision."""
     covariance = some_covariance(6).astype(np.float32).astype(np.float64)
     (whitening,) = whiten(covariance[None])
-    # No number is larger than one by the least of the noise that there is.
+    # No number exceeds the limit by even the smallest noise.
     least = np.sqrt(np.linalg.eigvalsh(covariance)[2])
     assert np.linalg.norm(whitening, 2) == pytest.approx(1 / least)
     np.testing.assert_allclose(
@@ -48,7 +48,7 @@ def test_directions_without_noise_weigh_as_much_as_the_others() -> None:
 
 
 @pytest.mark.parametrize("covariance", [np.zeros((8, 8)), np.full((8, 8), np.nan), -np.eye(8)])
-def test_what_is_no_covariance_is_named(covariance: Array) -> None:
+def test_invalid_covariance_is_reported(covariance: Array) -> None:
     with pytest.raises(IpsysError, match="marker 3 of camera red: covariance_px2 has no variance in it"):
         check_covariance(covariance, "marker 3 of camera red")
     check_covariance(some_covariance(6), "marker 3 of camera red")

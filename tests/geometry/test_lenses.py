@@ -1,4 +1,4 @@
-"""Lenses against the formulas of their models, written out here."""
+"""Lenses compared with the formulas of their models, written out here."""
 
 from __future__ import annotations
 
@@ -24,7 +24,7 @@ def lens(model: str, d: tuple[float, ...]) -> CameraCalibration:
 
 
 def kannala_brandt(point: tuple[float, float, float]) -> tuple[float, float]:
-    """Eq. of the fisheye model as in OpenCV's documentation, by hand."""
+    """Project with the fisheye formula of OpenCV's documentation."""
     x, y, z = point
     r = np.hypot(x, y) / z
     theta = np.arctan(r)
@@ -75,11 +75,11 @@ def test_undistort_is_the_inverse_of_project(model: str, d: tuple[float, ...]) -
         ("plumb_bob", (0.0, 0.0, 0.0, 0.0, np.nan), "are not valid"),
     ],
 )
-def test_a_lens_that_cannot_be_computed_with(model: str, d: tuple[float, ...], said: str) -> None:
+def test_unusable_calibration_is_refused(model: str, d: tuple[float, ...], said: str) -> None:
     with pytest.raises(IpsysError, match=said):
         check_calibration(lens(model, d), "calibration of red")
 
 
-def test_same_lens_looks_at_what_bends_the_rays() -> None:
+def test_lens_equality_compares_the_distortion() -> None:
     assert same_intrinsics(lens("kannala_brandt", FISHEYE), lens("kannala_brandt", FISHEYE))
     assert not same_intrinsics(lens("kannala_brandt", FISHEYE), lens("kannala_brandt", (0.0, *FISHEYE[1:])))

@@ -1,4 +1,4 @@
-"""Eq. (3) to (5) against a marker whose place is known."""
+"""Eq. (3) to (5) compared with a marker at a known position."""
 
 from __future__ import annotations
 
@@ -12,8 +12,8 @@ from ipsys_log.geometry.markers import camera_point, camera_point_slopes, headin
 
 
 def seen(centre: tuple[float, float, float], angle_rad: float, length_m: float) -> np.ndarray:
-    """Normalized corners of a marker parallel to the image plane, facing the camera."""
-    # The marker's y is up and the camera's is down: half a turn about x, then the angle about z.
+    """Return normalized corners of a marker parallel to the image plane, facing the camera."""
+    # The marker's y is up and the camera's y is down: a half turn about x, then the angle about z.
     turn = Rotation.from_euler("z", angle_rad) * Rotation.from_euler("x", np.pi)
     corners = turn.apply(marker_corners(length_m)) + np.array(centre)
     return np.asarray(corners[:, :2] / corners[:, 2:])
@@ -31,10 +31,10 @@ def test_a_parallel_marker_is_found_exactly(
 
 
 @given(places, st.floats(-3.1, 3.1))
-def test_heading_is_minus_the_angle_of_the_side_from_corner_3_to_0(
+def test_heading_is_minus_the_angle_from_corner_3_to_0(
     centre: tuple[float, float, float], angle_rad: float
 ) -> None:
-    # Upright (angle 0) the side points up in the picture, along minus y: its angle is -90 degrees.
+    # At angle 0, the side points up in the image, along minus y: its angle is -90 degrees.
     expected = np.pi / 2 - angle_rad
     found = heading(seen(centre, angle_rad, 0.2))
     assert abs(np.angle(np.exp(1j * (found - expected)))) < 1e-6
@@ -58,7 +58,7 @@ def test_the_slopes_are_those_of_the_camera_point(
 
 
 @given(st.integers(0, 1000), st.integers(1, 9))
-def test_markers_together_are_where_they_are_one_by_one_to_the_last_bit(seed: int, count: int) -> None:
+def test_joint_and_single_fits_are_bit_identical(seed: int, count: int) -> None:
     rng = np.random.default_rng(seed)
     uv = rng.normal(0, 0.5, (count, 1, 2)) + rng.normal(0, 0.05, (count, 4, 2))
     lengths_m = rng.uniform(0.05, 0.3, count)

@@ -1,4 +1,4 @@
-"""Least squares of eq. (25) against scipy, its covariance against closed forms and drawn samples."""
+"""Least squares of eq. (25) compared with scipy; its covariance with closed forms and samples."""
 
 from __future__ import annotations
 
@@ -56,7 +56,7 @@ def test_two_distances_are_eq_25_to_the_last_digit(numbers: tuple[float, ...], s
 def test_exact_distances_from_three_points_or_more_need_no_side(numbers: list[tuple[float, float]]) -> None:
     point, references = np.array(numbers[0]), np.array(numbers[1:])
     triangles = [triangle_area(*corners) for corners in combinations(references, 3)]
-    assume(max(triangles) > 0.5)  # some three of them are well off one line
+    assume(max(triangles) > 0.5)  # some three of them are far from one line
     assume(not are_collinear(references) and ranges(point, references).min() > 0)
     found = multilaterate(references, ranges(point, references))
     np.testing.assert_allclose(found.point_m, point, atol=1e-6)
@@ -89,21 +89,21 @@ def test_contradicting_distances_are_weighed_as_scipy_does(seed: int, count: int
     np.testing.assert_allclose(found.covariance_m2, np.linalg.inv(slope.T @ slope), rtol=1e-4, atol=1e-12)
 
 
-def test_the_side_decides_where_two_places_fit_as_well() -> None:
-    """A third reference point 10 cm off the line through the others hardly tells its sides apart."""
+def test_side_selects_one_of_two_equal_solutions() -> None:
+    """A third reference point 10 cm beside the line of the others hardly determines the side."""
     references = np.array([[0.0, 0.0], [4.0, 0.0], [2.0, 0.1]])
     point = np.array([2.1, 0.6])
     distances = ranges(point, references)
     sigmas = np.full(3, 0.1)
     for side, sign in (("left", 1), ("right", -1)):
         assert np.sign(multilaterate(references, distances, sigmas, side).point_m[1]) == sign
-    # What the distances do tell, they tell better than who noted the side.
+    # The distances give the side more reliably than the noted side.
     fine = multilaterate(references, distances, np.full(3, 0.001), "right")
     np.testing.assert_allclose(fine.point_m, point, atol=1e-6)
     np.testing.assert_allclose(multilaterate(references, distances, side="right").point_m, point, atol=1e-6)
 
 
-def test_a_gross_contradiction_is_told_not_refused() -> None:
+def test_gross_contradiction_is_reported_and_not_refused() -> None:
     references, point = np.array([A, B, C]), np.array([2.0, 3.5])
     distances = ranges(point, references) + np.array([0.1, 0, 0])
     found = multilaterate(references, distances, np.full(3, 0.003))
@@ -114,7 +114,7 @@ def test_a_gross_contradiction_is_told_not_refused() -> None:
 
 
 def test_circles_that_just_miss_one_another() -> None:
-    point = np.array([0.5, 2.4384])  # beyond A on the line AB: a hair less and no triangle
+    point = np.array([0.5, 2.4384])  # beyond A on the line AB: a slightly shorter distance gives no triangle
     two, three = np.array([A, B]), np.array([A, B, C])
     short = ranges(point, three) + np.array([-0.002, 0.002, 0])
     with pytest.raises(IpsysError, match="no triangle"):
@@ -125,7 +125,7 @@ def test_circles_that_just_miss_one_another() -> None:
 @pytest.mark.parametrize("side", ["left", "right"])
 def test_three_reference_points_on_one_line_need_the_side(side: str) -> None:
     references = np.array([[0.0, 0.0], [1.0, 1.0], [3.0, 3.0]])
-    left = np.array([0.5, 2.0])  # of the line from the first to the last
+    left = np.array([0.5, 2.0])  # left or right of the line from the first point to the last
     right = left[::-1]
     distances = ranges(left, references) + np.array([0.001, -0.001, 0.001])
     assert are_collinear(references)
@@ -133,7 +133,7 @@ def test_three_reference_points_on_one_line_need_the_side(side: str) -> None:
         multilaterate(references, distances)
     found = multilaterate(references, distances, side=side)
     np.testing.assert_allclose(found.point_m, left if side == "left" else right, atol=0.005)
-    # Seen along the line the other way, left is right.
+    # In the opposite direction of the line, left is right.
     other = multilaterate(references[::-1], distances[::-1], side="left")
     np.testing.assert_allclose(other.point_m, right, atol=0.005)
 
@@ -158,7 +158,7 @@ def test_many_readings_are_as_good_as_their_mean() -> None:
     np.testing.assert_allclose(found.covariance_m2, alone / 200, rtol=0.02)
 
 
-def test_the_side_is_not_asked_where_the_distances_tell() -> None:
+def test_side_is_not_asked_if_the_distances_determine_it() -> None:
     references = np.array([A, B, C])
     point = np.array([2.0, 3.5])
     for side in ("left", "right", None):
@@ -168,9 +168,9 @@ def test_the_side_is_not_asked_where_the_distances_tell() -> None:
 
 
 @pytest.mark.parametrize("angle_deg", [5.0, 20.0, 45.0, 90.0, 135.0])
-def test_two_tapes_know_a_place_by_their_angle(angle_deg: float) -> None:
+def test_covariance_of_two_tapes_depends_on_their_angle(angle_deg: float) -> None:
     angle, sigma = np.radians(angle_deg), 0.003
-    # From the point, the references lie 2 m and 3 m away, this angle apart.
+    # The references are 2 m and 3 m from the point, with this angle between them.
     references = -np.array([[2.0, 0.0], [3 * np.cos(angle), 3 * np.sin(angle)]])
     covariance = tape_covariance(np.zeros(2), references, np.full(2, sigma))
     spread = np.sqrt(np.linalg.eigvalsh(covariance))
@@ -191,7 +191,7 @@ def test_the_crossing_angle_by_the_law_of_cosines(numbers: tuple[float, ...]) ->
     assert np.cos(crossing_angle(point, np.array([a, b]))) == pytest.approx(cosine, abs=1e-9)
 
 
-def test_of_three_tapes_the_widest_crossing_counts() -> None:
+def test_best_crossing_angle_of_three_tapes_counts() -> None:
     middle = (A + B) / 2 + [0, 0.05]
     assert crossing_angle(middle, np.array([A, B])) < np.radians(6)
     assert crossing_angle(middle, np.array([A, B, middle + np.array([0, 1.0])])) > np.radians(87)
@@ -217,7 +217,8 @@ def test_the_covariance_is_that_of_drawn_distances(
     sample = np.cov(np.array([one.point_m for one in found]).T)
     expected = multilaterate(known, true, sigmas, side).covariance_m2
     assert expected is not None
-    # Standardised by what is expected, the sample is the unit matrix to some per cent.
+    # Standardised with the expected covariance, the sample covariance is the unit matrix within some per
+    # cent.
     root = np.linalg.inv(np.linalg.cholesky(expected))
     np.testing.assert_allclose(root @ sample @ root.T, np.eye(2), atol=0.12)
     if len(known) == 3:
@@ -225,7 +226,7 @@ def test_the_covariance_is_that_of_drawn_distances(
 
 
 @pytest.mark.parametrize("along", [-0.3, 0.4, 1.0, 1.5])
-def test_on_the_line_the_covariance_is_finite_and_about_what_samples_scatter(along: float) -> None:
+def test_covariance_on_the_line_is_finite_and_matches_samples(along: float) -> None:
     rng = np.random.default_rng(7)
     known, sigmas = np.array([A, B]), np.full(2, 0.003)
     point = A + along * (B - A)
@@ -233,7 +234,7 @@ def test_on_the_line_the_covariance_is_finite_and_about_what_samples_scatter(alo
     assert np.isfinite(expected).all()
     assert np.linalg.eigvalsh(expected).min() > 0
     beside: list[float] = []
-    while len(beside) < 2000:  # who reads distances that close no triangle reads again
+    while len(beside) < 2000:  # distances without a triangle are drawn again
         d1, d2 = ranges(point, known) + rng.normal(0, sigmas)
         try:
             beside.append(trilaterate(A, B, d1, d2, str(rng.choice(["left", "right"])))[1] - A[1])
@@ -243,7 +244,7 @@ def test_on_the_line_the_covariance_is_finite_and_about_what_samples_scatter(alo
 
 
 @given(st.tuples(*[coordinates] * 6), st.floats(1e-4, 0.05))
-def test_no_place_has_a_covariance_without_bound(numbers: tuple[float, ...], sigma: float) -> None:
+def test_point_covariance_is_bounded(numbers: tuple[float, ...], sigma: float) -> None:
     a, b, point = np.array(numbers).reshape(3, 2)
     covariance = tape_covariance(point, np.array([a, b]), np.full(2, sigma))
     assert np.isfinite(covariance).all()
@@ -253,7 +254,7 @@ def test_no_place_has_a_covariance_without_bound(numbers: tuple[float, ...], sig
     assert large <= 2 * sigma * (longest + sigma) + sigma**2 / 2
 
 
-def test_sides_are_alike_where_three_points_lie_nearly_on_a_line() -> None:
+def test_both_sides_fit_nearly_collinear_reference_points() -> None:
     assert are_collinear(np.array([[0.0, 0.0], [2.0, 0.0], [4.0, 0.06]]))
     assert not are_collinear(np.array([[0.0, 0.0], [2.0, 0.3], [4.0, 0.0]]))
 
@@ -276,7 +277,7 @@ def test_sides_are_alike_where_three_points_lie_nearly_on_a_line() -> None:
         ([A, B], [1.7, 1.9], [0.003, np.nan], "left", "sigmas"),
     ],
 )
-def test_what_cannot_form_a_point_is_refused(
+def test_distances_without_a_solution_are_refused(
     references: list[Array], distances: list[float], sigmas: list[float] | None, side: str | None, said: str
 ) -> None:
     with pytest.raises(IpsysError, match=said):

@@ -1,4 +1,4 @@
-"""Poses of squares against the poses that their corners were made of."""
+"""Estimated poses of squares, compared with the poses that gave the corners."""
 
 from __future__ import annotations
 
@@ -35,7 +35,7 @@ from tests.geometry.squares import (
 def fit(
     seen_px: Array, lens: CameraCalibration, covariance_px2: Array, length_m: float = LENGTH_M
 ) -> SquarePoses:
-    """Markers (n, 4, 2) in px, all with the same noise, one frame after the other."""
+    """Return markers (n, 4, 2) in px, all with the same noise, one frame after the other."""
     uv = undistort(seen_px.reshape(-1, 2), lens)
     slopes = np.zeros((len(seen_px), 4, 2, 4, 2))
     corner = np.arange(4)
@@ -45,7 +45,7 @@ def fit(
 
 
 def tilts_deg(poses: SquarePoses, axes: Array) -> Array:
-    """Angles between the markers' normals as found, both of them, and as they are, (n, 2)."""
+    """Return the angles between the two estimated normals and the true normals, (n, 2)."""
     cosines = np.einsum("nki,ni->nk", poses.rotations[..., 2], axes[:, :, 2])
     return np.asarray(np.rad2deg(np.arccos(np.clip(cosines, -1, 1))))
 
@@ -55,7 +55,7 @@ def test_exact_corners_give_the_exact_pose(model: str) -> None:
     lens = LENSES[model]
     axes, centres_m, seen_px = random_poses(100, np.random.default_rng(0), lens)
     found = fit(seen_px, lens, 0.0009 * np.eye(8))
-    # Where both poses nearly fall together, the last steps are small ones.
+    # The last steps are small if both poses are nearly equal.
     np.testing.assert_allclose(found.centres_m[:, 0], centres_m, atol=3e-6)
     assert np.median(np.abs(found.centres_m[:, 0] - centres_m)) < 1e-11
     np.testing.assert_allclose(found.rotations[:, 0], axes, atol=1e-4)
@@ -66,7 +66,7 @@ def test_exact_corners_give_the_exact_pose(model: str) -> None:
 @pytest.mark.parametrize("heading_rad", [0.0, np.pi / 2, np.pi, -np.pi / 2, 0.3])
 @pytest.mark.parametrize("centre_m", [(0.0, 0.0, 2.0), (1.0, 0.0, 2.0), EDGE])
 def test_a_marker_that_faces_the_camera(heading_rad: float, centre_m: tuple[float, float, float]) -> None:
-    """Half a turn about an axis in the plane: there OpenCV's IPPE gives no numbers, or wrong ones."""
+    """After a half turn about an axis in the plane, OpenCV's IPPE gives no numbers or wrong ones."""
     axes = turned(heading_rad)
     uv = (marker_corners(LENGTH_M) @ axes.T + centre_m)[:, :2] / centre_m[2]
     found = fit_squares(uv[None], 5000 * np.eye(8)[None], np.array([LENGTH_M]))
@@ -84,13 +84,13 @@ def test_the_formula_is_opencvs() -> None:
         _, vectors, shifts, _ = cv2.solvePnPGeneric(square, uv[n], np.eye(3), None, flags=flag)
         theirs = sorted(Rotation.from_rotvec(np.ravel(v)).as_matrix().ravel().tolist() for v in vectors)
         np.testing.assert_allclose(sorted(rotations[n].reshape(2, 9).tolist()), theirs, atol=1e-5)
-        # OpenCV fits the centre to all corners; the formula has it where the diagonals meet.
+        # OpenCV fits the centre to all corners; the formula takes the intersection of the diagonals.
         np.testing.assert_allclose(centres_m[n, 0], np.ravel(shifts[0]), atol=0.03)
 
 
 @pytest.mark.parametrize("place_m", [CENTRE, MIDWAY, EDGE])
 def test_the_refined_pose_is_that_of_least_squares_in_pixels(place_m: tuple[float, float, float]) -> None:
-    """Through the lens itself, with the whole covariance, by SciPy."""
+    """Compute the pose with the lens itself and the whole covariance, by SciPy."""
     rng = np.random.default_rng(3)
     root = rng.normal(0, 0.05, (8, 8))
     axes = turned(0.7, 6.0, 1.0)
@@ -102,13 +102,13 @@ def test_the_refined_pose_is_that_of_least_squares_in_pixels(place_m: tuple[floa
         again_px = corners_px(FISHEYE, Rotation.from_rotvec(pose[:3]).as_matrix(), pose[3:])
         return np.asarray(whitening @ (again_px - seen_px).ravel())
 
-    # In the middle of the image the other solution runs into this one, slowly.
+    # At the image centre, the second solution slowly converges to the first one.
     for k in range(1 if place_m is CENTRE else 2):
         start = np.concatenate(
             [Rotation.from_matrix(found.rotations[0, k]).as_rotvec(), found.centres_m[0, k]]
         )
         best = least_squares(misses, start, x_scale="jac", xtol=1e-12, ftol=1e-12)
-        # What a hundredth of the noise would do; a lens is not quite linear over the miss of the worse one.
+        # The error for a hundredth of the noise; the lens is not exactly linear over the larger error.
         assert found.chi2[0, k] <= 2 * best.cost * 1.05 + 1e-3
         if k == 0:
             sigma_m = np.sqrt(np.diag(found.covariances_m2[0]))
@@ -122,7 +122,7 @@ def test_the_depth_has_no_bias(place_m: tuple[float, float, float]) -> None:
     found = fit(exact_px + rng.normal(0, 0.03, (1000, 4, 2)), FISHEYE, 0.0009 * np.eye(8))
     off_m = found.centres_m[:, 0, 2] - place_m[2]
     assert abs(off_m.mean()) < 0.0005 / 5
-    # 0.4 mm in the middle of the image, 0.65 mm half-way out.
+    # 0.4 mm at the image centre, 0.65 mm half-way out
     assert off_m.std() < 0.0008
 
 
@@ -143,7 +143,7 @@ def test_the_covariance_is_that_of_the_scatter(place_m: tuple[float, float, floa
 
 
 def pose_slopes(axes: Array, centre_m: Array) -> Array:
-    """An orthonormal basis of what the six motions of a marker do to its corners, (8, 6)."""
+    """Return an orthonormal basis of the corner shifts by the six motions of a marker, (8, 6)."""
     moved = []
     for step in 1e-5 * np.eye(6):
         turn = Rotation.from_rotvec(step[:3]).as_matrix() @ axes
@@ -153,7 +153,7 @@ def pose_slopes(axes: Array, centre_m: Array) -> Array:
 
 
 def test_corners_of_a_fitted_pose_give_that_pose() -> None:
-    """The two directions in which they have no noise decide nothing by themselves, and break nothing."""
+    """The two directions without noise do not decide the choice alone, and cause no error."""
     axes, centres_m, seen_px = random_poses(60, np.random.default_rng(6), FISHEYE)
     for n in range(60):
         basis = pose_slopes(axes[n], centres_m[n])
@@ -165,7 +165,10 @@ def test_corners_of_a_fitted_pose_give_that_pose() -> None:
 
 
 def test_both_solutions_are_there() -> None:
-    """The other one mirrors the normal at the line of sight: far away at the edge, near in the middle."""
+    """The second pose mirrors the normal at the line of sight.
+
+    The poses differ at the image edge, not at the centre.
+    """
     axes, centre_m = turned(0.4, 3.0, 1.0), np.array(EDGE)
     found = fit(corners_px(FISHEYE, axes, centre_m)[None], FISHEYE, 0.0009 * np.eye(8))
     sight = centre_m / np.linalg.norm(centre_m)
@@ -182,8 +185,8 @@ def test_both_solutions_are_there() -> None:
     ("length_m", "sigma_px", "most"),
     [(0.2, 0.03, 0.0), (0.2, 0.25, 0.006), (0.1, 0.03, 0.002), (0.1, 0.25, 0.01)],
 )
-def test_how_often_the_other_solution_is_taken(length_m: float, sigma_px: float, most: float) -> None:
-    """Neither the corners nor the tilt alone choose as well; docs/method.md has the figures."""
+def test_rate_of_wrong_pose_choices_is_bounded(length_m: float, sigma_px: float, most: float) -> None:
+    """The corners alone or the tilt alone choose worse; docs/method.md has the figures."""
     rng = np.random.default_rng(7)
     axes, _, seen_px = random_poses(2000, rng, FISHEYE, length_m)
     seen_px += rng.normal(0, sigma_px, seen_px.shape)
@@ -193,23 +196,23 @@ def test_how_often_the_other_solution_is_taken(length_m: float, sigma_px: float,
 
 
 def test_corners_outweigh_the_tilt_where_they_are_sure() -> None:
-    """A marker held aslant: its mirrored twin would face the camera much better."""
+    """A tilted marker: its mirrored solution faces the camera much better."""
     axes, centre_m = turned(0.4, 35.0, np.pi / 2), np.array([0.6, 0.1, 2.0])
     found = fit(corners_px(FISHEYE, axes, centre_m)[None], FISHEYE, 0.0009 * np.eye(8))
     right_deg, wrong_deg = tilts_deg(found, axes[None])[0]
     assert right_deg < 0.001
     assert wrong_deg > 20
-    # Weighed by the tilt alone it would have been the other.
+    # With the tilt as the only criterion, the other pose would win.
     assert found.rotations[0, 1, 2, 2] < found.rotations[0, 0, 2, 2]
 
 
 @pytest.mark.parametrize(
     ("place_m", "least_m", "most_m"), [(CENTRE, 0.002, 0.006), (MIDWAY, 0.05, 0.08), (EDGE, 0.12, 0.25)]
 )
-def test_what_a_tilt_of_5_degrees_costs(
+def test_error_of_a_5_degree_tilt_is_bounded(
     place_m: tuple[float, float, float], least_m: float, most_m: float
 ) -> None:
-    """Eq. (3) takes the foreshortened marker for a farther one; docs/method.md has the figures."""
+    """Eq. (3) takes the foreshortened marker for a more distant one; docs/method.md has the figures."""
     off_m = []
     for about_rad in np.linspace(0, 2 * np.pi, 24, endpoint=False):
         seen_px = corners_px(FISHEYE, turned(0.3, 5.0, about_rad), np.array(place_m))

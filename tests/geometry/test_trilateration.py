@@ -1,4 +1,4 @@
-"""Eq. (25) against points whose distances were measured here."""
+"""Eq. (25) compared with points at known distances."""
 
 from __future__ import annotations
 
@@ -44,13 +44,13 @@ def test_an_impossible_triangle_is_refused_with_its_numbers(distances: tuple[flo
         assert f"{number:.4f}" in str(refused.value)
 
 
-def test_a_distance_of_nothing_was_not_measured() -> None:
+def test_zero_distance_is_not_a_measurement() -> None:
     for distances in ((0.0, 2.0), (2.0, 0.0)):
         with pytest.raises(IpsysError, match="no triangle"):
             trilaterate(np.array([0.0, 0.0]), np.array([2.0, 0.0]), *distances, "left")
 
 
-def test_reference_points_that_are_one() -> None:
+def test_equal_reference_points_are_refused() -> None:
     with pytest.raises(IpsysError, match="one and the same"):
         trilaterate(A, A, 1.0, 1.0, "left")
     with pytest.raises(IpsysError, match="neither 'left' nor 'right'"):

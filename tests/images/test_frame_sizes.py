@@ -1,4 +1,4 @@
-"""Pictures of sizes that nobody asked for."""
+"""Images of unexpected sizes."""
 
 from __future__ import annotations
 
@@ -21,7 +21,7 @@ def test_a_tiny_picture_has_no_markers(shape: tuple[int, int]) -> None:
 
 
 def sent(sizes_px: list[tuple[int, int]]) -> list[Message]:
-    """A marker at rest, in pictures of several sizes."""
+    """Return frames of a stationary marker, in images of several sizes."""
     picture = draw(VGA, [at_px(VGA, 5, (330, 240), 2.0, 0.3, 0.4)], Look())
     times_ns = each_time(len(sizes_px))
     return [
@@ -44,7 +44,7 @@ def test_a_size_that_changes_costs_only_those_frames(corners: str) -> None:
     assert "are 800 x 600 px, its calibration is for 640 x 480" in large.text
     found = [[one.id for one in made.markers] for n in (0, 1, 4, 5) for made in answers[n][:1]]
     assert found == [[5]] * 4
-    # As if they had never come.
+    # The result is as without these frames.
     alone = Detect(corners)
     for message in (rig(), calibrated(VGA)):
         list(alone(message))

@@ -1,4 +1,4 @@
-"""Some rows of a JPEG are the same pixels as all of it, and damage is never taken for a picture."""
+"""Partial decoding of a JPEG gives the same pixels as full decoding, and damage is detected."""
 
 from __future__ import annotations
 
@@ -61,7 +61,7 @@ ROWS = st.lists(st.tuples(st.integers(0, 200), st.integers(0, 200)), max_size=4)
 @given(data=jpegs(), wanted=ROWS, fill=st.booleans())
 @ENOUGH
 def test_rows_are_those_of_the_whole(data: bytes, wanted: list[tuple[int, int]], fill: bool) -> None:
-    """Any baseline JPEG: the rows that are shown are bit for bit those of the full decode."""
+    """For any baseline JPEG, the decoded rows equal those of the full image bit for bit."""
     whole = simplejpeg.decode_jpeg(data, colorspace="GRAY")[..., 0]
     frame = CompressedImage(0, "red", data + b"\0" * 5 * fill, "jpeg")
     rows = [slice(*sorted(pair)) for pair in wanted]
@@ -78,7 +78,7 @@ def test_rows_are_those_of_the_whole(data: bytes, wanted: list[tuple[int, int]],
 
 @pytest.mark.parametrize("sampling", SAMPLINGS)
 def test_restart_markers_save_the_rows_above(sampling: str) -> None:
-    """A camera that sends restart markers is not decoded from the top."""
+    """Images with restart markers are not decoded from the top."""
     data = packed(colourful(320, 480, 1), sampling, interval=40)
     layout = read_layout(data)
     assert layout is not None
@@ -103,7 +103,7 @@ def test_any_kind_of_jpeg_is_shown(options: tuple[int, ...]) -> None:
 
 
 def test_pictures_of_one_canvas_do_not_mix() -> None:
-    """Sizes and kinds may change from frame to frame; a picture that was handed out is not written into."""
+    """Sizes and formats may change from frame to frame; a returned image is not overwritten."""
     png = cv2.imencode(".png", colourful(90, 70, 2))[1].tobytes()
     for data in (
         packed(colourful(64, 48, 1), "4:2:0", 0),
@@ -121,10 +121,10 @@ def test_pictures_of_one_canvas_do_not_mix() -> None:
 
 
 class Filmed:
-    """A marker that lies still, as a camera with and without restart markers sends it."""
+    """Return frames of a stationary marker, from a camera with and without restart markers."""
 
     def __init__(self, interval: int) -> None:
-        # Rows of blocks are 8 px high at 4:2:2: a picture that is shifted by one might just be followed.
+        # Rows of blocks are 8 px high at 4:2:2: an image shifted by one row might still be tracked.
         self.marker = at_px(VGA, 5, (350, 300), 0.7)
         grey = draw(VGA, [self.marker], Look())
         options = (cv2.IMWRITE_JPEG_SAMPLING_FACTOR, SAMPLINGS["4:2:2"], cv2.IMWRITE_JPEG_RST_INTERVAL)
@@ -132,9 +132,9 @@ class Filmed:
         self.truth_px = corners_px(VGA, self.marker)
 
     def after(self, damaged: bytes, frames: int) -> Array | None:
-        """The corners in a damaged frame after so many others; None: the marker is lost.
+        """Return the corners in a damaged frame after other frames. None means a lost marker.
 
-        FrameError, SizeError: it is known to be damaged.
+        FrameError and SizeError mean detected damage.
         """
         follow = MarkerTracker("DICT_4X4_100", VGA, None, 0.0)
         for n in range(frames):
@@ -156,12 +156,12 @@ def check(scene: Filmed, damaged: bytes, frames: int) -> None:
     except (FrameError, SizeError):
         return
     if found is not None:
-        # A wrong bit that a decoder cannot notice disturbs some blocks; it must not move the picture.
+        # A wrong bit that a decoder cannot detect disturbs some blocks, but must not shift the image.
         assert np.hypot(*(found - scene.truth_px).T).max() < 2.0
 
 
 def flips(data: bytes, count: int, rng: np.random.Generator, first: int = 0) -> bytes:
-    """With some bits of it the other way round."""
+    """Invert some bits."""
     damaged = bytearray(data)
     for at in rng.integers(first, len(data), count).tolist():
         damaged[at] ^= 1 << int(rng.integers(8))
@@ -169,7 +169,7 @@ def flips(data: bytes, count: int, rng: np.random.Generator, first: int = 0) -> 
 
 
 def kinds(data: bytes, rng: np.random.Generator) -> Iterator[bytes]:
-    """A bit in the header, bits in the codes, an end that is missing, a hole, a piece twice."""
+    """Damage the header, the codes or the end; remove or repeat a part."""
     layout = read_layout(data)
     assert layout is not None
     low, high = sorted(rng.integers(layout.data_at, len(data), 2).tolist())
@@ -203,7 +203,7 @@ def test_damage_gives_no_wrong_marker_where_rows_are_decoded(interval: int) -> N
 
 
 def test_a_wrong_bit_above_a_marker_does_not_move_it() -> None:
-    """It makes all that follows begin a block too late; that data are missing is seen at the end only."""
+    """It shifts all later blocks by one; the missing data are only visible at the end."""
     scene, rng = filmed(0), np.random.default_rng(1)
     layout = read_layout(scene.data)
     assert layout is not None
@@ -222,7 +222,7 @@ def restarts_of(data: bytes) -> list[int]:
 
 @pytest.mark.parametrize("which", [0, 3])
 def test_a_lost_restart_marker_does_not_shift_the_picture(which: int) -> None:
-    """Rows are found by counting restart markers: one that is not there must not move what follows."""
+    """Rows are found by the count of restart markers: a missing marker must not shift the rows."""
     scene = filmed(40)
     at = restarts_of(scene.data)[which]
     check(scene, scene.data[: at + 1] + b"\0" + scene.data[at + 2 :], 2)
@@ -246,7 +246,7 @@ def test_an_interval_too_many_does_not_shift_the_picture() -> None:
 )
 @pytest.mark.parametrize("size", [(512, 256), (1024, 64)])
 def test_any_bit_of_the_header_may_be_wrong(size: tuple[int, int], interval: int) -> None:
-    """An untrusted log gives a FrameError or a picture, and nothing else."""
+    """A frame of an untrusted log gives a FrameError or an image, and no other error."""
     data = packed(colourful(*size, 0), "4:2:0", interval)
     layout = read_layout(data)
     assert layout is not None
@@ -262,15 +262,15 @@ def test_any_bit_of_the_header_may_be_wrong(size: tuple[int, int], interval: int
 
 @given(data=st.binary(max_size=80))
 @ENOUGH
-def test_what_only_begins_like_a_jpeg_is_damaged(data: bytes) -> None:
+def test_jpeg_header_without_an_image_is_damaged(data: bytes) -> None:
     for whole in (data, b"\xff\xd8" + data, b"\xff\xd8\xff\xc0" + data + b"\xff\xd9"):
         with pytest.raises(FrameError):
             decode_rows(CompressedImage(0, "red", whole, "jpeg"), [slice(0, 9)])
 
 
 @pytest.mark.parametrize("interval", [0, 40], ids=["plain", "restarts"])
-def test_nothing_of_an_earlier_picture_shows(interval: int) -> None:
-    """All cameras of a thread are decoded into the same memory: what is not decoded is black."""
+def test_undecoded_rows_do_not_show_an_earlier_image(interval: int) -> None:
+    """All cameras of a thread are decoded into the same memory: undecoded rows are black."""
     first, second = (packed(colourful(320, 480, n), "4:2:0", interval) for n in (1, 2))
     decode_rows(CompressedImage(0, "red", first, "jpeg"))
     grey, shown = decode_rows(CompressedImage(0, "white", second, "jpeg"), [slice(100, 120), slice(300, 310)])

@@ -1,4 +1,4 @@
-"""Markers in a video: the same pictures as FFmpeg's own decoder shows."""
+"""Markers in a video: the images equal those of FFmpeg's own decoder."""
 
 from __future__ import annotations
 
@@ -28,7 +28,7 @@ CODECS = {
 
 @pytest.fixture
 def pictures(tmp_path: Path) -> Path:
-    """A marker that moves 4 px a frame."""
+    """Encode a marker that moves 4 px per frame."""
     dictionary = cv2.aruco.getPredefinedDictionary(cv2.aruco.DICT_4X4_100)
     for number in range(12):
         grey = np.full((240, 330), 220, np.uint8)
@@ -51,7 +51,7 @@ def decoded_by_ffmpeg(video: Path) -> NDArray[np.uint8]:
 
 
 def pixels(picture: RawImage | None) -> bytes | None:
-    """Without the padding of the rows."""
+    """Remove the padding of the rows."""
     if picture is None:
         return None
     rows = np.frombuffer(picture.data, np.uint8).reshape(picture.height, picture.step)
@@ -89,14 +89,14 @@ def test_markers_are_found_from_the_first_keyframe_on(pictures: Path) -> None:
     assert [(event.kind, event.timestamp, event.camera) for event in events] == [("no_keyframe", 2, "red")]
     seen = [payload for payload in found if isinstance(payload, Markers)]
     assert [frame.timestamp for frame in seen] == [5, 6, 7, 8, 9, 10, 11]
-    # The marker's first corner, where it was drawn.
+    # the drawn position of the marker's first corner
     for frame in seen:
         (marker,) = frame.markers
         assert marker.id == 6
         assert np.abs(marker.corners_px[0] - [39.5 + 4 * frame.timestamp, 59.5]).max() < 0.7
 
 
-def test_what_is_no_video_is_a_corrupt_frame(pictures: Path) -> None:
+def test_invalid_video_data_is_a_corrupt_frame(pictures: Path) -> None:
     video = frames(encode(pictures, "video.mp4", *CODECS["h264"]), "h264")
     broken = CompressedVideo(3, "red", b"\x00\x00\x00\x01\x65nothing of the kind", "h264")
     found = run(Detect("stock"), [*video[:3], broken, *video[5:]])
@@ -114,8 +114,8 @@ def test_a_picture_that_needs_a_later_one_is_named(pictures: Path) -> None:
 
 
 @pytest.mark.parametrize("name", CODECS)
-def test_what_lies_before_a_keyframe_has_no_effect_even_on_a_damaged_one(pictures: Path, name: str) -> None:
-    """A live run that fell behind goes on with a keyframe; its replay has decoded all before that."""
+def test_frames_before_a_keyframe_do_not_change_its_image(pictures: Path, name: str) -> None:
+    """A slow live run continues at a keyframe; its replay has decoded all frames before it."""
     video = frames(encode(pictures, "video.mp4", *CODECS[name]), name)
     assert [n for n, frame in enumerate(video) if is_keyframe(frame)] == [0, 5, 10]
     video[5] = replace(video[5], data=video[5].data[:-200] + bytes(200))
@@ -152,10 +152,10 @@ FULL = ("-profile:v", "high444", "-pix_fmt", "yuv444p", "-crf", "0")
 
 
 @pytest.mark.parametrize("options", [BASELINE, HIGH, FULL, H265])
-def test_a_frame_that_is_lost_is_not_guessed(pictures: Path, options: tuple[str, ...]) -> None:
-    """Over UDP some are; FFmpeg would fill in the one before."""
+def test_lost_frame_is_not_replaced(pictures: Path, options: tuple[str, ...]) -> None:
+    """Over UDP, some packets are lost; FFmpeg would show the previous image."""
     name = "h265" if "libx265" in options else "h264"
-    for number in range(12, 60):  # more than frames are numbered with, 16 at the least
+    for number in range(12, 60):  # more than the range of frame numbers, 16 at least
         shutil.copy(pictures / f"{number % 12:03}.jpg", pictures / f"{number:03}.jpg")
     video = frames(
         encode(pictures, "video.mp4", *CODECS["h264"], *options, "-g", "40", "-sc_threshold", "0"), name

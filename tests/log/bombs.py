@@ -1,4 +1,4 @@
-"""Small files that ask for much: time, memory, or both. None is larger than 1 MB."""
+"""Small files that cost much time or memory. None is larger than 1 MB."""
 
 import struct
 import tempfile
@@ -57,7 +57,7 @@ def compress(name: str, data: bytes) -> bytes:
 
 @dataclass
 class Attack:
-    """A log being put together, as well or as badly made as an attack needs it."""
+    """A builder of logs, valid or as damaged as an attack needs."""
 
     contents: Contents = field(default_factory=Contents)
     data: bytearray = field(default_factory=lambda: bytearray(MAGIC + to_bytes(mcap.Header("", ""))))
@@ -166,7 +166,7 @@ def empty_messages(payload: bytes, kind: type, topic: str, times: int, chunks: i
 
 
 def of_run(number: int, stage: str, payload: Markers | Positions, name: str) -> bytes:
-    """One message of a run very often, with the record that makes it a run, in a log of our own."""
+    """Write one message of a run very often, with the record that makes it a run."""
     topic = f"/runs/r/cameras/a/{name}"
     with tempfile.TemporaryDirectory() as folder:
         path = Path(folder) / "log.mcap"
@@ -176,7 +176,7 @@ def of_run(number: int, stage: str, payload: Markers | Positions, name: str) -> 
 
 
 def many_robots(number: int) -> bytes:
-    """Tracks, each of a robot of its own."""
+    """Write tracks, each of a separate robot."""
     attack = Attack()
     attack.channel(Tracks, "/truth/tracks")
     content, rows = bytearray(), []
@@ -188,13 +188,13 @@ def many_robots(number: int) -> bytes:
 
 
 def lost_channels(number: int) -> bytes:
-    """Messages in no chunk, each of a channel of its own that is not defined."""
+    """Write messages outside of chunks, each of an undefined channel."""
     messages = (to_bytes(mcap.Message(n + 1, n, b"", n, n)) for n in range(number))
     return MAGIC + to_bytes(mcap.Header("", "")) + b"".join(messages)
 
 
 def with_rig(measurements: list[bytes]) -> bytes:
-    """Measurements that are each solved by least squares."""
+    """Write measurements that each need least squares."""
     attack = Attack()
     attack.channel(Measurement, "/measurements")
     content, rows = bytearray(), []
@@ -211,7 +211,7 @@ def with_rig(measurements: list[bytes]) -> bytes:
 
 
 def same_message_again(times: int, size: int) -> bytes:
-    """One message index, all of whose entries point to one large message."""
+    """Write one message index, all of whose entries point to one large message."""
     attack = Attack()
     attack.channel(CompressedImage, IMAGES)
     content = message(encode(CompressedImage(0, "a", b"\xff\xd8\xff" + bytes(size), "jpeg")))
@@ -220,7 +220,7 @@ def same_message_again(times: int, size: int) -> bytes:
 
 
 def nested_messages(times: int, size: int) -> bytes:
-    """Each message's payload holds all those behind it."""
+    """Write messages whose payload contains all later messages."""
     attack = Attack()
     attack.channel(CompressedImage, IMAGES)
     whole = times * MESSAGE.size + size
@@ -284,7 +284,7 @@ def large_definition(size: int, name: str = "ipsys.v1.Event") -> bytes:
 
 
 def many_elements(kind: type, field_number: int, element: bytes, times: int, messages: int) -> bytes:
-    """Messages with a repeated field of very many small elements."""
+    """Write messages with a repeated field of very many small elements."""
     attack = Attack()
     topic = {CameraPoints: POINTS, Markers: "/runs/r/cameras/a/markers", Run: "/runs/r/record"}.get(
         kind, "/m"
@@ -297,7 +297,7 @@ def many_elements(kind: type, field_number: int, element: bytes, times: int, mes
 
 
 def chunk_heads(number: int) -> bytes:
-    """Many places that look like the head of a large chunk, behind damage."""
+    """Write many byte sequences that look like the start of a large chunk, after damage."""
     attack = Attack()
     attack.channel(CompressedImage, IMAGES)
     packed = compress("zstd", bytes(16 * MIB))
@@ -310,7 +310,7 @@ def chunk_heads(number: int) -> bytes:
 
 
 def real_chunk_heads(number: int) -> bytes:
-    """Many large chunks, each behind damage."""
+    """Write many large chunks, each after damage."""
     attack = Attack()
     attack.channel(CompressedImage, IMAGES)
     packed = compress("zstd", bytes(16 * MIB))
@@ -356,7 +356,7 @@ def raw_image(width: int, height: int, data: bytes, times: int) -> bytes:
 
 
 def jpeg_head(width: int, height: int) -> bytes:
-    """A JPEG of one grey pixel that says it is larger."""
+    """Return a JPEG of one grey pixel with a larger size in its header."""
     import cv2
     import numpy as np
 

@@ -1,4 +1,4 @@
-"""Small logs, and the other readers that must agree with ours."""
+"""Small logs, and independent readers for comparison."""
 
 import fcntl
 import subprocess
@@ -69,7 +69,7 @@ def linear_rows(path: Path) -> list[Row]:
 
 @pytest.fixture
 def rows() -> list[Row]:
-    """Two seconds of two cameras and a small channel; some payloads are big enough for several chunks."""
+    """Write two seconds of two cameras and a small channel; some payloads need several chunks."""
     out: list[Row] = []
     for number in range(60):
         time = 1_700_000_000_000_000_000 + number * 33_000_000
@@ -85,10 +85,10 @@ def log(tmp_path: Path, rows: list[Row]) -> Path:
 
 @pytest.fixture(scope="session")
 def read_with_node() -> Callable[[Path], tuple[int, int, int]]:
-    """A function that reads a log with @mcap/core: count and CRC-32 indexed, count streaming."""
+    """Return a function that reads a log with @mcap/core: count and CRC-32 indexed, count streaming."""
     home = ROOT / ".cache" / "node"
     home.mkdir(parents=True, exist_ok=True)
-    with (home / "lock").open("w") as lock:  # two test processes must not install at once
+    with (home / "lock").open("w") as lock:  # two test processes must not install at the same time
         fcntl.flock(lock, fcntl.LOCK_EX)
         _install(home)
 

@@ -30,14 +30,14 @@ class Operation:
 
 @dataclass(slots=True)
 class Recorder:
-    """A `Storage` that does everything for real and writes down what it did."""
+    """A `Storage` that does all operations for real and notes them."""
 
     operations: list[Operation] = field(default_factory=list)
     _files: dict[int, int] = field(default_factory=dict)
     _names: dict[str, int] = field(default_factory=dict)
 
     def know(self, path: Path) -> None:
-        """Declare a file that exists and is safely on the disk."""
+        """Declare a file that is already safe on the disk."""
         self._names[path.name] = len(self._names) + 1
 
     def open(self, path: Path, flags: int) -> int:
@@ -82,7 +82,7 @@ class Recorder:
 
 @dataclass(slots=True)
 class Disk:
-    """Contents by file number, names in the directory."""
+    """File contents by number, and names in the directory."""
 
     files: dict[int, bytearray]
     names: dict[str, int]
@@ -115,7 +115,7 @@ class Disk:
 
 
 def durable(operations: Sequence[Operation]) -> list[bool]:
-    """For each operation whether a later sync among `operations` has made it safe."""
+    """Return for each operation whether a later sync has made it safe."""
     safe = [False] * len(operations)
     for index, operation in enumerate(operations):
         for earlier in range(index):
@@ -132,7 +132,7 @@ def durable(operations: Sequence[Operation]) -> list[bool]:
 
 
 def torn(operation: Operation, chance: random.Random) -> Iterator[Operation]:
-    """Some sectors of a write."""
+    """Return some sectors of a write."""
     start = operation.at
     end = start + len(operation.data)
     edges = [start, *range(start - start % SECTOR + SECTOR, end, SECTOR), end]
@@ -144,7 +144,7 @@ def torn(operation: Operation, chance: random.Random) -> Iterator[Operation]:
 def crashes(
     files: dict[str, bytes], operations: Sequence[Operation], chance: random.Random, tries: int
 ) -> Iterator[tuple[int, Disk]]:
-    """States of the disk after a loss of power at every point: (operations issued, disk)."""
+    """Yield states of the disk after a power loss at every point: (operations issued, disk)."""
     for cut in range(len(operations) + 1):
         issued = operations[:cut]
         safe = durable(issued)

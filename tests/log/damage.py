@@ -1,4 +1,4 @@
-"""Natural damage to logs of ours and of others, and what of them must survive a repair.
+"""Natural damage to logs, and the messages that must survive a repair.
 
     python -m tests.log.damage --cases 20000 --seed 1
 
@@ -40,7 +40,7 @@ Span = tuple[int, int]
 
 
 class NoSync:
-    """A disk that is not waited for."""
+    """A disk without waiting for syncs."""
 
     def __getattr__(self, name: str) -> Any:
         return getattr(DISK, name)
@@ -57,23 +57,23 @@ QUICK = cast(Storage, NoSync())
 
 @dataclass(frozen=True)
 class Sample:
-    """A log, and where in it each message lies: the record that holds it, and what defines its channel.
+    """A log, and for each message the record that contains it and the definitions of its channel.
 
-    `checked` says that each message is covered by the CRC of its chunk.
+    If `checked` is true, the CRC of its chunk covers each message.
     """
 
     name: str
     data: bytes
     messages: list[tuple[Span, int, Row]]  # record, channel id, message
-    definitions: dict[int, list[Span]]  # by channel id: the records that define it, first ones
-    summary: Span | None  # what repeats the definitions, if anything does
+    definitions: dict[int, list[Span]]  # by channel id: the records that define it, the first ones
+    summary: Span | None  # the records that repeat the definitions, if any
     checked: bool
-    is_readable: bool  # by the stock reader: it needs the channels of a log with chunk indexes in the summary
-    written: frozenset[Payload]  # what the writer had, whether or not it is in the log as a whole record
+    is_readable: bool  # by the stock reader, which needs the channels in the summary
+    written: frozenset[Payload]  # all written data, complete or not in the log
 
 
 def sample_of(name: str, data: bytes, rows: Iterable[Row] = ()) -> Sample:
-    """Take a log apart: by struct and by the stock reader of chunks, not by what is tested."""
+    """Split a log into records with struct and the stock reader, not with the code under test."""
     messages: list[tuple[Span, int, Row]] = []
     channels: dict[int, mcap.Channel] = {}
     schemas: dict[int, Span] = {}
@@ -116,7 +116,7 @@ def _records(data: bytes, opcode: int) -> Iterator[mcap.McapRecord]:
 
 
 def _repeats(rest: bytes) -> bool:
-    """Return if a summary defines channels, counts messages, and has a CRC."""
+    """Return whether a summary defines channels, counts messages, and has a CRC."""
     opcodes, position = set(), 0
     while position + 9 <= len(rest) - 8:
         opcode, length = struct.unpack_from("<BQ", rest, position)
@@ -207,7 +207,7 @@ def foreign_log(folder: Path, chance: random.Random, shape: str) -> bytes:
 
 
 def repeated_log(chance: random.Random) -> bytes:
-    """A log with the definitions in every chunk; half of the time without its last records."""
+    """Return a log with the definitions in every chunk; half of the time without its last records."""
     schema = mcap.Schema(1, b"{}", "jsonschema", "Thing")
     channels = [mcap.Channel(key, topic, "json", {}, 1) for key, topic in ((1, "/a"), (7, "/b"))]
     out = MAGIC + to_bytes(mcap.Header("", "other"))
@@ -231,7 +231,7 @@ def repeated_log(chance: random.Random) -> bytes:
 
 
 def samples(seed: int) -> list[Sample]:
-    """Logs of every kind; another seed gives others."""
+    """Return logs of every kind; another seed gives others."""
     chance = random.Random(seed)
     made: list[Sample] = []
     with tempfile.TemporaryDirectory() as name:
@@ -246,7 +246,7 @@ def samples(seed: int) -> list[Sample]:
 
 @dataclass
 class Damaged:
-    """A damaged log, what was done to it, and which of its bytes are other ones now."""
+    """A damaged log, its damage, and its changed bytes."""
 
     data: bytearray
     done: list[str] = field(default_factory=list)
@@ -265,7 +265,7 @@ class Damaged:
 
 
 def damage(sample: Sample, chance: random.Random, times: int, other: bytes) -> Damaged:
-    """Do to a log what disks, memory and power cuts do."""
+    """Damage a log as disks, memory and power cuts do."""
     out = Damaged(bytearray(sample.data))
     for _ in range(times):
         size = len(out.data)
@@ -306,7 +306,7 @@ class Outcome:
 
 
 def check(path: Path, sample: Sample, damaged: Damaged, other: Sample) -> Outcome:
-    """Repair a damaged log and read it with three readers; sectors of `other` may have got into it."""
+    """Repair a damaged log and read it with three readers; it may contain sectors of `other`."""
     for old in path.parent.iterdir():
         old.unlink()
     path.write_bytes(damaged.data)
@@ -343,7 +343,7 @@ def _check_readers(
         with LogReader(path) as reader:
             count = reader.message_count
             ours = sorted(as_row(m) for m in reader.messages()) if not reader.conflicts else indexed
-    except Exception as error:  # whatever it is, a user would meet it
+    except Exception as error:  # any exception would reach the user
         out.complaints.append(f"reading fails: {error!r}")
         return
     out.kept = len(indexed)
@@ -360,7 +360,7 @@ def _check_readers(
     out.beyond = len(indexed) - out.owed
     if strange and sample.checked:
         out.invented = strange
-        # Without beginning and end nobody knows whether its messages lay in chunks, which have CRCs.
+        # Without beginning and end, it is unknown whether the messages were in chunks with CRCs.
         ends = sample.summary is not None and not damaged.touches(sample.summary)
         known = ends or not damaged.touches((0, 2 * SECTOR))
         if not out.report.unchecked and known:
@@ -368,7 +368,7 @@ def _check_readers(
 
 
 def _check_topics(sample: Sample, damaged: Damaged, got: Counter[Row], out: Outcome) -> None:
-    """Under their own topics, as long as what defines these is whole somewhere."""
+    """Messages have their own topics if the definitions are undamaged somewhere."""
     summary = sample.summary is not None and not damaged.touches(sample.summary)
     for span, channel, row in sample.messages:
         defined = summary or not any(damaged.touches(at) for at in sample.definitions[channel])
@@ -387,7 +387,7 @@ def non_seeking_rows(path: Path) -> list[Row]:
 
 
 def _check_restored(path: Path, damaged: bytes, out: Outcome) -> None:
-    """Check that the removed bytes, put back, give the damaged log byte for byte."""
+    """Check that the repaired log and the removed bytes give the damaged log again, byte for byte."""
     assert out.report is not None
     data = bytearray(path.read_bytes())
     if out.report.damaged_file is not None:
@@ -403,7 +403,7 @@ def _check_restored(path: Path, damaged: bytes, out: Outcome) -> None:
 
 
 def cases(seed: int) -> Iterator[tuple[Sample, Damaged, Sample]]:
-    """Yield logs, what damage made of them, and the log whose sectors may have got into them; without end."""
+    """Yield logs, their damaged versions, and the log whose sectors may be in them, without end."""
     chance = random.Random(seed)
     while True:
         pool = samples(chance.randrange(1 << 30))

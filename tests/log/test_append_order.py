@@ -1,4 +1,4 @@
-"""An append that is cut short, as others see it: programs without the journal, and a disk that fails."""
+"""An interrupted append, as other processes see it: without the journal, and on a failing disk."""
 
 from __future__ import annotations
 
@@ -26,7 +26,7 @@ NEW: list[Row] = [("/runs/a", 10**9 * k, k, bytes([k]) * 400) for k in range(20)
 
 
 def killed_at_each_operation(path: Path, rows: list[Row]) -> Iterator[int]:
-    """Append, then put the file and its journal into each state in between; yields operations done."""
+    """Append, then restore each state of the file and its journal; yield the operations done."""
     old = path.read_bytes()
     storage = Recorder()
     storage.know(path)
@@ -53,7 +53,7 @@ def rows_of(path: Path) -> list[Row]:
 
 @pytest.mark.parametrize("size", [40, 400_000])
 def test_stock_reader_opens_a_log_whatever_append_is_cut(path: Path, size: int) -> None:
-    """It reads the footer at the end of the file, and has no journal."""
+    """Such a reader uses the footer at the end of the file, and has no journal."""
     chance = random.Random(size)
     new = [("/runs/a", 10**9 * k, k, chance.randbytes(size)) for k in range(20)]
     counts = [len(stock_rows(path)) for _ in killed_at_each_operation(path, new)]
@@ -72,8 +72,8 @@ def test_foxglove_reader_opens_a_log_whatever_append_is_cut(
     assert set(complete) == {len(OLD), len(OLD) + len(NEW)}
 
 
-def test_log_cut_short_is_read_appended_and_repaired_without_journal(path: Path) -> None:
-    """The journal stayed on the machine that crashed."""
+def test_truncated_log_is_usable_without_its_journal(path: Path) -> None:
+    """The journal is on the machine that crashed."""
     seen = set()
     for _ in killed_at_each_operation(path, NEW):
         journal_path(path).unlink(missing_ok=True)
@@ -100,7 +100,7 @@ def test_reading_command_names_repair_for_an_append_cut_short(ipsys: Ipsys, path
                               f"Repair it with: ipsys repair {path}"])  # fmt: skip
         said.append(bool(lines))
         if lines:
-            with LogWriter.append(path) as other:  # another process is at it, and mends it itself
+            with LogWriter.append(path) as other:  # another process appends, and rolls back itself
                 other.abandon()
             assert ipsys("info", path).err == ""
     assert 5 < sum(said) < len(said)
@@ -108,7 +108,7 @@ def test_reading_command_names_repair_for_an_append_cut_short(ipsys: Ipsys, path
     assert not said[-1]
 
 
-def test_repair_mends_an_append_cut_short(ipsys: Ipsys, path: Path) -> None:
+def test_repair_rolls_back_an_interrupted_append(ipsys: Ipsys, path: Path) -> None:
     old = path.read_bytes()
     for cut in killed_at_each_operation(path, NEW):
         assert ipsys("repair", path).code == 0
@@ -118,7 +118,7 @@ def test_repair_mends_an_append_cut_short(ipsys: Ipsys, path: Path) -> None:
 
 
 class Failing:
-    """A disk whose operations fail from the one of a number on: all of them, or that one alone."""
+    """A disk whose operations fail from a given number on: all of them, or only that one."""
 
     def __init__(self, first: int, error: int, for_good: bool) -> None:
         self.first, self.error, self.for_good, self.done = first, error, for_good, 0
@@ -147,7 +147,7 @@ def error_of_append(path: Path, storage: Failing) -> str:
 
 @pytest.mark.parametrize("for_good", [True, False])
 @pytest.mark.parametrize("error", [errno.EIO, errno.ENOSPC])
-def test_words_after_a_failed_append_are_true(
+def test_message_after_a_failed_append_is_correct(
     tmp_path: Path, error: int, for_good: bool, caplog: pytest.LogCaptureFixture
 ) -> None:
     whole = create(tmp_path / "whole.mcap", OLD).read_bytes()
@@ -176,8 +176,8 @@ def test_words_after_a_failed_append_are_true(
     assert said == {"as it was", "in the log", ""} | ({"not put back"} if for_good else set())
 
 
-def test_journal_of_the_first_format_still_brings_the_old_log_back(path: Path) -> None:
-    """As earlier versions wrote it, who cut the file before they wrote."""
+def test_journal_of_the_first_format_rolls_back(path: Path) -> None:
+    """Earlier versions truncated the file before they wrote."""
     old = path.read_bytes()
     storage = Recorder()
     storage.know(path)
@@ -218,7 +218,7 @@ class Interrupting:
 
 
 def test_interrupted_append_leaves_the_old_log_or_the_new_one(path: Path) -> None:
-    """Neither a journal nor a longer file stays behind, so that no other command has to mend it."""
+    """No journal and no longer file remains, so no other command has to roll back."""
     old, ends = path.read_bytes(), set()
     for number in range(1, 100):
         path.write_bytes(old)

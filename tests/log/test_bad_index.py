@@ -1,4 +1,4 @@
-"""A message index that points to no whole message of its channel: one line says so."""
+"""A message index that points to no valid message of its channel gives one line."""
 
 import struct
 from pathlib import Path
@@ -21,13 +21,13 @@ BEYOND = "beyond the end of its chunk"
     [
         (5, 30, 1, 0, 0, ""),
         (4, 30, 1, 0, 0, NO_MESSAGE),
-        (5, 30, 9, 0, 0, NO_MESSAGE),  # of a channel that nobody declared
-        (5, 21, 1, 0, 0, NO_MESSAGE),  # too short for its own head
+        (5, 30, 9, 0, 0, NO_MESSAGE),  # of an undefined channel
+        (5, 21, 1, 0, 0, NO_MESSAGE),  # shorter than its own header
         (5, 31, 1, 0, 0, BEYOND),
         (5, (1 << 64) - 10, 1, 0, 0, BEYOND),
         (5, 30, 1, 20, 0, BEYOND),
         (5, 30, 1, (1 << 64) - 1, 0, BEYOND),
-        (5, 30, 1, 20, 1000, "damaged"),  # the chunk index says that the chunk is longer than it is
+        (5, 30, 1, 20, 1000, "damaged"),  # the chunk index has a chunk length that is too large
     ],
 )
 def test_one_message(

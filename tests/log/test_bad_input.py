@@ -1,4 +1,4 @@
-"""A log is untrusted input: one clear line, never another exception, never much memory."""
+"""A log is untrusted input: one clear line, no other exception, and little memory."""
 
 import errno
 import random
@@ -142,7 +142,7 @@ def test_a_journal_without_its_log(tmp_path: Path) -> None:
         LogWriter.create(path)
 
 
-def test_a_journal_of_another_file_is_not_believed(log: Path, tmp_path: Path, rows: list[Row]) -> None:
+def test_journal_of_another_file_is_not_used(log: Path, tmp_path: Path, rows: list[Row]) -> None:
     other = create(tmp_path / "other.mcap", rows[::2])
     before = log.read_bytes()
     for content in (b"", b"junk", bytes(5000), other.read_bytes()):
@@ -153,7 +153,7 @@ def test_a_journal_of_another_file_is_not_believed(log: Path, tmp_path: Path, ro
         assert not journal_path(log).exists()
 
 
-def test_a_whole_journal_of_another_file_is_not_believed(log: Path, tmp_path: Path, rows: list[Row]) -> None:
+def test_complete_journal_of_another_file_is_not_used(log: Path, tmp_path: Path, rows: list[Row]) -> None:
     storage = Recorder()
     other = create(tmp_path / "other.mcap", rows[::2])
     storage.know(other)
@@ -180,7 +180,7 @@ def test_a_changed_summary(log: Path) -> None:
 
 
 def build(path: Path, contents: Contents, *records: mcap.McapRecord) -> Path:
-    """A log of these records with a summary by `contents`."""
+    """Return a log of these records with a summary by `contents`."""
     data = MAGIC + to_bytes(mcap.Header("", "")) + b"".join(to_bytes(record) for record in records)
     contents.data_end = len(data)
     path.write_bytes(data + tail_bytes(contents))
@@ -189,7 +189,7 @@ def build(path: Path, contents: Contents, *records: mcap.McapRecord) -> Path:
 
 @pytest.mark.parametrize("with_size", [True, False])
 def test_a_bomb_is_not_unpacked(with_size: bool, tmp_path: Path) -> None:
-    """A frame that claims much more than its chunk does, and a chunk that claims more than one may."""
+    """A frame with a much larger claimed size than its chunk, and a chunk above the limit."""
     bomb = zstandard.ZstdCompressor(write_content_size=with_size).compress(bytes(300 << 20))
     size = 1000 if with_size else 1 << 42
     chunk = mcap.Chunk("zstd", bomb, 1, 1, 0, size)
@@ -231,7 +231,7 @@ def test_an_index_that_points_to_another_message(log: Path) -> None:
     assert fault_of(read_everything, log) == ""
 
 
-def test_a_hash_that_was_copied_with_its_record_is_not_believed(tmp_path: Path) -> None:
+def test_copied_hash_is_not_trusted(tmp_path: Path) -> None:
     path = tmp_path / "copy.mcap"
     with path.open("wb") as file:
         writer = Writer(file)
@@ -245,7 +245,7 @@ def test_a_hash_that_was_copied_with_its_record_is_not_believed(tmp_path: Path) 
 
 
 def test_any_byte_changed(log: Path) -> None:
-    """Either it is read, or one line says what is wrong."""
+    """The log is readable, or one line names the fault."""
     append(log, [("/runs/a", k, k, b"x") for k in range(9)])
     whole = log.read_bytes()
     chance = random.Random(1)
@@ -277,7 +277,7 @@ def test_any_byte_changed_and_repaired(log: Path) -> None:
 
 
 @pytest.mark.parametrize("claim", [1 << 31, 1 << 40, (1 << 64) - 1])
-def test_lengths_are_not_believed(log: Path, claim: int) -> None:
+def test_claimed_lengths_are_checked(log: Path, claim: int) -> None:
     whole = log.read_bytes()
     chunk = whole.index(b"\x06", 40)
     tracemalloc.start()
@@ -292,7 +292,7 @@ def test_lengths_are_not_believed(log: Path, claim: int) -> None:
         tracemalloc.stop()
 
 
-def test_a_damaged_chunk_in_the_middle_costs_only_itself(log: Path) -> None:
+def test_damaged_chunk_loses_only_itself(log: Path) -> None:
     with LogReader(log) as reader:
         total, chunks = reader.message_count, reader.chunk_count
     data = bytearray(log.read_bytes())
@@ -306,8 +306,8 @@ def test_a_damaged_chunk_in_the_middle_costs_only_itself(log: Path) -> None:
     assert not repair(log).changed
 
 
-def test_what_lay_in_a_damaged_chunk_is_named_exactly(tmp_path: Path) -> None:
-    """By the message indexes behind it, which are whole."""
+def test_messages_lost_in_a_damaged_chunk_are_named_exactly(tmp_path: Path) -> None:
+    """The message indexes after the chunk are undamaged."""
     rows = [(f"/image/{k % 3}", k * 10**8, k, bytes([k]) * 3000) for k in range(60)]
     rows += [("/points", k * 10**8 + 1, k, bytes([k]) * 40) for k in range(60)]
     whole = create(tmp_path / "log.mcap", sorted(rows, key=lambda row: row[1])).read_bytes()
@@ -331,7 +331,7 @@ def test_what_lay_in_a_damaged_chunk_is_named_exactly(tmp_path: Path) -> None:
 
 @dataclass(frozen=True)
 class FullDisk:
-    """A disk that takes `room` bytes of each file."""
+    """A disk with room for `room` bytes of each file."""
 
     room: int
 
@@ -355,7 +355,7 @@ def test_a_full_disk_while_recording(tmp_path: Path, rows: list[Row]) -> None:
 
 @dataclass
 class OneFault:
-    """A disk that once writes only half."""
+    """A disk that writes only a half once."""
 
     armed: bool = False
 
@@ -395,7 +395,7 @@ def test_a_full_disk_while_appending(log: Path) -> None:
 
 
 def test_a_chunk_index_with_wrong_times_is_repaired(tmp_path: Path) -> None:
-    """Readers go by the index, so repair must not say that all is well."""
+    """Readers use the index, so repair must not report a good log."""
     path = create(tmp_path / "a.mcap", [("/a", n, n, bytes(50)) for n in range(100, 160)])
     whole = bytearray(path.read_bytes())
     summary_start = int.from_bytes(whole[-28:-20], "little")
@@ -410,7 +410,7 @@ def test_a_chunk_index_with_wrong_times_is_repaired(tmp_path: Path) -> None:
     crc = zlib.crc32(bytes(whole[summary_start : footer + 25]))
     whole[footer + 25 : footer + 29] = crc.to_bytes(4, "little")
     path.write_bytes(whole)
-    with LogReader(path) as reader:  # goes by the index
+    with LogReader(path) as reader:  # uses the index
         assert list(reader.messages(start_ns=100, end_ns=110)) == []
     assert repair(path).changed
     with LogReader(path) as reader:
@@ -418,8 +418,8 @@ def test_a_chunk_index_with_wrong_times_is_repaired(tmp_path: Path) -> None:
     assert not repair(path).changed
 
 
-def test_a_second_log_behind_the_first_is_kept_beside_it(tmp_path: Path) -> None:
-    """As from ``cat a.mcap b.mcap``: it is not this log's, and it is not thrown away either."""
+def test_appended_second_log_is_kept_in_a_separate_file(tmp_path: Path) -> None:
+    """The file is from ``cat a.mcap b.mcap``: the second part is foreign, and is kept."""
     one = create(tmp_path / "a.mcap", [("/a", n, n, bytes(50)) for n in range(30)]).read_bytes()
     other = create(tmp_path / "b.mcap", [("/b", n, n, bytes(50)) for n in range(20)]).read_bytes()
     path = tmp_path / "joined.mcap"

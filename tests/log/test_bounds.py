@@ -1,4 +1,4 @@
-"""A small file cannot ask for much; a true recording is never refused."""
+"""A small file cannot cost much time or memory; a true recording is never refused."""
 
 from __future__ import annotations
 
@@ -73,7 +73,7 @@ class Cost(NamedTuple):
 
 
 def run(*arguments: object) -> Cost:
-    """A command in a process of its own, which may not go far beyond its bounds."""
+    """Run a command in a separate process that may not exceed its bounds much."""
 
     command = ["prlimit", "--cpu=30", f"--as={4 << 30}", sys.executable, "-m", "ipsys_log"]
     command += map(str, arguments)
@@ -165,7 +165,7 @@ def test_work_on_one_chunk_counts_once() -> None:
 
 
 def black_frames(path: Path, compression: str, with_size: bool, claim: int = 0) -> Path:
-    """Raw images as another program writes them: 20 MiB of black, packed 1000 to 1."""
+    """Write raw images as another program does: 20 MiB of black, packed 1000 to 1."""
     attack = Attack()
     attack.channel(RawImage, "/image")
     frame = message(encode(RawImage(0, "a", 5120, 4096, "mono8", 5120, bytes(20 * MIB))))
@@ -179,7 +179,7 @@ def black_frames(path: Path, compression: str, with_size: bool, claim: int = 0) 
 
 @pytest.mark.parametrize("with_size", [True, False])
 def test_repair_leaves_a_refused_log_as_it_is(with_size: bool, tmp_path: Path) -> None:
-    """It is not damaged: to cut it would lose what another program can read."""
+    """The chunk is not damaged: a cut would lose readable data."""
     path = black_frames(tmp_path / "black.mcap", "zstd", with_size)
     before = path.read_bytes()
     for act in (read_all, repair):
@@ -190,7 +190,7 @@ def test_repair_leaves_a_refused_log_as_it_is(with_size: bool, tmp_path: Path) -
 
 @pytest.mark.parametrize("with_size", [True, False])
 def test_repair_takes_a_false_claim_for_damage(with_size: bool, tmp_path: Path) -> None:
-    """One flipped bit in the size of a chunk is no bomb: its message is saved."""
+    """One flipped bit in the size of a chunk does not make a bomb: its message is saved."""
     path = tmp_path / "a.mcap"
     attack = Attack()
     attack.channel(RawImage, "/image")
@@ -205,7 +205,7 @@ def test_repair_takes_a_false_claim_for_damage(with_size: bool, tmp_path: Path) 
         assert [len(one.data) for one in reader.messages()] == [len(good) - 31] * 2
 
 
-def test_indexed_log_with_a_refused_chunk_still_shows_its_contents(tmp_path: Path) -> None:
+def test_log_with_a_refused_chunk_still_shows_its_contents(tmp_path: Path) -> None:
     path = black_frames(tmp_path / "black.mcap", "zstd", True)
     with LogReader(path) as reader:
         assert reader.message_count == 1
@@ -213,7 +213,7 @@ def test_indexed_log_with_a_refused_chunk_still_shows_its_contents(tmp_path: Pat
 
 
 def test_densest_log_that_we_write_is_read_and_whole(tmp_path: Path) -> None:
-    """Minutes of empty frames; and parameters of one model that are all zeros."""
+    """The log has minutes of empty frames, and parameters of one model that are all zeros."""
     path = tmp_path / "dense.mcap"
     nothing = encode(Markers(0, (), 960, 540))
     with LogWriter.create(path) as log:
@@ -245,5 +245,5 @@ def test_message_larger_than_a_chunk_is_refused_when_written(tmp_path: Path) -> 
     assert LARGEST_MESSAGE < LARGEST_CHUNK
 
 
-def test_refusals_are_faults_of_the_input() -> None:
+def test_refusals_are_input_errors() -> None:
     assert issubclass(BoundError, IpsysError)

@@ -1,4 +1,4 @@
-"""Payloads survive the log bit for bit, and the schemas are those of the package."""
+"""Payloads keep every bit in the log, and the schemas are those of the package."""
 
 from __future__ import annotations
 
@@ -91,7 +91,7 @@ def same(one: Any, other: Any) -> bool:
 
 
 @given(payloads)
-def test_what_is_read_is_what_was_written(payload: Any) -> None:
+def test_reader_returns_the_written_messages(payload: Any) -> None:
     name = next(key for key, kind in PAYLOADS.items() if kind is type(payload))
     data = encode(payload)
     back = decode(name, data)
@@ -100,7 +100,7 @@ def test_what_is_read_is_what_was_written(payload: Any) -> None:
 
 
 @given(payloads)
-def test_anybody_can_read_it_with_the_schema_in_the_log(payload: Any) -> None:
+def test_log_is_readable_with_its_own_schemas(payload: Any) -> None:
     name = next(key for key, kind in PAYLOADS.items() if kind is type(payload))
     pool = descriptor_pool.DescriptorPool()
     for file in descriptor_pb2.FileDescriptorSet.FromString(schema_data(name)).file:
@@ -151,7 +151,7 @@ def test_bytes_that_are_no_such_message(data: bytes) -> None:
 
 
 def test_every_payload_mirrors_its_schema() -> None:
-    """A field that the schema lacks would be lost; the codec finds it only when it is used."""
+    """A field without a schema entry would be lost; the codec finds it only on use."""
     for name, payload in PAYLOADS.items():
         pool = descriptor_pool.DescriptorPool()
         for file in descriptor_pb2.FileDescriptorSet.FromString(schema_data(name)).file:

@@ -1,4 +1,4 @@
-"""Columns of messages equal the payloads that the codec reads, whatever the messages look like."""
+"""Columns of messages equal the payloads of the codec for all message contents."""
 
 from __future__ import annotations
 
@@ -56,7 +56,7 @@ def test_columns_equal_the_payloads(payloads: list[Tracks]) -> None:
 def test_messages_of_another_order_of_fields_are_read() -> None:
     track = Track("a", 3, 1.0, 2.0, 3.0)
     data = encode(Tracks(7, (track,)))
-    # A writer may repeat a field (the last one counts), and add fields that are not known here.
+    # A writer may repeat a field (the last one counts), and add unknown fields.
     more = data + b"\xb8\x3e\x01"
     columns = read_columns("ipsys.v1.Tracks", [data, more], ("id", "x_m"))
     assert columns.fields["id"].values.tolist() == [3, 3]

@@ -1,4 +1,4 @@
-"""A loss of power at any instant leaves the old log or the new one; a recording, a part of it."""
+"""A power loss at any instant leaves the old log or the new one; of a recording, a part."""
 
 import random
 from collections.abc import Sequence
@@ -30,7 +30,7 @@ def record_append(path: Path, rows: list[Row]) -> list[Operation]:
 
 
 def check_append(folder: Path, old: bytes, new: bytes, operations: Sequence[Operation], tries: int) -> int:
-    """Every crash state, seen by a reader, by the next appender and by repair."""
+    """Check every crash state with a reader, the next append and repair."""
     folder.mkdir()
     path = folder / "session.mcap"
     wanted = {}
@@ -104,7 +104,7 @@ def test_append_to_a_larger_log(tmp_path: Path) -> None:
 
 
 def is_repaired(path: Path) -> bool:
-    """Repair a log; False if its beginning is lost, and nothing else says that it is one."""
+    """Repair a log; return False if its start is lost and no other part identifies it."""
     begins_well = path.read_bytes()[:8] == MAGIC
     try:
         repair(path)
@@ -116,7 +116,7 @@ def is_repaired(path: Path) -> bool:
 
 
 def check_recording(folder: Path, rows: list[Row], operations: Sequence[Operation], tries: int) -> set[int]:
-    """After repair every row is one that was written, in order; returns how many were kept."""
+    """Check that every repaired row was written, in order; return the number of kept rows."""
     folder.mkdir()
     path = folder / "recording.mcap"
     by_topic = {topic: [row for row in rows if row[0] == topic] for topic in {row[0] for row in rows}}
@@ -130,12 +130,12 @@ def check_recording(folder: Path, rows: list[Row], operations: Sequence[Operatio
         if not is_repaired(path):
             continue
         got = read(path)
-        # Where the sector that defined a channel is lost, its messages have another topic.
+        # If the sector with a channel's definition is lost, its messages have another topic.
         assert {row[1:] for row in got} <= {row[1:] for row in rows}, f"after {cut} operations"
         for topic, expected in by_topic.items():
             mine = [row for row in got if row[0] == topic]
             rest = iter(expected)
-            assert all(row in rest for row in mine), f"after {cut} operations"  # in order, none changed
+            assert all(row in rest for row in mine), f"after {cut} operations"  # in order and unchanged
         assert sorted(linear_rows(path)) == sorted(got)
         assert not repair(path).changed
         kept.add(len(got))
@@ -173,8 +173,8 @@ def test_larger_recording(tmp_path: Path) -> None:
     check_recording(tmp_path / "crashed", rows, operations, tries=10)
 
 
-def test_what_was_made_of_a_frame_is_never_there_without_it(tmp_path: Path) -> None:
-    """Whenever a recorder is killed: what it has handed to the system is there, and nothing else."""
+def test_results_of_a_frame_are_never_stored_without_the_frame(tmp_path: Path) -> None:
+    """At any kill of a recorder, the flushed messages are there, and no others."""
     rows: list[Row] = [("/points", 0, 0, b"a note before the first frame")]
     for k in range(6, 60):
         rows += [("/image/a", k * 10**8, k, bytes([k]) * 500), ("/points", k * 10**8, k, bytes([k]) * 50)]
@@ -207,7 +207,7 @@ def test_an_atomic_log_is_there_whole_or_not_at_all(tmp_path: Path) -> None:
     assert content == whole
 
 
-def test_what_a_killed_recorder_flushed_is_there(tmp_path: Path) -> None:
+def test_flushed_messages_of_a_killed_recorder_are_kept(tmp_path: Path) -> None:
     path = tmp_path / "recording.mcap"
     writer = LogWriter.create(path)
     writer.add_channel("/points", POINT)

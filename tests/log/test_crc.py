@@ -1,4 +1,4 @@
-"""A CRC put together from those of the parts is that of the whole."""
+"""A CRC combined from the parts equals that of the whole."""
 
 import zlib
 from random import Random
@@ -12,19 +12,21 @@ CRCS = st.integers(0, (1 << 32) - 1)
 
 
 @given(st.binary(), st.binary())
-def test_two_texts(first: bytes, second: bytes) -> None:
+def test_crc_of_two_texts_is_combined(first: bytes, second: bytes) -> None:
     assert combine(zlib.crc32(first), zlib.crc32(second), len(second)) == zlib.crc32(first + second)
 
 
 @given(CRCS, st.integers(0, 1 << 20), st.binary(max_size=20))
-def test_any_length(crc: int, zeros: int, rest: bytes) -> None:
+def test_crc_of_zeros_is_combined_for_any_length(crc: int, zeros: int, rest: bytes) -> None:
     text = bytes(zeros) + rest
     assert combine(crc, zlib.crc32(text), len(text)) == zlib.crc32(text, crc)
 
 
 @given(CRCS, CRCS, CRCS, st.integers(0, 1 << 60), st.integers(0, 1 << 60))
-def test_texts_longer_than_memory(first: int, second: int, third: int, one: int, other: int) -> None:
-    """Whichever two of three are put together first."""
+def test_texts_longer_than_memory_are_refused(
+    first: int, second: int, third: int, one: int, other: int
+) -> None:
+    """The order of combination does not matter."""
     from_left = combine(combine(first, second, one), third, other)
     assert from_left == combine(first, combine(second, third, other), one + other)
 

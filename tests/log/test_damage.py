@@ -1,4 +1,4 @@
-"""Natural damage: what is undamaged survives, three readers agree, and a second repair changes nothing.
+"""Natural damage: all undamaged messages survive, three readers agree, and a second repair changes nothing.
 
 ``IPSYS_DAMAGE_CASES=20000 IPSYS_DAMAGE_SEED=3`` make the slow test longer, and other; `tests.log.damage` is
 the same as a script.
@@ -12,15 +12,15 @@ import pytest
 
 from tests.log.damage import cases, check, run
 
-# What longer runs found: seed, number of the case, log and damage.
+# Cases that longer runs found: seed, number of the case, log and damage.
 HARD = [
-    (71, 1795, "no CRC: swapped in at 2048"),  # indexes of another log swallow the head of a chunk
+    (71, 1795, "no CRC: swapped in at 2048"),  # indexes of another log overwrite the start of a chunk
     (72, 2305, "unchunked: swapped in at 7680"),  # and of a message, in a log without chunks
     (72, 8057, "unchunked, data CRC: cut at 2329, swapped in at 512"),
     (61, 2806, "no CRC: cut at 3916, swapped in at 512"),  # definitions of another log in an attachment
-    (62, 8102, "unchunked: cut at 3264, duplicated 1536 at 512"),  # one whole message between both
+    (62, 8102, "unchunked: cut at 3264, duplicated 1536 at 512"),  # one complete message between both
     (51, 733, "appended: zeroed at 1536, swapped in at 25088"),
-    (92, 7827, "no statistics: cut at 10390, swapped in at 1024"),  # a head half of another log's
+    (92, 7827, "no statistics: cut at 10390, swapped in at 1024"),  # a header that is half of another log's
     (92, 8604, "killed: swapped in at 14848, flipped at 11844"),  # a whole chunk of another log
     (93, 1545, "unchunked, data CRC: cut at 14735, swapped in at 13824"),  # the end of another log
     (
@@ -28,7 +28,7 @@ HARD = [
         3223,
         "unchunked, data CRC: duplicated 13312 at 22528, flipped at 1396",
     ),  # a channel id in a message
-    (101, 6904, "repeated definitions: swapped in at 0"),  # the beginning of another log
+    (101, 6904, "repeated definitions: swapped in at 0"),  # the start of another log
     (103, 3192, "killed: swapped in at 6144"),  # a whole chunk of another log in the first one
     (103, 8041, "unchunked: cut at 1214, zeroed at 512"),  # two small messages between both
     (103, 8506, "unchunked: zeroed at 2560, duplicated 18432 at 512"),  # the first message between both

@@ -1,4 +1,4 @@
-"""Logs that others wrote, in every shape that the format allows: read, appended to, read again."""
+"""Logs of other software, in every shape of the format: read, appended to, read again."""
 
 import random
 from collections.abc import Callable
@@ -27,7 +27,7 @@ def payload(number: int) -> bytes:
 
 
 def write(path: Path, **options: object) -> list[Row]:
-    """Two topics and a third with two channels, chunks of 2 kB, an attachment, metadata."""
+    """Return two topics and a third with two channels, chunks of 2 kB, an attachment, metadata."""
     rows: list[Row] = []
     with path.open("wb") as file:
         writer = Writer(file, chunk_size=2000, **options)  # type: ignore[arg-type]
@@ -37,7 +37,7 @@ def write(path: Path, **options: object) -> list[Row]:
         ids = [writer.register_channel(topic, "json", schema) for topic in topics]
         writer.add_attachment(1, 2, "notes.txt", "text/plain", b"hello")
         for number in range(COUNT):
-            time = number * 10 - number % 3 * 25 + 100  # not in order
+            time = number * 10 - number % 3 * 25 + 100  # out of order
             writer.add_message(ids[number % 4], time, payload(number), time)
             rows.append((topics[number % 4], time, time, payload(number)))
         writer.add_metadata("robot", {"name": "seven"})
@@ -103,7 +103,7 @@ def test_every_shape(shape: str, tmp_path: Path) -> None:
 def test_node_reads_what_was_appended(
     shape: str, tmp_path: Path, read_with_node: Callable[[Path], tuple[int, int, int]]
 ) -> None:
-    """It reads by index neither logs without chunks nor chunks without message indexes."""
+    """The other reader cannot index logs without chunks, or chunks without message indexes."""
     path = tmp_path / "foreign.mcap"
     rows = write(path, **SHAPES[shape])
     append(path, NEW)
@@ -130,7 +130,7 @@ def test_a_foreign_channel_can_be_extended(tmp_path: Path) -> None:
 
 
 def test_ids_with_gaps(tmp_path: Path) -> None:
-    """Ids 7 and 65535 are taken: new ones must be others."""
+    """Ids 7 and 65535 are in use, so new ids must differ."""
     contents = Contents()
     contents.schemas[65535] = mcap.Schema(65535, b"", "json", "Thing")
     for key in (7, 65535):
@@ -163,8 +163,8 @@ def test_channels_of_one_topic_that_differ(tmp_path: Path) -> None:
             reader.messages()
 
 
-def test_images_in_a_compressed_log_are_read_in_place(tmp_path: Path) -> None:
-    """Raw blocks of zstd and lz4 frames; messages that span blocks; compressible ones in between."""
+def test_images_in_a_compressed_log_are_read_directly(tmp_path: Path) -> None:
+    """The log has raw blocks of zstd and lz4 frames, messages across blocks, and compressible ones."""
     chance = random.Random(1)
     for compression in (CompressionType.ZSTD, CompressionType.LZ4):
         for soft in (0, 40_000):

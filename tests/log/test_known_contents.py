@@ -19,7 +19,7 @@ from tests.conftest import ROOT, Ipsys
 
 
 class Parses:
-    """Counts how often a summary is parsed."""
+    """A counter of parsed summaries."""
 
     count = 0
 
@@ -77,7 +77,7 @@ def test_change_by_another_process_is_read(log: Path, tmp_path: Path, parses: Pa
     with one_reading():
         with LogReader(log) as reader:
             assert "/by_another_process" not in reader.channels
-        with log.open("r+b") as file:  # the same file, as an append of another process leaves it
+        with log.open("r+b") as file:  # the same file after an append of another process
             file.write(other.read_bytes())
         append(log, "/ours")
         with LogReader(log) as reader:

@@ -1,4 +1,4 @@
-"""The merge of chunks that overlap in time, apart from files."""
+"""The merge of chunks that overlap in time, without files."""
 
 from collections.abc import Iterator
 
@@ -9,12 +9,12 @@ from hypothesis import strategies as st
 from ipsys_log.log.contents import RawMessage
 from ipsys_log.log.order import Cursor, PendingChunk, in_log_order
 
-Chunk = tuple[int, list[int]]  # how long before its first message it says to start, and log times
+Chunk = tuple[int, list[int]]  # time from the claimed start to the first message, and log times
 CHUNKS = st.lists(st.tuples(st.integers(0, 3), st.lists(st.integers(3, 30), max_size=8)), max_size=8)
 
 
 class Opened:
-    """Chunks at offsets 100, 200, ..., of messages that carry their own offset as publish time."""
+    """Return chunks at offsets 100, 200, ..., of messages with their own offset as publish time."""
 
     def __init__(self, chunks: list[Chunk]) -> None:
         self.places: list[int] = []
@@ -47,7 +47,7 @@ def test_by_time_then_chunk_then_offset(chunks: list[Chunk]) -> None:
 
 
 @given(CHUNKS)
-def test_no_chunk_is_opened_before_its_time(chunks: list[Chunk]) -> None:
+def test_chunks_are_opened_as_late_as_possible(chunks: list[Chunk]) -> None:
     opened = Opened(chunks)
     last_ns = 0
     for message in in_log_order(opened.pending, fault):
@@ -58,7 +58,7 @@ def test_no_chunk_is_opened_before_its_time(chunks: list[Chunk]) -> None:
 
 @pytest.mark.parametrize("others", [[5, 20], [5, 6, 7, 8, 20]])
 def test_a_message_from_before_its_chunk_says(others: list[int]) -> None:
-    """The second chunk says that it starts at 9 and holds a message of 4."""
+    """The second chunk claims to start at 9 but contains a message of 4."""
     pending = Opened([(0, others), (-5, [4])]).pending
     with pytest.raises(ValueError, match="200"):
         list(in_log_order(pending, fault))

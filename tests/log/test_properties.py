@@ -1,4 +1,4 @@
-"""Whatever is written in whatever order: the reader sorts it, and k sessions equal one."""
+"""For any messages in any order, the reader sorts them, and k sessions equal one."""
 
 import tempfile
 from pathlib import Path
@@ -24,7 +24,7 @@ ROWS = st.lists(
 
 @settings(max_examples=150)
 @given(st.lists(ROWS, min_size=1, max_size=4), st.integers(0, 10**10), st.integers(0, 10**11))
-def test_sessions(sessions: list[list[Row]], start: int, length: int) -> None:
+def test_appended_sessions_equal_one_log(sessions: list[list[Row]], start: int, length: int) -> None:
     with tempfile.TemporaryDirectory() as folder:
         path = create(Path(folder) / "log.mcap", sessions[0])
         for rows in sessions[1:]:
@@ -60,7 +60,7 @@ def hash_of(rows: list[Row]) -> str:
 @settings(max_examples=60)
 @given(ROWS, st.data())
 def test_repair_of_any_beginning(rows: list[Row], data: st.DataObject) -> None:
-    """A log cut anywhere is repaired to a part of each channel, in the order in which it was written."""
+    """A log that is cut at any byte is repaired to the first messages of each channel."""
     with tempfile.TemporaryDirectory() as folder:
         path = create(Path(folder) / "log.mcap", rows)
         size = path.stat().st_size

@@ -1,4 +1,4 @@
-"""A repair saves what can be saved, loses no byte, says what it does not know, and is done or not done."""
+"""A repair saves all readable data, loses no byte, reports unknown losses, and is atomic."""
 
 import random
 import struct
@@ -31,7 +31,7 @@ def read(path: Path) -> list[Row]:
 
 
 def agree(path: Path) -> list[Row]:
-    """Read with all readers, which must find the same; repair it again, which must change nothing."""
+    """Read with all readers, which must agree; repair again, which must change nothing."""
     rows = sorted(read(path))
     for other in (stock_rows, linear_rows, non_seeking_rows):
         assert sorted(other(path)) == rows
@@ -80,7 +80,7 @@ def test_repair_zeroed_index_body_is_written_again(tmp_path: Path) -> None:
 @pytest.mark.parametrize("finished", [True, False])
 @pytest.mark.parametrize("what", ["schema id", "channel id", "schema record"])
 def test_repair_lost_definition_keeps_messages(what: str, finished: bool, tmp_path: Path) -> None:
-    """Under their topics where the summary says them, or where only one bit of an id differs."""
+    """Messages keep their topics if the summary has them, or if only one bit of an id differs."""
     rows = rows_of(60)
     path = create(tmp_path / "a.mcap", rows)
     data = bytearray(path.read_bytes())
@@ -104,7 +104,7 @@ def test_repair_lost_definition_keeps_messages(what: str, finished: bool, tmp_pa
 
 
 def test_repair_zeroed_beginning_keeps_every_message(tmp_path: Path) -> None:
-    """Without a summary nobody knows the topics; the messages are there under others."""
+    """Without a summary, the topics are unknown; the messages are there under others."""
     rows = rows_of(60)
     path = create(tmp_path / "a.mcap", rows)
     data = bytearray(path.read_bytes())
@@ -137,7 +137,7 @@ def one_chunk_log(path: Path, compression: CompressionType, count: int = 3000) -
 
 
 def whole_messages(data: bytes) -> int:
-    """Messages in the records of a chunk that ends somewhere."""
+    """Messages are in the records of a chunk with a lost end."""
     position = count = 0
     while position + 9 <= len(data):
         opcode, length = struct.unpack_from("<BQ", data, position)
@@ -174,7 +174,7 @@ def test_repair_cut_chunk_keeps_what_streams_out(compression: CompressionType, t
 
 @pytest.mark.parametrize("compression", CompressionType)
 def test_repair_hole_in_chunk_keeps_its_beginning(compression: CompressionType, tmp_path: Path) -> None:
-    """In the middle of a log: what was in the chunk is known by its index, and saved up to the hole."""
+    """The index gives the contents of a chunk; the part before the hole is saved."""
     path = tmp_path / "a.mcap"
     rows = one_chunk_log(path, compression)
     data = bytearray(path.read_bytes())
@@ -193,7 +193,7 @@ def test_repair_hole_in_chunk_keeps_its_beginning(compression: CompressionType, 
 
 
 def log_with_loose_messages(path: Path) -> list[Row]:
-    """Chunks, each with its message indexes, and messages between them; no summary."""
+    """Return chunks, each with its message indexes, and messages between them; no summary."""
     rows, data = [], to_bytes(mcap.Header("", "other"), mcap.Channel(1, "/a", "json", {}, 0))
     data = MAGIC + data + to_bytes(mcap.Channel(2, "/b", "json", {}, 0))
     for number in range(6):
@@ -216,7 +216,7 @@ def log_with_loose_messages(path: Path) -> list[Row]:
 @pytest.mark.parametrize("at", [9, 0, 14])
 @pytest.mark.parametrize("number", [2, 5, 7])
 def test_repair_damaged_index_costs_no_loose_message(at: int, number: int, tmp_path: Path) -> None:
-    """One bit of its channel, its type or its length, in a log with messages in chunks and beside them."""
+    """Flip one bit of channel, type or length, in a log with messages in and outside of chunks."""
     path = tmp_path / "mixed.mcap"
     rows = log_with_loose_messages(path)
     data = bytearray(path.read_bytes())
@@ -226,8 +226,8 @@ def test_repair_damaged_index_costs_no_loose_message(at: int, number: int, tmp_p
     assert agree(path) == sorted(rows)
 
 
-def test_repair_says_that_it_does_not_know_what_was_taken_out(tmp_path: Path) -> None:
-    """A whole chunk is missing, with its indexes: the summary is elsewhere, and no CRC fits."""
+def test_repair_reports_an_unknown_content_of_removed_bytes(tmp_path: Path) -> None:
+    """A chunk and its indexes are missing: the summary has moved, and no CRC matches."""
     path = create(tmp_path / "log.mcap", rows_of(60))
     data = path.read_bytes()
     start, _ = record_at(data, Opcode.CHUNK, 1)
@@ -239,7 +239,7 @@ def test_repair_says_that_it_does_not_know_what_was_taken_out(tmp_path: Path) ->
 
 
 def test_repair_wrong_crc_takes_no_message(tmp_path: Path) -> None:
-    """Nobody knows which message is damaged: none is taken for right, and all are named."""
+    """The damaged message is unknown: none is trusted, and all are named."""
     path = tmp_path / "a.mcap"
     rows = one_chunk_log(path, CompressionType.NONE, 50)
     data = bytearray(path.read_bytes())
@@ -252,7 +252,7 @@ def test_repair_wrong_crc_takes_no_message(tmp_path: Path) -> None:
 
 
 def restored(path: Path, kept_in: Path | None, size: int) -> bytes:
-    """The damaged log, from the repaired one and the bytes that were taken out."""
+    """Return the damaged log, from the repaired one and the removed bytes."""
     assert kept_in is not None
     data = bytearray(path.read_bytes()[:size])
     with kept_in.open("rb") as file:
@@ -304,8 +304,7 @@ def repair_module_of() -> object:
 
 
 def test_repair_cut_at_every_point_is_old_or_new(tmp_path: Path) -> None:
-    """A loss of power during a repair: repaired again, the log is what it would have been, and its old
-    bytes are kept."""
+    """After a power loss during a repair, a second repair gives the same log, and the old bytes are kept."""
     path = create(tmp_path / "a.mcap", rows_of(25))
     data = bytearray(path.read_bytes())
     start, end = record_at(data, Opcode.CHUNK, 1)
@@ -339,7 +338,7 @@ def test_repair_cut_at_every_point_is_old_or_new(tmp_path: Path) -> None:
 
 
 def test_repair_record_types_that_stray_are_passed_over(tmp_path: Path) -> None:
-    """A second definition of one id, an index of no chunk, and a message of no channel."""
+    """The log has a second definition of one id, an index of no chunk, and a message of no channel."""
     rows = rows_of(20)
     path = create(tmp_path / "a.mcap", rows)
     data = path.read_bytes()
@@ -355,7 +354,7 @@ def test_repair_record_types_that_stray_are_passed_over(tmp_path: Path) -> None:
 
 
 def test_repair_small_bomb_takes_little_memory(tmp_path: Path) -> None:
-    """A cut chunk of 1 GiB of zeros in 33 kB."""
+    """Return a cut chunk of 1 GiB of zeros in 33 kB."""
     import tracemalloc
 
     path = create(tmp_path / "a.mcap", rows_of(5))
@@ -374,7 +373,7 @@ def test_repair_small_bomb_takes_little_memory(tmp_path: Path) -> None:
 
 
 def test_repair_hash_of_channel_is_that_of_its_messages(tmp_path: Path) -> None:
-    """A run must not be told another input than it has."""
+    """The record of a run must not name another input than the real one."""
     path = tmp_path / "a.mcap"
     one_chunk_log(path, CompressionType.NONE)
     data = bytearray(path.read_bytes())

@@ -1,4 +1,4 @@
-"""Logs of ROS 2, as another library writes them."""
+"""Logs of ROS 2, written by another library."""
 
 from __future__ import annotations
 
@@ -50,7 +50,7 @@ def raw(grey: Any) -> Any:
 
 
 def write(folder: Path, messages: list[tuple[str, int, Any]]) -> Path:
-    """A bag; messages are recorded 20 ms after they were stamped."""
+    """Write a bag whose messages are recorded 20 ms after their stamps."""
     connections: dict[str, Any] = {}
     with Writer(folder / "bag", version=9, storage_plugin=StoragePlugin.MCAP) as writer:
         for topic, time_ns, message in messages:
@@ -88,7 +88,7 @@ def test_pictures_and_lenses_are_read_as_they_are(bag: Path) -> None:
     assert lens.payload.K.tolist() == [[500, 0, 320], [0, 510, 180], [0, 0, 1]]
     assert isinstance(first.payload, CompressedImage)
     assert first.payload.format == "jpeg"
-    # Published when the frame was taken, logged when it came.
+    # The publish time is the exposure, the log time the arrival.
     assert first.publish_time_ns == first.payload.timestamp == NS + 10**8
     assert first.log_time_ns == NS + 10**8 + 20_000_000
     assert isinstance(white.payload, RawImage)
@@ -108,7 +108,7 @@ def test_a_bag_is_detected_in_place(bag: Path, tmp_path: Path, ipsys: Ipsys) -> 
     }
 
 
-def test_what_is_no_message_is_named(bag: Path) -> None:
+def test_invalid_messages_are_reported(bag: Path) -> None:
     with bag.open("rb") as file:
         schema, _, message = next(iter(make_reader(file).iter_messages("/red/camera_info")))
     assert schema is not None

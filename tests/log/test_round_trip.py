@@ -104,7 +104,7 @@ def test_an_exception_leaves_an_append_undone(log: Path) -> None:
     with pytest.raises(RuntimeError):
         fail_in(LogWriter.append(log), LATER)
     assert log.read_bytes() == before
-    append(log, LATER)  # and the lock is free again
+    append(log, LATER)  # and the lock is released
 
 
 def test_an_exception_leaves_no_atomic_log(tmp_path: Path, rows: list[Row]) -> None:
@@ -150,7 +150,7 @@ def test_another_schema_on_the_same_topic_is_refused(log: Path) -> None:
 
 
 def test_a_schema_that_has_grown_continues_the_topic(log: Path) -> None:
-    """A later version adds fields to a message; old logs are still appended to."""
+    """A later version adds fields to a message; appends to old logs still work."""
     with LogReader(log) as reader:
         old = reader.channels["/points"].schema
         count = reader.channels["/points"].message_count
@@ -165,7 +165,7 @@ def test_a_schema_that_has_grown_continues_the_topic(log: Path) -> None:
         messages = list(reader.messages(["/points"]))
         hashed = reader.channel_hash("/points")
     assert messages[-1].data == b"new"
-    # The one hash of both is right, and is found without reading them.
+    # The combined hash is correct, and is computed without reading them.
     with LogWriter.append(log) as writer:
         writer.add_channel("/points", grown)
         writer.write("/points", end_ns + 2, end_ns + 2, b"newer")

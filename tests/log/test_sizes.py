@@ -1,4 +1,4 @@
-"""Messages of every size from nothing to a whole chunk: long ones go other ways, written and read."""
+"""Messages of every size up to a whole chunk: long ones use other code paths."""
 
 import random
 import tempfile
@@ -23,7 +23,7 @@ SIZES = st.one_of(
 
 @st.composite
 def any_rows(draw: st.DrawFn) -> list[Row]:
-    """Topics and log times in any order; payloads that compress and such that do not."""
+    """Draw topics and log times in any order, and payloads that compress or not."""
     chance = random.Random(draw(st.integers(0, 9)))
     rows: list[Row] = []
     for _ in range(draw(st.integers(0, 12))):
@@ -41,7 +41,7 @@ def test_own_logs(first: list[Row], second: list[Row]) -> None:
         path = append(create(Path(folder) / "log.mcap", first), second)
         everything = sorted(first + second)
         assert sorted(stock_rows(path)) == everything
-        assert sorted(linear_rows(path)) == everything  # the CRC of the data section holds
+        assert sorted(linear_rows(path)) == everything  # the CRC of the data section is correct
         check(path, first + second)
         assert not repair(path).changed
 
@@ -62,7 +62,7 @@ def test_foreign_logs(rows: list[Row], compression: CompressionType, chunk_size:
 
 
 def check(path: Path, rows: list[Row]) -> None:
-    """All of it, and each topic by itself: other messages lie between its own then."""
+    """Read all topics, and each topic alone, with messages of other topics between its own."""
     with LogReader(path) as reader:
         got = [as_row(message) for message in reader.messages()]
         assert sorted(got) == sorted(rows)
@@ -75,7 +75,7 @@ def check(path: Path, rows: list[Row]) -> None:
 
 @given(st.lists(st.integers(0, 5 * 10**9), max_size=20))
 def test_no_chunk_spans_a_second(times: list[int]) -> None:
-    """This holds for times in any order, so that a reader opens few chunks at once."""
+    """This is true for times in any order, so a reader opens few chunks at once."""
     with tempfile.TemporaryDirectory() as folder:
         path = create(Path(folder) / "log.mcap", [("/points", time, time, b"point") for time in times])
         with LogReader(path) as reader:
@@ -85,7 +85,7 @@ def test_no_chunk_spans_a_second(times: list[int]) -> None:
 
 
 def test_a_recording_of_frames_cut_at_every_point(tmp_path: Path) -> None:
-    """As in test_crash, with frames so large that CRCs are put together."""
+    """The test is that of test_crash, with frames so large that CRCs are combined."""
     chance = random.Random(8)
     rows: list[Row] = []
     for k in range(5):

@@ -1,4 +1,4 @@
-"""Readers while somebody appends, and writers killed at random moments."""
+"""Readers during appends, and writers killed at random moments."""
 
 import os
 import random
@@ -31,7 +31,7 @@ def session(number: int) -> list[Row]:
 
 
 def check_consistent(path: Path) -> int:
-    """Read all; the number of sessions in the log, which must all be whole."""
+    """Read all messages; return the number of sessions, which must all be complete."""
     with LogReader(path) as reader:
         rows = [as_row(message) for message in reader.messages()]
         assert reader.message_count == len(rows)
@@ -100,7 +100,7 @@ def start(kind: str, path: Path) -> "subprocess.Popen[bytes]":
 
 def kill_soon(process: "subprocess.Popen[bytes]", chance: random.Random) -> None:
     assert process.stdout is not None
-    process.stdout.readline()  # it has begun
+    process.stdout.readline()  # the writer has started
     time.sleep(chance.random() * 0.15)
     process.send_signal(signal.SIGKILL)
     process.wait()
@@ -149,12 +149,12 @@ def test_kill_a_recorder(tmp_path: Path) -> None:
     assert kept > 0
 
 
-def test_a_journal_that_the_log_has_outlived_is_not_rolled_back(tmp_path: Path) -> None:
+def test_outdated_journal_is_not_rolled_back(tmp_path: Path) -> None:
     """A crash, then a repair and an append under another name, then the old name again."""
     path, moved = tmp_path / "a.mcap", tmp_path / "b.mcap"
     create(path, [("/a", n, n, b"old") for n in range(30)])
     whole = path.read_bytes()
-    # As a crash leaves it: the journal is there, the file is cut where the tail was.
+    # This is the state after a crash: the journal exists, the file ends at the old tail.
     with pytest.raises(OSError, match="crash"):
         _crash_after_truncate(path, whole)
     path.rename(moved)
@@ -184,7 +184,7 @@ def _crash_after_truncate(path: Path, whole: bytes) -> None:
         os.close(fd)
 
 
-def test_a_log_is_one_by_whichever_link_it_is_opened(tmp_path: Path) -> None:
+def test_log_is_the_same_through_every_link(tmp_path: Path) -> None:
     path, link = tmp_path / "a.mcap", tmp_path / "link.mcap"
     create(path, [("/a", n, n, b"old") for n in range(30)])
     whole = path.read_bytes()

@@ -1,4 +1,4 @@
-"""Started by test_together.py and killed: appends to a log, or records one, until then."""
+"""Append to a log, or record one, until test_together.py kills this process."""
 
 import itertools
 import sys

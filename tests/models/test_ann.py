@@ -1,4 +1,4 @@
-"""Small networks: their slopes, what they can learn, and the paper's figures."""
+"""Small networks: their gradients, their learning, and the paper's figures."""
 
 from __future__ import annotations
 
@@ -21,7 +21,7 @@ from tests.models.test_rays import authors_pairs, error_cm
 
 
 def test_three_tanh_neurons_and_a_linear_output() -> None:
-    """Fig. 4 of the paper, written out."""
+    """Compute the network of fig. 4 of the paper, written out."""
     rng = np.random.default_rng(0)
     weights, x = rng.normal(size=16), rng.normal(size=(5, 3))
     neurons = [np.tanh(weights[4 * k] + x @ weights[4 * k + 1 : 4 * k + 4]) for k in range(3)]
@@ -30,7 +30,7 @@ def test_three_tanh_neurons_and_a_linear_output() -> None:
     np.testing.assert_allclose(found[0], expected, atol=1e-12)
 
 
-def test_its_slopes_are_those_of_finite_differences() -> None:
+def test_gradients_equal_finite_differences() -> None:
     rng = np.random.default_rng(1)
     weights, inputs = rng.normal(size=16), np.column_stack([np.ones(6), rng.normal(size=(6, 3))])
 
@@ -42,7 +42,7 @@ def test_its_slopes_are_those_of_finite_differences() -> None:
     np.testing.assert_allclose(found[0].T, numeric, atol=1e-5)
 
 
-def test_it_learns_what_another_network_of_its_kind_says() -> None:
+def test_network_learns_the_output_of_another_network() -> None:
     rng = np.random.default_rng(2)
     x, elsewhere = rng.normal(size=(200, 3)), rng.normal(size=(200, 3))
     teacher = MLPRegressor(
@@ -54,15 +54,15 @@ def test_it_learns_what_another_network_of_its_kind_says() -> None:
 
 
 def test_noise_alone_is_not_learned() -> None:
-    """The pull that the data choose: without it 16 weights make much of 40 numbers."""
+    """The data select the weight decay: without it, 16 weights overfit 40 numbers."""
     rng = np.random.default_rng(3)
     x, noise = rng.normal(size=(40, 3)), rng.normal(size=40)
     assert NeuralNetwork().fit(x, noise).predict(x).std() < 0.2 * noise.std()
 
 
 @pytest.mark.parametrize("count", [5, 6, 8, 10])
-def test_a_few_pairs_are_not_taken_for_noise(count: int) -> None:
-    """A network that says nothing explains them too, if the noise may be as large as the floor."""
+def test_few_pairs_give_no_noise_estimate(count: int) -> None:
+    """A constant network also explains the data if the noise may be as large as the floor."""
     for seed in range(10):
         rng = np.random.default_rng(seed)
         x = rng.uniform((-2.3, -1.0, 1.9), (2.3, 1.0, 2.2), (count, 3))
@@ -84,7 +84,7 @@ def test_a_seed_gives_the_same_network_and_another_another() -> None:
     assert not np.array_equal(one, other)
 
 
-def test_it_keeps_scikit_learns_contract() -> None:
+def test_estimator_passes_scikit_learn_checks() -> None:
     with warnings.catch_warnings():
         warnings.simplefilter("ignore", SkipTestWarning)
         check_estimator(NeuralNetwork())
@@ -92,7 +92,7 @@ def test_it_keeps_scikit_learns_contract() -> None:
 
 @pytest.mark.parametrize(("hybrid", "limit_cm"), [(False, 1.782), (True, 1.670)])
 def test_the_papers_figures(data: Path, hybrid: bool, limit_cm: float) -> None:
-    """Table I: means of ANN and RT+ANN over the three cameras, whatever the seed."""
+    """Compare the means of ANN and RT+ANN over the three cameras with Table I, for any seed."""
     means = []
     for seed in range(5):
         network_of_seed = NeuralNetwork(seed)

@@ -1,4 +1,4 @@
-"""Kriging against formulas written out, and against the paper's figures."""
+"""Kriging compared with written formulas and with the paper's figures."""
 
 from __future__ import annotations
 
@@ -25,7 +25,7 @@ def wavy(seed: int, count: int = 30, noise: float = 0.0) -> tuple[np.ndarray, np
 
 @pytest.mark.parametrize("noisy", [False, True])
 def test_mean_and_variance_are_those_of_the_textbook(noisy: bool) -> None:
-    """Universal kriging by its normal equations, with the parameters that were found."""
+    """Compute universal kriging by its normal equations, with the fitted parameters."""
     x, y = wavy(0, noise=0.1 if noisy else 0.0)
     model = Kriging(noisy).fit(x, y)
     points = (x - model.centre_) / model.scale_
@@ -52,7 +52,7 @@ def test_mean_and_variance_are_those_of_the_textbook(noisy: bool) -> None:
     np.testing.assert_allclose(std, np.sqrt(variance) * model.target_scale_, rtol=1e-3, atol=1e-6)
 
 
-def test_interpolation_goes_through_its_places_and_is_uncertain_away_from_them() -> None:
+def test_interpolation_is_exact_only_at_its_points() -> None:
     x, y = wavy(1)
     model = Kriging().fit(x, y)
     found, std = model.predict(x, return_std=True)
@@ -70,7 +70,7 @@ def test_regression_finds_the_noise() -> None:
     assert np.abs(model.predict(x) - y).std() > 0.1
 
 
-def test_no_other_parameters_are_more_likely() -> None:
+def test_fitted_parameters_maximise_the_likelihood() -> None:
     from scipy.stats import multivariate_normal
 
     x, y = wavy(3, count=40, noise=0.1)
@@ -92,7 +92,7 @@ def test_no_other_parameters_are_more_likely() -> None:
     assert log_likelihood(best) >= max(log_likelihood(np.clip(o, low, high)) for o in others) - 1e-6
 
 
-def test_two_measurements_of_one_place_do_not_break_it() -> None:
+def test_duplicate_points_do_not_break_the_fit() -> None:
     x, y = wavy(4)
     x[5] = x[6]
     found = Kriging().fit(x, y).predict(x)
@@ -100,18 +100,18 @@ def test_two_measurements_of_one_place_do_not_break_it() -> None:
     assert np.isfinite(Kriging(noisy=True).fit(x, y).predict(x)).all()
 
 
-# It fits 11 rows of 10 columns: the linear trend leaves nothing that a variance could be learned from.
+# It fits 11 rows of 10 columns: the linear trend leaves no data for a variance.
 _TOO_FEW = {"check_regressor_multioutput": "has fewer rows than a linear trend of its columns needs"}
 
 
 @pytest.mark.parametrize("noisy", [False, True])
-def test_it_keeps_scikit_learns_contract(noisy: bool) -> None:
+def test_estimator_passes_scikit_learn_checks(noisy: bool) -> None:
     with warnings.catch_warnings():
         warnings.simplefilter("ignore", SkipTestWarning)
         check_estimator(Kriging(noisy), expected_failed_checks=_TOO_FEW)
 
 
-def test_pairs_that_leave_nothing_beside_the_trend_are_refused() -> None:
+def test_too_few_pairs_for_a_trend_are_refused() -> None:
     x, y = wavy(5, count=6)
     Kriging().fit(x, y)
     with pytest.raises(FitError, match=r"kriging needs at least 6 pairs .*, found 5 samples; measure more"):
@@ -139,7 +139,7 @@ def test_the_variance_comes_back_out_of_a_log_too() -> None:
         np.testing.assert_allclose(one, other, atol=1e-9)
 
 
-# Tables I: means of KI and RT+KI in cm for the red, white and black camera.
+# Table I: means of KI and RT+KI in cm for the red, white and black camera.
 INTERPOLATED = {"kriging": (1.306, 2.297, 2.898), "rigid+kriging": (1.312, 2.294, 2.804)}
 REGRESSED = {"kriging-regression": 2.048, "rigid+kriging-regression": 2.033}
 

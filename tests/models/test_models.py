@@ -1,4 +1,4 @@
-"""Models against other roads to the same numbers."""
+"""Models compared with independent computations."""
 
 from __future__ import annotations
 
@@ -25,7 +25,7 @@ from ipsys_log.models.table import MODELS, create, inputs, min_pairs, parameters
 
 
 def places(seed: int, count: int = 40, noise_m: float = 0.01) -> tuple[Any, Any]:
-    """Camera points over a floor, and world points about where they are."""
+    """Return camera points over a floor, and world points near their positions."""
     rng = np.random.default_rng(seed)
     points = rng.uniform((-2.3, -1.0, 1.9), (2.3, 1.0, 2.2), (count, 3))
     world = Rotation.from_euler("xyz", (3.1, 0.02, 0.03)).apply(points) + np.array([2.4, 0.9, 2.1])
@@ -41,12 +41,12 @@ def test_rigid_is_what_scipy_finds(seed: int, noise_m: float) -> None:
     np.testing.assert_allclose(translation, world.mean(axis=0) - oracle.apply(points.mean(axis=0)), atol=1e-5)
 
 
-def test_a_flat_set_of_places_gives_a_rotation_and_not_a_reflection() -> None:
+def test_coplanar_points_give_a_rotation_not_a_reflection() -> None:
     points, _ = places(0)
     points[:, 2] = 2.0  # all at one height
     turn = Rotation.from_euler("xyz", (3.1, 0.02, 0.03))
     world = turn.apply(points) + np.array([2.4, 0.9, 2.1])
-    # A trace of noise beside the plane tempts eq. (11) into mirroring it.
+    # A little noise out of the plane makes eq. (11) mirror it.
     mirrored = points.copy()
     mirrored[:, 2] += np.random.default_rng(0).normal(0, 1e-3, len(points))
     normal = turn.apply([0, 0, 1])
@@ -67,8 +67,8 @@ def test_poly_is_least_squares_on_second_order_terms(seed: int) -> None:
     np.testing.assert_allclose(found, oracle.predict(elsewhere), atol=1e-7)
 
 
-def test_poly_keeps_its_digits_where_the_normal_equations_lose_them() -> None:
-    """Far from the origin and flat, as in centimetres and a height that hardly varies."""
+def test_poly_is_more_exact_than_normal_equations() -> None:
+    """The points are far from the origin and flat: centimetres, and heights that hardly vary."""
     rng = np.random.default_rng(0)
     points = rng.uniform((-200, -100, 2000), (200, 100, 2000.5), (40, 3))
     coefficients = rng.normal(size=(10, 3))
@@ -93,7 +93,7 @@ def test_parameters_bring_the_model_back(name: str) -> None:
     assert all(array.dtype == np.float64 for array in arrays.values())
     back = restore(name, arrays)
     np.testing.assert_array_equal(back.predict(points), fitted.predict(points))
-    pickle.loads(pickle.dumps(fitted))  # scikit-learn's own tools may; the log does not
+    pickle.loads(pickle.dumps(fitted))  # scikit-learn's tools allow it; the log does not
 
 
 @pytest.mark.parametrize("name", list(MODELS))
@@ -106,13 +106,13 @@ def test_min_pairs_is_enough_and_one_less_is_not(name: str) -> None:
 
 
 def test_rigid_then_poly_is_poly() -> None:
-    """A rotation of the inputs does not change what a full second-order polynomial can say."""
+    """A rotation of the inputs does not change the span of a full second-order polynomial."""
     points, world = places(3)
     both = create("rigid+poly").fit(points, world).predict(points)
     np.testing.assert_allclose(both, create("poly").fit(points, world).predict(points), atol=1e-9)
 
 
-def test_poly_keeps_scikit_learns_contract() -> None:
+def test_poly_passes_scikit_learn_checks() -> None:
     with warnings.catch_warnings():
         warnings.simplefilter("ignore", SkipTestWarning)
         check_estimator(PolynomialRegression())
@@ -126,7 +126,7 @@ def test_unknown_models_and_parameters_are_named() -> None:
 
 
 @pytest.mark.parametrize("name", ["rigid", "poly", "rigid+poly", "rayplane", "best"])
-def test_without_checks_a_model_says_the_same_to_the_last_bit(name: str) -> None:
+def test_prediction_without_input_checks_is_bit_identical(name: str) -> None:
     points, world = places(0)
     heights = np.full(len(points), 0.1)
     model = create(name).fit(inputs(name, points, heights), np.column_stack([world[:, :2], heights]))

@@ -21,7 +21,7 @@ def error_cm(predicted: np.ndarray, world: np.ndarray, axes: int = 3) -> float:
 
 @given(st.integers(0, 10_000))
 @settings(max_examples=25)
-def test_without_noise_pose_lens_and_places_come_back(seed: int) -> None:
+def test_noise_free_data_recover_pose_lens_and_points(seed: int) -> None:
     rng = np.random.default_rng(seed)
     camera = labs.camera(rng, along=0.0, across=0.0)
     world, elsewhere = labs.places(rng, 30), labs.places(rng, 30)
@@ -48,7 +48,7 @@ def test_depths_do_not_matter_where_the_height_is_known() -> None:
 
 
 @pytest.mark.parametrize("name", ["rayplane", "best"])
-def test_one_wrong_place_hardly_moves_the_others(name: str) -> None:
+def test_one_wrong_point_has_little_effect_on_the_others(name: str) -> None:
     rng = np.random.default_rng(3)
     world = labs.places(rng, 40)
     points = labs.camera(rng).see(world, rng)
@@ -59,13 +59,13 @@ def test_one_wrong_place_hardly_moves_the_others(name: str) -> None:
         for w in (world, wrong)
     )
     assert np.linalg.norm(right - moved, axis=1).max() < 0.01
-    # Least squares spreads the error over the floor.
+    # Least squares distributes the error over the floor.
     poly = [create("poly").fit(points, w).predict(points) for w in (world, wrong)]
     assert np.linalg.norm(poly[0] - poly[1], axis=1).max() > 0.05
 
 
-def test_places_that_two_cameras_saw_tie_them_together() -> None:
-    """In the overlap both cameras then say nearly the same, although the tape errs."""
+def test_shared_points_connect_two_cameras() -> None:
+    """In the overlap, both cameras give nearly the same position, in spite of tape errors."""
     apart: list[float] = []
     together: list[float] = []
     for seed in range(20):
@@ -106,7 +106,7 @@ def test_cameras_are_tied_through_others_too() -> None:
     assert group_dependent_cameras("poly", cameras) == [["a"], ["b"], ["c"], ["d"]]
 
 
-def test_a_ray_that_does_not_meet_the_height_gives_no_place() -> None:
+def test_ray_that_misses_the_height_gives_no_position() -> None:
     rng = np.random.default_rng(0)
     world = labs.places(rng, 20)
     points = labs.camera(rng).see(world, rng)
@@ -116,7 +116,7 @@ def test_a_ray_that_does_not_meet_the_height_gives_no_place() -> None:
     assert np.isnan(above[1]).all()
 
 
-def test_one_height_for_all_places_is_the_height_of_all_positions() -> None:
+def test_equal_point_heights_give_that_height_to_all_positions() -> None:
     rng = np.random.default_rng(1)
     world = labs.places(rng, 30, heights=(0.1,))
     camera = labs.camera(rng, along=0.01)
@@ -125,7 +125,7 @@ def test_one_height_for_all_places_is_the_height_of_all_positions() -> None:
     assert error_cm(found, world, 2) < 0.1
 
 
-def test_noisy_heights_are_drawn_to_those_measured_no_more_than_their_noise_warrants() -> None:
+def test_height_correction_is_limited_by_the_noise() -> None:
     rng = np.random.default_rng(2)
     world = labs.places(rng, 200)
     for along, most in ((0.0005, 0.01), (0.02, 0.4)):
@@ -154,7 +154,7 @@ def authors_pairs(data: Path) -> dict[str, tuple[np.ndarray, ...]]:
 
 
 def cross_validated_cm(name: str, data: Path, seed: int, axes: int) -> float:
-    """Mean error over the cameras in 4 x 5-fold cross-validation by scikit-learn's own folds."""
+    """Return the mean error over the cameras in 4 x 5-fold cross-validation by scikit-learn's folds."""
     means = []
     for points, world, test_points, test_world in authors_pairs(data).values():
         x = inputs(name, np.vstack([points, test_points]), np.concatenate([world, test_world])[:, 2])
@@ -168,8 +168,8 @@ def cross_validated_cm(name: str, data: Path, seed: int, axes: int) -> float:
     return float(np.mean(means))
 
 
-def test_known_height_on_the_authors_places(data: Path) -> None:
-    """The paper's best method is off by 1.14 cm on its test places, 1.75 cm in cross-validation."""
+def test_known_height_error_on_the_authors_points(data: Path) -> None:
+    """The paper's best method has 1.14 cm on its test points, and 1.75 cm in cross-validation."""
     errors = []
     for points, world, test_points, test_world in authors_pairs(data).values():
         model = create("rayplane").fit(inputs("rayplane", points, world[:, 2]), world)
@@ -180,8 +180,8 @@ def test_known_height_on_the_authors_places(data: Path) -> None:
 
 
 @pytest.mark.slow
-def test_best_is_better_than_poly_on_folds_that_it_was_not_chosen_on(data: Path) -> None:
-    """Chosen with other folds; ten seeds, each with four times five folds over all places of a camera."""
+def test_best_is_better_than_poly_on_other_folds(data: Path) -> None:
+    """The model was chosen with other folds; the test has ten seeds, each with four times five folds."""
     seeds = range(700, 710)
     poly, best = (np.mean([cross_validated_cm(name, data, s, 3) for s in seeds]) for name in ("poly", "best"))
     assert best <= 0.82 * poly

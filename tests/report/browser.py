@@ -1,4 +1,4 @@
-"""A page as a real browser has it: what it fetches, how large its pictures are, whether it is too wide."""
+"""A page in a real browser: its requests, its image sizes, and its width."""
 
 from __future__ import annotations
 
@@ -15,7 +15,7 @@ import pytest
 
 _NAMES = ("chromium", "chromium-browser", "google-chrome")
 
-# A window of a headless Chromium is at least 500 px wide; a frame in it can be as narrow as a telephone.
+# A window of headless Chromium is at least 500 px wide; a frame in it can be as narrow as a phone.
 _FRAME = """<!doctype html><meta charset="utf-8"><body style="margin:0">
 <iframe id="frame" style="border:0;width:{width}px;height:900px" srcdoc="{page}"></iframe>
 <script>
@@ -43,7 +43,10 @@ window.onload = () => {{
 
 @dataclass(frozen=True)
 class Visit:
-    """``width`` is what the page takes; ``images`` have alt, natural width and height, and width shown."""
+    """The state of a page: ``width`` in px.
+
+    ``images`` with alt text, natural width and height, and shown width.
+    """
 
     width: int
     images: list[tuple[str, int, int, float]]
@@ -56,12 +59,12 @@ class Visit:
 
     @property
     def remote(self) -> list[str]:
-        """Addresses that are neither in the page nor of it."""
+        """Return the addresses that are outside the page."""
         return [a for a in (*self.addresses, *self.fetched) if not a.startswith(("#", "data:"))]
 
 
 def chromium() -> str:
-    """The browser; without one the test that asks is skipped."""
+    """Return the path of the browser; skip the test without a browser."""
     found = next((path for name in _NAMES if (path := shutil.which(name))), None)
     if found is None:
         pytest.skip("no Chromium to open the page in; on Debian: apt-get install chromium")
@@ -69,7 +72,7 @@ def chromium() -> str:
 
 
 def visit(page: str, width: int, folder: Path) -> Visit:
-    """Open a page in a frame of so many pixels, without a network."""
+    """Open a page in a frame of a given width, without a network."""
     frame = folder / f"frame_{width}.html"
     frame.write_text(_FRAME.format(width=width, page=html.escape(page)), encoding="utf-8")
     done = subprocess.run(

@@ -1,4 +1,4 @@
-"""Logs that were evaluated, for tables, pictures and pages of them."""
+"""Evaluated logs, for tables, figures and pages."""
 
 from __future__ import annotations
 
@@ -30,7 +30,7 @@ ALL_MODELS = (
 
 @pytest.fixture(scope="session")
 def paper(data: Path, tmp_path_factory: pytest.TempPathFactory) -> Findings:
-    """The paper's data, evaluated with its two simplest methods."""
+    """Return the paper's data, evaluated with its two simplest methods."""
     path = tmp_path_factory.mktemp("paper") / "imsel.mcap"
     write_log(path, read_imsel(data / "imsel"))
     return find(path, ("rigid", "poly"))
@@ -49,7 +49,7 @@ def with_accuracies(findings: Findings, accuracies: Sequence[Accuracy]) -> Findi
 def lab_messages(
     rig: Rig = labs.RIG, heights: Sequence[float] = labs.HEIGHTS, count: int = 30, cameras: int = 2
 ) -> list[Message]:
-    """A session of one or two cameras over the paper's floor, with places measured by tape."""
+    """Return a session of one or two cameras over the paper's floor, with calibration points."""
     rng = np.random.default_rng(3)
     world_m = labs.places(rng, count, heights=tuple(heights))
     hung = [labs.camera(rng, y_m) for y_m in (0.9, 1.2)[:cameras]]
@@ -59,14 +59,14 @@ def lab_messages(
 
 
 def find(path: Path, models: Sequence[str]) -> Findings:
-    """Evaluate models on a log; what was found."""
+    """Evaluate models on a log; return the findings."""
     outcomes = replay([path], Request(models=tuple(models)), "evaluate")
     with Session([path]) as session:
         return gather_findings(session, read_accuracy(session, outcomes))
 
 
 def many_models(accuracies: Sequence[Accuracy]) -> list[Accuracy]:
-    """As many evaluations as there can be, out of a few: each with another name and its errors scaled."""
+    """Return as many evaluations as possible, derived from a few: new names, scaled errors."""
     known = {accuracy.model: accuracy for accuracy in accuracies}
     found = []
     for number, model in enumerate(ALL_MODELS):
@@ -79,7 +79,7 @@ def many_models(accuracies: Sequence[Accuracy]) -> list[Accuracy]:
 
 
 def scale(evaluation: Evaluation, factor: float) -> Evaluation:
-    """The same with all errors so many times as large, but for the single ones."""
+    """Return the findings with all errors scaled, except the single ones."""
     rows = tuple(
         replace(
             row,
@@ -98,7 +98,7 @@ def _scaled(payload: Any, factor: float) -> Any:
 
 
 def rename_cameras(accuracy: Accuracy, names: dict[str, str]) -> Accuracy:
-    """The same with other names of cameras."""
+    """Return the findings with other camera names."""
     assert accuracy.evaluation is not None
     found = accuracy.evaluation
     rows = tuple(replace(row, camera=names.get(row.camera, POOLED)) for row in found.cameras)

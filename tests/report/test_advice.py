@@ -1,4 +1,4 @@
-"""The advice on the number of places and on the model, with its reasons."""
+"""The advice on the number of points and on the model, with its reasons."""
 
 from __future__ import annotations
 
@@ -15,7 +15,7 @@ from ipsys_log.report.findings import Findings
 from ipsys_log.runs.output import write_log
 from tests.report.conftest import find
 
-# The 95 % interval of the mean is this share of it, each way.
+# half of the 95 % interval of the mean, as a share of the mean
 WIDE, NARROW = 0.3, 0.01
 
 
@@ -32,7 +32,7 @@ def evaluation(
     labelled: bool = False,
     level: bool = False,
 ) -> Evaluation:
-    """An evaluation with these mean errors in space by number of places; on the floor they are half."""
+    """Return an evaluation with these 3D mean errors by number of points; the 2D errors are half."""
     last_m = means_cm[max(means_cm)] / 100
     space = None if level else errors(last_m, share)
     rows = tuple(
@@ -48,8 +48,8 @@ def evaluation(
     return Evaluation(0, model, rows, points)
 
 
-def test_the_paper_s_data_ask_for_rigid_with_10_places_and_poly_from_30(paper: Findings) -> None:
-    """Sect. 4.1: the rigid transformation exceeds the polynomial with 10 places, and falls behind later."""
+def test_paper_data_recommend_rigid_with_10_points_poly_from_30(paper: Findings) -> None:
+    """Sect. 4.1: the rigid transformation is better than the polynomial with 10 points, and worse later."""
     advice = paper.advice
     assert advice is not None
     assert advice.published
@@ -60,7 +60,7 @@ def test_the_paper_s_data_ask_for_rigid_with_10_places_and_poly_from_30(paper: F
     assert "poly from" in advice.sentences[0]
 
 
-def test_the_paper_s_data_on_random_subsets_say_the_same(paper: Findings) -> None:
+def test_random_subsets_of_the_paper_data_agree(paper: Findings) -> None:
     found = paper.evaluations
     drawn = [replace(e, learning=tuple(p for p in e.learning if p.label is None)) for e in found]
     advice = advise(drawn)
@@ -71,14 +71,12 @@ def test_the_paper_s_data_on_random_subsets_say_the_same(paper: Findings) -> Non
 
 
 @pytest.mark.slow
-def test_our_models_save_places_on_the_paper_s_data(data: Path, tmp_path: Path) -> None:
+def test_own_models_need_fewer_points_on_the_paper_data(data: Path, tmp_path: Path) -> None:
     write_log(tmp_path / "imsel.mcap", read_imsel(data / "imsel"))
     advice = find(tmp_path / "imsel.mcap", ("rigid", "poly", "rayplane", "best")).advice
     assert advice is not None
-    assert advice.sentences[1].startswith("The model best with 10 points is as good as poly with 40")
-    assert advice.sentences[2].startswith(
-        "Where the heights of the markers are known, the model rayplane with 10 points"
-    )
+    assert advice.sentences[1].startswith("Model best with 10 points is as good as poly with 40")
+    assert advice.sentences[2].startswith("With known marker heights, model rayplane with 10 points")
 
 
 def test_the_simplest_model_within_the_noise_is_used() -> None:
@@ -101,21 +99,21 @@ def test_the_spread_over_random_subsets_is_noise_too() -> None:
     assert advice.choices[20][SIMPLE].model == "rigid"
 
 
-def test_labelled_subsets_come_before_random_ones_where_they_have_sizes() -> None:
+def test_labelled_subsets_of_several_sizes_have_priority() -> None:
     labelled = evaluation("rigid", {10: 1.0, 20: 1.0}, labelled=True)
     drawn = evaluation("rigid", {5: 2.0, 10: 2.0})
     both = advise([replace(drawn, learning=(*drawn.learning, *labelled.learning))])
     assert both is not None
     assert both.published
     assert list(both.choices) == [10, 20]
-    # One label is no curve.
+    # One label gives no curve.
     one = advise([replace(drawn, learning=(*drawn.learning, labelled.learning[0]))])
     assert one is not None
     assert not one.published
     assert list(one.choices) == [5, 10]
 
 
-def test_a_model_that_is_told_heights_is_not_compared_with_those_that_are_not() -> None:
+def test_models_with_known_heights_are_compared_separately() -> None:
     advice = advise(
         [evaluation("rigid", {10: 3.0, 20: 3.0}), evaluation("best", {10: 2.0, 20: 2.0}),
          evaluation("rayplane", {10: 1.0, 20: 1.0})]
@@ -126,7 +124,7 @@ def test_a_model_that_is_told_heights_is_not_compared_with_those_that_are_not() 
     }  # fmt: skip
 
 
-def test_the_paper_s_other_methods_are_no_reason_to_use_neither_rigid_nor_poly() -> None:
+def test_other_paper_methods_are_not_better_than_rigid_or_poly() -> None:
     advice = advise(
         [evaluation("rigid", {10: 3.0, 20: 3.0}), evaluation("poly", {10: 8.0, 20: 2.4}),
          evaluation("kriging", {10: 2.0, 20: 2.0})]
@@ -137,18 +135,18 @@ def test_the_paper_s_other_methods_are_no_reason_to_use_neither_rigid_nor_poly()
     assert advice.sentences[0] == (
         "Between rigid and poly, use rigid with up to 10 points per camera, poly from 20 on."
     )
-    # Nothing is there that is not of the paper: a column of all would say the same again.
+    # All methods are the paper's: a column for all would repeat the same.
     assert advice.groups == [SIMPLE, PAPER]
 
 
-def test_a_level_lab_is_judged_on_the_floor() -> None:
+def test_points_at_one_height_are_evaluated_in_2d() -> None:
     advice = advise([evaluation("rigid", {10: 3.0, 20: 3.0}, level=True)])
     assert advice is not None
     assert not advice.in_space
     assert advice.choices[10][SIMPLE].mean_m == pytest.approx(0.015)
 
 
-def test_a_number_of_places_that_a_camera_lacks_says_nothing_of_all_cameras() -> None:
+def test_mean_curve_needs_the_number_of_points_from_all_cameras() -> None:
     found = evaluation("rigid", {10: 3.0, 20: 3.0, 30: 3.0})
     other = tuple(replace(p, camera="white") for p in found.learning if p.pairs < 30)
     advice = advise([replace(found, learning=(*found.learning, *other))])
@@ -156,13 +154,13 @@ def test_a_number_of_places_that_a_camera_lacks_says_nothing_of_all_cameras() ->
     assert list(advice.choices) == [10, 20]
 
 
-def test_without_a_learning_curve_nothing_is_advised() -> None:
+def test_missing_learning_curve_gives_no_advice() -> None:
     assert advise([]) is None
     assert advise([evaluation("rigid", {10: 3.0})]) is None
     assert advise([replace(evaluation("rigid", {10: 3.0}), learning=())]) is None
 
 
-def test_one_model_alone_is_said_with_what_more_places_bring() -> None:
+def test_single_model_advice_gives_the_gain_of_more_points() -> None:
     advice = advise([evaluation("best", {10: 3.0, 40: 1.5})])
     assert advice is not None
     assert advice.sentences == (

@@ -1,4 +1,4 @@
-"""The picture of a session: complete, legible, of the right size, whatever there is to draw."""
+"""The figure of a session: complete, legible, of the right size, for all data."""
 
 from __future__ import annotations
 
@@ -95,7 +95,7 @@ def messages(rig: Rig | None, moving: bool, truth: bool) -> list[Message]:
 
 @pytest.mark.parametrize("models", [(), MODELS[:1], MODELS[:2], MODELS])
 @pytest.mark.parametrize(("moving", "truth"), [(False, False), (True, False), (True, True)])
-def test_picture_is_drawn_whatever_there_is(
+def test_figure_is_drawn_for_all_kinds_of_data(
     models: tuple[str, ...], moving: bool, truth: bool, tmp_path: Path
 ) -> None:
     write_log(tmp_path / "lab.mcap", messages(RIG, moving, truth))
@@ -110,14 +110,14 @@ def test_picture_is_drawn_whatever_there_is(
     assert {path.name for path in tmp_path.iterdir()} == {"lab.mcap", "lab.png"}
 
 
-def test_picture_without_a_rig_shows_places_and_tracks(tmp_path: Path) -> None:
+def test_figure_without_a_rig_shows_points_and_tracks(tmp_path: Path) -> None:
     write_log(tmp_path / "lab.mcap", messages(None, True, False))
     with Session([tmp_path / "lab.mcap"]) as session:
         draw_session(session, [], tmp_path / "lab.png")
     assert (tmp_path / "lab.png").stat().st_size > 1000
 
 
-def test_nothing_to_draw_is_said(tmp_path: Path) -> None:
+def test_log_without_data_to_draw_is_refused(tmp_path: Path) -> None:
     write_log(tmp_path / "lab.mcap", [Message("/rig", T0, T0, replace(RIG, floor=None))])
     with Session([tmp_path / "lab.mcap"]) as session, pytest.raises(IpsysError, match="nothing to draw"):
         draw_session(session, [], tmp_path / "lab.png")
@@ -134,7 +134,7 @@ def test_no_text_covers_another_or_leaves_the_picture(
     figure = Figure(figsize=(14, max(8.0, 1.6 + 0.23 * count_rows(accuracies))), dpi=100)
     draw_errors(figure, accuracies, camera_styles(cameras), left_in=7.3, top_in=0.65)
     width, height = figure.get_size_inches() * figure.dpi
-    figure.savefig(io.BytesIO(), format="png")  # ticks have their texts only when drawn
+    figure.savefig(io.BytesIO(), format="png")  # ticks get their texts during the drawing
     (axes,) = figure.axes
     ticks = [
         tick
@@ -162,8 +162,8 @@ def test_arrows_are_exaggerated_by_the_factor_that_is_stated(scale_m: float, fac
     axes: Axes = Figure().add_subplot()
     draw_floor(axes, FloorData(RIG, [], "poly", found, {}, {}), camera_styles(["red"]))
     title = axes.get_title(loc="left")
-    assert title == "Errors of poly on held-out places" + (
-        f", drawn {factor} times as long" if factor else ""
+    assert title == "Errors of poly at held-out points" + (
+        f", arrows {factor} times true length" if factor else ""
     )
     (arrows,) = [artist for artist in axes.collections if hasattr(artist, "scale")]
     assert arrows.scale == pytest.approx(1 / (factor or 1))

@@ -1,4 +1,4 @@
-"""``ipsys report``: one page that needs no network, obeys nobody's names, and can be read on a telephone."""
+"""``ipsys report``: one page without a network, safe with any name, and readable on a phone."""
 
 from __future__ import annotations
 
@@ -27,7 +27,7 @@ EVIL = "<script>window.ran=true</script><img src='http://evil.example/x.png'>"
 
 
 def hostile(messages: list[Message]) -> list[Message]:
-    """The same session with names that would run, load or break something."""
+    """Return the same session with names that contain HTML and scripts."""
 
     def spoiled(message: Message) -> Message:
         payload = message.payload
@@ -48,7 +48,7 @@ def hostile_log(tmp_path_factory: pytest.TempPathFactory) -> Path:
 
 
 def with_suspect(accuracies: list[Accuracy]) -> list[Accuracy]:
-    """The last model suspects a measurement, and says how to mend it."""
+    """Give the last model an outlier with a correction."""
     *rest, last = accuracies
     assert last.evaluation is not None
     suspect = Suspect(
@@ -60,7 +60,7 @@ def with_suspect(accuracies: list[Accuracy]) -> list[Accuracy]:
 
 @pytest.fixture(scope="module")
 def page(hostile_log: Path) -> str:
-    """A page with everything that a page can have: all models, suspects, flat tape, hostile names."""
+    """Return a page with all parts: all models, outliers, uncertain tape, hostile names."""
     outcomes = replay([hostile_log], Request(models=("poly",)), "evaluate")
     with Session([hostile_log]) as session:
         return render_report(session, with_suspect(many_models(read_accuracy(session, outcomes))))
@@ -87,15 +87,15 @@ def test_the_page_in_a_browser(page: str, width: int, tmp_path: Path) -> None:
         assert natural_height > 50
         assert 0.8 * min(width, 450) < shown <= width
     for words in (
-        "Positions are off by", "What to use", "Models", "Where on the floor", "How many places are enough",
-        "Suspect measurements", "Where the tape knows little", "Where not to trust it",
-        "Does it know how wrong it is?", "How it was made", "seed=0", "would fit on the other side",
-        "1.000, 2.000, 0.100 m", "rigid+kriging-regression", "Camera white",
+        "Mean position error", "Recommended model", "Models", "Error map", "Number of calibration points",
+        "Outliers", "Uncertain tape measurements", "Extrapolation",
+        "Consistency of the covariance", "Runs and versions", "seed=0", "would fit on the other side",
+        "100.0, 200.0, 10.0", "rigid+kriging-regression", "Camera white",
     ):  # fmt: skip
         assert words in seen.text, words
 
 
-def test_the_browser_would_see_what_a_page_must_not_do(tmp_path: Path) -> None:
+def test_browser_check_finds_forbidden_actions(tmp_path: Path) -> None:
     bad = visit(
         '<body><script>window.ran = true; console.error("boo")</script><img src="http://evil.example/x.png">'
         '<div style="width:700px">wide</div></body>',
@@ -119,7 +119,7 @@ def test_the_figures_are_those_of_the_evaluation(page: str, hostile_log: Path) -
     assert f"{pooled.error_3d.p95_m * 100:.2f}</td>" in page
 
 
-def test_report_is_the_same_each_time_and_leaves_the_log_as_it_is(ipsys: Ipsys, tmp_path: Path) -> None:
+def test_report_is_repeatable_and_leaves_the_log_unchanged(ipsys: Ipsys, tmp_path: Path) -> None:
     log = tmp_path / "lab.mcap"
     write_log(log, lab_messages())
     done = ipsys("report", log, "--model", "poly")
@@ -159,19 +159,19 @@ def test_a_page_that_cannot_be_written_is_refused_beforehand(ipsys: Ipsys, tmp_p
     assert {path.name for path in tmp_path.iterdir()} == {"lab.mcap", "link.html"}
 
 
-def test_a_level_lab_with_one_camera_has_a_page(tmp_path: Path) -> None:
+def test_one_camera_and_one_height_give_a_report(tmp_path: Path) -> None:
     log = tmp_path / "level.mcap"
     write_log(log, lab_messages(heights=(0.1,), cameras=1))
     outcomes = replay([log], Request(models=("rigid",)), "evaluate")
     with Session([log]) as session:
         page = render_report(session, read_accuracy(session, outcomes))
-    assert "cm on the floor, with model rigid" in page
+    assert "cm (2D, model rigid)" in page
     assert "None" not in re.sub(r"data:[^\"]+", "", page)
     assert "nan" not in re.sub(r"data:[^\"]+", "", page)
 
 
 def test_a_model_of_another_log_has_a_page(ipsys: Ipsys, tmp_path: Path) -> None:
-    """It is not fitted again here: there is no cross-validation and no learning curve."""
+    """The model is not fitted again: there is no cross-validation and no learning curve."""
     for name in ("old", "new"):
         write_log(tmp_path / f"{name}.mcap", lab_messages(count=30 if name == "old" else 20))
     assert ipsys("fit", tmp_path / "old.mcap", "--model", "poly").code == 0
@@ -179,7 +179,7 @@ def test_a_model_of_another_log_has_a_page(ipsys: Ipsys, tmp_path: Path) -> None
     assert done.code == 0, done.err
     page = (tmp_path / "new.html").read_text()
     assert "held out" in page
-    assert "How many places are enough" not in page
+    assert "Number of calibration points" not in page
 
 
 TABLES = """[...document.querySelectorAll("table")].map(table => {
@@ -202,7 +202,7 @@ def test_page_fits_screens_and_follows_the_colour_scheme(page: str, tmp_path: Pa
             tables = browser.run(TABLES)
             assert len(tables) >= 6
             for hidden_px, scrolled_px, name_px, is_of_models in tables:
-                # What does not fit is scrolled to, and the name of the row stays.
+                # Wide parts scroll, and the name of the row stays visible.
                 assert scrolled_px >= hidden_px - 1
                 assert name_px < 1
                 assert hidden_px < 1 or size[0] < 1280 or not is_of_models

@@ -1,4 +1,4 @@
-"""The files of ``--plots``: the figures of the JSON, and pictures that can be read."""
+"""The files of ``--plots``: the numbers of the JSON, and legible figures."""
 
 from __future__ import annotations
 
@@ -44,7 +44,7 @@ def test_tables_1_and_2_are_the_figures_of_the_json(paper: Findings) -> None:
         rows = read(content)
         assert [row["method"] for row in rows] == list(models)
         assert [row["paper"] for row in rows] == ["RT", "PR"]
-        # The order of the paper's columns, which is that of the rig.
+        # The columns have the paper's order, which is that of the rig.
         assert list(rows[0])[2:6] == ["mean_cm_red", "mean_cm_white", "mean_cm_black", "min_cm_red"]
         for row in rows:
             for camera, figures in models[row["method"]]["cameras"].items():
@@ -73,7 +73,7 @@ def test_all_files_are_there_and_differ_between_models(paper: Findings, tmp_path
         assert {path.name for path in (tmp_path / "deep" / model).iterdir()} == ALL_FILES
     for name in ALL_FILES:
         one, other = ((tmp_path / "deep" / model / name).read_bytes() for model in ("rigid", "poly"))
-        # The places are the same for both.
+        # The points are the same for both.
         assert (one == other) == (name == "figure_9.png"), name
         if name.endswith(".png"):
             picture = cv2.imread(str(tmp_path / "deep/poly" / name))
@@ -88,8 +88,8 @@ def test_the_same_log_gives_the_same_bytes(paper: Findings, tmp_path: Path) -> N
         assert (tmp_path / "a" / name).read_bytes() == (tmp_path / "b" / name).read_bytes()
 
 
-def test_only_what_there_is_is_drawn(tmp_path: Path) -> None:
-    """Without labelled subsets there are no figures 10 and 11; a level lab has no errors in space."""
+def test_only_available_data_are_drawn(tmp_path: Path) -> None:
+    """Without labelled subsets, there are no figures 10 and 11; points at one height have no 3D errors."""
     log = tmp_path / "level.mcap"
     write_log(log, lab_messages(heights=(0.1,)))
     findings = find(log, ("rigid", "best"))
@@ -102,8 +102,8 @@ def test_only_what_there_is_is_drawn(tmp_path: Path) -> None:
 
 
 def texts_of(figure: Figure) -> dict[Text, tuple[float, float, float, float]]:
-    """Each text that is seen, and the box it takes of the picture."""
-    png(figure, 100)  # ticks have their texts only when drawn
+    """Return each visible text and its box in the figure."""
+    png(figure, 100)  # the ticks get their texts during the drawing
     hidden = _hidden_ticks(figure)
     boxes = {}
     for text in figure.findobj(Text):
@@ -115,7 +115,7 @@ def texts_of(figure: Figure) -> dict[Text, tuple[float, float, float, float]]:
 
 
 def _hidden_ticks(figure: Figure) -> set[Text]:
-    """Texts of ticks beyond the ends of their axis."""
+    """Return the texts of ticks beyond the ends of their axis."""
     hidden = set()
     for axes in figure.axes:
         for axis in (axes.xaxis, axes.yaxis, getattr(axes, "zaxis", axes.xaxis)):
@@ -155,7 +155,7 @@ def test_bad_folders_are_refused_before_anything_is_done(ipsys: Ipsys, tmp_path:
     write_log(log, lab_messages())
     before = log.read_bytes()
     (tmp_path / "file").write_text("mine")
-    # Nobody can make a file in /proc, whoever runs the tests.
+    # No user can create a file in /proc.
     elsewhere = [Path("/proc/plots")] if Path("/proc").is_dir() else []
     for target in (tmp_path / "file", tmp_path / "file" / "in_it", log, *elsewhere):
         done = ipsys("evaluate", log, "--model", "rigid", "--plots", target)
@@ -181,7 +181,7 @@ def test_a_folder_in_the_way_leaves_the_other_files_as_they_were(ipsys: Ipsys, t
     assert [path.name for path in plots.iterdir()] == ["models.png"]
 
 
-def test_nothing_to_evaluate_says_so_and_writes_nothing(ipsys: Ipsys, tmp_path: Path) -> None:
+def test_log_without_points_is_refused_and_no_file_is_written(ipsys: Ipsys, tmp_path: Path) -> None:
     log = tmp_path / "few.mcap"
     write_log(log, lab_messages(count=4))
     for command in (("evaluate", log, "--plots", tmp_path / "plots"), ("report", log)):
@@ -205,7 +205,7 @@ def test_evaluate_writes_them(ipsys: Ipsys, tmp_path: Path) -> None:
     assert f"{tmp_path / 'plots'} has table_1.csv" in done.err
 
 
-def test_learning_marks_stand_at_their_numbers_of_places(paper: Findings) -> None:
+def test_learning_curve_marks_are_at_their_number_of_points(paper: Findings) -> None:
     findings = with_accuracies(paper, many_models(paper.accuracies))
     for figure in (learning_figure(findings), published_figure(findings, True)):
         for axes in figure.axes:

@@ -1,4 +1,4 @@
-"""Markers and boards on paper: a PDF is rendered and measured as a camera would see it."""
+"""Markers and boards on paper: a PDF is rendered and measured in a simulated camera."""
 
 from __future__ import annotations
 
@@ -24,7 +24,7 @@ Grey = NDArray[np.uint8]
 
 
 def rendered(path: Path, dpi: float = DPI) -> list[Grey]:
-    """The pages of a PDF by PDFium, which is not what drew them."""
+    """Render the pages of a PDF with PDFium, which is independent of the code that draws."""
     document = pypdfium2.PdfDocument(path)
     pages = [np.asarray(page.render(scale=dpi / 72, grayscale=True).to_numpy()) for page in document]
     document.close()
@@ -32,7 +32,7 @@ def rendered(path: Path, dpi: float = DPI) -> list[Grey]:
 
 
 def detected(page: Grey, dictionary: str) -> dict[int, NDArray[np.float64]]:
-    """The markers on a page by OpenCV: id, and corners (4, 2) in mm."""
+    """Detect the markers on a page with OpenCV: id, and corners (4, 2) in mm."""
     parameters = cv2.aruco.DetectorParameters()
     parameters.cornerRefinementMethod = cv2.aruco.CORNER_REFINE_SUBPIX
     known = cv2.aruco.getPredefinedDictionary(getattr(cv2.aruco, dictionary))
@@ -51,7 +51,7 @@ def sides_mm(corners_mm: NDArray[np.float64]) -> NDArray[np.float64]:
 @pytest.mark.parametrize(
     ("page", "size_mm"), [("a4", (210, 297)), ("letter", (215.9, 279.4)), ("a3", (297, 420))]
 )
-def test_markers_of_a_rig_have_their_sizes(
+def test_rig_markers_are_printed_at_their_size(
     ipsys: Ipsys, tmp_path: Path, page: str, size_mm: tuple[float, float]
 ) -> None:
     rig = tmp_path / "lab.toml"
@@ -69,7 +69,7 @@ def test_markers_of_a_rig_have_their_sizes(
     assert sorted(seen) == [3, 7, 99]
     for number, side_mm in ((7, 80), (3, 50), (99, 80)):
         assert np.abs(sides_mm(seen[number]) - side_mm).max() < 0.1
-        # The front, from corner 3 to corner 0, is up on the page, as the arrow says.
+        # The front, from corner 3 to corner 0, is up on the page, as the arrow shows.
         up = seen[number][0] - seen[number][3]
         assert abs(up[0]) < 0.1
         assert up[1] < 0
@@ -97,7 +97,7 @@ def test_ruler_is_ten_centimetres_long(ipsys: Ipsys, tmp_path: Path) -> None:
     path = tmp_path / "m.pdf"
     assert ipsys("markers", "--ids", "1", "--length", "0.05", "-o", path).code == 0
     (page,) = rendered(path, 600)
-    # A row of pixels through the ticks, 1 mm above the line that they stand on: 15 mm from the bottom.
+    # Read a row of pixels through the ticks, 1 mm above their base line: 15 mm from the bottom.
     row = page[page.shape[0] - round(16 / 25.4 * 600)]
     dark = np.flatnonzero(np.diff((row < 128).astype(int)) == 1) / 600 * 25.4
     assert len(dark) == 101
@@ -124,7 +124,7 @@ def test_board_is_found_at_its_size(ipsys: Ipsys, tmp_path: Path, text: str, pag
 
 
 def test_charuco_board_is_the_one_of_opencv(ipsys: Ipsys, tmp_path: Path) -> None:
-    """OpenCV's own detector finds all corners in the current layout, and none in that of before 4.6."""
+    """OpenCV's detector finds all corners in the current layout, and none in the layout before 4.6."""
     path = tmp_path / "board.pdf"
     options = ("--board", "charuco:6x8", "--square", "0.025", "--marker-scale", "0.6")
     assert ipsys("markers", *options, "--dictionary", "DICT_5X5_100", "-o", path).code == 0
@@ -141,7 +141,7 @@ def test_charuco_board_is_the_one_of_opencv(ipsys: Ipsys, tmp_path: Path) -> Non
 
 
 def test_black_cells_have_no_seams(ipsys: Ipsys, tmp_path: Path) -> None:
-    """At a resolution at which the edges of cells fall between pixels."""
+    """The resolution puts the edges of cells between pixels."""
     path = tmp_path / "m.pdf"
     assert ipsys("markers", "--ids", "17", "--length", "0.0713", "-o", path).code == 0
     (page,) = rendered(path, 187)
@@ -161,7 +161,7 @@ def test_black_cells_have_no_seams(ipsys: Ipsys, tmp_path: Path) -> None:
 @given(st.lists(st.lists(st.booleans(), min_size=5, max_size=5), min_size=1, max_size=5))
 @settings(max_examples=60)
 def test_outlines_enclose_the_black_cells(rows: list[list[bool]]) -> None:
-    """By the shoelace formula: the area of the black; by each cell's centre: inside or outside."""
+    """The shoelace formula gives the black area; the centre of each cell is inside or outside."""
     black = np.array(rows)
     outlines = cell_outlines(black)
     doubled = sum(
@@ -187,7 +187,10 @@ def test_outlines_enclose_the_black_cells(rows: list[list[bool]]) -> None:
         (("--ids", "1;2", "--length", "0.1"), "write ids as 1,2,3 or as 0-9"),
         (("--ids", "100", "--length", "0.1"), "DICT_4X4_100 has the ids 0 to 99"),
         (("--ids", "1", "--length", "0.1", "--dictionary", "DICT_9X9"), "is none of OpenCV's"),
-        (("--ids", "1", "--length", "0.1", "--page", "a5"), "--page a5: is none of a4, letter, a3"),
+        (
+            ("--ids", "1", "--length", "0.1", "--page", "a5"),
+            "--page a5: is not known; give one of a4, letter, a3",
+        ),
         (("--board", "20x10"), "make its squares smaller, with --square"),
         (("--board", "6"), "write the inner corners of a chessboard as 6x4"),
         (("--ids", "1", "--length", "0.1", "-o", "m.png"), "only PDF keeps the true size"),

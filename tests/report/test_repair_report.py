@@ -45,7 +45,7 @@ def lines(path: Path) -> list[str]:
 
 
 def killed(path: Path, tmp_path: Path, written_ns: int) -> Path:
-    """Cut off in the middle of its last frames, and last written at a given time."""
+    """Return a log that is cut in its last frames, with a given time of the last write."""
     with LogReader(path) as log:
         last = max(c.end for c in log._contents.chunks if not c.compression)
     cut = tmp_path / "cut.mcap"
@@ -54,7 +54,7 @@ def killed(path: Path, tmp_path: Path, written_ns: int) -> Path:
     return cut
 
 
-def test_what_a_killed_recorder_left_and_what_is_gone(
+def test_report_counts_the_messages_of_a_killed_recorder(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     monkeypatch.chdir(tmp_path)
@@ -64,41 +64,41 @@ def test_what_a_killed_recorder_left_and_what_is_gone(
         counts = [log.channels[f"/cameras/{name}/image"].message_count for name in ("red", "white")]
     assert 90 < sum(counts) < 100
     assert said[0].startswith(f"cut.mcap repaired: {sum(counts) + 1} messages, up to 2017-07-14 02:40:02.")
-    # At 20/s, from the last one kept to a second after the last write.
+    # The rate is 20 Hz, from the last kept frame to one second after the last write.
     for name, count in zip(("red", "white"), counts, strict=True):
         last_ns = (count - 1) * FRAME_NS
         gone = -(-(3_700_000_000 - last_ns) // FRAME_NS)
         clock = f"02:40:{last_ns / 1e9:06.3f}"
         assert f"/cameras/{name}/image {count} {clock} {gone} at 20.0/s" in said
     assert "/events 1 02:40:00.000" in said
-    assert "The file was last written at 02:40:02.700 UTC. What came after that is gone:" in said
+    assert "The file was last written at 02:40:02.700 UTC. Later messages are lost:" in said
     (torn,) = (line for line in said if line.startswith("/cameras/white/image 1 02:40:02."))
     assert torn.count("02:40:02.") == 2
 
 
-def test_of_a_copy_it_is_not_known_when_it_ended(tmp_path: Path) -> None:
+def test_copied_log_has_an_unknown_end_time(tmp_path: Path) -> None:
     cut = killed(recorded(tmp_path / "a.mcap", 50), tmp_path, START_NS + 10**14)
     said = lines(cut)
-    assert said[-1].startswith("Its end is gone. When it ended is not known")
+    assert said[-1].startswith("The end of the log is lost. Its time is unknown")
     assert sum(line.endswith("not known") for line in said) == 2
 
 
 def test_a_whole_log_is_left_alone(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.chdir(tmp_path)
-    assert lines(recorded(Path("a.mcap"), 5)) == ["a.mcap is whole, nothing changed: 11 messages"]
+    assert lines(recorded(Path("a.mcap"), 5)) == ["a.mcap is undamaged and unchanged: 11 messages"]
 
 
 def found(said: Sequence[str], topic: str) -> list[str]:
     return [line for line in said if line.startswith(topic)]
 
 
-def test_what_a_damaged_part_held_is_named(tmp_path: Path) -> None:
+def test_messages_of_a_damaged_part_are_listed(tmp_path: Path) -> None:
     path = recorded(tmp_path / "a.mcap", 50)
     data = bytearray(path.read_bytes())
     data[len(data) // 2] ^= 0xFF
     path.write_bytes(data)
     said = lines(path)
-    assert any("cannot be read; these messages are gone:" in line for line in said)
+    assert any("cannot be read; these messages are lost:" in line for line in said)
     with LogReader(path) as log:
         for name in ("red", "white"):
             (line,) = found(said, f"/cameras/{name}/image")
@@ -113,22 +113,22 @@ def test_bytes_cut_away_are_named_with_unknown_count(tmp_path: Path, monkeypatch
     data[-9_000:] = b"\xff" * 9_000
     cut.write_bytes(data)
     said = lines(cut)
-    assert any("cannot be read; the number of messages in them is not known" in line for line in said)
-    assert "all bytes that were taken out are kept in cut.mcap.damaged" in said
+    assert any("cannot be read; the number of messages in these bytes is not known" in line for line in said)
+    assert "the removed bytes are in cut.mcap.damaged" in said
     assert not any("no whole message" in line for line in said)
 
 
 def test_messages_saved_without_crc_are_counted(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.chdir(tmp_path)
     said = lines(killed(recorded(Path("a.mcap"), 50), Path(), START_NS + 2_700_000_000))
-    (line,) = (line for line in said if "saved from damaged chunks" in line)
+    (line,) = (line for line in said if "from damaged chunks" in line)
     assert 0 < int(line.split()[0]) < 100
 
 
 def test_frames_without_rig_are_named_with_a_way_out(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.chdir(tmp_path)
     cut = killed(recorded(Path("a.mcap"), 50), Path(), START_NS + 2_700_000_000)
-    assert "it has frames but no rig: give one to each command, as --rig lab.toml" in lines(cut)
+    assert "the log has frames but no rig: give one to each command (--rig lab.toml)" in lines(cut)
     path = recorded(Path("b.mcap"), 5)
     with LogWriter.append(path) as writer:
         writer.add_channel("/rig", Schema("ipsys.v1.Rig", "protobuf", b""))

@@ -1,4 +1,4 @@
-"""The answer of an evaluation comes first, fits a terminal, and has the figures of the JSON."""
+"""The summary of an evaluation comes first, fits a terminal, and has the figures of the JSON."""
 
 from __future__ import annotations
 
@@ -32,7 +32,7 @@ NAMES = ("[bold]x[/nothing]", "a\x1b[31mb", "white_11", "m4", "m5")
 
 
 def printed(accuracies: Sequence[Accuracy], width: int = 80) -> str:
-    """The answer and its table, as on a terminal, which does not wrap for us."""
+    """Return the summary and its table, as on a terminal that does not wrap."""
     file = io.StringIO()
     console = Console(file=file, width=width, highlight=False, soft_wrap=True)
     for part in (answer_text(accuracies), models_table(accuracies)):
@@ -42,7 +42,7 @@ def printed(accuracies: Sequence[Accuracy], width: int = 80) -> str:
 
 
 def with_suspects(accuracy: Accuracy, count: int) -> Accuracy:
-    """The same with made-up outliers, the first one the worst."""
+    """Return the accuracy with invented outliers, the worst first."""
     assert accuracy.evaluation is not None
     suspects = tuple(
         Suspect(name, ("red",), np.array([0.1 - 0.01 * n, 0.0, 0.0]), 9.0, "side", f"{n}: it lies right")
@@ -52,7 +52,7 @@ def with_suspects(accuracy: Accuracy, count: int) -> Accuracy:
 
 
 def errors_of(rows: Sequence[CameraEvaluation], row: CameraEvaluation, axes: int) -> np.ndarray:
-    """The lengths of the residuals that a row rests on."""
+    """Return the lengths of the residuals behind a row."""
     own = [one for one in rows if (one.scheme, one.against) == (row.scheme, row.against)]
     found = [r for one in own if row.camera in (POOLED, one.camera) for r in one.residuals]
     return np.array([np.linalg.norm((r.predicted_m - r.world_m)[:axes]) for r in found])
@@ -113,7 +113,7 @@ def test_answer_names_model_error_and_outliers_first(paper: Findings) -> None:
     assert f"RMSE {found['rmse_cm']:.1f} cm" in rest[0]
     text = "\n".join(rest)
     outliers, errors = text.index("Outliers: measure 5 points again"), text.index("Errors in cm")
-    assert outliers < text.index("white_11, 8.0 cm off: 2: it lies right") < errors
+    assert outliers < text.index("white_11, error 8.0 cm: 2: it lies right") < errors
     assert outliers < text.index("m5 (6.0 cm)") < text.index("Between rigid and poly, use rigid") < errors
     assert "\x1b" not in text
     assert NAMES[0] in text
@@ -143,22 +143,23 @@ def test_answer_of_all_models_fits_a_window(paper: Findings, truth: bool, factor
     assert ("Against the ground truth: " in text) == truth
 
 
-def test_one_model_is_answered_by_camera(paper: Findings) -> None:
+def test_single_model_has_one_row_per_camera(paper: Findings) -> None:
     lines = printed(only(paper, "poly").accuracies).splitlines()
     assert lines[0] == "Model: poly"
     assert {line.split()[0] for line in lines[-4:]} == {"red", "white", "black", "(all)"}
 
 
-def test_outliers_that_were_not_searched_are_not_none(paper: Findings) -> None:
+def test_missing_outlier_search_is_not_reported_as_none(paper: Findings) -> None:
     searched = printed([with_suspects(a, 0) for a in only(paper, "poly").accuracies])
     assert "Outliers: none." in searched
     unsearched = " ".join(printed(only(paper, "rigid").accuracies).split())
     assert (
-        "Outliers: not searched: that needs 15 points of a camera, and one of the models poly" in unsearched
+        "Outliers: not searched. The search needs 15 points of a camera, and one of the models poly"
+        in unsearched
     )
 
 
-def test_nothing_judged_is_answered_with_nothing() -> None:
+def test_no_evaluation_gives_an_empty_answer() -> None:
     assert answer_text([]) is None
     assert models_table([]) is None
     assert answer_json([]) == {}

@@ -19,7 +19,7 @@ from tests.report.conftest import ALL_MODELS, many_models, only, rename_cameras,
 
 
 def printed(accuracies: Sequence[Accuracy], width: int = 80) -> str:
-    """As on a terminal, which does not wrap for us."""
+    """Print as on a terminal that does not wrap."""
     file = io.StringIO()
     console = Console(file=file, width=width, highlight=False, soft_wrap=True)
     for table in accuracy_tables(accuracies):
@@ -41,7 +41,7 @@ def test_tables_of_all_models_fit_80_columns(paper: Findings, truth: bool, facto
     accuracies = [replace(a, evaluation=scale(a.evaluation, factor)) for a in accuracies if a.evaluation]
     text = printed([with_truth(a) for a in accuracies] if truth else accuracies)
     assert max(len(line.rstrip()) for line in text.splitlines()) <= 80, text
-    # A name over two lines is still there, part by part; errors of metres leave less room.
+    # A name in two lines is complete; large errors leave less room.
     parts = {part for model in ALL_MODELS for part in re.split("[+-]", model)}
     assert factor > 1 or all(part in text for part in parts)
     assert "…" not in text

@@ -29,7 +29,7 @@ RIG = Rig(
 )
 
 
-def test_what_is_written_reads_back(tmp_path: Path) -> None:
+def test_written_rig_reads_back(tmp_path: Path) -> None:
     path = tmp_path / "lab.toml"
     bare = replace(RIG, markers=(), cameras=(), reference_points=(), floor=None)
     for rig in (RIG, replace(bare, marker_height_m=None, tape_sigma_m=None)):
@@ -50,7 +50,7 @@ def test_heights_and_sigma_read_back_to_the_last_digit(
     assert load_rig(path) == rig
 
 
-def test_the_commented_examples_of_init_hold_when_the_comments_go(tmp_path: Path) -> None:
+def test_commented_examples_of_init_are_valid(tmp_path: Path) -> None:
     path = tmp_path / "lab.toml"
     path.write_text(example_toml())
     plain = load_rig(path)
@@ -96,7 +96,7 @@ def test_the_commented_examples_of_init_hold_when_the_comments_go(tmp_path: Path
         ({"marker_length_m": 0.0}, "0.0 m is not a length"),
     ],
 )
-def test_a_rig_that_cannot_be_right_is_refused(change: dict[str, object], said: str) -> None:
+def test_impossible_rig_is_refused(change: dict[str, object], said: str) -> None:
     assert check_rig(RIG, "lab.toml") is RIG
     with pytest.raises(IpsysError, match=f"^lab.toml: .*{said}"):
         check_rig(replace(RIG, **change), "lab.toml")  # type: ignore[arg-type]
@@ -125,9 +125,7 @@ def test_a_rig_that_cannot_be_right_is_refused(change: dict[str, object], said: 
         ({"cameras": (RigCamera("red", row_time_ns=31),)}, "too little for ns; write 31000 if that is us"),
     ],
 )
-def test_what_was_meant_in_another_unit_is_refused_in_a_rig_file(
-    tmp_path: Path, change: dict[str, object], said: str
-) -> None:
+def test_rig_file_with_a_wrong_unit_is_refused(tmp_path: Path, change: dict[str, object], said: str) -> None:
     path = tmp_path / "lab.toml"
     path.write_text(rig_toml(replace(RIG, **change)))  # type: ignore[arg-type]
     with pytest.raises(IpsysError, match=f"lab.toml: .*{said}"):
@@ -187,6 +185,6 @@ def test_the_floor_itself_is_a_height() -> None:
         ("usb:/dev/video0", "usb:/dev/video0"),
     ],
 )  # fmt: skip
-def test_a_password_is_hidden_and_nothing_else_is(address: str, shown: str) -> None:
+def test_only_the_password_is_hidden(address: str, shown: str) -> None:
     assert hide_password(address) == shown
     assert hide_password(shown) == shown

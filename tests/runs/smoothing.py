@@ -1,4 +1,4 @@
-"""A stage for tests, as a newcomer would add it: one file, one entry, and one channel.
+"""A stage for tests, in the form of a new stage: one file, one entry, and one channel.
 
 Run as a program, it is ``ipsys`` with this stage: ``python -m tests.runs.smoothing smooth LOG``.
 """

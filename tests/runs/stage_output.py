@@ -1,4 +1,4 @@
-"""The output of every stage on a golden log with frames, and what it was when it was last looked at.
+"""The output of every stage on a golden log with frames, and its expected hashes and numbers.
 
     python -m tests.runs.stage_output
 
@@ -33,24 +33,24 @@ from ipsys_log.stages.detect import CORNERS
 GOLDEN = Path(__file__).parents[1] / "golden" / "stages"
 LOG, EXPECTED = GOLDEN / "frames.mcap", GOLDEN / "expected.json"
 COMBINATIONS = [(corners, method) for corners in CORNERS for method in METHODS]
-_SAMPLES = 4  # messages of a channel whose numbers are kept
+_SAMPLES = 4  # number of stored messages per channel
 _DIGITS = 9
-# By kind of channel: how far its numbers (px, m, rad) may be from those kept, in another environment. Corners
-# move by up to 0.15 px between OpenCV 4.14 and 5; a neural network moves by more than what it is fitted to.
+# Tolerance of the stored numbers (px, m, rad) in another environment, by kind of channel. Corners move by up
+# to 0.15 px between OpenCV 4.14 and 5; a neural network moves by more than its inputs.
 TOLERANCES = {"markers": 0.2, "camera_points": 0.02, "positions": 0.05, "tracks": 0.05}
-# Two environments with equal values here give equal bytes.
+# Environments with equal values here give equal bytes.
 _RELEVANT = ("numpy", "scipy", "scikit-learn", "opencv-python-headless", "simplejpeg", "machine", "blas")
 
 Channels = dict[str, dict[str, Any]]
 
 
 def environment() -> dict[str, str]:
-    """Return what of the environment the bytes of a result can depend on."""
+    """Return the part of the environment that can change the bytes of a result."""
     return {key: value for key, value in fingerprint().items() if key in _RELEVANT}
 
 
 def computed(corners: str, method: str) -> Channels:
-    """Compute all stages on the golden log, with all models, and return what their channels hold.
+    """Compute all stages on the golden log with all models, and return the contents of their channels.
 
     Models are evaluated, and positions fused, with ``poly`` only.
     """
@@ -87,7 +87,7 @@ def kind_of(topic: str) -> str:
 
 
 def _numbers(value: Any) -> Iterator[float]:
-    """Yield the numbers of a payload, in the order of its fields, but for covariances."""
+    """Yield the numbers of a payload in the order of its fields, without covariances."""
     if dataclasses.is_dataclass(value):
         for field in dataclasses.fields(value):
             if "covariance" not in field.name:

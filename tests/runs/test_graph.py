@@ -1,4 +1,4 @@
-"""The graph of stages: a stage is one row, a channel is told from another one of the same payload type."""
+"""The graph of stages: a stage is one row, and channels with the same payload type are distinct."""
 
 from __future__ import annotations
 
@@ -26,7 +26,7 @@ from tests.runs.smoothing import SMOOTHED_TRACKS
 
 @pytest.fixture
 def with_smoothing(monkeypatch: pytest.MonkeyPatch) -> None:
-    """The stage smooth in the graph: one row more, and one channel."""
+    """Add the stage smooth to the graph: one more row and channel."""
     monkeypatch.setattr(channels, "CHANNELS", (*CHANNELS, SMOOTHED_TRACKS))
     monkeypatch.setattr(graph, "STAGES", (*STAGES, smoothing.STAGE))
     monkeypatch.setitem(graph.VERSIONS, "smooth", 1)
@@ -73,17 +73,17 @@ def test_stage_writes_a_payload_type_to_one_channel() -> None:
         ("/rig", None, None),
     ],
 )
-def test_channel_is_told_by_topic_and_payload(
+def test_channel_is_identified_by_topic_and_payload(
     topic: str, payload: type | None, channel: channels.Channel | None
 ) -> None:
     assert channel_of(topic, payload) is channel
 
 
-def test_stages_until_are_those_that_are_needed() -> None:
+def test_stages_until_gives_the_needed_stages() -> None:
     assert names("detect") == ["detect"]
     assert names("locate") == ["detect", "camera-frame", "fit", "locate"]
     assert names("evaluate") == ["detect", "camera-frame", "fit", "evaluate"]
-    # fuse is a result that no other stage reads; so is evaluate, which comes before it.
+    # No other stage reads the results of fuse and of evaluate, which comes before it.
     assert names("fuse") == names(None) == [stage.name for stage in STAGES]
 
 

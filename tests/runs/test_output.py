@@ -1,4 +1,4 @@
-"""Messages into an open log."""
+"""Appends of messages to an open log."""
 
 from __future__ import annotations
 

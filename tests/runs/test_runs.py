@@ -1,4 +1,4 @@
-"""Runs: a name for what belongs together, found again only where it is whole."""
+"""Runs: names of stage results, reused only if they are complete."""
 
 from __future__ import annotations
 
@@ -33,7 +33,7 @@ PAPER = ROOT / "sample_logs" / "paper_lab.mcap"
 
 @pytest.fixture
 def paper(tmp_path: Path) -> Path:
-    """The paper's layout without frames: its markers are in run ``edges``."""
+    """Write the paper's layout without frames: its markers are in run ``edges``."""
     return Path(shutil.copy(PAPER, tmp_path / "paper.mcap"))
 
 
@@ -61,7 +61,7 @@ def change(log: Path, edit: Callable[[Any], Any]) -> Path:
 
 
 def robots(folder: Path, log: Path, prefix: str) -> Path:
-    """A rig file that differs from the log's in the names of the robots only."""
+    """Write a rig file that differs from the log's only in the names of the robots."""
     with Session([log]) as session:
         rig = session.payloads(session.topics(RIG))[0]
     text = f'name = "a"\ndictionary = "{rig.dictionary}"\nmarker_length_m = {rig.marker_length_m}\n'
@@ -74,9 +74,7 @@ def robots(folder: Path, log: Path, prefix: str) -> Path:
     return path
 
 
-def test_models_that_were_copied_in_are_used_without_measurements(
-    ipsys: Ipsys, paper: Path, tmp_path: Path
-) -> None:
+def test_copied_models_are_used_without_measurements(ipsys: Ipsys, paper: Path, tmp_path: Path) -> None:
     calibration = tmp_path / "calibration.mcap"
     bare = without(paper, lambda message: isinstance(message.payload, Measurement))
     ipsys("replay", paper, "--model", "rigid", "-o", calibration)
@@ -84,7 +82,7 @@ def test_models_that_were_copied_in_are_used_without_measurements(
     assert first["fuse"] == ("rigid", True)
     found = runs_of(ipsys, "replay", bare)
     assert {found[stage] for stage in ("locate", "fuse")} == {("rigid", False)}
-    # One that was entered and withdrawn is none.
+    # A withdrawn measurement is none.
     with Session([paper]) as session, Session([bare]) as other:
         entered: Measurement = session.payloads(["/measurements"])[0]
         time_ns = other.end_ns + 1
@@ -104,7 +102,7 @@ def test_newest_run_is_found_again(ipsys: Ipsys, paper: Path) -> None:
 
 
 def test_run_of_last_log_is_newest_whatever_its_number(ipsys: Ipsys, paper: Path, tmp_path: Path) -> None:
-    """Two results of one recording: the one in the log that is given last counts."""
+    """With two results of one recording, that of the last log counts."""
     low, high = tmp_path / "low.mcap", tmp_path / "high.mcap"
     ipsys("camera-frame", paper)
     assert runs_of(ipsys, "replay", paper, "-o", low, "--run", "low")["fuse"] == ("low", True)
@@ -113,13 +111,13 @@ def test_run_of_last_log_is_newest_whatever_its_number(ipsys: Ipsys, paper: Path
     assert runs_of(ipsys, "replay", paper, high, low)["fuse"] == ("low", False)
 
 
-def test_a_run_holds_only_what_belongs_together(ipsys: Ipsys, paper: Path, tmp_path: Path) -> None:
+def test_run_contains_only_consistent_results(ipsys: Ipsys, paper: Path, tmp_path: Path) -> None:
     ipsys("replay", paper)
     renamed = runs_of(ipsys, "replay", paper, "--rig", robots(tmp_path, paper, "ada"))
-    # Other robots bear on fuse alone, which gets a run of its own ...
+    # Other robots change only fuse, which gets a new run ...
     assert renamed["locate"] == ("poly", False)
     assert renamed["fuse"] == ("poly_2", True)
-    # ... that a new model does not join.
+    # ... without the results of a new model.
     fewer = runs_of(ipsys, "replay", paper, "--model", "rigid", "--rig", robots(tmp_path, paper, "ada"))
     assert {fewer[stage] for stage in ("fit", "evaluate", "locate", "fuse")} == {("rigid", True)}
     with Session([paper]) as session:
@@ -132,7 +130,7 @@ def test_a_run_holds_only_what_belongs_together(ipsys: Ipsys, paper: Path, tmp_p
     assert {again[stage] for stage in ("fit", "evaluate", "locate", "fuse")} == {("poly_3", True)}
 
 
-def test_topics_without_a_record_are_nobodys_and_are_left_alone(ipsys: Ipsys, paper: Path) -> None:
+def test_topics_without_a_record_are_ignored(ipsys: Ipsys, paper: Path) -> None:
     ipsys("replay", paper)
     log = without(paper, lambda m: isinstance(m.payload, Run) and m.payload.stage in ("fit", "locate"))
     with Session([log]) as session:
@@ -157,14 +155,14 @@ def test_a_named_run_takes_the_shared_detection(ipsys: Ipsys, lab: Path) -> None
     ipsys("detect", lab)
     made = runs_of(ipsys, "camera-frame", lab, "--run", "again")
     assert made == {"detect": ("edges", False), "camera-frame": ("again", True)}
-    # Whoever asks next gets the first one that is right, and nothing is made again.
+    # The next request gets the first correct run, and computes nothing again.
     ipsys("replay", lab)
     before = lab.read_bytes()
     assert "nothing to do" in ipsys("replay", lab).err
     assert lab.read_bytes() == before
 
 
-def test_one_name_for_several_models_is_refused_before_anything_is_made(ipsys: Ipsys, paper: Path) -> None:
+def test_one_run_name_for_several_models_is_refused_first(ipsys: Ipsys, paper: Path) -> None:
     before = paper.read_bytes()
     done = ipsys("evaluate", paper, "--run", "x")
     assert done.code == 1
@@ -172,23 +170,19 @@ def test_one_name_for_several_models_is_refused_before_anything_is_made(ipsys: I
     assert paper.read_bytes() == before
 
 
-def test_a_seed_changes_the_folds_and_nothing_else_where_places_are_labelled(
-    ipsys: Ipsys, paper: Path
-) -> None:
+def test_seed_changes_only_the_folds_of_labelled_points(ipsys: Ipsys, paper: Path) -> None:
     ipsys("replay", paper)
     made = runs_of(ipsys, "replay", paper, "--seed", 5)
     assert {stage for stage, (_, new) in made.items() if new} == {"evaluate"}
     assert all(not new for _, new in runs_of(ipsys, "replay", paper, "--seed", 5).values())
-    # What is shown is the new evaluation, once, with the tracks that are still right.
+    # The output has the new evaluation, once, with the tracks that are still correct.
     done = ipsys("replay", paper, "--seed", 5, "--details")
     assert done.out.count("(tracks)") == 1
-    # One row in the summary, and one in each table of the details.
+    # The summary has one row, and so has each table of the details.
     assert sum(line.split()[:1] == ["red"] for line in done.out.splitlines()) == 1 + 4
 
 
-def test_a_model_is_known_by_what_it_is_and_not_by_its_file(
-    ipsys: Ipsys, paper: Path, tmp_path: Path
-) -> None:
+def test_model_is_identified_by_content_not_by_file(ipsys: Ipsys, paper: Path, tmp_path: Path) -> None:
     ipsys("replay", paper)
     copy = Path(shutil.copy(paper, tmp_path / "copy.mcap"))
     drive = without(paper, lambda m: m.topic.startswith("/runs/poly") or m.topic == "/measurements")
@@ -232,7 +226,7 @@ def test_a_camera_that_the_model_does_not_know_is_named(ipsys: Ipsys, paper: Pat
     assert "camera red has no model" in done.err
 
 
-def test_a_model_knows_the_places_it_was_made_of(ipsys: Ipsys, paper: Path, tmp_path: Path) -> None:
+def test_model_contains_its_calibration_points(ipsys: Ipsys, paper: Path, tmp_path: Path) -> None:
     plain = change(paper, lambda p: replace(p, splits=()) if hasattr(p, "splits") else p)
     fitted = tmp_path / "fitted.mcap"
     assert ipsys("fit", plain, "-o", fitted).code == 0
@@ -241,7 +235,7 @@ def test_a_model_knows_the_places_it_was_made_of(ipsys: Ipsys, paper: Path, tmp_
     counts = {c: e["3d"]["n"] for c, e in json.loads(done.out)["models"]["poly"]["cameras"].items()}
     with Session([plain]) as session:
         total = len(session.payloads(["/measurements"]))
-    # A fifth was held out when the model was fitted; only these count.
+    # A fifth of the points was held out by fit; only these count.
     assert sum(counts.values()) < 0.5 * total
 
 
@@ -266,7 +260,7 @@ def test_the_rig_of_a_log_is_checked_too(ipsys: Ipsys, paper: Path) -> None:
     assert "/rig: 0.0 m is not a length" in done.err
 
 
-def test_a_rig_recorded_later_does_not_change_what_was_measured_before(ipsys: Ipsys, paper: Path) -> None:
+def test_later_rig_does_not_change_earlier_measurements(ipsys: Ipsys, paper: Path) -> None:
     ipsys("replay", paper)
     with Session([paper]) as session:
         rig, end_ns = session.payloads(["/rig"])[0], session.end_ns
@@ -284,7 +278,7 @@ def test_a_rig_recorded_later_does_not_change_what_was_measured_before(ipsys: Ip
 
 def test_a_marker_beyond_the_lens_is_left_out_and_named(ipsys: Ipsys, paper: Path) -> None:
     def bent(payload: Any) -> Any:
-        # A model that folds back: far from the centre no ray belongs to a pixel.
+        # The lens model folds back: far from the centre, a pixel has no ray.
         if isinstance(payload, CameraCalibration) and payload.frame_id == "red":
             return replace(payload, D=np.array([-0.45, 0.0, 0.0, 0.0]))
         return payload
@@ -309,7 +303,7 @@ def test_a_model_and_its_evaluation_speak_of_the_last_input(ipsys: Ipsys, lab: P
     assert model.payload.timestamp == model.publish_time_ns
 
 
-def test_places_measured_for_nothing_are_named(ipsys: Ipsys, paper: Path) -> None:
+def test_points_that_no_camera_saw_are_named(ipsys: Ipsys, paper: Path) -> None:
     def late(payload: Any) -> Any:
         if getattr(payload, "id", "") == "s003":
             return replace(payload, still=None, timestamp=payload.timestamp + 10**15)
@@ -333,7 +327,7 @@ def test_a_log_knows_the_model_that_was_copied_into_it(ipsys: Ipsys, paper: Path
     ipsys("replay", paper, "--model", "poly")
     ipsys("replay", paper, "--model", "rigid")
     drive = without(paper, lambda m: m.topic.startswith(("/runs/poly", "/runs/rigid", "/measurements")))
-    # Of several models the usual one is meant, not the last one made.
+    # Among several models, the default one is selected, not the newest.
     assert runs_of(ipsys, "replay", drive, "--model-from", paper)["fit"] == ("poly", True)
     paper.unlink()
     before = drive.read_bytes()
@@ -342,9 +336,7 @@ def test_a_log_knows_the_model_that_was_copied_into_it(ipsys: Ipsys, paper: Path
     assert "no measurements" in ipsys("replay", drive, "--model", "rigid").err
 
 
-def test_the_rig_of_a_log_can_be_taken_out_mended_and_given_back(
-    ipsys: Ipsys, paper: Path, tmp_path: Path
-) -> None:
+def test_rig_of_a_log_can_be_exported_edited_and_used(ipsys: Ipsys, paper: Path, tmp_path: Path) -> None:
     path = tmp_path / "mended.toml"
     ipsys("replay", paper)
     assert ipsys("init", path, "--from", paper).code == 0
@@ -357,7 +349,7 @@ def test_the_rig_of_a_log_can_be_taken_out_mended_and_given_back(
     assert lengths == [0.19]
 
 
-def test_the_rig_taken_out_says_what_a_camera_does_to_edges(ipsys: Ipsys, tmp_path: Path) -> None:
+def test_exported_rig_has_the_edge_offset(ipsys: Ipsys, tmp_path: Path) -> None:
     lab, path = tmp_path / "lab.mcap", tmp_path / "lab.toml"
     size = ("--width", 960, "--height", 540, "--stations", 9, "--drive-s", 0.5)
     assert ipsys("simulate", "-o", lab, *size, "--gamma", 2.2, "--markers", 6).code == 0
@@ -365,7 +357,7 @@ def test_the_rig_taken_out_says_what_a_camera_does_to_edges(ipsys: Ipsys, tmp_pa
     assert ipsys("init", path, "--from", lab).code == 0
     offsets_px = [camera.edge_offset_px for camera in load_rig(path).cameras]
     assert offsets_px == pytest.approx([0.42] * 3, abs=0.1)
-    # With it, every marker has the same.
+    # With the option, every marker has the same length.
     assert ipsys("detect", lab, "--rig", path).code == 0
     with Session([lab]) as session:
         (topic,) = session.topics(MARKERS, "edges_2")[:1]

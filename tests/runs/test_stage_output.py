@@ -1,4 +1,4 @@
-"""The output of every stage, held to what it was: a change without a higher version is seen here."""
+"""The output of every stage equals the stored output; a change needs a higher version."""
 
 from __future__ import annotations
 
@@ -18,7 +18,7 @@ def expected() -> Any:
 
 
 def test_output_belongs_to_these_versions(expected: Any) -> None:
-    """Raise a version when the output changes, and write the file anew in the same commit."""
+    """If the output changes, raise a version and write the file again in the same commit."""
     assert expected["versions"] == VERSIONS
 
 

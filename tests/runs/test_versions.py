@@ -1,4 +1,4 @@
-"""Versions of stages: what older software made is told from what this one makes, and made again beside it."""
+"""Versions of stages: results of older software are recognised, and computed again beside them."""
 
 from __future__ import annotations
 
@@ -96,7 +96,7 @@ def test_changed_stage_is_done_again_beside_the_old_run(
 
 
 @pytest.mark.parametrize("changed", ["camera-frame", "perimeter", "fit", "evaluate", "locate", "fuse"])
-def test_after_a_replay_all_that_it_used_is_current(
+def test_replay_leaves_its_runs_current(
     changed: str, ipsys: Ipsys, log: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     monkeypatch.setitem(VERSIONS, changed, 2)
@@ -105,7 +105,7 @@ def test_after_a_replay_all_that_it_used_is_current(
     rows = states(ipsys, log)
     assert {rows[run, stage]["state"] for stage, (run, _) in used.items()} == {"current"}
     assert not any(new for _, new in made(ipsys, log).values())
-    # What was made again is what had been said to be out of date, and nothing else.
+    # Exactly the results that were out of date are computed again.
     assert {stage for (_, stage), row in before.items() if row["out_of_date"]} == {
         stage for stage, (_, new) in used.items() if new
     }
@@ -184,7 +184,7 @@ def test_run_of_newer_software_is_never_replaced(
     assert states(ipsys, log)["edges_2", "detect"]["out_of_date"] is False
 
 
-def test_verify_names_what_another_version_made_and_verifies_the_rest(
+def test_verify_names_results_of_other_versions(
     ipsys: Ipsys, log: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     monkeypatch.setitem(VERSIONS, "detect", 2)
@@ -201,7 +201,7 @@ def test_verify_names_what_another_version_made_and_verifies_the_rest(
     assert "nothing of its runs can be verified" in done.err
 
 
-def test_versions_of_packages_make_nothing_out_of_date(
+def test_package_versions_do_not_outdate_runs(
     ipsys: Ipsys, log: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     monkeypatch.setattr(provenance, "_versions", lambda: (("ipsys_log", "99.0"), ("numpy", "99.0")))
@@ -225,9 +225,7 @@ def test_measurement_since_makes_the_model_out_of_date(ipsys: Ipsys, log: Path, 
     assert "fit is computed again; run poly is out of date: measurements changed" in ipsys("replay", log).err
 
 
-def test_run_without_its_inputs_is_not_repeatable_and_later_stages_go_on(
-    ipsys: Ipsys, tmp_path: Path
-) -> None:
+def test_run_without_its_inputs_is_not_repeatable(ipsys: Ipsys, tmp_path: Path) -> None:
     log = Path(shutil.copy(ROOT / "sample_logs" / "paper_lab.mcap", tmp_path / "paper.mcap"))
     first = states(ipsys, log)
     assert first
@@ -239,7 +237,7 @@ def test_run_without_its_inputs_is_not_repeatable_and_later_stages_go_on(
     assert "/runs/poly/tracks" in ipsys("verify", log, "--json").out
 
 
-def test_unfinished_run_is_said_to_be(ipsys: Ipsys, log: Path, tmp_path: Path) -> None:
+def test_unfinished_run_has_the_state_unfinished(ipsys: Ipsys, log: Path, tmp_path: Path) -> None:
     short = tmp_path / "short.mcap"
     with Session([log]) as session, LogWriter.create(short) as writer:
         from ipsys_log.runs.output import write_message

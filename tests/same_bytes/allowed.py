@@ -1,4 +1,4 @@
-"""The list of differences that are allowed: one a line, ``CASE PLACE REASON``."""
+"""The list of allowed differences: one per line, ``CASE PLACE REASON``."""
 
 from __future__ import annotations
 
@@ -12,7 +12,7 @@ __all__ = ["AllowList", "AllowListError"]
 
 
 class AllowListError(Exception):
-    """A line of an allow file that cannot be read."""
+    """An unreadable line of an allow file."""
 
 
 @dataclass(slots=True)
@@ -26,9 +26,9 @@ class _Line:
 
 @dataclass(slots=True)
 class AllowList:
-    """Allowed differences by case and place: a topic, a JSON path, a file name, or ``order`` and the like.
+    """Allowed differences by case and place: a topic, a JSON path, a file name, or ``order`` and others.
 
-    Both are patterns as of a shell: ``*`` stands for any text, ``?`` for any character.
+    Both are shell patterns: ``*`` stands for any text, ``?`` for any character.
     """
 
     path: Path | None = None
@@ -41,9 +41,9 @@ class AllowList:
         Raises
         ------
         AllowListError
-            For a line without a reason.
+            A line has no reason.
         OSError
-            Where the file cannot be read.
+            The file cannot be read.
         """
         allowed = cls(path)
         for number, text in enumerate(path.read_text(encoding="utf-8").splitlines(), start=1):
@@ -56,7 +56,7 @@ class AllowList:
         return allowed
 
     def allows(self, case: str, difference: Difference) -> bool:
-        """Return whether a line allows a difference; all lines that do count as used."""
+        """Return whether a line allows a difference, and note each such line as used."""
         matching = [
             line
             for line in self.lines
@@ -67,7 +67,7 @@ class AllowList:
         return bool(matching)
 
     def unused(self, cases: list[str]) -> list[str]:
-        """Describe the lines that allowed nothing, of those for the cases that ran."""
+        """Describe the unused lines of the cases that ran."""
         return [
             f"{self.path}: line {line.number} is not used: {line.case} {line.place}"
             for line in self.lines

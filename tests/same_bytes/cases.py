@@ -1,7 +1,7 @@
-"""The table of cases: commands as users type them, and the files that they are given.
+"""The table of cases: typed commands and their input files.
 
-A case runs in a folder of its own with copies of its inputs. All files in the folder are compared afterwards,
-and so is what each command with ``--json`` prints.
+A case runs in a separate folder with copies of its inputs. Afterwards, all files in the folder and the
+output of each command with ``--json`` are compared.
 """
 
 from __future__ import annotations
@@ -19,7 +19,7 @@ MODELS = (
 
 @dataclass(frozen=True, slots=True)
 class Step:
-    """A command: its words, whether it runs with the scripted clock, and the exit codes that are right."""
+    """A command: its words, the use of the scripted clock, and the valid exit codes."""
 
     arguments: tuple[str, ...]
     scripted: bool = False
@@ -43,7 +43,7 @@ class Case:
 
 
 def ipsys(text: str, scripted: bool = False, codes: tuple[int, ...] = (0,)) -> Step:
-    """A step; of several options with one name, ``{models}`` stands for all models."""
+    """Return a step; ``{models}`` stands for the options of all models."""
     models = " ".join(f"--model {model}" for model in MODELS)
     return Step(tuple(text.replace("{models}", models).split()), scripted, codes)
 

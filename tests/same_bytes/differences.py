@@ -1,4 +1,4 @@
-"""Differences between two outputs: logs message by message, JSON key by key, other files line by line.
+"""Differences between two outputs: logs by message, JSON by key, other files by line.
 
 Nothing here imports ``ipsys_log``. The ``mcap`` package reads the logs, and their own schemas decode them:
 a fault of the code under test cannot hide itself.
@@ -32,7 +32,7 @@ __all__ = [
     "read_log",
 ]
 
-# Places that are no topic.
+# places that are not topics
 ORDER, SCHEMAS, BYTES, EXIT_CODE = "order", "schemas", "bytes", "exit-code"
 _LONGEST_VALUE = 60
 
@@ -51,18 +51,18 @@ class Difference:
 
 @dataclass(slots=True)
 class JsonDifferences:
-    """The differences between two JSON values, and the paths of keys that only the new one has."""
+    """The differences between two JSON values, and the paths of keys in the new one only."""
 
     differences: list[Difference] = field(default_factory=list)
     additions: list[str] = field(default_factory=list)
 
 
-# Of a schema: its name, its encoding, and its definition.
+# The name, encoding and definition of a schema.
 Definition = tuple[str, str, bytes]
 
 
 class Entry(NamedTuple):
-    """A message of a log as it is stored."""
+    """A stored message of a log."""
 
     topic: str
     log_time_ns: int
@@ -89,7 +89,7 @@ def read_log(path: Path) -> Log:
     Raises
     ------
     McapError
-        For a file that is no complete log.
+        The file is no complete log.
     """
     schemas: dict[int, Schema] = {}
     channels: dict[int, Channel] = {}
@@ -110,12 +110,12 @@ def read_log(path: Path) -> Log:
 
 
 def compare_logs(old: Path, new: Path, messages_only: bool = False) -> list[Difference]:
-    """Compare two logs; the first difference is the one that comes first in the old log.
+    """Compare two logs; the first difference is the earliest in the old log.
 
     Parameters
     ----------
-    messages_only : compare the messages of each topic in the order of their log times, not how the file holds
-        them: where several threads write, neither the order between topics nor the chunks are determined.
+    messages_only : compare the messages of each topic in the order of their log times, not in file order:
+        with several writing threads, the order between topics and the chunks are random.
     """
     if old.read_bytes() == new.read_bytes():
         return []
@@ -151,7 +151,7 @@ def _compare_topic(
     old_schema: Definition | None,
     new_schema: Definition | None,
 ) -> tuple[Entry, Difference]:
-    """Return the first message of a topic that differs, and what differs."""
+    """Return the first different message of a topic, and the difference."""
     if not old or not new:
         side, entries = ("new", new) if new else ("old", old)
         text = f"only in the {side} log, {_count(len(entries))}; first at {entries[0].log_time_ns}"
@@ -193,7 +193,7 @@ def _first_field_of(
 
 
 def decode(data: bytes, schema: Definition | None) -> Message | None:
-    """Decode a payload with the schema that its log holds; None for another encoding than Protobuf."""
+    """Decode a payload with the schema of its log; return None for encodings other than Protobuf."""
     if schema is None or schema[1] != "protobuf":
         return None
     name, _, definition = schema
@@ -205,7 +205,7 @@ def decode(data: bytes, schema: Definition | None) -> Message | None:
 
 
 def first_field(old: Message, new: Message, prefix: str = "") -> str | None:
-    """Name the first field in which two messages differ, with both values; None where all are equal."""
+    """Return the first different field of two messages, with both values; None if all are equal."""
     fields = {f.name: (f.number, f.name) for message in (new, old) for f in message.DESCRIPTOR.fields}
     for _, name in sorted(fields.values()):
         sides = _value(old, name), _value(new, name)
@@ -216,7 +216,7 @@ def first_field(old: Message, new: Message, prefix: str = "") -> str | None:
 
 
 def _value(message: Message, name: str) -> Any:
-    """The value of a field: None where it is absent, a list where it is repeated."""
+    """Return the value of a field: None if it is absent, a list if it is repeated."""
     described = message.DESCRIPTOR.fields_by_name.get(name)
     if described is None:
         return None
@@ -251,7 +251,7 @@ def _compare_schemas(old: dict[str, Definition], new: dict[str, Definition]) -> 
 
 
 def _compare_order(old: Iterable[Entry], new: Iterable[Entry], topics: set[str]) -> Iterator[Difference]:
-    """The order between messages of topics that are equal by themselves."""
+    """Compare the order between messages of topics that are equal by themselves."""
     sides = [[entry for entry in side if entry.topic in topics] for side in (old, new)]
     for before, after in zip(*sides, strict=True):
         if before != after:
@@ -269,7 +269,7 @@ def _compare_bytes(old: bytes, new: bytes) -> Difference:
 
 
 def compare_json(old: Any, new: Any) -> JsonDifferences:
-    """Compare two JSON values; a key that only the new one has is an addition, not a difference.
+    """Compare two JSON values; a key in the new one only is an addition, not a difference.
 
     Examples
     --------
@@ -303,7 +303,7 @@ def _join(path: str, key: str) -> str:
 
 
 def compare_files(old: Path, new: Path, place: str) -> list[Difference]:
-    """Compare two files that are neither a log nor JSON: by their first line that differs."""
+    """Compare two other files by their first different line."""
     before, after = old.read_bytes(), new.read_bytes()
     if before == after:
         return []
@@ -322,7 +322,7 @@ def _count(messages: int) -> str:
 
 
 def _short(value: Any) -> str:
-    """A value as text that fits a line: of bytes their number and hash."""
+    """Return a value as text for one line; for bytes, their number and hash."""
     if value is None:
         return "absent"
     if isinstance(value, bytes):

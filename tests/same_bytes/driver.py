@@ -1,7 +1,7 @@
 """Run the cases with the code of one commit: ``python -P driver.py PLAN``, with PYTHONPATH at its work tree.
 
-This program imports nothing of the project. It only uses what does not change in a rebuild: ``python -m
-ipsys_log`` with the names of commands and options. Each command runs in a process that is forked from this
+This program imports nothing of the project. It uses only stable names: ``python -m ipsys_log``
+with commands and options. Each command runs in a process that is forked from this
 one. There the libraries are imported already, and the project is not.
 """
 
@@ -45,7 +45,7 @@ def main() -> None:
 
 
 def run_case(case: dict[str, Any], inputs: Path, work: Path, tree: str) -> dict[str, Any]:
-    """Run the commands of a case in a folder of its own; exit codes and hashes of the files in it."""
+    """Run the commands of a case in a separate folder; return exit codes and hashes of its files."""
     folder, said = work / case["name"], work / f"{case['name']}.said"
     folder.mkdir(parents=True)
     said.mkdir()
@@ -55,7 +55,7 @@ def run_case(case: dict[str, Any], inputs: Path, work: Path, tree: str) -> dict[
         else:
             shutil.copy(inputs / name, folder / name)
     for path in folder.rglob("*"):
-        os.utime(path, (MODIFIED_S, MODIFIED_S))  # repair keeps it
+        os.utime(path, (MODIFIED_S, MODIFIED_S))  # kept by repair
     codes = []
     for number, step in enumerate(case["steps"]):
         out, err = said / f"{number}.out", said / f"{number}.err"
@@ -68,7 +68,7 @@ def run_case(case: dict[str, Any], inputs: Path, work: Path, tree: str) -> dict[
 
 
 def run_command(arguments: list[str], scripted: bool, folder: Path, out: Path, err: Path, tree: str) -> int:
-    """Run ``ipsys`` in a process forked from this one; its exit code, 124 where it takes too long."""
+    """Run ``ipsys`` in a forked process; return its exit code, or 124 after the time limit."""
     child = os.fork()
     if child == 0:
         code = 70

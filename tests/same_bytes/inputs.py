@@ -1,4 +1,4 @@
-"""The files that cases start from: shipped ones, what the old commit makes, and what is derived from these.
+"""The input files of cases: shipped files, results of the old commit, and files derived from these.
 
 Both commits get the same files, so a case differs only where its own commands do.
 """
@@ -26,7 +26,7 @@ __all__ = ["MADE", "Inputs", "MissingInputError", "UnmadeInputError"]
 
 _LAB = "--width 960 --height 540 --markers 8 --stations 20 --frames-per-station 2 --rate-hz 5 --drive-s 1"
 _START = "--rig live.toml --calibration lab.mcap"
-# What the old commit makes: the inputs, and the command.
+# The inputs and the command for each file that the old commit makes.
 MADE: dict[str, Case] = {
     "lab.mcap": Case("lab", (), (ipsys(f"simulate -o lab.mcap {_LAB}"),)),
     "fitted.mcap": Case("fitted", ("lab.mcap",), (ipsys("locate lab.mcap {models} -o fitted.mcap"),)),
@@ -43,15 +43,15 @@ MADE: dict[str, Case] = {
 
 
 class MissingInputError(Exception):
-    """An input that is not at hand, such as public data."""
+    """A missing input, such as public data."""
 
 
 class UnmadeInputError(Exception):
-    """An input that the old commit fails to make."""
+    """An input that the old commit cannot make."""
 
 
 class Inputs:
-    """Makes inputs in a folder, each when it is first asked for.
+    """A maker of inputs in a folder, each at its first request.
 
     Parameters
     ----------
@@ -63,14 +63,14 @@ class Inputs:
         self.folder, self._tree, self._run = folder, tree, run
 
     def make(self, names: Sequence[str]) -> None:
-        """Make inputs, and those that they are made from.
+        """Make inputs, and the inputs that these need.
 
         Raises
         ------
         MissingInputError
-            For what is not at hand.
+            An input is missing.
         UnmadeInputError
-            For what the old commit fails to make.
+            The old commit cannot make an input.
         """
         for name in names:
             if not (self.folder / name).exists():
@@ -99,7 +99,7 @@ class Inputs:
 
 
 def _live_rig(folder: Path, target: Path) -> None:
-    """The rig of the lab, with cameras that play its log."""
+    """Write the rig of the lab, with cameras that play its log."""
     text = (folder / "lab.toml").read_text()
     cameras = r'(\[\[cameras\]\]\nname = "(\w+)"\n)'
     target.write_text(re.sub(cameras, r'\1source = "file:lab.mcap?\2"\n', text))
@@ -140,7 +140,7 @@ def _pictures(folder: Path, target: Path) -> None:
 
 
 def _video(folder: Path, target: Path) -> None:
-    """The frames of a camera as H.264, a keyframe every five."""
+    """Encode the frames of a camera as H.264, with a keyframe every five frames."""
     with av.open(str(target), "w") as container:
         stream = container.add_stream("libx264", rate=5)
         stream.width, stream.height, stream.pix_fmt = 960, 540, "yuv420p"
@@ -154,7 +154,7 @@ def _video(folder: Path, target: Path) -> None:
 
 
 def _board(folder: Path, target: Path) -> None:
-    """Pictures of a chessboard with 6 x 4 inner corners, as a camera without distortion sees it."""
+    """Render images of a chessboard with 6 x 4 inner corners in a camera without distortion."""
     (target / "red").mkdir(parents=True)
     cell_px, rng = 60, np.random.default_rng(0)
     squares = np.indices((5, 7)).sum(axis=0) % 2
@@ -173,7 +173,7 @@ def _board(folder: Path, target: Path) -> None:
 
 
 def _unmeasured(folder: Path, target: Path) -> None:
-    """The lab without its measurements."""
+    """Write the lab without its measurements."""
     with (folder / "lab.mcap").open("rb") as source, target.open("wb") as out:
         writer = Writer(out)
         writer.start()
@@ -193,7 +193,7 @@ def _unmeasured(folder: Path, target: Path) -> None:
 
 
 def _sheet(folder: Path, target: Path) -> None:
-    """The distances of the lab's measurements as a sheet, for the places where cameras see the marker."""
+    """Write the distances of the lab's measurements as a sheet, for points with a stationary marker."""
     log = read_log(folder / "lab.mcap")
     start_ns = min(entry.log_time_ns for entry in log.entries)
     places = json.loads((folder / "0_measure.json").read_text())
@@ -220,7 +220,7 @@ def _sheet(folder: Path, target: Path) -> None:
 
 
 def _imsel(folder: Path, target: Path) -> None:
-    """The authors' data, where IPSYS_DATA says, as for the tests."""
+    """Return the authors' data in the folder IPSYS_DATA, as in the tests."""
     root = Path(__file__).resolve().parent.parent.parent
     data = Path(os.environ.get("IPSYS_DATA", root / "../shared/data")).resolve() / "imsel"
     if not data.is_dir():
@@ -228,7 +228,7 @@ def _imsel(folder: Path, target: Path) -> None:
     shutil.copytree(data, target)
 
 
-# By name: what an input is derived from, and how.
+# For each input name, its source and the function that derives it.
 _DERIVED: dict[str, tuple[tuple[str, ...], Callable[[Path, Path], None]]] = {
     "live.toml": (("lab.toml",), _live_rig),
     "pictures": (("lab.mcap",), _pictures),

@@ -8,8 +8,9 @@ Each commit gets a temporary git work tree and a process that runs the same comm
 virtual environment. The tool compares the files that the commands write, their --json output and their exit
 codes. It does not compare texts on the screen.
 
-Logs must be equal byte for byte. Recordings have several writing threads: of them the messages of each topic
-must be equal, in the order of their log times. New keys in JSON are no difference; the report lists them.
+Logs must be equal byte for byte. Recordings have several writing threads, so only the messages of each
+topic must be equal, in the order of their log times. New keys in JSON are no difference; the report lists
+them.
 
 A line of the allow file is CASE PLACE REASON. CASE and PLACE are patterns of a shell (* is any text). PLACE
 is a topic, a path in JSON such as stages.3.run, the name of another file, exit-code, or for a whole log:
@@ -52,7 +53,7 @@ __all__ = ["CaseResult", "compare_case", "main", "report_lines"]
 ROOT = Path(__file__).resolve().parent.parent.parent
 DRIVER = Path(__file__).resolve().parent / "driver.py"
 _LINES_PER_CASE, _WIDTH = 10, 80
-# Other files, such as what `repair` takes out of a log, are compared as bytes.
+# Other files, such as the bytes that `repair` removes, are compared as bytes.
 _LOG = ".mcap"
 
 
@@ -68,7 +69,7 @@ class Outcome:
 
 @dataclass(slots=True)
 class CaseResult:
-    """The comparison of a case; ``skipped`` says why it did not run."""
+    """The comparison of a case; ``skipped`` is the reason for not running it."""
 
     case: str
     files: int = 0
@@ -89,7 +90,7 @@ class CaseResult:
 
 
 class Side:
-    """One of the two commits: its work tree, and the folders that its commands run in."""
+    """One of the two commits: its work tree, and the folders of its commands."""
 
     def __init__(self, name: str, commit: str, folder: Path) -> None:
         self.name, self.commit, self.folder = name, commit, folder
@@ -97,7 +98,7 @@ class Side:
         (folder / "tmp").mkdir(parents=True)
 
     def run(self, cases: Sequence[Case], inputs: Path, show: Callable[[str], None]) -> dict[str, Outcome]:
-        """Run cases one after the other in one process."""
+        """Run cases in turn in one process."""
         plan = self.folder / "plan.json"
         work = self.folder / "work"
         described = {"inputs": str(inputs), "work": str(work), "tree": str(self.tree)}
@@ -134,7 +135,7 @@ def compare_case(case: Case, old: Outcome, new: Outcome, allowed: AllowList) -> 
     """Compare the exit codes, files and JSON of a case."""
     result = CaseResult(case.name, seconds=(old.seconds, new.seconds))
     found = list(_compare_codes(case, old, new))
-    # Logs first: what is printed follows from them.
+    # Logs come first, because the printed output follows from them.
     for name in sorted({*old.files, *new.files}, key=lambda name: (not name.endswith(_LOG), name)):
         result.files += 1
         if old.files.get(name) == new.files.get(name):
@@ -156,7 +157,7 @@ def _compare_codes(case: Case, old: Outcome, new: Outcome) -> Iterator[Differenc
         if codes[0] != codes[1]:
             yield Difference(EXIT_CODE, f"{command}: {codes[0]} -> {codes[1]}{_said(new, number)}")
         elif codes[0] not in step.codes:
-            # Equal faults prove nothing.
+            # Equal errors prove nothing.
             yield Difference(EXIT_CODE, f"{command}: fails with both, {codes[0]}{_said(new, number)}")
 
 
@@ -189,7 +190,7 @@ def _compare_file(
 def report_lines(
     results: Sequence[CaseResult], commits: tuple[str, str], seconds: float, unused: Sequence[str]
 ) -> Iterator[str]:
-    """The answer, the table, and at most ten lines of differences for each case."""
+    """Return the result, the table, and at most ten lines of differences per case."""
     states = [result.state for result in results]
     different, ran = states.count("DIFFERENT"), len(states) - states.count("skipped")
     files = sum(result.files for result in results)
@@ -222,7 +223,10 @@ def _details(result: CaseResult) -> Iterator[str]:
 
 
 def _first_of_each_file(differences: Sequence[Difference]) -> list[Difference]:
-    """The first difference of each file, then the second of each, so that no file hides the others."""
+    """Return the differences in order: the first of each file, then the second of each.
+
+    The first of each file, then the second of each, so that no file hides the others.
+    """
     counts: Counter[str] = Counter()
     ranks = []
     for one in differences:
@@ -240,7 +244,7 @@ def _as_json(results: Sequence[CaseResult], commits: tuple[str, str], unused: Se
 
 @contextmanager
 def _worktrees(sides: Sequence[Side]) -> Iterator[None]:
-    """A work tree of each commit for as long as the block lasts."""
+    """Create a work tree of each commit for the duration of the block."""
     try:
         for side in sides:
             _git("worktree", "add", "--detach", "--force", str(side.tree), side.commit)
@@ -360,7 +364,7 @@ def main(arguments: Sequence[str] | None = None) -> int:
 
 
 def _fitting(line: str) -> str:
-    """A line of at most 80 columns, folded with what follows further in."""
+    """Return a line of at most 80 columns; continuation lines are indented."""
     import textwrap
 
     if len(line) <= _WIDTH:

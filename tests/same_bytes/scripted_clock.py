@@ -1,4 +1,4 @@
-"""A clock that stands still while anything runs, so that a recording is the same each time.
+"""A clock that stops while anything runs, so that a recording is the same each time.
 
 The driver loads this file into a command that records, before that command imports its own modules. The
 file imports nothing of the code under test, so it fits any layout. It relies on three habits of that code:
@@ -7,7 +7,7 @@ file imports nothing of the code under test, so it fits any layout. It relies on
 - A played camera waits for its next frame with ``time.sleep``.
 - Threads wait for each other with ``threading``, not with a loop of sleeps.
 
-Where a rebuild breaks one of them, adapt :func:`install`, and keep the old way beside the new.
+If a rebuild breaks one of them, adapt :func:`install`, and keep the old way beside the new.
 
 The functions behave as follows.
 
@@ -43,7 +43,7 @@ _conductors: set[int] = set()
 
 
 class _Script:
-    """The scripted time, and the threads that sleep until a later one."""
+    """The scripted time, and the threads that sleep until a later time."""
 
     def __init__(self) -> None:
         self.since_ns = 0
@@ -60,7 +60,7 @@ class _Script:
         woken.wait()
 
     def wake_next(self) -> None:
-        """Wake the sleeper that is due first; of several the one whose thread started first."""
+        """Wake the sleeper that is due first; among several, the one whose thread started first."""
         with self._lock:
             if not self.sleepers:
                 return
@@ -71,7 +71,7 @@ class _Script:
 
 
 def install() -> None:
-    """Replace the clock of this process; for the main thread, before others are started."""
+    """Replace the clock of this process, in the main thread, before other threads start."""
     script = _Script()
     script.numbers[threading.get_ident()] = 0
 
@@ -90,7 +90,7 @@ def install() -> None:
             _real_sleep(_LOOK_S)
             if script.sleepers:
                 _wait_until_quiet()
-                if not starting:  # who starts a thread waits too, but goes on by itself
+                if not starting:  # a thread that starts another one also waits, but continues by itself
                     script.wake_next()
 
     conductor = threading.Thread(target=conduct, name="conductor", daemon=True)
@@ -108,7 +108,7 @@ def install() -> None:
 
 
 def _wait_until_quiet() -> None:
-    """Return when no other thread of this process runs or could run."""
+    """Wait until no other thread of this process runs or could run."""
     with _looking:
         me, quiet, looked = threading.get_native_id(), 0, 0
         before = _threads(me)
@@ -124,7 +124,7 @@ def _wait_until_quiet() -> None:
 
 
 def _threads(but: int) -> dict[int, tuple[str, int]]:
-    """The state of each other thread, S where it waits, and its processor time in ns.
+    """Return the state of each other thread (S: waiting) and its processor time in ns.
 
     The state alone is not enough: a thread that waits for the interpreter's lock, because this thread has it,
     is in the state S too. But it runs while this thread sleeps, and that shows in its time.
@@ -136,8 +136,8 @@ def _threads(but: int) -> dict[int, tuple[str, int]]:
             continue
         try:
             state = (task / "stat").read_text().rpartition(")")[2].split()[0]
-            # The clock of a thread by its number: CPUCLOCK_PERTHREAD and CPUCLOCK_SCHED of Linux.
+            # the clock of a thread by its number: CPUCLOCK_PERTHREAD and CPUCLOCK_SCHED of Linux
             found[number] = state, _real_clock_ns((~number << 3) | 6)
-        except OSError:  # it has ended meanwhile
+        except OSError:  # the thread has ended
             continue
     return found

@@ -1,4 +1,4 @@
-"""The comparison finds what differs, names it, and accepts what is allowed."""
+"""The comparison finds and names differences, and accepts the allowed ones."""
 
 from __future__ import annotations
 

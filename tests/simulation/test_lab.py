@@ -1,4 +1,4 @@
-"""The simulated session as its readers get it."""
+"""The contents of the simulated session."""
 
 import hashlib
 from collections import Counter
@@ -78,7 +78,10 @@ def test_all_cameras_take_their_frames_at_the_same_instants(session: list[Messag
 
 
 def test_markers_are_seen_in_the_images_where_the_truth_says(session: list[Message]) -> None:
-    """At a third of the size the stock detector misses some far ones; what it finds must be true."""
+    """At a third of the size, the stock detector misses some distant markers.
+
+    The detected ones must be correct.
+    """
     detector = cv2.aruco.ArucoDetector(cv2.aruco.getPredefinedDictionary(cv2.aruco.DICT_4X4_100))
     cameras = {camera.name: camera for camera in mount_cameras(SMALL)}
     truth: Tracks | None = None
@@ -112,7 +115,7 @@ def rotated(heading_rad: float) -> tuple[list[float], list[float]]:
     return [c, s], [s, -c]
 
 
-def test_a_measurement_lies_in_its_still_interval_and_names_a_place(session: list[Message]) -> None:
+def test_measurement_is_within_its_stationary_interval(session: list[Message]) -> None:
     truth = {
         (m.payload.timestamp, t.id): t
         for m in session
@@ -150,7 +153,7 @@ def test_tape_and_ruler_err_by_their_sigmas() -> None:
     assert taken[0].height_sigma_m == 0.002
 
 
-def test_each_camera_gets_its_places_and_a_fifth_of_them_is_held_out() -> None:
+def test_each_camera_gets_its_points_and_a_fifth_are_held_out() -> None:
     settings = LabSettings()
     cameras = mount_cameras(settings)
     sets = plan_points(settings, cameras)
@@ -210,7 +213,7 @@ def test_robots_stay_in_view_and_within_their_speed(markers: int) -> None:
         ({"stations": 0, "drive_s": 0.0}, "nothing to show"),
     ],
 )
-def test_impossible_settings_are_refused_in_one_line(change: dict[str, object], said: str) -> None:
+def test_impossible_settings_give_one_line(change: dict[str, object], said: str) -> None:
     with pytest.raises(IpsysError, match=said) as error:
         LabSettings(**change)  # type: ignore[arg-type]
     assert "\n" not in str(error.value)
@@ -225,7 +228,7 @@ def test_a_lab_that_cannot_be_built_says_why() -> None:
 
 
 @pytest.mark.slow
-def test_the_default_lab_yields_what_it_promises() -> None:
+def test_default_lab_has_the_documented_contents() -> None:
     counts: Counter[str] = Counter(m.topic for m in simulate(LabSettings(drive_s=2.0)))
     assert counts["/cameras/red/image"] == counts["/truth/tracks"] > 200
     assert counts["/measurements"] > 100

@@ -1,4 +1,4 @@
-"""The rendered truth, against formulas written down here once more."""
+"""The rendered images, compared with independent formulas."""
 
 from dataclasses import replace
 
@@ -30,7 +30,7 @@ def lay(marker_id: int, x_m: float, y_m: float, z_m: float, heading_rad: float) 
 
 
 def world_points(x_m: float, y_m: float, z_m: float, heading_rad: float, local: Array) -> Array:
-    """Points of a print (along its right side, along its top side), laid on the floor by hand."""
+    """Return world points of a print (along its right side, along its top side) on the floor."""
     up = np.array([np.cos(heading_rad), np.sin(heading_rad)])
     right = np.array([np.sin(heading_rad), -np.cos(heading_rad)])
     xy = np.array([x_m, y_m]) + local[:, :1] * right + local[:, 1:] * up
@@ -38,7 +38,7 @@ def world_points(x_m: float, y_m: float, z_m: float, heading_rad: float, local: 
 
 
 def to_pixels(camera: Camera, points_m: Array) -> Array:
-    """Kannala and Brandt's formula."""
+    """Project with the formula of Kannala and Brandt."""
     x, y, z = (points_m @ camera.camera_from_world[:3, :3].T + camera.camera_from_world[:3, 3]).T
     r = np.hypot(x, y)
     theta = np.arctan2(r, z)
@@ -62,9 +62,9 @@ def test_true_corners_agree_with_the_formulas(views: list[View]) -> None:
 
 
 def edge_errors(view: View, placed: PlacedMarker, settings: LabSettings) -> Array:
-    """By how many px the drawn sides of the black square lie off, pixel row by pixel row.
+    """Return the errors in px of the drawn sides of the black square, by pixel row.
 
-    The light along a line across an edge, added up, tells where the edge is, whatever the blur.
+    The sum of the light along a line across an edge gives the position of the edge, for any blur.
     """
     image = expose(view, [placed], settings).astype(np.float64)
     camera_from_marker = view.camera.camera_from_world @ placed.world_from_marker
@@ -93,7 +93,7 @@ def edge_errors(view: View, placed: PlacedMarker, settings: LabSettings) -> Arra
 
 
 @pytest.mark.parametrize("turn_rad", [0.0, np.pi / 2, 0.3, 2.0])
-def test_edges_lie_where_they_should_to_a_hundredth_of_a_pixel(views: list[View], turn_rad: float) -> None:
+def test_rendered_edges_are_exact_to_0_01_px(views: list[View], turn_rad: float) -> None:
     rng = np.random.default_rng(int(turn_rad * 10))
     for view in views:
         y_m = view.camera.origin_m[1]
@@ -115,7 +115,7 @@ def test_edges_of_a_tilted_marker_are_as_exact(views: list[View]) -> None:
 
 
 def test_a_frame_equals_one_drawn_by_brute_force(views: list[View]) -> None:
-    """Twelve by twelve hard samples per pixel through an inverse of the lens found by bisection."""
+    """Render twelve by twelve samples per pixel through a numerical inverse of the lens."""
     view, samples = views[1], 12
     where = (3.1, 2.9, 0.15, 0.6)
     corners = project_corners(view.camera.lens, view.camera.camera_from_world, lay(7, *where))
@@ -130,7 +130,7 @@ def test_a_frame_equals_one_drawn_by_brute_force(views: list[View]) -> None:
     drawn = drawn.reshape(size[1] + 16, samples, size[0] + 16, samples).mean(axis=(1, 3))[8:-8, 8:-8]
     fast = expose(view, [lay(7, *where)], SETTINGS)
     fast = fast[low[1] : low[1] + size[1], low[0] : low[0] + size[0]]
-    # The floor is not drawn by brute force: compare what lies clear of the rim of the print.
+    # The reference does not draw the floor: compare only pixels away from the edge of the print.
     inner = np.zeros(fast.shape, np.uint8)
     cv2.fillConvexPoly(inner, np.round(corners - low).astype(np.int32), 1)
     off = (fast - drawn)[inner > 0]
@@ -139,7 +139,7 @@ def test_a_frame_equals_one_drawn_by_brute_force(views: list[View]) -> None:
 
 
 def local_points(camera: Camera, x: float, y: float, z: float, turn: float, px: Array) -> Array:
-    """Pixels on the plane of a print, along its right and its top side."""
+    """Return pixels on the plane of a print, along its right and top side."""
     K, D = camera.lens.K, camera.lens.D
     mx, my = (px[..., 0] - K[0, 2]) / K[0, 0], (px[..., 1] - K[1, 2]) / K[1, 1]
     bent = np.hypot(mx, my)
@@ -158,7 +158,7 @@ def local_points(camera: Camera, x: float, y: float, z: float, turn: float, px: 
 
 
 def hard_print(local: Array, marker_id: int) -> Array:
-    """Black or white at points of a print."""
+    """Return black or white at points of a print."""
     known = cv2.aruco.getPredefinedDictionary(cv2.aruco.DICT_4X4_100)
     cells = np.asarray(cv2.aruco.generateImageMarker(known, marker_id, 6))
     column = np.floor((local[..., 0] / LENGTH_M + 0.5) * 6).astype(int)
@@ -177,11 +177,11 @@ def test_gamma_keeps_black_and_white_and_thins_black(views: list[View]) -> None:
     outer = image[int(corners[:, 1].min()) : int(corners[:, 1].max())]
     assert outer.min() == pytest.approx(35, abs=0.05)
     assert image.max() == pytest.approx(205, abs=0.05)
-    # Blurred light, then encoded: about 0.2 to 0.4 px of black are lost on each side.
+    # Blurred light, then gamma: about 0.2 to 0.4 px of black are lost on each side.
     assert -0.5 < edge_errors(view, placed, settings).mean() < -0.1
 
 
-def test_without_blur_pixels_are_black_white_or_mixed_at_edges(views: list[View]) -> None:
+def test_unblurred_pixels_are_black_white_or_mixed_at_edges(views: list[View]) -> None:
     settings = replace(SETTINGS, psf_sigma_px=0.0)
     view = prepare_view(views[1].camera, settings)
     image = expose(view, [lay(3, 2.6, 2.3, 0.0, 0.0)], settings)
@@ -208,7 +208,7 @@ def test_the_stock_detector_finds_every_marker_near_its_truth(views: list[View])
     assert np.sqrt(np.mean(np.sum(np.square(errors), axis=-1))) < 0.35
 
 
-def test_a_marker_at_the_edge_of_the_image_is_cut_off_and_nothing_else(views: list[View]) -> None:
+def test_marker_at_the_image_edge_is_cut_off(views: list[View]) -> None:
     view = views[1]
     bare = expose(view, [], SETTINGS)
     cut = expose(view, [lay(1, 2.44, view.camera.origin_m[1] + 1.0, 0.0, 0.4)], SETTINGS)

@@ -1,4 +1,4 @@
-"""Rolling shutter and motion blur, against frozen frames put together row by row."""
+"""Rolling shutter and motion blur, compared with static frames combined row by row."""
 
 from dataclasses import replace
 
@@ -22,7 +22,7 @@ from ipsys_log.simulation.settings import LabSettings
 Array = NDArray[np.float64]
 
 ROW_NS = 62_000
-# An exposure of so many row times, about 1/60 s: that many frozen frames lie within it.
+# Exposure in row times, about 1/60 s: it contains as many static frames.
 FRAMES = 269
 EXPOSURE_S = FRAMES * ROW_NS * 1e-9
 SPEED_M_S = 2.0
@@ -36,20 +36,20 @@ SHUTTERS = {
 
 @pytest.fixture(scope="module")
 def camera() -> Camera:
-    """A piece of a frame, for speed: 260 x 240 px beside the axis of a lens 2.1 m above the floor."""
+    """A part of a frame, for speed: 260 x 240 px beside the axis of a lens 2.1 m above the floor."""
     K = np.array([[1150.0, 0.0, 49.7], [0.0, 1152.0, 150.2], [0.0, 0.0, 1.0]])
     D, P = np.array([-0.13, 0.01, -0.03, 0.02]), np.hstack([K, np.zeros((3, 1))])
     lens = CameraCalibration(0, "red", 260, 240, "kannala_brandt", D, K, np.eye(3), P)
     return Camera("red", lens, look_down(np.array([2.4, 2.4, 2.1]), np.array([0.03, -0.02, 0.0])))
 
 
-# Where a marker is while row 120, the middle one, is exposed: in the middle of the piece; half outside,
-# at its corner; below the last row, by so little that it comes in while the frame is taken.
+# Positions of a marker at the exposure of row 120: at the centre of the part; half outside, at its corner;
+# below the last row, but entering during the exposure of the frame.
 MIDDLE, CORNER, BELOW = (2.580, 2.393), (2.806, 2.189), (2.582, 2.095)
 
 
 def drive_past(where_m: tuple[float, float], towards_rad: float, turn_rad_s: float) -> MovingMarker:
-    """A marker that is at a place while row 120 is exposed."""
+    """Return a moving marker with a given position at the exposure of row 120."""
     velocity = SPEED_M_S * np.array([np.cos(towards_rad), np.sin(towards_rad)])
 
     def moving(time_s: float) -> PlacedMarker:
@@ -61,7 +61,7 @@ def drive_past(where_m: tuple[float, float], towards_rad: float, turn_rad_s: flo
 
 
 def by_brute_force(camera: Camera, moving: MovingMarker, settings: LabSettings) -> Array:
-    """Each row: the mean, in light, of the frozen frames at all times within its exposure."""
+    """Return for each row the mean light of the static frames within its exposure."""
     frozen = replace(settings, row_time_ns=0, exposure_s=0.0)
     view = prepare_view(camera, frozen)
     height = camera.lens.height
@@ -78,7 +78,7 @@ def by_brute_force(camera: Camera, moving: MovingMarker, settings: LabSettings) 
 
 
 def edge_shift_px(found: Array, wanted: Array) -> float:
-    """By how much an edge can lie off at most: the light that is too much within nine pixels, as px."""
+    """Return the largest possible edge error in px, from the excess light within nine pixels."""
     off = (found - wanted) / (STILL.white - STILL.black)
     return max(float(np.abs(uniform_filter1d(off, 9, axis=axis)).max()) * 9 for axis in (0, 1))
 
@@ -108,7 +108,7 @@ def test_a_moving_marker_equals_one_drawn_by_brute_force(
 
 
 def test_the_marker_below_the_frame_comes_in_while_it_is_taken(camera: Camera) -> None:
-    """Or the brute force above would compare empty floors."""
+    """Otherwise the comparison would use empty floors."""
     settings = SHUTTERS["rolling"]
     view, moving = prepare_view(camera, settings), drive_past(BELOW, np.pi / 2, -2.5)
     bare = expose(view, [], settings)
@@ -117,7 +117,7 @@ def test_the_marker_below_the_frame_comes_in_while_it_is_taken(camera: Camera) -
 
 
 @pytest.mark.parametrize("shutter", SHUTTERS)
-def test_a_marker_that_stands_is_drawn_as_ever(camera: Camera, shutter: str) -> None:
+def test_stationary_marker_is_drawn_without_motion_blur(camera: Camera, shutter: str) -> None:
     placed = drive_past(MIDDLE, 0.0, 0.0)(0.0)
     before = expose(prepare_view(camera, STILL), [placed], STILL)
     view = prepare_view(camera, SHUTTERS[shutter])
@@ -125,7 +125,7 @@ def test_a_marker_that_stands_is_drawn_as_ever(camera: Camera, shutter: str) -> 
         np.testing.assert_array_equal(expose(view, [one], SHUTTERS[shutter]), before)
 
 
-def test_without_row_time_and_exposure_a_marker_is_seen_at_the_time_of_the_frame(camera: Camera) -> None:
+def test_global_shutter_shows_a_marker_at_the_frame_time(camera: Camera) -> None:
     moving = drive_past(MIDDLE, 0.3, 1.0)
     view = prepare_view(camera, STILL)
     np.testing.assert_array_equal(expose(view, [moving], STILL), expose(view, [moving(0.0)], STILL))
@@ -154,7 +154,7 @@ def drive_of(settings: LabSettings) -> tuple[Drive, int, dict[str, Camera]]:
     return plan_drive(settings, cameras), drive_start_ns(settings, cameras), named
 
 
-def test_the_truth_is_that_of_the_time_of_the_frame(session: list[Message]) -> None:
+def test_ground_truth_has_the_time_of_the_frame(session: list[Message]) -> None:
     drive, start_ns, _ = drive_of(LAB)
     truth = [m.payload for m in session if isinstance(m.payload, Tracks)]
     driving = [tracks for tracks in truth if tracks.timestamp >= start_ns]
@@ -167,13 +167,13 @@ def test_the_truth_is_that_of_the_time_of_the_frame(session: list[Message]) -> N
         ]
 
 
-def test_before_their_start_the_robots_stand() -> None:
+def test_robots_are_stationary_before_their_start() -> None:
     drive = drive_of(LAB)[0]
     assert drive.poses_at(-1.0) == drive.poses_at(0.0)
     assert drive.poses_at(1e-2) != drive.poses_at(0.0)
 
 
-def test_corners_in_a_session_lie_where_the_marker_was_while_their_row_was_exposed(
+def test_corners_follow_the_exposure_time_of_their_row(
     session: list[Message],
 ) -> None:
     drive, start_ns, cameras = drive_of(LAB)
@@ -196,12 +196,12 @@ def test_corners_in_a_session_lie_where_the_marker_was_while_their_row_was_expos
                     off_px[name].append(px - truth)
     assert len(off_px["frame"]) > 200
     rms = {name: float(np.sqrt(np.mean(np.sum(np.square(off), axis=-1)))) for name, off in off_px.items()}
-    # As good as without a rolling shutter.
+    # The accuracy is that of a global shutter.
     assert rms["own row"] < 0.4
     assert rms["frame"] > 2
 
 
-def test_the_rig_says_the_row_time_and_nothing_where_there_is_none() -> None:
+def test_rig_has_the_row_time_or_no_entry() -> None:
     for settings, row_time_ns in ((LAB, 3 * ROW_NS), (replace(LAB, row_time_ns=0), None)):
         rig = next(simulate(settings)).payload
         assert isinstance(rig, Rig)

@@ -1,4 +1,4 @@
-"""Rerun reads back the live recording itself, without a screen."""
+"""Rerun reads the live recording, without a screen."""
 
 from __future__ import annotations
 
@@ -37,7 +37,7 @@ def test_frames_and_robots_arrive_in_rerun(lab: Path, tmp_path: Path) -> None:
     messages, session = replayed(lab)
     (rig,) = session.payloads(["/rig"])
     LiveView(rig, session.images, "poly", print, show).consume(iter([*messages, None]))
-    # What a viewer reads from a pipe has a table of contents after every piece; a file has one.
+    # The pipe to a viewer has a table of contents after every part; a file has one.
     whole = tmp_path / "whole.rrd"
     command = [sys.executable, "-m", "rerun", "rrd", "merge", str(path), "-o", str(whole)]
     subprocess.run(command, check=True, capture_output=True)
@@ -46,7 +46,7 @@ def test_frames_and_robots_arrive_in_rerun(lab: Path, tmp_path: Path) -> None:
     assert any(entity.startswith("/world/runs/poly/robots/robot_") for entity in entities)
 
 
-def test_no_screen_is_said_before_anything_is_recorded(lab: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+def test_missing_screen_is_reported_before_the_recording(lab: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     for name in ("DISPLAY", "WAYLAND_DISPLAY", "WAYLAND_SOCKET"):
         monkeypatch.delenv(name, raising=False)
     with Session([lab]) as session:
@@ -55,7 +55,7 @@ def test_no_screen_is_said_before_anything_is_recorded(lab: Path, monkeypatch: p
             LiveView(rig, session.images, None, print)
 
 
-def test_why_the_viewer_failed_is_said(lab: Path) -> None:
+def test_viewer_failure_is_reported_with_its_reason(lab: Path) -> None:
     def broken(feed: Callable[[Write], None]) -> None:
         raise IpsysError("the viewer could not be shown")
 

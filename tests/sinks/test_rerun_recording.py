@@ -1,4 +1,4 @@
-"""A session saved for Rerun and read back with Rerun's own reader."""
+"""A session saved for Rerun, and read with Rerun's own reader."""
 
 from __future__ import annotations
 
@@ -40,7 +40,7 @@ from ipsys_log.sinks.rerun.recording import write_recording
 
 START_NS = 1_700_000_000_000_000_001
 STEP_NS = 100_000_000
-# Ten instants, silence, five more.
+# ten times, a pause, five more times
 TIMES_NS = [START_NS + STEP_NS * n for n in (*range(10), *range(200, 205))]
 DELAY_NS = 7_000_000
 CAMERAS = ("red", "white")
@@ -83,7 +83,7 @@ def session_messages() -> Iterator[Message]:
             positions = Positions(time_ns, (Position(0, 1 + 0.1 * n, 2.0, 0.1),))
             yield Message(f"/runs/poly/cameras/{camera}/positions", log_ns, time_ns, positions, camera)
             robots = (Track("robot_0", 0, 1 + 0.1 * n, 2.0, 0.1, 0.5), Track("robot_1", 1, 3.0, 0.1 * n, 0.1))
-            # The second robot goes away during the silence, and one camera sees the first only.
+            # The second robot disappears during the pause, and one camera sees only the first robot.
             seen = robots[: 2 if n < 10 and camera == "white" else 1]
             yield Message("/runs/poly/tracks", log_ns, time_ns, Tracks(time_ns, seen))
         yield Message("/truth/tracks", log_ns, time_ns, Tracks(time_ns, robots))
@@ -110,7 +110,7 @@ def saved(log: Path) -> Path:
 
 
 def rows(path: Path, entity: str, column: str) -> list[tuple[int, int, Any]]:
-    """Publish time, log time and value of a component, in the order of time and writing."""
+    """Return publish time, log time and value of a component, in the order of time and writing."""
     found: list[tuple[int, int, Any]] = []
     for chunk in RrdReader(path).stream().to_chunks():
         batch = chunk.to_record_batch()
@@ -138,7 +138,7 @@ def test_recording_is_sound_and_has_what_the_log_has(saved: Path) -> None:
     expected |= {"/world/floor", "/world/floor/grid", "/world/reference_points", "/events/recorded"}
     expected |= {f"/world/{name}" for name in ("places/training", "places/test", "truth/robots/robot_1")}
     assert expected <= entities
-    # Nothing of the clock of the machine that drew it.
+    # Nothing depends on the clock of the drawing machine.
     assert {name for chunk in chunks for name in chunk.timeline_names} == {"publish_time", "log_time"}
     assert len(RrdReader(saved).blueprints()) >= 1
 
@@ -161,7 +161,7 @@ def test_corners_lie_half_a_pixel_from_opencvs(saved: Path) -> None:
     assert TIMES_NS[3] in {row[0] for row in cleared}
 
 
-def test_each_robot_is_where_the_log_has_it(saved: Path) -> None:
+def test_robots_have_the_positions_of_the_log(saved: Path) -> None:
     for robot, axis, start in (("robot_0", 0, 1.0), ("robot_1", 1, 0.0)):
         drawn = rows(saved, f"/world/runs/poly/robots/{robot}", "Points3D:positions")
         assert {row[0] for row in drawn} == set(TIMES_NS if robot == "robot_0" else TIMES_NS[:10])
@@ -170,7 +170,7 @@ def test_each_robot_is_where_the_log_has_it(saved: Path) -> None:
 
 
 def looks_at(path: Path, entity: str, kind: str, moved: str, look: str) -> dict[int, Any]:
-    """The look in force wherever something is drawn, by publish time: None if a viewer has none."""
+    """Return the visible style at each publish time; None if a viewer has none."""
     drawn = [(time_ns, 2, None) for time_ns, _, _ in rows(path, entity, f"{kind}:{moved}")]
     given = [(time_ns, 1, value) for time_ns, _, value in rows(path, entity, f"{kind}:{look}")]
     parents = ["/".join(entity.split("/")[:depth]) for depth in range(2, entity.count("/") + 2)]
@@ -187,7 +187,7 @@ def looks_at(path: Path, entity: str, kind: str, moved: str, look: str) -> dict[
     return found
 
 
-def test_everything_drawn_has_its_look_again_after_it_went_away(saved: Path) -> None:
+def test_drawn_objects_keep_their_style_after_they_disappear(saved: Path) -> None:
     robot = "/world/runs/poly/robots/robot_0"
     labels = looks_at(saved, robot, "Points3D", "positions", "labels")
     assert labels == {time_ns: ["robot_0"] for time_ns in TIMES_NS}
@@ -219,7 +219,7 @@ def drawn_by(path: Path, messages: Iterable[Message], fade_ns: Mapping[str, int]
 
 
 def test_look_of_late_message_holds_for_it_alone(tmp_path: Path) -> None:
-    """Positions of another marker come later than they were taken: each keeps its own label."""
+    """Positions of another marker arrive after their exposure: each keeps its own label."""
     taken = [(10, 0), (5, 1), (12, 0), (7, 1), (13, 0), (14, 0)]
     messages = [
         Message(
@@ -252,7 +252,7 @@ def test_late_message_clears_nothing_that_was_drawn_after_it(tmp_path: Path) -> 
     assert [row[0] - START_NS for row in rows(saved, entity, "Clear:is_recursive")] == [15]
 
 
-def test_markers_have_their_look_again_after_their_image_went_away(tmp_path: Path) -> None:
+def test_markers_keep_their_style_after_their_image_disappears(tmp_path: Path) -> None:
     def frame(time_ns: int) -> Message:
         return Message(
             "/cameras/red/image", time_ns, time_ns, CompressedImage(time_ns, "red", jpeg(1), "jpeg"), "red"
@@ -281,24 +281,24 @@ def test_robot_without_heading_loses_its_arrow(tmp_path: Path) -> None:
     assert None not in looks_at(saved, arrow, "Arrows3D", "vectors", "colors").values()
 
 
-def test_what_is_no_longer_seen_goes_away(saved: Path) -> None:
+def test_unseen_objects_disappear_from_the_view(saved: Path) -> None:
     for entity in ("runs/poly/robots/robot_1", "runs/poly/robots/robot_0", "runs/poly/positions/red"):
         cleared = rows(saved, f"/world/{entity}", "Clear:is_recursive")
-        # A second after the last of the first ten, and not at the end of the log.
+        # one second after the last of the first ten times, not at the end of the log
         assert [row[:2] for row in cleared if row[0] > TIMES_NS[9]] == [
             (TIMES_NS[9] + 10**9, TIMES_NS[9] + DELAY_NS + 10**9)
         ]
     assert rows(saved, "/cameras/red/image", "Clear:is_recursive")[0][0] == TIMES_NS[9] + 10**10
 
 
-def test_trail_has_a_way_for_each_step_and_none_over_the_silence(saved: Path) -> None:
+def test_trail_has_a_line_per_step_and_none_over_a_gap(saved: Path) -> None:
     drawn = rows(saved, "/world/runs/poly/trails", "LineStrips3D:strips")
     robot_0 = [(time_ns, strips[0]) for time_ns, _, strips in drawn if strips[0][0][1] == 2.0]
     assert [time_ns for time_ns, _ in robot_0] == TIMES_NS[1:10] + TIMES_NS[11:]
     assert robot_0[0][1][1][0] == pytest.approx(1.1)
 
 
-def test_place_that_forms_no_triangle_is_left_out_and_said(saved: Path) -> None:
+def test_point_without_a_triangle_is_excluded_and_reported(saved: Path) -> None:
     chunks = RrdReader(saved).stream().to_chunks()
     batches = [c.to_record_batch() for c in chunks if c.entity_path == "/events/measurements"]
     ((text,),) = [row for batch in batches for row in batch.column("TextLog:text").to_pylist()]
@@ -332,7 +332,7 @@ def test_log_with_nothing_to_show_is_refused(tmp_path: Path) -> None:
         write_recording(session, save=tmp_path / "out.rrd")
 
 
-def test_runs_named_bring_the_markers_they_rest_on(log: Path, tmp_path: Path) -> None:
+def test_named_runs_include_their_input_markers(log: Path, tmp_path: Path) -> None:
     with Session([log]) as session:
         shown = write_recording(session, ["stock"], tmp_path / "out.rrd")
         assert (shown.markers, shown.runs) == ("stock", ())

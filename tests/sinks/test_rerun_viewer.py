@@ -1,4 +1,4 @@
-"""The viewer's process: bound to this machine, fed through a pipe, its failures in one line."""
+"""The viewer's process: local to this machine, fed by a pipe, with failures in one line."""
 
 from __future__ import annotations
 
@@ -37,7 +37,7 @@ def test_only_this_machine_can_connect() -> None:
 
 
 @pytest.mark.skipif(not sys.platform.startswith("linux"), reason="elsewhere there is always a screen")
-def test_without_a_screen_the_way_out_is_named() -> None:
+def test_missing_screen_error_names_an_alternative() -> None:
     with pytest.raises(IpsysError, match="--save"):
         check_screen({"HOME": "/"})
     check_screen({"WAYLAND_DISPLAY": "wayland-0"})
@@ -68,7 +68,7 @@ def test_window_closed_early_is_no_error(screen: None, monkeypatch: pytest.Monke
             taken.append(number)
 
     show_in_viewer(feed)
-    assert len(taken) < 8  # the rest was not pressed on a window that is gone
+    assert len(taken) < 8  # the other keys were not sent to a closed window
 
 
 def test_viewer_ends_when_reading_fails(screen: None, monkeypatch: pytest.MonkeyPatch) -> None:

@@ -1,4 +1,4 @@
-"""Sinks: a slow one loses images first, one that raises ends no recording, and offline nothing is lost."""
+"""Sinks: a slow sink loses images first, a failing sink ends no recording, and offline none loses data."""
 
 from __future__ import annotations
 
@@ -25,7 +25,7 @@ _LIMIT_S = 120.0
 
 
 class Collected:
-    """A sink, as a newcomer would write it: it keeps the messages. ``fault`` is raised at the n-th one."""
+    """A sink in the form of a new sink: it keeps the messages. ``fault`` is raised at the n-th one."""
 
     def __init__(self, name: str = "collected", fault_at: int | None = None) -> None:
         self.name = name
@@ -42,7 +42,7 @@ class Collected:
 
 
 class Stuck:
-    """A sink that takes one message and no more, until it is released."""
+    """A sink that accepts one message only, until it is released."""
 
     name = "stuck"
 
@@ -102,7 +102,7 @@ def test_video_continues_with_a_keyframe() -> None:
 
 
 def recorded(target: Path, *sinks: Sink) -> None:
-    """Record 40 frames of each of two cameras, of a source that is a row of the table of openers."""
+    """Record 40 frames of each of two cameras; their source is a row of the table of openers."""
     rig = Rig("lab", "DICT_4X4_100", 0.2)
     cameras = [RigCamera(name, source=f"test:{name}") for name in ("red", "white")]
     attached = LiveCameras(cameras, open_source, Clock())
@@ -112,7 +112,7 @@ def recorded(target: Path, *sinks: Sink) -> None:
 
 @pytest.fixture
 def source_of_one_row(monkeypatch: pytest.MonkeyPatch) -> None:
-    """A source for tests, as a newcomer would add it: a function, and a row in the table."""
+    """A source for tests in the form of a new source: a function, and a row in the table."""
     data = jpeg(np.full((120, 160), 200, np.uint8))
 
     @contextmanager

@@ -1,5 +1,8 @@
-"""Frames with known truth, drawn by other code than the simulator's: each pixel of a print is the mean of
-8 by 8 samples, each at a random place in its own square, of what its ray through the lens meets."""
+"""Frames with ground truth, drawn independently of the simulator.
+
+Each pixel of a print is the mean of 8 by 8 samples. Each sample is a random ray in its own part of the
+pixel.
+"""
 
 from __future__ import annotations
 
@@ -82,20 +85,20 @@ class Look:
 
 
 def corners_px(lens: CameraCalibration, one: Print, sides: float = 1.0) -> Array:
-    """Return the corners of the black square, or of a larger square, in a perfect camera: (4, 2)."""
+    """Return the corners (4, 2) of the black square, or of a larger square, in a perfect camera."""
     half = sides * one.length_m / 2
     square = np.array([[-half, half, 0], [half, half, 0], [half, -half, 0], [-half, -half, 0]])
     return _project(lens, square @ one.axes.T + one.centre_m)
 
 
 def print_px(lens: CameraCalibration, one: Print, look: Look) -> Array:
-    """The same of the white margin's corners."""
+    """Return the corners of the white margin."""
     cells = _black(look.dictionary, one.id).shape[0]
     return corners_px(lens, one, (cells + 2 * look.margin_cells) / cells)
 
 
 def draw(lens: CameraCalibration, prints: Sequence[Print], look: Look) -> Picture:
-    """The grey frame (h, w) of prints on a floor, the last one on top."""
+    """Draw the grey frame (h, w) of prints on a floor, the last one on top."""
     rng = np.random.default_rng(look.seed)
     light = np.broadcast_to(_light(look.floor, look), (lens.height, lens.width)).copy()
     for one in prints:
@@ -107,7 +110,7 @@ def draw(lens: CameraCalibration, prints: Sequence[Print], look: Look) -> Pictur
 
 
 def jpeg(grey: Picture, quality: int = 90, *options: int) -> bytes:
-    """As a camera sends it, in colour."""
+    """Encode a frame as a camera sends it, in colour."""
     options = (cv2.IMWRITE_JPEG_QUALITY, quality, *options)
     return cv2.imencode(".jpg", cv2.merge([grey, grey, grey]), options)[1].tobytes()
 
@@ -121,7 +124,7 @@ def strewn(
     height_m: tuple[float, float] = (1.9, 2.1),
     tilt_deg: float = 5.0,
 ) -> list[Print]:
-    """Markers 0, 1, ... side by side at random places, their margins wholly in the image."""
+    """Return markers 0, 1, ... side by side at random positions, with their margins inside the image."""
     found: list[Print] = []
     middles: list[Array] = []
     while len(found) < count:
@@ -139,14 +142,14 @@ def strewn(
 
 
 def turned(rng: np.random.Generator, tilt_deg: float) -> Array:
-    """Axes of a marker that faces the camera, turned at random and tilted by up to an angle."""
+    """Return the axes of a marker that faces the camera, rotated at random and tilted by up to an angle."""
     about = rng.uniform(0, 2 * np.pi)
     tilt = np.radians(rng.uniform(0, tilt_deg)) * np.array([np.cos(about), np.sin(about), 0.0])
     return facing(rng.uniform(-np.pi, np.pi), tilt)
 
 
 def facing(heading_rad: float, tilt_rad: Sequence[float] | Array = (0.0, 0.0, 0.0)) -> Array:
-    """Axes of a marker that faces the camera, turned in its plane, then tilted by a rotation vector."""
+    """Return the axes of a marker that faces the camera, rotated in its plane, then by a rotation vector."""
     upright = Rotation.from_euler("z", heading_rad) * Rotation.from_euler("x", np.pi)
     return np.asarray((Rotation.from_rotvec(tilt_rad) * upright).as_matrix())
 
@@ -160,13 +163,13 @@ def at_px(
     length_m: float = 0.2,
     tilt_rad: Sequence[float] = (0.0, 0.0, 0.0),
 ) -> Print:
-    """A marker whose middle is seen at a place in the picture."""
+    """Return a marker whose centre is at a given point of the image."""
     u, v = _rays(lens, np.array([middle_px], dtype=np.float64))[0]
     return Print(marker_id, facing(heading_rad, tilt_rad), np.array([u * z_m, v * z_m, z_m]), length_m)
 
 
 def texture(lens: CameraCalibration, seed: int, mean: float = 140.0, spread: float = 18.0) -> Array:
-    """A floor with blotches of all sizes."""
+    """Draw a floor with spots of all sizes."""
     rng = np.random.default_rng(seed)
     total = np.zeros((lens.height, lens.width))
     for blotch_px in (3, 10, 40, 160):
@@ -178,20 +181,20 @@ def texture(lens: CameraCalibration, seed: int, mean: float = 140.0, spread: flo
 
 
 def tiles(lens: CameraCalibration, low: float = 90.0, high: float = 170.0, size_px: int = 45) -> Array:
-    """A floor of light and dark squares, as large as markers' cells."""
+    """Draw a floor of light and dark squares, as large as marker cells."""
     y, x = np.mgrid[: lens.height, : lens.width] // size_px
     return np.where((x + y) % 2 == 0, low, high).astype(np.float64)
 
 
 def vignette(lens: CameraCalibration, corner: float = 0.35, slope: float = 0.5) -> Array:
-    """Light that falls off to the corners, and from the left to the right."""
+    """Return light that decreases to the corners, and from left to right."""
     y, x = np.mgrid[: lens.height, : lens.width]
     r2 = ((x / lens.width - 0.5) ** 2 + (y / lens.height - 0.5) ** 2) / 0.5
     return np.asarray((1 - (1 - corner) * r2) * (1 - slope * x / lens.width))
 
 
 def rig(*cameras: RigCamera, dictionary: str = "DICT_4X4_100") -> Message:
-    """A rig that knows every id."""
+    """Return a rig with every id."""
     markers = tuple(RigMarker(n) for n in range(600))
     return Message("/rig", 0, 0, Rig("lab", dictionary, 0.2, markers, cameras))
 
@@ -201,13 +204,13 @@ def calibrated(lens: CameraCalibration) -> Message:
 
 
 def frame(data: bytes | RawImage, time_ns: int, camera: str = "red") -> Message:
-    """A frame as a source hands it over."""
+    """Return a frame as a source delivers it."""
     payload = data if isinstance(data, RawImage) else CompressedImage(time_ns, camera, data, "jpeg")
     return Message(f"/cameras/{camera}/image", time_ns, time_ns, payload, camera)
 
 
 class Score:
-    """The errors of found corners, the missed markers and the false markers."""
+    """The errors of the detected corners, the missed markers and the false markers."""
 
     def __init__(self) -> None:
         self.offs_px: list[Array] = []
@@ -217,7 +220,7 @@ class Score:
         self.wrong: list[int] = []
 
     def add(self, markers: Sequence[Marker], truth_px: Mapping[int, Array], whole: Iterable[int]) -> None:
-        """The markers of a frame; ``whole`` are to be found."""
+        """Compare the detected markers of a frame; ``whole`` markers must be detected."""
         found = {marker.id: marker for marker in markers}
         for marker_id, marker in found.items():
             off_px = marker.corners_px - truth_px.get(marker_id, np.full((4, 2), np.inf))
@@ -259,7 +262,7 @@ def detect(
     look: Look = Look(),
     *cameras: RigCamera,
 ) -> tuple[Marker, ...]:
-    """The markers in a single frame."""
+    """Detect the markers in a single frame."""
     return follow(lens, [(1, data)], look, *cameras)[0]
 
 
@@ -269,7 +272,7 @@ def follow(
     look: Look = Look(),
     *cameras: RigCamera,
 ) -> list[tuple[Marker, ...]]:
-    """The markers in one frame after the other."""
+    """Detect the markers in consecutive frames."""
     stage = Detect("edges")
     made = [
         payload
@@ -288,13 +291,13 @@ def _draw_print(
 ) -> None:
     around = int(np.ceil(4 * look.psf_px)) + 2
     outline_px = print_px(lens, one, look)
-    # The blur is not right at the edge of the box: as much again is drawn and thrown away.
+    # The blur is wrong at the edge of the box, so a larger box is drawn and cropped.
     low = np.floor(outline_px.min(axis=0)).astype(int) - around
     high = np.ceil(outline_px.max(axis=0)).astype(int) + around + 1
     first, last = np.maximum(low, 0), np.minimum(high, [lens.width, lens.height])
     if (first >= last).any():
         return
-    # Beyond the edge of the frame the floor goes on.
+    # Outside the frame, the floor continues.
     x, y = (np.clip(np.arange(low[n] - around, high[n] + around), 0, light.shape[1 - n] - 1) for n in (0, 1))
     mean = _sampled(lens, one, look, low - around, high + around, light[np.ix_(y, x)], rng)
     start, stop = first - low + around, last - low + around
@@ -310,7 +313,7 @@ def _sampled(
     below: Array,
     rng: np.random.Generator,
 ) -> Array:
-    """Mean light of the pixels in a box."""
+    """Return the mean light of the pixels in a box."""
     lights = _lights(one, look)
     places = _on_print(lens, one, low, high, len(_black(look.dictionary, one.id)))
     column, row = ((2 * (part + look.margin_cells) + 1).astype(np.float32) for part in places)
@@ -331,7 +334,7 @@ def _sampled(
 
 
 def _lights(one: Print, look: Look) -> NDArray[np.float32]:
-    """The light from a print by half cells, its margin included, and NaN all around."""
+    """Return the light of a print by half cells, with its margin, and NaN around it."""
     levels = np.where(_black(look.dictionary, one.id), look.black, look.white)
     for cell, level in one.covered.items():
         levels[cell] = level
@@ -355,7 +358,7 @@ def _on_print(
 
 
 def _rays(lens: CameraCalibration, points_px: Array) -> Array:
-    """(u, v) of pixels: Newton's steps with the slopes of the pinhole camera, until they lead back."""
+    """Return (u, v) of pixels by Newton steps with the derivatives of the pinhole camera."""
     if lens.distortion_model == "kannala_brandt":
         rays = cv2.fisheye.undistortPoints(points_px[:, None], lens.K, lens.D)
         return np.asarray(rays, dtype=np.float64).reshape(-1, 2)
@@ -386,5 +389,5 @@ def _light(levels: float | Array, look: Look) -> Array:
 
 
 def each_time(count: int, step_ns: int = 33_333_333) -> Iterator[int]:
-    """Times of frames, 30 in a second."""
+    """Return frame times at 30 Hz."""
     return (1_000_000_000 + n * step_ns for n in range(count))

@@ -27,7 +27,7 @@ __all__ = ["LIGHTS", "Light", "lit_frame", "marker_in_glare", "shadow", "spots",
 # Corners in sides of the square, clockwise from the top left.
 _CORNERS = np.array([[-0.5, 0.5], [0.5, 0.5], [0.5, -0.5], [-0.5, -0.5]])
 
-# Of a print: the light that it gets besides, and the share of it that remains, (h, w) each.
+# The light of a print: added light, and the remaining share of the light, (h, w) each.
 Light = Callable[[CameraCalibration, Print, np.random.Generator], tuple[Array | float, Array | float]]
 
 
@@ -38,7 +38,7 @@ def lit_frame(
     length_m: float = 0.2,
     count: int = 5,
 ) -> tuple[bytes, dict[int, Array]]:
-    """Return a JPEG of markers at random places in a light, and their corners in px by id."""
+    """Return a JPEG of markers at random positions with a given lighting, and their corners in px by id."""
     rng, look = np.random.default_rng(seed), Look(seed=seed)
     prints = strewn(lens, count, rng, look, length_m=length_m)
     glare, shade = np.zeros((lens.height, lens.width)), np.ones((lens.height, lens.width))
@@ -80,7 +80,7 @@ def spots(level: float, breadth: float, where: str) -> Light:
 
 
 def streak(level: float, breadth: float, outside: float = 0.0) -> Light:
-    """Return glare along a whole side, as of a lamp's tube, or beside it by a share of the side."""
+    """Return glare along a whole side, as of a tube lamp, or at a given distance from the side."""
 
     def light(lens: CameraCalibration, one: Print, rng: np.random.Generator) -> tuple[Array, float]:
         k = int(rng.integers(4))
@@ -120,7 +120,7 @@ def _pixels(lens: CameraCalibration) -> tuple[Array, Array]:
 
 
 def _seen(lens: CameraCalibration, one: Print, place: Sequence[float] | Array) -> Array:
-    """Return where a place of a print, in sides from its centre, is seen."""
+    """Return the image point of a point of a print; the input is in sides from its centre."""
     point_m = np.array([[place[0], place[1], 0.0]]) * one.length_m
     return np.asarray(_project(lens, point_m @ one.axes.T + one.centre_m)[0])
 
@@ -132,7 +132,7 @@ def _side_px(lens: CameraCalibration, one: Print) -> float:
 
 @dataclass(frozen=True)
 class Scene:
-    """A light, and by how many px corners may be off in it (RMS)."""
+    """A lighting, and its allowed corner error in px (RMS)."""
 
     light: Light
     rms_px: float = 0.1

@@ -1,4 +1,4 @@
-"""Markers into the frame of their camera, by both methods."""
+"""Marker centres in camera coordinates, by both methods."""
 
 from __future__ import annotations
 
@@ -84,7 +84,7 @@ def test_a_tilted_marker_is_where_it_is_by_its_pose() -> None:
     (by_perimeter,), _ = points("perimeter", marker(3, EDGE, axes))
     np.testing.assert_allclose(where(by_pose), EDGE, atol=1e-6)
     assert np.linalg.norm(np.subtract(where(by_perimeter), EDGE)) > 0.05
-    # Both poses are there, the one that was taken first, with the direction of its y axis as heading.
+    # Both poses are stored, the chosen one first, with the direction of its y axis as heading.
     taken, other = by_pose.poses
     assert (taken.x_m, taken.y_m, taken.z_m) == where(by_pose)
     assert taken.reprojection_px < 1e-6 < other.reprojection_px
@@ -123,7 +123,7 @@ def test_the_covariance_is_that_of_the_scatter(method: str, place_m: tuple[float
 
 
 @pytest.mark.parametrize("method", METHODS)
-def test_without_a_covariance_there_is_none(method: str) -> None:
+def test_missing_input_covariance_gives_no_covariance(method: str) -> None:
     found, _ = points(method, marker(3), marker(5, CENTRE, covariance_px2=SIGMA_PX**2 * np.eye(8)))
     assert [point.covariance_m2 is None for point in found] == [True, False]
 
@@ -137,7 +137,7 @@ def test_a_marker_does_not_depend_on_those_beside_it(method: str) -> None:
 
 
 def test_the_perimeter_is_to_the_last_digit_that_of_each_marker() -> None:
-    """Logs of earlier releases have taken each through the lens by itself."""
+    """Logs of earlier releases have separately computed points."""
     rng = np.random.default_rng(1)
     for lens in LENSES.values():
         places_m = rng.uniform((-0.9, -0.6, 1.9), (0.9, 0.6, 2.1), (6, 3))
@@ -167,7 +167,7 @@ def test_corners_of_no_square_are_an_event(method: str) -> None:
 
 
 @pytest.mark.parametrize("method", METHODS)
-def test_a_covariance_that_is_none_is_named(method: str) -> None:
+def test_invalid_corner_covariance_is_reported(method: str) -> None:
     with pytest.raises(IpsysError, match="marker 3 of camera red: covariance_px2"):
         points(method, marker(3, covariance_px2=np.full((8, 8), np.nan)))
 

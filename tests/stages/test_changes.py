@@ -19,13 +19,13 @@ def floor() -> Picture:
 
 
 def square(x: float, y: float, size: float = BREADTH_PX) -> Array:
-    """Corners of a marker whose middle is at (x, y)."""
+    """Return the corners of a marker with its centre at (x, y)."""
     half = size / 2
     return np.array([[x - half, y - half], [x + half, y - half], [x + half, y + half], [x - half, y + half]])
 
 
 def put(picture: Picture, corners_px: Array, level: int = THING) -> Picture:
-    """With a thing where a marker is."""
+    """Return an image with an object at the position of a marker."""
     (left, top), (right, bottom) = corners_px.min(axis=0).astype(int), corners_px.max(axis=0).astype(int)
     with_it = picture.copy()
     with_it[max(top, 0) : max(bottom, 0), max(left, 0) : max(right, 0)] = level
@@ -34,7 +34,7 @@ def put(picture: Picture, corners_px: Array, level: int = THING) -> Picture:
 
 @pytest.fixture
 def watch() -> ChangeDetector:
-    """One that knows the empty floor."""
+    """Return a detector of changes that knows the empty floor."""
     watch = ChangeDetector()
     for _ in range(3):
         assert watch.find_change(floor(), ALL, [], BREADTH_PX) is None
@@ -52,19 +52,19 @@ def covers(region: tuple[slice, slice] | None, corners_px: Array) -> bool:
 
 
 @pytest.mark.parametrize("place", [(320, 240), (41, 41), (599, 41), (41, 439), (599, 439), (333, 222)])
-def test_a_new_thing_is_noticed_where_it_is(watch: ChangeDetector, place: tuple[float, float]) -> None:
+def test_new_object_is_detected_at_its_position(watch: ChangeDetector, place: tuple[float, float]) -> None:
     there = square(*place)
     assert covers(watch.find_change(put(floor(), there), ALL, [], BREADTH_PX), there)
 
 
-def test_what_is_known_to_be_a_marker_is_no_news(watch: ChangeDetector) -> None:
+def test_known_markers_start_no_search(watch: ChangeDetector) -> None:
     there = square(300, 200)
     assert watch.find_change(put(floor(), there), ALL, [there], BREADTH_PX) is None
 
 
 @pytest.mark.parametrize("step_px", [3, 20, 70])
 def test_floor_that_a_marker_uncovers_is_no_alarm(step_px: int) -> None:
-    """A marker drives across a floor that was never seen without it."""
+    """A marker moves across a floor that was never seen without it."""
     watch = ChangeDetector()
     for n in range(8):
         there = square(100 + step_px * n, 200)
@@ -86,8 +86,8 @@ def test_another_marker_beside_a_known_one_is_noticed(watch: ChangeDetector) -> 
 
 
 @pytest.mark.parametrize("side", ["left", "right", "top", "bottom"])
-def test_at_the_edge_a_thing_counts_when_half_of_it_is_in(watch: ChangeDetector, side: str) -> None:
-    """Less cannot be a marker yet, and would be searched for in vain in every frame."""
+def test_object_at_the_edge_counts_if_half_of_it_is_visible(watch: ChangeDetector, side: str) -> None:
+    """A smaller part cannot be a marker yet, and a search in every frame would be useless."""
     little, enough = (
         square(
             *{
@@ -103,8 +103,8 @@ def test_at_the_edge_a_thing_counts_when_half_of_it_is_in(watch: ChangeDetector,
     assert covers(watch.find_change(put(floor(), enough), ALL, [], BREADTH_PX), enough)
 
 
-def test_what_stays_becomes_background(watch: ChangeDetector) -> None:
-    """A chair is searched for markers some frames long, not for ever."""
+def test_unchanged_object_becomes_background(watch: ChangeDetector) -> None:
+    """A chair is searched for some frames only."""
     picture = put(floor(), square(320, 240, 160))
     alarms = [watch.find_change(picture, ALL, [], BREADTH_PX) is not None for _ in range(30)]
     assert alarms[0]
@@ -116,8 +116,8 @@ def test_slow_changes_of_light_are_no_alarm(watch: ChangeDetector) -> None:
         assert watch.find_change(floor() - np.uint8(level), ALL, [], BREADTH_PX) is None
 
 
-def test_rows_that_were_not_decoded_say_nothing(watch: ChangeDetector) -> None:
-    """They still hold what an older frame left there."""
+def test_undecoded_rows_start_no_search(watch: ChangeDetector) -> None:
+    """They still contain an older frame."""
     there = square(320, 100)
     picture = put(floor(), there)
     assert watch.find_change(picture, [slice(200, HEIGHT)], [], BREADTH_PX) is None
@@ -132,7 +132,7 @@ def test_frames_of_another_size_begin_anew(watch: ChangeDetector, size: tuple[in
         assert watch.find_change(other, [slice(0, size[0])], [square(5, 5)], BREADTH_PX) is None
 
 
-def test_markers_outside_of_the_picture_are_no_trouble(watch: ChangeDetector) -> None:
+def test_markers_outside_the_image_are_ignored(watch: ChangeDetector) -> None:
     for place in ((-500, -500), (5000, 100), (320, -60), (-39, 479)):
         assert watch.find_change(floor(), ALL, [square(*place)], BREADTH_PX) is None
     assert (

@@ -1,4 +1,4 @@
-"""Corners from edges against known truth: the simulator's frames, and frames drawn by other code."""
+"""Corners from edges, compared with ground truth of the simulator and of independent drawings."""
 
 from __future__ import annotations
 
@@ -59,7 +59,7 @@ def view(camera: str, gamma: float) -> View:
 
 
 def filmed(settings: LabSettings, camera: str, starts_s: Sequence[float], frames: int) -> Score:
-    """Some frames of one camera in a row, 30 in a second, from each of some times of the drive on."""
+    """Return consecutive frames of one camera at 30 Hz, from each of some times of the drive."""
     score, rng = Score(), np.random.default_rng(0)
     drive, where = plan_drive(settings, list(CAMERAS.values())), CAMERAS[camera]
     for start_s in starts_s:
@@ -102,7 +102,7 @@ def test_corners_along_the_whole_drive(count: int, camera: str) -> None:
     "starts_s", [(2.0,), pytest.param(np.arange(0, 15, 1.0).tolist(), marks=pytest.mark.slow)]
 )
 def test_a_gamma_does_not_move_corners(starts_s: Sequence[float]) -> None:
-    """It makes black too small all around, by the same for all markers: that is taken out."""
+    """Gamma makes black too small by the same distance for all markers: the offset corrects this."""
     score = filmed(replace(LAB, markers=8, gamma=2.2), "black", starts_s, 3)
     check(score, 0.07, 0.5, 0.995)
     assert np.mean(score.edge_offsets_px) == pytest.approx(0.42, abs=0.05)
@@ -115,8 +115,8 @@ ROLLING = LabSettings(
 
 
 @pytest.mark.slow
-def test_markers_behind_a_rolling_shutter_are_where_they_were_then() -> None:
-    """Robots at 2 m/s, 1/60 s of motion blur; from the third sighting on speed is known as well."""
+def test_rolling_shutter_markers_are_at_their_exposure_position() -> None:
+    """Robots have 2 m/s and 1/60 s of motion blur; the speed is known from the third sighting."""
     cameras = mount_cameras(ROLLING)
     drive, start_ns = plan_drive(ROLLING, cameras), drive_start_ns(ROLLING, cameras)
     row_s = ROLLING.row_time_ns / NS_PER_S
@@ -166,7 +166,7 @@ def strew(
     first: int = 0,
     **where: Any,
 ) -> Score:
-    """Markers at random places, each frame for itself."""
+    """Return markers at random positions, each frame independently."""
     score = Score()
     for n in range(first, first + frames):
         rng = np.random.default_rng(n)
@@ -185,7 +185,7 @@ PLAIN = Look()
 
 @dataclass(frozen=True)
 class Row:
-    """A scene, and what is expected of it."""
+    """A scene, and its expected result."""
 
     rms_px: float
     found: float = 0.98
@@ -199,7 +199,7 @@ class Row:
 
 
 def cover(level: float) -> Callable[[Print, np.random.Generator], Print]:
-    """One of the inner cells is covered."""
+    """One inner cell is covered."""
 
     def covered(one: Print, rng: np.random.Generator) -> Print:
         return one._replace(covered={(int(rng.integers(1, 5)), int(rng.integers(1, 5))): level})
@@ -208,7 +208,7 @@ def cover(level: float) -> Callable[[Print, np.random.Generator], Print]:
 
 
 def cells_px(size_px: float, cells: int = 6) -> float:
-    """The length in m of a marker whose cells are so large in the middle of the image."""
+    """Return the length in m of a marker with a given cell size in px at the image centre."""
     return size_px * cells * 2.0 / float(FISHEYE.K[0, 0])
 
 
@@ -247,7 +247,7 @@ def scored(row: Row, frames: int, per_frame: int) -> Score:
 
 @pytest.mark.parametrize("name", ROWS)
 def test_corners_of_another_renderer(name: str) -> None:
-    # One frame says less than many.
+    # One frame gives less information than many.
     row = ROWS[name]
     check(scored(row, 1, row.per_frame), 1.5 * row.rms_px, row.max_px, 0.6)
 
@@ -265,18 +265,18 @@ def test_random_poses_out_to_the_edge_of_the_image(gamma: float, rms_px: float, 
     check(strew(FISHEYE, Look(gamma=gamma), 60, 8), rms_px, 0.5, found)
 
 
-def test_a_marker_in_shadow_on_a_bright_floor_is_found_within_a_second() -> None:
-    """Its paper is darker than the floor, so that only the thorough search sees it."""
+def test_marker_in_shadow_is_found_within_a_second() -> None:
+    """The paper is darker than the floor, so that only the thorough search finds the marker."""
     look = Look(black=20, white=80, floor=150)
     one = at_px(VGA, 5, (330, 240), 2.0, length_m=0.4)
     empty, data = jpeg(draw(VGA, [], look)), jpeg(draw(VGA, [one], look))
     assert [marker.id for marker in detect(VGA, data, look)] == [5]
-    # The first frame is searched thoroughly. Here the marker comes with the second one.
+    # The first frame is searched thoroughly. Here the marker appears in the second frame.
     frames = [(n * 33_000_000, data if n else empty) for n in range(30)]
     answers = follow(VGA, frames, look)
     assert [marker.id for marker in answers[-1]] == [5]
     assert np.hypot(*(answers[-1][0].corners_px - corners_px(VGA, one)).T).max() < 0.15
-    # Cameras do so one after another: all at once would take longer than live tracking has.
+    # Cameras do so in turn: at the same time, it would take longer than live tracking allows.
     others = [RigCamera(name) for name in ("black", "red")]
     rigs = [(RigCamera(VGA.frame_id), *others), (*others, RigCamera(VGA.frame_id))]
     first, last = ([*map(bool, follow(VGA, frames, look, *them))] for them in rigs)
@@ -284,7 +284,7 @@ def test_a_marker_in_shadow_on_a_bright_floor_is_found_within_a_second() -> None
 
 
 def test_glare_on_a_marker_gives_no_wrong_one() -> None:
-    """If the glare is too strong, the marker is not found. It is never found in another place."""
+    """With too much glare, the marker is not found. It is never found at a wrong position."""
     y, x = np.mgrid[: VGA.height, : VGA.width]
     one = at_px(VGA, 5, (330, 240), 2.0, length_m=0.4)
     for strength in (60, 120, 250):
@@ -307,17 +307,17 @@ def test_glare_on_a_marker_gives_no_wrong_one() -> None:
         pytest.param(Look(black=60, white=110, floor=90), 30, marks=pytest.mark.slow),
     ],
 )
-def test_corners_are_as_uncertain_as_they_say(look: Look, frames: int) -> None:
+def test_corner_covariance_is_consistent(look: Look, frames: int) -> None:
     score = strew(FISHEYE, look, frames, 6)
     assert 0.7 < np.mean(score.normalized) < 1.9, score
 
 
-def test_corners_that_are_blurred_are_as_uncertain_as_they_say() -> None:
+def test_covariance_of_blurred_corners_is_consistent() -> None:
     assert np.mean(strew(FISHEYE, Look(psf_px=1.6), 1, 5).normalized) < 3
 
 
 def test_a_covariance_is_one_of_a_rigid_square() -> None:
-    """Eight coordinates, six freedoms; it is symmetric and never negative."""
+    """The covariance has eight coordinates and rank six; it is symmetric and never negative."""
     (marker, *_) = detect(FISHEYE, jpeg(draw(FISHEYE, [at_px(FISHEYE, 3, (700, 500))], Look())))
     assert marker.covariance_px2 is not None
     np.testing.assert_allclose(marker.covariance_px2, marker.covariance_px2.T, atol=1e-9)
@@ -340,12 +340,12 @@ def test_an_edge_offset_that_is_given_is_used() -> None:
     marker, right_px = one_marker(Look(gamma=2.2), RigCamera("red", edge_offset_px=0.42))
     assert marker.edge_offset_px == pytest.approx(0.42, abs=1e-4)
     assert np.abs(right_px).max() < 0.06
-    # Of a picture without gamma it is wrong: black is taken to be larger all around than it is.
+    # For an image without gamma, the offset is wrong: black is assumed too large all around.
     marker, wrong_px = one_marker(Look(), RigCamera("red", edge_offset_px=0.36))
     assert marker.edge_offset_px == pytest.approx(0.36, abs=1e-4)
     assert 0.3 < np.hypot(*wrong_px.T).mean() < 0.6
     assert np.abs(wrong_px.mean(axis=0)).max() < 0.05
-    # It is that camera's alone.
+    # The offset belongs to that camera only.
     marker, other_px = one_marker(Look(), RigCamera("white", edge_offset_px=0.36))
     assert marker.edge_offset_px == pytest.approx(0.0, abs=0.02)
     assert np.abs(other_px).max() < 0.06
@@ -361,14 +361,14 @@ def still() -> tuple[Picture, Print]:
 
 
 def guess(one: Print, shift_px: tuple[float, float] = (0.0, 0.0), marker_id: int | None = None) -> Guess:
-    """A marker's pose in sides of it, beside where it is."""
+    """Return a marker's pose in sides of the marker, beside its true position."""
     z = one.centre_m[2] / one.length_m
     shift = np.array([*shift_px, 0.0]) * z / VGA.K[0, 0]
     return Guess(one.id if marker_id is None else marker_id, one.axes, one.centre_m / one.length_m + shift)
 
 
 @pytest.mark.parametrize("shift_px", [(0.0, 0.0), (4.0, -3.0), (-5.0, 0.0), (3.0, 5.0)])
-def test_a_fit_finds_back(shift_px: tuple[float, float]) -> None:
+def test_fit_recovers_the_parameters(shift_px: tuple[float, float]) -> None:
     grey, one = still()
     (fit,) = fit_edges(grey, [guess(one, shift_px)], "DICT_4X4_100", VGA)
     assert fit is not None
@@ -376,7 +376,7 @@ def test_a_fit_finds_back(shift_px: tuple[float, float]) -> None:
     np.testing.assert_allclose(fit.pose.centre * one.length_m, one.centre_m, atol=0.004)
 
 
-def test_what_is_not_that_marker_is_not_fitted() -> None:
+def test_other_markers_are_not_fitted() -> None:
     grey, one = still()
     empty = np.full_like(grey, 150)
     noise = np.random.default_rng(0).integers(0, 255, grey.shape).astype(np.uint8)
@@ -390,7 +390,7 @@ def test_what_is_not_that_marker_is_not_fitted() -> None:
 
 
 def test_fits_do_not_disturb_one_another() -> None:
-    """Markers are fitted together; what is none among them changes nothing of the others."""
+    """Markers are fitted together; a false marker does not change the others."""
     grey, one = still()
     (alone,) = fit_edges(grey, [guess(one)], "DICT_4X4_100", VGA)
     together = fit_edges(
@@ -403,7 +403,7 @@ def test_fits_do_not_disturb_one_another() -> None:
 
 
 def test_a_marker_beyond_the_edge_is_not_fitted() -> None:
-    """A corner that lies outside of the picture was not seen, however well the rest fits."""
+    """A corner outside the image was not seen, even if the rest fits well."""
     one = at_px(VGA, 5, (9, 240), 2.0, length_m=0.4)
     grey = draw(VGA, [one], Look())
     assert (corners_px(VGA, one) < 0).any()
@@ -412,7 +412,7 @@ def test_a_marker_beyond_the_edge_is_not_fitted() -> None:
 
 @pytest.mark.parametrize("tilt_deg", [15, 30, 45])
 def test_a_tilted_marker_follows_its_tilt(tilt_deg: float) -> None:
-    """From a guess of the right one of the two poses that look alike."""
+    """The start is the correct one of the two similar poses."""
     axes = facing(0.4, np.radians(tilt_deg) * np.array([0.6, 0.8, 0.0]))
     one = Print(5, axes, np.array([0.2, 0.1, 1.2]), 0.4)
     (fit,) = fit_edges(draw(VGA, [one], Look()), [guess(one)], "DICT_4X4_100", VGA)
@@ -422,6 +422,6 @@ def test_a_tilted_marker_follows_its_tilt(tilt_deg: float) -> None:
     assert np.degrees(angle_rad) < 1.5
 
 
-def test_a_tilted_marker_is_found_as_it_lies() -> None:
+def test_tilted_marker_is_fitted_with_its_tilt() -> None:
     score = strew(FISHEYE, Look(), 3, 6, first=100, tilt_deg=50.0)
     assert score.max_px < 0.5, score

@@ -1,4 +1,4 @@
-"""Errors by eq. (26) and (27) on places held out and by cross-validation; learning curves; covariances."""
+"""Errors by eq. (26) and (27) at held-out points and by cross-validation; learning curves; covariances."""
 
 from __future__ import annotations
 
@@ -34,7 +34,7 @@ def pairs(offset: np.ndarray) -> list[Pair]:
 
 
 def lab(seed: int, count: int = 40, **noise: float) -> tuple[list[Pair], np.ndarray, np.ndarray]:
-    """Measured pairs of one camera; camera points and world points of a drive in the same view."""
+    """Return pairs of one camera, and camera points and world points of a drive in the same view."""
     rng = np.random.default_rng(seed)
     camera, world = labs.camera(rng, **noise), labs.places(rng, count)
     tape, covariances = labs.measure(world, rng)
@@ -54,7 +54,7 @@ def test_statistics_are_those_of_the_standard_library() -> None:
     assert (single.std_m, single.mean_low_m) == (None, None)
 
 
-def test_the_interval_of_the_mean_holds_it_as_often_as_it_says() -> None:
+def test_confidence_interval_contains_the_mean_at_its_rate() -> None:
     rng = np.random.default_rng(0)
     held = 0
     for _ in range(300):
@@ -65,7 +65,7 @@ def test_the_interval_of_the_mean_holds_it_as_often_as_it_says() -> None:
     assert 0.90 <= held / 300 <= 0.98
 
 
-def test_repeats_at_one_place_do_not_make_the_mean_more_certain() -> None:
+def test_repeats_at_one_point_do_not_narrow_the_interval() -> None:
     errors = np.random.default_rng(1).gamma(2.0, 0.005, 30)
     once, four_times = error_statistics(errors), error_statistics(np.tile(errors, (4, 1)))
     assert four_times.count == 30
@@ -105,13 +105,13 @@ def test_all_cameras_together_are_one_row_more() -> None:
     assert [row.camera for row in only] == ["white"]
 
 
-def test_places_that_the_model_was_fitted_on_are_not_held_out() -> None:
-    """As where a model is applied to the very log that it was made from."""
+def test_points_of_the_fit_are_not_held_out() -> None:
+    """A model may be applied to the log of its own calibration points."""
     model = fit_model("rigid", {"red": pairs(np.zeros(3))}, 0)
     assert evaluate_held_out(model, {"red": pairs(np.zeros(3))}, {}) == []
 
 
-def test_where_all_places_have_one_height_there_is_no_error_in_space() -> None:
+def test_points_at_one_height_have_no_3d_error() -> None:
     rng = np.random.default_rng(0)
     world = labs.places(rng, 20, heights=(0.1,))
     tape, covariances = labs.measure(world, rng)
@@ -130,7 +130,7 @@ def test_cross_validation_is_that_of_a_loop_written_out() -> None:
         error = float(np.linalg.norm(residual.predicted_m - residual.world_m))
         by_place.setdefault(residual.measurement, []).append(error)
     assert {len(errors) for errors in by_place.values()} == {4}
-    # No place is predicted by a model that has seen it: it never comes near its own residual of the fit.
+    # No model predicts a point of its own fit: the error never approaches the residual of the fit.
     applied = AppliedModel("poly", model.cameras[0])
     points, world = (np.array([getattr(p, f) for p in found]) for f in ("camera_m", "world_m"))
     inside = np.linalg.norm(applied.predict(points, world[:, 2]) - world, axis=1)
@@ -140,7 +140,7 @@ def test_cross_validation_is_that_of_a_loop_written_out() -> None:
     assert again[0].error_3d != row.error_3d
 
 
-def test_a_place_seen_by_two_cameras_is_held_out_from_both() -> None:
+def test_point_of_two_cameras_is_held_out_from_both() -> None:
     def seen(*names: str) -> CalibrationPoints:
         return CalibrationPoints(np.zeros((len(names), 3)), np.zeros((len(names), 3)), names)
 
@@ -157,7 +157,7 @@ def test_a_place_seen_by_two_cameras_is_held_out_from_both() -> None:
         assert max(sizes) - min(sizes) <= 1
 
 
-def test_leave_one_out_is_a_fit_without_the_place() -> None:
+def test_leave_one_out_equals_a_fit_without_the_point() -> None:
     found, _, _ = lab(1, 16)
     cameras = gather_points({"red": found})
     left_out = leave_one_out("poly", cameras)(frozenset({"m03"}))["red"]
@@ -169,7 +169,7 @@ def test_leave_one_out_is_a_fit_without_the_place() -> None:
     assert set(left_out) == {p.measurement for p in found}
 
 
-def test_more_places_make_a_better_model_and_the_curve_says_so() -> None:
+def test_learning_curve_falls_with_more_points() -> None:
     found, _, _ = lab(2, 60)
     curve = [p for points in learning_curve("poly", gather_points({"red": found}), 0) for p in points]
     assert [p.pairs for p in curve] == [10, 15, 20, 30, 40]
@@ -177,7 +177,7 @@ def test_more_places_make_a_better_model_and_the_curve_says_so() -> None:
     assert all(p.std_3d_m is not None and p.subsets == 10 for p in curve)
 
 
-def test_published_subsets_are_fitted_and_looked_at_where_the_paper_does() -> None:
+def test_published_subsets_are_evaluated_as_in_the_paper() -> None:
     found, _, _ = lab(3, 30)
     cameras = gather_points({"red": found})
     names = [p.measurement for p in found]
@@ -189,21 +189,21 @@ def test_published_subsets_are_fitted_and_looked_at_where_the_paper_does() -> No
     assert labelled_subsets([]) == {}
 
 
-def test_the_covariance_is_of_errors_that_the_fit_has_not_seen() -> None:
+def test_covariance_is_for_held_out_errors() -> None:
     rng = np.random.default_rng(1)
     noisy = [
         Pair(p.measurement, 0, p.camera_m, p.world_m + rng.normal(0, 0.01, 3), 1) for p in pairs(np.zeros(3))
     ]
     covariance = fit_model("poly", {"red": noisy}, 0).cameras[0].covariance_m2
     assert covariance is not None
-    # With 14 pairs for 10 parameters the fit looks good and is not.
+    # With 14 pairs for 10 parameters, the residuals are small but the errors are not.
     assert np.sqrt(np.trace(covariance) / 3) > 0.015
     few = fit_model("poly", {"red": noisy[:10]}, 0).cameras[0]
     assert (few.covariance_m2, few.noise) == (None, None)
 
 
 def regions(name: str, along: float, seeds: Sequence[int]) -> tuple[float, float]:
-    """Shares of the true places of drives within the 68 % and 95 % regions of their positions."""
+    """Return the shares of true positions within the 68 % and 95 % regions of their positions."""
     size = 2 if name == "rayplane" else 3
     within: list[Mapping[float, float]] = []
     for seed in seeds:
@@ -227,21 +227,21 @@ def regions(name: str, along: float, seeds: Sequence[int]) -> tuple[float, float
         pytest.param("best", 0.003, marks=pytest.mark.slow),
     ],
 )  # fmt: skip
-def test_covariances_hold_the_truth_as_often_as_they_say(name: str, along: float) -> None:
-    """One session's tape errors are common to all its positions: only many sessions can tell."""
+def test_covariance_regions_contain_the_truth_at_their_rate(name: str, along: float) -> None:
+    """All positions of a session share its tape errors, so the test needs many sessions."""
     within_68, within_95 = regions(name, along, range(40))
     assert 0.60 <= within_68 <= 0.76
     assert 0.90 <= within_95 <= 0.98
 
 
-def test_the_covariance_of_a_model_that_misfits_knows_most_of_it() -> None:
-    """The lens error that rigid leaves is no noise: it is equal at near positions and not Gaussian."""
+def test_covariance_includes_most_of_a_model_misfit() -> None:
+    """The remaining lens error of rigid is no noise: it is equal at near positions and not Gaussian."""
     within_68, within_95 = regions("rigid", 0.0004, range(40))
     assert 0.55 <= within_68 <= 0.76
     assert 0.80 <= within_95 <= 0.98
 
 
-def test_away_from_the_measured_places_a_position_is_less_certain() -> None:
+def test_uncertainty_grows_away_from_the_calibration_points() -> None:
     found, _, _ = lab(5)
     inner = [p for p in found if 1.0 < p.world_m[0] < 3.8]
     applied = AppliedModel("poly", fit_model("poly", {"red": inner}, 0).cameras[0])
@@ -250,7 +250,7 @@ def test_away_from_the_measured_places_a_position_is_less_certain() -> None:
     assert sizes[1] > 9 * sizes[0]
 
 
-def test_places_of_a_fold_too_few_to_fit_are_an_error() -> None:
+def test_fold_with_too_few_points_is_an_error() -> None:
     found, _, _ = lab(7, min_pairs("poly") + 1)
     with pytest.raises(FitError):
         predict_without("rigid", gather_points({"red": found}), {p.measurement for p in found[2:]})

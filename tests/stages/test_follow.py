@@ -1,4 +1,4 @@
-"""Markers from frame to frame: what comes, goes, hides, and what else a camera may send."""
+"""Markers from frame to frame: new, lost and hidden markers, and unusual frames."""
 
 from __future__ import annotations
 
@@ -44,7 +44,7 @@ from tests.stages.drawing import (
 )
 
 LENGTH_M = 0.4
-# Frames in which a marker has to be found again: all of the picture is decoded every tenth time.
+# Number of frames to find a marker again: the whole image is decoded every tenth time.
 SOON = 10
 RESTARTS = (cv2.IMWRITE_JPEG_RST_INTERVAL, 40)
 
@@ -77,7 +77,7 @@ def feed(detect: Detect, messages: Iterable[Message]) -> list[list[Any]]:
 
 
 def film(pictures: Iterable[Picture], camera: str = "red", *options: int) -> list[Message]:
-    """Pictures as a camera sends them, 30 in a second; the same one is packed once."""
+    """Return images as a camera sends them at 30 Hz; equal images are encoded once."""
     packed: dict[int, bytes] = {}
     kept = list(pictures)
     for picture in kept:
@@ -103,7 +103,7 @@ def off_px(made: list[Any], one: Print, lens: CameraCalibration = VGA) -> float:
 
 
 def same(one: Sequence[list[Any]], other: Sequence[list[Any]]) -> bool:
-    """Bit for bit."""
+    """Compare bit for bit."""
     return [list(map(bits, made)) for made in one] == [list(map(bits, made)) for made in other]
 
 
@@ -119,7 +119,7 @@ def bits(payload: Any) -> Any:
 
 @cache
 def driven() -> tuple[Picture, ...]:
-    """Two markers that drive, one of them out of the picture."""
+    """Return two moving markers; one leaves the image."""
     return tuple(
         draw(VGA, [lying(5, 200 + 12 * n, 240, 0.1 * n), lying(7, 520 + 16 * n, 120)], Look(seed=n))
         for n in range(12)
@@ -131,7 +131,7 @@ def driven() -> tuple[Picture, ...]:
 
 @pytest.mark.parametrize("options", [(), RESTARTS], ids=["plain", "restarts"])
 def test_the_same_frames_give_the_same_markers(options: tuple[int, ...]) -> None:
-    """A replay equals what ran live, bit for bit, whatever other cameras send in between."""
+    """A replay equals the live result bit for bit, for any frames of other cameras."""
     red, white = film(driven(), "red", *options), film(reversed(driven()), "white", *options)
     alone = feed(started(), red)
     assert [5, 7] in ids(alone)
@@ -143,8 +143,8 @@ def test_the_same_frames_give_the_same_markers(options: tuple[int, ...]) -> None
     assert same(feed(detect, mixed)[::2], alone)
 
 
-def test_a_calibration_that_says_the_same_changes_nothing() -> None:
-    """Recorders repeat it every so often."""
+def test_equal_calibration_changes_nothing() -> None:
+    """Recorders repeat the calibration regularly."""
     frames, detect = film(driven()), started()
     answers = []
     for message in frames:
@@ -163,7 +163,7 @@ def test_markers_are_followed_as_well_as_they_are_found() -> None:
         assert off_px(alone, one) < 0.12
 
 
-# --- what cannot be decoded ---------------------------------------------------------------------
+# --- undecodable frames -------------------------------------------------------------------------
 
 
 DAMAGES: dict[str, Callable[[bytes], bytes]] = {
@@ -176,7 +176,7 @@ DAMAGES: dict[str, Callable[[bytes], bytes]] = {
 
 @pytest.mark.parametrize("at", [1, 4, 5])
 @pytest.mark.parametrize("damage", DAMAGES)
-def test_a_corrupt_frame_is_said_and_does_no_harm(damage: str, at: int) -> None:
+def test_corrupt_frame_is_reported_and_changes_nothing_else(damage: str, at: int) -> None:
     frames = film([with_marker()] * 8)
     bad = frame(DAMAGES[damage](frames[at].payload.data), frames[at].publish_time_ns)
     answers = feed(started(), [*frames[:at], bad, *frames[at + 1 :]])
@@ -188,11 +188,11 @@ def test_a_corrupt_frame_is_said_and_does_no_harm(damage: str, at: int) -> None:
 
 
 def markers_or_event(made: list[Any]) -> bool:
-    """A hole below what is decoded is not noticed: then the marker has to be right."""
+    """Damage below the decoded rows is not detected: then the marker has to be correct."""
     return isinstance(made[0], Markers) and off_px(made, lying(5, 330, 240)) < 0.1
 
 
-# --- what comes and goes ------------------------------------------------------------------------
+# --- new and lost markers -----------------------------------------------------------------------
 
 
 @pytest.mark.parametrize("options", [(), RESTARTS], ids=["plain", "restarts"])
@@ -224,7 +224,7 @@ SIDES = {"left": (-1, 0), "right": (1, 0), "top": (0, -1), "bottom": (0, 1)}
 
 @pytest.mark.parametrize("side", SIDES)
 def test_a_marker_that_enters_is_seen_soon_after_it_is_whole(side: str) -> None:
-    """While another marker is followed, so that only some rows are decoded."""
+    """Another marker is tracked, so only some rows are decoded."""
     towards = np.array(SIDES[side])
     beside = draw(VGA, [lying(9, 530, 385)], Look(noise=0.0)).astype(np.float64)
     starts_px = np.abs(towards) * (380, 300)
@@ -244,7 +244,7 @@ def inside(points_px: Array) -> bool:
 
 
 def test_a_marker_at_the_corner_of_the_image() -> None:
-    """Its black square reaches the last pixels; the margin lies outside."""
+    """The black square reaches the last pixels; the margin is outside."""
     for x, y in ((34, 30), (604, 30), (34, 448), (604, 448)):
         one = lying(5, x, y, 0.05)
         (made,) = feed(started(), film([draw(VGA, [one], Look())]))
@@ -269,7 +269,7 @@ def test_a_hundred_markers_at_once() -> None:
 
 
 def test_two_markers_of_one_id_are_ambiguous_in_every_frame() -> None:
-    """Neither of them is handed on: which one the robot is cannot be known."""
+    """Neither of them is reported, because the robot could be either."""
     picture = draw(VGA, [lying(5, 180, 240), lying(5, 470, 240), lying(7, 330, 100)], Look())
     answers = feed(started(), film([picture] * 8))
     assert ids(answers) == [[7]] * 8
@@ -308,7 +308,7 @@ def test_a_marker_that_is_not_in_the_rig_is_named_once() -> None:
     ids=["equal", "backwards", "mixed", "nanoseconds", "months later"],
 )
 def test_odd_time_stamps_lose_no_marker(times_ns: list[int], row_time_ns: int | None) -> None:
-    """The search region depends on the time, and a marker may lie still."""
+    """The search region depends on the time, and a marker may be stationary."""
     detect = Detect("edges")
     for message in (rig(RigCamera("red", row_time_ns=row_time_ns)), calibrated(VGA)):
         list(detect(message))
@@ -320,7 +320,7 @@ def test_odd_time_stamps_lose_no_marker(times_ns: list[int], row_time_ns: int | 
 
 @pytest.mark.parametrize(("step_px", "gap_s"), [(0, 10), (12, 5)], ids=["at rest", "driving"])
 def test_after_a_gap_a_marker_is_found_at_once(step_px: int, gap_s: int) -> None:
-    """A camera was lost for some seconds; the robot stands, or stopped soon after the last frame."""
+    """A camera was lost for some seconds; the robot is stationary, or stopped soon after the last frame."""
     data = [jpeg(draw(VGA, [lying(5, 200 + step_px * n, 240)], Look(seed=n))) for n in (0, 1, 2, 4)]
     times_ns = [0, 33_000_000, 67_000_000, 67_000_000 + gap_s * 10**9]
     answers = feed(started(), [frame(d, t) for d, t in zip(data, times_ns, strict=True)])
@@ -328,12 +328,12 @@ def test_after_a_gap_a_marker_is_found_at_once(step_px: int, gap_s: int) -> None
 
 
 def test_the_frame_size_changes_in_the_middle_of_a_log() -> None:
-    """A camera is set to another size, and its calibration follows."""
+    """A camera gets another frame size, and its calibration follows."""
     large, small = at_px(FISHEYE, 5, (900, 500)), lying(5, 330, 240)
     frames = [frame(jpeg(draw(FISHEYE, [large], Look())), 1), frame(jpeg(with_marker()), 34_000_000)]
     detect = started(FISHEYE)
     (first,) = feed(detect, frames[:1])
-    # Before its calibration is there, nothing can be right.
+    # Without its calibration, no result can be correct.
     ((early,),) = feed(detect, [replace(frames[1], publish_time_ns=20_000_000)])
     assert early.kind == "wrong_size"
     assert "1920 x 1080" in early.text
@@ -345,7 +345,7 @@ def test_the_frame_size_changes_in_the_middle_of_a_log() -> None:
 
 
 def test_a_calibration_of_another_size_is_refused() -> None:
-    """Fitted through a lens of twice the focal length, corners look right and poses are wrong."""
+    """With intrinsics of twice the focal length, corners look correct and poses are wrong."""
     for lens, picture in ((FISHEYE, with_marker()), (VGA, draw(FISHEYE, [], Look()))):
         with pytest.raises(IpsysError, match="calibration"):
             feed(started(lens), film([picture]))
@@ -395,14 +395,14 @@ KINDS: dict[str, Callable[[Picture], bytes | RawImage]] = {
 
 @pytest.mark.parametrize("kind", KINDS)
 def test_any_kind_of_frame(kind: str) -> None:
-    """Followed over some frames, so that rows of it are decoded where that can be."""
+    """The marker is tracked over some frames, so that only rows are decoded if possible."""
     data = KINDS[kind](with_marker())
     for made in feed(started(), [frame(data, time_ns) for time_ns in each_time(4)]):
         assert off_px(made, lying(5, 330, 240)) < 0.1
 
 
 def test_kinds_of_frames_may_take_turns() -> None:
-    """Pictures are decoded into the memory of those before; a raw frame's memory is its owner's."""
+    """Images are decoded into the memory of earlier ones; the memory of a raw frame belongs to its owner."""
     kinds = [KINDS[kind](with_marker()) for kind in ("mono8", "4:2:0", "png", "4:2:2 with restarts", "bgr8")]
     first = kinds[0]
     assert isinstance(first, RawImage)
@@ -412,7 +412,7 @@ def test_kinds_of_frames_may_take_turns() -> None:
     assert bytes(first.data) == before
 
 
-def test_a_corrupt_first_frame_costs_nothing_but_itself() -> None:
+def test_corrupt_first_frame_loses_only_itself() -> None:
     frames = film([with_marker()] * 4)
     broken = replace(frames[0], payload=replace(frames[0].payload, data=b"\xff\xd8 no picture"))
     answers = feed(started(), [broken, *frames[1:]])

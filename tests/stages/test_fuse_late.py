@@ -1,4 +1,4 @@
-"""Positions from frames that came late are in no pose."""
+"""Positions from late frames are in no pose."""
 
 from __future__ import annotations
 

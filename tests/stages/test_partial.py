@@ -1,4 +1,4 @@
-"""Markers of which glare or a shadow hides a part, against known truth and OpenCV's detector."""
+"""Markers with a part hidden by glare or a shadow, compared with ground truth and OpenCV's detector."""
 
 from __future__ import annotations
 
@@ -42,7 +42,7 @@ from tests.stages.drawing import (
 from tests.stages.lighting import LIGHTS, lit_frame, marker_in_glare, spots, streak
 
 DICTIONARY = "DICT_4X4_100"
-# Of the small frames of the fast tests: cells of 13 px in the middle.
+# Values for the small frames of the fast tests: cells of 13 px at the centre.
 SIDE_M = 0.4
 
 
@@ -51,7 +51,7 @@ def stock(data: bytes) -> list[Marker]:
 
 
 def count_right(markers: Iterable[Marker], truth_px: dict[int, Array]) -> int:
-    """Return how many markers lie within 10 px of where they are."""
+    """Return the number of markers within 10 px of their true position."""
     offs_px = [m.corners_px - truth_px[m.id] for m in markers if m.id in truth_px]
     return sum(bool(np.hypot(*off_px.T).mean() < 10) for off_px in offs_px)
 
@@ -72,7 +72,7 @@ def test_edges_in_uneven_light_find_as_many_as_stock(name: str) -> None:
 
 @cache
 def scored_at_full_size(name: str) -> tuple[Score, int, list[Array]]:
-    """Return the score, what stock finds, and errors in standard deviations, of 40 markers."""
+    """Return the score, the detections of stock, and errors in standard deviations, of 40 markers."""
     score, by_stock, errors = Score(), 0, []
     for seed in range(8):
         data, truth_px = lit_frame(FISHEYE, LIGHTS[name].light, seed + 1000)
@@ -97,7 +97,7 @@ def test_edges_in_uneven_light_are_exact_at_full_size(name: str) -> None:
 
 @pytest.mark.slow
 def test_covariance_with_three_sides_holds_the_errors() -> None:
-    """In each coordinate, 68 % of the errors, give or take 5 points, lie within their sigma."""
+    """In each coordinate, 68 % of the errors, within 5 points, are below their sigma."""
     errors = [e for name in LIGHTS if "along" in name for e in scored_at_full_size(name)[2]]
     assert np.mean(np.abs(errors) <= 1) == pytest.approx(0.68, abs=0.05)
     assert np.mean(np.abs(errors) <= 2) >= 0.9
@@ -107,7 +107,7 @@ def test_covariance_with_three_sides_holds_the_errors() -> None:
 
 
 def test_simulated_marker_with_glare_on_a_side_is_exact() -> None:
-    """Glare is added to the picture, as light that saturates: another way than the drawing's."""
+    """Glare is added to the image as saturating light: another method than in the drawing."""
     settings = LabSettings(stations=0, markers=3, width=960, height=540)
     camera = mount_cameras(settings)[0]
     drive = plan_drive(settings, [camera])
@@ -149,7 +149,7 @@ def test_tracked_marker_is_kept_while_glare_moves_over_it() -> None:
         assert np.hypot(*(marker.corners_px - truth_px).T).max() < 0.25
 
 
-# --- what is seen and cannot be measured --------------------------------------------------------
+# --- detected markers that cannot be measured ----------------------------------------------------
 
 
 def answers_to(pictures: Iterable[Picture]) -> list[object]:
@@ -186,7 +186,7 @@ def test_partial_fit_is_never_that_of_another_marker() -> None:
 
 
 def test_side_in_glare_makes_its_corners_uncertain() -> None:
-    """The covariance says which corners follow from the other sides alone."""
+    """The covariance shows the corners that depend on the other sides only."""
     one = at_px(VGA, 5, (330, 240), 2.0, length_m=SIDE_M, heading_rad=0.0)
     top = corners_px(VGA, one)[:2].mean(axis=0)
     y, _ = np.mgrid[: VGA.height, : VGA.width]

@@ -1,4 +1,4 @@
-"""Single stages, fed by hand."""
+"""Single stages with direct input."""
 
 from __future__ import annotations
 
@@ -33,7 +33,7 @@ def frame(payload: Any, time_ns: int = 1, camera: str = "red") -> Message:
 
 
 def test_detected_corners_are_where_they_were_drawn() -> None:
-    """A marker drawn 8 times too large and reduced: its corners are known to a fraction of a pixel."""
+    """Draw a marker 8 times too large and reduce it: its corners are known to a fraction of a pixel."""
     dictionary = cv2.aruco.getPredefinedDictionary(cv2.aruco.DICT_4X4_100)
     large = np.full((480 * 8, 640 * 8), 200, np.uint8)
     large[1003:1803, 2005:2805] = cv2.aruco.generateImageMarker(dictionary, 3, 800)
@@ -44,7 +44,7 @@ def test_detected_corners_are_where_they_were_drawn() -> None:
     found = list(detect(frame(CompressedImage(1, "red", data, "png"))))
     (marker,) = found[0].markers
     left, top, right, bottom = (v / 8 - 0.5 for v in (2005, 1003, 2805, 1803))
-    # The authors' refinement draws a blurred corner inwards by about a quarter of a pixel.
+    # The authors' refinement moves a blurred corner inwards by about a quarter of a pixel.
     np.testing.assert_allclose(
         marker.corners_px, [[left, top], [right, top], [right, bottom], [left, bottom]], atol=0.3
     )
@@ -68,7 +68,7 @@ def test_the_world_heading_follows_the_model() -> None:
     world = turn.apply(points) + 2.0
     pairs = [Pair(str(n), 0, p, w, 1) for n, (p, w) in enumerate(zip(points, world, strict=True))]
     locate = Locate(fit_model("rigid", {"red": pairs}, 0))
-    angle = -0.7  # in the picture; the heading is minus that
+    angle = -0.7  # in the image; the heading is minus this angle
     seen = CameraPoints(1, (CameraPoint(3, 0.1, 0.2, 2.0, -angle), CameraPoint(4, 0.1, 0.2, 2.0)))
     (positions,) = locate(Message("t", 1, 1, seen, "red"))
     along = turn.apply([np.cos(angle), np.sin(angle), 0])
@@ -88,7 +88,7 @@ def test_weights_are_inverse_covariances() -> None:
     assert fused.x_m == pytest.approx(0.25)
     assert fused.covariance_m2 is not None
     np.testing.assert_allclose(fused.covariance_m2, 0.75 * np.eye(3))
-    # Without the covariance of one there is no weight to give it: the mean, and no covariance.
+    # Without the covariance of one position, it has no weight: the result is the mean, without covariance.
     plain = fuse_positions([at(0.0, 1.0), at(1.0, None)])
     assert plain.x_m == pytest.approx(0.5)
     assert plain.covariance_m2 is None
@@ -99,7 +99,7 @@ def test_headings_are_averaged_around_the_circle() -> None:
     assert abs(fused.heading_rad or 0.0) == pytest.approx(np.pi)
 
 
-def test_only_what_was_seen_at_one_instant_is_fused() -> None:
+def test_only_positions_of_one_instant_are_fused() -> None:
     fuse = Fuse("poly", window_ns=5)
     list(fuse(RIG))
 

@@ -1,4 +1,4 @@
-"""A marker's geometry speaks of the instant at which its rows were exposed, in all that is made of it."""
+"""The geometry of a marker is for the exposure time of its rows, in all derived messages."""
 
 from __future__ import annotations
 
@@ -56,7 +56,7 @@ def test_locate_hands_the_offset_on() -> None:
 
 
 def frame(time_ns: int, camera: str, *offsets_ns: int | None) -> Message:
-    """Positions of markers 0, 1, ... as a camera has them; it puts them at x = 0, or 1 if it is white."""
+    """Return the positions of markers 0, 1, ... of a camera, at x = 0, or at x = 1 for white."""
     x_m = 1.0 if camera == "white" else 0.0
     seen = tuple(Position(n, x_m, 0.0, 0.0, time_offset_ns=each) for n, each in enumerate(offsets_ns))
     topic = POSITIONS.topic_of("poly", camera)
@@ -86,7 +86,7 @@ def test_a_pose_goes_out_with_its_own_instant() -> None:
     ]
 
 
-def test_without_offsets_nothing_is_other_than_before_there_were_any() -> None:
+def test_zero_time_offsets_do_not_change_the_result() -> None:
     made = fused(frame(100, "red", None, None))
     tracks = tuple(Track(f"marker_{n}", n, 0.0, 0.0, 0.0, cameras=("red",)) for n in range(2))
     still = Quaternion(0.0, 0.0, 0.0, 1.0)
@@ -103,8 +103,8 @@ def cameras_of(made: Iterable[Message]) -> list[tuple[str, ...]]:
     return [m.payload.tracks[0].cameras for m in made if isinstance(m.payload, Tracks)]
 
 
-def test_cameras_are_averaged_by_when_they_exposed_the_marker() -> None:
-    # Frames of one time, the marker in rows 20 ms apart.
+def test_cameras_are_averaged_by_exposure_time() -> None:
+    # The frames have one time, but the marker is in rows 20 ms apart.
     apart = fused(frame(0, "red", 25 * MS), frame(0, "white", 5 * MS))
     assert cameras_of(apart) == [("red",), ("white",)]
     # The same marker in the next frame of the white camera, 4 ms after the red one saw it.
@@ -137,7 +137,7 @@ def rolling(tmp_path_factory: pytest.TempPathFactory) -> Path:
 
 
 def drive_error_m(log: Path, rig: Rig | None) -> float:
-    """Mean error of the tracks on the drive, of a model that reads no depths."""
+    """Return the mean track error on the drive, with a model that reads no depths."""
     fused = replay([log], Request(models=("rayplane",), rig=rig))[-1]
     start_ns = drive_start_ns(ROLLING, mount_cameras(ROLLING))
     with Session([log]) as session:
@@ -149,7 +149,7 @@ def drive_error_m(log: Path, rig: Rig | None) -> float:
     return found[0].mean_m
 
 
-def test_a_rig_that_says_the_row_time_puts_a_driving_robot_where_it_is(rolling: Path) -> None:
+def test_row_time_of_the_rig_corrects_a_moving_robot(rolling: Path) -> None:
     with Session([rolling]) as session:
         (rig,) = session.payloads([RIG_TOPIC])
     said_m = drive_error_m(rolling, None)

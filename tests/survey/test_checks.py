@@ -1,4 +1,4 @@
-"""One place, checked: where it is, and whether it can be."""
+"""The check of one point: its position, and its faults."""
 
 from __future__ import annotations
 
@@ -24,14 +24,14 @@ Array = labs.Array
 RIG = replace(labs.RIG, tape_sigma_m=0.003)
 THREE = replace(RIG, reference_points=(*RIG.reference_points, ReferencePoint("C", 2.0, 0.3)))
 STILL = Interval(1_000, 2_000)
-# On the floor, where the tapes cross at 15 degrees or more.
+# points on the floor, at tape crossings of 15 degrees or more
 PLACES = st.tuples(st.floats(0.1, 4.7), st.floats(0.1, 4.7), st.floats(0.0, 0.3)).filter(
     lambda p: abs(p[1] - labs.A[1]) > 0.5
 )
 
 
 def tape(world_m: Sequence[float], rig: Rig = RIG, **changed: Any) -> TypedEntry:
-    """A place as somebody reads it who reads well: to the millimetre."""
+    """Return a point with correct readings, to the millimetre."""
     distances = {
         p.name: f"{100 * np.hypot(world_m[0] - p.x_m, world_m[1] - p.y_m):.1f}" for p in rig.reference_points
     }
@@ -52,12 +52,12 @@ def check(
 
 
 @given(PLACES)
-def test_the_place_is_where_it_was_measured(world_m: tuple[float, float, float]) -> None:
+def test_checked_point_equals_the_measured_point(world_m: tuple[float, float, float]) -> None:
     checked = check(tape(world_m))
     assert checked.faults == ()
     assert checked.point_m is not None
     assert checked.sigma_m is not None
-    # Read to half a millimetre; flat circles make more of it, and say so.
+    # Readings are to half a millimetre; flat circles amplify this, and report it.
     assert np.linalg.norm(checked.point_m - world_m) < 0.002 + 0.6 * checked.sigma_m
     assert checked.on_floor is True
     assert checked.measurement is not None
@@ -82,15 +82,15 @@ def test_two_tapes_that_cannot_meet() -> None:
     assert checked.measurement is None
     said = "no triangle has the sides A to B = 243.8 cm, distance to A = 40 cm and distance to B = 50 cm"
     assert checked.faults[0].text == f"{said}; read both again"
-    # The side is not what is wrong: said before it is asked for.
+    # The fault is not the side, so it is reported before the question for the side.
     unsided = check(TypedEntry("0", {"A": "40", "B": "50"}, "", "0"))
     assert any("no triangle" in fault.text for fault in unsided.faults)
-    # Nor is the height.
+    # The height is not needed either.
     alone = check(TypedEntry("0", {"A": "40", "B": "50"}))
     assert any("no triangle" in fault.text for fault in alone.faults)
 
 
-def test_both_places_while_the_side_is_missing() -> None:
+def test_missing_side_gives_both_points() -> None:
     checked = check(tape((1.0, 4.0, 0.0), side=""))
     assert checked.measurement is None
     places = dict(checked.sides_m)
@@ -98,7 +98,7 @@ def test_both_places_while_the_side_is_missing() -> None:
     assert places["right"] == pytest.approx([1.0, 2 * labs.A[1] - 4.0, 0.0], abs=0.002)
 
 
-def test_a_place_that_is_not_on_the_floor_and_the_side_on_which_it_would_be() -> None:
+def test_point_outside_the_floor_names_the_side_inside() -> None:
     narrow = replace(RIG, floor=replace(labs.RIG.floor, depth_m=3.0))  # type: ignore[type-var]
     checked = check(tape((1.0, 1.0, 0.0), side="left"), narrow)
     assert checked.on_floor is False
@@ -134,7 +134,7 @@ def test_ids_count_up_and_undo_withdraws() -> None:
     assert check(tape((1.0, 4.0, 0.0), id="p001"), history=[first, gone]).faults[0].field == "id"
 
 
-def test_the_same_place_once_more() -> None:
+def test_repeated_point_gives_a_warning() -> None:
     first = check(tape((1.0, 4.0, 0.0))).measurement
     assert first is not None
     again = check(tape((1.0, 4.0, 0.0)), history=[first])
@@ -166,7 +166,7 @@ def known() -> tuple[labs.Camera, Model]:
         ({"height": "65"}, "the height reads 0.650 m"),
     ],
 )
-def test_the_model_finds_the_slip(
+def test_model_finds_the_gross_error(
     known: tuple[labs.Camera, Model], changed: dict[str, str], said: str | None
 ) -> None:
     camera, model = known

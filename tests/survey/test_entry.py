@@ -32,7 +32,7 @@ def test_centimetres_become_metres_with_point_or_comma() -> None:
     ("text", "said"),
     [
         ("1.234", "looks like metres; type 123.4"),
-        ("1,9", None),  # a short distance, or metres to the decimetre: asked for, not refused
+        ("1,9", None),  # a short distance, or metres to the decimetre: the page asks, and does not refuse
         ("1700", "in mm? Then type 170"),
         ("99999", "further than the floor reaches"),
         ("0", "above 0"),
@@ -69,7 +69,7 @@ def test_a_height_that_cannot_be_in_centimetres(text: str, said: str) -> None:
     assert said in faults(replace(GOOD, height=text))["height"]
 
 
-def test_what_is_missing_is_named() -> None:
+def test_missing_entries_are_named() -> None:
     assert set(faults(TypedEntry("", {}))) == {"marker", "d_A", "d_B", "height"}
     assert set(faults(replace(GOOD, side=""))) == {"side"}
     assert "from A to B" in faults(replace(GOOD, side=""))["side"]
@@ -79,7 +79,7 @@ def test_a_marker_that_the_rig_does_not_know() -> None:
     assert faults(replace(GOOD, marker="7"))["marker"] == "marker 7 is not in the rig (it has 0)"
 
 
-def test_of_three_reference_points_any_two_and_no_side_unless_they_lie_on_a_line() -> None:
+def test_two_of_three_references_need_no_side_unless_collinear() -> None:
     assert parse_entry(replace(GOOD, distances={"A": "170", "B": "190", "C": "300"}, side=""), THREE)[1] == []
     two = replace(GOOD, distances={"A": "170", "B": "", "C": "300"}, side="")
     assert [fault.field for fault in parse_entry(two, THREE)[1]] == ["side"]

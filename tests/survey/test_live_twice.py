@@ -1,4 +1,4 @@
-"""Measured while cameras send: whether a marker lies where it was measured before."""
+"""Live measurement: detection of a marker that is still at its measured point."""
 
 from __future__ import annotations
 
@@ -18,7 +18,7 @@ BETTER = TypedEntry("0", {"A": "171", "B": "190"}, "left", "10")
 
 
 class Lab:
-    """A marker before one camera, ten times a second, with the noise of plain corners."""
+    """A marker in front of one camera at 10 Hz, with the noise of plain corners."""
 
     def __init__(self) -> None:
         self.scene = LiveScene(labs.RIG, None, {"red": CameraState(up=True)}, lambda topic, payload: None)
@@ -50,7 +50,7 @@ def test_a_marker_that_has_not_moved_since_it_was_measured() -> None:
     lab.show(2, 0.1)
     assert lab.check(PLACE).warnings == ()
     lab.save(PLACE)
-    lab.show(4, 0.1)  # so that the seconds of both have nothing in common
+    lab.show(4, 0.1)  # so that the two intervals have no common second
     assert "this is p001 once more" in lab.check(PLACE).faults[0].text
     (text,) = lab.check(BETTER).warnings
     assert "marker 0 is measured here already, as p001" in text
@@ -63,12 +63,12 @@ def test_a_marker_that_has_not_moved_since_it_was_measured() -> None:
     assert lab.check(BETTER).warnings == ()
 
 
-def test_a_marker_that_was_moved_on_by_a_little() -> None:
+def test_slightly_moved_marker_is_a_new_point() -> None:
     lab = Lab()
     lab.show(2, 0.1)
     lab.save(PLACE)
     lab.show(2, 0.13)
     assert lab.check(BETTER).warnings == ()
-    # Back where it was: the place is the same, however it got there.
+    # The marker is back at its point, so the point is the same.
     lab.show(2, 0.1)
     assert "measured here already" in lab.check(BETTER).warnings[0]

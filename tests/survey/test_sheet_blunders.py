@@ -1,4 +1,4 @@
-"""Rows of a sheet that look wrong: named with what contradicts them, and written only on request."""
+"""Doubtful rows of a sheet: named with their contradiction, and written only on request."""
 
 from __future__ import annotations
 
@@ -27,13 +27,13 @@ from tests.test_measure import foreign_read, sheet, times
 
 
 def swap_distances(one: Measurement) -> Measurement:
-    """The same measurement with the distances to A and B exchanged."""
+    """Return the measurement with the distances to A and B exchanged."""
     a, b = one.distances
     return replace(one, distances=(replace(a, distance_m=b.distance_m), replace(b, distance_m=a.distance_m)))
 
 
 def swap_rows(tape: Sequence[Measurement], first: int, second: int) -> list[Measurement]:
-    """The same measurements with what tape and ruler say exchanged between two of them."""
+    """Return the measurements with the readings of two of them exchanged."""
     rows = [*tape]
     for number, other in ((first, tape[second]), (second, tape[first])):
         rows[number] = replace(
@@ -49,14 +49,14 @@ def lies_far_from_b(one: Measurement) -> bool:
 
 @pytest.fixture
 def with_model(ipsys: Ipsys, unmeasured: Unmeasured, lab: Path) -> Unmeasured:
-    """A session that nobody has measured, with the model of another log of the same cameras."""
+    """Return a session without measurements, with the model of another log of the same cameras."""
     assert ipsys("fit", lab, "--model", "rigid").code == 0
     assert ipsys("fit", unmeasured.log, "--model-from", lab, "--model", "rigid").code == 0
     return unmeasured
 
 
 def cm_away(line: str) -> float:
-    """The contradiction that a line states, in cm."""
+    """Return the contradiction in a line, in cm."""
     stated = re.search(r"(\d+) cm away", line)
     assert stated is not None, line
     return float(stated[1])
@@ -89,7 +89,7 @@ def test_sheet_row_that_looks_wrong_is_written_with_force(ipsys: Ipsys, with_mod
     assert done.code == 0, done.err
     assert "line 3: p002: the point is" in done.err
     assert [row.id for row in foreign_read(log)] == ["p001", "p002"]
-    # A place that is measured already is asked for on the page, too.
+    # The page also asks about a point that is already measured.
     again = [replace(tape[0], height_m=(tape[0].height_m or 0) + 0.01)]
     lines = refused(
         ipsys, log, "measure", log, "--csv", sheet(path, again, time=times(again, log))
@@ -105,7 +105,7 @@ def test_sheet_with_bad_and_doubtful_rows_names_both(ipsys: Ipsys, with_model: U
     text = refused(ipsys, log, "measure", log, "--csv", path)
     assert text.index("line 2: marker 0 does not lie still") < text.index("line 3: the point")
     assert "--force" not in text
-    # To insist is no way round what cannot be right.
+    # An impossible row is refused even on request.
     assert "line 2: marker 0" in refused(ipsys, log, "measure", log, "--csv", path, "--force")
 
 

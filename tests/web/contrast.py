@@ -1,4 +1,4 @@
-"""Contrast as WCAG 2.2 counts it, of all that a browser shows of a page."""
+"""The contrast of WCAG 2.2, of all visible parts of a page."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""A phone: headless Chromium of a phone's size, tapped and typed into through its debugging pipe."""
+"""A phone: headless Chromium of phone size, controlled by taps and keys through its debugging pipe."""
 
 from __future__ import annotations
 
@@ -17,12 +17,12 @@ from tests.report.browser import chromium
 
 _WIDTH, _HEIGHT = 390, 844
 _PATIENCE_S = 120.0
-# Two taps at one place that follow one another faster are one double tap.
+# Two taps at one point within this time are a double tap.
 _DOUBLE_TAP_S = 0.35
 
 
 class Phone:
-    """One page in one browser; ``told`` is what the browser says by itself."""
+    """One page in one browser; ``console`` has the messages of the browser."""
 
     def __init__(self, read: int, write: int) -> None:
         self._read, self._write = read, write
@@ -33,7 +33,7 @@ class Phone:
         self._tapped_s = 0.0
 
     def send(self, method: str, **given: Any) -> dict[str, Any]:
-        """A command of the DevTools protocol and its answer."""
+        """Send a command of the DevTools protocol; return its answer."""
         self._number += 1
         message: dict[str, Any] = {"id": self._number, "method": method, "params": given}
         if self._session is not None:
@@ -70,7 +70,7 @@ class Phone:
         )  # fmt: skip
         self.prefer(scheme)
         self.send("Emulation.setTouchEmulationEnabled", enabled=True)
-        # Keys go to a page that has the focus, on a busy machine too.
+        # Keys go to a page with the focus, also on a busy machine.
         self.send("Emulation.setFocusEmulationEnabled", enabled=True)
         for domain in ("Log", "Runtime", "Page"):
             self.send(f"{domain}.enable")
@@ -84,13 +84,13 @@ class Phone:
         self.send("Emulation.setEmulatedMedia", features=features)
 
     def run(self, script: str) -> Any:
-        """The value of an expression in the page."""
+        """Return the value of an expression in the page."""
         answer = self.send("Runtime.evaluate", expression=script, returnByValue=True, awaitPromise=True)
         assert "exceptionDetails" not in answer, answer
         return answer["result"].get("value")
 
     def wait(self, script: str) -> None:
-        """Until an expression is true in the page."""
+        """Wait until an expression is true in the page."""
         script = f"Boolean({script})"
         end = time.monotonic() + _PATIENCE_S
         while not self.run(script):
@@ -98,13 +98,13 @@ class Phone:
             time.sleep(0.05)
 
     def tap(self, selector: str) -> None:
-        """With a finger on the middle of an element, wherever that is; it must not be covered."""
+        """Tap the centre of an element, which must not be covered."""
         found = json.dumps(selector)
         time.sleep(max(self._tapped_s + _DOUBLE_TAP_S - time.monotonic(), 0.0))
         x, y, hit = self.run(
             f"(async () => {{ const e = document.querySelector({found});"
             "e.scrollIntoView({block: 'center'});"
-            # A finger waits until nothing moves under it.
+            # The tap waits until the element stops moving.
             "let b = {}, still = 0; while (still < 6) { await new Promise(requestAnimationFrame);"
             "const now = e.getBoundingClientRect(); still = now.x === b.x && now.y === b.y ? still + 1 : 0;"
             "b = now; } const x = b.x + b.width / 2, y = b.y + b.height / 2;"
@@ -117,7 +117,7 @@ class Phone:
         self.send("Input.dispatchTouchEvent", type="touchEnd", touchPoints=[])
 
     def type(self, selector: str, text: str) -> None:
-        """Key by key into a field that was tapped."""
+        """Type a text key by key into a tapped field."""
         self.tap(selector)
         self.wait(f"document.activeElement === document.querySelector({json.dumps(selector)})")
         for key in text:
@@ -128,17 +128,17 @@ class Phone:
         return str(self.run(f"document.querySelector({json.dumps(selector)}).innerText"))
 
     def picture(self, path: Path) -> None:
-        """The whole page, however long."""
+        """Save the whole page as an image."""
         data = self.send("Page.captureScreenshot", captureBeyondViewport=True, format="png")["data"]
         path.write_bytes(base64.b64decode(data))
 
 
 @contextmanager
 def phone(folder: Path) -> Iterator[Phone]:
-    """A browser without any network but this machine's."""
+    """Start a browser without any network except this machine's."""
     there, write = os.pipe()
     read, here = os.pipe()
-    # Out of the way of the two numbers that the browser wants them at.
+    # The numbers avoid the two numbers that the browser uses.
     ours = [fcntl.fcntl(end, fcntl.F_DUPFD_CLOEXEC, 20) for end in (there, here)]
     for end in (there, here):
         os.close(end)

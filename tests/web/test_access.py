@@ -21,7 +21,7 @@ PLACE = {"marker": "0", "distances": {"A": "170", "B": "190"}, "side": "left", "
 
 
 class Caller:
-    """Plain HTTP, with whatever headers."""
+    """A plain HTTP client with any headers."""
 
     def __init__(self, url: str) -> None:
         self.parts = urlsplit(url)
@@ -57,7 +57,7 @@ def shared(scene: Recording) -> Iterator[Caller]:
         yield Caller(page.url)
 
 
-def test_alone_there_is_no_token_and_only_this_machine_is_listened_to(here: Caller) -> None:
+def test_local_page_has_no_token_and_listens_on_loopback(here: Caller) -> None:
     assert here.token == ""
     assert here.parts.hostname == "127.0.0.1"
     assert here.ask("GET", "/")[0] == 200
@@ -68,7 +68,7 @@ def test_alone_there_is_no_token_and_only_this_machine_is_listened_to(here: Call
 
 
 @pytest.mark.parametrize("path", ["/", "/measure.js", "/api/scene", "/api/views", "/picture/red/1", "/none"])
-def test_without_the_token_nothing_is_told(shared: Caller, path: str) -> None:
+def test_request_without_the_token_is_refused(shared: Caller, path: str) -> None:
     assert len(shared.token) >= 16
     wrong = shared.token[:-1] + ("A" if shared.token[-1] != "A" else "B")
     cookie = f"ipsys_{shared.parts.port}"
@@ -79,7 +79,7 @@ def test_without_the_token_nothing_is_told(shared: Caller, path: str) -> None:
     assert shared.ask("GET", f"{path}?token={wrong}")[0] == 403
 
 
-def test_the_token_becomes_a_cookie_that_scripts_and_other_sites_do_not_get(shared: Caller) -> None:
+def test_token_becomes_a_protected_cookie(shared: Caller) -> None:
     status, _, headers = shared.ask("GET", f"/?token={shared.token}")
     assert (status, headers["location"]) == (303, "/")
     cookie = headers["set-cookie"].lower()
@@ -91,7 +91,7 @@ def test_the_token_becomes_a_cookie_that_scripts_and_other_sites_do_not_get(shar
     assert "default-src 'self'" in headers["content-security-policy"]
 
 
-def test_cookies_of_other_programs_lock_nobody_out(shared: Caller) -> None:
+def test_cookies_of_other_programs_do_not_block_access(shared: Caller) -> None:
     name = f"ipsys_{shared.parts.port}"
     ours = f"{name}={shared.token}"
     for header in (
@@ -112,7 +112,7 @@ def test_cookies_of_other_programs_lock_nobody_out(shared: Caller) -> None:
         assert shared.ask("GET", "/api/scene", Cookie=header)[0] == 403, header
 
 
-def test_a_name_that_leads_here_from_elsewhere_is_refused(here: Caller, shared: Caller) -> None:
+def test_foreign_host_name_is_refused(here: Caller, shared: Caller) -> None:
     for caller in (here, shared):
         path = f"/?token={caller.token}"
         for host in (
@@ -127,7 +127,7 @@ def test_a_name_that_leads_here_from_elsewhere_is_refused(here: Caller, shared: 
             assert caller.ask("GET", path, Host=host)[0] in (200, 303)
 
 
-def test_only_the_page_itself_writes(here: Caller, scene: Recording) -> None:
+def test_requests_of_other_pages_cannot_write(here: Caller, scene: Recording) -> None:
     origin = f"http://127.0.0.1:{here.parts.port}"
     assert here.ask("POST", "/api/measure", PLACE)[0] == 403
     assert here.ask("POST", "/api/measure", PLACE, X_Ipsys="1", Origin="http://evil.example")[0] == 403
@@ -141,7 +141,7 @@ def test_only_the_page_itself_writes(here: Caller, scene: Recording) -> None:
 @pytest.mark.parametrize(
     "body", [b"", b"{", b"[]", b"\xff", {"distances": [1]}, {**PLACE, "marker": "x" * 20_000}, {"id": "p9"}]
 )
-def test_what_is_no_place_is_refused_in_words(here: Caller, scene: Recording, body: Any) -> None:
+def test_invalid_entry_is_refused_with_a_text(here: Caller, scene: Recording, body: Any) -> None:
     for path in ("/api/measure", "/api/undo"):
         status, text, _ = here.ask("POST", path, body, X_Ipsys="1")
         assert status in (400, 409)
@@ -173,7 +173,7 @@ def test_request_beyond_all_bounds_gets_no_server_error(
     assert "Traceback" not in capfd.readouterr().err
 
 
-def test_a_warning_has_to_be_seen_before_it_is_passed_over(here: Caller, scene: Recording) -> None:
+def test_unseen_warning_blocks_saving(here: Caller, scene: Recording) -> None:
     flat = {**PLACE, "distances": {"A": "330", "B": "87"}}
     status, text, _ = here.ask("POST", "/api/measure", flat, X_Ipsys="1")
     assert status == 409, text
@@ -191,7 +191,7 @@ def test_a_port_that_is_in_use_and_a_host_that_is_not_ours(here: Caller, scene: 
     ):
         pass
     with (
-        pytest.raises(IpsysError, match=r"no address of this machine|cannot be listened on"),
+        pytest.raises(IpsysError, match=r"not an address of this machine|cannot listen on"),
         serve(scene, "192.0.2.7", 0),
     ):
         pass

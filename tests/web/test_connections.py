@@ -1,4 +1,4 @@
-"""Connections to the measuring page: bounded in number and time, and harmless to a recording."""
+"""Connections to the measuring page: bounded in number and time, without effect on a recording."""
 
 from __future__ import annotations
 
@@ -46,7 +46,7 @@ def wait_until(condition: Callable[[], object]) -> None:
 
 @contextmanager
 def connections(caller: Caller, count: int, source: str = "127.0.0.1") -> Iterator[list[socket.socket]]:
-    """Plain connections to a page, from one address of the loopback."""
+    """Plain connections to a page, from one loopback address."""
     address = str(caller.parts.hostname), caller.parts.port or 0
     with ExitStack() as stack:
         yield [
@@ -57,7 +57,7 @@ def connections(caller: Caller, count: int, source: str = "127.0.0.1") -> Iterat
 
 @contextmanager
 def recording(lab: Lab, log: Path) -> Iterator[tuple[subprocess.Popen[str], Caller, Path]]:
-    """A recorder with its page and few descriptors, as soon as the cameras' markers are seen."""
+    """A recorder with its page and few descriptors, after the detection of markers."""
     errors = log.with_suffix(".stderr")
     command = ["bash", "-c", f'ulimit -n {DESCRIPTORS}; exec "$@"', "bash", sys.executable, "-m", "ipsys_log"]
     command += ["record", "-o", str(log), "--rig", str(lab.rig), "--calibration", str(lab.lenses)]
@@ -76,7 +76,7 @@ def recording(lab: Lab, log: Path) -> Iterator[tuple[subprocess.Popen[str], Call
 
 
 def sign_in(caller: Caller) -> str:
-    """Open the page by its whole address; its cookie."""
+    """Open the page by its full address; return its cookie."""
     status, _, headers = caller.ask("GET", f"/?token={caller.token}")
     assert status == 303
     return headers["set-cookie"].split(";")[0]
@@ -120,7 +120,7 @@ def is_open(connection: socket.socket) -> bool:
 
 
 def is_closed_by_page(connection: socket.socket) -> bool:
-    """Wait for the end of a connection, and ignore what comes before it."""
+    """Wait for the end of a connection, and ignore earlier data."""
     connection.settimeout(PATIENCE_S)
     try:
         while connection.recv(1 << 16):
@@ -189,7 +189,7 @@ def answers(caller: Caller) -> bool:
         return False
 
 
-def test_answers_that_are_not_read_make_room_in_time() -> None:
+def test_unread_answers_are_closed_in_time() -> None:
     scene = Recording()
     scene.views = lambda interval: [CameraView("red", 1, bytes(8 << 20))]  # type: ignore[method-assign]
     with page_with(Limits(total=6, per_address=4, request_s=0.5), scene) as (caller, page):
@@ -247,7 +247,7 @@ def test_faults_are_printed_when_the_command_ends(capsys: pytest.CaptureFixture[
     assert said.rstrip().endswith("ZeroDivisionError: [first]")
 
 
-def test_end_of_the_server_leaves_the_block_going(
+def test_end_of_the_server_does_not_end_the_block(
     monkeypatch: pytest.MonkeyPatch, capfd: pytest.CaptureFixture[str]
 ) -> None:
     is_broken = threading.Event()

@@ -1,4 +1,4 @@
-"""The measuring page's layout: nothing too wide, covered, out of sight or hard to see, on any screen."""
+"""The layout of the measuring page: no part too wide, covered, hidden or hard to see, on any screen."""
 
 from __future__ import annotations
 
@@ -20,7 +20,7 @@ from tests.web.test_measuring_page import Recording, save, says, texts_at
 
 PHONE, DESKTOP = (390, 844), (1280, 800)
 
-# The boxes of elements as the user sees them: what a part that scrolls hides is not seen.
+# The boxes of elements as the user sees them: hidden parts of a scrolled area do not count.
 BOXES = """(() => {
   const seen = e => {
     const b = e.getBoundingClientRect();
@@ -51,7 +51,7 @@ def meet(one: list[float], other: list[float]) -> bool:
 
 
 def check_screen(browser: Phone) -> None:
-    """Look at the page as it is now, in both colour schemes."""
+    """Check the present page in both colour schemes."""
     fields, messages, button, width, screen_width, screen_height = browser.run(BOXES)
     assert width <= screen_width
     assert 0 <= button[1] < button[3] <= screen_height
@@ -84,7 +84,7 @@ def test_every_state_of_the_page_fits_the_screen(
         browser.type("#d-B", b)
         browser.tap(f"#sides label:nth-of-type({1 if side == 'left' else 2})")
         browser.type("#height", "0.1")
-        says(browser, "#save", "all the same")
+        says(browser, "#save", "despite the warning")
         check_screen(browser)
         browser.run("document.querySelector('#height').value = ''")
         browser.type("#height", height)
@@ -97,7 +97,7 @@ def test_every_state_of_the_page_fits_the_screen(
         save(browser, "p001")
         says(browser, "#notice", "p001 is in the log")
         check_screen(browser)
-        # Nothing that has to be typed needs scrolling.
+        # All entry fields are visible without scrolling.
         assert browser.run(
             "['main', '#entry'].every(part => document.querySelector(part).scrollTop === 0)"
             "&& document.querySelector('#height').getBoundingClientRect().bottom"
@@ -126,7 +126,7 @@ def test_desktop_shows_cameras_and_entry_side_by_side(browser: Phone) -> None:
 
 @contextmanager
 def other_program() -> Iterator[str]:
-    """Another web page of this host; its cookie goes to all ports."""
+    """Another web page of this host; its cookie applies to all ports."""
 
     class Handler(http.server.BaseHTTPRequestHandler):
         def do_GET(self) -> None:
@@ -143,7 +143,7 @@ def other_program() -> Iterator[str]:
         server.shutdown()
 
 
-def test_cookie_of_another_program_locks_no_phone_out(browser: Phone) -> None:
+def test_cookie_of_another_program_does_not_block_a_phone(browser: Phone) -> None:
     with other_program() as other, serve(Recording(), "127.0.0.1", 0) as page:
         browser.open(other)
         browser.open(page.url)

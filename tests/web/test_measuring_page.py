@@ -1,4 +1,4 @@
-"""The measuring page on a phone: taps and keys in, measurements in the log out."""
+"""The measuring page on a phone: taps and keys as input, measurements in the log as output."""
 
 from __future__ import annotations
 
@@ -50,7 +50,7 @@ def fill(hand: Phone, a: str, b: str, side: str, height: str) -> None:
 
 
 def save(hand: Phone, name: str) -> None:
-    """When it can be saved: only then is the button one."""
+    """Save a point as soon as the button is enabled."""
     hand.wait("document.querySelector('#verdict[aria-busy=false]')")
     hand.wait("document.querySelector('#save:enabled')")
     says(hand, "#save", f"Save {name}")
@@ -66,7 +66,7 @@ def texts_at(scene: FinishedLog, tape: Sequence[Measurement], number: int) -> tu
     return typed.distances["A"], typed.distances["B"], typed.side, typed.height
 
 
-def test_a_place_is_typed_checked_saved_and_withdrawn(hand: Phone, unmeasured: Unmeasured) -> None:
+def test_point_is_typed_checked_saved_and_withdrawn(hand: Phone, unmeasured: Unmeasured) -> None:
     log, tape = unmeasured
     with open_finished_log(log, Request()) as scene, serve(scene, port=0) as page:
         a, b, side, height = texts_at(scene, tape, 0)
@@ -85,12 +85,12 @@ def test_a_place_is_typed_checked_saved_and_withdrawn(hand: Phone, unmeasured: U
         assert foreign_read(log) == []
         hand.run("document.querySelector('#d-B').value = ''")
         hand.type("#d-B", b)
-        says(hand, "#verdict", "within the floor's edges")
+        says(hand, "#verdict", "inside the floor")
         assert hand.run("document.querySelectorAll('#floor .place').length") == 1
         save(hand, "p001")
         says(hand, "#notice", "p001 is in the log")
         assert [(row.id, row.withdraws) for row in foreign_read(log)] == [("p001", "")]
-        says(hand, "#stop", "place 2 of")
+        says(hand, "#stop", "interval 2 of")
         assert hand.run("[...document.querySelectorAll('.cm input')].every(e => e.value === '')")
 
         hand.tap("#places button")
@@ -99,13 +99,13 @@ def test_a_place_is_typed_checked_saved_and_withdrawn(hand: Phone, unmeasured: U
         assert hand.run("document.querySelectorAll('#places .gone').length") == 1
         hand.tap("#before")
         says(hand, "#stop", "not measured")
-        # What fills a phone is not wider than it, and nothing went wrong unseen.
+        # The page is not wider than the phone, and the browser reports no error.
         assert hand.run("document.documentElement.scrollWidth") == 390
         assert hand.console == []
         assert hand.run(f"{FETCHED}.every(name => name.startsWith(location.origin))")
 
 
-def test_the_side_is_chosen_on_the_map_and_a_slip_is_seen_by_the_model(
+def test_side_is_chosen_on_the_map_and_checked_by_the_model(
     hand: Phone, ipsys: Ipsys, unmeasured: Unmeasured, lab: Path
 ) -> None:
     log, tape = unmeasured
@@ -123,14 +123,14 @@ def test_the_side_is_chosen_on_the_map_and_a_slip_is_seen_by_the_model(
         hand.wait("document.querySelector('#verdict[aria-busy=false]')")
         hand.tap(f"#floor .maybe[aria-label$={other}]")
         says(hand, "#verdict", f"it lies {side} of the line from A to B, not {other}?")
-        says(hand, "#save", "all the same")
+        says(hand, "#save", "despite the warning")
         hand.tap(f"#sides label:nth-of-type({1 if side == 'left' else 2})")
-        says(hand, "#verdict", "Off the present model")
+        says(hand, "#verdict", "Difference from the present model")
         hand.wait("document.querySelector('#save').innerText === 'Save p001'")
         assert hand.run("document.querySelectorAll('#floor path.predicted').length") > 0
 
 
-def test_what_goes_wrong_in_the_log_is_said_on_the_page(hand: Phone, unmeasured: Unmeasured) -> None:
+def test_log_errors_are_shown_on_the_page(hand: Phone, unmeasured: Unmeasured) -> None:
     log, tape = unmeasured
     with open_finished_log(log, Request()) as scene, serve(scene, port=0) as page:
         a, b, side, height = texts_at(scene, tape, 0)
@@ -141,7 +141,7 @@ def test_what_goes_wrong_in_the_log_is_said_on_the_page(hand: Phone, unmeasured:
             fcntl.flock(other, fcntl.LOCK_EX)
             save(hand, "p001")
             says(hand, "#notice", "another process is writing it")
-        # What was typed is still there, and goes in when the log is free.
+        # The typed values are still there, and are saved when the log is free.
         assert hand.run("document.querySelector('#d-A').value") == a
         save(hand, "p001")
         says(hand, "#notice", "p001 is in the log")
@@ -150,7 +150,7 @@ def test_what_goes_wrong_in_the_log_is_said_on_the_page(hand: Phone, unmeasured:
     says(hand, "#notice", "The computer does not answer")
 
 
-def test_somebody_else_measures_in_the_same_log(hand: Phone, unmeasured: Unmeasured) -> None:
+def test_second_process_measures_in_the_same_log(hand: Phone, unmeasured: Unmeasured) -> None:
     log, tape = unmeasured
     with (
         open_finished_log(log, Request()) as scene,
@@ -166,7 +166,7 @@ def test_somebody_else_measures_in_the_same_log(hand: Phone, unmeasured: Unmeasu
         says(hand, "#notice", "somebody else measured in this log meanwhile (p001)")
         says(hand, "#places", "p001")
         assert hand.run("document.querySelector('#d-A').value") == texts[0]
-        # Without a word more: what was typed is checked anew, beside what the other one did.
+        # Without further action, the typed values are checked again, with the other process's entry.
         save(hand, "p002")
         says(hand, "#notice", "p002 is in the log")
         other_id = "p003"
@@ -182,7 +182,7 @@ def test_somebody_else_measures_in_the_same_log(hand: Phone, unmeasured: Unmeasu
 
 
 class Recording:
-    """A lab while it is recorded: one camera, markers that somebody moves by hand."""
+    """A lab during a recording: one camera, and markers that are moved by hand."""
 
     rig: Rig = labs.RIG
     model: Model | None = None
@@ -207,7 +207,7 @@ class Recording:
         self.done += measurements
 
 
-def test_while_recording_the_marker_has_to_lie_still(hand: Phone) -> None:
+def test_moving_marker_cannot_be_saved_during_a_recording(hand: Phone) -> None:
     scene = Recording()
     scene.speed_m = 0.02
     with serve(scene, port=0) as page:
@@ -215,7 +215,7 @@ def test_while_recording_the_marker_has_to_lie_still(hand: Phone) -> None:
         says(hand, "#sight", "Marker 0 moves, as seen by red")
         fill(hand, "170", "190", "left", "10")
         hand.wait("document.querySelector('#verdict .point')")
-        says(hand, "#save", "Wait: the marker has to lie still")
+        says(hand, "#save", "Wait: the marker must not move")
         assert hand.run("document.querySelector('#save').disabled")
         scene.seen = False
         says(hand, "#sight", "No camera sees a marker")
@@ -228,21 +228,21 @@ def test_while_recording_the_marker_has_to_lie_still(hand: Phone) -> None:
     assert (saved.marker_id, saved.side, saved.still.end - saved.still.start) == (0, "left", 8)
 
 
-# Of an element: whether a finger would hit it where it is now, without scrolling.
+# Return whether a tap would hit an element at its present position, without scrolling.
 SEEN = """(e => {{ const b = e.getBoundingClientRect();
   const within = b.top >= 0 && b.bottom <= innerHeight;
   return within && e.contains(document.elementFromPoint(b.x + b.width / 2, b.y + b.height / 2));
 }})(document.querySelector('{}'))"""
 
 
-def test_what_is_saved_stands_above_the_button_that_saves_it(hand: Phone) -> None:
+def test_save_button_shows_the_point_to_save(hand: Phone) -> None:
     scene = Recording()
     with serve(scene, port=0) as page:
         hand.open(page.url)
         says(hand, "#sight", "Marker 0 lies still")
         hand.type("#d-A", "152 cm")
         hand.type("#d-B", "40")
-        # Of side and height nothing need be known.
+        # The side and the height are not needed.
         says(hand, "#verdict", "No triangle has the sides")
         hand.run("document.querySelector('#d-B').value = ''")
         hand.type("#d-B", "190")
@@ -260,13 +260,13 @@ def test_what_is_saved_stands_above_the_button_that_saves_it(hand: Phone) -> Non
             assert hand.run(SEEN.format("#save"))
             assert hand.run(SEEN.format("#short"))
         said = hand.text("#short")
-        assert "10.0 cm high" in said
+        assert "height 10.0 cm" in said
         assert said.split(" ± ")[0] in hand.text("#verdict")
         assert hand.run("document.querySelector('#short').getClientRects().length") == 1
         assert hand.run("document.querySelector('#short').offsetHeight") < 30  # one line
 
 
-def test_before_a_marker_is_chosen_each_camera_says_which_it_sees(hand: Phone) -> None:
+def test_cameras_show_visible_markers_before_a_choice(hand: Phone) -> None:
     scene = Recording()
     scene.rig = replace(labs.RIG, markers=(RigMarker(0), RigMarker(3)))
     square = np.array([[0, 0], [60, 0], [60, 60], [0, 60.0]])
@@ -281,15 +281,15 @@ def test_before_a_marker_is_chosen_each_camera_says_which_it_sees(hand: Phone) -
     scene.views = lambda interval: views  # type: ignore[method-assign]
     with serve(scene, port=0) as page:
         hand.open(page.url)
-        says(hand, "#sight", "Choose the marker: 0, 3 are seen")
+        says(hand, "#sight", "Choose the marker: 0, 3 are visible")
         says(hand, "#cameras button:nth-child(1) span", "sees 0, 3")
-        says(hand, "#cameras button:nth-child(2) span", "sees none")
+        says(hand, "#cameras button:nth-child(2) span", "no marker")
         hand.run("document.querySelector('#marker').value = '3'")
         says(hand, "#cameras button:nth-child(1) span", "sees it")
-        says(hand, "#cameras button:nth-child(2) span", "no")
+        says(hand, "#cameras button:nth-child(2) span", "not visible")
 
 
-def test_of_three_reference_points_two_need_the_side_and_three_check_one_another(hand: Phone) -> None:
+def test_two_distances_need_the_side_and_three_show_residuals(hand: Phone) -> None:
     scene = Recording()
     third = ReferencePoint("C", 2.4, 0.3)
     scene.rig = replace(labs.RIG, reference_points=(*labs.RIG.reference_points, third))
@@ -299,24 +299,24 @@ def test_of_three_reference_points_two_need_the_side_and_three_check_one_another
         assert hand.run("document.querySelector('#sides').hidden")
         for selector, text in (("#d-A", "170"), ("#d-C", "348"), ("#height", "10")):
             hand.type(selector, text)
-        says(hand, "#sides", "Seen from A looking to C, the place lies")
+        says(hand, "#sides", "Side of the point, seen from A towards C")
         says(hand, "#save", "Still missing: left or right of the line from A to C")
         hand.type("#d-B", "190")
         hand.wait("document.querySelector('#sides').hidden")
-        says(hand, "#verdict", "The distances disagree by")
+        says(hand, "#verdict", "Residuals of the distances")
         save(hand, "p001")
         says(hand, "#places", "p001 marker 0")
     assert [tape.reference for tape in scene.done[0].distances] == ["A", "B", "C"]
 
 
-def test_place_after_place_in_through_the_token(hand: Phone, unmeasured: Unmeasured) -> None:
+def test_points_are_measured_in_turn_with_a_token(hand: Phone, unmeasured: Unmeasured) -> None:
     log, tape = unmeasured
     with open_finished_log(log, Request()) as scene, serve(scene, "127.0.0.1", 0) as page:
         hand.open(page.url)
-        # The token is out of sight as soon as it was used.
+        # The token disappears from the address after its use.
         assert hand.run("location.pathname + location.search") == "/"
         for number in range(5):
-            says(hand, "#stop", f"place {number + 1} of")
+            says(hand, "#stop", f"interval {number + 1} of")
             says(hand, "#sight", "lies still")
             fill(hand, *texts_at(scene, tape, number))
             save(hand, f"p00{number + 1}")

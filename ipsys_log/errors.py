@@ -58,7 +58,7 @@ def disk_advice(error: OSError) -> str:
     if error.errno == errno.EROFS:
         return "the disk is read-only (perhaps after a fault): mount it for writing, or use another disk"
     if error.errno == errno.EFBIG:
-        return "files of this size are not possible there: use a disk with another file system"
+        return "the file system does not allow files of this size: use a disk with another file system"
     if error.errno in (errno.EACCES, errno.EPERM):
         return "ask for write permission there, or use another folder"
-    return "the disk or its connection is at fault: copy the log to another disk, and try again there"
+    return "the disk or its connection has failed: copy the log to another disk, and try again there"

@@ -198,9 +198,9 @@ def test_times_bound_a_table(replayed: Path) -> None:
 @pytest.mark.parametrize(
     ("given", "text"),
     [
-        ({"name": "trax"}, "there is no table 'trax'"),
+        ({"name": "trax"}, "table 'trax' is not known"),
         ({"name": "tracks", "run": "nobody"}, "run nobody has no tracks"),
-        ({"name": "events", "run": "poly"}, "was recorded: it belongs to no run"),
+        ({"name": "events", "run": "poly"}, "is recorded and belongs to no run"),
     ],
 )
 def test_wrong_names_are_one_line(replayed: Path, given: dict[str, Any], text: str) -> None:

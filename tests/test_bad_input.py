@@ -196,7 +196,7 @@ def test_fewer_places_than_a_model_needs(
 
     log = rewrite(imsel, few)
     line = refused(ipsys, log, "fit", log, "--model", model)
-    assert f"{model} needs at least {needed} measured places, found {places}" in line
+    assert f"{model} needs at least {needed} calibration points, found {places}" in line
 
 
 def test_places_on_a_line(ipsys: Ipsys, data: Path, tmp_path: Path) -> None:
@@ -244,7 +244,7 @@ def test_two_cameras_of_one_name(ipsys: Ipsys, lab: Path, tmp_path: Path) -> Non
     assert "two cameras have the name 'red'" in refused(ipsys, lab, "replay", lab, "--rig", rig)
     other = rewrite(lab, lambda message: message)
     line = refused(ipsys, lab, "replay", lab, other, "-o", tmp_path / "out.mcap")
-    assert "two cameras of one name" in line
+    assert "two cameras have the same name" in line
 
 
 @pytest.mark.parametrize("damage", ["cut", "zeros", "empty", "noise"])
@@ -291,7 +291,7 @@ def test_names_and_options_that_cannot_be(ipsys: Ipsys, lab: Path, tmp_path: Pat
     assert "camera=file.yaml" in refused(ipsys, lab, "replay", lab, "--calibration", "red")
     assert "no such camera" in refused(ipsys, lab, "replay", lab, "--calibration", f"blue={yaml(tmp_path)}")
     assert "there is no such" in refused(ipsys, lab, "replay", lab, "--calibration", "red=nowhere.yaml")
-    assert "no measurement is labelled 'half'" in refused(ipsys, lab, "fit", lab, "--train", "half")
+    assert "no measurement has the label 'half'" in refused(ipsys, lab, "fit", lab, "--train", "half")
     (tmp_path / "out.mcap").write_bytes(b"kept")
     assert "exists already" in refused(ipsys, lab, "replay", lab, "-o", tmp_path / "out.mcap")
     assert "no fitted model" in refused(ipsys, lab, "replay", lab, "--model-from", lab)
@@ -312,8 +312,8 @@ def yaml(folder: Path) -> Path:
     ("text", "said"),
     [
         ("name = ", "not valid TOML"),
-        ('name = "a"\nmarker_length_m = 0,20', "a decimal comma? Write 0.20"),
-        ("name = lab one # mine", 'text stands in quotes; write "lab one"'),
+        ('name = "a"\nmarker_length_m = 0,20', "write the decimal point as 0.20"),
+        ("name = lab one # mine", 'text needs quotes; write "lab one"'),
         ('name = "a"', "dictionary is missing"),
         ('name = "a"\ndictionary = "DICT_4X4_100"\nmarker_length_m = "20 cm"', "must be a number"),
         ('name = "a"\ndictionary = "DICT_4X4_100"\nmarker_length_m = -1', "not a length"),

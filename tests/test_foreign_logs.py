@@ -201,7 +201,7 @@ def test_json_is_read_too(ipsys: Ipsys, tmp_path: Path, rig: Path) -> None:
 @pytest.mark.parametrize(
     ("encoding", "data", "said"),
     [
-        ("flatbuffer", b"...", "messages encoded as 'flatbuffer' are not read, only protobuf and json"),
+        ("flatbuffer", b"...", "messages encoded as 'flatbuffer' cannot be read, only protobuf and json"),
         ("json", b"{]", "not a valid foxglove.CompressedImage"),
         ("protobuf", b"\xff\xff", "not a valid foxglove.CompressedImage"),
     ],

@@ -231,7 +231,7 @@ def test_a_place_measured_since_is_said_and_no_difference(
     append_messages(log, [Message("/measurements", time_ns, time_ns, withdrawal_of([last], last.id))])
     done = ipsys("verify", log)
     assert done.code == 0, done.out
-    assert "its fit is not verified: ipsys replay makes it again" in done.err
+    assert "its fit is not verified: ipsys replay computes it again" in done.err
 
 
 def test_a_result_that_is_gone_is_found(recorded: Path, tmp_path: Path) -> None:
@@ -243,7 +243,7 @@ def test_a_result_that_is_gone_is_found(recorded: Path, tmp_path: Path) -> None:
     write_log(unsigned, iter(fuse))
     apart = {one.topic: one.first for one in again(unsigned) if not one.equal}
     assert apart.keys() == {"/runs/poly/tracks", "/runs/poly/poses"}
-    assert set(apart.values()) == {"no record says how it was made"}
+    assert set(apart.values()) == {"no record of the run"}
 
 
 def test_models_and_their_evaluation_are_made_again_too(
@@ -295,7 +295,7 @@ def test_a_stage_that_stops_does_not_stop_the_recording(
     target = tmp_path / "x.mcap"
     with monkeypatch.context() as patch:
         patch.setattr(Detect, "_frame", broken)
-        with pytest.raises(IpsysError, match="has all frames: replay it"):
+        with pytest.raises(IpsysError, match="has all frames; to process them: ipsys replay"):
             go_live(lab_log, calibration, target, 30.0)
     with Session([target]) as session:
         assert {name: session.count(topic) for name, topic in session.images.items()} == {
@@ -355,7 +355,7 @@ def test_frame_that_was_exchanged_is_found(recorded: Path, tmp_path: Path) -> No
         CompressedImage,
         lambda image: replace(image, data=image.data + b"\0"),
     )
-    with pytest.raises(IpsysError, match=r"run edges was made from .* is out of date"):
+    with pytest.raises(IpsysError, match=r"run edges is out of date: it has read"):
         again(log)
 
 
@@ -530,7 +530,7 @@ def test_a_model_that_is_not_there(ipsys: Ipsys, lab: Path, tmp_path: Path) -> N
 def test_verify_and_diff_on_the_command_line(ipsys: Ipsys, recorded: Path, lab: Path) -> None:
     done = ipsys("verify", recorded)
     assert (done.code, done.err) == (0, "")
-    assert done.out.endswith("a replay equals the log\n")
+    assert done.out.endswith("the replay is identical to the log\n")
     done = ipsys("verify", lab)
     assert done.code == 1
     assert "has no run to verify" in done.err

@@ -105,11 +105,11 @@ def test_every_place_of_a_session_is_found_and_paired_as_if_measured_while_recor
     path = sheet(tmp_path / "a.csv", tape, time=times(tape, log))
     # One place is so near to B that its distance may be in metres; nothing else is doubted.
     (doubt,) = refused(ipsys, log, "measure", log, "--csv", path).splitlines()[1:]
-    assert "d_B_cm: 8.15 cm is very near to B: in metres? Then type 815" in doubt
+    assert "d_B_cm: 8.15 cm is very short; if it is in metres, type 815" in doubt
     done = ipsys("measure", log, "--csv", path, "--force")
     assert done.code == 0, done.err
     assert f"{len(tape)} places measured into {log}" in done.out
-    assert done.err.splitlines()[-1] == f"then: ipsys replay {log}"
+    assert done.err.splitlines()[-1] == f"next: ipsys replay {log}"
     assert data_section(log).startswith(before)
     assert ipsys("replay", log).code == 0
     mine = pairs_of(log)
@@ -157,9 +157,9 @@ def test_rows_of_a_marker_in_order_and_by_place(ipsys: Ipsys, unmeasured: Unmeas
     assert done.code == 0
     listed = ipsys("measure", log, "--places")
     assert f"p{len(mine):03d}" in listed.out
-    needed = "a model needs 10 or more that each camera sees, and gets good with some 40"
+    needed = "each camera must see 10 or more for a model, and about 40 for a good one"
     assert f"places in it: {len(mine)}; {needed}" in done.err
-    assert f"then: ipsys replay {log}" in done.err
+    assert f"next: ipsys replay {log}" in done.err
     other = [one for one in tape if one.marker_id == 4][:2]
     with open_finished_log(log, Request()) as scene:
         numbers = [str(next(n for n, s in enumerate(scene.intervals, 1) if s.covers(one))) for one in other]
@@ -177,16 +177,16 @@ def test_rows_of_a_marker_in_order_and_by_place(ipsys: Ipsys, unmeasured: Unmeas
     [
         (
             "marker,d_A_cm,d_B_cm,side,height_cm\n0,100,40,left,0\n",
-            ["line 2: no triangle has the sides A to B = 243.8 cm, d_A_cm = 100 cm and d_B_cm = 40 cm"],
+            ["line 2: d_A_cm = 100 cm and d_B_cm = 40 cm do not meet, because A to B is 243.8 cm"],
         ),
         (
             "marker,d_A_cm,d_B_cm,side,height_cm,place\n0,1.7,190,left,0,1\n\n99,170,190,left,0,1\n0,170,x,up,,1\n",
             [
-                "line 2: no triangle has the sides",
+                "cm do not meet, because A to B is",
                 "line 4: marker 99 is not in the rig",
-                "line 5: d_B_cm: 'x' is no number",
+                "line 5: d_B_cm: 'x' is not a number",
                 "line 5: side 'up'",
-                "line 5: height_cm? 0 where",
+                "line 5: height_cm? 0 if",
             ],
         ),
         (
@@ -194,17 +194,21 @@ def test_rows_of_a_marker_in_order_and_by_place(ipsys: Ipsys, unmeasured: Unmeas
             ["line 2: place 999 is none"],
         ),
         ("marker,d_A_cm,d_B_cm,side,height_cm,time\n0,170,190,left,0,noon\n", ["line 2: time 'noon'"]),
-        ("marker,d_A_cm,d_B_cm,side,height_cm\n0,170,190,left,0,7\n", ["line 2: 6 cells, but 5 columns"]),
+        (
+            "marker,d_A_cm,d_B_cm,side,height_cm\n0,170,190,left,0,7\n",
+            ["line 2: the row has 6 cells, but the header has 5"],
+        ),
         (
             "marker,d_A_cm,d_B_cm,side,height_cm\n0,170,190,left,0,20\n0,170,190,up,10\n",
             [
-                "line 2: 6 cells, but 5 columns; a decimal comma? Write a point: 212.7",
+                "line 2: the row has 6 cells, but the header has 5; if it has a decimal comma, write a "
+                "point: 212.7",
                 "line 3: side 'up': write left or right",
             ],
         ),
         (
             "marker,d_A_cm,d_B_cm,side,height_cm,place,note\n0,170,5,190,left,20\n",
-            ["line 2: side '190': write left or right; a decimal comma? Write a point: 212.7"],
+            ["line 2: side '190': write left or right; if it has a decimal comma, write a point: 212.7"],
         ),
         ("marker,d_A_cm,side,height_cm\n0,170,left,0\n", ["line 1: the column d_A_cm is missing"]),
         ("marker,d_A_m,d_B_cm,side,height_cm\n0,1.7,190,left,0\n", ["line 1: unknown column 'd_A_m'"]),
@@ -249,7 +253,7 @@ def test_two_people_at_one_log(unmeasured: Unmeasured) -> None:
     log, tape = unmeasured
     with open_finished_log(log, Request()) as one, open_finished_log(log, Request()) as other:
         one.add([Measurement(tape[0].timestamp, "p001", marker_id=0)])
-        with pytest.raises(LogError, match="somebody else measured in this log meanwhile"):
+        with pytest.raises(LogError, match="another program wrote measurements into this log"):
             other.add([Measurement(tape[0].timestamp, "p001", marker_id=0)])
         # What the first one did is known now: the other goes on after it, and they take turns.
         assert [m.id for m in other.history()] == ["p001"]
@@ -346,12 +350,12 @@ def test_a_bad_answer_in_the_terminal_costs_that_answer_only(
         assert next(left, None) is None
     said = " ".join(capsys.readouterr().out.split())
     for text in (
-        "distance to A: 'hallo' is no number",
-        "3 cm is very near to B: in metres? Then type 300",
-        "no triangle has the sides",
-        "'up' is no side; type l or r",
+        "distance to A: 'hallo' is not a number",
+        "3 cm is very short; if it is in metres, type 300",
+        "cm do not meet, because",
+        "'up' is not a side; type l or r",
         "0,15 cm looks like metres; type 15",
-        "'perhaps' is neither yes nor no; type y or n",
+        "'perhaps' is not yes or no; type y or n",
         "p001 is in the log",
     ):
         assert text in said
@@ -379,7 +383,7 @@ def test_in_the_terminal_somebody_else_may_measure_meanwhile(
         monkeypatch.setattr("typer.prompt", prompt)
         ask_places(scene)
     said = capsys.readouterr().out
-    assert "somebody else measured in this log meanwhile (p001)" in said
+    assert "another program wrote measurements into this log (p001)" in said
     assert "p002 is in the log" in said
     assert sorted(row.id for row in foreign_read(log)) == ["p001", "p002"]
 

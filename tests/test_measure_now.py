@@ -215,7 +215,7 @@ def test_a_log_that_is_there_is_kept_unless_it_is_forced(
         (["measure", "--rig", "RIG", "-o", "a.mcap", "--places"], "--places is for a finished log"),
         (["measure", "--rig", "RIG", "-o", "a.mcap", "--csv", "s.csv"], "--csv is for a finished log"),
         (["measure", "LOG", "-o", "a.mcap"], "--output is for cameras"),
-        (["measure", "LOG", "--force"], "--force is for --csv, or cameras; leave it out"),
+        (["measure", "LOG", "--force"], "--force is only for --csv or live cameras; leave it out"),
         (
             ["measure", "--rig", "RIG", "-o", "LOG", "--model-from", "LOG", "--force"],
             "is the log with the model",

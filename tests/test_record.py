@@ -416,7 +416,7 @@ def test_what_is_there_is_never_overwritten_unless_it_is_said(
         ),
         (
             'name = "red"\nsource = "usb:7"\n[[cameras]]\nname = "white"\nsource = "usb:/dev/video7"',
-            "cameras red and white are one device, /dev/video7",
+            "cameras red and white have the same device, /dev/video7",
         ),
         ('name = "red"\nstamp = "middle"', 'stamp is \'middle\'; write "start" or "end"'),
         ('name = "red"\nsourc = "a"', "unknown key 'sourc'"),

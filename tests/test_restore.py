@@ -134,11 +134,11 @@ def test_a_live_run_that_is_killed_is_brought_to_its_end(
             looked_at = session.count(f"/runs/edges/cameras/{camera}/markers")
             assert looked_at + skipped(session, camera) == session.count(topic) > 50
             assert looked_at > 20
-    assert ipsys("verify", log).out.endswith("a replay equals the log\n")
+    assert ipsys("verify", log).out.endswith("the replay is identical to the log\n")
     # On a busy machine frames are skipped; a replay of all would be another run.
     done = ipsys("replay", log, "--as-live")
     assert done.code == 0, done.err
-    assert "nothing to do: all of it is up to date" in done.err
+    assert "nothing to do: all results are up to date" in done.err
     assert not [topic for topic in topics_of(log) if "_2/" in topic]
     again = pipeline.replay([log], Request(model_from=calibration, as_live=True))
     assert not any(one.fresh for one in again)
@@ -194,7 +194,7 @@ def test_a_run_that_is_not_what_its_stage_makes_is_left_as_it_is(
                 write_message(writer, _moved(message, session.end_ns), counts)
     done = ipsys("repair", log)
     assert done.code == 0, done.err
-    assert "run poly was cut short, and is left so: /runs/poly/tracks is another one at" in done.err
+    assert "run poly stays unfinished: /runs/poly/tracks has other content at" in done.err
     apart = {one.topic for one in verify([log], None, lambda *_: None) if not one.equal}
     assert apart == {"/runs/poly/tracks", "/runs/poly/poses"}
     with Session([log]) as session:
@@ -260,6 +260,6 @@ def test_a_full_disk_ends_live_with_runs_that_are_signed(
             markers = sum(session.count(topic) for topic in session.topics(MARKERS, "edges"))
     assert program.returncode == 1, out
     assert "the disk is full; recording has stopped, and the log is complete" in err
-    assert verified.out.endswith("a replay equals the log\n")
-    assert "nothing to do: all of it is up to date" in replayed.err
+    assert verified.out.endswith("the replay is identical to the log\n")
+    assert "nothing to do: all results are up to date" in replayed.err
     assert frames >= markers > 50

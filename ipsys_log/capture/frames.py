@@ -146,7 +146,10 @@ def report_refused_settings(camera: RigCamera, settings: ActualSettings, say: Sa
     size = (camera.width or settings.width, camera.height or settings.height)
     if settings.width and settings.height and size != (settings.width, settings.height):
         text = " x ".join(str(side) for side in size)
-        say(f"camera {camera.name}: asked for {text} px, gives {settings.width} x {settings.height}")
+        say(
+            f"camera {camera.name}: asked for {text} px, but the camera gives {settings.width} x "
+            f"{settings.height}"
+        )
     rows = (
         ("frames/s", camera.rate_hz, settings.rate_hz),
         ("s of exposure", camera.exposure_s, settings.exposure_s),
@@ -157,9 +160,9 @@ def report_refused_settings(camera: RigCamera, settings: ActualSettings, say: Sa
         if requested is None or (actual is None and unit == "frames/s"):
             continue
         if actual is None:
-            say(f"camera {camera.name}: asked for {requested:g} {unit}, which it does not let us set")
+            say(f"camera {camera.name}: asked for {requested:g} {unit}, but the camera cannot set this")
         elif abs(requested - actual) > _NEAR * max(abs(requested), abs(actual)):
-            say(f"camera {camera.name}: asked for {requested:g} {unit}, gives {actual:g}")
+            say(f"camera {camera.name}: asked for {requested:g} {unit}, but the camera gives {actual:g}")
 
 
 def device_path(source: str) -> str:

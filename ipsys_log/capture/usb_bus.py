@@ -129,7 +129,7 @@ def _explain(bus: int, shared: Sequence[BandwidthDemand]) -> str | None:
     needed, most = (_wire_bytes(shared, each) for each in (_needed, lambda demand: demand.most))
     carries = f"MB/s of its {_CARRIES * _MICROFRAMES_PER_S / 1e6:.0f}"
     if needed > _CARRIES:
-        ways = ["plug one into another bus"] if names else []
+        ways = ["plug one camera into another bus"] if names else []
         ways += _smaller(shared)
         demand_text = f"need {_mb_s(needed)}" if names else f"needs {_mb_s(needed)}"
         return f"{subject} USB bus {bus} ({hubs}) and {demand_text} {carries}: {', or '.join(ways)}"
@@ -160,7 +160,7 @@ def _smaller(shared: Sequence[BandwidthDemand]) -> list[str]:
             ways.append(f"{'' if ways else 'ask '}for {width} x {height} px")
             break
     if any(demand.format in _BYTES_PER_PX for demand in shared):
-        ways.append("take a camera that gives MJPG")
+        ways.append("use a camera with MJPG")
     return ways
 
 
@@ -274,7 +274,7 @@ def _hub(usb: Path) -> str:
     name = " ".join(filter(None, (_read(hub / "manufacturer"), _read(hub / "product"))))
     # The root of the tree is the controller in the machine.
     if _read(hub / "devpath") in ("", "0"):
-        return f"the machine's own, controller {hub.parent.name}"
+        return f"built in, controller {hub.parent.name}"
     return f"{name or 'a hub'} at port {_read(hub / 'devpath')}"
 
 

@@ -54,7 +54,7 @@ def measure_now(
 
         check_port_free(host, port)
     ends = "q" if terminal else "Ctrl-C"
-    doing = f"measuring into {output}; {ends} ends it"
+    doing = f"measuring into {output}; {ends} to end"
     with open_cameras(lab, output, None, doing, not terminal) as (cameras, settings, status):
         scene = live_scene(settings, cameras, model)
         consumers: list[Consumer] = [status, scene]
@@ -99,7 +99,7 @@ def serve_live_page(scene: LiveScene, host: str | None, port: int) -> Iterator[N
     with serve(scene, host, port) as page:
         if host is not None:
             console.print(qr_code(page.url), style="#ffffff on #000000", markup=False)
-        remarks.print(f"measure at {page.url}", markup=False)
+        remarks.print(f"open {page.url} to measure", markup=False)
         try:
             yield
         finally:
@@ -110,7 +110,7 @@ def say_faults(page: PageServer) -> None:
     """Print the faults of the page's server at the end, when the screen is free for a traceback."""
     if page.exceptions.count:
         remarks.print(
-            f"faults of ipsys in the measuring page: {page.exceptions.count}; the first one:", style="red"
+            f"internal errors of the measuring page: {page.exceptions.count}; the first one:", style="red"
         )
         remarks.print(page.exceptions.first, markup=False, highlight=False)
 

@@ -35,7 +35,7 @@ __all__ = [
 
 _SIGNALS = (signal.SIGINT, signal.SIGTERM, signal.SIGHUP)
 _AGAIN_S = 0.5
-_KEPT = "complete results are kept, and nothing else was changed"
+_KEPT = "complete results are kept; nothing else is changed"
 
 
 class Interrupted(KeyboardInterrupt):

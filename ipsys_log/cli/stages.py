@@ -37,7 +37,7 @@ __all__ = ["EVALUATE", "MORE", "add_commands", "build_command", "derive", "optio
 _Path = Optional[Path]  # noqa: UP045
 
 _MODEL_HELP = (
-    "rigid, poly, ann, kriging, kriging-regression, rigid+ and the name of one of these, rayplane, best; "
+    "Model: rigid, poly, ann, kriging, kriging-regression, rayplane, best, or a hybrid such as rigid+poly; "
     "repeat it for several."
 )
 # Every option of these commands: its type with its help, and its default.
@@ -53,7 +53,7 @@ OPTIONS: dict[str, tuple[Any, Any]] = {
     "model_from": (
         Annotated[
             _Path,
-            typer.Option("--model-from", metavar="LOG", help="Apply the model of another log; copy it in."),
+            typer.Option("--model-from", metavar="LOG", help="Copy the model of this log, and apply it."),
         ],
         None,
     ),
@@ -62,9 +62,7 @@ OPTIONS: dict[str, tuple[Any, Any]] = {
         "train",
     ),
     "seed": (
-        Annotated[
-            int, typer.Option(min=0, metavar="N", help="The seed of random splits, folds and subsets.")
-        ],
+        Annotated[int, typer.Option(min=0, metavar="N", help="Seed of random splits, folds and subsets.")],
         0,
     ),
     "rig": (RigFile, None),
@@ -75,28 +73,26 @@ OPTIONS: dict[str, tuple[Any, Any]] = {
         Annotated[
             Optional[str],  # noqa: UP045
             typer.Option(
-                "--run", metavar="NAME", help="A name for the new run, instead of edges, poly, poly_2 ..."
+                "--run", metavar="NAME", help="Name of the new run, instead of edges, poly, poly_2 ..."
             ),
         ],
         None,
     ),
     "output": (
-        Annotated[_Path, log_option(help="Write the results to a new log instead.")],
+        Annotated[_Path, log_option(help="Write the results to a new log, not to the last LOG.")],
         None,
     ),
     "as_live": (
         Annotated[
             bool,
-            typer.Option(
-                "--as-live", help="Pass over the frames that were skipped when the log was recorded."
-            ),
+            typer.Option("--as-live", help="Exclude the frames that were skipped during the recording."),
         ],
         False,
     ),
     "skip_ambiguous": (
         Annotated[
             bool,
-            typer.Option("--skip-ambiguous", help="Leave out a marker in frames that show its id twice."),
+            typer.Option("--skip-ambiguous", help="Exclude a marker from frames that show its id twice."),
         ],
         False,
     ),
@@ -112,7 +108,7 @@ OPTIONS: dict[str, tuple[Any, Any]] = {
             bool,
             typer.Option(
                 "--details",
-                help="Print all figures, too: errors by camera, every outlier, models by number of points.",
+                help="Print details, too: errors by camera, every outlier, models by number of points.",
             ),
         ],
         False,
@@ -139,29 +135,29 @@ _DETECT = tuple(name for name in _FRAMES if name != "method")
 _MODELS = tuple(name for name in OPTIONS if name not in ("plot", "plots", "details"))
 EVALUATE = (*_MODELS, "plots")
 
-MORE = "\n\nWhat it needs and the log does not hold yet is made first."
+MORE = "\n\nThe command runs missing stages first."
 _COMMANDS: dict[str, tuple[str, tuple[str, ...], str]] = {
     "replay": (
         "fuse",
         tuple(OPTIONS),
-        "Run whatever a log lacks, from detect to fuse, append it, and print how accurate it is.",
+        "Run the missing stages from detect to fuse, append their results, and print the accuracy.",
     ),
-    "detect": ("detect", _DETECT, "Find the markers in the frames."),
+    "detect": ("detect", _DETECT, "Detect the markers in the frames."),
     "camera-frame": (
         "camera-frame",
         _FRAMES,
-        f"Put the markers into the frame of their camera.{MORE}",
+        f"Compute the position of each marker in camera coordinates.{MORE}",
     ),
-    "fit": ("fit", _MODELS, f"Fit models to the measured places (poly, unless you say which).{MORE}"),
+    "fit": ("fit", _MODELS, f"Fit models to the calibration points (default: poly).{MORE}"),
     "evaluate": (
         "evaluate",
         (*EVALUATE, "details"),
-        "Say how far models are off, how many places are enough, and which look wrongly measured.\n\n"
-        "For all models, unless you say which; on places held out, and by cross-validation, which takes each "
-        f"part of the places in turn.{MORE}",
+        "Evaluate models: their errors, the learning curve and outliers of the measurements.\n\n"
+        "The errors are on held-out calibration points and by cross-validation. Without --model, the command "
+        f"evaluates all models.{MORE}",
     ),
-    "locate": ("locate", _MODELS, f"Apply a model: world positions for each camera.{MORE}"),
-    "fuse": ("fuse", _MODELS, f"One pose per robot from all cameras that see it.{MORE}"),
+    "locate": ("locate", _MODELS, f"Apply a model: compute world positions from each camera.{MORE}"),
+    "fuse": ("fuse", _MODELS, f"Combine the positions of all cameras into one pose per robot.{MORE}"),
 }
 
 
@@ -251,7 +247,7 @@ def _kept_runs(logs: list[Path], output: Path | None) -> Callable[[Sequence[str]
         named = "; ".join(f"{run} ({', '.join(stages)})" for run, stages in new.items() if stages)
         if not named:
             return f"{logs[-1]} is unchanged: no run was complete"
-        return f"complete in {logs[-1]}: {named}. The same command continues there"
+        return f"complete in {logs[-1]}: {named}. To continue, repeat the command"
 
     return added
 
@@ -331,4 +327,4 @@ def _remark(outcomes: list[Outcome], target: Path | None) -> None:
     if any(outcome.fresh for outcome in outcomes):
         remarks.print(f"results are in {target}", markup=False)
     else:
-        remarks.print("nothing to do: all of it is up to date")
+        remarks.print("nothing to do: all results are up to date")

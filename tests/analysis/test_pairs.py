@@ -204,7 +204,7 @@ def test_places_that_are_held_out_are_never_fitted_on() -> None:
     assert split(both, "train", 0) == ({"a"}, {"b"})
     with pytest.raises(IpsysError, match="held out"):
         split(both, "test", 0)
-    with pytest.raises(IpsysError, match="label some to fit on"):
+    with pytest.raises(IpsysError, match="label some for the fit"):
         split(both[1:], "train", 0)
 
 

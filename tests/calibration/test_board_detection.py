@@ -169,8 +169,8 @@ def test_blurred_pictures_and_those_with_few_corners_are_dropped_with_the_reason
     chosen = select_images(seen, CHESSBOARD, (640, 480))
     assert len(chosen.used) == 10
     reasons = dict(chosen.bad)
-    assert reasons["shaken"] == "blurred: edges are 3.5 px wide, in the sharp pictures 0.8"
-    assert reasons["half"] == "only 4 corners are seen"
+    assert reasons["shaken"] == "blurred: edges are 3.5 px wide, but 0.8 px in sharp pictures"
+    assert reasons["half"] == "only 4 corners are found"
     assert reasons["row"] == "its corners lie on one line"
 
 
@@ -199,7 +199,7 @@ def test_of_two_that_show_the_same_the_sharp_one_is_chosen() -> None:
         ("6", "write the inner corners of a chessboard as 6x4"),
         ("charuco:5", "charuco:4x5"),
         ("2x9", "3 to 100 inner corners"),
-        ("charuco:50x50", "has 50 markers, the board 1250"),
+        ("charuco:50x50", "has 50 markers, but the board has 1250"),
     ],
 )
 def test_boards_that_cannot_be(text: str, said: str) -> None:

@@ -60,7 +60,7 @@ def test_of_good_pictures_nothing_is_asked() -> None:
 
 def test_a_side_without_a_board_is_named() -> None:
     found = calibrated(sightings(everywhere(x=(-0.03, 0.13)), 0.5))
-    assert "no board near the left edge of the image: hold it there too" in found.notes
+    assert "no board near the left edge of the image: move it there, too" in found.notes
     assert found.coverage.empty_sides == ("left",)
 
 
@@ -116,7 +116,7 @@ def test_pinhole_on_a_fisheye_is_refused() -> None:
 def test_pinhole_on_a_fisheye_insisted_on_is_noted() -> None:
     result = calibrate("red", through_fisheye(), BOARD, LENS_MODELS["pinhole4"], force=True)
     assert result.rms_px > 2
-    assert "written only for --force: the RMS reprojection error is" in result.notes[0]
+    assert "written only because of --force:  the RMS reprojection error is" in result.notes[0]
 
 
 def test_too_few_say_what_to_add() -> None:

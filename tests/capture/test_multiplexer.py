@@ -101,7 +101,9 @@ def test_frames_that_were_lost_before_they_came_are_counted_and_named() -> None:
     # The first at once, those within a second of it together.
     assert [(event.kind, event.camera) for event in events(found)] == [("frames_missed", "red")] * 2
     assert [event.text for event in events(found)] == said
-    assert said == [f"{n} frames of camera red were lost before they came" for n in (2, 4)]
+    assert said == [
+        f"{n} frames of camera red are missing: the camera or its driver lost them" for n in (2, 4)
+    ]
 
 
 def test_a_camera_that_cannot_be_opened_ends_it_at_once() -> None:
@@ -157,7 +159,7 @@ def test_a_camera_that_vanishes_is_tried_again_while_the_others_go_on() -> None:
     said = [event for event in events(found) if event.camera == "red"]
     # It was open when it went the first time, and not when the second try failed.
     assert [event.kind for event in said] == ["camera_lost", "camera_back"]
-    assert "has gone; trying again" in said[0].text
+    assert "has gone; ipsys tries again" in said[0].text
     assert len(data_of(found, "red")) == 10
     assert len(data_of(found, "white")) == 45
     assert tries[2] - gone[1] > tries[1] - gone[0]
@@ -190,7 +192,7 @@ def test_a_camera_that_returns_with_another_codec_is_not_recorded(monkeypatch: p
     assert kinds == ["camera_lost", "camera_lost", "camera_back", "camera_lost", "camera_back"]
     assert "sends h264 now, and jpeg before" in said[1]
     assert said[1] == said[3]
-    assert said[1].endswith("set it back to jpeg, or begin a new recording; trying again")
+    assert said[1].endswith("set the camera to jpeg, or start a new recording; ipsys tries again")
 
 
 def test_pictures_of_another_size_are_said_once_for_each_change() -> None:
@@ -204,7 +206,7 @@ def test_pictures_of_another_size_are_said_once_for_each_change() -> None:
     )
     found = messages(attached)
     assert [event.kind for event in events(found)] == ["camera_size"] * 2
-    assert "are 32 x 24 px now, and were 64 x 48 px" in events(found)[0].text
+    assert "its image size changed from 64 x 48 px to 32 x 24 px" in events(found)[0].text
     assert attached.states["red"].size_px == (64, 48)
     assert len(data_of(found, "red")) == 7
 
@@ -399,7 +401,7 @@ def test_what_came_before_a_fault_is_given_out() -> None:
     # Not only in the end: the other camera might go on for hours.
     ((number, event),) = [(n, m.payload) for n, m in enumerate(found) if isinstance(m.payload, Event)]
     assert (event.kind, event.camera, event.text) == ("camera_failed", "red", said[0])
-    assert "camera red: the program failed (ZeroDivisionError('a bug'))" in event.text
+    assert "camera red: internal error (ZeroDivisionError('a bug'))" in event.text
     assert number < len(found) - 5
 
 

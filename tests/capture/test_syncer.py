@@ -170,5 +170,7 @@ def test_point_on_a_failing_disk_is_not_called_saved(tmp_path: Path) -> None:
             for _ in write_each(attached, log):
                 pass
         disk.error = None
-        with pytest.raises(SourceError, match=r"maybe not saved: the disk has failed \(Input/output error\)"):
+        with pytest.raises(
+            SourceError, match=r"perhaps not saved: the disk has failed \(Input/output error\)"
+        ):
             saved.result(LIMIT_S)

@@ -90,7 +90,7 @@ def test_cameras_are_found_where_they_hang(tmp_path: Path, plug_in: Callable[[in
     first, second = find_cameras(tmp_path)
     assert (first.device, first.name) == (str(tmp_path / "dev/video2"), "Lab Camera 2")
     assert first.stable == str(tmp_path / "dev/v4l/by-id/usb-Acme_2-video-index0")
-    assert first.plug == UsbConnection(1, "4", 480.0, "the machine's own, controller 0000:00:14.0", 3060)
+    assert first.plug == UsbConnection(1, "4", 480.0, "built in, controller 0000:00:14.0", 3060)
     assert second.plug == UsbConnection(1, "2.3", 480.0, "Acme USB2.0 Hub at port 2", 3060)
     assert first.modes == (
         Mode("YUYV", 640, 480, 30),
@@ -163,7 +163,7 @@ def test_one_camera_can_be_too_much() -> None:
     (line,) = advise(cameras(1, format="YUYV"))
     assert line == (
         "camera red is alone on USB bus 1 (Acme Hub at port 2) and needs 129.3 MB/s of its 48: "
-        "ask for 10 frames/s, or for 800 x 600 px, or take a camera that gives MJPG"
+        "ask for 10 frames/s, or for 800 x 600 px, or use a camera with MJPG"
     )
 
 

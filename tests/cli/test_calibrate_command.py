@@ -151,7 +151,7 @@ def test_a_log_gives_a_file_for_each_camera_that_saw_the_board(ipsys: Ipsys, log
     assert done.code == 0, done.err
     assert (log.parent / "red.yaml").is_file()
     assert not (log.parent / "white.yaml").exists()
-    assert "camera white: a chessboard of 6 x 4 inner corners is not seen in any of 12" in done.err
+    assert "camera white: a chessboard of 6 x 4 inner corners is not found in any of the 12" in done.err
     # And the file is what every other command takes.
     assert "no such camera" not in ipsys("detect", log, "--calibration", f"red={log.parent}/red.yaml").err
 
@@ -160,7 +160,7 @@ def test_one_camera_of_a_log(ipsys: Ipsys, log: Path) -> None:
     line = refused(ipsys, log.parent, log, "--board", "6x4", "--camera", "white", "-o", log.parent)
     assert "camera white" in line
     line = refused(ipsys, log.parent, log, "--board", "6x4", "--camera", "blue", "-o", log.parent)
-    assert "--camera blue: there are no frames of such a camera (only of red, white)" in line
+    assert "--camera blue: this camera has no frames; the cameras are red, white" in line
 
 
 def test_a_video(ipsys: Ipsys, rendered: Path, tmp_path: Path) -> None:
@@ -178,15 +178,21 @@ def test_a_video(ipsys: Ipsys, rendered: Path, tmp_path: Path) -> None:
 @pytest.mark.parametrize(
     ("board", "said"),
     [
-        ("7x5", "a chessboard of 6 x 4 inner corners is seen in"),
+        ("7x5", "a chessboard of 6 x 4 inner corners is in"),
         (
             "5x3",
-            "a part of a chessboard of 6 x 4 inner corners, which 3 of 3 pictures of a board show: give "
+            "only a part of the board: 3 of 3 pictures show a chessboard of 6 x 4 inner corners; give "
             "--board 6x4; if the size is right, give --force",
         ),
-        ("9x9", "but a chessboard of 6 x 4 inner corners is seen in 3 of 3 tried: give --board 6x4"),
-        ("charuco:7x5", "but a chessboard of 6 x 4 inner corners is seen in 3 of 3 tried: give --board 6x4"),
-        ("charuco:6x4", "but a chessboard of 6 x 4 inner corners is seen in 3 of 3 tried: give --board 6x4"),
+        ("9x9", "but a chessboard of 6 x 4 inner corners is in 3 of 3 checked pictures: give --board 6x4"),
+        (
+            "charuco:7x5",
+            "but a chessboard of 6 x 4 inner corners is in 3 of 3 checked pictures: give --board 6x4",
+        ),
+        (
+            "charuco:6x4",
+            "but a chessboard of 6 x 4 inner corners is in 3 of 3 checked pictures: give --board 6x4",
+        ),
     ],
 )
 def test_another_board_than_said(ipsys: Ipsys, red: Path, tmp_path: Path, board: str, said: str) -> None:
@@ -269,7 +275,7 @@ def test_pictures_without_the_board_are_named(ipsys: Ipsys, red: Path, tmp_path:
     cv2.imwrite(str(red / "98.png"), np.full(SIZE_PX[::-1], 90, np.uint8))
     done = calibrate(ipsys, red, "--board", "6x4", "-o", tmp_path)
     assert done.code == 0, done.err
-    assert "not seen: 98.png: the board is not seen" in done.out
+    assert "not seen: 98.png: the board is not found" in done.out
 
 
 def test_better_model_is_named(ipsys: Ipsys, red: Path, tmp_path: Path) -> None:
@@ -291,7 +297,7 @@ def test_four_pictures_are_used_if_insisted_on(ipsys: Ipsys, red: Path, tmp_path
         path.unlink()
     done = calibrate(ipsys, red, "--board", "6x4", "-o", tmp_path, "--force")
     assert done.code == 0, done.err
-    assert "written only for --force: only 4 of 4 pictures can be used" in done.err
+    assert "written only because of --force:  only 4 of 4 pictures can be used" in done.err
 
 
 def test_sources_that_are_none(ipsys: Ipsys, red: Path, tmp_path: Path) -> None:

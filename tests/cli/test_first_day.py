@@ -56,9 +56,12 @@ def played(lab: Path, camera: str = "red", more: str = "") -> str:
 FAULTS = {
     "source": ('[[cameras]]\nname = "white"\nsource = "carrier_pigeon:7"\n', "is none of http:"),
     "simulated camera": ('[[cameras]]\nname = "white"\nsource = "sim:blue"\n', "has no camera 'blue'"),
-    "device": ('[[cameras]]\nname = "white"\nsource = "usb:/dev/none"\n', "there is no device '/dev/none'"),
-    "address": ('[[cameras]]\nname = "white"\nsource = "http:/cam/1"\n', "names no host; write it as"),
-    "file": ('[[cameras]]\nname = "white"\nsource = "file:none.mp4"\n', "none.mp4: there is no such file"),
+    "device": (
+        '[[cameras]]\nname = "white"\nsource = "usb:/dev/none"\n',
+        "device '/dev/none' does not exist",
+    ),
+    "address": ('[[cameras]]\nname = "white"\nsource = "http:/cam/1"\n', "has no host; write it as"),
+    "file": ('[[cameras]]\nname = "white"\nsource = "file:none.mp4"\n', "none.mp4: does not exist"),
     "lens": (
         '[[cameras]]\nname = "white"\nsource = "sim:white"\ncalibration = "none.yaml"\n',
         "none.yaml: there is no such calibration file",
@@ -136,7 +139,9 @@ def test_a_picture_that_is_higher_than_wide_is_asked_about(ipsys: Ipsys, tmp_pat
         size = f"width = {width}\nheight = {height}"
         rig = write_rig(tmp_path, f'[[cameras]]\nname = "red"\nsource = "http://127.0.0.1:9/"\n{size}')
         done = ipsys("record", "--rig", rig, "-o", tmp_path / "none" / "a.mcap")
-        assert ("camera red: 180 x 320 px is upright: are width and height exchanged?" in done.err) == said
+        assert (
+            "camera red: 180 x 320 px is upright: check that width and height are not exchanged" in done.err
+        ) == said
 
 
 def test_a_model_of_other_cameras_is_refused_before_any_is_opened(
@@ -147,7 +152,7 @@ def test_a_model_of_other_cameras_is_refused_before_any_is_opened(
         given = ("-o", tmp_path / "a.mcap", "--rig", rig, "--model-from", fitted, "--seconds", "1")
         done = ipsys(*command, *given)
         assert done.code == 1
-        assert "is of the cameras black, red, white, and none of them is here, but blue" in done.err
+        assert "is for the cameras black, red, white, but the rig has only blue" in done.err
         assert OPENED not in done.err
 
 
@@ -169,7 +174,7 @@ def test_a_lens_comes_out_of_a_log(ipsys: Ipsys, tmp_path: Path, lab: Path) -> N
         assert (held.D.tolist(), held.K.tolist(), held.width) == (meant.D.tolist(), meant.K.tolist(), 960)
     stranger = write_rig(tmp_path, played(lab).replace('name = "red"', 'name = "green"'))
     done = ipsys("record", "--rig", stranger, "-o", tmp_path / "green.mcap")
-    assert "holds no calibration of camera green; it has those of: black, red, white" in done.err
+    assert "has no calibration of camera green, only of black, red, white" in done.err
 
 
 def test_a_name_without_an_ending_gets_it_and_that_is_said(
@@ -177,10 +182,10 @@ def test_a_name_without_an_ending_gets_it_and_that_is_said(
 ) -> None:
     monkeypatch.chdir(tmp_path)
     done = ipsys("record", "--rig", write_rig(tmp_path, played(lab)), "--seconds", "0.5", "-o", "monday")
-    assert "-o monday: the log is called monday.mcap" in done.err
+    assert "-o monday: the log gets the name monday.mcap" in done.err
     assert "monday.mcap written" in done.out
     done = ipsys("detect", "monday.mcap", "-o", "results.v2")
-    assert "the log is called results.v2.mcap" in done.err
+    assert "the log gets the name results.v2.mcap" in done.err
     assert ipsys("info", "monday.mcap", "results.v2.mcap").code == 0
     assert not (tmp_path / "monday").exists()
 
@@ -205,7 +210,7 @@ def test_what_is_wrong_with_frames_just_taken_names_no_file_that_is_gone(
     rig = write_rig(tmp_path, played(lab))
     done = ipsys("calibrate", "--rig", rig, "--board", "6x4", "--seconds", "1")
     assert done.code == 1
-    assert "what the cameras sent" in done.err
+    assert "the camera images" in done.err
     assert "now.mcap" not in done.err
 
 
@@ -219,7 +224,7 @@ def test_a_marker_that_is_not_in_the_rig_is_shown_with_what_to_do(
     rig_file = write_rig(tmp_path, markers + played(lab))
     done = ipsys("record", "--rig", rig_file, "--seconds", "2.5", "-o", tmp_path / "a.mcap")
     assert "camera red: marker 0 is seen, but not in the rig; to track it add" in done.out
-    assert "add the line [[markers]] to it, and below id = 0" in done.out
+    assert "add [[markers]] with id = 0 to lab.toml" in done.out
     assert f"marker {known[0]} is seen" not in done.out
 
 
@@ -288,9 +293,9 @@ def test_info_keeps_each_channel_on_a_line_and_has_no_rates_of_events(
 
 def test_the_help_lists_the_commands_in_the_order_of_a_first_day(ipsys: Ipsys) -> None:
     out = ipsys("--help").out
-    panel = out[out.index("The first day, in this order") : out.index("How good it is")]
+    panel = out[out.index("First day, in this order") : out.index("Accuracy, and the next")]
     listed = [line.split()[1] for line in panel.splitlines()[1:] if line[2:3].isalpha()]
-    assert tuple(listed) == PANELS["The first day, in this order"]
+    assert tuple(listed) == PANELS["First day, in this order"]
 
 
 @pytest.mark.parametrize("command", EXAMPLES)

@@ -98,7 +98,7 @@ def test_the_plan_is_a_table_and_a_headline(
     assert max(map(len, lines)) <= 80, done.out
     rows = [line for line in lines if line[:1].isdigit()]
     assert [row.split()[0] for row in rows] == ["1", "2", "3", "4", "5"]
-    assert lines[-1].startswith("predicted mean error over the floor now 0.")
+    assert lines[-1].startswith("predicted mean error over the floor: 0.")
     assert "with these 5 places 0." in lines[-1]
     # The model that was lacking was fitted and appended; what was recorded is as it was.
     assert "fit           run best  1 message\n" in done.err
@@ -210,7 +210,7 @@ def test_what_cannot_be_planned_is_refused(ipsys: Ipsys, paper: Path) -> None:
     assert "model 'spline' is not known; use one of" in refused(ipsys, paper, "--model", "spline")
     for height in ("-0.1", "15", "nan", "inf"):
         assert f"--height-m {height}: " in refused(ipsys, paper, "--height-m", height)
-    assert "no measurement is labelled 'half'" in refused(ipsys, paper, "--train", "half")
+    assert "no measurement has the label 'half'" in refused(ipsys, paper, "--train", "half")
     assert "this is the log itself" in refused(ipsys, paper, "--plot", paper)
     assert "there is no folder" in refused(ipsys, paper, "--plot", paper.parent / "nowhere" / "plan.png")
     assert ipsys("fit", paper, "--model", "best").code == 0

@@ -221,7 +221,7 @@ def test_measurement_since_makes_the_model_out_of_date(ipsys: Ipsys, log: Path, 
     assert rows["poly", "fit"]["state"] == "out of date: measurements changed"
     assert rows["poly", "fuse"]["state"] == "out of date: input poly is"
     done = ipsys("view", log, "--save", tmp_path / "a.rrd")
-    assert "run poly: fit is out of date: measurements changed; ipsys replay makes it again" in done.err
+    assert "run poly: fit is out of date: measurements changed; ipsys replay computes it again" in done.err
     assert "fit is computed again; run poly is out of date: measurements changed" in ipsys("replay", log).err
 
 

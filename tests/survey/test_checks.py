@@ -80,7 +80,7 @@ def test_three_distances_need_no_side_and_check_one_another(world_m: tuple[float
 def test_two_tapes_that_cannot_meet() -> None:
     checked = check(TypedEntry("0", {"A": "40", "B": "50"}, "left", "0"))
     assert checked.measurement is None
-    said = "no triangle has the sides A to B = 243.8 cm, distance to A = 40 cm and distance to B = 50 cm"
+    said = "distance to A = 40 cm and distance to B = 50 cm do not meet, because A to B is 243.8 cm"
     assert checked.faults[0].text == f"{said}; read both again"
     # The side is not what is wrong: said before it is asked for.
     unsided = check(TypedEntry("0", {"A": "40", "B": "50"}, "", "0"))
@@ -102,7 +102,7 @@ def test_a_place_that_is_not_on_the_floor_and_the_side_on_which_it_would_be() ->
     narrow = replace(RIG, floor=replace(labs.RIG.floor, depth_m=3.0))  # type: ignore[type-var]
     checked = check(tape((1.0, 1.0, 0.0), side="left"), narrow)
     assert checked.on_floor is False
-    assert "outside of the floor; on the right it would lie on it" in checked.warnings[0]
+    assert "outside of the floor; with side right, it is on the floor" in checked.warnings[0]
     assert checked.measurement is not None
 
 
@@ -118,7 +118,7 @@ def test_a_marker_that_no_camera_sees_or_that_moves() -> None:
     assert unseen.point_m is not None
     moving = MarkerObservations(0, None, {}, ("red",))
     checked = check_entry(*parse_entry(tape((1.0, 4.0, 0.0)), RIG), RIG, moving, [])
-    assert checked.faults[0].text == "marker 0 moves, as seen by red: wait until it lies still"
+    assert checked.faults[0].text == "marker 0 moves, as seen by red: wait until it stops"
 
 
 def test_ids_count_up_and_undo_withdraws() -> None:
@@ -141,7 +141,7 @@ def test_the_same_place_once_more() -> None:
     assert "p001 once more" in again.faults[0].text
     other = check(tape((1.0, 4.01, 0.0)), history=[first])
     assert len(other.warnings) == 1
-    assert other.warnings[0].startswith("marker 0 is measured here already, as p001")
+    assert other.warnings[0].startswith("marker 0 is already measured here, as p001")
     assert check(tape((1.0, 4.0, 0.0)), history=[first, withdrawal_of([first], "p001")]).warnings == ()
 
 

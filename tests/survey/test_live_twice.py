@@ -53,7 +53,7 @@ def test_a_marker_that_has_not_moved_since_it_was_measured() -> None:
     lab.show(4, 0.1)  # so that the seconds of both have nothing in common
     assert "this is p001 once more" in lab.check(PLACE).faults[0].text
     (text,) = lab.check(BETTER).warnings
-    assert "marker 0 is measured here already, as p001" in text
+    assert "marker 0 is already measured here, as p001" in text
     lab.save(BETTER)
     lab.show(2, 0.1)
     (text,) = lab.check(TypedEntry("0", {"A": "172", "B": "190"}, "left", "10")).warnings

@@ -71,7 +71,7 @@ def test_a_place_is_typed_checked_saved_and_withdrawn(hand: Phone, unmeasured: U
     with open_finished_log(log, Request()) as scene, serve(scene, port=0) as page:
         a, b, side, height = texts_at(scene, tape, 0)
         hand.open(page.url)
-        says(hand, "#sight", "lies still, seen by")
+        says(hand, "#sight", "is stationary, seen by")
         assert hand.run("document.querySelector('#sight').className") == "chip still"
         hand.wait("document.querySelector('#cameras .still polygon.chosen')")
         hand.wait(f"{FETCHED}.filter(name => name.includes('/picture/')).length === 3")
@@ -163,7 +163,7 @@ def test_somebody_else_measures_in_the_same_log(hand: Phone, unmeasured: Unmeasu
         fill(hand, *texts)
         other.add([Measurement(tape[-1].timestamp, "p001", marker_id=1)])
         save(hand, "p001")
-        says(hand, "#notice", "somebody else measured in this log meanwhile (p001)")
+        says(hand, "#notice", "another program wrote measurements into this log (p001)")
         says(hand, "#places", "p001")
         assert hand.run("document.querySelector('#d-A').value") == texts[0]
         # Without a word more: what was typed is checked anew, beside what the other one did.
@@ -174,7 +174,7 @@ def test_somebody_else_measures_in_the_same_log(hand: Phone, unmeasured: Unmeasu
             other.add([Measurement(tape[-1].timestamp, other_id, marker_id=1)])
         other.add([Measurement(tape[-1].timestamp, other_id, marker_id=1)])
         hand.tap("#places li:first-child button")
-        says(hand, "#notice", "somebody else measured in this log meanwhile (p003)")
+        says(hand, "#notice", "another program wrote measurements into this log (p003)")
         hand.wait("document.querySelector('#places button[aria-label=\"Undo p002\"]')")
         hand.tap("#places button[aria-label='Undo p002']")
         says(hand, "#notice", "p002 is withdrawn")
@@ -220,7 +220,7 @@ def test_while_recording_the_marker_has_to_lie_still(hand: Phone) -> None:
         scene.seen = False
         says(hand, "#sight", "No camera sees a marker")
         scene.speed_m, scene.seen = 0.0, True
-        says(hand, "#sight", "Marker 0 lies still, seen by red")
+        says(hand, "#sight", "Marker 0 is stationary, seen by red")
         save(hand, "p001")
         says(hand, "#places", "p001 marker 0")
     (saved,) = scene.done
@@ -295,7 +295,7 @@ def test_of_three_reference_points_two_need_the_side_and_three_check_one_another
     scene.rig = replace(labs.RIG, reference_points=(*labs.RIG.reference_points, third))
     with serve(scene, port=0) as page:
         hand.open(page.url)
-        says(hand, "#sight", "Marker 0 lies still, seen by red")
+        says(hand, "#sight", "Marker 0 is stationary, seen by red")
         assert hand.run("document.querySelector('#sides').hidden")
         for selector, text in (("#d-A", "170"), ("#d-C", "348"), ("#height", "10")):
             hand.type(selector, text)

@@ -183,14 +183,15 @@ def _note(damaged_range: DamagedRange, records: _Records, count: int, *, complet
     chunk_text = f"the chunk at byte {damaged_range.offset} ({records.span})"
     if records.checked:
         return (
-            f"all {count} messages of {chunk_text} were copied: its CRC is right, but it cannot stay in place"
+            f"all {count} messages of {chunk_text} were copied, because it has a valid CRC but "
+            "cannot stay in place"
         )
     if count:
         count_text = "all" if complete else "the first"
         return f"{count_text} {count} messages of {chunk_text} were saved; their CRC cannot be checked"
     if records.ends_early or not records.data:
-        return f"{chunk_text} holds no message that can be read"
-    return f"{chunk_text}: an unknown one of its messages is damaged, so that none was saved"
+        return f"{chunk_text} has no readable message"
+    return f"{chunk_text}: one of its messages is damaged, but it is unknown which, so none was saved"
 
 
 def _records_of(view: View, damaged_range: DamagedRange) -> _Records | None:

@@ -289,8 +289,12 @@ def test_names_and_options_that_cannot_be(ipsys: Ipsys, lab: Path, tmp_path: Pat
     )
     assert "small letters" in refused(ipsys, lab, "replay", lab, "--run", "Monday/1")
     assert "camera=file.yaml" in refused(ipsys, lab, "replay", lab, "--calibration", "red")
-    assert "no such camera" in refused(ipsys, lab, "replay", lab, "--calibration", f"blue={yaml(tmp_path)}")
-    assert "there is no such" in refused(ipsys, lab, "replay", lab, "--calibration", "red=nowhere.yaml")
+    assert "does not have this camera" in refused(
+        ipsys, lab, "replay", lab, "--calibration", f"blue={yaml(tmp_path)}"
+    )
+    assert "nowhere.yaml: does not exist" in refused(
+        ipsys, lab, "replay", lab, "--calibration", "red=nowhere.yaml"
+    )
     assert "no measurement has the label 'half'" in refused(ipsys, lab, "fit", lab, "--train", "half")
     (tmp_path / "out.mcap").write_bytes(b"kept")
     assert "exists already" in refused(ipsys, lab, "replay", lab, "-o", tmp_path / "out.mcap")
@@ -318,7 +322,7 @@ def yaml(folder: Path) -> Path:
         ('name = "a"\ndictionary = "DICT_4X4_100"\nmarker_length_m = "20 cm"', "must be a number"),
         ('name = "a"\ndictionary = "DICT_4X4_100"\nmarker_length_m = -1', "not a length"),
         ('name = "a"\ndictionary = "DICT_4X4_100"\nmarker_lenght_m = 1', "was marker_length_m meant?"),
-        ('name = "a"\ndictionary = "DICT_9X9"\nmarker_length_m = 0.2', "none of OpenCV's"),
+        ('name = "a"\ndictionary = "DICT_9X9"\nmarker_length_m = 0.2', "is unknown to OpenCV"),
     ],
 )
 def test_a_bad_rig_file(ipsys: Ipsys, lab: Path, tmp_path: Path, text: str, said: str) -> None:
@@ -329,7 +333,9 @@ def test_a_bad_rig_file(ipsys: Ipsys, lab: Path, tmp_path: Path, text: str, said
 
 def test_a_folder_that_is_not_the_authors(ipsys: Ipsys, lab: Path, tmp_path: Path) -> None:
     out = tmp_path / "out.mcap"
-    assert "no such folder" in refused(ipsys, lab, "import", "imsel", tmp_path / "nowhere", "-o", out)
+    assert "nowhere: does not exist" in refused(
+        ipsys, lab, "import", "imsel", tmp_path / "nowhere", "-o", out
+    )
     assert "has no testing.mat" in refused(ipsys, lab, "import", "imsel", tmp_path, "-o", out)
     (tmp_path / "data").mkdir()
     assert "no sub-folders with pictures" in refused(

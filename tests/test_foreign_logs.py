@@ -135,7 +135,7 @@ def test_a_second_detect_finds_the_first(ipsys: Ipsys, tmp_path: Path, rig: Path
     done = ipsys("detect", log, "--rig", rig)
     assert done.code == 0
     # Edges are fitted through the lens: without one corners are OpenCV's, and that is said.
-    assert "camera cam has no calibration: corners are found as with --corners stock" in done.err
+    assert "camera cam has no calibration, so its corners are from --corners stock" in done.err
     before = log.read_bytes()
     assert "up to date" in ipsys("detect", log, "--rig", rig).err
     assert log.read_bytes() == before

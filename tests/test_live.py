@@ -337,7 +337,7 @@ def test_consumer_that_fails_ends_no_recording(
         frames = {name: session.count(topic) for name, topic in session.images.items()}
         assert frames == {name: len(found) for name, found in sent(lab_log).items()}
         assert [e.text for e in session.payloads(["/events"]) if e.kind == "sink_stopped"] == [
-            "the display stopped (a fault in the display); the recording goes on"
+            "the display stopped (a fault in the display); the recording continues"
         ]
         signed = {run.stage for run in session.runs()}
         assert signed == ({"detect", "camera-frame", "fit", "locate", "fuse"} if stages else set())
@@ -536,7 +536,7 @@ def test_verify_and_diff_on_the_command_line(ipsys: Ipsys, recorded: Path, lab: 
     assert "has no run to verify" in done.err
     assert ipsys("diff", recorded, recorded, "--run", "poly").code == 0
     assert "has no run spline" in ipsys("diff", recorded, recorded, "--run", "spline").err
-    assert "holds no latencies" in ipsys("latency", lab).err
+    assert "has no latencies" in ipsys("latency", lab).err
 
 
 def test_the_latency_ledger_as_table_and_picture(ipsys: Ipsys, recorded: Path, tmp_path: Path) -> None:

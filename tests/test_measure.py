@@ -158,7 +158,7 @@ def test_rows_of_a_marker_in_order_and_by_place(ipsys: Ipsys, unmeasured: Unmeas
     listed = ipsys("measure", log, "--places")
     assert f"p{len(mine):03d}" in listed.out
     needed = "each camera must see 10 or more for a model, and about 40 for a good one"
-    assert f"places in it: {len(mine)}; {needed}" in done.err
+    assert f"calibration points in the log: {len(mine)}; {needed}" in done.err
     assert f"next: ipsys replay {log}" in done.err
     other = [one for one in tape if one.marker_id == 4][:2]
     with open_finished_log(log, Request()) as scene:
@@ -212,8 +212,8 @@ def test_rows_of_a_marker_in_order_and_by_place(ipsys: Ipsys, unmeasured: Unmeas
         ),
         ("marker,d_A_cm,side,height_cm\n0,170,left,0\n", ["line 1: the column d_A_cm is missing"]),
         ("marker,d_A_m,d_B_cm,side,height_cm\n0,1.7,190,left,0\n", ["line 1: unknown column 'd_A_m'"]),
-        ("marker,d_A_cm,d_B_cm,side,height_cm\n0,170,190,left,0\n", ["rows name no place or time"]),
-        ("marker,d_A_cm,d_B_cm,side,height_cm\n", ["holds no measurements"]),
+        ("marker,d_A_cm,d_B_cm,side,height_cm\n0,170,190,left,0\n", ["rows without place and time"]),
+        ("marker,d_A_cm,d_B_cm,side,height_cm\n", ["has no measurements"]),
         ("", ["line 1: the column marker is missing"]),
     ],
 )
@@ -281,7 +281,7 @@ def test_a_rig_without_reference_points(ipsys: Ipsys, unmeasured: Unmeasured) ->
     rig = unmeasured.log.with_name("lab.toml")
     rig.write_text('name = "lab"\ndictionary = "DICT_4X4_100"\nmarker_length_m = 0.2\n')
     line = refused(ipsys, unmeasured.log, "measure", unmeasured.log, "--rig", rig)
-    assert "the rig has no reference points to lay the tape from" in line
+    assert "the rig has no reference points, but a tape needs two" in line
     assert "[[reference_points]]" in line
 
 
@@ -291,12 +291,12 @@ def test_a_log_in_which_nothing_lies_still(ipsys: Ipsys, lab: Path) -> None:
     log = rewrite(lab, lambda m: m if m.log_time_ns <= start_ns + 1_050_000_000 else None)
     done = ipsys("measure", log)
     assert done.code == 1
-    assert "no marker of the rig lies still in it" in done.err
+    assert "no marker of the rig is stationary" in done.err
 
 
 def test_options_that_exclude_one_another(ipsys: Ipsys, unmeasured: Unmeasured) -> None:
     log = unmeasured.log
-    assert "exclude one another" in refused(ipsys, log, "measure", log, "--terminal", "--places")
+    assert "cannot be used together" in refused(ipsys, log, "measure", log, "--terminal", "--places")
 
 
 def test_the_terminal_asks_checks_and_undoes(
@@ -359,7 +359,7 @@ def test_a_bad_answer_in_the_terminal_costs_that_answer_only(
         "p001 is in the log",
     ):
         assert text in said
-    assert said.count("a begins the place anew") == 1
+    assert said.count("a: start the point again") == 1
     with Session([log]) as session:
         (saved,) = session.payloads(session.topics(MEASUREMENTS))
     assert as_typed(saved).distances == first.distances

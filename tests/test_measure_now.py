@@ -212,8 +212,8 @@ def test_a_log_that_is_there_is_kept_unless_it_is_forced(
     [
         (["measure"], "name a finished log, or give --rig lab.toml -o places.mcap"),
         (["measure", "-o", "a.mcap"], "name a finished log, or give --rig lab.toml"),
-        (["measure", "--rig", "RIG", "-o", "a.mcap", "--places"], "--places is for a finished log"),
-        (["measure", "--rig", "RIG", "-o", "a.mcap", "--csv", "s.csv"], "--csv is for a finished log"),
+        (["measure", "--rig", "RIG", "-o", "a.mcap", "--places"], "--places is only for a finished log"),
+        (["measure", "--rig", "RIG", "-o", "a.mcap", "--csv", "s.csv"], "--csv is only for a finished log"),
         (["measure", "LOG", "-o", "a.mcap"], "--output is for cameras"),
         (["measure", "LOG", "--force"], "--force is only for --csv or live cameras; leave it out"),
         (

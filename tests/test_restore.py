@@ -110,7 +110,7 @@ def test_a_live_run_that_is_killed_is_brought_to_its_end(
         for command in ("info", "replay", "verify", "latency", "view"):
             done = ipsys(command, log)
             assert (done.code, done.err.count("\n")) == (1, 1)
-            assert "is being recorded or written just now" in done.err
+            assert "is being recorded or written now" in done.err
         assert "another process is writing it" in ipsys("repair", log).err
         assert program.poll() is None
         program.send_signal(signal.SIGKILL)
@@ -119,7 +119,7 @@ def test_a_live_run_that_is_killed_is_brought_to_its_end(
     for command in ("info", "replay", "verify", "measure", "latency", "view"):
         done = ipsys(command, log)
         assert done.code == 1
-        assert f"its recorder was killed, or the file was cut off. What it holds can be saved. Run: ipsys repair {log}" in done.err  # fmt: skip # noqa: E501
+        assert f"its recorder was killed, or the file was cut off. Its messages can be saved. Run: ipsys repair {log}" in done.err  # fmt: skip # noqa: E501
     done = ipsys("repair", log)
     assert done.code == 0, done.err
     assert "monday.mcap repaired" in done.out
@@ -259,7 +259,7 @@ def test_a_full_disk_ends_live_with_runs_that_are_signed(
             frames = sum(session.count(topic) for topic in session.images.values())
             markers = sum(session.count(topic) for topic in session.topics(MARKERS, "edges"))
     assert program.returncode == 1, out
-    assert "the disk is full; recording has stopped, and the log is complete" in err
+    assert "the disk is full; the recording has stopped. The log is complete" in err
     assert verified.out.endswith("the replay is identical to the log\n")
     assert "nothing to do: all results are up to date" in replayed.err
     assert frames >= markers > 50

@@ -151,13 +151,13 @@ def _smaller(shared: Sequence[BandwidthDemand]) -> list[str]:
     for rate_hz in _RATES_HZ:
         slower = [demand._replace(rate_hz=min(rate_hz, demand.rate_hz)) for demand in shared]
         if _wire_bytes(slower, _needed) <= _CARRIES:
-            ways.append(f"ask for {rate_hz} frames/s" + (" of each" if len(shared) > 1 else ""))
+            ways.append(f"set {rate_hz} frames/s" + (" for each" if len(shared) > 1 else ""))
             break
     largest = max(demand.width * demand.height for demand in shared)
     for width, height in _SIZES:
         less = [demand._replace(width=width, height=height) for demand in shared]
         if width * height < largest and _wire_bytes(less, _needed) <= _CARRIES:
-            ways.append(f"{'' if ways else 'ask '}for {width} x {height} px")
+            ways.append(f"set {width} x {height} px")
             break
     if any(demand.format in _BYTES_PER_PX for demand in shared):
         ways.append("use a camera with MJPG")

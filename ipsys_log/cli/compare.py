@@ -67,7 +67,7 @@ def diff(
         typer.Option(
             "--run",
             metavar="NAME",
-            help="The run to compare. Give it twice for two runs: of the first side, then of the second.",
+            help="The run to compare. Give it twice to compare two runs.",
         ),
     ] = None,
     as_json: AsJson = False,

@@ -99,7 +99,7 @@ def serve_live_page(scene: LiveScene, host: str | None, port: int) -> Iterator[N
     with serve(scene, host, port) as page:
         if host is not None:
             console.print(qr_code(page.url), style="#ffffff on #000000", markup=False)
-        remarks.print(f"open {page.url} to measure", markup=False)
+        remarks.print(f"measure at {page.url}", markup=False)
         try:
             yield
         finally:

@@ -42,7 +42,7 @@ SETTINGS: dict[str, tuple[int | float, str]] = {
 
 # The beginning of the rig file of the simulated lab.
 _SIMULATED = """# The simulated lab, without hardware. docs/first-day.md goes through all commands with it.
-# The robots 0, 1 and 2 drive to and fro at a height of 10 cm. The other markers lie still.
+# The robots 0, 1 and 2 drive to and fro at a height of 10 cm. The other markers do not move.
 
 """
 

@@ -140,7 +140,7 @@ def test_a_board_as_opencv_printed_it_before_4_6() -> None:
 def test_mirrored_pictures_are_said_to_be() -> None:
     """Markers are not found in a mirror. A chessboard is, and looks as it always does."""
     pictures = [np.ascontiguousarray(drawn(CHARUCO, seed, 0.7)[0][:, ::-1]) for seed in range(2)]
-    said = "it is seen mirrored in 2 of 2 tried"
+    said = "it is mirrored in 2 of 2 checked"
     with pytest.raises(IpsysError, match=said):
         search_images([("a", pictures[0]), ("b", pictures[1])], CHARUCO, 2, "red")
 
@@ -184,7 +184,7 @@ def test_of_hundreds_of_frames_some_dozens_that_differ_are_chosen() -> None:
     corners = np.concatenate([s.pixels for s in chosen.used])
     assert corners.min(axis=0).tolist() == [0, 0]
     assert corners.max(axis=0).tolist() == [620, 460]
-    assert "nearly as" in chosen.spare[0].reason
+    assert "nearly the same pose as" in chosen.spare[0].reason
 
 
 def test_of_two_that_show_the_same_the_sharp_one_is_chosen() -> None:
@@ -210,7 +210,9 @@ def test_boards_that_cannot_be(text: str, said: str) -> None:
 def test_a_chessboard_that_was_taken_for_a_charuco_board_is_named_while_others_are_tried() -> None:
     pictures = [(f"{seed}", drawn(CHESSBOARD, seed, 1.0)[0]) for seed in range(3)]
     tried: list[tuple[int, int]] = []
-    with pytest.raises(IpsysError, match="but a chessboard of 6 x 4 inner corners is seen in 3 of 3 tried"):
+    with pytest.raises(
+        IpsysError, match="but a chessboard of 6 x 4 inner corners is in 3 of 3 checked pictures"
+    ):
         search_images(
             pictures,
             Board(7, 5, 0.03, 0.75),

@@ -109,14 +109,16 @@ def through_fisheye() -> SearchResult:
 
 
 def test_pinhole_on_a_fisheye_is_refused() -> None:
-    with pytest.raises(IpsysError, match=r"error is .*--lens fisheye leaves 0\.1\d px: use it; or give"):
+    with pytest.raises(
+        IpsysError, match=r"error is .*use --lens fisheye, with an error of 0\.1\d px; or use"
+    ):
         calibrate("red", through_fisheye(), BOARD, LENS_MODELS["pinhole4"])
 
 
 def test_pinhole_on_a_fisheye_insisted_on_is_noted() -> None:
     result = calibrate("red", through_fisheye(), BOARD, LENS_MODELS["pinhole4"], force=True)
     assert result.rms_px > 2
-    assert "written only because of --force:  the RMS reprojection error is" in result.notes[0]
+    assert "written only because of --force: the RMS reprojection error is" in result.notes[0]
 
 
 def test_too_few_say_what_to_add() -> None:

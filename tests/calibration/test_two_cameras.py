@@ -99,5 +99,5 @@ def test_two_cameras_are_refused_with_their_pictures() -> None:
 def test_two_cameras_insisted_on_are_one() -> None:
     result = calibrated(mixed(1), insist=True)
     assert any(
-        "written only because of --force:  the pictures are of two cameras" in note for note in result.notes
+        "written only because of --force: the pictures are of two cameras" in note for note in result.notes
     )

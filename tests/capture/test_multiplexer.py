@@ -190,7 +190,7 @@ def test_a_camera_that_returns_with_another_codec_is_not_recorded(monkeypatch: p
     assert [m.payload.data for m in found if m.camera] == [b"a"] * 3
     kinds = [event.kind for event in events(found)]
     assert kinds == ["camera_lost", "camera_lost", "camera_back", "camera_lost", "camera_back"]
-    assert "sends h264 now, and jpeg before" in said[1]
+    assert "its format changed from jpeg to h264" in said[1]
     assert said[1] == said[3]
     assert said[1].endswith("set the camera to jpeg, or start a new recording; ipsys tries again")
 

@@ -155,7 +155,9 @@ def test_of_large_frames_fewer_are_kept_and_events_all_the_same(log: Noted) -> N
 
 
 def test_of_a_video_no_seconds_can_be_kept() -> None:
-    with pytest.raises(IpsysError, match="camera white sends h264, of which no single seconds can be kept"):
+    with pytest.raises(
+        IpsysError, match="camera white sends h264, but ipsys measure can keep short parts only of MJPEG"
+    ):
         check_independent_frames({"red": CameraState(format="jpeg"), "white": CameraState(format="h264")})
 
 

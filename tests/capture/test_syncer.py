@@ -154,7 +154,7 @@ def test_fault_of_a_sync_is_said_once_and_at_the_end(tmp_path: Path) -> None:
     assert [kind for kind, _ in sent.warned] == ["disk_fault"]
     assert "the disk has failed (Input/output error)" in sent.warned[0][1]
     assert sent.confirmed[0][1] is not None
-    with pytest.raises(IpsysError, match=r"Input/output error.*may be lost.*ipsys repair") as caught:
+    with pytest.raises(IpsysError, match=r"Input/output error.*may be missing.*ipsys repair") as caught:
         log.check_disk()
     assert "space" not in str(caught.value)
 

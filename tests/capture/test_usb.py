@@ -127,9 +127,9 @@ def test_what_the_camera_refuses_is_said(driver: Driver) -> None:
     with open_usb(asked, Clock(), said.append) as frames:
         next(frames)
     assert said == [
-        "camera red: asked for 1900 x 1000 px, gives 1920 x 1080",
-        "camera red: asked for 60 frames/s, gives 30",
-        "camera red: asked for 1 s of exposure, gives 0.5",
+        "camera red: asked for 1900 x 1000 px, but the camera gives 1920 x 1080",
+        "camera red: asked for 60 frames/s, but the camera gives 30",
+        "camera red: asked for 1 s of exposure, but the camera gives 0.5",
         "camera red: asked for 12 of focus, but the camera cannot set this",
         "camera red: the driver stamps the start of a frame, but the rig has 'end'",
     ]
@@ -156,7 +156,7 @@ def test_a_stamp_of_another_clock_is_none(driver: Driver) -> None:
     driver.frames.append(b"x")
     with open_usb(ask(driver), Clock(), said.append) as frames:
         assert next(frames) == Frame(b"x", "jpeg", None)
-    assert "by another clock" in said[0]
+    assert "with another clock" in said[0]
 
 
 def test_a_camera_that_is_pulled_out(driver: Driver) -> None:
@@ -170,7 +170,7 @@ def test_a_camera_that_is_pulled_out(driver: Driver) -> None:
 def test_a_bus_that_is_full(driver: Driver) -> None:
     driver.no_room = True
     with (
-        pytest.raises(SourceError, match="its USB bus has no room left"),
+        pytest.raises(SourceError, match="its USB bus has too little bandwidth"),
         open_usb(ask(driver), Clock(), lambda _: None),
     ):
         pass
@@ -223,7 +223,7 @@ def test_pictures_of_a_camera_without_jpeg_are_encoded_once(driver: Driver, name
 
 
 @pytest.mark.parametrize(
-    ("source", "said"), [("usb:/nowhere/video9", "no such device"), ("usb:/dev/null", "is no camera")]
+    ("source", "said"), [("usb:/nowhere/video9", "does not exist"), ("usb:/dev/null", "is not a camera")]
 )
 def test_what_is_no_camera(source: str, said: str) -> None:
     """With the real kernel."""

@@ -151,7 +151,8 @@ def test_what_does_not_fit_a_bus_is_explained() -> None:
     (line,) = advise([*cameras(4), *cameras(1, bus=2)])
     assert line == (
         "cameras black, blue, red and white share USB bus 1 (Acme Hub at port 2) and need "
-        "64.6 MB/s of its 48: plug one into another bus, or ask for 20 frames/s of each, or for 1280 x 960 px"
+        "64.6 MB/s of its 48: plug one camera into another bus, or set 20 frames/s for each, or set "
+        "1280 x 960 px"
     )
     # What it advises fits.
     assert advise(cameras(4, rate_hz=20.0)) == []
@@ -163,7 +164,7 @@ def test_one_camera_can_be_too_much() -> None:
     (line,) = advise(cameras(1, format="YUYV"))
     assert line == (
         "camera red is alone on USB bus 1 (Acme Hub at port 2) and needs 129.3 MB/s of its 48: "
-        "ask for 10 frames/s, or for 800 x 600 px, or use a camera with MJPG"
+        "set 10 frames/s, or set 800 x 600 px, or use a camera with MJPG"
     )
 
 
@@ -177,7 +178,7 @@ def test_the_command(
 ) -> None:
     monkeypatch.setattr(usb_bus, "find_cameras", lambda: find_cameras(tmp_path))
     done = ipsys("cameras")
-    assert (done.code, done.out.splitlines()[0]) == (0, "no cameras are attached by USB")
+    assert (done.code, done.out.splitlines()[0]) == (0, "no USB camera is attached")
     assert "rtsp://" in done.out
     assert "sim:red" in done.out
     for number in (0, 1, 2, 3):

@@ -119,9 +119,9 @@ def test_times_are_in_a_table(tmp_path: Path, ipsys: Ipsys) -> None:
     ("text", "said"),
     [
         ("file,time\nred/a.jpg,1700000000\n", "times.csv: has no row for red/b.jpg; add it"),
-        ("file,time\nred/a.jpg,noon\n", "times.csv: line 2: 'noon' is no time; write s, ms"),
+        ("file,time\nred/a.jpg,noon\n", "times.csv: line 2: 'noon' is not a time; write s, ms"),
         ("file,time\nred/c.jpg,1700000000\n", "times.csv: line 2: picture 'red/c.jpg' does not exist"),
-        ("file,time\nred/a.jpg,1700000000\nred/b.jpg,1700000000\n", "b.jpg: has the time of a.jpg"),
+        ("file,time\nred/a.jpg,1700000000\nred/b.jpg,1700000000\n", "b.jpg: has the same time as a.jpg"),
         ("picture,time\n", "the first line must name the columns file and time"),
     ],
 )
@@ -174,7 +174,10 @@ def test_a_file_is_played_in_real_time(tmp_path: Path, ipsys: Ipsys) -> None:
 
 @pytest.mark.parametrize(
     ("source", "said"),
-    [(None, "the rig gives no source"), ("firewire:0", "source 'firewire:0' is none of http:, https:")],
+    [
+        (None, "has no source in the rig"),
+        ("firewire:0", "source 'firewire:0' has an unknown type; use one of http:, https:"),
+    ],
 )
 def test_a_source_that_nothing_opens(source: str | None, said: str) -> None:
     with pytest.raises(IpsysError, match=said):

@@ -54,7 +54,10 @@ def played(lab: Path, camera: str = "red", more: str = "") -> str:
 
 # Beside the camera that would tell that it was opened.
 FAULTS = {
-    "source": ('[[cameras]]\nname = "white"\nsource = "carrier_pigeon:7"\n', "is none of http:"),
+    "source": (
+        '[[cameras]]\nname = "white"\nsource = "carrier_pigeon:7"\n',
+        "has an unknown type; use one of http:",
+    ),
     "simulated camera": ('[[cameras]]\nname = "white"\nsource = "sim:blue"\n', "has no camera 'blue'"),
     "device": (
         '[[cameras]]\nname = "white"\nsource = "usb:/dev/none"\n',
@@ -64,7 +67,7 @@ FAULTS = {
     "file": ('[[cameras]]\nname = "white"\nsource = "file:none.mp4"\n', "none.mp4: does not exist"),
     "lens": (
         '[[cameras]]\nname = "white"\nsource = "sim:white"\ncalibration = "none.yaml"\n',
-        "none.yaml: there is no such calibration file",
+        "none.yaml: does not exist",
     ),
 }
 COMMANDS = {
@@ -194,7 +197,7 @@ def test_aligning_now_says_what_is_kept(ipsys: Ipsys, tmp_path: Path, lab: Path)
     rig = write_rig(tmp_path, played(lab))
     done = ipsys("align", "--rig", rig, "--seconds", "1")
     assert done.code == 0, done.err
-    assert "nothing is kept" in done.err
+    assert "no frames or results are kept" in done.err
     assert "now.mcap" not in done.out + done.err
     kept = tmp_path / "kept.mcap"
     done = ipsys("align", "--rig", rig, "--seconds", "1", "-o", kept)
@@ -232,7 +235,7 @@ def test_a_camera_without_a_lens_is_recorded_and_named(ipsys: Ipsys, tmp_path: P
     bare = played(lab).replace("calibration =", "# calibration =")
     done = ipsys("record", "--rig", write_rig(tmp_path, bare), "--seconds", "0.5", "-o", tmp_path / "a.mcap")
     assert done.code == 0, done.err
-    assert "camera red has no lens; a replay needs one" in done.err
+    assert "camera red has no calibration, but a replay needs one" in done.err
     lensed = write_rig(tmp_path, played(lab))
     done = ipsys("record", "--rig", lensed, "--seconds", "0.5", "-o", tmp_path / "b.mcap")
     assert "no lens" not in done.err

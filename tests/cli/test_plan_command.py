@@ -199,14 +199,14 @@ def test_the_authors_ten_places_want_more_where_there_are_none(ipsys: Ipsys, aut
 def test_a_log_without_measured_places_says_what_to_do_first(ipsys: Ipsys, paper: Path) -> None:
     log = rewrite(paper, drop_measured)
     line = refused(ipsys, log)
-    assert "no place is measured yet" in line
-    assert "measure about 10 places, spread over the view of each camera out to its edges" in line
+    assert "has no calibration points" in line
+    assert "measure about 10 points over the whole view of each camera" in line
 
 
 def test_what_cannot_be_planned_is_refused(ipsys: Ipsys, paper: Path) -> None:
     assert "does not exist" in refused(ipsys, paper, paper.with_name("none.mcap"))
     for count in (0, -1, 51):
-        assert f"--places {count}: plan 1 to 50 places at a time" in refused(ipsys, paper, "--places", count)
+        assert f"--places {count}: is not between 1 and 50" in refused(ipsys, paper, "--places", count)
     assert "model 'spline' is not known; use one of" in refused(ipsys, paper, "--model", "spline")
     for height in ("-0.1", "15", "nan", "inf"):
         assert f"--height-m {height}: " in refused(ipsys, paper, "--height-m", height)

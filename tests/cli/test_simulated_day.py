@@ -94,7 +94,7 @@ def test_simulated_lab_gives_its_rig_and_its_tape(
     assert (done.code, (tmp_path / "lab.toml").exists()) == (1, False)
     assert "lab_tape.csv: exists already" in done.err
     assert (tmp_path / "lab_tape.csv").read_bytes() == before
-    assert "exclude each other" in ipsys("init", "x.toml", "--simulated", "--from", "a.mcap").err
+    assert "cannot be used together" in ipsys("init", "x.toml", "--simulated", "--from", "a.mcap").err
 
 
 def test_simulated_lab_is_measured_and_fitted(

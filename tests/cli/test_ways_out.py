@@ -35,7 +35,7 @@ PAPER_LAB = ROOT / "sample_logs" / "paper_lab.mcap"
 def test_view_saved_under_another_ending_is_refused(ipsys: Ipsys, lab: Path) -> None:
     line = refused(ipsys, lab, "view", lab, "--save", lab.with_name("out.txt"))
     assert "--save" in line
-    assert "name it out.rrd" in line
+    assert "use out.rrd" in line
     assert "there is no folder" in refused(ipsys, lab, "view", lab, "--save", lab.with_name("no") / "out.rrd")
 
 
@@ -45,7 +45,7 @@ def test_import_of_a_log_names_what_to_run(ipsys: Ipsys, lab: Path, command: tup
     log = Path(shutil.copy(lab, lab.with_name("recorded.bin")))
     source = f"red={log}" if command == ("videos",) else log
     line = refused(ipsys, lab, "import", *command, source, "-o", lab.with_name("new.mcap"))
-    assert f"{log}: is a log already and needs no import" in line
+    assert f"{log}: is already a log and needs no import" in line
     assert f"ipsys replay {log}" in line
 
 
@@ -206,7 +206,7 @@ def test_diff_of_runs_without_frames_says_which_side(ipsys: Ipsys, detected: Pat
     bare = changed(detected, "bare.mcap", lambda m: None if isinstance(m.payload, Markers) else m)
     done = ipsys("diff", detected, bare)
     assert done.code == 1
-    assert "the second has no markers, points, positions or tracks" in " ".join(done.out.split())
+    assert "the second has no markers, camera points, positions or tracks" in " ".join(done.out.split())
 
 
 def test_extents_that_meet_are_not_explained() -> None:

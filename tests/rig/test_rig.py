@@ -69,7 +69,7 @@ def test_the_commented_examples_of_init_hold_when_the_comments_go(tmp_path: Path
 @pytest.mark.parametrize(
     ("change", "said"),
     [
-        ({"tape_sigma_m": 0.0}, "tape_sigma_m = 0.0 m is no standard deviation"),
+        ({"tape_sigma_m": 0.0}, "tape_sigma_m = 0.0 m is not a standard deviation"),
         ({"tape_sigma_m": -0.003}, "tape_sigma_m = -0.003"),
         ({"tape_sigma_m": float("nan")}, "tape_sigma_m = nan"),
         ({"tape_sigma_m": float("inf")}, "tape_sigma_m = inf"),
@@ -121,8 +121,8 @@ def test_a_rig_that_cannot_be_right_is_refused(change: dict[str, object], said: 
         ({"reference_points": (ReferencePoint("A", 122.0, 0.0),)}, "reference point A: x_m = 122"),
         ({"tape_sigma_m": 1.0}, "tape_sigma_m = 1 .* write 0.01 if it is in cm or 0.001 if it is in mm"),
         ({"cameras": (RigCamera("red", rate_hz=3000.0),)}, "camera red: rate_hz = 3000 .*; write 0 to 1000"),
-        ({"cameras": (RigCamera("red", exposure_s=8.0),)}, "exposure_s = 8 .* write 0.008 if that is ms"),
-        ({"cameras": (RigCamera("red", row_time_ns=31),)}, "too little for ns; write 31000 if that is us"),
+        ({"cameras": (RigCamera("red", exposure_s=8.0),)}, "exposure_s = 8 .* write 0.008 if it is in ms"),
+        ({"cameras": (RigCamera("red", row_time_ns=31),)}, "too small for ns; write 31000 if it is in us"),
     ],
 )
 def test_what_was_meant_in_another_unit_is_refused_in_a_rig_file(

@@ -198,7 +198,7 @@ def test_verify_names_what_another_version_made_and_verifies_the_rest(
         monkeypatch.setitem(VERSIONS, name, 2)
     done = ipsys("verify", log)
     assert done.code == 1
-    assert "nothing of its runs can be verified" in done.err
+    assert "has no run that can be verified" in done.err
 
 
 def test_versions_of_packages_make_nothing_out_of_date(

@@ -220,7 +220,7 @@ def test_a_lab_that_cannot_be_built_says_why() -> None:
     with pytest.raises(IpsysError, match="'red' cannot see its part of the floor"):
         mount_cameras(LabSettings(mount_height_m=1.5))
     crowded = LabSettings(markers=60, marker_length_m=0.5)
-    with pytest.raises(IpsysError, match="no room for marker"):
+    with pytest.raises(IpsysError, match="has no room beside"):
         plan_points(crowded, mount_cameras(LabSettings()))
 
 

@@ -57,10 +57,10 @@ def test_no_screen_is_said_before_anything_is_recorded(lab: Path, monkeypatch: p
 
 def test_why_the_viewer_failed_is_said(lab: Path) -> None:
     def broken(feed: Callable[[Write], None]) -> None:
-        raise IpsysError("the viewer could not be shown")
+        raise IpsysError("the viewer cannot be shown")
 
     said: list[str] = []
     with Session([lab]) as session:
         (rig,) = session.payloads(["/rig"])
         LiveView(rig, session.images, None, said.append, broken).consume(iter([]))
-    assert said == ["the viewer could not be shown"]
+    assert said == ["the viewer cannot be shown"]

@@ -51,7 +51,7 @@ def test_a_marker_that_has_not_moved_since_it_was_measured() -> None:
     assert lab.check(PLACE).warnings == ()
     lab.save(PLACE)
     lab.show(4, 0.1)  # so that the seconds of both have nothing in common
-    assert "this is p001 once more" in lab.check(PLACE).faults[0].text
+    assert "saved already as p001" in lab.check(PLACE).faults[0].text
     (text,) = lab.check(BETTER).warnings
     assert "marker 0 is already measured here, as p001" in text
     lab.save(BETTER)
@@ -71,4 +71,4 @@ def test_a_marker_that_was_moved_on_by_a_little() -> None:
     assert lab.check(BETTER).warnings == ()
     # Back where it was: the place is the same, however it got there.
     lab.show(2, 0.1)
-    assert "measured here already" in lab.check(BETTER).warnings[0]
+    assert "already measured here" in lab.check(BETTER).warnings[0]

@@ -103,7 +103,7 @@ def test_sheet_with_bad_and_doubtful_rows_names_both(ipsys: Ipsys, with_model: U
     rows = [tape[0], swap_distances(tape[1])]
     path = sheet(log.with_name("sheet.csv"), rows, time=["900", *times(rows[1:], log)])
     text = refused(ipsys, log, "measure", log, "--csv", path)
-    assert text.index("line 2: marker 0 does not lie still") < text.index("line 3: the point")
+    assert text.index("line 2: marker 0 is not stationary") < text.index("line 3: the point")
     assert "--force" not in text
     # To insist is no way round what cannot be right.
     assert "line 2: marker 0" in refused(ipsys, log, "measure", log, "--csv", path, "--force")

@@ -78,7 +78,7 @@ def test_every_state_of_the_page_fits_the_screen(
         check_screen(browser)
         browser.run("document.querySelector('#d-B').value = ''")
         browser.type("#d-B", "0.5")
-        says(browser, "#verdict", "No triangle has the sides")
+        says(browser, "#verdict", "do not meet, because")
         check_screen(browser)
         browser.run("document.querySelector('#d-B').value = ''")
         browser.type("#d-B", b)

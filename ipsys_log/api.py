@@ -488,7 +488,7 @@ def calibrate(
     board : inner corners of a chessboard as ``6x4``, or squares of a ChArUco board as ``charuco:4x5``.
     square_m : side of a square in m.
     lens : ``fisheye`` or another lens model of ``ipsys calibrate``.
-    cameras : only these cameras of a log; or the name of the only camera of the other sources.
+    cameras : the cameras of a log to use; for other sources, the name of the one camera.
     force : accept the stated board size, and poor results.
 
     Yields

@@ -23,7 +23,7 @@ class IpsysError(Exception):
 
 
 class LogError(IpsysError):
-    """A log file cannot be read or written as it is."""
+    """A log file that cannot be read or written."""
 
 
 class WriteError(LogError):
@@ -52,7 +52,7 @@ def is_full(error: OSError) -> bool:
 
 
 def disk_advice(error: OSError) -> str:
-    """Return what to do about a disk that cannot be written to, by the error of the operating system."""
+    """Return advice on a disk that cannot be written to, by the error of the operating system."""
     if is_full(error):
         return "free some space and try again"
     if error.errno == errno.EROFS:

@@ -199,7 +199,7 @@ def build_pairs(
 
 
 def _check_duplicates(camera: str, pairs: Iterable[Pair]) -> None:
-    """Check that no pair occurs twice: it would count double, and a fit would know it when it is held out."""
+    """Check that no pair occurs twice: when one copy is held out, the other would stay in the fit."""
     seen: dict[bytes, str] = {}
     for pair in pairs:
         twin = seen.setdefault(pair.camera_m.tobytes() + pair.world_m.tobytes(), pair.measurement)

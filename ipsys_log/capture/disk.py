@@ -185,7 +185,7 @@ class DiskRoom:
         return self.free_bytes / self.bytes_per_s if self.bytes_per_s > 0 else None
 
     def is_short(self, seconds: float | None = None) -> bool:
-        """Return whether the disk is full before ``seconds``, or before 10 minutes if no end is set."""
+        """Return whether the disk will be full within ``seconds``; within 10 minutes if no end is set."""
         return self.remaining_s is not None and self.remaining_s < (
             LOW_DISK_WARNING_S if seconds is None else seconds
         )

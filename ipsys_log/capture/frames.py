@@ -118,7 +118,7 @@ _NEAR = 0.01
 class ActualSettings(NamedTuple):
     """The actual settings of a camera.
 
-    None means that the camera does not let us set the value. For the rate, None means that it is not known.
+    None means that the camera cannot set the value. For the rate, None means that it is not known.
     """
 
     width: int | None = None
@@ -141,7 +141,7 @@ def report_refused_settings(camera: RigCamera, settings: ActualSettings, say: Sa
     Examples
     --------
     >>> report_refused_settings(RigCamera("red", rate_hz=60.0), ActualSettings(1920, 1080, 30.0), print)
-    camera red: asked for 60 frames/s, gives 30
+    camera red: asked for 60 frames/s, but the camera gives 30
     """
     size = (camera.width or settings.width, camera.height or settings.height)
     if settings.width and settings.height and size != (settings.width, settings.height):

@@ -137,7 +137,7 @@ def check_model(model: Model, cameras: Collection[str]) -> None:
     Raises
     ------
     IpsysError
-        The model has none of them.
+        The model has none of the cameras.
     """
     known = sorted(camera.camera for camera in model.cameras)
     if not set(known) & set(cameras):

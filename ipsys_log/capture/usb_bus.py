@@ -112,7 +112,7 @@ def advise(demands: Sequence[BandwidthDemand]) -> list[str]:
     --------
     >>> three = [BandwidthDemand(name, 1, 480, "a hub", "MJPG", 1920, 1080, 30.0) for name in ("a", "b", "c")]
     >>> print(advise(three)[0])
-    cameras a, b and c share USB bus 1 (a hub) and need 48.5 MB/s of its 48: plug one into another bus, or ask for 25 frames/s of each, or for 1600 x 1200 px
+    cameras a, b and c share USB bus 1 (a hub) and need 48.5 MB/s of its 48: plug one camera into another bus, or set 25 frames/s for each, or set 1600 x 1200 px
     """  # noqa: E501
     by_bus = defaultdict(list)
     for demand in demands:

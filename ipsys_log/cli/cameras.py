@@ -19,7 +19,7 @@ __all__ = ["add_commands"]
 
 _NONE = """no USB camera is attached
   for a network camera, put its address into lab.toml: source = "rtsp://..." or "http://..."
-  without a camera, use the simulated lab: ipsys init lab.toml --simulated"""
+  without a camera, source = "sim:red" is a simulated one: ipsys init lab.toml --simulated"""
 
 
 def add_commands(app: typer.Typer) -> None:

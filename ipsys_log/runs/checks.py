@@ -77,7 +77,7 @@ def check_inputs(
 def _check_versions(
     session: Session, request: Request, models: Sequence[str], stages: Sequence[Stage]
 ) -> None:
-    """Check that this software would not repeat a result of newer software."""
+    """Check that no result to repeat is from newer software."""
     corners = request.corners or usual_corners(session.images, {*session.calibrations, *request.lenses})
     wanted = {corners, request.method, *models, ""}
     for run in session.runs():

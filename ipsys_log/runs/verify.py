@@ -139,7 +139,7 @@ def diff(left: Path, right: Path, runs: tuple[str | None, str | None]) -> list[C
 
 
 def explain_diff(left: Path, right: Path, runs: tuple[str | None, str | None]) -> str | None:
-    """Return the reason why two logs or two runs have nothing in common to compare; None if they have.
+    """Return the reason why two logs or two runs cannot be compared; None if they can.
 
     The parameters are those of `diff`.
     """

@@ -57,7 +57,7 @@ def test_a_marker_that_has_not_moved_since_it_was_measured() -> None:
     lab.save(BETTER)
     lab.show(2, 0.1)
     (text,) = lab.check(TypedEntry("0", {"A": "172", "B": "190"}, "left", "10")).warnings
-    assert "as p001 (2.0 cm away), p002 (1.0 cm away)" in text
+    assert "as p001 (2.0 cm from here), p002 (1.0 cm from here)" in text
     for name in ("p001", "p002"):
         lab.scene.add([withdrawal_of(lab.scene.history(), name)])
     assert lab.check(BETTER).warnings == ()

@@ -41,7 +41,7 @@ Rows = Mapping[int, list[tuple[int, int]]]  # by channel id: log time in ns, off
 class _Records(NamedTuple):
     """The records of a damaged chunk, as far as they can be decoded.
 
-    `checked` says that all records are present with a right CRC, `is_wrong` that all are present with a
+    `checked` says that all records are present with a valid CRC, `is_wrong` that all are present with a
     wrong CRC. `ends_early` says that the rest is missing, or cannot be decoded. `size` is the stated size
     of the chunk in bytes.
     """

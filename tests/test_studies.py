@@ -81,7 +81,7 @@ def test_nan_in_an_import_is_refused_and_nothing_is_written(ipsys: Ipsys, data: 
 def test_where_all_heights_are_equal_the_floor_is_what_can_be_learned(ipsys: Ipsys, tmp_path: Path) -> None:
     log = made(tmp_path / "flat.mcap", heights=(0.1,))
     done = ipsys("evaluate", log, "--model", "poly", "--model", "best", "--json")
-    assert "camera red: all calibration points have the height 0.100 m" in done.err
+    assert "camera red: all calibration points have the height 10.0 cm" in done.err
     for name in ("poly", "best"):
         validated = json.loads(done.out)["models"][name]["cameras"]["red"]["cross_validation"]
         assert "3d" not in validated

@@ -8,8 +8,8 @@ import re
 import tokenize
 from collections.abc import Iterator
 from pathlib import Path
+from typing import Any
 
-import click
 import pytest
 import typer
 
@@ -103,7 +103,7 @@ def text_faults(text: str) -> list[str]:
     return found + [f"{phrase!r}: {text[:90]}" for phrase in _TEXT_PHRASES if phrase in text.lower()]
 
 
-def help_texts(command: click.Command, path: str) -> Iterator[tuple[str, str]]:
+def help_texts(command: Any, path: str) -> Iterator[tuple[str, str]]:
     """Yield the help of a command, of its options and of its subcommands, each with its name."""
     yield path, command.help or ""
     for parameter in command.params:

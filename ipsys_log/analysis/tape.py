@@ -11,6 +11,7 @@ from numpy.typing import NDArray
 from ipsys_log.errors import IpsysError
 from ipsys_log.geometry.trilateration import crossing_angle, multilaterate, tape_covariance
 from ipsys_log.messages import Measurement, Rig
+from ipsys_log.units import CM_PER_M
 
 __all__ = [
     "RiggedMeasurement",
@@ -231,7 +232,8 @@ def _check_lengths(measurement: Measurement, where: str) -> None:
     for distance in measurement.distances:
         if not abs(distance.distance_m) <= _FARTHEST_M:
             raise IpsysError(
-                f"{where}: a tape of {distance.distance_m:g} m is too long; withdraw it and measure again"
+                f"{where}: a tape of {distance.distance_m * CM_PER_M:g} cm is too long; withdraw it and "
+                "measure again"
             )
 
 

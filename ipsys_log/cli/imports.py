@@ -24,7 +24,10 @@ def add_commands(app: typer.Typer) -> None:
 
 
 def imsel(
-    folder: Annotated[Path, typer.Argument(help="Folder of the paper's data, or a clone of its repository.")],
+    folder: Annotated[
+        Path,
+        typer.Argument(metavar="FOLDER", help="Folder of the paper's data, or a clone of its repository."),
+    ],
     output: NewLog,
 ) -> None:
     """Import the data of the paper (Ou et al., Robotica 2023): .mat files and camera YAML files."""
@@ -37,7 +40,9 @@ def imsel(
 
 
 def images(
-    folder: Annotated[Path, typer.Argument(help="A folder with one sub-folder of pictures per camera.")],
+    folder: Annotated[
+        Path, typer.Argument(metavar="FOLDER", help="A folder with one sub-folder of pictures per camera.")
+    ],
     output: NewLog,
     rig: RigFile = None,
     calibration: Calibrations = None,

@@ -77,7 +77,7 @@ def runs(logs: Logs, as_json: AsJson = False) -> None:
 
 
 def repair(
-    log: Annotated[Path, typer.Argument(help="A damaged or incomplete log.")],
+    log: Annotated[Path, typer.Argument(metavar="LOG", help="A damaged or incomplete log.")],
 ) -> None:
     """Repair a log in place: keep all complete records, report the losses, and complete its runs.
 

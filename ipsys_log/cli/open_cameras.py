@@ -149,7 +149,7 @@ def open_cameras(
 
     Parameters
     ----------
-    doing : text for the beginning if the command does not record; then the end has no text on frames.
+    doing : text printed at the start of a command that does not record; without it, the end reports frames.
     panel : the screen is free for a table of the cameras.
     until_stopped : a signal stops the cameras, and the command ends in order; otherwise it interrupts.
 

@@ -53,7 +53,7 @@ def add_commands(app: typer.Typer) -> None:
 
 
 def init(
-    path: Annotated[Path, typer.Argument(help="The rig file to write.")] = Path("lab.toml"),
+    path: Annotated[Path, typer.Argument(metavar="FILE", help="The rig file to write.")] = Path("lab.toml"),
     log: Annotated[
         Path | None,
         typer.Option("--from", metavar="LOG", help="Write the rig of a log, with its camera settings."),

@@ -29,6 +29,7 @@ from ipsys_log.models.table import (
     parameters,
 )
 from ipsys_log.models.uncertainty import Uncertainty, estimate_uncertainty
+from ipsys_log.units import CM_PER_M
 
 __all__ = ["STAGE", "fit_model", "model_run"]
 
@@ -195,8 +196,8 @@ def _plan(view: View, options: Mapping[str, str]) -> Plan | str:
         fitted = fit_model(name, pairs, view.last_ns(RIG, CAMERA_POINTS, MEASUREMENTS), progress)
         notes.extend(_unused_points(pairs, train))
         notes.extend(
-            f"camera {camera}: all calibration points have the height {height_m:.3f} m: the model is valid "
-            "for x and y, and returns only this height"
+            f"camera {camera}: all calibration points have the height {height_m * CM_PER_M:.1f} cm: the "
+            "model is valid for x and y, and returns only this height"
             for camera, height_m in level_cameras(fitted).items()
         )
         return fitted

@@ -183,7 +183,7 @@ def _note(damaged_range: DamagedRange, records: _Records, count: int, *, complet
     chunk_text = f"the chunk at byte {damaged_range.offset} ({records.span})"
     if records.checked:
         return (
-            f"all {count} messages of {chunk_text} were copied, because it has a valid CRC but "
+            f"all {count} messages of {chunk_text} were copied: the chunk has a valid CRC, but "
             "cannot stay in place"
         )
     if count:

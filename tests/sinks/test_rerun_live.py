@@ -51,7 +51,7 @@ def test_no_screen_is_said_before_anything_is_recorded(lab: Path, monkeypatch: p
         monkeypatch.delenv(name, raising=False)
     with Session([lab]) as session:
         (rig,) = session.payloads(["/rig"])
-        with pytest.raises(IpsysError, match="no screen"):
+        with pytest.raises(IpsysError, match="needs a screen"):
             LiveView(rig, session.images, None, print)
 
 
